@@ -10,6 +10,7 @@ mod doctor;
 mod examples;
 mod gateway;
 mod generated;
+mod key;
 mod latency;
 mod leds;
 mod listen;
@@ -25,9 +26,12 @@ use std::path::PathBuf;
 use std::time::Duration;
 
 use ::config::Sources;
+use clap::builder::{PossibleValuesParser, TypedValueParser};
 use clap::{Args, Command, CommandFactory, FromArgMatches, Parser, Subcommand};
 use schema::{DEFAULT_DOMAIN, Domain, Environment, Failure};
 use verbs::{Bounds, duration};
+
+use crate::demo::Families;
 
 pub(crate) use self::config::Config;
 pub(crate) use background::Background;
@@ -36,6 +40,7 @@ pub(crate) use control::Control;
 pub(crate) use convert::Convert;
 pub(crate) use gateway::Gateway;
 pub(crate) use generated::{Completions, Man};
+pub(crate) use key::Key;
 pub(crate) use latency::Latency;
 pub(crate) use leds::Leds;
 pub(crate) use listen::Listen;
@@ -110,7 +115,7 @@ pub(crate) enum Verb {
     Replay(Replay),
     /// Run two simulated sensors, the hub and a consumer for each in one terminal
     Demo(Demo),
-    /// Simulate sensors at the other end of ptys
+    /// Simulate sensors at the other end of ptys, or behind TCP
     #[command(after_help = simulate::fault_table())]
     Simulate(Box<simulate::Simulate>),
     /// Show the sensor at a port; without a port, list the ports
@@ -163,6 +168,8 @@ pub(crate) enum Verb {
     /// Receive what gateways of other machines send, and show what was lost
     #[command(after_help = listen::SIGNALS)]
     Listen(Listen),
+    /// Make the key that gateways and listeners share
+    Key(Key),
     /// Convert a recording to another format, or repair a damaged one
     #[command(after_help = convert::REPAIR)]
     Convert(Convert),
@@ -179,8 +186,9 @@ pub(crate) enum Verb {
 pub(crate) struct Run {
     #[command(flatten)]
     pub(crate) configured: Configured,
-    /// Add a link with default settings; PORT is a tty, tcp:HOST:PORT or file:PATH[?rate=max]
-    #[arg(long, value_name = "NAME=PORT")]
+    /// Add a link with default settings; PORT is a tty, tcp:HOST:PORT or file:PATH[?rate=max], and keys of the link may follow
+    /// it, as in front=/dev/ttyUSB0,family=ld
+    #[arg(long, value_name = "NAME=PORT[,KEY=VALUE]")]
     pub(crate) link: Vec<String>,
 }
 
@@ -224,6 +232,14 @@ pub(crate) struct Demo {
     /// Seed of rooms and people
     #[arg(long, default_value_t = 1)]
     pub(crate) seed: u64,
+    /// Of which family the two sensors are; mixed: one of each family
+    #[arg(long, default_value = "lms", value_name = "FAMILY", value_parser = families())]
+    pub(crate) family: Families,
+}
+
+fn families() -> impl TypedValueParser<Value = Families> {
+    PossibleValuesParser::new(Families::names())
+        .map(|name| Families::parse(&name).expect("one of the possible names"))
 }
 
 #[derive(Args, Debug)]

@@ -1,4 +1,4 @@
-//! The whole thing in one terminal: two simulated sensors, the hub and one consumer per sensor, each a process as in
+//! The whole thing in one terminal: simulated sensors of one family or of all, the hub and one consumer per sensor, each a process as in
 //! real life. This process only starts them, reads what they print, compares what was sent with what arrived, and shows
 //! the picture that `watch` makes of it.
 
@@ -14,7 +14,7 @@ use std::sync::mpsc::{self, RecvTimeoutError};
 use std::thread;
 use std::time::{Duration, Instant};
 
-use schema::{Domain, Failure, Kind};
+use schema::{Domain, Failure, Family, Kind};
 use serde::Serialize;
 use serde_json::Value;
 use verbs::{Bounds, WatchOptions};
@@ -25,6 +25,54 @@ use process::Line;
 use stage::Stage;
 use view::View;
 
+/// A simulated sensor.
+#[derive(Clone, Debug)]
+pub(crate) struct Sensor {
+    pub(crate) name: &'static str,
+    pub(crate) family: Family,
+    /// Where it sits, as its world has it (`tests/worlds/demo.toml`): keys of its link.
+    pub(crate) pose: &'static [&'static str],
+}
+
+/// Of which families the sensors are.
+#[derive(Clone, Copy, Debug)]
+pub(crate) enum Families {
+    /// All of one.
+    Of(Family),
+    /// One of each.
+    Mixed,
+}
+
+impl Families {
+    /// The names in all input: of the families, and `mixed`.
+    pub(crate) fn names() -> impl Iterator<Item = &'static str> {
+        Family::ALL.into_iter().map(Family::name).chain([MIXED])
+    }
+
+    /// The families that `name` says, if it is one of [`names`](Self::names).
+    pub(crate) fn parse(name: &str) -> Option<Families> {
+        if name == MIXED { Some(Families::Mixed) } else { Family::parse(name).map(Families::Of) }
+    }
+
+    fn sensors(self) -> Vec<Sensor> {
+        let ahead = |name, family| Sensor { name, family, pose: &["pose.x=0.3"] };
+        match self {
+            Families::Of(family) => {
+                let behind = &["pose.x=-0.3", "pose.yaw=3.14159"];
+                vec![ahead("front", family), Sensor { name: "rear", family, pose: behind }]
+            }
+            // Each family has a simulator of its own, and its first sensor sits in front: one above the other.
+            Families::Mixed => ["front", "side", "top"]
+                .into_iter()
+                .zip(Family::ALL)
+                .map(|(name, family)| ahead(name, family))
+                .collect(),
+        }
+    }
+}
+
+const MIXED: &str = "mixed";
+
 /// What the demonstration is asked for.
 #[derive(Clone, Debug)]
 pub(crate) struct DemoOptions {
@@ -34,6 +82,8 @@ pub(crate) struct DemoOptions {
     pub(crate) run_for: Option<Duration>,
     /// Seed of the rooms.
     pub(crate) seed: u64,
+    /// Of which families the sensors are.
+    pub(crate) family: Families,
     /// Whether the summary is JSON.
     pub(crate) json: bool,
 }
@@ -45,7 +95,7 @@ pub(crate) struct DemoOptions {
 pub(crate) fn demo(options: &DemoOptions, out: &mut dyn Write, stop: &AtomicBool) -> Result<(), Failure> {
     let shows = !options.headless && !options.json;
     let has_picture = shows && can_show_pictures();
-    let stage = Stage::new(has_picture)?;
+    let stage = Stage::new(has_picture, options.family.sensors())?;
     let played = if has_picture {
         play_with_picture(options, &stage, out, stop)
     } else {
@@ -79,7 +129,7 @@ fn play_with_picture(
     stop: &AtomicBool,
 ) -> Result<(Account, bool), Failure> {
     let picture = WatchOptions {
-        sensors: SENSORS.map(String::from).to_vec(),
+        sensors: stage.names(),
         colours: colours(),
         note: attach(&stage.domain),
         bounds: Bounds::default(),
@@ -143,9 +193,9 @@ fn play(
     let (lines, received) = mpsc::channel();
     let hub = stage.start_hub(lines.clone())?;
     let consumers = stage.start_consumers(&lines)?;
-    let mut account = Account::new(SENSORS.map(String::from).to_vec(), stage.open_truth()?);
+    let mut account = Account::new(&stage.sensors, stage.open_truths()?);
     // The sensors come last: whoever listens from the beginning can tell whether something was lost.
-    let mut simulator = None;
+    let mut simulators = Vec::new();
     let mut ready = 0;
     let mut first_sample: Option<Instant> = None;
     let begun = Instant::now();
@@ -155,10 +205,10 @@ fn play(
         match received.recv_timeout(next_look.saturating_duration_since(Instant::now()).min(PATIENCE)) {
             Ok(Line::Said { of, text }) => {
                 let value: Value = serde_json::from_str(&text).unwrap_or_default();
-                if value["class"] == "status" && simulator.is_none() {
+                if value["class"] == "status" && simulators.is_empty() {
                     ready |= 1 << of;
-                    if ready == (1 << SENSORS.len()) - 1 {
-                        simulator = Some(stage.start_simulator(options.seed, lines.clone())?);
+                    if ready == (1 << stage.sensors.len()) - 1 {
+                        simulators = stage.start_simulators(options.seed, &lines)?;
                     }
                 }
                 account.take(of, &value);
@@ -195,7 +245,7 @@ fn play(
     }
     drop(consumers);
     drop(hub);
-    drop(simulator);
+    drop(simulators);
     account.read_truth();
     Ok((account, is_stopped()))
 }
@@ -203,13 +253,12 @@ fn play(
 fn ended(of: usize) -> Failure {
     let who = match of {
         HUB => "the hub",
-        SIMULATOR => "the simulator",
+        SIMULATOR => "a simulator",
         _ => "a consumer",
     };
     Failure::new(Kind::Failed, format!("{who} ended early"), "its output is above")
 }
 
-const SENSORS: [&str; 2] = ["front", "rear"];
 /// Number of the hub among the processes; consumers have their sensor's.
 const HUB: usize = 100;
 const SIMULATOR: usize = 101;

@@ -70,6 +70,7 @@ fn dispatch(cli: &Cli) -> Result<(), Failure> {
                 headless: demo.headless,
                 run_for: demo.run_for,
                 seed: demo.seed,
+                family: demo.family,
                 json: everywhere.json,
             };
             // Without a picture it may be meant to outlive its terminal.
@@ -146,6 +147,7 @@ fn dispatch(cli: &Cli) -> Result<(), Failure> {
             }
         }
         Verb::Control(control) => verbs::control(&control.options(everywhere)?, &mut out, &*interrupt()?),
+        Verb::Key(key) => key.run(everywhere.json, &mut out),
         Verb::Background(background) => {
             // A model is read before Ctrl-C is a flag, which would not end a person's typing.
             let options = background.options(everywhere)?;
@@ -198,7 +200,8 @@ fn run_simulator(simulate: &cli::simulate::Simulate, everywhere: &Everywhere) ->
     }
     let announce = |ready: &[sim::Ready]| {
         if everywhere.json {
-            let ports = ready.iter().map(|one| ReadyPort { port: &one.port, pty: &one.pty }).collect();
+            let ports =
+                ready.iter().map(|one| ReadyPort { port: &one.port, pty: one.pty.as_deref() }).collect();
             say(&line(&SimulatorReady { class: "ready", ports }));
         } else {
             let ports: Vec<_> = ready.iter().map(|one| one.port.display().to_string()).collect();
@@ -229,7 +232,8 @@ struct SimulatorReady<'a> {
 #[derive(Serialize)]
 struct ReadyPort<'a> {
     port: &'a Path,
-    pty: &'a Path,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pty: Option<&'a Path>,
 }
 
 fn line(value: &impl Serialize) -> String {

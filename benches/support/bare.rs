@@ -60,7 +60,8 @@ pub(crate) fn sleeper(number: &str, count: usize) -> Outcome<()> {
     Ok(())
 }
 
-fn start_sleeper(number: usize, count: usize, wake: OwnedFd) -> Outcome<Guard> {
+/// A process that sleeps at `wake` until `count` wake-ups came, see [`sleeper`].
+pub(crate) fn start_sleeper(number: usize, count: usize, wake: OwnedFd) -> Outcome<Guard> {
     let words = [PART, "sleeper", &number.to_string(), &count.to_string()].map(String::from);
     let process = Command::new(std::env::current_exe()?).args(words).stdin(Stdio::from(wake)).spawn()?;
     Ok(Guard::new(process))

@@ -44,7 +44,8 @@ pub(crate) fn telegrams(domain: &str, sensor: &str, count: usize) -> Outcome<()>
     while count == 0 || kept.len() < count {
         let Some(telegram) = telegrams.next()? else { continue };
         let now = clock::now();
-        if schema::Telegram(&telegram).command() != lms::measured::MEASURED {
+        let of_lms = schema::Telegram::of(telegram.header().family, &telegram);
+        if of_lms.is_none_or(|telegram| telegram.command() != lms::measured::MEASURED) {
             continue;
         }
         let header = *telegram.header();

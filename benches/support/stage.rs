@@ -63,7 +63,12 @@ impl Stage {
 
     /// Sensors that stream at 500 kBd to whoever opens their ptys, in a simulator of their own that writes no truth.
     pub(crate) fn simulate_streaming(&self, sensors: &[&str]) -> Outcome<Child> {
-        self.simulator(sensors, Path::new("/dev/null"), &["--baud", "500000", "--state", "streaming"])
+        self.simulate_as(sensors, &["--baud", "500000", "--state", "streaming"])
+    }
+
+    /// Sensors at the other end of ptys, as `flags` say, in a simulator of their own that writes no truth.
+    pub(crate) fn simulate_as(&self, sensors: &[&str], flags: &[&str]) -> Outcome<Child> {
+        self.simulator(sensors, Path::new("/dev/null"), flags)
     }
 
     /// A sensor in a simulator of its own, as `flags` say, with its truth in [`Stage::own_truth`].

@@ -171,6 +171,10 @@ impl Line for Bytes {
         Ok(None)
     }
 
+    fn set_dtr(&self, _: bool) -> io::Result<()> {
+        Ok(())
+    }
+
     fn waiting(&self) -> Option<usize> {
         None
     }

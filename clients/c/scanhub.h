@@ -74,6 +74,7 @@ struct scanhub_datagram {
     uint8_t part;       /* which part of the sample this is, from 0 */
     uint8_t parts;      /* in how many it comes: 1 for most. To read one that comes in more, put `payload` of all parts of
                          * one sequence behind each other, point `payload` of one of them to that, and set `parts` to 1 */
+    uint8_t family;     /* of the sensor, see enum scanhub_family */
     uint16_t revision;  /* of the payload: a greater one only appends */
     uint32_t counter;   /* the same in all datagrams that came from one telegram */
     const uint8_t *payload;
@@ -155,6 +156,7 @@ static inline enum scanhub_result scanhub_read(const void *bytes, size_t len, st
     out->sensor = at[32];
     out->part = at[33];
     out->parts = at[34];
+    out->family = at[35];
     out->revision = scanhub_u16(at + 38);
     out->counter = scanhub_u32(at + 40);
     out->payload = at + header;
@@ -231,10 +233,15 @@ static inline struct scanhub_announced scanhub_announced(const struct scanhub_an
     return out;
 }
 
-/* A telegram of the sensor as it came: of an LMS STX to CRC, of other families whole packets. */
+/* Families of scanners: what speaks one protocol. */
+enum scanhub_family { SCANHUB_LMS = 0, SCANHUB_LD = 1, SCANHUB_RPLIDAR = 2 };
+
+/* What a sensor sent, as it came: of an LMS a telegram, STX to CRC; of other families whole packets that arrived together. */
 struct scanhub_telegram {
     const uint8_t *bytes;
     uint16_t len;
+    uint8_t family;
+    uint16_t packets; /* their number; 0 of an LMS, and where it is not known here */
 };
 static inline enum scanhub_result scanhub_read_telegram(const struct scanhub_datagram *datagram,
                                                         struct scanhub_telegram *out)
@@ -245,18 +252,22 @@ static inline enum scanhub_result scanhub_read_telegram(const struct scanhub_dat
     if (result != SCANHUB_OK)
         return result;
     len = datagram->payload_len;
-    if (at[0] == 0x02)
-        len = len < 4 ? 815 : scanhub_u16(at + 2) + (size_t)6;
+    if (datagram->family == SCANHUB_LMS) {
+        if (len < 4 || at[0] != 0x02)
+            return SCANHUB_BAD_PAYLOAD;
+        len = scanhub_u16(at + 2) + (size_t)6;
+    }
     if (len > 814 || len > datagram->payload_len)
         return SCANHUB_BAD_PAYLOAD;
     out->bytes = at;
     out->len = (uint16_t)len;
+    out->family = datagram->family;
+    out->packets = datagram->family == SCANHUB_LD ? (uint16_t)(len / 47) : 0;
     return SCANHUB_OK;
 }
 
 /* A scan: at most 8192 beams in the order of their measuring. Angles are in radians: 0 is the sensor's own ahead,
  * counter-clockwise positive seen from above. */
-enum scanhub_family { SCANHUB_LMS = 0, SCANHUB_LD = 1 };
 struct scanhub_scan {
     double first_angle;    /* of beam 0 */
     double step;           /* from one beam to the next; negative for a scanner that turns clockwise */
@@ -568,6 +579,7 @@ struct scanhub_status {
     uint8_t state;            /* 0 absent, 1 probing, 2 switching, 3 starting, 4 streaming, 5 silent, 6 paused */
     uint8_t mode;             /* measuring mode; FFh unknown */
     uint8_t unit_mm;          /* 0 unknown */
+    uint8_t family;           /* enum scanhub_family */
     uint32_t baud;            /* 0 unknown */
     uint64_t since_ns;        /* CLOCK_MONOTONIC of the hub's machine when the state began */
     uint32_t rate_mhz;        /* scans per second in 1/1000 */
@@ -590,6 +602,7 @@ static inline enum scanhub_result scanhub_read_status(const struct scanhub_datag
     out->state = at[0];
     out->mode = at[1];
     out->unit_mm = at[2];
+    out->family = at[3];
     out->baud = scanhub_u32(at + 4);
     out->since_ns = scanhub_u64(at + 8);
     out->rate_mhz = scanhub_u32(at + 16);

@@ -34,7 +34,7 @@ PORT = 22200
 TOPICS = ("announce", "telegram", "scan", "marks", "zones", "foreground", "background", "status")
 VERDICTS = ("clear", "slow", "stop", "unknown")
 STATES = ("absent", "probing", "switching", "starting", "streaming", "silent", "paused")
-FAMILIES = ("lms", "ld")
+FAMILIES = ("lms", "ld", "rplidar")
 CODES = ("not_measured", "no_return", "beyond", "too_near", "too_bright", "weak", "overflow", "error")
 """Why a beam has no reading, from the greatest value down; those of an LMS count from that of its measuring mode."""
 _OF_LMS = {0: "no_return", 1: "too_bright", 4: "weak", 5: "error", 8: "beyond"}
@@ -90,9 +90,12 @@ class Announce:
 
 @dataclass(frozen=True)
 class Telegram:
-    """A telegram of the sensor as it came: of an LMS STX to CRC, of other families whole packets."""
+    """What a sensor sent, as it came: of an LMS a telegram, STX to CRC; of other families whole packets that arrived
+    together, `packets` of them (None of an LMS). `family` is None if it is not known here."""
 
     telegram: bytes
+    family: Optional[str]
+    packets: Optional[int]
 
 
 @dataclass(frozen=True)
@@ -259,6 +262,7 @@ class Status:
     state: Optional[str]
     mode: int
     unit_mm: int
+    family: Optional[str]
     baud: int
     since_ns: int
     rate_mhz: int
@@ -281,7 +285,7 @@ class Datagram:
     `hub` is the gateway, `epoch` its life (a greater one ends the one before), `sequence` the number of the sample among
     those of this sensor and topic (modulo 2^32: a gap is what was lost), `counter` the same in all that came from one
     telegram, `stamp_ns` the wall clock of the telegram's first byte. `part` of `parts`, from 0: a sample that is longer
-    than a datagram comes in several, see `Parts`. `authenticated`: a key was given, and the MAC is of it.
+    than a datagram comes in several, see `Parts`. `family` is the number of the sensor's. `authenticated`: a key was given, and the MAC is of it.
     """
 
     number: int
@@ -293,6 +297,7 @@ class Datagram:
     sensor: int
     part: int
     parts: int
+    family: int
     revision: int
     counter: int
     payload: bytes
@@ -311,6 +316,8 @@ class Datagram:
         if self.revision == 0 or self.parts != 1:
             raise Refused("payload")
         try:
+            if self.topic == "telegram":
+                return _telegram(self.payload, self.family)
             return _UNPACK[self.number](self.payload)
         except struct.error:
             raise Refused("payload") from None
@@ -326,8 +333,8 @@ def read(data: bytes, key: Optional[bytes] = None) -> Datagram:
         raise Refused("magic")
     if version != 2:
         raise Refused("version")
-    fields = struct.unpack_from("<QIIQBBBxHHII", data, 8)
-    hub, epoch, sequence, stamp_ns, sensor, part, parts, length, revision, counter, crc = fields
+    fields = struct.unpack_from("<QIIQBBBBHHII", data, 8)
+    hub, epoch, sequence, stamp_ns, sensor, part, parts, family, length, revision, counter, crc = fields
     if not 48 <= header <= len(data) or part >= parts:
         raise Refused("header")
     end = header + length
@@ -342,9 +349,8 @@ def read(data: bytes, key: Optional[bytes] = None) -> Datagram:
         if not hmac.compare_digest(hmac.new(key, without[:end], hashlib.sha256).digest()[:16], data[end:]):
             raise Refused("mac")
     payload, authenticated = data[header:end], key is not None
-    return Datagram(
-        number, flags, hub, epoch, sequence, stamp_ns, sensor, part, parts, revision, counter, payload, authenticated
-    )
+    head = number, flags, hub, epoch, sequence, stamp_ns, sensor, part, parts, family, revision, counter
+    return Datagram(*head, payload, authenticated)
 
 
 class Parts:
@@ -423,13 +429,19 @@ def _announce(payload: bytes) -> Announce:
 _OF_NAMES = b"abcdefghijklmnopqrstuvwxyz0123456789_-"
 
 
-def _telegram(payload: bytes) -> Telegram:
-    if payload[:1] not in (b"", b"\x02"):
-        _limit(len(payload) <= 814)
-        return Telegram(payload)
+def _telegram(payload: bytes, number: int) -> Telegram:
+    family = FAMILIES[number] if number < len(FAMILIES) else None
+    if family != "lms":
+        _limit(1 <= len(payload) <= 814)
+        return Telegram(payload, family, len(payload) // _PACKET[family] if family in _PACKET else None)
+    _limit(payload[:1] == b"\x02")
     (length,) = struct.unpack_from("<2xH", payload)
     _limit(length + 6 <= min(len(payload), 814))
-    return Telegram(payload[: length + 6])
+    return Telegram(payload[: length + 6], family, None)
+
+
+# Bytes of a packet.
+_PACKET = {"ld": 47}
 
 
 def _scan(payload: bytes) -> Scan:
@@ -502,12 +514,15 @@ def _background(payload: bytes) -> Background:
 
 
 def _status(payload: bytes) -> Status:
-    state, *numbers = struct.unpack_from("<BBBxIQIHH", payload)
+    state, mode, unit_mm, family, *numbers = struct.unpack_from("<BBBBIQIHH", payload)
     texts = struct.unpack_from("<24s128s160s", payload, 24)
     counters = dict(zip(COUNTERS, struct.unpack_from("<28Q", payload, 336)))
     x_m, y_m, yaw_rad, upside_down = struct.unpack_from("<dddB7x", payload, 560)
     return Status(
         STATES[state] if state < len(STATES) else None,
+        mode,
+        unit_mm,
+        FAMILIES[family] if family < len(FAMILIES) else None,
         *numbers,
         *map(_text, texts),
         counters,
@@ -515,4 +530,4 @@ def _status(payload: bytes) -> Status:
     )
 
 
-_UNPACK = (_announce, _telegram, _scan, _marks, _zones, _foreground, _background, _status)
+_UNPACK = (_announce, None, _scan, _marks, _zones, _foreground, _background, _status)

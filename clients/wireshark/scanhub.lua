@@ -16,7 +16,9 @@ local TOPICS = {
 }
 local VERDICTS = { [0] = "clear", "slow", "stop", "unknown" }
 local STATES = { [0] = "absent", "probing", "switching", "starting", "streaming", "silent", "paused" }
-local FAMILIES = { [0] = "lms", "ld" }
+local FAMILIES = { [0] = "lms", "ld", "rplidar" }
+-- Of families that send packets: how many bytes one has.
+local PACKET = { 47 }
 local CODES = { [0] = "not_measured", "no_return", "beyond", "too_near", "too_bright", "weak", "overflow", "error" }
 -- From the greatest value of an LMS's measuring mode down.
 local OF_LMS = { [0] = "no_return", [1] = "too_bright", [4] = "weak", [5] = "error", [8] = "beyond" }
@@ -54,6 +56,7 @@ field("stamp", "absolute_time", "Stamp", base.UTC)
 field("sensor", "uint8", "Sensor")
 field("part", "uint8", "Part, from 0")
 field("parts", "uint8", "Parts of the sample")
+field("family", "uint8", "Family", base.DEC, FAMILIES)
 field("sensor_name", "string", "Sensor's name")
 field("payload_length", "uint16", "Payload length")
 field("revision", "uint16", "Payload revision")
@@ -78,6 +81,8 @@ field("announce.port", "uint16", "Port")
 field("announce.next", "uint32", "Next sequence")
 
 field("telegram", "bytes", "Telegram")
+field("telegram.packets", "uint16", "Packets")
+field("telegram.packet", "bytes", "Packet")
 
 field("scan.first_angle", "double", "First angle, rad, 0 ahead")
 field("scan.step", "double", "Step, rad")
@@ -151,6 +156,7 @@ field("background.range", "uint16", "Range, device units")
 field("status.state", "uint8", "State", base.DEC, STATES)
 field("status.mode", "uint8", "Measuring mode", base.HEX)
 field("status.unit_mm", "uint8", "Millimetres per unit")
+field("status.family", "uint8", "Family", base.DEC, FAMILIES)
 field("status.baud", "uint32", "Baud rate")
 field("status.since_ns", "uint64", "Since, ns of the hub's monotonic clock")
 field("status.rate_mhz", "uint32", "Scans per second, 1/1000")
@@ -293,16 +299,22 @@ unpack_payload[0] = function(payload, tree, hub, sensor)
     return payload(64, 1):uint() .. " topics"
 end
 
-unpack_payload[1] = function(payload, tree)
-    local len = payload:len()
+unpack_payload[1] = function(payload, tree, _, _, family)
+    local len, words = payload:len(), ""
     -- Of an LMS it says its length; of other families it is all of the payload.
-    if len > 0 and payload(0, 1):uint() == 2 then
-        if len < 4 then return nil end
+    if family == 0 then
+        if len < 4 or payload(0, 1):uint() ~= 2 then return nil end
         len = payload(2, 2):le_uint() + 6
     end
     if len == 0 or len > payload:len() or len > 814 then return nil end
-    tree:add(f["telegram"], payload(0, len))
-    return len .. " bytes"
+    local item = tree:add(f["telegram"], payload(0, len))
+    local packet = PACKET[family]
+    if packet then
+        item:add(f["telegram.packets"], math.floor(len / packet)):set_generated()
+        for at = 0, len - packet, packet do item:add(f["telegram.packet"], payload(at, packet)) end
+        words = string.format("%d packets, ", math.floor(len / packet))
+    end
+    return words .. len .. " bytes"
 end
 
 local function is_finite(number)
@@ -451,7 +463,8 @@ end
 
 unpack_payload[7] = function(payload, tree)
     if payload:len() < 592 then return nil end
-    add_fields(tree, payload, 0, "status.state", 1, "status.mode", 1, "status.unit_mm", 1)
+    add_fields(tree, payload, 0, "status.state", 1, "status.mode", 1, "status.unit_mm", 1,
+        "status.family", 1)
     add_fields(tree, payload, 4, "status.baud", 4, "status.since_ns", 8, "status.rate_mhz", 4, "status.angle_deg", 2,
         "status.resolution_cdeg", 2)
     for _, text in ipairs({ { "type", 24, 24 }, { "port", 48, 128 }, { "last_error", 176, 160 } }) do
@@ -496,7 +509,7 @@ local function add_header(tvb, tree)
     local stamp_ns = tvb(24, 8):le_uint64()
     local stamp = NSTime.new((stamp_ns / 1000000000):tonumber(), (stamp_ns % 1000000000):tonumber())
     tree:add(f["stamp"], tvb(24, 8), stamp):set_generated()
-    add_fields(tree, tvb, 32, "sensor", 1, "part", 1, "parts", 1)
+    add_fields(tree, tvb, 32, "sensor", 1, "part", 1, "parts", 1, "family", 1)
     add_fields(tree, tvb, 36, "payload_length", 2, "revision", 2, "counter", 4)
 end
 
@@ -537,7 +550,7 @@ function scanhub.dissector(tvb, pinfo, root)
         words = string.format("part %d of %d, %d bytes", part + 1, parts, length)
     elseif unpack and length > 0 and tvb(38, 2):le_uint() > 0 then
         local payload = tvb(header, length)
-        words = unpack(payload:tvb(), tree:add(payload, "Payload: " .. TOPICS[topic]), hub, sensor)
+        words = unpack(payload:tvb(), tree:add(payload, "Payload: " .. TOPICS[topic]), hub, sensor, tvb(35, 1):uint())
     end
     if not words then
         return add_refusal(tree, pinfo, unpack and "payload" or "skipped")

@@ -54,13 +54,14 @@ const EXAMPLES: &[(&str, &[&str])] = &[
             "scanhub replay walk.mcap --start 1m --end 90s --loop --paused",
         ],
     ),
-    ("demo", &["scanhub demo", "scanhub demo --headless --for 10s"]),
+    ("demo", &["scanhub demo", "scanhub demo --family mixed", "scanhub demo --headless --for 10s"]),
     (
         "simulate",
         &[
             "scanhub simulate --port /tmp/front --world room",
             "scanhub simulate --port /tmp/front --fault loss=0.00135,burst=1.89",
             "scanhub simulate --port /tmp/front --replay robot.mcap --sensor front",
+            "scanhub simulate --family rplidar --model a1 --tcp 127.0.0.1:0",
         ],
     ),
     ("probe", &["scanhub probe", "scanhub probe /dev/ttyUSB0"]),
@@ -80,6 +81,8 @@ const EXAMPLES: &[(&str, &[&str])] = &[
         &["scanhub config show", "scanhub config show --config robot.toml --set link.front.angle=100"],
     ),
     ("doctor", &["scanhub doctor", "scanhub doctor /dev/ttyUSB0", "scanhub doctor --clean"]),
+    ("key", &["scanhub key new lan.key"]),
+    ("key new", &["scanhub key new lan.key"]),
     ("list", &["scanhub list"]),
     ("info", &["scanhub info front"]),
     (

@@ -1,6 +1,7 @@
 //! `scanhub gateway` on the command line.
 
 use std::io::{IsTerminal, stdout};
+use std::path::PathBuf;
 use std::time::Duration;
 
 use clap::Args;
@@ -29,6 +30,10 @@ pub(crate) struct Gateway {
     /// Send only telegrams, without a header, each sensor on its own port
     #[arg(long, conflicts_with = "background_every")]
     bare: bool,
+    /// File with the key of which every datagram gets a MAC, so that `listen --key-file` knows who sent it; `scanhub key
+    /// new` makes one
+    #[arg(long, value_name = "FILE", conflicts_with = "bare")]
+    key_file: Option<PathBuf>,
     /// How many networks datagrams to the groups may cross, including the first one [default: 1]
     #[arg(long, value_name = "N")]
     ttl: Option<u8>,
@@ -70,6 +75,7 @@ impl Gateway {
             topics: or(&self.topics, said.topics),
             to: or(&self.to, said.to),
             bare: self.bare || said.bare.unwrap_or_default(),
+            key_file: self.key_file.clone().or(said.key_file),
             ttl: self.ttl.or(said.ttl).unwrap_or(config::Gateway::TTL),
             background_every: self.background_every.or(every),
             longest: self.mtu.or(said.mtu).unwrap_or(config::Gateway::MTU),

@@ -1,10 +1,11 @@
 //! `scanhub listen` on the command line.
 
 use std::io::{IsTerminal, stdout};
+use std::path::PathBuf;
 
 use clap::Args;
-use schema::Failure;
 use schema::limits::TopicLimits;
+use schema::{Failure, StateDirectory};
 use verbs::ListenOptions;
 
 use super::{Everywhere, Limits};
@@ -23,6 +24,10 @@ pub(crate) struct Listen {
     /// Hub to listen to, by its 16 hex digits or its name from --name [default: all]
     #[arg(long = "hub", value_name = "HUB")]
     hubs: Vec<String>,
+    /// File with the key that gateways have: nothing else is believed, and nothing that is sent again. Clocks must agree
+    /// within 5 s
+    #[arg(long, value_name = "FILE")]
+    key_file: Option<PathBuf>,
     /// Print only the counts: received, lost, duplicate, reordered, refused
     #[arg(long)]
     stats: bool,
@@ -44,6 +49,8 @@ impl Listen {
             topics: self.topics.clone(),
             names: self.names.clone(),
             hubs: self.hubs.clone(),
+            key_file: self.key_file.clone(),
+            state: StateDirectory::of_domain(&everywhere.domain),
             stats: self.stats,
             publish: if self.publish { Some(everywhere.hub_domain()?) } else { None },
             limits: TopicLimits { consumers: self.consumers.into(), ..TopicLimits::default() },

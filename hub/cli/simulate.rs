@@ -12,8 +12,12 @@ use verbs::duration;
 #[derive(Args, Debug)]
 pub(crate) struct Simulate {
     /// Where to create each sensor's pty, as a symlink
-    #[arg(long, required = true, value_name = "PATH")]
+    #[arg(long, required_unless_present = "tcp", value_name = "PATH")]
     port: Vec<PathBuf>,
+    /// Where a sensor is found as behind a serial server in raw mode; port 0 is any that is free. The line `ready` says
+    /// which; the hub opens it as tcp:HOST:PORT. These sensors come after those of --port
+    #[arg(long, value_name = "HOST:PORT")]
+    tcp: Vec<String>,
     /// Rate of the line: 9600, 19200, 38400 or 500000 [default: the permanent rate]
     #[arg(long, value_name = "RATE")]
     baud: Option<String>,
@@ -34,8 +38,8 @@ pub(crate) struct Simulate {
     /// crowd, demo, empty, wall640 or random; or a TOML file, see docs/worlds.md
     #[arg(long, default_value = "room", value_name = "NAME|FILE", conflicts_with = "replay")]
     world: String,
-    /// Recording to send instead: MCAP file, telegram stream or CARMEN log, plain or gzipped; of family ld the bytes that
-    /// one sent
+    /// Recording to send instead: MCAP file, telegram stream or CARMEN log, plain or gzipped; of family ld an MCAP file or
+    /// the bytes that one sent. Of family rplidar there is none
     #[arg(long, value_name = "FILE")]
     replay: Option<PathBuf>,
     /// Which sensor of the recording, if it has several: one for all ports, or one for each in their order
@@ -56,10 +60,11 @@ pub(crate) struct Simulate {
     /// Write one JSON line per telegram to this file: what was sent, with its hash
     #[arg(long, value_name = "FILE")]
     truth: Option<PathBuf>,
-    /// Family of the sensors: lms (SICK LMS 2xx) or ld (LDROBOT)
+    /// Family of the sensors: lms (SICK LMS 2xx), ld (LDROBOT) or rplidar (Slamtec)
     #[arg(long, default_value = "lms", value_name = "FAMILY")]
     family: String,
-    /// Model, of family ld: ld06, ld19, stl19p, stl27l or ld14p [default: ld19]
+    /// Model, of family ld: ld06, ld19, stl19p, stl27l or ld14p [default: ld19]; of family rplidar: a1, a2m8, a2m12, a3, s1,
+    /// s2, s3 or c1 [default: a1]
     #[arg(long, value_name = "NAME")]
     model: Option<String>,
     /// Type of the sensors of family lms, which also limits what they support: lms200, lms211, lms221 or lms291
@@ -71,8 +76,9 @@ pub(crate) struct Simulate {
     /// Unit: mm, cm or dm [default: the recording's, else mm of an lms200, cm of others]
     #[arg(long)]
     unit: Option<String>,
-    /// Measuring mode [default: the recording's, else 0x01]
-    #[arg(long, value_name = "BYTE")]
+    /// Measuring mode, of family lms a byte [default: the recording's, else 0x01]; of family rplidar the name of the mode that
+    /// it recommends, such as Boost [default: the model's]
+    #[arg(long, value_name = "MODE")]
     mode: Option<String>,
     /// End measured values with scan and telegram index
     #[arg(long)]
@@ -96,8 +102,11 @@ pub(crate) struct Simulate {
 
 impl Simulate {
     pub(crate) fn options(&self) -> Result<SimulateOptions, Failure> {
+        let servers = self.tcp.iter().map(|address| format!("tcp:{address}").into());
+        let mode = self.mode.as_deref();
+        let scanner = options::parse_family(&self.family, self.model.as_deref(), mode)?;
         Ok(SimulateOptions {
-            ports: self.port.clone(),
+            ports: self.port.iter().cloned().chain(servers).collect(),
             baud: self.baud.as_deref().map(options::parse_baud).transpose()?,
             permanent_baud: self.permanent_baud.as_deref().map(options::parse_baud).transpose()?,
             state: options::parse_state(&self.state)?,
@@ -114,14 +123,14 @@ impl Simulate {
             family: options::parse_type(&self.lms_type)?,
             variant: self.variant.as_deref().map(options::parse_variant).transpose()?,
             unit: self.unit.as_deref().map(options::parse_unit).transpose()?,
-            mode: self.mode.as_deref().map(options::parse_mode).transpose()?,
+            mode: mode.filter(|_| scanner.is_none()).map(options::parse_mode).transpose()?,
             indices: self.indices,
             short_configuration: self.short_configuration,
             status: options::parse_byte("status", &self.status)?,
             errors: self.error.iter().map(|text| options::parse_error(text)).collect::<Result<_, _>>()?,
             pollution: self.pollution,
             chunk: self.chunk.parse()?,
-            model: options::parse_family(&self.family, self.model.as_deref())?,
+            scanner,
         })
     }
 }

@@ -6,6 +6,7 @@ use std::fs::File;
 use std::io::{Read, Write};
 use std::time::Instant;
 
+use schema::Family;
 use serde::Serialize;
 use serde_json::Value;
 use sha2::{Digest, Sha256};
@@ -13,10 +14,8 @@ use sha2::{Digest, Sha256};
 /// The account of all sensors.
 pub(crate) struct Account {
     pub(crate) sensors: Vec<Sensor>,
-    /// What the simulator says, line by line; reading never waits.
-    truth: File,
-    /// The beginning of a line.
-    unfinished: Vec<u8>,
+    /// What each simulator says, line by line, and the beginning of a line; reading never waits.
+    truths: Vec<(File, Vec<u8>)>,
     /// Telegrams whose last byte left after this moment do not count.
     cut_ns: u64,
     hub: Option<Work>,
@@ -30,6 +29,10 @@ pub(crate) struct Sensor {
     pub(crate) name: String,
     pub(crate) state: String,
     pub(crate) baud: u64,
+    /// Its head turns: what it sends are packets, and before anybody listens they do not count.
+    turns: bool,
+    /// Packets that were sent before the first one that arrived, as far as that is known.
+    before: Vec<String>,
     /// Telegrams of measured data that were sent whole before the cut.
     pub(crate) sent: u64,
     /// Hash of each that was sent and has not arrived.
@@ -37,7 +40,7 @@ pub(crate) struct Sensor {
     /// Hash of each that arrived before the simulator said that it was sent.
     early: HashMap<String, u64>,
     pub(crate) received_count: u64,
-    /// Ranges of the last scan, in mm; none where there is no reading.
+    /// Ranges of the last scan from right to left, in mm; none where there is no reading.
     pub(crate) ranges: Vec<Option<u64>>,
     pub(crate) nearest_mm: Option<u64>,
     pub(crate) nearest_deg: f64,
@@ -75,13 +78,16 @@ struct Summary<'a> {
 }
 
 impl Account {
-    pub(crate) fn new(names: Vec<String>, truth: File) -> Self {
-        let sensors =
-            names.into_iter().map(|name| Sensor { name, state: "absent".into(), ..Sensor::default() });
+    pub(crate) fn new(sensors: &[super::Sensor], truths: Vec<File>) -> Self {
+        let sensors = sensors.iter().map(|&super::Sensor { name, family, .. }| Sensor {
+            name: name.into(),
+            state: "absent".into(),
+            turns: family != Family::Lms,
+            ..Sensor::default()
+        });
         Account {
             sensors: sensors.collect(),
-            truth,
-            unfinished: Vec::new(),
+            truths: truths.into_iter().map(|truth| (truth, Vec::new())).collect(),
             cut_ns: u64::MAX,
             hub: None,
             hub_cpu_percent: 0.0,
@@ -116,27 +122,26 @@ impl Account {
         self.sensors.iter().all(|sensor| sensor.lost() == 0)
     }
 
-    /// Reads what the simulator wrote since the last time.
+    /// Reads what the simulators wrote since the last time.
     pub(crate) fn read_truth(&mut self) {
-        // Ends with an error where there is nothing more to read now; what was read before it is kept.
-        let _ = self.truth.read_to_end(&mut self.unfinished);
-        let whole = self.unfinished.iter().rposition(|&byte| byte == b'\n').map_or(0, |end| end + 1);
-        let rest = self.unfinished.split_off(whole);
-        let lines = std::mem::replace(&mut self.unfinished, rest);
-        for line in lines.split(|&byte| byte == b'\n').filter(|line| !line.is_empty()) {
-            let value: Value = serde_json::from_slice(line).unwrap_or_default();
-            let of = self.sensors.iter_mut().find(|sensor| {
-                value["port"]
-                    .as_str()
-                    .is_some_and(|port| port.rsplit('/').next() == Some(sensor.name.as_str()))
-            });
-            let Some(sensor) = of else { continue };
-            if value["class"] == "simulated" {
-                sensor.eeprom_writes = value["eeprom_writes"].as_u64().unwrap_or(u64::MAX);
-            } else if value["kind"] == "data" && value["fault"].is_null() {
-                let sent_ns = value["sent_ns"].as_u64().unwrap_or_default();
-                if sent_ns <= self.cut_ns {
-                    sensor.take_sent(value["sha256"].as_str().unwrap_or_default());
+        for (truth, unfinished) in &mut self.truths {
+            // Ends with an error where there is nothing more to read now; what was read before it is kept.
+            let _ = truth.read_to_end(unfinished);
+            let whole = unfinished.iter().rposition(|&byte| byte == b'\n').map_or(0, |end| end + 1);
+            let rest = unfinished.split_off(whole);
+            let lines = std::mem::replace(unfinished, rest);
+            for line in lines.split(|&byte| byte == b'\n').filter(|line| !line.is_empty()) {
+                let value: Value = serde_json::from_slice(line).unwrap_or_default();
+                let name = value["port"].as_str().and_then(|port| port.rsplit('/').next());
+                let of = self.sensors.iter_mut().find(|sensor| name == Some(sensor.name.as_str()));
+                let Some(sensor) = of else { continue };
+                if value["class"] == "simulated" {
+                    sensor.eeprom_writes = value["eeprom_writes"].as_u64().unwrap_or(u64::MAX);
+                } else if value["kind"] == "data" && value["fault"].is_null() {
+                    let sent_ns = value["sent_ns"].as_u64().unwrap_or_default();
+                    if sent_ns <= self.cut_ns {
+                        sensor.take_sent(value["sha256"].as_str().unwrap_or_default());
+                    }
                 }
             }
         }
@@ -211,13 +216,28 @@ impl Sensor {
     }
 
     fn take_sent(&mut self, hash: &str) {
+        if self.turns && self.sent == 0 && !self.early.contains_key(hash) {
+            return self.before.push(hash.to_owned());
+        }
         self.sent += 1;
         if !take(&mut self.early, hash) {
             *self.missing.entry(hash.to_owned()).or_default() += 1;
         }
     }
 
-    /// Telegrams per second from the first to the last.
+    fn take_arrived(&mut self, bytes: &[u8]) {
+        let hash: String = Sha256::digest(bytes).iter().map(|byte| format!("{byte:02x}")).collect();
+        if let Some(first) = self.before.iter().position(|sent| *sent == hash) {
+            let sent: Vec<String> = std::mem::take(&mut self.before).split_off(first);
+            self.sent += sent.len() as u64;
+            sent.into_iter().for_each(|hash| *self.missing.entry(hash).or_default() += 1);
+        }
+        if !take(&mut self.missing, &hash) {
+            *self.early.entry(hash).or_default() += 1;
+        }
+    }
+
+    /// Telegrams per second from the first to the last; of a head that turns, turns.
     pub(crate) fn hz(&self) -> f64 {
         if self.seconds() > 0.0 { (self.received_count - 1) as f64 / self.seconds() } else { 0.0 }
     }
@@ -227,14 +247,20 @@ impl Sensor {
     }
 
     fn take_telegram(&mut self, line: &Value) {
-        if line["command"] != MEASURED {
+        let is_data = if self.turns { line["kind"] == "data" } else { line["command"] == MEASURED };
+        if !is_data {
             return;
         }
         let bytes = from_hex(line["data"].as_str().unwrap_or_default());
-        let hash: String = Sha256::digest(&bytes).iter().map(|byte| format!("{byte:02x}")).collect();
-        if !take(&mut self.missing, &hash) {
-            *self.early.entry(hash).or_default() += 1;
+        let packets = line["packets"].as_u64().unwrap_or(1).max(1) as usize;
+        bytes.chunks((bytes.len() / packets).max(1)).for_each(|packet| self.take_arrived(packet));
+        if !self.turns {
+            self.note(line);
         }
+    }
+
+    /// A telegram came, or a turn.
+    fn note(&mut self, line: &Value) {
         self.received_count += 1;
         self.last_ns = line["stamp_ns"].as_u64().unwrap_or_default();
         if self.first_ns == 0 {
@@ -243,7 +269,10 @@ impl Sensor {
     }
 
     fn take_scan(&mut self, line: &Value) {
-        let unit = line["unit_mm"].as_u64().unwrap_or(1);
+        if self.turns {
+            self.note(line);
+        }
+        let unit = line["unit_um"].as_u64().unwrap_or(1000) / 1000;
         let ranges = line["ranges"].as_array().map(Vec::as_slice).unwrap_or_default();
         self.ranges = ranges.iter().map(|range| range.as_u64().map(|range| range * unit)).collect();
         // What is there is seen by two beams side by side; a single one may be noise. Of both the farther one counts.
@@ -254,6 +283,12 @@ impl Sensor {
         let angle = |key: &str| line[key].as_f64().unwrap_or_default();
         self.nearest_deg =
             nearest.map_or(0.0, |(_, i)| angle("first_angle_deg") + i as f64 * angle("step_deg"));
+        if angle("step_deg") < 0.0 {
+            // Of a whole turn, what is behind is at both ends, and the right comes first as of others.
+            let half = self.ranges.len() / 2;
+            self.ranges.rotate_left(half);
+            self.ranges.reverse();
+        }
     }
 }
 
@@ -292,10 +327,38 @@ mod tests {
     #[test]
     fn a_single_beam_is_not_the_nearest() {
         let mut sensor = Sensor::default();
-        let scan = |ranges: Value| serde_json::json!({ "unit_mm": 10, "first_angle_deg": -90.0, "step_deg": 0.5, "ranges": ranges });
+        let scan = |ranges: Value| serde_json::json!({ "unit_um": 10_000, "first_angle_deg": -90.0, "step_deg": 0.5, "ranges": ranges });
         sensor.take_scan(&scan(serde_json::json!([400, 400, 3, 400, null, 7, null, 120, 110, 300])));
         assert_eq!((sensor.nearest_mm, sensor.nearest_deg), (Some(1200), -86.5));
         sensor.take_scan(&scan(serde_json::json!([null, 3, null])));
         assert_eq!(sensor.nearest_mm, None);
+    }
+
+    #[test]
+    fn packets_count_from_the_first_that_arrives() {
+        let telegram = |data: &str, packets: u64| serde_json::json!({ "kind": "data", "packets": packets, "data": data });
+        let hash =
+            |bytes: &[u8]| Sha256::digest(bytes).iter().map(|byte| format!("{byte:02x}")).collect::<String>();
+        let mut sensor = Sensor { turns: true, ..Sensor::default() };
+        // Two before anybody listened, and one after another of which the middle one is lost; the truth comes before or after.
+        [b"a", b"b", b"c"].iter().for_each(|sent| sensor.take_sent(&hash(*sent)));
+        assert_eq!((sensor.sent, sensor.lost()), (0, 0));
+        sensor.take_telegram(&telegram("6365", 2));
+        assert_eq!((sensor.sent, sensor.lost()), (1, 0));
+        [b"d", b"e"].iter().for_each(|sent| sensor.take_sent(&hash(*sent)));
+        assert_eq!((sensor.sent, sensor.lost()), (3, 1));
+        let mut sensor = Sensor { turns: true, ..Sensor::default() };
+        sensor.take_telegram(&telegram("62", 1));
+        [b"a", b"b", b"c"].iter().for_each(|sent| sensor.take_sent(&hash(*sent)));
+        assert_eq!((sensor.sent, sensor.lost()), (2, 1));
+    }
+
+    #[test]
+    fn a_turn_is_shown_from_right_to_left() {
+        let mut sensor = Sensor { turns: true, ..Sensor::default() };
+        // Ahead, right, behind, left.
+        let turn = serde_json::json!({ "unit_um": 1000, "first_angle_deg": 0.0, "step_deg": -90.0, "ranges": [1, 2, 3, 4] });
+        sensor.take_scan(&turn);
+        assert_eq!(sensor.ranges, [2, 1, 4, 3].map(Some));
     }
 }

@@ -9,14 +9,15 @@ use std::process::Stdio;
 use std::sync::mpsc;
 
 use rustix::fs::{CWD, FileType, Mode, OFlags, mknodat};
-use schema::{Domain, Environment, Failure, Kind};
+use schema::{Domain, Environment, Failure, Family, Kind};
 
 use super::process::{Child, Line};
-use super::{HUB, SENSORS, SIMULATOR};
+use super::{HUB, SIMULATOR, Sensor};
 
 /// A domain and a directory of its own.
 pub(super) struct Stage {
     pub(super) domain: Domain,
+    pub(super) sensors: Vec<Sensor>,
     directory: PathBuf,
     /// There is a picture on the terminal, into which nobody may write.
     quiet: bool,
@@ -24,7 +25,7 @@ pub(super) struct Stage {
 
 impl Stage {
     /// `quiet`: what the processes have to say of errors is kept until [`tell_errors`](Self::tell_errors).
-    pub(super) fn new(quiet: bool) -> Result<Stage, Failure> {
+    pub(super) fn new(quiet: bool, sensors: Vec<Sensor>) -> Result<Stage, Failure> {
         let name = format!("demo-{}", std::process::id());
         let environment = Environment::of_process();
         // Where the user's own place is too long a name for a domain, that of who has none is not.
@@ -41,7 +42,7 @@ impl Stage {
                 "set TMPDIR to a directory that this user may write, or remove what is in the way",
             )
         })?;
-        Ok(Stage { domain, directory, quiet })
+        Ok(Stage { domain, sensors, directory, quiet })
     }
 
     /// Says on stderr what was kept.
@@ -60,19 +61,34 @@ impl Stage {
         log.ok().filter(|_| self.quiet).map_or_else(Stdio::inherit, Stdio::from)
     }
 
-    fn truth(&self) -> PathBuf {
-        self.directory.join("truth")
+    /// The names of the sensors.
+    pub(super) fn names(&self) -> Vec<String> {
+        self.sensors.iter().map(|sensor| sensor.name.to_owned()).collect()
     }
 
-    /// The reading end of what the simulator will tell: a pipe, because a demonstration may run for days.
-    pub(super) fn open_truth(&self) -> Result<File, Failure> {
-        let open = || -> io::Result<File> {
-            mknodat(CWD, self.truth(), FileType::Fifo, Mode::RUSR | Mode::WUSR, 0)?;
-            OpenOptions::new().read(true).custom_flags(OFlags::NONBLOCK.bits() as i32).open(self.truth())
+    /// The families of the sensors: each has a simulator of its own.
+    fn families(&self) -> impl Iterator<Item = Family> {
+        Family::ALL.into_iter().filter(|family| self.sensors.iter().any(|sensor| sensor.family == *family))
+    }
+
+    fn truth(&self, family: Family) -> PathBuf {
+        self.directory.join(format!("truth-{}", family.name()))
+    }
+
+    /// The reading ends of what the simulators will tell: pipes, because a demonstration may run for days.
+    pub(super) fn open_truths(&self) -> Result<Vec<File>, Failure> {
+        let open = |path: &PathBuf| -> io::Result<File> {
+            mknodat(CWD, path, FileType::Fifo, Mode::RUSR | Mode::WUSR, 0)?;
+            OpenOptions::new().read(true).custom_flags(OFlags::NONBLOCK.bits() as i32).open(path)
         };
-        open().map_err(|error| {
-            Failure::new(Kind::Failed, format!("cannot make a pipe {}: {error}", self.truth().display()), "")
-        })
+        let pipes = self.families().map(|family| self.truth(family));
+        pipes
+            .map(|path| {
+                open(&path).map_err(|error| {
+                    Failure::new(Kind::Failed, format!("cannot make a pipe {}: {error}", path.display()), "")
+                })
+            })
+            .collect()
     }
 
     fn port(&self, sensor: &str) -> String {
@@ -80,15 +96,19 @@ impl Stage {
     }
 
     pub(super) fn start_hub(&self, lines: mpsc::Sender<Line>) -> Result<Child, Failure> {
-        let links: Vec<_> = SENSORS.iter().flat_map(|sensor| ["--link".into(), self.link(sensor)]).collect();
-        let poses = POSES.map(|pose| format!("--set=link.{pose}"));
+        let links = self.sensors.iter().flat_map(|Sensor { name, family, pose }| {
+            let set = move |setting: &str| format!("--set=link.{name}.{setting}");
+            let link = [
+                "--link".into(),
+                format!("{name}={}", self.port(name)),
+                set(&format!("family={}", family.name())),
+            ];
+            link.into_iter().chain(pose.iter().map(move |pose| set(pose)))
+        });
+        let links: Vec<String> = links.collect();
         let hub = Child::start(
-            &[
-                &["run".into(), "--json".into(), "--no-system-config".into(), FORGETS.into()],
-                &links[..],
-                &poses[..],
-            ]
-            .concat(),
+            &[&["run".into(), "--json".into(), "--no-system-config".into(), FORGETS.into()], &links[..]]
+                .concat(),
             &self.domain,
             &self.directory,
             None,
@@ -97,24 +117,34 @@ impl Stage {
         hub.await_ready(HUB, lines)
     }
 
-    fn link(&self, sensor: &str) -> String {
-        format!("{sensor}={}", self.port(sensor))
-    }
-
     pub(super) fn start_consumers(&self, lines: &mpsc::Sender<Line>) -> Result<Vec<Child>, Failure> {
-        let start = |(of, sensor): (usize, &&str)| {
+        let start = |(of, Sensor { name: sensor, .. }): (usize, &Sensor)| {
             let topics = ["telegram", "scan", "status"].map(|topic| format!("{sensor}/{topic}"));
             let arguments = [&["echo".into(), "--json".into()], &topics[..]].concat();
             Child::start(&arguments, &self.domain, &self.directory, Some((of, lines.clone())), self.errors())
         };
-        SENSORS.iter().enumerate().map(start).collect()
+        self.sensors.iter().enumerate().map(start).collect()
     }
 
-    pub(super) fn start_simulator(&self, seed: u64, lines: mpsc::Sender<Line>) -> Result<Child, Failure> {
-        let ports: Vec<_> = SENSORS.iter().flat_map(|sensor| ["--port".into(), self.port(sensor)]).collect();
-        let truth = self.truth().display().to_string();
+    pub(super) fn start_simulators(
+        &self,
+        seed: u64,
+        lines: &mpsc::Sender<Line>,
+    ) -> Result<Vec<Child>, Failure> {
+        self.families().map(|family| self.start_simulator(family, seed, lines.clone())).collect()
+    }
+
+    fn start_simulator(
+        &self,
+        family: Family,
+        seed: u64,
+        lines: mpsc::Sender<Line>,
+    ) -> Result<Child, Failure> {
+        let sensors = self.sensors.iter().filter(|sensor| sensor.family == family);
+        let ports: Vec<_> = sensors.flat_map(|sensor| ["--port".into(), self.port(sensor.name)]).collect();
+        let truth = self.truth(family).display().to_string();
         let rest = ["--truth".into(), truth, "--seed".into(), seed.to_string(), "--json".into()];
-        let world = ["--world".into(), "demo".into()];
+        let world = ["--world".into(), "demo".into(), "--family".into(), family.name().into()];
         let arguments = [&["simulate".into()], &world[..], &ports[..], &rest[..]].concat();
         Child::start(&arguments, &self.domain, &self.directory, None, self.errors())?
             .await_ready(SIMULATOR, lines)
@@ -137,5 +167,3 @@ impl Drop for Stage {
 
 /// What a demonstration learns is gone with it.
 const FORGETS: &str = "--set=background.keep=false";
-/// Where the sensors sit, as the world has them (`tests/worlds/demo.toml`).
-const POSES: [&str; 3] = ["front.pose.x=0.3", "rear.pose.x=-0.3", "rear.pose.yaw=3.14159"];

@@ -16,7 +16,7 @@ pub use announce::{Announce, Announced};
 pub use datagram_error::DatagramError;
 pub use lives::LIVES;
 pub use numbers::{Fresh, Row, WINDOW};
-pub use payload::{Packed, telegram};
+pub use payload::Packed;
 pub use standing::{Arrival, Standing};
 pub use stream_stats::{GivenUp, ROWS, StreamStats};
 
@@ -78,6 +78,8 @@ pub struct Head {
     pub part: u8,
     /// In how many parts the sample comes; 1 for most.
     pub parts: u8,
+    /// Of which family the sensor is, a number of [`Family`](crate::Family).
+    pub family: u8,
     /// Revision of the payload: a greater one only appends.
     pub revision: u16,
     /// The lower half of the sample's `seq`: joins the samples of one telegram.
@@ -97,6 +99,7 @@ impl Default for Head {
             sensor: 0,
             part: 0,
             parts: 1,
+            family: 0,
             revision: 0,
             counter: 0,
         }
@@ -120,22 +123,55 @@ impl Head {
     /// fit into two bytes.
     pub fn seal<'a>(&self, buffer: &'a mut [u8], len: usize) -> Option<&'a [u8]> {
         let datagram = buffer.get_mut(..HEAD + len)?;
+        self.write(datagram, len, self.flags & !LanFlags::AUTHENTICATED)?;
+        Some(checked(datagram))
+    }
+
+    /// As [`seal`](Head::seal), with the MAC behind the payload that `mac` makes of header and payload, the checksum in
+    /// them 0. `None` also if the buffer ends before the MAC does.
+    pub fn seal_with<'a>(
+        &self,
+        buffer: &'a mut [u8],
+        len: usize,
+        mac: impl FnOnce(&[u8]) -> [u8; MAC],
+    ) -> Option<&'a [u8]> {
+        let datagram = buffer.get_mut(..HEAD + len + MAC)?;
+        self.write(datagram, len, self.flags | LanFlags::AUTHENTICATED)?;
+        let (covered, place) = datagram.split_last_chunk_mut::<MAC>()?;
+        *place = mac(covered);
+        Some(checked(datagram))
+    }
+
+    /// Writes the header, with a checksum of 0, to the beginning of `datagram`.
+    fn write(&self, datagram: &mut [u8], len: usize, flags: u8) -> Option<()> {
         let (head, _) = datagram.split_first_chunk_mut::<HEAD>()?;
         head[..4].copy_from_slice(MAGIC);
-        head[4..8].copy_from_slice(&[VERSION, HEAD as u8, self.topic, self.flags]);
+        head[4..8].copy_from_slice(&[VERSION, HEAD as u8, self.topic, flags]);
         head[8..16].copy_from_slice(&self.hub.to_le_bytes());
         head[16..20].copy_from_slice(&self.epoch.to_le_bytes());
         head[20..24].copy_from_slice(&self.sequence.to_le_bytes());
         head[24..32].copy_from_slice(&self.stamp_ns.to_le_bytes());
-        head[32..36].copy_from_slice(&[self.sensor, self.part, self.parts, 0]);
+        head[32..36].copy_from_slice(&[self.sensor, self.part, self.parts, self.family]);
         head[36..38].copy_from_slice(&u16::try_from(len).ok()?.to_le_bytes());
         head[38..40].copy_from_slice(&self.revision.to_le_bytes());
         head[40..44].copy_from_slice(&self.counter.to_le_bytes());
         head[CRC_AT..].fill(0);
-        let crc = CRC.checksum(datagram);
-        datagram[CRC_AT..HEAD].copy_from_slice(&crc.to_le_bytes());
-        Some(datagram)
+        Some(())
     }
+}
+
+/// `datagram` with its checksum, the place of which is 0.
+fn checked(datagram: &mut [u8]) -> &[u8] {
+    let crc = CRC.checksum(datagram);
+    datagram[CRC_AT..HEAD].copy_from_slice(&crc.to_le_bytes());
+    datagram
+}
+
+/// What the MAC of `bytes`, a datagram that has one and was [`read`](Datagram::read), covers, in three pieces: header and
+/// payload with a checksum of 0.
+pub fn covered(bytes: &[u8]) -> [&[u8]; 3] {
+    let end = bytes.len().saturating_sub(MAC).max(HEAD);
+    [&bytes[..CRC_AT], &[0; HEAD - CRC_AT], &bytes[HEAD..end]]
 }
 
 impl<'a> Datagram<'a> {
@@ -196,6 +232,7 @@ impl<'a> Datagram<'a> {
             sensor: head[32],
             part,
             parts,
+            family: head[35],
             revision: two(38),
             counter: four(40),
         };
@@ -245,6 +282,7 @@ mod tests {
             sensor: 5,
             part: 1,
             parts: 255,
+            family: 8,
             revision: 6,
             counter: 7,
         };

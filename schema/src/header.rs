@@ -5,6 +5,8 @@ use bytemuck::{Pod, Zeroable};
 #[cfg(feature = "ipc")]
 use iceoryx2::prelude::ZeroCopySend;
 
+use crate::Family;
+
 /// The user header of every topic, 64 bytes, the same for all.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Pod, Zeroable)]
 #[cfg_attr(feature = "ipc", derive(ZeroCopySend), type_name("scanhub.Header.v2"))]
@@ -28,7 +30,9 @@ pub struct Header {
     /// 0 clean, 1 suspect; see [`Quality`].
     pub quality: u8,
     /// Bits of [`Flags`].
-    pub flags: u16,
+    pub flags: u8,
+    /// Of which family the sensor is, a number of [`Family`]; see [`family`](Self::family).
+    pub family: u8,
     /// Nominal time between two samples of a scan, in us; 0 unknown.
     pub period_us: u32,
     /// Process of the hub.
@@ -56,6 +60,11 @@ impl Header {
         let units = units.clamp(1, HUB_TIME_MORE.into()) as u32;
         let [low, middle, high, _] = units.to_le_bytes();
         self.hub_time = [low, middle, high];
+    }
+
+    /// Returns the family of the sensor; nothing if this version does not know it.
+    pub fn family(&self) -> Option<Family> {
+        Family::of_number(self.family)
     }
 
     /// Returns the quality as a word; unknown values are suspect.
@@ -130,16 +139,16 @@ pub struct Flags;
 
 impl Flags {
     /// The port resolves to a pty.
-    pub const SIMULATED: u16 = 2;
+    pub const SIMULATED: u8 = 2;
     /// The link is a recording.
-    pub const REPLAYED: u16 = 4;
+    pub const REPLAYED: u8 = 4;
     /// The stamps were computed, not taken when the bytes arrived.
-    pub const STAMP_ESTIMATED: u16 = 8;
+    pub const STAMP_ESTIMATED: u8 = 8;
     /// The sample came from another machine.
-    pub const REMOTE: u16 = 32;
+    pub const REMOTE: u8 = 32;
 
     /// Returns the names of the bits that are set, as in all output.
-    pub fn names(flags: u16) -> impl Iterator<Item = &'static str> {
+    pub fn names(flags: u8) -> impl Iterator<Item = &'static str> {
         let named = [
             (Flags::SIMULATED, "simulated"),
             (Flags::REPLAYED, "replayed"),

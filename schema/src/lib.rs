@@ -54,8 +54,8 @@ pub use marks::{MARKS, Mark, Marks};
 pub use pose::Pose;
 pub use printable::{Printable, escape_json, json_line};
 pub use scan::{
-    BEAMS, Code, Contents, Family, Intensities, Scan, ScanArrays, ScanHead, ScanWord, in_degrees,
-    in_sector_mdeg,
+    BEAMS, Code, Contents, Family, Intensities, PacketFacts, Scan, ScanArrays, ScanHead, ScanWord,
+    in_degrees, in_sector_mdeg,
 };
 pub use status::{COUNTERS, Counter, Counters, State, Status};
 pub use telegram::Telegram;

@@ -14,7 +14,7 @@ pub const MARKS: usize = 64;
 pub struct Marks {
     /// Marks used, at most [`MARKS`].
     pub count: u8,
-    /// [`Marks::OVERFLOW`] and [`Marks::UNAVAILABLE`].
+    /// [`Marks::OVERFLOW`], [`Marks::UNAVAILABLE`] and [`Marks::NO_LEVEL`].
     pub flags: u8,
     /// 0.
     pub reserved: u16,
@@ -52,8 +52,11 @@ impl Default for Marks {
 impl Marks {
     /// Flag: there were more marks than fit.
     pub const OVERFLOW: u8 = 1;
-    /// Flag: the sensor's measuring mode has no reflector bits, so that nothing is known of marks.
+    /// Flag: the sensor's measuring mode has no reflector bits, or [`Marks::NO_LEVEL`], so that nothing is known of marks.
     pub const UNAVAILABLE: u8 = 2;
+    /// Flag, beside [`Marks::UNAVAILABLE`]: the sensor's intensities are counts of any surface, and nobody said from which on
+    /// one is a reflector.
+    pub const NO_LEVEL: u8 = 4;
 
     /// Returns the marks that are used.
     pub fn marks(&self) -> &[Mark] {
@@ -63,6 +66,11 @@ impl Marks {
     /// Returns whether the sensor sends what marks are found by: without it an empty list says nothing.
     pub fn is_available(&self) -> bool {
         self.flags & Marks::UNAVAILABLE == 0
+    }
+
+    /// Returns whether only the least count of a reflector is missing.
+    pub fn lacks_level(&self) -> bool {
+        self.flags & Marks::NO_LEVEL != 0
     }
 
     /// Returns whether there were more marks than fit.

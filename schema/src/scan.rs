@@ -13,7 +13,7 @@ use iceoryx2::prelude::ZeroCopySend;
 
 use crate::sliced::sliced;
 pub use code::Code;
-pub use family::Family;
+pub use family::{Family, PacketFacts};
 
 /// The most beams of a scan, of any family.
 pub const BEAMS: usize = 8192;

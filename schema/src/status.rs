@@ -7,7 +7,7 @@ use bytemuck::{Pod, Zeroable};
 #[cfg(feature = "ipc")]
 use iceoryx2::prelude::ZeroCopySend;
 
-use crate::{Pose, text};
+use crate::{Family, Pose, text};
 
 /// Room for counters in a [`Status`]; new ones append.
 pub const COUNTERS: usize = 28;
@@ -23,8 +23,8 @@ pub struct Status {
     pub mode: u8,
     /// Millimetres per device unit: 1, 10 or 100; 0 unknown.
     pub unit_mm: u8,
-    /// 0.
-    pub reserved: u8,
+    /// See [`Status::family`].
+    pub family: u8,
     /// Rate of the line in bits per second; 0 unknown.
     pub baud: u32,
     /// CLOCK_MONOTONIC when the state began, in ns.
@@ -104,6 +104,17 @@ impl Status {
     /// Returns whether the sensor is a recording, of which nothing can be asked.
     pub fn is_replayed(&self) -> bool {
         self.port().starts_with("file:")
+    }
+
+    /// Returns the family of the scanner, as configured; nothing if a newer hub has one that this program does not know.
+    pub fn family(&self) -> Option<Family> {
+        Family::of_number(self.family)
+    }
+
+    /// Returns the scanner's model in lower case, the first word of what the sensor calls itself; nothing if unknown.
+    pub fn model(&self) -> Option<String> {
+        let word = self.sensor_type().split(|c: char| c == ';' || c.is_whitespace()).next()?;
+        (!word.is_empty()).then(|| word.to_lowercase())
     }
 
     /// Returns what the sensor calls itself; empty if unknown.
@@ -289,6 +300,18 @@ mod tests {
         status.mode = 0;
         assert_eq!((status.has_reflector_bits(), status.reflector_remedy()), (Some(false), None));
         assert_eq!(Status::default().has_reflector_bits(), None);
+    }
+
+    #[test]
+    fn a_scanner_has_a_family_and_a_model() {
+        let mut status = Status::default();
+        assert_eq!((status.family(), status.model()), (Some(Family::Lms), None));
+        status.set_sensor_type("LMS200;301063;V02.30 ");
+        assert_eq!(status.model().as_deref(), Some("lms200"));
+        status.set_sensor_type("LMS291-S05 30106");
+        assert_eq!(status.model().as_deref(), Some("lms291-s05"));
+        status.family = 255;
+        assert_eq!(status.family(), None);
     }
 
     #[test]

@@ -38,7 +38,7 @@ fn values_are_these_bytes() {
         assert_eq!(datagram, vector(name), "{name}");
         built += 1;
     }
-    assert_eq!(built, 11);
+    assert_eq!(built, 12);
 }
 
 #[test]
@@ -151,7 +151,8 @@ fn these_bytes_are_values_or_refused() {
 #[test]
 fn every_reason_has_its_datagram() {
     let vectors = vectors();
-    for reason in DatagramError::ALL {
+    // When a datagram was sent again is nothing that its bytes say.
+    for reason in DatagramError::ALL.into_iter().filter(|reason| *reason != DatagramError::Untimely) {
         assert!(vectors.iter().any(|vector| vector.says["refusal"] == reason.name()), "{}", reason.name());
     }
 }

@@ -28,8 +28,8 @@ macro_rules! layout {
 #[test]
 fn the_text_says_what_the_structs_are() {
     let mut text = String::new();
-    layout!(text, Header: seq topic_seq stamp_first_ns stamp_last_ns wall_ns boot sensor quality flags period_us
-        hub_pid reasons hub_time);
+    layout!(text, Header: seq topic_seq stamp_first_ns stamp_last_ns wall_ns boot sensor quality flags family
+        period_us hub_pid reasons hub_time);
     layout!(text, ScanHead: first_angle step spacing beam_time_ns first_beam_ns unit_um count valid_to no_return beyond
         collapsed family flags contents intensity_bits turns reserved turn_ns reserved2);
     layout!(text, Mark: angle_mdeg range_dmm weight peak edge first_beam last_beam);
@@ -40,7 +40,7 @@ fn the_text_says_what_the_structs_are() {
     layout!(text, ForegroundHead: generation unit_um count beams segments left_out);
     layout!(text, BackgroundHead: first_angle step generation unit_um taught count flags reserved);
     layout!(text, Pose: x_m y_m yaw_rad upside_down reserved);
-    layout!(text, Status: state mode unit_mm reserved baud since_ns rate_mhz angle_deg resolution_cdeg type_text
+    layout!(text, Status: state mode unit_mm family baud since_ns rate_mhz angle_deg resolution_cdeg type_text
         port_text last_error_text counters pose);
     let golden = include_str!("../../tests/vectors/v2/layouts.txt");
     assert_eq!(text, golden);

@@ -42,6 +42,7 @@ fn header_layout() {
     assert_eq!(offset_of!(Header, quality), 49);
     assert_eq!(offset_of!(Header, flags), 50);
     assert_eq!(offset_of!(Header, period_us), 52);
+    assert_eq!((offset_of!(Header, flags), offset_of!(Header, family)), (50, 51));
     assert_eq!(offset_of!(Header, hub_pid), 56);
     assert_eq!(offset_of!(Header, reasons), 60);
     assert_eq!(offset_of!(Header, hub_time), 61);
@@ -58,7 +59,8 @@ fn header_bytes() {
         boot: 0x99AA_BBCC_DDEE_FF00,
         sensor: 5,
         quality: 1,
-        flags: 0x0102,
+        flags: 2,
+        family: 1,
         period_us: 26_640,
         hub_pid: 7,
         reasons: 0x12,
@@ -227,7 +229,7 @@ fn status_layout() {
     assert_eq!(offset_of!(Status, state), 0);
     assert_eq!(offset_of!(Status, mode), 1);
     assert_eq!(offset_of!(Status, unit_mm), 2);
-    assert_eq!(offset_of!(Status, reserved), 3);
+    assert_eq!(offset_of!(Status, family), 3);
     assert_eq!(offset_of!(Status, baud), 4);
     assert_eq!(offset_of!(Status, since_ns), 8);
     assert_eq!(offset_of!(Status, rate_mhz), 16);
@@ -249,6 +251,7 @@ fn status_bytes() {
         state: State::Streaming as u8,
         mode: 1,
         unit_mm: 1,
+        family: 1,
         baud: 500_000,
         since_ns: 9,
         rate_mhz: 37_538,
@@ -266,7 +269,7 @@ fn status_bytes() {
     let expected = golden(
         592,
         &[
-            (0, &[4, 1, 1, 0, 0x20, 0xA1, 0x07, 0]),
+            (0, &[4, 1, 1, 1, 0x20, 0xA1, 0x07, 0]),
             (8, &[9]),
             (16, &[0xA2, 0x92, 0, 0, 180, 0, 50, 0]),
             (24, b"LMS200-30106"),

@@ -44,6 +44,7 @@ pub(super) fn processors(data: &[u8]) {
     let max_gap = u16::from(bytes.u8());
     let mut finder = marks::MarkDetector::new(marks::Settings {
         i_min: bytes.u8(),
+        level: is(2).then(|| bytes.u16()),
         max_range_step_mm: bytes.u16(),
         max_gap,
     });

@@ -32,11 +32,11 @@ fn processes(domain: &str) -> Vec<String> {
     lines.filter(|line| line.split('\0').any(|word| word == domain)).collect()
 }
 
-/// Whether the two last lines say that nothing was lost of a stream that lived.
-fn nothing_was_lost(outcome: &Outcome) {
+/// Whether the last lines, one for each of `names`, say that nothing was lost of a stream that lived.
+fn nothing_was_lost_of(outcome: &Outcome, names: &[&str]) {
     let lines = outcome.of_class("summary");
     let sensors: Vec<_> = lines.iter().map(|line| line["sensor"].as_str().unwrap_or_default()).collect();
-    assert_eq!(sensors, ["front", "rear"], "{outcome}");
+    assert_eq!(sensors, names, "{outcome}");
     for line in &lines {
         assert_eq!((&line["class"], &line["state"]), (&"summary".into(), &"streaming".into()), "{outcome}");
         assert_eq!((number(line, "lost"), number(line, "eeprom_writes")), (0, 0), "{outcome}");
@@ -44,6 +44,28 @@ fn nothing_was_lost(outcome: &Outcome) {
         assert!(sent >= 20 && received >= sent, "{outcome}");
         assert!(line["nearest_mm"].is_u64() && line["hub_cpu_percent"].is_f64(), "{outcome}");
     }
+}
+
+fn nothing_was_lost(outcome: &Outcome) {
+    nothing_was_lost_of(outcome, &["front", "rear"]);
+}
+
+#[test]
+fn of_another_family_or_of_all() {
+    for (family, names) in [
+        ("ld", &["front", "rear"][..]),
+        ("rplidar", &["front", "rear"]),
+        ("mixed", &["front", "side", "top"]),
+    ] {
+        let outcome = demo(&["--headless", "--for", "2s", "--json", "--family", family], Program::wait);
+        assert_eq!(outcome.code, Some(0), "{family}: {outcome}");
+        nothing_was_lost_of(&outcome, names);
+        // Turns, and not packets.
+        let last = &outcome.of_class("summary")[1];
+        assert!(last["hz"].as_f64().is_some_and(|hz| (5.0..12.0).contains(&hz)), "{last}");
+    }
+    let outcome = demo(&["--family", "sick"], Program::wait);
+    assert!(outcome.code == Some(2) && outcome.errors.contains("lms, ld, rplidar, mixed"), "{outcome}");
 }
 
 #[test]

@@ -55,9 +55,19 @@ fn a_scanner_that_turns_is_published_like_any_other() {
     zones.await_line("a verdict", |line| is_class("zones")(line) && line["verdict"] != "unknown");
     raw.await_bytes(100 * PACKET);
     let info = env.await_info("front", |info| info["hz"].as_f64().is_some_and(|hz| hz > 8.0));
-    let facts = ["state", "type", "baud", "unit_mm", "angle_deg", "step_deg", "last_error"];
-    let expected: [Value; 7] =
-        ["streaming".into(), "LD19".into(), 230_400.into(), 1.into(), 360.into(), 0.8.into(), "".into()];
+    let facts =
+        ["state", "family", "model", "type", "baud", "unit_mm", "angle_deg", "step_deg", "last_error"];
+    let expected: [Value; 9] = [
+        "streaming".into(),
+        "ld".into(),
+        "ld19".into(),
+        "LD19".into(),
+        230_400.into(),
+        1.into(),
+        360.into(),
+        0.8.into(),
+        "".into(),
+    ];
     assert_eq!(facts.map(|key| info[key].clone()), expected, "{info}");
 
     let scans = scans.end(INT).of_class("scan");
@@ -118,4 +128,96 @@ fn a_scanner_that_goes_and_comes_back() {
     // One hub, one life: the numbers go on.
     sequence(&consumer.end(INT).of_class("scan"), "topic_seq");
     assert_eq!(hub.end(TERM).code, Some(0));
+}
+
+#[test]
+fn marks_need_a_level() {
+    let env = TestEnv::new();
+    let _simulator = ld19(&env);
+    let without = hub(&env, &["model=ld19"]);
+    let marks = env.echo(&["front/marks"]).await_line("marks", is_class("marks"));
+    assert_eq!((&marks["available"], &marks["marks"]), (&false.into(), &Value::Array(Vec::new())), "{marks}");
+    let said = env.run(&["echo", "front/marks", "-n", "1"]);
+    assert!(String::from_utf8_lossy(&said.out).contains("set link.NAME.marks.level"), "{said}");
+    assert_eq!(without.end(TERM).code, Some(0));
+    // Reflectors of the room have 255 of 255.
+    let _hub = hub(&env, &["model=ld19", "marks.level=250"]);
+    let is_found = |line: &Value| line["marks"].as_array().is_some_and(|marks| !marks.is_empty());
+    let marks = env.echo(&["front/marks"]).await_line("marks", is_found);
+    assert_eq!(marks["available"], true, "{marks}");
+    assert!(marks["marks"][0]["peak"].as_u64().is_some_and(|peak| peak >= 250), "{marks}");
+}
+
+#[test]
+fn probe_hears_what_it_is_and_leaves_no_trace() {
+    let env = TestEnv::new();
+    let models = [("front", "ld19", 230_400, 4_500.0), ("side", "stl27l", 921_600, 21_600.0)];
+    for (name, model, rate, points) in models {
+        let model_of = format!("--model={model}");
+        let simulator = env.simulator(&[name], &["--family=ld", &model_of, "--world=room", "--seed=7"]);
+        let outcome = env.run(&["probe", &env.word(name), "--json"]);
+        let [found] = &outcome.lines()[..] else { panic!("{outcome}") };
+        assert_eq!(
+            (outcome.code, &found["class"], &found["family"]),
+            (Some(0), &"probe".into(), &"ld".into())
+        );
+        assert_eq!((found["model"].as_str(), number(found, "baud")), (Some(model), rate), "{found}");
+        let of = |key: &str| found[key].as_f64().unwrap_or_else(|| panic!("no {key}: {found}"));
+        assert!((of("points_per_second") / points - 1.0).abs() < 0.02, "{found}");
+        assert!((of("turns_per_second") / 10.0 - 1.0).abs() < 0.05 && of("damaged") == 0.0, "{found}");
+        assert!(number(found, "packets") > 20 && found["trouble"].is_null(), "{found}");
+        assert_eq!(outcome.errors, "", "no progress without a terminal");
+        let text = env.run(&["probe", &env.word(name)]).to_string();
+        for word in ["family", "ld", model, "Bd", "turns"] {
+            assert!(text.contains(word), "{word}: {text}");
+        }
+        assert_eq!(simulator.end(TERM).code, Some(0));
+    }
+}
+
+#[test]
+fn doctor_judges_what_it_hears() {
+    let env = TestEnv::new();
+    let port = env.word("front");
+    let check = |arguments: &[&str], code: i32| {
+        let outcome = env.run(&[&["doctor", "--json", "--no-system-config"], arguments].concat());
+        assert_eq!(outcome.code, Some(code), "{outcome}");
+        let found = outcome.of_class("check");
+        move |name: &str| {
+            let of = found.iter().find(|line| line["name"] == name && !line["port"].is_null());
+            let of = of.unwrap_or_else(|| panic!("no {name}: {outcome}"));
+            let words = format!("{} {}", of["finding"].as_str().unwrap(), of["remedy"].as_str().unwrap());
+            (of["state"].as_str().unwrap().to_owned(), words)
+        }
+    };
+    let simulator = ld19(&env);
+    let of_port = check(&[&port], 0);
+    for name in ["access", "rate", "sensor", "settings", "health", "line-loss"] {
+        assert_eq!(of_port(name).0, "ok", "{}", of_port(name).1);
+    }
+    assert!(of_port("sensor").1.contains("LD19 at 230400 Bd, family ld"), "{}", of_port("sensor").1);
+    assert!(of_port("health").1.contains("turns a second"));
+    let link = env.link("front");
+    let wrong = check(&[&link, "--set=link.front.family=ld", "--set=link.front.model=stl27l"], 0);
+    assert_eq!(wrong("settings").0, "warning");
+    assert!(wrong("settings").1.contains("link.front.model=ld19"), "{}", wrong("settings").1);
+    let hub = hub(&env, &[]);
+    env.await_info("front", |info| info["state"] == "streaming");
+    let of_hub = check(&["front"], 0);
+    assert!(of_hub("sensor").1.contains("streaming, family ld, LD19, 230400 Bd"), "{}", of_hub("sensor").1);
+    assert_eq!((hub.end(TERM).code, simulator.end(TERM).code), (Some(0), Some(0)));
+
+    let _lossy = env.simulator(&["front"], &["--family=ld", "--world=room", "--fault=loss=0.02,burst=3"]);
+    let lossy = check(&[&port], 0);
+    assert_eq!(lossy("line-loss").0, "warning");
+    assert!(lossy("line-loss").1.contains("bytes damaged"), "{}", lossy("line-loss").1);
+    let _mute = env.simulator(&["mute"], &["--fault=mute=1"]);
+    let link = env.link("mute");
+    let mute = check(&[&link, "--set=link.mute.family=ld"], 5);
+    assert_eq!(mute("sensor").0, "failed");
+    assert!(
+        mute("sensor").1.contains("no packets of family ld at 230400 or 921600 Bd; no byte"),
+        "{}",
+        mute("sensor").1
+    );
 }

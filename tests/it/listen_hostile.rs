@@ -114,6 +114,7 @@ fn sealed_nonsense_neither_ends_it_nor_fills_memory() {
                 sequence: random.u32(..),
                 stamp_ns: random.u64(..),
                 sensor: random.u8(..),
+                family: random.u8(..4),
                 revision: random.u16(..3),
                 counter: random.u32(..),
             };

@@ -14,8 +14,9 @@ fn a_sensor_tells_of_itself_and_is_left_as_it_was() {
         assert_eq!(outcome.code, Some(0), "{outcome}");
         let [found] = &outcome.lines()[..] else { panic!("{outcome}") };
         let text = String::from_utf8_lossy(&outcome.out);
-        let begin =
-            format!(r#"{{"class":"probe","port":"{port}","baud":19200,"type":"LMS291","number":"301063""#);
+        let begin = format!(
+            r#"{{"class":"probe","port":"{port}","family":"lms","model":"lms291","baud":19200,"type":"LMS291","number":"301063""#
+        );
         assert!(text.starts_with(&begin), "{text}");
         assert_eq!((number(found, "operating_mode"), number(found, "unit_mm")), (0x25, 10), "{found}");
         assert_eq!(

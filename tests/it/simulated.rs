@@ -4,7 +4,7 @@ use std::io::{Read, Write};
 use std::thread::sleep;
 use std::time::Duration;
 
-use crate::testkit::{TERM, TestEnv, number, open_line, until};
+use crate::testkit::{TERM, TestEnv, is_class, number, open_line, until};
 
 #[test]
 fn a_sensor_with_a_past_tells_it_when_it_is_asked() {
@@ -72,12 +72,93 @@ fn a_scanner_that_never_listens_speaks_at_once_and_others_are_refused() {
         assert_eq!(outcome.code, Some(78), "{outcome}");
         assert!(outcome.errors.contains(says), "{outcome}");
     };
-    for family in ["scip", "cola", "rplidar"] {
-        refused(&[&format!("--family={family}")], "one of: lms, ld");
+    for family in ["scip", "cola"] {
+        refused(&[&format!("--family={family}")], "one of: lms, ld, rplidar");
     }
+    refused(&["--family=rplidar", "--model=a4"], "one of: a1, a2m8, a2m12, a3, s1, s2, s3, c1");
+    refused(
+        &["--family=rplidar", "--mode=dense"],
+        "one of: standard, express, boost, sensitivity, stability",
+    );
+    refused(&["--family=rplidar", "--replay=none"], "has no recording to choose");
+    refused(&["--family=ld", "--mode=boost"], "one way to measure");
     refused(&["--family=ld", "--model=ld20"], "one of: ld06, ld19, stl19p, stl27l, ld14p");
     refused(&["--model=ld19"], "--type says which LMS");
     refused(&["--family=ld", "--unit=cm"], "has no unit to choose");
+}
+
+#[test]
+fn an_rplidar_answers_and_streams_in_the_mode_that_it_was_asked_for() {
+    let env = TestEnv::new();
+    let flags = ["--family=rplidar", "--model=a3", "--mode=Stability", "--state=streaming"];
+    let simulator = env.simulator(&["front"], &flags);
+    let mut port = open_line(&env.path("front"), 256_000);
+    let mut bytes: Vec<u8> = Vec::new();
+    let mut read = |what: &str, port: &mut std::fs::File, is_there: &dyn Fn(&[u8]) -> bool| {
+        bytes.clear();
+        until(what, || {
+            let mut buffer = [0; 4_096];
+            let len = port.read(&mut buffer).unwrap_or(0);
+            bytes.extend(&buffer[..len]);
+            is_there(&bytes)
+        });
+    };
+    let is_packet = |packet: &[u8]| packet[0] >> 4 == 0xA && packet[1] >> 4 == 5 && packet[132] >> 4 == 0xA;
+    read("a stream", &mut port, &|bytes| bytes.windows(133).any(is_packet));
+    port.write_all(&[0xA5, 0x25]).expect("room");
+    // Which it recommends, 7Ch: the one with this number.
+    port.write_all(&[0xA5, 0x84, 4, 0x7C, 0, 0, 0, 0xA5 ^ 0x84 ^ 4 ^ 0x7C]).expect("room");
+    let answer = [0xA5, 0x5A, 6, 0, 0, 0, 0x20, 0x7C, 0, 0, 0, 4, 0];
+    read("an answer", &mut port, &|bytes| bytes.ends_with(&answer));
+    assert_eq!(simulator.end(TERM).code, Some(0));
+    assert_eq!(env.simulated("front").1, 0);
+}
+
+#[test]
+fn a_hub_reads_sensors_behind_tcp() {
+    let env = TestEnv::new();
+    let server = |flags: &[&str]| {
+        let mut simulator = env.start(&[&["simulate", "--json", "--tcp=127.0.0.1:0"], flags].concat());
+        let ready = simulator.await_line("ready", is_class("ready"));
+        let [port] = &ready["ports"].as_array().expect("ports")[..] else { panic!("{ready}") };
+        assert!(port["pty"].is_null(), "{ready}");
+        (simulator, port["port"].as_str().expect("a port").to_owned())
+    };
+    let (lms, front) = server(&["--baud=38400"]);
+    let (ld, side) = server(&["--family=ld", "--model=ld19"]);
+    assert!(front.starts_with("tcp:127.0.0.1:") && front != side);
+    let family = ["--set=link.front.baud=38400", "--set=link.side.family=ld"];
+    let links = [format!("--link=front={front}"), format!("--link=side={side}")];
+    let hub = env.hub(&[&links.each_ref().map(String::as_str)[..], &family].concat());
+    for sensor in ["front", "side"] {
+        let info = env.await_info(sensor, |info| info["state"] == "streaming");
+        assert!(info["port"] == front.as_str() || info["port"] == side.as_str(), "{info}");
+    }
+    for program in [hub, lms, ld] {
+        assert_eq!(program.end(TERM).code, Some(0));
+    }
+}
+
+#[test]
+fn packets_that_a_hub_recorded_are_sent_again() {
+    let env = TestEnv::new();
+    let simulator = env.simulator(&["front"], &["--family=ld", "--model=ld19"]);
+    let hub = env.hub(&[&env.link("front"), "--set=link.front.family=ld"]);
+    env.await_info("front", |info| info["state"] == "streaming");
+    let file = env.word("day.mcap");
+    let outcome = env.run(&["record", "-o", &file, "--for=1s"]);
+    assert_eq!(outcome.code, Some(0), "{outcome}");
+    for program in [hub, simulator] {
+        assert_eq!(program.end(TERM).code, Some(0));
+    }
+    let sent: Vec<_> = env.truth("front").into_iter().map(|sent| sent.hash).collect();
+    let again = env.simulator(&["again"], &["--family=ld", "--replay", &file, "--sensor=front"]);
+    until("packets are sent again", || env.truth("again").len() > 100);
+    assert_eq!(again.end(TERM).code, Some(0));
+    let replayed: Vec<_> = env.truth("again").into_iter().map(|sent| sent.hash).collect();
+    // In their order, and nothing else.
+    let mut rest = sent.iter();
+    assert!(replayed.iter().all(|packet| rest.any(|sent| sent == packet)), "{} packets", replayed.len());
 }
 
 /// A host that stopped in the middle of a request and finds no answer is told why.

@@ -4,6 +4,7 @@
 mod between;
 mod crates;
 mod eeprom;
+mod families;
 mod sources;
 mod tree;
 mod within;

@@ -3,10 +3,10 @@
 use std::net::{Ipv4Addr, UdpSocket};
 
 use rustix::net::sockopt::set_ip_multicast_if;
-use schema::Topic;
 use schema::datagram::{
-    Announce, Announced, GROUPS, HEAD, Head, LanFlags, MTU_ETHERNET, PORT, Packed, group,
+    Announce, Announced, GROUPS, HEAD, Head, LanFlags, MTU_ETHERNET, PART_LONGEST, PORT, Packed, group,
 };
+use schema::{Family, Topic};
 
 /// One sensor of one gateway.
 pub(crate) struct Sender {
@@ -14,6 +14,8 @@ pub(crate) struct Sender {
     pub(crate) hub: u64,
     pub(crate) epoch: u32,
     pub(crate) sensor: u8,
+    /// Of which family it is.
+    pub(crate) family: Family,
     pub(crate) name: String,
     pub(crate) boot: u64,
     /// By topic's number: that of the next datagram.
@@ -29,7 +31,8 @@ impl Sender {
         let socket = UdpSocket::bind("127.0.0.1:0").expect("a port");
         set_ip_multicast_if(&socket, &Ipv4Addr::LOCALHOST).expect("the loopback has an address");
         let (boot, next, counter, stamp_ns) = (0xb007, [0; 9], 0, wall_ns());
-        Sender { socket, hub, epoch, sensor, name: name.to_owned(), boot, next, counter, stamp_ns }
+        let (name, family) = (name.to_owned(), Family::Lms);
+        Sender { socket, hub, epoch, sensor, family, name, boot, next, counter, stamp_ns }
     }
 
     /// The next datagram of `topic`.
@@ -46,10 +49,18 @@ impl Sender {
         self.seal(Topic::Telegram.number(), &mut buffer, bytes.len())
     }
 
-    /// Sends the next datagram of `topic`.
+    /// Sends the next sample of `topic`, in parts if it is longer than a datagram.
     pub(crate) fn send(&mut self, topic: Topic, payload: &(impl Packed + ?Sized)) {
-        let datagram = self.make(topic, payload);
-        self.throw(topic, &datagram);
+        let mut packed = vec![0; 100_000];
+        let len = payload.pack(&mut packed).expect("it fits");
+        let parts = len.div_ceil(PART_LONGEST).max(1);
+        let head = self.head(topic.number());
+        for (part, payload) in packed[..len].chunks(PART_LONGEST).enumerate() {
+            let mut buffer = [0; MTU_ETHERNET];
+            buffer[HEAD..HEAD + payload.len()].copy_from_slice(payload);
+            let head = Head { part: part as u8, parts: parts as u8, ..head };
+            self.throw(topic, head.seal(&mut buffer, payload.len()).expect("it fits"));
+        }
     }
 
     /// Sends these bytes to the group of `topic`.
@@ -92,10 +103,16 @@ impl Sender {
     }
 
     fn seal(&mut self, topic: u8, buffer: &mut [u8], len: usize) -> Vec<u8> {
+        self.head(topic).seal(buffer, len).expect("it fits").to_vec()
+    }
+
+    /// The header of the next sample of the topic with this number.
+    fn head(&mut self, topic: u8) -> Head {
         let next = &mut self.next[usize::from(topic)];
         let head = Head {
             part: 0,
             parts: 1,
+            family: self.family as u8,
             topic,
             flags: LanFlags::SIMULATED,
             hub: self.hub,
@@ -107,7 +124,7 @@ impl Sender {
             counter: self.counter,
         };
         *next = next.wrapping_add(1);
-        head.seal(buffer, len).expect("it fits").to_vec()
+        head
     }
 }
 

@@ -163,13 +163,27 @@ impl SensorPublisher {
     /// [`Kind::DomainHeld`](schema::Kind) if this process publishes it already; [`Kind::Short`](schema::Kind) if memory or
     /// descriptors are short; [`Kind::Failed`](schema::Kind) if the topic is there with another layout.
     pub fn topic<P: Payload + ?Sized>(&self) -> Result<Publication<P>, Failure> {
-        let Membership { domain, node, limits, .. } = &*self.0.membership;
+        self.topic_for(self.limits())
+    }
+
+    /// Makes the topic as [`topic`](Self::topic), for samples as long as `limits` say.
+    ///
+    /// # Errors
+    ///
+    /// As [`topic`](Self::topic).
+    pub fn topic_for<P: Payload + ?Sized>(&self, limits: &TopicLimits) -> Result<Publication<P>, Failure> {
+        let Membership { domain, node, .. } = &*self.0.membership;
         check_topics(&[P::TOPIC], limits)?;
         check_descriptors(SERVICE_DESCRIPTORS)?;
         let topic = TopicPublisher::new(node, &self.0.name, limits)?;
         // To write into what has no memory behind it would end the process.
         allocate(domain)?;
         Ok(Publication { topic, sensor: SensorPublisher(self.0.clone()) })
+    }
+
+    /// Returns what the topics of the session are made for.
+    pub fn limits(&self) -> &TopicLimits {
+        &self.0.membership.limits
     }
 
     /// Wakes the consumers that got samples of any topic of this name since the last call, for `why`. Once is enough for
@@ -271,7 +285,7 @@ impl<P: Payload + ?Sized> Publication<P> {
         len: usize,
         fill: impl FnOnce(&mut P),
     ) -> Result<usize, Failure> {
-        self.topic.send_len(header, len, fill)
+        self.topic.send_len(header, len, fill).inspect(|&reached| self.sensor.note(P::TOPIC, reached))
     }
 }
 

@@ -6,8 +6,9 @@ use std::time::Duration;
 
 use fake::{FakeHub, Place, until};
 use scanhub_client::{Kind, Marks, PublishSession, Scan, Subscription, Topic, Verdict, Wait, Wake, Zones};
+use schema::ipc::{self, Bell};
 use schema::limits::TopicLimits;
-use schema::publisher;
+use schema::{ScanHead, publisher};
 
 fn marks(count: u8) -> Marks {
     Marks { count, ..Marks::default() }
@@ -151,4 +152,29 @@ fn one_process_publishes_beside_the_hub_and_no_name_of_its_sensors() {
     assert!(scans.try_next().unwrap().is_none());
     hub.front().scan(&[1000]);
     assert_eq!(scans.next().unwrap().unwrap().beams(), 1);
+}
+
+#[test]
+fn samples_of_any_length_ring_the_bell_of_those_who_sleep_at_it() {
+    let place = Place::new();
+    let session = PublishSession::open(&place.domain, &[Topic::Scan], TopicLimits::default()).unwrap();
+    let sensor = session.sensor("tracker.near").unwrap();
+    let mut scans = sensor.topic_for::<Scan>(&TopicLimits { beams: 2_160, ..*sensor.limits() }).unwrap();
+    let mut followed = Subscription::<Scan>::in_domain(place.places(), "tracker.near")
+        .unwrap()
+        .timeout(Duration::from_secs(10));
+    assert!(followed.try_next().unwrap().is_none());
+    let node = ipc::client_node(&place.domain).unwrap();
+    let bell = Bell::open(&node, "tracker.near").unwrap().expect("the sensor has one");
+    for (number, beams) in [1, 401, 2_160].into_iter().enumerate() {
+        let scan = Scan::of(ScanHead::default(), &vec![7; beams]);
+        let before = bell.rung(Topic::Scan.row().ring);
+        scans.send_len(scan.bytes().len(), |sample| assert!(sample.copy_from(scan.bytes()))).unwrap();
+        assert_eq!(bell.rung(Topic::Scan.row().ring), before.wrapping_add(1));
+        let sample = followed.next().unwrap().expect("it was sent");
+        assert_eq!((sample.beams(), sample.header().topic_seq), (beams, number as u64));
+    }
+    let longer = Scan::of(ScanHead::default(), &[7; 4_000]);
+    let refused = scans.send_len(longer.bytes().len(), |_| unreachable!("there is no memory for it"));
+    assert_eq!(refused.unwrap_err().kind, Kind::Short);
 }

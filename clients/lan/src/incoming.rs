@@ -2,15 +2,19 @@
 //! of it. Refuses to know sockets and clocks, and what becomes of samples.
 
 mod duplicate_gateways;
+mod guard;
 mod parts;
 mod peer_table;
 mod remote;
 
+use std::collections::HashMap;
+
 use schema::Topic;
 use schema::datagram::{Announce, Datagram, DatagramError, Fresh, Head, StreamStats};
 
-use crate::Stamp;
+use crate::{Key, Stamp};
 use duplicate_gateways::DuplicateGateways;
+use guard::Guard;
 use parts::Parts;
 pub use peer_table::PeerTable;
 pub use remote::Remote;
@@ -21,6 +25,8 @@ pub struct Incoming {
     peers: PeerTable,
     duplicates: DuplicateGateways,
     parts: Parts,
+    /// Nothing is believed without it, if there is one.
+    guard: Option<Guard>,
 }
 
 /// What a datagram is to who received it.
@@ -31,6 +37,12 @@ pub enum Arrived<'a> {
         why: DatagramError,
         /// The gateway's number, if two are known to send under it.
         shared: Option<u64>,
+    },
+    /// It is the first announcement of a sensor, and has the key, but is stamped by a clock that is so much behind ours, in
+    /// ns, or was recorded so long ago; it was refused.
+    Untimely {
+        /// How much.
+        behind_ns: i64,
     },
     /// It is a part of a sample that is not whole yet.
     Part,
@@ -89,7 +101,23 @@ impl Incoming {
             peers: PeerTable::default(),
             duplicates: DuplicateGateways::default(),
             parts: Parts::default(),
+            guard: None,
         }
+    }
+
+    /// Makes an end that believes only what was sent with `key`, and is not older than it can be: `epochs` has the greatest
+    /// epoch of each gateway that was heard before, see [`take_epochs`](Incoming::take_epochs).
+    pub fn with_key(topics: &[Topic], key: Key, epochs: HashMap<u64, u32>) -> Incoming {
+        Incoming {
+            stats: Box::new(StreamStats::new(topics).only_announced()),
+            guard: Some(Guard::new(key, epochs)),
+            ..Incoming::new(topics)
+        }
+    }
+
+    /// Returns the greatest epochs of all gateways that had the key, to be kept, if one of them is new since the last call.
+    pub fn take_epochs(&mut self) -> Option<&HashMap<u64, u32>> {
+        self.guard.as_mut()?.take_changed()
     }
 
     /// Takes `bytes`, a whole datagram that came `from` a sender at `arrival`. A sender is any number that others do not
@@ -105,6 +133,17 @@ impl Incoming {
             Ok(datagram) => datagram,
             Err(why) => return Arrived::Refused { why, shared: None },
         };
+        if let Some(guard) = &self.guard
+            && let Err(why) = guard.check(bytes, &datagram, &self.stats, arrival.wall_ns)
+        {
+            self.stats.refuse(why);
+            if why == DatagramError::Untimely && datagram.head.topic == Announce::NUMBER {
+                return Arrived::Untimely {
+                    behind_ns: arrival.wall_ns.wrapping_sub(datagram.head.stamp_ns) as i64,
+                };
+            }
+            return Arrived::Refused { why, shared: None };
+        }
         if datagram.head.parts > 1 {
             let Some(head) = self.parts.take(&datagram, from, whole) else { return Arrived::Part };
             datagram = Datagram { head, payload: whole, mac: None };
@@ -112,6 +151,9 @@ impl Incoming {
         match self.stats.take(&datagram, from, arrival.monotonic_ns) {
             Ok(Fresh::Duplicate) => Arrived::Known,
             Ok(fresh) => {
+                if let Some(guard) = &mut self.guard {
+                    guard.note(datagram.head.hub, datagram.head.epoch);
+                }
                 self.duplicates.taken(datagram.head.hub);
                 self.accepted(datagram, fresh == Fresh::Late, arrival)
             }
@@ -147,8 +189,13 @@ impl Incoming {
         let sensor = life.sensor(head.sensor);
         let missed = if late { 0 } else { sensor.advance(head.topic, head.sequence) };
         let announced = sensor.announced;
+        // What follows it is a later revision's.
+        let telegram = datagram.telegram().filter(|_| topic == Topic::Telegram);
+        let datagram =
+            Datagram { payload: telegram.map_or(datagram.payload, |telegram| telegram.bytes), ..datagram };
         let boot = announced.map_or(0, |announced| announced.boot);
-        let remote = Remote { topic, datagram, boot, arrival_ns: arrival.monotonic_ns, age_ns, late };
+        let (arrival_ns, authenticated) = (arrival.monotonic_ns, self.guard.is_some());
+        let remote = Remote { topic, datagram, boot, arrival_ns, age_ns, late, authenticated };
         Arrived::Sample(RemoteSample { remote, announced, begins, missed })
     }
 

@@ -4,8 +4,10 @@
 #![forbid(unsafe_code)]
 
 pub mod incoming;
+mod key;
 pub mod outgoing;
 pub mod republish;
 mod stamp;
 
+pub use key::Key;
 pub use stamp::Stamp;

@@ -46,7 +46,7 @@ impl Outgoing {
 
     /// Returns whether samples of this topic are wanted: they go out, or an announcement says what they say.
     pub fn wants(&self, sensor: usize, topic: Topic) -> bool {
-        let is_announced = self.numbering.form() == Form::Sealed;
+        let is_announced = self.numbering.announces();
         self.sensors[sensor].sends(topic) || is_announced && topic == Topic::Status
     }
 

@@ -46,7 +46,7 @@ pub struct LeftOut {
     pub shortage: u64,
 }
 
-/// The most sensors: each takes up to 6 MB of shared memory, and whoever can send to the network can announce some.
+/// The most sensors: each takes up to 20 MB of shared memory, and whoever can send to the network can announce some.
 pub const SENSORS: usize = 16;
 
 /// To put out a sensor and make the topics of another takes milliseconds, and whoever can send can ask for it: so long it

@@ -13,30 +13,41 @@ from .sample import Sample, view
 
 
 class Telegram(Sample):
-    """A telegram, replies too."""
+    """What a scanner sent: of an LMS a telegram, replies too; of other families whole packets that arrived together."""
 
     topic = "telegram"
     struct = element = ctypes.c_uint8
 
     @property
+    def family(self) -> str | None:
+        """What the sensor speaks, such as `lms`; None if it is not known here."""
+        return named_family(self._header.family)
+
+    @property
     def data(self) -> NDArray[np.uint8]:
-        """Its bytes, STX to CRC: a view."""
+        """Its bytes, of an LMS STX to CRC: a view."""
         return np.frombuffer(memoryview(self._data).toreadonly(), np.uint8)
 
     @property
-    def address(self) -> int:
-        """Of the sender, 80h added."""
-        return int(self.data[1])
+    def packets(self) -> int | None:
+        """How many packets they are; None of an LMS, and where it is not known here."""
+        length = _PACKET.get(self.family)
+        return len(self.data) // length if length else None
 
     @property
-    def length(self) -> int:
-        """From command to status, as the telegram says."""
-        return int(self.data[2]) | int(self.data[3]) << 8
+    def address(self) -> int | None:
+        """Of the sender, 80h added; None of other families than LMS."""
+        return int(self.data[1]) if self.family == "lms" else None
 
     @property
-    def command(self) -> int:
-        """What it is: B0h measured values."""
-        return int(self.data[4])
+    def length(self) -> int | None:
+        """From command to status, as the telegram says; None of other families than LMS."""
+        return int(self.data[2]) | int(self.data[3]) << 8 if self.family == "lms" else None
+
+    @property
+    def command(self) -> int | None:
+        """What it is: B0h measured values; None of other families than LMS."""
+        return int(self.data[4]) if self.family == "lms" else None
 
 
 class Scan(Sample):
@@ -50,8 +61,7 @@ class Scan(Sample):
     @property
     def family(self) -> str | None:
         """What the sensor speaks, such as `lms`; None if it is not known here."""
-        number = self._fields.family
-        return FAMILIES[number] if number < len(FAMILIES) else None
+        return named_family(self._fields.family)
 
     @property
     def count(self) -> int:
@@ -159,9 +169,13 @@ class Scan(Sample):
         return view(self._data, kind, offset, count)
 
     def _code(self, value: int) -> str:
-        if value != _NOT_MEASURED and self._fields.family == FAMILIES.index("lms"):
+        if value != _NOT_MEASURED and self.family == "lms":
             return _OF_LMS.get(self._fields.no_return - value, "overflow")
         return _CODES[min(_NOT_MEASURED - value, len(_CODES) - 1)]
+
+
+def named_family(number: int) -> str | None:
+    return FAMILIES[number] if number < len(FAMILIES) else None
 
 
 def _width(contents: int) -> int:
@@ -169,8 +183,10 @@ def _width(contents: int) -> int:
     return sum(size for bit, size in _SIZES.items() if contents & bit)
 
 
-FAMILIES = ("lms", "ld")
+FAMILIES = ("lms", "ld", "rplidar")
 """By their numbers."""
+_PACKET = {"ld": 47}
+"""Bytes of a packet, of families that send packets."""
 _HEAD = ctypes.sizeof(layout.ScanHead)
 _UPPER, _WIDE, _ANGLES, _RANGES = 1, 2, 4, 0x80
 _SIZES = {_UPPER: 1, _WIDE: 2, _ANGLES: 4, _RANGES: 2}

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import re
 from typing import NamedTuple
 
 from . import layout
 from .sample import Sample
+from .scan import named_family
 
 
 class Pose(NamedTuple):
@@ -42,6 +44,17 @@ class Status(Sample):
     def mode(self) -> int | None:
         """The measuring mode."""
         return None if self._fields.mode == 0xFF else self._fields.mode
+
+    @property
+    def family(self) -> str | None:
+        """What the scanner speaks, such as `lms`; None if it is not known here."""
+        return named_family(self._fields.family)
+
+    @property
+    def model(self) -> str | None:
+        """The scanner's model in lower case: the first word of what it calls itself."""
+        word = re.split(r"[;\s]", self.type, maxsplit=1)[0]
+        return word.lower() or None
 
     @property
     def unit_mm(self) -> int | None:

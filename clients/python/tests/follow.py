@@ -31,6 +31,10 @@ def flags(sample: scanhub.Sample) -> dict:
 
 
 def telegram(sample: scanhub.Telegram) -> dict:
+    if sample.family != "lms":
+        said = {"family": sample.family, "kind": "data", "checked": True, "packets": sample.packets}
+        assert sample.address is sample.command is sample.length is None
+        return {**said, "length": len(sample.data), "data": sample.data.tobytes().hex()}
     fields = ("address", "command", "length")
     return {**{name: getattr(sample, name) for name in fields}, "data": sample.data.tobytes().hex()}
 
@@ -80,7 +84,7 @@ def background(sample: scanhub.Background) -> dict:
 
 
 def status(sample: scanhub.Status) -> dict:
-    names = ("state", "baud", "mode", "type", "unit_mm", "angle_deg", "step_deg", "hz", "port", "since_ns")
+    names = ("state", "family", "model", "baud", "mode", "type", "unit_mm", "angle_deg", "step_deg", "hz", "port", "since_ns")
     said = {name: getattr(sample, name) for name in (*names, "counters", "last_error", "damaged", "lost_on_line")}
     return {**said, "pose": sample.pose._asdict()}
 

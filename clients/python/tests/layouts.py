@@ -100,6 +100,7 @@ def payloads_say_what_they_are() -> None:
 
     of = status.Status("front", Chunk("status"))
     assert (of.state, of.mode, of.unit_mm, of.baud, of.since_ns) == ("streaming", 1, 1, 500_000, 9)
+    assert (of.family, of.model) == ("ld", "lms200-30106")
     assert (of.hz, of.angle_deg, of.step_deg) == (37.538, 180, 0.5)
     assert (of.type, of.port, of.last_error) == ("LMS200-30106", "/dev/ttyUSB0", "none")
     assert of.pose == (0.5, -0.5, 2.0, True)

@@ -13,10 +13,11 @@ mod uplink;
 
 use std::io::Write;
 use std::os::fd::AsFd;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
+use lan::Key;
 use lan::outgoing::{ANNOUNCE_EVERY, Form};
 use scanhub_client::clock;
 use scanhub_client::streams::{GRACE, Session};
@@ -24,6 +25,7 @@ use schema::{Domain, Failure, Kind, check_sensor};
 
 use crate::discovery::Discovery;
 use crate::follow::Notice;
+use crate::key_file;
 use crate::lossy_writer::LossyWriter;
 use crate::names::no_sensor;
 use crate::output::{End, quiet};
@@ -46,6 +48,8 @@ pub struct GatewayOptions {
     pub to: Vec<String>,
     /// Telegrams and nothing else, without a header.
     pub bare: bool,
+    /// The file with the key of which every datagram gets a MAC.
+    pub key_file: Option<PathBuf>,
     /// How many routers pass on what goes to the groups.
     pub ttl: u8,
     /// The background goes out so often, besides when it is a new one.
@@ -72,6 +76,10 @@ impl GatewayOptions {
             let what = "no background is sent where only telegrams are";
             return Err(Failure::new(Kind::Configuration, what, "leave bare or background_every out"));
         }
+        if self.bare && self.key_file.is_some() {
+            let what = "bare telegrams have no room for a MAC";
+            return Err(Failure::new(Kind::Configuration, what, "leave bare or key_file out"));
+        }
         Ok(selection)
     }
 }
@@ -92,7 +100,7 @@ pub enum GatewayLook {
 /// are left out: whoever does not read delays nothing but the end, and that by a second.
 ///
 /// [`Kind::Configuration`] if there is no such interface, neither an interface nor a host is named, a destination is no host,
-/// or a value is not possible; [`Kind::Usage`] if there is no such topic; [`Kind::NoTopic`] if the first hub that is met has no
+/// a value is not possible, or the key file holds no key of this user alone; [`Kind::Usage`] if there is no such topic; [`Kind::NoTopic`] if the first hub that is met has no
 /// such sensor; [`Kind::Short`] if descriptors or memory are; [`Kind::Interrupted`] if `stop` is set before it is known
 /// where the hosts are.
 pub fn gateway(
@@ -111,6 +119,8 @@ pub fn gateway(
 struct Gateway<'a> {
     options: &'a GatewayOptions,
     selection: Selection,
+    /// Of its key, if there is one.
+    key_name: Option<String>,
     session: Session,
     sensors: Vec<Sensor>,
     network: Network,
@@ -135,13 +145,19 @@ impl<'a> Gateway<'a> {
         if options.interface.is_none() && options.to.is_empty() {
             return Err(uplink::nowhere());
         }
+        let key = options.key_file.as_deref().map(key_file::read).transpose()?;
         let interface = options.interface.as_deref().map(Uplink::open).transpose()?;
         let domain = options.places.first().map(Domain::name).unwrap_or_default();
         let now_s = clock::wall_ns() / 1_000_000_000;
         let machine = machine::machine(Path::new(machine::ID));
         let way = interface.as_ref().map_or(HOSTS, Uplink::name);
         let life = Life::begin(&life::directory()?, domain, way, now_s, machine)?;
-        let form = if options.bare { Form::Bare } else { Form::Sealed };
+        let key_name = key.as_ref().map(Key::name);
+        let form = match key {
+            Some(key) => Form::Authenticated(key),
+            None if options.bare => Form::Bare,
+            None => Form::Sealed,
+        };
         let mut network =
             Network::open(life, interface, &options.to, form, options.ttl, options.longest, stop)?;
         let named = selection.named();
@@ -150,6 +166,7 @@ impl<'a> Gateway<'a> {
             options,
             sensors,
             selection,
+            key_name,
             session: Session::new(options.places.clone()),
             network,
             started: Instant::now(),
@@ -162,7 +179,7 @@ impl<'a> Gateway<'a> {
     }
 
     fn run(&mut self, report: &mut Report<'_>, tell: &AtomicBool, stop: &AtomicBool) -> Result<(), End> {
-        report.begin(&self.network, self.options.bare)?;
+        report.begin(&self.network, self.options.bare, self.key_name.as_deref())?;
         if self.network.destinations.groups.as_ref().is_some_and(|groups| !groups.interface.is_up()) {
             report.interface(&self.network)?;
         }

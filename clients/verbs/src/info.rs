@@ -103,6 +103,8 @@ fn properties(sensor: &str, status: &Status, now_ns: u64) -> Vec<Vec<String>> {
     let row = |label: &str, value: String| vec![format!("{label:<WIDTH$}"), value];
     let mut rows = vec![
         row(sensor, format!("{state} for {seconds:.1} s")),
+        row("  family", status.family().map_or("unknown", |family| family.name()).into()),
+        row("  model", status.model().unwrap_or_else(|| "unknown".into())),
         row("  type", known(status.sensor_type().into(), !status.sensor_type().is_empty())),
         row("  port", status.port().into()),
         row("  baud rate", known(format!("{} Bd", status.baud), status.baud != 0)),

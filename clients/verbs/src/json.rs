@@ -76,28 +76,35 @@ pub(crate) fn telegram<'a>(sensor: &'a str, header: &Header, bytes: &'a [u8]) ->
         #[serde(flatten)]
         stamp: Stamp<'a>,
         #[serde(skip_serializing_if = "Option::is_none")]
+        family: Option<&'static str>,
+        #[serde(skip_serializing_if = "Option::is_none")]
         address: Option<u8>,
         #[serde(skip_serializing_if = "Option::is_none")]
         command: Option<u8>,
         #[serde(skip_serializing_if = "Option::is_none")]
         kind: Option<&'static str>,
+        /// `null` where the family has no checksum.
         #[serde(skip_serializing_if = "Option::is_none")]
-        checked: Option<bool>,
+        checked: Option<Option<bool>>,
+        #[serde(skip_serializing_if = "Option::is_none")]
+        packets: Option<usize>,
         length: usize,
         #[serde(serialize_with = "hex")]
         data: &'a [u8],
         #[serde(flatten)]
         flags: Words,
     }
-    let telegram = Telegram(bytes);
+    let telegram = Telegram { family: header.family(), bytes };
+    let (is_lms, facts) = (telegram.is_lms(), telegram.packets());
     Line {
         stamp: Stamp::new("telegram", sensor, header),
-        address: telegram.is_lms().then(|| telegram.address()),
-        command: telegram.is_lms().then(|| telegram.command()),
-        // Of a scanner that only speaks; and what is published had a checksum that was right.
-        kind: (!telegram.is_lms()).then_some("data"),
-        checked: (!telegram.is_lms()).then_some(true),
-        length: if telegram.is_lms() { telegram.length().into() } else { bytes.len() },
+        family: (!is_lms).then(|| header.family().map_or("unknown", Family::name)),
+        address: is_lms.then(|| telegram.address()),
+        command: is_lms.then(|| telegram.command()),
+        kind: facts.map(|facts| facts.kind),
+        checked: facts.map(|facts| facts.checked),
+        packets: facts.map(|facts| facts.packets),
+        length: if is_lms { telegram.length().into() } else { bytes.len() },
         data: bytes,
         flags: Words::of(header),
     }
@@ -172,6 +179,8 @@ pub(crate) fn status<'a>(sensor: &'a str, status: &'a Status) -> impl Serialize 
         class: &'static str,
         sensor: &'a str,
         state: &'static str,
+        family: &'static str,
+        model: Option<String>,
         baud: Option<u32>,
         mode: Option<u8>,
         #[serde(rename = "type")]
@@ -194,6 +203,8 @@ pub(crate) fn status<'a>(sensor: &'a str, status: &'a Status) -> impl Serialize 
         class: "status",
         sensor,
         state: status.state().map_or("unknown", |state| state.name()),
+        family: status.family().map_or("unknown", |family| family.name()),
+        model: status.model(),
         baud: known(status.baud, 0),
         mode: known(status.mode, Status::MODE_UNKNOWN),
         sensor_type: status.sensor_type(),

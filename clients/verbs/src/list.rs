@@ -6,7 +6,7 @@ use std::sync::atomic::AtomicBool;
 
 use scanhub_client::streams::find;
 use schema::ipc::{self, Node, Payload, PortFactory};
-use schema::{Domain, Failure, Pace, State, Status, Topic, publisher};
+use schema::{Domain, Failure, Family, Pace, State, Status, Topic, publisher};
 use serde::{Serialize, Serializer};
 
 use crate::info::statuses;
@@ -36,7 +36,10 @@ pub fn list(options: &ListOptions, out: &mut dyn Write, stop: &AtomicBool) -> Re
         for line in
             lines.iter_mut().filter(|line| line.sensor == sensor && line.topic.row().pace == Pace::Scan)
         {
-            line.hz = status.as_ref().and_then(rate_hz);
+            // Of families other than LMS a telegram is no scan, and how many come is told by `hz`.
+            let is_of_scans =
+                |status: &&Status| line.topic != Topic::Telegram || status.family() == Some(Family::Lms);
+            line.hz = status.as_ref().filter(is_of_scans).and_then(rate_hz);
         }
     }
     let mut output = Output::new(out);

@@ -3,30 +3,37 @@
 
 mod crowd;
 mod duplicate_gateways;
+mod epochs;
 mod multicast_receiver;
 mod names;
 mod publish;
 mod remote;
 mod report;
+mod wanted;
 
+use std::collections::HashMap;
 use std::io::Write;
 use std::net::SocketAddrV4;
+use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-use lan::Stamp;
 use lan::incoming::{Announcement, Arrived, Incoming, RemoteSample};
-use schema::datagram::{Announce, DatagramError, Head, group};
+use lan::{Key, Stamp};
+use schema::datagram::{DatagramError, Head, group};
 use schema::limits::TopicLimits;
-use schema::{Domain, Failure, Kind, Topic};
+use schema::{Domain, Failure, Kind, StateDirectory, Topic};
 
 use self::crowd::{Crowd, Crowding};
+use self::epochs::Epochs;
 use self::multicast_receiver::{LONGEST, MulticastReceiver};
 use self::names::{Hubs, Names};
 use self::publish::Publication;
 use self::report::Report;
+use self::wanted::{groups, topics};
 use crate::follow::Bounds;
 use crate::interface::is_of_this_machine;
+use crate::key_file;
 use crate::output::{End, Output, quiet};
 use crate::stamp;
 
@@ -42,6 +49,10 @@ pub struct ListenOptions {
     /// The gateways to hear, by 16 hex digits or by one of `names`; none: all. What others send is passed over, before the
     /// account.
     pub hubs: Vec<String>,
+    /// The file with the key without which nothing is believed; none: everything is.
+    pub key_file: Option<PathBuf>,
+    /// Where it keeps what has to survive it, if anywhere.
+    pub state: Option<StateDirectory>,
     /// Only the account, no samples.
     pub stats: bool,
     /// Instead of writing samples, publish them in this domain, as `HUB.SENSOR`.
@@ -75,6 +86,7 @@ pub fn listen(
     let wanted = topics(&options.topics)?;
     let names = Names::parse(&options.names)?;
     let hubs = Hubs::parse(&options.hubs, &names)?;
+    let key = options.key_file.as_deref().map(key_file::read).transpose()?;
     let groups = groups(&wanted);
     let now = Instant::now();
     let publication =
@@ -82,6 +94,16 @@ pub fn listen(
     let receiver = MulticastReceiver::open(options.interface.as_deref(), &groups, now)?;
     // Of topics whose group is not joined announcements would tell as lost what nobody wanted.
     let heard: Vec<_> = Topic::ALL.into_iter().filter(|&topic| groups.contains(&group(topic))).collect();
+    let key_name = key.as_ref().map(Key::name);
+    let epochs = key.as_ref().map(|key| Epochs::of(key, options.state.clone()));
+    let (known, unreadable) = match epochs.as_ref().map_or(Ok(HashMap::new()), Epochs::read) {
+        Ok(known) => (known, None),
+        Err(failure) => (HashMap::new(), Some(failure)),
+    };
+    let incoming = match key {
+        Some(key) => Incoming::with_key(&heard, key, known),
+        None => Incoming::new(&heard),
+    };
     let mut listener = Listener {
         options,
         wanted,
@@ -89,16 +111,17 @@ pub fn listen(
         receiver,
         publication,
         told: Vec::new(),
-        incoming: Incoming::new(&heard),
+        incoming,
+        epochs,
         crowd: Crowd::default(),
-        report: Report::new(options.json, Output::new(out), Output::new(notes), names),
+        report: Report::new(options.json, Output::new(out), Output::new(notes), names, key_name),
         started: now,
         last_sample: now,
         taken: Stamp::default(),
         draw_at: now,
         received: 0,
     };
-    quiet(listener.listen(tell, stop))
+    quiet(listener.listen(unreadable, tell, stop))
 }
 
 struct Listener<'a> {
@@ -110,6 +133,8 @@ struct Listener<'a> {
     /// What was told that is wrong here.
     told: Vec<String>,
     incoming: Incoming,
+    /// Where the epochs of gateways are kept that had the key, if there is one.
+    epochs: Option<Epochs>,
     crowd: Crowd,
     report: Report<'a>,
     started: Instant,
@@ -133,8 +158,16 @@ const TOLD: usize = 16;
 const DRAW_EVERY: Duration = Duration::from_secs(1);
 
 impl Listener<'_> {
-    fn listen(&mut self, tell: &AtomicBool, stop: &AtomicBool) -> Result<(), End> {
+    fn listen(
+        &mut self,
+        unreadable: Option<Failure>,
+        tell: &AtomicBool,
+        stop: &AtomicBool,
+    ) -> Result<(), End> {
         self.report.ready(&self.receiver.interfaces(), self.options.publish.as_ref())?;
+        if let Some(failure) = unreadable {
+            self.trouble(&failure.to_string())?;
+        }
         let end = self.run(tell, stop);
         if !matches!(end, Err(End::ReaderGone)) {
             self.tell()?;
@@ -197,13 +230,24 @@ impl Listener<'_> {
                 Arrived::Sample(sample) => self.sample(&sample, caught.from)?,
                 Arrived::Announced(announcement) => self.announced(&announcement, caught.from)?,
                 Arrived::Refused { shared: Some(hub), .. } => self.is_shared(hub)?,
+                Arrived::Untimely { behind_ns } => self.trouble(&untimely(behind_ns))?,
                 Arrived::Refused { shared: None, .. } | Arrived::Part | Arrived::Known => {}
             }
+            self.keep_epochs()?;
             if self.options.bounds.count.is_some_and(|count| self.received >= count) {
                 return Ok(true);
             }
         }
         Ok(true)
+    }
+
+    /// Keeps the epochs of gateways that had the key, if one is new: once in a life of a gateway.
+    fn keep_epochs(&mut self) -> Result<(), End> {
+        let kept = match (self.incoming.take_epochs(), &self.epochs) {
+            (Some(known), Some(epochs)) => epochs.keep(known),
+            _ => return Ok(()),
+        };
+        kept.or_else(|failure| self.trouble(&failure.to_string()))
     }
 
     /// A sample that was not there before.
@@ -341,26 +385,13 @@ fn nothing_came(limit: Duration) -> Failure {
 const NOTHING_CAME: &str = "is `scanhub gateway` running in the same network? `scanhub listen --stats` counts what is \
                             refused, --interface names another interface";
 
-/// The topics called so; all if none is.
-fn topics(names: &[String]) -> Result<Vec<Topic>, Failure> {
-    if names.is_empty() {
-        return Ok(Topic::ALL.to_vec());
-    }
-    let known: Vec<_> = Topic::ALL.iter().map(|topic| topic.name()).collect();
-    let parse = |name: &String| {
-        Topic::parse(name).ok_or_else(|| {
-            let hint = format!("there are {}; they are those of all sensors", known.join(", "));
-            Failure::new(Kind::Usage, format!("no topic {name:?}"), hint)
-        })
-    };
-    names.iter().map(parse).collect()
-}
-
-/// The groups of `topics`, and that of announcements, without which nobody has a name.
-fn groups(topics: &[Topic]) -> Vec<u8> {
-    let mut groups = vec![Announce::GROUP];
-    groups.extend(topics.iter().map(|&topic| group(topic)));
-    groups.sort_unstable();
-    groups.dedup();
-    groups
+/// What is wrong where an announcement has the key and is not believed.
+fn untimely(behind_ns: i64) -> String {
+    let seconds = behind_ns as f64 / 1e9;
+    let which = if seconds < 0.0 { "ahead of" } else { "behind" };
+    format!(
+        "a gateway has the key, and its clock is {:.0} s {which} this machine's: more than 5 s are not believed; set the \
+         clocks, unless somebody sends again what was recorded",
+        seconds.abs()
+    )
 }

@@ -6,7 +6,7 @@ use std::fmt;
 use std::io::{self, Write};
 
 use scanhub_client::streams::Sample;
-use schema::{Flags, Header, Reasons, Scan, Status, Telegram};
+use schema::{Flags, Header, PacketFacts, Reasons, Scan, Status, Telegram, in_degrees};
 
 use crate::follow::Notice;
 use crate::names::TopicName;
@@ -81,9 +81,14 @@ fn numbers(line: &mut Vec<u8>, header: &Header) -> io::Result<()> {
 pub(crate) fn telegram(line: &mut Vec<u8>, header: &Header, bytes: &[u8]) -> io::Result<()> {
     const SHOWN: usize = 16;
     numbers(line, header)?;
-    let telegram = Telegram(bytes);
+    let telegram = Telegram { family: header.family(), bytes };
     if telegram.is_lms() {
         write!(line, " address {:02x} command {:02x}", telegram.address(), telegram.command())?;
+    }
+    match telegram.packets() {
+        Some(PacketFacts { kind, packets: 1, .. }) => write!(line, " {kind} of 1 packet")?,
+        Some(PacketFacts { kind, packets, .. }) => write!(line, " {kind} of {packets} packets")?,
+        None => {}
     }
     write!(line, " {} bytes ", bytes.len())?;
     write!(line, "{}", Hex(&bytes[..bytes.len().min(SHOWN)]))?;
@@ -94,8 +99,9 @@ pub(crate) fn telegram(line: &mut Vec<u8>, header: &Header, bytes: &[u8]) -> io:
 pub(crate) fn scan(line: &mut Vec<u8>, header: &Header, scan: &Scan) -> io::Result<()> {
     numbers(line, header)?;
     let beams = scan.beams();
-    let last = scan.angle_deg(beams.saturating_sub(1));
-    write!(line, " {beams} beams {} to {last} deg", scan.angle_deg(0))?;
+    // Those of the grid: exact ones of the first beams may be a turn more or less.
+    let last = in_degrees(scan.first_angle + scan.step * beams.saturating_sub(1) as f64);
+    write!(line, " {beams} beams {} to {last} deg", in_degrees(scan.first_angle))?;
     let valid = (0..beams).filter_map(|i| Some((scan.distance_mm(i)?, i)));
     write!(line, " {} valid", valid.clone().count())?;
     match valid.min() {

@@ -11,9 +11,10 @@ use serde::Serialize;
 use serde_json::{Value as Json, json};
 
 use crate::gateway::Gateway;
-use crate::link::{Config, Link, Scanner};
+use crate::link::{Config, Link};
 use crate::places::Places;
 use crate::processing::{Background, Zones};
+use crate::scanner::Scanner;
 use crate::sources::Sources;
 
 /// One value in effect.
@@ -56,9 +57,16 @@ impl List {
         self.put(of("family"), json!(link.family().name()), DEFAULT);
         match scanner {
             Scanner::Lms => self.lms(link),
-            Scanner::Ld { model, beams } => {
-                self.put(of("model"), json!(model.map_or("auto", |model| model.name())), DEFAULT);
-                self.put(of("beams"), json!(beams), DEFAULT);
+            Scanner::Turning(turning) => {
+                self.put(of("model"), json!(turning.model.name), DEFAULT);
+                self.put(of("beams"), json!(turning.beams), DEFAULT);
+                if !turning.features.modes.is_empty() {
+                    self.put(of("mode"), json!(turning.mode.unwrap_or("auto")), DEFAULT);
+                }
+                if turning.features.can_rest {
+                    let idle = if turning.stop_when_idle { "stop" } else { "run" };
+                    self.put(of("idle"), json!(idle), DEFAULT);
+                }
             }
         }
         let Pose { x_m, y_m, yaw_rad, upside_down, .. } = processing.pose;
@@ -67,8 +75,12 @@ impl List {
         self.put(of("pose.yaw"), json!(yaw_rad), DEFAULT);
         self.put(of("pose.upside_down"), json!(upside_down != 0), DEFAULT);
         self.zones(name, &processing.zones);
-        let marks::Settings { i_min, max_range_step_mm, max_gap } = processing.marks;
-        self.put(of("marks.i_min"), json!(i_min), DEFAULT);
+        let marks::Settings { i_min, level, max_range_step_mm, max_gap } = processing.marks;
+        if link.family().has_reflector_levels() {
+            self.put(of("marks.i_min"), json!(i_min), DEFAULT);
+        } else {
+            self.put(of("marks.level"), json!(level), DEFAULT);
+        }
         self.put(of("marks.max_range_step"), json!(metres(max_range_step_mm)), DEFAULT);
         self.put(of("marks.max_gap"), json!(max_gap), DEFAULT);
         self.background(name, &processing.background);
@@ -138,13 +150,14 @@ impl List {
     }
 
     fn gateway(&mut self, gateway: &Gateway) {
-        let Gateway { interface, topics, to, bare, ttl, background_every, mtu } = gateway;
+        let Gateway { interface, topics, to, bare, key_file, ttl, background_every, mtu } = gateway;
         let every = background_every.as_ref().map(|(text, _)| text);
         for (key, value) in [
             ("gateway.interface", json!(interface)),
             ("gateway.topics", json!(topics)),
             ("gateway.to", json!(to.as_deref().unwrap_or_default())),
             ("gateway.bare", json!(bare.unwrap_or_default())),
+            ("gateway.key_file", json!(key_file)),
             ("gateway.ttl", json!(ttl.unwrap_or(Gateway::TTL))),
             ("gateway.background_every", json!(every)),
             ("gateway.mtu", json!(mtu.unwrap_or(Gateway::MTU))),

@@ -1,5 +1,7 @@
 //! Section `gateway` from all sources. Refuses to know what a gateway is: the gateway reads what only it understands.
 
+use std::path::PathBuf;
+
 use schema::datagram::MTU_SAFE;
 
 /// The settings of the gateway; `None` for what is not set.
@@ -13,6 +15,8 @@ pub struct Gateway {
     pub to: Option<Vec<String>>,
     /// Telegrams and nothing else, without a header.
     pub bare: Option<bool>,
+    /// The file with the key of which datagrams get a MAC.
+    pub key_file: Option<PathBuf>,
     /// How many routers pass a datagram on.
     pub ttl: Option<u8>,
     /// A duration, and where it is set.

@@ -17,9 +17,10 @@ use schema::{Failure, Kind, check_sensor};
 use serde::Deserialize;
 use toml::Spanned;
 
-use crate::link::{Link, MAX_LINKS, Scanner};
+use crate::link::{Link, MAX_LINKS};
 use crate::origin::Origin;
 use crate::processing::Processing;
+use crate::scanner::Scanner;
 use gateway::GatewayLayer;
 use limits::LimitsLayer;
 use processing::{BackgroundLayer, MarksLayer, PoseLayer, Sections, ZonesLayer};
@@ -53,7 +54,9 @@ struct LinkLayer {
     angle: Option<Spanned<f64>>,
     resolution: Option<Spanned<f64>>,
     unit: Option<Spanned<String>>,
-    mode: Option<Spanned<i64>>,
+    /// A number of an LMS, a name of other families.
+    mode: Option<Spanned<toml::Value>>,
+    idle: Option<Spanned<String>>,
     baud: Option<Spanned<u32>>,
     pose: Option<PoseLayer>,
     zones: Option<ZonesLayer>,
@@ -188,6 +191,7 @@ impl Draft {
         let mode = mode.map(|said| said.value);
         let mut link = Link { name, port, scanner, family, variant, unit, mode, baud, processing };
         Sight { link: &link, place: &place, said }.check()?;
+        own.iter().try_for_each(|(origin, sections)| sections.check_family(origin, link.family()))?;
         let mut background = std::mem::take(&mut link.processing.background);
         background.read(&link).map_err(|failure| {
             let place = start.unwrap_or_default();
@@ -263,8 +267,8 @@ fn merge(
                 )
             })?);
         }
-        let scanner = ScannerLayer { family: link.family, model: link.model, beams: link.beams };
-        draft.scanner.lay(scanner, origin)?;
+        let LinkLayer { family, model, beams, idle, .. } = link;
+        draft.scanner.lay(ScannerLayer { family, model, beams, idle }, origin)?;
         if let Some(family) = link.lms_type {
             let value = Family::of_name(family.get_ref()).ok_or_else(|| {
                 let what = format!("type = \"{}\"", family.get_ref());
@@ -292,12 +296,17 @@ fn merge(
             draft.unit = Some(Said { value, place: origin.place(Some(unit.span())) });
         }
         if let Some(mode) = link.mode {
-            let known = u8::try_from(*mode.get_ref()).ok().map(Mode).filter(|mode| mode.has_ranges());
-            let value = known.ok_or_else(|| {
-                let what = format!("mode = {}", mode.get_ref());
-                origin.refuse(Some(mode.span()), what, MODES)
-            })?;
-            draft.mode = Some(Said { value, place: origin.place(Some(mode.span())) });
+            let place = origin.place(Some(mode.span()));
+            // The later one counts, of whichever family it is.
+            (draft.mode, draft.scanner.mode) = match mode.get_ref() {
+                toml::Value::String(name) => (None, Some((name.clone(), place))),
+                value => {
+                    let number = value.as_integer().and_then(|number| u8::try_from(number).ok());
+                    let known = number.map(Mode).filter(|mode| mode.has_ranges());
+                    let refuse = || origin.refuse(Some(mode.span()), format!("mode = {value}"), MODES);
+                    (Some(Said { value: known.ok_or_else(refuse)?, place }), None)
+                }
+            };
         }
         if let Some(baud) = link.baud {
             let value = Baud::of_rate(*baud.get_ref()).ok_or_else(|| {
@@ -339,11 +348,32 @@ pub(crate) fn setting(flag: &str) -> Option<String> {
     if key == "name" || key.split('.').any(|word| word.is_empty() || !word.chars().all(is_key)) {
         return None;
     }
-    let value = match toml::from_str::<toml::Table>(&format!("v = {value}")) {
+    Some(format!("{head}{key} = {}", written(value)))
+}
+
+/// `NAME=PORT`, which may end with `,KEY=VALUE` as often as it likes, as TOML.
+pub(crate) fn link(flag: &str) -> Option<String> {
+    let (name, rest) = flag.split_once('=')?;
+    let is_set = |part: &&str| {
+        part.split_once('=').is_some_and(|(key, _)| key.chars().all(|c| c.is_ascii_lowercase() || c == '_'))
+    };
+    // A comma may be in the name of a port.
+    let parts: Vec<&str> = rest.split(',').collect();
+    let set = parts.iter().rev().take_while(|part| is_set(part)).count().min(parts.len() - 1);
+    let (port, set) = parts.split_at(parts.len() - set);
+    let mut text = format!("[[link]]\nname = {}\nport = {}", quoted(name), quoted(&port.join(",")));
+    for (key, value) in set.iter().filter_map(|part| part.split_once('=')) {
+        text = format!("{text}\n{key} = {}", written(value));
+    }
+    Some(text)
+}
+
+/// `value` as TOML: as text, if it is nothing else.
+fn written(value: &str) -> String {
+    match toml::from_str::<toml::Table>(&format!("v = {value}")) {
         Ok(table) if table.len() == 1 => value.to_owned(),
         _ => quoted(value),
-    };
-    Some(format!("{head}{key} = {value}"))
+    }
 }
 
 /// As a TOML string.

@@ -10,12 +10,14 @@ pub mod needs;
 mod origin;
 mod places;
 mod processing;
+mod scanner;
 mod sources;
 
 pub use effective::{Value, values};
 pub use gateway::Gateway;
-pub use link::{Config, Link, Scanner};
+pub use link::{Config, Link};
 pub use processing::{Background, Processing, Zones};
+pub use scanner::{Scanner, Turning};
 pub use sources::Sources;
 
 /// A configuration to start from, with the default values.

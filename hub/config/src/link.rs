@@ -8,6 +8,7 @@ use schema::limits::TopicLimits;
 use schema::{Background, Contents};
 
 use crate::processing::Processing;
+use crate::scanner::Scanner;
 
 /// The effective configuration.
 #[derive(Clone, Debug, PartialEq)]
@@ -48,26 +49,12 @@ pub struct Link {
     pub processing: Processing,
 }
 
-/// A family of scanners, with what is set for one of them. What is set for an LMS is in its [`Link`].
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Scanner {
-    /// SICK LMS 2xx.
-    Lms,
-    /// LDROBOT.
-    Ld {
-        /// The model, if it is not to be found out.
-        model: Option<ld::Model>,
-        /// Beams of a scan; the model's, if they are not set.
-        beams: Option<usize>,
-    },
-}
-
 impl Link {
     /// Returns the rate at which its port is opened, in bits per second.
     pub fn rate(&self) -> u32 {
         match self.scanner {
             Scanner::Lms => self.baud.rate(),
-            Scanner::Ld { .. } => self.ld_settings().baud(),
+            Scanner::Turning(turning) => turning.model.baud,
         }
     }
 
@@ -75,9 +62,7 @@ impl Link {
     pub fn beams(&self) -> usize {
         match self.scanner {
             Scanner::Lms => MAX_BEAMS,
-            Scanner::Ld { model, beams } => {
-                beams.or(model.map(|model| model.beams())).unwrap_or(LD_AUTO_BEAMS)
-            }
+            Scanner::Turning(turning) => turning.most_beams(),
         }
     }
 
@@ -85,7 +70,7 @@ impl Link {
     pub fn limits(&self, all: &TopicLimits) -> TopicLimits {
         match self.scanner {
             Scanner::Lms => *all,
-            Scanner::Ld { .. } => TopicLimits { beams: self.beams(), contents: Contents::TURNING, ..*all },
+            Scanner::Turning(_) => TopicLimits { beams: self.beams(), contents: Contents::TURNING, ..*all },
         }
     }
 
@@ -93,7 +78,7 @@ impl Link {
     pub fn family(&self) -> schema::Family {
         match self.scanner {
             Scanner::Lms => schema::Family::Lms,
-            Scanner::Ld { .. } => schema::Family::Ld,
+            Scanner::Turning(turning) => turning.family,
         }
     }
 
@@ -109,30 +94,17 @@ impl Link {
                 let unit_mm = unit.unwrap_or(model.unit_um / 1000);
                 (usize::from(model.count) == beams, beams.to_string(), unit_mm)
             }
-            Scanner::Ld { model: None, beams: None } => {
+            Scanner::Turning(turning) if turning.is_auto() => {
                 (usize::from(model.count) <= self.beams(), format!("at most {}", self.beams()), 1)
             }
-            Scanner::Ld { .. } => (usize::from(model.count) == self.beams(), self.beams().to_string(), 1),
+            Scanner::Turning(_) => (usize::from(model.count) == self.beams(), self.beams().to_string(), 1),
         };
         if fits && model.unit_um == 1000 * unit_mm {
             return Ok(());
         }
         Err(format!("{beams} beams in units of {unit_mm} mm"))
     }
-
-    /// Returns what a session with a scanner of LDROBOT at its port needs; of other families what means nothing.
-    pub fn ld_settings(&self) -> ld::Settings {
-        let fixed_rate = !matches!(self.port, Source::Tty(_));
-        let (model, beams) = match self.scanner {
-            Scanner::Lms => (None, None),
-            Scanner::Ld { model, beams } => (model, beams),
-        };
-        ld::Settings { model, beams, most_beams: Some(self.beams()), fixed_rate }
-    }
 }
-
-/// Beams for which there is room where the model is to be found out: those of all but the STL27L.
-const LD_AUTO_BEAMS: usize = 720;
 
 /// Links of one hub.
 pub(crate) const MAX_LINKS: usize = 256;

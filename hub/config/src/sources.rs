@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 
 use schema::Failure;
 
-use crate::layer::{Layer, parse, quoted, setting};
+use crate::layer::{Layer, link, parse, setting};
 use crate::origin::Origin;
 
 /// A layer, and where it comes from.
@@ -17,7 +17,7 @@ pub struct Sources {
     pub files: Vec<PathBuf>,
     /// `--set KEY=VALUE`, as given.
     pub set: Vec<String>,
-    /// `--link NAME=PORT`, as given.
+    /// `--link NAME=PORT[,KEY=VALUE]..`, as given.
     pub links: Vec<String>,
 }
 
@@ -48,11 +48,8 @@ impl Sources {
     /// The links of the command line.
     pub(crate) fn links(&self) -> impl Iterator<Item = Said> {
         self.links.iter().map(|flag| {
-            let text = flag
-                .split_once('=')
-                .map(|(name, port)| format!("[[link]]\nname = {}\nport = {}", quoted(name), quoted(port)));
             let remedy = "write --link NAME=PORT, for example front=/dev/ttyUSB0";
-            of_flag(format!("--link {flag}"), text, "no = in it", remedy)
+            of_flag(format!("--link {flag}"), link(flag), "no = in it", remedy)
         })
     }
 

@@ -4,10 +4,10 @@
 use std::fs;
 use std::path::PathBuf;
 
-use config::{Config, Gateway, Link, Processing, Scanner, Sources};
+use config::{Config, Gateway, Processing, Scanner, Sources};
 use preprocess::background::{Candidate, Method, Start};
 use preprocess::zones::Sector;
-use schema::{Background, BackgroundHead, Kind, as_json};
+use schema::{Background, BackgroundHead, Family, Kind, as_json};
 
 /// A file that goes with the test.
 struct Scratch(PathBuf);
@@ -52,15 +52,31 @@ fn the_page_holds() {
         page.split("```toml\n").nth(1).and_then(|rest| rest.split("```").next()).expect("an example");
     let file = Scratch::new("page.toml", example);
     let config = load(&[&file], &[]).unwrap();
-    let [front, rear, side] = &config.links[..] else { panic!("{config:?}") };
+    let [front, rear, side, top] = &config.links[..] else { panic!("{config:?}") };
     assert_eq!((front.processing.pose.x_m, rear.processing.pose.upside_down), (0.3, 1));
     assert_eq!(front.processing.zones.self_min.len(), 1);
     assert_eq!(front.processing.zones.margin_mm, 50);
-    assert_eq!(side.scanner, Scanner::Ld { model: Some(ld::Model::Ld19), beams: Some(450) });
+    let Scanner::Turning(side) = side.scanner else { panic!("{side:?}") };
+    assert_eq!((side.family, side.model.name, side.beams), (Family::Ld, "ld19", Some(450)));
+    let Scanner::Turning(top) = top.scanner else { panic!("{top:?}") };
+    assert_eq!(
+        (top.family, top.is_auto(), top.mode, top.stop_when_idle),
+        (Family::Rplidar, true, None, false)
+    );
     // What the page shows as the values without a word are those: the front's are changed in these sections.
     let Processing { zones, marks, background, .. } = Processing::default();
     let shown = &rear.processing;
     assert_eq!((&shown.zones, shown.marks, &shown.background), (&zones, marks, &background));
+}
+
+#[test]
+fn a_scanner_is_refused_at_its_place() {
+    let file = Scratch::new(
+        "family.toml",
+        "[[link]]\nname = \"a\"\nport = \"x\"\nfamily = \"ld\"\nmodel = \"ld20\"\n",
+    );
+    let refusal = load(&[&file], &[]).unwrap_err();
+    assert!(refusal.contains("family.toml:5:9: link a: model = \"ld20\""), "{refusal}");
 }
 
 #[test]
@@ -137,6 +153,11 @@ fn what_cannot_be_is_refused_with_place_value_and_remedy() {
         ("zones.self_min=[{from_deg=1,to_deg=12,rang=1}]", "unknown key `rang`\n  did you mean `range`?"),
         ("zonse.margin=1", "unknown key `zonse`\n  did you mean `zones`?"),
         ("marks.i_min=8", "i_min = 8\n  a whole number from 1 to 7"),
+        ("marks.level=0", "level = 0\n  a whole number from 1 to 65535"),
+        (
+            "link.front.marks.level=200",
+            "level, and the intensities of an lms are levels of reflectors, 0 to 7\n  i_min is",
+        ),
         ("marks.max_range_step=100", "max_range_step = 100\n  metres"),
         ("marks.max_gap=-1", "max_gap = -1"),
         ("background.method=mult", "`mult`\n  did you mean `multi`? Possible here: multi, paper, off"),
@@ -172,79 +193,6 @@ fn what_cannot_be_is_refused_with_place_value_and_remedy() {
     );
     let refusal = load(&[&place], &[]).unwrap_err();
     assert!(refusal.contains("place.toml:6:9: radii = [0.6, 1.0]"), "{refusal}");
-}
-
-#[test]
-fn a_link_has_a_family_and_what_its_family_needs() {
-    let front = |set: &[&str]| load(&[], set).map(|mut config| config.links.swap_remove(0));
-    let known = |link: &Link| (link.scanner, link.rate(), link.beams());
-    let (family, ld19) = ("link.front.family=ld", Some(ld::Model::Ld19));
-    for (set, scanner, rate, beams) in [
-        (&[][..], Scanner::Lms, 500_000, 401),
-        (&["link.front.family=lms", "link.front.model=auto"], Scanner::Lms, 500_000, 401),
-        (&[family, "link.front.model=ld19"], Scanner::Ld { model: ld19, beams: None }, 230_400, 450),
-        (
-            &[family, "link.front.model=stl27l"],
-            Scanner::Ld { model: Some(ld::Model::Stl27l), beams: None },
-            921_600,
-            2160,
-        ),
-        (
-            &[family, "link.front.model=ld14p", "link.front.beams=8192"],
-            Scanner::Ld { model: Some(ld::Model::Ld14p), beams: Some(8192) },
-            230_400,
-            8192,
-        ),
-        (&[family, "link.front.beams=2"], Scanner::Ld { model: None, beams: Some(2) }, 230_400, 2),
-        // Room for every model but the one that the remedy of a status names.
-        (&[family, "link.front.model=auto"], Scanner::Ld { model: None, beams: None }, 230_400, 720),
-    ] {
-        let link = front(set).unwrap();
-        assert_eq!(known(&link), (scanner, rate, beams), "{set:?}");
-    }
-    // The other link is what it was.
-    assert_eq!(load(&[], &[family]).unwrap().links[1].scanner, Scanner::Lms);
-
-    let lms = "is of family lms; a scanner of another family has no such setting\n  leave it out, or set family = \"lms\"";
-    for (others, setting, words) in [
-        (&[][..], "family=sick", "family = \"sick\"\n  one of: lms, ld"),
-        (&[], "famly=ld", "unknown key `famly`\n  did you mean `family`?"),
-        (
-            &[],
-            "model=ld19",
-            "link front: model = \"ld19\", and an lms says itself what it is\n  leave it out; `type`",
-        ),
-        (
-            &[],
-            "beams=450",
-            "link front: beams = 450, and an lms has its own\n  leave it out; `angle` and `resolution`",
-        ),
-        (&[], "beams=1", "beams = 1\n  a whole number from 2 to 8192"),
-        (&[family], "beams=8193", "beams = 8193\n  a whole number from 2 to 8192"),
-        (&[family], "beams=-450", "beams = -450\n  a whole number"),
-        (
-            &[family],
-            "model=LD19",
-            "link front: model = \"LD19\"\n  auto, or one of: ld06, ld19, stl19p, stl27l, ld14p",
-        ),
-        (&[family], "type=lms200", &format!("link front: type {lms}")),
-        (&[family], "angle=180", &format!("link front: angle {lms}")),
-        (&[family], "resolution=1", &format!("link front: resolution {lms}")),
-        (&[family], "unit=mm", &format!("link front: unit {lms}")),
-        (&[family], "mode=0x01", &format!("link front: mode {lms}")),
-        (&[family], "baud=38400", &format!("link front: baud {lms}")),
-    ] {
-        let setting = format!("link.front.{setting}");
-        let refusal = front(&[others, &[setting.as_str()]].concat()).expect_err(&setting);
-        assert!(refusal.starts_with(&format!("--set {setting}: ")), "{refusal}");
-        assert!(refusal.contains(words), "{setting}: {refusal}");
-    }
-    let file = Scratch::new(
-        "family.toml",
-        "[[link]]\nname = \"a\"\nport = \"x\"\nfamily = \"ld\"\nmodel = \"ld20\"\n",
-    );
-    let refusal = load(&[&file], &[]).unwrap_err();
-    assert!(refusal.contains("family.toml:5:9: link a: model = \"ld20\""), "{refusal}");
 }
 
 #[test]
@@ -351,8 +299,10 @@ fn topics_have_places_for_as_many_consumers_as_are_configured() {
 
 #[test]
 fn the_gateway_has_a_section_that_needs_no_links() {
-    let first =
-        Scratch::new("gateway-1.toml", "[gateway]\ninterface = \"eth0\"\nttl = 2\ntopics = [\"a/scan\"]\n");
+    let first = Scratch::new(
+        "gateway-1.toml",
+        "[gateway]\ninterface = \"eth0\"\nttl = 2\nkey_file = \"/k\"\ntopics = [\"a/scan\"]\n",
+    );
     let second = Scratch::new("gateway-2.toml", "[gateway]\nbackground_every = \"10s\"\ntopics = []\n");
     let gateway = |files: &[&Scratch], set: &[&str]| {
         let sources = Sources {
@@ -370,6 +320,7 @@ fn the_gateway_has_a_section_that_needs_no_links() {
             topics: Some(Vec::new()),
             to: None,
             bare: Some(true),
+            key_file: Some("/k".into()),
             ttl: Some(3),
             background_every: Some(("10s".into(), place)),
             mtu: None,

@@ -109,6 +109,10 @@ fn a_link_shows_the_keys_of_its_own_family() {
     ] {
         assert_eq!(shown(values, key), (&value, origin), "{key}");
     }
+    let top = values(&["link.front.family=rplidar", "link.front.mode=express", "link.front.idle=stop"]);
+    assert_eq!(shown(&top, "link.front.mode").0, &json!("express"));
+    assert_eq!(shown(&top, "link.front.idle").0, &json!("stop"));
+    assert!(all.iter().all(|value| value.key != "link.front.mode" && value.key != "link.front.idle"));
     let lms = ["type", "angle", "resolution", "unit", "mode", "baud"].map(|key| format!("link.front.{key}"));
     let ld = ["model", "beams"].map(|key| format!("link.rear.{key}"));
     assert!(all.iter().all(|value| !lms.contains(&value.key) && !ld.contains(&value.key)));

@@ -8,7 +8,7 @@ use lms::variant::Unit;
 use port::Source;
 use schema::{State, Status};
 
-use crate::driver::Driver;
+use crate::driver::{Driver, Trouble};
 
 /// What is known to be wrong with one link.
 pub(crate) struct Diagnosis<'a> {
@@ -30,19 +30,12 @@ pub(crate) struct Diagnosis<'a> {
 }
 
 /// What the words are made from.
-#[derive(Clone, Copy, PartialEq, Eq)]
+#[derive(Clone, Copy, PartialEq)]
 struct Facts {
     state: State,
     trouble: Option<Trouble>,
     unit: Option<Unit>,
     notice: Option<Notice>,
-}
-
-/// The trouble of a session of any family.
-#[derive(Clone, Copy, PartialEq, Eq)]
-enum Trouble {
-    Lms(lms::Trouble),
-    Ld(ld::Trouble),
 }
 
 impl<'a> Diagnosis<'a> {
@@ -63,16 +56,12 @@ impl<'a> Diagnosis<'a> {
     /// Looks at `session`. The state of the link, and whether anything is new since the last look.
     pub(crate) fn examine(&mut self, driver: &Driver) -> (State, bool) {
         let state = if self.is_doubtful(driver) { State::Absent } else { state_of(driver) };
-        let facts = match driver {
-            Driver::Lms(session) => {
-                let sensor = session.sensor();
-                let trouble = session.trouble().map(Trouble::Lms);
-                Facts { state, trouble, unit: sensor.unit, notice: sensor.notices().next() }
-            }
-            Driver::Ld(session) => {
-                let trouble = session.trouble().map(Trouble::Ld);
-                Facts { state, trouble, unit: None, notice: None }
-            }
+        let sensor = driver.lms().map(lms::Session::sensor);
+        let facts = Facts {
+            state,
+            trouble: driver.trouble(),
+            unit: sensor.and_then(|sensor| sensor.unit),
+            notice: sensor.and_then(|sensor| sensor.notices().next()),
         };
         let is_new = self.facts != Some(facts);
         if is_new {
@@ -143,11 +132,7 @@ impl<'a> Diagnosis<'a> {
     /// Whether the port may go away again before it brings anything, as it did the last time: a serial server that
     /// serves somebody else takes each connection and closes it.
     fn is_doubtful(&self, driver: &Driver) -> bool {
-        let has_trouble = match driver {
-            Driver::Lms(session) => session.trouble().is_some(),
-            Driver::Ld(session) => session.trouble().is_some(),
-        };
-        let is_silent = driver.account().read == 0 && !has_trouble;
+        let is_silent = driver.account().read == 0 && driver.trouble().is_none();
         !self.doubt.is_empty() && is_silent && driver.state() == line::State::Probing
     }
 
@@ -162,49 +147,45 @@ impl<'a> Diagnosis<'a> {
                 self.link.rate()
             );
         }
-        let session = match driver {
-            Driver::Lms(session) => session,
-            Driver::Ld(session) => return self.trouble_of_ld(session),
-        };
         let is_server = matches!(self.link.port, Source::Tcp { .. });
-        match (session.trouble(), session.sensor().unit, self.link.unit) {
-            (Some(lms::Trouble::NoAnswer { .. }), _, _) if is_server => format!(
+        match driver.trouble() {
+            Some(Trouble::Lms(lms::Trouble::NoAnswer { .. })) if is_server => format!(
                 "no answer at {} baud, the rate set in the serial server: check power, cable, rate",
                 self.link.baud.rate()
             ),
-            (Some(trouble), _, _) => trouble.to_string(),
-            (None, Some(is), Some(expected)) if is != expected => format!(
+            Some(trouble) => trouble.to_string(),
+            None => self.mismatch(driver).unwrap_or_else(|| match driver.lms() {
+                _ if self.unserved_for >= UNSERVED_LIMIT => self.unserved(),
+                Some(session) => {
+                    let fault = session.sensor().notices().find(|notice| notice.is_fault());
+                    fault.map_or_else(String::new, |notice| notice.to_string())
+                }
+                None => String::new(),
+            }),
+        }
+    }
+
+    /// What the configuration says otherwise than the scanner.
+    fn mismatch(&self, driver: &Driver) -> Option<String> {
+        let unit = driver.lms().and_then(|session| session.sensor().unit);
+        if let Some((is, expected)) = unit.zip(self.link.unit).filter(|(is, expected)| is != expected) {
+            return Some(format!(
                 "the sensor measures in units of {} mm, the configuration says {} mm; the unit is stored in its EEPROM, \
                  which the hub never writes",
                 is.mm(),
                 expected.mm()
-            ),
-            _ if self.unserved_for >= UNSERVED_LIMIT => self.unserved(),
-            _ => {
-                let fault = session.sensor().notices().find(|notice| notice.is_fault());
-                fault.map_or_else(String::new, |notice| notice.to_string())
-            }
+            ));
         }
-    }
-
-    fn trouble_of_ld(&self, session: &ld::Session) -> String {
-        let needed = session.model().map_or(0, |model| model.beams());
-        match session.trouble() {
-            Some(trouble) => trouble.to_string(),
-            None if session.beams().is_some_and(|beams| beams < needed) && self.is_auto() => format!(
-                "its turns have {needed} points, and there is room for {}: set link.{}.model or link.{}.beams",
-                self.link.beams(),
-                self.link.name,
-                self.link.name
-            ),
-            None if self.unserved_for >= UNSERVED_LIMIT => self.unserved(),
-            None => String::new(),
-        }
-    }
-
-    /// Whether the number of beams is left to the model, and that to be found out.
-    fn is_auto(&self) -> bool {
-        matches!(self.link.scanner, Scanner::Ld { model: None, beams: None })
+        let (model, beams) = driver.model()?;
+        let Scanner::Turning(turning) = self.link.scanner else { return None };
+        let name = &self.link.name;
+        (beams < model.beams && turning.is_auto()).then(|| {
+            format!(
+                "its turns have {} points, and there is room for {}: set link.{name}.model or link.{name}.beams",
+                model.beams,
+                self.link.beams()
+            )
+        })
     }
 
     fn unserved(&self) -> String {

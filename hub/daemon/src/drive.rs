@@ -171,6 +171,7 @@ impl<'a, S: Surroundings> Drive<'a, S> {
                     // What waited is discarded.
                     open.backlog = None;
                 }
+                Output::SetDtr(on) => line.set_dtr(on)?,
                 Output::Transmit { byte, not_before } => {
                     around.pause(not_before);
                     line.write(byte)?;
@@ -194,21 +195,21 @@ impl<'a, S: Surroundings> Drive<'a, S> {
                     }
                     published = true;
                 }
-                Output::Heard(Heard::Ld(ld::Heard::Packets(mut received))) => {
+                Output::Heard(Heard::Turning(line::Heard::Packets(mut received))) => {
                     let counted = line.line_errors();
                     core.stats.line_errors += counted;
                     let is_hit = self.line_errors.note(counted);
                     received.estimated |= self.behind_at.is_some_and(|at| received.last <= at);
                     received.reasons |= if is_hit { suspect::LINE_ERROR } else { 0 };
-                    core.publish_packets(&received);
+                    core.publish_packets(&received, &recorded);
                     published = true;
                 }
-                Output::Heard(Heard::Ld(ld::Heard::Turn(turn))) => {
+                Output::Heard(Heard::Turning(line::Heard::Turn(turn))) => {
                     let is_behind = self.behind_at.is_some_and(|at| turn.last <= at);
                     if !is_behind && turn.last > self.follows_by {
                         core.output.learn_silence();
                     }
-                    if let Some(limit) = core.publish_turn(&turn, is_behind) {
+                    if let Some(limit) = core.publish_turn(&turn, &recorded, is_behind) {
                         self.follows_by = if is_behind { 0 } else { turn.last.saturating_add(limit) };
                     }
                     published = true;
@@ -228,6 +229,11 @@ impl<'a, S: Surroundings> Drive<'a, S> {
         }
         if (is_new || core.is_due(around.now())) && core.show_session(session, state) {
             self.identity.keep(session, around.now());
+            if core.stops_when_idle() {
+                session.followed(around.now(), core.output.topics.is_followed());
+                // What follows from it is done at once, after an empty look at the line.
+                open.until = around.now();
+            }
         }
         // While telegrams come there is no need for wake-ups of the status' own.
         let bound = if state == State::Streaming { Nanos::MAX } else { core.next_status() };

@@ -1,7 +1,11 @@
-//! The session on a link's line, whatever family its scanner is of: the one list of families in the hub. What all of them
-//! have is [`line::Session`]; what only one has is asked of that one. Refuses to know what is made of what they say.
+//! The session on a link's line, whatever family its scanner is of. What all of them have is [`line::Session`]; what only
+//! an LMS has is asked of that one, what only scanners whose heads turn have, of those. Refuses to know what is made of
+//! what they say.
+
+use std::fmt;
 
 use config::{Link, Scanner};
+use line::family::Model;
 use line::{Account, Control, Nanos, Output, State};
 use lms::variant::Baud;
 use lms::{Identity, Settings};
@@ -10,26 +14,42 @@ use port::Source;
 /// A session of one of the families.
 #[expect(clippy::large_enum_variant, reason = "there is one per open port")]
 pub(crate) enum Driver {
-    /// SICK LMS 2xx.
+    /// With an LMS.
     Lms(lms::Session),
-    /// LDROBOT.
-    Ld(ld::Session),
+    /// With a scanner whose head turns.
+    Turning(scanner::Session),
 }
 
 /// What a session hands out.
 pub(crate) enum Heard<'a> {
-    /// A telegram.
+    /// A telegram of an LMS.
     Lms(lms::session::Received<'a>),
-    /// Packets, or a turn that they complete.
-    Ld(ld::Heard<'a>),
+    /// Packets of a scanner whose head turns, or a turn that they complete.
+    Turning(line::Heard<'a>),
 }
 
-/// Says the same of whatever family it is.
+/// Why a session is not where it should be; its words are the family's.
+#[derive(Clone, Copy, PartialEq)]
+pub(crate) enum Trouble {
+    Lms(lms::Trouble),
+    Turning(scanner::Trouble),
+}
+
+impl fmt::Display for Trouble {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Trouble::Lms(trouble) => trouble.fmt(f),
+            Trouble::Turning(trouble) => trouble.fmt(f),
+        }
+    }
+}
+
+/// Says the same of whatever session it is.
 macro_rules! each {
     ($driver:expr, $session:ident => $said:expr) => {
         match $driver {
             Driver::Lms($session) => $said,
-            Driver::Ld($session) => $said,
+            Driver::Turning($session) => $said,
         }
     };
 }
@@ -37,13 +57,35 @@ macro_rules! each {
 impl Driver {
     /// A session on the port of `link`, which is open at its rate; to a recording nobody talks.
     pub(crate) fn new(link: &Link, is_recording: bool, now: Nanos) -> Driver {
-        if let Scanner::Ld { .. } = link.scanner {
-            return Driver::Ld(ld::Session::new(link.ld_settings(), now));
+        if let Scanner::Turning(turning) = &link.scanner {
+            let fixed_rate = !matches!(link.port, Source::Tty(_));
+            let wanted = turning.wanted(fixed_rate, is_recording);
+            if let Some(session) = scanner::Session::begin(turning.family, wanted, now) {
+                return Driver::Turning(session);
+            }
         }
         let fixed_rate = matches!(link.port, Source::Tcp { .. });
         let settings =
             Settings { variant: link.variant, baud: link.baud, listen_only: is_recording, fixed_rate };
         Driver::Lms(lms::Session::new(settings, now))
+    }
+
+    /// The session, if it is one with an LMS.
+    pub(crate) fn lms(&self) -> Option<&lms::Session> {
+        if let Driver::Lms(session) = self { Some(session) } else { None }
+    }
+
+    /// What is at the other end, where its head turns, and the beams of its scans; nothing before that is known.
+    pub(crate) fn model(&self) -> Option<(Model, usize)> {
+        let Driver::Turning(session) = self else { return None };
+        session.model().zip(session.beams())
+    }
+
+    /// Packets of a scanner whose head turns that are handed out next are suspect for these `reasons` too.
+    pub(crate) fn doubt(&mut self, reasons: u8) {
+        if let Driver::Turning(session) = self {
+            session.doubt(reasons);
+        }
     }
 
     /// What a session before this one knew of the scanner a moment ago. To be said before anything is read.
@@ -64,24 +106,19 @@ impl Driver {
 
     /// The rate at which a scanner that was sought answered; nothing if none had to be sought.
     pub(crate) fn found_at(&self) -> Option<u32> {
-        match self {
-            Driver::Lms(session) => session.found_at().map(Baud::rate),
-            Driver::Ld(_) => None,
-        }
+        self.lms()?.found_at().map(Baud::rate)
     }
 
     /// What the next session would have to ask if this one ended now; nothing if that is not known.
     pub(crate) fn identity(&self) -> Option<Identity> {
-        match self {
-            Driver::Lms(session) => session.identity(),
-            Driver::Ld(_) => None,
-        }
+        self.lms()?.identity()
     }
 }
 
 impl line::Session for Driver {
     type Heard<'a> = Heard<'a>;
     type Why = ();
+    type Trouble = Trouble;
 
     fn spare(&mut self) -> &mut [u8] {
         each!(self, session => session.spare())
@@ -107,6 +144,10 @@ impl line::Session for Driver {
         each!(self, session => session.control(control, now))
     }
 
+    fn followed(&mut self, now: Nanos, is_followed: bool) {
+        each!(self, session => session.followed(now, is_followed))
+    }
+
     fn transmitted(&mut self, now: Nanos) {
         each!(self, session => session.transmitted(now))
     }
@@ -114,12 +155,19 @@ impl line::Session for Driver {
     fn poll_output(&mut self) -> Output<Heard<'_>, ()> {
         match self {
             Driver::Lms(session) => session.poll_output().map(Heard::Lms),
-            Driver::Ld(session) => session.poll_output().map(Heard::Ld),
+            Driver::Turning(session) => session.poll_output().map(Heard::Turning),
         }
     }
 
     fn state(&self) -> State {
         each!(self, session => session.state())
+    }
+
+    fn trouble(&self) -> Option<Trouble> {
+        match self {
+            Driver::Lms(session) => session.trouble().map(Trouble::Lms),
+            Driver::Turning(session) => session.trouble().map(Trouble::Turning),
+        }
     }
 
     fn rate(&self) -> u32 {

@@ -1,7 +1,7 @@
 //! What a link has, whatever its other end is: where its results go, what it reports of itself, what users ask of it, and
 //! when it has to do something although nothing came. Refuses to know where bytes come from, and how a wait is done.
 
-use config::{Link, Processing};
+use config::{Link, Processing, Scanner};
 use line::Control;
 use lms::session::Received;
 use lms::{MILLIS, Nanos};
@@ -45,7 +45,8 @@ impl<'a, S: Surroundings> LinkCore<'a, S> {
         control: ControlQueue,
     ) -> Result<Self, Failure> {
         let now = around.now();
-        let topics = Topics::new(around, &link.name, number, boot)?;
+        let mut topics = Topics::new(around, &link.name, number, boot)?;
+        topics.set_family(link.family());
         Ok(LinkCore {
             link,
             around,
@@ -79,6 +80,11 @@ impl<'a, S: Surroundings> LinkCore<'a, S> {
         matches!(self.link.port, Source::File { .. })
     }
 
+    /// Whether its motor rests while nobody follows.
+    pub(crate) fn stops_when_idle(&self) -> bool {
+        matches!(self.link.scanner, Scanner::Turning(turning) if turning.stop_when_idle)
+    }
+
     /// What is known beside the sensor: nothing of one that can be asked.
     pub(crate) fn recorded(&self) -> RecordedContext {
         let mode = self.link.mode.filter(|_| self.is_recording());
@@ -100,15 +106,24 @@ impl<'a, S: Surroundings> LinkCore<'a, S> {
     }
 
     /// Publishes packets of a scanner whose head turns, and wakes the consumers.
-    pub(crate) fn publish_packets(&mut self, received: &line::Received<'_, ld::Packets>) {
-        let processed = self.output.process_packets(received);
+    pub(crate) fn publish_packets<M>(
+        &mut self,
+        received: &line::Received<'_, M>,
+        recorded: &RecordedContext,
+    ) {
+        let processed = self.output.process_packets(received, recorded);
         self.output.topics.wake(Wake::Telegram);
         self.stats.note(processed);
     }
 
     /// Publishes what is made of `turn`, and wakes the consumers. For how long the verdict on it stands.
-    pub(crate) fn publish_turn(&mut self, turn: &ld::Turn<'_>, is_behind: bool) -> Option<Nanos> {
-        let processed = self.output.process_turn(turn, is_behind);
+    pub(crate) fn publish_turn(
+        &mut self,
+        turn: &line::Turn<'_>,
+        recorded: &RecordedContext,
+        is_behind: bool,
+    ) -> Option<Nanos> {
+        let processed = self.output.process_turn(turn, recorded, is_behind);
         self.output.topics.wake(Wake::Telegram);
         self.stats.note(processed);
         processed.stands_for

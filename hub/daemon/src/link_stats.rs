@@ -38,6 +38,7 @@ pub(crate) struct LinkStats {
 impl LinkStats {
     pub(crate) fn new(link: &Link, now: Nanos) -> Self {
         let mut status = Status { since_ns: now, pose: link.processing.pose, ..Status::default() };
+        status.family = link.family() as u8;
         status.set_port(&link.port.name());
         LinkStats {
             status,
@@ -146,11 +147,13 @@ impl LinkStats {
     fn describe(&mut self, driver: &Driver) {
         let known_rate = matches!(self.status.state(), Some(State::Streaming | State::Starting));
         self.status.baud = if known_rate { driver.rate() } else { 0 };
-        let session = match driver {
-            Driver::Lms(session) => session,
-            Driver::Ld(session) => return self.describe_ld(session),
-        };
-        let sensor = session.sensor();
+        if let Some((model, beams)) = driver.model() {
+            self.status.unit_mm = 1;
+            self.status.angle_deg = 360;
+            self.status.resolution_cdeg = (36_000.0 / beams as f64).round() as u16;
+            self.status.set_sensor_type(&model.name.to_uppercase());
+        }
+        let Some(sensor) = driver.lms().map(lms::Session::sensor) else { return };
         self.status.mode = sensor.mode.or(self.mode).map_or(Status::MODE_UNKNOWN, |mode| mode.0);
         self.status.unit_mm = sensor.unit.map_or(0, |unit| unit.mm());
         let Variant { angle_deg, resolution_cdeg } =
@@ -158,14 +161,6 @@ impl LinkStats {
         self.status.angle_deg = angle_deg;
         self.status.resolution_cdeg = resolution_cdeg;
         self.status.set_sensor_type(&String::from_utf8_lossy(sensor.kind()));
-    }
-
-    fn describe_ld(&mut self, session: &ld::Session) {
-        let Some((model, beams)) = session.model().zip(session.beams()) else { return };
-        self.status.unit_mm = 1;
-        self.status.angle_deg = 360;
-        self.status.resolution_cdeg = (36_000.0 / beams as f64).round() as u16;
-        self.status.set_sensor_type(&model.name().to_uppercase());
     }
 }
 
@@ -182,13 +177,8 @@ fn add(counters: &mut Counters, driver: &Driver) {
     counters[Counter::DueOnLine] += account.due;
     counters[Counter::LostOnLine] += account.lost;
     counters[Counter::LostInRestart] += u64::from(account.began_with_a_cut);
-    let session = match driver {
-        Driver::Lms(session) => session,
-        Driver::Ld(session) => {
-            counters[Counter::RejectedCrc] += session.tally().rejected_checksum;
-            return;
-        }
-    };
+    counters[Counter::RejectedCrc] += account.rejected_checksum;
+    let Some(session) = driver.lms() else { return };
     let tally = session.tally();
     counters[Counter::Aborted] += tally.aborted;
     for (reject, counter) in REJECTS {
@@ -196,12 +186,12 @@ fn add(counters: &mut Counters, driver: &Driver) {
     }
 }
 
-const REJECTS: [(Reject, Counter); Reject::COUNT] = [
+/// But for the checksum, which every family has.
+const REJECTS: [(Reject, Counter); Reject::COUNT - 1] = [
     (Reject::Address, Counter::RejectedAddress),
     (Reject::Length, Counter::RejectedLength),
     (Reject::Command, Counter::RejectedCommand),
     (Reject::Count, Counter::RejectedCount),
-    (Reject::Crc, Counter::RejectedCrc),
     (Reject::Vetoed, Counter::RejectedVetoed),
     (Reject::Superseded, Counter::RejectedSuperseded),
 ];

@@ -6,7 +6,7 @@ use lms::Nanos;
 use lms::reply::Reply;
 use lms::session::Received;
 use lms::variant::{Mode, Variant};
-use schema::{Background, Failure, Flags, Pose, Scan, Verb, Wake, Zones};
+use schema::{Background, Failure, Family, Flags, Pose, Scan, Verb, Wake, Zones};
 
 use crate::pipeline::Pipeline;
 use crate::surroundings::Surroundings;
@@ -26,7 +26,14 @@ pub(crate) struct RecordedContext {
     /// How many times longer than then everything takes.
     pub(crate) stretch: f64,
     /// Of its [`Flags`] that it came from a pty.
-    pub(crate) flags: u16,
+    pub(crate) flags: u8,
+}
+
+impl RecordedContext {
+    /// A period as long as it takes here.
+    pub(crate) fn stretched(&self, period_us: u32) -> u32 {
+        if self.stretch > 1.0 { (f64::from(period_us) * self.stretch) as u32 } else { period_us }
+    }
 }
 
 /// What became of a telegram.
@@ -76,11 +83,8 @@ impl<'a, S: Surroundings> LinkOutput<'a, S> {
         let variant = measured.and_then(|measured| Variant::of_beams(measured.count()));
         let nominal = || scanner::period_us(variant, self.link.baud.rate());
         let period_us = recorded.period_us.unwrap_or_else(nominal).max(recorded.gap_us);
-        let period_us =
-            if recorded.stretch > 1.0 { (f64::from(period_us) * recorded.stretch) as u32 } else { period_us };
-        if let Some(wall_ns) = recorded.wall_ns {
-            self.topics.recall(wall_ns, Flags::REPLAYED | recorded.flags);
-        }
+        let period_us = recorded.stretched(period_us);
+        self.recall(recorded);
         self.topics.telegram(received, reasons, period_us);
         let is_suspect = reasons != 0;
         // Better no range than a wrong one.
@@ -91,6 +95,13 @@ impl<'a, S: Surroundings> LinkOutput<'a, S> {
         let stands_for = limit(period_us);
         self.publish_scan(measured.count(), scanner::len(&measured), decode, stands_for, is_behind);
         Processed { is_suspect, stands_for: Some(stands_for) }
+    }
+
+    /// What comes next was measured when `recorded` says.
+    pub(crate) fn recall(&mut self, recorded: &RecordedContext) {
+        if let Some(wall_ns) = recorded.wall_ns {
+            self.topics.recall(wall_ns, Flags::REPLAYED | recorded.flags);
+        }
     }
 
     /// Publishes the scan of `beams` beams and `len` bytes that `decode` writes, and what is made of it. The verdict on it
@@ -116,6 +127,11 @@ impl<'a, S: Surroundings> LinkOutput<'a, S> {
         self.stale_at = self.around.now().saturating_add(stands_for);
     }
 
+    /// The family of the link's scanner.
+    pub(crate) fn family(&self) -> Family {
+        self.link.family()
+    }
+
     /// Takes loans for a telegram that will be complete in a moment, so that it need not wait for them.
     pub(crate) fn prepare(&mut self) {
         self.topics.prepare(&self.pipeline);
@@ -126,8 +142,13 @@ impl<'a, S: Surroundings> LinkOutput<'a, S> {
         let Some(mode) = mode.filter(|mode| mode.has_ranges()) else { return };
         if let Some(Reply::Measured(measured)) = reply {
             let decode = |scan: &mut Scan| scanner::decode(measured, mode, scan);
-            self.topics.learn(scanner::len(measured), decode, &mut self.pipeline);
+            self.learn_scan(scanner::len(measured), decode);
         }
+    }
+
+    /// As [`learn`](Self::learn), from a scan of `len` bytes that `decode` writes.
+    pub(crate) fn learn_scan(&mut self, len: usize, decode: impl FnOnce(&mut Scan)) {
+        self.topics.learn(len, decode, &mut self.pipeline);
     }
 
     /// As [`learn`](Self::learn), of a time without scans.

@@ -2,6 +2,7 @@
 //! stream is lost for it; what belongs to a line waits for the next start, which is said. One that cannot be changes nothing.
 
 use config::{Background, Config, Link, Processing, Scanner};
+use line::family::Wanted;
 use lms::Nanos;
 use schema::Failure;
 
@@ -103,25 +104,23 @@ impl Differences {
             let background = &link.processing.background;
             (background.learning.start, background.file.clone())
         };
-        let model = |link: &Link| match link.scanner {
-            Scanner::Lms => None,
-            Scanner::Ld { model, .. } => model,
+        let wanted = |link: &Link| match link.scanner {
+            Scanner::Lms => Wanted::default(),
+            Scanner::Turning(turning) => turning.wanted(false, false),
         };
-        let beams = |link: &Link| match link.scanner {
-            Scanner::Lms => None,
-            Scanner::Ld { beams, .. } => beams,
-        };
+        let (was, will) = (wanted(old), wanted(new));
         let is_begun = before.background.is_kept && new.processing.background.is_kept;
         let waiting = of_others([
             ("port", old.port != new.port),
             ("family", old.family() != new.family()),
-            ("model", model(old) != model(new)),
-            ("beams", beams(old) != beams(new)),
+            ("model", was.model != will.model),
+            ("beams", was.beams != will.beams),
             ("type", old.family != new.family),
             ("angle", old.variant.angle_deg != new.variant.angle_deg),
             ("resolution", old.variant.resolution_cdeg != new.variant.resolution_cdeg),
             ("unit", old.unit != new.unit),
-            ("mode", old.mode != new.mode),
+            ("mode", old.mode != new.mode || was.mode != will.mode),
+            ("idle", was.stop_when_idle != will.stop_when_idle),
             ("baud", old.baud != new.baud),
             ("background.start", is_begun && begin(old) != begin(new)),
         ]);

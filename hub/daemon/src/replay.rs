@@ -2,6 +2,7 @@
 //! nothing is asked.
 
 mod frames;
+mod packets;
 mod recorded;
 mod stream;
 
@@ -114,6 +115,7 @@ impl<'a, 'p> ReplayLink<'a, 'p> {
             let ended = match &mut recorded {
                 Recorded::Stream(stream) => stream::play(self, stream),
                 Recorded::Frames(frames) => frames::play(self, frames),
+                Recorded::Packets(frames) => packets::play(self, frames),
             };
             let Some(limit) = ended else { return };
             self.link.output.stand_until(limit.map_or(Nanos::MAX, |limit| clock::now() + limit));

@@ -4,11 +4,12 @@
 use std::path::Path;
 use std::sync::Arc;
 
-use config::{Config, Sources};
+use config::{Config, Scanner, Sources};
+use line::family::Model;
 use lms::Nanos;
 use port::Source;
 use recording::Recording;
-use schema::{Domain, Failure, Kind, check_sensor};
+use schema::{Domain, Failure, Family, Kind, check_sensor};
 
 use crate::player::{Play, Player, Progress};
 use crate::replay::{Origin, Recorded, tell_of_damage};
@@ -47,7 +48,7 @@ pub fn replay(
     let sensors = sensors(&recording, replay.sensor)?;
     let read = || configuration(sources, &sensors, file);
     let config = read()?;
-    let (links, left_out) = (config.links.len(), left_out(sources, &config)?);
+    let (links, left_out) = (config.links.len(), left_out(sources, &sensors, &config)?);
     for name in left_out {
         tracing::info!("{name}: not in the recording, left out");
     }
@@ -95,6 +96,20 @@ struct Sensor {
     recorded: Option<String>,
     /// Its link's.
     link: String,
+    /// What it is.
+    family: Family,
+    /// Where its head turns: the model, and the beams that were recorded, as far as they are known.
+    model: Option<Model>,
+    beams: Option<usize>,
+}
+
+impl Sensor {
+    /// The sensor of `recording`, which has no other one, for `link`.
+    fn new(recorded: Option<String>, link: String, recording: &Recording) -> Result<Sensor, Failure> {
+        let beams = recording.contents().beams.map(usize::from);
+        let family = recording.family().unwrap_or(Family::Lms);
+        Ok(Sensor { recorded, link, family, model: recording.model()?, beams })
+    }
 }
 
 fn sensors(recording: &Recording, wanted: Option<&str>) -> Result<Vec<Sensor>, Failure> {
@@ -102,14 +117,14 @@ fn sensors(recording: &Recording, wanted: Option<&str>) -> Result<Vec<Sensor>, F
     if names.is_empty() {
         let link = wanted.unwrap_or(UNNAMED).to_owned();
         check_sensor(&link).map_err(|failure| Failure { kind: Kind::Usage, ..failure })?;
-        return Ok(vec![Sensor { recorded: None, link }]);
+        return Ok(vec![Sensor::new(None, link, recording)?]);
     }
     if let Some(wanted) = wanted {
         recording.of(wanted)?;
     }
     let played = names.iter().filter(|name| wanted.is_none_or(|wanted| wanted == name.as_str()));
-    let sensor = |name: &String| Sensor { recorded: Some(name.clone()), link: link_name(name) };
-    let sensors: Vec<Sensor> = played.map(sensor).collect();
+    let sensor = |name: &String| Sensor::new(Some(name.clone()), link_name(name), &recording.of(name)?);
+    let sensors: Vec<Sensor> = played.map(sensor).collect::<Result<_, _>>()?;
     for (at, sensor) in sensors.iter().enumerate() {
         check_sensor(&sensor.link)?;
         if sensors[..at].iter().any(|other| other.link == sensor.link) {
@@ -130,25 +145,39 @@ fn link_name(sensor: &str) -> String {
 
 /// What is configured, with the sensors of the recording for links.
 fn configuration(sources: &Sources, sensors: &[Sensor], file: &Path) -> Result<Config, Failure> {
-    let mut sources = sources.clone();
-    // Not the path itself, which may have signs that have a meaning in a port's name.
-    sources.links.extend(sensors.iter().map(|sensor| format!("{}=file:recording", sensor.link)));
-    let mut config = Config::load(&sources)?;
+    let mut config = Config::load(&with_links(sources, sensors))?;
     config.links.retain(|link| sensors.iter().any(|sensor| sensor.link == link.name));
     for link in &mut config.links {
         link.port = Source::File { path: file.to_owned(), paced: true };
+        let of = sensors.iter().find(|sensor| sensor.link == link.name);
+        // What is not configured is as it was recorded.
+        if let Scanner::Turning(turning) = &mut link.scanner
+            && let Some(Sensor { model, beams, .. }) = of.filter(|_| turning.is_auto())
+        {
+            turning.model = model.unwrap_or(turning.model);
+            turning.beams = *beams;
+        }
     }
     Ok(config)
 }
 
+/// `sources`, and a link for each of the sensors, of its family unless another one is set for it.
+fn with_links(sources: &Sources, sensors: &[Sensor]) -> Sources {
+    let mut sources = sources.clone();
+    // Not the path itself, which may have signs that have a meaning in a port's name.
+    sources.links.extend(sensors.iter().map(|sensor| format!("{}=file:recording", sensor.link)));
+    let turning = sensors.iter().filter(|sensor| sensor.family != Family::Lms);
+    let families = turning.map(|sensor| format!("link.{}.family={}", sensor.link, sensor.family.name()));
+    sources.set.splice(..0, families);
+    sources
+}
+
 /// Links that are configured and not in `config`.
-fn left_out(sources: &Sources, config: &Config) -> Result<Vec<String>, Failure> {
+fn left_out(sources: &Sources, sensors: &[Sensor], config: &Config) -> Result<Vec<String>, Failure> {
     if sources.files.is_empty() {
         return Ok(Vec::new());
     }
-    let mut sources = sources.clone();
-    sources.links.extend(config.links.iter().map(|link| format!("{}=file:recording", link.name)));
-    let all = Config::load(&sources)?.links.into_iter().map(|link| link.name);
+    let all = Config::load(&with_links(sources, sensors))?.links.into_iter().map(|link| link.name);
     Ok(all.filter(|name| config.links.iter().all(|link| link.name != *name)).collect())
 }
 
@@ -162,7 +191,7 @@ mod tests {
     use super::*;
 
     fn sensor(name: &str) -> Sensor {
-        Sensor { recorded: None, link: name.to_owned() }
+        Sensor { recorded: None, link: name.to_owned(), family: Family::Lms, model: None, beams: None }
     }
 
     #[test]
@@ -178,7 +207,7 @@ mod tests {
         std::fs::write(&place, "[[link]]\nname = \"rear\"\nport = \"/dev/x\"\nbaud = 38400\n[[link]]\nname = \"up\"\nport = \"y\"\n").unwrap();
         let sources = Sources { files: vec![place.clone()], ..Sources::default() };
         let config = configuration(&sources, &[sensor("rear")], file).unwrap();
-        let left_out = left_out(&sources, &config).unwrap();
+        let left_out = left_out(&sources, &[sensor("rear")], &config).unwrap();
         std::fs::remove_file(&place).unwrap();
         assert_eq!(
             (config.links.len(), config.links[0].baud.rate(), left_out),

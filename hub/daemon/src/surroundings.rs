@@ -109,6 +109,13 @@ pub trait Line {
     /// The line is gone.
     fn set_baud(&self, baud: u32) -> io::Result<Option<io::Error>>;
 
+    /// Asserts DTR of a serial port, or clears it; a line without one ignores it.
+    ///
+    /// # Errors
+    ///
+    /// The line is gone.
+    fn set_dtr(&self, on: bool) -> io::Result<()>;
+
     /// Returns how many bytes there are to read; nothing if asking is not worth it.
     fn waiting(&self) -> Option<usize>;
 

@@ -249,6 +249,10 @@ impl Line for Port {
         self.try_baud(baud)
     }
 
+    fn set_dtr(&self, on: bool) -> io::Result<()> {
+        self.set_dtr(on)
+    }
+
     fn waiting(&self) -> Option<usize> {
         self.waiting()
     }

@@ -7,7 +7,7 @@ use line::Received;
 use lms::Nanos;
 use schema::ipc::DueRings;
 use schema::{
-    Background, Failure, Flags, Foreground, Header, Marks, Quality, Ring, Scan, Status, Wake, Zones,
+    Background, Failure, Family, Flags, Foreground, Header, Marks, Quality, Ring, Scan, Status, Wake, Zones,
 };
 
 use crate::pipeline::{Outputs, Pipeline, Relearned};
@@ -60,12 +60,17 @@ impl<'a, S: Surroundings> Topics<'a, S> {
     }
 
     /// What all samples from now on have in common: bits of [`Flags`].
-    pub(crate) fn set_flags(&mut self, flags: u16) {
+    pub(crate) fn set_flags(&mut self, flags: u8) {
         self.header.flags = flags;
     }
 
+    /// Of which family the sensor is.
+    pub(crate) fn set_family(&mut self, family: Family) {
+        self.header.family = family as u8;
+    }
+
     /// What is published from now on, until the next call, was recorded at `wall_ns`, and has these [`Flags`].
-    pub(crate) fn recall(&mut self, wall_ns: u64, flags: u16) {
+    pub(crate) fn recall(&mut self, wall_ns: u64, flags: u8) {
         (self.header.wall_ns, self.header.flags, self.is_recalled) = (wall_ns, flags, true);
     }
 
@@ -232,6 +237,12 @@ impl<'a, S: Surroundings> Topics<'a, S> {
             self.telegram.missed_out().max(self.scan.missed_out()).max(self.zones.missed_out());
         let of_wanted = self.marks.missed_out().max(self.foreground.missed_out());
         of_telegrams.max(of_wanted).max(self.status.missed_out())
+    }
+
+    /// Whether anybody follows what the sensor measures: of the status alone nobody needs a scanner that measures.
+    pub(crate) fn is_followed(&self) -> bool {
+        let of_scans = self.scan.is_heard() || self.zones.is_heard() || self.marks.is_heard();
+        of_scans || self.telegram.is_heard() || self.foreground.is_heard() || self.background.is_heard()
     }
 
     fn of_moment(&self, now: u64) -> Header {

@@ -1,27 +1,6 @@
-//! What a session hands out, and what it says of itself, in plain values.
+//! What a session says of itself, in plain values.
 
 use core::fmt;
-
-use line::Received;
-
-use crate::turn::Turn;
-
-/// What a session hands out.
-#[derive(Clone, Copy, Debug)]
-pub enum Heard<'a> {
-    /// Whole packets that arrived together, of at most 10 ms, without anything between them. Each packet is in one
-    /// of these, in the order in which they came.
-    Packets(Received<'a, Packets>),
-    /// A turn of the head, after its packets.
-    Turn(Turn<'a>),
-}
-
-/// What packets that arrived together say, taken together.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Packets {
-    /// How many there are.
-    pub count: usize,
-}
 
 /// Why a session is not where it should be.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

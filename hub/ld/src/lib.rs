@@ -6,17 +6,16 @@
 #![no_std]
 #![forbid(unsafe_code)]
 
-mod arrival;
+mod family;
 pub mod framer;
 mod heard;
 mod model;
 pub mod packet;
-mod sensor_clock;
 mod sequence;
 mod session;
 mod turn;
 
-pub use heard::{Heard, Packets, Trouble, Why};
+pub use heard::{Trouble, Why};
+pub use line::{Heard, Packets, Tally, Turn, TurnCounts};
 pub use model::Model;
 pub use session::{Session, Settings};
-pub use turn::{Turn, TurnCounts};

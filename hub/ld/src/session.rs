@@ -4,16 +4,16 @@
 
 mod driven;
 
-use line::{MILLIS, Nanos, Received, State, line_time};
+use line::{
+    Arrivals, MILLIS, Nanos, Packets, Received, SensorClock, State, Tally, Turn, TurnCounts, line_time,
+};
 
-use crate::arrival::Arrivals;
-use crate::framer::{Framer, Span, Tally};
-use crate::heard::{Packets, Trouble};
+use crate::framer::{Framer, Span};
+use crate::heard::Trouble;
 use crate::model::Model;
 use crate::packet::{LEN, Packet};
-use crate::sensor_clock::SensorClock;
 use crate::sequence::{Place, Sequence};
-use crate::turn::{Closed, Progress, Turn, TurnCounts, Turns};
+use crate::turn::{Closed, Progress, Turns};
 
 /// What a session shall do.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -50,6 +50,10 @@ pub struct Session {
     /// The grid, once it is known, and whether it is known what this stream is.
     beams: Option<usize>,
     is_learned: bool,
+    /// As [`line::family::Turning::scanner_time`].
+    pub(crate) scanner_time: Option<Nanos>,
+    /// As [`line::family::Turning::doubt`].
+    pub(crate) doubt: u8,
     /// Packets that were handed out and are not in turns yet.
     current: Option<Current>,
     now: Nanos,
@@ -57,8 +61,9 @@ pub struct Session {
     /// Until when nothing has to be read.
     rest_until: Nanos,
     room: usize,
-    /// The last stamp of a turn, behind which none goes.
+    /// The last stamp of a turn, behind which none goes, and that of the last packet.
     last_stamp: Nanos,
+    last_packet: Nanos,
     trouble: Option<Trouble>,
     /// Since when no packet came, and bytes read by then.
     quiet_since: (Nanos, u64),
@@ -103,12 +108,15 @@ impl Session {
             change_baud: false,
             beams: None,
             is_learned: false,
+            scanner_time: None,
+            doubt: 0,
             current: None,
             now,
             last_byte: now,
             rest_until: 0,
             room: 0,
             last_stamp: 0,
+            last_packet: 0,
             trouble: None,
             quiet_since: (now, 0),
             damaged: (0, 0),
@@ -131,11 +139,6 @@ impl Session {
     /// Points that the scanner measures in a second; nothing before enough packets came.
     pub fn points_per_second(&self) -> Option<f32> {
         self.sequence.points_per_second()
-    }
-
-    /// Why it is not where it should be.
-    pub fn trouble(&self) -> Option<Trouble> {
-        self.trouble.filter(|_| !matches!(self.phase, Phase::Paused))
     }
 
     /// What became of the bytes.
@@ -201,6 +204,8 @@ impl Session {
 
     /// Packets came: dates them, and remembers them for turns.
     fn receive(&mut self, span: Span) -> Received<'_, Packets> {
+        let mut span = span;
+        span.reasons |= core::mem::take(&mut self.doubt);
         let pace = (!self.settings.fixed_rate).then_some(self.baud);
         let packet_time = line_time(LEN, self.baud);
         let mut places = [Place::Odd; MOST];
@@ -217,20 +222,24 @@ impl Session {
             }
             places[number] = place;
         }
+        self.scanner_time = places[..span.packets].iter().rev().find_map(|place| place.time());
         let stamp = |place: Place| place.time().and_then(|time| self.clock.time(time));
         let first = stamp(places[0]);
         let last_byte = span.offset + (span.packets * LEN - 1) as u64;
         let latest = self.arrivals.latest(last_byte, pace);
         let last = stamp(places[span.packets - 1]).map_or(latest, |at| at + packet_time);
         let at = first.unwrap_or(last.saturating_sub(packet_time * span.packets as u64));
+        // One that came twice is dated by its arrival, and the next one by the scanner's clock.
+        let last = last.max(at).max(self.last_packet);
+        self.last_packet = last;
         self.current = Some(Current { span, places, packet: 0, progress: Progress::default() });
         self.cut |= self.framer.tally().packets == span.packets as u64 && self.framer.tally().discarded > 0;
         self.hear();
         Received {
             bytes: self.framer.bytes(span),
-            message: Packets { count: span.packets },
+            message: Packets { count: span.packets, is_checked: true, is_reply: false },
             first: at,
-            last: last.max(at),
+            last,
             estimated: first.is_none(),
             reasons: span.reasons,
         }

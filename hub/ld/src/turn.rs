@@ -2,45 +2,11 @@
 //! ahead is measured in one piece. A turn of which packets are missing is incomplete, two turns are never one, and of a
 //! turn less than half of which is there only the count is told. Knows no bytes and no hub's clock.
 
-use line::Nanos;
 use line::grid::{NO_RETURN, Point};
+use line::{Nanos, TurnCounts};
 
 use crate::packet::{POINTS, Packet, TURN};
 use crate::sequence::Place;
-
-/// A turn of the head.
-#[derive(Clone, Copy, Debug)]
-pub struct Turn<'a> {
-    /// Its points as they came, to be put on a [`line::grid::Grid`].
-    pub points: &'a [Point],
-    /// When beam 0 was measured: the first point, or where it would have been.
-    pub first: Nanos,
-    /// When the last point was measured.
-    pub last: Nanos,
-    /// How long a turn takes.
-    pub period: Nanos,
-    /// Beams of the grid that it is for.
-    pub beams: usize,
-    /// Points that the scanner measures in a second.
-    pub points_per_second: f32,
-    /// Whether packets of it are missing.
-    pub incomplete: bool,
-    /// Why it is suspect, bits of [`line::suspect`]; 0 is clean.
-    pub reasons: u8,
-}
-
-/// How many turns there were of which kind; every field only grows.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub struct TurnCounts {
-    /// Handed out, the incomplete ones too.
-    pub turns: u64,
-    /// Of these the incomplete ones.
-    pub incomplete: u64,
-    /// Begun, but less than half of it came.
-    pub short: u64,
-    /// Gone without a packet.
-    pub missed: u64,
-}
 
 /// The turn that is being measured.
 #[derive(Clone, Debug)]

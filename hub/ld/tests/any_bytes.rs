@@ -42,7 +42,7 @@ fn every_byte_is_counted_once() {
                     }
                     Output::Heard(Heard::Turn(turn)) => assert!(turn.points.len() >= POINTS),
                     Output::SetRate(_) => {}
-                    Output::Transmit { .. } => panic!("nothing is sent"),
+                    Output::Transmit { .. } | Output::SetDtr(_) => panic!("nothing is sent"),
                     Output::Rest(_) | Output::Wait { .. } => break,
                 }
             }

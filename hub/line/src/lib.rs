@@ -1,16 +1,27 @@
 //! What every conversation with a scanner on a line says, and nothing of any family of scanners: time, what a session
-//! wants next, how far it is, what arrived and why it is suspect, and the grid that a turn of points is put on.
+//! wants next, how far it is, what arrived and when, and why it is suspect; and what scanners share whose head turns:
+//! packets, turns, and the grid that a turn is put on.
 //!
 //! Sans-I/O: no port, no clock, no thread and no heap. Time comes in as an argument ([`Nanos`]), deadlines go out as
 //! return values.
 #![no_std]
 #![forbid(unsafe_code)]
 
+mod arrival;
+mod buffer;
+pub mod family;
+pub mod framing;
 pub mod grid;
+mod sensor_clock;
 mod session;
 pub mod suspect;
+mod turning;
 
+pub use arrival::Arrivals;
+pub use buffer::{Buffer, Tally};
+pub use sensor_clock::SensorClock;
 pub use session::{Account, Control, Output, Received, Session, State};
+pub use turning::{Heard, Packets, Turn, TurnCounts};
 
 /// A point in time or a span, in nanoseconds of one monotonic clock that the caller chooses.
 pub type Nanos = u64;

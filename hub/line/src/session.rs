@@ -1,6 +1,8 @@
 //! The session with one scanner as its driver sees it: bytes and the time go in, bytes, what arrived and the next deadline
 //! come out. It never waits, reads or writes itself. Refuses to know what the bytes say: that is the family's.
 
+use core::fmt;
+
 use crate::Nanos;
 
 /// A conversation with a scanner that goes on as long as the line is open. After every call that changes it, drain
@@ -12,6 +14,8 @@ pub trait Session {
         Self: 'a;
     /// What a deadline is for.
     type Why;
+    /// Why it is not where it should be; shown, it is said in words.
+    type Trouble: Copy + PartialEq + fmt::Display;
 
     /// Room for the next read; never empty once the outputs are drained.
     fn spare(&mut self) -> &mut [u8];
@@ -38,6 +42,11 @@ pub trait Session {
     /// recording cannot be controlled.
     fn control(&mut self, control: Control, now: Nanos);
 
+    /// Whether anybody follows what it hands out, as it is at `now`: a scanner may rest while nobody does.
+    fn followed(&mut self, now: Nanos, is_followed: bool) {
+        let _ = (now, is_followed);
+    }
+
     /// The byte of [`Output::Transmit`] was written at `now`.
     fn transmitted(&mut self, now: Nanos);
 
@@ -46,6 +55,9 @@ pub trait Session {
 
     /// How far it is.
     fn state(&self) -> State;
+
+    /// Why it is not where it should be; nothing if it is.
+    fn trouble(&self) -> Option<Self::Trouble>;
 
     /// The rate at which it listens, and talks if it does, in bits per second.
     fn rate(&self) -> u32;
@@ -59,6 +71,8 @@ pub trait Session {
 pub enum Output<H, W> {
     /// Set the port to this rate, in bits per second, and forget what it had received, then go on draining.
     SetRate(u32),
+    /// Assert the line DTR of a serial port, or clear it; other ports have none. Then go on draining.
+    SetDtr(bool),
     /// Write this byte, not before the time given, then say so by [`Session::transmitted`]. Do nothing else meanwhile:
     /// a request may have to come without pauses.
     Transmit {
@@ -85,6 +99,7 @@ impl<H, W> Output<H, W> {
     pub fn map<T>(self, f: impl FnOnce(H) -> T) -> Output<T, ()> {
         match self {
             Output::SetRate(rate) => Output::SetRate(rate),
+            Output::SetDtr(on) => Output::SetDtr(on),
             Output::Transmit { byte, not_before } => Output::Transmit { byte, not_before },
             Output::Heard(heard) => Output::Heard(f(heard)),
             Output::Rest(until) => Output::Rest(until),
@@ -160,6 +175,8 @@ pub struct Account {
     pub lost: u64,
     /// Bytes of streams that were in nothing.
     pub damaged: u64,
+    /// What looked like a transmission and had a wrong checksum.
+    pub rejected_checksum: u64,
     /// How often the session began again.
     pub resyncs: u64,
     /// Whether the first transmission came after a piece of one: what was in flight when the port was opened.

@@ -9,6 +9,7 @@ use crate::cadence::Cadence;
 use crate::damage::Damage;
 use crate::dialogue::Dialogue;
 use crate::framer::{Advance, Framer, Tally, TelegramSpan};
+use crate::header::Reject;
 use crate::identity::Identity;
 use crate::measured::MEASURED;
 use crate::outgoing::SOON;
@@ -202,6 +203,7 @@ impl Session {
 impl line::Session for Session {
     type Heard<'a> = Received<'a>;
     type Why = Why;
+    type Trouble = Trouble;
 
     fn spare(&mut self) -> &mut [u8] {
         let spare = self.framer.spare();
@@ -320,6 +322,10 @@ impl line::Session for Session {
         self.dialogue.state()
     }
 
+    fn trouble(&self) -> Option<Trouble> {
+        self.trouble()
+    }
+
     fn rate(&self) -> u32 {
         self.dialogue.baud.rate()
     }
@@ -341,6 +347,7 @@ impl line::Session for Session {
             due: self.cadence.due(),
             lost: self.cadence.lost(),
             damaged: self.damage.damaged(tally),
+            rejected_checksum: tally.rejected[Reject::Crc as usize],
             resyncs: self.dialogue.resyncs,
             began_with_a_cut: self.cut,
         }

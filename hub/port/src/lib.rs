@@ -99,6 +99,14 @@ impl Port {
         }
     }
 
+    /// Asserts DTR, or clears it; what has no such line ignores it.
+    pub fn set_dtr(&self, on: bool) -> io::Result<()> {
+        match self {
+            Port::Tty(tty) => tty.set_dtr(on),
+            Port::Tcp(_) => Ok(()),
+        }
+    }
+
     /// As [`Port::set_baud`], for callers with other rates to try: returns the error if this rate is not possible.
     pub fn try_baud(&self, baud: u32) -> io::Result<Option<io::Error>> {
         match self.set_baud(baud) {

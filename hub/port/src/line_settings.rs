@@ -40,6 +40,15 @@ pub(crate) fn apply_baud(line: impl AsFd, baud: u32) -> Result<()> {
     with(line, |port| set_baud(port, baud))
 }
 
+/// Asserts DTR, or clears it.
+///
+/// # Errors
+///
+/// There is no such line, or the whole line is gone.
+pub(crate) fn set_dtr(line: impl AsFd, on: bool) -> Result<()> {
+    with(line, |port| port.write_data_terminal_ready(on))
+}
+
 /// Forgets what came in.
 ///
 /// # Errors

@@ -111,6 +111,14 @@ impl Tty {
         })
     }
 
+    /// A terminal of a program, and some adapters, have no such line.
+    pub(crate) fn set_dtr(&self, on: bool) -> io::Result<()> {
+        match line_settings::set_dtr(&self.line, on) {
+            Err(_) if self.baud().is_none() => Err(self.gone()),
+            _ => Ok(()),
+        }
+    }
+
     /// How many bytes there are to read, if the driver tells.
     pub(crate) fn waiting(&self) -> Option<usize> {
         rustix::io::ioctl_fionread(&self.line).ok().map(|waiting| waiting as usize)

@@ -1,13 +1,17 @@
 //! Finds reflectors: neighbouring beams with a raised intensity become one mark, at their average weighted by
 //! intensity (paper III.B.2). Refuses to know what a mark belongs to, and where the robot is.
 
-use schema::{Contents, MARKS, Mark, Marks, Scan, in_degrees};
+use std::f64::consts::{PI, TAU};
+
+use schema::{Contents, Family, MARKS, Mark, Marks, Scan, in_degrees};
 
 /// What makes a mark.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Settings {
-    /// The least intensity of a beam that belongs to a mark; 0 is 1.
+    /// The least level of a beam that belongs to a mark, where intensities are levels of reflectors; 0 is 1.
     pub i_min: u8,
+    /// The same where they are the sensor's own counts; without it there are no marks then. 0 is 1.
+    pub level: Option<u16>,
     /// Ranges of neighbouring beams of a mark differ by at most so much.
     pub max_range_step_mm: u16,
     /// So many beams without enough intensity or a range, one after the other, do not part a mark.
@@ -16,7 +20,7 @@ pub struct Settings {
 
 impl Settings {
     /// As the paper has it.
-    pub const PAPER: Settings = Settings { i_min: 1, max_range_step_mm: 100, max_gap: 0 };
+    pub const PAPER: Settings = Settings { i_min: 1, level: None, max_range_step_mm: 100, max_gap: 0 };
 }
 
 impl Default for Settings {
@@ -38,21 +42,41 @@ impl MarkDetector {
 
     /// Writes the marks of `scan` into `out`, every byte of it.
     pub fn update(&mut self, scan: &Scan, out: &mut Marks) {
-        let intensities = scan.intensities();
+        (out.count, out.flags, out.reserved) = (0, 0, 0);
+        match self.least(scan) {
+            Ok(least) => self.find(scan, least, out),
+            Err(unavailable) => out.flags = unavailable,
+        }
+        out.mark_array[usize::from(out.count)..].fill(Mark::default());
+    }
+
+    /// The least intensity of a mark of `scan`; why there can be none, as flags.
+    fn least(&self, scan: &Scan) -> Result<u16, u8> {
+        // The sensor's mode has intensities, and they came.
+        if scan.intensity_bits == 0 || scan.contents & (Contents::UPPER | Contents::WIDE) == 0 {
+            return Err(Marks::UNAVAILABLE);
+        }
+        if Family::of_number(scan.family).is_some_and(Family::has_reflector_levels) {
+            return Ok(u16::from(self.settings.i_min.max(1)));
+        }
+        self.settings.level.map(|level| level.max(1)).ok_or(Marks::UNAVAILABLE | Marks::NO_LEVEL)
+    }
+
+    /// Writes the marks, of which no beam has an intensity below `least`.
+    fn find(&self, scan: &Scan, least: u16, out: &mut Marks) {
         let mut list = List { scan, out, count: 0, overflow: false };
         let unit_um = scan.unit_um;
-        let i_min = u16::from(self.settings.i_min.max(1));
         let mut open: Option<Open> = None;
-        for (i, intensity) in intensities.iter().enumerate() {
-            if intensity < i_min && open.is_none() {
+        for (i, intensity) in scan.intensities().iter().enumerate() {
+            if intensity < least && open.is_none() {
                 continue;
             }
-            match (scan.range(i).filter(|_| intensity >= i_min), &mut open) {
+            match (scan.range(i).filter(|_| intensity >= least), &mut open) {
                 (Some(value), Some(mark)) if mark.is_near(value, unit_um, &self.settings) => {
-                    mark.join(i, value, intensity);
+                    mark.join(scan, i, value, intensity);
                 }
                 (Some(value), _) => {
-                    open.replace(Open::at(i, value, intensity)).inspect(|mark| list.push(mark));
+                    open.replace(Open::at(scan, i, value, intensity)).inspect(|mark| list.push(mark));
                 }
                 (None, Some(mark)) => {
                     mark.gap += 1;
@@ -66,16 +90,8 @@ impl MarkDetector {
         open.inspect(|mark| list.push(mark));
         let List { count, overflow, .. } = list;
         out.count = count as u8;
-        let unavailable = if is_available(scan) { 0 } else { Marks::UNAVAILABLE };
-        out.flags = if overflow { Marks::OVERFLOW } else { 0 } | unavailable;
-        out.reserved = 0;
-        out.mark_array[count..].fill(Mark::default());
+        out.flags = if overflow { Marks::OVERFLOW } else { 0 };
     }
-}
-
-/// The sensor's mode has reflector bits, and they came.
-fn is_available(scan: &Scan) -> bool {
-    scan.intensity_bits != 0 && scan.contents & (Contents::UPPER | Contents::WIDE) != 0
 }
 
 /// The marks that were closed.
@@ -105,6 +121,8 @@ struct Open {
     weight: u64,
     /// Sum of w * i.
     beams: u64,
+    /// Sum of w times how far the exact angle is from that of the beam, in millionths of a degree.
+    off_udeg: i64,
     /// Sum of w * r in device units.
     ranges: u64,
     last_range: u16,
@@ -115,10 +133,11 @@ struct Open {
 }
 
 impl Open {
-    fn at(i: usize, range: u16, intensity: u16) -> Open {
+    fn at(scan: &Scan, i: usize, range: u16, intensity: u16) -> Open {
         let mut open = Open {
             weight: 0,
             beams: 0,
+            off_udeg: 0,
             ranges: 0,
             last_range: range,
             peak: 0,
@@ -126,7 +145,7 @@ impl Open {
             first_beam: i,
             last_beam: i,
         };
-        open.join(i, range, intensity);
+        open.join(scan, i, range, intensity);
         open
     }
 
@@ -135,10 +154,11 @@ impl Open {
         apart_um <= 1000 * u64::from(settings.max_range_step_mm)
     }
 
-    fn join(&mut self, i: usize, range: u16, intensity: u16) {
+    fn join(&mut self, scan: &Scan, i: usize, range: u16, intensity: u16) {
         let weight = u64::from(intensity);
         self.weight += weight;
         self.beams += weight * i as u64;
+        self.off_udeg += i64::from(intensity) * off_udeg(scan, i);
         self.ranges += weight * u64::from(range);
         self.peak = self.peak.max(intensity);
         (self.last_range, self.last_beam, self.gap) = (range, i, 0);
@@ -150,7 +170,8 @@ impl Open {
         let [first_udeg, step_udeg] =
             [scan.first_angle, scan.step].map(|angle| (1e6 * in_degrees(angle)).round() as i128);
         let weight = 1000 * i128::from(self.weight);
-        let angle = 2 * (first_udeg * i128::from(self.weight) + step_udeg * i128::from(self.beams)) + weight;
+        let of_beams = first_udeg * i128::from(self.weight) + step_udeg * i128::from(self.beams);
+        let angle = 2 * (of_beams + i128::from(self.off_udeg)) + weight;
         let last = scan.beams() - 1;
         Mark {
             angle_mdeg: angle.div_euclid(2 * weight) as i32,
@@ -162,6 +183,15 @@ impl Open {
             last_beam: self.last_beam as u16,
         }
     }
+}
+
+/// How far the exact angle of beam `i` is from that of the beam, in millionths of a degree: 0 where there is none. Either may
+/// be counted from another turn.
+fn off_udeg(scan: &Scan, i: usize) -> i64 {
+    let Some(exact) = scan.exact_angles().get(i).filter(|exact| exact.is_finite()) else { return 0 };
+    let off = f64::from(*exact) - (scan.first_angle + i as f64 * scan.step);
+    let off = (off + PI).rem_euclid(TAU) - PI;
+    (1e6 * in_degrees(off)).round() as i64
 }
 
 /// The whole number next to `sum / weight`, the greater of two.

@@ -1,6 +1,8 @@
 //! Groups neighbouring foreground beams into segments, and computes where each segment is. Refuses to know why a beam
 //! is in the foreground, and what object a segment is.
 
+use std::f64::consts::{PI, TAU};
+
 use schema::{Foreground, ForegroundArrays, Pose, Scan, Segment};
 
 /// Cuts the foreground of one sensor into segments.
@@ -13,9 +15,16 @@ pub struct Segmenter {
     angles: Option<(f64, f64)>,
     /// Where each beam points in the robot's frame: a unit vector.
     directions: Box<[(f64, f64)]>,
-    /// 2 (1 - cos step): what the law of cosines says of two neighbouring beams.
+    /// Of two neighbouring beams.
+    step: Step,
+}
+
+/// What follows from the angle between two points.
+#[derive(Clone, Copy, Default)]
+struct Step {
+    /// 2 (1 - cos step), of the law of cosines.
     spread: f64,
-    /// How far apart two neighbouring points of one surface are at most, per mm of range.
+    /// How far apart the two points of one surface are at most, per mm of range.
     slope: f64,
 }
 
@@ -28,13 +37,14 @@ impl Segmenter {
     /// For a sensor that sits at `pose` and has at most `beams` beams.
     pub fn new(pose: Pose, beams: usize) -> Segmenter {
         let directions = vec![(0.0, 0.0); beams].into();
-        Segmenter { pose, angles: None, directions, spread: 0.0, slope: 0.0 }
+        Segmenter { pose, angles: None, directions, step: Step::default() }
     }
 
     /// Fills in the segments of `foreground`, which was made from `scan`, and writes every byte of them.
     ///
     /// Two foreground beams belong together if they are neighbours and their points lie as near to each other as those
-    /// of a surface seen at 10 degrees: r sin(step) / sin(10 degrees - step) + 15 mm, r being the first one's range.
+    /// of a surface seen at 10 degrees: r sin(step) / sin(10 degrees - step) + 15 mm, r being the first one's range, and the
+    /// step from one exact angle to the other where there are such.
     pub fn update(&mut self, scan: &Scan, foreground: &mut Foreground) {
         self.point(scan);
         let unit_mm = f64::from(scan.unit_um) / 1000.0;
@@ -49,21 +59,24 @@ impl Segmenter {
             None => left_out = left_out.saturating_add(1),
         };
         let mut open: Option<Open> = None;
-        let mut ranges = ranges.iter();
+        let (mut ranges, exact_angles) = (ranges.iter(), scan.exact_angles());
         for (byte, &bits) in bits.iter().enumerate() {
             let mut rest = bits;
             while rest != 0 {
                 let beam = 8 * byte + rest.trailing_zeros() as usize;
                 rest &= rest - 1;
-                let (Some(&range), Some(&(x, y))) = (ranges.next(), self.directions.get(beam)) else { break };
+                let (Some(&range), Some(&even)) = (ranges.next(), self.directions.get(beam)) else { break };
                 let range_mm = f64::from(range) * unit_mm;
+                let exact = exact_angles.get(beam).filter(|exact| exact.is_finite());
+                let exact = exact.map(|&exact| f64::from(exact));
+                let (x, y) = exact.map_or(even, |exact| self.pose.direction(exact));
                 let point = (range_mm * x, range_mm * y);
                 match &mut open {
-                    Some(open) if open.last + 1 == beam && self.joins(open.last_mm, range_mm) => {
-                        open.add(beam, range, range_mm, point);
+                    Some(open) if open.last + 1 == beam && self.joins(open, range_mm, exact) => {
+                        open.add(beam, range, (range_mm, exact), point);
                     }
                     _ => {
-                        if let Some(done) = open.replace(Open::new(beam, range, range_mm, point)) {
+                        if let Some(done) = open.replace(Open::new(beam, range, (range_mm, exact), point)) {
                             put(&done, &self.pose);
                         }
                     }
@@ -78,10 +91,12 @@ impl Segmenter {
         foreground.left_out = left_out;
     }
 
-    /// A point at `next_mm` on the next beam belongs to one at `range_mm`.
-    fn joins(&self, range_mm: f64, next_mm: f64) -> bool {
-        let most = range_mm * self.slope + NOISE_MM;
-        (range_mm - next_mm) * (range_mm - next_mm) + range_mm * next_mm * self.spread <= most * most
+    /// A point at `next_mm` on the next beam, and at this `exact` angle, belongs to the last one of `open`.
+    fn joins(&self, open: &Open, next_mm: f64, exact: Option<f64>) -> bool {
+        let range_mm = open.last_mm;
+        let step = open.last_exact.zip(exact).map_or(self.step, |(last, next)| Step::of(next - last));
+        let most = range_mm * step.slope + NOISE_MM;
+        (range_mm - next_mm) * (range_mm - next_mm) + range_mm * next_mm * step.spread <= most * most
     }
 
     /// Makes the tables for scans with the angles of `scan`.
@@ -94,11 +109,19 @@ impl Segmenter {
         for (i, direction) in self.directions.iter_mut().enumerate() {
             *direction = self.pose.direction(scan.first_angle + i as f64 * scan.step);
         }
-        let step = scan.step.abs();
-        self.spread = 2.0 * (1.0 - step.cos());
+        self.step = Step::of(scan.step);
+    }
+}
+
+impl Step {
+    /// Of points so many radians apart, either way, and perhaps a turn more.
+    fn of(radians: f64) -> Step {
+        let step = ((radians + PI).rem_euclid(TAU) - PI).abs();
+        let spread = 2.0 * (1.0 - step.cos());
         // Steps of 10 degrees and more are no scanner's; nothing but the noise joins them.
         let flattest = FLATTEST_DEG.to_radians();
-        self.slope = if step < flattest { step.sin() / (flattest - step).sin() } else { 0.0 };
+        let slope = if step < flattest { step.sin() / (flattest - step).sin() } else { 0.0 };
+        Step { spread, slope }
     }
 }
 
@@ -108,6 +131,7 @@ struct Open {
     last: usize,
     nearest: u16,
     last_mm: f64,
+    last_exact: Option<f64>,
     /// As seen from the sensor, in the directions of the robot's frame.
     first_point: (f64, f64),
     last_point: (f64, f64),
@@ -115,22 +139,23 @@ struct Open {
 }
 
 impl Open {
-    fn new(beam: usize, range: u16, range_mm: f64, point: (f64, f64)) -> Open {
+    fn new(beam: usize, range: u16, (range_mm, exact): (f64, Option<f64>), point: (f64, f64)) -> Open {
         Open {
             first: beam,
             last: beam,
             nearest: range,
             last_mm: range_mm,
+            last_exact: exact,
             first_point: point,
             last_point: point,
             sum: point,
         }
     }
 
-    fn add(&mut self, beam: usize, range: u16, range_mm: f64, point: (f64, f64)) {
+    fn add(&mut self, beam: usize, range: u16, (range_mm, exact): (f64, Option<f64>), point: (f64, f64)) {
         self.last = beam;
         self.nearest = self.nearest.min(range);
-        self.last_mm = range_mm;
+        (self.last_mm, self.last_exact) = (range_mm, exact);
         self.last_point = point;
         self.sum = (self.sum.0 + point.0, self.sum.1 + point.1);
     }

@@ -4,7 +4,7 @@ mod scans;
 
 use fastrand::Rng;
 use preprocess::marks::{MarkDetector, Settings};
-use schema::{MARKS, Mark, Marks, Scan, ScanHead};
+use schema::{Family, MARKS, Mark, Marks, Scan, ScanHead};
 
 /// A beam that belongs to a mark: its index, range in mm and intensity.
 #[derive(Clone, Copy)]
@@ -85,6 +85,7 @@ fn marks_are_those_of_the_definition() {
     for _ in 0..2000 {
         let settings = Settings {
             i_min: random.u8(..4),
+            level: [None, Some(200)][random.usize(..2)],
             max_range_step_mm: [0, 50, 100, 1000][random.usize(..4)],
             max_gap: [0, 0, 1, 5][random.usize(..4)],
         };
@@ -156,4 +157,45 @@ fn without_reflector_bits_nothing_is_known() {
     assert!(!find(&scan, Settings::default()).is_available());
     let nothing = find(&lit(&[]), Settings::default());
     assert_eq!((nothing.count, nothing.is_available()), (0, true), "nothing there is something known");
+}
+
+/// A turn of eight beams at 1 m, with these intensities, each an eighth of a beam behind its middle.
+fn turn(intensities: [u8; 8]) -> Box<Scan> {
+    let mut scan = Scan::of(ScanHead::turning(Family::Ld, 8), &[1000; 8]);
+    let step = scan.step;
+    let arrays = scan.arrays();
+    arrays.upper.copy_from_slice(&intensities);
+    for (i, exact) in arrays.angles.iter_mut().enumerate() {
+        // The first one is told from the end of the turn.
+        *exact = ((i as f64 + 0.125) * step - if i == 0 { std::f64::consts::TAU } else { 0.0 }) as f32;
+    }
+    scan
+}
+
+#[test]
+fn counts_of_any_surface_are_marks_from_a_level_on() {
+    let scan = turn([3, 90, 240, 255, 241, 239, 0, 7]);
+    let none = find(&scan, Settings::default());
+    assert_eq!((none.count, none.is_available(), none.lacks_level()), (0, false, true));
+    let settings = Settings { level: Some(240), i_min: 7, ..Settings::PAPER };
+    let found = find(&scan, settings);
+    assert_eq!((found.count, found.is_available(), found.lacks_level()), (1, true, false));
+    let mark = found.mark_array[0];
+    assert_eq!((mark.first_beam, mark.last_beam, mark.peak, mark.weight), (2, 4, 255, 240 + 255 + 241));
+    // A level is not for reflector levels, and these are not for it.
+    let lms = find(&lit(&[(4, 3)]), Settings { level: Some(5), ..Settings::PAPER });
+    assert_eq!((lms.count, lms.is_available(), lms.lacks_level()), (1, true, false));
+    assert_eq!(find(&lit(&[(4, 3)]), settings).count, 0);
+}
+
+#[test]
+fn a_mark_is_at_the_exact_angles() {
+    let angle = |intensities| {
+        let settings = Settings { level: Some(100), ..Settings::PAPER };
+        f64::from(find(&turn(intensities), settings).mark_array[0].angle_mdeg) / 1000.0
+    };
+    let near = |angle: f64, expected: f64| assert!((angle - expected).abs() < 1e-3, "{angle} {expected}");
+    near(angle([0, 0, 100, 100, 0, 0, 0, 0]), -45.0 * (2.5 + 0.125));
+    near(angle([200, 0, 0, 0, 0, 0, 0, 0]), -45.0 * 0.125);
+    near(angle([0, 0, 0, 0, 0, 0, 0, 200]), -45.0 * 7.125);
 }

@@ -1,7 +1,7 @@
 //! Segments against a slow version of them: every point by sine and cosine, every distance from two points.
 
 use preprocess::segments::Segmenter;
-use schema::{Foreground, ForegroundHead, Pose, SEGMENTS, Scan, ScanHead, Segment};
+use schema::{Contents, Foreground, ForegroundHead, Pose, SEGMENTS, Scan, ScanHead, Segment};
 
 /// Beams of every scan here.
 const BEAMS: usize = 401;
@@ -23,7 +23,7 @@ fn foreground(ranges: &[(usize, u16)]) -> Box<Foreground> {
 
 /// Where beam `i` of `scan` ends in the robot's frame, in mm.
 fn point(scan: &Scan, pose: &Pose, i: usize, range: u16) -> (f64, f64) {
-    let turned = scan.first_angle + i as f64 * scan.step;
+    let turned = scan.angle(i);
     let turned = if pose.upside_down == 1 { -turned } else { turned };
     let angle = pose.yaw_rad + turned;
     let range_mm = f64::from(range) * f64::from(scan.unit_um) / 1000.0;
@@ -38,11 +38,20 @@ fn apart(a: (f64, f64), b: (f64, f64)) -> f64 {
 fn segments_are_those_of_the_formula() {
     let mut random = fastrand::Rng::with_seed(3);
     let mut most = 0;
+    // Of those where it makes a difference.
+    let mut others = 0;
     for round in 0..3_000 {
+        let is_exact = round % 2 == 1;
         let step_mdeg = [250, 500, 1000][random.usize(..3)];
         let unit_mm = [1, 10, 100][random.usize(..3)];
         let head = ScanHead::lms(BEAMS, random.i32(-180_000..0), step_mdeg, unit_mm, 13);
-        let scan = Scan::of(head, &[0; BEAMS]);
+        let contents = head.contents | if is_exact { Contents::ANGLES } else { 0 };
+        let mut scan = Scan::of(ScanHead { contents, ..head }, &[0; BEAMS]);
+        let (first_angle, step) = (scan.first_angle, scan.step);
+        for (i, exact) in scan.arrays().angles.iter_mut().enumerate() {
+            let turns = f64::from(random.i32(-1..=1)) * std::f64::consts::TAU;
+            *exact = (first_angle + (i as f64 + random.f64() - 0.5) * step + turns) as f32;
+        }
         let pose = Pose {
             x_m: random.f64() - 0.5,
             y_m: random.f64() - 0.5,
@@ -60,14 +69,23 @@ fn segments_are_those_of_the_formula() {
                 ranges.push((i, (range_mm / f64::from(unit_mm)) as u16));
             }
         }
-        let step = (f64::from(step_mdeg) / 1000.0).to_radians();
+        let even = (f64::from(step_mdeg) / 1000.0).to_radians();
+        let limit_mm =
+            |range_mm: f64, step: f64| range_mm * step.sin() / (10_f64.to_radians() - step).sin() + 15.0;
         let together = |a: &(usize, u16), b: &(usize, u16)| {
+            let step = (scan.angle(b.0) - scan.angle(a.0)).rem_euclid(std::f64::consts::TAU);
+            let step = if is_exact { step } else { even };
             let range_mm = f64::from(a.1) * f64::from(unit_mm);
-            let limit_mm = range_mm * step.sin() / (10_f64.to_radians() - step).sin() + 15.0;
-            a.0 + 1 == b.0 && apart(point(&scan, &pose, a.0, a.1), point(&scan, &pose, b.0, b.1)) <= limit_mm
+            let apart_mm = apart(point(&scan, &pose, a.0, a.1), point(&scan, &pose, b.0, b.1));
+            a.0 + 1 == b.0 && apart_mm <= limit_mm(range_mm, step)
         };
         let expected: Vec<_> = ranges.chunk_by(together).collect();
         most = most.max(expected.len());
+        if is_exact {
+            let mut of_grid = foreground(&ranges);
+            Segmenter::new(pose, BEAMS).update(&Scan::of(head, &[0; BEAMS]), &mut of_grid);
+            others += usize::from(usize::from(of_grid.segments) != expected.len().min(SEGMENTS));
+        }
 
         let mut out = foreground(&ranges);
         Segmenter::new(pose, BEAMS).update(&scan, &mut out);
@@ -93,6 +111,7 @@ fn segments_are_those_of_the_formula() {
         }
     }
     assert!(most > SEGMENTS, "{most} segments at most: none was left out");
+    assert!(others > 100, "{others} differ from those of an even grid");
 }
 
 #[test]

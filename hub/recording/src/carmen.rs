@@ -111,7 +111,7 @@ impl Sweep {
     pub(crate) fn frame(&self, own: Encoding, encoding: Encoding) -> Frame {
         let words = self.words(own, encoding);
         let telegram = measured::encode(0, encoding.unit, &words, STATUS).bytes().to_vec();
-        Frame { telegram, wall_ns: self.wall_ns(), header: None }
+        Frame { telegram, wall_ns: self.wall_ns(), ..Frame::default() }
     }
 
     /// Its time in ns.

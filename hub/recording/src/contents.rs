@@ -4,6 +4,7 @@ use lms::measured::Measured;
 use lms::reply::Reply;
 use lms::telegram::Telegram;
 use lms::variant::{Mode, Unit, Variant};
+use schema::Family;
 
 use crate::{Damage, Unfit};
 
@@ -23,6 +24,8 @@ pub enum Form {
 pub struct Contents {
     /// Its form.
     pub form: Form,
+    /// Of which family its first sensor is, a number of [`Family`]; a log is of an LMS.
+    pub family: u8,
     /// Names of the sensors in it, in order of appearance; a stream and a log name none.
     pub sensors: Vec<String>,
     /// Number of whole telegrams; of a log, of scans.
@@ -31,6 +34,10 @@ pub struct Contents {
     pub scans: u64,
     /// Wall clock of the first and the last telegram, ns since 1970, if there are stamps.
     pub span: Option<(u64, u64)>,
+    /// How long it took by the scanner's own clock, in ns, where that is all there is.
+    pub scanner_ns: Option<u64>,
+    /// Beams of the scans that were recorded of a scanner whose head turns.
+    pub beams: Option<u16>,
     /// Variant of the first scan.
     pub variant: Option<Variant>,
     /// Unit of the first scan; of a log the one in which its ranges are whole values.
@@ -58,10 +65,13 @@ impl Contents {
     pub(crate) fn new(form: Form) -> Contents {
         Contents {
             form,
+            family: Family::Lms as u8,
             sensors: Vec::new(),
             telegrams: 0,
             scans: 0,
             span: None,
+            scanner_ns: None,
+            beams: None,
             variant: None,
             unit: None,
             mode: None,
@@ -71,10 +81,21 @@ impl Contents {
         }
     }
 
-    /// Counts a telegram, and believes what it says of the sensor.
-    pub(crate) fn note(&mut self, telegram: &[u8], wall_ns: Option<u64>) {
+    /// Returns whether it is of an LMS.
+    pub fn is_lms(&self) -> bool {
+        self.family == Family::Lms as u8
+    }
+
+    /// Counts a telegram of a sensor of `family`, and believes what it says of the sensor.
+    pub(crate) fn note(&mut self, family: u8, telegram: &[u8], wall_ns: Option<u64>) {
+        if self.telegrams == 0 {
+            self.family = family;
+        }
         self.telegrams += 1;
         self.note_time(wall_ns);
+        if family != Family::Lms as u8 {
+            return;
+        }
         let Some(telegram) = Telegram::check(telegram) else { return };
         if let Some(Reply::Configuration(configuration)) = Reply::decode(telegram) {
             self.mode = self.mode.or(Some(configuration.mode()));

@@ -5,7 +5,9 @@ mod copy;
 mod decoded;
 mod output;
 mod scans;
+mod target;
 mod times;
+mod turns;
 mod views;
 
 use std::cell::Cell;
@@ -21,6 +23,8 @@ use schema::{Failure, Kind, Topic, check_followed};
 use crate::{Damage, Encoding, Form, Frame, Recording, carmen};
 use decoded::Sight;
 use output::{Place, unwritable};
+use target::target_of;
+pub use target::{Target, form_name};
 use times::Times;
 use views::{Csv, Ros2, View};
 
@@ -41,28 +45,6 @@ pub struct ConvertOptions {
     pub mode: Option<Mode>,
     /// How an MCAP file is packed, if not as usual.
     pub compression: Option<Compression>,
-}
-
-/// What a recording becomes.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Target {
-    /// A recording again, of this form.
-    Recording(Form),
-    /// An MCAP file with only messages of ROS 2.
-    Ros2,
-    /// A row of columns for each scan.
-    Csv,
-}
-
-impl Target {
-    /// The target as a word.
-    pub fn name(self) -> &'static str {
-        match self {
-            Target::Recording(form) => form_name(form),
-            Target::Ros2 => "ROS 2",
-            Target::Csv => "CSV",
-        }
-    }
 }
 
 /// What was converted.
@@ -291,6 +273,19 @@ fn encoding(recording: &Recording, target: Target) -> Result<Encoding, Failure> 
         let hint = "round its ranges first; `scanhub replay` plays it rounded";
         return Err(Failure::new(Kind::Input, message, hint));
     }
+    if !contents.is_lms() && target == Target::Recording(Form::Carmen) {
+        let message = format!(
+            "{} is of a scanner that looks all around, which a CARMEN log has no place for",
+            recording.path().display()
+        );
+        let hint = "name OUT.mcap with --ros2, or OUT.csv";
+        return Err(Failure::new(Kind::Input, message, hint));
+    }
+    if recording.family().is_none() && !matches!(target, Target::Recording(_)) {
+        let (place, number) = (recording.path().display(), contents.family);
+        let message = format!("{place} is of a scanner of family number {number}, which is not known here");
+        return Err(Failure::new(Kind::Input, message, "a later version of scanhub recorded it: use that"));
+    }
     let mode = contents.readable();
     if mode.is_none() && target == Target::Recording(Form::Carmen) {
         let message = format!("{} does not contain its measuring mode", recording.path().display());
@@ -307,55 +302,9 @@ fn frames(recording: &Recording, encoding: Encoding) -> Result<impl Iterator<Ite
         let telegram = carmen::configuration(encoding);
         let took_ns = lms::line_time(telegram.len(), Baud::B500000.rate());
         let wall_ns = contents.span.map(|(first_ns, _)| first_ns.saturating_sub(took_ns));
-        Frame { telegram, wall_ns, header: None }
+        Frame { telegram, wall_ns, ..Frame::default() }
     });
     Ok(told.into_iter().chain(recording.telegrams(encoding)?))
-}
-
-/// What the name of the file and the options tell.
-fn target_of(options: &ConvertOptions) -> Result<Target, Failure> {
-    let target = ending(&options.output)?;
-    let usage = |message: &str, hint: &str| Err(Failure::new(Kind::Usage, message, hint));
-    match (target, options.ros2) {
-        (Target::Recording(Form::Mcap), true) => Ok(Target::Ros2),
-        (Target::Csv | Target::Recording(Form::Telegrams | Form::Carmen), _)
-            if options.compression.is_some() =>
-        {
-            usage("--compression is for MCAP files", "add .gz to OUT, which compresses it")
-        }
-        (_, true) => usage("--ros2 makes an MCAP file", "scanhub convert IN OUT.mcap --ros2"),
-        (Target::Recording(_), _) if options.mode.is_some() => {
-            usage("--mode is for scans; telegrams are copied as they are", "with --ros2, or OUT.csv")
-        }
-        (target, false) => Ok(target),
-    }
-}
-
-/// What the name of a file tells.
-fn ending(path: &Path) -> Result<Target, Failure> {
-    let name = path.file_name().map(|name| name.to_string_lossy().to_lowercase()).unwrap_or_default();
-    let plain = name.strip_suffix(".gz").unwrap_or(&name);
-    match plain.rsplit_once('.') {
-        _ if name == "-" => Ok(Target::Recording(Form::Telegrams)),
-        Some((_, "mcap")) if plain == name => Ok(Target::Recording(Form::Mcap)),
-        Some((_, "log" | "clf")) => Ok(Target::Recording(Form::Carmen)),
-        Some((_, "bin" | "raw")) => Ok(Target::Recording(Form::Telegrams)),
-        Some((_, "csv")) => Ok(Target::Csv),
-        _ => {
-            let message = format!("the ending of {} is not a known format", path.display());
-            let hint = ".mcap; .log (CARMEN), .bin (telegram stream), .csv, also with .gz; or - for stdout";
-            Err(Failure::new(Kind::Usage, message, hint))
-        }
-    }
-}
-
-/// The form as a word.
-pub fn form_name(form: Form) -> &'static str {
-    match form {
-        Form::Telegrams => "telegram stream",
-        Form::Carmen => "CARMEN log",
-        Form::Mcap => "MCAP",
-    }
 }
 
 /// Packed if the name of the file says so.

@@ -13,29 +13,45 @@ mod damage;
 mod mcap;
 mod open;
 mod packed;
+mod packets;
 mod stream;
+mod survey;
+mod virtual_time;
 
 pub use carmen::{BEYOND, Unfit};
 pub use contents::{Contents, Form};
 pub use damage::Damage;
 pub use open::{Encoding, Recording};
+pub use virtual_time::VirtualTime;
 
 use lms::measured::MEASURED;
+use schema::Family;
 
-/// One telegram of a recording.
-#[derive(Clone, Debug, PartialEq, Eq)]
+/// One telegram of a recording, or the packets that arrived together.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Frame {
-    /// The whole telegram, STX to checksum; of a telegram stream bit for bit as it was received.
+    /// The whole telegram, STX to checksum; of other families than LMS whole packets. Of a stream bit for bit as it was
+    /// received.
     pub telegram: Vec<u8>,
+    /// Of which family it is, a number of [`Family`].
+    pub family: u8,
     /// When it was measured, in nanoseconds since 1970, if the recording contains that.
     pub wall_ns: Option<u64>,
+    /// When it was measured by the scanner's own clock, in nanoseconds from the first one on, where that is all there is.
+    pub scanner_ns: Option<u64>,
+    /// Why it is suspect, bits of [`line::suspect`].
+    pub reasons: u8,
     /// What the hub knew of it when it was recorded: numbers, stamps, quality. Streams and logs have none.
     pub header: Option<schema::Header>,
 }
 
 impl Frame {
-    /// Whether it is a telegram of measured values (B0h), which is what a sensor streams.
+    /// Whether it is a telegram of measured values (B0h), which is what an LMS streams.
     pub fn is_scan(&self) -> bool {
-        self.telegram.get(4) == Some(&MEASURED)
+        is_scan(self.family, &self.telegram)
     }
+}
+
+pub(crate) fn is_scan(family: u8, telegram: &[u8]) -> bool {
+    family == Family::Lms as u8 && telegram.get(4) == Some(&MEASURED)
 }

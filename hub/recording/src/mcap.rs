@@ -20,7 +20,7 @@ use std::sync::Arc;
 
 use lms::variant::Mode;
 use schema::datagram::Packed;
-use schema::{Header, Pace, Status, Topic};
+use schema::{Family, Header, Pace, Scan, Status, Topic};
 
 use crate::open::is_end;
 use crate::{Contents, Damage, Form, Frame};
@@ -160,7 +160,7 @@ impl Survey {
             *numbers = Numbers { last: Some(header), estimated: 0 };
         }
         for contents in [&mut self.whole, of_sensor(&mut self.sensors, &sighting.sensor)] {
-            contents.note(&sighting.telegram, Some(sighting.header.wall_ns));
+            contents.note(sighting.header.family, &sighting.telegram, Some(sighting.header.wall_ns));
             contents.damage.telegrams = contents.damage.telegrams.saturating_add(missing);
             contents.damage.estimated += u64::from(sighting.is_estimated);
         }
@@ -183,6 +183,14 @@ impl Survey {
                     self.lives += 1;
                 }
                 None => {}
+            }
+        }
+        if place.has_scans() && header.family != Family::Lms as u8 {
+            let of_sensor = of_sensor(&mut self.sensors, &place.sensor);
+            let mut scan = Box::<Scan>::default();
+            if of_sensor.beams.is_none() && Scan::unpack_into(&mut scan, payload) {
+                of_sensor.beams = Some(scan.beams() as u16);
+                self.whole.beams = self.whole.beams.or(of_sensor.beams);
             }
         }
         let mut status = Status::default();
@@ -218,7 +226,14 @@ impl<R: Read> Iterator for Frames<R> {
             if let Item::Telegram(Sighting { sensor, header, telegram, .. }) = self.reader.next().ok()??
                 && sensor == self.sensor
             {
-                return Some(Frame { telegram, wall_ns: Some(header.wall_ns), header: Some(header) });
+                return Some(Frame {
+                    telegram,
+                    family: header.family,
+                    wall_ns: Some(header.wall_ns),
+                    scanner_ns: None,
+                    reasons: header.reasons,
+                    header: Some(header),
+                });
             }
         }
     }

@@ -5,15 +5,18 @@ use std::fmt;
 use std::io::{self, BufRead, BufReader, Read};
 use std::path::{Path, PathBuf};
 
+use line::family::{Model, Wanted};
 use lms::variant::{Mode, Unit};
-use schema::{Failure, Kind, regular};
+use schema::{Failure, Family, Kind, regular};
 
-use crate::carmen::{self, Census, Log, Wrong};
+use crate::carmen::{self, Log};
 #[cfg(feature = "mcap")]
 use crate::mcap::{Knowledge, reader::Reader};
 use crate::packed::Packed;
+use crate::packets::Packets;
 use crate::stream::Telegrams;
-use crate::{Contents, Form, Frame};
+use crate::survey::{survey_log, survey_packets, survey_stream};
+use crate::{Contents, Form, Frame, VirtualTime};
 
 /// How a log's metres become value words; a telegram stream is what it is.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -78,7 +81,10 @@ impl Recording {
         }
         let contents = match form {
             Form::Carmen => survey_log(&path, reader)?,
-            _ => survey_stream(&path, reader)?,
+            _ => match survey_stream(&path, reader)? {
+                contents if contents.telegrams == 0 => survey_packets(&path)?.unwrap_or(contents),
+                contents => contents,
+            },
         };
         if form == Form::Carmen && contents.telegrams == 0 {
             return Err(refused(&path, "is a CARMEN log without a scan"));
@@ -146,6 +152,36 @@ impl Recording {
         None
     }
 
+    /// Returns the family of its first sensor; nothing if this version does not know it.
+    pub fn family(&self) -> Option<Family> {
+        Family::of_number(self.contents.family)
+    }
+
+    /// Returns what its scanner is, if that is one whose head turns, as far as its first packets tell.
+    ///
+    /// # Errors
+    ///
+    /// As [`telegrams`](Self::telegrams).
+    pub fn model(&self) -> Result<Option<Model>, Failure> {
+        let wanted = Wanted { fixed_rate: true, listen_only: true, ..Wanted::default() };
+        let Some(session) = self.family().and_then(|family| scanner::Session::begin(family, wanted, 0))
+        else {
+            return Ok(None);
+        };
+        let mut session = VirtualTime::new(session, 0);
+        // Nothing of it is encoded here.
+        let mut frames = self.telegrams(Encoding { unit: Unit::Mm, mode: Mode(0) })?;
+        let mut told = None;
+        for frame in frames.by_ref().take(TELLING) {
+            session.take(0, &frame.telegram, |_| {});
+            told = session.session().model();
+            if told.is_some() {
+                break;
+            }
+        }
+        Ok(told)
+    }
+
     /// Where it is.
     pub fn path(&self) -> &Path {
         &self.path
@@ -177,12 +213,15 @@ impl Recording {
                 let (mut log, own) = (Log::new(reader), self.encoding().unwrap_or(encoding));
                 Box::new(std::iter::from_fn(move || Some(log.following()?.frame(own, encoding))))
             }
-            Form::Telegrams => {
-                let mut telegrams = Telegrams::new(reader);
-                Box::new(std::iter::from_fn(move || {
-                    Some(Frame { telegram: telegrams.next().ok()??, wall_ns: None, header: None })
-                }))
-            }
+            Form::Telegrams => match self.family().and_then(|family| Packets::of(family, reader)) {
+                Some(mut packets) => Box::new(std::iter::from_fn(move || packets.next().ok()?)),
+                None => {
+                    let mut telegrams = Telegrams::new(self::reader(&self.path)?);
+                    Box::new(std::iter::from_fn(move || {
+                        Some(Frame { telegram: telegrams.next().ok()??, ..Frame::default() })
+                    }))
+                }
+            },
             Form::Mcap => self.telegrams_of_sensor(reader)?,
         })
     }
@@ -248,64 +287,13 @@ impl Recording {
     }
 }
 
-fn survey_log(path: &Path, reader: impl BufRead) -> Result<Contents, Failure> {
-    let mut contents = Contents::new(Form::Carmen);
-    let (mut log, mut census, mut refusal) = (Log::new(reader), Census::default(), None);
-    loop {
-        match log.next() {
-            Ok(Some(sweep)) => {
-                contents.note_scan(sweep.variant(), sweep.wall_ns());
-                census.note(&sweep.ranges_m);
-            }
-            Ok(None) => break,
-            Err(Wrong::File(error)) if is_end(&error) && contents.scans > 0 => {
-                contents.damage.is_cut = true;
-                break;
-            }
-            Err(Wrong::File(error)) => return Err(unreadable(path, &error)),
-            Err(Wrong::Line(wrong)) => {
-                let message = format!("{}:{}: {wrong}", path.display(), log.line);
-                let hint = "a scan is: FLASER 361 RANGE... in metres";
-                refusal.get_or_insert(Failure::new(Kind::Input, message, hint));
-                contents.damage.telegrams += 1;
-                contents.damage.is_harmed = true;
-            }
-        }
-    }
-    let (encoding, unfit) = census.encoding(log.told);
-    (contents.unit, contents.mode, contents.unfit) = (Some(encoding.unit), Some(encoding.mode), unfit);
-    // Where no line is right it is the format that is wrong, not the file.
-    match refusal.filter(|_| contents.scans == 0) {
-        Some(refusal) => Err(refusal),
-        None => Ok(contents),
-    }
-}
-
-fn survey_stream(path: &Path, reader: impl Read) -> Result<Contents, Failure> {
-    let mut contents = Contents::new(Form::Telegrams);
-    let mut telegrams = Telegrams::new(reader);
-    loop {
-        match telegrams.next() {
-            Ok(Some(bytes)) => contents.note(&bytes, None),
-            Ok(None) => break,
-            Err(error) if is_end(&error) && contents.telegrams > 0 => {
-                contents.damage.is_cut = true;
-                break;
-            }
-            Err(error) => return Err(unreadable(path, &error)),
-        }
-    }
-    contents.damage.bytes = telegrams.discarded();
-    Ok(contents)
-}
-
 /// Whether a reader that fails so has no more to give, and the disk is not to blame: a packed file is cut or harmed.
 pub(crate) fn is_end(error: &io::Error) -> bool {
     use io::ErrorKind::{InvalidData, InvalidInput, UnexpectedEof};
     matches!(error.kind(), InvalidData | InvalidInput | UnexpectedEof)
 }
 
-fn reader(path: &Path) -> Result<Box<dyn BufRead + Send>, Failure> {
+pub(crate) fn reader(path: &Path) -> Result<Box<dyn BufRead + Send>, Failure> {
     open(path).map_err(|error| unreadable(path, &error))
 }
 
@@ -317,7 +305,7 @@ fn open(path: &Path) -> io::Result<Box<dyn BufRead + Send>> {
     Ok(Box::new(file))
 }
 
-fn unreadable(path: &Path, error: &io::Error) -> Failure {
+pub(crate) fn unreadable(path: &Path, error: &io::Error) -> Failure {
     let hint = match error.kind() {
         io::ErrorKind::NotFound => "give the path of an existing recording",
         io::ErrorKind::PermissionDenied => "the file must be readable by this user",
@@ -345,3 +333,5 @@ const GZIP: &[u8] = &[0x1F, 0x8B];
 const MCAP: &[u8] = b"\x89MCAP0\r\n";
 /// Enough for the head of a log to show a line that tells it.
 const BUFFER: usize = 64 * 1024;
+/// Frames within which a model is known.
+const TELLING: usize = 500;

@@ -1,7 +1,9 @@
-//! Decodes a telegram of the sensor into a scan: the only file that knows both. Here raw words become ranges; the hub
-//! lets it write them directly into the shared memory that consumers read.
+//! What families speak and what consumers read meet here alone: the list of the families, and decoders of their telegrams
+//! and turns into scans. Here raw words become ranges; the hub lets them be written directly into the shared memory that
+//! consumers read.
 #![forbid(unsafe_code)]
 
+mod families;
 mod turning;
 
 use line::suspect;
@@ -9,6 +11,7 @@ use lms::measured::Measured;
 use lms::variant::{Mode, Variant};
 use schema::{Contents, Reasons, Scan, ScanArrays, ScanHead};
 
+pub use families::{Introduction, Session, Trouble, features};
 pub use turning::Turning;
 
 /// Bytes of the scan that `measured` makes.

@@ -1,35 +1,54 @@
-//! How many beams a grid for each model of LDROBOT should have: what share of its points find their bin taken, and what
-//! share of the bins stays empty, against the number of bins; and how long a turn takes to be put there. The tables of
-//! docs/scanners.md: `cargo run --release -p scanhub-sim --example beams`.
+//! How many beams a grid for each model of a turning scanner should have: what share of its points find their bin taken,
+//! and what share of the bins stays empty, against the number of bins; and how long a turn takes to be put there. The
+//! tables of docs/scanners.md: `cargo run --release -p scanhub-sim --example beams`.
 
-use ld::{Heard, Model, Session, Settings};
 use line::grid::{Grid, Point};
-use line::{MILLIS, Nanos, Output, Session as _};
-use sim::device::Device as _;
+use line::{Heard, MILLIS, Nanos, Output, Session, line_time};
+use sim::Arrival;
+use sim::device::Device;
 use sim::ld::{Head, HeadSettings, Packets};
 use sim::pty::now_ns;
+
 use sim::room::Room;
+use sim::rplidar::{Unit, UnitSettings};
 use sim::world::World;
 
-/// The whole turns of `seconds` of a `model` in a furnished room.
-fn turns(model: Model, seconds: u64) -> Vec<Vec<Point>> {
+fn room() -> Room {
     let world: World = "room".parse().expect("a built-in world");
-    let room = Packets::Room(Box::new(Room::new(&world, 1)));
-    let mut head = Head::new(HeadSettings::of(model), room);
-    let mut session = Session::new(Settings { model: Some(model), ..Settings::default() }, 0);
+    Room::new(&world, 1)
+}
+
+/// The whole turns that `session` makes of what `device` sends in `seconds`.
+fn turns<S>(mut session: S, mut device: impl Device, seconds: u64) -> Vec<Vec<Point>>
+where
+    S: for<'a> Session<Heard<'a> = Heard<'a>>,
+{
     let (mut now, mut turns): (Nanos, Vec<Vec<Point>>) = (0, Vec::new());
     while now < seconds * 1_000 * MILLIS {
         now += MILLIS;
         let mut bytes = Vec::new();
-        while let Some(chunk) = head.poll_transmit(now) {
+        while let Some(chunk) = device.poll_transmit(now) {
             bytes.extend(chunk.bytes);
         }
-        session.spare()[..bytes.len()].copy_from_slice(&bytes);
-        session.commit(now, bytes.len());
+        let spare = session.spare();
+        let len = bytes.len().min(spare.len());
+        spare[..len].copy_from_slice(&bytes[..len]);
+        session.commit(now, len);
+        if len == 0 {
+            session.handle_timeout(now);
+        }
         loop {
             match session.poll_output() {
                 Output::Heard(Heard::Turn(turn)) if !turn.incomplete => turns.push(turn.points.to_vec()),
-                Output::Heard(_) | Output::SetRate(_) | Output::Transmit { .. } => {}
+                Output::Transmit { byte, .. } => {
+                    now += line_time(1, device.rate());
+                    while device.poll_transmit(now).is_some() {}
+                    if session.rate() == device.rate() {
+                        device.receive(byte, Arrival::at(now));
+                    }
+                    session.transmitted(now);
+                }
+                Output::Heard(_) | Output::SetRate(_) | Output::SetDtr(_) => {}
                 Output::Rest(_) | Output::Wait { .. } => break,
             }
         }
@@ -58,24 +77,37 @@ impl Sheet {
     }
 }
 
+/// The rows of one model, which measures so many points in a turn.
+fn rows(name: &str, a_turn: usize, turns: &[Vec<Point>]) {
+    let points: usize = turns.iter().map(Vec::len).sum();
+    for percent in [67, 80, 90, 95, 99, 100, 101, 105, 110, 120, 133] {
+        let mut sheet = Sheet::new(a_turn * percent / 100);
+        let (mut collapsed, mut empty) = (0, 0);
+        for turn in turns {
+            let placed = sheet.fill(turn);
+            (collapsed, empty) = (collapsed + placed.0, empty + placed.1);
+        }
+        let beams = sheet.grid.beams();
+        let collapsed = 100.0 * f64::from(collapsed) / points as f64;
+        let empty = 100.0 * f64::from(empty) / (beams * turns.len()) as f64;
+        println!("| {name} | {beams} | {collapsed:.1} % | {empty:.1} % |");
+    }
+}
+
 fn main() {
     println!("| model | beams | of points collapsed | of beams not measured |\n|---|---|---|---|");
-    for model in [Model::Ld19, Model::Stl27l, Model::Ld14p] {
-        let turns = turns(model, 30);
-        let points: usize = turns.iter().map(Vec::len).sum();
-        let a_turn = (model.points_per_second() / model.turns_per_second()) as usize;
-        for percent in [67, 80, 90, 95, 99, 100, 101, 105, 110, 120, 133] {
-            let mut sheet = Sheet::new(a_turn * percent / 100);
-            let (mut collapsed, mut empty) = (0, 0);
-            for turn in &turns {
-                let placed = sheet.fill(turn);
-                (collapsed, empty) = (collapsed + placed.0, empty + placed.1);
-            }
-            let beams = sheet.grid.beams();
-            let collapsed = 100.0 * f64::from(collapsed) / points as f64;
-            let empty = 100.0 * f64::from(empty) / (beams * turns.len()) as f64;
-            println!("| {} | {beams} | {collapsed:.1} % | {empty:.1} % |", model.name());
-        }
+    for model in [ld::Model::Ld19, ld::Model::Stl27l, ld::Model::Ld14p] {
+        let session = ld::Session::new(ld::Settings { model: Some(model), ..ld::Settings::default() }, 0);
+        let head = Head::new(HeadSettings::of(model), Packets::Room(Box::new(room())));
+        let a_turn = model.points_per_second() / model.turns_per_second();
+        rows(model.name(), a_turn as usize, &turns(session, head, 30));
+    }
+    for model in rplidar::Model::ALL {
+        let settings = rplidar::Settings { model: Some(model), ..rplidar::Settings::default() };
+        let simulated =
+            sim::rplidar::Model::ALL.into_iter().find(|simulated| simulated.name() == model.name());
+        let unit = Unit::new(UnitSettings::of(simulated.expect("it is simulated")), room());
+        rows(model.name(), model.beams(), &turns(rplidar::Session::new(settings, 0), unit, 30));
     }
     let mut random = fastrand::Rng::with_seed(1);
     let mut points: Vec<Point> = (0..3_240)

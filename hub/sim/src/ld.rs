@@ -1,19 +1,23 @@
 //! A scanner of LDROBOT, without a line and without a clock: its head turns and measures point by point, each at its own
 //! time, and each twelve of them leave as a packet. It never listens. Or it sends packets that were recorded.
 
-use std::f64::consts::TAU;
 use std::path::Path;
 
 use ld::Model;
-use ld::framer::Framer;
 use ld::packet::{CLOCK_TURN, Contents, LEN, POINTS, Packet, TURN};
 use line::{MILLIS, Nanos};
-use schema::{Failure, Kind};
+use lms::variant::{Mode, Unit};
+use recording::{Encoding, Recording};
+use schema::{Failure, Family, Kind};
 
-use crate::device::{Chunk, Device, Part, Sent};
+use crate::device::{Chunk, Device};
+use crate::outlet::Outlet;
 use crate::request_decoder::{Arrival, Dropped};
 use crate::room::{Beams, Room};
-use crate::transmission::{ChunkSize, Transmission};
+use crate::transmission::ChunkSize;
+use crate::turning::{Rotation, ahead_deg};
+
+pub use crate::turning::TruePoint;
 
 /// How a scanner is.
 #[derive(Clone, Copy, Debug)]
@@ -66,11 +70,10 @@ pub struct Head {
     /// When its power came on, and when its head turns.
     power_ns: Nanos,
     turns_ns: Nanos,
-    /// Packets sent since then.
+    /// Packets sent since it turns.
     sent: u64,
-    transmission: Option<Transmission<()>>,
-    /// When the next packet may leave at the earliest.
-    free_ns: Nanos,
+    rotation: Rotation,
+    outlet: Outlet,
 }
 
 enum Source {
@@ -83,17 +86,6 @@ enum Source {
     },
 }
 
-/// A point of the head, without noise.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct TruePoint {
-    /// When it is measured.
-    pub at_ns: Nanos,
-    /// Degrees, clockwise from the head's zero, 0 to 360.
-    pub clockwise_deg: f64,
-    /// What lies there in millimetres, if anything does.
-    pub range_mm: Option<f64>,
-}
-
 impl Head {
     /// The scanner that `settings` describe, at time 0, when it turns already.
     pub fn new(settings: HeadSettings, packets: Packets) -> Head {
@@ -101,45 +93,48 @@ impl Head {
             Packets::Room(room) => Source::Room(Beams::new(*room)),
             Packets::Recorded { packets, looped } => Source::Recorded { packets, looped, passed_ms: 0 },
         };
-        Head { settings, source, power_ns: 0, turns_ns: 0, sent: 0, transmission: None, free_ns: 0 }
+        let HeadSettings { turns_per_second, wander, seed, .. } = settings;
+        let rotation = Rotation::new(turns_per_second, wander, 0.0, seed);
+        let outlet = Outlet::new(settings.model.baud(), settings.chunk);
+        Head { settings, source, power_ns: 0, turns_ns: 0, sent: 0, rotation, outlet }
     }
 
-    /// Point number `point` since the head turns, as it is; a recording does not tell.
+    /// Makes it turn so many times in a second from its next packet on. The inertia of a real head is the caller's: of two
+    /// packets in a row the second is 5 % faster or slower at the most.
+    pub fn set_speed(&mut self, turns_per_second: f64) {
+        self.rotation.set_speed(self.seconds(self.sent * POINTS as u64), turns_per_second);
+    }
+
+    /// Packets of a room that were begun since the head turns; each has the next twelve points.
+    pub fn sent(&self) -> u64 {
+        self.sent
+    }
+
+    /// Point number `point` since the head turns, as it is, if it is not of the time before the last
+    /// [`set_speed`](Self::set_speed); a recording does not tell.
     pub fn truth(&mut self, point: u64) -> TruePoint {
-        let (at_ns, turns) = self.place(point);
+        let (at_ns, clockwise_deg) = self.place(point);
         let range_mm = match &mut self.source {
-            Source::Room(beams) => beams.look(at_ns, ahead_deg(turns)).exact_mm,
+            Source::Room(beams) => beams.look(at_ns, ahead_deg(clockwise_deg)).exact_mm,
             Source::Recorded { .. } => None,
         };
-        TruePoint { at_ns, clockwise_deg: turns.fract() * 360.0, range_mm }
+        TruePoint { at_ns, clockwise_deg, range_mm }
     }
 
     /// Where point number `point` is: degrees clockwise from the head's zero, 0 to 360.
     pub fn clockwise_deg(&self, point: u64) -> f64 {
-        self.place(point).1.fract() * 360.0
+        self.place(point).1
     }
 
-    /// When point number `point` is measured, and how many turns the head has made by then.
+    /// When point number `point` is measured, and where.
     fn place(&self, point: u64) -> (Nanos, f64) {
-        let seconds = point as f64 / f64::from(self.settings.model.points_per_second());
-        let (pace, phase) = self.pace();
-        let swing = ((pace * seconds + phase).sin() - phase.sin()) / pace;
-        let turns = self.settings.turns_per_second * (seconds + self.settings.wander * swing);
-        // A head does not begin where its zero is.
-        (self.turns_ns + (seconds * 1e9) as Nanos, turns + phase / TAU)
+        let seconds = self.seconds(point);
+        (self.turns_ns + (seconds * 1e9) as Nanos, self.rotation.turns(seconds).fract() * 360.0)
     }
 
-    /// Turns in a second at point number `point`.
-    fn speed(&self, point: u64) -> f64 {
-        let seconds = point as f64 / f64::from(self.settings.model.points_per_second());
-        let (pace, phase) = self.pace();
-        self.settings.turns_per_second * (1.0 + self.settings.wander * (pace * seconds + phase).cos())
-    }
-
-    /// How fast the speed goes up and down, and where it begins.
-    fn pace(&self) -> (f64, f64) {
-        let mut random = fastrand::Rng::with_seed(self.settings.seed);
-        (TAU / WANDER_S, TAU * random.f64())
+    /// When point number `point` is measured, in seconds since the head turns.
+    fn seconds(&self, point: u64) -> f64 {
+        point as f64 / f64::from(self.settings.model.points_per_second())
     }
 
     /// Packet number `number` of a room.
@@ -148,18 +143,18 @@ impl Head {
         let places: [(Nanos, f64); POINTS] = std::array::from_fn(|i| self.place(first + i as u64));
         let model = self.settings.model;
         let Source::Room(beams) = &mut self.source else { return [0; LEN] };
-        let points = places.map(|(at_ns, turns)| {
-            let look = beams.look(at_ns, ahead_deg(turns));
+        let points = places.map(|(at_ns, clockwise_deg)| {
+            let look = beams.look(at_ns, ahead_deg(clockwise_deg));
             match look.range_mm.filter(|range_mm| reach_mm(model).contains(range_mm)) {
                 Some(range_mm) => (range_mm.round() as u16, look.intensity),
                 None => (0, 0),
             }
         });
-        let hundredths = |turns: f64| (turns.fract() * f64::from(TURN)) as u16;
-        let (last_ns, last_turns) = places[POINTS - 1];
+        let hundredths = |degrees: f64| (degrees / 360.0 * f64::from(TURN)) as u16;
+        let (last_ns, last_deg) = places[POINTS - 1];
         let millis = (last_ns - self.power_ns) / MILLIS % Nanos::from(CLOCK_TURN);
-        let speed = (360.0 * self.speed(first)).round() as u16;
-        let (start, end) = (hundredths(places[0].1), hundredths(last_turns));
+        let speed = (360.0 * self.rotation.speed(self.seconds(first))).round() as u16;
+        let (start, end) = (hundredths(places[0].1), hundredths(last_deg));
         Contents { speed, start, points, end, millis: millis as u16 }.encode()
     }
 
@@ -169,7 +164,7 @@ impl Head {
             Source::Room(_) => Some(self.place((number + 1) * POINTS as u64).0),
             Source::Recorded { packets, looped, passed_ms } => {
                 let is_there = (number as usize) < packets.len() || *looped && !packets.is_empty();
-                is_there.then(|| (self.turns_ns + passed_ms * MILLIS).max(self.free_ns))
+                is_there.then(|| (self.turns_ns + passed_ms * MILLIS).max(self.outlet.free_ns()))
             }
         }
     }
@@ -191,54 +186,39 @@ impl Head {
 
 impl Device for Head {
     fn poll_transmit(&mut self, now: Nanos) -> Option<Chunk> {
-        if self.transmission.is_none() {
+        if self.outlet.next_ns().is_none() {
             let start_ns = self.due_ns(self.sent).filter(|&at| at <= now)?;
             let packet = self.take(self.sent);
             self.sent += 1;
-            let (rate, chunk) = (self.rate(), self.settings.chunk);
-            self.transmission = Some(Transmission::new(packet.to_vec(), start_ns, rate, chunk, ()));
+            self.outlet.send(packet.to_vec(), start_ns, false);
         }
-        let rate = self.rate();
-        let front = self.transmission.as_mut()?;
-        let (bytes, idle_after) = front.take_chunk(now)?;
-        let bytes = bytes.to_vec();
-        if !front.is_done() {
-            return Some(Chunk { bytes, rate, idle_after, part: Part::Telegram });
-        }
-        let front = self.transmission.take()?;
-        self.free_ns = front.end_ns();
-        let aborted = front.is_broken();
-        let (telegram, ()) = front.into_parts();
-        let part = Part::End(Sent { is_reply: false, telegram, aborted });
-        Some(Chunk { bytes, rate, idle_after, part })
+        self.outlet.take(now)
     }
 
     fn poll_timeout(&self) -> Option<Nanos> {
-        match &self.transmission {
-            Some(front) => Some(front.next_chunk_ns()),
-            None => self.due_ns(self.sent),
-        }
+        self.outlet.next_ns().or_else(|| self.due_ns(self.sent))
     }
 
     fn receive(&mut self, _: u8, _: Arrival) {}
 
     fn power_cycle(&mut self, now: Nanos) -> bool {
-        self.break_off(now);
+        let broken = self.outlet.break_off(now);
         self.power_ns = now;
         self.turns_ns = now + self.settings.boot_ns;
-        self.sent = 0;
+        let HeadSettings { turns_per_second, wander, seed, .. } = self.settings;
+        (self.rotation, self.sent) = (Rotation::new(turns_per_second, wander, 0.0, seed), 0);
         if let Source::Recorded { passed_ms, .. } = &mut self.source {
             *passed_ms = 0;
         }
-        self.transmission.as_ref().is_some_and(Transmission::is_broken)
+        broken
     }
 
     fn break_off(&mut self, now: Nanos) {
-        self.transmission.iter_mut().for_each(|front| front.break_off(now));
+        self.outlet.break_off(now);
     }
 
     fn rate(&self) -> u32 {
-        self.settings.model.baud()
+        self.outlet.rate()
     }
 
     fn streams(&self) -> bool {
@@ -258,42 +238,28 @@ impl Device for Head {
     }
 }
 
-/// The packets in the bytes of the file at `path`, damaged ones left out.
+/// The packets in the recording at `path`, of its sensor `sensor` if it has several; damaged ones left out.
 ///
 /// # Errors
 ///
-/// [`Kind::Input`] if it cannot be read, or there are none.
-pub fn recorded(path: &Path) -> Result<Vec<[u8; LEN]>, Failure> {
-    let wrong = |why: String| {
-        let hint = "a file of the bytes that such a scanner sent";
-        Failure::new(Kind::Input, format!("cannot replay {}: {why}", path.display()), hint)
-    };
-    let bytes = std::fs::read(path).map_err(|error| wrong(error.to_string()))?;
-    let (mut framer, mut packets, mut rest) = (Framer::default(), Vec::new(), &bytes[..]);
-    while !rest.is_empty() {
-        let spare = framer.spare();
-        let len = spare.len().min(rest.len());
-        spare[..len].copy_from_slice(&rest[..len]);
-        framer.commit(len);
-        rest = &rest[len..];
-        if rest.is_empty() {
-            framer.release(Nanos::MAX);
-        }
-        while let Some(span) = framer.advance(usize::MAX) {
-            packets.extend_from_slice(framer.bytes(span).as_chunks().0);
-        }
-    }
+/// [`Kind::Input`] if it cannot be read, or there are none; [`Kind::NoTopic`] and [`Kind::Usage`] as of
+/// [`Recording::of`].
+pub fn recorded(path: &Path, sensor: Option<&str>) -> Result<Vec<[u8; LEN]>, Failure> {
+    let whole = Recording::open_line(path)?;
+    let recording = sensor.map_or(Ok(whole.clone()), |sensor| whole.of(sensor))?;
+    // Packets are sent as they were: nothing of them is encoded.
+    let frames = recording.telegrams(Encoding { unit: Unit::Mm, mode: Mode(1) })?;
+    let of_family = frames.filter(|frame| frame.family == Family::Ld as u8);
+    let packets: Vec<_> = of_family
+        .flat_map(|frame| frame.telegram.as_chunks().0.to_vec())
+        .filter(|packet| Packet::check(packet).is_ok())
+        .collect();
     if packets.is_empty() {
-        Err(wrong("it holds no packet of an LDROBOT scanner".into()))
-    } else {
-        Ok(packets)
+        let message = format!("cannot replay {}: it holds no packet of an LDROBOT scanner", path.display());
+        let hint = "a recording of one, or a file of the bytes that one sent";
+        return Err(Failure::new(Kind::Input, message, hint));
     }
-}
-
-/// The angle of a head that turns clockwise after so many turns: degrees, 0 ahead, counter-clockwise, -180 to 180.
-fn ahead_deg(turns: f64) -> f64 {
-    let clockwise = turns.fract() * 360.0;
-    if clockwise > 180.0 { 360.0 - clockwise } else { -clockwise }
+    Ok(packets)
 }
 
 /// Between which ranges a model measures, by its data sheet.
@@ -304,6 +270,3 @@ fn reach_mm(model: Model) -> std::ops::RangeInclusive<f64> {
         Model::Ld14p => 100.0..=8_000.0,
     }
 }
-
-/// The speed goes up and down once in so many seconds.
-const WANDER_S: f64 = 7.3;

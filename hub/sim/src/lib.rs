@@ -1,10 +1,10 @@
-//! The sensor at the other end of the wire: a simulated SICK LMS 2xx on a pty, for tests, demonstrations and
+//! The sensor at the other end of the wire: simulated scanners on ptys or TCP servers, for tests, demonstrations and
 //! measurements without hardware.
 //!
-//! [`machine`] is the sensor itself, without I/O and clock; [`world`] is what it sees, [`room`] how that is measured,
-//! [`labeled_scan`] the true values; [`wire`], [`fault`] and [`noise`] are what happens on the line; [`pty`] is the
-//! only file that knows real time and ports; [`simulate()`] is the verb. It uses the protocol crate's other direction and
-//! knows nothing of the hub.
+//! [`machine`] is a SICK LMS 2xx, [`ld`] a scanner of LDROBOT, [`rplidar`] one of Slamtec, without I/O and clock;
+//! [`world`] is what they see, [`room`] how that is measured, [`labeled_scan`] the true values; [`wire`], [`fault`] and
+//! [`noise`] are what happens on the line; [`pty`] is the only file that knows real time; [`simulate()`] is the verb. It
+//! uses the protocol crates' other direction and knows nothing of the hub.
 
 mod answer;
 pub mod device;
@@ -18,20 +18,25 @@ pub mod machine;
 pub mod noise;
 pub mod operating;
 pub mod options;
+mod outlet;
 mod people;
 mod place;
 pub mod pty;
 mod request_decoder;
 pub mod room;
+pub mod rplidar;
 mod scene;
 pub mod series;
+mod server;
 mod settings;
 mod shape;
 mod simulate;
+mod socket;
 pub mod source;
 mod spot;
 mod transmission;
 pub mod truth;
+mod turning;
 mod view;
 pub mod wire;
 pub mod world;

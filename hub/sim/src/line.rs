@@ -10,15 +10,15 @@ use schema::Failure;
 use crate::device::{Device, Part};
 use crate::fault::{Fault, Faults};
 use crate::noise::Mistuned;
-use crate::place::Place;
-use crate::pty::{Pty, Wake, now_ns, wait};
+use crate::pty::{Wake, now_ns, wait};
 use crate::request_decoder::Arrival;
+use crate::socket::Socket;
 use crate::truth::{Record, Summary};
 use crate::wire::{Carried, Wire};
 
 /// A sensor on its line.
 pub(crate) struct Line<'a> {
-    /// The port as the user named it.
+    /// The port as the user named it, of a server as it is found.
     pub(crate) port: PathBuf,
     /// What is there to be opened; nothing while the adapter is unplugged.
     pub(crate) socket: Option<Socket>,
@@ -40,21 +40,6 @@ pub enum Event {
     Unplug(Nanos),
     /// The line does this to bytes from now on, with random numbers of this seed; times count from now.
     Faults(Box<Faults>, u64),
-}
-
-/// A pty and where it is found. Dropped, it is gone as an adapter is that was pulled out: first the name, then the
-/// terminal.
-pub(crate) struct Socket {
-    _place: Place,
-    pub(crate) pty: Pty,
-}
-
-impl Socket {
-    /// A new pty, with `port` leading to it.
-    pub(crate) fn new(port: &Path) -> Result<Socket, Failure> {
-        let pty = Pty::open()?;
-        Ok(Socket { _place: Place::new(port, pty.name())?, pty })
-    }
 }
 
 /// The machine's time: from 0 on, `speed` times as fast as the clock.
@@ -105,7 +90,7 @@ impl Line<'_> {
             while let Some(carried) = self.wire.poll_transmit(&mut *self.machine, machine_ns) {
                 self.hand_over(carried, &mut way)?;
             }
-            if count > 0 && same_rate(self.rate(), self.machine.rate()) {
+            if count > 0 && self.is_tuned() {
                 let arrival = Arrival {
                     not_before: self.time.of_machine(quiet_ns.saturating_sub(PTY_DELAY_NS)),
                     not_after: self.time.of_machine(now_ns),
@@ -127,9 +112,8 @@ impl Line<'_> {
             }
             let due = self.wire.poll_timeout(&*self.machine, machine_ns);
             let due_ns = due.map_or(Nanos::MAX, |at| self.time.of_clock(at));
-            let pty = self.socket.as_ref().map(|socket| &socket.pty);
-            let look_ns = if pty.is_some() { now_ns + LOOK_NS } else { Nanos::MAX };
-            let watched = pty.filter(|_| way.is_open);
+            let look_ns = if self.socket.is_some() { now_ns + LOOK_NS } else { Nanos::MAX };
+            let watched = self.socket.as_ref().and_then(|socket| socket.waits_for(way.is_open));
             if wait(stops, watched, due_ns.min(look_ns)) == Wake::Stop {
                 let eeprom_writes = self.machine.eeprom_writes();
                 return Ok(Summary { port: self.port, sent: way.sent, eeprom_writes });
@@ -151,18 +135,16 @@ impl Line<'_> {
     }
 
     /// Whether a host is there, and what it has written.
-    fn look(&self, way: &mut Way, buffer: &mut [u8]) -> Result<usize, Failure> {
-        let Some(Socket { pty, .. }) = &self.socket else { return Ok(0) };
-        let was_open = std::mem::replace(&mut way.is_open, pty.is_open());
-        if was_open && !way.is_open {
-            pty.clean_up_after_close();
-        }
-        pty.read(buffer)
+    fn look(&mut self, way: &mut Way, buffer: &mut [u8]) -> Result<usize, Failure> {
+        let Some(socket) = &mut self.socket else { return Ok(0) };
+        way.is_open = socket.is_open(way.is_open);
+        socket.read(buffer)
     }
 
-    /// Rate of the host's port; 0 if it is unplugged.
-    fn rate(&self) -> u32 {
-        self.socket.as_ref().map_or(0, |socket| socket.pty.rate())
+    /// Whether the host's port has the sensor's rate.
+    fn is_tuned(&self) -> bool {
+        let rate = self.socket.as_ref().and_then(Socket::rate);
+        rate.is_none_or(|rate| same_rate(rate, self.machine.rate()))
     }
 
     /// A line never brings more at once than it carries: where this thread was kept from running for long, the
@@ -177,16 +159,16 @@ impl Line<'_> {
     fn hand_over(&mut self, carried: Carried, way: &mut Way) -> Result<(), Failure> {
         let is_telegram = carried.is_telegram();
         let Carried { mut bytes, rate, idle_after, part, mut fault } = carried;
-        match self.socket.as_ref().filter(|_| way.is_open) {
-            Some(Socket { pty, .. }) => {
-                let rates = (rate, pty.rate());
+        match self.socket.as_mut().filter(|_| way.is_open) {
+            Some(socket) => {
+                let rates = (rate, socket.rate().unwrap_or(rate));
                 if same_rate(rates.1, rates.0) {
                     way.mistuned.tune();
                 } else {
                     fault = fault.or(Some(Fault::Baud));
                     bytes = way.mistuned.receive(rates, &bytes, idle_after);
                 }
-                if !pty.write(&bytes)? {
+                if !socket.write(&bytes)? {
                     fault = fault.or(Some(Fault::Overrun));
                 }
             }

@@ -4,13 +4,13 @@ use std::path::PathBuf;
 use std::str::FromStr;
 use std::time::Duration;
 
-use ld::Model;
 use lms::family::Family;
 use lms::variant::{Baud, Mode, Unit, Variant};
 use schema::{Failure, Kind};
 
 use crate::fault::Faults;
 use crate::operating::Operating;
+use crate::rplidar;
 use crate::settings::Start;
 use crate::transmission::ChunkSize;
 use crate::world::World;
@@ -18,7 +18,7 @@ use crate::world::World;
 /// The options of the verb.
 #[derive(Clone, Debug)]
 pub struct SimulateOptions {
-    /// One sensor each: where the symlink to its pty is to be.
+    /// One sensor each: where the symlink to its pty is to be, or `tcp:HOST:PORT` for a TCP server there.
     pub ports: Vec<PathBuf>,
     /// Rate of the line; `None`: the permanent rate, else 9600.
     pub baud: Option<Baud>,
@@ -67,8 +67,32 @@ pub struct SimulateOptions {
     pub mode: Option<Mode>,
     /// How many bytes the host's hardware hands over at once.
     pub chunk: ChunkSize,
-    /// Which scanner of LDROBOT the ports are in place of an LMS; then what only an LMS has must be left as it is.
-    pub model: Option<Model>,
+    /// Which scanner of another family the ports are in place of an LMS; then what only an LMS has must be left as it is.
+    pub scanner: Option<Scanner>,
+}
+
+/// A scanner that is no LMS.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Scanner {
+    /// One of LDROBOT.
+    Ld(ld::Model),
+    /// One of Slamtec.
+    Rplidar {
+        /// Which one.
+        model: rplidar::Model,
+        /// Number of the mode that it recommends, and in which it streams if an earlier host left it so.
+        mode: usize,
+    },
+}
+
+impl Scanner {
+    /// Its model as options call it.
+    pub fn name(self) -> &'static str {
+        match self {
+            Scanner::Ld(model) => model.name(),
+            Scanner::Rplidar { model, .. } => model.name(),
+        }
+    }
 }
 
 impl Default for SimulateOptions {
@@ -99,7 +123,7 @@ impl Default for SimulateOptions {
             unit: None,
             mode: None,
             chunk: ChunkSize::Uart,
-            model: None,
+            scanner: None,
         }
     }
 }
@@ -109,18 +133,41 @@ pub fn type_name(family: Family) -> String {
     format!("{};301063;V02.30 ", family.name().to_uppercase())
 }
 
-/// Which scanner of LDROBOT `family` and `model` say, `None` for an LMS: its models are types.
-pub fn parse_family(family: &str, model: Option<&str>) -> Result<Option<Model>, Failure> {
-    match (one_of("family", family, &[("lms", false), ("ld", true)])?, model) {
-        (false, None) => Ok(None),
-        (false, Some(model)) => {
-            let message = format!("model {model:?} of family \"lms\"");
-            Err(Failure::new(Kind::Configuration, message, "--type says which LMS; --family ld has models"))
+/// Which scanner `family`, `model` and the name of a `mode` say, `None` for an LMS: its models are types, and its modes
+/// numbers.
+pub fn parse_family(
+    family: &str,
+    model: Option<&str>,
+    mode: Option<&str>,
+) -> Result<Option<Scanner>, Failure> {
+    let wrong = |message: String, hint: &str| Err(Failure::new(Kind::Configuration, message, hint));
+    match one_of("family", family, &["lms", "ld", "rplidar"].map(|name| (name, name)))? {
+        "ld" => {
+            if let Some(mode) = mode {
+                return wrong(
+                    format!("mode {mode:?} of family \"ld\""),
+                    "its scanners have one way to measure",
+                );
+            }
+            let models = ld::Model::ALL.map(|model| (model.name(), Scanner::Ld(model)));
+            one_of("model", model.unwrap_or(ld::Model::Ld19.name()), &models).map(Some)
         }
-        (true, model) => {
-            let models = Model::ALL.map(|model| (model.name(), Some(model)));
-            one_of("model", model.unwrap_or(Model::Ld19.name()), &models)
+        "rplidar" => {
+            let models = rplidar::Model::ALL.map(|model| (model.name(), model));
+            let model = one_of("model", model.unwrap_or(rplidar::Model::A1.name()), &models)?;
+            let modes: Vec<_> = model.modes().iter().map(|mode| mode.name.to_lowercase()).collect();
+            let known: Vec<_> = modes.iter().enumerate().map(|(mode, name)| (name.as_str(), mode)).collect();
+            let typical = modes[model.typical()].clone();
+            let mode = one_of("mode", &mode.map_or(typical, str::to_lowercase), &known)?;
+            Ok(Some(Scanner::Rplidar { model, mode }))
         }
+        _ => match model {
+            None => Ok(None),
+            Some(model) => {
+                let hint = "--type says which LMS; the families ld and rplidar have models";
+                wrong(format!("model {model:?} of family \"lms\""), hint)
+            }
+        },
     }
 }
 
@@ -231,10 +278,16 @@ mod tests {
         assert_eq!((parse_mode("0x0F").unwrap(), parse_mode("1").unwrap()), (Mode(15), Mode(1)));
         assert_eq!(parse_unit("cm").unwrap(), Unit::Cm);
         assert_eq!(parse_baud("500000").unwrap().rate(), 500_000);
-        let model = |family, model| parse_family(family, model).unwrap();
-        assert_eq!((model("lms", None), model("ld", None)), (None, Some(Model::Ld19)));
-        assert_eq!(model("ld", Some("stl27l")), Some(Model::Stl27l));
-        assert!(parse_family("lms", Some("ld19")).unwrap_err().hint.contains("--type"));
+        let family = |family, model, mode| parse_family(family, model, mode).unwrap();
+        assert_eq!(family("lms", None, None), None);
+        assert_eq!(family("lms", None, Some("0x01")), None);
+        assert_eq!(family("ld", None, None), Some(Scanner::Ld(ld::Model::Ld19)));
+        assert_eq!(family("ld", Some("stl27l"), None), Some(Scanner::Ld(ld::Model::Stl27l)));
+        let rplidar = |model, mode| Some(Scanner::Rplidar { model, mode });
+        assert_eq!(family("rplidar", None, None), rplidar(rplidar::Model::A1, 3));
+        assert_eq!(family("rplidar", Some("s3"), Some("ultradense")), rplidar(rplidar::Model::S3, 2));
+        assert!(parse_family("lms", Some("ld19"), None).unwrap_err().hint.contains("--type"));
+        assert!(parse_family("ld", None, Some("boost")).is_err());
         assert_eq!("usb".parse::<ChunkSize>().unwrap().bytes(), 62);
         for family in [Family::Lms200, Family::Lms211, Family::Lms221, Family::Lms291] {
             let name = type_name(family);
@@ -255,8 +308,10 @@ mod tests {
             parse_type("s300").unwrap_err(),
             parse_type("s14").unwrap_err(),
             parse_state("asleep").unwrap_err(),
-            parse_family("velodyne", None).unwrap_err(),
-            parse_family("ld", Some("ld20")).unwrap_err(),
+            parse_family("velodyne", None, None).unwrap_err(),
+            parse_family("ld", Some("ld20"), None).unwrap_err(),
+            parse_family("rplidar", Some("a9"), None).unwrap_err(),
+            parse_family("rplidar", Some("c1"), Some("boost")).unwrap_err(),
         ] {
             assert!(failure.hint.starts_with("one of: ") && failure.kind.exit_code() == 78, "{failure}");
         }

@@ -109,6 +109,11 @@ impl Pty {
         Ok(true)
     }
 
+    /// What becomes readable when a host has written.
+    pub(crate) fn waits_for(&self) -> BorrowedFd<'_> {
+        self.master.as_fd()
+    }
+
     /// After the host's side was closed: forgets what it has not read, and lets others than root open it again.
     pub(crate) fn clean_up_after_close(&self) {
         // Somebody else may have opened it exclusively in this moment: then there is nothing to clean up.
@@ -123,13 +128,12 @@ impl Pty {
     }
 }
 
-/// Waits for bytes at `pty`, for `deadline_ns` of the clock, or for one of the `stops`. A host's side that is closed must
-/// not be waited for: it would say so all the time.
-pub(crate) fn wait(stops: [BorrowedFd<'_>; 2], pty: Option<&Pty>, deadline_ns: Nanos) -> Wake {
+/// Waits for bytes at `line`, for `deadline_ns` of the clock, or for one of the `stops`.
+pub(crate) fn wait(stops: [BorrowedFd<'_>; 2], line: Option<BorrowedFd<'_>>, deadline_ns: Nanos) -> Wake {
     let left = deadline_ns.saturating_sub(now_ns());
     let timeout = Timespec { tv_sec: (left / 1_000_000_000) as _, tv_nsec: (left % 1_000_000_000) as _ };
-    let line = pty.map_or(stops[0], |pty| pty.master.as_fd());
-    let mut fds = [stops[0], stops[1], line].map(|fd| PollFd::from_borrowed_fd(fd, PollFlags::IN));
+    let mut fds =
+        [stops[0], stops[1], line.unwrap_or(stops[0])].map(|fd| PollFd::from_borrowed_fd(fd, PollFlags::IN));
     // An interrupted wait is a short one.
     let _ = poll(&mut fds, Some(&timeout));
     if fds[..2].iter().any(|fd| !fd.revents().is_empty()) { Wake::Stop } else { Wake::Line }

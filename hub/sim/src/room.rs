@@ -16,7 +16,7 @@ use crate::view::View;
 use crate::world::World;
 use crate::world_view::WorldView;
 
-pub(crate) use beam::Beams;
+pub(crate) use beam::{Beams, Look};
 
 /// A world with its furniture in place, as one sensor in it sees it.
 #[derive(Clone, Debug)]

@@ -55,8 +55,18 @@ impl Series {
         &self.at(changes, time_ns).0
     }
 
+    /// All rooms.
+    pub(crate) fn rooms(&self) -> impl Iterator<Item = &Room> {
+        self.rooms.iter().map(|(room, _)| room)
+    }
+
+    /// The number of the one in which `changes` have the sensor at `time_ns`.
+    pub(crate) fn number(&self, changes: &Changes, time_ns: Nanos) -> usize {
+        changes.at(time_ns).min(self.rooms.len() - 1)
+    }
+
     fn at(&self, changes: &Changes, time_ns: Nanos) -> &(Room, Vec<Vec<u16>>) {
-        &self.rooms[changes.at(time_ns).min(self.rooms.len() - 1)]
+        &self.rooms[self.number(changes, time_ns)]
     }
 }
 

@@ -1,4 +1,4 @@
-//! The verb `simulate`: sensors on ptys until it is stopped. Builds them from the options, gives each a thread, and writes
+//! The verb `simulate`: sensors on ptys or TCP servers until it is stopped. Builds them from the options, gives each a thread, and writes
 //! the truth. Refuses to print and to handle signals: the program does.
 
 use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
@@ -12,12 +12,14 @@ use schema::{Failure, Kind};
 
 use crate::device::Device;
 use crate::ld::{Head, HeadSettings, Packets, recorded};
-use crate::line::{Event, Line, Socket, Time};
+use crate::line::{Event, Line, Time};
 use crate::machine::{Machine, Settings, Start};
 use crate::operating::Operating;
-use crate::options::{SimulateOptions, type_name};
+use crate::options::{Scanner, SimulateOptions, type_name};
 use crate::pty::now_ns;
 use crate::room::Room;
+use crate::rplidar::{Unit, UnitSettings, UnitStart};
+use crate::socket::{self, Socket};
 use crate::source::Source;
 use crate::truth::{Record, Summary, Truth};
 use crate::wire::Wire;
@@ -25,10 +27,10 @@ use crate::wire::Wire;
 /// A port that is ready to be opened.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Ready {
-    /// The symlink as the user named it.
+    /// The symlink as the user named it; of a TCP server `tcp:HOST:PORT`, which a hub opens.
     pub port: PathBuf,
-    /// The pty behind it.
-    pub pty: PathBuf,
+    /// The pty behind it, if it is one.
+    pub pty: Option<PathBuf>,
 }
 
 /// Simulates the sensors of `options` until `stop` is readable, and returns what each port sent. `on_ready` is called once
@@ -52,7 +54,7 @@ pub fn simulate_with(
     event: impl Fn(&Path) -> Option<Event> + Sync,
 ) -> Result<Vec<Summary>, Failure> {
     check(options)?;
-    let recording = options.replay.as_ref().filter(|_| options.model.is_none());
+    let recording = options.replay.as_ref().filter(|_| options.scanner.is_none());
     let recording = recording.map(Recording::open).transpose()?;
     let truth = options.truth.as_deref().map(Truth::create).transpose()?;
     let tell = |record: &Record| {
@@ -66,9 +68,10 @@ pub fn simulate_with(
         let seed = options.seed.wrapping_add(number as u64);
         let machine = device(options, recording.as_ref(), number)?;
         let socket = Socket::new(port)?;
-        ready.push(Ready { port: port.clone(), pty: socket.pty.name().to_owned() });
+        let port = socket.found(port);
+        ready.push(Ready { port: port.clone(), pty: socket.pty().map(Path::to_owned) });
         let wire = Wire::new(&options.faults, seed);
-        let (port, socket) = (port.clone(), Some(socket));
+        let socket = Some(socket);
         lines.push(Line { port, socket, machine, wire, time, tell: &tell, event: &event });
     }
     on_ready(&ready);
@@ -113,22 +116,49 @@ fn device(
     recording: Option<&Recording>,
     number: usize,
 ) -> Result<Box<dyn Device + Send>, Failure> {
-    let Some(model) = options.model else {
-        let chosen = chosen(options, recording, number)?;
-        let (settings, source) = sensor(options, chosen.as_ref(), number)?;
-        return Ok(Box::new(Machine::new(settings, source)));
-    };
-    let packets = match &options.replay {
-        Some(path) => Packets::Recorded { packets: recorded(path)?, looped: options.looped },
-        None => Packets::Room(Box::new(Room::of_port(&options.world, options.seed, number as u64))),
-    };
-    let settings = HeadSettings {
-        chunk: options.chunk,
-        boot_ns: options.boot.as_nanos() as Nanos,
-        seed: options.seed.wrapping_add(number as u64),
-        ..HeadSettings::of(model)
-    };
-    Ok(Box::new(Head::new(settings, packets)))
+    let room = || Room::of_port(&options.world, options.seed, number as u64);
+    let (chunk, boot_ns) = (options.chunk, options.boot.as_nanos() as Nanos);
+    let seed = options.seed.wrapping_add(number as u64);
+    Ok(match options.scanner {
+        None => {
+            let chosen = chosen(options, recording, number)?;
+            if let Some(other) = chosen.as_ref().filter(|chosen| !chosen.contents().is_lms()) {
+                let message = format!("{} is not of an LMS, which is simulated", other.path().display());
+                let hint = "--family says of which scanner it is";
+                return Err(Failure::new(Kind::Input, message, hint));
+            }
+            let (settings, source) = sensor(options, chosen.as_ref(), number)?;
+            Box::new(Machine::new(settings, source))
+        }
+        Some(Scanner::Ld(model)) => {
+            let sensor = options.sensors.get(number).or(options.sensors.last()).map(String::as_str);
+            let packets = match &options.replay {
+                Some(path) => Packets::Recorded { packets: recorded(path, sensor)?, looped: options.looped },
+                None => Packets::Room(Box::new(room())),
+            };
+            Box::new(Head::new(HeadSettings { chunk, boot_ns, seed, ..HeadSettings::of(model) }, packets))
+        }
+        Some(Scanner::Rplidar { model, mode }) => {
+            let faults = options.faults;
+            let settings = UnitSettings {
+                typical: mode,
+                start: match &options.state {
+                    Start::PowerOn => UnitStart::PowerOn,
+                    Start::In(operating) if operating.streams() => UnitStart::Streaming,
+                    Start::In(_) => UnitStart::Idle,
+                },
+                health: (faults.health as u8, u16::from(faults.health > 0.0)),
+                stubborn: faults.stubborn > 0.0,
+                habits: faults.habits(),
+                faults,
+                chunk,
+                boot_ns,
+                seed,
+                ..UnitSettings::of(model)
+            };
+            Box::new(Unit::new(settings, room()))
+        }
+    })
 }
 
 /// The recording that the port with this number plays: of several sensors the one that was named for it.
@@ -215,10 +245,11 @@ fn scans(
 fn check(options: &SimulateOptions) -> Result<(), Failure> {
     let wrong = |message: String, hint: &str| Err(Failure::new(Kind::Configuration, message, hint));
     if options.ports.is_empty() {
-        return wrong("no port to simulate".into(), "name one with --port PATH");
+        return wrong("no port to simulate".into(), "name one with --port PATH or --tcp HOST:PORT");
     }
     for (number, port) in options.ports.iter().enumerate() {
-        if options.ports[..number].contains(port) {
+        let is_any = socket::server(port).is_some_and(|address| address.ends_with(":0"));
+        if options.ports[..number].contains(port) && !is_any {
             return wrong(
                 format!("port {} is named twice", port.display()),
                 "each sensor needs its own path",
@@ -234,19 +265,22 @@ fn check(options: &SimulateOptions) -> Result<(), Failure> {
     if options.pollution > 100 {
         return wrong(format!("pollution {} is out of range", options.pollution), "percent, 0 to 100");
     }
-    if let Some(model) = options.model {
+    if let Some(scanner) = options.scanner {
+        let talks = matches!(scanner, Scanner::Rplidar { .. });
+        let states = [Start::In(Operating::OnRequest), Start::In(Operating::All), Start::PowerOn];
         let lms = [
             ("baud", options.baud.is_some() || options.permanent_baud.is_some()),
             ("variant", options.variant.is_some()),
             ("unit", options.unit.is_some()),
-            ("mode", options.mode.is_some()),
-            ("state", options.state != Start::In(Operating::OnRequest)),
-            ("sensor", !options.sensors.is_empty()),
+            ("mode by number", options.mode.is_some()),
+            ("state", options.state != states[0] && !(talks && states.contains(&options.state))),
+            ("sensor", !options.sensors.is_empty() && talks),
             ("error", !options.errors.is_empty()),
             ("indices", options.indices || options.short_configuration),
+            ("recording", options.replay.is_some() && talks),
         ];
         if let Some((name, _)) = lms.into_iter().find(|(_, is_said)| *is_said) {
-            let message = format!("an {} has no {name} to choose", model.name());
+            let message = format!("a scanner {} has no {name} to choose", scanner.name());
             return wrong(message, "leave it out, or use --family lms");
         }
     }

@@ -18,6 +18,7 @@ mod segments;
 mod sensor;
 mod strangers;
 mod system;
+mod turning;
 mod version;
 
 use std::sync::atomic::AtomicBool;

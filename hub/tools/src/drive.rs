@@ -61,7 +61,7 @@ fn drain<C: Conversation>(port: &Port, talk: &mut C) -> std::io::Result<Option<N
     }
 }
 
-fn gone(error: &std::io::Error) -> Failure {
+pub(crate) fn gone(error: &std::io::Error) -> Failure {
     Failure::new(
         Kind::PortMissing,
         format!("the port went away: {error}"),

@@ -4,5 +4,6 @@
 pub mod configure;
 pub mod doctor;
 mod drive;
+mod listen;
 pub mod probe;
 pub mod telegram;

@@ -1,17 +1,42 @@
-//! `scanhub probe`: what is at the other end of a port. Opens it, asks the sensor, and leaves the sensor as it was.
+//! `scanhub probe`: what is at the other end of a port, of whatever family. Opens it, listens for scanners that speak unasked,
+//! then asks the sensor, and leaves the sensor as it was.
 
 mod description;
+mod turning;
 
+use std::fmt;
 use std::sync::atomic::AtomicBool;
 
 use lms::inquiry::{Inquiry, Report};
 use lms::variant::Baud;
 use port::{Candidate, Port, Source, candidates, clock};
-use schema::{Failure, Kind};
+use schema::{Failure, Family, Kind};
+use serde::Serialize;
 
 use crate::drive::drive;
+use crate::listen::{Overheard, listen, not_heard, turning};
 pub use description::Description;
 pub(crate) use description::{hex, measuring};
+pub use turning::Turning;
+
+/// What is at the other end of a port.
+#[derive(Clone, Debug, Serialize)]
+#[serde(untagged)]
+pub enum Found {
+    /// An LMS, which was asked.
+    Lms(Box<Description>),
+    /// A scanner whose head turns.
+    Turning(Box<Turning>),
+}
+
+impl fmt::Display for Found {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Found::Lms(description) => description.fmt(f),
+            Found::Turning(turning) => turning.fmt(f),
+        }
+    }
+}
 
 /// The serial lines of this machine.
 ///
@@ -28,14 +53,58 @@ pub fn list() -> Result<Vec<Candidate>, Failure> {
     Ok(found)
 }
 
-/// Asks the sensor at `source` what it is. Calls `look` with each rate at which it searches.
+/// Finds out what is at `source`: listens for those that speak unasked before anything is sent, then asks. Calls `look` with
+/// each rate at which it searches.
 ///
 /// The port kinds if the port cannot be used, [`Kind::Timeout`] if nobody answers, [`Kind::Interrupted`] if `stop` is
 /// set.
-pub fn probe(source: &Source, stop: &AtomicBool, look: impl FnMut(u32)) -> Result<Description, Failure> {
+pub fn probe(source: &Source, stop: &AtomicBool, look: impl FnMut(u32)) -> Result<Found, Failure> {
     let (port, first) = open(source, stop)?;
-    let report = ask(&port, first, source, stop, look)?;
-    Ok(Description::new(source.name(), &report))
+    Ok(match find(&port, first, source, None, stop, look)? {
+        Answer::Asked(report) => Found::Lms(Box::new(Description::new(source.name(), &report))),
+        Answer::Heard(heard) => Found::Turning(Box::new(Turning::new(source.name(), &heard))),
+    })
+}
+
+/// What a scanner said.
+pub(crate) enum Answer {
+    /// An LMS, because it was asked.
+    Asked(Box<Report>),
+    /// A scanner whose head turns, which was heard or asked.
+    Heard(Box<Overheard>),
+}
+
+/// Finds out what is at `port`, which is open at `first`: of any family, or of `only` one. Before anything is sent, it is
+/// listened for those that speak unasked; then whoever must be asked is.
+///
+/// [`Kind::Timeout`] if nobody answers; the rest as [`probe`].
+pub(crate) fn find(
+    port: &Port,
+    first: Baud,
+    source: &Source,
+    only: Option<Family>,
+    stop: &AtomicBool,
+    mut look: impl FnMut(u32),
+) -> Result<Answer, Failure> {
+    let mut missed = Vec::new();
+    for (family, features) in
+        turning().into_iter().filter(|(family, _)| only.is_none_or(|only| only == *family))
+    {
+        match listen(port, (family, features), stop, &mut look)? {
+            Ok(heard) => return Ok(Answer::Heard(Box::new(heard))),
+            Err(bytes) if only.is_some() => return Err(not_heard(&source.name(), family, features, bytes)),
+            Err(_) => missed.push(family.name()),
+        }
+    }
+    let _ = port.set_baud(first.rate());
+    match ask(port, first, source, stop, look) {
+        Ok(report) => Ok(Answer::Asked(Box::new(report))),
+        Err(failure) if failure.kind == Kind::Timeout && !missed.is_empty() => {
+            let message = format!("{}; no sensor of family {} either", failure.message, missed.join(", "));
+            Err(Failure { message, ..failure })
+        }
+        Err(failure) => Err(failure),
+    }
 }
 
 /// The port that `text` names: a tty, or `tcp:HOST:PORT`.

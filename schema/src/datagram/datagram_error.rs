@@ -16,10 +16,12 @@ pub enum DatagramError {
     Length,
     /// The checksum is wrong.
     Crc,
-    /// A key is given and there is no MAC. No receiver here has keys yet.
+    /// A key is given and there is no MAC.
     Unauthenticated,
     /// A key is given and the MAC is not of it.
     Mac,
+    /// A key is given, and no announcement of the sensor came that was sent just now: it may be an old one, sent again.
+    Untimely,
     /// A later epoch of the same hub was seen.
     Epoch,
     /// Of another sender than the hub's epoch was taken from, which is not known to be the same gateway's: of another one
@@ -37,7 +39,7 @@ pub enum DatagramError {
 
 impl DatagramError {
     /// All reasons, in the order of the checks.
-    pub const ALL: [DatagramError; 14] = [
+    pub const ALL: [DatagramError; 15] = [
         DatagramError::Short,
         DatagramError::Magic,
         DatagramError::Version,
@@ -46,6 +48,7 @@ impl DatagramError {
         DatagramError::Crc,
         DatagramError::Unauthenticated,
         DatagramError::Mac,
+        DatagramError::Untimely,
         DatagramError::Epoch,
         DatagramError::Twin,
         DatagramError::Stale,
@@ -65,6 +68,7 @@ impl DatagramError {
             DatagramError::Crc => "crc",
             DatagramError::Unauthenticated => "unauthenticated",
             DatagramError::Mac => "mac",
+            DatagramError::Untimely => "untimely",
             DatagramError::Epoch => "epoch",
             DatagramError::Twin => "twin",
             DatagramError::Stale => "stale",

@@ -84,6 +84,11 @@ impl Row {
         self.received > 0 && self.highest - self.number(sequence) >= WINDOW as i64
     }
 
+    /// Sent before the first number that is known to have been sent to us.
+    pub(super) fn is_before(&self, sequence: u32) -> bool {
+        self.number(sequence) < self.lowest
+    }
+
     /// A number came that is not stale.
     pub(super) fn take(&mut self, sequence: u32) -> Fresh {
         let number = self.number(sequence);

@@ -4,7 +4,7 @@
 use bytemuck::{Pod, bytes_of, bytes_of_mut, cast_slice, cast_slice_mut, pod_read_unaligned};
 
 use super::{Announce, Datagram, DatagramError};
-use crate::telegram::STX;
+use crate::limits::TopicLimits;
 use crate::{
     BEAMS, Background, BackgroundHead, Contents, Foreground, ForegroundArrays, ForegroundHead, MARKS, Marks,
     SEGMENTS, Scan, ScanHead, Segment, Status, Telegram, Topic, ZONES, Zones,
@@ -19,6 +19,11 @@ pub trait Packed {
     /// itself. What follows behind it is a later revision's.
     fn room(payload: &[u8]) -> Option<usize>;
 
+    /// Widens `limits` until a topic that is made as they say has room for `payload`, which has a [`room`](Self::room).
+    fn widen(limits: &mut TopicLimits, payload: &[u8]) {
+        let _ = (limits, payload);
+    }
+
     /// Takes over what `payload` says, every byte of it. `false` if it has no [`room`](Self::room), or there is too little
     /// here: then the value is of no use.
     #[must_use]
@@ -30,18 +35,12 @@ pub trait Packed {
     fn unpack_into(place: &mut Box<Self>, payload: &[u8]) -> bool;
 }
 
-/// Returns the telegram that a payload is: of an LMS it has STX, two bytes with the length of what lies between them and the
-/// CRC, and what follows is a later revision's; of another family it is all of the payload.
-pub fn telegram(payload: &[u8]) -> Option<Telegram<'_>> {
-    if !payload.is_empty() && !Telegram(payload).is_lms() {
-        return Some(Telegram(payload)).filter(|telegram| telegram.0.len() <= Telegram::MAX);
+impl<'a> Datagram<'a> {
+    /// Returns the telegram that the payload of topic `telegram` is, if it is one of the sensor's family.
+    pub fn telegram(&self) -> Option<Telegram<'a>> {
+        Telegram::of(self.head.family, self.payload)
     }
-    let [STX, _, low, high, ..] = payload else { return None };
-    let len = usize::from(u16::from_le_bytes([*low, *high])) + AROUND_DATA;
-    payload.get(..len).filter(|bytes| bytes.len() <= Telegram::MAX).map(Telegram)
-}
 
-impl Datagram<'_> {
     /// Checks what stands after the header: its topic is known, and the payload is one of that topic.
     ///
     /// # Errors
@@ -52,6 +51,7 @@ impl Datagram<'_> {
         let is_sound = match Topic::of_number(self.head.topic) {
             None if self.head.topic == Announce::NUMBER => Announce::unpack(self.payload).is_some(),
             None => return Err(DatagramError::Skipped),
+            Some(Topic::Telegram) => self.telegram().is_some(),
             Some(topic) => is_sound(topic, self.payload),
         };
         if is_sound && self.head.revision > 0 && self.head.parts == 1 {
@@ -79,17 +79,16 @@ impl Packed for [u8] {
     }
 
     fn room(payload: &[u8]) -> Option<usize> {
-        telegram(payload).map(|telegram| telegram.0.len())
+        (1..=Telegram::MAX).contains(&payload.len()).then_some(payload.len())
     }
 
     fn unpack(&mut self, payload: &[u8]) -> bool {
-        let Some(telegram) = telegram(payload) else { return false };
-        let memory = self.get_mut(..telegram.0.len());
-        memory.map(|memory| memory.copy_from_slice(telegram.0)).is_some()
+        let Some(len) = <[u8]>::room(payload) else { return false };
+        self.get_mut(..len).map(|memory| memory.copy_from_slice(payload)).is_some()
     }
 
     fn unpack_into(place: &mut Box<[u8]>, payload: &[u8]) -> bool {
-        telegram(payload).map(|telegram| *place = telegram.0.into()).is_some()
+        <[u8]>::room(payload).map(|_| *place = payload.into()).is_some()
     }
 }
 
@@ -104,6 +103,13 @@ impl Packed for Scan {
         let is_known = usize::from(head.count) <= BEAMS && head.contents & !Contents::ALL == 0;
         let is_finite = head.first_angle.is_finite() && head.step.is_finite() && head.spacing.is_finite();
         (is_known && is_finite && len <= payload.len()).then_some(len)
+    }
+
+    fn widen(limits: &mut TopicLimits, payload: &[u8]) {
+        let Some(head) = payload.get(..Scan::HEAD) else { return };
+        let head: ScanHead = pod_read_unaligned(head);
+        limits.beams = limits.beams.max(head.count.into());
+        limits.contents |= head.contents;
     }
 
     fn unpack(&mut self, payload: &[u8]) -> bool {
@@ -186,6 +192,12 @@ impl Packed for Background {
         fits(payload, Background::len(head.count.into())).filter(|_| is_known)
     }
 
+    fn widen(limits: &mut TopicLimits, payload: &[u8]) {
+        let Some(head) = payload.get(..Background::HEAD) else { return };
+        let head: BackgroundHead = pod_read_unaligned(head);
+        limits.beams = limits.beams.max(head.count.into());
+    }
+
     fn unpack(&mut self, payload: &[u8]) -> bool {
         Background::room(payload).is_some_and(|len| self.copy_from(&payload[..len]))
     }
@@ -225,6 +237,12 @@ impl Packed for Foreground {
             && members == u32::from(head.beams)
             && unused == 0;
         is_sound.then_some(Foreground::len(head.count.into()))
+    }
+
+    fn widen(limits: &mut TopicLimits, payload: &[u8]) {
+        let Some(head) = payload.get(..Foreground::HEAD) else { return };
+        let head: ForegroundHead = pod_read_unaligned(head);
+        limits.beams = limits.beams.max(head.count.into());
     }
 
     fn unpack(&mut self, payload: &[u8]) -> bool {
@@ -291,8 +309,6 @@ fn write(room: &mut [u8], parts: &[&[u8]]) -> Option<usize> {
     Some(end)
 }
 
-/// STX, address, length and CRC (Telegram listing 4).
-const AROUND_DATA: usize = 6;
 const MARKS_HEAD: usize = 4;
 const ZONES_HEAD: usize = 12;
 

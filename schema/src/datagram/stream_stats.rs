@@ -30,6 +30,8 @@ pub const ROWS: usize = 1024;
 pub struct StreamStats {
     /// Bit n: topic number n is listened to.
     followed: u64,
+    /// Nothing is taken but what an announcement spoke of.
+    only_announced: bool,
     lives: Lives,
     rows: [Row; ROWS],
     /// Positions in `rows`: of those in use, sorted by key, then of the others.
@@ -62,6 +64,7 @@ impl StreamStats {
     pub fn new(topics: &[Topic]) -> StreamStats {
         StreamStats {
             followed: topics.iter().fold(0, |bits, topic| bits | 1 << topic.number()),
+            only_announced: false,
             lives: Lives::new(),
             rows: [Row::EMPTY; ROWS],
             order: core::array::from_fn(|at| at as u16),
@@ -69,6 +72,23 @@ impl StreamStats {
             given_up: GivenUp::default(),
             refused: [0; DatagramError::ALL.len()],
         }
+    }
+
+    /// The same for who has a key: a sample is taken only of a sensor and topic that were announced, from the number on that
+    /// the first announcement said; and another sender is not taken for the next life of a silent gateway. So what was sent
+    /// before cannot be sent again.
+    pub fn only_announced(self) -> StreamStats {
+        StreamStats { only_announced: true, ..self }
+    }
+
+    /// Returns whether this sensor was announced in this life of `hub`, and neither was given up since.
+    pub fn is_announced(&self, hub: u64, epoch: u32, sensor: u8) -> bool {
+        self.find((hub, epoch, sensor, Announce::NUMBER)).is_some()
+    }
+
+    /// Counts a datagram that was read and is refused for a reason that these statistics do not know themselves.
+    pub fn refuse(&mut self, why: DatagramError) {
+        self.count(Some(why));
     }
 
     /// Checks and counts `bytes`, a datagram with a whole sample as it was received `from` a sender, at `now_ns` of any clock
@@ -162,7 +182,10 @@ impl StreamStats {
         let announce = if is_announce { Announce::unpack(datagram.payload) } else { None };
         let boot = announce.map(|announce| announce.boot);
         let judge = |slot: usize| self.lives.record(slot).voices.judge(from, boot, now_ns);
-        let whose = known.map_or(Whose::Own, judge);
+        let whose = match known.map_or(Whose::Own, judge) {
+            Whose::Next if self.only_announced => Whose::Twin,
+            whose => whose,
+        };
         if whose == Whose::Twin {
             if let Some(slot) = known.filter(|_| datagram.check_payload().is_ok()) {
                 self.lives.record_mut(slot).voices.note(from, boot, now_ns);
@@ -177,6 +200,10 @@ impl StreamStats {
             // All of the one that is silent makes room.
             _ if whose == Whose::Next => datagram.check_payload()?,
             Some(at) if self.rows[at].is_stale(head.sequence) => return Err(DatagramError::Stale),
+            Some(at) if self.only_announced && self.rows[at].is_before(head.sequence) => {
+                return Err(DatagramError::Stale);
+            }
+            None if self.only_announced && !is_announce => return Err(DatagramError::Untimely),
             None if is_full && !self.lives.can_give_up(life, arrival) => return Err(DatagramError::Capacity),
             _ => datagram.check_payload()?,
         }

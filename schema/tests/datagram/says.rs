@@ -1,6 +1,6 @@
 //! What a datagram says, in the words of the list of golden datagrams.
 
-use schema::datagram::{Announce, Datagram, MTU_SAFE, Packed, telegram};
+use schema::datagram::{Announce, Datagram, MTU_SAFE, Packed};
 use schema::{BEAMS, Background, Code, Family, Foreground, Marks, Scan, Status, Topic, Zones};
 use serde_json::{Map, Value, json};
 
@@ -9,7 +9,7 @@ pub(crate) fn head(datagram: &Datagram<'_>) -> Value {
     json!({
         "topic": head.topic, "flags": head.flags, "hub": id(head.hub), "epoch": head.epoch,
         "sequence": head.sequence, "stamp_ns": head.stamp_ns, "sensor": head.sensor, "part": head.part,
-        "parts": head.parts, "revision": head.revision,
+        "parts": head.parts, "family": head.family, "revision": head.revision,
         "counter": head.counter, "payload_len": datagram.payload.len(),
     })
 }
@@ -19,8 +19,9 @@ pub(crate) fn payload(datagram: &Datagram<'_>) -> Value {
     match Topic::of_number(datagram.head.topic) {
         None => announce(Announce::unpack(payload).expect("an announcement")),
         Some(Topic::Telegram) => {
-            let bytes = telegram(payload).expect("a telegram").0;
-            json!({ "telegram": bytes.iter().map(|byte| format!("{byte:02x}")).collect::<String>() })
+            let telegram = datagram.telegram().expect("a telegram");
+            let hex = telegram.bytes.iter().map(|byte| format!("{byte:02x}")).collect::<String>();
+            json!({ "telegram": hex, "packets": telegram.packets().map(|facts| facts.packets) })
         }
         Some(Topic::Scan) => scan(&unpacked(Scan::zeroed(MTU_SAFE), payload)),
         Some(Topic::Marks) => marks(&unpacked(Box::<Marks>::default(), payload)),
@@ -120,6 +121,7 @@ fn status(status: &Status) -> Value {
     let pose = status.pose;
     json!({
         "state": status.state().map(|state| state.name()), "mode": status.mode, "unit_mm": status.unit_mm,
+        "family": status.family().map(|family| family.name()),
         "baud": status.baud, "since_ns": status.since_ns, "rate_mhz": status.rate_mhz,
         "angle_deg": status.angle_deg, "resolution_cdeg": status.resolution_cdeg,
         "type": status.sensor_type(), "port": status.port(), "last_error": status.last_error(),

@@ -11,9 +11,10 @@ use schema::{
 pub(crate) type Golden = (&'static str, Head, fn(&mut [u8]) -> Option<usize>);
 
 /// Those that a gateway of this version sends.
-pub(crate) const ALL: [Golden; 11] = [
+pub(crate) const ALL: [Golden; 12] = [
     ("announce", Head { sequence: 7, counter: 0, ..head(None) }, announce),
     ("telegram", Head { sequence: u32::MAX, ..head(Some(Topic::Telegram)) }, telegram),
+    ("packets", Head { sequence: 5, family: Family::Ld as u8, ..head(Some(Topic::Telegram)) }, packets),
     ("scan", Head { flags: LanFlags::SUSPECT, ..head(Some(Topic::Scan)) }, |room| {
         scan(361, -90_000, 500, 0).pack(room)
     }),
@@ -22,7 +23,9 @@ pub(crate) const ALL: [Golden; 11] = [
         Head { flags: LanFlags::SIMULATED, sequence: 2, ..head(Some(Topic::Scan)) },
         |room| scan(401, -50_000, 250, 3).pack(room),
     ),
-    ("scan_turn", Head { sequence: 3, ..head(Some(Topic::Scan)) }, |room| turn().pack(room)),
+    ("scan_turn", Head { sequence: 3, family: Family::Ld as u8, ..head(Some(Topic::Scan)) }, |room| {
+        turn().pack(room)
+    }),
     ("marks", head(Some(Topic::Marks)), |room| marks().pack(room)),
     ("zones", ZONES, |room| zones().pack(room)),
     ("zones_unknown", Head { sequence: 5001, ..ZONES }, |room| {
@@ -46,6 +49,7 @@ const fn head(topic: Option<Topic>) -> Head {
     Head {
         part: 0,
         parts: 1,
+        family: Family::Lms as u8,
         topic: match topic {
             Some(topic) => topic as u8 + 1,
             None => Announce::NUMBER,
@@ -70,6 +74,16 @@ fn announce(room: &mut [u8]) -> Option<usize> {
         announce.add(Announced { topic: topic.number(), group, port: 22_200, next });
     }
     announce.pack(room)
+}
+
+/// The packet that the manual of the LD06 explains, twice.
+fn packets(room: &mut [u8]) -> Option<usize> {
+    const PACKET: [u8; 47] = [
+        0x54, 0x2C, 0x68, 0x08, 0xAB, 0x7E, 0xE0, 0x00, 0xE4, 0xDC, 0x00, 0xE2, 0xD9, 0x00, 0xE5, 0xD5, 0x00,
+        0xE3, 0xD3, 0x00, 0xE4, 0xD0, 0x00, 0xE9, 0xCD, 0x00, 0xE4, 0xCA, 0x00, 0xE2, 0xC7, 0x00, 0xE9, 0xC5,
+        0x00, 0xE5, 0xC2, 0x00, 0xE5, 0xC0, 0x00, 0xE5, 0xBE, 0x82, 0x3A, 0x1A, 0x50,
+    ];
+    [PACKET, PACKET].concat().pack(room)
 }
 
 fn telegram(room: &mut [u8]) -> Option<usize> {

@@ -112,5 +112,8 @@ fn codes() {
     assert_eq!(words[..8].join(" "), expected);
     assert!(words[8..].iter().all(|word| *word == "error"));
     assert_eq!((other.code(16), other.range(16)), (None, Some(0xFFEF)));
-    assert_eq!(Family::ALL.map(|family| (family as u8, family.name())), [(0, "lms"), (1, "ld")]);
+    assert_eq!(
+        Family::ALL.map(|family| (family as u8, family.name())),
+        [(0, "lms"), (1, "ld"), (2, "rplidar")]
+    );
 }

@@ -36,7 +36,7 @@ macro_rules! layouts {
 
 fn layouts() -> Vec<Layout> {
     let layouts = layouts! {
-        "scanhub_header_v2" Header: seq topic_seq stamp_first_ns stamp_last_ns wall_ns boot sensor quality flags
+        "scanhub_header_v2" Header: seq topic_seq stamp_first_ns stamp_last_ns wall_ns boot sensor quality flags family
             period_us hub_pid reasons hub_time;
         "scanhub_scan_v2" ScanHead: first_angle step spacing beam_time_ns first_beam_ns unit_um count valid_to no_return
             beyond collapsed family flags contents intensity_bits turns reserved turn_ns reserved2;
@@ -48,7 +48,7 @@ fn layouts() -> Vec<Layout> {
         "scanhub_foreground_v2" ForegroundHead: generation unit_um count beams segments left_out;
         "scanhub_background_v2" BackgroundHead: first_angle step generation unit_um taught count flags reserved;
         "scanhub_pose_v2" Pose: x_m y_m yaw_rad upside_down reserved;
-        "scanhub_status_v2" Status: state mode unit_mm reserved baud since_ns rate_mhz angle_deg resolution_cdeg
+        "scanhub_status_v2" Status: state mode unit_mm family baud since_ns rate_mhz angle_deg resolution_cdeg
             type_text port_text last_error_text counters pose;
     };
     for layout in &layouts {

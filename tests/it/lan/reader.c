@@ -26,7 +26,11 @@ static void telegram(const struct scanhub_telegram *t)
     printf("{\"telegram\":\"");
     for (unsigned i = 0; i < t->len; i++)
         printf("%02x", t->bytes[i]);
-    printf("\"}");
+    printf("\",\"packets\":");
+    if (t->family == SCANHUB_LD)
+        printf("%u}", t->packets);
+    else
+        printf("null}");
 }
 
 /* With as few digits as say the number and no other, and a point; JSON has neither nan nor infinity. */
@@ -41,9 +45,10 @@ static void number(const char *before, double value)
            digits[strspn(digits, "-0123456789")] == 0 ? ".0" : "");
 }
 
+static const char *const families[] = {"lms", "ld"};
+
 static void scan(const struct scanhub_scan *s)
 {
-    static const char *const families[] = {"lms", "ld"};
     printf("{\"family\":%s%s%s", s->family < 2 ? "\"" : "", s->family < 2 ? families[s->family] : "null",
            s->family < 2 ? "\"" : "");
     printf(",\"unit_um\":%lu,\"count\":%u", (unsigned long)s->unit_um, s->count);
@@ -151,6 +156,8 @@ static void status(const struct scanhub_status *s)
         printf("{\"state\":\"%s\"", states[s->state]);
     else
         printf("{\"state\":null");
+    printf(",\"family\":%s%s%s", s->family < 2 ? "\"" : "", s->family < 2 ? families[s->family] : "null",
+           s->family < 2 ? "\"" : "");
     printf(",\"mode\":%u,\"unit_mm\":%u,\"baud\":%lu,\"since_ns\":%llu,\"rate_mhz\":%lu,\"angle_deg\":%u", s->mode, s->unit_mm, (unsigned long)s->baud,
            (unsigned long long)s->since_ns, (unsigned long)s->rate_mhz, s->angle_deg);
     printf(",\"resolution_cdeg\":%u,\"type\":\"%s\",\"port\":\"%s\",\"last_error\":\"%s\",\"counters\":[", s->resolution_cdeg,
@@ -178,8 +185,9 @@ static void head(const struct scanhub_datagram *d)
     printf("{\"head\":{\"topic\":%u,\"flags\":%u,\"hub\":\"%016llx\",\"epoch\":%lu,\"sequence\":%lu,\"stamp_ns\":%llu,",
            d->topic, d->flags, (unsigned long long)d->hub, (unsigned long)d->epoch, (unsigned long)d->sequence,
            (unsigned long long)d->stamp_ns);
-    printf("\"sensor\":%u,\"part\":%u,\"parts\":%u,\"revision\":%u,\"counter\":%lu,\"payload_len\":%lu},", d->sensor, d->part,
-           d->parts, d->revision, (unsigned long)d->counter, (unsigned long)d->payload_len);
+    printf("\"sensor\":%u,\"part\":%u,\"parts\":%u,\"family\":%u,", d->sensor, d->part, d->parts, d->family);
+    printf("\"revision\":%u,\"counter\":%lu,\"payload_len\":%lu},", d->revision, (unsigned long)d->counter,
+           (unsigned long)d->payload_len);
     printf("\"mac\":%s,\"payload\":", boolean(d->mac != NULL));
 }
 

@@ -25,6 +25,9 @@ def says(datagram):
     out = {name: plain(value) for name, value in dataclasses.asdict(payload).items()}
     if datagram.topic == "announce":
         out["boot"] = f"{payload.boot:016x}"
+    if datagram.topic == "telegram":
+        # The list has its number in the head.
+        assert out.pop("family") == scanhub_lan.FAMILIES[datagram.family]
     if datagram.topic == "scan":
         # The list has what is computed of these.
         for name in ("payload", "first_beam_ns", "turns", "turn_ns", "exact"):
@@ -40,7 +43,7 @@ def says(datagram):
             view = payload.view()
             assert view.dtype == numpy.uint16 and not view.flags.writeable and not view.flags.owndata
             assert tuple(view.tolist()) == payload.ranges
-    head = {name: getattr(datagram, name) for name in "flags epoch sequence stamp_ns sensor part parts revision counter".split()}
+    head = {name: getattr(datagram, name) for name in "flags epoch sequence stamp_ns sensor part parts family revision counter".split()}
     head.update(topic=datagram.number, hub=f"{datagram.hub:016x}", payload_len=len(datagram.payload))
     return {"head": head, "authenticated": datagram.authenticated, "payload": out}
 

@@ -101,6 +101,12 @@ impl Desk {
             fs::copy(self.env.path("one.mcap"), here.join(name)).expect("a recording");
         }
         fs::copy(self.env.path("capture.bin"), here.join("capture.bin")).expect("a stream");
+        if line.contains(" --key-file ") {
+            let key = here.join("lan.key");
+            fs::write(&key, "5a".repeat(32)).expect("a key");
+            fs::set_permissions(key, std::os::unix::fs::PermissionsExt::from_mode(0o600))
+                .expect("it is ours");
+        }
         let typed = PORTS.iter().fold(line.to_owned(), |line, port| {
             let is_made = line.starts_with("scanhub simulate");
             line.replace(port, &if is_made { "lms".into() } else { self.env.word("spare") })
@@ -115,8 +121,9 @@ impl Desk {
         shell.env("SCANHUB_END_WITH_PARENT", "1").env("SCANHUB_LOG", "error").env_remove("SCANHUB_CONFIG");
         let program = Program::start(shell);
         let group = Pid::from_raw(program.pid() as i32).expect("a process");
-        // A doctor looks at everything and then ends, however long that takes.
-        let patience = if line.starts_with("scanhub doctor") { PATIENCE } else { LONG_ENOUGH };
+        // These look at everything and then end, however long that takes.
+        let ends = ["scanhub doctor", "scanhub probe"].iter().any(|verb| line.starts_with(verb));
+        let patience = if ends { PATIENCE } else { LONG_ENOUGH };
         let end_at = Instant::now() + patience;
         while !program.is_over() && Instant::now() < end_at {
             thread::sleep(Duration::from_millis(20));

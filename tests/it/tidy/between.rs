@@ -36,7 +36,7 @@ fn families_know_the_line_alone() {
             ]
         };
         let another = tree.with_line("hub/ld/Cargo.toml", "[dependencies]", "scanhub-lms.workspace = true");
-        ["lms", "ld"].into_iter().flat_map(planted).chain([another]).collect()
+        ["lms", "ld", "rplidar"].into_iter().flat_map(planted).chain([another]).collect()
     });
 }
 

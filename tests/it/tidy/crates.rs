@@ -40,7 +40,7 @@ pub(crate) fn the_line_knows_no_family(tree: &Tree) -> Vec<String> {
 
 /// A family knows neither another one nor the hub.
 pub(crate) fn families_know_the_line_alone(tree: &Tree) -> Vec<String> {
-    let breaches = ["lms", "ld"].into_iter().flat_map(|family| {
+    let breaches = ["lms", "ld", "rplidar"].into_iter().flat_map(|family| {
         let package = format!("scanhub-{family}");
         let mut breaches: Vec<String> = ours(&tree.members()[&package], &ALL).into_iter().collect();
         breaches.retain(|name| name != "scanhub-line");
@@ -189,15 +189,17 @@ pub(crate) fn the_ends_of_a_network_only_compute(tree: &Tree) -> Vec<String> {
         "std::thread",
         "extern crate",
     ];
-    let mut breaches = built_of(tree, "scanhub-lan", &["scanhub-schema"]);
+    let mut breaches = built_of(tree, "scanhub-lan", &["scanhub-schema", "hmac", "sha2"]);
     breaches.extend(lacks(tree, "clients/lan/src/lib.rs", &["#![forbid(unsafe_code)]"]));
     breaches.extend(find(tree, &OUTSIDE, |path| path.starts_with("clients/lan/src/")));
     breaches
 }
 
-/// From a telegram to a scan: the protocol and the words for it, and no other crate.
+/// From a telegram to a scan: the families and the words for scans, and no other crate.
 pub(crate) fn the_scanner_only_translates(tree: &Tree) -> Vec<String> {
-    let mut breaches = built_of(tree, "scanhub-scanner", &["scanhub-line", "scanhub-lms", "scanhub-schema"]);
+    const KNOWN: [&str; 5] =
+        ["scanhub-ld", "scanhub-line", "scanhub-lms", "scanhub-rplidar", "scanhub-schema"];
+    let mut breaches = built_of(tree, "scanhub-scanner", &KNOWN);
     breaches.extend(lacks(tree, "hub/scanner/src/lib.rs", &["#![forbid(unsafe_code)]"]));
     breaches
 }

@@ -1,9 +1,9 @@
 //! Everything that happens in a world, as the judges see it and as its hash has it. Refuses to know what is right.
 
 use lms::Nanos;
-use lms::measured::MEASURED;
 use schema::datagram::{Datagram, DatagramError, Row};
 use schema::{Header, Ring, Status, Topic, Verdict, Zones};
+use sim::ld::TruePoint;
 
 use crate::consumer::Number;
 use crate::hash::History;
@@ -24,6 +24,8 @@ pub(crate) enum Event<'a> {
     Closed { sensor: usize },
     /// Another sensor is there instead of the one that was.
     Exchanged { sensor: usize },
+    /// A scanner whose head turns measured these points.
+    Measured { sensor: usize, points: &'a [TruePoint] },
     /// The last byte of a telegram went into the port, or did not.
     Sent { sensor: usize, telegram: &'a Telegram<'a> },
     /// Bytes that were in the port are gone, those from one to the other.
@@ -100,6 +102,8 @@ pub(crate) struct Telegram<'a> {
     pub(crate) damage: Option<&'static str>,
     /// The sensor did not send all of it.
     pub(crate) aborted: bool,
+    /// It is a reply, and no measured values.
+    pub(crate) is_reply: bool,
 }
 
 /// How much of what happens is told to standard error.
@@ -111,6 +115,35 @@ pub enum Detail {
     News,
     /// Verdicts, too.
     All,
+}
+
+/// What the turns of heads were like that the judges of turns saw.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Figures {
+    /// Scans, and those that were marked because packets of them are missing.
+    pub scans: u64,
+    /// See above.
+    pub incomplete: u64,
+    /// Points that were found among the true ones.
+    pub points: u64,
+    /// How far the exact angle of one was off at most, in degrees.
+    pub angle_deg: f64,
+    /// How far its range was off at most, in millimetres.
+    pub range_mm: f64,
+    /// How far the stamp of a scan was off at most, of those that are judged.
+    pub stamp_ns: Nanos,
+}
+
+impl Figures {
+    /// Takes over what is worse in `other`, and adds what it counts.
+    pub fn add(&mut self, other: &Figures) {
+        self.scans += other.scans;
+        self.incomplete += other.incomplete;
+        self.points += other.points;
+        self.angle_deg = self.angle_deg.max(other.angle_deg);
+        self.range_mm = self.range_mm.max(other.range_mm);
+        self.stamp_ns = self.stamp_ns.max(other.stamp_ns);
+    }
 }
 
 /// What a judge says.
@@ -155,6 +188,8 @@ impl Event<'_> {
                 history.bytes(bytemuck::bytes_of(&Header { hub_pid: 0, ..sample.header }));
                 history.bytes(&sample.bytes);
             }
+            // What it tells of them is hashed.
+            Event::Measured { .. } => {}
             Event::Rung { sensor, ring } => numbers(&[29, sensor as u64, ring as u64]),
             Event::Lacking { sensor, topic } => numbers(&[11, sensor as u64, topic as u64]),
             Event::Attached { consumer, sensor, topic, .. } => {
@@ -202,14 +237,12 @@ impl Event<'_> {
     /// What to say of it to whoever wants to see so much of it.
     pub(crate) fn words(&self, detail: Detail) -> Option<String> {
         match self {
-            Event::Sent { telegram: Telegram { bytes, damage: None, aborted: false, .. }, .. }
-                if bytes[4] == MEASURED =>
-            {
-                None
-            }
+            Event::Sent {
+                telegram: Telegram { damage: None, aborted: false, is_reply: false, .. }, ..
+            } => None,
             Event::Sent { sensor, telegram } => {
-                let Telegram { bytes, span, damage, aborted } = telegram;
-                Some(format!("{sensor} sent {:02X} {span:?} {damage:?} aborted {aborted}", bytes[4]))
+                let Telegram { bytes, span, damage, aborted, .. } = telegram;
+                Some(format!("{sensor} sent {:02X?} {span:?} {damage:?} aborted {aborted}", begin(bytes)))
             }
             Event::Published { sensor, sample } => {
                 let Sample { topic, header, bytes, .. } = sample;
@@ -227,21 +260,26 @@ impl Event<'_> {
                         let (state, error) = (status.state()?.name(), status.last_error());
                         Some(format!("{sensor} status {state} {} {error}", status.baud))
                     }
-                    Topic::Telegram if header.reasons != 0 || bytes[4] != MEASURED => {
+                    Topic::Telegram if header.reasons != 0 => {
                         let Header { seq, reasons, .. } = header;
-                        Some(format!("{sensor} published {:02X} seq {seq} reasons {reasons}", bytes[4]))
+                        Some(format!("{sensor} published {:02X?} seq {seq} reasons {reasons}", begin(bytes)))
                     }
                     _ => None,
                 }
             }
             Event::Taken { .. } | Event::Read { .. } | Event::Dropped { .. } | Event::Lacking { .. } => None,
-            Event::Rung { .. } => None,
+            Event::Rung { .. } | Event::Measured { .. } => None,
             Event::Transmitted { .. } | Event::Republished { .. } | Event::Counted { .. } => None,
             Event::Arrived { outcome: Arrival::Refused(why), .. } => Some(format!("refused: {why:?}")),
             Event::Arrived { .. } => None,
             other => Some(format!("{other:?}")),
         }
     }
+}
+
+/// Enough to know what it is.
+fn begin(bytes: &[u8]) -> &[u8] {
+    &bytes[..bytes.len().min(8)]
 }
 
 impl Arrival {

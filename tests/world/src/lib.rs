@@ -9,6 +9,7 @@ mod around;
 mod consumer;
 pub mod corpus;
 mod event;
+mod family;
 mod hash;
 mod hub;
 mod judges;
@@ -26,7 +27,7 @@ mod topics;
 mod tty;
 mod world;
 
-pub use event::{Detail, Violation};
+pub use event::{Detail, Figures, Violation};
 pub use plan::{Action, Plan};
 pub use planted::Defect;
 pub use runner::{Runner, Totals};

@@ -108,6 +108,10 @@ impl Line for OpenLine {
         Ok(None)
     }
 
+    fn set_dtr(&self, _: bool) -> io::Result<()> {
+        Ok(())
+    }
+
     fn waiting(&self) -> Option<usize> {
         let Handle { shared, port, device } = &*self.handle;
         let mut tty = shared.ports[*port].borrow_mut();

@@ -8,6 +8,7 @@ use lms::{MILLIS, Nanos};
 use sim::fault::Faults;
 
 use crate::actions::{self, KINDS, Kind};
+use crate::family;
 
 /// What shall happen. Everything else (how many sensors, their rates, the consumers) follows from the seed.
 #[derive(Clone, Debug, PartialEq)]
@@ -16,6 +17,8 @@ pub struct Plan {
     pub seed: u64,
     /// How long it lasts, in virtual seconds.
     pub seconds: u64,
+    /// The model of the only sensor; else the seed draws one or two.
+    pub model: Option<String>,
     /// In the order of time.
     pub actions: Vec<Action>,
 }
@@ -50,7 +53,7 @@ impl Plan {
             }
         }
         actions.sort_by_key(|action| action.at_ms);
-        Plan { seed, seconds, actions }
+        Plan { seed, seconds, model: None, actions }
     }
 
     /// When everything is made well again: what is to be seen then has eight seconds.
@@ -120,7 +123,9 @@ impl FromStr for Action {
 impl fmt::Display for Plan {
     /// A line for the seed, and one for each action.
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        writeln!(f, "seed {} seconds {}", self.seed, self.seconds)?;
+        write!(f, "seed {} seconds {}", self.seed, self.seconds)?;
+        self.model.iter().try_for_each(|model| write!(f, " {model}"))?;
+        writeln!(f)?;
         self.actions.iter().try_for_each(|action| writeln!(f, "{action}"))
     }
 }
@@ -132,12 +137,17 @@ impl FromStr for Plan {
         let mut lines = text.lines().map(str::trim).filter(|line| !line.is_empty());
         let head = lines.next().unwrap_or_default();
         let words: Vec<&str> = head.split_whitespace().collect();
-        let ["seed", seed, "seconds", seconds] = words[..] else {
+        let ["seed", seed, "seconds", seconds, ref model @ ..] = words[..] else {
             return Err(format!("{head:?} is not the first line of a plan"));
+        };
+        let model = match *model {
+            [] => None,
+            [model] if family::MODELS.contains(&model) => Some(model.to_owned()),
+            _ => return Err(format!("{head:?} names no model")),
         };
         let number = |word: &str| word.parse().map_err(|_| format!("{word:?} is no number"));
         let (seed, seconds) = (number(seed)?, number(seconds)?);
-        Ok(Plan { seed, seconds, actions: lines.map(str::parse).collect::<Result<_, _>>()? })
+        Ok(Plan { seed, seconds, model, actions: lines.map(str::parse).collect::<Result<_, _>>()? })
     }
 }
 

@@ -4,6 +4,7 @@
 use std::cell::Cell;
 
 use lms::telegram::Writer;
+use schema::{Counter, Header, Scan, ScanHead, Status, Topic};
 
 /// A defect.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -36,6 +37,16 @@ pub enum Defect {
     Delayed,
     /// Now and then two samples come in the wrong order.
     Reordered,
+    /// Now and then the second half of a turn is that of the turn before it.
+    MergedTurn,
+    /// Now and then a scan has a beam more.
+    OtherBeams,
+    /// A scan that waited for the hub is stamped when it was made.
+    StampedOnArrival,
+    /// A turn of which packets are missing is not marked.
+    UnmarkedTurn,
+    /// What was lost on the line is not counted.
+    UncountedLoss,
     /// Now and then a byte of a remote sample is another one.
     RemoteAltered,
     /// Now and then a listener takes a part for the whole sample.
@@ -52,7 +63,7 @@ pub enum Defect {
 
 impl Defect {
     /// All of them.
-    pub const ALL: [Defect; 20] = [
+    pub const ALL: [Defect; 25] = [
         Defect::LostWake,
         Defect::OneRing,
         Defect::LostByte,
@@ -67,6 +78,11 @@ impl Defect {
         Defect::SwallowedHangUp,
         Defect::Delayed,
         Defect::Reordered,
+        Defect::MergedTurn,
+        Defect::OtherBeams,
+        Defect::StampedOnArrival,
+        Defect::UnmarkedTurn,
+        Defect::UncountedLoss,
         Defect::RemoteAltered,
         Defect::RemoteHalf,
         Defect::RemoteCountedTwice,
@@ -102,6 +118,72 @@ impl Planted {
         self.chances.get().is_multiple_of(of)
     }
 }
+
+/// What [`Defect`]s of turns make of scans and of what is counted.
+#[derive(Debug, Default)]
+pub(crate) struct Spoiler {
+    /// The last scan as it was.
+    before: Option<Box<Scan>>,
+}
+
+impl Spoiler {
+    /// Spoils a sample of `topic` that is sent at `now`, if one of these defects is `planted`.
+    pub(crate) fn spoil(
+        &mut self,
+        planted: &Planted,
+        (topic, now): (Topic, u64),
+        header: &mut Header,
+        bytes: &mut Vec<u8>,
+    ) {
+        if topic == Topic::Status && planted.is(Defect::UncountedLoss) {
+            let status: &mut Status = bytemuck::from_bytes_mut(bytes);
+            status.counters[Counter::LostOnLine] = 0;
+        }
+        if topic != Topic::Scan {
+            return;
+        }
+        if planted.is(Defect::StampedOnArrival) {
+            let late = now.saturating_sub(header.stamp_last_ns + STALE_NS);
+            (header.stamp_first_ns, header.stamp_last_ns) =
+                (header.stamp_first_ns + late, header.stamp_last_ns + late);
+        }
+        let mut scan = Scan::of_bytes(bytes);
+        if planted.is(Defect::UnmarkedTurn) {
+            scan.flags &= !Scan::INCOMPLETE;
+        }
+        if planted.strikes(Defect::OtherBeams, 100) {
+            let head = ScanHead { count: scan.count + 1, ..**scan };
+            scan = Scan::zeroed(Scan::len(head.count.into(), head.contents));
+            scan.begin(head).ranges.fill(Scan::NOT_MEASURED);
+        }
+        let before = self.before.replace(scan.clone()).filter(|before| before.beams() == scan.beams());
+        if let Some(mut before) = before.filter(|_| planted.strikes(Defect::MergedTurn, 20)) {
+            let half = scan.beams() / 2;
+            let (into, from) = (scan.arrays(), before.arrays());
+            into.ranges[half..].copy_from_slice(&from.ranges[half..]);
+            if !into.angles.is_empty() {
+                into.angles[half..].copy_from_slice(&from.angles[half..]);
+            }
+        }
+        bytes.clear();
+        bytes.extend_from_slice(scan.bytes());
+    }
+
+    /// Whether one of these is `planted`.
+    pub(crate) fn is_needed(planted: &Planted) -> bool {
+        let mine = [
+            Defect::MergedTurn,
+            Defect::OtherBeams,
+            Defect::StampedOnArrival,
+            Defect::UnmarkedTurn,
+            Defect::UncountedLoss,
+        ];
+        mine.into_iter().any(|defect| planted.is(defect))
+    }
+}
+
+/// What waited for so long did not come just now.
+const STALE_NS: u64 = 100_000_000;
 
 /// A request that writes the EEPROM: 66h, the rate after power-on.
 pub(crate) fn eeprom_request() -> Vec<u8> {

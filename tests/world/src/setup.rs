@@ -1,23 +1,21 @@
 //! What a world begins with, as its seed has it: the sensors and the state in which they are found, the hub's configuration,
 //! whether a service manager keeps ports, the consumers. Refuses to know what happens later.
 
-use std::sync::{Arc, LazyLock, Mutex, PoisonError};
+use std::rc::Rc;
 
 use config::{Config, Sources};
-use lms::variant::{Baud, Variant};
-use lms::{MILLIS, Nanos};
 use schema::{Failure, Topic};
-use sim::ChunkSize;
-use sim::machine::{Settings, Start};
-use sim::operating::Operating;
-use sim::series::{Changes, Series};
+use sim::series::Changes;
 
 use crate::consumer::Habit;
-use crate::sensor::{Sensor, series};
+use crate::family::{self, Family};
+use crate::plan::Plan;
+use crate::sensor::Sensor;
 
 /// How a world begins.
 pub(crate) struct Setup {
-    pub(crate) sensors: Vec<OfSensor>,
+    /// The sensors, and what their links ask for.
+    pub(crate) sensors: Vec<Rc<dyn Family>>,
     /// A service manager keeps the ports of a killed hub.
     pub(crate) keeps_ports: bool,
     /// Scans in a row that violate a circle.
@@ -26,21 +24,15 @@ pub(crate) struct Setup {
     pub(crate) cast: Vec<(usize, Topic, Habit, usize)>,
 }
 
-/// One sensor and its link.
-pub(crate) struct OfSensor {
-    pub(crate) settings: Settings,
-    /// What its link asks for.
-    pub(crate) variant: Variant,
-    pub(crate) baud: Baud,
-}
-
 impl Setup {
-    pub(crate) fn of_seed(seed: u64) -> Setup {
-        let mut random = fastrand::Rng::with_seed(seed);
-        let count = random.usize(1..=2);
-        let sensors: Vec<OfSensor> = (0..count).map(|_| OfSensor::draw(&mut random)).collect();
+    pub(crate) fn of_plan(plan: &Plan) -> Setup {
+        let mut random = fastrand::Rng::with_seed(plan.seed);
+        let sensors = match &plan.model {
+            Some(model) => family::named(model, &mut random).into_iter().collect(),
+            None => family::draw(&mut random),
+        };
         let mut cast = Vec::new();
-        for sensor in 0..count {
+        for sensor in 0..sensors.len() {
             cast.extend(Topic::ALL.map(|topic| (sensor, topic, Habit::Prompt, 0)));
             cast.push((sensor, Topic::Zones, Habit::Robot, 0));
             let every_ms = random.u64(5..400);
@@ -61,9 +53,7 @@ impl Setup {
         for (number, sensor) in self.sensors.iter().enumerate() {
             let name = Setup::name(number);
             links.push(format!("{name}=/dev/world/{number}"));
-            set.push(format!("link.{name}.baud={}", sensor.baud.rate()));
-            set.push(format!("link.{name}.angle={}", sensor.variant.angle_deg));
-            set.push(format!("link.{name}.resolution={}", f64::from(sensor.variant.resolution_cdeg) / 100.0));
+            set.extend(sensor.keys().into_iter().map(|key| format!("link.{name}.{key}")));
         }
         match edition {
             0 => {}
@@ -75,58 +65,7 @@ impl Setup {
 
     /// The sensors as they are found, whose view changes as `changes` say.
     pub(crate) fn sensors(&self, mut changes: impl FnMut(usize) -> Changes) -> Vec<Sensor> {
-        let sensor = |(number, of): (usize, &OfSensor)| {
-            Sensor::new(of.settings.clone(), measured(of.variant), changes(number))
-        };
+        let sensor = |(number, of): (usize, &Rc<dyn Family>)| Sensor::new(of.found(changes(number)));
         self.sensors.iter().enumerate().map(sensor).collect()
-    }
-}
-
-impl OfSensor {
-    fn draw(random: &mut fastrand::Rng) -> OfSensor {
-        let variant = if random.u8(..8) == 0 { Variant::ALL[random.usize(..5)] } else { Variant::HALF };
-        let baud = if random.u8(..6) == 0 { Baud::B38400 } else { Baud::B500000 };
-        let found = [baud, Baud::B9600, Baud::B38400, Baud::B19200][random.usize(..4)];
-        let states = [
-            Start::In(Operating::OnRequest),
-            Start::In(Operating::Installation),
-            Start::In(Operating::All),
-            Start::PowerOn,
-        ];
-        let settings = Settings {
-            baud: found,
-            permanent_baud: [None, Some(baud)][random.usize(..2)],
-            variant: if random.bool() { variant } else { Variant::HALF },
-            start: states[random.usize(..4)].clone(),
-            boot_ns: random.u64(100..1_500) * MILLIS,
-            chunk: if random.bool() { ChunkSize::Uart } else { ChunkSize::Usb },
-            seed: random.u64(..),
-            ..Settings::default()
-        };
-        OfSensor { settings, variant, baud }
-    }
-
-    /// Time between two scans, and from the first byte of a telegram to the last, at the rate that the link asks for.
-    pub(crate) fn times(&self) -> (Nanos, Nanos) {
-        let len = 2 * self.variant.beams() + 10;
-        let rate = self.baud.rate();
-        let turns = (len - 1) / lms::variant::BYTES_PER_TURN;
-        let on_line = lms::line_time(len, rate) + turns as Nanos * lms::variant::MIRROR_TURN;
-        (self.variant.period(len, rate), on_line)
-    }
-}
-
-/// The scans that sensors of `variant` tell, measured once.
-fn measured(variant: Variant) -> Arc<Series> {
-    type Known = Mutex<Vec<(Variant, Arc<Series>)>>;
-    static KNOWN: LazyLock<Known> = LazyLock::new(Known::default);
-    let mut known = KNOWN.lock().unwrap_or_else(PoisonError::into_inner);
-    match known.iter().find(|(of, _)| *of == variant) {
-        Some((_, series)) => series.clone(),
-        None => {
-            let made = Arc::new(series(variant));
-            known.push((variant, made.clone()));
-            made
-        }
     }
 }

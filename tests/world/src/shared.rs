@@ -8,7 +8,7 @@ use std::rc::Rc;
 use lms::Nanos;
 use schema::Ring;
 
-use crate::event::{Detail, Event, Violation};
+use crate::event::{Detail, Event, Figures, Violation};
 use crate::hash::History;
 use crate::judges::{Judge, Say};
 use crate::line::Handle;
@@ -83,9 +83,11 @@ impl Log {
         }
     }
 
-    /// What the judges said, the hash of everything, and how many samples were published.
-    pub(crate) fn end(&self) -> (Vec<Violation>, u64, u64) {
+    /// What the judges said, the hash of everything, how many samples were published, and what the judges measured.
+    pub(crate) fn end(&self) -> (Vec<Violation>, u64, u64, Figures) {
         let mut inner = self.inner.borrow_mut();
-        (std::mem::take(&mut inner.violations), inner.history.value(), inner.published)
+        let mut figures = Figures::default();
+        inner.judges.iter().for_each(|judge| figures.add(&judge.figures()));
+        (std::mem::take(&mut inner.violations), inner.history.value(), inner.published, figures)
     }
 }

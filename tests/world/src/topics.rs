@@ -17,7 +17,7 @@ use schema::{Header, Topic, Verdict, limits};
 use crate::consumer::Number;
 use crate::event::Event;
 use crate::line::LinkClock;
-use crate::planted::Defect;
+use crate::planted::{Defect, Spoiler};
 use crate::shared::{Log, Shared};
 
 /// A sample that was sent.
@@ -177,6 +177,7 @@ pub(crate) struct Carrier<P: ?Sized> {
     sent: Cell<u64>,
     /// A sample that a planted defect holds back.
     late: RefCell<Option<Rc<Sample>>>,
+    spoiler: RefCell<Spoiler>,
     payload: PhantomData<fn(&P)>,
 }
 
@@ -197,6 +198,7 @@ impl<P: Payload + ?Sized> Carrier<P> {
             loaned: Rc::default(),
             sent: Cell::new(0),
             late: RefCell::default(),
+            spoiler: RefCell::default(),
             payload: PhantomData,
         }
     }
@@ -250,6 +252,9 @@ impl<P: Payload + ?Sized> Medium<P> for Carrier<P> {
         }
         if header.topic_seq > 0 && planted.strikes(Defect::Renumbered, 100) {
             header.topic_seq -= 1;
+        }
+        if Spoiler::is_needed(planted) {
+            self.spoiler.borrow_mut().spoil(planted, (topic, now), &mut header, &mut bytes);
         }
         let index = self.sent.replace(self.sent.get() + 1);
         let sample = Rc::new(Sample { topic, header, bytes, at: now, index, _counted });

@@ -10,7 +10,7 @@ use sim::noise::Mistuned;
 use sim::wire::Carried;
 
 use crate::event::{Event, Telegram};
-use crate::sensor::Sensor;
+use crate::sensor::{Happening, Sensor};
 use crate::shared::Log;
 
 /// A port and the sensor at its line.
@@ -62,7 +62,13 @@ impl Tty {
     pub(crate) fn advance(&mut self, to: Nanos, log: &Log) {
         // The sensor is lent out, so that what arrives can go into the buffer.
         let Tty { number, sensor, device, is_open, rate, mistuned, buffer, put, begun, .. } = self;
-        sensor.advance(to, |at, carried| {
+        sensor.advance(to, |at, happening| {
+            let carried = match happening {
+                Happening::Arrived(carried) => carried,
+                Happening::Measured(points) => {
+                    return log.tell(at, &Event::Measured { sensor: *number, points: &points });
+                }
+            };
             let Carried { bytes, rate: sent_at, idle_after, part, fault } = carried;
             let mut damage = fault.map(|fault| fault.name());
             let mut bytes = bytes;
@@ -87,10 +93,10 @@ impl Tty {
             }
             *put += bytes.len() as u64;
             buffer.extend(bytes);
-            if let Some(Part::End(Sent { telegram, aborted, .. })) = part
+            if let Some(Part::End(Sent { telegram, aborted, is_reply })) = part
                 && let Some((first, damage)) = begun.take()
             {
-                let telegram = Telegram { bytes: &telegram, span: (first, *put), damage, aborted };
+                let telegram = Telegram { bytes: &telegram, span: (first, *put), damage, aborted, is_reply };
                 log.tell(at, &Event::Sent { sensor: *number, telegram: &telegram });
             }
         });

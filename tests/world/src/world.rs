@@ -12,7 +12,7 @@ use sim::fault::Faults;
 
 use crate::actions::object;
 use crate::consumer::{Consumer, Habit, Number};
-use crate::event::{Detail, Event, Violation};
+use crate::event::{Detail, Event, Figures, Violation};
 use crate::hub;
 use crate::judges;
 use crate::plan::{Action, Plan};
@@ -34,6 +34,8 @@ pub struct Outcome {
     pub sensor_seconds: u64,
     /// Samples that hubs published.
     pub samples: u64,
+    /// What the turns of heads were like.
+    pub figures: Figures,
 }
 
 /// Lets happen what `plan` says, and tells standard error so much of it.
@@ -101,7 +103,7 @@ pub(crate) struct World {
 
 impl World {
     fn new(plan: &Plan, detail: Detail, defect: Option<Defect>) -> World {
-        let setup = Rc::new(Setup::of_seed(plan.seed));
+        let setup = Rc::new(Setup::of_plan(plan));
         let sensors = setup.sensors(|sensor| object::changes(plan, sensor, setup.sensors.len()));
         let ports =
             sensors.into_iter().enumerate().map(|(number, sensor)| RefCell::new(Tty::new(number, sensor)));
@@ -299,9 +301,9 @@ impl World {
         let eeprom_writes = self.shared.ports.iter().map(|port| port.borrow().sensor.eeprom_writes()).sum();
         let handles = self.shared.handles.get();
         self.shared.tell(&Event::Over { eeprom_writes, handles, loans, held });
-        let (violations, hash, samples) = self.shared.log.end();
+        let (violations, hash, samples, figures) = self.shared.log.end();
         let sensor_seconds = self.end / (1_000 * MILLIS) * self.setup.sensors.len() as u64;
-        Outcome { violations, hash, sensor_seconds, samples }
+        Outcome { violations, hash, sensor_seconds, samples, figures }
     }
 }
 

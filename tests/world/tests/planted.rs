@@ -14,6 +14,10 @@ fn judge(defect: Defect) -> &'static [&'static str] {
         Defect::Renumbered => &["numbers"],
         Defect::EepromWrite => &["eeprom"],
         Defect::SwallowedHangUp => &["liveness"],
+        Defect::MergedTurn | Defect::OtherBeams | Defect::StampedOnArrival | Defect::UnmarkedTurn => {
+            &["turns"]
+        }
+        Defect::UncountedLoss => &["lost_on_line"],
         Defect::RemoteAltered | Defect::RemoteHalf => &["remote_nothing_invented"],
         Defect::RemoteCountedTwice => &["remote_accounts"],
         Defect::RemoteStampedLate => &["remote_numbers"],

@@ -41,7 +41,7 @@ extern "C" {
 #define SCANHUB_REFUSED_BUG (-5)           /* in this library; close the handle */
 
 /* What the hub publishes for each sensor, and what a payload is, or begins with. */
-#define SCANHUB_TOPIC_TELEGRAM 1   /* length bytes, STX to CRC */
+#define SCANHUB_TOPIC_TELEGRAM 1   /* length bytes: of an LMS STX to CRC, of other families whole packets */
 #define SCANHUB_TOPIC_SCAN 2       /* struct scanhub_scan_v2 */
 #define SCANHUB_TOPIC_MARKS 3      /* struct scanhub_marks_v2 */
 #define SCANHUB_TOPIC_ZONES 4      /* struct scanhub_zones_v2 */
@@ -67,7 +67,8 @@ struct scanhub_header_v2 {
     uint64_t boot;           /* random per start of the hub */
     uint8_t sensor;          /* position of the link in the hub's configuration */
     uint8_t quality;         /* 0 clean, 1 suspect */
-    uint16_t flags;          /* 2 simulated, 4 replayed, 8 stamp estimated, 32 of another machine */
+    uint8_t flags;           /* 2 simulated, 4 replayed, 8 stamp estimated, 32 of another machine */
+    uint8_t family;          /* of the scanner: SCANHUB_FAMILY_... */
     uint32_t period_us;      /* nominal time between two scans, 0 unknown */
     uint32_t hub_pid;
     uint8_t reasons;         /* to suspect it: 1 line error, 2 neighbour, 4 slow, 8 forbidden bits, 16 header inside */
@@ -77,6 +78,7 @@ struct scanhub_header_v2 {
 /* Families of scanners. */
 #define SCANHUB_FAMILY_LMS 0
 #define SCANHUB_FAMILY_LD 1
+#define SCANHUB_FAMILY_RPLIDAR 2
 
 /* The arrays of a scan, beside its ranges. */
 #define SCANHUB_SCAN_UPPER 1  /* a byte: intensities, or of some modes of an LMS field bits */
@@ -122,7 +124,7 @@ struct scanhub_mark_v2 {
 
 struct scanhub_marks_v2 {
     uint8_t count; /* at most 64 */
-    uint8_t flags; /* 1 there were more, 2 unavailable: the measuring mode has no reflector bits */
+    uint8_t flags; /* 1 there were more, 2 unavailable: the measuring mode has no reflector bits, or 4: marks.level is not set */
     uint16_t reserved;
     struct scanhub_mark_v2 mark_array[64];
 };
@@ -234,7 +236,7 @@ struct scanhub_status_v2 {
     uint8_t state;
     uint8_t mode;    /* measuring mode, 255 unknown */
     uint8_t unit_mm; /* 0 unknown */
-    uint8_t reserved;
+    uint8_t family;  /* SCANHUB_FAMILY_.. */
     uint32_t baud;     /* 0 unknown */
     uint64_t since_ns; /* stamp of the state's beginning */
     uint32_t rate_mhz; /* scans per second in 1/1000 */

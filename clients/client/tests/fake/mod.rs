@@ -80,7 +80,7 @@ pub(crate) struct FakeSensor {
     pub(crate) waker: Waker,
     pub(crate) boot: u64,
     /// Of the headers.
-    pub(crate) flags: u16,
+    pub(crate) flags: u8,
     pub(crate) seq: u64,
     /// CLOCK_MONOTONIC at its first telegram, in ns; without a word long before any consumer.
     pub(crate) begun_ns: u64,

@@ -18,6 +18,8 @@ pub struct Remote<'a> {
     pub age_ns: Option<u64>,
     /// It came after a newer one.
     pub late: bool,
+    /// It has a MAC of the key that is given.
+    pub authenticated: bool,
 }
 
 impl Remote<'_> {
@@ -36,7 +38,8 @@ impl Remote<'_> {
             boot: self.boot,
             sensor: head.sensor,
             quality: quality as u8,
-            flags: u16::from(head.flags & same) | Flags::REMOTE,
+            flags: head.flags & same | Flags::REMOTE,
+            family: head.family,
             hub_pid: pid,
             ..Header::default()
         }

@@ -2,7 +2,9 @@
 //! buffer that is always the same. Refuses to know where samples come from and where datagrams go.
 
 use schema::Topic;
-use schema::datagram::{Announce, HEAD, Head, MTU_ETHERNET, PARTS, group};
+use schema::datagram::{Announce, HEAD, Head, MAC, MTU_ETHERNET, PARTS, group};
+
+use crate::Key;
 
 /// What takes datagrams: sockets, or a model of a network.
 pub trait Transmit {
@@ -12,12 +14,25 @@ pub trait Transmit {
 }
 
 /// How a payload becomes a datagram.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug)]
 pub enum Form {
     /// Behind a header.
     Sealed,
+    /// Between a header and a MAC of this key.
+    Authenticated(Key),
     /// By itself, to a port of its sensor.
     Bare,
+}
+
+impl Form {
+    /// Bytes around a payload.
+    fn around(&self) -> usize {
+        if matches!(self, Form::Authenticated(_)) { HEAD + MAC } else { HEAD }
+    }
+
+    fn is_bare(&self) -> bool {
+        matches!(self, Form::Bare)
+    }
 }
 
 /// Numbers what goes out, and keeps the account of it.
@@ -83,15 +98,17 @@ impl Rows {
 impl Numbering {
     /// Datagrams of at most `longest` bytes, as gateway `hub` in this `epoch`.
     pub(super) fn new(hub: u64, epoch: u32, form: Form, longest: usize) -> Numbering {
-        let longest = longest.clamp(HEAD + 1, MTU_ETHERNET);
+        let around = form.around();
+        let longest = longest.clamp(around + 1, MTU_ETHERNET);
         // Telegrams by themselves have no header that could say which part one is.
-        let parts = if form == Form::Sealed { PARTS } else { 1 };
-        let buffer = vec![0; HEAD + parts * (longest - HEAD)];
+        let parts = if form.is_bare() { 1 } else { PARTS };
+        let buffer = vec![0; around + parts * (longest - around)];
         Numbering { hub, epoch, sensors: Vec::new(), form, longest, unfit: 0, buffer }
     }
 
-    pub(super) fn form(&self) -> Form {
-        self.form
+    /// Whether announcements go out.
+    pub(super) fn announces(&self) -> bool {
+        !self.form.is_bare()
     }
 
     pub(super) fn longest(&self) -> usize {
@@ -147,10 +164,11 @@ impl Numbering {
         let (hub, epoch) = (self.hub, self.epoch);
         let Some(row) = self.row(head.sensor, head.topic) else { return };
         let head = Head { hub, epoch, sequence: row.next(), ..head };
-        let payload = pack(&mut self.buffer[HEAD..]);
+        let end = self.buffer.len() + HEAD - self.form.around();
+        let payload = pack(&mut self.buffer[HEAD..end]);
         let group = Topic::of_number(head.topic).map_or(Announce::GROUP, group);
         let taken = payload.and_then(|len| match self.form {
-            Form::Sealed => self.send_sealed(head, len, group, to),
+            Form::Sealed | Form::Authenticated(_) => self.send_sealed(head, len, group, to),
             Form::Bare => to.transmit(&self.buffer[HEAD..HEAD + len], group, head.sensor).then_some(len),
         });
         if let Some(row) = self.row(head.sensor, head.topic) {
@@ -169,18 +187,30 @@ impl Numbering {
     }
 
     /// Sends the payload of `len` bytes that lies in the buffer, in as few parts as possible; the bytes of all datagrams if all
-    /// were taken. The header of each part but the first is written over the end of the part before it, which is sent.
+    /// were taken. The header of each part but the first is written over the end of the part before it, which is sent; a MAC
+    /// over the begin of the part after it, which is put back.
     fn send_sealed(&mut self, head: Head, len: usize, group: u8, to: &mut impl Transmit) -> Option<usize> {
-        let room = self.longest - HEAD;
+        let room = self.longest - self.form.around();
         let parts = len.div_ceil(room).max(1);
         let mut bytes = Some(0);
         for part in 0..parts {
             let begin = part * room;
             let head = Head { part: part as u8, parts: parts as u8, ..head };
-            let datagram = head.seal(&mut self.buffer[begin..], room.min(len - begin))?;
+            let (buffer, len) = (&mut self.buffer[begin..], room.min(len - begin));
+            let mut behind = [0; MAC];
+            let datagram = match &self.form {
+                Form::Authenticated(key) => {
+                    behind.copy_from_slice(buffer.get(HEAD + len..HEAD + len + MAC)?);
+                    head.seal_with(buffer, len, |covered| key.mac(covered))?
+                }
+                _ => head.seal(buffer, len)?,
+            };
             // Whoever else it goes to may get all of it, although one did not get this part.
             let is_taken = to.transmit(datagram, group, 0);
             bytes = bytes.filter(|_| is_taken).map(|bytes| bytes + datagram.len());
+            if matches!(self.form, Form::Authenticated(_)) {
+                buffer[HEAD + len..][..MAC].copy_from_slice(&behind);
+            }
         }
         bytes
     }

@@ -1,13 +1,14 @@
 //! One sensor of the hub on its way out: which of its samples become datagrams, and what is announced of it. Refuses to
 //! know what a datagram looks like.
 
+use std::collections::VecDeque;
 use std::num::NonZeroU64;
 use std::time::Duration;
 
 use schema::datagram::{Announce, Announced, Head, LanFlags, PORT, Packed, group};
-use schema::{Background, Flags, Header, Quality, Topic, Verdict};
+use schema::{Background, Family, Flags, Header, Quality, Topic, Verdict};
 
-use super::numbering::{Form, Numbering, Transmit};
+use super::numbering::{Numbering, Transmit};
 use super::sample::{PayloadRef, Sample};
 use crate::Stamp;
 
@@ -18,6 +19,7 @@ pub(super) struct Sensor {
     tracks: [Track; Topic::ALL.len()],
     /// Of what came last; nothing as long as nothing did.
     heard: Option<Header>,
+    turns: Turns,
     /// As its status says; empty if unknown.
     kind: String,
     model: Option<Model>,
@@ -30,6 +32,29 @@ struct Track {
     last: Option<Header>,
     /// The last zones that went out were unknown.
     is_unknown: bool,
+}
+
+/// The turns of a scanner whose head turns, counted: the numbers of the telegrams that complete them have gaps, which may all be
+/// of one length.
+#[derive(Default)]
+struct Turns {
+    /// Of the last ones the number of the telegram, and their own.
+    last: VecDeque<(u64, u64)>,
+}
+
+impl Turns {
+    /// The number of the turn of which a sample with `header` is made; nothing if it is none of those that are remembered.
+    fn number(&mut self, header: &Header) -> Option<u64> {
+        let newest = self.last.back().copied();
+        if newest.is_none_or(|(seq, _)| header.seq > seq) && header.hub_time_ns().is_some() {
+            let number = newest.map_or(0, |(_, number)| number + 1);
+            if self.last.len() == REMEMBERED {
+                self.last.pop_front();
+            }
+            self.last.push_back((header.seq, number));
+        }
+        self.last.iter().rev().find(|(seq, _)| *seq == header.seq).map(|(_, number)| *number)
+    }
 }
 
 /// The background as it went out last.
@@ -45,7 +70,14 @@ impl Sensor {
     pub(super) fn new(name: &str, every: impl Fn(Topic) -> Option<NonZeroU64>) -> Sensor {
         let track = |topic| Track { topic, every: every(topic), last: None, is_unknown: false };
         let tracks = Topic::ALL.map(track);
-        Sensor { name: name.to_owned(), tracks, heard: None, kind: String::new(), model: None }
+        Sensor {
+            name: name.to_owned(),
+            tracks,
+            heard: None,
+            turns: Turns::default(),
+            kind: String::new(),
+            model: None,
+        }
     }
 
     /// Samples of this topic go out.
@@ -74,7 +106,7 @@ impl Sensor {
 
     /// Says who this is and which number each topic has next; nothing as long as nothing was heard of it.
     pub(super) fn announce(&self, now: Stamp, numbering: &mut Numbering, to: &mut impl Transmit) {
-        let is_announced = numbering.form() == Form::Sealed;
+        let is_announced = numbering.announces();
         let heard = self.heard.filter(|heard| is_announced && numbering.is_claimed(heard.sensor, &self.name));
         let Some(heard) = heard else { return };
         let mut announce = Announce::new(heard.boot, &self.name, &self.kind);
@@ -135,12 +167,17 @@ impl Sensor {
         if is_new {
             self.announce(now, numbering, to);
         }
-        let Sensor { tracks, model, .. } = self;
+        let Sensor { tracks, model, turns, .. } = self;
+        if is_new {
+            *turns = Turns::default();
+        }
         let track = &mut tracks[topic as usize];
         let Some(every) = track.every else { return };
         numbering.miss(header.sensor, topic, sample.missed);
         let mut stamp_ns = header.wall_ns;
-        let mut is_due = header.seq.is_multiple_of(every.get());
+        let is_of_telegram = topic == Topic::Telegram || header.family == Family::Lms as u8;
+        let number = if is_of_telegram { Some(header.seq) } else { turns.number(&header) };
+        let mut is_due = every.get() == 1 || number.is_some_and(|number| number.is_multiple_of(every.get()));
         match sample.payload {
             PayloadRef::Status(_) => stamp_ns = now.wall_ns,
             PayloadRef::Zones(zones) => {
@@ -166,6 +203,9 @@ impl Sensor {
     }
 }
 
+/// No topic is behind another one by more turns than its consumers have places for.
+const REMEMBERED: usize = 64;
+
 /// What stands before a sample of `topic`.
 fn head(topic: Topic, header: &Header, stamp_ns: u64) -> Head {
     Head {
@@ -173,6 +213,7 @@ fn head(topic: Topic, header: &Header, stamp_ns: u64) -> Head {
         flags: flags(header),
         stamp_ns,
         sensor: header.sensor,
+        family: header.family,
         revision: topic.revision() as u16,
         counter: header.seq as u32,
         ..Head::default()
@@ -182,12 +223,12 @@ fn head(topic: Topic, header: &Header, stamp_ns: u64) -> Head {
 fn flags(header: &Header) -> u8 {
     let known = Flags::SIMULATED | Flags::REPLAYED | Flags::STAMP_ESTIMATED;
     let suspect = if header.quality() == Quality::Suspect { LanFlags::SUSPECT } else { 0 };
-    (header.flags & known) as u8 | suspect
+    header.flags & known | suspect
 }
 
 // The bits are the same in both forms.
 const _: () = assert!(
-    Flags::SIMULATED == LanFlags::SIMULATED as u16
-        && Flags::REPLAYED == LanFlags::REPLAYED as u16
-        && Flags::STAMP_ESTIMATED == LanFlags::STAMP_ESTIMATED as u16
+    Flags::SIMULATED == LanFlags::SIMULATED
+        && Flags::REPLAYED == LanFlags::REPLAYED
+        && Flags::STAMP_ESTIMATED == LanFlags::STAMP_ESTIMATED
 );

@@ -7,7 +7,7 @@ use schema::datagram::{Announce, Datagram, HEAD, Head, MTU_LEAST, MTU_SAFE};
 use schema::{Background, BackgroundHead, Flags, Header, Status, Topic, Verdict, Zones};
 
 use super::{Form, Outgoing, PayloadRef, Sample, Transmit};
-use crate::Stamp;
+use crate::{Key, Stamp};
 
 /// What went out, and whether it is taken.
 #[derive(Default)]
@@ -233,4 +233,25 @@ fn bare_telegrams_go_to_a_port_of_their_sensor() {
     out.sample(front, &sample, at(0), &mut taken);
     out.announce(at(1000), &mut taken);
     assert_eq!(taken.datagrams, [(b"\x02bytes".to_vec(), 83, 5)]);
+}
+
+#[test]
+fn parts_with_a_key_have_each_a_mac_and_together_the_sample() {
+    let key = Key::new(&[7; 32]);
+    let mut out = Outgoing::new(7, 9, Form::Authenticated(key.clone()), MTU_LEAST);
+    let front = out.follow("front", each);
+    let telegram: Vec<u8> = (0..2000_u32).map(|n| (n * 7) as u8).collect();
+    let header = header(1, 3, 0);
+    let sample = Sample { header: Some(&header), missed: 0, payload: PayloadRef::Telegram(&telegram) };
+    let mut taken = Taken::default();
+    out.sample(front, &sample, at(0), &mut taken);
+    let mut whole: Vec<u8> = Vec::new();
+    for (bytes, ..) in &taken.datagrams {
+        let datagram = Datagram::read(bytes).expect("a datagram");
+        assert!(bytes.len() <= MTU_LEAST && key.is_of(bytes, datagram.mac.expect("a MAC")));
+        if datagram.head.topic == Topic::Telegram.number() {
+            whole.extend(datagram.payload);
+        }
+    }
+    assert!(whole == telegram && taken.datagrams.len() == 1 + 2000_usize.div_ceil(MTU_LEAST - HEAD - 16));
 }

@@ -250,6 +250,7 @@ mod tests {
             arrival_ns: ms * MS,
             age_ns: None,
             late: false,
+            authenticated: false,
         };
         let read = |ms| Stamp { monotonic_ns: ms * MS, wall_ns: ms * MS };
         assert!(sensor.publish(&came(1_000)));

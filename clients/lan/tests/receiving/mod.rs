@@ -106,7 +106,9 @@ impl Receiving {
                 let made = match &arrived {
                     Arrived::Sample(sample) => self.republisher.sample(sample, || hub.to_owned(), wall),
                     Arrived::Announced(announced) => self.republisher.announced(announced, hub, wall),
-                    Arrived::Refused { .. } | Arrived::Part | Arrived::Known => Ok(None),
+                    Arrived::Refused { .. } | Arrived::Untimely { .. } | Arrived::Part | Arrived::Known => {
+                        Ok(None)
+                    }
                 };
                 made.expect("memory is not short");
             }

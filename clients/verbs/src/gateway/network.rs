@@ -53,7 +53,7 @@ impl Network {
             return Err(Failure::new(Kind::Configuration, what, hint));
         }
         let (port, more) = match form {
-            Form::Sealed => (PORT, 0),
+            Form::Sealed | Form::Authenticated(_) => (PORT, 0),
             Form::Bare => (BARE_PORT, u16::from(u8::MAX)),
         };
         let groups = interface.map(|interface| {

@@ -28,8 +28,8 @@ impl<'a> Report<'a> {
         Report { look, out: Output::new(out), notes: Output::new(notes), sent: 0 }
     }
 
-    /// Who it is and where it sends.
-    pub(super) fn begin(&mut self, network: &Network, bare: bool) -> Result<(), End> {
+    /// Who it is, where it sends, and of which key datagrams have a MAC.
+    pub(super) fn begin(&mut self, network: &Network, bare: bool, key: Option<&str>) -> Result<(), End> {
         let to: Vec<_> = network.destinations.copies.iter().map(|copy| copy.name.as_str()).collect();
         if self.look == GatewayLook::Json {
             return self.out.json(&Begin {
@@ -39,6 +39,7 @@ impl<'a> Report<'a> {
                 interface: network.destinations.groups.as_ref().map(|groups| groups.interface.name()),
                 to,
                 bare,
+                key,
                 longest: network.outgoing.longest(),
                 renumbered: network.life.is_renumbered,
             });
@@ -52,8 +53,13 @@ impl<'a> Report<'a> {
                 write!(line, " on {}", groups.interface.name())?;
             }
             to.iter().try_for_each(|to| write!(line, ", copies to {to}"))?;
-            write!(line, ", datagrams of {} bytes at most", network.outgoing.longest())
-        })
+            write!(line, ", datagrams of {} bytes at most", network.outgoing.longest())?;
+            key.map_or(Ok(()), |key| write!(line, ", key {key}"))
+        })?;
+        if key.is_none() && !bare {
+            self.notes.line(|line| write!(line, "no key: {NO_KEY}"))?;
+        }
+        Ok(())
     }
 
     /// News of the hub.
@@ -229,6 +235,7 @@ struct Begin<'a> {
     interface: Option<&'a str>,
     to: Vec<&'a str>,
     bare: bool,
+    key: Option<&'a str>,
     longest: usize,
     renumbered: bool,
 }
@@ -270,5 +277,7 @@ struct Link<'a> {
 
 /// Why a gateway has another number than is kept.
 const RENUMBERED: &str = "a new number, because the one that is kept here was drawn on another machine";
+/// What a gateway without a key says once.
+const NO_KEY: &str = "receivers cannot know who sends; see `scanhub key new` and --key-file";
 /// To the line's begin, and nothing on it (ECMA-48).
 const WIPE: &[u8] = b"\r\x1b[K";

@@ -61,7 +61,7 @@ pub(super) struct Spans {
     /// Stamps ahead of the clock here, from which no time follows: another machine's wall clock is not ours.
     pub(super) ahead: u64,
     /// Bits of [`Flags`] that any of them had.
-    pub(super) flags: u16,
+    pub(super) flags: u8,
     ages: [Ages; Span::ALL.len()],
 }
 

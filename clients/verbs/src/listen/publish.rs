@@ -5,8 +5,8 @@ mod any_publisher;
 use lan::republish::{Republisher, SensorTopics, TopicStore};
 use scanhub_client::{PublishSession, SensorPublisher, clock};
 use schema::limits::TopicLimits;
-use schema::shortage::raise_descriptor_limit;
-use schema::{Domain, Failure, Header, Topic, Wake};
+use schema::shortage::{check_memory, longest_segment, raise_descriptor_limit, sensor_bytes};
+use schema::{BEAMS, Contents, Domain, Failure, Header, Topic, Wake};
 
 use any_publisher::AnyPublisher;
 
@@ -16,13 +16,30 @@ pub(super) type Publication = Republisher<SharedMemory>;
 /// The shared memory of a domain.
 pub(super) struct SharedMemory(PublishSession);
 
-/// The topics of one sensor in shared memory.
+/// The topics of one sensor in shared memory. How long its samples are is not announced: topics are made for an LMS, and
+/// made anew where a sample comes that is longer. Their consumers stay.
 pub(super) struct SharedTopics {
     /// One for each of [`Topic::ALL`].
-    topics: [Option<AnyPublisher>; Topic::ALL.len()],
+    topics: [Option<Made>; Topic::ALL.len()],
+    /// What the next one is made for: what is known of the samples so far.
+    limits: TopicLimits,
+    /// How often that became more.
+    widened: u32,
+    /// Samples without memory, of topics that were made anew.
+    failed: u64,
     // Behind the topics: it wakes their consumers.
     sensor: SensorPublisher,
 }
+
+/// A topic, and what it was made for.
+struct Made {
+    publisher: AnyPublisher,
+    limits: TopicLimits,
+}
+
+/// So often topics are made anew for exactly what came, then for the longest samples that there can be: whoever can send
+/// could ask for a beam more with each sample.
+const WIDENED_EXACTLY: u32 = 4;
 
 /// Takes the domain's place for a listener, beside its hub if there is one. All topics are made as `limits` say.
 ///
@@ -44,7 +61,8 @@ impl TopicStore for SharedMemory {
 
     fn sensor(&self, name: &str) -> Result<SharedTopics, Failure> {
         let topics = [const { None }; Topic::ALL.len()];
-        Ok(SharedTopics { topics, sensor: self.0.sensor(name)? })
+        let sensor = self.0.sensor(name)?;
+        Ok(SharedTopics { topics, limits: *sensor.limits(), widened: 0, failed: 0, sensor })
     }
 
     fn clean_up(&self) {
@@ -52,9 +70,48 @@ impl TopicStore for SharedMemory {
     }
 }
 
+impl SharedTopics {
+    /// Makes `topic` anew if it has no room for `payload`. What is too long all the same is counted when it is published.
+    fn make_room(&mut self, topic: Topic, payload: &[u8]) {
+        let Some(made) = &self.topics[topic as usize] else { return };
+        let mut limits = made.limits;
+        if !AnyPublisher::widen(topic, &mut limits, payload) {
+            return;
+        }
+        let known = TopicLimits {
+            beams: limits.beams.max(self.limits.beams),
+            contents: limits.contents | self.limits.contents,
+            ..limits
+        };
+        let limits = if known != self.limits && self.widened >= WIDENED_EXACTLY {
+            TopicLimits { beams: BEAMS, contents: Contents::ALL, ..known }
+        } else {
+            known
+        };
+        let needed = sensor_bytes(&[topic], &limits);
+        if check_memory(needed, needed.min(longest_segment(&limits))).is_err() {
+            return;
+        }
+        self.widened += u32::from(limits != self.limits);
+        self.limits = limits;
+        let Some(Made { publisher, limits: before }) = self.topics[topic as usize].take() else { return };
+        let (next, failed) = (publisher.next_number(), publisher.failed());
+        // One at a time publishes a topic.
+        drop(publisher);
+        self.failed += failed;
+        self.topics[topic as usize] =
+            [limits, before].into_iter().find_map(|limits| self.made(topic, limits).ok());
+        self.skip(topic, next);
+    }
+
+    fn made(&self, topic: Topic, limits: TopicLimits) -> Result<Made, Failure> {
+        Ok(Made { publisher: AnyPublisher::new(topic, &self.sensor, &limits)?, limits })
+    }
+}
+
 impl SensorTopics for SharedTopics {
     fn add(&mut self, topic: Topic) -> Result<(), Failure> {
-        self.topics[topic as usize] = Some(AnyPublisher::new(topic, &self.sensor)?);
+        self.topics[topic as usize] = Some(self.made(topic, self.limits)?);
         Ok(())
     }
 
@@ -63,20 +120,21 @@ impl SensorTopics for SharedTopics {
     }
 
     fn skip(&mut self, topic: Topic, count: u64) {
-        if let Some(topic) = &mut self.topics[topic as usize] {
-            topic.skip(count);
+        if let Some(made) = &mut self.topics[topic as usize] {
+            made.publisher.skip(count);
         }
     }
 
     fn send(&mut self, topic: Topic, header: &Header, payload: &[u8]) {
-        if let Some(topic) = &mut self.topics[topic as usize] {
-            topic.publish(header, payload);
+        self.make_room(topic, payload);
+        if let Some(made) = &mut self.topics[topic as usize] {
+            made.publisher.publish(header, payload);
         }
     }
 
     fn connect(&self, topic: Topic) {
-        if let Some(topic) = &self.topics[topic as usize] {
-            topic.connect();
+        if let Some(made) = &self.topics[topic as usize] {
+            made.publisher.connect();
         }
     }
 
@@ -86,6 +144,6 @@ impl SensorTopics for SharedTopics {
     }
 
     fn failed(&self) -> u64 {
-        self.topics.iter().flatten().map(AnyPublisher::failed).sum()
+        self.failed + self.topics.iter().flatten().map(|made| made.publisher.failed()).sum::<u64>()
     }
 }

@@ -95,14 +95,20 @@ impl Keys for Line<'_, '_> {
             #[serde(flatten)]
             flags: Option<json::Words>,
         }
-        let Remote { topic, datagram, late, .. } = self.remote;
+        let Remote { topic, datagram, late, authenticated, .. } = self.remote;
         let Head { hub, epoch, .. } = datagram.head;
-        // Nobody has keys yet: what is flagged may be as false as what is not.
-        let authenticated = false;
         let has_head = topic.row().pace == Pace::Scan;
         let flags = has_head.then(|| json::Words::of(&self.remote.header(std::process::id())));
         let age_ms = age_ms(self.remote);
-        self.out.json(&WithOrigin { keys, hub, epoch, authenticated, age_ms, late: *late, flags })
+        self.out.json(&WithOrigin {
+            keys,
+            hub,
+            epoch,
+            authenticated: *authenticated,
+            age_ms,
+            late: *late,
+            flags,
+        })
     }
 }
 

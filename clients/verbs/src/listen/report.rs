@@ -24,20 +24,36 @@ pub(super) struct Report<'a> {
     pub(super) notes: Output<'a>,
     /// What gateways are called for people.
     pub(super) names: Names,
+    /// What the key is called without which nothing is believed, if there is one.
+    key: Option<String>,
     /// Lines of the account that stand on the terminal.
     drawn: usize,
 }
 
 impl<'a> Report<'a> {
-    pub(super) fn new(json: bool, out: Output<'a>, notes: Output<'a>, names: Names) -> Report<'a> {
-        Report { json, out, notes, names, drawn: 0 }
+    pub(super) fn new(
+        json: bool,
+        out: Output<'a>,
+        notes: Output<'a>,
+        names: Names,
+        key: Option<String>,
+    ) -> Report<'a> {
+        Report { json, out, notes, names, key, drawn: 0 }
     }
 
     /// The groups are joined on `interfaces`; what comes will be published in `domain`, if there is one.
     pub(super) fn ready(&mut self, interfaces: &[&str], domain: Option<&Domain>) -> Result<(), End> {
+        let key = self.key.as_deref();
         if self.json {
-            return self.out.json(&Ready::new(interfaces, domain));
+            return self.out.json(&Ready::new(interfaces, domain, key));
         }
+        self.notes.line(|line| match key {
+            Some(key) => write!(line, "only datagrams with key {key} are believed"),
+            None => write!(
+                line,
+                "no key: whoever can send here is believed; see `scanhub key new` and --key-file"
+            ),
+        })?;
         self.notes.line(|line| match interfaces {
             [] => write!(line, "no network interface has a link, waiting for one"),
             some => write!(line, "listening on {}", some.join(", ")),
@@ -132,7 +148,7 @@ impl<'a> Report<'a> {
         }
         for row in stats.rows() {
             let sensor = peers.row_name(row.hub, row.epoch, row.sensor);
-            self.out.json(&Lan::new(row, &sensor))?;
+            self.out.json(&Lan::new(row, &sensor, self.key.is_some()))?;
         }
         self.out.json(&Sums::new(stats.given_up()))?;
         self.out.json(&Refused { class: "lan_refused", reasons: stats })
@@ -185,7 +201,7 @@ struct Lan<'a> {
 }
 
 impl<'a> Lan<'a> {
-    fn new(row: &Row, sensor: &'a str) -> Lan<'a> {
+    fn new(row: &Row, sensor: &'a str, authenticated: bool) -> Lan<'a> {
         Lan {
             class: "lan",
             hub: row.hub,
@@ -196,7 +212,7 @@ impl<'a> Lan<'a> {
             lost: row.lost(),
             duplicate: row.duplicate,
             reordered: row.reordered,
-            authenticated: false,
+            authenticated,
         }
     }
 }

@@ -9,6 +9,10 @@ use super::numbers;
 
 pub(crate) fn marks(line: &mut Vec<u8>, header: &Header, marks: &Marks) -> io::Result<()> {
     numbers(line, header)?;
+    if marks.lacks_level() {
+        let why = "unavailable: nobody said from which intensity on this scanner sees a reflector";
+        return write!(line, " {why}: set link.NAME.marks.level");
+    }
     if !marks.is_available() {
         // A sample does not tell whether the mode of a recording is known; `info` does.
         return if header.flags & Flags::REPLAYED != 0 {

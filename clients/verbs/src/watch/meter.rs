@@ -48,7 +48,7 @@ const WINDOW_NS: u64 = 2_000_000_000;
 mod tests {
     use super::*;
 
-    fn header(first_ms: u64, flags: u16) -> Header {
+    fn header(first_ms: u64, flags: u8) -> Header {
         let stamp_first_ns = first_ms * 1_000_000;
         Header { stamp_first_ns, stamp_last_ns: stamp_first_ns + 10_000_000, flags, ..Header::default() }
     }

@@ -1,5 +1,7 @@
 //! The keys of section `gateway`, and their valid values. A value is checked in its own source.
 
+use std::path::PathBuf;
+
 use schema::Failure;
 use schema::datagram::{MTU_ETHERNET, MTU_LEAST};
 use serde::Deserialize;
@@ -16,6 +18,7 @@ pub(crate) struct GatewayLayer {
     topics: Option<Vec<String>>,
     to: Option<Vec<String>>,
     bare: Option<bool>,
+    key_file: Option<PathBuf>,
     ttl: Option<Spanned<i64>>,
     background_every: Option<Spanned<String>>,
     mtu: Option<Spanned<i64>>,
@@ -24,11 +27,12 @@ pub(crate) struct GatewayLayer {
 impl GatewayLayer {
     /// Lays what it says over `gateway`.
     pub(crate) fn lay(self, origin: &Origin, gateway: &mut Gateway) -> Result<(), Failure> {
-        let GatewayLayer { interface, topics, to, bare, ttl, background_every, mtu } = self;
+        let GatewayLayer { interface, topics, to, bare, key_file, ttl, background_every, mtu } = self;
         gateway.interface = interface.or(gateway.interface.take());
         gateway.topics = topics.or(gateway.topics.take());
         gateway.to = to.or(gateway.to.take());
         gateway.bare = bare.or(gateway.bare);
+        gateway.key_file = key_file.or(gateway.key_file.take());
         if let Some(ttl) = ttl {
             let value = u8::try_from(*ttl.get_ref());
             let refuse = |_| origin.refuse(Some(ttl.span()), format!("ttl = {}", ttl.get_ref()), "0 to 255");

@@ -5,7 +5,7 @@ use std::ops::{Range, RangeInclusive};
 
 use preprocess::background::{Candidate, Method, Start};
 use preprocess::zones::{SECTORS, Sector};
-use schema::{BEAMS, Failure, ZONES};
+use schema::{BEAMS, Failure, Family, ZONES};
 use serde::Deserialize;
 use toml::Spanned;
 
@@ -49,9 +49,10 @@ struct SectorLayer {
 
 /// Section `marks`.
 #[derive(Clone, Deserialize)]
-#[serde(deny_unknown_fields, expecting = "keys of marks, as { i_min = 1 }")]
+#[serde(deny_unknown_fields, expecting = "keys of marks, as { i_min = 1 } or { level = 240 }")]
 pub(super) struct MarksLayer {
     i_min: Option<Spanned<i64>>,
+    level: Option<Spanned<i64>>,
     max_range_step: Option<Spanned<f64>>,
     max_gap: Option<Spanned<i64>>,
 }
@@ -127,6 +128,9 @@ impl Sections {
         if let Some(layer) = marks {
             let marks = &mut processing.marks;
             put(&mut marks.i_min, layer.i_min, |value| whole(origin, "i_min", value, 1..=7))?;
+            put(&mut marks.level, layer.level, |value| {
+                whole(origin, "level", value, 1..=i64::from(u16::MAX)).map(Some)
+            })?;
             put(&mut marks.max_range_step_mm, layer.max_range_step, |value| {
                 millimetres(origin, "max_range_step", value, 0.001..=10.0)
             })?;
@@ -138,6 +142,21 @@ impl Sections {
             layer.lay(origin, &mut processing.background)?;
         }
         Ok(())
+    }
+
+    /// [`Kind::Configuration`](schema::Kind::Configuration) if `origin` says here for one link what a scanner of `family` has
+    /// not. What is said for all links is for those that have it.
+    pub(super) fn check_family(&self, origin: &Origin, family: Family) -> Result<(), Failure> {
+        let Some(MarksLayer { i_min, level, .. }) = &self.marks else { return Ok(()) };
+        let name = family.name();
+        let (foreign, what, remedy) = if family.has_reflector_levels() {
+            let what = format!("level, and the intensities of an {name} are levels of reflectors, 0 to 7");
+            (level, what, "i_min is the least of them")
+        } else {
+            let what = format!("i_min, and the intensities of an {name} are counts of any surface");
+            (i_min, what, "level is the least of a reflector, as intensities of scans show it")
+        };
+        foreign.as_ref().map_or(Ok(()), |value| Err(origin.refuse(Some(value.span()), what, remedy)))
     }
 
     /// Where the sensor's pose is set, if it is.

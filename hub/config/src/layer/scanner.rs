@@ -1,17 +1,20 @@
 //! The keys that say of which family a link's scanner is, and what only some families have. Refuses to know what a family
 //! speaks.
 
+use ::scanner::features;
+use line::family::Features;
 use schema::{Failure, Family};
 use toml::Spanned;
 
-use crate::link::Scanner;
 use crate::origin::Origin;
+use crate::scanner::{Scanner, Turning};
 
-/// The keys `family`, `model` and `beams` of a link, as one source says them.
+/// The keys of a scanner, as one source says them.
 pub(super) struct ScannerLayer {
     pub(super) family: Option<Spanned<String>>,
     pub(super) model: Option<Spanned<String>>,
     pub(super) beams: Option<Spanned<i64>>,
+    pub(super) idle: Option<Spanned<String>>,
 }
 
 /// What all sources say, with their places.
@@ -20,27 +23,27 @@ pub(super) struct ScannerDraft {
     family: Option<(Family, String)>,
     model: Option<(String, String)>,
     beams: Option<(usize, String)>,
+    /// The name of one; the number of one is of an LMS.
+    pub(super) mode: Option<(String, String)>,
+    stop_when_idle: Option<(bool, String)>,
 }
 
 impl ScannerDraft {
     /// Lays what `layer` says over it.
     pub(super) fn lay(&mut self, layer: ScannerLayer, origin: &Origin) -> Result<(), Failure> {
-        if let Some(family) = layer.family {
+        let ScannerLayer { family, model, beams, idle } = layer;
+        if let Some(family) = family {
             let known = Family::parse(family.get_ref()).ok_or_else(|| {
                 let what = format!("family = \"{}\"", family.get_ref());
-                origin.refuse(
-                    Some(family.span()),
-                    what,
-                    format!("one of: {}", names(Family::ALL, Family::name)),
-                )
+                origin.refuse(Some(family.span()), what, one_of(Family::ALL.map(Family::name)))
             })?;
             self.family = Some((known, origin.place(Some(family.span()))));
         }
-        if let Some(model) = layer.model {
+        if let Some(model) = model {
             let place = origin.place(Some(model.span()));
             self.model = Some((model.into_inner(), place));
         }
-        if let Some(beams) = layer.beams {
+        if let Some(beams) = beams {
             let known =
                 usize::try_from(*beams.get_ref()).ok().filter(|beams| line::grid::BEAMS.contains(beams));
             let known = known.ok_or_else(|| {
@@ -50,40 +53,83 @@ impl ScannerDraft {
             })?;
             self.beams = Some((known, origin.place(Some(beams.span()))));
         }
+        if let Some(idle) = idle {
+            let stops = IDLE.iter().find(|(word, _)| word == idle.get_ref()).ok_or_else(|| {
+                let what = format!("idle = \"{}\"", idle.get_ref());
+                origin.refuse(Some(idle.span()), what, one_of(IDLE.map(|(word, _)| word)))
+            })?;
+            self.stop_when_idle = Some((stops.1, origin.place(Some(idle.span()))));
+        }
         Ok(())
     }
 
     /// What it says; `refuse` makes the failure of a place, of what is said there and of the remedy.
     pub(super) fn finish(self, refuse: impl Fn(&str, String, &str) -> Failure) -> Result<Scanner, Failure> {
-        let model = self.model.filter(|(name, _)| name != AUTO);
-        match self.family.map_or(Family::Lms, |(family, _)| family) {
-            Family::Lms => {
-                if let Some((name, place)) = model {
-                    let what = format!("model = \"{name}\", and an lms says itself what it is");
-                    return Err(refuse(&place, what, "leave it out; `type` is what is expected of it"));
-                }
-                if let Some((beams, place)) = self.beams {
-                    let what = format!("beams = {beams}, and an lms has its own");
-                    return Err(refuse(&place, what, "leave it out; `angle` and `resolution` say how many"));
-                }
-                Ok(Scanner::Lms)
-            }
-            Family::Ld => {
-                let beams = self.beams.map(|(beams, _)| beams);
-                let Some((name, place)) = model else { return Ok(Scanner::Ld { model: None, beams }) };
-                let known = ld::Model::named(&name).ok_or_else(|| {
-                    let remedy = format!("auto, or one of: {}", names(ld::Model::ALL, ld::Model::name));
-                    refuse(&place, format!("model = \"{name}\""), &remedy)
-                })?;
-                Ok(Scanner::Ld { model: Some(known), beams })
-            }
+        let ScannerDraft { family, model, beams, mode, stop_when_idle } = self;
+        let family = family.map_or(Family::Lms, |(family, _)| family);
+        let name = family.name();
+        let model = model.filter(|(model, _)| model != AUTO);
+        let mode = mode.filter(|(mode, _)| mode != AUTO);
+        let rest = stop_when_idle.filter(|(stops, _)| *stops);
+        let known = features(family);
+        if let Some((_, place)) = rest.as_ref().filter(|_| known.is_none_or(|known| !known.can_rest)) {
+            let what = format!("idle = \"stop\", and an {name} cannot be told to rest");
+            return Err(refuse(place, what, "leave it out"));
         }
+        let Some(features) = known else {
+            let own = [
+                model.map(|(model, place)| {
+                    let what = format!("model = \"{model}\", and an {name} says itself what it is");
+                    (place, what, "leave it out; `type` is what is expected of it")
+                }),
+                beams.map(|(beams, place)| {
+                    let what = format!("beams = {beams}, and an {name} has its own");
+                    (place, what, "leave it out; `angle` and `resolution` say how many")
+                }),
+                mode.map(|(mode, place)| (place, format!("mode = \"{mode}\""), super::MODES)),
+            ];
+            return match own.into_iter().flatten().next() {
+                Some((place, what, remedy)) => Err(refuse(&place, what, remedy)),
+                None => Ok(Scanner::Lms),
+            };
+        };
+        let mut turning = Turning::new(family, features);
+        if let Some((model, place)) = model {
+            let known = features.models.iter().find(|known| known.name == model);
+            turning.model = *known.ok_or_else(|| {
+                let names = features.models.iter().map(|model| model.name);
+                refuse(&place, format!("model = \"{model}\""), &auto_or(names))
+            })?;
+        }
+        if let Some((mode, place)) = mode {
+            turning.mode =
+                Some(mode_of(features, name, &mode).map_err(|(what, remedy)| refuse(&place, what, &remedy))?);
+        }
+        turning.beams = beams.map(|(beams, _)| beams);
+        turning.stop_when_idle = rest.is_some();
+        Ok(Scanner::Turning(turning))
     }
 }
 
-fn names<T, const N: usize>(all: [T; N], name: impl Fn(T) -> &'static str) -> String {
-    all.map(name).join(", ")
+/// The mode called `mode` of a family called `name`; else what is wrong, and the remedy.
+fn mode_of(features: &Features, name: &str, mode: &str) -> Result<&'static str, (String, String)> {
+    if features.modes.is_empty() {
+        let what = format!("mode = \"{mode}\", and an {name} measures in one way only");
+        return Err((what, "leave it out".to_owned()));
+    }
+    let known = features.modes.iter().find(|known| **known == mode);
+    known.copied().ok_or_else(|| (format!("mode = \"{mode}\""), auto_or(features.modes.iter().copied())))
 }
 
-/// The model is found out.
+fn auto_or(names: impl Iterator<Item = &'static str>) -> String {
+    format!("auto, or one of: {}", names.collect::<Vec<_>>().join(", "))
+}
+
+fn one_of<const N: usize>(names: [&str; N]) -> String {
+    format!("one of: {}", names.join(", "))
+}
+
+/// It is found out, or chosen.
 const AUTO: &str = "auto";
+/// What the motor does while nobody follows: whether it stops.
+const IDLE: [(&str, bool); 2] = [("run", false), ("stop", true)];

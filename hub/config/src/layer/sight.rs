@@ -5,12 +5,13 @@ use std::rc::Rc;
 
 use lms::variant::Unit;
 use preprocess::zones::{Check, Settings};
-use schema::{Failure, Family, Kind, Scan, ScanHead, Zones};
+use schema::{Failure, Kind, Scan, ScanHead, Zones};
 
 use super::processing::Sections;
-use crate::link::{Link, Scanner};
+use crate::link::Link;
 use crate::origin::Origin;
 use crate::processing::Processing;
+use crate::scanner::Scanner;
 
 /// A link with what was said about it.
 pub(super) struct Sight<'a> {
@@ -81,7 +82,7 @@ impl Sight<'_> {
                     .map(|unit| ScanHead::lms(beams, first, step_mdeg, unit.mm().into(), MOST_RANGE_BITS))
                     .collect()
             }
-            Scanner::Ld { .. } => vec![ScanHead::turning(Family::Ld, self.link.beams())],
+            Scanner::Turning(turning) => vec![ScanHead::turning(turning.family, turning.most_beams())],
         }
     }
 

@@ -10,7 +10,7 @@ use lms::reply::Reply;
 use lms::telegram::Telegram;
 use lms::variant::{Mode, Unit, Variant};
 use recording::{Encoding, Form, Frame, Recording};
-use schema::{Failure, Header, Kind};
+use schema::{Failure, Family, Header, Kind};
 
 use super::{LONGEST_GAP, period};
 
@@ -20,6 +20,8 @@ pub(crate) enum Recorded {
     Stream(Stream),
     /// Telegram by telegram.
     Frames(Frames),
+    /// Packets of a scanner whose head turns.
+    Packets(Frames),
 }
 
 /// A stream of telegrams, with whatever came between them.
@@ -66,7 +68,17 @@ impl Recorded {
     }
 
     /// `recording`, which is of one sensor, as the link of `link`; says how the ranges of a log are read.
+    ///
+    /// [`Kind::Input`] if it is of a family that this version does not know, [`Kind::Configuration`] if it is not of the
+    /// link's.
     pub(crate) fn new(recording: Recording, link: &Link) -> Result<Recorded, Failure> {
+        check_family(&recording, link)?;
+        if link.family() != Family::Lms {
+            let encoding = Encoding { unit: Unit::Mm, mode: Mode(0) };
+            let mut frames = Frames { recording, encoding, mode: None, origin: None, is_told_later: false };
+            frames.origin = frames.read()?.next().as_ref().and_then(Origin::of);
+            return Ok(Recorded::Packets(frames));
+        }
         tell_of_log(&recording, &link.name);
         let contents = recording.contents();
         let mode = contents.mode.or(link.mode).or(contents.readable());
@@ -92,13 +104,13 @@ impl Recorded {
     pub(crate) fn origin(&self) -> Option<Origin> {
         match self {
             Recorded::Stream(_) => None,
-            Recorded::Frames(frames) => frames.origin,
+            Recorded::Frames(frames) | Recorded::Packets(frames) => frames.origin,
         }
     }
 
     /// Lets its media time begin at `origin`, at which that of others begins.
     pub(crate) fn set_origin(&mut self, origin: Origin) {
-        if let Recorded::Frames(frames) = self {
+        if let Recorded::Frames(frames) | Recorded::Packets(frames) = self {
             frames.origin = Some(origin);
         }
     }
@@ -110,8 +122,9 @@ impl Recorded {
 
     /// Why no scan can be read, in words; empty if they can.
     pub(super) fn trouble(&self, name: &str) -> String {
-        let (Recorded::Stream(Stream { mode, recording }) | Recorded::Frames(Frames { mode, recording, .. })) =
-            self;
+        let (Recorded::Stream(Stream { mode, recording })
+        | Recorded::Frames(Frames { mode, recording, .. })
+        | Recorded::Packets(Frames { mode, recording, .. })) = self;
         if recording.contents().telegrams == 0 {
             return "there is no telegram in the recording".to_owned();
         }
@@ -123,10 +136,13 @@ impl Recorded {
 
     /// Media time of its end, as far as that is known.
     pub(crate) fn length(&self) -> Option<Nanos> {
-        let (Recorded::Stream(Stream { recording, .. }) | Recorded::Frames(Frames { recording, .. })) = self;
+        let (Recorded::Stream(Stream { recording, .. })
+        | Recorded::Frames(Frames { recording, .. })
+        | Recorded::Packets(Frames { recording, .. })) = self;
         let contents = recording.contents();
         match (contents.span, self.begin_ns()) {
             (Some((_, last_ns)), Some(begin_ns)) => Some(last_ns.saturating_sub(begin_ns)),
+            _ if contents.scanner_ns.is_some() => contents.scanner_ns,
             _ => Some(contents.scans.saturating_sub(1) * period(contents.variant)),
         }
     }
@@ -134,7 +150,7 @@ impl Recorded {
     /// Media time of its last telegram, for which all of it is read where it has stamps.
     pub(crate) fn end(&self) -> Result<Nanos, Failure> {
         match self {
-            Recorded::Frames(frames) if frames.has_stamps() => {
+            Recorded::Frames(frames) | Recorded::Packets(frames) if frames.has_stamps() => {
                 let mut timeline = frames.timeline();
                 Ok(frames.read()?.map(|frame| timeline.media(&frame)).last().unwrap_or(0))
             }
@@ -219,6 +235,10 @@ pub(super) struct Timeline {
 impl Timeline {
     /// The media time of `frame`, which comes next.
     pub(super) fn media(&mut self, frame: &Frame) -> Nanos {
+        if let Some(scanner_ns) = frame.scanner_ns {
+            self.last = self.last.max(scanner_ns);
+            return self.last;
+        }
         let media = match (frame.header, self.life) {
             (Some(header), Some((boot, zero_ns))) if boot == header.boot => {
                 i128::from(header.stamp_first_ns) - zero_ns
@@ -262,6 +282,27 @@ impl Origin {
         };
         if is_earlier { self } else { other }
     }
+}
+
+/// Whether `recording` is of a scanner that `link` can be of.
+fn check_family(recording: &Recording, link: &Link) -> Result<(), Failure> {
+    if recording.contents().telegrams == 0 || recording.family() == Some(link.family()) {
+        return Ok(());
+    }
+    let (place, number) = (recording.path().display(), recording.contents().family);
+    let Some(family) = recording.family() else {
+        let message = format!("recording {place} is of a scanner of family number {number}");
+        let hint = "a later version of scanhub recorded it: replay it with that";
+        return Err(Failure::new(Kind::Input, message, hint));
+    };
+    let message = format!(
+        "recording {place} is of a scanner of family {}, and link {} is of family {}",
+        family.name(),
+        link.name,
+        link.family().name()
+    );
+    let hint = format!("set link.{}.family = \"{}\"", link.name, family.name());
+    Err(Failure::new(Kind::Configuration, message, hint))
 }
 
 /// That the values are read in a way which neither the recording nor the configuration tells.
@@ -318,7 +359,7 @@ mod tests {
     const SECOND: Nanos = 1_000 * lms::MILLIS;
 
     fn frame(wall_s: u64, header: Option<Header>) -> Frame {
-        Frame { telegram: Vec::new(), wall_ns: Some(wall_s * SECOND), header }
+        Frame { wall_ns: Some(wall_s * SECOND), header, ..Frame::default() }
     }
 
     /// Media times, in seconds.

@@ -1,13 +1,14 @@
 //! The session as its driver sees it: what goes in, and what is wanted next.
 
-use line::{Account, Control, MILLIS, Nanos, Output, State};
+use line::{Account, Control, Heard, MILLIS, Nanos, Output, State};
 
 use super::{MOST, Phase, Session};
-use crate::heard::{Heard, Why};
+use crate::heard::{Trouble, Why};
 
 impl line::Session for Session {
     type Heard<'a> = Heard<'a>;
     type Why = Why;
+    type Trouble = Trouble;
 
     fn spare(&mut self) -> &mut [u8] {
         let spare = self.framer.spare();
@@ -93,6 +94,10 @@ impl line::Session for Session {
         }
     }
 
+    fn trouble(&self) -> Option<Trouble> {
+        self.trouble.filter(|_| !matches!(self.phase, Phase::Paused))
+    }
+
     fn rate(&self) -> u32 {
         self.baud
     }
@@ -110,6 +115,7 @@ impl line::Session for Session {
             due: came + lost,
             lost,
             damaged: self.damaged.0,
+            rejected_checksum: tally.rejected_checksum,
             resyncs: self.resyncs,
             began_with_a_cut: self.cut,
         }

@@ -81,7 +81,7 @@ impl Bench {
         loop {
             match self.session.poll_output() {
                 Output::SetRate(baud) => self.log.bauds.push(baud),
-                Output::Transmit { .. } => panic!("nothing is sent to such a scanner"),
+                Output::Transmit { .. } | Output::SetDtr(_) => panic!("nothing is sent to such a scanner"),
                 Output::Rest(until) => {
                     assert!(until > self.now && until <= self.now + 5 * MILLIS);
                     return (Some(until), until);

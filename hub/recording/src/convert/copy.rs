@@ -30,7 +30,7 @@ pub(super) fn copy(
     while let Some(item) = reader.next().map_err(|error| recording.broken(&error))? {
         match item {
             Item::Telegram(sighting) if sensor.is_none_or(|sensor| *sensor == sighting.sensor) => {
-                let is_scan = sighting.telegram.get(4) == Some(&lms::measured::MEASURED);
+                let is_scan = crate::is_scan(sighting.header.family, &sighting.telegram);
                 let len = sighting.telegram.len();
                 let header = &sighting.header;
                 let written =

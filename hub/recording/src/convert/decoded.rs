@@ -1,5 +1,6 @@
 //! What other programs need from a recording: its scans, and the poses of their sensors. Scans are decoded from telegrams
-//! as in the hub; if a sensor's telegrams were not recorded, its published scans are used. Refuses to know the output.
+//! as in the hub; if a sensor's telegrams were not recorded, its published scans are used. Of a scanner whose head turns the
+//! published ones go first. Refuses to know the output.
 
 use std::collections::BTreeMap;
 
@@ -8,9 +9,10 @@ use lms::reply::Reply;
 use lms::telegram::Telegram;
 use lms::variant::Mode;
 use schema::datagram::Packed;
-use schema::{Failure, Header, Kind, Pose, Scan, Status, Topic};
+use schema::{Failure, Family, Header, Kind, Pose, Scan, Status, Topic};
 
 use super::times::Times;
+use super::turns::Turns;
 use crate::mcap::reader::Item;
 use crate::{Encoding, Form, Recording};
 
@@ -29,6 +31,8 @@ struct Sensor {
     mode: Option<Mode>,
     /// Its scans are made of telegrams.
     is_decoded: bool,
+    /// Where its head turns.
+    turns: Option<Turns>,
 }
 
 /// Calls `tell` with all that is in `recording`, in its order. What came without the name of a sensor is of `name`; `mode`
@@ -48,7 +52,7 @@ pub(super) fn each(
             let told = (form == Form::Carmen).then_some(encoding.mode);
             let contents = recording.contents();
             let mode = contents.mode.or(told).or(mode).or(contents.readable());
-            let mut sensor = Sensor { mode, is_decoded: true };
+            let mut sensor = Sensor { mode, is_decoded: true, turns: Turns::of(recording)? };
             sensor.check(recording, name)?;
             let mut times = Times::of(recording);
             let mut scan = Box::<Scan>::default();
@@ -56,6 +60,12 @@ pub(super) fn each(
             while let Some((number, frame)) = frames.next() {
                 let next_ns = frames.peek().and_then(|(_, next)| next.wall_ns);
                 let header = times.header(&frame, number as u64, next_ns);
+                if let Some(turns) = &mut sensor.turns {
+                    turns.each(&header, &frame.telegram, |header, scan| {
+                        tell(Sight::Scan(name, header, scan))
+                    })?;
+                    continue;
+                }
                 tell(match sensor.decode(&frame.telegram, &mut scan) {
                     true => Sight::Scan(name, header, &scan),
                     false => Sight::Other,
@@ -76,8 +86,10 @@ fn each_of_mcap(
     for name in &recording.contents().sensors {
         let contents = recording.of(name)?.contents().clone();
         let mode = contents.mode.or(mode).or(contents.readable());
-        let is_decoded = contents.scans > 0 && (mode.is_some() || !known.channels.has_scans(name));
-        let sensor = Sensor { mode, is_decoded };
+        let has_scans = known.channels.has_scans(name);
+        let turns = if has_scans { None } else { Turns::of(&recording.of(name)?)? };
+        let is_decoded = contents.scans > 0 && (mode.is_some() || !has_scans);
+        let sensor = Sensor { mode, is_decoded, turns };
         sensor.check(recording, name)?;
         sensors.insert(name.clone(), sensor);
     }
@@ -86,6 +98,14 @@ fn each_of_mcap(
         match item {
             Item::Telegram(sighting) => {
                 let Some(sensor) = sensors.get_mut(&sighting.sensor) else { continue };
+                if sighting.header.family != Family::Lms as u8 {
+                    let Some(turns) = &mut sensor.turns else { continue };
+                    let name = &sighting.sensor;
+                    turns.each(&sighting.header, &sighting.telegram, |header, scan| {
+                        tell(Sight::Scan(name, header, scan))
+                    })?;
+                    continue;
+                }
                 tell(match sensor.decode(&sighting.telegram, &mut scan) && sensor.is_decoded {
                     true => Sight::Scan(&sighting.sensor, sighting.header, &scan),
                     false => Sight::Other,

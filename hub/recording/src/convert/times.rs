@@ -19,7 +19,7 @@ impl Times {
     pub(super) fn of(recording: &Recording) -> Times {
         let contents = recording.contents();
         let variant = contents.variant.unwrap_or(Variant::HALF);
-        let took_ns = contents.scans * scan_ns(variant);
+        let took_ns = contents.scanner_ns.unwrap_or(contents.scans * scan_ns(variant));
         let begin_ns = match contents.span {
             Some((first_ns, _)) => first_ns,
             None => recording.written_ns().saturating_sub(took_ns),
@@ -31,7 +31,8 @@ impl Times {
 
     /// When `frame`, the next one, was measured.
     pub(super) fn wall_ns(&mut self, frame: &Frame) -> u64 {
-        let at_ns = frame.wall_ns.unwrap_or(self.wall_ns);
+        let of_scanner = frame.scanner_ns.map(|ns| self.begin_ns.saturating_add(ns));
+        let at_ns = frame.wall_ns.or(of_scanner).unwrap_or(self.wall_ns);
         let step_ns = if frame.is_scan() { scan_ns(self.variant) } else { line_ns(frame) };
         self.wall_ns = at_ns.saturating_add(step_ns);
         at_ns
@@ -52,7 +53,11 @@ impl Times {
             wall_ns,
             boot: self.boot,
             flags: Flags::STAMP_ESTIMATED,
-            period_us: (period_ns / 1000) as u32,
+            family: frame.family,
+            quality: u8::from(frame.reasons != 0),
+            reasons: frame.reasons,
+            // Packets are no scans.
+            period_us: if frame.scanner_ns.is_some() { 0 } else { (period_ns / 1000) as u32 },
             ..Header::default()
         }
     }

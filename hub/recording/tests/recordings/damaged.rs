@@ -133,8 +133,7 @@ fn schema_bytes(known: &crate::written::Known) -> Vec<u8> {
     ] {
         bytes.extend(word.to_le_bytes());
     }
-    bytes.extend([header.sensor, header.quality]);
-    bytes.extend(header.flags.to_le_bytes());
+    bytes.extend([header.sensor, header.quality, header.flags, header.family]);
     bytes.extend(header.period_us.to_le_bytes());
     bytes.extend(header.hub_pid.to_le_bytes());
     bytes.push(header.reasons);

@@ -113,7 +113,7 @@ fn one_without_its_beginning_is_known_by_its_end_or_its_messages() {
     for (name, bytes, sensors, telegrams) in [
         ("rest", written.bytes[len / 3..].to_vec(), ["front", "rear"], 40..60),
         ("end", written.bytes[end..].to_vec(), ["front", "rear"], 0..8),
-        ("blank", blank, ["front", "rear"], 60..80),
+        ("blank", blank, ["front", "rear"], 60..81),
         ("middle", middle.clone(), ["sensor0", "sensor1"], 8..20),
     ] {
         let file = File::new(name, &bytes);

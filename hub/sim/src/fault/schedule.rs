@@ -28,11 +28,17 @@ impl Schedule {
 
     /// When the sensor's power is cycled.
     pub(crate) fn power_cycles(faults: &Faults, seed: u64) -> Schedule {
-        let Faults { power_at, power_every, .. } = *faults;
-        match power_at + power_every > 0.0 {
-            true => Schedule::new(power_at, power_every, random(seed, 7)),
-            false => Schedule::never(),
-        }
+        Schedule::wanted(faults.power_at, faults.power_every, random(seed, 7))
+    }
+
+    /// When the sensor's voltage dips.
+    pub(crate) fn brownouts(faults: &Faults, seed: u64) -> Schedule {
+        Schedule::wanted(faults.brownout_at, faults.brownout_every, random(seed, 12))
+    }
+
+    /// As [`Schedule::new`]; never, where neither time is said.
+    fn wanted(at_s: f64, every_s: f64, random: fastrand::Rng) -> Schedule {
+        if at_s + every_s > 0.0 { Schedule::new(at_s, every_s, random) } else { Schedule::never() }
     }
 
     /// Never.
@@ -87,6 +93,11 @@ impl Window {
     /// When the port is gone.
     pub(crate) fn unplugs(faults: &Faults, seed: u64) -> Window {
         Window::new(faults.unplug, faults.unplug_at, faults.unplug_every, random(seed, 9))
+    }
+
+    /// When something holds the sensor's head.
+    pub(crate) fn held(faults: &Faults, seed: u64) -> Window {
+        Window::new(faults.hold, faults.hold_at, faults.hold_every, random(seed, 13))
     }
 
     /// Whether it holds at `now`. Time must not go backwards.

@@ -75,6 +75,13 @@ faults! {
     unplug_every, 0.0 to 86400.0, 0.0, "as silence_every";
     power_at, 0.0 to 86400.0, 0.0, "time of the first power cycle, in seconds; 0: within power_every";
     power_every, 0.0 to 86400.0, 0.0, "mean seconds to the next; 0: once";
+    brownout_at, 0.0 to 86400.0, 0.0, "of an RPLIDAR: time of the first restart by itself, as power_at";
+    brownout_every, 0.0 to 86400.0, 0.0, "as power_every";
+    hold, 0.0 to 86400.0, 0.0, "of an RPLIDAR: seconds for which something holds its head";
+    hold_at, 0.0 to 86400.0, 0.0, "as silence_at";
+    hold_every, 0.0 to 86400.0, 0.0, "as silence_every";
+    health, 0.0 to 2.0, 0.0, "of an RPLIDAR: status that it reports until a RESET: 1 warning, 2 error";
+    stubborn, 0.0 to 1.0, 0.0, "1: a RESET does not change that status";
     overlook, 0.0 to 1.0, 0.0, "share of the requests that the sensor ignores";
     nak, 0.0 to 1.0, 0.0, "share of the requests that it answers with NAK";
     twice, 0.0 to 1.0, 0.0, "share of the replies that it sends twice";

@@ -4,7 +4,7 @@
 use lms::Nanos;
 
 use super::{Room, Sight, told};
-use crate::layers::Dice;
+use crate::layers::{Dice, Layers};
 use crate::spot::echo;
 use crate::view::View;
 
@@ -14,6 +14,8 @@ pub(crate) struct Beams {
     room: Room,
     /// The things around the beam, to be drawn over.
     view: Option<View>,
+    /// Those of a series of rooms, each seen so.
+    rooms: Vec<Beams>,
 }
 
 /// What a beam tells.
@@ -25,18 +27,32 @@ pub(crate) struct Look {
     pub(crate) exact_mm: Option<f64>,
     /// How much comes back, 0 to 255.
     pub(crate) intensity: u8,
+    /// The same beside a white surface at 1 m; without end where a world has no noise at all.
+    pub(crate) signal: f64,
 }
 
 impl Beams {
     pub(crate) fn new(room: Room) -> Beams {
-        Beams { room, view: None }
+        let rooms = match &room.sight {
+            Sight::Series(series, _) => series.rooms().map(|room| Beams::new(room.clone())).collect(),
+            _ => Vec::new(),
+        };
+        Beams { room, view: None, rooms }
     }
 
     /// Looks at `angle_deg` (0 ahead, counter-clockwise, -180 to 180) at `at_ns`.
     pub(crate) fn look(&mut self, at_ns: Nanos, angle_deg: f64) -> Look {
+        if let Sight::Series(series, changes) = &self.room.sight {
+            return self.rooms[series.number(changes, at_ns)].look(at_ns, angle_deg);
+        }
         let mut random = fastrand::Rng::with_seed(self.room.seed ^ at_ns.wrapping_mul(0x9E37_79B9_7F4A_7C15));
         let dice = Dice::throw(&mut random);
-        let all = |range_mm: Option<f64>| Look { range_mm, exact_mm: range_mm, intensity: PLAIN as u8 };
+        let all = |range_mm: Option<f64>| Look {
+            range_mm,
+            exact_mm: range_mm,
+            intensity: PLAIN as u8,
+            signal: f64::INFINITY,
+        };
         let stage = match &self.room.sight {
             Sight::Scene(stage) => stage,
             Sight::Empty | Sight::Series(..) => return Look { intensity: 0, ..all(None) },
@@ -56,7 +72,8 @@ impl Beams {
         let range_mm = told(stage, &echo, sun, &dice).ok().map(|range_mm| range_mm + off_mm);
         let plain = PLAIN * echo.signal.min(1.0).powf(0.25);
         let intensity = if echo.bright > 0.0 { plain.max(REFLECTOR * echo.bright) } else { plain };
-        Look { range_mm, exact_mm, intensity: range_mm.map_or(0, |_| intensity as u8) }
+        let signal = if stage.layers != Layers::NONE { echo.signal } else { f64::INFINITY };
+        Look { range_mm, exact_mm, intensity: range_mm.map_or(0, |_| intensity as u8), signal }
     }
 }
 

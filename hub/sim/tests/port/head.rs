@@ -8,7 +8,7 @@ use line::{Nanos, Output, Session as _, State};
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use schema::Failure;
 use sim::fault::Faults;
-use sim::options::SimulateOptions;
+use sim::options::{Scanner, SimulateOptions};
 use sim::pty::now_ns;
 use sim::simulate;
 use sim::truth::Record;
@@ -56,7 +56,7 @@ fn every_model_is_heard_bit_for_bit_as_the_truth_says() {
         let port = folder.path("front");
         let simulator = Simulator::start(SimulateOptions {
             ports: vec![port.clone()],
-            model: Some(model),
+            scanner: Some(Scanner::Ld(model)),
             ..SimulateOptions::default()
         });
         let settings = Settings::default();
@@ -83,13 +83,10 @@ fn every_model_is_heard_bit_for_bit_as_the_truth_says() {
 fn faults_are_told_and_what_an_ld_has_not_is_refused() {
     let folder = Folder::new("ld-faults");
     let port = folder.path("front");
-    let of = |model| SimulateOptions { ports: vec![port.clone()], model, ..SimulateOptions::default() };
+    let scanner = Some(Scanner::Ld(Model::Ld06));
+    let of = || SimulateOptions { ports: vec![port.clone()], scanner, ..SimulateOptions::default() };
     let faults: Faults = "truncate=0.2,power_every=0.3".parse().expect("faults");
-    let simulator = Simulator::start(SimulateOptions {
-        faults,
-        boot: Duration::from_millis(50),
-        ..of(Some(Model::Ld06))
-    });
+    let simulator = Simulator::start(SimulateOptions { faults, boot: Duration::from_millis(50), ..of() });
     let host = Host::open(&port, Model::Ld06.baud());
     for fault in ["truncated", "power"] {
         simulator.record_where(|record| record.fault.is_some_and(|found| found.name() == fault));
@@ -100,8 +97,8 @@ fn faults_are_told_and_what_an_ld_has_not_is_refused() {
         simulate(&options, &stop, |_| {}, |_| {}).expect_err("refused")
     };
     let unit = Some(lms::variant::Unit::Cm);
-    let failure = refused(SimulateOptions { unit, ..of(Some(Model::Ld06)) });
+    let failure = refused(SimulateOptions { unit, ..of() });
     assert!(failure.message.contains("ld06 has no unit") && failure.kind.exit_code() == 78, "{failure}");
     let replay = Some("/no/file".into());
-    assert_eq!(refused(SimulateOptions { replay, ..of(Some(Model::Ld06)) }).kind.exit_code(), 66);
+    assert_eq!(refused(SimulateOptions { replay, ..of() }).kind.exit_code(), 66);
 }

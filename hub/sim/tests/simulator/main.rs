@@ -6,4 +6,5 @@ mod head;
 mod inquiry;
 mod machine;
 mod session;
+mod unit;
 mod worlds;

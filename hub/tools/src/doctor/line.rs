@@ -12,8 +12,8 @@ use super::Subject;
 use super::counts::{as_the_hub_counts, line_errors, line_loss};
 use super::finding::Finding;
 use super::hub::Hub;
-use super::sensor;
-use crate::probe;
+use super::{sensor, turning};
+use crate::probe::{self, Answer};
 
 /// Examines a port and its sensor.
 ///
@@ -136,18 +136,18 @@ fn ask(
     stop: &AtomicBool,
     tell: &mut dyn FnMut(Finding),
 ) -> Result<bool, Failure> {
-    match probe::ask(port, first, &subject.source, stop, |_| {}) {
-        Ok(report) => {
-            let findings = sensor::examine(&subject.source.name(), &report, subject.link.as_ref());
-            findings.into_iter().for_each(tell);
-            Ok(true)
-        }
-        Err(failure) if failure.kind == Kind::Interrupted => Err(failure),
+    let (source, link) = (&subject.source, subject.link.as_ref());
+    let findings = match probe::find(port, first, source, link.map(config::Link::family), stop, |_| {}) {
+        Ok(Answer::Asked(report)) => sensor::examine(&source.name(), &report, link),
+        Ok(Answer::Heard(heard)) => turning::examine(&heard, link),
+        Err(failure) if failure.kind == Kind::Interrupted => return Err(failure),
         Err(failure) => {
             tell(Finding::failed("sensor", failure.message, failure.hint));
-            Ok(false)
+            return Ok(false);
         }
-    }
+    };
+    findings.into_iter().for_each(tell);
+    Ok(true)
 }
 
 /// The hub has it; whoever has it too takes bytes away from it. The service manager keeps it for the next hub.
@@ -250,17 +250,22 @@ fn latency(path: &Path, ms: Option<u8>) -> Finding {
 /// Whether it can have the rate to stream at.
 fn rate(subject: &Subject, port: &Port, first: Baud) -> Finding {
     const NAME: &str = "rate";
-    let wanted = subject.link.as_ref().map_or(Baud::B500000, |link| link.baud);
-    let outcome = port.set_baud(wanted.rate());
-    let given = port.baud().filter(|&given| given != wanted.rate());
+    let wanted = subject.link.as_ref().map_or(Baud::B500000.rate(), config::Link::rate);
+    let outcome = port.set_baud(wanted);
+    let given = port.baud().filter(|&given| given != wanted);
     // The inquiry begins at the rate at which it was opened.
     let _ = port.set_baud(first.rate());
     match (outcome, &subject.link) {
         (Ok(()), _) => {
             let near =
                 given.map_or(String::new(), |given| format!(": the driver sets {given} Bd, close enough"));
-            Finding::ok(NAME, format!("{} Bd is possible{near}", wanted.rate()))
+            Finding::ok(NAME, format!("{wanted} Bd is possible{near}"))
         }
+        (Err(error), Some(link)) if link.scanner != config::Scanner::Lms => Finding::failed(
+            NAME,
+            error.to_string(),
+            "use an adapter that can set it: with a CP2102N, FT232R or newer",
+        ),
         (Err(error), Some(link)) => Finding::failed(
             NAME,
             error.to_string(),

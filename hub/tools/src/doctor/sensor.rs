@@ -52,8 +52,9 @@ fn marks(status: &Status, when: &str) -> Option<Finding> {
 fn link_of_the_hub(name: &str, status: &Status) -> Finding {
     const NAME: &str = "sensor";
     let text = format!(
-        "link {name} of the hub: {}, {}",
+        "link {name} of the hub: {}, family {}, {}",
         status.state().map_or("unknown", State::name),
+        status.family().map_or("unknown", |family| family.name()),
         match status.sensor_type() {
             "" => "type not known",
             kind => kind,

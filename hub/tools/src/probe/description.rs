@@ -16,6 +16,8 @@ use serde::Serialize;
 pub struct Description {
     class: &'static str,
     port: String,
+    family: &'static str,
+    model: Option<String>,
     baud: Option<u32>,
     #[serde(rename = "type")]
     kind: Option<String>,
@@ -77,6 +79,8 @@ impl Description {
         Description {
             class: "probe",
             port,
+            family: schema::Family::Lms.name(),
+            model: kind.as_deref().map(str::to_lowercase),
             baud: report.baud.map(|baud| baud.rate()),
             kind,
             number,
@@ -110,6 +114,7 @@ impl fmt::Display for Description {
             None => Ok(()),
         };
         let (kind, number) = (self.kind.as_deref(), self.number.as_deref());
+        row("family", Some(self.family.to_owned()))?;
         row("type", kind.map(|kind| format!("{kind}, number {}", number.unwrap_or("not told"))))?;
         row("firmware", self.firmware.clone())?;
         row("rate", self.baud.map(|baud| format!("{baud} Bd")))?;

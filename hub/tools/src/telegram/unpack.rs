@@ -7,7 +7,7 @@ use std::path::Path;
 
 use lms::variant::{Mode, Unit};
 use recording::{Encoding, Form, Frame, Recording};
-use schema::{Failure, Kind};
+use schema::{Failure, Family, Kind};
 
 /// Bytes, and the measuring mode of their values where the recording tells it.
 type Unpacked = (Box<dyn Read>, Option<Mode>);
@@ -32,6 +32,14 @@ pub(super) fn open(path: &Path, sensor: Option<&str>) -> Result<Unpacked, Failur
         recording = recording.of(sensor)?;
     }
     let contents = recording.contents();
+    if !contents.is_lms() {
+        let family = recording.family().map_or("that is not known here", Family::name);
+        let message = format!(
+            "{} has packets of a scanner of family {family}, not telegrams of an LMS",
+            path.display()
+        );
+        return Err(Failure::new(Kind::Input, message, "`scanhub convert IN OUT.csv` makes scans of them"));
+    }
     if !contents.damage.is_none() {
         tracing::warn!("{}: missing: {}", path.display(), contents.damage);
     }

@@ -1,7 +1,5 @@
 //! Another sensor is at the line, at some rate, idle or streaming already.
 
-use lms::variant::Baud;
-
 use super::{Key, Kind, SENSOR};
 use crate::event::Event;
 use crate::plan::Action;
@@ -15,12 +13,10 @@ pub(crate) const KIND: Kind = Kind {
 };
 
 fn act(world: &mut World, action: &Action) {
-    let baud = Baud::ALL[action.value("rate") as usize % Baud::ALL.len()];
-    let streams = action.value("streams") > 0;
     let sensor = world.sensor(action);
     world.port(sensor, |tty, log, now| {
         tty.advance(now, log);
-        tty.sensor.exchange(baud, streams);
+        tty.sensor.exchange(action);
     });
     world.shared.tell(&Event::Exchanged { sensor });
 }

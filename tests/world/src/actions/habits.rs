@@ -1,8 +1,5 @@
 //! A sensor behaves badly for a while: it overlooks requests, refuses them, answers twice or late.
 
-use lms::MILLIS;
-use sim::machine::Habits;
-
 use super::{Key, Kind, SENSOR};
 use crate::plan::Action;
 use crate::world::World;
@@ -24,18 +21,9 @@ pub(crate) const KIND: Kind = Kind {
 };
 
 fn act(world: &mut World, action: &Action) {
-    let share = |name| action.value(name) as f64 / 1e2;
-    let habits = Habits {
-        overlooks: share("overlooks"),
-        naks: share("naks"),
-        doubles: share("doubles"),
-        late_reply_ns: action.value("late_ms") * MILLIS,
-        mute: action.value("mute") > 0,
-        ..Habits::default()
-    };
     let sensor = world.sensor(action);
-    world.port(sensor, |tty, _, _| tty.sensor.set_habits(habits));
+    world.port(sensor, |tty, _, _| tty.sensor.misbehave(Some(action)));
     world.later(action.value("span_ms"), move |world| {
-        world.port(sensor, |tty, _, _| tty.sensor.set_habits(Habits::default()));
+        world.port(sensor, |tty, _, _| tty.sensor.misbehave(None));
     });
 }

@@ -17,6 +17,7 @@ mod no_descriptors;
 mod no_memory;
 mod noise;
 pub(crate) mod object;
+mod pace;
 mod partition;
 mod pause;
 mod power_cycle;
@@ -93,6 +94,7 @@ pub(crate) const KINDS: &[Kind] = &[
     network_stall::KIND,
     gateway_killed::KIND,
     listener_killed::KIND,
+    pace::KIND,
 ];
 
 /// What `action` does to the bytes on a line from `now` on, if it is of such a kind.

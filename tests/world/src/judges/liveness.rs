@@ -1,12 +1,14 @@
 //! When nothing goes wrong any more, everything comes back soon: each link says that it streams, and publishes measured values;
 //! and scans, as soon as the sensor has told how its values are split. One that did not tell is asked again now and then.
 
-use lms::measured::MEASURED;
+use std::rc::Rc;
+
 use lms::{MILLIS, Nanos};
 use schema::{State, Status, Topic};
 
 use super::{Judge, Say};
 use crate::event::Event;
+use crate::family::Family;
 
 /// Since when nothing goes wrong, and what has come back.
 pub(crate) struct Liveness {
@@ -14,16 +16,18 @@ pub(crate) struct Liveness {
     sensors: Vec<OfSensor>,
 }
 
-#[derive(Clone, Copy, Default)]
 struct OfSensor {
+    family: Rc<dyn Family>,
     says_so: bool,
     /// Telegrams of measured values came, and scans.
     came: [bool; 2],
 }
 
 impl Liveness {
-    pub(crate) fn new(sensors: usize) -> Liveness {
-        Liveness { healed: None, sensors: vec![OfSensor::default(); sensors] }
+    pub(crate) fn new(sensors: &[Rc<dyn Family>]) -> Liveness {
+        let sensor =
+            |family: &Rc<dyn Family>| OfSensor { family: family.clone(), says_so: false, came: [false; 2] };
+        Liveness { healed: None, sensors: sensors.iter().map(sensor).collect() }
     }
 }
 
@@ -43,12 +47,14 @@ impl Judge for Liveness {
                 self.sensors[sensor].says_so = status.state() == Some(State::Streaming);
             }
             Event::Published { sensor, sample } => {
+                let of = &mut self.sensors[sensor];
+                let is_data =
+                    || of.family.units(&sample.bytes).into_iter().any(|unit| of.family.is_data(unit));
                 let which = match sample.topic {
-                    Topic::Telegram if sample.bytes[4] == MEASURED => 0,
+                    Topic::Telegram if is_data() => 0,
                     Topic::Scan => 1,
                     _ => return,
                 };
-                let of = &mut self.sensors[sensor];
                 let is_back = of.says_so && !of.came[which];
                 of.came[which] |= of.says_so;
                 if let Some(healed) = self.healed

@@ -5,6 +5,7 @@ mod accounts;
 mod bytes;
 mod eeprom;
 mod liveness;
+mod lost_on_line;
 mod nothing_invented;
 mod nothing_lost;
 mod numbers;
@@ -16,11 +17,12 @@ mod remote_nothing_invented;
 mod remote_numbers;
 mod remote_verdict;
 mod resources;
+mod turns;
 mod verdict;
 
 use lms::Nanos;
 
-use crate::event::{Event, Violation};
+use crate::event::{Event, Figures, Violation};
 use crate::plan::Plan;
 use crate::remote::Terms;
 use crate::setup::Setup;
@@ -32,6 +34,11 @@ pub(crate) trait Judge {
 
     /// `event` happened at `at`.
     fn note(&mut self, at: Nanos, event: &Event<'_>, say: &mut Say<'_>);
+
+    /// What it measured, if that can be told in figures.
+    fn figures(&self) -> Figures {
+        Figures::default()
+    }
 }
 
 /// Where a judge says what is broken.
@@ -53,13 +60,15 @@ impl Say<'_> {
 
 /// All judges, for a world that begins with `setup`.
 pub(crate) fn all(setup: &Setup, plan: &Plan) -> Vec<Box<dyn Judge>> {
-    let (sensors, terms) = (setup.sensors.len(), Terms::of_seed(plan.seed));
+    let (sensors, terms) = (&setup.sensors[..], Terms::of_seed(plan.seed));
     vec![
-        Box::new(bytes::Bytes::new(sensors)),
+        Box::new(bytes::Bytes::new(sensors.len())),
         Box::new(accounts::Accounts::default()),
-        Box::new(numbers::Numbers::default()),
+        Box::new(numbers::Numbers::new(sensors)),
         Box::new(nothing_invented::NothingInvented::new(sensors)),
         Box::new(nothing_lost::NothingLost::new(sensors)),
+        Box::new(turns::Turns::new(sensors)),
+        Box::new(lost_on_line::LostOnLine::new(sensors)),
         Box::new(prompt::Prompt::default()),
         Box::new(recording::Recording::new(plan.seed)),
         Box::new(verdict::OfRobot::new(setup, plan)),

@@ -2,21 +2,22 @@
 //! hub said that it streams, is published once and in order, unless there was no memory for it.
 
 use std::collections::VecDeque;
+use std::rc::Rc;
 
-use lms::measured::MEASURED;
 use lms::{MILLIS, Nanos};
 use schema::{State, Status, Topic};
 
 use super::{Judge, Say};
 use crate::event::{Event, Telegram};
+use crate::family::Family;
 
 /// What is due of each sensor.
 pub(crate) struct NothingLost {
     sensors: Vec<OfSensor>,
 }
 
-#[derive(Default)]
 struct OfSensor {
+    family: Rc<dyn Family>,
     sent: VecDeque<Sent>,
     /// Place of the first byte that the session on the line can know.
     valid_from: u64,
@@ -45,8 +46,8 @@ struct Sent {
 }
 
 impl NothingLost {
-    pub(crate) fn new(sensors: usize) -> NothingLost {
-        NothingLost { sensors: (0..sensors).map(|_| OfSensor::default()).collect() }
+    pub(crate) fn new(sensors: &[Rc<dyn Family>]) -> NothingLost {
+        NothingLost { sensors: sensors.iter().cloned().map(OfSensor::new).collect() }
     }
 }
 
@@ -77,10 +78,16 @@ impl Judge for NothingLost {
             Event::Closed { sensor } => self.sensors[sensor].end(at),
             Event::HubEnds { .. } => self.sensors.iter_mut().for_each(|of| of.end(at)),
             Event::Read { sensor, to, .. } => self.sensors[sensor].read(at, to),
-            Event::Lacking { sensor, topic: Topic::Telegram } => self.sensors[sensor].holes += 1,
+            Event::Lacking { sensor, topic: Topic::Telegram } => {
+                let of = &mut self.sensors[sensor];
+                of.holes += of.family.most_units();
+            }
             Event::Published { sensor, sample } if sample.topic == Topic::Telegram => {
-                if let Some(lost) = self.sensors[sensor].publish(at, &sample.bytes) {
-                    say.broken(format!("sensor {sensor}: {lost}"));
+                let of = &mut self.sensors[sensor];
+                for unit in of.family.clone().units(&sample.bytes) {
+                    if let Some(lost) = of.publish(at, unit) {
+                        say.broken(format!("sensor {sensor}: {lost}"));
+                    }
                 }
             }
             Event::Published { sensor, sample } if sample.topic == Topic::Status => {
@@ -108,12 +115,26 @@ impl Judge for NothingLost {
 }
 
 impl OfSensor {
+    fn new(family: Rc<dyn Family>) -> OfSensor {
+        OfSensor {
+            family,
+            sent: VecDeque::new(),
+            valid_from: 0,
+            streams_from: None,
+            read: 0,
+            exchanged: 0,
+            is_other: false,
+            mixed_until: 0,
+            holes: 0,
+        }
+    }
+
     fn send(&mut self, telegram: &Telegram<'_>) {
-        let Telegram { bytes, span, damage, aborted } = *telegram;
+        let Telegram { bytes, span, damage, aborted, .. } = *telegram;
         let is_whole = damage.is_none() && !aborted;
         let (bytes, exchanged) = (bytes.to_vec(), self.exchanged);
         self.sent.push_back(Sent { bytes, span, exchanged, is_whole, is_read: false, due_at: None });
-        while self.sent.len() > MOST && self.sent[0].due_at.is_none() {
+        while self.sent.len() > MOST * self.family.most_units() && self.sent[0].due_at.is_none() {
             self.sent.pop_front();
         }
     }
@@ -149,15 +170,20 @@ impl OfSensor {
         // Replies are often the same, and of those that are, the whole one came.
         let whole = self.sent.iter().position(|sent| sent.is_whole && is_it(sent));
         let found = whole.or_else(|| self.sent.iter().position(is_it))?;
-        let is_of_this = bytes[4] == MEASURED && self.sent[found].exchanged == self.exchanged;
+        let is_of_this = self.family.is_data(bytes) && self.sent[found].exchanged == self.exchanged;
         self.is_other &= !is_of_this || at < self.mixed_until;
+        // One that lost its first byte is whole again with the last one of the one before it, if that is the same: either is.
+        let is_lent = !self.sent[found].is_whole;
         let passed = self.sent.drain(..=found).take(found);
-        let lost: Vec<Sent> = passed.filter(|sent| sent.due_at.is_some()).collect();
+        let mut lost: Vec<Sent> = passed.filter(|sent| sent.due_at.is_some()).collect();
+        if is_lent && lost.last().is_some_and(|sent| sent.bytes.last() == bytes.first()) {
+            lost.pop();
+        }
         let (count, holes) = (lost.len(), self.holes);
         self.holes = holes.saturating_sub(count);
         (count > holes).then(|| {
             let Sent { bytes, span, .. } = &lost[0];
-            format!("{count} lost, first {:02X} at {span:?}", bytes[4])
+            format!("{count} lost, first at {span:?}: {:02X?}", &bytes[..bytes.len().min(8)])
         })
     }
 }
@@ -166,5 +192,5 @@ impl OfSensor {
 const HELD: Nanos = 100 * MILLIS;
 /// A line holds bytes back for no longer than so (action `silence`).
 const HELD_BACK: Nanos = 4_000 * MILLIS;
-/// So many that were never due are remembered.
+/// So many samples that were never due are remembered.
 const MOST: usize = 64;

@@ -2,18 +2,29 @@
 //! has its number, its stamps and its quality.
 
 use std::collections::BTreeMap;
+use std::rc::Rc;
 
 use lms::Nanos;
 use schema::{Header, Topic};
 
 use super::{Judge, Say};
 use crate::event::Event;
+use crate::family::Family;
 use crate::topics::Sample;
 
 /// The last headers.
-#[derive(Default)]
 pub(crate) struct Numbers {
+    /// Of which sample of a sensor all others are made that say when they were sent.
+    sources: Vec<Topic>,
     last: BTreeMap<(usize, Topic), Header>,
+}
+
+impl Numbers {
+    pub(crate) fn new(sensors: &[Rc<dyn Family>]) -> Numbers {
+        // A turn is of many telegrams: what is made of it is of its scan.
+        let source = |family: &Rc<dyn Family>| if family.turns() { Topic::Scan } else { Topic::Telegram };
+        Numbers { sources: sensors.iter().map(source).collect(), last: BTreeMap::new() }
+    }
 }
 
 impl Judge for Numbers {
@@ -41,15 +52,16 @@ impl Judge for Numbers {
             }
         }
         // What has no telegram does not say when it was sent.
-        if *topic != Topic::Telegram && header.hub_time_ns().is_some() {
+        let source = self.sources[sensor];
+        if *topic != Topic::Telegram && *topic != source && header.hub_time_ns().is_some() {
             let of = |header: &Header| {
                 let Header { seq, boot, stamp_first_ns, stamp_last_ns, wall_ns, reasons, .. } = *header;
                 (seq, boot, stamp_first_ns, stamp_last_ns, wall_ns, reasons)
             };
-            // A telegram without memory was not published.
-            let telegram = self.last.get(&(sensor, Topic::Telegram));
-            if telegram.is_some_and(|telegram| telegram.seq >= header.seq && of(telegram) != of(header)) {
-                broken("not that of its telegram");
+            // One without memory was not published.
+            let source = self.last.get(&(sensor, source));
+            if source.is_some_and(|source| source.seq >= header.seq && of(source) != of(header)) {
+                broken("not that of what it was made of");
             }
         }
     }

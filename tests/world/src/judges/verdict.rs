@@ -75,9 +75,9 @@ impl OfSensor {
 
 /// For so long it may be believed that nothing is inside a circle of sensor `number`, although something is.
 pub(super) fn bound(setup: &Setup, number: usize) -> Nanos {
-    let (period, on_line) = setup.sensors[number].times();
+    let (period, told_after) = setup.sensors[number].times();
     let in_hub = 2 * period + GRACE;
-    period + on_line + setup.min_scans * in_hub + GRACE + SLACK
+    told_after + setup.min_scans * in_hub + GRACE + SLACK
 }
 
 /// What is added to the two periods in the hub, and once more with a consumer.

@@ -93,6 +93,7 @@ impl Listener {
         let arrived = self.incoming.receive(taken, 1, terms.stamp(stamped), &mut whole);
         let outcome = match &arrived {
             Arrived::Refused { why, .. } => Arrival::Refused(*why),
+            Arrived::Untimely { .. } => Arrival::Refused(DatagramError::Untimely),
             Arrived::Part => Arrival::Part,
             Arrived::Known => Arrival::Known,
             Arrived::Announced(_) => Arrival::Announced,
@@ -106,7 +107,7 @@ impl Listener {
         let made = match &arrived {
             Arrived::Sample(sample) => self.republisher.sample(sample, || GATEWAY.to_owned(), wall),
             Arrived::Announced(announced) => self.republisher.announced(announced, GATEWAY, wall),
-            Arrived::Refused { .. } | Arrived::Part | Arrived::Known => Ok(None),
+            Arrived::Refused { .. } | Arrived::Untimely { .. } | Arrived::Part | Arrived::Known => Ok(None),
         };
         if let Err(failure) = made {
             shared.log.tell(now, &Event::Acted { text: &format!("a listener says {failure}") });

@@ -3,6 +3,7 @@
 use scanhub_client::{Publication, SensorPublisher};
 use schema::datagram::Packed;
 use schema::ipc::Payload;
+use schema::limits::TopicLimits;
 use schema::{Failure, Header, Topic};
 
 /// What is published from a payload as it stands in a datagram.
@@ -27,9 +28,25 @@ macro_rules! publishers {
         pub(super) enum AnyPublisher { $($topic(Publication<schema::payload_type!($payload)>),)* }
 
         impl AnyPublisher {
-            /// `topic` of `sensor`.
-            pub(super) fn new(topic: Topic, sensor: &SensorPublisher) -> Result<AnyPublisher, Failure> {
-                Ok(match topic { $(Topic::$topic => AnyPublisher::$topic(sensor.topic()?),)* })
+            /// `topic` of `sensor`, for samples as long as `limits` say.
+            pub(super) fn new(
+                topic: Topic,
+                sensor: &SensorPublisher,
+                limits: &TopicLimits,
+            ) -> Result<AnyPublisher, Failure> {
+                Ok(match topic { $(Topic::$topic => AnyPublisher::$topic(sensor.topic_for(limits)?),)* })
+            }
+
+            /// Widens `limits` until `topic` has room for `payload`; whether they had not.
+            pub(super) fn widen(topic: Topic, limits: &mut TopicLimits, payload: &[u8]) -> bool {
+                match topic { $(Topic::$topic => {
+                    type P = schema::payload_type!($payload);
+                    if P::room(payload).is_none_or(|len| len <= topic.longest(limits)) {
+                        return false;
+                    }
+                    P::widen(limits, payload);
+                })* }
+                true
             }
 
             /// Publishes the `payload` of this topic, as it stands in a datagram.
@@ -40,6 +57,11 @@ macro_rules! publishers {
             /// Uses up `count` numbers without a sample.
             pub(super) fn skip(&mut self, count: u64) {
                 match self { $(AnyPublisher::$topic(topic) => topic.skip(count),)* }
+            }
+
+            /// Number of the next sample.
+            pub(super) fn next_number(&self) -> u64 {
+                match self { $(AnyPublisher::$topic(topic) => topic.next_number(),)* }
             }
 
             /// Connects who came since, and gives them what the topic keeps for late joiners.

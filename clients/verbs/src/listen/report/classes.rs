@@ -57,6 +57,7 @@ pub(super) struct Ready<'a> {
     class: &'static str,
     port: u16,
     interfaces: &'a [&'a str],
+    key: Option<&'a str>,
     #[serde(flatten)]
     place: Option<Place<'a>>,
 }
@@ -69,13 +70,17 @@ struct Place<'a> {
 }
 
 impl<'a> Ready<'a> {
-    pub(super) fn new(interfaces: &'a [&'a str], domain: Option<&'a Domain>) -> Ready<'a> {
+    pub(super) fn new(
+        interfaces: &'a [&'a str],
+        domain: Option<&'a Domain>,
+        key: Option<&'a str>,
+    ) -> Ready<'a> {
         let place = domain.map(|domain| Place {
             domain: domain.name(),
             root: domain.root(),
             pid: std::process::id(),
         });
-        Ready { class: "ready", port: PORT, interfaces, place }
+        Ready { class: "ready", port: PORT, interfaces, key, place }
     }
 }
 

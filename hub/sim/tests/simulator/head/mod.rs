@@ -112,6 +112,29 @@ fn a_power_cycle_is_a_silence_and_a_new_beginning() {
 }
 
 #[test]
+fn a_head_that_changes_its_speed_still_tells_the_truth() {
+    let mut bench = Bench::new(HeadSettings::of(Model::Ld19), &still("room"), "", 7);
+    for step in 0..60 {
+        bench.run(2 * SECOND + step * 100 * MILLIS);
+        // From 10 turns in a second to 6 and back to 12.
+        let turns = if step < 20 { 10.0 - 0.2 * step as f64 } else { 6.2 + 0.15 * (step - 20) as f64 };
+        bench.head.set_speed(turns);
+    }
+    bench.run(10 * SECOND);
+    bench.judge_packets();
+    let turns = std::mem::take(&mut bench.turns);
+    assert!(turns.iter().all(|turn| !turn.incomplete));
+    let periods: Vec<_> = turns.windows(2).map(|pair| pair[1].first - pair[0].first).collect();
+    let (least, most) = (periods.iter().min().unwrap(), periods.iter().max().unwrap());
+    assert!(*least < 87 * MILLIS && *most > 155 * MILLIS, "{least} {most}");
+    // What was measured since the last change is known.
+    let after = turns.into_iter().filter(|turn| turn.first > 8_100 * MILLIS);
+    bench.turns = after.collect();
+    assert!(bench.turns.len() > 18, "{}", bench.turns.len());
+    assert!(bench.judge_turns(0, 0.05, 2.0) < 2 * MILLIS);
+}
+
+#[test]
 fn the_same_seed_says_the_same_and_what_was_recorded_is_said_again() {
     let world: World = "demo".parse().expect("a world");
     let said = |seed| {
@@ -125,9 +148,9 @@ fn the_same_seed_says_the_same_and_what_was_recorded_is_said_again() {
     let mut bytes = packets[0][20..].to_vec();
     packets.iter().for_each(|packet| bytes.extend(packet));
     std::fs::write(&path, &bytes).expect("written");
-    let found = recorded(&path).expect("packets");
+    let found = recorded(&path, None).expect("packets");
     std::fs::write(&path, b"nothing").expect("written");
-    let none = recorded(&path).expect_err("no packets");
+    let none = recorded(&path, None).expect_err("no packets");
     std::fs::remove_file(&path).expect("removed");
     assert!(none.message.contains("no packet"), "{none}");
     assert_eq!(found, packets);

@@ -233,6 +233,7 @@ impl Bench {
     fn drain(&mut self) -> (bool, Nanos) {
         let wait = loop {
             match self.session.poll_output() {
+                Output::SetDtr(_) => panic!("there is nothing at this line"),
                 Output::SetRate(baud) => {
                     self.port = self.session.baud();
                     assert_eq!(self.port.rate(), baud);

@@ -94,6 +94,7 @@ impl Chaos {
                     self.session.transmitted(self.now);
                 }
                 Output::SetRate(_) => {}
+                Output::SetDtr(_) => panic!("there is nothing at this line"),
                 Output::Heard(received) => {
                     assert!(Telegram::check(received.message.telegram.bytes()).is_some());
                     self.telegrams += 1;

@@ -1,10 +1,10 @@
 //! When a byte arrived, at the latest: the port only tells when a read returned and how many bytes it brought.
 
-use line::{Nanos, line_time};
+use crate::{Nanos, line_time};
 
 /// Reads, newest last, by the number of the byte after their last one.
 #[derive(Clone, Debug, Default)]
-pub(crate) struct Arrivals {
+pub struct Arrivals {
     reads: [(u64, Nanos); Arrivals::CAPACITY],
     next: usize,
     total: u64,
@@ -15,7 +15,7 @@ impl Arrivals {
     const CAPACITY: usize = 8;
 
     /// A read at `now` brought `len` bytes.
-    pub(crate) fn note(&mut self, now: Nanos, len: usize) {
+    pub fn note(&mut self, now: Nanos, len: usize) {
         if len > 0 {
             self.total += len as u64;
             self.reads[self.next % Arrivals::CAPACITY] = (self.total, now);
@@ -25,7 +25,7 @@ impl Arrivals {
 
     /// When byte number `offset` was there for sure: what came behind it took its time on a line of `pace` bits per second,
     /// if it was one, but none of it was there when it was read before.
-    pub(crate) fn latest(&self, offset: u64, pace: Option<u32>) -> Nanos {
+    pub fn latest(&self, offset: u64, pace: Option<u32>) -> Nanos {
         let oldest = self.next.saturating_sub(Arrivals::CAPACITY);
         let mut latest = Nanos::MAX;
         for n in (oldest..self.next).rev() {

@@ -2,16 +2,17 @@
 //! the last seconds is the truth about all packets of these seconds, also about those that waited while the host did not
 //! run. Both clocks drift against each other; by how much is learned. Knows no bytes.
 
-use line::{MILLIS, Nanos};
+use crate::{MILLIS, Nanos};
 
 /// The least delays of the last seconds.
 #[derive(Clone, Debug)]
-pub(crate) struct SensorClock {
-    /// The least delay of each span of [`SPAN`], oldest first from `next` on.
+pub struct SensorClock {
+    /// The least delay of each span, oldest first from `next` on.
     least: [Option<Delay>; SensorClock::SPANS],
     next: usize,
-    /// When the newest span began.
+    /// When the newest span began, and how long one is: drift is to be known soon, and later well.
     since: Nanos,
+    span: Nanos,
     /// Of all spans the one that says most.
     best: Option<Delay>,
     /// Nanoseconds by which the hub's clock gets ahead in each nanosecond of the scanner's.
@@ -35,14 +36,26 @@ impl Delay {
 impl SensorClock {
     const SPANS: usize = 16;
 
-    pub(crate) fn new() -> Self {
-        SensorClock { least: [None; Self::SPANS], next: 0, since: 0, best: None, drift: 0.0 }
+    /// Nothing is known of it yet.
+    #[expect(clippy::new_without_default, reason = "a clock of which nothing is known is no default")]
+    pub fn new() -> Self {
+        SensorClock {
+            least: [None; Self::SPANS],
+            next: 0,
+            since: 0,
+            span: FIRST_SPAN,
+            best: None,
+            drift: 0.0,
+        }
     }
 
     /// What happened at `at` of the scanner's clock was known at `latest` of the hub's.
-    pub(crate) fn note(&mut self, at: Nanos, latest: Nanos) {
+    pub fn note(&mut self, at: Nanos, latest: Nanos) {
         let delay = Delay { at, offset: latest as i64 - at as i64 };
-        if self.best.is_none() || at.saturating_sub(self.since) >= SPAN {
+        if self.best.is_none() || at.saturating_sub(self.since) >= self.span {
+            if self.span < SPAN && self.known().count() == Self::SPANS {
+                self.join_pairs();
+            }
             self.next = (self.next + 1) % Self::SPANS;
             self.least[self.next] = None;
             self.since = at;
@@ -62,9 +75,23 @@ impl SensorClock {
     }
 
     /// The hub's time at which it was `at` by the scanner's clock; nothing before anything was noted.
-    pub(crate) fn time(&self, at: Nanos) -> Option<Nanos> {
+    pub fn time(&self, at: Nanos) -> Option<Nanos> {
         let best = self.best?;
         Some(at.saturating_add_signed(best.seen_from(at, self.drift)))
+    }
+
+    /// Two spans become one, twice as long.
+    fn join_pairs(&mut self) {
+        let mut joined = [None; Self::SPANS];
+        for (n, delay) in self.known().enumerate() {
+            let place: &mut Option<Delay> = &mut joined[n / 2];
+            let drift = self.drift;
+            if place.is_none_or(|known| delay.offset < known.seen_from(delay.at, drift)) {
+                *place = Some(delay);
+            }
+        }
+        (self.least, self.next) = (joined, Self::SPANS / 2 - 1);
+        self.span *= 2;
     }
 
     fn known(&self) -> impl Iterator<Item = Delay> {
@@ -72,16 +99,21 @@ impl SensorClock {
         older.iter().chain(newer).copied().flatten()
     }
 
-    /// The median of what pairs of an older and a newer span say: one in which the host did not run does not count.
+    /// The median of what pairs of an older and a newer span say, of those in which the host ran.
     fn learn_drift(&mut self) {
-        let count = self.known().count();
+        let Some(least) = self.known().min_by_key(|known| known.offset) else { return };
+        let ran = |known: &Delay| {
+            let most = MOST_DRIFT * known.at.abs_diff(least.at) as f64;
+            ((known.offset - least.offset) as f64) < most + JITTER
+        };
+        let count = self.known().filter(ran).count();
         if count < ENOUGH {
             return;
         }
         let mut slopes = [0.0; (Self::SPANS / 2) * Self::SPANS.div_ceil(2)];
         let mut len = 0;
-        for older in self.known().take(count / 2) {
-            for newer in self.known().skip(count / 2) {
+        for older in self.known().filter(ran).take(count / 2) {
+            for newer in self.known().filter(ran).skip(count / 2) {
                 let span = newer.at.saturating_sub(older.at).max(1);
                 slopes[len] = (newer.offset - older.offset) as f64 / span as f64;
                 len += 1;
@@ -93,12 +125,15 @@ impl SensorClock {
     }
 }
 
-/// A host that stops for so long spoils one span at most.
+/// Spans get as long as this, and begin shorter.
 const SPAN: Nanos = 500 * MILLIS;
-/// Spans that tell a drift, though one of them is spoiled.
+const FIRST_SPAN: Nanos = SPAN / 8;
+/// Spans that tell a drift.
 const ENOUGH: usize = 6;
 /// No oscillator is off by more, not even one without a crystal.
 const MOST_DRIFT: f64 = 0.02;
+/// What a host that runs is late by, in nanoseconds.
+const JITTER: f64 = 4e6;
 
 #[cfg(test)]
 mod tests {

@@ -1,0 +1,180 @@
+//! What a listener with a key believes: datagrams of that key, and none that was recorded and is sent again. A sensor is
+//! believed from an announcement on that was sent just now by our own clock; from then on numbers only go forward. Refuses
+//! to know where the epochs are kept.
+
+use std::collections::HashMap;
+
+use schema::datagram::{Announce, Datagram, DatagramError, StreamStats};
+
+use crate::Key;
+
+/// A key, and the greatest epoch of each gateway that had it.
+pub(super) struct Guard {
+    key: Key,
+    epochs: HashMap<u64, u32>,
+    is_changed: bool,
+}
+
+impl Guard {
+    /// With the `epochs` of gateways that were heard before.
+    pub(super) fn new(key: Key, epochs: HashMap<u64, u32>) -> Guard {
+        Guard { key, epochs, is_changed: false }
+    }
+
+    /// Whether `datagram`, which was read from `bytes` and came at `wall_ns`, is to be believed; `stats` is what was taken
+    /// before it.
+    ///
+    /// # Errors
+    ///
+    /// Why not.
+    pub(super) fn check(
+        &self,
+        bytes: &[u8],
+        datagram: &Datagram<'_>,
+        stats: &StreamStats,
+        wall_ns: u64,
+    ) -> Result<(), DatagramError> {
+        let mac = datagram.mac.ok_or(DatagramError::Unauthenticated)?;
+        if !self.key.is_of(bytes, mac) {
+            return Err(DatagramError::Mac);
+        }
+        let head = &datagram.head;
+        if self.epochs.get(&head.hub).is_some_and(|greatest| head.epoch < *greatest) {
+            return Err(DatagramError::Epoch);
+        }
+        let is_timely =
+            || head.topic == Announce::NUMBER && wall_ns.abs_diff(head.stamp_ns) <= FIRST_WITHIN_NS;
+        if stats.is_announced(head.hub, head.epoch, head.sensor) || is_timely() {
+            return Ok(());
+        }
+        Err(DatagramError::Untimely)
+    }
+
+    /// Something of this life of `hub` was taken.
+    pub(super) fn note(&mut self, hub: u64, epoch: u32) {
+        let greatest = self.epochs.entry(hub).or_default();
+        self.is_changed |= epoch > *greatest;
+        *greatest = epoch.max(*greatest);
+    }
+
+    /// The epochs, if there is a greater one since this was asked last.
+    pub(super) fn take_changed(&mut self) -> Option<&HashMap<u64, u32>> {
+        std::mem::take(&mut self.is_changed).then_some(&self.epochs)
+    }
+}
+
+/// The first announcement of a sensor is stamped by a clock that differs from ours by no more.
+const FIRST_WITHIN_NS: u64 = 5_000_000_000;
+
+#[cfg(test)]
+mod tests {
+    use schema::datagram::{Announced, HEAD, Head, PORT, Packed, group};
+    use schema::{Topic, Zones};
+
+    use super::super::{Arrived, Incoming};
+    use super::*;
+    use crate::Stamp;
+
+    const SECOND: u64 = 1_000_000_000;
+
+    fn key() -> Key {
+        Key::new(&[7; 32])
+    }
+
+    fn sealed(head: Head, pack: impl FnOnce(&mut [u8]) -> Option<usize>) -> Vec<u8> {
+        let mut buffer = [0; 400];
+        let len = pack(&mut buffer[HEAD..]).unwrap();
+        let head = Head { revision: 1, hub: 5, ..head };
+        head.seal_with(&mut buffer, len, |covered| key().mac(covered)).unwrap().to_vec()
+    }
+
+    /// Announces sensor 0 at `at_s` of the gateway's clock, which has `next` zones.
+    fn announcement(epoch: u32, sequence: u32, at_s: u64, next: u32) -> Vec<u8> {
+        let mut announce = Announce::new(1, "front", "");
+        let topic = Topic::Zones;
+        announce.add(Announced { topic: topic.number(), group: group(topic), port: PORT, next });
+        sealed(Head { epoch, sequence, stamp_ns: at_s * SECOND, ..Head::default() }, |room| {
+            announce.pack(room)
+        })
+    }
+
+    fn zones(epoch: u32, sequence: u32) -> Vec<u8> {
+        sealed(Head { topic: Topic::Zones.number(), epoch, sequence, ..Head::default() }, |room| {
+            Zones::unknown().pack(room)
+        })
+    }
+
+    fn listener(epochs: &[(u64, u32)]) -> Incoming {
+        Incoming::with_key(&Topic::ALL, key(), epochs.iter().copied().collect())
+    }
+
+    /// What becomes of `bytes` from sender 1 at `at_s` of the listener's clock: why it is refused, if it is.
+    fn receive(incoming: &mut Incoming, bytes: &[u8], at_s: u64) -> Option<DatagramError> {
+        let arrival = Stamp { monotonic_ns: at_s * SECOND, wall_ns: at_s * SECOND };
+        match incoming.receive(bytes, 1, arrival, &mut Vec::new()) {
+            Arrived::Refused { why, .. } => Some(why),
+            Arrived::Untimely { .. } => Some(DatagramError::Untimely),
+            _ => None,
+        }
+    }
+
+    #[test]
+    fn only_who_has_the_key_is_believed() {
+        let mut incoming = listener(&[]);
+        let mut plain = [0; 400];
+        let len = Zones::unknown().pack(&mut plain[HEAD..]).unwrap();
+        let head = Head { topic: Topic::Zones.number(), revision: 1, hub: 5, ..Head::default() };
+        let bytes = head.seal(&mut plain, len).unwrap().to_vec();
+        assert_eq!(receive(&mut incoming, &bytes, 100), Some(DatagramError::Unauthenticated));
+        let other = head.seal_with(&mut plain, len, |covered| Key::new(&[8; 32]).mac(covered)).unwrap();
+        assert_eq!(receive(&mut incoming, other, 100), Some(DatagramError::Mac));
+        assert_eq!(receive(&mut incoming, &announcement(1, 0, 100, 0), 100), None);
+        assert_eq!(receive(&mut incoming, &zones(1, 0), 100), None);
+        let refused = |why| incoming.stats().refused(why);
+        assert_eq!([DatagramError::Unauthenticated, DatagramError::Mac].map(refused), [1, 1]);
+    }
+
+    #[test]
+    fn a_recording_that_is_sent_again_is_refused() {
+        let recorded = [announcement(1, 3, 100, 40), zones(1, 40), zones(1, 41)];
+        let mut incoming = listener(&[]);
+        let again = recorded.each_ref().map(|bytes| receive(&mut incoming, bytes, 200));
+        assert_eq!(again, [Some(DatagramError::Untimely); 3], "the gateway is gone");
+        // The gateway goes on: its announcement is believed, and nothing that was sent before.
+        assert_eq!(receive(&mut incoming, &zones(1, 90), 200), Some(DatagramError::Untimely));
+        assert_eq!(receive(&mut incoming, &announcement(1, 50, 200, 91), 203), None);
+        assert_eq!(receive(&mut incoming, &zones(1, 91), 203), None);
+        let again = recorded.each_ref().map(|bytes| receive(&mut incoming, bytes, 204));
+        assert_eq!(again, [Some(DatagramError::Stale); 3]);
+        let clocks = [announcement(2, 0, 94, 0), announcement(2, 0, 106, 0)];
+        let refused = clocks.map(|bytes| receive(&mut listener(&[]), &bytes, 100));
+        assert_eq!(refused, [Some(DatagramError::Untimely); 2]);
+    }
+
+    #[test]
+    fn epochs_only_go_forward_over_restarts_of_the_listener() {
+        let mut incoming = listener(&[]);
+        assert_eq!(receive(&mut incoming, &announcement(7, 0, 100, 0), 100), None);
+        let kept: Vec<_> =
+            incoming.take_epochs().unwrap().iter().map(|(hub, epoch)| (*hub, *epoch)).collect();
+        assert_eq!((kept.as_slice(), incoming.take_epochs()), (&[(5, 7)][..], None));
+        let mut next = listener(&kept);
+        assert_eq!(receive(&mut next, &announcement(6, 0, 100, 0), 100), Some(DatagramError::Epoch));
+        assert_eq!(receive(&mut next, &announcement(7, 1, 101, 0), 101), None);
+        assert_eq!(
+            (receive(&mut next, &announcement(8, 0, 102, 0), 102), next.take_epochs().is_some()),
+            (None, true)
+        );
+        assert_eq!(receive(&mut next, &zones(7, 0), 102), Some(DatagramError::Epoch));
+    }
+
+    #[test]
+    fn another_sender_is_not_the_next_life_of_a_silent_gateway() {
+        let mut incoming = listener(&[]);
+        assert_eq!(receive(&mut incoming, &announcement(7, 0, 100, 0), 100), None);
+        let arrival = Stamp { monotonic_ns: 110 * SECOND, wall_ns: 110 * SECOND };
+        let (bytes, mut whole) = (zones(7, 0), Vec::new());
+        let arrived = incoming.receive(&bytes, 2, arrival, &mut whole);
+        assert!(matches!(arrived, Arrived::Refused { why: DatagramError::Twin, .. }));
+    }
+}

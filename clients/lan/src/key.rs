@@ -1,0 +1,75 @@
+//! The key that gateways and listeners of one network share: who has it can send what they believe. Refuses to know where
+//! it is kept, and whether what was sent is new.
+
+use hmac::{Hmac, KeyInit, Mac};
+use schema::datagram::{MAC, covered};
+use sha2::Sha256;
+
+/// A key of [`Key::LEN`] bytes.
+#[derive(Clone)]
+pub struct Key(Hmac<Sha256>);
+
+impl Key {
+    /// Bytes of a key.
+    pub const LEN: usize = 32;
+
+    /// The key with these bytes.
+    pub fn new(bytes: &[u8; Key::LEN]) -> Key {
+        let mut block = [0; 64];
+        block[..Key::LEN].copy_from_slice(bytes);
+        // A key is filled up with zeros to a block of the hash (RFC 2104).
+        Key(Hmac::new(&block.into()))
+    }
+
+    /// Returns the MAC of header and payload `covered`, in which the checksum is 0: the first half of HMAC-SHA256.
+    pub fn mac(&self, covered: &[u8]) -> [u8; MAC] {
+        let whole = self.0.clone().chain_update(covered).finalize().into_bytes();
+        std::array::from_fn(|at| whole[at])
+    }
+
+    /// Returns whether `bytes`, a datagram that was read, has `mac` of this key.
+    pub fn is_of(&self, bytes: &[u8], mac: &[u8; MAC]) -> bool {
+        let digest =
+            covered(bytes).into_iter().fold(self.0.clone(), |digest, piece| digest.chain_update(piece));
+        digest.verify_truncated_left(mac).is_ok()
+    }
+
+    /// Returns a name for the key that does not tell it: 16 hex digits.
+    pub fn name(&self) -> String {
+        self.mac(b"name").iter().take(8).map(|byte| format!("{byte:02x}")).collect()
+    }
+}
+
+impl std::fmt::Debug for Key {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(f, "Key({})", self.name())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use schema::datagram::{Datagram, HEAD, Head};
+
+    use super::*;
+
+    #[test]
+    fn what_is_sealed_with_a_key_is_of_that_key_alone() {
+        let (key, other) = (Key::new(&[7; 32]), Key::new(&[8; 32]));
+        let mut buffer = [0; 200];
+        buffer[HEAD..HEAD + 3].copy_from_slice(b"abc");
+        let bytes =
+            Head { hub: 3, ..Head::default() }.seal_with(&mut buffer, 3, |covered| key.mac(covered)).unwrap();
+        let mac = *Datagram::read(bytes).unwrap().mac.unwrap();
+        assert!(key.is_of(bytes, &mac) && !other.is_of(bytes, &mac));
+        let mut other = bytes.to_vec();
+        other[HEAD] ^= 1;
+        assert!(!key.is_of(&other, &mac));
+        assert!(!key.is_of(bytes, &[0; MAC]));
+    }
+
+    #[test]
+    fn a_key_does_not_tell_itself() {
+        let shown = format!("{:?}", Key::new(&[0x61; 32]));
+        assert!(!shown.contains("6161") && !shown.contains("aaa") && shown.len() == 21, "{shown}");
+    }
+}

@@ -1,0 +1,165 @@
+//! Which scanner a link has, wherever that is said, and that what its family does not have is refused with place, value and remedy.
+
+use config::{Config, Link, Scanner, Sources};
+use schema::Kind;
+
+fn load(set: &[&str]) -> Result<Config, String> {
+    let sources = Sources {
+        files: Vec::new(),
+        set: set.iter().map(|flag| (*flag).to_owned()).collect(),
+        links: ["front=/dev/ttyUSB0", "rear=/dev/ttyUSB1"].map(str::to_owned).into(),
+    };
+    Config::load(&sources).map_err(|failure| {
+        assert_eq!(failure.kind, Kind::Configuration);
+        failure.to_string()
+    })
+}
+
+/// Family, model and beams of a scanner whose head turns.
+fn set_of(link: &Link) -> Option<(&'static str, &'static str, Option<usize>)> {
+    match link.scanner {
+        Scanner::Lms => None,
+        Scanner::Turning(turning) => Some((turning.family.name(), turning.model.name, turning.beams)),
+    }
+}
+
+#[test]
+fn a_link_has_a_family_and_what_its_family_needs() {
+    let front = |set: &[&str]| load(set).map(|mut config| config.links.swap_remove(0));
+    let known = |link: &Link| (set_of(link), link.rate(), link.beams());
+    let family = "link.front.family=ld";
+    let set = |model, beams| Some(("ld", model, beams));
+    for (setting, scanner, rate, beams) in [
+        (&[][..], None, 500_000, 401),
+        (&["link.front.family=lms", "link.front.model=auto"], None, 500_000, 401),
+        (&[family, "link.front.model=ld19"], set("ld19", None), 230_400, 450),
+        (&[family, "link.front.model=stl27l"], set("stl27l", None), 921_600, 2160),
+        (
+            &[family, "link.front.model=ld14p", "link.front.beams=8192"],
+            set("ld14p", Some(8192)),
+            230_400,
+            8192,
+        ),
+        (&[family, "link.front.beams=2"], set("auto", Some(2)), 230_400, 2),
+        // Room for every model but the one that the remedy of a status names.
+        (&[family, "link.front.model=auto"], set("auto", None), 230_400, 720),
+        // What it does anyway may be said.
+        (&[family, "link.front.mode=auto", "link.front.idle=run"], set("auto", None), 230_400, 720),
+        // The later one counts, of whichever family it is.
+        (&[family, "link.front.mode=1", "link.front.mode=auto"], set("auto", None), 230_400, 720),
+        (&["link.front.mode=auto", "link.front.idle=run"], None, 500_000, 401),
+    ] {
+        let link = front(setting).unwrap();
+        assert_eq!(known(&link), (scanner, rate, beams), "{setting:?}");
+    }
+    // What is said for all links is for those that have it.
+    let config = load(&[family, "marks.level=240", "marks.i_min=2", "link.front.marks.level=250"]).unwrap();
+    let marks = |link: &Link| (link.processing.marks.i_min, link.processing.marks.level);
+    assert_eq!((marks(&config.links[0]), marks(&config.links[1])), ((2, Some(250)), (2, Some(240))));
+    // The other link is what it was.
+    assert_eq!(load(&[family]).unwrap().links[1].scanner, Scanner::Lms);
+
+    let lms = "is of family lms; a scanner of another family has no such setting\n  leave it out, or set family = \"lms\"";
+    for (others, setting, words) in [
+        (&[][..], "family=sick", "family = \"sick\"\n  one of: lms, ld, rplidar"),
+        (&[], "famly=ld", "unknown key `famly`\n  did you mean `family`?"),
+        (
+            &[],
+            "model=ld19",
+            "link front: model = \"ld19\", and an lms says itself what it is\n  leave it out; `type`",
+        ),
+        (
+            &[],
+            "beams=450",
+            "link front: beams = 450, and an lms has its own\n  leave it out; `angle` and `resolution`",
+        ),
+        (&[], "beams=1", "beams = 1\n  a whole number from 2 to 8192"),
+        (&[family], "beams=8193", "beams = 8193\n  a whole number from 2 to 8192"),
+        (&[family], "beams=-450", "beams = -450\n  a whole number"),
+        (
+            &[family],
+            "model=LD19",
+            "link front: model = \"LD19\"\n  auto, or one of: ld06, ld19, stl19p, stl27l, ld14p",
+        ),
+        (&[family], "type=lms200", &format!("link front: type {lms}")),
+        (&[family], "angle=180", &format!("link front: angle {lms}")),
+        (&[family], "resolution=1", &format!("link front: resolution {lms}")),
+        (&[family], "unit=mm", &format!("link front: unit {lms}")),
+        (&[family], "mode=0x01", &format!("link front: mode {lms}")),
+        (
+            &[family],
+            "mode=express",
+            "link front: mode = \"express\", and an ld measures in one way only\n  leave it out",
+        ),
+        (&[], "mode=express", "link front: mode = \"express\"\n  0x00 to 0x06, or 0x0F"),
+        (&[], "mode=1.5", "mode = 1.5\n  0x00 to 0x06, or 0x0F"),
+        (
+            &[family],
+            "idle=stop",
+            "link front: idle = \"stop\", and an ld cannot be told to rest\n  leave it out",
+        ),
+        (&[], "idle=stop", "link front: idle = \"stop\", and an lms cannot be told to rest"),
+        (&[family], "idle=rest", "idle = \"rest\"\n  one of: run, stop"),
+        (
+            &[family],
+            "marks.i_min=2",
+            "i_min, and the intensities of an ld are counts of any surface\n  level is the least of a reflector",
+        ),
+        (&[family], "baud=38400", &format!("link front: baud {lms}")),
+    ] {
+        let setting = format!("link.front.{setting}");
+        let refusal = front(&[others, &[setting.as_str()]].concat()).expect_err(&setting);
+        assert!(refusal.starts_with(&format!("--set {setting}: ")), "{refusal}");
+        assert!(refusal.contains(words), "{setting}: {refusal}");
+    }
+}
+
+#[test]
+fn a_mode_and_rest_are_for_those_that_have_them() {
+    let family = "link.front.family=rplidar";
+    let front = |set: &[&str]| load(&[&[family], set].concat()).map(|mut config| config.links.swap_remove(0));
+    let set = |set: &[&str]| match front(set).unwrap().scanner {
+        Scanner::Lms => panic!("{set:?}"),
+        Scanner::Turning(turning) => (turning.model.name, turning.mode, turning.stop_when_idle),
+    };
+    assert_eq!(set(&[]), ("auto", None, false));
+    let said = ["link.front.model=s2", "link.front.mode=denseboost", "link.front.idle=stop"];
+    assert_eq!(set(&said), ("s2", Some("denseboost"), true));
+    let link = front(&said).unwrap();
+    assert_eq!((link.rate(), link.beams()), (1_000_000, 3200));
+    // The later source wins, also over the number of an LMS.
+    assert_eq!(set(&["link.front.mode=1", "link.front.mode=express"]), ("auto", Some("express"), false));
+    for (setting, words) in [
+        ("mode=fast", "link front: mode = \"fast\"\n  auto, or one of: standard, express, boost"),
+        ("mode=1", "link front: mode is of family lms"),
+        ("model=a4", "link front: model = \"a4\"\n  auto, or one of: a1, a2m8, a2m12, a3, s1, s2, s3, c1"),
+    ] {
+        let setting = format!("link.front.{setting}");
+        let refusal = front(&[&setting]).expect_err(&setting);
+        assert!(refusal.starts_with(&format!("--set {setting}: ")) && refusal.contains(words), "{refusal}");
+    }
+}
+
+#[test]
+fn keys_of_a_link_may_follow_its_port() {
+    let load = |link: &str| {
+        let sources = Sources { files: Vec::new(), set: Vec::new(), links: vec![link.to_owned()] };
+        Config::load(&sources)
+            .map(|mut config| config.links.swap_remove(0))
+            .map_err(|failure| failure.to_string())
+    };
+    let link = load("side=/dev/ttyUSB2,family=ld,model=ld19,beams=300").unwrap();
+    assert_eq!((link.name.as_str(), link.port.name().as_str()), ("side", "/dev/ttyUSB2"));
+    assert_eq!(set_of(&link), Some(("ld", "ld19", Some(300))));
+    assert_eq!(load("a=tcp:10.0.0.7:4001,angle=100,unit=cm").unwrap().variant.angle_deg, 100);
+    // A comma may be in the name of a port.
+    assert_eq!(load("a=file:/tmp/a,b.bin").unwrap().port.name(), "file:/tmp/a,b.bin");
+    for (link, words) in [
+        ("a=/dev/x,famly=ld", "--link a=/dev/x,famly=ld: unknown key `famly`\n  did you mean `family`?"),
+        ("a=/dev/x,family=sick", "--link a=/dev/x,family=sick: family = \"sick\""),
+    ] {
+        let refusal = load(link).unwrap_err();
+        assert!(refusal.contains(words), "{refusal}");
+    }
+    assert_eq!(load("a=family=ld").unwrap().port.name(), "family=ld", "a port has to be there");
+}

@@ -1,0 +1,73 @@
+//! A session with a scanner in the time of a recording: it hears each packet when the hub heard it that recorded it, and
+//! what it waits for in between comes when it is due. So it makes of the packets what was made of them then. Refuses to know
+//! where they are from, and what becomes of that.
+
+use line::{Nanos, Output, Session};
+
+/// `S` in a time that its owner tells.
+pub struct VirtualTime<S> {
+    session: S,
+    now: Nanos,
+    /// When it wants to be asked again.
+    until: Nanos,
+}
+
+impl<S: Session> VirtualTime<S> {
+    /// Begins with `session`, which was made at `now`.
+    pub fn new(session: S, now: Nanos) -> VirtualTime<S> {
+        VirtualTime { session, now, until: now }
+    }
+
+    /// Returns the session.
+    pub fn session(&self) -> &S {
+        &self.session
+    }
+
+    /// Returns the session, to be told something.
+    pub fn session_mut(&mut self) -> &mut S {
+        &mut self.session
+    }
+
+    /// Lets the time pass until `now`, at which `bytes` are there; `heard` gets what the session hands out meanwhile. Time
+    /// does not go back: an earlier `now` is the last one.
+    pub fn take(&mut self, now: Nanos, bytes: &[u8], mut heard: impl FnMut(S::Heard<'_>)) {
+        let now = now.max(self.now);
+        while self.until < now {
+            self.now = self.until.max(self.now);
+            self.session.spare();
+            self.session.commit(self.now, 0);
+            self.session.handle_timeout(self.now);
+            self.drain(&mut heard);
+            // What it waits for did not come, and cannot be waited for again in the same moment.
+            self.until = self.until.max(self.now + 1);
+        }
+        self.now = now;
+        let mut bytes = bytes;
+        while !bytes.is_empty() {
+            let room = self.session.spare();
+            let (taken, rest) = bytes.split_at(bytes.len().min(room.len()));
+            room[..taken.len()].copy_from_slice(taken);
+            self.session.commit(now, taken.len());
+            self.drain(&mut heard);
+            bytes = rest;
+        }
+    }
+
+    fn drain(&mut self, heard: &mut impl FnMut(S::Heard<'_>)) {
+        self.until = loop {
+            let is_sent = match self.session.poll_output() {
+                Output::Transmit { .. } => true,
+                Output::Heard(said) => {
+                    heard(said);
+                    false
+                }
+                Output::SetRate(_) | Output::SetDtr(_) => false,
+                Output::Rest(until) | Output::Wait { until, .. } => break until,
+            };
+            // Nobody is there who could hear it.
+            if is_sent {
+                self.session.transmitted(self.now);
+            }
+        };
+    }
+}

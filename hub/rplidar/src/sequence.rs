@@ -1,0 +1,255 @@
+//! What a packet is to the one before it: the next one, one after a gap, or something that does not belong there. Packets have
+//! no counter. But a head turns evenly, so the angle from packet to packet is known, and how many are missing in a gap is
+//! that angle's share of it; how many turns are missing besides, only the time tells. Knows no bytes.
+
+/// The packets of one stream: of several points each, or of one.
+#[derive(Clone, Debug)]
+pub(crate) struct Sequence {
+    last: Option<Seen>,
+    /// One that did not belong there: the next one may tell that it did.
+    odd: Option<f32>,
+    odds: u32,
+    /// Degrees from one packet to the next, and packets that it was learned from.
+    advance: f64,
+    lessons: u32,
+    /// Of packets of one point: where a full turn is counted from, and how many came since.
+    counted: (f64, u32),
+    is_whole: bool,
+    came: u64,
+    lost: u64,
+}
+
+#[derive(Clone, Copy, Debug)]
+struct Seen {
+    start: f32,
+    angle: f64,
+    time: f64,
+}
+
+/// The place of a packet in its stream.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(crate) struct Place {
+    /// How it follows.
+    pub(crate) step: Step,
+    /// Degrees of its first point, clockwise over all turns.
+    pub(crate) angle: f64,
+    /// When its first point was measured, by the scanner's clock in nanoseconds.
+    pub(crate) time: f64,
+}
+
+/// How a packet follows the last one.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(crate) enum Step {
+    /// A new sequence begins with it, and with it a new clock.
+    First,
+    /// It is the next one.
+    Next,
+    /// Others are missing between, or may be: the last one was at `from`.
+    Gap {
+        /// Degrees, as in [`Place::angle`].
+        from: f64,
+    },
+    /// It does not belong here.
+    Odd,
+}
+
+/// A packet that came.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Came {
+    /// Degrees of its first point, clockwise.
+    pub(crate) start: f32,
+    /// Bytes between it and the last one that are in nothing.
+    pub(crate) skipped: u32,
+    /// Nanoseconds from one packet to the next.
+    pub(crate) packet_ns: f64,
+}
+
+impl Came {
+    fn adjoins(&self) -> bool {
+        self.skipped == 0
+    }
+}
+
+impl Sequence {
+    pub(crate) fn new() -> Self {
+        Sequence {
+            last: None,
+            odd: None,
+            odds: 0,
+            advance: 0.0,
+            lessons: 0,
+            counted: (0.0, 0),
+            is_whole: true,
+            came: 0,
+            lost: 0,
+        }
+    }
+
+    /// The stream ended: the next packet is the first one of another.
+    pub(crate) fn end(&mut self) {
+        (self.last, self.odd, self.odds, self.lessons) = (None, None, 0, 0);
+    }
+
+    /// Packets that came, and those that did not although the ones before and after them did.
+    pub(crate) fn came_and_lost(&self) -> (u64, u64) {
+        (self.came, self.lost)
+    }
+
+    /// Degrees from one packet to the next; nothing before that is known, or if the head stands still.
+    pub(crate) fn advance(&self) -> Option<f64> {
+        (self.lessons >= LESSONS && self.advance > STILL).then_some(self.advance)
+    }
+
+    /// A packet of several points came; `late` says by how many nanoseconds more than usual, if its first point was
+    /// measured at that time.
+    pub(crate) fn place(&mut self, came: Came, late: impl Fn(f64) -> f64) -> Place {
+        self.came += 1;
+        let Some(last) = self.last else { return self.first(came.start) };
+        let angle = clockwise(last.start, came.start);
+        let Some(advance) = self.advance() else {
+            let is_even = (angle - self.advance).abs() <= 0.25 * self.advance + 1.0;
+            if angle > WIDEST || !came.adjoins() || (self.lessons > 0 && !is_even) {
+                return self.first(came.start);
+            }
+            self.lessons += 1;
+            self.advance += (angle - self.advance) / f64::from(self.lessons.min(8));
+            return self.next(last, came, angle, 1.0, Step::Next);
+        };
+        if came.adjoins() && self.odds == 0 && (angle - advance).abs() <= 0.25 * advance {
+            self.lessons += 1;
+            self.advance += (angle - advance) / 4.0;
+            return self.next(last, came, angle, 1.0, Step::Next);
+        }
+        let angle = angle
+            + 360.0 * turns(late(last.time + angle / advance * came.packet_ns), advance, came.packet_ns);
+        let packets = f64::from((angle / advance + 0.5) as u32);
+        let tolerance = advance * (0.25 + 0.01 * packets).min(0.5);
+        let is_early = late(last.time + packets * came.packet_ns) < EARLY;
+        if packets < 1.0 || (angle - packets * advance).abs() > tolerance || is_early {
+            return self.odd(came);
+        }
+        self.next(last, came, angle, packets, Step::Gap { from: last.angle })
+    }
+
+    /// A packet of one point came: such points may lie before ones that came before them.
+    pub(crate) fn place_point(&mut self, came: Came, late: impl Fn(f64) -> f64) -> Place {
+        self.came += 1;
+        let Some(last) = self.last else {
+            self.counted = (f64::from(came.start), 0);
+            return self.first(came.start);
+        };
+        let angle = clockwise(last.start, came.start);
+        let angle = if angle > 360.0 - BACK { angle - 360.0 } else { angle };
+        self.is_whole &= came.adjoins();
+        // What is left of points that lost bytes, or had one too many.
+        let points = f64::from(1 + (came.skipped + 3) / POINT);
+        let Some(advance) = self.advance() else {
+            if angle > WIDEST {
+                return self.first_point(came.start);
+            }
+            return self.next_point(last, came, angle, points, Step::Next);
+        };
+        // Only where something was between them, a whole turn may be missing.
+        let due = last.time + (angle / advance).max(1.0) * came.packet_ns;
+        let turns = if came.adjoins() { 0.0 } else { turns(late(due), advance, came.packet_ns) };
+        if angle <= AHEAD && turns == 0.0 {
+            return self.next_point(last, came, angle, points, Step::Next);
+        }
+        if came.adjoins() || late(due) < EARLY {
+            return self.odd(came);
+        }
+        let angle = angle + 360.0 * turns;
+        let points = (angle / advance + 0.5) as u32;
+        let is_gap = points > GAP;
+        let step = if is_gap { Step::Gap { from: last.angle } } else { Step::Next };
+        self.next_point(last, came, angle, f64::from(points.max(1)), step)
+    }
+
+    fn first(&mut self, start: f32) -> Place {
+        let (angle, time) = (f64::from(start), BEGIN);
+        self.last = Some(Seen { start, angle, time });
+        (self.odd, self.odds, self.lessons, self.advance) = (None, 0, 0, 0.0);
+        Place { step: Step::First, angle, time }
+    }
+
+    fn first_point(&mut self, start: f32) -> Place {
+        self.counted = (f64::from(start), 0);
+        self.first(start)
+    }
+
+    /// It came `packets` packets and `angle` degrees after `last`.
+    fn next(&mut self, last: Seen, came: Came, angle: f64, packets: f64, step: Step) -> Place {
+        let missing = (packets - 1.0).max(0.0) as u64;
+        self.lost += missing.saturating_sub(u64::from(self.odds));
+        (self.odd, self.odds) = (None, 0);
+        let (angle, time) = (last.angle + angle, last.time + packets * came.packet_ns);
+        self.last = Some(Seen { start: came.start, angle, time });
+        Place { step, angle, time }
+    }
+
+    fn next_point(&mut self, last: Seen, came: Came, angle: f64, packets: f64, step: Step) -> Place {
+        let place = self.next(last, came, angle, packets, step);
+        self.counted.1 += packets as u32;
+        let (from, count) = self.counted;
+        let passed = place.angle - from;
+        if passed < 360.0 {
+            return place;
+        }
+        self.counted = (place.angle, 0);
+        let whole = core::mem::replace(&mut self.is_whole, true);
+        match self.advance() {
+            // What is missing without a jump of the angle.
+            Some(advance) if !whole => {
+                let missing = passed / advance - f64::from(count);
+                if missing >= 2.0 {
+                    self.lost += missing as u64;
+                    self.last.iter_mut().for_each(|last| last.time += missing * came.packet_ns);
+                }
+            }
+            Some(advance) => self.advance += (passed / f64::from(count) - advance) / 4.0,
+            None => (self.advance, self.lessons) = (passed / f64::from(count), LESSONS),
+        }
+        place
+    }
+
+    /// It does not belong here, unless it goes on from the last one that did not.
+    fn odd(&mut self, came: Came) -> Place {
+        let follows = self.odd.is_some_and(|odd| clockwise(odd, came.start) < WIDEST);
+        if follows && came.adjoins() && self.odds + 1 >= LESSONS {
+            return self.first_point(came.start);
+        }
+        self.odd = Some(came.start);
+        self.odds += 1;
+        Place { step: Step::Odd, angle: 0.0, time: 0.0 }
+    }
+}
+
+/// Degrees from one angle to another, 0 to 360.
+fn clockwise(from: f32, to: f32) -> f64 {
+    let angle = f64::from(to) - f64::from(from);
+    if angle < 0.0 { angle + 360.0 } else { angle }
+}
+
+/// How many turns are missing where a packet comes later than usual by `late`.
+fn turns(late: f64, advance: f64, packet_ns: f64) -> f64 {
+    let turn_ns = 360.0 / advance * packet_ns;
+    f64::from((late.max(0.0) / turn_ns + 0.5) as u32)
+}
+
+/// Packets that agree before it is believed how far they are apart; and those in a row that may be wrong.
+const LESSONS: u32 = 3;
+/// Degrees of the widest packet: a head that turns so fast measures less than four of them in a turn.
+const WIDEST: f64 = 100.0;
+/// Degrees of a packet of a head that stands still.
+const STILL: f64 = 0.02;
+/// The scanner's clock begins so late that nothing is before it, in nanoseconds.
+const BEGIN: f64 = 1e10;
+/// Degrees by which a point may lie before one that came before it, and behind it without a gap.
+const BACK: f64 = 25.0;
+const AHEAD: f64 = 25.0;
+/// Nanoseconds by which nothing comes before its time.
+const EARLY: f64 = -1e7;
+/// Bytes of a packet of one point.
+const POINT: u32 = 5;
+/// So many points of a stream of single ones may be missing without a word.
+const GAP: u32 = 30;

@@ -1,0 +1,271 @@
+//! A scanner behind a line, driven from outside as [`line::Session`] says: it is asked what it is and told to measure, then
+//! packets are handed out as they come, and turns. Refuses to know a hub, and what becomes of a turn.
+//!
+//! A stream that somebody left is stopped, never taken over: express and dense packets look alike, and a scanner that
+//! measures answers no question.
+
+mod dialogue;
+mod driven;
+mod stream;
+
+use line::{Arrivals, MILLIS, Nanos, SensorClock, State, Tally, TurnCounts};
+
+use crate::framer::{Expect, Framer};
+use crate::model::{Mode, Model};
+use crate::offers::Offers;
+use crate::packet::Kind;
+use crate::sequence::Sequence;
+use crate::told::{Health, Info, Trouble};
+use crate::turn::Turns;
+
+use self::dialogue::{Ask, Outgoing};
+use self::stream::{Current, Held, Measure};
+
+/// What a session shall do.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Settings {
+    /// What is at the other end; `None` is asked, at the rates of all models.
+    pub model: Option<Model>,
+    /// How it shall measure; `None`: as fast as the line carries.
+    pub mode: Option<Mode>,
+    /// Beams of the grid that turns are for; `None`: the model's, at most [`most_beams`](Self::most_beams).
+    pub beams: Option<usize>,
+    /// The most beams that there is room for; `None`: as many as a grid can have.
+    pub most_beams: Option<usize>,
+    /// Whether the port has one rate and not the pace of a line: a serial server on the network, a recording.
+    pub fixed_rate: bool,
+    /// Whether nobody is at the other end who could be asked: a recording.
+    pub listen_only: bool,
+    /// Whether the motor rests while nobody follows.
+    pub stop_when_idle: bool,
+}
+
+impl Settings {
+    /// The rate at which the port is to be opened, in bits per second.
+    pub fn baud(&self) -> u32 {
+        self.model.unwrap_or(Model::A1).baud()
+    }
+
+    /// What packets are that look like express and like dense ones, where no answer says it.
+    fn alike(&self) -> Kind {
+        match (self.model, self.mode) {
+            (_, Some(Mode::DenseBoost)) => Kind::Dense,
+            (_, Some(_)) | (None | Some(Model::A1 | Model::A2m8 | Model::A2m12 | Model::A3), None) => {
+                Kind::Express
+            }
+            (Some(_), None) => Kind::Dense,
+        }
+    }
+}
+
+/// One scanner's session.
+#[derive(Clone, Debug)]
+pub struct Session {
+    settings: Settings,
+    framer: Framer,
+    arrivals: Arrivals,
+    clock: SensorClock,
+    sequence: Sequence,
+    turns: Turns,
+    phase: Phase,
+    /// What to show until measured data come.
+    shown: State,
+    baud: u32,
+    change_baud: bool,
+    /// What the line DTR shall be from now on.
+    change_dtr: Option<bool>,
+    outgoing: Outgoing,
+    info: Option<Info>,
+    health: Option<Health>,
+    offers: Offers,
+    /// Whether a scanner that is not well was booted already.
+    was_reset: bool,
+    /// Whether the motor obeys requests for a duty cycle.
+    has_board: bool,
+    /// The mode in use is not the wanted one.
+    no_mode: Option<Mode>,
+    /// Nanoseconds from one point to the next, once they are known, or what they are measured by.
+    point_ns: Option<f64>,
+    measure: Option<Measure>,
+    /// The grid, once it is known, and whether it is known what this stream is.
+    beams: Option<usize>,
+    is_learned: bool,
+    /// Packets that were handed out and are not in turns yet.
+    current: Option<Current>,
+    held: Option<Held>,
+    /// Since when nobody follows.
+    idle_since: Option<Nanos>,
+    now: Nanos,
+    last_byte: Nanos,
+    /// Until when nothing has to be read.
+    rest_until: Nanos,
+    room: usize,
+    /// The last stamp of a turn, behind which none goes.
+    last_stamp: Nanos,
+    trouble: Option<Trouble>,
+    /// Since when nothing answers, and bytes read by then.
+    quiet_since: Option<(Nanos, u64)>,
+    /// Bytes of streams that were in nothing, and all of those when it was last looked.
+    damaged: (u64, u64),
+    resyncs: u64,
+    cut: bool,
+}
+
+#[derive(Clone, Copy, Debug)]
+enum Phase {
+    /// Nobody can be asked, and no packets come yet.
+    Listening { since: Nanos },
+    /// It was told to stop. After so many attempts at this rate, and no later than `at_most`, it is asked.
+    Draining { attempts: u8, until: Nanos, at_most: Nanos },
+    /// An answer should come by `until`.
+    Asking { ask: Ask, attempts: u8, until: Nanos },
+    /// It was told to boot.
+    Booting { until: Nanos },
+    /// It is not well, and asked again later.
+    Unwell { until: Nanos },
+    /// It measures; by `silent_at` the next packet comes. `turned_at` the last turn was over, or it began.
+    Hearing { turned_at: Nanos, has_turned: bool, silent_at: Nanos },
+    /// Nobody wants anything, or nobody follows.
+    Paused { is_resting: bool },
+}
+
+impl Session {
+    /// A session on a port that is open at the rate of `settings`.
+    pub fn new(settings: Settings, now: Nanos) -> Self {
+        let mut session = Session {
+            settings,
+            framer: Framer::new(Expect::Nothing),
+            arrivals: Arrivals::default(),
+            clock: SensorClock::new(),
+            sequence: Sequence::new(),
+            turns: Turns::new(),
+            phase: Phase::Listening { since: now },
+            shown: State::Probing,
+            baud: settings.baud(),
+            change_baud: false,
+            change_dtr: None,
+            outgoing: Outgoing::default(),
+            info: None,
+            health: None,
+            offers: Offers::default(),
+            was_reset: false,
+            has_board: false,
+            no_mode: None,
+            point_ns: None,
+            measure: None,
+            beams: None,
+            is_learned: false,
+            current: None,
+            held: None,
+            idle_since: None,
+            now,
+            last_byte: now,
+            rest_until: 0,
+            room: 0,
+            last_stamp: 0,
+            trouble: None,
+            quiet_since: None,
+            damaged: (0, 0),
+            resyncs: 0,
+            cut: false,
+        };
+        session.begin(State::Probing);
+        session
+    }
+
+    /// What is at the other end, as far as that is known.
+    pub fn model(&self) -> Option<Model> {
+        self.info.and_then(|info| info.model()).or(self.settings.model)
+    }
+
+    /// What it says that it is; nothing before it was asked.
+    pub fn info(&self) -> Option<Info> {
+        self.info
+    }
+
+    /// How it says that it is; nothing before it was asked.
+    pub fn health(&self) -> Option<Health> {
+        self.health
+    }
+
+    /// Whether it was asked what it is and how it is, and has answered, or was asked in vain.
+    pub(crate) fn is_introduced(&self) -> bool {
+        let is_asked = matches!(self.phase, Phase::Asking { ask: Ask::Info | Ask::Health, .. });
+        self.info.is_some() && !is_asked && !matches!(self.phase, Phase::Draining { .. })
+    }
+
+    /// Beams of the grid that turns are for; nothing before it is known what is at the other end.
+    pub fn beams(&self) -> Option<usize> {
+        self.beams
+    }
+
+    /// Points that the scanner measures in a second; nothing before it is known.
+    pub fn points_per_second(&self) -> Option<f32> {
+        self.point_ns.map(|ns| (1e9 / ns) as f32)
+    }
+
+    /// What became of the bytes.
+    pub fn tally(&self) -> &Tally {
+        self.framer.tally()
+    }
+
+    /// How many turns there were of which kind.
+    pub fn turn_counts(&self) -> TurnCounts {
+        self.turns.counts()
+    }
+
+    /// Does what is due now that all bytes were looked at: bytes that are nothing keep nobody waiting.
+    fn expire(&mut self) {
+        let now = self.now;
+        let is_idle =
+            self.settings.stop_when_idle && self.idle_since.is_some_and(|since| now >= since + IDLE);
+        if is_idle && !self.settings.listen_only && !matches!(self.phase, Phase::Paused { .. }) {
+            return self.rest(true);
+        }
+        match self.phase {
+            Phase::Listening { since } => self.complain(since),
+            Phase::Draining { attempts, until, at_most } if now >= until.min(at_most) => {
+                self.ask(Ask::Info, attempts);
+            }
+            Phase::Asking { ask, attempts, until } if now >= until => self.unanswered(ask, attempts),
+            Phase::Booting { until } | Phase::Unwell { until } if now >= until => self.begin(self.shown),
+            Phase::Hearing { silent_at, .. } if now >= silent_at => {
+                self.resyncs += 1;
+                self.trouble = Some(Trouble::Silence);
+                self.begin(State::Silent);
+            }
+            Phase::Hearing { turned_at, .. } if now >= turned_at + STILL => {
+                self.trouble = Some(Trouble::StandsStill);
+            }
+            _ => {}
+        }
+    }
+
+    /// When something is due, and what.
+    fn deadline(&self) -> (Nanos, crate::told::Why) {
+        use crate::told::Why;
+        let (until, why) = match self.phase {
+            Phase::Listening { since } => {
+                let seconds = self.now.saturating_sub(since) / SILENCE;
+                (since + (seconds + 1) * SILENCE, Why::Answer)
+            }
+            Phase::Paused { .. } => (Nanos::MAX, Why::Never),
+            Phase::Draining { until, at_most, .. } => (until.min(at_most), Why::Draining),
+            Phase::Asking { until, .. } => (until, Why::Answer),
+            Phase::Booting { until } => (until, Why::Booting),
+            Phase::Unwell { until } => (until, Why::Unwell),
+            Phase::Hearing { silent_at, .. } => (silent_at, Why::Silence),
+        };
+        match self.framer.hold() {
+            Some(hold) if self.last_byte + hold < until => (self.last_byte + hold, Why::Held),
+            _ => (until, why),
+        }
+    }
+}
+
+/// Without a packet for so long the session begins again.
+const SILENCE: Nanos = 1_000 * MILLIS;
+/// The slowest head turns once in this.
+const STILL: Nanos = 2_000 * MILLIS;
+/// Nobody follows for so long before the motor rests: a program that is started again follows again.
+const IDLE: Nanos = 5_000 * MILLIS;

@@ -1,0 +1,275 @@
+//! What becomes of packets: they are dated and handed out, and their points go into turns. Of a packet of several points these
+//! are known once the next one came, and only if nothing was between.
+
+use line::{MILLIS, Nanos, Packets, Received, SensorClock, Turn, line_time};
+
+use super::dialogue::Ask;
+use super::{Phase, SILENCE, Session};
+use crate::framer::{Expect, Span};
+use crate::packet::Kind;
+use crate::sequence::{Came, Place, Step};
+use crate::turn::{Closed, Pace};
+
+/// Packets on their way into turns.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Current {
+    kind: Kind,
+    span: Span,
+    places: [Place; MOST],
+    /// The first one that is not done, and whether its points are.
+    packet: usize,
+    is_put: bool,
+}
+
+/// A packet of which the points are not known yet.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Held {
+    bytes: [u8; Kind::LONGEST],
+    place: Place,
+    reasons: u8,
+}
+
+/// Points that came since then: so long takes one.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Measure {
+    since: Nanos,
+    points: usize,
+}
+
+impl Session {
+    /// No more packets of this stream.
+    pub(super) fn end_stream(&mut self) {
+        self.sequence.end();
+        self.turns.give_up();
+        self.is_learned = false;
+        (self.current, self.held, self.measure, self.rest_until) = (None, None, None, 0);
+    }
+
+    /// The scanner begins to measure, if it is what it was told last.
+    pub(super) fn stream_begins(&mut self) {
+        match self.phase {
+            Phase::Asking { ask: Ask::Scan(_), .. } | Phase::Listening { .. } | Phase::Hearing { .. } => {
+                self.end_stream();
+                self.hear();
+                if let Phase::Hearing { turned_at, silent_at, .. } = &mut self.phase {
+                    (*turned_at, *silent_at) = (self.now + SPIN_UP, self.now + SPIN_UP);
+                }
+            }
+            Phase::Paused { .. } => self.framer.expect(Expect::Nothing),
+            _ => self.framer.expect(Expect::Answers),
+        }
+    }
+
+    /// Packets that arrive in ten milliseconds, as far as a sample has room for them.
+    pub(super) fn most_together(&self, kind: Kind) -> usize {
+        let packet_ns = self.point_ns.unwrap_or(1e6) * kind.points() as f64;
+        ((1e7 / packet_ns) as usize).clamp(1, (LONGEST / kind.bytes()).min(MOST))
+    }
+
+    /// Packets came: dates them, and remembers them for turns.
+    pub(super) fn receive(&mut self, kind: Kind, span: Span) -> Received<'_, Packets> {
+        self.hear();
+        let len = kind.bytes();
+        let pace = (!self.settings.fixed_rate).then_some(self.baud);
+        let packet_time = line_time(len, self.baud);
+        let arrived = |n: usize| self.arrivals.latest(span.offset + (n * len + len - 1) as u64, pace);
+        let latest = arrived(span.packets - 1).saturating_sub(packet_time);
+        let mut stamps = None;
+        if let Some(point_ns) = self.point_ns {
+            let behind_first = point_ns * (kind.points() - 1) as f64;
+            let mut places = [Place { step: Step::Odd, angle: 0.0, time: 0.0 }; MOST];
+            for (n, bytes) in self.framer.bytes(span).chunks_exact(len).enumerate() {
+                let came = Came {
+                    start: kind.start(bytes),
+                    skipped: if n == 0 { span.skipped } else { 0 },
+                    packet_ns: point_ns * kind.points() as f64,
+                };
+                let behind = self.framer.tally().read - span.offset - ((n + 1) * len) as u64;
+                let at = arrived(n).saturating_sub(packet_time);
+                let late = |time: f64| {
+                    let due = self.clock.time((time + behind_first) as Nanos);
+                    let late = due.map_or(0.0, |due| at as f64 - due as f64);
+                    // One that waited is late for another reason.
+                    if behind < FRESH { late } else { late.min(0.0) }
+                };
+                let place = match kind {
+                    Kind::Standard => self.sequence.place_point(came, late),
+                    _ => self.sequence.place(came, late),
+                };
+                if place.step == Step::First {
+                    self.clock = SensorClock::new();
+                }
+                if place.step != Step::Odd {
+                    self.clock.note((place.time + behind_first) as Nanos, at);
+                }
+                places[n] = place;
+            }
+            let stamp = |place: Place| {
+                let is_placed = place.step != Step::Odd;
+                self.clock.time((place.time + behind_first) as Nanos).filter(|_| is_placed)
+            };
+            stamps = stamp(places[0]).zip(stamp(places[span.packets - 1]));
+            self.current = Some(Current { kind, span, places, packet: 0, is_put: false });
+            self.learn(kind);
+            let tally = self.framer.tally();
+            self.cut |= tally.packets == span.packets as u64 && tally.discarded > 0;
+        } else {
+            self.measure(kind.points() * span.packets);
+        }
+        let (first, last) = stamps.unwrap_or((latest, latest));
+        let first = first.min(self.now);
+        Received {
+            bytes: self.framer.bytes(span),
+            message: Packets { count: span.packets, is_checked: kind.is_checked(), is_reply: false },
+            first,
+            last: (last + packet_time).clamp(first, self.now.max(first)),
+            estimated: stamps.is_none(),
+            reasons: span.reasons,
+        }
+    }
+
+    /// The stream begins or goes on.
+    fn hear(&mut self) {
+        let silent_at = self.now + SILENCE;
+        let discarded = self.framer.tally().discarded;
+        match &mut self.phase {
+            Phase::Hearing { silent_at: at, .. } => {
+                *at = silent_at;
+                self.damaged.0 += discarded - self.damaged.1;
+            }
+            _ => {
+                self.trouble = None;
+                self.phase = Phase::Hearing { turned_at: self.now, has_turned: false, silent_at };
+            }
+        }
+        self.damaged.1 = discarded;
+    }
+
+    /// How long a point takes, where nobody says it.
+    fn measure(&mut self, points: usize) {
+        let Some(measure) = &mut self.measure else {
+            self.measure = Some(Measure { since: self.now, points: 0 });
+            return;
+        };
+        measure.points += points;
+        let passed = self.now - measure.since;
+        if passed >= SILENCE {
+            self.point_ns = Some(passed as f64 / measure.points as f64);
+        }
+    }
+
+    /// The grid is known once it is known how fast the head turns.
+    fn learn(&mut self, kind: Kind) {
+        let Some(point_ns) = self.point_ns.filter(|_| !self.is_learned) else { return };
+        let Some(advance) = self.sequence.advance() else { return };
+        let points_per_turn = 360.0 / advance * kind.points() as f64;
+        let own = match (self.model(), self.settings.mode) {
+            (Some(model), None) => model.beams(),
+            (Some(model), Some(_)) => model.beams_of((1e9 / point_ns) as f32),
+            (None, _) => (points_per_turn + 0.5) as usize,
+        };
+        let most = self.settings.most_beams.unwrap_or(*line::grid::BEAMS.end());
+        let beams =
+            self.settings.beams.or(self.beams).unwrap_or(own.max(*line::grid::BEAMS.start())).min(most);
+        (self.beams, self.is_learned) = (Some(beams), true);
+        self.turns.begin(beams);
+    }
+
+    /// Puts what was handed out into turns; one that is over.
+    pub(super) fn advance_turns(&mut self) -> Option<Closed> {
+        while let Some(current) = &mut self.current {
+            let (kind, span, packet) = (current.kind, current.span, current.packet);
+            let is_put = core::mem::replace(&mut current.is_put, true);
+            let place = current.places.get(packet).copied().filter(|_| packet < span.packets);
+            let (Some(place), Some(pace)) = (place, self.pace(kind)) else {
+                self.current = None;
+                return None;
+            };
+            if !is_put {
+                self.put_packet(kind, span, packet, place, pace);
+            }
+            if place.step != Step::Odd
+                && let Some(closed) = self.turns.reach(place.angle - kind.most_before(), pace)
+            {
+                return Some(closed);
+            }
+            if let Some(current) = &mut self.current {
+                (current.packet, current.is_put) = (packet + 1, false);
+            }
+        }
+        None
+    }
+
+    /// Puts points into turns: those of this packet, or those of the one before it.
+    fn put_packet(&mut self, kind: Kind, span: Span, packet: usize, place: Place, pace: Pace) {
+        let reasons = if packet == 0 { span.reasons } else { 0 };
+        let bytes = &self.framer.bytes(span)[packet * kind.bytes()..][..kind.bytes()];
+        match place.step {
+            Step::First => self.turns.give_up(),
+            Step::Gap { from } => {
+                self.turns.lacks(from - kind.most_before(), place.angle + kind.most_behind());
+            }
+            Step::Next => {}
+            Step::Odd => {
+                self.held = None;
+                return;
+            }
+        }
+        if kind == Kind::Standard {
+            let point = kind.point(bytes, bytes, 0);
+            return self.turns.put(place.angle, place.time, point.range, point.quality, reasons, pace);
+        }
+        if let Some(held) = self.held.take().filter(|_| place.step == Step::Next) {
+            put(&mut self.turns, kind, &held, bytes, place, pace);
+        }
+        let mut copy = [0; Kind::LONGEST];
+        copy[..kind.bytes()].copy_from_slice(bytes);
+        self.held = Some(Held { bytes: copy, place, reasons });
+    }
+
+    /// How fast the head turns past points; nothing before turns are wanted.
+    fn pace(&self, kind: Kind) -> Option<Pace> {
+        let (point_ns, advance) = self.point_ns.zip(self.sequence.advance()).filter(|_| self.is_learned)?;
+        Some(Pace { step: advance / kind.points() as f64, point_ns })
+    }
+
+    pub(super) fn show(&mut self, closed: Closed) -> Turn<'_> {
+        let stamp = |at: Nanos| self.clock.time(at).unwrap_or(self.now);
+        let first = stamp(closed.first).max(self.last_stamp);
+        let last = stamp(closed.last).max(first);
+        self.last_stamp = first;
+        self.trouble = None;
+        if let Phase::Hearing { turned_at, has_turned, .. } = &mut self.phase {
+            (*turned_at, *has_turned) = (self.now, true);
+        }
+        Turn {
+            points: self.turns.points(&closed),
+            first,
+            last,
+            period: closed.period,
+            beams: self.beams.unwrap_or_default(),
+            points_per_second: self.points_per_second().unwrap_or_default(),
+            incomplete: closed.incomplete,
+            reasons: closed.reasons,
+        }
+    }
+}
+
+/// The points of `held`, which `next` follows at `place`.
+fn put(turns: &mut crate::turn::Turns, kind: Kind, held: &Held, next: &[u8], place: Place, pace: Pace) {
+    let step = (place.angle - held.place.angle) / kind.points() as f64;
+    for i in 0..kind.points() {
+        let point = kind.point(&held.bytes[..kind.bytes()], next, i);
+        let angle = held.place.angle + step * i as f64 - f64::from(point.before);
+        let time = held.place.time + pace.point_ns * i as f64;
+        turns.put(angle, time, point.range, point.quality, held.reasons, Pace { step, ..pace });
+    }
+}
+
+/// Some heads have to turn before they measure.
+const SPIN_UP: Nanos = 3_000 * MILLIS;
+/// Packets of one sample at the most, and its bytes.
+const MOST: usize = 128;
+const LONGEST: usize = 800;
+/// With fewer bytes behind it a packet did not wait long.
+const FRESH: u64 = 1_024;

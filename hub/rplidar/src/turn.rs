@@ -1,0 +1,173 @@
+//! Points to turns. A turn begins half a step of the grid before the scanner's zero, so that the beam ahead is measured in
+//! one piece, and each point belongs to the turn that its own angle says: it may come after points that lie behind it. So a
+//! turn is over only when the head is past its end by more than a point can be late, and until then there are two. Knows
+//! no bytes and no hub's clock.
+
+use line::grid::{NO_RETURN, Point};
+use line::{Nanos, TurnCounts};
+
+/// The turn that is being measured, and the next one.
+#[derive(Clone, Debug)]
+pub(crate) struct Turns {
+    points: [[Point; CAPACITY]; 2],
+    /// Which of both holds the points of the first one.
+    at: usize,
+    open: [Open; 2],
+    /// The number of the first one since the sequence began; nothing before that is known.
+    number: Option<i64>,
+    /// The last turn of which it is known that points are missing.
+    lacking: i64,
+    /// Degrees from the edge of a turn to the zero.
+    edge: f64,
+    counts: TurnCounts,
+}
+
+#[derive(Clone, Copy, Debug, Default)]
+struct Open {
+    len: usize,
+    /// By the scanner's clock, in nanoseconds, at its edge and of its last point.
+    first: Option<f64>,
+    last: f64,
+    incomplete: bool,
+    reasons: u8,
+}
+
+/// A turn that is over, with times of the scanner's clock; its points stay until the next point comes.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Closed {
+    points: usize,
+    len: usize,
+    pub(crate) first: Nanos,
+    pub(crate) last: Nanos,
+    pub(crate) period: Nanos,
+    pub(crate) incomplete: bool,
+    pub(crate) reasons: u8,
+}
+
+/// How fast the head turns past points.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Pace {
+    /// Degrees from one point to the next.
+    pub(crate) step: f64,
+    /// Nanoseconds from one point to the next.
+    pub(crate) point_ns: f64,
+}
+
+impl Turns {
+    pub(crate) fn new() -> Self {
+        const NONE: Point = Point { angle: 0.0, range: NO_RETURN, intensity: 0 };
+        Turns {
+            points: [[NONE; CAPACITY]; 2],
+            at: 0,
+            open: [Open::default(); 2],
+            number: None,
+            lacking: i64::MIN,
+            edge: 0.0,
+            counts: TurnCounts::default(),
+        }
+    }
+
+    /// From now on turns are for a grid of so many beams; the open ones are given up.
+    pub(crate) fn begin(&mut self, beams: usize) {
+        self.edge = 180.0 / beams as f64;
+        self.give_up();
+    }
+
+    pub(crate) fn counts(&self) -> TurnCounts {
+        self.counts
+    }
+
+    /// The points of a turn that was closed just now.
+    pub(crate) fn points(&self, closed: &Closed) -> &[Point] {
+        &self.points[closed.points][..closed.len]
+    }
+
+    /// The open turns come to no end, and no angle that is known goes on.
+    pub(crate) fn give_up(&mut self) {
+        self.counts.short += u64::from(self.open[0].len > 0);
+        self.open = [Open::default(); 2];
+        (self.number, self.lacking) = (None, i64::MIN);
+    }
+
+    /// A point at `angle`, in degrees clockwise over all turns, measured at `time`.
+    pub(crate) fn put(&mut self, angle: f64, time: f64, range: u16, intensity: u8, reasons: u8, pace: Pace) {
+        let turn = self.turn_of(angle);
+        // Turns are measured from their edge on.
+        let number = *self.number.get_or_insert(turn + 1);
+        let Some(which) = usize::try_from(turn - number).ok().filter(|which| *which < 2) else { return };
+        let Some(place) = self.points[self.at ^ which].get_mut(self.open[which].len) else {
+            self.open[which].incomplete = true;
+            return;
+        };
+        let within = angle - turn as f64 * 360.0;
+        let range = if (1..NO_RETURN).contains(&range) { range } else { NO_RETURN };
+        *place = Point { angle: -(within as f32).to_radians(), range, intensity };
+        let open = &mut self.open[which];
+        open.len += 1;
+        open.last = open.last.max(time);
+        open.reasons |= reasons;
+        // Where the first points are missing, the edge is dated as if they were there.
+        let points = if pace.step > 0.0 { (within + self.edge) / pace.step } else { 0.0 };
+        open.first.get_or_insert((time - points * pace.point_ns).max(0.0));
+    }
+
+    /// Between these angles points are missing.
+    pub(crate) fn lacks(&mut self, from: f64, to: f64) {
+        let Some(number) = self.number else { return };
+        let (from, to) = (self.turn_of(from), self.turn_of(to));
+        for (turn, open) in (number..).zip(&mut self.open) {
+            open.incomplete |= (from..=to).contains(&turn);
+        }
+        self.lacking = self.lacking.max(to);
+    }
+
+    /// All points before `angle` were put. The turn that is over with it, if there is one; then this is to be called
+    /// once more.
+    pub(crate) fn reach(&mut self, angle: f64, pace: Pace) -> Option<Closed> {
+        let (turn, due) = (self.turn_of(angle), 360.0 / pace.step.max(1e-3));
+        while let Some(number) = self.number.filter(|number| turn > *number) {
+            let open = self.open[0];
+            if open.len == 0 && self.open[1].len == 0 {
+                self.counts.missed += (turn - number) as u64;
+                self.number = Some(turn);
+                self.open = [self.fresh(turn), self.fresh(turn + 1)];
+                return None;
+            }
+            let points = self.at;
+            self.at ^= 1;
+            self.open = [self.open[1], self.fresh(number + 2)];
+            self.number = Some(number + 1);
+            let Some(first) = open.first.filter(|_| open.len as f64 >= due / 2.0) else {
+                self.counts.short += u64::from(open.len > 0);
+                self.counts.missed += u64::from(open.len == 0);
+                continue;
+            };
+            self.counts.turns += 1;
+            self.counts.incomplete += u64::from(open.incomplete);
+            return Some(Closed {
+                points,
+                len: open.len,
+                first: first as Nanos,
+                last: open.last.max(first) as Nanos,
+                period: (due * pace.point_ns) as Nanos,
+                incomplete: open.incomplete,
+                reasons: open.reasons,
+            });
+        }
+        None
+    }
+
+    fn fresh(&self, turn: i64) -> Open {
+        Open { incomplete: turn <= self.lacking, ..Open::default() }
+    }
+
+    fn turn_of(&self, angle: f64) -> i64 {
+        let turns = (angle + self.edge) / 360.0;
+        // Towards less, also below zero.
+        let whole = turns as i64;
+        if (whole as f64) > turns { whole - 1 } else { whole }
+    }
+}
+
+/// Points of an S2 that turns four times a second; what is more does not fit into a turn.
+const CAPACITY: usize = 8_192;

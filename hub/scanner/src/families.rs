@@ -1,0 +1,174 @@
+//! The list of the families of scanners whose heads turn: who wants to talk to any of them, or to offer them all, needs no
+//! other one. Refuses to know what a family speaks.
+
+use std::fmt;
+
+use line::family::{Condition, Features, Model, Turning as _, Wanted};
+use line::{Account, Control, Heard, Nanos, Output, State};
+use schema::Family;
+
+/// Declares the families: number and crate of one stand in a line.
+macro_rules! families {
+    ($($Family:ident $family:ident,)*) => {
+        /// A session with a scanner of one of the families.
+        #[expect(clippy::large_enum_variant, reason = "there is one per open port")]
+        #[derive(Clone, Debug)]
+        pub enum Session {
+            $(#[doc = concat!("Of family ", stringify!($family), ".")] $Family($family::Session),)*
+        }
+
+        /// Why a session is not where it should be; its words are the family's.
+        #[derive(Clone, Copy, Debug, PartialEq)]
+        pub enum Trouble {
+            $(#[doc = concat!("Of family ", stringify!($family), ".")] $Family($family::Trouble),)*
+        }
+
+        /// Returns what may be set for a scanner of `family`; nothing for an LMS, whose settings are its own.
+        pub const fn features(family: Family) -> Option<&'static Features> {
+            match family {
+                Family::Lms => None,
+                $(Family::$Family => Some(&$family::Session::FEATURES),)*
+            }
+        }
+
+        impl Session {
+            /// A session with a scanner of `family` on a port that is open at the rate of the model that is `wanted`; nothing
+            /// with an LMS.
+            pub fn begin(family: Family, wanted: Wanted, now: Nanos) -> Option<Session> {
+                match family {
+                    Family::Lms => None,
+                    $(Family::$Family => Some(Session::$Family($family::Session::begin(wanted, now))),)*
+                }
+            }
+
+            /// What it talks to.
+            pub fn family(&self) -> Family {
+                match self { $(Session::$Family(_) => Family::$Family,)* }
+            }
+        }
+
+        /// The trouble of a session of any family.
+        fn trouble(session: &Session) -> Option<Trouble> {
+            match session {
+                $(Session::$Family(session) => line::Session::trouble(session).map(Trouble::$Family),)*
+            }
+        }
+
+        impl fmt::Display for Trouble {
+            fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+                match self { $(Trouble::$Family(trouble) => trouble.fmt(f),)* }
+            }
+        }
+
+        /// Says the same of whatever family it is.
+        macro_rules! each {
+            ($of:expr, $session:ident => $said:expr) => {
+                match $of { $(Session::$Family($session) => $said,)* }
+            };
+        }
+    };
+}
+
+families! {
+    Ld ld,
+    Rplidar rplidar,
+}
+
+/// What a scanner said of itself when it was asked, in words.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Introduction {
+    /// Firmware and numbers.
+    pub identity: String,
+    /// How it says that it is; empty if it did not say.
+    pub health: String,
+    /// The same as a verdict.
+    pub condition: Condition,
+}
+
+impl Session {
+    /// What is at the other end, as far as that is known: of models that cannot be told apart, one.
+    pub fn model(&self) -> Option<Model> {
+        each!(self, session => line::family::Turning::model(session))
+    }
+
+    /// Beams of the grid that turns are for; nothing before it is known what is at the other end.
+    pub fn beams(&self) -> Option<usize> {
+        each!(self, session => line::family::Turning::beams(session))
+    }
+
+    /// What the scanner said of itself, and how it says that it is; nothing before it was asked all that changes nothing, and
+    /// nothing of one that is never asked.
+    pub fn introduction(&self) -> Option<Introduction> {
+        let (mut identity, mut health) = (String::new(), String::new());
+        let condition = each!(self, session => session.introduction(&mut identity, &mut health))?;
+        Some(Introduction { identity, health, condition })
+    }
+
+    /// When the last packet that was handed out was measured, by the scanner's own clock, if it has one.
+    pub fn scanner_time(&self) -> Option<Nanos> {
+        each!(self, session => line::family::Turning::scanner_time(session))
+    }
+
+    /// The packets that are handed out next are suspect for these `reasons` too, bits of [`line::suspect`].
+    pub fn doubt(&mut self, reasons: u8) {
+        each!(self, session => line::family::Turning::doubt(session, reasons));
+    }
+}
+
+impl line::Session for Session {
+    type Heard<'a> = Heard<'a>;
+    type Why = ();
+    type Trouble = Trouble;
+
+    fn spare(&mut self) -> &mut [u8] {
+        each!(self, session => session.spare())
+    }
+
+    fn commit(&mut self, now: Nanos, len: usize) {
+        each!(self, session => session.commit(now, len))
+    }
+
+    fn may_leave(&self) -> bool {
+        each!(self, session => session.may_leave())
+    }
+
+    fn leave(&mut self, now: Nanos, waiting: usize) -> bool {
+        each!(self, session => session.leave(now, waiting))
+    }
+
+    fn handle_timeout(&mut self, now: Nanos) {
+        each!(self, session => session.handle_timeout(now))
+    }
+
+    fn control(&mut self, control: Control, now: Nanos) {
+        each!(self, session => session.control(control, now))
+    }
+
+    fn followed(&mut self, now: Nanos, is_followed: bool) {
+        each!(self, session => session.followed(now, is_followed))
+    }
+
+    fn transmitted(&mut self, now: Nanos) {
+        each!(self, session => session.transmitted(now))
+    }
+
+    fn poll_output(&mut self) -> Output<Heard<'_>, ()> {
+        each!(self, session => session.poll_output().map(|heard| heard))
+    }
+
+    fn state(&self) -> State {
+        each!(self, session => session.state())
+    }
+
+    fn trouble(&self) -> Option<Trouble> {
+        trouble(self)
+    }
+
+    fn rate(&self) -> u32 {
+        each!(self, session => session.rate())
+    }
+
+    fn account(&self) -> Account {
+        each!(self, session => session.account())
+    }
+}

@@ -1,0 +1,119 @@
+//! The verb behind TCP: a host that connects as to a serial server in raw mode gets the bytes of every family as they were
+//! sent, one host at a time.
+
+use std::io::{Read, Write};
+use std::net::TcpStream;
+use std::path::PathBuf;
+use std::time::{Duration, Instant};
+
+use lms::command::Request;
+use schema::Kind;
+use sim::fault::Faults;
+use sim::options::{Scanner, SimulateOptions};
+use sim::rplidar::Model;
+use sim::simulate;
+use sim::truth::Record;
+
+use crate::PATIENCE;
+use crate::simulator::Simulator;
+
+fn options(scanner: Option<Scanner>) -> SimulateOptions {
+    SimulateOptions { ports: vec!["tcp:127.0.0.1:0".into()], scanner, ..SimulateOptions::default() }
+}
+
+/// Connects to where `simulator` says that it is.
+fn connect(simulator: &Simulator) -> TcpStream {
+    let port = simulator.ready[0].port.to_str().expect("a name");
+    assert_eq!(simulator.ready[0].pty, None);
+    let stream = TcpStream::connect(port.strip_prefix("tcp:").expect("a server")).expect("connected");
+    stream.set_read_timeout(Some(PATIENCE)).expect("set");
+    stream
+}
+
+fn read(stream: &mut TcpStream, len: usize) -> Vec<u8> {
+    let mut bytes = vec![0; len];
+    stream.read_exact(&mut bytes).expect("bytes");
+    bytes
+}
+
+#[test]
+fn every_family_speaks_over_tcp_as_the_truth_says() {
+    let rplidar = Scanner::Rplidar { model: Model::A1, mode: 1 };
+    for (scanner, request) in [
+        (None, Request::Stream.encode(0).bytes().to_vec()),
+        (Some(Scanner::Ld(ld::Model::Ld19)), Vec::new()),
+        (Some(rplidar), vec![0xA5, 0x82, 5, 1, 0, 0, 0, 0, 0xA5 ^ 0x82 ^ 5 ^ 1]),
+    ] {
+        // Fast enough that an LMS at its 9,600 baud is through with some scans.
+        let simulator = Simulator::start(SimulateOptions { speed: 4.0, ..options(scanner) });
+        let mut host = connect(&simulator);
+        host.write_all(&request).expect("written");
+        let bytes = read(&mut host, 2_500);
+        let (summaries, records) = simulator.end();
+        assert_eq!(summaries[0].eeprom_writes, 0);
+        // What was sent before it was known that somebody is connected went nowhere.
+        let intact = records.iter().filter(|record| record.fault.is_none());
+        let found = intact.filter(|record| {
+            bytes.windows(record.length).any(|window| Record::hash(window) == record.sha256)
+        });
+        assert!(found.count() >= 2, "{scanner:?}");
+    }
+}
+
+#[test]
+fn one_host_at_a_time_and_the_next_when_it_has_left() {
+    let simulator = Simulator::start(options(Some(Scanner::Rplidar { model: Model::A1, mode: 1 })));
+    let ask = |host: &mut TcpStream| {
+        host.write_all(&[0xA5, 0x52]).expect("written");
+        assert_eq!(read(host, 10), [0xA5, 0x5A, 3, 0, 0, 0, 0x06, 0, 0, 0]);
+    };
+    let mut first = connect(&simulator);
+    ask(&mut first);
+    let mut second = connect(&simulator);
+    assert_eq!(second.read(&mut [0; 1]).expect("turned away"), 0);
+    ask(&mut first);
+    drop(first);
+    let end = Instant::now() + PATIENCE;
+    let mut third = loop {
+        let mut host = connect(&simulator);
+        host.set_read_timeout(Some(Duration::from_millis(50))).expect("set");
+        // Turned away as long as it is not known that the first one has left.
+        let is_away = matches!(host.read(&mut [0; 1]), Ok(0));
+        if !is_away {
+            break host;
+        }
+        assert!(Instant::now() < end);
+    };
+    third.set_read_timeout(Some(PATIENCE)).expect("set");
+    ask(&mut third);
+    let taken = SimulateOptions { ports: vec![simulator.ready[0].port.clone()], ..options(None) };
+    let refused = |options: SimulateOptions| {
+        let (_write, stop) = std::os::unix::net::UnixStream::pair().expect("a pair");
+        simulate(&options, &stop, |_| {}, |_| {}).expect_err("refused").kind
+    };
+    assert_eq!(refused(taken), Kind::PortBusy);
+    let wrong = |port: &str| SimulateOptions { ports: vec![PathBuf::from(port)], ..options(None) };
+    assert_eq!(refused(wrong("tcp:localhost")), Kind::Configuration);
+}
+
+#[test]
+fn an_unplugged_server_is_gone_and_comes_back_at_the_same_address() {
+    let faults: Faults = "unplug=0.3,unplug_at=0.2".parse().expect("faults");
+    let scanner = Some(Scanner::Ld(ld::Model::Ld19));
+    let simulator = Simulator::start(SimulateOptions { faults, ..options(scanner) });
+    let mut host = connect(&simulator);
+    let mut rest = Vec::new();
+    // It may end with a reset, where bytes were on their way.
+    let _ = host.read_to_end(&mut rest);
+    let end = Instant::now() + PATIENCE;
+    let address = simulator.ready[0].port.to_str().expect("a name").replace("tcp:", "");
+    let mut again = loop {
+        match TcpStream::connect(&address) {
+            Ok(stream) => break stream,
+            Err(_) => assert!(Instant::now() < end),
+        }
+    };
+    again.set_read_timeout(Some(PATIENCE)).expect("set");
+    read(&mut again, 470);
+    drop(simulator.end());
+}

@@ -1,0 +1,100 @@
+//! A scanner of Slamtec on a real pty: what a host reads of it is what the truth says.
+
+use std::fs;
+use std::time::{Duration, Instant};
+
+use rustix::event::{PollFd, PollFlags, Timespec, poll};
+use sim::fault::Fault;
+use sim::options::{Scanner, SimulateOptions};
+use sim::rplidar::Model;
+use sim::simulate;
+use sim::truth::Record;
+
+use crate::PATIENCE;
+use crate::host::Host;
+use crate::simulator::{Folder, Simulator};
+
+/// Reads until there are `len` bytes.
+fn read(host: &Host, len: usize) -> Vec<u8> {
+    let (end, mut bytes) = (Instant::now() + PATIENCE, Vec::new());
+    while bytes.len() < len {
+        assert!(Instant::now() < end, "{} of {len} bytes", bytes.len());
+        let timeout = Timespec { tv_sec: 0, tv_nsec: 100_000_000 };
+        poll(&mut [PollFd::new(&host.port, PollFlags::IN)], Some(&timeout)).expect("a poll");
+        let mut buffer = [0; 256];
+        let most = buffer.len().min(len - bytes.len());
+        let count = rustix::io::read(&host.port, &mut buffer[..most]).unwrap_or(0);
+        bytes.extend(&buffer[..count]);
+    }
+    bytes
+}
+
+fn say(host: &Host, request: &[u8]) {
+    assert_eq!(rustix::io::write(&host.port, request), Ok(request.len()));
+}
+
+#[test]
+fn what_a_host_reads_is_what_the_truth_says_and_it_starts_anew_after_a_dip_and_a_power_cycle() {
+    for (model, mode) in [(Model::A1, 1), (Model::S2, 1)] {
+        let folder = Folder::new(&format!("unit-{}", model.name()));
+        let (port, truth) = (folder.path("front"), folder.path("truth.jsonl"));
+        let simulator = Simulator::start(SimulateOptions {
+            ports: vec![port.clone()],
+            scanner: Some(Scanner::Rplidar { model, mode }),
+            faults: "brownout_at=3,power_at=5".parse().expect("faults"),
+            boot: Duration::from_millis(50),
+            truth: Some(truth.clone()),
+            ..SimulateOptions::default()
+        });
+        let host = Host::open(&port, model.baud());
+        say(&host, &[0xA5, 0x50]);
+        let info = read(&host, 27);
+        assert_eq!(info[..8], [0xA5, 0x5A, 0x14, 0, 0, 0, 0x04, model.id()]);
+        say(&host, &[0xA5, 0x82, 5, 1, 0, 0, 0, 0, 0xA5 ^ 0x82 ^ 5 ^ 1]);
+        let descriptor = read(&host, 7);
+        let form = model.modes()[1].form;
+        assert_eq!(descriptor, [0xA5, 0x5A, form.packet_len() as u8, 0, 0, 0x40, form.answer()]);
+        let packets = read(&host, 50 * form.packet_len());
+        // By the dip of the voltage, and by the power cycle.
+        for _ in 0..2 {
+            simulator.record_where(|record| record.is_reply && record.length == 64);
+        }
+        let (summaries, _) = simulator.end();
+        assert_eq!(summaries[0].eeprom_writes, 0);
+        let truth = fs::read_to_string(&truth).expect("the truth");
+        let mut told = truth.lines();
+        for packet in packets.chunks(form.packet_len()) {
+            let sum = packet[2..].iter().fold(0, |sum, byte| sum ^ byte);
+            assert_eq!((packet[0], packet[1]), (0xA0 | sum & 15, 0x50 | sum >> 4));
+            let sha256 = Record::hash(packet).map(|byte| format!("{byte:02x}")).concat();
+            assert!(told.any(|line| line.contains(&sha256)), "the truth has not this packet, or earlier");
+        }
+    }
+}
+
+#[test]
+fn a_host_at_another_rate_hears_noise_and_what_it_has_not_is_refused() {
+    let folder = Folder::new("unit-rate");
+    let port = folder.path("front");
+    let of = |model| SimulateOptions {
+        ports: vec![port.clone()],
+        scanner: Some(Scanner::Rplidar { model, mode: 0 }),
+        state: sim::options::parse_state("streaming").expect("a state"),
+        ..SimulateOptions::default()
+    };
+    let simulator = Simulator::start(of(Model::C1));
+    let host = Host::open(&port, 115_200);
+    simulator.record_where(|record| record.fault == Some(Fault::Baud));
+    host.set_rate(460_800);
+    let intact = simulator.record_where(|record: &Record| record.fault.is_none());
+    assert_eq!((intact.length, intact.is_reply), (5, false));
+    drop((host, simulator.end()));
+    let refused = |options: SimulateOptions| {
+        let (_write, stop) = std::os::unix::net::UnixStream::pair().expect("a pair");
+        simulate(&options, &stop, |_| {}, |_| {}).expect_err("refused")
+    };
+    let replay = refused(SimulateOptions { replay: Some("/no/file".into()), ..of(Model::A1) });
+    assert!(replay.message.contains("a1 has no recording") && replay.kind.exit_code() == 78, "{replay}");
+    let state = sim::options::parse_state("means").expect("a state");
+    assert!(refused(SimulateOptions { state, ..of(Model::A1) }).message.contains("no state"));
+}

@@ -1,0 +1,297 @@
+//! Recordings of scanners whose heads turn: their packets are played as those of an LMS are, and the scans that come of them
+//! are those that were published when they were recorded.
+
+use std::collections::BTreeMap;
+use std::path::Path;
+
+use crate::testkit::Recording;
+use crate::testkit::{INT, Program, TERM, TestEnv, is_class, number};
+use schema::datagram::Packed;
+use schema::file::{self, Writer};
+use schema::{Family, Flags, Header, Reasons, Scan, Topic};
+use serde_json::Value;
+
+/// How far stamps may be off to each other: both sessions learn how late packets come and how clocks drift, and on a machine
+/// that is busy the first ones come late.
+const OFF_NS: i64 = 5_000_000;
+
+/// A recorder of `flags` that is attached.
+fn recorder(env: &TestEnv, name: &str, flags: &[&str]) -> Program {
+    let file = env.word(name);
+    let before = env.subscribers("front/telegram");
+    let recorder = env.start(&[&["record", "--json", "-o", &file], flags].concat());
+    crate::testkit::until("the recorder is attached", || env.subscribers("front/telegram") > before);
+    recorder
+}
+
+/// Records two files, one with telegrams alone, until so many scans came: of a scanner of `model`, on a line with faults.
+fn record(env: &TestEnv, model: &str, settings: &[&str], scans: usize) {
+    let set = ["family=ld"].iter().chain(settings).map(|set| format!("--set=link.front.{set}"));
+    let hub = env.hub(&[vec![env.link("front")], set.collect()].concat());
+    let recorders = [recorder(env, "all.mcap", &["--all"]), recorder(env, "telegrams.mcap", &["*/telegram"])];
+    let mut echo = env.echo(&["front/scan"]);
+    let model = format!("--model={model}");
+    let faults = "--fault=loss=0.004,burst=40";
+    let words = ["--family=ld", &model, "--world=room", "--seed=5", faults];
+    let simulator = env.simulator(&["front"], &words);
+    echo.await_lines(scans, "a scan", is_class("scan"));
+    for recorder in recorders {
+        assert_eq!(recorder.end(INT).code, Some(0));
+    }
+    assert_eq!((echo.end(INT).code, hub.end(TERM).code), (Some(0), Some(0)));
+    assert_eq!(simulator.end(TERM).code, Some(0));
+}
+
+/// Replays `name` with these words, and records what comes of it.
+fn replay(env: &TestEnv, name: &str, words: &[&str]) -> Value {
+    let file = env.word(name);
+    let words = [&["replay", "--json", "--no-system-config", "--paused", &file], words].concat();
+    let player = env.start(&words).ready();
+    let recorder = recorder(env, "replayed.mcap", &["--all", "--force"]);
+    assert_eq!(env.run(&["control", "front", "resume"]).code, Some(0));
+    let outcome = player.wait();
+    assert_eq!(outcome.code, Some(0), "{outcome}");
+    assert_eq!(recorder.end(INT).code, Some(0));
+    outcome.of_class("replayed").pop().expect("what was played")
+}
+
+/// Headers and payloads of a topic in a file.
+fn samples(file: &Path, topic: &str) -> Vec<(Header, Vec<u8>)> {
+    let recording = Recording::whole(file);
+    let parts = |data: &[u8]| file::parts(data).map(|(header, payload)| (header, payload.to_vec()));
+    recording.of(topic).iter().map(|kept| parts(&kept.data).expect("a sample")).collect()
+}
+
+fn scan(payload: &[u8]) -> Box<Scan> {
+    let mut scan = Box::default();
+    assert!(Scan::unpack_into(&mut scan, payload));
+    scan
+}
+
+/// Whether the scans of both are the same, but for those of the first half second, in which a session learns.
+fn check_scans(recorded: &[(Header, Vec<u8>)], replayed: &[(Header, Vec<u8>)], learning: usize) {
+    let by_seq: BTreeMap<u64, _> =
+        replayed.iter().map(|(header, payload)| (header.seq, (header, payload))).collect();
+    let (mut compared, mut incomplete, mut suspect) = (0, 0, 0);
+    let mut first: Option<(&Header, &Header)> = None;
+    for (header, payload) in &recorded[learning..] {
+        let (played, bytes) = by_seq.get(&header.seq).unwrap_or_else(|| panic!("no scan of {}", header.seq));
+        let (then, now) = (scan(payload), scan(bytes));
+        assert_eq!(then.ranges(), now.ranges(), "{}", header.seq);
+        let exact =
+            |scan: &Scan| (0..scan.beams()).map(|beam| scan.angle(beam).to_bits()).collect::<Vec<_>>();
+        assert_eq!(exact(&then), exact(&now), "{}", header.seq);
+        assert_eq!(then.intensities(), now.intensities());
+        assert_eq!((then.flags, then.collapsed, then.family), (now.flags, now.collapsed, now.family));
+        let line_error = Reasons::LINE_ERROR;
+        assert_eq!(header.reasons & !line_error, played.reasons & !line_error, "{}", header.seq);
+        assert_eq!(played.flags & Flags::REPLAYED, Flags::REPLAYED);
+        let (begin, begin_played) = *first.get_or_insert((header, played));
+        for of in [|header: &Header| header.stamp_first_ns, |header: &Header| header.stamp_last_ns] {
+            let (then, now) = (of(header) - begin.stamp_first_ns, of(played) - begin_played.stamp_first_ns);
+            assert!(then.abs_diff(now) < OFF_NS as u64, "{then} ns then, {now} ns now");
+        }
+        let wall_off = header.wall_ns.abs_diff(played.wall_ns);
+        assert!(wall_off < OFF_NS as u64, "wall clock off by {wall_off} ns");
+        assert!(
+            header.period_us.abs_diff(played.period_us) < 200,
+            "{} {}",
+            header.period_us,
+            played.period_us
+        );
+        compared += 1;
+        incomplete += u32::from(then.is_incomplete());
+        suspect += u32::from(header.reasons != 0);
+    }
+    assert!(compared + learning >= recorded.len() && compared > 20, "{compared} of {}", recorded.len());
+    assert!(incomplete > 0 && suspect > 0, "the faults did nothing: {incomplete} {suspect}");
+}
+
+#[test]
+fn scans_are_those_that_were_recorded() {
+    let env = TestEnv::new();
+    record(&env, "ld19", &[], 45);
+    let recorded = samples(&env.path("all.mcap"), "front/scan");
+    let packets = samples(&env.path("telegrams.mcap"), "front/telegram");
+    assert!(packets.iter().all(|(header, _)| header.family() == Some(Family::Ld)));
+    for name in ["telegrams.mcap", "all.mcap"] {
+        let end = replay(&env, name, &[]);
+        assert_eq!(number(&end, "telegrams"), samples(&env.path(name), "front/telegram").len() as u64);
+        let file = env.path("replayed.mcap");
+        let replayed = samples(&file, "front/telegram");
+        let bytes = |samples: &[(Header, Vec<u8>)]| -> Vec<(Vec<u8>, u8, u64)> {
+            samples.iter().map(|(header, bytes)| (bytes.clone(), header.reasons, header.wall_ns)).collect()
+        };
+        assert!(
+            bytes(&replayed) == bytes(&samples(&env.path(name), "front/telegram")),
+            "{name}: not bit for bit"
+        );
+        check_scans(&recorded, &samples(&file, "front/scan"), 0);
+    }
+    let info = |words: &[&str]| {
+        let file = env.word("all.mcap");
+        let words =
+            [&["replay", "--json", "--no-system-config", "--hold", "--rate=max", &file], words].concat();
+        let player = env.start(&words).ready();
+        let info = env.await_info("front", |info| info["last_error"] == "the recording is at its end");
+        assert_eq!(player.end(TERM).code, Some(0));
+        info
+    };
+    let known = info(&[]);
+    assert_eq!((&known["type"], number(&known, "angle_deg")), (&"LD19".into(), 360), "{known}");
+    // What is configured goes before what was recorded.
+    let fewer = info(&["--set=link.front.beams=300"]);
+    assert_eq!(fewer["step_deg"], 1.2, "{fewer}");
+}
+
+#[test]
+fn beams_are_those_that_were_recorded() {
+    let env = TestEnv::new();
+    record(&env, "stl27l", &["model=stl27l", "beams=1000"], 25);
+    let recorded = samples(&env.path("all.mcap"), "front/scan");
+    replay(&env, "all.mcap", &[]);
+    check_scans(&recorded, &samples(&env.path("replayed.mcap"), "front/scan"), 0);
+    // Telegrams alone do not say into how many beams they were put: the model's, which they do say.
+    replay(&env, "telegrams.mcap", &["--rate=max"]);
+    let replayed = samples(&env.path("replayed.mcap"), "front/scan");
+    assert!(!replayed.is_empty() && replayed.iter().all(|(_, payload)| scan(payload).beams() == 2_160));
+}
+
+#[test]
+fn a_part_of_it_and_again() {
+    let env = TestEnv::new();
+    record(&env, "ld19", &[], 30);
+    let recorded = samples(&env.path("all.mcap"), "front/scan");
+    let end = replay(&env, "telegrams.mcap", &["--start=1s", "--end=2s", "--rate=2"]);
+    assert!((0.9..=2.0).contains(&end["position_s"].as_f64().expect("seconds")), "{end}");
+    let replayed = samples(&env.path("replayed.mcap"), "front/scan");
+    assert!((8..=12).contains(&replayed.len()), "{} scans in a second", replayed.len());
+    let walls =
+        |samples: &[(Header, Vec<u8>)]| samples.iter().map(|(header, _)| header.wall_ns).collect::<Vec<_>>();
+    for wall_ns in walls(&replayed) {
+        let near = walls(&recorded).into_iter().map(|then| then.abs_diff(wall_ns)).min();
+        assert!(near.is_some_and(|off| off < OFF_NS as u64), "{near:?}");
+    }
+    let pairs = replayed.windows(2).map(|pair| pair[1].0.stamp_first_ns - pair[0].0.stamp_first_ns);
+    assert!(
+        pairs.clone().all(|ns| (30_000_000..70_000_000).contains(&ns)),
+        "{:?}",
+        pairs.collect::<Vec<_>>()
+    );
+    let file = env.word("telegrams.mcap");
+    let player =
+        env.start(&["replay", "--json", "--no-system-config", "--loop", "--rate=max", &file]).ready();
+    let mut echo = env.echo(&["front/scan"]);
+    echo.await_lines(100, "scans of several laps", is_class("scan"));
+    let outcome = player.end(INT);
+    assert!(number(&outcome.of_class("replayed")[0], "laps") >= 2, "{outcome}");
+}
+
+#[test]
+fn bytes_of_a_line_are_played_by_the_scanners_own_clock() {
+    let env = TestEnv::new();
+    record(&env, "ld19", &[], 30);
+    let (recording, bytes) = (env.word("telegrams.mcap"), env.word("telegrams.bin"));
+    assert_eq!(env.run(&["convert", &recording, &bytes]).code, Some(0));
+    let recorded = samples(&env.path("all.mcap"), "front/scan");
+    let link = format!("--link=front=file:{bytes}");
+    let hub = env.hub(&[&link, "--set=link.front.family=ld"]);
+    let mut echo = env.echo(&["front/scan"]);
+    let scans = echo.await_lines(20, "a scan", is_class("scan"));
+    assert_eq!((echo.end(INT).code, hub.end(TERM).code), (Some(0), Some(0)));
+    let stamps = |of: &Value| number(of, "stamp_ns") as i64;
+    // In which turn it begins depends on what came before: they are found by what they say.
+    let ranges: Vec<Vec<Option<u64>>> = scans
+        .iter()
+        .map(|line| line["ranges"].as_array().expect("ranges").iter().map(Value::as_u64).collect())
+        .collect();
+    let then: Vec<Vec<Option<u64>>> = recorded
+        .iter()
+        .map(|(_, payload)| {
+            let scan = scan(payload);
+            (0..scan.beams()).map(|beam| scan.distance_mm(beam).map(u64::from)).collect()
+        })
+        .collect();
+    let places: Vec<_> = ranges.iter().map(|ranges| then.iter().position(|other| other == ranges)).collect();
+    assert!(places.iter().flatten().count() >= 18, "{places:?}");
+    let known: Vec<_> =
+        places.iter().zip(&scans).filter_map(|(place, line)| Some(((*place)?, line))).collect();
+    for pair in known.windows(2) {
+        let passed = |at: usize| recorded[at].0.stamp_first_ns as i64;
+        let (was, is) = (passed(pair[1].0) - passed(pair[0].0), stamps(pair[1].1) - stamps(pair[0].1));
+        assert!((was - is).abs() < 2 * OFF_NS, "{was} ns then, {is} ns now");
+    }
+}
+
+#[test]
+fn what_cannot_be_played_is_refused_in_words() {
+    let env = TestEnv::new();
+    record(&env, "ld19", &[], 25);
+    let recording = env.word("telegrams.mcap");
+    let refused = |words: &[&str], code: i32, said: &str| {
+        let outcome = env.run(&[words, &["--no-system-config"]].concat());
+        assert_eq!(outcome.code, Some(code), "{outcome}");
+        assert!(outcome.errors.contains(said), "{outcome}");
+    };
+    refused(
+        &["replay", &recording, "--set=link.front.family=lms"],
+        78,
+        "of family ld, and link front is of family lms",
+    );
+    refused(&["run", &format!("--link=front=file:{recording}")], 78, "set link.front.family = \"ld\"");
+    let outcome = env.run(&["convert", &recording, &env.word("x.log")]);
+    assert_eq!((outcome.code, outcome.errors.contains("no place")), (Some(66), true), "{outcome}");
+    let outcome = env.run(&["telegram", "decode", &recording]);
+    assert_eq!((outcome.code, outcome.errors.contains("of family ld")), (Some(66), true), "{outcome}");
+    let port = format!("--port={}", env.word("other"));
+    let outcome = env.run(&["simulate", &port, "--replay", &recording]);
+    assert_eq!((outcome.code, outcome.errors.contains("not of an LMS")), (Some(66), true), "{outcome}");
+    // A family of tomorrow.
+    let later = env.path("later.mcap");
+    let mut writer = Writer::begin(std::fs::File::create(&later).expect("a file"), "", BTreeMap::new())
+        .expect("is written");
+    let header = Header { family: 99, hub_pid: 1, ..Header::default() };
+    writer.sample("front", Topic::Telegram, &header, &[2; 47]).expect("is written");
+    writer.finish().expect("is written");
+    let later = env.word("later.mcap");
+    refused(&["replay", &later], 66, "family number 99");
+    let outcome = env.run(&["convert", &later, &env.word("later.csv")]);
+    assert_eq!((outcome.code, outcome.errors.contains("family number 99")), (Some(66), true), "{outcome}");
+}
+
+#[test]
+fn other_programs_get_the_same_scans_of_packets() {
+    let env = TestEnv::new();
+    record(&env, "ld19", &[], 30);
+    let rows = |name: &str| -> Vec<Vec<String>> {
+        let (file, out) = (env.word(name), env.word("out.csv"));
+        let outcome = env.run(&["convert", &file, &out, "--force"]);
+        assert_eq!(outcome.code, Some(0), "{outcome}");
+        let text = std::fs::read_to_string(env.path("out.csv")).expect("rows");
+        text.lines().skip(1).map(|row| row.split(',').map(str::to_owned).collect()).collect()
+    };
+    let (published, computed) = (rows("all.mcap"), rows("telegrams.mcap"));
+    let ranges =
+        |rows: &[Vec<String>]| rows.iter().map(|row| row[row.len() - 450..].to_vec()).collect::<Vec<_>>();
+    assert!(
+        published.len() > 20 && ranges(&published) == ranges(&computed),
+        "{} {}",
+        published.len(),
+        computed.len()
+    );
+    // A stream has no stamps, and begins anywhere.
+    let (bytes, again) = (env.word("telegrams.bin"), env.word("again.mcap"));
+    for (from, to) in [(&env.word("telegrams.mcap"), &bytes), (&bytes, &again)] {
+        assert_eq!(env.run(&["convert", from, to]).code, Some(0));
+    }
+    let all = |name: &str| {
+        samples(&env.path(name), "front/telegram")
+            .into_iter()
+            .flat_map(|(_, bytes)| bytes)
+            .collect::<Vec<_>>()
+    };
+    assert!(all("again.mcap") == all("telegrams.mcap"));
+    let ranges_again = ranges(&rows("again.mcap"));
+    let same = ranges_again.iter().filter(|row| ranges(&published).contains(row)).count();
+    assert!(same + 2 >= ranges_again.len() && same > 20, "{same} of {}", ranges_again.len());
+}

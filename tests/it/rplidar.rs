@@ -1,0 +1,160 @@
+//! A hub on simulated scanners of Slamtec: it asks them what they are, has them measure as they can, publishes whole turns on
+//! an even grid and their packets as they came, and lets them rest if it is asked to. Nothing they keep is changed.
+
+use serde_json::Value;
+
+use crate::testkit::{INT, Program, TERM, TestEnv, is_class, number, sequence};
+
+/// A scanner of this model.
+fn simulator(env: &TestEnv, model: &str, more: &[&str]) -> Program {
+    let model = format!("--model={model}");
+    let arguments = ["--family=rplidar", &model, "--world=room", "--seed=7"];
+    env.simulator(&["front"], &[&arguments[..], more].concat())
+}
+
+/// A hub of one link with these settings.
+fn hub(env: &TestEnv, settings: &[&str]) -> Program {
+    let set = ["family=rplidar"].iter().chain(settings).map(|setting| format!("--set=link.front.{setting}"));
+    env.hub(&[vec![env.link("front")], set.collect()].concat())
+}
+
+fn text<'a>(line: &'a Value, key: &str) -> &'a str {
+    line[key].as_str().unwrap_or_else(|| panic!("no {key}: {line}"))
+}
+
+#[test]
+fn what_it_is_is_asked_and_its_turns_are_published() {
+    let env = TestEnv::new();
+    let hub = hub(&env, &[]);
+    let mut scans = env.echo(&["front/scan"]);
+    let telegrams = env.echo(&["front/telegram"]);
+    let simulator = simulator(&env, "a1", &[]);
+    scans.await_lines(10, "a scan", is_class("scan"));
+    let info = env.await_info("front", |info| info["hz"].as_f64().is_some_and(|hz| hz > 6.0));
+    assert_eq!(
+        (text(&info, "family"), text(&info, "model"), text(&info, "state")),
+        ("rplidar", "a1", "streaming")
+    );
+    assert_eq!((number(&info, "baud"), text(&info, "last_error")), (115_200, ""), "{info}");
+    assert_eq!((number(&info, "lost_on_line"), info["damaged"].as_f64()), (0, Some(0.0)), "{info}");
+    let scans = scans.end(INT).of_class("scan");
+    sequence(&scans, "topic_seq");
+    let counts: Vec<u64> = scans.iter().map(|scan| number(scan, "count")).collect();
+    assert!(counts[0] > 300 && counts.iter().all(|count| *count == counts[0]), "{counts:?}");
+    // The first turn may have begun before it was heard.
+    let whole = scans.iter().skip(1).filter(|scan| scan["incomplete"].is_null()).count();
+    assert!(whole + 1 >= scans.len(), "{whole} of {} are whole", scans.len());
+    let telegrams = telegrams.end(INT).of_class("telegram");
+    let kinds = |kind: &str| telegrams.iter().filter(|line| line["kind"] == kind).count();
+    assert!(kinds("reply") > 3 && kinds("data") > 50, "{} and {}", kinds("reply"), kinds("data"));
+    assert_eq!(hub.end(TERM).code, Some(0));
+    assert_eq!(simulator.end(TERM).code, Some(0));
+    assert_eq!(env.simulated("front").1, 0, "nothing that it keeps was changed");
+}
+
+#[test]
+fn a_mode_and_a_model_may_be_named() {
+    let env = TestEnv::new();
+    let _simulator = simulator(&env, "s1", &[]);
+    let _hub = hub(&env, &["model=s1", "mode=standard", "beams=500"]);
+    let mut telegrams = env.echo(&["front/telegram"]);
+    for scan in env.echo(&["front/scan"]).await_lines(5, "a scan", is_class("scan")) {
+        assert_eq!((text(&scan, "family"), number(&scan, "count")), ("rplidar", 500), "{scan}");
+    }
+    // Points one by one have no checksum.
+    let data = telegrams.await_line("packets", |line| line["kind"] == "data");
+    assert!(data["checked"].is_null() && number(&data, "length") == 5 * number(&data, "packets"), "{data}");
+    let info = env.await_info("front", |info| info["state"] == "streaming");
+    assert_eq!((number(&info, "baud"), text(&info, "model")), (256_000, "s1"), "{info}");
+}
+
+#[test]
+fn a_mode_that_it_does_not_have_is_told() {
+    let env = TestEnv::new();
+    let _simulator = simulator(&env, "a1", &[]);
+    let _hub = hub(&env, &["mode=ultradense"]);
+    let info = env.await_info("front", |info| info["state"] == "streaming" && info["last_error"] != "");
+    assert!(text(&info, "last_error").contains("cannot do mode ultradense"), "{info}");
+}
+
+#[test]
+fn its_motor_rests_while_nobody_follows() {
+    let env = TestEnv::new();
+    let simulator = simulator(&env, "a1", &[]);
+    let hub = hub(&env, &["idle=stop"]);
+    let paused = |info: &Value| info["state"] == "paused";
+    env.await_info("front", paused);
+    let mut scans = env.echo(&["front/scan"]);
+    scans.await_lines(3, "a scan", is_class("scan"));
+    assert_eq!(text(&env.info("front"), "state"), "streaming");
+    scans.end(INT);
+    // Of the status alone nobody needs a scanner that measures.
+    let _status = env.echo(&["front/status"]);
+    env.await_info("front", paused);
+    assert_eq!((hub.end(TERM).code, simulator.end(TERM).code), (Some(0), Some(0)));
+    assert_eq!(env.simulated("front").1, 0);
+}
+
+#[test]
+fn probe_asks_what_it_is_and_nothing_else() {
+    let env = TestEnv::new();
+    for (model, rate) in [("a1", 115_200), ("s2", 1_000_000)] {
+        let simulator = simulator(&env, model, &[]);
+        let outcome = env.run(&["probe", &env.word("front"), "--json"]);
+        let [found] = &outcome.lines()[..] else { panic!("{outcome}") };
+        assert_eq!(
+            (outcome.code, text(found, "family"), text(found, "model")),
+            (Some(0), "rplidar", model),
+            "{outcome}"
+        );
+        assert_eq!((number(found, "baud"), text(found, "health")), (rate, "good"), "{found}");
+        assert!(text(found, "identity").contains("firmware"), "{found}");
+        assert_eq!(simulator.end(TERM).code, Some(0));
+        assert_eq!(env.simulated("front").1, 0);
+        let asked = env.truth("front");
+        assert!(asked.len() == 2 && asked.iter().all(|sent| sent.is_reply), "more than what it is, and how");
+    }
+}
+
+#[test]
+fn doctor_says_what_its_health_means() {
+    let env = TestEnv::new();
+    let port = env.word("front");
+    let health = |code: i32| {
+        let outcome = env.run(&["doctor", &port, "--json", "--no-system-config"]);
+        assert_eq!(outcome.code, Some(code), "{outcome}");
+        let found = outcome.of_class("check");
+        let of =
+            |name: &str| found.iter().find(|line| line["name"] == name && !line["port"].is_null()).cloned();
+        let sensor = of("sensor").unwrap_or_else(|| panic!("no sensor: {outcome}"));
+        assert!(text(&sensor, "finding").contains("A1 at 115200 Bd, family rplidar, firmware"), "{sensor}");
+        of("health").unwrap_or_else(|| panic!("no health: {outcome}"))
+    };
+    let well = simulator(&env, "a1", &[]);
+    assert_eq!(text(&health(0), "state"), "ok");
+    assert_eq!(well.end(TERM).code, Some(0));
+    let _unwell = simulator(&env, "a1", &["--fault=health=2"]);
+    let unwell = health(5);
+    assert!(
+        text(&unwell, "state") == "failed" && text(&unwell, "finding").contains("does not measure"),
+        "{unwell}"
+    );
+}
+
+#[test]
+fn an_error_that_a_reset_clears_is_cleared_and_another_one_is_told() {
+    let env = TestEnv::new();
+    let hub = hub(&env, &[]);
+    let cleared = simulator(&env, "a1", &["--fault=health=2"]);
+    env.await_info("front", |info| info["state"] == "streaming");
+    env.kill_simulator(cleared, "front");
+    env.await_info("front", |info| info["state"] == "absent");
+    let stubborn = simulator(&env, "a1", &["--fault=health=2,stubborn=1"]);
+    let info = env.await_info("front", |info| text(info, "last_error").contains("does not measure"));
+    assert_ne!(info["state"], "streaming", "{info}");
+    // It comes back well, and nobody has to do anything.
+    env.kill_simulator(stubborn, "front");
+    let _well = simulator(&env, "a1", &[]);
+    env.await_info("front", |info| info["state"] == "streaming" && info["last_error"] == "");
+    assert_eq!(hub.end(TERM).code, Some(0));
+}

@@ -1,0 +1,76 @@
+//! How many files name a family of scanners: one more family is a crate, a module of the simulator, and a line in each of
+//! these.
+
+use super::holds;
+use super::tree::{Tree, code};
+
+/// What names a family, but for its crate, its simulator, tests, benches and pages; each says why.
+const MAY: [&str; 10] = [
+    // The workspace's crates.
+    "Cargo.toml",
+    // The list of the families, and what it is built with.
+    "hub/scanner/Cargo.toml",
+    "hub/scanner/src/families.rs",
+    // Number and name, in each language that reads scans, and what can be said of its packets.
+    "schema/src/scan/family.rs",
+    "schema/src/file/layout.txt",
+    "clients/c/include/scanhub/attach.h",
+    "clients/c/scanhub.h",
+    "clients/python/scanhub/scan.py",
+    "clients/python/scanhub_lan.py",
+    "clients/wireshark/scanhub.lua",
+];
+
+/// Words for a family, beside the name of its crate.
+const FAMILIES: [(&str, &[&str]); 2] = [
+    ("ld", &["ldrobot", "ld06", "ld19", "stl19p", "stl27l", "ld14p"]),
+    ("rplidar", &["slamtec", "a1m8", "a2m8", "a2m12"]),
+];
+
+/// Files that name a family and may not.
+fn few_files_name_a_family(tree: &Tree) -> Vec<String> {
+    let named = FAMILIES.iter().flat_map(|(name, words)| named(tree, name, words));
+    let others = named.filter(|path| !MAY.contains(path));
+    others.map(|path| format!("{path} names a family: what it needs of all belongs into a list")).collect()
+}
+
+/// Files that name the family `name`, or say one of `words`.
+fn named<'a>(tree: &'a Tree, name: &str, words: &[&str]) -> Vec<&'a str> {
+    const OWN: [&str; 7] = [".ci/", "hub/sim/", "tests/", "benches/", "docs/", "README.md", "CHANGELOG.md"];
+    let own = |path: &str| {
+        OWN.iter().any(|own| path.starts_with(own))
+            || path.starts_with(&format!("hub/{name}/"))
+            || path.contains("tests")
+            || path.ends_with(".lock")
+    };
+    let names_it = |line: &str| {
+        let line = line.replace("ls -ld", "").to_lowercase();
+        line.split(|c: char| !c.is_alphanumeric()).any(|word| word == name || words.contains(&word))
+    };
+    let named =
+        tree.files("").filter(|(path, _)| !own(path)).filter(|(path, text)| match path.ends_with(".rs") {
+            true => code(text).any(|(_, line)| names_it(line)),
+            false => text.lines().any(names_it),
+        });
+    named.map(|(path, _)| path).collect()
+}
+
+#[test]
+fn a_family_is_a_line_in_few_files() {
+    holds(few_files_name_a_family, |tree| {
+        vec![
+            tree.with("hub/daemon/src/drive.rs", "//! Drives.\nlet trouble = ld::Trouble::Silence;\n"),
+            tree.with("hub/daemon/src/drive.rs", "//! Drives.\nlet trouble = rplidar::Trouble::Silence;\n"),
+            tree.with_line("hub/config/Cargo.toml", "[dependencies]", "scanhub-ld.workspace = true"),
+            tree.with("hub/tools/src/probe.rs", "//! Probes.\nif model == \"LD19\" {\n"),
+            tree.with("clients/c/planted.h", "#define FAMILY_LD 1\n"),
+        ]
+    });
+    let tree = Tree::load();
+    for (name, words) in FAMILIES {
+        let named = named(&tree, name, words);
+        for path in MAY {
+            assert!(named.contains(&path), "{path} does not name {name}: it need not be in the list");
+        }
+    }
+}

@@ -1,0 +1,21 @@
+"""What the vendor's own driver makes of a simulated RPLIDAR: scans.py PORT BAUD SCANS. Prints one line of JSON: the model
+that it saw, its health, and of each scan the angles (radians) and the ranges (metres)."""
+
+import json
+import sys
+
+from pyrplidarsdk import RplidarDriver
+
+driver = RplidarDriver(port=sys.argv[1], baudrate=int(sys.argv[2]))
+assert driver.connect(), "it does not connect"
+info, health = driver.get_device_info(), driver.get_health()
+assert driver.start_scan(), "it does not start"
+scans, tries = [], 0
+while len(scans) < int(sys.argv[3]) and tries < 100:
+    tries += 1
+    scan = driver.get_scan_data()
+    if scan and scan[0]:
+        scans.append([scan[0], scan[1]])
+driver.stop_scan()
+driver.disconnect()
+print(json.dumps({"model": info.model, "health": str(health.status), "scans": scans}))

@@ -1,0 +1,170 @@
+//! LDROBOT: a head that turns and tells of what it measures in packets, unasked. What it measures has no noise, so that each
+//! point that is told can be found among those that are true.
+
+use std::sync::{Arc, LazyLock};
+
+use ld::Model;
+use ld::packet::{LEN, POINTS, Packet};
+use lms::variant::{Mode, Unit, Variant};
+use lms::{MILLIS, Nanos};
+use schema::Scan;
+use sim::ChunkSize;
+use sim::device::Device;
+use sim::layers::Layers;
+use sim::ld::{Head, HeadSettings, Packets, TruePoint};
+use sim::room::Room;
+use sim::series::{Changes, Series};
+
+use super::{Family, Scanner, rooms};
+use crate::plan::Action;
+
+/// One of them, and what its link asks for.
+pub(super) struct Ld {
+    settings: HeadSettings,
+    /// The link says which model it is.
+    is_said: bool,
+    beams: Option<usize>,
+}
+
+impl Ld {
+    pub(super) fn draw(random: &mut fastrand::Rng) -> Ld {
+        let model = Model::ALL[random.usize(..Model::ALL.len())];
+        let beams = (random.u8(..4) == 0).then(|| random.usize(200..900));
+        Ld { beams, ..Ld::of(model, random) }
+    }
+
+    /// One of this model, on its own beams.
+    pub(super) fn of(model: Model, random: &mut fastrand::Rng) -> Ld {
+        let settings = HeadSettings {
+            wander: random.f64() * 0.01,
+            boot_ns: random.u64(100..2_500) * MILLIS,
+            chunk: if random.bool() { ChunkSize::Uart } else { ChunkSize::Usb },
+            seed: random.u64(..),
+            ..HeadSettings::of(model)
+        };
+        Ld { settings, is_said: random.bool(), beams: None }
+    }
+}
+
+impl Family for Ld {
+    fn keys(&self) -> Vec<String> {
+        let model = self.is_said.then(|| format!("model={}", self.settings.model.name()));
+        let beams = self.beams.map(|beams| format!("beams={beams}"));
+        ["family=ld".to_owned()].into_iter().chain(model).chain(beams).collect()
+    }
+
+    /// What appears where the head has just been is measured a turn later, and told when that turn is over.
+    fn times(&self) -> (Nanos, Nanos) {
+        let HeadSettings { turns_per_second, wander, .. } = self.settings;
+        let slowest = turns_per_second * SLOWEST * (1.0 - wander);
+        let turn = (1e9 / slowest) as Nanos;
+        (turn, 2 * turn + LAST_PACKET)
+    }
+
+    fn found(&self, changes: Changes) -> Box<dyn Scanner> {
+        Box::new(AtLine::new(self.settings, changes))
+    }
+
+    fn units<'a>(&self, sample: &'a [u8]) -> Vec<&'a [u8]> {
+        sample.chunks(LEN).collect()
+    }
+
+    fn most_units(&self) -> usize {
+        17
+    }
+
+    fn is_data(&self, _: &[u8]) -> bool {
+        true
+    }
+
+    /// A turn has points of many samples.
+    fn is_scan_of(&self, _: &Scan, _: &[u8]) -> bool {
+        true
+    }
+
+    /// One of 256 damaged ones has a right checksum.
+    fn is_collision(&self, _: &[u8], damaged: &mut dyn Iterator<Item = &[u8]>) -> bool {
+        damaged.next().is_some()
+    }
+
+    fn turns(&self) -> bool {
+        true
+    }
+
+    fn last_deg(&self, unit: &[u8]) -> Option<f64> {
+        let packet = Packet::check(unit.first_chunk()?).ok()?;
+        Some(f64::from(packet.angle(POINTS - 1)) / 100.0)
+    }
+}
+
+/// A scanner at a line.
+struct AtLine {
+    head: Head,
+    settings: HeadSettings,
+    changes: Changes,
+    /// Packets whose points were told as true.
+    told: u64,
+    /// The share of its usual speed at which it turns, and at which it shall.
+    pace: f64,
+    wanted: f64,
+}
+
+impl AtLine {
+    fn new(settings: HeadSettings, changes: Changes) -> AtLine {
+        let room = Room::of_series(SERIES.clone(), changes.clone());
+        let head = Head::new(settings, Packets::Room(Box::new(room)));
+        AtLine { head, settings, changes, told: 0, pace: 1.0, wanted: 1.0 }
+    }
+}
+
+impl Scanner for AtLine {
+    fn device(&self) -> &dyn Device {
+        &self.head
+    }
+
+    fn device_mut(&mut self) -> &mut dyn Device {
+        &mut self.head
+    }
+
+    /// It gets its power then.
+    fn exchange(&mut self, _: &Action, now: Nanos) -> Vec<u8> {
+        let seed = self.settings.seed.wrapping_add(1);
+        *self = AtLine::new(HeadSettings { seed, ..self.settings }, self.changes.clone());
+        self.head.power_cycle(now);
+        Vec::new()
+    }
+
+    fn misbehave(&mut self, _: Option<&Action>) {}
+
+    fn set_pace(&mut self, share: f64) {
+        self.wanted = share;
+    }
+
+    fn measured(&mut self) -> Vec<TruePoint> {
+        let sent = self.head.sent();
+        if std::mem::replace(&mut self.told, sent) == sent || sent == 0 {
+            return Vec::new();
+        }
+        let first = (sent - 1) * POINTS as u64;
+        let points = (first..first + POINTS as u64).map(|point| self.head.truth(point)).collect();
+        if self.pace != self.wanted {
+            let most = INERTIA * POINTS as f64 / f64::from(self.settings.model.points_per_second());
+            self.pace += (self.wanted - self.pace).clamp(-most, most);
+            self.head.set_speed(self.settings.turns_per_second * self.pace);
+        }
+        points
+    }
+}
+
+/// The rooms, for all worlds. No LMS tells its scans of them.
+static SERIES: LazyLock<Arc<Series>> = LazyLock::new(|| {
+    let rooms = rooms(|scene| scene.with_layers(Layers::NONE));
+    Arc::new(Series::new(rooms, 1, Variant::HALF, Unit::Mm, Mode(1)))
+});
+
+/// A head that is slowed down turns at this share of its speed.
+const SLOWEST: f64 = 0.6;
+/// The most by which a head gets faster or slower in a second, as a share of its usual speed.
+const INERTIA: f64 = 0.4;
+/// The last packet of a turn, until the hub has all of it.
+const LAST_PACKET: Nanos = 20 * MILLIS;

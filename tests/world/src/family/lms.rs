@@ -1,0 +1,186 @@
+//! SICK LMS 2xx: found at any rate and in any state, asked for any variant. Its scans were measured once for all worlds.
+
+use std::sync::{Arc, LazyLock, Mutex, PoisonError};
+
+use lms::command::Request;
+use lms::measured::MEASURED;
+use lms::variant::{Baud, Mode, Unit, Variant};
+use lms::{MILLIS, Nanos};
+use schema::Scan;
+use sim::ChunkSize;
+use sim::device::Device;
+use sim::machine::{Habits, Machine, Settings, Start};
+use sim::operating::Operating;
+use sim::room::Room;
+use sim::series::{Changes, Series};
+use sim::source::Source;
+
+use super::{Family, Scanner, rooms};
+use crate::plan::Action;
+
+/// One of them, and what its link asks for.
+pub(super) struct Lms {
+    settings: Settings,
+    variant: Variant,
+    baud: Baud,
+}
+
+impl Lms {
+    pub(super) fn draw(random: &mut fastrand::Rng) -> Lms {
+        let variant = if random.u8(..8) == 0 { Variant::ALL[random.usize(..5)] } else { Variant::HALF };
+        let baud = if random.u8(..6) == 0 { Baud::B38400 } else { Baud::B500000 };
+        let found = [baud, Baud::B9600, Baud::B38400, Baud::B19200][random.usize(..4)];
+        let states = [
+            Start::In(Operating::OnRequest),
+            Start::In(Operating::Installation),
+            Start::In(Operating::All),
+            Start::PowerOn,
+        ];
+        let settings = Settings {
+            baud: found,
+            permanent_baud: [None, Some(baud)][random.usize(..2)],
+            variant: if random.bool() { variant } else { Variant::HALF },
+            start: states[random.usize(..4)].clone(),
+            boot_ns: random.u64(100..1_500) * MILLIS,
+            chunk: if random.bool() { ChunkSize::Uart } else { ChunkSize::Usb },
+            seed: random.u64(..),
+            ..Settings::default()
+        };
+        Lms { settings, variant, baud }
+    }
+}
+
+impl Family for Lms {
+    fn keys(&self) -> Vec<String> {
+        let Variant { angle_deg, resolution_cdeg } = self.variant;
+        let resolution = f64::from(resolution_cdeg) / 100.0;
+        vec![
+            format!("baud={}", self.baud.rate()),
+            format!("angle={angle_deg}"),
+            format!("resolution={resolution}"),
+        ]
+    }
+
+    /// At the rate that the link asks for.
+    fn times(&self) -> (Nanos, Nanos) {
+        let len = 2 * self.variant.beams() + 10;
+        let rate = self.baud.rate();
+        let turns = (len - 1) / lms::variant::BYTES_PER_TURN;
+        let on_line = lms::line_time(len, rate) + turns as Nanos * lms::variant::MIRROR_TURN;
+        let period = self.variant.period(len, rate);
+        (period, period + on_line)
+    }
+
+    fn found(&self, changes: Changes) -> Box<dyn Scanner> {
+        let (settings, series) = (self.settings.clone(), measured(self.variant));
+        let machine = machine(&settings, &series, &changes);
+        Box::new(AtLine { machine, settings, series, changes })
+    }
+
+    fn units<'a>(&self, sample: &'a [u8]) -> Vec<&'a [u8]> {
+        vec![sample]
+    }
+
+    fn most_units(&self) -> usize {
+        1
+    }
+
+    fn is_data(&self, unit: &[u8]) -> bool {
+        unit[4] == MEASURED
+    }
+
+    fn is_scan_of(&self, scan: &Scan, sample: &[u8]) -> bool {
+        let [_, _, _, _, MEASURED, low, high, values @ ..] = sample else { return false };
+        let count = usize::from(u16::from_le_bytes([*low, *high]) & 0x01FF);
+        let (words, _) = values.as_chunks::<2>();
+        let mask = scan.no_return;
+        let same = |(range, word): (&u16, &[u8; 2])| *range == u16::from_le_bytes(*word) & mask;
+        scan.beams() == count && words.len() >= count && scan.ranges().iter().zip(&words[..count]).all(same)
+    }
+
+    /// One of 65,536 damaged ones of its length has a right checksum.
+    fn is_collision(&self, got: &[u8], damaged: &mut dyn Iterator<Item = &[u8]>) -> bool {
+        let others = |sent: &[u8], got: &[u8]| sent.iter().zip(got).filter(|(sent, got)| sent != got).count();
+        damaged.filter(|sent| sent.len() == got.len()).any(|sent| {
+            let Some(first) = sent.iter().zip(got).position(|(sent, got)| sent != got) else {
+                return false;
+            };
+            let last = sent.iter().zip(got).rposition(|(sent, got)| sent != got).unwrap_or(first);
+            let (sent, got) = (&sent[first..=last], &got[first..=last]);
+            // A byte too many and one too few shift what is between.
+            let shifted = [others(&sent[1..], got), others(sent, &got[1..])];
+            others(sent, got).min(shifted[0]).min(shifted[1]) <= MOST_OTHERS
+        })
+    }
+}
+
+/// A sensor at a line.
+struct AtLine {
+    machine: Machine,
+    settings: Settings,
+    series: Arc<Series>,
+    changes: Changes,
+}
+
+impl Scanner for AtLine {
+    fn device(&self) -> &dyn Device {
+        &self.machine
+    }
+
+    fn device_mut(&mut self) -> &mut dyn Device {
+        &mut self.machine
+    }
+
+    /// At some rate, idle or streaming already.
+    fn exchange(&mut self, action: &Action, _: Nanos) -> Vec<u8> {
+        let baud = Baud::ALL[action.value("rate") as usize % Baud::ALL.len()];
+        let seed = self.settings.seed.wrapping_add(1);
+        let start = Start::In(Operating::OnRequest);
+        self.settings = Settings { baud, seed, start, ..self.settings.clone() };
+        self.machine = machine(&self.settings, &self.series, &self.changes);
+        let streams = action.value("streams") > 0;
+        if streams { Request::Stream.encode(0).bytes().to_vec() } else { Vec::new() }
+    }
+
+    fn misbehave(&mut self, action: Option<&Action>) {
+        self.machine.set_habits(action.map_or_else(Habits::default, habits));
+    }
+}
+
+/// Shares are in percent.
+fn habits(action: &Action) -> Habits {
+    let share = |name| action.value(name) as f64 / 1e2;
+    Habits {
+        overlooks: share("overlooks"),
+        naks: share("naks"),
+        doubles: share("doubles"),
+        late_reply_ns: action.value("late_ms") * MILLIS,
+        mute: action.value("mute") > 0,
+        ..Habits::default()
+    }
+}
+
+fn machine(settings: &Settings, series: &Arc<Series>, changes: &Changes) -> Machine {
+    let room = Room::of_series(series.clone(), changes.clone());
+    Machine::new(settings.clone(), Source::Room(room))
+}
+
+/// The scans that sensors of `variant` tell, measured once.
+fn measured(variant: Variant) -> Arc<Series> {
+    type Known = Mutex<Vec<(Variant, Arc<Series>)>>;
+    static KNOWN: LazyLock<Known> = LazyLock::new(Known::default);
+    let mut known = KNOWN.lock().unwrap_or_else(PoisonError::into_inner);
+    match known.iter().find(|(of, _)| *of == variant) {
+        Some((_, series)) => series.clone(),
+        None => {
+            let made = Arc::new(Series::new(rooms(|scene| scene), SCANS, variant, Unit::Mm, Mode(1)));
+            known.push((variant, made.clone()));
+            made
+        }
+    }
+}
+
+/// So many different scans of each room: enough that no model of it stands still.
+const SCANS: usize = 12;
+/// A line that changes more bytes of a telegram changes its neighbours, too, and then it is suspect.
+const MOST_OTHERS: usize = 32;
