@@ -50,7 +50,7 @@ pub(crate) use telegram::{Telegram, Way};
 pub(crate) use watch::Watch;
 pub(crate) use zones::Zones;
 
-/// Serve SICK laser scanners on serial lines to many programs: a hub that publishes telegrams and scans in shared
+/// Serve laser scanners on serial lines to many programs: a hub that publishes telegrams and scans in shared
 /// memory, and programs that read them.
 #[derive(Debug, Parser)]
 #[command(version, max_term_width = 100)]
@@ -113,7 +113,7 @@ pub(crate) enum Verb {
     /// Run a hub that plays a recording instead of sensors, with the keys of a player
     #[command(after_help = replay::KEYS)]
     Replay(Replay),
-    /// Run two simulated sensors, the hub and a consumer for each in one terminal
+    /// Run simulated sensors, the hub and a consumer for each in one terminal
     Demo(Demo),
     /// Simulate sensors at the other end of ptys, or behind TCP
     #[command(after_help = simulate::fault_table())]

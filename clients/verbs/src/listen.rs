@@ -230,7 +230,7 @@ impl Listener<'_> {
                 Arrived::Sample(sample) => self.sample(&sample, caught.from)?,
                 Arrived::Announced(announcement) => self.announced(&announcement, caught.from)?,
                 Arrived::Refused { shared: Some(hub), .. } => self.is_shared(hub)?,
-                Arrived::Untimely { behind_ns } => self.trouble(&untimely(behind_ns))?,
+                Arrived::Untimely { behind_ns } => self.trouble(untimely(behind_ns))?,
                 Arrived::Refused { shared: None, .. } | Arrived::Part | Arrived::Known => {}
             }
             self.keep_epochs()?;
@@ -385,13 +385,15 @@ fn nothing_came(limit: Duration) -> Failure {
 const NOTHING_CAME: &str = "is `scanhub gateway` running in the same network? `scanhub listen --stats` counts what is \
                             refused, --interface names another interface";
 
-/// What is wrong where an announcement has the key and is not believed.
-fn untimely(behind_ns: i64) -> String {
-    let seconds = behind_ns as f64 / 1e9;
-    let which = if seconds < 0.0 { "ahead of" } else { "behind" };
-    format!(
-        "a gateway has the key, and its clock is {:.0} s {which} this machine's: more than 5 s are not believed; set the \
-         clocks, unless somebody sends again what was recorded",
-        seconds.abs()
-    )
+/// What is wrong where an announcement has the key and is not believed; in so few words that it is told once.
+fn untimely(behind_ns: i64) -> &'static str {
+    match behind_ns < 0 {
+        true => {
+            "a gateway has the key, and its clock is more than 5 s ahead of this machine's: it is not believed; set the clocks"
+        }
+        false => {
+            "a gateway has the key, and its clock is more than 5 s behind this machine's, or somebody sends again what was \
+             recorded: it is not believed; set the clocks"
+        }
+    }
 }

@@ -355,7 +355,8 @@ pub(crate) fn setting(flag: &str) -> Option<String> {
 pub(crate) fn link(flag: &str) -> Option<String> {
     let (name, rest) = flag.split_once('=')?;
     let is_set = |part: &&str| {
-        part.split_once('=').is_some_and(|(key, _)| key.chars().all(|c| c.is_ascii_lowercase() || c == '_'))
+        part.split_once('=')
+            .is_some_and(|(key, _)| key.chars().all(|c| c.is_ascii_lowercase() || c == '_' || c == '.'))
     };
     // A comma may be in the name of a port.
     let parts: Vec<&str> = rest.split(',').collect();

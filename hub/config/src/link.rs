@@ -58,6 +58,14 @@ impl Link {
         }
     }
 
+    /// Returns the highest rate of what may be behind its port, which a serial server has whatever is configured here.
+    pub fn most_rate(&self) -> u32 {
+        match self.scanner {
+            Scanner::Turning(turning) if !matches!(self.port, Source::Tty(_)) => turning.most_rate(),
+            _ => self.rate(),
+        }
+    }
+
     /// Returns the most beams of a scan of its sensor.
     pub fn beams(&self) -> usize {
         match self.scanner {

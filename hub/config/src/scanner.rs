@@ -46,6 +46,12 @@ impl Turning {
         self.beams.unwrap_or(self.model.beams)
     }
 
+    /// Returns the highest rate that it can have.
+    pub fn most_rate(&self) -> u32 {
+        let all = self.features.models.iter().map(|model| model.baud);
+        if self.is_auto() { all.max().unwrap_or(self.model.baud) } else { self.model.baud }
+    }
+
     /// Returns what a session with it needs, on a port that has one rate or not, of a scanner that listens or not.
     pub fn wanted(&self, fixed_rate: bool, listen_only: bool) -> Wanted {
         Wanted {

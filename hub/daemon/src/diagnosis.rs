@@ -144,7 +144,7 @@ impl<'a> Diagnosis<'a> {
             return format!(
                 "the server sends more than a line of {} baud carries; the hub reads at most twice that; the serial \
                  server must be in raw mode at that rate",
-                self.link.rate()
+                self.link.most_rate()
             );
         }
         let is_server = matches!(self.link.port, Source::Tcp { .. });
@@ -179,7 +179,7 @@ impl<'a> Diagnosis<'a> {
         let (model, beams) = driver.model()?;
         let Scanner::Turning(turning) = self.link.scanner else { return None };
         let name = &self.link.name;
-        (beams < model.beams && turning.is_auto()).then(|| {
+        (beams < model.beams && beams == self.link.beams() && turning.is_auto()).then(|| {
             format!(
                 "its turns have {} points, and there is room for {}: set link.{name}.model or link.{name}.beams",
                 model.beams,

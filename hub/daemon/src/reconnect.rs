@@ -167,7 +167,7 @@ impl<'a, S: Surroundings> LiveLink<'a, S> {
         if core.control.is_paused() {
             session.control(Control::Pause, now);
         }
-        self.phase = Phase::Open(Box::new(Open::new(line, session, core.link.rate(), now)));
+        self.phase = Phase::Open(Box::new(Open::new(line, session, core.link.most_rate(), now)));
     }
 
     /// A session begins, if there is a line.

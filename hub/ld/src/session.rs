@@ -42,6 +42,8 @@ pub struct Session {
     framer: Framer,
     arrivals: Arrivals,
     clock: SensorClock,
+    /// The clock of the packets before the one with this number, of those handed out last, if another sequence began there.
+    clock_before: Option<(usize, SensorClock)>,
     sequence: Sequence,
     turns: Turns,
     phase: Phase,
@@ -101,6 +103,7 @@ impl Session {
             framer: Framer::default(),
             arrivals: Arrivals::default(),
             clock: SensorClock::new(),
+            clock_before: None,
             sequence: Sequence::new(),
             turns: Turns::new(),
             phase: Phase::Listening { shown: State::Probing, next_at: now + LISTEN },
@@ -209,12 +212,14 @@ impl Session {
         let pace = (!self.settings.fixed_rate).then_some(self.baud);
         let packet_time = line_time(LEN, self.baud);
         let mut places = [Place::Odd; MOST];
+        self.clock_before = None;
         let (bytes, _) = self.framer.bytes(span).as_chunks::<LEN>();
         for (number, bytes) in bytes.iter().enumerate() {
             let Ok(packet) = Packet::check(bytes) else { continue };
             let place = self.sequence.place(&packet);
             if matches!(place, Place::First { .. }) {
-                self.clock = SensorClock::new();
+                let before = core::mem::replace(&mut self.clock, SensorClock::new());
+                self.clock_before.get_or_insert((number, before));
             }
             if let Some(time) = place.time() {
                 let end = span.offset + ((number + 1) * LEN - 1) as u64;
@@ -223,11 +228,11 @@ impl Session {
             places[number] = place;
         }
         self.scanner_time = places[..span.packets].iter().rev().find_map(|place| place.time());
-        let stamp = |place: Place| place.time().and_then(|time| self.clock.time(time));
-        let first = stamp(places[0]);
+        let stamp = |number: usize| places[number].time().and_then(|time| self.clock_of(number).time(time));
+        let first = stamp(0);
         let last_byte = span.offset + (span.packets * LEN - 1) as u64;
         let latest = self.arrivals.latest(last_byte, pace);
-        let last = stamp(places[span.packets - 1]).map_or(latest, |at| at + packet_time);
+        let last = stamp(span.packets - 1).map_or(latest, |at| at + packet_time);
         let at = first.unwrap_or(last.saturating_sub(packet_time * span.packets as u64));
         // One that came twice is dated by its arrival, and the next one by the scanner's clock.
         let last = last.max(at).max(self.last_packet);
@@ -242,6 +247,14 @@ impl Session {
             last,
             estimated: first.is_none(),
             reasons: span.reasons,
+        }
+    }
+
+    /// The clock by which packet `number` of those handed out last is dated.
+    fn clock_of(&self, number: usize) -> &SensorClock {
+        match &self.clock_before {
+            Some((first, clock)) if number < *first => clock,
+            _ => &self.clock,
         }
     }
 
@@ -294,7 +307,8 @@ impl Session {
     }
 
     fn show(&mut self, closed: Closed) -> Turn<'_> {
-        let stamp = |at: Nanos| self.clock.time(at).unwrap_or(self.now);
+        let packet = self.current.map_or(0, |current| current.packet);
+        let stamp = |at: Nanos| self.clock_of(packet).time(at).unwrap_or(self.now);
         let first = stamp(closed.first).max(self.last_stamp);
         let last = stamp(closed.last).max(first);
         self.last_stamp = first;

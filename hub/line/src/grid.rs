@@ -1,6 +1,8 @@
 //! A turn of points that fall where they like becomes a constant number of beams. Knows no family and no time: a turn is a
 //! slice of points, the result goes into plain slices.
 
+use core::f32::consts::TAU;
+
 /// One measurement of a scanner whose head turns.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Point {
@@ -70,15 +72,19 @@ impl Grid {
         ranges.fill(NOT_MEASURED);
         intensities.fill(0);
         angles.fill(f32::NAN);
-        let bins_per_radian = -(beams as f32) / core::f32::consts::TAU;
+        let bins_per_radian = -(beams as f32) / TAU;
         let mut collapsed = 0;
         for point in points {
             // Beyond a turn by less than another one on either side, and rounded to the nearest beam.
             let place = point.angle * bins_per_radian + (beams as f32 + 0.5);
             // What is no angle has no place either.
-            let bin = if place >= 0.0 { place as usize } else { usize::MAX };
-            let bin = if bin >= beams { bin - beams } else { bin };
-            let bin = if bin >= beams { bin - beams } else { bin };
+            let mut bin = if place >= 0.0 { place as usize } else { usize::MAX };
+            let mut angle = point.angle - TAU;
+            for _ in 0..2 {
+                if bin >= beams {
+                    (bin, angle) = (bin - beams, angle + TAU);
+                }
+            }
             let Some(range) = ranges.get_mut(bin) else { continue };
             let is_taken = *range != NOT_MEASURED;
             collapsed += u32::from(is_taken);
@@ -86,7 +92,9 @@ impl Grid {
             if point.range < *range {
                 *range = point.range;
                 intensities[bin] = point.intensity;
-                angles[bin] = point.angle;
+                // Near its beam, from whatever turn it is counted.
+                angles[bin] =
+                    if (beams..2 * beams).contains(&(place as usize)) { point.angle } else { angle };
             }
         }
         let not_measured = ranges.iter().filter(|range| **range == NOT_MEASURED).count() as u32;
@@ -97,7 +105,6 @@ impl Grid {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use core::f32::consts::TAU;
 
     const NONE: Point = Point { angle: 0.0, range: NO_RETURN, intensity: 0 };
 

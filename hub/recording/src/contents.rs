@@ -38,6 +38,8 @@ pub struct Contents {
     pub scanner_ns: Option<u64>,
     /// Beams of the scans that were recorded of a scanner whose head turns.
     pub beams: Option<u16>,
+    /// Name of the model, if it is of a family whose heads turn and a status says it.
+    pub model: Option<&'static str>,
     /// Variant of the first scan.
     pub variant: Option<Variant>,
     /// Unit of the first scan; of a log the one in which its ranges are whole values.
@@ -72,6 +74,7 @@ impl Contents {
             span: None,
             scanner_ns: None,
             beams: None,
+            model: None,
             variant: None,
             unit: None,
             mode: None,

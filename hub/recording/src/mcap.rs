@@ -194,12 +194,22 @@ impl Survey {
             }
         }
         let mut status = Status::default();
-        if place.topic == Topic::Status && status.unpack(payload) && status.mode != Status::MODE_UNKNOWN {
+        if place.topic == Topic::Status && status.unpack(payload) {
+            let mode = (status.mode != Status::MODE_UNKNOWN).then_some(Mode(status.mode));
+            let model = if place.is_old() { None } else { model(&status) };
             for contents in [&mut self.whole, of_sensor(&mut self.sensors, &place.sensor)] {
-                contents.mode = contents.mode.or(Some(Mode(status.mode)));
+                contents.mode = contents.mode.or(mode);
+                contents.model = contents.model.or(model);
             }
         }
     }
+}
+
+/// The name of the model that `status` tells, of a scanner whose head turns.
+fn model(status: &Status) -> Option<&'static str> {
+    let features = scanner::features(Family::of_number(status.family)?)?;
+    let name = status.model()?;
+    features.models.iter().map(|model| model.name).find(|known| *known == name)
 }
 
 fn of_sensor<'a>(sensors: &'a mut BTreeMap<String, Contents>, sensor: &str) -> &'a mut Contents {

@@ -157,12 +157,18 @@ impl Recording {
         Family::of_number(self.contents.family)
     }
 
-    /// Returns what its scanner is, if that is one whose head turns, as far as its first packets tell.
+    /// Returns what its scanner is, if that is one whose head turns, as far as a status or its first packets tell.
     ///
     /// # Errors
     ///
     /// As [`telegrams`](Self::telegrams).
     pub fn model(&self) -> Result<Option<Model>, Failure> {
+        let models = || self.family().and_then(scanner::features).map(|features| features.models.iter());
+        if let Some(told) =
+            models().and_then(|mut models| models.find(|it| Some(it.name) == self.contents.model))
+        {
+            return Ok(Some(*told));
+        }
         let wanted = Wanted { fixed_rate: true, listen_only: true, ..Wanted::default() };
         let Some(session) = self.family().and_then(|family| scanner::Session::begin(family, wanted, 0))
         else {

@@ -52,15 +52,14 @@ impl KeptBackground {
         let saved = SavedModel::parse(text.as_bytes(), place).map_err(|failure| failure.message)?;
         let Place { pose, wall_ns } = serde_json::from_str(text)
             .map_err(|error| format!("{place} does not contain its time: {error}"))?;
-        let (model, beams) = (saved.model, link.variant.beams());
-        let unit_mm = link.unit.map_or(model.unit_um / 1000, |unit| unit.mm().into());
+        let model = saved.model;
         if saved.sensor != link.name {
             return Err(format!("{place} is the background of {}", saved.sensor));
         }
-        if usize::from(model.count) != beams || model.unit_um != 1000 * unit_mm {
+        if let Err(wanted) = link.fits(&model) {
             let (count, of) = (model.count, model.unit_um / 1000);
             return Err(format!(
-                "{place} has {count} beams in units of {of} mm, the link is configured for {beams} in units of {unit_mm} mm"
+                "{place} has {count} beams in units of {of} mm, the link is configured for {wanted}"
             ));
         }
         let Pose { x_m, y_m, yaw_rad, upside_down, .. } = link.processing.pose;
@@ -116,8 +115,8 @@ mod tests {
             ("link.front.pose.x=0.101", "another pose"),
             ("link.front.pose.yaw=1.5708", "another pose"),
             ("link.front.pose.upside_down=false", "another pose"),
-            ("link.front.resolution=1", "the link is configured for 181 in units of 1 mm"),
-            ("link.front.unit=cm", "the link is configured for 361 in units of 10 mm"),
+            ("link.front.resolution=1", "the link is configured for 181 beams in units of 1 mm"),
+            ("link.front.unit=cm", "the link is configured for 361 beams in units of 10 mm"),
         ] {
             let other = link(&[&set[..], &[change]].concat());
             let refusal = KeptBackground::read(&text, "f", &other).unwrap_err();

@@ -27,6 +27,11 @@ impl Place {
         Some(Place { sensor: sensor.to_owned(), topic, is_old })
     }
 
+    /// Whether its messages are of version 1.
+    pub(crate) fn is_old(&self) -> bool {
+        self.is_old
+    }
+
     /// Whether its messages are scans as they are now.
     pub(crate) fn has_scans(&self) -> bool {
         self.topic == Topic::Scan && !self.is_old

@@ -97,18 +97,23 @@ impl Session {
                     _ => self.sequence.place(came, late),
                 };
                 if place.step == Step::First {
+                    // Nothing goes on from what was before: neither its turn nor its clock.
                     self.clock = SensorClock::new();
+                    self.turns.give_up();
+                    self.held = None;
+                    places[..n].iter_mut().for_each(|place| place.step = Step::Odd);
                 }
                 if place.step != Step::Odd {
                     self.clock.note((place.time + behind_first) as Nanos, at);
                 }
                 places[n] = place;
             }
-            let stamp = |place: Place| {
+            let stamp = |n: usize| {
+                let place = &places[n];
                 let is_placed = place.step != Step::Odd;
                 self.clock.time((place.time + behind_first) as Nanos).filter(|_| is_placed)
             };
-            stamps = stamp(places[0]).zip(stamp(places[span.packets - 1]));
+            stamps = stamp(0).zip(stamp(span.packets - 1));
             self.current = Some(Current { kind, span, places, packet: 0, is_put: false });
             self.learn(kind);
             let tally = self.framer.tally();

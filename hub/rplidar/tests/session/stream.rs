@@ -165,3 +165,20 @@ fn a_line_that_damages_bytes_costs_the_packets_that_it_damages() {
     println!("{wrong_points:?} of {points:?}");
     assert!(wrong_points[0] * 500 < points[0], "{wrong_points:?} of {points:?}");
 }
+
+#[test]
+fn a_head_that_stood_still_turns_on_and_so_do_its_turns() {
+    for kind in KINDS {
+        let mut bench = in_mode(kind, 1);
+        bench.run(20 * SECOND);
+        let hz = std::mem::replace(&mut bench.head.hz, 0.0);
+        bench.run(21 * SECOND);
+        bench.head.hz = hz;
+        bench.run(23 * SECOND);
+        let before = bench.log.turns.len();
+        bench.run(26 * SECOND);
+        let turns = (bench.log.turns.len() - before) as f64;
+        assert!(turns >= 3.0 * hz - 2.0, "{kind:?}: {turns}");
+        assert!(bench.log.turns.iter().all(|told| told.beams == bench.log.turns[0].beams), "{kind:?}");
+    }
+}

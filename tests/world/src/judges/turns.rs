@@ -32,8 +32,10 @@ struct OfSensor {
     /// Hashes of what was sent lately, and in their order.
     sent: HashSet<u64>,
     order: VecDeque<u64>,
-    /// When something was published last that was not sent.
+    /// When something was published last that was not sent, or was not published for lack of memory, so that nobody saw
+    /// whether it was sent; and the number of the last telegram that was.
     foreign_at: Option<Nanos>,
+    seen: Option<u64>,
     /// Of the scans of this life of the topic.
     beams: Option<(u64, usize)>,
     /// Place behind the last packet that came without delay, and when it did.
@@ -63,6 +65,7 @@ impl Turns {
             sent: HashSet::new(),
             order: VecDeque::new(),
             foreign_at: None,
+            seen: None,
             beams: None,
             prompt: None,
             prompts: 0,
@@ -191,8 +194,10 @@ impl OfSensor {
                 Ok(Figures::default())
             }
             Topic::Telegram => {
+                let seq = sample.header.seq;
+                let is_gap = self.seen.replace(seq).is_some_and(|seen| seq > seen + 1);
                 let units = self.family.units(&sample.bytes);
-                if units.into_iter().any(|unit| !self.sent.contains(&key(unit))) {
+                if is_gap || units.into_iter().any(|unit| !self.sent.contains(&key(unit))) {
                     self.foreign_at = Some(at);
                 }
                 Ok(Figures::default())
@@ -206,6 +211,9 @@ impl OfSensor {
                 let before = self.beams.replace((boot, beams)).filter(|(of, _)| *of == boot);
                 if let Some((_, before)) = before.filter(|(_, before)| *before != beams) {
                     return Err(format!("{beams} beams after {before}"));
+                }
+                if self.seen.is_some_and(|seen| sample.header.seq > seen) {
+                    self.foreign_at = Some(at);
                 }
                 self.check(at, sample.header.stamp_first_ns, &scan)
             }
