@@ -104,7 +104,7 @@ fn what_does_not_fit_or_is_not_wanted_is_not_taken() {
     empty(&["--set=link.front.pose.yaw=0.1"], "is of another pose");
     empty(
         &["--set=link.front.unit=cm"],
-        "361 beams in units of 1 mm, the link is configured for 361 in units of 10 mm",
+        "361 beams in units of 1 mm, the link is configured for 361 beams in units of 10 mm",
     );
     empty(&["--set=background.keep=false"], "");
     empty(&["--set=background.start=empty"], "");
