@@ -1,6 +1,7 @@
 //! The command line: the verbs and their arguments. Syntax only; the code that uses a value checks what it means.
 
 mod background;
+mod bridge;
 mod complete;
 mod config;
 mod configure;
@@ -20,6 +21,7 @@ pub(crate) mod replay;
 pub(crate) mod simulate;
 mod telegram;
 pub(crate) mod watch;
+mod web;
 mod zones;
 
 use std::path::PathBuf;
@@ -35,6 +37,7 @@ use crate::demo::Families;
 
 pub(crate) use self::config::Config;
 pub(crate) use background::Background;
+pub(crate) use bridge::Bridge;
 pub(crate) use complete::Complete;
 pub(crate) use control::Control;
 pub(crate) use convert::Convert;
@@ -48,6 +51,7 @@ pub(crate) use record::Record;
 pub(crate) use replay::Replay;
 pub(crate) use telegram::{Telegram, Way};
 pub(crate) use watch::Watch;
+pub(crate) use web::Web;
 pub(crate) use zones::Zones;
 
 /// Serve laser scanners on serial lines to many programs: a hub that publishes telegrams and scans in shared
@@ -148,6 +152,9 @@ pub(crate) enum Verb {
     /// Show the live picture in the terminal: what the sensors see, marks, zones and the verdict
     #[command(after_help = watch::KEYS)]
     Watch(Watch),
+    /// Serve the live picture to browsers, and to Foxglove and Lichtblick
+    #[command(after_help = web::VIEWERS)]
+    Web(Web),
     /// Record what the hub publishes in MCAP files
     #[command(after_help = record::READING)]
     Record(Record),
@@ -168,6 +175,8 @@ pub(crate) enum Verb {
     /// Receive what gateways of other machines send, and show what was lost
     #[command(after_help = listen::SIGNALS)]
     Listen(Listen),
+    /// Carry topics to other machines and back over Zenoh, through a router or as one (program scanhub-bridge)
+    Bridge(Bridge),
     /// Make the key that gateways and listeners share
     Key(Key),
     /// Convert a recording to another format, or repair a damaged one

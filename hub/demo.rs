@@ -96,10 +96,13 @@ pub(crate) fn demo(options: &DemoOptions, out: &mut dyn Write, stop: &AtomicBool
     let shows = !options.headless && !options.json;
     let has_picture = shows && can_show_pictures();
     let stage = Stage::new(has_picture, options.family.sensors())?;
+    // Where no port is free the demonstration goes on without a browser.
+    let web = if shows { stage.start_web().ok() } else { None };
+    let url = web.as_ref().map(|(_, url)| url.as_str());
     let played = if has_picture {
-        play_with_picture(options, &stage, out, stop)
+        play_with_picture(options, &stage, url, out, stop)
     } else {
-        let (mut view, mut is_said) = (View::new(&stage.domain), false);
+        let (mut view, mut is_said) = (View::new(&stage.domain, url), false);
         let mut show = |account: &Account, elapsed: Duration| {
             if shows {
                 view.draw(out, account, elapsed);
@@ -109,6 +112,7 @@ pub(crate) fn demo(options: &DemoOptions, out: &mut dyn Write, stop: &AtomicBool
         };
         play(options, &stage, &mut show, &|| stop.load(Ordering::Relaxed))
     };
+    drop(web);
     stage.tell_errors();
     let (account, stopped) = played?;
     let lost = account.summary(out, options.json);
@@ -125,13 +129,14 @@ pub(crate) fn demo(options: &DemoOptions, out: &mut dyn Write, stop: &AtomicBool
 fn play_with_picture(
     options: &DemoOptions,
     stage: &Stage,
+    url: Option<&str>,
     out: &mut dyn Write,
     stop: &AtomicBool,
 ) -> Result<(Account, bool), Failure> {
     let picture = WatchOptions {
         sensors: stage.names(),
         colours: colours(),
-        note: attach(&stage.domain),
+        note: url.map_or_else(|| attach(&stage.domain), |url| short(url, &stage.domain)),
         bounds: Bounds::default(),
         places: vec![stage.domain.clone()],
     };
@@ -162,6 +167,11 @@ impl Drop for Raise<'_> {
 /// What somebody types in another terminal to look at it.
 fn attach(domain: &Domain) -> String {
     format!("other terminal: scanhub echo front/scan --domain {}", domain.name())
+}
+
+/// As much of it as stands beside the keys on 80 columns.
+fn short(url: &str, domain: &Domain) -> String {
+    format!("browser: {url}  domain: {}", domain.name())
 }
 
 /// Says where it takes place.
@@ -254,6 +264,7 @@ fn ended(of: usize) -> Failure {
     let who = match of {
         HUB => "the hub",
         SIMULATOR => "a simulator",
+        WEB => "the picture for browsers",
         _ => "a consumer",
     };
     Failure::new(Kind::Failed, format!("{who} ended early"), "its output is above")
@@ -262,6 +273,7 @@ fn ended(of: usize) -> Failure {
 /// Number of the hub among the processes; consumers have their sensor's.
 const HUB: usize = 100;
 const SIMULATOR: usize = 101;
+const WEB: usize = 102;
 /// Between two pictures.
 const REFRESH: Duration = Duration::from_millis(250);
 /// Longest wait for a line before the clock is looked at.

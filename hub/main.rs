@@ -136,6 +136,7 @@ fn dispatch(cli: &Cli) -> Result<(), Failure> {
             let stop = interrupt_by(&ENDS)?;
             verbs::watch(&watch.options(everywhere)?, &mut out, &stop)
         }
+        Verb::Web(web) => verbs::web(&web.options(everywhere)?, &mut out, &*interrupt()?),
         Verb::Record(record) => {
             let options = record.options(everywhere)?;
             // Whatever ends it, the file is finished.
@@ -147,6 +148,7 @@ fn dispatch(cli: &Cli) -> Result<(), Failure> {
             }
         }
         Verb::Control(control) => verbs::control(&control.options(everywhere)?, &mut out, &*interrupt()?),
+        Verb::Bridge(bridge) => bridge.run(everywhere).map(|never| match never {}),
         Verb::Key(key) => key.run(everywhere.json, &mut out),
         Verb::Background(background) => {
             // A model is read before Ctrl-C is a flag, which would not end a person's typing.

@@ -23,8 +23,8 @@
 extern "C" {
 #endif
 
-/* The groups are 239.255.76.80 to .83, all on this port: .80 announce and status, .81 zones, marks and foreground, .82 scan
- * and background, .83 telegram. */
+/* The groups are 239.255.76.80 to .83, all on this port: .80 announce and status, .81 zones, marks, lines and foreground, .82
+ * scan and background, .83 telegram. */
 #define SCANHUB_PORT 22200
 /* The longest datagram that a gateway ever sends. */
 #define SCANHUB_MAX 1472
@@ -37,7 +37,8 @@ enum scanhub_topic {
     SCANHUB_ZONES = 4,
     SCANHUB_FOREGROUND = 5,
     SCANHUB_BACKGROUND = 6,
-    SCANHUB_STATUS = 7
+    SCANHUB_STATUS = 7,
+    SCANHUB_LINES = 8
 };
 
 /* Bits of `flags`. */
@@ -58,11 +59,18 @@ enum scanhub_result {
     SCANHUB_BAD_HEADER,  /* the header is too short, or longer than the datagram, or the part is none of the parts */
     SCANHUB_BAD_LENGTH,  /* the lengths do not add up to the datagram's, or a part is too long */
     SCANHUB_BAD_CRC,     /* the checksum is wrong */
+    SCANHUB_BAD_KEY,     /* without a MAC; this one and the next six only scanhub_key.h says */
+    SCANHUB_BAD_MAC,     /* the MAC is not of the key */
+    SCANHUB_UNTIMELY,    /* its sensor or topic was not announced just now */
+    SCANHUB_EPOCH,       /* of a life of its gateway that is over */
+    SCANHUB_STALE,       /* its number is too far behind, or from before the first announcement */
+    SCANHUB_CAPACITY,    /* there is no room to remember it */
+    SCANHUB_DUPLICATE,   /* it came before */
     SCANHUB_SKIPPED,     /* another topic than the one asked for */
     SCANHUB_BAD_PAYLOAD  /* shorter than its own counts say, in contradiction to itself, without revision, or a part */
 };
 
-/* A datagram whose header, lengths and checksum are right. Whether a MAC is, this header cannot tell. */
+/* A datagram whose header, lengths and checksum are right. Whether a MAC is, scanhub_key.h tells. */
 struct scanhub_datagram {
     uint8_t topic;
     uint8_t flags;
@@ -411,6 +419,91 @@ static inline struct scanhub_mark scanhub_mark(const struct scanhub_marks *marks
     out.first_beam = scanhub_u16(at + 12);
     out.last_beam = scanhub_u16(at + 14);
     return out;
+}
+
+/* Straight lines of a scan, at most 64, and where they meet, in the robot's frame: x ahead of its centre, y to the left. */
+struct scanhub_lines {
+    uint8_t count;
+    uint8_t corner_count;
+    uint8_t overflow;  /* 1: there are more than are allowed */
+    uint16_t readings; /* beams that have a range */
+    uint16_t on_lines; /* of them those that end on a line */
+    float noise_m;     /* standard deviation of the ranges */
+    const uint8_t *lines;
+    const uint8_t *corners;
+};
+struct scanhub_line {
+    float x1_m, y1_m, x2_m, y2_m; /* where its first and its last beam meet it */
+    float r_m, alpha_rad;         /* x cos alpha + y sin alpha = r */
+    float sd_r_m, sd_alpha_rad;   /* standard deviations */
+    uint16_t first, last;         /* beams */
+    uint16_t points;              /* those that have a range */
+};
+struct scanhub_corner {
+    float x_m, y_m;
+    uint16_t first_line, second_line; /* below `count` */
+};
+/* One line, i below `count`. */
+static inline struct scanhub_line scanhub_line(const struct scanhub_lines *lines, unsigned i)
+{
+    const uint8_t *at = lines->lines + 40 * (size_t)i;
+    struct scanhub_line out;
+    out.x1_m = scanhub_f32(at);
+    out.y1_m = scanhub_f32(at + 4);
+    out.x2_m = scanhub_f32(at + 8);
+    out.y2_m = scanhub_f32(at + 12);
+    out.r_m = scanhub_f32(at + 16);
+    out.alpha_rad = scanhub_f32(at + 20);
+    out.sd_r_m = scanhub_f32(at + 24);
+    out.sd_alpha_rad = scanhub_f32(at + 28);
+    out.first = scanhub_u16(at + 32);
+    out.last = scanhub_u16(at + 34);
+    out.points = scanhub_u16(at + 36);
+    return out;
+}
+/* One corner, i below `corner_count`. */
+static inline struct scanhub_corner scanhub_corner(const struct scanhub_lines *lines, unsigned i)
+{
+    const uint8_t *at = lines->corners + 12 * (size_t)i;
+    struct scanhub_corner out;
+    out.x_m = scanhub_f32(at);
+    out.y_m = scanhub_f32(at + 4);
+    out.first_line = scanhub_u16(at + 8);
+    out.second_line = scanhub_u16(at + 10);
+    return out;
+}
+static inline enum scanhub_result scanhub_read_lines(const struct scanhub_datagram *datagram,
+                                                     struct scanhub_lines *out)
+{
+    const uint8_t *at = datagram->payload;
+    enum scanhub_result result = scanhub_expect(datagram, SCANHUB_LINES, 12);
+    unsigned i, n;
+    if (result != SCANHUB_OK)
+        return result;
+    if (at[0] > 64 || at[1] > 64 || datagram->payload_len < 12 + 40 * (size_t)at[0] + 12 * (size_t)at[1])
+        return SCANHUB_BAD_PAYLOAD;
+    out->count = at[0];
+    out->corner_count = at[1];
+    out->overflow = at[2] & 1;
+    out->readings = scanhub_u16(at + 4);
+    out->on_lines = scanhub_u16(at + 6);
+    out->noise_m = scanhub_f32(at + 8);
+    out->lines = at + 12;
+    out->corners = out->lines + 40 * (size_t)out->count;
+    /* All numbers are finite, and corners are of lines that are there. */
+    if (!isfinite(scanhub_f32(at + 8)))
+        return SCANHUB_BAD_PAYLOAD;
+    for (i = 0; i < out->count; i++)
+        for (n = 0; n < 8; n++)
+            if (!isfinite(scanhub_f32(out->lines + 40 * (size_t)i + 4 * (size_t)n)))
+                return SCANHUB_BAD_PAYLOAD;
+    for (i = 0; i < out->corner_count; i++) {
+        struct scanhub_corner corner = scanhub_corner(out, i);
+        if (!isfinite(scanhub_f32(out->corners + 12 * (size_t)i)) || !isfinite(scanhub_f32(out->corners + 12 * (size_t)i + 4))
+            || corner.first_line >= out->count || corner.second_line >= out->count)
+            return SCANHUB_BAD_PAYLOAD;
+    }
+    return SCANHUB_OK;
 }
 
 /* What is near the robot: at most 8 circles around its centre, the largest first. */

@@ -26,12 +26,14 @@ ranges of a scan are a view into the datagram. docs/datagram.md has the bytes.
 import hashlib
 import hmac
 import math
+import os
 import struct
-from dataclasses import dataclass, replace
+import time
+from dataclasses import astuple, dataclass, replace
 from typing import Optional, Union
 
 PORT = 22200
-TOPICS = ("announce", "telegram", "scan", "marks", "zones", "foreground", "background", "status")
+TOPICS = ("announce", "telegram", "scan", "marks", "zones", "foreground", "background", "status", "lines")
 VERDICTS = ("clear", "slow", "stop", "unknown")
 STATES = ("absent", "probing", "switching", "starting", "streaming", "silent", "paused")
 FAMILIES = ("lms", "ld", "rplidar")
@@ -185,6 +187,47 @@ class Marks:
 
 
 @dataclass(frozen=True)
+class Line:
+    """A straight surface: both ends in metres ahead and to the left of the robot's centre; x cos alpha + y sin alpha = r, with
+    standard deviations; its first and last beam, and how many of them have a range."""
+
+    x1_m: float
+    y1_m: float
+    x2_m: float
+    y2_m: float
+    r_m: float
+    alpha_rad: float
+    sd_r_m: float
+    sd_alpha_rad: float
+    first: int
+    last: int
+    points: int
+
+
+@dataclass(frozen=True)
+class Corner:
+    """Where two lines meet, and their numbers."""
+
+    x_m: float
+    y_m: float
+    first_line: int
+    second_line: int
+
+
+@dataclass(frozen=True)
+class Lines:
+    """The straight lines of a scan: beams with a range, beams that end on a line, deviation of a range, the lines and their
+    corners. `overflow`: there are more than are allowed."""
+
+    overflow: bool
+    readings: int
+    on_lines: int
+    noise_m: float
+    lines: "tuple[Line, ...]"
+    corners: "tuple[Corner, ...]"
+
+
+@dataclass(frozen=True)
 class Zone:
     """A circle around the robot's centre and the beams that met something inside."""
 
@@ -275,7 +318,7 @@ class Status:
     pose: Pose
 
 
-Payload = Union[Announce, Telegram, Scan, Marks, Zones, Foreground, Background, Status]
+Payload = Union[Announce, Telegram, Scan, Marks, Zones, Foreground, Background, Status, Lines]
 
 
 @dataclass(frozen=True)
@@ -351,6 +394,102 @@ def read(data: bytes, key: Optional[bytes] = None) -> Datagram:
     payload, authenticated = data[header:end], key is not None
     head = number, flags, hub, epoch, sequence, stamp_ns, sensor, part, parts, family, revision, counter
     return Datagram(*head, payload, authenticated)
+
+
+def read_key(path: str) -> bytes:
+    """The key in a file of `scanhub key new`, for `read`: 32 bytes, or 64 hex digits. ValueError if it is none, or if others
+    can use it."""
+    with open(path, "rb") as file:
+        mode = os.fstat(file.fileno()).st_mode
+        if mode & 0o077:
+            raise ValueError(f"{path}: its mode is {mode & 0o777:04o}, so others can use the key; chmod 600 it")
+        content = file.read(256)
+    try:
+        key = content if len(content) == 32 else bytes.fromhex(content.decode().strip())
+    except ValueError:
+        key = b""
+    if len(key) != 32:
+        raise ValueError(f"{path}: its {len(content)} bytes are no key: 32 bytes, or 64 hex digits")
+    return key
+
+
+class Guard:
+    """What is new, and not of a recording, of what was read with a key.
+
+        datagram = guard.take(scanhub_lan.read(data, key))
+
+    A sensor is believed from an announcement on that is stamped within 5 s of our clock; from then on numbers and epochs only
+    go forward. `epochs` has the greatest epoch of each gateway: keep it over restarts, and begin with it. It knows no
+    senders. Parts are judged, and not counted: `take` the sample again when `Parts` has made it whole.
+    """
+
+    STREAMS = 1024
+    """The most topics of all sensors."""
+
+    def __init__(self, epochs: "Optional[dict[int, int]]" = None):
+        self.epochs: "dict[int, int]" = dict(epochs or {})
+        # By hub, sensor and topic: the lowest number that is believed, the highest that came, those of the window that did.
+        self._streams: "dict[tuple[int, int, int], tuple[int, Optional[int], set[int]]]" = {}
+        # By hub: the epoch of which the streams are.
+        self._lives: "dict[int, int]" = {}
+
+    def take(self, datagram: Datagram, wall_ns: Optional[int] = None) -> Datagram:
+        """`datagram`, if it is to be believed; `wall_ns` is our clock, ns since 1970.
+
+        Refused: `unauthenticated` if it was read without a key, `untimely`, `epoch`, `stale`, `capacity`, and `duplicate` if
+        it came before."""
+        if not datagram.authenticated:
+            raise Refused("unauthenticated")
+        hub, sensor = datagram.hub, datagram.sensor
+        if datagram.epoch < self.epochs.get(hub, 0):
+            raise Refused("epoch")
+        is_next = self._lives.get(hub) != datagram.epoch
+        is_announce = datagram.number == 0
+        if is_next or (hub, sensor, 0) not in self._streams:
+            wall_ns = time.time_ns() if wall_ns is None else wall_ns
+            if not is_announce or abs(wall_ns - datagram.stamp_ns) > 5_000_000_000:
+                raise Refused("untimely")
+        if not is_announce:
+            if (hub, sensor, datagram.number) not in self._streams:
+                raise Refused("untimely")
+            self._count(datagram)
+            return datagram
+        announce = datagram.unpack()
+        if is_next:
+            self._streams = {key: stream for key, stream in self._streams.items() if key[0] != hub}
+        first = {topic.topic: topic.next for topic in announce.topics if topic.topic < len(TOPICS)}
+        first[0] = datagram.sequence
+        new = {(hub, sensor, topic): number for topic, number in first.items()}
+        new = {key: (number, None, set()) for key, number in new.items() if key not in self._streams}
+        if len(self._streams) + len(new) > self.STREAMS:
+            raise Refused("capacity")
+        self.epochs[hub] = self._lives[hub] = datagram.epoch
+        self._streams.update(new)
+        self._count(datagram)
+        return datagram
+
+    def _count(self, datagram: Datagram) -> None:
+        key = datagram.hub, datagram.sensor, datagram.number
+        lowest, highest, seen = self._streams[key]
+        # The number without wrapping: the nearest to what is known.
+        known = lowest if highest is None else highest
+        number = known + (datagram.sequence - known + 0x80000000) % 0x100000000 - 0x80000000
+        if number < lowest:
+            raise Refused("stale")
+        if number in seen:
+            raise Refused("duplicate")
+        if datagram.parts > 1:
+            return
+        seen.add(number)
+        highest = number if highest is None else max(highest, number)
+        lowest = max(lowest, highest - _WINDOW + 1)
+        if len(seen) > 2 * _WINDOW:
+            seen = {number for number in seen if number >= lowest}
+        self._streams[key] = lowest, highest, seen
+
+
+# Numbers below the highest that are still kept apart.
+_WINDOW = 1024
 
 
 class Parts:
@@ -530,4 +669,16 @@ def _status(payload: bytes) -> Status:
     )
 
 
-_UNPACK = (_announce, None, _scan, _marks, _zones, _foreground, _background, _status)
+def _lines(payload: bytes) -> Lines:
+    count, corners, flags, readings, on_lines, noise_m = struct.unpack_from("<BBBxHHf", payload)
+    _limit(count <= 64 and corners <= 64)
+    lines = _items(Line, "<8fHHH2x", payload, 12, count)
+    meetings = _items(Corner, "<ffHH", payload, 12 + 40 * count, corners)
+    _limit(math.isfinite(noise_m))
+    _limit(all(math.isfinite(number) for line in lines for number in astuple(line)))
+    _limit(all(math.isfinite(at.x_m) and math.isfinite(at.y_m) for at in meetings))
+    _limit(all(max(at.first_line, at.second_line) < count for at in meetings))
+    return Lines(bool(flags & 1), readings, on_lines, noise_m, lines, meetings)
+
+
+_UNPACK = (_announce, None, _scan, _marks, _zones, _foreground, _background, _status, _lines)

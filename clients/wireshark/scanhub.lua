@@ -1,7 +1,8 @@
--- Shows the datagrams of `scanhub gateway` in Wireshark and tshark: every field by its name, checksums checked, and gaps,
+-- Shows the datagrams of `scanhub gateway` in Wireshark and tshark: every field by its name, checksums and MACs checked, gaps,
 -- duplicates and datagrams out of order flagged per hub, epoch, sensor and topic. docs/datagram.md has the bytes.
 --
 --   tshark -X lua_script:scanhub.lua -f 'udp port 22200' -Y scanhub.lost
+--   tshark -X lua_script:scanhub.lua -o scanhub.key_file:KEY -Y 'scanhub.mac_status == "wrong"'
 --
 -- or copy it to where Help, About, Folders shows the personal Lua plugins.
 
@@ -11,8 +12,10 @@ local WINDOW = 1024
 local scanhub = Proto("scanhub", "scanhub LAN")
 scanhub.prefs.crc = Pref.bool("Check checksums", true, "Bytes by bytes in Lua: off for long captures")
 
+scanhub.prefs.key_file = Pref.string("Key file", "", "Of `scanhub key new`: 32 bytes, or 64 hex digits")
+
 local TOPICS = {
-    [0] = "announce", "telegram", "scan", "marks", "zones", "foreground", "background", "status"
+    [0] = "announce", "telegram", "scan", "marks", "zones", "foreground", "background", "status", "lines"
 }
 local VERDICTS = { [0] = "clear", "slow", "stop", "unknown" }
 local STATES = { [0] = "absent", "probing", "switching", "starting", "streaming", "silent", "paused" }
@@ -65,6 +68,7 @@ field("crc", "uint32", "CRC-32C", base.HEX)
 field("crc_status", "string", "Checksum")
 field("later", "bytes", "Of a later version")
 field("mac", "bytes", "MAC")
+field("mac_status", "string", "MAC is")
 field("refused", "string", "Refused")
 field("lost", "uint32", "Lost before this one")
 field("duplicate", "uint32", "Duplicate: this many places below the highest")
@@ -117,6 +121,26 @@ field("marks.peak", "uint8", "Peak")
 field("marks.edge", "uint8", "Edge")
 field("marks.first_beam", "uint16", "First beam")
 field("marks.last_beam", "uint16", "Last beam")
+
+field("lines.overflow", "uint8", "Overflow", base.DEC, nil, 1)
+field("lines.readings", "uint16", "Beams with a range")
+field("lines.on_lines", "uint16", "Beams on a line")
+field("lines.noise_m", "float", "Deviation of a range, m")
+field("lines.x1_m", "float", "First end x, m")
+field("lines.y1_m", "float", "First end y, m")
+field("lines.x2_m", "float", "Last end x, m")
+field("lines.y2_m", "float", "Last end y, m")
+field("lines.r_m", "float", "r, m")
+field("lines.alpha_rad", "float", "alpha, rad")
+field("lines.sd_r_m", "float", "Deviation of r, m")
+field("lines.sd_alpha_rad", "float", "Deviation of alpha, rad")
+field("lines.first", "uint16", "First beam")
+field("lines.last", "uint16", "Last beam")
+field("lines.points", "uint16", "Points")
+field("lines.x_m", "float", "Corner x, m")
+field("lines.y_m", "float", "Corner y, m")
+field("lines.first_line", "uint16", "Of line")
+field("lines.second_line", "uint16", "And line")
 
 field("zones.verdict", "uint8", "Verdict", base.DEC, VERDICTS)
 field("zones.count", "uint8", "Zones")
@@ -190,8 +214,9 @@ scanhub.experts = { expert_lost, expert_order, expert_refused }
 
 -- Lua 5.2 brings bit32, Lua 5.4 has operators that 5.2 cannot parse.
 local bits = bit32 or bit or load([[return {
-    bxor = function(a, b) return a ~ b end, band = function(a, b) return a & b end,
-    rshift = function(a, n) return a >> n end, bnot = function(a) return ~a & 0xFFFFFFFF end }]])()
+    bxor = function(a, b, c) return a ~ b ~ (c or 0) end, band = function(a, b) return a & b end,
+    rshift = function(a, n) return a >> n end, bnot = function(a) return ~a & 0xFFFFFFFF end,
+    rrotate = function(a, n) return (a >> n | a << 32 - n) & 0xFFFFFFFF end }]])()
 
 local CRC = {}
 for byte = 0, 255 do
@@ -213,6 +238,94 @@ local function crc_of(tvb)
         crc = bits.bxor(bits.rshift(crc, 8), CRC[bits.band(bits.bxor(crc, byte), 0xFF)])
     end
     return bits.bnot(crc) % 0x100000000
+end
+
+-- Keys -------------------------------------------------------------------------------------------------------------
+
+-- Of SHA-256 (FIPS 180-4).
+local ROUNDS = {
+    0x428a2f98, 0x71374491, 0xb5c0fbcf, 0xe9b5dba5, 0x3956c25b, 0x59f111f1, 0x923f82a4, 0xab1c5ed5,
+    0xd807aa98, 0x12835b01, 0x243185be, 0x550c7dc3, 0x72be5d74, 0x80deb1fe, 0x9bdc06a7, 0xc19bf174,
+    0xe49b69c1, 0xefbe4786, 0x0fc19dc6, 0x240ca1cc, 0x2de92c6f, 0x4a7484aa, 0x5cb0a9dc, 0x76f988da,
+    0x983e5152, 0xa831c66d, 0xb00327c8, 0xbf597fc7, 0xc6e00bf3, 0xd5a79147, 0x06ca6351, 0x14292967,
+    0x27b70a85, 0x2e1b2138, 0x4d2c6dfc, 0x53380d13, 0x650a7354, 0x766a0abb, 0x81c2c92e, 0x92722c85,
+    0xa2bfe8a1, 0xa81a664b, 0xc24b8b70, 0xc76c51a3, 0xd192e819, 0xd6990624, 0xf40e3585, 0x106aa070,
+    0x19a4c116, 0x1e376c08, 0x2748774c, 0x34b0bcb5, 0x391c0cb3, 0x4ed8aa4a, 0x5b9cca4f, 0x682e6ff3,
+    0x748f82ee, 0x78a5636f, 0x84c87814, 0x8cc70208, 0x90befffa, 0xa4506ceb, 0xbef9a3f7, 0xc67178f2,
+}
+local BEGIN = {
+    0x6a09e667, 0xbb67ae85, 0x3c6ef372, 0xa54ff53a, 0x510e527f, 0x9b05688c, 0x1f83d9ab, 0x5be0cd19,
+}
+local turn, unpack = bits.rrotate or bits.ror, table.unpack or unpack
+
+-- SHA-256 of a string, as one.
+local function sha256(text)
+    local bxor, band, bnot, rshift = bits.bxor, bits.band, bits.bnot, bits.rshift
+    local len = #text
+    text = text .. "\128" .. string.rep("\0", (55 - len) % 64) .. "\0\0\0\0"
+        .. string.char(math.floor(len / 0x200000) % 256, math.floor(len / 0x2000) % 256, math.floor(len / 32) % 256,
+            len * 8 % 256)
+    local state = { unpack(BEGIN) }
+    local w = {}
+    for begin = 1, #text, 64 do
+        for i = 1, 16 do
+            local a, b, c, d = text:byte(begin + 4 * i - 4, begin + 4 * i - 1)
+            w[i] = a * 0x1000000 + b * 0x10000 + c * 0x100 + d
+        end
+        for i = 17, 64 do
+            local x, y = w[i - 15], w[i - 2]
+            local first = bxor(turn(x, 7), turn(x, 18), rshift(x, 3))
+            local second = bxor(turn(y, 17), turn(y, 19), rshift(y, 10))
+            w[i] = (w[i - 16] + first + w[i - 7] + second) % 0x100000000
+        end
+        local a, b, c, d, e, x, y, z = unpack(state)
+        for i = 1, 64 do
+            local choice, majority = bxor(band(e, x), band(bnot(e), y)), bxor(band(a, b), band(a, c), band(b, c))
+            local first = z + bxor(turn(e, 6), turn(e, 11), turn(e, 25)) + choice + ROUNDS[i] + w[i]
+            local second = bxor(turn(a, 2), turn(a, 13), turn(a, 22)) + majority
+            a, b, c, d, e, x, y, z = (first + second) % 0x100000000, a, b, c, (d + first) % 0x100000000, e, x, y
+        end
+        for i, value in ipairs({ a, b, c, d, e, x, y, z }) do state[i] = (state[i] + value) % 0x100000000 end
+    end
+    local out = {}
+    for i, value in ipairs(state) do
+        for byte = 3, 0, -1 do out[4 * i - byte] = string.char(math.floor(value / 256 ^ byte) % 256) end
+    end
+    return table.concat(out)
+end
+
+-- The key in a file as the beginnings of the two hashes of a MAC, or nothing and why.
+local function read_key(path)
+    local file, why = io.open(path, "rb")
+    if not file then return nil, why end
+    local key = file:read(256) or ""
+    file:close()
+    local digits = key:match("^(%x+)%s*$")
+    if #key ~= 32 and digits and #digits == 64 then
+        key = digits:gsub("..", function(pair) return string.char(tonumber(pair, 16)) end)
+    end
+    if #key ~= 32 then return nil, path .. ": it is no key" end
+    local function pad(with)
+        return (key .. string.rep("\0", 32)):gsub(".", function(c) return string.char(bits.bxor(c:byte(), with)) end)
+    end
+    return { inner = (pad(0x36)), outer = (pad(0x5C)) }
+end
+
+local key, key_path, no_key
+
+-- Whether the MAC of a datagram, which it may not have, is of the key: `right`, `wrong`, `none`, or why nobody knows.
+local function mac_status(tvb, has_mac)
+    local path = scanhub.prefs.key_file
+    if path ~= key_path then
+        key_path, key, no_key = path, nil, nil
+        if path ~= "" then key, no_key = read_key(path) end
+    end
+    if not key then return no_key and "no key: " .. no_key or "no key" end
+    if not has_mac then return "none" end
+    local all = tvb:raw()
+    local mac = all:sub(-16)
+    local covered = all:sub(1, 44) .. "\0\0\0\0" .. all:sub(49, -17)
+    return sha256(key.outer .. sha256(key.inner .. covered)):sub(1, 16) == mac and "right" or "wrong"
 end
 
 -- Sequence ---------------------------------------------------------------------------------------------------------
@@ -478,6 +591,38 @@ unpack_payload[7] = function(payload, tree)
     return STATES[payload(0, 1):uint()] or "unknown"
 end
 
+unpack_payload[8] = function(payload, tree)
+    local len = payload:len()
+    if len < 12 then return nil end
+    local count, corners = payload(0, 1):uint(), payload(1, 1):uint()
+    local behind = 12 + 40 * count
+    if count > 64 or corners > 64 or len < behind + 12 * corners then return nil end
+    if not is_finite(payload(8, 4):le_float()) then return nil end
+    for i = 0, count - 1 do
+        for n = 0, 7 do
+            if not is_finite(payload(12 + 40 * i + 4 * n, 4):le_float()) then return nil end
+        end
+    end
+    for at = behind, behind + 12 * corners - 1, 12 do
+        if not (is_finite(payload(at, 4):le_float()) and is_finite(payload(at + 4, 4):le_float())) then return nil end
+        if payload(at + 8, 2):le_uint() >= count or payload(at + 10, 2):le_uint() >= count then return nil end
+    end
+    tree:add(f["lines.overflow"], payload(2, 1))
+    add_fields(tree, payload, 4, "lines.readings", 2, "lines.on_lines", 2, "lines.noise_m", 4)
+    for i = 0, count - 1 do
+        local item = tree:add(payload(12 + 40 * i, 40), "Line " .. i)
+        add_fields(item, payload, 12 + 40 * i, "lines.x1_m", 4, "lines.y1_m", 4, "lines.x2_m", 4, "lines.y2_m", 4,
+            "lines.r_m", 4, "lines.alpha_rad", 4, "lines.sd_r_m", 4, "lines.sd_alpha_rad", 4, "lines.first", 2,
+            "lines.last", 2, "lines.points", 2)
+    end
+    for i = 0, corners - 1 do
+        local item = tree:add(payload(behind + 12 * i, 12), "Corner " .. i)
+        add_fields(item, payload, behind + 12 * i, "lines.x_m", 4, "lines.y_m", 4, "lines.first_line", 2,
+            "lines.second_line", 2)
+    end
+    return count .. " lines, " .. corners .. " corners"
+end
+
 -- Datagram ---------------------------------------------------------------------------------------------------------
 
 local FLAGS = { "authenticated", "simulated", "replayed", "stamp_estimated", "suspect" }
@@ -538,10 +683,15 @@ function scanhub.dissector(tvb, pinfo, root)
     tree:add(f["crc_status"], scanhub.prefs.crc and "good" or "unchecked"):set_generated()
 
     local header, length = tvb(5, 1):uint(), tvb(36, 2):le_uint()
+    local has_mac = tvb:len() > header + length
+    if has_mac then tree:add(f["mac"], tvb(header + length)) end
+    local status = mac_status(tvb, has_mac)
+    if has_mac or key then tree:add(f["mac_status"], status):set_generated() end
+    if status == "wrong" then return add_refusal(tree, pinfo, "mac") end
+    if status == "none" then return add_refusal(tree, pinfo, "unauthenticated") end
     local topic, sensor = tvb(6, 1):uint(), tvb(32, 1):uint()
     local hub, epoch, sequence = tostring(tvb(8, 8):le_uint64()), tvb(16, 4):le_uint(), tvb(20, 4):le_uint()
     if header > 48 then tree:add(f["later"], tvb(48, header - 48)) end
-    if tvb:len() > header + length then tree:add(f["mac"], tvb(header + length)) end
 
     local unpack = unpack_payload[topic]
     local words

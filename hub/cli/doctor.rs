@@ -1,11 +1,12 @@
 //! `scanhub doctor` on the command line: what it takes, and a line for each finding.
 
+use std::path::PathBuf;
 use std::sync::atomic::AtomicBool;
 
 use clap::Args;
 use config::{Config, Gateway};
 use schema::Failure;
-use tools::doctor::{Subjects, System, examine};
+use tools::doctor::{Bridge, Subjects, System, examine};
 use tools::probe::source;
 
 use super::{Everywhere, Run};
@@ -19,6 +20,13 @@ pub(crate) struct Doctor {
     /// First remove what dead processes left in this domain; removes nothing while a hub runs there
     #[arg(long)]
     clean: bool,
+    /// Router that a bridge of this machine connects to, as in `scanhub bridge --connect`: checks whether that would work.
+    /// Can be repeated
+    #[arg(long, value_name = "ADDRESS")]
+    bridge: Vec<String>,
+    /// The same by Zenoh's own configuration, as in `scanhub bridge --config`
+    #[arg(long, value_name = "FILE")]
+    bridge_config: Option<PathBuf>,
     #[command(flatten)]
     run: Run,
 }
@@ -36,6 +44,11 @@ impl Doctor {
             domain: everywhere.hub_domain()?,
             places: everywhere.places()?,
             system: System::this(),
+            bridge: Bridge {
+                connect: self.bridge.clone(),
+                config: self.bridge_config.clone(),
+                ..Bridge::default()
+            },
             clean: self.clean,
         };
         let mut port = None;

@@ -118,6 +118,7 @@ const EXAMPLES: &[(&str, &[&str])] = &[
         ],
     ),
     ("watch", &["scanhub watch", "scanhub watch front"]),
+    ("web", &["scanhub web", "scanhub web --listen 0.0.0.0:8080 --token carrot"]),
     (
         "record",
         &[
@@ -138,6 +139,14 @@ const EXAMPLES: &[(&str, &[&str])] = &[
     ("zones mask", &["scanhub zones front mask --for 10s"]),
     ("leds", &["scanhub leds front", "scanhub leds robot --led green=led0"]),
     ("gateway", &["scanhub gateway --interface eth0 --topic */zones --topic front/scan:every=4"]),
+    (
+        "bridge",
+        &[
+            "scanhub bridge --listen tcp/0.0.0.0:7447",
+            "scanhub bridge --connect tcp/robot:7447 --publish --name robot1=5f3a12bc00d1e2f3",
+            "scanhub bridge --help",
+        ],
+    ),
     ("listen", &["scanhub listen --interface eth0 --stats"]),
     ("completions", &["scanhub completions bash > ~/.local/share/bash-completion/completions/scanhub"]),
     ("man", &["scanhub man | man -l -", "scanhub man ~/.local/share/man/man1"]),

@@ -19,7 +19,7 @@ pub(crate) struct Gateway {
     #[arg(long, value_name = "NAME")]
     interface: Option<String>,
     /// Topics to send: front/scan, */scan for all sensors or front/* for all topics. With :every=4, only the samples of
-    /// every fourth telegram. Can be repeated [default: all topics except telegrams, of all sensors]
+    /// every fourth telegram. Can be repeated [default: all topics except telegrams and lines, of all sensors]
     #[arg(long = "topic", value_name = "SENSOR/TOPIC[:every=N]")]
     topics: Vec<String>,
     // Help for people, in which brackets are no link.

@@ -10,9 +10,10 @@ use sim::options::{self, SimulateOptions};
 use verbs::duration;
 
 #[derive(Args, Debug)]
+#[command(group = clap::ArgGroup::new("place").args(["port", "tcp"]).required(true).multiple(true))]
 pub(crate) struct Simulate {
     /// Where to create each sensor's pty, as a symlink
-    #[arg(long, required_unless_present = "tcp", value_name = "PATH")]
+    #[arg(long, value_name = "PATH")]
     port: Vec<PathBuf>,
     /// Where a sensor is found as behind a serial server in raw mode; port 0 is any that is free. The line `ready` says
     /// which; the hub opens it as tcp:HOST:PORT. These sensors come after those of --port

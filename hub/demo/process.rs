@@ -62,15 +62,15 @@ impl Child {
         Ok(Child { process })
     }
 
-    /// Waits for the first line, which says that it is up; what comes later goes to `lines`.
-    pub(crate) fn await_ready(mut self, of: usize, lines: Sender<Line>) -> Result<Child, Failure> {
+    /// Waits for the first line, which says that it is up, and returns it too; what comes later goes to `lines`.
+    pub(crate) fn await_ready(mut self, of: usize, lines: Sender<Line>) -> Result<(Child, String), Failure> {
         let mut first = String::new();
         if let Some(stdout) = self.process.stdout.take() {
             let mut stdout = BufReader::new(stdout);
             let _ = stdout.read_line(&mut first);
             forward(stdout, of, lines);
         }
-        if first.is_empty() { Err(super::ended(of)) } else { Ok(self) }
+        if first.is_empty() { Err(super::ended(of)) } else { Ok((self, first)) }
     }
 
     /// Its process id.

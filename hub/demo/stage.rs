@@ -10,9 +10,10 @@ use std::sync::mpsc;
 
 use rustix::fs::{CWD, FileType, Mode, OFlags, mknodat};
 use schema::{Domain, Environment, Failure, Family, Kind};
+use serde_json::Value;
 
 use super::process::{Child, Line};
-use super::{HUB, SIMULATOR, Sensor};
+use super::{HUB, SIMULATOR, Sensor, WEB};
 
 /// A domain and a directory of its own.
 pub(super) struct Stage {
@@ -114,7 +115,7 @@ impl Stage {
             None,
             self.errors(),
         )?;
-        hub.await_ready(HUB, lines)
+        Ok(hub.await_ready(HUB, lines)?.0)
     }
 
     pub(super) fn start_consumers(&self, lines: &mpsc::Sender<Line>) -> Result<Vec<Child>, Failure> {
@@ -146,8 +147,21 @@ impl Stage {
         let rest = ["--truth".into(), truth, "--seed".into(), seed.to_string(), "--json".into()];
         let world = ["--world".into(), "demo".into(), "--family".into(), family.name().into()];
         let arguments = [&["simulate".into()], &world[..], &ports[..], &rest[..]].concat();
-        Child::start(&arguments, &self.domain, &self.directory, None, self.errors())?
-            .await_ready(SIMULATOR, lines)
+        let simulator = Child::start(&arguments, &self.domain, &self.directory, None, self.errors())?;
+        Ok(simulator.await_ready(SIMULATOR, lines)?.0)
+    }
+
+    /// The picture for a browser, and its address.
+    pub(super) fn start_web(&self) -> Result<(Child, String), Failure> {
+        let arguments = ["web".into(), "--json".into()];
+        let web = Child::start(&arguments, &self.domain, &self.directory, None, self.errors())?;
+        // Who comes and goes is not told here.
+        let (web, ready) = web.await_ready(WEB, mpsc::channel().0)?;
+        let ready: Value = serde_json::from_str(&ready).unwrap_or_default();
+        match ready["url"].as_str() {
+            Some(url) => Ok((web, url.to_owned())),
+            None => Err(super::ended(WEB)),
+        }
     }
 }
 

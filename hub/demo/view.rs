@@ -11,14 +11,16 @@ use super::attach;
 /// What was said last.
 pub(crate) struct View {
     attach: String,
+    /// Where a browser sees it.
+    url: Option<String>,
     /// Seconds for which there are lines.
     seconds: u64,
 }
 
 impl View {
     /// Of the demonstration in `domain`.
-    pub(crate) fn new(domain: &Domain) -> Self {
-        View { attach: attach(domain), seconds: 0 }
+    pub(crate) fn new(domain: &Domain, url: Option<&str>) -> Self {
+        View { attach: attach(domain), url: url.map(str::to_owned), seconds: 0 }
     }
 
     /// Says once a second how the account is after `elapsed`.
@@ -41,6 +43,7 @@ impl View {
             ),
             self.attach.clone(),
         ];
+        lines.extend(self.url.iter().map(|url| format!("browser: {url}")));
         for sensor in &account.sensors {
             lines.push(String::new());
             lines.extend(sensor_lines(sensor));

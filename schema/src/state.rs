@@ -68,14 +68,26 @@ impl StateDirectory {
     ///
     /// [`Kind::Failed`] if that is not possible; then what the file held is still there.
     pub fn write(&self, name: &str, text: &str) -> Result<(), Failure> {
-        self.replace(name, text).map_err(|error| {
-            let what = format!("cannot keep {}: {error}", self.path(name).display());
-            Failure::new(
-                Kind::Failed,
-                what,
-                "set STATE_DIRECTORY or XDG_STATE_HOME to a directory of this user",
-            )
-        })
+        self.replace(name, text).map_err(|error| self.unusable(name, &error))
+    }
+
+    /// Waits until no other process is between reading and writing file `name`; they wait for us until what is returned is
+    /// dropped. Creates the directory as [`write`](Self::write) does, and beside the file one that is locked.
+    ///
+    /// # Errors
+    ///
+    /// [`Kind::Failed`] if that is not possible.
+    pub fn lock(&self, name: &str) -> Result<File, Failure> {
+        let lock = || {
+            self.make()?;
+            let mut options = OpenOptions::new();
+            let options = options.write(true).create(true).truncate(false).mode(0o600);
+            let file = options
+                .custom_flags((OFlags::NOFOLLOW | OFlags::NONBLOCK).bits() as i32)
+                .open(self.path(&format!("{name}.lock")))?;
+            file.lock().map(|()| file)
+        };
+        lock().map_err(|error| self.unusable(name, &error))
     }
 
     /// Removes file `name`, if it is there.
@@ -94,8 +106,17 @@ impl StateDirectory {
         }
     }
 
+    fn make(&self) -> io::Result<()> {
+        DirBuilder::new().recursive(true).mode(0o700).create(&self.path)
+    }
+
+    fn unusable(&self, name: &str, error: &io::Error) -> Failure {
+        let what = format!("cannot keep {}: {error}", self.path(name).display());
+        Failure::new(Kind::Failed, what, "set STATE_DIRECTORY or XDG_STATE_HOME to a directory of this user")
+    }
+
     fn replace(&self, name: &str, text: &str) -> io::Result<()> {
-        DirBuilder::new().recursive(true).mode(0o700).create(&self.path)?;
+        self.make()?;
         let beside = self.path(&format!("{name}.new"));
         // One that a crash left may have another mode, or lead elsewhere.
         match fs::remove_file(&beside) {

@@ -81,12 +81,12 @@ impl Status {
         self.counters[Counter::DamagedPpm] as f64 / 1e6
     }
 
-    /// Scans that must have been sent, by the sensor's period, and did not arrive; nothing if that is not known.
+    /// Scans, or of a scanner whose head turns packets, that must have been sent and did not arrive; nothing if that is not known.
     pub fn lost_on_line(&self) -> Option<u64> {
         (self.counters[Counter::DueOnLine] > 0).then_some(self.counters[Counter::LostOnLine])
     }
 
-    /// Returns their share of the scans that were due in the last 10 s, 0 to 1.
+    /// Returns their share of those that were due in the last 10 s, 0 to 1.
     pub fn lost_share(&self) -> Option<f64> {
         self.lost_on_line().map(|_| self.counters[Counter::LostPpm] as f64 / 1e6)
     }
@@ -115,6 +115,19 @@ impl Status {
     pub fn model(&self) -> Option<String> {
         let word = self.sensor_type().split(|c: char| c == ';' || c.is_whitespace()).next()?;
         (!word.is_empty()).then(|| word.to_lowercase())
+    }
+
+    /// Returns how a scanner measures whose modes have names, the second word of what the sensor calls itself; nothing if
+    /// unknown.
+    pub fn way(&self) -> Option<&str> {
+        let is_named = self.family().is_some_and(|family| family != Family::Lms);
+        let word = self.sensor_type().split_whitespace().nth(1).filter(|_| is_named)?;
+        word.starts_with(|c: char| c.is_ascii_lowercase()).then_some(word)
+    }
+
+    /// Returns what the scanner sends, of which [`lost_on_line`](Self::lost_on_line) counts: scans, or packets.
+    pub fn sent(&self) -> &'static str {
+        if self.family() == Some(Family::Lms) { "scans" } else { "packets" }
     }
 
     /// Returns what the sensor calls itself; empty if unknown.

@@ -5,7 +5,8 @@ use std::fmt::Write as _;
 use std::mem::{offset_of, size_of};
 
 use schema::{
-    BackgroundHead, ForegroundHead, Header, Mark, Marks, Pose, ScanHead, Segment, Status, Zone, Zones,
+    BackgroundHead, Corner, ForegroundHead, Header, Line, Lines, Mark, Marks, Pose, ScanHead, Segment,
+    Status, Zone, Zones,
 };
 
 /// The lines of one struct.
@@ -42,6 +43,9 @@ fn the_text_says_what_the_structs_are() {
     layout!(text, Pose: x_m y_m yaw_rad upside_down reserved);
     layout!(text, Status: state mode unit_mm family baud since_ns rate_mhz angle_deg resolution_cdeg type_text
         port_text last_error_text counters pose);
+    layout!(text, Line: x1_m y1_m x2_m y2_m r_m alpha_rad sd_r_m sd_alpha_rad first last points reserved);
+    layout!(text, Corner: x_m y_m first_line second_line);
+    layout!(text, Lines: count corners flags reserved readings on_lines noise_m line_array corner_array);
     let golden = include_str!("../../tests/vectors/v2/layouts.txt");
     assert_eq!(text, golden);
 }

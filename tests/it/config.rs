@@ -135,7 +135,12 @@ fn every_verb_has_an_example_a_page_and_a_completion() {
     printed(&env, &["man", &pages]);
     let completions = ["bash", "zsh", "fish"].map(|shell| printed(&env, &["completions", shell]));
     for verb in &verbs {
-        assert!(printed(&env, &[verb, "--help"]).contains(&format!("  scanhub {verb}")), "{verb}");
+        // A program of its own, which `cargo test` does not build; its tests hold its help.
+        let is_apart = verb == "bridge";
+        assert!(
+            is_apart || printed(&env, &[verb, "--help"]).contains(&format!("  scanhub {verb}")),
+            "{verb}"
+        );
         let page = fs::read_to_string(Path::new(&pages).join(format!("scanhub-{verb}.1")));
         let page = page.unwrap_or_else(|error| panic!("{verb}: {error}"));
         assert!(page.contains(&format!("scanhub {verb}")), "{page}");

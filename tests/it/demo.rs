@@ -123,9 +123,15 @@ fn the_picture_into_a_pipe() {
     assert_eq!(outcome.code, Some(0), "{outcome}");
     let text = String::from_utf8_lossy(&outcome.out);
     assert!(!text.contains('\x1b'), "controls a terminal that is none: {text:?}");
-    for word in
-        ["scanhub demo", "front", "rear", "nearest", "0 lost", "scanhub echo front/scan --domain demo-"]
-    {
+    for word in [
+        "scanhub demo",
+        "front",
+        "rear",
+        "nearest",
+        "0 lost",
+        "scanhub echo front/scan --domain demo-",
+        "browser: http://127.0.0.1:",
+    ] {
         assert!(text.contains(word), "no {word:?}: {outcome}");
     }
 }

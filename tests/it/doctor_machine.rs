@@ -12,7 +12,7 @@ use std::sync::atomic::AtomicBool;
 use crate::testkit::{Findings, KILL, Program, TERM, TestEnv, in_a_network, is_class, shared_memory, skip};
 use config::Gateway;
 use schema::Domain;
-use tools::doctor::{Subjects, System, examine};
+use tools::doctor::{Bridge, Subjects, System, examine};
 
 /// `sh` with these words before the program, as `ulimit -f 100; exec`, and its arguments.
 fn under(env: &TestEnv, words: &str, arguments: &[&str]) -> Command {
@@ -83,6 +83,7 @@ fn laid_out(env: &TestEnv) -> Findings {
         domain: env.place(),
         places: Vec::new(),
         system: System::at(env.path("machine"), 1000),
+        bridge: Bridge::default(),
         clean: false,
     };
     let mut lines = Vec::new();

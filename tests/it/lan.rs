@@ -3,6 +3,7 @@
 mod c;
 mod capture;
 mod damaged;
+mod keyed_vectors;
 mod python;
 mod readers;
 #[path = "../../schema/tests/datagram/says.rs"]

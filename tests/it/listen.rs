@@ -9,7 +9,8 @@ use crate::testkit::{
 };
 use schema::datagram::{DatagramError, HEAD, WINDOW};
 use schema::{
-    Background, BackgroundHead, Foreground, Mark, Marks, Scan, ScanHead, State, Status, Topic, Verdict, Zones,
+    Background, BackgroundHead, Foreground, Line, Lines, Mark, Marks, Scan, ScanHead, State, Status, Topic,
+    Verdict, Zones,
 };
 use serde_json::{Value, json};
 
@@ -68,6 +69,8 @@ fn every_topic_is_a_line() {
         let mut foreground = Foreground::of(0);
         foreground.generation = 4;
         let background = Background::of(BackgroundHead { generation: 5, ..BackgroundHead::default() }, &[]);
+        let mut lines = Lines { count: 1, noise_m: 0.25, ..Lines::default() };
+        lines.line_array[0] = Line { r_m: 1.5, last: 7, points: 8, ..Line::default() };
         let telegram = sender.telegram(&TELEGRAM);
         sender.throw(Topic::Telegram, &telegram);
         sender.send(Topic::Scan, &*scan());
@@ -75,6 +78,7 @@ fn every_topic_is_a_line() {
         sender.send(Topic::Zones, &zones(Verdict::Slow));
         sender.send(Topic::Foreground, &*foreground);
         sender.send(Topic::Background, &*background);
+        sender.send(Topic::Lines, &lines);
         sender.send(Topic::Status, &status);
         program.await_line("the last one", is_class("status"));
         let outcome = program.end(INT);
@@ -97,6 +101,10 @@ fn every_topic_is_a_line() {
         assert_eq!(line("telegram")["data"], "02800300a00010160a");
         assert_eq!(line("scan")["ranges"], json!([100, null, 300]));
         assert_eq!(line("marks")["marks"][0]["range_mm"], 1234.5);
+        assert_eq!(
+            (&line("lines")["lines"][0]["r_m"], &line("lines")["noise_m"]),
+            (&json!(1.5), &json!(0.25))
+        );
         assert_eq!((&line("zones")["verdict"], &line("zones")["topic_seq"]), (&json!("slow"), &json!(1)));
         assert_eq!(
             (&line("foreground")["generation"], &line("background")["generation"]),
@@ -346,7 +354,7 @@ fn each_refusal_has_its_reason() {
             std::thread::sleep(std::time::Duration::from_millis(wait_ms));
         }
         Sender::new(64, 7, 0, "front").send(Topic::Zones, &zones(Verdict::Clear));
-        sender.empty(8);
+        sender.empty(255);
         sender.empty(Topic::Zones.number());
         sender.send(Topic::Zones, &zones(Verdict::Stop));
         program.await_line("the last one", |line| line["verdict"] == "stop");

@@ -5,6 +5,7 @@
 mod testkit;
 
 mod background;
+mod browser;
 mod chart;
 mod client_c;
 mod config;
@@ -36,6 +37,7 @@ mod limits_memory;
 mod limits_ports;
 mod limits_process;
 mod line_loss;
+mod lines;
 mod listen;
 mod listen_beams;
 mod listen_crowd;
@@ -76,7 +78,10 @@ mod streaming;
 mod suspended;
 mod telegram;
 mod terminal_text;
+mod three_machines;
 mod tidy;
 mod two_machines;
 mod vendor;
 mod watch;
+mod web;
+mod web_page;

@@ -26,6 +26,7 @@ use std::fs;
 use std::os::unix::fs::DirBuilderExt;
 use std::path::{Path, PathBuf};
 use std::process::Command;
+use std::sync::OnceLock;
 use std::sync::atomic::{AtomicU32, Ordering};
 use std::thread;
 use std::time::{Duration, Instant};
@@ -130,7 +131,7 @@ impl TestEnv {
 
     /// As [`TestEnv::command`], with the domain in another directory.
     pub(crate) fn command_at<S: AsRef<str>>(&self, root: &Path, arguments: &[S]) -> Command {
-        let program = std::env::var(PROGRAM).unwrap_or_else(|_| env!("CARGO_BIN_EXE_scanhub").into());
+        let program = std::env::var(PROGRAM).unwrap_or_else(|_| scanhub().into());
         let mut command = match &self.network {
             Some(network) => command_in(network, &program),
             None => Command::new(program),
@@ -291,6 +292,22 @@ impl Drop for TestEnv {
             let _ = fs::remove_file(path);
         }
     }
+}
+
+/// The program. Tests of other crates build it, once.
+fn scanhub() -> &'static str {
+    static BUILT: OnceLock<String> = OnceLock::new();
+    option_env!("CARGO_BIN_EXE_scanhub").unwrap_or_else(|| {
+        BUILT.get_or_init(|| {
+            let built = own_program().ancestors().nth(2).map(|directory| directory.join("scanhub"));
+            let built = built.unwrap_or_else(|| panic!("tests are not where Cargo puts them"));
+            let mut cargo = Command::new(env!("CARGO"));
+            cargo.args(["build", "--quiet", "--package=scanhub", "--bin=scanhub"]);
+            cargo.args(built.components().any(|word| word.as_os_str() == "release").then_some("--release"));
+            assert!(cargo.status().is_ok_and(|status| status.success()), "cargo cannot build scanhub");
+            built.display().to_string()
+        })
+    })
 }
 
 /// Files in shared memory whose names begin with `prefix`.

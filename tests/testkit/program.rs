@@ -122,6 +122,12 @@ impl Program {
         lines.filter_map(|line| serde_json::from_slice(line).ok()).any(|line| wanted(&line))
     }
 
+    /// Whether a line that it has said by now is `wanted`.
+    pub(crate) fn is_heard(&mut self, wanted: impl Fn(&Value) -> bool) -> bool {
+        while self.receive(Instant::now()).is_ok() {}
+        self.has_said(wanted)
+    }
+
     /// Its next `count` lines from now on that are `wanted`.
     pub(crate) fn await_lines(
         &mut self,

@@ -19,7 +19,7 @@ pub(crate) struct Sender {
     pub(crate) name: String,
     pub(crate) boot: u64,
     /// By topic's number: that of the next datagram.
-    pub(crate) next: [u32; 9],
+    pub(crate) next: [u32; 256],
     /// Of the telegram that is sent.
     pub(crate) counter: u32,
     /// Of what is sent, ns since 1970.
@@ -30,7 +30,7 @@ impl Sender {
     pub(crate) fn new(hub: u64, epoch: u32, sensor: u8, name: &str) -> Sender {
         let socket = UdpSocket::bind("127.0.0.1:0").expect("a port");
         set_ip_multicast_if(&socket, &Ipv4Addr::LOCALHOST).expect("the loopback has an address");
-        let (boot, next, counter, stamp_ns) = (0xb007, [0; 9], 0, wall_ns());
+        let (boot, next, counter, stamp_ns) = (0xb007, [0; 256], 0, wall_ns());
         let (name, family) = (name.to_owned(), Family::Lms);
         Sender { socket, hub, epoch, sensor, family, name, boot, next, counter, stamp_ns }
     }

@@ -6,7 +6,7 @@ use std::fmt::Display;
 use std::io::Write;
 
 /// What tests can do without, by its name in `SCANHUB_REQUIRE`.
-const NEEDS: [&str; 22] = [
+const NEEDS: [&str; 24] = [
     "bash",
     "cc",
     "c++",
@@ -21,7 +21,11 @@ const NEEDS: [&str; 22] = [
     "rplidar-driver",
     "setsid",
     "tmux",
+    // A headless browser.
+    "chromium",
     "tshark",
+    // The program `scanhub-bridge`, beside the program.
+    "bridge",
     "systemd-analyze",
     // A user who may make a network namespace, and `ip`.
     "netns",

@@ -145,8 +145,17 @@ impl Incoming {
             return Arrived::Refused { why, shared: None };
         }
         if datagram.head.parts > 1 {
-            let Some(head) = self.parts.take(&datagram, from, whole) else { return Arrived::Part };
+            let is_known = match self.stats.check_part(&datagram.head) {
+                Ok(is_known) => is_known,
+                Err(why) => return Arrived::Refused { why, shared: None },
+            };
+            let Some(head) = self.parts.take(&datagram, from, is_known, whole) else { return Arrived::Part };
             datagram = Datagram { head, payload: whole, mac: None };
+        }
+        if let Some(guard) = &self.guard
+            && guard.is_timely(&datagram.head, arrival.wall_ns)
+        {
+            self.stats.follow(&datagram, from, arrival.monotonic_ns);
         }
         match self.stats.take(&datagram, from, arrival.monotonic_ns) {
             Ok(Fresh::Duplicate) => Arrived::Known,

@@ -3,6 +3,7 @@
 //! shared memory and clocks.
 #![forbid(unsafe_code)]
 
+pub mod address;
 pub mod incoming;
 mod key;
 pub mod outgoing;

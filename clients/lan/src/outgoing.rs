@@ -4,6 +4,7 @@
 mod numbering;
 mod sample;
 mod sensor;
+mod slots;
 
 use std::num::NonZeroU64;
 use std::time::Duration;
@@ -12,7 +13,7 @@ use schema::Topic;
 
 use crate::Stamp;
 use numbering::Numbering;
-pub use numbering::{Form, Row, Rows, Transmit};
+pub use numbering::{Form, Handed, Row, Rows, Transmit};
 pub use sample::{PayloadRef, Sample};
 use sensor::Sensor;
 
@@ -30,6 +31,12 @@ impl Outgoing {
     /// [`MTU_ETHERNET`](schema::datagram::MTU_ETHERNET).
     pub fn new(hub: u64, epoch: u32, form: Form, longest: usize) -> Outgoing {
         Outgoing { numbering: Numbering::new(hub, epoch, form, longest), sensors: Vec::new() }
+    }
+
+    /// Makes the end of gateway `hub` in its life `epoch` for a way that is slow at times: of each sensor and topic the newest
+    /// sample waits until [`hand`](Outgoing::hand) asks for it. Samples are whole, in one datagram however long.
+    pub fn waiting(hub: u64, epoch: u32) -> Outgoing {
+        Outgoing { numbering: Numbering::waiting(hub, epoch), sensors: Vec::new() }
     }
 
     /// Takes the sensor called `name`, of whose topics every so many samples go out; nothing: none do. Returns its position,
@@ -65,6 +72,28 @@ impl Outgoing {
     /// Sends all backgrounds again that went out longer than `every` ago.
     pub fn repeat(&mut self, every: Duration, now: Stamp, to: &mut impl Transmit) {
         self.sensors.iter_mut().for_each(|sensor| sensor.repeat(every, now, &mut self.numbering, to));
+    }
+
+    /// Returns the sample that has waited for longest, with its number; nothing if none waits.
+    pub fn hand(&mut self) -> Option<Handed<'_>> {
+        self.numbering.hand()
+    }
+
+    /// Returns whether a sample waits.
+    pub fn is_waiting(&self) -> bool {
+        self.numbering.is_waiting()
+    }
+
+    /// Takes note that the last sample which [`hand`](Outgoing::hand) returned of this sensor and topic, of so many `bytes`,
+    /// went nowhere: its number is used up.
+    pub fn not_taken(&mut self, sensor: u8, topic: Option<Topic>, bytes: usize) {
+        self.numbering.not_taken(sensor, topic, bytes);
+    }
+
+    /// Returns the announcement (no topic), the status or the background of the sensor called `name` that was handed on last,
+    /// as it is sent again `now` to who asks: with the number that it has, so that it is counted once.
+    pub fn again(&mut self, name: &str, topic: Option<Topic>, now: Stamp) -> Option<&[u8]> {
+        self.numbering.again(name, topic, now)
     }
 
     /// Returns the longest datagram that goes out, in bytes.

@@ -21,7 +21,7 @@ from .errors import Denied, Failure, Held, Impossible, Mismatch, NoHub, NoTopic,
 from .model import Background, Shown
 from .names import TopicName, candidates, check_sensor, parse
 from .presence import find
-from .processed import Foreground, Mark, Marks, Segment, Zone, Zones
+from .processed import Corner, Foreground, Line, Lines, Mark, Marks, Segment, Zone, Zones
 from .sample import Sample
 from .scan import Scan, Telegram
 from .status import Pose, Status
@@ -32,11 +32,14 @@ __version__ = "0.1.0"
 
 __all__ = [
     "Background",
+    "Corner",
     "Denied",
     "Failure",
     "Foreground",
     "Held",
     "Impossible",
+    "Line",
+    "Lines",
     "Mark",
     "Marks",
     "Mismatch",

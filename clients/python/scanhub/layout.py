@@ -84,6 +84,41 @@ class Marks(_Struct):
     _fields_ = [("count", c_uint8), ("flags", c_uint8), ("reserved", c_uint16), ("mark_array", Mark * 64)]
 
 
+class Line(_Struct):
+    _fields_ = [
+        ("x1_m", c_float),
+        ("y1_m", c_float),
+        ("x2_m", c_float),
+        ("y2_m", c_float),
+        ("r_m", c_float),
+        ("alpha_rad", c_float),
+        ("sd_r_m", c_float),
+        ("sd_alpha_rad", c_float),
+        ("first", c_uint16),
+        ("last", c_uint16),
+        ("points", c_uint16),
+        ("reserved", c_uint16),
+    ]
+
+
+class Corner(_Struct):
+    _fields_ = [("x_m", c_float), ("y_m", c_float), ("first_line", c_uint16), ("second_line", c_uint16)]
+
+
+class Lines(_Struct):
+    _fields_ = [
+        ("count", c_uint8),
+        ("corners", c_uint8),
+        ("flags", c_uint8),
+        ("reserved", c_uint8),
+        ("readings", c_uint16),
+        ("on_lines", c_uint16),
+        ("noise_m", c_float),
+        ("line_array", Line * 64),
+        ("corner_array", Corner * 64),
+    ]
+
+
 class Zone(_Struct):
     _fields_ = [("radius_mm", c_uint16), ("beams", c_uint16), ("violated", c_uint8), ("reserved", c_uint8 * 3)]
 

@@ -1,4 +1,4 @@
-"""What the hub makes of a scan: marks, zones, foreground."""
+"""What the hub makes of a scan: marks, lines, zones, foreground."""
 
 from __future__ import annotations
 
@@ -47,6 +47,75 @@ class Marks(Sample):
         return tuple(
             Mark(m.angle_mdeg / 1000, m.range_dmm / 10, m.peak, m.weight, m.first_beam, m.last_beam, bool(m.edge))
             for m in self._fields.mark_array[: self._fields.count]
+        )
+
+
+class Line(NamedTuple):
+    """A straight surface: both ends, x ahead of the robot's centre and y to the left; its normal form x cos alpha + y sin
+    alpha = r with standard deviations; its first and last beam, and how many of them have a range."""
+
+    x1_m: float
+    y1_m: float
+    x2_m: float
+    y2_m: float
+    r_m: float
+    alpha_rad: float
+    sd_r_m: float
+    sd_alpha_rad: float
+    first: int
+    last: int
+    points: int
+
+
+class Corner(NamedTuple):
+    """Where two lines meet, and their numbers."""
+
+    x_m: float
+    y_m: float
+    first_line: int
+    second_line: int
+
+
+class Lines(Sample):
+    """The straight lines of a scan, in the robot's frame."""
+
+    topic = "lines"
+    struct = layout.Lines
+
+    @property
+    def overflow(self) -> bool:
+        """There are more than are allowed."""
+        return bool(self._fields.flags & 1)
+
+    @property
+    def readings(self) -> int:
+        """Beams of the scan that have a range."""
+        return self._fields.readings
+
+    @property
+    def on_lines(self) -> int:
+        """Of them those that end on a line."""
+        return self._fields.on_lines
+
+    @property
+    def noise_m(self) -> float:
+        """Standard deviation of the ranges in this scan, as its own beams tell it."""
+        return self._fields.noise_m
+
+    @property
+    def lines(self) -> tuple[Line, ...]:
+        """In the order of their beams: copied."""
+        return tuple(
+            Line(*(getattr(line, name) for name in Line._fields))
+            for line in self._fields.line_array[: self._fields.count]
+        )
+
+    @property
+    def corners(self) -> tuple[Corner, ...]:
+        """Where lines meet: copied."""
+        return tuple(
+            Corner(c.x_m, c.y_m, c.first_line, c.second_line)
+            for c in self._fields.corner_array[: self._fields.corners]
         )
 
 

@@ -12,13 +12,13 @@ from .freshness import REMOTE
 from .model import Background
 from .names import Domain, TopicName, service
 from .presence import Presence
-from .processed import Foreground, Marks, Zones, nothing
+from .processed import Foreground, Lines, Marks, Zones, nothing
 from .sample import Sample
 from .scan import Scan, Telegram
 from .status import Status
 
 KINDS: dict[str, type[Sample]] = {
-    kind.topic: kind for kind in (Telegram, Scan, Marks, Zones, Foreground, Background, Status)
+    kind.topic: kind for kind in (Telegram, Scan, Marks, Zones, Foreground, Background, Status, Lines)
 }
 """What each topic carries."""
 

@@ -62,6 +62,26 @@ def marks(sample: scanhub.Marks) -> dict:
     return {"available": sample.available, "overflow": sample.overflow, "marks": found}
 
 
+def lines(sample: scanhub.Lines) -> dict:
+    def metres(value: float) -> float:
+        # Halves away from 0, as Rust rounds.
+        return math.copysign(math.floor(abs(value) * 1e6 + 0.5), value) / 1e6
+
+    said = {"readings": sample.readings, "points": sample.on_lines, "noise_m": metres(sample.noise_m)}
+    said["overflow"] = sample.overflow
+    found = []
+    for line in sample.lines:
+        of = {name: metres(getattr(line, name)) for name in ("x1_m", "y1_m", "x2_m", "y2_m", "r_m", "sd_r_m")}
+        of.update({name: getattr(line, name) for name in ("first", "last", "points")})
+        of["alpha_deg"], of["sd_alpha_deg"] = in_degrees(line.alpha_rad), in_degrees(line.sd_alpha_rad)
+        found.append(of)
+    corners = [
+        {"x_m": metres(at.x_m), "y_m": metres(at.y_m), "first": at.first_line, "second": at.second_line}
+        for at in sample.corners
+    ]
+    return {**said, "lines": found, "corners": corners}
+
+
 def zones(sample: scanhub.Zones) -> dict:
     said = {name: getattr(sample, name) for name in ("verdict", "nearest_mm", "nearest_beam", "invalid_beams")}
     said["zones"] = [zone._asdict() for zone in sample.zones]

@@ -42,7 +42,7 @@ def offsets_are_golden() -> None:
         else:
             assert getattr(its, words[0]).offset == int(words[1]), (its, line)
             said[-1][1].append(words[0])
-    assert len(said) == 11
+    assert len(said) == 14
     for name, fields in said:
         its = getattr(layout, name.split(".")[1])
         assert [field[0] for field in its._fields_] == fields, name
@@ -80,6 +80,12 @@ def payloads_say_what_they_are() -> None:
     of = processed.Marks("front", Chunk("marks"))
     assert (len(of.marks), of.available, of.overflow) == (64, False, True)
     assert of.marks[63] == (-0.002, 0x10203 / 10, 7, 0x405, 0x106, 0x108, True)
+
+    of = processed.Lines("front", Chunk("lines"))
+    assert (len(of.lines), len(of.corners), of.overflow) == (64, 64, True)
+    assert (of.readings, of.on_lines, of.noise_m) == (0x102, 0x304, 1)
+    assert of.lines[63] == (1, -1, 2, -2, 0.5, -0.5, 0.25, 4, 0x506, 0x708, 0x90A)
+    assert of.corners[63] == (1, -1, 62, 63)
 
     of = processed.Zones("front", Chunk("zones"))
     assert (of.verdict, of.nearest_beam, of.nearest_mm, of.invalid_beams) == ("slow", 0x102, 0x30405, 0x106)

@@ -37,7 +37,7 @@ impl Bounds {
 
 /// What went wrong in a stream, beside its samples.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum Notice {
+pub enum Notice {
     /// So many samples were sent and not received.
     Missed(u64),
     /// Nothing came for longer than the topic's samples are apart.

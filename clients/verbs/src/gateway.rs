@@ -2,39 +2,28 @@
 //! ordinary client of the hub that outlives it, its links and its own network. Takes nothing from the network.
 
 mod host;
-mod life;
-mod machine;
 mod network;
 mod report;
-mod selection;
-mod sensor;
 mod udp_destination;
 mod uplink;
 
 use std::io::Write;
 use std::os::fd::AsFd;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use lan::Key;
 use lan::outgoing::{ANNOUNCE_EVERY, Form};
-use scanhub_client::clock;
-use scanhub_client::streams::{GRACE, Session};
-use schema::{Domain, Failure, Kind, check_sensor};
+use schema::{Domain, Failure, Kind};
 
-use crate::discovery::Discovery;
-use crate::follow::Notice;
+use crate::forward::{Forwarder, Selection, begin_life};
 use crate::key_file;
 use crate::lossy_writer::LossyWriter;
-use crate::names::no_sensor;
 use crate::output::{End, quiet};
 use crate::stamp;
-use life::Life;
 use network::Network;
 use report::Report;
-use selection::Selection;
-use sensor::Sensor;
 use uplink::Uplink;
 
 /// What `gateway` is asked for.
@@ -42,7 +31,7 @@ use uplink::Uplink;
 pub struct GatewayOptions {
     /// The network interface of the groups; without one nothing goes to groups.
     pub interface: Option<String>,
-    /// `SENSOR/TOPIC`, `*/TOPIC` or `SENSOR/*`, with `:every=N` if it is to be thinned; none: all but telegrams, of all sensors.
+    /// `SENSOR/TOPIC`, `*/TOPIC` or `SENSOR/*`, with `:every=N` if it is to be thinned; none: all but telegrams and lines, of all sensors.
     pub topics: Vec<String>,
     /// `HOST:PORT` of those that get copies; a name is asked for again while it runs, as its address may change.
     pub to: Vec<String>,
@@ -118,18 +107,10 @@ pub fn gateway(
 
 struct Gateway<'a> {
     options: &'a GatewayOptions,
-    selection: Selection,
     /// Of its key, if there is one.
     key_name: Option<String>,
-    session: Session,
-    sensors: Vec<Sensor>,
+    forwarder: Forwarder,
     network: Network,
-    started: Instant,
-    discovery: Discovery,
-    is_there: bool,
-    /// The sensors that are named were found in a hub.
-    is_checked: bool,
-    waiting_said: bool,
     tick_at: Instant,
 }
 
@@ -148,10 +129,7 @@ impl<'a> Gateway<'a> {
         let key = options.key_file.as_deref().map(key_file::read).transpose()?;
         let interface = options.interface.as_deref().map(Uplink::open).transpose()?;
         let domain = options.places.first().map(Domain::name).unwrap_or_default();
-        let now_s = clock::wall_ns() / 1_000_000_000;
-        let machine = machine::machine(Path::new(machine::ID));
-        let way = interface.as_ref().map_or(HOSTS, Uplink::name);
-        let life = Life::begin(&life::directory()?, domain, way, now_s, machine)?;
+        let life = begin_life(domain, interface.as_ref().map_or(HOSTS, Uplink::name))?;
         let key_name = key.as_ref().map(Key::name);
         let form = match key {
             Some(key) => Form::Authenticated(key),
@@ -160,22 +138,8 @@ impl<'a> Gateway<'a> {
         };
         let mut network =
             Network::open(life, interface, &options.to, form, options.ttl, options.longest, stop)?;
-        let named = selection.named();
-        let sensors = named.iter().map(|name| Sensor::new(name, &selection, &mut network)).collect();
-        Ok(Gateway {
-            options,
-            sensors,
-            selection,
-            key_name,
-            session: Session::new(options.places.clone()),
-            network,
-            started: Instant::now(),
-            discovery: Discovery::default(),
-            waiting_said: false,
-            is_there: false,
-            is_checked: false,
-            tick_at: Instant::now(),
-        })
+        let forwarder = Forwarder::new(selection, &options.places, &mut network);
+        Ok(Gateway { options, key_name, forwarder, network, tick_at: Instant::now() })
     }
 
     fn run(&mut self, report: &mut Report<'_>, tell: &AtomicBool, stop: &AtomicBool) -> Result<(), End> {
@@ -195,67 +159,16 @@ impl<'a> Gateway<'a> {
                 report.interface(&self.network)?;
             }
             // What is there comes before the question whether the hub still is: that takes longer than sending.
-            let (mut more, mut subscribed) = (false, false);
-            for sensor in &mut self.sensors {
-                more |= sensor.forward(&mut self.session, &mut self.network, &mut subscribed)?;
-            }
+            let more = self.forwarder.forward(&mut self.network)?;
             let now = Instant::now();
-            self.look(report, now)?;
+            self.forwarder.look(now, &mut self.network, &mut |notice| report.hub(notice))?;
             self.tick(report, now)?;
             if tell.swap(false, Ordering::Relaxed) {
                 report.account(&self.network)?;
             }
             if !more {
-                let tick = self.tick_at.saturating_duration_since(now);
-                let left = self.sensors.iter().filter_map(Sensor::left).chain(self.discovery.left());
-                self.session.wait_for(Some(left.fold(tick, Duration::min)))?;
+                self.forwarder.wait(self.tick_at.saturating_duration_since(now))?;
             }
-        }
-        Ok(())
-    }
-
-    /// News of the hub, and the sensors of one that came.
-    fn look(&mut self, report: &mut Report<'_>, now: Instant) -> Result<(), End> {
-        let change = self.session.look()?;
-        if change.gone.is_some() && self.is_there {
-            self.is_there = false;
-            self.discovery.end();
-            report.hub(Notice::HubGone)?;
-        }
-        // Somebody else may bring the sensors of other machines, which are not sent on.
-        if change.back.is_some() && self.session.hub_lives() {
-            if self.discovery.has_begun() || self.waiting_said {
-                report.hub(Notice::HubBack)?;
-            }
-            self.is_there = true;
-            self.discovery.begin(now);
-        }
-        if !self.discovery.has_begun() && !self.waiting_said && now - self.started >= GRACE {
-            self.waiting_said = true;
-            report.hub(Notice::HubGone)?;
-        }
-        Ok(self.discover(now)?)
-    }
-
-    /// Follows the sensors of the hub if all are wanted; those that are named have to be there in the first hub.
-    fn discover(&mut self, now: Instant) -> Result<(), Failure> {
-        let Some(domain) = self.session.domain().filter(|_| self.is_there) else { return Ok(()) };
-        let Some(called) = self.discovery.call(domain, now)? else { return Ok(()) };
-        if self.selection.wants_all() {
-            for name in &called.sensors {
-                // One that came from another machine has another name.
-                let is_known = self.sensors.iter().any(|sensor| sensor.name == *name);
-                if !is_known && check_sensor(name).is_ok() {
-                    self.sensors.push(Sensor::new(name, &self.selection, &mut self.network));
-                }
-            }
-        }
-        if !self.is_checked && called.age >= GRACE {
-            let is_there = |name: &&str| called.sensors.iter().any(|it| it == name);
-            if let Some(name) = self.selection.named().into_iter().find(|name| !is_there(name)) {
-                return Err(no_sensor(name, &called.sensors));
-            }
-            self.is_checked = true;
         }
         Ok(())
     }
@@ -282,7 +195,7 @@ impl<'a> Gateway<'a> {
         if let Some(what) = self.network.outgoing.misfit() {
             report.misfit(&what, self.network.outgoing.longest())?;
         }
-        report.periodic(&self.network, self.is_there)
+        report.periodic(&self.network, self.forwarder.is_there())
     }
 
     fn announce(&mut self) {

@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 
 use scanhub_client::clock;
 use scanhub_client::streams::{Follower, GRACE, Session, find};
-use schema::{Counter, Domain, Failure, Kind, Pose, Status, check_followed, ipc};
+use schema::{Counter, Domain, Failure, Family, Kind, Pose, Status, check_followed, ipc};
 
 use crate::json;
 use crate::names::{as_word, no_sensor};
@@ -108,7 +108,6 @@ fn properties(sensor: &str, status: &Status, now_ns: u64) -> Vec<Vec<String>> {
         row("  type", known(status.sensor_type().into(), !status.sensor_type().is_empty())),
         row("  port", status.port().into()),
         row("  baud rate", known(format!("{} Bd", status.baud), status.baud != 0)),
-        row("  mode", known(format!("{:02x}h", status.mode), status.mode != Status::MODE_UNKNOWN)),
         row("  unit", known(format!("{} mm", status.unit_mm), status.unit_mm != 0)),
         row(
             "  view",
@@ -119,10 +118,22 @@ fn properties(sensor: &str, status: &Status, now_ns: u64) -> Vec<Vec<String>> {
         row("  pose", pose(&status.pose)),
         row("  marks", marks(sensor, status)),
     ];
+    if let Some(mode) = mode(status) {
+        rows.insert(6, row("  mode", mode));
+    }
     if !status.last_error().is_empty() {
         rows.push(row("  last error", status.last_error().into()));
     }
     rows
+}
+
+/// The number of an LMS's measuring mode, or the name of another scanner's, of which some have only one.
+fn mode(status: &Status) -> Option<String> {
+    match status.mode {
+        Status::MODE_UNKNOWN if status.family() == Some(Family::Lms) => Some("unknown".into()),
+        Status::MODE_UNKNOWN => status.way().map(str::to_owned),
+        mode => Some(format!("{mode:02x}h")),
+    }
 }
 
 /// What the line takes away: lately, and since the hub's start.
@@ -131,7 +142,7 @@ fn line(status: &Status) -> String {
     let lost = match (status.lost_on_line(), status.lost_share()) {
         (Some(lost), Some(share)) => {
             let due = status.counters[Counter::DueOnLine];
-            format!("{} of the scans lost in 10 s, {lost} of {due} in all", percent(share))
+            format!("{} of the {} lost in 10 s, {lost} of {due} in all", percent(share), status.sent())
         }
         _ => "the loss is not known".to_owned(),
     };
@@ -146,6 +157,9 @@ fn pose(pose: &Pose) -> String {
 
 fn marks(sensor: &str, status: &Status) -> String {
     match (status.has_reflector_bits(), status.reflector_remedy()) {
+        (None, _) if status.family() != Some(Family::Lms) => {
+            format!("those above link.{sensor}.marks.level, if that is set")
+        }
         (None, _) if status.is_replayed() => {
             format!("unavailable: the recording does not contain its measuring mode; set link.{sensor}.mode")
         }

@@ -11,6 +11,7 @@ pub mod duration;
 mod echo;
 mod file;
 mod follow;
+mod forward;
 mod gateway;
 mod hz;
 mod info;
@@ -27,6 +28,7 @@ mod mask;
 mod names;
 mod output;
 mod receive_stats;
+mod reception;
 #[cfg(feature = "record")]
 mod record;
 mod selection;
@@ -35,7 +37,22 @@ mod stamp;
 mod text;
 #[cfg(feature = "tui")]
 mod watch;
+#[cfg(feature = "web")]
+mod web;
 mod window;
+#[cfg(any(feature = "tui", feature = "web"))]
+mod work;
+
+/// What carries samples to other machines and back has in common, whatever the network: the programs `scanhub` and
+/// `scanhub-bridge` are built of it.
+pub mod network {
+    pub use crate::follow::Notice;
+    pub use crate::forward::{Carrier, Forwarder, Life, Selection, begin_life, tell};
+    pub use crate::lossy_writer::LossyWriter;
+    pub use crate::output::{End, Output, quiet};
+    pub use crate::reception::{Origin, Reception, Wanted, Words};
+    pub use crate::stamp::now;
+}
 
 pub use background::{BackgroundOptions, ModelOrder, background, saved_model};
 pub use control::{ControlOptions, control};
@@ -55,3 +72,5 @@ pub use mask::{MaskOptions, mask};
 pub use record::{RecordLook, RecordOptions, Split, record};
 #[cfg(feature = "tui")]
 pub use watch::{WatchOptions, watch};
+#[cfg(feature = "web")]
+pub use web::{WebOptions, web};

@@ -9,7 +9,7 @@ use std::time::{Duration, Instant};
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 
 /// Writes each piece at once or not at all.
-pub(crate) struct LossyWriter<'a, W> {
+pub struct LossyWriter<'a, W> {
     to: &'a mut W,
     /// There is nothing left to send: then who reads is waited for, for a while.
     stop: &'a AtomicBool,
@@ -20,8 +20,8 @@ pub(crate) struct LossyWriter<'a, W> {
 const PATIENCE: Duration = Duration::from_secs(1);
 
 impl<'a, W: Write + AsFd> LossyWriter<'a, W> {
-    /// Pieces to `to`; not waited for before `stop` is set.
-    pub(crate) fn around(to: &'a mut W, stop: &'a AtomicBool) -> LossyWriter<'a, W> {
+    /// Makes a writer of pieces to `to`, which is not waited for before `stop` is set.
+    pub fn around(to: &'a mut W, stop: &'a AtomicBool) -> LossyWriter<'a, W> {
         LossyWriter { to, stop, left: PATIENCE }
     }
 

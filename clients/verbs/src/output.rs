@@ -8,7 +8,7 @@ use serde::Serialize;
 
 /// Why a verb ended early.
 #[derive(Debug)]
-pub(crate) enum End {
+pub enum End {
     /// The reader of the output closed it.
     ReaderGone,
     /// It failed.
@@ -30,8 +30,12 @@ impl From<io::Error> for End {
     }
 }
 
-/// A reader that went away is no failure: `scanhub echo front/scan | head` is normal use.
-pub(crate) fn quiet(result: Result<(), End>) -> Result<(), Failure> {
+/// Makes a success of a reader that went away: `scanhub echo front/scan | head` is normal use.
+///
+/// # Errors
+///
+/// What else it ended by.
+pub fn quiet(result: Result<(), End>) -> Result<(), Failure> {
     match result {
         Ok(()) | Err(End::ReaderGone) => Ok(()),
         Err(End::Failure(failure)) => Err(failure),
@@ -39,28 +43,36 @@ pub(crate) fn quiet(result: Result<(), End>) -> Result<(), Failure> {
 }
 
 /// Writes whole lines; the buffer is used again and again.
-pub(crate) struct Output<'a> {
+pub struct Output<'a> {
     out: &'a mut dyn Write,
     line: Vec<u8>,
 }
 
 impl<'a> Output<'a> {
-    /// Lines to `out`.
-    pub(crate) fn new(out: &'a mut dyn Write) -> Output<'a> {
+    /// Makes an output of lines to `out`.
+    pub fn new(out: &'a mut dyn Write) -> Output<'a> {
         Output { out, line: Vec::with_capacity(8192) }
     }
 
-    /// A line of JSON, which a terminal does not obey either.
-    pub(crate) fn json(&mut self, value: &impl Serialize) -> Result<(), End> {
+    /// Writes a line of JSON, which a terminal does not obey either.
+    ///
+    /// # Errors
+    ///
+    /// As [`End`] says.
+    pub fn json(&mut self, value: &impl Serialize) -> Result<(), End> {
         self.line.clear();
         serde_json::to_writer(&mut self.line, value).map_err(io::Error::from)?;
         escape_json(&mut self.line);
         self.end()
     }
 
-    /// A line of text that `build` makes, without its end. What would move a terminal's cursor or change its colours is
+    /// Writes a line of text that `build` makes, without its end. What would move a terminal's cursor or change its colours is
     /// shown as `?`: ports, types and errors may come from another machine.
-    pub(crate) fn line(&mut self, build: impl FnOnce(&mut Vec<u8>) -> io::Result<()>) -> Result<(), End> {
+    ///
+    /// # Errors
+    ///
+    /// As [`End`] says, and what `build` says.
+    pub fn line(&mut self, build: impl FnOnce(&mut Vec<u8>) -> io::Result<()>) -> Result<(), End> {
         self.line.clear();
         build(&mut self.line)?;
         disarm(&mut self.line);

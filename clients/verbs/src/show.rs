@@ -6,7 +6,7 @@ use std::io;
 use scanhub_client::streams::{RobotHeard, Sample};
 use scanhub_client::{Heard, Received};
 use schema::ipc::Payload;
-use schema::{Background, Foreground, Header, Marks, Scan, Status, Zones};
+use schema::{Background, Foreground, Header, Lines, Marks, Scan, Status, Zones};
 use serde::Serialize;
 
 use crate::output::{End, Output};
@@ -53,6 +53,7 @@ shown! {
     [u8], telegram(header);
     Scan, scan(header);
     Marks, marks(header);
+    Lines, lines(header);
     Foreground, foreground(header);
     Background, background;
     Status, status;

@@ -3,7 +3,7 @@
 use lan::Stamp;
 use scanhub_client::clock;
 
-/// This moment.
-pub(crate) fn now() -> Stamp {
+/// Returns this moment.
+pub fn now() -> Stamp {
     Stamp { monotonic_ns: clock::now_ns(), wall_ns: clock::wall_ns() }
 }

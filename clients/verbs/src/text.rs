@@ -2,6 +2,7 @@
 
 mod processed;
 
+use std::f64::consts::TAU;
 use std::fmt;
 use std::io::{self, Write};
 
@@ -13,7 +14,7 @@ use crate::names::TopicName;
 use crate::receive_stats::ReceiveStats;
 use crate::show;
 
-pub(crate) use processed::{background, foreground, marks, robot, zones};
+pub(crate) use processed::{background, foreground, lines, marks, robot, zones};
 
 /// Bytes as lower hex, without spaces.
 pub(crate) struct Hex<'a>(pub(crate) &'a [u8]);
@@ -100,12 +101,21 @@ pub(crate) fn scan(line: &mut Vec<u8>, header: &Header, scan: &Scan) -> io::Resu
     numbers(line, header)?;
     let beams = scan.beams();
     // Those of the grid: exact ones of the first beams may be a turn more or less.
-    let last = in_degrees(scan.first_angle + scan.step * beams.saturating_sub(1) as f64);
-    write!(line, " {beams} beams {} to {last} deg", in_degrees(scan.first_angle))?;
+    let (first, last) = (scan.first_angle, scan.first_angle + scan.step * beams.saturating_sub(1) as f64);
+    if (last - first).abs() + scan.step.abs() > TAU - 1e-6 {
+        write!(line, " {beams} beams all around")?;
+    } else {
+        write!(line, " {beams} beams {} to {} deg", in_degrees(first), in_degrees(last))?;
+    }
     let valid = (0..beams).filter_map(|i| Some((scan.distance_mm(i)?, i)));
     write!(line, " {} valid", valid.clone().count())?;
     match valid.min() {
-        Some((mm, i)) => write!(line, " nearest {mm} mm at {} deg", scan.angle_deg(i)),
+        Some((mm, i)) => {
+            // The shorter way around from ahead.
+            let angle = scan.angle(i);
+            let turns = (angle / TAU).round();
+            write!(line, " nearest {mm} mm at {} deg", in_degrees(angle - TAU * turns))
+        }
         None => Ok(()),
     }
 }

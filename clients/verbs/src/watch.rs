@@ -7,11 +7,8 @@ mod golden;
 mod hub_requests;
 mod keys;
 mod map;
-mod meter;
-mod scene;
 mod screen;
 mod view;
-mod work;
 
 use std::io::Write;
 use std::sync::atomic::AtomicBool;
@@ -25,11 +22,11 @@ use crate::follow::{Bounds, Notice, Sink, follow};
 use crate::names::{TopicName, as_word};
 use crate::output::{End, quiet};
 use crate::receive_stats::ReceiveStats;
+use crate::work::Work;
 use hub_requests::HubRequests;
 use scene::Scene;
 use screen::{News, Screen};
 use view::{View, Wish};
-use work::Work;
 
 /// What `watch` is asked for.
 #[derive(Clone, Debug)]

@@ -4,7 +4,7 @@
 use std::fmt;
 
 use preprocess::background::{Candidate, Method, Start};
-use preprocess::{marks, zones};
+use preprocess::{lines, marks, zones};
 use schema::limits::TopicLimits;
 use schema::{Failure, Pose};
 use serde::Serialize;
@@ -83,6 +83,10 @@ impl List {
         }
         self.put(of("marks.max_range_step"), json!(metres(max_range_step_mm)), DEFAULT);
         self.put(of("marks.max_gap"), json!(max_gap), DEFAULT);
+        let lines::Settings { max, min_points, polish, stop: _ } = processing.lines;
+        self.put(of("lines.max"), json!(max), DEFAULT);
+        self.put(of("lines.min_points"), json!(min_points), DEFAULT);
+        self.put(of("lines.polish"), json!(polish), DEFAULT);
         self.background(name, &processing.background);
     }
 

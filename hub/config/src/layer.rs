@@ -1,6 +1,7 @@
 //! One source of configuration on top of the others. Every value is checked in its own source, so that an error names
 //! file, line and column, or the flag.
 
+mod flags;
 mod gateway;
 mod limits;
 mod processing;
@@ -21,10 +22,11 @@ use crate::link::{Link, MAX_LINKS};
 use crate::origin::Origin;
 use crate::processing::Processing;
 use crate::scanner::Scanner;
+pub(crate) use flags::{link, setting};
 use gateway::GatewayLayer;
 use limits::LimitsLayer;
-use processing::{BackgroundLayer, MarksLayer, PoseLayer, Sections, ZonesLayer};
-use scanner::{ScannerDraft, ScannerLayer};
+use processing::{BackgroundLayer, LinesLayer, MarksLayer, PoseLayer, Sections, ZonesLayer};
+use scanner::{ScannerDraft, ScannerLayer, remedy_of_lms};
 use sight::Sight;
 
 /// What one source says. Knows the keys; what is not here is an unknown key.
@@ -35,6 +37,7 @@ pub(crate) struct Layer {
     link: Vec<LinkLayer>,
     zones: Option<ZonesLayer>,
     marks: Option<MarksLayer>,
+    lines: Option<LinesLayer>,
     background: Option<BackgroundLayer>,
     limits: Option<LimitsLayer>,
     /// The hub's own configuration may be that of its gateway, too.
@@ -61,6 +64,7 @@ struct LinkLayer {
     pose: Option<PoseLayer>,
     zones: Option<ZonesLayer>,
     marks: Option<MarksLayer>,
+    lines: Option<LinesLayer>,
     background: Option<BackgroundLayer>,
 }
 
@@ -102,13 +106,13 @@ impl Drafts {
 
     /// Lays `layer` over the others; only where `may_add` may it bring links that were not there.
     pub(crate) fn merge(&mut self, layer: Layer, origin: Origin, may_add: bool) -> Result<(), Failure> {
-        let Layer { link, zones, marks, background, limits, gateway: _ } = layer;
+        let Layer { link, zones, marks, lines, background, limits, gateway: _ } = layer;
         if let Some(section) = limits {
             section.lay(&origin, &mut self.limits)?;
         }
         let origin = Rc::new(origin);
         merge(&mut self.links, link, &origin, may_add)?;
-        self.general.push((origin, Sections { pose: None, zones, marks, background }));
+        self.general.push((origin, Sections { pose: None, zones, marks, lines, background }));
         Ok(())
     }
 
@@ -142,7 +146,7 @@ impl Draft {
             ];
             if let Some((place, key)) = of_lms.into_iter().flatten().next() {
                 let what = format!("{key} is of family lms; a scanner of another family has no such setting");
-                return Err(refuse(&place, what, "leave it out, or set family = \"lms\""));
+                return Err(refuse(&place, what, &remedy_of_lms(key, &scanner)));
             }
         }
         let (unit, baud) = (unit.map(|said| said.value), baud.map_or(Baud::B500000, |said| said.value));
@@ -311,12 +315,16 @@ fn merge(
         if let Some(baud) = link.baud {
             let value = Baud::of_rate(*baud.get_ref()).ok_or_else(|| {
                 let what = format!("baud = {}", baud.get_ref());
-                origin.refuse(Some(baud.span()), what, "500000, 38400, 19200 or 9600")
+                origin.refuse(
+                    Some(baud.span()),
+                    what,
+                    "500000, 38400, 19200 or 9600; it is of an LMS, and the rate of others is the model's",
+                )
             })?;
             draft.baud = Some(Said { value, place: origin.place(Some(baud.span())) });
         }
-        let LinkLayer { pose, zones, marks, background, .. } = link;
-        draft.own.push((origin.clone(), Sections { pose, zones, marks, background }));
+        let LinkLayer { pose, zones, marks, lines, background, .. } = link;
+        draft.own.push((origin.clone(), Sections { pose, zones, marks, lines, background }));
     }
     Ok(())
 }
@@ -333,61 +341,6 @@ fn whole(
     let known = |v: &Variant| if scale == 1.0 { v.angle_deg } else { v.resolution_cdeg };
     let found = Variant::ALL.iter().map(known).find(|&number| f64::from(number) == scaled);
     found.ok_or_else(|| origin.refuse(Some(value.span()), format!("{key} = {}", value.get_ref()), allowed))
-}
-
-/// `link.NAME.KEY=VALUE`, or a key of all links as `zones.margin=0.05`, as TOML; a value that is none is taken as text.
-pub(crate) fn setting(flag: &str) -> Option<String> {
-    let (path, value) = flag.split_once('=')?;
-    let (table, key) = path.split_once('.')?;
-    let (head, key) = match (table, key.split_once('.')) {
-        ("link", Some((name, key))) => (format!("[[link]]\nname = {}\n", quoted(name)), key),
-        ("link", None) => return None,
-        _ => (String::new(), path),
-    };
-    let is_key = |c: char| c.is_ascii_alphanumeric() || c == '_' || c == '-';
-    if key == "name" || key.split('.').any(|word| word.is_empty() || !word.chars().all(is_key)) {
-        return None;
-    }
-    Some(format!("{head}{key} = {}", written(value)))
-}
-
-/// `NAME=PORT`, which may end with `,KEY=VALUE` as often as it likes, as TOML.
-pub(crate) fn link(flag: &str) -> Option<String> {
-    let (name, rest) = flag.split_once('=')?;
-    let is_set = |part: &&str| {
-        part.split_once('=')
-            .is_some_and(|(key, _)| key.chars().all(|c| c.is_ascii_lowercase() || c == '_' || c == '.'))
-    };
-    // A comma may be in the name of a port.
-    let parts: Vec<&str> = rest.split(',').collect();
-    let set = parts.iter().rev().take_while(|part| is_set(part)).count().min(parts.len() - 1);
-    let (port, set) = parts.split_at(parts.len() - set);
-    let mut text = format!("[[link]]\nname = {}\nport = {}", quoted(name), quoted(&port.join(",")));
-    for (key, value) in set.iter().filter_map(|part| part.split_once('=')) {
-        text = format!("{text}\n{key} = {}", written(value));
-    }
-    Some(text)
-}
-
-/// `value` as TOML: as text, if it is nothing else.
-fn written(value: &str) -> String {
-    match toml::from_str::<toml::Table>(&format!("v = {value}")) {
-        Ok(table) if table.len() == 1 => value.to_owned(),
-        _ => quoted(value),
-    }
-}
-
-/// As a TOML string.
-pub(crate) fn quoted(text: &str) -> String {
-    let escaped: String = text
-        .chars()
-        .map(|c| match c {
-            '"' | '\\' => format!("\\{c}"),
-            c if c.is_control() => format!("\\u{:04X}", c as u32),
-            c => c.to_string(),
-        })
-        .collect();
-    format!("\"{escaped}\"")
 }
 
 /// The modes whose values are ranges (Telegram listing, 77h block D).

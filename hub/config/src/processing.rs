@@ -1,11 +1,11 @@
-//! How the hub processes the scans of a link: the effective values of sections pose, zones, marks and background. Refuses
-//! to know where they were set.
+//! How the hub processes the scans of a link: the effective values of sections pose, zones, marks, lines and background.
+//! Refuses to know where they were set.
 
 use std::path::PathBuf;
 
 use crate::link::Link;
 use preprocess::background::Settings as Learning;
-use preprocess::{marks, zones};
+use preprocess::{lines, marks, zones};
 use schema::{Failure, Kind, Pose, SavedModel, regular};
 
 /// How the scans of one link are processed.
@@ -17,6 +17,8 @@ pub struct Processing {
     pub zones: Zones,
     /// How reflector marks are found.
     pub marks: marks::Settings,
+    /// How straight lines are found.
+    pub lines: lines::Settings,
     /// How the background is learned.
     pub background: Background,
 }

@@ -64,9 +64,10 @@ fn the_page_holds() {
         (Family::Rplidar, true, None, false)
     );
     // What the page shows as the values without a word are those: the front's are changed in these sections.
-    let Processing { zones, marks, background, .. } = Processing::default();
+    let Processing { zones, marks, lines, background, .. } = Processing::default();
     let shown = &rear.processing;
     assert_eq!((&shown.zones, shown.marks, &shown.background), (&zones, marks, &background));
+    assert_eq!(shown.lines, lines);
 }
 
 #[test]
@@ -90,10 +91,15 @@ fn a_link_wins_over_all_links_and_the_later_source_over_the_earlier() {
         "second.toml",
         "[zones]\nmargin = 0.01\nradii = [2.0]\nself_min = [{ from_deg = -77.5, to_deg = -60, range = 0.42 }]\n\
          [background]\nmethod = \"paper\"\ncandidate = \"latest\"\nthreshold_mm = 40\nscans = 100\n\
-         publish = \"every-scan\"\nstart = \"first-scan\"\n[marks]\nmax_range_step = 0.2\ni_min = 2\nmax_gap = 1\n",
+         publish = \"every-scan\"\nstart = \"first-scan\"\n[marks]\nmax_range_step = 0.2\ni_min = 2\nmax_gap = 1\n\
+         [lines]\nmax = 20\npolish = true\n",
     );
     let set = ["link.a.pose.x=-0.25", "link.a.pose.upside_down=true", "zones.radii=[1.2,0.7]"];
-    let set = [&set[..], &["link.b.background.method=off", "link.b.zones.exact=false"]].concat();
+    let set = [
+        &set[..],
+        &["link.b.background.method=off", "link.b.zones.exact=false", "link.b.lines.min_points=9"],
+    ]
+    .concat();
     let [a, b] = [0, 1].map(|link| processing(&[&first, &second], &set, link));
     assert_eq!((a.pose.x_m, a.pose.y_m, a.pose.yaw_rad, a.pose.upside_down), (-0.25, 0.0, 1.5, 1));
     assert_eq!((a.zones.margin_mm, b.zones.margin_mm), (50, 10));
@@ -108,6 +114,8 @@ fn a_link_wins_over_all_links_and_the_later_source_over_the_earlier() {
     assert_eq!((learning.threshold_mm, learning.candidate_mm, learning.scans), (Some(40), None, Some(100)));
     assert_eq!((a.background.is_kept, b.background.is_kept, a.background.every_scan), (true, false, true));
     assert_eq!((a.marks.max_range_step_mm, a.marks.i_min, a.marks.max_gap), (200, 2, 1));
+    assert_eq!((a.lines.max, a.lines.min_points, a.lines.polish), (20, 5, true));
+    assert_eq!((b.lines.max, b.lines.min_points, b.lines.polish), (20, 9, true));
 }
 
 #[test]
@@ -160,6 +168,8 @@ fn what_cannot_be_is_refused_with_place_value_and_remedy() {
         ),
         ("marks.max_range_step=100", "max_range_step = 100\n  metres"),
         ("marks.max_gap=-1", "max_gap = -1"),
+        ("lines.max=65", "max = 65\n  a whole number from 1 to 64"),
+        ("lines.min_points=2", "min_points = 2\n  a whole number from 3 to 8192"),
         ("background.method=mult", "`mult`\n  did you mean `multi`? Possible here: multi, paper, off"),
         ("background.threshold_mm=0", "threshold_mm = 0\n  a whole number from 1 to 10000"),
         ("background.scans=-4", "scans = -4"),

@@ -78,8 +78,8 @@ fn a_link_has_a_family_and_what_its_family_needs() {
         (&[family], "beams=-450", "beams = -450\n  a whole number"),
         (
             &[family],
-            "model=LD19",
-            "link front: model = \"LD19\"\n  auto, or one of: ld06, ld19, stl19p, stl27l, ld14p",
+            "model=LD18",
+            "link front: model = \"LD18\"\n  auto, or one of: ld06, ld19, stl19p, stl27l, ld14p",
         ),
         (&[family], "type=lms200", &format!("link front: type {lms}")),
         (&[family], "angle=180", &format!("link front: angle {lms}")),
@@ -105,7 +105,12 @@ fn a_link_has_a_family_and_what_its_family_needs() {
             "marks.i_min=2",
             "i_min, and the intensities of an ld are counts of any surface\n  level is the least of a reflector",
         ),
-        (&[family], "baud=38400", &format!("link front: baud {lms}")),
+        (
+            &[family],
+            "baud=38400",
+            "link front: baud is of family lms; a scanner of another family has no such setting\n  \
+             leave it out: the rate is the model's",
+        ),
     ] {
         let setting = format!("link.front.{setting}");
         let refusal = front(&[others, &[setting.as_str()]].concat()).expect_err(&setting);
@@ -125,6 +130,9 @@ fn a_mode_and_rest_are_for_those_that_have_them() {
     assert_eq!(set(&[]), ("auto", None, false));
     let said = ["link.front.model=s2", "link.front.mode=denseboost", "link.front.idle=stop"];
     assert_eq!(set(&said), ("s2", Some("denseboost"), true));
+    let shouted = ["link.front.model=S2", "link.front.mode=DenseBoost", "link.front.idle=stop"];
+    assert_eq!(set(&shouted), set(&said));
+    assert_eq!(set(&["link.front.model=Auto"]).0, "auto");
     let link = front(&said).unwrap();
     assert_eq!((link.rate(), link.beams()), (1_000_000, 3200));
     // The later source wins, also over the number of an LMS.
@@ -132,6 +140,8 @@ fn a_mode_and_rest_are_for_those_that_have_them() {
     for (setting, words) in [
         ("mode=fast", "link front: mode = \"fast\"\n  auto, or one of: standard, express, boost"),
         ("mode=1", "link front: mode is of family lms"),
+        ("mode=1", "\n  name one of: standard, express"),
+        ("baud=38400", "\n  leave it out: the rate is the model's"),
         ("model=a4", "link front: model = \"a4\"\n  auto, or one of: a1, a2m8, a2m12, a3, s1, s2, s3, c1"),
     ] {
         let setting = format!("link.front.{setting}");

@@ -34,6 +34,7 @@ pub(crate) struct Diagnosis<'a> {
 struct Facts {
     state: State,
     trouble: Option<Trouble>,
+    other_model: Option<&'static str>,
     unit: Option<Unit>,
     notice: Option<Notice>,
 }
@@ -60,6 +61,7 @@ impl<'a> Diagnosis<'a> {
         let facts = Facts {
             state,
             trouble: driver.trouble(),
+            other_model: driver.other_model().map(|model| model.name),
             unit: sensor.and_then(|sensor| sensor.unit),
             notice: sensor.and_then(|sensor| sensor.notices().next()),
         };
@@ -176,9 +178,15 @@ impl<'a> Diagnosis<'a> {
                 expected.mm()
             ));
         }
+        let name = &self.link.name;
+        if let Some((is, Scanner::Turning(turning))) = driver.other_model().zip(Some(self.link.scanner)) {
+            return Some(format!(
+                "the configuration says model {}, and it is {}, or speaks like it: set link.{name}.model",
+                turning.model.name, is.name
+            ));
+        }
         let (model, beams) = driver.model()?;
         let Scanner::Turning(turning) = self.link.scanner else { return None };
-        let name = &self.link.name;
         (beams < model.beams && beams == self.link.beams() && turning.is_auto()).then(|| {
             format!(
                 "its turns have {} points, and there is room for {}: set link.{name}.model or link.{name}.beams",

@@ -117,6 +117,27 @@ impl<'a, S: Surroundings> Drive<'a, S> {
         self.drain(core, open)
     }
 
+    /// The hub ends: the scanner is told what it is to be told then.
+    pub(crate) fn end(&self, core: &LinkCore<'a, S>, open: &mut Open<S::Line>) -> io::Result<()> {
+        let Open { line, session, .. } = open;
+        if !session.end(core.around.now()) {
+            return Ok(());
+        }
+        loop {
+            match session.poll_output() {
+                Output::SetDtr(on) => line.set_dtr(on)?,
+                Output::Transmit { byte, not_before } => {
+                    core.around.pause(not_before);
+                    line.write(byte)?;
+                    session.transmitted(core.around.now());
+                }
+                // What is heard now is for nobody.
+                Output::SetRate(_) | Output::Heard(_) => {}
+                Output::Rest(_) | Output::Wait { .. } => return Ok(()),
+            }
+        }
+    }
+
     fn read(&mut self, core: &mut LinkCore<'a, S>, open: &mut Open<S::Line>) -> io::Result<()> {
         let Open { line, session, allowance, backlog, watch, until, .. } = open;
         let around = core.around;

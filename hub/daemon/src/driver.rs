@@ -6,7 +6,7 @@ use std::fmt;
 
 use config::{Link, Scanner};
 use line::family::Model;
-use line::{Account, Control, Nanos, Output, State};
+use line::{Nanos, Output};
 use lms::variant::Baud;
 use lms::{Identity, Settings};
 use port::Source;
@@ -75,6 +75,16 @@ impl Driver {
         if let Driver::Lms(session) = self { Some(session) } else { None }
     }
 
+    /// What it is in words, where its head turns; nothing before that is known.
+    pub(crate) fn kind(&self) -> Option<String> {
+        if let Driver::Turning(session) = self { session.kind() } else { None }
+    }
+
+    /// What it turned out to be, where its head turns, if another model is configured.
+    pub(crate) fn other_model(&self) -> Option<Model> {
+        if let Driver::Turning(session) = self { session.other_model() } else { None }
+    }
+
     /// What is at the other end, where its head turns, and the beams of its scans; nothing before that is known.
     pub(crate) fn model(&self) -> Option<(Model, usize)> {
         let Driver::Turning(session) = self else { return None };
@@ -120,37 +130,7 @@ impl line::Session for Driver {
     type Why = ();
     type Trouble = Trouble;
 
-    fn spare(&mut self) -> &mut [u8] {
-        each!(self, session => session.spare())
-    }
-
-    fn commit(&mut self, now: Nanos, len: usize) {
-        each!(self, session => session.commit(now, len))
-    }
-
-    fn may_leave(&self) -> bool {
-        each!(self, session => session.may_leave())
-    }
-
-    fn leave(&mut self, now: Nanos, waiting: usize) -> bool {
-        each!(self, session => session.leave(now, waiting))
-    }
-
-    fn handle_timeout(&mut self, now: Nanos) {
-        each!(self, session => session.handle_timeout(now))
-    }
-
-    fn control(&mut self, control: Control, now: Nanos) {
-        each!(self, session => session.control(control, now))
-    }
-
-    fn followed(&mut self, now: Nanos, is_followed: bool) {
-        each!(self, session => session.followed(now, is_followed))
-    }
-
-    fn transmitted(&mut self, now: Nanos) {
-        each!(self, session => session.transmitted(now))
-    }
+    line::delegate_session!(each);
 
     fn poll_output(&mut self) -> Output<Heard<'_>, ()> {
         match self {
@@ -159,22 +139,10 @@ impl line::Session for Driver {
         }
     }
 
-    fn state(&self) -> State {
-        each!(self, session => session.state())
-    }
-
     fn trouble(&self) -> Option<Trouble> {
         match self {
             Driver::Lms(session) => session.trouble().map(Trouble::Lms),
             Driver::Turning(session) => session.trouble().map(Trouble::Turning),
         }
-    }
-
-    fn rate(&self) -> u32 {
-        each!(self, session => session.rate())
-    }
-
-    fn account(&self) -> Account {
-        each!(self, session => session.account())
     }
 }

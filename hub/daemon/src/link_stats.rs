@@ -147,11 +147,13 @@ impl LinkStats {
     fn describe(&mut self, driver: &Driver) {
         let known_rate = matches!(self.status.state(), Some(State::Streaming | State::Starting));
         self.status.baud = if known_rate { driver.rate() } else { 0 };
-        if let Some((model, beams)) = driver.model() {
+        if let Some(kind) = driver.kind() {
+            self.status.set_sensor_type(&kind);
+        }
+        if let Some((_, beams)) = driver.model() {
             self.status.unit_mm = 1;
             self.status.angle_deg = 360;
             self.status.resolution_cdeg = (36_000.0 / beams as f64).round() as u16;
-            self.status.set_sensor_type(&model.name.to_uppercase());
         }
         let Some(sensor) = driver.lms().map(lms::Session::sensor) else { return };
         self.status.mode = sensor.mode.or(self.mode).map_or(Status::MODE_UNKNOWN, |mode| mode.0);

@@ -1,20 +1,22 @@
-//! What the hub makes of each scan of a link: marks, zones, foreground. One after the other on the scan where it was
+//! What the hub makes of each scan of a link: marks, lines, zones, foreground. One after the other on the scan where it was
 //! decoded, each into the payload that is given. Refuses to know topics, and who listens.
 
 use std::fmt;
 
 use config::Processing;
 use preprocess::background::{Mismatch, Model};
+use preprocess::lines::LineFinder;
 use preprocess::marks::MarkDetector;
 use preprocess::segments::Segmenter;
 use preprocess::zones::Check;
-use schema::{Background, Failure, Foreground, Kind, Marks, Pose, Scan, Verb, Zones};
+use schema::{Background, Failure, Foreground, Kind, Lines, Marks, Pose, Scan, Verb, Zones};
 
 /// The processors of one link. Suspect scans take the same way as clean ones: an obstacle counts also where it is only
 /// suspected, and a background needs hundreds of scans in agreement, which the one bad one among them does not spoil.
 pub(crate) struct Pipeline {
     pub(crate) zones: Check,
     marks: MarkDetector,
+    lines: LineFinder,
     background: Option<BackgroundStage>,
     /// By which they are made.
     processing: Processing,
@@ -66,16 +68,18 @@ impl fmt::Display for Relearned {
 #[derive(Default)]
 pub(crate) struct Outputs<'a> {
     pub(crate) marks: Option<&'a mut Marks>,
+    pub(crate) lines: Option<&'a mut Lines>,
     pub(crate) foreground: Option<&'a mut Foreground>,
 }
 
 impl Pipeline {
     /// The processors as configured, with the model to begin with, for scans of at most `beams` beams.
     pub(crate) fn new(processing: &Processing, beams: usize) -> Pipeline {
-        let Processing { pose, zones, marks, background } = processing;
+        let Processing { pose, zones, marks, lines, background } = processing;
         Pipeline {
             zones: Check::new(*pose, &zones.settings(), beams),
             marks: MarkDetector::new(*marks),
+            lines: LineFinder::new(*pose, *lines, beams),
             background: background.is_kept.then(|| BackgroundStage::new(processing, beams)),
             processing: processing.clone(),
             beams,
@@ -92,11 +96,12 @@ impl Pipeline {
     /// seen its scans; a background stays, as far as it is known.
     pub(crate) fn change(&mut self, processing: &Processing) {
         let before = std::mem::replace(&mut self.processing, processing.clone());
-        let Processing { pose, zones, marks, background } = &self.processing;
+        let Processing { pose, zones, marks, lines, background } = &self.processing;
         if (pose, zones) != (&before.pose, &before.zones) {
             self.zones = Check::new(*pose, &zones.settings(), self.beams);
         }
         self.marks = MarkDetector::new(*marks);
+        self.lines.change(*pose, *lines);
         match &mut self.background {
             Some(kept) if background.is_kept => {
                 kept.cutter = Segmenter::new(*pose, self.beams);
@@ -118,6 +123,9 @@ impl Pipeline {
     pub(crate) fn examine(&mut self, scan: &Scan, out: Outputs<'_>) -> Option<Relearned> {
         if let Some(marks) = out.marks {
             self.marks.update(scan, marks);
+        }
+        if let Some(lines) = out.lines {
+            self.lines.update(scan, lines);
         }
         self.background.as_mut()?.update(scan, out.foreground, &mut self.spare.foreground)
     }

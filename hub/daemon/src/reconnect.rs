@@ -109,7 +109,9 @@ impl<'a, S: Surroundings> LiveLink<'a, S> {
 
     /// The hub ends: hands on what was learned.
     pub fn end(mut self) {
-        if let Phase::Open(open) = &self.phase {
+        if let Phase::Open(open) = &mut self.phase {
+            // If the line goes just now, there is nobody to be told.
+            let _ = self.drive.end(&self.core, open);
             self.core.close(&open.session);
         }
         self.core.end();

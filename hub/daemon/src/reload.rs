@@ -98,6 +98,7 @@ impl Differences {
             ("pose", before.pose != after.pose),
             ("zones", before.zones != after.zones),
             ("marks", before.marks != after.marks),
+            ("lines", before.lines != after.lines),
             ("background", before.background != after.background),
         ]);
         let begin = |link: &Link| {
@@ -187,6 +188,7 @@ mod tests {
                 "zones.radii=[2.0]",
                 "link.a.pose.x=0.3",
                 "link.b.marks.i_min=2",
+                "link.b.lines.polish=true",
                 "link.b.angle=100",
                 "link.b.resolution=0.25",
                 "link.b.unit=cm",
@@ -200,7 +202,10 @@ mod tests {
             .iter()
             .map(|(name, to, sections)| (name.as_str(), &to.zones.radii_mm[..], &sections[..]))
             .collect();
-        assert_eq!(now, [("a", &[2000][..], &["pose", "zones"][..]), ("b", &[2000], &["zones", "marks"])]);
+        assert_eq!(
+            now,
+            [("a", &[2000][..], &["pose", "zones"][..]), ("b", &[2000], &["zones", "marks", "lines"])]
+        );
         let later: Vec<_> = later.iter().map(|(name, what)| (name.as_str(), what.join(" "))).collect();
         assert_eq!(
             later,

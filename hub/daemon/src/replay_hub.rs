@@ -99,16 +99,18 @@ struct Sensor {
     /// What it is.
     family: Family,
     /// Where its head turns: the model, and the beams that were recorded, as far as they are known.
-    model: Option<Model>,
+    model: Result<Option<Model>, Failure>,
     beams: Option<usize>,
+    /// The way in which it measures.
+    way: Option<&'static str>,
 }
 
 impl Sensor {
     /// The sensor of `recording`, which has no other one, for `link`.
-    fn new(recorded: Option<String>, link: String, recording: &Recording) -> Result<Sensor, Failure> {
-        let beams = recording.contents().beams.map(usize::from);
+    fn new(recorded: Option<String>, link: String, recording: &Recording) -> Sensor {
         let family = recording.family().unwrap_or(Family::Lms);
-        Ok(Sensor { recorded, link, family, model: recording.model()?, beams })
+        let (model, beams, way) = (recording.model(), recording.beams(), recording.contents().way);
+        Sensor { recorded, link, family, model, beams, way }
     }
 }
 
@@ -117,13 +119,15 @@ fn sensors(recording: &Recording, wanted: Option<&str>) -> Result<Vec<Sensor>, F
     if names.is_empty() {
         let link = wanted.unwrap_or(UNNAMED).to_owned();
         check_sensor(&link).map_err(|failure| Failure { kind: Kind::Usage, ..failure })?;
-        return Ok(vec![Sensor::new(None, link, recording)?]);
+        return Ok(vec![Sensor::new(None, link, recording)]);
     }
     if let Some(wanted) = wanted {
         recording.of(wanted)?;
     }
     let played = names.iter().filter(|name| wanted.is_none_or(|wanted| wanted == name.as_str()));
-    let sensor = |name: &String| Sensor::new(Some(name.clone()), link_name(name), &recording.of(name)?);
+    let sensor = |name: &String| -> Result<Sensor, Failure> {
+        Ok(Sensor::new(Some(name.clone()), link_name(name), &recording.of(name)?))
+    };
     let sensors: Vec<Sensor> = played.map(sensor).collect::<Result<_, _>>()?;
     for (at, sensor) in sensors.iter().enumerate() {
         check_sensor(&sensor.link)?;
@@ -152,9 +156,12 @@ fn configuration(sources: &Sources, sensors: &[Sensor], file: &Path) -> Result<C
         let of = sensors.iter().find(|sensor| sensor.link == link.name);
         // What is not configured is as it was recorded.
         if let Scanner::Turning(turning) = &mut link.scanner
-            && let Some(Sensor { model, beams, .. }) = of.filter(|_| turning.is_auto())
+            && let Some(Sensor { model, beams, way, .. }) = of.filter(|_| turning.is_auto())
         {
-            turning.model = model.unwrap_or(turning.model);
+            if turning.mode.is_none() {
+                turning.model = model.clone()?.unwrap_or(turning.model);
+            }
+            turning.mode = turning.mode.or(*way);
             turning.beams = *beams;
         }
     }
@@ -191,7 +198,14 @@ mod tests {
     use super::*;
 
     fn sensor(name: &str) -> Sensor {
-        Sensor { recorded: None, link: name.to_owned(), family: Family::Lms, model: None, beams: None }
+        Sensor {
+            recorded: None,
+            link: name.to_owned(),
+            family: Family::Lms,
+            model: Ok(None),
+            beams: None,
+            way: None,
+        }
     }
 
     #[test]

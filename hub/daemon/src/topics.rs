@@ -7,7 +7,8 @@ use line::Received;
 use lms::Nanos;
 use schema::ipc::DueRings;
 use schema::{
-    Background, Failure, Family, Flags, Foreground, Header, Marks, Quality, Ring, Scan, Status, Wake, Zones,
+    Background, Failure, Family, Flags, Foreground, Header, Lines, Marks, Quality, Ring, Scan, Status, Wake,
+    Zones,
 };
 
 use crate::pipeline::{Outputs, Pipeline, Relearned};
@@ -24,6 +25,7 @@ pub(crate) struct Topics<'a, S: Surroundings> {
     scan: Publisher<Scan, S>,
     zones: Publisher<Zones, S>,
     marks: Publisher<Marks, S>,
+    lines: Publisher<Lines, S>,
     foreground: Publisher<Foreground, S>,
     background: Publisher<Background, S>,
     status: Publisher<Status, S>,
@@ -48,6 +50,7 @@ impl<'a, S: Surroundings> Topics<'a, S> {
             scan: PreparedPublisher::new(around, sensor)?,
             zones: PreparedPublisher::new(around, sensor)?,
             marks: PreparedPublisher::new(around, sensor)?,
+            lines: PreparedPublisher::new(around, sensor)?,
             foreground: PreparedPublisher::new(around, sensor)?,
             background: PreparedPublisher::new(around, sensor)?,
             status: PreparedPublisher::new(around, sensor)?,
@@ -81,6 +84,7 @@ impl<'a, S: Surroundings> Topics<'a, S> {
         self.scan.prepare();
         self.zones.prepare();
         self.marks.prepare();
+        self.lines.prepare();
         if pipeline.keeps_background() {
             self.foreground.prepare();
         }
@@ -116,8 +120,8 @@ impl<'a, S: Surroundings> Topics<'a, S> {
     }
 
     /// Publishes a scan of the last telegram, of `beams` beams and `len` bytes, which `fill` writes, and its zones, and wakes
-    /// those who wait for these; then whatever else `pipeline` makes of it. Marks and foreground that nobody wants are not
-    /// made. A background that does not fit the scan starts again; then it is told why.
+    /// those who wait for these; then whatever else `pipeline` makes of it. Marks, lines and foreground that nobody wants are
+    /// not made. A background that does not fit the scan starts again; then it is told why.
     pub(crate) fn scan(
         &mut self,
         beams: usize,
@@ -137,17 +141,19 @@ impl<'a, S: Surroundings> Topics<'a, S> {
         self.scan.send(scan, &header, &mut self.due);
         self.zones.send(zones, &header, &mut self.due);
         self.ring(Ring::First);
-        let mut marks = self.marks.loan(0);
+        let (mut marks, mut lines) = (self.marks.loan(0), self.lines.loan(0));
         let mut foreground =
             pipeline.keeps_background().then(|| self.foreground.loan(Foreground::len(beams)));
         let relearned = pipeline.examine(
             &self.decoded,
             Outputs {
                 marks: Publisher::<Marks, S>::payload_mut(&mut marks),
+                lines: Publisher::<Lines, S>::payload_mut(&mut lines),
                 foreground: foreground.as_mut().and_then(Publisher::<Foreground, S>::payload_mut),
             },
         );
         self.marks.send(marks, &header, &mut self.due);
+        self.lines.send(lines, &header, &mut self.due);
         if let Some(foreground) = foreground {
             self.foreground.send(foreground, &header, &mut self.due);
         }
@@ -216,12 +222,12 @@ impl<'a, S: Surroundings> Topics<'a, S> {
     pub(crate) fn is_heard(&self) -> bool {
         let of_telegrams = self.telegram.is_heard() || self.scan.is_heard() || self.zones.is_heard();
         let of_wanted = self.marks.is_heard() || self.foreground.is_heard() || self.background.is_heard();
-        of_telegrams || of_wanted || self.status.is_heard()
+        of_telegrams || of_wanted || self.lines.is_heard() || self.status.is_heard()
     }
 
     /// Samples without memory.
     pub(crate) fn loan_failed(&self) -> u64 {
-        let of_scans = self.scan.failed() + self.zones.failed() + self.marks.failed();
+        let of_scans = self.scan.failed() + self.zones.failed() + self.marks.failed() + self.lines.failed();
         let of_models = self.foreground.failed() + self.background.failed();
         self.telegram.failed() + of_scans + of_models + self.status.failed()
     }
@@ -235,14 +241,19 @@ impl<'a, S: Surroundings> Topics<'a, S> {
         }
         let of_telegrams =
             self.telegram.missed_out().max(self.scan.missed_out()).max(self.zones.missed_out());
-        let of_wanted = self.marks.missed_out().max(self.foreground.missed_out());
+        let of_wanted =
+            self.marks.missed_out().max(self.lines.missed_out()).max(self.foreground.missed_out());
         of_telegrams.max(of_wanted).max(self.status.missed_out())
     }
 
     /// Whether anybody follows what the sensor measures: of the status alone nobody needs a scanner that measures.
     pub(crate) fn is_followed(&self) -> bool {
         let of_scans = self.scan.is_heard() || self.zones.is_heard() || self.marks.is_heard();
-        of_scans || self.telegram.is_heard() || self.foreground.is_heard() || self.background.is_heard()
+        of_scans
+            || self.lines.is_heard()
+            || self.telegram.is_heard()
+            || self.foreground.is_heard()
+            || self.background.is_heard()
     }
 
     fn of_moment(&self, now: u64) -> Header {

@@ -29,6 +29,10 @@ impl Turning for Session {
         self.beams()
     }
 
+    fn other_model(&self) -> Option<line::family::Model> {
+        self.other_model().map(described)
+    }
+
     fn scanner_time(&self) -> Option<Nanos> {
         self.scanner_time
     }

@@ -29,8 +29,11 @@ impl fmt::Display for Trouble {
                     Some(baud) => write!(f, "{baud}")?,
                     None => f.write_str("230400 and 921600")?,
                 }
-                let remedy =
-                    if *noise { "another model, another rate?" } else { "power, cable, other port?" };
+                let remedy = if *noise {
+                    "another scanner? stop the hub and run `scanhub probe`"
+                } else {
+                    "power, cable, other port?"
+                };
                 write!(f, " baud for {seconds} s: {remedy}")
             }
             Trouble::Silence => f.write_str("no packet for one second"),

@@ -4,9 +4,7 @@
 
 mod driven;
 
-use line::{
-    Arrivals, MILLIS, Nanos, Packets, Received, SensorClock, State, Tally, Turn, TurnCounts, line_time,
-};
+use line::{MILLIS, Nanos, Packets, Reads, Received, SensorClock, State, Tally, Turn, TurnCounts, line_time};
 
 use crate::framer::{Framer, Span};
 use crate::heard::Trouble;
@@ -40,7 +38,7 @@ impl Settings {
 pub struct Session {
     settings: Settings,
     framer: Framer,
-    arrivals: Arrivals,
+    reads: Reads,
     clock: SensorClock,
     /// The clock of the packets before the one with this number, of those handed out last, if another sequence began there.
     clock_before: Option<(usize, SensorClock)>,
@@ -59,13 +57,6 @@ pub struct Session {
     /// Packets that were handed out and are not in turns yet.
     current: Option<Current>,
     now: Nanos,
-    last_byte: Nanos,
-    /// Until when nothing has to be read.
-    rest_until: Nanos,
-    room: usize,
-    /// The last stamp of a turn, behind which none goes, and that of the last packet.
-    last_stamp: Nanos,
-    last_packet: Nanos,
     trouble: Option<Trouble>,
     /// Since when no packet came, and bytes read by then.
     quiet_since: (Nanos, u64),
@@ -101,7 +92,7 @@ impl Session {
         Session {
             settings,
             framer: Framer::default(),
-            arrivals: Arrivals::default(),
+            reads: Reads::new(now),
             clock: SensorClock::new(),
             clock_before: None,
             sequence: Sequence::new(),
@@ -115,11 +106,6 @@ impl Session {
             doubt: 0,
             current: None,
             now,
-            last_byte: now,
-            rest_until: 0,
-            room: 0,
-            last_stamp: 0,
-            last_packet: 0,
             trouble: None,
             quiet_since: (now, 0),
             damaged: (0, 0),
@@ -130,8 +116,17 @@ impl Session {
 
     /// What is at the other end, as far as that is known: of models that cannot be told apart, one.
     pub fn model(&self) -> Option<Model> {
-        let heard = || self.sequence.points_per_second().map(Model::of_point_rate);
-        self.settings.model.or_else(heard)
+        self.settings.model.or_else(|| self.heard_model())
+    }
+
+    /// What it turned out to be where another model is wanted: many of them speak alike.
+    pub(crate) fn other_model(&self) -> Option<Model> {
+        let wanted = self.settings.model?;
+        self.heard_model().filter(|heard| heard.points_per_second() != wanted.points_per_second())
+    }
+
+    fn heard_model(&self) -> Option<Model> {
+        self.sequence.points_per_second().map(Model::of_point_rate)
     }
 
     /// Beams of the grid that turns are for; nothing before it is known what is at the other end.
@@ -168,7 +163,7 @@ impl Session {
         self.turns.give_up();
         self.is_learned = false;
         self.current = None;
-        self.rest_until = 0;
+        self.reads.end_rest();
     }
 
     /// Nothing was heard at this rate: tries the next one, and says for how long already.
@@ -223,7 +218,7 @@ impl Session {
             }
             if let Some(time) = place.time() {
                 let end = span.offset + ((number + 1) * LEN - 1) as u64;
-                self.clock.note(time, self.arrivals.latest(end, pace).saturating_sub(packet_time));
+                self.clock.note(time, self.reads.arrivals().latest(end, pace).saturating_sub(packet_time));
             }
             places[number] = place;
         }
@@ -231,12 +226,11 @@ impl Session {
         let stamp = |number: usize| places[number].time().and_then(|time| self.clock_of(number).time(time));
         let first = stamp(0);
         let last_byte = span.offset + (span.packets * LEN - 1) as u64;
-        let latest = self.arrivals.latest(last_byte, pace);
+        let latest = self.reads.arrivals().latest(last_byte, pace);
         let last = stamp(span.packets - 1).map_or(latest, |at| at + packet_time);
         let at = first.unwrap_or(last.saturating_sub(packet_time * span.packets as u64));
         // One that came twice is dated by its arrival, and the next one by the scanner's clock.
-        let last = last.max(at).max(self.last_packet);
-        self.last_packet = last;
+        let last = self.reads.date_packet(last.max(at));
         self.current = Some(Current { span, places, packet: 0, progress: Progress::default() });
         self.cut |= self.framer.tally().packets == span.packets as u64 && self.framer.tally().discarded > 0;
         self.hear();
@@ -309,9 +303,8 @@ impl Session {
     fn show(&mut self, closed: Closed) -> Turn<'_> {
         let packet = self.current.map_or(0, |current| current.packet);
         let stamp = |at: Nanos| self.clock_of(packet).time(at).unwrap_or(self.now);
-        let first = stamp(closed.first).max(self.last_stamp);
-        let last = stamp(closed.last).max(first);
-        self.last_stamp = first;
+        let (first, last) = (stamp(closed.first), stamp(closed.last));
+        let (first, last) = self.reads.date_turn(first, last);
         self.trouble = None;
         if let Phase::Hearing { turned_at, has_turned, .. } = &mut self.phase {
             (*turned_at, *has_turned) = (self.now, true);

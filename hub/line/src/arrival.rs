@@ -39,11 +39,32 @@ impl Arrivals {
         }
         latest
     }
+
+    /// When byte number `offset` was there at the earliest, in a stream of which bytes come `byte_ns` apart; nothing where
+    /// that is not known: more came at once than was sent since the read before, so it had waited.
+    pub fn earliest(&self, offset: u64, byte_ns: f64) -> Option<Nanos> {
+        let oldest = self.next.saturating_sub(Arrivals::CAPACITY);
+        let read = |n: usize| self.reads[n % Arrivals::CAPACITY];
+        let n = (oldest + 1..self.next).rev().find(|&n| read(n - 1).0 <= offset)?;
+        let ((begin, before), (end, now)) = (read(n - 1), read(n));
+        let sent = (end - begin) as f64 * byte_ns;
+        if offset >= end || sent > 1.25 * now.saturating_sub(before) as f64 {
+            return None;
+        }
+        // So few find room anywhere: if they were dropped that came then, these would have been too.
+        let behind = (end - offset) as f64 * byte_ns;
+        let came = if end - begin <= ROOM { now.saturating_sub(behind as Nanos) } else { 0 };
+        Some(came.max(before))
+    }
 }
+
+/// Bytes that every adapter keeps for a host that is late.
+const ROOM: u64 = 256;
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::MILLIS;
 
     #[test]
     fn what_came_behind_it_took_its_time() {
@@ -62,5 +83,27 @@ mod tests {
         arrivals.note(3_000_000, 200);
         assert_eq!(arrivals.latest(139, Some(1_000_000)), 2_000_001, "faster than a line");
         assert_eq!(arrivals.latest(300, Some(1_000_000)), 3_000_000 - 39 * byte);
+    }
+
+    #[test]
+    fn what_had_waited_may_have_been_there_long_before() {
+        let (mut arrivals, byte_ns) = (Arrivals::default(), 100_000.0);
+        let at = |millis: Nanos| millis * MILLIS;
+        arrivals.note(at(1_000), 50);
+        arrivals.note(at(1_005), 50);
+        assert_eq!(arrivals.earliest(10, byte_ns), None, "nothing was read before");
+        assert_eq!(arrivals.earliest(60, byte_ns), Some(at(1_001)));
+        arrivals.note(at(2_005), 100);
+        assert_eq!(arrivals.earliest(100, byte_ns), Some(at(1_995)), "nothing was sent before");
+        arrivals.note(at(3_005), 4_000);
+        assert_eq!(
+            arrivals.earliest(4_100, byte_ns),
+            Some(at(2_005)),
+            "behind it others may have found no room"
+        );
+        arrivals.note(at(3_010), 700);
+        assert_eq!(arrivals.earliest(4_300, byte_ns), None, "all of it waited");
+        arrivals.note(at(3_015), 50);
+        assert_eq!(arrivals.earliest(4_910, byte_ns), Some(at(3_011)));
     }
 }

@@ -71,6 +71,13 @@ impl<const N: usize> Buffer<N> {
         at
     }
 
+    /// The last `len` bytes that were taken, which are `packets` packets, are open again.
+    pub fn give_back(&mut self, len: usize, packets: usize) {
+        self.start -= len;
+        self.tally.packets -= packets as u64;
+        self.tally.in_packets -= len as u64;
+    }
+
     /// `len` bytes that [`Buffer::take`] took `at` this place.
     pub fn taken(&self, at: usize, len: usize) -> &[u8] {
         &self.bytes[at..at + len]

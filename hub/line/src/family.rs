@@ -20,6 +20,21 @@ pub trait Turning: Session + Sized {
     /// Beams of the grid that turns are for; nothing before it is known what is at the other end.
     fn beams(&self) -> Option<usize>;
 
+    /// What it turned out to be where another model is wanted; of models that cannot be told apart, one.
+    fn other_model(&self) -> Option<Model> {
+        None
+    }
+
+    /// What has to be named before it can be read where nobody can be asked, in words; nothing if nothing has.
+    fn lacks(&self) -> Option<&'static str> {
+        None
+    }
+
+    /// Writes more of what it is, in a few letters: how it measures, and its firmware.
+    fn specify(&self, text: &mut dyn fmt::Write) {
+        let _ = text;
+    }
+
     /// Writes what the scanner said of itself, such as its firmware, into `identity`, and how it says that it is into
     /// `health`. Nothing before it was asked all that changes nothing; of one that is never asked, nothing at all.
     fn introduction(&self, identity: &mut dyn fmt::Write, health: &mut dyn fmt::Write) -> Option<Condition> {

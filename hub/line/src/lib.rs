@@ -12,6 +12,7 @@ mod buffer;
 pub mod family;
 pub mod framing;
 pub mod grid;
+mod reads;
 mod sensor_clock;
 mod session;
 pub mod suspect;
@@ -19,6 +20,7 @@ mod turning;
 
 pub use arrival::Arrivals;
 pub use buffer::{Buffer, Tally};
+pub use reads::Reads;
 pub use sensor_clock::SensorClock;
 pub use session::{Account, Control, Output, Received, Session, State};
 pub use turning::{Heard, Packets, Turn, TurnCounts};

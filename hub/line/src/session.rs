@@ -47,6 +47,13 @@ pub trait Session {
         let _ = (now, is_followed);
     }
 
+    /// The line is closed in a moment, and nobody comes after it. Whether there is something to write before: to be drained
+    /// once more then.
+    fn end(&mut self, now: Nanos) -> bool {
+        let _ = now;
+        false
+    }
+
     /// The byte of [`Output::Transmit`] was written at `now`.
     fn transmitted(&mut self, now: Nanos);
 
@@ -64,6 +71,61 @@ pub trait Session {
 
     /// What became of the bytes and of what the scanner must have sent.
     fn account(&self) -> Account;
+}
+
+/// Writes those methods of a [`Session`] that say the same of whatever session is inside: `$each!(of, session => said)` says
+/// `said` of the one that is in `of`.
+#[macro_export]
+macro_rules! delegate_session {
+    ($each:ident) => {
+        fn spare(&mut self) -> &mut [u8] {
+            $each!(self, session => session.spare())
+        }
+
+        fn commit(&mut self, now: $crate::Nanos, len: usize) {
+            $each!(self, session => session.commit(now, len))
+        }
+
+        fn may_leave(&self) -> bool {
+            $each!(self, session => session.may_leave())
+        }
+
+        fn leave(&mut self, now: $crate::Nanos, waiting: usize) -> bool {
+            $each!(self, session => session.leave(now, waiting))
+        }
+
+        fn handle_timeout(&mut self, now: $crate::Nanos) {
+            $each!(self, session => session.handle_timeout(now))
+        }
+
+        fn control(&mut self, control: $crate::Control, now: $crate::Nanos) {
+            $each!(self, session => session.control(control, now))
+        }
+
+        fn followed(&mut self, now: $crate::Nanos, is_followed: bool) {
+            $each!(self, session => session.followed(now, is_followed))
+        }
+
+        fn end(&mut self, now: $crate::Nanos) -> bool {
+            $each!(self, session => session.end(now))
+        }
+
+        fn transmitted(&mut self, now: $crate::Nanos) {
+            $each!(self, session => session.transmitted(now))
+        }
+
+        fn state(&self) -> $crate::State {
+            $each!(self, session => session.state())
+        }
+
+        fn rate(&self) -> u32 {
+            $each!(self, session => session.rate())
+        }
+
+        fn account(&self) -> $crate::Account {
+            $each!(self, session => session.account())
+        }
+    };
 }
 
 /// What a session wants, in the order in which it wants it.

@@ -111,8 +111,11 @@ impl Tty {
         })
     }
 
-    /// A terminal of a program, and some adapters, have no such line.
+    /// A terminal of a program, and some adapters, have no such line. Asserted, it stays so when the line is closed.
     pub(crate) fn set_dtr(&self, on: bool) -> io::Result<()> {
+        let mut termios = tcgetattr(&self.line)?;
+        termios.control_modes.set(ControlModes::HUPCL, !on);
+        tcsetattr(&self.line, OptionalActions::Now, &termios)?;
         match line_settings::set_dtr(&self.line, on) {
             Err(_) if self.baud().is_none() => Err(self.gone()),
             _ => Ok(()),

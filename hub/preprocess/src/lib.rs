@@ -4,6 +4,7 @@
 #![forbid(unsafe_code)]
 
 pub mod background;
+pub mod lines;
 pub mod marks;
 #[cfg(test)]
 mod reading;

@@ -10,9 +10,9 @@ use std::sync::atomic::Ordering::Relaxed;
 use counting::{TAKEN, WATCHED};
 use preprocess::background::{self, Method, Model};
 use preprocess::segments::Segmenter;
-use preprocess::{marks, zones};
+use preprocess::{lines, marks, zones};
 use rustix::thread::gettid;
-use schema::{Background, Foreground, Marks, Pose, Scan, Zones};
+use schema::{Background, Foreground, Lines, Marks, Pose, Scan, Zones};
 use surroundings::{BEAMS, Shape, Surroundings};
 
 #[test]
@@ -30,13 +30,16 @@ fn a_scan_takes_nothing_from_the_heap() {
     let pose = Pose { x_m: 0.3, yaw_rad: 1.0, ..Pose::default() };
     let mut check = zones::Check::new(pose, &zones::Settings::default(), BEAMS);
     let mut finder = marks::MarkDetector::new(marks::Settings::default());
+    let of_form = |polish| lines::Settings { polish, ..lines::Settings::default() };
+    let mut line_finders = [false, true].map(|polish| lines::LineFinder::new(pose, of_form(polish), BEAMS));
+    let mut found_lines = Lines::default();
     let settings = |method| background::Settings { method, scans: Some(10), ..Default::default() };
     let mut models = [Method::Paper, Method::Multi].map(|method| Model::new(settings(method), BEAMS));
     let mut cutter = Segmenter::new(pose, BEAMS);
     let (mut zones, mut marks) = (Zones::default(), Marks::default());
     let mut foreground = Foreground::of(BEAMS);
     let mut background = Background::zeroed(Background::len(BEAMS));
-    let mut segments = 0;
+    let (mut segments, mut lines_found) = (0, 0);
 
     WATCHED.store(gettid().as_raw_nonzero().get(), Relaxed);
     drop(black_box(Box::new(0)));
@@ -44,6 +47,10 @@ fn a_scan_takes_nothing_from_the_heap() {
     for scan in &scans {
         check.update(scan, &mut zones);
         finder.update(scan, &mut marks);
+        for finder in &mut line_finders {
+            finder.update(scan, &mut found_lines);
+            lines_found += found_lines.lines().len();
+        }
         for model in &mut models {
             model.update(scan, &mut foreground);
             cutter.update(scan, &mut foreground);
@@ -55,5 +62,5 @@ fn a_scan_takes_nothing_from_the_heap() {
     let taken = TAKEN.load(Relaxed) - before;
     WATCHED.store(0, Relaxed);
     assert_eq!((before, taken), (1, 0), "one piece was taken before, to see that it is counted");
-    assert!(marks.count > 0 && segments > 0, "there was something to do");
+    assert!(marks.count > 0 && segments > 0 && lines_found > 0, "there was something to do");
 }

@@ -40,6 +40,10 @@ pub struct Contents {
     pub beams: Option<u16>,
     /// Name of the model, if it is of a family whose heads turn and a status says it.
     pub model: Option<&'static str>,
+    /// Name of the way in which that one measures, if a status says it.
+    pub way: Option<&'static str>,
+    /// Angle between two beams in 1/100 degree, of such a one, as a status says it.
+    pub step_cdeg: Option<u16>,
     /// Variant of the first scan.
     pub variant: Option<Variant>,
     /// Unit of the first scan; of a log the one in which its ranges are whole values.
@@ -75,6 +79,8 @@ impl Contents {
             scanner_ns: None,
             beams: None,
             model: None,
+            way: None,
+            step_cdeg: None,
             variant: None,
             unit: None,
             mode: None,

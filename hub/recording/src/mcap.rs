@@ -196,20 +196,26 @@ impl Survey {
         let mut status = Status::default();
         if place.topic == Topic::Status && status.unpack(payload) {
             let mode = (status.mode != Status::MODE_UNKNOWN).then_some(Mode(status.mode));
-            let model = if place.is_old() { None } else { model(&status) };
+            let told = if place.is_old() { None } else { told(&status) };
             for contents in [&mut self.whole, of_sensor(&mut self.sensors, &place.sensor)] {
                 contents.mode = contents.mode.or(mode);
-                contents.model = contents.model.or(model);
+                if let Some((model, way)) = told {
+                    contents.model = contents.model.or(Some(model));
+                    contents.way = contents.way.or(way);
+                    contents.step_cdeg = contents.step_cdeg.or(Some(status.resolution_cdeg));
+                }
             }
         }
     }
 }
 
-/// The name of the model that `status` tells, of a scanner whose head turns.
-fn model(status: &Status) -> Option<&'static str> {
+/// The names of the model and of the way of measuring that `status` tells, of a scanner whose head turns.
+fn told(status: &Status) -> Option<(&'static str, Option<&'static str>)> {
     let features = scanner::features(Family::of_number(status.family)?)?;
     let name = status.model()?;
-    features.models.iter().map(|model| model.name).find(|known| *known == name)
+    let model = features.models.iter().map(|model| model.name).find(|known| *known == name)?;
+    let way = features.modes.iter().copied().find(|known| status.way() == Some(known));
+    Some((model, way))
 }
 
 fn of_sensor<'a>(sensors: &'a mut BTreeMap<String, Contents>, sensor: &str) -> &'a mut Contents {

@@ -161,7 +161,7 @@ impl Recording {
     ///
     /// # Errors
     ///
-    /// As [`telegrams`](Self::telegrams).
+    /// As [`telegrams`](Self::telegrams); [`Kind::Input`] if nothing in it tells how its packets are to be read.
     pub fn model(&self) -> Result<Option<Model>, Failure> {
         let models = || self.family().and_then(scanner::features).map(|features| features.models.iter());
         if let Some(told) =
@@ -185,7 +185,28 @@ impl Recording {
                 break;
             }
         }
+        if let Some(lacks) =
+            session.session().lacks().filter(|_| told.is_none() && self.contents.way.is_none())
+        {
+            return Err(Failure::new(
+                Kind::Input,
+                format!("recording {} does not tell of which kind its packets are", self.path.display()),
+                format!("`scanhub replay` plays it where link.NAME.{lacks} is set"),
+            ));
+        }
         Ok(told)
+    }
+
+    /// Returns how many beams the scans of its scanner had, if that is one whose head turns, as far as they or a status
+    /// tell.
+    pub fn beams(&self) -> Option<usize> {
+        let scans = self.contents.beams.map(usize::from);
+        scans.or_else(|| {
+            let (step, features) = (self.contents.step_cdeg?, scanner::features(self.family()?)?);
+            let model = features.models.iter().find(|model| Some(model.name) == self.contents.model);
+            let is_told = |beams: &usize| (36_000.0 / *beams as f64).round() == f64::from(step);
+            [model.map(|model| model.beams), Some(features.auto.beams)].into_iter().flatten().find(is_told)
+        })
     }
 
     /// Where it is.

@@ -7,7 +7,7 @@ use line::family::{Condition, Features, Turning, Wanted};
 
 use crate::model::{Mode, Model};
 use crate::session::{Session, Settings};
-use crate::told::Health;
+use crate::told::{Health, Info, Trouble};
 
 impl Turning for Session {
     const FEATURES: Features = Features {
@@ -32,6 +32,29 @@ impl Turning for Session {
 
     fn beams(&self) -> Option<usize> {
         self.beams()
+    }
+
+    fn other_model(&self) -> Option<line::family::Model> {
+        self.info().and_then(|info| info.model()).filter(|model| self.is_wrong(*model)).map(described)
+    }
+
+    fn lacks(&self) -> Option<&'static str> {
+        (line::Session::trouble(self) == Some(Trouble::Alike)).then_some("model or mode")
+    }
+
+    fn specify(&self, text: &mut dyn fmt::Write) {
+        let _ = self.mode().map_or(Ok(()), |mode| write!(text, " {}", mode.name()));
+        if let Some(Info { firmware: (major, minor), .. }) = self.info() {
+            let _ = write!(text, " {major}.{minor:02}");
+        }
+    }
+
+    fn scanner_time(&self) -> Option<Nanos> {
+        self.scanner_time
+    }
+
+    fn doubt(&mut self, reasons: u8) {
+        self.doubt = reasons;
     }
 
     fn introduction(&self, identity: &mut dyn fmt::Write, health: &mut dyn fmt::Write) -> Option<Condition> {

@@ -18,8 +18,8 @@ pub(crate) enum Expect {
     Answers,
     /// Packets of this kind.
     Packets(Kind),
-    /// Packets of any kind; express and dense ones look alike, these are taken for the given one.
-    Anything(Kind),
+    /// Packets of any kind; express and dense ones look alike, these are taken for the given one, if there is one.
+    Anything(Option<Kind>),
 }
 
 /// What was found.
@@ -63,6 +63,8 @@ pub(crate) struct Framer {
     skipped: u32,
     /// Printable ones among them, in a row.
     text: usize,
+    /// There were packets that look alike, and it was not said what they are.
+    is_alike: bool,
 }
 
 impl Format for Kind {
@@ -98,6 +100,7 @@ impl Framer {
             is_released: false,
             skipped: 0,
             text: 0,
+            is_alike: false,
         }
     }
 
@@ -164,6 +167,13 @@ impl Framer {
         self.buffer.taken(span.at, span.len)
     }
 
+    /// Of `span`, which [`Framer::advance`] answered last, the packets from number `packets` on are to come once more.
+    pub(crate) fn cut(&mut self, span: &mut Span, packets: usize) {
+        let len = span.len / span.packets;
+        self.buffer.give_back((span.packets - packets) * len, span.packets - packets);
+        (span.len, span.packets) = (packets * len, packets);
+    }
+
     /// How long the line must be idle until [`Framer::release`] may let pass what waits; `None` if nothing does.
     pub(crate) fn hold(&self) -> Option<Nanos> {
         self.is_held.then_some(HOLD)
@@ -183,6 +193,11 @@ impl Framer {
     /// The kind of packets that are expected.
     pub(crate) fn kind(&self) -> Option<Kind> {
         if let Expect::Packets(kind) = self.expect { Some(kind) } else { None }
+    }
+
+    /// Whether there were packets of which it was not said what they are.
+    pub(crate) fn is_alike(&self) -> bool {
+        self.is_alike
     }
 
     pub(crate) fn tally(&self) -> &Tally {
@@ -242,12 +257,12 @@ impl Framer {
     }
 
     /// Looks for two packets of any kind, one behind the other.
-    fn seek(&mut self, alike: Kind) -> Step {
+    fn seek(&mut self, alike: Option<Kind>) -> Step {
         let open = self.buffer.open();
         let mut is_open = false;
         for kind in Kind::ALL {
             let kind = match (kind, alike) {
-                (Kind::Express, Kind::Dense) => Kind::Dense,
+                (Kind::Express, Some(Kind::Dense)) => Kind::Dense,
                 (Kind::Dense, _) => continue,
                 _ => kind,
             };
@@ -261,6 +276,10 @@ impl Framer {
                 is_open |= kind.begins(open);
                 false
             };
+            if is_found && kind == Kind::Express && alike.is_none() {
+                self.is_alike = true;
+                return Step::Discard;
+            }
             if is_found {
                 self.expect(Expect::Packets(kind));
                 self.is_locked = true;

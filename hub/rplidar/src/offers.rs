@@ -84,6 +84,23 @@ impl Offers {
         })
     }
 
+    /// Microseconds from one point to the next in the modes of `kind`: of the wanted one first, else of the fastest.
+    pub(crate) fn sample_us(&self, kind: Kind, mode: Option<Mode>) -> Option<f32> {
+        let of_kind = || self.of_kind(kind);
+        let named = of_kind().filter(|(named, _)| mode.is_some() && *named == mode).map(|(_, us)| us);
+        named.reduce(f32::min).or_else(|| of_kind().map(|(_, us)| us).reduce(f32::min))
+    }
+
+    /// Of the same the one that is nearest to `us`.
+    pub(crate) fn nearest_us(&self, kind: Kind, us: f32) -> Option<f32> {
+        self.of_kind(kind).map(|(_, told)| told).min_by(|a, b| (a - us).abs().total_cmp(&(b - us).abs()))
+    }
+
+    fn of_kind(&self, kind: Kind) -> impl Iterator<Item = (Option<Mode>, f32)> {
+        let all = self.all[..self.count].iter().filter(move |offer| offer.kind == Some(kind));
+        all.filter_map(|offer| Some((offer.named, offer.sample_us?)))
+    }
+
     /// Those of which the kind is known here and that the line can carry.
     fn possible(&self, baud: Option<u32>) -> impl Iterator<Item = Offer> {
         self.all[..self.count].iter().copied().filter(move |offer| {

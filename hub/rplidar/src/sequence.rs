@@ -3,7 +3,7 @@
 //! that angle's share of it; how many turns are missing besides, only the time tells. Knows no bytes.
 
 /// The packets of one stream: of several points each, or of one.
-#[derive(Clone, Debug)]
+#[derive(Clone, Copy, Debug)]
 pub(crate) struct Sequence {
     last: Option<Seen>,
     /// One that did not belong there: the next one may tell that it did.
@@ -90,6 +90,11 @@ impl Sequence {
         (self.last, self.odd, self.odds, self.lessons) = (None, None, 0, 0);
     }
 
+    /// Whether a packet came since the stream began.
+    pub(crate) fn is_begun(&self) -> bool {
+        self.last.is_some()
+    }
+
     /// Packets that came, and those that did not although the ones before and after them did.
     pub(crate) fn came_and_lost(&self) -> (u64, u64) {
         (self.came, self.lost)
@@ -115,18 +120,27 @@ impl Sequence {
             self.advance += (angle - self.advance) / f64::from(self.lessons.min(8));
             return self.next(last, came, angle, 1.0, Step::Next);
         };
-        if came.adjoins() && self.odds == 0 && (angle - advance).abs() <= 0.25 * advance {
-            self.lessons += 1;
+        let turn = Turn { advance, packet_ns: came.packet_ns };
+        let is_next = came.adjoins() && self.odds == 0 && (angle - advance).abs() <= 0.25 * advance;
+        if is_next && turn.missing(late(last.time + came.packet_ns)) == 0.0 {
+            let is_even = (angle - advance).abs() <= 0.08 * advance;
+            self.lessons = if is_even { self.lessons + 1 } else { LESSONS };
             self.advance += (angle - advance) / 4.0;
             return self.next(last, came, angle, 1.0, Step::Next);
         }
-        let angle = angle
-            + 360.0 * turns(late(last.time + angle / advance * came.packet_ns), advance, came.packet_ns);
+        let angle = angle + 360.0 * turn.missing(late(last.time + turn.time(angle)));
         let packets = f64::from((angle / advance + 0.5) as u32);
-        let tolerance = advance * (0.25 + 0.01 * packets).min(0.5);
-        let is_early = late(last.time + packets * came.packet_ns) < EARLY;
-        if packets < 1.0 || (angle - packets * advance).abs() > tolerance || is_early {
+        // In a long gap a head may have changed its speed: then the time tells better how many there were.
+        let most = 0.1 * packets;
+        let off = (late(last.time + packets * came.packet_ns) / came.packet_ns).clamp(-most, most) as i32;
+        let packets = packets + f64::from(off);
+        let tolerance = advance * ((0.25 + 0.01 * packets).min(0.5) + f64::from(off.abs()));
+        let late = late(last.time + packets * came.packet_ns);
+        if packets < 1.0 || (angle - packets * advance).abs() > tolerance || late < EARLY {
             return self.odd(came);
+        }
+        if turn.is_apart(late) {
+            return self.first(came.start);
         }
         self.next(last, came, angle, packets, Step::Gap { from: last.angle })
     }
@@ -134,10 +148,7 @@ impl Sequence {
     /// A packet of one point came: such points may lie before ones that came before them.
     pub(crate) fn place_point(&mut self, came: Came, late: impl Fn(f64) -> f64) -> Place {
         self.came += 1;
-        let Some(last) = self.last else {
-            self.counted = (f64::from(came.start), 0);
-            return self.first(came.start);
-        };
+        let Some(last) = self.last else { return self.first(came.start) };
         let angle = clockwise(last.start, came.start);
         let angle = if angle > 360.0 - BACK { angle - 360.0 } else { angle };
         self.is_whole &= came.adjoins();
@@ -145,18 +156,22 @@ impl Sequence {
         let points = f64::from(1 + (came.skipped + 3) / POINT);
         let Some(advance) = self.advance() else {
             if angle > WIDEST {
-                return self.first_point(came.start);
+                return self.first(came.start);
             }
             return self.next_point(last, came, angle, points, Step::Next);
         };
-        // Only where something was between them, a whole turn may be missing.
-        let due = last.time + (angle / advance).max(1.0) * came.packet_ns;
-        let turns = if came.adjoins() { 0.0 } else { turns(late(due), advance, came.packet_ns) };
+        let turn = Turn { advance, packet_ns: came.packet_ns };
+        let due = last.time + turn.time(angle.max(advance));
+        let turns = turn.missing(late(due));
         if angle <= AHEAD && turns == 0.0 {
             return self.next_point(last, came, angle, points, Step::Next);
         }
-        if came.adjoins() || late(due) < EARLY {
+        let late = late(due + turn.time(360.0 * turns));
+        if late < EARLY || (came.adjoins() && turns == 0.0) {
             return self.odd(came);
+        }
+        if turn.is_apart(late) {
+            return self.first(came.start);
         }
         let angle = angle + 360.0 * turns;
         let points = (angle / advance + 0.5) as u32;
@@ -167,19 +182,16 @@ impl Sequence {
 
     fn first(&mut self, start: f32) -> Place {
         let (angle, time) = (f64::from(start), BEGIN);
+        self.counted = (angle, 0);
         self.last = Some(Seen { start, angle, time });
         (self.odd, self.odds, self.lessons, self.advance) = (None, 0, 0, 0.0);
         Place { step: Step::First, angle, time }
     }
 
-    fn first_point(&mut self, start: f32) -> Place {
-        self.counted = (f64::from(start), 0);
-        self.first(start)
-    }
-
     /// It came `packets` packets and `angle` degrees after `last`.
     fn next(&mut self, last: Seen, came: Came, angle: f64, packets: f64, step: Step) -> Place {
-        let missing = (packets - 1.0).max(0.0) as u64;
+        let is_steady = self.lessons >= STEADY;
+        let missing = if is_steady { (packets - 1.0).max(0.0) as u64 } else { 0 };
         self.lost += missing.saturating_sub(u64::from(self.odds));
         (self.odd, self.odds) = (None, 0);
         let (angle, time) = (last.angle + angle, last.time + packets * came.packet_ns);
@@ -192,6 +204,10 @@ impl Sequence {
         self.counted.1 += packets as u32;
         let (from, count) = self.counted;
         let passed = place.angle - from;
+        // A turn in which the head stood still is none.
+        if self.advance().is_some_and(|advance| f64::from(count) > (passed + 90.0) / advance) {
+            return self.first(came.start);
+        }
         if passed < 360.0 {
             return place;
         }
@@ -206,8 +222,12 @@ impl Sequence {
                     self.last.iter_mut().for_each(|last| last.time += missing * came.packet_ns);
                 }
             }
-            Some(advance) => self.advance += (passed / f64::from(count) - advance) / 4.0,
-            None => (self.advance, self.lessons) = (passed / f64::from(count), LESSONS),
+            known => {
+                let is = passed / f64::from(count);
+                let even = known.filter(|advance| (is - advance).abs() <= 0.1 * advance);
+                self.lessons = if even.is_some() { STEADY } else { LESSONS };
+                self.advance = even.map_or(is, |advance| advance + (is - advance) / 4.0);
+            }
         }
         place
     }
@@ -216,7 +236,7 @@ impl Sequence {
     fn odd(&mut self, came: Came) -> Place {
         let follows = self.odd.is_some_and(|odd| clockwise(odd, came.start) < WIDEST);
         if follows && came.adjoins() && self.odds + 1 >= LESSONS {
-            return self.first_point(came.start);
+            return self.first(came.start);
         }
         self.odd = Some(came.start);
         self.odds += 1;
@@ -230,14 +250,35 @@ fn clockwise(from: f32, to: f32) -> f64 {
     if angle < 0.0 { angle + 360.0 } else { angle }
 }
 
-/// How many turns are missing where a packet comes later than usual by `late`.
-fn turns(late: f64, advance: f64, packet_ns: f64) -> f64 {
-    let turn_ns = 360.0 / advance * packet_ns;
-    f64::from((late.max(0.0) / turn_ns + 0.5) as u32)
+/// How fast a head turns.
+#[derive(Clone, Copy)]
+struct Turn {
+    /// Degrees from one packet to the next, and nanoseconds.
+    advance: f64,
+    packet_ns: f64,
+}
+
+impl Turn {
+    /// Nanoseconds that `angle` degrees take.
+    fn time(self, angle: f64) -> f64 {
+        angle / self.advance * self.packet_ns
+    }
+
+    /// How many turns are missing where a packet comes later than usual by `late`.
+    fn missing(self, late: f64) -> f64 {
+        f64::from((late.max(0.0) / self.time(360.0) + 0.5) as u32)
+    }
+
+    /// Whether a packet comes so much later than its angle says that the scanner did not send for a while.
+    fn is_apart(self, late: f64) -> bool {
+        late > 0.15 * self.time(360.0)
+    }
 }
 
 /// Packets that agree before it is believed how far they are apart; and those in a row that may be wrong.
 const LESSONS: u32 = 3;
+/// Packets that agree before it is believed that what does not come is missing: a head gets up to its speed.
+const STEADY: u32 = 12;
 /// Degrees of the widest packet: a head that turns so fast measures less than four of them in a turn.
 const WIDEST: f64 = 100.0;
 /// Degrees of a packet of a head that stands still.
@@ -253,3 +294,27 @@ const EARLY: f64 = -1e7;
 const POINT: u32 = 5;
 /// So many points of a stream of single ones may be missing without a word.
 const GAP: u32 = 30;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Packets of a head that gets up to its speed within 200 of them, and goes on.
+    #[test]
+    fn nothing_is_lost_while_a_head_gets_up_to_its_speed() {
+        for steps in [20.0, 60.0, 200.0] {
+            let (mut sequence, mut start, mut begun) = (Sequence::new(), 0.0f64, 0.0);
+            for n in 0..400 {
+                let at = BEGIN + f64::from(n) * 8e6;
+                let came = Came { start: (start % 360.0) as f32, skipped: 0, packet_ns: 8e6 };
+                let place = sequence.place(came, |time| at - begun - time);
+                if place.step == Step::First {
+                    begun = at - BEGIN;
+                }
+                assert!(n < 300 || place.step == Step::Next, "{steps} {n}: {place:?}");
+                start += 21.4 * (f64::from(n) / steps).min(1.0);
+            }
+            assert_eq!(sequence.came_and_lost(), (400, 0), "{steps}");
+        }
+    }
+}

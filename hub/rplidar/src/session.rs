@@ -6,19 +6,22 @@
 
 mod dialogue;
 mod driven;
+mod outgoing;
+mod reply;
 mod stream;
 
-use line::{Arrivals, MILLIS, Nanos, SensorClock, State, Tally, TurnCounts};
+use line::{MILLIS, Nanos, Reads, SensorClock, State, Tally, TurnCounts};
 
 use crate::framer::{Expect, Framer};
 use crate::model::{Mode, Model};
 use crate::offers::Offers;
 use crate::packet::Kind;
 use crate::sequence::Sequence;
-use crate::told::{Health, Info, Trouble};
+use crate::told::{Health, Info, Trouble, Why};
 use crate::turn::Turns;
 
-use self::dialogue::{Ask, Outgoing};
+use self::dialogue::Ask;
+use self::outgoing::Outgoing;
 use self::stream::{Current, Held, Measure};
 
 /// What a session shall do.
@@ -45,17 +48,6 @@ impl Settings {
     pub fn baud(&self) -> u32 {
         self.model.unwrap_or(Model::A1).baud()
     }
-
-    /// What packets are that look like express and like dense ones, where no answer says it.
-    fn alike(&self) -> Kind {
-        match (self.model, self.mode) {
-            (_, Some(Mode::DenseBoost)) => Kind::Dense,
-            (_, Some(_)) | (None | Some(Model::A1 | Model::A2m8 | Model::A2m12 | Model::A3), None) => {
-                Kind::Express
-            }
-            (Some(_), None) => Kind::Dense,
-        }
-    }
 }
 
 /// One scanner's session.
@@ -63,7 +55,7 @@ impl Settings {
 pub struct Session {
     settings: Settings,
     framer: Framer,
-    arrivals: Arrivals,
+    reads: Reads,
     clock: SensorClock,
     sequence: Sequence,
     turns: Turns,
@@ -82,11 +74,14 @@ pub struct Session {
     was_reset: bool,
     /// Whether the motor obeys requests for a duty cycle.
     has_board: bool,
-    /// The mode in use is not the wanted one.
+    /// The mode in use, if it is known here, and the wanted one if it is another.
+    mode: Option<Mode>,
     no_mode: Option<Mode>,
     /// Nanoseconds from one point to the next, once they are known, or what they are measured by.
     point_ns: Option<f64>,
     measure: Option<Measure>,
+    /// The last mode of which somebody else was told, and by which key.
+    overheard: (u8, u8),
     /// The grid, once it is known, and whether it is known what this stream is.
     beams: Option<usize>,
     is_learned: bool,
@@ -96,12 +91,10 @@ pub struct Session {
     /// Since when nobody follows.
     idle_since: Option<Nanos>,
     now: Nanos,
-    last_byte: Nanos,
-    /// Until when nothing has to be read.
-    rest_until: Nanos,
-    room: usize,
-    /// The last stamp of a turn, behind which none goes.
-    last_stamp: Nanos,
+    /// As [`line::family::Turning::scanner_time`].
+    pub(crate) scanner_time: Option<Nanos>,
+    /// As [`line::family::Turning::doubt`].
+    pub(crate) doubt: u8,
     trouble: Option<Trouble>,
     /// Since when nothing answers, and bytes read by then.
     quiet_since: Option<(Nanos, u64)>,
@@ -135,7 +128,7 @@ impl Session {
         let mut session = Session {
             settings,
             framer: Framer::new(Expect::Nothing),
-            arrivals: Arrivals::default(),
+            reads: Reads::new(now),
             clock: SensorClock::new(),
             sequence: Sequence::new(),
             turns: Turns::new(),
@@ -150,19 +143,19 @@ impl Session {
             offers: Offers::default(),
             was_reset: false,
             has_board: false,
+            mode: settings.mode.filter(|_| settings.listen_only),
             no_mode: None,
             point_ns: None,
             measure: None,
+            overheard: (0, 0),
             beams: None,
             is_learned: false,
             current: None,
             held: None,
             idle_since: None,
             now,
-            last_byte: now,
-            rest_until: 0,
-            room: 0,
-            last_stamp: 0,
+            scanner_time: None,
+            doubt: 0,
             trouble: None,
             quiet_since: None,
             damaged: (0, 0),
@@ -176,6 +169,26 @@ impl Session {
     /// What is at the other end, as far as that is known.
     pub fn model(&self) -> Option<Model> {
         self.info.and_then(|info| info.model()).or(self.settings.model)
+    }
+
+    /// How it measures, as far as that has a name here; nothing before it does.
+    pub(crate) fn mode(&self) -> Option<Mode> {
+        self.mode
+    }
+
+    /// Whether another model than this one is wanted.
+    pub(crate) fn is_wrong(&self, model: Model) -> bool {
+        self.settings.model.is_some_and(|wanted| wanted != model)
+    }
+
+    /// What packets are that look like express and like dense ones, where no answer says it: the model's fastest ones.
+    fn alike(&self) -> Option<Kind> {
+        match (self.settings.mode, self.model()) {
+            (Some(Mode::DenseBoost), _) => Some(Kind::Dense),
+            (Some(_), _) => Some(Kind::Express),
+            (None, Some(Model::A1 | Model::A2m8 | Model::A2m12 | Model::A3)) => Some(Kind::Express),
+            (None, model) => model.map(|_| Kind::Dense),
+        }
     }
 
     /// What it says that it is; nothing before it was asked.
@@ -223,6 +236,7 @@ impl Session {
             return self.rest(true);
         }
         match self.phase {
+            Phase::Listening { .. } if self.framer.is_alike() => self.trouble = Some(Trouble::Alike),
             Phase::Listening { since } => self.complain(since),
             Phase::Draining { attempts, until, at_most } if now >= until.min(at_most) => {
                 self.ask(Ask::Info, attempts);
@@ -242,9 +256,8 @@ impl Session {
     }
 
     /// When something is due, and what.
-    fn deadline(&self) -> (Nanos, crate::told::Why) {
-        use crate::told::Why;
-        let (until, why) = match self.phase {
+    fn deadline(&self) -> (Nanos, Why) {
+        match self.phase {
             Phase::Listening { since } => {
                 let seconds = self.now.saturating_sub(since) / SILENCE;
                 (since + (seconds + 1) * SILENCE, Why::Answer)
@@ -255,10 +268,6 @@ impl Session {
             Phase::Booting { until } => (until, Why::Booting),
             Phase::Unwell { until } => (until, Why::Unwell),
             Phase::Hearing { silent_at, .. } => (silent_at, Why::Silence),
-        };
-        match self.framer.hold() {
-            Some(hold) if self.last_byte + hold < until => (self.last_byte + hold, Why::Held),
-            _ => (until, why),
         }
     }
 }

@@ -91,10 +91,12 @@ pub enum Trouble {
     Silence,
     /// Packets come, but the head does not turn.
     StandsStill,
-    /// The scanner says that it is not well, also after it was booted.
+    /// The scanner says that it is not well, or that it may not be for long.
     Unwell(Health),
     /// It answers, but does not begin to measure.
     Refused,
+    /// In a recording there are packets that look like those of two kinds, and nothing tells of which they are.
+    Alike,
     /// It does not have this mode, or its line cannot carry it: it measures in another one.
     NoMode(Mode),
 }
@@ -109,13 +111,16 @@ impl fmt::Display for Trouble {
                     None => f.write_str("115200, 256000, 460800 and 1000000")?,
                 }
                 let remedy =
-                    if *noise { "another rate, another device?" } else { "power, cable, other port?" };
+                    if *noise { "another scanner? stop the hub and run `scanhub probe`" } else { "power, cable, other port?" };
                 write!(f, " baud for {seconds} s: {remedy}")
             }
             Trouble::Silence => f.write_str("no measured data for one second"),
             Trouble::StandsStill => f.write_str("packets come, but the head does not turn: is it blocked?"),
             Trouble::Unwell(health) => write!(f, "the scanner reports: {health}"),
             Trouble::Refused => f.write_str("the scanner answers, but does not begin to measure"),
+            Trouble::Alike => f.write_str(
+                "the packets may be of two kinds (82h or 85h), which nothing here tells: name the model or the mode",
+            ),
             Trouble::NoMode(mode) => {
                 write!(
                     f,

@@ -4,7 +4,7 @@
 use std::fmt;
 
 use line::family::{Condition, Features, Model, Turning as _, Wanted};
-use line::{Account, Control, Heard, Nanos, Output, State};
+use line::{Heard, Nanos, Output};
 use schema::Family;
 
 /// Declares the families: number and crate of one stand in a line.
@@ -96,6 +96,23 @@ impl Session {
         each!(self, session => line::family::Turning::beams(session))
     }
 
+    /// What it turned out to be where another model is wanted.
+    pub fn other_model(&self) -> Option<Model> {
+        each!(self, session => line::family::Turning::other_model(session))
+    }
+
+    /// What has to be named before it can be read where nobody can be asked.
+    pub fn lacks(&self) -> Option<&'static str> {
+        each!(self, session => line::family::Turning::lacks(session))
+    }
+
+    /// What it is in a few words, the model first: how it measures, and its firmware.
+    pub fn kind(&self) -> Option<String> {
+        let mut text = self.model()?.name.to_uppercase();
+        each!(self, session => session.specify(&mut text));
+        Some(text)
+    }
+
     /// What the scanner said of itself, and how it says that it is; nothing before it was asked all that changes nothing, and
     /// nothing of one that is never asked.
     pub fn introduction(&self) -> Option<Introduction> {
@@ -120,55 +137,13 @@ impl line::Session for Session {
     type Why = ();
     type Trouble = Trouble;
 
-    fn spare(&mut self) -> &mut [u8] {
-        each!(self, session => session.spare())
-    }
-
-    fn commit(&mut self, now: Nanos, len: usize) {
-        each!(self, session => session.commit(now, len))
-    }
-
-    fn may_leave(&self) -> bool {
-        each!(self, session => session.may_leave())
-    }
-
-    fn leave(&mut self, now: Nanos, waiting: usize) -> bool {
-        each!(self, session => session.leave(now, waiting))
-    }
-
-    fn handle_timeout(&mut self, now: Nanos) {
-        each!(self, session => session.handle_timeout(now))
-    }
-
-    fn control(&mut self, control: Control, now: Nanos) {
-        each!(self, session => session.control(control, now))
-    }
-
-    fn followed(&mut self, now: Nanos, is_followed: bool) {
-        each!(self, session => session.followed(now, is_followed))
-    }
-
-    fn transmitted(&mut self, now: Nanos) {
-        each!(self, session => session.transmitted(now))
-    }
+    line::delegate_session!(each);
 
     fn poll_output(&mut self) -> Output<Heard<'_>, ()> {
         each!(self, session => session.poll_output().map(|heard| heard))
     }
 
-    fn state(&self) -> State {
-        each!(self, session => session.state())
-    }
-
     fn trouble(&self) -> Option<Trouble> {
         trouble(self)
-    }
-
-    fn rate(&self) -> u32 {
-        each!(self, session => session.rate())
-    }
-
-    fn account(&self) -> Account {
-        each!(self, session => session.account())
     }
 }

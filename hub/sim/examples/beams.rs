@@ -2,6 +2,7 @@
 //! and what share of the bins stays empty, against the number of bins; and how long a turn takes to be put there. The
 //! tables of docs/scanners.md: `cargo run --release -p scanhub-sim --example beams`.
 
+use line::family::Turning;
 use line::grid::{Grid, Point};
 use line::{Heard, MILLIS, Nanos, Output, Session, line_time};
 use sim::Arrival;
@@ -18,10 +19,10 @@ fn room() -> Room {
     Room::new(&world, 1)
 }
 
-/// The whole turns that `session` makes of what `device` sends in `seconds`.
-fn turns<S>(mut session: S, mut device: impl Device, seconds: u64) -> Vec<Vec<Point>>
+/// The whole turns that `session` makes of what `device` sends in `seconds`, and the beams that it has by itself.
+fn turns<S>(mut session: S, mut device: impl Device, seconds: u64) -> (Vec<Vec<Point>>, usize)
 where
-    S: for<'a> Session<Heard<'a> = Heard<'a>>,
+    S: for<'a> Session<Heard<'a> = Heard<'a>> + Turning,
 {
     let (mut now, mut turns): (Nanos, Vec<Vec<Point>>) = (0, Vec::new());
     while now < seconds * 1_000 * MILLIS {
@@ -53,7 +54,7 @@ where
             }
         }
     }
-    turns
+    (turns, session.beams().expect("it was heard"))
 }
 
 /// A grid and the slices that it fills.
@@ -78,9 +79,9 @@ impl Sheet {
 }
 
 /// The rows of one model, which measures so many points in a turn.
-fn rows(name: &str, a_turn: usize, turns: &[Vec<Point>]) {
+fn rows(name: &str, a_turn: usize, turns: &[Vec<Point>], percents: &[usize]) {
     let points: usize = turns.iter().map(Vec::len).sum();
-    for percent in [67, 80, 90, 95, 99, 100, 101, 105, 110, 120, 133] {
+    for percent in percents {
         let mut sheet = Sheet::new(a_turn * percent / 100);
         let (mut collapsed, mut empty) = (0, 0);
         for turn in turns {
@@ -100,14 +101,20 @@ fn main() {
         let session = ld::Session::new(ld::Settings { model: Some(model), ..ld::Settings::default() }, 0);
         let head = Head::new(HeadSettings::of(model), Packets::Room(Box::new(room())));
         let a_turn = model.points_per_second() / model.turns_per_second();
-        rows(model.name(), a_turn as usize, &turns(session, head, 30));
+        let percents = [67, 80, 90, 95, 99, 100, 101, 105, 110, 120, 133];
+        rows(model.name(), a_turn as usize, &turns(session, head, 30).0, &percents);
     }
-    for model in rplidar::Model::ALL {
-        let settings = rplidar::Settings { model: Some(model), ..rplidar::Settings::default() };
-        let simulated =
-            sim::rplidar::Model::ALL.into_iter().find(|simulated| simulated.name() == model.name());
-        let unit = Unit::new(UnitSettings::of(simulated.expect("it is simulated")), room());
-        rows(model.name(), model.beams(), &turns(rplidar::Session::new(settings, 0), unit, 30));
+    for simulated in sim::rplidar::Model::ALL {
+        for mode in simulated.modes() {
+            let settings = rplidar::Settings {
+                model: rplidar::Model::named(simulated.name()),
+                mode: rplidar::Mode::named(mode.name),
+                ..rplidar::Settings::default()
+            };
+            let unit = Unit::new(UnitSettings::of(simulated), room());
+            let (turns, beams) = turns(rplidar::Session::new(settings, 0), unit, 30);
+            rows(&format!("{} {}", simulated.name(), mode.name), beams, &turns, &[80, 90, 100, 110, 120]);
+        }
     }
     let mut random = fastrand::Rng::with_seed(1);
     let mut points: Vec<Point> = (0..3_240)

@@ -141,6 +141,7 @@ pub fn parse_family(
     mode: Option<&str>,
 ) -> Result<Option<Scanner>, Failure> {
     let wrong = |message: String, hint: &str| Err(Failure::new(Kind::Configuration, message, hint));
+    let model = model.map(str::to_lowercase);
     match one_of("family", family, &["lms", "ld", "rplidar"].map(|name| (name, name)))? {
         "ld" => {
             if let Some(mode) = mode {
@@ -150,15 +151,21 @@ pub fn parse_family(
                 );
             }
             let models = ld::Model::ALL.map(|model| (model.name(), Scanner::Ld(model)));
-            one_of("model", model.unwrap_or(ld::Model::Ld19.name()), &models).map(Some)
+            one_of("model", model.as_deref().unwrap_or(ld::Model::Ld19.name()), &models).map(Some)
         }
         "rplidar" => {
             let models = rplidar::Model::ALL.map(|model| (model.name(), model));
-            let model = one_of("model", model.unwrap_or(rplidar::Model::A1.name()), &models)?;
+            let model = one_of("model", model.as_deref().unwrap_or(rplidar::Model::A1.name()), &models)?;
             let modes: Vec<_> = model.modes().iter().map(|mode| mode.name.to_lowercase()).collect();
-            let known: Vec<_> = modes.iter().enumerate().map(|(mode, name)| (name.as_str(), mode)).collect();
-            let typical = modes[model.typical()].clone();
-            let mode = one_of("mode", &mode.map_or(typical, str::to_lowercase), &known)?;
+            let named = |wanted: &str| modes.iter().position(|name| *name == wanted.to_lowercase());
+            let mode = match mode.map(|mode| (mode, named(mode))) {
+                None => model.typical(),
+                Some((_, Some(mode))) => mode,
+                Some((mode, None)) => {
+                    let hint = format!("one of: {}", modes.join(", "));
+                    return wrong(format!("a scanner {} has no mode {mode:?}", model.name()), &hint);
+                }
+            };
             Ok(Some(Scanner::Rplidar { model, mode }))
         }
         _ => match model {

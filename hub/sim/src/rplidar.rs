@@ -104,6 +104,33 @@ impl Unit {
         Some(self.stream?.mode)
     }
 
+    /// Packets of the stream as it is now that were begun; nothing where none began. The next one begins with the point
+    /// behind theirs.
+    pub fn sent(&self) -> Option<u64> {
+        self.begin_ns()?;
+        Some(self.stream?.sent())
+    }
+
+    /// Turns that its motor makes in a second, wander aside; nothing while it rests.
+    pub fn turns_per_second(&self) -> Option<f64> {
+        Some(self.motor?.rotation.turns_per_second)
+    }
+
+    /// Makes a motor that turns turn so many times in a second from the next packet of its stream on. The inertia of a real
+    /// head is the caller's.
+    pub fn set_speed(&mut self, turns_per_second: f64) {
+        let next = self.stream.and_then(|stream| stream.next_ns(self.motor));
+        if let (Some(motor), Some(next_ns)) = (&mut self.motor, next) {
+            let seconds = next_ns.saturating_sub(motor.since_ns) as f64 / 1e9;
+            motor.rotation.set_speed(seconds, turns_per_second);
+        }
+    }
+
+    /// From now on it deviates from the manual like this.
+    pub fn set_habits(&mut self, habits: Habits) {
+        self.settings.habits = habits;
+    }
+
     /// The voltage dips at `now`: it starts anew, and its banner comes where measurements came. Returns whether a packet
     /// was broken off.
     pub fn brown_out(&mut self, now: Nanos) -> bool {
@@ -180,8 +207,8 @@ impl Unit {
             }
             (false, Some(before)) => {
                 self.held = None;
-                let again =
-                    before.map(|before| Motion { rotation: before.rotation, ..self.motion(now, 1.0) });
+                let usual = self.settings.turns_per_second;
+                let again = before.map(|before| self.motion(now, before.rotation.turns_per_second / usual));
                 self.turn(again);
             }
             _ => {}

@@ -275,13 +275,21 @@ fn check(options: &SimulateOptions) -> Result<(), Failure> {
             ("mode by number", options.mode.is_some()),
             ("state", options.state != states[0] && !(talks && states.contains(&options.state))),
             ("sensor", !options.sensors.is_empty() && talks),
+            ("type", options.family != SimulateOptions::default().family),
+            ("address", options.address != 0),
+            ("pollution", options.pollution != 100),
+            ("status byte", options.status != SimulateOptions::default().status),
             ("error", !options.errors.is_empty()),
             ("indices", options.indices || options.short_configuration),
             ("recording", options.replay.is_some() && talks),
         ];
         if let Some((name, _)) = lms.into_iter().find(|(_, is_said)| *is_said) {
             let message = format!("a scanner {} has no {name} to choose", scanner.name());
-            return wrong(message, "leave it out, or use --family lms");
+            let hint = match name {
+                "state" if talks => "use idle, streaming or starting, or --family lms",
+                _ => "leave it out, or use --family lms",
+            };
+            return wrong(message, hint);
         }
     }
     if let (Some(variant), family) = (options.variant, options.family)

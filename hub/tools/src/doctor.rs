@@ -3,6 +3,7 @@
 //! nobody holds, as the hub would: the port stays raw at the rate of the last question, and its driver hands over bytes at
 //! once.
 
+mod bridge;
 mod counts;
 mod finding;
 mod hub;
@@ -27,6 +28,7 @@ use port::{Candidate, Source, candidates};
 use schema::limits::TopicLimits;
 use schema::{Domain, Failure, Kind, ipc};
 
+pub use bridge::Bridge;
 use config::{Config, Gateway, Link};
 pub use finding::{CHECKS, Finding, State};
 use hub::Hub;
@@ -48,6 +50,8 @@ pub struct Subjects {
     pub places: Vec<Domain>,
     /// The machine's files.
     pub system: System,
+    /// How a bridge to other machines would connect.
+    pub bridge: Bridge,
     /// Whether to first remove what dead processes left in the domain.
     pub clean: bool,
 }
@@ -101,6 +105,7 @@ pub fn examine(
     tell(limits::file_size(&facts));
     tell(logout::logout(system, pid.and_then(program::user_of).unwrap_or(system.user())));
     tell(multicast::multicast(system, subjects.gateway.interface.as_deref()));
+    bridge::bridge(&subjects.bridge).into_iter().for_each(&mut tell);
     for subject in &ports {
         let (port, link) = (subject.source.name(), subject.link.as_ref().map(|link| link.name.as_str()));
         line::examine(subject, &there, hub.as_ref(), stop, &mut |finding| tell(finding.at(&port, link)))?;

@@ -84,7 +84,8 @@ pub fn decode(options: &DecodeOptions, out: &mut dyn Write) -> Result<(), Failur
         Err(error) => Err(Failure::new(Kind::Failed, format!("cannot write: {error}"), "")),
         Ok(()) if show.telegrams() == 0 => {
             let message = format!("{name}: no telegram in {} bytes", show.bytes());
-            let hint = "expected: raw bytes of a line, or text such as 02 00 01 00 31 15 12";
+            let hint = "expected: raw bytes of an LMS, or text such as 02 00 01 00 31 15 12; packets of other families are \
+                        not explained here: `scanhub convert FILE OUT.csv` has their scans";
             Err(Failure::new(Kind::Check, message, hint))
         }
         Ok(()) => Ok(()),

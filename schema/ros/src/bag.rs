@@ -17,6 +17,7 @@ pub struct Bag {
     /// Channels of the sensors' scans; few enough to be looked through.
     scans: Vec<(String, u16)>,
     transforms: Option<Transforms>,
+    /// By frame.
     poses: Vec<(String, Pose)>,
     message: Vec<u8>,
 }
@@ -61,10 +62,11 @@ impl Bag {
         wall_ns: u64,
         pose: &Pose,
     ) -> io::Result<()> {
-        match self.poses.iter_mut().find(|(of, _)| of == sensor) {
+        let frame = frame(sensor);
+        match self.poses.iter_mut().find(|(of, _)| of == frame) {
             Some((_, known)) if known == pose => return Ok(()),
             Some((_, known)) => *known = *pose,
-            None => self.poses.push((sensor.to_owned(), *pose)),
+            None => self.poses.push((frame.to_owned(), *pose)),
         }
         let Transforms { channel, number, from_ns } = match self.transforms {
             Some(known) => known,

@@ -16,6 +16,14 @@ impl Cdr<'_> {
         Cdr { message, body }
     }
 
+    pub(crate) fn bool(&mut self, value: bool) {
+        self.u8(value.into());
+    }
+
+    pub(crate) fn u8(&mut self, value: u8) {
+        self.message.push(value);
+    }
+
     pub(crate) fn u32(&mut self, value: u32) {
         self.value(value.to_le_bytes());
     }
@@ -38,6 +46,11 @@ impl Cdr<'_> {
     pub(crate) fn floats(&mut self, values: impl ExactSizeIterator<Item = f32>) {
         self.u32(values.len() as u32);
         values.for_each(|value| self.message.extend(value.to_le_bytes()));
+    }
+
+    /// Bytes of an array whose number is told already.
+    pub(crate) fn bytes(&mut self, bytes: &[u8]) {
+        self.message.extend(bytes);
     }
 
     /// `std_msgs/Header`. Seconds are an int32: from 2038 on they are cut.

@@ -5,28 +5,59 @@ use schema::{Code, Header, Scan};
 use crate::cdr::Cdr;
 
 /// Writes `scan`, of the frame `frame`, to the end of `message`: x ahead, angles in radians counter-clockwise from there as
-/// the sensor itself counts them, also if it is mounted upside down; ranges in metres (REP 103), each the float nearest to
-/// the sensor's value. +inf: no echo within the sensor's range; -inf: something is too near; NaN: not known (REP 117).
-/// Stamped when its first beam was measured.
+/// the sensor itself counts them, also if it is mounted upside down, in ascending order; ranges in metres (REP 103), each the
+/// float nearest to the sensor's value. +inf: no echo within the sensor's range; -inf: something is too near; NaN: not known
+/// (REP 117). Stamped when its first beam was measured: of a scanner that turns clockwise that is the one it measured last,
+/// and the time from beam to beam is negative.
 pub fn laser_scan(message: &mut Vec<u8>, frame: &str, header: &Header, scan: &Scan) {
     let mut cdr = Cdr::begin(message);
-    cdr.header(header.wall_ns.saturating_add_signed(scan.beam_ns(0)), frame);
-    // Beams that stand between others are measured a turn later: then no one time lies between two.
-    let beam_ns = if scan.turns > 1 { 0 } else { scan.beam_time_ns };
+    cdr.header(stamp_ns(header, scan), frame);
+    let last = scan.beams().saturating_sub(1);
+    // The beam at place `i` of the message.
+    let beam = |i: usize| if is_clockwise(scan) { last - i } else { i };
+    let (first_angle, step) = (scan.first_angle + beam(0) as f64 * scan.step, scan.step.abs());
     for value in [
-        scan.first_angle as f32,
-        (scan.first_angle + scan.beams().saturating_sub(1) as f64 * scan.step) as f32,
-        scan.step as f32,
-        (f64::from(beam_ns) / 1e9) as f32,
-        (f64::from(header.period_us) / 1e6) as f32,
+        first_angle as f32,
+        (first_angle + last as f64 * step) as f32,
+        step as f32,
+        (beam_time_ns(scan) / 1e9) as f32,
+        (scan_time_us(header, scan) / 1e6) as f32,
         metres(1, scan),
         metres(scan.valid_to, scan),
     ] {
         cdr.f32(value);
     }
-    cdr.floats((0..scan.beams()).map(|i| range_m(scan, i)));
+    cdr.floats((0..scan.beams()).map(|i| range_m(scan, beam(i))));
     let intensities = scan.intensities();
-    cdr.floats((0..intensities.len()).map(|i| f32::from(intensities.get(i).unwrap_or_default())));
+    cdr.floats((0..intensities.len()).map(|i| f32::from(intensities.get(beam(i)).unwrap_or_default())));
+}
+
+/// When the first beam of the message was measured, by the wall clock.
+pub(crate) fn stamp_ns(header: &Header, scan: &Scan) -> u64 {
+    let first = if is_clockwise(scan) { scan.beams().saturating_sub(1) } else { 0 };
+    header.wall_ns.saturating_add_signed(scan.beam_ns(first))
+}
+
+fn is_clockwise(scan: &Scan) -> bool {
+    scan.step < 0.0
+}
+
+/// From a beam of the message to the next.
+fn beam_time_ns(scan: &Scan) -> f64 {
+    match f64::from(scan.beam_time_ns) {
+        // Beams that stand between others are measured a turn later: then no one time lies between two.
+        _ if scan.turns > 1 => 0.0,
+        time if is_clockwise(scan) => -time,
+        time => time,
+    }
+}
+
+/// The time between two scans: that of a turn where the header does not tell.
+fn scan_time_us(header: &Header, scan: &Scan) -> f64 {
+    match header.period_us {
+        0 => f64::from(scan.beam_time_ns) * scan.beams() as f64 / 1e3,
+        period => period.into(),
+    }
 }
 
 fn range_m(scan: &Scan, i: usize) -> f32 {
@@ -46,7 +77,7 @@ fn metres(range: u16, scan: &Scan) -> f32 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use schema::ScanHead;
+    use schema::{Family, ScanHead};
 
     fn scan(ranges: &[u16], step_mdeg: u32) -> Box<Scan> {
         Scan::of(ScanHead::lms(ranges.len(), -90_000, step_mdeg, 10, 13), ranges)
@@ -95,5 +126,22 @@ mod tests {
         laser_scan(&mut message, "rear", &Header { wall_ns: 1 << 60, ..Header::default() }, &between);
         let told = numbers(&message);
         assert_eq!((told[3], told[7].to_bits(), told[17].to_bits(), told.len()), (0.0, 9, 0, 18));
+    }
+
+    #[test]
+    fn angles_ascend_also_of_a_scanner_that_turns_clockwise() {
+        let mut head = ScanHead::turning(Family::Ld, 4);
+        (head.beam_time_ns, head.first_beam_ns) = (25_000_000, 0);
+        let mut it = Scan::of(head, &[1000, 2000, 3000, 4000]);
+        it.arrays().upper.copy_from_slice(&[1, 2, 3, 4]);
+        let mut message = Vec::new();
+        laser_scan(&mut message, "rear", &Header { wall_ns: 5_000_000_000, ..Header::default() }, &it);
+        let told = numbers(&message);
+        let quarter = std::f32::consts::FRAC_PI_2;
+        // The grid begins ahead and turns to the right; its last beam looks left and was measured 75 ms after the first.
+        assert_eq!(message[4..12], [5, 0, 0, 0, 0xC0, 0x68, 0x78, 0x04]);
+        assert_eq!(told[..5], [-3.0 * quarter, 0.0, quarter, -0.025, 0.1]);
+        assert_eq!(told[8..12], [4.0, 3.0, 2.0, 1.0]);
+        assert_eq!(told[13..], [4.0, 3.0, 2.0, 1.0]);
     }
 }

@@ -7,11 +7,21 @@
 pub mod bag;
 mod cdr;
 mod laser_scan;
+mod layout;
+mod markers;
 mod names;
+mod point_cloud;
+mod state;
 mod transforms;
+mod type_hash;
 mod types;
+pub mod zenoh_wire;
 
 pub use laser_scan::laser_scan;
-pub use names::{BASE_FRAME, TF_STATIC, frame, scan_topic};
+pub use layout::{Value, read};
+pub use markers::{mark_markers, zone_markers};
+pub use names::{BASE_FRAME, DIAGNOSTICS, Names, TF_STATIC, frame, scan_topic};
+pub use point_cloud::foreground_cloud;
+pub use state::{diagnosis, verdict_word};
 pub use transforms::static_transforms;
-pub use types::{LASER_SCAN, TF_MESSAGE, Type};
+pub use types::{DIAGNOSTIC_ARRAY, LASER_SCAN, MARKER_ARRAY, POINT_CLOUD, STRING, TF_MESSAGE, Type};

@@ -2,10 +2,10 @@
 
 use schema::Pose;
 
+use crate::BASE_FRAME;
 use crate::cdr::Cdr;
-use crate::{BASE_FRAME, frame};
 
-/// Appends the `poses` of the sensors on the robot to `message`, stamped `stamp_ns` (since 1970). It contains all of them,
+/// Appends the `poses` of the sensors on the robot, by their frames, to `message`, stamped `stamp_ns` (since 1970). It contains all of them,
 /// because a late subscriber gets only the last message of its topic.
 ///
 /// A sensor that is mounted upside down is rotated by half a turn around its x axis, then by its yaw around the robot's z:
@@ -13,9 +13,9 @@ use crate::{BASE_FRAME, frame};
 pub fn static_transforms(message: &mut Vec<u8>, stamp_ns: u64, poses: &[(String, Pose)]) {
     let mut cdr = Cdr::begin(message);
     cdr.u32(poses.len() as u32);
-    for (sensor, pose) in poses {
+    for (frame, pose) in poses {
         cdr.header(stamp_ns, BASE_FRAME);
-        cdr.text(frame(sensor));
+        cdr.text(frame);
         for value in [pose.x_m, pose.y_m, 0.0].into_iter().chain(rotation(pose)) {
             cdr.f64(value);
         }

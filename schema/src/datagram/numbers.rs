@@ -89,10 +89,20 @@ impl Row {
         self.number(sequence) < self.lowest
     }
 
+    /// Greater than all that came.
+    pub(super) fn is_ahead(&self, sequence: u32) -> bool {
+        self.received == 0 || self.number(sequence) > self.highest
+    }
+
+    /// It came, if it is not stale.
+    pub(super) fn came(&self, sequence: u32) -> bool {
+        !self.is_ahead(sequence) && self.has(self.number(sequence))
+    }
+
     /// A number came that is not stale.
     pub(super) fn take(&mut self, sequence: u32) -> Fresh {
         let number = self.number(sequence);
-        let is_late = self.received > 0 && number <= self.highest;
+        let is_late = !self.is_ahead(sequence);
         if is_late && self.has(number) {
             self.duplicate += 1;
             return Fresh::Duplicate;

@@ -5,7 +5,7 @@ use super::lives::{Found, Gone, Lives};
 use super::numbers::{Fresh, Key, Row};
 use super::standing::Arrival;
 use super::voices::Whose;
-use super::{Announce, Datagram, DatagramError};
+use super::{Announce, Datagram, DatagramError, Head};
 use crate::Topic;
 
 /// The most sensors and topics of all lives that are counted separately.
@@ -117,6 +117,45 @@ impl StreamStats {
         let read = Datagram::read(bytes);
         self.count(read.err());
         read
+    }
+
+    /// Checks a part of a sample before memory is spent on it; the sample is checked and counted when it is whole. Returns
+    /// whether the sample came before. Without [`only_announced`](StreamStats::only_announced) it knows nothing of parts.
+    ///
+    /// # Errors
+    ///
+    /// [`DatagramError::Epoch`], [`DatagramError::Stale`] or [`DatagramError::Untimely`], for which all of the sample would be
+    /// refused; it is counted.
+    pub fn check_part(&mut self, head: &Head) -> Result<bool, DatagramError> {
+        if !self.only_announced {
+            return Ok(false);
+        }
+        let row = self.find((head.hub, head.epoch, head.sensor, head.topic)).map(|at| &self.rows[at]);
+        let checked = match (self.lives.find((head.hub, head.epoch)), row) {
+            (Found::Over, _) => Err(DatagramError::Epoch),
+            (_, None) => Err(DatagramError::Untimely),
+            (_, Some(row)) if row.is_stale(head.sequence) || row.is_before(head.sequence) => {
+                Err(DatagramError::Stale)
+            }
+            (_, Some(row)) => Ok(row.came(head.sequence)),
+        };
+        self.count(checked.err());
+        checked
+    }
+
+    /// Takes the sender of an announcement for the gateway's, which goes on at another address and for another life of its
+    /// hub: if the address that was heard is silent, and the announcement's number is ahead of all that came of its sensor.
+    /// Only for announcements that nobody else can have made, with a key; other ones are a twin's until then.
+    pub fn follow(&mut self, datagram: &Datagram<'_>, from: u64, now_ns: u64) {
+        let head = datagram.head;
+        let Found::At(slot) = self.lives.find((head.hub, head.epoch)) else { return };
+        let Some(announce) = Announce::unpack(datagram.payload) else { return };
+        let row = self.find((head.hub, head.epoch, head.sensor, Announce::NUMBER));
+        let is_ahead = row.is_some_and(|at| self.rows[at].is_ahead(head.sequence));
+        let voices = &mut self.lives.record_mut(slot).voices;
+        if is_ahead && voices.judge(from, Some(announce.boot), now_ns) == Whose::Next {
+            voices.move_to(from, announce.boot, now_ns);
+        }
     }
 
     /// Checks and counts a sample that is whole, be it that it came in one datagram, or that it was put together of parts,

@@ -95,6 +95,17 @@ impl Voices {
         }
     }
 
+    /// The gateway goes on at `from`, and announced there another life of its hub.
+    pub(super) fn move_to(&mut self, from: u64, boot: u64, now_ns: u64) {
+        let boots = self.all[0].boots;
+        let at = self.place(from);
+        self.all[at].boots = boots;
+        self.all[at].announce(boot, now_ns);
+        self.all[at].heard_ns = now_ns;
+        self.all[at].other_since_ns = None;
+        self.all[..=at].rotate_right(1);
+    }
+
     /// Two gateways are known to send.
     pub(super) fn is_shared(&self) -> bool {
         self.is_shared

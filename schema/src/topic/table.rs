@@ -33,6 +33,8 @@ macro_rules! for_each_topic {
                 "The background model.";
             Status Status, "status", "scanhub.Status.v2", 80, Second, Last, 4, 1:
                 "State, properties and counters of the link.";
+            Lines Lines, "lines", "scanhub.Lines.v2", 81, Scan, Last, 16, 0:
+                "Straight lines and their corners.";
         }
     };
 }

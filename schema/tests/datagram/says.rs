@@ -1,7 +1,7 @@
 //! What a datagram says, in the words of the list of golden datagrams.
 
 use schema::datagram::{Announce, Datagram, MTU_SAFE, Packed};
-use schema::{BEAMS, Background, Code, Family, Foreground, Marks, Scan, Status, Topic, Zones};
+use schema::{BEAMS, Background, Code, Family, Foreground, Lines, Marks, Scan, Status, Topic, Zones};
 use serde_json::{Map, Value, json};
 
 pub(crate) fn head(datagram: &Datagram<'_>) -> Value {
@@ -28,6 +28,7 @@ pub(crate) fn payload(datagram: &Datagram<'_>) -> Value {
         Some(Topic::Zones) => zones(&unpacked(Box::<Zones>::default(), payload)),
         Some(Topic::Foreground) => foreground(&unpacked(Foreground::of(BEAMS), payload)),
         Some(Topic::Background) => background(&unpacked(Background::zeroed(MTU_SAFE), payload)),
+        Some(Topic::Lines) => lines(&unpacked(Box::<Lines>::default(), payload)),
         Some(Topic::Status) => status(&unpacked(Box::<Status>::default(), payload)),
     }
 }
@@ -76,6 +77,23 @@ fn marks(marks: &Marks) -> Value {
     json!({
         "overflow": marks.is_overflow(), "unavailable": !marks.is_available(),
         "marks": list.collect::<Vec<_>>(),
+    })
+}
+
+fn lines(lines: &Lines) -> Value {
+    let list = lines.lines().iter().map(|line| {
+        json!({
+            "x1_m": line.x1_m, "y1_m": line.y1_m, "x2_m": line.x2_m, "y2_m": line.y2_m, "r_m": line.r_m,
+            "alpha_rad": line.alpha_rad, "sd_r_m": line.sd_r_m, "sd_alpha_rad": line.sd_alpha_rad,
+            "first": line.first, "last": line.last, "points": line.points,
+        })
+    });
+    let corners = lines.corners().iter().map(|corner| {
+        json!({ "x_m": corner.x_m, "y_m": corner.y_m, "first_line": corner.first_line, "second_line": corner.second_line })
+    });
+    json!({
+        "overflow": lines.is_overflow(), "readings": lines.readings, "on_lines": lines.on_lines,
+        "noise_m": lines.noise_m, "lines": list.collect::<Vec<_>>(), "corners": corners.collect::<Vec<_>>(),
     })
 }
 

@@ -3,15 +3,16 @@
 use bytemuck::Zeroable;
 use schema::datagram::{Announce, Announced, Head, LanFlags, Packed};
 use schema::{
-    Background, BackgroundHead, COUNTERS, Code, Contents, Counter, Counters, Family, Foreground,
-    ForegroundHead, Mark, Marks, Pose, Scan, ScanHead, Segment, State, Status, Topic, Verdict, Zone, Zones,
+    Background, BackgroundHead, COUNTERS, Code, Contents, Corner, Counter, Counters, Family, Foreground,
+    ForegroundHead, Line, Lines, Mark, Marks, Pose, Scan, ScanHead, Segment, State, Status, Topic, Verdict,
+    Zone, Zones,
 };
 
 /// Name of the file, header, and what writes the payload.
 pub(crate) type Golden = (&'static str, Head, fn(&mut [u8]) -> Option<usize>);
 
 /// Those that a gateway of this version sends.
-pub(crate) const ALL: [Golden; 12] = [
+pub(crate) const ALL: [Golden; 13] = [
     ("announce", Head { sequence: 7, counter: 0, ..head(None) }, announce),
     ("telegram", Head { sequence: u32::MAX, ..head(Some(Topic::Telegram)) }, telegram),
     ("packets", Head { sequence: 5, family: Family::Ld as u8, ..head(Some(Topic::Telegram)) }, packets),
@@ -40,6 +41,7 @@ pub(crate) const ALL: [Golden; 12] = [
         Head { flags: LanFlags::STAMP_ESTIMATED, counter: u32::MAX, ..head(Some(Topic::Status)) },
         |room| status().pack(room),
     ),
+    ("lines", head(Some(Topic::Lines)), |room| lines().pack(room)),
 ];
 
 /// The header of `zones`.
@@ -158,6 +160,49 @@ fn marks() -> Marks {
         last_beam: 180,
     };
     marks
+}
+
+/// Numbers that a 32-bit float has exactly.
+fn lines() -> Lines {
+    let mut lines = Lines {
+        count: 2,
+        corners: 1,
+        flags: Lines::OVERFLOW,
+        readings: 361,
+        on_lines: 350,
+        noise_m: 0.0078125,
+        ..Lines::default()
+    };
+    lines.line_array[0] = Line {
+        x1_m: 0.0,
+        y1_m: -2.5,
+        x2_m: 4.0,
+        y2_m: -2.5,
+        r_m: 2.5,
+        alpha_rad: -1.5703125,
+        sd_r_m: 0.00390625,
+        sd_alpha_rad: 0.001953125,
+        first: 0,
+        last: 115,
+        points: 110,
+        reserved: 0,
+    };
+    lines.line_array[1] = Line {
+        x1_m: 4.0,
+        y1_m: -2.5,
+        x2_m: 4.0,
+        y2_m: 3.0,
+        r_m: 4.0,
+        alpha_rad: 0.0,
+        sd_r_m: 0.0009765625,
+        sd_alpha_rad: 0.00048828125,
+        first: 116,
+        last: 360,
+        points: 240,
+        reserved: 0,
+    };
+    lines.corner_array[0] = Corner { x_m: 4.0, y_m: -2.5, first_line: 0, second_line: 1 };
+    lines
 }
 
 fn zones() -> Zones {

@@ -38,6 +38,7 @@ fn the_header_reads_what_schema_reads() {
     let Some(program) = reader() else { return };
     let mut reader = Reader::start(&mut Command::new(program));
     readers::golden(&mut reader);
+    readers::keyed(&mut reader);
     readers::damaged(&mut reader, 5_000);
     reader.end();
 }

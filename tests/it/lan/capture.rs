@@ -41,6 +41,16 @@ impl Capture {
 
     /// What tshark shows of each packet: the values of these fields, joined by commas. `name` is the file's.
     pub(crate) fn fields(&self, name: &str, fields: &[String]) -> Vec<BTreeMap<String, String>> {
+        self.fields_with(name, fields, &[])
+    }
+
+    /// The same with these settings of the dissector.
+    pub(crate) fn fields_with(
+        &self,
+        name: &str,
+        fields: &[String],
+        settings: &[String],
+    ) -> Vec<BTreeMap<String, String>> {
         let path = Path::new(env!("CARGO_TARGET_TMPDIR")).join(format!("{name}.pcap"));
         let head: [u32; 6] = [0xA1B2_C3D4, 4 << 16 | 2, 0, 0, 65_535, 101];
         let head = head.into_iter().flat_map(u32::to_le_bytes);
@@ -52,6 +62,9 @@ impl Capture {
         // settings and no installed copy of the dissector are in the way.
         tshark.args(["-2", "-T", "fields"]).env("HOME", env!("CARGO_TARGET_TMPDIR"));
         tshark.env("XDG_CONFIG_HOME", env!("CARGO_TARGET_TMPDIR"));
+        settings.iter().for_each(|setting| {
+            tshark.args(["-o", setting]);
+        });
         let names: Vec<&str> = fields.iter().map(String::as_str).chain([LUA_ERROR]).collect();
         for name in &names {
             tshark.args(["-e", name]);

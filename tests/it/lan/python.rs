@@ -27,6 +27,7 @@ fn reader() -> Option<Reader> {
 fn the_module_reads_what_schema_reads() {
     let Some(mut reader) = reader() else { return };
     readers::golden(&mut reader);
+    readers::keyed(&mut reader);
     readers::damaged(&mut reader, 5_000);
     reader.end();
 }

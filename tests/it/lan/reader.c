@@ -1,11 +1,14 @@
 /* Reads datagrams with clients/c/scanhub.h: a line of hex digits in, a line of JSON out, in the words of the list of golden
- * datagrams. */
-#include "scanhub.h"
+ * datagrams. Before them and a colon may be the hex digits of a key, `@` and the second at which the datagram comes: then
+ * what becomes of it is told, after those before, by clients/c/scanhub_key.h. */
+#include "scanhub_key.h"
 
 #include <stdio.h>
 #include <stdlib.h>
 
-static const char *const refusals[] = {"", "short", "magic", "version", "header", "length", "crc", "skipped", "payload"};
+static const char *const refusals[] = {"", "short", "magic", "version", "header", "length", "crc",
+                                       "unauthenticated", "mac", "untimely", "epoch", "stale", "capacity", "duplicate",
+                                       "skipped", "payload"};
 
 static const char *boolean(int value) { return value ? "true" : "false"; }
 
@@ -96,6 +99,33 @@ static void marks(const struct scanhub_marks *m)
                "\"last_beam\":%u}",
                i ? "," : "", (long)k.angle_mdeg, (unsigned long)k.range_dmm, k.weight, k.peak, k.edge, k.first_beam,
                k.last_beam);
+    }
+    printf("]}");
+}
+
+static void lines(const struct scanhub_lines *l)
+{
+    printf("{\"overflow\":%s,\"readings\":%u,\"on_lines\":%u", boolean(l->overflow), l->readings, l->on_lines);
+    number(",\"noise_m\":", l->noise_m);
+    printf(",\"lines\":[");
+    for (unsigned i = 0; i < l->count; i++) {
+        struct scanhub_line k = scanhub_line(l, i);
+        number(i ? ",{\"x1_m\":" : "{\"x1_m\":", k.x1_m);
+        number(",\"y1_m\":", k.y1_m);
+        number(",\"x2_m\":", k.x2_m);
+        number(",\"y2_m\":", k.y2_m);
+        number(",\"r_m\":", k.r_m);
+        number(",\"alpha_rad\":", k.alpha_rad);
+        number(",\"sd_r_m\":", k.sd_r_m);
+        number(",\"sd_alpha_rad\":", k.sd_alpha_rad);
+        printf(",\"first\":%u,\"last\":%u,\"points\":%u}", k.first, k.last, k.points);
+    }
+    printf("],\"corners\":[");
+    for (unsigned i = 0; i < l->corner_count; i++) {
+        struct scanhub_corner k = scanhub_corner(l, i);
+        number(i ? ",{\"x_m\":" : "{\"x_m\":", k.x_m);
+        number(",\"y_m\":", k.y_m);
+        printf(",\"first_line\":%u,\"second_line\":%u}", k.first_line, k.second_line);
     }
     printf("]}");
 }
@@ -202,32 +232,98 @@ static enum scanhub_result payload(const struct scanhub_datagram *d)
         TOPIC(SCANHUB_FOREGROUND, foreground)
         TOPIC(SCANHUB_BACKGROUND, background)
         TOPIC(SCANHUB_STATUS, status)
+        TOPIC(SCANHUB_LINES, lines)
     }
     return SCANHUB_SKIPPED;
 }
 
+/* Puts one sample of three parts together. */
+static int is_whole(struct scanhub_datagram *d)
+{
+    static uint8_t bytes[3][1424], whole[3 * 1424];
+    static uint32_t lengths[3], end;
+    unsigned i;
+    memcpy(bytes[d->part], d->payload, d->payload_len);
+    lengths[d->part] = d->payload_len;
+    for (i = end = 0; i < 3; end += lengths[i++]) {
+        if (!lengths[i])
+            return 0;
+        memcpy(whole + end, bytes[i], lengths[i]);
+    }
+    d->payload = whole;
+    d->payload_len = end;
+    d->parts = 1;
+    return 1;
+}
+
+/* What becomes of a datagram, with a key that takes up the first 64 characters of `key`, `@` and the second. */
+static void keyed(const char *key, const uint8_t *bytes, size_t len)
+{
+    static struct scanhub_guard guard;
+    struct scanhub_key known;
+    struct scanhub_datagram datagram;
+    uint64_t wall_ns = strtoull(key + 65, NULL, 10) * 1000000000u;
+    enum scanhub_result result;
+    int is_part;
+    if (!scanhub_key_of(&known, key, 64))
+        abort();
+    result = scanhub_read_with(&known, bytes, len, &datagram);
+    if (result == SCANHUB_OK)
+        result = scanhub_guard_take(&guard, &datagram, wall_ns);
+    is_part = result == SCANHUB_OK && datagram.parts > 1;
+    if (is_part && is_whole(&datagram)) {
+        is_part = 0;
+        result = scanhub_guard_take(&guard, &datagram, wall_ns);
+    }
+    printf("{\"outcome\":\"%s\"}\n", result != SCANHUB_OK ? refusals[result] : is_part ? "part" : "taken");
+}
+
+static void plain(const uint8_t *bytes, size_t len)
+{
+    struct scanhub_datagram datagram;
+    enum scanhub_result result = scanhub_read(bytes, len, &datagram);
+    if (result == SCANHUB_OK)
+        result = payload(&datagram);
+    if (result == SCANHUB_OK)
+        printf("}\n");
+    else
+        printf("{\"refusal\":\"%s\"}\n", refusals[result]);
+}
+
+static void vectors_of_sha(void)
+{
+    static const uint8_t begin[4] = {0xba, 0x78, 0x16, 0xbf};
+    struct scanhub_sha sha;
+    struct scanhub_key key;
+    uint8_t digest[32];
+    scanhub_sha_begin(&sha);
+    scanhub_sha_add(&sha, (const uint8_t *)"abc", 3);
+    scanhub_sha_end(&sha, digest);
+    if (memcmp(digest, begin, 4) != 0)
+        abort();
+    if (scanhub_key_of(&key, "short", 5) || scanhub_key_of(&key, "", 0) || !scanhub_key_of(&key, digest, 32))
+        abort();
+}
+
 int main(void)
 {
-    static char line[2 * 65536];
-    while (fgets(line, sizeof line, stdin)) {
+    static char buffer[2 * 65536];
+    vectors_of_sha();
+    while (fgets(buffer, sizeof buffer, stdin)) {
+        const char *key = strchr(buffer, ':') ? buffer : NULL, *line = key ? strchr(buffer, ':') + 1 : buffer;
         size_t len = strspn(line, "0123456789abcdef") / 2;
         /* Of its very length, so that a tool that watches memory sees whoever reads behind it. */
         uint8_t *bytes = malloc(len ? len : 1);
-        struct scanhub_datagram datagram;
-        enum scanhub_result result;
         if (!bytes)
             return 1;
         for (size_t i = 0; i < len; i++) {
             char digits[3] = {line[2 * i], line[2 * i + 1], 0};
             bytes[i] = (uint8_t)strtoul(digits, NULL, 16);
         }
-        result = scanhub_read(bytes, len, &datagram);
-        if (result == SCANHUB_OK)
-            result = payload(&datagram);
-        if (result == SCANHUB_OK)
-            printf("}\n");
+        if (key)
+            keyed(key, bytes, len);
         else
-            printf("{\"refusal\":\"%s\"}\n", refusals[result]);
+            plain(bytes, len);
         fflush(stdout);
         free(bytes);
     }

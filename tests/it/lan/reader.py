@@ -1,5 +1,6 @@
 """Reads datagrams with clients/python/scanhub_lan.py: a line of hex digits in, behind the hex digits of a key and a colon
-where there is one, a line of JSON out, in the words of the list of golden datagrams."""
+where there is one, a line of JSON out, in the words of the list of golden datagrams. Behind the key and `@` may be the
+second at which the datagram comes; then what becomes of it is told, after those before."""
 
 import dataclasses
 import json
@@ -60,8 +61,28 @@ assert scanhub_lan.crc32c(b"123456789") == 0xE3069283
 if len(sys.argv) > 1:
     print((whole([bytes.fromhex(digits) for digits in sys.argv[1:]]) or b"").hex())
     sys.exit()
+guard, parts = scanhub_lan.Guard(), scanhub_lan.Parts()
+
+
+def outcome(data, key, at_s):
+    """What becomes of a datagram that comes at this second."""
+    datagram = guard.take(scanhub_lan.read(data, key), at_s * 1_000_000_000)
+    if datagram.parts == 1:
+        return "taken"
+    whole = parts.take(datagram)
+    return "taken" if whole and guard.take(whole) else "part"
+
+
 for line in sys.stdin:
     key, _, digits = line.strip().rpartition(":")
+    key, _, at_s = key.partition("@")
+    if at_s:
+        try:
+            said = outcome(bytes.fromhex(digits), bytes.fromhex(key), int(at_s))
+        except scanhub_lan.Refused as refused:
+            said = refused.reason
+        print(json.dumps({"outcome": said}), flush=True)
+        continue
     try:
         out = says(scanhub_lan.read(bytes.fromhex(digits), bytes.fromhex(key) if key else None))
     except scanhub_lan.Refused as refused:

@@ -8,7 +8,7 @@ use schema::datagram::{Datagram, Packed};
 use schema::{Counter, Scan};
 use serde_json::{Map, Value, json};
 
-use super::{damaged, vectors};
+use super::{damaged, keyed_vectors, vectors};
 
 /// A program that answers a datagram in hex with a line of JSON.
 pub(crate) struct Reader {
@@ -27,7 +27,10 @@ impl Reader {
     /// What it says of a datagram; `key` as hex digits.
     pub(crate) fn read(&mut self, key: Option<&str>, datagram: &[u8]) -> Value {
         let digits: String = datagram.iter().map(|byte| format!("{byte:02x}")).collect();
-        let line = key.map_or(digits.clone(), |key| format!("{key}:{digits}"));
+        self.ask(&key.map_or(digits.clone(), |key| format!("{key}:{digits}")))
+    }
+
+    fn ask(&mut self, line: &str) -> Value {
         writeln!(self.input, "{line}").expect("it reads");
         let mut answer = String::new();
         self.output.read_line(&mut answer).expect("it answers");
@@ -49,6 +52,16 @@ pub(crate) fn golden(reader: &mut Reader) {
             !["after", "after_hubs", "from_another", "with_key"].iter().any(|key| says.contains_key(*key));
         let expected = if by_itself { vector.says.clone() } else { damaged::expected(&vector.bytes) };
         same(&vector.file, &vector.bytes, reader.read(None, &vector.bytes), &expected);
+    }
+}
+
+/// With the key they take, and refuse, what the receiving end in Rust does: also what is sent again.
+pub(crate) fn keyed(reader: &mut Reader) {
+    let keyed = keyed_vectors::keyed();
+    for step in keyed.steps {
+        let digits: String = step.bytes.iter().map(|byte| format!("{byte:02x}")).collect();
+        let said = reader.ask(&format!("{}@{}:{digits}", keyed.key, step.at_s));
+        assert_eq!(said["outcome"], step.outcome, "{}", step.name);
     }
 }
 

@@ -4,7 +4,8 @@
 use std::collections::{BTreeMap, BTreeSet};
 
 use super::capture::{Capture, has_tshark};
-use super::{damaged, vectors};
+use super::{damaged, keyed_vectors, vectors};
+use crate::testkit::TestEnv;
 use schema::datagram::{HEAD, Head, Packed};
 use schema::{Family, State, Topic, Verdict, Zones};
 use serde_json::Value;
@@ -62,9 +63,10 @@ fn word(name: &str, value: &Value) -> String {
     }
 }
 
-/// Angles have as many digits as the tool likes.
+/// Angles, and the metres of lines, have as many digits as the tool likes.
 fn as_shown(name: &str, values: &str) -> String {
-    let is_angle = ["angle", "step", "spacing"].iter().any(|word| name.ends_with(word));
+    let is_angle = ["angle", "step", "spacing"].iter().any(|word| name.ends_with(word))
+        || name.starts_with("scanhub.lines.") && ["_m", "_rad"].iter().any(|word| name.ends_with(word));
     if !is_angle || values.is_empty() {
         return values.to_owned();
     }
@@ -147,6 +149,45 @@ fn damaged_datagrams_are_shown_as_refused() {
         let is_part = refusal == "payload" && datagram[34] > 1;
         let refusal = if is_part { "" } else { refusal };
         assert_eq!(shown["scanhub.refused"], refusal, "{datagram:02x?}");
+    }
+}
+
+/// With the key, what is not of it is refused; without one, nobody knows.
+#[test]
+fn macs_are_checked() {
+    if !has_tshark() {
+        return;
+    }
+    let keyed = keyed_vectors::keyed();
+    let mut capture = Capture::default();
+    keyed.steps.iter().for_each(|step| capture.add(&step.bytes));
+    let env = TestEnv::new();
+    let names = ["mac_status", "refused"].map(|name| format!("scanhub.{name}"));
+    let shown = |name: &str, file: &str| {
+        let setting = Some(format!("scanhub.key_file:{file}")).filter(|_| !file.is_empty());
+        let settings: Vec<_> = setting.into_iter().collect();
+        capture.fields_with(name, &names, &settings)
+    };
+    let raw: Vec<u8> = keyed_vectors::unhex(&keyed.key);
+    for (name, file) in [("hex", env.file("hex", format!("{}\n", keyed.key))), ("raw", env.file("raw", raw))]
+    {
+        for (step, shown) in keyed.steps.iter().zip(shown(name, &file)) {
+            assert_eq!(shown["scanhub.mac_status"], step.mac, "{}", step.name);
+            let refused = Some(step.outcome.as_str()).filter(|_| step.mac != "right").unwrap_or_default();
+            assert_eq!(shown["scanhub.refused"], refused, "{}", step.name);
+        }
+    }
+    let (missing, short) = (env.word("missing"), env.file("short", "00ff"));
+    for (name, file) in [("without", ""), ("missing", &missing), ("short", &short)] {
+        for (step, shown) in keyed.steps.iter().zip(shown(name, file)) {
+            let status = &shown["scanhub.mac_status"];
+            let is_right = match step.mac.as_str() {
+                "none" => status.is_empty(),
+                _ => status.starts_with("no key") && status.contains(file),
+            };
+            assert!(is_right, "{status} of {}", step.name);
+            assert_eq!(shown["scanhub.refused"], "", "{}", step.name);
+        }
     }
 }
 

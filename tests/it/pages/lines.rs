@@ -17,7 +17,7 @@ use schema::Topic;
 
 /// Commands that are not run, by how their line begins or what is in it, and what makes sure of them. Those of the program
 /// are read by `hub/cli/examples.rs`.
-const NOT_RUN: [(&str, &str); 12] = [
+const NOT_RUN: [(&str, &str); 14] = [
     ("sudo ", "changes the machine; tests/it/dist.rs and tests/it/client_c.rs install elsewhere"),
     ("sudoedit ", "an editor"),
     ("systemctl ", "asks the machine's service manager; tests/it/service.rs has one of its own"),
@@ -29,6 +29,8 @@ const NOT_RUN: [(&str, &str); 12] = [
     ("python3 -m venv", "fetches packages; the package is used from its directory"),
     ("~/scans/bin/pip", "the same"),
     ("cc ", "tests/it/client_c.rs builds the same program against an installed library"),
+    ("scanhub bridge", "another program; clients/bridge/tests/bridge/page.rs runs it"),
+    ("openssl ", "the same"),
     ("scanhub watch", "needs a terminal; tests/it/watch.rs has one"),
 ];
 /// The same of what is in the middle of a line.

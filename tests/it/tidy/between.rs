@@ -114,6 +114,30 @@ fn ros_knows_only_schema() {
 }
 
 #[test]
+fn the_scene_only_computes() {
+    holds(crates::the_scene_only_computes, |tree| {
+        let (manifest, lib) = ("clients/scene/Cargo.toml", "clients/scene/src/lib.rs");
+        vec![
+            tree.with_line(manifest, "[dependencies]", "scanhub-client.workspace = true"),
+            tree.with(lib, &tree.text(lib).replace("#![forbid(unsafe_code)]", "")),
+            tree.with("clients/scene/src/planted.rs", "//! So.\nuse std::time::Instant;\n"),
+        ]
+    });
+}
+
+#[test]
+fn the_server_knows_no_hub() {
+    holds(crates::the_server_knows_no_hub, |tree| {
+        let (manifest, lib) = ("clients/web/Cargo.toml", "clients/web/src/lib.rs");
+        vec![
+            tree.with_line(manifest, "[dependencies]", "scanhub-client.workspace = true"),
+            tree.with(lib, &tree.text(lib).replace("#![forbid(unsafe_code)]", "")),
+            tree.with("clients/web/src/planted.rs", "//! So.\nuse std::fs::File;\n"),
+        ]
+    });
+}
+
+#[test]
 fn the_ends_of_a_network_only_compute() {
     holds(crates::the_ends_of_a_network_only_compute, |tree| {
         let (manifest, lib) = ("clients/lan/Cargo.toml", "clients/lan/src/lib.rs");

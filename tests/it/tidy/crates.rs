@@ -106,7 +106,8 @@ pub(crate) fn preprocess_only_computes(tree: &Tree) -> Vec<String> {
         "collect::",
     ];
     // Rc, Arc, maps, clocks, threads, files: all else that std has stands under another name.
-    const HARMLESS: [&str; 6] = ["std::array", "std::error", "std::f64", "std::fmt", "std::mem", "std::ops"];
+    const HARMLESS: [&str; 7] =
+        ["std::array", "std::error", "std::f32", "std::f64", "std::fmt", "std::mem", "std::ops"];
     let is_of_tests = |path: &str| {
         let parent = path.strip_suffix("/tests.rs").map(|module| tree.text(&format!("{module}.rs")));
         parent.is_some_and(|text| text.contains("\n#[cfg(test)]\nmod tests;"))
@@ -135,7 +136,7 @@ pub(crate) fn preprocess_only_computes(tree: &Tree) -> Vec<String> {
 /// What a processor does must not depend on which others run.
 pub(crate) fn no_processor_uses_another(tree: &Tree) -> Vec<String> {
     const BELOW: &str = "hub/preprocess/src/";
-    const PROCESSORS: [&str; 4] = ["zones", "marks", "background", "segments"];
+    const PROCESSORS: [&str; 5] = ["zones", "marks", "lines", "background", "segments"];
     let mut breaches = Vec::new();
     for own in PROCESSORS {
         let is_own = |path: &str| {
@@ -152,11 +153,21 @@ pub(crate) fn no_processor_uses_another(tree: &Tree) -> Vec<String> {
 }
 
 /// A consumer's program has nothing of ours below it but the library and the words. The verbs stand on it as others do; the
-/// words of ROS come with them where they record, the ends of a network where they send and listen.
+/// words of ROS come with them where they record, the ends of a network where they send and listen, the scene where they show it.
 pub(crate) fn clients_know_only_schema(tree: &Tree) -> Vec<String> {
     let known: [(&str, &[&str]); 2] = [
         ("scanhub-client", &["scanhub-schema"]),
-        ("scanhub-verbs", &["scanhub-client", "scanhub-lan", "scanhub-schema", "scanhub-ros"]),
+        (
+            "scanhub-verbs",
+            &[
+                "scanhub-client",
+                "scanhub-lan",
+                "scanhub-schema",
+                "scanhub-ros",
+                "scanhub-scene",
+                "scanhub-web",
+            ],
+        ),
     ];
     let members = tree.members();
     let others = known.iter().flat_map(|(name, known)| {
@@ -168,7 +179,7 @@ pub(crate) fn clients_know_only_schema(tree: &Tree) -> Vec<String> {
 
 /// From payloads to messages: nothing of the system, nothing of others, so that anybody can call it.
 pub(crate) fn ros_knows_only_schema(tree: &Tree) -> Vec<String> {
-    let mut breaches = built_of(tree, "scanhub-ros", &["scanhub-schema"]);
+    let mut breaches = built_of(tree, "scanhub-ros", &["scanhub-schema", "sha2"]);
     breaches.extend(lacks(tree, "schema/ros/src/lib.rs", &["#![forbid(unsafe_code)]"]));
     let ours = |path: &str| path.starts_with("schema/ros/src/");
     breaches.extend(find(tree, &["schema::ipc", "std::time", "std::net", "std::fs", "extern crate"], ours));
@@ -192,6 +203,30 @@ pub(crate) fn the_ends_of_a_network_only_compute(tree: &Tree) -> Vec<String> {
     let mut breaches = built_of(tree, "scanhub-lan", &["scanhub-schema", "hmac", "sha2"]);
     breaches.extend(lacks(tree, "clients/lan/src/lib.rs", &["#![forbid(unsafe_code)]"]));
     breaches.extend(find(tree, &OUTSIDE, |path| path.starts_with("clients/lan/src/")));
+    breaches
+}
+
+/// What a picture shows is told by samples and times, so that a terminal and a browser show the same.
+pub(crate) fn the_scene_only_computes(tree: &Tree) -> Vec<String> {
+    const OUTSIDE: [&str; 7] =
+        ["schema::ipc", "Instant", "SystemTime", "std::env", "std::fs", "std::io", "std::net"];
+    let mut breaches = built_of(tree, "scanhub-scene", &["scanhub-schema"]);
+    breaches.extend(lacks(tree, "clients/scene/src/lib.rs", &["#![forbid(unsafe_code)]"]));
+    breaches.extend(find(tree, &OUTSIDE, |path| path.starts_with("clients/scene/src/")));
+    breaches
+}
+
+/// The server shows a scene to whoever comes, and cannot follow a hub: what strangers send ends in it.
+pub(crate) fn the_server_knows_no_hub(tree: &Tree) -> Vec<String> {
+    let known = ["scanhub-ros", "scanhub-scene", "scanhub-schema"];
+    let members = tree.members();
+    let others =
+        ours(&members["scanhub-web"], &ALL).into_iter().filter(|name| !known.contains(&name.as_str()));
+    let mut breaches: Vec<_> = others.map(|name| format!("scanhub-web knows {name}")).collect();
+    breaches.extend(lacks(tree, "clients/web/src/lib.rs", &["#![forbid(unsafe_code)]"]));
+    breaches.extend(find(tree, &["schema::ipc", "std::fs", "process::Command"], |path| {
+        path.starts_with("clients/web/src/")
+    }));
     breaches
 }
 
@@ -286,10 +321,16 @@ pub(crate) fn every_crate_is_tested_from_the_top(tree: &Tree) -> Vec<String> {
     };
     let mut wanted = list("members");
     wanted.insert(".".to_owned());
-    wanted
+    // Whoever builds the hub does not build Zenoh.
+    let apart = wanted.take("clients/bridge");
+    let mut breaches: Vec<String> = wanted
         .difference(&list("default-members"))
         .map(|member| format!("{member} is no default member"))
-        .collect()
+        .collect();
+    if apart.is_some() {
+        breaches.extend(lacks(tree, ".ci/run", &["step cargo test --package scanhub-bridge"]));
+    }
+    breaches
 }
 
 /// Every crate takes over the workspace's lints, which deny unsafe code.

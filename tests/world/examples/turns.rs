@@ -1,29 +1,58 @@
-//! What the turns of scanners whose heads turn are like behind the whole hub, in virtual time: each model for ten minutes, a
-//! hundred lines that lose bytes in bursts, a hundred hubs that stand still for half a second again and again. The figures of
-//! docs/scanners.md: `cargo run --release -p scanhub-world --example turns`.
+//! What the turns of scanners whose heads turn are like behind the whole hub, in virtual time: each model, in each mode, for ten
+//! minutes, a hundred lines that lose bytes in bursts, a hundred hubs that stand still for half a second again and again, and
+//! how soon a scanner streams that was found in any state. The figures of docs/scanners.md:
+//! `cargo run --release -p scanhub-world --example turns`; with words behind `--`, only those tables whose names begin so.
 
 use std::fmt::Write as _;
 
 use world::{Detail, Figures, Plan, run};
 
-/// All that `plans` come to, and what the judges say of them.
-fn judge(what: &str, plans: impl Iterator<Item = String>) {
-    let (mut figures, mut broken, mut worlds) = (Figures::default(), Vec::new(), 0);
-    for text in plans {
-        let plan: Plan = text.parse().expect("a plan");
-        let outcome = run(&plan, Detail::Nothing);
-        figures.add(&outcome.figures);
-        broken.extend(outcome.violations.into_iter().map(|violation| format!("{}: {violation}", plan.seed)));
-        worlds += 1;
+const LD: [&str; 5] = ["ld06", "ld19", "stl19p", "stl27l", "ld14p"];
+/// Each mode of each model of RPLIDAR.
+const RPLIDAR: [(&str, &[&str]); 8] = [
+    ("a1", &["standard", "express", "boost", "sensitivity", "stability"]),
+    ("a2m8", &["standard", "express", "boost", "sensitivity", "stability"]),
+    ("a2m12", &["standard", "express", "boost", "sensitivity", "stability"]),
+    ("a3", &["standard", "express", "boost", "sensitivity", "stability"]),
+    ("s1", &["standard", "express", "denseboost"]),
+    ("s2", &["standard", "denseboost"]),
+    ("s3", &["standard", "denseboost", "ultradense"]),
+    ("c1", &["standard", "denseboost"]),
+];
+/// One of each kind of packets.
+const KINDS: [&str; 5] = ["a1:standard", "a1:express", "a1:boost", "s1:denseboost", "s3:ultradense"];
+
+/// The tables that are wanted.
+struct Tables(Vec<String>);
+
+impl Tables {
+    /// All that `plans` of `seconds` with `actions` come to, and what the judges say of them.
+    fn judge(&self, table: &str, model: &str, seeds: std::ops::Range<u64>, seconds: u64, actions: &str) {
+        if !self.0.is_empty() && !self.0.iter().any(|wanted| table.starts_with(wanted.as_str())) {
+            return;
+        }
+        let (mut figures, mut broken, worlds) = (Figures::default(), Vec::new(), seeds.end - seeds.start);
+        for seed in seeds {
+            let text = format!("seed {seed} seconds {seconds} {model}\n{actions}");
+            let plan: Plan = text.parse().expect("a plan");
+            let outcome = run(&plan, Detail::Nothing);
+            figures.add(&outcome.figures);
+            broken.extend(outcome.violations.into_iter().map(|violation| format!("{seed}: {violation}")));
+        }
+        let Figures { scans, incomplete, points, angle_deg, range_mm, wrong, lost, .. } = figures;
+        let ms = |ns: u64| ns as f64 / 1e6;
+        println!(
+            "{table}, {model}: {worlds} worlds, {scans} scans, {incomplete} incomplete, {lost} packets lost, {points} points, \
+             {wrong} wrong unmarked; at most {angle_deg:.3} degrees, {range_mm:.2} mm, stamps {:.2} ms off and {:.2} ms uneven; \
+             data after {:.0} ms, scans after {:.0} ms; {} broken promises",
+            ms(figures.stamp_ns),
+            ms(figures.uneven_ns),
+            ms(figures.data_ns),
+            ms(figures.scan_ns),
+            broken.len()
+        );
+        broken.iter().take(5).for_each(|broken| println!("  {broken}"));
     }
-    let Figures { scans, incomplete, points, angle_deg, range_mm, stamp_ns } = figures;
-    println!(
-        "{what}: {worlds} worlds, {scans} scans, {incomplete} of them incomplete, {points} points, at most {angle_deg:.3} degrees, \
-         {range_mm:.2} mm and {:.2} ms off; {} broken promises",
-        stamp_ns as f64 / 1e6,
-        broken.len()
-    );
-    broken.iter().take(5).for_each(|broken| println!("  {broken}"));
 }
 
 /// Again and again what `action` says, every so many milliseconds for a minute.
@@ -36,22 +65,28 @@ fn often(every_ms: u64, action: &str) -> String {
 }
 
 fn main() {
-    for model in ["ld06", "ld19", "stl19p", "stl27l", "ld14p"] {
-        judge(
-            &format!("{model}, ten minutes"),
-            (1..2).map(|seed| format!("seed {seed} seconds 600 {model}")),
-        );
+    let tables = Tables(std::env::args().skip(1).collect());
+    for model in LD {
+        tables.judge("ld ten minutes", model, 1..2, 600, "");
+    }
+    for (model, modes) in RPLIDAR {
+        for mode in modes {
+            tables.judge("rplidar ten minutes", &format!("{model}:{mode}"), 1..2, 600, "");
+        }
     }
     let loss = often(10_000, "noise sensor=0 loss=135 flip=0 insert=0 double=0 burst=2 span_ms=9900");
-    judge("ld19, burst loss", (0..100).map(|seed| format!("seed {seed} seconds 60 ld19\n{loss}")));
+    tables.judge("ld burst loss", "ld19", 0..100, 60, &loss);
+    KINDS.iter().for_each(|model| tables.judge("rplidar burst loss", model, 0..100, 60, &loss));
     let stalls = often(5_000, "stall span_ms=500");
-    judge(
-        "ld19, hub stands still for 0.5 s",
-        (0..100).map(|seed| format!("seed {seed} seconds 60 ld19\n{stalls}")),
-    );
+    tables.judge("ld hub stands still for 0.5 s", "ld19", 0..100, 60, &stalls);
+    for model in KINDS {
+        tables.judge("rplidar hub stands still for 0.5 s", model, 0..20, 60, &stalls);
+    }
     let stalls = often(6_000, "stall span_ms=2000");
-    judge(
-        "ld19, hub stands still for 2 s",
-        (0..100).map(|seed| format!("seed {seed} seconds 60 ld19\n{stalls}")),
-    );
+    tables.judge("ld hub stands still for 2 s", "ld19", 0..100, 60, &stalls);
+    for (model, _) in RPLIDAR {
+        for state in ["idle", "streaming", "off", "error"] {
+            tables.judge("rplidar start", &format!("{model}::{state}"), 0..20, 14, "");
+        }
+    }
 }

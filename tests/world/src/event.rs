@@ -7,6 +7,7 @@ use sim::ld::TruePoint;
 
 use crate::consumer::Number;
 use crate::hash::History;
+use crate::remote::Forgery;
 use crate::topics::Sample;
 
 /// Something that happened, at a time that is told beside it.
@@ -56,6 +57,8 @@ pub(crate) enum Event<'a> {
     GatewayEnds { epoch: u32, is_killed: bool },
     /// It made a datagram, which its sockets took or not.
     Transmitted { datagram: &'a Datagram<'a>, bytes: &'a [u8], is_taken: bool },
+    /// Somebody else sent this.
+    Forged { forgery: Forgery, bytes: &'a [u8] },
     /// A listener begins.
     ListenerBegins { life: u64 },
     /// It took what had come to its machine, which may be a datagram, at some time before.
@@ -132,6 +135,16 @@ pub struct Figures {
     pub range_mm: f64,
     /// How far the stamp of a scan was off at most, of those that are judged.
     pub stamp_ns: Nanos,
+    /// By how much the time between two of them was another one than that which passed, at most.
+    pub uneven_ns: Nanos,
+    /// Points of scans without any mark that are more than 5 cm from everything that was measured.
+    pub wrong: u64,
+    /// Packets that a hub counted as lost on the line.
+    pub lost: u64,
+    /// When a hub had the first packet of measured values, and the first scan.
+    pub data_ns: Nanos,
+    /// See above.
+    pub scan_ns: Nanos,
 }
 
 impl Figures {
@@ -143,6 +156,11 @@ impl Figures {
         self.angle_deg = self.angle_deg.max(other.angle_deg);
         self.range_mm = self.range_mm.max(other.range_mm);
         self.stamp_ns = self.stamp_ns.max(other.stamp_ns);
+        self.uneven_ns = self.uneven_ns.max(other.uneven_ns);
+        self.wrong += other.wrong;
+        self.lost += other.lost;
+        self.data_ns = self.data_ns.max(other.data_ns);
+        self.scan_ns = self.scan_ns.max(other.scan_ns);
     }
 }
 
@@ -214,6 +232,10 @@ impl Event<'_> {
                 numbers(&[22, is_taken.into()]);
                 history.bytes(bytes);
             }
+            Event::Forged { forgery, bytes } => {
+                numbers(&[30, forgery as u64]);
+                history.bytes(bytes);
+            }
             Event::ListenerBegins { life } => numbers(&[23, life]),
             Event::Arrived { came, bytes, outcome, .. } => {
                 numbers(&[24, came, bytes.len() as u64, outcome.number()])
@@ -270,6 +292,7 @@ impl Event<'_> {
             Event::Taken { .. } | Event::Read { .. } | Event::Dropped { .. } | Event::Lacking { .. } => None,
             Event::Rung { .. } | Event::Measured { .. } => None,
             Event::Transmitted { .. } | Event::Republished { .. } | Event::Counted { .. } => None,
+            Event::Forged { forgery, .. } => Some(format!("forged: {forgery:?}")),
             Event::Arrived { outcome: Arrival::Refused(why), .. } => Some(format!("refused: {why:?}")),
             Event::Arrived { .. } => None,
             other => Some(format!("{other:?}")),

@@ -3,15 +3,20 @@
 
 mod ld;
 mod lms;
+mod rplidar;
 
 use std::rc::Rc;
+use std::sync::{Arc, LazyLock};
 
-use ::lms::Nanos;
+use ::lms::variant::{Mode, Unit, Variant};
+use ::lms::{MILLIS, Nanos};
 use schema::Scan;
 use sim::device::Device;
+use sim::layers::Layers;
 use sim::ld::TruePoint;
+use sim::machine::Habits;
 use sim::room::Room;
-use sim::series::Changes;
+use sim::series::{Changes, Series};
 use sim::world::World as Scene;
 
 use crate::plan::Action;
@@ -48,10 +53,57 @@ pub(crate) trait Family {
         false
     }
 
-    /// Where the last point of `unit` is, in degrees clockwise, if it has one and its head turns.
-    fn last_deg(&self, unit: &[u8]) -> Option<f64> {
+    /// Where the points of `unit` begin, if it has any and its head turns.
+    fn begin(&self, unit: &[u8]) -> Option<Begin> {
         let _ = unit;
         None
+    }
+
+    /// How exactly `unit` tells points.
+    fn exactness(&self, unit: &[u8]) -> Exactness {
+        let _ = unit;
+        Exactness::default()
+    }
+}
+
+/// The points of a packet.
+pub(crate) struct Begin {
+    /// Where the first one is.
+    pub(crate) clockwise_deg: f64,
+    /// How many there are, one after the other.
+    pub(crate) points: usize,
+    /// How long the packet is on the line after the last one.
+    pub(crate) on_line: Nanos,
+}
+
+/// How exactly a packet tells points, and how much may be missing without a mark.
+#[derive(Clone, Copy)]
+pub(crate) struct Exactness {
+    pub(crate) angle_deg: f64,
+    pub(crate) range_mm: f64,
+    /// Where nothing came back, the angle says little.
+    pub(crate) nothing_deg: f64,
+    /// Points of a turn.
+    pub(crate) points: usize,
+    /// Packets before and behind damaged bytes that may be lost with them: of what has a checksum only the one before them,
+    /// and only that which follows could tell how its points are.
+    pub(crate) neighbours: usize,
+    /// Whether packets have a time of their own. Without one it takes a while until it is known how the scanner's clock goes, and
+    /// over a long gap nobody can know how many packets there were.
+    pub(crate) has_clock: bool,
+}
+
+impl Default for Exactness {
+    /// Packets that tell angles and ranges as they are, and everything by themselves.
+    fn default() -> Exactness {
+        Exactness {
+            angle_deg: 0.05,
+            range_mm: 2.0,
+            nothing_deg: 0.05,
+            points: 2,
+            neighbours: 0,
+            has_clock: true,
+        }
     }
 }
 
@@ -69,6 +121,11 @@ pub(crate) trait Scanner {
     /// It behaves badly as `action` says, or well again.
     fn misbehave(&mut self, action: Option<&Action>);
 
+    /// Something happens to it that only some scanners know.
+    fn suffer(&mut self, ailment: Ailment, now: Nanos) {
+        let _ = (ailment, now);
+    }
+
     /// Its head turns at this share of its usual speed, as soon as it gets there.
     fn set_pace(&mut self, share: f64) {
         let _ = share;
@@ -80,25 +137,67 @@ pub(crate) trait Scanner {
     }
 }
 
+/// What happens to a scanner beside its line.
+#[derive(Clone, Copy, Debug)]
+pub(crate) enum Ailment {
+    /// Its voltage dips: it starts anew by itself.
+    BrownOut,
+    /// Something holds its head for so long.
+    Held { span: Nanos },
+    /// It says that it is well (0), may not be for long (1), or is not (2); if it is stubborn, also after it booted.
+    Unwell { status: u8, is_stubborn: bool },
+    /// While it measures it hears nothing; or it hears again.
+    Deaf(bool),
+}
+
 /// The scanners that `random` draws.
 pub(crate) fn draw(random: &mut fastrand::Rng) -> Vec<Rc<dyn Family>> {
     let count = random.usize(1..=2);
     let one = |random: &mut fastrand::Rng| -> Rc<dyn Family> {
-        match random.u8(..5) {
-            0..=2 => Rc::new(lms::Lms::draw(random)),
-            _ => Rc::new(ld::Ld::draw(random)),
+        match random.u8(..8) {
+            0..=3 => Rc::new(lms::Lms::draw(random)),
+            4..=5 => Rc::new(ld::Ld::draw(random)),
+            _ => Rc::new(rplidar::Rplidar::draw(random)),
         }
     };
     (0..count).map(|_| one(random)).collect()
 }
 
-/// The scanner of this model, otherwise as `random` draws it; nothing if there is none.
-pub(crate) fn named(model: &str, random: &mut fastrand::Rng) -> Option<Rc<dyn Family>> {
-    Some(Rc::new(ld::Ld::of(::ld::Model::named(model)?, random)))
+/// The scanner that a plan calls so, otherwise as `random` draws it; nothing if there is none: `ld19`, `a1`, `a1:boost`,
+/// `a1:boost:streaming`.
+pub(crate) fn named(text: &str, random: &mut fastrand::Rng) -> Option<Rc<dyn Family>> {
+    match ::ld::Model::named(text) {
+        Some(model) => Some(Rc::new(ld::Ld::of(model, random))),
+        None => Some(Rc::new(rplidar::Rplidar::named(text, random)?)),
+    }
 }
 
-/// The models that a plan may name.
-pub(crate) const MODELS: [&str; ::ld::Model::ALL.len()] = ["ld06", "ld19", "stl19p", "stl27l", "ld14p"];
+/// How a scanner behaves to which `action` happens: shares are in percent.
+fn habits(action: &Action) -> Habits {
+    let share = |name| action.value(name) as f64 / 1e2;
+    Habits {
+        overlooks: share("overlooks"),
+        naks: share("naks"),
+        doubles: share("doubles"),
+        late_reply_ns: action.value("late_ms") * MILLIS,
+        mute: action.value("mute") > 0,
+        ..Habits::default()
+    }
+}
+
+/// The rooms without any noise, for all worlds. No LMS tells its scans of them.
+fn still_rooms() -> Arc<Series> {
+    static SERIES: LazyLock<Arc<Series>> = LazyLock::new(|| {
+        let rooms = rooms(|scene| scene.with_layers(Layers::NONE));
+        Arc::new(Series::new(rooms, 1, Variant::HALF, Unit::Mm, Mode(1)))
+    });
+    SERIES.clone()
+}
+
+/// A head that is slowed down turns at this share of its speed.
+const SLOWEST: f64 = 0.6;
+/// The most by which a head gets faster or slower in a second, as a share of its usual speed.
+const INERTIA: f64 = 0.4;
 
 /// What scanners see in all worlds: a room without anything near, the same with a post 0.8 m ahead, and with one 0.4 m ahead.
 fn rooms(layers: impl Fn(Scene) -> Scene) -> Vec<Room> {

@@ -92,7 +92,10 @@ impl Line for OpenLine {
         let Handle { shared, port, device } = &*self.handle;
         let (mut tty, now) = (shared.ports[*port].borrow_mut(), self.clock.now());
         tty.advance(now, &shared.log);
-        if self.check(tty.is_there(*device))? {
+        let is_deaf = shared.planted.is(Defect::DeafScanner) && tty.sensor.streams();
+        // Half a request is none.
+        let is_cut = shared.planted.is(Defect::UnturnedHead) && matches!(byte, 0xF0 | 0xA8);
+        if self.check(tty.is_there(*device))? && !is_deaf && !is_cut {
             tty.write(byte, now);
         }
         Ok(())

@@ -17,7 +17,7 @@ pub struct Plan {
     pub seed: u64,
     /// How long it lasts, in virtual seconds.
     pub seconds: u64,
-    /// The model of the only sensor; else the seed draws one or two.
+    /// The only sensor, by its model, of some its mode and what it does at first; else the seed draws one or two.
     pub model: Option<String>,
     /// In the order of time.
     pub actions: Vec<Action>,
@@ -142,7 +142,9 @@ impl FromStr for Plan {
         };
         let model = match *model {
             [] => None,
-            [model] if family::MODELS.contains(&model) => Some(model.to_owned()),
+            [model] if family::named(model, &mut fastrand::Rng::with_seed(0)).is_some() => {
+                Some(model.to_owned())
+            }
             _ => return Err(format!("{head:?} names no model")),
         };
         let number = |word: &str| word.parse().map_err(|_| format!("{word:?} is no number"));

@@ -57,13 +57,25 @@ pub enum Defect {
     RemoteStampedLate,
     /// A remote robot does not see that nothing comes.
     RemoteSurvivingVerdict,
+    /// A listener with a key checks no MAC.
+    RemoteUnchecked,
     /// A gateway says only once who its sensors are.
     Unannounced,
+    /// Now and then a packet is published whose checksum is wrong.
+    WrongChecksum,
+    /// What comes beside damaged bytes is not marked.
+    UnmarkedNeighbour,
+    /// A scanner that measures hears nothing, not even that it shall stop.
+    DeafScanner,
+    /// No request for a motor gets through.
+    UnturnedHead,
+    /// Now and then all points of a turn are a degree beside their places.
+    WrongPlaces,
 }
 
 impl Defect {
     /// All of them.
-    pub const ALL: [Defect; 25] = [
+    pub const ALL: [Defect; 31] = [
         Defect::LostWake,
         Defect::OneRing,
         Defect::LostByte,
@@ -88,7 +100,13 @@ impl Defect {
         Defect::RemoteCountedTwice,
         Defect::RemoteStampedLate,
         Defect::RemoteSurvivingVerdict,
+        Defect::RemoteUnchecked,
         Defect::Unannounced,
+        Defect::WrongChecksum,
+        Defect::UnmarkedNeighbour,
+        Defect::DeafScanner,
+        Defect::UnturnedHead,
+        Defect::WrongPlaces,
     ];
 }
 
@@ -139,6 +157,13 @@ impl Spoiler {
             let status: &mut Status = bytemuck::from_bytes_mut(bytes);
             status.counters[Counter::LostOnLine] = 0;
         }
+        if topic == Topic::Telegram && planted.strikes(Defect::WrongChecksum, 100) {
+            let middle = bytes.len() / 2;
+            bytes[middle] ^= 4;
+        }
+        if planted.is(Defect::UnmarkedNeighbour) {
+            (header.reasons, header.quality) = (0, 0);
+        }
         if topic != Topic::Scan {
             return;
         }
@@ -165,6 +190,9 @@ impl Spoiler {
                 into.angles[half..].copy_from_slice(&from.angles[half..]);
             }
         }
+        if planted.strikes(Defect::WrongPlaces, 20) {
+            scan.arrays().angles.iter_mut().for_each(|angle| *angle += 1f32.to_radians());
+        }
         bytes.clear();
         bytes.extend_from_slice(scan.bytes());
     }
@@ -177,6 +205,9 @@ impl Spoiler {
             Defect::StampedOnArrival,
             Defect::UnmarkedTurn,
             Defect::UncountedLoss,
+            Defect::WrongChecksum,
+            Defect::UnmarkedNeighbour,
+            Defect::WrongPlaces,
         ];
         mine.into_iter().any(|defect| planted.is(defect))
     }

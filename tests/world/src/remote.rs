@@ -1,24 +1,31 @@
 //! What is behind the hub's topics in another machine: a gateway, a network, a listener that publishes, and a robot that
 //! believes. Each ends and begins by itself. Refuses to know what goes wrong, and when.
 
+mod forger;
 mod gateway;
 mod listener;
 mod payload;
 mod robot;
 mod topics;
 
+use std::collections::HashMap;
 use std::num::NonZeroU64;
 use std::time::Duration;
 
-use lan::Stamp;
+use lan::{Key, Stamp};
 use lms::{MICROS, MILLIS, Nanos};
 use scanhub_client::clock::Moment;
 use schema::Topic;
 use schema::datagram::{MTU_ETHERNET, MTU_LEAST, MTU_SAFE};
 
+use crate::actions;
+use crate::event::Event;
 use crate::network::{Faults, Network};
+use crate::plan::Plan;
 use crate::setup::Setup;
 use crate::shared::Shared;
+use forger::Forger;
+pub(crate) use forger::Forgery;
 use gateway::Gateway;
 use listener::Listener;
 pub(crate) use payload::Packet;
@@ -40,10 +47,15 @@ pub(crate) struct Terms {
     pub(crate) delay_ns: Nanos,
     /// The clocks of the machine that listens, when a world begins.
     pub(crate) clocks: Stamp,
+    /// Gateway and listener have a key.
+    pub(crate) has_key: bool,
+    /// With a key: so much the wall clock of the listener's machine is ahead of the hub's, in ns.
+    ahead_ns: i64,
 }
 
 impl Terms {
-    pub(crate) fn of_seed(seed: u64) -> Terms {
+    pub(crate) fn of_plan(plan: &Plan) -> Terms {
+        let seed = plan.seed;
         let mut random = fastrand::Rng::with_seed(seed ^ 0x001A_0000_1A00);
         let every = NonZeroU64::MIN.saturating_add([0, 0, 1, 3, 7][random.usize(..5)]);
         Terms {
@@ -53,6 +65,8 @@ impl Terms {
             repeat: random.bool().then(|| Duration::from_secs(random.u64(1..20))),
             delay_ns: random.u64(50..20_000) * MICROS,
             clocks: Stamp { monotonic_ns: random.u64(1..1 << 50), wall_ns: random.u64(1 << 60..1 << 61) },
+            has_key: actions::have_key(&plan.actions),
+            ahead_ns: random.i64(-2_000_000_000..2_000_000_000),
         }
     }
 
@@ -69,6 +83,11 @@ impl Terms {
     fn stamp(&self, now: Nanos) -> Stamp {
         let Stamp { monotonic_ns, wall_ns } = self.clocks;
         Stamp { monotonic_ns: monotonic_ns + now, wall_ns: wall_ns + now }
+    }
+
+    /// The key, if there is one.
+    fn key(&self) -> Option<Key> {
+        self.has_key.then(|| Key::new(&[7; Key::LEN]))
     }
 
     /// That machine is never suspended.
@@ -99,11 +118,16 @@ pub(crate) struct Remote {
     listeners: u64,
     memory: Memory,
     robot: RemoteRobot,
+    forger: Forger,
+    /// So much more the wall clocks are apart now, in ns.
+    apart_ns: i64,
+    /// The greatest epochs, as listeners keep them.
+    epochs: HashMap<u64, u32>,
 }
 
 impl Remote {
-    pub(crate) fn new(seed: u64, setup: &Setup) -> Remote {
-        let terms = Terms::of_seed(seed);
+    pub(crate) fn new(plan: &Plan, setup: &Setup) -> Remote {
+        let (seed, terms) = (plan.seed, Terms::of_plan(plan));
         let faults = Faults { delay_ns: terms.delay_ns, ..Faults::default() };
         let sensors = setup.sensors.len();
         Remote {
@@ -122,6 +146,9 @@ impl Remote {
             listeners: 0,
             memory: Memory::default(),
             robot: RemoteRobot::new(&terms, sensors),
+            forger: Forger::default(),
+            apart_ns: 0,
+            epochs: HashMap::new(),
         }
     }
 
@@ -147,9 +174,8 @@ impl Remote {
     pub(crate) fn begin_listener(&mut self, shared: &Shared) {
         if self.listener.is_none() {
             self.listeners += 1;
-            let now = shared.clock.get();
             self.listener =
-                Some(Listener::begin(shared, &self.terms, self.listeners, self.memory.clone(), now));
+                Some(Listener::begin(shared, &self.terms, self.listeners, self.memory.clone(), &self.epochs));
         }
     }
 
@@ -170,6 +196,26 @@ impl Remote {
     /// All processes run.
     pub(crate) fn heal(&mut self) {
         (self.gateway_stalled_until, self.listener_stalled_until) = (0, 0);
+    }
+
+    /// The wall clock of the listener's machine is so much further ahead, in ns.
+    pub(crate) fn set_apart(&mut self, apart_ns: i64) {
+        self.apart_ns = apart_ns;
+    }
+
+    /// Somebody sends so many datagrams of this kind.
+    pub(crate) fn forge(&mut self, shared: &Shared, forgery: Forgery, count: usize) {
+        let now = shared.clock.get();
+        for bytes in self.forger.forge(forgery, count, self.wall_ns(shared, now)) {
+            shared.log.tell(now, &Event::Forged { forgery, bytes: &bytes });
+            self.network.send(now, &bytes);
+        }
+    }
+
+    /// The wall clock of the listener's machine at `now`, with a key: as far from the hub's as clocks are that are set by the
+    /// same server, but for what goes wrong.
+    fn wall_ns(&self, shared: &Shared, now: Nanos) -> Nanos {
+        (now + shared.wall_ahead.get()).saturating_add_signed(self.terms.ahead_ns + self.apart_ns)
     }
 
     /// The network has these faults from now on, besides its delay.
@@ -222,7 +268,11 @@ impl Remote {
 
     /// What came until `now` is the listener's.
     fn deliver(&mut self, shared: &Shared, now: Nanos) {
+        let wall_ns = self.wall_ns(shared, now);
         while let Some(bytes) = self.network.poll(now) {
+            if self.terms.has_key {
+                self.forger.hear(wall_ns, &bytes);
+            }
             if let Some(listener) = &mut self.listener {
                 listener.catch(now, bytes);
             }
@@ -230,7 +280,8 @@ impl Remote {
         if let Some(listener) = self.listener.as_mut().filter(|_| now >= self.listener_stalled_until)
             && listener.next_ns() <= now
         {
-            listener.run(shared, &self.terms, now);
+            let ahead_ns = wall_ns.wrapping_sub(now);
+            listener.run(shared, &self.terms, now, ahead_ns, &mut self.epochs);
         }
     }
 

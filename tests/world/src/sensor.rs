@@ -9,7 +9,7 @@ use sim::fault::Faults;
 use sim::ld::TruePoint;
 use sim::wire::{Carried, Wire};
 
-use crate::family::Scanner;
+use crate::family::{Ailment, Scanner};
 use crate::plan::Action;
 
 /// A sensor at the end of its line.
@@ -114,6 +114,16 @@ impl Sensor {
     /// It behaves badly as `action` says, or well again.
     pub(crate) fn misbehave(&mut self, action: Option<&Action>) {
         self.scanner.misbehave(action);
+    }
+
+    /// Something happens to it.
+    pub(crate) fn suffer(&mut self, ailment: Ailment) {
+        self.scanner.suffer(ailment, self.now);
+    }
+
+    /// Whether it sends unasked.
+    pub(crate) fn streams(&self) -> bool {
+        self.scanner.device().streams()
     }
 
     /// Requests heard that would write the EEPROM.

@@ -13,6 +13,7 @@ use sim::fault::Faults;
 use crate::actions::object;
 use crate::consumer::{Consumer, Habit, Number};
 use crate::event::{Detail, Event, Figures, Violation};
+use crate::family::Ailment;
 use crate::hub;
 use crate::judges;
 use crate::plan::{Action, Plan};
@@ -140,7 +141,7 @@ impl World {
             begins_at: 0,
             stalled_until: 0,
             orders: None,
-            remote: Remote::new(plan.seed, &setup),
+            remote: Remote::new(plan, &setup),
         };
         for &(sensor, topic, habit, holds) in &setup.cast {
             world.attach(sensor, topic, habit, holds);
@@ -259,6 +260,20 @@ impl World {
                 tty.sensor.set_faults(&Faults::default(), 0);
             });
         });
+    }
+
+    /// `ailment` happens to an action's sensor.
+    pub(crate) fn ail(&mut self, action: &Action, ailment: Ailment) {
+        self.port(self.sensor(action), |tty, log, now| {
+            tty.advance(now, log);
+            tty.sensor.suffer(ailment);
+        });
+    }
+
+    /// The same when an action's time is over.
+    pub(crate) fn ail_later(&mut self, action: &Action, ailment: Ailment) {
+        let copy = action.clone();
+        self.later(action.value("span_ms"), move |world| world.ail(&copy, ailment));
     }
 
     /// The sensor that an action means.

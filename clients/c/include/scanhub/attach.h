@@ -48,6 +48,7 @@ extern "C" {
 #define SCANHUB_TOPIC_FOREGROUND 5 /* struct scanhub_foreground_v2 */
 #define SCANHUB_TOPIC_BACKGROUND 6 /* struct scanhub_background_v2 */
 #define SCANHUB_TOPIC_STATUS 7     /* struct scanhub_status_v2 */
+#define SCANHUB_TOPIC_LINES 8      /* struct scanhub_lines_v2 */
 
 /* How scanhub_wait waits. */
 #define SCANHUB_WAIT_DOORBELL 0 /* at a word in the hub's memory, at which one call wakes all: what to take if in doubt */
@@ -127,6 +128,40 @@ struct scanhub_marks_v2 {
     uint8_t flags; /* 1 there were more, 2 unavailable: the measuring mode has no reflector bits, or 4: marks.level is not set */
     uint16_t reserved;
     struct scanhub_mark_v2 mark_array[64];
+};
+
+struct scanhub_line_v2 {
+    float x1_m; /* where its first beam meets it: ahead of the robot's centre */
+    float y1_m; /* to the left of it */
+    float x2_m; /* where its last beam meets it */
+    float y2_m;
+    float r_m; /* x cos alpha + y sin alpha = r */
+    float alpha_rad;
+    float sd_r_m; /* standard deviations */
+    float sd_alpha_rad;
+    uint16_t first; /* beam */
+    uint16_t last;
+    uint16_t points; /* its beams that have a range */
+    uint16_t reserved;
+};
+
+struct scanhub_corner_v2 {
+    float x_m;
+    float y_m;
+    uint16_t first_line; /* the lines that meet here */
+    uint16_t second_line;
+};
+
+struct scanhub_lines_v2 {
+    uint8_t count;   /* lines, at most 64 */
+    uint8_t corners; /* at most 64 */
+    uint8_t flags;   /* 1 there are more than are allowed */
+    uint8_t reserved;
+    uint16_t readings; /* beams of the scan that have a range */
+    uint16_t on_lines; /* of them those that end on a line */
+    float noise_m;     /* standard deviation of the ranges in this scan */
+    struct scanhub_line_v2 line_array[64];
+    struct scanhub_corner_v2 corner_array[64];
 };
 
 struct scanhub_zone_v2 {
@@ -533,6 +568,11 @@ SCANHUB_AT(scanhub_scan_v2, turn_ns, 48);
 SCANHUB_SIZE(scanhub_mark_v2, 16);
 SCANHUB_SIZE(scanhub_marks_v2, 1028);
 SCANHUB_AT(scanhub_marks_v2, mark_array, 4);
+SCANHUB_SIZE(scanhub_line_v2, 40);
+SCANHUB_SIZE(scanhub_corner_v2, 12);
+SCANHUB_SIZE(scanhub_lines_v2, 3340);
+SCANHUB_AT(scanhub_lines_v2, line_array, 12);
+SCANHUB_AT(scanhub_lines_v2, corner_array, 2572);
 SCANHUB_SIZE(scanhub_zone_v2, 8);
 SCANHUB_SIZE(scanhub_zones_v2, 76);
 SCANHUB_AT(scanhub_zones_v2, zone_array, 12);

@@ -4,7 +4,7 @@
 
 use std::collections::HashMap;
 
-use schema::datagram::{Announce, Datagram, DatagramError, StreamStats};
+use schema::datagram::{Announce, Datagram, DatagramError, Head, StreamStats};
 
 use crate::Key;
 
@@ -42,12 +42,15 @@ impl Guard {
         if self.epochs.get(&head.hub).is_some_and(|greatest| head.epoch < *greatest) {
             return Err(DatagramError::Epoch);
         }
-        let is_timely =
-            || head.topic == Announce::NUMBER && wall_ns.abs_diff(head.stamp_ns) <= FIRST_WITHIN_NS;
-        if stats.is_announced(head.hub, head.epoch, head.sensor) || is_timely() {
+        if stats.is_announced(head.hub, head.epoch, head.sensor) || self.is_timely(head, wall_ns) {
             return Ok(());
         }
         Err(DatagramError::Untimely)
+    }
+
+    /// Whether `head` is that of an announcement which was sent just now by our own clock, which is at `wall_ns`.
+    pub(super) fn is_timely(&self, head: &Head, wall_ns: u64) -> bool {
+        head.topic == Announce::NUMBER && wall_ns.abs_diff(head.stamp_ns) <= FIRST_WITHIN_NS
     }
 
     /// Something of this life of `hub` was taken.
@@ -68,7 +71,7 @@ const FIRST_WITHIN_NS: u64 = 5_000_000_000;
 
 #[cfg(test)]
 mod tests {
-    use schema::datagram::{Announced, HEAD, Head, PORT, Packed, group};
+    use schema::datagram::{Announced, HEAD, PORT, Packed, group};
     use schema::{Topic, Zones};
 
     use super::super::{Arrived, Incoming};
@@ -90,7 +93,12 @@ mod tests {
 
     /// Announces sensor 0 at `at_s` of the gateway's clock, which has `next` zones.
     fn announcement(epoch: u32, sequence: u32, at_s: u64, next: u32) -> Vec<u8> {
-        let mut announce = Announce::new(1, "front", "");
+        announced_of(1, epoch, sequence, at_s, next)
+    }
+
+    /// The same in this life of its hub.
+    fn announced_of(boot: u64, epoch: u32, sequence: u32, at_s: u64, next: u32) -> Vec<u8> {
+        let mut announce = Announce::new(boot, "front", "");
         let topic = Topic::Zones;
         announce.add(Announced { topic: topic.number(), group: group(topic), port: PORT, next });
         sealed(Head { epoch, sequence, stamp_ns: at_s * SECOND, ..Head::default() }, |room| {
@@ -110,8 +118,12 @@ mod tests {
 
     /// What becomes of `bytes` from sender 1 at `at_s` of the listener's clock: why it is refused, if it is.
     fn receive(incoming: &mut Incoming, bytes: &[u8], at_s: u64) -> Option<DatagramError> {
+        receive_from(1, incoming, bytes, at_s)
+    }
+
+    fn receive_from(from: u64, incoming: &mut Incoming, bytes: &[u8], at_s: u64) -> Option<DatagramError> {
         let arrival = Stamp { monotonic_ns: at_s * SECOND, wall_ns: at_s * SECOND };
-        match incoming.receive(bytes, 1, arrival, &mut Vec::new()) {
+        match incoming.receive(bytes, from, arrival, &mut Vec::new()) {
             Arrived::Refused { why, .. } => Some(why),
             Arrived::Untimely { .. } => Some(DatagramError::Untimely),
             _ => None,
@@ -172,9 +184,54 @@ mod tests {
     fn another_sender_is_not_the_next_life_of_a_silent_gateway() {
         let mut incoming = listener(&[]);
         assert_eq!(receive(&mut incoming, &announcement(7, 0, 100, 0), 100), None);
-        let arrival = Stamp { monotonic_ns: 110 * SECOND, wall_ns: 110 * SECOND };
-        let (bytes, mut whole) = (zones(7, 0), Vec::new());
-        let arrived = incoming.receive(&bytes, 2, arrival, &mut whole);
-        assert!(matches!(arrived, Arrived::Refused { why: DatagramError::Twin, .. }));
+        assert_eq!(receive_from(2, &mut incoming, &zones(7, 0), 110), Some(DatagramError::Twin));
+    }
+
+    #[test]
+    fn a_gateway_may_change_its_address_while_its_hub_starts_again() {
+        let mut incoming = listener(&[]);
+        let twin = Some(DatagramError::Twin);
+        assert_eq!(receive(&mut incoming, &announcement(7, 4, 100, 0), 100), None);
+        assert_eq!(receive(&mut incoming, &zones(7, 0), 100), None);
+        let mut moved = |bytes: &[u8], at_s| receive_from(2, &mut incoming, bytes, at_s);
+        assert_eq!(moved(&announced_of(2, 7, 5, 102, 1), 102), twin, "the other one was heard just now");
+        assert_eq!(moved(&announced_of(2, 7, 6, 104, 1), 110), twin, "recorded");
+        assert_eq!(moved(&announced_of(2, 7, 4, 110, 1), 110), twin, "of a number that came");
+        assert_eq!(moved(&zones(7, 1), 110), twin, "nothing was announced there yet");
+        assert_eq!(moved(&announced_of(2, 7, 8, 110, 1), 110), None);
+        assert_eq!(moved(&zones(7, 0), 110), None, "which is a duplicate");
+        assert_eq!(moved(&zones(7, 1), 110), None);
+        assert_eq!(incoming.stats().rows().map(|row| row.received).sum::<u64>(), 4);
+        assert_eq!(receive(&mut incoming, &announcement(7, 9, 110, 1), 110), None, "and back, the same boot");
+        assert_eq!(receive(&mut incoming, &zones(7, 2), 110), None);
+    }
+
+    #[test]
+    fn parts_of_a_recording_are_refused_before_memory_is_spent_on_them() {
+        let mut incoming = listener(&[]);
+        let part = |sequence, part| {
+            let topic = Topic::Zones.number();
+            let head = Head { topic, epoch: 7, sequence, part, parts: 2, ..Head::default() };
+            sealed(head, |room| {
+                let len = Zones::unknown().pack(room)? / 2;
+                room.copy_within(len * usize::from(part)..len * (usize::from(part) + 1), 0);
+                Some(len)
+            })
+        };
+        assert_eq!(receive(&mut incoming, &announcement(7, 0, 100, 40), 100), None);
+        assert_eq!(receive(&mut incoming, &part(39, 0), 100), Some(DatagramError::Stale));
+        assert_eq!([0, 1].map(|at| receive(&mut incoming, &part(40, at), 100)), [None; 2]);
+        // A sample that is new goes on waiting, however many of those that came are sent again meanwhile.
+        assert_eq!(receive(&mut incoming, &part(60, 0), 101), None);
+        for sequence in (41..50).chain(52..60) {
+            [0, 1].iter().for_each(|&at| assert_eq!(receive(&mut incoming, &part(sequence, at), 101), None));
+        }
+        for sequence in 41..50 {
+            assert_eq!(receive(&mut incoming, &part(sequence, 0), 101), None);
+        }
+        assert_eq!(receive(&mut incoming, &part(60, 1), 101), None);
+        let received: u64 =
+            incoming.stats().rows().filter(|row| row.topic != 0).map(|row| row.received).sum();
+        assert_eq!((received, incoming.stats().refused(DatagramError::Stale)), (19, 1));
     }
 }

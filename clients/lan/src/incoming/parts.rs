@@ -19,6 +19,8 @@ struct Unfinished {
     /// That of its parts, as of the first one.
     head: Head,
     from: u64,
+    /// The sample came before.
+    is_known: bool,
     /// The number of its part that came last, among all that came.
     last: u64,
     /// The length of each part that came.
@@ -33,12 +35,22 @@ const OF_TOPIC: usize = 4;
 const OF_ALL: usize = 64;
 
 impl Parts {
-    /// Takes a part that came `from` a sender. Once its sample is whole, writes that into `whole`, and returns its header.
-    pub(super) fn take(&mut self, part: &Datagram<'_>, from: u64, whole: &mut Vec<u8>) -> Option<Head> {
+    /// Takes a part that came `from` a sender, of a sample that came before if it `is_known`. Once its sample is whole, writes
+    /// that into `whole`, and returns its header.
+    pub(super) fn take(
+        &mut self,
+        part: &Datagram<'_>,
+        from: u64,
+        is_known: bool,
+        whole: &mut Vec<u8>,
+    ) -> Option<Head> {
         self.count += 1;
         let head = Head { part: 0, ..part.head };
         let known = self.unfinished.iter().position(|it| it.from == from && it.head == head);
-        let at = known.unwrap_or_else(|| self.begin(head, from));
+        let at = match known {
+            Some(at) => at,
+            None => self.begin(head, from, is_known)?,
+        };
         let it = &mut self.unfinished[at];
         it.last = self.count;
         let number = usize::from(part.head.part);
@@ -58,8 +70,8 @@ impl Parts {
     }
 
     /// Where the sample is from now on. It takes the place of one that says otherwise of the same number, of the one of its
-    /// topic that waits for longest, or of the one of all.
-    fn begin(&mut self, head: Head, from: u64) -> usize {
+    /// topic that waits for longest, or of the one of all; but one that came before never that of one that did not.
+    fn begin(&mut self, head: Head, from: u64, is_known: bool) -> Option<usize> {
         let topic = |it: &Unfinished| (it.from, it.head.hub, it.head.epoch, it.head.sensor, it.head.topic);
         let of_topic = (from, head.hub, head.epoch, head.sensor, head.topic);
         let same = self.unfinished.iter().filter(|it| topic(it) == of_topic);
@@ -67,20 +79,25 @@ impl Parts {
             self.unfinished.iter().position(|it| topic(it) == of_topic && it.head.sequence == head.sequence);
         let is_full = same.count() == OF_TOPIC;
         let waits = self.unfinished.iter().enumerate();
-        let oldest = waits.filter(|(_, it)| !is_full || topic(it) == of_topic).min_by_key(|(_, it)| it.last);
+        let oldest = waits
+            .filter(|(_, it)| !is_full || topic(it) == of_topic)
+            .min_by_key(|(_, it)| (!it.is_known, it.last));
         let is_full = is_full || self.unfinished.len() == OF_ALL;
+        if other.is_none() && is_full && is_known && oldest.is_some_and(|(_, it)| !it.is_known) {
+            return None;
+        }
         if let Some(at) = other.or(oldest.filter(|_| is_full).map(|(at, _)| at)) {
             self.free.push(self.unfinished.swap_remove(at));
         }
-        let new = || Unfinished { head, from, last: 0, lengths: Vec::new(), bytes: Vec::new() };
+        let new = || Unfinished { head, from, is_known, last: 0, lengths: Vec::new(), bytes: Vec::new() };
         let mut it = self.free.pop().unwrap_or_else(new);
-        (it.head, it.from) = (head, from);
+        (it.head, it.from, it.is_known) = (head, from, is_known);
         let parts = usize::from(head.parts);
         it.lengths.clear();
         it.lengths.resize(parts, None);
         it.bytes.resize(parts * PART_LONGEST, 0);
         self.unfinished.push(it);
-        self.unfinished.len() - 1
+        Some(self.unfinished.len() - 1)
     }
 }
 
@@ -96,7 +113,7 @@ mod tests {
     fn take(parts: &mut Parts, head: Head, part: u8, from: u64) -> Option<Vec<u8>> {
         let (payload, mut whole) = ([head.sequence as u8, part].repeat(usize::from(part) + 1), vec![9]);
         let datagram = Datagram { head: Head { part, ..head }, payload: &payload, mac: None };
-        let told = parts.take(&datagram, from, &mut whole)?;
+        let told = parts.take(&datagram, from, false, &mut whole)?;
         assert_eq!(told, Head { parts: 1, ..head });
         Some(whole)
     }

@@ -91,6 +91,17 @@ impl PeerTable {
         }
     }
 
+    /// Returns how many samples of the topic with this number were replaced by newer ones before they were sent, as last
+    /// announced; nothing if that was not said.
+    pub fn replaced(&self, hub: u64, epoch: u32, sensor: u8, topic: u8) -> Option<u32> {
+        self.announced(hub, epoch, sensor)?.replaced(topic)
+    }
+
+    /// Returns what was announced last of a sensor.
+    pub fn announced(&self, hub: u64, epoch: u32, sensor: u8) -> Option<&Announce> {
+        self.sensor(hub, epoch, sensor)?.announced.as_ref()
+    }
+
     fn sensor(&self, hub: u64, epoch: u32, sensor: u8) -> Option<&Sensor> {
         self.lives.get(&(hub, epoch))?.sensors.get(&sensor)
     }

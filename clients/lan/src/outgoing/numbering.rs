@@ -1,10 +1,12 @@
 //! The datagrams of a gateway: each sample is numbered, sealed in one datagram or in parts, and handed over once, in a
-//! buffer that is always the same. Refuses to know where samples come from and where datagrams go.
+//! buffer that is always the same; at once, or when it is asked for. Refuses to know where samples come from and where
+//! datagrams go.
 
 use schema::Topic;
 use schema::datagram::{Announce, HEAD, Head, MAC, MTU_ETHERNET, PARTS, group};
 
-use crate::Key;
+use super::slots::Slots;
+use crate::{Key, Stamp};
 
 /// What takes datagrams: sockets, or a model of a network.
 pub trait Transmit {
@@ -46,6 +48,26 @@ pub(super) struct Numbering {
     unfit: u64,
     /// A header, and the longest payload that can go out.
     buffer: Vec<u8>,
+    waiting: Option<Waiting>,
+}
+
+/// Where samples wait until they are asked for.
+#[derive(Default)]
+struct Waiting {
+    slots: Slots,
+    /// Of announcements, statuses and backgrounds the last one that was handed on.
+    last: Vec<(Head, Vec<u8>)>,
+}
+
+/// A sample that was asked for, with its number.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Handed<'a> {
+    /// The sensor's number in the hub, and what it is called.
+    pub sensor: (u8, &'a str),
+    /// Of which topic; announcements are of none.
+    pub topic: Option<Topic>,
+    /// All of it, in one piece.
+    pub datagram: &'a [u8],
 }
 
 /// The account of one sensor.
@@ -67,6 +89,8 @@ pub struct Row {
     pub bytes: u64,
     /// Samples that the hub sent and the gateway did not receive; they have no number.
     pub missed: u64,
+    /// Samples that waited until a newer one took their place; they have no number.
+    pub replaced: u64,
     fit: Fit,
 }
 
@@ -103,7 +127,80 @@ impl Numbering {
         // Telegrams by themselves have no header that could say which part one is.
         let parts = if form.is_bare() { 1 } else { PARTS };
         let buffer = vec![0; around + parts * (longest - around)];
-        Numbering { hub, epoch, sensors: Vec::new(), form, longest, unfit: 0, buffer }
+        Numbering { hub, epoch, sensors: Vec::new(), form, longest, unfit: 0, buffer, waiting: None }
+    }
+
+    /// Whole samples, however long, each of which waits until it is asked for.
+    pub(super) fn waiting(hub: u64, epoch: u32) -> Numbering {
+        let buffer = vec![0; WHOLE_LONGEST];
+        let waiting = Some(Waiting::default());
+        let (form, longest) = (Form::Sealed, WHOLE_LONGEST);
+        Numbering { hub, epoch, sensors: Vec::new(), form, longest, unfit: 0, buffer, waiting }
+    }
+
+    /// Whether announcements say how many samples were replaced.
+    pub(super) fn tells_replaced(&self) -> bool {
+        self.waiting.is_some()
+    }
+
+    /// How many samples of this sensor and topic were replaced.
+    pub(super) fn replaced(&self, number: u8, topic: Topic) -> u64 {
+        let rows = self.sensors.get(usize::from(number));
+        rows.map_or(0, |rows| rows.rows[usize::from(topic.number())].replaced)
+    }
+
+    /// Numbers the sample that waits for longest and returns it; nothing if none waits.
+    pub(super) fn hand(&mut self) -> Option<Handed<'_>> {
+        let Waiting { slots, last } = self.waiting.as_mut()?;
+        let (head, payload) = slots.take()?;
+        let row = self.sensors.get_mut(usize::from(head.sensor))?.rows.get_mut(usize::from(head.topic))?;
+        let head = Head { hub: self.hub, epoch: self.epoch, sequence: row.next(), ..head };
+        self.buffer.get_mut(HEAD..HEAD + payload.len())?.copy_from_slice(payload);
+        let datagram = head.seal(&mut self.buffer, payload.len())?;
+        row.sent += 1;
+        row.bytes += datagram.len() as u64;
+        let topic = Topic::of_number(head.topic);
+        if topic.is_none_or(is_kept) {
+            let same = |(other, _): &(Head, _)| (other.sensor, other.topic) == (head.sensor, head.topic);
+            match last.iter_mut().find(|kept| same(kept)) {
+                Some((kept, bytes)) => {
+                    *kept = head;
+                    bytes.clear();
+                    bytes.extend_from_slice(payload);
+                }
+                None => last.push((head, payload.to_vec())),
+            }
+        }
+        let name = &self.sensors[usize::from(head.sensor)].name;
+        Some(Handed { sensor: (head.sensor, name), topic, datagram })
+    }
+
+    /// What was handed on last of a topic that is kept, sent again `now` under the number that it has.
+    pub(super) fn again(&mut self, name: &str, topic: Option<Topic>, now: Stamp) -> Option<&[u8]> {
+        let number = topic.map_or(Announce::NUMBER, Topic::number);
+        let sensor = self.sensors.iter().position(|rows| rows.name == name)?;
+        let last = &self.waiting.as_ref()?.last;
+        let is_it = |head: &Head| usize::from(head.sensor) == sensor && head.topic == number;
+        let (head, payload) = last.iter().find(|(head, _)| is_it(head))?;
+        // Announcements and statuses say when they are sent.
+        let is_old = topic == Some(Topic::Background);
+        let head = Head { stamp_ns: if is_old { head.stamp_ns } else { now.wall_ns }, ..*head };
+        self.buffer.get_mut(HEAD..HEAD + payload.len())?.copy_from_slice(payload);
+        head.seal(&mut self.buffer, payload.len())
+    }
+
+    /// What was handed on as this sensor's and topic's last sample, of so many bytes, was not taken.
+    pub(super) fn not_taken(&mut self, number: u8, topic: Option<Topic>, bytes: usize) {
+        if let Some(row) = self.row(number, topic.map_or(Announce::NUMBER, Topic::number)) {
+            row.sent -= 1;
+            row.bytes -= bytes as u64;
+            row.failed += 1;
+        }
+    }
+
+    /// Whether a sample waits.
+    pub(super) fn is_waiting(&self) -> bool {
+        self.waiting.as_ref().is_some_and(|waiting| !waiting.slots.is_empty())
     }
 
     /// Whether announcements go out.
@@ -125,8 +222,15 @@ impl Numbering {
         if self.sensors.len() <= at {
             self.sensors.resize_with(at + 1, Rows::default);
         }
-        if self.sensors[at].name != name {
-            name.clone_into(&mut self.sensors[at].name);
+        if self.sensors[at].name == name {
+            return;
+        }
+        name.clone_into(&mut self.sensors[at].name);
+        if let Some(Waiting { slots, last }) = &mut self.waiting {
+            last.retain(|(head, _)| head.sensor != number);
+            for topic in slots.drop_sensor(number) {
+                self.sensors[at].rows[usize::from(topic)].replaced += 1;
+            }
         }
     }
 
@@ -154,7 +258,7 @@ impl Numbering {
     }
 
     /// Sends what `pack` writes, under the next number of this sensor and topic; `head` lacks hub, epoch and sequence. A
-    /// failure uses the number up.
+    /// failure uses the number up. Where samples wait, nothing is sent and no number used.
     pub(super) fn send(
         &mut self,
         head: Head,
@@ -162,6 +266,15 @@ impl Numbering {
         pack: impl FnOnce(&mut [u8]) -> Option<usize>,
     ) {
         let (hub, epoch) = (self.hub, self.epoch);
+        if let Some(Waiting { slots, .. }) = &mut self.waiting {
+            let payload = pack(&mut self.buffer[HEAD..]);
+            let is_replaced = payload.is_some_and(|len| slots.put(head, &self.buffer[HEAD..HEAD + len]));
+            self.unfit += u64::from(payload.is_none());
+            if let Some(row) = self.row(head.sensor, head.topic) {
+                row.replaced += u64::from(is_replaced);
+            }
+            return;
+        }
         let Some(row) = self.row(head.sensor, head.topic) else { return };
         let head = Head { hub, epoch, sequence: row.next(), ..head };
         let end = self.buffer.len() + HEAD - self.form.around();
@@ -229,6 +342,14 @@ impl Numbering {
         self.sensors.get_mut(usize::from(number))?.rows.get_mut(usize::from(topic))
     }
 }
+
+/// Whether the last sample of this topic is given to who asks: what it says holds until the next one.
+fn is_kept(topic: Topic) -> bool {
+    matches!(topic, Topic::Status | Topic::Background)
+}
+
+/// A header, and the longest payload of which it can say the length.
+const WHOLE_LONGEST: usize = HEAD + u16::MAX as usize;
 
 /// Announcements, and the topics by their numbers.
 const KINDS: usize = 1 + Topic::ALL.len();

@@ -117,11 +117,14 @@ impl Sensor {
                 port: PORT,
                 next: numbering.next(heard.sensor, topic),
             });
+            if numbering.tells_replaced() {
+                announce.add_replaced(numbering.replaced(heard.sensor, topic));
+            }
         }
         let head = Head {
             topic: Announce::NUMBER,
             flags: flags(&heard) & !LanFlags::SUSPECT,
-            revision: 1,
+            revision: announce.revision(),
             ..head(Topic::Status, &heard, now.wall_ns)
         };
         numbering.send(head, to, |room| announce.pack(room));

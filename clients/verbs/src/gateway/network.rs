@@ -1,15 +1,17 @@
 //! Where datagrams go: the groups on an interface and the hosts that get copies, each datagram to all of them. Refuses to
 //! know what a datagram says.
 
+use std::num::NonZeroU64;
 use std::sync::atomic::AtomicBool;
 
-use lan::outgoing::{Form, Outgoing, Transmit};
+use lan::outgoing::{Form, Outgoing, Sample, Transmit};
 use schema::datagram::{HEAD, MTU_ETHERNET, MTU_LEAST, PORT};
-use schema::{Failure, Kind};
+use schema::{Failure, Kind, Topic};
 
-use super::life::Life;
 use super::udp_destination::UdpDestination;
 use super::uplink::Uplink;
+use crate::forward::{Carrier, Life};
+use crate::stamp;
 
 /// What goes out, and the account of it.
 pub(super) struct Network {
@@ -78,6 +80,20 @@ impl Network {
         let longest = longest.min(room.unwrap_or(longest)).max(HEAD);
         let outgoing = Outgoing::new(life.hub, life.epoch, form, longest);
         Ok(Network { life, outgoing, destinations: Destinations { groups, copies } })
+    }
+}
+
+impl Carrier for Network {
+    fn follow(&mut self, name: &str, every: &dyn Fn(Topic) -> Option<NonZeroU64>) -> usize {
+        self.outgoing.follow(name, every)
+    }
+
+    fn wants(&self, sensor: usize, topic: Topic) -> bool {
+        self.outgoing.wants(sensor, topic)
+    }
+
+    fn sample(&mut self, sensor: usize, sample: &Sample<'_>) {
+        self.outgoing.sample(sensor, sample, stamp::now(), &mut self.destinations);
     }
 }
 

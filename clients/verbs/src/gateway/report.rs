@@ -10,8 +10,8 @@ use super::GatewayLook;
 use super::network::{Groups, Network};
 use super::udp_destination::{News, UdpDestination};
 use crate::follow::Notice;
+use crate::forward;
 use crate::output::{End, Output};
-use crate::{json, text};
 
 /// Where it is told.
 pub(super) struct Report<'a> {
@@ -64,11 +64,8 @@ impl<'a> Report<'a> {
 
     /// News of the hub.
     pub(super) fn hub(&mut self, notice: Notice) -> Result<(), End> {
-        if self.look == GatewayLook::Json {
-            return json::notices(&mut self.out, &[], notice);
-        }
         self.wipe()?;
-        self.notes.line(|line| text::notice(line, &[], notice))
+        forward::tell(notice, self.look == GatewayLook::Json, &mut self.out, &mut self.notes)
     }
 
     /// The state of the interface became another one.

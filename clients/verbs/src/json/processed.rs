@@ -1,8 +1,11 @@
-//! The classes of the results that the hub computes from a scan: marks, zones, foreground. A contract, like its parent
+//! The classes of the results that the hub computes from a scan: marks, lines, zones, foreground. A contract, like its parent
 //! module.
 
 use scanhub_client::{Heard, Robot};
-use schema::{Foreground, Header, Mark, Marks, ROBOT, Segment, Verdict, Zone, Zones};
+use schema::{
+    Corner, Foreground, Header, Line as StraightLine, Lines, Mark, Marks, ROBOT, Segment, Verdict, Zone,
+    Zones, in_degrees,
+};
 use serde::{Serialize, Serializer};
 
 use super::{Stamp, Words};
@@ -25,6 +28,35 @@ pub(crate) fn marks<'a>(sensor: &'a str, header: &Header, marks: &'a Marks) -> i
         available: marks.is_available(),
         overflow: marks.is_overflow(),
         marks: marks.marks(),
+        flags: Words::of(header),
+    }
+}
+
+/// Class `lines`.
+pub(crate) fn lines<'a>(sensor: &'a str, header: &Header, lines: &'a Lines) -> impl Serialize + 'a {
+    #[derive(Serialize)]
+    struct Line<'a> {
+        #[serde(flatten)]
+        stamp: Stamp<'a>,
+        readings: u16,
+        points: u16,
+        noise_m: f64,
+        overflow: bool,
+        #[serde(serialize_with = "line_list")]
+        lines: &'a [StraightLine],
+        #[serde(serialize_with = "corner_list")]
+        corners: &'a [Corner],
+        #[serde(flatten)]
+        flags: Words,
+    }
+    Line {
+        stamp: Stamp::new("lines", sensor, header),
+        readings: lines.readings,
+        points: lines.on_lines,
+        noise_m: millionths(lines.noise_m),
+        overflow: lines.is_overflow(),
+        lines: lines.lines(),
+        corners: lines.corners(),
         flags: Words::of(header),
     }
 }
@@ -151,6 +183,57 @@ fn mark_list<S: Serializer>(marks: &[Mark], serializer: S) -> Result<S::Ok, S::E
         last_beam: mark.last_beam,
         edge: mark.edge != 0,
     }))
+}
+
+fn line_list<S: Serializer>(lines: &[StraightLine], serializer: S) -> Result<S::Ok, S::Error> {
+    #[derive(Serialize)]
+    struct Item {
+        x1_m: f64,
+        y1_m: f64,
+        x2_m: f64,
+        y2_m: f64,
+        r_m: f64,
+        alpha_deg: f64,
+        first: u16,
+        last: u16,
+        points: u16,
+        sd_r_m: f64,
+        sd_alpha_deg: f64,
+    }
+    serializer.collect_seq(lines.iter().map(|line| Item {
+        x1_m: millionths(line.x1_m),
+        y1_m: millionths(line.y1_m),
+        x2_m: millionths(line.x2_m),
+        y2_m: millionths(line.y2_m),
+        r_m: millionths(line.r_m),
+        alpha_deg: millionths(in_degrees(line.alpha_rad.into())),
+        first: line.first,
+        last: line.last,
+        points: line.points,
+        sd_r_m: millionths(line.sd_r_m),
+        sd_alpha_deg: millionths(in_degrees(line.sd_alpha_rad.into())),
+    }))
+}
+
+fn corner_list<S: Serializer>(corners: &[Corner], serializer: S) -> Result<S::Ok, S::Error> {
+    #[derive(Serialize)]
+    struct Item {
+        x_m: f64,
+        y_m: f64,
+        first: u16,
+        second: u16,
+    }
+    serializer.collect_seq(corners.iter().map(|corner| Item {
+        x_m: millionths(corner.x_m),
+        y_m: millionths(corner.y_m),
+        first: corner.first_line,
+        second: corner.second_line,
+    }))
+}
+
+/// As many digits as there is sense in: six behind the point.
+fn millionths(value: impl Into<f64>) -> f64 {
+    (1e6 * value.into()).round() / 1e6
 }
 
 fn zone_list<S: Serializer>(zones: &[Zone], serializer: S) -> Result<S::Ok, S::Error> {

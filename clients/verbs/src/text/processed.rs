@@ -3,7 +3,7 @@
 use std::io::{self, Write};
 
 use scanhub_client::{Heard, Robot};
-use schema::{Background, BackgroundHead, Flags, Foreground, Header, Marks, Verdict};
+use schema::{Background, BackgroundHead, Flags, Foreground, Header, Lines, Marks, Verdict};
 
 use super::numbers;
 
@@ -32,6 +32,23 @@ pub(crate) fn marks(line: &mut Vec<u8>, header: &Header, marks: &Marks) -> io::R
         write!(line, ", {range_mm:.1} mm at {angle_deg:.3} deg")?;
     }
     if marks.is_overflow() { write!(line, ", and more") } else { Ok(()) }
+}
+
+pub(crate) fn lines(line: &mut Vec<u8>, header: &Header, lines: &Lines) -> io::Result<()> {
+    numbers(line, header)?;
+    let count = lines.lines().len();
+    write!(
+        line,
+        " {count} {}, {} corners",
+        if count == 1 { "line" } else { "lines" },
+        lines.corners().len()
+    )?;
+    write!(line, ", {} of {} beams", lines.on_lines, lines.readings)?;
+    for found in lines.lines() {
+        let (r_m, alpha_deg) = (found.r_m, found.alpha_rad.to_degrees());
+        write!(line, ", r {r_m:.3} m alpha {alpha_deg:.2} deg")?;
+    }
+    if lines.is_overflow() { write!(line, ", and more") } else { Ok(()) }
 }
 
 pub(crate) fn zones(line: &mut Vec<u8>, heard: &Heard) -> io::Result<()> {

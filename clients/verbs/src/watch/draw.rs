@@ -10,8 +10,8 @@ use ratatui::widgets::{Block, Clear, Paragraph};
 use schema::Counter;
 
 use super::map::{DOTS, colour, map};
-use super::scene::{Scene, Sensor, verdict};
 use super::view::View;
+use scene::{Scene, Sensor, verdict};
 
 /// Draws `scene` as `view` says, with the picture of `held` if that is there: what there is to act on is never held.
 pub(crate) fn draw(frame: &mut Frame<'_>, scene: &Scene, held: Option<&Scene>, view: &View) {

@@ -15,8 +15,8 @@ use schema::{
 };
 
 use super::draw::{dots, draw};
-use super::scene::{Scene, Sensor};
 use super::view::View;
+use scene::{Scene, Sensor};
 
 /// The room, without people: metres ahead and to the left of the robot.
 const WALLS: [f64; 4] = [4.2, -3.4, 3.0, -3.6];

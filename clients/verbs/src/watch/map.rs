@@ -8,8 +8,8 @@ use ratatui::widgets::canvas::{Canvas, Context, Points};
 
 use schema::Verdict;
 
-use super::scene::{Scene, Sensor};
 use super::view::View;
+use scene::{Scene, circles};
 
 /// Dots of a cell of the terminal.
 pub(crate) const DOTS: (f64, f64) = (2.0, 4.0);
@@ -90,21 +90,22 @@ struct Circle {
 impl Layers {
     fn new(scene: &Scene, view: &View) -> Layers {
         let shown = view.shown(scene);
+        let around = if view.zones { circles(shown.iter().map(|(_, sensor)| *sensor)) } else { Vec::new() };
         let mut layers = Layers {
             colours: view.colours,
             robot: Some((0.0, 0.0)),
             background: Vec::new(),
-            circles: if view.zones { circles(&shown, view.dot_m) } else { Vec::new() },
+            circles: around.iter().map(|circle| dotted(circle, view.dot_m)).collect(),
             walls: Vec::new(),
             foreground: Vec::new(),
             marks: Vec::new(),
             sensors: Vec::new(),
         };
         for (number, sensor) in shown {
-            for (x, y, is_foreground) in sensor.points() {
-                let dots =
-                    if is_foreground && view.foreground { &mut layers.foreground } else { &mut layers.walls };
-                dots.push((-y, x));
+            for point in sensor.points() {
+                let is_foreground = point.is_foreground && view.foreground;
+                let dots = if is_foreground { &mut layers.foreground } else { &mut layers.walls };
+                dots.push((-point.y_m, point.x_m));
             }
             let turned = |points: Dots| points.into_iter().map(|(x, y)| (-y, x));
             if view.background {
@@ -172,34 +173,18 @@ impl Layers {
     }
 }
 
-/// The circles around the robot, each once, the worst over all sensors.
-fn circles(shown: &[(usize, &Sensor)], dot_m: f64) -> Vec<Circle> {
-    let mut radii: Vec<(u16, bool)> = Vec::new();
-    for zone in shown.iter().flat_map(|(_, sensor)| sensor.zones.zones()) {
-        match radii.iter_mut().find(|(radius, _)| *radius == zone.radius_mm) {
-            Some((_, violated)) => *violated |= zone.violated != 0,
-            None => radii.push((zone.radius_mm, zone.violated != 0)),
-        }
+/// `circle` as a dotted line, from the top on.
+fn dotted(circle: &scene::Circle, dot_m: f64) -> Circle {
+    let radius = circle.radius_m;
+    let points = (radius / dot_m * std::f64::consts::TAU / CIRCLE_DOTS).clamp(8.0, 360.0) as u32;
+    let at = |n: u32| f64::from(n) * std::f64::consts::TAU / f64::from(points);
+    let is_large = radius / dot_m > LABEL_DOTS;
+    let sign = if circle.is_violated() { "!" } else { "" };
+    Circle {
+        dots: (0..points).map(at).map(|at| (radius * at.sin(), radius * at.cos())).collect(),
+        label: is_large.then(|| (0.0, radius, format!("{radius:.2}{sign}"))),
+        colour: colour(circle.verdict),
     }
-    let innermost = radii.iter().map(|(radius, _)| *radius).min();
-    let circle = |(radius_mm, violated): (u16, bool)| {
-        let radius = f64::from(radius_mm) / 1000.0;
-        // As many points as leave it a dotted line, from the top on.
-        let points = (radius / dot_m * std::f64::consts::TAU / CIRCLE_DOTS).clamp(8.0, 360.0) as u32;
-        let at = |n: u32| f64::from(n) * std::f64::consts::TAU / f64::from(points);
-        let verdict = match violated {
-            false => Verdict::Clear,
-            true if Some(radius_mm) == innermost => Verdict::Stop,
-            true => Verdict::Slow,
-        };
-        let is_large = radius / dot_m > LABEL_DOTS;
-        Circle {
-            dots: (0..points).map(at).map(|at| (radius * at.sin(), radius * at.cos())).collect(),
-            label: is_large.then(|| (0.0, radius, format!("{radius:.2}{}", if violated { "!" } else { "" }))),
-            colour: colour(verdict),
-        }
-    };
-    radii.into_iter().map(circle).collect()
 }
 
 /// Dots between two of a circle.

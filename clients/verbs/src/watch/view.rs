@@ -2,7 +2,7 @@
 //! keys.
 
 use super::keys::Key;
-use super::scene::{Scene, Sensor};
+use scene::{Scene, Sensor};
 
 /// What is shown.
 #[derive(Clone, Debug)]
@@ -112,8 +112,8 @@ impl View {
         }
         let reach = shown.iter().flat_map(|(_, sensor)| sensor.zones.zones().iter());
         let reach = reach.map(|zone| f64::from(zone.radius_mm) / 1000.0).fold(LEAST_M, f64::max);
-        let ahead = span(seen.iter().map(|point| point.0).collect(), reach);
-        let aside = span(seen.iter().map(|point| point.1).collect(), reach);
+        let ahead = span(seen.iter().map(|point| point.x_m).collect(), reach);
+        let aside = span(seen.iter().map(|point| point.y_m).collect(), reach);
         let needed = ((aside.1 - aside.0) / dots.0).max((ahead.1 - ahead.0) / dots.1) * MARGIN;
         let fits = |middle: f64, span: (f64, f64), dots: f64| {
             let half = self.dot_m * dots / 2.0;

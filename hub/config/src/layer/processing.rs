@@ -1,11 +1,11 @@
-//! The keys of sections pose, zones, marks and background, and their valid values. Metres, radians and degrees become the
+//! The keys of sections pose, zones, marks, lines and background, and their valid values. Metres, radians and degrees become the
 //! units of the processors. Each value is checked in its own source; this file refuses to know which source wins.
 
 use std::ops::{Range, RangeInclusive};
 
 use preprocess::background::{Candidate, Method, Start};
 use preprocess::zones::{SECTORS, Sector};
-use schema::{BEAMS, Failure, Family, ZONES};
+use schema::{BEAMS, Failure, Family, LINES, ZONES};
 use serde::Deserialize;
 use toml::Spanned;
 
@@ -57,6 +57,15 @@ pub(super) struct MarksLayer {
     max_gap: Option<Spanned<i64>>,
 }
 
+/// Section `lines`.
+#[derive(Clone, Deserialize)]
+#[serde(deny_unknown_fields, expecting = "keys of lines, as { max = 20, polish = true }")]
+pub(super) struct LinesLayer {
+    max: Option<Spanned<i64>>,
+    min_points: Option<Spanned<i64>>,
+    polish: Option<bool>,
+}
+
 /// Section `background`.
 #[derive(Clone, Deserialize)]
 #[serde(deny_unknown_fields, expecting = "keys of background, as { method = \"multi\" }")]
@@ -100,13 +109,14 @@ pub(super) struct Sections {
     pub(super) pose: Option<PoseLayer>,
     pub(super) zones: Option<ZonesLayer>,
     pub(super) marks: Option<MarksLayer>,
+    pub(super) lines: Option<LinesLayer>,
     pub(super) background: Option<BackgroundLayer>,
 }
 
 impl Sections {
     /// Lays what `origin` says over `processing`.
     pub(super) fn lay(self, origin: &Origin, processing: &mut Processing) -> Result<(), Failure> {
-        let Sections { pose, zones, marks, background } = self;
+        let Sections { pose, zones, marks, lines, background } = self;
         if let Some(layer) = pose {
             let pose = &mut processing.pose;
             put(&mut pose.x_m, layer.x, |value| place(origin, "x", value))?;
@@ -137,6 +147,14 @@ impl Sections {
             put(&mut marks.max_gap, layer.max_gap, |value| {
                 whole(origin, "max_gap", value, 0..=BEAMS as i64)
             })?;
+        }
+        if let Some(layer) = lines {
+            let lines = &mut processing.lines;
+            put(&mut lines.max, layer.max, |value| whole(origin, "max", value, 1..=LINES as i64))?;
+            put(&mut lines.min_points, layer.min_points, |value| {
+                whole(origin, "min_points", value, 3..=BEAMS as i64)
+            })?;
+            lines.polish = layer.polish.unwrap_or(lines.polish);
         }
         if let Some(layer) = background {
             layer.lay(origin, &mut processing.background)?;

@@ -68,7 +68,7 @@ impl ScannerDraft {
         let ScannerDraft { family, model, beams, mode, stop_when_idle } = self;
         let family = family.map_or(Family::Lms, |(family, _)| family);
         let name = family.name();
-        let model = model.filter(|(model, _)| model != AUTO);
+        let model = model.filter(|(model, _)| !model.eq_ignore_ascii_case(AUTO));
         let mode = mode.filter(|(mode, _)| mode != AUTO);
         let rest = stop_when_idle.filter(|(stops, _)| *stops);
         let known = features(family);
@@ -95,7 +95,7 @@ impl ScannerDraft {
         };
         let mut turning = Turning::new(family, features);
         if let Some((model, place)) = model {
-            let known = features.models.iter().find(|known| known.name == model);
+            let known = features.models.iter().find(|known| known.name.eq_ignore_ascii_case(&model));
             turning.model = *known.ok_or_else(|| {
                 let names = features.models.iter().map(|model| model.name);
                 refuse(&place, format!("model = \"{model}\""), &auto_or(names))
@@ -117,8 +117,19 @@ fn mode_of(features: &Features, name: &str, mode: &str) -> Result<&'static str, 
         let what = format!("mode = \"{mode}\", and an {name} measures in one way only");
         return Err((what, "leave it out".to_owned()));
     }
-    let known = features.modes.iter().find(|known| **known == mode);
+    let known = features.modes.iter().find(|known| known.eq_ignore_ascii_case(mode));
     known.copied().ok_or_else(|| (format!("mode = \"{mode}\""), auto_or(features.modes.iter().copied())))
+}
+
+/// What to do about a key of an LMS that is set for another `scanner`.
+pub(super) fn remedy_of_lms(key: &str, scanner: &Scanner) -> String {
+    match (key, scanner) {
+        ("baud", _) => "leave it out: the rate is the model's".to_owned(),
+        ("mode", Scanner::Turning(turning)) if !turning.features.modes.is_empty() => {
+            format!("name one of: {}", turning.features.modes.join(", "))
+        }
+        _ => "leave it out, or set family = \"lms\"".to_owned(),
+    }
 }
 
 fn auto_or(names: impl Iterator<Item = &'static str>) -> String {

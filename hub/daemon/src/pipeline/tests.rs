@@ -34,7 +34,7 @@ fn it_learns_and_warns_whoever_wants_to_know() {
     }
     let mut foreground = Foreground::of(361);
     let near = wall(361, 1, 500);
-    let out = Outputs { marks: None, foreground: Some(&mut foreground) };
+    let out = Outputs { foreground: Some(&mut foreground), ..Outputs::default() };
     pipeline.watch(&near, Some(&mut zones));
     assert_eq!(pipeline.examine(&near, out), None);
     assert_eq!((zones.verdict(), foreground.beams), (Verdict::Stop, 361));
@@ -112,7 +112,7 @@ fn other_settings_keep_what_is_known() {
     }
     let told = |pipeline: &mut Pipeline, range| {
         let (mut zones, mut foreground) = (Zones::default(), Foreground::of(361));
-        let out = Outputs { marks: None, foreground: Some(&mut foreground) };
+        let out = Outputs { foreground: Some(&mut foreground), ..Outputs::default() };
         pipeline.watch(&wall(361, 1, range), Some(&mut zones));
         assert_eq!(pipeline.examine(&wall(361, 1, range), out), None);
         (zones.verdict(), foreground.beams)

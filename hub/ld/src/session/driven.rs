@@ -1,6 +1,6 @@
 //! The session as its driver sees it: what goes in, and what is wanted next.
 
-use line::{Account, Control, Heard, MILLIS, Nanos, Output, State};
+use line::{Account, Control, Heard, Nanos, Output, State};
 
 use super::{MOST, Phase, Session};
 use crate::heard::{Trouble, Why};
@@ -12,26 +12,21 @@ impl line::Session for Session {
 
     fn spare(&mut self) -> &mut [u8] {
         let spare = self.framer.spare();
-        self.room = spare.len();
+        self.reads.offer(spare.len());
         spare
     }
 
     fn commit(&mut self, now: Nanos, len: usize) {
         self.now = now;
-        self.arrivals.note(now, len);
-        self.rest_until = 0;
+        self.reads.note(now, len, self.state() == State::Streaming);
         if len > 0 {
             self.framer.commit(len);
-            self.last_byte = now;
-            if self.state() == State::Streaming && len < self.room {
-                self.rest_until = now + REST;
-            }
         }
     }
 
     fn handle_timeout(&mut self, now: Nanos) {
         self.now = now;
-        self.framer.release(now.saturating_sub(self.last_byte));
+        self.framer.release(now.saturating_sub(self.reads.last_byte()));
     }
 
     fn control(&mut self, control: Control, now: Nanos) {
@@ -69,20 +64,12 @@ impl line::Session for Session {
             self.framer.clear();
             return Output::SetRate(self.baud);
         }
-        if self.rest_until > self.now {
-            return Output::Rest(self.rest_until);
-        }
-        let (until, reason) = match self.phase {
+        let until = match self.phase {
             Phase::Listening { next_at, .. } => (next_at, Why::Listening),
             Phase::Hearing { silent_at, .. } => (silent_at, Why::Silence),
             Phase::Paused => (Nanos::MAX, Why::Never),
         };
-        match self.framer.hold() {
-            Some(hold) if self.last_byte + hold < until => {
-                Output::Wait { until: self.last_byte + hold, reason: Why::Held }
-            }
-            _ => Output::Wait { until, reason },
-        }
+        self.reads.wait(self.now, until, self.framer.hold(), Why::Held)
     }
 
     fn state(&self) -> State {
@@ -126,6 +113,3 @@ impl line::Session for Session {
 const fn most_together(baud: u32) -> usize {
     if baud > 500_000 { MOST } else { 3 }
 }
-
-/// A stream is read so late after bytes of it were: a packet or nine at once, and a tenth of what a tty keeps.
-const REST: Nanos = 5 * MILLIS;

@@ -23,8 +23,8 @@ impl Turns {
             return Ok(None);
         };
         let model = recording.model()?.map(|model| model.name);
-        let beams = recording.contents().beams.map(usize::from);
-        let wanted = Wanted { model, beams, fixed_rate: true, listen_only: true, ..Wanted::default() };
+        let (beams, mode) = (recording.beams(), recording.contents().way);
+        let wanted = Wanted { model, mode, beams, fixed_rate: true, listen_only: true, ..Wanted::default() };
         Ok(Some(Turns { family, wanted, session: None, scan: Box::default() }))
     }
 

@@ -2,6 +2,8 @@
 
 use line::{MILLIS, Nanos, State};
 
+use super::outgoing::Outgoing;
+use super::reply::{Reply, number};
 use super::{Phase, Session};
 use crate::framer::Expect;
 use crate::model::{Mode, Motor};
@@ -22,6 +24,9 @@ pub(super) enum Ask {
     Kind(u8),
     Name(u8),
     SampleTimes,
+    /// How long a point takes in the mode that will be started, once more: answers have no checksum, and all times are
+    /// counted by this one.
+    Confirmed(u8),
     /// To measure.
     Scan(Wanted),
 }
@@ -33,39 +38,6 @@ pub(super) enum Wanted {
     Express(u8),
 }
 
-/// Bytes on their way out.
-#[derive(Clone, Copy, Debug, Default)]
-pub(super) struct Outgoing {
-    bytes: [u8; 32],
-    len: usize,
-    sent: usize,
-}
-
-impl Outgoing {
-    fn push(&mut self, request: &Request) {
-        for byte in request.bytes() {
-            if let Some(place) = self.bytes.get_mut(self.len) {
-                *place = *byte;
-                self.len += 1;
-            }
-        }
-    }
-
-    pub(super) fn next(&self) -> Option<u8> {
-        self.bytes[self.sent..self.len].first().copied()
-    }
-
-    /// The next byte was written. Whether it was the last one.
-    pub(super) fn advance(&mut self) -> bool {
-        self.sent += 1;
-        let is_done = self.sent >= self.len;
-        if is_done {
-            *self = Outgoing::default();
-        }
-        is_done
-    }
-}
-
 impl Session {
     /// Begins the conversation anew, at the rate of the last one.
     pub(super) fn begin(&mut self, shown: State) {
@@ -73,7 +45,7 @@ impl Session {
         self.shown = shown;
         if self.settings.listen_only {
             self.phase = Phase::Listening { since: self.now };
-            return self.framer.expect(Expect::Anything(self.settings.alike()));
+            return self.framer.expect(Expect::Anything(self.alike()));
         }
         // Opening a port asserts it, which keeps the motor of an A1 off.
         self.change_dtr = Some(false);
@@ -102,13 +74,19 @@ impl Session {
     }
 
     pub(super) fn ask(&mut self, ask: Ask, attempts: u8) {
+        if self.settings.listen_only {
+            // Somebody else asks.
+            return;
+        }
         let request = match ask {
             Ask::Info => Request::INFO,
             Ask::Health => Request::HEALTH,
             Ask::Board => Request::board(),
             Ask::Count => Request::configuration(key::COUNT, None),
             Ask::Typical => Request::configuration(key::TYPICAL, None),
-            Ask::SampleTime(mode) => Request::configuration(key::SAMPLE_TIME, Some(mode)),
+            Ask::SampleTime(mode) | Ask::Confirmed(mode) => {
+                Request::configuration(key::SAMPLE_TIME, Some(mode))
+            }
             Ask::Kind(mode) => Request::configuration(key::ANSWER, Some(mode)),
             Ask::Name(mode) => Request::configuration(key::NAME, Some(mode)),
             Ask::SampleTimes => Request::SAMPLE_TIMES,
@@ -137,21 +115,25 @@ impl Session {
 
     /// No answer came.
     pub(super) fn unanswered(&mut self, ask: Ask, attempts: u8) {
+        // Something came, and was no answer: nobody is believed not to know what he was asked.
+        let is_damaged = self.reads.last_byte() + self.patience() > self.now && attempts < PATIENT;
         match ask {
             Ask::Info if attempts == 0 => self.stop(1),
             Ask::Info => self.seek_on(),
+            _ if attempts == 0 || is_damaged => self.ask(ask, attempts + 1),
             Ask::Board => self.turn_and_list(),
-            _ if attempts == 0 => self.ask(ask, 1),
             // It answers, but not to everything; without an answer it is taken to be well.
             Ask::Health => self.look_for_board(),
             Ask::Count => self.ask(Ask::SampleTimes, 0),
             Ask::SampleTimes => {
                 self.offers = Offers::of_old(0, 0);
-                self.scan();
+                self.start();
             }
+            Ask::Confirmed(_) => self.start(),
             Ask::Scan(_) => {
+                // It answered at this rate.
                 self.trouble = Some(Trouble::Refused);
-                self.seek_on();
+                self.stop(0);
             }
             ask => self.ask_next(ask),
         }
@@ -170,7 +152,7 @@ impl Session {
 
     pub(super) fn complain(&mut self, since: Nanos) {
         let seconds = (self.now.saturating_sub(since) / (1_000 * MILLIS)) as u32;
-        if seconds > 0 && self.trouble != Some(Trouble::Refused) {
+        if seconds > 0 && self.trouble != Some(Trouble::Alike) {
             let read = self.quiet_since.map_or(0, |(_, read)| read);
             let noise = self.framer.tally().read > read + NOISE;
             let baud = self.next_rate().is_none().then_some(self.baud);
@@ -191,7 +173,11 @@ impl Session {
         if answer == Answer::Info {
             self.info = Info::parse(data);
         }
-        let Phase::Asking { ask, .. } = self.phase else { return };
+        let ask = match self.phase {
+            Phase::Asking { ask, .. } => ask,
+            _ if self.settings.listen_only => self.overhear(answer, data),
+            _ => return,
+        };
         // What is said of a key begins with that key.
         let of_key = |key: u8| data.strip_prefix(&[key, 0, 0, 0]).filter(|_| answer == Answer::Configuration);
         match ask {
@@ -223,6 +209,12 @@ impl Session {
                 self.offer(mode, |offer| offer.sample_us = (us > 0.0).then_some(us));
                 self.ask_next(ask);
             }
+            Ask::Confirmed(mode) => {
+                let Some(data) = of_key(key::SAMPLE_TIME) else { return };
+                let us = number(data) as f32 / 256.0;
+                let said = self.offers.nth_mut(usize::from(mode)).and_then(|offer| offer.sample_us);
+                if said == Some(us) { self.start() } else { self.begin(self.shown) }
+            }
             Ask::Kind(mode) => {
                 let Some(data) = of_key(key::ANSWER) else { return };
                 let kind = Kind::of(number(data) as u8);
@@ -238,9 +230,34 @@ impl Session {
             Ask::SampleTimes if answer == Answer::SampleTimes => {
                 let us = number(data);
                 self.offers = Offers::of_old(us as u16, (us >> 16) as u16);
-                self.scan();
+                self.start();
             }
             _ => {}
+        }
+    }
+
+    /// What somebody asked that is answered so: the modes are listed in their order, and of each one key after the other.
+    fn overhear(&mut self, answer: Answer, data: &[u8]) -> Ask {
+        let key = match answer {
+            Answer::Info => return Ask::Info,
+            Answer::Health => return Ask::Health,
+            Answer::Board => return Ask::Board,
+            Answer::SampleTimes => return Ask::SampleTimes,
+            Answer::Configuration => data.first().copied().unwrap_or(key::COUNT),
+        };
+        let (mode, before) = self.overheard;
+        let mode = if key > before { mode } else { mode + 1 };
+        match key {
+            key::COUNT => self.overheard = (0, 0),
+            key::SAMPLE_TIME | key::ANSWER | key::NAME => self.overheard = (mode, key),
+            _ => {}
+        }
+        match key {
+            key::SAMPLE_TIME => Ask::SampleTime(mode),
+            key::ANSWER => Ask::Kind(mode),
+            key::NAME => Ask::Name(mode),
+            key::TYPICAL => Ask::Typical,
+            _ => Ask::Count,
         }
     }
 
@@ -265,6 +282,7 @@ impl Session {
     fn examine(&mut self, health: Option<Health>) {
         self.health = health;
         match health {
+            _ if self.settings.listen_only => {}
             Some(Health::Error(_)) if !self.was_reset => {
                 self.was_reset = true;
                 self.outgoing.push(&Request::RESET);
@@ -285,6 +303,8 @@ impl Session {
     pub(super) fn booted(&mut self) {
         match self.phase {
             Phase::Paused { .. } | Phase::Listening { .. } => {}
+            // It is asked anyway; and what another rate makes of a stream may be text, again and again.
+            Phase::Draining { .. } | Phase::Asking { ask: Ask::Info, .. } => {}
             Phase::Booting { .. } => self.phase = Phase::Booting { until: self.now + SETTLE },
             _ => {
                 self.resyncs += u64::from(matches!(self.phase, Phase::Hearing { .. }));
@@ -311,6 +331,7 @@ impl Session {
     /// Has the head turn, or not.
     fn turn_head(&mut self, turns: bool) {
         match self.motor() {
+            _ if self.settings.listen_only => {}
             Motor::Speed => self.outgoing.push(&Request::speed(if turns { SPEED } else { 0 })),
             Motor::Board if self.has_board => {
                 self.outgoing.push(&Request::duty(if turns { DUTY } else { 0 }))
@@ -321,42 +342,35 @@ impl Session {
         }
     }
 
-    /// All is known: it shall measure.
+    /// All is known but whether it is true.
     fn scan(&mut self) {
+        if self.settings.listen_only {
+            return;
+        }
+        let offer = self.choose();
+        if offer.sample_us.is_some() { self.ask(Ask::Confirmed(offer.id), 0) } else { self.start() }
+    }
+
+    /// The mode that is wanted, or else the fastest.
+    fn choose(&mut self) -> Offer {
         let baud = (!self.settings.fixed_rate).then_some(self.baud);
         let wanted = self.settings.mode.and_then(|mode| self.offers.wanted(mode, baud));
         self.no_mode = self.settings.mode.filter(|_| wanted.is_none());
         let fastest = || self.offers.fastest(baud).or_else(|| self.offers.fastest(None));
-        let offer = wanted.or_else(fastest).unwrap_or_default();
+        wanted.or_else(fastest).unwrap_or_default()
+    }
+
+    /// It shall measure.
+    fn start(&mut self) {
+        if self.settings.listen_only {
+            return;
+        }
+        let offer = self.choose();
+        self.mode = offer.named;
         self.point_ns = offer.sample_us.map(|us| f64::from(us) * 1e3);
         let is_standard = offer.kind.is_none_or(|kind| kind == Kind::Standard);
         self.ask(Ask::Scan(if is_standard { Wanted::Standard } else { Wanted::Express(offer.id) }), 0);
     }
-}
-
-/// What an answer says, apart from the framer.
-#[derive(Clone, Copy, Debug)]
-pub(super) struct Reply {
-    bytes: [u8; 64],
-    len: usize,
-}
-
-impl Reply {
-    pub(super) fn new(data: &[u8]) -> Reply {
-        let len = data.len().min(64);
-        let mut bytes = [0; 64];
-        bytes[..len].copy_from_slice(&data[..len]);
-        Reply { bytes, len }
-    }
-
-    fn bytes(&self) -> &[u8] {
-        &self.bytes[..self.len]
-    }
-}
-
-/// A number of one to four bytes.
-fn number(data: &[u8]) -> u32 {
-    data.iter().take(4).rev().fold(0, |number, byte| number << 8 | u32::from(*byte))
 }
 
 /// A line on which nothing came for so long is quiet after a request to stop; and it is asked after so long, quiet or not.
@@ -364,6 +378,8 @@ pub(super) const QUIET: Nanos = 15 * MILLIS;
 const DRAIN: Nanos = 60 * MILLIS;
 /// An answer takes some milliseconds, and an adapter that collects bytes 16 more, twice.
 const ANSWER: Nanos = 70 * MILLIS;
+/// So often something is asked at the most of which a damaged answer came.
+const PATIENT: u8 = 8;
 /// Behind a network.
 const FAR: Nanos = 500 * MILLIS;
 /// A real A1 has booted after 0.67 s.

@@ -1,12 +1,12 @@
 //! The session as its driver sees it: what goes in, and what is wanted next.
 
-use line::{Account, Control, Heard, MILLIS, Nanos, Output, Packets, Received, State};
+use line::{Account, Control, Heard, Nanos, Output, Packets, Received, State};
 
-use super::dialogue::Reply;
+use super::reply::Reply;
 use super::{Phase, Session};
 use crate::framer::{Found, Span};
 use crate::request::Head;
-use crate::told::{Trouble, Why};
+use crate::told::{Health, Trouble, Why};
 
 impl line::Session for Session {
     type Heard<'a> = Heard<'a>;
@@ -15,29 +15,24 @@ impl line::Session for Session {
 
     fn spare(&mut self) -> &mut [u8] {
         let spare = self.framer.spare();
-        self.room = spare.len();
+        self.reads.offer(spare.len());
         spare
     }
 
     fn commit(&mut self, now: Nanos, len: usize) {
         self.now = now;
-        self.arrivals.note(now, len);
-        self.rest_until = 0;
+        self.reads.note(now, len, self.state() == State::Streaming);
         if len > 0 {
             self.framer.commit(len);
-            self.last_byte = now;
             if let Phase::Draining { until, .. } = &mut self.phase {
                 *until = now + super::dialogue::QUIET;
-            }
-            if self.state() == State::Streaming && len < self.room {
-                self.rest_until = now + REST;
             }
         }
     }
 
     fn handle_timeout(&mut self, now: Nanos) {
         self.now = now;
-        self.framer.release(now.saturating_sub(self.last_byte));
+        self.framer.release(now.saturating_sub(self.reads.last_byte()));
     }
 
     fn control(&mut self, control: Control, now: Nanos) {
@@ -64,6 +59,15 @@ impl line::Session for Session {
         if let Phase::Paused { is_resting: true } = self.phase {
             self.begin(State::Starting);
         }
+    }
+
+    fn end(&mut self, now: Nanos) -> bool {
+        self.now = now;
+        let is_at_work = !self.settings.listen_only && !matches!(self.phase, Phase::Paused { .. });
+        if is_at_work {
+            self.rest(false);
+        }
+        is_at_work
     }
 
     fn transmitted(&mut self, now: Nanos) {
@@ -110,11 +114,7 @@ impl line::Session for Session {
         if self.change_dtr.is_some() || self.change_baud || self.outgoing.next().is_some() {
             return self.poll_output();
         }
-        if self.rest_until > self.now {
-            return Output::Rest(self.rest_until);
-        }
-        let (until, reason) = self.deadline();
-        Output::Wait { until, reason }
+        self.reads.wait(self.now, self.deadline(), self.framer.hold(), Why::Held)
     }
 
     fn state(&self) -> State {
@@ -128,7 +128,8 @@ impl line::Session for Session {
 
     fn trouble(&self) -> Option<Trouble> {
         let is_paused = matches!(self.phase, Phase::Paused { .. });
-        self.trouble.or(self.no_mode.map(Trouble::NoMode)).filter(|_| !is_paused)
+        let warning = self.health.filter(|health| matches!(health, Health::Warning(_))).map(Trouble::Unwell);
+        self.trouble.or(self.no_mode.map(Trouble::NoMode)).or(warning).filter(|_| !is_paused)
     }
 
     fn rate(&self) -> u32 {
@@ -160,13 +161,10 @@ impl Session {
         Received {
             bytes: self.framer.bytes(span),
             message: Packets { count: span.packets, is_checked: false, is_reply: true },
-            first: self.last_byte,
-            last: self.last_byte,
+            first: self.reads.last_byte(),
+            last: self.reads.last_byte(),
             estimated: true,
             reasons: 0,
         }
     }
 }
-
-/// A stream is read so late after bytes of it were: some packets at once, and a tenth of what a tty keeps.
-const REST: Nanos = 5 * MILLIS;

@@ -1,7 +1,7 @@
 //! What becomes of packets: they are dated and handed out, and their points go into turns. Of a packet of several points these
 //! are known once the next one came, and only if nothing was between.
 
-use line::{MILLIS, Nanos, Packets, Received, SensorClock, Turn, line_time};
+use line::{MILLIS, Nanos, Packets, Received, SensorClock, State, Turn, line_time};
 
 use super::dialogue::Ask;
 use super::{Phase, SILENCE, Session};
@@ -29,11 +29,13 @@ pub(super) struct Held {
     reasons: u8,
 }
 
-/// Points that came since then: so long takes one.
+/// Points that came since then, and packets that were lost by then: so long takes a point. Looked at next after `span`.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Measure {
     since: Nanos,
-    points: usize,
+    points: u64,
+    lost: u64,
+    span: Nanos,
 }
 
 impl Session {
@@ -42,12 +44,22 @@ impl Session {
         self.sequence.end();
         self.turns.give_up();
         self.is_learned = false;
-        (self.current, self.held, self.measure, self.rest_until) = (None, None, None, 0);
+        (self.current, self.held, self.measure) = (None, None, None);
+        self.reads.end_rest();
+        if self.settings.listen_only {
+            // The next one may be another one, and nobody asks for it here.
+            (self.point_ns, self.scanner_time) = (None, None);
+        }
     }
 
     /// The scanner begins to measure, if it is what it was told last.
     pub(super) fn stream_begins(&mut self) {
         match self.phase {
+            // Another one is there that somebody else told to measure, nobody knows in which mode.
+            Phase::Hearing { .. } if self.sequence.is_begun() && !self.settings.listen_only => {
+                self.resyncs += 1;
+                self.begin(State::Starting);
+            }
             Phase::Asking { ask: Ask::Scan(_), .. } | Phase::Listening { .. } | Phase::Hearing { .. } => {
                 self.end_stream();
                 self.hear();
@@ -66,47 +78,62 @@ impl Session {
         ((1e7 / packet_ns) as usize).clamp(1, (LONGEST / kind.bytes()).min(MOST))
     }
 
-    /// Packets came: dates them, and remembers them for turns.
-    pub(super) fn receive(&mut self, kind: Kind, span: Span) -> Received<'_, Packets> {
+    /// Packets came: dates them, and remembers them for turns. Those behind a gap come once more, by themselves.
+    pub(super) fn receive(&mut self, kind: Kind, mut span: Span) -> Received<'_, Packets> {
         self.hear();
+        span.reasons |= core::mem::take(&mut self.doubt);
+        if self.settings.listen_only || self.point_ns.is_none() || self.measure.is_some() {
+            self.measure(kind, span.packets);
+        }
         let len = kind.bytes();
         let pace = (!self.settings.fixed_rate).then_some(self.baud);
         let packet_time = line_time(len, self.baud);
-        let arrived = |n: usize| self.arrivals.latest(span.offset + (n * len + len - 1) as u64, pace);
-        let latest = arrived(span.packets - 1).saturating_sub(packet_time);
+        let end = |n: usize| span.offset + (n * len + len - 1) as u64;
         let mut stamps = None;
         if let Some(point_ns) = self.point_ns {
             let behind_first = point_ns * (kind.points() - 1) as f64;
+            let packet_ns = point_ns * kind.points() as f64;
             let mut places = [Place { step: Step::Odd, angle: 0.0, time: 0.0 }; MOST];
+            let mut count = 0;
             for (n, bytes) in self.framer.bytes(span).chunks_exact(len).enumerate() {
                 let came = Came {
                     start: kind.start(bytes),
                     skipped: if n == 0 { span.skipped } else { 0 },
-                    packet_ns: point_ns * kind.points() as f64,
+                    packet_ns,
                 };
-                let behind = self.framer.tally().read - span.offset - ((n + 1) * len) as u64;
-                let at = arrived(n).saturating_sub(packet_time);
+                let at = self.reads.arrivals().latest(end(n), pace).saturating_sub(packet_time);
                 let late = |time: f64| {
-                    let due = self.clock.time((time + behind_first) as Nanos);
-                    let late = due.map_or(0.0, |due| at as f64 - due as f64);
+                    let Some(due) = self.clock.time((time + behind_first) as Nanos) else { return 0.0 };
+                    if at <= due {
+                        return -((due - at) as f64);
+                    }
                     // One that waited is late for another reason.
-                    if behind < FRESH { late } else { late.min(0.0) }
+                    let least = self.reads.arrivals().earliest(end(n), packet_ns / len as f64).unwrap_or(0);
+                    least.saturating_sub(packet_time + due) as f64
                 };
+                let before = self.sequence;
                 let place = match kind {
                     Kind::Standard => self.sequence.place_point(came, late),
                     _ => self.sequence.place(came, late),
                 };
+                if n > 0 && matches!(place.step, Step::First | Step::Gap { .. }) {
+                    self.sequence = before;
+                    break;
+                }
                 if place.step == Step::First {
                     // Nothing goes on from what was before: neither its turn nor its clock.
                     self.clock = SensorClock::new();
                     self.turns.give_up();
                     self.held = None;
-                    places[..n].iter_mut().for_each(|place| place.step = Step::Odd);
                 }
                 if place.step != Step::Odd {
                     self.clock.note((place.time + behind_first) as Nanos, at);
                 }
                 places[n] = place;
+                count += 1;
+            }
+            if count < span.packets {
+                self.framer.cut(&mut span, count);
             }
             let stamp = |n: usize| {
                 let place = &places[n];
@@ -118,16 +145,22 @@ impl Session {
             self.learn(kind);
             let tally = self.framer.tally();
             self.cut |= tally.packets == span.packets as u64 && tally.discarded > 0;
-        } else {
-            self.measure(kind.points() * span.packets);
+            self.scanner_time = places[..span.packets]
+                .iter()
+                .rev()
+                .find(|place| place.step != Step::Odd)
+                .map(|place| place.time as Nanos);
         }
+        let latest =
+            self.reads.arrivals().latest(span.offset + span.len as u64 - 1, pace).saturating_sub(packet_time);
         let (first, last) = stamps.unwrap_or((latest, latest));
         let first = first.min(self.now);
+        let last = self.reads.date_packet((last + packet_time).clamp(first, self.now.max(first)));
         Received {
             bytes: self.framer.bytes(span),
             message: Packets { count: span.packets, is_checked: kind.is_checked(), is_reply: false },
             first,
-            last: (last + packet_time).clamp(first, self.now.max(first)),
+            last,
             estimated: stamps.is_none(),
             reasons: span.reasons,
         }
@@ -150,17 +183,30 @@ impl Session {
         self.damaged.1 = discarded;
     }
 
-    /// How long a point takes, where nobody says it.
-    fn measure(&mut self, points: usize) {
+    /// How long a point takes, where nobody is asked or nobody answered: as somebody was told, of the modes of `kind` the one that `packets`
+    /// agree with; else as long as these take, better known the longer they come.
+    fn measure(&mut self, kind: Kind, packets: usize) {
+        let (_, lost) = self.sequence.came_and_lost();
         let Some(measure) = &mut self.measure else {
-            self.measure = Some(Measure { since: self.now, points: 0 });
+            let told = self.offers.sample_us(kind, self.settings.mode);
+            self.point_ns = told.map(|us| f64::from(us) * 1e3);
+            self.measure = Some(Measure { since: self.now, points: 0, lost, span: SOON });
             return;
         };
-        measure.points += points;
+        measure.points += (packets * kind.points()) as u64;
         let passed = self.now - measure.since;
-        if passed >= SILENCE {
-            self.point_ns = Some(passed as f64 / measure.points as f64);
+        if passed < measure.span {
+            return;
         }
+        measure.span *= 2;
+        let points = measure.points + (lost - measure.lost) * kind.points() as u64;
+        let measured = passed as f64 / points as f64;
+        let told = self.offers.nearest_us(kind, (measured / 1e3) as f32);
+        let point_ns = told.map_or(measured, |us| f64::from(us) * 1e3);
+        if self.point_ns.is_some_and(|before| (before / point_ns - 1.0).abs() > 0.1) {
+            self.sequence.end();
+        }
+        self.point_ns = Some(point_ns);
     }
 
     /// The grid is known once it is known how fast the head turns.
@@ -240,9 +286,8 @@ impl Session {
 
     pub(super) fn show(&mut self, closed: Closed) -> Turn<'_> {
         let stamp = |at: Nanos| self.clock.time(at).unwrap_or(self.now);
-        let first = stamp(closed.first).max(self.last_stamp);
-        let last = stamp(closed.last).max(first);
-        self.last_stamp = first;
+        let (first, last) = (stamp(closed.first), stamp(closed.last));
+        let (first, last) = self.reads.date_turn(first, last);
         self.trouble = None;
         if let Phase::Hearing { turned_at, has_turned, .. } = &mut self.phase {
             (*turned_at, *has_turned) = (self.now, true);
@@ -271,10 +316,10 @@ fn put(turns: &mut crate::turn::Turns, kind: Kind, held: &Held, next: &[u8], pla
     }
 }
 
+/// A stream of which nobody was told how long a point takes is measured so long before it has turns.
+const SOON: Nanos = 250 * MILLIS;
 /// Some heads have to turn before they measure.
 const SPIN_UP: Nanos = 3_000 * MILLIS;
 /// Packets of one sample at the most, and its bytes.
 const MOST: usize = 128;
 const LONGEST: usize = 800;
-/// With fewer bytes behind it a packet did not wait long.
-const FRESH: u64 = 1_024;

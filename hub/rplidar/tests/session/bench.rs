@@ -25,6 +25,8 @@ pub(crate) struct Log {
     pub(crate) packets: Vec<Vec<u8>>,
     pub(crate) turns: Vec<Told>,
     pub(crate) replies: usize,
+    /// All that was handed out but turns, with its stamps.
+    pub(crate) heard: Vec<(Nanos, Nanos, Vec<u8>)>,
     pub(crate) reads: usize,
     pub(crate) bauds: Vec<u32>,
     pub(crate) dtr: Vec<bool>,
@@ -67,7 +69,8 @@ impl Bench {
         let mut bytes = self.head.read(self.now, room);
         if self.session.rate() != self.head.baud {
             // Another rate makes noise of it.
-            bytes = bytes.iter().step_by(3).map(|byte| byte | 0x80).collect();
+            let made = |byte: &u8| if self.head.is_text { b'0' | byte & 15 } else { byte | 0x80 };
+            bytes = bytes.iter().step_by(3).map(made).collect();
         }
         self.session.spare()[..bytes.len()].copy_from_slice(&bytes);
         self.session.commit(self.now, bytes.len());
@@ -103,6 +106,7 @@ impl Bench {
                 Output::Wait { until, .. } => return (until, true),
                 Output::Heard(Heard::Packets(received)) => {
                     assert!(received.first <= received.last && received.last <= self.now, "{received:?}");
+                    self.log.heard.push((received.first, received.last, received.bytes.to_vec()));
                     if received.message.is_reply {
                         self.log.replies += 1;
                         continue;

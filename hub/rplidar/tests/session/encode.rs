@@ -94,3 +94,14 @@ fn twenty_bits(sample: Sample) -> u32 {
         _ => 3 | ((range - 24567) / 5) << 2 | quality >> 3 << 15,
     }
 }
+
+/// What a scanner says of packets of this kind.
+pub(crate) fn answer_of(kind: Kind) -> u8 {
+    match kind {
+        Kind::Standard => 0x81,
+        Kind::Express => 0x82,
+        Kind::Ultra => 0x84,
+        Kind::Dense => 0x85,
+        Kind::UltraDense => 0x86,
+    }
+}

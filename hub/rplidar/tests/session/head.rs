@@ -7,26 +7,8 @@ use line::{MILLIS, Nanos, line_time};
 use rplidar::packet::Kind;
 use rplidar::{Mode, Model};
 
-use crate::encode::{Sample, encode};
-
-/// What goes wrong with bytes of packets; shares of all bytes.
-#[derive(Clone, Copy, Debug, Default)]
-pub(crate) struct Damage {
-    /// Begins of bursts that are lost, four bytes long on the mean.
-    pub(crate) lost: f64,
-    /// Bytes before which a foreign one comes.
-    pub(crate) inserted: f64,
-    /// Bytes with bits that are turned over.
-    pub(crate) flipped: f64,
-}
-
-/// A packet as it was sent.
-pub(crate) struct Sent {
-    pub(crate) bytes: Vec<u8>,
-    pub(crate) intact: bool,
-    /// When its last byte was through, if all of them were.
-    pub(crate) at: Nanos,
-}
+use crate::encode::{Sample, answer_of, encode};
+use crate::wire::{Damage, Sent};
 
 /// A mode that it offers.
 pub(crate) type Offered = (&'static str, f64, Kind);
@@ -61,9 +43,13 @@ pub(crate) struct Head {
     /// Status and code; whether booting heals it.
     pub(crate) health: (u8, u16),
     pub(crate) heals: bool,
+    /// Requests that it does not hear, each as often as it is here.
+    pub(crate) deaf_to: Vec<u8>,
     /// Whether it is there.
     pub(crate) is_on: bool,
     pub(crate) dtr: bool,
+    /// What another rate makes of its bytes is text.
+    pub(crate) is_text: bool,
     /// The last request for a motor: duty or speed.
     pub(crate) motor: Option<u16>,
     pub(crate) requests: Vec<u8>,
@@ -122,8 +108,10 @@ impl Head {
             damage: Damage::default(),
             health: (0, 0),
             heals: true,
+            deaf_to: Vec::new(),
             is_on: true,
             dtr: true,
+            is_text: false,
             motor: None,
             requests: Vec::new(),
             doing: Doing::Nothing,
@@ -224,6 +212,10 @@ impl Head {
     }
 
     fn obey(&mut self, command: u8, payload: &[u8], now: Nanos) {
+        if let Some(at) = self.deaf_to.iter().position(|unheard| *unheard == command) {
+            self.deaf_to.swap_remove(at);
+            return;
+        }
         if self.is_measuring() && !matches!(command, 0x25 | 0x40 | 0xA8 | 0xF0) {
             return;
         }
@@ -375,6 +367,15 @@ impl Head {
         self.sent.iter_mut().filter(is_hit).for_each(|sent| sent.intact = false);
     }
 
+    /// Nobody read until `until`, and only about `room` bytes found room; what was dropped are whole packets.
+    pub(crate) fn overflow(&mut self, until: Nanos, room: usize) {
+        self.send_until(until);
+        let Some(kind) = self.kind() else { return };
+        let dropped = self.line.len().saturating_sub(room) / kind.bytes();
+        self.line.truncate(self.line.len() - dropped * kind.bytes());
+        self.sent.iter_mut().rev().take(dropped).for_each(|sent| sent.intact = false);
+    }
+
     /// The kind of packets that it sends.
     pub(crate) fn kind(&self) -> Option<Kind> {
         if let Doing::Measuring { kind, .. } = self.doing { Some(kind) } else { None }
@@ -383,15 +384,5 @@ impl Head {
     /// The number of the mode of this name.
     pub(crate) fn has(&self, mode: Mode) -> bool {
         self.modes.iter().any(|(name, ..)| name.replace(' ', "").eq_ignore_ascii_case(mode.name()))
-    }
-}
-
-fn answer_of(kind: Kind) -> u8 {
-    match kind {
-        Kind::Standard => 0x81,
-        Kind::Express => 0x82,
-        Kind::Ultra => 0x84,
-        Kind::Dense => 0x85,
-        Kind::UltraDense => 0x86,
     }
 }

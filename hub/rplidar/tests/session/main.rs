@@ -3,5 +3,7 @@
 mod bench;
 mod encode;
 mod head;
+mod replay;
 mod start;
 mod stream;
+mod wire;

@@ -1,5 +1,6 @@
 //! How a session finds its scanner and gets it to measure, from whatever it was doing.
 
+use line::family::Turning as _;
 use line::{Control, Heard, MILLIS, Output, Session as _, State};
 use rplidar::packet::Kind;
 use rplidar::{Health, Mode, Model, Session, Settings, Trouble};
@@ -39,16 +40,29 @@ fn every_model_streams_within_three_seconds_whatever_it_was_doing() {
 
 #[test]
 fn every_rate_is_sought() {
-    for baud in [115_200, 256_000, 460_800, 1_000_000] {
+    for (model, baud) in
+        [(Model::A1, 115_200), (Model::S1, 256_000), (Model::C1, 460_800), (Model::S2, 1_000_000)]
+    {
         for doing in [None, Some(Kind::Standard)] {
-            let mut head = Head::new(Model::S1, 1);
-            head.baud = baud;
+            let mut head = Head::new(model, 1);
             doing.into_iter().for_each(|kind| head.left_in(kind, 0));
             let mut bench = Bench::new(Settings::default(), head);
             let took = bench.until(3 * SECOND, is_streaming);
             assert_eq!((bench.session.rate(), bench.session.trouble()), (baud, None));
             assert!(took < 2 * SECOND, "{baud}: {took}");
         }
+    }
+}
+
+#[test]
+fn a_stream_that_is_text_at_another_rate_is_no_greeting_again_and_again() {
+    for kind in [Kind::Standard, Kind::Dense] {
+        let mut head = Head::new(Model::S1, 1);
+        head.left_in(kind, 0);
+        head.is_text = true;
+        let mut bench = Bench::new(Settings::default(), head);
+        let took = bench.until(3 * SECOND, is_streaming);
+        assert!(took < 2 * SECOND, "{took}");
     }
 }
 
@@ -106,7 +120,12 @@ fn one_that_stays_unwell_is_told_in_words_and_asked_again() {
     assert!(!bench.head.is_measuring());
     bench.head.health = (1, 7);
     bench.until(3 * SECOND, is_streaming);
-    assert_eq!((bench.session.trouble(), bench.session.health()), (None, Some(Health::Warning(7))));
+    // It measures, and says that it may not for long.
+    let warning = Health::Warning(7);
+    assert_eq!(
+        (bench.session.trouble(), bench.session.health()),
+        (Some(Trouble::Unwell(warning)), Some(warning))
+    );
 }
 
 #[test]
@@ -127,6 +146,65 @@ fn a_motor_obeys_what_its_model_obeys() {
         bench.until(3 * SECOND, is_streaming);
         assert_eq!((bench.head.motor, bench.head.dtr), (request, false), "{model:?}");
     }
+}
+
+#[test]
+fn the_motor_rests_when_the_hub_ends() {
+    for (model, duty) in [(Model::A1, None), (Model::A2m8, Some(0)), (Model::S2, Some(0))] {
+        let mut bench = Bench::new(of(model), Head::new(model, 1));
+        bench.until(3 * SECOND, is_streaming);
+        assert!(bench.session.end(bench.now));
+        bench.run(bench.now + MILLIS);
+        assert_eq!((bench.head.motor, bench.head.dtr), (duty, model == Model::A1), "{model:?}");
+        assert!(!bench.head.is_measuring() && !bench.session.end(bench.now));
+    }
+}
+
+#[test]
+fn what_it_is_is_told_also_where_something_else_was_expected() {
+    let told = |settings, model| {
+        let mut bench = Bench::new(settings, Head::new(model, 1));
+        bench.until(3 * SECOND, is_streaming);
+        let mut kind = String::new();
+        bench.session.specify(&mut kind);
+        (kind, bench.session.other_model().map(|model| model.name))
+    };
+    assert_eq!(told(Settings::default(), Model::A1), (" boost 1.29".to_owned(), None));
+    let standard = Settings { mode: Some(Mode::Standard), ..of(Model::A2m8) };
+    assert_eq!(told(standard, Model::A2m8), (" standard 1.29".to_owned(), None));
+    assert_eq!(told(of(Model::A1), Model::A2m8).1, Some("a2m8"));
+    // As long as a status has room for it.
+    let longest = Model::ALL.map(|model| model.name().len()).into_iter().max().expect("some");
+    let mode = Model::ALL.iter().flat_map(|_| Mode::ALL).map(|mode| mode.name().len()).max().expect("some");
+    assert!(longest + 1 + mode + " 1.29".len() <= 24);
+}
+
+#[test]
+fn one_answer_may_be_missing() {
+    for request in [0x50, 0x52, 0x82, 0x84, 0xFF] {
+        let mut head = Head::new(Model::A2m8, 1);
+        head.deaf_to = vec![request];
+        let mut bench = Bench::new(of(Model::A2m8), head);
+        bench.until(3 * SECOND, is_streaming);
+        assert_eq!((bench.head.motor, bench.head.kind()), (Some(660), Some(Kind::Ultra)), "{request:02X}");
+    }
+}
+
+#[test]
+fn one_that_does_not_begin_to_measure_is_told_as_long_as_that_is_so() {
+    let mut head = Head::new(Model::A1, 1);
+    head.deaf_to = vec![0x82; 1_000];
+    let mut bench = Bench::new(Settings::default(), head);
+    bench.run(3 * SECOND);
+    assert_eq!(bench.session.trouble(), Some(Trouble::Refused));
+    assert_eq!(bench.session.rate(), 115_200, "it answers at this one");
+    bench.head.is_on = false;
+    bench.run(8 * SECOND);
+    let told = bench.session.trouble();
+    assert!(matches!(told, Some(Trouble::NoAnswer { .. })), "{told:?}");
+    (bench.head.is_on, bench.head.deaf_to) = (true, Vec::new());
+    bench.until(3 * SECOND, is_streaming);
+    assert_eq!(bench.session.trouble(), None);
 }
 
 #[test]

@@ -4,8 +4,9 @@ use line::{MILLIS, Session as _};
 use rplidar::{Mode, Model, Settings};
 
 use crate::bench::{Bench, SECOND};
-use crate::head::{Damage, Head};
+use crate::head::Head;
 use crate::start::of;
+use crate::wire::Damage;
 
 #[test]
 fn every_mode_of_every_model_is_heard_and_every_turn_of_it() {
@@ -121,6 +122,41 @@ fn what_a_full_buffer_drops_is_missing_and_told() {
     }
 }
 
+/// What is left begins where the last packet before it ended, and if whole turns were dropped, at its angle.
+#[test]
+fn whole_packets_that_a_full_buffer_drops_are_missing_and_told() {
+    for kind in KINDS {
+        for (room, more) in [(4_096, 40), (576, 40), (300, 25)] {
+            for stall in 0..more {
+                let mut bench = in_mode(kind, 3);
+                bench.run(4 * SECOND);
+                let filled = room as f64 / bytes_per_second(&bench);
+                let stall = (filled * 1e9) as u64 + stall * 7 * MILLIS;
+                let before = bench.session.turn_counts();
+                bench.head.overflow(bench.now + stall, room);
+                bench.now += stall;
+                bench.read(true);
+                bench.run(7 * SECOND);
+                let dropped = bench.head.sent.iter().filter(|sent| !sent.intact).count();
+                if dropped == 0 || (kind.1 == Mode::Standard && dropped <= 31) {
+                    continue;
+                }
+                let counts = bench.session.turn_counts();
+                let (worst, wrong) = bench.judge(&bench.log.turns);
+                let what = format!("{kind:?} {room} {} ms: {worst} {wrong} {counts:?}", stall / MILLIS);
+                assert!(worst < 5 * MILLIS && wrong == 0, "{what}");
+                assert!(counts.incomplete + counts.short > before.incomplete + before.short, "{what}");
+            }
+        }
+    }
+}
+
+fn bytes_per_second(bench: &Bench) -> f64 {
+    let kind = bench.head.kind().expect("measuring");
+    let points = bench.session.points_per_second().expect("known");
+    f64::from(points) * kind.bytes() as f64 / kind.points() as f64
+}
+
 #[test]
 fn a_line_that_damages_bytes_costs_the_packets_that_it_damages() {
     let (mut points, mut wrong_points) = ([0; 6], [0; 6]);
@@ -179,6 +215,8 @@ fn a_head_that_stood_still_turns_on_and_so_do_its_turns() {
         bench.run(26 * SECOND);
         let turns = (bench.log.turns.len() - before) as f64;
         assert!(turns >= 3.0 * hz - 2.0, "{kind:?}: {turns}");
+        let most = (360.0 / bench.head.step()) as usize + 60;
+        assert!(bench.log.turns.iter().all(|told| told.points.len() <= most), "{kind:?}: more than a turn");
         assert!(bench.log.turns.iter().all(|told| told.beams == bench.log.turns[0].beams), "{kind:?}");
     }
 }

@@ -216,27 +216,20 @@ const fn mode(name: &'static str, sample_us: f64, form: Form, reach_m: f64) -> M
     Mode { name, sample_us, form, reach_m }
 }
 
-const MODES_8K: [Mode; 5] = [
-    mode("Standard", 508.0, Form::Standard, 12.0),
-    mode("Express", 254.0, Form::Express, 12.0),
-    mode("Boost", 127.0, Form::Ultra, 12.0),
-    mode("Sensitivity", 127.0, Form::Ultra, 12.0),
-    mode("Stability", 201.0, Form::Ultra, 12.0),
-];
-const MODES_A2M12: [Mode; 5] = [
-    mode("Standard", 252.0, Form::Standard, 12.0),
-    mode("Express", 126.0, Form::Express, 12.0),
-    mode("Boost", 63.0, Form::Ultra, 12.0),
-    mode("Sensitivity", 63.0, Form::Ultra, 12.0),
-    mode("Stability", 100.0, Form::Ultra, 12.0),
-];
-const MODES_A3: [Mode; 5] = [
-    mode("Standard", 252.0, Form::Standard, 16.0),
-    mode("Express", 126.0, Form::Express, 16.0),
-    mode("Boost", 63.0, Form::Ultra, 25.0),
-    mode("Sensitivity", 63.0, Form::Ultra, 25.0),
-    mode("Stability", 100.0, Form::Ultra, 25.0),
-];
+/// Those of a laser beside a lens: a point of the fastest ones takes `us` microseconds, one of Stability `stable_us`.
+const fn modes(us: f64, stable_us: f64, reach_m: f64, fast_reach_m: f64) -> [Mode; 5] {
+    [
+        mode("Standard", 4.0 * us, Form::Standard, reach_m),
+        mode("Express", 2.0 * us, Form::Express, reach_m),
+        mode("Boost", us, Form::Ultra, fast_reach_m),
+        mode("Sensitivity", us, Form::Ultra, fast_reach_m),
+        mode("Stability", stable_us, Form::Ultra, fast_reach_m),
+    ]
+}
+
+const MODES_8K: [Mode; 5] = modes(127.0, 201.0, 12.0, 12.0);
+const MODES_A2M12: [Mode; 5] = modes(63.0, 100.0, 12.0, 12.0);
+const MODES_A3: [Mode; 5] = modes(63.0, 100.0, 16.0, 25.0);
 /// Its standard mode is as fast as the line is.
 const MODES_S1: [Mode; 3] = [
     mode("Standard", 217.0, Form::Standard, 16.0),

@@ -56,6 +56,16 @@ impl Stream {
         Some((at_ns, turns.fract() * 360.0))
     }
 
+    /// Packets that were begun.
+    pub(super) fn sent(&self) -> u64 {
+        self.sent
+    }
+
+    /// When the first point of the next packet is measured.
+    pub(super) fn next_ns(&self, motor: Option<Motion>) -> Option<Nanos> {
+        self.place(self.sent * self.mode.form.points() as u64, motor).map(|(at_ns, _)| at_ns)
+    }
+
     /// When the next packet has all its points.
     pub(super) fn due_ns(&self, motor: Option<Motion>) -> Option<Nanos> {
         let points = self.mode.form.points() as u64 * (self.sent + 1);

@@ -50,8 +50,8 @@ pub(crate) fn line_loss(status: &Status) -> Finding {
     const NAME: &str = "line-loss";
     let due = status.counters[Counter::DueOnLine];
     let all = match status.lost_on_line() {
-        Some(lost) => format!("{lost} of {due} scans lost since the hub's start"),
-        None => "how many scans are lost is not known".to_owned(),
+        Some(lost) => format!("{lost} of {due} {} lost since the hub's start", status.sent()),
+        None => format!("how many {} are lost is not known", status.sent()),
     };
     let text = format!("{:.2} % of the bytes damaged in the last 10 s, {all}", 100.0 * status.damaged());
     match status.line_loss() {

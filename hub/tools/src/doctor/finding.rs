@@ -22,6 +22,7 @@ pub const CHECKS: &[&str] = &[
     "file-size",
     "logout",
     "multicast",
+    "bridge",
     "port",
     "holder",
     "access",

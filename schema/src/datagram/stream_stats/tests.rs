@@ -76,7 +76,7 @@ fn what_is_refused_changes_nothing() {
     let refused = [
         (DatagramError::Payload, damaged(head(1, 2, 0))),
         (DatagramError::Payload, zones(Head { revision: 0, ..head(1, 2, 0) })),
-        (DatagramError::Skipped, zones(Head { topic: 8, revision: 0, ..head(1, 2, 0) })),
+        (DatagramError::Skipped, zones(Head { topic: 255, revision: 0, ..head(1, 2, 0) })),
     ];
     for (refusal, bytes) in &refused {
         assert_eq!(fresh(&mut account, bytes), Err(*refusal));

@@ -1,7 +1,9 @@
 //! What can go wrong: one file for each kind, with its name, its keys and what it does. A plan draws, prints and parses all of
 //! them alike. What an action breaks it mends itself after a while, or when everything is made well again.
 
+mod brown_out;
 mod consumers;
+mod deaf;
 mod denied;
 mod disk_full;
 mod end_hub;
@@ -9,6 +11,8 @@ mod exchange;
 mod garbage;
 mod gateway_killed;
 mod habits;
+mod hold;
+mod key_errors;
 mod kill_hub;
 mod listener_killed;
 mod network_loss;
@@ -28,6 +32,7 @@ mod silence;
 mod stall;
 mod telegrams;
 mod unplug;
+mod unwell;
 mod wall_step;
 
 use lms::Nanos;
@@ -95,7 +100,17 @@ pub(crate) const KINDS: &[Kind] = &[
     gateway_killed::KIND,
     listener_killed::KIND,
     pace::KIND,
+    key_errors::KIND,
+    brown_out::KIND,
+    hold::KIND,
+    unwell::KIND,
+    deaf::KIND,
 ];
+
+/// Gateway and listener of a world with these actions have a key.
+pub(crate) fn have_key(actions: &[Action]) -> bool {
+    actions.iter().any(|action| action.name() == key_errors::KIND.name)
+}
 
 /// What `action` does to the bytes on a line from `now` on, if it is of such a kind.
 pub(crate) fn faults(action: &Action, now: Nanos) -> Option<Faults> {

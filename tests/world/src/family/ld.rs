@@ -1,21 +1,17 @@
 //! LDROBOT: a head that turns and tells of what it measures in packets, unasked. What it measures has no noise, so that each
 //! point that is told can be found among those that are true.
 
-use std::sync::{Arc, LazyLock};
-
 use ld::Model;
 use ld::packet::{LEN, POINTS, Packet};
-use lms::variant::{Mode, Unit, Variant};
 use lms::{MILLIS, Nanos};
 use schema::Scan;
 use sim::ChunkSize;
 use sim::device::Device;
-use sim::layers::Layers;
 use sim::ld::{Head, HeadSettings, Packets, TruePoint};
 use sim::room::Room;
-use sim::series::{Changes, Series};
+use sim::series::Changes;
 
-use super::{Family, Scanner, rooms};
+use super::{Begin, Family, INERTIA, SLOWEST, Scanner, still_rooms};
 use crate::plan::Action;
 
 /// One of them, and what its link asks for.
@@ -91,9 +87,10 @@ impl Family for Ld {
         true
     }
 
-    fn last_deg(&self, unit: &[u8]) -> Option<f64> {
+    fn begin(&self, unit: &[u8]) -> Option<Begin> {
         let packet = Packet::check(unit.first_chunk()?).ok()?;
-        Some(f64::from(packet.angle(POINTS - 1)) / 100.0)
+        let on_line = lms::line_time(LEN, self.settings.model.baud());
+        Some(Begin { clockwise_deg: f64::from(packet.angle(0)) / 100.0, points: POINTS, on_line })
     }
 }
 
@@ -111,7 +108,7 @@ struct AtLine {
 
 impl AtLine {
     fn new(settings: HeadSettings, changes: Changes) -> AtLine {
-        let room = Room::of_series(SERIES.clone(), changes.clone());
+        let room = Room::of_series(still_rooms(), changes.clone());
         let head = Head::new(settings, Packets::Room(Box::new(room)));
         AtLine { head, settings, changes, told: 0, pace: 1.0, wanted: 1.0 }
     }
@@ -156,15 +153,5 @@ impl Scanner for AtLine {
     }
 }
 
-/// The rooms, for all worlds. No LMS tells its scans of them.
-static SERIES: LazyLock<Arc<Series>> = LazyLock::new(|| {
-    let rooms = rooms(|scene| scene.with_layers(Layers::NONE));
-    Arc::new(Series::new(rooms, 1, Variant::HALF, Unit::Mm, Mode(1)))
-});
-
-/// A head that is slowed down turns at this share of its speed.
-const SLOWEST: f64 = 0.6;
-/// The most by which a head gets faster or slower in a second, as a share of its usual speed.
-const INERTIA: f64 = 0.4;
 /// The last packet of a turn, until the hub has all of it.
 const LAST_PACKET: Nanos = 20 * MILLIS;

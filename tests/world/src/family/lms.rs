@@ -15,7 +15,7 @@ use sim::room::Room;
 use sim::series::{Changes, Series};
 use sim::source::Source;
 
-use super::{Family, Scanner, rooms};
+use super::{Family, Scanner, habits, rooms};
 use crate::plan::Action;
 
 /// One of them, and what its link asks for.
@@ -144,19 +144,6 @@ impl Scanner for AtLine {
 
     fn misbehave(&mut self, action: Option<&Action>) {
         self.machine.set_habits(action.map_or_else(Habits::default, habits));
-    }
-}
-
-/// Shares are in percent.
-fn habits(action: &Action) -> Habits {
-    let share = |name| action.value(name) as f64 / 1e2;
-    Habits {
-        overlooks: share("overlooks"),
-        naks: share("naks"),
-        doubles: share("doubles"),
-        late_reply_ns: action.value("late_ms") * MILLIS,
-        mute: action.value("mute") > 0,
-        ..Habits::default()
     }
 }
 

@@ -7,7 +7,7 @@ use lms::{MILLIS, Nanos};
 use schema::{State, Status, Topic};
 
 use super::{Judge, Say};
-use crate::event::Event;
+use crate::event::{Event, Figures};
 use crate::family::Family;
 
 /// Since when nothing goes wrong, and what has come back.
@@ -21,12 +21,18 @@ struct OfSensor {
     says_so: bool,
     /// Telegrams of measured values came, and scans.
     came: [bool; 2],
+    /// When the first one of each came.
+    first: [Option<Nanos>; 2],
 }
 
 impl Liveness {
     pub(crate) fn new(sensors: &[Rc<dyn Family>]) -> Liveness {
-        let sensor =
-            |family: &Rc<dyn Family>| OfSensor { family: family.clone(), says_so: false, came: [false; 2] };
+        let sensor = |family: &Rc<dyn Family>| OfSensor {
+            family: family.clone(),
+            says_so: false,
+            came: [false; 2],
+            first: [None; 2],
+        };
         Liveness { healed: None, sensors: sensors.iter().map(sensor).collect() }
     }
 }
@@ -34,6 +40,11 @@ impl Liveness {
 impl Judge for Liveness {
     fn name(&self) -> &'static str {
         "liveness"
+    }
+
+    fn figures(&self) -> Figures {
+        let last = |which: usize| self.sensors.iter().filter_map(|of| of.first[which]).max().unwrap_or(0);
+        Figures { data_ns: last(0), scan_ns: last(1), ..Figures::default() }
     }
 
     fn note(&mut self, at: Nanos, event: &Event<'_>, say: &mut Say<'_>) {
@@ -55,6 +66,7 @@ impl Judge for Liveness {
                     Topic::Scan => 1,
                     _ => return,
                 };
+                of.first[which].get_or_insert(at);
                 let is_back = of.says_so && !of.came[which];
                 of.came[which] |= of.says_so;
                 if let Some(healed) = self.healed

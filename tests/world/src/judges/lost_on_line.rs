@@ -9,7 +9,7 @@ use schema::{Counter, State, Status, Topic};
 use sim::ld::TruePoint;
 
 use super::{Judge, Say};
-use crate::event::Event;
+use crate::event::{Event, Figures};
 use crate::family::Family;
 
 /// What is missing of each scanner whose head turns.
@@ -30,6 +30,9 @@ struct OfSensor {
     /// Something came between that nobody can count: another session, a packet that nobody sent.
     is_broken: bool,
     measured_at: Nanos,
+    /// What statuses counted in all, and the last one of this hub.
+    told: u64,
+    told_before: u64,
 }
 
 impl LostOnLine {
@@ -43,6 +46,8 @@ impl LostOnLine {
             lenience: 0,
             is_broken: true,
             measured_at: 0,
+            told: 0,
+            told_before: 0,
         };
         LostOnLine { sensors: sensors.iter().map(sensor).collect() }
     }
@@ -53,24 +58,35 @@ impl Judge for LostOnLine {
         "lost_on_line"
     }
 
+    fn figures(&self) -> Figures {
+        Figures { lost: self.sensors.iter().map(|of| of.told).sum(), ..Figures::default() }
+    }
+
     fn note(&mut self, _: Nanos, event: &Event<'_>, say: &mut Say<'_>) {
         match *event {
             Event::Measured { sensor, points } => self.sensors[sensor].measure(points),
-            Event::Sent { sensor, telegram } => self.sensors[sensor].send(telegram.bytes),
+            Event::Sent { sensor, telegram } if !telegram.is_reply => {
+                self.sensors[sensor].send(telegram.bytes);
+            }
             Event::Exchanged { sensor } => self.sensors[sensor].send(&[]),
             Event::Opened { sensor, .. } | Event::Retuned { sensor } | Event::Lacking { sensor, .. } => {
                 self.sensors[sensor].is_broken = true
             }
-            Event::HubBegins { .. } => self.sensors.iter_mut().for_each(|of| of.is_broken = true),
+            Event::HubBegins { .. } => {
+                self.sensors.iter_mut().for_each(|of| (of.is_broken, of.told_before) = (true, 0));
+            }
             Event::Published { sensor, sample } if self.sensors[sensor].family.turns() => {
                 let of = &mut self.sensors[sensor];
                 match sample.topic {
                     Topic::Telegram => {
-                        let units = of.family.clone();
-                        units.units(&sample.bytes).into_iter().for_each(|unit| of.publish(unit));
+                        let family = of.family.clone();
+                        let units = family.units(&sample.bytes).into_iter();
+                        units.filter(|unit| family.is_data(unit)).for_each(|unit| of.publish(unit));
                     }
                     Topic::Status => {
                         let status: Status = bytemuck::pod_read_unaligned(&sample.bytes);
+                        of.told += status.counters[Counter::LostOnLine].saturating_sub(of.told_before);
+                        of.told_before = status.counters[Counter::LostOnLine];
                         if let Err(words) = of.check(&status) {
                             say.broken(format!("sensor {sensor}: {words}"));
                         }
@@ -122,7 +138,13 @@ impl OfSensor {
         }
         self.missing += missing;
         // How many fit between two packets is rounded, and a head may change its speed between them.
-        self.lenience += if missing > 0 { 1 + missing / 20 } else { 0 };
+        let exactness = self.family.exactness(unit);
+        let unmarked = if exactness.neighbours > 0 { UNMARKED + missing / 10 } else { 1 };
+        self.lenience += match missing {
+            0 => 0,
+            _ if !exactness.has_clock && missing > SURE => missing,
+            _ => unmarked + missing / 20,
+        };
     }
 
     /// What is wrong with what `status` counts.
@@ -141,6 +163,10 @@ impl OfSensor {
     }
 }
 
+/// Without a clock in packets more may be a turn more or less, or begin another sequence.
+const SURE: u64 = 8;
+/// Where nothing tells what is missing but how many there were in a turn.
+const UNMARKED: u64 = 30;
 /// So many are remembered: of the fastest scanner for as long as a tty keeps.
 const MOST: usize = 20_000;
 /// After more the scanner's clock may be another one: 1.5 s of the slowest.

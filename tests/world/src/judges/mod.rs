@@ -12,6 +12,7 @@ mod numbers;
 mod prompt;
 mod recording;
 mod remote_accounts;
+mod remote_keys;
 mod remote_liveness;
 mod remote_nothing_invented;
 mod remote_numbers;
@@ -60,7 +61,7 @@ impl Say<'_> {
 
 /// All judges, for a world that begins with `setup`.
 pub(crate) fn all(setup: &Setup, plan: &Plan) -> Vec<Box<dyn Judge>> {
-    let (sensors, terms) = (&setup.sensors[..], Terms::of_seed(plan.seed));
+    let (sensors, terms) = (&setup.sensors[..], Terms::of_plan(plan));
     vec![
         Box::new(bytes::Bytes::new(sensors.len())),
         Box::new(accounts::Accounts::default()),
@@ -77,6 +78,7 @@ pub(crate) fn all(setup: &Setup, plan: &Plan) -> Vec<Box<dyn Judge>> {
         Box::new(eeprom::Eeprom),
         Box::new(remote_nothing_invented::RemoteNothingInvented::new(&terms)),
         Box::new(remote_accounts::RemoteAccounts::default()),
+        Box::new(remote_keys::RemoteKeys::default()),
         Box::new(remote_numbers::RemoteNumbers::new(terms)),
         Box::new(remote_verdict::RemoteVerdict::new(setup, plan, &terms)),
         Box::new(remote_liveness::RemoteLiveness::new(setup, &terms)),

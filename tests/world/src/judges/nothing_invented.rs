@@ -1,6 +1,7 @@
 //! Nothing is delivered that no sensor sent, unless it is marked suspect: each telegram byte by byte, as often as it was sent,
 //! and each scan value by value.
 
+use std::collections::hash_map::Entry;
 use std::collections::{HashMap, VecDeque};
 use std::rc::Rc;
 
@@ -22,8 +23,10 @@ struct OfSensor {
     family: Rc<dyn Family>,
     /// How often a telegram was sent and not published.
     open: HashMap<u64, u32>,
-    /// The last telegrams that the line damaged.
+    /// The last telegrams that the line damaged, and nothing where it brought bytes between two.
     damaged: VecDeque<Vec<u8>>,
+    /// Place behind the last telegram.
+    end: u64,
     /// Number, life and bytes of the last published sample of telegrams.
     last: (u64, u64, Vec<u8>),
 }
@@ -34,6 +37,7 @@ impl NothingInvented {
             family: family.clone(),
             open: HashMap::new(),
             damaged: VecDeque::new(),
+            end: 0,
             last: Default::default(),
         };
         NothingInvented { sensors: sensors.iter().map(sensor).collect() }
@@ -50,16 +54,18 @@ impl Judge for NothingInvented {
             Event::Sent { sensor, telegram } => {
                 let of = &mut self.sensors[sensor];
                 *of.open.entry(key(telegram.bytes)).or_default() += 1;
+                let (begin, end) = telegram.span;
+                if std::mem::replace(&mut of.end, end) < begin {
+                    of.damage(&[]);
+                }
                 if telegram.damage.is_some() {
-                    of.damaged.truncate(REMEMBERED - 1);
-                    of.damaged.push_front(telegram.bytes.to_vec());
+                    of.damage(telegram.bytes);
                 }
             }
             Event::Published { sensor, sample } if sample.topic == Topic::Telegram => {
                 let of = &mut self.sensors[sensor];
                 for unit in of.family.units(&sample.bytes) {
-                    let open = of.open.get_mut(&key(unit)).filter(|count| **count > 0);
-                    let is_known = open.map(|count| *count -= 1).is_some();
+                    let is_known = of.take(key(unit));
                     let mut damaged = of.damaged.iter().map(Vec::as_slice);
                     let is_clean = sample.header.reasons == 0;
                     if !is_known && is_clean && !of.family.is_collision(unit, &mut damaged) {
@@ -84,6 +90,24 @@ impl Judge for NothingInvented {
             }
             _ => {}
         }
+    }
+}
+
+impl OfSensor {
+    /// The line damaged `telegram`.
+    fn damage(&mut self, telegram: &[u8]) {
+        self.damaged.truncate(REMEMBERED - 1);
+        self.damaged.push_front(telegram.to_vec());
+    }
+
+    /// Takes one of those that were sent and not published, if there is one.
+    fn take(&mut self, key: u64) -> bool {
+        let Entry::Occupied(mut entry) = self.open.entry(key) else { return false };
+        *entry.get_mut() -= 1;
+        if *entry.get() == 0 {
+            entry.remove();
+        }
+        true
     }
 }
 

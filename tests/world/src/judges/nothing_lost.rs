@@ -32,6 +32,13 @@ struct OfSensor {
     mixed_until: Nanos,
     /// Telegrams for which there was no memory.
     holes: usize,
+    /// Place behind the last telegram, and how many of the next ones may be lost with damaged bytes before them.
+    end: u64,
+    spared: usize,
+    /// Something was published last that nobody sent.
+    is_foreign: bool,
+    /// From when until when the hub does not run.
+    stalled: (Nanos, Nanos),
 }
 
 struct Sent {
@@ -40,6 +47,8 @@ struct Sent {
     /// Of which sensor.
     exchanged: u32,
     is_whole: bool,
+    /// All of its bytes arrived as they were sent.
+    is_intact: bool,
     is_read: bool,
     /// When the hub had all of it, if it has to be published.
     due_at: Option<Nanos>,
@@ -73,10 +82,16 @@ impl Judge for NothingLost {
                 (of.streams_from, of.is_other) = (None, true);
                 of.exchanged += 1;
                 of.mixed_until = at + HELD_BACK;
-                of.end(at);
+                of.break_off(at);
             }
-            Event::Closed { sensor } => self.sensors[sensor].end(at),
-            Event::HubEnds { .. } => self.sensors.iter_mut().for_each(|of| of.end(at)),
+            Event::Closed { sensor } => self.sensors[sensor].break_off(at),
+            Event::HubEnds { .. } => self.sensors.iter_mut().for_each(|of| of.break_off(at)),
+            Event::Stalled { until } => {
+                self.sensors.iter_mut().for_each(|of| {
+                    let from = if of.stalled.1 < at { at } else { of.stalled.0 };
+                    of.stalled = (from, until);
+                });
+            }
             Event::Read { sensor, to, .. } => self.sensors[sensor].read(at, to),
             Event::Lacking { sensor, topic: Topic::Telegram } => {
                 let of = &mut self.sensors[sensor];
@@ -85,6 +100,9 @@ impl Judge for NothingLost {
             Event::Published { sensor, sample } if sample.topic == Topic::Telegram => {
                 let of = &mut self.sensors[sensor];
                 for unit in of.family.clone().units(&sample.bytes) {
+                    if sample.header.reasons == 0 && of.is_beside_damage(unit) {
+                        say.broken(format!("sensor {sensor}: beside damage, and not marked"));
+                    }
                     if let Some(lost) = of.publish(at, unit) {
                         say.broken(format!("sensor {sensor}: {lost}"));
                     }
@@ -95,7 +113,7 @@ impl Judge for NothingLost {
                 let of = &mut self.sensors[sensor];
                 if status.state() != Some(State::Streaming) {
                     of.streams_from = None;
-                    of.end(at);
+                    of.break_off(at);
                 } else if of.streams_from.is_none() && !of.is_other {
                     of.streams_from = Some(of.read);
                 }
@@ -126,14 +144,39 @@ impl OfSensor {
             is_other: false,
             mixed_until: 0,
             holes: 0,
+            end: 0,
+            spared: 0,
+            is_foreign: false,
+            stalled: (0, 0),
         }
     }
 
     fn send(&mut self, telegram: &Telegram<'_>) {
         let Telegram { bytes, span, damage, aborted, .. } = *telegram;
-        let is_whole = damage.is_none() && !aborted;
+        let is_intact = damage.is_none() && !aborted;
+        let near = self.family.exactness(bytes).neighbours;
+        // What is asked of one whose head turns is asked again until it answers.
+        let is_promised = !self.family.turns() || self.family.is_data(bytes);
+        let is_plain = span.1 - span.0 == bytes.len() as u64 && span.0 <= self.end;
+        self.end = span.1;
+        if !is_intact || !is_plain || !is_promised {
+            self.spared = near + 1;
+            self.sent.iter_mut().rev().take(near).for_each(|sent| {
+                (sent.is_whole, sent.due_at) = (false, None);
+            });
+        }
+        self.spared = self.spared.saturating_sub(1);
+        let is_whole = is_intact && is_promised && (self.spared == 0 || near == 0);
         let (bytes, exchanged) = (bytes.to_vec(), self.exchanged);
-        self.sent.push_back(Sent { bytes, span, exchanged, is_whole, is_read: false, due_at: None });
+        self.sent.push_back(Sent {
+            bytes,
+            span,
+            exchanged,
+            is_whole,
+            is_intact,
+            is_read: false,
+            due_at: None,
+        });
         while self.sent.len() > MOST * self.family.most_units() && self.sent[0].due_at.is_none() {
             self.sent.pop_front();
         }
@@ -158,18 +201,48 @@ impl OfSensor {
     }
 
     /// The stream ends: what came just before may still have been held back, to see what follows.
-    fn end(&mut self, at: Nanos) {
+    fn break_off(&mut self, at: Nanos) {
+        let at = if self.stalled.1 >= at { self.stalled.0 } else { at };
         for sent in self.sent.iter_mut().filter(|sent| sent.due_at.is_some_and(|due| due + HELD > at)) {
             sent.due_at = None;
         }
+        // Where only what follows tells that it is one, nothing follows the last one.
+        if let Some(last) = self.sent.iter_mut().rfind(|sent| sent.is_read)
+            && self.family.exactness(&last.bytes).neighbours > 0
+        {
+            last.due_at = None;
+        }
+    }
+
+    /// Whether damaged bytes came before `unit`, which has a checksum and is published now: then it has to be marked.
+    fn is_beside_damage(&self, unit: &[u8]) -> bool {
+        let exactness = self.family.exactness(unit);
+        if self.is_foreign || exactness.has_clock || exactness.neighbours > 0 || !self.family.is_data(unit) {
+            return false;
+        }
+        let Some(found) = self.sent.iter().position(|sent| sent.is_read && sent.bytes == unit) else {
+            return false;
+        };
+        let before = found.checked_sub(1).and_then(|before| self.sent.get(before));
+        let is_known = |from: u64| self.streams_from.is_some_and(|streams_from| streams_from <= from);
+        before.is_some_and(|before| {
+            !before.is_intact && before.span.1 > before.span.0 && is_known(before.span.0)
+        })
     }
 
     /// A telegram is published. What was lost before it.
     fn publish(&mut self, at: Nanos, bytes: &[u8]) -> Option<String> {
         let is_it = |sent: &Sent| sent.is_read && sent.bytes == bytes;
-        // Replies are often the same, and of those that are, the whole one came.
-        let whole = self.sent.iter().position(|sent| sent.is_whole && is_it(sent));
-        let found = whole.or_else(|| self.sent.iter().position(is_it))?;
+        // Replies are often the same, and single points sometimes: of those that are, the one that has to come, or a whole one.
+        let due = self.sent.iter().position(|sent| sent.due_at.is_some() && is_it(sent));
+        let whole = due.or_else(|| self.sent.iter().position(|sent| sent.is_whole && is_it(sent)));
+        let first = self.sent.iter().position(is_it);
+        // The first of two alike, if the other would mean that something between them is lost; what is lost shows later.
+        let is_due = |sent: &Sent| sent.due_at.is_some();
+        let skips = whole.is_some_and(|whole| self.sent.range(first.unwrap_or(0)..whole).any(is_due));
+        let found = if skips { first } else { whole.or(first) };
+        self.is_foreign = found.is_none();
+        let found = found?;
         let is_of_this = self.family.is_data(bytes) && self.sent[found].exchanged == self.exchanged;
         self.is_other &= !is_of_this || at < self.mixed_until;
         // One that lost its first byte is whole again with the last one of the one before it, if that is the same: either is.

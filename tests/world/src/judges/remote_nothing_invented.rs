@@ -1,5 +1,5 @@
 //! Nothing comes over the network that the hub did not publish: no datagram is taken that was not sent like this bit by bit,
-//! none is refused that came as it was sent, unless its gateway's life is over, and what a listener publishes is byte by byte
+//! none is refused that came as it was sent, unless its gateway's life is over, or a key is given and it is not known to be new, and what a listener publishes is byte by byte
 //! what the hub published, with its number, time and quality, and never a half of it.
 //!
 //! Two things nobody published (`docs/topics.md`): zones that are unknown, because nothing came, and that a sensor is silent,
@@ -9,7 +9,7 @@
 use std::collections::{BTreeMap, BTreeSet, HashSet};
 
 use lms::{MILLIS, Nanos};
-use schema::datagram::{Datagram, DatagramError, Packed};
+use schema::datagram::{Announce, Announced, Datagram, DatagramError, Head, Packed, WINDOW};
 use schema::{Flags, Header, Quality, State, Status, Topic, Zones};
 
 use super::{Judge, Say};
@@ -30,6 +30,9 @@ pub(crate) struct RemoteNothingInvented {
     named: HashSet<(u32, u8)>,
     /// When samples of each sensor came that the listener took, knew and did not find late.
     heard_at: BTreeSet<(usize, Nanos)>,
+    /// With a key: by epoch, sensor and topic the first number that was announced to the listener, and the highest it took.
+    numbers: BTreeMap<(u32, u8, u8), (u32, u32)>,
+    has_key: bool,
     /// CLOCK_MONOTONIC of the listener's machine when the world began.
     clock: Nanos,
     packet: Packet,
@@ -49,9 +52,41 @@ impl RemoteNothingInvented {
             epoch: 0,
             named: HashSet::new(),
             heard_at: BTreeSet::new(),
+            numbers: BTreeMap::new(),
+            has_key: terms.has_key,
             clock: terms.clocks.monotonic_ns,
             packet: Packet::new(terms),
             unknown,
+        }
+    }
+}
+
+impl RemoteNothingInvented {
+    /// Whether a listener with a key refuses it rightly: it came before its sensor's announcement, or is older than that, or
+    /// than the window, as a recording is.
+    fn is_before(&self, head: &Head, why: DatagramError) -> bool {
+        let known = self.numbers.get(&(head.epoch, head.sensor, head.topic));
+        match (why, known) {
+            (DatagramError::Untimely, None) => self.has_key,
+            (DatagramError::Stale, Some((first, highest))) => {
+                self.has_key && (head.sequence < *first || head.sequence + WINDOW as u32 <= *highest)
+            }
+            _ => false,
+        }
+    }
+
+    /// The listener took this.
+    fn take_number(&mut self, datagram: &Datagram<'_>) {
+        let head = &datagram.head;
+        let own = self.numbers.entry((head.epoch, head.sensor, head.topic));
+        let own = own.or_insert((head.sequence, head.sequence));
+        own.1 = own.1.max(head.sequence);
+        if head.topic == Announce::NUMBER
+            && let Some(announce) = Announce::unpack(datagram.payload)
+        {
+            for Announced { topic, next, .. } in announce.topics() {
+                self.numbers.entry((head.epoch, head.sensor, *topic)).or_insert((*next, *next));
+            }
         }
     }
 }
@@ -71,7 +106,9 @@ impl Judge for RemoteNothingInvented {
             }
             Event::Transmitted { datagram, bytes, .. } => _ = self.sent.insert(place(datagram), hash(bytes)),
             Event::ListenerBegins { .. } => {
-                self.epoch = 0;
+                // With a key it is kept.
+                self.epoch = if self.has_key { self.epoch } else { 0 };
+                self.numbers.clear();
                 self.named.clear();
                 self.heard_at.clear();
             }
@@ -80,8 +117,8 @@ impl Judge for RemoteNothingInvented {
                 let is_sent = sent == Some(hash(bytes));
                 match (outcome, datagram) {
                     (Arrival::Refused(why), Some(datagram)) if is_sent => {
-                        let is_over = datagram.head.epoch < self.epoch;
-                        if !(is_over && why == DatagramError::Epoch) {
+                        let is_over = datagram.head.epoch < self.epoch && why == DatagramError::Epoch;
+                        if !is_over && !self.is_before(&datagram.head, why) {
                             say.broken(format!("{why:?}: {:?}", datagram.head));
                         }
                     }
@@ -91,6 +128,7 @@ impl Judge for RemoteNothingInvented {
                         let head = &datagram.head;
                         self.epoch = self.epoch.max(head.epoch);
                         let life = (head.epoch, head.sensor);
+                        self.take_number(datagram);
                         match outcome {
                             Arrival::Announced => _ = self.named.insert(life),
                             Arrival::Sample { late: false } if self.named.contains(&life) => {

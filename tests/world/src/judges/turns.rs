@@ -5,17 +5,21 @@
 //! A stamp can only be right once the hub has heard a packet without delay: before that, nobody can tell a line that is
 //! late from a scanner that is.
 
-use std::collections::{HashSet, VecDeque};
+mod points;
+
+use std::collections::hash_map::Entry;
+use std::collections::{HashMap, VecDeque};
 use std::rc::Rc;
 
 use lms::{MILLIS, Nanos};
 use schema::datagram::Packed;
-use schema::{Code, Scan, State, Status, Topic};
+use schema::{Header, Scan, State, Status, Topic};
 use sim::ld::TruePoint;
 
+use self::points::{Point, Told, told};
 use super::{Judge, Say};
 use crate::event::{Event, Figures, Telegram};
-use crate::family::Family;
+use crate::family::{Begin, Exactness, Family};
 use crate::hash::History;
 use crate::topics::Sample;
 
@@ -30,31 +34,27 @@ struct OfSensor {
     /// All that was measured lately, in the order of time.
     points: VecDeque<Point>,
     /// Hashes of what was sent lately, and in their order.
-    sent: HashSet<u64>,
+    sent: HashMap<u64, u32>,
     order: VecDeque<u64>,
+    /// How exactly the packets tell that were published last.
+    exactness: Exactness,
     /// When something was published last that was not sent, or was not published for lack of memory, so that nobody saw
     /// whether it was sent; and the number of the last telegram that was.
     foreign_at: Option<Nanos>,
     seen: Option<u64>,
     /// Of the scans of this life of the topic.
     beams: Option<(u64, usize)>,
+    is_other: bool,
     /// Place behind the last packet that came without delay, and when it did.
     prompt: Option<(u64, Nanos)>,
     /// How many were read without delay since the session began, and when the last one of the first few was.
     prompts: u32,
     settled_at: Option<Nanos>,
+    prompt_at: Option<Nanos>,
     /// Place behind the last packet that was sent, and when bytes came that took no time on the line: what was read with them
     /// looks earlier than it was.
     end: u64,
     crowded_at: Option<Nanos>,
-}
-
-/// A point that was measured.
-#[derive(Clone, Copy, PartialEq)]
-struct Point {
-    truth: TruePoint,
-    /// Degrees since the first one, turns and all.
-    turned_deg: f64,
 }
 
 impl Turns {
@@ -62,14 +62,17 @@ impl Turns {
         let sensor = |family: &Rc<dyn Family>| OfSensor {
             family: family.clone(),
             points: VecDeque::new(),
-            sent: HashSet::new(),
+            sent: HashMap::new(),
             order: VecDeque::new(),
+            exactness: Exactness::default(),
             foreign_at: None,
             seen: None,
             beams: None,
+            is_other: false,
             prompt: None,
             prompts: 0,
             settled_at: None,
+            prompt_at: None,
             end: 0,
             crowded_at: None,
         };
@@ -93,13 +96,18 @@ impl Judge for Turns {
             Event::Read { sensor, to, .. } => {
                 let of = &mut self.sensors[sensor];
                 let is_prompt = of.prompt.is_some_and(|(place, came)| place <= to && at < came + PROMPT);
-                of.prompts += u32::from(is_prompt);
-                if is_prompt && of.prompts >= FEW {
-                    of.settled_at.get_or_insert(at);
+                if is_prompt {
+                    of.be_prompt(at);
                 }
             }
-            Event::Opened { sensor, .. } | Event::Retuned { sensor } | Event::Exchanged { sensor } => {
+            Event::Retuned { sensor } => self.sensors[sensor].begin(),
+            Event::Opened { sensor, .. } => {
                 self.sensors[sensor].begin();
+                self.sensors[sensor].forget_beams(false);
+            }
+            Event::Exchanged { sensor } => {
+                self.sensors[sensor].begin();
+                self.sensors[sensor].forget_beams(true);
             }
             Event::HubBegins { .. } => self.sensors.iter_mut().for_each(OfSensor::begin),
             Event::Published { sensor, sample } if self.sensors[sensor].family.turns() => {
@@ -113,40 +121,43 @@ impl Judge for Turns {
     }
 }
 
-impl Figures {
-    fn of(scan: &Scan, told: &[Told], points: &[Option<&Point>]) -> Figures {
-        let pairs = || told.iter().zip(points).filter_map(|(told, point)| Some((told, (*point)?)));
-        let worst = |off: &dyn Fn((&Told, &Point)) -> f64| pairs().map(off).fold(0.0, f64::max);
-        let range_mm = |(told, point): (&Told, &Point)| {
-            told.range_mm
-                .zip(point.truth.range_mm)
-                .map_or(0.0, |(told, exact)| (f64::from(told) - exact).abs())
-        };
-        Figures {
-            scans: 1,
-            incomplete: scan.is_incomplete().into(),
-            points: pairs().count() as u64,
-            angle_deg: worst(&|(told, point)| point.off_deg(told.clockwise_deg)),
-            range_mm: worst(&range_mm),
-            stamp_ns: 0,
-        }
-    }
-}
-
 impl OfSensor {
     /// What the session knew of the scanner's clock is void.
     fn begin(&mut self) {
         (self.prompts, self.settled_at) = (0, None);
     }
 
+    /// A packet was read without delay at `at`.
+    fn be_prompt(&mut self, at: Nanos) {
+        let before = self.prompt_at.replace(at).unwrap_or(0);
+        if !self.exactness.has_clock && before + LONG_GAP < at {
+            self.begin();
+        }
+        self.prompt = None;
+        self.prompts += 1;
+        if self.prompts >= FEW {
+            self.settled_at.get_or_insert(at);
+        }
+    }
+
+    /// Another model may have other beams, at once or when the port is opened again.
+    fn forget_beams(&mut self, is_other: bool) {
+        if is_other || std::mem::take(&mut self.is_other) {
+            self.beams = None;
+        }
+        self.is_other |= is_other;
+    }
+
     fn measure(&mut self, points: &[TruePoint]) {
         for &truth in points {
             let turned_deg = match self.points.back() {
                 Some(last) => {
-                    let step_deg = (truth.clockwise_deg - last.truth.clockwise_deg).rem_euclid(360.0);
-                    // After its power was off it is another turn, whatever the angle.
+                    // After its power was off it is another turn, whatever the angle; and points may come out of order.
                     let is_new = truth.at_ns > last.truth.at_ns + POWER_OFF;
-                    last.turned_deg + step_deg + if is_new { 720.0 } else { 0.0 }
+                    let step_deg = (truth.clockwise_deg - last.truth.clockwise_deg).rem_euclid(360.0);
+                    let is_back = step_deg > 360.0 - BACK_DEG && !is_new;
+                    let turns_deg = if is_new { 720.0 } else { 0.0 } - if is_back { 360.0 } else { 0.0 };
+                    last.turned_deg + step_deg + turns_deg
                 }
                 None => truth.clockwise_deg,
             };
@@ -162,25 +173,43 @@ impl OfSensor {
     }
 
     fn send(&mut self, at: Nanos, telegram: &Telegram<'_>) {
-        let Some(last_deg) = self.family.last_deg(telegram.bytes) else { return };
-        let key = key(telegram.bytes);
         let (begin, end) = (std::mem::replace(&mut self.end, telegram.span.1), telegram.span.1);
-        let is_new = self.sent.insert(key);
-        if is_new {
-            self.order.push_back(key);
+        if telegram.is_reply {
+            return;
         }
-        if !is_new || end - begin > telegram.bytes.len() as u64 {
+        let key = key(telegram.bytes);
+        let is_double = self.order.back() == Some(&key);
+        *self.sent.entry(key).or_default() += 1;
+        self.order.push_back(key);
+        if is_double || end - begin > telegram.bytes.len() as u64 {
             self.crowded_at = Some(at);
         }
         if self.order.len() > MOST
-            && let Some(oldest) = self.order.pop_front()
+            && let Some(Entry::Occupied(mut oldest)) =
+                self.order.pop_front().map(|oldest| self.sent.entry(oldest))
         {
-            self.sent.remove(&oldest);
+            *oldest.get_mut() -= 1;
+            if *oldest.get() == 0 {
+                oldest.remove();
+            }
         }
-        let late = self.points.iter().rev().take_while(|point| point.truth.at_ns + PROMPT > at);
-        if telegram.damage.is_none() && late.into_iter().any(|point| point.is_at(last_deg)) {
+        if telegram.damage.is_none()
+            && let Some(begin) = self.family.begin(telegram.bytes)
+            && let Some(measured) = self.last_of(at, &begin, self.family.exactness(telegram.bytes))
+            && at < measured + begin.on_line + PROMPT
+        {
             self.prompt = Some((telegram.span.1, at));
         }
+    }
+
+    /// When the last point was measured of a packet that was through at `at`.
+    fn last_of(&self, at: Nanos, packet: &Begin, exactness: Exactness) -> Option<Nanos> {
+        let (of, most) = (self.points.len(), at.saturating_sub(LONGEST + packet.on_line));
+        let lately = (0..of).rev().skip(packet.points - 1);
+        let mut lately = lately.take_while(|&first| self.points[first].truth.at_ns > most);
+        let first =
+            lately.find(|&first| self.points[first].off_deg(packet.clockwise_deg) < exactness.angle_deg)?;
+        Some(self.points[first + packet.points - 1].truth.at_ns)
     }
 
     /// What is wrong with what is published, if it is a scan.
@@ -197,7 +226,12 @@ impl OfSensor {
                 let seq = sample.header.seq;
                 let is_gap = self.seen.replace(seq).is_some_and(|seen| seq > seen + 1);
                 let units = self.family.units(&sample.bytes);
-                if is_gap || units.into_iter().any(|unit| !self.sent.contains(&key(unit))) {
+                let mut is_foreign = is_gap;
+                for unit in units.into_iter().filter(|unit| self.family.is_data(unit)) {
+                    is_foreign |= !self.sent.contains_key(&key(unit));
+                    self.exactness = self.family.exactness(unit);
+                }
+                if is_foreign {
                     self.foreign_at = Some(at);
                 }
                 Ok(Figures::default())
@@ -215,14 +249,16 @@ impl OfSensor {
                 if self.seen.is_some_and(|seen| sample.header.seq > seen) {
                     self.foreign_at = Some(at);
                 }
-                self.check(at, sample.header.stamp_first_ns, &scan)
+                self.check(at, &sample.header, &scan)
             }
             _ => Ok(Figures::default()),
         }
     }
 
-    /// What is wrong with `scan`, which says that its first beam was measured at `stamp`.
-    fn check(&self, at: Nanos, stamp: Nanos, scan: &Scan) -> Result<Figures, String> {
+    /// What is wrong with `scan`, whose `header` says when its first beam was measured.
+    fn check(&self, at: Nanos, header: &Header, scan: &Scan) -> Result<Figures, String> {
+        let stamp = header.stamp_first_ns;
+        let is_marked = scan.is_incomplete() || header.reasons != 0;
         let is_foreign = self.foreign_at.is_some_and(|foreign_at| at < foreign_at + FOREIGN);
         let told = told(stamp, scan);
         let Some(begin) = told.first().map(|first| first.at_ns) else {
@@ -233,7 +269,8 @@ impl OfSensor {
             told.iter().map(|told| self.find(told, shift, lenience(told))).collect()
         };
         let is_crowded = self.crowded_at.is_some_and(|crowded_at| at < crowded_at + CROWDED);
-        let is_settled = self.settled_at.is_some_and(|settled_at| settled_at + SETTLED < at) && !is_crowded;
+        let settles = if self.exactness.has_clock { SETTLED } else { LEARNED };
+        let is_settled = self.settled_at.is_some_and(|settled_at| settled_at + settles < at) && !is_crowded;
         let (mut points, mut shift) = (found(0), 0);
         if points.contains(&None) {
             shift = self.shift(&told);
@@ -243,12 +280,14 @@ impl OfSensor {
                 return Err(format!("the stamp is off by {} us", shift / 1_000));
             }
         }
+        let wrong = if is_marked || !points.contains(&None) { 0 } else { self.wrong(&told, shift) };
         if is_foreign {
-            return Ok(Figures::default());
+            let scans = Figures { scans: 1, incomplete: scan.is_incomplete().into(), ..Figures::default() };
+            return Ok(Figures { wrong, ..scans });
         }
         if let Some(beam) = points.iter().position(Option::is_none) {
             let told = &told[beam];
-            let is_it = |point: &&Point| point.is(told);
+            let is_it = |point: &&Point| point.is(told, &self.exactness);
             let off = |point: &Point| point.truth.at_ns as i64 - told.at_ns as i64;
             let nearest = self.points.iter().filter(is_it).map(off).min_by_key(|off| off.abs());
             let when = nearest.map_or("never".to_owned(), |off| format!("{} us later", off / 1_000));
@@ -264,20 +303,23 @@ impl OfSensor {
         let (first_deg, end_deg) = (360.0 * turn, 360.0 * (turn + 1.0));
         let is_outside = |point: &&Point| {
             let turned = turned(point);
-            turned < first_deg - ANGLE_DEG || turned > end_deg + ANGLE_DEG
+            let off_deg = self.exactness.angle_deg.max(self.exactness.nothing_deg);
+            turned < first_deg - off_deg || turned > end_deg + off_deg
         };
         if let Some(point) = points.iter().flatten().copied().find(is_outside) {
             let (deg, us) = (point.truth.clockwise_deg, (point.truth.at_ns as i64 - stamp as i64) / 1_000);
             return Err(format!("a point of another turn, at {deg} degrees, {us} us after the stamp"));
         }
-        let of_turn = |deg: f64| self.points.partition_point(|point| point.turned_deg + edge_deg < deg);
-        let (measured, there) =
-            (of_turn(end_deg) - of_turn(first_deg), told.len() + usize::from(scan.collapsed));
-        // One at the very edge may be of either turn.
-        if !scan.is_incomplete() && measured.abs_diff(there) > 2 {
+        let begin = self.points.partition_point(|point| turned(&point) < first_deg - BACK_DEG);
+        let around = self.points.range(begin..).map(|point| turned(&point));
+        let around = around.take_while(|turned| *turned < end_deg + BACK_DEG);
+        let measured = around.filter(|turned| (first_deg..end_deg).contains(turned)).count();
+        let there = told.len() + usize::from(scan.collapsed);
+        // Those at the very edge may be of either turn.
+        if !scan.is_incomplete() && measured.abs_diff(there) > self.exactness.points {
             return Err(format!("{there} of {measured} points, and it is not marked"));
         }
-        let mut figures = Figures::of(scan, &told, &points);
+        let mut figures = Figures { wrong, ..Figures::of(scan, &told, &points) };
         if let Some(point) = points[0].filter(|_| is_settled && !scan.is_incomplete()) {
             figures.stamp_ns = point.truth.at_ns.abs_diff(told[0].at_ns);
         }
@@ -289,7 +331,19 @@ impl OfSensor {
         let at_ns = told.at_ns.saturating_add_signed(shift);
         let begin = self.points.partition_point(|point| point.truth.at_ns + lenience < at_ns);
         let near = self.points.range(begin..).take_while(|point| point.truth.at_ns <= at_ns + lenience);
-        near.into_iter().find(|point| point.is(told))
+        near.into_iter().find(|point| point.is(told, &self.exactness))
+    }
+
+    /// How many points of `told` are where nothing was measured within 5 cm.
+    fn wrong(&self, told: &[Told], shift: i64) -> u64 {
+        let exactness = Exactness { angle_deg: 1.0, range_mm: 50.0, ..self.exactness };
+        let is_wrong = |told: &&Told| {
+            let at_ns = told.at_ns.saturating_add_signed(shift);
+            let begin = self.points.partition_point(|point| point.truth.at_ns + FAR_NS < at_ns);
+            let mut near = self.points.range(begin..).take_while(|point| point.truth.at_ns <= at_ns + FAR_NS);
+            !near.any(|point| point.is(told, &exactness))
+        };
+        told.iter().filter(is_wrong).count() as u64
     }
 
     /// By how much most points were measured later than is told. From turn to turn a head is nearly where it was before: of the
@@ -300,7 +354,7 @@ impl OfSensor {
             told.filter(|told| self.find(told, shift, NEAR).is_some()).count()
         };
         let some = told.len().div_ceil(16);
-        let candidates = self.points.iter().filter(|point| point.is(first));
+        let candidates = self.points.iter().filter(|point| point.is(first, &self.exactness));
         let shifts = candidates.map(|point| point.truth.at_ns as i64 - first.at_ns as i64);
         let mut shifts: Vec<_> =
             shifts.map(|shift| (fit(&mut told.iter().step_by(some), shift), shift)).collect();
@@ -311,54 +365,18 @@ impl OfSensor {
     }
 }
 
-/// What a scan tells of a point.
-#[derive(Debug)]
-struct Told {
-    at_ns: Nanos,
-    clockwise_deg: f64,
-    range_mm: Option<u16>,
-}
-
-/// The beams of `scan` that were measured.
-fn told(stamp: Nanos, scan: &Scan) -> Vec<Told> {
-    let beams = (0..scan.beams()).filter(|&i| scan.code(i) != Some(Code::NotMeasured));
-    let told = |i: usize| Told {
-        at_ns: stamp.saturating_add_signed(scan.beam_ns(i)),
-        clockwise_deg: (-scan.angle(i).to_degrees()).rem_euclid(360.0),
-        range_mm: scan.range(i),
-    };
-    beams.map(told).collect()
-}
-
-impl Point {
-    /// Whether it is what is told: a scanner may see nothing where there is something.
-    fn is(&self, told: &Told) -> bool {
-        let is_there = match (told.range_mm, self.truth.range_mm) {
-            (Some(told), Some(exact)) => (f64::from(told) - exact).abs() < RANGE_MM,
-            (Some(_), None) => false,
-            (None, _) => true,
-        };
-        is_there && self.is_at(told.clockwise_deg)
-    }
-
-    fn is_at(&self, clockwise_deg: f64) -> bool {
-        self.off_deg(clockwise_deg) < ANGLE_DEG
-    }
-
-    fn off_deg(&self, clockwise_deg: f64) -> f64 {
-        ((self.truth.clockwise_deg - clockwise_deg + 180.0).rem_euclid(360.0) - 180.0).abs()
-    }
-}
-
 fn key(bytes: &[u8]) -> u64 {
     let mut history = History::new();
     history.bytes(bytes);
     history.value()
 }
 
-/// An exact angle is off by no more, and a range by no more: nobody measures with noise here.
-const ANGLE_DEG: f64 = 0.05;
-const RANGE_MM: f64 = 2.0;
+/// A point may lie so far before one that was measured before it.
+const BACK_DEG: f64 = 40.0;
+/// The first point of a packet was measured no longer before the last one.
+const LONGEST: Nanos = 60 * MILLIS;
+/// A wrong point is where nothing was measured in so long.
+const FAR_NS: Nanos = 15 * MILLIS;
 /// A stamp is off by no more; a later point by a tenth of the time since it more, while the head changes its speed.
 const NEAR: Nanos = 5 * MILLIS;
 /// A packet is on its way, or in the port, for no longer.
@@ -367,6 +385,10 @@ const PROMPT: Nanos = 15 * MILLIS;
 const FEW: u32 = 10;
 /// Whoever knows that is right from so much later on.
 const SETTLED: Nanos = 10 * MILLIS;
+/// Where packets have no clock, it takes so long until it is known how the scanner's goes; after so long without a packet it
+/// may be another one.
+const LEARNED: Nanos = 1_500 * MILLIS;
+const LONG_GAP: Nanos = 300 * MILLIS;
 /// The least delays of so many seconds count.
 const CROWDED: Nanos = 9_000 * MILLIS;
 /// For so long after a packet that nobody sent turns may have points of it.
@@ -375,4 +397,4 @@ const FOREIGN: Nanos = 2_000 * MILLIS;
 const POWER_OFF: Nanos = 50 * MILLIS;
 /// What was measured is remembered for so long, and so many packets are.
 const REMEMBERED: Nanos = 12_000 * MILLIS;
-const MOST: usize = 32_768;
+const MOST: usize = 65_536;

@@ -47,7 +47,8 @@ impl Gateway {
     pub(super) fn begin(shared: &Shared, terms: &Terms, life: u32, sensors: usize) -> Gateway {
         let (now, epoch) = (shared.clock.get(), EPOCH + life);
         shared.tell(&Event::GatewayBegins { epoch });
-        let mut outgoing = Outgoing::new(HUB, epoch, Form::Sealed, terms.longest);
+        let form = terms.key().map_or(Form::Sealed, Form::Authenticated);
+        let mut outgoing = Outgoing::new(HUB, epoch, form, terms.longest);
         let mut sources = Vec::new();
         for sensor in 0..sensors {
             let position = outgoing.follow(&Setup::name(sensor), |topic| terms.every(topic));

@@ -1,8 +1,9 @@
 //! A life of a listener: it takes datagrams in the order in which they came, and publishes what they say. Refuses to know who
 //! follows that.
 
-use std::collections::VecDeque;
+use std::collections::{HashMap, VecDeque};
 
+use lan::Stamp;
 use lan::incoming::{Arrived, Incoming};
 use lan::republish::Republisher;
 use lms::Nanos;
@@ -31,11 +32,22 @@ pub(super) struct Listener {
 
 impl Listener {
     /// Number `life` of all listeners publishes in `memory`.
-    pub(super) fn begin(shared: &Shared, terms: &Terms, life: u64, memory: Memory, now: Nanos) -> Listener {
+    pub(super) fn begin(
+        shared: &Shared,
+        terms: &Terms,
+        life: u64,
+        memory: Memory,
+        epochs: &HashMap<u64, u32>,
+    ) -> Listener {
+        let now = shared.clock.get();
+        let incoming = match terms.key().filter(|_| !shared.planted.is(Defect::RemoteUnchecked)) {
+            Some(key) => Incoming::with_key(&Topic::ALL, key, epochs.clone()),
+            None => Incoming::new(&Topic::ALL),
+        };
         shared.log.tell(now, &Event::ListenerBegins { life });
         Listener {
             life,
-            incoming: Incoming::new(&Topic::ALL),
+            incoming,
             republisher: Republisher::new(memory, PID, terms.stamp(now).monotonic_ns),
             queue: VecDeque::new(),
             queued: 0,
@@ -58,16 +70,26 @@ impl Listener {
         self.next_at.min(self.look_at)
     }
 
-    /// Takes what waits.
-    pub(super) fn run(&mut self, shared: &Shared, terms: &Terms, now: Nanos) {
+    /// Takes what waits. With a key its machine's wall clock is `ahead_ns` of the world's, and `epochs` are kept.
+    pub(super) fn run(
+        &mut self,
+        shared: &Shared,
+        terms: &Terms,
+        now: Nanos,
+        ahead_ns: Nanos,
+        epochs: &mut HashMap<u64, u32>,
+    ) {
         self.next_at = Nanos::MAX;
         loop {
             let mut read = None;
             for _ in 0..TURN.min(self.queue.len()) {
                 let Some((came, bytes)) = self.queue.pop_front() else { break };
                 self.queued -= bytes.len();
-                self.take(shared, terms, came, &bytes, now);
+                self.take(shared, terms, (came, ahead_ns), &bytes, now);
                 read = Some(came);
+            }
+            if let Some(known) = self.incoming.take_epochs() {
+                epochs.extend(known);
             }
             let read = read.filter(|_| !self.queue.is_empty()).unwrap_or(now);
             self.republisher.wake();
@@ -81,16 +103,27 @@ impl Listener {
         }
     }
 
-    fn take(&mut self, shared: &Shared, terms: &Terms, came: Nanos, bytes: &[u8], now: Nanos) {
+    fn take(
+        &mut self,
+        shared: &Shared,
+        terms: &Terms,
+        (came, ahead_ns): (Nanos, Nanos),
+        bytes: &[u8],
+        now: Nanos,
+    ) {
+        let arrival = |at| match terms.has_key {
+            true => Stamp { wall_ns: at + ahead_ns, ..terms.stamp(at) },
+            false => terms.stamp(at),
+        };
         let wall = terms.stamp(now);
         if shared.planted.strikes(Defect::RemoteCountedTwice, 100) {
-            self.incoming.receive(bytes, 1, terms.stamp(came), &mut Vec::new());
+            self.incoming.receive(bytes, 1, arrival(came), &mut Vec::new());
         }
         let stamped = if shared.planted.is(Defect::RemoteStampedLate) { now } else { came };
         let mut whole = Vec::new();
         let half = shared.planted.strikes(Defect::RemoteHalf, 10).then(|| half(bytes)).flatten();
         let taken = half.as_deref().unwrap_or(bytes);
-        let arrived = self.incoming.receive(taken, 1, terms.stamp(stamped), &mut whole);
+        let arrived = self.incoming.receive(taken, 1, arrival(stamped), &mut whole);
         let outcome = match &arrived {
             Arrived::Refused { why, .. } => Arrival::Refused(*why),
             Arrived::Untimely { .. } => Arrival::Refused(DatagramError::Untimely),

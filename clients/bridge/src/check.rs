@@ -1,0 +1,262 @@
+//! What keeps a bridge from carrying anything, found by connecting as it would: who cannot be reached and why, whose clock is
+//! another one, who speaks another version. `scanhub doctor` shows it. Sends nothing, publishes nothing.
+
+use std::collections::BTreeMap;
+use std::convert::Infallible;
+use std::io::Write;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::thread;
+use std::time::{Duration, Instant};
+
+use lan::address::{Address, LIVE, PREFIX, live};
+use schema::datagram::{Datagram, DatagramError};
+use schema::{Failure, Kind, Printable};
+use serde::Serialize;
+use verbs::network::{now, quiet};
+
+use crate::BridgeOptions;
+use crate::engine::{Connection, Engine, News, Prepared};
+
+/// One line of what was found.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
+struct Finding {
+    class: &'static str,
+    state: &'static str,
+    finding: String,
+    /// What to do; empty if nothing.
+    remedy: String,
+}
+
+/// So long a router may take to answer, and then the hubs behind it.
+const CONNECTED_WITHIN: Duration = Duration::from_secs(5);
+const HEARD_WITHIN: Duration = Duration::from_secs(2);
+/// Between two looks.
+const LOOK_EVERY: Duration = Duration::from_millis(20);
+/// Announcements are stamped when they are made, at most this long ago; what a clock is off beyond it is an error of the
+/// clock. A listener with a key demands as much.
+const CLOCKS_AGREE_NS: u64 = 5_000_000_000;
+/// Sensors that are asked: whoever can connect can say that some are there.
+const SENSORS: usize = 256;
+
+/// Connects as `options` say, and writes to `out` what is found: a line each, of JSON if they say so.
+///
+/// # Errors
+///
+/// [`Kind::Check`] if something keeps the bridge from working, [`Kind::Interrupted`] if `stop` is set.
+pub fn check(options: &BridgeOptions, stop: &AtomicBool, out: &mut dyn Write) -> Result<(), Failure> {
+    let findings = find(options, stop)?;
+    for finding in &findings {
+        let written = if options.json {
+            let line = serde_json::to_string(finding).unwrap_or_default();
+            writeln!(out, "{}", Printable(&line))
+        } else {
+            let Finding { state, finding, remedy, .. } = finding;
+            writeln!(out, "{state:<8} {}", Printable(finding)).and_then(|()| match remedy.as_str() {
+                "" => Ok(()),
+                remedy => writeln!(out, "{:9}{}", "", Printable(remedy)),
+            })
+        };
+        quiet(written.map_err(Into::into))?;
+    }
+    match findings.iter().filter(|finding| finding.state == "failed").count() {
+        0 => Ok(()),
+        _ => Err(Failure::new(Kind::Check, "the bridge cannot work so", "its remedy is printed below it")),
+    }
+}
+
+fn find(options: &BridgeOptions, stop: &AtomicBool) -> Result<Vec<Finding>, Failure> {
+    let opened = Prepared::read(options).and_then(Connection::open);
+    let connection = match opened {
+        Ok(connection) => connection,
+        Err(failure) => return Ok(vec![Finding::failed(failure.message, failure.hint)]),
+    };
+    let mut reasons = Vec::new();
+    let mut is_linked = false;
+    let begin = Instant::now();
+    while !is_linked && begin.elapsed() < CONNECTED_WITHIN && connection.failure().is_none() {
+        if stop.load(Ordering::Relaxed) {
+            return Err(Failure::new(Kind::Interrupted, "interrupted", ""));
+        }
+        thread::sleep(LOOK_EVERY);
+        let news = |news| {
+            match news {
+                News::Up => is_linked = true,
+                News::Down => is_linked = false,
+                News::Failing(why) => reasons.push(why),
+            }
+            Ok::<_, Infallible>(())
+        };
+        let Ok(()) = connection.news(news);
+    }
+    if let Some(failure) = connection.failure() {
+        return Ok(vec![Finding::failed(failure.message, failure.hint)]);
+    }
+    let findings = match connection.engine(&AtomicBool::new(true)) {
+        Some(engine) if is_linked => hubs(engine)?,
+        _ if !options.listen.is_empty() => {
+            vec![Finding::ok("it can listen; nobody is connected yet".to_owned())]
+        }
+        _ => vec![unreachable(&reasons)],
+    };
+    connection.close();
+    Ok(findings)
+}
+
+/// Why nobody is connected, as Zenoh says it.
+fn unreachable(reasons: &[String]) -> Finding {
+    let said = reasons.join("; ");
+    let lower = said.to_lowercase();
+    let has = |words: &[&str]| words.iter().any(|word| lower.contains(word));
+    let (what, remedy) = if has(&["expired"]) {
+        (
+            "a certificate has expired",
+            "renew it: the router's, or this machine's, whose date `openssl x509 -enddate` shows",
+        )
+    } else if has(&["notvalidyet", "not valid yet"]) {
+        ("a certificate is not valid yet", "set the clock of this machine, or of the one that made it")
+    } else if has(&["certificate", "unknownissuer", "tls"]) {
+        (
+            "the certificates do not fit",
+            "root_ca_certificate must be of who signed the router's certificate, whose name must be in --connect; a router that \
+             wants one of this machine is shown connect_certificate",
+        )
+    } else if has(&["usrpwd", "authenticat", "password"]) {
+        (
+            "the user or the password is refused",
+            "compare transport/auth/usrpwd with the router's dictionary_file",
+        )
+    } else {
+        (
+            "no router is reached",
+            "it must run at the address that is named (`scanhub bridge --listen ..` or zenohd), and no firewall be between",
+        )
+    };
+    let said = if said.is_empty() { what.to_owned() } else { format!("{what}: {said}") };
+    Finding::failed(said, remedy)
+}
+
+/// What each hub is heard to say: by its number how much our clock is ahead of its, or that it speaks another version.
+type Hubs = BTreeMap<u64, Result<i64, DatagramError>>;
+
+/// Somebody is connected: asks all sensors for their announcements.
+fn hubs(engine: &Engine) -> Result<Vec<Finding>, Failure> {
+    let live_sensors: Arc<Mutex<Vec<String>>> = Arc::default();
+    let heard: Arc<Mutex<Hubs>> = Arc::default();
+    let (tokens, begin) = (live_sensors.clone(), Instant::now());
+    let _ear = engine.watch(&format!("{PREFIX}/*/*/{LIVE}"), move |key| {
+        let mut tokens = tokens.lock().unwrap_or_else(PoisonError::into_inner);
+        if let Some((hub, sensor)) = live(key).filter(|_| tokens.len() < SENSORS) {
+            tokens.push(Address { hub, sensor, topic: None }.to_string());
+        }
+    })?;
+    let mut asked = 0;
+    while begin.elapsed() < HEARD_WITHIN {
+        thread::sleep(LOOK_EVERY);
+        let news = live_sensors.lock().unwrap_or_else(PoisonError::into_inner)[asked..].to_vec();
+        asked += news.len();
+        for key in news {
+            let heard = heard.clone();
+            engine.ask(&key, usize::from(u16::MAX), move |key, payload| {
+                let Some(Address { hub, .. }) = Address::parse(key) else { return };
+                let ahead_ns = match Datagram::read(&payload.unwrap_or_default()) {
+                    Ok(datagram) => Ok(now().wall_ns.wrapping_sub(datagram.head.stamp_ns) as i64),
+                    Err(error) => Err(error),
+                };
+                heard.lock().unwrap_or_else(PoisonError::into_inner).insert(hub, ahead_ns);
+            })?;
+        }
+    }
+    let heard = heard.lock().unwrap_or_else(PoisonError::into_inner);
+    Ok(judge(&heard))
+}
+
+fn judge(hubs: &Hubs) -> Vec<Finding> {
+    let bad = |(hub, said): (&u64, &Result<i64, DatagramError>)| match said {
+        Err(DatagramError::Version) => Some(Finding::failed(
+            format!("hub {hub:016x} speaks another version"),
+            "install the same version of scanhub-bridge on both machines",
+        )),
+        Err(error) => Some(Finding::failed(
+            format!("what hub {hub:016x} announces is refused as `{}`", error.name()),
+            "something else sends under its name: see the access control of the router",
+        )),
+        Ok(ahead_ns) if ahead_ns.unsigned_abs() > CLOCKS_AGREE_NS => {
+            let (seconds, which) =
+                (ahead_ns.unsigned_abs() / 1_000_000_000, if *ahead_ns > 0 { "behind" } else { "ahead of" });
+            Some(Finding {
+                state: "warning",
+                ..Finding::failed(
+                    format!("the clock of hub {hub:016x} is {seconds} s {which} this one"),
+                    "let both machines set their clocks by the network (`timedatectl set-ntp true`): ages cannot be told so",
+                )
+            })
+        }
+        Ok(_) => None,
+    };
+    let mut findings: Vec<Finding> = hubs.iter().filter_map(bad).collect();
+    if findings.is_empty() {
+        let who = match hubs.len() {
+            0 => "no hub is heard behind it".to_owned(),
+            _ => {
+                let names: Vec<String> = hubs.keys().map(|hub| format!("{hub:016x}")).collect();
+                format!("heard: {}; their clocks and versions fit", names.join(", "))
+            }
+        };
+        findings.push(Finding::ok(format!("connected; {who}")));
+    }
+    findings
+}
+
+impl Finding {
+    fn ok(finding: String) -> Finding {
+        Finding { class: "bridge_check", state: "ok", finding, remedy: String::new() }
+    }
+
+    fn failed(finding: impl Into<String>, remedy: impl Into<String>) -> Finding {
+        let (finding, remedy) = (finding.into(), remedy.into());
+        Finding { class: "bridge_check", state: "failed", finding, remedy }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn why_nobody_is_connected_has_a_remedy() {
+        let of = |line: &str| unreachable(&[line.to_owned()]);
+        for (line, finding, remedy) in [
+            ("invalid peer certificate: certificate expired: verification time 7", "has expired", "renew"),
+            ("invalid peer certificate: Expired", "has expired", "renew"),
+            ("invalid peer certificate: NotValidYet", "not valid yet", "clock"),
+            ("invalid peer certificate: UnknownIssuer", "do not fit", "root_ca_certificate"),
+            ("Received a close message (reason INVALID) usrpwd", "refused", "usrpwd"),
+            ("Unable to connect: Connection refused (os error 111)", "no router", "firewall"),
+        ] {
+            let said = of(line);
+            assert!(said.finding.contains(finding) && said.remedy.contains(remedy), "{said:?}");
+            assert!(said.finding.contains(line) && said.state == "failed", "{said:?}");
+        }
+        assert_eq!(unreachable(&[]).finding, "no router is reached");
+    }
+
+    #[test]
+    fn clocks_and_versions_are_judged_hub_by_hub() {
+        const SECOND: i64 = 1_000_000_000;
+        let of = |hubs: &[(u64, Result<i64, DatagramError>)]| judge(&hubs.iter().copied().collect());
+        let well = of(&[(1, Ok(SECOND)), (2, Ok(-4 * SECOND))]);
+        assert!(
+            well.len() == 1 && well[0].state == "ok" && well[0].finding.contains("0000000000000002"),
+            "{well:?}"
+        );
+        assert!(of(&[])[0].finding.contains("no hub is heard"));
+        let bad =
+            of(&[(1, Ok(7 * SECOND)), (2, Ok(-60 * SECOND)), (3, Err(DatagramError::Version)), (4, Ok(0))]);
+        let states: Vec<_> = bad.iter().map(|it| it.state).collect();
+        assert_eq!(states, ["warning", "warning", "failed"]);
+        assert!(bad[0].finding.ends_with("is 7 s behind this one"), "{bad:?}");
+        assert!(bad[1].finding.ends_with("is 60 s ahead of this one"), "{bad:?}");
+        assert!(bad[2].remedy.contains("same version"), "{bad:?}");
+    }
+}

@@ -1,0 +1,246 @@
+//! What Zenoh is told: the routers and places that the user named, in what its own configuration file says, and limits where
+//! that says nothing. Nothing listens, nothing is looked for, unless somebody said so. Refuses to know when it is opened.
+
+use std::fs::File;
+use std::path::Path;
+
+use schema::regular;
+use schema::{Failure, Kind};
+use zenoh::Config;
+use zenoh::config::{EndPoint, WhatAmI};
+
+use super::log::without_places;
+use crate::BridgeOptions;
+
+/// A configuration that was checked.
+#[derive(Debug)]
+pub(crate) struct Prepared {
+    config: Config,
+    listens: bool,
+}
+
+/// What is told where the file says nothing: keys of Zenoh's configuration, and their values as JSON.
+///
+/// Its own values are made for throughput: what stands in long queues is old on a slow link. A message that finds no room
+/// is waited for here (and only here: a router on the way has values of its own), and the sender keeps the newest meanwhile.
+const LIMITS: &[(&str, &str)] = &[
+    ("scouting/multicast/enabled", "false"),
+    ("scouting/gossip/enabled", "false"),
+    ("connect/retry", r#"{"period_init_ms": 100, "period_max_ms": 400, "period_increase_factor": 2}"#),
+    ("transport/unicast/open_timeout", "3000"),
+    ("transport/unicast/accept_timeout", "3000"),
+    ("transport/unicast/accept_pending", "32"),
+    ("transport/unicast/max_sessions", "64"),
+    ("transport/link/tx/batch_size", "8192"),
+    ("transport/link/tx/queue/size/data", "1"),
+    ("transport/link/tx/queue/congestion_control/drop/wait_before_drop", "1000000"),
+    ("transport/link/tx/queue/congestion_control/drop/max_wait_before_drop_fragments", "2000000"),
+    ("transport/link/rx/max_message_size", "1048576"),
+    ("transport/link/tcp/so_sndbuf", "8192"),
+    ("transport/link/tls/so_sndbuf", "8192"),
+];
+
+/// Files that Zenoh opens when it connects, and not before.
+const FILES: &[&str] = &[
+    "transport/link/tls/root_ca_certificate",
+    "transport/link/tls/listen_certificate",
+    "transport/link/tls/listen_private_key",
+    "transport/link/tls/connect_certificate",
+    "transport/link/tls/connect_private_key",
+    "transport/auth/usrpwd/dictionary_file",
+];
+
+impl Prepared {
+    /// Reads what `options` say.
+    ///
+    /// [`Kind::Input`] if the file is missing or unreadable, [`Kind::Configuration`] if it or an address cannot be, or if neither
+    /// a router nor a place to listen is named.
+    pub(crate) fn read(options: &BridgeOptions) -> Result<Prepared, Failure> {
+        let mut config = options.config.as_deref().map_or_else(|| Ok(Config::default()), read)?;
+        let unsaid = Config::default();
+        let is_said = |config: &Config, key: &str| config.get_json(key).ok() != unsaid.get_json(key).ok();
+        let listens_by_itself = !is_said(&config, "listen/endpoints");
+        let said = config.get_json("mode").ok().and_then(|said| serde_json::from_str::<WhatAmI>(&said).ok());
+        let mode = match said {
+            _ if !options.listen.is_empty() => WhatAmI::Router,
+            Some(mode) => mode,
+            None => WhatAmI::Client,
+        };
+        set(&mut config, "mode", &format!("{:?}", mode.to_str()));
+        for (key, value) in LIMITS {
+            if !is_said(&config, key) {
+                set(&mut config, key, value);
+            }
+        }
+        let mut listen = if listens_by_itself { Vec::new() } else { endpoints(&config, "listen", mode) };
+        listen.extend(checked("--listen", &options.listen)?);
+        let mut connect = endpoints(&config, "connect", mode);
+        connect.extend(checked("--connect", &options.connect)?);
+        let is_silent = config.get_json("scouting/multicast/enabled").is_ok_and(|said| said != "true");
+        if listen.is_empty() && connect.is_empty() && is_silent {
+            let hint = "--connect tcp/HOST:7447 names a router, --listen tcp/0.0.0.0:7447 makes this one a router, and \
+                        --config FILE says it in Zenoh's words";
+            return Err(Failure::new(Kind::Configuration, "nobody to connect to is named", hint));
+        }
+        let listens = !listen.is_empty();
+        for (key, endpoints) in [("listen/endpoints", &listen), ("connect/endpoints", &connect)] {
+            let list: Vec<_> = endpoints.iter().map(|endpoint| format!("{endpoint:?}")).collect();
+            set(&mut config, key, &format!("[{}]", list.join(",")));
+        }
+        for key in FILES {
+            check_file(&config, key)?;
+        }
+        Ok(Prepared { config, listens })
+    }
+
+    /// What Zenoh is told.
+    pub(super) fn config(&self) -> Config {
+        self.config.clone()
+    }
+
+    /// It listens.
+    pub(super) fn listens(&self) -> bool {
+        self.listens
+    }
+}
+
+fn read(path: &Path) -> Result<Config, Failure> {
+    let text = regular::read_text(path, regular::LONGEST)
+        .map_err(|error| Failure::new(Kind::Input, format!("cannot read {}: {error}", path.display()), ""))?;
+    Config::from_json5(&text).map_err(|error| {
+        let what = format!("{}: {}", path.display(), without_places(&error.to_string()));
+        let hint = "it is Zenoh's own configuration in JSON5: https://zenoh.io/docs/manual/configuration";
+        Failure::new(Kind::Configuration, what, hint)
+    })
+}
+
+/// Sets what is ours: a key and a value that Zenoh knows, as a test sees.
+fn set(config: &mut Config, key: &str, value: &str) {
+    let set = config.insert_json5(key, value);
+    debug_assert!(set.is_ok(), "{key} = {value}: {set:?}");
+}
+
+/// The addresses under `key` that are said for this `mode`.
+fn endpoints(config: &Config, key: &str, mode: WhatAmI) -> Vec<String> {
+    let said = config.get_json(&format!("{key}/endpoints")).unwrap_or_default();
+    let said: serde_json::Value = serde_json::from_str(&said).unwrap_or_default();
+    let said = if said.is_object() { said[mode.to_str()].clone() } else { said };
+    let text = |value: &serde_json::Value| value.as_str().map(str::to_owned);
+    said.as_array().map(|all| all.iter().filter_map(text).collect()).unwrap_or_default()
+}
+
+fn checked(flag: &str, texts: &[String]) -> Result<Vec<String>, Failure> {
+    let check = |text: &String| {
+        let refuse = |why: &str| {
+            let hint = "tcp/HOST:PORT or tls/HOST:PORT, for example tcp/192.0.2.7:7447";
+            Failure::new(Kind::Configuration, format!("{flag} {text}: {why}"), hint)
+        };
+        let endpoint: EndPoint =
+            text.parse().map_err(|error| refuse(&without_places(&format!("{error}"))))?;
+        match endpoint.protocol().as_str() {
+            "tcp" | "tls" => Ok(text.clone()),
+            other => Err(refuse(&format!("{other} is not built in"))),
+        }
+    };
+    texts.iter().map(check).collect()
+}
+
+fn check_file(config: &Config, key: &str) -> Result<(), Failure> {
+    let said = config.get_json(key).ok().and_then(|said| serde_json::from_str::<Option<String>>(&said).ok());
+    let Some(path) = said.flatten() else { return Ok(()) };
+    File::open(&path).map(drop).map_err(|error| {
+        let what = format!("{key}: cannot read {path}: {error}");
+        Failure::new(Kind::Configuration, what, "see --config")
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn options(connect: &[&str], listen: &[&str], config: Option<&Path>) -> BridgeOptions {
+        let texts = |all: &[&str]| all.iter().map(|&text| text.to_owned()).collect();
+        BridgeOptions {
+            connect: texts(connect),
+            listen: texts(listen),
+            config: config.map(Path::to_path_buf),
+            send: None,
+            publish: None,
+            ros2: None,
+            json: false,
+        }
+    }
+
+    fn said(prepared: &Prepared, key: &str) -> String {
+        prepared.config.get_json(key).unwrap()
+    }
+
+    /// What becomes of a file with this `text`.
+    fn of_file(name: &str, text: &str, connect: &[&str]) -> Result<Prepared, Failure> {
+        let path = std::env::temp_dir().join(format!("scanhub-bridge-{}-{name}", std::process::id()));
+        std::fs::write(&path, text).unwrap();
+        let read = Prepared::read(&options(connect, &[], Some(&path)));
+        std::fs::remove_file(&path).unwrap();
+        read
+    }
+
+    #[test]
+    fn nothing_listens_or_is_looked_for_unless_it_was_said() {
+        let client = Prepared::read(&options(&["tcp/127.0.0.1:7447"], &[], None)).unwrap();
+        assert_eq!(said(&client, "mode"), r#""client""#);
+        assert_eq!(said(&client, "listen/endpoints"), "[]");
+        assert_eq!(said(&client, "connect/endpoints"), r#"["tcp/127.0.0.1:7447"]"#);
+        let router = Prepared::read(&options(&[], &["tcp/127.0.0.1:0"], None)).unwrap();
+        assert_eq!((said(&router, "mode"), router.listens()), (r#""router""#.into(), true));
+        for prepared in [&client, &router] {
+            for (key, value) in LIMITS.iter().filter(|(key, _)| *key != "connect/retry") {
+                assert_eq!(said(prepared, key), *value, "{key}");
+            }
+        }
+        let nobody = Prepared::read(&options(&[], &[], None)).unwrap_err();
+        assert!(nobody.kind == Kind::Configuration && nobody.hint.contains("--listen"), "{nobody}");
+    }
+
+    #[test]
+    fn what_the_file_says_stands_and_flags_are_added() {
+        let text = "{ connect: { endpoints: ['tcp/10.0.0.1:1'] }, transport: { link: { tx: { batch_size: 4096 } } } }";
+        let read = of_file("adds", text, &["tcp/10.0.0.2:2"]).unwrap();
+        assert_eq!(said(&read, "connect/endpoints"), r#"["tcp/10.0.0.1:1","tcp/10.0.0.2:2"]"#);
+        assert_eq!(
+            (said(&read, "transport/link/tx/batch_size"), said(&read, "mode")),
+            ("4096".into(), r#""client""#.into())
+        );
+        let peer =
+            of_file("peer", "{ mode: 'peer', scouting: { multicast: { enabled: true } } }", &[]).unwrap();
+        assert_eq!((said(&peer, "mode"), said(&peer, "listen/endpoints")), (r#""peer""#.into(), "[]".into()));
+        assert_eq!(said(&peer, "scouting/multicast/enabled"), "true");
+    }
+
+    #[test]
+    fn what_cannot_be_is_refused_by_its_place() {
+        let kind = |read: Result<Prepared, Failure>| read.map(drop).map_err(|failure| failure.kind);
+        let missing = Prepared::read(&options(&[], &[], Some(Path::new("/nowhere/zenoh.json5"))));
+        assert_eq!(kind(missing), Err(Kind::Input));
+        for text in ["{ mode: 'king' }", "{ mode: ", "{ no_such_key: 1 }"] {
+            let failure = of_file("wrong", text, &["tcp/10.0.0.1:1"]).unwrap_err();
+            assert!(
+                failure.kind == Kind::Configuration && failure.message.contains("wrong"),
+                "{text}: {failure}"
+            );
+        }
+        for address in ["nonsense", "udp/10.0.0.1:1", "quic/10.0.0.1:1", ""] {
+            assert_eq!(
+                kind(Prepared::read(&options(&[address], &[], None))),
+                Err(Kind::Configuration),
+                "{address}"
+            );
+        }
+        let text = "{ transport: { link: { tls: { root_ca_certificate: '/nowhere/ca.pem' } } } }";
+        let failure = of_file("ca", text, &["tls/10.0.0.1:1"]).unwrap_err();
+        assert_eq!(failure.kind, Kind::Configuration);
+        assert!(
+            failure.message.contains("/nowhere/ca.pem") && failure.message.contains("root_ca"),
+            "{failure}"
+        );
+    }
+}

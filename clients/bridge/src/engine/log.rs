@@ -1,0 +1,169 @@
+//! What Zenoh says of connections that fail: it has no other way to tell why. The newest lines wait here, each once, until
+//! they are told; everything else that it logs is passed over. Refuses to know what they mean.
+
+use std::collections::VecDeque;
+use std::fmt::{Debug, Write};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+
+use tracing::field::{Field, Visit};
+use tracing::span::{Attributes, Id, Record};
+use tracing::{Event, Level, Metadata, Subscriber};
+
+/// The lines of this process.
+#[derive(Clone, Default)]
+pub(super) struct Log(Arc<Mutex<Lines>>);
+
+#[derive(Default)]
+struct Lines {
+    waiting: VecDeque<String>,
+    /// The last ones that were told or wait, so that they are told once.
+    known: VecDeque<String>,
+    count: u64,
+}
+
+/// Lines that wait or are known: whoever can connect can cause them.
+const MOST: usize = 16;
+/// The longest line, in bytes.
+const LONGEST: usize = 500;
+
+/// What Zenoh tells at the level of debugging only: where it is from, and how it begins. Why a connection that was lost does not
+/// come again, and why one that somebody else began was refused.
+const QUIET: [(&str, &str); 3] = [
+    ("zenoh::net::runtime::orchestrator", "Unable to connect"),
+    ("zenoh_link_tls::unicast", "Can not accept"),
+    ("zenoh_transport::unicast::establishment::accept", ""),
+];
+/// How it tells of one that it did not refuse.
+const ACCEPTED: &str = "New transport";
+
+impl Log {
+    /// Takes what is logged from now on. In a process that has somebody else for that, nothing comes.
+    pub(super) fn install() -> Log {
+        let log = Log::default();
+        let _ = tracing::subscriber::set_global_default(Taker(log.clone()));
+        log
+    }
+
+    /// The lines that were not told yet.
+    pub(super) fn take(&self) -> Vec<String> {
+        self.lines().waiting.drain(..).collect()
+    }
+
+    /// How many lines there were, those that were told before among them.
+    pub(super) fn count(&self) -> u64 {
+        self.lines().count
+    }
+
+    fn lines(&self) -> MutexGuard<'_, Lines> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    fn add(&self, line: &str) {
+        let mut line = without_places(line);
+        let end = line.char_indices().map(|(at, _)| at).find(|at| *at + 4 > LONGEST);
+        line.truncate(end.unwrap_or(line.len()));
+        let mut lines = self.lines();
+        lines.count += 1;
+        if lines.known.contains(&line) {
+            return;
+        }
+        if lines.known.len() == MOST {
+            lines.known.pop_front();
+        }
+        if lines.waiting.len() == MOST {
+            lines.waiting.pop_front();
+        }
+        lines.known.push_back(line.clone());
+        lines.waiting.push_back(line);
+    }
+}
+
+/// `line` without the places in Zenoh's own files of which its errors tell, ` at PATH.rs:LINE`.
+pub(super) fn without_places(line: &str) -> String {
+    let mut kept = String::with_capacity(line.len());
+    let mut rest = line;
+    while let Some(at) = rest.find(" at ") {
+        let (before, place) = rest.split_at(at);
+        let word = place[4..].split([' ', ']', ')']).next().unwrap_or_default();
+        kept.push_str(before);
+        if !word.contains(".rs:") {
+            kept.push_str(" at ");
+            rest = &place[4..];
+            continue;
+        }
+        rest = &place[4 + word.len()..];
+    }
+    kept.push_str(rest);
+    kept
+}
+
+struct Taker(Log);
+
+impl Subscriber for Taker {
+    fn enabled(&self, metadata: &Metadata<'_>) -> bool {
+        let is_zenoh = metadata.target().starts_with("zenoh");
+        let is_quiet = QUIET.iter().any(|(target, _)| metadata.target() == *target);
+        let level = *metadata.level();
+        metadata.is_event() && is_zenoh && (level <= Level::WARN || is_quiet && level == Level::DEBUG)
+    }
+
+    fn new_span(&self, _: &Attributes<'_>) -> Id {
+        Id::from_u64(1)
+    }
+
+    fn record(&self, _: &Id, _: &Record<'_>) {}
+
+    fn record_follows_from(&self, _: &Id, _: &Id) {}
+
+    fn event(&self, event: &Event<'_>) {
+        let mut message = Message(String::new());
+        event.record(&mut message);
+        let is_wanted = |(target, begin): &(&str, &str)| {
+            event.metadata().target() == *target
+                && message.0.starts_with(begin)
+                && !message.0.starts_with(ACCEPTED)
+        };
+        if *event.metadata().level() <= Level::WARN || QUIET.iter().any(is_wanted) {
+            self.0.add(&message.0);
+        }
+    }
+
+    fn enter(&self, _: &Id) {}
+
+    fn exit(&self, _: &Id) {}
+}
+
+/// The text of an event.
+struct Message(String);
+
+impl Visit for Message {
+    fn record_debug(&mut self, field: &Field, value: &dyn Debug) {
+        if field.name() == "message" {
+            let _ = write!(self.0, "{value:?}");
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn places_in_other_peoples_files_are_left_out() {
+        let line =
+            "no link: [host: refused (error 111) at /a/b-1.0/tcp.rs:105.] at /a/c.rs:1. at noon. Retry";
+        assert_eq!(without_places(line), "no link: [host: refused (error 111)] at noon. Retry");
+    }
+
+    #[test]
+    fn a_line_is_told_once_and_a_flood_takes_no_memory() {
+        let log = Log::default();
+        log.add("no route");
+        log.add("no route");
+        assert_eq!((log.take(), log.take(), log.count()), (vec!["no route".to_owned()], vec![], 2));
+        (0..1000).for_each(|n| log.add(&format!("{n} {}", "é".repeat(1000))));
+        let lines = log.take();
+        assert!(lines.len() == MOST && lines.iter().all(|line| line.len() <= LONGEST), "{lines:?}");
+        assert!(lines.last().is_some_and(|line| line.starts_with("999 ")));
+    }
+}

@@ -1,0 +1,199 @@
+//! Topics of a hub over Zenoh, to other machines and from them: what `gateway` and `listen` are for a LAN. Which sample
+//! goes out, who may speak and what was lost is decided by `scanhub_lan`, without a network; Zenoh stands in one module.
+#![forbid(unsafe_code)]
+
+mod check;
+mod engine;
+mod receiving;
+mod report;
+mod ros2;
+mod sending;
+
+use std::io::{self, stderr, stdout};
+use std::path::PathBuf;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::thread;
+use std::time::{Duration, Instant};
+
+use lan::outgoing::ANNOUNCE_EVERY;
+use schema::limits::TopicLimits;
+use schema::{Domain, Failure, Kind};
+use verbs::network::{End, LossyWriter, Output, quiet};
+
+pub use check::check;
+use engine::{Connection, Prepared};
+use report::Report;
+pub use ros2::Ros2Options;
+use sending::Sending;
+
+/// What a bridge is asked for.
+#[derive(Clone, Debug)]
+pub struct BridgeOptions {
+    /// Routers to connect to, as Zenoh writes them: `tcp/HOST:PORT`, `tls/HOST:PORT`.
+    pub connect: Vec<String>,
+    /// Where to listen, as a router.
+    pub listen: Vec<String>,
+    /// A file of Zenoh's own configuration.
+    pub config: Option<PathBuf>,
+    /// What goes out; nothing: nothing does.
+    pub send: Option<SendOptions>,
+    /// What comes in; nothing: nothing does.
+    pub publish: Option<PublishOptions>,
+    /// What goes into a graph of ROS 2; nothing: nothing does.
+    pub ros2: Option<Ros2Options>,
+    /// Lines of JSON, with the account once a second.
+    pub json: bool,
+}
+
+/// What goes out.
+#[derive(Clone, Debug)]
+pub struct SendOptions {
+    /// `SENSOR/TOPIC`, `*/TOPIC` or `SENSOR/*`, with `:every=N` if it is to be thinned; none: all but telegrams, of all sensors.
+    pub topics: Vec<String>,
+    /// Where the domain of the hub may be.
+    pub places: Vec<Domain>,
+}
+
+/// What comes in.
+#[derive(Clone, Debug)]
+pub struct PublishOptions {
+    /// Where topics of other machines are published.
+    pub domain: Domain,
+    /// `NAME=HUB`: what to call a hub, instead of its 16 hex digits.
+    pub names: Vec<String>,
+    /// The hubs to hear, by 16 hex digits or by one of `names`; none: all.
+    pub hubs: Vec<String>,
+    /// What the topics are made for.
+    pub limits: TopicLimits,
+}
+
+/// Carries samples until `stop` is set, whatever becomes of the hub and of the network. The account goes to stdout at the
+/// end and whenever `tell` is set; what is no account to stderr if it is not JSON.
+///
+/// # Errors
+///
+/// [`Kind::Configuration`] if neither a router nor a place to listen is named, or what Zenoh is told cannot be;
+/// [`Kind::Input`] if the file of its configuration cannot be read; [`Kind::Usage`] if there is no such topic;
+/// [`Kind::DomainHeld`] if another listener publishes in the domain; [`Kind::NoTopic`] if the first hub has no such sensor.
+pub fn bridge(options: &BridgeOptions, tell: &AtomicBool, stop: &AtomicBool) -> Result<(), Failure> {
+    let prepared = Prepared::read(options)?;
+    let mut out = stdout();
+    let mut notes = stderr();
+    let (mut out, mut notes) = (LossyWriter::around(&mut out, stop), LossyWriter::around(&mut notes, stop));
+    let mut report = Report::new(options.json, Output::new(&mut out), Output::new(&mut notes));
+    let sending = options.send.as_ref().map(Sending::open).transpose()?;
+    let connection = Connection::open(prepared)?;
+    quiet(run(options, &connection, sending, &mut report, tell, stop))
+}
+
+/// Between two announcements, and two accounts.
+const TICK: Duration = ANNOUNCE_EVERY;
+/// So long it sleeps at most where nothing wakes it.
+const NAP: Duration = Duration::from_millis(50);
+
+fn run(
+    options: &BridgeOptions,
+    connection: &Connection,
+    mut sending: Option<Sending>,
+    report: &mut Report<'_>,
+    tell: &AtomicBool,
+    stop: &AtomicBool,
+) -> Result<(), End> {
+    report.begin(options, sending.as_ref())?;
+    let (tell_in, is_over) = ([AtomicBool::new(false), AtomicBool::new(false)], AtomicBool::new(false));
+    thread::scope(|scope| {
+        let begin = |name: &str| thread::Builder::new().name(name.into());
+        let ([tell_in, tell_ros2], is_over) = (&tell_in, &is_over);
+        let threads = (|| {
+            let receiving = options.publish.as_ref().map(|publish| {
+                let work = move || receiving::run(publish, options.json, connection, tell_in, is_over);
+                begin("receiving").spawn_scoped(scope, work)
+            });
+            let handing = sending.as_ref().map(|sending| {
+                let handing = sending.handing();
+                begin("handing").spawn_scoped(scope, move || handing.run(connection, is_over))
+            });
+            let ros2 = options.ros2.as_ref().map(|ros2| {
+                let work = move || ros2::run(ros2, options.json, connection, tell_ros2, is_over);
+                begin("ros2").spawn_scoped(scope, work)
+            });
+            Ok((receiving.transpose()?, handing.transpose()?, ros2.transpose()?))
+        })()
+        .map_err(|error: io::Error| no_thread(&error));
+        let end = match &threads {
+            Ok((receiving, _, ros2)) => {
+                let has_ended = || [receiving, ros2].into_iter().flatten().any(|thread| thread.is_finished());
+                let is_done = || stop.load(Ordering::Relaxed) || has_ended();
+                carry(connection, &mut sending, report, tell, [tell_in, tell_ros2], &is_done)
+            }
+            Err(failure) => Err(failure.clone().into()),
+        };
+        // However it ends: how many were sent is the last word.
+        if let Some(sending) = &mut sending {
+            sending.announce();
+        }
+        is_over.store(true, Ordering::Relaxed);
+        let (receiving, handing, ros2) = threads?;
+        let handed = handing.map_or(Ok(()), |thread| thread.join().unwrap_or_else(|_| Err(died())));
+        let received =
+            receiving.map_or(Ok(()), |thread| thread.join().unwrap_or_else(|_| Err(died().into())));
+        let graph = ros2.map_or(Ok(()), |thread| thread.join().unwrap_or_else(|_| Err(died().into())));
+        connection.close();
+        if let Some(sending) = &sending {
+            report.account(sending)?;
+        }
+        received.and(graph).and(end).and(Ok(handed?))
+    })
+}
+
+/// The work of the main thread until it is done.
+fn carry(
+    connection: &Connection,
+    sending: &mut Option<Sending>,
+    report: &mut Report<'_>,
+    tell: &AtomicBool,
+    tell_others: [&AtomicBool; 2],
+    is_done: &impl Fn() -> bool,
+) -> Result<(), End> {
+    let mut tick_at = Instant::now();
+    while !is_done() {
+        let more = match sending {
+            Some(sending) => sending.forward(report)?,
+            None => false,
+        };
+        connection.news(|news| report.link(&news))?;
+        if let Some(failure) = connection.failure() {
+            return Err(failure.into());
+        }
+        let now = Instant::now();
+        let is_due = now >= tick_at;
+        if is_due {
+            tick_at = now + TICK;
+            if let Some(sending) = sending {
+                sending.announce();
+            }
+        }
+        if tell.swap(false, Ordering::Relaxed) || is_due && report.is_periodic() {
+            tell_others.into_iter().for_each(|tell| tell.store(true, Ordering::Relaxed));
+            if let Some(sending) = sending {
+                report.account(sending)?;
+            }
+        }
+        if !more {
+            let left = tick_at.saturating_duration_since(now).min(NAP);
+            match sending {
+                Some(sending) => sending.wait(left)?,
+                None => thread::sleep(left),
+            }
+        }
+    }
+    Ok(())
+}
+
+fn no_thread(error: &io::Error) -> Failure {
+    Failure::new(Kind::Short, format!("cannot start a thread: {error}"), "")
+}
+
+fn died() -> Failure {
+    Failure::new(Kind::Failed, "a thread of the bridge panicked", "")
+}

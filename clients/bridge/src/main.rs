@@ -1,0 +1,212 @@
+//! The program `scanhub-bridge`: its command line, its signals and its exit code. `scanhub bridge` runs it with the same
+//! arguments.
+#![forbid(unsafe_code)]
+
+use std::io::{self, Write};
+use std::path::PathBuf;
+use std::process::ExitCode;
+use std::sync::Arc;
+use std::sync::atomic::AtomicBool;
+
+use bridge::{BridgeOptions, PublishOptions, Ros2Options, SendOptions, bridge, check};
+use clap::Parser;
+use ros::Names;
+use ros::zenoh_wire::Distro;
+use schema::limits::TopicLimits;
+use schema::{DEFAULT_DOMAIN, Domain, Environment, Failure, Kind, Printable};
+
+/// Carry topics to other machines and back over Zenoh, through a router or as one: other rooms, Wi-Fi, the internet
+#[derive(Debug, Parser)]
+#[command(name = "scanhub-bridge", version, max_term_width = 100, after_help = EXAMPLES, args_override_self = true)]
+struct Cli {
+    /// Router to connect to: tcp/HOST:PORT or tls/HOST:PORT. Can be repeated; the first one that answers is used
+    #[arg(long, value_name = "ADDRESS")]
+    connect: Vec<String>,
+    /// Be a router, and listen there: tcp/0.0.0.0:7447, tls/[::]:7447. Can be repeated
+    #[arg(long, value_name = "ADDRESS")]
+    listen: Vec<String>,
+    /// Zenoh's own configuration, JSON5: TLS, users, access control. --connect and --listen are added to it
+    #[arg(long, value_name = "FILE")]
+    config: Option<PathBuf>,
+    /// Topics to send: front/scan, */scan for all sensors or front/* for all topics. With :every=4, only the samples of
+    /// every fourth telegram. Can be repeated [default: all topics except telegrams, of all sensors]
+    #[arg(long = "topic", value_name = "SENSOR/TOPIC[:every=N]")]
+    topics: Vec<String>,
+    /// Publish what other machines send in this machine's domain, as HUB.SENSOR; then nothing is sent without --send
+    #[arg(long)]
+    publish: bool,
+    /// Send too, beside --publish or --ros2
+    #[arg(long)]
+    send: bool,
+    /// Name a hub, instead of its 16 hex digits, for example robot1=5f3a12bc00d1e2f3
+    #[arg(long = "name", value_name = "NAME=HUB", requires = "publish")]
+    names: Vec<String>,
+    /// Hub to publish, by its 16 hex digits or its name from --name [default: all]
+    #[arg(long = "hub", value_name = "HUB", requires = "publish")]
+    hubs: Vec<String>,
+    /// Places for consumers of each published topic, 1 to 250
+    #[arg(long, value_name = "N", requires = "publish", default_value_t = 32, value_parser = clap::value_parser!(u16).range(1..=250))]
+    consumers: u16,
+    /// Connect, print what would keep a bridge from working and what to do, and end; nothing is sent or published
+    #[arg(long, conflicts_with = "publish")]
+    check: bool,
+    /// Be a node of ROS 2 (rmw_zenoh) that publishes the hub's topics; then nothing else is sent without --send
+    #[arg(long)]
+    ros2: bool,
+    /// Release of ROS 2 whose nodes hear it: humble, jazzy, kilted or rolling
+    #[arg(long, value_name = "NAME", requires = "ros2", default_value = "jazzy", value_parser = distro)]
+    ros_distro: Distro,
+    /// ROS_DOMAIN_ID of the node
+    #[arg(long, env = "ROS_DOMAIN_ID", value_name = "N", requires = "ros2", default_value_t = 0, value_parser = clap::value_parser!(u32).range(0..=232))]
+    domain_id: u32,
+    /// Namespace before all topics of ROS 2, for example robot1
+    #[arg(long, value_name = "NAME", requires = "ros2", default_value = "")]
+    namespace: String,
+    /// Words before the topics of sensors in ROS 2, for example lidars for /lidars/front/scan
+    #[arg(long, value_name = "NAME", requires = "ros2", default_value = "")]
+    topic_prefix: String,
+    /// Frame of a sensor in ROS 2, for example front=laser [default: its name]
+    #[arg(long = "frame", value_name = "SENSOR=FRAME", requires = "ros2")]
+    frames: Vec<String>,
+    /// Domain of the hub: 1 to 16 of a-z, 0-9 and -
+    #[arg(long, env = "SCANHUB_DOMAIN", default_value = DEFAULT_DOMAIN, value_name = "NAME")]
+    domain: String,
+    /// Use the domain in this directory instead of the usual ones
+    #[arg(long, value_name = "DIR")]
+    root: Option<PathBuf>,
+    /// Print one JSON object per line
+    #[arg(long)]
+    json: bool,
+}
+
+/// What is below the help.
+const EXAMPLES: &str = "Examples:
+  scanhub bridge --listen tcp/0.0.0.0:7447
+  scanhub bridge --connect tcp/robot:7447 --publish --name robot1=5f3a12bc00d1e2f3
+  scanhub bridge --connect tcp/localhost:7447 --ros2
+  scanhub bridge --connect tls/router.example:7447 --config zenoh.json5
+
+SIGUSR1: print the counts so far";
+
+impl Cli {
+    fn options(self) -> Result<BridgeOptions, Failure> {
+        let environment = Environment::of_process();
+        let sends = self.send || !self.publish && !self.ros2;
+        let ros2 = self.ros2.then(|| self.ros2(&environment, !sends)).transpose()?;
+        let send = sends.then(|| {
+            let places = Domain::candidates(&self.domain, self.root.as_deref(), &environment)?;
+            Ok(SendOptions { topics: self.topics, places })
+        });
+        let publish = self.publish.then(|| {
+            let domain = Domain::of_hub(&self.domain, self.root.as_deref(), &environment)?;
+            let limits = TopicLimits { consumers: self.consumers.into(), ..TopicLimits::default() };
+            Ok(PublishOptions { domain, names: self.names, hubs: self.hubs, limits })
+        });
+        Ok(BridgeOptions {
+            connect: self.connect,
+            listen: self.listen,
+            config: self.config,
+            send: send.transpose()?,
+            publish: publish.transpose()?,
+            ros2,
+            json: self.json,
+        })
+    }
+}
+
+impl Cli {
+    fn ros2(&self, environment: &Environment, tells_of_hub: bool) -> Result<Ros2Options, Failure> {
+        let frame = |text: &String| {
+            let (sensor, frame) = text.split_once('=').ok_or_else(|| no_name("--frame", text))?;
+            Ok((sensor.to_owned(), frame.to_owned()))
+        };
+        let frames = self.frames.iter().map(frame).collect::<Result<_, Failure>>()?;
+        let names = Names::new(&self.namespace, &self.topic_prefix, frames)
+            .map_err(|name| no_name("--namespace, --topic-prefix or --frame", &name))?;
+        Ok(Ros2Options {
+            topics: self.topics.clone(),
+            places: Domain::candidates(&self.domain, self.root.as_deref(), environment)?,
+            domain_id: self.domain_id,
+            distro: self.ros_distro,
+            names,
+            tells_of_hub,
+        })
+    }
+}
+
+/// ROS takes words of letters, digits and `_`.
+fn no_name(flag: &str, text: &str) -> Failure {
+    let hint =
+        "names of ROS 2 are words of letters, digits and _ between slashes; a frame stands behind SENSOR=";
+    Failure::new(Kind::Usage, format!("{flag}: {text:?} is no name"), hint)
+}
+
+fn distro(name: &str) -> Result<Distro, String> {
+    Distro::parse(name).ok_or_else(|| format!("one of {}", Distro::ALL.map(Distro::name).join(", ")))
+}
+
+fn main() -> ExitCode {
+    let cli = Cli::parse();
+    let json = cli.json;
+    match run(cli) {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(failure) => {
+            // Whoever closed them does not want it.
+            let _ = match json {
+                true => writeln!(io::stdout(), "{}", Printable(&verbs::error_line(&failure))),
+                false => writeln!(io::stderr(), "scanhub-bridge: {}", Printable(&failure.to_string())),
+            };
+            ExitCode::from(failure.kind.exit_code())
+        }
+    }
+}
+
+fn run(cli: Cli) -> Result<(), Failure> {
+    let is_check = cli.check;
+    let options = cli.options()?;
+    let (stop, tell) = (Arc::new(AtomicBool::new(false)), Arc::new(AtomicBool::new(false)));
+    let signals = [
+        (signal_hook::consts::SIGINT, &stop),
+        (signal_hook::consts::SIGTERM, &stop),
+        (signal_hook::consts::SIGUSR1, &tell),
+    ];
+    for (signal, flag) in signals {
+        signal_hook::flag::register(signal, flag.clone())
+            .map_err(|error| Failure::new(Kind::Failed, format!("cannot take signals: {error}"), ""))?;
+    }
+    if is_check {
+        return check(&options, &stop, &mut io::stdout());
+    }
+    bridge(&options, &tell, &stop)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn parse(words: &[&str]) -> Cli {
+        Cli::try_parse_from([&["scanhub-bridge"], words].concat()).unwrap_or_else(|error| panic!("{error}"))
+    }
+
+    #[test]
+    fn what_scanhub_says_first_is_overridden_by_what_the_user_says() {
+        let words =
+            ["--domain", "scanhub", "--connect", "tcp/a:1", "--domain", "lab", "--connect", "tcp/b:1"];
+        let cli = parse(&words);
+        assert_eq!((cli.domain.as_str(), cli.connect.len()), ("lab", 2));
+        assert!(parse(&["--json", "--json"]).json);
+    }
+
+    #[test]
+    fn it_sends_unless_it_publishes_and_both_if_both_are_said() {
+        let directions = |words: &[&str]| {
+            let options = parse(words).options().unwrap();
+            (options.send.is_some(), options.publish.is_some())
+        };
+        let root = ["--root", "/tmp"];
+        assert_eq!(directions(&root), (true, false));
+        assert_eq!(directions(&[&root[..], &["--publish"]].concat()), (false, true));
+        assert_eq!(directions(&[&root[..], &["--publish", "--send"]].concat()), (true, true));
+        assert!(Cli::try_parse_from(["scanhub-bridge", "--send"]).is_err());
+    }
+}

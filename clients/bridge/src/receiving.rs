@@ -1,0 +1,204 @@
+//! The way in: what others send is checked against the name that it came under, counted, and published as topics of this
+//! machine. However much comes, what waits is bounded, and the rest is counted. Refuses to know what carries it.
+
+use std::io::{stderr, stdout};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
+use std::time::{Duration, Instant};
+
+use lan::address::{Address, LIVE, PREFIX, live};
+use schema::datagram::{Datagram, HEAD, MAC};
+use schema::{Failure, Topic};
+use verbs::network::{End, Origin, Output, Reception, Wanted, Words, now};
+
+use crate::PublishOptions;
+use crate::engine::{Connection, Ear, Engine};
+
+/// What was heard.
+enum Heard {
+    /// A payload under a name.
+    Sample(Box<str>, Vec<u8>),
+    /// A sensor came.
+    Live(Box<str>),
+}
+
+/// What comes in, between the threads of the engine and the one that takes it.
+#[derive(Clone)]
+struct Inlet {
+    to: SyncSender<Heard>,
+    counts: Arc<Counts>,
+}
+
+/// What was refused before it was looked at.
+#[derive(Default)]
+struct Counts {
+    /// Longer than a sample can be, or no payload.
+    long: AtomicU64,
+    /// Came faster than it could be taken.
+    overrun: AtomicU64,
+}
+
+/// So much may wait: 32 MB of the longest samples, a second of many sensors.
+const WAITING: usize = 512;
+/// The longest sample in one piece, in bytes.
+const LONGEST: usize = HEAD + u16::MAX as usize + MAC;
+/// The longest name that is looked at; ours have 56 bytes at most.
+const LONGEST_NAME: usize = 128;
+/// What is taken before anything else has its turn.
+const TURN: usize = 64;
+/// So often it is looked whether something is due.
+const LOOK_EVERY: Duration = Duration::from_millis(100);
+/// The most sensors that are asked for their announcement in a second: whoever can connect can say that they came.
+const ASKED: usize = 64;
+
+/// Takes what comes until it `is_over`; the account is told then and whenever `tell` is set.
+pub(crate) fn run(
+    options: &PublishOptions,
+    json: bool,
+    connection: &Connection,
+    tell: &AtomicBool,
+    is_over: &AtomicBool,
+) -> Result<(), End> {
+    let (mut out, mut notes) = (stdout(), stderr());
+    let wanted = Wanted {
+        topics: Topic::ALL.to_vec(),
+        heard: Topic::ALL.to_vec(),
+        names: &options.names,
+        hubs: &options.hubs,
+        key: None,
+        state: None,
+        publish: Some(&options.domain),
+        limits: options.limits,
+        stats: true,
+    };
+    let reception =
+        Reception::open(wanted, json, Words::BRIDGE, Output::new(&mut out), Output::new(&mut notes))?;
+    let Some(engine) = connection.engine(is_over) else { return Ok(()) };
+    let (to, inbox) = sync_channel(WAITING);
+    let inlet = Inlet { to, counts: Arc::default() };
+    let _ears = inlet.listen(engine)?;
+    let mut receiving =
+        Receiving { reception, engine, connection, inlet, foreign: 0, asked: 0, second: Instant::now() };
+    receiving.run(&inbox, tell, is_over)
+}
+
+impl Inlet {
+    fn listen(&self, engine: &Engine) -> Result<[Ear; 2], Failure> {
+        let (samples, tokens) = (self.clone(), self.clone());
+        Ok([
+            engine.subscribe(&format!("{PREFIX}/*/*/*"), LONGEST, move |key, payload| {
+                samples.take(key, payload)
+            })?,
+            engine.watch(&format!("{PREFIX}/*/*/{LIVE}"), move |key| {
+                if key.len() <= LONGEST_NAME {
+                    tokens.put(Heard::Live(key.into()));
+                }
+            })?,
+        ])
+    }
+
+    fn take(&self, key: &str, payload: Option<Vec<u8>>) {
+        match payload.filter(|_| key.len() <= LONGEST_NAME) {
+            Some(payload) => self.put(Heard::Sample(key.into(), payload)),
+            None => _ = self.counts.long.fetch_add(1, Ordering::Relaxed),
+        }
+    }
+
+    /// Nobody waits: whoever sends more than can be taken delays nobody but himself.
+    fn put(&self, heard: Heard) {
+        if self.to.try_send(heard).is_err() {
+            self.counts.overrun.fetch_add(1, Ordering::Relaxed);
+        }
+    }
+}
+
+struct Receiving<'a> {
+    reception: Reception<'a>,
+    engine: &'a Engine,
+    connection: &'a Connection,
+    inlet: Inlet,
+    /// What came under a name that is not its own.
+    foreign: u64,
+    /// Sensors that were asked for in this second.
+    asked: usize,
+    second: Instant,
+}
+
+impl Receiving<'_> {
+    fn run(&mut self, inbox: &Receiver<Heard>, tell: &AtomicBool, is_over: &AtomicBool) -> Result<(), End> {
+        self.reception.begin()?;
+        while !is_over.load(Ordering::Relaxed) {
+            let more = self.take(inbox)?;
+            self.reception.wake();
+            self.reception.look(Instant::now(), more)?;
+            if tell.swap(false, Ordering::Relaxed) {
+                self.tell()?;
+            }
+        }
+        self.tell()
+    }
+
+    /// Takes what waits, up to a turn; whether there may be more.
+    fn take(&mut self, inbox: &Receiver<Heard>) -> Result<bool, End> {
+        let mut next = inbox.recv_timeout(LOOK_EVERY).ok();
+        for _ in 0..TURN {
+            match next.take().or_else(|| inbox.try_recv().ok()) {
+                Some(Heard::Sample(key, payload)) => self.sample(&key, &payload)?,
+                Some(Heard::Live(key)) => self.came(&key)?,
+                None => return Ok(false),
+            }
+        }
+        Ok(true)
+    }
+
+    fn sample(&mut self, key: &str, payload: &[u8]) -> Result<(), End> {
+        let peers = self.reception.incoming().peers();
+        let is_own = match (Address::parse(key), Datagram::read(payload)) {
+            (Some(address), Ok(datagram)) => address.is_of(&datagram, peers),
+            // Why it cannot be read is counted where all such are.
+            (Some(_), Err(_)) => true,
+            (None, _) => false,
+        };
+        if !is_own {
+            self.foreign += 1;
+            return Ok(());
+        }
+        // Zenoh does not say who sent it: who may is up to its access control.
+        self.reception.take(payload, Origin { sender: 0, address: None, arrival: now() })
+    }
+
+    /// Asks a sensor that came for what it said last, rather than waiting until it says it again.
+    fn came(&mut self, key: &str) -> Result<(), End> {
+        let Some((hub, sensor)) = live(key) else {
+            self.foreign += 1;
+            return Ok(());
+        };
+        if self.second.elapsed() >= Duration::from_secs(1) {
+            (self.second, self.asked) = (Instant::now(), 0);
+        }
+        self.asked += 1;
+        if self.asked > ASKED {
+            return Ok(());
+        }
+        // A sample without a name is not published: first the name.
+        for topic in [None, Some(Topic::Status), Some(Topic::Background)] {
+            let inlet = self.inlet.clone();
+            let key = Address { hub, sensor, topic }.to_string();
+            self.engine.ask(&key, LONGEST, move |key, payload| inlet.take(key, payload))?;
+        }
+        Ok(())
+    }
+
+    fn tell(&mut self) -> Result<(), End> {
+        let count = |count: &AtomicU64| count.load(Ordering::Relaxed);
+        let Counts { long, overrun } = &*self.inlet.counts;
+        let others = [
+            ("key", self.foreign),
+            ("long", count(long)),
+            ("overrun", count(overrun)),
+            ("connection", self.connection.refused()),
+        ];
+        self.reception.tell(&others)
+    }
+}

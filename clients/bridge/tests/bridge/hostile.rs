@@ -1,0 +1,131 @@
+//! Peers that mean harm: whatever they send is refused, counted, and takes no memory; who is honest is heard.
+
+use schema::datagram::{HEAD, Head};
+use schema::{State, Status, Topic, Verdict, Zones};
+use zenoh::{Config, Session, Wait};
+
+use crate::testkit::{INT, Program, Sender, TestEnv, number, until};
+use crate::{address, bridge, linked, refused};
+
+const HUB: u64 = 0x5f3a_12bc_00d1_e2f3;
+const FRONT: &str = "scanhub/5f3a12bc00d1e2f3/front";
+
+/// A peer that is connected to the router at this address.
+fn peer(at: &str) -> Session {
+    let mut config = Config::default();
+    for (key, value) in [
+        ("mode", "\"client\""),
+        ("connect/endpoints", &format!("[{at:?}]")),
+        ("scouting/multicast/enabled", "false"),
+    ] {
+        config.insert_json5(key, value).expect("a key of Zenoh");
+    }
+    // It said that it has begun before it listens.
+    let mut session = None;
+    until("the router is there", || {
+        session = zenoh::open(config.clone()).wait().ok();
+        session.is_some()
+    });
+    session.expect("it was waited for")
+}
+
+fn put(session: &Session, key: &str, bytes: &[u8]) {
+    use zenoh::qos::CongestionControl;
+    session.put(key, bytes).congestion_control(CongestionControl::Block).wait().expect("it is connected");
+}
+
+/// Memory of its own, in bytes.
+fn resident(program: &Program) -> u64 {
+    let text = std::fs::read_to_string(format!("/proc/{}/statm", program.pid())).expect("it lives");
+    let pages: u64 = text.split(' ').nth(1).and_then(|word| word.parse().ok()).expect("a number");
+    pages * 4096
+}
+
+#[test]
+fn what_is_wrong_is_refused_and_who_is_honest_is_heard() {
+    let env = TestEnv::new();
+    let at = address("tcp");
+    let (mut here, _) = bridge(&env, &["--listen", &at, "--publish", "--name=robot1=5f3a12bc00d1e2f3"]);
+    let session = peer(&at);
+    linked(&mut here);
+    let mut sender = Sender::new(HUB, 7, 0, "front");
+    let topics = [Topic::Zones, Topic::Status];
+    // Nobody has a name for it before the bridge has heard of it.
+    until("the sensor is published", || {
+        let bytes = sender.announcement(&topics);
+        put(&session, &format!("{FRONT}/announce"), &bytes);
+        here.is_heard(|line| line["kind"] == "published")
+    });
+    let status = sender.make(Topic::Status, &Status { state: State::Streaming as u8, ..Status::default() });
+    put(&session, &format!("{FRONT}/status"), &status);
+    let mut echo = env.echo(&["robot1.front/zones"]);
+    let zones = |sender: &mut Sender, verdict: Verdict| {
+        sender.make(Topic::Zones, &Zones { verdict: verdict as u8, ..Zones::unknown() })
+    };
+    put(&session, &format!("{FRONT}/zones"), &zones(&mut sender, Verdict::Clear));
+    echo.await_line("zones", |line| line["class"] == "zones" && line["verdict"] == "clear");
+    let before = resident(&here);
+
+    let good = zones(&mut sender, Verdict::Stop);
+    let version = [&good[..4], &[9], &good[5..]].concat();
+    let mut broken = good.clone();
+    broken[HEAD] ^= 1;
+    let wrong: [(&str, &[u8], &str); 8] = [
+        ("zones", b"", "short"),
+        ("zones", b"SHUB", "short"),
+        ("zones", &[0; 4096], "magic"),
+        ("zones", &version, "version"),
+        ("zones", &broken, "crc"),
+        ("zones", &good[..good.len() - 1], "length"),
+        ("zones", &[0x55; 200_000], "long"),
+        ("scan", &good, "key"),
+    ];
+    for (topic, bytes, _) in &wrong {
+        (0..50).for_each(|_| put(&session, &format!("{FRONT}/{topic}"), bytes));
+    }
+    // Names of others, names that are none, and a sensor that is called otherwise.
+    for key in [
+        "scanhub/0000000000000001/front/zones",
+        "scanhub/5f3a12bc00d1e2f3/rear/zones",
+        "scanhub/x/front/zones",
+    ] {
+        put(&session, key, &good);
+    }
+    // Ten thousand names, each with a datagram that says the same of itself.
+    for n in 0..10_000_u64 {
+        let topic = Topic::Zones.number();
+        let head = Head { hub: n, epoch: 1, topic, revision: 1, ..Head::default() };
+        let mut buffer = [0; 100];
+        put(&session, &format!("scanhub/{n:016x}/front/zones"), head.seal(&mut buffer, 12).expect("it fits"));
+    }
+    // A flood of what nobody can take so fast.
+    for _ in 0..20_000 {
+        put(&session, &format!("{FRONT}/zones"), &broken);
+    }
+    // Who is honest goes on, and announces: it sent for less than a second, and had to make room for others.
+    until("who is honest is heard", || {
+        put(&session, &format!("{FRONT}/announce"), &sender.announcement(&topics));
+        put(&session, &format!("{FRONT}/zones"), &zones(&mut sender, Verdict::Stop));
+        echo.is_heard(|line| line["class"] == "zones" && line["verdict"] == "stop")
+    });
+    let grown = resident(&here).saturating_sub(before);
+    assert!(grown < 64 << 20, "{grown} bytes more");
+    let outcome = here.end(INT);
+    let overrun = refused(&outcome, "overrun");
+    for (_, _, reason) in wrong {
+        assert!(refused(&outcome, reason) > 0, "{reason}: {outcome}");
+    }
+    assert!(refused(&outcome, "key") >= 50 || overrun > 0, "{outcome}");
+    let sum: u64 = ["short", "magic", "version", "crc", "length", "long", "key", "capacity", "overrun"]
+        .iter()
+        .map(|reason| refused(&outcome, reason))
+        .sum();
+    assert!(sum >= 20_400, "{sum}: {outcome}");
+    let published = outcome.of_class("bridge_published");
+    assert_eq!(
+        published.last().expect("an account")["sensors"].as_array().map(Vec::len),
+        Some(1),
+        "{outcome}"
+    );
+    assert_eq!(number(published.last().expect("an account"), "loan_failed"), 0);
+}

@@ -1,0 +1,134 @@
+//! Two machines and a bridge on each: what the hub of one publishes is on the other.
+
+use std::fs;
+use std::process::Command;
+
+use serde_json::Value;
+
+use crate::testkit::{INT, TestEnv, number, until};
+use crate::{NO_FLAGS, address, agree, bridge, linked, refused};
+
+/// By the number of the scan, what `name` saw.
+fn scans(env: &TestEnv, name: &str, count: &str) -> Vec<(u64, Value)> {
+    let outcome = env.run(&["echo", name, "--json", "-n", count, "--timeout", "20s"]);
+    assert_eq!(outcome.code, Some(0), "{outcome}");
+    outcome.of_class("scan").iter().map(|line| (number(line, "seq"), line["ranges"].clone())).collect()
+}
+
+#[test]
+fn what_a_hub_publishes_is_on_the_other_machine_and_nothing_is_lost() {
+    let (robot, desk) = (TestEnv::new(), TestEnv::new());
+    let _sensor = robot.simulator(&["front"], NO_FLAGS);
+    let at = address("tcp");
+    let (mut there, id) = bridge(&robot, &["--listen", &at]);
+    let (mut here, _) =
+        bridge(&desk, &["--connect", &at, "--publish", "--hub=robot1", &format!("--name=robot1={id}")]);
+    linked(&mut here);
+    linked(&mut there);
+    let hub = robot.hub(&[robot.link("front")]);
+    let line = here.await_line("a sensor", |line| line["kind"] == "published");
+    assert_eq!(line["sensor"], "robot1.front");
+
+    // The same scans on both sides.
+    let mut far = desk.echo(&["robot1.front/scan"]);
+    let near = scans(&robot, "front/scan", "20");
+    let last = near.last().expect("scans").0;
+    far.await_line("the last of them", |line| line["class"] == "scan" && number(line, "seq") >= last);
+    let far = far.end(INT);
+    let far = far.of_class("scan");
+    let both: Vec<_> = far.iter().map(|line| (number(line, "seq"), &line["ranges"])).collect();
+    // Where the machine is busy a newer scan takes the place of one that waits.
+    let pairs =
+        near.iter().filter_map(|(seq, ranges)| Some((ranges, both.iter().find(|far| far.0 == *seq)?.1)));
+    let pairs: Vec<_> = pairs.collect();
+    assert!(pairs.len() > 5 && pairs.iter().all(|(near, far)| near == far), "{} scans", pairs.len());
+
+    // Who comes late has state and background all the same, and at once.
+    let late = TestEnv::new();
+    let (mut latest, _) = bridge(&late, &["--connect", &at, "--publish"]);
+    latest.await_line("a sensor", |line| line["kind"] == "published");
+    let own = format!("{id}.front");
+    late.await_info(&own, |info| info["state"] == "streaming");
+    let background = late.run(&["echo", &format!("{own}/background"), "--json", "-n1", "--timeout=20s"]);
+    assert_eq!(background.code, Some(0), "{background}");
+
+    // The hub goes: zones are unknown, and its bridge stays for the next one.
+    let mut zones = desk.echo(&["robot1.front/zones"]);
+    hub.end(INT);
+    zones.await_line("nothing is known", |line| line["class"] == "zones" && line["verdict"] == "unknown");
+    let (sent, latest) = (there.end(INT), latest.end(INT));
+    let received = here.end(INT);
+    assert_eq!((sent.code, received.code, latest.code), (Some(0), Some(0), Some(0)), "{sent}{received}");
+    assert_eq!(agree(&sent, &received), 0, "{received}");
+    for reason in ["crc", "payload", "key", "long", "overrun", "twin"] {
+        assert_eq!((refused(&received, reason), refused(&latest, reason)), (0, 0), "{reason}: {received}");
+    }
+}
+
+#[test]
+fn both_directions_go_through_one_connection() {
+    let (left, right) = (TestEnv::new(), TestEnv::new());
+    let (_one, _other) = (left.simulator(&["front"], NO_FLAGS), right.simulator(&["rear"], NO_FLAGS));
+    let (_left_hub, _right_hub) = (left.hub(&[left.link("front")]), right.hub(&[right.link("rear")]));
+    let at = address("tcp");
+    let (mut one, left_id) = bridge(&left, &["--listen", &at, "--publish", "--send"]);
+    let (mut other, right_id) = bridge(&right, &["--connect", &at, "--publish", "--send"]);
+    let published = |line: &Value| line["kind"] == "published";
+    assert_eq!(one.await_line("its sensor", published)["sensor"], format!("{right_id}.rear"));
+    assert_eq!(other.await_line("its sensor", published)["sensor"], format!("{left_id}.front"));
+    until("both have both", || left.subscribers_of_all() == 2 && right.subscribers_of_all() == 2);
+    let (one, other) = (one.end(INT), other.end(INT));
+    // What came is not sent back.
+    for outcome in [&one, &other] {
+        let published = outcome.of_class("bridge_published");
+        assert_eq!(
+            published.last().expect("an account")["sensors"].as_array().map(Vec::len),
+            Some(1),
+            "{outcome}"
+        );
+    }
+}
+
+impl TestEnv {
+    /// How many sensors have topics here.
+    fn subscribers_of_all(&self) -> usize {
+        let topics = self.run(&["list", "--json"]).of_class("topic");
+        let mut sensors: Vec<_> = topics.iter().map(|line| line["sensor"].to_string()).collect();
+        sensors.sort();
+        sensors.dedup();
+        sensors.len()
+    }
+}
+
+#[test]
+fn without_the_program_it_is_said_how_to_get_it() {
+    let env = TestEnv::new();
+    let program = env.command(&["bridge", "--connect=tcp/127.0.0.1:1"]).get_program().to_owned();
+    let alone = env.path("scanhub");
+    fs::copy(program, &alone).expect("can be copied");
+    let outcome = Command::new(&alone).arg("bridge").env("PATH", env.path("nothing")).output().expect("runs");
+    let errors = String::from_utf8_lossy(&outcome.stderr);
+    assert_eq!(outcome.status.code(), Some(78), "{errors}");
+    assert!(errors.contains("cargo install --path clients/bridge"), "{errors}");
+}
+
+#[test]
+fn what_cannot_be_is_refused_before_anything_begins() {
+    let env = TestEnv::new();
+    let code = |flags: &[&str]| env.run(&[&["bridge", "--json"], flags].concat()).code;
+    assert_eq!(code(&[]), Some(78), "nobody is named");
+    assert_eq!(code(&["--connect=nonsense"]), Some(78));
+    assert_eq!(code(&["--connect=tcp/127.0.0.1:1", "--topic=front/scam"]), Some(2));
+    assert_eq!(code(&["--connect=tcp/127.0.0.1:1", "--publish", "--hub=robot1"]), Some(78));
+    assert_eq!(code(&["--connect=tcp/127.0.0.1:1", "--config=/nowhere"]), Some(66));
+    assert_eq!(
+        code(&["--connect=tcp/127.0.0.1:1", &format!("--config={}", env.file("c", "{ mode: 'king' }"))]),
+        Some(78)
+    );
+    assert_eq!(code(&["--no-such-flag"]), Some(2));
+    let taken = std::net::TcpListener::bind("127.0.0.1:0").expect("a port");
+    let port = taken.local_addr().expect("bound").port();
+    let outcome = env.run(&["bridge", "--json", &format!("--listen=tcp/127.0.0.1:{port}")]);
+    assert_eq!(outcome.code, Some(78), "{outcome}");
+    assert!(outcome.to_string().contains("in use"), "{outcome}");
+}

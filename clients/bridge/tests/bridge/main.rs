@@ -1,0 +1,82 @@
+//! The program `scanhub-bridge` from outside, as `scanhub bridge` runs it: a hub's topics on another machine, over routers
+//! that come and go, links that are slow, and among peers that mean harm. Routers are bridges that listen.
+
+#[path = "../../../../tests/testkit/mod.rs"]
+mod testkit;
+
+mod access;
+mod hostile;
+mod machines;
+mod page;
+mod routers;
+mod slow;
+
+use std::collections::BTreeMap;
+use std::net::TcpListener;
+
+use serde_json::Value;
+use testkit::{Outcome, Program, TestEnv, number};
+
+/// A simulator whose sensors are as usual.
+const NO_FLAGS: &[&str] = &[];
+
+/// An address on the loopback that nobody listens at.
+fn address(protocol: &str) -> String {
+    let port =
+        TcpListener::bind("127.0.0.1:0").and_then(|socket| socket.local_addr()).expect("a port").port();
+    format!("{protocol}/127.0.0.1:{port}")
+}
+
+/// A bridge with these flags that has begun, and what it is called if it sends.
+fn bridge(env: &TestEnv, flags: &[&str]) -> (Program, String) {
+    let mut program = env.start(&[&["bridge", "--json"], flags].concat());
+    let line = program.await_line("its begin", |line| line["class"] == "bridge_ready");
+    (program, line["hub"].as_str().unwrap_or_default().to_owned())
+}
+
+/// Waits until somebody is connected to it.
+fn linked(program: &mut Program) {
+    program.await_line("a link", |line| line["class"] == "bridge_link" && line["state"] == "up");
+}
+
+/// A router that knows nothing of sensors.
+fn router(env: &TestEnv, listen: &str, connect: &[&str]) -> Program {
+    let listen = format!("--listen={listen}");
+    let connect: Vec<_> = connect.iter().map(|address| format!("--connect={address}")).collect();
+    let flags: Vec<_> = std::iter::once(listen.as_str()).chain(connect.iter().map(String::as_str)).collect();
+    bridge(env, &flags).0
+}
+
+/// By sensor and topic, the last value of each of these keys that a bridge accounted.
+fn account(outcome: &Outcome, keys: &[&str]) -> BTreeMap<String, Vec<u64>> {
+    let mut rows = BTreeMap::new();
+    for line in outcome.of_class("bridge").iter().filter(|line| !line[keys[0]].is_null()) {
+        let name = format!("{}/{}", text(&line["sensor"]), text(&line["topic"]));
+        rows.insert(name, keys.iter().map(|key| line[key].as_u64().unwrap_or_default()).collect());
+    }
+    rows
+}
+
+/// What was refused for this reason, as last accounted.
+fn refused(outcome: &Outcome, reason: &str) -> u64 {
+    outcome.of_class("bridge_refused").last().map_or(0, |line| number(line, reason))
+}
+
+fn text(value: &Value) -> &str {
+    value.as_str().unwrap_or_default()
+}
+
+/// Nothing that was sent is lost or counted twice: of each topic as much was received and lost as was sent.
+fn agree(sent: &Outcome, received: &Outcome) -> u64 {
+    let there = account(sent, &["sent", "replaced"]);
+    let here = account(received, &["received", "lost", "replaced"]);
+    assert!(there.len() > 4 && there.keys().eq(here.keys()), "{there:?}\n{here:?}");
+    let mut lost = 0;
+    for (name, row) in &there {
+        assert_eq!(row[0], here[name][0] + here[name][1], "{name}: {there:?}\n{here:?}");
+        // Announcements do not tell of themselves.
+        assert!(name.ends_with("/announce") || row[1] == here[name][2], "{name}: {there:?}\n{here:?}");
+        lost += here[name][1];
+    }
+    lost
+}

@@ -1,0 +1,50 @@
+//! The commands of docs/bridge.md run as they stand there, but for names and ports of this machine.
+
+use std::fs;
+use std::path::Path;
+use std::process::Command;
+
+use crate::bridge;
+use crate::testkit::{INT, TestEnv};
+
+/// The blocks of the page in this language.
+fn blocks(language: &str) -> Vec<String> {
+    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../docs/bridge.md");
+    let page = fs::read_to_string(path).expect("the page is there");
+    let begin = format!("```{language}\n");
+    page.split(&begin).skip(1).filter_map(|rest| Some(rest.split_once("\n```")?.0.to_owned())).collect()
+}
+
+#[test]
+fn the_commands_of_the_page_run() {
+    let env = TestEnv::new();
+    let [configuration] = &blocks("json5")[..] else { panic!("one configuration") };
+    let mut count = 0;
+    let (plain, safe) = (crate::address("tcp"), crate::address("tls"));
+    let mut running = Vec::new();
+    for line in blocks("sh").iter().flat_map(|block| block.lines()) {
+        if let Some(words) = line.strip_prefix("openssl ") {
+            let output = Command::new("openssl").args(words.split(' ')).current_dir(env.path("")).output();
+            let output = output.expect("openssl is installed");
+            assert!(output.status.success(), "{line}: {}", String::from_utf8_lossy(&output.stderr));
+        } else if let Some(words) = line.strip_prefix("scanhub bridge ") {
+            let configured =
+                configuration.replace('"', "'").replace(": 'ca", &format!(": '{}/ca", env.word("")));
+            let configured = configured.replace(": 'robot", &format!(": '{}/robot", env.word("")));
+            let words = words.replace("tcp/0.0.0.0:7447", &plain).replace("tcp/robot:7447", &plain);
+            let words = words.replace("tls/0.0.0.0:7447", &safe);
+            let words = words.replace("robot.json5", &env.file("robot.json5", configured));
+            let place = TestEnv::new();
+            running.push((bridge(&place, &words.split(' ').collect::<Vec<_>>()).0, place));
+        } else {
+            panic!("nobody runs {line}");
+        }
+        count += 1;
+    }
+    assert!(count > 5, "{count}");
+    crate::linked(&mut running[1].0);
+    for (program, _place) in running {
+        let outcome = program.end(INT);
+        assert_eq!(outcome.code, Some(0), "{outcome}");
+    }
+}

@@ -1,0 +1,67 @@
+//! Routers between the machines: two in a row, and one that is killed and comes back.
+
+use std::time::{Duration, Instant};
+
+use serde_json::Value;
+
+use crate::testkit::{INT, KILL, TestEnv};
+use crate::{NO_FLAGS, address, agree, bridge, linked, router};
+
+fn is_link(line: &Value, state: &str) -> bool {
+    line["class"] == "bridge_link" && line["state"] == state
+}
+
+#[test]
+fn a_router_that_is_killed_and_back_loses_nothing_that_is_not_told() {
+    let (robot, desk, first, second) = (TestEnv::new(), TestEnv::new(), TestEnv::new(), TestEnv::new());
+    let (near, far) = (address("tcp"), address("tcp"));
+    let mut killed = router(&first, &near, &[]);
+    let _second = router(&second, &far, &[&near]);
+    let _sensor = robot.simulator(&["front"], NO_FLAGS);
+    let (mut there, id) = bridge(&robot, &["--connect", &near]);
+    let (mut here, _) = bridge(&desk, &["--connect", &far, "--publish", &format!("--name=robot1={id}")]);
+    linked(&mut there);
+    linked(&mut here);
+    let _hub = robot.hub(&[robot.link("front")]);
+    here.await_line("a sensor", |line| line["kind"] == "published");
+    let mut local = robot.echo(&["front/scan"]);
+    let mut remote = desk.echo(&["robot1.front/zones"]);
+    let mut longest = Duration::ZERO;
+    for _ in 0..3 {
+        let is_zones =
+            |line: &Value| line["class"] == "zones" && line["stale"] != true && line["verdict"] != "unknown";
+        remote.await_line("zones", is_zones);
+        killed.end(KILL);
+        there.await_line("the end of the link", |line| is_link(line, "down"));
+        killed = router(&first, &near, &[]);
+        let back = Instant::now();
+        there.await_line("the link", |line| is_link(line, "up"));
+        longest = longest.max(back.elapsed());
+        remote.await_line("zones", is_zones);
+    }
+    assert!(longest < Duration::from_secs(5), "{longest:?}");
+    local.await_line("a scan", |line| line["class"] == "scan");
+    let local = local.end(INT);
+    assert_eq!(local.of_class("summary")[0]["lost"], 0, "the hub's own consumers: {local}");
+    let sent = there.end(INT);
+    // The last announcement goes over two routers.
+    let announced = account_of_announcements(&sent);
+    here.await_line("the last announcement", |line| {
+        line["class"] == "bridge"
+            && line["topic"] == "announce"
+            && line["received"].as_u64() >= Some(1)
+            && line["received"]
+                .as_u64()
+                .zip(line["lost"].as_u64())
+                .is_some_and(|(received, lost)| received + lost >= announced)
+    });
+    agree(&sent, &here.end(INT));
+}
+
+/// How many announcements were sent.
+fn account_of_announcements(sent: &crate::testkit::Outcome) -> u64 {
+    crate::account(sent, &["sent"])
+        .iter()
+        .find(|(name, _)| name.ends_with("/announce"))
+        .map_or(0, |(_, row)| row[0])
+}

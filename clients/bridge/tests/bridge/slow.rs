@@ -1,0 +1,59 @@
+//! A link that is slower than what is sent: what arrives is new, what was replaced or lost is told exactly, and nobody on
+//! the robot waits.
+
+use std::process::Command;
+
+use serde_json::Value;
+
+use crate::testkit::{INT, TestEnv, in_a_network, number, skip, wall_ns};
+use crate::{NO_FLAGS, account, address, agree, bridge, linked};
+
+/// Lets no more than 0.5 Mbit/s through the loopback, whose packets are those of a network.
+fn slow_down() -> bool {
+    let run = |program: &str, words: &str| {
+        Command::new(program).args(words.split(' ')).status().is_ok_and(|status| status.success())
+    };
+    run("ip", "link set lo mtu 1500")
+        && run("tc", "qdisc add dev lo root tbf rate 500kbit burst 5000 latency 200ms")
+}
+
+#[test]
+fn on_a_slow_link_the_newest_comes_first() {
+    in_a_network("slow::on_a_slow_link_the_newest_comes_first", || {
+        let (robot, desk) = (TestEnv::new(), TestEnv::new());
+        let _sensors = robot.simulator(&["front", "rear"], NO_FLAGS);
+        if !slow_down() {
+            return skip("tc", "the kernel has no tbf");
+        }
+        let at = address("tcp");
+        let (mut there, id) = bridge(&robot, &["--listen", &at, "--topic=*/*"]);
+        let (mut here, _) = bridge(&desk, &["--connect", &at, "--publish", &format!("--name=robot1={id}")]);
+        linked(&mut there);
+        linked(&mut here);
+        let _hub = robot.hub(&[robot.link("front"), robot.link("rear")]);
+        here.await_line("a sensor", |line| line["kind"] == "published");
+        let mut local = robot.echo(&["front/scan"]);
+        let mut remote = desk.echo(&["robot1.front/scan"]);
+        let mut ages: Vec<u64> = Vec::new();
+        while ages.len() < 60 {
+            let line = remote.await_line("a scan", |line: &Value| line["class"] == "scan");
+            ages.push(wall_ns().saturating_sub(number(&line, "wall_ns")) / 1_000_000);
+        }
+        // The first ones waited for the connection.
+        ages.drain(..20);
+        ages.sort_unstable();
+        assert!(ages[ages.len() / 2] < 1500, "ms: {ages:?}");
+        local.await_line("a scan", |line| line["class"] == "scan");
+        let local = local.end(INT);
+        assert_eq!(local.of_class("summary")[0]["lost"], 0, "{local}");
+        let sent = there.end(INT);
+        let received = {
+            here.await_line("what is under way", |line| line["class"] == "bridge_published");
+            std::thread::sleep(std::time::Duration::from_secs(3));
+            here.end(INT)
+        };
+        agree(&sent, &received);
+        let replaced: u64 = account(&sent, &["sent", "replaced"]).values().map(|row| row[1]).sum();
+        assert!(replaced > 100, "it was not slow: {sent}");
+    });
+}

@@ -1,0 +1,208 @@
+//! The bridge as a node of ROS 2, judged by other people's implementations of the wire (PyPI's zenoh-ros2-sdk and rosbags, see
+//! ros2.py): two simulated sensors, their hub, the bridge as a router, and the hub's own consumers beside it.
+
+use std::fs::{self, DirBuilder, File};
+use std::io::{BufRead, BufReader};
+use std::net::TcpListener;
+use std::os::unix::fs::DirBuilderExt;
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Stdio};
+use std::thread;
+use std::time::{Duration, Instant};
+
+use serde_json::Value;
+
+const BRIDGE: &str = env!("CARGO_BIN_EXE_scanhub-bridge");
+/// The program beside the bridge; built if it is not there.
+fn scanhub() -> PathBuf {
+    let program = Path::new(BRIDGE).with_file_name("scanhub");
+    if !program.is_file() {
+        let built = Command::new(env!("CARGO")).args(["build", "--quiet", "--package=scanhub"]).status();
+        assert!(built.is_ok_and(|status| status.success()), "cargo cannot build scanhub");
+    }
+    program
+}
+
+/// A directory of this test, with a domain in it; removed at the end.
+struct Place(PathBuf);
+
+impl Place {
+    fn new(name: &str) -> Place {
+        let path = std::env::temp_dir().join(format!("scanhub-ros2-{}-{name}", std::process::id()));
+        for part in ["", "root", "state"] {
+            DirBuilder::new().mode(0o700).create(path.join(part)).expect("a new directory");
+        }
+        Place(path)
+    }
+
+    fn path(&self, name: &str) -> String {
+        self.0.join(name).display().to_string()
+    }
+
+    /// A program in the domain, which ends with the test.
+    fn start(&self, program: &Path, arguments: &[&str], out: Stdio) -> Running {
+        let mut command = Command::new(program);
+        command.args(arguments).args(["--domain", "ros2", "--root", &self.path("root")]);
+        command.env("STATE_DIRECTORY", self.path("state")).env_remove("ROS_DOMAIN_ID");
+        command.stdin(Stdio::null()).stdout(out).stderr(Stdio::null());
+        Running(command.spawn().expect("a program"))
+    }
+}
+
+impl Drop for Place {
+    fn drop(&mut self) {
+        let _ = fs::remove_dir_all(&self.0);
+    }
+}
+
+struct Running(Child);
+
+impl Running {
+    /// Ends it by a signal; returns its exit code.
+    fn end(mut self) -> Option<i32> {
+        let id = self.0.id().to_string();
+        assert!(Command::new("kill").args(["-TERM", &id]).status().is_ok_and(|status| status.success()));
+        self.0.wait().ok().and_then(|status| status.code())
+    }
+}
+
+impl Drop for Running {
+    fn drop(&mut self) {
+        let _ = self.0.kill();
+        let _ = self.0.wait();
+    }
+}
+
+/// Says why a test is left out, unless what `need`s it must be there.
+fn skip(need: &str, why: &str) {
+    let required = std::env::var("SCANHUB_REQUIRE").unwrap_or_default();
+    assert!(!required.split(',').any(|name| name == need), "{need} is required: {why}");
+    eprintln!("skipped: {why}");
+}
+
+/// A Python with others' implementations of the wire.
+fn python() -> Option<PathBuf> {
+    let made = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../target/venv/bin/python");
+    let python = std::env::var_os("SCANHUB_PYTHON").map_or(made, PathBuf::from);
+    let has_all = Command::new(&python).args(["-c", "import zenoh_ros2_sdk, rosbags"]).output();
+    has_all.is_ok_and(|outcome| outcome.status.success()).then_some(python)
+}
+
+fn free_port() -> u16 {
+    TcpListener::bind("127.0.0.1:0").and_then(|socket| socket.local_addr()).expect("a port").port()
+}
+
+#[test]
+fn others_find_every_topic_and_decode_every_message() {
+    let Some(python) = python() else {
+        return skip("python-packages", "there is no zenoh-ros2-sdk: .ci/run installs it");
+    };
+    let scanhub = scanhub();
+    let place = Place::new("graph");
+    let (front, rear, port) = (place.path("front"), place.path("rear"), free_port().to_string());
+    let simulate = ["simulate", "--port", &front, "--port", &rear, "--baud=500000", "--seed=5"];
+    let _simulator = place.start(&scanhub, &simulate, Stdio::null());
+    let [front, rear] = [format!("front={front}"), format!("rear={rear}")];
+    let run = ["run", "--link", &front, "--link", &rear, "--set=link.front.pose.x=0.3"];
+    let _hub = place.start(&scanhub, &run, Stdio::null());
+    let echoes = ["front", "rear"].map(|sensor| {
+        let path = place.path(&format!("{sensor}.jsonl"));
+        let file = File::create(&path).expect("a file");
+        (place.start(&scanhub, &["echo", &format!("{sensor}/scan"), "--json"], file.into()), path)
+    });
+    let listen = format!("--listen=tcp/127.0.0.1:{port}");
+    let flags = [&listen, "--ros2", "--domain-id=42", "--topic-prefix=robot1", "--frame=rear=back"];
+    let bridge = place.start(Path::new(BRIDGE), &flags, Stdio::null());
+    let deadline = Instant::now() + Duration::from_secs(60);
+    while !echoes.iter().all(|(_, path)| fs::metadata(path).is_ok_and(|file| file.len() > 0)) {
+        assert!(Instant::now() < deadline, "no scans");
+        thread::sleep(Duration::from_millis(50));
+    }
+    let mut judge = Command::new(python);
+    judge.args(["-B", concat!(env!("CARGO_MANIFEST_DIR"), "/tests/ros2.py"), &port, "42", "5"]);
+    let outcome = judge.args(echoes.iter().map(|(_, path)| path)).output().expect("Python");
+    let (said, why) = (String::from_utf8_lossy(&outcome.stdout), String::from_utf8_lossy(&outcome.stderr));
+    assert!(outcome.status.success(), "{said}{why}");
+    let said: Value = serde_json::from_str(said.lines().last().unwrap_or_default()).expect("an object");
+    check_scans(&said, "front");
+    check_scans(&said, "rear");
+    check_graph(&said);
+    check_others(&said);
+    assert_eq!(bridge.end(), Some(0));
+}
+
+/// All topics are there as a ROS node would have made them.
+fn check_graph(said: &Value) {
+    let topics = said["topics"].as_object().expect("topics");
+    let words = ["foreground", "marks", "scan", "verdict", "zones"];
+    let of = |sensor: &str| words.map(|word| format!("/robot1/{sensor}/{word}")).to_vec();
+    let mut wanted = [of("front"), of("rear")].concat();
+    wanted.extend(["/diagnostics".to_owned(), "/tf_static".to_owned()]);
+    wanted.sort();
+    assert_eq!(topics.keys().cloned().collect::<Vec<_>>(), wanted);
+    for (name, topic) in topics {
+        assert_eq!((&topic["hash"], &topic["hash"]), (&topic["rosbags_hash"], &topic["sdk_hash"]), "{name}");
+        assert_eq!((topic["node"].as_str(), topic["namespace"].as_str()), (Some("scanhub"), Some("/")));
+        let qos = ["reliability", "durability"].map(|key| topic[key].as_str().unwrap_or_default());
+        let wanted = match name.as_str() {
+            "/diagnostics" => (["RELIABLE", "VOLATILE"], 10),
+            "/tf_static" => (["RELIABLE", "TRANSIENT_LOCAL"], 1),
+            _ => (["BEST_EFFORT", "VOLATILE"], 5),
+        };
+        assert_eq!((qos, topic["depth"].as_i64()), (wanted.0, Some(wanted.1)), "{name}");
+    }
+}
+
+/// What was decoded is what was measured, and nearly all of it came: best effort leaves out what a busy machine is late with.
+fn check_scans(said: &Value, sensor: &str) {
+    let scans = &said["scans"][format!("/robot1/{sensor}/scan")];
+    let number = |key: &str| scans[key].as_u64().unwrap_or_default();
+    assert!(number("decoded") > 50, "{sensor}: {scans}");
+    assert_eq!(number("matched"), number("decoded"), "{sensor}: {scans}");
+    assert_eq!(scans["ranges_equal"], true, "{sensor}: {scans}");
+    assert!(scans["angles"].as_f64().is_some_and(|apart| apart < 1e-6), "{sensor}: {scans}");
+    let frame = if sensor == "rear" { "back" } else { "front" };
+    assert_eq!((&scans["frames"], &scans["beams"]), (&[frame].as_slice().into(), &[361].as_slice().into()));
+    // Neighbouring beams of half a degree are of two turns.
+    assert_eq!(scans["time_increment"], Value::from([0.0].as_slice()), "{sensor}");
+    let lost = number("published") - number("matched");
+    assert!(100 * lost <= number("published") + 100, "{sensor}: {lost} lost: {scans}");
+}
+
+/// Every other topic said something, and what it should.
+fn check_others(said: &Value) {
+    for (name, count) in said["heard"].as_object().expect("counts") {
+        assert!(count.as_u64() > Some(0), "{name}: {said:#}");
+    }
+    let attachments = &said["attachments"];
+    assert_eq!((&attachments["ascend"], &attachments["gids"]), (&true.into(), &1.into()), "{attachments}");
+    assert_eq!(attachments["length"], Value::from([33].as_slice()));
+    let frames = serde_json::json!([["base_link", "front"], ["base_link", "back"]]);
+    let mut got = said["frames"].as_array().cloned().unwrap_or_default();
+    got.sort_by_key(|pair| pair[1] != "front");
+    assert_eq!(Value::from(got), frames);
+    for sensor in ["front", "rear"] {
+        let line = serde_json::json!([format!("scanhub: {sensor}"), 0, "streaming"]);
+        assert!(said["diagnostics"].as_array().is_some_and(|all| all.contains(&line)), "{said:#}");
+    }
+}
+
+/// The lines of its page that are ours, on ports of this machine.
+#[test]
+fn the_examples_of_the_page_run() {
+    let page =
+        fs::read_to_string(concat!(env!("CARGO_MANIFEST_DIR"), "/../../docs/ros2.md")).expect("the page");
+    let lines: Vec<_> = page.lines().filter_map(|line| line.strip_prefix("scanhub bridge ")).collect();
+    assert_eq!(lines.len(), 2, "{lines:?}");
+    for (number, line) in lines.into_iter().enumerate() {
+        let place = Place::new(&format!("page{number}"));
+        let line = line.replace("0.0.0.0", "127.0.0.1").replace("7447", &free_port().to_string());
+        let words: Vec<&str> = line.split_whitespace().collect();
+        let mut program = place.start(Path::new(BRIDGE), &words, Stdio::piped());
+        let mut first = String::new();
+        let out = program.0.stdout.take().expect("a pipe");
+        BufReader::new(out).read_line(&mut first).expect("a line");
+        assert!(first.starts_with("bridge"), "{line}: {first:?}");
+        assert_eq!(program.end(), Some(0), "{line}");
+    }
+}

@@ -1,0 +1,236 @@
+//! What is known of the robot and its surroundings: the last sample of each topic of each sensor. Time is an argument.
+
+use schema::{
+    Background, Counter, Foreground, Header, Mark, Marks, Pose, Scan, State, Status, Verdict, Zones,
+    is_remote,
+};
+
+use crate::meter::Meter;
+use crate::trouble::{Trouble, trouble};
+use crate::{Point, point_m};
+
+/// All that a picture is made of.
+#[derive(Clone, Debug, Default)]
+pub struct Scene {
+    /// In the order in which they were named, or of the hub.
+    pub sensors: Vec<Sensor>,
+    /// A hub lives.
+    pub hub_lives: bool,
+    /// Its process; 0 unknown, or on another machine.
+    pub hub_pid: u32,
+    /// What it uses, in percent of one processor.
+    pub hub_percent: Option<f64>,
+}
+
+/// What is known of one sensor.
+#[derive(Clone, Debug)]
+pub struct Sensor {
+    /// Its name; a remote one's begins with its machine's.
+    pub name: String,
+    /// How its link is, as it was said last.
+    pub status: Option<Status>,
+    /// Where it sits; at the robot's centre as long as that is not told.
+    pub pose: Pose,
+    /// The last scan, as long as it is new.
+    pub scan: Option<Box<Scan>>,
+    /// What stands before the background.
+    pub foreground: Option<Box<Foreground>>,
+    /// The reflectors, where the sensor can see such.
+    pub marks: Option<Marks>,
+    /// What it has learned to be always there.
+    pub background: Option<Box<Background>>,
+    /// Unknown in a silence.
+    pub zones: Zones,
+    /// Rate and age of its scans.
+    pub meter: Meter,
+    /// Scans that were sent and not received here.
+    pub lost: u64,
+    /// When the scan is too old to be shown as what is there, in ns of CLOCK_MONOTONIC.
+    old_at_ns: u64,
+}
+
+impl Scene {
+    /// The sensor called `name`, which is known from now on.
+    pub fn sensor(&mut self, name: &str) -> &mut Sensor {
+        let at = self.sensors.iter().position(|sensor| sensor.name == name).unwrap_or_else(|| {
+            self.sensors.push(Sensor::new(name));
+            self.sensors.len() - 1
+        });
+        &mut self.sensors[at]
+    }
+
+    /// The sensors of the robot, or if there are none, all; with their numbers from 0. Those of other machines sit on other
+    /// robots.
+    pub fn robot(&self) -> impl Iterator<Item = (usize, &Sensor)> {
+        let has_own = self.sensors.iter().any(|sensor| !is_remote(&sensor.name));
+        self.sensors.iter().enumerate().filter(move |(_, sensor)| !has_own || !is_remote(&sensor.name))
+    }
+
+    /// Forgets scans that are too old at `now_ns`; whether there were any.
+    pub fn age(&mut self, now_ns: u64) -> bool {
+        let mut any = false;
+        for sensor in &mut self.sensors {
+            if sensor.scan.is_some() && now_ns >= sensor.old_at_ns {
+                (sensor.scan, sensor.foreground, sensor.marks) = (None, None, None);
+                sensor.meter = Meter::default();
+                any = true;
+            }
+        }
+        any
+    }
+
+    /// The hub is gone: all of its data is discarded except for the background, which is only drawn.
+    pub fn hub_gone(&mut self) {
+        (self.hub_lives, self.hub_pid, self.hub_percent) = (false, 0, None);
+        for sensor in &mut self.sensors {
+            let background = sensor.background.take();
+            *sensor =
+                Sensor { pose: sensor.pose, background, lost: sensor.lost, ..Sensor::new(&sensor.name) };
+        }
+    }
+}
+
+impl Sensor {
+    fn new(name: &str) -> Sensor {
+        Sensor {
+            name: name.to_owned(),
+            status: None,
+            pose: Pose::default(),
+            scan: None,
+            foreground: None,
+            marks: None,
+            background: None,
+            zones: Zones::unknown(),
+            meter: Meter::default(),
+            lost: 0,
+            old_at_ns: 0,
+        }
+    }
+
+    /// Takes a scan that arrived at `now_ns`.
+    pub fn take_scan(&mut self, header: &Header, scan: &Scan, now_ns: u64) {
+        self.scan = Some(scan.boxed());
+        self.meter.scan(header, now_ns);
+        self.old_at_ns = now_ns + OLD_NS.max(3000 * u64::from(header.period_us));
+    }
+
+    /// Takes how its link is.
+    pub fn take_status(&mut self, status: &Status) {
+        (self.status, self.pose) = (Some(*status), status.pose);
+    }
+
+    /// What its link is doing, in a word.
+    pub fn state(&self) -> &'static str {
+        match self.status.map(|status| status.state()) {
+            None => "unheard",
+            Some(state) => state.map_or("unknown", State::name),
+        }
+    }
+
+    /// Why nothing comes from it, and what to do about that; nothing as long as its scans come.
+    pub fn trouble(&self) -> Option<Trouble> {
+        self.scan.is_none().then(|| trouble(&self.name, self.status.as_ref()))
+    }
+
+    /// A counter of its link.
+    pub fn count(&self, counter: Counter) -> u64 {
+        self.status.map_or(0, |status| status.counters[counter])
+    }
+
+    /// Its background model is held.
+    pub fn is_frozen(&self) -> bool {
+        self.background.as_ref().is_some_and(|model| model.is_frozen())
+    }
+
+    /// The points of the last scan.
+    pub fn points(&self) -> impl Iterator<Item = Point> {
+        let scan = self.scan.iter();
+        scan.flat_map(|scan| {
+            (0..scan.beams()).filter_map(|beam| {
+                let (x_m, y_m) = point_m(&self.pose, scan.angle(beam), f64::from(scan.distance_mm(beam)?));
+                let is_foreground =
+                    self.foreground.as_ref().is_some_and(|foreground| foreground.contains(beam));
+                Some(Point { x_m, y_m, beam, intensity: scan.intensities().get(beam), is_foreground })
+            })
+        })
+    }
+
+    /// The marks of the last scan in metres in the robot's frame.
+    pub fn mark_points(&self) -> Vec<(f64, f64)> {
+        let pose = self.pose;
+        let marks = self.marks.iter().flat_map(|marks| marks.marks());
+        let angle = |mark: &Mark| (f64::from(mark.angle_mdeg) / 1000.0).to_radians();
+        marks.map(|mark| point_m(&pose, angle(mark), f64::from(mark.range_dmm) / 10.0)).collect()
+    }
+
+    /// Where its background ends, in metres in the robot's frame.
+    pub fn background_points(&self) -> Vec<(f64, f64)> {
+        let Some(model) = &self.background else { return Vec::new() };
+        let pose = self.pose;
+        let taught = |range: &&u16| ![Background::UNTAUGHT, Background::FAR].contains(range);
+        let ranges = model.ranges().iter().enumerate().filter(|(_, range)| taught(range));
+        let points = ranges.map(|(i, range)| {
+            let angle = model.first_angle + i as f64 * model.step;
+            point_m(&pose, angle, f64::from(*range) * f64::from(model.unit_um) / 1000.0)
+        });
+        points.collect()
+    }
+}
+
+/// The verdict over `sensors`, whose it is, and the nearest of all points around the robot's centre in mm; unknown
+/// without any.
+pub fn verdict<'a>(sensors: impl Iterator<Item = &'a Sensor>) -> (Verdict, Option<&'a str>, Option<u32>) {
+    let (mut worst, mut nearest): (Option<(Verdict, &str)>, Option<u32>) = (None, None);
+    for sensor in sensors {
+        let verdict = sensor.zones.verdict();
+        if worst.is_none_or(|(worst, _)| worst != verdict && worst.worse(verdict) == verdict) {
+            worst = Some((verdict, &sensor.name));
+        }
+        let here = sensor.zones.nearest().map(|(_, mm)| mm);
+        nearest = nearest.into_iter().chain(here).min();
+    }
+    (worst.map_or(Verdict::Unknown, |(verdict, _)| verdict), worst.map(|(_, name)| name), nearest)
+}
+
+/// How long the last scan is what is there, at least.
+const OLD_NS: u64 = 1_000_000_000;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn old_scans_are_forgotten_and_a_hub_that_goes_leaves_nothing_to_act_on() {
+        let mut scene = Scene { hub_lives: true, ..Scene::default() };
+        let sensor = scene.sensor("front");
+        sensor.take_scan(&Header { period_us: 500_000, ..Header::default() }, &Box::<Scan>::default(), 7);
+        sensor.zones = Zones { verdict: Verdict::Clear as u8, ..Zones::unknown() };
+        assert!(!scene.age(1_500_000_006) && scene.age(1_500_000_007) && !scene.age(u64::MAX));
+        assert!(scene.sensors[0].scan.is_none());
+        assert_eq!(verdict(scene.sensors.iter()).0, Verdict::Clear, "the verdict has a clock of its own");
+        scene.hub_gone();
+        assert_eq!(verdict(scene.sensors.iter()), (Verdict::Unknown, Some("front"), None));
+        assert!(!scene.hub_lives);
+    }
+
+    #[test]
+    fn the_first_of_the_worst_gives_the_verdict() {
+        let mut scene = Scene::default();
+        for (name, word, nearest_mm) in [("a", Verdict::Slow, 900), ("b", Verdict::Stop, 300)] {
+            scene.sensor(name).zones =
+                Zones { verdict: word as u8, nearest_beam: 1, nearest_mm, ..Zones::unknown() };
+        }
+        scene.sensor("c").zones = scene.sensors[1].zones;
+        assert_eq!(verdict(scene.sensors.iter()), (Verdict::Stop, Some("b"), Some(300)));
+        assert_eq!(verdict([].iter()), (Verdict::Unknown, None, None));
+    }
+
+    #[test]
+    fn sensors_of_other_machines_sit_on_other_robots() {
+        let mut scene = Scene::default();
+        scene.sensor("hub1.front");
+        assert_eq!(scene.robot().count(), 1);
+        scene.sensor("rear");
+        assert_eq!(scene.robot().map(|(n, sensor)| (n, &sensor.name[..])).collect::<Vec<_>>(), [(1, "rear")]);
+    }
+}

@@ -1,0 +1,205 @@
+//! Who a gateway is: a random number that it keeps from one start to the next, and the number of this life, greater than
+//! those before. Two gateways at once are two, also those of one hub. Refuses to know what is sent under them.
+
+use std::fs::{DirBuilder, File};
+use std::hash::{BuildHasher, RandomState};
+use std::io;
+use std::os::unix::fs::{DirBuilderExt, FileExt};
+use std::path::{Path, PathBuf};
+
+use schema::{Failure, Kind, StateDirectory};
+
+/// One life of a gateway. Nobody else has its number as long as this value is there.
+#[derive(Debug)]
+pub struct Life {
+    /// The gateway.
+    pub hub: u64,
+    /// Seconds since 1970 at its start, or one more than the last epoch of it.
+    pub epoch: u32,
+    /// The number that was kept was another machine's, of whose disk this one's is a copy: this gateway drew its own.
+    pub is_renumbered: bool,
+    /// Locked.
+    _file: File,
+}
+
+impl Life {
+    /// Begins a life of the gateway of `domain` on `interface` (or another word for where it sends), or of another one if
+    /// there is one already: kept in a file in `directory`, which is made if it is not there. `now_s` is seconds since 1970.
+    /// What was kept on another `machine` than this one is another gateway's; where that is not known, it is not asked.
+    ///
+    /// [`Kind::Configuration`] if the file cannot be written: then listeners could not tell this life from the last one.
+    pub(super) fn begin(
+        directory: &Path,
+        domain: &str,
+        interface: &str,
+        now_s: u64,
+        machine: Option<u64>,
+    ) -> Result<Life, Failure> {
+        let unusable = |path: &Path, error: &io::Error| {
+            let what = format!("cannot keep the gateway's number in {}: {error}", path.display());
+            Failure::new(Kind::Configuration, what, "set XDG_STATE_HOME to a directory that can be written")
+        };
+        DirBuilder::new()
+            .recursive(true)
+            .mode(0o700)
+            .create(directory)
+            .map_err(|error| unusable(directory, &error))?;
+        for number in 1..=MOST {
+            let path = directory.join(format!("gateway-{domain}-{interface}-{number}"));
+            let file = File::options().read(true).write(true).create(true).truncate(false).open(&path);
+            let file = file.map_err(|error| unusable(&path, &error))?;
+            match file.try_lock() {
+                Ok(()) => return Life::of(file, now_s, machine).map_err(|error| unusable(&path, &error)),
+                Err(std::fs::TryLockError::WouldBlock) => {}
+                Err(std::fs::TryLockError::Error(error)) => return Err(unusable(&path, &error)),
+            }
+        }
+        let what = format!("{MOST} gateways of domain {domain} are on {interface} already");
+        Err(Failure::new(Kind::Configuration, what, "stop some of them"))
+    }
+
+    fn of(file: File, now_s: u64, machine: Option<u64>) -> io::Result<Life> {
+        let now = u32::try_from(now_s).unwrap_or(u32::MAX);
+        let kept = Kept::read(&file);
+        let is_copy =
+            |kept: &Kept| kept.machine.is_some_and(|there| machine.is_some_and(|here| here != there));
+        let is_renumbered = kept.as_ref().is_some_and(is_copy);
+        // What is no such line, or has no next epoch, is as good as nothing: another gateway.
+        let last = kept.filter(|kept| !is_copy(kept)).and_then(|kept| {
+            let epoch = kept.epoch.checked_add(1)?.max(now);
+            Some(Kept { epoch, machine: machine.or(kept.machine), ..kept })
+        });
+        let kept =
+            last.unwrap_or_else(|| Kept { hub: RandomState::new().hash_one(now_s), epoch: now, machine });
+        let line = kept.line();
+        file.write_all_at(line.as_bytes(), 0)?;
+        file.set_len(line.len() as u64)?;
+        file.sync_data()?;
+        Ok(Life { hub: kept.hub, epoch: kept.epoch, is_renumbered, _file: file })
+    }
+}
+
+/// What the file says: 16 hex digits, 10 digits, and 16 hex digits for the machine if that is known.
+struct Kept {
+    hub: u64,
+    epoch: u32,
+    machine: Option<u64>,
+}
+
+impl Kept {
+    fn read(file: &File) -> Option<Kept> {
+        let mut bytes = [0; 64];
+        let len = file.read_at(&mut bytes, 0).ok()?;
+        let mut words = str::from_utf8(&bytes[..len]).ok()?.strip_suffix('\n')?.split(' ');
+        let mut word = |digits: usize| words.next().filter(|word| word.len() == digits);
+        let hex = |word: &str| u64::from_str_radix(word, 16).ok();
+        let (hub, epoch) = (hex(word(16)?)?, word(10)?.parse().ok()?);
+        Some(Kept { hub, epoch, machine: word(16).and_then(hex) })
+    }
+
+    fn line(&self) -> String {
+        let Kept { hub, epoch, machine } = self;
+        let machine = machine.map(|machine| format!(" {machine:016x}")).unwrap_or_default();
+        format!("{hub:016x} {epoch:010}{machine}\n")
+    }
+}
+
+/// Where such files are: beside the directories of domains.
+///
+/// [`Kind::Configuration`] if the environment names no place.
+pub(super) fn directory() -> Result<PathBuf, Failure> {
+    StateDirectory::base().ok_or_else(|| {
+        let what = "no place for the gateway's number: neither XDG_STATE_HOME nor HOME is set";
+        Failure::new(Kind::Configuration, what, "set XDG_STATE_HOME to a directory that can be written")
+    })
+}
+
+/// Gateways of one domain on one interface: more are started by mistake.
+const MOST: u32 = 16;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    struct Place(PathBuf);
+
+    impl Place {
+        fn new(name: &str) -> Place {
+            Place(std::env::temp_dir().join(format!("scanhub-life-{}-{name}", std::process::id())))
+        }
+
+        fn begin(&self, interface: &str, now_s: u64) -> Life {
+            self.begin_on(interface, now_s, None)
+        }
+
+        fn begin_on(&self, interface: &str, now_s: u64, machine: Option<u64>) -> Life {
+            Life::begin(&self.0, "d", interface, now_s, machine).unwrap()
+        }
+    }
+
+    impl Drop for Place {
+        fn drop(&mut self) {
+            let _ = std::fs::remove_dir_all(&self.0);
+        }
+    }
+
+    #[test]
+    fn each_life_has_a_greater_epoch() {
+        let place = Place::new("epoch");
+        let (hub, epoch) = {
+            let life = place.begin("eth0", 1000);
+            (life.hub, life.epoch)
+        };
+        assert_eq!(epoch, 1000);
+        for (now_s, epoch) in [(1000, 1001), (5, 1002), (2000, 2000), (0, 2001)] {
+            let life = place.begin("eth0", now_s);
+            assert_eq!((life.hub, life.epoch), (hub, epoch));
+        }
+    }
+
+    #[test]
+    fn two_at_once_are_two() {
+        let place = Place::new("two");
+        let first = place.begin("eth0", 1);
+        let (second, elsewhere) = (place.begin("eth0", 1), place.begin("wlan0", 1));
+        assert!(first.hub != second.hub && first.hub != elsewhere.hub && second.hub != elsewhere.hub);
+        let (first_hub, second_hub) = (first.hub, second.hub);
+        drop((first, second));
+        let (first, second) = (place.begin("eth0", 1), place.begin("eth0", 1));
+        assert_eq!((first.hub, second.hub), (first_hub, second_hub));
+    }
+
+    #[test]
+    fn a_copy_on_another_machine_is_another_gateway() {
+        let place = Place::new("copy");
+        let of = |life: Life| (life.hub, life.epoch, life.is_renumbered);
+        // Kept before machines were told apart, and where they cannot be.
+        let (hub, ..) = of(place.begin("eth0", 7));
+        assert_eq!(of(place.begin_on("eth0", 7, Some(0xa))), (hub, 8, false));
+        assert_eq!(of(place.begin("eth0", 7)), (hub, 9, false));
+        assert_eq!(of(place.begin_on("eth0", 7, Some(0xa))), (hub, 10, false));
+        let (copy, epoch, is_renumbered) = of(place.begin_on("eth0", 7, Some(0xb)));
+        assert!(copy != hub && epoch == 7 && is_renumbered);
+        assert_eq!(of(place.begin_on("eth0", 7, Some(0xb))), (copy, 8, false), "said once");
+    }
+
+    #[test]
+    fn what_is_no_number_is_replaced() {
+        let place = Place::new("torn");
+        let hub = place.begin("eth0", 7).hub;
+        let path = place.0.join("gateway-d-eth0-1");
+        for torn in ["", "0123", "0123456789abcdef 4294967295\n", "0123456789abcdef 12\n", &"x".repeat(60)] {
+            std::fs::write(&path, torn).unwrap();
+            let life = place.begin("eth0", 8);
+            assert!(life.hub != hub && life.epoch == 8, "{torn}");
+            assert_eq!(std::fs::metadata(&path).unwrap().len(), 28);
+        }
+    }
+
+    #[test]
+    fn a_place_that_cannot_be_written_is_refused() {
+        let refused = Life::begin(Path::new("/dev/null/x"), "d", "eth0", 1, None).unwrap_err();
+        assert_eq!(refused.kind, Kind::Configuration);
+        assert!(refused.message.contains("/dev/null/x"), "{refused}");
+    }
+}

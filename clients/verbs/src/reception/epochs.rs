@@ -1,0 +1,91 @@
+//! The greatest epochs of the gateways that had the key, over restarts of the listener: what an older life sent is not
+//! believed again. Losing the file loses no more than that. Refuses to know how they were learned.
+
+use std::collections::HashMap;
+
+use lan::Key;
+use schema::{Failure, StateDirectory};
+
+/// The file in which they are kept; nothing where there is no place for one.
+pub(super) struct Epochs {
+    state: Option<StateDirectory>,
+    name: String,
+}
+
+impl Epochs {
+    /// Those of gateways that have `key`.
+    pub(super) fn of(key: &Key, state: Option<StateDirectory>) -> Epochs {
+        Epochs { state, name: format!("heard-{}", key.name()) }
+    }
+
+    /// What was kept.
+    ///
+    /// As [`StateDirectory::read`]; what is no such line says nothing.
+    pub(super) fn read(&self) -> Result<HashMap<u64, u32>, Failure> {
+        let text = self.state.as_ref().map(|state| state.read(&self.name, LONGEST)).transpose()?.flatten();
+        Ok(text.unwrap_or_default().lines().filter_map(parse).collect())
+    }
+
+    /// Keeps `epochs`, and what another listener kept meanwhile.
+    ///
+    /// As [`StateDirectory::lock`] and [`StateDirectory::write`].
+    pub(super) fn keep(&self, epochs: &HashMap<u64, u32>) -> Result<(), Failure> {
+        let Some(state) = &self.state else { return Ok(()) };
+        // Until the end of this: two listeners that merge at once would forget what one of them adds.
+        let _turn = state.lock(&self.name)?;
+        // One that cannot be used is replaced.
+        let mut all = self.read().unwrap_or_default();
+        for (&hub, &epoch) in epochs {
+            let kept = all.entry(hub).or_default();
+            *kept = epoch.max(*kept);
+        }
+        let mut lines: Vec<String> = all.iter().map(|(hub, epoch)| format!("{hub:016x} {epoch}\n")).collect();
+        lines.sort_unstable();
+        state.write(&self.name, &lines.concat())
+    }
+}
+
+fn parse(line: &str) -> Option<(u64, u32)> {
+    let (hub, epoch) = line.split_once(' ')?;
+    Some((u64::from_str_radix(hub, 16).ok()?, epoch.parse().ok()?))
+}
+
+/// More gateways than one key has.
+const LONGEST: u64 = 1 << 20;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn listeners_that_keep_at_once_forget_nothing() {
+        let root = std::env::temp_dir().join(format!("scanhub-epochs-at-once-{}", std::process::id()));
+        let epochs = || Epochs::of(&Key::new(&[1; 32]), Some(StateDirectory::at(&root)));
+        std::thread::scope(|scope| {
+            for listener in 0..8u64 {
+                let epochs = epochs();
+                scope.spawn(move || {
+                    let keep = |n: u64| epochs.keep(&HashMap::from([(8 * n + listener, 1)])).unwrap();
+                    (0..10).for_each(keep);
+                });
+            }
+        });
+        assert_eq!(epochs().read().unwrap().len(), 80);
+        std::fs::remove_dir_all(&root).unwrap();
+    }
+
+    #[test]
+    fn the_greatest_of_all_listeners_is_kept() {
+        let root = std::env::temp_dir().join(format!("scanhub-epochs-{}", std::process::id()));
+        let epochs = |key| Epochs::of(&Key::new(&[key; 32]), Some(StateDirectory::at(&root)));
+        assert_eq!(epochs(1).read().unwrap(), HashMap::new());
+        epochs(1).keep(&HashMap::from([(5, 7), (6, 1)])).unwrap();
+        epochs(1).keep(&HashMap::from([(5, 6), (7, u32::MAX)])).unwrap();
+        assert_eq!(epochs(1).read().unwrap(), HashMap::from([(5, 7), (6, 1), (7, u32::MAX)]));
+        assert_eq!(epochs(2).read().unwrap(), HashMap::new(), "another key");
+        std::fs::write(StateDirectory::at(&root).path(&epochs(1).name), "torn\n5 9 \nffff 3\n").unwrap();
+        assert_eq!(epochs(1).read().unwrap(), HashMap::from([(0xffff, 3)]));
+        std::fs::remove_dir_all(&root).unwrap();
+        assert_eq!(Epochs::of(&Key::new(&[1; 32]), None).keep(&HashMap::from([(5, 7)])), Ok(()));
+    }
+}

@@ -1,0 +1,169 @@
+//! `scanhub web`: what the sensors see, live, for browsers and for viewers of `foxglove.sdk.v1`. Follows the hub as `watch`
+//! does, into the same scene, and puts up what that becomes; a thread of its own serves whoever looks at it.
+
+mod feeder;
+mod told;
+
+use std::io::Write;
+use std::net::SocketAddr;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::mpsc;
+use std::thread;
+
+use ::web::{Board, Door, Server};
+use schema::{Domain, Failure, Kind, Topic, check_followed};
+
+use crate::follow::{Bounds, follow};
+use crate::names::{TopicName, as_word};
+use crate::output::{Output, quiet};
+use feeder::Feeder;
+
+/// What `web` is asked for.
+#[derive(Clone, Debug)]
+pub struct WebOptions {
+    /// The sensors; none: all of the hub.
+    pub sensors: Vec<String>,
+    /// Where it listens; if the port is taken, on one of the next.
+    pub listen: SocketAddr,
+    /// The word that viewers have to know.
+    pub token: Option<String>,
+    /// Who reaches the address may look, without a word.
+    pub open: bool,
+    /// Pages from elsewhere whose viewers may come.
+    pub origins: Vec<String>,
+    /// Names of this machine by which a browser may come, beside its addresses.
+    pub names: Vec<String>,
+    /// JSON instead of text.
+    pub json: bool,
+    /// When it ends by itself.
+    pub bounds: Bounds,
+    /// Where the domain may be, see [`Domain::candidates`].
+    pub places: Vec<Domain>,
+}
+
+/// Serves the picture until the bounds are reached or `stop` is set; says on `out` where, and who comes and goes.
+///
+/// [`Kind::Usage`] if it would listen beyond this machine without a word; [`Kind::Failed`] if it cannot listen; else as
+/// [`echo`](crate::echo()).
+pub fn web(options: &WebOptions, out: &mut dyn Write, stop: &AtomicBool) -> Result<(), Failure> {
+    options.sensors.iter().try_for_each(|sensor| as_word(check_followed(sensor)))?;
+    if !options.listen.ip().is_loopback() && options.token.is_none() && !options.open {
+        let what = format!("everybody who reaches {} could look", options.listen);
+        let hint = "give them a word: --token WORD, or let everybody: --open";
+        return Err(Failure::new(Kind::Usage, what, hint));
+    }
+    if options.token.as_deref().is_some_and(|token| !is_word(token)) {
+        let hint = "--token WORD: letters, digits and . _ ~ -, which an address shows as they are";
+        return Err(Failure::new(Kind::Usage, "the token is no word", hint));
+    }
+    let door =
+        Door { token: options.token.clone(), origins: options.origins.clone(), names: options.names.clone() };
+    let server = Server::bind(options.listen, door)?;
+    let board = Board::new()?;
+    let (tell, events) = mpsc::channel();
+    let mut output = Output::new(out);
+    let url = url(server.address(), &options.names, options.token.as_deref());
+    if let Err(end) = told::ready(&mut output, &url, options.json) {
+        return quiet(Err(end));
+    }
+    let named = |sensor: &String| TOPICS.map(|topic| TopicName { sensor: sensor.clone(), topic });
+    let names: Vec<_> = options.sensors.iter().flat_map(named).collect();
+    let topics: &[Topic] = if names.is_empty() { &TOPICS } else { &[] };
+    let over = AtomicBool::new(false);
+    thread::scope(|scope| {
+        let served = thread::Builder::new()
+            .name("web".into())
+            .spawn_scoped(scope, || server.run(&board, &tell, &over))
+            .map_err(|error| Failure::new(Kind::Short, format!("no thread: {error}"), ""))?;
+        let closing = Close { over: &over, board: &board };
+        let mut feeder = Feeder::new(options, &board, events, output);
+        let end = follow(&names, topics, &options.places, &options.bounds, stop, &mut feeder);
+        drop(closing);
+        let _ = served.join();
+        quiet(end)
+    })
+}
+
+/// Whether browsers send it as it was written.
+fn is_word(token: &str) -> bool {
+    !token.is_empty() && token.bytes().all(|byte| byte.is_ascii_alphanumeric() || b"._~-".contains(&byte))
+}
+
+/// What a browser opens; by the machine's name where every address of it does.
+fn url(address: SocketAddr, names: &[String], token: Option<&str>) -> String {
+    let token = token.map(|token| format!("?token={token}")).unwrap_or_default();
+    match names.first().filter(|_| address.ip().is_unspecified()) {
+        Some(name) => format!("http://{name}:{}/{token}", address.port()),
+        None => format!("http://{address}/{token}"),
+    }
+}
+
+/// Ends the thread that serves, however this one ends.
+struct Close<'a> {
+    over: &'a AtomicBool,
+    board: &'a Board,
+}
+
+impl Drop for Close<'_> {
+    fn drop(&mut self) {
+        self.over.store(true, Ordering::Relaxed);
+        self.board.ring();
+    }
+}
+
+/// What a picture is made of.
+const TOPICS: [Topic; 6] =
+    [Topic::Scan, Topic::Marks, Topic::Zones, Topic::Foreground, Topic::Background, Topic::Status];
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn options(listen: &str) -> WebOptions {
+        WebOptions {
+            sensors: Vec::new(),
+            listen: listen.parse().unwrap(),
+            token: None,
+            open: false,
+            origins: Vec::new(),
+            names: Vec::new(),
+            json: false,
+            bounds: Bounds::default(),
+            places: Vec::new(),
+        }
+    }
+
+    #[test]
+    fn beyond_this_machine_a_word_is_needed() {
+        let stop = AtomicBool::new(true);
+        for listen in ["0.0.0.0:0", "[::]:0"] {
+            let failure = web(&options(listen), &mut Vec::new(), &stop).unwrap_err();
+            assert_eq!(failure.kind, Kind::Usage);
+            assert!(failure.hint.contains("--token"), "{failure}");
+            let open = WebOptions { open: true, ..options(listen) };
+            assert!(web(&open, &mut Vec::new(), &stop).map_err(|failure| failure.kind) != Err(Kind::Usage));
+        }
+        assert!(web(&options("127.0.0.1:0"), &mut Vec::new(), &stop).is_ok());
+    }
+
+    #[test]
+    fn the_address_has_the_word() {
+        let address = "127.0.0.1:8080".parse().unwrap();
+        let names = ["robot".to_owned()];
+        assert_eq!(url(address, &names, None), "http://127.0.0.1:8080/");
+        assert_eq!(url(address, &names, Some("carrot")), "http://127.0.0.1:8080/?token=carrot");
+        let all = "0.0.0.0:8080".parse().unwrap();
+        assert_eq!(url(all, &names, None), "http://robot:8080/");
+        assert_eq!(url(all, &[], None), "http://0.0.0.0:8080/");
+    }
+
+    #[test]
+    fn a_token_that_no_address_shows_is_refused() {
+        for token in ["", " ", "a&b", "a#b", "ö", "100%"] {
+            let stop = AtomicBool::new(true);
+            let options = WebOptions { token: Some(token.to_owned()), ..options("127.0.0.1:0") };
+            let failure = web(&options, &mut Vec::new(), &stop).unwrap_err();
+            assert_eq!(failure.kind, Kind::Usage, "{token:?}");
+        }
+    }
+}

@@ -1,0 +1,85 @@
+//! What a session of packets keeps of its reads: when bytes came, for how long the line may be left alone, and the stamps
+//! before which no later ones go. Refuses to know what a packet is.
+
+use crate::{Arrivals, MILLIS, Nanos, Output};
+
+/// The reads of one session.
+#[derive(Clone, Debug)]
+pub struct Reads {
+    arrivals: Arrivals,
+    last_byte: Nanos,
+    /// Bytes that the next read has room for.
+    room: usize,
+    /// Until when nothing has to be read.
+    rest_until: Nanos,
+    last_packet: Nanos,
+    last_turn: Nanos,
+}
+
+impl Reads {
+    /// Of a session that begins at `now`.
+    pub fn new(now: Nanos) -> Reads {
+        let arrivals = Arrivals::default();
+        Reads { arrivals, last_byte: now, room: 0, rest_until: 0, last_packet: 0, last_turn: 0 }
+    }
+
+    /// The next read has room for so many bytes.
+    pub fn offer(&mut self, room: usize) {
+        self.room = room;
+    }
+
+    /// A read at `now` brought `len` bytes. While a scanner streams, packets are read some at once.
+    pub fn note(&mut self, now: Nanos, len: usize, is_streaming: bool) {
+        self.arrivals.note(now, len);
+        self.rest_until = if is_streaming && (1..self.room).contains(&len) { now + REST } else { 0 };
+        self.last_byte = if len > 0 { now } else { self.last_byte };
+    }
+
+    /// The line is to be looked at again at once.
+    pub fn end_rest(&mut self) {
+        self.rest_until = 0;
+    }
+
+    /// When which byte was there.
+    pub fn arrivals(&self) -> &Arrivals {
+        &self.arrivals
+    }
+
+    /// When the last byte came, or the session began.
+    pub fn last_byte(&self) -> Nanos {
+        self.last_byte
+    }
+
+    /// What to wait for at `now`: the end of a rest, or `until` for a `reason`, or if a packet is held back until the line
+    /// was idle for `hold`, that for the reason `held`.
+    pub fn wait<H, W>(
+        &self,
+        now: Nanos,
+        (until, reason): (Nanos, W),
+        hold: Option<Nanos>,
+        held: W,
+    ) -> Output<H, W> {
+        if self.rest_until > now {
+            return Output::Rest(self.rest_until);
+        }
+        match hold.map(|hold| self.last_byte + hold) {
+            Some(hold) if hold < until => Output::Wait { until: hold, reason: held },
+            _ => Output::Wait { until, reason },
+        }
+    }
+
+    /// When a packet was over that seems to be over at `last`: not before the one before it.
+    pub fn date_packet(&mut self, last: Nanos) -> Nanos {
+        self.last_packet = last.max(self.last_packet);
+        self.last_packet
+    }
+
+    /// From when to when a turn was that seems to be from `first` to `last`: it does not begin before the one before it.
+    pub fn date_turn(&mut self, first: Nanos, last: Nanos) -> (Nanos, Nanos) {
+        self.last_turn = first.max(self.last_turn);
+        (self.last_turn, last.max(self.last_turn))
+    }
+}
+
+/// A stream is read so late after bytes of it were: some packets at once, and a tenth of what a tty keeps.
+const REST: Nanos = 5 * MILLIS;

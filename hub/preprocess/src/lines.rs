@@ -1,0 +1,316 @@
+//! Finds the straight lines of one scan: each beam ends on the line that it meets, or on nothing, and the lines are those
+//! that make the measured ranges likeliest, if each range has normal noise along its beam. Nothing is kept from one scan
+//! to the next. Refuses to know what a line belongs to.
+//!
+//! The method is maximum likelihood as in Schaefer, Buescher, Luft, Burgard: "A Maximum Likelihood Approach to Extract
+//! Polylines from 2-D Laser Range Scans" (IROS 2018), for lines that need not be connected: pairs of beams are joined to
+//! lines, the likeliest first, then the cuts between lines are moved ([`cut`]).
+//!
+//! Nothing is set by hand: the noise comes from the scan itself, and a line has to explain more than its numbers
+//! explain of mere noise, by a Bayesian information criterion.
+
+mod cut;
+mod fit;
+mod join;
+mod least;
+mod piece;
+mod refine;
+
+use std::f32::consts::{PI, TAU};
+
+use schema::{BEAMS, Corner, LINES, Line, Lines, Pose, Scan};
+
+use cut::{Bounds, Cutter};
+use fit::{Information, Ray};
+use piece::Piece;
+
+/// Which lines are looked for.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Settings {
+    /// So many lines at most, 1 to 64.
+    pub max: u8,
+    /// Beams of a line, at least; 3 and more.
+    pub min_points: u16,
+    /// The slower, better form: cuts are taken to wherever they help most, and beams at a line's ends that fit worst are
+    /// left out.
+    pub polish: bool,
+    /// What ends the joining of lines.
+    pub stop: Stop,
+}
+
+/// What ends the joining of lines.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Stop {
+    /// One line less would explain the scan worse than its noise does. Points more than a metre apart are never joined: the
+    /// distance that the paper has for real scans.
+    Likelihood,
+    /// There are no more than `max`. Points farther apart than this many metres are never joined. For comparisons at equal
+    /// numbers.
+    Number(f64),
+}
+
+impl Default for Settings {
+    fn default() -> Self {
+        Settings { max: LINES as u8, min_points: 5, polish: false, stop: Stop::Likelihood }
+    }
+}
+
+/// Finds the lines of the scans of one sensor.
+pub struct LineFinder {
+    pose: Pose,
+    settings: Settings,
+    /// First angle and step of the scans that the directions are for.
+    angles: Option<(f64, f64)>,
+    /// Where each beam points in the robot's frame: a unit vector.
+    directions: Box<[(f64, f64)]>,
+    /// The beams that have a range, and their numbers.
+    rays: Box<[Ray]>,
+    beams: Box<[u16]>,
+    /// Behind the last ray of each group, the neighbours of which are near enough.
+    ends: Box<[u16]>,
+    /// Room to find the noise in.
+    steps: Box<[[f64; 2]]>,
+    cutter: Cutter,
+}
+
+impl LineFinder {
+    /// For a sensor that sits at `pose` and has at most `beams` beams.
+    pub fn new(pose: Pose, settings: Settings, beams: usize) -> LineFinder {
+        let beams = beams.min(BEAMS);
+        LineFinder {
+            pose,
+            settings,
+            angles: None,
+            directions: vec![(0.0, 0.0); beams].into(),
+            rays: vec![Ray::default(); beams].into(),
+            beams: vec![0; beams].into(),
+            ends: vec![0; beams].into(),
+            steps: vec![[0.0; 2]; beams].into(),
+            cutter: Cutter::new(beams),
+        }
+    }
+
+    /// Goes on for a sensor at `pose` as `settings` say.
+    pub fn change(&mut self, pose: Pose, settings: Settings) {
+        (self.pose, self.settings, self.angles) = (pose, settings, None);
+    }
+
+    /// Writes the lines of `scan` into `out`, every byte of it.
+    pub fn update(&mut self, scan: &Scan, out: &mut Lines) {
+        *out = Lines::default();
+        let rays = self.read(scan);
+        let groups = self.group(rays);
+        let noise = self.noise(groups, scan);
+        (out.readings, out.noise_m) = (rays as u16, noise as f32);
+        let bounds = self.bounds(rays, noise);
+        let rays = &self.rays[..rays];
+        let pieces = self.cutter.cut(rays, &self.ends[..groups], &bounds);
+        if pieces.is_full {
+            out.flags = Lines::OVERFLOW;
+        }
+        let mut count = 0;
+        for piece in pieces.list {
+            if let (Some(place), Some(line)) =
+                (out.line_array.get_mut(count), line(&self.pose, rays, &self.beams, piece, noise))
+            {
+                *place = line;
+                out.on_lines += line.points;
+                count += 1;
+            }
+        }
+        out.count = count as u8;
+        corners(out, &self.pose, scan.step.abs() as f32);
+    }
+
+    /// Takes over the beams of `scan` that have a range; how many these are.
+    fn read(&mut self, scan: &Scan) -> usize {
+        self.point(scan);
+        let unit_m = f64::from(scan.unit_um) * 1e-6;
+        let exact = scan.exact_angles();
+        let mut count = 0;
+        for (i, even) in self.directions.iter().enumerate().take(scan.beams()) {
+            let range = scan.range(i).map_or(0.0, |range| f64::from(range) * unit_m);
+            if range <= 0.0 {
+                continue;
+            }
+            let exact = exact.get(i).filter(|exact| exact.is_finite());
+            let (cos, sin) = exact.map_or(*even, |&exact| self.pose.direction(exact.into()));
+            self.rays[count] = Ray { cos, sin, range };
+            self.beams[count] = i as u16;
+            count += 1;
+        }
+        count
+    }
+
+    /// Makes the table for scans with the angles of `scan`.
+    fn point(&mut self, scan: &Scan) {
+        let angles = Some((scan.first_angle, scan.step));
+        if self.angles != angles {
+            self.angles = angles;
+            for (i, direction) in self.directions.iter_mut().enumerate() {
+                *direction = self.pose.direction(scan.first_angle + i as f64 * scan.step);
+            }
+        }
+    }
+
+    /// Where points are too far apart for one line; how many groups there are.
+    fn group(&mut self, rays: usize) -> usize {
+        let most = match self.settings.stop {
+            Stop::Likelihood => GAP_M,
+            Stop::Number(most) => most,
+        };
+        let mut groups = 0;
+        for i in 1..=rays {
+            if i == rays || self.rays[i - 1].apart(&self.rays[i]) > most {
+                self.ends[groups] = i as u16;
+                groups += 1;
+            }
+        }
+        groups
+    }
+
+    /// The standard deviation of a range in metres: from how far each beam is from the lines through its neighbours and through
+    /// those behind them, in the median, which edges and corners do not move. At least that of rounding to the unit of `scan`.
+    fn noise(&mut self, groups: usize, scan: &Scan) -> f64 {
+        let (mut count, mut first) = (0, 0);
+        let steps = self.steps.as_flattened_mut();
+        for &end in &self.ends[..groups] {
+            let rays = &self.rays[first..end.into()];
+            for apart in [1, 2] {
+                for (i, ray) in rays.iter().enumerate().skip(apart) {
+                    let Some(after) = rays.get(i + apart) else { break };
+                    let inverse = fit::Line::through(&rays[i - apart], after).inverse(ray);
+                    let off = (ray.range - 1.0 / inverse).abs();
+                    if off.is_finite() && inverse > 0.0 {
+                        steps[count] = off;
+                        count += 1;
+                    }
+                }
+            }
+            first = end.into();
+        }
+        let least = f64::from(scan.unit_um) * 1e-6 / 12_f64.sqrt();
+        let Some(steps) = steps.get_mut(..count).filter(|steps| !steps.is_empty()) else { return least };
+        let (_, median, _) = steps.select_nth_unstable_by(count / 2, f64::total_cmp);
+        // The median of the absolute value is .6745 deviations; that of one range and the mean of two others has the variance
+        // 1 + 1/2.
+        (*median / (0.6745 * 1.5_f64.sqrt())).max(least)
+    }
+
+    fn bounds(&self, rays: usize, noise: f64) -> Bounds {
+        let Settings { max, min_points, polish, stop } = self.settings;
+        let penalty = NUMBERS * (rays.max(2) as f64).ln() * noise * noise;
+        // Where nothing parts points, all of them end on a line.
+        let (penalty, variance, loss) = match stop {
+            Stop::Likelihood => (penalty, noise * noise, LOSS_M * LOSS_M),
+            Stop::Number(gap_m) if gap_m.is_finite() => (0.0, f64::INFINITY, LOSS_M * LOSS_M),
+            Stop::Number(_) => (0.0, f64::INFINITY, f64::INFINITY),
+        };
+        Bounds {
+            max: usize::from(max).min(LINES),
+            penalty,
+            variance,
+            loss,
+            min_points: usize::from(min_points),
+            rounds: if polish { 3 } else { 1 },
+            exchange: polish,
+            // So that 98 of 100 beams still end on a line.
+            trimmed: if polish { rays / 50 } else { 0 },
+        }
+    }
+}
+
+/// Of a line: its two numbers, and the cut to the next, which may be anywhere and counts twice, as in the criterion of Zhang
+/// and Siegmund (2007) for points of change.
+const NUMBERS: f64 = 4.0;
+/// Points of one line are at most so far apart: PLE's own for real scans.
+const GAP_M: f64 = 1.0;
+/// Where there are more lines than allowed, leaving out a beam is as bad as an error of this. On logs of four sensors (aces,
+/// Freiburg, Intel, Orebro: `cargo bench --bench lines`) ten vertices cover more beams so than RANSAC's, and fit better.
+const LOSS_M: f64 = 0.2;
+/// Lines are neighbours if fewer beams than this are between them.
+const NEIGHBOURS: f32 = 4.5;
+/// Steps of Newton's method towards the likeliest line.
+const STEPS: usize = 3;
+
+/// The likeliest line of `piece`; nothing if its rays do not say where it is.
+fn line(pose: &Pose, rays: &[Ray], beams: &[u16], piece: &Piece, noise: f64) -> Option<Line> {
+    let inside = &rays[piece.first..piece.end];
+    let (fit, error) = piece.line().refined(inside, STEPS);
+    let information = Information::of(&fit, inside)?;
+    let free = inside.len().saturating_sub(2).max(1) as f64;
+    let (aa, ab, bb) = information.inverse((error / free).max(noise * noise))?;
+    let square = fit.a * fit.a + fit.b * fit.b;
+    let of_sensor = 1.0 / square.sqrt();
+    let (cos, sin) = (fit.a * of_sensor, fit.b * of_sensor);
+    let along =
+        |by_a: f64, by_b: f64| (by_a * by_a * aa + 2.0 * by_a * by_b * ab + by_b * by_b * bb).max(0.0).sqrt();
+    let alpha_by = (-fit.b / square, fit.a / square);
+    // The sensor sits beside the robot's centre.
+    let lever = pose.y_m * cos - pose.x_m * sin;
+    let r_by = |of: f64, by_alpha: f64| lever * by_alpha - of * of_sensor / square;
+    let r = of_sensor + pose.x_m * cos + pose.y_m * sin;
+    let (cos, sin) = if r < 0.0 { (-cos, -sin) } else { (cos, sin) };
+    let end = |ray: &Ray| {
+        let range = 1.0 / fit.inverse(ray);
+        ((pose.x_m + range * ray.cos) as f32, (pose.y_m + range * ray.sin) as f32)
+    };
+    let ((x1_m, y1_m), (x2_m, y2_m)) = (end(inside.first()?), end(inside.last()?));
+    let line = Line {
+        x1_m,
+        y1_m,
+        x2_m,
+        y2_m,
+        r_m: r.abs() as f32,
+        alpha_rad: sin.atan2(cos) as f32,
+        sd_r_m: along(r_by(fit.a, alpha_by.0), r_by(fit.b, alpha_by.1)) as f32,
+        sd_alpha_rad: along(alpha_by.0, alpha_by.1) as f32,
+        first: beams[piece.first],
+        last: beams[piece.end - 1],
+        points: inside.len() as u16,
+        reserved: 0,
+    };
+    let numbers = [x1_m, y1_m, x2_m, y2_m, line.r_m, line.alpha_rad, line.sd_r_m, line.sd_alpha_rad];
+    // A direction that could be any is none.
+    let is_known = numbers.iter().all(|number| number.is_finite()) && line.sd_alpha_rad < 1.0;
+    is_known.then_some(line)
+}
+
+/// Writes where neighbours meet: lines that are certainly not parallel, and that meet where the last beam of the one and the
+/// first of the other look. There both have the same range, so that nothing stands between them.
+fn corners(out: &mut Lines, pose: &Pose, step: f32) {
+    let count = usize::from(out.count);
+    // The last of a full turn is a neighbour of the first.
+    let pairs = if count > 2 { count } else { count.saturating_sub(1) };
+    let looks = |x: f32, y: f32| (y - pose.y_m as f32).atan2(x - pose.x_m as f32);
+    let turned = |from: f32, to: f32| (to - from + PI).rem_euclid(TAU) - PI;
+    let mut corners = 0;
+    for first in 0..pairs {
+        let second = (first + 1) % count;
+        let (one, two) = (&out.line_array[first], &out.line_array[second]);
+        let Some((x_m, y_m)) = meeting(one, two) else { continue };
+        let last = looks(one.x2_m, one.y2_m);
+        let gap = turned(last, looks(two.x1_m, two.y1_m));
+        let middle = last + gap / 2.0;
+        let range = (x_m - pose.x_m as f32).hypot(y_m - pose.y_m as f32);
+        let unsure = 1.5 * step + 3.0 * out.noise_m / range;
+        if gap.abs() <= NEIGHBOURS * step && turned(middle, looks(x_m, y_m)).abs() <= gap.abs() / 2.0 + unsure
+        {
+            out.corner_array[corners] =
+                Corner { x_m, y_m, first_line: first as u16, second_line: second as u16 };
+            corners += 1;
+        }
+    }
+    out.corners = corners as u8;
+}
+
+/// Where two lines meet, if they are certainly not parallel.
+fn meeting(one: &Line, two: &Line) -> Option<(f32, f32)> {
+    let sine = (two.alpha_rad - one.alpha_rad).sin();
+    if sine.abs() <= 3.0 * one.sd_alpha_rad.hypot(two.sd_alpha_rad) {
+        return None;
+    }
+    let ((sin1, cos1), (sin2, cos2)) = (one.alpha_rad.sin_cos(), two.alpha_rad.sin_cos());
+    let (x_m, y_m) = ((one.r_m * sin2 - two.r_m * sin1) / sine, (two.r_m * cos1 - one.r_m * cos2) / sine);
+    (x_m.is_finite() && y_m.is_finite()).then_some((x_m, y_m))
+}

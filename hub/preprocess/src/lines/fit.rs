@@ -1,0 +1,221 @@
+//! The line on which some beams end: the one that their radial noise makes most likely. Refuses to know which beams belong
+//! together.
+//!
+//! A line is the pair (a, b) for which the beam in direction (cos, sin) meets it at the range 1 / (a cos + b sin): the
+//! normal form r = cos (t - alpha) * range with a = cos alpha / r and b = sin alpha / r. Ranges have normal noise along
+//! their beams, so the likeliest line has the least sum of squares of (measured range - range of the line). That sum is not
+//! linear in a and b; range^2 (a cos + b sin) - range is, and is the same up to the factor measured / true range. Sums over
+//! it are added and taken away beam by beam ([`Sums`]); from its line, a few steps of Newton's method as Gauss has it lead
+//! to the likeliest ([`Line::refined`]).
+
+/// A beam that returned: its direction as a unit vector, and its range in metres.
+#[derive(Clone, Copy, Debug, Default)]
+pub(super) struct Ray {
+    pub(super) cos: f64,
+    pub(super) sin: f64,
+    pub(super) range: f64,
+}
+
+impl Ray {
+    /// Returns how far the ends of two rays are apart, in metres.
+    pub(super) fn apart(&self, other: &Ray) -> f64 {
+        let (x, y) = (
+            self.range * self.cos - other.range * other.cos,
+            self.range * self.sin - other.range * other.sin,
+        );
+        (x * x + y * y).sqrt()
+    }
+}
+
+/// A line by where beams meet it, in 1/m.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub(super) struct Line {
+    pub(super) a: f64,
+    pub(super) b: f64,
+}
+
+impl Line {
+    /// Returns the inverse of the range at which `ray` meets the line; not above 0 if it does not.
+    pub(super) fn inverse(&self, ray: &Ray) -> f64 {
+        self.a * ray.cos + self.b * ray.sin
+    }
+
+    /// Returns the sum of squares of the ranges' differences from the line, in m2; infinite if a ray does not meet it.
+    pub(super) fn error(&self, rays: &[Ray]) -> f64 {
+        let mut sum = 0.0;
+        for ray in rays {
+            let inverse = self.inverse(ray);
+            if inverse <= FARTHEST {
+                return f64::INFINITY;
+            }
+            let off = ray.range - 1.0 / inverse;
+            sum += off * off;
+        }
+        sum
+    }
+
+    /// Returns the line through the ends of two rays.
+    pub(super) fn through(first: &Ray, last: &Ray) -> Line {
+        let det = first.cos * last.sin - first.sin * last.cos;
+        let (one, two) = (1.0 / first.range, 1.0 / last.range);
+        Line { a: (one * last.sin - two * first.sin) / det, b: (two * first.cos - one * last.cos) / det }
+    }
+
+    /// Returns the line that is likelier for `rays` after at most `steps` steps, and its error.
+    pub(super) fn refined(self, rays: &[Ray], steps: usize) -> (Line, f64) {
+        let (mut line, mut error) = (self, self.error(rays));
+        if let [first, .., last] = rays {
+            // A surface that is seen very flatly: the sums may have led behind the sensor.
+            let through = Line::through(first, last);
+            let alternative = through.error(rays);
+            if alternative < error {
+                (line, error) = (through, alternative);
+            }
+        }
+        for _ in 0..steps {
+            let Some(information) = Information::of(&line, rays) else { break };
+            let (da, db) = information.step();
+            let (mut part, before) = (1.0, error);
+            while part > 0.1 {
+                let next = Line { a: line.a + part * da, b: line.b + part * db };
+                let reached = next.error(rays);
+                if reached < error {
+                    (line, error) = (next, reached);
+                    break;
+                }
+                part *= 0.5;
+            }
+            if before - error <= 1e-4 * error {
+                break;
+            }
+        }
+        (line, error)
+    }
+}
+
+/// No scanner sees as far: 10 km.
+const FARTHEST: f64 = 1e-4;
+
+/// What the rays say of a line near one: the sums of the squares of the slopes, and of slope times difference.
+#[derive(Clone, Copy, Debug, Default)]
+pub(super) struct Information {
+    aa: f64,
+    ab: f64,
+    bb: f64,
+    a: f64,
+    b: f64,
+}
+
+impl Information {
+    /// Returns it for `line`; nothing if a ray does not meet it.
+    pub(super) fn of(line: &Line, rays: &[Ray]) -> Option<Information> {
+        let mut sums = Information::default();
+        for ray in rays {
+            let inverse = line.inverse(ray);
+            if inverse <= FARTHEST {
+                return None;
+            }
+            let range = 1.0 / inverse;
+            let (off, square) = (ray.range - range, range * range);
+            let (by_a, by_b) = (-square * ray.cos, -square * ray.sin);
+            sums.aa += by_a * by_a;
+            sums.ab += by_a * by_b;
+            sums.bb += by_b * by_b;
+            sums.a += by_a * off;
+            sums.b += by_b * off;
+        }
+        Some(sums)
+    }
+
+    /// Returns the covariance of a and b (aa, ab, bb) if a range has this `variance`; nothing if all rays are one.
+    pub(super) fn inverse(&self, variance: f64) -> Option<(f64, f64, f64)> {
+        let (product, det) = (self.aa * self.bb, self.aa * self.bb - self.ab * self.ab);
+        let scale = variance / det;
+        (det > 1e-12 * product && scale.is_finite()).then_some((
+            scale * self.bb,
+            -scale * self.ab,
+            scale * self.aa,
+        ))
+    }
+
+    fn step(&self) -> (f64, f64) {
+        let det = self.aa * self.bb - self.ab * self.ab;
+        ((self.bb * self.a - self.ab * self.b) / det, (self.aa * self.b - self.ab * self.a) / det)
+    }
+}
+
+/// Sums over rays, of which line and error follow.
+#[derive(Clone, Copy, Debug, Default)]
+pub(super) struct Sums {
+    cc: f64,
+    cs: f64,
+    ss: f64,
+    c: f64,
+    s: f64,
+    square: f64,
+    count: f64,
+}
+
+impl Sums {
+    /// Returns the sums over `rays`.
+    pub(super) fn of(rays: &[Ray]) -> Sums {
+        rays.iter().fold(Sums::default(), |sums, ray| sums + Sums::one(ray))
+    }
+
+    /// Returns the sums over one ray.
+    pub(super) fn one(ray: &Ray) -> Sums {
+        let square = ray.range * ray.range;
+        let (c, s) = (square * ray.cos, square * ray.sin);
+        Sums { cc: c * c, cs: c * s, ss: s * s, c: c * ray.range, s: s * ray.range, square, count: 1.0 }
+    }
+
+    /// Returns the line of least error.
+    pub(super) fn line(&self) -> Line {
+        let det = self.cc * self.ss - self.cs * self.cs;
+        Line {
+            a: (self.ss * self.c - self.cs * self.s) / det,
+            b: (self.cc * self.s - self.cs * self.c) / det,
+        }
+    }
+
+    /// Returns its error in m2.
+    pub(super) fn error(&self) -> f64 {
+        if self.count < 2.5 {
+            return 0.0;
+        }
+        let Line { a, b } = self.line();
+        (self.square - a * self.c - b * self.s).max(0.0)
+    }
+}
+
+impl std::ops::Add for Sums {
+    type Output = Sums;
+
+    fn add(self, other: Sums) -> Sums {
+        Sums {
+            cc: self.cc + other.cc,
+            cs: self.cs + other.cs,
+            ss: self.ss + other.ss,
+            c: self.c + other.c,
+            s: self.s + other.s,
+            square: self.square + other.square,
+            count: self.count + other.count,
+        }
+    }
+}
+
+impl std::ops::Sub for Sums {
+    type Output = Sums;
+
+    fn sub(self, other: Sums) -> Sums {
+        Sums {
+            cc: self.cc - other.cc,
+            cs: self.cs - other.cs,
+            ss: self.ss - other.ss,
+            c: self.c - other.c,
+            s: self.s - other.s,
+            square: self.square - other.square,
+            count: self.count - other.count,
+        }
+    }
+}

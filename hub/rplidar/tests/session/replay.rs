@@ -1,0 +1,116 @@
+//! A session of a recording, at whose other end nobody is: it hears what another session handed out.
+
+use line::{Heard, MILLIS, Nanos, Output, Session as _, Turn};
+use rplidar::{Mode, Model, Session, Settings, Trouble};
+
+use crate::bench::{Bench, SECOND};
+use crate::head::Head;
+use crate::start::of;
+
+/// Turns of a recording: stamp, points a second, beams, and how many points each has.
+#[derive(Debug, PartialEq)]
+struct Seen {
+    first: Nanos,
+    points: usize,
+    beams: usize,
+    incomplete: bool,
+}
+
+/// What a session with these `settings` makes of `heard`.
+fn replay(settings: Settings, heard: &[(Nanos, Nanos, Vec<u8>)]) -> (Session, Vec<Seen>) {
+    let settings = Settings { fixed_rate: true, listen_only: true, ..settings };
+    let mut session = Session::new(settings, heard[0].0);
+    let mut turns = Vec::new();
+    for (_, last, bytes) in heard {
+        session.spare()[..bytes.len()].copy_from_slice(bytes);
+        session.commit(*last, bytes.len());
+        loop {
+            match session.poll_output() {
+                Output::Heard(Heard::Turn(turn)) => turns.push(seen(&turn)),
+                Output::Heard(Heard::Packets(_)) => {}
+                Output::Rest(_) | Output::Wait { .. } => break,
+                output => panic!("{output:?}"),
+            }
+        }
+    }
+    (session, turns)
+}
+
+fn seen(turn: &Turn<'_>) -> Seen {
+    Seen { first: turn.first, points: turn.points.len(), beams: turn.beams, incomplete: turn.incomplete }
+}
+
+const MODES: [(Model, Mode); 7] = [
+    (Model::A1, Mode::Standard),
+    (Model::A1, Mode::Express),
+    (Model::A1, Mode::Sensitivity),
+    (Model::A1, Mode::Stability),
+    (Model::S1, Mode::DenseBoost),
+    (Model::S2, Mode::DenseBoost),
+    (Model::S3, Mode::UltraDense),
+];
+
+fn recorded(model: Model, mode: Mode, seconds: u64) -> Bench {
+    let mut live = Bench::new(Settings { mode: Some(mode), ..of(model) }, Head::new(model, 1));
+    live.run(seconds * SECOND);
+    live
+}
+
+/// What was answered is in the recording: how long a point takes, and what the packets are.
+#[test]
+fn a_recording_from_the_beginning_has_the_turns_that_were_handed_out() {
+    for (model, mode) in MODES {
+        let live = recorded(model, mode, 6);
+        for settings in [Settings::default(), Settings { mode: Some(mode), ..of(model) }] {
+            let (session, turns) = replay(settings, &live.log.heard);
+            let per_second = session.points_per_second().expect("told");
+            assert_eq!(Some(per_second), live.session.points_per_second(), "{model:?} {mode:?}");
+            assert_eq!(session.model(), Some(model));
+            // Where the wanted mode is not known, the first quarter of a second may be of another one.
+            let missing = if settings.mode.is_some() { 0 } else { 3 };
+            assert!(turns.len() + missing >= live.log.turns.len(), "{model:?} {mode:?}: {}", turns.len());
+            let behind = live.log.turns.len() - turns.len();
+            for (seen, told) in turns.iter().zip(&live.log.turns[behind..]) {
+                assert_eq!(seen.incomplete, told.incomplete, "{model:?} {mode:?}");
+                // Without the mode it is another grid, which begins elsewhere.
+                let off = if settings.mode.is_some() { 0 } else { 2 };
+                assert!(seen.points.abs_diff(told.points.len()) <= off, "{model:?} {mode:?}");
+                assert!(settings.mode.is_none() || seen.beams == told.beams);
+                assert!(
+                    seen.first.abs_diff(told.first) < 15 * MILLIS,
+                    "{model:?} {mode:?}: {seen:?} {}",
+                    told.first
+                );
+            }
+        }
+    }
+}
+
+#[test]
+fn one_that_begins_in_the_midst_has_turns_soon() {
+    for (model, mode) in MODES {
+        let live = recorded(model, mode, 8);
+        let from = live.log.heard.iter().position(|(first, ..)| *first > 3 * SECOND).expect("some");
+        let (session, turns) = replay(Settings { mode: Some(mode), ..of(model) }, &live.log.heard[from..]);
+        let first = turns.first().expect("some").first;
+        assert!(first < 3 * SECOND + SECOND * 6 / 10, "{model:?} {mode:?}: {first}");
+        let is =
+            session.points_per_second().expect("measured") / live.session.points_per_second().expect("told");
+        assert!((is - 1.0).abs() < 0.005, "{model:?} {mode:?}: {is}");
+        assert!(turns.iter().all(|seen| !seen.incomplete), "{model:?} {mode:?}");
+        assert!(session.account().lost == 0);
+    }
+}
+
+/// Ranges of the one kind are nonsense as those of the other one.
+#[test]
+fn packets_that_may_be_of_two_kinds_are_refused_in_words() {
+    let live = recorded(Model::S1, Mode::DenseBoost, 4);
+    let from = live.log.heard.iter().position(|(first, ..)| *first > 2 * SECOND).expect("some");
+    let (session, turns) = replay(Settings::default(), &live.log.heard[from..]);
+    assert_eq!((session.trouble(), turns.len()), (Some(Trouble::Alike), 0));
+    assert!(Trouble::Alike.to_string().contains("model or the mode"));
+    let (session, turns) = replay(of(Model::S1), &live.log.heard[from..]);
+    assert_eq!(session.trouble(), None);
+    assert!(turns.len() > 10);
+}

@@ -1,0 +1,135 @@
+//! How a sensor is, for programs and for people: `std_msgs/msg/String` and `diagnostic_msgs/msg/DiagnosticArray`. Refuses
+//! to know where a status comes from.
+
+use schema::{State, Status, Verdict};
+
+use crate::cdr::Cdr;
+
+/// Writes the name of `verdict` to the end of `message`: `clear`, `slow`, `stop` or `unknown`.
+pub fn verdict_word(message: &mut Vec<u8>, verdict: Verdict) {
+    Cdr::begin(message).text(verdict.name());
+}
+
+/// Writes how `sensor` is to the end of `message`, at `now_ns` since 1970. `status` is what its hub said last, nothing if no
+/// hub says anything; `age_ns` is how long ago the last scan was measured.
+pub fn diagnosis(
+    message: &mut Vec<u8>,
+    sensor: &str,
+    now_ns: u64,
+    status: Option<&Status>,
+    age_ns: Option<u64>,
+) {
+    let mut cdr = Cdr::begin(message);
+    cdr.header(now_ns, "");
+    cdr.u32(1);
+    let (level, words) = status.map_or((STALE, "no hub".to_owned()), judged);
+    cdr.u8(level);
+    cdr.text(&format!("scanhub: {sensor}"));
+    cdr.text(&words);
+    cdr.text(status.map_or("", |status| status.sensor_type().trim()));
+    let values = status.map_or(Vec::new(), |status| values(status, age_ns));
+    cdr.u32(values.len() as u32);
+    for (key, value) in values {
+        cdr.text(key);
+        cdr.text(&value);
+    }
+}
+
+/// Level and words.
+fn judged(status: &Status) -> (u8, String) {
+    let state = status.state();
+    let name = state.map_or("unknown state", State::name);
+    let loss = status.line_loss();
+    let level = match state {
+        Some(State::Streaming) if loss.is_none() => OK,
+        Some(State::Absent | State::Silent) => ERROR,
+        _ => WARN,
+    };
+    (level, loss.map_or(name.to_owned(), |loss| format!("{name}, {loss}")))
+}
+
+/// What is known, with its unit in the key.
+fn values(status: &Status, age_ns: Option<u64>) -> Vec<(&'static str, String)> {
+    let mut values = vec![
+        ("state", status.state().map_or("unknown", State::name).to_owned()),
+        ("rate_hz", (f64::from(status.rate_mhz) / 1e3).to_string()),
+        ("damaged", status.damaged().to_string()),
+    ];
+    values.extend(status.lost_share().map(|share| ("lost", share.to_string())));
+    values.extend(age_ns.map(|age| ("age_s", (age as f64 / 1e9).to_string())));
+    values.push(("port", status.port().to_owned()));
+    if !status.last_error().is_empty() {
+        values.push(("last_error", status.last_error().to_owned()));
+    }
+    values
+}
+
+/// `DiagnosticStatus.OK` and so on.
+const OK: u8 = 0;
+const WARN: u8 = 1;
+const ERROR: u8 = 2;
+const STALE: u8 = 3;
+
+#[cfg(test)]
+mod tests {
+    use schema::Counter;
+
+    use super::*;
+    use crate::{DIAGNOSTIC_ARRAY, STRING, Value, read};
+
+    #[test]
+    fn a_verdict_is_a_word() {
+        let mut message = Vec::new();
+        verdict_word(&mut message, Verdict::Unknown);
+        assert_eq!(read(&STRING, &message).unwrap().text("data"), Some("unknown"));
+    }
+
+    fn told(status: Option<&Status>, age_ns: Option<u64>) -> Value {
+        let mut message = Vec::new();
+        diagnosis(&mut message, "front", 9_000_000_001, status, age_ns);
+        read(&DIAGNOSTIC_ARRAY, &message).unwrap()
+    }
+
+    #[test]
+    fn a_sensor_is_as_good_as_its_state_and_its_line() {
+        let mut status = Status { rate_mhz: 37_500, ..Status::default() };
+        status.set_sensor_type("LMS291-S05 30106");
+        let mut judge = |state: State, damaged_ppm: u64| {
+            status.state = state as u8;
+            status.counters[Counter::DamagedPpm] = damaged_ppm;
+            let told = told(Some(&status), Some(250_000_000));
+            (told.number("status.0.level").unwrap() as u8, told.text("status.0.message").unwrap().to_owned())
+        };
+        assert_eq!(judge(State::Streaming, 0), (0, "streaming".to_owned()));
+        assert_eq!(judge(State::Streaming, 430_000), (1, "streaming, 43 % damaged on the line".to_owned()));
+        assert_eq!(judge(State::Probing, 0), (1, "probing".to_owned()));
+        assert_eq!(judge(State::Silent, 0), (2, "silent".to_owned()));
+        assert_eq!(judge(State::Absent, 0), (2, "absent".to_owned()));
+        let told = told(Some(&status), Some(250_000_000));
+        assert_eq!(
+            (told.number("header.stamp.sec"), told.number("header.stamp.nanosec")),
+            (Some(9.0), Some(1.0))
+        );
+        assert_eq!(told.text("status.0.name"), Some("scanhub: front"));
+        assert_eq!(told.text("status.0.hardware_id"), Some("LMS291-S05 30106"));
+        let values: Vec<_> = (0..told.sequence("status.0.values").unwrap().len())
+            .map(|i| {
+                let [key, value] =
+                    ["key", "value"].map(|of| told.text(&format!("status.0.values.{i}.{of}")).unwrap());
+                (key, value)
+            })
+            .collect();
+        let wanted =
+            [("state", "absent"), ("rate_hz", "37.5"), ("damaged", "0"), ("age_s", "0.25"), ("port", "")];
+        assert_eq!(values, wanted);
+    }
+
+    #[test]
+    fn without_a_hub_nothing_is_known() {
+        let told = told(None, None);
+        assert_eq!(
+            (told.number("status.0.level"), told.text("status.0.message")),
+            (Some(3.0), Some("no hub"))
+        );
+    }
+}

@@ -1,0 +1,184 @@
+//! A headless Chromium, driven over its debugging protocol: pages are opened, asked and photographed. Refuses to know what is
+//! on them.
+
+use std::fs;
+use std::io::{BufRead, BufReader};
+use std::net::TcpStream;
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Stdio};
+use std::thread;
+use std::time::{Duration, Instant};
+
+use serde_json::{Value, json};
+use tungstenite::{Message, WebSocket};
+
+use crate::testkit::{PATIENCE, TestEnv, skip};
+
+/// Where Debian has it, with a window and without.
+const NAMES: [&str; 2] = ["chromium", "chromium-headless-shell"];
+
+/// What a page is looked at with.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Look {
+    pub(crate) width: u32,
+    pub(crate) height: u32,
+    /// `light` or `dark`.
+    pub(crate) scheme: &'static str,
+    /// A telephone: two dots a pixel, and fingers.
+    pub(crate) is_phone: bool,
+}
+
+impl Look {
+    pub(crate) const LAPTOP: Look = Look { width: 1280, height: 800, scheme: "light", is_phone: false };
+    pub(crate) const PHONE: Look = Look { width: 390, height: 844, scheme: "dark", is_phone: true };
+}
+
+/// A browser with one page.
+pub(crate) struct Browser {
+    process: Child,
+    socket: WebSocket<TcpStream>,
+    session: String,
+    calls: u64,
+    profile: PathBuf,
+    /// What the page complained about.
+    pub(crate) complaints: Vec<String>,
+}
+
+impl Browser {
+    /// A new one, looking as `look` says; nothing, and why, where there is none.
+    pub(crate) fn start(env: &TestEnv, look: Look) -> Option<Browser> {
+        let profile = env.path("browser");
+        let spawned = NAMES.iter().find_map(|name| {
+            let mut command = Command::new(name);
+            command.args(["--headless=new", "--no-sandbox", "--disable-gpu", "--hide-scrollbars"]);
+            command.args(["--remote-debugging-port=0", "--no-first-run", "--disable-dev-shm-usage"]);
+            command.arg(format!("--user-data-dir={}", profile.display())).arg("about:blank");
+            command.stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::piped()).spawn().ok()
+        });
+        let Some(mut process) = spawned else {
+            skip("chromium", "there is no browser (Debian: apt-get install chromium)");
+            return None;
+        };
+        let mut lines = BufReader::new(process.stderr.take()?).lines().map_while(Result::ok);
+        let address = lines.find_map(|line| Some(line.split_once("listening on ws://")?.1.to_owned()));
+        let address = address.unwrap_or_else(|| panic!("the browser does not say where it listens"));
+        // What it says later is read, so that it does not wait for that.
+        thread::spawn(move || lines.for_each(drop));
+        let (host, _) = address.split_once('/').expect("a path");
+        let stream = TcpStream::connect(host).expect("its own port");
+        stream.set_read_timeout(Some(PATIENCE)).expect("a timeout");
+        let (socket, _) = tungstenite::client(format!("ws://{address}"), stream).expect("its protocol");
+        let mut browser =
+            Browser { process, socket, session: String::new(), calls: 0, profile, complaints: Vec::new() };
+        let target = browser.call("Target.createTarget", json!({ "url": "about:blank" }));
+        let attached = json!({ "targetId": target["targetId"], "flatten": true });
+        let session = browser.call("Target.attachToTarget", attached);
+        browser.session = session["sessionId"].as_str().expect("a session").to_owned();
+        for domain in ["Page", "Runtime", "Log"] {
+            browser.call(&format!("{domain}.enable"), json!({}));
+        }
+        let Look { width, height, scheme, is_phone } = look;
+        let ratio = if is_phone { 2 } else { 1 };
+        let screen =
+            json!({ "width": width, "height": height, "deviceScaleFactor": ratio, "mobile": is_phone });
+        browser.call("Emulation.setDeviceMetricsOverride", screen);
+        let features = json!([{ "name": "prefers-color-scheme", "value": scheme }]);
+        browser.call("Emulation.setEmulatedMedia", json!({ "features": features }));
+        Some(browser)
+    }
+
+    pub(crate) fn open(&mut self, url: &str) {
+        self.call("Page.navigate", json!({ "url": url }));
+    }
+
+    /// What `script` is on the page.
+    pub(crate) fn ask(&mut self, script: &str) -> Value {
+        let asked = json!({ "expression": script, "returnByValue": true, "awaitPromise": true });
+        let told = self.call("Runtime.evaluate", asked);
+        assert!(told.get("exceptionDetails").is_none(), "{script}: {told}");
+        told["result"]["value"].clone()
+    }
+
+    /// Waits until `script` is true on the page; how long that took.
+    pub(crate) fn await_true(&mut self, script: &str) -> Duration {
+        let begun = Instant::now();
+        while self.ask(script) != Value::Bool(true) {
+            let seen = |browser: &mut Browser| browser.ask("JSON.stringify(window.scanhub)");
+            assert!(begun.elapsed() < PATIENCE, "{script} is not to be seen: {}", seen(self));
+            thread::sleep(Duration::from_millis(20));
+        }
+        begun.elapsed()
+    }
+
+    /// Types `key`, as `KeyboardEvent.key` has it.
+    pub(crate) fn press(&mut self, key: &str) {
+        for kind in ["keyDown", "keyUp"] {
+            self.call("Input.dispatchKeyEvent", json!({ "type": kind, "key": key }));
+        }
+    }
+
+    /// Moves the mouse, with its button held if `is_held`.
+    pub(crate) fn mouse(&mut self, kind: &str, (x, y): (f64, f64), is_held: bool) {
+        let button = if is_held { "left" } else { "none" };
+        let buttons = u8::from(is_held);
+        let moved =
+            json!({ "type": kind, "x": x, "y": y, "button": button, "buttons": buttons, "clickCount": 1 });
+        self.call("Input.dispatchMouseEvent", moved);
+    }
+
+    /// Writes what is to be seen to a PNG file.
+    pub(crate) fn photograph(&mut self, path: &Path) {
+        let told = self.call("Page.captureScreenshot", json!({ "format": "png" }));
+        let text = told["data"].as_str().expect("a picture");
+        fs::write(path, from_base64(text)).unwrap_or_else(|error| panic!("{}: {error}", path.display()));
+    }
+
+    fn call(&mut self, method: &str, params: Value) -> Value {
+        self.calls += 1;
+        let mut call = json!({ "id": self.calls, "method": method, "params": params });
+        if !self.session.is_empty() {
+            call["sessionId"] = self.session.clone().into();
+        }
+        self.socket.send(Message::text(call.to_string())).expect("the browser lives");
+        loop {
+            let told = self.socket.read().unwrap_or_else(|error| panic!("{method}: {error}"));
+            let Message::Text(text) = told else { continue };
+            let told: Value = serde_json::from_str(&text).expect("JSON");
+            if told["id"] == self.calls {
+                assert!(told.get("error").is_none(), "{method}: {told}");
+                return told["result"].clone();
+            }
+            let is_complaint = told["method"] == "Runtime.exceptionThrown"
+                || told["method"] == "Log.entryAdded" && told["params"]["entry"]["source"] == "security";
+            if is_complaint {
+                self.complaints.push(told["params"].to_string());
+            }
+        }
+    }
+}
+
+impl Drop for Browser {
+    fn drop(&mut self) {
+        let _ = self.process.kill();
+        let _ = self.process.wait();
+        let _ = fs::remove_dir_all(&self.profile);
+    }
+}
+
+/// RFC 4648, without line feeds.
+fn from_base64(text: &str) -> Vec<u8> {
+    let value = |sign: u8| match sign {
+        b'A'..=b'Z' => sign - b'A',
+        b'a'..=b'z' => sign - b'a' + 26,
+        b'0'..=b'9' => sign - b'0' + 52,
+        b'+' => 62,
+        _ => 63,
+    };
+    let mut bytes = Vec::with_capacity(text.len() * 3 / 4);
+    for four in text.trim_end_matches('=').as_bytes().chunks(4) {
+        let bits = four.iter().fold(0_u32, |bits, sign| bits << 6 | u32::from(value(*sign)));
+        let bits = bits << (6 * (4 - four.len()));
+        bytes.extend(&bits.to_be_bytes()[1..four.len()]);
+    }
+    bytes
+}

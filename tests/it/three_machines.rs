@@ -1,0 +1,126 @@
+//! Three machines on a router: two rooms with a hub each, and somebody who watches both. The test's own network is the
+//! router's machine; cables lead from it to the three.
+
+use std::ffi::OsStr;
+use std::path::{Path, PathBuf};
+use std::process::Command;
+
+use crate::testkit::{
+    INT, KILL, Machine, Outcome, Program, Sitting, TestEnv, can_sit, in_a_network, is_class, number, skip,
+    until,
+};
+
+/// The program `scanhub-bridge`, where it was built: `cargo build` alone does not.
+fn bridge_program() -> Option<PathBuf> {
+    let beside = Path::new(env!("CARGO_BIN_EXE_scanhub")).with_file_name("scanhub-bridge");
+    if !beside.is_file() {
+        skip("bridge", "there is no scanhub-bridge beside the program (cargo build -p scanhub-bridge)");
+        return None;
+    }
+    Some(beside)
+}
+
+/// The program with these flags, in the network and domain of `env`.
+fn command(env: &TestEnv, flags: &[&str]) -> Command {
+    let inner = env.command(flags);
+    let own = OsStr::new(env!("CARGO_BIN_EXE_scanhub"));
+    let bridge = bridge_program().expect("it was there");
+    let words: Vec<_> = std::iter::once(inner.get_program()).chain(inner.get_args()).collect();
+    let words = words.into_iter().map(|word| if word == own { bridge.as_os_str() } else { word });
+    let words: Vec<_> = words.collect();
+    let mut command = Command::new(words[0]);
+    command.args(&words[1..]);
+    for (key, value) in inner.get_envs() {
+        match value {
+            Some(value) => command.env(key, value),
+            None => command.env_remove(key),
+        };
+    }
+    command
+}
+
+/// A bridge that has begun, and what it is called.
+fn bridge(env: &TestEnv, flags: &[&str]) -> (Program, String) {
+    let mut program = Program::start(command(env, &[&["--json"], flags].concat()));
+    let begin = program.await_line("its begin", is_class("bridge_ready"));
+    (program, begin["hub"].as_str().unwrap_or_default().to_owned())
+}
+
+/// What a bridge that is only to be checked finds: the state and the words of each finding.
+fn checked(env: &TestEnv, flags: &[&str]) -> (Option<i32>, Vec<(String, String)>) {
+    let outcome: Outcome = Program::start(command(env, &[&["--json", "--check"], flags].concat())).wait();
+    let said = |line: &serde_json::Value, key: &str| line[key].as_str().unwrap_or_default().to_owned();
+    let findings = outcome.of_class("bridge_check");
+    (outcome.code, findings.iter().map(|line| (said(line, "state"), said(line, "finding"))).collect())
+}
+
+#[test]
+fn two_rooms_are_watched_from_a_third_machine() {
+    in_a_network("three_machines::two_rooms_are_watched_from_a_third_machine", || {
+        if bridge_program().is_none() {
+            return;
+        }
+        let machines = [2, 3, 4].map(Machine::new);
+        let to: Vec<String> = machines.iter().map(|it| format!("--connect=tcp/{}:7447", it.here())).collect();
+        let middle = TestEnv::new();
+        let router = || bridge(&middle, &["--listen=tcp/0.0.0.0:7447"]).0;
+        let first = router();
+
+        let rooms = [TestEnv::on(&machines[0]), TestEnv::on(&machines[1])];
+        let watcher = TestEnv::on(&machines[2]);
+        let sensors =
+            rooms.each_ref().map(|room| room.simulator(&["front"], &["--seed=61", "--baud=500000"]));
+        let hubs = rooms.each_ref().map(|room| room.hub(&[room.link("front")]));
+        let bridges = [bridge(&rooms[0], &[&to[0]]), bridge(&rooms[1], &[&to[1]])];
+        let names = [0, 1].map(|room| format!("--name=room{room}={}", bridges[room].1));
+        let (mut here, _) = bridge(&watcher, &[&to[2], "--publish", &names[0], &names[1]]);
+        for _ in &rooms {
+            here.await_line("a room", |line| line["kind"] == "published");
+        }
+
+        // Both rooms, as if they were here.
+        let ages = watcher.run(&["latency", "room0.front/scan", "room1.front/scan", "-n20", "--json"]);
+        let received = |room: &str| {
+            let line = ages.of_class("latency").into_iter().rfind(|line| line["sensor"] == room);
+            line.map_or(0, |line| number(&line, "received"))
+        };
+        assert!(ages.code == Some(0) && received("room0.front") > 0 && received("room1.front") > 0, "{ages}");
+        let (mut near, mut far) = (rooms[1].echo(&["front/scan"]), watcher.echo(&["room1.front/scan"]));
+        let scan = near.await_lines(10, "a scan", is_class("scan")).pop().expect("ten");
+        let same =
+            far.await_line("the same or a newer scan", |line| number(line, "seq") >= number(&scan, "seq"));
+        assert!(same["seq"] != scan["seq"] || same["ranges"] == scan["ranges"], "{same}");
+        if can_sit() {
+            let watch = Sitting::start(&watcher.command(&["watch"]), (100, 30));
+            watch.await_words("room0.front");
+            watch.await_words("room1.front");
+        }
+        let (code, found) = checked(&watcher, &[&to[2]]);
+        assert!(code == Some(0) && found.len() == 1 && found[0].0 == "ok", "{found:?}");
+        assert!(bridges.iter().all(|(_, hub)| found[0].1.contains(hub)), "{found:?}");
+
+        // Without the router the rooms go on by themselves, and nobody elsewhere believes an old verdict.
+        let mut zones = watcher.echo(&["room0.front/zones"]);
+        zones.await_line("a verdict", |line| line["class"] == "zones" && line["verdict"] != "unknown");
+        let mut local = rooms[0].start(&["hz", "--json", "front/scan"]);
+        drop(first.end(KILL));
+        zones.await_line("nothing is known", |line| line["class"] == "zones" && line["verdict"] == "unknown");
+        let (code, found) = checked(&watcher, &[&to[2]]);
+        assert!(code == Some(5) && found[0].0 == "failed" && found[0].1.contains("no router"), "{found:?}");
+        let second = router();
+        zones.await_line("a verdict again", |line| line["class"] == "zones" && line["verdict"] != "unknown");
+        let rate =
+            local.await_line("a rate", |line| line["class"] == "hz" && line["received"].as_u64() > Some(100));
+        assert_eq!(rate["lost"], 0, "{rate}");
+
+        for program in [near, far, zones, local, here, second] {
+            drop(program.end(INT));
+        }
+        for ((program, _), hub) in bridges.into_iter().zip(hubs) {
+            drop(program.end(INT));
+            assert_eq!(hub.end(INT).code, Some(0));
+        }
+        drop(sensors);
+        until("nothing is left", || rooms.iter().chain([&watcher]).all(|env| env.left_behind().is_empty()));
+    });
+}

@@ -1,0 +1,190 @@
+//! The server of `web` as viewers and strangers meet it: the wire of Foxglove, closed doors, and too many.
+
+use std::io::{Read, Write};
+use std::net::TcpStream;
+use std::thread;
+use std::time::{Duration, Instant};
+
+use crate::testkit::{INT, PATIENCE, Program, TestEnv, is_class};
+use serde_json::{Value, json};
+use tungstenite::client::IntoClientRequest;
+use tungstenite::{Message, WebSocket};
+
+/// A server with these flags, and `HOST:PORT` of it.
+fn web(env: &TestEnv, flags: &[&str]) -> (Program, String) {
+    let mut server = env.start(&[&["web", "--json", "--listen", "127.0.0.1:0"], flags].concat());
+    let ready = server.await_line("its address", is_class("ready"));
+    let url = ready["url"].as_str().expect("an address");
+    let host = url.trim_start_matches("http://").split('/').next().expect("a host").to_owned();
+    (server, host)
+}
+
+fn connect(host: &str) -> TcpStream {
+    let stream = TcpStream::connect(host).expect("the server listens");
+    stream.set_read_timeout(Some(PATIENCE)).expect("a timeout");
+    stream
+}
+
+/// What the server answers to `head`; nothing if it says nothing.
+fn ask(host: &str, head: &str) -> String {
+    let mut stream = connect(host);
+    stream.write_all(head.as_bytes()).expect("it reads");
+    let mut answer = Vec::new();
+    let _ = stream.read_to_end(&mut answer);
+    String::from_utf8_lossy(&answer).into_owned()
+}
+
+fn status(answer: &str) -> &str {
+    answer.split(' ').nth(1).unwrap_or("none")
+}
+
+/// A viewer that was let in, or the status with which it was not.
+fn view(host: &str, path: &str, origin: Option<&str>) -> Result<WebSocket<TcpStream>, u16> {
+    let mut request = format!("ws://{host}{path}").into_client_request().expect("an address");
+    let headers = request.headers_mut();
+    headers.insert("Sec-WebSocket-Protocol", "foxglove.sdk.v1".parse().expect("a header"));
+    if let Some(origin) = origin {
+        headers.insert("Origin", origin.parse().expect("a header"));
+    }
+    match tungstenite::client(request, connect(host)) {
+        Ok((socket, _)) => Ok(socket),
+        Err(tungstenite::HandshakeError::Failure(tungstenite::Error::Http(answer))) => {
+            Err(answer.status().as_u16())
+        }
+        Err(other) => panic!("{other}"),
+    }
+}
+
+fn text(socket: &mut WebSocket<TcpStream>) -> Value {
+    loop {
+        if let Message::Text(text) = socket.read().expect("the server lives") {
+            return serde_json::from_str(&text).expect("JSON");
+        }
+    }
+}
+
+#[test]
+fn strangers_stay_outside() {
+    let env = TestEnv::new();
+    let (_open, host) = web(&env, &[]);
+    let get = |host: &str, name: &str, more: &str| {
+        ask(host, &format!("GET / HTTP/1.1\r\nHost: {name}\r\n{more}\r\n"))
+    };
+    let page = get(&host, &host, "");
+    assert_eq!(status(&page), "200");
+    for header in ["nosniff", "no-store", "default-src 'none'", "frame-ancestors 'none'", "no-referrer"] {
+        assert!(page.contains(header), "{header}");
+    }
+    assert_eq!(status(&get(&host, "evil.example", "")), "403");
+    assert_eq!(status(&get(&host, &host, "Origin: http://evil.example\r\n")), "403");
+    assert_eq!(view(&host, "/", Some("https://evil.example")).err(), Some(403));
+    assert!(view(&host, "/", None).is_ok());
+    assert_eq!(status(&ask(&host, &format!("POST / HTTP/1.1\r\nHost: {host}\r\n\r\n"))), "405");
+    assert_eq!(status(&ask(&host, &format!("GET /etc/passwd HTTP/1.1\r\nHost: {host}\r\n\r\n"))), "404");
+    assert_eq!(ask(&host, "\x16\x03\x01 no request\r\n\r\n"), "");
+    assert_eq!(ask(&host, &format!("GET /{}", "a".repeat(9000))), "");
+
+    let (_closed, host) = web(&env, &["--token", "carrot", "--allow-origin", "https://viewer.example"]);
+    assert_eq!(status(&get(&host, &host, "")), "401");
+    assert_eq!(status(&get(&host, &host, "Authorization: Bearer carrot\r\n")), "200");
+    assert_eq!(view(&host, "/", None).err(), Some(401));
+    assert_eq!(view(&host, "/?token=carro", None).err(), Some(401));
+    assert!(view(&host, "/?token=carrot", Some("https://viewer.example")).is_ok());
+
+    let outcome = env.run(&["web", "--listen", "0.0.0.0:0"]);
+    assert_eq!(outcome.code, Some(2), "{outcome}");
+    assert!(outcome.errors.contains("--token"), "{outcome}");
+}
+
+#[test]
+fn viewers_get_the_messages_of_foxglove_whatever_others_send() {
+    let env = TestEnv::new();
+    let _sensor = env.simulator(&["front"], &["--seed=5", "--baud=500000"]);
+    let _hub = env.hub(&[env.link("front")]);
+    env.await_info("front", |info| info["state"] == "streaming");
+    let (mut server, host) = web(&env, &[]);
+    let mut viewer = view(&host, "/", None).expect("let in");
+    server.await_line("who came", |line| line["class"] == "client" && line["came"] == true);
+    assert_eq!(text(&mut viewer)["op"], "serverInfo");
+    // Hostile frames come from the next viewer; this one is not to notice.
+    let mut hostile = view(&host, "/", None).expect("let in");
+    hostile.send(Message::text("[".repeat(60_000))).expect("it reads");
+    hostile.send(Message::binary(vec![1; 60_000])).expect("it reads");
+    let _ = hostile.send(Message::binary(vec![1; 1 << 20]));
+
+    let begun = Instant::now();
+    let mut channels = Vec::new();
+    let of =
+        |channels: &[Value], topic: &str| channels.iter().find(|channel| channel["topic"] == topic).cloned();
+    while of(&channels, "/front/status").is_none() {
+        assert!(begun.elapsed() < PATIENCE, "{channels:?}");
+        let told = text(&mut viewer);
+        channels.extend(told["channels"].as_array().cloned().unwrap_or_default());
+    }
+    let scan = of(&channels, "/front/scan").expect("scans");
+    assert_eq!(
+        [&scan["encoding"], &scan["schemaName"], &scan["schemaEncoding"]],
+        ["cdr", "sensor_msgs/msg/LaserScan", "ros2msg"]
+    );
+    let zones = of(&channels, "/zones").expect("zones");
+    assert_eq!([&zones["encoding"], &zones["schemaName"]], ["json", "foxglove.SceneUpdate"]);
+    let subscribe = json!({ "op": "subscribe", "subscriptions": [
+        { "id": 70, "channelId": scan["id"] }, { "id": 71, "channelId": zones["id"] }, { "id": 72, "channelId": 9999 },
+    ] });
+    viewer.send(Message::text(subscribe.to_string())).expect("it reads");
+    let mut seen = [0_u32; 2];
+    while seen.iter().any(|count| *count < 5) {
+        assert!(begun.elapsed() < PATIENCE, "{seen:?}");
+        let Message::Binary(frame) = viewer.read().expect("the server lives") else { continue };
+        let subscription = u32::from_le_bytes(frame[1..5].try_into().expect("four bytes"));
+        assert_eq!(frame[0], 1);
+        let body = &frame[13..];
+        match subscription {
+            70 => {
+                let told = ros::read(&ros::LASER_SCAN, body).expect("a LaserScan");
+                assert_eq!(told.text("header.frame_id"), Some("front"));
+                assert!(told.number("ranges.0").is_some());
+                seen[0] += 1;
+            }
+            71 => {
+                let told: Value = serde_json::from_slice(body).expect("a SceneUpdate");
+                seen[1] += u32::from(told["entities"].as_array().is_some_and(|all| all.len() >= 2));
+            }
+            other => panic!("nobody subscribed to {other}"),
+        }
+    }
+    drop(viewer);
+    server.await_line("who went", |line| line["class"] == "client" && line["came"] == false);
+    assert_eq!(server.end(INT).code, Some(0));
+}
+
+#[test]
+fn as_many_come_in_as_there_is_room_for() {
+    let env = TestEnv::new();
+    let (server, host) = web(&env, &[]);
+    let mut viewers: Vec<_> = (0..32).map(|_| view(&host, "/", None).expect("let in")).collect();
+    assert_eq!(view(&host, "/", None).err(), Some(503));
+    // Connections that ask for nothing take no viewer's place, and the page is still served.
+    let idle: Vec<_> = (0..20).map(|_| connect(&host)).collect();
+    assert_eq!(status(&ask(&host, &format!("GET / HTTP/1.1\r\nHost: {host}\r\n\r\n"))), "200");
+    drop(idle);
+    let _ = viewers.pop().map(|mut one| one.close(None));
+    let begun = Instant::now();
+    while view(&host, "/", None).is_err() {
+        assert!(begun.elapsed() < PATIENCE, "the place of who went is free");
+        thread::sleep(Duration::from_millis(20));
+    }
+    assert_eq!(server.end(INT).code, Some(0));
+}
+
+#[test]
+fn a_port_that_is_taken_is_not_the_end() {
+    let env = TestEnv::new();
+    let (_first, host) = web(&env, &[]);
+    let mut second = env.start(&["web", "--json", "--listen", &host]);
+    let ready = second.await_line("its address", is_class("ready"));
+    let port =
+        |text: &str| text.trim_end_matches('/').rsplit(':').next().and_then(|port| port.parse::<u16>().ok());
+    let (first, second) = (port(&host), port(ready["url"].as_str().expect("an address")));
+    assert!(first < second && second <= first.map(|port| port + 20), "{first:?} {second:?}");
+}

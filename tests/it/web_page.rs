@@ -1,0 +1,138 @@
+//! The picture in a browser, as somebody looks at it: it follows the hub, says why nothing comes, and goes on by itself.
+
+use std::path::Path;
+use std::time::Duration;
+
+use crate::browser::{Browser, Look};
+use crate::testkit::{INT, KILL, Program, TestEnv, hold_in_time};
+
+/// A hall with a reflector, and a post that is put beside the robot when its background is learned.
+const WORLD: &str =
+    "[noise]\ntail = 0\n\n[[thing]]\nline = [[3000, -3000], [3000, 3000], [-3000, 3000], [-3000, -3000]]\n
+[[thing]]\nradius_mm = 60\npose = [0, 450]\nfrom_s = 9\n
+[[thing]]\nline = [[900, 2000], [1000, 2000]]\nsurface = \"reflector\"\n";
+
+fn sensor(env: &TestEnv) -> Program {
+    let world = format!("--world={}", env.file("world", WORLD));
+    env.simulator(&["front"], &["--seed=71", "--baud=500000", &world])
+}
+
+/// The server, and the address that it says.
+fn web(env: &TestEnv, listen: &str) -> (Program, String) {
+    let mut web = env.start(&["web", "--json", "--listen", listen]);
+    let ready = web.await_line("its address", |line| line["class"] == "ready");
+    let url = ready["url"].as_str().expect("an address").to_owned();
+    (web, url)
+}
+
+#[test]
+fn it_shows_what_comes_and_says_why_nothing_does() {
+    hold_in_time(look_on);
+}
+
+fn look_on() {
+    let env = TestEnv::in_time();
+    let Some(mut page) = Browser::start(&env, Look::LAPTOP) else { return };
+    let (server, url) = web(&env, "127.0.0.1:0");
+    page.open(&url);
+    page.await_true("window.scanhub?.connected && /no hub/.test(window.scanhub.reason)");
+    assert_eq!(page.ask("scanhub.verdict"), "unknown");
+
+    let _sensor = sensor(&env);
+    let hub = env.hub(&[env.link("front")]);
+    page.await_true("scanhub.reason === null && scanhub.verdict === 'clear' && scanhub.beams > 100");
+    page.await_true("scanhub.zones === 2 && scanhub.marks > 0 && scanhub.sensors[0].hz > 30");
+    page.await_true("document.querySelector('#sensors article').innerText.includes('streaming')");
+
+    // The post is new, and nearer than the robot may be.
+    page.await_true("scanhub.verdict === 'stop' && scanhub.foreground > 2");
+    page.await_true("document.querySelector('#verdict').innerText.startsWith('STOP')");
+    let before = page.ask("scanhub.scans.front").as_u64().expect("a number");
+    page.ask("new Promise((done) => setTimeout(done, 10_000))");
+    let scans = page.ask("scanhub.scans.front").as_u64().expect("a number") - before;
+    let age = page.ask("scanhub.drawn_ms[0]").as_f64().expect("scans were drawn");
+    // 37.5 a second; of those that come at once the newest is shown.
+    assert!(scans > 340 && age < 100.0, "{scans} scans in 10 s, half of them seen after {age:.0} ms");
+
+    // Held, the picture stands and the verdict does not.
+    page.press(" ");
+    page.await_true("document.querySelector('#verdict').innerText.includes('held')");
+    hub.end(KILL);
+    let unknown = page.await_true("scanhub.verdict === 'unknown'");
+    let said = page.await_true("/no hub/.test(scanhub.reason)");
+    assert!(unknown < Duration::from_secs(1) && said < Duration::from_secs(2), "{unknown:?} {said:?}");
+    page.press(" ");
+    page.await_true("scanhub.beams === 0");
+    let _hub = env.hub(&[env.link("front")]);
+    page.await_true("scanhub.verdict === 'stop' && scanhub.beams > 100");
+
+    // The socket is cut, and another server comes at the same place.
+    let address = url.trim_start_matches("http://").trim_end_matches('/').to_owned();
+    server.end(INT);
+    page.await_true("scanhub.verdict === 'unknown' && /No connection/.test(scanhub.reason)");
+    let (_server, again) = web(&env, &address);
+    assert_eq!(again, url);
+    page.await_true("scanhub.verdict === 'stop' && scanhub.beams > 100 && scanhub.reason === null");
+    assert!(page.complaints.is_empty(), "{:?}", page.complaints);
+}
+
+#[test]
+fn keys_and_the_mouse_change_the_picture() {
+    let env = TestEnv::new();
+    let Some(mut page) = Browser::start(&env, Look::PHONE) else { return };
+    let _sensor = sensor(&env);
+    let _hub = env.hub(&[env.link("front")]);
+    let (_server, url) = web(&env, "127.0.0.1:0");
+    page.open(&url);
+    page.await_true("window.scanhub?.beams > 100 && scanhub.zones === 2");
+    for (key, layer) in [("z", "zones"), ("m", "marks"), ("s", "beams")] {
+        page.press(key);
+        page.await_true(&format!("scanhub.{layer} === 0"));
+        page.press(key);
+        page.await_true(&format!("scanhub.{layer} > 0"));
+    }
+    let fits = "document.querySelector('[data-do=fit]').getAttribute('aria-pressed')";
+    assert_eq!(page.ask(fits), "true");
+    page.mouse("mousePressed", (180.0, 300.0), true);
+    page.mouse("mouseMoved", (220.0, 330.0), true);
+    page.mouse("mouseReleased", (220.0, 330.0), false);
+    page.await_true(&format!("{fits} === 'false'"));
+    page.press("c");
+    page.await_true(&format!("{fits} === 'true'"));
+    page.mouse("mouseMoved", (195.0, 300.0), false);
+    page.await_true("/from the robot/.test(document.querySelector('#readout').innerText)");
+    page.press("?");
+    page.await_true("document.querySelector('#help').open");
+    page.press("Escape");
+    // Nothing is wider than the screen, and every key can be hit by a finger.
+    assert_eq!(page.ask("document.documentElement.scrollWidth <= 390"), true);
+    let small = "[...document.querySelectorAll('nav button')].filter((one) => one.offsetHeight < 40).length";
+    assert_eq!(page.ask(small), 0);
+    assert!(page.complaints.is_empty(), "{:?}", page.complaints);
+}
+
+/// As in the documents: `SCANHUB_PICTURES=docs cargo test --test it the_picture_of_the_documents` makes those anew.
+#[test]
+fn the_picture_of_the_documents() {
+    let env = TestEnv::new();
+    let _sensors = env.simulator(&["front", "rear"], &["--world=demo", "--seed=3", "--baud=500000"]);
+    let poses = ["front.pose.x=0.3", "rear.pose.x=-0.3", "rear.pose.yaw=3.14159"];
+    let poses = poses.map(|pose| format!("--set=link.{pose}"));
+    let _hub = env.hub(&[&[env.link("front"), env.link("rear")], &poses[..]].concat());
+    let (_server, url) = web(&env, "127.0.0.1:0");
+    let dark = Look { scheme: "dark", ..Look::LAPTOP };
+    for (name, look) in [("web-light", Look::LAPTOP), ("web-dark", dark), ("web-phone", Look::PHONE)] {
+        let Some(mut page) = Browser::start(&env, look) else { return };
+        page.open(&url);
+        page.await_true(
+            "window.scanhub?.verdict === 'slow' && scanhub.foreground > 20 && scanhub.beams > 600",
+        );
+        page.ask("new Promise((done) => setTimeout(done, 1500))");
+        page.await_true("scanhub.zones === 2 && scanhub.marks >= 2 && scanhub.sensors.length === 2");
+        page.await_true("document.querySelectorAll('#sensors article.streaming').length === 2");
+        assert!(page.complaints.is_empty(), "{:?}", page.complaints);
+        if let Some(directory) = std::env::var_os("SCANHUB_PICTURES") {
+            page.photograph(&Path::new(&directory).join(format!("{name}.png")));
+        }
+    }
+}
