@@ -22,7 +22,7 @@ pub(crate) struct Web {
     /// Let everybody look who reaches the address, without a token
     #[arg(long, conflicts_with = "token")]
     open: bool,
-    /// Let viewers come that are served from this address, as https://app.example.org. Can be repeated
+    /// Let viewers come that are served from this URL. Can be repeated
     #[arg(long = "allow-origin", value_name = "URL")]
     origins: Vec<String>,
     #[command(flatten)]
