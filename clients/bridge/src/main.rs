@@ -22,7 +22,7 @@ struct Cli {
     /// Router to connect to: tcp/HOST:PORT or tls/HOST:PORT. Can be repeated; the first one that answers is used
     #[arg(long, value_name = "ADDRESS")]
     connect: Vec<String>,
-    /// Be a router, and listen there: tcp/0.0.0.0:7447, tls/[::]:7447. Can be repeated
+    /// Be a router, and listen there: tcp/0.0.0.0:7447, or tls/.. with certificates. Can be repeated
     #[arg(long, value_name = "ADDRESS")]
     listen: Vec<String>,
     /// Zenoh's own configuration, JSON5: TLS, users, access control. --connect and --listen are added to it
