@@ -165,11 +165,11 @@ pub fn tell(notice: Notice, json: bool, out: &mut Output<'_>, notes: &mut Output
     notes.line(|line| text::notice(line, &[], notice))
 }
 
-/// Begins a life of the gateway of `domain` by this `way`, as [`Life::begin`], on this machine and now.
+/// Begins a life of the gateway of `domain` by this `way`, as `Life::begin`, on this machine and now.
 ///
 /// # Errors
 ///
-/// As [`Life::begin`], and if the environment names no place for its number.
+/// As `Life::begin`, and if the environment names no place for its number.
 pub fn begin_life(domain: &str, way: &str) -> Result<Life, Failure> {
     let now_s = clock::wall_ns() / 1_000_000_000;
     Life::begin(&life::directory()?, domain, way, now_s, machine::machine(Path::new(machine::ID)))

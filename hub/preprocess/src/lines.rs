@@ -4,7 +4,7 @@
 //!
 //! The method is maximum likelihood as in Schaefer, Buescher, Luft, Burgard: "A Maximum Likelihood Approach to Extract
 //! Polylines from 2-D Laser Range Scans" (IROS 2018), for lines that need not be connected: pairs of beams are joined to
-//! lines, the likeliest first, then the cuts between lines are moved ([`cut`]).
+//! lines, the likeliest first, then the cuts between lines are moved (`cut`).
 //!
 //! Nothing is set by hand: the noise comes from the scan itself, and a line has to explain more than its numbers
 //! explain of mere noise, by a Bayesian information criterion.

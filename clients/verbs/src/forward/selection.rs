@@ -19,7 +19,7 @@ struct Entry {
 }
 
 impl Selection {
-    /// What `texts` name, see [`Word`], with `:every=N` behind it if the samples are to be thinned. Nothing
+    /// What `texts` name, as words of topics (`SENSOR/TOPIC`), with `:every=N` behind it if the samples are to be thinned. Nothing
     /// named is all sensors, and of these telegrams if `bare`, else all other topics but lines, which cost time only where
     /// they are followed.
     ///
