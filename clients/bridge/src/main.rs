@@ -207,6 +207,8 @@ mod tests {
         assert_eq!(directions(&root), (true, false));
         assert_eq!(directions(&[&root[..], &["--publish"]].concat()), (false, true));
         assert_eq!(directions(&[&root[..], &["--publish", "--send"]].concat()), (true, true));
-        assert!(Cli::try_parse_from(["scanhub-bridge", "--send"]).is_err());
+        assert_eq!(directions(&[&root[..], &["--send"]].concat()), (true, false));
+        assert_eq!(directions(&[&root[..], &["--ros2"]].concat()), (false, false));
+        assert_eq!(directions(&[&root[..], &["--ros2", "--send"]].concat()), (true, false));
     }
 }
