@@ -59,6 +59,18 @@ impl Scene {
         &mut self.sensors[at]
     }
 
+    /// A sample of the sensor called `name` came: if it has a header, a hub lives, and unless the sensor is of another machine,
+    /// it is the process that the header names.
+    pub fn heard(&mut self, name: &str, header: Option<&Header>) -> &mut Sensor {
+        if let Some(header) = header {
+            self.hub_lives = true;
+            if !is_remote(name) {
+                self.hub_pid = header.hub_pid;
+            }
+        }
+        self.sensor(name)
+    }
+
     /// The sensors of the robot, or if there are none, all; with their numbers from 0. Those of other machines sit on other
     /// robots.
     pub fn robot(&self) -> impl Iterator<Item = (usize, &Sensor)> {

@@ -156,13 +156,7 @@ impl Sink for Watcher<'_> {
     }
 
     fn sample(&mut self, name: &TopicName, sample: &Sample) -> Result<(), End> {
-        if let Some(header) = sample.header() {
-            self.scene.hub_lives = true;
-            if !is_remote(&name.sensor) {
-                self.scene.hub_pid = header.hub_pid;
-            }
-        }
-        let sensor = self.scene.sensor(&name.sensor);
+        let sensor = self.scene.heard(&name.sensor, sample.header());
         match sample {
             Sample::Scan(scan) => sensor.take_scan(scan.header(), scan, clock::now_ns()),
             Sample::Marks(marks) => sensor.marks = marks.is_available().then_some(**marks),

@@ -7,7 +7,7 @@ use ::web::{Board, ChannelId, Event, messages};
 use scanhub_client::clock;
 use scanhub_client::streams::{Sample, Session};
 use scene::{Scene, Trouble};
-use schema::{Domain, Header, Topic, is_remote};
+use schema::{Domain, Header, Topic};
 
 use super::{WebOptions, told};
 use crate::follow::{Notice, Sink};
@@ -211,13 +211,7 @@ impl Sink for Feeder<'_> {
     }
 
     fn sample(&mut self, name: &TopicName, sample: &Sample) -> Result<(), End> {
-        if let Some(header) = sample.header() {
-            self.scene.hub_lives = true;
-            if !is_remote(&name.sensor) {
-                self.scene.hub_pid = header.hub_pid;
-            }
-        }
-        let sensor = self.scene.sensor(&name.sensor);
+        let sensor = self.scene.heard(&name.sensor, sample.header());
         match sample {
             Sample::Scan(scan) => {
                 sensor.take_scan(scan.header(), scan, clock::now_ns());
