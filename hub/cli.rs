@@ -19,7 +19,9 @@ mod probe;
 pub(crate) mod record;
 pub(crate) mod replay;
 pub(crate) mod simulate;
+mod site;
 mod telegram;
+mod track;
 pub(crate) mod watch;
 mod web;
 mod zones;
@@ -49,7 +51,9 @@ pub(crate) use leds::Leds;
 pub(crate) use listen::Listen;
 pub(crate) use record::Record;
 pub(crate) use replay::Replay;
+pub(crate) use site::Site;
 pub(crate) use telegram::{Telegram, Way};
+pub(crate) use track::Track;
 pub(crate) use watch::Watch;
 pub(crate) use web::Web;
 pub(crate) use zones::Zones;
@@ -166,6 +170,10 @@ pub(crate) enum Verb {
     Background(Background),
     /// Learn which part of a sensor's view is the robot itself
     Zones(Zones),
+    /// Follow people across the sensors and rooms of a site, and count them at doors
+    Track(Track),
+    /// Check and draw the plan of sensors, rooms and doors that people are followed in
+    Site(Site),
     /// Show the zone verdict and the marks as lights, in the terminal and on LEDs of this machine
     #[command(after_help = leds::MEANING)]
     Leds(Leds),

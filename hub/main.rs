@@ -3,6 +3,7 @@
 
 mod cli;
 mod demo;
+mod own_domain;
 mod replay;
 
 use std::ffi::c_int;
@@ -136,7 +137,10 @@ fn dispatch(cli: &Cli) -> Result<(), Failure> {
             let stop = interrupt_by(&ENDS)?;
             verbs::watch(&watch.options(everywhere)?, &mut out, &stop)
         }
-        Verb::Web(web) => verbs::web(&web.options(everywhere)?, &mut out, &*interrupt()?),
+        Verb::Web(web) => match &web.replay {
+            Some(file) => replay::page::show(web, file, everywhere, &mut out, &interrupt()?),
+            None => verbs::web(&web.options(everywhere)?, None, &mut out, &*interrupt()?),
+        },
         Verb::Record(record) => {
             let options = record.options(everywhere)?;
             // Whatever ends it, the file is finished.
@@ -156,6 +160,10 @@ fn dispatch(cli: &Cli) -> Result<(), Failure> {
             verbs::background(&options, &mut out, &*interrupt()?)
         }
         Verb::Zones(zones) => zones.run(everywhere, &mut out, &*interrupt()?),
+        Verb::Track(track) => {
+            verbs::track(&track.options(everywhere)?, &mut out, &mut io::stderr(), &*interrupt()?)
+        }
+        Verb::Site(site) => site.run(everywhere.json),
         Verb::Leds(leds) => {
             verbs::leds(&leds.options(everywhere)?, &mut out, &mut io::stderr(), &*interrupt()?)
         }

@@ -2,6 +2,7 @@
 //! keys and a line that says how far it is.
 
 pub(crate) mod line;
+pub(crate) mod page;
 mod terminal;
 
 use std::io::{IsTerminal, Read, stderr, stdin};

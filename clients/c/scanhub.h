@@ -23,7 +23,7 @@
 extern "C" {
 #endif
 
-/* The groups are 239.255.76.80 to .83, all on this port: .80 announce and status, .81 zones, marks, lines and foreground, .82
+/* The groups are 239.255.76.80 to .83, all on this port: .80 announce and status, .81 zones, early, marks, lines, motion and foreground, .82
  * scan and background, .83 telegram. */
 #define SCANHUB_PORT 22200
 /* The longest datagram that a gateway ever sends. */
@@ -38,7 +38,9 @@ enum scanhub_topic {
     SCANHUB_FOREGROUND = 5,
     SCANHUB_BACKGROUND = 6,
     SCANHUB_STATUS = 7,
-    SCANHUB_LINES = 8
+    SCANHUB_LINES = 8,
+    SCANHUB_MOTION = 9,
+    SCANHUB_EARLY = 10
 };
 
 /* Bits of `flags`. */
@@ -506,6 +508,52 @@ static inline enum scanhub_result scanhub_read_lines(const struct scanhub_datagr
     return SCANHUB_OK;
 }
 
+/* How the robot moved since the scan before, in its own frame at that scan. */
+enum scanhub_method {
+    SCANHUB_MOTION_FIRST = 0,   /* there is no scan before, and no step */
+    SCANHUB_MOTION_REFUSED = 1, /* no step explains the scan: neither a step nor a place; greater than BOTH is the same */
+    SCANHUB_MOTION_BEAMS = 2,
+    SCANHUB_MOTION_POINTS = 3,
+    SCANHUB_MOTION_LINES = 4,
+    SCANHUB_MOTION_BOTH = 5
+};
+struct scanhub_motion {
+    double x_m, y_m, yaw_rad;    /* the sum of all steps: it drifts */
+    float dx_m, dy_m, dyaw_rad;  /* the step */
+    float covariance[9];         /* of the step, row by row */
+    float overlap;               /* share of the readings that lie on the scan before */
+    uint8_t method;
+    uint8_t degenerate;          /* 1: the surroundings leave a direction open */
+    uint16_t breaks;             /* steps that were refused since the start */
+};
+static inline enum scanhub_result scanhub_read_motion(const struct scanhub_datagram *datagram,
+                                                      struct scanhub_motion *out)
+{
+    const uint8_t *at = datagram->payload;
+    enum scanhub_result result = scanhub_expect(datagram, SCANHUB_MOTION, 80);
+    unsigned i;
+    int finite;
+    if (result != SCANHUB_OK)
+        return result;
+    out->x_m = scanhub_f64(at);
+    out->y_m = scanhub_f64(at + 8);
+    out->yaw_rad = scanhub_f64(at + 16);
+    out->dx_m = scanhub_f32(at + 24);
+    out->dy_m = scanhub_f32(at + 28);
+    out->dyaw_rad = scanhub_f32(at + 32);
+    for (i = 0; i < 9; i++)
+        out->covariance[i] = scanhub_f32(at + 36 + 4 * (size_t)i);
+    out->overlap = scanhub_f32(at + 72);
+    out->method = at[76];
+    out->degenerate = at[77] & 1;
+    out->breaks = scanhub_u16(at + 78);
+    finite = isfinite(out->x_m) && isfinite(out->y_m) && isfinite(out->yaw_rad) && isfinite(out->dx_m)
+             && isfinite(out->dy_m) && isfinite(out->dyaw_rad) && isfinite(out->overlap);
+    for (i = 0; i < 9; i++)
+        finite = finite && isfinite(out->covariance[i]);
+    return finite ? SCANHUB_OK : SCANHUB_BAD_PAYLOAD;
+}
+
 /* What is near the robot: at most 8 circles around its centre, the largest first. */
 enum scanhub_verdict { SCANHUB_CLEAR = 0, SCANHUB_SLOW = 1, SCANHUB_STOP = 2, SCANHUB_UNKNOWN = 3 };
 struct scanhub_zones {
@@ -538,6 +586,33 @@ static inline enum scanhub_result scanhub_read_zones(const struct scanhub_datagr
     out->invalid_beams = scanhub_u16(at + 8);
     out->provisional = at[10] & 1;
     out->zones = at + 12;
+    return SCANHUB_OK;
+}
+
+/* A warning by a telegram that was not complete: slow or stop, never clear. The zones of the same number confirm it. */
+struct scanhub_early {
+    uint8_t verdict;       /* SCANHUB_SLOW or SCANHUB_STOP */
+    uint8_t withdrawn;     /* 1: what was said under this number does not hold */
+    uint16_t beam;         /* of the nearest point so far */
+    uint32_t distance_mm;  /* of that, from the robot's centre */
+    uint16_t bytes_seen;   /* of the telegram */
+    uint16_t beams_seen;   /* of the scan */
+};
+static inline enum scanhub_result scanhub_read_early(const struct scanhub_datagram *datagram,
+                                                     struct scanhub_early *out)
+{
+    const uint8_t *at = datagram->payload;
+    enum scanhub_result result = scanhub_expect(datagram, SCANHUB_EARLY, 12);
+    if (result != SCANHUB_OK)
+        return result;
+    if (at[0] != SCANHUB_SLOW && at[0] != SCANHUB_STOP)
+        return SCANHUB_BAD_PAYLOAD;
+    out->verdict = at[0];
+    out->withdrawn = at[1] & 1;
+    out->beam = scanhub_u16(at + 2);
+    out->distance_mm = scanhub_u32(at + 4);
+    out->bytes_seen = scanhub_u16(at + 8);
+    out->beams_seen = scanhub_u16(at + 10);
     return SCANHUB_OK;
 }
 /* One of them, i below `count`. */

@@ -33,7 +33,7 @@ from dataclasses import astuple, dataclass, replace
 from typing import Optional, Union
 
 PORT = 22200
-TOPICS = ("announce", "telegram", "scan", "marks", "zones", "foreground", "background", "status", "lines")
+TOPICS = ("announce", "telegram", "scan", "marks", "zones", "foreground", "background", "status", "lines", "motion", "early")
 VERDICTS = ("clear", "slow", "stop", "unknown")
 STATES = ("absent", "probing", "switching", "starting", "streaming", "silent", "paused")
 FAMILIES = ("lms", "ld", "rplidar")
@@ -227,6 +227,40 @@ class Lines:
     corners: "tuple[Corner, ...]"
 
 
+METHODS = ("first", "refused", "beams", "points", "lines", "both")
+
+
+@dataclass(frozen=True)
+class Motion:
+    """How the robot moved: the sum of all steps, the last step with its covariance (9 numbers, row by row), the share of
+    readings that lie on the scan before, and one of METHODS. `first` and `refused` have no step (0), `refused` no place."""
+
+    x_m: float
+    y_m: float
+    yaw_rad: float
+    dx_m: float
+    dy_m: float
+    dyaw_rad: float
+    covariance: "tuple[float, ...]"
+    overlap: float
+    method: str
+    degenerate: bool
+    breaks: int
+
+
+@dataclass(frozen=True)
+class Early:
+    """A warning by a telegram that was not complete: slow or stop, the beam of the nearest point so far and its distance, and
+    what of the telegram had arrived. `withdrawn`: what was said under this number does not hold."""
+
+    verdict: str
+    withdrawn: bool
+    beam: int
+    distance_mm: int
+    bytes_seen: int
+    beams_seen: int
+
+
 @dataclass(frozen=True)
 class Zone:
     """A circle around the robot's centre and the beams that met something inside."""
@@ -318,7 +352,7 @@ class Status:
     pose: Pose
 
 
-Payload = Union[Announce, Telegram, Scan, Marks, Zones, Foreground, Background, Status, Lines]
+Payload = Union[Announce, Telegram, Scan, Marks, Zones, Foreground, Background, Status, Lines, Motion, Early]
 
 
 @dataclass(frozen=True)
@@ -681,4 +715,17 @@ def _lines(payload: bytes) -> Lines:
     return Lines(bool(flags & 1), readings, on_lines, noise_m, lines, meetings)
 
 
-_UNPACK = (_announce, None, _scan, _marks, _zones, _foreground, _background, _status, _lines)
+def _motion(payload: bytes) -> Motion:
+    *numbers, method, flags, breaks = struct.unpack_from("<3d13fBBH", payload)
+    _limit(all(math.isfinite(number) for number in numbers))
+    method = METHODS[method] if method < len(METHODS) else "refused"
+    return Motion(*numbers[:6], tuple(numbers[6:15]), numbers[15], method, bool(flags & 1), breaks)
+
+
+def _early(payload: bytes) -> Early:
+    verdict, flags, *numbers = struct.unpack_from("<BBHIHH", payload)
+    _limit(verdict in (1, 2))
+    return Early(VERDICTS[verdict], bool(flags & 1), *numbers)
+
+
+_UNPACK = (_announce, None, _scan, _marks, _zones, _foreground, _background, _status, _lines, _motion, _early)

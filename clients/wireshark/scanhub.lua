@@ -15,7 +15,7 @@ scanhub.prefs.crc = Pref.bool("Check checksums", true, "Bytes by bytes in Lua: o
 scanhub.prefs.key_file = Pref.string("Key file", "", "Of `scanhub key new`: 32 bytes, or 64 hex digits")
 
 local TOPICS = {
-    [0] = "announce", "telegram", "scan", "marks", "zones", "foreground", "background", "status", "lines"
+    [0] = "announce", "telegram", "scan", "marks", "zones", "foreground", "background", "status", "lines", "motion", "early"
 }
 local VERDICTS = { [0] = "clear", "slow", "stop", "unknown" }
 local STATES = { [0] = "absent", "probing", "switching", "starting", "streaming", "silent", "paused" }
@@ -141,6 +141,24 @@ field("lines.x_m", "float", "Corner x, m")
 field("lines.y_m", "float", "Corner y, m")
 field("lines.first_line", "uint16", "Of line")
 field("lines.second_line", "uint16", "And line")
+field("motion.x_m", "double", "x since the start, m")
+field("motion.y_m", "double", "y since the start, m")
+field("motion.yaw_rad", "double", "Yaw since the start, rad")
+field("motion.dx_m", "float", "Step x, m")
+field("motion.dy_m", "float", "Step y, m")
+field("motion.dyaw_rad", "float", "Step yaw, rad")
+field("motion.covariance", "float", "Covariance")
+field("motion.overlap", "float", "Overlap")
+field("motion.method", "uint8", "Method")
+field("motion.degenerate", "uint8", "Degenerate", base.DEC, nil, 1)
+field("motion.breaks", "uint16", "Steps refused")
+
+field("early.verdict", "uint8", "Verdict", base.DEC, VERDICTS)
+field("early.withdrawn", "uint8", "Withdrawn", base.DEC, nil, 1)
+field("early.beam", "uint16", "Nearest beam so far")
+field("early.distance_mm", "uint32", "Its distance, mm")
+field("early.bytes_seen", "uint16", "Bytes that had arrived")
+field("early.beams_seen", "uint16", "Beams that had arrived")
 
 field("zones.verdict", "uint8", "Verdict", base.DEC, VERDICTS)
 field("zones.count", "uint8", "Zones")
@@ -621,6 +639,37 @@ unpack_payload[8] = function(payload, tree)
             "lines.second_line", 2)
     end
     return count .. " lines, " .. corners .. " corners"
+end
+
+local METHODS = { [0] = "first", "refused", "beams", "points", "lines", "both" }
+
+unpack_payload[9] = function(payload, tree)
+    if payload:len() < 80 then return nil end
+    for at = 0, 16, 8 do
+        if not is_finite(payload(at, 8):le_float()) then return nil end
+    end
+    for at = 24, 72, 4 do
+        if not is_finite(payload(at, 4):le_float()) then return nil end
+    end
+    add_fields(tree, payload, 0, "motion.x_m", 8, "motion.y_m", 8, "motion.yaw_rad", 8, "motion.dx_m", 4,
+        "motion.dy_m", 4, "motion.dyaw_rad", 4)
+    for at = 36, 68, 4 do
+        tree:add_le(f["motion.covariance"], payload(at, 4))
+    end
+    add_fields(tree, payload, 72, "motion.overlap", 4)
+    tree:add(f["motion.method"], payload(76, 1))
+    tree:add(f["motion.degenerate"], payload(77, 1))
+    add_fields(tree, payload, 78, "motion.breaks", 2)
+    return METHODS[payload(76, 1):uint()] or "refused"
+end
+
+unpack_payload[10] = function(payload, tree)
+    if payload:len() < 12 then return nil end
+    local verdict = payload(0, 1):uint()
+    if verdict < 1 or verdict > 2 then return nil end
+    add_fields(tree, payload, 0, "early.verdict", 1, "early.withdrawn", 1, "early.beam", 2, "early.distance_mm", 4,
+        "early.bytes_seen", 2, "early.beams_seen", 2)
+    return VERDICTS[verdict] .. (payload(1, 1):uint() % 2 == 1 and " withdrawn" or "")
 end
 
 -- Datagram ---------------------------------------------------------------------------------------------------------

@@ -137,6 +137,9 @@ const EXAMPLES: &[(&str, &[&str])] = &[
     ("background load", &["scanhub background front load front.json"]),
     ("zones", &["scanhub zones front mask --for 10s"]),
     ("zones mask", &["scanhub zones front mask --for 10s"]),
+    ("track", &["scanhub track --site house.toml", "scanhub track --site house.toml --count left"]),
+    ("site", &["scanhub site check house.toml"]),
+    ("site check", &["scanhub site check house.toml --svg house.svg"]),
     ("leds", &["scanhub leds front", "scanhub leds robot --led green=led0"]),
     ("gateway", &["scanhub gateway --interface eth0 --topic */zones --topic front/scan:every=4"]),
     (

@@ -25,6 +25,9 @@ pub(crate) struct Leds {
     /// How long a better verdict must last before it is shown; a worse one is shown at once
     #[arg(long, default_value = "300ms", value_name = "DURATION", value_parser = duration::parse)]
     hold: Duration,
+    /// Show early warnings too, before a telegram is complete (docs/early.md)
+    #[arg(long)]
+    early: bool,
     #[command(flatten)]
     limits: Limits,
 }
@@ -41,6 +44,7 @@ impl Leds {
                 (false, false) => LedsLook::Lines,
             },
             hold: self.hold,
+            early: self.early,
             bounds: self.limits.bounds(),
             places: everywhere.places()?,
         })

@@ -1,6 +1,7 @@
 //! `scanhub web` on the command line.
 
 use std::net::SocketAddr;
+use std::path::PathBuf;
 
 use clap::Args;
 use schema::Failure;
@@ -25,6 +26,13 @@ pub(crate) struct Web {
     /// Let viewers come that are served from this URL. Can be repeated
     #[arg(long = "allow-origin", value_name = "URL")]
     origins: Vec<String>,
+    /// Show this recording instead of a hub: a private hub plays it, and the page has the keys of the player. Files: MCAP,
+    /// telegram stream or CARMEN log, plain or gzipped
+    #[arg(long, value_name = "FILE")]
+    pub(crate) replay: Option<PathBuf>,
+    /// Start the recording again at its end
+    #[arg(long = "loop", requires = "replay")]
+    pub(crate) is_looped: bool,
     #[command(flatten)]
     limits: Limits,
 }

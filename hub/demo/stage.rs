@@ -9,15 +9,17 @@ use std::process::Stdio;
 use std::sync::mpsc;
 
 use rustix::fs::{CWD, FileType, Mode, OFlags, mknodat};
-use schema::{Domain, Environment, Failure, Family, Kind};
+use schema::{Failure, Family, Kind};
 use serde_json::Value;
 
 use super::process::{Child, Line};
+use crate::own_domain::OwnDomain;
+
 use super::{HUB, SIMULATOR, Sensor, WEB};
 
 /// A domain and a directory of its own.
 pub(super) struct Stage {
-    pub(super) domain: Domain,
+    pub(super) domain: OwnDomain,
     pub(super) sensors: Vec<Sensor>,
     directory: PathBuf,
     /// There is a picture on the terminal, into which nobody may write.
@@ -27,12 +29,8 @@ pub(super) struct Stage {
 impl Stage {
     /// `quiet`: what the processes have to say of errors is kept until [`tell_errors`](Self::tell_errors).
     pub(super) fn new(quiet: bool, sensors: Vec<Sensor>) -> Result<Stage, Failure> {
-        let name = format!("demo-{}", std::process::id());
-        let environment = Environment::of_process();
-        // Where the user's own place is too long a name for a domain, that of who has none is not.
-        let fallback = Environment { uid: environment.uid, ..Environment::default() };
-        let domain =
-            Domain::of_hub(&name, None, &environment).or_else(|_| Domain::of_hub(&name, None, &fallback))?;
+        let domain = OwnDomain::new("demo")?;
+        let name = domain.name().to_owned();
         let directory = std::env::temp_dir().join(format!("scanhub-{name}"));
         // Not one that is there already: it may be another user's.
         std::fs::DirBuilder::new().mode(0o700).create(&directory).map_err(|error| {
@@ -167,15 +165,8 @@ impl Stage {
 
 impl Drop for Stage {
     fn drop(&mut self) {
-        // All of it is ours alone: the domain's name has our process id.
+        // Ours alone: its name has our process id.
         let _ = std::fs::remove_dir_all(&self.directory);
-        let _ = std::fs::remove_dir_all(self.domain.root());
-        let entries = std::fs::read_dir("/dev/shm").into_iter().flatten().flatten();
-        for entry in
-            entries.filter(|entry| entry.file_name().to_string_lossy().starts_with(&self.domain.prefix()))
-        {
-            let _ = std::fs::remove_file(entry.path());
-        }
     }
 }
 

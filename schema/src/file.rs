@@ -222,4 +222,4 @@ fn io_error(error: McapError) -> io::Error {
 }
 
 /// What stands in a file about the messages, for whoever has nothing but the file.
-const LAYOUT: &str = include_str!("file/layout.txt");
+pub const LAYOUT: &str = include_str!("file/layout.txt");

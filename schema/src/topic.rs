@@ -85,6 +85,8 @@ pub enum Wake {
     HubUp = 3,
     /// The hub is down; sent automatically when the notifier is dropped or its process is found dead.
     HubDown = 4,
+    /// A telegram that is not complete is a warning.
+    Early = 5,
 }
 
 impl Wake {

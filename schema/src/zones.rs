@@ -86,7 +86,7 @@ impl Zones {
 
     /// Returns the verdict; what this program does not know is unknown.
     pub fn verdict(&self) -> Verdict {
-        Verdict::ALL.into_iter().find(|verdict| *verdict as u8 == self.verdict).unwrap_or(Verdict::Unknown)
+        Verdict::of(self.verdict)
     }
 
     /// Returns beam and distance from the robot's centre, in mm, of what is nearest to it.
@@ -112,6 +112,11 @@ pub enum Verdict {
 impl Verdict {
     /// All verdicts, by their number.
     pub const ALL: [Verdict; 4] = [Verdict::Clear, Verdict::Slow, Verdict::Stop, Verdict::Unknown];
+
+    /// Returns the verdict of `number`; what this program does not know is unknown.
+    pub(crate) fn of(number: u8) -> Verdict {
+        Verdict::ALL.into_iter().find(|verdict| *verdict as u8 == number).unwrap_or(Verdict::Unknown)
+    }
 
     /// Returns the verdict's name in all output.
     pub fn name(self) -> &'static str {

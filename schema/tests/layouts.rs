@@ -5,8 +5,8 @@ use std::fmt::Write as _;
 use std::mem::{offset_of, size_of};
 
 use schema::{
-    BackgroundHead, Corner, ForegroundHead, Header, Line, Lines, Mark, Marks, Pose, ScanHead, Segment,
-    Status, Zone, Zones,
+    BackgroundHead, Corner, Early, ForegroundHead, Header, Line, Lines, Mark, Marks, Motion, Pose, ScanHead,
+    Segment, Status, Zone, Zones,
 };
 
 /// The lines of one struct.
@@ -46,6 +46,8 @@ fn the_text_says_what_the_structs_are() {
     layout!(text, Line: x1_m y1_m x2_m y2_m r_m alpha_rad sd_r_m sd_alpha_rad first last points reserved);
     layout!(text, Corner: x_m y_m first_line second_line);
     layout!(text, Lines: count corners flags reserved readings on_lines noise_m line_array corner_array);
+    layout!(text, Motion: x_m y_m yaw_rad dx_m dy_m dyaw_rad covariance overlap method flags breaks);
+    layout!(text, Early: verdict flags beam distance_mm bytes_seen beams_seen);
     let golden = include_str!("../../tests/vectors/v2/layouts.txt");
     assert_eq!(text, golden);
 }

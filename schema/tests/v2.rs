@@ -1,8 +1,12 @@
 //! Golden size, offsets and bytes of every payload of version 2. Do not change these tests: another layout is another
 //! version. The bytes stand in `tests/vectors/v2` too, for other languages.
 
+#[path = "v2/early.rs"]
+mod early;
 #[path = "v2/lines.rs"]
 mod lines;
+#[path = "v2/motion.rs"]
+mod motion;
 #[path = "v2/scan.rs"]
 mod scan;
 

@@ -12,8 +12,8 @@ use std::time::{Duration, Instant};
 use serde_json::{Value, json};
 use tungstenite::{Message, WebSocket};
 
-use crate::testkit::{PATIENCE, TestEnv, skip};
-
+/// Far longer than anything takes.
+const PATIENCE: Duration = Duration::from_secs(60);
 /// Where Debian has it, with a window and without.
 const NAMES: [&str; 2] = ["chromium", "chromium-headless-shell"];
 
@@ -45,9 +45,8 @@ pub(crate) struct Browser {
 }
 
 impl Browser {
-    /// A new one, looking as `look` says; nothing, and why, where there is none.
-    pub(crate) fn start(env: &TestEnv, look: Look) -> Option<Browser> {
-        let profile = env.path("browser");
+    /// A new one that keeps its things in `profile`, looking as `look` says; nothing where there is none.
+    pub(crate) fn start(profile: PathBuf, look: Look) -> Option<Browser> {
         let spawned = NAMES.iter().find_map(|name| {
             let mut command = Command::new(name);
             command.args(["--headless=new", "--no-sandbox", "--disable-gpu", "--hide-scrollbars"]);
@@ -55,10 +54,7 @@ impl Browser {
             command.arg(format!("--user-data-dir={}", profile.display())).arg("about:blank");
             command.stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::piped()).spawn().ok()
         });
-        let Some(mut process) = spawned else {
-            skip("chromium", "there is no browser (Debian: apt-get install chromium)");
-            return None;
-        };
+        let mut process = spawned?;
         let mut lines = BufReader::new(process.stderr.take()?).lines().map_while(Result::ok);
         let address = lines.find_map(|line| Some(line.split_once("listening on ws://")?.1.to_owned()));
         let address = address.unwrap_or_else(|| panic!("the browser does not say where it listens"));
@@ -112,8 +108,20 @@ impl Browser {
 
     /// Types `key`, as `KeyboardEvent.key` has it.
     pub(crate) fn press(&mut self, key: &str) {
+        // What the browser itself does with a key goes by its number and its text.
+        let (number, text) = match key {
+            "Tab" => (9, ""),
+            "Escape" => (27, ""),
+            "Enter" => (13, "\r"),
+            " " => (32, " "),
+            _ => (0, ""),
+        };
         for kind in ["keyDown", "keyUp"] {
-            self.call("Input.dispatchKeyEvent", json!({ "type": kind, "key": key }));
+            let mut pressed = json!({ "type": kind, "key": key, "windowsVirtualKeyCode": number });
+            if kind == "keyDown" && !text.is_empty() {
+                pressed["text"] = text.into();
+            }
+            self.call("Input.dispatchKeyEvent", pressed);
         }
     }
 
@@ -133,7 +141,8 @@ impl Browser {
         fs::write(path, from_base64(text)).unwrap_or_else(|error| panic!("{}: {error}", path.display()));
     }
 
-    fn call(&mut self, method: &str, params: Value) -> Value {
+    /// What the browser answers to a call of its protocol.
+    pub(crate) fn call(&mut self, method: &str, params: Value) -> Value {
         self.calls += 1;
         let mut call = json!({ "id": self.calls, "method": method, "params": params });
         if !self.session.is_empty() {

@@ -36,7 +36,7 @@ fn a_hub_starts_or_says_how_many_it_needs() {
     for limit in [6, 8, 12, 16, 24, 32, 40, 48] {
         is_short(&limited(&env, limit, &run).wait());
     }
-    for limit in [74, 80, 128] {
+    for limit in [88, 96, 128] {
         let hub = limited(&env, limit, &run).ready();
         assert_eq!(env.info("front")["state"], "absent", "{limit}");
         assert_eq!(hub.end(TERM).code, Some(0), "{limit}");
@@ -73,7 +73,7 @@ fn a_client_works_or_says_how_many_it_needs() {
 fn a_hub_that_runs_out_of_them_serves_on_whom_it_serves() {
     let env = TestEnv::new();
     let _simulator = env.simulator(&["front"], &["--seed=51", "--baud=500000"]);
-    let hub = limited(&env, 74, &["run", "--json", &env.link("front")]).ready();
+    let hub = limited(&env, 88, &["run", "--json", &env.link("front")]).ready();
     let mut served = env.echo(&["front/scan", "front/status"]);
     served.await_lines(20, "a scan", is_class("scan"));
     let others: Vec<_> = (0..16).map(|_| env.start(&["echo", "--json", "front/scan"])).collect();

@@ -3,14 +3,14 @@
 
 use std::io::Read;
 
-use crate::testkit;
 use crate::testkit::{
-    INT, Outcome, Program, Sender, TestEnv, in_a_network, is_class, number, skip, terminal, until, wall_ns,
+    self, INT, Outcome, Program, Sender, TestEnv, in_a_network, is_class, number, skip, terminal, until,
+    wall_ns,
 };
 use schema::datagram::{DatagramError, HEAD, WINDOW};
 use schema::{
-    Background, BackgroundHead, Foreground, Line, Lines, Mark, Marks, Scan, ScanHead, State, Status, Topic,
-    Verdict, Zones,
+    Background, BackgroundHead, Early, Foreground, Line, Lines, Mark, Marks, Motion, MotionMethod, Scan,
+    ScanHead, State, Status, Topic, Verdict, Zones,
 };
 use serde_json::{Value, json};
 
@@ -53,10 +53,8 @@ fn every_topic_is_a_line() {
         let mut sender = Sender::new(HUB, 7, 2, "front");
         sender.send(Topic::Zones, &zones(Verdict::Stop));
         let early = program.await_line("zones", is_class("zones"));
-        assert_eq!(
-            (&early["sensor"], &early["age_ms"], &early["boot"]),
-            (&json!("#2"), &Value::Null, &Value::Null)
-        );
+        assert_eq!((&early["sensor"], &early["age_ms"]), (&json!("#2"), &Value::Null));
+        assert_eq!(early["boot"], Value::Null);
         sender.announce(&Topic::ALL);
         let named = program.await_line("its name", |line| line["kind"] == "named");
         assert_eq!((&named["number"], &named["sensor"]), (&json!(2), &json!("front")));
@@ -71,6 +69,7 @@ fn every_topic_is_a_line() {
         let background = Background::of(BackgroundHead { generation: 5, ..BackgroundHead::default() }, &[]);
         let mut lines = Lines { count: 1, noise_m: 0.25, ..Lines::default() };
         lines.line_array[0] = Line { r_m: 1.5, last: 7, points: 8, ..Line::default() };
+        let motion = Motion { dx_m: 0.5, method: MotionMethod::Both as u8, ..Motion::default() };
         let telegram = sender.telegram(&TELEGRAM);
         sender.throw(Topic::Telegram, &telegram);
         sender.send(Topic::Scan, &*scan());
@@ -79,6 +78,8 @@ fn every_topic_is_a_line() {
         sender.send(Topic::Foreground, &*foreground);
         sender.send(Topic::Background, &*background);
         sender.send(Topic::Lines, &lines);
+        sender.send(Topic::Motion, &motion);
+        sender.send(Topic::Early, &Early { verdict: Verdict::Stop as u8, beam: 8, ..Early::default() });
         sender.send(Topic::Status, &status);
         program.await_line("the last one", is_class("status"));
         let outcome = program.end(INT);
@@ -101,10 +102,10 @@ fn every_topic_is_a_line() {
         assert_eq!(line("telegram")["data"], "02800300a00010160a");
         assert_eq!(line("scan")["ranges"], json!([100, null, 300]));
         assert_eq!(line("marks")["marks"][0]["range_mm"], 1234.5);
-        assert_eq!(
-            (&line("lines")["lines"][0]["r_m"], &line("lines")["noise_m"]),
-            (&json!(1.5), &json!(0.25))
-        );
+        let lines = line("lines");
+        assert_eq!([&lines["lines"][0]["r_m"], &lines["noise_m"]], [&json!(1.5), &json!(0.25)]);
+        assert_eq!([&line("motion")["dx_m"], &line("motion")["method"]], [&json!(0.5), &json!("both")]);
+        assert_eq!((&line("early")["verdict"], &line("early")["beam"]), (&json!("stop"), &json!(8)));
         assert_eq!((&line("zones")["verdict"], &line("zones")["topic_seq"]), (&json!("slow"), &json!(1)));
         assert_eq!(
             (&line("foreground")["generation"], &line("background")["generation"]),

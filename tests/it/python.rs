@@ -80,8 +80,8 @@ fn models_and_the_flow_of_data_on_request() {
 
 #[test]
 fn samples_say_what_echo_says() {
-    const TOPICS: [&str; 8] =
-        ["telegram", "scan", "marks", "zones", "foreground", "background", "status", "lines"];
+    const TOPICS: [&str; 9] =
+        ["telegram", "scan", "marks", "zones", "foreground", "background", "status", "lines", "motion"];
     let env = TestEnv::new();
     let topics = TOPICS.map(|topic| format!("front/{topic}"));
     let Some(mut command) = check_on(&env, "follow") else { return };

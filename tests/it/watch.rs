@@ -74,6 +74,19 @@ fn it_follows_the_hub_the_keys_and_the_window() {
     watch.await_rows("picture without marks", |rows| !rows[1..28].concat().contains('*'));
     watch.press(" ");
 
+    // Lines are found only while somebody looks at them; a place is read out, and counters are listed.
+    assert_eq!(env.subscribers("front/lines"), 0);
+    watch.press("e");
+    testkit::until("lines are followed", || env.subscribers("front/lines") == 1);
+    watch.press("e");
+    testkit::until("nobody follows them", || env.subscribers("front/lines") == 0);
+    watch.press("x\x1b[A");
+    watch.await_words(" m from the robot, x ");
+    watch.press("xn");
+    watch.await_words("damaged on the line, last 10 s");
+    watch.await_words("bytes_in_telegrams");
+    watch.press("n");
+
     // Requests to the hub, and what came of them.
     watch.press("F");
     watch.await_words("front: background is frozen");

@@ -11,7 +11,7 @@ use tungstenite::client::IntoClientRequest;
 use tungstenite::{Message, WebSocket};
 
 /// A server with these flags, and `HOST:PORT` of it.
-fn web(env: &TestEnv, flags: &[&str]) -> (Program, String) {
+pub(crate) fn web(env: &TestEnv, flags: &[&str]) -> (Program, String) {
     let mut server = env.start(&[&["web", "--json", "--listen", "127.0.0.1:0"], flags].concat());
     let ready = server.await_line("its address", is_class("ready"));
     let url = ready["url"].as_str().expect("an address");
@@ -19,14 +19,14 @@ fn web(env: &TestEnv, flags: &[&str]) -> (Program, String) {
     (server, host)
 }
 
-fn connect(host: &str) -> TcpStream {
+pub(crate) fn connect(host: &str) -> TcpStream {
     let stream = TcpStream::connect(host).expect("the server listens");
     stream.set_read_timeout(Some(PATIENCE)).expect("a timeout");
     stream
 }
 
 /// What the server answers to `head`; nothing if it says nothing.
-fn ask(host: &str, head: &str) -> String {
+pub(crate) fn ask(host: &str, head: &str) -> String {
     let mut stream = connect(host);
     stream.write_all(head.as_bytes()).expect("it reads");
     let mut answer = Vec::new();
@@ -34,12 +34,12 @@ fn ask(host: &str, head: &str) -> String {
     String::from_utf8_lossy(&answer).into_owned()
 }
 
-fn status(answer: &str) -> &str {
+pub(crate) fn status(answer: &str) -> &str {
     answer.split(' ').nth(1).unwrap_or("none")
 }
 
 /// A viewer that was let in, or the status with which it was not.
-fn view(host: &str, path: &str, origin: Option<&str>) -> Result<WebSocket<TcpStream>, u16> {
+pub(crate) fn view(host: &str, path: &str, origin: Option<&str>) -> Result<WebSocket<TcpStream>, u16> {
     let mut request = format!("ws://{host}{path}").into_client_request().expect("an address");
     let headers = request.headers_mut();
     headers.insert("Sec-WebSocket-Protocol", "foxglove.sdk.v1".parse().expect("a header"));
@@ -55,7 +55,7 @@ fn view(host: &str, path: &str, origin: Option<&str>) -> Result<WebSocket<TcpStr
     }
 }
 
-fn text(socket: &mut WebSocket<TcpStream>) -> Value {
+pub(crate) fn text(socket: &mut WebSocket<TcpStream>) -> Value {
     loop {
         if let Message::Text(text) = socket.read().expect("the server lives") {
             return serde_json::from_str(&text).expect("JSON");

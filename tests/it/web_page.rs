@@ -4,7 +4,7 @@ use std::path::Path;
 use std::time::Duration;
 
 use crate::browser::{Browser, Look};
-use crate::testkit::{INT, KILL, Program, TestEnv, hold_in_time};
+use crate::testkit::{INT, KILL, Program, TestEnv, hold_in_time, skip, until};
 
 /// A hall with a reflector, and a post that is put beside the robot when its background is learned.
 const WORLD: &str =
@@ -17,6 +17,15 @@ fn sensor(env: &TestEnv) -> Program {
     env.simulator(&["front"], &["--seed=71", "--baud=500000", &world])
 }
 
+/// A browser with a page, looking as `look` says; nothing, and why, where there is none.
+pub(crate) fn browse(env: &TestEnv, look: Look) -> Option<Browser> {
+    let browser = Browser::start(env.path("browser"), look);
+    if browser.is_none() {
+        skip("chromium", "there is no browser (Debian: apt-get install chromium)");
+    }
+    browser
+}
+
 /// The server, and the address that it says.
 fn web(env: &TestEnv, listen: &str) -> (Program, String) {
     let mut web = env.start(&["web", "--json", "--listen", listen]);
@@ -25,6 +34,9 @@ fn web(env: &TestEnv, listen: &str) -> (Program, String) {
     (web, url)
 }
 
+/// Of the verdict's word.
+const COLOUR: &str = "getComputedStyle(document.querySelector('#verdict strong')).backgroundColor";
+
 #[test]
 fn it_shows_what_comes_and_says_why_nothing_does() {
     hold_in_time(look_on);
@@ -32,21 +44,27 @@ fn it_shows_what_comes_and_says_why_nothing_does() {
 
 fn look_on() {
     let env = TestEnv::in_time();
-    let Some(mut page) = Browser::start(&env, Look::LAPTOP) else { return };
+    let Some(mut page) = browse(&env, Look::LAPTOP) else { return };
     let (server, url) = web(&env, "127.0.0.1:0");
     page.open(&url);
     page.await_true("window.scanhub?.connected && /no hub/.test(window.scanhub.reason)");
     assert_eq!(page.ask("scanhub.verdict"), "unknown");
+    assert_eq!(page.ask("/scanhub run/.test(scanhub.reason)"), true, "and what to do");
+    let red = page.ask(COLOUR);
 
-    let _sensor = sensor(&env);
+    // One that does not answer yet says where it is looked for, and what looks into that.
     let hub = env.hub(&[env.link("front")]);
+    page.await_true("/^front: ./.test(scanhub.reason)");
+    let _sensor = sensor(&env);
     page.await_true("scanhub.reason === null && scanhub.verdict === 'clear' && scanhub.beams > 100");
+    assert_ne!(page.ask(COLOUR), red);
     page.await_true("scanhub.zones === 2 && scanhub.marks > 0 && scanhub.sensors[0].hz > 30");
     page.await_true("document.querySelector('#sensors article').innerText.includes('streaming')");
 
     // The post is new, and nearer than the robot may be.
     page.await_true("scanhub.verdict === 'stop' && scanhub.foreground > 2");
     page.await_true("document.querySelector('#verdict').innerText.startsWith('STOP')");
+    assert_eq!(page.ask(COLOUR), red, "what is not known is as red as a stop");
     let before = page.ask("scanhub.scans.front").as_u64().expect("a number");
     page.ask("new Promise((done) => setTimeout(done, 10_000))");
     let scans = page.ask("scanhub.scans.front").as_u64().expect("a number") - before;
@@ -79,7 +97,7 @@ fn look_on() {
 #[test]
 fn keys_and_the_mouse_change_the_picture() {
     let env = TestEnv::new();
-    let Some(mut page) = Browser::start(&env, Look::PHONE) else { return };
+    let Some(mut page) = browse(&env, Look::PHONE) else { return };
     let _sensor = sensor(&env);
     let _hub = env.hub(&[env.link("front")]);
     let (_server, url) = web(&env, "127.0.0.1:0");
@@ -91,6 +109,15 @@ fn keys_and_the_mouse_change_the_picture() {
         page.press(key);
         page.await_true(&format!("scanhub.{layer} > 0"));
     }
+    // Lines are found only while somebody looks at them.
+    assert_eq!(page.ask("scanhub.lines"), 0);
+    assert_eq!(env.subscribers("front/lines"), 0);
+    page.press("e");
+    page.await_true("scanhub.lines >= 3");
+    assert_eq!(env.subscribers("front/lines"), 1);
+    page.press("e");
+    page.await_true("scanhub.lines === 0");
+    until("nobody follows them", || env.subscribers("front/lines") == 0);
     let fits = "document.querySelector('[data-do=fit]').getAttribute('aria-pressed')";
     assert_eq!(page.ask(fits), "true");
     page.mouse("mousePressed", (180.0, 300.0), true);
@@ -104,6 +131,7 @@ fn keys_and_the_mouse_change_the_picture() {
     page.press("?");
     page.await_true("document.querySelector('#help').open");
     page.press("Escape");
+    page.await_true("!document.querySelector('#help').open");
     // Nothing is wider than the screen, and every key can be hit by a finger.
     assert_eq!(page.ask("document.documentElement.scrollWidth <= 390"), true);
     let small = "[...document.querySelectorAll('nav button')].filter((one) => one.offsetHeight < 40).length";
@@ -122,7 +150,7 @@ fn the_picture_of_the_documents() {
     let (_server, url) = web(&env, "127.0.0.1:0");
     let dark = Look { scheme: "dark", ..Look::LAPTOP };
     for (name, look) in [("web-light", Look::LAPTOP), ("web-dark", dark), ("web-phone", Look::PHONE)] {
-        let Some(mut page) = Browser::start(&env, look) else { return };
+        let Some(mut page) = browse(&env, look) else { return };
         page.open(&url);
         page.await_true(
             "window.scanhub?.verdict === 'slow' && scanhub.foreground > 20 && scanhub.beams > 600",

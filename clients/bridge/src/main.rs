@@ -56,9 +56,9 @@ struct Cli {
     /// Release of ROS 2 whose nodes hear it: humble, jazzy, kilted or rolling
     #[arg(long, value_name = "NAME", requires = "ros2", default_value = "jazzy", value_parser = distro)]
     ros_distro: Distro,
-    /// ROS_DOMAIN_ID of the node
-    #[arg(long, env = "ROS_DOMAIN_ID", value_name = "N", requires = "ros2", default_value_t = 0, value_parser = clap::value_parser!(u32).range(0..=232))]
-    domain_id: u32,
+    /// ROS_DOMAIN_ID of the node, 0 to 232 [default: that of the environment, else 0]
+    #[arg(long, value_name = "N", requires = "ros2", value_parser = clap::value_parser!(u32).range(0..=i64::from(DOMAIN_IDS)))]
+    domain_id: Option<u32>,
     /// Namespace before all topics of ROS 2, for example robot1
     #[arg(long, value_name = "NAME", requires = "ros2", default_value = "")]
     namespace: String,
@@ -120,17 +120,42 @@ impl Cli {
             let (sensor, frame) = text.split_once('=').ok_or_else(|| no_name("--frame", text))?;
             Ok((sensor.to_owned(), frame.to_owned()))
         };
-        let frames = self.frames.iter().map(frame).collect::<Result<_, Failure>>()?;
+        let frames = self.frames.iter().map(frame).collect::<Result<Vec<_>, Failure>>()?;
+        for (at, (sensor, frame)) in frames.iter().enumerate() {
+            if frames[..at].iter().any(|(other, _)| other == sensor) {
+                let what = format!("--frame: {sensor} has two frames");
+                return Err(Failure::new(Kind::Usage, what, "name each sensor once"));
+            }
+            if frame == ros::BASE_FRAME {
+                let what = format!("--frame: {sensor}={frame} is the frame of the robot itself");
+                return Err(Failure::new(Kind::Usage, what, "give the sensor a frame of its own"));
+            }
+        }
         let names = Names::new(&self.namespace, &self.topic_prefix, frames)
             .map_err(|name| no_name("--namespace, --topic-prefix or --frame", &name))?;
         Ok(Ros2Options {
             topics: self.topics.clone(),
             places: Domain::candidates(&self.domain, self.root.as_deref(), environment)?,
-            domain_id: self.domain_id,
+            domain_id: self.domain_id.map_or_else(domain_id, Ok)?,
             distro: self.ros_distro,
             names,
             tells_of_hub,
         })
+    }
+}
+
+/// The greatest number of a domain of ROS 2 on Linux.
+const DOMAIN_IDS: u32 = 232;
+
+/// What the environment of a ROS user says; one who is no node need not know.
+fn domain_id() -> Result<u32, Failure> {
+    let said = std::env::var("ROS_DOMAIN_ID").unwrap_or_default();
+    match said.as_str() {
+        "" => Ok(0),
+        said => said.parse().ok().filter(|number| *number <= DOMAIN_IDS).ok_or_else(|| {
+            let hint = format!("a number from 0 to {DOMAIN_IDS}, or --domain-id, which wins");
+            Failure::new(Kind::Usage, format!("ROS_DOMAIN_ID={said} of the environment is no domain"), hint)
+        }),
     }
 }
 

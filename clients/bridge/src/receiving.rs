@@ -1,6 +1,8 @@
 //! The way in: what others send is checked against the name that it came under, counted, and published as topics of this
 //! machine. However much comes, what waits is bounded, and the rest is counted. Refuses to know what carries it.
 
+mod asking;
+
 use std::io::{stderr, stdout};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
@@ -14,6 +16,7 @@ use verbs::network::{End, Origin, Output, Reception, Wanted, Words, now};
 
 use crate::PublishOptions;
 use crate::engine::{Connection, Ear, Engine};
+use asking::Asking;
 
 /// What was heard.
 enum Heard {
@@ -49,8 +52,6 @@ const LONGEST_NAME: usize = 128;
 const TURN: usize = 64;
 /// So often it is looked whether something is due.
 const LOOK_EVERY: Duration = Duration::from_millis(100);
-/// The most sensors that are asked for their announcement in a second: whoever can connect can say that they came.
-const ASKED: usize = 64;
 
 /// Takes what comes until it `is_over`; the account is told then and whenever `tell` is set.
 pub(crate) fn run(
@@ -77,10 +78,18 @@ pub(crate) fn run(
     let Some(engine) = connection.engine(is_over) else { return Ok(()) };
     let (to, inbox) = sync_channel(WAITING);
     let inlet = Inlet { to, counts: Arc::default() };
-    let _ears = inlet.listen(engine)?;
+    let ears = inlet.listen(engine)?;
+    let asks = inlet.clone();
+    let ask = |address: &Address<'_>| {
+        let asks = asks.clone();
+        engine.ask(&address.to_string(), LONGEST, move |key, payload| asks.take(key, payload))
+    };
+    let refused = || connection.refused();
+    let asking = Asking::new(Instant::now());
+    let counts = inlet.counts;
     let mut receiving =
-        Receiving { reception, engine, connection, inlet, foreign: 0, asked: 0, second: Instant::now() };
-    receiving.run(&inbox, tell, is_over)
+        Receiving { reception, asking, counts, foreign: 0, ask: Box::new(ask), refused: Box::new(refused) };
+    receiving.run(&inbox, tell, is_over, move || drop(ears))
 }
 
 impl Inlet {
@@ -113,29 +122,43 @@ impl Inlet {
     }
 }
 
+type Ask<'a> = dyn Fn(&Address<'_>) -> Result<(), Failure> + 'a;
+
 struct Receiving<'a> {
     reception: Reception<'a>,
-    engine: &'a Engine,
-    connection: &'a Connection,
-    inlet: Inlet,
+    asking: Asking,
+    counts: Arc<Counts>,
     /// What came under a name that is not its own.
     foreign: u64,
-    /// Sensors that were asked for in this second.
-    asked: usize,
-    second: Instant,
+    /// Asks for what is sent under an address.
+    ask: Box<Ask<'a>>,
+    /// Connections that were refused so far.
+    refused: Box<dyn Fn() -> u64 + 'a>,
 }
 
 impl Receiving<'_> {
-    fn run(&mut self, inbox: &Receiver<Heard>, tell: &AtomicBool, is_over: &AtomicBool) -> Result<(), End> {
+    /// Takes what is in the `inbox` until it `is_over`; then nothing more is let in by `close`, and what waits is taken.
+    fn run(
+        &mut self,
+        inbox: &Receiver<Heard>,
+        tell: &AtomicBool,
+        is_over: &AtomicBool,
+        close: impl FnOnce(),
+    ) -> Result<(), End> {
         self.reception.begin()?;
         while !is_over.load(Ordering::Relaxed) {
             let more = self.take(inbox)?;
+            self.ask_next()?;
             self.reception.wake();
             self.reception.look(Instant::now(), more)?;
             if tell.swap(false, Ordering::Relaxed) {
                 self.tell()?;
             }
         }
+        close();
+        inbox.try_iter().take(WAITING).try_for_each(|heard| self.heard(&heard))?;
+        self.asking.give_up();
+        self.reception.wake();
         self.tell()
     }
 
@@ -144,12 +167,22 @@ impl Receiving<'_> {
         let mut next = inbox.recv_timeout(LOOK_EVERY).ok();
         for _ in 0..TURN {
             match next.take().or_else(|| inbox.try_recv().ok()) {
-                Some(Heard::Sample(key, payload)) => self.sample(&key, &payload)?,
-                Some(Heard::Live(key)) => self.came(&key)?,
+                Some(heard) => self.heard(&heard)?,
                 None => return Ok(false),
             }
         }
         Ok(true)
+    }
+
+    fn heard(&mut self, heard: &Heard) -> Result<(), End> {
+        match heard {
+            Heard::Sample(key, payload) => return self.sample(key, payload),
+            Heard::Live(key) => match live(key) {
+                Some((hub, sensor)) => self.asking.came(hub, sensor),
+                None => self.foreign += 1,
+            },
+        }
+        Ok(())
     }
 
     fn sample(&mut self, key: &str, payload: &[u8]) -> Result<(), End> {
@@ -168,37 +201,34 @@ impl Receiving<'_> {
         self.reception.take(payload, Origin { sender: 0, address: None, arrival: now() })
     }
 
-    /// Asks a sensor that came for what it said last, rather than waiting until it says it again.
-    fn came(&mut self, key: &str) -> Result<(), End> {
-        let Some((hub, sensor)) = live(key) else {
-            self.foreign += 1;
-            return Ok(());
-        };
-        if self.second.elapsed() >= Duration::from_secs(1) {
-            (self.second, self.asked) = (Instant::now(), 0);
-        }
-        self.asked += 1;
-        if self.asked > ASKED {
-            return Ok(());
-        }
-        // A sample without a name is not published: first the name.
-        for topic in [None, Some(Topic::Status), Some(Topic::Background)] {
-            let inlet = self.inlet.clone();
-            let key = Address { hub, sensor, topic }.to_string();
-            self.engine.ask(&key, LONGEST, move |key, payload| inlet.take(key, payload))?;
+    /// Asks sensors that came for what they said last, rather than waiting until they say it again.
+    fn ask_next(&mut self) -> Result<(), End> {
+        while let Some((hub, sensor)) = self.asking.next(Instant::now()) {
+            // A sample without a name is not published: first the name.
+            let topics = [None, Some(Topic::Status), Some(Topic::Background)];
+            let asked =
+                topics.iter().try_for_each(|&topic| (self.ask)(&Address { hub, sensor: &sensor, topic }));
+            if let Err(failure) = asked {
+                self.asking.unasked += 1;
+                self.reception.trouble(&failure.to_string())?;
+            }
         }
         Ok(())
     }
 
     fn tell(&mut self) -> Result<(), End> {
         let count = |count: &AtomicU64| count.load(Ordering::Relaxed);
-        let Counts { long, overrun } = &*self.inlet.counts;
+        let Counts { long, overrun } = &*self.counts;
         let others = [
             ("key", self.foreign),
             ("long", count(long)),
             ("overrun", count(overrun)),
-            ("connection", self.connection.refused()),
+            ("unasked", self.asking.unasked),
+            ("connection", (self.refused)()),
         ];
         self.reception.tell(&others)
     }
 }
+
+#[cfg(test)]
+mod tests;

@@ -3,9 +3,8 @@
 
 use std::io::Write;
 
-use schema::Topic;
 use serde::Serialize;
-use verbs::network::{End, Notice, Output, tell};
+use verbs::network::{End, Notice, Output, account, tell};
 
 use crate::BridgeOptions;
 use crate::engine::News;
@@ -80,35 +79,7 @@ impl<'a> Report<'a> {
 
     /// The account of what goes out.
     pub(crate) fn account(&mut self, sending: &Sending) -> Result<(), End> {
-        let hub = format!("{:016x}", sending.life.hub);
-        let outgoing = sending.outgoing();
-        for sensor in outgoing.account() {
-            for (topic, row) in sensor.used() {
-                let name = topic.map_or("announce", Topic::name);
-                if self.json {
-                    self.out.json(&Line {
-                        class: "bridge",
-                        hub: &hub,
-                        epoch: sending.life.epoch,
-                        sensor: &sensor.name,
-                        topic: name,
-                        sent: row.sent,
-                        send_failed: row.failed,
-                        bytes: row.bytes,
-                        missed: row.missed,
-                        replaced: row.replaced,
-                    })?;
-                } else {
-                    self.out.line(|line| {
-                        write!(line, "{}/{name}: {} sent, ", sensor.name, row.sent)?;
-                        write!(line, "{} replaced, {} failed, ", row.replaced, row.failed)?;
-                        write!(line, "{} bytes", row.bytes)?;
-                        if row.missed > 0 { write!(line, ", {} missed", row.missed) } else { Ok(()) }
-                    })?;
-                }
-            }
-        }
-        Ok(())
+        account(&sending.outgoing(), &sending.life, "bridge", self.json, &mut self.out)
     }
 }
 
@@ -131,19 +102,4 @@ struct Link<'a> {
     class: &'static str,
     state: &'static str,
     message: Option<&'a str>,
-}
-
-/// Class `bridge` of what goes out.
-#[derive(Serialize)]
-struct Line<'a> {
-    class: &'static str,
-    hub: &'a str,
-    epoch: u32,
-    sensor: &'a str,
-    topic: &'static str,
-    sent: u64,
-    send_failed: u64,
-    bytes: u64,
-    missed: u64,
-    replaced: u64,
 }

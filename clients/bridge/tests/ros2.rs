@@ -206,3 +206,30 @@ fn the_examples_of_the_page_run() {
         assert_eq!(program.end(), Some(0), "{line}");
     }
 }
+
+/// What the program says of `flags` where the environment says `domain`: its exit code and stderr.
+fn said(domain: &str, flags: &[&str]) -> (Option<i32>, String) {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_scanhub-bridge"));
+    // Nobody is at this port.
+    command.args(["--connect=tcp/127.0.0.1:1", "--check"]).args(flags).env("ROS_DOMAIN_ID", domain);
+    let output = command.stdin(Stdio::null()).output().expect("a program");
+    (output.status.code(), String::from_utf8_lossy(&output.stderr).into_owned())
+}
+
+#[test]
+fn who_is_no_node_need_not_know_a_domain_of_ros() {
+    for domain in ["42", "abc"] {
+        let (code, errors) = said(domain, &[]);
+        assert!(code != Some(2) && !errors.contains("--ros2"), "{domain:?}: {code:?} {errors}");
+    }
+    for (domain, flags, words) in [
+        ("abc", &["--ros2"][..], "ROS_DOMAIN_ID=abc"),
+        ("233", &["--ros2"], "a number from 0 to 232"),
+        ("", &["--ros2", "--frame=front=a", "--frame=front=b"], "front has two frames"),
+        ("", &["--ros2", "--frame=front=base_link"], "the robot itself"),
+        ("", &["--ros2", "--domain-id=233"], "0..=232"),
+    ] {
+        let (code, errors) = said(domain, flags);
+        assert!(code == Some(2) && errors.contains(words), "{flags:?}: {code:?} {errors}");
+    }
+}

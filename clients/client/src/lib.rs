@@ -57,10 +57,10 @@ pub use zones::{Heard, ZonesFollower, zones};
 
 /// The types of topics and payloads: a program needs no second dependency.
 pub use schema::{
-    Age, BEAMS, Background, Code, Corner, Counter, Counters, DEFAULT_DOMAIN, Domain, Environment, Failure,
-    Flags, Foreground, Header, Kind, LINES, Line, Lines, MARKS, Mark, Marks, Pose, Quality, ROBOT, Reasons,
-    Request, SEGMENTS, Scan, Segment, Shown, State, Status, Telegram, Topic, Verb, Verdict, Wake, ZONES,
-    Zone, Zones, ipc::Payload,
+    Age, BEAMS, Background, Code, Corner, Counter, Counters, DEFAULT_DOMAIN, Domain, Early, Environment,
+    Failure, Flags, Foreground, Header, Kind, LINES, Line, Lines, MARKS, Mark, Marks, Motion, MotionMethod,
+    Pose, Quality, ROBOT, Reasons, Request, SEGMENTS, Scan, Segment, Shown, State, Status, Telegram, Topic,
+    Verb, Verdict, Wake, ZONES, Zone, Zones, ipc::Payload,
 };
 
 #[cfg(doctest)]

@@ -110,6 +110,12 @@ impl RobotFollower {
         RobotFollower { session: self.session.by(wait), ..self }
     }
 
+    /// Takes early warnings too ([`Early`](schema::Early)): the verdict becomes worse before a telegram is complete, and is taken
+    /// back if that turns out damaged. To be said before the first wait.
+    pub fn with_early(self) -> RobotFollower {
+        RobotFollower { source: self.source.with_early(), ..self }
+    }
+
     /// Waits until any of the sensors is heard, or any is heard no more; what is known then. The first time it waits for
     /// a word of each. A sensor becomes unknown as with [`ZonesFollower::next`](crate::ZonesFollower::next).
     ///

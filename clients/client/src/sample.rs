@@ -93,6 +93,15 @@ macro_rules! samples {
 schema::for_each_topic!(samples);
 
 impl Source {
+    /// As [`new`](Self::new) for the zones of `sensor`, with its early warnings: one makes the verdict worse until the zones of
+    /// its scan are there, or until it is withdrawn.
+    pub fn zones_with_early(sensor: &str) -> Source {
+        match sensor {
+            ROBOT => Source::Robot(RobotSource::new(&[]).with_early()),
+            sensor => Source::Zones(ZonesSource::new(sensor).with_early(sensor)),
+        }
+    }
+
     /// Returns after which time there may be something to receive although nothing was sent.
     pub fn left(&self) -> Option<Duration> {
         match self {

@@ -2,11 +2,12 @@
 //! whether the sensor, the hub or the machine stopped. A program that acts on it needs no timeout of its own.
 
 mod state;
+mod warned;
 
 use std::os::fd::BorrowedFd;
 use std::time::Duration;
 
-use schema::{Domain, Failure, Header, Zones, check_followed};
+use schema::{Domain, Early, Failure, Header, Zones, check_followed};
 
 use crate::clock;
 use crate::follower::Follower;
@@ -14,6 +15,7 @@ use crate::session::Session;
 use crate::subscribe::places;
 use crate::wait::Wait;
 pub use state::ZonesState;
+use warned::Warned;
 
 /// Follows the zones of `sensor` in the domain that SCANHUB_DOMAIN names. The hub may start later.
 ///
@@ -158,12 +160,20 @@ impl ZonesFollower {
 pub struct ZonesSource {
     follower: Follower<Zones>,
     state: ZonesState,
+    /// Early warnings, if they are wanted.
+    early: Option<Box<(Follower<Early>, Warned)>>,
 }
 
 impl ZonesSource {
     /// Makes what will follow the zones of `sensor`.
     pub fn new(sensor: &str) -> ZonesSource {
-        ZonesSource { follower: Follower::new(sensor), state: ZonesState::new(clock::now()) }
+        ZonesSource { follower: Follower::new(sensor), state: ZonesState::new(clock::now()), early: None }
+    }
+
+    /// Takes early warnings of `sensor` too: one makes the verdict worse until the zones of its scan are there, or until it is
+    /// withdrawn.
+    pub(crate) fn with_early(self, sensor: &str) -> ZonesSource {
+        ZonesSource { early: Some(Box::new((Follower::new(sensor), Warned::new()))), ..self }
     }
 
     /// Returns whether the topic has been there at least once.
@@ -184,10 +194,22 @@ impl ZonesSource {
     pub fn receive(&mut self, session: &mut Session) -> Result<Option<Heard>, Failure> {
         let sample = self.follower.receive(session)?;
         let now = clock::now();
-        Ok(match sample {
+        let heard = match sample {
             Some(sample) => Some(self.state.take(sample.header(), &sample, sample.missed, now)),
             None => self.state.silence(now),
-        })
+        };
+        let Some((follower, warned)) = self.early.as_deref_mut() else { return Ok(heard) };
+        if let Some(mut heard) = heard {
+            heard.zones = warned.hear(&heard.zones, heard.header.as_ref());
+            return Ok(Some(heard));
+        }
+        while let Some(early) = follower.receive(session)? {
+            let header = *early.header();
+            if let Some(zones) = warned.warn(&early, &header) {
+                return Ok(Some(Heard { zones, header: Some(header), missed: 0, stale: false, said: zones }));
+            }
+        }
+        Ok(None)
     }
 
     /// The last of all waiting samples. The skipped ones count as missed.

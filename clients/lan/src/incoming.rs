@@ -14,6 +14,7 @@ use schema::datagram::{Announce, Datagram, DatagramError, Fresh, Head, StreamSta
 
 use crate::{Key, Stamp};
 use duplicate_gateways::DuplicateGateways;
+pub use guard::GATEWAYS;
 use guard::Guard;
 use parts::Parts;
 pub use peer_table::PeerTable;
@@ -106,7 +107,7 @@ impl Incoming {
     }
 
     /// Makes an end that believes only what was sent with `key`, and is not older than it can be: `epochs` has the greatest
-    /// epoch of each gateway that was heard before, see [`take_epochs`](Incoming::take_epochs).
+    /// epoch of each gateway that was heard before, see [`take_epochs`](Incoming::take_epochs); it knows [`GATEWAYS`] at most.
     pub fn with_key(topics: &[Topic], key: Key, epochs: HashMap<u64, u32>) -> Incoming {
         Incoming {
             stats: Box::new(StreamStats::new(topics).only_announced()),

@@ -96,6 +96,11 @@ impl Outgoing {
         self.numbering.again(name, topic, now)
     }
 
+    /// Returns whether samples wait, so that newer ones may replace them: then announcements say how many were.
+    pub fn tells_replaced(&self) -> bool {
+        self.numbering.tells_replaced()
+    }
+
     /// Returns the longest datagram that goes out, in bytes.
     pub fn longest(&self) -> usize {
         self.numbering.longest()

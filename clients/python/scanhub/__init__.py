@@ -21,7 +21,7 @@ from .errors import Denied, Failure, Held, Impossible, Mismatch, NoHub, NoTopic,
 from .model import Background, Shown
 from .names import TopicName, candidates, check_sensor, parse
 from .presence import find
-from .processed import Corner, Foreground, Line, Lines, Mark, Marks, Segment, Zone, Zones
+from .processed import Corner, Early, Foreground, Line, Lines, Mark, Marks, Motion, Segment, Zone, Zones
 from .sample import Sample
 from .scan import Scan, Telegram
 from .status import Pose, Status
@@ -34,6 +34,7 @@ __all__ = [
     "Background",
     "Corner",
     "Denied",
+    "Early",
     "Failure",
     "Foreground",
     "Held",
@@ -43,6 +44,7 @@ __all__ = [
     "Mark",
     "Marks",
     "Mismatch",
+    "Motion",
     "NoHub",
     "NoTopic",
     "Pose",

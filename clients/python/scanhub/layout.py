@@ -119,6 +119,33 @@ class Lines(_Struct):
     ]
 
 
+class Motion(_Struct):
+    _fields_ = [
+        ("x_m", c_double),
+        ("y_m", c_double),
+        ("yaw_rad", c_double),
+        ("dx_m", c_float),
+        ("dy_m", c_float),
+        ("dyaw_rad", c_float),
+        ("covariance", c_float * 9),
+        ("overlap", c_float),
+        ("method", c_uint8),
+        ("flags", c_uint8),
+        ("breaks", c_uint16),
+    ]
+
+
+class Early(_Struct):
+    _fields_ = [
+        ("verdict", c_uint8),
+        ("flags", c_uint8),
+        ("beam", c_uint16),
+        ("distance_mm", c_uint32),
+        ("bytes_seen", c_uint16),
+        ("beams_seen", c_uint16),
+    ]
+
+
 class Zone(_Struct):
     _fields_ = [("radius_mm", c_uint16), ("beams", c_uint16), ("violated", c_uint8), ("reserved", c_uint8 * 3)]
 

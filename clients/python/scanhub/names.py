@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 from .errors import Impossible, NoTopic
 
-TOPICS = ("telegram", "scan", "marks", "zones", "foreground", "background", "status", "lines")
+TOPICS = ("telegram", "scan", "marks", "zones", "foreground", "background", "status", "lines", "motion", "early")
 """What the hub publishes for each sensor."""
 
 CONTROL = "scanhub/v2/control"

@@ -1,4 +1,4 @@
-"""What the hub makes of a scan: marks, lines, zones, foreground."""
+"""What the hub makes of a scan: marks, lines, motion, early warnings, zones, foreground."""
 
 from __future__ import annotations
 
@@ -117,6 +117,106 @@ class Lines(Sample):
             Corner(c.x_m, c.y_m, c.first_line, c.second_line)
             for c in self._fields.corner_array[: self._fields.corners]
         )
+
+
+class Step(NamedTuple):
+    """From one scan to the next, in the robot's frame at the first of them: ahead, to the left, counter-clockwise."""
+
+    dx_m: float
+    dy_m: float
+    dyaw_rad: float
+
+
+class Place(NamedTuple):
+    """Where the robot is since the start: ahead, to the left, counter-clockwise."""
+
+    x_m: float
+    y_m: float
+    yaw_rad: float
+
+
+class Motion(Sample):
+    """How the robot moved since the scan before."""
+
+    topic = "motion"
+    struct = layout.Motion
+
+    @property
+    def method(self) -> str:
+        """How that was found: `first` (there is no scan before), `refused` (no step explains the scan), `beams`, `points`,
+        `lines` or `both`."""
+        return METHODS[self._fields.method] if self._fields.method < len(METHODS) else "refused"
+
+    @property
+    def step(self) -> Step | None:
+        """The step: copied; None where there is none."""
+        f = self._fields
+        return None if self.method in ("first", "refused") else Step(f.dx_m, f.dy_m, f.dyaw_rad)
+
+    @property
+    def covariance(self) -> NDArray[np.float32] | None:
+        """Of the step, 3 x 3: copied."""
+        if self.step is None:
+            return None
+        return np.array(self._fields.covariance, dtype=np.float32).reshape(3, 3)
+
+    @property
+    def overlap(self) -> float | None:
+        """Share of the readings that lie on the scan before."""
+        return None if self.step is None else self._fields.overlap
+
+    @property
+    def place(self) -> Place | None:
+        """The sum of all steps: copied; None where it is not known. It drifts."""
+        f = self._fields
+        return None if self.method == "refused" else Place(f.x_m, f.y_m, f.yaw_rad)
+
+    @property
+    def degenerate(self) -> bool:
+        """The surroundings leave a direction open, as a corridor does."""
+        return bool(self._fields.flags & 1)
+
+    @property
+    def breaks(self) -> int:
+        """Steps that were refused since the start."""
+        return self._fields.breaks
+
+
+class Early(Sample):
+    """A warning by a telegram that was not complete. The zones of the same number confirm it, or it is withdrawn."""
+
+    topic = "early"
+    struct = layout.Early
+
+    @property
+    def verdict(self) -> str:
+        """`slow` or `stop`."""
+        return VERDICTS[min(self._fields.verdict, 3)]
+
+    @property
+    def withdrawn(self) -> bool:
+        """What was said under this number does not hold."""
+        return bool(self._fields.flags & 1)
+
+    @property
+    def beam(self) -> int:
+        """The beam of the nearest point so far."""
+        return self._fields.beam
+
+    @property
+    def distance_mm(self) -> int:
+        """That point's distance from the robot's centre."""
+        return self._fields.distance_mm
+
+    @property
+    def bytes_seen(self) -> int:
+        """Bytes of the telegram that had arrived."""
+        return self._fields.bytes_seen
+
+    @property
+    def beams_seen(self) -> int:
+        """Beams of the scan that had arrived."""
+        return self._fields.beams_seen
 
 
 class Zone(NamedTuple):
@@ -245,6 +345,7 @@ class Foreground(Sample):
         return self._fields.left_out
 
 
+METHODS = ("first", "refused", "beams", "points", "lines", "both")
 VERDICTS = ("clear", "slow", "stop", "unknown")
 _NO_BEAM = 0xFFFF
 _HEAD = ctypes.sizeof(layout.ForegroundHead)

@@ -12,13 +12,14 @@ from .freshness import REMOTE
 from .model import Background
 from .names import Domain, TopicName, service
 from .presence import Presence
-from .processed import Foreground, Lines, Marks, Zones, nothing
+from .processed import Early, Foreground, Lines, Marks, Motion, Zones, nothing
 from .sample import Sample
 from .scan import Scan, Telegram
 from .status import Status
 
 KINDS: dict[str, type[Sample]] = {
-    kind.topic: kind for kind in (Telegram, Scan, Marks, Zones, Foreground, Background, Status, Lines)
+    kind.topic: kind
+    for kind in (Telegram, Scan, Marks, Zones, Foreground, Background, Status, Lines, Motion, Early)
 }
 """What each topic carries."""
 

@@ -82,6 +82,21 @@ def lines(sample: scanhub.Lines) -> dict:
     return {**said, "lines": found, "corners": corners}
 
 
+def motion(sample: scanhub.Motion) -> dict:
+    def millionths(value: float | None) -> float | None:
+        return None if value is None else math.copysign(math.floor(abs(value) * 1e6 + 0.5), value) / 1e6
+
+    said = {name: getattr(sample, name) for name in ("method", "degenerate", "breaks")}
+    step, place = sample.step or (None,) * 3, sample.place or (None,) * 3
+    said["dx_m"], said["dy_m"], said["dyaw_deg"] = millionths(step[0]), millionths(step[1]), in_degrees(step[2])
+    said["x_m"], said["y_m"], said["yaw_deg"] = millionths(place[0]), millionths(place[1]), in_degrees(place[2])
+    said["overlap"] = millionths(sample.overlap)
+    covariance = sample.covariance
+    # The shortest number that is this one of 32 bits.
+    said["covariance"] = None if covariance is None else [float(str(value)) for value in covariance.flat]
+    return said
+
+
 def zones(sample: scanhub.Zones) -> dict:
     said = {name: getattr(sample, name) for name in ("verdict", "nearest_mm", "nearest_beam", "invalid_beams")}
     said["zones"] = [zone._asdict() for zone in sample.zones]

@@ -42,7 +42,7 @@ def offsets_are_golden() -> None:
         else:
             assert getattr(its, words[0]).offset == int(words[1]), (its, line)
             said[-1][1].append(words[0])
-    assert len(said) == 14
+    assert len(said) == 16
     for name, fields in said:
         its = getattr(layout, name.split(".")[1])
         assert [field[0] for field in its._fields_] == fields, name
@@ -86,6 +86,15 @@ def payloads_say_what_they_are() -> None:
     assert (of.readings, of.on_lines, of.noise_m) == (0x102, 0x304, 1)
     assert of.lines[63] == (1, -1, 2, -2, 0.5, -0.5, 0.25, 4, 0x506, 0x708, 0x90A)
     assert of.corners[63] == (1, -1, 62, 63)
+
+    of = processed.Motion("front", Chunk("motion"))
+    assert (of.method, of.degenerate, of.breaks, of.overlap) == ("both", True, 0x102, 0.75)
+    assert of.step == (0.25, -0.125, -0.0625) and of.place == (1, -2, 0.5)
+    assert of.covariance.tolist() == [[1 / 64, 2 / 64, 3 / 64], [4 / 64, 5 / 64, 6 / 64], [7 / 64, 8 / 64, 9 / 64]]
+
+    of = processed.Early("front", Chunk("early"))
+    assert (of.verdict, of.withdrawn, of.beam, of.distance_mm) == ("stop", True, 0x102, 0x3040506)
+    assert (of.bytes_seen, of.beams_seen) == (0x708, 0x90A)
 
     of = processed.Zones("front", Chunk("zones"))
     assert (of.verdict, of.nearest_beam, of.nearest_mm, of.invalid_beams) == ("slow", 0x102, 0x30405, 0x106)

@@ -5,14 +5,18 @@
 
 mod circles;
 mod meter;
+mod read_out;
 mod scene;
+mod trail;
 mod trouble;
 
 use schema::Pose;
 
 pub use circles::{Circle, circles};
 pub use meter::Meter;
+pub use read_out::{Reading, read_out};
 pub use scene::{Scene, Sensor, verdict};
+pub use trail::Trail;
 pub use trouble::Trouble;
 
 /// Where a beam ended, in the robot's frame.

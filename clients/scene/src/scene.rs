@@ -1,11 +1,12 @@
 //! What is known of the robot and its surroundings: the last sample of each topic of each sensor. Time is an argument.
 
 use schema::{
-    Background, Counter, Foreground, Header, Mark, Marks, Pose, Scan, State, Status, Verdict, Zones,
+    Background, Counter, Foreground, Header, Lines, Mark, Marks, Pose, Scan, State, Status, Verdict, Zones,
     is_remote,
 };
 
 use crate::meter::Meter;
+use crate::trail::Trail;
 use crate::trouble::{Trouble, trouble};
 use crate::{Point, point_m};
 
@@ -35,6 +36,10 @@ pub struct Sensor {
     pub scan: Option<Box<Scan>>,
     /// What stands before the background.
     pub foreground: Option<Box<Foreground>>,
+    /// Where that was over the last moments.
+    pub trail: Trail,
+    /// The straight surfaces of the last scan, if somebody asks for them.
+    pub lines: Option<Box<Lines>>,
     /// The reflectors, where the sensor can see such.
     pub marks: Option<Marks>,
     /// What it has learned to be always there.
@@ -45,6 +50,11 @@ pub struct Sensor {
     pub meter: Meter,
     /// Scans that were sent and not received here.
     pub lost: u64,
+    /// The most that came back over the last minutes, in the sensor's units.
+    brightest: f64,
+    /// The telegrams of scan and foreground.
+    scan_of: u64,
+    foreground_of: u64,
     /// When the scan is too old to be shown as what is there, in ns of CLOCK_MONOTONIC.
     old_at_ns: u64,
 }
@@ -78,17 +88,24 @@ impl Scene {
         self.sensors.iter().enumerate().filter(move |(_, sensor)| !has_own || !is_remote(&sensor.name))
     }
 
-    /// Forgets scans that are too old at `now_ns`; whether there were any.
+    /// Forgets scans and trails that are too old at `now_ns`; whether there were any.
     pub fn age(&mut self, now_ns: u64) -> bool {
         let mut any = false;
         for sensor in &mut self.sensors {
             if sensor.scan.is_some() && now_ns >= sensor.old_at_ns {
-                (sensor.scan, sensor.foreground, sensor.marks) = (None, None, None);
+                (sensor.scan, sensor.foreground) = (None, None);
+                (sensor.marks, sensor.lines) = (None, None);
                 sensor.meter = Meter::default();
                 any = true;
             }
+            any |= sensor.trail.age(now_ns);
         }
         any
+    }
+
+    /// Nobody asks for lines any more.
+    pub fn forget_lines(&mut self) {
+        self.sensors.iter_mut().for_each(|sensor| sensor.lines = None);
     }
 
     /// The hub is gone: all of its data is discarded except for the background, which is only drawn.
@@ -110,11 +127,16 @@ impl Sensor {
             pose: Pose::default(),
             scan: None,
             foreground: None,
+            trail: Trail::default(),
+            lines: None,
             marks: None,
             background: None,
             zones: Zones::unknown(),
             meter: Meter::default(),
             lost: 0,
+            brightest: 1.0,
+            scan_of: 0,
+            foreground_of: 0,
             old_at_ns: 0,
         }
     }
@@ -124,6 +146,35 @@ impl Sensor {
         self.scan = Some(scan.boxed());
         self.meter.scan(header, now_ns);
         self.old_at_ns = now_ns + OLD_NS.max(3000 * u64::from(header.period_us));
+        // What is bright is told over minutes: colours that breathe cannot be read.
+        let brightest = scan.intensities().iter().max().map_or(1.0, f64::from);
+        self.brightest = brightest.max(FADING * self.brightest).max(1.0);
+        self.scan_of = header.seq;
+        self.leave_trail(now_ns);
+    }
+
+    /// Takes what stands before the background of the scan with this `header`, which arrived at `now_ns`.
+    pub fn take_foreground(&mut self, header: &Header, foreground: &Foreground, now_ns: u64) {
+        self.foreground = Some(foreground.boxed());
+        self.foreground_of = header.seq;
+        self.leave_trail(now_ns);
+    }
+
+    /// Where the scan and the foreground of one telegram are here, that is a step of the trail.
+    fn leave_trail(&mut self, now_ns: u64) {
+        if self.scan_of == self.foreground_of && self.foreground.is_some() {
+            let mut trail = std::mem::take(&mut self.trail);
+            trail.take(now_ns, || {
+                let seen = self.points().filter(|point| point.is_foreground);
+                seen.map(|point| (point.x_m, point.y_m)).collect()
+            });
+            self.trail = trail;
+        }
+    }
+
+    /// How bright a point is that has this `intensity`, from 0 to 1: the root, because most of what is seen is dark.
+    pub fn shade(&self, intensity: u16) -> f64 {
+        (f64::from(intensity) / self.brightest).min(1.0).sqrt()
     }
 
     /// Takes how its link is.
@@ -204,12 +255,15 @@ pub fn verdict<'a>(sensors: impl Iterator<Item = &'a Sensor>) -> (Verdict, Optio
     (worst.map_or(Verdict::Unknown, |(verdict, _)| verdict), worst.map(|(_, name)| name), nearest)
 }
 
+/// What is left of the brightest with each scan.
+const FADING: f64 = 0.9995;
 /// How long the last scan is what is there, at least.
 const OLD_NS: u64 = 1_000_000_000;
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use schema::{ForegroundHead, ScanHead};
 
     #[test]
     fn old_scans_are_forgotten_and_a_hub_that_goes_leaves_nothing_to_act_on() {
@@ -219,10 +273,30 @@ mod tests {
         sensor.zones = Zones { verdict: Verdict::Clear as u8, ..Zones::unknown() };
         assert!(!scene.age(1_500_000_006) && scene.age(1_500_000_007) && !scene.age(u64::MAX));
         assert!(scene.sensors[0].scan.is_none());
+        let trail = |scene: &Scene| scene.sensors[0].trail.points().count();
+        assert_eq!(trail(&scene), 0, "nothing stood before the background");
         assert_eq!(verdict(scene.sensors.iter()).0, Verdict::Clear, "the verdict has a clock of its own");
         scene.hub_gone();
         assert_eq!(verdict(scene.sensors.iter()), (Verdict::Unknown, Some("front"), None));
         assert!(!scene.hub_lives);
+    }
+
+    #[test]
+    fn scan_and_foreground_of_one_telegram_leave_a_trail_and_light_is_told_by_the_brightest() {
+        let mut scene = Scene::default();
+        let sensor = scene.sensor("front");
+        let header = |seq| Header { seq, ..Header::default() };
+        let scan = Scan::of(ScanHead::lms(9, 0, 1000, 1, 13), &[1000; 9]);
+        let mut found = Foreground::of(9);
+        found.begin(ForegroundHead { count: 9, ..ForegroundHead::default() }).bits[0] = 0b101;
+        sensor.take_scan(&header(4), &scan, 0);
+        sensor.take_foreground(&header(5), &found, 1);
+        assert_eq!(sensor.trail.points().count(), 0, "of another telegram");
+        sensor.take_scan(&header(5), &scan, 2);
+        assert_eq!(sensor.trail.points().count(), 2);
+        assert_eq!((sensor.shade(0), sensor.shade(1), sensor.shade(9)), (0.0, 1.0, 1.0), "none are known");
+        sensor.brightest = 400.0;
+        assert_eq!((sensor.shade(100), sensor.shade(800)), (0.5, 1.0));
     }
 
     #[test]

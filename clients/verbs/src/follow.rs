@@ -3,11 +3,12 @@
 
 mod discovery;
 mod lines;
+mod track;
 
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-use scanhub_client::streams::{GRACE, Sample, Session, Source, Who};
+use scanhub_client::streams::{GRACE, Sample, Session, Who};
 use scanhub_client::{Wait, clock};
 use schema::{Domain, Failure, Kind, Status, Topic, is_remote};
 
@@ -16,6 +17,7 @@ use crate::names::TopicName;
 use crate::output::End;
 use crate::receive_stats::ReceiveStats;
 use lines::{LineTrack, watch_parts};
+use track::Track;
 
 /// When a verb that follows ends by itself.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -68,6 +70,10 @@ pub(crate) trait Sink {
     fn wake_at(&self) -> Option<Instant> {
         None
     }
+    /// Whether `topic` is wanted now: what is not is not subscribed to.
+    fn wants(&self, _topic: Topic) -> bool {
+        true
+    }
     /// Whether the statuses of what is followed are wanted too, for what its lines take away.
     fn wants_lines(&self) -> bool {
         false
@@ -91,6 +97,19 @@ pub(crate) fn follow(
     sink: &mut dyn Sink,
 ) -> Result<(), End> {
     carry(Run::new(names, topics, places, bounds), names, stop, sink)
+}
+
+/// As [`follow`], and zones with the early warnings of their sensors.
+pub(crate) fn follow_with_early(
+    names: &[TopicName],
+    places: &[Domain],
+    bounds: &Bounds,
+    stop: &AtomicBool,
+    sink: &mut dyn Sink,
+) -> Result<(), End> {
+    let mut run = Run::new(names, &[], places, bounds);
+    run.tracks.iter_mut().for_each(Track::take_early);
+    carry(run, names, stop, sink)
 }
 
 /// As [`follow`], woken by `wait`, and for the shortest latency: what is there is taken before it is asked whether the hub
@@ -119,25 +138,6 @@ fn carry(mut run: Run<'_>, names: &[TopicName], stop: &AtomicBool, sink: &mut dy
         }
     }
     end
-}
-
-struct Track {
-    name: TopicName,
-    source: Source,
-    stats: ReceiveStats,
-    /// CLOCK_MONOTONIC since when samples are received as they are sent, in ns.
-    since_ns: u64,
-}
-
-impl Track {
-    fn new(name: TopicName) -> Track {
-        Track {
-            source: Source::new(&name.sensor, name.topic),
-            stats: ReceiveStats::new(name.topic),
-            name,
-            since_ns: u64::MAX,
-        }
-    }
 }
 
 struct Run<'a> {
@@ -257,6 +257,10 @@ impl<'a> Run<'a> {
             more = false;
             let mut subscribed = false;
             for track in &mut self.tracks {
+                if !sink.wants(track.name.topic) {
+                    track.let_go();
+                    continue;
+                }
                 // That takes a thousand times as long as receiving: what waits of others comes before the next one.
                 if subscribed && !track.source.subscribed() {
                     more = true;

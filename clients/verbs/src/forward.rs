@@ -1,6 +1,7 @@
 //! A hub that is followed by what carries its samples away, over whatever network: its sensors as they come, its absence,
 //! and which topics go out. Refuses to know where samples go.
 
+mod account;
 mod life;
 mod machine;
 mod selection;
@@ -20,6 +21,7 @@ use crate::follow::Notice;
 use crate::names::no_sensor;
 use crate::output::{End, Output};
 use crate::{json, text};
+pub use account::account;
 pub use life::Life;
 pub use selection::Selection;
 use sensor::Sensor;

@@ -14,7 +14,7 @@ use crate::names::TopicName;
 use crate::output::{End, Output};
 use crate::receive_stats::ReceiveStats;
 
-pub(crate) use processed::{foreground, lines, marks, robot, zones};
+pub(crate) use processed::{early, foreground, lines, marks, motion, robot, zones};
 // A background model as a line is what a file of it is.
 pub(crate) use schema::as_json as background;
 

@@ -16,7 +16,7 @@ use scanhub_client::streams::{Freshness, Sample};
 use schema::{Domain, Failure, Kind, ROBOT, Status, Topic, Verdict, check_followed};
 use serde::Serialize;
 
-use crate::follow::{Bounds, Notice, Sink, follow};
+use crate::follow::{Bounds, Notice, Sink, follow, follow_with_early};
 use crate::names::{TopicName, as_word};
 use crate::output::{End, Output, quiet};
 use crate::receive_stats::ReceiveStats;
@@ -36,6 +36,8 @@ pub struct LedsOptions {
     pub led_root: PathBuf,
     /// How lights are shown in the terminal.
     pub look: LedsLook,
+    /// Early warnings count too.
+    pub early: bool,
     /// How long a better verdict has to stand until it is shown; a worse one is at once.
     pub hold: Duration,
     /// When it ends by itself.
@@ -89,7 +91,11 @@ pub fn leds(
         notes: Output::new(notes),
     };
     let began = board.take(&options.led_root, &wanted).and_then(|()| board.show(Lamps::UNKNOWN, true));
-    let end = began.and_then(|()| follow(&names, &[], &options.places, &options.bounds, stop, &mut board));
+    let LedsOptions { places, bounds, .. } = options;
+    let end = began.and_then(|()| match options.early {
+        true => follow_with_early(&names, places, bounds, stop, &mut board),
+        false => follow(&names, &[], places, bounds, stop, &mut board),
+    });
     quiet(end.and(board.leave()))
 }
 

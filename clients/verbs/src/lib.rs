@@ -27,6 +27,8 @@ mod lossy_writer;
 mod mask;
 mod names;
 mod output;
+#[cfg(any(feature = "tui", feature = "web"))]
+mod picture;
 mod receive_stats;
 mod reception;
 #[cfg(feature = "record")]
@@ -35,6 +37,7 @@ mod selection;
 mod show;
 mod stamp;
 mod text;
+mod track;
 #[cfg(feature = "tui")]
 mod watch;
 #[cfg(feature = "web")]
@@ -47,7 +50,7 @@ mod work;
 /// `scanhub-bridge` are built of it.
 pub mod network {
     pub use crate::follow::Notice;
-    pub use crate::forward::{Carrier, Forwarder, Life, Selection, begin_life, tell};
+    pub use crate::forward::{Carrier, Forwarder, Life, Selection, account, begin_life, tell};
     pub use crate::lossy_writer::LossyWriter;
     pub use crate::output::{End, Output, quiet};
     pub use crate::reception::{Origin, Reception, Wanted, Words};
@@ -70,6 +73,7 @@ pub use listen::{ListenOptions, listen};
 pub use mask::{MaskOptions, mask};
 #[cfg(feature = "record")]
 pub use record::{RecordLook, RecordOptions, Split, record};
+pub use track::{TrackOptions, track};
 #[cfg(feature = "tui")]
 pub use watch::{WatchOptions, watch};
 #[cfg(feature = "web")]

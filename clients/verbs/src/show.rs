@@ -6,7 +6,7 @@ use std::io;
 use scanhub_client::streams::{RobotHeard, Sample};
 use scanhub_client::{Heard, Received};
 use schema::ipc::Payload;
-use schema::{Background, Foreground, Header, Lines, Marks, Scan, Status, Zones};
+use schema::{Background, Early, Foreground, Header, Lines, Marks, Motion, Scan, Status, Zones};
 use serde::Serialize;
 
 use crate::output::{End, Output};
@@ -54,6 +54,8 @@ shown! {
     Scan, scan(header);
     Marks, marks(header);
     Lines, lines(header);
+    Motion, motion(header);
+    Early, early(header);
     Foreground, foreground(header);
     Background, background;
     Status, status;

@@ -14,7 +14,7 @@ use crate::names::TopicName;
 use crate::receive_stats::ReceiveStats;
 use crate::show;
 
-pub(crate) use processed::{background, foreground, lines, marks, robot, zones};
+pub(crate) use processed::{background, early, foreground, lines, marks, motion, robot, zones};
 
 /// Bytes as lower hex, without spaces.
 pub(crate) struct Hex<'a>(pub(crate) &'a [u8]);

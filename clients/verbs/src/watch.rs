@@ -1,6 +1,9 @@
 //! `scanhub watch`: what the sensors see, live, as a picture in the terminal. It sleeps until there is new data,
 //! limits the frame rate so that a slow line can carry it, and restores the terminal however it ends.
 
+#[cfg(test)]
+mod asked;
+mod counters;
 mod draw;
 #[cfg(test)]
 mod golden;
@@ -21,6 +24,7 @@ use schema::{Domain, Failure, Kind, Topic, Verb, check_followed, is_remote};
 use crate::follow::{Bounds, Notice, Sink, follow};
 use crate::names::{TopicName, as_word};
 use crate::output::{End, quiet};
+use crate::picture;
 use crate::receive_stats::ReceiveStats;
 use crate::work::Work;
 use hub_requests::HubRequests;
@@ -49,8 +53,7 @@ pub struct WatchOptions {
 /// else as [`echo`](crate::echo()).
 pub fn watch(options: &WatchOptions, out: &mut dyn Write, stop: &AtomicBool) -> Result<(), Failure> {
     options.sensors.iter().try_for_each(|sensor| as_word(check_followed(sensor)))?;
-    let named = |sensor: &String| TOPICS.map(|topic| TopicName { sensor: sensor.clone(), topic });
-    let names: Vec<_> = options.sensors.iter().flat_map(named).collect();
+    let (names, topics) = picture::followed(&options.sensors);
     let end = Screen::new(out).and_then(|screen| {
         let mut watcher = Watcher {
             options,
@@ -64,15 +67,10 @@ pub fn watch(options: &WatchOptions, out: &mut dyn Write, stop: &AtomicBool) -> 
             draw_at: Instant::now(),
             news_until: None,
         };
-        let topics: &[Topic] = if names.is_empty() { &TOPICS } else { &[] };
         follow(&names, topics, &options.places, &options.bounds, stop, &mut watcher)
     });
     quiet(end)
 }
-
-/// What a picture is made of.
-const TOPICS: [Topic; 6] =
-    [Topic::Scan, Topic::Marks, Topic::Zones, Topic::Foreground, Topic::Background, Topic::Status];
 
 struct Watcher<'a> {
     options: &'a WatchOptions,
@@ -105,6 +103,9 @@ impl Watcher<'_> {
             self.draw_at = now;
             let News::Key(key) = news else { continue };
             let wish = self.view.key(key, &self.scene);
+            if !self.view.lines {
+                self.scene.forget_lines();
+            }
             match (self.view.paused, &self.held) {
                 (true, None) => self.held = Some(self.scene.clone()),
                 (false, Some(_)) => self.held = None,
@@ -156,30 +157,13 @@ impl Sink for Watcher<'_> {
     }
 
     fn sample(&mut self, name: &TopicName, sample: &Sample) -> Result<(), End> {
-        let sensor = self.scene.heard(&name.sensor, sample.header());
-        match sample {
-            Sample::Scan(scan) => sensor.take_scan(scan.header(), scan, clock::now_ns()),
-            Sample::Marks(marks) => sensor.marks = marks.is_available().then_some(**marks),
-            Sample::Zones(heard) => sensor.zones = heard.zones,
-            Sample::Foreground(foreground) => sensor.foreground = Some(foreground.boxed()),
-            Sample::Background(model) => sensor.background = Some(model.boxed()),
-            Sample::Status(status) => sensor.take_status(status),
-            // The picture does not show it.
-            _ => return Ok(()),
-        }
+        picture::take(&mut self.scene, name, sample);
         self.changed = true;
         Ok(())
     }
 
     fn notice(&mut self, names: &[&TopicName], notice: Notice) -> Result<(), End> {
-        match (notice, names) {
-            (Notice::Missed(missed), [name]) if name.topic == Topic::Scan => {
-                self.scene.sensor(&name.sensor).lost += missed;
-            }
-            (Notice::HubGone, _) => self.scene.hub_gone(),
-            (Notice::HubBack, _) => self.scene.hub_lives = true,
-            _ => {}
-        }
+        picture::note(&mut self.scene, names, notice);
         self.changed = true;
         Ok(())
     }
@@ -207,6 +191,10 @@ impl Sink for Watcher<'_> {
             self.draw(now)?;
         }
         Ok(())
+    }
+
+    fn wants(&self, topic: Topic) -> bool {
+        topic != Topic::Lines || self.view.lines
     }
 
     fn wake_at(&self) -> Option<Instant> {

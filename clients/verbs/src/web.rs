@@ -10,12 +10,13 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc;
 use std::thread;
 
-use ::web::{Board, Door, Server};
-use schema::{Domain, Failure, Kind, Topic, check_followed};
+use ::web::{Board, Door, Playback, Server};
+use schema::{Domain, Failure, Kind, check_followed};
 
 use crate::follow::{Bounds, follow};
-use crate::names::{TopicName, as_word};
+use crate::names::as_word;
 use crate::output::{Output, quiet};
+use crate::picture::followed;
 use feeder::Feeder;
 
 /// What `web` is asked for.
@@ -41,11 +42,17 @@ pub struct WebOptions {
     pub places: Vec<Domain>,
 }
 
-/// Serves the picture until the bounds are reached or `stop` is set; says on `out` where, and who comes and goes.
+/// Serves the picture until the bounds are reached or `stop` is set; says on `out` where, and who comes and goes. Viewers
+/// have the keys of `player`, if there is one, whose hub no one else has.
 ///
 /// [`Kind::Usage`] if it would listen beyond this machine without a word; [`Kind::Failed`] if it cannot listen; else as
 /// [`echo`](crate::echo()).
-pub fn web(options: &WebOptions, out: &mut dyn Write, stop: &AtomicBool) -> Result<(), Failure> {
+pub fn web(
+    options: &WebOptions,
+    player: Option<&dyn Playback>,
+    out: &mut dyn Write,
+    stop: &AtomicBool,
+) -> Result<(), Failure> {
     options.sensors.iter().try_for_each(|sensor| as_word(check_followed(sensor)))?;
     if !options.listen.ip().is_loopback() && options.token.is_none() && !options.open {
         let what = format!("everybody who reaches {} could look", options.listen);
@@ -66,21 +73,27 @@ pub fn web(options: &WebOptions, out: &mut dyn Write, stop: &AtomicBool) -> Resu
     if let Err(end) = told::ready(&mut output, &url, options.json) {
         return quiet(Err(end));
     }
-    let named = |sensor: &String| TOPICS.map(|topic| TopicName { sensor: sensor.clone(), topic });
-    let names: Vec<_> = options.sensors.iter().flat_map(named).collect();
-    let topics: &[Topic] = if names.is_empty() { &TOPICS } else { &[] };
+    let (names, topics) = followed(&options.sensors);
     let over = AtomicBool::new(false);
     thread::scope(|scope| {
         let served = thread::Builder::new()
             .name("web".into())
-            .spawn_scoped(scope, || server.run(&board, &tell, &over))
+            // What tells goes with it: who feeds hears that it ended.
+            .spawn_scoped(scope, {
+                let (server, board, over) = (&server, &board, &over);
+                move || server.run(board, player, &tell, over)
+            })
             .map_err(|error| Failure::new(Kind::Short, format!("no thread: {error}"), ""))?;
         let closing = Close { over: &over, board: &board };
-        let mut feeder = Feeder::new(options, &board, events, output);
+        let mut feeder = Feeder::new(options, player, &board, events, output);
         let end = follow(&names, topics, &options.places, &options.bounds, stop, &mut feeder);
         drop(closing);
-        let _ = served.join();
-        quiet(end)
+        match served.join() {
+            Ok(Ok(())) => quiet(end),
+            Ok(Err(failure)) => Err(failure),
+            // It has said why.
+            Err(_) => Err(Failure::new(Kind::Failed, "what serves the viewers ended", "start it again")),
+        }
     })
 }
 
@@ -111,10 +124,6 @@ impl Drop for Close<'_> {
     }
 }
 
-/// What a picture is made of.
-const TOPICS: [Topic; 6] =
-    [Topic::Scan, Topic::Marks, Topic::Zones, Topic::Foreground, Topic::Background, Topic::Status];
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -137,13 +146,15 @@ mod tests {
     fn beyond_this_machine_a_word_is_needed() {
         let stop = AtomicBool::new(true);
         for listen in ["0.0.0.0:0", "[::]:0"] {
-            let failure = web(&options(listen), &mut Vec::new(), &stop).unwrap_err();
+            let failure = web(&options(listen), None, &mut Vec::new(), &stop).unwrap_err();
             assert_eq!(failure.kind, Kind::Usage);
             assert!(failure.hint.contains("--token"), "{failure}");
             let open = WebOptions { open: true, ..options(listen) };
-            assert!(web(&open, &mut Vec::new(), &stop).map_err(|failure| failure.kind) != Err(Kind::Usage));
+            assert!(
+                web(&open, None, &mut Vec::new(), &stop).map_err(|failure| failure.kind) != Err(Kind::Usage)
+            );
         }
-        assert!(web(&options("127.0.0.1:0"), &mut Vec::new(), &stop).is_ok());
+        assert!(web(&options("127.0.0.1:0"), None, &mut Vec::new(), &stop).is_ok());
     }
 
     #[test]
@@ -162,7 +173,7 @@ mod tests {
         for token in ["", " ", "a&b", "a#b", "ö", "100%"] {
             let stop = AtomicBool::new(true);
             let options = WebOptions { token: Some(token.to_owned()), ..options("127.0.0.1:0") };
-            let failure = web(&options, &mut Vec::new(), &stop).unwrap_err();
+            let failure = web(&options, None, &mut Vec::new(), &stop).unwrap_err();
             assert_eq!(failure.kind, Kind::Usage, "{token:?}");
         }
     }

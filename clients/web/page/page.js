@@ -13,11 +13,14 @@ let robot = { verdict: "unknown", sensor: null, nearest_m: null, hub: false, tro
 let circles = [];
 let beams = []; // that violate a circle
 let marks = [];
+let walls = []; // straight surfaces, as pairs of ends
+let corners = [];
 let tracks = [];
+let player = null; // of the recording that this server plays, if it does
 let heard = -Infinity; // when the verdict came last
 let frames = 0;
-const ages = []; // from the moment of a scan to the end of the frame that shows it, in ms, on one machine's clock
-const drawn = { beams: 0, foreground: 0, zones: 0, marks: 0, tracks: 0 };
+const ages = []; // moment of a scan, and of the end of the frame that shows it, in ms since 1970, by one machine's clock
+const drawn = { beams: 0, foreground: 0, zones: 0, marks: 0, lines: 0, tracks: 0 };
 
 const SILENT_MS = 500; // after which the verdict is not known
 const OLD_MS = 1000; // after which a scan is not what is there
@@ -135,12 +138,15 @@ function takeScan(topic, buffer, offset) {
   const told = laserScan(buffer, offset);
   const { ranges, intensities, first, step } = told;
   const points = inRobot(places(ranges, first, step), poseOf(told.frame));
-  const shades = new Uint8Array(ranges.length);
   // What is bright is told over minutes: colours that breathe cannot be read.
   sensor.brightest = intensities.reduce((most, one) => Math.max(most, one), Math.max(1, 0.9995 * (sensor.brightest ?? 1)));
-  intensities.forEach((one, i) => (shades[i] = Math.min(SHADES - 1, SHADES * Math.sqrt(one / sensor.brightest))));
+  const byShade = Array.from({ length: intensities.length ? SHADES : 0 }, () => []);
+  intensities.forEach((one, i) => {
+    if (Number.isNaN(points[2 * i])) return;
+    byShade[Math.min(SHADES - 1, Math.floor(SHADES * Math.sqrt(one / sensor.brightest)))].push(points[2 * i], points[2 * i + 1]);
+  });
   sensor.frame = told.frame;
-  sensor.scan = { ...told, points, shades, hasShades: intensities.length > 0, at: performance.now() };
+  sensor.scan = { ...told, points, byShade, at: performance.now() };
 }
 
 function takeForeground(topic, buffer, offset) {
@@ -148,7 +154,10 @@ function takeForeground(topic, buffer, offset) {
   const { frame, xy } = pointCloud(buffer, offset);
   const now = performance.now();
   sensor.foreground = inRobot(xy, poseOf(frame));
-  if (!(now - sensor.trail.at(-1)?.at < TRAIL_STEP_MS)) sensor.trail.push({ at: now, points: sensor.foreground });
+  if (now - sensor.trail.at(-1)?.at < TRAIL_STEP_MS) return;
+  // Here, too: a page that nobody sees draws no frames.
+  sensor.trail = sensor.trail.filter(({ at }) => now - at < TRAIL_MS);
+  sensor.trail.push({ at: now, points: sensor.foreground });
 }
 
 /** What is always there is told as a scan that nobody measured. */
@@ -180,6 +189,12 @@ function takeZones(update) {
   }
 }
 
+function takeLines(update) {
+  walls = update.entities.flatMap((entity) => entity.lines).flatMap(({ points }) =>
+    points.flatMap((from, n) => (n % 2 ? [] : [[from, points[n + 1]]])));
+  corners = update.entities.flatMap((entity) => entity.spheres.map((one) => one.pose.position));
+}
+
 function takeTracks(update) {
   tracks = update.entities.map((entity) => ({
     lines: entity.lines.map((line) => line.points),
@@ -199,7 +214,7 @@ function takeStatus(topic, status) {
 }
 
 /** Which topics make the picture, and not the words beside it. */
-const PICTURE = /\/(scan|foreground|background|zones|marks|tracks)$/;
+const PICTURE = /\/(scan|foreground|background|zones|marks|lines|tracks)$/;
 let kept = null; // what came for the picture while it is held, the newest of each topic
 
 function take(topic, buffer, offset) {
@@ -220,9 +235,11 @@ function take(topic, buffer, offset) {
 function show(topic, buffer, offset) {
   const object = () => JSON.parse(new TextDecoder().decode(new Uint8Array(buffer, offset)));
   if (topic === "/robot") takeRobot(object());
+  else if (topic === "/replay") player = object();
   else if (topic === "/tf_static") transforms(buffer, offset);
   else if (topic === "/zones") takeZones(object());
   else if (topic === "/marks") marks = object().entities.flatMap((entity) => entity.spheres.map((one) => one.pose.position));
+  else if (topic === "/lines") takeLines(object());
   else if (topic === "/tracks") takeTracks(object());
   else if (topic.endsWith("/scan")) takeScan(topic, buffer, offset);
   else if (topic.endsWith("/foreground")) takeForeground(topic, buffer, offset);
@@ -243,6 +260,8 @@ function forget() {
   circles = [];
   beams = [];
   marks = [];
+  walls = [];
+  corners = [];
   tracks = [];
 }
 
@@ -251,12 +270,30 @@ function forget() {
 let socket = null;
 let isOpen = false;
 let retry = 250;
+const topics = new Map(); // by channel, which is the number of its subscription, too
+
+/** Whoever asks for lines costs the hub something: that is done while they are looked at. */
+const isWanted = (topic) => topic !== "/lines" || layers.lines;
+
+function subscribe(ids) {
+  const wanted = ids.filter((id) => isWanted(topics.get(id)));
+  socket.send(JSON.stringify({ op: "subscribe", subscriptions: wanted.map((id) => ({ id, channelId: id })) }));
+}
+
+function changeLines() {
+  const [id] = [...topics].find(([, topic]) => topic === "/lines") ?? [];
+  if (!isOpen || id === undefined) return;
+  if (layers.lines) return subscribe([id]);
+  socket.send(JSON.stringify({ op: "unsubscribe", subscriptionIds: [id] }));
+  walls = [];
+  corners = [];
+}
 
 function connect() {
   const scheme = location.protocol === "https:" ? "wss" : "ws";
   socket = new WebSocket(`${scheme}://${location.host}/${location.search}`, "foxglove.sdk.v1");
   socket.binaryType = "arraybuffer";
-  const topics = new Map(); // by subscription
+  topics.clear();
   socket.onopen = () => {
     isOpen = true;
     retry = 250;
@@ -271,8 +308,7 @@ function connect() {
     const said = JSON.parse(data);
     if (said.op === "advertise") {
       for (const channel of said.channels) topics.set(channel.id, channel.topic);
-      const subscriptions = said.channels.map(({ id }) => ({ id, channelId: id }));
-      socket.send(JSON.stringify({ op: "subscribe", subscriptions }));
+      subscribe(said.channels.map(({ id }) => id));
     } else if (said.op === "status") {
       $("news").textContent = said.message;
       setTimeout(() => { if ($("news").textContent === said.message) $("news").textContent = ""; }, 4000);
@@ -288,9 +324,23 @@ function connect() {
 
 // ---------------------------------------------------------------- the view
 
-const stored = (key, otherwise) => JSON.parse(sessionStorage.getItem(key) ?? "null") ?? otherwise;
+/** What was chosen before in this window; browsers may refuse to keep anything. */
+function stored(key, otherwise) {
+  try {
+    return JSON.parse(sessionStorage.getItem(key)) ?? otherwise;
+  } catch {
+    return otherwise;
+  }
+}
+
+function store(key, value) {
+  try {
+    sessionStorage.setItem(key, JSON.stringify(value));
+  } catch { /* It holds as long as the page is open. */ }
+}
+
 const layers = Object.assign({ scan: true, intensity: true, foreground: true, trails: true, background: true, zones: true,
-  marks: true, field: true, grid: true }, stored("layers", {}));
+  marks: true, lines: false, field: true, grid: true }, stored("layers", {}));
 const view = { x: 1, y: 0, scale: 60, turn: 0, fits: true, isFitted: false, goal: null, only: null };
 const isCalm = matchMedia("(prefers-reduced-motion: reduce)");
 let pointer = null; // over the picture, in pixels
@@ -302,7 +352,7 @@ let size = { width: 1, height: 1, ratio: 1 };
 function open() {
   const isNarrow = size.width <= 720;
   const right = isNarrow ? 0 : 320;
-  const bottom = isNarrow ? 60 + ($("sensors").offsetHeight || 0) : 60;
+  const bottom = isNarrow ? 60 + ($("sensors").offsetHeight || 0) : player ? 116 : 60;
   const top = 56;
   return { x: (size.width - right) / 2, y: top + (size.height - top - bottom) / 2, width: size.width - right,
     height: size.height - top - bottom };
@@ -334,12 +384,14 @@ const MARGIN = 1.1;
 
 /** Brings what is seen into the picture, few outliers left out; keeps what is about right. */
 function fit() {
+  const scans = shown().flatMap(({ scan }) => scan ?? []);
+  // Where a picture ends some hundred points tell as well as thousands.
+  const stride = 2 * Math.ceil(scans.reduce((sum, { points }) => sum + points.length, 0) / 2000);
   const across = [];
   const along = [];
-  for (const { scan } of shown()) {
-    if (!scan) continue;
-    for (let i = 0; i < scan.points.length; i += 2) {
-      const [x, y] = [scan.points[i], scan.points[i + 1]];
+  for (const { points } of scans) {
+    for (let i = 0; i < points.length; i += stride) {
+      const [x, y] = [points[i], points[i + 1]];
       if (Number.isNaN(x)) continue;
       across.push(-(y * cos) - -x * sin);
       along.push(-y * sin + -x * cos);
@@ -386,7 +438,7 @@ let shadeColours = [];
 function readColours() {
   const probe = document.createElement("span");
   document.body.append(probe);
-  for (const name of ["paper", "ink", "soft", "grid", "axis", "accent", "clear", "slow", "stop", "new", "old", "mark", "shade", "edge"]) {
+  for (const name of ["paper", "ink", "soft", "grid", "axis", "accent", "clear", "slow", "stop", "new", "old", "mark", "line", "shade", "edge"]) {
     probe.style.color = `var(--${name})`;
     colours[name] = getComputedStyle(probe).color;
   }
@@ -495,14 +547,15 @@ function drawField(sensor) {
 
 /** Squares of `width` at `points`; how many of them are numbers. */
 function dots(points, width) {
-  const half = width / 2;
+  // As toScreen, without an array for each of thousands.
+  const [c, s] = [cos * view.scale, sin * view.scale];
+  const left = middle.x - width / 2 + view.y * c - view.x * s;
+  const top = middle.y - width / 2 + view.y * s + view.x * c;
   let count = 0;
   for (let i = 0; i < points.length; i += 2) {
-    const x = points[i];
+    const [x, y] = [points[i], points[i + 1]];
     if (Number.isNaN(x)) continue;
-    const a = -(points[i + 1] - view.y) * view.scale;
-    const b = -(x - view.x) * view.scale;
-    pen.fillRect(middle.x + a * cos - b * sin - half, middle.y + a * sin + b * cos - half, width, width);
+    pen.fillRect(left - y * c + x * s, top - y * s - x * c, width, width);
     count += 1;
   }
   return count;
@@ -511,15 +564,13 @@ function dots(points, width) {
 function drawScan({ scan }) {
   if (!scan) return 0;
   const width = scan.points.length > 2000 ? 2.5 : 3.5;
-  if (!layers.intensity || !scan.hasShades) {
+  if (!layers.intensity || !scan.byShade.length) {
     pen.fillStyle = colours.ink;
     return dots(scan.points, width);
   }
   // A colour is set once for all that have it.
-  const byShade = Array.from({ length: SHADES }, () => []);
-  for (let i = 0; i < scan.shades.length; i++) byShade[scan.shades[i]].push(scan.points[2 * i], scan.points[2 * i + 1]);
   let count = 0;
-  byShade.forEach((points, shade) => {
+  scan.byShade.forEach((points, shade) => {
     pen.fillStyle = shadeColours[shade];
     count += dots(points, width);
   });
@@ -584,6 +635,22 @@ function drawMarks() {
     pen.stroke();
   }
   return marks.length;
+}
+
+function drawLines() {
+  pen.strokeStyle = pen.fillStyle = colours.line;
+  pen.lineWidth = 2;
+  pen.beginPath();
+  for (const [from, to] of walls) {
+    pen.moveTo(...toScreen(from.x, from.y));
+    pen.lineTo(...toScreen(to.x, to.y));
+  }
+  pen.stroke();
+  for (const corner of corners) {
+    const [x, y] = toScreen(corner.x, corner.y);
+    pen.strokeRect(x - 4.5, y - 4.5, 9, 9);
+  }
+  return walls.length;
 }
 
 function drawTracks() {
@@ -653,7 +720,7 @@ function draw(now) {
   pen.setTransform(size.ratio, 0, 0, size.ratio, 0, 0);
   pen.fillStyle = colours.paper;
   pen.fillRect(0, 0, size.width, size.height);
-  Object.assign(drawn, { beams: 0, foreground: 0, zones: 0, marks: 0, tracks: 0 });
+  Object.assign(drawn, { beams: 0, foreground: 0, zones: 0, marks: 0, lines: 0, tracks: 0 });
   const seen = shown();
   if (layers.field) seen.forEach(drawField);
   if (layers.grid) drawGrid();
@@ -668,6 +735,7 @@ function draw(now) {
     pen.fillStyle = colours.new;
     for (const { foreground } of seen) if (foreground) drawn.foreground += dots(foreground, 5);
   }
+  if (layers.lines) drawn.lines = drawLines();
   if (layers.marks) drawn.marks = drawMarks();
   drawn.tracks = drawTracks();
   drawRobot();
@@ -677,7 +745,7 @@ function draw(now) {
   tellVerdict();
   frames += 1;
   for (const sensor of seen) {
-    if (sensor.stamp) ages.push(performance.timeOrigin + performance.now() - sensor.stamp);
+    if (sensor.stamp) ages.push([sensor.stamp, performance.timeOrigin + performance.now()]);
     sensor.stamp = null;
   }
   ages.splice(0, ages.length - 400);
@@ -734,7 +802,7 @@ function readOut() {
   if (!best.sensor) return box.replaceChildren(bold, `\n${place}`);
   const { scan, name } = best.sensor;
   const angle = ((scan.first + best.beam * scan.step) * 180) / Math.PI;
-  const intensity = scan.hasShades ? `, intensity ${scan.intensities[best.beam]}` : "";
+  const intensity = scan.byShade.length ? `, intensity ${scan.intensities[best.beam]}` : "";
   box.replaceChildren(bold, `\n${place}\n${name}: ${angle.toFixed(2)}°, ${scan.ranges[best.beam].toFixed(3)} m${intensity}`);
   pen.strokeStyle = colours.accent;
   pen.lineWidth = 2;
@@ -743,6 +811,8 @@ function readOut() {
   pen.stroke();
 }
 
+/** What a player shows while it waits stands. */
+const stands = () => player !== null && (player.paused || player.over);
 const isHeard = () => isOpen && performance.now() - heard < SILENT_MS;
 const verdict = () => (isHeard() ? robot.verdict : "unknown");
 
@@ -760,14 +830,15 @@ function tellVerdict() {
   put(box.lastElementChild, [isHeard() ? robot.sensor : null, nearest].filter(Boolean).join(", ") + (kept ? "  ·  picture held" : ""));
   const load = robot.load_percent === null || robot.load_percent === undefined ? "" : `, ${robot.load_percent.toFixed(1)} % of a processor`;
   put($("hub"), !isHeard() ? "" : robot.hub ? `${robot.domain}: hub ${robot.pid ?? ""}${load}` : "no hub");
-  document.title = `${word.toUpperCase()} – scanhub`;
+  const title = `${word.toUpperCase()} – scanhub`;
+  if (document.title !== title) document.title = title;
 }
 
 function tell() {
   const now = performance.now();
   tellVerdict();
   for (const sensor of sensors.values()) {
-    if (sensor.scan && !kept && now - sensor.scan.at > Math.max(OLD_MS, 3000 * sensor.scan.period)) {
+    if (sensor.scan && !kept && !stands() && now - sensor.scan.at > Math.max(OLD_MS, 3000 * sensor.scan.period)) {
       Object.assign(sensor, { scan: null, foreground: null, trail: [] });
       wake();
     }
@@ -778,10 +849,33 @@ function tell() {
       wake();
     }
   }
+  tellPlayer();
   explain();
 }
 
 /** Why the picture is empty, and what to do. */
+function clock(seconds) {
+  const [minutes, rest] = [Math.floor(seconds / 60), seconds % 60];
+  return `${minutes}:${rest.toFixed(1).padStart(4, "0")}`;
+}
+
+/** How far the recording is, where one is played. */
+function tellPlayer() {
+  const box = $("player");
+  box.hidden = !player;
+  if (!player) return;
+  const { position_s: at, length_s: length, rate, paused, over, lap } = player;
+  const state = over ? "at its end" : paused ? "paused" : `\u00d7${rate ?? "max"}`;
+  const speed = over || !paused ? "" : `, \u00d7${rate ?? "max"}`;
+  put($("played"), [clock(at), length === null ? "" : ` / ${clock(length)}`, `  ${state}${speed}`, lap ? `  lap ${lap + 1}` : ""].join(""));
+  $("line").hidden = length === null;
+  $("line").max = length ?? 1;
+  $("line").value = at;
+  const button = box.querySelector("[data-order=toggle]");
+  put(button, paused ? "Play" : "Pause");
+  for (const one of box.querySelectorAll("button")) one.disabled = over || !isOpen;
+}
+
 function explain() {
   let trouble = null;
   if (!isOpen) trouble = { what: "No connection to scanhub web", remedy: "It ended, or the network between is cut. This page tries again by itself." };
@@ -968,11 +1062,18 @@ for (const button of document.querySelectorAll("#layers button")) {
   const mark = () => button.setAttribute("aria-pressed", String(layers[layer]));
   button.onclick = () => {
     layers[layer] = !layers[layer];
-    sessionStorage.setItem("layers", JSON.stringify(layers));
+    store("layers", layers);
+    if (layer === "lines") changeLines();
     mark();
     wake();
   };
   mark();
+}
+
+for (const button of document.querySelectorAll("#player button")) {
+  button.onclick = () => {
+    if (isOpen) socket.send(JSON.stringify({ op: "scanhub.player", order: button.dataset.order }));
+  };
 }
 
 addEventListener("keydown", (event) => {
@@ -990,7 +1091,7 @@ addEventListener("keydown", (event) => {
     if (sensor) choose(sensor.space);
   } else {
     const button = [...document.querySelectorAll("[data-key]")].find((one) => one.dataset.key === event.key);
-    if (!button) return;
+    if (!button || button.closest("[hidden]")) return;
     button.click();
   }
   event.preventDefault();
@@ -1057,9 +1158,13 @@ Object.defineProperty(window, "scanhub", {
     frames,
     scans: Object.fromEntries([...sensors.values()].map(({ name, scans }) => [name, scans])),
     ...drawn,
-    drawn_ms: [0.5, 0.99].map((share) => [...ages].sort((a, b) => a - b)[Math.floor(share * (ages.length - 1))] ?? null),
+    drawn_ms: [0.5, 0.99].map((share) => ages.map(([from, to]) => to - from).sort((a, b) => a - b)[Math.floor(share * (ages.length - 1))] ?? null),
+    shown: () => ages,
+    points: (name) => [...([...sensors.values()].find((one) => one.name === name)?.scan?.points ?? [])],
+    view: { x: view.x, y: view.y, scale: view.scale, turn: view.turn },
     verdict: verdict(),
     connected: isOpen,
+    player,
     reason: $("reason").hidden ? null : $("reason").innerText,
     sensors: [...sensors.values()].filter(({ status }) => status).map(({ name, status }) => ({
       name, state: status.state, hz: status.hz, lost: status.lost, damaged: status.damaged,

@@ -2,6 +2,7 @@
 //! he is ready, and however many viewers there are, this is all that is kept. Refuses to know sockets and what messages mean.
 
 use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use rustix::event::{EventfdFlags, eventfd};
@@ -42,6 +43,8 @@ pub(crate) struct Newest {
 #[derive(Debug)]
 pub struct Board {
     posts: Mutex<Vec<Post>>,
+    /// Something was put up that who sends was not told of.
+    is_new: AtomicBool,
     bell: OwnedFd,
 }
 
@@ -64,7 +67,7 @@ impl Board {
         let bell = bell.map_err(|error| {
             Failure::new(Kind::Short, format!("no eventfd: {error}"), "raise the limit: ulimit -n")
         })?;
-        Ok(Board { posts: Mutex::default(), bell })
+        Ok(Board { posts: Mutex::default(), is_new: AtomicBool::new(false), bell })
     }
 
     /// Returns the channel with this topic; it is made if there is none.
@@ -90,20 +93,28 @@ impl Board {
         self.posts().get(id.0).is_some_and(|post| post.subscribers > 0)
     }
 
-    /// Puts up a message of a moment in ns since 1970, in place of the one before.
+    /// Puts up a message of a moment in ns since 1970, in place of the one before. Who sends hears of it by
+    /// [`tell`](Self::tell), once for all that came together.
     pub fn put(&self, id: ChannelId, wall_ns: u64, payload: &[u8]) {
         if let Some(post) = self.posts().get_mut(id.0) {
             post.number += 1;
             let (number, is_kept) = (post.number, post.channel.is_kept);
             post.newest = Some(Newest { number, wall_ns, payload: payload.into(), is_kept });
+            self.is_new.store(true, Ordering::Relaxed);
         }
-        self.ring();
     }
 
     /// Takes down what is there: it is not true any more.
     pub fn clear(&self, id: ChannelId) {
         if let Some(post) = self.posts().get_mut(id.0) {
             post.newest = None;
+        }
+    }
+
+    /// Wakes who sends, if something was put up since the last time.
+    pub fn tell(&self) {
+        if self.is_new.swap(false, Ordering::Relaxed) {
+            self.ring();
         }
     }
 
@@ -131,7 +142,8 @@ impl Board {
         let mut posts = self.posts();
         let post = posts.get_mut(id)?;
         post.subscribers += 1;
-        Some(if post.channel.is_kept { post.number.saturating_sub(1) } else { post.number })
+        let kept = post.newest.as_ref().filter(|newest| newest.is_kept);
+        Some(kept.map_or(post.number, |newest| newest.number - 1))
     }
 
     pub(crate) fn unsubscribe(&self, id: usize) {
@@ -186,6 +198,14 @@ mod tests {
         assert_eq!((newest.number, newest.payload[0]), (5, 5), "one was skipped");
         board.clear(scan);
         assert!(board.newer(scan.0, of_scan).is_none());
+        board.clear(status);
+        let late = board.subscribe(status.0).unwrap();
+        board.put(status, 4, &[4]);
+        assert_eq!(
+            board.newer(status.0, late).unwrap().number,
+            late + 1,
+            "what was taken down was not missed"
+        );
         assert!(board.is_wanted(scan) && board.is_watched(status));
         board.unsubscribe(scan.0);
         assert!(!board.is_wanted(scan));

@@ -4,6 +4,7 @@
 use serde::{Deserialize, Serialize};
 
 use crate::board::Channel;
+use crate::playback::Order;
 
 /// The subprotocol of the WebSocket.
 pub(crate) const PROTOCOL: &str = "foxglove.sdk.v1";
@@ -75,6 +76,8 @@ pub(crate) enum Wish {
     Subscribe(Vec<(u32, usize)>),
     /// No more of these subscriptions.
     Unsubscribe(Vec<u32>),
+    /// Something of the player, where there is one; this protocol's own players neither step nor double.
+    Player(Order),
 }
 
 /// What a viewer says; nothing if it is about what this server did not offer.
@@ -88,6 +91,10 @@ pub(crate) fn parse(text: &str) -> Option<Wish> {
         #[serde(rename_all = "camelCase")]
         Unsubscribe {
             subscription_ids: Vec<u32>,
+        },
+        #[serde(rename = "scanhub.player")]
+        Player {
+            order: Order,
         },
     }
     #[derive(Deserialize)]
@@ -103,6 +110,7 @@ pub(crate) fn parse(text: &str) -> Option<Wish> {
             Wish::Subscribe(subscriptions.into_iter().map(place).collect())
         }
         Said::Unsubscribe { subscription_ids } => Wish::Unsubscribe(subscription_ids),
+        Said::Player { order } => Wish::Player(order),
     })
 }
 
@@ -121,6 +129,8 @@ mod tests {
         assert_eq!(parse(subscribe), Some(Wish::Subscribe(vec![(7, 0), (8, usize::MAX)])));
         let unsubscribe = r#"{"op":"unsubscribe","subscriptionIds":[7]}"#;
         assert_eq!(parse(unsubscribe), Some(Wish::Unsubscribe(vec![7])));
+        let step = r#"{"op":"scanhub.player","order":"step"}"#;
+        assert_eq!(parse(step), Some(Wish::Player(Order::Step)));
         let deep = "[".repeat(100_000);
         for other in ["", "{}", r#"{"op":"getParameters"}"#, r#"{"op":"subscribe"}"#, &deep] {
             assert_eq!(parse(other), None);

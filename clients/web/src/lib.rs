@@ -8,10 +8,12 @@ mod door;
 mod foxglove;
 pub mod messages;
 mod page;
+mod playback;
 mod request;
 mod server;
 mod viewer;
 
 pub use board::{Board, Channel, ChannelId};
 pub use door::Door;
+pub use playback::{Order, Playback, Progress};
 pub use server::{Event, Server, VIEWERS};

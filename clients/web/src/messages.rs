@@ -9,8 +9,9 @@ use schema::{Background, Counter, Header, Pose, Scan, ScanHead, is_remote};
 use serde::Serialize;
 
 use crate::board::Channel;
+use crate::playback::Progress;
 
-pub use scene_update::{marks, zones};
+pub use scene_update::{lines, marks, zones};
 
 /// Scans of a sensor, as `sensor_msgs/msg/LaserScan`.
 pub fn scan_channel(sensor: &str) -> Channel {
@@ -42,6 +43,11 @@ pub fn marks_channel() -> Channel {
     scene_update::channel("/marks")
 }
 
+/// The straight surfaces that the sensors see, and their corners, as `foxglove.SceneUpdate`.
+pub fn lines_channel() -> Channel {
+    scene_update::channel("/lines")
+}
+
 /// The verdict and the hub, see [`robot`].
 pub fn robot_channel() -> Channel {
     json("/robot".to_owned(), "scanhub.Robot", include_str!("messages/robot.json"))
@@ -50,6 +56,16 @@ pub fn robot_channel() -> Channel {
 /// The state of a sensor, see [`status`].
 pub fn status_channel(sensor: &str) -> Channel {
     json(beside_scan(sensor, "status"), "scanhub.Status", include_str!("messages/status.json"))
+}
+
+/// How far the recording is that is played, see [`replay`].
+pub fn replay_channel() -> Channel {
+    json("/replay".to_owned(), "scanhub.Replay", include_str!("messages/replay.json"))
+}
+
+/// How far the player is.
+pub fn replay(progress: &Progress) -> Vec<u8> {
+    bytes(progress)
 }
 
 /// The verdict of the robot's sensors, and how its hub is; `trouble` is why there is none.
@@ -248,11 +264,22 @@ mod tests {
         let mut scene = Scene::default();
         scene.sensor("front");
         let keys = |value: &serde_json::Value| value.as_object().unwrap().keys().cloned().collect::<Vec<_>>();
+        let progress = Progress {
+            position_s: 1.0,
+            length_s: None,
+            rate: Some(0.5),
+            paused: true,
+            over: false,
+            lap: 0,
+            telegrams: 7,
+        };
         let pairs = [
             (robot_channel(), robot(&scene, "default", None)),
             (status_channel("front"), status(&scene.sensors[0])),
             (zones_channel(), zones(&scene, 1)),
             (marks_channel(), marks(&scene, 1)),
+            (lines_channel(), lines(&scene, 1)),
+            (replay_channel(), replay(&progress)),
         ];
         for (channel, message) in pairs {
             let schema: serde_json::Value = serde_json::from_str(channel.schema).unwrap();

@@ -45,4 +45,47 @@ mod tests {
         assert!(!SCRIPT.contains("</script") && !STYLE.contains("</style"));
         assert!(!SCRIPT.contains("innerHTML"), "names from elsewhere stay text");
     }
+
+    /// The colour `name` of the light and of the dark page, as 8-bit red, green and blue.
+    fn colour(name: &str) -> [[u8; 3]; 2] {
+        let line = STYLE.lines().find_map(|line| line.trim().strip_prefix(&format!("--{name}: light-dark(")));
+        let both = line.and_then(|line| line.strip_suffix(");")).unwrap_or_else(|| panic!("no {name}"));
+        let parts: Vec<_> = both.split(", ").map(|part| part.strip_prefix('#').unwrap()).collect();
+        let channel = |part: &str, at: usize| u8::from_str_radix(&part[2 * at..2 * at + 2], 16).unwrap();
+        [0, 1].map(|scheme| [0, 1, 2].map(|at| channel(parts[scheme], at)))
+    }
+
+    /// Contrast of two colours by WCAG 2.2 (relative luminance of sRGB), 1 to 21.
+    fn contrast(a: [u8; 3], b: [u8; 3]) -> f64 {
+        let linear = |channel: u8| {
+            let value = f64::from(channel) / 255.0;
+            if value <= 0.04045 { value / 12.92 } else { ((value + 0.055) / 1.055).powf(2.4) }
+        };
+        let luminance =
+            |[r, g, b]: [u8; 3]| 0.2126 * linear(r) + 0.7152 * linear(g) + 0.0722 * linear(b) + 0.05;
+        let (a, b) = (luminance(a), luminance(b));
+        a.max(b) / a.min(b)
+    }
+
+    /// WCAG 2.2, 1.4.3 and 1.4.11: text has 4.5 to 1, what is drawn and has a meaning 3 to 1, on the light page and the dark.
+    #[test]
+    fn what_is_written_and_drawn_can_be_seen() {
+        assert!((contrast([0; 3], [255; 3]) - 21.0).abs() < 1e-9);
+        let least = |inks: &[&str], papers: &[&str], wanted: f64| {
+            for (ink, paper) in inks.iter().flat_map(|ink| papers.iter().map(move |paper| (ink, paper))) {
+                for scheme in [0, 1] {
+                    let ratio = contrast(colour(ink)[scheme], colour(paper)[scheme]);
+                    assert!(ratio >= wanted, "{ink} on {paper}, scheme {scheme}: {ratio:.2} of {wanted}");
+                }
+            }
+        };
+        least(&["ink", "soft", "accent", "slow", "stop", "clear"], &["paper", "panel"], 4.5);
+        least(&["new", "mark", "line"], &["paper"], 3.0);
+        for fill in ["clear-fill", "slow-fill", "stop-fill"] {
+            for scheme in [0, 1] {
+                let ratio = contrast([255; 3], colour(fill)[scheme]);
+                assert!(ratio >= 4.5, "white on {fill}, scheme {scheme}: {ratio:.2}");
+            }
+        }
+    }
 }

@@ -3,11 +3,12 @@
 
 use std::io::{self, Read, Write};
 use std::net::{SocketAddr, TcpListener, TcpStream};
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
 use std::sync::mpsc::Sender;
-use std::time::{Duration, Instant};
+use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
+use rustix::io::Errno;
 use rustix::net::sockopt::set_socket_send_buffer_size;
 use schema::{Failure, Kind};
 
@@ -15,6 +16,7 @@ use crate::board::Board;
 use crate::door::{Door, Refusal};
 use crate::foxglove::PROTOCOL;
 use crate::page::Page;
+use crate::playback::Playback;
 use crate::request::{LONGEST, Request, answer, upgrade, words};
 use crate::viewer::{Gone, Viewer};
 
@@ -81,18 +83,31 @@ impl Server {
         self.address
     }
 
-    /// Serves what is on `board` until `stop`, which [`Board::ring`] makes it see; tells `events` who comes and goes.
-    pub fn run(&self, board: &Board, events: &Sender<Event>, stop: &AtomicBool) {
+    /// Serves what is on `board`, and hands orders to the `player`, until `stop`, which [`Board::ring`] makes it see; tells `events` who comes and goes.
+    ///
+    /// # Errors
+    ///
+    /// [`Kind::Failed`] if the system does not say any more who can be served.
+    pub fn run(
+        &self,
+        board: &Board,
+        player: Option<&dyn Playback>,
+        events: &Sender<Event>,
+        stop: &AtomicBool,
+    ) -> Result<(), Failure> {
         let mut guests: Vec<Guest> = Vec::new();
-        let session = format!("{:x}", std::process::id());
+        let house = House { server: self, board, player, session: session() };
+        // Where no descriptor is left, whoever is at the door waits for a while: he would not let this thread sleep.
+        let mut closed_until = None;
         while !stop.load(Ordering::Relaxed) {
-            let (is_new, ready) = self.wait(board, &guests);
+            let (is_new, ready) = self.wait(board, &guests, closed_until)?;
             board.rang();
             let now = Instant::now();
+            closed_until = closed_until.filter(|until| now < *until);
             let mut viewers = guests.iter().filter(|guest| matches!(guest.stage, Stage::Viewer(_))).count();
             for (guest, is_ready) in guests.iter_mut().zip(ready) {
                 let was_viewer = matches!(guest.stage, Stage::Viewer(_));
-                let served = guest.serve(self, board, is_ready, viewers, &session, now);
+                let served = guest.serve(&house, is_ready, viewers, now);
                 guest.is_gone = served.is_err();
                 let skipped = match &mut guest.stage {
                     Stage::Viewer(viewer) => {
@@ -111,29 +126,50 @@ impl Server {
                 let _ = events.send(Event { address: guest.address, came: !guest.is_gone, skipped, viewers });
             }
             guests.retain(|guest| !guest.is_gone);
-            if is_new {
-                self.take(&mut guests, now);
+            if is_new && self.take(&mut guests, now).is_err() {
+                closed_until = Some(now + SHORTAGE);
             }
         }
+        Ok(())
     }
 
     /// Sleeps until something happens: whether somebody is at the door, and which guests can be read or written.
-    fn wait(&self, board: &Board, guests: &[Guest]) -> (bool, Vec<bool>) {
+    fn wait(
+        &self,
+        board: &Board,
+        guests: &[Guest],
+        closed_until: Option<Instant>,
+    ) -> Result<(bool, Vec<bool>), Failure> {
         let bell = board.bell();
-        let mut ends = vec![PollFd::new(&self.listener, PollFlags::IN), PollFd::new(&bell, PollFlags::IN)];
+        let door = if closed_until.is_none() { PollFlags::IN } else { PollFlags::empty() };
+        let mut ends = vec![PollFd::new(&self.listener, door), PollFd::new(&bell, PollFlags::IN)];
         for guest in guests {
             ends.push(PollFd::new(guest.stream(), guest.waits_for()));
         }
-        let wake_at = guests.iter().filter_map(Guest::wake_at).min();
+        let wake_at = guests.iter().filter_map(Guest::wake_at).chain(closed_until).min();
         let left = wake_at.map_or(IDLE, |at| at.saturating_duration_since(Instant::now()).min(IDLE));
         let left = Timespec { tv_sec: left.as_secs() as i64, tv_nsec: i64::from(left.subsec_nanos()) };
-        let _ = poll(&mut ends, Some(&left));
+        match poll(&mut ends, Some(&left)) {
+            Ok(_) | Err(Errno::INTR | Errno::AGAIN) => {}
+            Err(error) => {
+                let hint = "start it again; if that lasts, raise the limits: ulimit -n, memory";
+                return Err(Failure::new(Kind::Failed, format!("cannot wait for viewers: {error}"), hint));
+            }
+        }
         let is_ready = |end: &PollFd<'_>| !end.revents().is_empty();
-        (is_ready(&ends[0]), ends[2..].iter().map(is_ready).collect())
+        Ok((is_ready(&ends[0]), ends[2..].iter().map(is_ready).collect()))
     }
 
-    fn take(&self, guests: &mut Vec<Guest>, now: Instant) {
-        while let Ok((stream, address)) = self.listener.accept() {
+    /// Lets in who is at the door; an error if the system is short of something.
+    fn take(&self, guests: &mut Vec<Guest>, now: Instant) -> io::Result<()> {
+        loop {
+            let (stream, address) = match self.listener.accept() {
+                Ok(guest) => guest,
+                Err(error) if error.kind() == io::ErrorKind::WouldBlock => return Ok(()),
+                // He went before he was let in.
+                Err(error) if PASSING.contains(&error.kind()) => continue,
+                Err(error) => return Err(error),
+            };
             if stream.set_nonblocking(true).is_err() {
                 continue;
             }
@@ -179,6 +215,14 @@ impl Server {
     }
 }
 
+/// What all guests are served from.
+struct House<'a> {
+    server: &'a Server,
+    board: &'a Board,
+    player: Option<&'a dyn Playback>,
+    session: String,
+}
+
 /// Somebody who is connected.
 struct Guest {
     address: SocketAddr,
@@ -217,30 +261,27 @@ impl Guest {
         }
     }
 
-    fn serve(
-        &mut self,
-        server: &Server,
-        board: &Board,
-        is_ready: bool,
-        viewers: usize,
-        session: &str,
-        now: Instant,
-    ) -> Result<(), Gone> {
+    fn serve(&mut self, house: &House<'_>, is_ready: bool, viewers: usize, now: Instant) -> Result<(), Gone> {
         match &mut self.stage {
             Stage::Request { until, .. } | Stage::Answer { until, .. } if now >= *until => Err(Gone),
             Stage::Request { stream, head, .. } if is_ready => {
                 let Some((request, length)) = receive(stream, head)? else { return Ok(()) };
                 let stream = stream.try_clone().map_err(|_| Gone)?;
-                self.stage = match server.answer(&request, viewers) {
+                self.stage = match house.server.answer(&request, viewers) {
                     Some(bytes) => Stage::Answer { stream, bytes, at: 0, until: now + ANSWER_TIME },
                     None => {
                         // It fits into the empty buffer of a new connection.
                         let key = request.key.unwrap_or_default();
                         (&stream).write_all(&upgrade(&key, PROTOCOL)).map_err(|_| Gone)?;
-                        Stage::Viewer(Box::new(Viewer::new(stream, head[length..].to_vec(), session, now)?))
+                        Stage::Viewer(Box::new(Viewer::new(
+                            stream,
+                            head[length..].to_vec(),
+                            &house.session,
+                            now,
+                        )?))
                     }
                 };
-                self.serve(server, board, true, viewers, session, now)
+                self.serve(house, true, viewers, now)
             }
             Stage::Request { .. } => Ok(()),
             Stage::Answer { stream, bytes, at, .. } => match stream.write(&bytes[*at..]) {
@@ -253,10 +294,10 @@ impl Guest {
                 Err(_) => Err(Gone),
             },
             Stage::Viewer(viewer) => {
-                if is_ready {
-                    viewer.hear(board)?;
+                if is_ready || viewer.hears_more() {
+                    viewer.hear(house.board, house.player)?;
                 }
-                viewer.serve(board, now)
+                viewer.serve(house.board, now)
             }
         }
     }
@@ -283,5 +324,17 @@ fn cannot(address: SocketAddr, error: &io::Error) -> Failure {
     Failure::new(Kind::Failed, format!("cannot listen on {address}: {error}"), hint)
 }
 
+/// Of one server: two of them are two, and so are two in one process.
+fn session() -> String {
+    static SERVERS: AtomicU32 = AtomicU32::new(0);
+    let since = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default().as_nanos();
+    format!("{since:x}-{:x}-{:x}", std::process::id(), SERVERS.fetch_add(1, Ordering::Relaxed))
+}
+
+/// Errors of a connection, not of the door.
+const PASSING: [io::ErrorKind; 3] =
+    [io::ErrorKind::ConnectionAborted, io::ErrorKind::ConnectionReset, io::ErrorKind::Interrupted];
+/// So long nobody is let in where descriptors are short.
+const SHORTAGE: Duration = Duration::from_millis(200);
 /// Where nothing happens.
 const IDLE: Duration = Duration::from_secs(1);

@@ -1,5 +1,5 @@
-//! One viewer at his WebSocket: what he subscribed to, and what he gets next. At most one message of his is on its way, so
-//! that his memory is bounded and he gets the newest when he is ready. Refuses to know where messages come from.
+//! One viewer at his WebSocket: what he subscribed to, and what he gets next. Few messages of his are on their way, so that
+//! his memory is bounded and he gets the newest when he is ready. Refuses to know where messages come from.
 
 use std::io;
 use std::net::TcpStream;
@@ -10,11 +10,16 @@ use tungstenite::{Bytes, Error, Message, WebSocket};
 
 use crate::board::{Board, Newest};
 use crate::foxglove::{self, Wish};
+use crate::playback::Playback;
 
 /// The most subscriptions of one viewer.
 const SUBSCRIPTIONS: usize = 256;
 /// The longest message of a viewer: room for subscribing to everything.
 const LONGEST: usize = 64 << 10;
+/// What one viewer says at a time, in messages: the others' turn comes, too.
+const HEARD: usize = 32;
+/// What is sent at a time, in bytes: few system calls for many small messages, and little that grows old on its way.
+const PIECE: usize = 16 << 10;
 /// So long a message may be on its way before the viewer is given up.
 const PATIENCE: Duration = Duration::from_secs(30);
 /// Between two words about what was skipped.
@@ -34,6 +39,8 @@ pub(crate) struct Viewer {
     tell_at: Instant,
     /// The last channel that he asked for in vain.
     unknown: Option<usize>,
+    /// He may have said more than was heard, though nothing new comes.
+    hears_more: bool,
 }
 
 struct Subscription {
@@ -57,7 +64,7 @@ impl Viewer {
     ) -> Result<Viewer, Gone> {
         let config = WebSocketConfig::default()
             .read_buffer_size(4096)
-            .write_buffer_size(0)
+            .write_buffer_size(2 * PIECE)
             .max_message_size(Some(LONGEST))
             .max_frame_size(Some(LONGEST));
         let mut viewer = Viewer {
@@ -70,8 +77,10 @@ impl Viewer {
             told_skipped: 0,
             tell_at: now,
             unknown: None,
+            hears_more: true,
         };
         viewer.send(Message::text(foxglove::server_info(session)), now)?;
+        viewer.flush(now)?;
         Ok(viewer)
     }
 
@@ -89,27 +98,36 @@ impl Viewer {
         self.skipped
     }
 
+    /// He may have said more than [`hear`](Self::hear) took.
+    pub(crate) fn hears_more(&self) -> bool {
+        self.hears_more
+    }
+
     /// When something is to be done though nothing happens.
     pub(crate) fn wake_at(&self) -> Option<Instant> {
         let gives_up = self.pending.map(|since| since + PATIENCE);
         let tells = (self.skipped > self.told_skipped).then_some(self.tell_at);
-        gives_up.into_iter().chain(tells).min()
+        let hears = self.hears_more.then(Instant::now);
+        gives_up.into_iter().chain(tells).chain(hears).min()
     }
 
-    /// Takes what he says.
-    pub(crate) fn hear(&mut self, board: &Board) -> Result<(), Gone> {
-        loop {
+    /// Takes what he says, but not all of who does not stop.
+    pub(crate) fn hear(&mut self, board: &Board, player: Option<&dyn Playback>) -> Result<(), Gone> {
+        self.hears_more = false;
+        for _ in 0..HEARD {
             match self.socket.read() {
-                Ok(Message::Text(text)) => self.obey(foxglove::parse(&text), board)?,
+                Ok(Message::Text(text)) => self.obey(foxglove::parse(&text), board, player)?,
                 Ok(Message::Close(_)) => return Err(Gone),
                 Ok(_) => {}
                 Err(Error::Io(error)) if error.kind() == io::ErrorKind::WouldBlock => return Ok(()),
                 Err(_) => return Err(Gone),
             }
         }
+        self.hears_more = true;
+        Ok(())
     }
 
-    fn obey(&mut self, wish: Option<Wish>, board: &Board) -> Result<(), Gone> {
+    fn obey(&mut self, wish: Option<Wish>, board: &Board, player: Option<&dyn Playback>) -> Result<(), Gone> {
         match wish {
             Some(Wish::Subscribe(wanted)) => {
                 for (id, channel) in wanted {
@@ -133,38 +151,53 @@ impl Viewer {
                 self.subscriptions = left;
                 gone.iter().for_each(|one| board.unsubscribe(one.channel));
             }
+            Some(Wish::Player(order)) => player.into_iter().for_each(|player| player.order(order)),
             None => {}
         }
         Ok(())
     }
 
-    /// Sends what there is for him, one message after the other, until one has to wait.
+    /// Sends what there is for him, until some of it has to wait: what came together in one piece.
     pub(crate) fn serve(&mut self, board: &Board, now: Instant) -> Result<(), Gone> {
-        loop {
-            self.flush(now)?;
-            if self.is_pending() {
+        self.flush(now)?;
+        while !self.is_pending() {
+            if !self.gather(board, now)? {
                 return Ok(());
             }
+            self.flush(now)?;
+        }
+        Ok(())
+    }
+
+    /// Writes down what there is for him, in a piece that is not much longer than [`PIECE`]; whether there is any.
+    fn gather(&mut self, board: &Board, now: Instant) -> Result<bool, Gone> {
+        let mut length = 0;
+        while length < PIECE {
             let channels = board.channels_from(self.told);
             if !channels.is_empty() {
                 self.told += channels.len();
+                length += PIECE;
                 let told = foxglove::advertise(channels.iter().map(|(at, channel)| (*at, &**channel)));
                 self.send(Message::text(told), now)?;
             } else if let Some(channel) = self.unknown.take() {
+                length += PIECE;
                 self.send(Message::text(foxglove::unknown_channel(channel)), now)?;
             } else if self.skipped > self.told_skipped && now >= self.tell_at {
                 self.told_skipped = self.skipped;
                 self.tell_at = now + TELL_EVERY;
                 let words =
                     format!("{} messages skipped: newer ones came before they could be sent", self.skipped);
+                length += PIECE;
                 self.send(Message::text(foxglove::warning("skipped", &words)), now)?;
             } else if let Some((id, newest)) = self.choose(board) {
                 let frame = foxglove::message(id, newest.wall_ns, &newest.payload);
+                length += frame.len();
                 self.send(Message::Binary(Bytes::from(frame)), now)?;
             } else {
-                return Ok(());
+                break;
             }
         }
+        Ok(length > 0)
     }
 
     /// The next subscription for which there is something new, each in its turn.
@@ -184,6 +217,7 @@ impl Viewer {
         None
     }
 
+    /// Writes `message` down; some of it may be sent already.
     fn send(&mut self, message: Message, now: Instant) -> Result<(), Gone> {
         match self.socket.write(message) {
             Err(Error::Io(error)) if error.kind() != io::ErrorKind::WouldBlock => return Err(Gone),
@@ -191,7 +225,7 @@ impl Viewer {
             Err(_) => return Err(Gone),
         }
         self.pending.get_or_insert(now);
-        self.flush(now)
+        Ok(())
     }
 
     fn flush(&mut self, now: Instant) -> Result<(), Gone> {
@@ -242,7 +276,7 @@ mod tests {
         let subscribe = r#"{"op":"subscribe","subscriptions":[{"id":7,"channelId":1}]}"#;
         client.send(Message::text(subscribe)).unwrap();
         while !board.is_wanted(scans) {
-            viewer.hear(&board).unwrap();
+            viewer.hear(&board, None).unwrap();
         }
         // Until the buffers of the system are full.
         let mut sent = 0_u32;

@@ -4,7 +4,7 @@
 use std::fmt;
 
 use preprocess::background::{Candidate, Method, Start};
-use preprocess::{lines, marks, zones};
+use preprocess::{lines, marks, motion, zones};
 use schema::limits::TopicLimits;
 use schema::{Failure, Pose};
 use serde::Serialize;
@@ -87,6 +87,13 @@ impl List {
         self.put(of("lines.max"), json!(max), DEFAULT);
         self.put(of("lines.min_points"), json!(min_points), DEFAULT);
         self.put(of("lines.polish"), json!(polish), DEFAULT);
+        let motion::Settings { max_step_m, max_turn_deg, min_overlap } = processing.motion;
+        self.put(of("motion.max_step"), json!(max_step_m), DEFAULT);
+        self.put(of("motion.max_turn"), json!(max_turn_deg), DEFAULT);
+        self.put(of("motion.min_overlap"), json!(min_overlap), DEFAULT);
+        if let Scanner::Lms = link.scanner {
+            self.put(of("early.pieces"), json!(processing.early.pieces), DEFAULT);
+        }
         self.background(name, &processing.background);
     }
 
@@ -126,6 +133,7 @@ impl List {
         let learning = &background.learning;
         let method = match learning.method {
             _ if !background.is_kept => "off",
+            Method::Moving => "moving",
             Method::Multi => "multi",
             Method::Paper => "paper",
         };

@@ -1,9 +1,11 @@
 //! One source of configuration on top of the others. Every value is checked in its own source, so that an error names
 //! file, line and column, or the flag.
 
+mod early;
 mod flags;
 mod gateway;
 mod limits;
+mod motion;
 mod processing;
 mod scanner;
 mod sight;
@@ -22,9 +24,11 @@ use crate::link::{Link, MAX_LINKS};
 use crate::origin::Origin;
 use crate::processing::Processing;
 use crate::scanner::Scanner;
+use early::EarlyLayer;
 pub(crate) use flags::{link, setting};
 use gateway::GatewayLayer;
 use limits::LimitsLayer;
+use motion::MotionLayer;
 use processing::{BackgroundLayer, LinesLayer, MarksLayer, PoseLayer, Sections, ZonesLayer};
 use scanner::{ScannerDraft, ScannerLayer, remedy_of_lms};
 use sight::Sight;
@@ -38,7 +42,9 @@ pub(crate) struct Layer {
     zones: Option<ZonesLayer>,
     marks: Option<MarksLayer>,
     lines: Option<LinesLayer>,
+    motion: Option<MotionLayer>,
     background: Option<BackgroundLayer>,
+    early: Option<EarlyLayer>,
     limits: Option<LimitsLayer>,
     /// The hub's own configuration may be that of its gateway, too.
     pub(crate) gateway: Option<GatewayLayer>,
@@ -65,7 +71,9 @@ struct LinkLayer {
     zones: Option<ZonesLayer>,
     marks: Option<MarksLayer>,
     lines: Option<LinesLayer>,
+    motion: Option<MotionLayer>,
     background: Option<BackgroundLayer>,
+    early: Option<EarlyLayer>,
 }
 
 /// All links while sources are merged.
@@ -106,13 +114,13 @@ impl Drafts {
 
     /// Lays `layer` over the others; only where `may_add` may it bring links that were not there.
     pub(crate) fn merge(&mut self, layer: Layer, origin: Origin, may_add: bool) -> Result<(), Failure> {
-        let Layer { link, zones, marks, lines, background, limits, gateway: _ } = layer;
+        let Layer { link, zones, marks, lines, motion, background, early, limits, gateway: _ } = layer;
         if let Some(section) = limits {
             section.lay(&origin, &mut self.limits)?;
         }
         let origin = Rc::new(origin);
         merge(&mut self.links, link, &origin, may_add)?;
-        self.general.push((origin, Sections { pose: None, zones, marks, lines, background }));
+        self.general.push((origin, Sections { pose: None, zones, marks, lines, motion, background, early }));
         Ok(())
     }
 
@@ -323,8 +331,8 @@ fn merge(
             })?;
             draft.baud = Some(Said { value, place: origin.place(Some(baud.span())) });
         }
-        let LinkLayer { pose, zones, marks, lines, background, .. } = link;
-        draft.own.push((origin.clone(), Sections { pose, zones, marks, lines, background }));
+        let LinkLayer { pose, zones, marks, lines, motion, background, early, .. } = link;
+        draft.own.push((origin.clone(), Sections { pose, zones, marks, lines, motion, background, early }));
     }
     Ok(())
 }

@@ -21,7 +21,7 @@ pub fn descriptors(links: usize) -> u64 {
 
 /// Descriptors of what belongs to no link, beside those open from the start: 16 are left open, making them takes more.
 const BASE_DESCRIPTORS: u64 = 24;
-/// Descriptors of a link: four for each of its eight services, its port, and a first consumer.
-const LINK_DESCRIPTORS: u64 = 38;
+/// Descriptors of a link: four for each of its services, which are a topic or the event, its port, and a first consumer.
+const LINK_DESCRIPTORS: u64 = 4 * (Topic::ALL.len() as u64 + 1) + 6;
 /// The control service, what belongs to no link, and the first consumers.
 const REST: u64 = 512 * 1024;

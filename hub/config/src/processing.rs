@@ -1,11 +1,11 @@
-//! How the hub processes the scans of a link: the effective values of sections pose, zones, marks, lines and background.
+//! How the hub processes the scans of a link: the effective values of sections pose, zones, marks, lines, motion, background and early.
 //! Refuses to know where they were set.
 
 use std::path::PathBuf;
 
 use crate::link::Link;
 use preprocess::background::Settings as Learning;
-use preprocess::{lines, marks, zones};
+use preprocess::{lines, marks, motion, zones};
 use schema::{Failure, Kind, Pose, SavedModel, regular};
 
 /// How the scans of one link are processed.
@@ -19,8 +19,25 @@ pub struct Processing {
     pub marks: marks::Settings,
     /// How straight lines are found.
     pub lines: lines::Settings,
+    /// Which steps of the robot are believed.
+    pub motion: motion::Settings,
     /// How the background is learned.
     pub background: Background,
+    /// How warnings come before a telegram is complete.
+    pub early: Early,
+}
+
+/// Section `[early]`.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Early {
+    /// A telegram is read in so many pieces while somebody follows the topic, 2 to 8.
+    pub pieces: u8,
+}
+
+impl Default for Early {
+    fn default() -> Self {
+        Early { pieces: 3 }
+    }
 }
 
 /// Section `[zones]`.

@@ -64,10 +64,11 @@ fn the_page_holds() {
         (Family::Rplidar, true, None, false)
     );
     // What the page shows as the values without a word are those: the front's are changed in these sections.
-    let Processing { zones, marks, lines, background, .. } = Processing::default();
+    let Processing { zones, marks, lines, background, early, .. } = Processing::default();
     let shown = &rear.processing;
     assert_eq!((&shown.zones, shown.marks, &shown.background), (&zones, marks, &background));
     assert_eq!(shown.lines, lines);
+    assert_eq!(shown.early, early);
 }
 
 #[test]
@@ -92,12 +93,17 @@ fn a_link_wins_over_all_links_and_the_later_source_over_the_earlier() {
         "[zones]\nmargin = 0.01\nradii = [2.0]\nself_min = [{ from_deg = -77.5, to_deg = -60, range = 0.42 }]\n\
          [background]\nmethod = \"paper\"\ncandidate = \"latest\"\nthreshold_mm = 40\nscans = 100\n\
          publish = \"every-scan\"\nstart = \"first-scan\"\n[marks]\nmax_range_step = 0.2\ni_min = 2\nmax_gap = 1\n\
-         [lines]\nmax = 20\npolish = true\n",
+         [lines]\nmax = 20\npolish = true\n[motion]\nmax_step = 0.8\n",
     );
     let set = ["link.a.pose.x=-0.25", "link.a.pose.upside_down=true", "zones.radii=[1.2,0.7]"];
     let set = [
         &set[..],
-        &["link.b.background.method=off", "link.b.zones.exact=false", "link.b.lines.min_points=9"],
+        &[
+            "link.b.background.method=off",
+            "link.b.zones.exact=false",
+            "link.b.lines.min_points=9",
+            "link.b.motion.max_turn=40",
+        ],
     ]
     .concat();
     let [a, b] = [0, 1].map(|link| processing(&[&first, &second], &set, link));
@@ -115,6 +121,8 @@ fn a_link_wins_over_all_links_and_the_later_source_over_the_earlier() {
     assert_eq!((a.background.is_kept, b.background.is_kept, a.background.every_scan), (true, false, true));
     assert_eq!((a.marks.max_range_step_mm, a.marks.i_min, a.marks.max_gap), (200, 2, 1));
     assert_eq!((a.lines.max, a.lines.min_points, a.lines.polish), (20, 5, true));
+    assert_eq!((a.motion.max_step_m, a.motion.max_turn_deg, a.motion.min_overlap), (0.8, 30.0, 0.4));
+    assert_eq!((b.motion.max_step_m, b.motion.max_turn_deg), (0.8, 40.0));
     assert_eq!((b.lines.max, b.lines.min_points, b.lines.polish), (20, 9, true));
 }
 
@@ -169,8 +177,14 @@ fn what_cannot_be_is_refused_with_place_value_and_remedy() {
         ("marks.max_range_step=100", "max_range_step = 100\n  metres"),
         ("marks.max_gap=-1", "max_gap = -1"),
         ("lines.max=65", "max = 65\n  a whole number from 1 to 64"),
+        ("motion.max_step=0", "max_step = 0\n  metres from scan to scan, from 0.01 to 10"),
+        ("motion.max_turn=90", "max_turn = 90\n  degrees from scan to scan, from 1 to 85"),
+        ("motion.min_overlap=0", "min_overlap = 0\n  a share from 0.1 to 1"),
         ("lines.min_points=2", "min_points = 2\n  a whole number from 3 to 8192"),
-        ("background.method=mult", "`mult`\n  did you mean `multi`? Possible here: multi, paper, off"),
+        (
+            "background.method=mult",
+            "`mult`\n  did you mean `multi`? Possible here: multi, paper, moving, off",
+        ),
         ("background.threshold_mm=0", "threshold_mm = 0\n  a whole number from 1 to 10000"),
         ("background.scans=-4", "scans = -4"),
         ("background.publish=always", "`always`\n  did you mean"),

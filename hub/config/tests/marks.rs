@@ -36,6 +36,11 @@ fn what_does_not_fit_is_refused() {
             "link.side.marks.i_min=2",
             "i_min, and the intensities of an ld are counts of any surface\n  level is the least of a reflector",
         ),
+        ("early.pieces=1", "pieces = 1\n  a whole number from 2 to 8"),
+        (
+            "link.side.early.pieces=4",
+            "pieces, and an ld sends packets, which are short\n  early warnings are for an LMS",
+        ),
     ] {
         let failure = Config::load(&sources(&[setting])).expect_err(setting);
         let refusal = format!("{}\n  {}", failure.message, failure.hint);

@@ -7,6 +7,7 @@ mod control;
 mod diagnosis;
 mod drive;
 mod driver;
+mod early;
 mod event_fd;
 mod identity_cache;
 mod learned;

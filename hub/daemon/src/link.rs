@@ -72,6 +72,7 @@ impl<'a, S: Surroundings> LinkCore<'a, S> {
     /// The `session` on the port is over.
     pub(crate) fn close(&mut self, session: &Driver) {
         self.diagnosis.end_flood();
+        self.output.foresee(None);
         self.stats.close(session);
     }
 

@@ -1,15 +1,16 @@
-//! What the hub makes of each scan of a link: marks, lines, zones, foreground. One after the other on the scan where it was
+//! What the hub makes of each scan of a link: marks, lines, motion, zones, foreground. One after the other on the scan where it was
 //! decoded, each into the payload that is given. Refuses to know topics, and who listens.
 
 use std::fmt;
 
 use config::Processing;
-use preprocess::background::{Mismatch, Model};
+use preprocess::background::{Method, Mismatch, Model};
 use preprocess::lines::LineFinder;
 use preprocess::marks::MarkDetector;
+use preprocess::motion::MotionEstimator;
 use preprocess::segments::Segmenter;
 use preprocess::zones::Check;
-use schema::{Background, Failure, Foreground, Kind, Lines, Marks, Pose, Scan, Verb, Zones};
+use schema::{Background, Failure, Foreground, Kind, Lines, Marks, Motion, Pose, Scan, Verb, Zones};
 
 /// The processors of one link. Suspect scans take the same way as clean ones: an obstacle counts also where it is only
 /// suspected, and a background needs hundreds of scans in agreement, which the one bad one among them does not spoil.
@@ -17,6 +18,7 @@ pub(crate) struct Pipeline {
     pub(crate) zones: Check,
     marks: MarkDetector,
     lines: LineFinder,
+    motion: MotionEstimator,
     background: Option<BackgroundStage>,
     /// By which they are made.
     processing: Processing,
@@ -43,6 +45,8 @@ struct BackgroundStage {
 
 struct Spare {
     zones: Zones,
+    lines: Box<Lines>,
+    motion: Motion,
     foreground: Box<Foreground>,
 }
 
@@ -69,21 +73,28 @@ impl fmt::Display for Relearned {
 pub(crate) struct Outputs<'a> {
     pub(crate) marks: Option<&'a mut Marks>,
     pub(crate) lines: Option<&'a mut Lines>,
+    pub(crate) motion: Option<&'a mut Motion>,
     pub(crate) foreground: Option<&'a mut Foreground>,
 }
 
 impl Pipeline {
     /// The processors as configured, with the model to begin with, for scans of at most `beams` beams.
     pub(crate) fn new(processing: &Processing, beams: usize) -> Pipeline {
-        let Processing { pose, zones, marks, lines, background } = processing;
+        let Processing { pose, zones, marks, lines, motion, background, early: _ } = processing;
         Pipeline {
             zones: Check::new(*pose, &zones.settings(), beams),
             marks: MarkDetector::new(*marks),
             lines: LineFinder::new(*pose, *lines, beams),
+            motion: MotionEstimator::new(*pose, *motion, beams),
             background: background.is_kept.then(|| BackgroundStage::new(processing, beams)),
             processing: processing.clone(),
             beams,
-            spare: Spare { zones: Zones::default(), foreground: Foreground::of(beams) },
+            spare: Spare {
+                zones: Zones::default(),
+                lines: Box::default(),
+                motion: Motion::default(),
+                foreground: Foreground::of(beams),
+            },
         }
     }
 
@@ -96,12 +107,13 @@ impl Pipeline {
     /// seen its scans; a background stays, as far as it is known.
     pub(crate) fn change(&mut self, processing: &Processing) {
         let before = std::mem::replace(&mut self.processing, processing.clone());
-        let Processing { pose, zones, marks, lines, background } = &self.processing;
+        let Processing { pose, zones, marks, lines, motion, background, early: _ } = &self.processing;
         if (pose, zones) != (&before.pose, &before.zones) {
             self.zones = Check::new(*pose, &zones.settings(), self.beams);
         }
         self.marks = MarkDetector::new(*marks);
         self.lines.change(*pose, *lines);
+        self.motion.change(*pose, *motion);
         match &mut self.background {
             Some(kept) if background.is_kept => {
                 kept.cutter = Segmenter::new(*pose, self.beams);
@@ -124,10 +136,33 @@ impl Pipeline {
         if let Some(marks) = out.marks {
             self.marks.update(scan, marks);
         }
-        if let Some(lines) = out.lines {
-            self.lines.update(scan, lines);
+        let is_moving = self.background.as_ref().is_some_and(BackgroundStage::is_moving);
+        let motion = match out.motion {
+            None if is_moving => Some(&mut self.spare.motion),
+            wanted => wanted,
+        };
+        match (out.lines, motion) {
+            (None, None) => self.motion.forget(),
+            (Some(lines), None) => {
+                self.lines.update(scan, lines);
+                self.motion.forget();
+            }
+            // The one is found by the other.
+            (lines, Some(motion)) => {
+                let lines = lines.unwrap_or(&mut self.spare.lines);
+                self.lines.update(scan, lines);
+                self.motion.update(scan, lines, motion);
+                if let Some(kept) = &mut self.background {
+                    kept.model.follow(&self.processing.pose, motion);
+                }
+            }
         }
         self.background.as_mut()?.update(scan, out.foreground, &mut self.spare.foreground)
+    }
+
+    /// In how many pieces a telegram is read for who wants to be warned early.
+    pub(crate) fn pieces(&self) -> u8 {
+        self.processing.early.pieces
     }
 
     /// What to say of the zones when scans stay out.
@@ -173,7 +208,7 @@ impl Pipeline {
     /// or that has learned since for as long as it takes; or, if it is `last` time, for however long.
     pub(crate) fn hand_on(&mut self, last: bool) -> Option<(Pose, Box<Background>)> {
         let Processing { pose, background, .. } = &self.processing;
-        let kept = self.background.as_mut().filter(|_| background.is_handed_on)?;
+        let kept = self.background.as_mut().filter(|kept| background.is_handed_on && !kept.is_moving())?;
         let (generation, learned) = kept.handed_on;
         let enough = if last { 1 } else { u32::from(kept.model.scans()) };
         if learned < enough && generation == kept.model.generation() {
@@ -203,6 +238,11 @@ impl Pipeline {
             Verb::Reset => kept.model.reset(),
             Verb::Freeze => kept.model.freeze(),
             Verb::Thaw => kept.model.thaw(),
+            Verb::Load if kept.is_moving() => {
+                let message = format!("{sensor}: background.method is \"moving\": a model is of one place");
+                let hint = "load models of sensors that stand: of methods multi and paper";
+                return Err(Failure::new(Kind::Configuration, message, hint));
+            }
             Verb::Load => kept.load(model).map_err(|mismatch| {
                 let hint =
                     "a model fits scans of its own resolution and unit: save one of this sensor as it is now";
@@ -227,12 +267,17 @@ impl BackgroundStage {
             handed_on: (0, 0),
             shape: None,
         };
-        if let Some(model) = &background.model {
+        if let Some(model) = background.model.as_ref().filter(|_| !kept.is_moving()) {
             // Before the first scan every model is taken.
             let _ = kept.load(model);
             kept.handed_on.0 = kept.model.generation();
         }
         kept
+    }
+
+    /// It is a map that the robot moves in.
+    fn is_moving(&self) -> bool {
+        self.model.method() == Method::Moving
     }
 
     fn load(&mut self, model: &Background) -> Result<(), Mismatch> {

@@ -4,10 +4,11 @@
 use config::{Link, Processing};
 use lms::Nanos;
 use lms::reply::Reply;
-use lms::session::Received;
+use lms::session::{Begun, Received};
 use lms::variant::{Mode, Variant};
 use schema::{Background, Failure, Family, Flags, Pose, Scan, Verb, Wake, Zones};
 
+use crate::early::EarlyWarner;
 use crate::pipeline::Pipeline;
 use crate::surroundings::Surroundings;
 use crate::topics::Topics;
@@ -51,6 +52,7 @@ pub(crate) struct LinkOutput<'a, S: Surroundings> {
     around: &'a S,
     pub(crate) topics: Topics<'a, S>,
     pipeline: Pipeline,
+    early: EarlyWarner,
     /// When the last verdict of the zones is too old to stand; `Nanos::MAX` if none stands.
     stale_at: Nanos,
     /// The sensor, as it turned out to be, sees too little of its circles.
@@ -61,7 +63,8 @@ impl<'a, S: Surroundings> LinkOutput<'a, S> {
     /// The output of `link` into `topics`; nothing is published yet.
     pub(crate) fn new(link: &'a Link, around: &'a S, topics: Topics<'a, S>) -> Self {
         let pipeline = Pipeline::new(&link.processing, link.beams());
-        LinkOutput { link, around, topics, pipeline, stale_at: Nanos::MAX, is_blind: false }
+        let early = EarlyWarner::new(link.beams());
+        LinkOutput { link, around, topics, pipeline, early, stale_at: Nanos::MAX, is_blind: false }
     }
 
     /// Publishes a telegram and, if it is measured data that can be read, its scan and what is made of it. What `recorded`
@@ -85,6 +88,8 @@ impl<'a, S: Surroundings> LinkOutput<'a, S> {
         let period_us = recorded.period_us.unwrap_or_else(nominal).max(recorded.gap_us);
         let period_us = recorded.stretched(period_us);
         self.recall(recorded);
+        // The number of what is taken back is the one that this telegram gets.
+        self.withdraw(Some(received.message.offset));
         self.topics.telegram(received, reasons, period_us);
         let is_suspect = reasons != 0;
         // Better no range than a wrong one.
@@ -94,7 +99,39 @@ impl<'a, S: Surroundings> LinkOutput<'a, S> {
         let decode = |scan: &mut Scan| scanner::decode(&measured, mode, scan);
         let stands_for = limit(period_us);
         self.publish_scan(measured.count(), scanner::len(&measured), decode, stands_for, is_behind);
+        self.early.confirm(received.message.offset);
         Processed { is_suspect, stands_for: Some(stands_for) }
+    }
+
+    /// In how many pieces a telegram is read: 1, unless somebody wants to be warned early.
+    pub(crate) fn pieces(&self) -> u8 {
+        if self.topics.wants_early() { self.pipeline.pieces() } else { 1 }
+    }
+
+    /// Publishes what the telegram that is arriving tells already, `begun`, if that is a warning and somebody wants it; and
+    /// takes back what was said of one that is gone.
+    pub(crate) fn foresee(&mut self, begun: Option<&Begun<'_>>) {
+        self.withdraw(begun.map(|begun| begun.offset));
+        if let Some(begun) = begun.filter(|_| self.topics.wants_early())
+            && let Some(early) = self.early.warn(begun, &mut self.pipeline.zones)
+        {
+            let variant = Variant::of_beams(begun.values.count());
+            let period_us = scanner::period_us(variant, self.link.baud.rate());
+            self.topics.early(&early, begun.first, begun.last, begun.reasons, period_us);
+        }
+    }
+
+    /// Whether something was said of a telegram that is not complete.
+    pub(crate) fn has_warned(&self) -> bool {
+        self.early.has_said()
+    }
+
+    /// Takes back what was said of another telegram than that at `offset`.
+    fn withdraw(&mut self, offset: Option<u64>) {
+        if let Some(withdrawn) = self.early.withdraw(offset) {
+            let now = self.around.now();
+            self.topics.early(&withdrawn, now, now, 0, 0);
+        }
     }
 
     /// What comes next was measured when `recorded` says.

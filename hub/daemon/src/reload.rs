@@ -99,7 +99,9 @@ impl Differences {
             ("zones", before.zones != after.zones),
             ("marks", before.marks != after.marks),
             ("lines", before.lines != after.lines),
+            ("motion", before.motion != after.motion),
             ("background", before.background != after.background),
+            ("early", before.early != after.early),
         ]);
         let begin = |link: &Link| {
             let background = &link.processing.background;
@@ -189,6 +191,8 @@ mod tests {
                 "link.a.pose.x=0.3",
                 "link.b.marks.i_min=2",
                 "link.b.lines.polish=true",
+                "link.b.motion.max_step=0.3",
+                "link.b.early.pieces=4",
                 "link.b.angle=100",
                 "link.b.resolution=0.25",
                 "link.b.unit=cm",
@@ -204,7 +208,10 @@ mod tests {
             .collect();
         assert_eq!(
             now,
-            [("a", &[2000][..], &["pose", "zones"][..]), ("b", &[2000], &["zones", "marks", "lines"])]
+            [
+                ("a", &[2000][..], &["pose", "zones"][..]),
+                ("b", &[2000], &["zones", "marks", "lines", "motion", "early"])
+            ]
         );
         let later: Vec<_> = later.iter().map(|(name, what)| (name.as_str(), what.join(" "))).collect();
         assert_eq!(

@@ -7,8 +7,8 @@ use line::Received;
 use lms::Nanos;
 use schema::ipc::DueRings;
 use schema::{
-    Background, Failure, Family, Flags, Foreground, Header, Lines, Marks, Quality, Ring, Scan, Status, Wake,
-    Zones,
+    Background, Early, Failure, Family, Flags, Foreground, Header, Lines, Marks, Motion, Quality, Ring, Scan,
+    Status, Wake, Zones,
 };
 
 use crate::pipeline::{Outputs, Pipeline, Relearned};
@@ -26,6 +26,8 @@ pub(crate) struct Topics<'a, S: Surroundings> {
     zones: Publisher<Zones, S>,
     marks: Publisher<Marks, S>,
     lines: Publisher<Lines, S>,
+    motion: Publisher<Motion, S>,
+    early: Publisher<Early, S>,
     foreground: Publisher<Foreground, S>,
     background: Publisher<Background, S>,
     status: Publisher<Status, S>,
@@ -51,6 +53,8 @@ impl<'a, S: Surroundings> Topics<'a, S> {
             zones: PreparedPublisher::new(around, sensor)?,
             marks: PreparedPublisher::new(around, sensor)?,
             lines: PreparedPublisher::new(around, sensor)?,
+            motion: PreparedPublisher::new(around, sensor)?,
+            early: PreparedPublisher::new(around, sensor)?,
             foreground: PreparedPublisher::new(around, sensor)?,
             background: PreparedPublisher::new(around, sensor)?,
             status: PreparedPublisher::new(around, sensor)?,
@@ -85,6 +89,7 @@ impl<'a, S: Surroundings> Topics<'a, S> {
         self.zones.prepare();
         self.marks.prepare();
         self.lines.prepare();
+        self.motion.prepare();
         if pipeline.keeps_background() {
             self.foreground.prepare();
         }
@@ -120,7 +125,7 @@ impl<'a, S: Surroundings> Topics<'a, S> {
     }
 
     /// Publishes a scan of the last telegram, of `beams` beams and `len` bytes, which `fill` writes, and its zones, and wakes
-    /// those who wait for these; then whatever else `pipeline` makes of it. Marks, lines and foreground that nobody wants are
+    /// those who wait for these; then whatever else `pipeline` makes of it. Marks, lines, motion and foreground that nobody wants are
     /// not made. A background that does not fit the scan starts again; then it is told why.
     pub(crate) fn scan(
         &mut self,
@@ -142,6 +147,7 @@ impl<'a, S: Surroundings> Topics<'a, S> {
         self.zones.send(zones, &header, &mut self.due);
         self.ring(Ring::First);
         let (mut marks, mut lines) = (self.marks.loan(0), self.lines.loan(0));
+        let mut motion = self.motion.loan(0);
         let mut foreground =
             pipeline.keeps_background().then(|| self.foreground.loan(Foreground::len(beams)));
         let relearned = pipeline.examine(
@@ -149,11 +155,13 @@ impl<'a, S: Surroundings> Topics<'a, S> {
             Outputs {
                 marks: Publisher::<Marks, S>::payload_mut(&mut marks),
                 lines: Publisher::<Lines, S>::payload_mut(&mut lines),
+                motion: Publisher::<Motion, S>::payload_mut(&mut motion),
                 foreground: foreground.as_mut().and_then(Publisher::<Foreground, S>::payload_mut),
             },
         );
         self.marks.send(marks, &header, &mut self.due);
         self.lines.send(lines, &header, &mut self.due);
+        self.motion.send(motion, &header, &mut self.due);
         if let Some(foreground) = foreground {
             self.foreground.send(foreground, &header, &mut self.due);
         }
@@ -161,6 +169,39 @@ impl<'a, S: Surroundings> Topics<'a, S> {
             self.show(pipeline, &header);
         }
         relearned
+    }
+
+    /// Whether anybody wants to be warned before a telegram is complete.
+    pub(crate) fn wants_early(&self) -> bool {
+        self.early.is_heard()
+    }
+
+    /// Publishes `early`, which the first bytes of the next telegram tell, of the time from `first` to `last`, and wakes those
+    /// who wait for that alone. `reasons` are why it is suspect already.
+    pub(crate) fn early(&mut self, early: &Early, first: Nanos, last: Nanos, reasons: u8, period_us: u32) {
+        let now = self.around.now();
+        let quality = if reasons == 0 { Quality::Clean } else { Quality::Suspect };
+        let mut header = Header {
+            seq: self.next_seq,
+            stamp_first_ns: first,
+            stamp_last_ns: last,
+            wall_ns: wall(self.around, first, now),
+            quality: quality as u8,
+            reasons,
+            period_us,
+            flags: self.header.flags & !Flags::STAMP_ESTIMATED,
+            ..self.header
+        };
+        header.set_sent_at(now);
+        let mut loan = self.early.loan(0);
+        if let Some(payload) = Publisher::<Early, S>::payload_mut(&mut loan) {
+            *payload = *early;
+        }
+        self.early.send(loan, &header, &mut self.due);
+        if self.due.take(Ring::Early) {
+            self.around.ring(Ring::Early);
+            self.around.tell(Wake::Early);
+        }
     }
 
     /// Lets `pipeline` learn from a scan of `len` bytes that is not published, and that `fill` writes.
@@ -222,14 +263,16 @@ impl<'a, S: Surroundings> Topics<'a, S> {
     pub(crate) fn is_heard(&self) -> bool {
         let of_telegrams = self.telegram.is_heard() || self.scan.is_heard() || self.zones.is_heard();
         let of_wanted = self.marks.is_heard() || self.foreground.is_heard() || self.background.is_heard();
-        of_telegrams || of_wanted || self.lines.is_heard() || self.status.is_heard()
+        let of_moved = self.lines.is_heard() || self.motion.is_heard();
+        of_telegrams || of_wanted || of_moved || self.early.is_heard() || self.status.is_heard()
     }
 
     /// Samples without memory.
     pub(crate) fn loan_failed(&self) -> u64 {
         let of_scans = self.scan.failed() + self.zones.failed() + self.marks.failed() + self.lines.failed();
+        let of_moved = self.motion.failed();
         let of_models = self.foreground.failed() + self.background.failed();
-        self.telegram.failed() + of_scans + of_models + self.status.failed()
+        self.telegram.failed() + of_scans + of_moved + of_models + self.early.failed() + self.status.failed()
     }
 
     /// Consumers that got nothing although they are attached: their descriptors or ours ran out, and sending says Ok
@@ -243,7 +286,8 @@ impl<'a, S: Surroundings> Topics<'a, S> {
             self.telegram.missed_out().max(self.scan.missed_out()).max(self.zones.missed_out());
         let of_wanted =
             self.marks.missed_out().max(self.lines.missed_out()).max(self.foreground.missed_out());
-        of_telegrams.max(of_wanted).max(self.status.missed_out())
+        let of_moved = self.motion.missed_out();
+        of_telegrams.max(of_wanted).max(of_moved).max(self.status.missed_out())
     }
 
     /// Whether anybody follows what the sensor measures: of the status alone nobody needs a scanner that measures.
@@ -251,6 +295,8 @@ impl<'a, S: Surroundings> Topics<'a, S> {
         let of_scans = self.scan.is_heard() || self.zones.is_heard() || self.marks.is_heard();
         of_scans
             || self.lines.is_heard()
+            || self.motion.is_heard()
+            || self.early.is_heard()
             || self.telegram.is_heard()
             || self.foreground.is_heard()
             || self.background.is_heard()

@@ -40,14 +40,17 @@ impl Arrivals {
         latest
     }
 
-    /// When byte number `offset` was there at the earliest, in a stream of which bytes come `byte_ns` apart; nothing where
-    /// that is not known: more came at once than was sent since the read before, so it had waited.
-    pub fn earliest(&self, offset: u64, byte_ns: f64) -> Option<Nanos> {
+    /// When byte number `offset` was there at the earliest, in a stream of which bytes come `byte_ns` apart on the whole, but
+    /// those of a packet of `packet_len` maybe at once; nothing where that is not known: more came at once than was sent
+    /// since the read before, so it had waited.
+    pub fn earliest(&self, offset: u64, byte_ns: f64, packet_len: usize) -> Option<Nanos> {
         let oldest = self.next.saturating_sub(Arrivals::CAPACITY);
         let read = |n: usize| self.reads[n % Arrivals::CAPACITY];
         let n = (oldest + 1..self.next).rev().find(|&n| read(n - 1).0 <= offset)?;
         let ((begin, before), (end, now)) = (read(n - 1), read(n));
-        let sent = (end - begin) as f64 * byte_ns;
+        let is_rest = n > oldest + 1 && begin - read(n - 2).0 >= TTY;
+        let at_once = if is_rest { 0 } else { packet_len as u64 };
+        let sent = (end - begin).saturating_sub(at_once) as f64 * byte_ns;
         if offset >= end || sent > 1.25 * now.saturating_sub(before) as f64 {
             return None;
         }
@@ -60,6 +63,8 @@ impl Arrivals {
 
 /// Bytes that every adapter keeps for a host that is late.
 const ROOM: u64 = 256;
+/// Bytes that a tty hands out at once, whatever waits behind them.
+const TTY: u64 = 4_095;
 
 #[cfg(test)]
 mod tests {
@@ -91,19 +96,35 @@ mod tests {
         let at = |millis: Nanos| millis * MILLIS;
         arrivals.note(at(1_000), 50);
         arrivals.note(at(1_005), 50);
-        assert_eq!(arrivals.earliest(10, byte_ns), None, "nothing was read before");
-        assert_eq!(arrivals.earliest(60, byte_ns), Some(at(1_001)));
+        assert_eq!(arrivals.earliest(10, byte_ns, 0), None, "nothing was read before");
+        assert_eq!(arrivals.earliest(60, byte_ns, 0), Some(at(1_001)));
         arrivals.note(at(2_005), 100);
-        assert_eq!(arrivals.earliest(100, byte_ns), Some(at(1_995)), "nothing was sent before");
+        assert_eq!(arrivals.earliest(100, byte_ns, 0), Some(at(1_995)), "nothing was sent before");
         arrivals.note(at(3_005), 4_000);
         assert_eq!(
-            arrivals.earliest(4_100, byte_ns),
+            arrivals.earliest(4_100, byte_ns, 0),
             Some(at(2_005)),
             "behind it others may have found no room"
         );
         arrivals.note(at(3_010), 700);
-        assert_eq!(arrivals.earliest(4_300, byte_ns), None, "all of it waited");
+        assert_eq!(arrivals.earliest(4_300, byte_ns, 0), None, "all of it waited");
         arrivals.note(at(3_015), 50);
-        assert_eq!(arrivals.earliest(4_910, byte_ns), Some(at(3_011)));
+        assert_eq!(arrivals.earliest(4_910, byte_ns, 0), Some(at(3_011)));
+    }
+
+    #[test]
+    fn packets_come_in_one_piece() {
+        let (mut arrivals, byte_ns) = (Arrivals::default(), 100_000.0);
+        let at = |millis: Nanos| millis * MILLIS;
+        arrivals.note(at(1_000), 84);
+        // Nothing was sent for a while, then a packet as fast as the line goes.
+        arrivals.note(at(1_500), 16);
+        arrivals.note(at(1_505), 68);
+        assert_eq!(arrivals.earliest(167, byte_ns, 0), None);
+        assert_eq!(arrivals.earliest(167, byte_ns, 84), Some(at(1_505) - 100_000));
+        // What a read leaves had waited, however little it is.
+        arrivals.note(at(2_500), 4_095);
+        arrivals.note(at(2_501), 60);
+        assert_eq!(arrivals.earliest(4_300, byte_ns, 84), None);
     }
 }

@@ -136,11 +136,18 @@ pub(crate) struct Rhythm {
     counted: u32,
     /// First byte of the telegram that is coming.
     first: Option<Nanos>,
+    /// A telegram is read in so many pieces, at least.
+    pieces: u8,
 }
 
 impl Rhythm {
     pub(crate) fn new() -> Self {
-        Rhythm { duration: None, least: Nanos::MAX, counted: 0, first: None }
+        Rhythm { duration: None, least: Nanos::MAX, counted: 0, first: None, pieces: 1 }
+    }
+
+    /// From now on the host looks at a telegram `pieces` times in all, in equal parts of it; 0 is 1.
+    pub(crate) fn look_in(&mut self, pieces: u8) {
+        self.pieces = pieces.max(1);
     }
 
     /// The first byte of a telegram arrived.
@@ -153,11 +160,17 @@ impl Rhythm {
         self.duration
     }
 
-    /// Until when nothing can be complete; answered once per telegram.
+    /// Until when nothing can be complete that is waited for: the next piece, or the telegram; answered once for each.
     pub(crate) fn rest(&mut self, now: Nanos) -> Option<Nanos> {
-        let until = self.first? + self.duration?.checked_sub(LEAD)?;
-        self.first = None;
-        (until > now + MIN_REST).then_some(until)
+        let (first, duration) = (self.first?, self.duration?);
+        let end = first + duration.checked_sub(LEAD)?;
+        let soon = now + MIN_REST;
+        let pieces = Nanos::from(self.pieces);
+        let piece = (1..pieces).map(|n| first + n * duration / pieces);
+        let piece = piece.take_while(|&at| at + MIN_REST < end).find(|&at| at > soon);
+        self.first = self.first.filter(|_| piece.is_some());
+        let until = piece.unwrap_or(end);
+        (until > soon).then_some(until)
     }
 
     /// A telegram is complete that took so long from its first to its last byte.
@@ -308,5 +321,28 @@ mod tests {
         }
         rhythm.begin(200_000_000);
         assert_eq!(rhythm.rest(200_000_000), Some(216_900_000));
+    }
+
+    #[test]
+    fn in_pieces_the_host_looks_once_for_each() {
+        let mut rhythm = Rhythm::new();
+        (0..3).for_each(|_| rhythm.complete(18_000_000));
+        rhythm.look_in(3);
+        rhythm.begin(0);
+        assert_eq!(rhythm.rest(100_000), Some(6_000_000));
+        assert_eq!(rhythm.rest(6_050_000), Some(12_000_000));
+        assert_eq!(rhythm.rest(12_050_000), Some(17_400_000), "the end, a little before it");
+        assert_eq!(rhythm.rest(17_450_000), None);
+        rhythm.begin(100_000_000);
+        assert_eq!(
+            rhythm.rest(113_000_000),
+            Some(117_400_000),
+            "a host that is late passes over what is over"
+        );
+        // So many pieces that the last one would be where the end is.
+        rhythm.look_in(200);
+        rhythm.begin(0);
+        let looks = core::iter::successors(rhythm.rest(0), |&at| rhythm.rest(at)).count();
+        assert!((20..=33).contains(&looks), "{looks}");
     }
 }

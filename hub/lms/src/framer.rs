@@ -50,6 +50,17 @@ pub struct Framed<'a> {
     pub reasons: u8,
 }
 
+/// The bytes of a telegram that has begun, as far as they are there: nothing of them is checked but the header.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Begun<'a> {
+    /// From its start byte on.
+    pub(crate) bytes: &'a [u8],
+    /// Number of its first byte among all bytes committed, from 0.
+    pub(crate) offset: u64,
+    /// Bits of [`suspect`] that are known already.
+    pub(crate) reasons: u8,
+}
+
 /// What was found next.
 #[derive(Clone, Copy, Debug)]
 pub enum Found<'a> {
@@ -231,6 +242,16 @@ impl Framer {
                 Judgement::Candidate { .. } | Judgement::Refused(_) => State::Stx,
             },
         }
+    }
+
+    /// The earliest telegram that has begun and was not delivered, after [`Framer::poll`] answered `None`.
+    pub(crate) fn begun(&self) -> Option<Begun<'_>> {
+        let held = self.held.map(|held| (held.at, held.end));
+        let live = || self.live.first().map(|candidate| (candidate.at.into(), candidate.end.into()));
+        let (at, end): (usize, usize) = held.or_else(live)?;
+        let reasons = if self.damage || at > self.start { suspect::NEIGHBOUR } else { 0 };
+        let offset = self.tally.read - (self.end - at) as u64;
+        Some(Begun { bytes: &self.buffer[at..end.min(self.end)], offset, reasons })
     }
 
     /// What became of the bytes.

@@ -76,7 +76,47 @@ impl<'a> Measured<'a> {
 
     /// The values as sent: range in the low bits, reflector level or field bits above (see [`crate::variant::Mode`]).
     pub fn words(&self) -> impl ExactSizeIterator<Item = u16> + use<'a> {
-        self.values.chunks_exact(2).map(|pair| u16::from_le_bytes([pair[0], pair[1]]))
+        words(self.values)
+    }
+}
+
+fn words(values: &[u8]) -> impl ExactSizeIterator<Item = u16> + use<'_> {
+    values.chunks_exact(2).map(|pair| u16::from_le_bytes([pair[0], pair[1]]))
+}
+
+/// The first values of a measured-value telegram that is not complete.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct FirstValues<'a> {
+    count: usize,
+    unit: Unit,
+    values: &'a [u8],
+}
+
+impl<'a> FirstValues<'a> {
+    /// Those of the telegram that begins with `bytes`, if its header is that of a whole scan.
+    pub(crate) fn of(bytes: &'a [u8]) -> Option<Self> {
+        let [_, _, _, _, MEASURED, low, high, rest @ ..] = bytes else { return None };
+        let count_word = u16::from_le_bytes([*low, *high]);
+        let count = usize::from(count_word & COUNT);
+        let unit = Unit::of_code((count_word >> 14) as u8)?;
+        let is_whole = count_word & PARTIAL == 0 && (1..=MAX_BEAMS).contains(&count);
+        let (values, _) = rest.split_at(rest.len().min(2 * count) & !1);
+        is_whole.then_some(FirstValues { count, unit, values })
+    }
+
+    /// Number of beams of the whole scan: 1 to 401.
+    pub fn count(&self) -> usize {
+        self.count
+    }
+
+    /// Unit of the ranges.
+    pub fn unit(&self) -> Unit {
+        self.unit
+    }
+
+    /// The values so far, as sent; see [`Measured::words`].
+    pub fn words(&self) -> impl ExactSizeIterator<Item = u16> + use<'a> {
+        words(self.values)
     }
 }
 

@@ -2,6 +2,7 @@
 //! the next deadline come out.
 
 mod beat;
+mod begun;
 
 use crate::Nanos;
 use crate::arrival::{Arrivals, Rhythm};
@@ -19,6 +20,8 @@ use crate::sensor::{Sensor, Trouble};
 use crate::telegram::Telegram;
 use crate::variant::{BYTES_PER_TURN, Baud, Mode};
 use line::{Account, Control, Output, State, suspect};
+
+pub use begun::Begun;
 
 /// What a deadline is for.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -39,6 +42,8 @@ pub struct Message<'a> {
     /// How measured values are split; `None` while the sensor has not reported it, if the angles of the values are not
     /// known, or if they came at another rate than the wanted one, by which their period and their age are judged.
     pub mode: Option<Mode>,
+    /// Number of its first byte among all bytes of the session, from 0.
+    pub offset: u64,
 }
 
 /// A telegram with its stamps.
@@ -185,7 +190,7 @@ impl Session {
         let mode = self.dialogue.sensor.mode_of_scans().filter(|_| is_at_rate);
         Received {
             bytes: telegram.bytes(),
-            message: Message { telegram, reply, mode },
+            message: Message { telegram, reply, mode, offset: span.offset },
             first: first.at,
             last,
             estimated: first.estimated,

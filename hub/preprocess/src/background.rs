@@ -1,7 +1,8 @@
 //! Decides which beams of a scan hit the permanent surroundings, and which hit something in front of them. The model
-//! of the surroundings is learned from the scans, beam by beam, by one of two methods. It compares ranges only: it
-//! refuses to know what objects there are, and where the sensor is.
+//! of the surroundings is learned from the scans, beam by beam, by one of two methods, or in a map
+//! that a moving sensor is laid into. It refuses to know what objects there are.
 
+mod moving;
 mod multi;
 mod paper;
 mod runs;
@@ -9,8 +10,11 @@ mod settings;
 
 use std::fmt;
 
-use schema::{Background, BackgroundHead, Foreground, ForegroundArrays, ForegroundHead, Scan, ScanHead};
+use schema::{
+    Background, BackgroundHead, Foreground, ForegroundArrays, ForegroundHead, Motion, Pose, Scan, ScanHead,
+};
 
+use moving::Moving;
 use multi::Multi;
 use paper::Paper;
 use settings::Limits;
@@ -63,6 +67,7 @@ pub struct Model {
 enum Learner {
     Paper(Paper),
     Multi(Multi),
+    Moving(Moving),
 }
 
 /// A reading that tells nothing. It lies between the ranges and [`Background::FAR`].
@@ -102,6 +107,7 @@ impl Model {
         match &mut self.learner {
             Learner::Paper(paper) => paper.update(readings, &self.limits, learn, classes),
             Learner::Multi(multi) => multi.update(readings, &self.limits, learn, classes),
+            Learner::Moving(moving) => moving.update(scan, readings, &self.limits, learn, classes),
         }
         if learn && self.fresh {
             if self.settings.start == Start::FirstScan {
@@ -110,6 +116,17 @@ impl Model {
             self.fresh = false;
         }
         write(scan, self.generation, &self.classes[..count], out);
+    }
+
+    /// The next scan is from where `motion` says that the robot is, of a sensor at `pose`: for
+    /// [`Method::Moving`]. Where the motion begins anew or is refused, all is forgotten.
+    pub fn follow(&mut self, pose: &Pose, motion: &Motion) {
+        if let Learner::Moving(moving) = &mut self.learner
+            && !moving.follow(pose, motion)
+            && !self.fresh
+        {
+            self.reset();
+        }
     }
 
     /// What the beams of the last scan are; empty before the first one.
@@ -145,6 +162,11 @@ impl Model {
         out.taught = taught;
     }
 
+    /// By which method it is learned.
+    pub fn method(&self) -> Method {
+        self.settings.method
+    }
+
     /// Counts the models: one more after a reset, a load, and a change of the scan's shape.
     pub fn generation(&self) -> u32 {
         self.generation
@@ -165,6 +187,7 @@ impl Model {
         match &mut self.learner {
             Learner::Paper(paper) if self.settings.method == Method::Paper => paper.forget(),
             Learner::Multi(multi) if self.settings.method == Method::Multi => multi.forget(),
+            Learner::Moving(moving) if self.settings.method == Method::Moving => moving.forget(),
             other => *other = Learner::new(self.settings.method, self.most),
         }
         self.generation = self.generation.wrapping_add(1);
@@ -241,6 +264,7 @@ impl Learner {
         match method {
             Method::Paper => Learner::Paper(Paper::new(beams)),
             Method::Multi => Learner::Multi(Multi::new(beams)),
+            Method::Moving => Learner::Moving(Moving::new(beams)),
         }
     }
 
@@ -251,6 +275,8 @@ impl Learner {
                 match self {
                     Learner::Paper(paper) => paper.adopt(i, range),
                     Learner::Multi(multi) => multi.adopt(i, range),
+                    // Ranges from one place are no map.
+                    Learner::Moving(_) => {}
                 }
             }
         }
@@ -261,6 +287,7 @@ impl Learner {
         match self {
             Learner::Paper(paper) => paper.background(i),
             Learner::Multi(multi) => multi.background(i, limits),
+            Learner::Moving(moving) => moving.background(i, limits),
         }
     }
 }

@@ -6,6 +6,7 @@
 pub mod background;
 pub mod lines;
 pub mod marks;
+pub mod motion;
 #[cfg(test)]
 mod reading;
 pub mod segments;

@@ -60,6 +60,17 @@ impl Default for Settings<'static> {
     }
 }
 
+/// What a part of a scan tells: never that the robot's surroundings are clear.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Warning {
+    /// [`Verdict::Slow`] or [`Verdict::Stop`].
+    pub verdict: Verdict,
+    /// The beam of the nearest point so far.
+    pub beam: u16,
+    /// Its distance from the robot's centre in mm, rounded down.
+    pub distance_mm: u32,
+}
+
 /// Compares scans of one sensor with its circles.
 ///
 /// Where the design leaves something open:
@@ -114,6 +125,24 @@ impl Check {
         (out.nearest_beam, out.nearest_mm) = nearest.unwrap_or((Zones::NO_BEAM, Zones::NO_DISTANCE));
         out.invalid_beams = invalid;
         self.write_circles(&inside, out);
+    }
+
+    /// What the first `ranges` of a scan tell that is not complete, of so many beams `count` and `unit_um` as the last one: the
+    /// zone that it will violate whatever else it brings, if any. A scan whose first one has yet to be seen tells nothing.
+    pub fn early(&mut self, count: usize, unit_um: u32, ranges: &[u16]) -> Option<Warning> {
+        if !self.table.layout().is_of(count, unit_um) || self.is_blind() {
+            return None;
+        }
+        let ranges = &ranges[..ranges.len().min(count).min(self.table.most())];
+        let inside = self.table.inside(ranges);
+        let will_be = |zone: &usize| {
+            inside[*zone] >= self.min_beams && self.streaks[*zone].saturating_add(1) >= self.min_scans
+        };
+        let smallest = self.table.circles().checked_sub(1)?;
+        let zone = (0..=smallest).rev().find(will_be)?;
+        let verdict = if zone == smallest { Verdict::Stop } else { Verdict::Slow };
+        let (beam, distance_mm) = self.table.nearest(ranges)?;
+        Some(Warning { verdict, beam, distance_mm })
     }
 
     /// Writes into `out` what to say when scans stay out: nothing is known but the circles. Scans have to follow each

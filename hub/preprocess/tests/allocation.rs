@@ -10,9 +10,9 @@ use std::sync::atomic::Ordering::Relaxed;
 use counting::{TAKEN, WATCHED};
 use preprocess::background::{self, Method, Model};
 use preprocess::segments::Segmenter;
-use preprocess::{lines, marks, zones};
+use preprocess::{lines, marks, motion, zones};
 use rustix::thread::gettid;
-use schema::{Background, Foreground, Lines, Marks, Pose, Scan, Zones};
+use schema::{Background, Foreground, Lines, Marks, Motion, Pose, Scan, Zones};
 use surroundings::{BEAMS, Shape, Surroundings};
 
 #[test]
@@ -34,7 +34,10 @@ fn a_scan_takes_nothing_from_the_heap() {
     let mut line_finders = [false, true].map(|polish| lines::LineFinder::new(pose, of_form(polish), BEAMS));
     let mut found_lines = Lines::default();
     let settings = |method| background::Settings { method, scans: Some(10), ..Default::default() };
-    let mut models = [Method::Paper, Method::Multi].map(|method| Model::new(settings(method), BEAMS));
+    let mut models =
+        [Method::Paper, Method::Multi, Method::Moving].map(|method| Model::new(settings(method), BEAMS));
+    let mut estimator = motion::MotionEstimator::new(pose, motion::Settings::default(), BEAMS);
+    let mut found_motion = Motion::default();
     let mut cutter = Segmenter::new(pose, BEAMS);
     let (mut zones, mut marks) = (Zones::default(), Marks::default());
     let mut foreground = Foreground::of(BEAMS);
@@ -51,7 +54,9 @@ fn a_scan_takes_nothing_from_the_heap() {
             finder.update(scan, &mut found_lines);
             lines_found += found_lines.lines().len();
         }
+        estimator.update(scan, &found_lines, &mut found_motion);
         for model in &mut models {
+            model.follow(&pose, &found_motion);
             model.update(scan, &mut foreground);
             cutter.update(scan, &mut foreground);
             model.show(&mut background);

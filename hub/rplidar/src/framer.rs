@@ -327,8 +327,8 @@ fn run(open: &[u8], most: usize) -> (usize, bool) {
 
 /// What a tty keeps for a reader who is late, and two packets.
 const CAPACITY: usize = 4_096 + 2 * Kind::LONGEST;
-/// After so long without a byte nothing is under way.
-const HOLD: Nanos = 4 * MILLIS;
+/// After so long without a byte nothing is under way: an adapter hands bytes on by the packet, in the slowest stream each 6 ms.
+const HOLD: Nanos = 10 * MILLIS;
 /// Packets of one point that are believed together: wrong places give as many once in millions.
 const RUN: usize = 6;
 /// Degrees between two points of one head, one after the other, even if some are missing between them.

@@ -7,7 +7,7 @@ mod families;
 mod turning;
 
 use line::suspect;
-use lms::measured::Measured;
+use lms::measured::{FirstValues, Measured};
 use lms::variant::{Mode, Variant};
 use schema::{Contents, Reasons, Scan, ScanArrays, ScanHead};
 
@@ -34,6 +34,22 @@ pub fn decode(measured: &Measured<'_>, mode: Mode, scan: &mut Scan) {
         *range = word & mask;
         *upper = (word >> bits) as u8;
     }
+}
+
+/// Writes the ranges of the first values of a telegram that is not complete to the beginning of `ranges`, with the values split
+/// as `mode` says; how many there are.
+pub fn decode_first(values: &FirstValues<'_>, mode: Mode, ranges: &mut [u16]) -> usize {
+    let words = values.words();
+    let count = words.len().min(ranges.len());
+    for (range, word) in ranges.iter_mut().zip(words) {
+        *range = word & mode.max_value();
+    }
+    count
+}
+
+/// Micrometres of a unit of these values.
+pub fn unit_um(values: &FirstValues<'_>) -> u32 {
+    1000 * u32::from(values.unit().mm())
 }
 
 fn head(measured: &Measured<'_>, mode: Mode) -> ScanHead {

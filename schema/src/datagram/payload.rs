@@ -3,14 +3,15 @@
 
 mod foreground;
 mod lines;
+mod motion;
 
 use bytemuck::{Pod, bytes_of, bytes_of_mut, pod_read_unaligned};
 
 use super::{Announce, Datagram, DatagramError};
 use crate::limits::TopicLimits;
 use crate::{
-    BEAMS, Background, BackgroundHead, Contents, MARKS, Marks, Scan, ScanHead, Status, Telegram, Topic,
-    ZONES, Zones,
+    BEAMS, Background, BackgroundHead, Contents, Early, MARKS, Marks, Scan, ScanHead, Status, Telegram,
+    Topic, Verdict, ZONES, Zones,
 };
 
 /// A payload that can go over a network.
@@ -182,6 +183,26 @@ impl Packed for Status {
     }
 }
 
+impl Packed for Early {
+    fn pack(&self, room: &mut [u8]) -> Option<usize> {
+        write(room, &[bytes_of(self)])
+    }
+
+    fn room(payload: &[u8]) -> Option<usize> {
+        let is_warning =
+            [Verdict::Slow, Verdict::Stop].map(|verdict| verdict as u8).contains(payload.first()?);
+        fits(payload, size_of::<Early>()).filter(|_| is_warning)
+    }
+
+    fn unpack(&mut self, payload: &[u8]) -> bool {
+        take(self, payload)
+    }
+
+    fn unpack_into(place: &mut Box<Self>, payload: &[u8]) -> bool {
+        place.unpack(payload)
+    }
+}
+
 impl Packed for Background {
     fn pack(&self, room: &mut [u8]) -> Option<usize> {
         write(room, &[self.bytes()])
@@ -274,6 +295,8 @@ mod tests {
         let mut zones = Zones { count: 2, ..Zones::unknown() };
         zones.zone_array[1] = Zone { radius_mm: 600, ..Zone::default() };
         there_and_back(&zones, &mut Zones::default(), 12 + 16);
+        let early = Early { verdict: 2, beam: 90, distance_mm: 512, bytes_seen: 240, ..Early::default() };
+        there_and_back(&early, &mut Early::default(), 12);
         let model = Background::of(BackgroundHead::default(), &[0, 0, 7]);
         there_and_back(&*model, &mut Background::zeroed(38), 32 + 6);
         there_and_back(&Status { baud: 500_000, ..Status::default() }, &mut Status::default(), 592);
@@ -321,6 +344,7 @@ mod tests {
             bad[at] = byte;
             assert!(refused(&bad), "{byte} at {at}");
         }
+        assert_eq!([0, 3, 4].map(|verdict| Early::room(&[verdict; 12])), [None; 3], "no warning");
         let other = Scan::of(ScanHead { step: f64::NAN, ..ScanHead::default() }, &[1]);
         assert_eq!(Scan::room(other.bytes()), None, "no angle is known");
         assert_eq!((Marks::room(&[65; 2000]), Zones::room(&[9; 2000])), (None, None));

@@ -1,4 +1,4 @@
-//! Two words in shared memory on which all consumers of a sensor sleep, one for each ring: one call of the hub wakes all that
+//! Three words in shared memory on which all consumers of a sensor sleep, one for each ring: one call of the hub wakes all that
 //! sleep at a word, however many they are; an event needs one message for each. Refuses to know what was sent, and who
 //! sleeps.
 //!
@@ -78,6 +78,7 @@ impl Drop for Ringer {
         let words = self.page.words();
         words::close(&words.closed, words.of(Ring::First));
         words::ring(words.of(Ring::Last));
+        words::ring(words.of(Ring::Early));
         let _ = std::fs::remove_file(&self.path);
     }
 }
@@ -169,6 +170,8 @@ struct Words {
     closed: AtomicU32,
     _far: [u32; 15],
     last: AtomicU32,
+    _beyond: [u32; 15],
+    early: AtomicU32,
 }
 
 impl Words {
@@ -176,6 +179,7 @@ impl Words {
         match ring {
             Ring::First => &self.first,
             Ring::Last => &self.last,
+            Ring::Early => &self.early,
         }
     }
 }

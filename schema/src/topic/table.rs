@@ -35,6 +35,10 @@ macro_rules! for_each_topic {
                 "State, properties and counters of the link.";
             Lines Lines, "lines", "scanhub.Lines.v2", 81, Scan, Last, 16, 0:
                 "Straight lines and their corners.";
+            Motion Motion, "motion", "scanhub.Motion.v2", 81, Scan, Last, 16, 0:
+                "How the robot moved since the scan before.";
+            Early Early, "early", "scanhub.Early.v2", 81, Change, Early, 16, 0:
+                "Warnings by telegrams that are not complete.";
         }
     };
 }
@@ -90,18 +94,20 @@ pub enum Pace {
     Change,
 }
 
-/// The two rings of a sensor's bell for a telegram: nobody waits for the marks of a scan whose zones he wants.
+/// The rings of a sensor's bell for a telegram: nobody waits for the marks of a scan whose zones he wants.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Ring {
     /// As soon as telegram, scan and zones are sent.
     First,
     /// When all is sent.
     Last,
+    /// Before it is complete, if it is a warning already.
+    Early,
 }
 
 impl Ring {
-    /// Both, in their order.
-    pub const ALL: [Ring; 2] = [Ring::First, Ring::Last];
+    /// All of them.
+    pub const ALL: [Ring; 3] = [Ring::First, Ring::Last, Ring::Early];
 }
 
 macro_rules! rows {

@@ -1,7 +1,9 @@
 //! What a datagram says, in the words of the list of golden datagrams.
 
 use schema::datagram::{Announce, Datagram, MTU_SAFE, Packed};
-use schema::{BEAMS, Background, Code, Family, Foreground, Lines, Marks, Scan, Status, Topic, Zones};
+use schema::{
+    BEAMS, Background, Code, Early, Family, Foreground, Lines, Marks, Motion, Scan, Status, Topic, Zones,
+};
 use serde_json::{Map, Value, json};
 
 pub(crate) fn head(datagram: &Datagram<'_>) -> Value {
@@ -29,6 +31,8 @@ pub(crate) fn payload(datagram: &Datagram<'_>) -> Value {
         Some(Topic::Foreground) => foreground(&unpacked(Foreground::of(BEAMS), payload)),
         Some(Topic::Background) => background(&unpacked(Background::zeroed(MTU_SAFE), payload)),
         Some(Topic::Lines) => lines(&unpacked(Box::<Lines>::default(), payload)),
+        Some(Topic::Motion) => motion(&unpacked(Box::<Motion>::default(), payload)),
+        Some(Topic::Early) => early(&unpacked(Box::<Early>::default(), payload)),
         Some(Topic::Status) => status(&unpacked(Box::<Status>::default(), payload)),
     }
 }
@@ -94,6 +98,21 @@ fn lines(lines: &Lines) -> Value {
     json!({
         "overflow": lines.is_overflow(), "readings": lines.readings, "on_lines": lines.on_lines,
         "noise_m": lines.noise_m, "lines": list.collect::<Vec<_>>(), "corners": corners.collect::<Vec<_>>(),
+    })
+}
+
+fn motion(motion: &Motion) -> Value {
+    json!({
+        "x_m": motion.x_m, "y_m": motion.y_m, "yaw_rad": motion.yaw_rad, "dx_m": motion.dx_m, "dy_m": motion.dy_m,
+        "dyaw_rad": motion.dyaw_rad, "covariance": motion.covariance, "overlap": motion.overlap,
+        "method": motion.how().name(), "degenerate": motion.is_degenerate(), "breaks": motion.breaks,
+    })
+}
+
+fn early(early: &Early) -> Value {
+    json!({
+        "verdict": early.verdict().name(), "withdrawn": early.is_withdrawn(), "beam": early.beam,
+        "distance_mm": early.distance_mm, "bytes_seen": early.bytes_seen, "beams_seen": early.beams_seen,
     })
 }
 

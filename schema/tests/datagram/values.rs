@@ -3,16 +3,16 @@
 use bytemuck::Zeroable;
 use schema::datagram::{Announce, Announced, Head, LanFlags, Packed};
 use schema::{
-    Background, BackgroundHead, COUNTERS, Code, Contents, Corner, Counter, Counters, Family, Foreground,
-    ForegroundHead, Line, Lines, Mark, Marks, Pose, Scan, ScanHead, Segment, State, Status, Topic, Verdict,
-    Zone, Zones,
+    Background, BackgroundHead, COUNTERS, Code, Contents, Corner, Counter, Counters, Early, Family,
+    Foreground, ForegroundHead, Line, Lines, Mark, Marks, Motion, MotionMethod, Pose, Scan, ScanHead,
+    Segment, State, Status, Topic, Verdict, Zone, Zones,
 };
 
 /// Name of the file, header, and what writes the payload.
 pub(crate) type Golden = (&'static str, Head, fn(&mut [u8]) -> Option<usize>);
 
 /// Those that a gateway of this version sends.
-pub(crate) const ALL: [Golden; 13] = [
+pub(crate) const ALL: [Golden; 16] = [
     ("announce", Head { sequence: 7, counter: 0, ..head(None) }, announce),
     ("telegram", Head { sequence: u32::MAX, ..head(Some(Topic::Telegram)) }, telegram),
     ("packets", Head { sequence: 5, family: Family::Ld as u8, ..head(Some(Topic::Telegram)) }, packets),
@@ -42,7 +42,21 @@ pub(crate) const ALL: [Golden; 13] = [
         |room| status().pack(room),
     ),
     ("lines", head(Some(Topic::Lines)), |room| lines().pack(room)),
+    ("motion", head(Some(Topic::Motion)), |room| motion().pack(room)),
+    ("early", head(Some(Topic::Early)), |room| EARLY.pack(room)),
+    ("early_withdrawn", head(Some(Topic::Early)), |room| {
+        Early { flags: Early::WITHDRAWN, ..EARLY }.pack(room)
+    }),
 ];
+
+const EARLY: Early = Early {
+    verdict: Verdict::Slow as u8,
+    flags: 0,
+    beam: 117,
+    distance_mm: 80_012,
+    bytes_seen: 303,
+    beams_seen: 148,
+};
 
 /// The header of `zones`.
 pub(crate) const ZONES: Head = Head { sequence: 5000, ..head(Some(Topic::Zones)) };
@@ -163,6 +177,23 @@ fn marks() -> Marks {
 }
 
 /// Numbers that a 32-bit float has exactly.
+fn motion() -> Motion {
+    Motion {
+        x_m: 12.5,
+        y_m: -0.75,
+        yaw_rad: 1.25,
+        dx_m: 0.03125,
+        dy_m: -0.0078125,
+        dyaw_rad: 0.015625,
+        covariance: [0.0625, 0.0, 0.0, 0.0, 0.03125, 0.0, 0.0, 0.0, 0.0078125],
+        overlap: 0.875,
+        method: MotionMethod::Lines as u8,
+        flags: Motion::DEGENERATE,
+        breaks: 2,
+    }
+}
+
+/// The same.
 fn lines() -> Lines {
     let mut lines = Lines {
         count: 2,

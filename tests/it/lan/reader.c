@@ -48,12 +48,12 @@ static void number(const char *before, double value)
            digits[strspn(digits, "-0123456789")] == 0 ? ".0" : "");
 }
 
-static const char *const families[] = {"lms", "ld"};
+static const char *const families[] = {"lms", "ld", "rplidar"};
 
 static void scan(const struct scanhub_scan *s)
 {
-    printf("{\"family\":%s%s%s", s->family < 2 ? "\"" : "", s->family < 2 ? families[s->family] : "null",
-           s->family < 2 ? "\"" : "");
+    printf("{\"family\":%s%s%s", s->family < 3 ? "\"" : "", s->family < 3 ? families[s->family] : "null",
+           s->family < 3 ? "\"" : "");
     printf(",\"unit_um\":%lu,\"count\":%u", (unsigned long)s->unit_um, s->count);
     number(",\"first_angle\":", s->first_angle);
     number(",\"step\":", s->step);
@@ -103,6 +103,13 @@ static void marks(const struct scanhub_marks *m)
     printf("]}");
 }
 
+static void early(const struct scanhub_early *e)
+{
+    printf("{\"verdict\":\"%s\",\"withdrawn\":%s,\"beam\":%u,\"distance_mm\":%lu,\"bytes_seen\":%u,\"beams_seen\":%u}",
+           e->verdict == SCANHUB_STOP ? "stop" : "slow", boolean(e->withdrawn), e->beam,
+           (unsigned long)e->distance_mm, e->bytes_seen, e->beams_seen);
+}
+
 static void lines(const struct scanhub_lines *l)
 {
     printf("{\"overflow\":%s,\"readings\":%u,\"on_lines\":%u", boolean(l->overflow), l->readings, l->on_lines);
@@ -128,6 +135,22 @@ static void lines(const struct scanhub_lines *l)
         printf(",\"first_line\":%u,\"second_line\":%u}", k.first_line, k.second_line);
     }
     printf("]}");
+}
+
+static void motion(const struct scanhub_motion *m)
+{
+    static const char *const methods[] = {"first", "refused", "beams", "points", "lines", "both"};
+    number("{\"x_m\":", m->x_m);
+    number(",\"y_m\":", m->y_m);
+    number(",\"yaw_rad\":", m->yaw_rad);
+    number(",\"dx_m\":", m->dx_m);
+    number(",\"dy_m\":", m->dy_m);
+    number(",\"dyaw_rad\":", m->dyaw_rad);
+    for (unsigned i = 0; i < 9; i++)
+        number(i ? "," : ",\"covariance\":[", m->covariance[i]);
+    number("],\"overlap\":", m->overlap);
+    printf(",\"method\":\"%s\",\"degenerate\":%s,\"breaks\":%u}", methods[m->method < 6 ? m->method : 1],
+           boolean(m->degenerate), m->breaks);
 }
 
 static void zones(const struct scanhub_zones *z)
@@ -186,8 +209,8 @@ static void status(const struct scanhub_status *s)
         printf("{\"state\":\"%s\"", states[s->state]);
     else
         printf("{\"state\":null");
-    printf(",\"family\":%s%s%s", s->family < 2 ? "\"" : "", s->family < 2 ? families[s->family] : "null",
-           s->family < 2 ? "\"" : "");
+    printf(",\"family\":%s%s%s", s->family < 3 ? "\"" : "", s->family < 3 ? families[s->family] : "null",
+           s->family < 3 ? "\"" : "");
     printf(",\"mode\":%u,\"unit_mm\":%u,\"baud\":%lu,\"since_ns\":%llu,\"rate_mhz\":%lu,\"angle_deg\":%u", s->mode, s->unit_mm, (unsigned long)s->baud,
            (unsigned long long)s->since_ns, (unsigned long)s->rate_mhz, s->angle_deg);
     printf(",\"resolution_cdeg\":%u,\"type\":\"%s\",\"port\":\"%s\",\"last_error\":\"%s\",\"counters\":[", s->resolution_cdeg,
@@ -233,6 +256,8 @@ static enum scanhub_result payload(const struct scanhub_datagram *d)
         TOPIC(SCANHUB_BACKGROUND, background)
         TOPIC(SCANHUB_STATUS, status)
         TOPIC(SCANHUB_LINES, lines)
+        TOPIC(SCANHUB_MOTION, motion)
+        TOPIC(SCANHUB_EARLY, early)
     }
     return SCANHUB_SKIPPED;
 }

@@ -55,6 +55,9 @@ fn word(name: &str, value: &Value) -> String {
         }
         ("family", Value::String(name)) => number(Family::parse(name).map(|family| family as usize)),
         ("state", Value::String(name)) => number(State::ALL.iter().position(|known| known.name() == name)),
+        ("method", Value::String(name)) => {
+            number(schema::MotionMethod::ALL.iter().position(|known| known.name() == name))
+        }
         ("boot" | "hub", Value::String(digits)) => format!("0x{digits}"),
         ("mode" | "flags", value) => format!("0x{:02x}", value.as_u64().expect("a byte")),
         (_, Value::Bool(value)) => u8::from(*value).to_string(),
@@ -63,10 +66,11 @@ fn word(name: &str, value: &Value) -> String {
     }
 }
 
-/// Angles, and the metres of lines, have as many digits as the tool likes.
+/// Angles, and the numbers of lines and motions, have as many digits as the tool likes.
 fn as_shown(name: &str, values: &str) -> String {
     let is_angle = ["angle", "step", "spacing"].iter().any(|word| name.ends_with(word))
-        || name.starts_with("scanhub.lines.") && ["_m", "_rad"].iter().any(|word| name.ends_with(word));
+        || ["scanhub.lines.", "scanhub.motion."].iter().any(|topic| name.starts_with(topic))
+            && ["_m", "_rad", "covariance"].iter().any(|word| name.ends_with(word));
     if !is_angle || values.is_empty() {
         return values.to_owned();
     }

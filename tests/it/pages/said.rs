@@ -11,12 +11,14 @@ use super::is_program;
 use crate::testkit::{TERM, TestEnv};
 
 /// Texts that are no examples, by how they begin, and what makes sure of them.
-const TEXTS: [(&str, &str, &str); 6] = [
+const TEXTS: [(&str, &str, &str); 8] = [
     ("README.md", " LMS 291 ──RS-422", "a drawing"),
     ("docs/datagram.md", " 0  53485542", "schema/tests/datagram.rs compares it with the golden datagram"),
     ("docs/ros2.md", "cargo install", "clients/bridge/tests/bridge/ros2.rs runs the second line"),
     ("docs/ros2.md", "sudo apt-get install ros-", "ROS is not installed where tests run"),
     ("docs/ros2.md", "scanhub bridge --connect", "clients/bridge/tests/bridge/ros2.rs runs it"),
+    ("docs/tracks.md", "1 appeared in hall", "tests/it/track.rs reads the same as lines of --json"),
+    ("docs/tracks.md", "empty rooms: ", "figures, which the example `proof` prints"),
     ("docs/worlds.md", "w.toml:2:1: unknown key", "a_wrong_world_is_refused_as_the_page_says"),
 ];
 
@@ -39,7 +41,7 @@ fn wrong_with(block: &Block) -> Option<String> {
     }
 }
 
-/// A configuration, or a world.
+/// A configuration, a world, or a site.
 fn wrong_with_toml(block: &Block) -> Option<String> {
     let env = TestEnv::new();
     let file = env.file("page.toml", &block.text);
@@ -53,13 +55,16 @@ fn wrong_with_toml(block: &Block) -> Option<String> {
     if checked.errors.contains("no link is configured") && completed.code == Some(0) {
         return None;
     }
+    if env.run(&["site", "check", &file]).code == Some(0) {
+        return None;
+    }
     let port = format!("--port={}", env.word("front"));
     let mut world = env.start(&["simulate", "--json", "--world", &file, &port]);
     if !world.is_over_before_it_says() {
         let outcome = world.end(TERM);
         return (outcome.code != Some(0)).then(|| outcome.to_string());
     }
-    Some(format!("neither a configuration nor a world: {checked}{}", world.wait()))
+    Some(format!("neither a configuration, a site nor a world: {checked}{}", world.wait()))
 }
 
 /// A line of output, with keys that docs/output.md names.

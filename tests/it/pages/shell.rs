@@ -22,13 +22,14 @@ pub(crate) fn commands(line: &str) -> Vec<Vec<String>> {
     commands
 }
 
-/// The words of each `scanhub` in a line, also of those that Cargo runs.
+/// The words of each `scanhub` in a line, also of those that Cargo runs; an example is another program.
 pub(crate) fn of_the_program(line: &str) -> Vec<Vec<String>> {
     let of_cargo = |words: &[String]| {
         let at = words
             .iter()
             .position(|word| word == "--")
-            .filter(|_| words.starts_with(&["cargo".into(), "run".into()]))?;
+            .filter(|_| words.starts_with(&["cargo".into(), "run".into()]))
+            .filter(|_| !words.contains(&"--example".into()))?;
         Some([&["scanhub".to_owned()], &words[at + 1..]].concat())
     };
     let commands = commands(line).into_iter();

@@ -118,9 +118,11 @@ pub(crate) fn preprocess_only_computes(tree: &Tree) -> Vec<String> {
         built_with(manifest).filter(|name| *name != "scanhub-schema").cloned().collect();
     breaches.extend(lacks(tree, "hub/preprocess/src/lib.rs", &["#![forbid(unsafe_code)]"]));
     let mut on_heap = find(tree, &HEAP, ours);
-    // For as many beams as its sensor has, each processor takes its memory once.
+    // For as many beams as its sensor has, or cells of a map, each processor takes its memory once.
     on_heap.retain(|place| {
-        let for_beams = place.matches("Box<[").count() + place.matches("; beams").count();
+        let for_beams = place.matches("Box<[").count()
+            + place.matches("; beams").count()
+            + place.matches("; CELLS]").count();
         HEAP.iter().map(|word| place.matches(word).count()).sum::<usize>() > for_beams
     });
     breaches.extend(on_heap);
@@ -136,7 +138,7 @@ pub(crate) fn preprocess_only_computes(tree: &Tree) -> Vec<String> {
 /// What a processor does must not depend on which others run.
 pub(crate) fn no_processor_uses_another(tree: &Tree) -> Vec<String> {
     const BELOW: &str = "hub/preprocess/src/";
-    const PROCESSORS: [&str; 5] = ["zones", "marks", "lines", "background", "segments"];
+    const PROCESSORS: [&str; 6] = ["zones", "marks", "lines", "motion", "background", "segments"];
     let mut breaches = Vec::new();
     for own in PROCESSORS {
         let is_own = |path: &str| {
@@ -165,6 +167,7 @@ pub(crate) fn clients_know_only_schema(tree: &Tree) -> Vec<String> {
                 "scanhub-schema",
                 "scanhub-ros",
                 "scanhub-scene",
+                "scanhub-track",
                 "scanhub-web",
             ],
         ),

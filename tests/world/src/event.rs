@@ -1,5 +1,6 @@
 //! Everything that happens in a world, as the judges see it and as its hash has it. Refuses to know what is right.
 
+use lan::outgoing;
 use lms::Nanos;
 use schema::datagram::{Datagram, DatagramError, Row};
 use schema::{Header, Ring, Status, Topic, Verdict, Zones};
@@ -57,6 +58,8 @@ pub(crate) enum Event<'a> {
     GatewayEnds { epoch: u32, is_killed: bool },
     /// It made a datagram, which its sockets took or not.
     Transmitted { datagram: &'a Datagram<'a>, bytes: &'a [u8], is_taken: bool },
+    /// A row of the account of a gateway that ends; announcements are of no topic.
+    Accounted { sensor: usize, topic: Option<Topic>, row: &'a outgoing::Row },
     /// Somebody else sent this.
     Forged { forgery: Forgery, bytes: &'a [u8] },
     /// A listener begins.
@@ -141,7 +144,7 @@ pub struct Figures {
     pub wrong: u64,
     /// Packets that a hub counted as lost on the line.
     pub lost: u64,
-    /// When a hub had the first packet of measured values, and the first scan.
+    /// When a hub had the first packet of measured values, and the first scan; what a scanner waited for its motor not counted.
     pub data_ns: Nanos,
     /// See above.
     pub scan_ns: Nanos,
@@ -250,6 +253,8 @@ impl Event<'_> {
                 numbers(&[27, row.epoch.into(), row.sensor.into(), row.topic.into()]);
                 numbers(&[row.received, row.lost(), row.duplicate, row.reordered]);
             }
+            // It follows from all that is told of before.
+            Event::Accounted { .. } => {}
             Event::ListenerEnds { life, refused, given_up, sensors } => {
                 numbers(&[28, life, refused, given_up, sensors as u64]);
             }
@@ -292,6 +297,7 @@ impl Event<'_> {
             Event::Taken { .. } | Event::Read { .. } | Event::Dropped { .. } | Event::Lacking { .. } => None,
             Event::Rung { .. } | Event::Measured { .. } => None,
             Event::Transmitted { .. } | Event::Republished { .. } | Event::Counted { .. } => None,
+            Event::Accounted { .. } => None,
             Event::Forged { forgery, .. } => Some(format!("forged: {forgery:?}")),
             Event::Arrived { outcome: Arrival::Refused(why), .. } => Some(format!("refused: {why:?}")),
             Event::Arrived { .. } => None,

@@ -26,6 +26,13 @@ impl History {
         self.number(bytes.len() as u64);
     }
 
+    /// Of these bytes alone.
+    pub(crate) fn of(bytes: &[u8]) -> u64 {
+        let mut history = History::new();
+        history.bytes(bytes);
+        history.value()
+    }
+
     pub(crate) fn value(self) -> u64 {
         self.0
     }

@@ -61,6 +61,10 @@ pub enum Defect {
     RemoteUnchecked,
     /// A gateway says only once who its sensors are.
     Unannounced,
+    /// A bridge does not come back to a router that was killed.
+    RouterGivenUp,
+    /// Now and then a bridge throws a sample away that waits, and its account says that it was sent.
+    RouterUntold,
     /// Now and then a packet is published whose checksum is wrong.
     WrongChecksum,
     /// What comes beside damaged bytes is not marked.
@@ -75,7 +79,7 @@ pub enum Defect {
 
 impl Defect {
     /// All of them.
-    pub const ALL: [Defect; 31] = [
+    pub const ALL: [Defect; 33] = [
         Defect::LostWake,
         Defect::OneRing,
         Defect::LostByte,
@@ -102,6 +106,8 @@ impl Defect {
         Defect::RemoteSurvivingVerdict,
         Defect::RemoteUnchecked,
         Defect::Unannounced,
+        Defect::RouterGivenUp,
+        Defect::RouterUntold,
         Defect::WrongChecksum,
         Defect::UnmarkedNeighbour,
         Defect::DeafScanner,

@@ -6,6 +6,7 @@ mod gateway;
 mod listener;
 mod payload;
 mod robot;
+mod router;
 mod topics;
 
 use std::collections::HashMap;
@@ -22,14 +23,18 @@ use crate::actions;
 use crate::event::Event;
 use crate::network::{Faults, Network};
 use crate::plan::Plan;
+use crate::planted::Defect;
 use crate::setup::Setup;
 use crate::shared::Shared;
 use forger::Forger;
 pub(crate) use forger::Forgery;
 use gateway::Gateway;
+pub(crate) use gateway::NUMBERS as FIRST_NUMBER;
 use listener::Listener;
 pub(crate) use payload::Packet;
 use robot::RemoteRobot;
+use router::Router;
+pub(crate) use router::{RECONNECTED, ROUND};
 use topics::Memory;
 
 /// How gateway, network and listener are, as the seed has it.
@@ -49,6 +54,8 @@ pub(crate) struct Terms {
     pub(crate) clocks: Stamp,
     /// Gateway and listener have a key.
     pub(crate) has_key: bool,
+    /// Gateway and listener are bridges, and a router is between them.
+    pub(crate) are_bridges: bool,
     /// With a key: so much the wall clock of the listener's machine is ahead of the hub's, in ns.
     ahead_ns: i64,
 }
@@ -66,6 +73,7 @@ impl Terms {
             delay_ns: random.u64(50..20_000) * MICROS,
             clocks: Stamp { monotonic_ns: random.u64(1..1 << 50), wall_ns: random.u64(1 << 60..1 << 61) },
             has_key: actions::have_key(&plan.actions),
+            are_bridges: actions::are_bridges(&plan.actions),
             ahead_ns: random.i64(-2_000_000_000..2_000_000_000),
         }
     }
@@ -108,6 +116,8 @@ pub(crate) struct Remote {
     gateway_stalled_until: Nanos,
     listener_stalled_until: Nanos,
     network: Network,
+    /// Instead of a network, if they are bridges.
+    router: Option<Router>,
     faults: Faults,
     /// So many partitions last.
     partitions: usize,
@@ -138,6 +148,7 @@ impl Remote {
             gateway_stalled_until: 0,
             listener_stalled_until: 0,
             network: Network::new(seed, faults),
+            router: terms.are_bridges.then(|| Router::new(seed, terms.delay_ns)),
             faults,
             partitions: 0,
             refusal: 0.0,
@@ -166,6 +177,7 @@ impl Remote {
         let now = shared.clock.get();
         if !is_killed {
             gateway.announce(shared, now, &mut self.uplink(shared, now));
+            self.hand(shared, &mut gateway, now);
         }
         gateway.leave(shared, is_killed, false);
     }
@@ -174,6 +186,7 @@ impl Remote {
     pub(crate) fn begin_listener(&mut self, shared: &Shared) {
         if self.listener.is_none() {
             self.listeners += 1;
+            self.router.iter_mut().for_each(|router| router.meet(shared.clock.get()));
             self.listener =
                 Some(Listener::begin(shared, &self.terms, self.listeners, self.memory.clone(), &self.epochs));
         }
@@ -231,8 +244,40 @@ impl Remote {
     }
 
     fn tell_network(&mut self, now: Nanos) {
+        if let Some(router) = &mut self.router {
+            router.set_link(self.faults.loss, self.faults.delay_ns);
+            return router.cut(self.partitions > 0, now);
+        }
         let loss = if self.partitions > 0 { 1.0 } else { self.faults.loss };
         self.network.set_faults(Faults { loss, ..self.faults }, now);
+    }
+
+    /// The router is killed, with what it holds.
+    pub(crate) fn kill_router(&mut self, now: Nanos) {
+        match &mut self.router {
+            Some(router) => router.kill(now),
+            None => self.part(true, now),
+        }
+    }
+
+    /// And another one is there.
+    pub(crate) fn begin_router(&mut self, shared: &Shared) {
+        let now = shared.clock.get();
+        match &mut self.router {
+            Some(router) => router.begin(now, shared.planted.is(Defect::RouterGivenUp)),
+            None => self.part(false, now),
+        }
+    }
+
+    /// What waits in a bridge goes to its router, as far as there is room.
+    fn hand(&mut self, shared: &Shared, gateway: &mut Gateway, now: Nanos) {
+        while let Some(router) = self.router.as_mut().filter(|router| router.room_at() <= now) {
+            let is_taken = self.refusal <= 0.0 || self.random.f64() >= self.refusal;
+            let Some(bytes) = gateway.hand(shared, now, is_taken) else { return };
+            if is_taken {
+                router.send(now, &bytes);
+            }
+        }
     }
 
     /// The hub woke the consumers of a sensor at `at`.
@@ -244,11 +289,15 @@ impl Remote {
 
     /// When something is due.
     pub(crate) fn next_ns(&self, now: Nanos) -> Nanos {
-        let gateway =
-            self.gateway.as_ref().map(|gateway| gateway.next_ns(now).max(self.gateway_stalled_until));
+        let room_at = self.router.as_ref().map_or(Nanos::MAX, Router::room_at);
+        let gateway = self.gateway.as_ref().map(|gateway| {
+            let handed_at = if gateway.is_waiting() { room_at } else { Nanos::MAX };
+            gateway.next_ns(now).min(handed_at).max(self.gateway_stalled_until)
+        });
         let listener =
             self.listener.as_ref().map(|listener| listener.next_ns().max(self.listener_stalled_until));
-        let all = gateway.into_iter().chain(listener).chain(self.network.next());
+        let came = self.network.next().into_iter().chain(self.router.as_ref().and_then(Router::next));
+        let all = gateway.into_iter().chain(listener).chain(came);
         all.fold(self.robot.next_ns(&self.terms, now), Nanos::min)
     }
 
@@ -260,6 +309,7 @@ impl Remote {
             if gateway.next_ns(now) <= now {
                 gateway.run(shared, now, &mut self.uplink(shared, now));
             }
+            self.hand(shared, &mut gateway, now);
             self.gateway = Some(gateway);
         }
         self.deliver(shared, now);
@@ -269,7 +319,9 @@ impl Remote {
     /// What came until `now` is the listener's.
     fn deliver(&mut self, shared: &Shared, now: Nanos) {
         let wall_ns = self.wall_ns(shared, now);
-        while let Some(bytes) = self.network.poll(now) {
+        while let Some(bytes) =
+            self.router.as_mut().map_or_else(|| self.network.poll(now), |router| router.poll(now))
+        {
             if self.terms.has_key {
                 self.forger.hear(wall_ns, &bytes);
             }
@@ -292,9 +344,19 @@ impl Remote {
             let uplink = &mut self.uplink(shared, now);
             gateway.run(shared, now, uplink);
             gateway.announce(shared, now, uplink);
+            while let Some(room_at) =
+                self.router.as_ref().map(Router::room_at).filter(|_| gateway.is_waiting())
+                && let Some(at) =
+                    [room_at].into_iter().chain(self.router.as_ref().and_then(Router::next)).min()
+                && at < Nanos::MAX
+            {
+                now = now.max(at);
+                self.hand(shared, &mut gateway, now);
+                self.deliver(shared, now);
+            }
             gateway.leave(shared, false, true);
         }
-        while let Some(at) = self.network.next() {
+        while let Some(at) = self.router.as_ref().map_or_else(|| self.network.next(), Router::next) {
             now = now.max(at);
             self.deliver(shared, now);
         }

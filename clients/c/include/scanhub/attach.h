@@ -49,6 +49,8 @@ extern "C" {
 #define SCANHUB_TOPIC_BACKGROUND 6 /* struct scanhub_background_v2 */
 #define SCANHUB_TOPIC_STATUS 7     /* struct scanhub_status_v2 */
 #define SCANHUB_TOPIC_LINES 8      /* struct scanhub_lines_v2 */
+#define SCANHUB_TOPIC_MOTION 9     /* struct scanhub_motion_v2 */
+#define SCANHUB_TOPIC_EARLY 10     /* struct scanhub_early_v2 */
 
 /* How scanhub_wait waits. */
 #define SCANHUB_WAIT_DOORBELL 0 /* at a word in the hub's memory, at which one call wakes all: what to take if in doubt */
@@ -164,6 +166,28 @@ struct scanhub_lines_v2 {
     struct scanhub_corner_v2 corner_array[64];
 };
 
+/* How a step was found. */
+#define SCANHUB_METHOD_FIRST 0   /* it is the first scan: there is no step */
+#define SCANHUB_METHOD_REFUSED 1 /* neither step nor place are known, and so with every number that is not here */
+#define SCANHUB_METHOD_BEAMS 2
+#define SCANHUB_METHOD_POINTS 3
+#define SCANHUB_METHOD_LINES 4
+#define SCANHUB_METHOD_BOTH 5
+
+struct scanhub_motion_v2 {
+    double x_m; /* the sum of all steps: ahead of where the robot was at the start */
+    double y_m;
+    double yaw_rad;
+    float dx_m; /* the step since the scan before: ahead */
+    float dy_m;
+    float dyaw_rad;
+    float covariance[9]; /* of the step, row by row */
+    float overlap;       /* share of the readings that lie on the scan before */
+    uint8_t method;
+    uint8_t flags;   /* 1 the surroundings leave a direction open */
+    uint16_t breaks; /* steps that were refused since the start */
+};
+
 struct scanhub_zone_v2 {
     uint16_t radius_mm;
     uint16_t beams;   /* that met something inside */
@@ -186,6 +210,16 @@ struct scanhub_zones_v2 {
     uint8_t flags;         /* 1: fewer scans were seen than a violation takes */
     uint8_t reserved;
     struct scanhub_zone_v2 zone_array[8]; /* the largest first */
+};
+
+/* A warning by a telegram that was not complete. The zones of the same number confirm it. */
+struct scanhub_early_v2 {
+    uint8_t verdict;      /* SCANHUB_VERDICT_SLOW or SCANHUB_VERDICT_STOP */
+    uint8_t flags;        /* 1 withdrawn: what was said under this number does not hold */
+    uint16_t beam;        /* of the nearest point so far */
+    uint32_t distance_mm; /* of that, from the robot's centre */
+    uint16_t bytes_seen;  /* of the telegram */
+    uint16_t beams_seen;  /* of the scan */
 };
 
 struct scanhub_segment_v2 {
@@ -573,9 +607,14 @@ SCANHUB_SIZE(scanhub_corner_v2, 12);
 SCANHUB_SIZE(scanhub_lines_v2, 3340);
 SCANHUB_AT(scanhub_lines_v2, line_array, 12);
 SCANHUB_AT(scanhub_lines_v2, corner_array, 2572);
+SCANHUB_SIZE(scanhub_motion_v2, 80);
+SCANHUB_AT(scanhub_motion_v2, covariance, 36);
+SCANHUB_AT(scanhub_motion_v2, method, 76);
 SCANHUB_SIZE(scanhub_zone_v2, 8);
 SCANHUB_SIZE(scanhub_zones_v2, 76);
 SCANHUB_AT(scanhub_zones_v2, zone_array, 12);
+SCANHUB_SIZE(scanhub_early_v2, 12);
+SCANHUB_AT(scanhub_early_v2, distance_mm, 4);
 SCANHUB_SIZE(scanhub_segment_v2, 16);
 SCANHUB_SIZE(scanhub_foreground_v2, 16);
 SCANHUB_SIZE(scanhub_background_v2, 32);

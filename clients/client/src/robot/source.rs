@@ -26,6 +26,8 @@ pub struct RobotSource {
     whose: Whose,
     /// When it is asked which sensors there are, if anybody publishes.
     call_at: Option<Instant>,
+    /// Early warnings count too.
+    early: bool,
 }
 
 /// Where the sensors come from.
@@ -67,9 +69,18 @@ impl RobotSource {
             nobody: Freshness::new(clock::now()),
             whose: if sensors.is_empty() { Whose::All(None) } else { Whose::Named },
             call_at: None,
+            early: false,
         };
         sensors.iter().for_each(|sensor| source.follow(sensor));
         source
+    }
+
+    /// Takes early warnings too: one makes the verdict worse until the zones of its scan are there, or until it is withdrawn.
+    pub fn with_early(self) -> RobotSource {
+        let RobotSource { robot, parts, .. } = self;
+        let names = robot.sensors().map(|(sensor, _)| sensor);
+        let parts = parts.into_iter().zip(names).map(|(part, sensor)| part.with_early(sensor)).collect();
+        RobotSource { parts, robot, early: true, ..self }
     }
 
     /// Returns what is known.
@@ -182,7 +193,8 @@ impl RobotSource {
 
     fn follow(&mut self, sensor: &str) {
         self.robot.expect(sensor);
-        self.parts.push(ZonesSource::new(sensor));
+        let part = ZonesSource::new(sensor);
+        self.parts.push(if self.early { part.with_early(sensor) } else { part });
     }
 }
 

@@ -2,7 +2,7 @@
 //! believed from an announcement on that was sent just now by our own clock; from then on numbers only go forward. Refuses
 //! to know where the epochs are kept.
 
-use std::collections::HashMap;
+use std::collections::{HashMap, VecDeque};
 
 use schema::datagram::{Announce, Datagram, DatagramError, Head, StreamStats};
 
@@ -12,13 +12,19 @@ use crate::Key;
 pub(super) struct Guard {
     key: Key,
     epochs: HashMap<u64, u32>,
+    /// The hubs of these, the one that has been known for longest first.
+    order: VecDeque<u64>,
     is_changed: bool,
 }
 
 impl Guard {
-    /// With the `epochs` of gateways that were heard before.
+    /// With the `epochs` of gateways that were heard before, of too many the greatest.
     pub(super) fn new(key: Key, epochs: HashMap<u64, u32>) -> Guard {
-        Guard { key, epochs, is_changed: false }
+        let mut known: Vec<_> = epochs.into_iter().collect();
+        known.sort_unstable_by_key(|&(hub, epoch)| (epoch, hub));
+        let known = known.split_off(known.len().saturating_sub(GATEWAYS));
+        let order = known.iter().map(|&(hub, _)| hub).collect();
+        Guard { key, epochs: known.into_iter().collect(), order, is_changed: false }
     }
 
     /// Whether `datagram`, which was read from `bytes` and came at `wall_ns`, is to be believed; `stats` is what was taken
@@ -53,11 +59,22 @@ impl Guard {
         head.topic == Announce::NUMBER && wall_ns.abs_diff(head.stamp_ns) <= FIRST_WITHIN_NS
     }
 
-    /// Something of this life of `hub` was taken.
+    /// Something of this life of `hub` was taken. Whoever has the key may be as many gateways as he likes: of too many the one
+    /// is forgotten that has been known for longest.
     pub(super) fn note(&mut self, hub: u64, epoch: u32) {
-        let greatest = self.epochs.entry(hub).or_default();
-        self.is_changed |= epoch > *greatest;
-        *greatest = epoch.max(*greatest);
+        if let Some(greatest) = self.epochs.get_mut(&hub) {
+            self.is_changed |= epoch > *greatest;
+            *greatest = epoch.max(*greatest);
+            return;
+        }
+        if self.order.len() == GATEWAYS
+            && let Some(first) = self.order.pop_front()
+        {
+            self.epochs.remove(&first);
+        }
+        self.order.push_back(hub);
+        self.epochs.insert(hub, epoch);
+        self.is_changed = true;
     }
 
     /// The epochs, if there is a greater one since this was asked last.
@@ -68,6 +85,8 @@ impl Guard {
 
 /// The first announcement of a sensor is stamped by a clock that differs from ours by no more.
 const FIRST_WITHIN_NS: u64 = 5_000_000_000;
+/// The most gateways whose epochs are known. A recording of one that is forgotten is refused by its time.
+pub const GATEWAYS: usize = 1024;
 
 #[cfg(test)]
 mod tests {
@@ -178,6 +197,19 @@ mod tests {
             (None, true)
         );
         assert_eq!(receive(&mut next, &zones(7, 0), 102), Some(DatagramError::Epoch));
+    }
+
+    #[test]
+    fn whoever_has_the_key_cannot_fill_the_memory() {
+        let mut guard = Guard::new(key(), (0..2000).map(|hub| (hub, 2000 - hub as u32)).collect());
+        assert_eq!(guard.take_changed(), None);
+        (10_000..10_001).for_each(|hub| guard.note(hub, 1));
+        let known = guard.take_changed().unwrap();
+        assert_eq!((known.len(), known.get(&0), known.get(&1023)), (GATEWAYS, Some(&2000), None));
+        (20_000..100_000).for_each(|hub| guard.note(hub, 1));
+        let known = guard.take_changed().unwrap();
+        assert_eq!((known.len(), known.contains_key(&99_999)), (GATEWAYS, true));
+        assert_eq!(guard.order.len(), GATEWAYS);
     }
 
     #[test]

@@ -20,7 +20,7 @@ struct Entry {
 
 impl Selection {
     /// What `texts` name, as words of topics (`SENSOR/TOPIC`), with `:every=N` behind it if the samples are to be thinned. Nothing
-    /// named is all sensors, and of these telegrams if `bare`, else all other topics but lines, which cost time only where
+    /// named is all sensors, and of these telegrams if `bare`, else all other topics but lines and motion, which cost time only where
     /// they are followed.
     ///
     /// # Errors
@@ -43,7 +43,7 @@ impl Selection {
         if entries.is_empty() {
             let wanted = |topic: &Topic| match topic {
                 Topic::Telegram => bare,
-                Topic::Lines => false,
+                Topic::Lines | Topic::Motion | Topic::Early => false,
                 _ => !bare,
             };
             let all = Topic::ALL.into_iter().filter(wanted);
@@ -121,10 +121,10 @@ mod tests {
     }
 
     #[test]
-    fn all_but_telegrams_and_lines_or_nothing_but_telegrams() {
+    fn all_but_what_runs_on_demand_or_nothing_but_telegrams() {
         let usual = selection(&[], false).unwrap();
         for topic in Topic::ALL {
-            let is_usual = !matches!(topic, Topic::Telegram | Topic::Lines);
+            let is_usual = !matches!(topic, Topic::Telegram | Topic::Lines | Topic::Motion | Topic::Early);
             assert_eq!(every(&usual, "front", topic), is_usual.then_some(1));
         }
         let bare = selection(&[], true).unwrap();

@@ -3,7 +3,6 @@
 use std::io::{self, Write};
 use std::net::SocketAddr;
 
-use schema::Topic;
 use serde::Serialize;
 
 use super::GatewayLook;
@@ -109,30 +108,8 @@ impl<'a> Report<'a> {
     /// The whole account.
     pub(super) fn account(&mut self, network: &Network) -> Result<(), End> {
         self.wipe()?;
-        for sensor in network.outgoing.account() {
-            for (topic, row) in sensor.used() {
-                let name = topic.map_or("announce", Topic::name);
-                if self.look == GatewayLook::Json {
-                    self.out.json(&Line {
-                        class: "lan",
-                        hub: id(network),
-                        epoch: network.life.epoch,
-                        sensor: &sensor.name,
-                        topic: name,
-                        sent: row.sent,
-                        send_failed: row.failed,
-                        bytes: row.bytes,
-                        missed: row.missed,
-                    })?;
-                } else {
-                    self.out.line(|line| {
-                        write!(line, "{}/{name}: {} sent, ", sensor.name, row.sent)?;
-                        write!(line, "{} failed, {} bytes", row.failed, row.bytes)?;
-                        if row.missed > 0 { write!(line, ", {} missed", row.missed) } else { Ok(()) }
-                    })?;
-                }
-            }
-        }
+        let json = self.look == GatewayLook::Json;
+        forward::account(&network.outgoing, &network.life, "lan", json, &mut self.out)?;
         if network.outgoing.unfit() > 0 && self.look != GatewayLook::Json {
             let longest = network.outgoing.longest();
             self.out.line(|line| {
@@ -235,20 +212,6 @@ struct Begin<'a> {
     key: Option<&'a str>,
     longest: usize,
     renumbered: bool,
-}
-
-/// Class `lan`.
-#[derive(Serialize)]
-struct Line<'a> {
-    class: &'static str,
-    hub: String,
-    epoch: u32,
-    sensor: &'a str,
-    topic: &'static str,
-    sent: u64,
-    send_failed: u64,
-    bytes: u64,
-    missed: u64,
 }
 
 /// Class `lan_to`.

@@ -1,10 +1,10 @@
-//! The classes of the results that the hub computes from a scan: marks, lines, zones, foreground. A contract, like its parent
+//! The classes of the results that the hub computes from a scan: marks, lines, motion, zones, foreground. A contract, like its parent
 //! module.
 
 use scanhub_client::{Heard, Robot};
 use schema::{
-    Corner, Foreground, Header, Line as StraightLine, Lines, Mark, Marks, ROBOT, Segment, Verdict, Zone,
-    Zones, in_degrees,
+    Corner, Early, Foreground, Header, Line as StraightLine, Lines, Mark, Marks, Motion, ROBOT, Segment,
+    Verdict, Zone, Zones, in_degrees,
 };
 use serde::{Serialize, Serializer};
 
@@ -57,6 +57,73 @@ pub(crate) fn lines<'a>(sensor: &'a str, header: &Header, lines: &'a Lines) -> i
         overflow: lines.is_overflow(),
         lines: lines.lines(),
         corners: lines.corners(),
+        flags: Words::of(header),
+    }
+}
+
+/// Class `motion`; what is not known is null.
+pub(crate) fn motion<'a>(sensor: &'a str, header: &Header, motion: &Motion) -> impl Serialize + 'a {
+    #[derive(Serialize)]
+    struct Line<'a> {
+        #[serde(flatten)]
+        stamp: Stamp<'a>,
+        dx_m: Option<f64>,
+        dy_m: Option<f64>,
+        dyaw_deg: Option<f64>,
+        covariance: Option<[f32; 9]>,
+        overlap: Option<f64>,
+        method: &'static str,
+        x_m: Option<f64>,
+        y_m: Option<f64>,
+        yaw_deg: Option<f64>,
+        degenerate: bool,
+        breaks: u16,
+        #[serde(flatten)]
+        flags: Words,
+    }
+    let of_step = |value: f32| motion.has_step().then(|| millionths(value));
+    let of_pose = |value: f64| motion.has_pose().then(|| millionths(value));
+    Line {
+        stamp: Stamp::new("motion", sensor, header),
+        dx_m: of_step(motion.dx_m),
+        dy_m: of_step(motion.dy_m),
+        dyaw_deg: motion.has_step().then(|| in_degrees(motion.dyaw_rad.into())),
+        covariance: motion.has_step().then_some(motion.covariance),
+        overlap: of_step(motion.overlap),
+        method: motion.how().name(),
+        x_m: of_pose(motion.x_m),
+        y_m: of_pose(motion.y_m),
+        yaw_deg: motion.has_pose().then(|| in_degrees(motion.yaw_rad)),
+        degenerate: motion.is_degenerate(),
+        breaks: motion.breaks,
+        flags: Words::of(header),
+    }
+}
+
+/// Class `early`.
+pub(crate) fn early<'a>(sensor: &'a str, header: &Header, early: &Early) -> impl Serialize + use<'a> {
+    #[derive(Serialize)]
+    struct Line<'a> {
+        #[serde(flatten)]
+        stamp: Stamp<'a>,
+        verdict: &'static str,
+        beam: u16,
+        distance_mm: u32,
+        bytes_seen: u16,
+        beams_seen: u16,
+        #[serde(skip_serializing_if = "std::ops::Not::not")]
+        withdrawn: bool,
+        #[serde(flatten)]
+        flags: Words,
+    }
+    Line {
+        stamp: Stamp::new("early", sensor, header),
+        verdict: early.verdict().name(),
+        beam: early.beam,
+        distance_mm: early.distance_mm,
+        bytes_seen: early.bytes_seen,
+        beams_seen: early.beams_seen,
+        withdrawn: early.is_withdrawn(),
         flags: Words::of(header),
     }
 }

@@ -1,9 +1,11 @@
 //! The greatest epochs of the gateways that had the key, over restarts of the listener: what an older life sent is not
 //! believed again. Losing the file loses no more than that. Refuses to know how they were learned.
 
+use std::cmp::Reverse;
 use std::collections::HashMap;
 
 use lan::Key;
+use lan::incoming::GATEWAYS;
 use schema::{Failure, StateDirectory};
 
 /// The file in which they are kept; nothing where there is no place for one.
@@ -26,7 +28,7 @@ impl Epochs {
         Ok(text.unwrap_or_default().lines().filter_map(parse).collect())
     }
 
-    /// Keeps `epochs`, and what another listener kept meanwhile.
+    /// Keeps `epochs`, and what another listener kept meanwhile, of too many those.
     ///
     /// As [`StateDirectory::lock`] and [`StateDirectory::write`].
     pub(super) fn keep(&self, epochs: &HashMap<u64, u32>) -> Result<(), Failure> {
@@ -39,6 +41,10 @@ impl Epochs {
             let kept = all.entry(hub).or_default();
             *kept = epoch.max(*kept);
         }
+        let mut all: Vec<_> = all.into_iter().collect();
+        // Those that this listener knows, and of the others the youngest lives.
+        all.sort_unstable_by_key(|&(hub, epoch)| (!epochs.contains_key(&hub), Reverse(epoch), hub));
+        all.truncate(GATEWAYS);
         let mut lines: Vec<String> = all.iter().map(|(hub, epoch)| format!("{hub:016x} {epoch}\n")).collect();
         lines.sort_unstable();
         state.write(&self.name, &lines.concat())
@@ -71,6 +77,20 @@ mod tests {
             }
         });
         assert_eq!(epochs().read().unwrap().len(), 80);
+        std::fs::remove_dir_all(&root).unwrap();
+    }
+
+    #[test]
+    fn no_more_are_kept_than_a_listener_knows() {
+        let root = std::env::temp_dir().join(format!("scanhub-epochs-many-{}", std::process::id()));
+        let epochs = Epochs::of(&Key::new(&[1; 32]), Some(StateDirectory::at(&root)));
+        let many = |from: u64, count: u64| (from..from + count).map(|hub| (hub, hub as u32 + 1)).collect();
+        epochs.keep(&many(0, GATEWAYS as u64)).unwrap();
+        epochs.keep(&many(50_000, 10)).unwrap();
+        epochs.keep(&HashMap::from([(7, 1)])).unwrap();
+        let kept = epochs.read().unwrap();
+        assert_eq!((kept.len(), kept.contains_key(&10)), (GATEWAYS, false), "the oldest lives are forgotten");
+        assert_eq!((kept.get(&7), kept.get(&50_009)), (Some(&1), Some(&50_010)));
         std::fs::remove_dir_all(&root).unwrap();
     }
 

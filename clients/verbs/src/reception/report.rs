@@ -190,12 +190,20 @@ impl<'a> Report<'a> {
         }
         for row in stats.rows() {
             let sensor = peers.row_name(row.hub, row.epoch, row.sensor);
-            if self.words.tells_replaced {
-                let replaced = peers.replaced(row.hub, row.epoch, row.sensor, row.topic);
-                self.out.json(&Bridge::new(row, &sensor, self.words.row, replaced))?;
-            } else {
-                self.out.json(&Lan::new(row, &sensor, self.words.row, self.key.is_some()))?;
-            }
+            let replaced = peers.replaced(row.hub, row.epoch, row.sensor, row.topic);
+            self.out.json(&Counted {
+                class: self.words.row,
+                hub: row.hub,
+                epoch: row.epoch,
+                sensor: &sensor,
+                topic: topic(row),
+                received: row.received,
+                lost: row.lost(),
+                duplicate: row.duplicate,
+                reordered: row.reordered,
+                authenticated: (!self.words.tells_replaced).then_some(self.key.is_some()),
+                replaced: self.words.tells_replaced.then_some(replaced),
+            })?;
         }
         self.out.json(&Sums::new(stats.given_up(), self.words.given_up))?;
         self.out.json(&Refused { class: self.words.refused, reasons: Reasons { stats, others } })
@@ -242,9 +250,9 @@ impl<'a> Report<'a> {
     }
 }
 
-/// Class `bridge` of what comes.
+/// Class `lan` or `bridge` of what comes.
 #[derive(Serialize)]
-struct Bridge<'a> {
+struct Counted<'a> {
     class: &'static str,
     #[serde(serialize_with = "id")]
     hub: u64,
@@ -255,57 +263,12 @@ struct Bridge<'a> {
     lost: u64,
     duplicate: u64,
     reordered: u64,
-    replaced: Option<u32>,
-}
-
-impl<'a> Bridge<'a> {
-    fn new(row: &Row, sensor: &'a str, class: &'static str, replaced: Option<u32>) -> Bridge<'a> {
-        Bridge {
-            class,
-            hub: row.hub,
-            epoch: row.epoch,
-            sensor,
-            topic: topic(row),
-            received: row.received,
-            lost: row.lost(),
-            duplicate: row.duplicate,
-            reordered: row.reordered,
-            replaced,
-        }
-    }
-}
-
-/// Class `lan`.
-#[derive(Serialize)]
-struct Lan<'a> {
-    class: &'static str,
-    #[serde(serialize_with = "id")]
-    hub: u64,
-    epoch: u32,
-    sensor: &'a str,
-    topic: &'static str,
-    received: u64,
-    lost: u64,
-    duplicate: u64,
-    reordered: u64,
-    authenticated: bool,
-}
-
-impl<'a> Lan<'a> {
-    fn new(row: &Row, sensor: &'a str, class: &'static str, authenticated: bool) -> Lan<'a> {
-        Lan {
-            class,
-            hub: row.hub,
-            epoch: row.epoch,
-            sensor,
-            topic: topic(row),
-            received: row.received,
-            lost: row.lost(),
-            duplicate: row.duplicate,
-            reordered: row.reordered,
-            authenticated,
-        }
-    }
+    /// Of datagrams, which may have a MAC.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    authenticated: Option<bool>,
+    /// Of a bridge: as its sender announced it, if it did.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    replaced: Option<Option<u32>>,
 }
 
 /// Class `lan_refused` or `bridge_refused`.

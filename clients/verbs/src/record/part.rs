@@ -307,7 +307,7 @@ const INDEX_OF_CHANNEL: usize = 24;
 const END_OF_CHUNK: u64 = 70;
 const END_OF_CHANNEL: u64 = 10;
 const END_OF_TRACK: u64 = 100;
-const END_OF_TOPIC: u64 = 4000;
+const END_OF_TOPIC: u64 = 100 + schema::file::LAYOUT.len() as u64;
 /// Name of the metadata record of a life of the hub, before its first sample.
 const LIFE: &str = "scanhub.life";
 /// Name of the metadata record of samples that were left out.

@@ -3,7 +3,7 @@
 use std::io::{self, Write};
 
 use scanhub_client::{Heard, Robot};
-use schema::{Background, BackgroundHead, Flags, Foreground, Header, Lines, Marks, Verdict};
+use schema::{Background, BackgroundHead, Early, Flags, Foreground, Header, Lines, Marks, Motion, Verdict};
 
 use super::numbers;
 
@@ -49,6 +49,35 @@ pub(crate) fn lines(line: &mut Vec<u8>, header: &Header, lines: &Lines) -> io::R
         write!(line, ", r {r_m:.3} m alpha {alpha_deg:.2} deg")?;
     }
     if lines.is_overflow() { write!(line, ", and more") } else { Ok(()) }
+}
+
+pub(crate) fn motion(line: &mut Vec<u8>, header: &Header, motion: &Motion) -> io::Result<()> {
+    numbers(line, header)?;
+    write!(line, " {}", motion.how())?;
+    if motion.has_step() {
+        let Motion { dx_m, dy_m, dyaw_rad, .. } = motion;
+        let [sd_x, sd_y, sd_yaw] = [0, 4, 8].map(|at| motion.covariance[at].max(0.0).sqrt());
+        write!(line, ", step ({dx_m:.4}, {dy_m:.4}) m {:.3} deg", dyaw_rad.to_degrees())?;
+        write!(line, " +- ({sd_x:.4}, {sd_y:.4}) m {:.3} deg", sd_yaw.to_degrees())?;
+        if motion.is_degenerate() {
+            write!(line, ", a direction is open")?;
+        }
+    }
+    if motion.has_pose() {
+        let Motion { x_m, y_m, yaw_rad, .. } = motion;
+        write!(line, ", at ({x_m:.3}, {y_m:.3}) m {:.2} deg", yaw_rad.to_degrees())?;
+    }
+    if motion.breaks > 0 { write!(line, ", {} steps refused", motion.breaks) } else { Ok(()) }
+}
+
+pub(crate) fn early(line: &mut Vec<u8>, header: &Header, early: &Early) -> io::Result<()> {
+    numbers(line, header)?;
+    let verdict = early.verdict().name();
+    if early.is_withdrawn() {
+        return write!(line, " {verdict} withdrawn");
+    }
+    let Early { beam, distance_mm, bytes_seen, .. } = early;
+    write!(line, " {verdict} {distance_mm} mm, beam {beam}, after {bytes_seen} bytes")
 }
 
 pub(crate) fn zones(line: &mut Vec<u8>, heard: &Heard) -> io::Result<()> {

@@ -9,9 +9,10 @@ use ratatui::widgets::{Block, Clear, Paragraph};
 
 use schema::Counter;
 
+use super::counters::page;
 use super::map::{DOTS, colour, map};
 use super::view::View;
-use scene::{Scene, Sensor, verdict};
+use scene::{Reading, Scene, Sensor, read_out, verdict};
 
 /// Draws `scene` as `view` says, with the picture of `held` if that is there: what there is to act on is never held.
 pub(crate) fn draw(frame: &mut Frame<'_>, scene: &Scene, held: Option<&Scene>, view: &View) {
@@ -24,8 +25,18 @@ pub(crate) fn draw(frame: &mut Frame<'_>, scene: &Scene, held: Option<&Scene>, v
         frame.render_widget(over, place);
     }
     frame.render_widget(heading, places.heading);
-    frame.render_widget(map(held.unwrap_or(scene), view, (places.map.width, places.map.height)), places.map);
-    frame.render_widget(Line::raw(measure(view.dot_m)), last_row(places.map));
+    let pictured = held.unwrap_or(scene);
+    if view.counters {
+        frame.render_widget(Paragraph::new(page(&view.shown(scene), places.map)), places.map);
+    } else {
+        frame.render_widget(map(pictured, view, (places.map.width, places.map.height)), places.map);
+        let measure = measure(view.dot_m);
+        let room = width(places.map).saturating_sub(measure.chars().count() + 2);
+        let said = words(pictured, view, room);
+        let place = right(last_row(places.map), said.chars().count());
+        frame.render_widget(Line::raw(measure), last_row(places.map));
+        frame.render_widget(Line::raw(said), place);
+    }
     for (row, (number, sensor)) in places.sensors.rows().zip(listed(scene, view, places.sensors.height)) {
         frame.render_widget(line(number, sensor, view, row.width), row);
     }
@@ -171,6 +182,29 @@ fn measure(dot_m: f64) -> String {
     format!("|{}| {length} m", "-".repeat(cells - 2))
 }
 
+/// What is under the pointer, if there is one, in at most `room` columns; what has no room is left out whole.
+fn words(scene: &Scene, view: &View, room: usize) -> String {
+    let Some(at) = view.pointer_m else { return String::new() };
+    let shown = view.shown(scene);
+    let read = read_out(shown.iter().map(|(_, sensor)| *sensor), at, NEAR_DOTS * view.dot_m);
+    let (x, y) = read.map_or(at, |reading| (reading.point.x_m, reading.point.y_m));
+    let place = format!("{:.2} m from the robot", x.hypot(y));
+    let mut parts = vec![place, format!(", x {x:.2} y {y:.2}")];
+    if let Some(Reading { sensor, point, angle_rad, range_m }) = read {
+        let angle = angle_rad.to_degrees();
+        parts.push(format!("; {} {angle:.2} deg {range_m:.3} m", sensor.name));
+        parts.extend(point.intensity.map(|intensity| format!(", intensity {intensity}")));
+    }
+    let mut words = String::new();
+    for part in parts {
+        if words.chars().count() + part.chars().count() > room {
+            break;
+        }
+        words += &part;
+    }
+    words
+}
+
 fn help(frame: &mut Frame<'_>, area: Rect) {
     let lines: Vec<Line<'_>> = HELP.lines().map(Line::raw).collect();
     let width = lines.iter().map(Line::width).max().unwrap_or_default() as u16 + 2;
@@ -196,22 +230,26 @@ fn last_row(area: Rect) -> Rect {
 }
 
 const FEW_KEYS: &str = "q quit  ? help";
-const KEYS: &str = "q quit  ? help  +- zoom  tab sensor  fbmz layers  space hold";
+const KEYS: &str = "q quit  ? help  +- zoom  x read  n counters  space hold";
 
 /// What keys do, and what signs mean; narrow enough for 60 columns, low enough for 16 rows.
 const HELP: &str = "\
 + -  arrows hjkl  c   zoom, pan, all of it
 tab  0 1 2 ..         next sensor, all, one of them
 f b m z               foreground, background, marks, zones
+t g i e               trails, grid, intensity, lines
+x, then arrows        read what is there    n counters
 space                 hold the picture
 R  F                  background: reset; freeze, thaw
 ? q Esc Ctrl-C        this help, quit
 
 dots  where a beam ends; small grey ones the background
-o     foreground (coloured: without the o)
-*     reflector mark   ^ 1 2 robot, sensors; ahead is up
+o ,   foreground, its trail (coloured: without the signs)
+* @   reflector mark, corner   ^ 1 2 robot, sensors
 0.60! circle around the robot, in m, with something inside";
 
+/// A point so near to the pointer is read.
+const NEAR_DOTS: f64 = 6.0;
 /// Columns from which a sensor's line says more.
 const WIDE: u16 = 100;
 const LENGTHS_M: [f64; 9] = [0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0];

@@ -98,7 +98,7 @@ fn zones(verdict: Verdict, nearest_mm: u32, violated: [u8; 2]) -> Zones {
 }
 
 /// Two sensors, a person ahead, and one so near behind that the robot has to slow down.
-fn scene() -> Scene {
+pub(super) fn scene() -> Scene {
     let mut scene = Scene { hub_lives: true, hub_pid: 4711, hub_percent: Some(1.234), ..Scene::default() };
     let front = scene.sensor("front");
     see(front, Pose { x_m: 0.3, ..Pose::default() });
@@ -110,7 +110,7 @@ fn scene() -> Scene {
     scene
 }
 
-fn screen(scene: &Scene, view: &View, size: (u16, u16)) -> Buffer {
+pub(super) fn screen(scene: &Scene, view: &View, size: (u16, u16)) -> Buffer {
     screen_held(scene, None, view, size)
 }
 
@@ -124,7 +124,7 @@ fn screen_held(scene: &Scene, held: Option<&Scene>, view: &View, (columns, rows)
     drawn.unwrap().buffer.clone()
 }
 
-fn text(buffer: &Buffer) -> String {
+pub(super) fn text(buffer: &Buffer) -> String {
     let width = usize::from(buffer.area.width);
     let rows = buffer.content.chunks(width);
     let row = |cells: &[ratatui::buffer::Cell]| cells.iter().map(|cell| cell.symbol()).collect::<String>();
@@ -213,6 +213,7 @@ fn colours_are_those_of_the_terminal() {
             Color::Reset,
             Color::DarkGray,
             Color::Magenta,
+            Color::LightMagenta,
             Color::Cyan,
             Color::Red,
             Color::Yellow,
@@ -310,7 +311,10 @@ fn svg(buffer: &Buffer) -> String {
 fn ink(colour: Color) -> &'static str {
     match colour {
         Color::DarkGray => "#a0a0a0",
-        Color::Magenta => "#b0208a",
+        Color::Magenta => "#d79ac6",
+        Color::LightMagenta => "#b0208a",
+        Color::Blue => "#3a5fc4",
+        Color::LightBlue => "#6a58c8",
         Color::Cyan => "#0a8a9a",
         Color::Red => "#c81e1e",
         Color::Yellow => "#b07800",

@@ -1,6 +1,9 @@
 //! The robot from above: what its sensors see, as Braille dots; ahead is up. Without colours, another sign replaces
 //! each colour.
 
+#[cfg(all(test, feature = "web"))]
+mod same;
+
 use ratatui::style::Color;
 use ratatui::symbols::Marker;
 use ratatui::text::Line;
@@ -22,6 +25,9 @@ pub(crate) fn map(scene: &Scene, view: &View, cells: (u16, u16)) -> Canvas<'stat
     let (up, right) = (view.centre_m.0, -view.centre_m.1);
     let (x, y) = ([right - aside, right + aside], [up - ahead, up + ahead]);
     let mut layers = Layers::new(scene, view);
+    if view.grid {
+        layers.rule(x, y, view.dot_m);
+    }
     layers.snap(&Grid { x, y, cells, dot_m: view.dot_m });
     Canvas::default()
         .marker(Marker::Braille)
@@ -73,8 +79,15 @@ struct Layers {
     robot: Option<(f64, f64)>,
     background: Dots,
     circles: Vec<Circle>,
-    walls: Dots,
+    /// Where beams ended, by how much came back.
+    walls: [Dots; SHADES.len()],
+    trails: Dots,
     foreground: Dots,
+    lines: Dots,
+    corners: Dots,
+    grid: Dots,
+    axes: Dots,
+    pointer: Option<(f64, f64)>,
     marks: Dots,
     /// Sensors by their numbers from 1.
     sensors: Vec<(f64, f64, String)>,
@@ -96,28 +109,56 @@ impl Layers {
             robot: Some((0.0, 0.0)),
             background: Vec::new(),
             circles: around.iter().map(|circle| dotted(circle, view.dot_m)).collect(),
-            walls: Vec::new(),
+            walls: Default::default(),
+            trails: Vec::new(),
             foreground: Vec::new(),
+            lines: Vec::new(),
+            corners: Vec::new(),
+            grid: Vec::new(),
+            axes: Vec::new(),
+            pointer: view.pointer_m.map(turned),
             marks: Vec::new(),
             sensors: Vec::new(),
         };
         for (number, sensor) in shown {
             for point in sensor.points() {
+                let shade = point.intensity.filter(|_| view.intensity).map(|value| sensor.shade(value));
+                let wall = shade.map_or(0, |shade| 1 + (shade * 3.999) as usize);
                 let is_foreground = point.is_foreground && view.foreground;
-                let dots = if is_foreground { &mut layers.foreground } else { &mut layers.walls };
-                dots.push((-point.y_m, point.x_m));
+                let dots = if is_foreground { &mut layers.foreground } else { &mut layers.walls[wall] };
+                dots.push(turned((point.x_m, point.y_m)));
             }
-            let turned = |points: Dots| points.into_iter().map(|(x, y)| (-y, x));
+            if view.trails && view.foreground {
+                layers.trails.extend(sensor.trail.points().map(turned));
+            }
             if view.background {
-                layers.background.extend(turned(sensor.background_points()));
+                layers.background.extend(sensor.background_points().into_iter().map(turned));
             }
             if view.marks {
-                layers.marks.extend(turned(sensor.mark_points()));
+                layers.marks.extend(sensor.mark_points().into_iter().map(turned));
+            }
+            if let Some(found) = sensor.lines.as_ref().filter(|_| view.lines) {
+                layers.lines.extend(found.lines().iter().flat_map(|line| dots_of(line, view.dot_m)));
+                let corners = found.corners().iter().map(|corner| (corner.x_m.into(), corner.y_m.into()));
+                layers.corners.extend(corners.map(turned));
             }
             let pose = sensor.pose;
             layers.sensors.push((-pose.y_m, pose.x_m, (number + 1).to_string()));
         }
         layers
+    }
+
+    /// Draws crossings of a grid in metres and dotted axes, from `x` to `y`.
+    fn rule(&mut self, x: [f64; 2], y: [f64; 2], dot_m: f64) {
+        let step = grid_step_m(dot_m);
+        let ticks = |[from, to]: [f64; 2], step: f64| {
+            let (first, last) = ((from / step).ceil() as i32, (to / step).floor() as i32);
+            (first..=last).map(move |n| f64::from(n) * step)
+        };
+        self.grid.extend(ticks(x, step).flat_map(|across| ticks(y, step).map(move |up| (across, up))));
+        let dots = step / (step / (AXIS_DOTS * dot_m)).round();
+        self.axes.extend(ticks(x, dots).map(|across| (across, 0.0)));
+        self.axes.extend(ticks(y, dots).map(|up| (0.0, up)));
     }
 
     /// Moves signs to where the cells of `grid` are.
@@ -126,11 +167,12 @@ impl Layers {
             dots.retain(|dot| grid.has(*dot));
             dots.iter_mut().for_each(|dot| *dot = grid.cell(*dot));
         };
-        snap(&mut self.marks);
+        [&mut self.marks, &mut self.corners, &mut self.grid].into_iter().for_each(snap);
         if !self.colours {
-            snap(&mut self.background);
-            snap(&mut self.foreground);
+            let signs = [&mut self.background, &mut self.foreground, &mut self.trails, &mut self.axes];
+            signs.into_iter().for_each(snap);
         }
+        self.pointer = self.pointer.filter(|at| grid.has(*at)).map(|at| grid.cell(at));
         self.robot = self.robot.filter(|at| grid.has(*at)).map(|at| grid.cell(at));
         self.sensors.retain(|(x, y, _)| grid.has((*x, *y)));
         let labels = self.circles.iter_mut().filter_map(|circle| circle.label.as_mut());
@@ -143,18 +185,31 @@ impl Layers {
         let colour = |colour| if self.colours { colour } else { Color::Reset };
         let draw = |context: &mut Context, coords: &Dots, color| context.draw(&Points { coords, color });
         if !self.colours {
-            context.marker(Marker::Custom('.'));
+            context.marker(Marker::Custom(':'));
         }
+        draw(context, &self.axes, colour(Color::DarkGray));
+        context.marker(Marker::Custom('+'));
+        draw(context, &self.grid, colour(Color::DarkGray));
+        context.marker(if self.colours { Marker::Braille } else { Marker::Custom('.') });
         draw(context, &self.background, colour(Color::DarkGray));
         context.marker(Marker::Braille);
         for circle in &self.circles {
             draw(context, &circle.dots, colour(circle.colour));
         }
-        draw(context, &self.walls, Color::Reset);
+        for (walls, ink) in self.walls.iter().zip(SHADES) {
+            draw(context, walls, colour(ink));
+        }
+        draw(context, &self.lines, colour(Color::LightBlue));
+        if !self.colours {
+            context.marker(Marker::Custom(','));
+        }
+        draw(context, &self.trails, colour(Color::Magenta));
         if !self.colours {
             context.marker(Marker::Custom('o'));
         }
-        draw(context, &self.foreground, colour(Color::Magenta));
+        draw(context, &self.foreground, colour(Color::LightMagenta));
+        context.marker(Marker::Custom('@'));
+        draw(context, &self.corners, colour(Color::LightBlue));
         context.marker(Marker::Custom('*'));
         draw(context, &self.marks, colour(Color::Cyan));
         // Labels take over the colour of what is below them, unless they have one.
@@ -170,7 +225,23 @@ impl Layers {
         for (x, y, number) in &self.sensors {
             print(*x, *y, number, Color::Reset);
         }
+        if let Some((x, y)) = self.pointer {
+            print(x, y, "X", Color::Reset);
+        }
     }
+}
+
+/// To the right and up, of metres ahead and to the left.
+fn turned((x, y): (f64, f64)) -> (f64, f64) {
+    (-y, x)
+}
+
+/// `line` from end to end, dot by dot.
+fn dots_of(line: &schema::Line, dot_m: f64) -> Dots {
+    let [x1, y1, x2, y2] = [line.x1_m, line.y1_m, line.x2_m, line.y2_m].map(f64::from);
+    let steps = ((x2 - x1).hypot(y2 - y1) / dot_m).ceil().clamp(1.0, 2000.0);
+    let at = |n: u32| (x1 + (x2 - x1) * f64::from(n) / steps, y1 + (y2 - y1) * f64::from(n) / steps);
+    (0..=steps as u32).map(at).map(turned).collect()
 }
 
 /// `circle` as a dotted line, from the top on.
@@ -187,6 +258,18 @@ fn dotted(circle: &scene::Circle, dot_m: f64) -> Circle {
     }
 }
 
+/// Metres between two crossings of the grid: a round length that is long enough to be counted.
+pub(super) fn grid_step_m(dot_m: f64) -> f64 {
+    STEPS_M.into_iter().find(|step| *step >= GRID_DOTS * dot_m).unwrap_or(50.0)
+}
+
+/// Without an intensity, and from the darkest to the brightest: what the palette has from cold to warm.
+const SHADES: [Color; 5] = [Color::Reset, Color::Blue, Color::Cyan, Color::Green, Color::Yellow];
+const STEPS_M: [f64; 9] = [0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0];
+/// The least between two crossings.
+const GRID_DOTS: f64 = 18.0;
+/// Dots between two of an axis.
+const AXIS_DOTS: f64 = 4.0;
 /// Dots between two of a circle.
 const CIRCLE_DOTS: f64 = 3.0;
 /// Circles of a smaller radius have no room for a label.

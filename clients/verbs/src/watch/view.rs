@@ -2,6 +2,7 @@
 //! keys.
 
 use super::keys::Key;
+use super::map::DOTS;
 use scene::{Scene, Sensor};
 
 /// What is shown.
@@ -19,6 +20,16 @@ pub(crate) struct View {
     pub(crate) background: bool,
     pub(crate) marks: bool,
     pub(crate) zones: bool,
+    pub(crate) trails: bool,
+    pub(crate) grid: bool,
+    /// Points have the colour of what came back.
+    pub(crate) intensity: bool,
+    /// Straight surfaces and corners, which the hub looks for only as long as somebody follows them.
+    pub(crate) lines: bool,
+    /// What is read out, in metres in the robot's frame; arrows move it.
+    pub(crate) pointer_m: Option<(f64, f64)>,
+    /// Counters instead of the picture.
+    pub(crate) counters: bool,
     /// The picture stands still.
     pub(crate) paused: bool,
     pub(crate) help: bool,
@@ -55,6 +66,12 @@ impl View {
             background: true,
             marks: true,
             zones: true,
+            trails: true,
+            grid: true,
+            intensity: true,
+            lines: false,
+            pointer_m: None,
+            counters: false,
             paused: false,
             help: false,
             colours,
@@ -76,6 +93,8 @@ impl View {
         match key {
             Key::Interrupt => return Some(Wish::Interrupt),
             Key::Escape if self.help => self.help = false,
+            Key::Escape if self.pointer_m.is_some() => self.pointer_m = None,
+            Key::Escape if self.counters => self.counters = false,
             Key::Sign('q') | Key::Escape => return Some(Wish::Quit),
             Key::Sign('R') => return Some(Wish::Reset),
             Key::Sign('F') => return Some(Wish::Freeze),
@@ -84,10 +103,14 @@ impl View {
             Key::Sign('+' | '=') => self.zoom(1.0 / ZOOM),
             Key::Sign('-') => self.zoom(ZOOM),
             Key::Sign('c') => self.fits = true,
-            Key::Left | Key::Sign('h') => self.pan(0.0, 1.0),
-            Key::Right | Key::Sign('l') => self.pan(0.0, -1.0),
-            Key::Up | Key::Sign('k') => self.pan(1.0, 0.0),
-            Key::Down | Key::Sign('j') => self.pan(-1.0, 0.0),
+            Key::Sign('x') => {
+                self.pointer_m = if self.pointer_m.is_none() { Some(self.centre_m) } else { None }
+            }
+            Key::Left | Key::Right | Key::Up | Key::Down => self.go(key),
+            Key::Sign('h') => self.pan(0.0, 1.0),
+            Key::Sign('l') => self.pan(0.0, -1.0),
+            Key::Sign('k') => self.pan(1.0, 0.0),
+            Key::Sign('j') => self.pan(-1.0, 0.0),
             Key::Tab => self.choose(self.only.map_or(0, |n| n + 1), scene),
             Key::Sign(digit @ '0'..='9') => {
                 let number = digit as usize - '0' as usize;
@@ -97,6 +120,11 @@ impl View {
             Key::Sign('b') => self.background = !self.background,
             Key::Sign('m') => self.marks = !self.marks,
             Key::Sign('z') => self.zones = !self.zones,
+            Key::Sign('t') => self.trails = !self.trails,
+            Key::Sign('g') => self.grid = !self.grid,
+            Key::Sign('i') => self.intensity = !self.intensity,
+            Key::Sign('e') => self.lines = !self.lines,
+            Key::Sign('n') => self.counters = !self.counters,
             _ => {}
         }
         None
@@ -129,6 +157,21 @@ impl View {
     fn zoom(&mut self, factor: f64) {
         self.fits = false;
         self.dot_m = (self.dot_m * factor).clamp(FINEST_DOT_M, COARSEST_DOT_M);
+    }
+
+    /// An arrow moves what is read out by a cell, or else the picture.
+    fn go(&mut self, arrow: Key) {
+        let (ahead, left) = match arrow {
+            Key::Up => (1.0, 0.0),
+            Key::Down => (-1.0, 0.0),
+            Key::Left => (0.0, 1.0),
+            _ => (0.0, -1.0),
+        };
+        let dot_m = self.dot_m;
+        match &mut self.pointer_m {
+            Some((x, y)) => (*x, *y) = (*x + ahead * DOTS.1 * dot_m, *y + left * DOTS.0 * dot_m),
+            None => self.pan(ahead, left),
+        }
     }
 
     /// By steps ahead and to the left.
@@ -199,6 +242,8 @@ mod tests {
         assert_eq!((view.only, view.shown(&scene)[0].1.name.as_str()), (Some(1), "rear"));
         assert!(!(view.foreground || view.background || view.marks || view.zones));
         assert!(view.paused && view.help);
+        press(&mut view, &scene, "tgien");
+        assert!(!(view.trails || view.grid || view.intensity) && view.lines && view.counters);
         press(&mut view, &scene, "9");
         assert_eq!(view.only, None, "there is no ninth");
     }
@@ -214,6 +259,25 @@ mod tests {
         assert_eq!(press(&mut view, &scene, "F"), Some(Wish::Freeze));
         assert_eq!(view.key(Key::Interrupt, &scene), Some(Wish::Interrupt));
         assert!(view.fits, "and c with it does not mean the picture");
+    }
+
+    #[test]
+    fn arrows_move_what_is_read_out_while_there_is_such() {
+        let (mut view, scene) = (View::new(false), two());
+        view.key(Key::Up, &scene);
+        let moved = view.centre_m;
+        assert!(moved.0 > 0.0, "the picture");
+        press(&mut view, &scene, "x");
+        view.key(Key::Left, &scene);
+        view.key(Key::Down, &scene);
+        let (x, y) = view.pointer_m.unwrap();
+        assert!(
+            (moved.0 - x - 4.0 * view.dot_m).abs() < 1e-9 && (y - 2.0 * view.dot_m).abs() < 1e-9,
+            "a cell"
+        );
+        assert_eq!(view.centre_m, moved);
+        assert_eq!((view.key(Key::Escape, &scene), view.pointer_m), (None, None));
+        assert_eq!(view.key(Key::Escape, &scene), Some(Wish::Quit));
     }
 
     #[test]

@@ -1,18 +1,19 @@
 //! What follows the hub: samples become a scene, and the scene what is put up on the board. Refuses to know who looks at it.
 
-use std::sync::mpsc::Receiver;
+use std::sync::mpsc::{Receiver, TryRecvError};
 use std::time::{Duration, Instant};
 
-use ::web::{Board, ChannelId, Event, messages};
+use ::web::{Board, ChannelId, Event, Playback, Progress, messages};
 use scanhub_client::clock;
 use scanhub_client::streams::{Sample, Session};
 use scene::{Scene, Trouble};
-use schema::{Domain, Header, Topic};
+use schema::{Domain, Header, Topic, Verdict};
 
 use super::{WebOptions, told};
 use crate::follow::{Notice, Sink};
 use crate::names::TopicName;
 use crate::output::{End, Output};
+use crate::picture;
 use crate::receive_stats::ReceiveStats;
 use crate::work::Work;
 
@@ -30,6 +31,11 @@ struct Channels {
 
 pub(super) struct Feeder<'a> {
     options: &'a WebOptions,
+    /// What plays the recording, its channel, and what is there.
+    player: Option<(&'a dyn Playback, ChannelId)>,
+    progress: Option<Progress>,
+    /// When it is put up again though nothing but its place changed.
+    progress_at: Instant,
     board: &'a Board,
     events: Receiver<Event>,
     output: Output<'a>,
@@ -38,15 +44,19 @@ pub(super) struct Feeder<'a> {
     transforms: ChannelId,
     zones: ChannelId,
     marks: ChannelId,
+    lines: ChannelId,
     robot: ChannelId,
     work: Work,
-    /// Of the zones or the marks something came that was not put up.
+    /// Of the zones, the marks or the lines something came that was not put up.
     zones_are_new: bool,
     marks_are_new: bool,
+    lines_are_new: bool,
     poses_are_new: bool,
-    /// The verdict as it was put up, and when it is again.
-    verdict: Vec<u8>,
+    /// The verdict as it was put up, whose it is and whether there is a hub; and when it is put up again.
+    told: (Verdict, Option<String>, bool),
     robot_at: Instant,
+    /// When marks, zones and lines are put up again, at the earliest.
+    marked_at: [Instant; 3],
     status_at: Instant,
     trouble: Option<Trouble>,
     message: Vec<u8>,
@@ -55,6 +65,7 @@ pub(super) struct Feeder<'a> {
 impl<'a> Feeder<'a> {
     pub(super) fn new(
         options: &'a WebOptions,
+        player: Option<&'a dyn Playback>,
         board: &'a Board,
         events: Receiver<Event>,
         output: Output<'a>,
@@ -62,6 +73,9 @@ impl<'a> Feeder<'a> {
         let now = Instant::now();
         Feeder {
             options,
+            player: player.map(|player| (player, board.channel(messages::replay_channel()))),
+            progress: None,
+            progress_at: now,
             board,
             events,
             output,
@@ -70,13 +84,16 @@ impl<'a> Feeder<'a> {
             robot: board.channel(messages::robot_channel()),
             zones: board.channel(messages::zones_channel()),
             marks: board.channel(messages::marks_channel()),
+            lines: board.channel(messages::lines_channel()),
             transforms: board.channel(messages::transforms_channel()),
             work: Work::default(),
             zones_are_new: true,
             marks_are_new: true,
+            lines_are_new: true,
             poses_are_new: true,
-            verdict: Vec::new(),
+            told: (Verdict::Unknown, None, false),
             robot_at: now,
+            marked_at: [now; 3],
             status_at: now,
             trouble: None,
             message: Vec::new(),
@@ -146,20 +163,27 @@ impl<'a> Feeder<'a> {
                 self.board.clear(channels.foreground);
             }
         }
-        (self.zones_are_new, self.marks_are_new) = (true, true);
+        (self.zones_are_new, self.marks_are_new, self.lines_are_new) = (true, true, true);
     }
 
     /// Puts up what is new of all but scans.
     fn put(&mut self, now: Instant) {
         let wall_ns = clock::wall_ns();
         // Of what changes with every scan nobody who is not there misses anything.
-        if self.zones_are_new && self.board.is_watched(self.zones) {
-            self.zones_are_new = false;
+        if now >= self.marked_at[0] && self.zones_are_new && self.board.is_watched(self.zones) {
+            (self.zones_are_new, self.marked_at[0]) = (false, now + MARKS_EVERY);
             self.board.put(self.zones, wall_ns, &messages::zones(&self.scene, wall_ns));
         }
-        if self.marks_are_new && self.board.is_watched(self.marks) {
-            self.marks_are_new = false;
+        if now >= self.marked_at[1] && self.marks_are_new && self.board.is_watched(self.marks) {
+            (self.marks_are_new, self.marked_at[1]) = (false, now + MARKS_EVERY);
             self.board.put(self.marks, wall_ns, &messages::marks(&self.scene, wall_ns));
+        }
+        if now >= self.marked_at[2] && self.lines_are_new && self.board.is_watched(self.lines) {
+            (self.lines_are_new, self.marked_at[2]) = (false, now + MARKS_EVERY);
+            self.board.put(self.lines, wall_ns, &messages::lines(&self.scene, wall_ns));
+        }
+        if !self.board.is_watched(self.lines) {
+            self.scene.forget_lines();
         }
         if std::mem::take(&mut self.poses_are_new) {
             self.board.put(self.transforms, wall_ns, &messages::transforms(&self.scene, wall_ns));
@@ -176,13 +200,29 @@ impl<'a> Feeder<'a> {
         if !self.board.is_watched(self.robot) {
             return;
         }
-        let domain = self.options.places.first().map(Domain::name).unwrap_or_default();
-        let verdict = messages::robot(&self.scene, domain, self.trouble.as_ref());
-        if now >= self.robot_at || verdict != self.verdict {
-            self.board.put(self.robot, wall_ns, &verdict);
-            self.verdict = verdict;
-            self.robot_at = now + ROBOT_EVERY;
+        let (verdict, whose, _) = scene::verdict(self.scene.robot().map(|(_, sensor)| sensor));
+        let told = (verdict, whose.map(str::to_owned), self.scene.hub_lives);
+        if now >= self.robot_at || told != self.told {
+            let domain = self.options.places.first().map(Domain::name).unwrap_or_default();
+            let message = messages::robot(&self.scene, domain, self.trouble.as_ref());
+            self.board.put(self.robot, wall_ns, &message);
+            (self.told, self.robot_at) = (told, now + ROBOT_EVERY);
         }
+    }
+
+    /// Puts up how far the player is, if that is another place or state.
+    fn put_progress(&mut self, now: Instant) {
+        let Some((player, channel)) = self.player else { return };
+        let progress = player.progress();
+        let is_only_later =
+            |before: Progress| Progress { position_s: progress.position_s, ..before } == progress;
+        if self.progress == Some(progress)
+            || (now < self.progress_at && self.progress.is_some_and(is_only_later))
+        {
+            return;
+        }
+        (self.progress, self.progress_at) = (Some(progress), now + PROGRESS_EVERY);
+        self.board.put(channel, clock::wall_ns(), &messages::replay(&progress));
     }
 
     /// Looks at the hub: what it uses, or why there is none.
@@ -211,65 +251,60 @@ impl Sink for Feeder<'_> {
     }
 
     fn sample(&mut self, name: &TopicName, sample: &Sample) -> Result<(), End> {
-        let sensor = self.scene.heard(&name.sensor, sample.header());
+        let pose = self.scene.sensor(&name.sensor).pose;
+        picture::take(&mut self.scene, name, sample);
         match sample {
             Sample::Scan(scan) => {
-                sensor.take_scan(scan.header(), scan, clock::now_ns());
                 self.put_scan(name, scan);
                 self.put_foreground(name);
             }
-            Sample::Marks(marks) => {
-                sensor.marks = marks.is_available().then_some(**marks);
-                self.marks_are_new = true;
-            }
-            Sample::Zones(heard) => {
-                sensor.zones = heard.zones;
-                self.zones_are_new = true;
-            }
+            Sample::Marks(_) => self.marks_are_new = true,
+            Sample::Zones(_) => self.zones_are_new = true,
+            Sample::Lines(_) => self.lines_are_new = true,
             Sample::Foreground(foreground) => {
-                sensor.foreground = Some(foreground.boxed());
                 self.of(&name.sensor).foreground_of = Some(foreground.header().seq);
                 self.put_foreground(name);
             }
-            Sample::Background(model) => {
-                sensor.background = Some(model.boxed());
-                self.put_background(name, model.header().wall_ns, model);
-            }
+            Sample::Background(model) => self.put_background(name, model.header().wall_ns, model),
             Sample::Status(status) => {
-                self.poses_are_new |= sensor.pose != status.pose;
-                sensor.take_status(status);
+                self.poses_are_new |= pose != status.pose;
                 self.status_at = Instant::now();
             }
-            // The picture does not show it.
             _ => {}
         }
         Ok(())
     }
 
     fn notice(&mut self, names: &[&TopicName], notice: Notice) -> Result<(), End> {
-        match (notice, names) {
-            (Notice::Missed(missed), [name]) if name.topic == Topic::Scan => {
-                self.scene.sensor(&name.sensor).lost += missed;
-            }
-            (Notice::HubGone, _) => {
-                self.scene.hub_gone();
-                self.clear();
-                self.status_at = Instant::now();
-            }
-            (Notice::HubBack, _) => self.scene.hub_lives = true,
-            _ => {}
+        picture::note(&mut self.scene, names, notice);
+        if notice == Notice::HubGone {
+            self.clear();
+            self.status_at = Instant::now();
         }
         Ok(())
     }
 
+    /// Lines are wanted as long as a viewer asks for them.
+    fn wants(&self, topic: Topic) -> bool {
+        topic != Topic::Lines || self.board.is_watched(self.lines)
+    }
+
     fn tick(&mut self, now: Instant) -> Result<(), End> {
-        while let Ok(event) = self.events.try_recv() {
-            told::client(&mut self.output, &event, self.options.json)?;
+        loop {
+            match self.events.try_recv() {
+                Ok(event) => told::client(&mut self.output, &event, self.options.json)?,
+                Err(TryRecvError::Empty) => break,
+                // Nobody is served any more; why is known where that thread is waited for.
+                Err(TryRecvError::Disconnected) => return Err(End::ReaderGone),
+            }
         }
-        if self.scene.age(clock::now_ns()) {
+        self.put_progress(now);
+        // What a player shows while it waits stands.
+        if !self.progress.is_some_and(|progress| progress.stands()) && self.scene.age(clock::now_ns()) {
             self.clear();
         }
         self.put(now);
+        self.board.tell();
         Ok(())
     }
 
@@ -278,6 +313,11 @@ impl Sink for Feeder<'_> {
     }
 }
 
-/// A page that hears nothing for half a second takes the verdict for unknown.
-const ROBOT_EVERY: Duration = Duration::from_millis(150);
+/// The same verdict, because a page that hears nothing for half a second takes it for unknown; and a distance that changes
+/// with every scan cannot be read.
+const ROBOT_EVERY: Duration = Duration::from_millis(50);
+/// Nobody sees a player move in smaller steps.
+const PROGRESS_EVERY: Duration = Duration::from_millis(50);
+/// Of several sensors one message has all.
+const MARKS_EVERY: Duration = Duration::from_millis(20);
 const STATUS_EVERY: Duration = Duration::from_millis(500);

@@ -227,7 +227,7 @@ fn all_sensors_and_all_topics() {
         assert_eq!(out.matches(begin).count(), 1, "{out}");
     }
     // One of the front's, all of the rear's, each once.
-    assert_eq!(out.matches(r#"{"class":"summary""#).count(), 1 + 8, "{out}");
+    assert_eq!(out.matches(r#"{"class":"summary""#).count(), 1 + 10, "{out}");
 }
 
 #[test]

@@ -152,7 +152,7 @@ fn rates_of_all_topics() {
         out.lines().any(|line| line.contains(r#""topic":"telegram","hz":null,"jitter_ms":null"#)),
         "{out}"
     );
-    assert_eq!(out.lines().filter(|line| line.contains("summary")).count(), 8);
+    assert_eq!(out.lines().filter(|line| line.contains("summary")).count(), 10);
     let statuses: Vec<_> = out.lines().filter(|line| line.contains(r#""topic":"status""#)).collect();
     let (summary, lines) = statuses.split_last().unwrap();
     // What is handed over at once would be hundreds of thousands a second.

@@ -55,6 +55,29 @@ pub fn zones(scene: &Scene, wall_ns: u64) -> Vec<u8> {
     update(&entities)
 }
 
+/// The lines of the robot's sensors, from end to end, and where two meet.
+pub fn lines(scene: &Scene, wall_ns: u64) -> Vec<u8> {
+    let entities = scene.robot().filter_map(|(_, sensor)| {
+        let found = sensor.lines.as_ref()?;
+        let mut entity = Entity::new(format!("lines {}", sensor.name), wall_ns);
+        entity.tell("sensor", sensor.name.clone());
+        let ends = |line: &schema::Line| [(line.x1_m, line.y1_m), (line.x2_m, line.y2_m)];
+        let point = |(x, y): (f32, f32)| json!({ "x": x, "y": y, "z": 0.0 });
+        entity.lines.push(json!({
+            "type": LINE_LIST, "pose": at(0.0, 0.0), "thickness": 2.0, "scale_invariant": true,
+            "points": found.lines().iter().flat_map(ends).map(point).collect::<Vec<_>>(),
+            "color": LINE, "colors": [], "indices": [],
+        }));
+        let corner = |corner: &schema::Corner| {
+            let size = json!({ "x": CORNER_M, "y": CORNER_M, "z": CORNER_M });
+            json!({ "pose": at(corner.x_m.into(), corner.y_m.into()), "size": size, "color": LINE })
+        };
+        entity.spheres = found.corners().iter().map(corner).collect();
+        Some(entity)
+    });
+    update(&entities.collect::<Vec<_>>())
+}
+
 /// The reflector marks of the robot's sensors.
 pub fn marks(scene: &Scene, wall_ns: u64) -> Vec<u8> {
     let entities = scene.robot().map(|(_, sensor)| {
@@ -143,10 +166,12 @@ fn colour(verdict: Verdict, a: f64) -> serde_json::Value {
 }
 
 const LINE_STRIP: u8 = 0;
+const LINE_LIST: u8 = 2;
 const FLAT_M: f64 = 0.002;
 const MARK_M: f64 = 0.08;
+const CORNER_M: f64 = 0.06;
 
-/// Of a mark.
+/// Of a mark or a line.
 #[derive(Clone, Copy, Serialize)]
 struct Colour {
     r: f64,
@@ -155,4 +180,5 @@ struct Colour {
     a: f64,
 }
 
+const LINE: Colour = Colour { r: 0.45, g: 0.33, b: 0.8, a: 1.0 };
 const MARK: Colour = Colour { r: 0.05, g: 0.55, b: 0.75, a: 1.0 };

@@ -1,4 +1,4 @@
-//! The keys of sections pose, zones, marks, lines and background, and their valid values. Metres, radians and degrees become the
+//! The keys of sections pose, zones, marks, lines, motion, background and early, and their valid values. Metres, radians and degrees become the
 //! units of the processors. Each value is checked in its own source; this file refuses to know which source wins.
 
 use std::ops::{Range, RangeInclusive};
@@ -9,6 +9,8 @@ use schema::{BEAMS, Failure, Family, LINES, ZONES};
 use serde::Deserialize;
 use toml::Spanned;
 
+use super::early::EarlyLayer;
+use super::motion::MotionLayer;
 use crate::origin::Origin;
 use crate::processing::{Background, Processing, START, Zones};
 
@@ -86,6 +88,7 @@ pub(super) struct BackgroundLayer {
 enum MethodLayer {
     Multi,
     Paper,
+    Moving,
     Off,
 }
 
@@ -110,13 +113,15 @@ pub(super) struct Sections {
     pub(super) zones: Option<ZonesLayer>,
     pub(super) marks: Option<MarksLayer>,
     pub(super) lines: Option<LinesLayer>,
+    pub(super) motion: Option<MotionLayer>,
     pub(super) background: Option<BackgroundLayer>,
+    pub(super) early: Option<EarlyLayer>,
 }
 
 impl Sections {
     /// Lays what `origin` says over `processing`.
     pub(super) fn lay(self, origin: &Origin, processing: &mut Processing) -> Result<(), Failure> {
-        let Sections { pose, zones, marks, lines, background } = self;
+        let Sections { pose, zones, marks, lines, motion, background, early } = self;
         if let Some(layer) = pose {
             let pose = &mut processing.pose;
             put(&mut pose.x_m, layer.x, |value| place(origin, "x", value))?;
@@ -156,8 +161,12 @@ impl Sections {
             })?;
             lines.polish = layer.polish.unwrap_or(lines.polish);
         }
+        motion.map_or(Ok(()), |layer| layer.lay(origin, &mut processing.motion))?;
         if let Some(layer) = background {
             layer.lay(origin, &mut processing.background)?;
+        }
+        if let Some(layer) = early {
+            layer.lay(origin, &mut processing.early)?;
         }
         Ok(())
     }
@@ -165,6 +174,9 @@ impl Sections {
     /// [`Kind::Configuration`](schema::Kind::Configuration) if `origin` says here for one link what a scanner of `family` has
     /// not. What is said for all links is for those that have it.
     pub(super) fn check_family(&self, origin: &Origin, family: Family) -> Result<(), Failure> {
+        if let Some(early) = &self.early {
+            early.check_family(origin, family)?;
+        }
         let Some(MarksLayer { i_min, level, .. }) = &self.marks else { return Ok(()) };
         let name = family.name();
         let (foreign, what, remedy) = if family.has_reflector_levels() {
@@ -225,6 +237,7 @@ impl BackgroundLayer {
             learning.method = match method {
                 MethodLayer::Multi => Method::Multi,
                 MethodLayer::Paper => Method::Paper,
+                MethodLayer::Moving => Method::Moving,
                 MethodLayer::Off => learning.method,
             };
         }
@@ -260,7 +273,7 @@ impl BackgroundLayer {
 }
 
 /// Puts what `check` makes of `value` into `field`, if there is a value.
-fn put<T, V>(
+pub(super) fn put<T, V>(
     field: &mut T,
     value: Option<Spanned<V>>,
     check: impl FnOnce(Spanned<V>) -> Result<T, Failure>,
@@ -271,7 +284,7 @@ fn put<T, V>(
     Ok(())
 }
 
-fn within(
+pub(super) fn within(
     origin: &Origin,
     key: &str,
     value: Spanned<f64>,
@@ -285,7 +298,7 @@ fn within(
     Err(origin.refuse(Some(value.span()), format!("{key} = {}", value.get_ref()), remedy))
 }
 
-fn whole<T: TryFrom<i64>>(
+pub(super) fn whole<T: TryFrom<i64>>(
     origin: &Origin,
     key: &str,
     value: Spanned<i64>,

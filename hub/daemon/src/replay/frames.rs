@@ -84,7 +84,7 @@ pub(super) fn play(replay: &mut ReplayLink<'_, '_>, frames: &Frames) -> Option<O
             let at = due.at.max(last_stamp);
             let received = Received {
                 bytes: telegram.bytes(),
-                message: Message { telegram, reply, mode },
+                message: Message { telegram, reply, mode, offset: 0 },
                 first: at.saturating_sub(took),
                 last: at,
                 estimated: header.is_some_and(|header| header.flags & Flags::STAMP_ESTIMATED != 0),

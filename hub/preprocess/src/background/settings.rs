@@ -36,6 +36,9 @@ pub enum Method {
     /// Several surfaces a beam, and neighbours that must agree before something is in the foreground.
     #[default]
     Multi,
+    /// A map of what stands around a robot that moves: what ends in space that was seen free is in the foreground. Each scan
+    /// needs the robot's place, see [`Model::follow`](super::Model::follow).
+    Moving,
 }
 
 /// What the readings of a run are compared with.

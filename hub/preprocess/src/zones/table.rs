@@ -29,6 +29,11 @@ impl Layout {
         Layout { count, unit_um, valid_to, no_return, beyond, first_angle, step, spacing }
     }
 
+    /// Whether scans of so many beams and this unit are of it.
+    pub(super) fn is_of(&self, count: usize, unit_um: u32) -> bool {
+        (self.count, self.unit_um) == (count, unit_um)
+    }
+
     /// Millimetres per device unit; no sensor has a unit of 0.
     fn unit_mm(&self) -> f64 {
         f64::from(self.unit_um.max(1)) / 1000.0
@@ -218,13 +223,19 @@ impl Table {
     pub(super) fn met(&mut self, scan: &Scan) -> Met {
         let ranges = &scan.ranges()[..self.layout.count];
         match scan.exact_angles() {
-            [] => {
-                let inside = std::array::from_fn(|zone| self.inside[zone].count(ranges));
-                let nearest = self.nearest.find(ranges).map(|(beam, square)| self.at_distance(beam, square));
-                Met { inside, nearest }
-            }
+            [] => Met { inside: self.inside(ranges), nearest: self.nearest(ranges) },
             angles => self.met_exactly(ranges, angles),
         }
+    }
+
+    /// Beams whose readings are inside each circle, of the first ones of a scan of the table's layout.
+    pub(super) fn inside(&self, ranges: &[u16]) -> [u16; ZONES] {
+        std::array::from_fn(|zone| self.inside[zone].count(ranges))
+    }
+
+    /// The beam of the nearest point of the same, and its distance from the robot's centre in mm, rounded down.
+    pub(super) fn nearest(&mut self, ranges: &[u16]) -> Option<(u16, u32)> {
+        self.nearest.find(ranges).map(|(beam, square)| self.at_distance(beam, square))
     }
 
     /// Only what is near enough to be inside a circle, or the nearest, is computed.

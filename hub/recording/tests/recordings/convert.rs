@@ -56,7 +56,7 @@ fn an_mcap_file_keeps_all_messages_of_all_channels() {
     let rear = folder.0.join("rear.mcap");
     assert_eq!(converted(&whole, &rear, Some("rear")).unwrap().telegrams, 20);
     let only = messages(&fs::read(&rear).unwrap());
-    assert!(only.len() == 160 && only.iter().all(|(topic, ..)| topic.starts_with("rear/")));
+    assert!(only.len() == 200 && only.iter().all(|(topic, ..)| topic.starts_with("rear/")));
 }
 
 #[test]

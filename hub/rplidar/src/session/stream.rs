@@ -108,7 +108,8 @@ impl Session {
                         return -((due - at) as f64);
                     }
                     // One that waited is late for another reason.
-                    let least = self.reads.arrivals().earliest(end(n), packet_ns / len as f64).unwrap_or(0);
+                    let least =
+                        self.reads.arrivals().earliest(end(n), packet_ns / len as f64, len).unwrap_or(0);
                     least.saturating_sub(packet_time + due) as f64
                 };
                 let before = self.sequence;

@@ -48,10 +48,10 @@ mod tests {
 
     #[test]
     fn descriptors_are_counted_in_consumers() {
-        says(&descriptors(&facts()), State::Ok, &["4096", "996 consumers"]);
+        says(&descriptors(&facts()), State::Ok, &["4096", "990 consumers"]);
         says(&descriptors(&Facts { descriptors: None, ..facts() }), State::Ok, &["no limit"]);
-        says(&descriptors(&Facts { descriptors: Some(128), ..facts() }), State::Warning, &["4 consumers"]);
-        says(&descriptors(&Facts { descriptors: Some(107), ..facts() }), State::Failed, &["needs 110"]);
+        says(&descriptors(&Facts { descriptors: Some(152), ..facts() }), State::Warning, &["4 consumers"]);
+        says(&descriptors(&Facts { descriptors: Some(131), ..facts() }), State::Failed, &["needs 134"]);
     }
 
     #[test]

@@ -28,6 +28,7 @@ mod power_cycle;
 mod reload;
 mod replug_elsewhere;
 mod resync;
+mod router_killed;
 mod silence;
 mod stall;
 mod telegrams;
@@ -105,11 +106,17 @@ pub(crate) const KINDS: &[Kind] = &[
     hold::KIND,
     unwell::KIND,
     deaf::KIND,
+    router_killed::KIND,
 ];
 
 /// Gateway and listener of a world with these actions have a key.
 pub(crate) fn have_key(actions: &[Action]) -> bool {
     actions.iter().any(|action| action.name() == key_errors::KIND.name)
+}
+
+/// Gateway and listener of a world with these actions are bridges, and a router is between them.
+pub(crate) fn are_bridges(actions: &[Action]) -> bool {
+    !have_key(actions) && actions.iter().any(|action| action.name() == router_killed::KIND.name)
 }
 
 /// What `action` does to the bytes on a line from `now` on, if it is of such a kind.

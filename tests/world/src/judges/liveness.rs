@@ -21,8 +21,11 @@ struct OfSensor {
     says_so: bool,
     /// Telegrams of measured values came, and scans.
     came: [bool; 2],
-    /// When the first one of each came.
+    /// When the first one of each came, without the time that the scanner waited for its motor.
     first: [Option<Nanos>; 2],
+    /// When it answered last before that, and when it measured first after that answer.
+    answered_at: Nanos,
+    measured_at: Option<Nanos>,
 }
 
 impl Liveness {
@@ -32,6 +35,8 @@ impl Liveness {
             says_so: false,
             came: [false; 2],
             first: [None; 2],
+            answered_at: 0,
+            measured_at: None,
         };
         Liveness { healed: None, sensors: sensors.iter().map(sensor).collect() }
     }
@@ -53,6 +58,16 @@ impl Judge for Liveness {
                 self.healed = Some(at);
                 self.sensors.iter_mut().for_each(|of| of.came = [false; 2]);
             }
+            Event::Sent { sensor, telegram }
+                if telegram.is_reply && self.sensors[sensor].first[0].is_none() =>
+            {
+                let of = &mut self.sensors[sensor];
+                (of.answered_at, of.measured_at) = (at, None);
+            }
+            Event::Measured { sensor, points } => {
+                let of = &mut self.sensors[sensor];
+                of.measured_at = of.measured_at.or(points.first().map(|first| first.at_ns));
+            }
             Event::Published { sensor, sample } if sample.topic == Topic::Status => {
                 let status: Status = bytemuck::pod_read_unaligned(&sample.bytes);
                 self.sensors[sensor].says_so = status.state() == Some(State::Streaming);
@@ -66,7 +81,10 @@ impl Judge for Liveness {
                     Topic::Scan => 1,
                     _ => return,
                 };
-                of.first[which].get_or_insert(at);
+                if of.first[which].is_none() {
+                    let waited = of.measured_at.unwrap_or(0).saturating_sub(of.answered_at);
+                    of.first[which] = Some(at.saturating_sub(waited));
+                }
                 let is_back = of.says_so && !of.came[which];
                 of.came[which] |= of.says_so;
                 if let Some(healed) = self.healed

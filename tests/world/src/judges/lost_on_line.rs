@@ -23,16 +23,24 @@ struct OfSensor {
     sent: VecDeque<Vec<u8>>,
     /// The last one that was published.
     last: Vec<u8>,
-    /// What the last status counted, if all was known since, and what should have come to that.
+    /// What the last status of this hub counted, and since nothing was missing for a while: what was told, what is missing, and
+    /// how much may lie between.
     counted: Option<u64>,
+    told: u64,
     missing: u64,
     lenience: u64,
-    /// Something came between that nobody can count: another session, a packet that nobody sent.
-    is_broken: bool,
+    /// What was told and missing when the last status came.
+    seen: u64,
+    /// Both did not agree then: of what waited while the hub did not run, and of points without a checksum,
+    /// it is seen afterwards only how much was missing.
+    is_open: bool,
+    /// Something came between that nobody can count: another session, a packet that nobody sent. So many statuses say nothing.
+    unsure: u8,
+    /// Packets were not published for lack of memory.
+    is_lacking: bool,
     measured_at: Nanos,
-    /// What statuses counted in all, and the last one of this hub.
-    told: u64,
-    told_before: u64,
+    /// What statuses counted in all.
+    told_in_all: u64,
 }
 
 impl LostOnLine {
@@ -42,12 +50,15 @@ impl LostOnLine {
             sent: VecDeque::new(),
             last: Vec::new(),
             counted: None,
+            told: 0,
             missing: 0,
             lenience: 0,
-            is_broken: true,
+            seen: 0,
+            is_open: false,
+            unsure: UNSURE,
+            is_lacking: false,
             measured_at: 0,
-            told: 0,
-            told_before: 0,
+            told_in_all: 0,
         };
         LostOnLine { sensors: sensors.iter().map(sensor).collect() }
     }
@@ -59,7 +70,7 @@ impl Judge for LostOnLine {
     }
 
     fn figures(&self) -> Figures {
-        Figures { lost: self.sensors.iter().map(|of| of.told).sum(), ..Figures::default() }
+        Figures { lost: self.sensors.iter().map(|of| of.told_in_all).sum(), ..Figures::default() }
     }
 
     fn note(&mut self, _: Nanos, event: &Event<'_>, say: &mut Say<'_>) {
@@ -69,11 +80,10 @@ impl Judge for LostOnLine {
                 self.sensors[sensor].send(telegram.bytes);
             }
             Event::Exchanged { sensor } => self.sensors[sensor].send(&[]),
-            Event::Opened { sensor, .. } | Event::Retuned { sensor } | Event::Lacking { sensor, .. } => {
-                self.sensors[sensor].is_broken = true
-            }
+            Event::Opened { sensor, .. } | Event::Retuned { sensor } => self.sensors[sensor].unsure = UNSURE,
+            Event::Lacking { sensor, topic: Topic::Telegram } => self.sensors[sensor].is_lacking = true,
             Event::HubBegins { .. } => {
-                self.sensors.iter_mut().for_each(|of| (of.is_broken, of.told_before) = (true, 0));
+                self.sensors.iter_mut().for_each(|of| (of.unsure, of.counted) = (UNSURE, None));
             }
             Event::Published { sensor, sample } if self.sensors[sensor].family.turns() => {
                 let of = &mut self.sensors[sensor];
@@ -85,8 +95,6 @@ impl Judge for LostOnLine {
                     }
                     Topic::Status => {
                         let status: Status = bytemuck::pod_read_unaligned(&sample.bytes);
-                        of.told += status.counters[Counter::LostOnLine].saturating_sub(of.told_before);
-                        of.told_before = status.counters[Counter::LostOnLine];
                         if let Err(words) = of.check(&status) {
                             say.broken(format!("sensor {sensor}: {words}"));
                         }
@@ -117,7 +125,7 @@ impl OfSensor {
         }
         if self.sent.len() > MOST {
             self.sent.pop_front();
-            self.is_broken = true;
+            self.unsure = UNSURE;
         }
     }
 
@@ -126,45 +134,51 @@ impl OfSensor {
             return;
         }
         let Some(missing) = self.sent.iter().position(|sent| sent == unit) else {
-            self.is_broken = true;
+            self.unsure = UNSURE;
             return;
         };
-        self.is_broken |= self.sent.drain(..=missing).any(|sent| sent.is_empty());
+        let is_other = self.sent.drain(..=missing).any(|sent| sent.is_empty());
         self.last.clear();
         self.last.extend_from_slice(unit);
         let missing = missing as u64;
-        if missing > LONGEST_GAP {
-            self.is_broken = true;
+        if std::mem::take(&mut self.is_lacking) || is_other || missing > LONGEST_GAP {
+            self.unsure = UNSURE;
         }
         self.missing += missing;
         // How many fit between two packets is rounded, and a head may change its speed between them.
         let exactness = self.family.exactness(unit);
         let unmarked = if exactness.neighbours > 0 { UNMARKED + missing / 10 } else { 1 };
-        self.lenience += match missing {
-            0 => 0,
-            _ if !exactness.has_clock && missing > SURE => missing,
-            _ => unmarked + missing / 20,
-        };
+        self.lenience += if missing > 0 { unmarked + missing / 20 } else { 0 };
     }
 
     /// What is wrong with what `status` counts.
     fn check(&mut self, status: &Status) -> Result<(), String> {
         let counted = status.counters[Counter::LostOnLine];
-        let is_whole = !self.is_broken && status.state() == Some(State::Streaming);
-        let before = self.counted.replace(counted).filter(|_| is_whole);
-        let (missing, lenience) = (std::mem::take(&mut self.missing), std::mem::take(&mut self.lenience));
-        self.is_broken = status.state() != Some(State::Streaming);
-        match before.map(|before| counted.saturating_sub(before)) {
-            Some(told) if told.abs_diff(missing) > lenience => {
-                Err(format!("{missing} packets are missing, {told} are told"))
-            }
-            _ => Ok(()),
+        let told = counted.saturating_sub(self.counted.replace(counted).unwrap_or(0));
+        self.told_in_all += told;
+        self.told += told;
+        if status.state() != Some(State::Streaming) {
+            self.unsure = UNSURE + 1;
         }
+        let is_sure = self.unsure == 0;
+        self.unsure = self.unsure.saturating_sub(1);
+        let (told, missing) = (self.told, self.missing);
+        let is_still = std::mem::replace(&mut self.seen, told + missing) == told + missing;
+        let agree = told.abs_diff(missing) <= self.lenience;
+        let was_open = std::mem::replace(&mut self.is_open, is_sure && !agree);
+        if is_sure && (agree && !is_still || !agree && !was_open) {
+            return Ok(());
+        }
+        (self.told, self.missing, self.lenience, self.seen, self.is_open) = (0, 0, 0, 0, false);
+        if is_sure && !agree {
+            return Err(format!("{missing} packets are missing, {told} are told"));
+        }
+        Ok(())
     }
 }
 
-/// Without a clock in packets more may be a turn more or less, or begin another sequence.
-const SURE: u64 = 8;
+/// The status behind what nobody can count, and the one behind that: it may tell what was seen afterwards.
+const UNSURE: u8 = 2;
 /// Where nothing tells what is missing but how many there were in a turn.
 const UNMARKED: u64 = 30;
 /// So many are remembered: of the fastest scanner for as long as a tty keeps.

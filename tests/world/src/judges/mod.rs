@@ -12,6 +12,7 @@ mod numbers;
 mod prompt;
 mod recording;
 mod remote_accounts;
+mod remote_bridge;
 mod remote_keys;
 mod remote_liveness;
 mod remote_nothing_invented;
@@ -78,6 +79,7 @@ pub(crate) fn all(setup: &Setup, plan: &Plan) -> Vec<Box<dyn Judge>> {
         Box::new(eeprom::Eeprom),
         Box::new(remote_nothing_invented::RemoteNothingInvented::new(&terms)),
         Box::new(remote_accounts::RemoteAccounts::default()),
+        Box::new(remote_bridge::RemoteBridge::new(&terms)),
         Box::new(remote_keys::RemoteKeys::default()),
         Box::new(remote_numbers::RemoteNumbers::new(terms)),
         Box::new(remote_verdict::RemoteVerdict::new(setup, plan, &terms)),

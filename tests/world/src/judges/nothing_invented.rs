@@ -53,7 +53,7 @@ impl Judge for NothingInvented {
         match *event {
             Event::Sent { sensor, telegram } => {
                 let of = &mut self.sensors[sensor];
-                *of.open.entry(key(telegram.bytes)).or_default() += 1;
+                *of.open.entry(History::of(telegram.bytes)).or_default() += 1;
                 let (begin, end) = telegram.span;
                 if std::mem::replace(&mut of.end, end) < begin {
                     of.damage(&[]);
@@ -65,7 +65,7 @@ impl Judge for NothingInvented {
             Event::Published { sensor, sample } if sample.topic == Topic::Telegram => {
                 let of = &mut self.sensors[sensor];
                 for unit in of.family.units(&sample.bytes) {
-                    let is_known = of.take(key(unit));
+                    let is_known = of.take(History::of(unit));
                     let mut damaged = of.damaged.iter().map(Vec::as_slice);
                     let is_clean = sample.header.reasons == 0;
                     if !is_known && is_clean && !of.family.is_collision(unit, &mut damaged) {
@@ -109,12 +109,6 @@ impl OfSensor {
         }
         true
     }
-}
-
-fn key(bytes: &[u8]) -> u64 {
-    let mut history = History::new();
-    history.bytes(bytes);
-    history.value()
 }
 
 /// So many damaged telegrams are remembered.

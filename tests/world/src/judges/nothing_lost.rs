@@ -35,8 +35,8 @@ struct OfSensor {
     /// Place behind the last telegram, and how many of the next ones may be lost with damaged bytes before them.
     end: u64,
     spared: usize,
-    /// Something was published last that nobody sent.
-    is_foreign: bool,
+    /// What was published last, if nobody sent it.
+    foreign: Vec<u8>,
     /// From when until when the hub does not run.
     stalled: (Nanos, Nanos),
 }
@@ -146,7 +146,7 @@ impl OfSensor {
             holes: 0,
             end: 0,
             spared: 0,
-            is_foreign: false,
+            foreign: Vec::new(),
             stalled: (0, 0),
         }
     }
@@ -217,7 +217,11 @@ impl OfSensor {
     /// Whether damaged bytes came before `unit`, which has a checksum and is published now: then it has to be marked.
     fn is_beside_damage(&self, unit: &[u8]) -> bool {
         let exactness = self.family.exactness(unit);
-        if self.is_foreign || exactness.has_clock || exactness.neighbours > 0 || !self.family.is_data(unit) {
+        if !self.foreign.is_empty()
+            || exactness.has_clock
+            || exactness.neighbours > 0
+            || !self.family.is_data(unit)
+        {
             return false;
         }
         let Some(found) = self.sent.iter().position(|sent| sent.is_read && sent.bytes == unit) else {
@@ -241,14 +245,21 @@ impl OfSensor {
         let is_due = |sent: &Sent| sent.due_at.is_some();
         let skips = whole.is_some_and(|whole| self.sent.range(first.unwrap_or(0)..whole).any(is_due));
         let found = if skips { first } else { whole.or(first) };
-        self.is_foreign = found.is_none();
-        let found = found?;
+        let foreign = std::mem::take(&mut self.foreign);
+        let Some(found) = found else {
+            self.foreign = bytes.to_vec();
+            return None;
+        };
         let is_of_this = self.family.is_data(bytes) && self.sent[found].exchanged == self.exchanged;
         self.is_other &= !is_of_this || at < self.mixed_until;
         // One that lost its first byte is whole again with the last one of the one before it, if that is the same: either is.
         let is_lent = !self.sent[found].is_whole;
         let passed = self.sent.drain(..=found).take(found);
         let mut lost: Vec<Sent> = passed.filter(|sent| sent.due_at.is_some()).collect();
+        // A checksum of one byte is right by chance in 1 of 256: what damage made of two packets has a part of the intact one.
+        if let Some(torn) = lost.iter().position(|sent| overlaps(&foreign, &sent.bytes)) {
+            lost.remove(torn);
+        }
         if is_lent && lost.last().is_some_and(|sent| sent.bytes.last() == bytes.first()) {
             lost.pop();
         }
@@ -261,6 +272,14 @@ impl OfSensor {
     }
 }
 
+/// Whether one of both ends, by a header at least, with what the other begins with.
+fn overlaps(foreign: &[u8], sent: &[u8]) -> bool {
+    let is_end = |len: usize| foreign.ends_with(&sent[..len]) || sent.ends_with(&foreign[..len]);
+    (HEADER..foreign.len().min(sent.len())).any(is_end)
+}
+
+/// Bytes by which what has a checksum is known to begin.
+const HEADER: usize = 2;
 /// A telegram is held back no longer than so.
 const HELD: Nanos = 100 * MILLIS;
 /// A line holds bytes back for no longer than so (action `silence`).

@@ -52,7 +52,7 @@ impl Recording {
             let len = status.pack(&mut packed).ok_or(io::ErrorKind::StorageFull)?;
             return writer.sample(&name, *topic, header, &packed[..len]);
         }
-        self.taken.entry(sensor).or_default().push((*header, hash(bytes)));
+        self.taken.entry(sensor).or_default().push((*header, History::of(bytes)));
         *self.missed.entry(sensor).or_default() += missed;
         writer.sample(&name, *topic, header, bytes)
     }
@@ -73,8 +73,9 @@ impl Recording {
         for (&sensor, taken) in &self.taken {
             let part = whole.of(&Setup::name(sensor)).map_err(|failure| failure.to_string())?;
             let frames = part.telegrams(ENCODING).map_err(|failure| failure.to_string())?;
-            let read: Vec<_> =
-                frames.map(|frame| (frame.header.unwrap_or_default(), hash(&frame.telegram))).collect();
+            let read: Vec<_> = frames
+                .map(|frame| (frame.header.unwrap_or_default(), History::of(&frame.telegram)))
+                .collect();
             let (missing, missed) = (part.contents().damage.telegrams, self.missed[&sensor]);
             // Between two hubs a reader cannot know how many there were.
             if read != *taken || missing > missed {
@@ -116,12 +117,6 @@ impl Judge for Recording {
             _ => {}
         }
     }
-}
-
-fn hash(bytes: &[u8]) -> u64 {
-    let mut history = History::new();
-    history.bytes(bytes);
-    history.value()
 }
 
 /// One world of so many is recorded.

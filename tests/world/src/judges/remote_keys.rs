@@ -30,10 +30,10 @@ impl Judge for RemoteKeys {
     fn note(&mut self, _: Nanos, event: &Event<'_>, say: &mut Say<'_>) {
         match *event {
             Event::ListenerBegins { .. } => self.taken.clear(),
-            Event::Forged { forgery: Forgery::Recording, bytes } => _ = self.again.insert(hash(bytes)),
-            Event::Forged { forgery, bytes } => _ = self.forged.insert(hash(bytes), forgery),
+            Event::Forged { forgery: Forgery::Recording, bytes } => _ = self.again.insert(History::of(bytes)),
+            Event::Forged { forgery, bytes } => _ = self.forged.insert(History::of(bytes), forgery),
             Event::Arrived { datagram, bytes, outcome, .. } => {
-                let bytes = hash(bytes);
+                let bytes = History::of(bytes);
                 let is_new = matches!(outcome, Arrival::Announced | Arrival::Sample { late: false });
                 if let Some(forgery) = self.forged.get(&bytes) {
                     let due = match forgery {
@@ -52,10 +52,4 @@ impl Judge for RemoteKeys {
             _ => {}
         }
     }
-}
-
-fn hash(bytes: &[u8]) -> u64 {
-    let mut history = History::new();
-    history.bytes(bytes);
-    history.value()
 }

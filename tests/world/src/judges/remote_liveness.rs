@@ -7,7 +7,7 @@ use schema::{Topic, Verdict, Zones};
 
 use super::{Judge, Say};
 use crate::event::Event;
-use crate::remote::Terms;
+use crate::remote::{RECONNECTED, ROUND, Terms};
 use crate::setup::Setup;
 
 /// What is known where.
@@ -33,7 +33,9 @@ impl RemoteLiveness {
         let sensor = |of: usize| {
             let (period, _) = setup.sensors[of].times();
             let every = terms.every.get() * period;
-            let soon = ANNOUNCED + every + period + terms.delay_ns + SLACK;
+            // A router that comes back with all else is found within so long, and what waited goes out.
+            let over_router = if terms.are_bridges { RECONNECTED + ROUND } else { 0 };
+            let soon = ANNOUNCED + every + period + terms.delay_ns + over_router + SLACK;
             OfSensor { soon, is_slow: every > OFTEN, said_since: None, is_known: false, came: false }
         };
         RemoteLiveness { is_healed: false, sensors: (0..setup.sensors.len()).map(sensor).collect() }
@@ -68,9 +70,7 @@ impl Judge for RemoteLiveness {
             }
             Event::Over { .. } => {
                 for (sensor, of) in self.sensors.iter().enumerate() {
-                    if self.is_healed && of.said_since.is_some() && !of.is_known {
-                        say.broken(format!("sensor {sensor}: nothing is known at the end"));
-                    }
+                    of.check(sensor, at, self.is_healed, say);
                 }
             }
             Event::ListenerEnds { sensors, .. } if self.is_healed && sensors != self.sensors.len() => {

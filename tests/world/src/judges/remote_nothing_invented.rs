@@ -104,7 +104,9 @@ impl Judge for RemoteNothingInvented {
                     self.published.insert(key(sensor, sample.topic, &sample.header, payload));
                 }
             }
-            Event::Transmitted { datagram, bytes, .. } => _ = self.sent.insert(place(datagram), hash(bytes)),
+            Event::Transmitted { datagram, bytes, .. } => {
+                _ = self.sent.insert(place(datagram), History::of(bytes))
+            }
             Event::ListenerBegins { .. } => {
                 // With a key it is kept.
                 self.epoch = if self.has_key { self.epoch } else { 0 };
@@ -114,7 +116,7 @@ impl Judge for RemoteNothingInvented {
             }
             Event::Arrived { came, datagram, bytes, outcome } => {
                 let sent = datagram.and_then(|datagram| self.sent.get(&place(datagram)).copied());
-                let is_sent = sent == Some(hash(bytes));
+                let is_sent = sent == Some(History::of(bytes));
                 match (outcome, datagram) {
                     (Arrival::Refused(why), Some(datagram)) if is_sent => {
                         let is_over = datagram.head.epoch < self.epoch && why == DatagramError::Epoch;
@@ -192,12 +194,6 @@ fn status(payload: &[u8]) -> Status {
 fn place(datagram: &Datagram<'_>) -> (u32, u8, u8, u32, u8) {
     let head = &datagram.head;
     (head.epoch, head.sensor, head.topic, head.sequence, head.part)
-}
-
-fn hash(bytes: &[u8]) -> u64 {
-    let mut history = History::new();
-    history.bytes(bytes);
-    history.value()
 }
 
 /// So long nothing came of a sensor that is silent.

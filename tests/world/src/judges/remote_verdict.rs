@@ -35,7 +35,10 @@ impl RemoteVerdict {
     pub(crate) fn new(setup: &Setup, plan: &Plan, terms: &Terms) -> RemoteVerdict {
         let sensor = |number: usize| {
             let inside = object::inside(plan, number, setup.sensors.len());
-            let bound = verdict::bound(setup, number);
+            // In a bridge the newest of those that go out waits until the next one comes.
+            let (period, _) = setup.sensors[number].times();
+            let waits = if terms.are_bridges { terms.every.get() * period } else { 0 };
+            let bound = verdict::bound(setup, number) + waits;
             OfSensor { inside, bound, until: 0, believed: Verdict::Unknown }
         };
         let sensors = (0..setup.sensors.len()).map(sensor).collect();

@@ -7,6 +7,7 @@
 
 mod points;
 
+use std::cell::Cell;
 use std::collections::hash_map::Entry;
 use std::collections::{HashMap, VecDeque};
 use std::rc::Rc;
@@ -55,6 +56,8 @@ struct OfSensor {
     /// looks earlier than it was.
     end: u64,
     crowded_at: Option<Nanos>,
+    /// By how much the stamp of the last scan was off that is judged.
+    off: Cell<Option<i64>>,
 }
 
 impl Turns {
@@ -75,6 +78,7 @@ impl Turns {
             prompt_at: None,
             end: 0,
             crowded_at: None,
+            off: Cell::default(),
         };
         Turns { sensors: sensors.iter().map(sensor).collect(), figures: Figures::default() }
     }
@@ -124,7 +128,7 @@ impl Judge for Turns {
 impl OfSensor {
     /// What the session knew of the scanner's clock is void.
     fn begin(&mut self) {
-        (self.prompts, self.settled_at) = (0, None);
+        (self.prompts, self.settled_at, self.off) = (0, None, Cell::default());
     }
 
     /// A packet was read without delay at `at`.
@@ -177,7 +181,7 @@ impl OfSensor {
         if telegram.is_reply {
             return;
         }
-        let key = key(telegram.bytes);
+        let key = History::of(telegram.bytes);
         let is_double = self.order.back() == Some(&key);
         *self.sent.entry(key).or_default() += 1;
         self.order.push_back(key);
@@ -228,7 +232,7 @@ impl OfSensor {
                 let units = self.family.units(&sample.bytes);
                 let mut is_foreign = is_gap;
                 for unit in units.into_iter().filter(|unit| self.family.is_data(unit)) {
-                    is_foreign |= !self.sent.contains_key(&key(unit));
+                    is_foreign |= !self.sent.contains_key(&History::of(unit));
                     self.exactness = self.family.exactness(unit);
                 }
                 if is_foreign {
@@ -321,7 +325,9 @@ impl OfSensor {
         }
         let mut figures = Figures { wrong, ..Figures::of(scan, &told, &points) };
         if let Some(point) = points[0].filter(|_| is_settled && !scan.is_incomplete()) {
-            figures.stamp_ns = point.truth.at_ns.abs_diff(told[0].at_ns);
+            let off = point.truth.at_ns as i64 - told[0].at_ns as i64;
+            figures.stamp_ns = off.unsigned_abs();
+            figures.uneven_ns = self.off.replace(Some(off)).map_or(0, |before| before.abs_diff(off));
         }
         Ok(figures)
     }
@@ -363,12 +369,6 @@ impl OfSensor {
         let best = shifts.iter().max_by_key(|(_, shift)| (fit(&mut told.iter(), *shift), -shift.abs()));
         best.map_or(0, |(_, shift)| *shift)
     }
-}
-
-fn key(bytes: &[u8]) -> u64 {
-    let mut history = History::new();
-    history.bytes(bytes);
-    history.value()
 }
 
 /// A point may lie so far before one that was measured before it.

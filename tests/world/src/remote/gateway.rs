@@ -48,7 +48,10 @@ impl Gateway {
         let (now, epoch) = (shared.clock.get(), EPOCH + life);
         shared.tell(&Event::GatewayBegins { epoch });
         let form = terms.key().map_or(Form::Sealed, Form::Authenticated);
-        let mut outgoing = Outgoing::new(HUB, epoch, form, terms.longest);
+        let mut outgoing = match terms.are_bridges {
+            true => Outgoing::waiting(HUB, epoch),
+            false => Outgoing::new(HUB, epoch, form, terms.longest),
+        };
         let mut sources = Vec::new();
         for sensor in 0..sensors {
             let position = outgoing.follow(&Setup::name(sensor), |topic| terms.every(topic));
@@ -121,8 +124,33 @@ impl Gateway {
         self.outgoing.announce(stamp(shared, now), uplink);
     }
 
+    /// Whether a sample waits until it is handed over.
+    pub(super) fn is_waiting(&self) -> bool {
+        self.outgoing.is_waiting()
+    }
+
+    /// The sample that has waited for longest, which is handed over now and taken or not.
+    pub(super) fn hand(&mut self, shared: &Shared, now: Nanos, is_taken: bool) -> Option<Vec<u8>> {
+        if shared.planted.strikes(Defect::RouterUntold, 100) {
+            self.outgoing.hand();
+        }
+        let handed = self.outgoing.hand()?;
+        let (sensor, topic, bytes) = (handed.sensor.0, handed.topic, handed.datagram.to_vec());
+        let datagram = Datagram::read(&bytes).expect("a bridge makes whole datagrams");
+        shared.log.tell(now, &Event::Transmitted { datagram: &datagram, bytes: &bytes, is_taken });
+        if !is_taken {
+            self.outgoing.not_taken(sensor, topic, bytes.len());
+        }
+        Some(bytes)
+    }
+
     /// It is gone.
     pub(super) fn leave(self, shared: &Shared, is_killed: bool, is_drained: bool) {
+        for (sensor, rows) in self.outgoing.account().enumerate() {
+            for (topic, row) in rows.used() {
+                shared.tell(&Event::Accounted { sensor, topic, row });
+            }
+        }
         for source in self.sources.into_iter().filter(|source| source.is_attached) {
             shared.board.borrow_mut().detach(source.sensor, source.topic, source.number, is_killed);
             shared.tell(&Event::Left { consumer: source.number, is_drained });
@@ -185,7 +213,7 @@ const HUB: u64 = 0x5f3a_12bc_00d1_e2f3;
 /// The epoch before the first one.
 const EPOCH: u32 = 1_780_000_000;
 /// As consumers, gateways have numbers beyond those of all others.
-const NUMBERS: u32 = 1_000_000;
+pub(crate) const NUMBERS: u32 = 1_000_000;
 /// Between two announcements.
 const TICK: Nanos = ANNOUNCE_EVERY.as_nanos() as Nanos;
 /// A hub that lives hands what it keeps to newcomers within so long, and wakes nobody for it.

@@ -42,7 +42,9 @@ pub(crate) struct Packet {
 
 impl Packet {
     pub(crate) fn new(terms: &Terms) -> Packet {
-        Packet { room: vec![0; PARTS * (terms.longest - HEAD)] }
+        // A bridge sends samples whole.
+        let room = if terms.are_bridges { u16::MAX.into() } else { PARTS * (terms.longest - HEAD) };
+        Packet { room: vec![0; room] }
     }
 
     /// What `sample` is in datagrams; nothing if it does not fit.

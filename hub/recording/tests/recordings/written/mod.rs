@@ -9,7 +9,9 @@ use lms::reply;
 use lms::variant::{Mode, Unit};
 use schema::datagram::Packed;
 use schema::file::{self, Compression, ENCODING_V1, Foreign, Writer};
-use schema::{Background, Flags, Foreground, Header, Lines, Marks, Scan, Status, Topic, Zones};
+use schema::{
+    Background, Early, Flags, Foreground, Header, Lines, Marks, Motion, Scan, Status, Topic, Zones,
+};
 
 /// A telegram that was written.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -156,6 +158,8 @@ fn results(telegram: &[u8], random: &mut Rng) -> Vec<(Topic, Vec<u8>)> {
         (Topic::Background, packed(&|room| Background::zeroed(0).pack(room))),
         (Topic::Status, packed(&|room| status.pack(room))),
         (Topic::Lines, packed(&|room| Lines::default().pack(room))),
+        (Topic::Motion, packed(&|room| Motion::default().pack(room))),
+        (Topic::Early, packed(&|room| Early { verdict: 2, ..Early::default() }.pack(room))),
     ]
 }
 

@@ -1,0 +1,189 @@
+//! What the benches of the bridge play on: programs in directories of their own, which end with the bench, plain sessions of
+//! Zenoh beside them, and how busy a process is.
+#![allow(dead_code)] // Each bench takes what it needs.
+
+use std::fs::{self, DirBuilder, File};
+use std::net::{SocketAddr, TcpListener, TcpStream};
+use std::os::unix::fs::DirBuilderExt;
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Stdio};
+use std::sync::{Arc, Mutex};
+use std::thread;
+use std::time::{Duration, Instant};
+
+use scanhub_client::streams::{Session, Source};
+use scanhub_client::{Domain, Topic};
+use zenoh::{Config, Wait};
+
+/// Places for what runs, gone with it.
+pub(crate) struct Stage {
+    place: PathBuf,
+    scanhub: PathBuf,
+}
+
+/// A program.
+pub(crate) struct Running {
+    child: Child,
+    out: PathBuf,
+}
+
+/// A machine: what runs there has one domain.
+pub(crate) struct Machine<'a> {
+    stage: &'a Stage,
+    pub(crate) root: PathBuf,
+}
+
+const BRIDGE: &str = env!("CARGO_BIN_EXE_scanhub-bridge");
+/// The sensors of a robot.
+pub(crate) const SENSORS: [&str; 2] = ["front", "rear"];
+
+impl Stage {
+    /// Nothing if the program is not there that has a hub.
+    pub(crate) fn new(name: &str) -> Option<Stage> {
+        let scanhub = Path::new(BRIDGE).with_file_name("scanhub");
+        if !scanhub.is_file() {
+            eprintln!("{} is not there: cargo build --release", scanhub.display());
+            return None;
+        }
+        let place = std::env::temp_dir().join(format!("scanhub-bench-{name}-{}", std::process::id()));
+        make(&place);
+        Some(Stage { place, scanhub })
+    }
+
+    pub(crate) fn machine(&self, name: &str) -> Machine<'_> {
+        let root = self.place.join(name);
+        make(&root);
+        Machine { stage: self, root }
+    }
+}
+
+impl Drop for Stage {
+    fn drop(&mut self) {
+        let _ = fs::remove_dir_all(&self.place);
+    }
+}
+
+impl Machine<'_> {
+    /// A hub of two simulated sensors at 500 kBd.
+    pub(crate) fn robot(&self) -> [Running; 2] {
+        let port = |name: &str| self.root.join(format!("tty-{name}")).display().to_string();
+        let ports = SENSORS.map(|name| format!("--port={}", port(name)));
+        let links = SENSORS.map(|name| format!("--link={name}={}", port(name)));
+        let scanhub = &self.stage.scanhub;
+        let simulator = self.start(scanhub, &["simulate", &ports[0], &ports[1], "--baud=500000"]);
+        [simulator, self.start(scanhub, &["run", &links[0], &links[1]])]
+    }
+
+    pub(crate) fn bridge(&self, arguments: &[&str]) -> Running {
+        self.start(Path::new(BRIDGE), &[&["--json"], arguments].concat())
+    }
+
+    fn start(&self, program: &Path, arguments: &[&str]) -> Running {
+        let number = fs::read_dir(&self.root).expect("it is there").count();
+        let out = self.root.join(format!("out-{number}"));
+        let mut command = Command::new(program);
+        command.args(arguments).args(["--domain", "bench", "--root"]).arg(&self.root);
+        command.env("STATE_DIRECTORY", &self.root).env("SCANHUB_END_WITH_PARENT", "1").stdin(Stdio::null());
+        command.stdout(File::create(&out).expect("a new file")).stderr(Stdio::null());
+        let child = command.spawn().unwrap_or_else(|error| panic!("{}: {error}", program.display()));
+        Running { child, out }
+    }
+
+    /// Follows topics in shared memory there, once each of them was there.
+    pub(crate) fn follow<const N: usize>(&self, topics: [(&str, Topic); N]) -> (Session, [Source; N]) {
+        let mut memory = Session::new(vec![Domain::at("bench", &self.root).expect("a name")]);
+        let mut sources = topics.map(|(sensor, topic)| Source::new(sensor, topic));
+        let begun = Instant::now();
+        while !sources.iter().all(Source::subscribed) {
+            assert!(begun.elapsed() < Duration::from_secs(30), "no topics in {}", self.root.display());
+            memory.look().expect("a domain");
+            sources.iter_mut().for_each(|source| drop(source.receive(&mut memory)));
+            memory.wait_for(Some(Duration::from_millis(20))).expect("to wait");
+        }
+        (memory, sources)
+    }
+}
+
+impl Running {
+    /// Processor time so far, in clock ticks of a hundredth of a second.
+    pub(crate) fn ticks(&self) -> u64 {
+        let stat = fs::read_to_string(format!("/proc/{}/stat", self.child.id())).unwrap_or_default();
+        let after_name = stat.rsplit(") ").next().unwrap_or_default();
+        after_name.split(' ').skip(11).take(2).filter_map(|number| number.parse::<u64>().ok()).sum()
+    }
+
+    /// What it has told so far, one object a line.
+    pub(crate) fn told(&self) -> Vec<serde_json::Value> {
+        let text = fs::read_to_string(&self.out).unwrap_or_default();
+        text.lines().filter_map(|line| serde_json::from_str(line).ok()).collect()
+    }
+
+    /// Waits until it tells something like this.
+    pub(crate) fn tells(&self, what: impl Fn(&serde_json::Value) -> bool) -> serde_json::Value {
+        let begun = Instant::now();
+        loop {
+            if let Some(line) = self.told().into_iter().find(&what) {
+                return line;
+            }
+            assert!(begun.elapsed() < Duration::from_secs(30), "it is not told: {:?}", self.told().last());
+            thread::sleep(Duration::from_millis(20));
+        }
+    }
+
+    /// Ends it in order, and returns what it told.
+    pub(crate) fn end(mut self) -> Vec<serde_json::Value> {
+        if let Some(process) = rustix::process::Pid::from_raw(self.child.id() as i32) {
+            rustix::process::kill_process(process, rustix::process::Signal::INT).expect("it is ours");
+        }
+        self.child.wait().expect("it is ours");
+        self.told()
+    }
+}
+
+impl Drop for Running {
+    fn drop(&mut self) {
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+    }
+}
+
+fn make(place: &Path) {
+    DirBuilder::new().mode(0o700).create(place).expect("a new directory");
+}
+
+/// An address that nobody listens at.
+pub(crate) fn free_port() -> SocketAddr {
+    TcpListener::bind("127.0.0.1:0").and_then(|it| it.local_addr()).expect("a port")
+}
+
+/// Waits until somebody listens there.
+pub(crate) fn listened(at: SocketAddr) {
+    let begun = Instant::now();
+    while TcpStream::connect(at).is_err() {
+        assert!(begun.elapsed() < Duration::from_secs(30), "nobody listens at {at}");
+        thread::sleep(Duration::from_millis(1));
+    }
+}
+
+/// A plain session of Zenoh at a router.
+pub(crate) fn session(router: SocketAddr) -> zenoh::Session {
+    let mut config = Config::default();
+    for (key, value) in [
+        ("mode", "\"client\"".to_owned()),
+        ("connect/endpoints", format!("[\"tcp/{router}\"]")),
+        ("scouting/multicast/enabled", "false".to_owned()),
+    ] {
+        config.insert_json5(key, &value).expect("a key of Zenoh");
+    }
+    zenoh::open(config).wait().expect("a session")
+}
+
+/// Nanoseconds of something, by whatever thread they are measured.
+pub(crate) type Times = Arc<Mutex<Vec<u64>>>;
+
+/// The value below which this share of all is, in us.
+pub(crate) fn percentile(values: &mut [u64], share: f64) -> f64 {
+    values.sort_unstable();
+    let place = ((values.len() as f64 - 1.0) * share).max(0.0) as usize;
+    values.get(place).map_or(f64::NAN, |&ns| ns as f64 / 1e3)
+}

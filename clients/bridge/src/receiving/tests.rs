@@ -1,0 +1,79 @@
+//! A way in whose inbox is filled by hand: what is taken, counted and asked for.
+
+use std::cell::RefCell;
+
+use schema::datagram::{Head, Packed};
+use schema::limits::TopicLimits;
+use schema::{Kind, Zones};
+
+use super::*;
+
+const HUB: u64 = 0x5f3a_12bc_00d1_e2f3;
+
+/// Runs a way in that `is_over` at once after `heard` was put into its inbox; what it told, and what it asked for.
+fn run(heard: Vec<Heard>, is_over: bool, ask: impl Fn(&str) -> Result<(), Failure>) -> (String, u64) {
+    let (mut out, mut notes) = (Vec::new(), Vec::new());
+    let wanted = Wanted {
+        topics: Topic::ALL.to_vec(),
+        heard: Topic::ALL.to_vec(),
+        names: &[],
+        hubs: &[],
+        key: None,
+        state: None,
+        publish: None,
+        limits: TopicLimits::default(),
+        stats: true,
+    };
+    let (to_out, to_notes) = (Output::new(&mut out), Output::new(&mut notes));
+    let reception = Reception::open(wanted, true, Words::BRIDGE, to_out, to_notes).unwrap();
+    let (to, inbox) = sync_channel(WAITING);
+    let inlet = Inlet { to, counts: Arc::default() };
+    heard.into_iter().for_each(|heard| inlet.put(heard));
+    let asked = RefCell::new(0);
+    let over = AtomicBool::new(is_over);
+    let ask_and_end = |address: &Address<'_>| {
+        *asked.borrow_mut() += 1;
+        over.store(true, Ordering::Relaxed);
+        ask(&address.to_string())
+    };
+    let mut receiving = Receiving {
+        reception,
+        asking: Asking::new(Instant::now()),
+        counts: inlet.counts.clone(),
+        foreign: 0,
+        ask: Box::new(ask_and_end),
+        refused: Box::new(|| 0),
+    };
+    // What comes behind the end is not let in.
+    receiving.run(&inbox, &AtomicBool::new(false), &over, || drop(inlet)).unwrap();
+    drop(receiving);
+    (String::from_utf8(out).unwrap(), asked.into_inner())
+}
+
+fn zones(sequence: u32) -> Heard {
+    let mut buffer = [0; 100];
+    let len = Zones::unknown().pack(&mut buffer[schema::datagram::HEAD..]).unwrap();
+    let head =
+        Head { topic: Topic::Zones.number(), revision: 1, hub: HUB, epoch: 1, sequence, ..Head::default() };
+    Heard::Sample(
+        format!("{PREFIX}/{HUB:016x}/front/zones").into(),
+        head.seal(&mut buffer, len).unwrap().to_vec(),
+    )
+}
+
+#[test]
+fn what_waits_at_the_end_is_in_the_account() {
+    let (told, _) = run((0..WAITING as u32 + 7).map(zones).collect(), true, |_| Ok(()));
+    assert!(told.contains(&format!("\"received\":{WAITING},")), "{told}");
+    assert!(told.contains("\"overrun\":7"), "{told}");
+}
+
+#[test]
+fn a_question_that_cannot_be_asked_is_told_and_ends_nothing() {
+    let heard = vec![Heard::Live(format!("{PREFIX}/{HUB:016x}/front/{LIVE}").into()), zones(0)];
+    let (told, asked) =
+        run(heard, false, |key| Err(Failure::new(Kind::Failed, format!("Zenoh refuses {key}"), "")));
+    assert_eq!(asked, 1);
+    assert!(told.contains("Zenoh refuses") && told.contains("\"unasked\":1"), "{told}");
+    assert!(told.contains("\"received\":1,"), "{told}");
+}

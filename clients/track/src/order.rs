@@ -1,0 +1,241 @@
+//! Scans of several sensors in the order of their time, with a bounded wait for the latest, and the offsets of the clocks that
+//! stamped them. Refuses to know what scans show.
+
+use std::collections::VecDeque;
+
+use schema::{Foreground, Scan};
+
+use crate::picture::Picture;
+use crate::site::Site;
+use crate::tracker::{PICTURE_NS, Tracker};
+
+/// Scans of one sensor that may wait: with one more the oldest is taken at once.
+const WAITING: usize = 64;
+/// A stamp so far from all others is of a clock that jumped.
+const JUMP_NS: u64 = 2_000_000_000;
+/// So many such stamps in a row are the time.
+const JUMPS: u32 = 50;
+/// Share of an offset that is corrected at once.
+const GAIN: f64 = 0.05;
+/// Weight, in (m/s)2, of what has to be seen before an offset is corrected.
+const ENOUGH: f64 = 40.0;
+/// Clocks of hubs that know each other are not farther apart.
+const MOST_OFFSET_NS: f64 = 250e6;
+
+/// What was not as it should be, since the start.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Counts {
+    /// Scans that were taken.
+    pub scans: u64,
+    /// Scans that came later than was waited for; they were left out.
+    pub late: u64,
+    /// Scans whose stamp was seconds away from all others; they were left out.
+    pub jumped: u64,
+    /// Scans without a foreground of the same beams, or of no sensor of the site; they were left out.
+    pub unfit: u64,
+}
+
+struct Waiting {
+    /// As stamped: what the clock is off by is known when it is taken.
+    wall_ns: u64,
+    scan: Box<Scan>,
+    foreground: Box<Foreground>,
+}
+
+/// Persons from the scans of a site's sensors.
+pub struct People {
+    tracker: Tracker,
+    delay_ns: u64,
+    /// In the order of time, per sensor.
+    queues: Vec<VecDeque<Waiting>>,
+    /// The hub of each sensor, by its first sensor.
+    hub_of: Vec<usize>,
+    /// How far the clock of each hub is ahead of the first one's, in ns; by its first sensor.
+    offsets: Vec<f64>,
+    /// The latest stamp.
+    latest_ns: u64,
+    /// What was taken last.
+    taken_ns: u64,
+    next_picture_ns: u64,
+    jumps: u32,
+    counts: Counts,
+    picture: Picture,
+    spare: Vec<Waiting>,
+}
+
+impl People {
+    /// Waits for the latest scan for `delay_ns`.
+    pub fn new(site: Site, delay_ns: u64) -> People {
+        let hub_of = site
+            .sensors
+            .iter()
+            .map(|one| site.sensors.iter().position(|other| other.hub() == one.hub()).unwrap_or_default());
+        let hub_of: Vec<usize> = hub_of.collect();
+        let count = site.sensors.len();
+        People {
+            tracker: Tracker::new(site),
+            delay_ns,
+            queues: (0..count).map(|_| VecDeque::with_capacity(WAITING)).collect(),
+            hub_of,
+            offsets: vec![0.0; count],
+            latest_ns: 0,
+            taken_ns: 0,
+            next_picture_ns: 0,
+            jumps: 0,
+            counts: Counts::default(),
+            picture: Picture::default(),
+            spare: Vec::new(),
+        }
+    }
+
+    /// Returns the site.
+    pub fn site(&self) -> &Site {
+        &self.tracker.site
+    }
+
+    /// Returns what was not as it should be.
+    pub fn counts(&self) -> Counts {
+        self.counts
+    }
+
+    /// Returns how far the clock that stamps `sensor` is ahead of the first sensor's, in seconds, as far as people whom both
+    /// see tell.
+    pub fn offset_s(&self, sensor: usize) -> f64 {
+        self.hub_of.get(sensor).map_or(0.0, |&hub| self.offsets[hub] * 1e-9)
+    }
+
+    /// Takes a scan of `sensor`, a number in the site, with its foreground and its stamp of the wall clock, and hands each
+    /// picture that is due to `show`. Scans that come within the delay are taken in the order of their stamps, however
+    /// they come.
+    pub fn take(
+        &mut self,
+        sensor: usize,
+        wall_ns: u64,
+        scan: &Scan,
+        foreground: &Foreground,
+        mut show: impl FnMut(&Picture),
+    ) {
+        if sensor >= self.queues.len() || usize::from(foreground.count) != scan.beams() || scan.beams() == 0 {
+            self.counts.unfit += 1;
+            return;
+        }
+        let at_ns = self.corrected(sensor, wall_ns);
+        if self.latest_ns > 0 && at_ns.abs_diff(self.latest_ns) > JUMP_NS && !self.is_new_time(at_ns) {
+            self.counts.jumped += 1;
+            return;
+        }
+        if at_ns <= self.taken_ns {
+            self.counts.late += 1;
+            return;
+        }
+        self.jumps = 0;
+        self.latest_ns = self.latest_ns.max(at_ns);
+        let mut one = self.spare.pop().unwrap_or_else(|| Waiting {
+            wall_ns,
+            scan: scan.boxed(),
+            foreground: foreground.boxed(),
+        });
+        one.wall_ns = wall_ns;
+        Scan::grow(&mut one.scan, scan.bytes().len());
+        Foreground::grow(&mut one.foreground, foreground.bytes().len());
+        one.scan.copy_from(scan.bytes());
+        one.foreground.copy_from(foreground.bytes());
+        let queue = &mut self.queues[sensor];
+        let place = queue.partition_point(|other| other.wall_ns <= wall_ns);
+        queue.insert(place, one);
+        let until_ns = self.latest_ns.saturating_sub(self.delay_ns);
+        self.advance(until_ns, &mut show);
+    }
+
+    /// Takes all that waits, at the end of a recording.
+    pub fn finish(&mut self, mut show: impl FnMut(&Picture)) {
+        self.advance(u64::MAX, &mut show);
+    }
+
+    /// What a stamp of `sensor` is by the clock of the first one.
+    fn corrected(&self, sensor: usize, wall_ns: u64) -> u64 {
+        wall_ns.saturating_add_signed(-(self.offsets[self.hub_of[sensor]] as i64))
+    }
+
+    fn advance(&mut self, until_ns: u64, show: &mut impl FnMut(&Picture)) {
+        loop {
+            let first = |sensor: usize, queue: &VecDeque<Waiting>| {
+                queue.front().map(|one| self.corrected(sensor, one.wall_ns))
+            };
+            let fronts = self.queues.iter().enumerate().filter_map(|(i, queue)| Some((first(i, queue)?, i)));
+            let Some((at_ns, sensor)) = fronts.min() else { break };
+            let is_full = self.queues.iter().any(|queue| queue.len() > WAITING);
+            if at_ns > until_ns && !is_full {
+                break;
+            }
+            // A corrected clock may step back.
+            let at_ns = at_ns.max(self.taken_ns + 1);
+            if self.next_picture_ns == 0 {
+                self.next_picture_ns = (at_ns / PICTURE_NS + 1) * PICTURE_NS;
+            }
+            self.pictures_until(at_ns, show);
+            if let Some(one) = self.queues[sensor].pop_front() {
+                self.tracker.take(sensor, at_ns, &one.scan, &one.foreground);
+                self.spare.push(one);
+                self.counts.scans += 1;
+                self.taken_ns = at_ns;
+                self.compare_clocks();
+            }
+        }
+    }
+
+    /// Pictures before `at_ns`.
+    fn pictures_until(&mut self, at_ns: u64, show: &mut impl FnMut(&Picture)) {
+        if at_ns.saturating_sub(self.next_picture_ns) > JUMP_NS {
+            self.next_picture_ns = (at_ns / PICTURE_NS) * PICTURE_NS;
+        }
+        while self.next_picture_ns < at_ns {
+            self.tracker.show(self.next_picture_ns, &mut self.picture);
+            show(&self.picture);
+            self.next_picture_ns += PICTURE_NS;
+        }
+    }
+
+    /// All stamps are far from what was the time, again and again: the time is another one.
+    fn is_new_time(&mut self, at_ns: u64) -> bool {
+        self.jumps += 1;
+        let is_new = self.jumps > JUMPS;
+        if is_new {
+            self.jumps = 0;
+            self.latest_ns = at_ns;
+            self.taken_ns = at_ns - 1;
+            self.next_picture_ns = 0;
+            self.queues.iter_mut().for_each(VecDeque::clear);
+        }
+        is_new
+    }
+
+    /// Who walks is seen ahead of where he should be by a sensor whose clock is late, and behind by one whose clock is early.
+    fn compare_clocks(&mut self) {
+        for (sensor, &hub) in self.hub_of.iter().enumerate() {
+            if hub == 0 || hub != sensor {
+                continue;
+            }
+            let sum = |is_of: &dyn Fn(usize) -> bool| {
+                let all = self.tracker.lateness.iter().zip(&self.hub_of).filter(|(_, hub)| is_of(**hub));
+                all.fold((0.0, 0.0), |sum, ((a, b), _)| (sum.0 + a, sum.1 + b))
+            };
+            let (own, others) = (sum(&|of| of == hub), sum(&|of| of == 0));
+            if own.1 < ENOUGH || others.1 < ENOUGH {
+                continue;
+            }
+            let ahead_s = own.0 / own.1 - others.0 / others.1;
+            let gain = GAIN;
+            self.offsets[hub] =
+                (self.offsets[hub] - gain * 1e9 * ahead_s * FEEDBACK).clamp(-MOST_OFFSET_NS, MOST_OFFSET_NS);
+            for (of, lateness) in self.hub_of.iter().zip(&mut self.tracker.lateness) {
+                if *of == hub || *of == 0 {
+                    *lateness = (0.0, 0.0);
+                }
+            }
+        }
+    }
+}
+
+/// The filter follows each sensor in part, so that only a part of an offset shows: what that part is multiplied with.
+const FEEDBACK: f64 = 3.0;

@@ -1,0 +1,138 @@
+//! One person as the tracker follows him: filter, and what speaks for him and against him. Refuses to know other persons.
+
+use crate::filter::{Filter, Side};
+use crate::geometry::Point;
+use crate::picture::State;
+use crate::sight::Leg;
+
+/// One person.
+pub(crate) struct Person {
+    pub(crate) id: u64,
+    pub(crate) filter: Filter,
+    /// What the filter holds for, in ns.
+    pub(crate) at_ns: u64,
+    pub(crate) born_ns: u64,
+    /// Where he was first seen.
+    pub(crate) born_at: Point,
+    pub(crate) life: Life,
+    /// When a leg of his was seen last.
+    pub(crate) seen_ns: u64,
+    /// When each sensor saw him last; 0 never.
+    pub(crate) seen_by_ns: [u64; crate::site::SENSORS],
+    /// Scans that spoke for him, at most [`MOST_SUPPORT`].
+    pub(crate) support: f64,
+    /// Scans that showed both legs.
+    pub(crate) pairs: f64,
+    /// For how many seconds he was seen through.
+    pub(crate) absent_s: f64,
+    /// How fast he walks when he does.
+    pub(crate) pace: f64,
+    pub(crate) room: Option<usize>,
+    /// Share of the scans that see him and show both legs, of late.
+    pub(crate) both: f64,
+}
+
+/// Where a person is in his life.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(crate) enum Life {
+    Tentative,
+    Known,
+    /// Out of sight since then, having gone through that door.
+    Away {
+        since_ns: u64,
+        door: usize,
+    },
+}
+
+/// So many scans make somebody known.
+const ENOUGH: f64 = 8.0;
+pub(crate) const MOST_SUPPORT: f64 = 20.0;
+/// Nobody is known sooner.
+const SOONEST_NS: u64 = 300_000_000;
+/// Who was seen within this time is not hidden.
+const LATELY_NS: u64 = 250_000_000;
+
+impl Person {
+    pub(crate) fn new(id: u64, at_ns: u64, legs: &[Leg]) -> Person {
+        let mut filter = Filter::of_leg(legs[0].at, legs[0].sigma_m);
+        if let Some(other) = legs.get(1) {
+            filter.correct(Side::Minus, other.at, other.sigma_m);
+        }
+        Person {
+            id,
+            born_at: filter.place(),
+            filter,
+            at_ns,
+            born_ns: at_ns,
+            life: Life::Tentative,
+            seen_ns: at_ns,
+            seen_by_ns: [0; crate::site::SENSORS],
+            support: 1.0,
+            pairs: if legs.len() > 1 { 1.0 } else { 0.0 },
+            absent_s: 0.0,
+            pace: 1.1,
+            room: None,
+            both: if legs.len() > 1 { 1.0 } else { 0.0 },
+        }
+    }
+
+    /// Moves the filter to `at_ns`.
+    pub(crate) fn predict(&mut self, at_ns: u64) {
+        if at_ns > self.at_ns {
+            let dt = (at_ns - self.at_ns) as f64 * 1e-9;
+            let fades = at_ns - self.seen_ns > LATELY_NS;
+            self.filter.predict(dt, fades);
+            self.at_ns = at_ns;
+        }
+    }
+
+    /// A scan of `sensor` showed `legs` of his.
+    pub(crate) fn seen(&mut self, sensor: usize, legs: usize) {
+        self.seen_ns = self.at_ns;
+        self.seen_by_ns[sensor] = self.at_ns;
+        self.absent_s = 0.0;
+        let both = if legs > 1 { 1.0 } else { 0.0 };
+        self.pairs += both;
+        self.both += 0.05 * (both - self.both);
+        self.support = (self.support + 1.0).min(MOST_SUPPORT);
+        let speed = self.speed();
+        if speed > 0.5 {
+            // Who turns or gives way is slower than his pace.
+            self.pace += if speed > self.pace { 0.03 } else { 0.01 } * (speed - self.pace);
+        }
+    }
+
+    pub(crate) fn speed(&self) -> f64 {
+        let [x, y] = self.filter.velocity();
+        (x * x + y * y).sqrt()
+    }
+
+    /// He is a person: he is seen often enough, and has two legs, or moves as no thing does.
+    pub(crate) fn is_sure(&self) -> bool {
+        let way = crate::geometry::distance(self.filter.place(), self.born_at);
+        self.support >= ENOUGH && self.at_ns - self.born_ns >= SOONEST_NS && (self.pairs >= 3.0 || way > 0.3)
+    }
+
+    pub(crate) fn is_known(&self) -> bool {
+        self.life == Life::Known
+    }
+
+    pub(crate) fn state(&self, now_ns: u64) -> State {
+        match self.life {
+            Life::Tentative => State::Tentative,
+            Life::Away { .. } => State::BetweenRooms,
+            Life::Known if now_ns.saturating_sub(self.seen_ns) > LATELY_NS => State::Hidden,
+            Life::Known => State::Confirmed,
+        }
+    }
+
+    /// Sensors that saw him within a quarter of a second, as bits.
+    pub(crate) fn sensors(&self, now_ns: u64) -> u32 {
+        let lately = |&at: &u64| at > 0 && now_ns.saturating_sub(at) <= LATELY_NS;
+        (0..)
+            .zip(&self.seen_by_ns)
+            .filter(|(_, at)| lately(at))
+            .map(|(sensor, _): (u32, _)| 1 << sensor)
+            .sum()
+    }
+}

@@ -1,0 +1,255 @@
+//! One scan as a sensor of the site sees it: how far it looks in each direction, the legs in it, and whether a place is seen,
+//! hidden or seen through. Refuses to know whose legs they are.
+
+use std::f64::consts::{FRAC_PI_4, TAU};
+
+use schema::{Foreground, Scan};
+
+use crate::geometry::{Point, distance, minus};
+use crate::site::Sensor;
+
+/// The most legs of a scan.
+pub const LEGS: usize = 64;
+/// Radius of a leg with its trousers, in metres.
+pub(crate) const LEG_M: f64 = 0.06;
+/// What is wider is two legs beside each other.
+const WIDEST_LEG_M: f64 = 0.26;
+/// What is wider is no person.
+const WIDEST_M: f64 = 1.3;
+/// By so much a beam has to end before the farthest that it ever reached, to have met something that stands there.
+const BEFORE_M: f64 = 0.15;
+/// So many scans in a row have to reach farther than any before.
+const SCANS_FARTHER: u8 = 5;
+/// So far around a place are the legs of somebody who stands there.
+const REACH_M: f64 = 0.35;
+
+/// A leg that one sensor sees.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(crate) struct Leg {
+    /// Its middle: a sensor sees the near side, which is corrected.
+    pub(crate) at: Point,
+    /// Standard deviation of each coordinate.
+    pub(crate) sigma_m: f64,
+    /// It stands in front of the background, and is no single beam. What the background has learned is not.
+    pub(crate) is_fresh: bool,
+}
+
+/// What a scan says of a place where somebody may stand.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Seen {
+    /// Nobody can stand there.
+    Through,
+    /// Something stands there.
+    Here,
+    /// Something nearer hides it, or no beam points there.
+    Hidden,
+}
+
+/// What one sensor sees, and has seen.
+pub(crate) struct Sight {
+    sensor: Sensor,
+    first_angle: f64,
+    step: f64,
+    /// Where each beam points in the map.
+    directions: Vec<Point>,
+    /// Metres; nan: no reading, infinite: nothing came back.
+    ranges: Vec<f64>,
+    /// The farthest that each beam ever reached for some scans: the empty room.
+    farthest: Vec<f64>,
+    /// For how many scans each beam has reached farther, and how far at least.
+    farther: Vec<(u8, f64)>,
+    is_foreground: Vec<bool>,
+    legs: Vec<Leg>,
+    /// Beams of the cluster that is open, and where they end.
+    points: Vec<(usize, Point)>,
+}
+
+impl Sight {
+    pub(crate) fn new(sensor: Sensor) -> Sight {
+        Sight {
+            sensor,
+            first_angle: 0.0,
+            step: 0.0,
+            directions: Vec::new(),
+            ranges: Vec::new(),
+            farthest: Vec::new(),
+            farther: Vec::new(),
+            is_foreground: Vec::new(),
+            legs: Vec::with_capacity(LEGS),
+            points: Vec::new(),
+        }
+    }
+
+    /// Takes the next scan and finds the legs in it.
+    pub(crate) fn take(&mut self, scan: &Scan, foreground: &Foreground) {
+        self.fit(scan);
+        let unit_m = f64::from(scan.unit_um) * 1e-6;
+        let exact = scan.exact_angles();
+        for (i, &value) in scan.ranges().iter().enumerate() {
+            let range = if value <= scan.valid_to {
+                f64::from(value) * unit_m
+            } else if value == scan.no_return || value == scan.beyond {
+                f64::INFINITY
+            } else {
+                f64::NAN
+            };
+            self.ranges[i] = range;
+            self.reach(i, range);
+            if let Some(&angle) = exact.get(i).filter(|angle| angle.is_finite()) {
+                self.directions[i] = self.sensor.direction(f64::from(angle));
+            }
+        }
+        self.is_foreground.fill(false);
+        for (beam, _) in foreground.readings() {
+            if let Some(bit) = self.is_foreground.get_mut(beam) {
+                *bit = true;
+            }
+        }
+        self.find_legs();
+    }
+
+    pub(crate) fn legs(&self) -> &[Leg] {
+        &self.legs
+    }
+
+    /// What the last scan says of `place`.
+    pub(crate) fn look(&self, place: Point) -> Seen {
+        let way = minus(place, self.sensor.place);
+        let far = (way[0] * way[0] + way[1] * way[1]).sqrt();
+        if self.step == 0.0 || far < 0.2 {
+            return Seen::Hidden;
+        }
+        let bearing = way[1].atan2(way[0]) - self.sensor.yaw_rad;
+        let angle = if self.sensor.is_upside_down { -bearing } else { bearing };
+        let turned = ((angle - self.first_angle) * self.step.signum() + 1e-9).rem_euclid(TAU);
+        let middle = turned / self.step.abs();
+        if middle >= self.ranges.len() as f64 {
+            return Seen::Hidden;
+        }
+        // Half the width of a person's legs.
+        let half = ((0.2 / far).min(0.5) / self.step.abs()).ceil();
+        let first = (middle - half).max(0.0) as usize;
+        let last = ((middle + half) as usize).min(self.ranges.len() - 1);
+        let (mut through, mut here, mut all) = (0, 0, 0);
+        for (&range, &farthest) in self.ranges[first..=last].iter().zip(&self.farthest[first..=last]) {
+            if range.is_nan() {
+                continue;
+            }
+            all += 1;
+            if range > far + REACH_M || (range > farthest - BEFORE_M && range > far - 0.05) {
+                through += 1;
+            } else if range > far - REACH_M && range < farthest - BEFORE_M {
+                here += 1;
+            }
+        }
+        match () {
+            () if here > 0 => Seen::Here,
+            () if all >= 2 && 5 * through >= 4 * all => Seen::Through,
+            () => Seen::Hidden,
+        }
+    }
+
+    /// Beam `i` reaches `range`: single readings that are too far are noise.
+    fn reach(&mut self, i: usize, range: f64) {
+        let (scans, least) = &mut self.farther[i];
+        if range > self.farthest[i] {
+            (*scans, *least) = (*scans + 1, least.min(range));
+            if *scans == SCANS_FARTHER {
+                self.farthest[i] = *least;
+                (*scans, *least) = (0, f64::INFINITY);
+            }
+        } else if !range.is_nan() {
+            (*scans, *least) = (0, f64::INFINITY);
+        }
+    }
+
+    /// Makes the tables for scans such as `scan`.
+    fn fit(&mut self, scan: &Scan) {
+        let (shape, count) = ((scan.first_angle, scan.step), scan.beams());
+        if (self.first_angle, self.step) == shape && self.ranges.len() == count {
+            return;
+        }
+        (self.first_angle, self.step) = shape;
+        self.directions.clear();
+        self.directions.extend((0..count).map(|i| self.sensor.direction(shape.0 + i as f64 * shape.1)));
+        for array in [&mut self.ranges, &mut self.farthest] {
+            array.clear();
+            array.resize(count, 0.0);
+        }
+        self.farther.clear();
+        self.farther.resize(count, (0, f64::INFINITY));
+        self.is_foreground.clear();
+        self.is_foreground.resize(count, false);
+        self.points.reserve(count);
+    }
+
+    fn find_legs(&mut self) {
+        self.legs.clear();
+        let mut points = std::mem::take(&mut self.points);
+        points.clear();
+        let step = self.step.abs();
+        for i in 0..self.ranges.len() {
+            let range = self.ranges[i];
+            let stands = range.is_finite() && (self.is_foreground[i] || range < self.farthest[i] - BEFORE_M);
+            if !stands {
+                self.close(&points);
+                points.clear();
+                continue;
+            }
+            let (place, direction) = (self.sensor.place, self.directions[i]);
+            let point = [place[0] + range * direction[0], place[1] + range * direction[1]];
+            if let Some(&(_, last)) = points.last()
+                && distance(last, point) > 0.08 + 1.5 * range * step
+            {
+                self.close(&points);
+                points.clear();
+            }
+            points.push((i, point));
+        }
+        self.close(&points);
+        self.points = points;
+    }
+
+    /// Makes legs of neighbouring points.
+    fn close(&mut self, points: &[(usize, Point)]) {
+        let (Some(&(first, begin)), Some(&(last, end))) = (points.first(), points.last()) else { return };
+        let width = distance(begin, end);
+        if width > WIDEST_M || self.legs.len() == LEGS {
+            return;
+        }
+        if width > WIDEST_LEG_M && points.len() >= 4 {
+            // Between two legs the points lie farther apart than on one.
+            let n = points.len();
+            let within = n / 4 + 1..=3 * n / 4;
+            let cut = within.max_by(|&a, &b| {
+                let gap = |i: usize| distance(points[i - 1].1, points[i].1);
+                gap(a).total_cmp(&gap(b))
+            });
+            if let Some(cut) = cut {
+                self.close(&points[..cut]);
+                self.close(&points[cut..]);
+            }
+            return;
+        }
+        let n = points.len() as f64;
+        let sum = points.iter().fold([0.0, 0.0], |sum, (_, p)| [sum[0] + p[0], sum[1] + p[1]]);
+        let mean = [sum[0] / n, sum[1] / n];
+        let way = minus(mean, self.sensor.place);
+        let range = (way[0] * way[0] + way[1] * way[1]).sqrt().max(0.05);
+        // Mean depth of the near half of a circle whose points lie at even angles.
+        let deeper = LEG_M * FRAC_PI_4 / range;
+        let spacing = range * self.step.abs();
+        let cut_off = |beam: Option<usize>| {
+            beam.and_then(|beam| self.ranges.get(beam)).is_some_and(|&beside| beside < range - 0.1)
+        };
+        let is_partial = cut_off(first.checked_sub(1)) || cut_off(Some(last + 1));
+        let is_short = points.len() == 1 && spacing < LEG_M;
+        let sigma_m = if is_partial || is_short { 0.07 } else { 0.03 + 0.3 * spacing };
+        let fresh = points.iter().filter(|(beam, _)| self.is_foreground[*beam]).count();
+        self.legs.push(Leg {
+            at: [mean[0] + deeper * way[0], mean[1] + deeper * way[1]],
+            sigma_m,
+            is_fresh: 2 * fresh > points.len() && !is_short,
+        });
+    }
+}

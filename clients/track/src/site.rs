@@ -1,0 +1,115 @@
+//! A site: where sensors, rooms and doors are, in one map. Refuses to know who walks there.
+
+mod check;
+mod drawing;
+mod file;
+
+use crate::geometry::{Point, contains, distance_to_border};
+
+/// The most sensors of a site: as many as a hub has links.
+pub const SENSORS: usize = 32;
+/// The most rooms.
+pub const ROOMS: usize = 64;
+
+/// A plan that was checked.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Site {
+    /// In the order of the file.
+    pub sensors: Vec<Sensor>,
+    /// Their polygons do not overlap.
+    pub rooms: Vec<Room>,
+    /// From room to room, or to outside.
+    pub doors: Vec<Door>,
+    /// Ways between doors that no sensor sees.
+    pub gaps: Vec<Gap>,
+}
+
+/// A sensor, and where it is in the map.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Sensor {
+    /// As consumers know it: `front`, or `kitchen.front` of another machine.
+    pub name: String,
+    /// Metres in the map.
+    pub place: Point,
+    /// Where it looks, in radians counter-clockwise from x.
+    pub yaw_rad: f64,
+    /// Its beams run the other way.
+    pub is_upside_down: bool,
+}
+
+/// A room.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Room {
+    /// As in events.
+    pub name: String,
+    /// Its corners in metres, at least three.
+    pub polygon: Vec<Point>,
+}
+
+/// An opening between two rooms, or a room and outside.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Door {
+    /// As in events.
+    pub name: String,
+    /// The room on the one side; none: outside.
+    pub from: Option<usize>,
+    /// The room on the other side; none: outside.
+    pub to: Option<usize>,
+    /// Its two jambs.
+    pub between: [Point; 2],
+}
+
+/// Doors that a way connects which no sensor sees, and how long it takes.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Gap {
+    /// Numbers of the two doors.
+    pub doors: [usize; 2],
+    /// Shortest and longest time, in seconds.
+    pub seconds: [f64; 2],
+}
+
+impl Site {
+    /// Returns the room that `point` is in.
+    pub fn room_at(&self, point: Point) -> Option<usize> {
+        self.rooms.iter().position(|room| contains(&room.polygon, point))
+    }
+
+    /// Returns the rooms in which there is a sensor, in the order of the rooms. A sensor on a wall is in every room that it
+    /// touches, at most 0.15 m away.
+    pub fn watched(&self) -> Vec<bool> {
+        let watched = |room: &Room| {
+            let mut places = self.sensors.iter().map(|sensor| sensor.place);
+            places.any(|place| touches(&room.polygon, place, ON_THE_WALL_M))
+        };
+        self.rooms.iter().map(watched).collect()
+    }
+
+    /// Returns the name of a room, `outside` for none.
+    pub fn room_name(&self, room: Option<usize>) -> &str {
+        room.and_then(|room| self.rooms.get(room)).map_or(OUTSIDE, |room| &room.name)
+    }
+}
+
+impl Sensor {
+    /// Returns the machine that its samples are stamped by: of `kitchen.front` it is `kitchen`, of a local one `""`.
+    pub fn hub(&self) -> &str {
+        self.name.split_once('.').map_or("", |(hub, _)| hub)
+    }
+
+    /// Returns the direction in the map of the beam at `angle` of the sensor: a unit vector.
+    pub fn direction(&self, angle: f64) -> Point {
+        let (sin, cos) = (self.yaw_rad + if self.is_upside_down { -angle } else { angle }).sin_cos();
+        [cos, sin]
+    }
+}
+
+/// The most bytes of a name of a room or door: so many have place in an event.
+pub const NAME: usize = 24;
+/// What a door leads to where there is no room.
+pub const OUTSIDE: &str = "outside";
+/// A sensor so near a wall sits on it.
+const ON_THE_WALL_M: f64 = 0.15;
+
+fn touches(polygon: &[Point], point: Point, tolerance_m: f64) -> bool {
+    contains(polygon, point) || distance_to_border(polygon, point) <= tolerance_m
+}

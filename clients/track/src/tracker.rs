@@ -1,0 +1,341 @@
+//! From scans in the order of time to persons: association, birth, death, doors. Refuses to know how scans come in order.
+
+mod doors;
+
+use schema::{Foreground, Scan};
+
+use crate::assignment::{Assignment, Edge};
+use crate::filter::Side;
+use crate::geometry::{Point, distance, distance_to_segment, minus};
+use crate::passage::LONGEST_S;
+use crate::person::{Life, Person};
+use crate::picture::{Event, Kind, Picture, Track};
+use crate::sight::{Leg, Seen, Sight};
+use crate::site::Site;
+
+/// The most persons at a time.
+pub const PERSONS: usize = 64;
+/// Time between two pictures.
+pub const PICTURE_NS: u64 = 40_000_000;
+
+/// Gain of a leg exactly where it should be: what a leg's squared distance over its variance must be below.
+const GATE: f64 = 11.0;
+/// Who is only tentative gives way.
+const GATE_TENTATIVE: f64 = 9.0;
+/// Legs farther from a person than this are not his.
+const FARTHEST_LEG_M: f64 = 0.8;
+/// The legs of a person are at most this far apart.
+const WIDEST_STEP_M: f64 = 0.9;
+/// Nobody is born so near to somebody who is known.
+const APART_M: f64 = 0.3;
+/// Who is seen through for so long is gone.
+const GONE_S: f64 = 0.7;
+const GONE_TENTATIVE_S: f64 = 0.25;
+/// Who is tentative and not seen for so long is forgotten.
+const FORGOTTEN_NS: u64 = 400_000_000;
+/// Who is hidden for so long is.
+const HIDDEN_NS: u64 = 120_000_000_000;
+/// Two who are nearer, and of whom never two pairs of legs are seen, are one.
+const SAME_M: f64 = 0.45;
+
+/// What follows persons.
+pub(crate) struct Tracker {
+    pub(crate) site: Site,
+    watched: Vec<bool>,
+    pub(crate) sights: Vec<Sight>,
+    pub(crate) persons: Vec<Person>,
+    next_id: u64,
+    events: Vec<Event>,
+    assignment: Assignment,
+    edges: Vec<Edge>,
+    pairs: Vec<(usize, usize)>,
+    scan_ns: Vec<u64>,
+    /// Legs that were seen where a person walks: how much later than expected, per sensor, summed.
+    pub(crate) lateness: Vec<(f64, f64)>,
+}
+
+impl Tracker {
+    pub(crate) fn new(site: Site) -> Tracker {
+        Tracker {
+            watched: site.watched(),
+            sights: site.sensors.iter().cloned().map(Sight::new).collect(),
+            persons: Vec::with_capacity(PERSONS),
+            next_id: 1,
+            events: Vec::new(),
+            assignment: Assignment::default(),
+            edges: Vec::new(),
+            pairs: Vec::new(),
+            scan_ns: vec![0; site.sensors.len()],
+            lateness: vec![(0.0, 0.0); site.sensors.len()],
+            site,
+        }
+    }
+
+    /// Takes the next scan in the order of time.
+    pub(crate) fn take(&mut self, sensor: usize, at_ns: u64, scan: &Scan, foreground: &Foreground) {
+        self.sights[sensor].take(scan, foreground);
+        let since_s = (at_ns.saturating_sub(self.scan_ns[sensor]) as f64 * 1e-9).min(0.1);
+        self.scan_ns[sensor] = at_ns;
+        self.walk(at_ns);
+        let mut pairs = std::mem::take(&mut self.pairs);
+        self.associate(sensor, &mut pairs);
+        self.correct(sensor, &pairs);
+        self.miss(sensor, since_s, &pairs);
+        self.bear(sensor, at_ns, &pairs);
+        self.pairs = pairs;
+        self.merge(at_ns);
+        self.pass(at_ns);
+        self.bury(at_ns);
+    }
+
+    /// Moves everybody to `at_ns`; nobody who is not seen walks through a wall.
+    fn walk(&mut self, at_ns: u64) {
+        for person in self.persons.iter_mut().filter(|person| !matches!(person.life, Life::Away { .. })) {
+            let before = person.filter.place();
+            person.predict(at_ns);
+            if at_ns.saturating_sub(person.seen_ns) < 200_000_000 {
+                continue;
+            }
+            let (room, after) = (self.site.room_at(before), person.filter.place());
+            if self.site.room_at(after) != room {
+                let door = |door: &crate::site::Door| distance_to_segment(before, door.between) < 0.4;
+                if !self.site.doors.iter().any(door) {
+                    person.filter.stop(before);
+                }
+            }
+        }
+    }
+
+    /// Finds whose legs the sensor sees: pairs of a leg and twice the number of a person plus the side.
+    fn associate(&mut self, sensor: usize, pairs: &mut Vec<(usize, usize)>) {
+        let legs = self.sights[sensor].legs();
+        self.edges.clear();
+        for (number, person) in self.persons.iter().enumerate() {
+            let gate = match person.life {
+                Life::Away { .. } => continue,
+                Life::Tentative => GATE_TENTATIVE,
+                Life::Known => GATE,
+            };
+            let (place, is_slow) = (person.filter.place(), person.speed() < 0.5);
+            for (side, which) in Side::BOTH.into_iter().enumerate() {
+                let (expected, variance) = person.filter.leg(which);
+                for (leg, found) in legs.iter().enumerate() {
+                    let off = minus(found.at, expected);
+                    let off2 = off[0] * off[0] + off[1] * off[1];
+                    if off2 > 1.0 || !(found.is_fresh || is_slow) {
+                        continue;
+                    }
+                    let variance = variance + found.sigma_m * found.sigma_m;
+                    let gain = gate - off2 / variance - 2.0 * (variance / 0.0025).ln().max(0.0);
+                    let reach = FARTHEST_LEG_M + 2.0 * person.filter.variance().sqrt().min(0.5);
+                    if gain > 0.0 && distance(found.at, place) < reach {
+                        self.edges.push(Edge { leg, place: 2 * number + side, gain });
+                    }
+                }
+            }
+        }
+        pairs.clear();
+        self.assignment.solve((legs.len(), 2 * self.persons.len()), &mut self.edges, pairs);
+        // By person, the surer leg first.
+        pairs.sort_unstable_by_key(|&(leg, place)| (place / 2, (legs[leg].sigma_m * 1e6) as u64, leg));
+        let mut i = 1;
+        while i < pairs.len() {
+            let ((one, of), (other, and)) = (pairs[i - 1], pairs[i]);
+            if of / 2 == and / 2 && distance(legs[one].at, legs[other].at) > WIDEST_STEP_M {
+                pairs.remove(i);
+            } else {
+                i += 1;
+            }
+        }
+    }
+
+    fn correct(&mut self, sensor: usize, pairs: &[(usize, usize)]) {
+        let legs = self.sights[sensor].legs();
+        for of_one in pairs.chunk_by(|a, b| a.1 / 2 == b.1 / 2) {
+            let person = &mut self.persons[of_one[0].1 / 2];
+            let (velocity, speed) = (person.filter.velocity(), person.speed());
+            let mut ahead = 0.0;
+            for &(leg, place) in of_one {
+                let Leg { at, sigma_m, .. } = legs[leg];
+                let side = Side::BOTH[place % 2];
+                let off = minus(at, person.filter.leg(side).0);
+                ahead += off[0] * velocity[0] + off[1] * velocity[1];
+                person.filter.correct(side, at, sigma_m);
+            }
+            if of_one.len() == 2 && speed > 0.6 && person.life == Life::Known {
+                let (sum, weight) = &mut self.lateness[sensor];
+                *sum += ahead / 2.0;
+                *weight += speed * speed;
+            }
+            person.seen(sensor, of_one.len());
+        }
+    }
+
+    /// Who is not among `pairs` is hidden, or seen through.
+    fn miss(&mut self, sensor: usize, since_s: f64, pairs: &[(usize, usize)]) {
+        let sight = &self.sights[sensor];
+        for (number, person) in self.persons.iter_mut().enumerate() {
+            if matches!(person.life, Life::Away { .. }) || pairs.iter().any(|&(_, place)| place / 2 == number)
+            {
+                continue;
+            }
+            let place = person.filter.place();
+            let sigma = person.filter.variance().sqrt();
+            let share = if sigma < 0.25 {
+                match sight.look(place) {
+                    Seen::Through => 1.0,
+                    Seen::Here => {
+                        // What the background has learned still stands there.
+                        if person.is_known() && person.speed() < 0.4 {
+                            person.absent_s = (person.absent_s - since_s).max(0.0);
+                        }
+                        0.0
+                    }
+                    Seen::Hidden => 0.0,
+                }
+            } else {
+                let s = 1.2 * sigma;
+                let around = [[0.0, 0.0], [s, 0.0], [-s, 0.0], [0.0, s], [0.0, -s]];
+                let through =
+                    |off: &&Point| sight.look([place[0] + off[0], place[1] + off[1]]) == Seen::Through;
+                around.iter().filter(through).count() as f64 / 5.0
+            };
+            person.absent_s += share * since_s;
+            if share > 0.5 {
+                person.support = (person.support - 0.5).max(0.0);
+            }
+        }
+    }
+
+    /// Legs of nobody are somebody's.
+    fn bear(&mut self, sensor: usize, at_ns: u64, pairs: &[(usize, usize)]) {
+        let legs = self.sights[sensor].legs();
+        let near_known = |at: Point| {
+            self.persons.iter().any(|person| {
+                let is_his = |side| distance(person.filter.leg(side).0, at) < APART_M;
+                !matches!(person.life, Life::Away { .. }) && Side::BOTH.into_iter().any(is_his)
+            })
+        };
+        let mut free: Vec<usize> = (0..legs.len())
+            .filter(|&leg| {
+                let taken = pairs.iter().any(|&(taken, _)| taken == leg);
+                legs[leg].is_fresh && !taken && !near_known(legs[leg].at)
+            })
+            .collect();
+        while let Some(leg) = free.pop() {
+            if self.persons.len() >= PERSONS {
+                return;
+            }
+            let off = |&&other: &&usize| distance(legs[other].at, legs[leg].at);
+            let mate = free
+                .iter()
+                .filter(|other| off(other) < 0.6)
+                .min_by(|a, b| off(a).total_cmp(&off(b)))
+                .copied();
+            free.retain(|&other| Some(other) != mate);
+            let both = [legs[leg], mate.map_or(legs[leg], |mate| legs[mate])];
+            let both = if mate.is_some() { &both[..] } else { &both[..1] };
+            let mut person = Person::new(self.next_id, at_ns, both);
+            person.seen_by_ns[sensor] = at_ns;
+            person.room = self.site.room_at(person.born_at);
+            self.next_id += 1;
+            self.persons.push(person);
+        }
+    }
+
+    /// Two who share one pair of legs are one.
+    fn merge(&mut self, at_ns: u64) {
+        let mut i = 0;
+        while i < self.persons.len() {
+            let one = &self.persons[i];
+            let is_same = |other: &Person| {
+                let near = distance(one.filter.place(), other.filter.place()) < SAME_M;
+                let alone = one.both + other.both < 0.35;
+                let known =
+                    !matches!(one.life, Life::Away { .. }) && !matches!(other.life, Life::Away { .. });
+                let grown = at_ns - other.born_ns > 600_000_000 && at_ns - one.born_ns > 600_000_000;
+                let unseen = (at_ns - one.seen_ns).max(at_ns - other.seen_ns) > 300_000_000;
+                let very_near = distance(one.filter.place(), other.filter.place()) < 0.2;
+                known
+                    && grown
+                    && (near && alone || very_near && unseen && (one.both < 0.3 || other.both < 0.3))
+            };
+            match (i + 1..self.persons.len()).find(|&j| is_same(&self.persons[j])) {
+                Some(other) => {
+                    // The one who was known first stays, with the filter of whom was seen last.
+                    let (keep, drop) = if self.persons[other].is_known() && !self.persons[i].is_known() {
+                        (other, i)
+                    } else {
+                        (i, other)
+                    };
+                    if self.persons[drop].seen_ns > self.persons[keep].seen_ns {
+                        self.persons[keep].filter = self.persons[drop].filter.clone();
+                        self.persons[keep].seen_ns = self.persons[drop].seen_ns;
+                    }
+                    if self.persons[drop].is_known() {
+                        self.tell(at_ns, drop, Kind::Left);
+                    }
+                    self.persons.remove(drop);
+                }
+                None => i += 1,
+            }
+        }
+    }
+
+    /// Who was seen through long enough is gone, and who was away too long.
+    fn bury(&mut self, at_ns: u64) {
+        let mut number = 0;
+        while number < self.persons.len() {
+            let person = &self.persons[number];
+            let silent_ns = at_ns.saturating_sub(person.seen_ns);
+            let (is_gone, is_told) = match person.life {
+                Life::Tentative => (person.absent_s > GONE_TENTATIVE_S || silent_ns > FORGOTTEN_NS, false),
+                Life::Known => (person.absent_s > GONE_S || silent_ns > HIDDEN_NS, true),
+                Life::Away { since_ns, .. } => {
+                    let away_s = at_ns.saturating_sub(since_ns) as f64 * 1e-9;
+                    (person.room.is_none() || away_s > 5.0 * LONGEST_S, true)
+                }
+            };
+            if is_gone {
+                if is_told {
+                    self.tell(at_ns, number, Kind::Left);
+                }
+                self.persons.remove(number);
+            } else {
+                number += 1;
+            }
+        }
+    }
+
+    fn tell(&mut self, wall_ns: u64, number: usize, kind: Kind) {
+        let Person { id, room, .. } = self.persons[number];
+        self.events.push(Event { wall_ns, id, room, kind });
+    }
+
+    /// Writes the picture of `at_ns`, at which or before which the last scan was.
+    pub(crate) fn show(&mut self, at_ns: u64, picture: &mut Picture) {
+        picture.wall_ns = at_ns;
+        picture.tracks.clear();
+        picture.tracks.extend(self.persons.iter().map(|person| {
+            let ahead = at_ns.saturating_sub(person.at_ns).min(200_000_000) as f64 * 1e-9;
+            let (place, velocity) = (person.filter.place(), person.filter.velocity());
+            let variance = person.filter.variance();
+            let is_away = matches!(person.life, Life::Away { .. });
+            let ahead = if is_away { 0.0 } else { ahead };
+            Track {
+                id: person.id,
+                state: person.state(at_ns),
+                place: [place[0] + ahead * velocity[0], place[1] + ahead * velocity[1]],
+                velocity,
+                covariance: [variance, 0.0, variance],
+                room: person.room,
+                sensors: person.sensors(at_ns),
+                age_s: at_ns.saturating_sub(person.born_ns) as f64 * 1e-9,
+                score: 1.0 - (-person.support / 5.0).exp(),
+            }
+        }));
+        picture.tracks.sort_unstable_by_key(|track| track.id);
+        picture.events.clear();
+        picture.events.append(&mut self.events);
+    }
+}

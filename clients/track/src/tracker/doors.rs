@@ -1,0 +1,160 @@
+//! Who goes through doors, who goes where no sensor looks, and who of them somebody new is. Refuses to know legs.
+
+use super::Tracker;
+use crate::geometry::{Point, distance, distance_to_segment};
+use crate::person::{Life, Person};
+use crate::picture::Kind;
+
+/// So far from a door somebody may be seen first who comes to it.
+const BEFORE_DOOR_M: f64 = 3.5;
+/// The same in a room with sensors, where he is seen as soon as he has come through.
+const INSIDE_DOOR_M: f64 = 1.2;
+/// Who is so far behind a door has gone through it.
+const BEHIND_DOOR_M: f64 = 0.12;
+/// Who is nearer to somebody known, and never shows two legs, is a part of him.
+const PART_M: f64 = 0.5;
+/// Squared distance over variance within which somebody new is one who was hidden: 98.9 % of the plane's normal distribution.
+const HIDDEN_GATE: f64 = 9.0;
+/// Who is out of sight for so long in an unseen room is away.
+const AWAY_NS: u64 = 250_000_000;
+
+impl Tracker {
+    /// Doors, and those who go where no sensor looks.
+    pub(super) fn pass(&mut self, at_ns: u64) {
+        let mut number = 0;
+        while number < self.persons.len() {
+            let person = &self.persons[number];
+            if person.life == Life::Tentative {
+                if person.is_sure() && !self.is_part_of_another(number) {
+                    self.confirm(number, at_ns);
+                    continue;
+                }
+            } else if person.is_known() {
+                self.cross(number, at_ns);
+            }
+            number += 1;
+        }
+    }
+
+    /// Who is hidden and may have been at `place` then, in the same room: the one for whom it is the least far off.
+    fn hidden_near(&self, place: Point, then_ns: u64) -> Option<usize> {
+        let room = self.site.room_at(place);
+        let off2 = |(number, person): (usize, &Person)| {
+            let is_hidden = person.is_known() && person.seen_ns + AWAY_NS < person.at_ns;
+            let is_he = is_hidden && person.seen_ns <= then_ns && person.room == room;
+            let off = distance(place, person.filter.place());
+            let off2 = off * off / (person.filter.variance() + 0.04);
+            (is_he && off2 < HIDDEN_GATE).then_some((off2, number))
+        };
+        let near = self.persons.iter().enumerate().filter_map(off2);
+        near.min_by(|a, b| a.0.total_cmp(&b.0)).map(|(_, number)| number)
+    }
+
+    /// One leg beside somebody who is seen is rather a part of him.
+    fn is_part_of_another(&self, number: usize) -> bool {
+        let one = &self.persons[number];
+        let near = |other: &Person| {
+            other.is_known()
+                && one.at_ns.saturating_sub(other.seen_ns) < AWAY_NS
+                && distance(one.filter.place(), other.filter.place()) < PART_M
+        };
+        one.both < 0.3 && self.persons.iter().any(near)
+    }
+
+    fn cross(&mut self, number: usize, at_ns: u64) {
+        let person = &self.persons[number];
+        let (place, from) = (person.filter.place(), person.room);
+        let to = self.site.room_at(place);
+        if to != from {
+            let door = self.site.door_between(from, to, place);
+            let behind = |door: usize| distance_to_segment(place, self.site.doors[door].between);
+            match door.filter(|&door| behind(door) < 1.5) {
+                Some(door) if behind(door) > BEHIND_DOOR_M => {
+                    self.persons[number].room = to;
+                    self.tell(at_ns, number, Kind::Door { door, from, to });
+                }
+                // He was not seen at the door, or is in a wall.
+                None if to.is_some() && at_ns - person.seen_ns < AWAY_NS => self.persons[number].room = to,
+                _ => {}
+            }
+        }
+        let person = &self.persons[number];
+        let is_watched = person.room.is_some_and(|room| self.watched[room]);
+        if !is_watched && at_ns - person.seen_ns > AWAY_NS {
+            let (room, place, since_ns) = (person.room, person.filter.place(), person.seen_ns);
+            let off = |&door: &usize| distance_to_segment(place, self.site.doors[door].between);
+            let leads =
+                |&door: &usize| [self.site.doors[door].from, self.site.doors[door].to].contains(&room);
+            let door = (0..self.site.doors.len()).filter(leads).min_by(|a, b| off(a).total_cmp(&off(b)));
+            if let Some(door) = door {
+                self.persons[number].life = Life::Away { since_ns, door };
+            }
+        }
+    }
+
+    /// Somebody new is sure: he may be one who went away.
+    fn confirm(&mut self, number: usize, at_ns: u64) {
+        let new = &self.persons[number];
+        let (born_at, born_ns) = (new.born_at, new.born_ns);
+        let off = |door: usize| distance_to_segment(born_at, self.site.doors[door].between);
+        let is_inside = self.site.room_at(born_at).is_some_and(|room| self.watched[room]);
+        let before_door_m = if is_inside { INSIDE_DOOR_M } else { BEFORE_DOOR_M };
+        // Everyone away, at the door that he would have come out of.
+        let arrival = |(old, person): (usize, &Person)| {
+            let Life::Away { since_ns, door: entry } = person.life else { return None };
+            let exits = (0..self.site.doors.len()).filter(|&door| {
+                let ends = [self.site.doors[door].from, self.site.doors[door].to];
+                let gap =
+                    self.site.gaps.iter().any(|gap| gap.doors.contains(&entry) && gap.doors.contains(&door));
+                (ends.contains(&person.room) || gap) && off(door) < before_door_m
+            });
+            let exit = exits.min_by(|&a, &b| off(a).total_cmp(&off(b)))?;
+            let after_s = (born_ns as f64 - since_ns as f64) * 1e-9;
+            // He was born while the other was seen: another one.
+            if after_s < 0.0 && exit != entry || after_s < -0.5 {
+                return None;
+            }
+            let way_m = distance(born_at, person.filter.place());
+            let likely = self.site.arrival([entry, exit], way_m, person.pace, after_s);
+            Some((likely, old, exit))
+        };
+        let best = self.persons.iter().enumerate().filter_map(arrival).max_by(|a, b| a.0.total_cmp(&b.0));
+        let best = best.filter(|best| best.0 > 1e-4).map(|(_, old, exit)| (old, Some(exit)));
+        match self.hidden_near(born_at, born_ns).map(|old| (old, None)).or(best) {
+            Some((old, exit)) => {
+                let mut new = self.persons.remove(number);
+                let old = if old > number { old - 1 } else { old };
+                let known = &mut self.persons[old];
+                let from = known.room;
+                (new.id, new.born_ns, new.pace, new.life) =
+                    (known.id, known.born_ns, known.pace, Life::Known);
+                new.room = self.site.room_at(new.filter.place()).or(new.room);
+                let to = new.room;
+                self.persons[old] = new;
+                if let Some(door) = exit.filter(|_| from != to) {
+                    self.tell(at_ns, old, Kind::Door { door, from, to });
+                }
+            }
+            None => {
+                self.persons[number].life = Life::Known;
+                // Who comes out of a door that leads where nobody looks has come through it.
+                let leads = |&door: &usize| {
+                    let ends = [self.site.doors[door].from, self.site.doors[door].to];
+                    let is_unseen = |room: &Option<usize>| room.is_none_or(|room| !self.watched[room]);
+                    ends.contains(&self.persons[number].room) && ends.iter().any(is_unseen)
+                };
+                let door = (0..self.site.doors.len()).filter(leads).find(|&door| off(door) < 0.7);
+                let (room, is_watched) = {
+                    let room = self.persons[number].room;
+                    (room, room.is_some_and(|room| self.watched[room]))
+                };
+                self.tell(at_ns, number, Kind::Appeared);
+                if let Some(door) = door.filter(|_| is_watched) {
+                    let ends = [self.site.doors[door].from, self.site.doors[door].to];
+                    let from = if ends[0] == room { ends[1] } else { ends[0] };
+                    self.tell(at_ns, number, Kind::Door { door, from, to: room });
+                }
+            }
+        }
+    }
+}

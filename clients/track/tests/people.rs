@@ -1,0 +1,137 @@
+//! The tracker from outside, in the house of the proof: the same tracks however scans come, latecomers and clocks that jump,
+//! identities that are never used again, a sensor that dies, legs of real people.
+
+#[allow(dead_code)]
+#[path = "../examples/proof/house.rs"]
+mod house;
+#[allow(dead_code)]
+#[path = "../examples/proof/walkers.rs"]
+mod walkers;
+
+use std::collections::BTreeSet;
+
+use house::{BEAMS, Eye};
+use preprocess::background::{Model, Settings};
+use preprocess::segments::Segmenter;
+use schema::{Foreground, Pose, Scan};
+use track::{People, Picture, Site, State};
+use walkers::Crowd;
+
+const DELAY_NS: u64 = 80_000_000;
+const MS: u64 = 1_000_000;
+const BEGIN_NS: u64 = 1_700_000_000_000_000_000;
+
+struct Sent {
+    sensor: usize,
+    wall_ns: u64,
+    scan: Box<Scan>,
+    foreground: Box<Foreground>,
+}
+
+fn site() -> Site {
+    Site::parse("house.toml", house::SITE).expect("the house is right")
+}
+
+/// What the sensors of the house send while `count` people walk there from second 12 on: each 25 scans a second.
+fn sent(count: usize, seconds: u64) -> Vec<Sent> {
+    let (site, walls) = (site(), house::walls());
+    let mut random = fastrand::Rng::with_seed(3);
+    let mut crowd = Crowd::new(count, 12.0, 0.25, 3);
+    let mut eyes: Vec<(Eye, Model, Segmenter)> = (0..site.sensors.len())
+        .map(|sensor| {
+            let segmenter = Segmenter::new(Pose::default(), BEAMS);
+            (Eye::new(&site, sensor, &walls), Model::new(Settings::default(), BEAMS), segmenter)
+        })
+        .collect();
+    let (mut all, mut legs) = (Vec::new(), Vec::new());
+    for step in 0..100 * seconds {
+        crowd.step(step as f64 / 100.0, 0.01);
+        crowd.legs(&mut legs);
+        let sensor = (step % 4) as usize;
+        let (eye, model, segmenter) = &mut eyes[sensor];
+        let scan = eye.scan(&legs, &mut random);
+        let mut foreground = Foreground::of(BEAMS);
+        model.update(&scan, &mut foreground);
+        segmenter.update(&scan, &mut foreground);
+        all.push(Sent { sensor, wall_ns: BEGIN_NS + 10 * MS * step, scan, foreground });
+    }
+    all
+}
+
+fn pictures<'a>(sent: impl Iterator<Item = &'a Sent>) -> (Vec<Picture>, People) {
+    let mut people = People::new(site(), DELAY_NS);
+    let mut pictures = Vec::new();
+    for Sent { sensor, wall_ns, scan, foreground } in sent {
+        people.take(*sensor, *wall_ns, scan, foreground, |picture| pictures.push(picture.clone()));
+    }
+    people.finish(|picture| pictures.push(picture.clone()));
+    (pictures, people)
+}
+
+#[test]
+fn the_same_scans_give_the_same_tracks_however_they_come() {
+    let sent = sent(4, 24);
+    let (in_order, people) = pictures(sent.iter());
+    assert!(in_order.iter().any(|picture| picture.tracks.len() >= 3));
+    assert_eq!((people.counts().scans, people.counts().late), (2_400, 0));
+    // Each group of seven comes backwards: 60 ms, less than is waited for.
+    let turned: Vec<&Sent> = sent.chunks(7).flat_map(|some| some.iter().rev()).collect();
+    let (turned, people) = pictures(turned.into_iter());
+    assert_eq!(people.counts().late, 0);
+    assert!(in_order == turned, "bit for bit");
+}
+
+#[test]
+fn latecomers_and_clocks_that_jump_are_counted_and_change_nothing() {
+    let sent = sent(2, 20);
+    let (in_order, _) = pictures(sent.iter());
+    let mut people = People::new(site(), DELAY_NS);
+    let mut shown = Vec::new();
+    for (number, Sent { sensor, wall_ns, scan, foreground }) in sent.iter().enumerate() {
+        let mut take = |wall_ns| {
+            people.take(*sensor, wall_ns, scan, foreground, |picture| shown.push(picture.clone()));
+        };
+        take(*wall_ns);
+        if number > 100 && number % 200 == 0 {
+            take(*wall_ns - 500 * MS);
+            take(*wall_ns + 3_600_000 * MS);
+        }
+    }
+    people.finish(|picture| shown.push(picture.clone()));
+    let counts = people.counts();
+    assert_eq!((counts.late, counts.jumped, counts.unfit), (9, 9, 0));
+    assert!(in_order == shown);
+    let other = Foreground::of(181);
+    people.take(0, BEGIN_NS, &sent[0].scan, &other, |_| {});
+    people.take(9, BEGIN_NS, &sent[0].scan, &sent[0].foreground, |_| {});
+    assert_eq!(people.counts().unfit, 2);
+}
+
+#[test]
+fn an_identity_is_never_used_again_and_nobody_is_invented_when_a_sensor_dies() {
+    let sent = sent(3, 60);
+    let dies_ns = BEGIN_NS + 30_000 * MS;
+    let alive = sent.iter().filter(|one| one.wall_ns < dies_ns || one.sensor != 0);
+    let (pictures, _) = pictures(alive);
+    let (mut gone, mut before) = (BTreeSet::new(), BTreeSet::new());
+    for picture in &pictures {
+        let now: BTreeSet<u64> = picture.tracks.iter().map(|track| track.id).collect();
+        gone.extend(before.difference(&now).copied());
+        assert!(now.is_disjoint(&gone), "{now:?} after {gone:?}");
+        let is_here = |track: &&track::Track| matches!(track.state, State::Confirmed | State::Hidden);
+        let known = picture.tracks.iter().filter(is_here).count();
+        assert!(known <= 4, "three people, and one who is not yet joined: {picture:?}");
+        before = now;
+    }
+    assert!(pictures.iter().any(|picture| picture.wall_ns > dies_ns + 20_000 * MS));
+}
+
+#[test]
+fn a_clock_that_is_off_is_found_by_those_whom_both_see() {
+    let mut sent = sent(4, 60);
+    // Sensors 1 and 3 are of another hub, whose clock is 40 ms ahead.
+    sent.iter_mut().filter(|one| one.sensor % 2 == 1).for_each(|one| one.wall_ns += 40 * MS);
+    let (_, people) = pictures(sent.iter());
+    assert_eq!(people.offset_s(0), 0.0);
+    assert!((people.offset_s(1) - 0.04).abs() < 0.01, "{}", people.offset_s(1));
+}

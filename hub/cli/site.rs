@@ -1,0 +1,86 @@
+//! `scanhub site` on the command line: the plan that `track` follows people in.
+
+use std::fs::File;
+use std::io::Write;
+use std::path::PathBuf;
+
+use clap::{Args, Subcommand};
+use schema::{Failure, Kind};
+use serde::Serialize;
+
+use crate::{line, print};
+
+#[derive(Args, Debug)]
+pub(crate) struct Site {
+    #[command(subcommand)]
+    order: Order,
+}
+
+#[derive(Debug, Subcommand)]
+enum Order {
+    /// Check a site file; if it has an error, show the place and exit with 78
+    Check {
+        /// The site file: sensors, rooms and doors
+        file: PathBuf,
+        /// Draw the plan into this file, which must not exist
+        #[arg(long, value_name = "OUT")]
+        svg: Option<PathBuf>,
+    },
+}
+
+#[derive(Serialize)]
+struct Checked {
+    class: &'static str,
+    sensors: Vec<String>,
+    rooms: Vec<String>,
+    /// Those that no sensor is in.
+    unwatched: Vec<String>,
+    doors: Vec<String>,
+    gaps: usize,
+}
+
+impl Site {
+    pub(crate) fn run(&self, json: bool) -> Result<(), Failure> {
+        let Order::Check { file, svg } = &self.order;
+        let site = track::Site::read(file)?;
+        if let Some(out) = svg {
+            let written = File::create_new(out).and_then(|mut file| file.write_all(site.svg().as_bytes()));
+            written.map_err(|error| {
+                let message = format!("{}: {error}", out.display());
+                Failure::new(Kind::Output, message, "name a new file in a folder that you may write to")
+            })?;
+        }
+        let watched = site.watched();
+        let rooms: Vec<String> = site.rooms.iter().map(|room| room.name.clone()).collect();
+        let checked = Checked {
+            class: "site",
+            sensors: site.sensors.iter().map(|sensor| sensor.name.clone()).collect(),
+            unwatched: rooms
+                .iter()
+                .zip(&watched)
+                .filter(|(_, seen)| !**seen)
+                .map(|(name, _)| name.clone())
+                .collect(),
+            rooms,
+            doors: site.doors.iter().map(|door| door.name.clone()).collect(),
+            gaps: site.gaps.len(),
+        };
+        print(&if json { line(&checked) } else { checked.text() })
+    }
+}
+
+impl Checked {
+    fn text(&self) -> String {
+        let mut text = format!(
+            "sensors: {}\nrooms: {}\ndoors: {}\ngaps: {}",
+            self.sensors.join(", "),
+            self.rooms.join(", "),
+            if self.doors.is_empty() { "none".to_owned() } else { self.doors.join(", ") },
+            self.gaps
+        );
+        if !self.unwatched.is_empty() {
+            text += &format!("\nno sensor is in: {}", self.unwatched.join(", "));
+        }
+        text
+    }
+}

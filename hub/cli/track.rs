@@ -1,0 +1,46 @@
+//! `scanhub track` on the command line.
+
+use std::path::PathBuf;
+use std::time::Duration;
+
+use clap::Args;
+use schema::Failure;
+use verbs::{Bounds, TrackOptions, duration};
+
+use super::Everywhere;
+
+#[derive(Args, Debug)]
+pub(crate) struct Track {
+    /// The site file: sensors, rooms and doors
+    #[arg(long, value_name = "FILE")]
+    site: PathBuf,
+    /// Name of the tracker in lines of JSON
+    #[arg(long = "as", default_value = "people", value_name = "NAME")]
+    name: String,
+    /// Print only how many went through this door, each time that somebody does. Can be repeated
+    #[arg(long, value_name = "DOOR")]
+    count: Vec<String>,
+    /// How long the scan of a sensor is waited for when others have sent later ones
+    #[arg(long, default_value = "80ms", value_name = "DURATION", value_parser = duration::parse)]
+    delay: Duration,
+    /// Stop after this time, for example 10s, 250ms, 5m
+    #[arg(long = "for", value_name = "DURATION", value_parser = duration::parse)]
+    run_for: Option<Duration>,
+    /// Exit with 3 after this time without a scan
+    #[arg(long, value_name = "DURATION", value_parser = duration::parse)]
+    timeout: Option<Duration>,
+}
+
+impl Track {
+    pub(crate) fn options(&self, everywhere: &Everywhere) -> Result<TrackOptions, Failure> {
+        Ok(TrackOptions {
+            site: track::Site::read(&self.site)?,
+            name: self.name.clone(),
+            count: self.count.clone(),
+            delay: self.delay,
+            json: everywhere.json,
+            bounds: Bounds { count: None, run_for: self.run_for, timeout: self.timeout },
+            places: everywhere.places()?,
+        })
+    }
+}

@@ -1,0 +1,310 @@
+//! A background for a scanner that moves: a map of what stands around the robot, which scrolls with it. A beam that ends in
+//! space that was seen free is in the foreground; shadows and the edge of what was seen are unknown. Refuses to know how
+//! the robot's place is found: each scan comes with it.
+
+use schema::{Background, Motion, Pose, Scan};
+
+use super::runs::Runs;
+use super::settings::Limits;
+use super::{Class, INVALID};
+
+/// State of the method that follows the robot.
+#[derive(Clone)]
+pub(super) struct Moving {
+    /// Square cells around the robot; the cell of a place is that of its coordinates modulo the width.
+    cells: Box<[Cell]>,
+    /// What happened to each cell in the last scan that met it: see [`Mark`].
+    marks: Box<[u8]>,
+    /// The cell of the robot, in the middle of those that are kept.
+    middle: (i32, i32),
+    place: Option<Place>,
+    scan: u8,
+    /// Where the beams end, in cells, while a scan is looked at.
+    ends: Box<[(f32, f32)]>,
+    runs: Runs,
+}
+
+/// What is known of a square of the floor.
+#[derive(Clone, Copy, Default)]
+struct Cell {
+    /// Scans in which a beam ended here, less those that saw through it since.
+    hits: u16,
+    /// Scans that saw through it, less an eighth of those in which a beam ended here.
+    free: u16,
+}
+
+/// Where the sensor is in the map, and where it looks.
+#[derive(Clone, Copy)]
+struct Place {
+    x: f64,
+    y: f64,
+    cos: f64,
+    sin: f64,
+    pose: Pose,
+    angles: (f64, f64),
+    unit_m: f64,
+}
+
+/// What a scan did to a cell, in a byte: three times the number of the scan, and this.
+struct Mark;
+
+impl Mark {
+    /// So many scans have numbers.
+    const SCANS: u8 = 84;
+    const THROUGH: u8 = 0;
+    /// A beam ended beside it.
+    const NEAR: u8 = 1;
+    const ENDED: u8 = 2;
+}
+
+impl Moving {
+    /// For so many beams at most.
+    pub(super) fn new(beams: usize) -> Moving {
+        Moving {
+            cells: vec![Cell::default(); CELLS].into(),
+            marks: vec![0; CELLS].into(),
+            middle: (0, 0),
+            place: None,
+            scan: 0,
+            ends: vec![(0.0, 0.0); beams].into(),
+            runs: Runs::new(beams),
+        }
+    }
+
+    /// As it was when it was new.
+    pub(super) fn forget(&mut self) {
+        self.cells.fill(Cell::default());
+        self.runs.forget();
+    }
+
+    /// The next scan is from where `motion` says that the robot is, of a sensor at `pose`. Whether the map is still one of
+    /// where the robot is.
+    pub(super) fn follow(&mut self, pose: &Pose, motion: &Motion) -> bool {
+        let (sin, cos) = motion.yaw_rad.sin_cos();
+        let x = motion.x_m + cos * pose.x_m - sin * pose.y_m;
+        let y = motion.y_m + sin * pose.x_m + cos * pose.y_m;
+        let is_known = motion.has_pose() && x.abs() < FARTHEST_M && y.abs() < FARTHEST_M;
+        let (angles, unit_m) = ((0.0, 0.0), 0.0);
+        self.place = is_known.then_some(Place { x, y, cos, sin, pose: *pose, angles, unit_m });
+        is_known && motion.has_step()
+    }
+
+    /// Compares all beams with the map before this scan, then lays the scan into it.
+    pub(super) fn update(
+        &mut self,
+        scan: &Scan,
+        readings: &[u16],
+        limits: &Limits,
+        learn: bool,
+        classes: &mut [Class],
+    ) {
+        let Some(place) = &mut self.place else {
+            classes.fill(Class::Unknown);
+            return;
+        };
+        (place.angles, place.unit_m) = ((scan.first_angle, scan.step), f64::from(scan.unit_um) * 1e-6);
+        let place = *place;
+        self.scroll((cell(place.x), cell(place.y)));
+        let exact = scan.exact_angles();
+        for (i, (&reading, class)) in readings.iter().zip(classes.iter_mut()).enumerate() {
+            self.ends[i] = (f32::NAN, f32::NAN);
+            if reading >= INVALID {
+                *class = if reading == INVALID { Class::Invalid } else { Class::Unknown };
+                continue;
+            }
+            let angle = exact.get(i).filter(|exact| exact.is_finite()).map(|&exact| f64::from(exact));
+            let angle = angle.unwrap_or(place.angles.0 + i as f64 * place.angles.1);
+            let along = place.along(angle);
+            let range = f64::from(reading) * place.unit_m;
+            let end = (place.x + range * along.0, place.y + range * along.1);
+            self.ends[i] = ((end.0 / CELL_M) as f32, (end.1 / CELL_M) as f32);
+            *class = self.class(cell(end.0), cell(end.1), limits);
+        }
+        self.runs.keep(readings, limits, classes);
+        if learn {
+            self.lay(&place, readings.len(), limits);
+        }
+    }
+
+    /// What a beam is that ends in this cell.
+    fn class(&self, x: i32, y: i32, limits: &Limits) -> Class {
+        if !self.is_inside(x, y, AROUND) {
+            return Class::Unknown;
+        }
+        let mut is_free = true;
+        for dx in -AROUND..=AROUND {
+            for dy in -AROUND..=AROUND {
+                let cell = &self.cells[index(x + dx, y + dy)];
+                if cell.stands(limits) {
+                    return Class::Background;
+                }
+                let is_near = dx.abs().max(dy.abs()) <= 1;
+                is_free &= !is_near || cell.free >= if (dx, dy) == (0, 0) { FREE } else { FREE / 2 };
+            }
+        }
+        if is_free { Class::Foreground } else { Class::Unknown }
+    }
+
+    /// Keeps the cells around `middle`, and forgets those that are new among them.
+    fn scroll(&mut self, middle: (i32, i32)) {
+        let (dx, dy) = (middle.0 - self.middle.0, middle.1 - self.middle.1);
+        if dx.abs() >= WIDTH || dy.abs() >= WIDTH {
+            self.cells.fill(Cell::default());
+        } else {
+            let new = |from: i32, by: i32| {
+                let (old, new) = (from - WIDTH / 2, from + by - WIDTH / 2);
+                if by > 0 { old + WIDTH..new + WIDTH } else { new..old }
+            };
+            for x in new(self.middle.0, dx) {
+                (0..WIDTH).for_each(|y| self.cells[index(x, y)] = Cell::default());
+            }
+            for y in new(self.middle.1, dy) {
+                (0..WIDTH).for_each(|x| self.cells[index(x, y)] = Cell::default());
+            }
+        }
+        self.middle = middle;
+    }
+
+    /// Whether a cell is kept, and so many around it.
+    fn is_inside(&self, x: i32, y: i32, around: i32) -> bool {
+        let half = WIDTH / 2 - around;
+        let is_near = |at: i32, middle: i32| (middle - half..middle + half).contains(&at);
+        is_near(x, self.middle.0) && is_near(y, self.middle.1)
+    }
+
+    /// Lays the scan into the map: each cell counts once, and where a beam ended no other sees through.
+    fn lay(&mut self, place: &Place, beams: usize, limits: &Limits) {
+        self.scan = if self.scan >= Mark::SCANS { 1 } else { self.scan + 1 };
+        if self.scan == 1 {
+            self.marks.fill(0);
+        }
+        let (near, ended) = (3 * self.scan + Mark::NEAR, 3 * self.scan + Mark::ENDED);
+        let most = limits.scans.max(FREE);
+        // Those that ended, before those that were seen through.
+        for i in 0..beams {
+            let (x, y) = self.ends[i];
+            let (x, y) = (x.floor() as i32, y.floor() as i32);
+            if self.ends[i].0.is_nan() || !self.is_inside(x, y, 1) {
+                continue;
+            }
+            let at = index(x, y);
+            if self.marks[at] == ended {
+                continue;
+            }
+            self.cells[at].hit(most);
+            for dx in -1..=1 {
+                for dy in -1..=1 {
+                    let mark = &mut self.marks[index(x + dx, y + dy)];
+                    *mark = near.max(*mark);
+                }
+            }
+            self.marks[at] = ended;
+        }
+        // Counted from the first cell that is kept, no place is below 0.
+        let first = ((self.middle.0 - WIDTH / 2) as f32, (self.middle.1 - WIDTH / 2) as f32);
+        let from = ((place.x / CELL_M) as f32 - first.0, (place.y / CELL_M) as f32 - first.1);
+        for i in 0..beams {
+            let end = self.ends[i];
+            if !end.0.is_nan() {
+                self.see_through(from, (end.0 - first.0, end.1 - first.1), most);
+            }
+        }
+    }
+
+    /// Counts the cells from the sensor to short of where a beam ended, in steps of less than a cell.
+    fn see_through(&mut self, from: (f32, f32), end: (f32, f32), most: u16) {
+        let through = 3 * self.scan + Mark::THROUGH;
+        let (dx, dy) = (end.0 - from.0, end.1 - from.1);
+        let length = dx.hypot(dy);
+        let steps = (length - SHORT).min(WIDTH as f32 / 2.0);
+        let (dx, dy) = (dx / length, dy / length);
+        let (mut x, mut y) = from;
+        let first = (self.middle.0 - WIDTH / 2, self.middle.1 - WIDTH / 2);
+        let first = (first.0.rem_euclid(WIDTH), first.1.rem_euclid(WIDTH));
+        let wrapped = |at: i32| if at >= WIDTH { at - WIDTH } else { at };
+        for _ in 0..steps as u32 {
+            (x, y) = (x + dx, y + dy);
+            let (column, row) = (x as i32, y as i32);
+            if !(0..WIDTH).contains(&column) || !(0..WIDTH).contains(&row) {
+                return;
+            }
+            let at = (wrapped(first.0 + column) * WIDTH + wrapped(first.1 + row)) as usize;
+            // Else this scan has said something of it.
+            if self.marks[at] < through {
+                self.marks[at] = through;
+                self.cells[at].seen_through(most);
+            }
+        }
+    }
+
+    /// What the beam with number `i` would end on if nothing were in the foreground, in device units.
+    pub(super) fn background(&self, i: usize, limits: &Limits) -> u16 {
+        let Some(place) = self.place.filter(|place| place.unit_m > 0.0) else { return Background::UNTAUGHT };
+        let along = place.along(place.angles.0 + i as f64 * place.angles.1);
+        for step in 1..WIDTH / 2 {
+            let range = f64::from(step) * CELL_M;
+            let (x, y) = (cell(place.x + range * along.0), cell(place.y + range * along.1));
+            if !self.is_inside(x, y, 0) {
+                break;
+            }
+            let cell = &self.cells[index(x, y)];
+            if cell.stands(limits) {
+                return (range / place.unit_m).min(f64::from(INVALID - 1)) as u16;
+            }
+        }
+        Background::UNTAUGHT
+    }
+}
+
+impl Cell {
+    /// Something stands here: it was there before the place was seen free, or for as long as it takes.
+    fn stands(&self, limits: &Limits) -> bool {
+        self.hits >= STANDS && self.free < FREE || self.hits >= limits.scans.max(STANDS)
+    }
+
+    fn hit(&mut self, most: u16) {
+        self.hits = (self.hits + 1).min(most);
+        if self.hits.is_multiple_of(8) {
+            self.free = self.free.saturating_sub(1);
+        }
+    }
+
+    fn seen_through(&mut self, most: u16) {
+        self.free = (self.free + 1).min(most);
+        self.hits = self.hits.saturating_sub(1 + self.hits / 16);
+    }
+}
+
+impl Place {
+    /// Where a beam at the sensor's `angle` points in the map.
+    fn along(&self, angle: f64) -> (f64, f64) {
+        let (x, y) = self.pose.direction(angle);
+        (self.cos * x - self.sin * y, self.sin * x + self.cos * y)
+    }
+}
+
+/// The cell of a coordinate in metres.
+fn cell(metres: f64) -> i32 {
+    (metres / CELL_M).floor() as i32
+}
+
+/// Where a cell is kept.
+fn index(x: i32, y: i32) -> usize {
+    (x.rem_euclid(WIDTH) * WIDTH + y.rem_euclid(WIDTH)) as usize
+}
+
+/// Width of a cell: people are several cells wide, and a place is known to less than one.
+const CELL_M: f64 = 0.05;
+/// Cells on each side of the square that is kept: 40 m.
+const WIDTH: i32 = 800;
+const CELLS: usize = (WIDTH * WIDTH) as usize;
+/// Cells around the end of a beam in which it may be that something stands: what a place and a wall are unsure by.
+const AROUND: i32 = 2;
+/// Scans that see through a cell until it is free.
+const FREE: u16 = 5;
+/// Beams that end in a cell until something stands there that was never seen free.
+const STANDS: u16 = 3;
+/// Cells before the end of a beam that it says nothing of.
+const SHORT: f32 = 2.5;
+/// Farther from its start no robot gets without a new one.
+const FARTHEST_M: f64 = 1e6;

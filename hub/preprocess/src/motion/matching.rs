@@ -1,0 +1,366 @@
+//! Lays a scan onto another: each of its beams ends on the surface nearest to it, and the place where the beams are least off
+//! is that of the scan. Refuses to know where to begin.
+
+use schema::{Corner, Line};
+
+use super::rigid::Rigid;
+use super::solve::{Square, add_outer, around, eigen};
+use super::view::{Surface, View};
+
+/// How one scan lies on another.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Match {
+    pub(super) place: Rigid,
+    /// How unsure that is by the noise of the scan, and by that of the one on which it lies.
+    pub(super) own: Square,
+    pub(super) of_kept: Square,
+    /// Share of the readings that lie on surfaces.
+    pub(super) overlap: f64,
+    /// Some direction is not known.
+    pub(super) is_degenerate: bool,
+    /// Corners of both are the same.
+    pub(super) has_corners: bool,
+    /// Lines of both are the same.
+    pub(super) has_lines: bool,
+}
+
+/// Lays scans onto others.
+pub(super) struct Matcher {
+    /// The readings that are of something that moves.
+    moves: Box<[bool]>,
+    runs: Box<[Run]>,
+}
+
+/// Neighbouring readings that may be of one thing.
+#[derive(Clone, Copy, Default)]
+struct Run {
+    first: u16,
+    /// Those of its readings that are near a surface.
+    beams: u16,
+    /// Of squares of what they are off, in variances of their noise.
+    off: f64,
+}
+
+/// What all beams say together.
+#[derive(Default)]
+struct Sums {
+    /// Of weights times (nx, ny, n x p / scale) in both directions: a number of beams that look at a wall.
+    weight: Square,
+    slope: [f64; 3],
+    /// What unsure surfaces add to it by mere chance.
+    chance: f64,
+    own: Square,
+    of_kept: Square,
+    /// Of squares of what beams are off, and of what they are off by noise alone.
+    off: f64,
+    expected: f64,
+    weights: f64,
+    beams: usize,
+}
+
+/// The directions in which the surroundings say where the robot is.
+struct Known {
+    values: [f64; 3],
+    vectors: [[f64; 3]; 3],
+    /// It is said by a few beams, or none.
+    is_said: [bool; 3],
+    /// It is said by enough beams to be believed.
+    is_known: [bool; 3],
+}
+
+impl Matcher {
+    /// For so many beams at most.
+    pub(super) fn new(beams: usize) -> Matcher {
+        Matcher { moves: vec![false; beams].into(), runs: vec![Run::default(); beams].into() }
+    }
+
+    /// How `now` lies on `kept`, near `begin`; nothing if too few beams say so. Where the surroundings say nothing, the place
+    /// is that of `begin`, and unsure by `unknown_m`.
+    pub(super) fn find(&mut self, kept: &View, now: &View, begin: Rigid, unknown_m: f64) -> Option<Match> {
+        let beams = now.points().len();
+        self.moves[..beams].fill(false);
+        let pair = Pair { kept, now, scale: scale(now)?, finest: WIDTH * kept.noise.hypot(now.noise) };
+        let mut place = pair.settle(begin, FIRST_M, &self.moves);
+        for _ in 0..LOOKS {
+            if !self.leave_out(&pair, &place) {
+                break;
+            }
+            place = pair.settle(place, 0.0, &self.moves);
+        }
+        let sums = pair.sums(&place, pair.finest, 1, &self.moves);
+        if sums.beams < LEAST_BEAMS {
+            return None;
+        }
+        let known = Known::of(&sums, 1);
+        let (own, of_kept) = known.covariances(&sums, pair.scale, unknown_m);
+        let is_finite =
+            own.as_flattened().iter().chain(of_kept.as_flattened()).all(|value| value.is_finite());
+        let found = Match {
+            place,
+            own,
+            of_kept,
+            overlap: pair.overlap(&place),
+            is_degenerate: !known.is_known.iter().all(|is_known| *is_known),
+            has_corners: same_corners(kept, now, &place),
+            has_lines: same_lines(kept, now, &place),
+        };
+        (is_finite && place.x.is_finite() && place.y.is_finite() && place.yaw.is_finite()).then_some(found)
+    }
+
+    /// Leaves out what moves: neighbouring readings that are off by more than their noise together, though none need be alone.
+    /// Whether there were others than before.
+    fn leave_out(&mut self, pair: &Pair<'_>, place: &Rigid) -> bool {
+        let width = 2.0 * pair.finest;
+        let beams = pair.now.points().len();
+        let (mut runs, mut off, mut expected) = (0, 0.0, 0.0);
+        for i in 0..beams {
+            if i == 0 || !pair.now.is_connected(i) {
+                self.runs[runs] = Run { first: i as u16, ..Run::default() };
+                runs += 1;
+            }
+            let Some(on) = pair.on(i, place, width) else { continue };
+            let run = &mut self.runs[runs - 1];
+            let square = on.off * on.off;
+            run.off += square / on.variance();
+            run.beams += 1;
+            if !self.moves[i] && on.off.abs() < pair.finest {
+                (off, expected) = (off + square, expected + on.variance());
+            }
+        }
+        let level = if expected > 0.0 { (off / expected).max(1.0) } else { 1.0 };
+        let mut is_new = false;
+        for at in 0..runs {
+            let end = if at + 1 < runs { self.runs[at + 1].first.into() } else { beams };
+            let Run { first, beams, off } = self.runs[at];
+            // The sum of squares has twice as much variance as beams.
+            let n = f64::from(beams);
+            let moves = off > level * (MORE * n + 4.0 * (2.0 * n).sqrt());
+            for was in &mut self.moves[first.into()..end] {
+                is_new |= *was != moves;
+                *was = moves;
+            }
+        }
+        is_new
+    }
+}
+
+/// Two scans, of which one is laid onto the other.
+struct Pair<'a> {
+    kept: &'a View,
+    now: &'a View,
+    /// See [`scale`].
+    scale: f64,
+    /// At last beams are off by less than this.
+    finest: f64,
+}
+
+/// How a beam ends near a surface.
+struct On {
+    point: (f64, f64),
+    surface: Surface,
+    off: f64,
+    /// Of `off`, by the noise of the scan and by that of the kept one.
+    by_now: f64,
+    by_kept: f64,
+}
+
+impl On {
+    fn variance(&self) -> f64 {
+        self.by_now + self.by_kept
+    }
+}
+
+impl Pair<'_> {
+    /// Where `now` lies, if it begins near `place` and beams may be off by `width` at first.
+    fn settle(&self, mut place: Rigid, width: f64, moves: &[bool]) -> Rigid {
+        let mut width = width.max(self.finest);
+        let coarse = self.now.points().len().div_ceil(COARSE);
+        for _ in 0..ROUNDS {
+            let is_last = width <= self.finest;
+            let stride = if is_last { 1 } else { coarse };
+            let sums = self.sums(&place, width, stride, moves);
+            let step = Known::of(&sums, stride).solve(&sums.slope);
+            let turn = step[2] / self.scale;
+            place = Rigid::new(step[0], step[1], turn).then(&place);
+            if is_last && step[0].hypot(step[1]) < STILL_M && turn.abs() < STILL_RAD {
+                break;
+            }
+            width = (0.5 * width).max(self.finest);
+        }
+        place
+    }
+
+    /// The share of the readings that are near a surface.
+    fn overlap(&self, place: &Rigid) -> f64 {
+        let beams = self.now.points().len();
+        (0..beams).filter(|&i| self.on(i, place, self.finest).is_some()).count() as f64 / beams as f64
+    }
+
+    /// How reading `i` ends, if it ends less than `width` from a surface.
+    fn on(&self, i: usize, place: &Rigid, width: f64) -> Option<On> {
+        let (reading, point) = (&self.now.readings()[i], place.point(self.now.points()[i]));
+        // A neighbour of the beam that would meet this very point may be as far away as beams are.
+        let on = &self.kept.readings()[self.kept.nearest(point, width + SPACING_M)?];
+        let surface = on.surface?;
+        let off = surface.off(point);
+        let along = |(x, y): (f64, f64)| surface.normal.0 * x + surface.normal.1 * y;
+        let deviations =
+            (along(place.turned(reading.direction)) * self.now.noise, along(on.direction) * self.kept.noise);
+        let (by_now, by_kept) = (deviations.0 * deviations.0, deviations.1 * deviations.1);
+        // A surface that is seen from its edge varies across the beams, too.
+        let least = LEAST_SHARE * (self.now.noise * self.now.noise);
+        (off.abs() < width).then_some(On {
+            point,
+            surface,
+            off,
+            by_now: by_now.max(least),
+            by_kept: by_kept.max(least),
+        })
+    }
+
+    /// Of each `stride`th beam at `place`, if it is off by less than `width` and of nothing that moves.
+    fn sums(&self, place: &Rigid, width: f64, stride: usize, moves: &[bool]) -> Sums {
+        let mut sums = Sums::default();
+        for i in (0..self.now.points().len()).step_by(stride.max(1)).filter(|&i| !moves[i]) {
+            let Some(on) = self.on(i, place, width) else { continue };
+            let (share, off) = (on.off / width, on.off);
+            // Tukey's.
+            let weight = (1.0 - share * share) * (1.0 - share * share);
+            let ((nx, ny), (x, y)) = (on.surface.normal, on.point);
+            let row = [nx, ny, (ny * x - nx * y) / self.scale];
+            add_outer(&mut sums.weight, &row, weight);
+            for (slope, value) in sums.slope.iter_mut().zip(row) {
+                *slope += weight * off * value;
+            }
+            add_outer(&mut sums.own, &row, weight * weight * on.by_now);
+            add_outer(&mut sums.of_kept, &row, weight * weight * on.by_kept);
+            sums.chance += CHANCE * weight * on.surface.variance;
+            sums.off += weight * off * off;
+            sums.expected += weight * on.variance();
+            sums.weights += weight;
+            sums.beams += 1;
+        }
+        sums
+    }
+}
+
+/// How far away the beams of `now` end, so that a turn by one over it moves them by about a metre; nothing if none has a range.
+fn scale(now: &View) -> Option<f64> {
+    let square: f64 = now.points().iter().map(|point| point.0 * point.0 + point.1 * point.1).sum();
+    let scale = (square / now.points().len().max(1) as f64).sqrt();
+    (scale.is_finite() && scale > 0.0).then_some(scale)
+}
+
+impl Known {
+    /// A direction is known if enough beams look at walls across it, beside what chance adds.
+    fn of(sums: &Sums, stride: usize) -> Known {
+        let (values, vectors) = eigen(sums.weight);
+        let least = (LEAST_BEAMS as f64 / stride as f64).max(LEAST_PART * sums.weights);
+        let said = values.map(|value| value - sums.chance);
+        let is_said = said.map(|beams| beams * stride as f64 >= SAID_BEAMS);
+        Known { values, vectors, is_said, is_known: said.map(|beams| beams >= least) }
+    }
+
+    /// The step against `slope`, along what is said.
+    fn solve(&self, slope: &[f64; 3]) -> [f64; 3] {
+        let mut step = [0.0; 3];
+        for ((value, vector), is_said) in self.values.iter().zip(&self.vectors).zip(self.is_said) {
+            if is_said {
+                let along: f64 = vector.iter().zip(slope).map(|(a, b)| a * b).sum();
+                step.iter_mut().zip(vector).for_each(|(step, v)| *step -= along / value * v);
+            }
+        }
+        step
+    }
+
+    /// How unsure a place is by the noise of the scan and by that of the kept one, in metres and radians.
+    fn covariances(&self, sums: &Sums, scale: f64, unknown_m: f64) -> (Square, Square) {
+        // Where beams are off by more than their noise, all is less sure.
+        let factor = (sums.off / sums.expected).max(1.0);
+        let inverse = self.inverse();
+        let of_radians = [1.0, 1.0, 1.0 / scale];
+        let of = |sum: &Square, unknown_m: f64| {
+            let mut covariance = around(&inverse, sum);
+            covariance.as_flattened_mut().iter_mut().for_each(|value| *value *= factor);
+            for (vector, is_known) in self.vectors.iter().zip(self.is_known) {
+                if !is_known {
+                    add_outer(&mut covariance, vector, unknown_m * unknown_m);
+                }
+            }
+            std::array::from_fn(|i| std::array::from_fn(|j| covariance[i][j] * of_radians[i] * of_radians[j]))
+        };
+        (of(&sums.own, unknown_m), of(&sums.of_kept, 0.0))
+    }
+
+    fn inverse(&self) -> Square {
+        let mut inverse = [[0.0; 3]; 3];
+        for ((value, vector), is_known) in self.values.iter().zip(&self.vectors).zip(self.is_known) {
+            if is_known {
+                add_outer(&mut inverse, vector, 1.0 / value);
+            }
+        }
+        inverse
+    }
+}
+
+/// Whether a corner of `now` at `place` is one of `kept`.
+fn same_corners(kept: &View, now: &View, place: &Rigid) -> bool {
+    let near = NEAR * kept.noise.hypot(now.noise) + NEAR_M;
+    let is_same = |corner: &Corner| {
+        let (x, y) = place.point((corner.x_m.into(), corner.y_m.into()));
+        let off = |other: &Corner| (x - f64::from(other.x_m)).hypot(y - f64::from(other.y_m));
+        kept.lines.corners().iter().any(|other| off(other) <= near)
+    };
+    now.lines.corners().iter().any(is_same)
+}
+
+/// Whether a line of `now` at `place` is one of `kept`: both of its ends lie on that, and they overlap.
+fn same_lines(kept: &View, now: &View, place: &Rigid) -> bool {
+    let near = NEAR * kept.noise.hypot(now.noise) + NEAR_M;
+    let is_same = |line: &Line| {
+        let ends =
+            [(line.x1_m, line.y1_m), (line.x2_m, line.y2_m)].map(|(x, y)| place.point((x.into(), y.into())));
+        let is_on = |other: &Line| {
+            let (sin, cos) = f64::from(other.alpha_rad).sin_cos();
+            let along = |(x, y): (f64, f64)| cos * y - sin * x;
+            let of_other = [(other.x1_m, other.y1_m), (other.x2_m, other.y2_m)];
+            let of_other = of_other.map(|(x, y)| along((x.into(), y.into())));
+            let (least, most) = (of_other[0].min(of_other[1]), of_other[0].max(of_other[1]));
+            let alongs = ends.map(along);
+            let is_beside = alongs[0].max(alongs[1]) < least || alongs[0].min(alongs[1]) > most;
+            !is_beside
+                && ends.iter().all(|end| (cos * end.0 + sin * end.1 - f64::from(other.r_m)).abs() <= near)
+        };
+        kept.lines.lines().iter().any(is_on)
+    };
+    now.lines.lines().iter().any(is_same)
+}
+
+/// Beams are first looked for so far from surfaces, then always half as far.
+const FIRST_M: f64 = 0.3;
+/// At last they are off by less than so many deviations: Tukey's constant, by which next to nothing is lost where all is noise.
+const WIDTH: f64 = 3.0;
+const ROUNDS: usize = 20;
+/// So many beams are enough for all rounds but the last ones.
+const COARSE: usize = 120;
+const STILL_M: f64 = 2e-5;
+const STILL_RAD: f64 = 1e-5;
+/// Beams that say something of a direction, at least: fewer may be a leg.
+const LEAST_BEAMS: usize = 6;
+/// From so many on it is better than to guess.
+const SAID_BEAMS: f64 = 1.5;
+/// The same as a share of all beams: in a long corridor, frames of doors are taken for one another.
+const LEAST_PART: f64 = 0.03;
+/// How often what moves is looked for.
+const LOOKS: usize = 2;
+/// What does not move is off by at most so many times what its noise says, in the mean of squares.
+const MORE: f64 = 3.0;
+/// Of the variance of a range.
+const LEAST_SHARE: f64 = 0.05;
+/// Twice what is to be expected: of a sum of many.
+const CHANCE: f64 = 2.0;
+/// Neighbouring beams end so far apart, where their surface still counts as that of a point between them.
+const SPACING_M: f64 = 0.2;
+/// Corners and lines are the same within so many deviations, and this.
+const NEAR: f64 = 3.0;
+const NEAR_M: f64 = 0.02;

@@ -1,0 +1,250 @@
+//! Scans of a robot that drives through made-up rooms, with the truth: where it was, and which beams met somebody.
+#![allow(dead_code)] // each test takes what it needs
+
+use std::collections::HashMap;
+use std::f64::consts::{PI, TAU};
+
+use fastrand::Rng;
+use preprocess::motion::Rigid;
+use schema::{Code, Scan, ScanHead};
+
+type Point = (f64, f64);
+
+/// Scans one after the other, and what is true of them.
+pub(crate) struct Drive {
+    pub(crate) scans: Vec<Box<Scan>>,
+    /// Where the robot was.
+    pub(crate) places: Vec<Rigid>,
+    /// Which beams met a person.
+    pub(crate) people: Vec<Vec<bool>>,
+    walls: Vec<(Point, Point)>,
+    walkers: Vec<Walker>,
+    head: ScanHead,
+    noise_m: f64,
+    random: Rng,
+}
+
+/// Which squares of 0.1 m were seen free in how many scans, by the true places.
+#[derive(Default)]
+pub(crate) struct Seen {
+    squares: HashMap<(i32, i32), (u32, u32)>,
+    scans: u32,
+}
+
+impl Seen {
+    /// Takes what a scan from `place` sees.
+    pub(crate) fn look(&mut self, place: &Rigid, scan: &Scan) {
+        self.scans += 1;
+        for beam in 0..scan.beams() {
+            let Some(range) = scan.distance_m(beam) else { continue };
+            for step in 1..(range / 0.05) as u32 {
+                let at = self.square(place, scan, beam, 0.05 * f64::from(step));
+                let (free, last) = self.squares.entry(at).or_default();
+                if *last != self.scans {
+                    (*free, *last) = (*free + 1, self.scans);
+                }
+            }
+        }
+    }
+
+    /// Whether a beam ends where at least five scans saw through.
+    pub(crate) fn is_free(&self, place: &Rigid, scan: &Scan, beam: usize) -> bool {
+        let end = scan.distance_m(beam).map(|range| self.square(place, scan, beam, range));
+        end.and_then(|at| self.squares.get(&at)).is_some_and(|(free, _)| *free >= 5)
+    }
+
+    fn square(&self, place: &Rigid, scan: &Scan, beam: usize, range: f64) -> (i32, i32) {
+        let angle = scan.angle(beam);
+        let (x, y) = place.point((range * angle.cos(), range * angle.sin()));
+        ((10.0 * x).floor() as i32, (10.0 * y).floor() as i32)
+    }
+}
+
+struct Walker {
+    at: Point,
+    by_scan: Point,
+}
+
+/// The head of a scan of so many beams, in mm.
+pub(crate) fn beams_at(count: usize, first_angle: f64, step: f64) -> ScanHead {
+    let no_return = Code::NoReturn.value();
+    ScanHead {
+        first_angle,
+        step,
+        unit_um: 1000,
+        count: count as u16,
+        valid_to: 0xFFEF,
+        no_return,
+        beyond: no_return,
+        turns: 1,
+        ..ScanHead::default()
+    }
+}
+
+/// A scan of these ranges in metres; none is no return.
+pub(crate) fn scan(head: ScanHead, mut range: impl FnMut(f64) -> Option<f64>) -> Box<Scan> {
+    let unit = |i: u16| {
+        let range = range(head.first_angle + f64::from(i) * head.step);
+        range
+            .filter(|range| *range < 65.0)
+            .map_or(head.no_return, |range| (1000.0 * range).max(0.0).round() as u16)
+    };
+    Scan::of(head, &(0..head.count).map(unit).collect::<Vec<_>>())
+}
+
+/// By Box and Muller.
+pub(crate) fn normal(random: &mut Rng) -> f64 {
+    (-2.0 * (1.0 - random.f64()).ln()).sqrt() * (TAU * random.f64()).cos()
+}
+
+fn boxed(middle: Point, (long, wide): (f64, f64), yaw: f64) -> Vec<(Point, Point)> {
+    let place = Rigid::new(middle.0, middle.1, yaw);
+    let corners = [(1.0, 1.0), (-1.0, 1.0), (-1.0, -1.0), (1.0, -1.0)]
+        .map(|(x, y): Point| place.point((x * long / 2.0, y * wide / 2.0)));
+    (0..4).map(|i| (corners[i], corners[(i + 1) % 4])).collect()
+}
+
+fn to_wall(from: Point, along: Point, ((x1, y1), (x2, y2)): &(Point, Point)) -> Option<f64> {
+    let (dx, dy) = (x2 - x1, y2 - y1);
+    let cross = along.0 * dy - along.1 * dx;
+    let (ox, oy) = (x1 - from.0, y1 - from.1);
+    let (range, share) = ((ox * dy - oy * dx) / cross, (ox * along.1 - oy * along.0) / cross);
+    (range > 0.0 && (0.0..=1.0).contains(&share)).then_some(range)
+}
+
+fn to_disc(from: Point, along: Point, middle: Point, radius: f64) -> Option<f64> {
+    let (dx, dy) = (middle.0 - from.0, middle.1 - from.1);
+    let ahead = dx * along.0 + dy * along.1;
+    let inside = radius * radius - (dx * dx + dy * dy - ahead * ahead);
+    (inside > 0.0 && ahead > radius).then(|| ahead - inside.sqrt())
+}
+
+impl Drive {
+    /// `count` scans of `beams` beams over half a turn in a room of `seed` with boxes in it.
+    pub(crate) fn through_a_room(seed: u64, beams: usize, count: usize, noise_m: f64) -> Drive {
+        let mut drive = Drive::begin(seed, beams, noise_m);
+        drive.on(count, 0.02);
+        drive
+    }
+
+    /// The same, with so many `people` around the robot.
+    pub(crate) fn among_people(seed: u64, beams: usize, count: usize, people: usize) -> Drive {
+        let mut drive = Drive::begin(seed, beams, 0.01);
+        for _ in 0..people {
+            drive.add_walker();
+        }
+        drive.on(count, 0.02);
+        drive
+    }
+
+    /// A robot that drives by `speed` metres a scan, or stands, among so many `people` who walk.
+    pub(crate) fn with_walkers(seed: u64, beams: usize, count: usize, people: usize, speed: f64) -> Drive {
+        let mut drive = Drive::begin(seed, beams, 0.01);
+        for _ in 0..people {
+            drive.add_walker();
+        }
+        if speed == 0.0 {
+            drive.stand(count);
+        } else {
+            drive.on(count, speed);
+        }
+        drive
+    }
+
+    fn add_walker(&mut self) {
+        let at = (1.2 + 2.0 * self.random.f64(), TAU * self.random.f64());
+        let way = (TAU * self.random.f64()).sin_cos();
+        let speed = 0.02 + 0.02 * self.random.f64();
+        self.walkers.push(Walker {
+            at: (at.0 * at.1.cos(), at.0 * at.1.sin()),
+            by_scan: (speed * way.1, speed * way.0),
+        });
+    }
+
+    /// Between two endless walls.
+    pub(crate) fn along_a_corridor(seed: u64, beams: usize, count: usize) -> Drive {
+        let mut drive = Drive::begin(seed, beams, 0.01);
+        drive.walls = vec![((-500.0, 1.2), (500.0, 1.2)), ((-500.0, -1.0), (500.0, -1.0))];
+        let mut place = Rigid::default();
+        for _ in 0..count {
+            drive.look(place);
+            place = place.then(&Rigid::new(0.02, 0.0, 0.0));
+        }
+        drive
+    }
+
+    fn begin(seed: u64, beams: usize, noise_m: f64) -> Drive {
+        let mut random = Rng::with_seed(seed);
+        let mut walls = boxed((0.3, -0.4), (11.0, 8.0), 0.0);
+        for _ in 0..9 {
+            let at = (10.0 * (random.f64() - 0.5), 7.0 * (random.f64() - 0.5));
+            if at.0.hypot(at.1) > 2.6 {
+                let size = (0.3 + random.f64(), 0.3 + random.f64());
+                walls.extend(boxed(at, size, PI * random.f64()));
+            }
+        }
+        Drive {
+            scans: Vec::new(),
+            places: Vec::new(),
+            people: Vec::new(),
+            walls,
+            walkers: Vec::new(),
+            head: match beams {
+                // As many scans a second as an LMS has.
+                361 => ScanHead::lms(361, -90_000, 500, 1, 15),
+                _ => beams_at(beams, -PI / 2.0, PI / (beams - 1) as f64),
+            },
+            noise_m,
+            random,
+        }
+    }
+
+    /// So many scans more, while the robot drives around.
+    pub(crate) fn on(&mut self, count: usize, speed: f64) {
+        let mut turn = 0.0;
+        let yaw = TAU * self.random.f64();
+        let mut place = self.places.last().copied().unwrap_or(Rigid::new(0.0, 0.0, yaw));
+        for _ in 0..count {
+            self.look(place);
+            turn = f64::clamp(turn + 0.01 * (self.random.f64() - 0.5), -0.03, 0.03);
+            let is_far = place.x.hypot(place.y) > 1.3;
+            let home = ((-place.y).atan2(-place.x) - place.yaw).sin();
+            place = place.then(&Rigid::new(speed, 0.0, if is_far { 0.04 * home } else { turn }));
+        }
+    }
+
+    /// So many scans more from where the robot is.
+    pub(crate) fn stand(&mut self, count: usize) {
+        let place = self.places.last().copied().unwrap_or_default();
+        (0..count).for_each(|_| self.look(place));
+    }
+
+    /// One scan more, from `place`.
+    fn look(&mut self, place: Rigid) {
+        let Drive { walls, walkers, head, noise_m, random, .. } = self;
+        for walker in walkers.iter_mut() {
+            walker.at = (walker.at.0 + walker.by_scan.0, walker.at.1 + walker.by_scan.1);
+            // Nobody walks into the robot, and nobody goes far.
+            let (dx, dy) = (walker.at.0 - place.x, walker.at.1 - place.y);
+            let far = dx.hypot(dy);
+            let outwards = dx * walker.by_scan.0 + dy * walker.by_scan.1;
+            if far < 0.8 && outwards < 0.0 || far > 3.2 && outwards > 0.0 {
+                walker.by_scan = (-walker.by_scan.0, -walker.by_scan.1);
+            }
+        }
+        let mut met = Vec::new();
+        let scan = scan(*head, |angle| {
+            let (sin, cos) = (place.yaw + angle).sin_cos();
+            let (from, along) = ((place.x, place.y), (cos, sin));
+            let wall =
+                walls.iter().filter_map(|wall| to_wall(from, along, wall)).fold(f64::INFINITY, f64::min);
+            let discs = walkers.iter().filter_map(|walker| to_disc(from, along, walker.at, 0.2));
+            let disc = discs.fold(f64::INFINITY, f64::min);
+            met.push(disc < wall);
+            Some(disc.min(wall) + *noise_m * normal(random))
+        });
+        self.scans.push(scan);
+        self.places.push(place);
+        self.people.push(met);
+    }
+}

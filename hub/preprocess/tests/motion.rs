@@ -1,0 +1,340 @@
+//! The motion of a robot from its scans: beside a slow version that tries all pairs, with truth, in surroundings that leave
+//! it open, and with input that says nothing.
+
+mod drives;
+
+use std::f64::consts::PI;
+
+use drives::{Drive, beams_at, normal, scan};
+use fastrand::Rng;
+use preprocess::lines::{self, LineFinder};
+use preprocess::motion::{MotionEstimator, Rigid, Settings};
+use schema::{Contents, Lines, Motion, MotionMethod, Pose, Scan};
+
+/// What is said of each of `scans`; what was in the payload before does not stay.
+fn follow(scans: &[Box<Scan>], pose: Pose, settings: Settings) -> Vec<Motion> {
+    let beams = scans.iter().map(|scan| scan.beams()).max().unwrap_or(0);
+    let mut finder = LineFinder::new(pose, lines::Settings::default(), beams);
+    let mut estimator = MotionEstimator::new(pose, settings, beams);
+    let mut lines = Lines::default();
+    let say = |scan: &Scan| {
+        finder.update(scan, &mut lines);
+        let mut motion: Motion = bytemuck::Zeroable::zeroed();
+        bytemuck::bytes_of_mut(&mut motion).fill(0xA5);
+        estimator.update(scan, &lines, &mut motion);
+        motion
+    };
+    scans.iter().map(|scan| &**scan).map(say).collect()
+}
+
+fn step(motion: &Motion) -> Rigid {
+    Rigid::new(motion.dx_m.into(), motion.dy_m.into(), motion.dyaw_rad.into())
+}
+
+/// Metres and radians apart.
+fn apart(one: &Rigid, other: &Rigid) -> (f64, f64) {
+    let between = one.inverse().then(other);
+    (between.x.hypot(between.y), between.yaw.abs())
+}
+
+/// The place of `now` on `kept` by all pairs of points: each point is drawn to the line through the nearest one and its
+/// neighbours, near ones more than far ones.
+fn slow(kept: &Scan, now: &Scan) -> Rigid {
+    let points = |scan: &Scan| -> Vec<(f64, f64)> {
+        let of = |i: usize| Some((scan.distance_m(i)?, scan.angle(i)));
+        (0..scan.beams()).filter_map(of).map(|(r, a)| (r * a.cos(), r * a.sin())).collect()
+    };
+    let (kept, now) = (points(kept), points(now));
+    // Through seven neighbours each: the direction of least spread, found by trying many.
+    let normal_at = |at: usize| -> (f64, f64) {
+        let near = &kept[at.saturating_sub(3)..(at + 4).min(kept.len())];
+        let spread = |angle: f64| -> f64 {
+            let along: Vec<f64> = near.iter().map(|p| p.0 * angle.cos() + p.1 * angle.sin()).collect();
+            let mean = along.iter().sum::<f64>() / along.len() as f64;
+            along.iter().map(|value| (value - mean).powi(2)).sum()
+        };
+        let angles = (0..720).map(|i| f64::from(i) * PI / 720.0);
+        let best = angles.min_by(|a, b| spread(*a).total_cmp(&spread(*b))).unwrap();
+        (best.cos(), best.sin())
+    };
+    let normals: Vec<(f64, f64)> = (0..kept.len()).map(normal_at).collect();
+    let cost = |place: &Rigid| -> f64 {
+        let off = |point: &(f64, f64)| {
+            let (x, y) = place.point(*point);
+            let square = |at: usize| (kept[at].0 - x).powi(2) + (kept[at].1 - y).powi(2);
+            let nearest = (0..kept.len()).min_by(|a, b| square(*a).total_cmp(&square(*b))).unwrap();
+            let (dx, dy) = (x - kept[nearest].0, y - kept[nearest].1);
+            let off = normals[nearest].0 * dx + normals[nearest].1 * dy;
+            (off * off).min(0.01)
+        };
+        now.iter().map(off).sum()
+    };
+    let (mut place, mut width) = (Rigid::default(), 0.05);
+    let mut best = cost(&place);
+    while width > 2e-5 {
+        let mut is_better = false;
+        for (x, y, yaw) in [
+            (1.0, 0.0, 0.0),
+            (-1.0, 0.0, 0.0),
+            (0.0, 1.0, 0.0),
+            (0.0, -1.0, 0.0),
+            (0.0, 0.0, 0.4),
+            (0.0, 0.0, -0.4),
+        ] {
+            let next = Rigid::new(place.x + width * x, place.y + width * y, place.yaw + width * yaw);
+            let of_next = cost(&next);
+            if of_next < best {
+                (place, best, is_better) = (next, of_next, true);
+            }
+        }
+        if !is_better {
+            width *= 0.6;
+        }
+    }
+    place
+}
+
+#[test]
+fn steps_are_those_of_a_slow_version_and_of_the_truth() {
+    for seed in 0..4 {
+        let drive = Drive::through_a_room(seed, 181, 2, 0.01);
+        let found = follow(&drive.scans, Pose::default(), Settings::default());
+        let truth = drive.places[0].inverse().then(&drive.places[1]);
+        let (slow, found) = (slow(&drive.scans[0], &drive.scans[1]), step(&found[1]));
+        let (of_slow, of_truth) = (apart(&slow, &found), apart(&truth, &found));
+        assert!(of_slow.0 < 0.01 && of_slow.1 < 0.004, "{seed}: {slow:?} {found:?}");
+        assert!(of_truth.0 < 0.008 && of_truth.1 < 0.003, "{seed}: {truth:?} {found:?}");
+    }
+}
+
+#[test]
+fn steps_add_up_to_the_pose_and_their_errors_are_as_great_as_is_said() {
+    let (mut squares, mut steps) = (0.0, 0);
+    for seed in 0..5 {
+        let drive = Drive::through_a_room(seed, 361, 150, 0.01);
+        let found = follow(&drive.scans, Pose::default(), Settings::default());
+        assert_eq!((found[0].how(), found[0].has_pose()), (MotionMethod::First, true));
+        let mut sum = Rigid::default();
+        for (at, motion) in found.iter().enumerate().skip(1) {
+            assert!(
+                motion.has_step() && motion.overlap > 0.6 && !motion.is_degenerate(),
+                "{seed} {at}: {motion:?}"
+            );
+            sum = sum.then(&step(motion));
+            let pose = Rigid::new(motion.x_m, motion.y_m, motion.yaw_rad);
+            let (metres, radians) = apart(&sum, &pose);
+            assert!(metres < 1e-4 && radians < 1e-4, "{seed} {at}: {sum:?} {pose:?}");
+            let truth = drive.places[at - 1].inverse().then(&drive.places[at]);
+            let off = step(motion);
+            let off = [off.x - truth.x, off.y - truth.y, off.yaw - truth.yaw];
+            for (k, off) in off.iter().enumerate() {
+                squares += off * off / f64::from(motion.covariance[4 * k]);
+                steps += 1;
+            }
+        }
+        let truth = drive.places[0].inverse().then(&drive.places[drive.places.len() - 1]);
+        let (metres, radians) = apart(&truth, &sum);
+        assert!(metres < 0.08 && radians < 0.03, "{seed}: {truth:?} {sum:?}");
+    }
+    let mean = squares / f64::from(steps);
+    assert!((0.5..2.0).contains(&mean), "in variances: {mean}");
+}
+
+#[test]
+fn a_sensor_anywhere_on_the_robot_tells_the_same() {
+    let drive = Drive::through_a_room(7, 361, 30, 0.002);
+    let own = follow(&drive.scans, Pose::default(), Settings::default());
+    let mut random = Rng::with_seed(1);
+    for _ in 0..6 {
+        let pose = Pose {
+            x_m: random.f64() - 0.5,
+            y_m: random.f64() - 0.5,
+            yaw_rad: 6.0 * random.f64(),
+            upside_down: random.u8(..2),
+            ..Pose::default()
+        };
+        // What the sensor turns and moves, as seen from the robot that it sits on.
+        let seat = Rigid::new(pose.x_m, pose.y_m, pose.yaw_rad);
+        let found = follow(&drive.scans, pose, Settings::default());
+        for (one, other) in own.iter().zip(&found).skip(1) {
+            let mut of_sensor = step(one);
+            if pose.upside_down != 0 {
+                of_sensor = Rigid::new(of_sensor.x, -of_sensor.y, -of_sensor.yaw);
+            }
+            let expected = seat.then(&of_sensor).then(&seat.inverse());
+            let (metres, radians) = apart(&expected, &step(other));
+            assert!(metres < 0.004 && radians < 0.003, "{pose:?}: {expected:?} {other:?}");
+        }
+    }
+}
+
+#[test]
+fn a_robot_that_stands_does_not_drift() {
+    let mut drive = Drive::through_a_room(3, 361, 1, 0.01);
+    drive.stand(600);
+    let found = follow(&drive.scans, Pose::default(), Settings::default());
+    let last = found.last().unwrap();
+    assert!(last.x_m.hypot(last.y_m) < 0.006 && last.yaw_rad.abs() < 0.003, "{last:?}");
+}
+
+#[test]
+fn a_corridor_leaves_its_direction_open() {
+    let drive = Drive::along_a_corridor(5, 361, 60);
+    let found = follow(&drive.scans, Pose::default(), Settings::default());
+    for motion in &found[1..] {
+        assert!(motion.has_step() && motion.is_degenerate(), "{motion:?}");
+        let [along, across] = [0, 4].map(|at| motion.covariance[at].sqrt());
+        assert!(along > 0.2 && across < 0.02, "{motion:?}");
+    }
+}
+
+#[test]
+fn a_jump_is_refused_and_what_follows_goes_on() {
+    for seed in 0..5 {
+        let mut drive = Drive::through_a_room(seed, 361, 40, 0.01);
+        let mut other = Drive::through_a_room(seed + 100, 361, 40, 0.01);
+        drive.scans.append(&mut other.scans);
+        let found = follow(&drive.scans, Pose::default(), Settings::default());
+        let methods: Vec<MotionMethod> = found.iter().map(Motion::how).collect();
+        let refused: Vec<usize> =
+            (0..found.len()).filter(|&at| methods[at] == MotionMethod::Refused).collect();
+        assert_eq!(refused, [40], "{seed}: {methods:?}");
+        assert_eq!(found[40], Motion { method: MotionMethod::Refused as u8, breaks: 1, ..Motion::default() });
+        let (before, after) = (&found[39], &found[41]);
+        assert_eq!((before.breaks, after.breaks), (0, 1));
+        assert!(
+            (before.x_m - after.x_m).hypot(before.y_m - after.y_m) < 0.05,
+            "the sum goes on where it was"
+        );
+    }
+}
+
+#[test]
+fn people_around_the_robot_do_not_carry_it_away() {
+    let mut off = [Vec::new(), Vec::new()];
+    for seed in 0..4 {
+        for (of, people) in off.iter_mut().zip([0, 7]) {
+            let drive = Drive::among_people(seed, 361, 80, people);
+            let found = follow(&drive.scans, Pose::default(), Settings::default());
+            for (at, motion) in found.iter().enumerate().skip(1) {
+                assert!(motion.has_step(), "{seed} {people} {at}: {motion:?}");
+                let truth = drive.places[at - 1].inverse().then(&drive.places[at]);
+                of.push(apart(&truth, &step(motion)).0);
+            }
+        }
+    }
+    let [without, among] = off.map(|mut of| {
+        of.sort_by(f64::total_cmp);
+        of[of.len() / 2]
+    });
+    assert!(among < 3.5 * without && among < 0.006, "{without} {among}");
+}
+
+#[test]
+fn what_says_nothing_is_refused_and_never_sure() {
+    let drive = Drive::through_a_room(2, 361, 60, 0.01);
+    let mut random = Rng::with_seed(9);
+    // Nine of ten beams have no reading, then all, then the robot is lifted: everything is near, then elsewhere.
+    let mut scans = drive.scans.clone();
+    for (at, scan) in scans.iter_mut().enumerate() {
+        let no_return = scan.no_return;
+        let share = match at {
+            10..20 => 90,
+            20..30 => 100,
+            _ => 0,
+        };
+        let lifted = (30..40).contains(&at);
+        for range in scan.arrays().ranges {
+            if lifted {
+                *range = random.u16(50..3000);
+            }
+            if random.u8(..100) < share {
+                *range = no_return;
+            }
+        }
+    }
+    let found = follow(&scans, Pose::default(), Settings::default());
+    for (at, motion) in found.iter().enumerate().take(41).skip(20) {
+        assert_eq!(motion.how(), MotionMethod::Refused, "{at}: {motion:?}");
+    }
+    for at in (1..20).chain(42..60) {
+        if found[at].has_step() {
+            let truth = drive.places[at - 1].inverse().then(&drive.places[at]);
+            let off = step(&found[at]);
+            for (k, off) in [off.x - truth.x, off.y - truth.y, off.yaw - truth.yaw].into_iter().enumerate() {
+                let variance = f64::from(found[at].covariance[4 * k]);
+                assert!(off * off < 30.0 * variance, "{at}: {off} {:?}", found[at]);
+            }
+        }
+    }
+    assert!((42..60).all(|at| found[at].has_step()), "it goes on");
+}
+
+#[test]
+fn any_scan_is_answered_with_numbers() {
+    let mut random = Rng::with_seed(17);
+    for _ in 0..150 {
+        let pose = Pose {
+            x_m: random.f64(),
+            yaw_rad: 7.0 * random.f64(),
+            upside_down: random.u8(..2),
+            ..Pose::default()
+        };
+        let scans: Vec<Box<Scan>> = (0..6)
+            .map(|_| {
+                let count = random.usize(..300);
+                let contents = if random.bool() { Contents::ANGLES } else { 0 };
+                let step = [0.0, 0.01, -0.02, 0.3, f64::MIN_POSITIVE][random.usize(..5)];
+                let head = schema::ScanHead { contents, ..beams_at(count, 3.0 * random.f64() - 1.5, step) };
+                let wild: Vec<u16> = (0..count).map(|_| random.u16(..)).collect();
+                let mut scan = Scan::of(head, &wild);
+                scan.unit_um = [0, 1, 1000, u32::MAX][random.usize(..4)];
+                for angle in scan.arrays().angles {
+                    *angle = [f32::NAN, 0.0, random.f32(), f32::INFINITY, 1e30][random.usize(..5)];
+                }
+                scan
+            })
+            .collect();
+        for motion in follow(&scans, pose, Settings::default()) {
+            let numbers = [motion.x_m, motion.y_m, motion.yaw_rad];
+            assert!(numbers.iter().all(|number| number.is_finite()), "{motion:?}");
+            let numbers = [motion.dx_m, motion.dy_m, motion.dyaw_rad, motion.overlap];
+            assert!(numbers.iter().chain(&motion.covariance).all(|number| number.is_finite()), "{motion:?}");
+            assert!((0.0..=1.0).contains(&motion.overlap), "{motion:?}");
+        }
+    }
+}
+
+#[test]
+fn lines_without_numbers_harm_nothing() {
+    let drive = Drive::through_a_room(2, 361, 10, 0.01);
+    let mut estimator = MotionEstimator::new(Pose::default(), Settings::default(), 361);
+    for scan in &drive.scans {
+        let mut lines = Lines { count: 64, corners: 64, noise_m: f32::NAN, ..Lines::default() };
+        for (at, line) in lines.line_array.iter_mut().enumerate() {
+            (line.alpha_rad, line.r_m, line.sd_alpha_rad) = (f32::NAN, f32::INFINITY, f32::NAN);
+            (line.first, line.last, line.points) = (360 - 5 * at as u16, 9999, 50);
+        }
+        let mut motion = Motion::default();
+        estimator.update(scan, &lines, &mut motion);
+        assert!(motion.dx_m.is_finite() && motion.x_m.is_finite());
+    }
+}
+
+#[test]
+fn a_turn_by_one_beam_is_seen_by_a_scanner_of_a_whole_turn() {
+    let mut random = Rng::with_seed(4);
+    let at = |yaw: f64, random: &mut Rng| {
+        scan(beams_at(360, -PI, PI / 180.0), |angle| {
+            let (sin, cos) = (angle + yaw).sin_cos();
+            let wall =
+                |along: f64, near: f64, far: f64| if along > 0.0 { far / along } else { -near / along };
+            Some(wall(cos, 2.0, 4.0).min(wall(sin, 3.0, 2.5)) + 0.005 * normal(random))
+        })
+    };
+    let scans: Vec<Box<Scan>> = (0..20).map(|i| at(f64::from(i) * PI / 180.0, &mut random)).collect();
+    for motion in &follow(&scans, Pose::default(), Settings::default())[1..] {
+        let (metres, radians) = apart(&Rigid::new(0.0, 0.0, PI / 180.0), &step(motion));
+        assert!(metres < 0.006 && radians < 0.003, "{motion:?}");
+    }
+}

@@ -1,0 +1,233 @@
+//! The map of a scanner that moves: beside a slow version without a square that scrolls, in drives with truth, and with
+//! places that say nothing.
+
+mod drives;
+
+use std::collections::{HashMap, HashSet};
+
+use drives::Drive;
+use fastrand::Rng;
+use preprocess::background::{Class, Method, Model, Settings};
+use preprocess::lines::{self, LineFinder};
+use preprocess::motion::{self, MotionEstimator, Rigid};
+use schema::{Background, Foreground, Lines, Motion, MotionMethod, Pose, Scan};
+
+const SETTINGS: Settings = Settings {
+    method: Method::Moving,
+    threshold_mm: None,
+    candidate_mm: None,
+    scans: Some(100),
+    candidate: preprocess::background::Candidate::First,
+    start: preprocess::background::Start::Empty,
+    no_return_is_far: None,
+};
+
+/// What is said of a robot that is known to be at `place`.
+fn at(place: &Rigid, is_first: bool) -> Motion {
+    let method = if is_first { MotionMethod::First } else { MotionMethod::Both };
+    Motion { x_m: place.x, y_m: place.y, yaw_rad: place.yaw, method: method as u8, ..Motion::default() }
+}
+
+/// The same method, square by square in a map without an end.
+#[derive(Default)]
+struct Slow {
+    /// Hits and free of each square.
+    squares: HashMap<(i32, i32), (i32, i32)>,
+}
+
+impl Slow {
+    fn square(x: f64, y: f64) -> (i32, i32) {
+        ((x / 0.05).floor() as i32, (y / 0.05).floor() as i32)
+    }
+
+    fn of(&self, (x, y): (i32, i32), (dx, dy): (i32, i32)) -> (i32, i32) {
+        self.squares.get(&(x + dx, y + dy)).copied().unwrap_or_default()
+    }
+
+    /// What each beam is, without a look at its neighbours.
+    fn update(&mut self, place: &Rigid, scan: &Scan) -> Vec<Class> {
+        let around =
+            |reach: i32| (-reach..=reach).flat_map(move |dx| (-reach..=reach).map(move |dy| (dx, dy)));
+        let ends: Vec<Option<(f64, f64)>> = (0..scan.beams())
+            .map(|i| {
+                let (range, angle) = (scan.distance_m(i)?, scan.angle(i));
+                Some(place.point((range * angle.cos(), range * angle.sin())))
+            })
+            .collect();
+        let class = |end: &Option<(f64, f64)>| {
+            let Some((x, y)) = *end else { return Class::Invalid };
+            let end = Slow::square(x, y);
+            let stands = |(hits, free): (i32, i32)| hits >= 3 && free < 5 || hits >= 100;
+            if around(2).any(|near| stands(self.of(end, near))) {
+                return Class::Background;
+            }
+            let is_free = self.of(end, (0, 0)).1 >= 5 && around(1).all(|near| self.of(end, near).1 >= 2);
+            if is_free { Class::Foreground } else { Class::Unknown }
+        };
+        let classes = ends.iter().map(class).collect();
+        let hit: HashSet<(i32, i32)> = ends.iter().flatten().map(|(x, y)| Slow::square(*x, *y)).collect();
+        let near: HashSet<(i32, i32)> =
+            hit.iter().flat_map(|(x, y)| around(1).map(move |(dx, dy)| (x + dx, y + dy))).collect();
+        for at in &hit {
+            let (hits, free) = self.squares.entry(*at).or_default();
+            *hits = (*hits + 1).min(100);
+            *free -= i32::from(*hits % 8 == 0 && *free > 0);
+        }
+        let mut through = HashSet::new();
+        for (x, y) in ends.iter().flatten() {
+            let (dx, dy) = (x - place.x, y - place.y);
+            let length = dx.hypot(dy);
+            for step in 1..=((length / 0.05 - 2.5).max(0.0) as u32) {
+                let far = 0.05 * f64::from(step) / length;
+                through.insert(Slow::square(place.x + far * dx, place.y + far * dy));
+            }
+        }
+        for at in through.difference(&near) {
+            let (hits, free) = self.squares.entry(*at).or_default();
+            *free = (*free + 1).min(100);
+            *hits = (*hits - 1 - *hits / 16).max(0);
+        }
+        classes
+    }
+}
+
+#[test]
+fn classes_are_those_of_a_slow_version() {
+    for seed in 0..3 {
+        let drive = Drive::with_walkers(seed, 361, 160, 3, 0.02);
+        let (mut model, mut slow) = (Model::new(SETTINGS, 361), Slow::default());
+        let mut out = Foreground::of(361);
+        let (mut same, mut all, mut foreground) = (0, 0, 0);
+        for (number, (scan, place)) in drive.scans.iter().zip(&drive.places).enumerate() {
+            let expected = slow.update(place, scan);
+            model.follow(&Pose::default(), &at(place, number == 0));
+            model.update(scan, &mut out);
+            for (one, other) in model.classes().iter().zip(&expected) {
+                // Which of the short runs are believed is the runs' business.
+                let is_same = one == other || (*one, *other) == (Class::Unknown, Class::Foreground);
+                same += usize::from(is_same);
+                foreground += usize::from(*one == Class::Foreground && is_same);
+                all += 1;
+            }
+        }
+        // The borders of squares are rounded in other ways.
+        assert!(same as f64 > 0.985 * all as f64, "{seed}: {same} of {all}");
+        assert!(foreground > 100, "{seed}: {foreground}");
+    }
+}
+
+/// What is told of persons, what is not, and what else is, from scan `from` on.
+fn told(drive: &Drive, from: usize) -> (usize, usize, usize) {
+    let mut finder = LineFinder::new(Pose::default(), lines::Settings::default(), 361);
+    let mut estimator = MotionEstimator::new(Pose::default(), motion::Settings::default(), 361);
+    let mut model = Model::new(Settings { scans: None, ..SETTINGS }, 361);
+    let (mut lines, mut motion, mut out) = (Lines::default(), Motion::default(), Foreground::of(361));
+    let (mut found, mut missed, mut wrong) = (0, 0, 0);
+    for (number, scan) in drive.scans.iter().enumerate() {
+        finder.update(scan, &mut lines);
+        estimator.update(scan, &lines, &mut motion);
+        model.follow(&Pose::default(), &motion);
+        model.update(scan, &mut out);
+        for (class, person) in model.classes().iter().zip(&drive.people[number]).filter(|_| number >= from) {
+            match (person, *class == Class::Foreground) {
+                (true, true) => found += 1,
+                (true, false) => missed += 1,
+                (false, true) => wrong += 1,
+                (false, false) => {}
+            }
+        }
+    }
+    (found, missed, wrong)
+}
+
+#[test]
+fn who_walks_is_told_from_a_robot_that_drives() {
+    for seed in 20..22 {
+        let drive = Drive::with_walkers(seed, 361, 600, 3, 0.02);
+        let (found, missed, wrong) = told(&drive, 300);
+        assert!(found as f64 > 0.8 * (found + missed) as f64, "{seed}: {found} {missed}, edges and all");
+        assert!(found as f64 > 0.95 * (found + wrong) as f64, "{seed}: {found} {wrong}");
+    }
+}
+
+#[test]
+fn nothing_is_told_where_nobody_walks() {
+    let drive = Drive::with_walkers(31, 361, 500, 0, 0.02);
+    let (found, missed, wrong) = told(&drive, 0);
+    assert_eq!((found, missed), (0, 0));
+    assert!(wrong < 25, "{wrong} in 500 scans");
+}
+
+#[test]
+fn a_place_that_is_not_known_leaves_all_unknown_and_a_new_one_begins_anew() {
+    let mut drive = Drive::with_walkers(3, 361, 40, 2, 0.0);
+    drive.stand(40);
+    let mut model = Model::new(SETTINGS, 361);
+    let mut out = Foreground::of(361);
+    let place = drive.places[0];
+    for (number, scan) in drive.scans.iter().enumerate() {
+        let generation = model.generation();
+        let motion = match number {
+            20 => Motion { method: MotionMethod::Refused as u8, ..Motion::default() },
+            50 => Motion { x_m: f64::NAN, ..at(&place, false) },
+            70 => at(&place, true),
+            _ => at(&place, number == 0),
+        };
+        model.follow(&Pose::default(), &motion);
+        model.update(scan, &mut out);
+        let is_anew = [20, 50, 70].contains(&number);
+        assert_eq!(model.generation() != generation, is_anew, "{number}");
+        if is_anew || [21, 51, 71].contains(&number) {
+            assert_eq!((out.beams, model.classes().contains(&Class::Background)), (0, false), "{number}");
+        }
+    }
+}
+
+#[test]
+fn what_it_shows_is_what_stands() {
+    let mut drive = Drive::through_a_room(4, 361, 1, 0.003);
+    drive.stand(30);
+    let mut model = Model::new(SETTINGS, 361);
+    let mut out = Foreground::of(361);
+    for (number, scan) in drive.scans.iter().enumerate() {
+        model.follow(&Pose::default(), &at(&drive.places[0], number == 0));
+        model.update(scan, &mut out);
+    }
+    let mut shown = Background::zeroed(Background::len(361));
+    model.show(&mut shown);
+    let scan = &drive.scans[0];
+    let near = |i: &usize| {
+        let (shown, range) = (shown.ranges()[*i], scan.ranges()[*i]);
+        shown != Background::UNTAUGHT && shown.abs_diff(range) < 200
+    };
+    let count = (0..361).filter(near).count();
+    assert!(count > 300, "{count} of 361, those along walls aside");
+    // A model of one place is no map.
+    let generation = model.generation();
+    model.load(&shown).unwrap();
+    model.update(scan, &mut out);
+    assert_eq!((out.beams, model.generation()), (0, generation + 1));
+}
+
+#[test]
+fn any_place_and_any_scan_are_taken() {
+    let mut random = Rng::with_seed(5);
+    let mut model = Model::new(SETTINGS, 300);
+    let mut out = Foreground::of(300);
+    for _ in 0..400 {
+        let count = random.usize(..=300);
+        let step = [0.0, 0.01, -0.02, 1e300][random.usize(..4)];
+        let head = drives::beams_at(count, random.f64(), step);
+        let mut scan = Scan::of(head, &(0..count).map(|_| random.u16(..)).collect::<Vec<_>>());
+        scan.unit_um = [0, 1, 1000, u32::MAX][random.usize(..4)];
+        let mut number =
+            || [0.0, random.f64(), 30.0 * random.f64(), 1e5, -1e9, 1e300, f64::NAN][random.usize(..7)];
+        let (x_m, y_m, yaw_rad) = (number(), number(), number());
+        let motion = Motion { x_m, y_m, yaw_rad, method: random.u8(..7), ..Motion::default() };
+        model.follow(&Pose { x_m: random.f64(), ..Pose::default() }, &motion);
+        model.update(&scan, &mut out);
+        let mut shown = Background::zeroed(Background::len(300));
+        model.show(&mut shown);
+        assert!(usize::from(out.beams) <= count);
+    }
+}

@@ -1,0 +1,100 @@
+//! `scanhub web --replay`: a hub of this process alone whose sensors are a recording, and the picture of it, with the keys of
+//! the player. Both end together.
+
+use std::io::Write;
+use std::path::Path;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, mpsc};
+use std::thread;
+
+use config::Sources;
+use daemon::{Pace, Play, Player};
+use schema::{Failure, Kind};
+use verbs::WebOptions;
+use web::{Order, Playback, Progress};
+
+use crate::cli::{Everywhere, Web};
+use crate::own_domain::OwnDomain;
+
+/// Shows `file` until `stop` is set, which is set, too, when its hub ends.
+pub(crate) fn show(
+    web: &Web,
+    file: &Path,
+    everywhere: &Everywhere,
+    out: &mut dyn Write,
+    stop: &Arc<AtomicBool>,
+) -> Result<(), Failure> {
+    let domain = OwnDomain::new("web")?;
+    let options = WebOptions { places: vec![domain.clone()], ..web.options(everywhere)? };
+    let sources = Sources { files: Sources::system(), ..Sources::default() };
+    let replay = daemon::Replay {
+        file,
+        sensor: None,
+        sources: &sources,
+        play: Play { is_looped: web.is_looped, ..Play::default() },
+        // What was seen last stands until whoever looks has seen enough.
+        holds: true,
+    };
+    thread::scope(|scope| {
+        let (ready, is_ready) = mpsc::channel();
+        let (replay, domain) = (&replay, &domain);
+        let hub = thread::Builder::new().name("hub".into()).spawn_scoped(scope, move || {
+            // Whichever way it ends, the page ends, too.
+            let _over = Over(stop);
+            daemon::replay(replay, domain, |_, player| {
+                let _ = ready.send(Keys(player.clone()));
+            })
+        });
+        let hub = hub.map_err(|error| Failure::new(Kind::Short, format!("no thread: {error}"), ""))?;
+        let mut shown = Ok(());
+        if let Ok(keys) = is_ready.recv() {
+            shown = verbs::web(&options, Some(&keys), out, stop);
+            keys.0.end();
+        }
+        match hub.join() {
+            Ok(played) => played.and(shown),
+            // It has said why.
+            Err(_) => Err(Failure::new(Kind::Failed, "the hub of the recording ended", "start it again")),
+        }
+    })
+}
+
+/// The player, as viewers have it.
+struct Keys(Arc<Player>);
+
+impl Playback for Keys {
+    fn order(&self, order: Order) {
+        match order {
+            Order::Toggle => self.0.toggle(),
+            Order::Step => self.0.step(),
+            Order::Faster => self.0.speed_up(),
+            Order::Slower => self.0.slow_down(),
+        }
+    }
+
+    fn progress(&self) -> Progress {
+        let progress = self.0.progress();
+        let seconds = |ns: u64| ns as f64 / 1e9;
+        Progress {
+            position_s: seconds(progress.position_ns),
+            length_s: progress.length_ns.map(seconds),
+            rate: match progress.pace {
+                Pace::Times(rate) => Some(rate),
+                Pace::Max => None,
+            },
+            paused: progress.is_paused,
+            over: progress.is_over,
+            lap: progress.lap,
+            telegrams: progress.telegrams,
+        }
+    }
+}
+
+/// Ends what waits for `stop`.
+struct Over<'a>(&'a AtomicBool);
+
+impl Drop for Over<'_> {
+    fn drop(&mut self) {
+        self.0.store(true, Ordering::Relaxed);
+    }
+}

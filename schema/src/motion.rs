@@ -1,0 +1,135 @@
+//! How a sensor moved from one scan to the next, as its scans tell it. Refuses to know how that is found.
+
+use std::fmt;
+
+use bytemuck::{Pod, Zeroable};
+#[cfg(feature = "ipc")]
+use iceoryx2::prelude::ZeroCopySend;
+
+/// The payload of topic `motion`, 80 bytes: one sample per scan, in the robot's frame.
+///
+/// The step is the pose of the robot at this scan in the frame that it had at the scan before. The pose is the sum of all
+/// steps since the start: it drifts.
+#[derive(Clone, Copy, Debug, PartialEq, Pod, Zeroable)]
+#[cfg_attr(feature = "ipc", derive(ZeroCopySend), type_name("scanhub.Motion.v2"))]
+#[repr(C)]
+pub struct Motion {
+    /// The summed pose: metres ahead of where the robot's centre was at the start.
+    pub x_m: f64,
+    /// Metres to the left of it.
+    pub y_m: f64,
+    /// Radians counter-clockwise from where the robot looked at the start, from -pi to pi.
+    pub yaw_rad: f64,
+    /// The step: metres ahead.
+    pub dx_m: f32,
+    /// Metres to the left.
+    pub dy_m: f32,
+    /// Radians counter-clockwise.
+    pub dyaw_rad: f32,
+    /// Covariance of the step, row by row, in the order x, y, yaw: m2, m rad and rad2.
+    pub covariance: [f32; 9],
+    /// Share of this scan's readings that lie on surfaces of the scan that it was compared with, 0 to 1.
+    pub overlap: f32,
+    /// See [`Motion::how`].
+    pub method: u8,
+    /// [`Motion::DEGENERATE`].
+    pub flags: u8,
+    /// Steps that were refused since the start; 65535 is that many and more. The summed pose leaves them out.
+    pub breaks: u16,
+}
+
+/// How a step was found.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[repr(u8)]
+pub enum MotionMethod {
+    /// It is the first scan: there is no step.
+    First,
+    /// There is no step that explains the scan: nothing is known of it, and of the pose.
+    Refused,
+    /// By the beams alone: no corner and no line of the one scan is one of the other.
+    Beams,
+    /// Corners of both scans are the same.
+    Points,
+    /// Lines of both scans are the same.
+    Lines,
+    /// Corners and lines.
+    Both,
+}
+
+impl MotionMethod {
+    /// All, in the order of their numbers.
+    pub const ALL: [MotionMethod; 6] = [
+        MotionMethod::First,
+        MotionMethod::Refused,
+        MotionMethod::Beams,
+        MotionMethod::Points,
+        MotionMethod::Lines,
+        MotionMethod::Both,
+    ];
+
+    /// Returns the word for it in all output.
+    pub const fn name(self) -> &'static str {
+        match self {
+            MotionMethod::First => "first",
+            MotionMethod::Refused => "refused",
+            MotionMethod::Beams => "beams",
+            MotionMethod::Points => "points",
+            MotionMethod::Lines => "lines",
+            MotionMethod::Both => "both",
+        }
+    }
+}
+
+impl fmt::Display for MotionMethod {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(self.name())
+    }
+}
+
+impl Default for Motion {
+    fn default() -> Self {
+        Zeroable::zeroed()
+    }
+}
+
+impl Motion {
+    /// Flag: the surroundings do not say how far the robot moved in some direction, as in a corridor. The covariance is
+    /// great there.
+    pub const DEGENERATE: u8 = 1;
+
+    /// Returns how the step was found; a number that is not known says nothing.
+    pub fn how(&self) -> MotionMethod {
+        MotionMethod::ALL.get(usize::from(self.method)).copied().unwrap_or(MotionMethod::Refused)
+    }
+
+    /// Returns whether there is a step: else its numbers are 0.
+    pub fn has_step(&self) -> bool {
+        !matches!(self.how(), MotionMethod::First | MotionMethod::Refused)
+    }
+
+    /// Returns whether the summed pose is known: else it is 0.
+    pub fn has_pose(&self) -> bool {
+        self.how() != MotionMethod::Refused
+    }
+
+    /// Returns whether the surroundings leave a direction open.
+    pub fn is_degenerate(&self) -> bool {
+        self.flags & Motion::DEGENERATE != 0
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_is_not_known_is_refused() {
+        for (number, method) in MotionMethod::ALL.into_iter().enumerate() {
+            let motion = Motion { method: number as u8, ..Motion::default() };
+            assert_eq!((motion.how(), method as usize), (method, number));
+        }
+        let later = Motion { method: 6, x_m: 1.0, ..Motion::default() };
+        assert!(!later.has_step() && !later.has_pose());
+        assert!(Motion::default().has_pose() && !Motion::default().has_step());
+    }
+}

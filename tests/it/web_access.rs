@@ -1,0 +1,137 @@
+//! The page for whoever has no mouse, does not see it, or does not bear movement. Contrasts are computed where the colours
+//! are (`clients/web/src/page.rs`).
+
+use serde_json::{Value, json};
+
+use crate::browser::{Browser, Look};
+use crate::testkit::TestEnv;
+use crate::web::web;
+use crate::web_page::browse;
+
+/// The page of a hub with two sensors.
+fn look_at(env: &TestEnv, look: Look) -> Option<(Browser, Vec<crate::testkit::Program>)> {
+    let mut page = browse(env, look)?;
+    let sensors = env.simulator(&["front", "rear"], &["--seed=5", "--baud=500000", "--world=demo"]);
+    let hub = env.hub(&[env.link("front"), env.link("rear")]);
+    let (server, host) = web(env, &[]);
+    page.open(&format!("http://{host}/"));
+    page.await_true("window.scanhub?.beams > 600 && scanhub.verdict !== 'unknown'");
+    page.await_true("document.querySelectorAll('#sensors article.streaming').length === 2");
+    Some((page, vec![sensors, hub, server]))
+}
+
+/// What has the keyboard, as far as words tell.
+const HOLDER: &str = "(document.activeElement === document.body ? 'BODY' : document.activeElement.getAttribute('aria-label') || document.activeElement.innerText || \
+                      document.activeElement.tagName).trim()";
+
+#[test]
+fn the_keyboard_alone_is_enough() {
+    let env = TestEnv::new();
+    let Some((mut page, _programs)) = look_at(&env, Look::LAPTOP) else { return };
+    // Once around: whatever can be pressed is reached, and it is seen where the keyboard is.
+    let mut reached: Vec<String> = Vec::new();
+    for _ in 0..40 {
+        page.press("Tab");
+        let holder = page.ask(HOLDER).as_str().unwrap_or_default().to_owned();
+        if reached.first() == Some(&holder) {
+            break;
+        }
+        let outline = "getComputedStyle(document.activeElement).outlineStyle";
+        assert!(
+            holder == "BODY" || page.ask(outline) != "none",
+            "{holder} does not show that it has the keyboard"
+        );
+        reached.push(holder);
+    }
+    let all = "[...document.querySelectorAll('button, canvas[tabindex]')].filter((one) => one.offsetParent || one.id === 'map')\
+               .map((one) => (one.getAttribute('aria-label') || one.innerText).trim())";
+    let all = page.ask(all);
+    for name in all.as_array().expect("names").iter().filter_map(Value::as_str) {
+        assert!(reached.iter().any(|holder| holder == name), "{name} of {reached:?}");
+    }
+    assert!(all.as_array().is_some_and(|all| all.len() >= 11), "{all}");
+
+    // What has the keyboard is pressed by Enter and by the space bar.
+    let pressed =
+        |what: &str| format!("document.querySelector('{what}').getAttribute('aria-pressed') === 'true'");
+    page.ask("document.querySelector('[data-do=hold]').focus()");
+    page.press("Enter");
+    page.await_true(&pressed("[data-do=hold]"));
+    page.press(" ");
+    page.await_true(&format!("!({})", pressed("[data-do=hold]")));
+    page.ask("document.querySelector('#sensors button').focus()");
+    page.press("Enter");
+    page.await_true(&pressed("#sensors button"));
+    page.press("0");
+    page.await_true(&format!("!({})", pressed("#sensors button")));
+    page.press("l");
+    page.await_true("document.querySelector('#layers').classList.contains('open')");
+    // A dialogue takes the keyboard, and gives it back.
+    page.ask("document.querySelector('[data-do=layers]').focus()");
+    page.press("?");
+    page.await_true("document.querySelector('#help').contains(document.activeElement)");
+    page.press("Escape");
+    page.await_true("document.activeElement.dataset.do === 'layers'");
+    assert!(page.complaints.is_empty(), "{:?}", page.complaints);
+}
+
+#[test]
+fn who_hears_the_page_is_told_names_states_and_the_verdict() {
+    let env = TestEnv::new();
+    let Some((mut page, _programs)) = look_at(&env, Look::LAPTOP) else { return };
+    let tree = page.call("Accessibility.getFullAXTree", json!({}));
+    let nodes: Vec<(String, String)> = tree["nodes"]
+        .as_array()
+        .expect("nodes")
+        .iter()
+        .filter(|node| node["ignored"] != true)
+        .map(|node| {
+            [&node["role"]["value"], &node["name"]["value"]]
+                .map(|text| text.as_str().unwrap_or_default().to_owned())
+        })
+        .map(|[role, name]| (role, name))
+        .collect();
+    let named = |role: &str| {
+        nodes.iter().filter(|node| node.0 == role).map(|node| node.1.as_str()).collect::<Vec<_>>()
+    };
+    assert!(named("button").len() >= 11 && named("button").iter().all(|name| !name.is_empty()), "{nodes:?}");
+    assert!(named("image").iter().any(|name| name.contains("from above")), "{:?}", named("image"));
+    assert!(
+        named("complementary").contains(&"Sensors") && named("navigation").contains(&"Picture"),
+        "{nodes:?}"
+    );
+    assert!(named("StaticText").iter().any(|text| ["SLOW", "CLEAR", "STOP"].contains(text)), "{nodes:?}");
+    for word in ["rate", "age p50 / p99", "damaged on the line", "streaming"] {
+        assert!(named("StaticText").contains(&word), "{word} of {:?}", named("StaticText"));
+    }
+    let live = "document.querySelector('#verdict').getAttribute('aria-live')";
+    assert_eq!(page.ask(live), "assertive");
+    assert_eq!(page.ask("document.documentElement.lang"), "en");
+}
+
+#[test]
+fn who_does_not_bear_movement_gets_none() {
+    let env = TestEnv::new();
+    let Some((mut page, _programs)) = look_at(&env, Look::LAPTOP) else { return };
+    // How many places the picture has on its way back from a larger one.
+    let places = "new Promise((done) => {
+        const scales = new Set();
+        const until = performance.now() + 1500;
+        const look = () => {
+            scales.add(scanhub.view.scale);
+            if (performance.now() < until) requestAnimationFrame(look); else done(scales.size);
+        };
+        requestAnimationFrame(look);
+    })";
+    let count = |page: &mut Browser, motion: &str| {
+        let features = json!([{ "name": "prefers-reduced-motion", "value": motion }]);
+        page.call("Emulation.setEmulatedMedia", json!({ "features": features }));
+        for _ in 0..6 {
+            page.press("+");
+        }
+        page.press("c");
+        page.ask(places).as_u64().expect("a number")
+    };
+    let (glides, jumps) = (count(&mut page, "no-preference"), count(&mut page, "reduce"));
+    assert!(glides >= 6 && jumps <= 4, "{glides} places, and {jumps} without movement");
+}

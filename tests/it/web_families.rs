@@ -1,0 +1,121 @@
+//! Sensors of every family and form in one picture: equal beams and exact angles, upside down, fields that overlap, and those
+//! of other machines. Where the page draws points is compared with where the hub's scans and poses put them.
+
+use serde_json::Value;
+
+use crate::browser::{Browser, Look};
+use crate::testkit::{Sender, TestEnv, in_a_network, number, until};
+use crate::web::web;
+use crate::web_page::browse;
+use schema::{Pose, Scan, ScanHead, State, Status, Topic, Verdict, Zones};
+
+/// A hall that is as no mirror shows it.
+const HALL: &str = "[noise]\ntail = 0\n\n[[thing]]\nline = [[3000, -2500], [3500, 4000], [-2000, 3000], [-4000, -3000], [3000, -2500]]\n
+[[thing]]\nradius_mm = 150\npose = [900, 1300]\n";
+
+/// Points of `sensor` on the page, in the robot's frame; not a number where there is none.
+fn drawn(page: &mut Browser, sensor: &str) -> Vec<(f64, f64)> {
+    let points = page.ask(&format!("scanhub.points('{sensor}')"));
+    let numbers: Vec<f64> =
+        points.as_array().expect("points").iter().map(|value| value.as_f64().unwrap_or(f64::NAN)).collect();
+    numbers.chunks(2).map(|pair| (pair[0], pair[1])).collect()
+}
+
+/// Where the beams of a line of class `scan` end for a sensor at `pose`.
+fn measured(scan: &Value, pose: &Pose) -> Vec<(f64, f64)> {
+    let unit_mm = number(scan, "unit_um") as f64 / 1000.0;
+    let (first, step) =
+        (scan["first_angle_deg"].as_f64().expect("a number"), scan["step_deg"].as_f64().expect("a number"));
+    let ranges = scan["ranges"].as_array().expect("ranges").iter().enumerate();
+    let point = |(i, range): (usize, &Value)| {
+        let angle = scan["angles_deg"][i].as_f64().unwrap_or(first + i as f64 * step);
+        let (x, y) = pose.point_mm(angle.to_radians(), range.as_f64()? * unit_mm);
+        Some((x / 1000.0, y / 1000.0))
+    };
+    ranges.filter_map(point).collect()
+}
+
+#[test]
+fn every_form_is_drawn_where_it_sees() {
+    let env = TestEnv::new();
+    let Some(mut page) = browse(&env, Look::LAPTOP) else { return };
+    let world = format!("--world={}", env.file("world", HALL));
+    let _lms = env.simulator(&["front", "flipped"], &["--seed=7", "--baud=500000", &world]);
+    let _rplidar = env.simulator(&["top"], &["--family=rplidar", "--model=s2", "--seed=8", &world]);
+    let links = [env.link("front"), env.link("flipped"), env.link("top")];
+    let set = [
+        "front.pose.x=0.3",
+        "flipped.pose.x=-0.2",
+        "flipped.pose.yaw=0.6",
+        "flipped.pose.upside_down=true",
+        "top.family=rplidar",
+        "top.model=s2",
+        "top.beams=3240",
+    ];
+    let _hub = env.hub(&[&links[..], &set.map(|setting| format!("--set=link.{setting}"))].concat());
+    let (_server, host) = web(&env, &[]);
+    page.open(&format!("http://{host}/"));
+    page.await_true(
+        "window.scanhub?.sensors.length === 3 && scanhub.sensors.every(({ state }) => state === 'streaming')",
+    );
+    page.await_true("scanhub.points('front').length === 722 && scanhub.points('top').length === 6480");
+    page.await_true("scanhub.points('flipped').length === 722");
+    let poses = [
+        ("front", Pose { x_m: 0.3, ..Pose::default() }),
+        ("flipped", Pose { x_m: -0.2, yaw_rad: 0.6, upside_down: 1, ..Pose::default() }),
+        ("top", Pose::default()),
+    ];
+    for (sensor, pose) in poses {
+        let outcome = env.run(&["echo", "--json", "-n", "1", &format!("{sensor}/scan")]);
+        let scan = outcome.of_class("scan").pop().unwrap_or_else(|| panic!("no scan: {outcome}"));
+        let wanted = measured(&scan, &pose);
+        assert!(wanted.len() > 300, "{sensor}: {}", wanted.len());
+        // On a busy machine a scan that is too old to be shown is gone for a moment.
+        until(&format!("{sensor} stands where it sees"), || {
+            let seen = drawn(&mut page, sensor);
+            let is_there = |(x, y): &&(f64, f64)| seen.iter().any(|(a, b)| (a - x).hypot(b - y) < 0.1);
+            wanted.iter().filter(is_there).count() * 100 >= wanted.len() * 97
+        });
+    }
+    assert!(page.complaints.is_empty(), "{:?}", page.complaints);
+}
+
+#[test]
+fn sensors_of_other_machines_stand_in_the_list_and_not_on_this_robot() {
+    in_a_network("web_families::sensors_of_other_machines_stand_in_the_list_and_not_on_this_robot", || {
+        let env = TestEnv::new();
+        let Some(mut page) = browse(&env, Look::LAPTOP) else { return };
+        let mut sender = Sender::new(0x5f3a_12bc_00d1_e2f3, 7, 3, "front");
+        let words = ["listen", "--json", "--publish", "--name=robot1=5f3a12bc00d1e2f3"];
+        let mut listener = env.start(&words).ready();
+        sender.announce(&[Topic::Zones, Topic::Scan, Topic::Status]);
+        listener.await_line("a sensor", |line| line["kind"] == "published");
+        let _lms = env.simulator(&["rear"], &["--seed=7", "--baud=500000"]);
+        let _hub = env.hub(&[env.link("rear")]);
+        let (_server, host) = web(&env, &[]);
+        page.open(&format!("http://{host}/"));
+        page.await_true("window.scanhub?.points('rear').length === 722");
+        // It says something now and then, as remote ones do.
+        let scan = Scan::of(ScanHead::lms(181, -90_000, 1000, 1, 13), &[2000; 181]);
+        let mut say = |page: &mut Browser, wanted: &str| {
+            let begun = std::time::Instant::now();
+            while page.ask(wanted) != Value::Bool(true) {
+                assert!(begun.elapsed() < crate::testkit::PATIENCE, "{wanted}");
+                sender.send(Topic::Status, &Status { state: State::Streaming as u8, ..Status::default() });
+                sender.send(Topic::Scan, &*scan);
+                sender.send(Topic::Zones, &Zones { verdict: Verdict::Stop as u8, ..Zones::unknown() });
+                std::thread::sleep(std::time::Duration::from_millis(30));
+            }
+        };
+        let card = "[...document.querySelectorAll('#sensors h2')].some((one) => /robot1\\.front/.test(one.innerText))";
+        say(&mut page, card);
+        say(&mut page, "scanhub.points('robot1.front').length === 362");
+        assert_eq!(page.ask("scanhub.beams <= 361"), true, "it sits on another robot");
+        assert_ne!(page.ask("scanhub.verdict"), "stop", "and says nothing of this one");
+        let number = "[...document.querySelectorAll('#sensors button')].find((one) => /robot1/.test(one.innerText)).click()";
+        page.ask(number);
+        say(&mut page, "scanhub.beams === 181");
+        let outcome = listener.end(crate::testkit::INT);
+        assert_eq!(outcome.code, Some(0), "{outcome}");
+    });
+}

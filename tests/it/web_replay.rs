@@ -1,0 +1,100 @@
+//! A recording in a browser: its time line, pause, single steps and speed, by buttons and by keys, from a hub that nobody else
+//! has and that is gone afterwards.
+
+use crate::browser::Look;
+use crate::testkit::{INT, Program, TestEnv, hold_in_time, is_class, shared_memory};
+use crate::web_page::browse;
+
+/// Starts what shows `file`, and waits for its address.
+fn show(env: &TestEnv, file: &str, flags: &[&str]) -> (Program, String) {
+    let words = ["web", "--json", "--listen", "127.0.0.1:0", "--replay", file];
+    let mut web = env.start(&[&words, flags].concat());
+    let ready = web.await_line("its address", is_class("ready"));
+    let url = ready["url"].as_str().expect("an address").to_owned();
+    (web, url)
+}
+
+/// A CARMEN log of a wall that comes nearer with every scan, five of them a second.
+fn log(env: &TestEnv, scans: u64) -> String {
+    let line = |n: u64| {
+        let stamp = 1000.0 + 0.2 * n as f64;
+        let range = format!(" {:.2}", 8.0 - 0.01 * n as f64).repeat(181);
+        format!("FLASER 181{range} 0 0 0 0 0 0 {stamp:.6} host {stamp:.6}\n")
+    };
+    env.file("wall.log", (0..scans).map(line).collect::<String>())
+}
+
+#[test]
+fn the_keys_of_a_player_are_on_the_page() {
+    hold_in_time(play);
+}
+
+fn play() {
+    let env = TestEnv::in_time();
+    let Some(mut page) = browse(&env, Look::LAPTOP) else { return };
+    let (server, url) = show(&env, &log(&env, 100), &[]);
+    page.open(&url);
+    page.await_true("window.scanhub?.beams === 181 && scanhub.player && !scanhub.player.paused");
+    let own = format!("sh_web-{}_", server.pid());
+    assert!(!shared_memory(&own).is_empty(), "a hub of its own");
+    assert_eq!(
+        page.ask("document.querySelector('#line').max > 19 && document.querySelector('#line').value > 0"),
+        true
+    );
+
+    // Paused by a key: the picture stands, longer than a scan is what is there.
+    page.press("p");
+    page.await_true("scanhub.player.paused && /paused/.test(document.querySelector('#played').innerText)");
+    page.ask("new Promise((done) => setTimeout(done, 1500))");
+    let before = page.ask("scanhub.player.telegrams").as_u64().expect("a number");
+    assert_eq!(page.ask("scanhub.beams"), 181);
+    assert_eq!(page.ask("scanhub.reason"), serde_json::Value::Null);
+    assert_eq!(page.ask("scanhub.verdict"), "unknown", "what stands is not what is there");
+
+    // One telegram each, by key and by button.
+    page.press(".");
+    page.await_true(&format!("scanhub.player.telegrams === {}", before + 1));
+    page.ask("document.querySelector('[data-order=step]').click()");
+    page.await_true(&format!("scanhub.player.telegrams === {} && scanhub.player.paused", before + 2));
+    page.await_true("scanhub.beams === 181");
+
+    // Twice as fast, half as fast.
+    page.press(">");
+    page.await_true("scanhub.player.rate === 2");
+    page.press("<");
+    page.press("<");
+    page.await_true("scanhub.player.rate === 0.5");
+    for _ in 0..8 {
+        page.press(">");
+    }
+    page.press("p");
+    page.await_true("scanhub.player.over && /at its end/.test(document.querySelector('#played').innerText)");
+    assert_eq!(
+        page.ask("document.querySelector('[data-order=step]').disabled && scanhub.player.telegrams === 100"),
+        true
+    );
+    assert_eq!(page.ask("scanhub.beams"), 181, "what was seen last stands");
+    assert!(page.complaints.is_empty(), "{:?}", page.complaints);
+    let outcome = server.end(INT);
+    assert_eq!(outcome.code, Some(0), "{outcome}");
+    assert!(shared_memory(&own).is_empty(), "its domain is left");
+}
+
+#[test]
+fn a_recording_starts_again_and_what_is_none_is_refused() {
+    let env = TestEnv::new();
+    let Some(mut page) = browse(&env, Look::PHONE) else { return };
+    let (server, url) = show(&env, &log(&env, 8), &["--loop"]);
+    page.open(&url);
+    page.await_true("window.scanhub?.player?.lap >= 1 && scanhub.beams === 181");
+    assert_eq!(page.ask("document.documentElement.scrollWidth <= 390"), true);
+    assert_eq!(server.end(INT).code, Some(0));
+    let outcome = env.run(&["web", "--json", "--replay", &env.word("none.log")]);
+    assert_eq!(
+        (outcome.code, &outcome.of_class("error")[0]["kind"]),
+        (Some(66), &"input".into()),
+        "{outcome}"
+    );
+    let outcome = env.run(&["web", "--loop"]);
+    assert_eq!(outcome.code, Some(2), "{outcome}");
+}
