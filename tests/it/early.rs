@@ -28,8 +28,9 @@ fn heard(env: &TestEnv, faults: &[&str], lines: usize, wanted: impl Fn(&Value) -
 /// Checks that each warning of `outcome` was confirmed or withdrawn; how many were.
 fn judge(outcome: &Outcome) -> (usize, usize) {
     let mut zones: BTreeMap<u64, Value> = BTreeMap::new();
-    // A silence has the number of the scan before it, or none.
-    for line in outcome.of_class("zones").into_iter().filter(|line| line["seq"].is_u64()) {
+    // A silence has the number of the scan before it, or none; what came too late is not said.
+    let heard = |line: &Value| line["seq"].is_u64() && line["stale"] != true;
+    for line in outcome.of_class("zones").into_iter().filter(heard) {
         zones.entry(number(&line, "seq")).or_insert(line);
     }
     let (&first, &last) = (zones.keys().next().expect("zones"), zones.keys().last().expect("zones"));

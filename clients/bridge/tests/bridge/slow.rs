@@ -5,7 +5,7 @@ use std::process::Command;
 
 use serde_json::Value;
 
-use crate::testkit::{INT, TestEnv, in_a_network, number, skip, wall_ns};
+use crate::testkit::{INT, TERM, TestEnv, in_a_network, number, skip, wall_ns};
 use crate::{NO_FLAGS, account, address, agree, bridge, linked};
 
 /// Lets no more than 0.5 Mbit/s through the loopback, whose packets are those of a network.
@@ -30,7 +30,7 @@ fn on_a_slow_link_the_newest_comes_first() {
         let (mut here, _) = bridge(&desk, &["--connect", &at, "--publish", &format!("--name=robot1={id}")]);
         linked(&mut there);
         linked(&mut here);
-        let _hub = robot.hub(&[robot.link("front"), robot.link("rear")]);
+        let hub = robot.hub(&[robot.link("front"), robot.link("rear")]);
         here.await_line("a sensor", |line| line["kind"] == "published");
         let mut local = robot.echo(&["front/scan"]);
         let mut remote = desk.echo(&["robot1.front/scan"]);
@@ -46,6 +46,9 @@ fn on_a_slow_link_the_newest_comes_first() {
         local.await_line("a scan", |line| line["class"] == "scan");
         let local = local.end(INT);
         assert_eq!(local.of_class("summary")[0]["lost"], 0, "{local}");
+        // What waits on the link when a bridge ends is cut off: nothing new comes, and it gets empty.
+        assert_eq!(hub.end(TERM).code, Some(0));
+        std::thread::sleep(std::time::Duration::from_secs(3));
         let sent = there.end(INT);
         let received = {
             here.await_line("what is under way", |line| line["class"] == "bridge_published");
