@@ -9,6 +9,8 @@
 #[allow(dead_code)] // Benches of time use more of it.
 mod figures;
 mod logs;
+#[path = "../support/quick.rs"]
+mod quick;
 mod rivals;
 mod rooms;
 mod score;
@@ -39,18 +41,10 @@ const NAMES: [[&str; 5]; 2] = [
 ];
 
 fn main() -> ExitCode {
-    let (mut is_json, mut is_quick) = (false, false);
-    for word in std::env::args().skip(1) {
-        match word.as_str() {
-            "--json" => is_json = true,
-            "--quick" => is_quick = true,
-            "--bench" => {}
-            other => {
-                eprintln!("{other}? --json, --quick");
-                return ExitCode::from(2);
-            }
-        }
-    }
+    let [is_json, is_quick] = match quick::asked() {
+        Ok(asked) => asked,
+        Err(code) => return code,
+    };
     let mut figures = Vec::new();
     let mut cells = Vec::new();
     of_rooms(if is_quick { 1..2 } else { 1..5 }, &mut figures, &mut cells);

@@ -10,6 +10,8 @@ mod drives;
 #[path = "../support/figures.rs"]
 #[allow(dead_code)] // Benches of time use more of it.
 mod figures;
+#[path = "../support/quick.rs"]
+mod quick;
 mod rivals;
 mod simulated;
 
@@ -24,18 +26,10 @@ use drives::Drive;
 use figures::{Cell, Figure, Target};
 
 fn main() -> ExitCode {
-    let (mut is_json, mut is_quick) = (false, false);
-    for word in std::env::args().skip(1) {
-        match word.as_str() {
-            "--json" => is_json = true,
-            "--quick" => is_quick = true,
-            "--bench" => {}
-            other => {
-                eprintln!("{other}? --json, --quick");
-                return ExitCode::from(2);
-            }
-        }
-    }
+    let [is_json, is_quick] = match quick::asked() {
+        Ok(asked) => asked,
+        Err(code) => return code,
+    };
     let (mut figures, mut cells) = (Vec::new(), Vec::new());
     let drives = drives::all();
     if drives.is_empty() {

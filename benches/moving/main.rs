@@ -11,6 +11,8 @@ mod drives;
 #[path = "../support/figures.rs"]
 #[allow(dead_code)] // Benches of time use more of it.
 mod figures;
+#[path = "../support/quick.rs"]
+mod quick;
 #[path = "../lines/rooms.rs"]
 #[allow(dead_code)] // The experiment of PLE.
 mod rooms;
@@ -29,18 +31,10 @@ use figures::{Cell, Figure, Target};
 use worlds::Drive;
 
 fn main() -> ExitCode {
-    let (mut is_json, mut is_quick) = (false, false);
-    for word in std::env::args().skip(1) {
-        match word.as_str() {
-            "--json" => is_json = true,
-            "--quick" => is_quick = true,
-            "--bench" => {}
-            other => {
-                eprintln!("{other}? --json, --quick");
-                return ExitCode::from(2);
-            }
-        }
-    }
+    let [is_json, is_quick] = match quick::asked() {
+        Ok(asked) => asked,
+        Err(code) => return code,
+    };
     let (mut figures, mut cells) = (Vec::new(), Vec::new());
     // Seeds below 10 were there to tune on.
     let seeds = if is_quick { 10..12 } else { 10..20 };

@@ -20,8 +20,6 @@ pub struct Begun<'a> {
     pub first: Nanos,
     /// When the last one of these arrived.
     pub last: Nanos,
-    /// Whether `first` is an estimate from bytes that came in one read.
-    pub estimated: bool,
     /// Why it is suspect already, bits of [`line::suspect`].
     pub reasons: u8,
 }
@@ -52,7 +50,6 @@ impl Session {
             bytes,
             first: first.at.max(self.last_stamp),
             last: last.at.max(first.at).max(self.last_stamp),
-            estimated: first.estimated,
             reasons: begun.reasons,
         })
     }
