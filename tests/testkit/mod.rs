@@ -206,31 +206,36 @@ impl TestEnv {
         fs::remove_file(self.path(port)).unwrap_or_else(|error| panic!("{port}: {error}"));
     }
 
-    /// `echo --json` of these topics, attached to all of them.
+    /// `echo --json` of these topics, attached to all of them, as soon as there are all of them: those of a remote sensor
+    /// come one by one, each with what is first heard of it.
     pub(crate) fn echo(&self, topics: &[&str]) -> Program {
-        let before = self.all_subscribers(topics);
+        let mut before = Vec::new();
+        until("all topics are there", || {
+            let listed = self.all_subscribers(topics);
+            before = listed.iter().copied().flatten().collect();
+            before.len() == topics.len()
+        });
         let program = self.start(&with(&["echo", "--json"], topics));
         until("the consumer is attached", || {
-            self.all_subscribers(topics).iter().zip(&before).all(|(now, before)| now > before)
+            self.all_subscribers(topics).iter().zip(&before).all(|(now, before)| now.is_some_and(|it| it > *before))
         });
         program
     }
 
     /// How many consumers `topic` has.
     pub(crate) fn subscribers(&self, topic: &str) -> u64 {
-        self.all_subscribers(&[topic])[0]
+        self.all_subscribers(&[topic])[0].unwrap_or_else(|| panic!("there is no {topic}"))
     }
 
-    /// How many consumers each of `topics` has, all of them at one time.
-    fn all_subscribers(&self, topics: &[&str]) -> Vec<u64> {
+    /// How many consumers each of `topics` has that is there, all of them at one time.
+    fn all_subscribers(&self, topics: &[&str]) -> Vec<Option<u64>> {
         let outcome = self.run(&["list", "--json"]);
         let lines = outcome.lines();
         let subscribers = |topic: &&str| {
             let (sensor, name) = topic.split_once('/').unwrap_or_else(|| panic!("{topic} has no sensor"));
             let is_it =
                 |line: &&Value| line["class"] == "topic" && line["sensor"] == sensor && line["topic"] == name;
-            let line = lines.iter().find(is_it).unwrap_or_else(|| panic!("no {topic}: {outcome}"));
-            number(line, "subscribers")
+            lines.iter().find(is_it).map(|line| number(line, "subscribers"))
         };
         topics.iter().map(subscribers).collect()
     }
