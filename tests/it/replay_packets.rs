@@ -109,7 +109,7 @@ fn check_scans(recorded: &[(Header, Vec<u8>)], replayed: &[(Header, Vec<u8>)], l
 
 #[test]
 fn scans_are_those_that_were_recorded() {
-    let env = TestEnv::new();
+    let env = TestEnv::in_time();
     record(&env, "ld19", &[], 45);
     let recorded = samples(&env.path("all.mcap"), "front/scan");
     let packets = samples(&env.path("telegrams.mcap"), "front/telegram");
@@ -146,7 +146,7 @@ fn scans_are_those_that_were_recorded() {
 
 #[test]
 fn beams_are_those_that_were_recorded() {
-    let env = TestEnv::new();
+    let env = TestEnv::in_time();
     record(&env, "stl27l", &["model=stl27l", "beams=1000"], 25);
     let recorded = samples(&env.path("all.mcap"), "front/scan");
     replay(&env, "all.mcap", &[]);
@@ -273,8 +273,9 @@ fn other_programs_get_the_same_scans_of_packets() {
     let (published, computed) = (rows("all.mcap"), rows("telegrams.mcap"));
     let ranges =
         |rows: &[Vec<String>]| rows.iter().map(|row| row[row.len() - 450..].to_vec()).collect::<Vec<_>>();
+    // The recorder of telegrams ended last.
     assert!(
-        published.len() > 20 && ranges(&published) == ranges(&computed),
+        published.len() > 20 && ranges(&computed).starts_with(&ranges(&published)),
         "{} {}",
         published.len(),
         computed.len()
@@ -292,6 +293,6 @@ fn other_programs_get_the_same_scans_of_packets() {
     };
     assert!(all("again.mcap") == all("telegrams.mcap"));
     let ranges_again = ranges(&rows("again.mcap"));
-    let same = ranges_again.iter().filter(|row| ranges(&published).contains(row)).count();
+    let same = ranges_again.iter().filter(|row| ranges(&computed).contains(row)).count();
     assert!(same + 2 >= ranges_again.len() && same > 20, "{same} of {}", ranges_again.len());
 }
