@@ -217,7 +217,10 @@ impl TestEnv {
         });
         let program = self.start(&with(&["echo", "--json"], topics));
         until("the consumer is attached", || {
-            self.all_subscribers(topics).iter().zip(&before).all(|(now, before)| now.is_some_and(|it| it > *before))
+            self.all_subscribers(topics)
+                .iter()
+                .zip(&before)
+                .all(|(now, before)| now.is_some_and(|it| it > *before))
         });
         program
     }
