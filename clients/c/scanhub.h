@@ -23,7 +23,8 @@
 extern "C" {
 #endif
 
-/* The groups are 239.255.76.80 to .83, all on this port: .80 announce and status, .81 zones, early, marks, lines, motion and foreground, .82
+/* The groups are 239.255.76.80 to .83, all on this port: .80 announce and status, .81 zones, early, marks, lines, motion,
+ * foreground, tracks and events, .82
  * scan and background, .83 telegram. */
 #define SCANHUB_PORT 22200
 /* The longest datagram that a gateway ever sends. */
@@ -40,7 +41,9 @@ enum scanhub_topic {
     SCANHUB_STATUS = 7,
     SCANHUB_LINES = 8,
     SCANHUB_MOTION = 9,
-    SCANHUB_EARLY = 10
+    SCANHUB_EARLY = 10,
+    SCANHUB_TRACKS = 11,
+    SCANHUB_EVENTS = 12
 };
 
 /* Bits of `flags`. */
@@ -586,6 +589,107 @@ static inline enum scanhub_result scanhub_read_zones(const struct scanhub_datagr
     out->invalid_beams = scanhub_u16(at + 8);
     out->provisional = at[10] & 1;
     out->zones = at + 12;
+    return SCANHUB_OK;
+}
+
+/* People at one instant, which is `stamp_ns`, in the map of a site. */
+enum scanhub_track_state {
+    SCANHUB_TENTATIVE = 0,    /* perhaps a person, and so is every number that is not here */
+    SCANHUB_CONFIRMED = 1,    /* a person who is seen */
+    SCANHUB_HIDDEN = 2,       /* a person who is not seen, where nobody could be seen either */
+    SCANHUB_BETWEEN_ROOMS = 3 /* a person on a way that no sensor sees */
+};
+struct scanhub_tracks {
+    uint8_t count;        /* people, at most 64 */
+    uint8_t sensor_count; /* of the site, at most 32 */
+    const uint8_t *tracks;
+    const uint8_t *sensors;
+};
+struct scanhub_track {
+    uint64_t id;         /* nobody else ever gets it */
+    float x_m, y_m;      /* the middle between his legs */
+    float vx_m_s, vy_m_s;
+    float covariance[3]; /* of the place, m2: xx, xy, yy */
+    float score;         /* how sure it is that this is a person, 0 to 1 */
+    uint32_t age_ms;     /* since he was first seen */
+    uint32_t sensors;    /* bit i: sensor i sees him */
+    char room[25];       /* UTF-8; empty: none */
+    uint8_t state;
+};
+/* One person, i below `count`. */
+static inline struct scanhub_track scanhub_track(const struct scanhub_tracks *tracks, unsigned i)
+{
+    const uint8_t *at = tracks->tracks + 80 * (size_t)i;
+    struct scanhub_track out;
+    unsigned n;
+    out.id = scanhub_u64(at);
+    out.x_m = scanhub_f32(at + 8);
+    out.y_m = scanhub_f32(at + 12);
+    out.vx_m_s = scanhub_f32(at + 16);
+    out.vy_m_s = scanhub_f32(at + 20);
+    for (n = 0; n < 3; n++)
+        out.covariance[n] = scanhub_f32(at + 24 + 4 * (size_t)n);
+    out.score = scanhub_f32(at + 36);
+    out.age_ms = scanhub_u32(at + 40);
+    out.sensors = scanhub_u32(at + 44);
+    scanhub_text(out.room, at + 48, 24);
+    out.state = at[72];
+    return out;
+}
+/* The name of one sensor, i below `sensor_count`. */
+static inline void scanhub_track_sensor(const struct scanhub_tracks *tracks, unsigned i, char name[57])
+{
+    scanhub_text(name, tracks->sensors + 56 * (size_t)i, 56);
+}
+static inline enum scanhub_result scanhub_read_tracks(const struct scanhub_datagram *datagram,
+                                                      struct scanhub_tracks *out)
+{
+    const uint8_t *at = datagram->payload;
+    enum scanhub_result result = scanhub_expect(datagram, SCANHUB_TRACKS, 8);
+    unsigned i, n;
+    if (result != SCANHUB_OK)
+        return result;
+    if (at[0] > 64 || at[1] > 32 || datagram->payload_len < 8 + 80 * (size_t)at[0] + 56 * (size_t)at[1])
+        return SCANHUB_BAD_PAYLOAD;
+    out->count = at[0];
+    out->sensor_count = at[1];
+    out->tracks = at + 8;
+    out->sensors = out->tracks + 80 * (size_t)out->count;
+    /* All numbers are finite, and sensors are some that are there. */
+    for (i = 0; i < out->count; i++) {
+        const uint8_t *track = out->tracks + 80 * (size_t)i;
+        for (n = 8; n < 40; n += 4)
+            if (!isfinite(scanhub_f32(track + n)))
+                return SCANHUB_BAD_PAYLOAD;
+        if ((uint64_t)scanhub_u32(track + 44) >> out->sensor_count)
+            return SCANHUB_BAD_PAYLOAD;
+    }
+    return SCANHUB_OK;
+}
+
+/* What happened to a person at `stamp_ns`. */
+enum scanhub_event_kind { SCANHUB_APPEARED = 0, SCANHUB_LEFT = 1, SCANHUB_DOOR = 2 };
+struct scanhub_events {
+    uint64_t id;
+    uint8_t kind;
+    char room[25];                   /* where he then is, UTF-8; empty: none */
+    char door[25], from[25], to[25]; /* of SCANHUB_DOOR; else empty */
+};
+static inline enum scanhub_result scanhub_read_events(const struct scanhub_datagram *datagram,
+                                                      struct scanhub_events *out)
+{
+    const uint8_t *at = datagram->payload;
+    enum scanhub_result result = scanhub_expect(datagram, SCANHUB_EVENTS, 112);
+    if (result != SCANHUB_OK)
+        return result;
+    if (at[8] > SCANHUB_DOOR)
+        return SCANHUB_BAD_PAYLOAD;
+    out->id = scanhub_u64(at);
+    out->kind = at[8];
+    scanhub_text(out->room, at + 16, 24);
+    scanhub_text(out->door, at + 40, out->kind == SCANHUB_DOOR ? 24 : 0);
+    scanhub_text(out->from, at + 64, out->kind == SCANHUB_DOOR ? 24 : 0);
+    scanhub_text(out->to, at + 88, out->kind == SCANHUB_DOOR ? 24 : 0);
     return SCANHUB_OK;
 }
 

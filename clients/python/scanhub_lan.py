@@ -33,7 +33,7 @@ from dataclasses import astuple, dataclass, replace
 from typing import Optional, Union
 
 PORT = 22200
-TOPICS = ("announce", "telegram", "scan", "marks", "zones", "foreground", "background", "status", "lines", "motion", "early")
+TOPICS = ("announce", "telegram", "scan", "marks", "zones", "foreground", "background", "status", "lines", "motion", "early", "tracks", "events")
 VERDICTS = ("clear", "slow", "stop", "unknown")
 STATES = ("absent", "probing", "switching", "starting", "streaming", "silent", "paused")
 FAMILIES = ("lms", "ld", "rplidar")
@@ -261,6 +261,50 @@ class Early:
     beams_seen: int
 
 
+TRACK_STATES = ("tentative", "confirmed", "hidden", "between_rooms")
+EVENTS = ("appeared", "left", "door")
+
+
+@dataclass(frozen=True)
+class Track:
+    """A person: number, place and speed in the map of the site, covariance of the place (xx, xy, yy, m2), how sure it is that
+    this is a person (0 to 1), since when he is known, bits of the sensors that see him, room (empty: none), and one of
+    TRACK_STATES."""
+
+    id: int
+    x_m: float
+    y_m: float
+    vx_m_s: float
+    vy_m_s: float
+    covariance: "tuple[float, float, float]"
+    score: float
+    age_ms: int
+    sensors: int
+    room: str
+    state: str
+
+
+@dataclass(frozen=True)
+class Tracks:
+    """People at one instant, which is `stamp_ns`, and the names of the sensors."""
+
+    names: "tuple[str, ...]"
+    tracks: "tuple[Track, ...]"
+
+
+@dataclass(frozen=True)
+class Event:
+    """What happened to a person: one of EVENTS, the room where he then is (empty: none); of `door` the door, and from where to
+    where."""
+
+    kind: str
+    id: int
+    room: str
+    door: str
+    from_room: str
+    to_room: str
+
+
 @dataclass(frozen=True)
 class Zone:
     """A circle around the robot's centre and the beams that met something inside."""
@@ -352,7 +396,7 @@ class Status:
     pose: Pose
 
 
-Payload = Union[Announce, Telegram, Scan, Marks, Zones, Foreground, Background, Status, Lines, Motion, Early]
+Payload = Union[Announce, Telegram, Scan, Marks, Zones, Foreground, Background, Status, Lines, Motion, Early, Tracks, Event]
 
 
 @dataclass(frozen=True)
@@ -728,4 +772,39 @@ def _early(payload: bytes) -> Early:
     return Early(VERDICTS[verdict], bool(flags & 1), *numbers)
 
 
-_UNPACK = (_announce, None, _scan, _marks, _zones, _foreground, _background, _status, _lines, _motion, _early)
+def _tracks(payload: bytes) -> Tracks:
+    count, sensors = struct.unpack_from("<BB6x", payload)
+    _limit(count <= 64 and sensors <= 32)
+
+    def track(*fields) -> Track:
+        id, *numbers, score, age_ms, seen_by, room, state = fields
+        _limit(all(math.isfinite(number) for number in (*numbers, score)) and not seen_by >> sensors)
+        state = TRACK_STATES[state] if state < len(TRACK_STATES) else "tentative"
+        return Track(id, *numbers[:4], tuple(numbers[4:]), score, age_ms, seen_by, _text(room), state)
+
+    tracks = _items(track, "<Q7ffII24sB7x", payload, 8, count)
+    return Tracks(_items(_text, "<56s", payload, 8 + 80 * count, sensors), tracks)
+
+
+def _events(payload: bytes) -> Event:
+    id, kind, *texts = struct.unpack_from("<QB7x24s24s24s24s", payload)
+    _limit(kind < len(EVENTS))
+    room, *door = map(_text, texts)
+    return Event(EVENTS[kind], id, room, *(door if EVENTS[kind] == "door" else ("", "", "")))
+
+
+_UNPACK = (
+    _announce,
+    None,
+    _scan,
+    _marks,
+    _zones,
+    _foreground,
+    _background,
+    _status,
+    _lines,
+    _motion,
+    _early,
+    _tracks,
+    _events,
+)

@@ -15,10 +15,12 @@ scanhub.prefs.crc = Pref.bool("Check checksums", true, "Bytes by bytes in Lua: o
 scanhub.prefs.key_file = Pref.string("Key file", "", "Of `scanhub key new`: 32 bytes, or 64 hex digits")
 
 local TOPICS = {
-    [0] = "announce", "telegram", "scan", "marks", "zones", "foreground", "background", "status", "lines", "motion", "early"
+    [0] = "announce", "telegram", "scan", "marks", "zones", "foreground", "background", "status", "lines", "motion", "early", "tracks", "events"
 }
 local VERDICTS = { [0] = "clear", "slow", "stop", "unknown" }
 local STATES = { [0] = "absent", "probing", "switching", "starting", "streaming", "silent", "paused" }
+local TRACK_STATES = { [0] = "tentative", "confirmed", "hidden", "between_rooms" }
+local EVENTS = { [0] = "appeared", "left", "door" }
 local FAMILIES = { [0] = "lms", "ld", "rplidar" }
 -- Of families that send packets: how many bytes one has.
 local PACKET = { 47 }
@@ -159,6 +161,26 @@ field("early.beam", "uint16", "Nearest beam so far")
 field("early.distance_mm", "uint32", "Its distance, mm")
 field("early.bytes_seen", "uint16", "Bytes that had arrived")
 field("early.beams_seen", "uint16", "Beams that had arrived")
+
+field("tracks.names", "string", "Sensor")
+field("tracks.id", "uint64", "Person")
+field("tracks.x_m", "float", "x, m")
+field("tracks.y_m", "float", "y, m")
+field("tracks.vx_m_s", "float", "Speed along x, m/s")
+field("tracks.vy_m_s", "float", "Speed along y, m/s")
+field("tracks.covariance", "float", "Covariance, m2")
+field("tracks.score", "float", "Score")
+field("tracks.age_ms", "uint32", "Age, ms")
+field("tracks.sensors", "uint32", "Sensors that see him")
+field("tracks.room", "string", "Room")
+field("tracks.state", "uint8", "State", base.DEC, TRACK_STATES)
+
+field("events.id", "uint64", "Person")
+field("events.kind", "uint8", "Kind", base.DEC, EVENTS)
+field("events.room", "string", "Room")
+field("events.door", "string", "Door")
+field("events.from", "string", "From")
+field("events.to", "string", "To")
 
 field("zones.verdict", "uint8", "Verdict", base.DEC, VERDICTS)
 field("zones.count", "uint8", "Zones")
@@ -670,6 +692,48 @@ unpack_payload[10] = function(payload, tree)
     add_fields(tree, payload, 0, "early.verdict", 1, "early.withdrawn", 1, "early.beam", 2, "early.distance_mm", 4,
         "early.bytes_seen", 2, "early.beams_seen", 2)
     return VERDICTS[verdict] .. (payload(1, 1):uint() % 2 == 1 and " withdrawn" or "")
+end
+
+unpack_payload[11] = function(payload, tree)
+    local len = payload:len()
+    if len < 8 then return nil end
+    local count, sensors = payload(0, 1):uint(), payload(1, 1):uint()
+    local behind = 8 + 80 * count
+    if count > 64 or sensors > 32 or len < behind + 56 * sensors then return nil end
+    for at = 8, behind - 1, 80 do
+        for n = 8, 36, 4 do
+            if not is_finite(payload(at + n, 4):le_float()) then return nil end
+        end
+        if payload(at + 44, 4):le_uint() >= 2 ^ sensors then return nil end
+    end
+    for at = 8, behind - 1, 80 do
+        local item = tree:add(payload(at, 80), "Person")
+        add_fields(item, payload, at, "tracks.id", 8, "tracks.x_m", 4, "tracks.y_m", 4, "tracks.vx_m_s", 4,
+            "tracks.vy_m_s", 4)
+        for n = 24, 32, 4 do
+            item:add_le(f["tracks.covariance"], payload(at + n, 4))
+        end
+        add_fields(item, payload, at + 36, "tracks.score", 4, "tracks.age_ms", 4, "tracks.sensors", 4)
+        item:add(f["tracks.room"], payload(at + 48, 24), payload(at + 48, 24):stringz(ENC_UTF_8))
+        item:add(f["tracks.state"], payload(at + 72, 1))
+    end
+    for at = behind, behind + 56 * sensors - 1, 56 do
+        tree:add(f["tracks.names"], payload(at, 56), payload(at, 56):stringz(ENC_UTF_8))
+    end
+    return count .. " people"
+end
+
+unpack_payload[12] = function(payload, tree)
+    if payload:len() < 112 or payload(8, 1):uint() > 2 then return nil end
+    local kind = payload(8, 1):uint()
+    add_fields(tree, payload, 0, "events.id", 8, "events.kind", 1)
+    for i, name in ipairs({ "room", "door", "from", "to" }) do
+        if i == 1 or kind == 2 then
+            local range = payload(24 * i - 8, 24)
+            tree:add(f["events." .. name], range, range:stringz(ENC_UTF_8))
+        end
+    end
+    return EVENTS[kind]
 end
 
 -- Datagram ---------------------------------------------------------------------------------------------------------

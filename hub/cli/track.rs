@@ -14,9 +14,9 @@ pub(crate) struct Track {
     /// The site file: sensors, rooms and doors
     #[arg(long, value_name = "FILE")]
     site: PathBuf,
-    /// Name of the tracker in lines of JSON
-    #[arg(long = "as", default_value = "people", value_name = "NAME")]
-    name: String,
+    /// Publish topics NAME/tracks and NAME/events, for other programs. No sensor of the hub is called so
+    #[arg(long = "as", value_name = "NAME", value_parser = tracker)]
+    name: Option<String>,
     /// Print only how many went through this door, each time that somebody does. Can be repeated
     #[arg(long, value_name = "DOOR")]
     count: Vec<String>,
@@ -29,6 +29,11 @@ pub(crate) struct Track {
     /// Exit with 3 after this time without a scan
     #[arg(long, value_name = "DURATION", value_parser = duration::parse)]
     timeout: Option<Duration>,
+}
+
+/// A name that topics of a tracker can have.
+fn tracker(name: &str) -> Result<String, String> {
+    schema::check_sensor(name).map(|()| name.to_owned()).map_err(|failure| format!("{failure}"))
 }
 
 impl Track {

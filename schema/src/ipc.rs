@@ -100,7 +100,7 @@ pub fn places<P: Payload + ?Sized>(topic: &TopicService<P>) -> usize {
 ///
 /// [`Kind::Failed`] with owner, mode and remedy if the directory is another user's.
 pub fn sensors(domain: &Domain) -> Result<Vec<String>, Failure> {
-    let mut sensors: Vec<String> = topics(domain)?.into_iter().map(|(sensor, _)| sensor).collect();
+    let mut sensors: Vec<String> = published(domain)?.into_iter().map(|(sensor, _)| sensor).collect();
     sensors.dedup();
     Ok(sensors)
 }
@@ -111,12 +111,16 @@ pub fn sensors(domain: &Domain) -> Result<Vec<String>, Failure> {
 ///
 /// As [`sensors`].
 pub fn sensors_with_zones(domain: &Domain) -> Result<Vec<String>, Failure> {
-    let with_zones = topics(domain)?.into_iter().filter(|(_, topic)| *topic == Topic::Zones);
+    let with_zones = published(domain)?.into_iter().filter(|(_, topic)| *topic == Topic::Zones);
     Ok(with_zones.map(|(sensor, _)| sensor).collect())
 }
 
-/// All topics with their sensors, sorted by these.
-fn topics(domain: &Domain) -> Result<Vec<(String, Topic)>, Failure> {
+/// Returns all topics that are there in `domain` with their sensors, sorted by these.
+///
+/// # Errors
+///
+/// As [`sensors`].
+pub fn published(domain: &Domain) -> Result<Vec<(String, Topic)>, Failure> {
     let mut topics = Vec::new();
     let Some(config) = config(domain.root())? else { return Ok(topics) };
     let listed = Service::list(&config, |service| {

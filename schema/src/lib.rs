@@ -8,6 +8,7 @@ pub mod csv;
 pub mod datagram;
 mod domain;
 mod early;
+mod event;
 mod failure;
 #[cfg(feature = "mcap")]
 pub mod file;
@@ -24,6 +25,7 @@ mod status;
 mod telegram;
 mod text;
 mod topic;
+mod tracks;
 mod zones;
 
 #[cfg(feature = "ipc")]
@@ -51,6 +53,7 @@ pub use background::{Background, BackgroundHead, BackgroundWord};
 pub use control::{Request, Response, Shown, Verb};
 pub use domain::{DEFAULT_DOMAIN, Domain, Environment};
 pub use early::Early;
+pub use event::{Event, EventKind};
 pub use failure::{Failure, Kind};
 pub use foreground::{Foreground, ForegroundArrays, ForegroundHead, ForegroundWord, SEGMENTS, Segment};
 pub use header::{Flags, Header, Quality, Reasons};
@@ -69,6 +72,7 @@ pub use topic::{
     CONTROL, CONTROL_REQUEST, CONTROL_RESPONSE, Pace, ROBOT, Ring, Row, Topic, WAKE, Wake, check_followed,
     check_sensor, is_remote, of_service,
 };
+pub use tracks::{TRACK_SENSORS, TRACKS, Track, TrackSensor, TrackState, Tracks};
 pub use zones::{Verdict, ZONES, Zone, Zones};
 
 #[cfg(feature = "ipc")]

@@ -8,6 +8,28 @@ use crate::{Failure, Kind};
 pub use table::{Pace, Ring, Row, Topic};
 
 impl Topic {
+    /// What a hub publishes of each link.
+    pub const OF_LINKS: [Topic; 10] = [
+        Topic::Telegram,
+        Topic::Scan,
+        Topic::Marks,
+        Topic::Zones,
+        Topic::Foreground,
+        Topic::Background,
+        Topic::Status,
+        Topic::Lines,
+        Topic::Motion,
+        Topic::Early,
+    ];
+
+    /// What a tracker of people publishes.
+    pub const OF_TRACKERS: [Topic; 2] = [Topic::Tracks, Topic::Events];
+
+    /// Returns whether a tracker publishes it, and no hub.
+    pub fn is_of_trackers(self) -> bool {
+        Topic::OF_TRACKERS.contains(&self)
+    }
+
     /// Returns what the table says of the topic.
     pub const fn row(self) -> &'static Row {
         &table::ROWS[self as usize]
@@ -161,6 +183,7 @@ mod tests {
             assert_eq!(Topic::parse(topic.name()), Some(topic));
             assert_eq!(Topic::of_number(topic.number()), Some(topic));
         }
+        assert!(Topic::OF_LINKS.into_iter().chain(Topic::OF_TRACKERS).eq(Topic::ALL));
         assert_eq!(of_service(&Wake::service("rear")), Some(("rear", None)));
         assert_eq!(of_service("scanhub/v1/rear/scan"), None);
         for control in [CONTROL, CONTROL_REQUEST, CONTROL_RESPONSE] {

@@ -5,8 +5,8 @@ use std::fmt::Write as _;
 use std::mem::{offset_of, size_of};
 
 use schema::{
-    BackgroundHead, Corner, Early, ForegroundHead, Header, Line, Lines, Mark, Marks, Motion, Pose, ScanHead,
-    Segment, Status, Zone, Zones,
+    BackgroundHead, Corner, Early, Event, ForegroundHead, Header, Line, Lines, Mark, Marks, Motion, Pose,
+    ScanHead, Segment, Status, Track, TrackSensor, Tracks, Zone, Zones,
 };
 
 /// The lines of one struct.
@@ -48,6 +48,10 @@ fn the_text_says_what_the_structs_are() {
     layout!(text, Lines: count corners flags reserved readings on_lines noise_m line_array corner_array);
     layout!(text, Motion: x_m y_m yaw_rad dx_m dy_m dyaw_rad covariance overlap method flags breaks);
     layout!(text, Early: verdict flags beam distance_mm bytes_seen beams_seen);
+    layout!(text, Track: id x_m y_m vx_m_s vy_m_s covariance score age_ms sensors room_text state reserved);
+    layout!(text, TrackSensor: name_text);
+    layout!(text, Tracks: count sensors reserved track_array sensor_array);
+    layout!(text, Event: id kind reserved room_text door_text from_text to_text);
     let golden = include_str!("../../tests/vectors/v2/layouts.txt");
     assert_eq!(text, golden);
 }

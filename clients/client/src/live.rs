@@ -1,6 +1,6 @@
 //! Which sensors and topics exist at this moment, for callers that want no failure and do not wait.
 
-use schema::{Domain, Topic, ipc, publisher};
+use schema::{Domain, Failure, ipc, publisher};
 
 /// Returns the sensors of the hub at the first live one of `places`, for who wants no failure; never waits.
 ///
@@ -14,12 +14,17 @@ use schema::{Domain, Topic, ipc, publisher};
 /// # Ok::<(), scanhub_client::Failure>(())
 /// ```
 pub fn live_sensors(places: &[Domain]) -> Vec<String> {
-    let lives = |domain: &&Domain| matches!(publisher(domain.root()), Ok(Some(_)));
-    places.iter().find(lives).and_then(|domain| ipc::sensors(domain).ok()).unwrap_or_default()
+    live(places, ipc::sensors)
 }
 
 /// Returns the topics of each of [`live_sensors`] as `SENSOR/TOPIC`.
 pub fn live_topics(places: &[Domain]) -> Vec<String> {
-    let of = |sensor: String| Topic::ALL.map(|topic| format!("{sensor}/{}", topic.name()));
-    live_sensors(places).into_iter().flat_map(of).collect()
+    let mut topics = live(places, ipc::published);
+    topics.sort();
+    topics.into_iter().map(|(sensor, topic)| format!("{sensor}/{}", topic.name())).collect()
+}
+
+fn live<T>(places: &[Domain], of: impl Fn(&Domain) -> Result<Vec<T>, Failure>) -> Vec<T> {
+    let lives = |domain: &&Domain| matches!(publisher(domain.root()), Ok(Some(_)));
+    places.iter().find(lives).and_then(|domain| of(domain).ok()).unwrap_or_default()
 }

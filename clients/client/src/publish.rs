@@ -11,7 +11,7 @@ use schema::limits::TopicLimits;
 use schema::shortage::{allocate, check_descriptors, check_memory, longest_segment, sensor_bytes};
 use schema::{
     DEFAULT_DOMAIN, Domain, Environment, Failure, Header, Kind, ListenLock, Ring, Topic, Wake,
-    check_followed, is_remote, publisher,
+    check_followed, check_sensor, is_remote, publisher,
 };
 
 use crate::clock;
@@ -67,7 +67,7 @@ struct Membership {
     sensors: RefCell<Vec<Weak<Awakener>>>,
     node: Node,
     // Behind the node, for whoever takes it next finds no other one.
-    _lock: ListenLock,
+    lock: Option<ListenLock>,
 }
 
 /// Whether there is memory for `topics` of one sensor.
@@ -94,12 +94,27 @@ impl PublishSession {
         limits.check()?;
         let lock = ListenLock::acquire(domain.root())?;
         check_topics(topics, &limits)?;
-        let node = ipc::hub_node(domain)?;
+        Ok(PublishSession::with(domain, limits, ipc::hub_node(domain)?, Some(lock)))
+    }
+
+    /// Publishes beside a hub or a listener that is there, of which it takes no place: for what is made of the topics of a
+    /// domain, such as tracks of people. Its names have no dot, and are none of a hub's sensors. Else as [`open`](Self::open).
+    ///
+    /// # Errors
+    ///
+    /// [`Kind::NoHub`](schema::Kind) if nobody is there; else as [`open`](Self::open), but for
+    /// [`Kind::DomainHeld`](schema::Kind).
+    pub fn beside(domain: &Domain, topics: &[Topic], limits: TopicLimits) -> Result<PublishSession, Failure> {
+        limits.check()?;
+        check_topics(topics, &limits)?;
+        Ok(PublishSession::with(domain, limits, ipc::client_node(domain)?, None))
+    }
+
+    fn with(domain: &Domain, limits: TopicLimits, node: Node, lock: Option<ListenLock>) -> PublishSession {
         node.try_cleanup_dead_nodes();
         let boot = RandomState::new().hash_one(std::process::id());
-        let sensors = RefCell::default();
-        let domain = domain.clone();
-        Ok(PublishSession(Rc::new(Membership { domain, limits, boot, sensors, node, _lock: lock })))
+        let (domain, sensors) = (domain.clone(), RefCell::default());
+        PublishSession(Rc::new(Membership { domain, limits, boot, sensors, node, lock }))
     }
 
     /// Checks that there is memory for `topics` of one sensor, and descriptors for their first consumers.
@@ -113,7 +128,8 @@ impl PublishSession {
     }
 
     /// Makes what wakes the consumers of the topics of `name`, which is `OWNER.NAME`: a hub's sensors have no dot, so that
-    /// nobody publishes in the place of another. A name that is there already is the same one.
+    /// nobody publishes in the place of another. Who publishes [`beside`](Self::beside) a hub has a name like its sensors, which
+    /// none of them has. A name that is there already is the same one.
     ///
     /// # Errors
     ///
@@ -121,7 +137,9 @@ impl PublishSession {
     /// descriptors are short; [`Kind::Failed`](schema::Kind) if the place is taken by another user.
     pub fn sensor(&self, name: &str) -> Result<SensorPublisher, Failure> {
         check_followed(name)?;
-        if !is_remote(name) {
+        if self.0.lock.is_none() {
+            self.check_beside(name)?;
+        } else if !is_remote(name) {
             let what = format!("{name:?} is no name to publish under: it may be a sensor of the hub");
             return Err(Failure::new(Kind::Configuration, what, "OWNER.NAME, for example tracker.near"));
         }
@@ -136,6 +154,16 @@ impl PublishSession {
         let sensor = Rc::new(Awakener { name, waker, due, membership: self.0.clone() });
         sensors.push(Rc::downgrade(&sensor));
         Ok(SensorPublisher(sensor))
+    }
+
+    fn check_beside(&self, name: &str) -> Result<(), Failure> {
+        check_sensor(name)?;
+        let is_link = |(sensor, topic): &(String, Topic)| sensor == name && !topic.is_of_trackers();
+        if ipc::published(&self.0.domain)?.iter().any(is_link) {
+            let what = format!("{name:?} is no name to publish under: it is a sensor of the hub");
+            return Err(Failure::new(Kind::Configuration, what, "any other name, for example house"));
+        }
+        Ok(())
     }
 
     /// Removes what consumers that were killed left in the domain. Call it every few seconds.

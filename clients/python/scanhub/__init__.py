@@ -20,6 +20,7 @@ from .control import background, control
 from .errors import Denied, Failure, Held, Impossible, Mismatch, NoHub, NoTopic, Refused, Short, Silent
 from .model import Background, Shown
 from .names import TopicName, candidates, check_sensor, parse
+from .people import Event, Track, Tracks
 from .presence import find
 from .processed import Corner, Early, Foreground, Line, Lines, Mark, Marks, Motion, Segment, Zone, Zones
 from .sample import Sample
@@ -35,6 +36,7 @@ __all__ = [
     "Corner",
     "Denied",
     "Early",
+    "Event",
     "Failure",
     "Foreground",
     "Held",
@@ -61,6 +63,8 @@ __all__ = [
     "Subscription",
     "Telegram",
     "TopicName",
+    "Track",
+    "Tracks",
     "Zone",
     "Zones",
     "background",

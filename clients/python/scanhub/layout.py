@@ -146,6 +146,49 @@ class Early(_Struct):
     ]
 
 
+class Track(_Struct):
+    _fields_ = [
+        ("id", c_uint64),
+        ("x_m", c_float),
+        ("y_m", c_float),
+        ("vx_m_s", c_float),
+        ("vy_m_s", c_float),
+        ("covariance", c_float * 3),
+        ("score", c_float),
+        ("age_ms", c_uint32),
+        ("sensors", c_uint32),
+        ("room_text", c_uint8 * 24),
+        ("state", c_uint8),
+        ("reserved", c_uint8 * 7),
+    ]
+
+
+class TrackSensor(_Struct):
+    _fields_ = [("name_text", c_uint8 * 56)]
+
+
+class Tracks(_Struct):
+    _fields_ = [
+        ("count", c_uint8),
+        ("sensors", c_uint8),
+        ("reserved", c_uint8 * 6),
+        ("track_array", Track * 64),
+        ("sensor_array", TrackSensor * 32),
+    ]
+
+
+class Event(_Struct):
+    _fields_ = [
+        ("id", c_uint64),
+        ("kind", c_uint8),
+        ("reserved", c_uint8 * 7),
+        ("room_text", c_uint8 * 24),
+        ("door_text", c_uint8 * 24),
+        ("from_text", c_uint8 * 24),
+        ("to_text", c_uint8 * 24),
+    ]
+
+
 class Zone(_Struct):
     _fields_ = [("radius_mm", c_uint16), ("beams", c_uint16), ("violated", c_uint8), ("reserved", c_uint8 * 3)]
 

@@ -11,6 +11,7 @@ from .errors import NoHub, Silent
 from .freshness import REMOTE
 from .model import Background
 from .names import Domain, TopicName, service
+from .people import Event, Tracks
 from .presence import Presence
 from .processed import Early, Foreground, Lines, Marks, Motion, Zones, nothing
 from .sample import Sample
@@ -19,7 +20,7 @@ from .status import Status
 
 KINDS: dict[str, type[Sample]] = {
     kind.topic: kind
-    for kind in (Telegram, Scan, Marks, Zones, Foreground, Background, Status, Lines, Motion, Early)
+    for kind in (Telegram, Scan, Marks, Zones, Foreground, Background, Status, Lines, Motion, Early, Tracks, Event)
 }
 """What each topic carries."""
 

@@ -97,6 +97,23 @@ def motion(sample: scanhub.Motion) -> dict:
     return said
 
 
+def tracks(sample: scanhub.Tracks) -> dict:
+    def rounded(value: float, digits: int) -> float:
+        return math.copysign(math.floor(abs(value) * 10**digits + 0.5), value) / 10**digits
+
+    def track(of: scanhub.Track) -> dict:
+        said = of._asdict()
+        said.update({name: rounded(said[name], 3) for name in ("x_m", "y_m", "vx_m_s", "vy_m_s", "score")})
+        return {**said, "cov": [rounded(value, 6) for value in of.cov], "sensors": list(of.sensors)}
+
+    return {"tracks": [track(of) for of in sample.tracks]}
+
+
+def events(sample: scanhub.Event) -> dict:
+    said = {"class": "event", "kind": sample.kind, "id": sample.id, "room": sample.room}
+    return said if sample.door is None else {**said, "from": sample.from_room, "to": sample.to_room, "door": sample.door}
+
+
 def zones(sample: scanhub.Zones) -> dict:
     said = {name: getattr(sample, name) for name in ("verdict", "nearest_mm", "nearest_beam", "invalid_beams")}
     said["zones"] = [zone._asdict() for zone in sample.zones]

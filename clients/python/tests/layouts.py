@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from scanhub import layout, model, processed, scan, status
+from scanhub import layout, model, people, processed, scan, status
 
 GOLDEN = Path(sys.argv[1])
 
@@ -42,7 +42,7 @@ def offsets_are_golden() -> None:
         else:
             assert getattr(its, words[0]).offset == int(words[1]), (its, line)
             said[-1][1].append(words[0])
-    assert len(said) == 16
+    assert len(said) == 20
     for name, fields in said:
         its = getattr(layout, name.split(".")[1])
         assert [field[0] for field in its._fields_] == fields, name
@@ -95,6 +95,24 @@ def payloads_say_what_they_are() -> None:
     of = processed.Early("front", Chunk("early"))
     assert (of.verdict, of.withdrawn, of.beam, of.distance_mm) == ("stop", True, 0x102, 0x3040506)
     assert (of.bytes_seen, of.beams_seen) == (0x708, 0x90A)
+
+    of = people.Tracks("house", Chunk("tracks"))
+    assert (len(of.tracks), len(of.sensors), of.sensors[31], of.sensors[0]) == (64, 32, "kitchen.rear", "")
+    assert of.tracks[63] == (
+        0x1020304_05060708,
+        "between_rooms",
+        *(1, -1, 2, -2),
+        (0.5, -0.5, 0.25),
+        "hall",
+        ("", "kitchen.rear"),
+        0x0A0B0C0D / 1000,
+        4,
+    )
+    assert (of.tracks[0].room, of.tracks[0].state) == (None, "tentative")
+
+    of = people.Event("house", Chunk("event"))
+    assert (of.kind, of.id, of.room, of.door) == ("door", 0x1020304_05060708, "kitchen", "left")
+    assert (of.from_room, of.to_room) == ("hall", "kitchen")
 
     of = processed.Zones("front", Chunk("zones"))
     assert (of.verdict, of.nearest_beam, of.nearest_mm, of.invalid_beams) == ("slow", 0x102, 0x30405, 0x106)

@@ -18,7 +18,7 @@ pub mod site;
 mod tracker;
 
 pub use order::{Counts, People};
-pub use picture::{Event, Kind, Picture, State, Track};
+pub use picture::{Event, Kind, Picture, Track};
 pub use sight::LEGS;
 pub use site::Site;
 pub use tracker::{PERSONS, PICTURE_NS};

@@ -1,8 +1,9 @@
 //! One person as the tracker follows him: filter, and what speaks for him and against him. Refuses to know other persons.
 
+use schema::TrackState;
+
 use crate::filter::{Filter, Side};
 use crate::geometry::Point;
-use crate::picture::State;
 use crate::sight::Leg;
 
 /// One person.
@@ -117,12 +118,12 @@ impl Person {
         self.life == Life::Known
     }
 
-    pub(crate) fn state(&self, now_ns: u64) -> State {
+    pub(crate) fn state(&self, now_ns: u64) -> TrackState {
         match self.life {
-            Life::Tentative => State::Tentative,
-            Life::Away { .. } => State::BetweenRooms,
-            Life::Known if now_ns.saturating_sub(self.seen_ns) > LATELY_NS => State::Hidden,
-            Life::Known => State::Confirmed,
+            Life::Tentative => TrackState::Tentative,
+            Life::Away { .. } => TrackState::BetweenRooms,
+            Life::Known if now_ns.saturating_sub(self.seen_ns) > LATELY_NS => TrackState::Hidden,
+            Life::Known => TrackState::Confirmed,
         }
     }
 

@@ -1,31 +1,10 @@
-//! What the tracker says: tracks at an instant, and what happened to them. Refuses to know how they are found.
+//! What the tracker says: tracks at an instant, and what happened to them; and as it is published. Refuses to know how they
+//! are found.
+
+use schema::{EventKind, TrackState, Tracks};
 
 use crate::geometry::Point;
-
-/// How well a person is known.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum State {
-    /// Perhaps a person.
-    Tentative,
-    /// A person who is seen.
-    Confirmed,
-    /// A person who is not seen, where nobody could be seen either.
-    Hidden,
-    /// A person on a way that no sensor sees.
-    BetweenRooms,
-}
-
-impl State {
-    /// Returns the name in JSON.
-    pub fn name(self) -> &'static str {
-        match self {
-            State::Tentative => "tentative",
-            State::Confirmed => "confirmed",
-            State::Hidden => "hidden",
-            State::BetweenRooms => "between_rooms",
-        }
-    }
-}
+use crate::site::Site;
 
 /// A person at an instant.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -33,7 +12,7 @@ pub struct Track {
     /// Never used again.
     pub id: u64,
     /// How well he is known.
-    pub state: State,
+    pub state: TrackState,
     /// The middle between the legs, metres in the map.
     pub place: Point,
     /// Metres per second.
@@ -91,3 +70,52 @@ pub struct Picture {
     /// In their order.
     pub events: Vec<Event>,
 }
+
+impl Picture {
+    /// Returns the picture as it is published, with the names that `site` gives.
+    pub fn payload(&self, site: &Site) -> Tracks {
+        let mut tracks = Tracks::default();
+        site.sensors.iter().for_each(|sensor| tracks.push_sensor(&sensor.name));
+        self.tracks.iter().for_each(|track| tracks.push(track.payload(site)));
+        tracks
+    }
+}
+
+impl Track {
+    fn payload(&self, site: &Site) -> schema::Track {
+        let mut track = schema::Track {
+            id: self.id,
+            x_m: self.place[0] as f32,
+            y_m: self.place[1] as f32,
+            vx_m_s: self.velocity[0] as f32,
+            vy_m_s: self.velocity[1] as f32,
+            covariance: self.covariance.map(|value| value as f32),
+            score: self.score as f32,
+            age_ms: (1000.0 * self.age_s) as u32,
+            sensors: self.sensors,
+            state: self.state as u8,
+            ..schema::Track::default()
+        };
+        track.set_room(self.room.and_then(|room| site.rooms.get(room)).map_or("", |room| &room.name));
+        track
+    }
+}
+
+impl Event {
+    /// Returns the event as it is published, with the names that `site` gives.
+    pub fn payload(&self, site: &Site) -> schema::Event {
+        let room = self.room.and_then(|room| site.rooms.get(room)).map(|room| room.name.as_str());
+        let of = |kind| schema::Event::new(kind, self.id, room);
+        match self.kind {
+            Kind::Appeared => of(EventKind::Appeared),
+            Kind::Left => of(EventKind::Left),
+            Kind::Door { door, from, to } => {
+                let name = site.doors.get(door).map_or("", |door| &door.name);
+                of(EventKind::Door).through(name, site.room_name(from), site.room_name(to))
+            }
+        }
+    }
+}
+
+const _: () =
+    assert!(crate::tracker::PERSONS == schema::TRACKS && crate::site::SENSORS == schema::TRACK_SENSORS);

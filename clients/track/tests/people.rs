@@ -13,8 +13,9 @@ use std::collections::BTreeSet;
 use house::{BEAMS, Eye};
 use preprocess::background::{Model, Settings};
 use preprocess::segments::Segmenter;
+use schema::TrackState;
 use schema::{Foreground, Pose, Scan};
-use track::{People, Picture, Site, State};
+use track::{People, Picture, Site};
 use walkers::Crowd;
 
 const DELAY_NS: u64 = 80_000_000;
@@ -118,7 +119,8 @@ fn an_identity_is_never_used_again_and_nobody_is_invented_when_a_sensor_dies() {
         let now: BTreeSet<u64> = picture.tracks.iter().map(|track| track.id).collect();
         gone.extend(before.difference(&now).copied());
         assert!(now.is_disjoint(&gone), "{now:?} after {gone:?}");
-        let is_here = |track: &&track::Track| matches!(track.state, State::Confirmed | State::Hidden);
+        let is_here =
+            |track: &&track::Track| matches!(track.state, TrackState::Confirmed | TrackState::Hidden);
         let known = picture.tracks.iter().filter(is_here).count();
         assert!(known <= 4, "three people, and one who is not yet joined: {picture:?}");
         before = now;

@@ -3,7 +3,7 @@
 
 use std::time::{Duration, Instant};
 
-use schema::{Domain, Failure, ipc};
+use schema::{Domain, Failure, Topic, ipc};
 
 use crate::background_task::BackgroundTask;
 
@@ -16,12 +16,14 @@ pub(crate) struct Discovery {
     call: Option<(BackgroundTask<Answer>, Duration)>,
 }
 
-type Answer = Result<Vec<String>, Failure>;
+type Answer = Result<Vec<(String, Topic)>, Failure>;
 
 /// What was answered.
 pub(crate) struct Called {
     /// The sensors that have topics, sorted.
     pub(crate) sensors: Vec<String>,
+    /// Those of them that are trackers.
+    trackers: Vec<String>,
     /// So long after the hub came it was asked.
     pub(crate) age: Duration,
 }
@@ -31,6 +33,23 @@ const CALLS: [Duration; 4] =
     [Duration::ZERO, Duration::from_millis(200), Duration::from_secs(1), Duration::from_secs(5)];
 /// So often an answer is looked for.
 const LOOK_EVERY: Duration = Duration::from_millis(5);
+
+impl Called {
+    fn of(published: &[(String, Topic)], age: Duration) -> Called {
+        let names = |is_wanted: &dyn Fn(Topic) -> bool| {
+            let names = published.iter().filter(|(_, topic)| is_wanted(*topic)).map(|(name, _)| name.clone());
+            let mut names: Vec<String> = names.collect();
+            names.dedup();
+            names
+        };
+        Called { sensors: names(&|_| true), trackers: names(&Topic::is_of_trackers), age }
+    }
+
+    /// Whether `sensor` has `topic`, now or when all its topics are made: a link has those of links, a tracker its own.
+    pub(crate) fn may_have(&self, sensor: &str, topic: Topic) -> bool {
+        self.trackers.iter().any(|tracker| tracker == sensor) == topic.is_of_trackers()
+    }
+}
 
 impl Discovery {
     /// A hub came; answers about the one before are of no use.
@@ -53,8 +72,8 @@ impl Discovery {
     /// [`Kind::Failed`](schema::Kind) if the domain cannot be read.
     pub(crate) fn call(&mut self, domain: &Domain, now: Instant) -> Result<Option<Called>, Failure> {
         if let Some((task, age)) = &self.call {
-            let Some(sensors) = task.result() else { return Ok(None) };
-            let called = Called { sensors: sensors?, age: *age };
+            let Some(published) = task.result() else { return Ok(None) };
+            let called = Called::of(&published?, *age);
             self.call = None;
             return Ok(Some(called));
         }
@@ -62,7 +81,7 @@ impl Discovery {
         let age = now - *came;
         if CALLS.get(*calls).is_some_and(|after| age >= *after) {
             let domain = domain.clone();
-            self.call = BackgroundTask::begin(move || ipc::sensors(&domain)).map(|task| (task, age));
+            self.call = BackgroundTask::begin(move || ipc::published(&domain)).map(|task| (task, age));
             *calls += usize::from(self.call.is_some());
         }
         Ok(None)
@@ -77,6 +96,16 @@ impl Discovery {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_link_has_the_topics_of_links_and_a_tracker_its_own() {
+        let published = [("front", Topic::Scan), ("front", Topic::Status), ("house", Topic::Tracks)];
+        let published = published.map(|(sensor, topic)| (sensor.to_owned(), topic));
+        let called = Called::of(&published, Duration::ZERO);
+        assert_eq!(called.sensors, ["front", "house"]);
+        assert!(called.may_have("front", Topic::Marks) && !called.may_have("front", Topic::Events));
+        assert!(called.may_have("house", Topic::Events) && !called.may_have("house", Topic::Scan));
+    }
 
     #[test]
     fn nobody_looks_for_an_answer_about_a_hub_that_is_gone() {

@@ -55,8 +55,11 @@ pub struct Forwarder {
 impl Forwarder {
     /// Follows what is selected of the hub in the first live one of `places`.
     pub fn new(selection: Selection, places: &[Domain], carrier: &mut impl Carrier) -> Forwarder {
-        let named = selection.named();
-        let sensors = named.iter().map(|name| Sensor::new(name, &selection, carrier)).collect();
+        let named = selection.named().into_iter().map(|name| {
+            let is_tracker = selection.names_tracker(name);
+            Sensor::new(name, |topic| topic.is_of_trackers() == is_tracker, &selection, carrier)
+        });
+        let sensors = named.collect();
         Forwarder {
             sensors,
             selection,
@@ -140,7 +143,8 @@ impl Forwarder {
                 // One that came from another machine has another name.
                 let is_known = self.sensors.iter().any(|sensor| sensor.name == *name);
                 if !is_known && check_sensor(name).is_ok() {
-                    self.sensors.push(Sensor::new(name, &self.selection, carrier));
+                    let may_have = |topic| called.may_have(name, topic);
+                    self.sensors.push(Sensor::new(name, may_have, &self.selection, carrier));
                 }
             }
         }

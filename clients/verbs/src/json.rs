@@ -1,5 +1,6 @@
 //! The classes of `--json`: which keys, in which order. A contract with scripts and other languages: add, never change.
 
+mod people;
 mod processed;
 
 use schema::{
@@ -14,6 +15,7 @@ use crate::names::TopicName;
 use crate::output::{End, Output};
 use crate::receive_stats::ReceiveStats;
 
+pub(crate) use people::{event, tracks};
 pub(crate) use processed::{early, foreground, lines, marks, motion, robot, zones};
 // A background model as a line is what a file of it is.
 pub(crate) use schema::as_json as background;

@@ -73,6 +73,14 @@ fn near<'a>(word: &str, known: impl Iterator<Item = &'a str>) -> Option<&'a str>
 /// From this similarity on, a word may be a misspelling of another: 1 is equal, 0 has nothing in common.
 const NEAR: f64 = 0.8;
 
+/// The sensor of `name` has other topics than that, and never will have it.
+pub(crate) fn no_such_topic(name: &TopicName, topics: &[Topic]) -> Failure {
+    let names = topics.iter().map(|topic| format!("{}/{}", name.sensor, topic.name()));
+    let hint = format!("there are {}", names.collect::<Vec<_>>().join(", "));
+    let who = if name.topic.is_of_trackers() { "is no tracker" } else { "is a tracker" };
+    Failure::new(Kind::NoTopic, format!("there is no topic {name}: {} {who}", name.sensor), hint)
+}
+
 /// The hub has no `sensor`, but `sensors`.
 pub(crate) fn no_sensor(sensor: &str, sensors: &[String]) -> Failure {
     let hint = match sensors {
@@ -115,5 +123,9 @@ mod tests {
         let hint = |sensor| no_sensor(sensor, &["front".to_owned(), "rear".to_owned()]).hint;
         assert_eq!(hint("frnt"), "did you mean front? there are front, rear");
         assert_eq!(hint("side"), "there are front, rear");
+        let name = TopicName { sensor: "house".to_owned(), topic: Topic::Scan };
+        let failure = no_such_topic(&name, &Topic::OF_TRACKERS);
+        assert_eq!(failure.message, "there is no topic house/scan: house is a tracker");
+        assert_eq!(failure.hint, "there are house/tracks, house/events");
     }
 }

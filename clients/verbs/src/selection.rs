@@ -63,7 +63,10 @@ impl Selection {
         let mut of_all = Vec::new();
         for text in texts {
             let word = Word::parse(text)?;
-            let meant = Topic::ALL.into_iter().filter(|topic| word.topic.is_none_or(|known| known == *topic));
+            // Which sensors are trackers is known when they are there: one that is named has what a link has.
+            let may_have = |topic: Topic| word.sensor.is_none() || !topic.is_of_trackers();
+            let is_meant = |topic: &Topic| word.topic.map_or(may_have(*topic), |known| known == *topic);
+            let meant = Topic::ALL.into_iter().filter(is_meant);
             match &word.sensor {
                 None => of_all.extend(meant),
                 Some(sensor) => named.extend(meant.map(|topic| TopicName { sensor: sensor.clone(), topic })),
@@ -96,7 +99,7 @@ mod tests {
     #[test]
     fn a_word_may_stand_for_all() {
         assert_eq!(selection(&["*/scan"]), (vec![], vec![Topic::Scan]));
-        let front: Vec<_> = Topic::ALL.iter().map(|topic| format!("front/{}", topic.name())).collect();
+        let front: Vec<_> = Topic::OF_LINKS.iter().map(|topic| format!("front/{}", topic.name())).collect();
         assert_eq!(selection(&["front/*"]), (front, vec![]));
         assert_eq!(selection(&["*/*"]), (vec![], Topic::ALL.to_vec()));
         assert_eq!(selection(&["robot1.front/scan"]), (vec!["robot1.front/scan".into()], vec![]));

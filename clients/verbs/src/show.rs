@@ -6,7 +6,9 @@ use std::io;
 use scanhub_client::streams::{RobotHeard, Sample};
 use scanhub_client::{Heard, Received};
 use schema::ipc::Payload;
-use schema::{Background, Early, Foreground, Header, Lines, Marks, Motion, Scan, Status, Zones};
+use schema::{
+    Background, Early, Event, Foreground, Header, Lines, Marks, Motion, Scan, Status, Tracks, Zones,
+};
 use serde::Serialize;
 
 use crate::output::{End, Output};
@@ -56,6 +58,8 @@ shown! {
     Lines, lines(header);
     Motion, motion(header);
     Early, early(header);
+    Tracks, tracks(header);
+    Event, event(header);
     Foreground, foreground(header);
     Background, background;
     Status, status;

@@ -1,5 +1,6 @@
 //! The classes of `--json` as text for people: one line per sample, the most important values first. Not a contract.
 
+mod people;
 mod processed;
 
 use std::f64::consts::TAU;
@@ -14,6 +15,7 @@ use crate::names::TopicName;
 use crate::receive_stats::ReceiveStats;
 use crate::show;
 
+pub(crate) use people::{event, event_words, tracks};
 pub(crate) use processed::{background, early, foreground, lines, marks, motion, robot, zones};
 
 /// Bytes as lower hex, without spaces.

@@ -1,14 +1,16 @@
-//! `scanhub track`: people across the sensors of a site, as lines. Refuses to know how they are found.
+//! `scanhub track`: people across the sensors of a site, as lines and as topics. Refuses to know how they are found.
 
 mod lines;
+mod publish;
 
 use std::io::Write;
 use std::sync::atomic::AtomicBool;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use ::track::{Kind as EventKind, People, Picture, Site};
+use publish::Samples;
 use scanhub_client::streams::Sample;
-use schema::{Domain, Failure, Foreground, Kind, Scan, Topic};
+use schema::{Domain, Failure, Foreground, Header, Kind, Scan, Topic};
 
 use crate::follow::{Bounds, Notice, Sink, follow};
 use crate::names::TopicName;
@@ -21,8 +23,8 @@ use crate::{json, text};
 pub struct TrackOptions {
     /// Sensors, rooms and doors.
     pub site: Site,
-    /// The name that lines call the tracker by.
-    pub name: String,
+    /// The name that its topics are published under; none: it publishes nothing.
+    pub name: Option<String>,
     /// Only the counts of these doors are told; none: everything.
     pub count: Vec<String>,
     /// How long a scan is waited for.
@@ -43,7 +45,7 @@ pub struct TrackOptions {
 ///
 /// [`Kind::Configuration`] if a door is not in the site, [`Kind::NoTopic`] with the sensors that there are,
 /// [`Kind::NoHub`] if bounded and there is none at the start, [`Kind::Timeout`], [`Kind::Interrupted`] if bounded and
-/// `stop` came first.
+/// `stop` came first; those of publishing if it has a name.
 pub fn track(
     options: &TrackOptions,
     out: &mut dyn Write,
@@ -58,6 +60,7 @@ pub fn track(
         .iter()
         .flat_map(|sensor| topics.map(|topic| TopicName { sensor: sensor.name.clone(), topic }));
     let names: Vec<TopicName> = names.collect();
+    let name = options.name.as_deref().unwrap_or(UNNAMED);
     let delay_ns = u64::try_from(options.delay.as_nanos()).unwrap_or(u64::MAX);
     let mut verb = Verb {
         options,
@@ -65,14 +68,17 @@ pub fn track(
         halves: names.iter().map(|_| Half::default()).collect(),
         teller: Teller {
             options,
+            name,
             counted: doors,
             passed: vec![[0; 2]; options.site.doors.len()],
-            pictures: 0,
             appeared: 0,
+            samples: Samples::new(name),
             out: Output::new(out),
         },
         notes: Output::new(notes),
         missed: 0,
+        is_there: false,
+        flags: 0,
         summaries: names.len(),
     };
     quiet(follow(&names, &[], &options.places, &options.bounds, stop, &mut verb))
@@ -92,10 +98,17 @@ fn door(site: &Site, name: &str) -> Result<usize, Failure> {
 /// Scans of a sensor whose foregrounds have not come, and the other way round: the two come one after the other.
 #[derive(Default)]
 struct Half {
-    scans: Vec<(u64, u64, Box<Scan>)>,
-    foregrounds: Vec<(u64, Box<Foreground>)>,
+    scans: Vec<(Header, Box<Scan>)>,
+    foregrounds: Vec<(Header, Box<Foreground>)>,
 }
 
+/// Whether both were made of the same telegram.
+fn is_same(one: &Header, other: &Header) -> bool {
+    (one.boot, one.seq) == (other.boot, other.seq)
+}
+
+/// What lines call a tracker that publishes nothing.
+const UNNAMED: &str = "people";
 /// So many wait for their other half.
 const WAITING: usize = 32;
 
@@ -107,42 +120,61 @@ struct Verb<'a> {
     teller: Teller<'a>,
     notes: Output<'a>,
     missed: u64,
+    /// A topic of a sensor was there.
+    is_there: bool,
+    /// Flags of the last scan.
+    flags: u8,
     /// Topics that are not yet over.
     summaries: usize,
 }
 
 impl Sink for Verb<'_> {
+    fn subscribed(&mut self, _: &TopicName) {
+        self.is_there = true;
+    }
+
+    /// Publishes from the moment that there is a domain.
+    fn tick(&mut self, _: Instant) -> Result<(), End> {
+        let samples = &mut self.teller.samples;
+        match &self.options.name {
+            Some(name) if self.is_there && !samples.is_published() => {
+                Ok(samples.publish(name, &self.options.places)?)
+            }
+            _ => Ok(()),
+        }
+    }
+
     fn sample(&mut self, name: &TopicName, sample: &Sample) -> Result<(), End> {
         let Some(sensor) = self.options.site.sensors.iter().position(|one| one.name == name.sensor) else {
             return Ok(());
         };
         let half = &mut self.halves[sensor];
-        let seq = match sample {
+        let of = match sample {
             Sample::Scan(scan) => {
-                let header = scan.header();
-                half.scans.push((header.seq, header.wall_ns, scan.boxed()));
-                header.seq
+                half.scans.push((*scan.header(), scan.boxed()));
+                *scan.header()
             }
             Sample::Foreground(foreground) => {
-                half.foregrounds.push((foreground.header().seq, foreground.boxed()));
-                foreground.header().seq
+                half.foregrounds.push((*foreground.header(), foreground.boxed()));
+                *foreground.header()
             }
             _ => return Ok(()),
         };
-        let scan = half.scans.iter().position(|(of, ..)| *of == seq);
-        let foreground = half.foregrounds.iter().position(|(of, _)| *of == seq);
+        let scan = half.scans.iter().position(|(header, _)| is_same(header, &of));
+        let foreground = half.foregrounds.iter().position(|(header, _)| is_same(header, &of));
         let (Some(scan), Some(foreground)) = (scan, foreground) else {
             half.scans.drain(..half.scans.len().saturating_sub(WAITING));
             half.foregrounds.drain(..half.foregrounds.len().saturating_sub(WAITING));
             return Ok(());
         };
-        let (_, wall_ns, scan) = half.scans.swap_remove(scan);
+        let (Header { wall_ns, flags, .. }, scan) = half.scans.swap_remove(scan);
         let (_, foreground) = half.foregrounds.swap_remove(foreground);
         let mut told = Ok(());
         let teller = &mut self.teller;
+        self.flags = flags;
         self.people.take(sensor, wall_ns, &scan, &foreground, |picture| {
             if told.is_ok() {
-                told = teller.tell(picture);
+                told = teller.tell(picture, flags);
             }
         });
         told
@@ -164,10 +196,10 @@ impl Sink for Verb<'_> {
             return Ok(());
         }
         let mut told = Ok(());
-        let teller = &mut self.teller;
+        let (teller, flags) = (&mut self.teller, self.flags);
         self.people.finish(|picture| {
             if told.is_ok() {
-                told = teller.tell(picture);
+                told = teller.tell(picture, flags);
             }
         });
         told?;
@@ -178,44 +210,42 @@ impl Sink for Verb<'_> {
 /// What writes the lines.
 struct Teller<'a> {
     options: &'a TrackOptions,
+    /// What lines call the tracker.
+    name: &'a str,
     /// Numbers of the doors whose counts alone are told; none: everything.
     counted: Vec<usize>,
     /// Who went through each door: from its `from` to its `to`, and back.
     passed: Vec<[u64; 2]>,
-    pictures: u64,
     appeared: u64,
+    samples: Samples,
     out: Output<'a>,
 }
 
 impl Teller<'_> {
-    fn tell(&mut self, picture: &Picture) -> Result<(), End> {
-        let (site, name) = (&self.options.site, self.options.name.as_str());
-        if self.counted.is_empty() && self.options.json {
-            self.out.json(&lines::tracks(site, name, self.pictures, picture))?;
+    fn tell(&mut self, picture: &Picture, flags: u8) -> Result<(), End> {
+        let Teller { options, name, counted, passed, appeared, samples, out } = self;
+        let TrackOptions { site, json: is_json, .. } = options;
+        samples.take(picture, site, flags);
+        let tells_all = counted.is_empty();
+        if tells_all && *is_json {
+            let (header, tracks) = samples.tracks();
+            out.json(&json::tracks(name, header, tracks))?;
         }
-        self.pictures += 1;
-        for event in &picture.events {
-            let mut passed_door = None;
-            match event.kind {
-                EventKind::Appeared => self.appeared += 1,
-                EventKind::Left => {}
-                EventKind::Door { door, from, .. } => {
-                    let back = usize::from(site.doors[door].from != from);
-                    self.passed[door][back] += 1;
-                    passed_door = Some(door);
-                }
+        for (event, (header, payload)) in picture.events.iter().zip(samples.events()) {
+            match (tells_all, is_json) {
+                (true, true) => out.json(&json::event(name, header, payload))?,
+                (true, false) => out.line(|line| text::event_words(line, payload))?,
+                (false, _) => {}
             }
-            match (self.counted.is_empty(), passed_door) {
-                (true, _) if self.options.json => self.out.json(&lines::event(site, name, event))?,
-                (true, _) => self.out.line(|line| lines::event_text(line, site, event))?,
-                (false, Some(door)) if self.counted.contains(&door) => {
-                    let (door, passed) = (&site.doors[door].name, self.passed[door]);
-                    match self.options.json {
-                        true => self.out.json(&lines::count(name, door, passed, event.wall_ns))?,
-                        false => self.out.line(|line| lines::count_text(line, door, passed))?,
-                    }
+            *appeared += u64::from(event.kind == EventKind::Appeared);
+            let EventKind::Door { door, from, .. } = event.kind else { continue };
+            passed[door][usize::from(site.doors[door].from != from)] += 1;
+            if counted.contains(&door) {
+                let (door, passed) = (&site.doors[door].name, passed[door]);
+                match is_json {
+                    true => out.json(&lines::count(name, door, passed, event.wall_ns))?,
+                    false => out.line(|line| lines::count_text(line, door, passed))?,
                 }
-                _ => {}
             }
         }
         Ok(())
@@ -225,11 +255,10 @@ impl Teller<'_> {
         let site = &self.options.site;
         let doors = site.doors.iter().zip(&self.passed).map(|(door, passed)| (door.name.as_str(), *passed));
         let doors: Vec<_> = doors.collect();
-        let counts = people.counts();
-        let (name, json) = (self.options.name.as_str(), self.options.json);
-        let sum = lines::Sum { pictures: self.pictures, appeared: self.appeared, counts, missed };
-        if json {
-            return self.out.json(&lines::summary(name, &sum, &doors));
+        let (pictures, failed) = (self.samples.pictures(), self.samples.failed());
+        let sum = lines::Sum { pictures, appeared: self.appeared, counts: people.counts(), missed, failed };
+        if self.options.json {
+            return self.out.json(&lines::summary(self.name, &sum, &doors));
         }
         self.out.line(|line| lines::summary_text(line, &sum, &doors))
     }

@@ -6,7 +6,7 @@ use schema::shortage::{self, sensor_bytes};
 
 /// Bytes of shared memory for links with topics made as `limits` say of each, and the first consumers.
 pub fn memory(limits: &[TopicLimits]) -> u64 {
-    limits.iter().map(|limits| sensor_bytes(&Topic::ALL, limits)).sum::<u64>() + REST
+    limits.iter().map(|limits| sensor_bytes(&Topic::OF_LINKS, limits)).sum::<u64>() + REST
 }
 
 /// Bytes of the longest segment of any of them.
@@ -22,6 +22,6 @@ pub fn descriptors(links: usize) -> u64 {
 /// Descriptors of what belongs to no link, beside those open from the start: 16 are left open, making them takes more.
 const BASE_DESCRIPTORS: u64 = 24;
 /// Descriptors of a link: four for each of its services, which are a topic or the event, its port, and a first consumer.
-const LINK_DESCRIPTORS: u64 = 4 * (Topic::ALL.len() as u64 + 1) + 6;
+const LINK_DESCRIPTORS: u64 = 4 * (Topic::OF_LINKS.len() as u64 + 1) + 6;
 /// The control service, what belongs to no link, and the first consumers.
 const REST: u64 = 512 * 1024;

@@ -39,6 +39,10 @@ macro_rules! for_each_topic {
                 "How the robot moved since the scan before.";
             Early Early, "early", "scanhub.Early.v2", 81, Change, Early, 16, 0:
                 "Warnings by telegrams that are not complete.";
+            Tracks Tracks, "tracks", "scanhub.Tracks.v2", 81, Scan, Last, 16, 0:
+                "Where people are, of a tracker.";
+            Events Event, "events", "scanhub.Event.v2", 81, Change, Last, 64, 0:
+                "What happened to them.";
         }
     };
 }

@@ -2,7 +2,8 @@
 
 use schema::datagram::{Announce, Datagram, MTU_SAFE, Packed};
 use schema::{
-    BEAMS, Background, Code, Early, Family, Foreground, Lines, Marks, Motion, Scan, Status, Topic, Zones,
+    BEAMS, Background, Code, Early, Event, Family, Foreground, Lines, Marks, Motion, Scan, Status, Topic,
+    Tracks, Zones,
 };
 use serde_json::{Map, Value, json};
 
@@ -33,6 +34,8 @@ pub(crate) fn payload(datagram: &Datagram<'_>) -> Value {
         Some(Topic::Lines) => lines(&unpacked(Box::<Lines>::default(), payload)),
         Some(Topic::Motion) => motion(&unpacked(Box::<Motion>::default(), payload)),
         Some(Topic::Early) => early(&unpacked(Box::<Early>::default(), payload)),
+        Some(Topic::Tracks) => tracks(&unpacked(Box::<Tracks>::default(), payload)),
+        Some(Topic::Events) => event(&unpacked(Box::<Event>::default(), payload)),
         Some(Topic::Status) => status(&unpacked(Box::<Status>::default(), payload)),
     }
 }
@@ -113,6 +116,26 @@ fn early(early: &Early) -> Value {
     json!({
         "verdict": early.verdict().name(), "withdrawn": early.is_withdrawn(), "beam": early.beam,
         "distance_mm": early.distance_mm, "bytes_seen": early.bytes_seen, "beams_seen": early.beams_seen,
+    })
+}
+
+fn tracks(tracks: &Tracks) -> Value {
+    let list = tracks.tracks().iter().map(|track| {
+        json!({
+            "id": track.id, "x_m": track.x_m, "y_m": track.y_m, "vx_m_s": track.vx_m_s, "vy_m_s": track.vy_m_s,
+            "covariance": track.covariance, "score": track.score, "age_ms": track.age_ms, "sensors": track.sensors,
+            "room": track.room_name().unwrap_or_default(), "state": track.state().name(),
+        })
+    });
+    let names = tracks.sensors().iter().map(|sensor| sensor.name());
+    json!({ "names": names.collect::<Vec<_>>(), "tracks": list.collect::<Vec<_>>() })
+}
+
+fn event(event: &Event) -> Value {
+    let (door, from, to) = event.door().unwrap_or_default();
+    json!({
+        "kind": event.kind().map(|kind| kind.name()), "id": event.id, "room": event.room_name().unwrap_or_default(),
+        "door": door, "from": from, "to": to,
     })
 }
 

@@ -3,16 +3,16 @@
 use bytemuck::Zeroable;
 use schema::datagram::{Announce, Announced, Head, LanFlags, Packed};
 use schema::{
-    Background, BackgroundHead, COUNTERS, Code, Contents, Corner, Counter, Counters, Early, Family,
-    Foreground, ForegroundHead, Line, Lines, Mark, Marks, Motion, MotionMethod, Pose, Scan, ScanHead,
-    Segment, State, Status, Topic, Verdict, Zone, Zones,
+    Background, BackgroundHead, COUNTERS, Code, Contents, Corner, Counter, Counters, Early, Event, EventKind,
+    Family, Foreground, ForegroundHead, Line, Lines, Mark, Marks, Motion, MotionMethod, Pose, Scan, ScanHead,
+    Segment, State, Status, Topic, Track, TrackState, Tracks, Verdict, Zone, Zones,
 };
 
 /// Name of the file, header, and what writes the payload.
 pub(crate) type Golden = (&'static str, Head, fn(&mut [u8]) -> Option<usize>);
 
 /// Those that a gateway of this version sends.
-pub(crate) const ALL: [Golden; 16] = [
+pub(crate) const ALL: [Golden; 18] = [
     ("announce", Head { sequence: 7, counter: 0, ..head(None) }, announce),
     ("telegram", Head { sequence: u32::MAX, ..head(Some(Topic::Telegram)) }, telegram),
     ("packets", Head { sequence: 5, family: Family::Ld as u8, ..head(Some(Topic::Telegram)) }, packets),
@@ -47,7 +47,43 @@ pub(crate) const ALL: [Golden; 16] = [
     ("early_withdrawn", head(Some(Topic::Early)), |room| {
         Early { flags: Early::WITHDRAWN, ..EARLY }.pack(room)
     }),
+    ("tracks", head(Some(Topic::Tracks)), |room| tracks().pack(room)),
+    ("events", head(Some(Topic::Events)), |room| {
+        Event::new(EventKind::Door, 3, Some("kitchen")).through("left", "hall", "kitchen").pack(room)
+    }),
 ];
+
+fn tracks() -> Tracks {
+    let mut tracks = Tracks::default();
+    ["front", "kitchen.rear"].map(|name| tracks.push_sensor(name));
+    let mut first = Track {
+        id: 3,
+        x_m: 1.5,
+        y_m: -2.25,
+        vx_m_s: 0.75,
+        vy_m_s: -0.125,
+        covariance: [0.007_812_5, 0.0, 0.003_906_25],
+        score: 0.9375,
+        age_ms: 12_345,
+        sensors: 3,
+        state: TrackState::Confirmed as u8,
+        ..Track::default()
+    };
+    first.set_room("hall");
+    let mut second = Track {
+        id: (1 << 32) + 1,
+        x_m: 9.5,
+        y_m: 2.0,
+        covariance: [0.5, 0.125, 0.25],
+        score: 0.5,
+        age_ms: 600_000,
+        state: TrackState::BetweenRooms as u8,
+        ..Track::default()
+    };
+    second.set_room("Küche");
+    [first, second].map(|track| tracks.push(track));
+    tracks
+}
 
 const EARLY: Early = Early {
     verdict: Verdict::Slow as u8,

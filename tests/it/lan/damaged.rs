@@ -41,6 +41,11 @@ fn damage(random: &mut Rng, datagram: &Datagram<'_>) -> Vec<u8> {
     let is_spared = |at: usize| match Topic::of_number(datagram.head.topic) {
         Some(Topic::Status) => (24..336).contains(&at) || at >= 560,
         None => (40..64).contains(&at),
+        // Where texts begin goes by the counts, too.
+        Some(Topic::Tracks) => {
+            at < 2 || !(8..8 + 80 * usize::from(datagram.payload[0])).contains(&at) || at % 80 >= 56
+        }
+        Some(Topic::Events) => at >= 16,
         Some(_) => false,
     };
     for _ in 0..random.usize(..4) {

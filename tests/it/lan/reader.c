@@ -110,6 +110,39 @@ static void early(const struct scanhub_early *e)
            (unsigned long)e->distance_mm, e->bytes_seen, e->beams_seen);
 }
 
+static void tracks(const struct scanhub_tracks *t)
+{
+    static const char *const states[] = {"tentative", "confirmed", "hidden", "between_rooms"};
+    char name[57];
+    printf("{\"names\":[");
+    for (unsigned i = 0; i < t->sensor_count; i++) {
+        scanhub_track_sensor(t, i, name);
+        printf("%s\"%s\"", i ? "," : "", name);
+    }
+    printf("],\"tracks\":[");
+    for (unsigned i = 0; i < t->count; i++) {
+        struct scanhub_track k = scanhub_track(t, i);
+        printf("%s{\"id\":%llu", i ? "," : "", (unsigned long long)k.id);
+        number(",\"x_m\":", k.x_m);
+        number(",\"y_m\":", k.y_m);
+        number(",\"vx_m_s\":", k.vx_m_s);
+        number(",\"vy_m_s\":", k.vy_m_s);
+        for (unsigned n = 0; n < 3; n++)
+            number(n ? "," : ",\"covariance\":[", k.covariance[n]);
+        number("],\"score\":", k.score);
+        printf(",\"age_ms\":%lu,\"sensors\":%lu,\"room\":\"%s\",\"state\":\"%s\"}", (unsigned long)k.age_ms,
+               (unsigned long)k.sensors, k.room, states[k.state < 4 ? k.state : 0]);
+    }
+    printf("]}");
+}
+
+static void events(const struct scanhub_events *e)
+{
+    static const char *const kinds[] = {"appeared", "left", "door"};
+    printf("{\"kind\":\"%s\",\"id\":%llu,\"room\":\"%s\",\"door\":\"%s\",\"from\":\"%s\",\"to\":\"%s\"}", kinds[e->kind],
+           (unsigned long long)e->id, e->room, e->door, e->from, e->to);
+}
+
 static void lines(const struct scanhub_lines *l)
 {
     printf("{\"overflow\":%s,\"readings\":%u,\"on_lines\":%u", boolean(l->overflow), l->readings, l->on_lines);
@@ -258,6 +291,8 @@ static enum scanhub_result payload(const struct scanhub_datagram *d)
         TOPIC(SCANHUB_LINES, lines)
         TOPIC(SCANHUB_MOTION, motion)
         TOPIC(SCANHUB_EARLY, early)
+        TOPIC(SCANHUB_TRACKS, tracks)
+        TOPIC(SCANHUB_EVENTS, events)
     }
     return SCANHUB_SKIPPED;
 }

@@ -24,6 +24,8 @@ def plain(value):
 def says(datagram):
     payload = datagram.unpack()
     out = {name: plain(value) for name, value in dataclasses.asdict(payload).items()}
+    if datagram.topic == "events":
+        out["from"], out["to"] = out.pop("from_room"), out.pop("to_room")
     if datagram.topic == "announce":
         out["boot"] = f"{payload.boot:016x}"
     if datagram.topic == "telegram":

@@ -7,7 +7,7 @@ use super::capture::{Capture, has_tshark};
 use super::{damaged, keyed_vectors, vectors};
 use crate::testkit::TestEnv;
 use schema::datagram::{HEAD, Head, Packed};
-use schema::{Family, State, Topic, Verdict, Zones};
+use schema::{EventKind, Family, State, Topic, TrackState, Verdict, Zones};
 use serde_json::Value;
 
 /// What the list says of a payload, in the names and the words of the dissector: the values of each field, in their order.
@@ -54,7 +54,11 @@ fn word(name: &str, value: &Value) -> String {
             number(Verdict::ALL.iter().find(|known| known.name() == name).map(|&known| known as usize))
         }
         ("family", Value::String(name)) => number(Family::parse(name).map(|family| family as usize)),
-        ("state", Value::String(name)) => number(State::ALL.iter().position(|known| known.name() == name)),
+        ("state", Value::String(name)) => {
+            let of_track = || TrackState::ALL.iter().position(|known| known.name() == name);
+            number(State::ALL.iter().position(|known| known.name() == name).or_else(of_track))
+        }
+        ("kind", Value::String(name)) => number(EventKind::ALL.iter().position(|known| known.name() == name)),
         ("method", Value::String(name)) => {
             number(schema::MotionMethod::ALL.iter().position(|known| known.name() == name))
         }
@@ -69,8 +73,10 @@ fn word(name: &str, value: &Value) -> String {
 /// Angles, and the numbers of lines and motions, have as many digits as the tool likes.
 fn as_shown(name: &str, values: &str) -> String {
     let is_angle = ["angle", "step", "spacing"].iter().any(|word| name.ends_with(word))
-        || ["scanhub.lines.", "scanhub.motion."].iter().any(|topic| name.starts_with(topic))
-            && ["_m", "_rad", "covariance"].iter().any(|word| name.ends_with(word));
+        || ["scanhub.lines.", "scanhub.motion.", "scanhub.tracks."]
+            .iter()
+            .any(|topic| name.starts_with(topic))
+            && ["_m", "_m_s", "_rad", "covariance", "score"].iter().any(|word| name.ends_with(word));
     if !is_angle || values.is_empty() {
         return values.to_owned();
     }

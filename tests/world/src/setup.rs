@@ -33,7 +33,7 @@ impl Setup {
         };
         let mut cast = Vec::new();
         for sensor in 0..sensors.len() {
-            cast.extend(Topic::ALL.map(|topic| (sensor, topic, Habit::Prompt, 0)));
+            cast.extend(Topic::OF_LINKS.map(|topic| (sensor, topic, Habit::Prompt, 0)));
             cast.push((sensor, Topic::Zones, Habit::Robot, 0));
             let every_ms = random.u64(5..400);
             cast.push((sensor, Topic::Scan, Habit::Slow { every_ms }, random.usize(0..=4)));

@@ -51,6 +51,8 @@ extern "C" {
 #define SCANHUB_TOPIC_LINES 8      /* struct scanhub_lines_v2 */
 #define SCANHUB_TOPIC_MOTION 9     /* struct scanhub_motion_v2 */
 #define SCANHUB_TOPIC_EARLY 10     /* struct scanhub_early_v2 */
+#define SCANHUB_TOPIC_TRACKS 11    /* struct scanhub_tracks_v2 */
+#define SCANHUB_TOPIC_EVENTS 12    /* struct scanhub_event_v2 */
 
 /* How scanhub_wait waits. */
 #define SCANHUB_WAIT_DOORBELL 0 /* at a word in the hub's memory, at which one call wakes all: what to take if in doubt */
@@ -220,6 +222,55 @@ struct scanhub_early_v2 {
     uint32_t distance_mm; /* of that, from the robot's centre */
     uint16_t bytes_seen;  /* of the telegram */
     uint16_t beams_seen;  /* of the scan */
+};
+
+/* How well a person is known. */
+#define SCANHUB_TRACK_TENTATIVE 0     /* perhaps a person, and so is every number that is not here */
+#define SCANHUB_TRACK_CONFIRMED 1     /* a person who is seen */
+#define SCANHUB_TRACK_HIDDEN 2        /* a person who is not seen, where nobody could be seen either */
+#define SCANHUB_TRACK_BETWEEN_ROOMS 3 /* a person on a way that no sensor sees */
+
+struct scanhub_track_v2 {
+    uint64_t id; /* nobody else ever gets it */
+    float x_m;   /* the middle between his legs, in the map of the site */
+    float y_m;
+    float vx_m_s;
+    float vy_m_s;
+    float covariance[3]; /* of the place, m2: xx, xy, yy */
+    float score;         /* how sure it is that this is a person, 0 to 1 */
+    uint32_t age_ms;     /* since he was first seen */
+    uint32_t sensors;    /* bit i: sensor_array[i] sees him */
+    char room_text[24];  /* UTF-8, 0 behind it; 24 bytes have none */
+    uint8_t state;       /* SCANHUB_TRACK_.. */
+    uint8_t reserved[7];
+};
+
+struct scanhub_track_sensor_v2 {
+    char name_text[56]; /* 0 behind it */
+};
+
+/* People at one instant, which is wall_ns of the header. */
+struct scanhub_tracks_v2 {
+    uint8_t count;   /* people, at most 64 */
+    uint8_t sensors; /* of the site, at most 32 */
+    uint8_t reserved[6];
+    struct scanhub_track_v2 track_array[64];
+    struct scanhub_track_sensor_v2 sensor_array[32];
+};
+
+/* What happened to a person. */
+#define SCANHUB_EVENT_APPEARED 0
+#define SCANHUB_EVENT_LEFT 1
+#define SCANHUB_EVENT_DOOR 2
+
+struct scanhub_event_v2 {
+    uint64_t id;
+    uint8_t kind; /* SCANHUB_EVENT_.. */
+    uint8_t reserved[7];
+    char room_text[24]; /* where he then is; texts are UTF-8 with 0 behind them, 24 bytes have none */
+    char door_text[24]; /* of SCANHUB_EVENT_DOOR, as are the next two */
+    char from_text[24];
+    char to_text[24];
 };
 
 struct scanhub_segment_v2 {
@@ -615,6 +666,13 @@ SCANHUB_SIZE(scanhub_zones_v2, 76);
 SCANHUB_AT(scanhub_zones_v2, zone_array, 12);
 SCANHUB_SIZE(scanhub_early_v2, 12);
 SCANHUB_AT(scanhub_early_v2, distance_mm, 4);
+SCANHUB_SIZE(scanhub_track_v2, 80);
+SCANHUB_AT(scanhub_track_v2, room_text, 48);
+SCANHUB_AT(scanhub_track_v2, state, 72);
+SCANHUB_SIZE(scanhub_tracks_v2, 6920);
+SCANHUB_AT(scanhub_tracks_v2, sensor_array, 5128);
+SCANHUB_SIZE(scanhub_event_v2, 112);
+SCANHUB_AT(scanhub_event_v2, to_text, 88);
 SCANHUB_SIZE(scanhub_segment_v2, 16);
 SCANHUB_SIZE(scanhub_foreground_v2, 16);
 SCANHUB_SIZE(scanhub_background_v2, 32);

@@ -44,6 +44,9 @@ template <> struct TopicOf<scanhub_background_v2> { enum { number = SCANHUB_TOPI
 template <> struct TopicOf<scanhub_status_v2> { enum { number = SCANHUB_TOPIC_STATUS }; };
 template <> struct TopicOf<scanhub_lines_v2> { enum { number = SCANHUB_TOPIC_LINES }; };
 template <> struct TopicOf<scanhub_motion_v2> { enum { number = SCANHUB_TOPIC_MOTION }; };
+template <> struct TopicOf<scanhub_early_v2> { enum { number = SCANHUB_TOPIC_EARLY }; };
+template <> struct TopicOf<scanhub_tracks_v2> { enum { number = SCANHUB_TOPIC_TRACKS }; };
+template <> struct TopicOf<scanhub_event_v2> { enum { number = SCANHUB_TOPIC_EVENTS }; };
 template <> struct TopicOf<scanhub_robot> { enum { number = 0 }; };
 
 /* A sample, or none; given back when it goes out of scope. */

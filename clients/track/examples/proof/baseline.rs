@@ -1,8 +1,9 @@
 //! The simplest that one might do: each segment is a person, and belongs to the nearest one within half a metre.
 
 use schema::Foreground;
+use schema::TrackState;
 use track::geometry::{Point, distance};
-use track::{PICTURE_NS, Picture, Site, State, Track};
+use track::{PICTURE_NS, Picture, Site, Track};
 
 struct One {
     id: u64,
@@ -48,7 +49,7 @@ impl Nearest {
             self.next_ns = at_ns + PICTURE_NS;
             let tracks = self.all.iter().map(|one| Track {
                 id: one.id,
-                state: State::Confirmed,
+                state: TrackState::Confirmed,
                 place: one.place,
                 velocity: [0.0, 0.0],
                 covariance: [0.0; 3],

@@ -5,9 +5,10 @@ use std::time::Instant;
 
 use preprocess::background::{Model, Settings};
 use preprocess::segments::Segmenter;
+use schema::TrackState;
 use schema::{Foreground, Pose, Scan};
 use track::geometry::{Point, distance, distance_to_border};
-use track::{Kind, People, Picture, Site, State};
+use track::{Kind, People, Picture, Site};
 
 use crate::baseline::Nearest;
 use crate::house::{self, BEAMS, Eye};
@@ -161,7 +162,7 @@ fn judge(site: &Site, truths: &[Vec<Point>], pictures: &[Picture], crowd: &Crowd
         }
         for track in &picture.tracks {
             let at = [track.place[0] + ahead * track.velocity[0], track.place[1] + ahead * track.velocity[1]];
-            let counts = matches!(track.state, State::Confirmed | State::Hidden);
+            let counts = matches!(track.state, TrackState::Confirmed | TrackState::Hidden);
             if !counts {
                 continue;
             }
@@ -173,7 +174,7 @@ fn judge(site: &Site, truths: &[Vec<Point>], pictures: &[Picture], crowd: &Crowd
             ids.insert(track.id, track.id);
             outcome.csv += &format!("{frame},1,{},{:.3},{:.3}\n", track.id, at[0], at[1]);
             if let Some((off, who)) = nearest.filter(|(off, _)| *off < 0.5) {
-                if track.state == State::Confirmed {
+                if track.state == TrackState::Confirmed {
                     outcome.squares.0 += off * off;
                     outcome.squares.1 += 1;
                 }

@@ -4,10 +4,10 @@
 use std::time::{Duration, Instant};
 
 use scanhub_client::streams::{GRACE, Who};
-use schema::{Failure, Kind, ipc, is_remote};
+use schema::{Failure, Kind, Topic, ipc, is_remote};
 
 use super::{Run, Sink, Track, brings};
-use crate::names::{TopicName, no_sensor};
+use crate::names::{TopicName, no_sensor, no_such_topic};
 use crate::output::End;
 
 /// Sensors of other machines that are there have been announced after so long: it is done once a second.
@@ -20,8 +20,8 @@ impl Run<'_> {
     pub(super) fn discover(&mut self, sink: &mut dyn Sink) -> Result<(), End> {
         let Some(domain) = self.session.domain().filter(|_| !self.topics.is_empty()) else { return Ok(()) };
         let Some(called) = self.discovery.call(domain, Instant::now())? else { return Ok(()) };
-        for sensor in called.sensors {
-            for &topic in self.topics {
+        for sensor in &called.sensors {
+            for &topic in self.topics.iter().filter(|topic| called.may_have(sensor, **topic)) {
                 let name = TopicName { sensor: sensor.clone(), topic };
                 if self.tracks.iter().all(|track| track.name != name) {
                     sink.begin(&name);
@@ -47,7 +47,9 @@ impl Run<'_> {
         // A hub that came to a listener has to make its topics first.
         let lives = self.session.hub_lives();
         self.hub_lives_since = if lives { self.hub_lives_since.or(Some(Instant::now())) } else { None };
-        let sensors = self.sensors()?;
+        let published = self.published()?;
+        let mut sensors: Vec<String> = published.iter().map(|(sensor, _)| sensor.clone()).collect();
+        sensors.dedup();
         let wants_all = self.tracks.iter().all(|track| track.name.is_robot());
         // Those of the hub, or where there is none, of other machines.
         let may_come = self.may_come(if lives { Who::Hub } else { Who::Listener });
@@ -66,6 +68,13 @@ impl Run<'_> {
             if !track.source.subscribed() && !is_there {
                 return Err(no_sensor(sensor, &sensors).into());
             }
+            let topics = published.iter().filter(|(of, _)| of == sensor).map(|(_, topic)| *topic);
+            let topics: Vec<Topic> = topics.collect();
+            let is_of_trackers = track.name.topic.is_of_trackers();
+            let is_other = |topic: &Topic| topic.is_of_trackers() != is_of_trackers;
+            if !topics.is_empty() && topics.iter().all(is_other) {
+                return Err(no_such_topic(&track.name, &topics).into());
+            }
         }
         Ok(())
     }
@@ -79,7 +88,7 @@ impl Run<'_> {
         }
     }
 
-    fn sensors(&self) -> Result<Vec<String>, Failure> {
-        self.session.domain().map(ipc::sensors).transpose().map(Option::unwrap_or_default)
+    fn published(&self) -> Result<Vec<(String, Topic)>, Failure> {
+        self.session.domain().map(ipc::published).transpose().map(Option::unwrap_or_default)
     }
 }

@@ -72,6 +72,14 @@ impl Selection {
         named
     }
 
+    /// The sensor is named with a topic that only trackers have.
+    pub(super) fn names_tracker(&self, sensor: &str) -> bool {
+        let words = self.entries.iter().map(|entry| &entry.word);
+        { words }.any(|word| {
+            word.sensor.as_deref() == Some(sensor) && word.topic.is_some_and(Topic::is_of_trackers)
+        })
+    }
+
     /// Something goes out of sensors that are not named.
     pub(super) fn wants_all(&self) -> bool {
         self.entries.iter().any(|entry| entry.word.sensor.is_none())
@@ -131,6 +139,8 @@ mod tests {
         for topic in Topic::ALL {
             assert_eq!(every(&bare, "front", topic), (topic == Topic::Telegram).then_some(1));
         }
+        let house = selection(&["front/*", "house/tracks"], false).unwrap();
+        assert_eq!((house.names_tracker("front"), house.names_tracker("house")), (false, true));
         assert!(usual.wants_all() && bare.wants_all() && usual.named().is_empty());
     }
 

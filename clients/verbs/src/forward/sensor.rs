@@ -22,9 +22,15 @@ pub(super) struct Sensor {
 const TURN: usize = 32;
 
 impl Sensor {
-    /// Will follow what goes out of the sensor called `name`; its status too if it is announced, for its type.
-    pub(super) fn new(name: &str, selection: &Selection, carrier: &mut impl Carrier) -> Sensor {
-        let position = carrier.follow(name, &|topic| selection.every(name, topic));
+    /// Will follow what goes out of the sensor called `name`, of the topics that it `may_have`; its status too if it is announced, for its type.
+    pub(super) fn new(
+        name: &str,
+        may_have: impl Fn(Topic) -> bool,
+        selection: &Selection,
+        carrier: &mut impl Carrier,
+    ) -> Sensor {
+        let every = |topic| selection.every(name, topic).filter(|_| may_have(topic));
+        let position = carrier.follow(name, &every);
         let wanted = Topic::ALL.into_iter().filter(|topic| carrier.wants(position, *topic));
         let sources = wanted.map(|topic| Source::new(name, topic)).collect();
         Sensor { name: name.to_owned(), position, sources }

@@ -299,7 +299,7 @@ fn corner_list<S: Serializer>(corners: &[Corner], serializer: S) -> Result<S::Ok
 }
 
 /// As many digits as there is sense in: six behind the point.
-fn millionths(value: impl Into<f64>) -> f64 {
+pub(super) fn millionths(value: impl Into<f64>) -> f64 {
     (1e6 * value.into()).round() / 1e6
 }
 

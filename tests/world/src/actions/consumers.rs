@@ -34,7 +34,7 @@ pub(crate) const STOPS: Kind = Kind {
 
 /// One that looks every 0 ms is a prompt one.
 fn come(world: &mut World, action: &Action, is_killed: bool) {
-    let topic = Topic::ALL[action.value("topic") as usize % Topic::ALL.len()];
+    let topic = Topic::OF_LINKS[action.value("topic") as usize % Topic::OF_LINKS.len()];
     let habit = match action.value("every_ms") {
         0 | 1 => Habit::Prompt,
         every_ms => Habit::Slow { every_ms },

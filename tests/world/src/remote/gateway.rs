@@ -55,7 +55,7 @@ impl Gateway {
         let mut sources = Vec::new();
         for sensor in 0..sensors {
             let position = outgoing.follow(&Setup::name(sensor), |topic| terms.every(topic));
-            for topic in Topic::ALL.into_iter().filter(|&topic| outgoing.wants(position, topic)) {
+            for topic in Topic::OF_LINKS.into_iter().filter(|&topic| outgoing.wants(position, topic)) {
                 let number = Number(NUMBERS * life + sources.len() as u32);
                 let numbers = Numbers::default();
                 sources.push(Source { sensor, topic, number, numbers, is_attached: false });
