@@ -3,13 +3,12 @@
 
 use std::convert::Infallible;
 use std::ffi::OsString;
-use std::io::ErrorKind;
 use std::os::unix::process::CommandExt;
-use std::path::PathBuf;
 use std::process::Command;
 
 use clap::Args;
 use schema::{Failure, Kind};
+use tools::bridge_program::{PROGRAM, find, places};
 
 use super::Everywhere;
 
@@ -21,17 +20,16 @@ pub(crate) struct Bridge {
     arguments: Vec<OsString>,
 }
 
-/// The program.
-const PROGRAM: &str = "scanhub-bridge";
-
 impl Bridge {
     /// Becomes the program: the one beside this one, else the one that is found by its name.
     ///
-    /// [`Kind::Configuration`] if there is none.
+    /// [`Kind::Configuration`] if there is none, or if it is of another version.
     pub(crate) fn run(&self, everywhere: &Everywhere) -> Result<Infallible, Failure> {
-        let beside = std::env::current_exe().ok().map(|own| own.with_file_name(PROGRAM));
-        let beside = beside.filter(|path| path.is_file()).unwrap_or_else(|| PathBuf::from(PROGRAM));
-        let mut command = Command::new(beside);
+        // In one line: what is wrong, and what to do.
+        let program = find(&places()).map_err(|Failure { kind, message, hint }| {
+            Failure::new(kind, format!("{message}; {hint}"), "")
+        })?;
+        let mut command = Command::new(&program);
         command.args(["--domain", &everywhere.domain]);
         if let Some(root) = &everywhere.root {
             command.arg("--root").arg(root);
@@ -40,11 +38,7 @@ impl Bridge {
             command.arg("--json");
         }
         let error = command.args(&self.arguments).exec();
-        let what = match error.kind() {
-            ErrorKind::NotFound => format!("{PROGRAM} is not installed"),
-            _ => format!("cannot run {PROGRAM}: {error}"),
-        };
-        let hint = "in the directory of scanhub's source: cargo install --path clients/bridge";
-        Err(Failure::new(Kind::Configuration, what, hint))
+        let what = format!("cannot run {PROGRAM} ({}): {error}", program.display());
+        Err(Failure::new(Kind::Configuration, what, "it must be a program that this user may run"))
     }
 }

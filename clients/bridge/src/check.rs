@@ -15,8 +15,9 @@ use schema::{Failure, Kind, Printable};
 use serde::Serialize;
 use verbs::network::{now, quiet};
 
-use crate::BridgeOptions;
+use crate::diagnosis::{Diagnosis, UNREACHED};
 use crate::engine::{Connection, Engine, News, Prepared};
+use crate::{BridgeOptions, now_s};
 
 /// One line of what was found.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
@@ -66,7 +67,7 @@ pub fn check(options: &BridgeOptions, stop: &AtomicBool, out: &mut dyn Write) ->
 }
 
 fn find(options: &BridgeOptions, stop: &AtomicBool) -> Result<Vec<Finding>, Failure> {
-    let opened = Prepared::read(options).and_then(Connection::open);
+    let opened = Prepared::read(options, now_s()).and_then(Connection::open);
     let connection = match opened {
         Ok(connection) => connection,
         Err(failure) => return Ok(vec![Finding::failed(failure.message, failure.hint)]),
@@ -106,33 +107,8 @@ fn find(options: &BridgeOptions, stop: &AtomicBool) -> Result<Vec<Finding>, Fail
 /// Why nobody is connected, as Zenoh says it.
 fn unreachable(reasons: &[String]) -> Finding {
     let said = reasons.join("; ");
-    let lower = said.to_lowercase();
-    let has = |words: &[&str]| words.iter().any(|word| lower.contains(word));
-    let (what, remedy) = if has(&["expired"]) {
-        (
-            "a certificate has expired",
-            "renew it: the router's, or this machine's, whose date `openssl x509 -enddate` shows",
-        )
-    } else if has(&["notvalidyet", "not valid yet"]) {
-        ("a certificate is not valid yet", "set the clock of this machine, or of the one that made it")
-    } else if has(&["certificate", "unknownissuer", "tls"]) {
-        (
-            "the certificates do not fit",
-            "root_ca_certificate must be of who signed the router's certificate, whose name must be in --connect; a router that \
-             wants one of this machine is shown connect_certificate",
-        )
-    } else if has(&["usrpwd", "authenticat", "password"]) {
-        (
-            "the user or the password is refused",
-            "compare transport/auth/usrpwd with the router's dictionary_file",
-        )
-    } else {
-        (
-            "no router is reached",
-            "it must run at the address that is named (`scanhub bridge --listen ..` or zenohd), and no firewall be between",
-        )
-    };
-    let said = if said.is_empty() { what.to_owned() } else { format!("{what}: {said}") };
+    let Diagnosis { finding, remedy } = Diagnosis::of(&said).unwrap_or(UNREACHED);
+    let said = if said.is_empty() { finding.to_owned() } else { format!("{finding}: {said}") };
     Finding::failed(said, remedy)
 }
 
@@ -225,19 +201,9 @@ mod tests {
 
     #[test]
     fn why_nobody_is_connected_has_a_remedy() {
-        let of = |line: &str| unreachable(&[line.to_owned()]);
-        for (line, finding, remedy) in [
-            ("invalid peer certificate: certificate expired: verification time 7", "has expired", "renew"),
-            ("invalid peer certificate: Expired", "has expired", "renew"),
-            ("invalid peer certificate: NotValidYet", "not valid yet", "clock"),
-            ("invalid peer certificate: UnknownIssuer", "do not fit", "root_ca_certificate"),
-            ("Received a close message (reason INVALID) usrpwd", "refused", "usrpwd"),
-            ("Unable to connect: Connection refused (os error 111)", "no router", "firewall"),
-        ] {
-            let said = of(line);
-            assert!(said.finding.contains(finding) && said.remedy.contains(remedy), "{said:?}");
-            assert!(said.finding.contains(line) && said.state == "failed", "{said:?}");
-        }
+        let said = unreachable(&["invalid peer certificate: Expired".into()]);
+        assert!(said.state == "failed" && said.remedy.contains("renew"), "{said:?}");
+        assert_eq!(said.finding, "a certificate has expired: invalid peer certificate: Expired");
         assert_eq!(unreachable(&[]).finding, "no router is reached");
     }
 

@@ -2,6 +2,7 @@
 //! and what it says of its links. Refuses to know what is in a payload.
 
 mod attached;
+mod certificate;
 mod config;
 mod log;
 
@@ -92,6 +93,11 @@ impl Connection {
             }
             thread::sleep(LOOK_EVERY);
         }
+    }
+
+    /// Whether there is a session: it listens, or who only connects is connected.
+    pub(crate) fn is_open(&self) -> bool {
+        self.state.engine.get().is_some()
     }
 
     /// Why there never will be a session, if that is known.

@@ -3,6 +3,7 @@
 #![forbid(unsafe_code)]
 
 mod check;
+mod diagnosis;
 mod engine;
 mod receiving;
 mod report;
@@ -18,7 +19,7 @@ use std::time::{Duration, Instant};
 use lan::outgoing::ANNOUNCE_EVERY;
 use schema::limits::TopicLimits;
 use schema::{Domain, Failure, Kind};
-use verbs::network::{End, LossyWriter, Output, quiet};
+use verbs::network::{End, LossyWriter, Output, now, quiet};
 
 pub use check::check;
 use engine::{Connection, Prepared};
@@ -76,7 +77,7 @@ pub struct PublishOptions {
 /// [`Kind::Input`] if the file of its configuration cannot be read; [`Kind::Usage`] if there is no such topic;
 /// [`Kind::DomainHeld`] if another listener publishes in the domain; [`Kind::NoTopic`] if the first hub has no such sensor.
 pub fn bridge(options: &BridgeOptions, tell: &AtomicBool, stop: &AtomicBool) -> Result<(), Failure> {
-    let prepared = Prepared::read(options)?;
+    let prepared = Prepared::read(options, now_s())?;
     let mut out = stdout();
     let mut notes = stderr();
     let (mut out, mut notes) = (LossyWriter::around(&mut out, stop), LossyWriter::around(&mut notes, stop));
@@ -88,6 +89,8 @@ pub fn bridge(options: &BridgeOptions, tell: &AtomicBool, stop: &AtomicBool) -> 
 
 /// Between two announcements, and two accounts.
 const TICK: Duration = ANNOUNCE_EVERY;
+/// So long it waits for a router before it says so.
+const PATIENCE: Duration = Duration::from_secs(1);
 /// So long it sleeps at most where nothing wakes it.
 const NAP: Duration = Duration::from_millis(50);
 
@@ -99,7 +102,6 @@ fn run(
     tell: &AtomicBool,
     stop: &AtomicBool,
 ) -> Result<(), End> {
-    report.begin(options, sending.as_ref())?;
     let (tell_in, is_over) = ([AtomicBool::new(false), AtomicBool::new(false)], AtomicBool::new(false));
     thread::scope(|scope| {
         let begin = |name: &str| thread::Builder::new().name(name.into());
@@ -124,14 +126,10 @@ fn run(
             Ok((receiving, _, ros2)) => {
                 let has_ended = || [receiving, ros2].into_iter().flatten().any(|thread| thread.is_finished());
                 let is_done = || stop.load(Ordering::Relaxed) || has_ended();
-                carry(connection, &mut sending, report, tell, [tell_in, tell_ros2], &is_done)
+                carry(options, connection, &mut sending, report, tell, [tell_in, tell_ros2], &is_done)
             }
             Err(failure) => Err(failure.clone().into()),
         };
-        // However it ends: how many were sent is the last word.
-        if let Some(sending) = &mut sending {
-            sending.announce();
-        }
         is_over.store(true, Ordering::Relaxed);
         let (receiving, handing, ros2) = threads?;
         let handed = handing.map_or(Ok(()), |thread| thread.join().unwrap_or_else(|_| Err(died())));
@@ -148,6 +146,7 @@ fn run(
 
 /// The work of the main thread until it is done.
 fn carry(
+    options: &BridgeOptions,
     connection: &Connection,
     sending: &mut Option<Sending>,
     report: &mut Report<'_>,
@@ -156,12 +155,20 @@ fn carry(
     is_done: &impl Fn() -> bool,
 ) -> Result<(), End> {
     let mut tick_at = Instant::now();
+    let (mut wait_until, mut is_ready) = (Some(tick_at + PATIENCE), false);
     while !is_done() {
         let more = match sending {
             Some(sending) => sending.forward(report)?,
             None => false,
         };
+        if !is_ready && connection.is_open() {
+            is_ready = true;
+            report.begin(options, sending.as_ref())?;
+        }
         connection.news(|news| report.link(&news))?;
+        if !is_ready && wait_until.take_if(|until| Instant::now() >= *until).is_some() {
+            report.waiting(options)?;
+        }
         if let Some(failure) = connection.failure() {
             return Err(failure.into());
         }
@@ -188,6 +195,11 @@ fn carry(
         }
     }
     Ok(())
+}
+
+/// Seconds since 1970.
+fn now_s() -> i64 {
+    (now().wall_ns / 1_000_000_000) as i64
 }
 
 fn no_thread(error: &io::Error) -> Failure {

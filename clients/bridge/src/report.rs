@@ -7,12 +7,15 @@ use serde::Serialize;
 use verbs::network::{End, Notice, Output, account, tell};
 
 use crate::BridgeOptions;
+use crate::diagnosis::Diagnosis;
 use crate::engine::News;
 use crate::sending::Sending;
 
 /// Where it is told.
 pub(crate) struct Report<'a> {
     json: bool,
+    /// What was told to be wrong since somebody was connected: the remedy is told once.
+    told: Vec<Diagnosis>,
     out: Output<'a>,
     notes: Output<'a>,
 }
@@ -20,7 +23,7 @@ pub(crate) struct Report<'a> {
 impl<'a> Report<'a> {
     /// Accounts to `out`, and what is no account to `notes` if `out` is not JSON.
     pub(crate) fn new(json: bool, out: Output<'a>, notes: Output<'a>) -> Report<'a> {
-        Report { json, out, notes }
+        Report { json, told: Vec::new(), out, notes }
     }
 
     /// Whether it accounts by itself, now and then.
@@ -28,7 +31,7 @@ impl<'a> Report<'a> {
         self.json
     }
 
-    /// Who it is, and what it will do.
+    /// It is ready: who it is, and what it does.
     pub(crate) fn begin(&mut self, options: &BridgeOptions, sending: Option<&Sending>) -> Result<(), End> {
         let life = sending.map(|sending| &sending.life);
         let publish = options.publish.as_ref().map(|publish| publish.domain.name());
@@ -60,20 +63,41 @@ impl<'a> Report<'a> {
         tell(notice, self.json, &mut self.out, &mut self.notes)
     }
 
-    /// News of the links.
-    pub(crate) fn link(&mut self, news: &News) -> Result<(), End> {
-        let (state, message) = match news {
-            News::Up => ("up", None),
-            News::Down => ("down", None),
-            News::Failing(why) => ("failing", Some(why.as_str())),
+    /// Nobody is connected yet, and it goes on trying.
+    pub(crate) fn waiting(&mut self, options: &BridgeOptions) -> Result<(), End> {
+        let message = match &options.connect[..] {
+            [] => "waits for the routers that --config names".to_owned(),
+            routers => format!("waits for a router: {}", routers.join(", ")),
         };
         if self.json {
-            return self.out.json(&Link { class: "bridge_link", state, message });
+            return self.out.json(&Link { message: Some(&message), ..Link::of("waiting") });
         }
-        self.notes.line(|line| match (news, message) {
-            (News::Up, _) => write!(line, "connected"),
-            (News::Down, _) => write!(line, "nobody is connected"),
-            (News::Failing(_), message) => write!(line, "{}", message.unwrap_or_default()),
+        self.notes.line(|line| write!(line, "{message}"))
+    }
+
+    /// News of the links.
+    pub(crate) fn link(&mut self, news: &News) -> Result<(), End> {
+        let News::Failing(words) = news else {
+            let is_up = *news == News::Up;
+            if is_up {
+                self.told.clear();
+            }
+            if self.json {
+                return self.out.json(&Link::of(if is_up { "up" } else { "down" }));
+            }
+            let words = if is_up { "connected" } else { "nobody is connected" };
+            return self.notes.line(|line| write!(line, "{words}"));
+        };
+        let known = Diagnosis::of(words);
+        if self.json {
+            let (finding, remedy) = (known.map(|known| known.finding), known.map(|known| known.remedy));
+            return self.out.json(&Link { message: Some(words), finding, remedy, ..Link::of("failing") });
+        }
+        let new = known.filter(|known| !self.told.contains(known));
+        self.told.extend(new);
+        self.notes.line(|line| match new {
+            Some(Diagnosis { finding, remedy }) => write!(line, "{finding}: {words}\n  {remedy}"),
+            None => write!(line, "{words}"),
         })
     }
 
@@ -102,4 +126,15 @@ struct Link<'a> {
     class: &'static str,
     state: &'static str,
     message: Option<&'a str>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    finding: Option<&'static str>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    remedy: Option<&'static str>,
+}
+
+impl Link<'_> {
+    /// As long as nothing else is said.
+    fn of(state: &'static str) -> Self {
+        Link { class: "bridge_link", state, message: None, finding: None, remedy: None }
+    }
 }

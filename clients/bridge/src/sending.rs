@@ -149,12 +149,18 @@ impl Handing {
             shared.outgoing().again(address.sensor, address.topic, now()).map(<[u8]>::to_vec)
         })?;
         let mut bytes = Vec::new();
-        let mut end_at = None;
+        let (mut end_at, mut is_announced) = (None, false);
         loop {
             if is_over.load(Ordering::Relaxed) {
                 let end_at = *end_at.get_or_insert_with(|| Instant::now() + LAST);
-                if !self.waiting.outgoing().is_waiting() || Instant::now() >= end_at {
+                let is_done = !self.waiting.outgoing().is_waiting();
+                if is_done && is_announced || Instant::now() >= end_at {
                     return Ok(());
+                }
+                // How many were sent is the last word, behind all that was.
+                if is_done {
+                    self.waiting.outgoing().announce(now(), &mut Nowhere);
+                    is_announced = true;
                 }
             }
             self.look(engine)?;

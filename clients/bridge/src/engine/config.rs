@@ -1,7 +1,6 @@
 //! What Zenoh is told: the routers and places that the user named, in what its own configuration file says, and limits where
 //! that says nothing. Nothing listens, nothing is looked for, unless somebody said so. Refuses to know when it is opened.
 
-use std::fs::File;
 use std::path::Path;
 
 use schema::regular;
@@ -9,6 +8,7 @@ use schema::{Failure, Kind};
 use zenoh::Config;
 use zenoh::config::{EndPoint, WhatAmI};
 
+use super::certificate::{Unusable, check_key, check_own, check_trusted};
 use super::log::without_places;
 use crate::BridgeOptions;
 
@@ -41,21 +41,30 @@ const LIMITS: &[(&str, &str)] = &[
 ];
 
 /// Files that Zenoh opens when it connects, and not before.
-const FILES: &[&str] = &[
-    "transport/link/tls/root_ca_certificate",
-    "transport/link/tls/listen_certificate",
-    "transport/link/tls/listen_private_key",
-    "transport/link/tls/connect_certificate",
-    "transport/link/tls/connect_private_key",
-    "transport/auth/usrpwd/dictionary_file",
+const FILES: &[(&str, Content)] = &[
+    ("transport/link/tls/root_ca_certificate", Content::Trusted),
+    ("transport/link/tls/listen_certificate", Content::Own),
+    ("transport/link/tls/listen_private_key", Content::Key),
+    ("transport/link/tls/connect_certificate", Content::Own),
+    ("transport/link/tls/connect_private_key", Content::Key),
+    ("transport/auth/usrpwd/dictionary_file", Content::Users),
 ];
 
+/// What is in a file.
+#[derive(Clone, Copy)]
+enum Content {
+    Trusted,
+    Own,
+    Key,
+    Users,
+}
+
 impl Prepared {
-    /// Reads what `options` say.
+    /// Reads what `options` say, `now_s` seconds after 1970.
     ///
-    /// [`Kind::Input`] if the file is missing or unreadable, [`Kind::Configuration`] if it or an address cannot be, or if neither
-    /// a router nor a place to listen is named.
-    pub(crate) fn read(options: &BridgeOptions) -> Result<Prepared, Failure> {
+    /// [`Kind::Input`] if the file is missing or unreadable, [`Kind::Configuration`] if it or an address cannot be, if neither
+    /// a router nor a place to listen is named, or if a certificate has expired.
+    pub(crate) fn read(options: &BridgeOptions, now_s: i64) -> Result<Prepared, Failure> {
         let mut config = options.config.as_deref().map_or_else(|| Ok(Config::default()), read)?;
         let unsaid = Config::default();
         let is_said = |config: &Config, key: &str| config.get_json(key).ok() != unsaid.get_json(key).ok();
@@ -87,8 +96,8 @@ impl Prepared {
             let list: Vec<_> = endpoints.iter().map(|endpoint| format!("{endpoint:?}")).collect();
             set(&mut config, key, &format!("[{}]", list.join(",")));
         }
-        for key in FILES {
-            check_file(&config, key)?;
+        for &(key, content) in FILES {
+            check_file(&config, key, content, now_s)?;
         }
         Ok(Prepared { config, listens })
     }
@@ -145,18 +154,29 @@ fn checked(flag: &str, texts: &[String]) -> Result<Vec<String>, Failure> {
     texts.iter().map(check).collect()
 }
 
-fn check_file(config: &Config, key: &str) -> Result<(), Failure> {
+fn check_file(config: &Config, key: &str, content: Content, now_s: i64) -> Result<(), Failure> {
     let said = config.get_json(key).ok().and_then(|said| serde_json::from_str::<Option<String>>(&said).ok());
     let Some(path) = said.flatten() else { return Ok(()) };
-    File::open(&path).map(drop).map_err(|error| {
-        let what = format!("{key}: cannot read {path}: {error}");
-        Failure::new(Kind::Configuration, what, "see --config")
-    })
+    let refuse = |why: String, remedy: &str| {
+        Failure::new(Kind::Configuration, format!("{key}: {path}: {why}"), remedy)
+    };
+    let text = regular::read(Path::new(&path), regular::LONGEST)
+        .map_err(|error| refuse(format!("cannot read it: {error}"), "see --config"))?;
+    match content {
+        Content::Trusted => check_trusted(&text, now_s),
+        Content::Own => check_own(&text, now_s),
+        Content::Key => check_key(&text),
+        Content::Users => Ok(()),
+    }
+    .map_err(|Unusable { why, remedy }| refuse(why, remedy))
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    /// Of no matter here: what certificates say of time is checked beside them.
+    const NOW_S: i64 = 0;
 
     fn options(connect: &[&str], listen: &[&str], config: Option<&Path>) -> BridgeOptions {
         let texts = |all: &[&str]| all.iter().map(|&text| text.to_owned()).collect();
@@ -179,25 +199,25 @@ mod tests {
     fn of_file(name: &str, text: &str, connect: &[&str]) -> Result<Prepared, Failure> {
         let path = std::env::temp_dir().join(format!("scanhub-bridge-{}-{name}", std::process::id()));
         std::fs::write(&path, text).unwrap();
-        let read = Prepared::read(&options(connect, &[], Some(&path)));
+        let read = Prepared::read(&options(connect, &[], Some(&path)), NOW_S);
         std::fs::remove_file(&path).unwrap();
         read
     }
 
     #[test]
     fn nothing_listens_or_is_looked_for_unless_it_was_said() {
-        let client = Prepared::read(&options(&["tcp/127.0.0.1:7447"], &[], None)).unwrap();
+        let client = Prepared::read(&options(&["tcp/127.0.0.1:7447"], &[], None), NOW_S).unwrap();
         assert_eq!(said(&client, "mode"), r#""client""#);
         assert_eq!(said(&client, "listen/endpoints"), "[]");
         assert_eq!(said(&client, "connect/endpoints"), r#"["tcp/127.0.0.1:7447"]"#);
-        let router = Prepared::read(&options(&[], &["tcp/127.0.0.1:0"], None)).unwrap();
+        let router = Prepared::read(&options(&[], &["tcp/127.0.0.1:0"], None), NOW_S).unwrap();
         assert_eq!((said(&router, "mode"), router.listens()), (r#""router""#.into(), true));
         for prepared in [&client, &router] {
             for (key, value) in LIMITS.iter().filter(|(key, _)| *key != "connect/retry") {
                 assert_eq!(said(prepared, key), *value, "{key}");
             }
         }
-        let nobody = Prepared::read(&options(&[], &[], None)).unwrap_err();
+        let nobody = Prepared::read(&options(&[], &[], None), NOW_S).unwrap_err();
         assert!(nobody.kind == Kind::Configuration && nobody.hint.contains("--listen"), "{nobody}");
     }
 
@@ -219,7 +239,7 @@ mod tests {
     #[test]
     fn what_cannot_be_is_refused_by_its_place() {
         let kind = |read: Result<Prepared, Failure>| read.map(drop).map_err(|failure| failure.kind);
-        let missing = Prepared::read(&options(&[], &[], Some(Path::new("/nowhere/zenoh.json5"))));
+        let missing = Prepared::read(&options(&[], &[], Some(Path::new("/nowhere/zenoh.json5"))), NOW_S);
         assert_eq!(kind(missing), Err(Kind::Input));
         for text in ["{ mode: 'king' }", "{ mode: ", "{ no_such_key: 1 }"] {
             let failure = of_file("wrong", text, &["tcp/10.0.0.1:1"]).unwrap_err();
@@ -230,7 +250,7 @@ mod tests {
         }
         for address in ["nonsense", "udp/10.0.0.1:1", "quic/10.0.0.1:1", ""] {
             assert_eq!(
-                kind(Prepared::read(&options(&[address], &[], None))),
+                kind(Prepared::read(&options(&[address], &[], None), NOW_S)),
                 Err(Kind::Configuration),
                 "{address}"
             );

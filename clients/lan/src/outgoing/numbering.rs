@@ -3,7 +3,7 @@
 //! datagrams go.
 
 use schema::Topic;
-use schema::datagram::{Announce, HEAD, Head, MAC, MTU_ETHERNET, PARTS, group};
+use schema::datagram::{Announce, Announced, HEAD, Head, MAC, MTU_ETHERNET, PARTS, group};
 
 use super::slots::Slots;
 use crate::{Key, Stamp};
@@ -117,6 +117,27 @@ impl Rows {
         let numbered = self.rows.iter().enumerate().filter(|(_, row)| **row != Row::default());
         numbered.map(|(number, row)| (Topic::of_number(number as u8), row))
     }
+
+    /// Writes the `payload` that waited behind `head` to the start of `room`; returns its length. An announcement says what
+    /// is so now: with the numbers of when it began to wait, who comes late would take for lost what was sent before.
+    fn write(&self, head: &Head, payload: &[u8], room: &mut [u8]) -> Option<usize> {
+        if head.topic == Announce::NUMBER {
+            return self.renewed(&Announce::unpack(payload)?).pack(room);
+        }
+        room.get_mut(..payload.len())?.copy_from_slice(payload);
+        Some(payload.len())
+    }
+
+    /// The announcement `said`, with the numbers as they are now.
+    fn renewed(&self, said: &Announce) -> Announce {
+        let mut announce = Announce::new(said.boot, said.sensor(), said.kind());
+        for topic in said.topics() {
+            let row = self.rows.get(usize::from(topic.topic)).copied().unwrap_or_default();
+            announce.add(Announced { next: row.next(), ..*topic });
+            announce.add_replaced(row.replaced);
+        }
+        announce
+    }
 }
 
 impl Numbering {
@@ -153,10 +174,11 @@ impl Numbering {
     pub(super) fn hand(&mut self) -> Option<Handed<'_>> {
         let Waiting { slots, last } = self.waiting.as_mut()?;
         let (head, payload) = slots.take()?;
-        let row = self.sensors.get_mut(usize::from(head.sensor))?.rows.get_mut(usize::from(head.topic))?;
+        let rows = self.sensors.get_mut(usize::from(head.sensor))?;
+        let len = rows.write(&head, payload, &mut self.buffer[HEAD..])?;
+        let row = rows.rows.get_mut(usize::from(head.topic))?;
         let head = Head { hub: self.hub, epoch: self.epoch, sequence: row.next(), ..head };
-        self.buffer.get_mut(HEAD..HEAD + payload.len())?.copy_from_slice(payload);
-        let datagram = head.seal(&mut self.buffer, payload.len())?;
+        let datagram = head.seal(&mut self.buffer, len)?;
         row.sent += 1;
         row.bytes += datagram.len() as u64;
         let topic = Topic::of_number(head.topic);
@@ -185,8 +207,8 @@ impl Numbering {
         // Announcements and statuses say when they are sent.
         let is_old = topic == Some(Topic::Background);
         let head = Head { stamp_ns: if is_old { head.stamp_ns } else { now.wall_ns }, ..*head };
-        self.buffer.get_mut(HEAD..HEAD + payload.len())?.copy_from_slice(payload);
-        head.seal(&mut self.buffer, payload.len())
+        let len = self.sensors[sensor].write(&head, payload, &mut self.buffer[HEAD..])?;
+        head.seal(&mut self.buffer, len)
     }
 
     /// What was handed on as this sensor's and topic's last sample, of so many bytes, was not taken.

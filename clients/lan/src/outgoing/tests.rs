@@ -3,7 +3,7 @@
 use std::num::NonZeroU64;
 use std::time::Duration;
 
-use schema::datagram::{Announce, Datagram, HEAD, Head, MTU_LEAST, MTU_SAFE};
+use schema::datagram::{Announce, Datagram, HEAD, Head, MTU_LEAST, MTU_SAFE, StreamStats};
 use schema::{Background, BackgroundHead, Flags, Header, Status, Topic, Verdict, Zones};
 
 use super::{Form, Outgoing, PayloadRef, Sample, Transmit};
@@ -254,4 +254,53 @@ fn parts_with_a_key_have_each_a_mac_and_together_the_sample() {
         }
     }
     assert!(whole == telegram && taken.datagrams.len() == 1 + 2000_usize.div_ceil(MTU_LEAST - HEAD - 16));
+}
+
+/// Sends zones over a way where they wait.
+fn wait(out: &mut Outgoing, sensor: usize, seq: u64) {
+    assert_eq!(send(out, sensor, Some(header(1, 0, seq)), Verdict::Clear), []);
+}
+
+/// What waits, in its order.
+fn handed(out: &mut Outgoing) -> Vec<Vec<u8>> {
+    let mut all = Vec::new();
+    while let Some(handed) = out.hand() {
+        all.push(handed.datagram.to_vec());
+    }
+    all
+}
+
+/// Zones that are received and lost of what comes to somebody who heard nothing before.
+fn heard(datagrams: &[&[u8]]) -> (u64, u64) {
+    let mut stats = StreamStats::new(&Topic::ALL);
+    for bytes in datagrams {
+        stats.receive(bytes, 1, 0).expect("a datagram");
+    }
+    let zones = stats.rows().find(|row| row.topic == ZONES);
+    zones.map_or((0, 0), |row| (row.received, row.lost()))
+}
+
+#[test]
+fn who_comes_late_counts_nothing_that_came_before() {
+    let mut out = Outgoing::waiting(7, 9);
+    let front = out.follow("front", each);
+    for seq in 0..100 {
+        wait(&mut out, front, seq);
+        handed(&mut out);
+    }
+    // Zones wait, and then the announcement, so that they have a number before it goes out.
+    wait(&mut out, front, 100);
+    out.announce(at(0), &mut Taken::default());
+    let [_, announced] = &handed(&mut out)[..] else { panic!("zones and an announcement") };
+    for seq in 101..110 {
+        wait(&mut out, front, seq);
+        handed(&mut out);
+    }
+    let asked = out.again("front", None, at(900)).expect("it was announced").to_vec();
+    wait(&mut out, front, 110);
+    let [zones] = &handed(&mut out)[..] else { panic!("zones") };
+    assert_eq!(heard(&[&asked, zones]), (1, 0), "the answer says what is so now");
+    assert_eq!(heard(&[announced, zones]), (1, 9), "nine were sent since it was announced");
+    assert_eq!(heard(&[announced, &asked, zones]), (1, 9), "it was sent before, with the same number");
+    assert_eq!(heard(&[&asked, announced, zones]), (1, 0), "in whichever order they come");
 }

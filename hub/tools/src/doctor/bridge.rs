@@ -7,10 +7,9 @@ use std::process::{Command, Stdio};
 use serde::Deserialize;
 
 use super::finding::Finding;
+use crate::bridge_program::{PROGRAM, find, places};
 
 const NAME: &str = "bridge";
-/// The program.
-const PROGRAM: &str = "scanhub-bridge";
 
 /// How a bridge would connect.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
@@ -38,44 +37,10 @@ pub(crate) fn bridge(bridge: &Bridge) -> Vec<Finding> {
         return vec![Finding::skipped(NAME, "no router is named; --bridge tcp/HOST:7447 does")];
     }
     let places = if bridge.places.is_empty() { places() } else { bridge.places.clone() };
-    let Some(program) = places.iter().map(|place| place.join(PROGRAM)).find(|path| path.is_file()) else {
-        let remedy = "in the sources: cargo install --path clients/bridge";
-        return vec![Finding::failed(NAME, format!("{PROGRAM} is not installed"), remedy)];
-    };
-    match version(&program) {
-        Ok(version) if version == env!("CARGO_PKG_VERSION") => ask(&program, bridge),
-        Ok(version) => {
-            let found = format!(
-                "{} has version {version}, this program {}",
-                program.display(),
-                env!("CARGO_PKG_VERSION")
-            );
-            vec![Finding::failed(
-                NAME,
-                found,
-                "install both of one version: cargo install --path clients/bridge",
-            )]
-        }
-        Err(why) => {
-            let found = format!("{} does not run: {why}", program.display());
-            vec![Finding::failed(NAME, found, "install it again: cargo install --path clients/bridge")]
-        }
+    match find(&places) {
+        Ok(program) => ask(&program, bridge),
+        Err(failure) => vec![Finding::failed(NAME, failure.message, failure.hint)],
     }
-}
-
-/// Beside this program, and where the shell looks.
-fn places() -> Vec<PathBuf> {
-    let beside = std::env::current_exe().ok().and_then(|path| path.parent().map(Path::to_owned));
-    let path = std::env::var_os("PATH").unwrap_or_default();
-    beside.into_iter().chain(std::env::split_paths(&path)).collect()
-}
-
-fn version(program: &Path) -> Result<String, String> {
-    let said = Command::new(program).arg("--version").stdin(Stdio::null()).output();
-    let said = said.map_err(|error| error.to_string())?;
-    let text = String::from_utf8_lossy(&said.stdout);
-    let version = text.strip_prefix(PROGRAM).map(str::trim).filter(|_| said.status.success());
-    version.map(str::to_owned).ok_or_else(|| format!("it says {:?}", text.trim()))
 }
 
 /// What the program finds when it connects.
