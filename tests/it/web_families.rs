@@ -1,10 +1,13 @@
 //! Sensors of every family and form in one picture: equal beams and exact angles, upside down, fields that overlap, and those
 //! of other machines. Where the page draws points is compared with where the hub's scans and poses put them.
 
+use std::thread;
+use std::time::{Duration, Instant};
+
 use serde_json::Value;
 
 use crate::browser::{Browser, Look};
-use crate::testkit::{Sender, TestEnv, in_a_network, number, until};
+use crate::testkit::{INT, PATIENCE, Sender, TestEnv, in_a_network, number, until};
 use crate::web::web;
 use crate::web_page::browse;
 use schema::{Pose, Scan, ScanHead, State, Status, Topic, Verdict, Zones};
@@ -66,15 +69,13 @@ fn every_form_is_drawn_where_it_sees() {
         ("top", Pose::default()),
     ];
     for (sensor, pose) in poses {
-        let outcome = env.run(&["echo", "--json", "-n", "1", &format!("{sensor}/scan")]);
-        let scan = outcome.of_class("scan").pop().unwrap_or_else(|| panic!("no scan: {outcome}"));
-        let wanted = measured(&scan, &pose);
-        assert!(wanted.len() > 300, "{sensor}: {}", wanted.len());
-        // On a busy machine a scan that is too old to be shown is gone for a moment.
+        // On a busy machine the scan of a moment may have holes, and one that is too old to be shown is gone.
         until(&format!("{sensor} stands where it sees"), || {
-            let seen = drawn(&mut page, sensor);
+            let outcome = env.run(&["echo", "--json", "-n", "1", &format!("{sensor}/scan")]);
+            let scan = outcome.of_class("scan").pop().unwrap_or_else(|| panic!("no scan: {outcome}"));
+            let (wanted, seen) = (measured(&scan, &pose), drawn(&mut page, sensor));
             let is_there = |(x, y): &&(f64, f64)| seen.iter().any(|(a, b)| (a - x).hypot(b - y) < 0.1);
-            wanted.iter().filter(is_there).count() * 100 >= wanted.len() * 97
+            wanted.len() > 300 && wanted.iter().filter(is_there).count() * 100 >= wanted.len() * 97
         });
     }
     assert!(page.complaints.is_empty(), "{:?}", page.complaints);
@@ -88,34 +89,39 @@ fn sensors_of_other_machines_stand_in_the_list_and_not_on_this_robot() {
         let mut sender = Sender::new(0x5f3a_12bc_00d1_e2f3, 7, 3, "front");
         let words = ["listen", "--json", "--publish", "--name=robot1=5f3a12bc00d1e2f3"];
         let mut listener = env.start(&words).ready();
-        sender.announce(&[Topic::Zones, Topic::Scan, Topic::Status]);
+        let said = [Topic::Zones, Topic::Scan, Topic::Status];
+        sender.announce(&said);
         listener.await_line("a sensor", |line| line["kind"] == "published");
-        let _lms = env.simulator(&["rear"], &["--seed=7", "--baud=500000"]);
+        // Nothing in this hall comes near.
+        let world = format!("--world={}", env.file("world", HALL));
+        let _lms = env.simulator(&["rear"], &["--seed=7", "--baud=500000", &world]);
         let _hub = env.hub(&[env.link("rear")]);
         let (_server, host) = web(&env, &[]);
         page.open(&format!("http://{host}/"));
         page.await_true("window.scanhub?.points('rear').length === 722");
-        // It says something now and then, as remote ones do.
         let scan = Scan::of(ScanHead::lms(181, -90_000, 1000, 1, 13), &[2000; 181]);
+        // It announces itself and says something all the time, as remote ones do: however long the rest took, it is there
+        // again.
         let mut say = |page: &mut Browser, wanted: &str| {
-            let begun = std::time::Instant::now();
+            let begun = Instant::now();
             while page.ask(wanted) != Value::Bool(true) {
-                assert!(begun.elapsed() < crate::testkit::PATIENCE, "{wanted}");
+                assert!(begun.elapsed() < PATIENCE, "{wanted}");
+                sender.announce(&said);
                 sender.send(Topic::Status, &Status { state: State::Streaming as u8, ..Status::default() });
                 sender.send(Topic::Scan, &*scan);
                 sender.send(Topic::Zones, &Zones { verdict: Verdict::Stop as u8, ..Zones::unknown() });
-                std::thread::sleep(std::time::Duration::from_millis(30));
+                thread::sleep(Duration::from_millis(30));
             }
         };
         let card = "[...document.querySelectorAll('#sensors h2')].some((one) => /robot1\\.front/.test(one.innerText))";
         say(&mut page, card);
         say(&mut page, "scanhub.points('robot1.front').length === 362");
-        assert_eq!(page.ask("scanhub.beams <= 361"), true, "it sits on another robot");
-        assert_ne!(page.ask("scanhub.verdict"), "stop", "and says nothing of this one");
+        // It sits on another robot, and says nothing of this one.
+        say(&mut page, "scanhub.beams > 300 && scanhub.beams <= 361 && scanhub.verdict === 'clear'");
         let number = "[...document.querySelectorAll('#sensors button')].find((one) => /robot1/.test(one.innerText)).click()";
         page.ask(number);
         say(&mut page, "scanhub.beams === 181");
-        let outcome = listener.end(crate::testkit::INT);
+        let outcome = listener.end(INT);
         assert_eq!(outcome.code, Some(0), "{outcome}");
     });
 }

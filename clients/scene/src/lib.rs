@@ -14,7 +14,7 @@ use schema::Pose;
 
 pub use circles::{Circle, circles};
 pub use meter::Meter;
-pub use read_out::{Reading, read_out};
+pub use read_out::{Place, Reading};
 pub use scene::{Scene, Sensor, verdict};
 pub use trail::Trail;
 pub use trouble::Trouble;

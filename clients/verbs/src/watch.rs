@@ -28,6 +28,7 @@ use crate::picture;
 use crate::receive_stats::ReceiveStats;
 use crate::work::Work;
 use hub_requests::HubRequests;
+use keys::Key;
 use scene::Scene;
 use screen::{News, Screen};
 use view::{View, Wish};
@@ -99,8 +100,10 @@ impl Watcher<'_> {
     fn listen(&mut self, now: Instant) -> Result<(), End> {
         while let Some(news) = self.screen.news()? {
             self.changed = true;
-            // A person who types waits for the answer.
-            self.draw_at = now;
+            // A person who types waits for the answer; a mouse says more than can be drawn.
+            if !matches!(news, News::Key(Key::Point(..))) {
+                self.draw_at = now;
+            }
             let News::Key(key) = news else { continue };
             let wish = self.view.key(key, &self.scene);
             if !self.view.lines {
@@ -142,7 +145,8 @@ impl Watcher<'_> {
     fn draw(&mut self, now: Instant) -> Result<(), End> {
         let (scene, held, view) = (&self.scene, self.held.as_ref(), &mut self.view);
         let bytes = self.screen.draw(|frame| {
-            view.fit(held.unwrap_or(scene), draw::dots(frame.area(), scene));
+            view.map = draw::place_of_map(frame.area(), scene);
+            view.fit(held.unwrap_or(scene));
             draw::draw(frame, scene, held, view);
         })?;
         self.changed = false;

@@ -780,6 +780,9 @@ function resize() {
 
 // ---------------------------------------------------------------- words
 
+/** So many digits behind the point; what rounds to nothing has no sign. */
+const fixed = (value, digits) => value.toFixed(digits).replace(/^-(?=[0.]*$)/, "");
+
 /** What is under the pointer: a point of a scan, or a place. */
 function readOut() {
   const box = $("readout");
@@ -796,14 +799,17 @@ function readOut() {
     }
   }
   const [x, y] = best.at ?? toRobot(...pointer);
-  const place = `x ${x.toFixed(2)}  y ${y.toFixed(2)} m`;
   const bold = document.createElement("b");
-  bold.textContent = `${Math.hypot(x, y).toFixed(2)} m from the robot`;
-  if (!best.sensor) return box.replaceChildren(bold, `\n${place}`);
-  const { scan, name } = best.sensor;
-  const angle = ((scan.first + best.beam * scan.step) * 180) / Math.PI;
-  const intensity = scan.byShade.length ? `, intensity ${scan.intensities[best.beam]}` : "";
-  box.replaceChildren(bold, `\n${place}\n${name}: ${angle.toFixed(2)}°, ${scan.ranges[best.beam].toFixed(3)} m${intensity}`);
+  bold.textContent = `${fixed(Math.hypot(x, y), 2)} m from the robot`;
+  const lines = [bold, `\nx ${fixed(x, 2)}  y ${fixed(y, 2)} m`];
+  if (best.sensor) {
+    const { scan, name } = best.sensor;
+    const angle = ((scan.first + best.beam * scan.step) * 180) / Math.PI;
+    lines.push(`\n${name}: ${fixed(angle, 2)}\u00b0, ${fixed(scan.ranges[best.beam], 3)} m`);
+    if (scan.byShade.length) lines.push(`, intensity ${scan.intensities[best.beam]}`);
+  }
+  box.replaceChildren(...lines);
+  if (!best.sensor) return;
   pen.strokeStyle = colours.accent;
   pen.lineWidth = 2;
   pen.beginPath();
@@ -853,7 +859,6 @@ function tell() {
   explain();
 }
 
-/** Why the picture is empty, and what to do. */
 function clock(seconds) {
   const [minutes, rest] = [Math.floor(seconds / 60), seconds % 60];
   return `${minutes}:${rest.toFixed(1).padStart(4, "0")}`;
@@ -876,6 +881,7 @@ function tellPlayer() {
   for (const one of box.querySelectorAll("button")) one.disabled = over || !isOpen;
 }
 
+/** Why the picture is empty, and what to do. */
 function explain() {
   let trouble = null;
   if (!isOpen) trouble = { what: "No connection to scanhub web", remedy: "It ended, or the network between is cut. This page tries again by itself." };

@@ -6,8 +6,9 @@ use serde::{Deserialize, Serialize};
 use crate::board::Channel;
 use crate::playback::Order;
 
-/// The subprotocol of the WebSocket.
-pub(crate) const PROTOCOL: &str = "foxglove.sdk.v1";
+/// The subprotocols of the WebSocket, the preferred one first. The second is the name of the first before Foxglove had an SDK;
+/// clients that know that name alone (npm's `@foxglove/ws-protocol`, older ones of Lichtblick) say and hear the same.
+pub(crate) const PROTOCOLS: [&str; 2] = ["foxglove.sdk.v1", "foxglove.websocket.v1"];
 
 /// What the server says first.
 pub(crate) fn server_info(session: &str) -> String {

@@ -6,6 +6,7 @@
 mod board;
 mod door;
 mod foxglove;
+mod guest;
 pub mod messages;
 mod page;
 mod playback;
@@ -16,4 +17,4 @@ mod viewer;
 pub use board::{Board, Channel, ChannelId};
 pub use door::Door;
 pub use playback::{Order, Playback, Progress};
-pub use server::{Event, Server, VIEWERS};
+pub use server::{Event, Server, VIEWERS, Visit};

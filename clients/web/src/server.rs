@@ -1,40 +1,47 @@
 //! The one thread that serves all viewers: it takes connections, answers their requests, and sends what is new. It sleeps
 //! until something happens. Refuses to know what is sent.
 
-use std::io::{self, Read, Write};
-use std::net::{SocketAddr, TcpListener, TcpStream};
-use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
+use std::io;
+use std::net::{SocketAddr, TcpListener};
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::Sender;
-use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
+use std::time::{Duration, Instant};
 
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::io::Errno;
 use rustix::net::sockopt::set_socket_send_buffer_size;
+use rustix::rand::{GetRandomFlags, getrandom};
 use schema::{Failure, Kind};
 
 use crate::board::Board;
 use crate::door::{Door, Refusal};
-use crate::foxglove::PROTOCOL;
+use crate::foxglove::PROTOCOLS;
+use crate::guest::{Guest, House};
 use crate::page::Page;
 use crate::playback::Playback;
-use crate::request::{LONGEST, Request, answer, upgrade, words};
-use crate::viewer::{Gone, Viewer};
+use crate::request::{Request, answer, words};
 
 /// The most viewers at a time.
 pub const VIEWERS: usize = 32;
 /// The most connections, with those that only fetch the page.
 const CONNECTIONS: usize = 64;
-/// So long a request may take, and its answer, over a slow line.
-const REQUEST_TIME: Duration = Duration::from_secs(10);
-const ANSWER_TIME: Duration = Duration::from_secs(60);
 /// Where a port is taken, so many after it are tried.
 const PORTS: u16 = 20;
 /// What the kernel keeps for a viewer who is slow grows old there.
 const SEND_BUFFER: usize = 64 << 10;
 
+/// What happened at the door.
+#[derive(Debug)]
+pub enum Event {
+    /// A viewer came or went.
+    Viewer(Visit),
+    /// Nobody can be let in, because the system is short of something; told every ten seconds while that lasts.
+    Short(io::Error),
+}
+
 /// A viewer came or went.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Event {
+pub struct Visit {
     /// Where he is.
     pub address: SocketAddr,
     /// He came; else he went.
@@ -96,38 +103,37 @@ impl Server {
         stop: &AtomicBool,
     ) -> Result<(), Failure> {
         let mut guests: Vec<Guest> = Vec::new();
-        let house = House { server: self, board, player, session: session() };
-        // Where no descriptor is left, whoever is at the door waits for a while: he would not let this thread sleep.
-        let mut closed_until = None;
+        let house = House { server: self, board, player, session: session()? };
+        let mut shortage = Shortage::default();
         while !stop.load(Ordering::Relaxed) {
-            let (is_new, ready) = self.wait(board, &guests, closed_until)?;
+            let (is_new, ready) = self.wait(board, &guests, shortage.until)?;
             board.rang();
             let now = Instant::now();
-            closed_until = closed_until.filter(|until| now < *until);
-            let mut viewers = guests.iter().filter(|guest| matches!(guest.stage, Stage::Viewer(_))).count();
+            shortage.until = shortage.until.filter(|until| now < *until);
+            let mut viewers = guests.iter().filter(|guest| guest.is_viewer()).count();
             for (guest, is_ready) in guests.iter_mut().zip(ready) {
-                let was_viewer = matches!(guest.stage, Stage::Viewer(_));
-                let served = guest.serve(&house, is_ready, viewers, now);
-                guest.is_gone = served.is_err();
-                let skipped = match &mut guest.stage {
-                    Stage::Viewer(viewer) => {
-                        if guest.is_gone {
-                            viewer.leave(board);
-                        }
-                        viewer.skipped()
-                    }
-                    _ => continue,
-                };
-                if was_viewer != guest.is_gone {
+                let was_viewer = guest.is_viewer();
+                guest.is_gone = guest.serve(&house, is_ready, viewers, now).is_err();
+                let (address, is_gone) = (guest.address, guest.is_gone);
+                let Some(viewer) = guest.viewer() else { continue };
+                if is_gone {
+                    viewer.leave(board);
+                }
+                if was_viewer != is_gone {
                     continue;
                 }
                 // A viewer who went, or somebody who became one.
-                viewers = if guest.is_gone { viewers - 1 } else { viewers + 1 };
-                let _ = events.send(Event { address: guest.address, came: !guest.is_gone, skipped, viewers });
+                viewers = if is_gone { viewers - 1 } else { viewers + 1 };
+                let visit = Visit { address, came: !is_gone, skipped: viewer.skipped(), viewers };
+                let _ = events.send(Event::Viewer(visit));
             }
             guests.retain(|guest| !guest.is_gone);
-            if is_new && self.take(&mut guests, now).is_err() {
-                closed_until = Some(now + SHORTAGE);
+            if let Some(Err(error)) = is_new.then(|| self.take(&mut guests, now)) {
+                shortage.until = Some(now + SHORTAGE);
+                if shortage.tell_at.is_none_or(|at| now >= at) {
+                    shortage.tell_at = Some(now + TELL_EVERY);
+                    let _ = events.send(Event::Short(error));
+                }
             }
         }
         Ok(())
@@ -143,9 +149,9 @@ impl Server {
         let bell = board.bell();
         let door = if closed_until.is_none() { PollFlags::IN } else { PollFlags::empty() };
         let mut ends = vec![PollFd::new(&self.listener, door), PollFd::new(&bell, PollFlags::IN)];
-        for guest in guests {
-            ends.push(PollFd::new(guest.stream(), guest.waits_for()));
-        }
+        ends.extend(
+            guests.iter().filter_map(Guest::waits_for).map(|(stream, flags)| PollFd::new(stream, flags)),
+        );
         let wake_at = guests.iter().filter_map(Guest::wake_at).chain(closed_until).min();
         let left = wake_at.map_or(IDLE, |at| at.saturating_duration_since(Instant::now()).min(IDLE));
         let left = Timespec { tv_sec: left.as_secs() as i64, tv_nsec: i64::from(left.subsec_nanos()) };
@@ -157,7 +163,10 @@ impl Server {
             }
         }
         let is_ready = |end: &PollFd<'_>| !end.revents().is_empty();
-        Ok((is_ready(&ends[0]), ends[2..].iter().map(is_ready).collect()))
+        let mut told = ends[2..].iter().map(is_ready);
+        let of_guest = |guest: &Guest| guest.waits_for().is_some() && told.next() == Some(true);
+        let ready = guests.iter().map(of_guest).collect();
+        Ok((is_ready(&ends[0]), ready))
     }
 
     /// Lets in who is at the door; an error if the system is short of something.
@@ -175,148 +184,60 @@ impl Server {
             }
             // Whoever is too many is shut out before he costs anything; but whoever says nothing keeps nobody out.
             if guests.len() >= CONNECTIONS {
-                let silent = guests.iter().position(|guest| matches!(guest.stage, Stage::Request { .. }));
-                let Some(silent) = silent else { continue };
+                let Some(silent) = guests.iter().position(Guest::is_silent) else { continue };
                 guests.remove(silent);
             }
             let _ = stream.set_nodelay(true);
             let _ = set_socket_send_buffer_size(&stream, SEND_BUFFER);
-            let stage = Stage::Request { stream, head: Vec::new(), until: now + REQUEST_TIME };
-            guests.push(Guest { address, stage, is_gone: false });
+            guests.push(Guest::new(stream, address, now));
         }
     }
 
-    /// What a whole request gets; nothing if it becomes a viewer's socket.
-    fn answer(&self, request: &Request, viewers: usize) -> Option<Vec<u8>> {
+    /// What a whole request gets, where there are so many viewers.
+    pub(crate) fn reply<'a>(&self, request: &'a Request, viewers: usize) -> Reply<'a> {
         if let Err(refusal) = self.door.check(&request.caller()) {
             let status = match refusal {
                 Refusal::Token => "401 Unauthorized",
                 Refusal::Host | Refusal::Origin => "403 Forbidden",
             };
-            return Some(words(status, refusal.words()));
+            return Reply::Whole(words(status, refusal.words()));
         }
         if request.method != "GET" {
-            return Some(words("405 Method Not Allowed", "nothing here can be changed: GET alone"));
+            return Reply::Whole(words("405 Method Not Allowed", "nothing here can be changed: GET alone"));
         }
         if request.path != "/" {
-            return Some(words("404 Not Found", "there is one page: /"));
+            return Reply::Whole(words("404 Not Found", "there is one page: /"));
         }
-        if request.key.is_none() {
+        let Some(key) = &request.key else {
             let policy = self.page.policy(request.caller().host.unwrap_or_default());
-            return Some(answer("200 OK", "text/html", &policy, self.page.body.as_bytes()));
-        }
-        if !request.offers(PROTOCOL) {
-            return Some(words("400 Bad Request", "the socket speaks foxglove.sdk.v1"));
-        }
+            return Reply::Whole(answer("200 OK", "text/html", &policy, self.page.body.as_bytes()));
+        };
+        let Some(protocol) = PROTOCOLS.into_iter().find(|protocol| request.offers(protocol)) else {
+            return Reply::Whole(words("400 Bad Request", "the socket speaks foxglove.sdk.v1"));
+        };
         if viewers >= VIEWERS {
-            return Some(words("503 Service Unavailable", "as many viewers as there may be: close one"));
+            let full = "as many viewers as there may be: close one";
+            return Reply::Whole(words("503 Service Unavailable", full));
         }
-        None
+        Reply::Socket { key, protocol }
     }
 }
 
-/// What all guests are served from.
-struct House<'a> {
-    server: &'a Server,
-    board: &'a Board,
-    player: Option<&'a dyn Playback>,
-    session: String,
+/// What a request gets.
+pub(crate) enum Reply<'a> {
+    /// These bytes, and the connection is closed.
+    Whole(Vec<u8>),
+    /// A WebSocket of this protocol, for the key of the handshake.
+    Socket { key: &'a str, protocol: &'static str },
 }
 
-/// Somebody who is connected.
-struct Guest {
-    address: SocketAddr,
-    stage: Stage,
-    is_gone: bool,
-}
-
-/// How far he came.
-enum Stage {
-    Request { stream: TcpStream, head: Vec<u8>, until: Instant },
-    Answer { stream: TcpStream, bytes: Vec<u8>, at: usize, until: Instant },
-    Viewer(Box<Viewer>),
-}
-
-impl Guest {
-    fn stream(&self) -> &TcpStream {
-        match &self.stage {
-            Stage::Request { stream, .. } | Stage::Answer { stream, .. } => stream,
-            Stage::Viewer(viewer) => viewer.stream(),
-        }
-    }
-
-    fn waits_for(&self) -> PollFlags {
-        match &self.stage {
-            Stage::Request { .. } => PollFlags::IN,
-            Stage::Answer { .. } => PollFlags::OUT,
-            Stage::Viewer(viewer) if viewer.is_pending() => PollFlags::IN | PollFlags::OUT,
-            Stage::Viewer(_) => PollFlags::IN,
-        }
-    }
-
-    fn wake_at(&self) -> Option<Instant> {
-        match &self.stage {
-            Stage::Request { until, .. } | Stage::Answer { until, .. } => Some(*until),
-            Stage::Viewer(viewer) => viewer.wake_at(),
-        }
-    }
-
-    fn serve(&mut self, house: &House<'_>, is_ready: bool, viewers: usize, now: Instant) -> Result<(), Gone> {
-        match &mut self.stage {
-            Stage::Request { until, .. } | Stage::Answer { until, .. } if now >= *until => Err(Gone),
-            Stage::Request { stream, head, .. } if is_ready => {
-                let Some((request, length)) = receive(stream, head)? else { return Ok(()) };
-                let stream = stream.try_clone().map_err(|_| Gone)?;
-                self.stage = match house.server.answer(&request, viewers) {
-                    Some(bytes) => Stage::Answer { stream, bytes, at: 0, until: now + ANSWER_TIME },
-                    None => {
-                        // It fits into the empty buffer of a new connection.
-                        let key = request.key.unwrap_or_default();
-                        (&stream).write_all(&upgrade(&key, PROTOCOL)).map_err(|_| Gone)?;
-                        Stage::Viewer(Box::new(Viewer::new(
-                            stream,
-                            head[length..].to_vec(),
-                            &house.session,
-                            now,
-                        )?))
-                    }
-                };
-                self.serve(house, true, viewers, now)
-            }
-            Stage::Request { .. } => Ok(()),
-            Stage::Answer { stream, bytes, at, .. } => match stream.write(&bytes[*at..]) {
-                Ok(0) => Err(Gone),
-                Ok(written) => {
-                    *at += written;
-                    if *at == bytes.len() { Err(Gone) } else { Ok(()) }
-                }
-                Err(error) if error.kind() == io::ErrorKind::WouldBlock => Ok(()),
-                Err(_) => Err(Gone),
-            },
-            Stage::Viewer(viewer) => {
-                if is_ready || viewer.hears_more() {
-                    viewer.hear(house.board, house.player)?;
-                }
-                viewer.serve(house.board, now)
-            }
-        }
-    }
-}
-
-/// Reads on at a head; the request when it is whole.
-fn receive(stream: &mut TcpStream, head: &mut Vec<u8>) -> Result<Option<(Request, usize)>, Gone> {
-    let mut room = [0; LONGEST];
-    loop {
-        match stream.read(&mut room[..LONGEST - head.len().min(LONGEST)]) {
-            Ok(0) => return Err(Gone),
-            Ok(length) => head.extend(&room[..length]),
-            Err(error) if error.kind() == io::ErrorKind::WouldBlock => return Ok(None),
-            Err(_) => return Err(Gone),
-        }
-        if let Some(request) = Request::parse(head).map_err(|_| Gone)? {
-            return Ok(Some(request));
-        }
-    }
+/// Where no descriptor is left, whoever is at the door waits for a while: he would not let this thread sleep.
+#[derive(Default)]
+struct Shortage {
+    /// Until when the door is not looked at.
+    until: Option<Instant>,
+    /// Before that it is not told again.
+    tell_at: Option<Instant>,
 }
 
 fn cannot(address: SocketAddr, error: &io::Error) -> Failure {
@@ -324,11 +245,18 @@ fn cannot(address: SocketAddr, error: &io::Error) -> Failure {
     Failure::new(Kind::Failed, format!("cannot listen on {address}: {error}"), hint)
 }
 
-/// Of one server: two of them are two, and so are two in one process.
-fn session() -> String {
-    static SERVERS: AtomicU32 = AtomicU32::new(0);
-    let since = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default().as_nanos();
-    format!("{since:x}-{:x}-{:x}", std::process::id(), SERVERS.fetch_add(1, Ordering::Relaxed))
+/// Of one server, and of no other one: time and process id repeat, in containers above all.
+fn session() -> Result<String, Failure> {
+    let mut bytes = [0; 16];
+    match getrandom(&mut bytes, GetRandomFlags::empty()) {
+        Ok(count) if count == bytes.len() => Ok(bytes.iter().map(|byte| format!("{byte:02x}")).collect()),
+        Ok(_) => Err(no_random("too few bytes")),
+        Err(error) => Err(no_random(error)),
+    }
+}
+
+fn no_random(why: impl std::fmt::Display) -> Failure {
+    Failure::new(Kind::Failed, format!("no random numbers: {why}"), "start it again")
 }
 
 /// Errors of a connection, not of the door.
@@ -336,5 +264,7 @@ const PASSING: [io::ErrorKind; 3] =
     [io::ErrorKind::ConnectionAborted, io::ErrorKind::ConnectionReset, io::ErrorKind::Interrupted];
 /// So long nobody is let in where descriptors are short.
 const SHORTAGE: Duration = Duration::from_millis(200);
+/// Between two words about that.
+const TELL_EVERY: Duration = Duration::from_secs(10);
 /// Where nothing happens.
 const IDLE: Duration = Duration::from_secs(1);

@@ -24,12 +24,12 @@ fn what_a_person_asks_for_is_drawn() {
     let front = scene.sensor("front").points().find(|point| point.beam == 180).unwrap();
     let pointing = View { pointer_m: Some((front.x_m - 0.05, front.y_m)), ..View::new(false) };
     let read = text(&screen(&scene, &pointing, (120, 40)));
-    assert!(read.contains("4.20 m from the robot, x 4.20 y 0.00; front 0.00 deg 3.900 m"), "{read}");
+    assert!(read.contains("4.20 m from the robot, x 4.20  y 0.00 m, front: 0.00\u{b0}, 3.900 m"), "{read}");
     let narrow = text(&screen(&scene, &pointing, (60, 20)));
-    assert!(narrow.contains("4.20 m from the robot") && !narrow.contains("front 0.00"), "{narrow}");
+    assert!(narrow.contains("4.20 m from the robot") && !narrow.contains("front: 0.00"), "{narrow}");
     let nowhere = View { pointer_m: Some((1.0, -2.0)), ..View::new(false) };
     let read = text(&screen(&scene, &nowhere, (120, 40)));
-    assert!(read.contains("2.24 m from the robot, x 1.00 y -2.00\n") && read.contains('X'), "{read}");
+    assert!(read.contains("2.24 m from the robot, x 1.00  y -2.00 m\n") && read.contains('X'), "{read}");
 
     let mut lines = Lines { count: 1, corners: 1, ..Lines::default() };
     lines.line_array[0] = Line { x1_m: 1.0, y1_m: -1.0, x2_m: 1.0, y2_m: -3.0, ..Line::default() };

@@ -12,7 +12,7 @@ use schema::Counter;
 use super::counters::page;
 use super::map::{DOTS, colour, map};
 use super::view::View;
-use scene::{Reading, Scene, Sensor, read_out, verdict};
+use scene::{Place, Scene, Sensor, verdict};
 
 /// Draws `scene` as `view` says, with the picture of `held` if that is there: what there is to act on is never held.
 pub(crate) fn draw(frame: &mut Frame<'_>, scene: &Scene, held: Option<&Scene>, view: &View) {
@@ -51,10 +51,9 @@ pub(crate) fn draw(frame: &mut Frame<'_>, scene: &Scene, held: Option<&Scene>, v
     }
 }
 
-/// How many dots the picture has, across and up, on a screen of `area`.
-pub(crate) fn dots(area: Rect, scene: &Scene) -> (f64, f64) {
-    let map = Places::of(area, scene).map;
-    (f64::from(map.width.max(1)) * DOTS.0, f64::from(map.height.max(1)) * DOTS.1)
+/// Where the picture is on a screen of `area`.
+pub(crate) fn place_of_map(area: Rect, scene: &Scene) -> Rect {
+    Places::of(area, scene).map
 }
 
 /// Where things are on the screen.
@@ -186,20 +185,14 @@ fn measure(dot_m: f64) -> String {
 fn words(scene: &Scene, view: &View, room: usize) -> String {
     let Some(at) = view.pointer_m else { return String::new() };
     let shown = view.shown(scene);
-    let read = read_out(shown.iter().map(|(_, sensor)| *sensor), at, NEAR_DOTS * view.dot_m);
-    let (x, y) = read.map_or(at, |reading| (reading.point.x_m, reading.point.y_m));
-    let place = format!("{:.2} m from the robot", x.hypot(y));
-    let mut parts = vec![place, format!(", x {x:.2} y {y:.2}")];
-    if let Some(Reading { sensor, point, angle_rad, range_m }) = read {
-        let angle = angle_rad.to_degrees();
-        parts.push(format!("; {} {angle:.2} deg {range_m:.3} m", sensor.name));
-        parts.extend(point.intensity.map(|intensity| format!(", intensity {intensity}")));
-    }
+    let place = Place::of(shown.iter().map(|(_, sensor)| *sensor), at, NEAR_DOTS * view.dot_m);
     let mut words = String::new();
-    for part in parts {
-        if words.chars().count() + part.chars().count() > room {
+    for part in place.words() {
+        let between = if words.is_empty() { "" } else { ", " };
+        if words.chars().count() + between.len() + part.chars().count() > room {
             break;
         }
+        words += between;
         words += &part;
     }
     words
@@ -234,11 +227,11 @@ const KEYS: &str = "q quit  ? help  +- zoom  x read  n counters  space hold";
 
 /// What keys do, and what signs mean; narrow enough for 60 columns, low enough for 16 rows.
 const HELP: &str = "\
-+ -  arrows hjkl  c   zoom, pan, all of it
++ - wheel, hjkl, c    zoom, pan, all of it
 tab  0 1 2 ..         next sensor, all, one of them
 f b m z               foreground, background, marks, zones
 t g i e               trails, grid, intensity, lines
-x, then arrows        read what is there    n counters
+x, arrows; mouse      read what is there    n counters
 space                 hold the picture
 R  F                  background: reset; freeze, thaw
 ? q Esc Ctrl-C        this help, quit

@@ -14,7 +14,7 @@ use schema::{
     ScanHead, Segment, State, Status, Verdict, Zone, Zones,
 };
 
-use super::draw::{dots, draw};
+use super::draw::{draw, place_of_map};
 use super::view::View;
 use scene::{Scene, Sensor};
 
@@ -118,7 +118,8 @@ fn screen_held(scene: &Scene, held: Option<&Scene>, view: &View, (columns, rows)
     let mut terminal = Terminal::new(TestBackend::new(columns, rows)).unwrap();
     let mut view = view.clone();
     let drawn = terminal.draw(|frame| {
-        view.fit(held.unwrap_or(scene), dots(frame.area(), scene));
+        view.map = place_of_map(frame.area(), scene);
+        view.fit(held.unwrap_or(scene));
         draw(frame, scene, held, &view);
     });
     drawn.unwrap().buffer.clone()

@@ -10,6 +10,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 use ratatui::backend::CrosstermBackend;
 use ratatui::crossterm::cursor::{Hide, Show};
+use ratatui::crossterm::style::Print;
 use ratatui::crossterm::terminal::{
     EnterAlternateScreen, LeaveAlternateScreen, disable_raw_mode, enable_raw_mode,
 };
@@ -20,7 +21,7 @@ use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::termios::tcgetwinsize;
 use schema::{Failure, Kind};
 
-use super::keys::{Key, Keys};
+use super::keys::{Key, Keys, MOUSE_OFF, MOUSE_ON};
 use crate::output::End;
 
 /// The terminal, as long as it is ours.
@@ -58,7 +59,7 @@ impl<'a> Screen<'a> {
         };
         let keys = Keys::open().map_err(no_terminal)?;
         enable_raw_mode().map_err(no_terminal)?;
-        let taken = execute!(sheet, EnterAlternateScreen, Hide)
+        let taken = execute!(sheet, EnterAlternateScreen, Hide, Print(MOUSE_ON))
             .and_then(|()| Terminal::new(CrosstermBackend::new(sheet)));
         let terminal = taken.inspect_err(|_| {
             let _ = disable_raw_mode();
@@ -68,7 +69,7 @@ impl<'a> Screen<'a> {
         // What a panic says would go with the sheet.
         set_hook(Box::new(move |info| {
             if !giving.swap(true, Ordering::Relaxed) {
-                let _ = execute!(io::stdout(), LeaveAlternateScreen, Show);
+                let _ = execute!(io::stdout(), Print(MOUSE_OFF), LeaveAlternateScreen, Show);
                 let _ = disable_raw_mode();
             }
             before(info);
@@ -100,7 +101,8 @@ impl Drop for Screen<'_> {
     fn drop(&mut self) {
         if !self.given_back.swap(true, Ordering::Relaxed) {
             let backend = self.terminal.backend_mut();
-            let _ = queue!(backend, LeaveAlternateScreen, Show).and_then(|()| io::Write::flush(backend));
+            let _ = queue!(backend, Print(MOUSE_OFF), LeaveAlternateScreen, Show)
+                .and_then(|()| io::Write::flush(backend));
             let _ = disable_raw_mode();
         }
         // Hooks cannot be changed while a panic unwinds.

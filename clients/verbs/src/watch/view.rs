@@ -1,5 +1,7 @@
-//! Which part of a scene is shown and at which scale, and how keys change that. Of the terminal it knows only the
-//! keys.
+//! Which part of a scene is shown and at which scale, and how keys and the mouse change that. Of the terminal it knows only
+//! those, and where the picture is.
+
+use ratatui::layout::{Position, Rect};
 
 use super::keys::Key;
 use super::map::DOTS;
@@ -10,7 +12,9 @@ use scene::{Scene, Sensor};
 pub(crate) struct View {
     /// One sensor by its number from 0, or the robot with all of its own.
     pub(crate) only: Option<usize>,
-    /// What is in the middle of the picture, in metres in the robot's frame.
+    /// Where the picture is on the screen, in cells.
+    pub(crate) map: Rect,
+    /// What is in the middle of it, in metres in the robot's frame.
     pub(crate) centre_m: (f64, f64),
     /// Metres between two dots.
     pub(crate) dot_m: f64,
@@ -59,6 +63,7 @@ impl View {
     pub(crate) fn new(colours: bool) -> View {
         View {
             only: None,
+            map: Rect::default(),
             centre_m: (0.0, 0.0),
             dot_m: FIRST_DOT_M,
             fits: true,
@@ -107,6 +112,10 @@ impl View {
                 self.pointer_m = if self.pointer_m.is_none() { Some(self.centre_m) } else { None }
             }
             Key::Left | Key::Right | Key::Up | Key::Down => self.go(key),
+            Key::Point(..) | Key::WheelUp(..) | Key::WheelDown(..) if self.help || self.counters => {}
+            Key::Point(column, row) => self.pointer_m = self.at_m(column, row).or(self.pointer_m),
+            Key::WheelUp(column, row) => self.zoom_at(column, row, 1.0 / ZOOM),
+            Key::WheelDown(column, row) => self.zoom_at(column, row, ZOOM),
             Key::Sign('h') => self.pan(0.0, 1.0),
             Key::Sign('l') => self.pan(0.0, -1.0),
             Key::Sign('k') => self.pan(1.0, 0.0),
@@ -130,9 +139,10 @@ impl View {
         None
     }
 
-    /// Brings what is seen into a picture of `dots`, unless a person chose its place; keeps what is about right, because a
+    /// Brings what is seen into the picture, unless a person chose its place; keeps what is about right, because a
     /// picture that breathes cannot be read.
-    pub(crate) fn fit(&mut self, scene: &Scene, dots: (f64, f64)) {
+    pub(crate) fn fit(&mut self, scene: &Scene) {
+        let dots = (f64::from(self.map.width.max(1)) * DOTS.0, f64::from(self.map.height.max(1)) * DOTS.1);
         let shown = self.shown(scene);
         let seen: Vec<_> = shown.iter().flat_map(|(_, sensor)| sensor.points()).collect();
         if !self.fits || seen.is_empty() {
@@ -152,6 +162,27 @@ impl View {
             self.dot_m = needed;
             self.centre_m = ((ahead.0 + ahead.1) / 2.0, (aside.0 + aside.1) / 2.0);
         }
+    }
+
+    /// The place in the middle of a cell of the screen, in metres in the robot's frame; nothing beside the picture.
+    fn at_m(&self, column: u16, row: u16) -> Option<(f64, f64)> {
+        if !self.map.contains(Position { x: column, y: row }) {
+            return None;
+        }
+        // In dots from the middle of the picture.
+        let from_middle =
+            |cell: u16, cells: u16, dots: f64| (f64::from(cell) + 0.5 - f64::from(cells) / 2.0) * dots;
+        let right = from_middle(column - self.map.x, self.map.width, DOTS.0);
+        let down = from_middle(row - self.map.y, self.map.height, DOTS.1);
+        Some((self.centre_m.0 - down * self.dot_m, self.centre_m.1 - right * self.dot_m))
+    }
+
+    /// Changes the size of the picture, and what is in this cell of the screen stays there.
+    fn zoom_at(&mut self, column: u16, row: u16, factor: f64) {
+        let Some(before) = self.at_m(column, row) else { return };
+        self.zoom(factor);
+        let after = self.at_m(column, row).unwrap_or(before);
+        self.centre_m = (self.centre_m.0 + before.0 - after.0, self.centre_m.1 + before.1 - after.1);
     }
 
     fn zoom(&mut self, factor: f64) {
@@ -281,22 +312,45 @@ mod tests {
     }
 
     #[test]
+    fn the_mouse_reads_and_its_wheel_zooms_where_it_is() {
+        let (mut view, scene) = (View::new(false), two());
+        view.map = Rect::new(0, 1, 60, 16);
+        (view.centre_m, view.dot_m) = ((2.0, 1.0), 0.1);
+        // A cell has 2 dots across and 4 up.
+        view.key(Key::Point(30, 9), &scene);
+        let (x, y) = view.pointer_m.unwrap();
+        assert!((x - 1.8).abs() < 1e-9 && (y - 0.9).abs() < 1e-9, "{x} {y}");
+        view.key(Key::Point(3, 0), &scene);
+        assert_eq!(view.pointer_m, Some((x, y)), "beside the picture");
+        let there = view.at_m(50, 3).unwrap();
+        view.key(Key::WheelUp(50, 3), &scene);
+        let still = view.at_m(50, 3).unwrap();
+        assert!((view.dot_m - 0.08).abs() < 1e-9 && !view.fits);
+        assert!((there.0 - still.0).hypot(there.1 - still.1) < 1e-9, "{there:?} {still:?}");
+        view.key(Key::WheelDown(50, 3), &scene);
+        assert!((view.dot_m - 0.1).abs() < 1e-9 && (view.centre_m.0 - 2.0).abs() < 1e-9);
+        press(&mut view, &scene, "?");
+        view.key(Key::Point(10, 10), &scene);
+        assert_eq!(view.pointer_m, Some((x, y)), "the help is over it");
+    }
+
+    #[test]
     fn the_picture_fits_until_a_person_chooses_and_again_when_asked() {
         let (mut view, scene) = (View::new(false), two());
-        let dots = (120.0, 68.0);
-        view.fit(&scene, dots);
+        view.map = Rect::new(0, 1, 60, 17);
+        view.fit(&scene);
         let fitted = view.clone();
         // Half a circle of four metres ahead, and half a metre behind.
         assert!((fitted.centre_m.0 - 1.75).abs() < 0.1 && fitted.centre_m.1.abs() < 0.01, "{fitted:?}");
-        assert!((8.0..10.0).contains(&(fitted.dot_m * dots.0)), "{fitted:?}");
+        assert!((8.0..10.0).contains(&(fitted.dot_m * 120.0)), "{fitted:?}");
         press(&mut view, &scene, "+l");
         assert!(view.dot_m < fitted.dot_m && view.centre_m.1 < 0.0, "right is negative");
         let chosen = view.centre_m;
-        view.fit(&scene, dots);
+        view.fit(&scene);
         assert_eq!(view.centre_m, chosen);
         press(&mut view, &scene, "kkkkkkkkkkkkkkkkkkkk");
         press(&mut view, &scene, "c");
-        view.fit(&scene, dots);
+        view.fit(&scene);
         assert_eq!((view.centre_m, view.dot_m), (fitted.centre_m, fitted.dot_m));
     }
 }

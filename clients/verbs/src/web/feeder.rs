@@ -292,7 +292,7 @@ impl Sink for Feeder<'_> {
     fn tick(&mut self, now: Instant) -> Result<(), End> {
         loop {
             match self.events.try_recv() {
-                Ok(event) => told::client(&mut self.output, &event, self.options.json)?,
+                Ok(event) => told::event(&mut self.output, &event, self.options.json)?,
                 Err(TryRecvError::Empty) => break,
                 // Nobody is served any more; why is known where that thread is waited for.
                 Err(TryRecvError::Disconnected) => return Err(End::ReaderGone),

@@ -1,8 +1,8 @@
-//! The lines of `web`: where it is, and who comes and goes.
+//! The lines of `web`: where it is, who comes and goes, and why nobody can.
 
 use std::io::Write;
 
-use ::web::Event;
+use ::web::{Event, Visit};
 use serde::Serialize;
 
 use crate::output::{End, Output};
@@ -20,7 +20,14 @@ pub(crate) fn ready(output: &mut Output<'_>, url: &str, json: bool) -> Result<()
     }
 }
 
-pub(crate) fn client(output: &mut Output<'_>, event: &Event, json: bool) -> Result<(), End> {
+pub(crate) fn event(output: &mut Output<'_>, event: &Event, json: bool) -> Result<(), End> {
+    match event {
+        Event::Viewer(visit) => client(output, visit, json),
+        Event::Short(error) => short(output, &error.to_string(), json),
+    }
+}
+
+fn client(output: &mut Output<'_>, visit: &Visit, json: bool) -> Result<(), End> {
     #[derive(Serialize)]
     struct Client {
         class: &'static str,
@@ -29,7 +36,7 @@ pub(crate) fn client(output: &mut Output<'_>, event: &Event, json: bool) -> Resu
         skipped: u64,
         clients: usize,
     }
-    let Event { address, came, skipped, viewers } = *event;
+    let Visit { address, came, skipped, viewers } = *visit;
     let word = if came { "came" } else { "went" };
     match json {
         true => {
@@ -37,5 +44,21 @@ pub(crate) fn client(output: &mut Output<'_>, event: &Event, json: bool) -> Resu
             output.json(&Client { class: "client", address, came, skipped, clients: viewers })
         }
         false => output.line(|line| write!(line, "{address} {word}, {viewers} here, {skipped} skipped")),
+    }
+}
+
+/// It goes on with those who are here, so it is no end.
+fn short(output: &mut Output<'_>, why: &str, json: bool) -> Result<(), End> {
+    #[derive(Serialize)]
+    struct Short<'a> {
+        class: &'static str,
+        message: &'a str,
+        hint: &'a str,
+    }
+    let message = &format!("nobody can be let in: {why}");
+    let hint = "raise the limit of descriptors: ulimit -n";
+    match json {
+        true => output.json(&Short { class: "web_short", message, hint }),
+        false => output.line(|line| write!(line, "{message}; {hint}")),
     }
 }
