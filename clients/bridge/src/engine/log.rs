@@ -26,6 +26,9 @@ const MOST: usize = 16;
 /// The longest line, in bytes.
 const LONGEST: usize = 500;
 
+/// What Zenoh writes behind addresses, because this program told it so (`config.rs`).
+const OUR_LIMIT: &str = "#so_sndbuf=8192";
+
 /// What Zenoh tells at the level of debugging only: where it is from, and how it begins. Why a connection that was lost does not
 /// come again, and why one that somebody else began was refused.
 const QUIET: [(&str, &str); 3] = [
@@ -59,7 +62,7 @@ impl Log {
     }
 
     fn add(&self, line: &str) {
-        let mut line = without_places(line);
+        let mut line = without_places(line).replace(OUR_LIMIT, "");
         let end = line.char_indices().map(|(at, _)| at).find(|at| *at + 4 > LONGEST);
         line.truncate(end.unwrap_or(line.len()));
         let mut lines = self.lines();
