@@ -62,6 +62,8 @@ impl Log {
     }
 
     fn add(&self, line: &str) {
+        // How soon it tries again is another time each time.
+        let line = line.split(" Retry in ").next().unwrap_or_default();
         let mut line = without_places(line).replace(OUR_LIMIT, "");
         let end = line.char_indices().map(|(at, _)| at).find(|at| *at + 4 > LONGEST);
         line.truncate(end.unwrap_or(line.len()));
@@ -164,6 +166,9 @@ mod tests {
         log.add("no route");
         log.add("no route");
         assert_eq!((log.take(), log.take(), log.count()), (vec!["no route".to_owned()], vec![], 2));
+        log.add("no tcp/r:1#so_sndbuf=8192: refused. Retry in 100ms.");
+        log.add("no tcp/r:1#so_sndbuf=8192: refused. Retry in 200ms.");
+        assert_eq!(log.take(), ["no tcp/r:1: refused."]);
         (0..1000).for_each(|n| log.add(&format!("{n} {}", "é".repeat(1000))));
         let lines = log.take();
         assert!(lines.len() == MOST && lines.iter().all(|line| line.len() <= LONGEST), "{lines:?}");
