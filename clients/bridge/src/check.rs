@@ -29,8 +29,9 @@ struct Finding {
     remedy: String,
 }
 
-/// So long a router may take to answer, and then the hubs behind it.
+/// So long a router may take to answer, another one where one has refused, and then the hubs behind it.
 const CONNECTED_WITHIN: Duration = Duration::from_secs(5);
+const REFUSED_WITHIN: Duration = Duration::from_secs(1);
 const HEARD_WITHIN: Duration = Duration::from_secs(2);
 /// Between two looks.
 const LOOK_EVERY: Duration = Duration::from_millis(20);
@@ -75,7 +76,8 @@ fn find(options: &BridgeOptions, stop: &AtomicBool) -> Result<Vec<Finding>, Fail
     let mut reasons = Vec::new();
     let mut is_linked = false;
     let begin = Instant::now();
-    while !is_linked && begin.elapsed() < CONNECTED_WITHIN && connection.failure().is_none() {
+    let mut end_at = begin + CONNECTED_WITHIN;
+    while !is_linked && Instant::now() < end_at && connection.failure().is_none() {
         if stop.load(Ordering::Relaxed) {
             return Err(Failure::new(Kind::Interrupted, "interrupted", ""));
         }
@@ -89,6 +91,10 @@ fn find(options: &BridgeOptions, stop: &AtomicBool) -> Result<Vec<Finding>, Fail
             Ok::<_, Infallible>(())
         };
         let Ok(()) = connection.news(news);
+        // Who is refused by one router may still be taken by another, but not by waiting for long.
+        if Diagnosis::of(&reasons.join("; ")).is_some_and(|known| known != UNREACHED) {
+            end_at = end_at.min(Instant::now() + REFUSED_WITHIN);
+        }
     }
     if let Some(failure) = connection.failure() {
         return Ok(vec![Finding::failed(failure.message, failure.hint)]);

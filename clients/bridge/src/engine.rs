@@ -27,6 +27,8 @@ use log::{Log, without_places};
 pub(crate) struct Connection {
     state: Arc<State>,
     log: Log,
+    /// It listens: then there soon is a session, or never.
+    listens: bool,
     is_up: Mutex<Option<bool>>,
 }
 
@@ -56,7 +58,7 @@ impl Connection {
     /// Begins to open what was `prepared`, and goes on until it succeeds.
     pub(crate) fn open(prepared: Prepared) -> Result<Connection, Failure> {
         let log = Log::install();
-        let state = Arc::new(State::default());
+        let (state, listens) = (Arc::new(State::default()), prepared.listens());
         let theirs = state.clone();
         // It ends with the process: an attempt cannot be ended.
         let opening = thread::Builder::new().name("opening".into()).spawn(move || {
@@ -68,7 +70,7 @@ impl Connection {
                         return;
                     }
                     // Who listens waits for nobody: it cannot be.
-                    Err(error) if prepared.listens() => {
+                    Err(error) if listens => {
                         let what = format!("Zenoh does not start: {}", without_places(&error.to_string()));
                         let failure = Failure::new(Kind::Configuration, what, "see --listen and --config");
                         *theirs.failure.lock().unwrap_or_else(PoisonError::into_inner) = Some(failure);
@@ -79,7 +81,7 @@ impl Connection {
             }
         });
         opening.map_err(|error| Failure::new(Kind::Short, format!("cannot start a thread: {error}"), ""))?;
-        Ok(Connection { state, log, is_up: Mutex::new(None) })
+        Ok(Connection { state, log, listens, is_up: Mutex::new(None) })
     }
 
     /// Waits for the session; nothing if it `is_over` before.
@@ -105,8 +107,11 @@ impl Connection {
         self.state.failure.lock().unwrap_or_else(PoisonError::into_inner).clone()
     }
 
-    /// Tells what is new.
+    /// Tells what is new. Why there never will be a session, [`failure`](Connection::failure) says.
     pub(crate) fn news<E>(&self, mut tell: impl FnMut(News) -> Result<(), E>) -> Result<(), E> {
+        if self.listens && !self.is_open() {
+            return Ok(());
+        }
         self.log.take().into_iter().try_for_each(|line| tell(News::Failing(line)))?;
         let mut is_up = self.is_up.lock().unwrap_or_else(PoisonError::into_inner);
         let Some(engine) = self.state.engine.get() else { return Ok(()) };

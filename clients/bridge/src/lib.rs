@@ -18,7 +18,7 @@ use std::time::{Duration, Instant};
 
 use lan::outgoing::ANNOUNCE_EVERY;
 use schema::limits::TopicLimits;
-use schema::{Domain, Failure, Kind};
+use schema::{Domain, Failure, Kind, Topic};
 use verbs::network::{End, LossyWriter, Output, now, quiet};
 
 pub use check::check;
@@ -60,6 +60,8 @@ pub struct SendOptions {
 pub struct PublishOptions {
     /// Where topics of other machines are published.
     pub domain: Domain,
+    /// The topics that are received, of all sensors.
+    pub topics: Vec<Topic>,
     /// `NAME=HUB`: what to call a hub, instead of its 16 hex digits.
     pub names: Vec<String>,
     /// The hubs to hear, by 16 hex digits or by one of `names`; none: all.

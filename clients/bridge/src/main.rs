@@ -14,6 +14,7 @@ use ros::Names;
 use ros::zenoh_wire::Distro;
 use schema::limits::TopicLimits;
 use schema::{DEFAULT_DOMAIN, Domain, Environment, Failure, Kind, Printable};
+use verbs::network::received_topics;
 
 /// Carry topics to other machines and back over Zenoh, through a router or as one: other rooms, Wi-Fi, the internet
 #[derive(Debug, Parser)]
@@ -29,7 +30,8 @@ struct Cli {
     #[arg(long, value_name = "FILE")]
     config: Option<PathBuf>,
     /// Topics to send: front/scan, */scan for all sensors or front/* for all topics. With :every=4, only the samples of
-    /// every fourth telegram. Can be repeated [default: all topics except telegrams, of all sensors]
+    /// every fourth telegram. Can be repeated [default: all topics except telegrams, of all sensors]. With --publish the
+    /// topics to receive, too: then only */scan and its like
     #[arg(long = "topic", value_name = "SENSOR/TOPIC[:every=N]")]
     topics: Vec<String>,
     /// Publish what other machines send in this machine's domain, as HUB.SENSOR; then nothing is sent without --send
@@ -95,12 +97,13 @@ impl Cli {
         let ros2 = self.ros2.then(|| self.ros2(&environment, !sends)).transpose()?;
         let send = sends.then(|| {
             let places = Domain::candidates(&self.domain, self.root.as_deref(), &environment)?;
-            Ok(SendOptions { topics: self.topics, places })
+            Ok(SendOptions { topics: self.topics.clone(), places })
         });
         let publish = self.publish.then(|| {
             let domain = Domain::of_hub(&self.domain, self.root.as_deref(), &environment)?;
             let limits = TopicLimits { consumers: self.consumers.into(), ..TopicLimits::default() };
-            Ok(PublishOptions { domain, names: self.names, hubs: self.hubs, limits })
+            let topics = received_topics(&self.topics)?;
+            Ok(PublishOptions { domain, topics, names: self.names, hubs: self.hubs, limits })
         });
         Ok(BridgeOptions {
             connect: self.connect,
@@ -131,8 +134,11 @@ impl Cli {
                 return Err(Failure::new(Kind::Usage, what, "give the sensor a frame of its own"));
             }
         }
+        // One by one, so that the one that is wrong is named.
+        Names::new(&self.namespace, "", Vec::new()).map_err(|name| no_name("--namespace", &name))?;
+        Names::new("", &self.topic_prefix, Vec::new()).map_err(|name| no_name("--topic-prefix", &name))?;
         let names = Names::new(&self.namespace, &self.topic_prefix, frames)
-            .map_err(|name| no_name("--namespace, --topic-prefix or --frame", &name))?;
+            .map_err(|name| no_name("--frame", &name))?;
         Ok(Ros2Options {
             topics: self.topics.clone(),
             places: Domain::candidates(&self.domain, self.root.as_deref(), environment)?,
@@ -161,9 +167,13 @@ fn domain_id() -> Result<u32, Failure> {
 
 /// ROS takes words of letters, digits and `_`.
 fn no_name(flag: &str, text: &str) -> Failure {
-    let hint =
-        "names of ROS 2 are words of letters, digits and _ between slashes; a frame stands behind SENSOR=";
-    Failure::new(Kind::Usage, format!("{flag}: {text:?} is no name"), hint)
+    let hint = match flag {
+        "--frame" => "SENSOR=FRAME, the frame of letters, digits and _, for example front=laser",
+        _ => {
+            "words of letters, digits and _ with slashes between them, none at the end: robot1, or site/robot1"
+        }
+    };
+    Failure::new(Kind::Usage, format!("{flag}: {text:?} is no name of ROS 2"), hint)
 }
 
 fn distro(name: &str) -> Result<Distro, String> {
@@ -220,6 +230,17 @@ mod tests {
         let cli = parse(&words);
         assert_eq!((cli.domain.as_str(), cli.connect.len()), ("lab", 2));
         assert!(parse(&["--json", "--json"]).json);
+    }
+
+    #[test]
+    fn the_flag_that_is_wrong_is_named() {
+        for (flag, value) in [("--namespace", "/robot1/"), ("--topic-prefix", "a b"), ("--frame", "front=1a")]
+        {
+            let failure = parse(&["--root", "/tmp", "--ros2", flag, value]).options().unwrap_err();
+            assert!(failure.kind == Kind::Usage && failure.message.starts_with(flag), "{failure}");
+        }
+        let failure = parse(&["--root", "/tmp", "--publish", "--topic=front/scan"]).options().unwrap_err();
+        assert!(failure.kind == Kind::Usage && failure.message.contains("front/scan"), "{failure}");
     }
 
     #[test]

@@ -9,7 +9,7 @@ use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 use std::time::{Duration, Instant};
 
-use lan::address::{Address, LIVE, PREFIX, live};
+use lan::address::{ANNOUNCE, Address, LIVE, PREFIX, live};
 use schema::datagram::{Datagram, HEAD, MAC};
 use schema::{Failure, Topic};
 use verbs::network::{End, Origin, Output, Reception, Wanted, Words, now};
@@ -63,8 +63,8 @@ pub(crate) fn run(
 ) -> Result<(), End> {
     let (mut out, mut notes) = (stdout(), stderr());
     let wanted = Wanted {
-        topics: Topic::ALL.to_vec(),
-        heard: Topic::ALL.to_vec(),
+        topics: options.topics.clone(),
+        heard: options.topics.clone(),
         names: &options.names,
         hubs: &options.hubs,
         key: None,
@@ -78,7 +78,7 @@ pub(crate) fn run(
     let Some(engine) = connection.engine(is_over) else { return Ok(()) };
     let (to, inbox) = sync_channel(WAITING);
     let inlet = Inlet { to, counts: Arc::default() };
-    let ears = inlet.listen(engine)?;
+    let ears = inlet.listen(engine, &options.topics)?;
     let asks = inlet.clone();
     let ask = |address: &Address<'_>| {
         let asks = asks.clone();
@@ -87,24 +87,39 @@ pub(crate) fn run(
     let refused = || connection.refused();
     let asking = Asking::new(Instant::now());
     let counts = inlet.counts;
-    let mut receiving =
-        Receiving { reception, asking, counts, foreign: 0, ask: Box::new(ask), refused: Box::new(refused) };
+    let mut receiving = Receiving {
+        reception,
+        asked: asked(&options.topics),
+        asking,
+        counts,
+        foreign: 0,
+        ask: Box::new(ask),
+        refused: Box::new(refused),
+    };
     receiving.run(&inbox, tell, is_over, move || drop(ears))
 }
 
 impl Inlet {
-    fn listen(&self, engine: &Engine) -> Result<[Ear; 2], Failure> {
-        let (samples, tokens) = (self.clone(), self.clone());
-        Ok([
-            engine.subscribe(&format!("{PREFIX}/*/*/*"), LONGEST, move |key, payload| {
-                samples.take(key, payload)
-            })?,
-            engine.watch(&format!("{PREFIX}/*/*/{LIVE}"), move |key| {
-                if key.len() <= LONGEST_NAME {
-                    tokens.put(Heard::Live(key.into()));
-                }
-            })?,
-        ])
+    /// Hears announcements, samples of `topics`, and who comes.
+    fn listen(&self, engine: &Engine, topics: &[Topic]) -> Result<Vec<Ear>, Failure> {
+        // All in one word: who has rights to all needs no more.
+        let words = match topics.len() == Topic::ALL.len() {
+            true => vec!["*"],
+            false => std::iter::once(ANNOUNCE).chain(topics.iter().map(|topic| topic.name())).collect(),
+        };
+        let mut ears = Vec::new();
+        for word in words {
+            let samples = self.clone();
+            let hear = move |key: &str, payload| samples.take(key, payload);
+            ears.push(engine.subscribe(&format!("{PREFIX}/*/*/{word}"), LONGEST, hear)?);
+        }
+        let tokens = self.clone();
+        ears.push(engine.watch(&format!("{PREFIX}/*/*/{LIVE}"), move |key| {
+            if key.len() <= LONGEST_NAME {
+                tokens.put(Heard::Live(key.into()));
+            }
+        })?);
+        Ok(ears)
     }
 
     fn take(&self, key: &str, payload: Option<Vec<u8>>) {
@@ -126,6 +141,8 @@ type Ask<'a> = dyn Fn(&Address<'_>) -> Result<(), Failure> + 'a;
 
 struct Receiving<'a> {
     reception: Reception<'a>,
+    /// What sensors that come are asked for.
+    asked: Vec<Option<Topic>>,
     asking: Asking,
     counts: Arc<Counts>,
     /// What came under a name that is not its own.
@@ -204,10 +221,8 @@ impl Receiving<'_> {
     /// Asks sensors that came for what they said last, rather than waiting until they say it again.
     fn ask_next(&mut self) -> Result<(), End> {
         while let Some((hub, sensor)) = self.asking.next(Instant::now()) {
-            // A sample without a name is not published: first the name.
-            let topics = [None, Some(Topic::Status), Some(Topic::Background)];
             let asked =
-                topics.iter().try_for_each(|&topic| (self.ask)(&Address { hub, sensor: &sensor, topic }));
+                self.asked.iter().try_for_each(|&topic| (self.ask)(&Address { hub, sensor: &sensor, topic }));
             if let Err(failure) = asked {
                 self.asking.unasked += 1;
                 self.reception.trouble(&failure.to_string())?;
@@ -228,6 +243,12 @@ impl Receiving<'_> {
         ];
         self.reception.tell(&others)
     }
+}
+
+/// What is asked for where `topics` are received: first the name, without which no sample is published.
+fn asked(topics: &[Topic]) -> Vec<Option<Topic>> {
+    let kept = [Topic::Status, Topic::Background].into_iter().filter(|topic| topics.contains(topic));
+    std::iter::once(None).chain(kept.map(Some)).collect()
 }
 
 #[cfg(test)]

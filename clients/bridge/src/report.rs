@@ -95,10 +95,11 @@ impl<'a> Report<'a> {
         }
         let new = known.filter(|known| !self.told.contains(known));
         self.told.extend(new);
-        self.notes.line(|line| match new {
-            Some(Diagnosis { finding, remedy }) => write!(line, "{finding}: {words}\n  {remedy}"),
-            None => write!(line, "{words}"),
-        })
+        let Some(Diagnosis { finding, remedy }) = new else {
+            return self.notes.line(|line| write!(line, "{words}"));
+        };
+        self.notes.line(|line| write!(line, "{finding}: {words}"))?;
+        self.notes.line(|line| write!(line, "  {remedy}"))
     }
 
     /// The account of what goes out.

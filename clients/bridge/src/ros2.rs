@@ -70,9 +70,10 @@ pub(crate) fn run(
     let (mut out, mut notes) = (stdout(), stderr());
     let (mut out, mut notes) = (Output::new(&mut out), Output::new(&mut notes));
     let selection = Selection::parse(&options.topics, false)?;
-    let shared = Shared { graph: Mutex::new(Graph::new(options.names.clone())), bell: Condvar::new() };
-    let mut waiting = Waiting(Arc::new(shared));
+    let graph = Graph::new(options.names.clone(), selection.names(Topic::Status));
+    let mut waiting = Waiting(Arc::new(Shared { graph: Mutex::new(graph), bell: Condvar::new() }));
     let mut forwarder = Forwarder::new(selection, &options.places, &mut waiting);
+    options.names.framed().for_each(|sensor| forwarder.demand(sensor));
     let is_done = AtomicBool::new(false);
     thread::scope(|scope| {
         let handing = Handing { waiting: waiting.clone(), outlets: Vec::new() };
@@ -82,7 +83,7 @@ pub(crate) fn run(
         let mut follow = || {
             while !is_over.load(Ordering::Relaxed) && !handing.is_finished() {
                 let more = forwarder.forward(&mut waiting)?;
-                waiting.graph().look(now());
+                waiting.graph().look(forwarder.is_there(), now());
                 waiting.ring();
                 forwarder.look(Instant::now(), &mut waiting, &mut |notice| match options.tells_of_hub {
                     true => tell(notice, json, &mut out, &mut notes),

@@ -180,7 +180,7 @@ impl Handing {
             let woken = bell.wait_timeout(outgoing, LOOK_EVERY).unwrap_or_else(PoisonError::into_inner);
             outgoing = woken.0;
         }
-        let Some(handed) = outgoing.hand() else { return Ok(()) };
+        let Some(handed) = outgoing.hand(now()) else { return Ok(()) };
         let (number, topic) = (handed.sensor.0, handed.topic);
         bytes.clear();
         bytes.extend_from_slice(handed.datagram);

@@ -22,7 +22,7 @@ pub struct Address<'a> {
 /// What all names begin with.
 pub const PREFIX: &str = "scanhub";
 /// The last word of the name of announcements.
-const ANNOUNCE: &str = "announce";
+pub const ANNOUNCE: &str = "announce";
 /// The last word of the names that are there as long as a hub or a sensor is.
 pub const LIVE: &str = "@live";
 

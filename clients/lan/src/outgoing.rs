@@ -74,9 +74,9 @@ impl Outgoing {
         self.sensors.iter_mut().for_each(|sensor| sensor.repeat(every, now, &mut self.numbering, to));
     }
 
-    /// Returns the sample that has waited for longest, with its number; nothing if none waits.
-    pub fn hand(&mut self) -> Option<Handed<'_>> {
-        self.numbering.hand()
+    /// Returns the sample that has waited for longest, with its number, as it is sent `now`; nothing if none waits.
+    pub fn hand(&mut self, now: Stamp) -> Option<Handed<'_>> {
+        self.numbering.hand(now)
     }
 
     /// Returns whether a sample waits.

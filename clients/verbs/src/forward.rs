@@ -47,6 +47,8 @@ pub struct Forwarder {
     started: Instant,
     discovery: Discovery,
     is_there: bool,
+    /// More sensors that have to be there, whatever goes out of them.
+    demanded: Vec<String>,
     /// The sensors that are named were found in a hub.
     is_checked: bool,
     waiting_said: bool,
@@ -67,9 +69,15 @@ impl Forwarder {
             started: Instant::now(),
             discovery: Discovery::default(),
             is_there: false,
+            demanded: Vec::new(),
             is_checked: false,
             waiting_said: false,
         }
+    }
+
+    /// Says that the user named `sensor` for something else than what goes out: it has to be there, too.
+    pub fn demand(&mut self, sensor: &str) {
+        self.demanded.push(sensor.to_owned());
     }
 
     /// Hands on what waits of all sensors; returns whether there may be more.
@@ -150,7 +158,10 @@ impl Forwarder {
         }
         if !self.is_checked && called.age >= GRACE {
             let is_there = |name: &&str| called.sensors.iter().any(|it| it == name);
-            if let Some(name) = self.selection.named().into_iter().find(|name| !is_there(name)) {
+            let demanded = self.demanded.iter().map(String::as_str);
+            if let Some(name) =
+                self.selection.named().into_iter().chain(demanded).find(|name| !is_there(name))
+            {
                 return Err(no_sensor(name, &called.sensors));
             }
             self.is_checked = true;

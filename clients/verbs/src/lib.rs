@@ -53,7 +53,7 @@ pub mod network {
     pub use crate::forward::{Carrier, Forwarder, Life, Selection, account, begin_life, tell};
     pub use crate::lossy_writer::LossyWriter;
     pub use crate::output::{End, Output, quiet};
-    pub use crate::reception::{Origin, Reception, Wanted, Words};
+    pub use crate::reception::{Origin, Reception, Wanted, Words, received_topics};
     pub use crate::stamp::now;
 }
 

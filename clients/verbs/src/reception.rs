@@ -6,6 +6,7 @@ mod duplicate_gateways;
 mod epochs;
 mod names;
 mod publish;
+mod received_topics;
 mod remote;
 mod report;
 
@@ -26,6 +27,7 @@ use crowd::{Crowd, Crowding};
 use epochs::Epochs;
 use names::{Hubs, Names};
 use publish::Publication;
+pub use received_topics::received_topics;
 pub(crate) use report::Report;
 pub use report::Words;
 
@@ -88,6 +90,12 @@ pub struct Reception<'a> {
     unreadable: Option<Failure>,
 }
 
+/// What is wrong where a datagram is of another version.
+const OTHER_VERSION: &str = "somebody sends datagrams of another version, which are refused: install the same version of \
+                             scanhub on both machines";
+/// What is wrong where a datagram is of a topic that is not known here.
+const NEWER_TOPIC: &str = "somebody sends topics that this version does not know, which are left out: install the same \
+                           version of scanhub on both machines";
 /// The most things that are told to be wrong: it may be the network that makes them.
 const TOLD: usize = 16;
 
@@ -230,9 +238,17 @@ impl<'a> Reception<'a> {
             publication.begun(head, stamp::now());
         }
         match arrived {
-            Arrived::Sample(sample) => self.sample(&sample, origin),
-            Arrived::Announced(announcement) => self.announced(&announcement, origin),
+            Arrived::Sample(mut sample) => {
+                sample.announced = sample.announced.map(|announce| announce.only(&self.wanted));
+                self.sample(&sample, origin)
+            }
+            Arrived::Announced(mut announcement) => {
+                announcement.announce = announcement.announce.only(&self.wanted);
+                self.announced(&announcement, origin)
+            }
             Arrived::Refused { shared: Some(hub), .. } => self.is_shared(hub),
+            Arrived::Refused { why: DatagramError::Version, .. } => self.trouble(OTHER_VERSION),
+            Arrived::Refused { why: DatagramError::Skipped, .. } => self.trouble(NEWER_TOPIC),
             Arrived::Untimely { behind_ns } => self.trouble(untimely(behind_ns)),
             Arrived::Refused { shared: None, .. } | Arrived::Part | Arrived::Known => Ok(()),
         }

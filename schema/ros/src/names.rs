@@ -68,6 +68,11 @@ impl Names {
         [self.namespace(), name].concat()
     }
 
+    /// Returns the sensors to which a frame was given.
+    pub fn framed(&self) -> impl Iterator<Item = &str> {
+        self.frames.iter().map(|(sensor, _)| &**sensor)
+    }
+
     /// Returns the frame in which `sensor` measures.
     pub fn frame<'a>(&'a self, sensor: &'a str) -> &'a str {
         self.frames.iter().find(|(of, _)| of == sensor).map_or(frame(sensor), |(_, frame)| frame)

@@ -19,19 +19,37 @@ pub fn diagnosis(
     status: Option<&Status>,
     age_ns: Option<u64>,
 ) {
+    let (level, words) = status.map_or((STALE, NO_HUB.to_owned()), judged);
+    let hardware = status.map_or("", |status| status.sensor_type().trim());
+    let values = status.map_or(Vec::new(), |status| values(status, age_ns));
+    write(message, now_ns, level, [sensor, &words, hardware], &values);
+}
+
+/// Writes whether the hub is there to the end of `message`, at `now_ns` since 1970.
+pub fn hub_diagnosis(message: &mut Vec<u8>, now_ns: u64, is_there: bool) {
+    let (level, words) = if is_there { (OK, "running") } else { (STALE, NO_HUB) };
+    write(message, now_ns, level, ["hub", words, ""], &[]);
+}
+
+/// An array of one status.
+fn write(
+    message: &mut Vec<u8>,
+    now_ns: u64,
+    level: u8,
+    [name, words, hardware]: [&str; 3],
+    values: &[(&str, String)],
+) {
     let mut cdr = Cdr::begin(message);
     cdr.header(now_ns, "");
     cdr.u32(1);
-    let (level, words) = status.map_or((STALE, "no hub".to_owned()), judged);
     cdr.u8(level);
-    cdr.text(&format!("scanhub: {sensor}"));
-    cdr.text(&words);
-    cdr.text(status.map_or("", |status| status.sensor_type().trim()));
-    let values = status.map_or(Vec::new(), |status| values(status, age_ns));
+    cdr.text(&format!("scanhub: {name}"));
+    cdr.text(words);
+    cdr.text(hardware);
     cdr.u32(values.len() as u32);
     for (key, value) in values {
         cdr.text(key);
-        cdr.text(&value);
+        cdr.text(value);
     }
 }
 
@@ -63,6 +81,9 @@ fn values(status: &Status, age_ns: Option<u64>) -> Vec<(&'static str, String)> {
     }
     values
 }
+
+/// What is said if nobody says how a sensor is.
+const NO_HUB: &str = "no hub";
 
 /// `DiagnosticStatus.OK` and so on.
 const OK: u8 = 0;
@@ -131,5 +152,18 @@ mod tests {
             (told.number("status.0.level"), told.text("status.0.message")),
             (Some(3.0), Some("no hub"))
         );
+    }
+
+    #[test]
+    fn a_hub_is_there_or_not() {
+        let told = [true, false].map(|is_there| {
+            let mut message = Vec::new();
+            hub_diagnosis(&mut message, 9_000_000_001, is_there);
+            let told = read(&DIAGNOSTIC_ARRAY, &message).unwrap();
+            let text = |key: &str| told.text(key).unwrap().to_owned();
+            (told.number("status.0.level").unwrap() as u8, text("status.0.name"), text("status.0.message"))
+        });
+        let wanted = [(0, "running"), (3, "no hub")];
+        assert_eq!(told, wanted.map(|(level, words)| (level, "scanhub: hub".to_owned(), words.to_owned())));
     }
 }

@@ -81,6 +81,20 @@ impl Announce {
         if self.replaced_count > 0 { 2 } else { 1 }
     }
 
+    /// Returns the same announcement of those of its topics alone that are among `topics`.
+    pub fn only(&self, topics: &[Topic]) -> Announce {
+        let mut only = Announce::new(self.boot, self.sensor(), self.kind());
+        for announced in self.topics() {
+            if Topic::of_number(announced.topic).is_some_and(|topic| topics.contains(&topic)) {
+                only.add(*announced);
+                if let Some(replaced) = self.replaced(announced.topic) {
+                    only.add_replaced(replaced.into());
+                }
+            }
+        }
+        only
+    }
+
     /// Returns the sensor's name.
     pub fn sensor(&self) -> &str {
         text::read(&self.name)
@@ -195,6 +209,12 @@ mod tests {
         let read = Announce::unpack(&room[..92]).unwrap();
         let replaced = [Topic::Scan, Topic::Status, Topic::Zones].map(|topic| read.replaced(topic.number()));
         assert_eq!((read, replaced), (announce, [Some(7), Some(3), None]));
+        let only = read.only(&[Topic::Status, Topic::Zones]);
+        assert_eq!(
+            (only.sensor(), only.topics(), only.replaced(Topic::Scan.number())),
+            ("front", &read.topics()[1..], None)
+        );
+        assert_eq!(only.replaced(Topic::Status.number()), Some(3));
         let cut = Announce::unpack(&room[..91]).unwrap();
         assert_eq!((cut.topics(), cut.replaced(Topic::Scan.number())), (announce.topics(), None));
     }

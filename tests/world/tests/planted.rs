@@ -62,3 +62,30 @@ fn every_planted_defect_is_found() {
     }
     assert_eq!(missed, []);
 }
+
+/// What happens between the machines, and a defect that shows when nothing else happens.
+const BETWEEN_MACHINES: [(&str, Defect); 3] = [
+    ("partition", Defect::RemoteSurvivingVerdict),
+    ("router_killed", Defect::RouterGivenUp),
+    ("key_errors", Defect::RemoteUnchecked),
+];
+
+#[test]
+fn what_happens_between_machines_alone_shows_its_defect() {
+    for (name, defect) in BETWEEN_MACHINES {
+        let finds = |seed: &u64, defect: Option<Defect>| {
+            let mut plan = Plan::of_seed(*seed, 40);
+            plan.actions.retain(|action| action.name() == name);
+            let outcome = run_with(&plan, Detail::Nothing, defect);
+            !plan.actions.is_empty()
+                && outcome.violations.iter().any(|found| match defect {
+                    Some(defect) => judge(defect).contains(&found.judge),
+                    None => true,
+                })
+        };
+        let found = (0..200).find(|seed| finds(seed, Some(defect)));
+        let seed = found.unwrap_or_else(|| panic!("{name}: nobody finds {defect:?}"));
+        println!("{name}: {defect:?} is found by {:?} with seed {seed}", judge(defect));
+        assert!(!finds(&seed, None), "{name}, seed {seed}: something is found without it");
+    }
+}

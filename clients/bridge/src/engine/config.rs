@@ -50,6 +50,9 @@ const FILES: &[(&str, Content)] = &[
     ("transport/auth/usrpwd/dictionary_file", Content::Users),
 ];
 
+/// Without it nobody can listen with TLS.
+const CERTIFICATE: &str = "transport/link/tls/listen_certificate";
+
 /// What is in a file.
 #[derive(Clone, Copy)]
 enum Content {
@@ -96,6 +99,17 @@ impl Prepared {
             let list: Vec<_> = endpoints.iter().map(|endpoint| format!("{endpoint:?}")).collect();
             set(&mut config, key, &format!("[{}]", list.join(",")));
         }
+        let has = |key: &str| is_said(&config, key) || is_said(&config, &format!("{key}_base64"));
+        let of_tls = listen.iter().find(|endpoint| endpoint.starts_with("tls/"));
+        if let Some(endpoint) = of_tls.filter(|_| !has(CERTIFICATE)) {
+            let hint =
+                format!("--config FILE with {CERTIFICATE} and listen_private_key, as in docs/bridge.md");
+            return Err(Failure::new(
+                Kind::Configuration,
+                format!("{endpoint}: no certificate is named"),
+                hint,
+            ));
+        }
         for &(key, content) in FILES {
             check_file(&config, key, content, now_s)?;
         }
@@ -114,8 +128,10 @@ impl Prepared {
 }
 
 fn read(path: &Path) -> Result<Config, Failure> {
-    let text = regular::read_text(path, regular::LONGEST)
-        .map_err(|error| Failure::new(Kind::Input, format!("cannot read {}: {error}", path.display()), ""))?;
+    let text = regular::read_text(path, regular::LONGEST).map_err(|error| {
+        let what = format!("--config {}: cannot read it: {error}", path.display());
+        Failure::new(Kind::Input, what, "name a file with Zenoh's own configuration (docs/bridge.md)")
+    })?;
     Config::from_json5(&text).map_err(|error| {
         let what = format!("{}: {}", path.display(), without_places(&error.to_string()));
         let hint = "it is Zenoh's own configuration in JSON5: https://zenoh.io/docs/manual/configuration";
@@ -248,6 +264,8 @@ mod tests {
                 "{text}: {failure}"
             );
         }
+        let bare = Prepared::read(&options(&[], &["tls/127.0.0.1:0"], None), NOW_S).unwrap_err();
+        assert!(bare.kind == Kind::Configuration && bare.hint.contains("listen_certificate"), "{bare}");
         for address in ["nonsense", "udp/10.0.0.1:1", "quic/10.0.0.1:1", ""] {
             assert_eq!(
                 kind(Prepared::read(&options(&[address], &[], None), NOW_S)),

@@ -29,15 +29,16 @@ fn run(heard: Vec<Heard>, is_over: bool, ask: impl Fn(&str) -> Result<(), Failur
     let (to, inbox) = sync_channel(WAITING);
     let inlet = Inlet { to, counts: Arc::default() };
     heard.into_iter().for_each(|heard| inlet.put(heard));
-    let asked = RefCell::new(0);
+    let questions = RefCell::new(0);
     let over = AtomicBool::new(is_over);
     let ask_and_end = |address: &Address<'_>| {
-        *asked.borrow_mut() += 1;
+        *questions.borrow_mut() += 1;
         over.store(true, Ordering::Relaxed);
         ask(&address.to_string())
     };
     let mut receiving = Receiving {
         reception,
+        asked: asked(&Topic::ALL),
         asking: Asking::new(Instant::now()),
         counts: inlet.counts.clone(),
         foreign: 0,
@@ -47,7 +48,7 @@ fn run(heard: Vec<Heard>, is_over: bool, ask: impl Fn(&str) -> Result<(), Failur
     // What comes behind the end is not let in.
     receiving.run(&inbox, &AtomicBool::new(false), &over, || drop(inlet)).unwrap();
     drop(receiving);
-    (String::from_utf8(out).unwrap(), asked.into_inner())
+    (String::from_utf8(out).unwrap(), questions.into_inner())
 }
 
 fn zones(sequence: u32) -> Heard {
@@ -66,6 +67,19 @@ fn what_waits_at_the_end_is_in_the_account() {
     let (told, _) = run((0..WAITING as u32 + 7).map(zones).collect(), true, |_| Ok(()));
     assert!(told.contains(&format!("\"received\":{WAITING},")), "{told}");
     assert!(told.contains("\"overrun\":7"), "{told}");
+}
+
+#[test]
+fn another_version_is_told_once_and_counted() {
+    let spoilt = |at: usize, value: u8| {
+        let Heard::Sample(key, mut bytes) = zones(0) else { panic!("a sample") };
+        bytes[at] = value;
+        Heard::Sample(key, bytes)
+    };
+    // The version stands behind the magic.
+    let (told, _) = run(vec![spoilt(4, 9), spoilt(4, 9), zones(0)], true, |_| Ok(()));
+    assert_eq!(told.matches("another version").count(), 1, "{told}");
+    assert!(told.contains("\"version\":2,") && told.contains("\"received\":1,"), "{told}");
 }
 
 #[test]

@@ -15,6 +15,7 @@ use schema::{Foreground, Header, Pose, Scan, Status, Topic};
 #[derive(Debug)]
 pub(super) struct Graph {
     names: Names,
+    hub: Hub,
     sensors: Vec<Sensor>,
     topics: Vec<Published>,
     slots: Vec<Slot>,
@@ -56,6 +57,16 @@ pub(super) struct Handed<'a> {
     pub(super) message: &'a [u8],
 }
 
+/// What is said of the hub itself.
+#[derive(Debug, Default)]
+struct Hub {
+    /// Nothing if nobody wants to know how anything is.
+    slot: Option<usize>,
+    /// Wall clock of when it was first missed, and of when it was told of last.
+    missed_ns: Option<u64>,
+    told_ns: u64,
+}
+
 #[derive(Debug)]
 struct Sensor {
     name: String,
@@ -90,14 +101,17 @@ const TOPICS: usize = Topic::ALL.len();
 const SCANS: usize = 4;
 /// A hub sends a status each second: after this long without one nobody says how a sensor is.
 const SILENT_NS: u64 = 3_000_000_000;
-/// Between two words about that.
+/// A hub that is looked for as long as this is not there.
+const ABSENT_NS: u64 = 500_000_000;
+/// Between two words about either.
 const SAID_EVERY_NS: u64 = 1_000_000_000;
 
 impl Graph {
-    /// Makes the graph of a hub of which nothing is known yet.
-    pub(super) fn new(names: Names) -> Graph {
-        Graph {
+    /// Makes the graph of a hub of which nothing is known yet; where it `tells_state`, it says each second whether there is one.
+    pub(super) fn new(names: Names, tells_state: bool) -> Graph {
+        let mut graph = Graph {
             names,
+            hub: Hub::default(),
             sensors: Vec::new(),
             topics: Vec::new(),
             slots: Vec::new(),
@@ -106,7 +120,9 @@ impl Graph {
             spare: Vec::new(),
             poses: Vec::new(),
             poses_slot: None,
-        }
+        };
+        graph.hub.slot = tells_state.then(|| graph.publish_diagnostics());
+        graph
     }
 
     /// Takes the sensor called `name`, of whose topics the samples of every so many telegrams go out; nothing: none do.
@@ -125,8 +141,7 @@ impl Graph {
             diagnosis: None,
         };
         if every[Topic::Status as usize].is_some() {
-            let topic = self.names.shared(DIAGNOSTICS);
-            slots.diagnosis = Some(self.publish(topic, ros::DIAGNOSTIC_ARRAY, Qos::Reliable(10)));
+            slots.diagnosis = Some(self.publish_diagnostics());
         }
         self.sensors.push(Sensor {
             name: name.to_owned(),
@@ -190,13 +205,23 @@ impl Graph {
         }
     }
 
-    /// Says of sensors whose status stays out that nobody says how they are.
-    pub(super) fn look(&mut self, now: Stamp) {
+    /// Says each second whether the hub is there, and of sensors whose status stays out that nobody says how they are.
+    pub(super) fn look(&mut self, is_hub_there: bool, now: Stamp) {
         let now_ns = now.wall_ns;
+        let missed_ns = *self.hub.missed_ns.get_or_insert(now_ns);
+        if is_hub_there {
+            self.hub.missed_ns = None;
+        }
+        let is_absent = !is_hub_there && now_ns.saturating_sub(missed_ns) >= ABSENT_NS;
+        let is_due = now_ns.saturating_sub(self.hub.told_ns) >= SAID_EVERY_NS;
+        if is_due && (is_hub_there || is_absent) {
+            self.hub.told_ns = now_ns;
+            self.write(self.hub.slot, now, |message| ros::hub_diagnosis(message, now_ns, is_hub_there));
+        }
         for sensor in 0..self.sensors.len() {
             let Sensor { name, slots, heard_ns, told_ns, .. } = &mut self.sensors[sensor];
             let heard_ns = *heard_ns.get_or_insert(now_ns);
-            let is_silent = now_ns.saturating_sub(heard_ns) >= SILENT_NS;
+            let is_silent = is_absent || now_ns.saturating_sub(heard_ns) >= SILENT_NS;
             if is_silent && now_ns.saturating_sub(*told_ns) >= SAID_EVERY_NS {
                 *told_ns = now_ns;
                 let (slot, name) = (slots.diagnosis, name.clone());
@@ -289,6 +314,11 @@ impl Graph {
         let (_, scan) = scans.index(place);
         self.write(slot, now, |message| ros::foreground_cloud(message, &frame, header, scan, foreground));
         self.sensors[sensor].scans = scans;
+    }
+
+    /// A new place for messages of how something is.
+    fn publish_diagnostics(&mut self) -> usize {
+        self.publish(self.names.shared(DIAGNOSTICS), ros::DIAGNOSTIC_ARRAY, Qos::Reliable(10))
     }
 
     /// A new place for messages of the topic called `name`.

@@ -3,7 +3,7 @@
 use std::process::Command;
 
 use crate::testkit::{INT, Program, TestEnv};
-use crate::{address, bridge};
+use crate::{address, bridge, lonely};
 
 /// Runs `openssl` in the directory of this test.
 fn openssl(env: &TestEnv, words: &str) {
@@ -52,13 +52,24 @@ fn is_up(program: &mut Program) {
     crate::linked(program);
 }
 
-/// What it says of why it is not connected.
-fn reason(program: &mut Program, words: &[&str]) {
-    program.await_line("the reason", |line| {
-        line["class"] == "bridge_link"
-            && line["state"] == "failing"
-            && line["message"].as_str().is_some_and(|message| words.iter().any(|word| message.contains(word)))
+/// Waits until it says why it is not connected, in these words, and what to do.
+fn reason(program: &mut Program, finding: &str) {
+    let line = program.await_line("the reason", |line| {
+        line["class"] == "bridge_link" && line["state"] == "failing" && line["finding"] == finding
     });
+    assert!(line["remedy"].is_string() && line["message"].is_string(), "{line}");
+}
+
+/// What `doctor` and `bridge --check` find with this address and configuration: the same, and end so.
+fn checked(env: &TestEnv, at: &str, config: &str) -> String {
+    let doctor = env.run(&["doctor", "--json", "--bridge", at, "--bridge-config", config]);
+    assert_eq!(doctor.code, Some(5), "{doctor}");
+    let found = doctor.of_class("check").into_iter().find(|line| line["name"] == "bridge");
+    let said = found.unwrap_or_else(|| panic!("nothing of the bridge: {doctor}"))["finding"].to_string();
+    let outcome = env.run(&["bridge", "--check", "--json", "--connect", at, "--config", config]);
+    assert_eq!(outcome.code, Some(5), "{outcome}");
+    assert_eq!(outcome.of_class("bridge_check")[0]["finding"].to_string(), said);
+    said
 }
 
 #[test]
@@ -77,8 +88,8 @@ fn who_has_a_certificate_of_the_authority_is_connected_and_nobody_else() {
     // One that does not know the robot's authority, and one that the robot does not know.
     for (file, ca) in [("a.json5", "stranger"), ("b.json5", "ca")] {
         let config = of(file, ca, "thief");
-        let (mut thief, _) = bridge(&other, &["--connect", &at, "--publish", "--config", &config]);
-        reason(&mut thief, &["ertificate", "UnknownCA", "UnknownIssuer"]);
+        let mut thief = lonely(&other, &["--connect", &at, "--publish", "--config", &config]);
+        reason(&mut thief, "the certificates do not fit");
         assert_eq!(thief.end(INT).of_class("bridge_published").len(), 0);
     }
     let outcome = other.run(&[
@@ -110,11 +121,53 @@ fn who_does_not_know_the_password_is_refused() {
     is_up(&mut here);
     is_up(&mut robot);
     assert_eq!(here.end(INT).code, Some(0));
-    let (mut thief, _) = bridge(
-        &other,
-        &["--connect", &at, "--publish", "--config", &auth("thief.json5", "desk", "guess", "")],
+    let wrong = [
+        (auth("guess.json5", "desk", "guess", ""), "the user or the password is refused"),
+        (auth("nobody.json5", "nobody", "word", ""), "the user or the password is refused"),
+        (env.file("none.json5", "{}"), "the router wants a user and a password"),
+    ];
+    for (config, finding) in &wrong {
+        let mut thief = lonely(&other, &["--connect", &at, "--publish", "--config", config]);
+        reason(&mut thief, finding);
+        let outcome = thief.end(INT);
+        assert_eq!((outcome.code, outcome.of_class("bridge_ready").len()), (Some(0), 0), "{outcome}");
+    }
+    assert!(checked(&other, &at, &wrong[0].0).contains(wrong[0].1));
+    reason(&mut robot, "somebody was refused: the user or the password is wrong, or there is none");
+}
+
+/// A certificate of its own authority for CN=robot that was good on one day in 2024.
+fn expired(env: &TestEnv) -> String {
+    env.file("index", "");
+    env.file("serial", "01\n");
+    env.file(
+        "authority.cnf",
+        "[ca]\ndefault_ca=own\n[own]\ndatabase=index\nserial=serial\nnew_certs_dir=.\ndefault_md=sha256\npolicy=any\n\
+         [any]\ncommonName=supplied\n",
     );
-    reason(&mut thief, &["Unable to connect"]);
-    thief.end(INT);
-    robot.await_line("who was refused", |line| line["class"] == "bridge_link" && line["state"] == "failing");
+    openssl(env, "req -newkey rsa:2048 -nodes -keyout old.key -out old.csr -subj /CN=robot");
+    openssl(
+        env,
+        "ca -batch -selfsign -config authority.cnf -keyfile old.key -in old.csr -out old.pem -notext \
+         -startdate 20240101000000Z -enddate 20240102000000Z",
+    );
+    tls(env, "old.json5", "old", "old")
+}
+
+#[test]
+fn a_certificate_that_has_expired_is_told_with_its_date() {
+    let env = TestEnv::new();
+    let config = expired(&env);
+    let at = address("tls");
+    for flag in ["--listen", "--connect"] {
+        let outcome = env.run(&["bridge", "--json", flag, &at, "--config", &config]);
+        assert_eq!(outcome.code, Some(78), "{outcome}");
+        let said = outcome.to_string();
+        assert!(
+            said.contains("old.pem") && said.contains("CN=robot expired at Jan  2 00:00:00 2024"),
+            "{said}"
+        );
+        assert!(outcome.of_class("bridge_ready").is_empty(), "{outcome}");
+    }
+    assert!(checked(&env, &at, &config).contains("expired at Jan  2 00:00:00 2024"));
 }

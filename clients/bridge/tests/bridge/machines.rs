@@ -1,12 +1,14 @@
 //! Two machines and a bridge on each: what the hub of one publishes is on the other.
 
+use std::cell::Cell;
 use std::fs;
+use std::os::unix::fs::PermissionsExt;
 use std::process::Command;
 
 use serde_json::Value;
 
 use crate::testkit::{INT, TestEnv, number, until};
-use crate::{NO_FLAGS, address, agree, bridge, linked, refused};
+use crate::{NO_FLAGS, account, address, agree, bridge, linked, lonely, refused};
 
 /// By the number of the scan, what `name` saw.
 fn scans(env: &TestEnv, name: &str, count: &str) -> Vec<(u64, Value)> {
@@ -60,6 +62,12 @@ fn what_a_hub_publishes_is_on_the_other_machine_and_nothing_is_lost() {
     let received = here.end(INT);
     assert_eq!((sent.code, received.code, latest.code), (Some(0), Some(0), Some(0)), "{sent}{received}");
     assert_eq!(agree(&sent, &received), 0, "{received}");
+    // Who came late lost nothing: what was sent before does not count.
+    let (all, of_latest) = (account(&sent, &["sent"]), account(&latest, &["received", "lost", "duplicate"]));
+    assert!(of_latest["front/scan"][0] > 0, "{latest}");
+    for (name, row) in &of_latest {
+        assert!(row[1] == 0 && row[0] <= all[name][0], "{name}: {row:?} of {all:?}");
+    }
     for reason in ["crc", "payload", "key", "long", "overrun", "twin"] {
         assert_eq!((refused(&received, reason), refused(&latest, reason)), (0, 0), "{reason}: {received}");
     }
@@ -100,16 +108,79 @@ impl TestEnv {
     }
 }
 
-#[test]
-fn without_the_program_it_is_said_how_to_get_it() {
-    let env = TestEnv::new();
+/// What `scanhub bridge` says in one line, with nothing of its own but `beside`, a text of a shell.
+fn alone(env: &TestEnv, beside: Option<&str>) -> String {
     let program = env.command(&["bridge", "--connect=tcp/127.0.0.1:1"]).get_program().to_owned();
     let alone = env.path("scanhub");
     fs::copy(program, &alone).expect("can be copied");
+    if let Some(script) = beside {
+        let path = env.file("scanhub-bridge", format!("#!/bin/sh\n{script}\n"));
+        fs::set_permissions(&path, fs::Permissions::from_mode(0o755)).expect("it is there");
+    }
     let outcome = Command::new(&alone).arg("bridge").env("PATH", env.path("nothing")).output().expect("runs");
-    let errors = String::from_utf8_lossy(&outcome.stderr);
+    let errors = String::from_utf8_lossy(&outcome.stderr).into_owned();
     assert_eq!(outcome.status.code(), Some(78), "{errors}");
+    assert!(errors.trim_end().lines().count() == 1, "in one line: {errors}");
     assert!(errors.contains("cargo install --path clients/bridge"), "{errors}");
+    errors
+}
+
+#[test]
+fn without_the_program_or_with_another_version_it_is_said_how_to_get_it() {
+    let env = TestEnv::new();
+    assert!(alone(&env, None).contains("is not installed"));
+    let other = alone(&env, Some("echo scanhub-bridge 0.0.7"));
+    assert!(other.contains("version 0.0.7") && other.contains(env!("CARGO_PKG_VERSION")), "{other}");
+}
+
+#[test]
+fn it_is_ready_when_the_router_is_there() {
+    let (robot, middle) = (TestEnv::new(), TestEnv::new());
+    let at = address("tcp");
+    let mut there = lonely(&robot, &["--connect", &at]);
+    let is = |line: &Value, state: &str| line["class"] == "bridge_link" && line["state"] == state;
+    let (waits, why) = (Cell::new(false), Cell::new(false));
+    there.await_line("that it waits, and why", |line| {
+        let says = |key: &str, text: &str| line[key].as_str().is_some_and(|said| said.contains(text));
+        waits.set(waits.get() || is(line, "waiting") && says("message", &at));
+        why.set(why.get() || is(line, "failing") && says("finding", "no router is reached"));
+        waits.get() && why.get()
+    });
+    assert!(!there.is_heard(|line| line["class"] == "bridge_ready"));
+    // Who listens is ready when others can connect.
+    let _router = bridge(&middle, &["--listen", &at]);
+    let socket = at.strip_prefix("tcp/").expect("tcp");
+    std::net::TcpStream::connect(socket).expect("it listens");
+    there.await_line("its begin", |line| line["class"] == "bridge_ready");
+    linked(&mut there);
+    assert_eq!(there.end(INT).code, Some(0));
+}
+
+#[test]
+fn only_the_topics_that_are_named_are_received() {
+    let (robot, desk) = (TestEnv::new(), TestEnv::new());
+    let _sensor = robot.simulator(&["front"], NO_FLAGS);
+    let at = address("tcp");
+    let (there, id) = bridge(&robot, &["--listen", &at]);
+    let name = format!("--name=robot1={id}");
+    let (mut here, _) =
+        bridge(&desk, &["--connect", &at, "--publish", &name, "--topic=*/scan", "--topic=*/status"]);
+    let _hub = robot.hub(&[robot.link("front")]);
+    here.await_line("a sensor", |line| line["kind"] == "published");
+    assert_eq!(scans(&desk, "robot1.front/scan", "5").len(), 5);
+    desk.await_info("robot1.front", |info| info["state"] == "streaming");
+    let topics = desk.run(&["list", "--json"]).of_class("topic");
+    let topics: Vec<_> = topics.iter().map(|line| line["topic"].clone()).collect();
+    assert_eq!(topics, ["scan", "status"]);
+    let (sent, received) = (there.end(INT), here.end(INT));
+    let rows = account(&received, &["received", "lost"]);
+    let names: Vec<_> = rows.keys().map(String::as_str).collect();
+    assert_eq!(names, ["front/announce", "front/scan", "front/status"], "{received}");
+    assert!(rows.values().all(|row| row[1] == 0) && account(&sent, &["sent"]).len() > 3, "{received}");
+    for wrong in ["front/scan", "*/scan:every=2"] {
+        let outcome = desk.run(&["bridge", "--connect", &at, "--publish", &format!("--topic={wrong}")]);
+        assert_eq!(outcome.code, Some(2), "{outcome}");
+    }
 }
 
 #[test]

@@ -27,11 +27,16 @@ fn address(protocol: &str) -> String {
     format!("{protocol}/127.0.0.1:{port}")
 }
 
-/// A bridge with these flags that has begun, and what it is called if it sends.
+/// A bridge with these flags that listens or is connected, and what it is called if it sends.
 fn bridge(env: &TestEnv, flags: &[&str]) -> (Program, String) {
-    let mut program = env.start(&[&["bridge", "--json"], flags].concat());
+    let mut program = lonely(env, flags);
     let line = program.await_line("its begin", |line| line["class"] == "bridge_ready");
     (program, line["hub"].as_str().unwrap_or_default().to_owned())
+}
+
+/// A bridge with these flags that nobody waits for.
+fn lonely(env: &TestEnv, flags: &[&str]) -> Program {
+    env.start(&[&["bridge", "--json"], flags].concat())
 }
 
 /// Waits until somebody is connected to it.

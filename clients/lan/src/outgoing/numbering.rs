@@ -170,14 +170,15 @@ impl Numbering {
         rows.map_or(0, |rows| rows.rows[usize::from(topic.number())].replaced)
     }
 
-    /// Numbers the sample that waits for longest and returns it; nothing if none waits.
-    pub(super) fn hand(&mut self) -> Option<Handed<'_>> {
+    /// Numbers the sample that waits for longest and returns it, as it is sent `now`; nothing if none waits.
+    pub(super) fn hand(&mut self, now: Stamp) -> Option<Handed<'_>> {
         let Waiting { slots, last } = self.waiting.as_mut()?;
         let (head, payload) = slots.take()?;
         let rows = self.sensors.get_mut(usize::from(head.sensor))?;
         let len = rows.write(&head, payload, &mut self.buffer[HEAD..])?;
         let row = rows.rows.get_mut(usize::from(head.topic))?;
-        let head = Head { hub: self.hub, epoch: self.epoch, sequence: row.next(), ..head };
+        let stamp_ns = stamp_ns(&head, now);
+        let head = Head { hub: self.hub, epoch: self.epoch, sequence: row.next(), stamp_ns, ..head };
         let datagram = head.seal(&mut self.buffer, len)?;
         row.sent += 1;
         row.bytes += datagram.len() as u64;
@@ -204,9 +205,7 @@ impl Numbering {
         let last = &self.waiting.as_ref()?.last;
         let is_it = |head: &Head| usize::from(head.sensor) == sensor && head.topic == number;
         let (head, payload) = last.iter().find(|(head, _)| is_it(head))?;
-        // Announcements and statuses say when they are sent.
-        let is_old = topic == Some(Topic::Background);
-        let head = Head { stamp_ns: if is_old { head.stamp_ns } else { now.wall_ns }, ..*head };
+        let head = Head { stamp_ns: stamp_ns(head, now), ..*head };
         let len = self.sensors[sensor].write(&head, payload, &mut self.buffer[HEAD..])?;
         head.seal(&mut self.buffer, len)
     }
@@ -362,6 +361,15 @@ impl Numbering {
 
     fn row(&mut self, number: u8, topic: u8) -> Option<&mut Row> {
         self.sensors.get_mut(usize::from(number))?.rows.get_mut(usize::from(topic))
+    }
+}
+
+/// The stamp of a sample with this `head` that is sent `now`: announcements and statuses say when they are sent, however long
+/// they waited; by them clocks are compared.
+fn stamp_ns(head: &Head, now: Stamp) -> u64 {
+    match Topic::of_number(head.topic) {
+        None | Some(Topic::Status) => now.wall_ns,
+        Some(_) => head.stamp_ns,
     }
 }
 

@@ -264,7 +264,7 @@ fn wait(out: &mut Outgoing, sensor: usize, seq: u64) {
 /// What waits, in its order.
 fn handed(out: &mut Outgoing) -> Vec<Vec<u8>> {
     let mut all = Vec::new();
-    while let Some(handed) = out.hand() {
+    while let Some(handed) = out.hand(at(700)) {
         all.push(handed.datagram.to_vec());
     }
     all
@@ -296,6 +296,8 @@ fn who_comes_late_counts_nothing_that_came_before() {
         wait(&mut out, front, seq);
         handed(&mut out);
     }
+    let head = Datagram::read(announced).expect("a datagram").head;
+    assert_eq!(head.stamp_ns, at(700).wall_ns, "when it is sent, not when it began to wait");
     let asked = out.again("front", None, at(900)).expect("it was announced").to_vec();
     wait(&mut out, front, 110);
     let [zones] = &handed(&mut out)[..] else { panic!("zones") };

@@ -63,6 +63,11 @@ impl Selection {
         closest.into_iter().find_map(|(sensor, topic)| find(word(sensor, topic))).map(|entry| entry.every)
     }
 
+    /// Returns whether this topic goes out of any sensor.
+    pub fn names(&self, topic: Topic) -> bool {
+        self.entries.iter().any(|entry| entry.word.topic.is_none_or(|named| named == topic))
+    }
+
     /// The sensors that are named, each once.
     pub(super) fn named(&self) -> Vec<&str> {
         let mut named: Vec<_> =
@@ -154,6 +159,8 @@ mod tests {
             (Some(1), None)
         );
         assert_eq!((some.named(), some.wants_all()), (vec!["front"], true));
+        assert!(some.names(Topic::Zones) && !some.names(Topic::Marks));
+        assert!(selection(&["front/*"], false).unwrap().names(Topic::Marks));
         assert!(!selection(&["front/zones"], false).unwrap().wants_all());
         let front = selection(&["*/scan:every=8", "front/*", "front/marks:every=2"], false).unwrap();
         assert_eq!(every(&front, "front", Topic::Scan), Some(1));

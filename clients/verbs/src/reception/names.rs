@@ -15,7 +15,7 @@ impl Names {
         let mut names: Vec<(String, u64)> = Vec::new();
         for text in given {
             let wrong = |what: &str| {
-                let hint = "NAME=HUB, for example --name robot1=5f3a12bc00d1e2f3; `scanhub listen --stats` shows the hubs";
+                let hint = "NAME=HUB, for example --name robot1=5f3a12bc00d1e2f3; a gateway or bridge prints its own at its start";
                 Failure::new(Kind::Configuration, format!("--name {text}: {what}"), hint)
             };
             let (name, hub) = text.split_once('=').ok_or_else(|| wrong("no hub is named"))?;
@@ -59,7 +59,7 @@ impl Hubs {
                 let what = format!("--hub {text}: neither 16 hex digits nor a name that --name gives");
                 let hint = format!(
                     "for example --hub 5f3a12bc00d1e2f3, or --name {text}=5f3a12bc00d1e2f3 besides; \
-                     `scanhub listen --stats` shows the hubs"
+                     a gateway or bridge prints its own at its start"
                 );
                 Failure::new(Kind::Configuration, what, hint)
             })

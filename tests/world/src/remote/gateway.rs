@@ -132,9 +132,9 @@ impl Gateway {
     /// The sample that has waited for longest, which is handed over now and taken or not.
     pub(super) fn hand(&mut self, shared: &Shared, now: Nanos, is_taken: bool) -> Option<Vec<u8>> {
         if shared.planted.strikes(Defect::RouterUntold, 100) {
-            self.outgoing.hand();
+            self.outgoing.hand(stamp(shared, now));
         }
-        let handed = self.outgoing.hand()?;
+        let handed = self.outgoing.hand(stamp(shared, now))?;
         let (sensor, topic, bytes) = (handed.sensor.0, handed.topic, handed.datagram.to_vec());
         let datagram = Datagram::read(&bytes).expect("a bridge makes whole datagrams");
         shared.log.tell(now, &Event::Transmitted { datagram: &datagram, bytes: &bytes, is_taken });

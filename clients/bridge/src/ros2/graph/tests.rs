@@ -34,7 +34,7 @@ fn foreground() -> Box<Foreground> {
 }
 
 fn graph(every: impl Fn(Topic) -> Option<u64>) -> Graph {
-    let mut graph = Graph::new(Names::default());
+    let mut graph = Graph::new(Names::default(), false);
     assert_eq!(graph.follow("front", &|topic| every(topic).and_then(NonZeroU64::new)), 0);
     graph
 }
@@ -171,7 +171,7 @@ fn a_foreground_waits_for_its_scan_alone() {
 #[test]
 fn two_sensors_do_not_take_each_others_place_in_a_topic_that_they_share() {
     let names = Names::new("robot1", "lidars", vec![("rear".to_owned(), "back".to_owned())]).unwrap();
-    let mut graph = Graph::new(names);
+    let mut graph = Graph::new(names, false);
     for (position, sensor) in ["front", "rear"].into_iter().enumerate() {
         graph.follow(sensor, &|topic| (topic == Topic::Status).then_some(NonZeroU64::MIN));
         graph.sample(position, &sample(&header(1), PayloadRef::Status(&Status::default())), at(SECOND_NS));
@@ -189,7 +189,7 @@ fn without_a_hub_nobody_knows_how_a_sensor_is() {
     let mut graph = graph(|topic| matches!(topic, Topic::Status | Topic::Zones).then_some(1));
     graph.sample(0, &sample(&header(1), PayloadRef::Status(&Status::default())), at(10 * SECOND_NS));
     handed(&mut graph);
-    graph.look(at(12 * SECOND_NS));
+    graph.look(true, at(12 * SECOND_NS));
     assert!(handed(&mut graph).is_empty());
     let unknown = Zones::unknown();
     let silence = Sample { header: None, missed: 0, payload: PayloadRef::Zones(&unknown) };
@@ -198,10 +198,47 @@ fn without_a_hub_nobody_knows_how_a_sensor_is() {
     assert_eq!((names(&told), told[0].1.text("data")), (vec!["/front/verdict"], Some("unknown")));
     let mut said = 0;
     for tenth in 130..160 {
-        graph.look(at(tenth * SECOND_NS / 10));
+        graph.look(true, at(tenth * SECOND_NS / 10));
         let told = handed(&mut graph);
         said += told.len();
         assert!(told.iter().all(|(_, value)| value.number("status.0.level") == Some(3.0)), "{told:?}");
     }
     assert_eq!(said, 3);
+}
+
+#[test]
+fn that_there_is_no_hub_is_said_within_a_second_and_again() {
+    let mut graph = Graph::new(Names::default(), true);
+    let mut hear = |tenths: std::ops::Range<u64>, is_there| {
+        let mut told = Vec::new();
+        for tenth in tenths {
+            graph.look(is_there, at(tenth * SECOND_NS / 10));
+            told.extend(handed(&mut graph).into_iter().map(|(topic, value)| {
+                assert_eq!((&*topic, value.text("status.0.name")), ("/diagnostics", Some("scanhub: hub")));
+                (tenth, value.number("status.0.level"))
+            }));
+        }
+        told
+    };
+    assert_eq!(hear(100..120, false), [(105, Some(3.0)), (115, Some(3.0))]);
+    assert_eq!(hear(120..140, true), [(125, Some(0.0)), (135, Some(0.0))]);
+    // One that goes and comes at once is not gone.
+    assert_eq!(hear(140..144, false), []);
+    assert_eq!(hear(144..150, true), [(145, Some(0.0))]);
+    assert_eq!(hear(150..160, false), [(155, Some(3.0))]);
+}
+
+#[test]
+fn of_sensors_without_a_hub_it_is_said_as_soon() {
+    let mut graph = graph(|topic| (topic == Topic::Status).then_some(1));
+    graph.sample(0, &sample(&header(1), PayloadRef::Status(&Status::default())), at(10 * SECOND_NS));
+    handed(&mut graph);
+    for ms in [10_100, 10_500] {
+        graph.look(false, at(ms * SECOND_NS / 1000));
+        assert!(handed(&mut graph).is_empty(), "{ms}");
+    }
+    graph.look(false, at(11 * SECOND_NS));
+    let told = handed(&mut graph);
+    let said = told.last().map(|(_, value)| (value.text("status.0.name"), value.number("status.0.level")));
+    assert_eq!(said, Some((Some("scanhub: front"), Some(3.0))), "{told:?}");
 }
