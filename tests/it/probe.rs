@@ -118,3 +118,22 @@ fn without_a_port_the_candidates_are_listed() {
         }
     }
 }
+
+#[test]
+fn a_serial_server_that_has_another_client_is_told_with_a_remedy() {
+    let env = TestEnv::new();
+    let flags = ["--family=ld", "--model=ld19", "--world=room"];
+    let mut simulator = env.start(&[&["simulate", "--json", "--tcp=127.0.0.1:0"], &flags[..]].concat());
+    let ready = simulator.await_line("ready", |line| line["class"] == "ready");
+    let port = ready["ports"][0]["port"].as_str().expect("its address");
+    let hub = env.hub(&[&format!("--link=front={port}"), "--set=link.front.family=ld"]);
+    env.await_info("front", |info| info["state"] == "streaming");
+    let busy = env.run(&["probe", port, "--json"]);
+    let error = &busy.of_class("error")[0];
+    assert_eq!((busy.code, &error["kind"]), (Some(4), &"port_busy".into()), "{busy}");
+    assert!(error["hint"].as_str().is_some_and(|hint| hint.contains("end the other program")), "{busy}");
+    assert_eq!(env.info("front")["state"], "streaming", "the hub does not notice");
+    assert_eq!(hub.end(TERM).code, Some(0));
+    testkit::until("the server has no client", || env.run(&["probe", port]).code == Some(0));
+    assert_eq!(simulator.end(TERM).code, Some(0));
+}

@@ -238,6 +238,11 @@ impl Session {
         match self.phase {
             Phase::Listening { .. } if self.framer.is_alike() => self.trouble = Some(Trouble::Alike),
             Phase::Listening { since } => self.complain(since),
+            Phase::Draining { until, at_most, .. }
+                if until > at_most && now >= at_most && self.seeks_quickly() =>
+            {
+                self.seek_on();
+            }
             Phase::Draining { attempts, until, at_most } if now >= until.min(at_most) => {
                 self.ask(Ask::Info, attempts);
             }

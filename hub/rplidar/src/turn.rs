@@ -133,7 +133,7 @@ impl Turns {
                 self.open = [self.fresh(turn), self.fresh(turn + 1)];
                 return None;
             }
-            let points = self.at;
+            let (points, next) = (self.at, self.open[1].first);
             self.at ^= 1;
             self.open = [self.open[1], self.fresh(number + 2)];
             self.number = Some(number + 1);
@@ -144,12 +144,15 @@ impl Turns {
             };
             self.counts.turns += 1;
             self.counts.incomplete += u64::from(open.incomplete);
+            // A head may change its speed: from edge to edge is what this turn took.
+            let usual = due * pace.point_ns;
+            let took = next.map(|next| next - first).filter(|took| (0.5 * usual..2.0 * usual).contains(took));
             return Some(Closed {
                 points,
                 len: open.len,
                 first: first as Nanos,
                 last: open.last.max(first) as Nanos,
-                period: (due * pace.point_ns) as Nanos,
+                period: took.unwrap_or(usual) as Nanos,
                 incomplete: open.incomplete,
                 reasons: open.reasons,
             });
@@ -171,3 +174,23 @@ impl Turns {
 
 /// Points of an S2 that turns four times a second; what is more does not fit into a turn.
 const CAPACITY: usize = 8_192;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_turn_takes_the_time_from_its_edge_to_the_next_one() {
+        let mut turns = Turns::new();
+        turns.begin(360);
+        // Points of a degree each; the head is faster as soon as the turn is over.
+        for n in 0..735 {
+            let angle = f64::from(n);
+            let time = 1e6 * angle.min(722.0) + 0.9e6 * (angle - 722.0).max(0.0);
+            turns.put(angle, time, 1_000, 0, 0, Pace { step: 1.0, point_ns: 1e6 });
+        }
+        let pace = Pace { step: 1.0, point_ns: 0.9e6 };
+        let closed = turns.reach(735.0, pace).expect("a turn");
+        assert_eq!((closed.len, closed.period), (360, 360_000_000));
+    }
+}

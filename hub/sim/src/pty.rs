@@ -94,23 +94,22 @@ impl Pty {
         }
     }
 
-    /// Gives `bytes` to the host; returns whether its buffer had room for all. What has no room is lost, as in a UART
-    /// that nobody reads.
-    pub fn write(&self, bytes: &[u8]) -> Result<bool, Failure> {
+    /// Gives `bytes` to the host; returns how many of them its buffer had room for.
+    pub fn write(&self, bytes: &[u8]) -> Result<usize, Failure> {
         let mut rest = bytes;
         while !rest.is_empty() {
             match io::write(&self.master, rest) {
                 Ok(count) => rest = &rest[count..],
                 Err(Errno::INTR) => {}
-                Err(Errno::AGAIN | Errno::IO) => return Ok(false),
+                Err(Errno::AGAIN | Errno::IO) => break,
                 Err(errno) => return Err(broken("write to", &self.name, errno)),
             }
         }
-        Ok(true)
+        Ok(bytes.len() - rest.len())
     }
 
-    /// What becomes readable when a host has written.
-    pub(crate) fn waits_for(&self) -> BorrowedFd<'_> {
+    /// What becomes readable when a host has written, and writable when it has read.
+    pub fn waits_for(&self) -> BorrowedFd<'_> {
         self.master.as_fd()
     }
 

@@ -77,10 +77,11 @@ impl Socket {
         }
     }
 
-    /// Gives `bytes` to the host; returns whether there was room for all.
+    /// Gives `bytes` to the host; returns whether there was room for all. What has no room is lost, as in a UART that
+    /// nobody reads.
     pub(crate) fn write(&mut self, bytes: &[u8]) -> Result<bool, Failure> {
         match self {
-            Socket::Pty { pty, .. } => pty.write(bytes),
+            Socket::Pty { pty, .. } => Ok(pty.write(bytes)? == bytes.len()),
             Socket::Tcp(server) => Ok(server.write(bytes)),
         }
     }

@@ -19,7 +19,7 @@ pub(crate) fn drive<C: Conversation>(
     stop: &AtomicBool,
     mut look: impl FnMut(&C),
 ) -> Result<(), Failure> {
-    while let Some(until) = drain(port, talk).map_err(|error| gone(&error))? {
+    while let Some(until) = drain(port, talk).map_err(|error| gone(port, &error))? {
         look(talk);
         if stop.load(Ordering::Relaxed) {
             return Err(Failure::new(Kind::Interrupted, "interrupted", ""));
@@ -28,7 +28,7 @@ pub(crate) fn drive<C: Conversation>(
         let mut fds = [PollFd::new(port, PollFlags::IN)];
         // An interrupted wait is a short one.
         let _ = poll(&mut fds, Some(&clock::span(now, until.min(now + LOOK))));
-        let len = port.read(talk.spare()).map_err(|error| gone(&error))?;
+        let len = port.read(talk.spare()).map_err(|error| gone(port, &error))?;
         let now = clock::now();
         talk.commit(now, len);
         if len == 0 && now >= until {
@@ -61,7 +61,16 @@ fn drain<C: Conversation>(port: &Port, talk: &mut C) -> std::io::Result<Option<N
     }
 }
 
-pub(crate) fn gone(error: &std::io::Error) -> Failure {
+/// Why `port` can be used no more. A serial server that has a client closes the connection of another one.
+pub(crate) fn gone(port: &Port, error: &std::io::Error) -> Failure {
+    if let Port::Tcp(_) = port {
+        return Failure::new(
+            Kind::PortBusy,
+            format!("the connection is over: {error}"),
+            "a serial server has one client at a time: end the other program that is connected to it, such as a hub, and try \
+             again; if there is none, was the server switched off?",
+        );
+    }
     Failure::new(
         Kind::PortMissing,
         format!("the port went away: {error}"),

@@ -77,7 +77,7 @@ pub(crate) fn listen(
     let wanted = Wanted { fixed_rate, listen_only: features.speaks_unasked, ..Wanted::default() };
     let begun = clock::now();
     let Some(mut session) = Session::begin(family, wanted, begun) else { return Ok(Err(0)) };
-    port.try_baud(session.rate()).map_err(|error| gone(&error))?;
+    port.try_baud(session.rate()).map_err(|error| gone(port, &error))?;
     let mut heard = Turns::default();
     let (first_rate, mut rate, mut rates) = (session.rate(), 0, 0);
     loop {
@@ -88,7 +88,7 @@ pub(crate) fn listen(
             }
             look(rate);
         }
-        let until = heard.drain(port, &mut session).map_err(|error| gone(&error))?;
+        let until = heard.drain(port, &mut session).map_err(|error| gone(port, &error))?;
         if stop.load(Ordering::Relaxed) {
             return Err(Failure::new(Kind::Interrupted, "interrupted", ""));
         }
@@ -106,7 +106,7 @@ pub(crate) fn listen(
         let mut fds = [PollFd::new(port, PollFlags::IN)];
         // An interrupted wait is a short one.
         let _ = poll(&mut fds, Some(&clock::span(now, until.min(now + LOOK))));
-        let len = port.read(session.spare()).map_err(|error| gone(&error))?;
+        let len = port.read(session.spare()).map_err(|error| gone(port, &error))?;
         let now = clock::now();
         session.commit(now, len);
         if len == 0 && now >= until {

@@ -182,7 +182,8 @@ fn silence(source: &Source, first: Baud, report: &Report) -> Failure {
         ),
         (None, Source::Tcp { .. }) => (
             format!("{name}: connected, but no answer; {came}"),
-            "set the serial server to the sensor's rate, 8 bits, no parity; check power and cable",
+            "set the serial server to the sensor's rate, 8 bits, no parity; check power and cable; a server that has another \
+             client already may let this one wait: end that program first",
         ),
         (None, _) if report.bytes == 0 => (
             format!("{name}: no answer at {rates}; {came}"),

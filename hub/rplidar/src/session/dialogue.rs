@@ -118,7 +118,7 @@ impl Session {
         // Something came, and was no answer: nobody is believed not to know what he was asked.
         let is_damaged = self.reads.last_byte() + self.patience() > self.now && attempts < PATIENT;
         match ask {
-            Ask::Info if attempts == 0 => self.stop(1),
+            Ask::Info if attempts == 0 && is_damaged => self.stop(1),
             Ask::Info => self.seek_on(),
             _ if attempts == 0 || is_damaged => self.ask(ask, attempts + 1),
             Ask::Board => self.turn_and_list(),
@@ -139,8 +139,15 @@ impl Session {
         }
     }
 
+    /// Whether it was sought for a short time only: then what goes on to stream is not asked, for at its rate it would have
+    /// stopped. On a line that is never quiet it is asked all the same later.
+    pub(super) fn seeks_quickly(&self) -> bool {
+        let is_young = self.quiet_since.is_none_or(|(since, _)| self.now < since + ROUNDS);
+        is_young && self.next_rate().is_some()
+    }
+
     /// Tries the next rate, and says for how long already.
-    fn seek_on(&mut self) {
+    pub(super) fn seek_on(&mut self) {
         let since = self.quiet_since.get_or_insert((self.now, self.framer.tally().read)).0;
         if let Some(baud) = self.next_rate() {
             self.baud = baud;
@@ -376,6 +383,8 @@ impl Session {
 /// A line on which nothing came for so long is quiet after a request to stop; and it is asked after so long, quiet or not.
 pub(super) const QUIET: Nanos = 15 * MILLIS;
 const DRAIN: Nanos = 60 * MILLIS;
+/// All rates are tried twice in so long, where a stream goes on at each of them: one may not have heard that it shall stop.
+const ROUNDS: Nanos = 8 * DRAIN;
 /// An answer takes some milliseconds, and an adapter that collects bytes 16 more, twice.
 const ANSWER: Nanos = 70 * MILLIS;
 /// So often something is asked at the most of which a damaged answer came.

@@ -87,7 +87,7 @@ impl Head {
                 (0x31, vec![("Standard", 250.0, Kind::Standard), ("Sensitivity", 62.5, Kind::Ultra)])
             }
             Model::S1 => {
-                (0x61, vec![("Standard", 108.75, Kind::Standard), ("DenseBoost", 108.75, Kind::Dense)])
+                (0x61, vec![("Standard", 217.5, Kind::Standard), ("DenseBoost", 108.75, Kind::Dense)])
             }
             Model::S2 => (0x71, vec![("Standard", 62.5, Kind::Standard), ("DenseBoost", 31.25, Kind::Dense)]),
             Model::S3 => {

@@ -82,16 +82,32 @@ fn where_the_rate_is_fixed_it_stays() {
 }
 
 #[test]
-fn a_stream_that_somebody_left_ends_in_half_a_second() {
+fn a_stream_that_somebody_left_streams_again_in_half_a_second_at_whatever_rate() {
     for model in Model::ALL {
-        for kind in [Kind::Standard, Kind::Express, Kind::Dense] {
-            let mut head = Head::new(model, 1);
-            head.left_in(kind, 0);
-            head.line_is_full(4_000);
-            let mut bench = Bench::new(of(model), head);
-            bench.until(SECOND / 2, |bench| !bench.head.is_measuring());
-            bench.until(3 * SECOND, is_streaming);
+        let kinds = Head::new(model, 1).modes.into_iter().map(|(.., kind)| kind);
+        for kind in kinds {
+            // The rate of the first is tried first.
+            for first in [Settings::default(), of(model), of(Model::A3), of(Model::C1), of(Model::S3)] {
+                let mut head = Head::new(model, 1);
+                head.left_in(kind, 0);
+                head.line_is_full(4_000);
+                let mut bench = Bench::new(first, head);
+                bench.until(SECOND / 2, |bench| !bench.log.packets.is_empty());
+                bench.until(3 * SECOND, is_streaming);
+                assert_eq!(bench.session.rate(), model.baud());
+            }
         }
+    }
+}
+
+#[test]
+fn one_that_does_not_hear_that_it_shall_stop_is_told_again() {
+    for settings in [of(Model::S2), Settings::default()] {
+        let mut head = Head::new(Model::S2, 1);
+        head.left_in(Kind::Dense, 0);
+        head.deaf_to = vec![0x25];
+        let mut bench = Bench::new(settings, head);
+        bench.until(SECOND, |bench| !bench.log.packets.is_empty());
     }
 }
 

@@ -56,6 +56,8 @@ struct OfSensor {
     /// looks earlier than it was.
     end: u64,
     crowded_at: Option<Nanos>,
+    /// When a packet was on the line last that arrived as it was sent.
+    arrived_at: Nanos,
     /// By how much the stamp of the last scan was off that is judged.
     off: Cell<Option<i64>>,
 }
@@ -78,6 +80,7 @@ impl Turns {
             prompt_at: None,
             end: 0,
             crowded_at: None,
+            arrived_at: 0,
             off: Cell::default(),
         };
         Turns { sensors: sensors.iter().map(sensor).collect(), figures: Figures::default() }
@@ -180,6 +183,13 @@ impl OfSensor {
         let (begin, end) = (std::mem::replace(&mut self.end, telegram.span.1), telegram.span.1);
         if telegram.is_reply {
             return;
+        }
+        if telegram.damage.is_none() {
+            // The line lost all that came between: where nothing else tells, what waits behind it has no time yet.
+            if !self.exactness.has_clock && self.arrived_at + LONG_GAP < at {
+                self.begin();
+            }
+            self.arrived_at = at;
         }
         let key = History::of(telegram.bytes);
         let is_double = self.order.back() == Some(&key);
