@@ -636,10 +636,22 @@ static inline struct scanhub_track scanhub_track(const struct scanhub_tracks *tr
     out.state = at[72];
     return out;
 }
-/* The name of one sensor, i below `sensor_count`. */
-static inline void scanhub_track_sensor(const struct scanhub_tracks *tracks, unsigned i, char name[57])
+/* One sensor, i below `sensor_count`. */
+struct scanhub_track_sensor {
+    float x_m, y_m, yaw_rad; /* where it sits in the map, and looks, counter-clockwise from x */
+    uint8_t upside_down;     /* 1: it hangs so */
+    char name[57];
+};
+static inline struct scanhub_track_sensor scanhub_track_sensor(const struct scanhub_tracks *tracks, unsigned i)
 {
-    scanhub_text(name, tracks->sensors + 56 * (size_t)i, 56);
+    const uint8_t *at = tracks->sensors + 72 * (size_t)i;
+    struct scanhub_track_sensor out;
+    out.x_m = scanhub_f32(at);
+    out.y_m = scanhub_f32(at + 4);
+    out.yaw_rad = scanhub_f32(at + 8);
+    out.upside_down = at[12] == 1;
+    scanhub_text(out.name, at + 16, 56);
+    return out;
 }
 static inline enum scanhub_result scanhub_read_tracks(const struct scanhub_datagram *datagram,
                                                       struct scanhub_tracks *out)
@@ -649,7 +661,7 @@ static inline enum scanhub_result scanhub_read_tracks(const struct scanhub_datag
     unsigned i, n;
     if (result != SCANHUB_OK)
         return result;
-    if (at[0] > 64 || at[1] > 32 || datagram->payload_len < 8 + 80 * (size_t)at[0] + 56 * (size_t)at[1])
+    if (at[0] > 64 || at[1] > 32 || datagram->payload_len < 8 + 80 * (size_t)at[0] + 72 * (size_t)at[1])
         return SCANHUB_BAD_PAYLOAD;
     out->count = at[0];
     out->sensor_count = at[1];
@@ -664,6 +676,10 @@ static inline enum scanhub_result scanhub_read_tracks(const struct scanhub_datag
         if ((uint64_t)scanhub_u32(track + 44) >> out->sensor_count)
             return SCANHUB_BAD_PAYLOAD;
     }
+    for (i = 0; i < out->sensor_count; i++)
+        for (n = 0; n < 12; n += 4)
+            if (!isfinite(scanhub_f32(out->sensors + 72 * (size_t)i + n)))
+                return SCANHUB_BAD_PAYLOAD;
     return SCANHUB_OK;
 }
 

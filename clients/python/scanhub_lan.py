@@ -285,10 +285,21 @@ class Track:
 
 
 @dataclass(frozen=True)
-class Tracks:
-    """People at one instant, which is `stamp_ns`, and the names of the sensors."""
+class Site:
+    """Where a sensor sits in the map, and where it looks, counter-clockwise from x."""
 
-    names: "tuple[str, ...]"
+    name: str
+    site_x_m: float
+    site_y_m: float
+    yaw_rad: float
+    upside_down: bool
+
+
+@dataclass(frozen=True)
+class Tracks:
+    """People at one instant, which is `stamp_ns`, and the sensors."""
+
+    sites: "tuple[Site, ...]"
     tracks: "tuple[Track, ...]"
 
 
@@ -783,7 +794,12 @@ def _tracks(payload: bytes) -> Tracks:
         return Track(id, *numbers[:4], tuple(numbers[4:]), score, age_ms, seen_by, _text(room), state)
 
     tracks = _items(track, "<Q7ffII24sB7x", payload, 8, count)
-    return Tracks(_items(_text, "<56s", payload, 8 + 80 * count, sensors), tracks)
+
+    def site(x_m, y_m, yaw_rad, upside_down, name) -> Site:
+        _limit(all(math.isfinite(number) for number in (x_m, y_m, yaw_rad)))
+        return Site(_text(name), x_m, y_m, yaw_rad, upside_down == 1)
+
+    return Tracks(_items(site, "<3fB3x56s", payload, 8 + 80 * count, sensors), tracks)
 
 
 def _events(payload: bytes) -> Event:

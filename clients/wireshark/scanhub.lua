@@ -162,7 +162,11 @@ field("early.distance_mm", "uint32", "Its distance, mm")
 field("early.bytes_seen", "uint16", "Bytes that had arrived")
 field("early.beams_seen", "uint16", "Beams that had arrived")
 
-field("tracks.names", "string", "Sensor")
+field("tracks.name", "string", "Sensor")
+field("tracks.site_x_m", "float", "Its x, m")
+field("tracks.site_y_m", "float", "Its y, m")
+field("tracks.yaw_rad", "float", "Its yaw, rad")
+field("tracks.upside_down", "uint8", "It hangs upside down")
 field("tracks.id", "uint64", "Person")
 field("tracks.x_m", "float", "x, m")
 field("tracks.y_m", "float", "y, m")
@@ -699,12 +703,17 @@ unpack_payload[11] = function(payload, tree)
     if len < 8 then return nil end
     local count, sensors = payload(0, 1):uint(), payload(1, 1):uint()
     local behind = 8 + 80 * count
-    if count > 64 or sensors > 32 or len < behind + 56 * sensors then return nil end
+    if count > 64 or sensors > 32 or len < behind + 72 * sensors then return nil end
     for at = 8, behind - 1, 80 do
         for n = 8, 36, 4 do
             if not is_finite(payload(at + n, 4):le_float()) then return nil end
         end
         if payload(at + 44, 4):le_uint() >= 2 ^ sensors then return nil end
+    end
+    for at = behind, behind + 72 * sensors - 1, 72 do
+        for n = 0, 8, 4 do
+            if not is_finite(payload(at + n, 4):le_float()) then return nil end
+        end
     end
     for at = 8, behind - 1, 80 do
         local item = tree:add(payload(at, 80), "Person")
@@ -717,8 +726,11 @@ unpack_payload[11] = function(payload, tree)
         item:add(f["tracks.room"], payload(at + 48, 24), payload(at + 48, 24):stringz(ENC_UTF_8))
         item:add(f["tracks.state"], payload(at + 72, 1))
     end
-    for at = behind, behind + 56 * sensors - 1, 56 do
-        tree:add(f["tracks.names"], payload(at, 56), payload(at, 56):stringz(ENC_UTF_8))
+    for at = behind, behind + 72 * sensors - 1, 72 do
+        local item = tree:add(payload(at, 72), "Sensor")
+        add_fields(item, payload, at, "tracks.site_x_m", 4, "tracks.site_y_m", 4, "tracks.yaw_rad", 4,
+            "tracks.upside_down", 1)
+        item:add(f["tracks.name"], payload(at + 16, 56), payload(at + 16, 56):stringz(ENC_UTF_8))
     end
     return count .. " people"
 end

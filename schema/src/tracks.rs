@@ -4,14 +4,14 @@ use bytemuck::{Pod, Zeroable};
 #[cfg(feature = "ipc")]
 use iceoryx2::prelude::ZeroCopySend;
 
-use crate::text;
+use crate::{Pose, text};
 
 /// The most persons in a sample.
 pub const TRACKS: usize = 64;
 /// The most sensors that a sample names.
 pub const TRACK_SENSORS: usize = 32;
 
-/// The payload of topic `tracks`, 6920 bytes: all persons at one instant, in the map of the site. The instant is the sample's
+/// The payload of topic `tracks`, 7432 bytes: all persons at one instant, in the map of the site. The instant is the sample's
 /// `wall_ns`.
 #[derive(Clone, Copy, Debug, PartialEq, Pod, Zeroable)]
 #[cfg_attr(feature = "ipc", derive(ZeroCopySend), type_name("scanhub.Tracks.v2"))]
@@ -60,11 +60,21 @@ pub struct Track {
     pub reserved: [u8; 7],
 }
 
-/// The name of one sensor.
+/// One sensor of the site, and where it is in the map.
 #[derive(Clone, Copy, Debug, PartialEq, Pod, Zeroable)]
 #[cfg_attr(feature = "ipc", derive(ZeroCopySend), type_name("scanhub.TrackSensor.v2"))]
 #[repr(C)]
 pub struct TrackSensor {
+    /// Metres in the map.
+    pub x_m: f32,
+    /// The same, along y.
+    pub y_m: f32,
+    /// Where it looks, in radians counter-clockwise from x.
+    pub yaw_rad: f32,
+    /// 1: it hangs upside down.
+    pub upside_down: u8,
+    /// 0.
+    pub reserved: [u8; 3],
     /// As consumers know it, 0 behind it; see [`name`](TrackSensor::name).
     pub name_text: [u8; 56],
 }
@@ -138,9 +148,9 @@ impl Tracks {
     }
 
     /// Adds a sensor of the site; leaves it out if there are [`TRACK_SENSORS`] already.
-    pub fn push_sensor(&mut self, name: &str) {
+    pub fn push_sensor(&mut self, sensor: TrackSensor) {
         if let Some(place) = self.sensor_array.get_mut(usize::from(self.sensors)) {
-            text::write(&mut place.name_text, name);
+            *place = sensor;
             self.sensors += 1;
         }
     }
@@ -164,6 +174,22 @@ impl Track {
 }
 
 impl TrackSensor {
+    /// Makes the sensor called `name`, which sits at `pose` in the map.
+    pub fn new(name: &str, pose: &Pose) -> TrackSensor {
+        let Pose { x_m, y_m, yaw_rad, upside_down, .. } = *pose;
+        let (x_m, y_m, yaw_rad) = (x_m as f32, y_m as f32, yaw_rad as f32);
+        let mut sensor = TrackSensor { x_m, y_m, yaw_rad, upside_down, ..TrackSensor::default() };
+        text::write(&mut sensor.name_text, name);
+        sensor
+    }
+
+    /// Returns where it sits in the map.
+    pub fn pose(&self) -> Pose {
+        let TrackSensor { x_m, y_m, yaw_rad, upside_down, .. } = *self;
+        let (x_m, y_m, yaw_rad) = (x_m.into(), y_m.into(), yaw_rad.into());
+        Pose { x_m, y_m, yaw_rad, upside_down, ..Pose::default() }
+    }
+
     /// Returns the name.
     pub fn name(&self) -> &str {
         text::read(&self.name_text)
@@ -177,7 +203,9 @@ mod tests {
     #[test]
     fn names_and_states_of_a_sample() {
         let mut tracks = Tracks::default();
-        ["front", "kitchen.rear"].map(|name| tracks.push_sensor(name));
+        let pose = Pose { x_m: 1.5, y_m: -2.0, yaw_rad: 0.5, upside_down: 1, ..Pose::default() };
+        ["front", "kitchen.rear"].map(|name| tracks.push_sensor(TrackSensor::new(name, &pose)));
+        assert_eq!((tracks.sensors()[1].pose(), tracks.sensors()[1].name()), (pose, "kitchen.rear"));
         let mut track = Track { id: 7, sensors: 2, state: 3, ..Track::default() };
         assert_eq!(track.room_name(), None);
         track.set_room("hall");
@@ -196,7 +224,7 @@ mod tests {
     fn what_is_too_many_is_left_out() {
         let mut tracks = Tracks::default();
         (0..=TRACKS as u64).for_each(|id| tracks.push(Track { id, ..Track::default() }));
-        (0..=TRACK_SENSORS).for_each(|_| tracks.push_sensor("front"));
+        (0..=TRACK_SENSORS).for_each(|_| tracks.push_sensor(TrackSensor::default()));
         assert_eq!((tracks.tracks().len(), tracks.sensors().len()), (TRACKS, TRACK_SENSORS));
         assert_eq!(tracks.tracks()[TRACKS - 1].id, TRACKS as u64 - 1);
     }

@@ -49,7 +49,7 @@ fn the_text_says_what_the_structs_are() {
     layout!(text, Motion: x_m y_m yaw_rad dx_m dy_m dyaw_rad covariance overlap method flags breaks);
     layout!(text, Early: verdict flags beam distance_mm bytes_seen beams_seen);
     layout!(text, Track: id x_m y_m vx_m_s vy_m_s covariance score age_ms sensors room_text state reserved);
-    layout!(text, TrackSensor: name_text);
+    layout!(text, TrackSensor: x_m y_m yaw_rad upside_down reserved name_text);
     layout!(text, Tracks: count sensors reserved track_array sensor_array);
     layout!(text, Event: id kind reserved room_text door_text from_text to_text);
     let golden = include_str!("../../tests/vectors/v2/layouts.txt");

@@ -10,7 +10,7 @@ use crate::testkit::{
 use schema::datagram::{DatagramError, HEAD, WINDOW};
 use schema::{
     Background, BackgroundHead, Early, Event, EventKind, Foreground, Line, Lines, Mark, Marks, Motion,
-    MotionMethod, Scan, ScanHead, State, Status, Topic, Track, Tracks, Verdict, Zones,
+    MotionMethod, Pose, Scan, ScanHead, State, Status, Topic, Track, TrackSensor, Tracks, Verdict, Zones,
 };
 use serde_json::{Value, json};
 
@@ -81,7 +81,7 @@ fn every_topic_is_a_line() {
         sender.send(Topic::Motion, &motion);
         sender.send(Topic::Early, &Early { verdict: Verdict::Stop as u8, beam: 8, ..Early::default() });
         let mut tracks = Tracks::default();
-        tracks.push_sensor("front");
+        tracks.push_sensor(TrackSensor::new("front", &Pose::default()));
         tracks.push(Track { id: 9, x_m: 1.5, sensors: 1, ..Track::default() });
         sender.send(Topic::Tracks, &tracks);
         sender.send(Topic::Events, &Event::new(EventKind::Left, 9, Some("hall")));

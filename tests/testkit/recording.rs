@@ -89,6 +89,11 @@ impl Kept {
         self.eight(8)
     }
 
+    /// The wall clock of what it is of.
+    pub(crate) fn wall_ns(&self) -> u64 {
+        self.eight(32)
+    }
+
     /// The hub's life.
     pub(crate) fn boot(&self) -> u64 {
         self.eight(40)

@@ -20,7 +20,7 @@ from .control import background, control
 from .errors import Denied, Failure, Held, Impossible, Mismatch, NoHub, NoTopic, Refused, Short, Silent
 from .model import Background, Shown
 from .names import TopicName, candidates, check_sensor, parse
-from .people import Event, Track, Tracks
+from .people import Event, Site, Track, Tracks
 from .presence import find
 from .processed import Corner, Early, Foreground, Line, Lines, Mark, Marks, Motion, Segment, Zone, Zones
 from .sample import Sample
@@ -59,6 +59,7 @@ __all__ = [
     "Short",
     "Shown",
     "Silent",
+    "Site",
     "Status",
     "Subscription",
     "Telegram",

@@ -164,7 +164,14 @@ class Track(_Struct):
 
 
 class TrackSensor(_Struct):
-    _fields_ = [("name_text", c_uint8 * 56)]
+    _fields_ = [
+        ("x_m", c_float),
+        ("y_m", c_float),
+        ("yaw_rad", c_float),
+        ("upside_down", c_uint8),
+        ("reserved", c_uint8 * 3),
+        ("name_text", c_uint8 * 56),
+    ]
 
 
 class Tracks(_Struct):

@@ -29,6 +29,16 @@ class Track(NamedTuple):
     score: float
 
 
+class Site(NamedTuple):
+    """Where a sensor sits in the map, and where it looks, counter-clockwise from x."""
+
+    name: str
+    x_m: float
+    y_m: float
+    yaw_rad: float
+    upside_down: bool
+
+
 class Tracks(Sample):
     """People at one instant, which is `wall_ns`."""
 
@@ -36,15 +46,18 @@ class Tracks(Sample):
     struct = layout.Tracks
 
     @property
-    def sensors(self) -> tuple[str, ...]:
-        """The names of the site's sensors: copied."""
+    def sites(self) -> tuple[Site, ...]:
+        """The sensors, in the order of the site: copied."""
         fields = self._fields
-        return tuple(layout.text(sensor.name_text) for sensor in fields.sensor_array[: fields.sensors])
+        return tuple(
+            Site(layout.text(of.name_text), of.x_m, of.y_m, of.yaw_rad, of.upside_down == 1)
+            for of in fields.sensor_array[: fields.sensors]
+        )
 
     @property
     def tracks(self) -> tuple[Track, ...]:
         """By their numbers: copied."""
-        fields, names = self._fields, self.sensors
+        fields, names = self._fields, tuple(site.name for site in self.sites)
 
         def track(of: layout.Track) -> Track:
             return Track(

@@ -97,7 +97,8 @@ def payloads_say_what_they_are() -> None:
     assert (of.bytes_seen, of.beams_seen) == (0x708, 0x90A)
 
     of = people.Tracks("house", Chunk("tracks"))
-    assert (len(of.tracks), len(of.sensors), of.sensors[31], of.sensors[0]) == (64, 32, "kitchen.rear", "")
+    assert (len(of.tracks), len(of.sites), of.sites[0].name) == (64, 32, "")
+    assert of.sites[31] == ("kitchen.rear", 1, -1, 0.5, True)
     assert of.tracks[63] == (
         0x1020304_05060708,
         "between_rooms",

@@ -1,10 +1,10 @@
 //! What the tracker says: tracks at an instant, and what happened to them; and as it is published. Refuses to know how they
 //! are found.
 
-use schema::{EventKind, TrackState, Tracks};
+use schema::{EventKind, Pose, TrackSensor, TrackState, Tracks};
 
 use crate::geometry::Point;
-use crate::site::Site;
+use crate::site::{Sensor, Site};
 
 /// A person at an instant.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -75,9 +75,18 @@ impl Picture {
     /// Returns the picture as it is published, with the names that `site` gives.
     pub fn payload(&self, site: &Site) -> Tracks {
         let mut tracks = Tracks::default();
-        site.sensors.iter().for_each(|sensor| tracks.push_sensor(&sensor.name));
+        site.sensors.iter().for_each(|sensor| tracks.push_sensor(sensor.payload()));
         self.tracks.iter().for_each(|track| tracks.push(track.payload(site)));
         tracks
+    }
+}
+
+impl Sensor {
+    fn payload(&self) -> TrackSensor {
+        let [x_m, y_m] = self.place;
+        let upside_down = u8::from(self.is_upside_down);
+        let pose = Pose { x_m, y_m, yaw_rad: self.yaw_rad, upside_down, ..Pose::default() };
+        TrackSensor::new(&self.name, &pose)
     }
 }
 

@@ -127,8 +127,13 @@ fn tracks(tracks: &Tracks) -> Value {
             "room": track.room_name().unwrap_or_default(), "state": track.state().name(),
         })
     });
-    let names = tracks.sensors().iter().map(|sensor| sensor.name());
-    json!({ "names": names.collect::<Vec<_>>(), "tracks": list.collect::<Vec<_>>() })
+    let sites = tracks.sensors().iter().map(|sensor| {
+        json!({
+            "name": sensor.name(), "site_x_m": sensor.x_m, "site_y_m": sensor.y_m, "yaw_rad": sensor.yaw_rad,
+            "upside_down": sensor.upside_down == 1,
+        })
+    });
+    json!({ "sites": sites.collect::<Vec<_>>(), "tracks": list.collect::<Vec<_>>() })
 }
 
 fn event(event: &Event) -> Value {

@@ -5,7 +5,7 @@ use schema::datagram::{Announce, Announced, Head, LanFlags, Packed};
 use schema::{
     Background, BackgroundHead, COUNTERS, Code, Contents, Corner, Counter, Counters, Early, Event, EventKind,
     Family, Foreground, ForegroundHead, Line, Lines, Mark, Marks, Motion, MotionMethod, Pose, Scan, ScanHead,
-    Segment, State, Status, Topic, Track, TrackState, Tracks, Verdict, Zone, Zones,
+    Segment, State, Status, Topic, Track, TrackSensor, TrackState, Tracks, Verdict, Zone, Zones,
 };
 
 /// Name of the file, header, and what writes the payload.
@@ -55,7 +55,9 @@ pub(crate) const ALL: [Golden; 18] = [
 
 fn tracks() -> Tracks {
     let mut tracks = Tracks::default();
-    ["front", "kitchen.rear"].map(|name| tracks.push_sensor(name));
+    let pose = Pose { x_m: 12.5, y_m: -0.5, yaw_rad: 1.5, upside_down: 1, ..Pose::default() };
+    [("front", Pose::default()), ("kitchen.rear", pose)]
+        .map(|(name, pose)| tracks.push_sensor(TrackSensor::new(name, &pose)));
     let mut first = Track {
         id: 3,
         x_m: 1.5,

@@ -2,13 +2,13 @@
 
 use std::mem::{offset_of, size_of};
 
-use schema::{Event, EventKind, TRACK_SENSORS, TRACKS, Track, TrackSensor, TrackState, Tracks};
+use schema::{Event, EventKind, Pose, TRACK_SENSORS, TRACKS, Track, TrackSensor, TrackState, Tracks};
 
 use super::{golden, shared};
 
 #[test]
 fn tracks_layout() {
-    assert_eq!((size_of::<Tracks>(), align_of::<Tracks>(), TRACKS, TRACK_SENSORS), (6920, 8, 64, 32));
+    assert_eq!((size_of::<Tracks>(), align_of::<Tracks>(), TRACKS, TRACK_SENSORS), (7432, 8, 64, 32));
     assert_eq!(
         (offset_of!(Tracks, count), offset_of!(Tracks, sensors), offset_of!(Tracks, reserved)),
         (0, 1, 2)
@@ -23,8 +23,10 @@ fn tracks_layout() {
         (offset_of!(Track, room_text), offset_of!(Track, state), offset_of!(Track, reserved)),
         (48, 72, 73)
     );
-    assert_eq!((size_of::<TrackSensor>(), align_of::<TrackSensor>()), (56, 1));
-    assert_eq!(offset_of!(TrackSensor, name_text), 0);
+    assert_eq!((size_of::<TrackSensor>(), align_of::<TrackSensor>()), (72, 4));
+    assert_eq!((offset_of!(TrackSensor, x_m), offset_of!(TrackSensor, y_m)), (0, 4));
+    assert_eq!((offset_of!(TrackSensor, yaw_rad), offset_of!(TrackSensor, upside_down)), (8, 12));
+    assert_eq!((offset_of!(TrackSensor, reserved), offset_of!(TrackSensor, name_text)), (13, 16));
 }
 
 #[test]
@@ -38,7 +40,8 @@ fn event_layout() {
 #[test]
 fn tracks_bytes() {
     let mut tracks = Tracks { count: 64, sensors: 31, ..Tracks::default() };
-    tracks.push_sensor("kitchen.rear");
+    let pose = Pose { x_m: 1.0, y_m: -1.0, yaw_rad: 0.5, upside_down: 1, ..Pose::default() };
+    tracks.push_sensor(TrackSensor::new("kitchen.rear", &pose));
     let track = &mut tracks.track_array[63];
     *track = Track {
         id: 0x0102_0304_0506_0708,
@@ -59,9 +62,11 @@ fn tracks_bytes() {
         0x3F, 0, 0, 0, 0xBF, 0, 0, 0x80, 0x3E, 0, 0, 0x80, 0x40, 0x0D, 0x0C, 0x0B, 0x0A, 1, 0, 0, 0x80, b'h',
         b'a', b'l', b'l',
     ];
+    let mut sensor = vec![0, 0, 0x80, 0x3F, 0, 0, 0x80, 0xBF, 0, 0, 0, 0x3F, 1, 0, 0, 0];
+    sensor.extend(b"kitchen.rear");
     let last = 8 + 63 * 80;
-    let fields = [(0, &[64, 32][..]), (last, &bytes), (last + 72, &[3]), (5128 + 31 * 56, b"kitchen.rear")];
-    let expected = golden(6920, &fields);
+    let fields = [(0, &[64, 32][..]), (last, &bytes), (last + 72, &[3]), (5128 + 31 * 72, &sensor)];
+    let expected = golden(7432, &fields);
     assert_eq!(bytemuck::bytes_of(&tracks), expected);
     assert_eq!(bytemuck::bytes_of(&tracks), shared("tracks.hex"));
 }

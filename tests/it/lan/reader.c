@@ -113,11 +113,14 @@ static void early(const struct scanhub_early *e)
 static void tracks(const struct scanhub_tracks *t)
 {
     static const char *const states[] = {"tentative", "confirmed", "hidden", "between_rooms"};
-    char name[57];
-    printf("{\"names\":[");
+    printf("{\"sites\":[");
     for (unsigned i = 0; i < t->sensor_count; i++) {
-        scanhub_track_sensor(t, i, name);
-        printf("%s\"%s\"", i ? "," : "", name);
+        struct scanhub_track_sensor s = scanhub_track_sensor(t, i);
+        printf("%s{\"name\":\"%s\"", i ? "," : "", s.name);
+        number(",\"site_x_m\":", s.x_m);
+        number(",\"site_y_m\":", s.y_m);
+        number(",\"yaw_rad\":", s.yaw_rad);
+        printf(",\"upside_down\":%s}", boolean(s.upside_down));
     }
     printf("],\"tracks\":[");
     for (unsigned i = 0; i < t->count; i++) {

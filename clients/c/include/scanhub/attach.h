@@ -246,6 +246,11 @@ struct scanhub_track_v2 {
 };
 
 struct scanhub_track_sensor_v2 {
+    float x_m; /* where it sits in the map */
+    float y_m;
+    float yaw_rad;       /* where it looks, counter-clockwise from x */
+    uint8_t upside_down; /* 1: it hangs so */
+    uint8_t reserved[3];
     char name_text[56]; /* 0 behind it */
 };
 
@@ -669,7 +674,9 @@ SCANHUB_AT(scanhub_early_v2, distance_mm, 4);
 SCANHUB_SIZE(scanhub_track_v2, 80);
 SCANHUB_AT(scanhub_track_v2, room_text, 48);
 SCANHUB_AT(scanhub_track_v2, state, 72);
-SCANHUB_SIZE(scanhub_tracks_v2, 6920);
+SCANHUB_SIZE(scanhub_track_sensor_v2, 72);
+SCANHUB_AT(scanhub_track_sensor_v2, name_text, 16);
+SCANHUB_SIZE(scanhub_tracks_v2, 7432);
 SCANHUB_AT(scanhub_tracks_v2, sensor_array, 5128);
 SCANHUB_SIZE(scanhub_event_v2, 112);
 SCANHUB_AT(scanhub_event_v2, to_text, 88);

@@ -89,7 +89,7 @@ fn thousandths(value: f32) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use schema::{EventKind, Track, TrackState};
+    use schema::{EventKind, Pose, Track, TrackSensor, TrackState};
 
     const HEAD: &str = r#""sensor":"house","seq":7,"topic_seq":6,"stamp_ns":5,"wall_ns":4,"boot":"00000000000000ab","quality":"clean","#;
 
@@ -100,7 +100,7 @@ mod tests {
     #[test]
     fn tracks_to_the_letter() {
         let mut all = Tracks::default();
-        ["front", "kitchen.rear"].map(|name| all.push_sensor(name));
+        ["front", "kitchen.rear"].map(|name| all.push_sensor(TrackSensor::new(name, &Pose::default())));
         let mut track = Track {
             id: 3,
             x_m: 1.2344,

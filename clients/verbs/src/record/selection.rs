@@ -12,7 +12,15 @@ pub(super) struct Selection {
 }
 
 /// Telegrams, from which all else can be made again, and the results that are wanted first.
-const USUAL: [Topic; 5] = [Topic::Telegram, Topic::Marks, Topic::Zones, Topic::Foreground, Topic::Status];
+const USUAL: [Topic; 7] = [
+    Topic::Telegram,
+    Topic::Marks,
+    Topic::Zones,
+    Topic::Foreground,
+    Topic::Status,
+    Topic::Tracks,
+    Topic::Events,
+];
 
 impl Selection {
     /// What `texts` name, see [`selection::Word`]; nothing named: `everything` that there is, or what is usual. For

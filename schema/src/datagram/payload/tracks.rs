@@ -1,4 +1,4 @@
-//! People as they are sent over a network: a head, the persons that there are, the names of the sensors; and an event, as it
+//! People as they are sent over a network: a head, the persons and the sensors that there are; and an event, as it
 //! is.
 
 use bytemuck::{Zeroable, bytes_of, bytes_of_mut, cast_slice, pod_read_unaligned};
@@ -23,6 +23,11 @@ impl Packed for Tracks {
             is_finite && u64::from(sensors) >> named == 0
         };
         let are_sound = tracks.chunks_exact(size_of::<Track>()).all(is_sound);
+        let is_placed = |bytes: &[u8]| {
+            let TrackSensor { x_m, y_m, yaw_rad, .. } = pod_read_unaligned(bytes);
+            [x_m, y_m, yaw_rad].iter().all(|value| value.is_finite())
+        };
+        let are_sound = are_sound && sensors.chunks_exact(size_of::<TrackSensor>()).all(is_placed);
         are_sound.then_some(TRACKS_HEAD + tracks.len() + sensors.len())
     }
 
@@ -77,11 +82,12 @@ impl Packed for Event {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::Pose;
     use crate::datagram::payload::tests::there_and_back;
 
     fn two() -> Tracks {
         let mut tracks = Tracks::default();
-        ["front", "kitchen.rear"].map(|name| tracks.push_sensor(name));
+        ["front", "kitchen.rear"].map(|name| tracks.push_sensor(TrackSensor::new(name, &Pose::default())));
         tracks.push(Track { id: 1, x_m: -1.5, sensors: 3, ..Track::default() });
         tracks.push(Track { id: u64::MAX, age_ms: 9, state: 2, ..Track::default() });
         tracks
@@ -89,7 +95,7 @@ mod tests {
 
     #[test]
     fn people_go_there_and_back() {
-        there_and_back(&two(), &mut Tracks::default(), 8 + 2 * 80 + 2 * 56);
+        there_and_back(&two(), &mut Tracks::default(), 8 + 2 * 80 + 2 * 72);
         there_and_back(&Tracks::default(), &mut Tracks::default(), 8);
         let event = Event::new(EventKind::Door, 5, Some("hall")).through("left", "kitchen", "hall");
         there_and_back(&event, &mut Event::default(), 112);
@@ -97,7 +103,7 @@ mod tests {
 
     #[test]
     fn tracks_that_contradict_themselves_are_refused() {
-        let mut sound = [0; 8 + 2 * 80 + 2 * 56];
+        let mut sound = [0; 8 + 2 * 80 + 2 * 72];
         assert_eq!(two().pack(&mut sound), Some(sound.len()));
         for (at, bytes) in [
             (0, &[65][..]),
@@ -107,6 +113,7 @@ mod tests {
             (8 + 8, &f32::NAN.to_le_bytes()),
             (88 + 36, &f32::INFINITY.to_le_bytes()),
             (8 + 44, &[4]),
+            (8 + 160 + 72 + 8, &f32::NAN.to_le_bytes()),
         ] {
             let mut bad = sound;
             bad[at..at + bytes.len()].copy_from_slice(bytes);
