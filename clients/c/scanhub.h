@@ -754,6 +754,7 @@ struct scanhub_foreground {
     uint16_t beams;          /* beams in the foreground */
     uint16_t segment_count;
     uint16_t left_out;       /* segments for which there was no room */
+    uint64_t supported;      /* a bit for each segment: see scanhub_has_support */
     const uint8_t *bits;     /* beam i is bit i % 8 of byte i / 8 */
     const uint8_t *ranges;   /* of the foreground beams, in their order, beams x u16 */
     const uint8_t *segments;
@@ -786,11 +787,17 @@ static inline struct scanhub_segment scanhub_segment(const struct scanhub_foregr
     out.y_mm = scanhub_i32(at + 12);
     return out;
 }
+/* 1: segment i has several beams, or the foreground of the scan before was near it. 0: it may be an edge that flickers. i below
+ * `segment_count`. */
+static inline int scanhub_has_support(const struct scanhub_foreground *foreground, unsigned i)
+{
+    return (int)(foreground->supported >> i & 1);
+}
 static inline enum scanhub_result scanhub_read_foreground(const struct scanhub_datagram *datagram,
                                                           struct scanhub_foreground *out)
 {
     const uint8_t *at = datagram->payload;
-    enum scanhub_result result = scanhub_expect(datagram, SCANHUB_FOREGROUND, 16);
+    enum scanhub_result result = scanhub_expect(datagram, SCANHUB_FOREGROUND, 24);
     size_t count, beams, segments, set;
     unsigned i, members = 0;
     if (result != SCANHUB_OK)
@@ -799,17 +806,20 @@ static inline enum scanhub_result scanhub_read_foreground(const struct scanhub_d
     beams = scanhub_u16(at + 10);
     segments = scanhub_u16(at + 12);
     set = (count + 7) / 8;
-    if (count > 8192 || beams > count || segments > 64 || datagram->payload_len < 16 + set + 2 * beams + 16 * segments)
+    if (count > 8192 || beams > count || segments > 64 || datagram->payload_len < 24 + set + 2 * beams + 16 * segments)
         return SCANHUB_BAD_PAYLOAD;
     out->generation = scanhub_u32(at);
     out->count = (uint16_t)count;
     out->beams = (uint16_t)beams;
     out->unit_um = scanhub_u32(at + 4);
     out->left_out = scanhub_u16(at + 14);
+    out->supported = scanhub_u64(at + 16);
     out->segment_count = (uint16_t)segments;
-    out->bits = at + 16;
-    out->ranges = at + 16 + set;
-    out->segments = at + 16 + set + 2 * beams;
+    out->bits = at + 24;
+    out->ranges = at + 24 + set;
+    out->segments = at + 24 + set + 2 * beams;
+    if (segments < 64 && out->supported >> segments != 0)
+        return SCANHUB_BAD_PAYLOAD;
     /* As many beams as ranges, and none beyond the scan. */
     for (i = 0; i < 8 * set; i++) {
         if (scanhub_is_foreground(out, i)) {

@@ -339,7 +339,8 @@ class Zones:
 
 @dataclass(frozen=True)
 class Segment:
-    """Foreground beams that belong together: beams, device units, mm ahead and to the left of the robot's centre."""
+    """Foreground beams that belong together: beams, device units, mm ahead and to the left of the robot's centre. It has
+    `support` if it has several beams, or the foreground of the scan before was near it."""
 
     first: int
     last: int
@@ -347,6 +348,7 @@ class Segment:
     width: int
     x_mm: int
     y_mm: int
+    support: bool
 
 
 @dataclass(frozen=True)
@@ -723,12 +725,15 @@ def _zones(payload: bytes) -> Zones:
 
 
 def _foreground(payload: bytes) -> Foreground:
-    generation, unit_um, count, number, segments, left_out = struct.unpack_from("<IIHHHH", payload)
-    _limit(number <= count <= 8192 and segments <= 64)
+    generation, unit_um, count, number, segments, left_out, supported = struct.unpack_from("<IIHHHHQ", payload)
+    _limit(number <= count <= 8192 and segments <= 64 and supported >> segments == 0)
     size = (count + 7) // 8
-    bits, *ranges = struct.unpack_from(f"<{size}s{number}H", payload, 16)
+    bits, *ranges = struct.unpack_from(f"<{size}s{number}H", payload, 24)
     beams = tuple(i for i in range(8 * size) if bits[i // 8] >> i % 8 & 1)
-    items = _items(Segment, "<HHHHii", payload, 16 + size + 2 * number, segments)
+    support = (bool(supported >> i & 1) for i in range(segments))
+    items = _items(
+        lambda *fields: Segment(*fields, next(support)), "<HHHHii", payload, 24 + size + 2 * number, segments
+    )
     _limit(len(beams) == number and all(beam < count for beam in beams))
     _limit(all(item.first <= item.last < count for item in items))
     return Foreground(generation, count, unit_um, left_out, beams, tuple(ranges), items)

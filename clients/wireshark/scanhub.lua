@@ -211,6 +211,7 @@ field("foreground.nearest", "uint16", "Nearest, device units")
 field("foreground.width", "uint16", "Width, device units")
 field("foreground.x_mm", "int32", "x, mm")
 field("foreground.y_mm", "int32", "y, mm")
+field("foreground.support", "uint8", "Supported")
 
 field("background.first_angle", "double", "First angle, rad, 0 ahead")
 field("background.step", "double", "Step, rad")
@@ -570,36 +571,43 @@ end
 
 unpack_payload[5] = function(payload, tree)
     local len = payload:len()
-    if len < 16 then return nil end
+    if len < 24 then return nil end
     local count, beams, segments = payload(8, 2):le_uint(), payload(10, 2):le_uint(), payload(12, 2):le_uint()
     local set = math.floor((count + 7) / 8)
-    if count > 8192 or beams > count or segments > 64 or len < 16 + set + 2 * beams + 16 * segments then return nil end
+    if count > 8192 or beams > count or segments > 64 or len < 24 + set + 2 * beams + 16 * segments then return nil end
+    local function bit(at, i)
+        return bits.band(bits.rshift(payload(at + math.floor(i / 8), 1):uint(), i % 8), 1)
+    end
+    for i = segments, 63 do
+        if bit(16, i) == 1 then return nil end
+    end
     local members = {}
     for i = 0, 8 * set - 1 do
-        if bits.band(bits.rshift(payload(16 + math.floor(i / 8), 1):uint(), i % 8), 1) == 1 then
+        if bit(24, i) == 1 then
             if i >= count then return nil end
             table.insert(members, i)
         end
     end
     if #members ~= beams then return nil end
-    local begin = 16 + set + 2 * beams
+    local begin = 24 + set + 2 * beams
     for at = begin, begin + 16 * segments - 1, 16 do
         local first, last = payload(at, 2):le_uint(), payload(at + 2, 2):le_uint()
         if first > last or last >= count then return nil end
     end
     add_fields(tree, payload, 0, "foreground.generation", 4, "foreground.unit_um", 4, "foreground.count", 2,
         "foreground.beams", 2, "foreground.segments", 2, "foreground.left_out", 2)
-    if set > 0 then tree:add(f["foreground.set"], payload(16, set)) end
+    if set > 0 then tree:add(f["foreground.set"], payload(24, set)) end
     for n, beam in ipairs(members) do
-        local range = payload(16 + set + 2 * (n - 1), 2)
+        local range = payload(24 + set + 2 * (n - 1), 2)
         local item = tree:add(range, "Beam " .. beam)
-        item:add(f["foreground.beam"], payload(16 + math.floor(beam / 8), 1), beam)
+        item:add(f["foreground.beam"], payload(24 + math.floor(beam / 8), 1), beam)
         item:add_le(f["foreground.range"], range)
     end
     for i = 0, segments - 1 do
         local item = tree:add(payload(begin + 16 * i, 16), "Segment " .. i)
         add_fields(item, payload, begin + 16 * i, "foreground.first", 2, "foreground.last", 2, "foreground.nearest", 2,
             "foreground.width", 2, "foreground.x_mm", 4, "foreground.y_mm", 4)
+        item:add(f["foreground.support"], payload(16 + math.floor(i / 8), 1), bit(16, i))
     end
     return beams .. " of " .. count .. " beams, " .. segments .. " segments"
 end

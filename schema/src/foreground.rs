@@ -12,7 +12,7 @@ use crate::sliced::sliced;
 /// The most segments of a scan.
 pub const SEGMENTS: usize = 64;
 
-/// What stands before the arrays of a [`Foreground`]. 16 bytes.
+/// What stands before the arrays of a [`Foreground`]. 24 bytes.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Pod, Zeroable)]
 #[repr(C)]
 pub struct ForegroundHead {
@@ -28,6 +28,8 @@ pub struct ForegroundHead {
     pub segments: u16,
     /// Segments that did not fit.
     pub left_out: u16,
+    /// Bit i is 1 if segment i is supported: it has several beams, or the foreground of the scan before was near it.
+    pub supported: u64,
 }
 
 sliced! {
@@ -120,6 +122,12 @@ impl Foreground {
         &all[..usize::from(self.segments).min(all.len())]
     }
 
+    /// Returns whether segment `i` is supported: a single beam that nothing in the scan before was near to is not, and may
+    /// be an edge that flickers.
+    pub fn has_support(&self, i: usize) -> bool {
+        i < self.segments().len() && self.supported >> i & 1 == 1
+    }
+
     /// Returns a bit for every beam of the scan, as [`ForegroundArrays::bits`].
     pub(crate) fn bits(&self) -> &[u8] {
         self.memory().get(BITS..BITS + self.scan_beams().div_ceil(8)).unwrap_or_default()
@@ -165,13 +173,16 @@ mod tests {
     use super::*;
 
     #[test]
-    fn readings_pair_beams_with_ranges() {
+    fn readings_pair_beams_with_ranges_and_segments_with_support() {
         let mut foreground = Foreground::of(401);
         let arrays = foreground.begin(ForegroundHead { count: 401, beams: 2, ..ForegroundHead::default() });
         (arrays.bits[0], arrays.bits[50]) = (0x80, 1);
         arrays.ranges[..2].copy_from_slice(&[700, 800]);
         assert_eq!(foreground.readings().collect::<Vec<_>>(), [(7, 700), (400, 800)]);
         assert!(!foreground.contains(401) && !foreground.contains(10_000));
+        foreground.supported = 0b101;
+        foreground.segments = 2;
+        assert_eq!([0, 1, 2, 64].map(|i| foreground.has_support(i)), [true, false, false, false]);
         foreground.count = 2000;
         assert_eq!(foreground.readings().count(), 0, "there is no memory for so many");
     }

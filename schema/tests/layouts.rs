@@ -38,7 +38,7 @@ fn the_text_says_what_the_structs_are() {
     layout!(text, Zone: radius_mm beams violated reserved);
     layout!(text, Zones: verdict count nearest_beam nearest_mm invalid_beams flags reserved zone_array);
     layout!(text, Segment: first last nearest width x_mm y_mm);
-    layout!(text, ForegroundHead: generation unit_um count beams segments left_out);
+    layout!(text, ForegroundHead: generation unit_um count beams segments left_out supported);
     layout!(text, BackgroundHead: first_angle step generation unit_um taught count flags reserved);
     layout!(text, Pose: x_m y_m yaw_rad upside_down reserved);
     layout!(text, Status: state mode unit_mm family baud since_ns rate_mhz angle_deg resolution_cdeg type_text

@@ -154,16 +154,17 @@ fn zones_bytes() {
 
 #[test]
 fn foreground_layout() {
-    assert_eq!((size_of::<ForegroundHead>(), align_of::<ForegroundHead>(), Foreground::HEAD), (16, 4, 16));
+    assert_eq!((size_of::<ForegroundHead>(), align_of::<ForegroundHead>(), Foreground::HEAD), (24, 8, 24));
     assert_eq!((size_of::<ForegroundWord>(), align_of::<ForegroundWord>()), (8, 8));
     assert_eq!((offset_of!(ForegroundHead, generation), offset_of!(ForegroundHead, unit_um)), (0, 4));
     assert_eq!((offset_of!(ForegroundHead, count), offset_of!(ForegroundHead, beams)), (8, 10));
     assert_eq!((offset_of!(ForegroundHead, segments), offset_of!(ForegroundHead, left_out)), (12, 14));
+    assert_eq!(offset_of!(ForegroundHead, supported), 16);
     assert_eq!((size_of::<Segment>(), align_of::<Segment>(), SEGMENTS), (16, 4, 64));
     assert_eq!((offset_of!(Segment, first), offset_of!(Segment, last)), (0, 2));
     assert_eq!((offset_of!(Segment, nearest), offset_of!(Segment, width)), (4, 6));
     assert_eq!((offset_of!(Segment, x_mm), offset_of!(Segment, y_mm)), (8, 12));
-    assert_eq!([16, 17, 401].map(Foreground::len), [1074, 1078, 1894]);
+    assert_eq!([16, 17, 401].map(Foreground::len), [1082, 1086, 1902]);
 }
 
 #[test]
@@ -176,15 +177,16 @@ fn foreground_bytes() {
         beams: 1,
         segments: 64,
         left_out: 0x0104,
+        supported: 0x8000_0000_0000_0206,
     });
     arrays.segments[63] = Segment { first: 400, last: 0x0105, nearest: 6, width: 7, x_mm: -2, y_mm: 8 };
     (arrays.bits[50], arrays.ranges[0]) = (1, 0x1234);
     let expected = golden(
-        1894,
+        1902,
         &[
-            (0, &[3, 2, 1, 0, 0x10, 0x27, 0, 0, 0x91, 0x01, 1, 0, 64, 0, 4, 1]),
-            (1024, &[0x90, 0x01, 5, 1, 6, 0, 7, 0, 0xFE, 0xFF, 0xFF, 0xFF, 8]),
-            (1090, &[1, 0, 0x34, 0x12]),
+            (0, &[3, 2, 1, 0, 0x10, 0x27, 0, 0, 0x91, 0x01, 1, 0, 64, 0, 4, 1, 6, 2, 0, 0, 0, 0, 0, 0x80]),
+            (1032, &[0x90, 0x01, 5, 1, 6, 0, 7, 0, 0xFE, 0xFF, 0xFF, 0xFF, 8]),
+            (1098, &[1, 0, 0x34, 0x12]),
         ],
     );
     assert_eq!(foreground.bytes(), expected);

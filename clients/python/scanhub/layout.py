@@ -234,6 +234,7 @@ class ForegroundHead(_Struct):
         ("beams", c_uint16),
         ("segments", c_uint16),
         ("left_out", c_uint16),
+        ("supported", c_uint64),
     ]
 
 

@@ -283,7 +283,8 @@ def nothing(sensor: str, header: layout.Header, missed: int = 0, restarted: bool
 
 
 class Segment(NamedTuple):
-    """Foreground beams that belong together; x ahead of the robot's centre, y to the left."""
+    """Foreground beams that belong together; x ahead of the robot's centre, y to the left. It has `support` if it has
+    several beams, or the foreground of the scan before was near it."""
 
     first: int
     last: int
@@ -291,6 +292,7 @@ class Segment(NamedTuple):
     width_mm: int
     x_mm: int
     y_mm: int
+    support: bool
 
 
 class Foreground(Sample):
@@ -332,11 +334,19 @@ class Foreground(Sample):
     @property
     def segments(self) -> tuple[Segment, ...]:
         """In the order of their beams: copied."""
-        unit_um = self._fields.unit_um
+        unit_um, supported = self._fields.unit_um, self._fields.supported
         places = (layout.Segment * 64).from_buffer(self._data, _HEAD) if len(self._data) >= _BITS else ()
         return tuple(
-            Segment(s.first, s.last, s.nearest * unit_um // 1000, s.width * unit_um // 1000, s.x_mm, s.y_mm)
-            for s in places[: self._fields.segments]
+            Segment(
+                s.first,
+                s.last,
+                s.nearest * unit_um // 1000,
+                s.width * unit_um // 1000,
+                s.x_mm,
+                s.y_mm,
+                bool(supported >> i & 1),
+            )
+            for i, s in enumerate(places[: self._fields.segments])
         )
 
     @property

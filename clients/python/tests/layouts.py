@@ -122,7 +122,8 @@ def payloads_say_what_they_are() -> None:
     of = processed.Foreground("front", Chunk("foreground"))
     assert (of.generation, of.count, of.unit_mm, of.left_out) == (0x10203, 401, 10, 0x104)
     assert (list(of.beams), list(of.ranges), len(of.segments)) == ([400], [0x1234], 64)
-    assert of.segments[63] == (400, 0x105, 60, 70, -2, 8)
+    assert of.segments[63] == (400, 0x105, 60, 70, -2, 8, True)
+    assert [i for i, segment in enumerate(of.segments) if segment.support] == [1, 2, 9, 63]
 
     of = model.Background("front", Chunk("background"))
     assert (of.generation, of.taught, of.count, of.unit_mm, of.frozen) == (0x10203, 0x104, 401, 10, True)

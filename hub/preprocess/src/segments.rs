@@ -1,7 +1,9 @@
-//! Groups neighbouring foreground beams into segments, and computes where each segment is. Refuses to know why a beam
-//! is in the foreground, and what object a segment is.
+//! Groups neighbouring foreground beams into segments, and computes where each segment is and whether it is supported: an
+//! edge far away flickers in single beams, an object is seen by several or for longer. Refuses to know why a beam is in the
+//! foreground, and what object a segment is.
 
 use std::f64::consts::{PI, TAU};
+use std::mem::{replace, take};
 
 use schema::{Foreground, ForegroundArrays, Pose, Scan, Segment};
 
@@ -17,6 +19,17 @@ pub struct Segmenter {
     directions: Box<[(f64, f64)]>,
     /// Of two neighbouring beams.
     step: Step,
+    /// The foreground of the scan before.
+    before: Points,
+    /// Room for that of the next scan.
+    room: Points,
+}
+
+/// Points as seen from the sensor, in the directions of the robot's frame, in mm.
+#[derive(Default)]
+struct Points {
+    places: Box<[(f64, f64)]>,
+    used: usize,
 }
 
 /// What follows from the angle between two points.
@@ -32,12 +45,16 @@ struct Step {
 const FLATTEST_DEG: f64 = 10.0;
 /// Noise of two ranges, on top, in mm.
 const NOISE_MM: f64 = 15.0;
+/// A point of the scan before supports a single beam if it is at most so far from it, in mm: who runs at 3 m/s moves by this
+/// between two turns of a scanner that turns ten times a second.
+const REACH_MM: f64 = 300.0;
 
 impl Segmenter {
     /// For a sensor that sits at `pose` and has at most `beams` beams.
     pub fn new(pose: Pose, beams: usize) -> Segmenter {
-        let directions = vec![(0.0, 0.0); beams].into();
-        Segmenter { pose, angles: None, directions, step: Step::default() }
+        let points = || vec![(0.0, 0.0); beams].into();
+        let [before, room] = [points(), points()].map(|places| Points { places, used: 0 });
+        Segmenter { pose, angles: None, directions: points(), step: Step::default(), before, room }
     }
 
     /// Fills in the segments of `foreground`, which was made from `scan`, and writes every byte of them.
@@ -45,15 +62,22 @@ impl Segmenter {
     /// Two foreground beams belong together if they are neighbours and their points lie as near to each other as those
     /// of a surface seen at 10 degrees: r sin(step) / sin(10 degrees - step) + 15 mm, r being the first one's range, and the
     /// step from one exact angle to the other where there are such.
+    ///
+    /// A segment is supported if it has several beams, or if its point is at most 0.3 m from one of the foreground of the scan
+    /// before: of the last one that was given here.
     pub fn update(&mut self, scan: &Scan, foreground: &mut Foreground) {
         self.point(scan);
         let unit_mm = f64::from(scan.unit_um) / 1000.0;
         let head = **foreground;
         let ForegroundArrays { segments: places, bits, ranges } = foreground.begin(head);
-        let (mut segments, mut left_out) = (0, 0_u16);
+        let (mut segments, mut left_out, mut supported) = (0, 0_u16, 0_u64);
+        let (before, mut now) = (&self.before, take(&mut self.room));
+        now.used = 0;
         let mut put = |open: &Open, pose: &Pose| match places.get_mut(segments) {
             Some(segment) => {
                 *segment = open.close(pose, unit_mm);
+                let has_support = open.first < open.last || before.reach(open.first_point);
+                supported |= u64::from(has_support) << segments;
                 segments += 1;
             }
             None => left_out = left_out.saturating_add(1),
@@ -71,6 +95,7 @@ impl Segmenter {
                 let exact = exact.map(|&exact| f64::from(exact));
                 let (x, y) = exact.map_or(even, |exact| self.pose.direction(exact));
                 let point = (range_mm * x, range_mm * y);
+                now.add(point);
                 match &mut open {
                     Some(open) if open.last + 1 == beam && self.joins(open, range_mm, exact) => {
                         open.add(beam, range, (range_mm, exact), point);
@@ -89,6 +114,8 @@ impl Segmenter {
         places[segments..].fill(Segment::default());
         foreground.segments = segments as u16;
         foreground.left_out = left_out;
+        foreground.supported = supported;
+        self.room = replace(&mut self.before, now);
     }
 
     /// A point at `next_mm` on the next beam, and at this `exact` angle, belongs to the last one of `open`.
@@ -110,6 +137,25 @@ impl Segmenter {
             *direction = self.pose.direction(scan.first_angle + i as f64 * scan.step);
         }
         self.step = Step::of(scan.step);
+    }
+}
+
+impl Points {
+    /// There is room for a point of each beam of a scan.
+    fn add(&mut self, point: (f64, f64)) {
+        if let Some(place) = self.places.get_mut(self.used) {
+            *place = point;
+            self.used += 1;
+        }
+    }
+
+    /// One of them is near enough to `point` to support it.
+    fn reach(&self, point: (f64, f64)) -> bool {
+        let apart = |other: &(f64, f64)| {
+            let (dx, dy) = (other.0 - point.0, other.1 - point.1);
+            dx * dx + dy * dy
+        };
+        self.places[..self.used].iter().any(|other| apart(other) <= REACH_MM * REACH_MM)
     }
 }
 

@@ -127,3 +127,48 @@ fn other_angles_are_pointed_anew() {
     assert_eq!(x_mm(-90_000, 1000), (0, 1_000));
     assert_eq!(x_mm(-180_000, 1000), (1_000, 0));
 }
+
+/// Scan after scan of one sensor: walls of several beams, and single ones that come again, go elsewhere, or stay away.
+#[test]
+fn several_beams_or_the_scan_before_support_a_segment() {
+    let mut random = fastrand::Rng::with_seed(27);
+    let (mut supported, mut lonely) = (0, 0);
+    for unit_mm in [1, 10] {
+        let pose = Pose { x_m: 0.3, y_m: -0.2, yaw_rad: 2.5, ..Pose::default() };
+        let scan = Scan::of(ScanHead::lms(BEAMS, -100_000, 500, unit_mm, 13), &[0; BEAMS]);
+        let mut cutter = Segmenter::new(pose, BEAMS);
+        let mut before: Vec<(f64, f64)> = Vec::new();
+        for round in 0..2_000 {
+            let mut ranges = Vec::new();
+            for i in (0..BEAMS).filter(|i| i % 3 != 2) {
+                // A beam in two has a neighbour, at a range of its own or at that of a wall.
+                let range_mm = if random.bool() { 2_000 } else { random.u32(500..8_000) };
+                if random.u8(..10) == 0 {
+                    ranges.push((i, (range_mm / unit_mm) as u16));
+                }
+            }
+            if round % 50 == 49 {
+                ranges.clear();
+            }
+            let mut out = foreground(&ranges);
+            cutter.update(&scan, &mut out);
+            let points: Vec<_> = ranges.iter().map(|&(i, range)| point(&scan, &pose, i, range)).collect();
+            for (i, segment) in out.segments().iter().enumerate() {
+                let beam = ranges.iter().position(|&(beam, _)| beam == usize::from(segment.first)).unwrap();
+                let nearest_mm = before.iter().map(|&other| apart(points[beam], other)).reduce(f64::min);
+                let is_near = nearest_mm.is_some_and(|nearest_mm| nearest_mm < 300.0);
+                // Sine and cosine are not those of the fast one.
+                if nearest_mm.is_some_and(|nearest_mm| (nearest_mm - 300.0).abs() < 1e-6) {
+                    continue;
+                }
+                let expected = segment.first < segment.last || is_near;
+                assert_eq!(out.has_support(i), expected, "{unit_mm} mm, round {round}: {segment:?}");
+                supported += usize::from(expected && segment.first == segment.last);
+                lonely += usize::from(!expected);
+            }
+            assert_eq!(out.supported.checked_shr(out.segments.into()).unwrap_or(0), 0);
+            before = points;
+        }
+    }
+    assert!(supported > 1_000 && lonely > 1_000, "{supported} single beams with support, {lonely} without");
+}

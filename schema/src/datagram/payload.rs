@@ -306,8 +306,14 @@ mod tests {
     /// 64 beams in the foreground of 361, and as many segments.
     fn foreground() -> Box<Foreground> {
         let mut foreground = Foreground::of(361);
-        let head =
-            ForegroundHead { count: 361, beams: 64, segments: 64, left_out: 3, ..ForegroundHead::default() };
+        let head = ForegroundHead {
+            count: 361,
+            beams: 64,
+            segments: 64,
+            left_out: 3,
+            supported: 0xF0F0_0000_0000_F5A3,
+            ..ForegroundHead::default()
+        };
         let arrays = foreground.begin(head);
         for i in 0..64 {
             arrays.bits[i / 2] |= if i % 2 == 0 { 1 } else { 16 };
@@ -321,26 +327,26 @@ mod tests {
     #[test]
     fn a_foreground_leaves_out_the_segments_without_room() {
         let foreground = foreground();
-        let mut room = [0; 16 + 46 + 128 + 16 * 10 + 15];
-        assert_eq!(foreground.pack(&mut room), Some(16 + 46 + 128 + 160));
+        let mut room = [0; 24 + 46 + 128 + 16 * 10 + 15];
+        assert_eq!(foreground.pack(&mut room), Some(24 + 46 + 128 + 160));
         let mut back = Foreground::zeroed(Foreground::len(361));
         assert!(back.unpack(&room));
-        assert_eq!((back.segments, back.left_out), (10, 57));
+        assert_eq!((back.segments, back.left_out, back.supported), (10, 57, 0x1A3));
         assert_eq!(back.segments(), &foreground.segments()[..10]);
         assert!(back.readings().eq(foreground.readings()));
         let mut whole = [0; 2000];
         let len = foreground.pack(&mut whole).unwrap();
         assert!(back.unpack(&whole[..len]));
-        assert_eq!((len, back), (16 + 46 + 128 + 1024, foreground));
+        assert_eq!((len, back), (24 + 46 + 128 + 1024, foreground));
     }
 
     #[test]
     fn what_contradicts_itself_is_refused() {
         let refused = |payload: &[u8]| !Foreground::of(3).unpack(payload);
-        let mut good = [0; 16 + 1 + 2];
-        (good[8], good[10], good[16]) = (3, 1, 4);
+        let mut good = [0; 24 + 1 + 2];
+        (good[8], good[10], good[24]) = (3, 1, 4);
         assert!(!refused(&good));
-        for (at, byte) in [(16, 8), (16, 3), (16, 0), (10, 4), (9, 2), (12, 1)] {
+        for (at, byte) in [(24, 8), (24, 3), (24, 0), (10, 4), (9, 2), (12, 1), (16, 1), (23, 0x80)] {
             let mut bad = good;
             bad[at] = byte;
             assert!(refused(&bad), "{byte} at {at}");

@@ -159,10 +159,10 @@ fn zones(zones: &Zones) -> Value {
 }
 
 fn foreground(foreground: &Foreground) -> Value {
-    let segments = foreground.segments().iter().map(|segment| {
+    let segments = foreground.segments().iter().enumerate().map(|(i, segment)| {
         json!({
             "first": segment.first, "last": segment.last, "nearest": segment.nearest, "width": segment.width,
-            "x_mm": segment.x_mm, "y_mm": segment.y_mm,
+            "x_mm": segment.x_mm, "y_mm": segment.y_mm, "support": foreground.has_support(i),
         })
     });
     json!({

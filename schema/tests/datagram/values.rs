@@ -291,8 +291,15 @@ fn zones() -> Zones {
 /// 64 segments of three beams, of which 54 fit.
 fn foreground() -> Box<Foreground> {
     let mut foreground = Foreground::of(361);
-    let head =
-        ForegroundHead { generation: 9, unit_um: 1000, count: 361, beams: 192, segments: 64, left_out: 0 };
+    let head = ForegroundHead {
+        generation: 9,
+        unit_um: 1000,
+        count: 361,
+        beams: 192,
+        segments: 64,
+        left_out: 0,
+        supported: 0x8123_4567_89AB_CDEF,
+    };
     let arrays = foreground.begin(head);
     for s in 0..64_u16 {
         for k in 0..3 {

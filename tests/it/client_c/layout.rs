@@ -45,7 +45,7 @@ fn layouts() -> Vec<Layout> {
         "scanhub_zone_v2" Zone: radius_mm beams violated reserved;
         "scanhub_zones_v2" Zones: verdict count nearest_beam nearest_mm invalid_beams flags reserved zone_array;
         "scanhub_segment_v2" Segment: first last nearest width x_mm y_mm;
-        "scanhub_foreground_v2" ForegroundHead: generation unit_um count beams segments left_out;
+        "scanhub_foreground_v2" ForegroundHead: generation unit_um count beams segments left_out supported;
         "scanhub_background_v2" BackgroundHead: first_angle step generation unit_um taught count flags reserved;
         "scanhub_pose_v2" Pose: x_m y_m yaw_rad upside_down reserved;
         "scanhub_status_v2" Status: state mode unit_mm family baud since_ns rate_mhz angle_deg resolution_cdeg
@@ -146,7 +146,8 @@ pub(crate) fn computes(header: &Header, scan: &Scan) -> String {
          void *memory = malloc(sizeof bytes);\n\
          if (scanhub_count(&sample) != 0 || !isnan(scanhub_range_m(&sample, 0)) || scanhub_code(&sample, 0) != NULL\n\
              || scanhub_beam_stamp_ns(&sample, 0) != 0 || scanhub_background_ranges(&sample) != NULL\n\
-             || scanhub_segments(&sample) != NULL || scanhub_in_foreground(&sample, 0)) return 1;\n\
+             || scanhub_segments(&sample) != NULL || scanhub_in_foreground(&sample, 0)\n\
+             || scanhub_has_support(&sample, 0)) return 1;\n\
          memcpy(memory, bytes, sizeof bytes);\n\
          header.stamp_first_ns = {};\n\
          sample.header = &header; sample.payload = memory;\n\

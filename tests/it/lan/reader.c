@@ -220,8 +220,8 @@ static void foreground(const struct scanhub_foreground *f)
     printf("],\"segments\":[");
     for (unsigned i = 0; i < f->segment_count; i++) {
         struct scanhub_segment s = scanhub_segment(f, i);
-        printf("%s{\"first\":%u,\"last\":%u,\"nearest\":%u,\"width\":%u,\"x_mm\":%ld,\"y_mm\":%ld}", i ? "," : "", s.first,
-               s.last, s.nearest, s.width, (long)s.x_mm, (long)s.y_mm);
+        printf("%s{\"first\":%u,\"last\":%u,\"nearest\":%u,\"width\":%u,\"x_mm\":%ld,\"y_mm\":%ld,\"support\":%s}", i ? "," : "",
+               s.first, s.last, s.nearest, s.width, (long)s.x_mm, (long)s.y_mm, boolean(scanhub_has_support(f, i)));
     }
     printf("]}");
 }

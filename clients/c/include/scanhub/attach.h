@@ -295,6 +295,7 @@ struct scanhub_foreground_v2 {
     uint16_t beams;      /* of them in the foreground */
     uint16_t segments;   /* at most 64 */
     uint16_t left_out;   /* segments that did not fit */
+    uint64_t supported;  /* a bit for each segment: see scanhub_has_support */
 };
 
 /* A background begins with this; behind it is a range for every beam: see scanhub_background_ranges. */
@@ -608,6 +609,16 @@ static inline const struct scanhub_segment_v2 *scanhub_segments(const struct sca
     return (const struct scanhub_segment_v2 *)at;
 }
 
+/* 1: segment i has several beams, or the foreground of the scan before was near it. 0: it may be an edge that flickers, or
+ * there is no such segment. */
+static inline int scanhub_has_support(const struct scanhub_sample *foreground, unsigned i)
+{
+    const struct scanhub_foreground_v2 *head = (const struct scanhub_foreground_v2 *)foreground->payload;
+    if (scanhub_segments(foreground) == NULL || i >= head->segments)
+        return 0;
+    return (int)(head->supported >> i & 1);
+}
+
 /* 1: beam i of the scan is in the foreground. */
 static inline int scanhub_in_foreground(const struct scanhub_sample *foreground, unsigned i)
 {
@@ -681,7 +692,7 @@ SCANHUB_AT(scanhub_tracks_v2, sensor_array, 5128);
 SCANHUB_SIZE(scanhub_event_v2, 112);
 SCANHUB_AT(scanhub_event_v2, to_text, 88);
 SCANHUB_SIZE(scanhub_segment_v2, 16);
-SCANHUB_SIZE(scanhub_foreground_v2, 16);
+SCANHUB_SIZE(scanhub_foreground_v2, 24);
 SCANHUB_SIZE(scanhub_background_v2, 32);
 SCANHUB_AT(scanhub_background_v2, count, 26);
 SCANHUB_SIZE(scanhub_status_v2, 592);

@@ -336,17 +336,19 @@ fn segment_list<S: Serializer>(foreground: &Foreground, serializer: S) -> Result
         width_mm: u64,
         x_mm: i32,
         y_mm: i32,
+        support: bool,
     }
     let in_mm = |range: u16| u64::from(range) * u64::from(foreground.unit_um) / 1000;
-    let item = |segment: &Segment| Item {
+    let item = |(i, segment): (usize, &Segment)| Item {
         first: segment.first,
         last: segment.last,
         nearest_mm: in_mm(segment.nearest),
         width_mm: in_mm(segment.width),
         x_mm: segment.x_mm,
         y_mm: segment.y_mm,
+        support: foreground.has_support(i),
     };
-    serializer.collect_seq(foreground.segments().iter().map(item))
+    serializer.collect_seq(foreground.segments().iter().enumerate().map(item))
 }
 
 fn beams<S: Serializer>(foreground: &Foreground, serializer: S) -> Result<S::Ok, S::Error> {

@@ -122,9 +122,10 @@ fn without_nearest(verdict: Verdict) -> &'static str {
 pub(crate) fn foreground(line: &mut Vec<u8>, header: &Header, foreground: &Foreground) -> io::Result<()> {
     numbers(line, header)?;
     write!(line, " {} beams, {} segments", foreground.beams, foreground.segments)?;
-    for segment in foreground.segments() {
+    for (i, segment) in foreground.segments().iter().enumerate() {
+        let support = if foreground.has_support(i) { "" } else { " without support" };
         let width_mm = u64::from(segment.width) * u64::from(foreground.unit_um) / 1000;
-        write!(line, ", {width_mm} mm wide at ({}, {})", segment.x_mm, segment.y_mm)?;
+        write!(line, ", {width_mm} mm wide at ({}, {}){support}", segment.x_mm, segment.y_mm)?;
     }
     Ok(())
 }

@@ -16,7 +16,8 @@ impl Packed for Foreground {
         let fit = self.segments().len().min((room.len() - used) / size_of::<Segment>());
         let left_out = usize::from(self.left_out) + self.segments().len() - fit;
         let left_out = left_out.min(usize::from(u16::MAX)) as u16;
-        let used = fixed(&ForegroundHead { segments: fit as u16, left_out, ..**self }, room)?;
+        let supported = self.supported & only(fit);
+        let used = fixed(&ForegroundHead { segments: fit as u16, left_out, supported, ..**self }, room)?;
         Some(used + write(&mut room[used..], &[cast_slice(&self.segments()[..fit])])?)
     }
 
@@ -31,7 +32,8 @@ impl Packed for Foreground {
         });
         let is_sound = segments_inside.into_iter().all(|segment| inside(&segment))
             && members == u32::from(head.beams)
-            && unused == 0;
+            && unused == 0
+            && head.supported & !only(head.segments.into()) == 0;
         is_sound.then_some(Foreground::len(head.count.into()))
     }
 
@@ -59,6 +61,11 @@ impl Packed for Foreground {
             place.unpack(payload)
         })
     }
+}
+
+/// A bit for each of the first `segments` segments.
+fn only(segments: usize) -> u64 {
+    if segments < SEGMENTS { (1 << segments) - 1 } else { u64::MAX }
 }
 
 /// What stands behind the head of a packed foreground.
