@@ -29,6 +29,8 @@ pub(crate) struct Connection {
     log: Log,
     /// It listens: then there soon is a session, or never.
     listens: bool,
+    /// It was told that there is a session: nothing that comes over it is told before.
+    has_begun: AtomicBool,
     is_up: Mutex<Option<bool>>,
 }
 
@@ -81,13 +83,19 @@ impl Connection {
             }
         });
         opening.map_err(|error| Failure::new(Kind::Short, format!("cannot start a thread: {error}"), ""))?;
-        Ok(Connection { state, log, listens, is_up: Mutex::new(None) })
+        Ok(Connection { state, log, listens, has_begun: AtomicBool::new(false), is_up: Mutex::new(None) })
     }
 
-    /// Waits for the session; nothing if it `is_over` before.
+    /// Lets [`engine`](Connection::engine) have the session: that it is there was told.
+    pub(crate) fn begin(&self) {
+        self.has_begun.store(true, Ordering::Relaxed);
+    }
+
+    /// Waits for the session and for [`begin`](Connection::begin); nothing if it `is_over` before.
     pub(crate) fn engine(&self, is_over: &AtomicBool) -> Option<&Engine> {
         loop {
-            if let Some(engine) = self.state.engine.get() {
+            let has_begun = self.has_begun.load(Ordering::Relaxed);
+            if let Some(engine) = self.state.engine.get().filter(|_| has_begun) {
                 return Some(engine);
             }
             if is_over.load(Ordering::Relaxed) {

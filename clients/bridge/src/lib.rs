@@ -166,6 +166,7 @@ fn carry(
         if !is_ready && connection.is_open() {
             is_ready = true;
             report.begin(options, sending.as_ref())?;
+            connection.begin();
         }
         connection.news(|news| report.link(&news))?;
         if !is_ready && wait_until.take_if(|until| Instant::now() >= *until).is_some() {
