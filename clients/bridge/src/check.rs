@@ -73,6 +73,7 @@ fn find(options: &BridgeOptions, stop: &AtomicBool) -> Result<Vec<Finding>, Fail
         Ok(connection) => connection,
         Err(failure) => return Ok(vec![Finding::failed(failure.message, failure.hint)]),
     };
+    connection.begin();
     let mut reasons = Vec::new();
     let mut is_linked = false;
     let begin = Instant::now();
@@ -99,7 +100,6 @@ fn find(options: &BridgeOptions, stop: &AtomicBool) -> Result<Vec<Finding>, Fail
     if let Some(failure) = connection.failure() {
         return Ok(vec![Finding::failed(failure.message, failure.hint)]);
     }
-    connection.begin();
     let findings = match connection.engine(&AtomicBool::new(true)) {
         Some(engine) if is_linked => hubs(engine)?,
         _ if !options.listen.is_empty() => {

@@ -169,7 +169,8 @@ fn carry(
             connection.begin();
         }
         connection.news(|news| report.link(&news))?;
-        if !is_ready && wait_until.take_if(|until| Instant::now() >= *until).is_some() {
+        let mut is_late = || wait_until.take_if(|until| Instant::now() >= *until).is_some();
+        if !is_ready && !connection.listens() && is_late() {
             report.waiting(options)?;
         }
         if let Some(failure) = connection.failure() {
