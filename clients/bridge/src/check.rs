@@ -73,6 +73,7 @@ fn find(options: &BridgeOptions, stop: &AtomicBool) -> Result<Vec<Finding>, Fail
         Ok(connection) => connection,
         Err(failure) => return Ok(vec![Finding::failed(failure.message, failure.hint)]),
     };
+    connection.begin();
     let mut reasons = Vec::new();
     let mut is_linked = false;
     let begin = Instant::now();

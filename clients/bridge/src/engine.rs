@@ -29,6 +29,8 @@ pub(crate) struct Connection {
     log: Log,
     /// It listens: then there soon is a session, or never.
     listens: bool,
+    /// It was told that there is a session: nothing that comes over it is told before.
+    has_begun: AtomicBool,
     is_up: Mutex<Option<bool>>,
 }
 
@@ -81,13 +83,18 @@ impl Connection {
             }
         });
         opening.map_err(|error| Failure::new(Kind::Short, format!("cannot start a thread: {error}"), ""))?;
-        Ok(Connection { state, log, listens, is_up: Mutex::new(None) })
+        Ok(Connection { state, log, listens, has_begun: AtomicBool::new(false), is_up: Mutex::new(None) })
     }
 
-    /// Waits for the session; nothing if it `is_over` before.
+    /// Lets [`engine`](Connection::engine) have the session: that it is there was told.
+    pub(crate) fn begin(&self) {
+        self.has_begun.store(true, Ordering::Relaxed);
+    }
+
+    /// Waits for the session and for [`begin`](Connection::begin); nothing if it `is_over` before.
     pub(crate) fn engine(&self, is_over: &AtomicBool) -> Option<&Engine> {
         loop {
-            if let Some(engine) = self.state.engine.get() {
+            if let Some(engine) = self.begun() {
                 return Some(engine);
             }
             if is_over.load(Ordering::Relaxed) {
@@ -97,9 +104,18 @@ impl Connection {
         }
     }
 
+    fn begun(&self) -> Option<&Engine> {
+        self.state.engine.get().filter(|_| self.has_begun.load(Ordering::Relaxed))
+    }
+
     /// Whether there is a session: it listens, or who only connects is connected.
     pub(crate) fn is_open(&self) -> bool {
         self.state.engine.get().is_some()
+    }
+
+    /// Whether it is others that connect: it waits for no router.
+    pub(crate) fn listens(&self) -> bool {
+        self.listens
     }
 
     /// Why there never will be a session, if that is known.
@@ -114,7 +130,7 @@ impl Connection {
         }
         self.log.take().into_iter().try_for_each(|line| tell(News::Failing(line)))?;
         let mut is_up = self.is_up.lock().unwrap_or_else(PoisonError::into_inner);
-        let Some(engine) = self.state.engine.get() else { return Ok(()) };
+        let Some(engine) = self.begun() else { return Ok(()) };
         let is_linked = engine.is_linked();
         if is_up.is_none_or(|before| before != is_linked) && (is_linked || is_up.is_some()) {
             tell(if is_linked { News::Up } else { News::Down })?;

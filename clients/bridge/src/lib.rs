@@ -166,9 +166,11 @@ fn carry(
         if !is_ready && connection.is_open() {
             is_ready = true;
             report.begin(options, sending.as_ref())?;
+            connection.begin();
         }
         connection.news(|news| report.link(&news))?;
-        if !is_ready && wait_until.take_if(|until| Instant::now() >= *until).is_some() {
+        let mut is_late = || wait_until.take_if(|until| Instant::now() >= *until).is_some();
+        if !is_ready && !connection.listens() && is_late() {
             report.waiting(options)?;
         }
         if let Some(failure) = connection.failure() {

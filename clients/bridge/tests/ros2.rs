@@ -181,8 +181,8 @@ fn check_others(said: &Value) {
     let mut got = said["frames"].as_array().cloned().unwrap_or_default();
     got.sort_by_key(|pair| pair[1] != "front");
     assert_eq!(Value::from(got), frames);
-    for sensor in ["front", "rear"] {
-        let line = serde_json::json!([format!("scanhub: {sensor}"), 0, "streaming"]);
+    for (name, words) in [("front", "streaming"), ("rear", "streaming"), ("hub", "running")] {
+        let line = serde_json::json!([format!("scanhub: {name}"), 0, words]);
         assert!(said["diagnostics"].as_array().is_some_and(|all| all.contains(&line)), "{said:#}");
     }
 }

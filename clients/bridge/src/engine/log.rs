@@ -26,6 +26,9 @@ const MOST: usize = 16;
 /// The longest line, in bytes.
 const LONGEST: usize = 500;
 
+/// What is followed by what is another one at each attempt (how soon the next one is, the port on this side), and how much of
+/// it is kept.
+const OF_AN_ATTEMPT: [(&str, usize); 2] = [(" Retry in ", 0), ("Syn on: ", 3)];
 /// What Zenoh writes behind addresses, because this program told it so (`config.rs`).
 const OUR_LIMIT: &str = "#so_sndbuf=8192";
 
@@ -62,9 +65,8 @@ impl Log {
     }
 
     fn add(&self, line: &str) {
-        // How soon it tries again is another time each time.
-        let line = line.split(" Retry in ").next().unwrap_or_default();
-        let mut line = without_places(line).replace(OUR_LIMIT, "");
+        let end = OF_AN_ATTEMPT.iter().filter_map(|(sign, len)| Some(line.find(sign)? + len)).min();
+        let mut line = without_places(&line[..end.unwrap_or(line.len())]).replace(OUR_LIMIT, "");
         let end = line.char_indices().map(|(at, _)| at).find(|at| *at + 4 > LONGEST);
         line.truncate(end.unwrap_or(line.len()));
         let mut lines = self.lines();
@@ -169,6 +171,13 @@ mod tests {
         log.add("no tcp/r:1#so_sndbuf=8192: refused. Retry in 100ms.");
         log.add("no tcp/r:1#so_sndbuf=8192: refused. Retry in 200ms.");
         assert_eq!(log.take(), ["no tcp/r:1: refused."]);
+        log.add(
+            "a close message in response to an OpenSyn on: TransportLinkUnicast { src: tcp/127.0.0.1:7 }",
+        );
+        log.add(
+            "a close message in response to an OpenSyn on: TransportLinkUnicast { src: tcp/127.0.0.1:8 }",
+        );
+        assert_eq!(log.take(), ["a close message in response to an OpenSyn"]);
         (0..1000).for_each(|n| log.add(&format!("{n} {}", "é".repeat(1000))));
         let lines = log.take();
         assert!(lines.len() == MOST && lines.iter().all(|line| line.len() <= LONGEST), "{lines:?}");
