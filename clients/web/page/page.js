@@ -1167,6 +1167,8 @@ Object.defineProperty(window, "scanhub", {
     drawn_ms: [0.5, 0.99].map((share) => ages.map(([from, to]) => to - from).sort((a, b) => a - b)[Math.floor(share * (ages.length - 1))] ?? null),
     shown: () => ages,
     points: (name) => [...([...sensors.values()].find((one) => one.name === name)?.scan?.points ?? [])],
+    screen: toScreen,
+    place: toRobot,
     view: { x: view.x, y: view.y, scale: view.scale, turn: view.turn },
     verdict: verdict(),
     connected: isOpen,

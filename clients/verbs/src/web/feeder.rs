@@ -5,9 +5,9 @@ use std::time::{Duration, Instant};
 
 use ::web::{Board, ChannelId, Event, Playback, Progress, messages};
 use scanhub_client::clock;
-use scanhub_client::streams::{Sample, Session};
+use scanhub_client::streams::{Sample, Session, Who};
 use scene::{Scene, Trouble};
-use schema::{Domain, Header, Topic, Verdict};
+use schema::{Domain, Failure, Header, Kind, Topic, Verdict};
 
 use super::{WebOptions, told};
 use crate::follow::{Notice, Sink};
@@ -229,8 +229,17 @@ impl<'a> Feeder<'a> {
     fn look(&mut self, now: Instant) {
         self.trouble = if !self.scene.hub_lives {
             let mut session = Session::new(self.options.places.clone());
-            let failure = session.look().err().unwrap_or_else(|| session.no_hub());
-            session.domain().is_none().then_some(Trouble { what: failure.message, remedy: failure.hint })
+            let failure = session.look().err();
+            match session.publishes() {
+                None => Some(failure.unwrap_or_else(|| session.no_hub())),
+                Some(Who::Hub) => None,
+                Some(Who::Listener) => Some(Failure::new(
+                    Kind::NoTopic,
+                    "no sensor of another machine is published here yet",
+                    "on that machine: scanhub gateway --interface NAME; here, scanhub listen shows who sends",
+                )),
+            }
+            .map(|Failure { message, hint, .. }| Trouble { what: message, remedy: hint })
         } else if self.scene.sensors.is_empty() {
             let remedy = "scanhub run --link front=/dev/ttyUSB0".to_owned();
             Some(Trouble { what: "the hub has no sensors".to_owned(), remedy })
