@@ -12,12 +12,12 @@ use crate::testkit::{INT, KILL, Outcome, Program, TERM, TestEnv, is_class, until
 
 /// Where the namespace is made: the test that shall run in it.
 const INSIDE: &str = "SCANHUB_TEST_STRANGERS";
-const STRANGER: u32 = 65533;
+pub(crate) const STRANGER: u32 = 65533;
 /// What root has and nobody may touch.
 const LETTER: &str = "not a lock";
 
 /// Runs `test`, which is called `name`, beside a stranger; says so if the system does not allow that.
-fn beside_a_stranger(name: &str, test: impl FnOnce()) {
+pub(crate) fn beside_a_stranger(name: &str, test: impl FnOnce()) {
     if std::env::var_os(INSIDE).is_some() {
         return test();
     }
@@ -41,7 +41,7 @@ fn beside_a_stranger(name: &str, test: impl FnOnce()) {
 }
 
 /// The program with `arguments` and nothing but them, as root or as the stranger.
-fn scanhub(user: u32, arguments: &[&str]) -> Command {
+pub(crate) fn scanhub(user: u32, arguments: &[&str]) -> Command {
     let mut command = Command::new("/mnt/scanhub");
     command.args(arguments).env_clear().env("SCANHUB_END_WITH_PARENT", "1").uid(user).gid(user);
     command
@@ -52,7 +52,7 @@ fn run(user: u32, arguments: &[&str]) -> Outcome {
 }
 
 /// What the stranger does, as a line for the shell; it has to succeed.
-fn stranger(script: &str) {
+pub(crate) fn stranger(script: &str) {
     assert!(tried(script), "{script}");
 }
 

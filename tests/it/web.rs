@@ -40,9 +40,19 @@ pub(crate) fn status(answer: &str) -> &str {
 
 /// A viewer that was let in, or the status with which it was not.
 pub(crate) fn view(host: &str, path: &str, origin: Option<&str>) -> Result<WebSocket<TcpStream>, u16> {
+    view_as(host, path, origin, "foxglove.sdk.v1")
+}
+
+/// As [`view`], by this name of the protocol.
+pub(crate) fn view_as(
+    host: &str,
+    path: &str,
+    origin: Option<&str>,
+    protocol: &str,
+) -> Result<WebSocket<TcpStream>, u16> {
     let mut request = format!("ws://{host}{path}").into_client_request().expect("an address");
     let headers = request.headers_mut();
-    headers.insert("Sec-WebSocket-Protocol", "foxglove.sdk.v1".parse().expect("a header"));
+    headers.insert("Sec-WebSocket-Protocol", protocol.parse().expect("a header"));
     if let Some(origin) = origin {
         headers.insert("Origin", origin.parse().expect("a header"));
     }
@@ -79,6 +89,7 @@ fn strangers_stay_outside() {
     assert_eq!(status(&get(&host, &host, "Origin: http://evil.example\r\n")), "403");
     assert_eq!(view(&host, "/", Some("https://evil.example")).err(), Some(403));
     assert!(view(&host, "/", None).is_ok());
+    assert_eq!(view_as(&host, "/", None, "chat").err(), Some(400));
     assert_eq!(status(&ask(&host, &format!("POST / HTTP/1.1\r\nHost: {host}\r\n\r\n"))), "405");
     assert_eq!(status(&ask(&host, &format!("GET /etc/passwd HTTP/1.1\r\nHost: {host}\r\n\r\n"))), "404");
     assert_eq!(ask(&host, "\x16\x03\x01 no request\r\n\r\n"), "");

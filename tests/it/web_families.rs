@@ -10,7 +10,8 @@ use crate::browser::{Browser, Look};
 use crate::testkit::{INT, PATIENCE, Sender, TestEnv, in_a_network, number, until};
 use crate::web::web;
 use crate::web_page::browse;
-use schema::{Pose, Scan, ScanHead, State, Status, Topic, Verdict, Zones};
+use scene::{Place, Scene};
+use schema::{Contents, Header, Pose, Scan, ScanHead, State, Status, Topic, Verdict, Zones};
 
 /// A hall that is as no mirror shows it.
 const HALL: &str = "[noise]\ntail = 0\n\n[[thing]]\nline = [[3000, -2500], [3500, 4000], [-2000, 3000], [-4000, -3000], [3000, -2500]]\n
@@ -22,6 +23,11 @@ fn drawn(page: &mut Browser, sensor: &str) -> Vec<(f64, f64)> {
     let numbers: Vec<f64> =
         points.as_array().expect("points").iter().map(|value| value.as_f64().unwrap_or(f64::NAN)).collect();
     numbers.chunks(2).map(|pair| (pair[0], pair[1])).collect()
+}
+
+/// Two numbers.
+fn pair(value: &Value) -> (f64, f64) {
+    (value[0].as_f64().expect("a number"), value[1].as_f64().expect("a number"))
 }
 
 /// Where the beams of a line of class `scan` end for a sensor at `pose`.
@@ -99,7 +105,13 @@ fn sensors_of_other_machines_stand_in_the_list_and_not_on_this_robot() {
         let (_server, host) = web(&env, &[]);
         page.open(&format!("http://{host}/"));
         page.await_true("window.scanhub?.points('rear').length === 722");
-        let scan = Scan::of(ScanHead::lms(181, -90_000, 1000, 1, 13), &[2000; 181]);
+        let head = ScanHead {
+            intensity_bits: 8,
+            contents: Contents::UPPER,
+            ..ScanHead::lms(181, -90_000, 1000, 1, 13)
+        };
+        let mut scan = Scan::of(head, &[2000; 181]);
+        scan.arrays().upper.fill(77);
         // It announces itself and says something all the time, as remote ones do: however long the rest took, it is there
         // again.
         let mut say = |page: &mut Browser, wanted: &str| {
@@ -121,6 +133,23 @@ fn sensors_of_other_machines_stand_in_the_list_and_not_on_this_robot() {
         let number = "[...document.querySelectorAll('#sensors button')].find((one) => /robot1/.test(one.innerText)).click()";
         page.ask(number);
         say(&mut page, "scanhub.beams === 181");
+        // What is read out of it is what the terminal would say of the same place.
+        let mut scene = Scene::default();
+        scene.sensor("robot1.front").take_scan(&Header::default(), &scan, 0);
+        // Three points, and a place where there is none, in a picture that does not move any more.
+        page.press("-");
+        let beam = |degrees: f64| (2.0 * degrees.to_radians().cos(), 2.0 * degrees.to_radians().sin());
+        for (x, y) in [beam(0.0), beam(-53.0), beam(90.0), (0.7, 0.4)] {
+            let pixels = pair(&page.ask(&format!("scanhub.screen({x}, {y}).map(Math.round)")));
+            page.mouse("mouseMoved", pixels, false);
+            let at_m = pair(&page.ask(&format!("scanhub.place({}, {})", pixels.0, pixels.1)));
+            let within_m = 14.0 / page.ask("scanhub.view.scale").as_f64().expect("pixels for a metre");
+            let words = Place::of(scene.sensors.iter(), at_m, within_m).words();
+            let (lines, last) = words.split_at(words.len().min(3));
+            let last: String = last.iter().map(|word| format!(", {word}")).collect();
+            let text = lines.join("\\n") + &last;
+            say(&mut page, &format!("document.querySelector('#readout').textContent === '{text}'"));
+        }
         let outcome = listener.end(INT);
         assert_eq!(outcome.code, Some(0), "{outcome}");
     });

@@ -25,7 +25,8 @@ impl Circle {
         let radius_m = self.radius_m;
         let own = |zone: &&schema::Zone| f64::from(zone.radius_mm) / 1000.0 == radius_m;
         let is_violated = sensor.zones.zones().iter().find(own).is_some_and(|zone| zone.violated != 0);
-        sensor.points().filter(move |point| is_violated && point.distance_m() <= radius_m)
+        let points = is_violated.then(|| sensor.points()).into_iter().flatten();
+        points.filter(move |point| point.distance_m() <= radius_m)
     }
 }
 

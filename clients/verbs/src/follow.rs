@@ -326,7 +326,7 @@ impl<'a> Run<'a> {
                     self.notice(sink, Notice::HubGone)?;
                 }
             }
-            Some(seen) if now - seen >= GRACE => self.check_sensors()?,
+            Some(seen) if now - seen >= GRACE => self.check_sensors(sink)?,
             _ => {}
         }
         if self.bounds.timeout.is_some_and(|limit| now - self.last_sample >= limit) {

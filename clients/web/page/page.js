@@ -495,13 +495,15 @@ function drawGrid() {
   pen.textBaseline = "middle";
   const digits = step < 0.1 ? 2 : step < 1 ? 1 : 0;
   const free = ([x, y]) => x > 20 && x < middle.x + middle.width / 2 - 20 && y > 64 && y < middle.y + middle.height / 2 - 8;
+  // Where a circle crosses the axis stands what that is.
+  const isBare = (n) => n !== 0 && !(layers.zones && circles.some(({ radius }) => Math.abs(Math.abs(n * step) - radius) * view.scale < 26));
   for (let n = from(view.x); n <= to(view.x); n++) {
     const [x, y] = toScreen(n * step, 0);
-    if (n !== 0 && free([x, y])) label((n * step).toFixed(digits), x + 13 * cos, y + 13 * sin);
+    if (isBare(n) && free([x, y])) label((n * step).toFixed(digits), x + 13 * cos, y + 13 * sin);
   }
   for (let n = from(view.y); n <= to(view.y); n++) {
     const [x, y] = toScreen(0, n * step);
-    if (n !== 0 && free([x, y])) label((n * step).toFixed(digits), x - 11 * sin, y + 11 * cos);
+    if (isBare(n) && free([x, y])) label((n * step).toFixed(digits), x - 11 * sin, y + 11 * cos);
   }
 }
 
@@ -1167,6 +1169,8 @@ Object.defineProperty(window, "scanhub", {
     drawn_ms: [0.5, 0.99].map((share) => ages.map(([from, to]) => to - from).sort((a, b) => a - b)[Math.floor(share * (ages.length - 1))] ?? null),
     shown: () => ages,
     points: (name) => [...([...sensors.values()].find((one) => one.name === name)?.scan?.points ?? [])],
+    screen: toScreen,
+    place: toRobot,
     view: { x: view.x, y: view.y, scale: view.scale, turn: view.turn },
     verdict: verdict(),
     connected: isOpen,

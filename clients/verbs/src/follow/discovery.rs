@@ -33,8 +33,10 @@ impl Run<'_> {
     }
 
     /// A hub that is up has all its topics: a sensor that is not among them is no sensor of it.
-    pub(super) fn check_sensors(&mut self) -> Result<(), End> {
-        if !self.tracks.is_empty() && self.tracks.iter().all(|track| track.source.subscribed()) {
+    pub(super) fn check_sensors(&mut self, sink: &dyn Sink) -> Result<(), End> {
+        // What nobody wants now is not missing: asking costs more than following.
+        let is_missing = |track: &Track| sink.wants(track.name.topic) && !track.source.subscribed();
+        if !self.tracks.is_empty() && !self.tracks.iter().any(is_missing) {
             return Ok(());
         }
         if self.session.domain().is_none() {
@@ -65,7 +67,7 @@ impl Run<'_> {
         for track in &self.tracks {
             let sensor = &track.name.sensor;
             let is_there = track.name.is_robot() || sensors.contains(sensor) || self.may_come(brings(sensor));
-            if !track.source.subscribed() && !is_there {
+            if is_missing(track) && !is_there {
                 return Err(no_sensor(sensor, &sensors).into());
             }
             let topics = published.iter().filter(|(of, _)| of == sensor).map(|(_, topic)| *topic);

@@ -5,9 +5,9 @@ use std::time::{Duration, Instant};
 
 use ::web::{Board, ChannelId, Event, Playback, Progress, messages};
 use scanhub_client::clock;
-use scanhub_client::streams::{Sample, Session};
-use scene::{Scene, Trouble};
-use schema::{Domain, Header, Topic, Verdict};
+use scanhub_client::streams::{Sample, Session, Who};
+use scene::{Circle, Scene, Trouble, circles};
+use schema::{Domain, Failure, Header, Kind, Topic, Verdict};
 
 use super::{WebOptions, told};
 use crate::follow::{Notice, Sink};
@@ -55,6 +55,9 @@ pub(super) struct Feeder<'a> {
     /// The verdict as it was put up, whose it is and whether there is a hub; and when it is put up again.
     told: (Verdict, Option<String>, bool),
     robot_at: Instant,
+    /// The circles as they were put up, and when they are put up again although they are the same.
+    circles: Vec<Circle>,
+    circles_at: Instant,
     /// When marks, zones and lines are put up again, at the earliest.
     marked_at: [Instant; 3],
     status_at: Instant,
@@ -93,6 +96,8 @@ impl<'a> Feeder<'a> {
             poses_are_new: true,
             told: (Verdict::Unknown, None, false),
             robot_at: now,
+            circles: Vec::new(),
+            circles_at: now,
             marked_at: [now; 3],
             status_at: now,
             trouble: None,
@@ -172,7 +177,13 @@ impl<'a> Feeder<'a> {
         // Of what changes with every scan nobody who is not there misses anything.
         if now >= self.marked_at[0] && self.zones_are_new && self.board.is_watched(self.zones) {
             (self.zones_are_new, self.marked_at[0]) = (false, now + MARKS_EVERY);
-            self.board.put(self.zones, wall_ns, &messages::zones(&self.scene, wall_ns));
+            let around = circles(self.scene.robot().map(|(_, sensor)| sensor));
+            // Circles with nothing inside stay as they are.
+            let stands = around == self.circles && !around.iter().any(Circle::is_violated);
+            if !stands || now >= self.circles_at {
+                (self.circles, self.circles_at) = (around, now + CIRCLES_EVERY);
+                self.board.put(self.zones, wall_ns, &messages::zones(&self.scene, wall_ns));
+            }
         }
         if now >= self.marked_at[1] && self.marks_are_new && self.board.is_watched(self.marks) {
             (self.marks_are_new, self.marked_at[1]) = (false, now + MARKS_EVERY);
@@ -229,8 +240,17 @@ impl<'a> Feeder<'a> {
     fn look(&mut self, now: Instant) {
         self.trouble = if !self.scene.hub_lives {
             let mut session = Session::new(self.options.places.clone());
-            let failure = session.look().err().unwrap_or_else(|| session.no_hub());
-            session.domain().is_none().then_some(Trouble { what: failure.message, remedy: failure.hint })
+            let failure = session.look().err();
+            match session.publishes() {
+                None => Some(failure.unwrap_or_else(|| session.no_hub())),
+                Some(Who::Hub) => None,
+                Some(Who::Listener) => Some(Failure::new(
+                    Kind::NoTopic,
+                    "no sensor of another machine is published here yet",
+                    "on that machine: scanhub gateway --interface NAME; here, scanhub listen shows who sends",
+                )),
+            }
+            .map(|Failure { message, hint, .. }| Trouble { what: message, remedy: hint })
         } else if self.scene.sensors.is_empty() {
             let remedy = "scanhub run --link front=/dev/ttyUSB0".to_owned();
             Some(Trouble { what: "the hub has no sensors".to_owned(), remedy })
@@ -320,4 +340,6 @@ const ROBOT_EVERY: Duration = Duration::from_millis(50);
 const PROGRESS_EVERY: Duration = Duration::from_millis(50);
 /// Of several sensors one message has all.
 const MARKS_EVERY: Duration = Duration::from_millis(20);
+/// In viewers what is not said again is gone after a second, and whoever comes sees them so soon.
+const CIRCLES_EVERY: Duration = Duration::from_millis(300);
 const STATUS_EVERY: Duration = Duration::from_millis(500);

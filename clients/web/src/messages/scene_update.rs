@@ -5,7 +5,6 @@ use ros::BASE_FRAME;
 use scene::{Scene, circles};
 use schema::Verdict;
 use serde::Serialize;
-use serde_json::json;
 
 use super::{bytes, json};
 use crate::board::Channel;
@@ -24,14 +23,21 @@ pub fn zones(scene: &Scene, wall_ns: u64) -> Vec<u8> {
         let mut entity = Entity::new(format!("zone {:.3}", circle.radius_m), wall_ns);
         entity.tell("radius_m", format!("{:.3}", circle.radius_m));
         entity.tell("verdict", circle.verdict.name().to_owned());
-        entity.cylinders.push(json!({
-            "pose": at(0.0, 0.0), "size": { "x": across, "y": across, "z": FLAT_M },
-            "bottom_scale": 1.0, "top_scale": 1.0, "color": colour(circle.verdict, 0.18),
-        }));
-        entity.texts.push(json!({
-            "pose": at(circle.radius_m, 0.0), "billboard": true, "font_size": 12.0, "scale_invariant": true,
-            "color": colour(circle.verdict, 1.0), "text": format!("{:.2} m", circle.radius_m),
-        }));
+        entity.cylinders.push(Cylinder {
+            pose: at(0.0, 0.0),
+            size: Vector { x: across, y: across, z: FLAT_M },
+            bottom_scale: 1.0,
+            top_scale: 1.0,
+            color: colour(circle.verdict, 0.18),
+        });
+        entity.texts.push(Text {
+            pose: at(circle.radius_m, 0.0),
+            billboard: true,
+            font_size: 12.0,
+            scale_invariant: true,
+            color: colour(circle.verdict, 1.0),
+            text: format!("{:.2} m", circle.radius_m),
+        });
         entities.push(entity);
     }
     for (_, sensor) in scene.robot() {
@@ -44,12 +50,9 @@ pub fn zones(scene: &Scene, wall_ns: u64) -> Vec<u8> {
         entity.tell("beam", point.beam.to_string());
         entity.tell("distance_m", format!("{:.3}", point.distance_m()));
         entity.tell("verdict", circle.verdict.name().to_owned());
-        entity.lines.push(json!({
-            "type": LINE_STRIP, "pose": at(0.0, 0.0), "thickness": 2.0, "scale_invariant": true,
-            "points": [{ "x": sensor.pose.x_m, "y": sensor.pose.y_m, "z": 0.0 },
-                { "x": point.x_m, "y": point.y_m, "z": 0.0 }],
-            "color": colour(circle.verdict, 1.0), "colors": [], "indices": [],
-        }));
+        let points = [(sensor.pose.x_m, sensor.pose.y_m), (point.x_m, point.y_m)];
+        let color = colour(circle.verdict, 1.0);
+        entity.lines.push(LinePrimitive::new(LINE_STRIP, points.into_iter(), color));
         entities.push(entity);
     }
     update(&entities)
@@ -62,16 +65,9 @@ pub fn lines(scene: &Scene, wall_ns: u64) -> Vec<u8> {
         let mut entity = Entity::new(format!("lines {}", sensor.name), wall_ns);
         entity.tell("sensor", sensor.name.clone());
         let ends = |line: &schema::Line| [(line.x1_m, line.y1_m), (line.x2_m, line.y2_m)];
-        let point = |(x, y): (f32, f32)| json!({ "x": x, "y": y, "z": 0.0 });
-        entity.lines.push(json!({
-            "type": LINE_LIST, "pose": at(0.0, 0.0), "thickness": 2.0, "scale_invariant": true,
-            "points": found.lines().iter().flat_map(ends).map(point).collect::<Vec<_>>(),
-            "color": LINE, "colors": [], "indices": [],
-        }));
-        let corner = |corner: &schema::Corner| {
-            let size = json!({ "x": CORNER_M, "y": CORNER_M, "z": CORNER_M });
-            json!({ "pose": at(corner.x_m.into(), corner.y_m.into()), "size": size, "color": LINE })
-        };
+        let points = found.lines().iter().flat_map(ends).map(|(x, y)| (x.into(), y.into()));
+        entity.lines.push(LinePrimitive::new(LINE_LIST, points, LINE));
+        let corner = |corner: &schema::Corner| ball((corner.x_m.into(), corner.y_m.into()), CORNER_M, LINE);
         entity.spheres = found.corners().iter().map(corner).collect();
         Some(entity)
     });
@@ -83,11 +79,7 @@ pub fn marks(scene: &Scene, wall_ns: u64) -> Vec<u8> {
     let entities = scene.robot().map(|(_, sensor)| {
         let mut entity = Entity::new(format!("marks {}", sensor.name), wall_ns);
         entity.tell("sensor", sensor.name.clone());
-        entity.spheres = sensor
-            .mark_points()
-            .into_iter()
-            .map(|(x, y)| json!({ "pose": at(x, y), "size": { "x": MARK_M, "y": MARK_M, "z": MARK_M }, "color": MARK }))
-            .collect();
+        entity.spheres = sensor.mark_points().into_iter().map(|mark| ball(mark, MARK_M, MARK)).collect();
         entity
     });
     update(&entities.collect::<Vec<_>>())
@@ -100,14 +92,14 @@ struct Entity {
     id: String,
     lifetime: Time,
     frame_locked: bool,
-    metadata: Vec<serde_json::Value>,
+    metadata: Vec<KeyValue>,
     arrows: [(); 0],
     cubes: [(); 0],
-    spheres: Vec<serde_json::Value>,
-    cylinders: Vec<serde_json::Value>,
-    lines: Vec<serde_json::Value>,
+    spheres: Vec<Sphere>,
+    cylinders: Vec<Cylinder>,
+    lines: Vec<LinePrimitive>,
     triangles: [(); 0],
-    texts: Vec<serde_json::Value>,
+    texts: Vec<Text>,
     models: [(); 0],
 }
 
@@ -115,6 +107,96 @@ struct Entity {
 struct Time {
     sec: u64,
     nsec: u64,
+}
+
+#[derive(Serialize)]
+struct KeyValue {
+    key: &'static str,
+    value: String,
+}
+
+#[derive(Serialize)]
+struct Vector {
+    x: f64,
+    y: f64,
+    z: f64,
+}
+
+#[derive(Serialize)]
+struct Quaternion {
+    x: f64,
+    y: f64,
+    z: f64,
+    w: f64,
+}
+
+#[derive(Serialize)]
+struct Pose {
+    position: Vector,
+    orientation: Quaternion,
+}
+
+#[derive(Clone, Copy, Serialize)]
+struct Colour {
+    r: f64,
+    g: f64,
+    b: f64,
+    a: f64,
+}
+
+#[derive(Serialize)]
+struct Sphere {
+    pose: Pose,
+    size: Vector,
+    color: Colour,
+}
+
+#[derive(Serialize)]
+struct Cylinder {
+    pose: Pose,
+    size: Vector,
+    bottom_scale: f64,
+    top_scale: f64,
+    color: Colour,
+}
+
+#[derive(Serialize)]
+struct Text {
+    pose: Pose,
+    billboard: bool,
+    font_size: f64,
+    scale_invariant: bool,
+    color: Colour,
+    text: String,
+}
+
+#[derive(Serialize)]
+struct LinePrimitive {
+    #[serde(rename = "type")]
+    kind: u8,
+    pose: Pose,
+    thickness: f64,
+    scale_invariant: bool,
+    points: Vec<Vector>,
+    color: Colour,
+    colors: [(); 0],
+    indices: [(); 0],
+}
+
+impl LinePrimitive {
+    /// Two pixels wide, through these points of the robot's frame.
+    fn new(kind: u8, points: impl Iterator<Item = (f64, f64)>, color: Colour) -> LinePrimitive {
+        LinePrimitive {
+            kind,
+            pose: at(0.0, 0.0),
+            thickness: 2.0,
+            scale_invariant: true,
+            points: points.map(|(x, y)| Vector { x, y, z: 0.0 }).collect(),
+            color,
+            colors: [],
+            indices: [],
+        }
+    }
 }
 
 impl Entity {
@@ -137,8 +219,8 @@ impl Entity {
         }
     }
 
-    fn tell(&mut self, key: &str, value: String) {
-        self.metadata.push(json!({ "key": key, "value": value }));
+    fn tell(&mut self, key: &'static str, value: String) {
+        self.metadata.push(KeyValue { key, value });
     }
 }
 
@@ -151,18 +233,23 @@ fn update(entities: &[Entity]) -> Vec<u8> {
     bytes(&Update { deletions: [], entities })
 }
 
-fn at(x: f64, y: f64) -> serde_json::Value {
-    json!({ "position": { "x": x, "y": y, "z": 0.0 }, "orientation": { "x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0 } })
+fn at(x: f64, y: f64) -> Pose {
+    let (position, orientation) = (Vector { x, y, z: 0.0 }, Quaternion { x: 0.0, y: 0.0, z: 0.0, w: 1.0 });
+    Pose { position, orientation }
+}
+
+fn ball((x, y): (f64, f64), across: f64, color: Colour) -> Sphere {
+    Sphere { pose: at(x, y), size: Vector { x: across, y: across, z: across }, color }
 }
 
 /// Green, amber and red, as the page has them.
-fn colour(verdict: Verdict, a: f64) -> serde_json::Value {
+fn colour(verdict: Verdict, a: f64) -> Colour {
     let (r, g, b) = match verdict {
         Verdict::Clear => (0.18, 0.62, 0.36),
         Verdict::Slow => (0.85, 0.58, 0.08),
         Verdict::Stop | Verdict::Unknown => (0.84, 0.18, 0.2),
     };
-    json!({ "r": r, "g": g, "b": b, "a": a })
+    Colour { r, g, b, a }
 }
 
 const LINE_STRIP: u8 = 0;
@@ -170,15 +257,6 @@ const LINE_LIST: u8 = 2;
 const FLAT_M: f64 = 0.002;
 const MARK_M: f64 = 0.08;
 const CORNER_M: f64 = 0.06;
-
-/// Of a mark or a line.
-#[derive(Clone, Copy, Serialize)]
-struct Colour {
-    r: f64,
-    g: f64,
-    b: f64,
-    a: f64,
-}
 
 const LINE: Colour = Colour { r: 0.45, g: 0.33, b: 0.8, a: 1.0 };
 const MARK: Colour = Colour { r: 0.05, g: 0.55, b: 0.75, a: 1.0 };

@@ -1,0 +1,389 @@
+//! All channels of `web` as Foxglove's own library subscribes to them, one message for each: what comes is decoded by the schema
+//! that came with it, CDR by the messages of ROS and JSON by JSON Schema, and is what `echo --json` says of the same samples.
+
+use std::collections::HashMap;
+use std::net::TcpStream;
+use std::time::Instant;
+
+use ros::{LASER_SCAN, POINT_CLOUD, TF_MESSAGE, Value as Told, read};
+use schema::Pose;
+use serde_json::{Value, json};
+use tungstenite::{Message, WebSocket};
+
+use crate::testkit::{INT, Outcome, PATIENCE, TestEnv, is_class, wall_ns};
+use crate::web::{text, view_as, web};
+
+/// Where the sensor sits: metres ahead and to the left, and how it is turned, in radians.
+const PLACE: (f64, f64, f64) = (0.3, -0.1, 0.4);
+const TOPICS: [&str; 7] = ["scan", "foreground", "marks", "zones", "lines", "background", "status"];
+/// Somebody comes who is seen before the background, and walks into the circles; a reflector stands in the corner.
+const WORLD: &str =
+    "[noise]\ntail = 0\n\n[[thing]]\nline = [[3000, -3000], [3000, 3000], [-3000, 3000], [-3000, -3000]]\n
+[[thing]]\nradius_mm = 60\npose = [0, 700]\nfrom_s = 9\n
+[[thing]]\nline = [[900, 2000], [1000, 2000]]\nsurface = \"reflector\"\n";
+
+fn pose() -> Pose {
+    Pose { x_m: PLACE.0, y_m: PLACE.1, yaw_rad: PLACE.2, ..Pose::default() }
+}
+
+/// A message of a channel: when it was, in ns since 1970, and its body.
+type Heard = (u64, Vec<u8>);
+
+/// A viewer as npm's `@foxglove/ws-protocol` 0.8.0 is one: subscriptions are numbered from 0 on, and each is a message of its own.
+struct Viewer {
+    socket: WebSocket<TcpStream>,
+    /// By their subscriptions.
+    channels: Vec<Value>,
+    heard: HashMap<String, Vec<Heard>>,
+}
+
+impl Viewer {
+    fn new(host: &str, protocol: &str) -> Viewer {
+        let mut socket = view_as(host, "/", None, protocol).expect("let in");
+        assert_eq!(text(&mut socket)["op"], "serverInfo");
+        Viewer { socket, channels: Vec::new(), heard: HashMap::new() }
+    }
+
+    /// Listens until every channel that was told said so many messages.
+    fn listen(&mut self, wanted: usize) {
+        let begun = Instant::now();
+        while self.channels.len() < TOPICS.len() + 1 || self.least() < wanted {
+            assert!(begun.elapsed() < 3 * PATIENCE, "{wanted} of each: {:?}", self.counts());
+            match self.socket.read().expect("the server lives") {
+                Message::Text(text) => self.hear(&serde_json::from_str(&text).expect("JSON")),
+                Message::Binary(frame) => {
+                    let subscription = u32::from_le_bytes(frame[1..5].try_into().expect("four bytes"));
+                    let stamp = u64::from_le_bytes(frame[5..13].try_into().expect("eight bytes"));
+                    assert_eq!(frame[0], 1);
+                    let topic = self.channels[subscription as usize]["topic"].as_str().expect("a topic");
+                    self.heard.entry(topic.to_owned()).or_default().push((stamp, frame[13..].to_vec()));
+                }
+                _ => {}
+            }
+        }
+    }
+
+    fn hear(&mut self, said: &Value) {
+        for channel in said["channels"].as_array().into_iter().flatten() {
+            let one = json!({ "id": self.channels.len(), "channelId": channel["id"] });
+            let wish = json!({ "op": "subscribe", "subscriptions": [one] });
+            self.socket.send(Message::text(wish.to_string())).expect("it reads");
+            self.channels.push(channel.clone());
+        }
+    }
+
+    fn counts(&self) -> Vec<(&str, usize)> {
+        let of = |channel: &Value| {
+            self.heard.get(channel["topic"].as_str().unwrap_or_default()).map_or(0, Vec::len)
+        };
+        self.channels
+            .iter()
+            .map(|channel| (channel["topic"].as_str().unwrap_or_default(), of(channel)))
+            .collect()
+    }
+
+    /// Of the channel that said least; what is told once counts as much as all.
+    fn least(&self) -> usize {
+        let once = ["/tf_static", "/front/background"];
+        let enough = |(topic, count): (&str, usize)| {
+            if once.contains(&topic) && count > 0 { usize::MAX } else { count }
+        };
+        self.counts().into_iter().map(enough).min().unwrap_or(0)
+    }
+
+    fn of(&self, topic: &str) -> &[Heard] {
+        &self.heard[topic]
+    }
+}
+
+/// Whether `value` is what `schema` says, as far as this project's schemas say it: types, properties and items.
+fn conforms(value: &Value, schema: &Value) -> bool {
+    let is = |kind: &Value| match kind.as_str() {
+        Some("object") => value.is_object(),
+        Some("array") => value.is_array(),
+        Some("string") => value.is_string(),
+        Some("boolean") => value.is_boolean(),
+        Some("number") => value.is_number(),
+        Some("integer") => value.is_i64() || value.is_u64(),
+        Some("null") => value.is_null(),
+        _ => false,
+    };
+    let kinds = schema["type"].as_array().cloned().unwrap_or_else(|| vec![schema["type"].clone()]);
+    let properties = schema["properties"].as_object().into_iter().flatten();
+    kinds.iter().any(is)
+        && properties
+            .filter(|_| value.is_object())
+            .all(|(key, of)| value.get(key).is_some_and(|it| conforms(it, of)))
+        && value
+            .as_array()
+            .into_iter()
+            .flatten()
+            .all(|item| schema["items"].is_null() || conforms(item, &schema["items"]))
+}
+
+fn close(a: f64, b: f64) -> bool {
+    (a - b).abs() <= 2e-6 * b.abs().max(1.0)
+}
+
+fn numbers(values: &[Told]) -> Vec<f64> {
+    values
+        .iter()
+        .map(|value| if let Told::Number(number) = value { *number } else { panic!("a number") })
+        .collect()
+}
+
+/// Ranges of a line in m, nothing where there is none.
+fn ranges_m(line: &Value, unit: &str, in_m: f64) -> Vec<Option<f64>> {
+    let unit = line[unit].as_f64().expect("a unit") * in_m;
+    line["ranges"].as_array().expect("ranges").iter().map(|range| Some(range.as_f64()? * unit)).collect()
+}
+
+fn angle_rad(line: &Value, beam: usize) -> f64 {
+    let degrees = |key: &str| line[key].as_f64().expect("an angle");
+    (degrees("first_angle_deg") + beam as f64 * degrees("step_deg")).to_radians()
+}
+
+/// The lines of a topic by the moments of their samples.
+fn by_stamp(lines: &Outcome, class: &str) -> HashMap<u64, Value> {
+    let lines = lines.of_class(class).into_iter();
+    lines.filter_map(|line| Some((line["wall_ns"].as_u64()?, line))).collect()
+}
+
+/// That most of what was heard has its line, each as `is_same` says: a reader may miss a sample, but few.
+fn each_is_a_line(
+    topic: &str,
+    heard: &[Heard],
+    lines: &HashMap<u64, Value>,
+    is_same: impl Fn(&[u8], &Value) -> bool,
+) {
+    let met: Vec<_> = heard.iter().filter_map(|(stamp, body)| Some((body, lines.get(stamp)?))).collect();
+    assert!(met.len() * 2 > heard.len(), "{topic}: {} of {} have a line", met.len(), heard.len());
+    for (body, line) in met {
+        assert!(is_same(body, line), "{topic}: not what this line says: {line}");
+    }
+}
+
+fn is_scan(body: &[u8], line: &Value) -> bool {
+    let told = read(&LASER_SCAN, body).expect("a LaserScan");
+    let ranges = numbers(told.sequence("ranges").expect("ranges"));
+    let said = ranges_m(line, "unit_um", 1e-6);
+    let is_range =
+        |(range, said): (&f64, &Option<f64>)| said.map_or(!range.is_finite(), |said| close(*range, said));
+    told.text("header.frame_id") == Some("front")
+        && close(told.number("angle_min").expect("an angle"), angle_rad(line, 0))
+        && close(told.number("angle_max").expect("an angle"), angle_rad(line, said.len() - 1))
+        && ranges.len() == said.len()
+        && ranges.iter().zip(&said).all(is_range)
+}
+
+/// Points in the sensor's frame, as `scan` has the angles.
+fn is_foreground(body: &[u8], line: &Value, scan: &Value) -> bool {
+    let told = read(&POINT_CLOUD, body).expect("a PointCloud2");
+    let bytes: Vec<u8> =
+        numbers(told.sequence("data").expect("data")).iter().map(|byte| *byte as u8).collect();
+    let step = told.number("point_step").expect("a step") as usize;
+    let axis = |bytes: &[u8]| f64::from(f32::from_le_bytes(bytes.try_into().expect("four bytes")));
+    let points: Vec<_> = bytes.chunks(step).map(|point| (axis(&point[..4]), axis(&point[4..8]))).collect();
+    let beams =
+        line["beams"].as_array().expect("beams").iter().map(|beam| beam.as_u64().expect("a beam") as usize);
+    let said: Vec<_> = beams
+        .zip(ranges_m(line, "unit_mm", 1e-3))
+        .map(|(beam, range)| {
+            let (sin, cos) = angle_rad(scan, beam).sin_cos();
+            (range.expect("a range") * cos, range.expect("a range") * sin)
+        })
+        .collect();
+    points.len() == said.len() && points.iter().zip(&said).all(|(a, b)| close(a.0, b.0) && close(a.1, b.1))
+}
+
+fn object(body: &[u8]) -> Value {
+    serde_json::from_slice(body).expect("JSON")
+}
+
+/// All of one kind in a SceneUpdate.
+fn all(update: &Value, kind: &str) -> Vec<Value> {
+    let entities = update["entities"].as_array().expect("entities").iter();
+    entities.flat_map(|entity| entity[kind].as_array().expect("a list").clone()).collect()
+}
+
+fn place(of: &Value) -> (f64, f64) {
+    (of["x"].as_f64().expect("a number"), of["y"].as_f64().expect("a number"))
+}
+
+/// Whether these are the same places, one after the other.
+fn are_same(a: &[(f64, f64)], b: &[(f64, f64)]) -> bool {
+    a.len() == b.len() && a.iter().zip(b).all(|(a, b)| close(a.0, b.0) && close(a.1, b.1))
+}
+
+fn list<'a>(line: &'a Value, key: &str) -> impl Iterator<Item = &'a Value> {
+    line[key].as_array().expect("a list").iter()
+}
+
+/// Messages that stand for what was seen last: each that says something is what some line says.
+fn each_is_some_line(
+    topic: &str,
+    heard: &[Heard],
+    lines: &[Value],
+    says_something: impl Fn(&Value) -> bool,
+    is_same: impl Fn(&Value, &Value) -> bool,
+) {
+    let told: Vec<_> = heard.iter().map(|(_, body)| object(body)).filter(says_something).collect();
+    assert!(!told.is_empty(), "{topic}: nothing was said");
+    for told in told {
+        assert!(lines.iter().any(|line| is_same(&told, line)), "{topic}: no line says {told}");
+    }
+}
+
+fn marks(told: &Value, line: &Value) -> bool {
+    let spheres = all(told, "spheres");
+    let seen: Vec<_> = spheres.iter().map(|sphere| place(&sphere["pose"]["position"])).collect();
+    let of_mark = |mark: &Value| {
+        let (angle, range) = (mark["angle_deg"].as_f64(), mark["range_mm"].as_f64());
+        let (x, y) = pose().point_mm(angle.expect("an angle").to_radians(), range.expect("a range"));
+        (x / 1e3, y / 1e3)
+    };
+    are_same(&seen, &list(line, "marks").map(of_mark).collect::<Vec<_>>())
+}
+
+fn lines(told: &Value, line: &Value) -> bool {
+    let ends: Vec<_> = all(told, "lines")
+        .iter()
+        .flat_map(|one| list(one, "points").map(place).collect::<Vec<_>>())
+        .collect();
+    let corners: Vec<_> = all(told, "spheres").iter().map(|one| place(&one["pose"]["position"])).collect();
+    let end = |one: &Value, x: &str, y: &str| {
+        (one[x].as_f64().expect("a number"), one[y].as_f64().expect("a number"))
+    };
+    let said: Vec<_> =
+        list(line, "lines").flat_map(|one| [end(one, "x1_m", "y1_m"), end(one, "x2_m", "y2_m")]).collect();
+    let said_corners: Vec<_> = list(line, "corners").map(|one| end(one, "x_m", "y_m")).collect();
+    are_same(&ends, &said) && are_same(&corners, &said_corners)
+}
+
+fn zones(told: &Value, line: &Value) -> bool {
+    let metadata = |entity: &Value, key: &str| {
+        let mut all = entity["metadata"].as_array().expect("a list").iter();
+        all.find(|one| one["key"] == key).map(|one| one["value"].as_str().expect("text").to_owned())
+    };
+    let entities =
+        list(told, "entities").filter(|entity| !entity["cylinders"].as_array().expect("a list").is_empty());
+    let circles: Vec<_> =
+        entities.map(|entity| (metadata(entity, "radius_m"), metadata(entity, "verdict"))).collect();
+    let innermost = list(line, "zones").map(|zone| zone["radius_mm"].as_u64()).min().flatten();
+    let said = list(line, "zones").map(|zone| {
+        let verdict = match (zone["violated"].as_bool(), zone["radius_mm"].as_u64() == innermost) {
+            (Some(false), _) => "clear",
+            (_, true) => "stop",
+            (_, false) => "slow",
+        };
+        let radius_m = zone["radius_mm"].as_f64().map(|radius| format!("{:.3}", radius / 1e3));
+        (radius_m, Some(verdict.to_owned()))
+    });
+    circles == said.collect::<Vec<_>>()
+}
+
+fn status(told: &Value, line: &Value) -> bool {
+    let keys = ["state", "family", "model", "port", "damaged", "lost_on_line"];
+    told["name"] == line["sensor"]
+        && keys.iter().all(|key| told[*key] == line[*key])
+        && ["x_m", "y_m", "yaw_rad", "upside_down"].iter().all(|key| told["pose"][*key] == line["pose"][*key])
+}
+
+fn is_background(body: &[u8], line: &Value) -> bool {
+    let told = read(&LASER_SCAN, body).expect("a LaserScan");
+    let ranges = numbers(told.sequence("ranges").expect("ranges"));
+    let said = ranges_m(line, "unit_mm", 1e-3);
+    let far: Vec<_> = list(line, "far").filter_map(Value::as_u64).collect();
+    let is_range = |(beam, (range, said)): (usize, (&f64, &Option<f64>))| match said {
+        Some(said) => close(*range, *said),
+        None if far.contains(&(beam as u64)) => *range == f64::INFINITY,
+        None => range.is_nan(),
+    };
+    ranges.len() == said.len() && ranges.iter().zip(&said).enumerate().all(is_range)
+}
+
+fn compare(viewer: &Viewer, outcome: &Outcome) {
+    for channel in &viewer.channels {
+        let (topic, encoding) = (channel["topic"].as_str().expect("text"), &channel["encoding"]);
+        if encoding == "json" {
+            let schema: Value =
+                serde_json::from_str(channel["schema"].as_str().expect("text")).expect("JSON");
+            for (_, body) in viewer.of(topic) {
+                assert!(conforms(&object(body), &schema), "{topic}: {}", object(body));
+            }
+        } else {
+            assert_eq!((encoding, &channel["schemaEncoding"]), (&"cdr".into(), &"ros2msg".into()), "{topic}");
+        }
+    }
+    let scans = by_stamp(outcome, "scan");
+    each_is_a_line("scan", viewer.of("/front/scan"), &scans, is_scan);
+    let found = by_stamp(outcome, "foreground");
+    each_is_a_line("foreground", viewer.of("/front/foreground"), &found, |body, line| {
+        let stamp = line["wall_ns"].as_u64().expect("a stamp");
+        scans.get(&stamp).is_none_or(|scan| is_foreground(body, line, scan))
+    });
+    each_is_some_line(
+        "marks",
+        viewer.of("/marks"),
+        &outcome.of_class("marks"),
+        |told| !all(told, "spheres").is_empty(),
+        marks,
+    );
+    each_is_some_line(
+        "lines",
+        viewer.of("/lines"),
+        &outcome.of_class("lines"),
+        |told| !all(told, "lines").is_empty(),
+        lines,
+    );
+    each_is_some_line(
+        "zones",
+        viewer.of("/zones"),
+        &outcome.of_class("zones"),
+        |told| !all(told, "cylinders").is_empty(),
+        zones,
+    );
+    let is_heard = |told: &Value| told["state"] != "unheard";
+    each_is_some_line("status", viewer.of("/front/status"), &outcome.of_class("status"), is_heard, status);
+    let models = outcome.of_class("background");
+    for (_, body) in viewer.of("/front/background") {
+        assert!(models.iter().any(|line| is_background(body, line)), "background: no line says the same");
+    }
+    let verdicts = outcome.of_class("zones");
+    let robot: Vec<_> = viewer.of("/robot").iter().map(|(_, body)| object(body)).collect();
+    assert!(robot.iter().any(|told| told["hub"] == true), "{robot:?}");
+    for told in robot.iter().filter(|told| told["verdict"] != "unknown") {
+        assert!(verdicts.iter().any(|line| line["verdict"] == told["verdict"]), "{told}");
+    }
+    let told = read(&TF_MESSAGE, &viewer.of("/tf_static").last().expect("one").1).expect("a TFMessage");
+    let number = |path: &str| told.number(&format!("transforms.0.transform.{path}")).expect("a number");
+    assert!(close(number("translation.x"), PLACE.0) && close(number("translation.y"), PLACE.1));
+    assert!(close(number("rotation.z"), (PLACE.2 / 2.0).sin()));
+}
+
+#[test]
+fn every_channel_is_what_echo_says() {
+    let env = TestEnv::new();
+    let world = format!("--world={}", env.file("world", WORLD));
+    let _sensor = env.simulator(&["front"], &["--seed=71", "--baud=500000", &world]);
+    let places = [("x", PLACE.0), ("y", PLACE.1), ("yaw", PLACE.2)];
+    let places = places.map(|(key, value)| format!("--set=link.front.pose.{key}={value}"));
+    let _hub = env.hub(&[&[env.link("front")], &places[..]].concat());
+    env.await_info("front", |info| info["state"] == "streaming");
+    let topics = TOPICS.map(|topic| format!("front/{topic}"));
+    let mut echo = env.echo(&topics.each_ref().map(String::as_str));
+    let (_server, host) = web(&env, &[]);
+    let viewers = ["foxglove.sdk.v1", "foxglove.websocket.v1"].map(|protocol| {
+        let mut viewer = Viewer::new(&host, protocol);
+        viewer.listen(5);
+        viewer
+    });
+    // What they heard is among the lines before these.
+    let now = wall_ns();
+    for class in ["scan", "foreground", "marks", "zones", "lines"] {
+        echo.await_line(class, |line| line["class"] == class && line["wall_ns"].as_u64() > Some(now));
+    }
+    echo.await_line("status", is_class("status"));
+    let outcome = echo.end(INT);
+    viewers.iter().for_each(|viewer| compare(viewer, &outcome));
+}
