@@ -2,7 +2,7 @@
 //! would stay, so entities live for a second only.
 
 use ros::BASE_FRAME;
-use scene::{Scene, circles};
+use scene::{People, Scene, circles};
 use schema::Verdict;
 use serde::Serialize;
 use serde_json::json;
@@ -53,6 +53,33 @@ pub fn zones(scene: &Scene, wall_ns: u64) -> Vec<u8> {
         entities.push(entity);
     }
     update(&entities)
+}
+
+/// The people of one tracker with their numbers, and their tails; in the robot's frame, which is the map of the site for who
+/// follows a tracker.
+pub fn tracks(people: &People, wall_ns: u64) -> Vec<u8> {
+    let known = people.persons().iter().filter(|person| person.is_known());
+    let entities = known.map(|person| {
+        let (x, y) = person.place;
+        let mut entity = Entity::new(format!("person {}", person.id), wall_ns);
+        entity.tell("id", person.id.to_string());
+        entity.tell("state", person.state.name().to_owned());
+        entity.cylinders.push(json!({
+            "pose": at(x, y), "size": { "x": PERSON_M, "y": PERSON_M, "z": FLAT_M },
+            "bottom_scale": 1.0, "top_scale": 1.0, "color": PERSON,
+        }));
+        entity.lines.push(json!({
+            "type": LINE_STRIP, "pose": at(0.0, 0.0), "thickness": 2.0, "scale_invariant": true,
+            "points": person.tail().chain([(x, y)]).map(|(x, y)| json!({ "x": x, "y": y, "z": 0.0 })).collect::<Vec<_>>(),
+            "color": PERSON, "colors": [], "indices": [],
+        }));
+        entity.texts.push(json!({
+            "pose": at(x, y), "billboard": true, "font_size": 14.0, "scale_invariant": true,
+            "color": PERSON, "text": person.id.to_string(),
+        }));
+        entity
+    });
+    update(&entities.collect::<Vec<_>>())
 }
 
 /// The lines of the robot's sensors, from end to end, and where two meet.
@@ -171,7 +198,7 @@ const FLAT_M: f64 = 0.002;
 const MARK_M: f64 = 0.08;
 const CORNER_M: f64 = 0.06;
 
-/// Of a mark or a line.
+/// Of a person, a mark or a line.
 #[derive(Clone, Copy, Serialize)]
 struct Colour {
     r: f64,
@@ -181,4 +208,6 @@ struct Colour {
 }
 
 const LINE: Colour = Colour { r: 0.45, g: 0.33, b: 0.8, a: 1.0 };
+const PERSON: Colour = Colour { r: 0.2, g: 0.65, b: 0.3, a: 1.0 };
+const PERSON_M: f64 = 0.5;
 const MARK: Colour = Colour { r: 0.05, g: 0.55, b: 0.75, a: 1.0 };
