@@ -105,6 +105,18 @@ pub fn sensors(domain: &Domain) -> Result<Vec<String>, Failure> {
     Ok(sensors)
 }
 
+/// Returns those of [`sensors`] that have a link, here or on another machine: no tracker has one.
+///
+/// # Errors
+///
+/// As [`sensors`].
+pub fn links(domain: &Domain) -> Result<Vec<String>, Failure> {
+    let of_links = published(domain)?.into_iter().filter(|(_, topic)| !topic.is_of_trackers());
+    let mut links: Vec<String> = of_links.map(|(sensor, _)| sensor).collect();
+    links.dedup();
+    Ok(links)
+}
+
 /// Returns the sensors that have zones in `domain`, sorted, as [`sensors`]: those that a robot's verdict is made of.
 ///
 /// # Errors

@@ -9,8 +9,8 @@ use crate::testkit::{
 };
 use schema::datagram::{DatagramError, HEAD, WINDOW};
 use schema::{
-    Background, BackgroundHead, Early, Event, EventKind, Foreground, Line, Lines, Mark, Marks, Motion,
-    MotionMethod, Pose, Scan, ScanHead, State, Status, Topic, Track, TrackSensor, Tracks, Verdict, Zones,
+    Background, BackgroundHead, Early, Foreground, Line, Lines, Mark, Marks, Motion, MotionMethod, Scan,
+    ScanHead, State, Status, Topic, Verdict, Zones,
 };
 use serde_json::{Value, json};
 
@@ -80,19 +80,13 @@ fn every_topic_is_a_line() {
         sender.send(Topic::Lines, &lines);
         sender.send(Topic::Motion, &motion);
         sender.send(Topic::Early, &Early { verdict: Verdict::Stop as u8, beam: 8, ..Early::default() });
-        let mut tracks = Tracks::default();
-        tracks.push_sensor(TrackSensor::new("front", &Pose::default()));
-        tracks.push(Track { id: 9, x_m: 1.5, sensors: 1, ..Track::default() });
-        sender.send(Topic::Tracks, &tracks);
-        sender.send(Topic::Events, &Event::new(EventKind::Left, 9, Some("hall")));
         sender.send(Topic::Status, &status);
         program.await_line("the last one", is_class("status"));
         let outcome = program.end(INT);
         assert_eq!(outcome.code, Some(0), "{outcome}");
         let lines = outcome.lines();
-        for topic in Topic::ALL {
-            let class = if topic == Topic::Events { "event" } else { topic.name() };
-            let of_topic: Vec<_> = lines.iter().filter(|line| line["class"] == class).collect();
+        for topic in Topic::OF_LINKS {
+            let of_topic: Vec<_> = lines.iter().filter(|line| line["class"] == topic.name()).collect();
             let line = of_topic.last().unwrap_or_else(|| panic!("no {}: {outcome}", topic.name()));
             assert_eq!(line["sensor"], "front");
             assert_eq!(line["hub"], "5f3a12bc00d1e2f3");
@@ -111,12 +105,6 @@ fn every_topic_is_a_line() {
         let lines = line("lines");
         assert_eq!([&lines["lines"][0]["r_m"], &lines["noise_m"]], [&json!(1.5), &json!(0.25)]);
         assert_eq!([&line("motion")["dx_m"], &line("motion")["method"]], [&json!(0.5), &json!("both")]);
-        let track = &line("tracks")["tracks"][0];
-        assert_eq!(
-            [&track["id"], &track["x_m"], &track["sensors"]],
-            [&json!(9), &json!(1.5), &json!(["front"])]
-        );
-        assert_eq!([&line("event")["kind"], &line("event")["room"]], [&json!("left"), &json!("hall")]);
         assert_eq!((&line("early")["verdict"], &line("early")["beam"]), (&json!("stop"), &json!(8)));
         assert_eq!((&line("zones")["verdict"], &line("zones")["topic_seq"]), (&json!("slow"), &json!(1)));
         assert_eq!(

@@ -45,6 +45,7 @@ mod listen_crowd;
 mod listen_hostile;
 mod listen_hubs;
 mod listen_links;
+mod listen_people;
 mod listen_publish;
 mod listen_twins;
 mod logs;

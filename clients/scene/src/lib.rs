@@ -5,6 +5,7 @@
 
 mod circles;
 mod meter;
+mod people;
 mod read_out;
 mod scene;
 mod trail;
@@ -14,6 +15,7 @@ use schema::Pose;
 
 pub use circles::{Circle, circles};
 pub use meter::Meter;
+pub use people::{People, Person};
 pub use read_out::{Place, Reading};
 pub use scene::{Scene, Sensor, verdict};
 pub use trail::Trail;

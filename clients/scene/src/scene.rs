@@ -1,11 +1,12 @@
 //! What is known of the robot and its surroundings: the last sample of each topic of each sensor. Time is an argument.
 
 use schema::{
-    Background, Counter, Foreground, Header, Lines, Mark, Marks, Pose, Scan, State, Status, Verdict, Zones,
-    is_remote,
+    Background, Counter, Foreground, Header, Lines, Mark, Marks, Pose, Scan, State, Status, Tracks, Verdict,
+    Zones, is_remote,
 };
 
 use crate::meter::Meter;
+use crate::people::{People, Person};
 use crate::trail::Trail;
 use crate::trouble::{Trouble, trouble};
 use crate::{Point, point_m};
@@ -15,6 +16,8 @@ use crate::{Point, point_m};
 pub struct Scene {
     /// In the order in which they were named, or of the hub.
     pub sensors: Vec<Sensor>,
+    /// People of each tracker that is followed, by its name.
+    pub trackers: Vec<(String, People)>,
     /// A hub lives.
     pub hub_lives: bool,
     /// Its process; 0 unknown, or on another machine.
@@ -30,8 +33,10 @@ pub struct Sensor {
     pub name: String,
     /// How its link is, as it was said last.
     pub status: Option<Status>,
-    /// Where it sits; at the robot's centre as long as that is not told.
+    /// Where it sits; at the robot's centre as long as that is not told. Where a tracker is followed, in the map of its site.
     pub pose: Pose,
+    /// A tracker has told where it sits.
+    is_in_map: bool,
     /// The last scan, as long as it is new.
     pub scan: Option<Box<Scan>>,
     /// What stands before the background.
@@ -81,6 +86,26 @@ impl Scene {
         self.sensor(name)
     }
 
+    /// The tracker called `name` said at `now_ns` who is where, and so where its sensors are: what these see is shown in its map
+    /// from now on, as long as no other tracker says otherwise.
+    pub fn take_tracks(&mut self, name: &str, tracks: &Tracks, now_ns: u64) {
+        let at = self.trackers.iter().position(|(known, _)| known == name).unwrap_or_else(|| {
+            self.trackers.push((name.to_owned(), People::default()));
+            self.trackers.len() - 1
+        });
+        self.trackers[at].1.take(tracks, now_ns);
+        for told in tracks.sensors() {
+            if let Some(sensor) = self.sensors.iter_mut().find(|sensor| sensor.name == told.name()) {
+                (sensor.pose, sensor.is_in_map) = (told.pose(), true);
+            }
+        }
+    }
+
+    /// Returns everybody whom any tracker knows.
+    pub fn people(&self) -> impl Iterator<Item = &Person> {
+        self.trackers.iter().flat_map(|(_, people)| people.persons())
+    }
+
     /// The sensors of the robot, or if there are none, all; with their numbers from 0. Those of other machines sit on other
     /// robots.
     pub fn robot(&self) -> impl Iterator<Item = (usize, &Sensor)> {
@@ -100,6 +125,9 @@ impl Scene {
             }
             any |= sensor.trail.age(now_ns);
         }
+        for (_, people) in &mut self.trackers {
+            any |= people.age(now_ns);
+        }
         any
     }
 
@@ -111,10 +139,11 @@ impl Scene {
     /// The hub is gone: all of its data is discarded except for the background, which is only drawn.
     pub fn hub_gone(&mut self) {
         (self.hub_lives, self.hub_pid, self.hub_percent) = (false, 0, None);
+        self.trackers.clear();
         for sensor in &mut self.sensors {
             let background = sensor.background.take();
-            *sensor =
-                Sensor { pose: sensor.pose, background, lost: sensor.lost, ..Sensor::new(&sensor.name) };
+            let Sensor { pose, is_in_map, lost, .. } = *sensor;
+            *sensor = Sensor { pose, is_in_map, background, lost, ..Sensor::new(&sensor.name) };
         }
     }
 }
@@ -125,6 +154,7 @@ impl Sensor {
             name: name.to_owned(),
             status: None,
             pose: Pose::default(),
+            is_in_map: false,
             scan: None,
             foreground: None,
             trail: Trail::default(),
@@ -179,7 +209,10 @@ impl Sensor {
 
     /// Takes how its link is.
     pub fn take_status(&mut self, status: &Status) {
-        (self.status, self.pose) = (Some(*status), status.pose);
+        self.status = Some(*status);
+        if !self.is_in_map {
+            self.pose = status.pose;
+        }
     }
 
     /// What its link is doing, in a word.
@@ -263,7 +296,7 @@ const OLD_NS: u64 = 1_000_000_000;
 #[cfg(test)]
 mod tests {
     use super::*;
-    use schema::{ForegroundHead, ScanHead};
+    use schema::{ForegroundHead, ScanHead, Track, TrackSensor};
 
     #[test]
     fn old_scans_are_forgotten_and_a_hub_that_goes_leaves_nothing_to_act_on() {
@@ -297,6 +330,25 @@ mod tests {
         assert_eq!((sensor.shade(0), sensor.shade(1), sensor.shade(9)), (0.0, 1.0, 1.0), "none are known");
         sensor.brightest = 400.0;
         assert_eq!((sensor.shade(100), sensor.shade(800)), (0.5, 1.0));
+    }
+
+    #[test]
+    fn who_follows_a_tracker_sees_its_sensors_in_its_map() {
+        let mut scene = Scene::default();
+        scene.sensor("hall");
+        let pose = Pose { x_m: 4.0, y_m: 1.0, yaw_rad: 0.5, ..Pose::default() };
+        let mut tracks = Tracks::default();
+        tracks.push_sensor(TrackSensor::new("hall", &pose));
+        tracks.push(Track { id: 5, x_m: 3.0, ..Track::default() });
+        scene.take_tracks("house", &tracks, 1);
+        let status = Status { pose: Pose { x_m: 0.3, ..Pose::default() }, ..Status::default() };
+        scene.sensor("hall").take_status(&status);
+        assert_eq!(scene.sensors[0].pose, pose, "its place on a robot is another one");
+        assert!(scene.people().map(|person| (person.id, person.place)).eq([(5, (3.0, 0.0))]));
+        assert_eq!(scene.sensors.len(), 1, "a tracker is no sensor");
+        scene.sensor("rear").take_status(&status);
+        assert_eq!(scene.sensors[1].pose, status.pose);
+        assert!(scene.age(2_000_000_000) && scene.people().count() == 0);
     }
 
     #[test]

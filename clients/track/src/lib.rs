@@ -13,12 +13,13 @@ mod order;
 mod passage;
 mod person;
 mod picture;
+mod poses;
 mod sight;
 pub mod site;
 mod tracker;
 
 pub use order::{Counts, People};
-pub use picture::{Event, Kind, Picture, Track};
+pub use picture::{Event, Kind, Misplaced, Picture, Track};
 pub use sight::LEGS;
 pub use site::Site;
 pub use tracker::{PERSONS, PICTURE_NS};

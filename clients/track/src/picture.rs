@@ -60,6 +60,18 @@ pub struct Event {
     pub kind: Kind,
 }
 
+/// A sensor that is not where the site says, as far as another one tells that sees the same people. From now on it is taken
+/// to be where that one says.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Misplaced {
+    /// Number of the sensor in the site.
+    pub sensor: usize,
+    /// Of the earlier one that it was compared with.
+    pub other: usize,
+    /// How far the people that it sees are beside those that the other sees, in metres in the map.
+    pub off: Point,
+}
+
 /// All persons at an instant, and what happened since the last picture.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Picture {
@@ -69,6 +81,8 @@ pub struct Picture {
     pub tracks: Vec<Track>,
     /// In their order.
     pub events: Vec<Event>,
+    /// Sensors that were found not to be where the site says, since the last picture.
+    pub misplaced: Vec<Misplaced>,
 }
 
 impl Picture {

@@ -108,6 +108,11 @@ impl Sight {
         self.find_legs();
     }
 
+    /// All that it sees is off by so much: so is its place.
+    pub(crate) fn shift(&mut self, off: Point) {
+        self.sensor.place = minus(self.sensor.place, off);
+    }
+
     pub(crate) fn legs(&self) -> &[Leg] {
         &self.legs
     }

@@ -9,7 +9,8 @@ use crate::filter::Side;
 use crate::geometry::{Point, distance, distance_to_segment, minus};
 use crate::passage::LONGEST_S;
 use crate::person::{Life, Person};
-use crate::picture::{Event, Kind, Picture, Track};
+use crate::picture::{Event, Kind, Misplaced, Picture, Track};
+use crate::poses::Poses;
 use crate::sight::{Leg, Seen, Sight};
 use crate::site::Site;
 
@@ -35,6 +36,8 @@ const GONE_TENTATIVE_S: f64 = 0.25;
 const FORGOTTEN_NS: u64 = 400_000_000;
 /// Who is hidden for so long is.
 const HIDDEN_NS: u64 = 120_000_000_000;
+/// Scans that are not farther apart show the same.
+const AT_ONCE_NS: u64 = 45_000_000;
 /// Two who are nearer, and of whom never two pairs of legs are seen, are one.
 const SAME_M: f64 = 0.45;
 
@@ -50,6 +53,8 @@ pub(crate) struct Tracker {
     edges: Vec<Edge>,
     pairs: Vec<(usize, usize)>,
     scan_ns: Vec<u64>,
+    poses: Poses,
+    misplaced: Vec<Misplaced>,
     /// Legs that were seen where a person walks: how much later than expected, per sensor, summed.
     pub(crate) lateness: Vec<(f64, f64)>,
 }
@@ -66,6 +71,8 @@ impl Tracker {
             edges: Vec::new(),
             pairs: Vec::new(),
             scan_ns: vec![0; site.sensors.len()],
+            poses: Poses::new(site.sensors.len()),
+            misplaced: Vec::new(),
             lateness: vec![(0.0, 0.0); site.sensors.len()],
             site,
         }
@@ -76,6 +83,7 @@ impl Tracker {
         self.sights[sensor].take(scan, foreground);
         let since_s = (at_ns.saturating_sub(self.scan_ns[sensor]) as f64 * 1e-9).min(0.1);
         self.scan_ns[sensor] = at_ns;
+        self.compare_poses(sensor, at_ns);
         self.walk(at_ns);
         let mut pairs = std::mem::take(&mut self.pairs);
         self.associate(sensor, &mut pairs);
@@ -86,6 +94,20 @@ impl Tracker {
         self.merge(at_ns);
         self.pass(at_ns);
         self.bury(at_ns);
+    }
+
+    /// A sensor that sees everybody beside where others see them is taken to sit beside its place.
+    fn compare_poses(&mut self, sensor: usize, at_ns: u64) {
+        for other in 0..self.sights.len() {
+            if other == sensor || at_ns.saturating_sub(self.scan_ns[other]) > AT_ONCE_NS {
+                continue;
+            }
+            let legs = |sensor: usize| (sensor, self.sights[sensor].legs());
+            if let Some(misplaced) = self.poses.take(legs(sensor), legs(other)) {
+                self.sights[misplaced.sensor].shift(misplaced.off);
+                self.misplaced.push(misplaced);
+            }
+        }
     }
 
     /// Moves everybody to `at_ns`; nobody who is not seen walks through a wall.
@@ -337,5 +359,7 @@ impl Tracker {
         picture.tracks.sort_unstable_by_key(|track| track.id);
         picture.events.clear();
         picture.events.append(&mut self.events);
+        picture.misplaced.clear();
+        picture.misplaced.append(&mut self.misplaced);
     }
 }

@@ -60,7 +60,11 @@ fn sent(count: usize, seconds: u64) -> Vec<Sent> {
 }
 
 fn pictures<'a>(sent: impl Iterator<Item = &'a Sent>) -> (Vec<Picture>, People) {
-    let mut people = People::new(site(), DELAY_NS);
+    pictures_of(site(), sent)
+}
+
+fn pictures_of<'a>(site: Site, sent: impl Iterator<Item = &'a Sent>) -> (Vec<Picture>, People) {
+    let mut people = People::new(site, DELAY_NS);
     let mut pictures = Vec::new();
     for Sent { sensor, wall_ns, scan, foreground } in sent {
         people.take(*sensor, *wall_ns, scan, foreground, |picture| pictures.push(picture.clone()));
@@ -136,4 +140,44 @@ fn a_clock_that_is_off_is_found_by_those_whom_both_see() {
     let (_, people) = pictures(sent.iter());
     assert_eq!(people.offset_s(0), 0.0);
     assert!((people.offset_s(1) - 0.04).abs() < 0.01, "{}", people.offset_s(1));
+}
+
+#[test]
+fn a_sensor_that_sits_beside_its_place_is_told_by_those_whom_two_see() {
+    let sent = sent(3, 60);
+    let told = |pictures: &[Picture]| -> Vec<track::Misplaced> {
+        pictures.iter().flat_map(|picture| picture.misplaced.iter().copied()).collect()
+    };
+    let (right, _) = pictures(sent.iter());
+    assert_eq!(told(&right), [], "all are where they should be");
+    let mut wrong = site();
+    wrong.sensors[1].place[0] -= 0.4;
+    wrong.sensors[1].place[1] += 0.3;
+    let (shown, _) = pictures_of(wrong, sent.iter());
+    let told = told(&shown);
+    assert_eq!(told.len(), 1, "{told:?}");
+    assert_eq!((told[0].sensor, told[0].other), (1, 0));
+    assert!((told[0].off[0] + 0.4).abs() < 0.1 && (told[0].off[1] - 0.3).abs() < 0.1, "{told:?}");
+    // From then on nobody is seen twice.
+    let since = shown.iter().position(|picture| !picture.misplaced.is_empty()).expect("it is told");
+    let is_known = |track: &&track::Track| matches!(track.state, TrackState::Confirmed | TrackState::Hidden);
+    let most =
+        shown[since + 100..].iter().map(|picture| picture.tracks.iter().filter(is_known).count()).max();
+    assert!(most <= Some(4), "three people, and one who is not yet joined: {most:?}");
+}
+
+#[test]
+fn a_sensor_that_comes_back_sees_those_who_are_there_and_nobody_else() {
+    let sent = sent(3, 60);
+    let is_away = |one: &&Sent| one.sensor < 2 && (20_000..30_000).contains(&((one.wall_ns - BEGIN_NS) / MS));
+    let (pictures, _) = pictures(sent.iter().filter(|one| !is_away(one)));
+    let is_known = |track: &&track::Track| matches!(track.state, TrackState::Confirmed | TrackState::Hidden);
+    let most = pictures.iter().map(|picture| picture.tracks.iter().filter(is_known).count()).max();
+    assert!(most <= Some(4), "three people, and one who is not yet joined: {most:?}");
+    // While nobody looks, who is there gets uncertain.
+    let at = |second: u64| {
+        let picture = pictures.iter().find(|picture| picture.wall_ns >= BEGIN_NS + 1_000 * MS * second);
+        picture.expect("a picture").tracks.iter().map(|track| track.covariance[0]).fold(0.0, f64::max)
+    };
+    assert!(at(29) > 0.05 && at(29) > 4.0 * at(19), "{} and {}", at(19), at(29));
 }

@@ -31,6 +31,16 @@ pub(crate) struct Called {
 /// When the sensors of a hub that came are called: it makes their topics one after the other.
 const CALLS: [Duration; 4] =
     [Duration::ZERO, Duration::from_millis(200), Duration::from_secs(1), Duration::from_secs(5)];
+/// And so often from then on: a tracker, or a sensor of another machine, comes when it likes.
+const LATER: Duration = Duration::from_secs(10);
+
+/// How long after the hub came it is called when it was called so often.
+fn due(calls: usize) -> Duration {
+    let last = CALLS[CALLS.len() - 1];
+    let more = u32::try_from((calls + 1).saturating_sub(CALLS.len())).unwrap_or(u32::MAX);
+    CALLS.get(calls).copied().unwrap_or_else(|| last.saturating_add(LATER.saturating_mul(more)))
+}
+
 /// So often an answer is looked for.
 const LOOK_EVERY: Duration = Duration::from_millis(5);
 
@@ -79,7 +89,7 @@ impl Discovery {
         }
         let Some((came, calls)) = &mut self.hub else { return Ok(None) };
         let age = now - *came;
-        if CALLS.get(*calls).is_some_and(|after| age >= *after) {
+        if age >= due(*calls) {
             let domain = domain.clone();
             self.call = BackgroundTask::begin(move || ipc::published(&domain)).map(|task| (task, age));
             *calls += usize::from(self.call.is_some());
@@ -105,6 +115,12 @@ mod tests {
         assert_eq!(called.sensors, ["front", "house"]);
         assert!(called.may_have("front", Topic::Marks) && !called.may_have("front", Topic::Events));
         assert!(called.may_have("house", Topic::Events) && !called.may_have("house", Topic::Scan));
+    }
+
+    #[test]
+    fn it_is_called_soon_and_then_again_and_again() {
+        let due: Vec<u64> = (0..6).map(|calls| due(calls).as_secs()).collect();
+        assert_eq!(due, [0, 0, 1, 5, 15, 25]);
     }
 
     #[test]

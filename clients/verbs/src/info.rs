@@ -52,7 +52,7 @@ pub fn info(options: &InfoOptions, out: &mut dyn Write, stop: &AtomicBool) -> Re
 fn wanted(sensor: Option<&str>, domain: &Domain) -> Result<Vec<String>, Failure> {
     let give_up_at = Instant::now() + GRACE;
     loop {
-        let sensors = ipc::sensors(domain)?;
+        let sensors = ipc::links(domain)?;
         match sensor {
             None => return Ok(sensors),
             Some(sensor) if sensors.iter().any(|it| it == sensor) => return Ok(vec![sensor.to_owned()]),

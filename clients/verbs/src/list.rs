@@ -32,7 +32,7 @@ pub fn list(options: &ListOptions, out: &mut dyn Write, stop: &AtomicBool) -> Re
     for sensor in &sensors {
         of_sensor(&node, sensor, &mut lines)?;
     }
-    for (sensor, status) in statuses(&domain, &sensors, stop)? {
+    for (sensor, status) in statuses(&domain, &ipc::links(&domain)?, stop)? {
         for line in
             lines.iter_mut().filter(|line| line.sensor == sensor && line.topic.row().pace == Pace::Scan)
         {

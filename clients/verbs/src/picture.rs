@@ -1,17 +1,17 @@
 //! What a picture is made of, and how it comes into a scene: the same for the terminal and the browser. Refuses to know how
 //! it is drawn.
 
-use scanhub_client::clock;
 use scanhub_client::streams::Sample;
+use scanhub_client::{clock, live_topics};
 use scene::Scene;
-use schema::Topic;
+use schema::{Domain, Topic};
 
 use crate::follow::Notice;
 use crate::names::TopicName;
 
 /// What is followed. [`Topic::Lines`] costs the hub something as soon as somebody follows it, so that is only done while
 /// they are looked at.
-pub(crate) const TOPICS: [Topic; 7] = [
+pub(crate) const TOPICS: [Topic; 8] = [
     Topic::Scan,
     Topic::Marks,
     Topic::Zones,
@@ -19,18 +19,37 @@ pub(crate) const TOPICS: [Topic; 7] = [
     Topic::Background,
     Topic::Lines,
     Topic::Status,
+    Topic::Tracks,
 ];
 
-/// What is followed of `sensors`; of all of a hub if there are none.
-pub(crate) fn followed(sensors: &[String]) -> (Vec<TopicName>, &'static [Topic]) {
-    let named = |sensor: &String| TOPICS.map(|topic| TopicName { sensor: sensor.clone(), topic });
+/// What is followed of `sensors`; of all of a hub, and all trackers, if there are none. Who names one that is a tracker, in the
+/// first live one of `places`, wants to see the sensors, too.
+pub(crate) fn followed(sensors: &[String], places: &[Domain]) -> (Vec<TopicName>, Vec<Topic>) {
+    let live = live_topics(places);
+    let is_tracker = |sensor: &str| live.contains(&format!("{sensor}/{}", Topic::Tracks.name()));
+    let named = |sensor: &String| {
+        let of = |topic: &Topic| topic.is_of_trackers() == is_tracker(sensor);
+        let name = |topic| TopicName { sensor: sensor.clone(), topic };
+        TOPICS.into_iter().filter(of).map(name).collect::<Vec<_>>()
+    };
     let names: Vec<_> = sensors.iter().flat_map(named).collect();
-    let topics: &[Topic] = if names.is_empty() { &TOPICS } else { &[] };
-    (names, topics)
+    let has_tracker = names.iter().any(|name| name.topic.is_of_trackers());
+    let of_all = |topic: &Topic| names.is_empty() || has_tracker && !topic.is_of_trackers();
+    (names.clone(), TOPICS.into_iter().filter(of_all).collect())
+}
+
+/// A topic of `name` will be followed: of a link its sensor is there from now on.
+pub(crate) fn begin(scene: &mut Scene, name: &TopicName) {
+    if !name.topic.is_of_trackers() {
+        scene.sensor(&name.sensor);
+    }
 }
 
 /// Takes a `sample` of `name`.
 pub(crate) fn take(scene: &mut Scene, name: &TopicName, sample: &Sample) {
+    if let Sample::Tracks(tracks) = sample {
+        return scene.take_tracks(&name.sensor, tracks, clock::now_ns());
+    }
     let sensor = scene.heard(&name.sensor, sample.header());
     match sample {
         Sample::Scan(scan) => sensor.take_scan(scan.header(), scan, clock::now_ns()),

@@ -7,7 +7,7 @@ use std::io::Write;
 use std::sync::atomic::AtomicBool;
 use std::time::{Duration, Instant};
 
-use ::track::{Kind as EventKind, People, Picture, Site};
+use ::track::{Kind as EventKind, Misplaced, People, Picture, Site};
 use publish::Samples;
 use scanhub_client::streams::Sample;
 use schema::{Domain, Failure, Foreground, Header, Kind, Scan, Topic};
@@ -74,8 +74,8 @@ pub fn track(
             appeared: 0,
             samples: Samples::new(name),
             out: Output::new(out),
+            notes: Output::new(notes),
         },
-        notes: Output::new(notes),
         missed: 0,
         is_there: false,
         flags: 0,
@@ -118,7 +118,6 @@ struct Verb<'a> {
     /// By the number of the sensor in the site.
     halves: Vec<Half>,
     teller: Teller<'a>,
-    notes: Output<'a>,
     missed: u64,
     /// A topic of a sensor was there.
     is_there: bool,
@@ -186,7 +185,7 @@ impl Sink for Verb<'_> {
         }
         match self.options.json {
             true => json::notices(&mut self.teller.out, names, notice),
-            false => self.notes.line(|line| text::notice(line, names, notice)),
+            false => self.teller.notes.line(|line| text::notice(line, names, notice)),
         }
     }
 
@@ -219,17 +218,25 @@ struct Teller<'a> {
     appeared: u64,
     samples: Samples,
     out: Output<'a>,
+    notes: Output<'a>,
 }
 
 impl Teller<'_> {
     fn tell(&mut self, picture: &Picture, flags: u8) -> Result<(), End> {
-        let Teller { options, name, counted, passed, appeared, samples, out } = self;
+        let Teller { options, name, counted, passed, appeared, samples, out, notes } = self;
         let TrackOptions { site, json: is_json, .. } = options;
         samples.take(picture, site, flags);
         let tells_all = counted.is_empty();
         if tells_all && *is_json {
             let (header, tracks) = samples.tracks();
             out.json(&json::tracks(name, header, tracks))?;
+        }
+        for &Misplaced { sensor, other, off } in &picture.misplaced {
+            let [sensor, other] = [sensor, other].map(|number| site.sensors[number].name.as_str());
+            match is_json {
+                true => out.json(&lines::misplaced(name, picture.wall_ns, sensor, other, off))?,
+                false => notes.line(|line| lines::misplaced_text(line, sensor, other, off))?,
+            }
         }
         for (event, (header, payload)) in picture.events.iter().zip(samples.events()) {
             match (tells_all, is_json) {

@@ -54,7 +54,7 @@ pub struct WatchOptions {
 /// else as [`echo`](crate::echo()).
 pub fn watch(options: &WatchOptions, out: &mut dyn Write, stop: &AtomicBool) -> Result<(), Failure> {
     options.sensors.iter().try_for_each(|sensor| as_word(check_followed(sensor)))?;
-    let (names, topics) = picture::followed(&options.sensors);
+    let (names, topics) = picture::followed(&options.sensors, &options.places);
     let end = Screen::new(out).and_then(|screen| {
         let mut watcher = Watcher {
             options,
@@ -68,7 +68,7 @@ pub fn watch(options: &WatchOptions, out: &mut dyn Write, stop: &AtomicBool) -> 
             draw_at: Instant::now(),
             news_until: None,
         };
-        follow(&names, topics, &options.places, &options.bounds, stop, &mut watcher)
+        follow(&names, &topics, &options.places, &options.bounds, stop, &mut watcher)
     });
     quiet(end)
 }
@@ -157,7 +157,7 @@ impl Watcher<'_> {
 
 impl Sink for Watcher<'_> {
     fn begin(&mut self, name: &TopicName) {
-        self.scene.sensor(&name.sensor);
+        picture::begin(&mut self.scene, name);
     }
 
     fn sample(&mut self, name: &TopicName, sample: &Sample) -> Result<(), End> {

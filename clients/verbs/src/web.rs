@@ -73,7 +73,7 @@ pub fn web(
     if let Err(end) = told::ready(&mut output, &url, options.json) {
         return quiet(Err(end));
     }
-    let (names, topics) = followed(&options.sensors);
+    let (names, topics) = followed(&options.sensors, &options.places);
     let over = AtomicBool::new(false);
     thread::scope(|scope| {
         let served = thread::Builder::new()
@@ -86,7 +86,7 @@ pub fn web(
             .map_err(|error| Failure::new(Kind::Short, format!("no thread: {error}"), ""))?;
         let closing = Close { over: &over, board: &board };
         let mut feeder = Feeder::new(options, player, &board, events, output);
-        let end = follow(&names, topics, &options.places, &options.bounds, stop, &mut feeder);
+        let end = follow(&names, &topics, &options.places, &options.bounds, stop, &mut feeder);
         drop(closing);
         match served.join() {
             Ok(Ok(())) => quiet(end),

@@ -11,7 +11,7 @@ use serde::Serialize;
 use crate::board::Channel;
 use crate::playback::Progress;
 
-pub use scene_update::{lines, marks, zones};
+pub use scene_update::{lines, marks, tracks, zones};
 
 /// Scans of a sensor, as `sensor_msgs/msg/LaserScan`.
 pub fn scan_channel(sensor: &str) -> Channel {
@@ -46,6 +46,11 @@ pub fn marks_channel() -> Channel {
 /// The straight surfaces that the sensors see, and their corners, as `foxglove.SceneUpdate`.
 pub fn lines_channel() -> Channel {
     scene_update::channel("/lines")
+}
+
+/// The people of `tracker` and their tails, as `foxglove.SceneUpdate`.
+pub fn tracks_channel(tracker: &str) -> Channel {
+    scene_update::channel(&beside_scan(tracker, "tracks"))
 }
 
 /// The verdict and the hub, see [`robot`].
@@ -279,6 +284,7 @@ mod tests {
             (zones_channel(), zones(&scene, 1)),
             (marks_channel(), marks(&scene, 1)),
             (lines_channel(), lines(&scene, 1)),
+            (tracks_channel("house"), tracks(&scene::People::default(), 1)),
             (replay_channel(), replay(&progress)),
         ];
         for (channel, message) in pairs {

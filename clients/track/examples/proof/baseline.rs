@@ -58,7 +58,7 @@ impl Nearest {
                 age_s: 0.0,
                 score: 1.0,
             });
-            pictures.push(Picture { wall_ns: at_ns, tracks: tracks.collect(), events: Vec::new() });
+            pictures.push(Picture { wall_ns: at_ns, tracks: tracks.collect(), ..Picture::default() });
         }
     }
 }

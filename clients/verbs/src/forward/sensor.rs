@@ -31,7 +31,8 @@ impl Sensor {
     ) -> Sensor {
         let every = |topic| selection.every(name, topic).filter(|_| may_have(topic));
         let position = carrier.follow(name, &every);
-        let wanted = Topic::ALL.into_iter().filter(|topic| carrier.wants(position, *topic));
+        let wanted =
+            Topic::ALL.into_iter().filter(|topic| may_have(*topic) && carrier.wants(position, *topic));
         let sources = wanted.map(|topic| Source::new(name, topic)).collect();
         Sensor { name: name.to_owned(), position, sources }
     }

@@ -23,6 +23,37 @@ pub(super) fn count<'a>(
     Line { class: "count", sensor, wall_ns, door: Passed::of((door, passed)) }
 }
 
+/// Class `misplaced`.
+pub(super) fn misplaced<'a>(
+    tracker: &'a str,
+    wall_ns: u64,
+    name: &'a str,
+    other: &'a str,
+    off: [f64; 2],
+) -> impl Serialize + 'a {
+    #[derive(Serialize)]
+    struct Line<'a> {
+        class: &'static str,
+        sensor: &'a str,
+        wall_ns: u64,
+        name: &'a str,
+        other: &'a str,
+        dx_m: f64,
+        dy_m: f64,
+    }
+    let [dx_m, dy_m] = off.map(|value| (100.0 * value).round() / 100.0);
+    Line { class: "misplaced", sensor: tracker, wall_ns, name, other, dx_m, dy_m }
+}
+
+pub(super) fn misplaced_text(line: &mut Vec<u8>, name: &str, other: &str, off: [f64; 2]) -> io::Result<()> {
+    let [x, y] = off;
+    write!(
+        line,
+        "{name} sees people ({x:.2}, {y:.2}) m beside where {other} sees them: correct one of their poses "
+    )?;
+    write!(line, "in the site file; until then {name} is taken to be where {other} says")
+}
+
 #[derive(Serialize)]
 struct Passed<'a> {
     door: &'a str,

@@ -91,6 +91,9 @@ struct Layers {
     marks: Dots,
     /// Sensors by their numbers from 1.
     sensors: Vec<(f64, f64, String)>,
+    /// Where people were, and where they are, by their numbers.
+    tails: Dots,
+    people: Vec<(f64, f64, String)>,
 }
 
 struct Circle {
@@ -119,7 +122,16 @@ impl Layers {
             pointer: view.pointer_m.map(turned),
             marks: Vec::new(),
             sensors: Vec::new(),
+            tails: Vec::new(),
+            people: Vec::new(),
         };
+        for person in scene.people().filter(|person| person.is_known()) {
+            if view.trails {
+                layers.tails.extend(person.tail().map(turned));
+            }
+            let (x, y) = turned(person.place);
+            layers.people.push((x, y, format!("#{}", person.id)));
+        }
         for (number, sensor) in shown {
             for point in sensor.points() {
                 let shade = point.intensity.filter(|_| view.intensity).map(|value| sensor.shade(value));
@@ -169,14 +181,24 @@ impl Layers {
         };
         [&mut self.marks, &mut self.corners, &mut self.grid].into_iter().for_each(snap);
         if !self.colours {
-            let signs = [&mut self.background, &mut self.foreground, &mut self.trails, &mut self.axes];
+            let signs = [
+                &mut self.background,
+                &mut self.foreground,
+                &mut self.trails,
+                &mut self.tails,
+                &mut self.axes,
+            ];
             signs.into_iter().for_each(snap);
         }
         self.pointer = self.pointer.filter(|at| grid.has(*at)).map(|at| grid.cell(at));
         self.robot = self.robot.filter(|at| grid.has(*at)).map(|at| grid.cell(at));
-        self.sensors.retain(|(x, y, _)| grid.has((*x, *y)));
+        for labels in [&mut self.sensors, &mut self.people] {
+            labels.retain(|(x, y, _)| grid.has((*x, *y)));
+        }
         let labels = self.circles.iter_mut().filter_map(|circle| circle.label.as_mut());
-        for (x, y, _) in labels.filter(|(x, y, _)| grid.has((*x, *y))).chain(&mut self.sensors) {
+        for (x, y, _) in
+            labels.filter(|(x, y, _)| grid.has((*x, *y))).chain(&mut self.sensors).chain(&mut self.people)
+        {
             (*x, *y) = grid.cell((*x, *y));
         }
     }
@@ -204,6 +226,7 @@ impl Layers {
             context.marker(Marker::Custom(','));
         }
         draw(context, &self.trails, colour(Color::Magenta));
+        draw(context, &self.tails, colour(Color::LightGreen));
         if !self.colours {
             context.marker(Marker::Custom('o'));
         }
@@ -224,6 +247,9 @@ impl Layers {
         }
         for (x, y, number) in &self.sensors {
             print(*x, *y, number, Color::Reset);
+        }
+        for (x, y, number) in &self.people {
+            print(*x, *y, number, colour(Color::LightGreen));
         }
         if let Some((x, y)) = self.pointer {
             print(x, y, "X", Color::Reset);

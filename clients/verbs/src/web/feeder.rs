@@ -41,6 +41,8 @@ pub(super) struct Feeder<'a> {
     output: Output<'a>,
     scene: Scene,
     channels: Vec<Channels>,
+    /// Of each tracker.
+    tracks: Vec<(String, ChannelId)>,
     transforms: ChannelId,
     zones: ChannelId,
     marks: ChannelId,
@@ -84,6 +86,7 @@ impl<'a> Feeder<'a> {
             output,
             scene: Scene::default(),
             channels: Vec::new(),
+            tracks: Vec::new(),
             robot: board.channel(messages::robot_channel()),
             zones: board.channel(messages::zones_channel()),
             marks: board.channel(messages::marks_channel()),
@@ -120,6 +123,23 @@ impl<'a> Feeder<'a> {
             self.channels.len() - 1
         });
         &mut self.channels[at]
+    }
+
+    /// The channel of the people of `tracker`, which is there from now on.
+    fn tracks_of(&mut self, tracker: &str) -> ChannelId {
+        let at = self.tracks.iter().position(|(known, _)| known == tracker).unwrap_or_else(|| {
+            self.tracks.push((tracker.to_owned(), self.board.channel(messages::tracks_channel(tracker))));
+            self.tracks.len() - 1
+        });
+        self.tracks[at].1
+    }
+
+    fn put_tracks(&mut self, tracker: &str, wall_ns: u64) {
+        let channel = self.tracks_of(tracker);
+        let people = self.scene.trackers.iter().find(|(name, _)| name == tracker);
+        if let Some((_, people)) = people.filter(|_| self.board.is_wanted(channel)) {
+            self.board.put(channel, wall_ns, &messages::tracks(people, wall_ns));
+        }
     }
 
     fn put_scan(&mut self, name: &TopicName, scan: &scanhub_client::Received<schema::Scan>) {
@@ -265,12 +285,24 @@ impl<'a> Feeder<'a> {
 
 impl Sink for Feeder<'_> {
     fn begin(&mut self, name: &TopicName) {
-        self.scene.sensor(&name.sensor);
-        self.of(&name.sensor);
+        picture::begin(&mut self.scene, name);
+        if name.topic.is_of_trackers() {
+            self.tracks_of(&name.sensor);
+        } else {
+            self.of(&name.sensor);
+        }
         self.poses_are_new = true;
     }
 
     fn sample(&mut self, name: &TopicName, sample: &Sample) -> Result<(), End> {
+        if let Sample::Tracks(tracks) = sample {
+            let poses = |scene: &Scene| scene.sensors.iter().map(|sensor| sensor.pose).collect::<Vec<_>>();
+            let before = poses(&self.scene);
+            picture::take(&mut self.scene, name, sample);
+            self.poses_are_new |= poses(&self.scene) != before;
+            self.put_tracks(&name.sensor, tracks.header().wall_ns);
+            return Ok(());
+        }
         let pose = self.scene.sensor(&name.sensor).pose;
         picture::take(&mut self.scene, name, sample);
         match sample {
@@ -286,8 +318,8 @@ impl Sink for Feeder<'_> {
                 self.put_foreground(name);
             }
             Sample::Background(model) => self.put_background(name, model.header().wall_ns, model),
-            Sample::Status(status) => {
-                self.poses_are_new |= pose != status.pose;
+            Sample::Status(_) => {
+                self.poses_are_new |= pose != self.scene.sensor(&name.sensor).pose;
                 self.status_at = Instant::now();
             }
             _ => {}

@@ -2,7 +2,7 @@
 //! would stay, so entities live for a second only.
 
 use ros::BASE_FRAME;
-use scene::{Scene, circles};
+use scene::{People, Scene, circles};
 use schema::Verdict;
 use serde::Serialize;
 
@@ -19,25 +19,12 @@ pub fn zones(scene: &Scene, wall_ns: u64) -> Vec<u8> {
     let around = circles(scene.robot().map(|(_, sensor)| sensor));
     let mut entities = Vec::new();
     for circle in &around {
-        let across = 2.0 * circle.radius_m;
         let mut entity = Entity::new(format!("zone {:.3}", circle.radius_m), wall_ns);
         entity.tell("radius_m", format!("{:.3}", circle.radius_m));
         entity.tell("verdict", circle.verdict.name().to_owned());
-        entity.cylinders.push(Cylinder {
-            pose: at(0.0, 0.0),
-            size: Vector { x: across, y: across, z: FLAT_M },
-            bottom_scale: 1.0,
-            top_scale: 1.0,
-            color: colour(circle.verdict, 0.18),
-        });
-        entity.texts.push(Text {
-            pose: at(circle.radius_m, 0.0),
-            billboard: true,
-            font_size: 12.0,
-            scale_invariant: true,
-            color: colour(circle.verdict, 1.0),
-            text: format!("{:.2} m", circle.radius_m),
-        });
+        entity.cylinders.push(disc((0.0, 0.0), 2.0 * circle.radius_m, colour(circle.verdict, 0.18)));
+        let label = format!("{:.2} m", circle.radius_m);
+        entity.texts.push(Text::new(at(circle.radius_m, 0.0), 12.0, colour(circle.verdict, 1.0), label));
         entities.push(entity);
     }
     for (_, sensor) in scene.robot() {
@@ -56,6 +43,23 @@ pub fn zones(scene: &Scene, wall_ns: u64) -> Vec<u8> {
         entities.push(entity);
     }
     update(&entities)
+}
+
+/// The people of one tracker with their numbers, and their tails; in the robot's frame, which is the map of the site for who
+/// follows a tracker.
+pub fn tracks(people: &People, wall_ns: u64) -> Vec<u8> {
+    let known = people.persons().iter().filter(|person| person.is_known());
+    let entities = known.map(|person| {
+        let (x, y) = person.place;
+        let mut entity = Entity::new(format!("person {}", person.id), wall_ns);
+        entity.tell("id", person.id.to_string());
+        entity.tell("state", person.state.name().to_owned());
+        entity.cylinders.push(disc((x, y), PERSON_M, PERSON));
+        entity.lines.push(LinePrimitive::new(LINE_STRIP, person.tail().chain([(x, y)]), PERSON));
+        entity.texts.push(Text::new(at(x, y), 14.0, PERSON, person.id.to_string()));
+        entity
+    });
+    update(&entities.collect::<Vec<_>>())
 }
 
 /// The lines of the robot's sensors, from end to end, and where two meet.
@@ -183,6 +187,13 @@ struct LinePrimitive {
     indices: [(); 0],
 }
 
+impl Text {
+    /// Of that many pixels, and turned to who looks.
+    fn new(pose: Pose, font_size: f64, color: Colour, text: String) -> Text {
+        Text { pose, billboard: true, font_size, scale_invariant: true, color, text }
+    }
+}
+
 impl LinePrimitive {
     /// Two pixels wide, through these points of the robot's frame.
     fn new(kind: u8, points: impl Iterator<Item = (f64, f64)>, color: Colour) -> LinePrimitive {
@@ -242,6 +253,11 @@ fn ball((x, y): (f64, f64), across: f64, color: Colour) -> Sphere {
     Sphere { pose: at(x, y), size: Vector { x: across, y: across, z: across }, color }
 }
 
+fn disc((x, y): (f64, f64), across: f64, color: Colour) -> Cylinder {
+    let size = Vector { x: across, y: across, z: FLAT_M };
+    Cylinder { pose: at(x, y), size, bottom_scale: 1.0, top_scale: 1.0, color }
+}
+
 /// Green, amber and red, as the page has them.
 fn colour(verdict: Verdict, a: f64) -> Colour {
     let (r, g, b) = match verdict {
@@ -259,4 +275,6 @@ const MARK_M: f64 = 0.08;
 const CORNER_M: f64 = 0.06;
 
 const LINE: Colour = Colour { r: 0.45, g: 0.33, b: 0.8, a: 1.0 };
+const PERSON: Colour = Colour { r: 0.2, g: 0.65, b: 0.3, a: 1.0 };
+const PERSON_M: f64 = 0.5;
 const MARK: Colour = Colour { r: 0.05, g: 0.55, b: 0.75, a: 1.0 };

@@ -1,0 +1,33 @@
+//! `scanhub listen` against people: tracks and events of another machine are lines like those of this one.
+
+use crate::testkit::{INT, Sender, TestEnv, in_a_network, is_class};
+use schema::{Event, EventKind, Pose, Topic, Track, TrackSensor, Tracks};
+use serde_json::json;
+
+#[test]
+fn people_of_another_machine_are_lines() {
+    in_a_network("listen_people::people_of_another_machine_are_lines", || {
+        let env = TestEnv::new();
+        let mut program = env.start(&["listen", "--json"]).ready();
+        let mut sender = Sender::new(0x5f3a_12bc_00d1_e2f3, 7, 200, "house");
+        sender.announce(&Topic::OF_TRACKERS);
+        let mut tracks = Tracks::default();
+        tracks.push_sensor(TrackSensor::new("front", &Pose::default()));
+        tracks.push(Track { id: 9, x_m: 1.5, sensors: 1, state: 2, ..Track::default() });
+        sender.send(Topic::Tracks, &tracks);
+        sender.send(Topic::Events, &Event::new(EventKind::Left, 9, Some("hall")));
+        let event = program.await_line("an event", is_class("event"));
+        let line = &program.end(INT).of_class("tracks")[0];
+        let track = &line["tracks"][0];
+        assert_eq!([&line["sensor"], &line["hub"]], [&json!("house"), &json!("5f3a12bc00d1e2f3")]);
+        assert_eq!(
+            [&track["id"], &track["x_m"], &track["sensors"]],
+            [&json!(9), &json!(1.5), &json!(["front"])]
+        );
+        assert_eq!((&track["state"], &track["room"]), (&json!("hidden"), &json!(null)));
+        assert_eq!(
+            [&event["kind"], &event["room"], &event["id"]],
+            [&json!("left"), &json!("hall"), &json!(9)]
+        );
+    });
+}
