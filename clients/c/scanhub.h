@@ -754,7 +754,7 @@ struct scanhub_foreground {
     uint16_t beams;          /* beams in the foreground */
     uint16_t segment_count;
     uint16_t left_out;       /* segments for which there was no room */
-    uint64_t supported;      /* a bit for each segment: see scanhub_has_support */
+    uint64_t supported;      /* bit i: `support` of segment i */
     const uint8_t *bits;     /* beam i is bit i % 8 of byte i / 8 */
     const uint8_t *ranges;   /* of the foreground beams, in their order, beams x u16 */
     const uint8_t *segments;
@@ -763,6 +763,7 @@ struct scanhub_segment {
     uint16_t first, last;    /* beams */
     uint16_t nearest, width; /* device units */
     int32_t x_mm, y_mm;      /* its middle, ahead and to the left of the robot's centre */
+    uint8_t support;         /* 1: several beams, or the foreground of the scan before was near; 0: may be an edge that flickers */
 };
 /* Beam i of the scan is in the foreground, i below `count`. */
 static inline int scanhub_is_foreground(const struct scanhub_foreground *foreground, unsigned i)
@@ -785,13 +786,8 @@ static inline struct scanhub_segment scanhub_segment(const struct scanhub_foregr
     out.width = scanhub_u16(at + 6);
     out.x_mm = scanhub_i32(at + 8);
     out.y_mm = scanhub_i32(at + 12);
+    out.support = (uint8_t)(foreground->supported >> i & 1);
     return out;
-}
-/* 1: segment i has several beams, or the foreground of the scan before was near it. 0: it may be an edge that flickers. i below
- * `segment_count`. */
-static inline int scanhub_has_support(const struct scanhub_foreground *foreground, unsigned i)
-{
-    return (int)(foreground->supported >> i & 1);
 }
 static inline enum scanhub_result scanhub_read_foreground(const struct scanhub_datagram *datagram,
                                                           struct scanhub_foreground *out)

@@ -4,6 +4,8 @@
 mod lan;
 mod processors;
 mod recording;
+mod scans;
+mod surroundings;
 
 use line::Control;
 use line::{Output, Session as _};
@@ -23,12 +25,13 @@ use lms_configure::eeprom::Write;
 pub type Target = (&'static str, fn(&[u8]));
 
 /// All of them; the names are those of the corpus' folders.
-pub const TARGETS: [Target; 7] = [
+pub const TARGETS: [Target; 8] = [
     ("framer", framer),
     ("replies", replies),
     ("session", session),
     ("configuration", configuration),
     ("processors", processors),
+    ("surroundings", surroundings),
     ("lan", lan),
     ("recording", recording),
 ];
@@ -234,6 +237,11 @@ pub fn configuration(data: &[u8]) {
 /// Any scans, whoever sends such, with any settings, through all processors.
 pub fn processors(data: &[u8]) {
     processors::processors(data);
+}
+
+/// Any scans through those processors that follow the robot: lines, motion, and the map around it.
+pub fn surroundings(data: &[u8]) {
+    surroundings::surroundings(data);
 }
 
 /// Any datagrams, one after the other, through all checks and the receiver's account.

@@ -90,6 +90,11 @@ fn processors() {
 }
 
 #[test]
+fn surroundings() {
+    run("surroundings");
+}
+
+#[test]
 fn lan() {
     run("lan");
 }

@@ -221,7 +221,7 @@ static void foreground(const struct scanhub_foreground *f)
     for (unsigned i = 0; i < f->segment_count; i++) {
         struct scanhub_segment s = scanhub_segment(f, i);
         printf("%s{\"first\":%u,\"last\":%u,\"nearest\":%u,\"width\":%u,\"x_mm\":%ld,\"y_mm\":%ld,\"support\":%s}", i ? "," : "",
-               s.first, s.last, s.nearest, s.width, (long)s.x_mm, (long)s.y_mm, boolean(scanhub_has_support(f, i)));
+               s.first, s.last, s.nearest, s.width, (long)s.x_mm, (long)s.y_mm, boolean(s.support));
     }
     printf("]}");
 }

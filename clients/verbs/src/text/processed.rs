@@ -161,4 +161,33 @@ mod tests {
         robot(&mut line, &Robot::default()).unwrap();
         assert_eq!(line, b"unknown nearest not known:");
     }
+
+    #[test]
+    fn a_segment_without_support_says_so() {
+        let mut found = Foreground::of(3);
+        let head = schema::ForegroundHead {
+            unit_um: 10_000,
+            count: 3,
+            beams: 3,
+            segments: 2,
+            supported: 1,
+            ..schema::ForegroundHead::default()
+        };
+        let segments = found.begin(head).segments;
+        segments[0] = schema::Segment { first: 0, last: 1, width: 7, x_mm: 900, y_mm: -4, ..segments[0] };
+        segments[1] = schema::Segment { first: 2, last: 2, x_mm: 8, ..segments[1] };
+        let mut line = Vec::new();
+        foreground(&mut line, &Header::default(), &found).unwrap();
+        let line = String::from_utf8(line).unwrap();
+        assert!(
+            line.ends_with(
+                " 3 beams, 2 segments, 70 mm wide at (900, -4), 0 mm wide at (8, 0) without support"
+            )
+        );
+        let json =
+            serde_json::to_value(crate::json::foreground("front", &Header::default(), &found)).unwrap();
+        let supports: Vec<_> =
+            json["segments"].as_array().unwrap().iter().map(|segment| &segment["support"]).collect();
+        assert_eq!(supports, [true, false]);
+    }
 }

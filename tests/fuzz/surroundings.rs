@@ -1,0 +1,148 @@
+//! Any scans through those processors that follow the robot: lines, motion, and the map around it. Whatever the bytes say,
+//! what comes out keeps to its own rules, and nothing is surer than the readings that say it.
+
+use preprocess::background::{Candidate, Class, Method, Model, Settings, Start};
+use preprocess::lines::{self, LineFinder, Stop};
+use preprocess::motion::{self, MotionEstimator};
+use schema::datagram::Packed;
+use schema::limits::TopicLimits;
+use schema::{BEAMS, Contents, Foreground, Lines, Motion, MotionMethod, Scan};
+
+use super::scans::{Bytes, fill, layout};
+
+/// Read as settings, then as one scan after the other until nothing is left.
+pub(super) fn surroundings(data: &[u8]) {
+    let mut bytes = Bytes(data);
+    let most = TopicLimits::default().beams;
+    let mut pose = bytes.pose();
+    let of_lines = lines::Settings {
+        max: 1 + bytes.u8() % 64,
+        min_points: 3 + u16::from(bytes.u8() % 16),
+        polish: bytes.u8() % 4 == 0,
+        stop: Stop::Likelihood,
+    };
+    let of_motion = motion::Settings {
+        max_step_m: 0.01 + f64::from(bytes.u8()) / 100.0,
+        max_turn_deg: 1.0 + f64::from(bytes.u8() % 85),
+        min_overlap: 0.1 + f64::from(bytes.u8() % 91) / 100.0,
+    };
+    let mut finder = LineFinder::new(pose, of_lines, most);
+    let mut estimator = MotionEstimator::new(pose, of_motion, most);
+    let mut model = Model::new(MAP, most);
+    let mut foreground = Foreground::of(most);
+    let mut scan = Scan::zeroed(Scan::len(BEAMS, Contents::ALL));
+    let mut before = Motion::default();
+    for _ in 0..SCANS {
+        if bytes.is_empty() {
+            break;
+        }
+        // Else it is the same scan again.
+        let what = bytes.u8();
+        match what {
+            0..=3 => estimator.forget(),
+            4..=7 => {
+                pose = bytes.pose();
+                finder.change(pose, of_lines);
+                estimator.change(pose, of_motion);
+            }
+            8..=63 => layout(&mut bytes, &mut scan),
+            _ => {}
+        }
+        match what {
+            64..=127 => walls(&mut bytes, &mut scan),
+            128..=191 => {}
+            _ => fill(&mut bytes, &mut scan),
+        }
+        let mut lines = Lines::default();
+        finder.update(&scan, &mut lines);
+        assert_lines(&scan, &lines, &of_lines);
+        let mut motion = Motion::default();
+        estimator.update(&scan, &lines, &mut motion);
+        assert_motion(&scan, &before, &motion, &of_motion);
+        before = motion;
+        model.follow(&pose, &motion);
+        model.update(&scan, &mut foreground);
+        assert!(foreground.readings().all(|(beam, range)| scan.range(beam) == Some(range)));
+        if !motion.has_pose() {
+            assert!(model.classes().iter().all(|class| matches!(class, Class::Unknown | Class::Invalid)));
+        }
+    }
+}
+
+fn assert_lines(scan: &Scan, lines: &Lines, settings: &lines::Settings) {
+    let payload = &mut [0; 4096];
+    let len = lines.pack(payload).expect("the greatest one is shorter");
+    assert!(Lines::room(&payload[..len]).is_some(), "{lines:?}");
+    let found = lines.lines();
+    assert!(lines.count <= settings.max && usize::from(lines.readings) <= scan.beams());
+    assert_eq!(found.iter().map(|line| line.points).sum::<u16>(), lines.on_lines);
+    assert!(lines.on_lines <= lines.readings);
+    assert!(found.is_sorted_by(|one, next| one.last < next.first));
+    assert!(found.last().is_none_or(|line| usize::from(line.last) < scan.beams()));
+    for line in found {
+        assert!(line.points >= settings.min_points && line.last - line.first + 1 >= line.points);
+        assert!(line.sd_r_m >= 0.0 && line.sd_alpha_rad > 0.0, "{line:?}");
+    }
+}
+
+fn assert_motion(scan: &Scan, before: &Motion, motion: &Motion, settings: &motion::Settings) {
+    let place = [motion.x_m, motion.y_m, motion.yaw_rad];
+    let step = [motion.dx_m, motion.dy_m, motion.dyaw_rad];
+    assert!(place.iter().all(|number| number.is_finite()), "{motion:?}");
+    assert!(step.iter().chain(&motion.covariance).all(|number| number.is_finite()), "{motion:?}");
+    match motion.how() {
+        MotionMethod::First => assert_eq!(*motion, Motion::default()),
+        MotionMethod::Refused => {
+            let breaks = before.breaks.saturating_add(1);
+            let method = MotionMethod::Refused as u8;
+            assert_eq!(*motion, Motion { method, breaks, ..Motion::default() });
+        }
+        _ => {
+            let [x, y, yaw] = step.map(f64::from);
+            assert!(x.hypot(y) <= settings.max_step_m + 1e-6, "{motion:?}");
+            assert!(yaw.abs() <= settings.max_turn_deg.to_radians() + 1e-6, "{motion:?}");
+            assert!(motion.overlap >= settings.min_overlap as f32 && motion.overlap <= 1.0, "{motion:?}");
+            assert_eq!(motion.breaks, before.breaks);
+            let of = |row: usize, column: usize| f64::from(motion.covariance[3 * row + column]);
+            for (row, column) in [(0, 1), (0, 2), (1, 2)] {
+                let most = (of(row, row) * of(column, column)).sqrt();
+                assert!((of(row, column) - of(column, row)).abs() <= 1e-5 * most, "{motion:?}");
+                assert!(of(row, column).abs() <= (1.0 + 1e-5) * most, "{motion:?}");
+            }
+            // Of all beams together, if they looked at one wall and nothing else were unsure.
+            let surest = LEAST_VARIANCE / scan.beams() as f64;
+            assert!(of(0, 0) >= surest && of(1, 1) >= surest && of(2, 2) > 0.0, "{motion:?}");
+        }
+    }
+}
+
+/// Walls: a reading from each beam to the next is longer or shorter by the same.
+fn walls(bytes: &mut Bytes<'_>, scan: &mut Scan) {
+    let ranges = scan.arrays().ranges;
+    let mut end = 0;
+    while end < ranges.len() && !bytes.is_empty() {
+        let start = end;
+        end = (start + 1 + usize::from(bytes.u8())).min(ranges.len());
+        let (mut range, slope, noise) =
+            (bytes.u16(), i16::from(bytes.u8()) - 128, u16::from(bytes.u8() % 32));
+        for (i, place) in (0_u16..).zip(&mut ranges[start..end]) {
+            *place = range.wrapping_add(i.wrapping_mul(i) % (1 + noise));
+            range = range.wrapping_add_signed(slope);
+        }
+    }
+}
+
+/// The map's own settings.
+const MAP: Settings = Settings {
+    method: Method::Moving,
+    threshold_mm: None,
+    candidate_mm: None,
+    scans: None,
+    candidate: Candidate::First,
+    start: Start::Empty,
+    no_return_is_far: None,
+};
+/// A hundredth of the least variance of a range, (5 mm)^2, of which a beam that grazes its wall has a twentieth.
+const LEAST_VARIANCE: f64 = 2.5e-7;
+/// A map takes long to forget.
+const SCANS: usize = 40;
