@@ -2,7 +2,7 @@
 //! measurements without hardware.
 //!
 //! [`machine`] is a SICK LMS 2xx, [`ld`] a scanner of LDROBOT, [`rplidar`] one of Slamtec, without I/O and clock;
-//! [`world`] is what they see, [`room`] how that is measured, [`labeled_scan`] the true values; [`wire`], [`fault`] and
+//! [`world`] is what they see, [`room`] how that is measured, [`mount`] what may tilt the sensor, [`labeled_scan`] the true values; [`wire`], [`fault`] and
 //! [`noise`] are what happens on the line; [`pty`] is the only file that knows real time; [`simulate()`] is the verb. It
 //! uses the protocol crates' other direction and knows nothing of the hub.
 
@@ -15,6 +15,7 @@ pub mod layers;
 pub mod ld;
 mod line;
 pub mod machine;
+pub mod mount;
 pub mod noise;
 pub mod operating;
 pub mod options;
@@ -32,6 +33,7 @@ mod settings;
 mod shape;
 mod simulate;
 mod socket;
+mod solid;
 pub mod source;
 mod spot;
 mod transmission;

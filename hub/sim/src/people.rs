@@ -4,6 +4,7 @@
 use std::f64::consts::TAU;
 
 use crate::shape::{Point, Shape};
+use crate::solid::Heights;
 
 /// What a world says of a person.
 #[derive(Clone, Debug, PartialEq)]
@@ -102,18 +103,37 @@ impl Person {
 
     /// Both legs at `time_s`, as a sensor at the height of the shins sees them; none while nobody is there.
     pub(crate) fn legs(&self, time_s: f64) -> Option<[Shape; 2]> {
-        if !(self.from_s..self.until_s).contains(&time_s) {
-            return None;
-        }
-        let Stand { place, ahead, step } = self.course.stand(time_s);
+        self.stand(time_s).map(|stand| self.legs_of(&stand))
+    }
+
+    /// The whole person at `time_s`: legs, trunk and head, with their heights.
+    pub(crate) fn body(&self, time_s: f64) -> Option<[(Shape, Heights); 4]> {
+        let stand = self.stand(time_s)?;
+        let [left, right] = self.legs_of(&stand);
+        let part = |shape, from_mm, to_mm| (shape, Heights { from_mm, to_mm });
+        let upper = |radius| Shape::Post { centre: stand.place, radius };
+        Some([
+            part(left, 0.0, CROTCH_MM),
+            part(right, 0.0, CROTCH_MM),
+            part(upper(TRUNK_MM), CROTCH_MM, NECK_MM),
+            part(upper(HEAD_MM), NECK_MM, CROWN_MM),
+        ])
+    }
+
+    fn stand(&self, time_s: f64) -> Option<Stand> {
+        (self.from_s..self.until_s).contains(&time_s).then(|| self.course.stand(time_s))
+    }
+
+    fn legs_of(&self, stand: &Stand) -> [Shape; 2] {
+        let Stand { place, ahead, step } = *stand;
         let stride = STRIDE_MM * (TAU * (step + self.phase)).sin();
-        Some([1.0, -1.0].map(|side| Shape::Post {
+        [1.0, -1.0].map(|side| Shape::Post {
             centre: (
                 place.0 + side * (stride * ahead.0 - HIP_MM * ahead.1),
                 place.1 + side * (stride * ahead.1 + HIP_MM * ahead.0),
             ),
             radius: self.leg_mm,
-        }))
+        })
     }
 }
 
@@ -181,6 +201,12 @@ fn unit(way: Point) -> Point {
 
 /// Half the distance between the legs across the way.
 const HIP_MM: f64 = 110.0;
+/// Heights of an adult of 1.75 m, and the radii of trunk and head.
+const CROTCH_MM: f64 = 820.0;
+const NECK_MM: f64 = 1_480.0;
+const CROWN_MM: f64 = 1_750.0;
+const TRUNK_MM: f64 = 170.0;
+const HEAD_MM: f64 = 95.0;
 /// How far a foot gets ahead of the body.
 const STRIDE_MM: f64 = 250.0;
 /// Double steps per second of somebody who roams.

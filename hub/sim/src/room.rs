@@ -7,6 +7,7 @@ use std::sync::Arc;
 
 use lms::Nanos;
 use lms::variant::{Mode, Unit, Variant};
+use schema::{Scan, ScanHead};
 
 use crate::labeled_scan::{LabeledScan, Mark, Met};
 use crate::layers::{self, Dice};
@@ -132,21 +133,63 @@ fn measure(
     end_ns: Nanos,
     random: &mut fastrand::Rng,
 ) -> LabeledScan {
+    if stage.is_tilted() {
+        return measure_tilted(stage, angles_mdeg, unit, mode, end_ns, random);
+    }
     let times: Vec<Nanos> = (0..turns).map(|turn| stage.layers.turn_ns(turn, turns, end_ns)).collect();
     let views: Vec<View> = times.iter().map(|&time_ns| stage.view(time_ns)).collect();
     let mut look = LabeledScan { words: Vec::new(), truth: Vec::new() };
     for (beam, &angle_mdeg) in angles_mdeg.iter().enumerate() {
         // The beams between whole degrees are measured in the turns after the first.
         let turn = beam % turns as usize;
-        let dice = Dice::throw(random);
-        let echo = echo(&views[turn], angle_mdeg, stage.layers.spot, &dice);
-        let time_s = times[turn] as f64 / 1e9;
-        let sun = stage.suns.iter().map(|sun| sun.share(angle_mdeg, time_s)).fold(0.0, f64::max);
-        let word = word(stage, &echo, sun, unit, mode, &dice);
-        look.words.push(word);
-        look.truth.push(truth(word, echo.met, mode));
+        look_along(stage, &views[turn], (angle_mdeg, times[turn]), (unit, mode), random, &mut look);
     }
     look
+}
+
+/// The same of a sensor whose plane turns while it measures: each beam is measured at its own time, as
+/// [`ScanHead::lms`] has it; without layer `comb` all are of the end.
+fn measure_tilted(
+    stage: &WorldView,
+    angles_mdeg: &[i32],
+    unit: Unit,
+    mode: Mode,
+    end_ns: Nanos,
+    random: &mut fastrand::Rng,
+) -> LabeledScan {
+    let step_mdeg = angles_mdeg.windows(2).map(|pair| pair[1] - pair[0]).next().unwrap_or(1000);
+    let first_mdeg = angles_mdeg.first().copied().unwrap_or(0);
+    let head =
+        ScanHead::lms(angles_mdeg.len(), first_mdeg, step_mdeg as u32, unit.mm().into(), mode.range_bits());
+    let times = Scan::of(head, &vec![0; angles_mdeg.len()]);
+    let mut view = stage.still().clone();
+    let mut look = LabeledScan { words: Vec::new(), truth: Vec::new() };
+    for (beam, &angle_mdeg) in angles_mdeg.iter().enumerate() {
+        let off_ns = if stage.layers.comb { times.beam_ns(beam) } else { 0 };
+        let at_ns = end_ns.saturating_add_signed(off_ns);
+        stage.look_along(&mut view, f64::from(angle_mdeg) / 1e3, at_ns);
+        look_along(stage, &view, (angle_mdeg, at_ns), (unit, mode), random, &mut look);
+    }
+    look
+}
+
+/// Adds to `look` what the beam at the angle and time `at` tells, around which `view` lies.
+fn look_along(
+    stage: &WorldView,
+    view: &View,
+    at: (i32, Nanos),
+    (unit, mode): (Unit, Mode),
+    random: &mut fastrand::Rng,
+    look: &mut LabeledScan,
+) {
+    let (angle_mdeg, time_ns) = at;
+    let dice = Dice::throw(random);
+    let echo = echo(view, angle_mdeg, stage.layers.spot, &dice);
+    let time_s = time_ns as f64 / 1e9;
+    let sun = stage.suns.iter().map(|sun| sun.share(angle_mdeg, time_s)).fold(0.0, f64::max);
+    let word = word(stage, &echo, sun, unit, mode, &dice);
+    look.words.push(word);
+    look.truth.push(truth(word, echo.met, mode));
 }
 
 /// What a beam says that got `echo`, while the sun dazzles `sun` of its like.

@@ -2,18 +2,29 @@
 //! millimetres and seconds. Knows neither files nor beams.
 
 use crate::layers::Layers;
+use crate::mount::Mount;
 use crate::people::Plan;
 use crate::shape::{Pose, Shape};
+use crate::solid::Heights;
 
 /// A world that was read.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Scene {
-    /// The sensors that look at it. The beam ahead looks where the pose is turned to: 0 is along x.
-    pub(crate) sensors: Vec<Pose>,
+    /// The sensors that look at it.
+    pub(crate) sensors: Vec<Sensor>,
     pub(crate) layers: Layers,
     pub(crate) things: Vec<Thing>,
     pub(crate) people: Vec<Plan>,
     pub(crate) suns: Vec<Sun>,
+}
+
+/// A sensor that looks at a world.
+#[derive(Clone, Debug, PartialEq)]
+pub(crate) struct Sensor {
+    /// The beam ahead looks where the pose is turned to: 0 is along x. That of its mount, if it has one.
+    pub(crate) pose: Pose,
+    /// What tilts it. Without one it measures level, and sees everything whatever its height.
+    pub(crate) mount: Option<Mount>,
 }
 
 /// How a surface answers to the beam.
@@ -33,6 +44,10 @@ pub(crate) enum Surface {
 pub(crate) struct Thing {
     /// In its own frame.
     pub(crate) shapes: Vec<Shape>,
+    /// For tilted sensors.
+    pub(crate) heights: Heights,
+    /// Its shapes are the four sides of a box.
+    pub(crate) is_box: bool,
     pub(crate) pose: Pose,
     pub(crate) surface: Surface,
     pub(crate) from_s: f64,
@@ -131,7 +146,18 @@ mod tests {
     fn thing(from_s: f64, until_s: f64, moves: &[Move]) -> Thing {
         let shapes = vec![Shape::Post { centre: (0.0, 0.0), radius: 10.0 }];
         let moves = moves.to_vec();
-        Thing { shapes, pose: HERE, surface: Surface::Plain, from_s, until_s, moves, jitter_mm: 0.0 }
+        let (heights, is_box) = (Heights::ALL, false);
+        Thing {
+            shapes,
+            heights,
+            is_box,
+            pose: HERE,
+            surface: Surface::Plain,
+            from_s,
+            until_s,
+            moves,
+            jitter_mm: 0.0,
+        }
     }
 
     #[test]

@@ -28,6 +28,16 @@ pub(crate) enum Kind {
     Box { since_ns: Nanos },
 }
 
+impl Kind {
+    /// That of a thing that stands where it does since `since_ns`.
+    pub(crate) fn since(since_ns: Nanos) -> Kind {
+        match since_ns {
+            0 => Kind::Static,
+            since_ns => Kind::Box { since_ns },
+        }
+    }
+}
+
 /// Where a ray ends.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Hit {

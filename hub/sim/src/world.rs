@@ -2,6 +2,7 @@
 //! where a world comes from, not what is in it.
 
 mod file;
+mod mount;
 mod origin;
 
 use std::path::Path;
@@ -11,6 +12,7 @@ use std::sync::Arc;
 use schema::{Failure, Kind, regular};
 
 use crate::layers::Layers;
+use crate::mount::{Fault, Mount};
 use crate::scene::Scene;
 
 /// What a sensor can be put into.
@@ -28,7 +30,7 @@ pub enum World {
 }
 
 /// The scenes that the program brings along: name and text.
-const SCENES: [(&str, &str); 14] = [
+const SCENES: [(&str, &str); 15] = [
     ("room", include_str!("../../../tests/worlds/room.toml")),
     ("bare", include_str!("../../../tests/worlds/bare.toml")),
     ("fig8", include_str!("../../../tests/worlds/fig8.toml")),
@@ -43,6 +45,7 @@ const SCENES: [(&str, &str); 14] = [
     ("strips", include_str!("../../../tests/worlds/strips.toml")),
     ("crowd", include_str!("../../../tests/worlds/crowd.toml")),
     ("demo", include_str!("../../../tests/worlds/demo.toml")),
+    ("tilt", include_str!("../../../tests/worlds/tilt.toml")),
 ];
 
 impl World {
@@ -64,6 +67,23 @@ impl World {
             World::Scene(scene) => scene.sensors.len(),
             _ => 1,
         }
+    }
+
+    /// What tilts its sensor number `sensor`, if anything does.
+    pub fn mount(&self, sensor: usize) -> Option<&Mount> {
+        match self {
+            World::Scene(scene) => scene.sensors.get(sensor)?.mount.as_ref(),
+            _ => None,
+        }
+    }
+
+    /// The same world with `faults` of all its mounts, instead of those that they have.
+    pub fn with_mount_faults(self, faults: &[Fault]) -> World {
+        let World::Scene(scene) = self else { return self };
+        let mut scene = Arc::unwrap_or_clone(scene);
+        let mounts = scene.sensors.iter_mut().filter_map(|sensor| sensor.mount.as_mut());
+        mounts.for_each(|mount| mount.faults = faults.to_vec());
+        World::Scene(Arc::new(scene))
     }
 
     /// Its layers of noise, if it has any.

@@ -5,9 +5,11 @@ use lms::Nanos;
 
 use crate::labeled_scan::Mark;
 use crate::layers::Layers;
+use crate::mount::Mount;
 use crate::people::{Person, jittered};
 use crate::scene::{Scene, Sun, Surface, Thing};
 use crate::shape::{Pose, Shape};
+use crate::solid::Plane;
 use crate::view::{Face, Kind, View};
 
 /// A scene as a seed makes it.
@@ -15,10 +17,13 @@ use crate::view::{Face, Kind, View};
 pub(crate) struct WorldView {
     pub(crate) layers: Layers,
     sensor: Pose,
+    mount: Option<Mount>,
     /// By how much all ranges of this sensor are off.
     pub(crate) bias_mm: f64,
-    /// What never changes, drawn once.
+    /// What never changes, drawn once; of a tilted sensor nothing.
     still: View,
+    /// What a tilted sensor may see and never changes.
+    still_things: Vec<Thing>,
     still_reflectors: Vec<Shape>,
     changing: Vec<Thing>,
     people: Vec<Person>,
@@ -39,14 +44,20 @@ impl WorldView {
         let bias = fastrand::Rng::with_seed(!seed ^ sensor << 32).f64();
         let mut stage = WorldView {
             layers: scene.layers,
-            sensor: scene.sensors[sensor as usize],
+            sensor: scene.sensors[sensor as usize].pose,
+            mount: scene.sensors[sensor as usize].mount.clone(),
             bias_mm: scene.layers.bias_mm * (2.0 * bias - 1.0),
             still: View::empty(),
+            still_things: Vec::new(),
             still_reflectors: Vec::new(),
             changing,
             people,
             suns: scene.suns.clone(),
         };
+        if stage.mount.is_some() {
+            stage.still_things = still_things;
+            return stage;
+        }
         for thing in still_things {
             for shape in stage.seen(&thing, thing.pose) {
                 if thing.surface == Surface::Reflector {
@@ -76,10 +87,7 @@ impl WorldView {
         let mut faces = Vec::new();
         for thing in &self.changing {
             let Some(spell) = thing.at(time_s) else { continue };
-            let kind = match nanos(spell.since_s) {
-                0 => Kind::Static,
-                since_ns => Kind::Box { since_ns },
-            };
+            let kind = Kind::since(nanos(spell.since_s));
             let shapes = self.seen(thing, spell.pose);
             faces.extend(shapes.into_iter().map(|shape| Face { shape, surface: thing.surface, kind }));
         }
@@ -92,6 +100,11 @@ impl WorldView {
             faces.extend(legs.map(leg));
         }
         faces
+    }
+
+    /// Whether each beam has a plane of its own.
+    pub(crate) fn is_tilted(&self) -> bool {
+        self.mount.is_some()
     }
 
     /// What lies in each direction at `time_ns`.
@@ -113,6 +126,9 @@ impl WorldView {
     }
 
     fn draw(&self, view: &mut View, time_ns: Nanos) {
+        if let Some(mount) = &self.mount {
+            return self.draw_cut(&mount.plane(time_ns), view, time_ns);
+        }
         for face in self.faces(time_ns) {
             view.draw(face);
         }
@@ -125,8 +141,37 @@ impl WorldView {
         }
     }
 
-    /// The middle of each reflector that can be seen at `time_ns`.
+    /// Draws what `plane` cuts.
+    fn draw_cut(&self, plane: &Plane, view: &mut View, time_ns: Nanos) {
+        let time_s = time_ns as f64 / 1e9;
+        let face = |shape, surface, kind| Face { shape, surface, kind };
+        if let Some(floor) = plane.cut_floor() {
+            view.draw(face(floor, Surface::Plain, Kind::Static));
+        }
+        for thing in self.still_things.iter().chain(&self.changing) {
+            let Some(spell) = thing.at(time_s) else { continue };
+            let kind = Kind::since(nanos(spell.since_s));
+            let shapes = self.seen(thing, spell.pose);
+            plane.cut(&shapes, thing.heights, thing.is_box, |cut| view.draw(face(cut, thing.surface, kind)));
+        }
+        for (part, heights) in self.people.iter().filter_map(|person| person.body(time_s)).flatten() {
+            let part = part.placed(|point| self.eye(point));
+            plane.cut(&[part], heights, false, |cut| view.draw(face(cut, Surface::Plain, Kind::Person)));
+        }
+        for thing in &self.changing {
+            for spell in thing.left(time_s) {
+                let shapes = self.seen(thing, spell.pose);
+                let since_ns = nanos(spell.since_s);
+                plane.cut(&shapes, thing.heights, thing.is_box, |cut| view.uncover(&cut, since_ns));
+            }
+        }
+    }
+
+    /// The middle of each reflector that can be seen at `time_ns`; of a tilted sensor none.
     pub(crate) fn marks(&self, time_ns: Nanos) -> Vec<Mark> {
+        if self.is_tilted() {
+            return Vec::new();
+        }
         let view = self.view(time_ns);
         let moving = self.faces(time_ns).into_iter().filter(|face| face.surface == Surface::Reflector);
         let fronts = self.still_reflectors.iter().copied().chain(moving.map(|face| face.shape));

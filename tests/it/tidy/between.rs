@@ -126,6 +126,18 @@ fn the_scene_only_computes() {
 }
 
 #[test]
+fn three_dimensions_only_compute() {
+    holds(crates::three_dimensions_only_compute, |tree| {
+        let (manifest, lib) = ("clients/tilt/Cargo.toml", "clients/tilt/src/lib.rs");
+        vec![
+            tree.with_line(manifest, "[dependencies]", "scanhub-client.workspace = true"),
+            tree.with(lib, &tree.text(lib).replace("#![forbid(unsafe_code)]", "")),
+            tree.with("clients/tilt/src/planted.rs", "//! So.\nuse std::time::Instant;\n"),
+        ]
+    });
+}
+
+#[test]
 fn the_server_knows_no_hub() {
     holds(crates::the_server_knows_no_hub, |tree| {
         let (manifest, lib) = ("clients/web/Cargo.toml", "clients/web/src/lib.rs");

@@ -219,6 +219,16 @@ pub(crate) fn the_scene_only_computes(tree: &Tree) -> Vec<String> {
     breaches
 }
 
+/// Scans and angles become points by their stamps alone, so that a recording gives what was live.
+pub(crate) fn three_dimensions_only_compute(tree: &Tree) -> Vec<String> {
+    const OUTSIDE: [&str; 7] =
+        ["schema::ipc", "Instant", "SystemTime", "std::env", "std::fs", "std::io", "std::net"];
+    let mut breaches = built_of(tree, "scanhub-tilt", &["scanhub-schema"]);
+    breaches.extend(lacks(tree, "clients/tilt/src/lib.rs", &["#![forbid(unsafe_code)]"]));
+    breaches.extend(find(tree, &OUTSIDE, |path| path.starts_with("clients/tilt/src/")));
+    breaches
+}
+
 /// The server shows a scene to whoever comes, and cannot follow a hub: what strangers send ends in it.
 pub(crate) fn the_server_knows_no_hub(tree: &Tree) -> Vec<String> {
     let known = ["scanhub-ros", "scanhub-scene", "scanhub-schema"];

@@ -9,8 +9,10 @@ use toml::Spanned;
 
 use crate::layers::Layers;
 use crate::people::{Plan, Speed, Way};
-use crate::scene::{Move, Scene, Sun, Surface, Thing};
+use crate::scene::{Move, Scene, Sensor, Sun, Surface, Thing};
 use crate::shape::{Point, Pose, Shape};
+use crate::solid::Heights;
+use crate::world::mount::MountFile;
 use crate::world::origin::Origin;
 
 /// The scene that `text` describes; `name` is how failures call it.
@@ -19,10 +21,14 @@ use crate::world::origin::Origin;
 pub(crate) fn parse(name: &str, text: &str) -> Result<Scene, Failure> {
     let origin = Origin { name, text };
     let file: SceneFile = toml::from_str(text).map_err(|error| origin.explain(&error))?;
-    let sensors =
-        file.sensor.iter().map(|sensor| pose(&origin, &sensor.pose)).collect::<Result<Vec<_>, _>>()?;
+    let sensor = |file: &SensorFile| {
+        let mount =
+            file.mount.as_ref().map(|mount| mount.get_ref().mount(mount.span(), &origin)).transpose()?;
+        Ok(Sensor { pose: pose(&origin, &file.pose)?, mount })
+    };
+    let sensors = file.sensor.iter().map(sensor).collect::<Result<Vec<_>, _>>()?;
     Ok(Scene {
-        sensors: if sensors.is_empty() { vec![MIDDLE] } else { sensors },
+        sensors: if sensors.is_empty() { vec![Sensor { pose: MIDDLE, mount: None }] } else { sensors },
         layers: file.noise.layers(&origin)?,
         things: file
             .thing
@@ -60,6 +66,7 @@ struct SceneFile {
 #[serde(deny_unknown_fields)]
 struct SensorFile {
     pose: Spanned<Vec<Number>>,
+    mount: Option<Spanned<MountFile>>,
 }
 
 #[derive(Default, Deserialize)]
@@ -85,6 +92,8 @@ struct ThingFile {
     radius_mm: Option<Spanned<f64>>,
     pose: Option<Spanned<Vec<Number>>>,
     surface: Option<Spanned<String>>,
+    height_mm: Option<Spanned<f64>>,
+    above_mm: Option<Spanned<f64>>,
     from_s: Option<Spanned<f64>>,
     until_s: Option<Spanned<f64>>,
     #[serde(default)]
@@ -170,6 +179,8 @@ impl ThingFile {
         }
         Ok(Thing {
             shapes: self.shapes(span, origin)?,
+            heights: self.heights(origin)?,
+            is_box: self.sides.is_some(),
             pose: self.pose.as_ref().map_or(Ok(Pose { turn_deg: 0.0, ..MIDDLE }), |at| pose(origin, at))?,
             surface: self.surface.as_ref().map_or(Ok(Surface::Plain), |name| surface(origin, name))?,
             from_s,
@@ -177,6 +188,18 @@ impl ThingFile {
             moves,
             jitter_mm: origin.number(&self.jitter_mm, 0.0, 0.0..=1_000.0)?,
         })
+    }
+
+    fn heights(&self, origin: &Origin) -> Result<Heights, Failure> {
+        let from_mm = origin.number(&self.above_mm, Heights::ALL.from_mm, 0.0..=10_000.0)?;
+        let to_mm = origin.number(&self.height_mm, Heights::ALL.to_mm, 1.0..=10_000.0)?;
+        match &self.above_mm {
+            Some(above) if from_mm >= to_mm => {
+                let what = format!("above_mm = {from_mm}, height_mm = {to_mm}");
+                Err(origin.refuse(above.span(), what, "both from the floor, the top above the bottom"))
+            }
+            _ => Ok(Heights { from_mm, to_mm }),
+        }
     }
 
     fn shapes(&self, span: Range<usize>, origin: &Origin) -> Result<Vec<Shape>, Failure> {

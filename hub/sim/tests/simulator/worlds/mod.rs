@@ -3,6 +3,7 @@
 
 mod files;
 mod layers;
+mod tilted;
 mod truth;
 
 use lms::Nanos;

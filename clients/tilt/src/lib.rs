@@ -1,0 +1,24 @@
+//! Three dimensions with a planar scanner that a mount tilts: its scans and the mount's angles become points, sweep by sweep,
+//! and what stands before the learned background, or near the robot, becomes obstacles. No clock and no I/O: time is that of
+//! the stamps, so a recording gives the same at any speed.
+//!
+//! [`Mount`] is where the axis is; [`Tilting`] takes scans and [`Angle`]s and hands out [`Sweep`]s. An angle that cannot be
+//! trusted makes no points; [`Counts`] say how many were withheld, and why.
+
+#![forbid(unsafe_code)]
+
+mod angles;
+mod background;
+mod mount;
+mod obstacles;
+mod settings;
+mod sweep;
+mod swing;
+mod tilting;
+
+pub use angles::{Angle, Withheld};
+pub use mount::Mount;
+pub use obstacles::{OBSTACLES, Obstacle};
+pub use settings::Settings;
+pub use sweep::{Class, Point, Sweep};
+pub use tilting::{Counts, Tilting};

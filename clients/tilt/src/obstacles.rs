@@ -1,0 +1,172 @@
+//! Obstacles: points that are near each other, in three dimensions. Two points are of the same obstacle if their cubes touch,
+//! or cubes between them do. Refuses to know which points are worth it.
+
+/// The most obstacles of a sweep.
+pub const OBSTACLES: usize = 64;
+
+/// Something that stands there.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Obstacle {
+    /// The mean of its points in the robot's frame, in metres.
+    pub middle: [f32; 3],
+    /// The least coordinates of its points.
+    pub low: [f32; 3],
+    /// The greatest.
+    pub high: [f32; 3],
+    /// How far its nearest point is from the robot's centre, over ground, in metres.
+    pub distance_m: f32,
+    /// Points.
+    pub points: u32,
+    /// Bits: [`FOREGROUND`](Self::FOREGROUND), [`NEAR`](Self::NEAR).
+    pub flags: u8,
+}
+
+impl Obstacle {
+    /// Flag: points of it are before the background.
+    pub const FOREGROUND: u8 = 1;
+    /// Flag: points of it are in the space that is to be free.
+    pub const NEAR: u8 = 2;
+}
+
+/// Finds obstacles; keeps its memory.
+#[derive(Default)]
+pub(crate) struct Clusters {
+    /// Cube and number of each point, in the order of the cubes.
+    cubes: Vec<([i16; 3], u32)>,
+    /// Which cubes were not reached yet, by the first of their points.
+    open: Vec<bool>,
+    /// Where the search goes on: numbers of first points.
+    front: Vec<usize>,
+    found: Vec<Obstacle>,
+}
+
+impl Clusters {
+    /// Returns what the points make, the nearest first, of at least `least` points each, and how many did not fit. A point has
+    /// the flags of what it is.
+    pub(crate) fn find(
+        &mut self,
+        points: &[([f32; 3], u8)],
+        cube_m: f32,
+        least: usize,
+    ) -> (&[Obstacle], u32) {
+        let cube = |at: [f32; 3]| at.map(|value| (value / cube_m).floor() as i16);
+        self.cubes.clear();
+        self.cubes.extend(points.iter().zip(0..).map(|(&(at, _), number)| (cube(at), number)));
+        self.cubes.sort_unstable();
+        self.open.clear();
+        self.open.resize(self.cubes.len(), true);
+        self.found.clear();
+        for first in 0..self.cubes.len() {
+            if !self.open[first] || first > 0 && self.cubes[first].0 == self.cubes[first - 1].0 {
+                continue;
+            }
+            let obstacle = self.grown_from(first, points);
+            if obstacle.points as usize >= least {
+                self.found.push(obstacle);
+            }
+        }
+        self.found.sort_by(|a, b| a.distance_m.total_cmp(&b.distance_m));
+        let left_out = self.found.len().saturating_sub(OBSTACLES) as u32;
+        self.found.truncate(OBSTACLES);
+        (&self.found, left_out)
+    }
+
+    fn grown_from(&mut self, first: usize, points: &[([f32; 3], u8)]) -> Obstacle {
+        let (inf, mut sum) = (f32::INFINITY, [0.0_f64; 3]);
+        let mut grown = Obstacle { low: [inf; 3], high: [-inf; 3], distance_m: inf, ..Obstacle::default() };
+        self.open[first] = false;
+        self.front.push(first);
+        while let Some(first) = self.front.pop() {
+            let cube = self.cubes[first].0;
+            for (_, number) in self.cubes[first..].iter().take_while(|(other, _)| *other == cube) {
+                let (at, flags) = points[*number as usize];
+                for i in 0..3 {
+                    sum[i] += f64::from(at[i]);
+                    grown.low[i] = grown.low[i].min(at[i]);
+                    grown.high[i] = grown.high[i].max(at[i]);
+                }
+                grown.distance_m = grown.distance_m.min(at[0].hypot(at[1]));
+                grown.points += 1;
+                grown.flags |= flags;
+            }
+            for beside in around(cube) {
+                let place = self.cubes.partition_point(|(other, _)| *other < beside);
+                let is_there = self.cubes.get(place).is_some_and(|(other, _)| *other == beside);
+                if is_there && self.open[place] {
+                    self.open[place] = false;
+                    self.front.push(place);
+                }
+            }
+        }
+        grown.middle = sum.map(|value| (value / f64::from(grown.points)) as f32);
+        grown
+    }
+}
+
+/// The 26 cubes that touch `cube`.
+fn around(cube: [i16; 3]) -> impl Iterator<Item = [i16; 3]> {
+    let offset = |i: i16| [i / 9 - 1, i / 3 % 3 - 1, i % 3 - 1];
+    (0..27)
+        .map(offset)
+        .filter(|off| *off != [0; 3])
+        .map(move |off| std::array::from_fn(|i| cube[i].saturating_add(off[i])))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn near_points_are_one_obstacle_and_few_are_none() {
+        let pole = (0..20).map(|i| ([2.0, 0.0, 0.05 * i as f32], Obstacle::FOREGROUND));
+        let crate_ = (0..9).map(|i| ([1.0 + 0.1 * i as f32, -1.0, 0.3], Obstacle::NEAR));
+        let speck = (0..3).map(|i| ([5.0, 5.0, 0.1 * i as f32], Obstacle::FOREGROUND));
+        let mut clusters = Clusters::default();
+        let (found, left_out) = clusters.find(&pole.chain(crate_).chain(speck).collect::<Vec<_>>(), 0.15, 5);
+        assert_eq!((found.len(), left_out), (2, 0));
+        assert_eq!((found[0].points, found[0].flags), (9, Obstacle::NEAR), "the nearest first");
+        assert!((found[0].distance_m - 2.0_f32.sqrt()).abs() < 1e-6);
+        let pole = found[1];
+        assert_eq!((pole.low, pole.high, pole.points), ([2.0, 0.0, 0.0], [2.0, 0.0, 0.95], 20));
+        assert!((pole.middle[2] - 0.475).abs() < 1e-6);
+    }
+
+    /// The same by the definition: pairs of points whose cubes touch have the same name, until nothing changes.
+    fn slowly(points: &[[f32; 3]], cube_m: f32, least: usize) -> Vec<usize> {
+        let cube = |at: &[f32; 3]| at.map(|value| (value / cube_m).floor() as i32);
+        let mut names: Vec<usize> = (0..points.len()).collect();
+        let mut changes = true;
+        while changes {
+            changes = false;
+            for a in 0..points.len() {
+                for b in 0..points.len() {
+                    let (x, y) = (cube(&points[a]), cube(&points[b]));
+                    if (0..3).all(|i| (x[i] - y[i]).abs() <= 1) && names[b] < names[a] {
+                        names[a] = names[b];
+                        changes = true;
+                    }
+                }
+            }
+        }
+        let sizes = (0..points.len()).map(|name| names.iter().filter(|of| **of == name).count());
+        let mut sizes: Vec<usize> = sizes.filter(|size| *size >= least).collect();
+        sizes.sort_unstable();
+        sizes
+    }
+
+    #[test]
+    fn obstacles_are_those_of_the_definition() {
+        let mut clusters = Clusters::default();
+        for seed in 0..40 {
+            let mut random = fastrand::Rng::with_seed(seed);
+            let count = random.usize(0..90);
+            let points: Vec<[f32; 3]> =
+                (0..count).map(|_| std::array::from_fn(|_| 1.6 * random.f32() - 0.8)).collect();
+            let flagged: Vec<_> = points.iter().map(|at| (*at, 1)).collect();
+            let (found, left_out) = clusters.find(&flagged, 0.15, 2);
+            let mut sizes: Vec<usize> = found.iter().map(|obstacle| obstacle.points as usize).collect();
+            sizes.sort_unstable();
+            assert_eq!((sizes, left_out), (slowly(&points, 0.15, 2), 0), "seed {seed}");
+        }
+    }
+}

@@ -1,0 +1,194 @@
+//! What a sensor is tilted by: how it is turned at each moment, and what its encoder says of it, which may be wrong. A pure
+//! function of time. Knows no beams.
+
+use std::f64::consts::PI;
+
+use lms::Nanos;
+
+use crate::shape::Point;
+use crate::solid::Plane;
+
+/// A mount whose axis lies across, and that swings evenly to and fro. Angles grow as it looks down.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Mount {
+    /// Of the axis above the floor.
+    pub height_mm: f64,
+    /// From the axis to the sensor while it is level: ahead, and up.
+    pub arm_mm: (f64, f64),
+    /// Where it begins, and turns back.
+    pub from_deg: f64,
+    /// Where it turns, the greater angle.
+    pub to_deg: f64,
+    /// How fast.
+    pub deg_s: f64,
+    /// How often the encoder says where it is.
+    pub reports_hz: f64,
+    /// What goes wrong with what it says, or with the motor.
+    pub faults: Vec<Fault>,
+}
+
+/// Something goes wrong from one time to another.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Fault {
+    /// What.
+    pub kind: FaultKind,
+    /// Seconds since the sensor's start.
+    pub from_s: f64,
+    /// The end of it.
+    pub until_s: f64,
+}
+
+/// What goes wrong.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum FaultKind {
+    /// The motor stands, and the encoder says so. Afterwards it goes on from there.
+    Halts,
+    /// The encoder says nothing.
+    Silent,
+    /// The encoder says the same angle all the time, while the mount swings.
+    Stuck,
+    /// The encoder is off by so many degrees, from one moment to the next.
+    Jumps(f64),
+    /// The encoder gets off by so many degrees, at 2 degrees a second, and back.
+    Lies(f64),
+    /// What the encoder says comes so many seconds later, with the right time in it.
+    Late(f64),
+}
+
+/// What the encoder says.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Report {
+    /// When that was so.
+    pub stamp_ns: Nanos,
+    /// When it arrives.
+    pub arrives_ns: Nanos,
+    /// In radians.
+    pub angle_rad: f64,
+    /// How fast it grows, in radians a second.
+    pub rate_rad_s: f64,
+}
+
+impl Mount {
+    /// How the sensor is turned at `time_ns`, in radians.
+    pub fn angle_rad(&self, time_ns: Nanos) -> f64 {
+        self.angle_deg(time_ns as f64 / 1e9).to_radians()
+    }
+
+    /// What the encoder says for the `number`th time, if it says anything.
+    pub fn report(&self, number: u64) -> Option<Report> {
+        let time_s = number as f64 / self.reports_hz;
+        let mut at_s = time_s;
+        let mut off_deg = 0.0;
+        let mut late_s = 0.0;
+        for fault in self.faults.iter().filter(|fault| fault.is_on(time_s)) {
+            match fault.kind {
+                FaultKind::Halts => {}
+                FaultKind::Silent => return None,
+                FaultKind::Stuck => at_s = fault.from_s,
+                FaultKind::Jumps(by_deg) => off_deg += by_deg,
+                FaultKind::Lies(by_deg) => {
+                    let edge_s = (time_s - fault.from_s).min(fault.until_s - time_s);
+                    off_deg += by_deg.signum() * (LIE_DEG_S * edge_s).min(by_deg.abs());
+                }
+                FaultKind::Late(by_s) => late_s += by_s,
+            }
+        }
+        let stands = at_s != time_s || self.faults.iter().any(|fault| fault.halts(time_s));
+        let rate_deg_s = if stands { 0.0 } else { self.deg_s * self.direction(time_s) };
+        let nanos = |time_s: f64| (time_s * 1e9).round() as Nanos;
+        Some(Report {
+            stamp_ns: nanos(time_s),
+            arrives_ns: nanos(time_s + late_s),
+            angle_rad: (self.angle_deg(at_s) + off_deg).to_radians(),
+            rate_rad_s: rate_deg_s / 180.0 * PI,
+        })
+    }
+
+    /// The plane that the sensor measures in at `time_ns`.
+    pub(crate) fn plane(&self, time_ns: Nanos) -> Plane {
+        let down_deg = self.angle_deg(time_ns as f64 / 1e9);
+        let (sin, cos) = down_deg.to_radians().sin_cos();
+        let (ahead, up) = self.arm_mm;
+        let eye: Point = (ahead * cos + up * sin, self.height_mm - ahead * sin + up * cos);
+        Plane::new(eye, down_deg)
+    }
+
+    fn angle_deg(&self, time_s: f64) -> f64 {
+        let way = self.way(time_s);
+        let width = self.to_deg - self.from_deg;
+        self.from_deg + if way <= width { way } else { 2.0 * width - way }
+    }
+
+    fn direction(&self, time_s: f64) -> f64 {
+        if self.way(time_s) < self.to_deg - self.from_deg { 1.0 } else { -1.0 }
+    }
+
+    /// Degrees since it was at its beginning last.
+    fn way(&self, time_s: f64) -> f64 {
+        let stood = self.faults.iter().filter(|fault| fault.kind == FaultKind::Halts);
+        let stood_s: f64 = stood.map(|fault| (time_s.min(fault.until_s) - fault.from_s).max(0.0)).sum();
+        (self.deg_s * (time_s - stood_s)).rem_euclid(2.0 * (self.to_deg - self.from_deg))
+    }
+}
+
+impl Fault {
+    fn is_on(&self, time_s: f64) -> bool {
+        (self.from_s..self.until_s).contains(&time_s)
+    }
+
+    fn halts(&self, time_s: f64) -> bool {
+        self.kind == FaultKind::Halts && self.is_on(time_s)
+    }
+}
+
+/// How fast a lie grows: no step of it can be told from the mount's own.
+const LIE_DEG_S: f64 = 2.0;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn mount(faults: &[Fault]) -> Mount {
+        Mount {
+            height_mm: 1000.0,
+            arm_mm: (50.0, 30.0),
+            from_deg: -10.0,
+            to_deg: 50.0,
+            deg_s: 30.0,
+            reports_hz: 100.0,
+            faults: faults.to_vec(),
+        }
+    }
+
+    fn deg(mount: &Mount, time_s: f64) -> f64 {
+        mount.angle_rad((time_s * 1e9) as Nanos).to_degrees().round()
+    }
+
+    #[test]
+    fn it_swings_to_and_fro_and_stands_while_it_halts() {
+        let swings = mount(&[]);
+        assert_eq!([0.0, 1.0, 2.0, 3.0, 4.0].map(|s| deg(&swings, s)), [-10.0, 20.0, 50.0, 20.0, -10.0]);
+        let halted = mount(&[Fault { kind: FaultKind::Halts, from_s: 1.0, until_s: 5.0 }]);
+        assert_eq!([1.0, 3.0, 5.0, 6.0].map(|s| deg(&halted, s)), [20.0, 20.0, 20.0, 50.0]);
+        let report = halted.report(300).expect("it says so");
+        assert_eq!((report.angle_rad.to_degrees().round(), report.rate_rad_s), (20.0, 0.0));
+    }
+
+    #[test]
+    fn the_encoder_says_what_is_so_but_for_its_faults() {
+        let says =
+            |kind: FaultKind, number: u64| mount(&[Fault { kind, from_s: 0.5, until_s: 1.5 }]).report(number);
+        let deg = |kind, number| says(kind, number).map(|report| report.angle_rad.to_degrees().round());
+        assert_eq!(deg(FaultKind::Jumps(8.0), 100), Some(28.0));
+        assert_eq!(deg(FaultKind::Jumps(8.0), 200), Some(50.0));
+        assert_eq!(deg(FaultKind::Stuck, 100), Some(5.0));
+        assert_eq!(deg(FaultKind::Silent, 100), None);
+        assert_eq!(
+            [50, 75, 100, 149].map(|n| deg(FaultKind::Lies(-1.0), n)),
+            [5.0, 12.0, 19.0, 35.0].map(Some)
+        );
+        let late = says(FaultKind::Late(0.2), 100).expect("it says so");
+        assert_eq!((late.stamp_ns, late.arrives_ns), (1_000_000_000, 1_200_000_000));
+        assert!((late.rate_rad_s.to_degrees() - 30.0).abs() < 1e-9);
+    }
+}
