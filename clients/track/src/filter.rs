@@ -14,11 +14,7 @@ const SWING: f64 = 5.0;
 const DAMPING: f64 = 0.5;
 /// Spectral density of a leg's acceleration: with the two above, a leg is 0.14 m off the middle.
 const LEG_NOISE: f64 = 5.0;
-/// Who is slower than the first does not step: his legs stay where they are. So the middle of who stopped in the middle of a
-/// step is known, also if the one leg hides the other. Who is faster than the second walks as everybody does.
-const STANDS_M_S: f64 = 0.15;
-const WALKS_M_S: f64 = 0.5;
-/// The least share of that acceleration: who stands shifts his weight.
+/// Share of that acceleration of who stands: he shifts his weight.
 const STANDING: f64 = 0.01;
 /// Longest step of a prediction, and how many there are at most.
 const LONGEST_STEP_S: f64 = 0.05;
@@ -68,18 +64,16 @@ impl Filter {
     }
 
     /// Moves to `dt` seconds later, in steps that are short beside a swing. Who is not seen walks on with less and less
-    /// certainty: `fades`.
-    pub(crate) fn predict(&mut self, dt: f64, fades: bool) {
+    /// certainty: `fades`. The legs of who `stands` stay where they are, so that the middle of who stopped in the middle of a
+    /// step is known though one leg hides the other.
+    pub(crate) fn predict(&mut self, dt: f64, fades: bool, stands: bool) {
         let steps = (dt / LONGEST_STEP_S).ceil().clamp(1.0, MOST_STEPS);
-        (0..steps as usize).for_each(|_| self.step(dt / steps, fades));
+        (0..steps as usize).for_each(|_| self.step(dt / steps, fades, stands));
     }
 
-    fn step(&mut self, dt: f64, fades: bool) {
+    fn step(&mut self, dt: f64, fades: bool, stands: bool) {
         let keep = if fades { (-dt / 1.5).exp() } else { 1.0 };
-        let [vx, vy] = self.velocity();
-        let speed = (vx * vx + vy * vy).sqrt();
-        let walks = ((speed - STANDS_M_S) / (WALKS_M_S - STANDS_M_S)).clamp(0.0, 1.0);
-        let pull = walks * SWING * SWING;
+        let (pull, leg_noise) = if stands { (0.0, LEG_NOISE * STANDING) } else { (SWING * SWING, LEG_NOISE) };
         let swing = Matrix4::new(
             1.0,
             dt,
@@ -100,7 +94,7 @@ impl Filter {
         );
         self.state = swing * self.state;
         self.covariance = swing * self.covariance * swing.transpose();
-        for (row, noise) in [(0, BODY_NOISE), (2, LEG_NOISE * walks.max(STANDING))] {
+        for (row, noise) in [(0, BODY_NOISE), (2, leg_noise)] {
             self.covariance[(row, row)] += noise * dt * dt * dt / 3.0;
             self.covariance[(row, row + 1)] += noise * dt * dt / 2.0;
             self.covariance[(row + 1, row)] += noise * dt * dt / 2.0;
@@ -166,7 +160,7 @@ mod tests {
         for _ in 0..200 {
             let dt = 0.005 + 0.05 * random.f64();
             let before = filter.clone();
-            filter.predict(dt, false);
+            filter.predict(dt, false, false);
             let legs = [0, 1].map(|_| [1.0 + random.f64(), 2.0 + random.f64()]);
             let wide = |m: &Matrix4<f64>| {
                 DMatrix::from_fn(8, 8, |i, j| if i / 4 == j / 4 { m[(i % 4, j % 4)] } else { 0.0 })
@@ -202,7 +196,7 @@ mod tests {
         };
         for i in 0..600 {
             let t = 0.03 * f64::from(i);
-            filter.predict(0.03, false);
+            filter.predict(0.03, false, t > 3.0);
             filter.correct(Side::Plus, leg(t, 1.0), 0.03);
             if t < 3.5 {
                 filter.correct(Side::Minus, leg(t, -1.0), 0.03);
@@ -216,14 +210,14 @@ mod tests {
     fn who_is_not_seen_slows_down_and_gets_uncertain() {
         let mut filter = Filter::of_leg([0.0, 0.0], 0.03);
         for i in 0..50 {
-            filter.predict(0.04, false);
+            filter.predict(0.04, false, false);
             let x = 0.04 * f64::from(i);
             filter.correct(Side::Plus, [x, 0.1], 0.03);
             filter.correct(Side::Minus, [x, -0.1], 0.03);
         }
         assert!((filter.velocity()[0] - 1.0).abs() < 0.1 && filter.variance() < 0.03 * 0.03);
         let from = filter.place()[0];
-        (0..250).for_each(|_| filter.predict(0.04, true));
+        (0..250).for_each(|_| filter.predict(0.04, true, false));
         let walked = filter.place()[0] - from;
         assert!((1.2..1.8).contains(&walked) && filter.variance() > 0.5, "{walked} {}", filter.variance());
         assert!((filter.half()[0].powi(2) + filter.half()[1].powi(2)).sqrt() < 0.05);
