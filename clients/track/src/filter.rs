@@ -14,8 +14,6 @@ const SWING: f64 = 5.0;
 const DAMPING: f64 = 0.5;
 /// Spectral density of a leg's acceleration: with the two above, a leg is 0.14 m off the middle.
 const LEG_NOISE: f64 = 5.0;
-/// Share of that acceleration of who stands: he shifts his weight.
-const STANDING: f64 = 0.01;
 /// Longest step of a prediction, and how many there are at most.
 const LONGEST_STEP_S: f64 = 0.05;
 const MOST_STEPS: f64 = 40.0;
@@ -64,16 +62,14 @@ impl Filter {
     }
 
     /// Moves to `dt` seconds later, in steps that are short beside a swing. Who is not seen walks on with less and less
-    /// certainty: `fades`. The legs of who `stands` stay where they are, so that the middle of who stopped in the middle of a
-    /// step is known though one leg hides the other.
-    pub(crate) fn predict(&mut self, dt: f64, fades: bool, stands: bool) {
+    /// certainty: `fades`.
+    pub(crate) fn predict(&mut self, dt: f64, fades: bool) {
         let steps = (dt / LONGEST_STEP_S).ceil().clamp(1.0, MOST_STEPS);
-        (0..steps as usize).for_each(|_| self.step(dt / steps, fades, stands));
+        (0..steps as usize).for_each(|_| self.step(dt / steps, fades));
     }
 
-    fn step(&mut self, dt: f64, fades: bool, stands: bool) {
+    fn step(&mut self, dt: f64, fades: bool) {
         let keep = if fades { (-dt / 1.5).exp() } else { 1.0 };
-        let (pull, leg_noise) = if stands { (0.0, LEG_NOISE * STANDING) } else { (SWING * SWING, LEG_NOISE) };
         let swing = Matrix4::new(
             1.0,
             dt,
@@ -89,12 +85,12 @@ impl Filter {
             dt, //
             0.0,
             0.0,
-            -pull * dt,
+            -SWING * SWING * dt,
             (1.0 - 2.0 * DAMPING * SWING * dt).max(0.0),
         );
         self.state = swing * self.state;
         self.covariance = swing * self.covariance * swing.transpose();
-        for (row, noise) in [(0, BODY_NOISE), (2, leg_noise)] {
+        for (row, noise) in [(0, BODY_NOISE), (2, LEG_NOISE)] {
             self.covariance[(row, row)] += noise * dt * dt * dt / 3.0;
             self.covariance[(row, row + 1)] += noise * dt * dt / 2.0;
             self.covariance[(row + 1, row)] += noise * dt * dt / 2.0;
@@ -160,7 +156,7 @@ mod tests {
         for _ in 0..200 {
             let dt = 0.005 + 0.05 * random.f64();
             let before = filter.clone();
-            filter.predict(dt, false, false);
+            filter.predict(dt, false);
             let legs = [0, 1].map(|_| [1.0 + random.f64(), 2.0 + random.f64()]);
             let wide = |m: &Matrix4<f64>| {
                 DMatrix::from_fn(8, 8, |i, j| if i / 4 == j / 4 { m[(i % 4, j % 4)] } else { 0.0 })
@@ -187,37 +183,17 @@ mod tests {
     }
 
     #[test]
-    fn who_stops_in_the_middle_of_a_step_stays_where_he_is_though_one_leg_hides_the_other() {
-        let mut filter = Filter::of_leg([0.0, 0.0], 0.03);
-        let leg = |t: f64, side: f64| {
-            let t = t.min(2.6);
-            // Steps of 1.4 m to and fro, and 2.6 s are no whole number of them.
-            [t + side * 0.25 * (std::f64::consts::TAU * t / 1.4).sin(), side * 0.11]
-        };
-        for i in 0..600 {
-            let t = 0.03 * f64::from(i);
-            filter.predict(0.03, false, t > 3.0);
-            filter.correct(Side::Plus, leg(t, 1.0), 0.03);
-            if t < 3.5 {
-                filter.correct(Side::Minus, leg(t, -1.0), 0.03);
-            }
-        }
-        let [x, y] = filter.place();
-        assert!((x - 2.6).abs() < 0.05 && y.abs() < 0.05, "({x}, {y})");
-    }
-
-    #[test]
     fn who_is_not_seen_slows_down_and_gets_uncertain() {
         let mut filter = Filter::of_leg([0.0, 0.0], 0.03);
         for i in 0..50 {
-            filter.predict(0.04, false, false);
+            filter.predict(0.04, false);
             let x = 0.04 * f64::from(i);
             filter.correct(Side::Plus, [x, 0.1], 0.03);
             filter.correct(Side::Minus, [x, -0.1], 0.03);
         }
         assert!((filter.velocity()[0] - 1.0).abs() < 0.1 && filter.variance() < 0.03 * 0.03);
         let from = filter.place()[0];
-        (0..250).for_each(|_| filter.predict(0.04, true, false));
+        (0..250).for_each(|_| filter.predict(0.04, true));
         let walked = filter.place()[0] - from;
         assert!((1.2..1.8).contains(&walked) && filter.variance() > 0.5, "{walked} {}", filter.variance());
         assert!((filter.half()[0].powi(2) + filter.half()[1].powi(2)).sqrt() < 0.05);

@@ -18,8 +18,6 @@ pub(crate) struct Person {
     pub(crate) life: Life,
     /// When a leg of his was seen last.
     pub(crate) seen_ns: u64,
-    /// When both legs were seen last.
-    pub(crate) pair_ns: u64,
     /// When each sensor saw him last; 0 never.
     pub(crate) seen_by_ns: [u64; crate::site::SENSORS],
     /// Scans that spoke for him, at most [`MOST_SUPPORT`].
@@ -52,9 +50,6 @@ const ENOUGH: f64 = 8.0;
 pub(crate) const MOST_SUPPORT: f64 = 20.0;
 /// Nobody is known sooner.
 const SOONEST_NS: u64 = 300_000_000;
-/// Who is slower and shows only one leg for so long stands.
-const STANDS_M_S: f64 = 0.3;
-const ONE_LEG_NS: u64 = 60_000_000;
 /// Who was seen within this time is not hidden.
 const LATELY_NS: u64 = 250_000_000;
 
@@ -72,7 +67,6 @@ impl Person {
             born_ns: at_ns,
             life: Life::Tentative,
             seen_ns: at_ns,
-            pair_ns: at_ns,
             seen_by_ns: [0; crate::site::SENSORS],
             support: 1.0,
             pairs: if legs.len() > 1 { 1.0 } else { 0.0 },
@@ -88,8 +82,7 @@ impl Person {
         if at_ns > self.at_ns {
             let dt = (at_ns - self.at_ns) as f64 * 1e-9;
             let fades = at_ns - self.seen_ns > LATELY_NS;
-            let stands = self.speed() < STANDS_M_S && at_ns - self.pair_ns > ONE_LEG_NS;
-            self.filter.predict(dt, fades, stands);
+            self.filter.predict(dt, fades);
             self.at_ns = at_ns;
         }
     }
@@ -101,9 +94,6 @@ impl Person {
         self.absent_s = 0.0;
         let both = if legs > 1 { 1.0 } else { 0.0 };
         self.pairs += both;
-        if legs > 1 {
-            self.pair_ns = self.at_ns;
-        }
         self.both += 0.05 * (both - self.both);
         self.support = (self.support + 1.0).min(MOST_SUPPORT);
         let speed = self.speed();

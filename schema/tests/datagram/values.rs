@@ -56,8 +56,9 @@ pub(crate) const ALL: [Golden; 18] = [
 fn tracks() -> Tracks {
     let mut tracks = Tracks::default();
     let pose = Pose { x_m: 12.5, y_m: -0.5, yaw_rad: 1.5, upside_down: 1, ..Pose::default() };
-    [("front", Pose::default()), ("kitchen.rear", pose)]
-        .map(|(name, pose)| tracks.push_sensor(TrackSensor::new(name, &pose)));
+    for (name, pose) in [("front", Pose::default()), ("kitchen.rear", pose)] {
+        tracks.push_sensor(TrackSensor::new(name, &pose));
+    }
     let mut first = Track {
         id: 3,
         x_m: 1.5,
@@ -83,7 +84,8 @@ fn tracks() -> Tracks {
         ..Track::default()
     };
     second.set_room("Küche");
-    [first, second].map(|track| tracks.push(track));
+    tracks.push(first);
+    tracks.push(second);
     tracks
 }
 
