@@ -204,7 +204,9 @@ mod tests {
     fn names_and_states_of_a_sample() {
         let mut tracks = Tracks::default();
         let pose = Pose { x_m: 1.5, y_m: -2.0, yaw_rad: 0.5, upside_down: 1, ..Pose::default() };
-        ["front", "kitchen.rear"].map(|name| tracks.push_sensor(TrackSensor::new(name, &pose)));
+        for name in ["front", "kitchen.rear"] {
+            tracks.push_sensor(TrackSensor::new(name, &pose));
+        }
         assert_eq!((tracks.sensors()[1].pose(), tracks.sensors()[1].name()), (pose, "kitchen.rear"));
         let mut track = Track { id: 7, sensors: 2, state: 3, ..Track::default() };
         assert_eq!(track.room_name(), None);

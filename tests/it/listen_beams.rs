@@ -4,7 +4,7 @@
 
 use serde_json::{Value, json};
 
-use crate::testkit::{INT, Program, Sender, TERM, TestEnv, in_a_network, is_class, number, sequence};
+use crate::testkit::{INT, Program, Sender, TERM, TestEnv, in_a_network, is_class, number};
 use schema::{BEAMS, Contents, Family, Scan, ScanHead, Topic};
 
 /// What both say of one scan, but for what is of the place where it was published.
@@ -68,7 +68,9 @@ fn turns_of_any_length_come_whole() {
             for topic in ["scan", "foreground", "telegram"] {
                 let lines = outcome.of_class(topic);
                 let (far, near): (Vec<_>, Vec<_>) = lines.into_iter().partition(is_there);
-                sequence(&far, "topic_seq");
+                // One echo of all topics may skip some on a busy machine; the network loses none, see below.
+                let numbers: Vec<u64> = far.iter().map(|line| number(line, "topic_seq")).collect();
+                assert!(numbers.is_sorted_by(|one, next| one < next), "{topic}: {numbers:?}");
                 let same = |line: &Value| near.iter().find(|it| it["seq"] == line["seq"]).cloned();
                 let both = far.iter().filter_map(|line| Some((line, same(line)?)));
                 let mut compared = 0;
@@ -89,6 +91,7 @@ fn turns_of_any_length_come_whole() {
         }
         assert_eq!((gateway.end(TERM).code, hub.end(TERM).code), (Some(0), Some(0)));
         let outcome = listener.end(TERM);
+        assert!(outcome.of_class("lan").iter().all(|row| row["lost"] == 0), "{outcome}");
         let published = &outcome.of_class("lan_published")[0];
         assert_eq!(
             (&published["loan_failed"], &published["unannounced"]),

@@ -18,7 +18,7 @@ type Stream = (u8, u8);
 
 /// Sends all that two sensors have.
 fn gateway(robot: &Robot) -> Program {
-    robot.gateway(&Topic::ALL.map(|topic| format!("--topic=*/{}", topic.name())))
+    robot.gateway(&Topic::OF_LINKS.map(|topic| format!("--topic=*/{}", topic.name())))
 }
 
 fn listener(env: &TestEnv, words: &[&str]) -> Program {
@@ -110,7 +110,7 @@ fn every_listener_knows_exactly_what_it_missed() {
         let env = TestEnv::on(&second);
         let early = listener(&env, &["--stats"]);
         let gateway = gateway(&robot);
-        until("all topics of both sensors", || truth(&relay.log()).len() == 2 * (Topic::ALL.len() + 1));
+        until("all topics of both sensors", || truth(&relay.log()).len() == 2 * (Topic::OF_LINKS.len() + 1));
         relay.set_rough(true);
         until("half of what is rough", || relay.log().len() > MANY / 2);
         let env = TestEnv::on(&third);
@@ -165,7 +165,7 @@ fn a_sensor_of_another_machine_is_followed_as_one_here() {
         let hub = format!("{:016x}", read(&relay.log()[0]).head.hub);
         let (front, rear) = (format!("{hub}.front/scan"), format!("{hub}.rear/zones"));
         let topics = || env.run(&["list", "--json"]).of_class("topic").len();
-        until("both sensors are published", || topics() == 2 * Topic::ALL.len());
+        until("both sensors are published", || topics() == 2 * Topic::OF_LINKS.len());
         let mut hz = env.start(&["hz", "--json", &front]);
         let mut there = robot.env.echo(&["front/scan"]);
         let mut here = env.echo(&[&front, &rear]);

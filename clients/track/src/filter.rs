@@ -14,12 +14,6 @@ const SWING: f64 = 5.0;
 const DAMPING: f64 = 0.5;
 /// Spectral density of a leg's acceleration: with the two above, a leg is 0.14 m off the middle.
 const LEG_NOISE: f64 = 5.0;
-/// Who is slower than the first does not step: his legs stay where they are. So the middle of who stopped in the middle of a
-/// step is known, also if the one leg hides the other. Who is faster than the second walks as everybody does.
-const STANDS_M_S: f64 = 0.15;
-const WALKS_M_S: f64 = 0.5;
-/// The least share of that acceleration: who stands shifts his weight.
-const STANDING: f64 = 0.01;
 /// Longest step of a prediction, and how many there are at most.
 const LONGEST_STEP_S: f64 = 0.05;
 const MOST_STEPS: f64 = 40.0;
@@ -76,10 +70,6 @@ impl Filter {
 
     fn step(&mut self, dt: f64, fades: bool) {
         let keep = if fades { (-dt / 1.5).exp() } else { 1.0 };
-        let [vx, vy] = self.velocity();
-        let speed = (vx * vx + vy * vy).sqrt();
-        let walks = ((speed - STANDS_M_S) / (WALKS_M_S - STANDS_M_S)).clamp(0.0, 1.0);
-        let pull = walks * SWING * SWING;
         let swing = Matrix4::new(
             1.0,
             dt,
@@ -95,12 +85,12 @@ impl Filter {
             dt, //
             0.0,
             0.0,
-            -pull * dt,
+            -SWING * SWING * dt,
             (1.0 - 2.0 * DAMPING * SWING * dt).max(0.0),
         );
         self.state = swing * self.state;
         self.covariance = swing * self.covariance * swing.transpose();
-        for (row, noise) in [(0, BODY_NOISE), (2, LEG_NOISE * walks.max(STANDING))] {
+        for (row, noise) in [(0, BODY_NOISE), (2, LEG_NOISE)] {
             self.covariance[(row, row)] += noise * dt * dt * dt / 3.0;
             self.covariance[(row, row + 1)] += noise * dt * dt / 2.0;
             self.covariance[(row + 1, row)] += noise * dt * dt / 2.0;
@@ -190,26 +180,6 @@ mod tests {
             }
             assert!((&p - wide(&filter.covariance)).amax() < 1e-6);
         }
-    }
-
-    #[test]
-    fn who_stops_in_the_middle_of_a_step_stays_where_he_is_though_one_leg_hides_the_other() {
-        let mut filter = Filter::of_leg([0.0, 0.0], 0.03);
-        let leg = |t: f64, side: f64| {
-            let t = t.min(2.6);
-            // Steps of 1.4 m to and fro, and 2.6 s are no whole number of them.
-            [t + side * 0.25 * (std::f64::consts::TAU * t / 1.4).sin(), side * 0.11]
-        };
-        for i in 0..600 {
-            let t = 0.03 * f64::from(i);
-            filter.predict(0.03, false);
-            filter.correct(Side::Plus, leg(t, 1.0), 0.03);
-            if t < 3.5 {
-                filter.correct(Side::Minus, leg(t, -1.0), 0.03);
-            }
-        }
-        let [x, y] = filter.place();
-        assert!((x - 2.6).abs() < 0.05 && y.abs() < 0.05, "({x}, {y})");
     }
 
     #[test]

@@ -84,9 +84,8 @@ fn tracks() -> Tracks {
         ..Track::default()
     };
     second.set_room("Küche");
-    for track in [first, second] {
-        tracks.push(track);
-    }
+    tracks.push(first);
+    tracks.push(second);
     tracks
 }
 

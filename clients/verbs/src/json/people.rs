@@ -100,7 +100,9 @@ mod tests {
     #[test]
     fn tracks_to_the_letter() {
         let mut all = Tracks::default();
-        ["front", "kitchen.rear"].map(|name| all.push_sensor(TrackSensor::new(name, &Pose::default())));
+        for name in ["front", "kitchen.rear"] {
+            all.push_sensor(TrackSensor::new(name, &Pose::default()));
+        }
         let mut track = Track {
             id: 3,
             x_m: 1.2344,

@@ -11,7 +11,7 @@ use ratatui::buffer::Buffer;
 use ratatui::style::{Color, Modifier};
 use schema::{
     Background, BackgroundHead, Counter, Foreground, ForegroundHead, Header, Mark, Marks, Pose, Scan,
-    ScanHead, Segment, State, Status, Verdict, Zone, Zones,
+    ScanHead, Segment, State, Status, Track, TrackState, Tracks, Verdict, Zone, Zones,
 };
 
 use super::draw::{draw, place_of_map};
@@ -342,4 +342,22 @@ fn what_the_line_takes_away_is_seen_on_a_small_screen_too() {
         assert!(line.contains(" Hz  41 % lost on the line"), "{line}");
         assert!(!screen.lines().any(|line| line.starts_with("1 front") && line.contains("line")), "{screen}");
     }
+}
+
+#[test]
+fn people_of_a_tracker_stand_in_the_picture_with_their_numbers_and_tails() {
+    let (mut scene, view) = (scene(), View::new(true));
+    let plain = screen(&scene, &view, (120, 40));
+    let mut tracks = Tracks::default();
+    for (id, state) in [(12, TrackState::Confirmed), (13, TrackState::Tentative)] {
+        tracks.push(Track { id, x_m: 2.0, y_m: -2.0, state: state as u8, ..Track::default() });
+    }
+    for n in 0..20 {
+        tracks.track_array[0].x_m = 1.0 + 0.05 * n as f32;
+        scene.take_tracks("house", &tracks, 1 + n * 200_000_000);
+    }
+    let shown = screen(&scene, &view, (120, 40));
+    assert!(text(&shown).contains("#12") && !text(&shown).contains("#13"), "{}", text(&shown));
+    let green = |buffer: &Buffer| buffer.content.iter().filter(|cell| cell.fg == Color::LightGreen).count();
+    assert!(green(&plain) == 0 && green(&shown) > 5, "{} and {}", green(&plain), green(&shown));
 }

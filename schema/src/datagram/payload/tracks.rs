@@ -87,7 +87,9 @@ mod tests {
 
     fn two() -> Tracks {
         let mut tracks = Tracks::default();
-        ["front", "kitchen.rear"].map(|name| tracks.push_sensor(TrackSensor::new(name, &Pose::default())));
+        for name in ["front", "kitchen.rear"] {
+            tracks.push_sensor(TrackSensor::new(name, &Pose::default()));
+        }
         tracks.push(Track { id: 1, x_m: -1.5, sensors: 3, ..Track::default() });
         tracks.push(Track { id: u64::MAX, age_ms: 9, state: 2, ..Track::default() });
         tracks
