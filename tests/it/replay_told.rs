@@ -73,6 +73,5 @@ fn packets_that_may_be_of_two_kinds_are_refused_with_what_to_set() {
     assert!(replayed.len() + 5 > recorded.len(), "{} of {}", replayed.len(), recorded.len());
 }
 
-/// How far times of the day may be off to each other: both sessions learn when packets come and how clocks drift, the
-/// second one from what the first one handed on together.
-const OFF_NS: u64 = 10_000_000;
+/// How far times of the day may be off to each other: how long a point takes is measured, better the longer that is done.
+const OFF_NS: u64 = 40_000_000;

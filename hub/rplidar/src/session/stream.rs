@@ -207,10 +207,7 @@ impl Session {
         if self.point_ns.is_some_and(|before| (before / point_ns - 1.0).abs() > 0.1) {
             self.sequence.end();
         }
-        if self.point_ns.replace(point_ns) != Some(point_ns) {
-            // Delays that were noted by another pace would date all that follows.
-            self.clock = SensorClock::new();
-        }
+        self.point_ns = Some(point_ns);
     }
 
     /// The grid is known once it is known how fast the head turns.
