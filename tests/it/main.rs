@@ -65,6 +65,7 @@ mod refusals;
 mod reload;
 mod replay;
 mod replay_packets;
+mod replay_told;
 mod replayed;
 mod report;
 mod restart;

@@ -16,7 +16,7 @@ use serde_json::Value;
 const OFF_NS: i64 = 5_000_000;
 
 /// A recorder of `flags` that is attached.
-fn recorder(env: &TestEnv, name: &str, flags: &[&str]) -> Program {
+pub(crate) fn recorder(env: &TestEnv, name: &str, flags: &[&str]) -> Program {
     let file = env.word(name);
     let before = env.subscribers("front/telegram");
     let recorder = env.start(&[&["record", "--json", "-o", &file], flags].concat());
@@ -43,7 +43,7 @@ fn record(env: &TestEnv, model: &str, settings: &[&str], scans: usize) {
 }
 
 /// Replays `name` with these words, and records what comes of it.
-fn replay(env: &TestEnv, name: &str, words: &[&str]) -> Value {
+pub(crate) fn replay(env: &TestEnv, name: &str, words: &[&str]) -> Value {
     let file = env.word(name);
     let words = [&["replay", "--json", "--no-system-config", "--paused", &file], words].concat();
     let player = env.start(&words).ready();
@@ -56,13 +56,13 @@ fn replay(env: &TestEnv, name: &str, words: &[&str]) -> Value {
 }
 
 /// Headers and payloads of a topic in a file.
-fn samples(file: &Path, topic: &str) -> Vec<(Header, Vec<u8>)> {
+pub(crate) fn samples(file: &Path, topic: &str) -> Vec<(Header, Vec<u8>)> {
     let recording = Recording::whole(file);
     let parts = |data: &[u8]| file::parts(data).map(|(header, payload)| (header, payload.to_vec()));
     recording.of(topic).iter().map(|kept| parts(&kept.data).expect("a sample")).collect()
 }
 
-fn scan(payload: &[u8]) -> Box<Scan> {
+pub(crate) fn scan(payload: &[u8]) -> Box<Scan> {
     let mut scan = Box::default();
     assert!(Scan::unpack_into(&mut scan, payload));
     scan

@@ -136,7 +136,7 @@ impl Sequence {
         let packets = packets + f64::from(off);
         let tolerance = advance * ((0.25 + 0.01 * packets).min(0.5) + f64::from(off.abs()));
         let late = late(last.time + packets * came.packet_ns);
-        if packets < 1.0 || (angle - packets * advance).abs() > tolerance || late < EARLY {
+        if packets < 1.0 || (angle - packets * advance).abs() > tolerance || turn.is_early(late, angle) {
             return self.odd(came);
         }
         if turn.is_apart(late) {
@@ -167,7 +167,7 @@ impl Sequence {
             return self.next_point(last, came, angle, points, Step::Next);
         }
         let late = late(due + turn.time(360.0 * turns));
-        if late < EARLY || (came.adjoins() && turns == 0.0) {
+        if turn.is_early(late, angle) || (came.adjoins() && turns == 0.0) {
             return self.odd(came);
         }
         if turn.is_apart(late) {
@@ -269,6 +269,11 @@ impl Turn {
         f64::from((late.max(0.0) / self.time(360.0) + 0.5) as u32)
     }
 
+    /// Whether a packet that is `angle` degrees behind the last one comes before it was measured: clocks differ by little.
+    fn is_early(self, late: f64, angle: f64) -> bool {
+        late < -(EARLY + MOST_DRIFT * self.time(angle))
+    }
+
     /// Whether a packet comes so much later than its angle says that the scanner did not send for a while.
     fn is_apart(self, late: f64) -> bool {
         late > 0.15 * self.time(360.0)
@@ -288,8 +293,10 @@ const BEGIN: f64 = 1e10;
 /// Degrees by which a point may lie before one that came before it, and behind it without a gap.
 const BACK: f64 = 25.0;
 const AHEAD: f64 = 25.0;
-/// Nanoseconds by which nothing comes before its time.
-const EARLY: f64 = -1e7;
+/// Nanoseconds by which nothing comes before its time, and the share of the time since the last packet by which two clocks
+/// may differ.
+const EARLY: f64 = 3e6;
+const MOST_DRIFT: f64 = 0.02;
 /// Bytes of a packet of one point.
 const POINT: u32 = 5;
 /// So many points of a stream of single ones may be missing without a word.

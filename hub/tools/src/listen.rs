@@ -80,10 +80,15 @@ pub(crate) fn listen(
     port.try_baud(session.rate()).map_err(|error| gone(port, &error))?;
     let mut heard = Turns::default();
     let (first_rate, mut rate, mut rates) = (session.rate(), 0, 0);
+    // Who is asked may not hear it, or be late with an answer.
+    let mut rounds = if features.speaks_unasked { 1 } else { 2 };
     loop {
         if !fixed_rate && rate != session.rate() {
             (rate, rates) = (session.rate(), rates + 1);
             if rates > 1 && rate == first_rate {
+                rounds -= 1;
+            }
+            if rounds == 0 {
                 break;
             }
             look(rate);

@@ -86,7 +86,7 @@ fn main() {
     tables.judge("ld hub stands still for 2 s", "ld19", 0..100, 60, &stalls);
     for (model, _) in RPLIDAR {
         for state in ["idle", "streaming", "off", "error"] {
-            tables.judge("rplidar start", &format!("{model}::{state}"), 0..20, 14, "");
+            tables.judge("rplidar start", &format!("{model}::{state}"), 0..20, 5, "");
         }
     }
 }

@@ -152,8 +152,13 @@ impl Table {
 
     /// The beam at a sensor angle.
     fn beam(&self, angle: f64) -> Beam {
-        let ((sx, sy), (ux, uy)) = (self.sensor_mm(), self.pose.direction(angle));
         let own = in_units(self.self_min_mm(angle) as f64, self.layout.unit_mm());
+        let (sx, sy) = self.sensor_mm();
+        if (sx, sy) == (0.0, 0.0) && self.pose.yaw_rad.is_finite() {
+            // From the robot's centre all beams are alike, and exact ones are many.
+            return Beam { q: 0.0, own };
+        }
+        let (ux, uy) = self.pose.direction(angle);
         Beam { q: sx * ux + sy * uy, own }
     }
 
@@ -285,6 +290,9 @@ impl Table {
 
     /// Where the robot's own body ends along a beam.
     fn self_min_mm(&self, angle: f64) -> u64 {
+        if self.sectors.is_empty() {
+            return 0;
+        }
         let angle_mdeg = in_sector_mdeg(angle);
         let here = |sector: &&Sector| (sector.from_mdeg..=sector.to_mdeg).contains(&angle_mdeg);
         self.sectors.iter().filter(here).map(|sector| u64::from(sector.range_mm)).max().unwrap_or(0)

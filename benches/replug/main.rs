@@ -1,9 +1,13 @@
 //! What does a pulled plug cost? A pty that plays a streaming sensor is taken away under a running hub and comes back
 //! under its name, every other time with another number, twenty times in all: how long until the hub says that the port
 //! is absent, how long until a consumer has a telegram again, and what the hub costs meanwhile. It does not tell how long
-//! the kernel takes to notice an adapter, nor udev to name it.
+//! the kernel takes to notice an adapter, nor udev to name it. The same for scanners whose heads turn, and what it takes when
+//! their power is gone and back.
 
+#[path = "../support/mod.rs"]
 mod support;
+
+mod heads;
 
 use std::ffi::OsStr;
 use std::fs;
@@ -67,7 +71,7 @@ fn measure(options: &Options) -> Outcome<()> {
     plug.pull(&name)?;
     let figure = |name, unit, hub, target| Figure { name, unit, hub, floor: Vec::new(), target };
     let worst = |values: &[f64]| vec![values.iter().copied().fold(0.0, f64::max)];
-    let figures = [
+    let mut figures = vec![
         figure("unplugged, longest until absent", "ms", worst(&noticed), Target::Most(50.0)),
         figure("unplugged until absent", "ms", noticed, Target::None),
         figure("back, longest until a telegram", "ms", worst(&back), Target::Most(500.0)),
@@ -76,6 +80,8 @@ fn measure(options: &Options) -> Outcome<()> {
         figure("hub while absent", "% of a core", busy, Target::None),
         figure("torn telegrams", "1", vec![torn], Target::Most(0.0)),
     ];
+    drop(stage);
+    figures.extend(heads::measure(options)?);
     figures::print("replug", options.json, &figures);
     Ok(())
 }

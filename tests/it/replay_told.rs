@@ -1,0 +1,77 @@
+//! Recordings of scanners that are asked what they are, begun while they streamed already: nobody asks in them any more. The
+//! status that a hub published tells how the packets are to be read; where nothing tells it, they are not played.
+
+use schema::Header;
+
+use crate::replay_packets::{recorder, replay, samples, scan};
+use crate::testkit::{INT, TERM, TestEnv, is_class};
+
+/// Records two files, one with telegrams alone, of an RPLIDAR that streams with these settings, until so many scans came.
+fn record(env: &TestEnv, model: &str, settings: &[&str], scans: usize) {
+    let words = ["--family=rplidar", &format!("--model={model}"), "--world=room", "--seed=5"];
+    let faults = "--fault=loss=0.01,burst=40";
+    let simulator = env.simulator(&["front"], &[&words[..], &[faults]].concat());
+    let set = ["family=rplidar"].iter().chain(settings).map(|set| format!("--set=link.front.{set}"));
+    let hub = env.hub(&[vec![env.link("front")], set.collect()].concat());
+    env.await_info("front", |info| info["state"] == "streaming" && info["hz"].as_f64() > Some(5.0));
+    let recorders = [recorder(env, "all.mcap", &["--all"]), recorder(env, "telegrams.mcap", &["*/telegram"])];
+    let mut echo = env.echo(&["front/scan"]);
+    echo.await_lines(scans, "a scan", is_class("scan"));
+    for recorder in recorders {
+        assert_eq!(recorder.end(INT).code, Some(0));
+    }
+    assert_eq!((echo.end(INT).code, hub.end(TERM).code), (Some(0), Some(0)));
+    assert_eq!(simulator.end(TERM).code, Some(0));
+}
+
+/// Whether the scans of both are the same, but for those of the first two seconds, in which a session learns how long a point
+/// takes. They have other numbers, and the same times of the day.
+fn check(recorded: &[(Header, Vec<u8>)], replayed: &[(Header, Vec<u8>)]) {
+    let begin = recorded[0].0.wall_ns;
+    let learned = recorded.iter().filter(|(header, _)| header.wall_ns > begin + 2_000_000_000);
+    let mut compared = 0;
+    for (header, payload) in learned {
+        let off = |played: &&(Header, Vec<u8>)| played.0.wall_ns.abs_diff(header.wall_ns);
+        let played = replayed.iter().min_by_key(off).expect("some");
+        assert!(off(&played) < OFF_NS, "{} ms off", off(&played) as f64 / 1e6);
+        let (then, now) = (scan(payload), scan(&played.1));
+        assert_eq!(then.ranges(), now.ranges(), "{}", header.seq);
+        assert_eq!((then.flags, then.collapsed), (now.flags, now.collapsed), "{}", header.seq);
+        compared += 1;
+    }
+    assert!(compared > 20, "{compared}");
+}
+
+#[test]
+fn a_recorded_status_tells_mode_and_beams() {
+    // Express packets and dense ones begin alike.
+    for (model, settings, beams) in [
+        ("a1", ["model=a1", "mode=express", "beams=400"], 400),
+        ("s1", ["model=auto", "mode=denseboost", "beams=700"], 700),
+    ] {
+        let env = TestEnv::in_time();
+        record(&env, model, &settings, 60);
+        let recorded = samples(&env.path("all.mcap"), "front/scan");
+        assert!(recorded.iter().all(|(_, payload)| scan(payload).beams() == beams), "{model}");
+        replay(&env, "all.mcap", &[]);
+        check(&recorded, &samples(&env.path("replayed.mcap"), "front/scan"));
+    }
+}
+
+#[test]
+fn packets_that_may_be_of_two_kinds_are_refused_with_what_to_set() {
+    let env = TestEnv::in_time();
+    record(&env, "s1", &["mode=denseboost"], 30);
+    let file = env.word("telegrams.mcap");
+    let refused = env.run(&["replay", "--json", "--no-system-config", "--rate=max", &file]);
+    assert_eq!(refused.code, Some(66), "{refused}");
+    assert!(refused.errors.contains("link.NAME.model or mode"), "{refused}");
+    // Said by hand, they are played.
+    let recorded = samples(&env.path("all.mcap"), "front/scan");
+    replay(&env, "telegrams.mcap", &["--set=link.front.mode=denseboost", "--set=link.front.model=s1"]);
+    let replayed = samples(&env.path("replayed.mcap"), "front/scan");
+    assert!(replayed.len() + 5 > recorded.len(), "{} of {}", replayed.len(), recorded.len());
+}
+
+/// How far times of the day may be off to each other: how long a point takes is measured, better the longer that is done.
+const OFF_NS: u64 = 40_000_000;
