@@ -9,16 +9,16 @@ use schema::Topic;
 use crate::follow::Notice;
 use crate::names::TopicName;
 
-/// What is followed. [`Topic::Lines`] costs the hub something as soon as somebody follows it, so that is only done while
+/// What is followed; the status first, because it says where the sensor sits. [`Topic::Lines`] costs the hub something as soon as somebody follows it, so that is only done while
 /// they are looked at.
 pub(crate) const TOPICS: [Topic; 7] = [
+    Topic::Status,
     Topic::Scan,
     Topic::Marks,
     Topic::Zones,
     Topic::Foreground,
     Topic::Background,
     Topic::Lines,
-    Topic::Status,
 ];
 
 /// What is followed of `sensors`; of all of a hub if there are none.
