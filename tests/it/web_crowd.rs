@@ -10,7 +10,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread;
 use std::time::{Duration, Instant};
 
-use crate::testkit::{INT, PATIENCE, Program, TestEnv, is_class};
+use crate::testkit::{INT, PATIENCE, Program, TestEnv, is_class, until};
 use crate::web::{connect, status, text, view, web};
 use rustix::net::sockopt::set_socket_recv_buffer_size;
 use rustix::process::{Pid, Resource, Rlimit, getrlimit, prlimit};
@@ -156,6 +156,10 @@ fn limit_descriptors(server: &Program, most: u64) {
     prlimit(pid, Resource::Nofile, limit).expect("its limit");
 }
 
+/// What the server follows of a sensor when nobody asks for lines.
+const FOLLOWED: [&str; 6] =
+    ["front/scan", "front/marks", "front/zones", "front/foreground", "front/background", "front/status"];
+
 /// The lowest descriptor that it does not have.
 fn next_descriptor(server: &Program) -> u64 {
     let open = |number: &u64| !Path::new(&format!("/proc/{}/fd/{number}", server.pid())).exists();
@@ -180,6 +184,8 @@ fn where_descriptors_are_short_who_is_there_is_served_and_who_comes_waits() {
     let (mut server, host) = web(&env, &[]);
     let mut viewer = view(&host, "/", None).expect("let in");
     subscribe(&mut viewer, "/front/scan");
+    // All that it follows takes descriptors, too.
+    until("it follows all topics", || FOLLOWED.iter().all(|topic| env.subscribers(topic) > 0));
     await_messages(&mut viewer, 5);
     limit_descriptors(&server, next_descriptor(&server));
     let mut late = connect(&host);

@@ -158,7 +158,9 @@ fn the_picture_of_the_documents() {
         page.await_true("scanhub.zones === 2 && scanhub.marks >= 2 && scanhub.sensors.length === 2");
         page.await_true("document.querySelectorAll('#sensors article.streaming').length === 2");
         if let Some(directory) = std::env::var_os("SCANHUB_PICTURES") {
-            page.ask("new Promise((done) => setTimeout(done, 60_000))");
+            for _ in 0..6 {
+                page.ask("new Promise((done) => setTimeout(done, 10_000))");
+            }
             let quiet =
                 "!document.querySelector('#sensors .lossy') && !document.querySelector('#news').innerText";
             page.await_true(&format!("{seen} && {quiet}"));

@@ -9,16 +9,16 @@ use schema::{Domain, Topic};
 use crate::follow::Notice;
 use crate::names::TopicName;
 
-/// What is followed. [`Topic::Lines`] costs the hub something as soon as somebody follows it, so that is only done while
-/// they are looked at.
+/// What is followed; the status first, because it says where the sensor sits. [`Topic::Lines`] costs the hub something as soon
+/// as somebody follows it, so that is only done while they are looked at.
 pub(crate) const TOPICS: [Topic; 8] = [
+    Topic::Status,
     Topic::Scan,
     Topic::Marks,
     Topic::Zones,
     Topic::Foreground,
     Topic::Background,
     Topic::Lines,
-    Topic::Status,
     Topic::Tracks,
 ];
 
