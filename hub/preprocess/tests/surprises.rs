@@ -37,7 +37,7 @@ fn follow(scans: &[Box<Scan>]) -> Vec<Said> {
     let mut estimator = MotionEstimator::new(Pose::default(), motion::Settings::default(), beams);
     let mut model = Model::new(MAP, beams);
     let mut out = Foreground::of(beams);
-    let say = |scan: &Box<Scan>| {
+    let say = |scan: &Scan| {
         let (mut lines, mut motion) = (Lines::default(), Motion::default());
         finder.update(scan, &mut lines);
         estimator.update(scan, &lines, &mut motion);
@@ -46,7 +46,7 @@ fn follow(scans: &[Box<Scan>]) -> Vec<Said> {
         let classes = model.classes().to_vec();
         Said { lines, motion, classes, foreground: usize::from(out.beams) }
     };
-    scans.iter().map(say).collect()
+    scans.iter().map(|scan| &**scan).map(say).collect()
 }
 
 /// The worst of the step's three numbers: its error in deviations that are said of it.
