@@ -148,7 +148,10 @@ fn write(track: &Track, found: &Match, step: &Rigid, out: &mut Motion) {
     (out.dx_m, out.dy_m, out.dyaw_rad) = (step.x as f32, step.y as f32, step.yaw as f32);
     // Both scans are unsure by their own noise; that of the kept one moves both places alike.
     let before = track.unsure.unwrap_or(found.of_kept);
-    let covariance = solve::of_step(&found.own, &before, &track.last, step);
+    let mut covariance = solve::of_step(&found.own, &before, &track.last, step);
+    // Readings that lie on nothing speak against this step: by them the robot went on as before.
+    let other = [step.x - track.step.x, step.y - track.step.y, step.yaw - track.step.yaw];
+    solve::add_outer(&mut covariance, &other, 1.0 - found.overlap);
     for (place, number) in out.covariance.iter_mut().zip(covariance.as_flattened()) {
         *place = *number as f32;
     }

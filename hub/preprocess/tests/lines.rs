@@ -156,7 +156,10 @@ fn all_cuts_find_little_better() {
         assert_eq!(beams, 60, "all end on a line");
         let polish = Settings { polish: true, ..settings };
         let (of_polished, beams) = error(&scan, &find(&scan, Pose::default(), polish));
-        assert!(beams >= 59 && of_polished <= 1.000_1 * of_plain, "{of_polished} of {of_plain}");
+        assert!(
+            beams >= 57 && of_polished <= 1.000_1 * of_plain,
+            "one in twenty may be left out, {beams} are not: {of_polished} of {of_plain}"
+        );
         let of_best = slow(&scan, 8);
         assert!(of_plain >= 0.999 * of_best, "nothing is better than the best: {of_plain}, {of_best}");
         plain += of_plain.sqrt();

@@ -78,7 +78,7 @@ impl Moving {
     }
 
     /// The next scan is from where `motion` says that the robot is, of a sensor at `pose`. Whether the map is still one of
-    /// where the robot is.
+    /// where the robot is: not after a step that could as well be another one.
     pub(super) fn follow(&mut self, pose: &Pose, motion: &Motion) -> bool {
         let (sin, cos) = motion.yaw_rad.sin_cos();
         let x = motion.x_m + cos * pose.x_m - sin * pose.y_m;
@@ -86,7 +86,10 @@ impl Moving {
         let is_known = motion.has_pose() && x.abs() < FARTHEST_M && y.abs() < FARTHEST_M;
         let (angles, unit_m) = ((0.0, 0.0), 0.0);
         self.place = is_known.then_some(Place { x, y, cos, sin, pose: *pose, angles, unit_m });
-        is_known && motion.has_step()
+        // Along a corridor every place looks alike.
+        let variance = f64::from(motion.covariance[0].max(motion.covariance[4]));
+        let is_sure = motion.is_degenerate() || variance <= UNSURE_M * UNSURE_M;
+        is_known && motion.has_step() && is_sure
     }
 
     /// Compares all beams with the map before this scan, then lays the scan into it.
@@ -306,5 +309,7 @@ const FREE: u16 = 5;
 const STANDS: u16 = 3;
 /// Cells before the end of a beam that it says nothing of.
 const SHORT: f32 = 2.5;
+/// A map does not go on by a step that is less sure than this: walls would stand where there are none.
+const UNSURE_M: f64 = CELL_M;
 /// Farther from its start no robot gets without a new one.
 const FARTHEST_M: f64 = 1e6;
