@@ -49,7 +49,7 @@ pub(crate) struct Model {
 impl Model {
     /// A model that knows nothing, of a mount that turns by a quarter to each side of level at most.
     pub(crate) fn new(beams: usize, settings: &Settings) -> Model {
-        let rows = (std::f64::consts::PI / settings.bin_rad).ceil() as usize + 1;
+        let rows = (std::f64::consts::PI / width_rad(settings)).ceil() as usize + 1;
         Model { beams, rows: (0..rows).map(|_| Box::default()).collect() }
     }
 
@@ -128,6 +128,11 @@ impl Model {
     }
 }
 
+/// Width of a row. Narrower ones would take memory without end.
+fn width_rad(settings: &Settings) -> f64 {
+    settings.bin_rad.max(LEAST_BIN_RAD)
+}
+
 /// Returns the row of the model for a beam at `beam_rad` that was measured at `angle_rad`, and how it is compared with it.
 pub(crate) fn placed(
     mount: &Mount,
@@ -138,7 +143,7 @@ pub(crate) fn placed(
 ) -> (usize, Reading) {
     const STEP_RAD: f64 = 1e-3;
     let from_lowest = angle_rad - mount.level_rad + std::f64::consts::FRAC_PI_2;
-    let row = (from_lowest / settings.bin_rad).floor().max(0.0) as usize;
+    let row = (from_lowest / width_rad(settings)).floor().max(0.0) as usize;
     let rise = |angle_rad: f64| mount.direction(angle_rad, beam_rad)[2];
     let turn = (rise(angle_rad + STEP_RAD) - rise(angle_rad)) / STEP_RAD;
     (row, Reading { beam, rise: rise(angle_rad) as f32, turn: turn as f32, range_m })
@@ -190,6 +195,8 @@ impl Surface {
     }
 }
 
+/// Less than a planar scanner measures exactly.
+const LEAST_BIN_RAD: f64 = 0.002;
 /// Share of the last beam in what is known of a surface.
 const NEWS: f32 = 0.25;
 /// A beam goes nearly straight up or down.

@@ -11,10 +11,16 @@ mod angles;
 mod background;
 mod mount;
 mod obstacles;
+mod scenery;
 mod settings;
 mod sweep;
 mod swing;
 mod tilting;
+
+/// The examples of the page.
+#[cfg(doctest)]
+#[doc = include_str!("../../../docs/tilt.md")]
+struct Page;
 
 pub use angles::{Angle, Withheld};
 pub use mount::Mount;

@@ -31,7 +31,7 @@ pub struct Point {
 }
 
 /// The points between two turns of the mount.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Sweep<'a> {
     /// From 0.
     pub number: u32,
@@ -44,7 +44,7 @@ pub struct Sweep<'a> {
     /// So much of the background was not where it should be that the angles are not to be trusted: all points have class
     /// unknown, and there are no obstacles, whatever stands there.
     pub is_doubted: bool,
-    /// Sweeps whose background the points were compared with; one more after it was forgotten.
+    /// Number of the background that the points were compared with: one more each time that it was forgotten.
     pub generation: u32,
     /// In the order of their scans.
     pub points: &'a [Point],

@@ -91,7 +91,7 @@ mod tests {
     /// To and fro by 20 degrees in a second, with a play of half a degree.
     fn triangle(i: u32) -> f64 {
         let phase = f64::from(i % 200) / 100.0;
-        20.0 * if phase < 1.0 { phase } else { 2.0 - phase } + if i % 2 == 0 { 0.25 } else { -0.25 }
+        20.0 * if phase < 1.0 { phase } else { 2.0 - phase } + if i.is_multiple_of(2) { 0.25 } else { -0.25 }
     }
 
     #[test]

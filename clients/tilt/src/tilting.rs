@@ -6,11 +6,10 @@ use std::collections::VecDeque;
 use schema::Scan;
 
 use crate::angles::{Angle, Angles, At, Step, Withheld};
-use crate::background::{Model, Reading, placed};
 use crate::mount::Mount;
-use crate::obstacles::{Clusters, Obstacle};
+use crate::scenery::{Ray, Scenery};
 use crate::settings::Settings;
-use crate::sweep::{Class, Point, Sweep};
+use crate::sweep::Sweep;
 use crate::swing::{Swing, Told};
 
 /// Scans that may wait for angles: with one more the oldest is taken at once.
@@ -19,11 +18,6 @@ const WAITING: usize = 64;
 const RAYS: usize = 262_144;
 /// A scan so far before the last one is of a clock that was set back.
 const JUMP_NS: u64 = 1_000_000_000;
-/// Parts of a sweep whose angles are judged each for itself.
-const PARTS: usize = 4;
-/// With fewer beams on known background nothing can be doubted.
-const ENOUGH: usize = 200;
-
 /// What was taken, made and left out, since the start.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Counts {
@@ -60,17 +54,6 @@ struct Waiting {
     scan: Box<Scan>,
 }
 
-/// A beam whose angle is known.
-#[derive(Clone, Copy)]
-struct Ray {
-    time_ns: u64,
-    angle_rad: f64,
-    beam_rad: f64,
-    /// Infinite if nothing came back.
-    range_m: f32,
-    beam: u16,
-}
-
 /// Where a sweep ends.
 #[derive(Clone, Copy)]
 struct End {
@@ -81,7 +64,6 @@ struct End {
 
 /// A scanner on a mount.
 pub struct Tilting {
-    mount: Mount,
     settings: Settings,
     angles: Angles,
     swing: Swing,
@@ -94,21 +76,12 @@ pub struct Tilting {
     ends: VecDeque<End>,
     rays: Vec<Ray>,
     later: Vec<Ray>,
-    points: Vec<Point>,
-    /// What each beam on a level surface tells of the angles.
-    off: Vec<f32>,
-    standing: Vec<([f32; 3], u8)>,
-    clusters: Clusters,
-    model: Model,
+    scenery: Scenery,
     /// Beams, first angle and step of the scans.
     shape: (usize, f64, f64),
     from_ns: u64,
     /// The sweep began at a turn, and nothing of it is missing so far.
     is_whole: bool,
-    /// The floor was where the angles say, or they have never jumped.
-    is_confirmed: bool,
-    /// Sweeps in a row that were doubted.
-    doubted: u16,
     counts: Counts,
 }
 
@@ -116,7 +89,6 @@ impl Tilting {
     /// One that has seen nothing.
     pub fn new(mount: Mount, settings: Settings) -> Tilting {
         Tilting {
-            mount,
             settings,
             angles: Angles::new(),
             swing: Swing::default(),
@@ -127,16 +99,10 @@ impl Tilting {
             ends: VecDeque::new(),
             rays: Vec::new(),
             later: Vec::new(),
-            points: Vec::new(),
-            off: Vec::new(),
-            standing: Vec::new(),
-            clusters: Clusters::default(),
-            model: Model::new(0, &settings),
+            scenery: Scenery::new(mount, settings),
             shape: (0, 0.0, 0.0),
             from_ns: 0,
             is_whole: false,
-            is_confirmed: true,
-            doubted: 0,
             counts: Counts::default(),
         }
     }
@@ -148,6 +114,7 @@ impl Tilting {
             angles_unordered: dropped.unordered,
             angles_ahead: dropped.ahead,
             angles_unfit: dropped.unfit,
+            forgotten: self.scenery.forgotten,
             ..self.counts
         }
     }
@@ -166,7 +133,9 @@ impl Tilting {
             Step::Dropped => return,
             Step::Torn => {
                 self.swing.forget();
-                self.is_confirmed &= self.angles.trouble() != Some(Withheld::Jumped);
+                if self.angles.trouble() == Some(Withheld::Jumped) {
+                    self.scenery.distrust();
+                }
                 self.tear(before_ns.unwrap_or(angle.stamp_ns));
             }
             Step::On => match self.swing.take(angle.stamp_ns, angle.angle_rad, &self.settings) {
@@ -217,8 +186,7 @@ impl Tilting {
     fn fit(&mut self, scan: &Scan) {
         let shape = (scan.beams(), scan.first_angle, scan.step);
         if shape != self.shape {
-            self.counts.forgotten += u64::from(self.shape.0 > 0);
-            self.model = Model::new(shape.0, &self.settings);
+            self.scenery.begin(shape.0, self.shape.0 == 0);
             self.shape = shape;
         }
     }
@@ -297,110 +265,18 @@ impl Tilting {
 
     /// Hands out what was measured until `end`.
     fn show(&mut self, end: End, show: &mut impl FnMut(&Sweep<'_>)) {
-        let (known, elsewhere) = self.compare();
-        let is_elsewhere = known >= ENOUGH && elsewhere as f64 > self.settings.doubt * known as f64;
-        let is_contradicted = is_elsewhere || self.is_angle_off();
-        // What jumped is believed when the floor is back in its place.
-        self.is_confirmed |= !is_contradicted && self.off.len() >= ENOUGH;
-        let is_doubted = is_contradicted || !self.is_confirmed;
-        let number = self.counts.sweeps as u32;
-        self.standing.clear();
-        let generation = self.counts.forgotten as u32;
-        if is_doubted {
-            self.points.iter_mut().for_each(|point| point.class = Class::Unknown);
-            self.doubted += 1;
-        } else {
-            self.learn(number);
-            self.pick();
-            self.doubted = 0;
-        }
-        if self.doubted > 2 * self.settings.sweeps {
-            self.model.forget();
-            self.counts.forgotten += 1;
-            (self.doubted, self.is_confirmed) = (0, true);
-        }
-        let (obstacles, left_out) =
-            self.clusters.find(&self.standing, self.settings.cube_m as f32, self.settings.points);
-        let is_complete = self.is_whole && end.is_turn;
-        self.counts.points += self.points.len() as u64;
-        self.counts.sweeps += 1;
-        self.counts.incomplete += u64::from(!is_complete);
-        self.counts.doubted += u64::from(is_doubted);
-        show(&Sweep {
-            number,
+        let sweep = Sweep {
+            number: self.counts.sweeps as u32,
             from_ns: self.from_ns,
             until_ns: end.stamp_ns,
-            is_complete,
-            is_doubted,
-            generation,
-            points: &self.points,
-            obstacles,
-            left_out,
-        });
-    }
-
-    /// Returns whether the level surfaces of the background are where they would be if the angles of a part of the sweep were
-    /// off.
-    fn is_angle_off(&mut self) -> bool {
-        let most = self.settings.off_rad as f32;
-        let part = (self.off.len() / PARTS).max(ENOUGH);
-        let is_off = |part: &mut [f32]| {
-            let middle = part.len() / 2;
-            part.select_nth_unstable_by(middle, f32::total_cmp).1.abs() > most
+            is_complete: self.is_whole && end.is_turn,
+            ..Sweep::default()
         };
-        self.off.chunks_exact_mut(part).any(is_off)
-    }
-
-    /// Makes points of the rays; returns how many met known background or should have, and how many did not.
-    fn compare(&mut self) -> (usize, usize) {
-        self.points.clear();
-        self.off.clear();
-        let threshold_m = self.settings.threshold_m as f32;
-        let (mut known, mut elsewhere) = (0, 0);
-        for ray in &self.rays {
-            let (row, reading) = ray.reading(&self.mount, &self.settings);
-            let class = self.model.class(&reading, row, threshold_m);
-            self.off.extend(self.model.angle_off(&reading, row, threshold_m));
-            if self.model.knows(&reading, row) {
-                known += 1;
-                elsewhere += usize::from(class != Class::Background);
-            }
-            if ray.range_m.is_finite() {
-                let at = self.mount.point(ray.angle_rad, ray.beam_rad, ray.range_m.into());
-                let at = at.map(|value| value as f32);
-                self.points.push(Point { at, stamp_ns: ray.time_ns, beam: ray.beam, class });
-            }
-        }
-        (known, elsewhere)
-    }
-
-    fn learn(&mut self, number: u32) {
-        for ray in &self.rays {
-            let (row, reading) = ray.reading(&self.mount, &self.settings);
-            self.model.learn(&reading, row, number, &self.settings);
-        }
-    }
-
-    /// Picks what may be of obstacles.
-    fn pick(&mut self) {
-        let near = self.settings.near;
-        for point in &self.points {
-            let within = |near: &[[f64; 2]; 3]| {
-                near.iter().zip(point.at).all(|(span, value)| (span[0]..=span[1]).contains(&f64::from(value)))
-            };
-            let is_foreground = point.class == Class::Foreground;
-            let flags = if is_foreground { Obstacle::FOREGROUND } else { 0 }
-                | if near.as_ref().is_some_and(within) { Obstacle::NEAR } else { 0 };
-            if flags != 0 {
-                self.standing.push((point.at, flags));
-            }
-        }
-    }
-}
-
-impl Ray {
-    /// The row of the background that it is compared with, and how.
-    fn reading(&self, mount: &Mount, settings: &Settings) -> (usize, Reading) {
-        placed(mount, settings, (self.angle_rad, self.beam_rad), self.beam, self.range_m)
+        let sweep = self.scenery.look(&self.rays, sweep);
+        self.counts.points += sweep.points.len() as u64;
+        self.counts.sweeps += 1;
+        self.counts.incomplete += u64::from(!sweep.is_complete);
+        self.counts.doubted += u64::from(sweep.is_doubted);
+        show(&sweep);
     }
 }
