@@ -1,12 +1,12 @@
 //! Recordings of scanners that are asked what they are, begun while they streamed already: nobody asks in them any more. The
-//! status that a hub published tells how the packets are to be read; where nothing tells it, they are not played.
+//! status that a hub published tells how the packets are to be read.
 
 use schema::Header;
 
 use crate::replay_packets::{recorder, replay, samples, scan};
 use crate::testkit::{INT, TERM, TestEnv, is_class};
 
-/// Records two files, one with telegrams alone, of an RPLIDAR that streams with these settings, until so many scans came.
+/// Records an RPLIDAR that streams with these settings, until so many scans came.
 fn record(env: &TestEnv, model: &str, settings: &[&str], scans: usize) {
     let words = ["--family=rplidar", &format!("--model={model}"), "--world=room", "--seed=5"];
     let faults = "--fault=loss=0.01,burst=40";
@@ -14,12 +14,10 @@ fn record(env: &TestEnv, model: &str, settings: &[&str], scans: usize) {
     let set = ["family=rplidar"].iter().chain(settings).map(|set| format!("--set=link.front.{set}"));
     let hub = env.hub(&[vec![env.link("front")], set.collect()].concat());
     env.await_info("front", |info| info["state"] == "streaming" && info["hz"].as_f64() > Some(5.0));
-    let recorders = [recorder(env, "all.mcap", &["--all"]), recorder(env, "telegrams.mcap", &["*/telegram"])];
+    let recorder = recorder(env, "all.mcap", &["--all"]);
     let mut echo = env.echo(&["front/scan"]);
     echo.await_lines(scans, "a scan", is_class("scan"));
-    for recorder in recorders {
-        assert_eq!(recorder.end(INT).code, Some(0));
-    }
+    assert_eq!(recorder.end(INT).code, Some(0));
     assert_eq!((echo.end(INT).code, hub.end(TERM).code), (Some(0), Some(0)));
     assert_eq!(simulator.end(TERM).code, Some(0));
 }
@@ -56,21 +54,6 @@ fn a_recorded_status_tells_mode_and_beams() {
         replay(&env, "all.mcap", &[]);
         check(&recorded, &samples(&env.path("replayed.mcap"), "front/scan"));
     }
-}
-
-#[test]
-fn packets_that_may_be_of_two_kinds_are_refused_with_what_to_set() {
-    let env = TestEnv::in_time();
-    record(&env, "s1", &["mode=denseboost"], 30);
-    let file = env.word("telegrams.mcap");
-    let refused = env.run(&["replay", "--json", "--no-system-config", "--rate=max", &file]);
-    assert_eq!(refused.code, Some(66), "{refused}");
-    assert!(refused.errors.contains("link.NAME.model or mode"), "{refused}");
-    // Said by hand, they are played.
-    let recorded = samples(&env.path("all.mcap"), "front/scan");
-    replay(&env, "telegrams.mcap", &["--set=link.front.mode=denseboost", "--set=link.front.model=s1"]);
-    let replayed = samples(&env.path("replayed.mcap"), "front/scan");
-    assert!(replayed.len() + 5 > recorded.len(), "{} of {}", replayed.len(), recorded.len());
 }
 
 /// How far times of the day may be off to each other: how long a point takes is measured, better the longer that is done.

@@ -260,6 +260,13 @@ impl Session {
         }
     }
 
+    /// Whether it was sought for a short time only: then what goes on to stream is not asked, for at its rate it would have
+    /// stopped. On a line that is never quiet it is asked all the same later.
+    fn seeks_quickly(&self) -> bool {
+        let is_young = self.quiet_since.is_none_or(|(since, _)| self.now < since + ROUNDS);
+        is_young && self.next_rate().is_some()
+    }
+
     /// When something is due, and what.
     fn deadline(&self) -> (Nanos, Why) {
         match self.phase {
@@ -283,3 +290,5 @@ const SILENCE: Nanos = 1_000 * MILLIS;
 const STILL: Nanos = 2_000 * MILLIS;
 /// Nobody follows for so long before the motor rests: a program that is started again follows again.
 const IDLE: Nanos = 5_000 * MILLIS;
+/// All rates are tried twice in so long, where a stream goes on at each of them: one may not have heard that it shall stop.
+const ROUNDS: Nanos = 8 * dialogue::DRAIN;

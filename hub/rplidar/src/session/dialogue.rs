@@ -139,13 +139,6 @@ impl Session {
         }
     }
 
-    /// Whether it was sought for a short time only: then what goes on to stream is not asked, for at its rate it would have
-    /// stopped. On a line that is never quiet it is asked all the same later.
-    pub(super) fn seeks_quickly(&self) -> bool {
-        let is_young = self.quiet_since.is_none_or(|(since, _)| self.now < since + ROUNDS);
-        is_young && self.next_rate().is_some()
-    }
-
     /// Tries the next rate, and says for how long already.
     pub(super) fn seek_on(&mut self) {
         let since = self.quiet_since.get_or_insert((self.now, self.framer.tally().read)).0;
@@ -168,7 +161,7 @@ impl Session {
     }
 
     /// The rate after this one, the model's first.
-    fn next_rate(&self) -> Option<u32> {
+    pub(super) fn next_rate(&self) -> Option<u32> {
         const RATES: [u32; 4] = [115_200, 256_000, 460_800, 1_000_000];
         let at = RATES.iter().position(|rate| *rate == self.baud)?;
         (!self.settings.fixed_rate && !self.settings.listen_only).then(|| RATES[(at + 1) % RATES.len()])
@@ -382,9 +375,7 @@ impl Session {
 
 /// A line on which nothing came for so long is quiet after a request to stop; and it is asked after so long, quiet or not.
 pub(super) const QUIET: Nanos = 15 * MILLIS;
-const DRAIN: Nanos = 60 * MILLIS;
-/// All rates are tried twice in so long, where a stream goes on at each of them: one may not have heard that it shall stop.
-const ROUNDS: Nanos = 8 * DRAIN;
+pub(super) const DRAIN: Nanos = 60 * MILLIS;
 /// An answer takes some milliseconds, and an adapter that collects bytes 16 more, twice.
 const ANSWER: Nanos = 70 * MILLIS;
 /// So often something is asked at the most of which a damaged answer came.
