@@ -130,7 +130,6 @@ fn somebody_goes_from_room_to_room_and_is_counted() {
     assert_eq!(door["door"], "middle");
     let counted = counts.await_line("the count", is_class("count"));
     assert_eq!((number(&counted, "forth"), number(&counted, "back")), (1, 0));
-    // He stops in the middle of a step, where the one leg hides the other.
     let stands = |line: &serde_json::Value| {
         let one = &line["tracks"][0];
         let near = |key: &str, at: f64| one[key].as_f64().is_some_and(|value| (value - at).abs() < 0.15);
