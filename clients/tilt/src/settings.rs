@@ -50,7 +50,7 @@ impl Default for Settings {
             sweeps: 5,
             doubt: 0.3,
             off_rad: 0.25_f64.to_radians(),
-            points: 5,
+            points: 8,
             cube_m: 0.15,
             near: None,
         }

@@ -67,7 +67,7 @@ impl Seen {
     pub(crate) fn add(&mut self, sweep: &Sweep<'_>) {
         let found = |at: [f32; 2], wide: f32| sweep.obstacles.iter().any(|one| stands_at(one, at, wide));
         // In the world x is to the right and y ahead.
-        self.pole.push((sweep.from_ns, found([2.0, -0.3], 0.4)));
+        self.pole.push((sweep.from_ns, found([2.0, -0.3], 0.6)));
         self.boxed.push((sweep.from_ns, found([2.6, 0.9], 0.8)));
     }
 
