@@ -3,7 +3,7 @@
 
 use std::path::Path;
 
-use ld::Model;
+pub use ld::Model;
 use ld::packet::{CLOCK_TURN, Contents, LEN, POINTS, Packet, TURN};
 use line::{MILLIS, Nanos};
 use lms::variant::{Mode, Unit};
