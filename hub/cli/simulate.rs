@@ -36,7 +36,7 @@ pub(crate) struct Simulate {
     #[arg(long, default_value_t = 0, value_name = "NUMBER")]
     address: u8,
     /// What the sensors see: room, bare, fig8, standing, approach, door, corridor, glass, faint, sun, chair, strips,
-    /// crowd, demo, empty, wall640 or random; or a TOML file, see docs/worlds.md
+    /// crowd, demo, tilt, empty, wall640 or random; or a TOML file, see docs/worlds.md
     #[arg(long, default_value = "room", value_name = "NAME|FILE", conflicts_with = "replay")]
     world: String,
     /// Recording to send instead: MCAP file, telegram stream or CARMEN log, plain or gzipped; of family ld an MCAP file or
