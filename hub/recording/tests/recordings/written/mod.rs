@@ -10,8 +10,7 @@ use lms::variant::{Mode, Unit};
 use schema::datagram::Packed;
 use schema::file::{self, Compression, ENCODING_V1, Foreign, Writer};
 use schema::{
-    Background, Early, Event, Flags, Foreground, Header, Lines, Marks, Motion, Scan, Status, Topic, Tracks,
-    Zones,
+    Background, Early, Flags, Foreground, Header, Lines, Marks, Motion, Scan, Status, Topic, Zones,
 };
 
 /// A telegram that was written.
@@ -161,8 +160,6 @@ fn results(telegram: &[u8], random: &mut Rng) -> Vec<(Topic, Vec<u8>)> {
         (Topic::Lines, packed(&|room| Lines::default().pack(room))),
         (Topic::Motion, packed(&|room| Motion::default().pack(room))),
         (Topic::Early, packed(&|room| Early { verdict: 2, ..Early::default() }.pack(room))),
-        (Topic::Tracks, packed(&|room| Tracks::default().pack(room))),
-        (Topic::Events, packed(&|room| Event::default().pack(room))),
     ]
 }
 
