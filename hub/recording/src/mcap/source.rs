@@ -43,6 +43,10 @@ impl<R: Read> Source<R> {
 
 fn unsound(error: McapError) -> io::Error {
     match error {
+        // What LZ4 says of a chunk that it cannot unpack; the system's errors have a number, gzip's another kind.
+        McapError::Io(error) if error.kind() == io::ErrorKind::Other && error.raw_os_error().is_none() => {
+            io::Error::new(io::ErrorKind::InvalidData, error)
+        }
         McapError::Io(error) => error,
         McapError::UnexpectedEof => io::ErrorKind::UnexpectedEof.into(),
         McapError::UnsupportedCompression(name) if matches!(&name[..], "lz4" | "zstd") => {
