@@ -135,6 +135,7 @@ fn sensors_of_other_machines_stand_in_the_list_and_not_on_this_robot() {
         say(&mut page, "scanhub.beams === 181");
         // What is read out of it is what the terminal would say of the same place.
         let mut scene = Scene::default();
+        scene.sensor("robot1.front").take_status(&Status::default());
         scene.sensor("robot1.front").take_scan(&Header::default(), &scan, 0);
         // Three points, and a place where there is none, in a picture that does not move any more.
         page.press("-");

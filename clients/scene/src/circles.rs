@@ -55,7 +55,7 @@ pub fn circles<'a>(sensors: impl Iterator<Item = &'a Sensor>) -> Vec<Circle> {
 mod tests {
     use super::*;
     use crate::Scene;
-    use schema::{Header, Scan, ScanHead, Zone, Zones};
+    use schema::{Header, Scan, ScanHead, Status, Zone, Zones};
 
     #[test]
     fn a_circle_is_as_bad_as_its_worst_sensor_and_shows_what_is_inside() {
@@ -66,6 +66,7 @@ mod tests {
                 *zone = Zone { radius_mm, violated: u8::from(range_mm < radius_mm), ..Zone::default() };
             }
             let sensor = scene.sensor(name);
+            sensor.take_status(&Status::default());
             sensor.zones = zones;
             let scan = Scan::of(ScanHead::lms(3, 0, 1000, 1, 13), &[range_mm, 8000, 1]);
             sensor.take_scan(&Header::default(), &scan, 0);

@@ -83,14 +83,15 @@ fn nearest<'a>(
 mod tests {
     use super::*;
     use crate::Scene;
-    use schema::{Header, Pose, Scan, ScanHead};
+    use schema::{Header, Pose, Scan, ScanHead, Status};
 
     #[test]
     fn the_nearest_point_is_read() {
         let mut scene = Scene::default();
         for (name, x_m) in [("front", 0.0), ("ahead", 1.0)] {
             let sensor = scene.sensor(name);
-            sensor.pose = Pose { x_m, ..Pose::default() };
+            let pose = Pose { x_m, ..Pose::default() };
+            sensor.take_status(&Status { pose, ..Status::default() });
             let scan = Scan::of(ScanHead::lms(3, -90_000, 90_000, 1, 13), &[2000, 4000, 2000]);
             sensor.take_scan(&Header::default(), &scan, 0);
         }

@@ -33,10 +33,12 @@ pub struct Sensor {
     pub name: String,
     /// How its link is, as it was said last.
     pub status: Option<Status>,
-    /// Where it sits; at the robot's centre as long as that is not told. Where a tracker is followed, in the map of its site.
+    /// Where it sits; as long as that is not told, its points are nowhere. Where a tracker is followed, in the map of its site.
     pub pose: Pose,
     /// A tracker has told where it sits.
     is_in_map: bool,
+    /// Somebody has told where it sits: what it sees is nowhere before.
+    is_placed: bool,
     /// The last scan, as long as it is new.
     pub scan: Option<Box<Scan>>,
     /// What stands before the background.
@@ -96,7 +98,7 @@ impl Scene {
         self.trackers[at].1.take(tracks, now_ns);
         for told in tracks.sensors() {
             if let Some(sensor) = self.sensors.iter_mut().find(|sensor| sensor.name == told.name()) {
-                (sensor.pose, sensor.is_in_map) = (told.pose(), true);
+                (sensor.pose, sensor.is_in_map, sensor.is_placed) = (told.pose(), true, true);
             }
         }
     }
@@ -142,8 +144,8 @@ impl Scene {
         self.trackers.clear();
         for sensor in &mut self.sensors {
             let background = sensor.background.take();
-            let Sensor { pose, is_in_map, lost, .. } = *sensor;
-            *sensor = Sensor { pose, is_in_map, background, lost, ..Sensor::new(&sensor.name) };
+            let Sensor { pose, is_in_map, is_placed, lost, .. } = *sensor;
+            *sensor = Sensor { pose, is_in_map, is_placed, background, lost, ..Sensor::new(&sensor.name) };
         }
     }
 }
@@ -155,6 +157,7 @@ impl Sensor {
             status: None,
             pose: Pose::default(),
             is_in_map: false,
+            is_placed: false,
             scan: None,
             foreground: None,
             trail: Trail::default(),
@@ -209,7 +212,7 @@ impl Sensor {
 
     /// Takes how its link is.
     pub fn take_status(&mut self, status: &Status) {
-        self.status = Some(*status);
+        (self.status, self.is_placed) = (Some(*status), true);
         if !self.is_in_map {
             self.pose = status.pose;
         }
@@ -240,7 +243,7 @@ impl Sensor {
 
     /// The points of the last scan.
     pub fn points(&self) -> impl Iterator<Item = Point> {
-        let scan = self.scan.iter();
+        let scan = self.scan.iter().filter(|_| self.is_placed);
         scan.flat_map(|scan| {
             (0..scan.beams()).filter_map(|beam| {
                 let (x_m, y_m) = point_m(&self.pose, scan.angle(beam), f64::from(scan.distance_mm(beam)?));
@@ -254,14 +257,14 @@ impl Sensor {
     /// The marks of the last scan in metres in the robot's frame.
     pub fn mark_points(&self) -> Vec<(f64, f64)> {
         let pose = self.pose;
-        let marks = self.marks.iter().flat_map(|marks| marks.marks());
+        let marks = self.marks.iter().filter(|_| self.is_placed).flat_map(|marks| marks.marks());
         let angle = |mark: &Mark| (f64::from(mark.angle_mdeg) / 1000.0).to_radians();
         marks.map(|mark| point_m(&pose, angle(mark), f64::from(mark.range_dmm) / 10.0)).collect()
     }
 
     /// Where its background ends, in metres in the robot's frame.
     pub fn background_points(&self) -> Vec<(f64, f64)> {
-        let Some(model) = &self.background else { return Vec::new() };
+        let Some(model) = self.background.as_ref().filter(|_| self.is_placed) else { return Vec::new() };
         let pose = self.pose;
         let taught = |range: &&u16| ![Background::UNTAUGHT, Background::FAR].contains(range);
         let ranges = model.ranges().iter().enumerate().filter(|(_, range)| taught(range));
@@ -323,6 +326,9 @@ mod tests {
         let mut found = Foreground::of(9);
         found.begin(ForegroundHead { count: 9, ..ForegroundHead::default() }).bits[0] = 0b101;
         sensor.take_scan(&header(4), &scan, 0);
+        assert_eq!(sensor.points().count(), 0, "nobody said where it sits");
+        sensor.take_status(&Status::default());
+        assert_eq!(sensor.points().count(), 9);
         sensor.take_foreground(&header(5), &found, 1);
         assert_eq!(sensor.trail.points().count(), 0, "of another telegram");
         sensor.take_scan(&header(5), &scan, 2);

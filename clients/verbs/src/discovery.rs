@@ -14,6 +14,8 @@ pub(crate) struct Discovery {
     hub: Option<(Instant, usize)>,
     /// The call that is under way, and how long after the hub it began.
     call: Option<(BackgroundTask<Answer>, Duration)>,
+    /// They answered once.
+    is_answered: bool,
 }
 
 type Answer = Result<Vec<(String, Topic)>, Failure>;
@@ -64,7 +66,7 @@ impl Called {
 impl Discovery {
     /// A hub came; answers about the one before are of no use.
     pub(crate) fn begin(&mut self, now: Instant) {
-        *self = Discovery { hub: Some((now, 0)), call: None };
+        *self = Discovery { hub: Some((now, 0)), call: None, is_answered: false };
     }
 
     /// The hub is gone: nobody waits for what it has.
@@ -79,13 +81,17 @@ impl Discovery {
 
     /// Calls the sensors of the hub in `domain` if it is time; what they answered, if that came since the last time.
     ///
-    /// [`Kind::Failed`](schema::Kind) if the domain cannot be read.
+    /// [`Kind::Failed`](schema::Kind) if the domain could never be read. Who knows the sensors goes on with them, and asks again.
     pub(crate) fn call(&mut self, domain: &Domain, now: Instant) -> Result<Option<Called>, Failure> {
         if let Some((task, age)) = &self.call {
-            let Some(published) = task.result() else { return Ok(None) };
-            let called = Called::of(&published?, *age);
+            let Some(answer) = task.result() else { return Ok(None) };
+            let called = answer.map(|published| Called::of(&published, *age));
             self.call = None;
-            return Ok(Some(called));
+            if self.is_answered && called.is_err() {
+                return Ok(None);
+            }
+            self.is_answered = true;
+            return called.map(Some);
         }
         let Some((came, calls)) = &mut self.hub else { return Ok(None) };
         let age = now - *came;
@@ -121,6 +127,25 @@ mod tests {
     fn it_is_called_soon_and_then_again_and_again() {
         let due: Vec<u64> = (0..6).map(|calls| due(calls).as_secs()).collect();
         assert_eq!(due, [0, 0, 1, 5, 15, 25]);
+    }
+
+    #[test]
+    fn who_knows_the_sensors_goes_on_where_asking_fails() {
+        let mut discovery = Discovery::default();
+        let domain = Domain::at("answers", std::path::Path::new("/tmp")).unwrap();
+        let mut answer = |answer: Answer| {
+            discovery.call = BackgroundTask::begin(|| answer).map(|task| (task, Duration::ZERO));
+            loop {
+                let called = discovery.call(&domain, Instant::now());
+                if discovery.call.is_none() {
+                    return called.map(|called| called.map(|called| called.sensors));
+                }
+            }
+        };
+        let short = || Err(Failure::new(schema::Kind::Short, "no descriptor is left", "ulimit -n"));
+        assert!(answer(short()).is_err());
+        assert_eq!(answer(Ok(vec![("front".to_owned(), Topic::Scan)])), Ok(Some(vec!["front".to_owned()])));
+        assert_eq!(answer(short()), Ok(None));
     }
 
     #[test]

@@ -1,7 +1,7 @@
 //! What a person asks the terminal's picture for: counters, a place, lines, and what colours and trails say.
 
 use ratatui::style::Color;
-use schema::{Contents, Corner, Foreground, ForegroundHead, Header, Line, Lines, Scan, ScanHead};
+use schema::{Contents, Corner, Foreground, ForegroundHead, Header, Line, Lines, Scan, ScanHead, Status};
 
 use super::golden::{scene, screen, text};
 use super::view::View;
@@ -65,6 +65,7 @@ fn what_comes_back_is_seen_by_its_colour_and_who_went_by_his_trail() {
     let mut found = Foreground::of(181);
     found.begin(ForegroundHead { count: 181, ..ForegroundHead::default() }).bits[3] = 0xFF;
     let header = |seq| Header { seq, ..Header::default() };
+    sensor.take_status(&Status::default());
     sensor.take_scan(&header(1), &scan, 0);
     sensor.take_foreground(&header(1), &found, 0);
     let inks = |view: &View| {

@@ -246,7 +246,7 @@ const OUTLIERS: usize = 50;
 #[cfg(test)]
 mod tests {
     use super::*;
-    use schema::{Header, Scan, ScanHead};
+    use schema::{Header, Scan, ScanHead, Status};
 
     fn press(view: &mut View, scene: &Scene, keys: &str) -> Option<Wish> {
         keys.chars().map(|key| view.key(Key::Sign(key), scene)).last().flatten()
@@ -256,7 +256,9 @@ mod tests {
         let mut scene = Scene::default();
         for name in ["front", "rear"] {
             let scan = Scan::of(ScanHead::lms(181, -90_000, 1000, 1, 13), &[4000; 181]);
-            scene.sensor(name).take_scan(&Header::default(), &scan, 0);
+            let sensor = scene.sensor(name);
+            sensor.take_status(&Status::default());
+            sensor.take_scan(&Header::default(), &scan, 0);
         }
         scene
     }

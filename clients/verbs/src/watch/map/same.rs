@@ -3,7 +3,7 @@
 
 use ::web::messages;
 use ros::{LASER_SCAN, POINT_CLOUD, TF_MESSAGE, Value, read};
-use schema::{Corner, Header, Line, Lines, Pose, Scan, ScanHead};
+use schema::{Corner, Header, Line, Lines, Pose, Scan, ScanHead, Status};
 use serde_json::Value as Json;
 
 use super::super::golden;
@@ -15,7 +15,8 @@ use scene::{Scene, Sensor};
 fn scene() -> Scene {
     let mut scene = golden::scene();
     let side = scene.sensor("side");
-    side.pose = Pose { x_m: 0.1, y_m: 0.4, yaw_rad: 1.1, upside_down: 1, ..Pose::default() };
+    let pose = Pose { x_m: 0.1, y_m: 0.4, yaw_rad: 1.1, upside_down: 1, ..Pose::default() };
+    side.take_status(&Status { pose, ..Status::default() });
     let ranges: Vec<u16> = (0..401).map(|n| if n % 2 == 0 { 700 + 3 * n } else { 8190 }).collect();
     side.take_scan(&Header::default(), &Scan::of(ScanHead::lms(401, -50_000, 250, 1, 13), &ranges), 0);
     let mut lines = Lines { count: 2, corners: 1, ..Lines::default() };
