@@ -114,7 +114,7 @@ fn one_without_its_beginning_is_known_by_its_end_or_its_messages() {
         ("rest", written.bytes[len / 3..].to_vec(), ["front", "rear"], 40..60),
         ("end", written.bytes[end..].to_vec(), ["front", "rear"], 0..8),
         ("blank", blank, ["front", "rear"], 60..81),
-        ("middle", middle.clone(), ["sensor0", "sensor1"], 8..20),
+        ("middle", middle.clone(), ["sensor0", "sensor1"], 8..24),
     ] {
         let file = File::new(name, &bytes);
         let recording = Recording::open(&file.0).unwrap();
