@@ -38,7 +38,7 @@ impl Turning for Session {
     }
 
     fn doubt(&mut self, reasons: u8) {
-        self.doubt = reasons;
+        self.reads.doubt(reasons);
     }
 }
 

@@ -38,7 +38,7 @@ impl Settings {
 pub struct Session {
     settings: Settings,
     framer: Framer,
-    reads: Reads,
+    pub(crate) reads: Reads,
     clock: SensorClock,
     /// The clock of the packets before the one with this number, of those handed out last, if another sequence began there.
     clock_before: Option<(usize, SensorClock)>,
@@ -52,8 +52,6 @@ pub struct Session {
     is_learned: bool,
     /// As [`line::family::Turning::scanner_time`].
     pub(crate) scanner_time: Option<Nanos>,
-    /// As [`line::family::Turning::doubt`].
-    pub(crate) doubt: u8,
     /// Packets that were handed out and are not in turns yet.
     current: Option<Current>,
     now: Nanos,
@@ -103,7 +101,6 @@ impl Session {
             beams: None,
             is_learned: false,
             scanner_time: None,
-            doubt: 0,
             current: None,
             now,
             trouble: None,
@@ -203,7 +200,7 @@ impl Session {
     /// Packets came: dates them, and remembers them for turns.
     fn receive(&mut self, span: Span) -> Received<'_, Packets> {
         let mut span = span;
-        span.reasons |= core::mem::take(&mut self.doubt);
+        span.reasons |= self.reads.take_doubt(span.offset + (span.packets * LEN) as u64);
         let pace = (!self.settings.fixed_rate).then_some(self.baud);
         let packet_time = line_time(LEN, self.baud);
         let mut places = [Place::Odd; MOST];

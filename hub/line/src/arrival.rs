@@ -23,6 +23,11 @@ impl Arrivals {
         }
     }
 
+    /// How many bytes came.
+    pub fn total(&self) -> u64 {
+        self.total
+    }
+
     /// When byte number `offset` was there for sure: what came behind it took its time on a line of `pace` bits per second,
     /// if it was one, but none of it was there when it was read before.
     pub fn latest(&self, offset: u64, pace: Option<u32>) -> Nanos {

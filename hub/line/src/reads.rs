@@ -14,13 +14,22 @@ pub struct Reads {
     rest_until: Nanos,
     last_packet: Nanos,
     last_turn: Nanos,
+    /// From which byte on the next packet is suspect, and why.
+    doubt: (u64, u8),
 }
 
 impl Reads {
     /// Of a session that begins at `now`.
     pub fn new(now: Nanos) -> Reads {
-        let arrivals = Arrivals::default();
-        Reads { arrivals, last_byte: now, room: 0, rest_until: 0, last_packet: 0, last_turn: 0 }
+        Reads {
+            arrivals: Arrivals::default(),
+            last_byte: now,
+            room: 0,
+            rest_until: 0,
+            last_packet: 0,
+            last_turn: 0,
+            doubt: (0, 0),
+        }
     }
 
     /// The next read has room for so many bytes.
@@ -48,6 +57,20 @@ impl Reads {
     /// When the last byte came, or the session began.
     pub fn last_byte(&self) -> Nanos {
         self.last_byte
+    }
+
+    /// The packet that comes next is suspect for these `reasons`, bits of [`crate::suspect`].
+    pub fn doubt(&mut self, reasons: u8) {
+        if reasons != 0 {
+            let from = if self.doubt.1 == 0 { self.arrivals.total() } else { self.doubt.0 };
+            self.doubt = (from, self.doubt.1 | reasons);
+        }
+    }
+
+    /// Why packets are suspect of which the last one ends before byte number `end`, beside what is in them: packets may be
+    /// held back until the next bytes come.
+    pub fn take_doubt(&mut self, end: u64) -> u8 {
+        if end > self.doubt.0 { core::mem::take(&mut self.doubt.1) } else { 0 }
     }
 
     /// What to wait for at `now`: the end of a rest, or `until` for a `reason`, or if a packet is held back until the line

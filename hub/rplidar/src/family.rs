@@ -54,7 +54,7 @@ impl Turning for Session {
     }
 
     fn doubt(&mut self, reasons: u8) {
-        self.doubt = reasons;
+        self.reads.doubt(reasons);
     }
 
     fn introduction(&self, identity: &mut dyn fmt::Write, health: &mut dyn fmt::Write) -> Option<Condition> {

@@ -55,7 +55,7 @@ impl Settings {
 pub struct Session {
     settings: Settings,
     framer: Framer,
-    reads: Reads,
+    pub(crate) reads: Reads,
     clock: SensorClock,
     sequence: Sequence,
     turns: Turns,
@@ -93,8 +93,6 @@ pub struct Session {
     now: Nanos,
     /// As [`line::family::Turning::scanner_time`].
     pub(crate) scanner_time: Option<Nanos>,
-    /// As [`line::family::Turning::doubt`].
-    pub(crate) doubt: u8,
     trouble: Option<Trouble>,
     /// Since when nothing answers, and bytes read by then.
     quiet_since: Option<(Nanos, u64)>,
@@ -155,7 +153,6 @@ impl Session {
             idle_since: None,
             now,
             scanner_time: None,
-            doubt: 0,
             trouble: None,
             quiet_since: None,
             damaged: (0, 0),

@@ -29,12 +29,16 @@ pub(super) struct Held {
     reasons: u8,
 }
 
-/// Points that came since then, and packets that were lost by then: so long takes a point. Looked at next after `span`.
+/// What the points of a span took, as far as nothing is missing between them: so long takes a point.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Measure {
-    since: Nanos,
+    /// When the last packet was there.
+    last: Nanos,
+    /// Whether something is missing before it.
+    lacks: bool,
+    passed: Nanos,
     points: u64,
-    lost: u64,
+    /// What has to pass until it is believed.
     span: Nanos,
 }
 
@@ -81,9 +85,9 @@ impl Session {
     /// Packets came: dates them, and remembers them for turns. Those behind a gap come once more, by themselves.
     pub(super) fn receive(&mut self, kind: Kind, mut span: Span) -> Received<'_, Packets> {
         self.hear();
-        span.reasons |= core::mem::take(&mut self.doubt);
+        span.reasons |= self.reads.take_doubt(span.offset + span.len as u64);
         if self.settings.listen_only || self.point_ns.is_none() || self.measure.is_some() {
-            self.measure(kind, span.packets);
+            self.measure(kind, span);
         }
         let len = kind.bytes();
         let pace = (!self.settings.fixed_rate).then_some(self.baud);
@@ -184,28 +188,39 @@ impl Session {
         self.damaged.1 = discarded;
     }
 
-    /// How long a point takes, where nobody is asked or nobody answered: as somebody was told, of the modes of `kind` the one that `packets`
-    /// agree with; else as long as these take, better known the longer they come.
-    fn measure(&mut self, kind: Kind, packets: usize) {
-        let (_, lost) = self.sequence.came_and_lost();
+    /// How long a point takes, where nobody is asked or nobody answered: as somebody was told, of the modes of `kind` the one that
+    /// packets agree with; else as long as these take, measured anew in spans that get longer.
+    fn measure(&mut self, kind: Kind, span: Span) {
+        let pace = (!self.settings.fixed_rate).then_some(self.baud);
+        let at = self.reads.arrivals().latest(span.offset + span.len as u64 - 1, pace);
         let Some(measure) = &mut self.measure else {
             let told = self.offers.sample_us(kind, self.settings.mode);
             self.point_ns = told.map(|us| f64::from(us) * 1e3);
-            self.measure = Some(Measure { since: self.now, points: 0, lost, span: SOON });
+            self.measure = Some(Measure { last: at, lacks: false, passed: 0, points: 0, span: SOON });
             return;
         };
-        measure.points += (packets * kind.points()) as u64;
-        let passed = self.now - measure.since;
-        if passed < measure.span {
+        let apart = at.saturating_sub(core::mem::replace(&mut measure.last, at));
+        // What comes at the same time came with it.
+        measure.lacks = span.reasons != 0 || (measure.lacks && apart == 0);
+        if measure.lacks {
             return;
         }
-        measure.span *= 2;
-        let points = measure.points + (lost - measure.lost) * kind.points() as u64;
-        let measured = passed as f64 / points as f64;
+        measure.passed += apart;
+        measure.points += (span.packets * kind.points()) as u64;
+        if measure.passed < measure.span {
+            return;
+        }
+        let measured = measure.passed as f64 / measure.points as f64;
+        *measure = Measure { last: at, lacks: false, passed: 0, points: 0, span: 2 * measure.span };
         let told = self.offers.nearest_us(kind, (measured / 1e3) as f32);
         let point_ns = told.map_or(measured, |us| f64::from(us) * 1e3);
-        if self.point_ns.is_some_and(|before| (before / point_ns - 1.0).abs() > 0.1) {
+        let off = self.point_ns.map_or(0.0, |before| (before / point_ns - 1.0).abs());
+        if off > 0.1 {
             self.sequence.end();
+        }
+        if off > 0.001 {
+            // Its times were others.
+            self.clock = SensorClock::new();
         }
         self.point_ns = Some(point_ns);
     }

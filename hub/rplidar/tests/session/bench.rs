@@ -20,13 +20,21 @@ pub(crate) struct Told {
     pub(crate) beams: usize,
 }
 
+/// What a recorder keeps of what was handed out.
+pub(crate) struct Kept {
+    pub(crate) first: Nanos,
+    pub(crate) last: Nanos,
+    pub(crate) bytes: Vec<u8>,
+    pub(crate) reasons: u8,
+}
+
 #[derive(Default)]
 pub(crate) struct Log {
     pub(crate) packets: Vec<Vec<u8>>,
     pub(crate) turns: Vec<Told>,
     pub(crate) replies: usize,
-    /// All that was handed out but turns, with its stamps.
-    pub(crate) heard: Vec<(Nanos, Nanos, Vec<u8>)>,
+    /// All that was handed out but turns.
+    pub(crate) heard: Vec<Kept>,
     pub(crate) reads: usize,
     pub(crate) bauds: Vec<u32>,
     pub(crate) dtr: Vec<bool>,
@@ -106,7 +114,12 @@ impl Bench {
                 Output::Wait { until, .. } => return (until, true),
                 Output::Heard(Heard::Packets(received)) => {
                     assert!(received.first <= received.last && received.last <= self.now, "{received:?}");
-                    self.log.heard.push((received.first, received.last, received.bytes.to_vec()));
+                    self.log.heard.push(Kept {
+                        first: received.first,
+                        last: received.last,
+                        bytes: received.bytes.to_vec(),
+                        reasons: received.reasons,
+                    });
                     if received.message.is_reply {
                         self.log.replies += 1;
                         continue;

@@ -1,11 +1,13 @@
 //! A session of a recording, at whose other end nobody is: it hears what another session handed out.
 
+use line::family::Turning as _;
 use line::{Heard, MILLIS, Nanos, Output, Session as _, Turn};
 use rplidar::{Mode, Model, Session, Settings, Trouble};
 
-use crate::bench::{Bench, SECOND};
+use crate::bench::{Bench, Kept, SECOND};
 use crate::head::Head;
 use crate::start::of;
+use crate::wire::Damage;
 
 /// Turns of a recording: stamp, points a second, beams, and how many points each has.
 #[derive(Debug, PartialEq)]
@@ -17,11 +19,12 @@ struct Seen {
 }
 
 /// What a session with these `settings` makes of `heard`.
-fn replay(settings: Settings, heard: &[(Nanos, Nanos, Vec<u8>)]) -> (Session, Vec<Seen>) {
+fn replay(settings: Settings, heard: &[Kept]) -> (Session, Vec<Seen>) {
     let settings = Settings { fixed_rate: true, listen_only: true, ..settings };
-    let mut session = Session::new(settings, heard[0].0);
+    let mut session = Session::new(settings, heard[0].first);
     let mut turns = Vec::new();
-    for (_, last, bytes) in heard {
+    for Kept { last, bytes, reasons, .. } in heard {
+        session.doubt(*reasons);
         session.spare()[..bytes.len()].copy_from_slice(bytes);
         session.commit(*last, bytes.len());
         loop {
@@ -90,7 +93,7 @@ fn a_recording_from_the_beginning_has_the_turns_that_were_handed_out() {
 fn one_that_begins_in_the_midst_has_turns_soon() {
     for (model, mode) in MODES {
         let live = recorded(model, mode, 8);
-        let from = live.log.heard.iter().position(|(first, ..)| *first > 3 * SECOND).expect("some");
+        let from = live.log.heard.iter().position(|kept| kept.first > 3 * SECOND).expect("some");
         let (session, turns) = replay(Settings { mode: Some(mode), ..of(model) }, &live.log.heard[from..]);
         let first = turns.first().expect("some").first;
         assert!(first < 3 * SECOND + SECOND * 6 / 10, "{model:?} {mode:?}: {first}");
@@ -98,7 +101,37 @@ fn one_that_begins_in_the_midst_has_turns_soon() {
             session.points_per_second().expect("measured") / live.session.points_per_second().expect("told");
         assert!((is - 1.0).abs() < 0.005, "{model:?} {mode:?}: {is}");
         assert!(turns.iter().all(|seen| !seen.incomplete), "{model:?} {mode:?}");
+        let worst = off(&live, &turns).into_iter().max().expect("some");
+        assert!(worst < 2 * MILLIS, "{model:?} {mode:?}: {worst}");
         assert!(session.account().lost == 0);
+    }
+}
+
+/// By how much the stamp of each of `turns` is off the one that was handed out.
+fn off(live: &Bench, turns: &[Seen]) -> Vec<Nanos> {
+    let off = |seen: &Seen| live.log.turns.iter().map(|told| told.first.abs_diff(seen.first)).min();
+    turns.iter().map(|seen| off(seen).expect("some")).collect()
+}
+
+/// What was damaged is not in a recording: only the marks of what came behind it tell that it is missing.
+#[test]
+fn one_that_begins_in_the_midst_of_a_line_that_damages_bytes_is_dated_right() {
+    for (model, mode) in MODES {
+        let settings = Settings { mode: Some(mode), ..of(model) };
+        let mut all = Vec::new();
+        for seed in 0..20 {
+            let mut live = Bench::new(settings, Head::new(model, seed));
+            live.head.damage = Damage { lost: 0.000_5, ..Damage::default() };
+            live.run(8 * SECOND);
+            let from = live.log.heard.iter().position(|kept| kept.first > 3 * SECOND).expect("some");
+            let (_, turns) = replay(settings, &live.log.heard[from..]);
+            all.extend(off(&live, &turns));
+        }
+        all.sort_unstable();
+        let (most, worst) = (all[all.len() * 98 / 100], all[all.len() - 1]);
+        // Points without a checksum are lost without a mark.
+        let bound = if mode == Mode::Standard { 15 } else { 10 };
+        assert!(most < 5 * MILLIS && worst < bound * MILLIS, "{model:?} {mode:?}: {most} {worst}");
     }
 }
 
@@ -106,7 +139,7 @@ fn one_that_begins_in_the_midst_has_turns_soon() {
 #[test]
 fn packets_that_may_be_of_two_kinds_are_refused_in_words() {
     let live = recorded(Model::S1, Mode::DenseBoost, 4);
-    let from = live.log.heard.iter().position(|(first, ..)| *first > 2 * SECOND).expect("some");
+    let from = live.log.heard.iter().position(|kept| kept.first > 2 * SECOND).expect("some");
     let (session, turns) = replay(Settings::default(), &live.log.heard[from..]);
     assert_eq!((session.trouble(), turns.len()), (Some(Trouble::Alike), 0));
     assert!(Trouble::Alike.to_string().contains("model or the mode"));
