@@ -14,7 +14,7 @@ use schema::{Event, EventKind, Header, Topic, TrackState, Tracks};
 use sim::room::Room;
 use sim::world::World;
 
-const SITE: &str = r#"
+pub(crate) const SITE: &str = r#"
 [[sensor]]
 name = "hall"
 pose = { x = 0.1, y = 0.1, yaw = 0.7854 }
@@ -53,7 +53,7 @@ from_s = 12
 
 /// Telegrams of both sensors over so many seconds of the world, as if a hub had recorded them: stamped when they were measured,
 /// however busy the machine of the test is.
-fn recorded(env: &TestEnv, seconds: u64) -> String {
+pub(crate) fn recorded(env: &TestEnv, seconds: u64) -> String {
     let file = env.word("world.mcap");
     let world = World::of_toml("world.toml", WORLD).expect("a world");
     let rooms: Vec<Room> = (0..2).map(|port| Room::of_port(&world, 5, port)).collect();
@@ -98,7 +98,7 @@ const BEGIN_NS: u64 = 1_700_000_000_000_000_000;
 const LEARNING: &str = "--set=background.scans=100";
 
 /// A hub that will play `file`, once it is told to.
-fn replay(env: &TestEnv, file: &str) -> Program {
+pub(crate) fn replay(env: &TestEnv, file: &str) -> Program {
     env.start(&["replay", file, "--json", "--paused", "--hold", LEARNING]).ready()
 }
 
