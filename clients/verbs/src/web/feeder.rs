@@ -387,12 +387,12 @@ impl Sink for Feeder<'_> {
 }
 
 /// The same verdict, because a page that hears nothing for half a second takes it for unknown; and a distance that changes
-/// with every scan cannot be read.
-const ROBOT_EVERY: Duration = Duration::from_millis(50);
+/// with every scan cannot be read. A change is put up at once.
+const ROBOT_EVERY: Duration = Duration::from_millis(90);
 /// Nobody sees a player move in smaller steps.
 const PROGRESS_EVERY: Duration = Duration::from_millis(50);
-/// Of several sensors one message has all.
-const MARKS_EVERY: Duration = Duration::from_millis(20);
+/// Of several sensors one message has all, and a sign that follows its scan so soon is seen to go with it.
+const MARKS_EVERY: Duration = Duration::from_millis(50);
 /// In viewers what is not said again is gone after a second, and whoever comes sees them so soon.
 const CIRCLES_EVERY: Duration = Duration::from_millis(300);
 const STATUS_EVERY: Duration = Duration::from_millis(500);
