@@ -96,3 +96,4 @@ mod web_empty;
 mod web_families;
 mod web_page;
 mod web_replay;
+mod web_tracks;

@@ -1,20 +1,15 @@
 //! `scanhub track` and `scanhub site`, from telegrams to who is where: one person from room to room, the same tracks again of a
 //! recording, a site file with a sensor that there is not, a plan that is drawn once.
 
-use std::collections::BTreeMap;
-use std::fs::File;
-
-use lms::variant::{MIRROR_TURN, Mode, Unit, Variant};
-
 use crate::pages::start_program_of_trackers;
-use crate::testkit::{INT, Outcome, Program, Recording, TERM, TestEnv, is_class, number, until};
+use crate::testkit::{
+    BEGIN_NS, INT, Outcome, Program, Recording, TERM, TestEnv, is_class, number, recorded_world, until,
+};
 use schema::datagram::Packed;
-use schema::file::Writer;
-use schema::{Event, EventKind, Header, Topic, TrackState, Tracks};
-use sim::room::Room;
+use schema::{Event, EventKind, TrackState, Tracks};
 use sim::world::World;
 
-const SITE: &str = r#"
+pub(crate) const SITE: &str = r#"
 [[sensor]]
 name = "hall"
 pose = { x = 0.1, y = 0.1, yaw = 0.7854 }
@@ -51,54 +46,16 @@ speed_mm_s = 1000
 from_s = 12
 "#;
 
-/// Telegrams of both sensors over so many seconds of the world, as if a hub had recorded them: stamped when they were measured,
-/// however busy the machine of the test is.
-fn recorded(env: &TestEnv, seconds: u64) -> String {
-    let file = env.word("world.mcap");
+/// What both sensors see over so many seconds.
+pub(crate) fn recorded(env: &TestEnv, seconds: u64) -> String {
     let world = World::of_toml("world.toml", WORLD).expect("a world");
-    let rooms: Vec<Room> = (0..2).map(|port| Room::of_port(&world, 5, port)).collect();
-    let mut writer =
-        Writer::begin(File::create(&file).expect("a file"), "", BTreeMap::new()).expect("begins");
-    let period = Variant::HALF.turns() * MIRROR_TURN;
-    let telegram_ns = 14_640_000;
-    for seq in 0..seconds * 1_000_000_000 / period {
-        for (number, room) in rooms.iter().enumerate() {
-            let end_ns = 1_000_000_000 + seq * period + number as u64 * 9_000_000;
-            let telegram = if seq == 0 {
-                lms::reply::configuration(0, Mode(1), Unit::Mm, 0x10)
-            } else {
-                lms::measured::encode(0, Unit::Mm, &room.scan(Variant::HALF, Unit::Mm, Mode(1), end_ns), 0x10)
-            };
-            let mut header = Header {
-                seq,
-                topic_seq: seq,
-                stamp_first_ns: end_ns - telegram_ns,
-                stamp_last_ns: end_ns,
-                wall_ns: BEGIN_NS + end_ns - telegram_ns,
-                boot: 7,
-                sensor: number as u8,
-                period_us: (period / 1000) as u32,
-                ..Header::default()
-            };
-            header.set_sent_at(end_ns + 100_000);
-            writer
-                .sample(["hall", "kitchen"][number], Topic::Telegram, &header, telegram.bytes())
-                .expect("is written");
-        }
-        if seq % 40 == 0 {
-            writer.close_chunk().expect("is written");
-        }
-    }
-    writer.finish().expect("ends");
-    file
+    recorded_world(env, &world, &["hall", "kitchen"], seconds)
 }
 
-/// When the world begins, by the wall clock.
-const BEGIN_NS: u64 = 1_700_000_000_000_000_000;
 const LEARNING: &str = "--set=background.scans=100";
 
 /// A hub that will play `file`, once it is told to.
-fn replay(env: &TestEnv, file: &str) -> Program {
+pub(crate) fn replay(env: &TestEnv, file: &str) -> Program {
     env.start(&["replay", file, "--json", "--paused", "--hold", LEARNING]).ready()
 }
 

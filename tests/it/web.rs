@@ -73,6 +73,25 @@ pub(crate) fn text(socket: &mut WebSocket<TcpStream>) -> Value {
     }
 }
 
+/// The channels of these `topics`, which there will be; messages that come before they are told are not looked at.
+pub(crate) fn channels<const N: usize>(viewer: &mut WebSocket<TcpStream>, topics: [&str; N]) -> [Value; N] {
+    let begun = Instant::now();
+    let mut told: Vec<Value> = Vec::new();
+    let of = |told: &[Value], topic: &str| told.iter().find(|channel| channel["topic"] == topic).cloned();
+    while !topics.iter().all(|topic| of(&told, topic).is_some()) {
+        assert!(begun.elapsed() < PATIENCE, "{topics:?} are not all in {told:?}");
+        told.extend(text(viewer)["channels"].as_array().into_iter().flatten().cloned());
+    }
+    topics.map(|topic| of(&told, topic).expect("it is there"))
+}
+
+/// Subscribes to channels by their ids, under these numbers.
+pub(crate) fn subscribe(viewer: &mut WebSocket<TcpStream>, wanted: &[(u32, &Value)]) {
+    let wanted: Vec<_> = wanted.iter().map(|(number, id)| json!({ "id": number, "channelId": id })).collect();
+    let wish = json!({ "op": "subscribe", "subscriptions": wanted });
+    viewer.send(Message::text(wish.to_string())).expect("it reads");
+}
+
 #[test]
 fn strangers_stay_outside() {
     let env = TestEnv::new();
@@ -123,26 +142,14 @@ fn viewers_get_the_messages_of_foxglove_whatever_others_send() {
     hostile.send(Message::binary(vec![1; 60_000])).expect("it reads");
     let _ = hostile.send(Message::binary(vec![1; 1 << 20]));
 
-    let begun = Instant::now();
-    let mut channels = Vec::new();
-    let of =
-        |channels: &[Value], topic: &str| channels.iter().find(|channel| channel["topic"] == topic).cloned();
-    while of(&channels, "/front/status").is_none() {
-        assert!(begun.elapsed() < PATIENCE, "{channels:?}");
-        let told = text(&mut viewer);
-        channels.extend(told["channels"].as_array().cloned().unwrap_or_default());
-    }
-    let scan = of(&channels, "/front/scan").expect("scans");
+    let [scan, zones, _] = channels(&mut viewer, ["/front/scan", "/zones", "/front/status"]);
     assert_eq!(
         [&scan["encoding"], &scan["schemaName"], &scan["schemaEncoding"]],
         ["cdr", "sensor_msgs/msg/LaserScan", "ros2msg"]
     );
-    let zones = of(&channels, "/zones").expect("zones");
     assert_eq!([&zones["encoding"], &zones["schemaName"]], ["json", "foxglove.SceneUpdate"]);
-    let subscribe = json!({ "op": "subscribe", "subscriptions": [
-        { "id": 70, "channelId": scan["id"] }, { "id": 71, "channelId": zones["id"] }, { "id": 72, "channelId": 9999 },
-    ] });
-    viewer.send(Message::text(subscribe.to_string())).expect("it reads");
+    subscribe(&mut viewer, &[(70, &scan["id"]), (71, &zones["id"]), (72, &9999.into())]);
+    let begun = Instant::now();
     let mut seen = [0_u32; 2];
     while seen.iter().any(|count| *count < 5) {
         assert!(begun.elapsed() < PATIENCE, "{seen:?}");

@@ -11,25 +11,16 @@ use std::thread;
 use std::time::{Duration, Instant};
 
 use crate::testkit::{INT, PATIENCE, Program, TestEnv, is_class, until};
-use crate::web::{connect, status, text, view, web};
+use crate::web::{channels, connect, status, subscribe, view, web};
 use rustix::net::sockopt::set_socket_recv_buffer_size;
 use rustix::process::{Pid, Resource, Rlimit, getrlimit, prlimit};
 use serde_json::json;
 use tungstenite::{Message, WebSocket};
 
 /// Subscribes to the channel `topic`, which there will be; messages of it that came meanwhile are not counted.
-fn subscribe(viewer: &mut WebSocket<TcpStream>, topic: &str) {
-    let begun = Instant::now();
-    loop {
-        assert!(begun.elapsed() < PATIENCE, "there is no {topic}");
-        let told = text(viewer);
-        let mut channels = told["channels"].as_array().into_iter().flatten();
-        if let Some(channel) = channels.find(|channel| channel["topic"] == topic) {
-            let one = json!({ "id": 1, "channelId": channel["id"] });
-            let wish = json!({ "op": "subscribe", "subscriptions": [one] });
-            return viewer.send(Message::text(wish.to_string())).expect("it reads");
-        }
-    }
+fn follow(viewer: &mut WebSocket<TcpStream>, topic: &str) {
+    let [channel] = channels(viewer, [topic]);
+    subscribe(viewer, &[(1, &channel["id"])]);
 }
 
 /// Set when this goes, in a panic too.
@@ -66,10 +57,10 @@ fn one_who_reads_slowly_and_a_crowd_keep_nobody_from_the_picture() {
     env.await_info("front", |info| info["state"] == "streaming");
     let (server, host) = web(&env, &[]);
     let mut well = view(&host, "/", None).expect("let in");
-    subscribe(&mut well, "/front/scan");
+    follow(&mut well, "/front/scan");
     let mut slow = view(&host, "/", None).expect("let in");
     set_socket_recv_buffer_size(slow.get_ref(), 4096).expect("a small one");
-    subscribe(&mut slow, "/front/scan");
+    follow(&mut slow, "/front/scan");
     let before = memory(&server);
     let slowly = thread::spawn(move || {
         let mut read = 0;
@@ -102,7 +93,7 @@ fn hostile_frames_cost_who_sends_them_his_place_and_others_nothing() {
     env.await_info("front", |info| info["state"] == "streaming");
     let (server, host) = web(&env, &[]);
     let mut well = view(&host, "/", None).expect("let in");
-    subscribe(&mut well, "/front/scan");
+    follow(&mut well, "/front/scan");
     let before = memory(&server);
 
     // Frames of any bytes; of the client's that are masked or not, whole or cut, of every opcode.
@@ -183,7 +174,7 @@ fn where_descriptors_are_short_who_is_there_is_served_and_who_comes_waits() {
     env.await_info("front", |info| info["state"] == "streaming");
     let (mut server, host) = web(&env, &[]);
     let mut viewer = view(&host, "/", None).expect("let in");
-    subscribe(&mut viewer, "/front/scan");
+    follow(&mut viewer, "/front/scan");
     // All that it follows takes descriptors, too.
     until("it follows all topics", || FOLLOWED.iter().all(|topic| env.subscribers(topic) > 0));
     await_messages(&mut viewer, 5);
@@ -206,13 +197,42 @@ fn where_descriptors_are_short_who_is_there_is_served_and_who_comes_waits() {
 }
 
 #[test]
+fn where_descriptors_are_short_for_a_topic_the_others_are_served() {
+    let env = TestEnv::new();
+    let _sensor = env.simulator(&["front"], &["--seed=5", "--baud=500000"]);
+    let _hub = env.hub(&[env.link("front")]);
+    env.await_info("front", |info| info["state"] == "streaming");
+    let (mut server, host) = web(&env, &[]);
+    let mut viewer = view(&host, "/", None).expect("let in");
+    let [scan, lines] = channels(&mut viewer, ["/front/scan", "/lines"]);
+    subscribe(&mut viewer, &[(1, &scan["id"])]);
+    until("it follows all topics", || FOLLOWED.iter().all(|topic| env.subscribers(topic) > 0));
+    await_messages(&mut viewer, 5);
+    limit_descriptors(&server, next_descriptor(&server));
+    // Lines are followed as soon as somebody asks for them.
+    subscribe(&mut viewer, &[(2, &lines["id"])]);
+    let short = server.await_line("what it is short of", is_class("web_short"));
+    assert!(
+        short["message"].as_str().is_some_and(|text| text.contains("front/lines is not served")),
+        "{short}"
+    );
+    assert!(!short["hint"].as_str().unwrap_or_default().is_empty(), "{short}");
+    await_messages(&mut viewer, 80);
+    assert_eq!(env.subscribers("front/lines"), 0);
+    limit_descriptors(&server, 1024);
+    until("it follows lines, too", || env.subscribers("front/lines") > 0);
+    let outcome = server.end(INT);
+    assert!(outcome.code == Some(0) && outcome.errors.is_empty(), "{outcome}");
+}
+
+#[test]
 fn where_there_are_no_descriptors_the_server_ends() {
     let env = TestEnv::new();
     let _sensor = env.simulator(&["front"], &["--seed=5", "--baud=500000"]);
     let _hub = env.hub(&[env.link("front")]);
     let (server, host) = web(&env, &[]);
     let mut viewer = view(&host, "/", None).expect("let in");
-    subscribe(&mut viewer, "/front/scan");
+    follow(&mut viewer, "/front/scan");
     await_messages(&mut viewer, 5);
     // It may not even wait any more: better to end than to serve nobody.
     limit_descriptors(&server, 1);

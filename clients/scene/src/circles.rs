@@ -24,16 +24,19 @@ impl Circle {
     pub fn inside<'a>(&self, sensor: &'a Sensor) -> impl Iterator<Item = Point> + use<'a> {
         let radius_m = self.radius_m;
         let own = |zone: &&schema::Zone| f64::from(zone.radius_mm) / 1000.0 == radius_m;
-        let is_violated = sensor.zones.zones().iter().find(own).is_some_and(|zone| zone.violated != 0);
+        let zone = sensor.zones.zones().iter().find(own).filter(|_| !sensor.mount.is_in_map());
+        let is_violated = zone.is_some_and(|zone| zone.violated != 0);
         let points = is_violated.then(|| sensor.points()).into_iter().flatten();
         points.filter(move |point| point.distance_m() <= radius_m)
     }
 }
 
-/// The circles of `sensors`, in the order in which they are met.
+/// The circles of `sensors`, in the order in which they are met; none of those that are shown in a map, where nobody knows the
+/// robot's centre.
 pub fn circles<'a>(sensors: impl Iterator<Item = &'a Sensor>) -> Vec<Circle> {
     let mut radii: Vec<(u16, bool)> = Vec::new();
-    for zone in sensors.flat_map(|sensor| sensor.zones.zones()) {
+    let on_robot = sensors.filter(|sensor| !sensor.mount.is_in_map());
+    for zone in on_robot.flat_map(|sensor| sensor.zones.zones()) {
         match radii.iter_mut().find(|(radius, _)| *radius == zone.radius_mm) {
             Some((_, violated)) => *violated |= zone.violated != 0,
             None => radii.push((zone.radius_mm, zone.violated != 0)),
@@ -54,8 +57,8 @@ pub fn circles<'a>(sensors: impl Iterator<Item = &'a Sensor>) -> Vec<Circle> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::Scene;
-    use schema::{Header, Scan, ScanHead, Status, Zone, Zones};
+    use crate::{Mount, Scene};
+    use schema::{Header, Pose, Scan, ScanHead, Status, Zone, Zones};
 
     #[test]
     fn a_circle_is_as_bad_as_its_worst_sensor_and_shows_what_is_inside() {
@@ -80,5 +83,12 @@ mod tests {
         assert_eq!((inside(0, 0), inside(0, 1)), (vec![0, 2], vec![0, 2]));
         assert!(inside(1, 0).is_empty(), "not violated in its view, however near one beam is");
         assert_eq!(inside(1, 1), [0, 2]);
+        scene.sensors[1].mount = Mount::InMap(Pose::default());
+        assert_eq!(
+            circles(scene.sensors.iter())[1].verdict,
+            Verdict::Clear,
+            "the other one is not around the robot"
+        );
+        assert_eq!(told[1].inside(&scene.sensors[1]).count(), 0);
     }
 }

@@ -5,6 +5,7 @@
 
 mod circles;
 mod meter;
+mod mount;
 mod people;
 mod read_out;
 mod scene;
@@ -15,7 +16,8 @@ use schema::Pose;
 
 pub use circles::{Circle, circles};
 pub use meter::Meter;
-pub use people::{People, Person};
+pub use mount::Mount;
+pub use people::{Ellipse, People, Person, rooms};
 pub use read_out::{Place, Reading};
 pub use scene::{Scene, Sensor, verdict};
 pub use trail::Trail;

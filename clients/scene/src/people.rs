@@ -1,9 +1,9 @@
-//! The people of a tracker: where they are, and the tails of where they were. Time is an argument. Refuses to know what tracks
-//! them.
+//! The people of a tracker: where they are and how surely, in which room, and the tails of where they were. Time is an argument.
+//! Refuses to know what tracks them.
 
 use std::collections::VecDeque;
 
-use schema::{TrackState, Tracks};
+use schema::{Track, TrackState, Tracks};
 
 /// The people of one tracker.
 #[derive(Clone, Debug, Default)]
@@ -16,25 +16,68 @@ pub struct People {
 /// One of them.
 #[derive(Clone, Debug)]
 pub struct Person {
-    /// His number.
+    /// The person's number.
     pub id: u64,
-    /// How well he is known.
+    /// How well the person is known.
     pub state: TrackState,
-    /// Where he is: metres in the map of the site.
+    /// Where: metres in the map of the site.
     pub place: (f64, f64),
-    /// When, in ns of CLOCK_MONOTONIC, and where he was, the oldest first.
+    /// Where else the person may be.
+    pub reach: Ellipse,
+    /// The room, if it is one of the site's.
+    pub room: Option<String>,
+    /// When, in ns of CLOCK_MONOTONIC, and where the person was, the oldest first.
     tail: VecDeque<(u64, (f64, f64))>,
 }
 
+/// An ellipse around a place that holds the true one in 95 of 100 cases.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Ellipse {
+    /// Half of its longer axis, in metres.
+    pub long_m: f64,
+    /// Half of its shorter axis, in metres.
+    pub short_m: f64,
+    /// Where the longer one points, in radians counter-clockwise from x.
+    pub yaw_rad: f64,
+}
+
+impl Ellipse {
+    /// Of a normal distribution with this covariance in m2: xx, xy, yy. Its axes are the eigenvectors, as long as the roots of
+    /// the eigenvalues times that of the 95 % quantile of chi-squared with two degrees of freedom.
+    pub fn of(covariance: [f32; 3]) -> Ellipse {
+        let [xx, xy, yy] = covariance.map(f64::from);
+        let (mean, half) = ((xx + yy) / 2.0, ((xx - yy) / 2.0).hypot(xy));
+        let axis = |eigenvalue: f64| (CHI_SQUARED_95 * eigenvalue.max(0.0)).sqrt();
+        let yaw_rad = 0.5 * (2.0 * xy).atan2(xx - yy);
+        Ellipse { long_m: axis(mean + half), short_m: axis(mean - half), yaw_rad }
+    }
+}
+
 impl Person {
-    /// Returns whether he is more than perhaps a person.
+    /// Returns whether this is more than perhaps a person.
     pub fn is_known(&self) -> bool {
         self.state != TrackState::Tentative
     }
 
-    /// Where he was over the last seconds, the oldest first.
+    /// Returns whether a sensor sees the person.
+    pub fn is_seen(&self) -> bool {
+        self.state == TrackState::Confirmed
+    }
+
+    /// Where the person was over the last seconds, the oldest first.
     pub fn tail(&self) -> impl Iterator<Item = (f64, f64)> {
         self.tail.iter().map(|(_, place)| *place)
+    }
+
+    fn of(track: &Track, tail: VecDeque<(u64, (f64, f64))>) -> Person {
+        Person {
+            id: track.id,
+            state: track.state(),
+            place: (track.x_m.into(), track.y_m.into()),
+            reach: Ellipse::of(track.covariance),
+            room: track.room_name().map(str::to_owned),
+            tail,
+        }
     }
 }
 
@@ -47,12 +90,12 @@ impl People {
             .iter()
             .map(|track| {
                 let known = before.iter().position(|person| person.id == track.id);
-                let mut tail = known.map(|at| before.swap_remove(at).tail).unwrap_or_default();
-                let place = (track.x_m.into(), track.y_m.into());
-                if tail.back().is_none_or(|(at_ns, _)| now_ns >= at_ns + STEP_NS) {
-                    tail.push_back((now_ns, place));
+                let mut person =
+                    Person::of(track, known.map(|at| before.swap_remove(at).tail).unwrap_or_default());
+                if person.tail.back().is_none_or(|(at_ns, _)| now_ns >= at_ns + STEP_NS) {
+                    person.tail.push_back((now_ns, person.place));
                 }
-                Person { id: track.id, state: track.state(), place, tail }
+                person
             })
             .collect();
         self.old_at_ns = now_ns + OLD_NS;
@@ -77,6 +120,24 @@ impl People {
     pub fn persons(&self) -> &[Person] {
         &self.persons
     }
+
+    /// Those of them who are more than perhaps persons.
+    pub fn known(&self) -> impl Iterator<Item = &Person> {
+        self.persons.iter().filter(|person| person.is_known())
+    }
+}
+
+/// How many of `people` are in which room, in words, the rooms by their names and those in none at the end; nothing if there
+/// is nobody.
+pub fn rooms<'a>(people: impl Iterator<Item = &'a Person>) -> Option<String> {
+    let mut rooms: Vec<_> = people.map(|person| person.room.as_deref()).collect();
+    rooms.sort_by_key(|room| (room.is_none(), *room));
+    let count = rooms.len();
+    let words = rooms.chunk_by(|a, b| a == b);
+    let words: Vec<_> =
+        words.map(|room| format!("{} {}", room[0].unwrap_or("elsewhere"), room.len())).collect();
+    let persons = if count == 1 { "person" } else { "people" };
+    (count > 0).then(|| format!("{count} {persons}: {}", words.join(", ")))
 }
 
 /// Between two steps of a tail.
@@ -85,11 +146,12 @@ const STEP_NS: u64 = 150_000_000;
 const TAIL_NS: u64 = 5_000_000_000;
 /// A tracker that says nothing for so long knows nothing.
 const OLD_NS: u64 = 1_000_000_000;
+/// -2 ln 0.05.
+const CHI_SQUARED_95: f64 = 5.991_464_547_107_979;
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use schema::Track;
 
     fn of(places: &[(u64, f32)]) -> Tracks {
         let mut tracks = Tracks::default();
@@ -115,5 +177,36 @@ mod tests {
         let last_ns = 299 * 40_000_000;
         assert!(!people.age(last_ns + 1) && people.age(last_ns + OLD_NS));
         assert!(people.persons().is_empty());
+    }
+
+    #[test]
+    fn where_else_somebody_may_be_is_an_ellipse() {
+        let near = |a: f64, b: f64| (a - b).abs() < 1e-6;
+        let along = Ellipse::of([0.25, 0.0, 0.01]);
+        assert!(near(along.long_m, 0.5 * CHI_SQUARED_95.sqrt()) && near(along.short_m, 0.2 * along.long_m));
+        assert!(near(along.yaw_rad, 0.0));
+        let across = Ellipse::of([0.01, 0.0, 0.25]);
+        assert!(near(across.long_m, along.long_m) && near(across.yaw_rad.abs(), 90_f64.to_radians()));
+        // Turned by 30 degrees.
+        let (sin, cos) = 30_f64.to_radians().sin_cos();
+        let turned =
+            [0.25 * cos * cos + 0.01 * sin * sin, 0.24 * sin * cos, 0.25 * sin * sin + 0.01 * cos * cos];
+        let turned = Ellipse::of(turned.map(|value| value as f32));
+        assert!(near(turned.yaw_rad.to_degrees(), 30.0) && near(turned.short_m, along.short_m), "{turned:?}");
+        // What no distribution has is a point, not nonsense.
+        assert_eq!(Ellipse::of([-1.0, 0.0, -1.0]).long_m, 0.0);
+    }
+
+    #[test]
+    fn rooms_are_counted_by_name() {
+        let mut tracks = of(&[(1, 0.0), (2, 0.0), (3, 0.0), (4, 0.0)]);
+        for (track, room) in tracks.track_array.iter_mut().zip(["kitchen", "", "hall", "kitchen"]) {
+            track.set_room(room);
+        }
+        let mut people = People::default();
+        people.take(&tracks, 0);
+        assert_eq!(rooms(people.known()).as_deref(), Some("4 people: hall 1, kitchen 2, elsewhere 1"));
+        assert_eq!(rooms(people.known().take(1)).as_deref(), Some("1 person: kitchen 1"));
+        assert_eq!(rooms(std::iter::empty()), None);
     }
 }

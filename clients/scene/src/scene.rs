@@ -1,11 +1,12 @@
 //! What is known of the robot and its surroundings: the last sample of each topic of each sensor. Time is an argument.
 
 use schema::{
-    Background, Counter, Foreground, Header, Lines, Mark, Marks, Pose, Scan, State, Status, Tracks, Verdict,
-    Zones, is_remote,
+    Background, Counter, Foreground, Header, Lines, Mark, Marks, Scan, State, Status, Tracks, Verdict, Zones,
+    is_remote,
 };
 
 use crate::meter::Meter;
+use crate::mount::Mount;
 use crate::people::{People, Person};
 use crate::trail::Trail;
 use crate::trouble::{Trouble, trouble};
@@ -33,12 +34,8 @@ pub struct Sensor {
     pub name: String,
     /// How its link is, as it was said last.
     pub status: Option<Status>,
-    /// Where it sits; as long as that is not told, its points are nowhere. Where a tracker is followed, in the map of its site.
-    pub pose: Pose,
-    /// A tracker has told where it sits.
-    is_in_map: bool,
-    /// Somebody has told where it sits: what it sees is nowhere before.
-    is_placed: bool,
+    /// Where it sits.
+    pub mount: Mount,
     /// The last scan, as long as it is new.
     pub scan: Option<Box<Scan>>,
     /// What stands before the background.
@@ -98,14 +95,19 @@ impl Scene {
         self.trackers[at].1.take(tracks, now_ns);
         for told in tracks.sensors() {
             if let Some(sensor) = self.sensors.iter_mut().find(|sensor| sensor.name == told.name()) {
-                (sensor.pose, sensor.is_in_map, sensor.is_placed) = (told.pose(), true, true);
+                sensor.mount = Mount::InMap(told.pose());
             }
         }
     }
 
     /// Returns everybody whom any tracker knows.
     pub fn people(&self) -> impl Iterator<Item = &Person> {
-        self.trackers.iter().flat_map(|(_, people)| people.persons())
+        self.trackers.iter().flat_map(|(_, people)| people.known())
+    }
+
+    /// Returns whether the picture is the map of a site, because a tracker told where its sensors sit there.
+    pub fn is_in_map(&self) -> bool {
+        self.sensors.iter().any(|sensor| sensor.mount.is_in_map())
     }
 
     /// The sensors of the robot, or if there are none, all; with their numbers from 0. Those of other machines sit on other
@@ -144,8 +146,8 @@ impl Scene {
         self.trackers.clear();
         for sensor in &mut self.sensors {
             let background = sensor.background.take();
-            let Sensor { pose, is_in_map, is_placed, lost, .. } = *sensor;
-            *sensor = Sensor { pose, is_in_map, is_placed, background, lost, ..Sensor::new(&sensor.name) };
+            let Sensor { mount, lost, .. } = *sensor;
+            *sensor = Sensor { mount, background, lost, ..Sensor::new(&sensor.name) };
         }
     }
 }
@@ -155,9 +157,7 @@ impl Sensor {
         Sensor {
             name: name.to_owned(),
             status: None,
-            pose: Pose::default(),
-            is_in_map: false,
-            is_placed: false,
+            mount: Mount::Unknown,
             scan: None,
             foreground: None,
             trail: Trail::default(),
@@ -212,9 +212,9 @@ impl Sensor {
 
     /// Takes how its link is.
     pub fn take_status(&mut self, status: &Status) {
-        (self.status, self.is_placed) = (Some(*status), true);
-        if !self.is_in_map {
-            self.pose = status.pose;
+        self.status = Some(*status);
+        if !self.mount.is_in_map() {
+            self.mount = Mount::OnRobot(status.pose);
         }
     }
 
@@ -241,12 +241,12 @@ impl Sensor {
         self.background.as_ref().is_some_and(|model| model.is_frozen())
     }
 
-    /// The points of the last scan.
+    /// The points of the last scan, in the frame of the picture.
     pub fn points(&self) -> impl Iterator<Item = Point> {
-        let scan = self.scan.iter().filter(|_| self.is_placed);
-        scan.flat_map(|scan| {
-            (0..scan.beams()).filter_map(|beam| {
-                let (x_m, y_m) = point_m(&self.pose, scan.angle(beam), f64::from(scan.distance_mm(beam)?));
+        let placed = self.scan.iter().zip(self.mount.pose());
+        placed.flat_map(move |(scan, pose)| {
+            (0..scan.beams()).filter_map(move |beam| {
+                let (x_m, y_m) = point_m(&pose, scan.angle(beam), f64::from(scan.distance_mm(beam)?));
                 let is_foreground =
                     self.foreground.as_ref().is_some_and(|foreground| foreground.contains(beam));
                 Some(Point { x_m, y_m, beam, intensity: scan.intensities().get(beam), is_foreground })
@@ -254,18 +254,17 @@ impl Sensor {
         })
     }
 
-    /// The marks of the last scan in metres in the robot's frame.
+    /// The marks of the last scan in metres in the frame of the picture.
     pub fn mark_points(&self) -> Vec<(f64, f64)> {
-        let pose = self.pose;
-        let marks = self.marks.iter().filter(|_| self.is_placed).flat_map(|marks| marks.marks());
+        let (Some(pose), Some(marks)) = (self.mount.pose(), &self.marks) else { return Vec::new() };
         let angle = |mark: &Mark| (f64::from(mark.angle_mdeg) / 1000.0).to_radians();
+        let marks = marks.marks().iter();
         marks.map(|mark| point_m(&pose, angle(mark), f64::from(mark.range_dmm) / 10.0)).collect()
     }
 
-    /// Where its background ends, in metres in the robot's frame.
+    /// Where its background ends, in metres in the frame of the picture.
     pub fn background_points(&self) -> Vec<(f64, f64)> {
-        let Some(model) = self.background.as_ref().filter(|_| self.is_placed) else { return Vec::new() };
-        let pose = self.pose;
+        let (Some(pose), Some(model)) = (self.mount.pose(), &self.background) else { return Vec::new() };
         let taught = |range: &&u16| ![Background::UNTAUGHT, Background::FAR].contains(range);
         let ranges = model.ranges().iter().enumerate().filter(|(_, range)| taught(range));
         let points = ranges.map(|(i, range)| {
@@ -273,6 +272,11 @@ impl Sensor {
             point_m(&pose, angle, f64::from(*range) * f64::from(model.unit_um) / 1000.0)
         });
         points.collect()
+    }
+
+    /// The lines of the last scan; they are the robot's, and nowhere in a map.
+    pub fn lines(&self) -> Option<&Lines> {
+        self.lines.as_deref().filter(|_| !self.mount.is_in_map())
     }
 }
 
@@ -299,7 +303,7 @@ const OLD_NS: u64 = 1_000_000_000;
 #[cfg(test)]
 mod tests {
     use super::*;
-    use schema::{ForegroundHead, ScanHead, Track, TrackSensor};
+    use schema::{ForegroundHead, Pose, ScanHead, Track, TrackSensor};
 
     #[test]
     fn old_scans_are_forgotten_and_a_hub_that_goes_leaves_nothing_to_act_on() {
@@ -345,15 +349,15 @@ mod tests {
         let pose = Pose { x_m: 4.0, y_m: 1.0, yaw_rad: 0.5, ..Pose::default() };
         let mut tracks = Tracks::default();
         tracks.push_sensor(TrackSensor::new("hall", &pose));
-        tracks.push(Track { id: 5, x_m: 3.0, ..Track::default() });
+        tracks.push(Track { id: 5, x_m: 3.0, state: 1, ..Track::default() });
         scene.take_tracks("house", &tracks, 1);
         let status = Status { pose: Pose { x_m: 0.3, ..Pose::default() }, ..Status::default() };
         scene.sensor("hall").take_status(&status);
-        assert_eq!(scene.sensors[0].pose, pose, "its place on a robot is another one");
+        assert_eq!(scene.sensors[0].mount, Mount::InMap(pose), "its place on a robot is another one");
         assert!(scene.people().map(|person| (person.id, person.place)).eq([(5, (3.0, 0.0))]));
         assert_eq!(scene.sensors.len(), 1, "a tracker is no sensor");
         scene.sensor("rear").take_status(&status);
-        assert_eq!(scene.sensors[1].pose, status.pose);
+        assert_eq!(scene.sensors[1].mount, Mount::OnRobot(status.pose));
         assert!(scene.age(2_000_000_000) && scene.people().count() == 0);
     }
 

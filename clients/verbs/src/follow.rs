@@ -3,6 +3,7 @@
 
 mod discovery;
 mod lines;
+mod shortage;
 mod track;
 
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -17,6 +18,7 @@ use crate::names::TopicName;
 use crate::output::End;
 use crate::receive_stats::ReceiveStats;
 use lines::{LineTrack, watch_parts};
+use shortage::Shortage;
 use track::Track;
 
 /// When a verb that follows ends by itself.
@@ -77,6 +79,11 @@ pub(crate) trait Sink {
     /// Whether the statuses of what is followed are wanted too, for what its lines take away.
     fn wants_lines(&self) -> bool {
         false
+    }
+    /// Memory, descriptors or places are too short to follow `name`, which is tried again; unless it goes on without that, the
+    /// run ends.
+    fn short(&mut self, _name: &TopicName, failure: Failure) -> Result<(), End> {
+        Err(failure.into())
     }
     /// A status of `sensor` came.
     fn line(&mut self, _sensor: &str, _status: &Status) -> Result<(), End> {
@@ -161,6 +168,7 @@ struct Run<'a> {
     asked_at: Option<Instant>,
     waiting_said: bool,
     received: u64,
+    shortage: Shortage,
 }
 
 /// Who brings the sensor that is called so.
@@ -195,6 +203,7 @@ impl<'a> Run<'a> {
             asked_at: None,
             waiting_said: false,
             received: 0,
+            shortage: Shortage::default(),
         }
     }
 
@@ -262,13 +271,20 @@ impl<'a> Run<'a> {
                     continue;
                 }
                 // That takes a thousand times as long as receiving: what waits of others comes before the next one.
-                if subscribed && !track.source.subscribed() {
-                    more = true;
+                if !track.source.subscribed() && (subscribed || self.shortage.lasts(Instant::now())) {
+                    more |= subscribed;
                     continue;
                 }
                 for turn in 0..TURN {
                     let was_subscribed = track.source.subscribed();
-                    let received = track.source.receive(&mut self.session)?;
+                    let received = match track.source.receive(&mut self.session) {
+                        Err(failure) if failure.kind == Kind::Short => {
+                            sink.short(&track.name, failure)?;
+                            self.shortage.begin(Instant::now());
+                            None
+                        }
+                        received => received?,
+                    };
                     if received.is_some() {
                         sink.arrived();
                     }

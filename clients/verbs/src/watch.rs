@@ -201,6 +201,12 @@ impl Sink for Watcher<'_> {
         topic != Topic::Lines || self.view.lines
     }
 
+    /// What is followed already is shown.
+    fn short(&mut self, name: &TopicName, failure: Failure) -> Result<(), End> {
+        self.tell(format!("{name} is not shown: {}; {}", failure.message, failure.hint), Instant::now());
+        Ok(())
+    }
+
     fn wake_at(&self) -> Option<Instant> {
         self.changed.then_some(self.draw_at)
     }

@@ -127,6 +127,10 @@ impl Drop for Close<'_> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use ::web::{Order, Progress};
+    use std::io;
+    use std::net::TcpStream;
+    use std::time::Duration;
 
     fn options(listen: &str) -> WebOptions {
         WebOptions {
@@ -155,6 +159,64 @@ mod tests {
             );
         }
         assert!(web(&options("127.0.0.1:0"), None, &mut Vec::new(), &stop).is_ok());
+    }
+
+    /// A player that breaks down over what a viewer wants.
+    struct Broken;
+
+    impl Playback for Broken {
+        fn order(&self, order: Order) {
+            panic!("nobody can {order:?}");
+        }
+
+        fn progress(&self) -> Progress {
+            let (position_s, length_s, rate) = (0.0, None, None);
+            Progress { position_s, length_s, rate, paused: true, over: false, lap: 0, telegrams: 0 }
+        }
+    }
+
+    /// Hands on what is written.
+    struct Told(mpsc::Sender<String>);
+
+    impl Write for Told {
+        fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+            let _ = self.0.send(String::from_utf8_lossy(bytes).into_owned());
+            Ok(bytes.len())
+        }
+
+        fn flush(&mut self) -> io::Result<()> {
+            Ok(())
+        }
+    }
+
+    /// Orders something of the server at `address`, as the page does.
+    fn order(address: &str) -> io::Result<TcpStream> {
+        let mut viewer = TcpStream::connect(address)?;
+        let upgrade = "Connection: Upgrade\r\nUpgrade: websocket\r\nSec-WebSocket-Version: 13\r\n\
+                       Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\nSec-WebSocket-Protocol: foxglove.sdk.v1";
+        write!(viewer, "GET / HTTP/1.1\r\nHost: {address}\r\n{upgrade}\r\n\r\n")?;
+        let words = br#"{"op":"scanhub.player","order":"step"}"#;
+        // A text in one frame, masked by zeros.
+        viewer.write_all(&[&[0x81, 0x80 | words.len() as u8, 0, 0, 0, 0], &words[..]].concat())?;
+        Ok(viewer)
+    }
+
+    #[test]
+    fn where_the_thread_that_serves_dies_the_verb_ends_and_says_so() {
+        let (tell, told) = mpsc::channel();
+        let stop = AtomicBool::new(false);
+        let (ordered, end) = thread::scope(|scope| {
+            let verb = scope.spawn(|| web(&options("127.0.0.1:0"), Some(&Broken), &mut Told(tell), &stop));
+            let ready = told.recv_timeout(Duration::from_secs(60)).unwrap_or_default();
+            let ordered = order(ready.trim().trim_start_matches("ready http://").trim_end_matches('/'));
+            // Else it would serve on for ever.
+            stop.store(ordered.is_err(), Ordering::Relaxed);
+            (ordered, verb.join().unwrap())
+        });
+        assert!(ordered.is_ok(), "{ordered:?}");
+        let failure = end.unwrap_err();
+        assert_eq!((failure.kind, &failure.message[..]), (Kind::Failed, "what serves the viewers ended"));
+        assert_eq!(failure.hint, "start it again");
     }
 
     #[test]

@@ -15,7 +15,7 @@ let beams = []; // that violate a circle
 let marks = [];
 let walls = []; // straight surfaces, as pairs of ends
 let corners = [];
-let tracks = [];
+const people = new Map(); // by topic of their tracker: when they came, and who is where
 let player = null; // of the recording that this server plays, if it does
 let heard = -Infinity; // when the verdict came last
 let frames = 0;
@@ -81,10 +81,10 @@ function laserScan(buffer, offset) {
   return { frame, first, last, step, period, farthest, ranges: cdr.floats(), intensities: cdr.floats() };
 }
 
-/** The frame, and x and y of each point of a cloud. */
+/** x and y of each point of a cloud. */
 function pointCloud(buffer, offset) {
   const cdr = new Cdr(buffer, offset);
-  const frame = cdr.frame();
+  cdr.frame();
   const count = cdr.u32() * cdr.u32();
   const fields = {};
   for (let n = cdr.u32(); n > 0; n--) {
@@ -102,7 +102,7 @@ function pointCloud(buffer, offset) {
     xy[2 * i] = cdr.view.getFloat32(cdr.at + i * step + fields.x, true);
     xy[2 * i + 1] = cdr.view.getFloat32(cdr.at + i * step + fields.y, true);
   }
-  return { frame, xy };
+  return xy;
 }
 
 function transforms(buffer, offset) {
@@ -115,18 +115,7 @@ function transforms(buffer, offset) {
     poses.set(child, [1 - 2 * (qy * qy + qz * qz), 2 * (qx * qy - qz * qw), 2 * (qx * qy + qz * qw),
       1 - 2 * (qx * qx + qz * qz), x, y]);
   }
-}
-
-const HERE = [1, 0, 0, 1, 0, 0];
-const poseOf = (frame) => poses.get(frame) ?? HERE;
-
-function inRobot(xy, [xx, xy_, yx, yy, x, y]) {
-  const points = new Float32Array(xy.length);
-  for (let i = 0; i < xy.length; i += 2) {
-    points[i] = xx * xy[i] + xy_ * xy[i + 1] + x;
-    points[i + 1] = yx * xy[i] + yy * xy[i + 1] + y;
-  }
-  return points;
+  isFitDue = true;
 }
 
 // ---------------------------------------------------------------- what comes
@@ -137,7 +126,7 @@ function takeScan(topic, buffer, offset) {
   const sensor = sensorAt(topic);
   const told = laserScan(buffer, offset);
   const { ranges, intensities, first, step } = told;
-  const points = inRobot(places(ranges, first, step), poseOf(told.frame));
+  const points = places(ranges, first, step);
   // What is bright is told over minutes: colours that breathe cannot be read.
   sensor.brightest = intensities.reduce((most, one) => Math.max(most, one), Math.max(1, 0.9995 * (sensor.brightest ?? 1)));
   const byShade = Array.from({ length: intensities.length ? SHADES : 0 }, () => []);
@@ -146,14 +135,14 @@ function takeScan(topic, buffer, offset) {
     byShade[Math.min(SHADES - 1, Math.floor(SHADES * Math.sqrt(one / sensor.brightest)))].push(points[2 * i], points[2 * i + 1]);
   });
   sensor.frame = told.frame;
+  isFitDue = true;
   sensor.scan = { ...told, points, byShade, at: performance.now() };
 }
 
 function takeForeground(topic, buffer, offset) {
   const sensor = sensorAt(topic);
-  const { frame, xy } = pointCloud(buffer, offset);
   const now = performance.now();
-  sensor.foreground = inRobot(xy, poseOf(frame));
+  sensor.foreground = pointCloud(buffer, offset);
   if (now - sensor.trail.at(-1)?.at < TRAIL_STEP_MS) return;
   // Here, too: a page that nobody sees draws no frames.
   sensor.trail = sensor.trail.filter(({ at }) => now - at < TRAIL_MS);
@@ -162,8 +151,8 @@ function takeForeground(topic, buffer, offset) {
 
 /** What is always there is told as a scan that nobody measured. */
 function takeBackground(topic, buffer, offset) {
-  const { frame, ranges, first, step } = laserScan(buffer, offset);
-  sensorAt(topic).background = inRobot(places(ranges, first, step), poseOf(frame));
+  const { ranges, first, step } = laserScan(buffer, offset);
+  sensorAt(topic).background = places(ranges, first, step);
 }
 
 /** x and y of each range in the frame of the sensor; not a number where there is none. */
@@ -176,6 +165,9 @@ function places(ranges, first, step) {
   }
   return xy;
 }
+
+/** Where a sensor sits; nothing as long as nobody told, and what it sees is nowhere. */
+const poseOf = ({ frame, name }) => poses.get(frame ?? name);
 
 const told = (entity) => Object.fromEntries(entity.metadata.map(({ key, value }) => [key, value]));
 
@@ -195,12 +187,14 @@ function takeLines(update) {
   corners = update.entities.flatMap((entity) => entity.spheres.map((one) => one.pose.position));
 }
 
-function takeTracks(update) {
-  tracks = update.entities.map((entity) => ({
-    lines: entity.lines.map((line) => line.points),
-    texts: entity.texts.map((text) => ({ ...text.pose.position, text: text.text })),
-    at: entity.spheres.concat(entity.cylinders, entity.cubes).map((one) => one.pose.position),
-  }));
+function takeTracks(topic, update) {
+  const persons = update.entities.map((entity) => {
+    const [body, reach] = entity.cylinders;
+    const { z, w } = reach.pose.orientation;
+    return { ...told(entity), ...body.pose.position, across: body.size.x, tail: entity.lines[0].points,
+      reach: { x: reach.size.x / 2, y: reach.size.y / 2, yaw: 2 * Math.atan2(z, w) } };
+  });
+  people.set(topic, { at: performance.now(), persons });
 }
 
 function takeStatus(topic, status) {
@@ -240,7 +234,7 @@ function show(topic, buffer, offset) {
   else if (topic === "/zones") takeZones(object());
   else if (topic === "/marks") marks = object().entities.flatMap((entity) => entity.spheres.map((one) => one.pose.position));
   else if (topic === "/lines") takeLines(object());
-  else if (topic === "/tracks") takeTracks(object());
+  else if (topic.endsWith("/tracks")) takeTracks(topic, object());
   else if (topic.endsWith("/scan")) takeScan(topic, buffer, offset);
   else if (topic.endsWith("/foreground")) takeForeground(topic, buffer, offset);
   else if (topic.endsWith("/background")) takeBackground(topic, buffer, offset);
@@ -262,7 +256,7 @@ function forget() {
   marks = [];
   walls = [];
   corners = [];
-  tracks = [];
+  people.clear();
 }
 
 // ---------------------------------------------------------------- the socket
@@ -364,6 +358,20 @@ function toScreen(x, y) {
   return [cx + a * cos - b * sin, cy + a * sin + b * cos];
 }
 
+/** From a sensor's frame to the right and down in the turned picture, `scale` pixels a metre, from the robot's centre on: the six
+ * numbers of a canvas's transformation. */
+function turned([xx, xy, yx, yy, x, y], scale) {
+  const [c, s] = [cos * scale, sin * scale];
+  return [xx * s - yx * c, -xx * c - yx * s, xy * s - yy * c, -xy * c - yy * s, x * s - y * c, -x * c - y * s];
+}
+
+/** From a sensor's frame to the screen. */
+function onScreen(pose) {
+  const [a, b, c, d, e, f] = turned(pose, view.scale);
+  const [x, y] = toScreen(0, 0);
+  return [a, b, c, d, e + x, f + y];
+}
+
 function toRobot(px, py) {
   const [a, b] = [px - middle.x, py - middle.y];
   return [view.x - (-a * sin + b * cos) / view.scale, view.y - (a * cos + b * sin) / view.scale];
@@ -384,23 +392,25 @@ const MARGIN = 1.1;
 
 /** Brings what is seen into the picture, few outliers left out; keeps what is about right. */
 function fit() {
-  const scans = shown().flatMap(({ scan }) => scan ?? []);
+  const scans = shown().filter((sensor) => sensor.scan && poseOf(sensor));
   // Where a picture ends some hundred points tell as well as thousands.
-  const stride = 2 * Math.ceil(scans.reduce((sum, { points }) => sum + points.length, 0) / 2000);
+  const stride = 2 * Math.ceil(scans.reduce((sum, { scan }) => sum + scan.points.length, 0) / 1000);
   const across = [];
   const along = [];
-  for (const { points } of scans) {
+  for (const sensor of scans) {
+    const { points } = sensor.scan;
+    const [a, b, c, d, e, f] = turned(poseOf(sensor), 1);
     for (let i = 0; i < points.length; i += stride) {
       const [x, y] = [points[i], points[i + 1]];
       if (Number.isNaN(x)) continue;
-      across.push(-(y * cos) - -x * sin);
-      along.push(-y * sin + -x * cos);
+      across.push(a * x + c * y + e);
+      along.push(b * x + d * y + f);
     }
   }
   if (!across.length) return;
   const reach = Math.max(0.5, ...circles.map(({ radius }) => radius)) * 1.08;
-  const span = (values) => {
-    values.sort((a, b) => a - b);
+  const span = (unsorted) => {
+    const values = Float32Array.from(unsorted).sort();
     const out = Math.floor(values.length / 50);
     return [Math.min(values[out], -reach), Math.max(values[values.length - 1 - out], reach)];
   };
@@ -438,7 +448,7 @@ let shadeColours = [];
 function readColours() {
   const probe = document.createElement("span");
   document.body.append(probe);
-  for (const name of ["paper", "ink", "soft", "grid", "axis", "accent", "clear", "slow", "stop", "new", "old", "mark", "line", "shade", "edge"]) {
+  for (const name of ["paper", "ink", "soft", "grid", "axis", "accent", "clear", "slow", "stop", "new", "old", "mark", "line", "person", "shade", "edge"]) {
     probe.style.color = `var(--${name})`;
     colours[name] = getComputedStyle(probe).color;
   }
@@ -520,8 +530,8 @@ function drawRobot() {
 
 function drawField(sensor) {
   const { scan } = sensor;
-  if (!scan) return;
-  const pose = poseOf(sensor.frame);
+  const pose = poseOf(sensor);
+  if (!scan || !pose) return;
   const far = Math.min(scan.farthest, 2 * Math.hypot(size.width, size.height) / view.scale);
   const at = (angle) => {
     const [x, y] = [far * Math.cos(angle), far * Math.sin(angle)];
@@ -547,34 +557,41 @@ function drawField(sensor) {
   }
 }
 
-/** Squares of `width` at `points`; how many of them are numbers. */
-function dots(points, width) {
-  // As toScreen, without an array for each of thousands.
-  const [c, s] = [cos * view.scale, sin * view.scale];
-  const left = middle.x - width / 2 + view.y * c - view.x * s;
-  const top = middle.y - width / 2 + view.y * s + view.x * c;
-  let count = 0;
+const HIDDEN = 0.8; // pixels
+
+/** Squares of `width` at `points` of a sensor at `pose`; how many of them are numbers. */
+function dots(points, width, pose) {
+  if (!points || !pose) return 0;
+  const [a, b, c, d, e, f] = onScreen(pose);
+  const [left, top] = [e - width / 2, f - width / 2];
+  let [count, px, py] = [0, NaN, NaN];
   for (let i = 0; i < points.length; i += 2) {
-    const [x, y] = [points[i], points[i + 1]];
-    if (Number.isNaN(x)) continue;
-    pen.fillRect(left - y * c + x * s, top - y * s - x * c, width, width);
+    const x = left + a * points[i] + c * points[i + 1];
+    const y = top + b * points[i] + d * points[i + 1];
+    if (x !== x) continue;
     count += 1;
+    // What is hidden behind the one before costs as much as what is seen.
+    if (Math.abs(x - px) < HIDDEN && Math.abs(y - py) < HIDDEN) continue;
+    pen.fillRect(x, y, width, width);
+    [px, py] = [x, y];
   }
   return count;
 }
 
-function drawScan({ scan }) {
+function drawScan(sensor) {
+  const { scan } = sensor;
   if (!scan) return 0;
+  const pose = poseOf(sensor);
   const width = scan.points.length > 2000 ? 2.5 : 3.5;
   if (!layers.intensity || !scan.byShade.length) {
     pen.fillStyle = colours.ink;
-    return dots(scan.points, width);
+    return dots(scan.points, width, pose);
   }
   // A colour is set once for all that have it.
   let count = 0;
   scan.byShade.forEach((points, shade) => {
     pen.fillStyle = shadeColours[shade];
-    count += dots(points, width);
+    count += dots(points, width, pose);
   });
   return count;
 }
@@ -583,7 +600,7 @@ function drawTrail(sensor, now) {
   pen.fillStyle = colours.new;
   for (const { at, points } of sensor.trail) {
     pen.globalAlpha = 0.34 * Math.max(0, 1 - (now - at) / TRAIL_MS);
-    dots(points, 3);
+    dots(points, 3, poseOf(sensor));
   }
   pen.globalAlpha = 1;
 }
@@ -655,23 +672,37 @@ function drawLines() {
   return walls.length;
 }
 
-function drawTracks() {
-  pen.strokeStyle = pen.fillStyle = colours.accent;
+/** Each with number and tail, and where else they may be; who is not seen is dashed and pale. */
+function drawPeople() {
+  pen.strokeStyle = pen.fillStyle = colours.person;
   pen.lineWidth = 2;
-  for (const { lines, texts, at } of tracks) {
-    for (const line of lines) {
+  pen.font = "600 13px system-ui, sans-serif";
+  pen.textAlign = "center";
+  pen.textBaseline = "bottom";
+  const all = persons();
+  for (const { id, state, x, y, across, tail, reach } of all) {
+    const [px, py] = toScreen(x, y);
+    const radius = Math.max(7, (across / 2) * view.scale);
+    pen.globalAlpha = 0.15;
+    pen.beginPath();
+    pen.ellipse(px, py, reach.x * view.scale, reach.y * view.scale, Math.PI / 2 - reach.yaw + view.turn, 0, 2 * Math.PI);
+    pen.fill();
+    pen.globalAlpha = state === "confirmed" ? 1 : 0.5;
+    if (layers.trails) {
       pen.beginPath();
-      for (const { x, y } of line) pen.lineTo(...toScreen(x, y));
+      for (const at of tail) pen.lineTo(...toScreen(at.x, at.y));
       pen.stroke();
     }
-    for (const { x, y } of at) {
-      pen.beginPath();
-      pen.arc(...toScreen(x, y), 7, 0, 2 * Math.PI);
-      pen.stroke();
-    }
-    for (const { x, y, text } of texts) pen.fillText(text, ...toScreen(x, y));
+    if (state !== "confirmed") pen.setLineDash([4, 4]);
+    pen.beginPath();
+    pen.arc(px, py, radius, 0, 2 * Math.PI);
+    pen.stroke();
+    pen.setLineDash([]);
+    label(`#${id}`, px, py - radius - 3);
+    pen.lineWidth = 2;
   }
-  return tracks.length;
+  pen.globalAlpha = 1;
+  return all.length;
 }
 
 function drawTape() {
@@ -699,9 +730,10 @@ function drawSensors() {
   pen.font = "600 11px system-ui, sans-serif";
   pen.textAlign = "center";
   pen.textBaseline = "middle";
+  const seen = shown();
   [...sensors.values()].forEach((sensor, n) => {
-    if (!shown().includes(sensor)) return;
-    const pose = poseOf(sensor.frame ?? sensor.name);
+    const pose = poseOf(sensor);
+    if (!pose || !seen.includes(sensor)) return;
     const [x, y] = toScreen(pose[4], pose[5]);
     pen.beginPath();
     pen.arc(x, y, 8.5, 0, 2 * Math.PI);
@@ -717,7 +749,8 @@ function drawSensors() {
 
 function draw(now) {
   place();
-  if (view.fits && !kept) fit();
+  if (view.fits && isFitDue && !kept) fit();
+  isFitDue = false;
   const moves = glide();
   pen.setTransform(size.ratio, 0, 0, size.ratio, 0, 0);
   pen.fillStyle = colours.paper;
@@ -728,19 +761,19 @@ function draw(now) {
   if (layers.grid) drawGrid();
   if (layers.background) {
     pen.fillStyle = colours.old;
-    for (const { background } of seen) if (background) dots(background, 2.5);
+    for (const sensor of seen) dots(sensor.background, 2.5, poseOf(sensor));
   }
   if (layers.trails) for (const sensor of seen) drawTrail(sensor, now);
   if (layers.zones) drawn.zones = drawZones();
   if (layers.scan) for (const sensor of seen) drawn.beams += drawScan(sensor);
   if (layers.foreground) {
     pen.fillStyle = colours.new;
-    for (const { foreground } of seen) if (foreground) drawn.foreground += dots(foreground, 5);
+    for (const sensor of seen) drawn.foreground += dots(sensor.foreground, 5, poseOf(sensor));
   }
   if (layers.lines) drawn.lines = drawLines();
   if (layers.marks) drawn.marks = drawMarks();
-  drawn.tracks = drawTracks();
-  drawRobot();
+  drawn.tracks = drawPeople();
+  if (!robot.map) drawRobot();
   drawSensors();
   drawTape();
   readOut();
@@ -757,6 +790,7 @@ function draw(now) {
 // ---------------------------------------------------------------- frames
 
 let isAwake = false;
+let isFitDue = false; // something came, or the view is another one
 
 function wake() {
   if (isAwake) return;
@@ -774,6 +808,7 @@ function wake() {
 
 function resize() {
   view.isFitted = false;
+  isFitDue = true;
   size = { width: innerWidth, height: innerHeight, ratio: Math.min(devicePixelRatio || 1, 3) };
   map.width = Math.round(size.width * size.ratio);
   map.height = Math.round(size.height * size.ratio);
@@ -792,17 +827,19 @@ function readOut() {
   let best = { apart: 14 };
   for (const sensor of shown()) {
     const points = layers.scan && sensor.scan?.points;
-    if (!points) continue;
+    const pose = poseOf(sensor);
+    if (!points || !pose) continue;
+    const [a, b, c, d, e, f] = onScreen(pose);
     for (let i = 0; i < points.length; i += 2) {
-      if (Number.isNaN(points[i])) continue;
-      const [x, y] = toScreen(points[i], points[i + 1]);
+      const x = a * points[i] + c * points[i + 1] + e;
+      const y = b * points[i] + d * points[i + 1] + f;
       const apart = Math.hypot(x - pointer[0], y - pointer[1]);
-      if (apart < best.apart) best = { apart, sensor, beam: i / 2, at: [points[i], points[i + 1]], screen: [x, y] };
+      if (apart < best.apart) best = { apart, sensor, beam: i / 2, at: toRobot(x, y), screen: [x, y] };
     }
   }
   const [x, y] = best.at ?? toRobot(...pointer);
   const bold = document.createElement("b");
-  bold.textContent = `${fixed(Math.hypot(x, y), 2)} m from the robot`;
+  bold.textContent = `${fixed(Math.hypot(x, y), 2)} m from the ${robot.map ? "map's origin" : "robot"}`;
   const lines = [bold, `\nx ${fixed(x, 2)}  y ${fixed(y, 2)} m`];
   if (best.sensor) {
     const { scan, name } = best.sensor;
@@ -817,6 +854,19 @@ function readOut() {
   pen.beginPath();
   pen.arc(...best.screen, 7, 0, 2 * Math.PI);
   pen.stroke();
+}
+
+const persons = () => [...people.values()].flatMap((one) => one.persons);
+
+/** How many people are in which room. */
+function tellPeople() {
+  const rooms = new Map();
+  const all = persons();
+  for (const { room } of all) rooms.set(room, (rooms.get(room) ?? 0) + 1);
+  // Who is in none comes last.
+  const names = [...rooms.keys()].sort((a, b) => (!a - !b) || (a < b ? -1 : 1));
+  const words = names.map((room) => `${room || "elsewhere"} ${rooms.get(room)}`).join(", ");
+  put($("people"), words && `${all.length} ${all.length === 1 ? "person" : "people"}: ${words}`);
 }
 
 /** What a player shows while it waits stands. */
@@ -857,6 +907,13 @@ function tell() {
       wake();
     }
   }
+  for (const [topic, { at }] of people) {
+    if (!kept && !stands() && now - at > OLD_MS) {
+      people.delete(topic);
+      wake();
+    }
+  }
+  tellPeople();
   tellPlayer();
   explain();
 }
@@ -992,6 +1049,7 @@ function sparkline(canvas, history, series) {
 
 function choose(space) {
   view.only = space === view.only ? null : space;
+  isFitDue = true;
   wake();
   tellSensors();
 }
@@ -1015,6 +1073,7 @@ function pan(dx, dy) {
 
 function turn(angle) {
   view.turn += angle;
+  isFitDue = true;
   place();
   wake();
 }
@@ -1161,14 +1220,23 @@ matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => {
 
 // ---------------------------------------------------------------- numbers for whoever looks
 
+/** x and y of each beam in the robot's frame. */
+function pointsOf(sensor) {
+  const pose = sensor && poseOf(sensor);
+  if (!pose || !sensor.scan) return [];
+  const [xx, xy, yx, yy, x, y] = pose;
+  return [...sensor.scan.points].map((_, i, xs) => (i % 2 ? yx * xs[i - 1] + yy * xs[i] + y : xx * xs[i] + xy * xs[i + 1] + x));
+}
+
 Object.defineProperty(window, "scanhub", {
   get: () => ({
     frames,
     scans: Object.fromEntries([...sensors.values()].map(({ name, scans }) => [name, scans])),
     ...drawn,
     drawn_ms: [0.5, 0.99].map((share) => ages.map(([from, to]) => to - from).sort((a, b) => a - b)[Math.floor(share * (ages.length - 1))] ?? null),
+    people: persons(),
     shown: () => ages,
-    points: (name) => [...([...sensors.values()].find((one) => one.name === name)?.scan?.points ?? [])],
+    points: (name) => pointsOf([...sensors.values()].find((one) => one.name === name)),
     screen: toScreen,
     place: toRobot,
     view: { x: view.x, y: view.y, scale: view.scale, turn: view.turn },

@@ -73,7 +73,7 @@ pub fn replay(progress: &Progress) -> Vec<u8> {
     bytes(progress)
 }
 
-/// The verdict of the robot's sensors, and how its hub is; `trouble` is why there is none.
+/// The verdict of the robot's sensors, whether they are shown in a map, and how its hub is; `trouble` is why there is none.
 pub fn robot(scene: &Scene, domain: &str, trouble: Option<&Trouble>) -> Vec<u8> {
     #[derive(Serialize)]
     struct Robot<'a> {
@@ -84,6 +84,7 @@ pub fn robot(scene: &Scene, domain: &str, trouble: Option<&Trouble>) -> Vec<u8> 
         hub: bool,
         pid: Option<u32>,
         load_percent: Option<f64>,
+        map: bool,
         trouble: Option<Words<'a>>,
     }
     let (verdict, sensor, nearest_mm) = scene::verdict(scene.robot().map(|(_, sensor)| sensor));
@@ -95,6 +96,7 @@ pub fn robot(scene: &Scene, domain: &str, trouble: Option<&Trouble>) -> Vec<u8> 
         hub: scene.hub_lives,
         pid: (scene.hub_pid != 0).then_some(scene.hub_pid),
         load_percent: scene.hub_percent,
+        map: scene.is_in_map(),
         trouble: trouble.map(Words::of),
     })
 }
@@ -133,7 +135,7 @@ pub fn status(sensor: &Sensor) -> Vec<u8> {
         yaw_rad: f64,
         upside_down: bool,
     }
-    let Pose { x_m, y_m, yaw_rad, upside_down, .. } = sensor.pose;
+    let Pose { x_m, y_m, yaw_rad, upside_down, .. } = sensor.mount.pose().unwrap_or_default();
     let status = sensor.status.as_ref();
     let ages = sensor.meter.age_percentiles_ms();
     let trouble = sensor.trouble();
@@ -188,9 +190,10 @@ pub fn background(message: &mut Vec<u8>, sensor: &str, wall_ns: u64, model: &Bac
 /// Stands for a range that no sensor measures.
 const BEYOND: u16 = u16::MAX - 1;
 
-/// Where the sensors of `scene` sit.
+/// Where the sensors of `scene` sit, as far as that was told.
 pub fn transforms(scene: &Scene, wall_ns: u64) -> Vec<u8> {
-    let poses: Vec<_> = scene.sensors.iter().map(|sensor| (sensor.name.clone(), sensor.pose)).collect();
+    let pose = |sensor: &Sensor| Some((sensor.name.clone(), sensor.mount.pose()?));
+    let poses: Vec<_> = scene.sensors.iter().filter_map(pose).collect();
     let mut message = Vec::new();
     ros::static_transforms(&mut message, wall_ns, &poses);
     message

@@ -81,6 +81,7 @@ mod tests {
         };
         least(&["ink", "soft", "accent", "slow", "stop", "clear"], &["paper", "panel"], 4.5);
         least(&["new", "mark", "line"], &["paper"], 3.0);
+        least(&["person"], &["paper", "panel"], 4.5);
         for fill in ["clear-fill", "slow-fill", "stop-fill"] {
             for scheme in [0, 1] {
                 let ratio = contrast([255; 3], colour(fill)[scheme]);

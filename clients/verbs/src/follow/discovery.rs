@@ -39,7 +39,8 @@ impl Run<'_> {
         if !self.tracks.is_empty() && !self.tracks.iter().any(is_missing) {
             return Ok(());
         }
-        if self.session.domain().is_none() {
+        // Who has no descriptor to follow a topic has none to ask for it.
+        if self.session.domain().is_none() || self.shortage.lasts(Instant::now()) {
             return Ok(());
         }
         if self.asked_at.is_some_and(|at| at.elapsed() < ASK_EVERY) {

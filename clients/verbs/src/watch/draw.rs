@@ -12,7 +12,7 @@ use schema::Counter;
 use super::counters::page;
 use super::map::{DOTS, colour, map};
 use super::view::View;
-use scene::{Place, Scene, Sensor, verdict};
+use scene::{Place, Scene, Sensor, rooms, verdict};
 
 /// Draws `scene` as `view` says, with the picture of `held` if that is there: what there is to act on is never held.
 pub(crate) fn draw(frame: &mut Frame<'_>, scene: &Scene, held: Option<&Scene>, view: &View) {
@@ -101,6 +101,9 @@ fn heading(scene: &Scene, view: &View, columns: u16) -> Line<'static> {
     }
     if let Some(mm) = nearest {
         spans.push(Span::raw(format!(", nearest {:.2} m", f64::from(mm) / 1000.0)));
+    }
+    if let Some(rooms) = rooms(scene.people()) {
+        spans.push(Span::raw(format!("  {rooms}")));
     }
     while spans.len() > 1 && spans.iter().map(Span::width).sum::<usize>() > usize::from(columns) {
         spans.pop();

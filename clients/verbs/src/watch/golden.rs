@@ -349,15 +349,22 @@ fn people_of_a_tracker_stand_in_the_picture_with_their_numbers_and_tails() {
     let (mut scene, view) = (scene(), View::new(true));
     let plain = screen(&scene, &view, (120, 40));
     let mut tracks = Tracks::default();
-    for (id, state) in [(12, TrackState::Confirmed), (13, TrackState::Tentative)] {
-        tracks.push(Track { id, x_m: 2.0, y_m: -2.0, state: state as u8, ..Track::default() });
+    let persons = [(12, TrackState::Confirmed), (13, TrackState::Tentative), (14, TrackState::Hidden)];
+    for ((id, state), y_m) in persons.into_iter().zip([-2.0, -1.0, 1.0]) {
+        tracks.push(Track { id, x_m: 2.0, y_m, state: state as u8, ..Track::default() });
     }
+    tracks.track_array[0].set_room("hall");
     for n in 0..20 {
         tracks.track_array[0].x_m = 1.0 + 0.05 * n as f32;
         scene.take_tracks("house", &tracks, 1 + n * 200_000_000);
     }
     let shown = screen(&scene, &view, (120, 40));
-    assert!(text(&shown).contains("#12") && !text(&shown).contains("#13"), "{}", text(&shown));
+    let words = text(&shown);
+    assert!(words.contains("#12") && !words.contains("#13") && words.contains("(#14)"), "{words}");
+    assert!(
+        words.lines().next().is_some_and(|line| line.contains("2 people: hall 1, elsewhere 1")),
+        "{words}"
+    );
     let green = |buffer: &Buffer| buffer.content.iter().filter(|cell| cell.fg == Color::LightGreen).count();
     assert!(green(&plain) == 0 && green(&shown) > 5, "{} and {}", green(&plain), green(&shown));
 }

@@ -91,7 +91,7 @@ struct Layers {
     marks: Dots,
     /// Sensors by their numbers from 1.
     sensors: Vec<(f64, f64, String)>,
-    /// Where people were, and where they are, by their numbers.
+    /// Where people were, and where they are, by their numbers; in brackets who is not seen.
     tails: Dots,
     people: Vec<(f64, f64, String)>,
 }
@@ -109,7 +109,7 @@ impl Layers {
         let around = if view.zones { circles(shown.iter().map(|(_, sensor)| *sensor)) } else { Vec::new() };
         let mut layers = Layers {
             colours: view.colours,
-            robot: Some((0.0, 0.0)),
+            robot: (!scene.is_in_map()).then_some((0.0, 0.0)),
             background: Vec::new(),
             circles: around.iter().map(|circle| dotted(circle, view.dot_m)).collect(),
             walls: Default::default(),
@@ -125,12 +125,13 @@ impl Layers {
             tails: Vec::new(),
             people: Vec::new(),
         };
-        for person in scene.people().filter(|person| person.is_known()) {
+        for person in scene.people() {
             if view.trails {
                 layers.tails.extend(person.tail().map(turned));
             }
             let (x, y) = turned(person.place);
-            layers.people.push((x, y, format!("#{}", person.id)));
+            let number = format!("#{}", person.id);
+            layers.people.push((x, y, if person.is_seen() { number } else { format!("({number})") }));
         }
         for (number, sensor) in shown {
             for point in sensor.points() {
@@ -149,13 +150,15 @@ impl Layers {
             if view.marks {
                 layers.marks.extend(sensor.mark_points().into_iter().map(turned));
             }
-            if let Some(found) = sensor.lines.as_ref().filter(|_| view.lines) {
+            if let Some(found) = sensor.lines().filter(|_| view.lines) {
                 layers.lines.extend(found.lines().iter().flat_map(|line| dots_of(line, view.dot_m)));
                 let corners = found.corners().iter().map(|corner| (corner.x_m.into(), corner.y_m.into()));
                 layers.corners.extend(corners.map(turned));
             }
-            let pose = sensor.pose;
-            layers.sensors.push((-pose.y_m, pose.x_m, (number + 1).to_string()));
+            if let Some(pose) = sensor.mount.pose() {
+                let (x, y) = turned((pose.x_m, pose.y_m));
+                layers.sensors.push((x, y, (number + 1).to_string()));
+            }
         }
         layers
     }
@@ -194,11 +197,10 @@ impl Layers {
         self.robot = self.robot.filter(|at| grid.has(*at)).map(|at| grid.cell(at));
         for labels in [&mut self.sensors, &mut self.people] {
             labels.retain(|(x, y, _)| grid.has((*x, *y)));
+            labels.iter_mut().for_each(|(x, y, _)| (*x, *y) = grid.cell((*x, *y)));
         }
         let labels = self.circles.iter_mut().filter_map(|circle| circle.label.as_mut());
-        for (x, y, _) in
-            labels.filter(|(x, y, _)| grid.has((*x, *y))).chain(&mut self.sensors).chain(&mut self.people)
-        {
+        for (x, y, _) in labels.filter(|(x, y, _)| grid.has((*x, *y))) {
             (*x, *y) = grid.cell((*x, *y));
         }
     }

@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 use ::web::{Board, ChannelId, Event, Playback, Progress, messages};
 use scanhub_client::clock;
 use scanhub_client::streams::{Sample, Session, Who};
-use scene::{Circle, Scene, Trouble, circles};
+use scene::{Circle, People, Scene, Trouble, circles};
 use schema::{Domain, Failure, Header, Kind, Topic, Verdict};
 
 use super::{WebOptions, told};
@@ -63,6 +63,8 @@ pub(super) struct Feeder<'a> {
     /// When marks, zones and lines are put up again, at the earliest.
     marked_at: [Instant; 3],
     status_at: Instant,
+    /// Before that it is not told again that something is short.
+    short_at: Instant,
     trouble: Option<Trouble>,
     message: Vec<u8>,
 }
@@ -103,6 +105,7 @@ impl<'a> Feeder<'a> {
             circles_at: now,
             marked_at: [now; 3],
             status_at: now,
+            short_at: now,
             trouble: None,
             message: Vec::new(),
         }
@@ -186,6 +189,13 @@ impl<'a> Feeder<'a> {
             if self.scene.sensors.iter().any(is_old) {
                 self.board.clear(channels.scan);
                 self.board.clear(channels.foreground);
+            }
+        }
+        for (tracker, channel) in &self.tracks {
+            let has_people =
+                |(name, people): &(String, People)| name == tracker && !people.persons().is_empty();
+            if !self.scene.trackers.iter().any(has_people) {
+                self.board.clear(*channel);
             }
         }
         (self.zones_are_new, self.marks_are_new, self.lines_are_new) = (true, true, true);
@@ -296,14 +306,14 @@ impl Sink for Feeder<'_> {
 
     fn sample(&mut self, name: &TopicName, sample: &Sample) -> Result<(), End> {
         if let Sample::Tracks(tracks) = sample {
-            let poses = |scene: &Scene| scene.sensors.iter().map(|sensor| sensor.pose).collect::<Vec<_>>();
-            let before = poses(&self.scene);
+            let mounts = |scene: &Scene| scene.sensors.iter().map(|sensor| sensor.mount).collect::<Vec<_>>();
+            let before = mounts(&self.scene);
             picture::take(&mut self.scene, name, sample);
-            self.poses_are_new |= poses(&self.scene) != before;
+            self.poses_are_new |= mounts(&self.scene) != before;
             self.put_tracks(&name.sensor, tracks.header().wall_ns);
             return Ok(());
         }
-        let pose = self.scene.sensor(&name.sensor).pose;
+        let mount = self.scene.sensor(&name.sensor).mount;
         picture::take(&mut self.scene, name, sample);
         match sample {
             Sample::Scan(scan) => {
@@ -319,7 +329,7 @@ impl Sink for Feeder<'_> {
             }
             Sample::Background(model) => self.put_background(name, model.header().wall_ns, model),
             Sample::Status(_) => {
-                self.poses_are_new |= pose != self.scene.sensor(&name.sensor).pose;
+                self.poses_are_new |= mount != self.scene.sensor(&name.sensor).mount;
                 self.status_at = Instant::now();
             }
             _ => {}
@@ -339,6 +349,17 @@ impl Sink for Feeder<'_> {
     /// Lines are wanted as long as a viewer asks for them.
     fn wants(&self, topic: Topic) -> bool {
         topic != Topic::Lines || self.board.is_watched(self.lines)
+    }
+
+    /// What is followed already is served.
+    fn short(&mut self, name: &TopicName, failure: Failure) -> Result<(), End> {
+        let now = Instant::now();
+        if now < self.short_at {
+            return Ok(());
+        }
+        self.short_at = now + SHORT_EVERY;
+        let message = format!("{name} is not served: {}", failure.message);
+        told::short(&mut self.output, &message, &failure.hint, self.options.json)
     }
 
     fn tick(&mut self, now: Instant) -> Result<(), End> {
@@ -366,12 +387,14 @@ impl Sink for Feeder<'_> {
 }
 
 /// The same verdict, because a page that hears nothing for half a second takes it for unknown; and a distance that changes
-/// with every scan cannot be read.
-const ROBOT_EVERY: Duration = Duration::from_millis(50);
+/// with every scan cannot be read. A change is put up at once.
+const ROBOT_EVERY: Duration = Duration::from_millis(90);
 /// Nobody sees a player move in smaller steps.
 const PROGRESS_EVERY: Duration = Duration::from_millis(50);
-/// Of several sensors one message has all.
-const MARKS_EVERY: Duration = Duration::from_millis(20);
+/// Of several sensors one message has all, and a sign that follows its scan so soon is seen to go with it.
+const MARKS_EVERY: Duration = Duration::from_millis(50);
 /// In viewers what is not said again is gone after a second, and whoever comes sees them so soon.
 const CIRCLES_EVERY: Duration = Duration::from_millis(300);
 const STATUS_EVERY: Duration = Duration::from_millis(500);
+/// Between two words about that.
+const SHORT_EVERY: Duration = Duration::from_secs(10);

@@ -1,4 +1,4 @@
-//! The lines of `web`: where it is, who comes and goes, and why nobody can.
+//! The lines of `web`: where it is, who comes and goes, why nobody can, and what is not served.
 
 use std::io::Write;
 
@@ -23,7 +23,10 @@ pub(crate) fn ready(output: &mut Output<'_>, url: &str, json: bool) -> Result<()
 pub(crate) fn event(output: &mut Output<'_>, event: &Event, json: bool) -> Result<(), End> {
     match event {
         Event::Viewer(visit) => client(output, visit, json),
-        Event::Short(error) => short(output, &error.to_string(), json),
+        Event::Short(error) => {
+            let hint = "raise the limit of descriptors: ulimit -n";
+            short(output, &format!("nobody can be let in: {error}"), hint, json)
+        }
     }
 }
 
@@ -47,16 +50,14 @@ fn client(output: &mut Output<'_>, visit: &Visit, json: bool) -> Result<(), End>
     }
 }
 
-/// It goes on with those who are here, so it is no end.
-fn short(output: &mut Output<'_>, why: &str, json: bool) -> Result<(), End> {
+/// Something is too short for more than there is; it goes on with that, so it is no end.
+pub(crate) fn short(output: &mut Output<'_>, message: &str, hint: &str, json: bool) -> Result<(), End> {
     #[derive(Serialize)]
     struct Short<'a> {
         class: &'static str,
         message: &'a str,
         hint: &'a str,
     }
-    let message = &format!("nobody can be let in: {why}");
-    let hint = "raise the limit of descriptors: ulimit -n";
     match json {
         true => output.json(&Short { class: "web_short", message, hint }),
         false => output.line(|line| write!(line, "{message}; {hint}")),

@@ -1,8 +1,8 @@
-//! Circles and marks as `foxglove.SceneUpdate`, encoded as JSON. Each message has all there is: what is not in the next one
+//! Circles, marks, lines and people as `foxglove.SceneUpdate`, encoded as JSON. Each message has all there is: what is not in the next one
 //! would stay, so entities live for a second only.
 
 use ros::BASE_FRAME;
-use scene::{People, Scene, circles};
+use scene::{Ellipse, People, Scene, circles};
 use schema::Verdict;
 use serde::Serialize;
 
@@ -37,7 +37,8 @@ pub fn zones(scene: &Scene, wall_ns: u64) -> Vec<u8> {
         entity.tell("beam", point.beam.to_string());
         entity.tell("distance_m", format!("{:.3}", point.distance_m()));
         entity.tell("verdict", circle.verdict.name().to_owned());
-        let points = [(sensor.pose.x_m, sensor.pose.y_m), (point.x_m, point.y_m)];
+        let from = sensor.mount.pose().unwrap_or_default();
+        let points = [(from.x_m, from.y_m), (point.x_m, point.y_m)];
         let color = colour(circle.verdict, 1.0);
         entity.lines.push(LinePrimitive::new(LINE_STRIP, points.into_iter(), color));
         entities.push(entity);
@@ -45,18 +46,20 @@ pub fn zones(scene: &Scene, wall_ns: u64) -> Vec<u8> {
     update(&entities)
 }
 
-/// The people of one tracker with their numbers, and their tails; in the robot's frame, which is the map of the site for who
-/// follows a tracker.
+/// The people of one tracker with their numbers, their tails, and around each the ellipse that holds the true place in 95 of 100
+/// cases; in the robot's frame, which is the map of the site for who follows a tracker. Who is not seen is pale.
 pub fn tracks(people: &People, wall_ns: u64) -> Vec<u8> {
-    let known = people.persons().iter().filter(|person| person.is_known());
-    let entities = known.map(|person| {
+    let entities = people.known().map(|person| {
         let (x, y) = person.place;
+        let colour = Colour { a: if person.is_seen() { 1.0 } else { PALE }, ..PERSON };
         let mut entity = Entity::new(format!("person {}", person.id), wall_ns);
         entity.tell("id", person.id.to_string());
         entity.tell("state", person.state.name().to_owned());
-        entity.cylinders.push(disc((x, y), PERSON_M, PERSON));
-        entity.lines.push(LinePrimitive::new(LINE_STRIP, person.tail().chain([(x, y)]), PERSON));
-        entity.texts.push(Text::new(at(x, y), 14.0, PERSON, person.id.to_string()));
+        entity.tell("room", person.room.clone().unwrap_or_default());
+        entity.cylinders.push(disc((x, y), PERSON_M, colour));
+        entity.cylinders.push(oval((x, y), &person.reach, Colour { a: FAINT, ..PERSON }));
+        entity.lines.push(LinePrimitive::new(LINE_STRIP, person.tail().chain([(x, y)]), colour));
+        entity.texts.push(Text::new(at(x, y), 14.0, colour, format!("#{}", person.id)));
         entity
     });
     update(&entities.collect::<Vec<_>>())
@@ -65,7 +68,7 @@ pub fn tracks(people: &People, wall_ns: u64) -> Vec<u8> {
 /// The lines of the robot's sensors, from end to end, and where two meet.
 pub fn lines(scene: &Scene, wall_ns: u64) -> Vec<u8> {
     let entities = scene.robot().filter_map(|(_, sensor)| {
-        let found = sensor.lines.as_ref()?;
+        let found = sensor.lines()?;
         let mut entity = Entity::new(format!("lines {}", sensor.name), wall_ns);
         entity.tell("sensor", sensor.name.clone());
         let ends = |line: &schema::Line| [(line.x1_m, line.y1_m), (line.x2_m, line.y2_m)];
@@ -258,6 +261,13 @@ fn disc((x, y): (f64, f64), across: f64, color: Colour) -> Cylinder {
     Cylinder { pose: at(x, y), size, bottom_scale: 1.0, top_scale: 1.0, color }
 }
 
+fn oval((x, y): (f64, f64), of: &Ellipse, color: Colour) -> Cylinder {
+    let (z, w) = (of.yaw_rad / 2.0).sin_cos();
+    let pose = Pose { orientation: Quaternion { x: 0.0, y: 0.0, z, w }, ..at(x, y) };
+    let size = Vector { x: 2.0 * of.long_m, y: 2.0 * of.short_m, z: FLAT_M };
+    Cylinder { pose, size, bottom_scale: 1.0, top_scale: 1.0, color }
+}
+
 /// Green, amber and red, as the page has them.
 fn colour(verdict: Verdict, a: f64) -> Colour {
     let (r, g, b) = match verdict {
@@ -277,4 +287,7 @@ const CORNER_M: f64 = 0.06;
 const LINE: Colour = Colour { r: 0.45, g: 0.33, b: 0.8, a: 1.0 };
 const PERSON: Colour = Colour { r: 0.2, g: 0.65, b: 0.3, a: 1.0 };
 const PERSON_M: f64 = 0.5;
+/// Who is not seen, and where else somebody may be.
+const PALE: f64 = 0.5;
+const FAINT: f64 = 0.15;
 const MARK: Colour = Colour { r: 0.05, g: 0.55, b: 0.75, a: 1.0 };

@@ -3,7 +3,7 @@
 
 use ::web::messages;
 use ros::{LASER_SCAN, POINT_CLOUD, TF_MESSAGE, Value, read};
-use schema::{Corner, Header, Line, Lines, Pose, Scan, ScanHead, Status};
+use schema::{Corner, Header, Line, Lines, Pose, Scan, ScanHead, Status, Track, Tracks};
 use serde_json::Value as Json;
 
 use super::super::golden;
@@ -24,6 +24,15 @@ fn scene() -> Scene {
     lines.line_array[1] = Line { x1_m: 2.0, y1_m: 1.5, x2_m: -0.5, y2_m: 1.5, ..Line::default() };
     lines.corner_array[0] = Corner { x_m: 2.0, y_m: 1.5, ..Corner::default() };
     scene.sensor("front").lines = Some(Box::new(lines));
+    // One who walks and is seen, one who is not seen, and one who is perhaps nobody.
+    let mut tracks = Tracks::default();
+    for (id, state) in [(7, 1), (8, 2), (9, 0)] {
+        tracks.push(Track { id, state, x_m: 1.0, y_m: id as f32 - 7.5, ..Track::default() });
+    }
+    for n in 0..9 {
+        tracks.track_array[0].x_m += 0.2;
+        scene.take_tracks("house", &tracks, n * 200_000_000);
+    }
     scene
 }
 
@@ -140,6 +149,23 @@ fn the_browser_is_sent_what_the_terminal_draws() {
         places(all(&lines, "spheres").iter().map(|one| &one["pose"]["position"])),
         &layers.corners,
     );
+
+    let people = entities(&messages::tracks(&scene.trackers[0].1, 1));
+    let mut tails = Vec::new();
+    for (entity, (right, up, number)) in people.iter().zip(&layers.people) {
+        let [at, word] = [&entity["cylinders"][0], &entity["texts"][0]];
+        let told = places([&at["pose"]["position"]].into_iter())[0];
+        assert!((up - told.0).hypot(right + told.1) < 1e-9, "{told:?}, {number} at {right}, {up}");
+        let is_seen = at["color"]["a"] == 1.0;
+        let text = word["text"].as_str().unwrap();
+        assert_eq!(*number, if is_seen { text.to_owned() } else { format!("({text})") });
+        // The last of a tail is where the person is.
+        let line = places(entity["lines"][0]["points"].as_array().unwrap().iter());
+        assert_eq!(line.last(), Some(&told));
+        tails.extend(line.into_iter().rev().skip(1));
+    }
+    assert_eq!((people.len(), layers.people.len()), (2, 2));
+    same("tails", tails, &layers.tails);
 
     let zones = entities(&messages::zones(&scene, 1));
     let circle = |entity: &Json| {

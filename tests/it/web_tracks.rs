@@ -1,0 +1,77 @@
+//! People in the browser's picture: those whom `track --as` tells of, with numbers, tails and rooms, in the map of the site.
+
+use serde_json::Value;
+
+use crate::browser::{Browser, Look};
+use crate::testkit::{INT, TestEnv, until};
+use crate::track::{SITE, recorded, replay};
+use crate::web::web;
+use crate::web_page::browse;
+
+/// Pixels of the colour of people in a square around where the first one is drawn.
+const GREEN: &str = "(() => {
+    const [x, y] = scanhub.screen(scanhub.people[0].x, scanhub.people[0].y);
+    const probe = document.body.appendChild(document.createElement('i'));
+    probe.style.color = 'var(--person)';
+    const wanted = getComputedStyle(probe).color.match(/\\d+/g).map(Number);
+    probe.remove();
+    const { data } = document.querySelector('#map').getContext('2d').getImageData(x - 40, y - 40, 80, 80);
+    let count = 0;
+    for (let i = 0; i < data.length; i += 4) count += wanted.every((one, n) => Math.abs(one - data[i + n]) < 30);
+    return count;
+})()";
+
+fn number(page: &mut Browser, script: &str) -> f64 {
+    page.ask(script).as_f64().unwrap_or_else(|| panic!("{script} is no number"))
+}
+
+#[test]
+fn people_stand_in_the_picture_where_the_tracker_sees_them() {
+    let env = TestEnv::in_time();
+    let Some(mut page) = browse(&env, Look::LAPTOP) else { return };
+    let site = env.file("site.toml", SITE);
+    let hub = replay(&env, &recorded(&env, 40));
+    let mut track = env.start(&["track", "--site", &site, "--as=house", "--delay=2s", "--json"]);
+    until("the tracker publishes and follows the sensors", || {
+        let listed = env.run(&["list", "--json"]).of_class("topic");
+        let followed = |line: &&Value| line["topic"] == "foreground" && line["subscribers"] == 1;
+        listed.iter().any(|line| line["sensor"] == "house") && listed.iter().filter(followed).count() == 2
+    });
+    let (_server, host) = web(&env, &[]);
+    page.open(&format!("http://{host}/"));
+    until("the page follows the tracker", || env.subscribers("house/tracks") > 0);
+    env.run(&["control", "hall", "resume"]);
+
+    page.await_true(
+        "scanhub.tracks === 1 && document.querySelector('#people').innerText === '1 person: hall 1'",
+    );
+    page.await_true("document.querySelector('#people').innerText === '1 person: kitchen 1'");
+    page.await_true("scanhub.tracks === 1 && scanhub.people[0].tail.length > 10");
+    // What is held stays to be looked at.
+    page.press(" ");
+    page.await_true("document.querySelector('#verdict').innerText.includes('held')");
+    assert_eq!(page.ask("scanhub.people[0].state"), "confirmed");
+    assert!(number(&mut page, GREEN) > 40.0, "a circle, a tail and a number are drawn");
+    let place = ["x", "y"].map(|axis| number(&mut page, &format!("scanhub.people[0].{axis}")));
+    let reach = ["x", "y"].map(|axis| number(&mut page, &format!("scanhub.people[0].reach.{axis}")));
+    assert!(reach.iter().all(|half| (0.005..0.5).contains(half)), "{reach:?}");
+    // Sensors are where the site has them, and the robot's circles nowhere.
+    assert_eq!(page.ask("scanhub.zones"), 0);
+    let far = "scanhub.points('kitchen').filter((at, i) => i % 2 === 0 && (at < -0.2 || at > 12.2)).length";
+    assert!(number(&mut page, "scanhub.points('kitchen').length") > 100.0);
+    assert_eq!(page.ask(far), 0);
+
+    let id = page.ask("scanhub.people[0].id");
+    let is_told = |line: &Value| {
+        let one = &line["tracks"][0];
+        let near = |key: &str, at: f64| one[key].as_f64().is_some_and(|told| (told - at).abs() < 1e-3);
+        id == one["id"].to_string().as_str() && near("x_m", place[0]) && near("y_m", place[1])
+    };
+    track.await_line("where the page draws the person", is_told);
+    assert_eq!(track.end(INT).code, Some(0));
+    // Who is not told of any more is not there.
+    page.press(" ");
+    page.await_true("scanhub.tracks === 0 && document.querySelector('#people').innerText === ''");
+    assert_eq!(hub.end(INT).code, Some(0));
+    assert!(page.complaints.is_empty(), "{:?}", page.complaints);
+}
