@@ -1,6 +1,6 @@
 //! Topics that a program publishes itself, such as what it makes of others. They are as a hub's own: consumers follow them
-//! by name, in every language, see what they missed, and are woken. One process of a domain publishes beside its hub; its
-//! lock says that it lives. Refuses to know what is published.
+//! by name, in every language, see what they missed, and are woken. A name has one publisher: its lock says that it lives.
+//! Refuses to know what is published.
 
 use std::cell::{Cell, RefCell};
 use std::hash::{BuildHasher, RandomState};
@@ -10,7 +10,7 @@ use schema::ipc::{self, DueRings, Node, Payload, TopicPublisher, Waker};
 use schema::limits::TopicLimits;
 use schema::shortage::{allocate, check_descriptors, check_memory, longest_segment, sensor_bytes};
 use schema::{
-    DEFAULT_DOMAIN, Domain, Environment, Failure, Header, Kind, ListenLock, Ring, Topic, Wake,
+    DEFAULT_DOMAIN, Domain, Environment, Failure, Header, Kind, ListenLock, NameLock, Ring, Topic, Wake,
     check_followed, check_sensor, is_remote, publisher,
 };
 
@@ -18,14 +18,18 @@ use crate::clock;
 use crate::subscribe::places;
 
 /// Publishes the topic of `name` that carries `P`, in the domain that SCANHUB_DOMAIN names: consumers follow it by
-/// [`subscribe::<P>(name)`](crate::subscribe). There need not be a hub. A name is `OWNER.NAME`, as `tracker.near`: those
-/// without a dot are the hub's.
+/// [`subscribe::<P>(name)`](crate::subscribe) while a hub or a listener is there; publishing needs neither.
 ///
-/// A process that publishes more than one topic, or for more than 32 consumers, opens one [`PublishSession`] for all of them.
+/// Which names are possible depends on the topic. One that no hub makes, such as people or angles of a mount, has a name of
+/// its own, as `mount`: any number of programs publish so, each under another name. A topic that a hub makes is published for
+/// somebody else, as `tracker.near` (`OWNER.NAME`), and one process of a domain does that.
+///
+/// A process that publishes more than one topic, or for more than 32 consumers, opens a [`PublishSession`].
 ///
 /// # Errors
 ///
-/// Those of [`PublishSession::open`], [`PublishSession::sensor`] and [`SensorPublisher::topic`].
+/// Those of [`PublishSession::beside`] or [`PublishSession::open`], of [`PublishSession::sensor`] and
+/// [`SensorPublisher::topic`].
 ///
 /// # Examples
 ///
@@ -42,7 +46,11 @@ use crate::subscribe::places;
 /// }
 /// ```
 pub fn publish<P: Payload + ?Sized>(name: &str) -> Result<Publication<P>, Failure> {
-    PublishSession::open(&own_domain()?, &[P::TOPIC], TopicLimits::default())?.sensor(name)?.topic()
+    let (domain, topics, limits) = (own_domain()?, [P::TOPIC], TopicLimits::default());
+    if Topic::OF_LINKS.contains(&P::TOPIC) {
+        return PublishSession::open(&domain, &topics, limits)?.sensor(name)?.topic();
+    }
+    PublishSession::beside(&domain, name, &topics, limits)?.topic()
 }
 
 /// Returns the first live place of the domain that SCANHUB_DOMAIN names, or that which a hub would take.
@@ -67,7 +75,15 @@ struct Membership {
     sensors: RefCell<Vec<Weak<Awakener>>>,
     node: Node,
     // Behind the node, for whoever takes it next finds no other one.
-    lock: Option<ListenLock>,
+    lock: Place,
+}
+
+/// What says that the process publishes.
+enum Place {
+    /// For others, under names with a dot.
+    Others { _lock: ListenLock },
+    /// Under a name of its own.
+    Own { name: String, _lock: NameLock },
 }
 
 /// Whether there is memory for `topics` of one sensor.
@@ -92,25 +108,39 @@ impl PublishSession {
     /// another user's.
     pub fn open(domain: &Domain, topics: &[Topic], limits: TopicLimits) -> Result<PublishSession, Failure> {
         limits.check()?;
-        let lock = ListenLock::acquire(domain.root())?;
+        let lock = Place::Others { _lock: ListenLock::acquire(domain.root())? };
         check_topics(topics, &limits)?;
-        Ok(PublishSession::with(domain, limits, ipc::hub_node(domain)?, Some(lock)))
+        Ok(PublishSession::with(domain, limits, ipc::hub_node(domain)?, lock))
     }
 
-    /// Publishes beside a hub or a listener that is there, of which it takes no place: for what is made of the topics of a
-    /// domain, such as tracks of people. Its names have no dot, and are none of a hub's sensors. Else as [`open`](Self::open).
+    /// Publishes as `name`, beside a hub or a listener if there is one, of which it takes no place: for what is made of the
+    /// topics of a domain, such as tracks of people, and for what no hub knows. The name has no dot, and no sensor of the hub
+    /// has it. Else as [`open`](Self::open).
     ///
     /// # Errors
     ///
-    /// [`Kind::NoHub`](schema::Kind) if nobody is there; else as [`open`](Self::open), but for
-    /// [`Kind::DomainHeld`](schema::Kind).
-    pub fn beside(domain: &Domain, topics: &[Topic], limits: TopicLimits) -> Result<PublishSession, Failure> {
+    /// [`Kind::DomainHeld`](schema::Kind) if another program publishes as `name`: the message has its number;
+    /// [`Kind::Configuration`](schema::Kind) if the name is not possible or a sensor's; else as [`open`](Self::open) and
+    /// [`sensor`](Self::sensor).
+    pub fn beside(
+        domain: &Domain,
+        name: &str,
+        topics: &[Topic],
+        limits: TopicLimits,
+    ) -> Result<SensorPublisher, Failure> {
         limits.check()?;
+        check_sensor(name)?;
+        let lock = Place::Own { name: name.to_owned(), _lock: NameLock::acquire(domain.root(), name)? };
         check_topics(topics, &limits)?;
-        Ok(PublishSession::with(domain, limits, ipc::client_node(domain)?, None))
+        let of_hub = |(sensor, topic): &(String, Topic)| sensor == name && Topic::OF_LINKS.contains(topic);
+        if ipc::published(domain)?.iter().any(of_hub) {
+            let what = format!("{name:?} is no name to publish under: it is a sensor of the hub");
+            return Err(Failure::new(Kind::Configuration, what, "any other name, for example house"));
+        }
+        PublishSession::with(domain, limits, ipc::client_node(domain)?, lock).sensor(name)
     }
 
-    fn with(domain: &Domain, limits: TopicLimits, node: Node, lock: Option<ListenLock>) -> PublishSession {
+    fn with(domain: &Domain, limits: TopicLimits, node: Node, lock: Place) -> PublishSession {
         node.try_cleanup_dead_nodes();
         let boot = RandomState::new().hash_one(std::process::id());
         let (domain, sensors) = (domain.clone(), RefCell::default());
@@ -128,8 +158,7 @@ impl PublishSession {
     }
 
     /// Makes what wakes the consumers of the topics of `name`, which is `OWNER.NAME`: a hub's sensors have no dot, so that
-    /// nobody publishes in the place of another. Who publishes [`beside`](Self::beside) a hub has a name like its sensors, which
-    /// none of them has. A name that is there already is the same one.
+    /// nobody publishes in the place of another. A name that is there already is the same one.
     ///
     /// # Errors
     ///
@@ -137,9 +166,8 @@ impl PublishSession {
     /// descriptors are short; [`Kind::Failed`](schema::Kind) if the place is taken by another user.
     pub fn sensor(&self, name: &str) -> Result<SensorPublisher, Failure> {
         check_followed(name)?;
-        if self.0.lock.is_none() {
-            self.check_beside(name)?;
-        } else if !is_remote(name) {
+        let is_own = matches!(&self.0.lock, Place::Own { name: own, .. } if own == name);
+        if !is_own && !is_remote(name) {
             let what = format!("{name:?} is no name to publish under: it may be a sensor of the hub");
             return Err(Failure::new(Kind::Configuration, what, "OWNER.NAME, for example tracker.near"));
         }
@@ -154,16 +182,6 @@ impl PublishSession {
         let sensor = Rc::new(Awakener { name, waker, due, membership: self.0.clone() });
         sensors.push(Rc::downgrade(&sensor));
         Ok(SensorPublisher(sensor))
-    }
-
-    fn check_beside(&self, name: &str) -> Result<(), Failure> {
-        check_sensor(name)?;
-        let is_link = |(sensor, topic): &(String, Topic)| sensor == name && !topic.is_of_trackers();
-        if ipc::published(&self.0.domain)?.iter().any(is_link) {
-            let what = format!("{name:?} is no name to publish under: it is a sensor of the hub");
-            return Err(Failure::new(Kind::Configuration, what, "any other name, for example house"));
-        }
-        Ok(())
     }
 
     /// Removes what consumers that were killed left in the domain. Call it every few seconds.
@@ -259,6 +277,13 @@ impl<P: Payload + ?Sized> Publication<P> {
         }
     }
 
+    /// Returns the header of a sample of what was so at `stamp_ns` on CLOCK_MONOTONIC, else as [`header`](Self::header).
+    pub fn header_at(&self, stamp_ns: u64) -> Header {
+        let now = self.header();
+        let wall_ns = now.wall_ns.wrapping_sub(now.stamp_last_ns.wrapping_sub(stamp_ns));
+        Header { stamp_first_ns: stamp_ns, stamp_last_ns: stamp_ns, wall_ns, ..now }
+    }
+
     /// Uses up `count` numbers without a sample: consumers see `count` of them missing.
     pub fn skip(&mut self, count: u64) {
         self.topic.skip(count);
@@ -326,6 +351,18 @@ impl<P: Payload> Publication<P> {
     /// [`SensorPublisher::wake`].
     pub fn send(&mut self, fill: impl FnOnce(&mut P)) -> Result<(), Failure> {
         let header = self.header();
+        self.send_with(&header, fill)?;
+        self.sensor.wake(Wake::Telegram)
+    }
+
+    /// Sends as [`send`](Self::send) what was so at `stamp_ns` on CLOCK_MONOTONIC, such as the angle of a mount when it was
+    /// measured.
+    ///
+    /// # Errors
+    ///
+    /// As [`send`](Self::send).
+    pub fn send_at(&mut self, stamp_ns: u64, fill: impl FnOnce(&mut P)) -> Result<(), Failure> {
+        let header = self.header_at(stamp_ns);
         self.send_with(&header, fill)?;
         self.sensor.wake(Wake::Telegram)
     }
