@@ -10,7 +10,7 @@ use schema::ipc::{self, DueRings, Node, Payload, TopicPublisher, Waker};
 use schema::limits::TopicLimits;
 use schema::shortage::{allocate, check_descriptors, check_memory, longest_segment, sensor_bytes};
 use schema::{
-    DEFAULT_DOMAIN, Domain, Environment, Failure, Header, Kind, ListenLock, Ring, Topic, Wake,
+    DEFAULT_DOMAIN, Domain, Environment, Failure, Header, Kind, ListenLock, Maker, Ring, Topic, Wake,
     check_followed, check_sensor, is_remote, publisher,
 };
 
@@ -72,8 +72,7 @@ struct Membership {
 
 /// Whether there is memory for `topics` of one sensor.
 fn check_topics(topics: &[Topic], limits: &TopicLimits) -> Result<(), Failure> {
-    let needed = sensor_bytes(topics, limits);
-    check_memory(needed, needed.min(longest_segment(limits)))
+    check_memory(sensor_bytes(topics, limits), longest_segment(topics, limits))
 }
 
 /// Descriptors of a service, and of its first consumer.
@@ -158,7 +157,7 @@ impl PublishSession {
 
     fn check_beside(&self, name: &str) -> Result<(), Failure> {
         check_sensor(name)?;
-        let is_link = |(sensor, topic): &(String, Topic)| sensor == name && !topic.is_of_trackers();
+        let is_link = |(sensor, topic): &(String, Topic)| sensor == name && topic.maker() == Maker::Link;
         if ipc::published(&self.0.domain)?.iter().any(is_link) {
             let what = format!("{name:?} is no name to publish under: it is a sensor of the hub");
             return Err(Failure::new(Kind::Configuration, what, "any other name, for example house"));
