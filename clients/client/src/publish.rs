@@ -2,6 +2,8 @@
 //! by name, in every language, see what they missed, and are woken. A name has one publisher: its lock says that it lives.
 //! Refuses to know what is published.
 
+mod publication;
+
 use std::cell::{Cell, RefCell};
 use std::hash::{BuildHasher, RandomState};
 use std::rc::{Rc, Weak};
@@ -10,12 +12,13 @@ use schema::ipc::{self, DueRings, Node, Payload, TopicPublisher, Waker};
 use schema::limits::TopicLimits;
 use schema::shortage::{allocate, check_descriptors, check_memory, longest_segment, sensor_bytes};
 use schema::{
-    DEFAULT_DOMAIN, Domain, Environment, Failure, Header, Kind, ListenLock, NameLock, Ring, Topic, Wake,
+    DEFAULT_DOMAIN, Domain, Environment, Failure, Kind, ListenLock, Maker, NameLock, Ring, Topic, Wake,
     check_followed, check_sensor, is_remote, publisher,
 };
 
-use crate::clock;
 use crate::subscribe::places;
+
+pub use publication::Publication;
 
 /// Publishes the topic of `name` that carries `P`, in the domain that SCANHUB_DOMAIN names: consumers follow it by
 /// [`subscribe::<P>(name)`](crate::subscribe) while a hub or a listener is there; publishing needs neither.
@@ -47,7 +50,7 @@ use crate::subscribe::places;
 /// ```
 pub fn publish<P: Payload + ?Sized>(name: &str) -> Result<Publication<P>, Failure> {
     let (domain, topics, limits) = (own_domain()?, [P::TOPIC], TopicLimits::default());
-    if Topic::OF_LINKS.contains(&P::TOPIC) {
+    if P::TOPIC.maker() == Maker::Link {
         return PublishSession::open(&domain, &topics, limits)?.sensor(name)?.topic();
     }
     PublishSession::beside(&domain, name, &topics, limits)?.topic()
@@ -88,8 +91,7 @@ enum Place {
 
 /// Whether there is memory for `topics` of one sensor.
 fn check_topics(topics: &[Topic], limits: &TopicLimits) -> Result<(), Failure> {
-    let needed = sensor_bytes(topics, limits);
-    check_memory(needed, needed.min(longest_segment(limits)))
+    check_memory(sensor_bytes(topics, limits), longest_segment(topics, limits))
 }
 
 /// Descriptors of a service, and of its first consumer.
@@ -132,7 +134,7 @@ impl PublishSession {
         check_sensor(name)?;
         let lock = Place::Own { name: name.to_owned(), _lock: NameLock::acquire(domain.root(), name)? };
         check_topics(topics, &limits)?;
-        let of_hub = |(sensor, topic): &(String, Topic)| sensor == name && Topic::OF_LINKS.contains(topic);
+        let of_hub = |(sensor, topic): &(String, Topic)| sensor == name && topic.maker() == Maker::Link;
         if ipc::published(domain)?.iter().any(of_hub) {
             let what = format!("{name:?} is no name to publish under: it is a sensor of the hub");
             return Err(Failure::new(Kind::Configuration, what, "any other name, for example house"));
@@ -224,7 +226,7 @@ impl SensorPublisher {
         let topic = TopicPublisher::new(node, &self.0.name, limits)?;
         // To write into what has no memory behind it would end the process.
         allocate(domain)?;
-        Ok(Publication { topic, sensor: SensorPublisher(self.0.clone()) })
+        Ok(Publication::new(topic, SensorPublisher(self.0.clone())))
     }
 
     /// Returns what the topics of the session are made for.
@@ -249,155 +251,5 @@ impl SensorPublisher {
         let mut due = self.0.due.get();
         due.note(topic, reached);
         self.0.due.set(due);
-    }
-}
-
-/// A topic that is being published.
-pub struct Publication<P: Payload + ?Sized> {
-    // Before what wakes its consumers, and before the session.
-    topic: TopicPublisher<P>,
-    sensor: SensorPublisher,
-}
-
-impl<P: Payload + ?Sized> Publication<P> {
-    /// Returns the header of a sample that is made now: both stamps are this moment, on CLOCK_MONOTONIC, and its number is
-    /// the next one.
-    pub fn header(&self) -> Header {
-        let now_ns = clock::now_ns();
-        let number = self.topic.next_number();
-        Header {
-            seq: number,
-            topic_seq: number,
-            stamp_first_ns: now_ns,
-            stamp_last_ns: now_ns,
-            wall_ns: clock::wall_ns(),
-            boot: self.sensor.0.membership.boot,
-            hub_pid: std::process::id(),
-            ..Header::default()
-        }
-    }
-
-    /// Returns the header of a sample of what was so at `stamp_ns` on CLOCK_MONOTONIC, else as [`header`](Self::header).
-    pub fn header_at(&self, stamp_ns: u64) -> Header {
-        let now = self.header();
-        let wall_ns = now.wall_ns.wrapping_sub(now.stamp_last_ns.wrapping_sub(stamp_ns));
-        Header { stamp_first_ns: stamp_ns, stamp_last_ns: stamp_ns, wall_ns, ..now }
-    }
-
-    /// Uses up `count` numbers without a sample: consumers see `count` of them missing.
-    pub fn skip(&mut self, count: u64) {
-        self.topic.skip(count);
-    }
-
-    /// Returns the number that the next sample will have: from 0, as they are sent.
-    pub fn next_number(&self) -> u64 {
-        self.topic.next_number()
-    }
-
-    /// Returns the number of consumers that follow the topic.
-    pub fn subscribers(&self) -> usize {
-        self.topic.subscribers()
-    }
-
-    /// Connects consumers that came since the last sample, and hands them what the topic keeps for late joiners. Of a topic
-    /// that is seldom sent, call it ten times a second.
-    pub fn connect(&self) {
-        // One that cannot be connected now is tried again with the next sample.
-        let _ = self.topic.connect();
-    }
-
-    /// Returns the number of samples that were not sent for lack of memory.
-    pub fn failed(&self) -> u64 {
-        self.topic.failed()
-    }
-}
-
-impl<P: Payload + ?Sized> Publication<P> {
-    /// Sends a sample of `len` bytes that `fill` writes in place, beginning with all of them 0, and wakes the consumers: for
-    /// payloads without a size of their own, such as a scan.
-    ///
-    /// # Errors
-    ///
-    /// As [`send`](Publication::send); also [`Kind::Short`](schema::Kind) if it is longer than the topic was made for.
-    pub fn send_len(&mut self, len: usize, fill: impl FnOnce(&mut P)) -> Result<(), Failure> {
-        let header = self.header();
-        self.send_len_with(&header, len, fill)?;
-        self.sensor.wake(Wake::Telegram)
-    }
-
-    /// Sends as [`send_len`](Self::send_len), with `header` but for the sample's number in the topic, and wakes nobody. Returns
-    /// how many consumers got it.
-    ///
-    /// # Errors
-    ///
-    /// [`Kind::Short`](schema::Kind) if there is no memory for it, or it is longer than the topic was made for: its number is
-    /// used up.
-    pub fn send_len_with(
-        &mut self,
-        header: &Header,
-        len: usize,
-        fill: impl FnOnce(&mut P),
-    ) -> Result<usize, Failure> {
-        self.topic.send_len(header, len, fill).inspect(|&reached| self.sensor.note(P::TOPIC, reached))
-    }
-}
-
-impl<P: Payload> Publication<P> {
-    /// Sends a sample that `fill` writes in place, beginning with the payload's default, and wakes the consumers.
-    ///
-    /// # Errors
-    ///
-    /// [`Kind::Short`](schema::Kind) if there is no memory for it: its number is used up. Else as
-    /// [`SensorPublisher::wake`].
-    pub fn send(&mut self, fill: impl FnOnce(&mut P)) -> Result<(), Failure> {
-        let header = self.header();
-        self.send_with(&header, fill)?;
-        self.sensor.wake(Wake::Telegram)
-    }
-
-    /// Sends as [`send`](Self::send) what was so at `stamp_ns` on CLOCK_MONOTONIC, such as the angle of a mount when it was
-    /// measured.
-    ///
-    /// # Errors
-    ///
-    /// As [`send`](Self::send).
-    pub fn send_at(&mut self, stamp_ns: u64, fill: impl FnOnce(&mut P)) -> Result<(), Failure> {
-        let header = self.header_at(stamp_ns);
-        self.send_with(&header, fill)?;
-        self.sensor.wake(Wake::Telegram)
-    }
-
-    /// Sends as [`send`](Self::send), with `header` but for the sample's number in the topic, and wakes nobody: for samples
-    /// of several topics that are sent together. Returns how many consumers got it.
-    ///
-    /// # Errors
-    ///
-    /// [`Kind::Short`](schema::Kind) if there is no memory for it: its number is used up.
-    pub fn send_with(&mut self, header: &Header, fill: impl FnOnce(&mut P)) -> Result<usize, Failure> {
-        self.topic.send(header, fill).inspect(|&reached| self.sensor.note(P::TOPIC, reached))
-    }
-}
-
-impl Publication<[u8]> {
-    /// Sends `bytes` as a sample and wakes the consumers.
-    ///
-    /// # Errors
-    ///
-    /// As [`send`](Publication::send); also [`Kind::Short`](schema::Kind) for more than
-    /// [`Telegram::MAX`](schema::Telegram::MAX) bytes.
-    pub fn send_bytes(&mut self, bytes: &[u8]) -> Result<(), Failure> {
-        let header = self.header();
-        self.send_bytes_with(&header, bytes)?;
-        self.sensor.wake(Wake::Telegram)
-    }
-
-    /// Sends `bytes` with `header`, as [`send_with`](Publication::send_with).
-    ///
-    /// # Errors
-    ///
-    /// [`Kind::Short`](schema::Kind) if there is no memory for it, or it is longer than
-    /// [`Telegram::MAX`](schema::Telegram::MAX).
-    pub fn send_bytes_with(&mut self, header: &Header, bytes: &[u8]) -> Result<usize, Failure> {
-        self.topic.send_bytes(header, bytes).inspect(|&reached| self.sensor.note(Topic::Telegram, reached))
     }
 }

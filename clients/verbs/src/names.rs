@@ -84,8 +84,10 @@ const NEAR: f64 = 0.8;
 pub(crate) fn no_such_topic(name: &TopicName, topics: &[Topic]) -> Failure {
     let names = topics.iter().map(|topic| format!("{}/{}", name.sensor, topic.name()));
     let hint = format!("there are {}", names.collect::<Vec<_>>().join(", "));
-    let who = if name.topic.is_of_trackers() { "is no tracker" } else { "is a tracker" };
-    Failure::new(Kind::NoTopic, format!("there is no topic {name}: {} {who}", name.sensor), hint)
+    let who = topics
+        .first()
+        .map_or(String::new(), |topic| format!(": {} is {}", name.sensor, topic.maker().name()));
+    Failure::new(Kind::NoTopic, format!("there is no topic {name}{who}"), hint)
 }
 
 /// The hub has no `sensor`, but `sensors`.
@@ -104,6 +106,7 @@ pub(crate) fn no_sensor(sensor: &str, sensors: &[String]) -> Failure {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use schema::Maker;
 
     #[test]
     fn names() {
@@ -131,7 +134,7 @@ mod tests {
         assert_eq!(hint("frnt"), "did you mean front? there are front, rear");
         assert_eq!(hint("side"), "there are front, rear");
         let name = TopicName { sensor: "house".to_owned(), topic: Topic::Scan };
-        let failure = no_such_topic(&name, &Topic::OF_TRACKERS);
+        let failure = no_such_topic(&name, Maker::Tracker.topics());
         assert_eq!(failure.message, "there is no topic house/scan: house is a tracker");
         assert_eq!(failure.hint, "there are house/tracks, house/events");
     }

@@ -7,7 +7,7 @@ use ::track::{PICTURE_NS, Picture, Site};
 use scanhub_client::streams::find;
 use scanhub_client::{Publication, PublishSession, SensorPublisher, clock};
 use schema::limits::TopicLimits;
-use schema::{Domain, Event, Failure, Flags, Header, Topic, Tracks, Wake};
+use schema::{Domain, Event, Failure, Flags, Header, Maker, Tracks, Wake};
 
 use crate::names::position;
 
@@ -50,8 +50,8 @@ impl Samples {
     /// [`Kind::NoHub`](schema::Kind) if none does, [`Kind::Configuration`](schema::Kind) if the name is not possible, [`Kind::DomainHeld`](schema::Kind) if another tracker
     /// has it, [`Kind::Short`](schema::Kind) if memory or descriptors are short.
     pub(super) fn publish(&mut self, name: &str, places: &[Domain]) -> Result<(), Failure> {
-        let (topics, limits) = (Topic::OF_TRACKERS, TopicLimits::default());
-        let sensor = PublishSession::beside(&find(places)?, name, &topics, limits)?;
+        let (topics, limits) = (Maker::Tracker.topics(), TopicLimits::default());
+        let sensor = PublishSession::beside(&find(places)?, name, topics, limits)?;
         self.topics = Some(Topics { tracks: sensor.topic()?, events: sensor.topic()?, sensor });
         Ok(())
     }
