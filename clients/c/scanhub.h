@@ -24,8 +24,8 @@ extern "C" {
 #endif
 
 /* The groups are 239.255.76.80 to .83, all on this port: .80 announce and status, .81 zones, early, marks, lines, motion,
- * foreground, tracks and events, .82
- * scan and background, .83 telegram. */
+ * foreground, tracks, events, tilt and obstacles, .82
+ * scan, background and cloud, .83 telegram. */
 #define SCANHUB_PORT 22200
 /* The longest datagram that a gateway ever sends. */
 #define SCANHUB_MAX 1472
@@ -43,7 +43,10 @@ enum scanhub_topic {
     SCANHUB_MOTION = 9,
     SCANHUB_EARLY = 10,
     SCANHUB_TRACKS = 11,
-    SCANHUB_EVENTS = 12
+    SCANHUB_EVENTS = 12,
+    SCANHUB_TILT = 13,
+    SCANHUB_CLOUD = 14,
+    SCANHUB_OBSTACLES = 15
 };
 
 /* Bits of `flags`. */
@@ -555,6 +558,140 @@ static inline enum scanhub_result scanhub_read_motion(const struct scanhub_datag
     for (i = 0; i < 9; i++)
         finite = finite && isfinite(out->covariance[i]);
     return finite ? SCANHUB_OK : SCANHUB_BAD_PAYLOAD;
+}
+
+/* The angle of a mount at `stamp_ns`. */
+struct scanhub_tilt {
+    double angle_rad;  /* right-handed around the mount's axis */
+    double rate_rad_s; /* how fast it grows; nan: not known */
+};
+static inline enum scanhub_result scanhub_read_tilt(const struct scanhub_datagram *datagram, struct scanhub_tilt *out)
+{
+    enum scanhub_result result = scanhub_expect(datagram, SCANHUB_TILT, 16);
+    if (result != SCANHUB_OK)
+        return result;
+    out->angle_rad = scanhub_f64(datagram->payload);
+    out->rate_rad_s = scanhub_f64(datagram->payload + 8);
+    return isfinite(out->angle_rad) && !isinf(out->rate_rad_s) ? SCANHUB_OK : SCANHUB_BAD_PAYLOAD;
+}
+
+/* What a point in three dimensions is beside the background. */
+enum scanhub_point_class {
+    SCANHUB_POINT_UNKNOWN = 0,    /* not known yet, and so is every number that is not here */
+    SCANHUB_POINT_BACKGROUND = 1, /* where something stands always */
+    SCANHUB_POINT_FOREGROUND = 2, /* nearer than that */
+    SCANHUB_POINT_BEHIND = 3      /* farther away */
+};
+/* The points of one scan. The samples of a sweep come one behind the other, from `first` to `last`. */
+struct scanhub_cloud {
+    uint32_t sweep;      /* number of the sweep, from 0 */
+    uint32_t generation; /* of the background: one more each time that it was forgotten */
+    uint16_t count;      /* points, at most 8192 */
+    uint8_t first, last; /* 1: the first sample of its sweep, the last one */
+    uint8_t complete;    /* 1: the sweep went from turn to turn, and no angle was missing */
+    uint8_t doubted;     /* 1: its angles contradict the background */
+    const uint8_t *points;
+};
+struct scanhub_point {
+    float x_m, y_m, z_m; /* ahead, to the left, above the floor */
+    uint16_t beam;       /* number of the beam in its scan */
+    uint8_t point_class; /* enum scanhub_point_class */
+};
+/* One point, i below `count`. */
+static inline struct scanhub_point scanhub_point(const struct scanhub_cloud *cloud, unsigned i)
+{
+    const uint8_t *at = cloud->points + 16 * (size_t)i;
+    struct scanhub_point out;
+    out.x_m = scanhub_f32(at);
+    out.y_m = scanhub_f32(at + 4);
+    out.z_m = scanhub_f32(at + 8);
+    out.beam = scanhub_u16(at + 12);
+    out.point_class = at[14];
+    return out;
+}
+static inline enum scanhub_result scanhub_read_cloud(const struct scanhub_datagram *datagram,
+                                                     struct scanhub_cloud *out)
+{
+    const uint8_t *at = datagram->payload;
+    enum scanhub_result result = scanhub_expect(datagram, SCANHUB_CLOUD, 16);
+    unsigned i;
+    if (result != SCANHUB_OK)
+        return result;
+    out->sweep = scanhub_u32(at);
+    out->generation = scanhub_u32(at + 4);
+    out->count = scanhub_u16(at + 8);
+    out->first = at[10] & 1;
+    out->last = at[10] >> 1 & 1;
+    out->complete = at[10] >> 2 & 1;
+    out->doubted = at[10] >> 3 & 1;
+    out->points = at + 16;
+    if (out->count > 8192 || datagram->payload_len < 16 + 16 * (size_t)out->count)
+        return SCANHUB_BAD_PAYLOAD;
+    for (i = 0; i < out->count; i++) {
+        struct scanhub_point point = scanhub_point(out, i);
+        if (!isfinite(point.x_m) || !isfinite(point.y_m) || !isfinite(point.z_m))
+            return SCANHUB_BAD_PAYLOAD;
+    }
+    return SCANHUB_OK;
+}
+
+/* What one sweep of a mount has found, the nearest first. */
+struct scanhub_obstacles {
+    uint32_t sweep, generation; /* as in a cloud */
+    uint32_t left_out;          /* obstacles that did not fit */
+    uint8_t count;              /* at most 64 */
+    uint8_t complete, doubted;  /* as in a cloud; if doubted, nothing is known of what stands there */
+    const uint8_t *obstacles;
+};
+struct scanhub_obstacle {
+    float x_m, y_m, z_m;       /* mean of its points: ahead, to the left, above the floor */
+    float low_m[3], high_m[3]; /* least and greatest coordinates of its points */
+    float distance_m;          /* of its nearest point from the robot's centre, over ground */
+    uint32_t points;
+    uint8_t foreground;        /* 1: has points before the background */
+    uint8_t near;              /* 1: has points in the space that is to be free */
+};
+/* One obstacle, i below `count`. */
+static inline struct scanhub_obstacle scanhub_obstacle(const struct scanhub_obstacles *obstacles, unsigned i)
+{
+    const uint8_t *at = obstacles->obstacles + 48 * (size_t)i;
+    struct scanhub_obstacle out;
+    unsigned n;
+    out.x_m = scanhub_f32(at);
+    out.y_m = scanhub_f32(at + 4);
+    out.z_m = scanhub_f32(at + 8);
+    for (n = 0; n < 3; n++) {
+        out.low_m[n] = scanhub_f32(at + 12 + 4 * (size_t)n);
+        out.high_m[n] = scanhub_f32(at + 24 + 4 * (size_t)n);
+    }
+    out.distance_m = scanhub_f32(at + 36);
+    out.points = scanhub_u32(at + 40);
+    out.foreground = at[44] & 1;
+    out.near = at[44] >> 1 & 1;
+    return out;
+}
+static inline enum scanhub_result scanhub_read_obstacles(const struct scanhub_datagram *datagram,
+                                                         struct scanhub_obstacles *out)
+{
+    const uint8_t *at = datagram->payload;
+    enum scanhub_result result = scanhub_expect(datagram, SCANHUB_OBSTACLES, 16);
+    unsigned i, n;
+    if (result != SCANHUB_OK)
+        return result;
+    out->sweep = scanhub_u32(at);
+    out->generation = scanhub_u32(at + 4);
+    out->left_out = scanhub_u32(at + 8);
+    out->count = at[12];
+    out->complete = at[13] >> 2 & 1;
+    out->doubted = at[13] >> 3 & 1;
+    out->obstacles = at + 16;
+    if (out->count > 64 || datagram->payload_len < 16 + 48 * (size_t)out->count)
+        return SCANHUB_BAD_PAYLOAD;
+    for (i = 0; i < out->count; i++)
+        for (n = 0; n < 10; n++)
+            if (!isfinite(scanhub_f32(out->obstacles + 48 * (size_t)i + 4 * (size_t)n)))
+                return SCANHUB_BAD_PAYLOAD;
+    return SCANHUB_OK;
 }
 
 /* What is near the robot: at most 8 circles around its centre, the largest first. */

@@ -33,7 +33,7 @@ from dataclasses import astuple, dataclass, replace
 from typing import Optional, Union
 
 PORT = 22200
-TOPICS = ("announce", "telegram", "scan", "marks", "zones", "foreground", "background", "status", "lines", "motion", "early", "tracks", "events")
+TOPICS = ("announce", "telegram", "scan", "marks", "zones", "foreground", "background", "status", "lines", "motion", "early", "tracks", "events", "tilt", "cloud", "obstacles")
 VERDICTS = ("clear", "slow", "stop", "unknown")
 STATES = ("absent", "probing", "switching", "starting", "streaming", "silent", "paused")
 FAMILIES = ("lms", "ld", "rplidar")
@@ -317,6 +317,72 @@ class Event:
 
 
 @dataclass(frozen=True)
+class Tilt:
+    """The angle of a mount at `stamp_ns`, right-handed around its axis, and how fast it grows (nan: not known)."""
+
+    angle_rad: float
+    rate_rad_s: float
+
+
+POINT_CLASSES = ("unknown", "background", "foreground", "behind")
+
+
+@dataclass(frozen=True)
+class Point:
+    """A point in the robot's frame: metres ahead, to the left and above the floor, its beam's number in the scan, and one of
+    POINT_CLASSES."""
+
+    x_m: float
+    y_m: float
+    z_m: float
+    beam: int
+    point_class: str
+
+
+@dataclass(frozen=True)
+class Cloud:
+    """The points of one scan of a sweep. The samples of a sweep come one behind the other, from `first` to `last`. A sweep is
+    `complete` if it went from turn to turn without a missing angle, and `doubted` if its angles contradict the background, of
+    which `generation` is the number."""
+
+    sweep: int
+    generation: int
+    first: bool
+    last: bool
+    complete: bool
+    doubted: bool
+    points: "tuple[Point, ...]"
+
+
+@dataclass(frozen=True)
+class Obstacle:
+    """The mean, the least and the greatest coordinates of its points in the robot's frame, the distance of the nearest one over
+    ground, how many there are, and whether some are before the background, or in the space that is to be free."""
+
+    x_m: float
+    y_m: float
+    z_m: float
+    low_m: "tuple[float, float, float]"
+    high_m: "tuple[float, float, float]"
+    distance_m: float
+    points: int
+    foreground: bool
+    near: bool
+
+
+@dataclass(frozen=True)
+class Obstacles:
+    """What one sweep has found, the nearest first. If it is `doubted`, nothing is known of what stands there."""
+
+    sweep: int
+    generation: int
+    complete: bool
+    doubted: bool
+    left_out: int
+    obstacles: "tuple[Obstacle, ...]"
+
+
+@dataclass(frozen=True)
 class Zone:
     """A circle around the robot's centre and the beams that met something inside."""
 
@@ -409,7 +475,9 @@ class Status:
     pose: Pose
 
 
-Payload = Union[Announce, Telegram, Scan, Marks, Zones, Foreground, Background, Status, Lines, Motion, Early, Tracks, Event]
+Payload = Union[
+    Announce, Telegram, Scan, Marks, Zones, Foreground, Background, Status, Lines, Motion, Early, Tracks, Event, Tilt, Cloud, Obstacles
+]
 
 
 @dataclass(frozen=True)
@@ -814,6 +882,39 @@ def _events(payload: bytes) -> Event:
     return Event(EVENTS[kind], id, room, *(door if EVENTS[kind] == "door" else ("", "", "")))
 
 
+def _tilt(payload: bytes) -> Tilt:
+    angle_rad, rate_rad_s = struct.unpack_from("<dd", payload)
+    _limit(math.isfinite(angle_rad) and not math.isinf(rate_rad_s))
+    return Tilt(angle_rad, rate_rad_s)
+
+
+def _cloud(payload: bytes) -> Cloud:
+    sweep, generation, count, flags = struct.unpack_from("<IIHB5x", payload)
+    _limit(count <= 8192)
+
+    def point(*fields) -> Point:
+        *place, beam, number = fields
+        _limit(all(math.isfinite(value) for value in place))
+        return Point(*place, beam, POINT_CLASSES[number] if number < len(POINT_CLASSES) else "unknown")
+
+    points = _items(point, "<fffHBx", payload, 16, count)
+    return Cloud(sweep, generation, *(bool(flags & bit) for bit in (1, 2, 4, 8)), points)
+
+
+def _obstacles(payload: bytes) -> Obstacles:
+    sweep, generation, left_out, count, flags = struct.unpack_from("<IIIBB2x", payload)
+    _limit(count <= 64)
+
+    def obstacle(*fields) -> Obstacle:
+        *numbers, points, bits = fields
+        _limit(all(math.isfinite(value) for value in numbers))
+        low_m, high_m = tuple(numbers[3:6]), tuple(numbers[6:9])
+        return Obstacle(*numbers[:3], low_m, high_m, numbers[9], points, bool(bits & 1), bool(bits & 2))
+
+    obstacles = _items(obstacle, "<10fIB3x", payload, 16, count)
+    return Obstacles(sweep, generation, bool(flags & 4), bool(flags & 8), left_out, obstacles)
+
+
 _UNPACK = (
     _announce,
     None,
@@ -828,4 +929,7 @@ _UNPACK = (
     _early,
     _tracks,
     _events,
+    _tilt,
+    _cloud,
+    _obstacles,
 )

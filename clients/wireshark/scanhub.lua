@@ -15,12 +15,13 @@ scanhub.prefs.crc = Pref.bool("Check checksums", true, "Bytes by bytes in Lua: o
 scanhub.prefs.key_file = Pref.string("Key file", "", "Of `scanhub key new`: 32 bytes, or 64 hex digits")
 
 local TOPICS = {
-    [0] = "announce", "telegram", "scan", "marks", "zones", "foreground", "background", "status", "lines", "motion", "early", "tracks", "events"
+    [0] = "announce", "telegram", "scan", "marks", "zones", "foreground", "background", "status", "lines", "motion", "early", "tracks", "events", "tilt", "cloud", "obstacles"
 }
 local VERDICTS = { [0] = "clear", "slow", "stop", "unknown" }
 local STATES = { [0] = "absent", "probing", "switching", "starting", "streaming", "silent", "paused" }
 local TRACK_STATES = { [0] = "tentative", "confirmed", "hidden", "between_rooms" }
 local EVENTS = { [0] = "appeared", "left", "door" }
+local POINT_CLASSES = { [0] = "unknown", "background", "foreground", "behind" }
 local FAMILIES = { [0] = "lms", "ld", "rplidar" }
 -- Of families that send packets: how many bytes one has.
 local PACKET = { 47 }
@@ -185,6 +186,36 @@ field("events.room", "string", "Room")
 field("events.door", "string", "Door")
 field("events.from", "string", "From")
 field("events.to", "string", "To")
+
+field("tilt.angle_rad", "double", "Angle, rad")
+field("tilt.rate_rad_s", "double", "Rate, rad/s")
+
+field("cloud.sweep", "uint32", "Sweep")
+field("cloud.generation", "uint32", "Generation")
+field("cloud.first", "uint8", "First of the sweep", base.DEC, nil, 1)
+field("cloud.last", "uint8", "Last of the sweep", base.DEC, nil, 2)
+field("cloud.complete", "uint8", "Complete", base.DEC, nil, 4)
+field("cloud.doubted", "uint8", "Doubted", base.DEC, nil, 8)
+field("cloud.x_m", "float", "x, m")
+field("cloud.y_m", "float", "y, m")
+field("cloud.z_m", "float", "z, m")
+field("cloud.beam", "uint16", "Beam")
+field("cloud.class", "uint8", "Class", base.DEC, POINT_CLASSES)
+
+field("obstacles.sweep", "uint32", "Sweep")
+field("obstacles.generation", "uint32", "Generation")
+field("obstacles.left_out", "uint32", "Left out")
+field("obstacles.complete", "uint8", "Complete", base.DEC, nil, 4)
+field("obstacles.doubted", "uint8", "Doubted", base.DEC, nil, 8)
+field("obstacles.x_m", "float", "x, m")
+field("obstacles.y_m", "float", "y, m")
+field("obstacles.z_m", "float", "z, m")
+field("obstacles.low_m", "float", "Least, m")
+field("obstacles.high_m", "float", "Greatest, m")
+field("obstacles.distance_m", "float", "Distance, m")
+field("obstacles.points", "uint32", "Points")
+field("obstacles.foreground", "uint8", "Foreground", base.DEC, nil, 1)
+field("obstacles.near", "uint8", "Near", base.DEC, nil, 2)
 
 field("zones.verdict", "uint8", "Verdict", base.DEC, VERDICTS)
 field("zones.count", "uint8", "Zones")
@@ -754,6 +785,65 @@ unpack_payload[12] = function(payload, tree)
         end
     end
     return EVENTS[kind]
+end
+
+unpack_payload[13] = function(payload, tree)
+    if payload:len() < 16 or not is_finite(payload(0, 8):le_float()) then return nil end
+    -- A rate that is no number is not known.
+    local rate = payload(8, 8):le_float()
+    if rate == math.huge or rate == -math.huge then return nil end
+    add_fields(tree, payload, 0, "tilt.angle_rad", 8, "tilt.rate_rad_s", 8)
+    return string.format("%.2f deg", math.deg(payload(0, 8):le_float()))
+end
+
+unpack_payload[14] = function(payload, tree)
+    local len = payload:len()
+    if len < 16 then return nil end
+    local count = payload(8, 2):le_uint()
+    if count > 8192 or len < 16 + 16 * count then return nil end
+    for i = 1, count do
+        for n = 0, 8, 4 do
+            if not is_finite(payload(16 * i + n, 4):le_float()) then return nil end
+        end
+    end
+    add_fields(tree, payload, 0, "cloud.sweep", 4, "cloud.generation", 4)
+    for _, flag in ipairs({ "first", "last", "complete", "doubted" }) do
+        tree:add(f["cloud." .. flag], payload(10, 1))
+    end
+    for i = 1, count do
+        local item = tree:add(payload(16 * i, 16), "Point " .. i - 1)
+        add_fields(item, payload, 16 * i, "cloud.x_m", 4, "cloud.y_m", 4, "cloud.z_m", 4, "cloud.beam", 2, "cloud.class", 1)
+    end
+    return count .. " points"
+end
+
+unpack_payload[15] = function(payload, tree)
+    local len = payload:len()
+    if len < 16 then return nil end
+    local count = payload(12, 1):uint()
+    if count > 64 or len < 16 + 48 * count then return nil end
+    for at = 16, 48 * count, 48 do
+        for n = 0, 36, 4 do
+            if not is_finite(payload(at + n, 4):le_float()) then return nil end
+        end
+    end
+    add_fields(tree, payload, 0, "obstacles.sweep", 4, "obstacles.generation", 4, "obstacles.left_out", 4)
+    tree:add(f["obstacles.complete"], payload(13, 1))
+    tree:add(f["obstacles.doubted"], payload(13, 1))
+    for at = 16, 48 * count, 48 do
+        local item = tree:add(payload(at, 48), "Obstacle")
+        add_fields(item, payload, at, "obstacles.x_m", 4, "obstacles.y_m", 4, "obstacles.z_m", 4)
+        for n = 12, 20, 4 do
+            item:add_le(f["obstacles.low_m"], payload(at + n, 4))
+        end
+        for n = 24, 32, 4 do
+            item:add_le(f["obstacles.high_m"], payload(at + n, 4))
+        end
+        add_fields(item, payload, at + 36, "obstacles.distance_m", 4, "obstacles.points", 4)
+        item:add(f["obstacles.foreground"], payload(at + 44, 1))
+        item:add(f["obstacles.near"], payload(at + 44, 1))
+    end
+    return count .. " obstacles"
 end
 
 -- Datagram ---------------------------------------------------------------------------------------------------------

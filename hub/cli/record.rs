@@ -13,7 +13,7 @@ use super::{Everywhere, Limits};
 #[derive(Args, Debug)]
 pub(crate) struct Record {
     /// Topics to record: front/telegram, */scan for all sensors, or front/* for all topics [default: telegram, marks,
-    /// zones, foreground and status of all sensors, tracks and events of trackers]
+    /// zones, foreground and status of all sensors, tracks and events of trackers, tilt and obstacles of mounts]
     #[arg(value_name = "SENSOR/TOPIC")]
     topics: Vec<String>,
     /// Record every topic of all sensors

@@ -29,7 +29,7 @@ use iceoryx2::service::Service as _;
 use iceoryx2::service::port_factory::{event, publish_subscribe};
 
 use crate::lock::MakingLock;
-use crate::{Directory, Domain, Failure, Header, Kind, Topic, access, of_service, prefix};
+use crate::{Directory, Domain, Failure, Header, Kind, Maker, Topic, access, of_service, prefix};
 
 pub use self::bell::{Bell, Unsupported, sleep_at_bells};
 pub use self::clean::{Cleaned, clean};
@@ -105,13 +105,13 @@ pub fn sensors(domain: &Domain) -> Result<Vec<String>, Failure> {
     Ok(sensors)
 }
 
-/// Returns those of [`sensors`] that have a link, here or on another machine: no tracker has one.
+/// Returns those of [`sensors`] that have a link, here or on another machine: a tracker has none.
 ///
 /// # Errors
 ///
 /// As [`sensors`].
 pub fn links(domain: &Domain) -> Result<Vec<String>, Failure> {
-    let of_links = published(domain)?.into_iter().filter(|(_, topic)| !topic.is_of_trackers());
+    let of_links = published(domain)?.into_iter().filter(|(_, topic)| topic.maker() == Maker::Link);
     let mut links: Vec<String> = of_links.map(|(sensor, _)| sensor).collect();
     links.dedup();
     Ok(links)

@@ -3,6 +3,7 @@
 
 mod age;
 mod background;
+mod cloud;
 mod control;
 pub mod csv;
 pub mod datagram;
@@ -17,6 +18,7 @@ mod header;
 mod lines;
 mod marks;
 mod motion;
+mod obstacles;
 mod pose;
 mod printable;
 mod scan;
@@ -24,6 +26,7 @@ mod sliced;
 mod status;
 mod telegram;
 mod text;
+mod tilt;
 mod topic;
 mod tracks;
 mod zones;
@@ -50,6 +53,7 @@ mod state;
 
 pub use age::Age;
 pub use background::{Background, BackgroundHead, BackgroundWord};
+pub use cloud::{Cloud, CloudHead, CloudPoint, CloudWord, PointClass};
 pub use control::{Request, Response, Shown, Verb};
 pub use domain::{DEFAULT_DOMAIN, Domain, Environment};
 pub use early::Early;
@@ -60,6 +64,7 @@ pub use header::{Flags, Header, Quality, Reasons};
 pub use lines::{Corner, LINES, Line, Lines};
 pub use marks::{MARKS, Mark, Marks};
 pub use motion::{Motion, MotionMethod};
+pub use obstacles::{OBSTACLES, Obstacle, Obstacles};
 pub use pose::Pose;
 pub use printable::{Printable, escape_json, json_line};
 pub use scan::{
@@ -68,9 +73,10 @@ pub use scan::{
 };
 pub use status::{COUNTERS, Counter, Counters, State, Status};
 pub use telegram::Telegram;
+pub use tilt::Tilt;
 pub use topic::{
-    CONTROL, CONTROL_REQUEST, CONTROL_RESPONSE, Pace, ROBOT, Ring, Row, Topic, WAKE, Wake, check_followed,
-    check_sensor, is_remote, of_service,
+    CONTROL, CONTROL_REQUEST, CONTROL_RESPONSE, Maker, Pace, ROBOT, Ring, Row, Topic, WAKE, Wake,
+    check_followed, check_sensor, is_remote, of_service,
 };
 pub use tracks::{TRACK_SENSORS, TRACKS, Track, TrackSensor, TrackState, Tracks};
 pub use zones::{Verdict, ZONES, Zone, Zones};
@@ -78,7 +84,7 @@ pub use zones::{Verdict, ZONES, Zone, Zones};
 #[cfg(feature = "ipc")]
 pub use directory::Directory;
 #[cfg(feature = "ipc")]
-pub use lock::{HubLock, ListenLock, holder, publisher};
+pub use lock::{HubLock, ListenLock, NameLock, holder, publisher};
 #[cfg(feature = "json")]
 pub use saved::{SavedModel, as_json, unit_in_mm};
 #[cfg(feature = "ipc")]

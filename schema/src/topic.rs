@@ -1,10 +1,12 @@
 //! The names of topics, their services and sensors. Refuses to know how a service is created.
 
+mod maker;
 mod table;
 
 use crate::limits::TopicLimits;
 use crate::{Failure, Kind};
 
+pub use maker::Maker;
 pub use table::{Pace, Ring, Row, Topic};
 
 impl Topic {
@@ -21,14 +23,6 @@ impl Topic {
         Topic::Motion,
         Topic::Early,
     ];
-
-    /// What a tracker of people publishes.
-    pub const OF_TRACKERS: [Topic; 2] = [Topic::Tracks, Topic::Events];
-
-    /// Returns whether a tracker publishes it, and no hub.
-    pub fn is_of_trackers(self) -> bool {
-        Topic::OF_TRACKERS.contains(&self)
-    }
 
     /// Returns what the table says of the topic.
     pub const fn row(self) -> &'static Row {
@@ -183,7 +177,6 @@ mod tests {
             assert_eq!(Topic::parse(topic.name()), Some(topic));
             assert_eq!(Topic::of_number(topic.number()), Some(topic));
         }
-        assert!(Topic::OF_LINKS.into_iter().chain(Topic::OF_TRACKERS).eq(Topic::ALL));
         assert_eq!(of_service(&Wake::service("rear")), Some(("rear", None)));
         assert_eq!(of_service("scanhub/v1/rear/scan"), None);
         for control in [CONTROL, CONTROL_REQUEST, CONTROL_RESPONSE] {

@@ -5,8 +5,9 @@ use std::fmt::Write as _;
 use std::mem::{offset_of, size_of};
 
 use schema::{
-    BackgroundHead, Corner, Early, Event, ForegroundHead, Header, Line, Lines, Mark, Marks, Motion, Pose,
-    ScanHead, Segment, Status, Track, TrackSensor, Tracks, Zone, Zones,
+    BackgroundHead, CloudHead, CloudPoint, Corner, Early, Event, ForegroundHead, Header, Line, Lines, Mark,
+    Marks, Motion, Obstacle, Obstacles, Pose, ScanHead, Segment, Status, Tilt, Track, TrackSensor, Tracks,
+    Zone, Zones,
 };
 
 /// The lines of one struct.
@@ -52,6 +53,11 @@ fn the_text_says_what_the_structs_are() {
     layout!(text, TrackSensor: x_m y_m yaw_rad upside_down reserved name_text);
     layout!(text, Tracks: count sensors reserved track_array sensor_array);
     layout!(text, Event: id kind reserved room_text door_text from_text to_text);
+    layout!(text, Tilt: angle_rad rate_rad_s);
+    layout!(text, CloudHead: sweep generation count flags reserved);
+    layout!(text, CloudPoint: at beam point_class reserved);
+    layout!(text, Obstacle: middle low high distance_m points flags reserved);
+    layout!(text, Obstacles: sweep generation left_out count flags reserved obstacle_array);
     let golden = include_str!("../../tests/vectors/v2/layouts.txt");
     assert_eq!(text, golden);
 }

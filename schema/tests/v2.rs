@@ -9,6 +9,8 @@ mod lines;
 mod motion;
 #[path = "v2/scan.rs"]
 mod scan;
+#[path = "v2/tilted.rs"]
+mod tilted;
 #[path = "v2/tracks.rs"]
 mod tracks;
 

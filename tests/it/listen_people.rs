@@ -1,7 +1,7 @@
 //! `scanhub listen` against people: tracks and events of another machine are lines like those of this one.
 
 use crate::testkit::{INT, Sender, TestEnv, in_a_network, is_class};
-use schema::{Event, EventKind, Pose, Topic, Track, TrackSensor, Tracks};
+use schema::{Event, EventKind, Maker, Pose, Topic, Track, TrackSensor, Tracks};
 use serde_json::json;
 
 #[test]
@@ -10,7 +10,7 @@ fn people_of_another_machine_are_lines() {
         let env = TestEnv::new();
         let mut program = env.start(&["listen", "--json"]).ready();
         let mut sender = Sender::new(0x5f3a_12bc_00d1_e2f3, 7, 200, "house");
-        sender.announce(&Topic::OF_TRACKERS);
+        sender.announce(Maker::Tracker.topics());
         let mut tracks = Tracks::default();
         tracks.push_sensor(TrackSensor::new("front", &Pose::default()));
         tracks.push(Track { id: 9, x_m: 1.5, sensors: 1, state: 2, ..Track::default() });

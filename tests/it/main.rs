@@ -84,6 +84,7 @@ mod telegram;
 mod terminal_text;
 mod three_machines;
 mod tidy;
+mod tilted;
 mod track;
 mod two_machines;
 mod vendor;

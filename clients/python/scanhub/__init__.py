@@ -27,12 +27,14 @@ from .sample import Sample
 from .scan import Scan, Telegram
 from .status import Pose, Status
 from .subscription import Subscription
+from .tilted import Cloud, Obstacle, Obstacles, Tilt
 from .verdict import Robot, RobotFollower
 
 __version__ = "0.1.0"
 
 __all__ = [
     "Background",
+    "Cloud",
     "Corner",
     "Denied",
     "Early",
@@ -49,6 +51,8 @@ __all__ = [
     "Motion",
     "NoHub",
     "NoTopic",
+    "Obstacle",
+    "Obstacles",
     "Pose",
     "Refused",
     "Robot",
@@ -63,6 +67,7 @@ __all__ = [
     "Status",
     "Subscription",
     "Telegram",
+    "Tilt",
     "TopicName",
     "Track",
     "Tracks",

@@ -196,6 +196,56 @@ class Event(_Struct):
     ]
 
 
+class Tilt(_Struct):
+    _fields_ = [("angle_rad", c_double), ("rate_rad_s", c_double)]
+
+
+class CloudHead(_Struct):
+    """Behind it the points."""
+
+    _fields_ = [
+        ("sweep", c_uint32),
+        ("generation", c_uint32),
+        ("count", c_uint16),
+        ("flags", c_uint8),
+        ("reserved", c_uint8 * 5),
+    ]
+
+
+class CloudWord(_Struct):
+    """Eight bytes of a cloud."""
+
+    _fields_ = [("word", c_uint64)]
+
+
+class CloudPoint(_Struct):
+    _fields_ = [("at", c_float * 3), ("beam", c_uint16), ("point_class", c_uint8), ("reserved", c_uint8)]
+
+
+class Obstacle(_Struct):
+    _fields_ = [
+        ("middle", c_float * 3),
+        ("low", c_float * 3),
+        ("high", c_float * 3),
+        ("distance_m", c_float),
+        ("points", c_uint32),
+        ("flags", c_uint8),
+        ("reserved", c_uint8 * 3),
+    ]
+
+
+class Obstacles(_Struct):
+    _fields_ = [
+        ("sweep", c_uint32),
+        ("generation", c_uint32),
+        ("left_out", c_uint32),
+        ("count", c_uint8),
+        ("flags", c_uint8),
+        ("reserved", c_uint8 * 2),
+        ("obstacle_array", Obstacle * 64),
+    ]
+
+
 class Zone(_Struct):
     _fields_ = [("radius_mm", c_uint16), ("beams", c_uint16), ("violated", c_uint8), ("reserved", c_uint8 * 3)]
 

@@ -8,8 +8,8 @@ from typing import NamedTuple
 
 from .errors import Impossible, NoTopic
 
-TOPICS = ("telegram", "scan", "marks", "zones", "foreground", "background", "status", "lines", "motion", "early", "tracks", "events")
-"""What the hub publishes for each sensor; the last two are of trackers."""
+TOPICS = ("telegram", "scan", "marks", "zones", "foreground", "background", "status", "lines", "motion", "early", "tracks", "events", "tilt", "cloud", "obstacles")
+"""What the hub publishes for each sensor; the last five are of trackers, mounts and clouds."""
 
 CONTROL = "scanhub/v2/control"
 """The service that takes requests; beside it are the events that wake the hub and its clients."""

@@ -139,7 +139,7 @@ class Sample:
         return f"<{self.sensor}/{self.topic} {self.topic_seq}, {self.quality}>"
 
 
-def view(data: Any, kind: str, offset: int, count: int) -> NDArray[Any]:
+def view(data: Any, kind: str | np.dtype[Any], offset: int, count: int) -> NDArray[Any]:
     """The `count` items at `offset` in `data`, as far as they are there: cannot be written, and keeps what `data` keeps."""
     room = max(len(data) - offset, 0) // np.dtype(kind).itemsize
     return np.frombuffer(memoryview(data).toreadonly(), kind, min(count, room), min(offset, len(data)))

@@ -17,10 +17,14 @@ from .processed import Early, Foreground, Lines, Marks, Motion, Zones, nothing
 from .sample import Sample
 from .scan import Scan, Telegram
 from .status import Status
+from .tilted import Cloud, Obstacles, Tilt
 
 KINDS: dict[str, type[Sample]] = {
     kind.topic: kind
-    for kind in (Telegram, Scan, Marks, Zones, Foreground, Background, Status, Lines, Motion, Early, Tracks, Event)
+    for kind in (
+        *(Telegram, Scan, Marks, Zones, Foreground, Background, Status, Lines, Motion, Early),
+        *(Tracks, Event, Tilt, Cloud, Obstacles),
+    )
 }
 """What each topic carries."""
 

@@ -98,9 +98,6 @@ def motion(sample: scanhub.Motion) -> dict:
 
 
 def tracks(sample: scanhub.Tracks) -> dict:
-    def rounded(value: float, digits: int) -> float:
-        return math.copysign(math.floor(abs(value) * 10**digits + 0.5), value) / 10**digits
-
     def track(of: scanhub.Track) -> dict:
         said = of._asdict()
         said.update({name: rounded(said[name], 3) for name in ("x_m", "y_m", "vx_m_s", "vy_m_s", "score")})
@@ -112,6 +109,38 @@ def tracks(sample: scanhub.Tracks) -> dict:
 def events(sample: scanhub.Event) -> dict:
     said = {"class": "event", "kind": sample.kind, "id": sample.id, "room": sample.room}
     return said if sample.door is None else {**said, "from": sample.from_room, "to": sample.to_room, "door": sample.door}
+
+
+def rounded(value: float, digits: int) -> float:
+    """Halves away from 0, as Rust rounds."""
+    return math.copysign(math.floor(abs(value) * 10**digits + 0.5), value) / 10**digits
+
+
+def tilt(sample: scanhub.Tilt) -> dict:
+    rate = sample.rate_rad_s
+    said = {"angle_deg": rounded(math.degrees(sample.angle_rad), 4)}
+    return {**said, "rate_deg_s": None if rate is None else rounded(math.degrees(rate), 4)}
+
+
+def swept(sample: scanhub.Cloud | scanhub.Obstacles) -> dict:
+    return {name: getattr(sample, name) for name in ("sweep", "generation", "complete", "doubted")}
+
+
+def cloud(sample: scanhub.Cloud) -> dict:
+    said = {**swept(sample), "first": sample.first, "last": sample.last}
+    points = [[rounded(float(value), 3) for value in point] for point in sample.points]
+    return {**said, "points": points, "beams": sample.beams.tolist(), "classes": sample.classes.tolist()}
+
+
+def obstacles(sample: scanhub.Obstacles) -> dict:
+    def obstacle(of: scanhub.Obstacle) -> dict:
+        said = of._asdict()
+        said.update({name: rounded(said[name], 3) for name in ("x_m", "y_m", "z_m", "distance_m")})
+        said.update({name: [rounded(value, 3) for value in said[name]] for name in ("low_m", "high_m")})
+        return said
+
+    said = {**swept(sample), "left_out": sample.left_out}
+    return {**said, "obstacles": [obstacle(of) for of in sample.obstacles]}
 
 
 def zones(sample: scanhub.Zones) -> dict:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from scanhub import layout, model, people, processed, scan, status
+from scanhub import layout, model, people, processed, scan, status, tilted
 
 GOLDEN = Path(sys.argv[1])
 
@@ -42,7 +42,7 @@ def offsets_are_golden() -> None:
         else:
             assert getattr(its, words[0]).offset == int(words[1]), (its, line)
             said[-1][1].append(words[0])
-    assert len(said) == 20
+    assert len(said) == 25
     for name, fields in said:
         its = getattr(layout, name.split(".")[1])
         assert [field[0] for field in its._fields_] == fields, name
@@ -115,6 +115,22 @@ def payloads_say_what_they_are() -> None:
     assert (of.kind, of.id, of.room, of.door) == ("door", 0x1020304_05060708, "kitchen", "left")
     assert (of.from_room, of.to_room) == ("hall", "kitchen")
 
+    of = tilted.Tilt("mount", Chunk("tilt"))
+    assert (of.angle_rad, of.rate_rad_s) == (-0.5, 2)
+
+    of = tilted.Cloud("room", Chunk("cloud"))
+    assert (of.sweep, of.generation, of.count) == (0x1020304, 0x5060708, 2)
+    assert of.first and of.last and of.complete and of.doubted
+    assert of.points.tolist() == [[0, 0, 0], [1, -1, 0.5]] and of.points.dtype == np.float32
+    assert (of.beams.tolist(), of.classes.tolist()) == ([0, 0x102], [0, 3])
+    assert tilted.CLASSES[of.classes[1]] == "behind" and not of.points.flags.writeable and not of.points.flags.owndata
+
+    of = tilted.Obstacles("room", Chunk("obstacles"))
+    assert (of.sweep, of.generation, of.left_out) == (0x1020304, 0x5060708, 0x90A0B0C)
+    assert (of.complete, of.doubted, len(of.obstacles)) == (True, True, 64)
+    assert of.obstacles[63] == (1, -1, 0.5, (0.5, -2, 0.25), (2, -0.5, 4), 0.5, 0xD0E0F10, True, True)
+    assert of.obstacles[0] == (0, 0, 0, (0, 0, 0), (0, 0, 0), 0, 0, False, False)
+
     of = processed.Zones("front", Chunk("zones"))
     assert (of.verdict, of.nearest_beam, of.nearest_mm, of.invalid_beams) == ("slow", 0x102, 0x30405, 0x106)
     assert of.provisional and of.zones == ((0, False, 0), (600, True, 0x107))
@@ -155,6 +171,10 @@ def what_is_cut_short_has_no_beams() -> None:
             chunk._bytes = (ctypes.c_uint8 * size).from_buffer_copy(golden(name)[:size])
             of = kind("front", chunk)
             assert of.ranges.size <= max(size - 32, 0) // 2 and of.count >= of.ranges.size, (kind, size)
+    for size, count in ((0, 0), (8, 0), (16, 0), (40, 1)):
+        chunk = Chunk("cloud")
+        chunk._bytes = (ctypes.c_uint8 * size).from_buffer_copy(golden("cloud")[:size])
+        assert tilted.Cloud("room", chunk).points.shape == (count, 3)
     whole = scan.Scan("front", Chunk("scan_turn"))
     whole._fields.count = 0xFFFF
     assert whole.ranges.tolist()[:1] != [] and whole.count == 5, "as far as there is memory"

@@ -1,9 +1,10 @@
 //! The background in three dimensions: for each beam in each narrow span of the mount's angle, how far it reaches always. It
 //! is learned by the paper's method: what is met in enough sweeps in a row replaces what was. Refuses to know time.
 
+use schema::PointClass;
+
 use crate::mount::Mount;
 use crate::settings::Settings;
-use crate::sweep::Class;
 
 /// A beam as it was measured.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -54,7 +55,7 @@ impl Model {
     }
 
     /// Compares with the model as it is.
-    pub(crate) fn class(&self, reading: &Reading, row: usize, threshold_m: f32) -> Class {
+    pub(crate) fn class(&self, reading: &Reading, row: usize, threshold_m: f32) -> PointClass {
         let beam = usize::from(reading.beam);
         let own = self.background(row, beam);
         let beside = (row.saturating_sub(1)..=row + 1)
@@ -62,14 +63,14 @@ impl Model {
         let mut all = beside.filter_map(|(row, beam)| self.background(row, beam));
         // At edges a beam meets what its neighbours meet.
         if all.any(|surface| surface.explains(reading, threshold_m)) {
-            return Class::Background;
+            return PointClass::Background;
         }
         match own {
-            None => Class::Unknown,
+            None => PointClass::Unknown,
             Some(surface) if reading.range_m < surface.expected(reading, threshold_m).0 - threshold_m => {
-                Class::Foreground
+                PointClass::Foreground
             }
-            Some(_) => Class::Behind,
+            Some(_) => PointClass::Behind,
         }
     }
 
@@ -224,16 +225,16 @@ mod tests {
         let class = |model: &Model, range| model.class(&reading(range), 90, 0.06);
         for (sweep, range) in [4.0, 4.0, 2.0, 4.0, 4.0].into_iter().enumerate() {
             model.learn(&reading(range), 90, sweep as u32, &settings());
-            assert_eq!(class(&model, 2.0), Class::Unknown, "after sweep {sweep}");
+            assert_eq!(class(&model, 2.0), PointClass::Unknown, "after sweep {sweep}");
         }
         (5..9).for_each(|_| model.learn(&reading(4.02), 90, 5, &settings()));
-        use Class::{Background, Behind, Foreground};
+        use PointClass::{Background, Behind, Foreground};
         assert_eq!([2.0, 4.05, 5.0].map(|range| class(&model, range)), [Foreground, Background, Behind]);
         assert_eq!(class(&model, f32::INFINITY), Behind);
         (6..9).for_each(|sweep| model.learn(&reading(2.0), 90, sweep, &settings()));
         assert_eq!([2.0, 4.0].map(|range| class(&model, range)), [Background, Behind], "it stays");
         model.forget();
-        assert_eq!(class(&model, 2.0), Class::Unknown);
+        assert_eq!(class(&model, 2.0), PointClass::Unknown);
     }
 
     #[test]
@@ -292,10 +293,10 @@ mod tests {
                 let range = surfaces[random.usize(..4) * random.usize(..2)];
                 let asked = surfaces[random.usize(..4)];
                 let class = match slowly(&met, 3) {
-                    None => Class::Unknown,
-                    Some(known) if known == asked || (known - asked).abs() <= 0.06 => Class::Background,
-                    Some(known) if asked < known => Class::Foreground,
-                    Some(_) => Class::Behind,
+                    None => PointClass::Unknown,
+                    Some(known) if known == asked || (known - asked).abs() <= 0.06 => PointClass::Background,
+                    Some(known) if asked < known => PointClass::Foreground,
+                    Some(_) => PointClass::Behind,
                 };
                 assert_eq!(model.class(&reading(asked), 90, 0.06), class, "seed {seed}, sweep {sweep}");
                 model.learn(&reading(range), 90, sweep, &settings());

@@ -24,7 +24,7 @@ struct Page;
 
 pub use angles::{Angle, Withheld};
 pub use mount::Mount;
-pub use obstacles::{OBSTACLES, Obstacle};
+pub use schema::{OBSTACLES, Obstacle, PointClass};
 pub use settings::Settings;
-pub use sweep::{Class, Point, Sweep};
+pub use sweep::{Point, Sweep};
 pub use tilting::{Counts, Tilting};

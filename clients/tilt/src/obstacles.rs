@@ -1,32 +1,7 @@
 //! Obstacles: points that are near each other, in three dimensions. Two points are of the same obstacle if their cubes touch,
 //! or cubes between them do. Refuses to know which points are worth it.
 
-/// The most obstacles of a sweep.
-pub const OBSTACLES: usize = 64;
-
-/// Something that stands there.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct Obstacle {
-    /// The mean of its points in the robot's frame, in metres.
-    pub middle: [f32; 3],
-    /// The least coordinates of its points.
-    pub low: [f32; 3],
-    /// The greatest.
-    pub high: [f32; 3],
-    /// How far its nearest point is from the robot's centre, over ground, in metres.
-    pub distance_m: f32,
-    /// Points.
-    pub points: u32,
-    /// Bits: [`FOREGROUND`](Self::FOREGROUND), [`NEAR`](Self::NEAR).
-    pub flags: u8,
-}
-
-impl Obstacle {
-    /// Flag: points of it are before the background.
-    pub const FOREGROUND: u8 = 1;
-    /// Flag: points of it are in the space that is to be free.
-    pub const NEAR: u8 = 2;
-}
+use schema::{OBSTACLES, Obstacle};
 
 /// Finds obstacles; keeps its memory.
 #[derive(Default)]

@@ -1,11 +1,13 @@
 //! What a sweep shows: its points beside the background, whether its angles can be right, and what stands there. Refuses to
 //! know scans and how they are put in order.
 
+use schema::{Obstacle, PointClass};
+
 use crate::background::{Model, Reading, placed};
 use crate::mount::Mount;
-use crate::obstacles::{Clusters, Obstacle};
+use crate::obstacles::Clusters;
 use crate::settings::Settings;
-use crate::sweep::{Class, Point, Sweep};
+use crate::sweep::{Point, Sweep};
 
 /// Parts of a sweep whose angles are judged each for itself.
 const PARTS: usize = 4;
@@ -79,7 +81,7 @@ impl Scenery {
         let generation = self.forgotten as u32;
         self.standing.clear();
         if is_doubted {
-            self.points.iter_mut().for_each(|point| point.class = Class::Unknown);
+            self.points.iter_mut().for_each(|point| point.class = PointClass::Unknown);
             self.doubted += 1;
         } else {
             self.learn(rays, sweep.number);
@@ -108,7 +110,7 @@ impl Scenery {
             self.off.extend(self.model.angle_off(&reading, row, threshold_m));
             if self.model.knows(&reading, row) {
                 known += 1;
-                elsewhere += usize::from(class != Class::Background);
+                elsewhere += usize::from(class != PointClass::Background);
             }
             if ray.range_m.is_finite() {
                 let at = self.mount.point(ray.angle_rad, ray.beam_rad, ray.range_m.into());
@@ -145,7 +147,7 @@ impl Scenery {
             let within = |near: &[[f64; 2]; 3]| {
                 near.iter().zip(point.at).all(|(span, value)| (span[0]..=span[1]).contains(&f64::from(value)))
             };
-            let is_foreground = point.class == Class::Foreground;
+            let is_foreground = point.class == PointClass::Foreground;
             let flags = if is_foreground { Obstacle::FOREGROUND } else { 0 }
                 | if near.as_ref().is_some_and(within) { Obstacle::NEAR } else { 0 };
             if flags != 0 {

@@ -1,21 +1,6 @@
 //! What one way of the mount from turn to turn has shown.
 
-use crate::obstacles::Obstacle;
-
-/// What a point is beside the background.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-#[repr(u8)]
-pub enum Class {
-    /// What stands there always is not known yet.
-    #[default]
-    Unknown,
-    /// It is where something stands always.
-    Background,
-    /// It is nearer than that.
-    Foreground,
-    /// It is farther away: something has gone.
-    Behind,
-}
+use schema::{Obstacle, PointClass};
 
 /// Where a beam ended.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -27,7 +12,7 @@ pub struct Point {
     /// Number of the beam in its scan.
     pub beam: u16,
     /// Beside the background as it was before this sweep.
-    pub class: Class,
+    pub class: PointClass,
 }
 
 /// The points between two turns of the mount.

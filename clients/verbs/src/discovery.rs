@@ -3,7 +3,7 @@
 
 use std::time::{Duration, Instant};
 
-use schema::{Domain, Failure, Topic, ipc};
+use schema::{Domain, Failure, Maker, Topic, ipc};
 
 use crate::background_task::BackgroundTask;
 
@@ -24,8 +24,8 @@ type Answer = Result<Vec<(String, Topic)>, Failure>;
 pub(crate) struct Called {
     /// The sensors that have topics, sorted.
     pub(crate) sensors: Vec<String>,
-    /// Those of them that are trackers.
-    trackers: Vec<String>,
+    /// Who has made their topics.
+    makers: Vec<(String, Maker)>,
     /// So long after the hub came it was asked.
     pub(crate) age: Duration,
 }
@@ -48,18 +48,15 @@ const LOOK_EVERY: Duration = Duration::from_millis(5);
 
 impl Called {
     fn of(published: &[(String, Topic)], age: Duration) -> Called {
-        let names = |is_wanted: &dyn Fn(Topic) -> bool| {
-            let names = published.iter().filter(|(_, topic)| is_wanted(*topic)).map(|(name, _)| name.clone());
-            let mut names: Vec<String> = names.collect();
-            names.dedup();
-            names
-        };
-        Called { sensors: names(&|_| true), trackers: names(&Topic::is_of_trackers), age }
+        let mut sensors: Vec<String> = published.iter().map(|(name, _)| name.clone()).collect();
+        sensors.dedup();
+        let makers = published.iter().map(|(name, topic)| (name.clone(), topic.maker())).collect();
+        Called { sensors, makers, age }
     }
 
-    /// Whether `sensor` has `topic`, now or when all its topics are made: a link has those of links, a tracker its own.
+    /// Whether `sensor` has `topic`, now or when all its topics are made: a name has all topics of the maker of one.
     pub(crate) fn may_have(&self, sensor: &str, topic: Topic) -> bool {
-        self.trackers.iter().any(|tracker| tracker == sensor) == topic.is_of_trackers()
+        self.makers.iter().any(|(name, maker)| name == sensor && *maker == topic.maker())
     }
 }
 

@@ -58,8 +58,8 @@ impl Forwarder {
     /// Follows what is selected of the hub in the first live one of `places`.
     pub fn new(selection: Selection, places: &[Domain], carrier: &mut impl Carrier) -> Forwarder {
         let named = selection.named().into_iter().map(|name| {
-            let is_tracker = selection.names_tracker(name);
-            Sensor::new(name, |topic| topic.is_of_trackers() == is_tracker, &selection, carrier)
+            let maker = selection.maker_of(name);
+            Sensor::new(name, |topic| topic.maker() == maker, &selection, carrier)
         });
         let sensors = named.collect();
         Forwarder {

@@ -2,6 +2,7 @@
 
 mod people;
 mod processed;
+mod tilted;
 
 use schema::{
     Code, Counters, Failure, Family, Flags, Header, Intensities, Reasons, Scan, Status, Telegram, Verb,
@@ -17,6 +18,7 @@ use crate::receive_stats::ReceiveStats;
 
 pub(crate) use people::{event, tracks};
 pub(crate) use processed::{early, foreground, lines, marks, motion, robot, zones};
+pub(crate) use tilted::{cloud, obstacles, tilt};
 // A background model as a line is what a file of it is.
 pub(crate) use schema::as_json as background;
 

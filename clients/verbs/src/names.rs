@@ -48,6 +48,13 @@ impl fmt::Display for TopicName {
     }
 }
 
+/// The position of what publishes as `name` beside a hub: numbers from 128 on are of no link.
+pub(crate) fn position(name: &str) -> u8 {
+    const FIRST: u8 = 128;
+    let sum = name.bytes().fold(0u32, |sum, byte| sum.wrapping_mul(31).wrapping_add(byte.into()));
+    FIRST + (sum % u32::from(u8::MAX - FIRST)) as u8
+}
+
 /// What is `checked` is a word of the command line, which cannot be understood if it is not possible: [`Kind::Usage`].
 pub(crate) fn as_word(checked: Result<(), Failure>) -> Result<(), Failure> {
     checked.map_err(|failure| Failure { kind: Kind::Usage, ..failure })
@@ -77,8 +84,10 @@ const NEAR: f64 = 0.8;
 pub(crate) fn no_such_topic(name: &TopicName, topics: &[Topic]) -> Failure {
     let names = topics.iter().map(|topic| format!("{}/{}", name.sensor, topic.name()));
     let hint = format!("there are {}", names.collect::<Vec<_>>().join(", "));
-    let who = if name.topic.is_of_trackers() { "is no tracker" } else { "is a tracker" };
-    Failure::new(Kind::NoTopic, format!("there is no topic {name}: {} {who}", name.sensor), hint)
+    let who = topics
+        .first()
+        .map_or(String::new(), |topic| format!(": {} is {}", name.sensor, topic.maker().name()));
+    Failure::new(Kind::NoTopic, format!("there is no topic {name}{who}"), hint)
 }
 
 /// The hub has no `sensor`, but `sensors`.
@@ -97,6 +106,7 @@ pub(crate) fn no_sensor(sensor: &str, sensors: &[String]) -> Failure {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use schema::Maker;
 
     #[test]
     fn names() {
@@ -124,7 +134,7 @@ mod tests {
         assert_eq!(hint("frnt"), "did you mean front? there are front, rear");
         assert_eq!(hint("side"), "there are front, rear");
         let name = TopicName { sensor: "house".to_owned(), topic: Topic::Scan };
-        let failure = no_such_topic(&name, &Topic::OF_TRACKERS);
+        let failure = no_such_topic(&name, Maker::Tracker.topics());
         assert_eq!(failure.message, "there is no topic house/scan: house is a tracker");
         assert_eq!(failure.hint, "there are house/tracks, house/events");
     }

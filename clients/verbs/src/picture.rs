@@ -4,7 +4,7 @@
 use scanhub_client::streams::Sample;
 use scanhub_client::{clock, live_topics};
 use scene::Scene;
-use schema::{Domain, Topic};
+use schema::{Domain, Maker, Topic};
 
 use crate::follow::Notice;
 use crate::names::TopicName;
@@ -28,19 +28,19 @@ pub(crate) fn followed(sensors: &[String], places: &[Domain]) -> (Vec<TopicName>
     let live = live_topics(places);
     let is_tracker = |sensor: &str| live.contains(&format!("{sensor}/{}", Topic::Tracks.name()));
     let named = |sensor: &String| {
-        let of = |topic: &Topic| topic.is_of_trackers() == is_tracker(sensor);
+        let of = |topic: &Topic| (topic.maker() == Maker::Tracker) == is_tracker(sensor);
         let name = |topic| TopicName { sensor: sensor.clone(), topic };
         TOPICS.into_iter().filter(of).map(name).collect::<Vec<_>>()
     };
     let names: Vec<_> = sensors.iter().flat_map(named).collect();
-    let has_tracker = names.iter().any(|name| name.topic.is_of_trackers());
-    let of_all = |topic: &Topic| names.is_empty() || has_tracker && !topic.is_of_trackers();
+    let has_tracker = names.iter().any(|name| name.topic.maker() == Maker::Tracker);
+    let of_all = |topic: &Topic| names.is_empty() || has_tracker && topic.maker() == Maker::Link;
     (names.clone(), TOPICS.into_iter().filter(of_all).collect())
 }
 
 /// A topic of `name` will be followed: of a link its sensor is there from now on.
 pub(crate) fn begin(scene: &mut Scene, name: &TopicName) {
-    if !name.topic.is_of_trackers() {
+    if name.topic.maker() == Maker::Link {
         scene.sensor(&name.sensor);
     }
 }

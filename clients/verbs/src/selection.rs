@@ -1,7 +1,7 @@
 //! The syntax for verbs that take several topics: `SENSOR/TOPIC`, `*/TOPIC` and `SENSOR/*`. Refuses to know which
 //! sensors there are.
 
-use schema::{Failure, Kind, ROBOT, Topic};
+use schema::{Failure, Kind, Maker, ROBOT, Topic};
 
 use crate::names::{TopicName, as_word, nearest, topics};
 
@@ -63,8 +63,8 @@ impl Selection {
         let mut of_all = Vec::new();
         for text in texts {
             let word = Word::parse(text)?;
-            // Which sensors are trackers is known when they are there: one that is named has what a link has.
-            let may_have = |topic: Topic| word.sensor.is_none() || !topic.is_of_trackers();
+            // Who made a name's topics is known when they are there: one that is named has what a link has.
+            let may_have = |topic: Topic| word.sensor.is_none() || topic.maker() == Maker::Link;
             let is_meant = |topic: &Topic| word.topic.map_or(may_have(*topic), |known| known == *topic);
             let meant = Topic::ALL.into_iter().filter(is_meant);
             match &word.sensor {

@@ -7,7 +7,8 @@ use scanhub_client::streams::{RobotHeard, Sample};
 use scanhub_client::{Heard, Received};
 use schema::ipc::Payload;
 use schema::{
-    Background, Early, Event, Foreground, Header, Lines, Marks, Motion, Scan, Status, Tracks, Zones,
+    Background, Cloud, Early, Event, Foreground, Header, Lines, Marks, Motion, Obstacles, Scan, Status, Tilt,
+    Tracks, Zones,
 };
 use serde::Serialize;
 
@@ -60,6 +61,9 @@ shown! {
     Early, early(header);
     Tracks, tracks(header);
     Event, event(header);
+    Tilt, tilt(header);
+    Cloud, cloud(header);
+    Obstacles, obstacles(header);
     Foreground, foreground(header);
     Background, background;
     Status, status;

@@ -2,6 +2,7 @@
 
 mod people;
 mod processed;
+mod tilted;
 
 use std::f64::consts::TAU;
 use std::fmt;
@@ -17,6 +18,7 @@ use crate::show;
 
 pub(crate) use people::{event, event_words, tracks};
 pub(crate) use processed::{background, early, foreground, lines, marks, motion, robot, zones};
+pub(crate) use tilted::{cloud, obstacles, tilt};
 
 /// Bytes as lower hex, without spaces.
 pub(crate) struct Hex<'a>(pub(crate) &'a [u8]);

@@ -11,7 +11,7 @@ pub fn memory(limits: &[TopicLimits]) -> u64 {
 
 /// Bytes of the longest segment of any of them.
 pub fn longest_segment(limits: &[TopicLimits]) -> u64 {
-    limits.iter().map(shortage::longest_segment).max().unwrap_or_default()
+    limits.iter().map(|limits| shortage::longest_segment(&Topic::OF_LINKS, limits)).max().unwrap_or_default()
 }
 
 /// Descriptors for `links` links and a first consumer of each, besides those open from the start.

@@ -4,6 +4,7 @@
 mod foreground;
 mod lines;
 mod motion;
+mod tilted;
 mod tracks;
 
 use bytemuck::{Pod, bytes_of, bytes_of_mut, pod_read_unaligned};

@@ -200,6 +200,7 @@ macro_rules! payloads {
     (Scan, $topic:ident) => { payloads!(Scan, ScanWord, $topic); };
     (Foreground, $topic:ident) => { payloads!(Foreground, ForegroundWord, $topic); };
     (Background, $topic:ident) => { payloads!(Background, BackgroundWord, $topic); };
+    (Cloud, $topic:ident) => { payloads!(Cloud, CloudWord, $topic); };
     ($payload:ident, $word:ident, $topic:ident) => {
         payload!(
             crate::$payload, Topic::$topic, [crate::$word], len, Box<crate::$payload>, crate::$payload::zeroed(len),

@@ -51,9 +51,9 @@ pub fn sensor_bytes(topics: &[Topic], limits: &TopicLimits) -> u64 {
     topics.iter().map(chunk).sum::<usize>() as u64 + services
 }
 
-/// Returns the bytes of the longest segment of any topic of a link made as `limits` say.
-pub fn longest_segment(limits: &TopicLimits) -> u64 {
-    Topic::OF_LINKS.iter().map(|&topic| sensor_bytes(&[topic], limits)).max().unwrap_or_default()
+/// Returns the bytes of the longest segment of any of one sensor's `topics` made as `limits` say.
+pub fn longest_segment(topics: &[Topic], limits: &TopicLimits) -> u64 {
+    topics.iter().map(|&topic| sensor_bytes(&[topic], limits)).max().unwrap_or_default()
 }
 
 /// What stands before each sample, rounded up: the header, and what the shared-memory library puts there.

@@ -43,6 +43,12 @@ macro_rules! for_each_topic {
                 "Where people are, of a tracker.";
             Events Event, "events", "scanhub.Event.v2", 81, Change, Last, 64, 0:
                 "What happened to them.";
+            Tilt Tilt, "tilt", "scanhub.Tilt.v2", 81, Scan, Last, 64, 0:
+                "The angle of a mount.";
+            Cloud Cloud, "cloud", "scanhub.Cloud.v2", 82, Change, Last, 128, 0:
+                "Points in three dimensions.";
+            Obstacles Obstacles, "obstacles", "scanhub.Obstacles.v2", 81, Change, Last, 16, 0:
+                "What stands there in three dimensions.";
         }
     };
 }
@@ -154,6 +160,9 @@ macro_rules! longest {
     };
     (Background) => {
         |limits| crate::Background::len(limits.beams)
+    };
+    (Cloud) => {
+        |limits| crate::Cloud::len(limits.beams)
     };
     ($payload:tt) => {
         |_| size_of::<crate::$payload>()

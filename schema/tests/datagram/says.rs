@@ -2,8 +2,8 @@
 
 use schema::datagram::{Announce, Datagram, MTU_SAFE, Packed};
 use schema::{
-    BEAMS, Background, Code, Early, Event, Family, Foreground, Lines, Marks, Motion, Scan, Status, Topic,
-    Tracks, Zones,
+    BEAMS, Background, Cloud, Code, Early, Event, Family, Foreground, Lines, Marks, Motion, Obstacle,
+    Obstacles, Scan, Status, Tilt, Topic, Tracks, Zones,
 };
 use serde_json::{Map, Value, json};
 
@@ -36,6 +36,9 @@ pub(crate) fn payload(datagram: &Datagram<'_>) -> Value {
         Some(Topic::Early) => early(&unpacked(Box::<Early>::default(), payload)),
         Some(Topic::Tracks) => tracks(&unpacked(Box::<Tracks>::default(), payload)),
         Some(Topic::Events) => event(&unpacked(Box::<Event>::default(), payload)),
+        Some(Topic::Tilt) => tilt(&unpacked(Box::<Tilt>::default(), payload)),
+        Some(Topic::Cloud) => cloud(&unpacked(Cloud::zeroed(MTU_SAFE), payload)),
+        Some(Topic::Obstacles) => obstacles(&unpacked(Box::<Obstacles>::default(), payload)),
         Some(Topic::Status) => status(&unpacked(Box::<Status>::default(), payload)),
     }
 }
@@ -141,6 +144,38 @@ fn event(event: &Event) -> Value {
     json!({
         "kind": event.kind().map(|kind| kind.name()), "id": event.id, "room": event.room_name().unwrap_or_default(),
         "door": door, "from": from, "to": to,
+    })
+}
+
+fn tilt(tilt: &Tilt) -> Value {
+    json!({ "angle_rad": tilt.angle_rad, "rate_rad_s": tilt.rate_rad_s() })
+}
+
+fn cloud(cloud: &Cloud) -> Value {
+    let list = cloud.points().iter().map(|point| {
+        let [x_m, y_m, z_m] = point.at;
+        json!({ "x_m": x_m, "y_m": y_m, "z_m": z_m, "beam": point.beam, "class": point.class().name() })
+    });
+    json!({
+        "sweep": cloud.sweep, "generation": cloud.generation, "first": cloud.has(Cloud::FIRST),
+        "last": cloud.has(Cloud::LAST), "complete": cloud.has(Cloud::COMPLETE),
+        "doubted": cloud.has(Cloud::DOUBTED), "points": list.collect::<Vec<_>>(),
+    })
+}
+
+fn obstacles(found: &Obstacles) -> Value {
+    let list = found.obstacles().iter().map(|one| {
+        let [x_m, y_m, z_m] = one.middle;
+        json!({
+            "x_m": x_m, "y_m": y_m, "z_m": z_m, "low_m": one.low, "high_m": one.high,
+            "distance_m": one.distance_m, "points": one.points,
+            "foreground": one.has(Obstacle::FOREGROUND), "near": one.has(Obstacle::NEAR),
+        })
+    });
+    json!({
+        "sweep": found.sweep, "generation": found.generation, "complete": found.has(Obstacles::COMPLETE),
+        "doubted": found.has(Obstacles::DOUBTED), "left_out": found.left_out,
+        "obstacles": list.collect::<Vec<_>>(),
     })
 }
 

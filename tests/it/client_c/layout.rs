@@ -4,8 +4,8 @@
 use std::mem::{offset_of, size_of};
 
 use schema::{
-    BackgroundHead, Contents, Counter, Family, ForegroundHead, Header, Mark, Marks, Pose, Scan, ScanHead,
-    Segment, Status, Zone, Zones,
+    BackgroundHead, CloudHead, CloudPoint, Contents, Counter, Family, ForegroundHead, Header, Mark, Marks,
+    Obstacle, Obstacles, Pose, Scan, ScanHead, Segment, Status, Tilt, Zone, Zones,
 };
 
 struct Layout {
@@ -48,6 +48,11 @@ fn layouts() -> Vec<Layout> {
         "scanhub_foreground_v2" ForegroundHead: generation unit_um count beams segments left_out supported;
         "scanhub_background_v2" BackgroundHead: first_angle step generation unit_um taught count flags reserved;
         "scanhub_pose_v2" Pose: x_m y_m yaw_rad upside_down reserved;
+        "scanhub_tilt_v2" Tilt: angle_rad rate_rad_s;
+        "scanhub_cloud_v2" CloudHead: sweep generation count flags reserved;
+        "scanhub_cloud_point_v2" CloudPoint: at beam point_class reserved;
+        "scanhub_obstacle_v2" Obstacle: middle low high distance_m points flags reserved;
+        "scanhub_obstacles_v2" Obstacles: sweep generation left_out count flags reserved obstacle_array;
         "scanhub_status_v2" Status: state mode unit_mm family baud since_ns rate_mhz angle_deg resolution_cdeg
             type_text port_text last_error_text counters pose;
     };

@@ -146,6 +146,51 @@ static void events(const struct scanhub_events *e)
            (unsigned long long)e->id, e->room, e->door, e->from, e->to);
 }
 
+static void tilt(const struct scanhub_tilt *t)
+{
+    number("{\"angle_rad\":", t->angle_rad);
+    number(",\"rate_rad_s\":", t->rate_rad_s);
+    printf("}");
+}
+
+static void cloud(const struct scanhub_cloud *c)
+{
+    static const char *const classes[] = {"unknown", "background", "foreground", "behind"};
+    printf("{\"sweep\":%lu,\"generation\":%lu,\"first\":%s", (unsigned long)c->sweep, (unsigned long)c->generation,
+           boolean(c->first));
+    printf(",\"last\":%s,\"complete\":%s,\"doubted\":%s,\"points\":[", boolean(c->last), boolean(c->complete),
+           boolean(c->doubted));
+    for (unsigned i = 0; i < c->count; i++) {
+        struct scanhub_point p = scanhub_point(c, i);
+        number(i ? ",{\"x_m\":" : "{\"x_m\":", p.x_m);
+        number(",\"y_m\":", p.y_m);
+        number(",\"z_m\":", p.z_m);
+        printf(",\"beam\":%u,\"class\":\"%s\"}", p.beam, classes[p.point_class < 4 ? p.point_class : 0]);
+    }
+    printf("]}");
+}
+
+static void obstacles(const struct scanhub_obstacles *s)
+{
+    printf("{\"sweep\":%lu,\"generation\":%lu,\"complete\":%s", (unsigned long)s->sweep, (unsigned long)s->generation,
+           boolean(s->complete));
+    printf(",\"doubted\":%s,\"left_out\":%lu,\"obstacles\":[", boolean(s->doubted), (unsigned long)s->left_out);
+    for (unsigned i = 0; i < s->count; i++) {
+        struct scanhub_obstacle o = scanhub_obstacle(s, i);
+        number(i ? ",{\"x_m\":" : "{\"x_m\":", o.x_m);
+        number(",\"y_m\":", o.y_m);
+        number(",\"z_m\":", o.z_m);
+        for (unsigned n = 0; n < 3; n++)
+            number(n ? "," : ",\"low_m\":[", o.low_m[n]);
+        for (unsigned n = 0; n < 3; n++)
+            number(n ? "," : "],\"high_m\":[", o.high_m[n]);
+        number("],\"distance_m\":", o.distance_m);
+        printf(",\"points\":%lu,\"foreground\":%s,\"near\":%s}", (unsigned long)o.points, boolean(o.foreground),
+               boolean(o.near));
+    }
+    printf("]}");
+}
+
 static void lines(const struct scanhub_lines *l)
 {
     printf("{\"overflow\":%s,\"readings\":%u,\"on_lines\":%u", boolean(l->overflow), l->readings, l->on_lines);
@@ -296,6 +341,9 @@ static enum scanhub_result payload(const struct scanhub_datagram *d)
         TOPIC(SCANHUB_EARLY, early)
         TOPIC(SCANHUB_TRACKS, tracks)
         TOPIC(SCANHUB_EVENTS, events)
+        TOPIC(SCANHUB_TILT, tilt)
+        TOPIC(SCANHUB_CLOUD, cloud)
+        TOPIC(SCANHUB_OBSTACLES, obstacles)
     }
     return SCANHUB_SKIPPED;
 }

@@ -26,6 +26,11 @@ def says(datagram):
     out = {name: plain(value) for name, value in dataclasses.asdict(payload).items()}
     if datagram.topic == "events":
         out["from"], out["to"] = out.pop("from_room"), out.pop("to_room")
+    if datagram.topic == "tilt" and math.isnan(out["rate_rad_s"]):
+        out["rate_rad_s"] = None
+    if datagram.topic == "cloud":
+        for point in out["points"]:
+            point["class"] = point.pop("point_class")
     if datagram.topic == "announce":
         out["boot"] = f"{payload.boot:016x}"
     if datagram.topic == "telegram":

@@ -7,7 +7,7 @@ use super::capture::{Capture, has_tshark};
 use super::{damaged, keyed_vectors, vectors};
 use crate::testkit::TestEnv;
 use schema::datagram::{HEAD, Head, Packed};
-use schema::{EventKind, Family, State, Topic, TrackState, Verdict, Zones};
+use schema::{EventKind, Family, PointClass, State, Topic, TrackState, Verdict, Zones};
 use serde_json::Value;
 
 /// What the list says of a payload, in the names and the words of the dissector: the values of each field, in their order.
@@ -58,6 +58,9 @@ fn word(name: &str, value: &Value) -> String {
             let of_track = || TrackState::ALL.iter().position(|known| known.name() == name);
             number(State::ALL.iter().position(|known| known.name() == name).or_else(of_track))
         }
+        ("class", Value::String(name)) => {
+            number(PointClass::ALL.iter().position(|known| known.name() == name))
+        }
         ("kind", Value::String(name)) => number(EventKind::ALL.iter().position(|known| known.name() == name)),
         ("method", Value::String(name)) => {
             number(schema::MotionMethod::ALL.iter().position(|known| known.name() == name))
@@ -73,10 +76,12 @@ fn word(name: &str, value: &Value) -> String {
 /// Angles, and the numbers of lines and motions, have as many digits as the tool likes.
 fn as_shown(name: &str, values: &str) -> String {
     let is_angle = ["angle", "step", "spacing"].iter().any(|word| name.ends_with(word))
-        || ["scanhub.lines.", "scanhub.motion.", "scanhub.tracks."]
+        || ["lines", "motion", "tracks", "tilt", "cloud", "obstacles"]
             .iter()
-            .any(|topic| name.starts_with(topic))
-            && ["_m", "_m_s", "_rad", "covariance", "score"].iter().any(|word| name.ends_with(word));
+            .any(|topic| name.starts_with(&format!("scanhub.{topic}.")))
+            && ["_m", "_m_s", "_rad", "_rad_s", "covariance", "score"]
+                .iter()
+                .any(|word| name.ends_with(word));
     if !is_angle || values.is_empty() {
         return values.to_owned();
     }

@@ -53,6 +53,9 @@ extern "C" {
 #define SCANHUB_TOPIC_EARLY 10     /* struct scanhub_early_v2 */
 #define SCANHUB_TOPIC_TRACKS 11    /* struct scanhub_tracks_v2 */
 #define SCANHUB_TOPIC_EVENTS 12    /* struct scanhub_event_v2 */
+#define SCANHUB_TOPIC_TILT 13      /* struct scanhub_tilt_v2 */
+#define SCANHUB_TOPIC_CLOUD 14     /* struct scanhub_cloud_v2 */
+#define SCANHUB_TOPIC_OBSTACLES 15 /* struct scanhub_obstacles_v2 */
 
 /* How scanhub_wait waits. */
 #define SCANHUB_WAIT_DOORBELL 0 /* at a word in the hub's memory, at which one call wakes all: what to take if in doubt */
@@ -276,6 +279,65 @@ struct scanhub_event_v2 {
     char door_text[24]; /* of SCANHUB_EVENT_DOOR, as are the next two */
     char from_text[24];
     char to_text[24];
+};
+
+/* The angle of a mount at the stamps of the header. */
+struct scanhub_tilt_v2 {
+    double angle_rad;  /* right-handed around the mount's axis */
+    double rate_rad_s; /* how fast it grows; nan: not known */
+};
+
+/* What is made of a sweep, the way of a mount from turn to turn. */
+#define SCANHUB_SWEEP_FIRST 1    /* of clouds: the first sample of its sweep */
+#define SCANHUB_SWEEP_LAST 2     /* of clouds: the last one */
+#define SCANHUB_SWEEP_COMPLETE 4 /* it went from one turn to the next, and no angle was missing */
+#define SCANHUB_SWEEP_DOUBTED 8  /* its angles contradict the background: nothing is known of what stands there */
+
+/* A cloud, the points of one scan, begins with this; behind it are the points: see scanhub_cloud_points. */
+struct scanhub_cloud_v2 {
+    uint32_t sweep;      /* its number, from 0 */
+    uint32_t generation; /* of the background: one more each time that it was forgotten */
+    uint16_t count;      /* points */
+    uint8_t flags;       /* SCANHUB_SWEEP_.. */
+    uint8_t reserved[5];
+};
+
+/* What a point is beside the background. */
+#define SCANHUB_POINT_UNKNOWN 0    /* not known yet, and so is every number that is not here */
+#define SCANHUB_POINT_BACKGROUND 1 /* where something stands always */
+#define SCANHUB_POINT_FOREGROUND 2 /* nearer than that */
+#define SCANHUB_POINT_BEHIND 3     /* farther away */
+
+struct scanhub_cloud_point_v2 {
+    float at[3];         /* metres ahead, to the left, above the floor */
+    uint16_t beam;       /* its number in the scan */
+    uint8_t point_class; /* SCANHUB_POINT_.. */
+    uint8_t reserved;
+};
+
+/* Something that stands there; all in the robot's frame: metres ahead, to the left, above the floor. */
+#define SCANHUB_OBSTACLE_FOREGROUND 1 /* has points before the background */
+#define SCANHUB_OBSTACLE_NEAR 2       /* has points in the space that is to be free */
+
+struct scanhub_obstacle_v2 {
+    float middle[3];  /* mean of its points */
+    float low[3];     /* their least coordinates */
+    float high[3];    /* their greatest */
+    float distance_m; /* of its nearest point from the robot's centre, over ground */
+    uint32_t points;
+    uint8_t flags;    /* SCANHUB_OBSTACLE_.. */
+    uint8_t reserved[3];
+};
+
+/* What one sweep has found. */
+struct scanhub_obstacles_v2 {
+    uint32_t sweep;      /* as in a cloud */
+    uint32_t generation; /* as in a cloud */
+    uint32_t left_out;   /* obstacles that did not fit */
+    uint8_t count;       /* at most 64 */
+    uint8_t flags;       /* SCANHUB_SWEEP_.. */
+    uint8_t reserved[2];
+    struct scanhub_obstacle_v2 obstacle_array[64]; /* the nearest first */
 };
 
 struct scanhub_segment_v2 {
@@ -650,6 +712,16 @@ static inline const uint16_t *scanhub_background_ranges(const struct scanhub_sam
     return (const uint16_t *)(const void *)(head + 1);
 }
 
+/* The points of a cloud, as many as `count`; NULL if the sample is none. */
+static inline const struct scanhub_cloud_point_v2 *scanhub_cloud_points(const struct scanhub_sample *cloud)
+{
+    const struct scanhub_cloud_v2 *head = (const struct scanhub_cloud_v2 *)cloud->payload;
+    if (cloud->length < sizeof *head
+        || cloud->length < sizeof *head + sizeof(struct scanhub_cloud_point_v2) * (size_t)head->count)
+        return NULL;
+    return (const struct scanhub_cloud_point_v2 *)(const void *)(head + 1);
+}
+
 /* A compiler with another layout than the hub's stops here. */
 #if defined(__cplusplus)
 #define SCANHUB_MUST(name, what) static_assert(what, #name)
@@ -691,6 +763,15 @@ SCANHUB_SIZE(scanhub_tracks_v2, 7432);
 SCANHUB_AT(scanhub_tracks_v2, sensor_array, 5128);
 SCANHUB_SIZE(scanhub_event_v2, 112);
 SCANHUB_AT(scanhub_event_v2, to_text, 88);
+SCANHUB_SIZE(scanhub_tilt_v2, 16);
+SCANHUB_SIZE(scanhub_cloud_v2, 16);
+SCANHUB_AT(scanhub_cloud_v2, flags, 10);
+SCANHUB_SIZE(scanhub_cloud_point_v2, 16);
+SCANHUB_AT(scanhub_cloud_point_v2, point_class, 14);
+SCANHUB_SIZE(scanhub_obstacle_v2, 48);
+SCANHUB_AT(scanhub_obstacle_v2, flags, 44);
+SCANHUB_SIZE(scanhub_obstacles_v2, 3088);
+SCANHUB_AT(scanhub_obstacles_v2, obstacle_array, 16);
 SCANHUB_SIZE(scanhub_segment_v2, 16);
 SCANHUB_SIZE(scanhub_foreground_v2, 24);
 SCANHUB_SIZE(scanhub_background_v2, 32);

@@ -47,6 +47,9 @@ template <> struct TopicOf<scanhub_motion_v2> { enum { number = SCANHUB_TOPIC_MO
 template <> struct TopicOf<scanhub_early_v2> { enum { number = SCANHUB_TOPIC_EARLY }; };
 template <> struct TopicOf<scanhub_tracks_v2> { enum { number = SCANHUB_TOPIC_TRACKS }; };
 template <> struct TopicOf<scanhub_event_v2> { enum { number = SCANHUB_TOPIC_EVENTS }; };
+template <> struct TopicOf<scanhub_tilt_v2> { enum { number = SCANHUB_TOPIC_TILT }; };
+template <> struct TopicOf<scanhub_cloud_v2> { enum { number = SCANHUB_TOPIC_CLOUD }; };
+template <> struct TopicOf<scanhub_obstacles_v2> { enum { number = SCANHUB_TOPIC_OBSTACLES }; };
 template <> struct TopicOf<scanhub_robot> { enum { number = 0 }; };
 
 /* A sample, or none; given back when it goes out of scope. */

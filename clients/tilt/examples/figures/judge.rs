@@ -1,7 +1,7 @@
 //! How right the classes of points are, and where obstacles are found. Refuses to know how a hall is played.
 
 use sim::labeled_scan::Met;
-use tilt::{Class, Obstacle, Settings, Sweep};
+use tilt::{Obstacle, PointClass, Settings, Sweep};
 
 use super::hall::Hall;
 
@@ -24,7 +24,7 @@ impl Score {
     pub(crate) fn add(&mut self, hall: &Hall, sweep: &Sweep<'_>, settings: &Settings, sweep_ns: u64) {
         let new_ns = u64::from(settings.sweeps) * sweep_ns;
         for point in sweep.points {
-            let is_found = point.class == Class::Foreground;
+            let is_found = point.class == PointClass::Foreground;
             let count = |(all, found): &mut (usize, usize)| {
                 (*all, *found) = (*all + 1, *found + usize::from(is_found))
             };

@@ -73,8 +73,8 @@ impl Run<'_> {
             }
             let topics = published.iter().filter(|(of, _)| of == sensor).map(|(_, topic)| *topic);
             let topics: Vec<Topic> = topics.collect();
-            let is_of_trackers = track.name.topic.is_of_trackers();
-            let is_other = |topic: &Topic| topic.is_of_trackers() != is_of_trackers;
+            let maker = track.name.topic.maker();
+            let is_other = |topic: &Topic| topic.maker() != maker;
             if !topics.is_empty() && topics.iter().all(is_other) {
                 return Err(no_such_topic(&track.name, &topics).into());
             }

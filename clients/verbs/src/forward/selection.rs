@@ -2,7 +2,7 @@
 
 use std::num::NonZeroU64;
 
-use schema::{Failure, Kind, Pace, ROBOT, Topic, is_remote};
+use schema::{Failure, Kind, Maker, Pace, ROBOT, Topic, is_remote};
 
 use crate::selection::Word;
 
@@ -20,8 +20,8 @@ struct Entry {
 
 impl Selection {
     /// What `texts` name, as words of topics (`SENSOR/TOPIC`), with `:every=N` behind it if the samples are to be thinned. Nothing
-    /// named is all sensors, and of these telegrams if `bare`, else all other topics but lines and motion, which cost time only where
-    /// they are followed.
+    /// named is all sensors, and of these telegrams if `bare`, else all other topics but lines, motion and early warnings,
+    /// which cost time only where they are followed, and clouds, which are many bytes.
     ///
     /// # Errors
     ///
@@ -43,7 +43,7 @@ impl Selection {
         if entries.is_empty() {
             let wanted = |topic: &Topic| match topic {
                 Topic::Telegram => bare,
-                Topic::Lines | Topic::Motion | Topic::Early => false,
+                Topic::Lines | Topic::Motion | Topic::Early | Topic::Cloud => false,
                 _ => !bare,
             };
             let all = Topic::ALL.into_iter().filter(wanted);
@@ -77,12 +77,13 @@ impl Selection {
         named
     }
 
-    /// The sensor is named with a topic that only trackers have.
-    pub(super) fn names_tracker(&self, sensor: &str) -> bool {
+    /// Who makes the topics that the sensor is named with: its link, if all of them are meant.
+    pub(super) fn maker_of(&self, sensor: &str) -> Maker {
         let words = self.entries.iter().map(|entry| &entry.word);
-        { words }.any(|word| {
-            word.sensor.as_deref() == Some(sensor) && word.topic.is_some_and(Topic::is_of_trackers)
-        })
+        let mut makers = words
+            .filter(|word| word.sensor.as_deref() == Some(sensor))
+            .filter_map(|word| word.topic.map(Topic::maker));
+        makers.find(|maker| *maker != Maker::Link).unwrap_or(Maker::Link)
     }
 
     /// Something goes out of sensors that are not named.
@@ -137,7 +138,8 @@ mod tests {
     fn all_but_what_runs_on_demand_or_nothing_but_telegrams() {
         let usual = selection(&[], false).unwrap();
         for topic in Topic::ALL {
-            let is_usual = !matches!(topic, Topic::Telegram | Topic::Lines | Topic::Motion | Topic::Early);
+            let rare = [Topic::Telegram, Topic::Lines, Topic::Motion, Topic::Early, Topic::Cloud];
+            let is_usual = !rare.contains(&topic);
             assert_eq!(every(&usual, "front", topic), is_usual.then_some(1));
         }
         let bare = selection(&[], true).unwrap();
@@ -145,7 +147,7 @@ mod tests {
             assert_eq!(every(&bare, "front", topic), (topic == Topic::Telegram).then_some(1));
         }
         let house = selection(&["front/*", "house/tracks"], false).unwrap();
-        assert_eq!((house.names_tracker("front"), house.names_tracker("house")), (false, true));
+        assert_eq!((house.maker_of("front"), house.maker_of("house")), (Maker::Link, Maker::Tracker));
         assert!(usual.wants_all() && bare.wants_all() && usual.named().is_empty());
     }
 

@@ -82,7 +82,7 @@ fn track_list<S: Serializer>(tracks: &Tracks, serializer: S) -> Result<S::Ok, S:
 }
 
 /// A millimetre is as much as there is sense in.
-fn thousandths(value: f32) -> f64 {
+pub(super) fn thousandths(value: f32) -> f64 {
     (1e3 * f64::from(value)).round() / 1e3
 }
 

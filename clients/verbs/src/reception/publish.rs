@@ -5,7 +5,7 @@ mod any_publisher;
 use lan::republish::{Republisher, SensorTopics, TopicStore};
 use scanhub_client::{PublishSession, SensorPublisher, clock};
 use schema::limits::TopicLimits;
-use schema::shortage::{check_memory, longest_segment, raise_descriptor_limit, sensor_bytes};
+use schema::shortage::{check_memory, raise_descriptor_limit, sensor_bytes};
 use schema::{BEAMS, Contents, Domain, Failure, Header, Topic, Wake};
 
 use any_publisher::AnyPublisher;
@@ -172,5 +172,5 @@ impl SensorTopics for SharedTopics {
 /// Whether there is memory for one more `topic` that is made as `limits` say.
 fn has_memory(topic: Topic, limits: &TopicLimits) -> bool {
     let needed = sensor_bytes(&[topic], limits);
-    check_memory(needed, needed.min(longest_segment(limits))).is_ok()
+    check_memory(needed, needed).is_ok()
 }

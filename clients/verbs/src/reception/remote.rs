@@ -4,7 +4,7 @@ use std::io::{self, Write};
 
 use lan::incoming::Remote;
 use schema::datagram::Head;
-use schema::{Header, Pace, Topic};
+use schema::{Header, Topic};
 use serde::{Serialize, Serializer};
 
 use crate::json;
@@ -97,7 +97,7 @@ impl Keys for Line<'_, '_> {
         }
         let Remote { topic, datagram, late, authenticated, .. } = self.remote;
         let Head { hub, epoch, .. } = datagram.head;
-        let has_head = topic.row().pace == Pace::Scan;
+        let has_head = !matches!(topic, Topic::Background | Topic::Status);
         let flags = has_head.then(|| json::Words::of(&self.remote.header(std::process::id())));
         let age_ms = age_ms(self.remote);
         self.out.json(&WithOrigin {

@@ -12,7 +12,7 @@ pub(super) struct Selection {
 }
 
 /// Telegrams, from which all else can be made again, and the results that are wanted first.
-const USUAL: [Topic; 7] = [
+const USUAL: [Topic; 9] = [
     Topic::Telegram,
     Topic::Marks,
     Topic::Zones,
@@ -20,6 +20,8 @@ const USUAL: [Topic; 7] = [
     Topic::Status,
     Topic::Tracks,
     Topic::Events,
+    Topic::Tilt,
+    Topic::Obstacles,
 ];
 
 impl Selection {

@@ -7,7 +7,7 @@ use ::web::{Board, ChannelId, Event, Playback, Progress, messages};
 use scanhub_client::clock;
 use scanhub_client::streams::{Sample, Session, Who};
 use scene::{Circle, People, Scene, Trouble, circles};
-use schema::{Domain, Failure, Header, Kind, Topic, Verdict};
+use schema::{Domain, Failure, Header, Kind, Maker, Topic, Verdict};
 
 use super::{WebOptions, told};
 use crate::follow::{Notice, Sink};
@@ -296,7 +296,7 @@ impl<'a> Feeder<'a> {
 impl Sink for Feeder<'_> {
     fn begin(&mut self, name: &TopicName) {
         picture::begin(&mut self.scene, name);
-        if name.topic.is_of_trackers() {
+        if name.topic.maker() == Maker::Tracker {
             self.tracks_of(&name.sensor);
         } else {
             self.of(&name.sensor);

@@ -6,7 +6,7 @@ use std::io;
 
 use mcap::records::Channel;
 use schema::file::{ENCODING, ENCODING_V1};
-use schema::{Topic, check_followed};
+use schema::{Maker, Topic, check_followed};
 
 /// What a channel is.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -18,12 +18,12 @@ pub(crate) struct Place {
 }
 
 impl Place {
-    /// What `channel` is; nothing if it is somebody else's, or a tracker's, which is no sensor.
+    /// What `channel` is; nothing if it is somebody else's, or of a name that is no sensor.
     fn of(channel: &Channel) -> Option<Place> {
         let (sensor, topic) = channel.topic.rsplit_once('/')?;
         let is_old = channel.message_encoding == ENCODING_V1;
         let is_ours = (is_old || channel.message_encoding == ENCODING) && check_followed(sensor).is_ok();
-        let topic = Topic::parse(topic).filter(|topic| is_ours && !topic.is_of_trackers())?;
+        let topic = Topic::parse(topic).filter(|topic| is_ours && topic.maker() == Maker::Link)?;
         Some(Place { sensor: sensor.to_owned(), topic, is_old })
     }
 

@@ -28,6 +28,9 @@ macro_rules! payloads {
     (Background $sample:ident) => {
         &schema::Background::of_bytes(&$sample.bytes)
     };
+    (Cloud $sample:ident) => {
+        &schema::Cloud::of_bytes(&$sample.bytes)
+    };
     ($payload:ident $sample:ident) => {
         &bytemuck::pod_read_unaligned::<schema::$payload>(&$sample.bytes)
     };

@@ -1,0 +1,212 @@
+//! Topics of a mount and of what makes points of it, published by a program beside a hub: every reader says the same of them,
+//! on this machine, on another one and in a recording.
+
+use std::cell::RefCell;
+use std::path::Path;
+
+use scanhub_client::{Publication, PublishSession, SensorPublisher};
+use schema::datagram::Packed;
+use schema::limits::TopicLimits;
+use schema::{Cloud, CloudHead, CloudPoint, Header, Maker, Obstacle, Obstacles, PointClass, Tilt, Wake};
+use serde_json::{Value, json};
+
+use crate::testkit::{INT, Outcome, Program, Recording, TestEnv, in_a_network, number, python, until};
+
+/// What turns a mount and what makes points of it, in one program.
+struct Made {
+    tilt: Publication<Tilt>,
+    cloud: Publication<Cloud>,
+    obstacles: Publication<Obstacles>,
+    mount: SensorPublisher,
+    room: SensorPublisher,
+    rounds: u32,
+}
+
+/// Points of a sample: as many as the beams of an LMS, so that a datagram has no room for them.
+const POINTS: u16 = 401;
+
+impl Made {
+    fn beside(env: &TestEnv) -> Made {
+        let topics = [Maker::Mount.topics(), Maker::Tilted.topics()].concat();
+        let session = PublishSession::beside(&env.place(), &topics, TopicLimits::default()).unwrap();
+        let (mount, room) = (session.sensor("mount").unwrap(), session.sensor("room").unwrap());
+        let (cloud, obstacles) = (room.topic().unwrap(), room.topic().unwrap());
+        Made { tilt: mount.topic().unwrap(), cloud, obstacles, mount, room, rounds: 0 }
+    }
+
+    /// An angle, obstacles and two clouds, different ones each time.
+    fn round(&mut self) {
+        let (sweep, k) = (self.rounds, self.rounds as f32 / 8.0);
+        let at = |header: Header, sensor| Header { sensor, ..header };
+        let angle = Tilt { angle_rad: 0.5 + f64::from(k), rate_rad_s: [f64::NAN, -0.25][sweep as usize % 2] };
+        self.tilt.send_with(&at(self.tilt.header(), 200), |sample| *sample = angle).unwrap();
+        let mut found = Obstacles { sweep, flags: Obstacles::COMPLETE, ..Obstacles::default() };
+        for i in 0..sweep % 3 {
+            let middle = [1.0 + k, -2.0, i as f32];
+            found.push(Obstacle {
+                middle,
+                low: middle,
+                high: middle,
+                points: 9,
+                flags: 1,
+                ..Obstacle::default()
+            });
+        }
+        self.obstacles.send_with(&at(self.obstacles.header(), 201), |sample| *sample = found).unwrap();
+        for flags in [Cloud::FIRST, Cloud::LAST] {
+            let head =
+                CloudHead { sweep, flags: flags | Cloud::COMPLETE, count: POINTS, ..CloudHead::default() };
+            let fill = |sample: &mut Cloud| {
+                for (point, beam) in sample.begin(head).iter_mut().zip(0..) {
+                    let point_class = PointClass::ALL[usize::from(beam % 4)] as u8;
+                    *point =
+                        CloudPoint { at: [k, f32::from(beam) / 64.0, 0.5], beam, point_class, reserved: 0 };
+                }
+            };
+            let header = at(self.cloud.header(), 201);
+            self.cloud.send_len_with(&header, Cloud::len(POINTS.into()), fill).unwrap();
+        }
+        self.mount.wake(Wake::Telegram).unwrap();
+        self.room.wake(Wake::Telegram).unwrap();
+        self.rounds += 1;
+    }
+
+    /// Publishes until each of `programs` has said lines of every class from rounds that began after all of them had said one.
+    fn until_heard(&mut self, programs: &mut [&mut Program]) {
+        for since in [0, 1] {
+            let since = since * u64::from(self.rounds);
+            until("all say all classes", || {
+                self.round();
+                let is_new = |line: &Value, class| line["class"] == class && round(line) >= since;
+                programs
+                    .iter_mut()
+                    .all(|program| CLASSES.iter().all(|class| program.is_heard(|line| is_new(line, *class))))
+            });
+        }
+    }
+}
+
+/// The round in which it was published.
+fn round(line: &Value) -> u64 {
+    match line["angle_deg"].as_f64() {
+        Some(angle_deg) => (8.0 * (angle_deg.to_radians() - 0.5)).round() as u64,
+        None => number(line, "sweep"),
+    }
+}
+
+const CLASSES: [&str; 3] = ["tilt", "cloud", "obstacles"];
+const TOPICS: [&str; 3] = ["mount/tilt", "room/cloud", "room/obstacles"];
+
+/// A hub whose sensor is not there.
+fn hub(env: &TestEnv) -> Program {
+    env.hub(&[env.link("front")])
+}
+
+/// How many lines of `class` one program has said that another one has, too; what they say of `keys` is the same.
+fn same(one: &Outcome, other: &Outcome, class: &str, keys: &[&str]) -> usize {
+    let others = other.of_class(class);
+    let mut same = 0;
+    for line in one.of_class(class) {
+        let is_same = |other: &&Value| round(other) == round(&line) && other["first"] == line["first"];
+        if let Some(other) = others.iter().find(is_same) {
+            keys.iter().for_each(|key| assert_eq!(line[*key], other[*key], "{key} of {class}"));
+            same += 1;
+        }
+    }
+    same
+}
+
+#[test]
+fn echo_python_and_a_recording_say_the_same() {
+    let env = TestEnv::new();
+    let _hub = hub(&env);
+    let mut made = Made::beside(&env);
+    let mut echo = env.echo(&TOPICS);
+    let package = Path::new(env!("CARGO_MANIFEST_DIR")).join("clients/python");
+    let mut follower = python("iceoryx2, numpy").map(|mut command| {
+        let place = env.place();
+        let root = place.root().parent().expect("a domain is below its base");
+        command.arg(package.join("tests/follow.py")).arg(place.name()).arg(root).args(TOPICS);
+        command.env("PYTHONPATH", &package).env_remove("SCANHUB_DOMAIN");
+        Program::start(command)
+    });
+    let file = env.word("tilted.mcap");
+    let record = env.start(&[&["record", "--json", "-o", &file][..], &TOPICS].concat());
+    let followers = 2 + u64::from(follower.is_some());
+    until("all follow", || TOPICS.iter().all(|topic| env.subscribers(topic) == followers));
+    made.until_heard(&mut std::iter::once(&mut echo).chain(&mut follower).collect::<Vec<_>>());
+    let (echo, record) = (echo.end(INT), record.end(INT));
+    assert_eq!(record.code, Some(0), "{record}");
+    let line = &echo.of_class("cloud")[0];
+    let points = line["points"].as_array().expect("points");
+    assert_eq!((points.len(), &points[1], &line["classes"][1]), (401, &json!([0.0, 0.016, 0.5]), &json!(1)));
+    assert_eq!(
+        (&line["sensor"], &line["first"], &line["beams"][400]),
+        (&json!("room"), &json!(true), &json!(400))
+    );
+    if let Some(follower) = follower.map(|follower| follower.end(INT)) {
+        for class in CLASSES {
+            let line = echo.of_class(class).remove(0);
+            let keys: Vec<&str> = line.as_object().expect("an object").keys().map(String::as_str).collect();
+            assert!(same(&echo, &follower, class, &keys) >= 2, "{class}");
+        }
+    }
+    // All were there before the first sample, so that what is kept is what was said.
+    let recording = Recording::whole(file.as_ref());
+    let [tilt, clouds, obstacles] = TOPICS.map(|topic| recording.of(topic));
+    for (i, line) in echo.of_class("cloud").iter().enumerate() {
+        let mut cloud = Box::<Cloud>::default();
+        assert!(Cloud::unpack_into(&mut cloud, clouds[i].payload()));
+        let metres =
+            cloud.points().iter().map(|point| point.at.map(f64::from).map(|x| (1e3 * x).round() / 1e3));
+        assert_eq!(line["points"], json!(metres.collect::<Vec<_>>()));
+    }
+    for (i, line) in echo.of_class("obstacles").iter().enumerate() {
+        let mut found = Obstacles::default();
+        assert!(found.unpack(obstacles[i].payload()));
+        assert_eq!(line["obstacles"].as_array().map(Vec::len), Some(found.obstacles().len()));
+    }
+    assert!(tilt.len() >= 2 && Tilt::default().unpack(tilt[0].payload()));
+}
+
+/// A cloud takes several datagrams. What `listen --publish` publishes again is what was said on the other machine.
+#[test]
+fn another_machine_says_the_same() {
+    in_a_network("tilted::another_machine_says_the_same", || {
+        let (env, there) = (TestEnv::new(), TestEnv::new());
+        let _hub = hub(&env);
+        let mut made = Made::beside(&env);
+        let mut listen = there.start(&["listen", "--json", "--publish"]).ready();
+        let mut echo = env.echo(&TOPICS);
+        let flags = CLASSES.map(|topic| format!("--topic=*/{topic}"));
+        let flags: Vec<&str> = flags.iter().map(String::as_str).chain(["--interface=lo"]).collect();
+        let _gateway = env.gateway(&flags);
+        let names = TOPICS.map(|topic| {
+            let (name, topic) = topic.split_once('/').expect("a topic");
+            let published = RefCell::default();
+            until("it is published", || {
+                made.round();
+                let is_it = |sensor: &str| sensor.ends_with(&format!(".{name}"));
+                listen.is_heard(|line| {
+                    let sensor = line["sensor"].as_str().filter(|sensor| is_it(sensor));
+                    let sensor = sensor.filter(|_| line["kind"] == "published");
+                    sensor.is_some_and(|sensor| {
+                        *published.borrow_mut() = format!("{sensor}/{topic}");
+                        true
+                    })
+                })
+            });
+            published.into_inner()
+        });
+        let mut again = there.echo(&names.each_ref().map(String::as_str));
+        made.until_heard(&mut [&mut echo, &mut again]);
+        let [echo, again, listen] = [echo, again, listen].map(|program| program.end(INT));
+        let keys = ["sweep", "generation", "first", "last", "complete", "points", "beams", "classes"];
+        for other in [&listen, &again] {
+            assert!(same(&echo, other, "cloud", &keys) >= 2);
+            assert!(same(&echo, other, "tilt", &["angle_deg", "rate_deg_s"]) >= 1);
+            assert!(same(&echo, other, "obstacles", &["sweep", "complete", "obstacles", "left_out"]) >= 1);
+        }
+        assert!(listen.of_class("cloud").iter().all(|line| line["sensor"] == "room"));
+    });
+}
