@@ -140,7 +140,8 @@ impl<'a> Feeder<'a> {
     fn put_tracks(&mut self, tracker: &str, wall_ns: u64) {
         let channel = self.tracks_of(tracker);
         let people = self.scene.trackers.iter().find(|(name, _)| name == tracker);
-        if let Some((_, people)) = people.filter(|_| self.board.is_wanted(channel)) {
+        // Whoever comes gets the next one soon.
+        if let Some((_, people)) = people.filter(|_| self.board.is_watched(channel)) {
             self.board.put(channel, wall_ns, &messages::tracks(people, wall_ns));
         }
     }
