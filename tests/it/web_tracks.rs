@@ -1,7 +1,5 @@
 //! People in the browser's picture: those whom `track --as` tells of, with numbers, tails and rooms, in the map of the site.
 
-use std::path::Path;
-
 use serde_json::Value;
 
 use crate::browser::{Browser, Look};
@@ -27,7 +25,6 @@ fn number(page: &mut Browser, script: &str) -> f64 {
     page.ask(script).as_f64().unwrap_or_else(|| panic!("{script} is no number"))
 }
 
-/// `SCANHUB_PICTURES=docs cargo test --test it people_stand_in_the_picture` makes the picture of the documents anew.
 #[test]
 fn people_stand_in_the_picture_where_the_tracker_sees_them() {
     let env = TestEnv::in_time();
@@ -50,9 +47,6 @@ fn people_stand_in_the_picture_where_the_tracker_sees_them() {
     );
     page.await_true("document.querySelector('#people').innerText === '1 person: kitchen 1'");
     page.await_true("scanhub.tracks === 1 && scanhub.people[0].tail.length > 10");
-    if let Some(directory) = std::env::var_os("SCANHUB_PICTURES") {
-        page.photograph(&Path::new(&directory).join("web-people.png"));
-    }
     // What is held stays to be looked at.
     page.press(" ");
     page.await_true("document.querySelector('#verdict').innerText.includes('held')");
