@@ -64,6 +64,21 @@ fn the_keyboard_alone_is_enough() {
     page.await_true(&pressed("#sensors button"));
     page.press("0");
     page.await_true(&format!("!({})", pressed("#sensors button")));
+    // What a mouse and fingers do, keys do, too; the first one ends that the view follows the scene.
+    page.press("ArrowUp");
+    page.await_true(&format!("!({})", pressed("[data-do=fit]")));
+    let moves =
+        [("ArrowUp", "x"), ("ArrowLeft", "y"), ("+", "scale"), ("-", "scale"), ("[", "turn"), ("]", "turn")];
+    for (key, part) in moves {
+        let before = page.ask(&format!("scanhub.view.{part}"));
+        page.press(key);
+        page.await_true(&format!("scanhub.view.{part} !== {before}"));
+    }
+    page.press("2");
+    page.await_true(&pressed("#sensors article:nth-child(2) button"));
+    page.press("0");
+    page.press("c");
+    page.await_true(&pressed("[data-do=fit]"));
     page.press("l");
     page.await_true("document.querySelector('#layers').classList.contains('open')");
     // A dialogue takes the keyboard, and gives it back.

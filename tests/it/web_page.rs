@@ -147,7 +147,7 @@ fn the_picture_of_the_documents() {
     let env = TestEnv::in_time();
     let directory = std::env::var_os("SCANHUB_PICTURES");
     let world: World = "demo".parse().expect("a world");
-    let file = recorded_world(&env, &world, &["front", "rear"], if directory.is_some() { 600 } else { 180 });
+    let file = recorded_world(&env, &world, &["front", "rear"], if directory.is_some() { 900 } else { 180 });
     let poses = ["front.pose.x=0.3", "rear.pose.x=-0.3", "rear.pose.yaw=3.14159"];
     let poses = poses.map(|pose| format!("--set=link.{pose}"));
     let replay = [["replay", &file, "--json", "--hold"].map(str::to_owned).to_vec(), poses.to_vec()].concat();
@@ -167,7 +167,15 @@ fn the_picture_of_the_documents() {
             }
             let quiet =
                 "!document.querySelector('#sensors .lossy') && !document.querySelector('#news').innerText";
-            page.await_true(&format!("{seen} && {quiet}"));
+            let frames = format!(
+                "new Promise((done) => {{
+                    const end = performance.now() + 40_000;
+                    const look = () => ({seen}) && ({quiet}) ? done(true)
+                        : performance.now() > end ? done(false) : requestAnimationFrame(look);
+                    look();
+                }})"
+            );
+            assert!((0..5).any(|_| page.ask(&frames) == true), "the machine is too busy for a picture");
             page.photograph(&Path::new(directory).join(format!("{name}.png")));
         }
         assert!(page.complaints.is_empty(), "{:?}", page.complaints);

@@ -140,7 +140,7 @@ impl<'a> Feeder<'a> {
     fn put_tracks(&mut self, tracker: &str, wall_ns: u64) {
         let channel = self.tracks_of(tracker);
         let people = self.scene.trackers.iter().find(|(name, _)| name == tracker);
-        if let Some((_, people)) = people.filter(|_| self.board.is_wanted(channel)) {
+        if let Some((_, people)) = people.filter(|_| self.board.is_watched(channel)) {
             self.board.put(channel, wall_ns, &messages::tracks(people, wall_ns));
         }
     }
@@ -353,11 +353,10 @@ impl Sink for Feeder<'_> {
 
     /// What is followed already is served.
     fn short(&mut self, name: &TopicName, failure: Failure) -> Result<(), End> {
-        let now = Instant::now();
-        if now < self.short_at {
+        if Instant::now() < self.short_at {
             return Ok(());
         }
-        self.short_at = now + SHORT_EVERY;
+        self.short_at = Instant::now() + SHORT_EVERY;
         let message = format!("{name} is not served: {}", failure.message);
         told::short(&mut self.output, &message, &failure.hint, self.options.json)
     }
@@ -396,5 +395,5 @@ const MARKS_EVERY: Duration = Duration::from_millis(50);
 /// In viewers what is not said again is gone after a second, and whoever comes sees them so soon.
 const CIRCLES_EVERY: Duration = Duration::from_millis(300);
 const STATUS_EVERY: Duration = Duration::from_millis(500);
-/// Between two words about that.
+/// Between two words about a shortage.
 const SHORT_EVERY: Duration = Duration::from_secs(10);
