@@ -86,7 +86,7 @@ pub use zones::{Verdict, ZONES, Zone, Zones};
 #[cfg(feature = "ipc")]
 pub use directory::Directory;
 #[cfg(feature = "ipc")]
-pub use lock::{HubLock, ListenLock, holder, publisher};
+pub use lock::{HubLock, ListenLock, NameLock, holder, publisher};
 #[cfg(feature = "json")]
 pub use saved::{SavedModel, as_json, unit_in_mm};
 #[cfg(feature = "ipc")]

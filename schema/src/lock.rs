@@ -1,5 +1,5 @@
-//! Who publishes in a domain: at most one hub, and one listener that publishes topics of other machines. Each holds a lock
-//! that ends with its process. Consumers ask who holds the locks and never hold one themselves. Refuses to know what is
+//! Who publishes in a domain: at most one hub, one listener that publishes topics of other machines, and any number of
+//! programs beside them, each under a name of its own. Each holds a lock that ends with its process. Consumers ask who holds the locks and never hold one themselves. Refuses to know what is
 //! published.
 
 use std::fs::File;
@@ -50,6 +50,37 @@ impl ListenLock {
     }
 }
 
+/// The lock of a program that publishes under a name of its own, such as a tracker or a mount. There need not be a hub.
+#[derive(Debug)]
+pub struct NameLock {
+    root: PathBuf,
+    _held: Held,
+}
+
+impl NameLock {
+    /// Takes the lock of `name` as [`HubLock::acquire`] does.
+    ///
+    /// # Errors
+    ///
+    /// As [`HubLock::acquire`], with another program that publishes under `name`.
+    pub fn acquire(root: &Path, name: &str) -> Result<NameLock, Failure> {
+        let held = Held::acquire(root, &format!("name.{name}.lock"), |pid| {
+            let what = format!("another program publishes as {name} in {}: pid {pid}", root.display());
+            Failure::new(Kind::DomainHeld, what, "end it, or choose another name")
+        });
+        Ok(NameLock { _held: held?, root: root.to_owned() })
+    }
+}
+
+impl Drop for NameLock {
+    /// The last one out takes the names of the shared memory along, as [`Publishing`] does.
+    fn drop(&mut self) {
+        if let Ok(None) = publisher(&self.root) {
+            ipc::forget_names(&self.root);
+        }
+    }
+}
+
 /// The lock of who publishes, with what has to be done at its end.
 #[derive(Debug)]
 struct Publishing {
@@ -60,7 +91,11 @@ struct Publishing {
 
 impl Publishing {
     fn acquire(root: &Path, name: &'static str, who: &str) -> Result<Publishing, Failure> {
-        Ok(Publishing { _held: Held::acquire(root, name, who)?, root: root.to_owned(), name })
+        Ok(Publishing {
+            _held: Held::acquire(root, name, |pid| held(root, who, pid))?,
+            root: root.to_owned(),
+            name,
+        })
     }
 }
 
@@ -102,14 +137,15 @@ struct Held {
 }
 
 impl Held {
-    fn acquire(root: &Path, name: &str, who: &str) -> Result<Held, Failure> {
+    /// `held` says who has it.
+    fn acquire(root: &Path, name: &str, held: impl Fn(u32) -> Failure) -> Result<Held, Failure> {
         let file = loop {
             let file = Held::open(root, name)?;
             match fcntl(file.as_raw_fd(), FcntlArg::F_OFD_SETLK(&whole_file(libc::F_WRLCK))) {
                 // Whoever held it until now may have taken the domain away, and the next one would lock another file.
                 Ok(_) if file.metadata().is_ok_and(|metadata| metadata.nlink() == 0) => {}
                 Ok(_) => break file,
-                Err(Errno::EAGAIN | Errno::EACCES) => return Err(held(root, who, pid_in(&file))),
+                Err(Errno::EAGAIN | Errno::EACCES) => return Err(held(pid_in(&file))),
                 Err(error) => return Err(unusable(root, &error.into())),
             }
         };

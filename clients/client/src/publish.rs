@@ -1,6 +1,8 @@
 //! Topics that a program publishes itself, such as what it makes of others. They are as a hub's own: consumers follow them
-//! by name, in every language, see what they missed, and are woken. One process of a domain publishes beside its hub; its
-//! lock says that it lives. Refuses to know what is published.
+//! by name, in every language, see what they missed, and are woken. A name has one publisher: its lock says that it lives.
+//! Refuses to know what is published.
+
+mod publication;
 
 use std::cell::{Cell, RefCell};
 use std::hash::{BuildHasher, RandomState};
@@ -10,22 +12,27 @@ use schema::ipc::{self, DueRings, Node, Payload, TopicPublisher, Waker};
 use schema::limits::TopicLimits;
 use schema::shortage::{allocate, check_descriptors, check_memory, longest_segment, sensor_bytes};
 use schema::{
-    DEFAULT_DOMAIN, Domain, Environment, Failure, Header, Kind, ListenLock, Maker, Ring, Topic, Wake,
+    DEFAULT_DOMAIN, Domain, Environment, Failure, Kind, ListenLock, Maker, NameLock, Ring, Topic, Wake,
     check_followed, check_sensor, is_remote, publisher,
 };
 
-use crate::clock;
 use crate::subscribe::places;
 
+pub use publication::Publication;
+
 /// Publishes the topic of `name` that carries `P`, in the domain that SCANHUB_DOMAIN names: consumers follow it by
-/// [`subscribe::<P>(name)`](crate::subscribe). There need not be a hub. A name is `OWNER.NAME`, as `tracker.near`: those
-/// without a dot are the hub's.
+/// [`subscribe::<P>(name)`](crate::subscribe) while a hub or a listener is there; publishing needs neither.
 ///
-/// A process that publishes more than one topic, or for more than 32 consumers, opens one [`PublishSession`] for all of them.
+/// Which names are possible depends on the topic. One that no hub makes, such as people or angles of a mount, has a name of
+/// its own, as `mount`: any number of programs publish so, each under another name. A topic that a hub makes is published for
+/// somebody else, as `tracker.near` (`OWNER.NAME`), and one process of a domain does that.
+///
+/// A process that publishes more than one topic, or for more than 32 consumers, opens a [`PublishSession`].
 ///
 /// # Errors
 ///
-/// Those of [`PublishSession::open`], [`PublishSession::sensor`] and [`SensorPublisher::topic`].
+/// Those of [`PublishSession::beside`] or [`PublishSession::open`], of [`PublishSession::sensor`] and
+/// [`SensorPublisher::topic`].
 ///
 /// # Examples
 ///
@@ -42,7 +49,11 @@ use crate::subscribe::places;
 /// }
 /// ```
 pub fn publish<P: Payload + ?Sized>(name: &str) -> Result<Publication<P>, Failure> {
-    PublishSession::open(&own_domain()?, &[P::TOPIC], TopicLimits::default())?.sensor(name)?.topic()
+    let (domain, topics, limits) = (own_domain()?, [P::TOPIC], TopicLimits::default());
+    if P::TOPIC.maker() == Maker::Link {
+        return PublishSession::open(&domain, &topics, limits)?.sensor(name)?.topic();
+    }
+    PublishSession::beside(&domain, name, &topics, limits)?.topic()
 }
 
 /// Returns the first live place of the domain that SCANHUB_DOMAIN names, or that which a hub would take.
@@ -67,7 +78,15 @@ struct Membership {
     sensors: RefCell<Vec<Weak<Awakener>>>,
     node: Node,
     // Behind the node, for whoever takes it next finds no other one.
-    lock: Option<ListenLock>,
+    lock: Place,
+}
+
+/// What says that the process publishes.
+enum Place {
+    /// For others, under names with a dot.
+    Others { _lock: ListenLock },
+    /// Under a name of its own.
+    Own { name: String, _lock: NameLock },
 }
 
 /// Whether there is memory for `topics` of one sensor.
@@ -91,25 +110,39 @@ impl PublishSession {
     /// another user's.
     pub fn open(domain: &Domain, topics: &[Topic], limits: TopicLimits) -> Result<PublishSession, Failure> {
         limits.check()?;
-        let lock = ListenLock::acquire(domain.root())?;
+        let lock = Place::Others { _lock: ListenLock::acquire(domain.root())? };
         check_topics(topics, &limits)?;
-        Ok(PublishSession::with(domain, limits, ipc::hub_node(domain)?, Some(lock)))
+        Ok(PublishSession::with(domain, limits, ipc::hub_node(domain)?, lock))
     }
 
-    /// Publishes beside a hub or a listener that is there, of which it takes no place: for what is made of the topics of a
-    /// domain, such as tracks of people. Its names have no dot, and are none of a hub's sensors. Else as [`open`](Self::open).
+    /// Publishes as `name`, beside a hub or a listener if there is one, of which it takes no place: for what is made of the
+    /// topics of a domain, such as tracks of people, and for what no hub knows. The name has no dot, and no sensor of the hub
+    /// has it. Else as [`open`](Self::open).
     ///
     /// # Errors
     ///
-    /// [`Kind::NoHub`](schema::Kind) if nobody is there; else as [`open`](Self::open), but for
-    /// [`Kind::DomainHeld`](schema::Kind).
-    pub fn beside(domain: &Domain, topics: &[Topic], limits: TopicLimits) -> Result<PublishSession, Failure> {
+    /// [`Kind::DomainHeld`](schema::Kind) if another program publishes as `name`: the message has its number;
+    /// [`Kind::Configuration`](schema::Kind) if the name is not possible or a sensor's; else as [`open`](Self::open) and
+    /// [`sensor`](Self::sensor).
+    pub fn beside(
+        domain: &Domain,
+        name: &str,
+        topics: &[Topic],
+        limits: TopicLimits,
+    ) -> Result<SensorPublisher, Failure> {
         limits.check()?;
+        check_sensor(name)?;
+        let lock = Place::Own { name: name.to_owned(), _lock: NameLock::acquire(domain.root(), name)? };
         check_topics(topics, &limits)?;
-        Ok(PublishSession::with(domain, limits, ipc::client_node(domain)?, None))
+        let of_hub = |(sensor, topic): &(String, Topic)| sensor == name && topic.maker() == Maker::Link;
+        if ipc::published(domain)?.iter().any(of_hub) {
+            let what = format!("{name:?} is no name to publish under: it is a sensor of the hub");
+            return Err(Failure::new(Kind::Configuration, what, "any other name, for example house"));
+        }
+        PublishSession::with(domain, limits, ipc::client_node(domain)?, lock).sensor(name)
     }
 
-    fn with(domain: &Domain, limits: TopicLimits, node: Node, lock: Option<ListenLock>) -> PublishSession {
+    fn with(domain: &Domain, limits: TopicLimits, node: Node, lock: Place) -> PublishSession {
         node.try_cleanup_dead_nodes();
         let boot = RandomState::new().hash_one(std::process::id());
         let (domain, sensors) = (domain.clone(), RefCell::default());
@@ -127,8 +160,7 @@ impl PublishSession {
     }
 
     /// Makes what wakes the consumers of the topics of `name`, which is `OWNER.NAME`: a hub's sensors have no dot, so that
-    /// nobody publishes in the place of another. Who publishes [`beside`](Self::beside) a hub has a name like its sensors, which
-    /// none of them has. A name that is there already is the same one.
+    /// nobody publishes in the place of another. A name that is there already is the same one.
     ///
     /// # Errors
     ///
@@ -136,9 +168,8 @@ impl PublishSession {
     /// descriptors are short; [`Kind::Failed`](schema::Kind) if the place is taken by another user.
     pub fn sensor(&self, name: &str) -> Result<SensorPublisher, Failure> {
         check_followed(name)?;
-        if self.0.lock.is_none() {
-            self.check_beside(name)?;
-        } else if !is_remote(name) {
+        let is_own = matches!(&self.0.lock, Place::Own { name: own, .. } if own == name);
+        if !is_own && !is_remote(name) {
             let what = format!("{name:?} is no name to publish under: it may be a sensor of the hub");
             return Err(Failure::new(Kind::Configuration, what, "OWNER.NAME, for example tracker.near"));
         }
@@ -153,16 +184,6 @@ impl PublishSession {
         let sensor = Rc::new(Awakener { name, waker, due, membership: self.0.clone() });
         sensors.push(Rc::downgrade(&sensor));
         Ok(SensorPublisher(sensor))
-    }
-
-    fn check_beside(&self, name: &str) -> Result<(), Failure> {
-        check_sensor(name)?;
-        let is_link = |(sensor, topic): &(String, Topic)| sensor == name && topic.maker() == Maker::Link;
-        if ipc::published(&self.0.domain)?.iter().any(is_link) {
-            let what = format!("{name:?} is no name to publish under: it is a sensor of the hub");
-            return Err(Failure::new(Kind::Configuration, what, "any other name, for example house"));
-        }
-        Ok(())
     }
 
     /// Removes what consumers that were killed left in the domain. Call it every few seconds.
@@ -205,7 +226,7 @@ impl SensorPublisher {
         let topic = TopicPublisher::new(node, &self.0.name, limits)?;
         // To write into what has no memory behind it would end the process.
         allocate(domain)?;
-        Ok(Publication { topic, sensor: SensorPublisher(self.0.clone()) })
+        Ok(Publication::new(topic, SensorPublisher(self.0.clone())))
     }
 
     /// Returns what the topics of the session are made for.
@@ -230,136 +251,5 @@ impl SensorPublisher {
         let mut due = self.0.due.get();
         due.note(topic, reached);
         self.0.due.set(due);
-    }
-}
-
-/// A topic that is being published.
-pub struct Publication<P: Payload + ?Sized> {
-    // Before what wakes its consumers, and before the session.
-    topic: TopicPublisher<P>,
-    sensor: SensorPublisher,
-}
-
-impl<P: Payload + ?Sized> Publication<P> {
-    /// Returns the header of a sample that is made now: both stamps are this moment, on CLOCK_MONOTONIC, and its number is
-    /// the next one.
-    pub fn header(&self) -> Header {
-        let now_ns = clock::now_ns();
-        let number = self.topic.next_number();
-        Header {
-            seq: number,
-            topic_seq: number,
-            stamp_first_ns: now_ns,
-            stamp_last_ns: now_ns,
-            wall_ns: clock::wall_ns(),
-            boot: self.sensor.0.membership.boot,
-            hub_pid: std::process::id(),
-            ..Header::default()
-        }
-    }
-
-    /// Uses up `count` numbers without a sample: consumers see `count` of them missing.
-    pub fn skip(&mut self, count: u64) {
-        self.topic.skip(count);
-    }
-
-    /// Returns the number that the next sample will have: from 0, as they are sent.
-    pub fn next_number(&self) -> u64 {
-        self.topic.next_number()
-    }
-
-    /// Returns the number of consumers that follow the topic.
-    pub fn subscribers(&self) -> usize {
-        self.topic.subscribers()
-    }
-
-    /// Connects consumers that came since the last sample, and hands them what the topic keeps for late joiners. Of a topic
-    /// that is seldom sent, call it ten times a second.
-    pub fn connect(&self) {
-        // One that cannot be connected now is tried again with the next sample.
-        let _ = self.topic.connect();
-    }
-
-    /// Returns the number of samples that were not sent for lack of memory.
-    pub fn failed(&self) -> u64 {
-        self.topic.failed()
-    }
-}
-
-impl<P: Payload + ?Sized> Publication<P> {
-    /// Sends a sample of `len` bytes that `fill` writes in place, beginning with all of them 0, and wakes the consumers: for
-    /// payloads without a size of their own, such as a scan.
-    ///
-    /// # Errors
-    ///
-    /// As [`send`](Publication::send); also [`Kind::Short`](schema::Kind) if it is longer than the topic was made for.
-    pub fn send_len(&mut self, len: usize, fill: impl FnOnce(&mut P)) -> Result<(), Failure> {
-        let header = self.header();
-        self.send_len_with(&header, len, fill)?;
-        self.sensor.wake(Wake::Telegram)
-    }
-
-    /// Sends as [`send_len`](Self::send_len), with `header` but for the sample's number in the topic, and wakes nobody. Returns
-    /// how many consumers got it.
-    ///
-    /// # Errors
-    ///
-    /// [`Kind::Short`](schema::Kind) if there is no memory for it, or it is longer than the topic was made for: its number is
-    /// used up.
-    pub fn send_len_with(
-        &mut self,
-        header: &Header,
-        len: usize,
-        fill: impl FnOnce(&mut P),
-    ) -> Result<usize, Failure> {
-        self.topic.send_len(header, len, fill).inspect(|&reached| self.sensor.note(P::TOPIC, reached))
-    }
-}
-
-impl<P: Payload> Publication<P> {
-    /// Sends a sample that `fill` writes in place, beginning with the payload's default, and wakes the consumers.
-    ///
-    /// # Errors
-    ///
-    /// [`Kind::Short`](schema::Kind) if there is no memory for it: its number is used up. Else as
-    /// [`SensorPublisher::wake`].
-    pub fn send(&mut self, fill: impl FnOnce(&mut P)) -> Result<(), Failure> {
-        let header = self.header();
-        self.send_with(&header, fill)?;
-        self.sensor.wake(Wake::Telegram)
-    }
-
-    /// Sends as [`send`](Self::send), with `header` but for the sample's number in the topic, and wakes nobody: for samples
-    /// of several topics that are sent together. Returns how many consumers got it.
-    ///
-    /// # Errors
-    ///
-    /// [`Kind::Short`](schema::Kind) if there is no memory for it: its number is used up.
-    pub fn send_with(&mut self, header: &Header, fill: impl FnOnce(&mut P)) -> Result<usize, Failure> {
-        self.topic.send(header, fill).inspect(|&reached| self.sensor.note(P::TOPIC, reached))
-    }
-}
-
-impl Publication<[u8]> {
-    /// Sends `bytes` as a sample and wakes the consumers.
-    ///
-    /// # Errors
-    ///
-    /// As [`send`](Publication::send); also [`Kind::Short`](schema::Kind) for more than
-    /// [`Telegram::MAX`](schema::Telegram::MAX) bytes.
-    pub fn send_bytes(&mut self, bytes: &[u8]) -> Result<(), Failure> {
-        let header = self.header();
-        self.send_bytes_with(&header, bytes)?;
-        self.sensor.wake(Wake::Telegram)
-    }
-
-    /// Sends `bytes` with `header`, as [`send_with`](Publication::send_with).
-    ///
-    /// # Errors
-    ///
-    /// [`Kind::Short`](schema::Kind) if there is no memory for it, or it is longer than
-    /// [`Telegram::MAX`](schema::Telegram::MAX).
-    pub fn send_bytes_with(&mut self, header: &Header, bytes: &[u8]) -> Result<usize, Failure> {
-        self.topic.send_bytes(header, bytes).inspect(|&reached| self.sensor.note(Topic::Telegram, reached))
     }
 }

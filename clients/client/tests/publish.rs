@@ -5,7 +5,9 @@ mod fake;
 use std::time::Duration;
 
 use fake::{FakeHub, Place, until};
-use scanhub_client::{Kind, Marks, PublishSession, Scan, Subscription, Topic, Verdict, Wait, Wake, Zones};
+use scanhub_client::{
+    Event, Kind, Marks, PublishSession, Scan, Subscription, Topic, Tracks, Verdict, Wait, Wake, Zones,
+};
 use schema::ipc::{self, Bell};
 use schema::limits::TopicLimits;
 use schema::{ScanHead, publisher};
@@ -152,6 +154,44 @@ fn one_process_publishes_beside_the_hub_and_no_name_of_its_sensors() {
     assert!(scans.try_next().unwrap().is_none());
     hub.front().scan(&[1000]);
     assert_eq!(scans.next().unwrap().unwrap().beams(), 1);
+}
+
+#[test]
+fn programs_with_names_of_their_own_publish_at_once_with_a_hub_and_without() {
+    let place = Place::new();
+    let beside = |name: &str| {
+        PublishSession::beside(&place.domain, name, &[Topic::Tracks, Topic::Events], TopicLimits::default())
+    };
+    let house = beside("house").unwrap();
+    let mut tracks = house.topic::<Tracks>().unwrap();
+    let mut yard = beside("yard").unwrap().topic::<Event>().unwrap();
+    assert_eq!(publisher(place.domain.root()), Ok(None), "nobody holds the domain");
+    let again = beside("house").map(drop).unwrap_err();
+    assert_eq!(again.kind, Kind::DomainHeld);
+    assert!(again.message.contains("publishes as house"), "{again}");
+    let _listener = PublishSession::open(&place.domain, &[Topic::Marks], TopicLimits::default()).unwrap();
+    let mut hub = FakeHub::new(&place.domain, &["front"], 1);
+    for impossible in ["front", "", "robot", "tracker.near"] {
+        assert_eq!(beside(impossible).map(drop).unwrap_err().kind, Kind::Configuration, "{impossible}");
+    }
+    let mut seen = Subscription::<Tracks>::in_domain(place.places(), "house").unwrap();
+    let mut happened = Subscription::<Event>::in_domain(place.places(), "yard").unwrap();
+    let mut scans = Subscription::<Scan>::in_domain(place.places(), "front").unwrap();
+    assert!(seen.try_next().unwrap().is_none() && happened.try_next().unwrap().is_none());
+    assert!(scans.try_next().unwrap().is_none());
+    tracks.send(|_| {}).unwrap();
+    yard.send(|_| {}).unwrap();
+    hub.front().scan(&[1000]);
+    let mut got = [false; 3];
+    until("all three", || {
+        got[0] |= seen.try_next().unwrap().is_some();
+        got[1] |= happened.try_next().unwrap().is_some();
+        got[2] |= scans.try_next().unwrap().is_some();
+        got == [true; 3]
+    });
+    // A name is free as soon as nobody publishes under it any more.
+    drop((tracks, house));
+    beside("house").unwrap();
 }
 
 #[test]

@@ -48,6 +48,13 @@ impl fmt::Display for TopicName {
     }
 }
 
+/// The position of what publishes as `name` beside a hub: numbers from 128 on are of no link.
+pub(crate) fn position(name: &str) -> u8 {
+    const FIRST: u8 = 128;
+    let sum = name.bytes().fold(0u32, |sum, byte| sum.wrapping_mul(31).wrapping_add(byte.into()));
+    FIRST + (sum % u32::from(u8::MAX - FIRST)) as u8
+}
+
 /// What is `checked` is a word of the command line, which cannot be understood if it is not possible: [`Kind::Usage`].
 pub(crate) fn as_word(checked: Result<(), Failure>) -> Result<(), Failure> {
     checked.map_err(|failure| Failure { kind: Kind::Usage, ..failure })

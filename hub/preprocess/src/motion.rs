@@ -95,6 +95,7 @@ impl MotionEstimator {
         *out = Motion::default();
         self.now.take(&self.pose, scan, lines);
         let Some(track) = self.track else {
+            self.matcher.trust_all();
             let (origin, step) = (Rigid::default(), Rigid::default());
             self.keep(Track { origin, last: origin, unsure: None, step, breaks: 0 });
             return;
@@ -111,6 +112,7 @@ impl MotionEstimator {
                 }
             }
             None => {
+                self.matcher.trust_all();
                 let breaks = track.breaks.saturating_add(1);
                 (out.method, out.breaks) = (MotionMethod::Refused as u8, breaks);
                 self.keep(Track { step: Rigid::default(), breaks, ..track });
@@ -131,6 +133,7 @@ impl MotionEstimator {
 
     /// From now on scans are compared with the one that was looked at.
     fn keep(&mut self, track: Track) {
+        self.now.doubt(self.matcher.doubts());
         std::mem::swap(&mut self.kept, &mut self.now);
         let origin = track.origin.then(&track.last);
         self.track = Some(Track { origin, last: Rigid::default(), unsure: None, ..track });

@@ -9,8 +9,7 @@ use scanhub_client::{Publication, PublishSession, SensorPublisher, clock};
 use schema::limits::TopicLimits;
 use schema::{Domain, Event, Failure, Flags, Header, Maker, Tracks, Wake};
 
-/// Numbers of positions from here on are of no link.
-const FIRST_POSITION: u8 = 128;
+use crate::names::position;
 
 /// Pictures as samples.
 pub(super) struct Samples {
@@ -37,10 +36,9 @@ struct Topics {
 }
 
 impl Samples {
-    /// Of a tracker called `name`. It has a position like a link, which no link has.
+    /// Of a tracker called `name`.
     pub(super) fn new(name: &str) -> Samples {
-        let sum = name.bytes().fold(0u32, |sum, byte| sum.wrapping_mul(31).wrapping_add(byte.into()));
-        let sensor = FIRST_POSITION + (sum % u32::from(u8::MAX - FIRST_POSITION)) as u8;
+        let sensor = position(name);
         let boot = RandomState::new().hash_one(std::process::id());
         let period_us = (PICTURE_NS / 1000) as u32;
         let header = Header { boot, sensor, period_us, hub_pid: std::process::id(), ..Header::default() };
@@ -52,9 +50,8 @@ impl Samples {
     /// [`Kind::NoHub`](schema::Kind) if none does, [`Kind::Configuration`](schema::Kind) if the name is not possible, [`Kind::DomainHeld`](schema::Kind) if another tracker
     /// has it, [`Kind::Short`](schema::Kind) if memory or descriptors are short.
     pub(super) fn publish(&mut self, name: &str, places: &[Domain]) -> Result<(), Failure> {
-        let session =
-            PublishSession::beside(&find(places)?, Maker::Tracker.topics(), TopicLimits::default())?;
-        let sensor = session.sensor(name)?;
+        let (topics, limits) = (Maker::Tracker.topics(), TopicLimits::default());
+        let sensor = PublishSession::beside(&find(places)?, name, topics, limits)?;
         self.topics = Some(Topics { tracks: sensor.topic()?, events: sensor.topic()?, sensor });
         Ok(())
     }

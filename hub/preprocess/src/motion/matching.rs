@@ -26,8 +26,8 @@ pub(super) struct Match {
 
 /// Lays scans onto others.
 pub(super) struct Matcher {
-    /// The readings that are of something that moves.
-    moves: Box<[bool]>,
+    /// For each reading: 0 if it is of something that stands, else how long what it shows is not to be trusted.
+    doubts: Box<[u8]>,
     runs: Box<[Run]>,
 }
 
@@ -35,7 +35,14 @@ pub(super) struct Matcher {
 #[derive(Clone, Copy, Default)]
 struct Run {
     first: u16,
-    /// Those of its readings that are near a surface.
+    /// Its readings.
+    all: u16,
+    /// Those that are where nothing was before.
+    come: u16,
+    /// Those that lie on what was not trusted before, and how long that is not.
+    doubted: u16,
+    doubt: u8,
+    /// Those that are near a surface.
     beams: u16,
     /// Of squares of what they are off, in variances of their noise.
     off: f64,
@@ -71,23 +78,22 @@ struct Known {
 impl Matcher {
     /// For so many beams at most.
     pub(super) fn new(beams: usize) -> Matcher {
-        Matcher { moves: vec![false; beams].into(), runs: vec![Run::default(); beams].into() }
+        Matcher { doubts: vec![0; beams].into(), runs: vec![Run::default(); beams].into() }
     }
 
     /// How `now` lies on `kept`, near `begin`; nothing if too few beams say so. Where the surroundings say nothing, the place
     /// is that of `begin`, and unsure by `unknown_m`.
     pub(super) fn find(&mut self, kept: &View, now: &View, begin: Rigid, unknown_m: f64) -> Option<Match> {
-        let beams = now.points().len();
-        self.moves[..beams].fill(false);
+        self.trust_all();
         let pair = Pair { kept, now, scale: scale(now)?, finest: WIDTH * kept.noise.hypot(now.noise) };
-        let mut place = pair.settle(begin, FIRST_M, &self.moves);
+        let mut place = pair.settle(begin, FIRST_M, &self.doubts);
         for _ in 0..LOOKS {
             if !self.leave_out(&pair, &place) {
                 break;
             }
-            place = pair.settle(place, 0.0, &self.moves);
+            place = pair.settle(place, 0.0, &self.doubts);
         }
-        let sums = pair.sums(&place, pair.finest, 1, &self.moves);
+        let sums = pair.sums(&place, pair.finest, 1, &self.doubts);
         if sums.beams < LEAST_BEAMS {
             return None;
         }
@@ -107,8 +113,19 @@ impl Matcher {
         (is_finite && place.x.is_finite() && place.y.is_finite() && place.yaw.is_finite()).then_some(found)
     }
 
-    /// Leaves out what moves: neighbouring readings that are off by more than their noise together, though none need be alone.
-    /// Whether there were others than before.
+    /// For each reading of the scan that was laid last: 0 if it is of something that stands, else for how many kept scans
+    /// what it shows is not to be trusted.
+    pub(super) fn doubts(&self) -> &[u8] {
+        &self.doubts
+    }
+
+    /// Nothing is known to move.
+    pub(super) fn trust_all(&mut self) {
+        self.doubts.fill(0);
+    }
+
+    /// Leaves out what moves: neighbouring readings that are off by more than their noise together, though none need be alone;
+    /// most of which are where nothing was; or which are of what moved before. Whether there were others than before.
     fn leave_out(&mut self, pair: &Pair<'_>, place: &Rigid) -> bool {
         let width = 2.0 * pair.finest;
         let beams = pair.now.points().len();
@@ -118,12 +135,18 @@ impl Matcher {
                 self.runs[runs] = Run { first: i as u16, ..Run::default() };
                 runs += 1;
             }
-            let Some(on) = pair.on(i, place, width) else { continue };
             let run = &mut self.runs[runs - 1];
+            run.all += 1;
+            let point = place.point(pair.now.points()[i]);
+            run.come += u16::from(pair.kept.sees_through(point, width));
+            let doubt = pair.kept.nearest(point, width).map_or(0, |at| pair.kept.readings()[at].doubt);
+            run.doubted += u16::from(doubt > 0);
+            run.doubt = run.doubt.max(doubt);
+            let Some(on) = pair.on(i, place, width) else { continue };
             let square = on.off * on.off;
             run.off += square / on.variance();
             run.beams += 1;
-            if !self.moves[i] && on.off.abs() < pair.finest {
+            if self.doubts[i] == 0 && on.off.abs() < pair.finest {
                 (off, expected) = (off + square, expected + on.variance());
             }
         }
@@ -131,13 +154,18 @@ impl Matcher {
         let mut is_new = false;
         for at in 0..runs {
             let end = if at + 1 < runs { self.runs[at + 1].first.into() } else { beams };
-            let Run { first, beams, off } = self.runs[at];
+            let run = self.runs[at];
             // The sum of squares has twice as much variance as beams.
-            let n = f64::from(beams);
-            let moves = off > level * (MORE * n + 4.0 * (2.0 * n).sqrt());
-            for was in &mut self.moves[first.into()..end] {
-                is_new |= *was != moves;
-                *was = moves;
+            let n = f64::from(run.beams);
+            let is_off = run.off > level * (MORE * n + 4.0 * (2.0 * n).sqrt());
+            let doubt = match is_off || 2 * run.come > run.all {
+                true => DOUBT,
+                false if 2 * run.doubted > run.all => run.doubt - 1,
+                false => 0,
+            };
+            for was in &mut self.doubts[run.first.into()..end] {
+                is_new |= (*was > 0) != (doubt > 0);
+                *was = doubt;
             }
         }
         is_new
@@ -159,6 +187,8 @@ struct On {
     point: (f64, f64),
     surface: Surface,
     off: f64,
+    /// The surface is of what moves.
+    is_doubted: bool,
     /// Of `off`, by the noise of the scan and by that of the kept one.
     by_now: f64,
     by_kept: f64,
@@ -172,13 +202,13 @@ impl On {
 
 impl Pair<'_> {
     /// Where `now` lies, if it begins near `place` and beams may be off by `width` at first.
-    fn settle(&self, mut place: Rigid, width: f64, moves: &[bool]) -> Rigid {
+    fn settle(&self, mut place: Rigid, width: f64, doubts: &[u8]) -> Rigid {
         let mut width = width.max(self.finest);
         let coarse = self.now.points().len().div_ceil(COARSE);
         for _ in 0..ROUNDS {
             let is_last = width <= self.finest;
             let stride = if is_last { 1 } else { coarse };
-            let sums = self.sums(&place, width, stride, moves);
+            let sums = self.sums(&place, width, stride, doubts);
             let step = Known::of(&sums, stride).solve(&sums.slope);
             let turn = step[2] / self.scale;
             place = Rigid::new(step[0], step[1], turn).then(&place);
@@ -213,16 +243,17 @@ impl Pair<'_> {
             point,
             surface,
             off,
+            is_doubted: on.doubt > 0,
             by_now: by_now.max(least),
             by_kept: by_kept.max(least),
         })
     }
 
     /// Of each `stride`th beam at `place`, if it is off by less than `width` and of nothing that moves.
-    fn sums(&self, place: &Rigid, width: f64, stride: usize, moves: &[bool]) -> Sums {
+    fn sums(&self, place: &Rigid, width: f64, stride: usize, doubts: &[u8]) -> Sums {
         let mut sums = Sums::default();
-        for i in (0..self.now.points().len()).step_by(stride.max(1)).filter(|&i| !moves[i]) {
-            let Some(on) = self.on(i, place, width) else { continue };
+        for i in (0..self.now.points().len()).step_by(stride.max(1)).filter(|&i| doubts[i] == 0) {
+            let Some(on) = self.on(i, place, width).filter(|on| !on.is_doubted) else { continue };
             let (share, off) = (on.off / width, on.off);
             // Tukey's.
             let weight = (1.0 - share * share) * (1.0 - share * share);
@@ -355,6 +386,8 @@ const LEAST_PART: f64 = 0.03;
 const LOOKS: usize = 2;
 /// What does not move is off by at most so many times what its noise says, in the mean of squares.
 const MORE: f64 = 3.0;
+/// For so many kept scans what was seen to move is not trusted.
+const DOUBT: u8 = 3;
 /// Of the variance of a range.
 const LEAST_SHARE: f64 = 0.05;
 /// Twice what is to be expected: of a sum of many.

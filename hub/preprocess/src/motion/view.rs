@@ -31,6 +31,8 @@ pub(super) struct Reading {
     /// Metres from the sensor.
     pub(super) range: f64,
     pub(super) surface: Option<Surface>,
+    /// What it shows was seen to move; so many kept scans later it is trusted again. 0: it stands.
+    pub(super) doubt: u8,
 }
 
 /// A plane: x nx + y ny = r.
@@ -83,7 +85,7 @@ impl View {
             let exact = exact.get(i).filter(|exact| exact.is_finite());
             let direction = exact.map_or(self.directions[i], |&exact| pose.direction(exact.into()));
             self.points[self.count] = (pose.x_m + range * direction.0, pose.y_m + range * direction.1);
-            self.readings[self.count] = Reading { beam: i as u16, direction, range, surface: None };
+            self.readings[self.count] = Reading { beam: i as u16, direction, range, surface: None, doubt: 0 };
             self.count += 1;
         }
         self.lay_on_lines();
@@ -164,25 +166,56 @@ impl View {
         &self.points[..self.count]
     }
 
-    /// The reading whose point is nearest to `point`, if it is nearer than `most`. Behind a beam that looks past `point` by an
-    /// angle there is nothing nearer than the sine of that angle says, so that few are looked at.
-    pub(super) fn nearest(&self, point: (f64, f64), most: f64) -> Option<usize> {
-        let (first, step, beams) = self.grid;
-        if self.count == 0 {
-            return None;
+    /// Keeps for each reading how long what it shows is not trusted.
+    pub(super) fn doubt(&mut self, doubts: &[u8]) {
+        for (reading, doubt) in self.readings[..self.count].iter_mut().zip(doubts) {
+            reading.doubt = *doubt;
         }
+    }
+
+    /// Whether the beams to both sides of `point` end more than `margin` behind it: nothing was there.
+    pub(super) fn sees_through(&self, point: (f64, f64), margin: f64) -> bool {
+        let Some((distance, at)) = self.towards(point) else { return false };
+        let last = self.grid.2 as f64 - 1.0;
+        if at < 1.0 || at > last - 1.0 {
+            return false;
+        }
+        let first = at as usize - 1;
+        // One more on each side: next to an edge, exact angles may be a step off.
+        (first..(first + 4).min(self.grid.2)).all(|beam| {
+            let reading = self.readings().get(usize::from(self.slots[beam]));
+            reading.is_some_and(|one| usize::from(one.beam) == beam && one.range > distance + margin)
+        })
+    }
+
+    /// How far `point` is from the sensor, and how many steps behind the first beam it lies, which may be less than none or
+    /// more than there are.
+    fn towards(&self, point: (f64, f64)) -> Option<(f64, f64)> {
+        let (first, step, beams) = self.grid;
         let (x, y) = (point.0 - self.pose.x_m, point.1 - self.pose.y_m);
-        let distance = x.hypot(y);
         let turned = y.atan2(x) - self.pose.yaw_rad;
         let angle = if self.pose.upside_down == 0 { turned } else { -turned };
         let turn = TAU / step.abs();
         let behind = ((angle - first) * step.signum()).rem_euclid(TAU) / step.abs();
-        let is_whole = beams as f64 + 1.5 >= turn;
-        let last = beams as f64 - 1.0;
-        let at = if !is_whole && behind > (last + turn) / 2.0 { behind - turn } else { behind };
-        if !at.is_finite() {
+        let is_before = !self.is_whole() && behind > (beams as f64 - 1.0 + turn) / 2.0;
+        let at = if is_before { behind - turn } else { behind };
+        at.is_finite().then_some((x.hypot(y), at))
+    }
+
+    /// The last beam is the first one's neighbour.
+    fn is_whole(&self) -> bool {
+        self.grid.2 as f64 + 1.5 >= TAU / self.grid.1.abs()
+    }
+
+    /// The reading whose point is nearest to `point`, if it is nearer than `most`. Behind a beam that looks past `point` by an
+    /// angle there is nothing nearer than the sine of that angle says, so that few are looked at.
+    pub(super) fn nearest(&self, point: (f64, f64), most: f64) -> Option<usize> {
+        let (_, step, beams) = self.grid;
+        if self.count == 0 {
             return None;
         }
+        let (distance, at) = self.towards(point)?;
+        let (turn, last) = (TAU / step.abs(), beams as f64 - 1.0);
         let begin = usize::from(self.slots[at.clamp(0.0, last) as usize]);
         let mut best = (most * most, None);
         // The least distance from a beam so many steps aside, by sin a >= 2 a / pi; exact angles are up to a step off.
@@ -202,8 +235,7 @@ impl View {
         };
         let up = (begin..self.count).all(|i| look(i, at));
         let down = (0..begin).rev().all(|i| look(i, at));
-        if is_whole {
-            // The last beam is the first one's neighbour.
+        if self.is_whole() {
             if up {
                 let _ = (0..begin).all(|i| look(i, at - turn));
             }
