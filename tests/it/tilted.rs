@@ -27,10 +27,10 @@ const POINTS: u16 = 401;
 
 impl Made {
     fn beside(env: &TestEnv) -> Made {
-        let name = |name, maker: Maker| {
+        let beside = |name: &str, maker: Maker| {
             PublishSession::beside(&env.place(), name, maker.topics(), TopicLimits::default()).unwrap()
         };
-        let (mount, room) = (name("mount", Maker::Mount), name("room", Maker::Tilted));
+        let (mount, room) = (beside("mount", Maker::Mount), beside("room", Maker::Tilted));
         let (cloud, obstacles) = (room.topic().unwrap(), room.topic().unwrap());
         Made { tilt: mount.topic().unwrap(), cloud, obstacles, mount, room, rounds: 0 }
     }
