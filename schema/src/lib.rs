@@ -24,6 +24,7 @@ mod printable;
 mod scan;
 mod sliced;
 mod status;
+mod sweep;
 mod telegram;
 mod text;
 mod tilt;
@@ -72,6 +73,7 @@ pub use scan::{
     in_degrees, in_sector_mdeg,
 };
 pub use status::{COUNTERS, Counter, Counters, State, Status};
+pub use sweep::SweepPoints;
 pub use telegram::Telegram;
 pub use tilt::Tilt;
 pub use topic::{

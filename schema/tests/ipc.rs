@@ -120,7 +120,7 @@ fn limits_are_those_of_the_contract() {
     let config = waker.service().static_config();
     assert_eq!((config.max_listeners(), config.max_nodes(), config.event_id_max_value()), (250, 260, 7));
     assert_eq!(limits::samples(Topic::Scan, 32), 64 + 128 + 2);
-    assert_eq!(Topic::ALL.map(limits::buffer), [64, 64, 16, 16, 16, 4, 4, 16, 16, 16, 16, 64]);
+    assert_eq!(Topic::ALL.map(limits::buffer), [64, 64, 16, 16, 16, 4, 4, 16, 16, 16, 16, 64, 64, 128, 16]);
     for consumers in [0, 251] {
         assert_eq!(TopicLimits { consumers, ..LIMITS }.check().unwrap_err().kind, Kind::Configuration);
     }

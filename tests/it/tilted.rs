@@ -27,9 +27,10 @@ const POINTS: u16 = 401;
 
 impl Made {
     fn beside(env: &TestEnv) -> Made {
-        let topics = [Maker::Mount.topics(), Maker::Tilted.topics()].concat();
-        let session = PublishSession::beside(&env.place(), &topics, TopicLimits::default()).unwrap();
-        let (mount, room) = (session.sensor("mount").unwrap(), session.sensor("room").unwrap());
+        let beside = |name: &str, maker: Maker| {
+            PublishSession::beside(&env.place(), name, maker.topics(), TopicLimits::default()).unwrap()
+        };
+        let (mount, room) = (beside("mount", Maker::Mount), beside("room", Maker::Tilted));
         let (cloud, obstacles) = (room.topic().unwrap(), room.topic().unwrap());
         Made { tilt: mount.topic().unwrap(), cloud, obstacles, mount, room, rounds: 0 }
     }
@@ -177,6 +178,7 @@ fn another_machine_says_the_same() {
         let _hub = hub(&env);
         let mut made = Made::beside(&env);
         let mut listen = there.start(&["listen", "--json", "--publish"]).ready();
+        let lines = there.start(&["listen", "--json"]).ready();
         let mut echo = env.echo(&TOPICS);
         let flags = CLASSES.map(|topic| format!("--topic=*/{topic}"));
         let flags: Vec<&str> = flags.iter().map(String::as_str).chain(["--interface=lo"]).collect();
@@ -200,13 +202,13 @@ fn another_machine_says_the_same() {
         });
         let mut again = there.echo(&names.each_ref().map(String::as_str));
         made.until_heard(&mut [&mut echo, &mut again]);
-        let [echo, again, listen] = [echo, again, listen].map(|program| program.end(INT));
+        let [echo, again, lines] = [echo, again, lines].map(|program| program.end(INT));
         let keys = ["sweep", "generation", "first", "last", "complete", "points", "beams", "classes"];
-        for other in [&listen, &again] {
+        for other in [&lines, &again] {
             assert!(same(&echo, other, "cloud", &keys) >= 2);
             assert!(same(&echo, other, "tilt", &["angle_deg", "rate_deg_s"]) >= 1);
             assert!(same(&echo, other, "obstacles", &["sweep", "complete", "obstacles", "left_out"]) >= 1);
         }
-        assert!(listen.of_class("cloud").iter().all(|line| line["sensor"] == "room"));
+        assert!(lines.of_class("cloud").iter().all(|line| line["sensor"] == "room"));
     });
 }

@@ -69,7 +69,9 @@ pub(crate) fn run(
 ) -> Result<(), End> {
     let (mut out, mut notes) = (stdout(), stderr());
     let (mut out, mut notes) = (Output::new(&mut out), Output::new(&mut notes));
-    let selection = Selection::parse(&options.topics, false)?;
+    let all = ["*/*".to_owned()];
+    let topics = if options.topics.is_empty() { &all[..] } else { &options.topics };
+    let selection = Selection::parse(topics, false)?;
     let graph = Graph::new(options.names.clone(), selection.names(Topic::Status));
     let mut waiting = Waiting(Arc::new(Shared { graph: Mutex::new(graph), bell: Condvar::new() }));
     let mut forwarder = Forwarder::new(selection, &options.places, &mut waiting);

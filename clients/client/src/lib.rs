@@ -60,8 +60,8 @@ pub use schema::{
     Age, BEAMS, Background, Cloud, CloudHead, CloudPoint, Code, Corner, Counter, Counters, DEFAULT_DOMAIN,
     Domain, Early, Environment, Event, EventKind, Failure, Flags, Foreground, Header, Kind, LINES, Line,
     Lines, MARKS, Mark, Marks, Motion, MotionMethod, OBSTACLES, Obstacle, Obstacles, PointClass, Pose,
-    Quality, ROBOT, Reasons, Request, SEGMENTS, Scan, Segment, Shown, State, Status, TRACKS, Telegram, Tilt,
-    Topic, Track, TrackState, Tracks, Verb, Verdict, Wake, ZONES, Zone, Zones, ipc::Payload,
+    Quality, ROBOT, Reasons, Request, SEGMENTS, Scan, Segment, Shown, State, Status, SweepPoints, TRACKS,
+    Telegram, Tilt, Topic, Track, TrackState, Tracks, Verb, Verdict, Wake, ZONES, Zone, Zones, ipc::Payload,
 };
 
 #[cfg(doctest)]

@@ -21,7 +21,7 @@ pub use laser_scan::laser_scan;
 pub use layout::{Value, read};
 pub use markers::{mark_markers, zone_markers};
 pub use names::{BASE_FRAME, DIAGNOSTICS, Names, TF_STATIC, frame, scan_topic};
-pub use point_cloud::foreground_cloud;
+pub use point_cloud::{foreground_cloud, sweep_cloud};
 pub use state::{diagnosis, hub_diagnosis, verdict_word};
 pub use transforms::static_transforms;
 pub use types::{DIAGNOSTIC_ARRAY, LASER_SCAN, MARKER_ARRAY, POINT_CLOUD, STRING, TF_MESSAGE, Type};

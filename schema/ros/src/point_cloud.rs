@@ -1,7 +1,11 @@
-//! The foreground of a scan as `sensor_msgs/msg/PointCloud2`. Refuses to know the background.
+//! Points as `sensor_msgs/msg/PointCloud2`: the foreground of a scan, and a sweep in three dimensions. Refuses to know the
+//! background.
 
-use schema::{Foreground, Header, Scan};
+use std::mem::offset_of;
 
+use schema::{CloudPoint, Foreground, Header, Scan};
+
+use crate::BASE_FRAME;
 use crate::cdr::Cdr;
 use crate::laser_scan::stamp_ns;
 
@@ -20,21 +24,7 @@ pub fn foreground_cloud(
         foreground.readings().filter(is_point)
     };
     let width = points().count();
-    let mut cdr = Cdr::begin(message);
-    cdr.header(stamp_ns(header, scan), frame);
-    cdr.u32(1);
-    cdr.u32(width as u32);
-    cdr.u32(AXES.len() as u32);
-    for (place, axis) in AXES.into_iter().enumerate() {
-        cdr.text(axis);
-        cdr.u32(4 * place as u32);
-        cdr.u8(FLOAT32);
-        cdr.u32(1);
-    }
-    cdr.bool(false);
-    cdr.u32(POINT);
-    cdr.u32(POINT * width as u32);
-    cdr.u32(POINT * width as u32);
+    let mut cdr = begin(message, stamp_ns(header, scan), frame, &AXES, (POINT, width));
     for (i, range) in points() {
         let metres = f64::from(range) * f64::from(foreground.unit_um) / 1e6;
         let (sin, cos) = scan.angle(i).sin_cos();
@@ -46,11 +36,61 @@ pub fn foreground_cloud(
     cdr.bool(true);
 }
 
-const AXES: [&str; 3] = ["x", "y", "z"];
-/// Bytes of a point.
+/// Writes the `points` of a sweep, of the robot's frame, to the end of `message`: x, y, z (metres, 32-bit floats), beam (its
+/// number in the scan, 16 bits) and class (8 bits: 0 unknown, 1 background, 2 foreground, 3 behind it), stamped as `header` is,
+/// which is that of the last of them.
+pub fn sweep_cloud(message: &mut Vec<u8>, header: &Header, points: &[CloudPoint]) {
+    let point = size_of::<CloudPoint>() as u32;
+    let mut cdr = begin(message, header.wall_ns, BASE_FRAME, &OF_SWEEPS, (point, points.len()));
+    for CloudPoint { at, beam, point_class, .. } in points {
+        cdr.bytes(at.map(f32::to_le_bytes).as_flattened());
+        cdr.bytes(&beam.to_le_bytes());
+        cdr.bytes(&[*point_class, 0]);
+    }
+    cdr.bool(true);
+}
+
+/// Writes all that stands before the points: of each a name, offset and type of its fields, and its bytes.
+fn begin<'a>(
+    message: &'a mut Vec<u8>,
+    stamp_ns: u64,
+    frame: &str,
+    fields: &[(&str, u32, u8)],
+    (point, count): (u32, usize),
+) -> Cdr<'a> {
+    let len = point * count as u32;
+    let mut cdr = Cdr::begin(message);
+    cdr.header(stamp_ns, frame);
+    cdr.u32(1);
+    cdr.u32(count as u32);
+    cdr.u32(fields.len() as u32);
+    for &(name, offset, kind) in fields {
+        cdr.text(name);
+        cdr.u32(offset);
+        cdr.u8(kind);
+        cdr.u32(1);
+    }
+    cdr.bool(false);
+    cdr.u32(point);
+    cdr.u32(len);
+    cdr.u32(len);
+    cdr
+}
+
+const AXES: [(&str, u32, u8); 3] = [("x", 0, FLOAT32), ("y", 4, FLOAT32), ("z", 8, FLOAT32)];
+/// Bytes of a point of a foreground.
 const POINT: u32 = 12;
-/// `PointField.FLOAT32`.
+const OF_SWEEPS: [(&str, u32, u8); 5] = [
+    AXES[0],
+    AXES[1],
+    AXES[2],
+    ("beam", offset_of!(CloudPoint, beam) as u32, UINT16),
+    ("class", offset_of!(CloudPoint, point_class) as u32, UINT8),
+];
+/// `PointField.FLOAT32` and others.
 const FLOAT32: u8 = 7;
+const UINT16: u8 = 4;
+const UINT8: u8 = 2;
 
 #[cfg(test)]
 mod tests {
@@ -96,5 +136,29 @@ mod tests {
         let nanoseconds =
             1e9 * told.number("header.stamp.sec").unwrap() + told.number("header.stamp.nanosec").unwrap();
         assert_eq!(nanoseconds, (7_000_000_000 + scan.beam_ns(0)) as f64);
+    }
+
+    #[test]
+    fn a_sweep_has_its_points_with_beams_and_classes() {
+        let point = CloudPoint { at: [1.5, -2.0, 0.25], beam: 300, point_class: 2, reserved: 0 };
+        let header = Header { wall_ns: 7_000_000_009, ..Header::default() };
+        let mut message = Vec::new();
+        sweep_cloud(&mut message, &header, &[CloudPoint::default(), point]);
+        let told = read(&POINT_CLOUD, &message).unwrap();
+        assert_eq!((told.number("width"), told.number("row_step")), (Some(2.0), Some(32.0)));
+        assert_eq!(
+            (told.text("header.frame_id"), told.number("point_step")),
+            (Some("base_link"), Some(16.0))
+        );
+        assert_eq!(told.number("header.stamp.nanosec"), Some(9.0));
+        let fields = [("x", 0, 7), ("y", 4, 7), ("z", 8, 7), ("beam", 12, 4), ("class", 14, 2)];
+        for (i, (name, offset, kind)) in fields.into_iter().enumerate() {
+            assert_eq!(told.text(&format!("fields.{i}.name")), Some(name));
+            assert_eq!(told.number(&format!("fields.{i}.offset")), Some(offset.into()));
+            assert_eq!(told.number(&format!("fields.{i}.datatype")), Some(kind.into()));
+        }
+        let data: Vec<u8> = (16..32).map(|i| told.number(&format!("data.{i}")).unwrap() as u8).collect();
+        assert_eq!(data, [0, 0, 0xC0, 0x3F, 0, 0, 0, 0xC0, 0, 0, 0x80, 0x3E, 44, 1, 2, 0]);
+        assert_eq!(told.number("is_dense"), Some(1.0));
     }
 }

@@ -9,7 +9,7 @@ use lan::Stamp;
 use lan::outgoing::{PayloadRef, Sample};
 use ros::zenoh_wire::Qos;
 use ros::{DIAGNOSTICS, Names, TF_STATIC, Type};
-use schema::{Foreground, Header, Pose, Scan, Status, Topic};
+use schema::{Cloud, Foreground, Header, Pose, Scan, Status, SweepPoints, Topic};
 
 /// The graph of one hub.
 #[derive(Debug)]
@@ -76,6 +76,8 @@ struct Sensor {
     scans: VecDeque<(u64, Box<Scan>)>,
     /// A foreground that came before its scan.
     early: Option<(Header, Box<Foreground>)>,
+    /// Of a name that has clouds.
+    sweep: SweepPoints,
     /// Wall clock of the last scan, and of the last status; when a status was told of last.
     scanned_ns: Option<u64>,
     heard_ns: Option<u64>,
@@ -90,6 +92,7 @@ struct Slots {
     marks: Option<usize>,
     zones: Option<usize>,
     verdict: Option<usize>,
+    cloud: Option<usize>,
     diagnosis: Option<usize>,
 }
 
@@ -138,6 +141,7 @@ impl Graph {
             marks: slot(Topic::Marks, "marks", ros::MARKER_ARRAY),
             zones: slot(Topic::Zones, "zones", ros::MARKER_ARRAY),
             verdict: slot(Topic::Zones, "verdict", ros::STRING),
+            cloud: slot(Topic::Cloud, "cloud", ros::POINT_CLOUD),
             diagnosis: None,
         };
         if every[Topic::Status as usize].is_some() {
@@ -149,6 +153,7 @@ impl Graph {
             slots,
             scans: VecDeque::new(),
             early: None,
+            sweep: SweepPoints::default(),
             scanned_ns: None,
             heard_ns: None,
             told_ns: 0,
@@ -162,7 +167,7 @@ impl Graph {
         match topic {
             Topic::Scan => goes_out(topic) || goes_out(Topic::Foreground),
             Topic::Status => true,
-            Topic::Foreground | Topic::Marks | Topic::Zones => goes_out(topic),
+            Topic::Foreground | Topic::Marks | Topic::Zones | Topic::Cloud => goes_out(topic),
             _ => false,
         }
     }
@@ -177,8 +182,10 @@ impl Graph {
             }
             return;
         };
-        if let PayloadRef::Status(status) = sample.payload {
-            return self.status(sensor, header, status, now);
+        match sample.payload {
+            PayloadRef::Status(status) => return self.status(sensor, header, status, now),
+            PayloadRef::Cloud(cloud) => return self.cloud(sensor, header, cloud, now),
+            _ => {}
         }
         let known = &self.sensors[sensor];
         let topic = sample.payload.topic();
@@ -314,6 +321,16 @@ impl Graph {
         let (_, scan) = scans.index(place);
         self.write(slot, now, |message| ros::foreground_cloud(message, &frame, header, scan, foreground));
         self.sensors[sensor].scans = scans;
+    }
+
+    /// A message of a whole sweep, with the last of its samples.
+    fn cloud(&mut self, sensor: usize, header: &Header, cloud: &Cloud, now: Stamp) {
+        let known = &mut self.sensors[sensor];
+        let (slot, mut sweep) = (known.slots.cloud, std::mem::take(&mut known.sweep));
+        if let Some(points) = sweep.take(header, cloud) {
+            self.write(slot, now, |message| ros::sweep_cloud(message, header, points));
+        }
+        self.sensors[sensor].sweep = sweep;
     }
 
     /// A new place for messages of how something is.

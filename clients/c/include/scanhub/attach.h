@@ -303,15 +303,15 @@ struct scanhub_cloud_v2 {
 };
 
 /* What a point is beside the background. */
-#define SCANHUB_POINT_UNKNOWN 0    /* not known yet, and so is every number that is not here */
-#define SCANHUB_POINT_BACKGROUND 1 /* where something stands always */
-#define SCANHUB_POINT_FOREGROUND 2 /* nearer than that */
-#define SCANHUB_POINT_BEHIND 3     /* farther away */
+#define SCANHUB_CLASS_UNKNOWN 0    /* not known yet, and so is every number that is not here */
+#define SCANHUB_CLASS_BACKGROUND 1 /* where something stands always */
+#define SCANHUB_CLASS_FOREGROUND 2 /* nearer than that */
+#define SCANHUB_CLASS_BEHIND 3     /* farther away */
 
 struct scanhub_cloud_point_v2 {
     float at[3];         /* metres ahead, to the left, above the floor */
     uint16_t beam;       /* its number in the scan */
-    uint8_t point_class; /* SCANHUB_POINT_.. */
+    uint8_t point_class; /* SCANHUB_CLASS_.. */
     uint8_t reserved;
 };
 

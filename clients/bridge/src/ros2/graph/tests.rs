@@ -1,7 +1,7 @@
 //! Messages of a hub, without one.
 
 use ros::{Value, read};
-use schema::{ForegroundHead, Marks, ScanHead, State, Verdict, Zones};
+use schema::{CloudHead, CloudPoint, ForegroundHead, Marks, ScanHead, State, Verdict, Zones};
 
 use super::*;
 
@@ -67,6 +67,7 @@ fn each_topic_of_the_hub_becomes_topics_of_the_graph() {
             ("/front/marks", best),
             ("/front/zones", best),
             ("/front/verdict", best),
+            ("/front/cloud", best),
             ("/diagnostics", Qos::Reliable(10)),
         ]
     );
@@ -241,4 +242,23 @@ fn of_sensors_without_a_hub_it_is_said_as_soon() {
     let told = handed(&mut graph);
     let said = told.last().map(|(_, value)| (value.text("status.0.name"), value.number("status.0.level")));
     assert_eq!(said, Some((Some("scanhub: front"), Some(3.0))), "{told:?}");
+}
+
+#[test]
+fn a_sweep_is_one_cloud() {
+    let mut graph = graph(|topic| (topic == Topic::Cloud).then_some(1));
+    assert_eq!(graph.topics().len(), 1);
+    assert!(graph.wants(0, Topic::Cloud) && !graph.wants(0, Topic::Scan));
+    for (topic_seq, flags) in [(4, Cloud::LAST), (5, Cloud::FIRST), (6, 0), (7, Cloud::LAST)] {
+        let cloud = Cloud::of(CloudHead { flags, ..CloudHead::default() }, &[CloudPoint::default(); 3]);
+        let header = Header { topic_seq, ..header(topic_seq) };
+        graph.sample(0, &sample(&header, PayloadRef::Cloud(&cloud)), at(0));
+    }
+    let told = handed(&mut graph);
+    assert_eq!(names(&told), ["/front/cloud"]);
+    assert_eq!(
+        (told[0].1.number("width"), told[0].1.text("header.frame_id")),
+        (Some(9.0), Some("base_link"))
+    );
+    assert_eq!(told[0].1.number("header.stamp.nanosec"), Some(7.0));
 }
