@@ -27,9 +27,10 @@ const POINTS: u16 = 401;
 
 impl Made {
     fn beside(env: &TestEnv) -> Made {
-        let topics = [Maker::Mount.topics(), Maker::Tilted.topics()].concat();
-        let session = PublishSession::beside(&env.place(), &topics, TopicLimits::default()).unwrap();
-        let (mount, room) = (session.sensor("mount").unwrap(), session.sensor("room").unwrap());
+        let beside = |name: &str, maker: Maker| {
+            PublishSession::beside(&env.place(), name, maker.topics(), TopicLimits::default()).unwrap()
+        };
+        let (mount, room) = (beside("mount", Maker::Mount), beside("room", Maker::Tilted));
         let (cloud, obstacles) = (room.topic().unwrap(), room.topic().unwrap());
         Made { tilt: mount.topic().unwrap(), cloud, obstacles, mount, room, rounds: 0 }
     }
