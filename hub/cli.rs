@@ -21,6 +21,7 @@ pub(crate) mod replay;
 pub(crate) mod simulate;
 mod site;
 mod telegram;
+mod tilt;
 mod track;
 pub(crate) mod watch;
 mod web;
@@ -31,11 +32,11 @@ use std::time::Duration;
 
 use ::config::Sources;
 use clap::builder::{PossibleValuesParser, TypedValueParser};
-use clap::{Args, Command, CommandFactory, FromArgMatches, Parser, Subcommand};
+use clap::{Args, Command, CommandFactory, FromArgMatches, Parser, Subcommand, ValueEnum};
 use schema::{DEFAULT_DOMAIN, Domain, Environment, Failure};
 use verbs::{Bounds, duration};
 
-use crate::demo::Families;
+use crate::demo::{Cast, Families};
 
 pub(crate) use self::config::Config;
 pub(crate) use background::Background;
@@ -53,6 +54,7 @@ pub(crate) use record::Record;
 pub(crate) use replay::Replay;
 pub(crate) use site::Site;
 pub(crate) use telegram::{Telegram, Way};
+pub(crate) use tilt::Tilt;
 pub(crate) use track::Track;
 pub(crate) use watch::Watch;
 pub(crate) use web::Web;
@@ -172,6 +174,8 @@ pub(crate) enum Verb {
     Zones(Zones),
     /// Follow people across the sensors and rooms of a site, and count them at doors
     Track(Track),
+    /// See in three dimensions with a scanner on a mount that tilts it: points, background and obstacles
+    Tilt(Tilt),
     /// Check and draw the plan of sensors, rooms and doors that people are followed in
     Site(Site),
     /// Show the zone verdict and the marks as lights, in the terminal and on LEDs of this machine
@@ -251,7 +255,25 @@ pub(crate) struct Demo {
     pub(crate) seed: u64,
     /// Of which family the two sensors are; mixed: one of each family
     #[arg(long, default_value = "lms", value_name = "FAMILY", value_parser = families())]
-    pub(crate) family: Families,
+    family: Families,
+    /// What they see: demo; or tilt, an LMS on a mount, of which obstacles in three dimensions are made
+    #[arg(long, default_value = "demo", value_name = "NAME", conflicts_with = "family")]
+    world: DemoWorld,
+}
+
+#[derive(Clone, Copy, Debug, ValueEnum)]
+enum DemoWorld {
+    Demo,
+    Tilt,
+}
+
+impl Demo {
+    pub(crate) fn cast(&self) -> Cast {
+        match self.world {
+            DemoWorld::Demo => Cast::Fixed(self.family),
+            DemoWorld::Tilt => Cast::Tilted,
+        }
+    }
 }
 
 fn families() -> impl TypedValueParser<Value = Families> {

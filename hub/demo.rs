@@ -5,6 +5,7 @@
 mod account;
 mod process;
 mod stage;
+mod tilted;
 mod view;
 
 use std::io::Write;
@@ -32,6 +33,32 @@ pub(crate) struct Sensor {
     pub(crate) family: Family,
     /// Where it sits, as its world has it (`tests/worlds/demo.toml`): keys of its link.
     pub(crate) pose: &'static [&'static str],
+}
+
+/// Who plays.
+#[derive(Clone, Copy, Debug)]
+pub(crate) enum Cast {
+    /// Sensors on a robot.
+    Fixed(Families),
+    /// One on a mount that tilts it, and what sees in three dimensions with it.
+    Tilted,
+}
+
+impl Cast {
+    fn sensors(self) -> Vec<Sensor> {
+        match self {
+            Cast::Fixed(families) => families.sensors(),
+            Cast::Tilted => vec![Sensor { name: "front", family: Family::Lms, pose: &["pose.x=0.06"] }],
+        }
+    }
+
+    /// The world of the simulators.
+    fn world(self) -> &'static str {
+        match self {
+            Cast::Fixed(_) => "demo",
+            Cast::Tilted => "tilt",
+        }
+    }
 }
 
 /// Of which families the sensors are.
@@ -82,8 +109,8 @@ pub(crate) struct DemoOptions {
     pub(crate) run_for: Option<Duration>,
     /// Seed of the rooms.
     pub(crate) seed: u64,
-    /// Of which families the sensors are.
-    pub(crate) family: Families,
+    /// The sensors, and what they see.
+    pub(crate) cast: Cast,
     /// Whether the summary is JSON.
     pub(crate) json: bool,
 }
@@ -95,7 +122,7 @@ pub(crate) struct DemoOptions {
 pub(crate) fn demo(options: &DemoOptions, out: &mut dyn Write, stop: &AtomicBool) -> Result<(), Failure> {
     let shows = !options.headless && !options.json;
     let has_picture = shows && can_show_pictures();
-    let stage = Stage::new(has_picture, options.family.sensors())?;
+    let stage = Stage::new(has_picture, options.cast)?;
     // Where no port is free the demonstration goes on without a browser.
     let web = if shows { stage.start_web().ok() } else { None };
     let url = web.as_ref().map(|(_, url)| url.as_str());
@@ -206,6 +233,7 @@ fn play(
     let mut account = Account::new(&stage.sensors, stage.open_truths()?);
     // The sensors come last: whoever listens from the beginning can tell whether something was lost.
     let mut simulators = Vec::new();
+    let mut tilted = None;
     let mut ready = 0;
     let mut first_sample: Option<Instant> = None;
     let begun = Instant::now();
@@ -219,6 +247,7 @@ fn play(
                     ready |= 1 << of;
                     if ready == (1 << stage.sensors.len()) - 1 {
                         simulators = stage.start_simulators(options.seed, &lines)?;
+                        tilted = stage.start_tilted(&lines)?;
                     }
                 }
                 account.take(of, &value);
@@ -253,6 +282,7 @@ fn play(
             break;
         }
     }
+    drop(tilted);
     drop(consumers);
     drop(hub);
     drop(simulators);
@@ -264,6 +294,7 @@ fn ended(of: usize) -> Failure {
     let who = match of {
         HUB => "the hub",
         SIMULATOR => "a simulator",
+        TILTED => "what sees in three dimensions",
         WEB => "the picture for browsers",
         _ => "a consumer",
     };
@@ -274,6 +305,7 @@ fn ended(of: usize) -> Failure {
 const HUB: usize = 100;
 const SIMULATOR: usize = 101;
 const WEB: usize = 102;
+const TILTED: usize = 103;
 /// Between two pictures.
 const REFRESH: Duration = Duration::from_millis(250);
 /// Longest wait for a line before the clock is looked at.

@@ -3,6 +3,7 @@
 
 mod cli;
 mod demo;
+mod encoders;
 mod own_domain;
 mod replay;
 
@@ -71,7 +72,7 @@ fn dispatch(cli: &Cli) -> Result<(), Failure> {
                 headless: demo.headless,
                 run_for: demo.run_for,
                 seed: demo.seed,
-                family: demo.family,
+                cast: demo.cast(),
                 json: everywhere.json,
             };
             // Without a picture it may be meant to outlive its terminal.
@@ -163,6 +164,9 @@ fn dispatch(cli: &Cli) -> Result<(), Failure> {
         Verb::Track(track) => {
             verbs::track(&track.options(everywhere)?, &mut out, &mut io::stderr(), &*interrupt()?)
         }
+        Verb::Tilt(tilt) => {
+            verbs::tilt(&tilt.options(everywhere)?, &mut out, &mut io::stderr(), &*interrupt()?)
+        }
         Verb::Site(site) => site.run(everywhere.json),
         Verb::Leds(leds) => {
             verbs::leds(&leds.options(everywhere)?, &mut out, &mut io::stderr(), &*interrupt()?)
@@ -218,7 +222,12 @@ fn run_simulator(simulate: &cli::simulate::Simulate, everywhere: &Everywhere) ->
             say(&format!("ready {}", ports.join(" ")));
         }
     };
-    sim::simulate(&options, &stop, announce, |_| {}).map(drop)
+    let said = encoders::publish(&simulate.angles, &options, &everywhere.places()?)?;
+    let say = |number, report| {
+        // Who publishes them lives as long as this.
+        let _ = said.send((number, report));
+    };
+    sim::simulate_with(&options, &stop, announce, |_| {}, |_| None, say).map(drop)
 }
 
 /// The line that says that the hub is up; keys in the order of their contract.

@@ -62,7 +62,7 @@ impl Head {
             let options =
                 SimulateOptions { ports: vec![port], scanner, boot: BOOT, ..SimulateOptions::default() };
             let next = move |_: &Path| events.lock().ok()?.pop_front();
-            move || simulate_with(&options, &stopped, |_| {}, |_| {}, next)
+            move || simulate_with(&options, &stopped, |_| {}, |_| {}, next, |_, _| {})
         });
         await_name(&port);
         let mut command = stage.hub_command(PROGRAM, &["front"]);

@@ -138,6 +138,13 @@ const EXAMPLES: &[(&str, &[&str])] = &[
     ("zones", &["scanhub zones front mask --for 10s"]),
     ("zones mask", &["scanhub zones front mask --for 10s"]),
     ("track", &["scanhub track --site house.toml", "scanhub track --site house.toml --count left"]),
+    (
+        "tilt",
+        &[
+            "scanhub tilt front --angles mount --axis-at 0,0,0.9 --as hall",
+            "scanhub tilt front --angles mount --axis-at 0,0,0.9 --near 0.3,1.2,-0.5,0.5,0.05,1.6",
+        ],
+    ),
     ("site", &["scanhub site check house.toml"]),
     ("site check", &["scanhub site check house.toml --svg house.svg"]),
     ("leds", &["scanhub leds front", "scanhub leds robot --led green=led0"]),

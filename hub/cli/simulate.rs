@@ -39,6 +39,10 @@ pub(crate) struct Simulate {
     /// crowd, demo, tilt, empty, wall640 or random; or a TOML file, see docs/worlds.md
     #[arg(long, default_value = "room", value_name = "NAME|FILE", conflicts_with = "replay")]
     world: String,
+    /// Publish what the encoder of a sensor's mount says as NAME/tilt, in the domain of --domain: one name for each port, in
+    /// their order. Worlds with a mount are told in docs/worlds.md
+    #[arg(long, value_name = "NAME", conflicts_with = "replay")]
+    pub(crate) angles: Vec<String>,
     /// Recording to send instead: MCAP file, telegram stream or CARMEN log, plain or gzipped; of family ld an MCAP file or
     /// the bytes that one sent. Of family rplidar there is none
     #[arg(long, value_name = "FILE")]

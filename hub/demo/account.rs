@@ -11,6 +11,8 @@ use serde::Serialize;
 use serde_json::Value;
 use sha2::{Digest, Sha256};
 
+use super::tilted::Tilted;
+
 /// The account of all sensors.
 pub(crate) struct Account {
     pub(crate) sensors: Vec<Sensor>,
@@ -18,6 +20,8 @@ pub(crate) struct Account {
     truths: Vec<(File, Vec<u8>)>,
     /// Telegrams whose last byte left after this moment do not count.
     cut_ns: u64,
+    /// What was seen in three dimensions, if anything was.
+    tilted: Option<Tilted>,
     hub: Option<Work>,
     /// Processor time of the hub in percent of one processor, over the last look and over all.
     pub(crate) hub_cpu_percent: f64,
@@ -89,6 +93,7 @@ impl Account {
             sensors: sensors.collect(),
             truths: truths.into_iter().map(|truth| (truth, Vec::new())).collect(),
             cut_ns: u64::MAX,
+            tilted: None,
             hub: None,
             hub_cpu_percent: 0.0,
         }
@@ -96,6 +101,9 @@ impl Account {
 
     /// Takes a line that the consumer of sensor number `of` printed.
     pub(crate) fn take(&mut self, of: usize, line: &Value) {
+        if line["class"] == "obstacles" {
+            self.tilted.get_or_insert_default().take(line);
+        }
         let Some(sensor) = self.sensors.get_mut(of) else { return };
         match line["class"].as_str() {
             Some("telegram") => sensor.take_telegram(line),
@@ -205,7 +213,15 @@ impl Account {
             };
             let _ = out.write_all(format!("{line}\n").as_bytes());
         }
+        if let Some(tilted) = &self.tilted {
+            let _ = out.write_all(format!("{}\n", tilted.line(json)).as_bytes());
+        }
         self.sensors.iter().map(Sensor::lost).sum()
+    }
+
+    /// What was seen in three dimensions, for people.
+    pub(crate) fn tilted_words(&self) -> Option<String> {
+        self.tilted.as_ref().map(|tilted| tilted.line(false))
     }
 }
 

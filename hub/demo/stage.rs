@@ -15,12 +15,13 @@ use serde_json::Value;
 use super::process::{Child, Line};
 use crate::own_domain::OwnDomain;
 
-use super::{HUB, SIMULATOR, Sensor, WEB};
+use super::{Cast, HUB, SIMULATOR, Sensor, TILTED, WEB};
 
 /// A domain and a directory of its own.
 pub(super) struct Stage {
     pub(super) domain: OwnDomain,
     pub(super) sensors: Vec<Sensor>,
+    cast: Cast,
     directory: PathBuf,
     /// There is a picture on the terminal, into which nobody may write.
     quiet: bool,
@@ -28,7 +29,7 @@ pub(super) struct Stage {
 
 impl Stage {
     /// `quiet`: what the processes have to say of errors is kept until [`tell_errors`](Self::tell_errors).
-    pub(super) fn new(quiet: bool, sensors: Vec<Sensor>) -> Result<Stage, Failure> {
+    pub(super) fn new(quiet: bool, cast: Cast) -> Result<Stage, Failure> {
         let domain = OwnDomain::new("demo")?;
         let name = domain.name().to_owned();
         let directory = std::env::temp_dir().join(format!("scanhub-{name}"));
@@ -41,7 +42,7 @@ impl Stage {
                 "set TMPDIR to a directory that this user may write, or remove what is in the way",
             )
         })?;
-        Ok(Stage { domain, sensors, directory, quiet })
+        Ok(Stage { domain, sensors: cast.sensors(), cast, directory, quiet })
     }
 
     /// Says on stderr what was kept.
@@ -143,10 +144,22 @@ impl Stage {
         let ports: Vec<_> = sensors.flat_map(|sensor| ["--port".into(), self.port(sensor.name)]).collect();
         let truth = self.truth(family).display().to_string();
         let rest = ["--truth".into(), truth, "--seed".into(), seed.to_string(), "--json".into()];
-        let world = ["--world".into(), "demo".into(), "--family".into(), family.name().into()];
-        let arguments = [&["simulate".into()], &world[..], &ports[..], &rest[..]].concat();
+        let world = ["--world".into(), self.cast.world().into(), "--family".into(), family.name().into()];
+        let angles = match self.cast {
+            Cast::Fixed(_) => Vec::new(),
+            Cast::Tilted => vec!["--angles".to_owned(), MOUNT.to_owned()],
+        };
+        let arguments = [&["simulate".into()], &world[..], &ports[..], &rest[..], &angles[..]].concat();
         let simulator = Child::start(&arguments, &self.domain, &self.directory, None, self.errors())?;
         Ok(simulator.await_ready(SIMULATOR, lines)?.0)
+    }
+
+    /// What sees in three dimensions, if a sensor is tilted: once the angles of its mount are there.
+    pub(super) fn start_tilted(&self, lines: &mpsc::Sender<Line>) -> Result<Option<Child>, Failure> {
+        let Cast::Tilted = self.cast else { return Ok(None) };
+        let arguments: Vec<String> = TILTED_VERB.iter().map(|word| (*word).to_owned()).collect();
+        let listener = Some((TILTED, lines.clone()));
+        Child::start(&arguments, &self.domain, &self.directory, listener, self.errors()).map(Some)
     }
 
     /// The picture for a browser, and its address.
@@ -170,5 +183,21 @@ impl Drop for Stage {
     }
 }
 
+/// Who says how the mount stands.
+const MOUNT: &str = "mount";
+/// Of the mount of world `tilt` (`tests/worlds/tilt.toml`).
+const TILTED_VERB: [&str; 11] = [
+    "tilt",
+    "front",
+    "--json",
+    "--angles",
+    MOUNT,
+    "--axis-at",
+    "0,0,0.9",
+    "--sensor-at",
+    "0.06,0,0.94",
+    "--as",
+    "hall",
+];
 /// What a demonstration learns is gone with it.
 const FORGETS: &str = "--set=background.keep=false";

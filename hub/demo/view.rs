@@ -48,6 +48,7 @@ impl View {
             lines.push(String::new());
             lines.extend(sensor_lines(sensor));
         }
+        lines.extend(account.tilted_words());
         lines
     }
 }

@@ -69,6 +69,18 @@ fn of_another_family_or_of_all() {
 }
 
 #[test]
+fn a_sensor_on_a_mount_sees_in_three_dimensions() {
+    // Two ways of the mount of 50 degrees at 30 degrees a second, and what comes before the first turn.
+    let outcome = demo(&["--world", "tilt", "--headless", "--for", "8s", "--json"], Program::wait);
+    assert_eq!(outcome.code, Some(0), "{outcome}");
+    let [front, hall] = &outcome.of_class("summary")[..] else { panic!("{outcome}") };
+    assert_eq!((&front["sensor"], number(front, "lost")), (&"front".into(), 0), "{outcome}");
+    assert!(hall["sensor"] == "hall" && number(hall, "sweeps") >= 2, "{outcome}");
+    let outcome = demo(&["--world", "tilt", "--family", "ld"], Program::wait);
+    assert!(outcome.code == Some(2) && outcome.errors.contains("--family"), "{outcome}");
+}
+
+#[test]
 fn headless_in_an_empty_environment() {
     let outcome = demo(&["--headless", "--for", "2s", "--json"], |mut program| {
         let ready = program.await_line("ready", testkit::is_class("ready"));

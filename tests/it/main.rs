@@ -84,6 +84,7 @@ mod telegram;
 mod terminal_text;
 mod three_machines;
 mod tidy;
+mod tilt;
 mod tilted;
 mod track;
 mod two_machines;

@@ -134,6 +134,14 @@ fn monotonic_ns() -> u64 {
     now.tv_sec as u64 * 1_000_000_000 + now.tv_nsec as u64
 }
 
+/// The words of the lines for a shell on `page` that begin with one of `begins`, behind the program's name.
+pub(crate) fn commands_on(page: &str, begins: &[&str]) -> Vec<Vec<String>> {
+    let blocks = blocks().into_iter().filter(|block| block.language == "sh" && block.place.starts_with(page));
+    let lines = blocks.flat_map(|block| shell::lines(&block.text));
+    let lines = lines.filter(|line| begins.iter().any(|begin| line.starts_with(begin)));
+    lines.map(|line| shell::commands(&line).remove(0).split_off(1)).collect()
+}
+
 fn is_program(block: &Block) -> bool {
     ["python", "rust", "c", "cpp"].contains(&block.language.as_str())
 }
@@ -145,6 +153,14 @@ const OF_TRACKERS: &str = "docs/tracks.md";
 pub(crate) fn start_program_of_trackers(env: &TestEnv) -> Option<Program> {
     let block = blocks().into_iter().find(|block| is_program(block) && block.place.starts_with(OF_TRACKERS));
     let example = Example::build(&block.expect("a program"), env).expect("it is built");
+    example.map(|example| Program::start(example.command(env)))
+}
+
+/// Starts the program that says how a mount stands.
+pub(crate) fn start_program_of_mounts(env: &TestEnv) -> Option<Program> {
+    let is_it = |block: &Block| block.place.starts_with("docs/tilt.md") && block.language == "rust,no_run";
+    let block = blocks().into_iter().find(is_it).expect("a program");
+    let example = Example::build(&Block { language: "rust".to_owned(), ..block }, env).expect("it is built");
     example.map(|example| Program::start(example.command(env)))
 }
 

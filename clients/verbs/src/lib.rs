@@ -37,6 +37,7 @@ mod selection;
 mod show;
 mod stamp;
 mod text;
+mod tilt;
 mod track;
 #[cfg(feature = "tui")]
 mod watch;
@@ -73,6 +74,7 @@ pub use listen::{ListenOptions, listen};
 pub use mask::{MaskOptions, mask};
 #[cfg(feature = "record")]
 pub use record::{RecordLook, RecordOptions, Split, record};
+pub use tilt::{TiltOptions, tilt};
 pub use track::{TrackOptions, track};
 #[cfg(feature = "tui")]
 pub use watch::{WatchOptions, watch};

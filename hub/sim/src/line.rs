@@ -9,6 +9,7 @@ use schema::Failure;
 
 use crate::device::{Device, Part};
 use crate::fault::{Fault, Faults};
+use crate::mount::{Encoder, Report};
 use crate::noise::Mistuned;
 use crate::pty::{Wake, now_ns, wait};
 use crate::request_decoder::Arrival;
@@ -18,6 +19,8 @@ use crate::wire::{Carried, Wire};
 
 /// A sensor on its line.
 pub(crate) struct Line<'a> {
+    /// Of the port, from 0.
+    pub(crate) number: usize,
     /// The port as the user named it, of a server as it is found.
     pub(crate) port: PathBuf,
     /// What is there to be opened; nothing while the adapter is unplugged.
@@ -29,6 +32,10 @@ pub(crate) struct Line<'a> {
     pub(crate) tell: &'a (dyn Fn(&Record) -> Result<(), Failure> + Sync),
     /// What is done to it next from outside, if anything.
     pub(crate) event: &'a (dyn Fn(&Path) -> Option<Event> + Sync),
+    /// What says how its mount stands, if it has one; reports have times of the clock.
+    pub(crate) encoder: Option<Encoder>,
+    /// Where that goes.
+    pub(crate) say: &'a (dyn Fn(usize, Report) + Sync),
 }
 
 /// Something that is done to a simulated sensor from outside while it runs.
@@ -87,6 +94,12 @@ impl Line<'_> {
             while let Some(event) = (self.event)(&self.port) {
                 self.suffer(event, machine_ns);
             }
+            while let Some(report) = self.encoder.as_mut().and_then(|encoder| encoder.poll(machine_ns)) {
+                let [stamp_ns, arrives_ns] =
+                    [report.stamp_ns, report.arrives_ns].map(|at| self.time.of_clock(at));
+                let rate_rad_s = report.rate_rad_s * self.time.speed;
+                (self.say)(self.number, Report { stamp_ns, arrives_ns, rate_rad_s, ..report });
+            }
             while let Some(carried) = self.wire.poll_transmit(&mut *self.machine, machine_ns) {
                 self.hand_over(carried, &mut way)?;
             }
@@ -111,6 +124,7 @@ impl Line<'_> {
                 self.socket = self.wire.is_plugged().then(|| Socket::new(&self.port)).transpose()?;
             }
             let due = self.wire.poll_timeout(&*self.machine, machine_ns);
+            let due = due.into_iter().chain(self.encoder.as_ref().map(Encoder::poll_timeout)).min();
             let due_ns = due.map_or(Nanos::MAX, |at| self.time.of_clock(at));
             let look_ns = if self.socket.is_some() { now_ns + LOOK_NS } else { Nanos::MAX };
             let watched = self.socket.as_ref().and_then(|socket| socket.waits_for(way.is_open));

@@ -1,6 +1,7 @@
 //! What a sensor is tilted by: how it is turned at each moment, and what its encoder says of it, which may be wrong. A pure
 //! function of time. Knows no beams.
 
+use std::cmp::Reverse;
 use std::f64::consts::PI;
 
 use lms::Nanos;
@@ -66,6 +67,43 @@ pub struct Report {
     pub angle_rad: f64,
     /// How fast it grows, in radians a second.
     pub rate_rad_s: f64,
+}
+
+/// What an encoder says, as it says it.
+#[derive(Clone, Debug)]
+pub(crate) struct Encoder {
+    mount: Mount,
+    /// The next report that is made.
+    number: u64,
+    /// Those that are made, and have not arrived; the latest first.
+    on_their_way: Vec<Report>,
+}
+
+impl Encoder {
+    /// That of `mount`.
+    pub(crate) fn new(mount: Mount) -> Encoder {
+        Encoder { mount, number: 0, on_their_way: Vec::new() }
+    }
+
+    /// The next report that has arrived at `now_ns`.
+    pub(crate) fn poll(&mut self, now_ns: Nanos) -> Option<Report> {
+        while self.made_ns() <= now_ns {
+            self.on_their_way.extend(self.mount.report(self.number));
+            self.on_their_way.sort_by_key(|report| Reverse(report.arrives_ns));
+            self.number += 1;
+        }
+        self.on_their_way.pop_if(|report| report.arrives_ns <= now_ns)
+    }
+
+    /// When to ask again.
+    pub(crate) fn poll_timeout(&self) -> Nanos {
+        let arrives_ns = self.on_their_way.last().map_or(Nanos::MAX, |report| report.arrives_ns);
+        arrives_ns.min(self.made_ns())
+    }
+
+    fn made_ns(&self) -> Nanos {
+        (self.number as f64 / self.mount.reports_hz * 1e9).round() as Nanos
+    }
 }
 
 impl Mount {
@@ -172,6 +210,23 @@ mod tests {
         assert_eq!([1.0, 3.0, 5.0, 6.0].map(|s| deg(&halted, s)), [20.0, 20.0, 20.0, 50.0]);
         let report = halted.report(300).expect("it says so");
         assert_eq!((report.angle_rad.to_degrees().round(), report.rate_rad_s), (20.0, 0.0));
+    }
+
+    #[test]
+    fn reports_come_when_they_arrive() {
+        let late = Fault { kind: FaultKind::Late(0.015), from_s: 0.01, until_s: 0.02 };
+        let mut encoder = Encoder::new(mount(&[late]));
+        let mut come = Vec::new();
+        for ms in 0..50 {
+            let now_ns = ms * 1_000_000;
+            let is_due = encoder.poll_timeout() <= now_ns;
+            let before = come.len();
+            come.extend(
+                std::iter::from_fn(|| encoder.poll(now_ns)).map(|one| (ms, one.stamp_ns / 1_000_000)),
+            );
+            assert_eq!(is_due, come.len() > before || ms == 10, "at {ms} ms");
+        }
+        assert_eq!(come, [(0, 0), (20, 20), (25, 10), (30, 30), (40, 40)]);
     }
 
     #[test]

@@ -14,6 +14,7 @@ use crate::device::Device;
 use crate::ld::{Head, HeadSettings, Packets, recorded};
 use crate::line::{Event, Line, Time};
 use crate::machine::{Machine, Settings, Start};
+use crate::mount::{Encoder, Report};
 use crate::operating::Operating;
 use crate::options::{Scanner, SimulateOptions, type_name};
 use crate::pty::now_ns;
@@ -42,16 +43,18 @@ pub fn simulate(
     on_ready: impl FnOnce(&[Ready]),
     tell: impl Fn(&Record) + Sync,
 ) -> Result<Vec<Summary>, Failure> {
-    simulate_with(options, stop, on_ready, tell, |_| None)
+    simulate_with(options, stop, on_ready, tell, |_| None, |_, _| {})
 }
 
-/// As [`simulate()`]; `event` is asked again and again, from the thread of each port, what is done to that sensor now.
+/// As [`simulate()`]; `event` is asked again and again, from the thread of each port, what is done to that sensor now, and
+/// `say` is called with the number of a port and what the encoder of its mount says, in times of the clock.
 pub fn simulate_with(
     options: &SimulateOptions,
     stop: impl AsFd,
     on_ready: impl FnOnce(&[Ready]),
     tell: impl Fn(&Record) + Sync,
     event: impl Fn(&Path) -> Option<Event> + Sync,
+    say: impl Fn(usize, Report) + Sync,
 ) -> Result<Vec<Summary>, Failure> {
     check(options)?;
     let recording = options.replay.as_ref().filter(|_| options.scanner.is_none());
@@ -72,7 +75,19 @@ pub fn simulate_with(
         ready.push(Ready { port: port.clone(), pty: socket.pty().map(Path::to_owned) });
         let wire = Wire::new(&options.faults, seed);
         let socket = Some(socket);
-        lines.push(Line { port, socket, machine, wire, time, tell: &tell, event: &event });
+        let encoder = options.world.mount(number % options.world.sensors()).cloned().map(Encoder::new);
+        lines.push(Line {
+            number,
+            port,
+            socket,
+            machine,
+            wire,
+            time,
+            tell: &tell,
+            event: &event,
+            encoder,
+            say: &say,
+        });
     }
     on_ready(&ready);
     let summaries = run(lines, stop.as_fd())?;

@@ -17,7 +17,7 @@ use schema::Topic;
 
 /// Commands that are not run, by how their line begins or what is in it, and what makes sure of them. Those of the program
 /// are read by `hub/cli/examples.rs`.
-const NOT_RUN: [(&str, &str); 14] = [
+const NOT_RUN: [(&str, &str); 16] = [
     ("sudo ", "changes the machine; tests/it/dist.rs and tests/it/client_c.rs install elsewhere"),
     ("sudoedit ", "an editor"),
     ("systemctl ", "asks the machine's service manager; tests/it/service.rs has one of its own"),
@@ -32,6 +32,8 @@ const NOT_RUN: [(&str, &str); 14] = [
     ("scanhub bridge", "another program; clients/bridge/tests/bridge/page.rs runs it"),
     ("openssl ", "the same"),
     ("scanhub watch", "needs a terminal; tests/it/watch.rs has one"),
+    ("scanhub tilt", "needs a mount; tests/it/tilt.rs runs it beside one"),
+    ("scanhub echo hall/", "follows what that makes; the same"),
 ];
 /// The same of what is in the middle of a line.
 const NOT_RUN_WITH: [(&str, &str); 1] = [("| ssh ", "needs another machine")];

@@ -49,6 +49,7 @@ impl Sensors {
                     let _ = told.lock().expect("whole").send(record.clone());
                 },
                 |port| asked.lock().expect("whole").get_mut(port)?.pop_front(),
+                |_, _| {},
             )
         });
         is_ready.recv_timeout(PATIENCE).expect("ports can be opened");

@@ -155,7 +155,8 @@ pub(crate) fn no_processor_uses_another(tree: &Tree) -> Vec<String> {
 }
 
 /// A consumer's program has nothing of ours below it but the library and the words. The verbs stand on it as others do; the
-/// words of ROS come with them where they record, the ends of a network where they send and listen, the scene where they show it.
+/// words of ROS come with them where they record, the ends of a network where they send and listen, the scene where they show it, what computes people and
+/// points for the verbs that publish them.
 pub(crate) fn clients_know_only_schema(tree: &Tree) -> Vec<String> {
     let known: [(&str, &[&str]); 2] = [
         ("scanhub-client", &["scanhub-schema"]),
@@ -167,6 +168,7 @@ pub(crate) fn clients_know_only_schema(tree: &Tree) -> Vec<String> {
                 "scanhub-schema",
                 "scanhub-ros",
                 "scanhub-scene",
+                "scanhub-tilt",
                 "scanhub-track",
                 "scanhub-web",
             ],

@@ -1,0 +1,231 @@
+//! `scanhub tilt`: three dimensions of a scanner on a mount, as lines and as topics. Refuses to know how points and obstacles
+//! are found.
+
+mod lines;
+mod publish;
+
+use std::io::Write;
+use std::sync::atomic::AtomicBool;
+use std::time::Instant;
+
+use ::tilt::{Angle, Mount, Settings, Sweep, Tilting, Withheld};
+use publish::Samples;
+use scanhub_client::streams::Sample;
+use schema::{Domain, Failure, Topic};
+
+use crate::follow::{Bounds, Notice, Sink, follow};
+use crate::names::TopicName;
+use crate::output::{End, Output, quiet};
+use crate::receive_stats::ReceiveStats;
+use crate::{json, text};
+
+/// What `tilt` is asked for.
+#[derive(Clone, Debug)]
+pub struct TiltOptions {
+    /// The scanner.
+    pub sensor: String,
+    /// The name under which the angles of its mount are published.
+    pub angles: String,
+    /// The name that its topics are published under; none: it publishes nothing.
+    pub name: Option<String>,
+    /// Where the axis is, and the scanner on it.
+    pub mount: Mount,
+    /// How sweeps, background and obstacles are found.
+    pub settings: Settings,
+    /// Lines of JSON.
+    pub json: bool,
+    /// When it ends by itself.
+    pub bounds: Bounds,
+    /// Where the domain may be, see [`Domain::candidates`].
+    pub places: Vec<Domain>,
+}
+
+/// Follows the scans of a sensor and the angles of its mount, and writes to `out` what stands there, sweep by sweep; what is
+/// wrong with the angles, and what is neither, to `notes` (stderr) if `out` is not JSON. Ends when the bounds are reached,
+/// `stop` is set, or nobody reads any more.
+///
+/// # Errors
+///
+/// [`Kind::NoTopic`](schema::Kind) with the sensors that there are, [`Kind::NoHub`](schema::Kind) if bounded and there is none
+/// at the start, [`Kind::Timeout`](schema::Kind), [`Kind::Interrupted`](schema::Kind) if bounded and `stop` came first; those of
+/// publishing if it has a name.
+pub fn tilt(
+    options: &TiltOptions,
+    out: &mut dyn Write,
+    notes: &mut dyn Write,
+    stop: &AtomicBool,
+) -> Result<(), Failure> {
+    let names = [(&options.sensor, Topic::Scan), (&options.angles, Topic::Tilt)]
+        .map(|(sensor, topic)| TopicName { sensor: sensor.clone(), topic });
+    let name = options.name.as_deref().unwrap_or(UNNAMED);
+    let mut verb = Verb {
+        options,
+        tilting: Tilting::new(options.mount, options.settings),
+        trouble: Trouble::default(),
+        teller: Teller {
+            name,
+            is_json: options.json,
+            samples: Samples::new(name),
+            told: Ok(()),
+            out: Output::new(out),
+            notes: Output::new(notes),
+        },
+        beams: None,
+        missed: 0,
+        summaries: names.len(),
+    };
+    quiet(follow(&names, &[], &options.places, &options.bounds, stop, &mut verb))
+}
+
+/// What lines call one that publishes nothing.
+const UNNAMED: &str = "tilted";
+/// What is wrong with the angles for less than this time is counted, and not told.
+const TOLD_AFTER_NS: u64 = 300_000_000;
+
+struct Verb<'a> {
+    options: &'a TiltOptions,
+    tilting: Tilting,
+    trouble: Trouble,
+    teller: Teller<'a>,
+    /// Of the first scan.
+    beams: Option<usize>,
+    missed: u64,
+    /// Topics that are not yet over.
+    summaries: usize,
+}
+
+impl Sink for Verb<'_> {
+    /// Publishes from the moment that it is known how long samples are.
+    fn tick(&mut self, _: Instant) -> Result<(), End> {
+        let samples = &mut self.teller.samples;
+        match (&self.options.name, self.beams) {
+            (Some(name), Some(beams)) if !samples.is_published() => {
+                Ok(samples.publish(name, beams, &self.options.places)?)
+            }
+            _ => Ok(()),
+        }
+    }
+
+    fn sample(&mut self, _: &TopicName, sample: &Sample) -> Result<(), End> {
+        let Verb { tilting, teller, .. } = self;
+        match sample {
+            Sample::Scan(scan) => {
+                let header = *scan.header();
+                self.beams.get_or_insert(scan.beams());
+                teller.samples.hear(&header);
+                tilting.take_scan(header.stamp_first_ns, scan, |sweep| teller.tell(sweep));
+                if let Some(trouble) = self.trouble.changed(header.stamp_first_ns, tilting.trouble()) {
+                    teller.tell_trouble(trouble)?;
+                }
+            }
+            Sample::Tilt(said) => {
+                let angle = Angle {
+                    stamp_ns: said.header().stamp_first_ns,
+                    angle_rad: said.angle_rad,
+                    rate_rad_s: said.rate_rad_s,
+                };
+                tilting.take_angle(angle, |sweep| teller.tell(sweep));
+            }
+            _ => {}
+        }
+        std::mem::replace(&mut teller.told, Ok(()))
+    }
+
+    fn notice(&mut self, names: &[&TopicName], notice: Notice) -> Result<(), End> {
+        if let Notice::Missed(count) = notice {
+            self.missed += count;
+        }
+        match self.teller.is_json {
+            true => json::notices(&mut self.teller.out, names, notice),
+            false => self.teller.notes.line(|line| text::notice(line, names, notice)),
+        }
+    }
+
+    fn summary(&mut self, _: &TopicName, _: &ReceiveStats) -> Result<(), End> {
+        self.summaries -= 1;
+        if self.summaries > 0 {
+            return Ok(());
+        }
+        let Teller { name, is_json, samples, out, .. } = &mut self.teller;
+        let sum = lines::Sum { counts: self.tilting.counts(), missed: self.missed, failed: samples.failed() };
+        match is_json {
+            true => out.json(&lines::summary(name, &sum)),
+            false => out.line(|line| lines::summary_text(line, &sum)),
+        }
+    }
+}
+
+/// What is wrong with the angles, once it has been so for a while.
+#[derive(Default)]
+struct Trouble {
+    told: Option<Withheld>,
+    now: Option<Withheld>,
+    since_ns: u64,
+}
+
+impl Trouble {
+    /// Takes what is so at the time of a scan; what is to be told, if it is news.
+    fn changed(&mut self, stamp_ns: u64, now: Option<Withheld>) -> Option<Option<Withheld>> {
+        if now != self.now || self.since_ns == 0 {
+            (self.now, self.since_ns) = (now, stamp_ns);
+        }
+        let is_old = stamp_ns.saturating_sub(self.since_ns) >= TOLD_AFTER_NS;
+        (is_old && now != self.told).then(|| {
+            self.told = now;
+            now
+        })
+    }
+}
+
+/// What writes the lines.
+struct Teller<'a> {
+    name: &'a str,
+    is_json: bool,
+    samples: Samples,
+    /// Why it could not.
+    told: Result<(), End>,
+    out: Output<'a>,
+    notes: Output<'a>,
+}
+
+impl Teller<'_> {
+    fn tell(&mut self, sweep: &Sweep<'_>) {
+        let (header, obstacles) = self.samples.take(sweep);
+        let told = match self.is_json {
+            true => self.out.json(&json::obstacles(self.name, header, obstacles)),
+            false => self.out.line(|line| text::obstacles(line, header, obstacles)),
+        };
+        if self.told.is_ok() {
+            self.told = told;
+        }
+    }
+
+    fn tell_trouble(&mut self, trouble: Option<Withheld>) -> Result<(), End> {
+        match self.is_json {
+            true => self.out.json(&lines::angles(self.name, trouble)),
+            false => self.notes.line(|line| lines::angles_text(line, trouble)),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_is_wrong_for_a_moment_is_not_told() {
+        const MS: u64 = 1_000_000;
+        let mut trouble = Trouble::default();
+        let (well, silent, jumped) = (None, Some(Withheld::Silent), Some(Withheld::Jumped));
+        // At the start no angle has come yet.
+        assert_eq!(trouble.changed(1000 * MS, silent), None);
+        assert_eq!(trouble.changed(1027 * MS, well), None);
+        assert_eq!(trouble.changed(1400 * MS, silent), None);
+        assert_eq!(trouble.changed(1690 * MS, silent), None);
+        assert_eq!(trouble.changed(1700 * MS, silent), Some(silent));
+        assert_eq!(trouble.changed(1800 * MS, silent), None, "once");
+        assert_eq!(trouble.changed(1900 * MS, jumped), None);
+        assert_eq!(trouble.changed(2200 * MS, jumped), Some(jumped));
+        assert_eq!([2300, 2600].map(|ms| trouble.changed(ms * MS, well)), [None, Some(well)]);
+    }
+}

@@ -1,0 +1,169 @@
+//! `scanhub tilt`, from telegrams and angles to points and an obstacle: as its page walks through it, and with angles that stop.
+
+use serde_json::Value;
+
+use crate::pages::{commands_on, start_program_of_mounts};
+use crate::testkit::{INT, Outcome, Program, TestEnv, is_class, number};
+
+/// A hall with a post ahead of a sensor that swings slowly: how late the hub stamps scans on a busy machine moves points little.
+const WORLD: &str = "
+[[sensor]]
+pose = [0, 0, 90]
+[sensor.mount]
+height_mm = 900
+arm_mm = [60, 40]
+from_deg = 0
+to_deg = 24
+deg_s = 12
+[noise]
+bias_mm = 0
+[[thing]]
+line = [[-3000, -2000], [3000, -2000], [3000, 4000], [-3000, 4000], [-3000, -2000]]
+[[thing]]
+legs = [1, 1]
+radius_mm = 100
+height_mm = 800
+pose = [0, 1500]
+";
+
+/// The post, as somebody says who wants nothing to stand there.
+const NEAR: &str = "--near=1,2,-0.5,0.5,0.1,0.7";
+
+struct Hall {
+    env: TestEnv,
+    hub: Program,
+    simulator: Option<Program>,
+}
+
+impl Hall {
+    fn new() -> Hall {
+        let env = TestEnv::new();
+        let world = env.file("hall.toml", WORLD);
+        let flags = [format!("--world={world}"), "--angles=mount".into(), "--baud=500000".into()];
+        let simulator = env.simulator(&["front"], &flags);
+        let hub = env.hub(&[env.link("front")]);
+        env.await_info("front", |info| info["state"] == "streaming");
+        Hall { env, hub, simulator: Some(simulator) }
+    }
+
+    fn tilt(&self, more: &[&str]) -> Program {
+        let place =
+            ["tilt", "front", "--angles=mount", "--axis-at=0,0,0.9", "--sensor-at=0.06,0,0.94", "--json"];
+        self.env.start(&[&place[..], more].concat())
+    }
+}
+
+/// How far a point is from floor, walls and post.
+fn off(point: &[f64]) -> f64 {
+    let [x, y, z] = point[..] else { panic!("{point:?}") };
+    let post = ((x - 1.5).hypot(y) - 0.1).abs();
+    let walls = [(x - 4.0).abs(), (x + 2.0).abs(), (y - 3.0).abs(), (y + 3.0).abs()];
+    walls.into_iter().chain([post, z.abs()]).fold(f64::INFINITY, f64::min)
+}
+
+fn has_obstacle(line: &Value) -> bool {
+    is_class("obstacles")(line) && line["obstacles"] != Value::Array(Vec::new())
+}
+
+/// Whether it ended with an error that has these words.
+fn is_told(outcome: &Outcome, words: &str) -> bool {
+    outcome.of_class("error").iter().any(|line| line["message"].to_string().contains(words))
+}
+
+fn numbers(list: &Value) -> Vec<f64> {
+    list.as_array().expect("a list").iter().map(|value| value.as_f64().expect("a number")).collect()
+}
+
+#[test]
+fn points_are_where_things_are_and_the_post_is_an_obstacle() {
+    let hall = Hall::new();
+    let mut tilt = hall.tilt(&["--as=hall", NEAR]);
+    tilt.await_line("a sweep", is_class("obstacles"));
+    let mut clouds = hall.env.echo(&["hall/cloud"]);
+    let found = tilt.await_line("the post", has_obstacle);
+    assert_eq!(found["sensor"], "hall", "{found}");
+    let post = found["obstacles"].as_array().expect("a list").first().expect("the post");
+    let [x, y] = ["x_m", "y_m"].map(|key| post[key].as_f64().expect("a number"));
+    assert!((x - 1.42).abs() < 0.1 && y.abs() < 0.1 && post["near"] == true, "{post}");
+    assert!((post["distance_m"].as_f64().expect("a number") - 1.4).abs() < 0.1, "{post}");
+    let is_last = |line: &Value| is_class("cloud")(line) && line["last"] == true;
+    let before = number(&clouds.await_line("the end of a sweep", is_last), "sweep");
+    let sweep = number(&clouds.await_line("the end of the next one", is_last), "sweep");
+    assert!(sweep > before, "{sweep} {before}");
+    let clouds = clouds.end(INT).of_class("cloud");
+    let of_sweep: Vec<&Value> = clouds.iter().filter(|line| number(line, "sweep") == sweep).collect();
+    let firsts = of_sweep.iter().filter(|line| line["first"] == true).count();
+    assert!(firsts == 1 && of_sweep[0]["first"] == true, "{firsts}");
+    let points = clouds.iter().flat_map(|line| line["points"].as_array().expect("a list")).map(numbers);
+    let points: Vec<Vec<f64>> = points.collect();
+    assert!(points.len() > 1_000, "{}", points.len());
+    let mut off: Vec<f64> = points.iter().map(|point| off(point)).collect();
+    off.sort_by(f64::total_cmp);
+    // A machine that stands still stamps scans late.
+    assert!(off[off.len() * 9 / 10] < 0.08, "{:?}", [off[off.len() / 2], off[off.len() * 9 / 10]]);
+    // Beside the others: a mount, a tracker's place, and what is made of both; a name has one publisher.
+    let again = hall.tilt(&["--as=hall"]).wait();
+    assert!(again.code == Some(1) && is_told(&again, "publishes as hall"), "{again}");
+    let taken = hall.tilt(&["--as=front"]).wait();
+    assert!(taken.code == Some(78) && is_told(&taken, "sensor of the hub"), "{taken}");
+    let outcome = tilt.end(INT);
+    assert_eq!(outcome.code, Some(0), "{outcome}");
+    let sum = &outcome.of_class("summary")[0];
+    assert!(
+        number(sum, "sweeps") > 2 && number(sum, "points") > 1_000 && number(sum, "angles") > 100,
+        "{sum}"
+    );
+    ends_well(hall);
+}
+
+#[test]
+fn the_program_of_the_page_says_how_a_mount_stands() {
+    let env = TestEnv::new();
+    let _hub = env.hub(&[env.link("front")]);
+    let Some(mount) = start_program_of_mounts(&env) else { return };
+    let mut echo = env.echo(&["mount/tilt"]);
+    let line = echo.await_line("an angle", is_class("tilt"));
+    let angle = line["angle_deg"].as_f64().expect("a number");
+    assert!((0.0..28.7).contains(&angle) && line["rate_deg_s"].is_null(), "{line}");
+    mount.end(INT);
+}
+
+fn ends_well(hall: Hall) {
+    let outcome = hall.hub.end(INT);
+    assert_eq!(outcome.code, Some(0), "{outcome}");
+}
+
+#[test]
+fn the_page_leads_to_an_obstacle() {
+    let hall = Hall::new();
+    let lines = commands_on("docs/tilt.md", &["scanhub tilt front --angles", "scanhub echo hall/"]);
+    let [tilt, echo] = &lines[..] else { panic!("{lines:?}") };
+    let start = |words: &[String]| hall.env.start(&[words, &["--json".to_owned()]].concat());
+    let mut tilt = start(tilt);
+    tilt.await_line("an obstacle", has_obstacle);
+    let mut echo = start(echo);
+    echo.await_line("an obstacle", has_obstacle);
+    assert_eq!((tilt.end(INT).code, echo.end(INT).code), (Some(0), Some(0)));
+    ends_well(hall);
+}
+
+#[test]
+fn angles_that_stop_are_told_and_a_name_that_is_not_there_too() {
+    let mut hall = Hall::new();
+    let mut tilt = hall.tilt(&[]);
+    tilt.await_line("a sweep", is_class("obstacles"));
+    // Whoever says how the mount stands goes away with the simulator; the hub's scans go on from another one.
+    drop(hall.simulator.take().map(|simulator| simulator.end(INT)));
+    hall.simulator = Some(hall.env.simulator(&["front"], &["--world=room", "--baud=500000"]));
+    let said = tilt.await_line("no angles", |line| is_class("angles")(line) && line["trouble"] == "silent");
+    assert_eq!(said["sensor"], "tilted", "it publishes nothing");
+    let outcome = tilt.end(INT);
+    let sum = &outcome.of_class("summary")[0];
+    assert!(outcome.code == Some(0) && number(&sum["withheld"], "silent") > 0, "{outcome}");
+    let none = hall.env.run(&["tilt", "front", "--angles=none", "--axis-at=0,0,1", "--timeout=2s"]);
+    assert!(none.code == Some(3) && none.errors.contains("none"), "{none}");
+    let wrong = hall.env.run(&["tilt", "front", "--angles=mount", "--axis-at=0,0"]);
+    assert!(wrong.code == Some(2) && wrong.errors.contains("2 numbers, and not 3"), "{wrong}");
+    let nowhere = hall.env.run(&["simulate", "--port=x", "--angles=mount"]);
+    assert!(nowhere.code == Some(2) && nowhere.errors.contains("--world tilt"), "{nowhere}");
+}
