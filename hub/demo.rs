@@ -1,8 +1,9 @@
-//! The whole thing in one terminal: simulated sensors of one family or of all, the hub and one consumer per sensor, each a process as in
-//! real life. This process only starts them, reads what they print, compares what was sent with what arrived, and shows
+//! The whole thing in one terminal: simulated sensors of one family or of all, the hub, one consumer per sensor, and where there are
+//! people to follow the tracker, each a process as in real life. This process only starts them, reads what they print, compares what was sent with what arrived, and shows
 //! the picture that `watch` makes of it.
 
 mod account;
+mod cast;
 mod process;
 mod stage;
 mod view;
@@ -14,64 +15,17 @@ use std::sync::mpsc::{self, RecvTimeoutError};
 use std::thread;
 use std::time::{Duration, Instant};
 
-use schema::{Domain, Failure, Family, Kind};
+use schema::{Domain, Failure, Kind};
 use serde::Serialize;
 use serde_json::Value;
 use verbs::{Bounds, WatchOptions};
 
 use crate::cli::watch::{can_show_pictures, colours};
 use account::Account;
+pub(crate) use cast::{Families, World};
 use process::Line;
 use stage::Stage;
 use view::View;
-
-/// A simulated sensor.
-#[derive(Clone, Debug)]
-pub(crate) struct Sensor {
-    pub(crate) name: &'static str,
-    pub(crate) family: Family,
-    /// Where it sits, as its world has it (`tests/worlds/demo.toml`): keys of its link.
-    pub(crate) pose: &'static [&'static str],
-}
-
-/// Of which families the sensors are.
-#[derive(Clone, Copy, Debug)]
-pub(crate) enum Families {
-    /// All of one.
-    Of(Family),
-    /// One of each.
-    Mixed,
-}
-
-impl Families {
-    /// The names in all input: of the families, and `mixed`.
-    pub(crate) fn names() -> impl Iterator<Item = &'static str> {
-        Family::ALL.into_iter().map(Family::name).chain([MIXED])
-    }
-
-    /// The families that `name` says, if it is one of [`names`](Self::names).
-    pub(crate) fn parse(name: &str) -> Option<Families> {
-        if name == MIXED { Some(Families::Mixed) } else { Family::parse(name).map(Families::Of) }
-    }
-
-    fn sensors(self) -> Vec<Sensor> {
-        let ahead = |name, family| Sensor { name, family, pose: &["pose.x=0.3"] };
-        match self {
-            Families::Of(family) => {
-                let behind = &["pose.x=-0.3", "pose.yaw=3.14159"];
-                vec![ahead("front", family), Sensor { name: "rear", family, pose: behind }]
-            }
-            // Each family has a simulator of its own, and its first sensor sits in front: one above the other.
-            Families::Mixed => ["front", "side", "top"]
-                .into_iter()
-                .zip(Family::ALL)
-                .map(|(name, family)| ahead(name, family))
-                .collect(),
-        }
-    }
-}
-
-const MIXED: &str = "mixed";
 
 /// What the demonstration is asked for.
 #[derive(Clone, Debug)]
@@ -80,6 +34,8 @@ pub(crate) struct DemoOptions {
     pub(crate) headless: bool,
     /// How long from the first sample on; until `stop` if nothing.
     pub(crate) run_for: Option<Duration>,
+    /// Where it takes place.
+    pub(crate) world: World,
     /// Seed of the rooms.
     pub(crate) seed: u64,
     /// Of which families the sensors are.
@@ -95,19 +51,20 @@ pub(crate) struct DemoOptions {
 pub(crate) fn demo(options: &DemoOptions, out: &mut dyn Write, stop: &AtomicBool) -> Result<(), Failure> {
     let shows = !options.headless && !options.json;
     let has_picture = shows && can_show_pictures();
-    let stage = Stage::new(has_picture, options.family.sensors())?;
+    let sensors = options.world.sensors(options.family)?;
+    let stage = Stage::new(has_picture, options.world, sensors)?;
     // Where no port is free the demonstration goes on without a browser.
     let web = if shows { stage.start_web().ok() } else { None };
     let url = web.as_ref().map(|(_, url)| url.as_str());
     let played = if has_picture {
         play_with_picture(options, &stage, url, out, stop)
     } else {
-        let (mut view, mut is_said) = (View::new(&stage.domain, url), false);
+        let (mut view, mut is_said) = (View::new(attach(&stage), url), false);
         let mut show = |account: &Account, elapsed: Duration| {
             if shows {
                 view.draw(out, account, elapsed);
             } else if !std::mem::replace(&mut is_said, true) {
-                say_ready(out, &stage.domain, options.json);
+                say_ready(out, &stage, options.json);
             }
         };
         play(options, &stage, &mut show, &|| stop.load(Ordering::Relaxed))
@@ -134,9 +91,9 @@ fn play_with_picture(
     stop: &AtomicBool,
 ) -> Result<(Account, bool), Failure> {
     let picture = WatchOptions {
-        sensors: stage.names(),
+        sensors: Vec::new(),
         colours: colours(),
-        note: url.map_or_else(|| attach(&stage.domain), |url| short(url, &stage.domain)),
+        note: url.map_or_else(|| attach(stage), |url| short(url, &stage.domain)),
         bounds: Bounds::default(),
         places: vec![stage.domain.clone()],
     };
@@ -165,8 +122,8 @@ impl Drop for Raise<'_> {
 }
 
 /// What somebody types in another terminal to look at it.
-fn attach(domain: &Domain) -> String {
-    format!("other terminal: scanhub echo front/scan --domain {}", domain.name())
+fn attach(stage: &Stage) -> String {
+    format!("other terminal: scanhub echo {} --domain {}", stage.world.topic(), stage.domain.name())
 }
 
 /// As much of it as stands beside the keys on 80 columns.
@@ -175,11 +132,12 @@ fn short(url: &str, domain: &Domain) -> String {
 }
 
 /// Says where it takes place.
-fn say_ready(out: &mut dyn Write, domain: &Domain, json: bool) {
+fn say_ready(out: &mut dyn Write, stage: &Stage, json: bool) {
+    let domain = &stage.domain;
     let ready = Ready { class: "ready", domain: domain.name(), root: domain.root(), pid: std::process::id() };
     let line = match json {
         true => crate::line(&ready),
-        false => format!("ready {} in {}; {}", ready.domain, ready.root.display(), attach(domain)),
+        false => format!("ready {} in {}; {}", ready.domain, ready.root.display(), attach(stage)),
     };
     let _ = out.write_all(format!("{line}\n").as_bytes());
 }
@@ -203,6 +161,7 @@ fn play(
     let (lines, received) = mpsc::channel();
     let hub = stage.start_hub(lines.clone())?;
     let consumers = stage.start_consumers(&lines)?;
+    let tracker = stage.start_tracker(&lines)?;
     let mut account = Account::new(&stage.sensors, stage.open_truths()?);
     // The sensors come last: whoever listens from the beginning can tell whether something was lost.
     let mut simulators = Vec::new();
@@ -213,6 +172,7 @@ fn play(
     let mut cut = None;
     loop {
         match received.recv_timeout(next_look.saturating_duration_since(Instant::now()).min(PATIENCE)) {
+            Ok(Line::Said { of: TRACKER, text }) => account.take_news(text),
             Ok(Line::Said { of, text }) => {
                 let value: Value = serde_json::from_str(&text).unwrap_or_default();
                 if value["class"] == "status" && simulators.is_empty() {
@@ -253,6 +213,7 @@ fn play(
             break;
         }
     }
+    drop(tracker);
     drop(consumers);
     drop(hub);
     drop(simulators);
@@ -264,6 +225,7 @@ fn ended(of: usize) -> Failure {
     let who = match of {
         HUB => "the hub",
         SIMULATOR => "a simulator",
+        TRACKER => "the tracker of people",
         WEB => "the picture for browsers",
         _ => "a consumer",
     };
@@ -274,6 +236,7 @@ fn ended(of: usize) -> Failure {
 const HUB: usize = 100;
 const SIMULATOR: usize = 101;
 const WEB: usize = 102;
+const TRACKER: usize = 103;
 /// Between two pictures.
 const REFRESH: Duration = Duration::from_millis(250);
 /// Longest wait for a line before the clock is looked at.

@@ -70,6 +70,7 @@ fn dispatch(cli: &Cli) -> Result<(), Failure> {
             let options = DemoOptions {
                 headless: demo.headless,
                 run_for: demo.run_for,
+                world: demo.world,
                 seed: demo.seed,
                 family: demo.family,
                 json: everywhere.json,
