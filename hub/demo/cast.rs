@@ -64,12 +64,12 @@ impl World {
     pub(crate) fn sensors(self, families: Families) -> Result<Vec<Sensor>, Failure> {
         match (self, families) {
             (World::Robot, families) => Ok(families.around_the_robot()),
-            (World::House, Families::Of(family)) => Ok(in_the_house(family)?),
-            (World::House, Families::Mixed) => Err(Failure::new(
-                Kind::Usage,
-                "--world house with --family mixed",
-                "all sensors of the house are of one family: lms, ld or rplidar",
-            )),
+            (World::House, Families::Of(family)) => in_the_house(family),
+            (World::House, Families::Mixed) => {
+                let names: Vec<_> = Family::ALL.into_iter().map(Family::name).collect();
+                let hint = format!("all sensors of the house are of one family: {}", names.join(", "));
+                Err(Failure::new(Kind::Usage, "--world house with --family mixed", hint))
+            }
         }
     }
 }
@@ -140,7 +140,7 @@ mod tests {
             .map(|pose| pose.split(", ").map(|value| value.parse().expect("a number")).collect::<Vec<f64>>())
             .map(|pose| [pose[0] / 1000.0, pose[1] / 1000.0, pose[2].to_radians()])
             .collect();
-        let sensors = World::House.sensors(Families::Of(Family::Lms)).expect("the site is right");
+        let sensors = World::House.sensors(Families::Of(Family::ALL[0])).expect("the site is right");
         assert_eq!((sensors.len(), poses.len()), (4, 4));
         for (sensor, pose) in sensors.iter().zip(poses) {
             let off = sensor.pose.iter().zip(pose).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
