@@ -91,6 +91,8 @@ struct Slots {
     zones: Option<usize>,
     verdict: Option<usize>,
     diagnosis: Option<usize>,
+    people: Option<usize>,
+    poses: Option<usize>,
 }
 
 /// A message that has waited longer than that is left out if there is a newer one of its topic: who keeps the last five of a
@@ -139,6 +141,8 @@ impl Graph {
             zones: slot(Topic::Zones, "zones", ros::MARKER_ARRAY),
             verdict: slot(Topic::Zones, "verdict", ros::STRING),
             diagnosis: None,
+            people: slot(Topic::Tracks, "tracks", ros::MARKER_ARRAY),
+            poses: slot(Topic::Tracks, "poses", ros::POSE_ARRAY),
         };
         if every[Topic::Status as usize].is_some() {
             slots.diagnosis = Some(self.publish_diagnostics());
@@ -162,7 +166,7 @@ impl Graph {
         match topic {
             Topic::Scan => goes_out(topic) || goes_out(Topic::Foreground),
             Topic::Status => true,
-            Topic::Foreground | Topic::Marks | Topic::Zones => goes_out(topic),
+            Topic::Foreground | Topic::Marks | Topic::Zones | Topic::Tracks => goes_out(topic),
             _ => false,
         }
     }
@@ -200,6 +204,10 @@ impl Graph {
             PayloadRef::Zones(zones) if goes_out => {
                 self.write(slots.zones, now, |message| ros::zone_markers(message, header, zones));
                 self.write(slots.verdict, now, |message| ros::verdict_word(message, zones.verdict()));
+            }
+            PayloadRef::Tracks(tracks) if goes_out => {
+                self.write(slots.people, now, |message| ros::people_markers(message, &frame, header, tracks));
+                self.write(slots.poses, now, |message| ros::people_poses(message, &frame, header, tracks));
             }
             _ => {}
         }

@@ -1,7 +1,7 @@
 //! Messages of a hub, without one.
 
 use ros::{Value, read};
-use schema::{ForegroundHead, Marks, ScanHead, State, Verdict, Zones};
+use schema::{ForegroundHead, Marks, ScanHead, State, Track, TrackState, Tracks, Verdict, Zones};
 
 use super::*;
 
@@ -35,7 +35,8 @@ fn foreground() -> Box<Foreground> {
 
 fn graph(every: impl Fn(Topic) -> Option<u64>) -> Graph {
     let mut graph = Graph::new(Names::default(), false);
-    assert_eq!(graph.follow("front", &|topic| every(topic).and_then(NonZeroU64::new)), 0);
+    let of_links = |topic: Topic| every(topic).filter(|_| !topic.is_of_trackers()).and_then(NonZeroU64::new);
+    assert_eq!(graph.follow("front", &of_links), 0);
     graph
 }
 
@@ -241,4 +242,26 @@ fn of_sensors_without_a_hub_it_is_said_as_soon() {
     let told = handed(&mut graph);
     let said = told.last().map(|(_, value)| (value.text("status.0.name"), value.number("status.0.level")));
     assert_eq!(said, Some((Some("scanhub: front"), Some(3.0))), "{told:?}");
+}
+
+#[test]
+fn people_of_a_tracker_are_shapes_and_poses_in_its_map() {
+    let mut graph = Graph::new(Names::default(), false);
+    graph.follow("house", &|topic| topic.is_of_trackers().then_some(NonZeroU64::MIN));
+    assert!(graph.wants(0, Topic::Tracks) && !graph.wants(0, Topic::Scan));
+    let topics: Vec<_> = graph.topics().iter().map(|topic| (&*topic.name, topic.of)).collect();
+    assert_eq!(topics, [("/house/tracks", ros::MARKER_ARRAY), ("/house/poses", ros::POSE_ARRAY)]);
+    let mut tracks = Tracks::default();
+    tracks.push(Track { id: 5, state: TrackState::Confirmed as u8, x_m: 2.0, ..Track::default() });
+    graph.sample(0, &sample(&header(1), PayloadRef::Tracks(&tracks)), at(101 * SECOND_NS));
+    let told = handed(&mut graph);
+    assert_eq!(names(&told), ["/house/tracks", "/house/poses"]);
+    assert_eq!(
+        (told[0].1.text("markers.1.text"), told[0].1.text("markers.1.header.frame_id")),
+        (Some("5"), Some("house"))
+    );
+    assert_eq!(
+        (told[1].1.number("poses.0.position.x"), told[1].1.text("header.frame_id")),
+        (Some(2.0), Some("house"))
+    );
 }
