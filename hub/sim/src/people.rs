@@ -70,14 +70,14 @@ impl Person {
     pub(crate) fn new(plan: &Plan, random: &mut fastrand::Rng) -> Person {
         let phase = random.f64();
         let Plan { from_s, until_s, jitter_mm, leg_mm, .. } = *plan;
-        let course = match &plan.way {
-            &Way::Roam { centre, reach } => {
+        let course = match plan.way {
+            Way::Roam { centre, reach } => {
                 // Peak speed is 2 pi * reach * pace: 0.5 to 1.3 m/s, as people indoors walk.
                 let mut pace = |reach: f64| (500.0 + 800.0 * random.f64()) / (TAU * reach);
                 let pace = (pace(reach.0), pace(reach.1));
                 Course::Roam { centre, reach, pace, phase: (random.f64(), random.f64()) }
             }
-            &Way::Path { ref corners, speed, repeats } => {
+            Way::Path { ref corners, speed, repeats } => {
                 let mut corners = corners.clone();
                 for (point, _) in &mut corners {
                     *point = jittered(*point, jitter_mm, random);
