@@ -32,11 +32,11 @@ use std::time::Duration;
 
 use ::config::Sources;
 use clap::builder::{PossibleValuesParser, TypedValueParser};
-use clap::{Args, Command, CommandFactory, FromArgMatches, Parser, Subcommand, ValueEnum};
+use clap::{Args, Command, CommandFactory, FromArgMatches, Parser, Subcommand};
 use schema::{DEFAULT_DOMAIN, Domain, Environment, Failure};
 use verbs::{Bounds, duration};
 
-use crate::demo::{Cast, Families};
+use crate::demo::{Families, World};
 
 pub(crate) use self::config::Config;
 pub(crate) use background::Background;
@@ -250,30 +250,21 @@ pub(crate) struct Demo {
     /// Stop after this time, for example 10s [default: at Ctrl-C]
     #[arg(long = "for", value_name = "DURATION", value_parser = duration::parse)]
     pub(crate) run_for: Option<Duration>,
+    /// demo: two sensors on a robot. house: four sensors in two rooms, and people who are followed from room to room. tilt: a
+    /// sensor on a mount, of which obstacles in three dimensions are made
+    #[arg(long, default_value = "demo", value_name = "WORLD", value_parser = worlds())]
+    pub(crate) world: World,
     /// Seed of rooms and people
     #[arg(long, default_value_t = 1)]
     pub(crate) seed: u64,
-    /// Of which family the two sensors are; mixed: one of each family
+    /// Of which family the sensors are; mixed: one of each family
     #[arg(long, default_value = "lms", value_name = "FAMILY", value_parser = families())]
-    family: Families,
-    /// What they see: demo; or tilt, an LMS on a mount, of which obstacles in three dimensions are made
-    #[arg(long, default_value = "demo", value_name = "NAME", conflicts_with = "family")]
-    world: DemoWorld,
+    pub(crate) family: Families,
 }
 
-#[derive(Clone, Copy, Debug, ValueEnum)]
-enum DemoWorld {
-    Demo,
-    Tilt,
-}
-
-impl Demo {
-    pub(crate) fn cast(&self) -> Cast {
-        match self.world {
-            DemoWorld::Demo => Cast::Fixed(self.family),
-            DemoWorld::Tilt => Cast::Tilted,
-        }
-    }
+fn worlds() -> impl TypedValueParser<Value = World> {
+    PossibleValuesParser::new(World::NAMES)
+        .map(|name| World::parse(&name).expect("one of the possible names"))
 }
 
 fn families() -> impl TypedValueParser<Value = Families> {

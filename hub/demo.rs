@@ -1,8 +1,9 @@
-//! The whole thing in one terminal: simulated sensors of one family or of all, the hub and one consumer per sensor, each a process as in
-//! real life. This process only starts them, reads what they print, compares what was sent with what arrived, and shows
+//! The whole thing in one terminal: simulated sensors of one family or of all, the hub, one consumer per sensor, and where there are
+//! people to follow the tracker, each a process as in real life. This process only starts them, reads what they print, compares what was sent with what arrived, and shows
 //! the picture that `watch` makes of it.
 
 mod account;
+mod cast;
 mod process;
 mod stage;
 mod tilted;
@@ -15,90 +16,17 @@ use std::sync::mpsc::{self, RecvTimeoutError};
 use std::thread;
 use std::time::{Duration, Instant};
 
-use schema::{Domain, Failure, Family, Kind};
+use schema::{Domain, Failure, Kind};
 use serde::Serialize;
 use serde_json::Value;
 use verbs::{Bounds, WatchOptions};
 
 use crate::cli::watch::{can_show_pictures, colours};
 use account::Account;
+pub(crate) use cast::{Families, World};
 use process::Line;
 use stage::Stage;
 use view::View;
-
-/// A simulated sensor.
-#[derive(Clone, Debug)]
-pub(crate) struct Sensor {
-    pub(crate) name: &'static str,
-    pub(crate) family: Family,
-    /// Where it sits, as its world has it (`tests/worlds/demo.toml`): keys of its link.
-    pub(crate) pose: &'static [&'static str],
-}
-
-/// Who plays.
-#[derive(Clone, Copy, Debug)]
-pub(crate) enum Cast {
-    /// Sensors on a robot.
-    Fixed(Families),
-    /// One on a mount that tilts it, and what sees in three dimensions with it.
-    Tilted,
-}
-
-impl Cast {
-    fn sensors(self) -> Vec<Sensor> {
-        match self {
-            Cast::Fixed(families) => families.sensors(),
-            Cast::Tilted => vec![Sensor { name: "front", family: Family::Lms, pose: &["pose.x=0.06"] }],
-        }
-    }
-
-    /// The world of the simulators.
-    fn world(self) -> &'static str {
-        match self {
-            Cast::Fixed(_) => "demo",
-            Cast::Tilted => "tilt",
-        }
-    }
-}
-
-/// Of which families the sensors are.
-#[derive(Clone, Copy, Debug)]
-pub(crate) enum Families {
-    /// All of one.
-    Of(Family),
-    /// One of each.
-    Mixed,
-}
-
-impl Families {
-    /// The names in all input: of the families, and `mixed`.
-    pub(crate) fn names() -> impl Iterator<Item = &'static str> {
-        Family::ALL.into_iter().map(Family::name).chain([MIXED])
-    }
-
-    /// The families that `name` says, if it is one of [`names`](Self::names).
-    pub(crate) fn parse(name: &str) -> Option<Families> {
-        if name == MIXED { Some(Families::Mixed) } else { Family::parse(name).map(Families::Of) }
-    }
-
-    fn sensors(self) -> Vec<Sensor> {
-        let ahead = |name, family| Sensor { name, family, pose: &["pose.x=0.3"] };
-        match self {
-            Families::Of(family) => {
-                let behind = &["pose.x=-0.3", "pose.yaw=3.14159"];
-                vec![ahead("front", family), Sensor { name: "rear", family, pose: behind }]
-            }
-            // Each family has a simulator of its own, and its first sensor sits in front: one above the other.
-            Families::Mixed => ["front", "side", "top"]
-                .into_iter()
-                .zip(Family::ALL)
-                .map(|(name, family)| ahead(name, family))
-                .collect(),
-        }
-    }
-}
-
-const MIXED: &str = "mixed";
 
 /// What the demonstration is asked for.
 #[derive(Clone, Debug)]
@@ -107,10 +35,12 @@ pub(crate) struct DemoOptions {
     pub(crate) headless: bool,
     /// How long from the first sample on; until `stop` if nothing.
     pub(crate) run_for: Option<Duration>,
+    /// Where it takes place.
+    pub(crate) world: World,
     /// Seed of the rooms.
     pub(crate) seed: u64,
-    /// The sensors, and what they see.
-    pub(crate) cast: Cast,
+    /// Of which families the sensors are.
+    pub(crate) family: Families,
     /// Whether the summary is JSON.
     pub(crate) json: bool,
 }
@@ -122,19 +52,20 @@ pub(crate) struct DemoOptions {
 pub(crate) fn demo(options: &DemoOptions, out: &mut dyn Write, stop: &AtomicBool) -> Result<(), Failure> {
     let shows = !options.headless && !options.json;
     let has_picture = shows && can_show_pictures();
-    let stage = Stage::new(has_picture, options.cast)?;
+    let sensors = options.world.sensors(options.family)?;
+    let stage = Stage::new(has_picture, options.world, sensors)?;
     // Where no port is free the demonstration goes on without a browser.
     let web = if shows { stage.start_web().ok() } else { None };
     let url = web.as_ref().map(|(_, url)| url.as_str());
     let played = if has_picture {
         play_with_picture(options, &stage, url, out, stop)
     } else {
-        let (mut view, mut is_said) = (View::new(&stage.domain, url), false);
+        let (mut view, mut is_said) = (View::new(attach(&stage), url), false);
         let mut show = |account: &Account, elapsed: Duration| {
             if shows {
                 view.draw(out, account, elapsed);
             } else if !std::mem::replace(&mut is_said, true) {
-                say_ready(out, &stage.domain, options.json);
+                say_ready(out, &stage, options.json);
             }
         };
         play(options, &stage, &mut show, &|| stop.load(Ordering::Relaxed))
@@ -161,9 +92,9 @@ fn play_with_picture(
     stop: &AtomicBool,
 ) -> Result<(Account, bool), Failure> {
     let picture = WatchOptions {
-        sensors: stage.names(),
+        sensors: Vec::new(),
         colours: colours(),
-        note: url.map_or_else(|| attach(&stage.domain), |url| short(url, &stage.domain)),
+        note: url.map_or_else(|| attach(stage), |url| short(url, &stage.domain)),
         bounds: Bounds::default(),
         places: vec![stage.domain.clone()],
     };
@@ -192,8 +123,8 @@ impl Drop for Raise<'_> {
 }
 
 /// What somebody types in another terminal to look at it.
-fn attach(domain: &Domain) -> String {
-    format!("other terminal: scanhub echo front/scan --domain {}", domain.name())
+fn attach(stage: &Stage) -> String {
+    format!("other terminal: scanhub echo {} --domain {}", stage.world.topic(), stage.domain.name())
 }
 
 /// As much of it as stands beside the keys on 80 columns.
@@ -202,11 +133,12 @@ fn short(url: &str, domain: &Domain) -> String {
 }
 
 /// Says where it takes place.
-fn say_ready(out: &mut dyn Write, domain: &Domain, json: bool) {
+fn say_ready(out: &mut dyn Write, stage: &Stage, json: bool) {
+    let domain = &stage.domain;
     let ready = Ready { class: "ready", domain: domain.name(), root: domain.root(), pid: std::process::id() };
     let line = match json {
         true => crate::line(&ready),
-        false => format!("ready {} in {}; {}", ready.domain, ready.root.display(), attach(domain)),
+        false => format!("ready {} in {}; {}", ready.domain, ready.root.display(), attach(stage)),
     };
     let _ = out.write_all(format!("{line}\n").as_bytes());
 }
@@ -230,6 +162,7 @@ fn play(
     let (lines, received) = mpsc::channel();
     let hub = stage.start_hub(lines.clone())?;
     let consumers = stage.start_consumers(&lines)?;
+    let tracker = stage.start_tracker(&lines)?;
     let mut account = Account::new(&stage.sensors, stage.open_truths()?);
     // The sensors come last: whoever listens from the beginning can tell whether something was lost.
     let mut simulators = Vec::new();
@@ -241,6 +174,7 @@ fn play(
     let mut cut = None;
     loop {
         match received.recv_timeout(next_look.saturating_duration_since(Instant::now()).min(PATIENCE)) {
+            Ok(Line::Said { of: TRACKER, text }) => account.take_news(text),
             Ok(Line::Said { of, text }) => {
                 let value: Value = serde_json::from_str(&text).unwrap_or_default();
                 if value["class"] == "status" && simulators.is_empty() {
@@ -283,6 +217,7 @@ fn play(
         }
     }
     drop(tilted);
+    drop(tracker);
     drop(consumers);
     drop(hub);
     drop(simulators);
@@ -295,6 +230,7 @@ fn ended(of: usize) -> Failure {
         HUB => "the hub",
         SIMULATOR => "a simulator",
         TILTED => "what sees in three dimensions",
+        TRACKER => "the tracker of people",
         WEB => "the picture for browsers",
         _ => "a consumer",
     };
@@ -306,6 +242,7 @@ const HUB: usize = 100;
 const SIMULATOR: usize = 101;
 const WEB: usize = 102;
 const TILTED: usize = 103;
+const TRACKER: usize = 104;
 /// Between two pictures.
 const REFRESH: Duration = Duration::from_millis(250);
 /// Longest wait for a line before the clock is looked at.

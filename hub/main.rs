@@ -71,8 +71,9 @@ fn dispatch(cli: &Cli) -> Result<(), Failure> {
             let options = DemoOptions {
                 headless: demo.headless,
                 run_for: demo.run_for,
+                world: demo.world,
                 seed: demo.seed,
-                cast: demo.cast(),
+                family: demo.family,
                 json: everywhere.json,
             };
             // Without a picture it may be meant to outlive its terminal.

@@ -54,7 +54,15 @@ const EXAMPLES: &[(&str, &[&str])] = &[
             "scanhub replay walk.mcap --start 1m --end 90s --loop --paused",
         ],
     ),
-    ("demo", &["scanhub demo", "scanhub demo --family mixed", "scanhub demo --headless --for 10s"]),
+    (
+        "demo",
+        &[
+            "scanhub demo",
+            "scanhub demo --world house",
+            "scanhub demo --family mixed",
+            "scanhub demo --headless --for 10s",
+        ],
+    ),
     (
         "simulate",
         &[

@@ -23,6 +23,8 @@ pub(crate) struct Account {
     /// What was seen in three dimensions, if anything was.
     tilted: Option<Tilted>,
     hub: Option<Work>,
+    /// What happened to people last.
+    pub(crate) news: Option<String>,
     /// Processor time of the hub in percent of one processor, over the last look and over all.
     pub(crate) hub_cpu_percent: f64,
 }
@@ -82,11 +84,11 @@ struct Summary<'a> {
 }
 
 impl Account {
-    pub(crate) fn new(sensors: &[super::Sensor], truths: Vec<File>) -> Self {
-        let sensors = sensors.iter().map(|&super::Sensor { name, family, .. }| Sensor {
-            name: name.into(),
+    pub(crate) fn new(sensors: &[super::cast::Sensor], truths: Vec<File>) -> Self {
+        let sensors = sensors.iter().map(|sensor| Sensor {
+            name: sensor.name.clone(),
             state: "absent".into(),
-            turns: family != Family::Lms,
+            turns: sensor.family != Family::Lms,
             ..Sensor::default()
         });
         Account {
@@ -95,6 +97,7 @@ impl Account {
             cut_ns: u64::MAX,
             tilted: None,
             hub: None,
+            news: None,
             hub_cpu_percent: 0.0,
         }
     }
@@ -118,6 +121,11 @@ impl Account {
             }
             _ => {}
         }
+    }
+
+    /// Takes a line that the tracker of people printed.
+    pub(crate) fn take_news(&mut self, line: String) {
+        self.news = Some(line);
     }
 
     /// Whether every sensor has sent a scan.

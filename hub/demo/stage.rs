@@ -1,4 +1,4 @@
-//! Where a demonstration takes place, and who takes part: a hub, consumers and simulated sensors, in a domain and a
+//! Where a demonstration takes place, and who takes part: a hub, consumers, a tracker of people and simulated sensors, in a domain and a
 //! directory that are gone afterwards. Refuses to know what they say.
 
 use std::fs::{File, OpenOptions};
@@ -15,13 +15,14 @@ use serde_json::Value;
 use super::process::{Child, Line};
 use crate::own_domain::OwnDomain;
 
-use super::{Cast, HUB, SIMULATOR, Sensor, TILTED, WEB};
+use super::cast::{Sensor, World};
+use super::{HUB, SIMULATOR, TILTED, TRACKER, WEB};
 
 /// A domain and a directory of its own.
 pub(super) struct Stage {
     pub(super) domain: OwnDomain,
+    pub(super) world: World,
     pub(super) sensors: Vec<Sensor>,
-    cast: Cast,
     directory: PathBuf,
     /// There is a picture on the terminal, into which nobody may write.
     quiet: bool,
@@ -29,7 +30,7 @@ pub(super) struct Stage {
 
 impl Stage {
     /// `quiet`: what the processes have to say of errors is kept until [`tell_errors`](Self::tell_errors).
-    pub(super) fn new(quiet: bool, cast: Cast) -> Result<Stage, Failure> {
+    pub(super) fn new(quiet: bool, world: World, sensors: Vec<Sensor>) -> Result<Stage, Failure> {
         let domain = OwnDomain::new("demo")?;
         let name = domain.name().to_owned();
         let directory = std::env::temp_dir().join(format!("scanhub-{name}"));
@@ -42,7 +43,7 @@ impl Stage {
                 "set TMPDIR to a directory that this user may write, or remove what is in the way",
             )
         })?;
-        Ok(Stage { domain, sensors: cast.sensors(), cast, directory, quiet })
+        Ok(Stage { domain, world, sensors, directory, quiet })
     }
 
     /// Says on stderr what was kept.
@@ -59,11 +60,6 @@ impl Stage {
     fn errors(&self) -> Stdio {
         let log = OpenOptions::new().append(true).create(true).open(self.log());
         log.ok().filter(|_| self.quiet).map_or_else(Stdio::inherit, Stdio::from)
-    }
-
-    /// The names of the sensors.
-    pub(super) fn names(&self) -> Vec<String> {
-        self.sensors.iter().map(|sensor| sensor.name.to_owned()).collect()
     }
 
     /// The families of the sensors: each has a simulator of its own.
@@ -96,16 +92,19 @@ impl Stage {
     }
 
     pub(super) fn start_hub(&self, lines: mpsc::Sender<Line>) -> Result<Child, Failure> {
-        let links = self.sensors.iter().flat_map(|Sensor { name, family, pose }| {
-            let set = move |setting: &str| format!("--set=link.{name}.{setting}");
-            let link = [
+        let links = self.sensors.iter().flat_map(|Sensor { name, family, pose: [x, y, yaw] }| {
+            let set = |setting: &str| format!("--set=link.{name}.{setting}");
+            [
                 "--link".into(),
                 format!("{name}={}", self.port(name)),
                 set(&format!("family={}", family.name())),
-            ];
-            link.into_iter().chain(pose.iter().map(move |pose| set(pose)))
+                set(&format!("pose.x={x}")),
+                set(&format!("pose.y={y}")),
+                set(&format!("pose.yaw={yaw}")),
+            ]
         });
-        let links: Vec<String> = links.collect();
+        let settings = self.world.settings().iter().map(|setting| format!("--set={setting}"));
+        let links: Vec<String> = links.chain(settings).collect();
         let hub = Child::start(
             &[&["run".into(), "--json".into(), "--no-system-config".into(), FORGETS.into()], &links[..]]
                 .concat(),
@@ -126,6 +125,20 @@ impl Stage {
         self.sensors.iter().enumerate().map(start).collect()
     }
 
+    /// What follows people, where there is a site to follow them in.
+    pub(super) fn start_tracker(&self, lines: &mpsc::Sender<Line>) -> Result<Option<Child>, Failure> {
+        let Some(site) = self.world.site() else { return Ok(None) };
+        let path = self.directory.join("site.toml");
+        std::fs::write(&path, site).map_err(|error| {
+            let hint = "set TMPDIR to a directory that this user may write and that has room";
+            Failure::new(Kind::Failed, format!("cannot write {}: {error}", path.display()), hint)
+        })?;
+        let site = path.display().to_string();
+        let arguments = ["track", "--site", &site, "--as", "people", "--delay", DELAY].map(str::to_owned);
+        let listener = Some((TRACKER, lines.clone()));
+        Child::start(&arguments, &self.domain, &self.directory, listener, self.errors()).map(Some)
+    }
+
     pub(super) fn start_simulators(
         &self,
         seed: u64,
@@ -141,13 +154,14 @@ impl Stage {
         lines: mpsc::Sender<Line>,
     ) -> Result<Child, Failure> {
         let sensors = self.sensors.iter().filter(|sensor| sensor.family == family);
-        let ports: Vec<_> = sensors.flat_map(|sensor| ["--port".into(), self.port(sensor.name)]).collect();
+        let ports: Vec<_> = sensors.flat_map(|sensor| ["--port".into(), self.port(&sensor.name)]).collect();
         let truth = self.truth(family).display().to_string();
         let rest = ["--truth".into(), truth, "--seed".into(), seed.to_string(), "--json".into()];
-        let world = ["--world".into(), self.cast.world().into(), "--family".into(), family.name().into()];
-        let angles = match self.cast {
-            Cast::Fixed(_) => Vec::new(),
-            Cast::Tilted => vec!["--angles".to_owned(), MOUNT.to_owned()],
+        let world = ["--world".into(), self.world.name().into(), "--family".into(), family.name().into()];
+        let angles = if self.world == World::Tilt {
+            vec!["--angles".to_owned(), MOUNT.to_owned()]
+        } else {
+            Vec::new()
         };
         let arguments = [&["simulate".into()], &world[..], &ports[..], &rest[..], &angles[..]].concat();
         let simulator = Child::start(&arguments, &self.domain, &self.directory, None, self.errors())?;
@@ -156,7 +170,9 @@ impl Stage {
 
     /// What sees in three dimensions, if a sensor is tilted: once the angles of its mount are there.
     pub(super) fn start_tilted(&self, lines: &mpsc::Sender<Line>) -> Result<Option<Child>, Failure> {
-        let Cast::Tilted = self.cast else { return Ok(None) };
+        if self.world != World::Tilt {
+            return Ok(None);
+        }
         let arguments: Vec<String> = TILTED_VERB.iter().map(|word| (*word).to_owned()).collect();
         let listener = Some((TILTED, lines.clone()));
         Child::start(&arguments, &self.domain, &self.directory, listener, self.errors()).map(Some)
@@ -199,5 +215,7 @@ const TILTED_VERB: [&str; 11] = [
     "--as",
     "hall",
 ];
+/// How long the tracker waits for the scan of a sensor: a machine on which somebody tries things is busy.
+const DELAY: &str = "200ms";
 /// What a demonstration learns is gone with it.
 const FORGETS: &str = "--set=background.keep=false";

@@ -3,13 +3,11 @@
 use std::io::Write;
 use std::time::Duration;
 
-use schema::Domain;
-
 use super::account::{Account, Sensor};
-use super::attach;
 
 /// What was said last.
 pub(crate) struct View {
+    /// What somebody types in another terminal to look at it.
     attach: String,
     /// Where a browser sees it.
     url: Option<String>,
@@ -18,9 +16,9 @@ pub(crate) struct View {
 }
 
 impl View {
-    /// Of the demonstration in `domain`.
-    pub(crate) fn new(domain: &Domain, url: Option<&str>) -> Self {
-        View { attach: attach(domain), url: url.map(str::to_owned), seconds: 0 }
+    /// Of a demonstration that `attach` lets somebody look at, and a browser at `url`.
+    pub(crate) fn new(attach: String, url: Option<&str>) -> Self {
+        View { attach, url: url.map(str::to_owned), seconds: 0 }
     }
 
     /// Says once a second how the account is after `elapsed`.
@@ -44,6 +42,7 @@ impl View {
             self.attach.clone(),
         ];
         lines.extend(self.url.iter().map(|url| format!("browser: {url}")));
+        lines.extend(account.news.iter().map(|news| format!("people: {news}")));
         for sensor in &account.sensors {
             lines.push(String::new());
             lines.extend(sensor_lines(sensor));

@@ -117,6 +117,42 @@ fn where_the_users_own_place_is_too_long_for_a_domain() {
     nothing_was_lost(&outcome);
 }
 
+/// A verb of the program in `domain` of a demonstration that runs.
+fn beside(domain: &str, arguments: &[&str]) -> Program {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_scanhub"));
+    command.args(arguments).args(["--json", "--domain", domain]).env_clear();
+    Program::start(command)
+}
+
+#[test]
+fn people_are_followed_from_room_to_room_in_the_house() {
+    let outcome = demo(&["--world", "house", "--headless", "--json"], |mut program| {
+        let ready = program.await_line("ready", testkit::is_class("ready"));
+        let domain = ready["domain"].as_str().expect("a name");
+        let mut echo = beside(domain, &["echo", "people/tracks", "people/events"]);
+        let tracks = echo.await_line("somebody whom a sensor sees", |line| {
+            line["tracks"].as_array().is_some_and(|tracks| {
+                let is_seen = |track: &serde_json::Value| {
+                    track["state"] == "confirmed"
+                        && track["sensors"].as_array().is_some_and(|sensors| !sensors.is_empty())
+                };
+                tracks.iter().any(is_seen)
+            })
+        });
+        assert_eq!((&tracks["class"], &tracks["sensor"]), (&"tracks".into(), &"people".into()));
+        assert!(number(&tracks["tracks"][0], "id") > 0, "{tracks}");
+        let door = echo.await_line("who goes through a door", |line| line["kind"] == "door");
+        assert!(["left", "right"].iter().any(|name| door["door"] == *name), "{door}");
+        assert!(number(&door, "id") > 0, "{door}");
+        assert_eq!(echo.end(INT).code, Some(0));
+        program.end(INT)
+    });
+    assert_eq!(outcome.code, Some(0), "{outcome}");
+    nothing_was_lost_of(&outcome, &["hall", "hall-door", "kitchen", "kitchen-door"]);
+    let refused = demo(&["--world", "house", "--family", "mixed", "--headless"], Program::wait);
+    assert!(refused.code == Some(2) && refused.errors.contains("one family"), "{refused}");
+}
+
 #[test]
 fn interrupted() {
     // Its processes are there, and all of them go.

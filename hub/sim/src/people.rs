@@ -26,8 +26,8 @@ pub(crate) struct Plan {
 pub(crate) enum Way {
     /// To and fro within a reach of a centre, on a closed curve that the seed chooses.
     Roam { centre: Point, reach: Point },
-    /// From corner to corner, with so many seconds of rest at each; gone at the end.
-    Path { corners: Vec<(Point, f64)>, speed: Speed },
+    /// From corner to corner, with so many seconds of rest at each; at the end gone, or if it `repeats`, on to the first corner.
+    Path { corners: Vec<(Point, f64)>, speed: Speed, repeats: bool },
 }
 
 /// How fast.
@@ -54,8 +54,8 @@ pub(crate) struct Person {
 enum Course {
     /// `pace`: turns per second along the two axes.
     Roam { centre: Point, reach: Point, pace: Point, phase: Point },
-    /// When the person is where, and what it has walked until then; the time never goes back.
-    Path(Vec<(f64, Point, f64)>),
+    /// When the person is where, and what it has walked until then; the time never goes back. Of a lap, if it `repeats`.
+    Path { knots: Vec<(f64, Point, f64)>, repeats: bool },
 }
 
 /// Where a body is, which way it looks (a unit vector), and in which part of a double step.
@@ -70,30 +70,33 @@ impl Person {
     pub(crate) fn new(plan: &Plan, random: &mut fastrand::Rng) -> Person {
         let phase = random.f64();
         let Plan { from_s, until_s, jitter_mm, leg_mm, .. } = *plan;
-        let course = match &plan.way {
-            &Way::Roam { centre, reach } => {
+        let course = match plan.way {
+            Way::Roam { centre, reach } => {
                 // Peak speed is 2 pi * reach * pace: 0.5 to 1.3 m/s, as people indoors walk.
                 let mut pace = |reach: f64| (500.0 + 800.0 * random.f64()) / (TAU * reach);
                 let pace = (pace(reach.0), pace(reach.1));
                 Course::Roam { centre, reach, pace, phase: (random.f64(), random.f64()) }
             }
-            Way::Path { corners, speed } => {
+            Way::Path { ref corners, speed, repeats } => {
                 let mut corners = corners.clone();
                 for (point, _) in &mut corners {
                     *point = jittered(*point, jitter_mm, random);
                 }
+                if repeats {
+                    corners.push((corners[0].0, 0.0));
+                }
                 let rest_s: f64 = corners.iter().map(|corner| corner.1).sum();
                 let length: f64 = corners.windows(2).map(|pair| distance(pair[0].0, pair[1].0)).sum();
-                let speed = match *speed {
+                let speed = match speed {
                     Speed::Between(slowest, fastest) => slowest + (fastest - slowest) * random.f64(),
                     Speed::InTime => length / (until_s - from_s - rest_s),
                 };
-                Course::Path(course(&corners, from_s, speed))
+                Course::Path { knots: course(&corners, from_s, speed), repeats }
             }
         };
         // Who has to be in time is; who has a speed is gone at the end of the way.
         let until_s = match (&plan.way, &course) {
-            (Way::Path { speed: Speed::Between(..), .. }, Course::Path(knots)) => {
+            (Way::Path { speed: Speed::Between(..), .. }, Course::Path { knots, repeats: false }) => {
                 knots.last().map_or(until_s, |knot| knot.0)
             }
             _ => until_s,
@@ -148,7 +151,11 @@ impl Course {
                 let place = (centre.0 + reach.0 * sin_x, centre.1 + reach.1 * sin_y);
                 Stand { place, ahead: unit(heading), step: STEPS_HZ * time_s }
             }
-            Course::Path(knots) => {
+            Course::Path { knots, repeats } => {
+                let (first, last) = (knots[0], knots[knots.len() - 1]);
+                let lap_s = last.0 - first.0;
+                let laps = if *repeats { ((time_s - first.0) / lap_s).floor() } else { 0.0 };
+                let time_s = time_s - laps * lap_s;
                 let next = knots.partition_point(|knot| knot.0 <= time_s).clamp(1, knots.len() - 1);
                 let ((t0, a, s0), (t1, b, s1)) = (knots[next - 1], knots[next]);
                 let share = if t1 > t0 { ((time_s - t0) / (t1 - t0)).min(1.0) } else { 1.0 };
@@ -160,7 +167,7 @@ impl Course {
                 Stand {
                     place: (a.0 + (b.0 - a.0) * share, a.1 + (b.1 - a.1) * share),
                     ahead: unit(ahead),
-                    step: (s0 + (s1 - s0) * share) / DOUBLE_STEP_MM,
+                    step: (laps * last.2 + s0 + (s1 - s0) * share) / DOUBLE_STEP_MM,
                 }
             }
         }
@@ -190,7 +197,7 @@ pub(crate) fn jittered(point: Point, most_mm: f64, random: &mut fastrand::Rng) -
     (point.0 + off(), point.1 + off())
 }
 
-fn distance(a: Point, b: Point) -> f64 {
+pub(crate) fn distance(a: Point, b: Point) -> f64 {
     (a.0 - b.0).hypot(a.1 - b.1)
 }
 
@@ -255,7 +262,11 @@ mod tests {
     #[test]
     fn a_path_is_walked_from_corner_to_corner_with_its_rests() {
         let corners = vec![((0.0, 0.0), 0.0), ((0.0, 2000.0), 3.0), ((1000.0, 2000.0), 0.0)];
-        let walker = person(Way::Path { corners, speed: Speed::Between(500.0, 500.0) }, 10.0, f64::INFINITY);
+        let walker = person(
+            Way::Path { corners, speed: Speed::Between(500.0, 500.0), repeats: false },
+            10.0,
+            f64::INFINITY,
+        );
         assert!(walker.legs(9.99).is_none() && walker.legs(19.01).is_none());
         let near = |at_s: f64, place: Point| {
             let body = body(&walker, at_s);
@@ -268,17 +279,43 @@ mod tests {
     }
 
     #[test]
+    fn a_path_that_repeats_is_walked_for_ever() {
+        let corners = vec![((0.0, 0.0), 1.0), ((0.0, 2000.0), 3.0)];
+        let walker = person(
+            Way::Path { corners, speed: Speed::Between(500.0, 500.0), repeats: true },
+            10.0,
+            f64::INFINITY,
+        );
+        assert!(walker.legs(9.99).is_none());
+        // A lap takes 12 s: 4 s each way and both rests.
+        for lap_s in [0.0, 12.0, 12_000.0] {
+            for (at_s, y) in [(10.5, 0.0), (13.0, 1000.0), (17.0, 2000.0), (20.0, 1000.0)] {
+                let body = body(&walker, lap_s + at_s);
+                assert!(distance(body, (0.0, y)) < 1.0, "{lap_s} + {at_s} s: {body:?}");
+            }
+        }
+        // Neither legs nor body jump from a lap to the next one.
+        let (before, after) =
+            (walker.stand(21.999).expect("is there"), walker.stand(22.001).expect("is there"));
+        assert!((before.step - after.step).abs() < 0.001, "{} and {}", before.step, after.step);
+    }
+
+    #[test]
     fn who_stands_stands_and_who_has_to_be_in_time_is() {
-        let stands = person(Way::Path { corners: vec![((5.0, 7.0), 0.0)], speed: Speed::InTime }, 0.0, 20.0);
+        let stands = person(
+            Way::Path { corners: vec![((5.0, 7.0), 0.0)], speed: Speed::InTime, repeats: false },
+            0.0,
+            20.0,
+        );
         assert_eq!(stands.legs(0.0), stands.legs(19.9));
         assert!(stands.legs(20.0).is_none());
         let corners = vec![((0.0, 0.0), 1.0), ((0.0, 2000.0), 0.0)];
-        let walks = person(Way::Path { corners, speed: Speed::InTime }, 2.0, 7.0);
+        let walks = person(Way::Path { corners, speed: Speed::InTime, repeats: false }, 2.0, 7.0);
         assert!(distance(body(&walks, 5.0), (0.0, 1000.0)) < 1.0);
         assert!(walks.legs(6.99).is_some() && walks.legs(7.0).is_none());
         // No way at all is in time as well.
         let corners = vec![((5.0, 7.0), 1.0), ((5.0, 7.0), 0.0)];
-        let waits = person(Way::Path { corners, speed: Speed::InTime }, 2.0, 7.0);
+        let waits = person(Way::Path { corners, speed: Speed::InTime, repeats: false }, 2.0, 7.0);
         assert_eq!((waits.legs(2.0), waits.legs(7.0)), (waits.legs(6.99), None));
         assert_eq!(body(&waits, 6.99), (5.0, 7.0));
     }

@@ -30,7 +30,7 @@ pub enum World {
 }
 
 /// The scenes that the program brings along: name and text.
-const SCENES: [(&str, &str); 15] = [
+const SCENES: [(&str, &str); 16] = [
     ("room", include_str!("../../../tests/worlds/room.toml")),
     ("bare", include_str!("../../../tests/worlds/bare.toml")),
     ("fig8", include_str!("../../../tests/worlds/fig8.toml")),
@@ -45,6 +45,7 @@ const SCENES: [(&str, &str); 15] = [
     ("strips", include_str!("../../../tests/worlds/strips.toml")),
     ("crowd", include_str!("../../../tests/worlds/crowd.toml")),
     ("demo", include_str!("../../../tests/worlds/demo.toml")),
+    ("house", include_str!("../../../tests/worlds/house.toml")),
     ("tilt", include_str!("../../../tests/worlds/tilt.toml")),
 ];
 

@@ -11,6 +11,7 @@ mod layout;
 mod markers;
 mod names;
 mod point_cloud;
+mod pose_array;
 mod state;
 mod transforms;
 mod type_hash;
@@ -19,9 +20,12 @@ pub mod zenoh_wire;
 
 pub use laser_scan::laser_scan;
 pub use layout::{Value, read};
-pub use markers::{mark_markers, zone_markers};
+pub use markers::{mark_markers, people_markers, zone_markers};
 pub use names::{BASE_FRAME, DIAGNOSTICS, Names, TF_STATIC, frame, scan_topic};
 pub use point_cloud::{foreground_cloud, sweep_cloud};
+pub use pose_array::people_poses;
 pub use state::{diagnosis, hub_diagnosis, verdict_word};
 pub use transforms::static_transforms;
-pub use types::{DIAGNOSTIC_ARRAY, LASER_SCAN, MARKER_ARRAY, POINT_CLOUD, STRING, TF_MESSAGE, Type};
+pub use types::{
+    DIAGNOSTIC_ARRAY, LASER_SCAN, MARKER_ARRAY, POINT_CLOUD, POSE_ARRAY, STRING, TF_MESSAGE, Type,
+};

@@ -1,6 +1,6 @@
-//! Circles and reflectors as `visualization_msgs/msg/MarkerArray`. Refuses to know how they are found.
+//! Circles, reflectors and people as `visualization_msgs/msg/MarkerArray`. Refuses to know how they are found.
 
-use schema::{Header, Marks, Verdict, Zones};
+use schema::{Header, Marks, TrackState, Tracks, Verdict, Zones};
 
 use crate::BASE_FRAME;
 use crate::cdr::Cdr;
@@ -25,9 +25,10 @@ pub fn zone_markers(message: &mut Vec<u8>, header: &Header, zones: &Zones) {
             number: place as u32,
             kind: CYLINDER,
             action: ADD,
-            height: DISC * place as f64,
+            place: [0.0, 0.0, DISC * place as f64],
             scale: [across, across, DISC],
             color,
+            text: "",
         };
         shape.write(&mut cdr, [].into_iter());
     }
@@ -45,15 +46,52 @@ pub fn mark_markers(message: &mut Vec<u8>, frame: &str, header: &Header, marks: 
         number: 0,
         kind: SPHERE_LIST,
         action: if marks.marks().is_empty() { DELETE } else { ADD },
-        height: 0.0,
+        place: [0.0; 3],
         scale: [SPHERE; 3],
         color: YELLOW,
+        text: "",
     };
     let points = marks.marks().iter().map(|mark| {
         let (sin, cos) = (f64::from(mark.angle_mdeg) / 1000.0).to_radians().sin_cos();
         [cos, sin].map(|axis| f64::from(mark.range_dmm) / 10_000.0 * axis)
     });
     shape.write(&mut cdr, points);
+}
+
+/// Writes the people of `tracks`, in the map called `frame`, to the end of `message`: for each one who is known a column and above
+/// it the number; grey who is not seen now. Who draws them removes them a second after the last message.
+pub fn people_markers(message: &mut Vec<u8>, frame: &str, header: &Header, tracks: &Tracks) {
+    let known = || tracks.tracks().iter().filter(|track| track.state() != TrackState::Tentative);
+    let mut cdr = Cdr::begin(message);
+    cdr.u32(2 * known().count() as u32);
+    for track in known() {
+        let number = track.id.to_string();
+        let at = |z: f64| [track.x_m.into(), track.y_m.into(), z];
+        let column = Shape {
+            stamp_ns: header.wall_ns,
+            frame,
+            name: "people",
+            // Markers are told apart by an int32.
+            number: (track.id & 0x7FFF_FFFF) as u32,
+            kind: CYLINDER,
+            action: ADD,
+            place: at(PERSON / 2.0),
+            scale: [SHOULDERS, SHOULDERS, PERSON],
+            color: if track.state() == TrackState::Confirmed { BLUE } else { GREY },
+            text: "",
+        };
+        column.write(&mut cdr, [].into_iter());
+        let words = Shape {
+            name: "numbers",
+            kind: WORDS,
+            place: at(PERSON + LETTERS),
+            scale: [0.0, 0.0, LETTERS],
+            color: WHITE,
+            text: &number,
+            ..column
+        };
+        words.write(&mut cdr, [].into_iter());
+    }
 }
 
 /// What is drawn: `visualization_msgs/msg/Marker` without what only other shapes have.
@@ -64,10 +102,12 @@ struct Shape<'a> {
     number: u32,
     kind: u32,
     action: u32,
-    /// z of its centre in metres.
-    height: f64,
+    /// x, y and z of its centre in metres.
+    place: [f64; 3],
     scale: [f64; 3],
     color: [f32; 4],
+    /// What it says, if it is words.
+    text: &'a str,
 }
 
 impl Shape<'_> {
@@ -76,10 +116,8 @@ impl Shape<'_> {
         cdr.text(self.name);
         [self.number, self.kind, self.action].into_iter().for_each(|value| cdr.u32(value));
         // Where it is, not turned, how large.
-        [0.0, 0.0, self.height, 0.0, 0.0, 0.0, 1.0]
-            .into_iter()
-            .chain(self.scale)
-            .for_each(|value| cdr.f64(value));
+        let whither = [0.0, 0.0, 0.0, 1.0];
+        self.place.into_iter().chain(whither).chain(self.scale).for_each(|value| cdr.f64(value));
         self.color.into_iter().for_each(|value| cdr.f32(value));
         // How long it is drawn, in seconds and nanoseconds.
         [1, 0].into_iter().for_each(|value| cdr.u32(value));
@@ -93,8 +131,8 @@ impl Shape<'_> {
         cdr.text("");
         cdr.u32(0);
         cdr.u32(0);
-        // No words, and no mesh: its name, its file, whether its colours are used.
-        cdr.text("");
+        // Its words, and no mesh: its name, its file, whether its colours are used.
+        cdr.text(self.text);
         cdr.text("");
         cdr.text("");
         cdr.u32(0);
@@ -104,12 +142,19 @@ impl Shape<'_> {
 
 const CYLINDER: u32 = 3;
 const SPHERE_LIST: u32 = 7;
+const WORDS: u32 = 9;
 const ADD: u32 = 0;
 const DELETE: u32 = 2;
 /// Metres.
 const DISC: f64 = 0.01;
 /// Metres across.
 const SPHERE: f64 = 0.1;
+/// Metres: how tall a person is drawn, how broad, and the number above.
+const PERSON: f64 = 1.7;
+const SHOULDERS: f64 = 0.4;
+const LETTERS: f64 = 0.3;
+const BLUE: [f32; 4] = [0.1, 0.4, 0.9, 0.8];
+const WHITE: [f32; 4] = [1.0; 4];
 const GREEN: [f32; 4] = [0.1, 0.7, 0.2, 0.25];
 const RED: [f32; 4] = [0.9, 0.1, 0.1, 0.4];
 const GREY: [f32; 4] = [0.5, 0.5, 0.5, 0.25];
@@ -117,7 +162,7 @@ const YELLOW: [f32; 4] = [1.0, 0.8, 0.0, 1.0];
 
 #[cfg(test)]
 mod tests {
-    use schema::{Mark, Zone};
+    use schema::{Mark, Track, Zone};
 
     use super::*;
     use crate::{MARKER_ARRAY, Value, read};
@@ -180,5 +225,26 @@ mod tests {
         assert_eq!(told.number("markers.0.points.1.y"), Some(1.5));
         let told = drawn(&Marks::default());
         assert_eq!(told.number("markers.0.action"), Some(2.0));
+    }
+
+    #[test]
+    fn people_are_columns_with_their_numbers() {
+        let mut tracks = Tracks::default();
+        for (id, state) in [(5, TrackState::Confirmed), (6, TrackState::Tentative), (7, TrackState::Hidden)] {
+            tracks.push(Track { id, state: state as u8, x_m: id as f32, y_m: -1.0, ..Track::default() });
+        }
+        let mut message = Vec::new();
+        people_markers(&mut message, "house", &header(), &tracks);
+        let told = read(&MARKER_ARRAY, &message).unwrap();
+        assert_eq!(told.sequence("markers").map(<[Value]>::len), Some(4), "nobody who is tentative");
+        for (place, id, kind, text) in
+            [(0, 5.0, 3.0, ""), (1, 5.0, 9.0, "5"), (2, 7.0, 3.0, ""), (3, 7.0, 9.0, "7")]
+        {
+            let number = |path: &str| told.number(&format!("markers.{place}.{path}"));
+            assert_eq!((number("id"), number("type"), number("action")), (Some(id), Some(kind), Some(0.0)));
+            assert_eq!((number("pose.position.x"), number("pose.position.y")), (Some(id), Some(-1.0)));
+            assert_eq!(told.text(&format!("markers.{place}.text")), Some(text));
+            assert_eq!(told.text(&format!("markers.{place}.header.frame_id")), Some("house"));
+        }
     }
 }

@@ -82,10 +82,11 @@ mod tests {
 
     /// As PyPI's `rosbags` 0.11.9 computes them for Jazzy, `zenoh-ros2-sdk` 0.1.8 from the same text, and as they stand in
     /// published code of others who took them from ROS itself.
-    const GOLDEN: [(Type, &str); 6] = [
+    const GOLDEN: [(Type, &str); 7] = [
         (LASER_SCAN, "64c191398013af96509d518dac71d5164f9382553fce5c1f8cca5be7924bd828"),
         (POINT_CLOUD, "9198cabf7da3796ae6fe19c4cb3bdd3525492988c70522628af5daa124bae2b5"),
         (MARKER_ARRAY, "86cb8800b6fb05b5eff1abd7a56f62a5641d3ae9a1c29e78e67e704f1d067dcf"),
+        (POSE_ARRAY, "af0cc36d190e104d546d168d6b39df04fa4b4ccecf59cb4c9ed328d3d5004aa0"),
         (STRING, "df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18"),
         (DIAGNOSTIC_ARRAY, "5a8a36efb05fb25070fa0fb3810290c0e6cd4862b54a8fb975a1ee8dc55a333e"),
         (TF_MESSAGE, "e369d0f05a23ae52508854b66f6aa0437f3449d652e8cbf22d5abe85d020f087"),

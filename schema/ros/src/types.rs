@@ -109,6 +109,12 @@ pub const MARKER_ARRAY: Type = Type {
     ),
 };
 
+/// Places with directions.
+pub const POSE_ARRAY: Type = Type {
+    name: "geometry_msgs/msg/PoseArray",
+    text: text!("std_msgs/Header header" "geometry_msgs/Pose[] poses"; Header Time Pose Point Quaternion),
+};
+
 /// A word.
 pub const STRING: Type = Type { name: "std_msgs/msg/String", text: text!("string data") };
 

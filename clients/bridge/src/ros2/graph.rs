@@ -94,6 +94,8 @@ struct Slots {
     verdict: Option<usize>,
     cloud: Option<usize>,
     diagnosis: Option<usize>,
+    people: Option<usize>,
+    poses: Option<usize>,
 }
 
 /// A message that has waited longer than that is left out if there is a newer one of its topic: who keeps the last five of a
@@ -143,6 +145,8 @@ impl Graph {
             verdict: slot(Topic::Zones, "verdict", ros::STRING),
             cloud: slot(Topic::Cloud, "cloud", ros::POINT_CLOUD),
             diagnosis: None,
+            people: slot(Topic::Tracks, "tracks", ros::MARKER_ARRAY),
+            poses: slot(Topic::Tracks, "poses", ros::POSE_ARRAY),
         };
         if every[Topic::Status as usize].is_some() {
             slots.diagnosis = Some(self.publish_diagnostics());
@@ -167,7 +171,7 @@ impl Graph {
         match topic {
             Topic::Scan => goes_out(topic) || goes_out(Topic::Foreground),
             Topic::Status => true,
-            Topic::Foreground | Topic::Marks | Topic::Zones | Topic::Cloud => goes_out(topic),
+            Topic::Foreground | Topic::Marks | Topic::Zones | Topic::Cloud | Topic::Tracks => goes_out(topic),
             _ => false,
         }
     }
@@ -207,6 +211,10 @@ impl Graph {
             PayloadRef::Zones(zones) if goes_out => {
                 self.write(slots.zones, now, |message| ros::zone_markers(message, header, zones));
                 self.write(slots.verdict, now, |message| ros::verdict_word(message, zones.verdict()));
+            }
+            PayloadRef::Tracks(tracks) if goes_out => {
+                self.write(slots.people, now, |message| ros::people_markers(message, &frame, header, tracks));
+                self.write(slots.poses, now, |message| ros::people_poses(message, &frame, header, tracks));
             }
             _ => {}
         }

@@ -8,7 +8,7 @@ use serde::Deserialize;
 use toml::Spanned;
 
 use crate::layers::Layers;
-use crate::people::{Plan, Speed, Way};
+use crate::people::{Plan, Speed, Way, distance};
 use crate::scene::{Move, Scene, Sensor, Sun, Surface, Thing};
 use crate::shape::{Point, Pose, Shape};
 use crate::solid::Heights;
@@ -116,6 +116,7 @@ struct PersonFile {
     speed_mm_s: Option<Spanned<SpeedFile>>,
     centre: Option<(Number, Number)>,
     reach: Option<(Length, Length)>,
+    repeat: Option<Spanned<bool>>,
     from_s: Option<Spanned<f64>>,
     until_s: Option<Spanned<f64>>,
     jitter_mm: Option<Spanned<f64>>,
@@ -241,7 +242,7 @@ impl PersonFile {
 
     fn way(&self, span: Range<usize>, origin: &Origin, from_s: f64, until_s: f64) -> Result<Way, Failure> {
         let (path, speed) = match (&self.path, self.centre, self.reach, &self.speed_mm_s) {
-            (None, Some(centre), Some(reach), None) => {
+            (None, Some(centre), Some(reach), None) if self.repeat.is_none() => {
                 return Ok(Way::Roam { centre: point(centre), reach: (reach.0.0, reach.1.0) });
             }
             (Some(path), None, None, speed) => (path, speed),
@@ -285,7 +286,13 @@ impl PersonFile {
                 return Err(origin.refuse(path.span(), what, remedy));
             }
         };
-        Ok(Way::Path { corners, speed })
+        let repeats = self.repeat.as_ref().filter(|repeat| *repeat.get_ref());
+        let length: f64 = corners.windows(2).map(|pair| distance(pair[0].0, pair[1].0)).sum();
+        if let Some(repeat) = repeats.filter(|_| speed == Speed::InTime || length == 0.0) {
+            let remedy = "repeat = true only beside a path with several corners and speed_mm_s";
+            return Err(origin.refuse(repeat.span(), "a path that cannot be walked again and again", remedy));
+        }
+        Ok(Way::Path { corners, speed, repeats: repeats.is_some() })
     }
 }
 

@@ -1,7 +1,9 @@
 //! Messages of a hub, without one.
 
 use ros::{Value, read};
-use schema::{CloudHead, CloudPoint, ForegroundHead, Marks, ScanHead, State, Verdict, Zones};
+use schema::{
+    CloudHead, CloudPoint, ForegroundHead, Marks, ScanHead, State, Track, TrackState, Tracks, Verdict, Zones,
+};
 
 use super::*;
 
@@ -35,7 +37,8 @@ fn foreground() -> Box<Foreground> {
 
 fn graph(every: impl Fn(Topic) -> Option<u64>) -> Graph {
     let mut graph = Graph::new(Names::default(), false);
-    assert_eq!(graph.follow("front", &|topic| every(topic).and_then(NonZeroU64::new)), 0);
+    let of_links = |topic: Topic| every(topic).filter(|_| topic.maker() != schema::Maker::Tracker).and_then(NonZeroU64::new);
+    assert_eq!(graph.follow("front", &of_links), 0);
     graph
 }
 
@@ -261,4 +264,26 @@ fn a_sweep_is_one_cloud() {
         (Some(9.0), Some("base_link"))
     );
     assert_eq!(told[0].1.number("header.stamp.nanosec"), Some(7.0));
+}
+
+#[test]
+fn people_of_a_tracker_are_shapes_and_poses_in_its_map() {
+    let mut graph = Graph::new(Names::default(), false);
+    graph.follow("house", &|topic| (topic.maker() == schema::Maker::Tracker).then_some(NonZeroU64::MIN));
+    assert!(graph.wants(0, Topic::Tracks) && !graph.wants(0, Topic::Scan));
+    let topics: Vec<_> = graph.topics().iter().map(|topic| (&*topic.name, topic.of)).collect();
+    assert_eq!(topics, [("/house/tracks", ros::MARKER_ARRAY), ("/house/poses", ros::POSE_ARRAY)]);
+    let mut tracks = Tracks::default();
+    tracks.push(Track { id: 5, state: TrackState::Confirmed as u8, x_m: 2.0, ..Track::default() });
+    graph.sample(0, &sample(&header(1), PayloadRef::Tracks(&tracks)), at(101 * SECOND_NS));
+    let told = handed(&mut graph);
+    assert_eq!(names(&told), ["/house/tracks", "/house/poses"]);
+    assert_eq!(
+        (told[0].1.text("markers.1.text"), told[0].1.text("markers.1.header.frame_id")),
+        (Some("5"), Some("house"))
+    );
+    assert_eq!(
+        (told[1].1.number("poses.0.position.x"), told[1].1.text("header.frame_id")),
+        (Some(2.0), Some("house"))
+    );
 }

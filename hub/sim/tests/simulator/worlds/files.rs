@@ -51,7 +51,7 @@ fn every_world_runs_for_a_minute_as_its_name_says() {
         }
         kinds.into_iter().collect::<Vec<_>>().join(" ")
     };
-    for name in ["room", "standing", "approach", "corridor", "glass", "faint", "sun", "crowd"] {
+    for name in ["room", "standing", "approach", "corridor", "glass", "faint", "sun", "crowd", "house"] {
         assert_eq!(met(name), "grazed invalid person static", "{name}");
     }
     for name in ["fig8", "door", "chair"] {
@@ -150,6 +150,16 @@ fn what_is_no_world_is_refused_by_name_place_and_remedy() {
             "[[person]]\npath = [[0, 0], [1, 1]]\nspeed_mm_s = [9, 1]",
             "w.toml:3:14: speed",
             "the slower one first",
+        ),
+        (
+            "[[person]]\npath = [[0, 0], [1, 1]]\nuntil_s = 9\nrepeat = true",
+            "w.toml:4:10: a path that cannot",
+            "several corners and speed_mm_s",
+        ),
+        (
+            "[[person]]\npath = [[0, 0], [0, 0]]\nspeed_mm_s = 900\nrepeat = true",
+            "w.toml:4:10: a path that cannot",
+            "several corners and speed_mm_s",
         ),
         ("[[person]]\npath = [[0, 0], [1, 1]]\nspeed_mm_s = \"fast\"", "w.toml:3:14: ", "docs/worlds.md"),
         ("[[person]]\ncentre = [0, 0]\nreach = [0, 1]", "w.toml:3:9: 0 is not between 1", "docs/worlds.md"),
