@@ -92,6 +92,12 @@ impl Assignment {
         }
     }
 
+    /// Elements for which there is memory.
+    #[cfg(test)]
+    pub(crate) fn capacity(&self) -> usize {
+        self.group.capacity() + self.legs.capacity() + self.places.capacity() + self.order.capacity()
+    }
+
     fn root(&mut self, mut one: usize) -> usize {
         while self.group[one] != one {
             self.group[one] = self.group[self.group[one]];

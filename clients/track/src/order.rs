@@ -239,3 +239,80 @@ impl People {
 
 /// The filter follows each sensor in part, so that only a part of an offset shows: what that part is multiplied with.
 const FEEDBACK: f64 = 3.0;
+
+#[cfg(test)]
+mod tests {
+    use std::collections::BTreeSet;
+
+    use preprocess::background::{Model, Settings};
+    use schema::ScanHead;
+
+    use super::*;
+
+    const ROOM: &str = r#"
+[[sensor]]
+name = "front"
+pose = { x = 0.1, y = 3.0, yaw = 0.0 }
+[[room]]
+name = "hall"
+polygon = [[0, 0], [6, 0], [6, 6], [0, 6]]
+"#;
+    const BEAMS: usize = 361;
+    const SCANS: usize = 75;
+
+    fn capacity(people: &People) -> usize {
+        let queues: usize = people.queues.iter().map(VecDeque::capacity).sum();
+        let picture = people.picture.tracks.capacity() + people.picture.events.capacity();
+        people.tracker.capacity() + queues + people.spare.capacity() + picture
+    }
+
+    /// A scan of a sensor that sees a wall 3 m around it, and two legs around a beam 2 m before it.
+    fn scan(legs: Option<usize>) -> Box<Scan> {
+        let head = ScanHead {
+            first_angle: -std::f64::consts::FRAC_PI_2,
+            step: std::f64::consts::PI / 360.0,
+            unit_um: 1000,
+            valid_to: 8182,
+            no_return: 8191,
+            beyond: 8191,
+            ..ScanHead::default()
+        };
+        let is_leg = |beam: usize| legs.is_some_and(|middle| (3..=8).contains(&beam.abs_diff(middle)));
+        let words: Vec<u16> = (0..BEAMS).map(|beam| if is_leg(beam) { 2000 } else { 3000 }).collect();
+        Scan::of(head, &words)
+    }
+
+    #[test]
+    fn memory_does_not_grow_and_no_identity_comes_again_however_many_come_and_go() {
+        let site = Site::parse("room.toml", ROOM).expect("a room");
+        let mut people = People::new(site, 80_000_000);
+        let mut model = Model::new(Settings::default(), BEAMS);
+        let (mut foreground, mut now_ns) = (Foreground::of(BEAMS), 1_700_000_000_000_000_000);
+        let (mut gone, mut here) = (BTreeSet::new(), BTreeSet::new());
+        let mut turn = |people: &mut People, legs: Option<usize>| {
+            let scan = scan(legs);
+            model.update(&scan, &mut foreground);
+            now_ns += PICTURE_NS;
+            people.take(0, now_ns, &scan, &foreground, |picture| {
+                let now: BTreeSet<u64> = picture.tracks.iter().map(|track| track.id).collect();
+                gone.extend(here.difference(&now).copied());
+                assert!(now.is_disjoint(&gone), "{now:?} after {gone:?}");
+                here = now;
+            });
+        };
+        (0..300).for_each(|_| turn(&mut people, None));
+        let mut visit = |people: &mut People, number: usize| {
+            // 40 of 75 scans with somebody who walks by: he is gone, and known to be, before the next one comes.
+            for i in 0..SCANS {
+                turn(people, (i < 40).then_some(60 + number % 100 + 3 * i));
+            }
+        };
+        // Every way that there is, once.
+        (0..100).for_each(|number| visit(&mut people, number));
+        let begin = capacity(&people);
+        (100..300).for_each(|number| visit(&mut people, number));
+        assert_eq!(capacity(&people), begin);
+        assert!(gone.len() >= 200, "{}", gone.len());
+        assert_eq!(people.counts().late, 0);
+    }
+}

@@ -154,6 +154,14 @@ impl Sight {
         }
     }
 
+    /// Elements for which there is memory.
+    #[cfg(test)]
+    pub(crate) fn capacity(&self) -> usize {
+        let of_beams = self.directions.capacity() + self.ranges.capacity() + self.farthest.capacity();
+        let flags = self.farther.capacity() + self.is_foreground.capacity();
+        of_beams + flags + self.legs.capacity() + self.points.capacity()
+    }
+
     /// Beam `i` reaches `range`: single readings that are too far are noise.
     fn reach(&mut self, i: usize, range: f64) {
         let (scans, least) = &mut self.farther[i];

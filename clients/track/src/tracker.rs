@@ -329,6 +329,14 @@ impl Tracker {
         }
     }
 
+    /// Elements for which there is memory.
+    #[cfg(test)]
+    pub(crate) fn capacity(&self) -> usize {
+        let sights: usize = self.sights.iter().map(Sight::capacity).sum();
+        let lists = self.edges.capacity() + self.pairs.capacity() + self.assignment.capacity();
+        sights + lists + self.persons.capacity() + self.events.capacity() + self.misplaced.capacity()
+    }
+
     fn tell(&mut self, wall_ns: u64, number: usize, kind: Kind) {
         let Person { id, room, .. } = self.persons[number];
         self.events.push(Event { wall_ns, id, room, kind });
