@@ -200,8 +200,10 @@ impl Session {
             return;
         };
         let apart = at.saturating_sub(core::mem::replace(&mut measure.last, at));
+        let points = (span.packets * kind.points()) as f64;
+        let is_late = self.point_ns.is_some_and(|ns| apart as f64 > 1.5 * points * ns + LATE);
         // What comes at the same time came with it.
-        measure.lacks = span.reasons != 0 || (measure.lacks && apart == 0);
+        measure.lacks = span.reasons != 0 || is_late || (measure.lacks && apart == 0);
         if measure.lacks {
             return;
         }
@@ -334,6 +336,8 @@ fn put(turns: &mut crate::turn::Turns, kind: Kind, held: &Held, next: &[u8], pla
 
 /// A stream of which nobody was told how long a point takes is measured so long before it has turns.
 const SOON: Nanos = 250 * MILLIS;
+/// Nanoseconds by which packets come late that came in one piece.
+const LATE: f64 = 15e6;
 /// Some heads have to turn before they measure.
 const SPIN_UP: Nanos = 3_000 * MILLIS;
 /// Packets of one sample at the most, and its bytes.

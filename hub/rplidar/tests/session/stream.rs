@@ -151,6 +151,27 @@ fn whole_packets_that_a_full_buffer_drops_are_missing_and_told() {
     }
 }
 
+/// A pty and what is behind it keep more: what waits is read in pieces, while more comes.
+#[test]
+fn a_host_that_stops_for_longer_than_a_pty_has_room_dates_what_comes_behind_the_gap() {
+    for kind in [(Model::A3, Mode::Sensitivity), (Model::S2, Mode::DenseBoost), (Model::S3, Mode::UltraDense)]
+    {
+        for hz in [0.97, 1.03] {
+            for stall in (250..650).step_by(25) {
+                let mut bench = in_mode(kind, 3);
+                bench.head.hz *= hz;
+                bench.run(4 * SECOND);
+                bench.head.overflow(bench.now + stall * MILLIS, 17_024);
+                bench.now += stall * MILLIS;
+                bench.read(true);
+                bench.run(7 * SECOND);
+                let (worst, wrong) = bench.judge(&bench.log.turns);
+                assert!(worst < 3 * MILLIS && wrong == 0, "{kind:?} {hz} {stall}: {worst} {wrong}");
+            }
+        }
+    }
+}
+
 fn bytes_per_second(bench: &Bench) -> f64 {
     let kind = bench.head.kind().expect("measuring");
     let points = bench.session.points_per_second().expect("known");
