@@ -63,16 +63,27 @@ impl World {
 
     /// Its sensors.
     ///
-    /// [`Kind::Usage`] for different families beside the robot's hall: each one's simulator would begin with the same sensor.
+    /// [`Kind::Usage`] for different families in the house, where each one's simulator would begin with the same sensor, and
+    /// on the mount for one that has no simulated heights.
     pub(crate) fn sensors(self, families: Families) -> Result<Vec<Sensor>, Failure> {
         match (self, families) {
             (World::Robot, families) => Ok(families.around_the_robot()),
             (World::House, Families::Of(family)) => in_the_house(family),
-            (World::Tilt, Families::Of(family)) => Ok(vec![sensor("front", family, ON_THE_MOUNT)]),
-            (World::House | World::Tilt, Families::Mixed) => {
+            (World::Tilt, Families::Of(family)) if family == WITH_HEIGHTS => {
+                Ok(vec![sensor("front", family, ON_THE_MOUNT)])
+            }
+            (World::Tilt, families) => {
+                let hint = format!("only an {} is simulated on a mount", WITH_HEIGHTS.name());
+                Err(Failure::new(
+                    Kind::Usage,
+                    format!("--world tilt with --family {}", families.name()),
+                    hint,
+                ))
+            }
+            (World::House, Families::Mixed) => {
                 let names: Vec<_> = Family::ALL.into_iter().map(Family::name).collect();
-                let hint = format!("all sensors of this world are of one family: {}", names.join(", "));
-                Err(Failure::new(Kind::Usage, format!("--world {} with --family mixed", self.name()), hint))
+                let hint = format!("all sensors of the house are of one family: {}", names.join(", "));
+                Err(Failure::new(Kind::Usage, "--world house with --family mixed", hint))
             }
         }
     }
@@ -96,6 +107,13 @@ impl Families {
     /// The families that `name` says, if it is one of [`names`](Self::names).
     pub(crate) fn parse(name: &str) -> Option<Families> {
         if name == MIXED { Some(Families::Mixed) } else { Family::parse(name).map(Families::Of) }
+    }
+
+    fn name(self) -> &'static str {
+        match self {
+            Families::Of(family) => family.name(),
+            Families::Mixed => MIXED,
+        }
     }
 
     fn around_the_robot(self) -> Vec<Sensor> {
@@ -127,6 +145,8 @@ fn in_the_house(family: Family) -> Result<Vec<Sensor>, Failure> {
     Ok(sensors.collect())
 }
 
+/// Whose simulator knows heights.
+const WITH_HEIGHTS: Family = Family::ALL[0];
 const MIXED: &str = "mixed";
 /// As `tests/worlds/demo.toml` has them.
 const AHEAD: [f64; 3] = [0.3, 0.0, 0.0];

@@ -57,7 +57,7 @@ impl Packed for Cloud {
 
 impl Packed for Obstacles {
     fn pack(&self, room: &mut [u8]) -> Option<usize> {
-        write(room, &[&bytes_of(self)[..OBSTACLES_HEAD + size_of::<Obstacle>() * self.obstacles().len()]])
+        write(room, &[&bytes_of(self)[..OBSTACLES_HEAD + size_of_val(self.obstacles())]])
     }
 
     fn room(payload: &[u8]) -> Option<usize> {

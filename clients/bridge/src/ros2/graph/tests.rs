@@ -37,7 +37,9 @@ fn foreground() -> Box<Foreground> {
 
 fn graph(every: impl Fn(Topic) -> Option<u64>) -> Graph {
     let mut graph = Graph::new(Names::default(), false);
-    let of_links = |topic: Topic| every(topic).filter(|_| topic.maker() != schema::Maker::Tracker).and_then(NonZeroU64::new);
+    let of_links = |topic: Topic| {
+        every(topic).filter(|_| topic.maker() != schema::Maker::Tracker).and_then(NonZeroU64::new)
+    };
     assert_eq!(graph.follow("front", &of_links), 0);
     graph
 }
