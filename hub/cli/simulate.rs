@@ -36,7 +36,7 @@ pub(crate) struct Simulate {
     #[arg(long, default_value_t = 0, value_name = "NUMBER")]
     address: u8,
     /// What the sensors see: room, bare, fig8, standing, approach, door, corridor, glass, faint, sun, chair, strips,
-    /// crowd, demo, tilt, empty, wall640 or random; or a TOML file, see docs/worlds.md
+    /// crowd, demo, house, tilt, empty, wall640 or random; or a TOML file, see docs/worlds.md
     #[arg(long, default_value = "room", value_name = "NAME|FILE", conflicts_with = "replay")]
     world: String,
     /// Publish what the encoder of a sensor's mount says as NAME/tilt, in the domain of --domain: one name for each port, in

@@ -62,7 +62,7 @@ fn a_recording_goes_on_in_files_of_which_the_last_stay() {
     let env = TestEnv::new();
     let _others = sensor(&env);
     let file = env.word("walk.mcap");
-    let mut recorder = env.start(&["record", "--json", "--split=64KiB", "--keep=3", "-o", &file]);
+    let mut recorder = env.start(&["record", "--json", "--split=128KiB", "--keep=3", "-o", &file]);
     for _ in 0..4 {
         recorder.await_line("the next file", is_kind("file"));
     }
@@ -74,8 +74,8 @@ fn a_recording_goes_on_in_files_of_which_the_last_stay() {
     assert!(gone.iter().all(|file| !file.exists()), "{files:?}");
     // A machine that has no time for the recorder makes one chunk of what came meanwhile.
     let lengths: Vec<_> = stay.iter().map(|file| fs::metadata(file).unwrap().len()).collect();
-    assert!(lengths.iter().all(|length| *length <= 96 << 10), "{lengths:?}");
-    assert!(lengths.iter().filter(|length| **length <= 64 << 10).count() > 1, "{lengths:?}");
+    assert!(lengths.iter().all(|length| *length <= 160 << 10), "{lengths:?}");
+    assert!(lengths.iter().filter(|length| **length <= 128 << 10).count() > 1, "{lengths:?}");
     let recordings: Vec<_> = stay.iter().map(|file| Recording::whole(file)).collect();
     let wanted = |number: usize| (files.len() - 3 + number).to_string();
     for (number, recording) in recordings.iter().enumerate() {

@@ -40,7 +40,7 @@ impl Split {
         let size = (size * *factor as f64) as u64;
         match (SMALLEST..=LARGEST).contains(&size) {
             true => Ok(Split::Bytes(size)),
-            false => Err(format!("{text:?}: a file takes 64KiB to 1024TiB")),
+            false => Err(format!("{text:?}: a file takes 128KiB to 1024TiB")),
         }
     }
 }
@@ -55,7 +55,8 @@ const UNITS: [(&str, u64); 8] = [
     ("GiB", 1 << 30),
     ("TiB", 1 << 40),
 ];
-const SMALLEST: u64 = 64 << 10;
+/// Half of it is what every file says of its topics.
+const SMALLEST: u64 = 128 << 10;
 const LARGEST: u64 = 1 << 50;
 const SHORTEST: Duration = Duration::from_secs(1);
 

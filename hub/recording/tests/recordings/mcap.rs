@@ -111,7 +111,7 @@ fn one_without_its_beginning_is_known_by_its_end_or_its_messages() {
     let blank = [&[0; 4096], &written.bytes[4096..]].concat();
     let middle = written.bytes[len / 3..len / 2].to_vec();
     for (name, bytes, sensors, telegrams) in [
-        ("rest", written.bytes[len / 3..].to_vec(), ["front", "rear"], 40..60),
+        ("rest", written.bytes[len / 3..].to_vec(), ["front", "rear"], 40..72),
         ("end", written.bytes[end..].to_vec(), ["front", "rear"], 0..8),
         ("blank", blank, ["front", "rear"], 60..81),
         ("middle", middle.clone(), ["sensor0", "sensor1"], 8..24),
