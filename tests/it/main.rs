@@ -60,6 +60,7 @@ mod real_speed;
 mod reconnect;
 mod record;
 mod record_disk;
+mod recorded_world;
 mod recordings;
 mod refusals;
 mod reload;

@@ -2,9 +2,8 @@
 //! recording, a site file with a sensor that there is not, a plan that is drawn once.
 
 use crate::pages::start_program_of_trackers;
-use crate::testkit::{
-    BEGIN_NS, INT, Outcome, Program, Recording, TERM, TestEnv, is_class, number, recorded_world, until,
-};
+use crate::recorded_world::{BEGIN_NS, recorded_world};
+use crate::testkit::{INT, Outcome, Program, Recording, TERM, TestEnv, is_class, number, until};
 use schema::datagram::Packed;
 use schema::{Event, EventKind, TrackState, Tracks};
 use sim::world::World;

@@ -4,7 +4,8 @@ use std::path::Path;
 use std::time::Duration;
 
 use crate::browser::{Browser, Look};
-use crate::testkit::{INT, KILL, Program, TestEnv, hold_in_time, recorded_world, skip, until};
+use crate::recorded_world::recorded_world;
+use crate::testkit::{INT, KILL, Program, TestEnv, hold_in_time, skip, until};
 use sim::world::World;
 
 /// A hall with a reflector, and a post that is put beside the robot when its background is learned.

@@ -10,7 +10,7 @@ use schema::{Header, Topic};
 use sim::room::Room;
 use sim::world::World;
 
-use super::TestEnv;
+use crate::testkit::TestEnv;
 
 /// When the world begins, by the wall clock.
 pub(crate) const BEGIN_NS: u64 = 1_700_000_000_000_000_000;
