@@ -73,7 +73,7 @@ impl NameLock {
 }
 
 impl Drop for NameLock {
-    /// The last one out takes the names of the shared memory along, as [`Publishing`] does.
+    /// The last one out takes the names of the shared memory along, as `Publishing` does.
     fn drop(&mut self) {
         if let Ok(None) = publisher(&self.root) {
             ipc::forget_names(&self.root);
