@@ -83,10 +83,7 @@ impl Sink for Echo<'_> {
     }
 
     fn notice(&mut self, names: &[&TopicName], notice: Notice) -> Result<(), End> {
-        match self.format {
-            Format::Json => json::notices(&mut self.out, names, notice),
-            _ => self.notes.line(|line| text::notice(line, names, notice)),
-        }
+        notice.tell(names, self.format == Format::Json, &mut self.out, &mut self.notes)
     }
 
     fn summary(&mut self, name: &TopicName, stats: &ReceiveStats) -> Result<(), End> {

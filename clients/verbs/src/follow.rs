@@ -3,6 +3,7 @@
 
 mod discovery;
 mod lines;
+mod notice;
 mod shortage;
 mod track;
 
@@ -21,6 +22,8 @@ use lines::{LineTrack, watch_parts};
 use shortage::Shortage;
 use track::Track;
 
+pub use notice::Notice;
+
 /// When a verb that follows ends by itself.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Bounds {
@@ -37,19 +40,6 @@ impl Bounds {
     pub(crate) fn bounded(&self) -> bool {
         self.count.is_some() || self.run_for.is_some()
     }
-}
-
-/// What went wrong in a stream, beside its samples.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Notice {
-    /// So many samples were sent and not received.
-    Missed(u64),
-    /// Nothing came for longer than the topic's samples are apart.
-    Stale,
-    /// No hub lives in the domain.
-    HubGone,
-    /// A hub lives in the domain again.
-    HubBack,
 }
 
 /// What a verb does with what it follows.

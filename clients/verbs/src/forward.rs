@@ -20,7 +20,6 @@ use crate::discovery::Discovery;
 use crate::follow::Notice;
 use crate::names::no_sensor;
 use crate::output::{End, Output};
-use crate::{json, text};
 pub use account::account;
 pub use life::Life;
 pub use selection::Selection;
@@ -176,10 +175,7 @@ impl Forwarder {
 ///
 /// If it cannot be written.
 pub fn tell(notice: Notice, json: bool, out: &mut Output<'_>, notes: &mut Output<'_>) -> Result<(), End> {
-    if json {
-        return json::notices(out, &[], notice);
-    }
-    notes.line(|line| text::notice(line, &[], notice))
+    notice.tell(&[], json, out, notes)
 }
 
 /// Begins a life of the gateway of `domain` by this `way`, as `Life::begin`, on this machine and now.

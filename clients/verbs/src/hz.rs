@@ -114,10 +114,7 @@ impl Sink for Hz<'_> {
         if notice == Notice::HubBack {
             names.iter().for_each(|name| self.subscribed(name));
         }
-        if self.json {
-            return json::notices(&mut self.out, names, notice);
-        }
-        self.notes.line(|line| text::notice(line, names, notice))
+        notice.tell(names, self.json, &mut self.out, &mut self.notes)
     }
 
     fn tick(&mut self, now: Instant) -> Result<(), End> {

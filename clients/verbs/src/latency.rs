@@ -153,10 +153,7 @@ impl Sink for Latency<'_> {
             let now_ns = clock::now_ns();
             self.topics.iter_mut().for_each(|(_, spans)| spans.begin(now_ns));
         }
-        if self.json {
-            return json::notices(&mut self.out, names, notice);
-        }
-        self.notes.line(|line| text::notice(line, names, notice))
+        notice.tell(names, self.json, &mut self.out, &mut self.notes)
     }
 
     fn tick(&mut self, now: Instant) -> Result<(), End> {

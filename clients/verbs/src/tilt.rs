@@ -135,10 +135,7 @@ impl Sink for Verb<'_> {
         if let Notice::Missed(count) = notice {
             self.missed += count;
         }
-        match self.teller.is_json {
-            true => json::notices(&mut self.teller.out, names, notice),
-            false => self.teller.notes.line(|line| text::notice(line, names, notice)),
-        }
+        notice.tell(names, self.teller.is_json, &mut self.teller.out, &mut self.teller.notes)
     }
 
     fn summary(&mut self, _: &TopicName, _: &ReceiveStats) -> Result<(), End> {

@@ -183,10 +183,7 @@ impl Sink for Verb<'_> {
         if let Notice::Missed(count) = notice {
             self.missed += count;
         }
-        match self.options.json {
-            true => json::notices(&mut self.teller.out, names, notice),
-            false => self.teller.notes.line(|line| text::notice(line, names, notice)),
-        }
+        notice.tell(names, self.options.json, &mut self.teller.out, &mut self.teller.notes)
     }
 
     fn summary(&mut self, _: &TopicName, _: &ReceiveStats) -> Result<(), End> {
