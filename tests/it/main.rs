@@ -88,6 +88,7 @@ mod tidy;
 mod tilt;
 mod tilted;
 mod track;
+mod track_page;
 mod two_machines;
 mod vendor;
 mod watch;

@@ -142,6 +142,14 @@ pub(crate) fn commands_on(page: &str, begins: &[&str]) -> Vec<Vec<String>> {
     lines.map(|line| shell::commands(&line).remove(0).split_off(1)).collect()
 }
 
+/// The block of `page` that is in `language` and begins with `begin`.
+pub(crate) fn text_on(page: &str, language: &str, begin: &str) -> String {
+    let is_it = |block: &Block| {
+        block.place.starts_with(page) && block.language == language && block.text.starts_with(begin)
+    };
+    blocks().into_iter().find(is_it).unwrap_or_else(|| panic!("{page} has no {begin:?}")).text
+}
+
 fn is_program(block: &Block) -> bool {
     ["python", "rust", "c", "cpp"].contains(&block.language.as_str())
 }

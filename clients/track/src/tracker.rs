@@ -138,13 +138,14 @@ impl Tracker {
                 Life::Tentative => GATE_TENTATIVE,
                 Life::Known => GATE,
             };
-            let (place, is_slow) = (person.filter.place(), person.speed() < 0.5);
+            // What the background has learned holds who is known and stands, and makes nobody known.
+            let (place, stands) = (person.filter.place(), person.is_known() && person.speed() < 0.5);
             for (side, which) in Side::BOTH.into_iter().enumerate() {
                 let (expected, variance) = person.filter.leg(which);
                 for (leg, found) in legs.iter().enumerate() {
                     let off = minus(found.at, expected);
                     let off2 = off[0] * off[0] + off[1] * off[1];
-                    if off2 > 1.0 || !(found.is_fresh || is_slow) {
+                    if off2 > 1.0 || !(found.is_fresh || stands) {
                         continue;
                     }
                     let variance = variance + found.sigma_m * found.sigma_m;

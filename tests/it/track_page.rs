@@ -1,0 +1,83 @@
+//! docs/tracks.md, walked as it stands: its site, a sensor of another machine in it, its commands, and what it says that they
+//! print.
+
+use crate::pages::text_on;
+use crate::recorded_world::recorded_world;
+use crate::testkit::{INT, Program, TERM, TestEnv, in_a_network, is_class, number, until};
+use sim::world::World;
+
+const PAGE: &str = "docs/tracks.md";
+
+/// The site of the page: two rooms, and between them a corridor through which the first person goes from `hall` to `kitchen`. A
+/// sensor looks from the middle of each outer wall.
+const WORLD: &str = r#"
+[[sensor]]
+pose = [0, 2500, 0]
+[[sensor]]
+pose = [14000, 2500, 180]
+[[thing]]
+line = [[-20, 0], [14020, 0], [14020, 5000], [-20, 5000], [-20, 0]]
+[[thing]]
+line = [[6000, 0], [6000, 2500]]
+[[thing]]
+line = [[6000, 3500], [6000, 5000]]
+[[thing]]
+line = [[8000, 0], [8000, 2500]]
+[[thing]]
+line = [[8000, 3500], [8000, 5000]]
+[[thing]]
+line = [[6000, 2000], [8000, 2000]]
+[[thing]]
+line = [[6000, 4000], [8000, 4000]]
+[[person]]
+path = [[2000, 3500, 2], [5500, 3000], [8500, 3000], [11000, 2500, 60]]
+speed_mm_s = 1000
+from_s = 12
+"#;
+
+/// The robot, and the machine in the kitchen: each with the recording of its own sensor.
+fn play(env: &TestEnv, file: &str, sensor: &str) -> Program {
+    let flags = ["--json", "--paused", "--hold"];
+    env.start(&[&["replay", file, "--sensor", sensor][..], &flags].concat()).ready()
+}
+
+#[test]
+fn somebody_goes_from_the_hall_to_the_kitchen_as_the_page_says() {
+    in_a_network("track_page::somebody_goes_from_the_hall_to_the_kitchen_as_the_page_says", || {
+        let [robot, kitchen] = [TestEnv::in_time(), TestEnv::in_time()];
+        let site = robot.file("house.toml", text_on(PAGE, "toml", "[[sensor]]"));
+        let checked = robot.run(&["site", "check", &site]);
+        assert_eq!(checked.code, Some(0), "{checked}");
+
+        let world = World::of_toml("world.toml", WORLD).expect("a world");
+        let file = recorded_world(&robot, &world, &["front", "rear"], 30);
+        let _played = [play(&robot, &file, "front"), play(&kitchen, &file, "rear")];
+        let mut gateway = kitchen.gateway_at(&["--interface=lo", "--topic=*/scan", "--topic=*/foreground"]);
+        let hub = gateway.await_line("its begin", is_class("gateway"))["hub"].clone();
+        let name = format!("--name=kitchen={}", hub.as_str().expect("the number of a hub"));
+        let mut listen = robot.start(&["listen", "--publish", "--json", &name]).ready();
+        listen.await_line("the sensor in the kitchen", |line| line["sensor"] == "kitchen.rear");
+
+        // Twice as the page has them; both wait longer than it says, for a machine that is busy.
+        let mut track = robot.start(&["track", "--site", &site, "--delay=2s"]);
+        let count = robot.start(&["track", "--site", &site, "--count", "left", "--delay=2s"]);
+        until("they follow all sensors", || {
+            let listed = robot.run(&["list", "--json"]).of_class("topic");
+            let followed = listed
+                .iter()
+                .filter(|line| ["scan", "foreground"].iter().any(|topic| line["topic"] == *topic));
+            followed.filter(|line| number(line, "subscribers") == 2).count() == 4
+        });
+        for (env, sensor) in [(&kitchen, "rear"), (&robot, "front")] {
+            let resumed = env.run(&["control", sensor, "resume"]);
+            assert_eq!(resumed.code, Some(0), "{resumed}");
+        }
+        for line in text_on(PAGE, "text", "1 appeared in hall").lines() {
+            assert_eq!(track.next_text(), line);
+        }
+        let sum = String::from_utf8(track.end(INT).out).expect("text");
+        assert!(sum.contains("1 people appeared"), "{sum}");
+        let counted = String::from_utf8(count.end(TERM).out).expect("text");
+        assert!(counted.starts_with("left: 1 forth, 0 back\n"), "{counted}");
+    });
+}
