@@ -165,7 +165,10 @@ fn programs_in_other_languages_say_how_a_mount_stands_and_the_post_is_an_obstacl
         let obstacles = found.of_class("obstacles").into_iter().find(has_obstacle).expect("the post");
         let [x, y] = ["x_m", "y_m"].map(|key| obstacles["obstacles"][0][key].as_f64().expect("a number"));
         assert!((x - 1.42).abs() < 0.1 && y.abs() < 0.1, "{obstacles}");
-        assert!(number(&found.of_class("summary")[0], "angles") > 100, "{found}");
+        let sum = &found.of_class("summary")[0];
+        let unfit =
+            ["angles_unordered", "angles_ahead", "angles_unfit", "missed"].map(|key| number(sum, key));
+        assert_eq!(unfit, [0; 4], "{sum}");
     }
     ends_well(hall);
 }
