@@ -295,6 +295,18 @@ fn the_examples_build_and_run() {
         assert_eq!(said.lines().count(), 5, "{said}");
         assert!(said.lines().all(|line| line.contains(" m at ") && line.ends_with(" degrees")), "{said}");
     }
+    let mut mounts = vec![installed.compile(&env, &examples.join("mount.c"), &[])];
+    mounts.extend(cmake.iter().map(|build| build.join("mount")));
+    for path in &mounts {
+        let mount = program(&env, path, &["swing"]);
+        let lines = env.echo(&["swing/tilt"]).await_lines(20, "angles", is_class("tilt"));
+        assert!(
+            lines.iter().all(|line| (0.0..28.7).contains(&line["angle_deg"].as_f64().expect("a number")))
+        );
+        let again = program(&env, path, &["swing"]).wait();
+        assert!(again.code == Some(1) && again.errors.contains("publishes as swing"), "{again}");
+        assert_eq!(mount.end(INT).errors, "");
+    }
     let Some(stop) = installed.compile_cpp(&env, &examples.join("stop.cpp")) else { return };
     for stop in cmake.iter().map(|build| build.join("stop")).chain([stop]) {
         let outcome = program(&env, &stop, &["Front"]).wait();

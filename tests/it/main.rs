@@ -55,6 +55,7 @@ mod pages;
 mod ports;
 mod probe;
 mod processed;
+mod publishers;
 mod python;
 mod real_speed;
 mod reconnect;

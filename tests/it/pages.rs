@@ -10,7 +10,7 @@ mod shell;
 
 use crate::testkit::{INT, Outcome, Program, TERM, TestEnv, is_class, side_by_side, until};
 use blocks::{Block, blocks};
-use program::Example;
+pub(crate) use program::Example;
 use rustix::time::{ClockId, clock_gettime};
 
 /// A room, and a sensor in it.
@@ -154,27 +154,25 @@ fn is_program(block: &Block) -> bool {
     ["python", "rust", "c", "cpp"].contains(&block.language.as_str())
 }
 
-/// Pages whose programs follow a tracker, and not a hub; `track.rs` runs them beside one.
-const OF_TRACKERS: &str = "docs/tracks.md";
+/// Pages whose programs follow a tracker, or publish a mount, and follow no hub; `track.rs` and `tilt.rs` run them.
+const OF_OTHERS: [&str; 2] = ["docs/tracks.md", "docs/tilt.md"];
 
-/// Starts the program for people who follow a tracker; nothing, said, where this machine cannot run it.
-pub(crate) fn start_program_of_trackers(env: &TestEnv) -> Option<Program> {
-    let block = blocks().into_iter().find(|block| is_program(block) && block.place.starts_with(OF_TRACKERS));
-    let example = Example::build(&block.expect("a program"), env).expect("it is built");
-    example.map(|example| Program::start(example.command(env)))
-}
-
-/// Starts the program that says how a mount stands.
-pub(crate) fn start_program_of_mounts(env: &TestEnv) -> Option<Program> {
-    let is_it = |block: &Block| block.place.starts_with("docs/tilt.md") && block.language == "rust,no_run";
-    let block = blocks().into_iter().find(is_it).expect("a program");
-    let example = Example::build(&Block { language: "rust".to_owned(), ..block }, env).expect("it is built");
-    example.map(|example| Program::start(example.command(env)))
+/// The programs on `page` in which these `words` stand, as far as this machine can run them.
+pub(crate) fn programs_on(page: &str, words: &str, env: &TestEnv) -> Vec<Example> {
+    let is_wanted = |block: &Block| block.place.starts_with(page) && block.text.contains(words);
+    let blocks = blocks().into_iter().filter(is_wanted).map(|block| match block.language.as_str() {
+        "rust,no_run" => Block { language: "rust".to_owned(), ..block },
+        _ => block,
+    });
+    let programs: Vec<Block> = blocks.filter(is_program).collect();
+    assert!(!programs.is_empty(), "{page} has no program with {words}");
+    programs.iter().filter_map(|block| Example::build(block, env).expect("it is built")).collect()
 }
 
 #[test]
 fn every_program_on_a_page_runs_and_tells_distances_only_where_there_are_some() {
-    let is_of_hubs = |block: &Block| is_program(block) && !block.place.starts_with(OF_TRACKERS);
+    let is_of_others = |block: &Block| OF_OTHERS.iter().any(|page| block.place.starts_with(page));
+    let is_of_hubs = |block: &Block| is_program(block) && !is_of_others(block);
     let blocks: Vec<Block> = blocks().into_iter().filter(is_of_hubs).collect();
     assert!(blocks.len() > 10, "{blocks:#?}");
     let wrong = wrong_with(&blocks, &SITUATIONS);

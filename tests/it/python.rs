@@ -22,7 +22,7 @@ fn check(name: &str) -> Option<Command> {
 }
 
 /// The same with the environment's domain and root as its first arguments.
-fn check_on(env: &TestEnv, name: &str) -> Option<Command> {
+pub(crate) fn check_on(env: &TestEnv, name: &str) -> Option<Command> {
     let mut command = check(name)?;
     let place = env.place();
     let root = place.root().parent().expect("a domain is below its base");
@@ -52,6 +52,13 @@ fn structs_are_golden() {
 #[test]
 fn verdicts_grow_stale() {
     let Some(command) = check("freshness") else { return };
+    passed(command);
+}
+
+#[test]
+fn early_warnings_count_as_in_rust() {
+    let Some(mut command) = check("early") else { return };
+    command.arg(Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/vectors/early.txt"));
     passed(command);
 }
 

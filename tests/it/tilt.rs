@@ -1,8 +1,11 @@
 //! `scanhub tilt`, from telegrams and angles to points and an obstacle: as its page walks through it, and with angles that stop.
 
+use scanhub_client::Subscription;
+use schema::Tilt;
 use serde_json::Value;
 
-use crate::pages::{commands_on, start_program_of_mounts};
+use crate::pages::{commands_on, programs_on};
+use crate::publishers::{Mount, languages};
 use crate::testkit::{INT, Outcome, Program, TestEnv, is_class, number};
 
 /// A hall with a post ahead of a sensor that swings slowly: how late the hub stamps scans on a busy machine moves points little.
@@ -37,9 +40,14 @@ struct Hall {
 
 impl Hall {
     fn new() -> Hall {
+        Hall::of_encoder("mount")
+    }
+
+    /// One where the mount's encoder has this name.
+    fn of_encoder(name: &str) -> Hall {
         let env = TestEnv::new();
         let world = env.file("hall.toml", WORLD);
-        let flags = [format!("--world={world}"), "--angles=mount".into(), "--baud=500000".into()];
+        let flags = [format!("--world={world}"), format!("--angles={name}"), "--baud=500000".into()];
         let simulator = env.simulator(&["front"], &flags);
         let hub = env.hub(&[env.link("front")]);
         env.await_info("front", |info| info["state"] == "streaming");
@@ -117,15 +125,52 @@ fn points_are_where_things_are_and_the_post_is_an_obstacle() {
 }
 
 #[test]
-fn the_program_of_the_page_says_how_a_mount_stands() {
+fn the_programs_of_the_page_say_how_a_mount_stands() {
     let env = TestEnv::new();
     let _hub = env.hub(&[env.link("front")]);
-    let Some(mount) = start_program_of_mounts(&env) else { return };
-    let mut echo = env.echo(&["mount/tilt"]);
-    let line = echo.await_line("an angle", is_class("tilt"));
-    let angle = line["angle_deg"].as_f64().expect("a number");
-    assert!((0.0..28.7).contains(&angle) && line["rate_deg_s"].is_null(), "{line}");
-    mount.end(INT);
+    for example in programs_on("docs/tilt.md", "mount", &env) {
+        let mount = Program::start(example.command(&env));
+        let mut echo = env.echo(&["mount/tilt"]);
+        let angle_deg = |line: &Value| line["angle_deg"].as_f64().expect("a number");
+        let lines = echo.await_lines(50, &example.place, is_class("tilt"));
+        let is_right = |line: &Value| (0.0..28.7).contains(&angle_deg(line)) && line["rate_deg_s"].is_null();
+        assert!(lines.iter().all(is_right), "{}: {lines:?}", example.place);
+        assert!(angle_deg(&lines[0]) != angle_deg(&lines[49]), "{}: it stands", example.place);
+        let outcome = mount.end(INT);
+        // An interrupt ends a program in Python with words.
+        assert!(outcome.errors.is_empty() || outcome.errors.contains("KeyboardInterrupt"), "{outcome}");
+    }
+}
+
+/// A servo or an encoder whose program is not in Rust: it hears the encoder of the world, and says it again.
+#[test]
+fn programs_in_other_languages_say_how_a_mount_stands_and_the_post_is_an_obstacle() {
+    let hall = Hall::of_encoder("encoder");
+    for start in languages(&hall.env) {
+        let mut mount = Mount::publishing(start("mount"));
+        let mut tilt = hall.tilt(&[NEAR]);
+        let mut encoder = Subscription::<Tilt>::in_domain(vec![hall.env.place()], "encoder").expect("a name");
+        let mut said = 0;
+        let found = loop {
+            assert!(said < 10_000, "no obstacle in so many angles");
+            said += 1;
+            let angle = encoder.next().expect("a domain").expect("without a timeout");
+            mount.send(&angle, angle.header().stamp_first_ns);
+            drop(angle);
+            if tilt.is_heard(has_obstacle) {
+                break tilt.end(INT);
+            }
+        };
+        assert_eq!(mount.end().code, Some(0));
+        let obstacles = found.of_class("obstacles").into_iter().find(has_obstacle).expect("the post");
+        let [x, y] = ["x_m", "y_m"].map(|key| obstacles["obstacles"][0][key].as_f64().expect("a number"));
+        assert!((x - 1.42).abs() < 0.1 && y.abs() < 0.1, "{obstacles}");
+        let sum = &found.of_class("summary")[0];
+        let unfit =
+            ["angles_unordered", "angles_ahead", "angles_unfit", "missed"].map(|key| number(sum, key));
+        assert_eq!(unfit, [0; 4], "{sum}");
+    }
+    ends_well(hall);
 }
 
 fn ends_well(hall: Hall) {

@@ -1,7 +1,7 @@
 //! `scanhub track` and `scanhub site`, from telegrams to who is where: one person from room to room, the same tracks again of a
 //! recording, a site file with a sensor that there is not, a plan that is drawn once.
 
-use crate::pages::start_program_of_trackers;
+use crate::pages::programs_on;
 use crate::recorded_world::{BEGIN_NS, recorded_world};
 use crate::testkit::{INT, Outcome, Program, Recording, TERM, TestEnv, is_class, number, until};
 use schema::datagram::Packed;
@@ -47,7 +47,11 @@ from_s = 12
 
 /// What both sensors see over so many seconds.
 pub(crate) fn recorded(env: &TestEnv, seconds: u64) -> String {
-    let world = World::of_toml("world.toml", WORLD).expect("a world");
+    recorded_of(env, WORLD, seconds)
+}
+
+fn recorded_of(env: &TestEnv, world: &str, seconds: u64) -> String {
+    let world = World::of_toml("world.toml", world).expect("a world");
     recorded_world(env, &world, &["hall", "kitchen"], seconds)
 }
 
@@ -65,7 +69,8 @@ fn somebody_goes_from_room_to_room_and_is_counted() {
     let _replay = replay(&env, &recorded(&env, 28));
     let mut counts = env.start(&["track", "--site", &site, "--count=middle", "--delay=2s", "--json"]);
     let (mut track, _record) = follow_and_record(&env, &site, &env.word("tracks.mcap"));
-    let program = start_program_of_trackers(&env);
+    let program = programs_on("docs/tracks.md", "house/tracks", &env).pop();
+    let program = program.map(|example| Program::start(example.command(&env)));
     until("the counts are followed", || {
         let listed = env.run(&["list", "--json"]).of_class("topic");
         let scans = listed.iter().filter(|line| line["topic"] == "scan" || line["topic"] == "foreground");
@@ -192,6 +197,35 @@ fn a_replay_of_a_recording_gives_the_same_tracks_bit_for_bit() {
         return;
     }
     panic!("three times the machine stood still for longer than topics keep samples");
+}
+
+/// What `track` says on its lines, the program of the page says while it goes on.
+#[test]
+fn events_come_to_a_program_in_python_live_in_order_and_none_is_lost() {
+    let env = TestEnv::in_time();
+    let Some(example) = programs_on("docs/tracks.md", "house/events", &env).pop() else { return };
+    let site = env.file("site.toml", SITE);
+    let to_and_fro =
+        WORLD.replace("[9500, 2000, 60]]", "[9500, 2000], [7000, 2500], [5000, 2500]]\nrepeat = true");
+    let _replay = replay(&env, &recorded_of(&env, &to_and_fro, 45));
+    let (mut track, record) = follow_and_record(&env, &site, &env.word("tracks.mcap"));
+    let mut program = Program::start(example.command(&env));
+    until("both follow the events", || env.subscribers("house/events") == 2);
+    env.run(&["control", "hall", "resume"]);
+    let mut doors = 0;
+    while doors < 3 {
+        let event = track.await_line("an event", is_class("event"));
+        let word = |key: &str| event[key].as_str().expect("a word").to_owned();
+        let (id, kind, room) = (&event["id"], word("kind"), event["room"].as_str().unwrap_or("None"));
+        let door = match kind.as_str() {
+            "door" => format!(" from {} through {}", word("from"), word("door")),
+            _ => String::new(),
+        };
+        doors += usize::from(kind == "door");
+        assert_eq!(program.next_text(), format!("0 missed, {id} {kind} {room}{door}"), "{event}");
+    }
+    assert!(!track.is_over() && !program.is_over(), "it was live");
+    drop((track, record));
 }
 
 #[test]

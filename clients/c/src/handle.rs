@@ -137,9 +137,15 @@ impl Handle {
         Ok(Handle::of(Source::open(places, sensor, topic, wait)?))
     }
 
-    /// Will follow the robot of `sensors` (none: all) in the first live one of `places`.
-    pub(crate) fn open_robot(places: Vec<Domain>, sensors: &[&str], wait: Wait) -> Result<Handle, CallError> {
-        Ok(Handle::of(Source::Robot(RobotFollower::in_domain(places, sensors)?.wait_by(wait))))
+    /// Will follow the robot of `sensors` (none: all) in the first live one of `places`, with its `early` warnings or without.
+    pub(crate) fn open_robot(
+        places: Vec<Domain>,
+        sensors: &[&str],
+        wait: Wait,
+        early: bool,
+    ) -> Result<Handle, CallError> {
+        let robot = RobotFollower::in_domain(places, sensors)?.wait_by(wait);
+        Ok(Handle::of(Source::Robot(if early { robot.with_early() } else { robot })))
     }
 
     fn of(source: Source) -> Handle {

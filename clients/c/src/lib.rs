@@ -6,12 +6,14 @@ mod boundary;
 mod call_error;
 mod export;
 mod handle;
+mod mount;
 mod robot;
 mod table;
 
 pub use boundary::Lent;
 pub use export::{
     scanhub_close, scanhub_error, scanhub_fd, scanhub_hub_lives, scanhub_open, scanhub_open_robot,
-    scanhub_release, scanhub_take, scanhub_version, scanhub_wait,
+    scanhub_open_robot_early, scanhub_publish_tilt, scanhub_release, scanhub_send_tilt, scanhub_take,
+    scanhub_unpublish, scanhub_version, scanhub_wait,
 };
 pub use table::Opaque;

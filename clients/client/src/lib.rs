@@ -49,7 +49,7 @@ mod zones;
 pub use control::request;
 pub use follower::Received;
 pub use live::{live_sensors, live_topics};
-pub use publish::{Publication, PublishSession, SensorPublisher, publish};
+pub use publish::{Publication, PublishSession, SensorPublisher, home, publish};
 pub use robot::{Robot, RobotFollower, robot};
 pub use subscribe::{Subscription, places, subscribe};
 pub use wait::Wait;

@@ -49,21 +49,22 @@ pub use publication::Publication;
 /// }
 /// ```
 pub fn publish<P: Payload + ?Sized>(name: &str) -> Result<Publication<P>, Failure> {
-    let (domain, topics, limits) = (own_domain()?, [P::TOPIC], TopicLimits::default());
-    if P::TOPIC.maker() == Maker::Link {
-        return PublishSession::open(&domain, &topics, limits)?.sensor(name)?.topic();
-    }
-    PublishSession::beside(&domain, name, &topics, limits)?.topic()
+    Publication::in_domain(&home(None)?, name)
 }
 
-/// Returns the first live place of the domain that SCANHUB_DOMAIN names, or that which a hub would take.
-fn own_domain() -> Result<Domain, Failure> {
+/// Returns where a program publishes in `domain`, or if none is named in that which SCANHUB_DOMAIN names: its first live place,
+/// or that which a hub would take.
+///
+/// # Errors
+///
+/// [`Kind::Configuration`](schema::Kind) if the name is not possible.
+pub fn home(domain: Option<&str>) -> Result<Domain, Failure> {
     let lives = |domain: &Domain| matches!(publisher(domain.root()), Ok(Some(_)));
-    if let Some(live) = places(None)?.into_iter().find(lives) {
+    if let Some(live) = places(domain)?.into_iter().find(lives) {
         return Ok(live);
     }
-    let name = std::env::var("SCANHUB_DOMAIN");
-    let name = name.as_deref().unwrap_or(DEFAULT_DOMAIN);
+    let of_process = std::env::var("SCANHUB_DOMAIN");
+    let name = domain.unwrap_or(of_process.as_deref().unwrap_or(DEFAULT_DOMAIN));
     Domain::of_hub(name, None, &Environment::of_process())
 }
 

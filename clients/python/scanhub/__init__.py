@@ -17,12 +17,13 @@ from typing import Callable
 
 from . import memory
 from .control import background, control
-from .errors import Denied, Failure, Held, Impossible, Mismatch, NoHub, NoTopic, Refused, Short, Silent
+from .errors import Denied, Failure, Held, Impossible, Mismatch, NoHub, NoTopic, Refused, Short, Silent, Taken
 from .model import Background, Shown
-from .names import TopicName, candidates, check_sensor, parse
+from .names import TopicName, candidates, check_sensor, home, is_remote, parse
 from .people import Event, Site, Track, Tracks
-from .presence import find
+from .presence import Presence, find
 from .processed import Corner, Early, Foreground, Line, Lines, Mark, Marks, Motion, Segment, Zone, Zones
+from .publication import Publication
 from .sample import Sample
 from .scan import Scan, Telegram
 from .status import Pose, Status
@@ -54,6 +55,7 @@ __all__ = [
     "Obstacle",
     "Obstacles",
     "Pose",
+    "Publication",
     "Refused",
     "Robot",
     "RobotFollower",
@@ -66,6 +68,7 @@ __all__ = [
     "Site",
     "Status",
     "Subscription",
+    "Taken",
     "Telegram",
     "Tilt",
     "TopicName",
@@ -75,6 +78,7 @@ __all__ = [
     "Zones",
     "background",
     "control",
+    "publish",
     "robot",
     "sensors",
     "subscribe",
@@ -101,16 +105,38 @@ def subscribe(
     return Subscription([parse(topic) for topic in topics], candidates(domain, root), timeout, on_notice)
 
 
-def robot(*sensors: str, domain: str | None = None, root: str | os.PathLike[str] | None = None) -> RobotFollower:
+def robot(
+    *sensors: str, domain: str | None = None, root: str | os.PathLike[str] | None = None, early: bool = False
+) -> RobotFollower:
     """Follows the verdict over the zones of `sensors`. Without names: all sensors of the hub; in a domain without a hub
-    the sensors of other machines that are published there.
+    the sensors of other machines that are published there. With `early` it becomes worse before a telegram is complete, and
+    is taken back if that turns out damaged.
 
     Iterate over the result, which does not end, or call `now()` in a loop of your own. The verdict becomes `unknown` by
     itself when no recent data arrived, with a hub or without one. Raises Impossible at once if a name is invalid.
     """
     for sensor in sensors:
         check_sensor(sensor)
-    return RobotFollower(list(sensors), candidates(domain, root))
+    return RobotFollower(list(sensors), candidates(domain, root), early)
+
+
+def publish(
+    topic: str, *, domain: str | None = None, root: str | os.PathLike[str] | None = None
+) -> Publication:
+    """Publishes the angles of a mount as `topic`, `NAME/tilt` as in `mount/tilt`, in the first live place of `domain`, or
+    where a hub would be: there need not be one. The name has no dot, and no sensor of the hub has it.
+
+    Raises Taken if another program publishes as NAME, Impossible if the name is not possible or a sensor's, or the topic
+    another one; Denied, Short, Mismatch, Failure as they say.
+    """
+    name = parse(topic)
+    if name.topic != Tilt.topic:
+        raise Impossible(f"Python does not publish {name.topic}", f"{Tilt.topic}, as in mount/tilt; Rust publishes all")
+    if is_remote(name.sensor):
+        raise Impossible(f"{name.sensor} is no name of a mount", "one without a dot, for example mount")
+    presence = Presence(candidates(domain, root))
+    presence.look()
+    return Publication(name, presence.domain or home(domain, root))
 
 
 def topics(*, domain: str | None = None, root: str | os.PathLike[str] | None = None) -> list[TopicName]:

@@ -12,7 +12,7 @@ from .errors import Denied
 
 def ensure(prefix: str) -> None:
     """Makes sure that the counter under `prefix` is there and this user's alone; Denied."""
-    path = f"/dev/shm/{prefix}{_NAME}"
+    path = _path(prefix)
     beside = f"{path}.new-{os.getpid()}-{threading.get_ident()}"
     while True:
         try:
@@ -32,6 +32,18 @@ def ensure(prefix: str) -> None:
             return
         what = f"{path} belongs to user {seen.st_uid} with mode {seen.st_mode & 0o7777:04o}: it is in the way"
         raise Denied(what, f"let its owner or an administrator remove it: sudo rm {path}")
+
+
+def remove(prefix: str) -> None:
+    """Removes the counter under `prefix`, which nobody needs any more."""
+    try:
+        os.unlink(_path(prefix))
+    except FileNotFoundError:
+        pass
+
+
+def _path(prefix: str) -> str:
+    return f"/dev/shm/{prefix}{_NAME}"
 
 
 _NAME = "9204dd183d1c4d8e1ff592a30766ffa6765aa8b5_node.0_10_0.global_mgmt"

@@ -1,6 +1,7 @@
 """The directory of a domain, opened so that no other user can put another one in its place: step by step from the root of
 the file system, its files relative to it. The same rules as the hub's (schema/src/directory.rs): base and domain belong
 to this user and nobody else can write there; links are followed only above them, where root or this user made them.
+Refuses to know what the files are for.
 """
 
 from __future__ import annotations
@@ -30,11 +31,38 @@ class Directory:
     def file(self, name: str) -> int | None:
         """A descriptor of the file `name` to read, or nothing if there is none; Denied if it is another user's, a link
         or no file."""
-        path, flags = os.path.join(self._path, name), os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
         try:
-            opened = os.open(name, flags, dir_fd=self._descriptor)
+            return self._open(name, os.O_RDONLY)
         except FileNotFoundError:
             return None
+
+    def file_or_new(self, name: str) -> int:
+        """A descriptor of the file `name` to read and write, made for this user alone if there is none; Denied as
+        `file`."""
+        return self._open(name, os.O_RDWR | os.O_CREAT)
+
+    def replace(self, name: str, content: bytes) -> None:
+        """Puts a file `name` with this content there in one step: a reader sees the old or the new one."""
+        beside = f"{name}.new"
+        file = self.file_or_new(beside)
+        try:
+            os.ftruncate(file, 0)
+            os.pwrite(file, content, 0)
+        finally:
+            os.close(file)
+        os.rename(beside, name, src_dir_fd=self._descriptor, dst_dir_fd=self._descriptor)
+
+    def remove(self, name: str) -> None:
+        """Removes the file `name`, if it is there."""
+        try:
+            os.unlink(name, dir_fd=self._descriptor)
+        except FileNotFoundError:
+            pass
+
+    def _open(self, name: str, how: int) -> int:
+        path, flags = os.path.join(self._path, name), how | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
+        try:
+            opened = os.open(name, flags, 0o600, dir_fd=self._descriptor)
         except OSError as error:
             if error.errno != errno.ELOOP:
                 raise
@@ -48,13 +76,25 @@ class Directory:
 
 def directory_of(domain: Domain) -> Directory | None:
     """The directory of `domain`, or nothing if there is none; Denied if it is another user's, or can be replaced."""
+    return _walk(domain, make=False)
+
+
+def made_directory(domain: Domain) -> Directory:
+    """The same; what is missing is made for this user alone."""
+    made = _walk(domain, make=True)
+    if made is None:
+        raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), domain.root)
+    return made
+
+
+def _walk(domain: Domain, make: bool) -> Directory | None:
     steps = [step for step in os.path.abspath(domain.root).split("/") if step]
     above, guarded = steps[:-2], steps[-2:]
     at, path, links = os.open("/", _ENTER), "/", 0
     try:
         while above:
             step = above.pop(0)
-            entered = _enter(at, path, step)
+            entered = _enter(at, path, step, make)
             if entered is None:
                 return None
             if entered >= 0:
@@ -69,7 +109,7 @@ def directory_of(domain: Domain) -> Directory | None:
                 at, path = os.open("/", _ENTER), "/"
             above = [part for part in target.split("/") if part not in ("", ".")] + above
         for step in guarded:
-            entered = _enter(at, path, step)
+            entered = _enter(at, path, step, make)
             if entered is None:
                 return None
             path = os.path.join(path, step)
@@ -85,12 +125,18 @@ def directory_of(domain: Domain) -> Directory | None:
             os.close(at)
 
 
-def _enter(at: int, path: str, step: str) -> int | None:
-    """The directory `step`, nothing if it is absent, -1 if it is a link or no directory."""
+def _enter(at: int, path: str, step: str, make: bool) -> int | None:
+    """The directory `step`, nothing if it is absent and not to be made, -1 if it is a link or no directory."""
     try:
         return os.open(step, _ENTER, dir_fd=at)
     except FileNotFoundError:
-        return None
+        if not make:
+            return None
+        try:
+            os.mkdir(step, 0o700, dir_fd=at)
+        except FileExistsError:
+            pass
+        return _enter(at, path, step, make=False)
     except NotADirectoryError:
         return -1
     except PermissionError:

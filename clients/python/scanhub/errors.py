@@ -43,6 +43,10 @@ class Held(Failure):
     """The program keeps more samples of a topic than a consumer may have at a time."""
 
 
+class Taken(Failure):
+    """Another program publishes under the name."""
+
+
 class Impossible(Failure, ValueError):
     """A name or a value is invalid."""
 

@@ -11,14 +11,18 @@ from typing import Any
 
 import iceoryx2 as iox2
 
-from . import counter, layout, trouble
-from .directory import directory_of
+from . import counter, layout, prefix, trouble
 from .errors import Held, NoHub, Short
 from .names import Domain, TopicName, of_service
 from .sample import Sample
 
 
-class Membership:
+class Kept:
+    """What a child that a fork makes has of its parent and never gives back, not even at its end: the parent would get no
+    more."""
+
+
+class Membership(Kept):
     """The stay of this process in a domain; Failure if it cannot join.
 
     The configuration is made here, never read from a file: the library would search the working directory for one.
@@ -27,10 +31,11 @@ class Membership:
 
     def __init__(self, domain: Domain) -> None:
         self.domain = domain
-        self.prefix = _prefix(domain)
-        if self.prefix is None:
+        found = prefix.of(domain)
+        if found is None:
             what = f"{domain.root} does not contain the name of the shared memory"
             raise NoHub(what, "its hub is just starting or ending, or has another version")
+        self.prefix = found
         counter.ensure(self.prefix)
         iox2.set_log_level_from_env_or(iox2.LogLevel.Error)
         builder = iox2.NodeBuilder.new().config(_config(domain, self.prefix))
@@ -42,7 +47,11 @@ class Membership:
 
     def is_current(self) -> bool:
         """Whether the names of shared memory are still valid: after everything ended, a new hub has others."""
-        return _prefix(self.domain) == self.prefix
+        return prefix.of(self.domain) == self.prefix
+
+    def clean_up(self) -> None:
+        """Removes what dead processes left in the domain."""
+        self._node.try_cleanup_dead_nodes()
 
     def service(self, name: str) -> Any:
         """The builder of a service."""
@@ -55,7 +64,7 @@ class Membership:
 
     def subscribe(self, name: TopicName, kind: type[Sample]) -> Port | None:
         """The subscriber of a topic, or None until a hub has made it. Raises Mismatch, Short, Failure."""
-        builder = self.service(name.service).publish_subscribe(_payload(kind)).user_header(layout.Header)
+        builder = self.service(name.service).publish_subscribe(payload(kind)).user_header(layout.Header)
         factory = self.open(name.service, builder, trouble.types(kind.element or kind.struct))
         return factory and Port(name, kind, self.port(name.service, factory.subscriber_builder()))
 
@@ -76,7 +85,7 @@ class Membership:
             raise trouble.no_port(name, str(error)) from None
 
 
-class Received:
+class Received(Kept):
     """A sample in shared memory. The hub does not reuse its memory while this object, or an array of it, is in use."""
 
     __slots__ = ("_sample", "_kind", "_data", "header")
@@ -97,7 +106,7 @@ class Received:
         return self._data
 
 
-class Port:
+class Port(Kept):
     """A consumer's end of a topic."""
 
     def __init__(self, name: TopicName, kind: type[Sample], subscriber: Any) -> None:
@@ -127,7 +136,7 @@ class Port:
             raise Short(f"cannot connect to {self._name}: {what}", "`ulimit -n` or /dev/shm may be too small")
 
 
-class Wakeups:
+class Wakeups(Kept):
     """What wakes the consumers of several sensors: the hub notifies once per telegram, after its last sample."""
 
     def __init__(self) -> None:
@@ -158,9 +167,8 @@ class Wakeups:
 
 
 def _keep_the_parents() -> None:
-    """What a child has of its parent is never given back by it, not even at its end: the parent would get no more."""
     for found in gc.get_objects():
-        if type(found) in (Membership, Received, Port, Wakeups):
+        if issubclass(type(found), Kept):
             ctypes.pythonapi.Py_IncRef(ctypes.py_object(found))
 
 
@@ -169,34 +177,29 @@ os.register_at_fork(after_in_child=_keep_the_parents)
 
 def topics(domain: Domain) -> list[TopicName]:
     """All topics of the domain, sorted. Those of a dead hub stay as long as a consumer keeps them."""
-    prefix = _prefix(domain)
-    if prefix is None:
+    begin = prefix.of(domain)
+    if begin is None:
         return []
     try:
-        found = iox2.Service.list(_config(domain, prefix), iox2.ServiceType.Ipc)
+        found = iox2.Service.list(_config(domain, begin), iox2.ServiceType.Ipc)
     except Exception as error:
         raise trouble.broken(domain, f"cannot list topics: {error}") from None
     named = {of_service(str(details.name().to_string())) for details in found}
     return sorted(name for name in named if name)
 
 
-def _prefix(domain: Domain) -> str | None:
-    """How the names of the domain's shared memory begin, or nothing as long as it has none; Denied."""
-    directory = directory_of(domain)
-    if directory is None:
-        return None
-    with directory:
-        file = directory.file("prefix")
-    if file is None:
-        return None
-    with open(file, encoding="ascii") as opened:
-        return opened.read(64).removesuffix("\n")
+def forget_names(domain: Domain) -> None:
+    """Where nobody is left in the domain: the next one there has other names. Only for who holds the lock `making`."""
+    begin = prefix.of(domain)
+    if begin is not None and not iox2.Node.list(iox2.ServiceType.Ipc, _config(domain, begin)):
+        counter.remove(begin)
+        prefix.forget(domain)
 
 
-def _config(domain: Domain, prefix: str) -> Any:
+def _config(domain: Domain, begin: str) -> Any:
     config = iox2.config.default()
     everything = config.global_cfg
-    everything.prefix = iox2.FileName.new(prefix)
+    everything.prefix = iox2.FileName.new(begin)
     everything.root_path = iox2.Path.new(domain.root)
     everything.creation_timeout = iox2.Duration.from_millis(100)
     # Cleaning up is the hub's business.
@@ -206,7 +209,8 @@ def _config(domain: Domain, prefix: str) -> Any:
     return config
 
 
-def _payload(kind: type[Sample]) -> Any:
+def payload(kind: type[Sample]) -> Any:
+    """As which the samples of a topic lie in shared memory."""
     return iox2.Slice[kind.element] if kind.element else kind.struct
 
 

@@ -11,6 +11,9 @@ from .errors import Impossible, NoTopic
 TOPICS = ("telegram", "scan", "marks", "zones", "foreground", "background", "status", "lines", "motion", "early", "tracks", "events", "tilt", "cloud", "obstacles")
 """What the hub publishes for each sensor; the last five are of trackers, mounts and clouds."""
 
+LINKS = TOPICS[:10]
+"""Those of sensors."""
+
 CONTROL = "scanhub/v2/control"
 """The service that takes requests; beside it are the events that wake the hub and its clients."""
 
@@ -94,11 +97,14 @@ def candidates(name: str | None = None, base: str | os.PathLike[str] | None = No
             what = f"domain {name} at {domain.root} is too long: root and prefix have {_length(domain)} bytes"
             raise Impossible(f"{what}, at most {_LIMIT - 1} are possible", "choose a shorter root or domain")
         return [domain]
-    places = [_of_environment("RUNTIME_DIRECTORY"), "/run/scanhub"]
-    user = _of_environment("XDG_RUNTIME_DIR")
-    places += [user and os.path.join(user, "scanhub"), f"/tmp/scanhub-{os.getuid()}"]
-    domains = [_at(name, place) for place in dict.fromkeys(places) if place]
+    bases = [place for place in (_service(), "/run/scanhub", _user(), _fallback()) if place]
+    domains = [_at(name, base) for base in dict.fromkeys(bases)]
     return [domain for domain in domains if _fits(domain)]
+
+
+def home(name: str | None = None, base: str | os.PathLike[str] | None = None) -> Domain:
+    """Where a hub would put the domain: the first place that the environment offers; all else as `candidates`."""
+    return candidates(name, base if base is not None else _service() or _user() or _fallback())[0]
 
 
 def _at(name: str, base: str) -> Domain:
@@ -111,6 +117,21 @@ def _length(domain: Domain) -> int:
 
 def _fits(domain: Domain) -> bool:
     return _length(domain) < _LIMIT
+
+
+def _service() -> str | None:
+    """What systemd makes for a service."""
+    return _of_environment("RUNTIME_DIRECTORY")
+
+
+def _user() -> str | None:
+    """The place of a user who has logged in."""
+    user = _of_environment("XDG_RUNTIME_DIR")
+    return user and os.path.join(user, "scanhub")
+
+
+def _fallback() -> str:
+    return f"/tmp/scanhub-{os.getuid()}"
 
 
 def _of_environment(variable: str) -> str | None:

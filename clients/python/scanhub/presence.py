@@ -4,13 +4,10 @@ domain may be at; opens nothing else there."""
 from __future__ import annotations
 
 import errno
-import fcntl
-import os
-import struct
 import time
 
-from .directory import directory_of
 from .errors import Denied, Failure, NoHub, Short
+from .lock import holder
 from .names import Domain
 
 LOOK_EVERY = 0.1
@@ -62,7 +59,7 @@ class Presence:
         for place in self._places:
             for lock, is_hub in (("hub.lock", True), ("listen.lock", False)):
                 try:
-                    pid = _holder(place, lock)
+                    pid = holder(place, lock)
                 except Denied as denied:
                     self.denied = denied
                     break
@@ -87,26 +84,3 @@ def find(places: list[Domain]) -> Domain:
         if time.monotonic() >= give_up_at:
             raise presence.absent()
         time.sleep(LOOK_EVERY)
-
-
-def _holder(place: Domain, lock: str) -> int:
-    """The process that holds the lock; 0 if none does, or it has not written yet who it is. Denied."""
-    directory = directory_of(place)
-    if directory is None:
-        return 0
-    with directory:
-        file = directory.file(lock)
-    if file is None:
-        return 0
-    try:
-        asked = fcntl.fcntl(file, fcntl.F_OFD_GETLK, struct.pack(_FLOCK, fcntl.F_RDLCK, os.SEEK_SET, 0, 0, 0))
-        if struct.unpack(_FLOCK, asked)[0] == fcntl.F_UNLCK:
-            return 0
-        written = os.read(file, 16).strip()
-        return int(written) if written.isdigit() else 0
-    finally:
-        os.close(file)
-
-
-_FLOCK = "hhqqi0q"
-"""struct flock: kind, whence, start, length (0: the whole file), process."""

@@ -237,6 +237,8 @@ class Zones(Sample):
     topic = "zones"
     struct = layout.Zones
     stale = False
+    silent = False
+    """Stale, because no sample came at all, and not because one was too old when it came."""
 
     def unknown(self) -> Zones:
         """The same as a silence: nothing is known."""

@@ -214,7 +214,11 @@ class _ZonesFollower(_Follower):
     def receive(self) -> Sample | None:
         zones, now = super().receive(), freshness.now()
         if zones is None:
-            return nothing(self.name.sensor, self._last) if self._freshness.silence(now) else None
+            if not self._freshness.silence(now):
+                return None
+            silence = nothing(self.name.sensor, self._last)
+            silence.silent = True
+            return silence
         assert isinstance(zones, Zones)
         self._last = zones.copy_of_header()
         is_fresh = self._freshness.heard(self._last, zones.verdict == "unknown", now)

@@ -13,7 +13,7 @@ from typing import Any
 
 from . import layout
 from .directory import directory_of
-from .errors import Denied, Failure, Mismatch, Short
+from .errors import Denied, Failure, Mismatch, Short, Taken
 from .names import Domain
 
 
@@ -28,8 +28,19 @@ def check_absent(domain: Domain, name: str, ours: str, what: str) -> None:
     raise broken(domain, f"{name}: {what}")
 
 
+def check_in_flux(domain: Domain, name: str, ours: str, what: str, is_late: bool) -> None:
+    """A service that is just being made or removed by others may be made soon, unless it `is_late`; all else is raised."""
+    kind = re.sub(r"^\w+\((\w+)\)$", r"\1", what)
+    if kind not in _IN_FLUX:
+        check_absent(domain, name, ours, kind)
+    if is_late:
+        raise Failure(f"{name} cannot be created", "remove what is left of it")
+
+
 def no_port(name: str, what: str) -> Failure:
     """Why there is no port."""
+    if "Publishers" in what:
+        return Taken(f"{name} has a publisher already", "end it, or choose another name")
     if "ExceedsMaxSupported" in what:
         return Short(
             f"{name} has no place for another consumer", "stop some; those that crashed free theirs in seconds"
@@ -52,21 +63,21 @@ def broken(domain: Domain, what: str) -> Failure:
     return Failure(what, "IOX2_LOG_LEVEL=debug shows the messages of the shared-memory library")
 
 
-def check_room() -> None:
+def check_room(descriptors: int = 8, size: int = 64 * 1024) -> None:
     """Refuses to make one more port where there is no room for it: the library would make one that gets nothing, or
-    end the process. Short."""
+    end the process. What one takes, with some to spare, if no more is said. Short."""
     try:
         opened = len(os.listdir("/proc/self/fd"))
     except FileNotFoundError:
         opened = 0
     limit = resource.getrlimit(resource.RLIMIT_NOFILE)[0]
-    if limit != resource.RLIM_INFINITY and limit - opened < _DESCRIPTORS:
-        what = f"descriptors are short: {opened} are open, {_DESCRIPTORS} more needed, the limit is {limit}"
+    if limit != resource.RLIM_INFINITY and limit - opened < descriptors:
+        what = f"descriptors are short: {opened} are open, {descriptors} more needed, the limit is {limit}"
         raise Short(what, "raise the limit: `ulimit -n`, for a service LimitNOFILE")
     memory = os.statvfs("/dev/shm")
     free = memory.f_bavail * memory.f_frsize
-    if memory.f_blocks and free < _BYTES:
-        what = f"shared memory is short: /dev/shm: {free // 1024} kB free, {_BYTES // 1024} kB needed"
+    if memory.f_blocks and free < size:
+        what = f"shared memory is short: /dev/shm: {free // 1024} kB free, {-(-size // 1024)} kB needed"
         raise Short(what, "free some of /dev/shm, then start again")
 
 
@@ -110,6 +121,5 @@ def _installed() -> str:
 
 _TYPES = re.compile(r'message_type_details\.(\w+)\]\s+variant = "\w+"\s+type_name = "([^"]*)"\s+size = (\d+)')
 _ABSENT = {"DoesNotExist", "HangsInCreation", "IsMarkedForDestruction", "Interrupt", "ServiceInCorruptedState"}
+_IN_FLUX = _ABSENT | {"AlreadyExists", "IsBeingCreatedByAnotherInstance", "SystemInFlux"}
 _OTHER = {"IncompatibleTypes", "IncompatiblePayload", "IncompatibleMessagingPattern", "VersionMismatch"}
-_DESCRIPTORS, _BYTES = 8, 64 * 1024
-"""What one more port takes, with some to spare."""

@@ -1,17 +1,18 @@
-"""The robot's verdict: the fold over its sensors' zones, in which a sensor that is not heard counts as unknown."""
+"""The robot's verdict: the fold over its sensors' zones, and their early warnings if these are wanted; a sensor that is not
+heard counts as unknown."""
 
 from __future__ import annotations
 
 import time
 from dataclasses import dataclass, field
-from typing import NamedTuple
-
 from . import memory
 from .freshness import Freshness, now
 from .names import Domain, TopicName, is_remote
 from .presence import GRACE
-from .processed import Zones
+from .processed import Early, Zones
+from .sample import Sample
 from .subscription import Subscription
+from .warned import RANKS, Said, Scan, Warned
 
 
 @dataclass(frozen=True)
@@ -33,14 +34,20 @@ class Robot:
 class RobotFollower(Subscription):
     """Iterates over the verdicts of the robot, without end. Made by `scanhub.robot`."""
 
-    def __init__(self, sensors: list[str], places: list[Domain]) -> None:
-        super().__init__([TopicName(sensor, Zones.topic) for sensor in sensors], places, None, None)
-        self._heard: dict[str, _Said | None] = dict.fromkeys(sensors)
+    def __init__(self, sensors: list[str], places: list[Domain], early: bool) -> None:
+        super().__init__([], places, None, None)
+        self._early = early
+        self._heard: dict[str, Said] = {}
+        self._warned: dict[str, Warned] = {}
+        self._silent: set[str] = set()
+        """Who has not said anything of zones yet, nor was silent for long enough."""
         self._begun = False
         self._nobody = Freshness(now())
         self._is_named = bool(sensors)
         self._is_of_hub: bool | None = None
         self._call_at: float | None = None
+        for sensor in sensors:
+            self._meet(TopicName(sensor, Zones.topic))
 
     def __next__(self) -> Robot:
         """Waits until any of the sensors is heard, or any is heard no more; the first time for a word of each."""
@@ -67,11 +74,22 @@ class RobotFollower(Subscription):
 
     def _drain(self) -> bool:
         any_heard = False
-        while (zones := self._receive()) is not None:
-            self._heard[zones.sensor] = _Said(zones.verdict, zones.nearest_mm)
-            self._begun = self._begun or None not in self._heard.values()
-            any_heard = True
+        while (sample := self._receive()) is not None:
+            said = self._said(sample)
+            if said is not None:
+                self._heard[sample.sensor] = said
+                any_heard = True
         return any_heard and self._begun
+
+    def _said(self, sample: Sample) -> Said | None:
+        """What is known of a sensor by its sample; nothing if that is no news."""
+        scan, warned = Scan(sample.boot, sample.seq), self._warned[sample.sensor]
+        if isinstance(sample, Early):
+            return warned.warn(Said(sample.verdict, sample.distance_mm), sample.withdrawn, scan)
+        assert isinstance(sample, Zones)
+        self._silent.discard(sample.sensor)
+        self._begun = self._begun or not self._silent
+        return warned.hear(Said(sample.verdict, sample.nearest_mm), None if sample.silent else scan)
 
     def _is_nobody_there(self) -> bool:
         return not self._followers and self._nobody.silence(now())
@@ -105,35 +123,29 @@ class RobotFollower(Subscription):
         stands one that is always unknown."""
         if name.sensor in self._heard:
             return
-        if is_remote(name.sensor) and len(self._followers) >= _MOST_REMOTE:
-            self._heard[_OTHERS] = _Said("unknown", None)
+        if not self._is_named and is_remote(name.sensor) and len(self._heard) >= _MOST_REMOTE:
+            self._heard[_OTHERS] = Said("unknown", None)
             return
-        self._heard[name.sensor] = None
+        self._heard[name.sensor], self._warned[name.sensor] = Said("unknown", None), Warned()
+        self._silent.add(name.sensor)
         self._follow(name)
+        if self._early:
+            self._follow(TopicName(name.sensor, Early.topic))
 
     def _forget(self) -> None:
         self._leave()
-        self._followers, self._turn, self._heard = [], 0, {}
+        self._followers, self._turn, self._heard, self._warned, self._silent = [], 0, {}, {}, set()
         self._begun, self._is_of_hub, self._call_at = False, True, None
 
     def _fold(self) -> Robot:
-        sensors = {sensor: said.verdict if said else "unknown" for sensor, said in self._heard.items()}
+        sensors = {sensor: said.verdict for sensor, said in self._heard.items()}
         # The first of the worst.
-        worst = max(sensors, key=lambda sensor: _RANKS[sensors[sensor]], default=None)
-        seen = [(said.nearest_mm, sensor) for sensor, said in self._heard.items() if said]
+        worst = max(sensors, key=lambda sensor: RANKS[sensors[sensor]], default=None)
+        seen = [(said.nearest_mm, sensor) for sensor, said in self._heard.items()]
         nearest = min(((mm, sensor) for mm, sensor in seen if mm is not None), default=(None, None))
         return Robot(sensors[worst] if worst else "unknown", worst, *nearest, sensors)
 
 
-class _Said(NamedTuple):
-    """The last word of a sensor."""
-
-    verdict: str
-    nearest_mm: int | None
-
-
-_RANKS = {"clear": 0, "slow": 1, "unknown": 2, "stop": 3}
-"""What is seen inside outweighs what is not known."""
 _MOST_REMOTE = 16
 """As many as a listener publishes at a time. None is forgotten, and whoever can send to its network can announce ever new
 ones."""

@@ -1,6 +1,6 @@
-"""Follows the verdict of a robot and prints each as a line of JSON: arguments are domain, root, sensors. Each tenth is also
-asked for by `now`, which never waits. Ends by Ctrl-C, and says so. With `--asked` in place of sensors: what `now` says for each
-line of stdin."""
+"""Follows the verdict of a robot and prints each as a line of JSON: arguments are domain, root, sensors, before them perhaps
+`--early`. Each tenth is also asked for by `now`, which never waits. Ends by Ctrl-C, and says so. With `--asked` in place of
+sensors: what `now` says for each line of stdin."""
 
 import json
 import os
@@ -10,7 +10,7 @@ from dataclasses import asdict
 
 import scanhub
 from scanhub.names import TopicName
-from scanhub.verdict import _Said
+from scanhub.warned import Said
 
 
 def say(line: dict) -> None:
@@ -39,7 +39,7 @@ with scanhub.robot(domain=domain, root=root) as crowd:
     for sensor in range(1000):
         crowd._meet(TopicName(f"robot{sensor}.front", "zones"))
     assert len(crowd._followers) == 16 and len(crowd._heard) == 17, "of other machines' sensors no more are followed"
-    crowd._heard = {sensor: said or _Said("clear", None) for sensor, said in crowd._heard.items()}
+    crowd._heard.update({sensor: Said("clear", None) for sensor in crowd._silent})
     assert (crowd._fold().verdict, crowd._fold().worst) == ("unknown", "others..."), "and one stands for the others"
     crowd._followers.clear()
 
@@ -49,7 +49,8 @@ if sensors == ["--asked"]:
         say({"class": "now", **asdict(robot.now())})
     sys.exit()
 
-robot = scanhub.robot(*sensors, domain=domain, root=root)
+early = sensors[:1] == ["--early"]
+robot = scanhub.robot(*sensors[early:], domain=domain, root=root, early=early)
 try:
     for number, now in enumerate(robot):
         say({"class": "robot", **asdict(now)})

@@ -48,6 +48,7 @@ static void names(const char *sensor)
     MUST(scanhub_open_robot(NULL, NULL, NULL, 0) == SCANHUB_REFUSED_ARGUMENT);
     MUST(scanhub_open_robot(&handle, NULL, NULL, 3) == SCANHUB_REFUSED_ARGUMENT && handle == NULL);
     SAYS("SCANHUB_WAIT_");
+    MUST(scanhub_open_robot_early(&handle, NULL, NULL, 3) == SCANHUB_REFUSED_ARGUMENT && handle == NULL);
     MUST(scanhub_open_robot(&handle, NULL, "front Front", 0) == SCANHUB_REFUSED_CONFIGURATION && handle == NULL);
     SAYS("\"Front\" is not possible");
     MUST(scanhub_open(&handle, "no/domain", sensor, SCANHUB_TOPIC_SCAN, 0) == SCANHUB_REFUSED_CONFIGURATION);
@@ -81,6 +82,80 @@ static void handles(const char *sensor)
     MUST(scanhub_close(handle) == 0);
     refused_as_a_handle(handle);
     MUST(scanhub_close(handle) == SCANHUB_REFUSED_ARGUMENT);
+}
+
+static void refused_as_a_publication(struct scanhub_publication *publication)
+{
+    MUST(scanhub_send_tilt(publication, 0, 0.5, NAN) == SCANHUB_REFUSED_ARGUMENT);
+    SAYS("no such handle");
+}
+
+static struct scanhub_publication *publish(const char *name)
+{
+    struct scanhub_publication *publication;
+    MUST(scanhub_publish_tilt(&publication, NULL, name) == 0);
+    return publication;
+}
+
+static void *publishes_elsewhere(void *publication)
+{
+    refused_as_a_publication(publication);
+    MUST(scanhub_unpublish(publication) == SCANHUB_REFUSED_ARGUMENT);
+    /* It ends with its thread. */
+    publish("third");
+    return NULL;
+}
+
+static void publications(const char *sensor)
+{
+    struct scanhub_publication *mount;
+    int status;
+    MUST(scanhub_publish_tilt(NULL, NULL, "mount") == SCANHUB_REFUSED_ARGUMENT);
+    MUST(scanhub_publish_tilt(&mount, NULL, NULL) == SCANHUB_REFUSED_ARGUMENT && mount == NULL);
+    SAYS("no mount");
+    MUST(scanhub_publish_tilt(&mount, "no/domain", "mount") == SCANHUB_REFUSED_CONFIGURATION && mount == NULL);
+    MUST(scanhub_publish_tilt(&mount, NULL, "robot1.mount") == SCANHUB_REFUSED_CONFIGURATION && mount == NULL);
+    MUST(scanhub_publish_tilt(&mount, NULL, sensor) == SCANHUB_REFUSED_CONFIGURATION && mount == NULL);
+    SAYS("is a sensor of the hub\n  any other name");
+    mount = publish("mount");
+    struct scanhub_publication *second = publish("second"), *again;
+    MUST(scanhub_publish_tilt(&again, NULL, "mount") == SCANHUB_REFUSED_FAILED && again == NULL);
+    SAYS("another program publishes as mount");
+    MUST(scanhub_send_tilt(mount, 0, 0.5, NAN) == 0 && scanhub_send_tilt(second, 1, 0.5, 0.1) == 0);
+    /* What follows is no publication, and what publishes is followed by other handles. */
+    struct scanhub_attachment *angles;
+    struct scanhub_sample sample;
+    MUST(scanhub_open(&angles, NULL, "mount", SCANHUB_TOPIC_TILT, SCANHUB_WAIT_DOORBELL) == 0);
+    refused_as_a_publication((struct scanhub_publication *)angles);
+    refused_as_a_handle((struct scanhub_attachment *)mount);
+    MUST(scanhub_close((struct scanhub_attachment *)mount) == SCANHUB_REFUSED_ARGUMENT);
+    MUST(scanhub_unpublish((struct scanhub_publication *)angles) == SCANHUB_REFUSED_ARGUMENT);
+    MUST(scanhub_take(angles, &sample) == 0);
+    MUST(scanhub_send_tilt(mount, 7, -0.5, 2) == 0);
+    MUST(scanhub_wait(angles, 20000) == 1 && scanhub_take(angles, &sample) == 1);
+    const struct scanhub_tilt_v2 *tilt = sample.payload;
+    MUST(sample.length == sizeof *tilt && sample.header->stamp_first_ns == 7 && sample.header->stamp_last_ns == 7);
+    MUST(sample.header->topic_seq == 1 && tilt->angle_rad == -0.5 && tilt->rate_rad_s == 2);
+    MUST(scanhub_close(angles) == 0);
+    refused_as_a_publication(NULL);
+    pthread_t thread;
+    MUST(pthread_create(&thread, NULL, publishes_elsewhere, mount) == 0 && pthread_join(thread, NULL) == 0);
+    MUST(scanhub_unpublish(publish("third")) == 0);
+    /* A child takes nothing from its parent. */
+    const pid_t child = fork();
+    MUST(child >= 0);
+    if (child == 0) {
+        refused_as_a_publication(mount);
+        MUST(scanhub_unpublish(mount) == SCANHUB_REFUSED_ARGUMENT);
+        exit(EXIT_SUCCESS);
+    }
+    MUST(waitpid(child, &status, 0) == child && WIFEXITED(status) && WEXITSTATUS(status) == EXIT_SUCCESS);
+    MUST(scanhub_send_tilt(mount, 0, 0.5, NAN) == 0);
+    MUST(scanhub_unpublish(mount) == 0 && scanhub_unpublish(NULL) == 0);
+    refused_as_a_publication(mount);
+    MUST(scanhub_unpublish(mount) == SCANHUB_REFUSED_ARGUMENT);
+    /* The name is free, and `second` is left to the end of the process. */
+    MUST(scanhub_unpublish(publish("mount")) == 0);
 }
 
 static void *elsewhere(void *handle)
@@ -239,6 +314,7 @@ int main(int argc, char **argv)
     polls(sensor);
     samples(sensor);
     robots(sensor);
+    publications(sensor);
     signals();
     /* Left open, with a sample: the end of the process is an end, too. */
     struct scanhub_attachment *left = open_scans(sensor, SCANHUB_WAIT_EVENT);

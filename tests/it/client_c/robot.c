@@ -1,4 +1,4 @@
-/* Follows the verdict of a robot and prints a line of JSON for each: robot doorbell|event|spin|poll [SENSORS]. */
+/* Follows the verdict of a robot and prints a line of JSON for each: robot doorbell|event|spin|poll [SENSORS [early]]. */
 #include <scanhub/attach.h>
 
 #include <errno.h>
@@ -55,7 +55,9 @@ int main(int argc, char **argv)
                                                             : SCANHUB_WAIT_DOORBELL;
     struct scanhub_attachment *robot;
     struct scanhub_sample sample;
-    if (scanhub_open_robot(&robot, NULL, argc > 2 ? argv[2] : NULL, wait) != 0)
+    const char *sensors = argc > 2 ? argv[2] : NULL;
+    const int early = argc > 3 && strcmp(argv[3], "early") == 0;
+    if ((early ? scanhub_open_robot_early : scanhub_open_robot)(&robot, NULL, sensors, wait) != 0)
         return fail("open");
     struct pollfd fds = {polls ? scanhub_fd(robot) : -1, POLLIN, 0};
     for (;;) {

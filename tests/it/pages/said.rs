@@ -36,9 +36,9 @@ fn wrong_with(block: &Block) -> Option<String> {
         "sh" => None,
         // Zenoh's own: the bridge's tests run it.
         "json5" if block.place.starts_with("docs/bridge.md") => None,
-        // Of a crate that consumers of topics do not have: its own tests run it.
         // What publishes angles: `tilt.rs` runs it.
         "rust,no_run" if block.place.starts_with("docs/tilt.md") => None,
+        // Of a crate that consumers of topics do not have: its own tests run it.
         "rust,edition2024" if block.place.starts_with("docs/tilt.md") => None,
         _ if is_program(block) => None,
         other => Some(format!("nobody knows what to do with {other:?}")),

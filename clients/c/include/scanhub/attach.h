@@ -37,7 +37,7 @@ extern "C" {
 #define SCANHUB_REFUSED_ARGUMENT (-1)      /* NULL, an unknown handle or number, a fifth sample */
 #define SCANHUB_REFUSED_CONFIGURATION (-2) /* an invalid name, a descriptor without SCANHUB_WAIT_EVENT */
 #define SCANHUB_REFUSED_SHORT (-3)         /* shared memory, descriptors or places for consumers are short: try later */
-#define SCANHUB_REFUSED_FAILED (-4)        /* another user's domain, another version's topic, or another failure */
+#define SCANHUB_REFUSED_FAILED (-4)        /* another user's domain, another version's topic, a taken name, or another failure */
 #define SCANHUB_REFUSED_BUG (-5)           /* in this library; close the handle */
 
 /* What the hub publishes for each sensor, and what a payload is, or begins with. */
@@ -64,6 +64,9 @@ extern "C" {
 
 /* A topic that is followed. */
 struct scanhub_attachment;
+
+/* A topic that this program publishes. */
+struct scanhub_publication;
 
 /* Of every sample, 64 bytes. Stamps are nanoseconds of CLOCK_MONOTONIC. */
 struct scanhub_header_v2 {
@@ -484,6 +487,12 @@ int scanhub_open(struct scanhub_attachment **handle, const char *domain, const c
 int scanhub_open_robot(struct scanhub_attachment **handle, const char *domain, const char *sensors, int wait);
 
 /*
+ * The same, with early warnings (docs/early.md): the verdict becomes worse before a telegram is complete, and goes back if that
+ * turns out damaged.
+ */
+int scanhub_open_robot_early(struct scanhub_attachment **handle, const char *domain, const char *sensors, int wait);
+
+/*
  * A descriptor that is readable while there may be a sample, for poll, select and epoll: never read, written or closed. It
  * stays the same until scanhub_close, also over restarts of the hub. It is readable until scanhub_take has returned 0: take
  * all, then poll. A readable descriptor does not promise a sample: it also becomes readable once a second, ten times a second
@@ -514,6 +523,23 @@ int scanhub_close(struct scanhub_attachment *handle);
 
 /* 1 if a hub lives in the domain, 0 if not, as of the last call that found no sample. */
 int scanhub_hub_lives(struct scanhub_attachment *handle);
+
+/*
+ * Publishes the angles of a mount as the topic tilt of `name` ("mount") in `domain` (NULL: the one that SCANHUB_DOMAIN names),
+ * for scanhub tilt and for everybody who follows it: docs/tilt.md. There need not be a hub. The name has no dot and is no
+ * sensor's of the hub: else SCANHUB_REFUSED_CONFIGURATION. It has one publisher: a name that another program has is
+ * SCANHUB_REFUSED_FAILED, and scanhub_error says which one. Returns 0; *publication is NULL after a refusal.
+ */
+int scanhub_publish_tilt(struct scanhub_publication **publication, const char *domain, const char *name);
+
+/*
+ * Says that the mount was at `angle_rad`, right-handed around its axis, at `stamp_ns` of CLOCK_MONOTONIC (0: now), and how fast
+ * the angle grew (NAN: not known). Wakes who follows it, and waits for nobody: 0.
+ */
+int scanhub_send_tilt(struct scanhub_publication *publication, uint64_t stamp_ns, double angle_rad, double rate_rad_s);
+
+/* Ends it and gives the name free: 0, also for NULL. The end of the thread or of the process does the same. */
+int scanhub_unpublish(struct scanhub_publication *publication);
 
 /* The message of this thread's last refused call: a line, and often a second one with the remedy. Valid until the next. */
 const char *scanhub_error(void);

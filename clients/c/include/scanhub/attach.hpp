@@ -100,6 +100,14 @@ public:
         check(scanhub_open_robot(&all.handle_, domain, sensors, wait));
         return all;
     }
+    /* The same with early warnings, as scanhub_open_robot_early. */
+    static Attachment robot_early(
+        const char *sensors = nullptr, int wait = SCANHUB_WAIT_DOORBELL, const char *domain = nullptr)
+    {
+        Attachment all;
+        check(scanhub_open_robot_early(&all.handle_, domain, sensors, wait));
+        return all;
+    }
     Attachment(Attachment &&other) noexcept : handle_(other.handle_), topic_(other.topic_) { other.handle_ = nullptr; }
     Attachment &operator=(Attachment &&other) noexcept
     {
@@ -134,6 +142,33 @@ private:
     Attachment() : handle_(nullptr), topic_(0) {}
     scanhub_attachment *handle_;
     int topic_;
+};
+
+/* The angles of a mount that this thread publishes, as scanhub_publish_tilt. */
+class TiltPublication {
+public:
+    explicit TiltPublication(const char *name, const char *domain = nullptr) : publication_(nullptr)
+    {
+        check(scanhub_publish_tilt(&publication_, domain, name));
+    }
+    TiltPublication(TiltPublication &&other) noexcept : publication_(other.publication_) { other.publication_ = nullptr; }
+    TiltPublication &operator=(TiltPublication &&other) noexcept
+    {
+        std::swap(publication_, other.publication_);
+        return *this;
+    }
+    TiltPublication(const TiltPublication &) = delete;
+    TiltPublication &operator=(const TiltPublication &) = delete;
+    ~TiltPublication() { scanhub_unpublish(publication_); }
+
+    /* As scanhub_send_tilt. */
+    void send(double angle_rad, double rate_rad_s = NAN, uint64_t stamp_ns = 0)
+    {
+        check(scanhub_send_tilt(publication_, stamp_ns, angle_rad, rate_rad_s));
+    }
+
+private:
+    scanhub_publication *publication_;
 };
 
 } // namespace scanhub

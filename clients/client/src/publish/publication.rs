@@ -2,9 +2,10 @@
 //! publishes.
 
 use schema::ipc::{Payload, TopicPublisher};
-use schema::{Failure, Header, Topic, Wake};
+use schema::limits::TopicLimits;
+use schema::{Domain, Failure, Header, Maker, Topic, Wake};
 
-use super::SensorPublisher;
+use super::{PublishSession, SensorPublisher};
 use crate::clock;
 
 /// A topic that is being published.
@@ -15,6 +16,19 @@ pub struct Publication<P: Payload + ?Sized> {
 }
 
 impl<P: Payload + ?Sized> Publication<P> {
+    /// Publishes as [`publish`](crate::publish) does, in `domain`.
+    ///
+    /// # Errors
+    ///
+    /// As [`publish`](crate::publish).
+    pub fn in_domain(domain: &Domain, name: &str) -> Result<Publication<P>, Failure> {
+        let (topics, limits) = ([P::TOPIC], TopicLimits::default());
+        if P::TOPIC.maker() == Maker::Link {
+            return PublishSession::open(domain, &topics, limits)?.sensor(name)?.topic();
+        }
+        PublishSession::beside(domain, name, &topics, limits)?.topic()
+    }
+
     pub(super) fn new(topic: TopicPublisher<P>, sensor: SensorPublisher) -> Publication<P> {
         Publication { topic, sensor }
     }

@@ -66,38 +66,72 @@ fn warning(early: &Early) -> Verdict {
 mod tests {
     use super::*;
 
-    fn zones(verdict: Verdict) -> Zones {
-        Zones { verdict: verdict as u8, ..Zones::unknown() }
-    }
-
-    fn of_scan(seq: u64) -> Header {
-        Header { seq, boot: 1, ..Header::default() }
+    fn zones(verdict: u8) -> Zones {
+        Zones { verdict, ..Zones::unknown() }
     }
 
     const STOP: Early =
         Early { verdict: 2, flags: 0, beam: 40, distance_mm: 500, bytes_seen: 240, beams_seen: 116 };
 
+    /// What the package for Python is tested with, too.
+    const VECTORS: &str = include_str!("../../../../tests/vectors/early.txt");
+
+    fn header(scan: &str) -> Header {
+        let (boot, seq) = scan.split_once(':').expect("LIFE:NUMBER");
+        Header {
+            boot: boot.parse().expect("a life"),
+            seq: seq.parse().expect("a number"),
+            ..Header::default()
+        }
+    }
+
+    fn said(zones: &Zones) -> String {
+        let nearest = zones.nearest().map_or("-".to_owned(), |(_, mm)| mm.to_string());
+        format!("{} {nearest}", zones.verdict() as u8)
+    }
+
     #[test]
-    fn a_warning_holds_until_its_scan_is_known_or_it_is_withdrawn() {
+    fn what_is_known_is_what_the_vectors_say() {
+        let (mut warned, mut steps) = (Warned::new(), 0);
+        let lines = VECTORS.lines().zip(1..).filter(|(line, _)| !line.is_empty() && !line.starts_with('#'));
+        for (line, number) in lines {
+            let (step, known) = line.split_once(" => ").unwrap_or((line, ""));
+            let words: Vec<&str> = step.split(' ').collect();
+            let verdict = |word: &str| word.parse().expect("a verdict");
+            let told = match words[..] {
+                ["begin"] => {
+                    warned = Warned::new();
+                    continue;
+                }
+                ["zones", scan, word, nearest] => {
+                    let mut zones = zones(verdict(word));
+                    if let Ok(mm) = nearest.parse() {
+                        (zones.nearest_beam, zones.nearest_mm) = (7, mm);
+                    }
+                    Some(warned.hear(&zones, Some(&header(scan))))
+                }
+                ["silence"] => Some(warned.hear(&Zones::unknown(), None)),
+                ["early", scan, word, mm] => {
+                    let distance_mm = mm.parse().expect("a distance");
+                    warned.warn(&Early { verdict: verdict(word), distance_mm, ..STOP }, &header(scan))
+                }
+                ["withdrawn", scan] => warned.warn(&Early { flags: Early::WITHDRAWN, ..STOP }, &header(scan)),
+                _ => panic!("line {number}: {line}"),
+            };
+            assert_eq!(told.as_ref().map_or("old".to_owned(), said), known, "line {number}: {line}");
+            steps += 1;
+        }
+        assert!(steps > 40, "{steps}");
+    }
+
+    #[test]
+    fn the_nearest_beam_is_that_of_the_nearest_point() {
         let mut warned = Warned::new();
-        warned.hear(&zones(Verdict::Clear), Some(&of_scan(7)));
-        assert_eq!(warned.warn(&STOP, &of_scan(7)), None, "the scan has come already");
-        let stop = warned.warn(&STOP, &of_scan(8)).expect("a warning");
+        warned.hear(&zones(0), Some(&header("1:7")));
+        let stop = warned.warn(&STOP, &header("1:8")).expect("a warning");
         assert_eq!((stop.verdict(), stop.nearest()), (Verdict::Stop, Some((40, 500))));
-        let withdrawn = Early { flags: Early::WITHDRAWN, ..STOP };
-        assert_eq!(warned.warn(&withdrawn, &of_scan(8)), Some(zones(Verdict::Clear)));
-        warned.hear(&zones(Verdict::Slow), Some(&of_scan(8)));
-        assert_eq!(warned.warn(&withdrawn, &of_scan(8)), None);
-        // Zones of a scan before it are overtaken by a warning.
-        assert!(warned.warn(&STOP, &of_scan(10)).is_some());
-        let overtaken = warned.hear(&zones(Verdict::Clear), Some(&of_scan(9)));
-        assert_eq!(overtaken.verdict(), Verdict::Stop);
-        assert_eq!(warned.hear(&zones(Verdict::Clear), Some(&of_scan(10))), zones(Verdict::Clear));
-        assert!(warned.warn(&STOP, &of_scan(12)).is_some());
-        assert_eq!(warned.hear(&Zones::unknown(), None), Zones::unknown(), "a silence");
-        assert_eq!(warned.hear(&zones(Verdict::Clear), Some(&of_scan(11))), zones(Verdict::Clear));
-        let next_hub = Header { boot: 2, ..of_scan(0) };
-        assert_eq!(warned.warn(&STOP, &next_hub).map(|zones| zones.verdict()), Some(Verdict::Stop));
+        let near = Zones { nearest_beam: 3, nearest_mm: 400, ..zones(0) };
+        assert_eq!(warned.hear(&near, Some(&header("1:7"))).nearest(), Some((3, 400)));
     }
 
     #[test]
@@ -105,9 +139,10 @@ mod tests {
         let mut warned = Warned::new();
         let slow = Early { verdict: Verdict::Slow as u8, ..STOP };
         for verdict in Verdict::ALL {
-            warned.hear(&zones(verdict), None);
+            warned.hear(&zones(verdict as u8), None);
             for early in [slow, STOP, Early { verdict: 9, ..STOP }, Early { verdict: 0, ..STOP }] {
-                let now = warned.warn(&early, &of_scan(1)).expect("nothing is known of the scan").verdict();
+                let now =
+                    warned.warn(&early, &header("1:1")).expect("nothing is known of the scan").verdict();
                 assert_eq!(now.worse(verdict), now, "{verdict:?} and {early:?}");
             }
         }

@@ -1,0 +1,100 @@
+"""Who publishes in a domain: each name has one publisher, whose lock ends with its process. The same files as the hub's
+(schema/src/lock.rs). Refuses to know what is published."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import fcntl
+import os
+import struct
+from typing import Iterator
+
+from . import prefix
+from .directory import directory_of, made_directory
+from .errors import Taken
+from .names import Domain
+
+
+class NameLock:
+    """The lock of a program that publishes under a name of its own. There need not be a hub. Taken, Denied, OSError."""
+
+    def __init__(self, domain: Domain, name: str) -> None:
+        self._file = _acquire(domain, name)
+        try:
+            # A process id that is read means that there is a prefix, too.
+            os.ftruncate(self._file, 0)
+            with making(domain):
+                prefix.settle(domain)
+            os.pwrite(self._file, b"%d\n" % os.getpid(), 0)
+        except BaseException:
+            self.release()
+            raise
+
+    def release(self) -> None:
+        """Gives the name free. Closing is not enough: a child has a copy of the descriptor."""
+        fcntl.fcntl(self._file, fcntl.F_OFD_SETLK, _whole_file(fcntl.F_UNLCK))
+        os.close(self._file)
+
+
+@contextlib.contextmanager
+def making(domain: Domain) -> Iterator[None]:
+    """Held while services are made in a domain; nobody holds it for longer than that takes."""
+    with made_directory(domain) as directory:
+        file = directory.file_or_new("making.lock")
+    try:
+        fcntl.fcntl(file, fcntl.F_OFD_SETLKW, _whole_file(fcntl.F_WRLCK))
+        yield
+    finally:
+        fcntl.fcntl(file, fcntl.F_OFD_SETLK, _whole_file(fcntl.F_UNLCK))
+        os.close(file)
+
+
+def holder(domain: Domain, lock: str) -> int | None:
+    """The process that holds `hub.lock` or `listen.lock`, nothing if none does; 0 if it has not written yet who it is.
+    Denied."""
+    directory = directory_of(domain)
+    if directory is None:
+        return None
+    with directory:
+        file = directory.file(lock)
+    if file is None:
+        return None
+    try:
+        asked = fcntl.fcntl(file, fcntl.F_OFD_GETLK, _whole_file(fcntl.F_RDLCK))
+        return None if struct.unpack(_FLOCK, asked)[0] == fcntl.F_UNLCK else _written(file)
+    finally:
+        os.close(file)
+
+
+def _acquire(domain: Domain, name: str) -> int:
+    while True:
+        with made_directory(domain) as directory:
+            file = directory.file_or_new(f"name.{name}.lock")
+        try:
+            fcntl.fcntl(file, fcntl.F_OFD_SETLK, _whole_file(fcntl.F_WRLCK))
+        except OSError as error:
+            pid = _written(file)
+            os.close(file)
+            if error.errno not in (errno.EAGAIN, errno.EACCES):
+                raise
+            what = f"another program publishes as {name} in {domain.root}: pid {pid}"
+            raise Taken(what, "end it, or choose another name") from None
+        # Whoever held it until now may have taken the domain away, and the next one would lock another file.
+        if os.fstat(file).st_nlink > 0:
+            return file
+        os.close(file)
+
+
+def _written(file: int) -> int:
+    """The lock itself tells no process, the file's content does."""
+    text = os.pread(file, 16, 0).strip()
+    return int(text) if text.isdigit() else 0
+
+
+def _whole_file(kind: int) -> bytes:
+    return struct.pack(_FLOCK, kind, os.SEEK_SET, 0, 0, 0)
+
+
+_FLOCK = "hhqqi0q"
+"""struct flock: kind, whence, start, length (0: the whole file), process."""

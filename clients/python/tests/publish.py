@@ -1,0 +1,38 @@
+"""Publishes the angles of a mount: arguments are domain, root and its name. Each line of stdin is a sample: angle, rate and
+stamp, 0 for now. Says so when it publishes, and after each sample; ends with stdin."""
+
+import math
+import sys
+
+import scanhub
+
+
+def refused(error: type, what) -> None:
+    try:
+        what()
+    except error as refusal:
+        assert refusal.message and str(refusal).startswith(refusal.message), refusal
+        return
+    raise AssertionError(f"{error} was not raised")
+
+
+domain, root, name = sys.argv[1:]
+place = {"domain": domain, "root": root}
+for topic in ("mount/scan", "mount/tracks", "robot1.mount/tilt", "Mount/tilt", "robot/tilt"):
+    refused(scanhub.Impossible, lambda: scanhub.publish(topic, **place))
+for topic in ("mount", "mount/angles"):
+    refused(scanhub.NoTopic, lambda: scanhub.publish(topic, **place))
+try:
+    with scanhub.publish(f"{name}/tilt", **place) as mount:
+        print('{"class": "open"}', flush=True)
+        for line in sys.stdin:
+            angle_rad, rate_rad_s, stamp_ns = line.split()
+            rate = None if math.isnan(float(rate_rad_s)) else float(rate_rad_s)
+            mount.send(angle_rad=float(angle_rad), rate_rad_s=rate, stamp_ns=int(stamp_ns) or None)
+            print('{"class": "sent"}', flush=True)
+except scanhub.Failure as refusal:
+    print(type(refusal).__name__, refusal, file=sys.stderr)
+    sys.exit(1)
+refused(scanhub.Failure, lambda: mount.send(0.0))
+assert mount.subscribers == 0
+mount.close()

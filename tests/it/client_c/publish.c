@@ -1,0 +1,29 @@
+/* Publishes the angles of a mount: publish NAME. Each line of stdin is a sample: angle, rate and stamp, 0 for now. Says so when
+ * it publishes, and after each sample; ends with stdin. */
+#include <scanhub/attach.h>
+
+#include <inttypes.h>
+#include <stdio.h>
+#include <stdlib.h>
+
+int main(int argc, char **argv)
+{
+    struct scanhub_publication *mount;
+    double angle_rad, rate_rad_s;
+    uint64_t stamp_ns;
+    if (scanhub_publish_tilt(&mount, NULL, argc > 1 ? argv[1] : NULL) != 0) {
+        fprintf(stderr, "%s\n", scanhub_error());
+        return EXIT_FAILURE;
+    }
+    puts("{\"class\":\"open\"}");
+    fflush(stdout);
+    while (scanf("%lf %lf %" SCNu64, &angle_rad, &rate_rad_s, &stamp_ns) == 3) {
+        if (scanhub_send_tilt(mount, stamp_ns, angle_rad, rate_rad_s) != 0) {
+            fprintf(stderr, "%s\n", scanhub_error());
+            return EXIT_FAILURE;
+        }
+        puts("{\"class\":\"sent\"}");
+        fflush(stdout);
+    }
+    return scanhub_unpublish(mount) == 0 ? EXIT_SUCCESS : EXIT_FAILURE;
+}
