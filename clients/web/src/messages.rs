@@ -2,6 +2,7 @@
 //! viewer draws; circles and marks are Foxglove's; states and the verdict are objects of JSON. Refuses to know viewers.
 
 mod scene_update;
+mod tilt;
 
 use ros::{LASER_SCAN, POINT_CLOUD, TF_MESSAGE, TF_STATIC, Type, scan_topic};
 use scene::{Scene, Sensor, Trouble};
@@ -11,7 +12,8 @@ use serde::Serialize;
 use crate::board::Channel;
 use crate::playback::Progress;
 
-pub use scene_update::{lines, marks, tracks, zones};
+pub use scene_update::{lines, marks, obstacles, obstacles_last, tracks, zones};
+pub use tilt::{tilt, tilt_channel};
 
 /// Scans of a sensor, as `sensor_msgs/msg/LaserScan`.
 pub fn scan_channel(sensor: &str) -> Channel {
@@ -51,6 +53,16 @@ pub fn lines_channel() -> Channel {
 /// The people of `tracker` and their tails, as `foxglove.SceneUpdate`.
 pub fn tracks_channel(tracker: &str) -> Channel {
     scene_update::channel(&beside_scan(tracker, "tracks"))
+}
+
+/// The points of whole sweeps, as `sensor_msgs/msg/PointCloud2` in the robot's frame.
+pub fn cloud_channel(name: &str) -> Channel {
+    of_ros(beside_scan(name, "cloud"), POINT_CLOUD, false)
+}
+
+/// What the last sweep has found, as `foxglove.SceneUpdate`.
+pub fn obstacles_channel(name: &str) -> Channel {
+    scene_update::channel(&beside_scan(name, "obstacles"))
 }
 
 /// The verdict and the hub, see [`robot`].
@@ -289,6 +301,8 @@ mod tests {
             (lines_channel(), lines(&scene, 1)),
             (tracks_channel("house"), tracks(&scene::People::default(), 1)),
             (replay_channel(), replay(&progress)),
+            (tilt_channel("mount"), tilt(&schema::Tilt::default())),
+            (obstacles_channel("hall"), obstacles(&Header::default(), &schema::Obstacles::default())),
         ];
         for (channel, message) in pairs {
             let schema: serde_json::Value = serde_json::from_str(channel.schema).unwrap();
