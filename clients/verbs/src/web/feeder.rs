@@ -181,6 +181,8 @@ impl<'a> Feeder<'a> {
         }
         if std::mem::take(&mut self.poses_are_new) {
             self.board.put(self.transforms, wall_ns, &messages::transforms(&self.scene, wall_ns));
+            // A status says it, too.
+            self.status_at = now;
         }
         if now >= self.status_at {
             self.status_at = now + STATUS_EVERY;

@@ -6,7 +6,7 @@ use schema::{Header, Obstacle, Obstacles};
 use super::{Colour, Cube, Deletion, Entity, Pose, Quaternion, Text, Time, Update, Vector, bytes};
 
 /// A box for each obstacle, with metadata `distance_m`, `points`, `foreground` and `near`, behind an entity without a sign
-/// whose metadata are those of the sweep: `sweep`, `generation`, `complete`, `doubted`, `left_out`. All of them live for as
+/// whose metadata are those of the sweep: `sweep`, `generation`, `complete`, `doubted`, `left_out`, and in `words` what it has found. All of them live for as
 /// long as they say something, see [`obstacles_last`].
 pub fn obstacles(header: &Header, found: &Obstacles) -> Vec<u8> {
     let lifetime = || Time::of(obstacles_last(header));
@@ -16,6 +16,7 @@ pub fn obstacles(header: &Header, found: &Obstacles) -> Vec<u8> {
     sweep.tell("complete", found.has(Obstacles::COMPLETE).to_string());
     sweep.tell("doubted", found.has(Obstacles::DOUBTED).to_string());
     sweep.tell("left_out", found.left_out.to_string());
+    sweep.tell("words", words(found));
     let boxes = found.obstacles().iter().enumerate().map(|(number, one)| {
         let id = format!("obstacle {number}");
         let mut entity = Entity { lifetime: lifetime(), ..Entity::new(id, header.wall_ns) };
@@ -41,6 +42,20 @@ pub fn obstacles(header: &Header, found: &Obstacles) -> Vec<u8> {
 /// How long a sweep says what stands there, in ns: until two more could have come, and some time to find that out.
 pub fn obstacles_last(header: &Header) -> u64 {
     2 * header.stamp_last_ns.saturating_sub(header.stamp_first_ns).min(LONGEST_NS) + PATIENCE_NS
+}
+
+fn words(found: &Obstacles) -> String {
+    if found.has(Obstacles::DOUBTED) {
+        return "sweep doubted, its angles contradict what is known".to_owned();
+    }
+    let count = u64::from(found.left_out) + found.obstacles().len() as u64;
+    let plural = if count == 1 { "" } else { "s" };
+    let obstacles = found.obstacles().first().map_or("no obstacle".to_owned(), |nearest| {
+        // Not more digits than stay the same from sweep to sweep: it is read out when it changes.
+        format!("{count} obstacle{plural}, nearest {:.1} m", nearest.distance_m)
+    });
+    let incomplete = if found.has(Obstacles::COMPLETE) { "" } else { ", sweep incomplete" };
+    format!("{obstacles}{incomplete}")
 }
 
 fn at(x: f64, y: f64, z: f64) -> Pose {
@@ -89,6 +104,12 @@ mod tests {
         let one = &told(&found)["entities"][1];
         assert_eq!(one["cubes"][0]["pose"]["position"], serde_json::json!({ "x": 1.5, "y": 0.0, "z": 0.75 }));
         assert_eq!(one["cubes"][0]["size"], serde_json::json!({ "x": 1.0, "y": 1.0, "z": 1.5 }));
+        assert_eq!(words(&found), "1 obstacle, nearest 1.0 m");
+        let mut other = Obstacles { flags: 0, ..found };
+        (0..2 * schema::OBSTACLES).for_each(|_| other.push(Obstacle::default()));
+        assert_eq!(words(&other), "129 obstacles, nearest 1.0 m, sweep incomplete");
+        other = Obstacles { flags: Obstacles::DOUBTED, ..Obstacles::default() };
+        assert_eq!(words(&other), "sweep doubted, its angles contradict what is known");
         assert_eq!((&one["texts"][0]["text"], &one["frame_id"]), (&"1.00 m".into(), &"base_link".into()));
         assert_eq!(obstacles_last(&Header { stamp_last_ns: u64::MAX, ..header }), 121_000_000_000);
     }
