@@ -22,20 +22,28 @@ pub(crate) const TOPICS: [Topic; 8] = [
     Topic::Tracks,
 ];
 
-/// What is followed of `sensors`; of all of a hub, and all trackers, if there are none. Who names one that is a tracker, in the
-/// first live one of `places`, wants to see the sensors, too.
-pub(crate) fn followed(sensors: &[String], places: &[Domain]) -> (Vec<TopicName>, Vec<Topic>) {
+/// Which of the `wanted` topics are followed of `sensors`; of all of a hub and all that publish beside it, if there are none. Who
+/// names one that is no sensor, in the first live one of `places`, wants to see the sensors, too.
+pub(crate) fn followed(
+    sensors: &[String],
+    wanted: &[Topic],
+    places: &[Domain],
+) -> (Vec<TopicName>, Vec<Topic>) {
     let live = live_topics(places);
-    let is_tracker = |sensor: &str| live.contains(&format!("{sensor}/{}", Topic::Tracks.name()));
+    let maker = |sensor: &str| {
+        let is_live = |topic: &&Topic| live.contains(&format!("{sensor}/{}", topic.name()));
+        wanted.iter().find(is_live).map_or(Maker::Link, |topic| topic.maker())
+    };
     let named = |sensor: &String| {
-        let of = |topic: &Topic| (topic.maker() == Maker::Tracker) == is_tracker(sensor);
-        let name = |topic| TopicName { sensor: sensor.clone(), topic };
-        TOPICS.into_iter().filter(of).map(name).collect::<Vec<_>>()
+        let maker = maker(sensor);
+        let of = wanted.iter().filter(move |topic| topic.maker() == maker);
+        of.map(|topic| TopicName { sensor: sensor.clone(), topic: *topic }).collect::<Vec<_>>()
     };
     let names: Vec<_> = sensors.iter().flat_map(named).collect();
-    let has_tracker = names.iter().any(|name| name.topic.maker() == Maker::Tracker);
-    let of_all = |topic: &Topic| names.is_empty() || has_tracker && topic.maker() == Maker::Link;
-    (names.clone(), TOPICS.into_iter().filter(of_all).collect())
+    let has_other = names.iter().any(|name| name.topic.maker() != Maker::Link);
+    let of_all = |topic: &&Topic| names.is_empty() || has_other && topic.maker() == Maker::Link;
+    let of_all = wanted.iter().filter(of_all).copied().collect();
+    (names, of_all)
 }
 
 /// A topic of `name` will be followed: of a link its sensor is there from now on.

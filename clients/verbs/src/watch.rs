@@ -54,7 +54,7 @@ pub struct WatchOptions {
 /// else as [`echo`](crate::echo()).
 pub fn watch(options: &WatchOptions, out: &mut dyn Write, stop: &AtomicBool) -> Result<(), Failure> {
     options.sensors.iter().try_for_each(|sensor| as_word(check_followed(sensor)))?;
-    let (names, topics) = picture::followed(&options.sensors, &options.places);
+    let (names, topics) = picture::followed(&options.sensors, &picture::TOPICS, &options.places);
     let end = Screen::new(out).and_then(|screen| {
         let mut watcher = Watcher {
             options,

@@ -2,6 +2,8 @@
 //! does, into the same scene, and puts up what that becomes; a thread of its own serves whoever looks at it.
 
 mod feeder;
+mod sensor;
+mod tilted;
 mod told;
 
 use std::io::Write;
@@ -11,12 +13,12 @@ use std::sync::mpsc;
 use std::thread;
 
 use ::web::{Board, Door, Playback, Server};
-use schema::{Domain, Failure, Kind, check_followed};
+use schema::{Domain, Failure, Kind, Maker, check_followed};
 
 use crate::follow::{Bounds, follow};
 use crate::names::as_word;
 use crate::output::{Output, quiet};
-use crate::picture::followed;
+use crate::picture;
 use feeder::Feeder;
 
 /// What `web` is asked for.
@@ -73,7 +75,8 @@ pub fn web(
     if let Err(end) = told::ready(&mut output, &url, options.json) {
         return quiet(Err(end));
     }
-    let (names, topics) = followed(&options.sensors, &options.places);
+    let wanted = [&picture::TOPICS[..], Maker::Mount.topics(), Maker::Tilted.topics()].concat();
+    let (names, topics) = picture::followed(&options.sensors, &wanted, &options.places);
     let over = AtomicBool::new(false);
     thread::scope(|scope| {
         let served = thread::Builder::new()

@@ -1,17 +1,20 @@
 //! What a scene becomes on the wire: the channels, and the bytes of their messages. Scans and poses are ROS's, which every
 //! viewer draws; circles and marks are Foxglove's; states and the verdict are objects of JSON. Refuses to know viewers.
 
+mod replay;
 mod scene_update;
+mod tilt;
 
 use ros::{LASER_SCAN, POINT_CLOUD, TF_MESSAGE, TF_STATIC, Type, scan_topic};
-use scene::{Scene, Sensor, Trouble};
+use scene::{Scene, Sensor, Trouble, rooms};
 use schema::{Background, Counter, Header, Pose, Scan, ScanHead, is_remote};
 use serde::Serialize;
 
 use crate::board::Channel;
-use crate::playback::Progress;
 
-pub use scene_update::{lines, marks, tracks, zones};
+pub use replay::{replay, replay_channel};
+pub use scene_update::{lines, marks, obstacles, obstacles_last, tracks, zones};
+pub use tilt::{tilt, tilt_channel};
 
 /// Scans of a sensor, as `sensor_msgs/msg/LaserScan`.
 pub fn scan_channel(sensor: &str) -> Channel {
@@ -53,6 +56,16 @@ pub fn tracks_channel(tracker: &str) -> Channel {
     scene_update::channel(&beside_scan(tracker, "tracks"))
 }
 
+/// The points of whole sweeps, as `sensor_msgs/msg/PointCloud2` in the robot's frame.
+pub fn cloud_channel(name: &str) -> Channel {
+    of_ros(beside_scan(name, "cloud"), POINT_CLOUD, false)
+}
+
+/// What the last sweep has found, as `foxglove.SceneUpdate`.
+pub fn obstacles_channel(name: &str) -> Channel {
+    scene_update::channel(&beside_scan(name, "obstacles"))
+}
+
 /// The verdict and the hub, see [`robot`].
 pub fn robot_channel() -> Channel {
     json("/robot".to_owned(), "scanhub.Robot", include_str!("messages/robot.json"))
@@ -63,17 +76,8 @@ pub fn status_channel(sensor: &str) -> Channel {
     json(beside_scan(sensor, "status"), "scanhub.Status", include_str!("messages/status.json"))
 }
 
-/// How far the recording is that is played, see [`replay`].
-pub fn replay_channel() -> Channel {
-    json("/replay".to_owned(), "scanhub.Replay", include_str!("messages/replay.json"))
-}
-
-/// How far the player is.
-pub fn replay(progress: &Progress) -> Vec<u8> {
-    bytes(progress)
-}
-
-/// The verdict of the robot's sensors, whether they are shown in a map, and how its hub is; `trouble` is why there is none.
+/// The verdict of the robot's sensors, whether they are shown in a map, how its hub is, and how many people are in which room, in
+/// words; `trouble` is why there is no hub.
 pub fn robot(scene: &Scene, domain: &str, trouble: Option<&Trouble>) -> Vec<u8> {
     #[derive(Serialize)]
     struct Robot<'a> {
@@ -84,7 +88,9 @@ pub fn robot(scene: &Scene, domain: &str, trouble: Option<&Trouble>) -> Vec<u8> 
         hub: bool,
         pid: Option<u32>,
         load_percent: Option<f64>,
+        hub_words: String,
         map: bool,
+        people: Option<String>,
         trouble: Option<Words<'a>>,
     }
     let (verdict, sensor, nearest_mm) = scene::verdict(scene.robot().map(|(_, sensor)| sensor));
@@ -96,12 +102,24 @@ pub fn robot(scene: &Scene, domain: &str, trouble: Option<&Trouble>) -> Vec<u8> 
         hub: scene.hub_lives,
         pid: (scene.hub_pid != 0).then_some(scene.hub_pid),
         load_percent: scene.hub_percent,
+        hub_words: hub_words(scene, domain),
         map: scene.is_in_map(),
+        people: rooms(scene.people()),
         trouble: trouble.map(Words::of),
     })
 }
 
-/// State, rate, ages and losses of `sensor`.
+/// How the hub is, in words.
+fn hub_words(scene: &Scene, domain: &str) -> String {
+    if !scene.hub_lives {
+        return "no hub".to_owned();
+    }
+    let pid = if scene.hub_pid == 0 { String::new() } else { format!(" {}", scene.hub_pid) };
+    let load = scene.hub_percent.map_or(String::new(), |load| format!(", {load:.1} % of a processor"));
+    format!("{domain}: hub{pid}{load}")
+}
+
+/// State, rate, ages and losses of `sensor`, and where it sits as far as that was told.
 pub fn status(sensor: &Sensor) -> Vec<u8> {
     #[derive(Serialize)]
     struct Told<'a> {
@@ -111,7 +129,7 @@ pub fn status(sensor: &Sensor) -> Vec<u8> {
         model: Option<String>,
         port: Option<&'a str>,
         remote: bool,
-        pose: Place,
+        pose: Option<Place>,
         hz: Option<f64>,
         lost: u64,
         lost_on_line: Option<u64>,
@@ -135,7 +153,12 @@ pub fn status(sensor: &Sensor) -> Vec<u8> {
         yaw_rad: f64,
         upside_down: bool,
     }
-    let Pose { x_m, y_m, yaw_rad, upside_down, .. } = sensor.mount.pose().unwrap_or_default();
+    let place = |Pose { x_m, y_m, yaw_rad, upside_down, .. }| Place {
+        x_m,
+        y_m,
+        yaw_rad,
+        upside_down: upside_down != 0,
+    };
     let status = sensor.status.as_ref();
     let ages = sensor.meter.age_percentiles_ms();
     let trouble = sensor.trouble();
@@ -146,7 +169,7 @@ pub fn status(sensor: &Sensor) -> Vec<u8> {
         model: status.and_then(|status| status.model()),
         port: status.map(|status| status.port()).filter(|port| !port.is_empty()),
         remote: is_remote(&sensor.name),
-        pose: Place { x_m, y_m, yaw_rad, upside_down: upside_down != 0 },
+        pose: sensor.mount.pose().map(place),
         hz: sensor.meter.hz(),
         lost: sensor.lost,
         lost_on_line: status.and_then(|status| status.lost_on_line()),
@@ -262,9 +285,19 @@ mod tests {
         let object = |bytes: Vec<u8>| serde_json::from_slice::<serde_json::Value>(&bytes).unwrap();
         let told = object(robot(&scene, "default", None));
         assert_eq!((&told["verdict"], &told["hub"]), (&"unknown".into(), &false.into()));
+        assert_eq!((&told["hub_words"], &told["people"]), (&"no hub".into(), &serde_json::Value::Null));
         let told = object(status(scene.sensor("front")));
         assert_eq!((&told["state"], &told["hz"]), (&"unheard".into(), &serde_json::Value::Null));
+        assert_eq!(told["pose"], serde_json::Value::Null, "nobody told where it sits");
         assert_eq!(told["trouble"]["what"], "nothing was heard of it yet");
+    }
+
+    #[test]
+    fn a_hub_in_words() {
+        let mut scene = Scene { hub_lives: true, ..Scene::default() };
+        assert_eq!(hub_words(&scene, "default"), "default: hub");
+        (scene.hub_pid, scene.hub_percent) = (77, Some(1.26));
+        assert_eq!(hub_words(&scene, "default"), "default: hub 77, 1.3 % of a processor");
     }
 
     #[test]
@@ -272,15 +305,6 @@ mod tests {
         let mut scene = Scene::default();
         scene.sensor("front");
         let keys = |value: &serde_json::Value| value.as_object().unwrap().keys().cloned().collect::<Vec<_>>();
-        let progress = Progress {
-            position_s: 1.0,
-            length_s: None,
-            rate: Some(0.5),
-            paused: true,
-            over: false,
-            lap: 0,
-            telegrams: 7,
-        };
         let pairs = [
             (robot_channel(), robot(&scene, "default", None)),
             (status_channel("front"), status(&scene.sensors[0])),
@@ -288,7 +312,9 @@ mod tests {
             (marks_channel(), marks(&scene, 1)),
             (lines_channel(), lines(&scene, 1)),
             (tracks_channel("house"), tracks(&scene::People::default(), 1)),
-            (replay_channel(), replay(&progress)),
+            (replay_channel(), replay(&crate::Progress::default())),
+            (tilt_channel("mount"), tilt(&schema::Tilt::default())),
+            (obstacles_channel("hall"), obstacles(&Header::default(), &schema::Obstacles::default())),
         ];
         for (channel, message) in pairs {
             let schema: serde_json::Value = serde_json::from_str(channel.schema).unwrap();

@@ -6,7 +6,18 @@ use sha2::{Digest, Sha256};
 
 const MARKUP: &str = include_str!("../page/page.html");
 const STYLE: &str = include_str!("../page/page.css");
-const SCRIPT: &str = include_str!("../page/page.js");
+/// One script, in the order in which it is read: a file for each of its concerns.
+const SCRIPT: &str = concat!(
+    include_str!("../page/known.js"),
+    include_str!("../page/wire.js"),
+    include_str!("../page/view.js"),
+    include_str!("../page/draw.js"),
+    include_str!("../page/signs.js"),
+    include_str!("../page/side.js"),
+    include_str!("../page/frame.js"),
+    include_str!("../page/words.js"),
+    include_str!("../page/person.js"),
+);
 
 /// The page and its policy.
 #[derive(Debug)]
@@ -80,7 +91,7 @@ mod tests {
             }
         };
         least(&["ink", "soft", "accent", "slow", "stop", "clear"], &["paper", "panel"], 4.5);
-        least(&["new", "mark", "line"], &["paper"], 3.0);
+        least(&["new", "mark", "line", "soft", "stop"], &["paper"], 3.0);
         least(&["person"], &["paper", "panel"], 4.5);
         for fill in ["clear-fill", "slow-fill", "stop-fill"] {
             for scheme in [0, 1] {

@@ -18,7 +18,7 @@ pub enum Order {
 }
 
 /// How far the player is.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
 pub struct Progress {
     /// Seconds from the first telegram on.
     pub position_s: f64,

@@ -7,8 +7,10 @@ use ::web::{Board, ChannelId, Event, Playback, Progress, messages};
 use scanhub_client::clock;
 use scanhub_client::streams::{Sample, Session, Who};
 use scene::{Circle, People, Scene, Trouble, circles};
-use schema::{Domain, Failure, Header, Kind, Maker, Topic, Verdict};
+use schema::{Domain, Failure, Kind, Maker, Topic, Verdict};
 
+use super::sensor::Channels;
+use super::tilted::Tilted;
 use super::{WebOptions, told};
 use crate::follow::{Notice, Sink};
 use crate::names::TopicName;
@@ -16,18 +18,6 @@ use crate::output::{End, Output};
 use crate::picture;
 use crate::receive_stats::ReceiveStats;
 use crate::work::Work;
-
-/// What a sensor is told in.
-struct Channels {
-    sensor: String,
-    scan: ChannelId,
-    foreground: ChannelId,
-    background: ChannelId,
-    status: ChannelId,
-    /// The telegram of the last scan, and of the last foreground.
-    scan_of: Option<Header>,
-    foreground_of: Option<u64>,
-}
 
 pub(super) struct Feeder<'a> {
     options: &'a WebOptions,
@@ -43,6 +33,7 @@ pub(super) struct Feeder<'a> {
     channels: Vec<Channels>,
     /// Of each tracker.
     tracks: Vec<(String, ChannelId)>,
+    tilted: Tilted<'a>,
     transforms: ChannelId,
     zones: ChannelId,
     marks: ChannelId,
@@ -89,6 +80,7 @@ impl<'a> Feeder<'a> {
             scene: Scene::default(),
             channels: Vec::new(),
             tracks: Vec::new(),
+            tilted: Tilted::new(board),
             robot: board.channel(messages::robot_channel()),
             zones: board.channel(messages::zones_channel()),
             marks: board.channel(messages::marks_channel()),
@@ -114,15 +106,7 @@ impl<'a> Feeder<'a> {
     /// The channels of `sensor`, which there are from now on.
     fn of(&mut self, sensor: &str) -> &mut Channels {
         let at = self.channels.iter().position(|one| one.sensor == sensor).unwrap_or_else(|| {
-            self.channels.push(Channels {
-                sensor: sensor.to_owned(),
-                scan: self.board.channel(messages::scan_channel(sensor)),
-                foreground: self.board.channel(messages::foreground_channel(sensor)),
-                background: self.board.channel(messages::background_channel(sensor)),
-                scan_of: None,
-                foreground_of: None,
-                status: self.board.channel(messages::status_channel(sensor)),
-            });
+            self.channels.push(Channels::new(self.board, sensor));
             self.channels.len() - 1
         });
         &mut self.channels[at]
@@ -145,41 +129,11 @@ impl<'a> Feeder<'a> {
         }
     }
 
-    fn put_scan(&mut self, name: &TopicName, scan: &scanhub_client::Received<schema::Scan>) {
-        let channels = self.of(&name.sensor);
-        channels.scan_of = Some(*scan.header());
-        let channel = channels.scan;
-        if self.board.is_wanted(channel) {
-            self.message.clear();
-            ros::laser_scan(&mut self.message, ros::frame(&name.sensor), scan.header(), scan);
-            self.board.put(channel, scan.header().wall_ns, &self.message);
+    fn put_foreground(&mut self, name: &TopicName, message: &mut Vec<u8>) {
+        let at = self.channels.iter().position(|one| one.sensor == name.sensor);
+        if let Some(channels) = at.map(|at| &mut self.channels[at]) {
+            channels.put_foreground(self.board, message, self.scene.sensor(&name.sensor));
         }
-    }
-
-    /// Puts up the foreground of `name`'s sensor as soon as the scan of the same telegram is here, which says where its beams
-    /// point.
-    fn put_foreground(&mut self, name: &TopicName) {
-        let channels = self.of(&name.sensor);
-        let Some(header) = channels.scan_of.filter(|header| channels.foreground_of == Some(header.seq))
-        else {
-            return;
-        };
-        channels.foreground_of = None;
-        let channel = channels.foreground;
-        let sensor = self.scene.sensor(&name.sensor);
-        let (Some(scan), Some(foreground)) = (&sensor.scan, &sensor.foreground) else { return };
-        if self.board.is_wanted(channel) {
-            self.message.clear();
-            ros::foreground_cloud(&mut self.message, ros::frame(&name.sensor), &header, scan, foreground);
-            self.board.put(channel, header.wall_ns, &self.message);
-        }
-    }
-
-    fn put_background(&mut self, name: &TopicName, wall_ns: u64, model: &schema::Background) {
-        let channel = self.of(&name.sensor).background;
-        self.message.clear();
-        messages::background(&mut self.message, &name.sensor, wall_ns, model);
-        self.board.put(channel, wall_ns, &self.message);
     }
 
     /// What was true a moment ago, and is not any more.
@@ -187,8 +141,7 @@ impl<'a> Feeder<'a> {
         for channels in &self.channels {
             let is_old = |sensor: &scene::Sensor| sensor.name == channels.sensor && sensor.scan.is_none();
             if self.scene.sensors.iter().any(is_old) {
-                self.board.clear(channels.scan);
-                self.board.clear(channels.foreground);
+                channels.clear(self.board);
             }
         }
         for (tracker, channel) in &self.tracks {
@@ -228,6 +181,8 @@ impl<'a> Feeder<'a> {
         }
         if std::mem::take(&mut self.poses_are_new) {
             self.board.put(self.transforms, wall_ns, &messages::transforms(&self.scene, wall_ns));
+            // A status says it, too.
+            self.status_at = now;
         }
         if now >= self.status_at {
             self.status_at = now + STATUS_EVERY;
@@ -296,15 +251,19 @@ impl<'a> Feeder<'a> {
 impl Sink for Feeder<'_> {
     fn begin(&mut self, name: &TopicName) {
         picture::begin(&mut self.scene, name);
-        if name.topic.maker() == Maker::Tracker {
-            self.tracks_of(&name.sensor);
-        } else {
-            self.of(&name.sensor);
+        match name.topic.maker() {
+            Maker::Link => drop(self.of(&name.sensor)),
+            Maker::Tracker => drop(self.tracks_of(&name.sensor)),
+            Maker::Mount | Maker::Tilted => self.tilted.begin(name),
         }
         self.poses_are_new = true;
     }
 
     fn sample(&mut self, name: &TopicName, sample: &Sample) -> Result<(), End> {
+        if let Maker::Mount | Maker::Tilted = name.topic.maker() {
+            self.tilted.take(name, sample);
+            return Ok(());
+        }
         if let Sample::Tracks(tracks) = sample {
             let mounts = |scene: &Scene| scene.sensors.iter().map(|sensor| sensor.mount).collect::<Vec<_>>();
             let before = mounts(&self.scene);
@@ -315,25 +274,32 @@ impl Sink for Feeder<'_> {
         }
         let mount = self.scene.sensor(&name.sensor).mount;
         picture::take(&mut self.scene, name, sample);
+        let board = self.board;
+        let mut message = std::mem::take(&mut self.message);
         match sample {
             Sample::Scan(scan) => {
-                self.put_scan(name, scan);
-                self.put_foreground(name);
+                let channels = self.of(&name.sensor);
+                channels.put_scan(board, &mut message, scan.header(), scan);
+                self.put_foreground(name, &mut message);
             }
             Sample::Marks(_) => self.marks_are_new = true,
             Sample::Zones(_) => self.zones_are_new = true,
             Sample::Lines(_) => self.lines_are_new = true,
             Sample::Foreground(foreground) => {
-                self.of(&name.sensor).foreground_of = Some(foreground.header().seq);
-                self.put_foreground(name);
+                self.of(&name.sensor).take_foreground(foreground.header().seq);
+                self.put_foreground(name, &mut message);
             }
-            Sample::Background(model) => self.put_background(name, model.header().wall_ns, model),
+            Sample::Background(model) => {
+                let wall_ns = model.header().wall_ns;
+                self.of(&name.sensor).put_background(board, &mut message, wall_ns, model);
+            }
             Sample::Status(_) => {
                 self.poses_are_new |= mount != self.scene.sensor(&name.sensor).mount;
                 self.status_at = Instant::now();
             }
             _ => {}
         }
+        self.message = message;
         Ok(())
     }
 
@@ -341,14 +307,15 @@ impl Sink for Feeder<'_> {
         picture::note(&mut self.scene, names, notice);
         if notice == Notice::HubGone {
             self.clear();
+            self.tilted.forget();
             self.status_at = Instant::now();
         }
         Ok(())
     }
 
-    /// Lines are wanted as long as a viewer asks for them.
+    /// Lines are wanted as long as a viewer asks for them, and so are angles and points.
     fn wants(&self, topic: Topic) -> bool {
-        topic != Topic::Lines || self.board.is_watched(self.lines)
+        if topic == Topic::Lines { self.board.is_watched(self.lines) } else { self.tilted.wants(topic) }
     }
 
     /// What is followed already is served.
@@ -371,6 +338,7 @@ impl Sink for Feeder<'_> {
             }
         }
         self.put_progress(now);
+        self.tilted.age(now);
         // What a player shows while it waits stands.
         if !self.progress.is_some_and(|progress| progress.stands()) && self.scene.age(clock::now_ns()) {
             self.clear();

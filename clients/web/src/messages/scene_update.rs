@@ -1,6 +1,8 @@
 //! Circles, marks, lines and people as `foxglove.SceneUpdate`, encoded as JSON. Each message has all there is: what is not in the next one
 //! would stay, so entities live for a second only.
 
+mod obstacles;
+
 use ros::BASE_FRAME;
 use scene::{Ellipse, People, Scene, circles};
 use schema::Verdict;
@@ -8,6 +10,8 @@ use serde::Serialize;
 
 use super::{bytes, json};
 use crate::board::Channel;
+
+pub use obstacles::{obstacles, obstacles_last};
 
 pub(super) fn channel(topic: &str) -> Channel {
     json(topic.to_owned(), "foxglove.SceneUpdate", include_str!("scene_update.json"))
@@ -101,7 +105,7 @@ struct Entity {
     frame_locked: bool,
     metadata: Vec<KeyValue>,
     arrows: [(); 0],
-    cubes: [(); 0],
+    cubes: Vec<Cube>,
     spheres: Vec<Sphere>,
     cylinders: Vec<Cylinder>,
     lines: Vec<LinePrimitive>,
@@ -152,6 +156,13 @@ struct Colour {
 }
 
 #[derive(Serialize)]
+struct Cube {
+    pose: Pose,
+    size: Vector,
+    color: Colour,
+}
+
+#[derive(Serialize)]
 struct Sphere {
     pose: Pose,
     size: Vector,
@@ -190,6 +201,12 @@ struct LinePrimitive {
     indices: [(); 0],
 }
 
+impl Time {
+    fn of(ns: u64) -> Time {
+        Time { sec: ns / 1_000_000_000, nsec: ns % 1_000_000_000 }
+    }
+}
+
 impl Text {
     /// Of that many pixels, and turned to who looks.
     fn new(pose: Pose, font_size: f64, color: Colour, text: String) -> Text {
@@ -216,14 +233,14 @@ impl LinePrimitive {
 impl Entity {
     fn new(id: String, wall_ns: u64) -> Entity {
         Entity {
-            timestamp: Time { sec: wall_ns / 1_000_000_000, nsec: wall_ns % 1_000_000_000 },
+            timestamp: Time::of(wall_ns),
             frame_id: BASE_FRAME,
             id,
             lifetime: Time { sec: 1, nsec: 0 },
             frame_locked: true,
             metadata: Vec::new(),
             arrows: [],
-            cubes: [],
+            cubes: Vec::new(),
             spheres: Vec::new(),
             cylinders: Vec::new(),
             lines: Vec::new(),
@@ -239,12 +256,21 @@ impl Entity {
 }
 
 fn update(entities: &[Entity]) -> Vec<u8> {
-    #[derive(Serialize)]
-    struct Update<'a> {
-        deletions: [(); 0],
-        entities: &'a [Entity],
-    }
-    bytes(&Update { deletions: [], entities })
+    bytes(&Update { deletions: &[], entities })
+}
+
+#[derive(Serialize)]
+struct Update<'a> {
+    deletions: &'a [Deletion],
+    entities: &'a [Entity],
+}
+
+#[derive(Serialize)]
+struct Deletion {
+    timestamp: Time,
+    #[serde(rename = "type")]
+    kind: u8,
+    id: &'static str,
 }
 
 fn at(x: f64, y: f64) -> Pose {

@@ -1,0 +1,53 @@
+// The picture in a browser. It speaks foxglove.sdk.v1 with the server that sent this page, as any other viewer does, keeps
+// the newest of each sensor, and draws that in the robot's coordinates: x ahead, y to the left, in metres.
+
+const { PI, abs, atan2, ceil, floor, hypot, max, min } = Math;
+const $ = (id) => document.getElementById(id);
+const map = $("map");
+let pen = map.getContext("2d");
+
+const sensors = new Map(); // by namespace, as "/front"
+let robot = {}; // what was said of it last
+let circles = [];
+let beams = []; // that violate a circle
+let marks = [];
+let walls = []; // straight surfaces, as pairs of ends
+let corners = [];
+const people = new Map(); // by topic of their tracker: when they came, and who is where
+const sweeps = new Map(); // by namespace of who makes them of a tilted scanner
+let player = null; // of the recording that this server plays, if it does
+let heard = -Infinity; // when the verdict came last
+let frames = 0;
+const ages = []; // moment of a scan, and of the end of the frame that shows it, in ms since 1970, by one machine's clock
+const drawn = { beams: 0, foreground: 0, zones: 0, marks: 0, lines: 0, tracks: 0, obstacles: 0, swept: 0 };
+
+const SILENT_MS = 500; // after which the verdict is not known
+const OLD_MS = 1000; // after which a scan is not what is there
+const TRAIL_MS = 1600;
+const TRAIL_STEP_MS = 90;
+const HISTORY_MS = 120_000;
+
+/** The one of `all` that a topic is of; `made` where there was none. */
+function owner(all, topic, made) {
+  const space = topic.slice(0, topic.lastIndexOf("/"));
+  if (!all.has(space)) all.set(space, { space, name: space.slice(1).replaceAll("/", "."), ...made() });
+  return all.get(space);
+}
+
+/** Of a sensor, and of who makes sweeps, that sees nothing. */
+const blind = () => ({ scan: null, foreground: null, trail: [] });
+const empty = () => ({ sweep: null, points: null, obstacles: [] });
+
+const sensorAt = (topic) =>
+  owner(sensors, topic, () => ({ ...blind(), scans: 0, history: [] }));
+const everySensor = () => [...sensors.values()];
+const everySweep = () => [...sweeps.values()];
+const sweepAt = (topic) => owner(sweeps, topic, empty);
+
+/** The hub is gone: what was seen is not there any more, except for the background. */
+function forget() {
+  for (const sensor of sensors.values()) Object.assign(sensor, blind());
+  for (const one of sweeps.values()) Object.assign(one, empty());
+  [circles, beams, marks, walls, corners] = [[], [], [], [], []];
+  people.clear();
+}

@@ -1,0 +1,211 @@
+// What a person does, and the start.
+
+function choose(space) {
+  only = space === only ? null : space;
+  isFitDue = true;
+  wake();
+  tellSensors();
+}
+
+function zoom(factor, px = middle.x, py = middle.y) {
+  const [x, y] = toRobot(px, py);
+  leaveFit();
+  view.scale = min(4000, max(1.5, view.scale * factor));
+  const [nx, ny] = toRobot(px, py);
+  view.x += x - nx;
+  view.y += y - ny;
+  wake();
+}
+
+function pan(dx, dy) {
+  const [x, y] = toRobot(middle.x - dx, middle.y - dy);
+  leaveFit();
+  [view.x, view.y] = [x, y].map((value) => max(-200, min(200, value)));
+  wake();
+}
+
+function turn(angle) {
+  view.turn += angle;
+  isFitDue = true;
+  place();
+  wake();
+}
+
+function leaveFit() {
+  Object.assign(view, { fits: false, goal: null });
+  press(buttonOf("fit"), false);
+}
+
+const buttonOf = (name) => document.querySelector(`[data-do=${name}]`);
+const press = (button, isOn) => { button.ariaPressed = isOn; };
+
+const actions = {
+  fit: () => {
+    Object.assign(view, { fits: true, isFitted: false, turn: 0 });
+    place();
+    press(buttonOf("fit"), true);
+    fit();
+  },
+  side: () => {
+    view = views[isAside() ? 0 : 1];
+    for (const one of sweeps.values()) one.points = null;
+    tape = null;
+    isFitDue = true;
+    place();
+    press(buttonOf("side"), isAside());
+    press(buttonOf("fit"), view.fits);
+    map.ariaLabel = map.ariaLabel.replace(/above|the side/, isAside() ? "the side" : "above");
+    follow();
+    tell();
+  },
+  in: () => zoom(1.25),
+  out: () => zoom(0.8),
+  turn: () => turn(PI / 12),
+  tape: () => {
+    isTape = !isTape;
+    tape = null;
+    press(buttonOf("tape"), isTape);
+  },
+  hold: () => {
+    const waiting = kept;
+    kept = waiting ? null : new Map();
+    for (const [topic, [buffer, offset]] of waiting ?? []) show(topic, buffer, offset);
+    press(buttonOf("hold"), Boolean(kept));
+    tell();
+  },
+  layers: () => press(buttonOf("layers"), $("layers").classList.toggle("open")),
+  theme: () => {
+    document.documentElement.dataset.theme = isDark ? "light" : "dark";
+    readColours();
+  },
+  help: () => ($("help").open ? $("help").close() : $("help").showModal()),
+};
+
+function act(name) {
+  actions[name]();
+  wake();
+}
+
+for (const button of document.querySelectorAll("nav button")) button.onclick = () => act(button.dataset.do);
+for (const [layer, [key, name]] of Object.entries(LAYERS)) {
+  const button = make("button", $("layers"));
+  button.dataset.key = key;
+  button.textContent = name;
+  const mark = () => press(button, layers[layer]);
+  button.onclick = () => {
+    layers[layer] = !layers[layer];
+    try { sessionStorage.setItem("layers", JSON.stringify(layers)); } catch { /* See there. */ }
+    if (layer === "lines") {
+      [walls, corners] = [[], []];
+      follow();
+    }
+    mark();
+    wake();
+  };
+  mark();
+}
+
+for (const button of document.querySelectorAll("#player button")) {
+  button.onclick = () => {
+    if (isOpen) socket.send(JSON.stringify({ op: "scanhub.player", order: button.dataset.order }));
+  };
+}
+
+addEventListener("keydown", (event) => {
+  if (event.ctrlKey || event.metaKey || $("help").open) return;
+  if (event.target.tagName === "BUTTON" && [" ", "Enter"].includes(event.key)) return;
+  const moves = { ArrowLeft: [48, 0], ArrowRight: [-48, 0], ArrowUp: [0, 48], ArrowDown: [0, -48] };
+  if (moves[event.key]) pan(...moves[event.key]);
+  else if (event.key === "=") act("in");
+  else if (event.key === "[") turn(-PI / 12);
+  else if (event.key === "0") choose(only);
+  else if (/^[1-9]$/.test(event.key)) {
+    const sensor = everySensor()[Number(event.key) - 1];
+    if (sensor) choose(sensor.space);
+  } else {
+    const button = document.querySelector(`[data-key="${CSS.escape(event.key)}"]`);
+    if (!button || button.closest("[hidden]")) return;
+    button.click();
+  }
+  event.preventDefault();
+});
+
+// Fingers and the mouse: one moves, two zoom and turn.
+const fingers = new Map();
+const placeOf = (event) => [event.clientX, event.clientY];
+
+map.onpointerdown = (event) => {
+  map.setPointerCapture(event.pointerId);
+  fingers.set(event.pointerId, placeOf(event));
+  const at = toRobot(...placeOf(event));
+  tape = (isTape || event.shiftKey) && fingers.size === 1 ? { from: at, to: at } : null;
+  wake();
+};
+
+map.onpointermove = (event) => {
+  pointer = placeOf(event);
+  const was = fingers.get(event.pointerId);
+  if (was) {
+    const from = (place) => [pointer[0] - place[0], pointer[1] - place[1]];
+    const other = [...fingers].find(([id]) => id !== event.pointerId)?.[1];
+    if (tape && fingers.size === 1) tape.to = toRobot(...pointer);
+    else if (other) {
+      const [before, after] = [[was[0] - other[0], was[1] - other[1]], from(other)];
+      turn(atan2(after[1], after[0]) - atan2(before[1], before[0]));
+      zoom(hypot(...after) / max(1, hypot(...before)), ...other);
+    } else if (event.altKey) turn(from(was)[0] / 200);
+    else pan(...from(was));
+    fingers.set(event.pointerId, pointer);
+  }
+  wake();
+};
+
+map.onpointerup = map.onpointercancel = (event) => {
+  fingers.delete(event.pointerId);
+  if (event.pointerType === "touch" && !fingers.size) pointer = placeOf(event);
+};
+map.onpointerleave = () => {
+  pointer = null;
+  wake();
+};
+map.addEventListener("wheel", (event) => {
+  event.preventDefault();
+  zoom(Math.exp(-event.deltaY * (event.ctrlKey ? 0.01 : 0.0015)), event.clientX, event.clientY);
+}, { passive: false });
+
+addEventListener("resize", resize);
+matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => {
+  readColours();
+  wake();
+});
+
+// Numbers for whoever looks.
+
+Object.defineProperty(window, "scanhub", {
+  get: () => ({
+    frames,
+    scans: Object.fromEntries(everySensor().map(({ name, scans }) => [name, scans])),
+    ...drawn,
+    people: persons(),
+    aside: isAside(),
+    sweeps: everySweep().map(({ name, sweep, obstacles, points }) => ({ name, ...sweep, obstacles, points: points?.map((xyz) => xyz.length / 3) })),
+    shown: () => ages,
+    points: (name) => allPoints().filter((one) => one.name === name).flatMap(({ points, pose }) =>
+      [...points].flatMap((x, i, xs) => (i % 2 ? [] : inFrame(pose, x, xs[i + 1])))),
+    screen: toScreen,
+    place: toRobot,
+    view: { x: view.x, y: view.y, scale: view.scale, turn: view.turn },
+    verdict: verdict(),
+    connected: isOpen,
+    player,
+    reason: $("reason").hidden ? null : $("reason").innerText,
+    sensors: everySensor().map(({ status }) => status).filter(Boolean),
+  }),
+});
+
+readColours();
+resize();
+connect();
+tell();
+setInterval(tell, 100);
+setInterval(tellSensors, 500);

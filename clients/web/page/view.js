@@ -1,0 +1,116 @@
+// Which part of the world is seen, and where on the screen.
+
+/** What can be shown, each with its key and its name. */
+const LAYERS = {
+  scan: ["s", "Scan"], intensity: ["i", "Intensity"], foreground: ["f", "Foreground"], trails: ["t", "Trails"],
+  background: ["b", "Background"], zones: ["z", "Zones"], marks: ["m", "Marks"], lines: ["e", "Lines and corners"],
+  obstacles: ["o", "Obstacles"], field: ["v", "Field of view"], grid: ["g", "Grid"],
+};
+const layers = Object.fromEntries(Object.keys(LAYERS).map((name) => [name, name !== "lines"]));
+try { // What was chosen before in this window; browsers may refuse to keep anything.
+  Object.assign(layers, JSON.parse(sessionStorage.getItem("layers")));
+} catch { /* It holds as long as the page is open. */ }
+const views = ["above", "aside"].map(() => ({ x: 1, y: 0, scale: 60, turn: 0, fits: true, isFitted: false, goal: null }));
+let view = views[0];
+const isAside = () => view === views[1];
+let only = null; // the one sensor that is shown
+const isCalm = matchMedia("(prefers-reduced-motion: reduce)");
+let pointer = null; // over the picture, in pixels
+let tape = null; // { from, to } in metres
+let isTape = false;
+let size = { width: 1, height: 1, ratio: 1 };
+
+/** The part of the window that nothing covers. */
+function open() {
+  const isNarrow = size.width <= 720;
+  const right = isNarrow ? 0 : 320;
+  const bottom = isNarrow ? 60 + ($("sensors").offsetHeight || 0) : player ? 116 : 60;
+  const top = 56;
+  return { x: (size.width - right) / 2, y: top + (size.height - top - bottom) / 2, width: size.width - right,
+    height: size.height - top - bottom };
+}
+
+function toScreen(x, y) {
+  const { x: cx, y: cy } = middle;
+  const [a, b] = [-(y - view.y) * view.scale, -(x - view.x) * view.scale];
+  return [cx + a * cos - b * sin, cy + a * sin + b * cos];
+}
+
+/** From a sensor's frame to the robot's. */
+const inFrame = ([xx, xy, yx, yy, x, y], px, py) => [xx * px + xy * py + x, yx * px + yy * py + y];
+
+/** From a sensor's frame to the screen: the six numbers of a canvas's transformation. */
+function onScreen([xx, xy, yx, yy, x, y]) {
+  const [c, s] = [cos * view.scale, sin * view.scale];
+  return [xx * s - yx * c, -xx * c - yx * s, xy * s - yy * c, -xy * c - yy * s, ...toScreen(x, y)];
+}
+
+function toRobot(px, py) {
+  const [a, b] = [px - middle.x, py - middle.y];
+  return [view.x - (-a * sin + b * cos) / view.scale, view.y - (a * cos + b * sin) / view.scale];
+}
+
+let middle = { x: 0, y: 0, width: 1, height: 1 };
+let [cos, sin] = [1, 0];
+
+function place() {
+  middle = open();
+  // From the side it is the robot that turns, and not the picture.
+  [cos, sin] = isAside() ? [1, 0] : [Math.cos(view.turn), Math.sin(view.turn)];
+}
+
+const shown = () => everySensor().filter((sensor) => (only === null ? !sensor.status?.remote || !hasOwn() : sensor.space === only));
+const hasOwn = () => everySensor().some((sensor) => sensor.status && !sensor.status.remote);
+
+/** All points that are looked at, the frame that they are in, and what is said of one. */
+const allPoints = () => (isAside() ? pointsAside() : shown().filter((one) => one.scan && poseOf(one)).map((one) =>
+  ({ name: one.name, points: one.scan.points, pose: poseOf(one), words: (beam) => beamWords(one, beam) })));
+
+const MARGIN = 1.1;
+
+/** Brings what is seen into the picture, few outliers left out; keeps what is about right. */
+function fit() {
+  const seen = allPoints();
+  // Where a picture ends some hundred points tell as well as thousands.
+  const stride = 2 * ceil(seen.reduce((sum, { points }) => sum + points.length, 0) / 1000);
+  const [xs, ys] = [[], []];
+  for (const { points, pose } of seen) {
+    const [a, b, c, d, e, f] = onScreen(pose);
+    for (let i = 0; i < points.length; i += stride) {
+      const [x, y] = [points[i], points[i + 1]];
+      if (Number.isNaN(x)) continue;
+      xs.push(a * x + c * y + e);
+      ys.push(b * x + d * y + f);
+    }
+  }
+  if (!xs.length) return;
+  const reach = max(0.5, ...(isAside() ? [] : circles.map(({ radius }) => radius))) * 1.08 * view.scale;
+  const robotAt = toScreen(0, 0);
+  const [[left, right], [top, bottom]] = [xs, ys].map((unsorted, n) => {
+    const values = Float32Array.from(unsorted).sort();
+    const out = floor(values.length / 50);
+    return [min(values[out], robotAt[n] - reach), max(values[values.length - 1 - out], robotAt[n] + reach)];
+  });
+  const scale = (view.scale * min(middle.width / (right - left), middle.height / (bottom - top))) / MARGIN;
+  const [x, y] = toRobot((left + right) / 2, (top + bottom) / 2);
+  const goal = { scale, x, y };
+  const now = view.goal ?? view;
+  const moved = hypot(goal.x - now.x, goal.y - now.y) * scale;
+  // A picture that breathes cannot be read: as long as all is in it and not too small, it stays.
+  const isOut = scale * MARGIN < now.scale * 0.99 || moved > 0.12 * min(middle.width, middle.height);
+  if (isOut || now.scale < 0.6 * scale || !view.isFitted) Object.assign(view, { goal, isFitted: true });
+}
+
+/** Moves towards where the picture is to be; true while it moves. */
+function glide() {
+  if (!view.goal) return false;
+  const share = isCalm.matches ? 1 : 0.16;
+  const { x, y, scale } = view.goal;
+  view.x += (x - view.x) * share;
+  view.y += (y - view.y) * share;
+  view.scale *= (scale / view.scale) ** share;
+  if (abs(Math.log(scale / view.scale)) < 0.002 && hypot(x - view.x, y - view.y) * scale < 0.5) {
+    Object.assign(view, view.goal, { goal: null });
+  }
+  return true;
+}

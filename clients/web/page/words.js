@@ -1,0 +1,191 @@
+// What is said in words.
+
+/** So many digits behind the point; what rounds to nothing has no sign. */
+const fixed = (value, digits) => value.toFixed(digits).replace(/^-(?=[0.]*$)/, "");
+
+function beamWords({ scan, name }, beam) {
+  const angle = ((scan.first + beam * scan.step) * 180) / PI;
+  const intensity = scan.byShade.length ? `, intensity ${scan.intensities[beam]}` : "";
+  return `\n${name}: ${fixed(angle, 2)}\u00b0, ${fixed(scan.ranges[beam], 3)} m${intensity}`;
+}
+
+/** What is under the pointer: a point, or a place. */
+function readOut() {
+  const box = $("readout");
+  if (!pointer || tape) return box.replaceChildren();
+  let best = { apart: 14 };
+  for (const { points, pose, words } of layers.scan ? allPoints() : []) {
+    const [a, b, c, d, e, f] = onScreen(pose);
+    for (let i = 0; i < points.length; i += 2) {
+      const x = a * points[i] + c * points[i + 1] + e;
+      const y = b * points[i] + d * points[i + 1] + f;
+      const apart = hypot(x - pointer[0], y - pointer[1]);
+      if (apart < best.apart) best = { apart, words, beam: i / 2, screen: [x, y] };
+    }
+  }
+  const [x, y] = toRobot(...(best.screen ?? pointer));
+  const bold = make("b");
+  bold.textContent = isAside() ? `${fixed(x, 2)} m above the floor` : `${fixed(hypot(x, y), 2)} m from the ${robot.map ? "map's origin" : "robot"}`;
+  const place = isAside() ? `${fixed(-y, 2)} m ${view.turn ? "to the right" : "ahead"}` : `x ${fixed(x, 2)}  y ${fixed(y, 2)} m`;
+  box.replaceChildren(bold, `\n${place}`, best.words?.(best.beam) ?? "");
+  if (!best.screen) return;
+  ink(colours.accent, 2);
+  circle(...best.screen, 7);
+  pen.stroke();
+}
+
+const persons = () => [...people.values()].flatMap((one) => one.persons);
+
+/** What a player shows while it waits stands. */
+const stands = () => player !== null && (player.paused || player.over);
+const isHeard = () => isOpen && performance.now() - heard < SILENT_MS;
+const verdict = () => (isHeard() ? robot.verdict : "unknown");
+
+function put(element, text) {
+  if (element.textContent !== text) element.textContent = text;
+}
+
+/** The verdict in words; with each frame, so that words and circles are of one moment. */
+function tellVerdict() {
+  const word = verdict();
+  const box = $("verdict");
+  box.className = word;
+  put(box.firstElementChild, word.toUpperCase());
+  const { sensor, nearest_m, hub_words: hub } = isHeard() ? robot : {};
+  const nearest = nearest_m?.toFixed(2);
+  put(box.lastElementChild, [sensor, nearest && `nearest ${nearest} m`].filter(Boolean).join(", ") + (kept ? "  ·  picture held" : ""));
+  put($("hub"), hub ?? "");
+  put($("title"), `${word.toUpperCase()} – scanhub`);
+}
+
+function lose(one, left) {
+  Object.assign(one, left);
+  wake();
+}
+
+/** Forgets what is too old to be what is there. */
+function age(now) {
+  for (const one of everySensor()) if (one.scan && now - one.scan.at > max(OLD_MS, 3000 * one.scan.period)) lose(one, blind());
+  for (const one of everySweep()) if (one.sweep && now > one.until) lose(one, empty());
+  for (const one of people.values()) if (one.persons.length && now - one.at > OLD_MS) lose(one, { persons: [] });
+}
+
+function tell() {
+  const now = performance.now();
+  tellVerdict();
+  if (!isHeard() && (circles.length || everySensor().some(({ scan }) => scan))) {
+    forget();
+    wake();
+  }
+  if (!kept && !stands()) age(now);
+  put($("people"), (isHeard() && robot.people) || "");
+  put($("swept"), everySweep().map(sweepWords).join("; "));
+  buttonOf("side").hidden = !sweeps.size;
+  tellPlayer();
+  explain();
+}
+
+function tellPlayer() {
+  const box = $("player");
+  box.hidden = !player;
+  if (!player) return;
+  const { position_s: at, length_s: length, paused, over, words } = player;
+  put($("played"), words);
+  Object.assign($("line"), { hidden: length === null, max: length ?? 1, value: at });
+  const button = box.querySelector("[data-order=toggle]");
+  put(button, paused ? "Play" : "Pause");
+  for (const one of box.querySelectorAll("button")) one.disabled = over || !isOpen;
+}
+
+/** Why the picture is empty, and what to do. */
+function explain() {
+  const [first] = shown();
+  let trouble = robot.trouble ?? (robot.hub ? null : { what: "No hub", remedy: "scanhub run" });
+  if (!isOpen) trouble = { what: "No connection to scanhub web", remedy: "It ended, or the network between is cut. This page tries again by itself." };
+  else if (!isHeard()) trouble = { what: "scanhub web is silent", remedy: "It does not say anything any more: look at the terminal where it runs." };
+  else if (!trouble && first?.status?.trouble && shown().every(({ scan }) => !scan)) {
+    const { what, remedy } = first.status.trouble;
+    trouble = { what: `${first.name}: ${what}`, remedy };
+  }
+  if (!trouble && isAside() && !pointsAside().length) {
+    trouble = { what: $("swept").textContent, remedy: "Does the mount swing from turn to turn, and does scanhub tilt run?" };
+  }
+  const box = $("reason");
+  box.hidden = !trouble;
+  if (trouble) {
+    put(box.firstElementChild, trouble.what);
+    put(box.lastElementChild, trouble.remedy);
+  }
+}
+
+const FIELDS = [
+  ["rate", "hz", ({ hz }) => (hz === null ? "–" : `${hz.toFixed(1)} Hz`)],
+  ["age p50 / p99", "age", ({ age_p50_ms: half, age_p99_ms: most }) => (half === null ? "–" : `${half.toFixed(1)} / ${most.toFixed(1)} ms`)],
+  ["damaged on the line", "loss", ({ loss }) => percent(loss)],
+  ["lost line / here", null, ({ lost_on_line: line, lost }) => `${line ?? "–"} / ${lost}`],
+];
+const percent = (share) => `${(100 * share).toFixed(!share ? 0 : share < 0.1 ? 2 : 1)} %`;
+const WELL = 0.001;
+
+function make(tag, parent, name = "") {
+  const element = document.createElement(tag);
+  element.className = name;
+  parent?.append(element);
+  return element;
+}
+
+function makeCard(sensor) {
+  const card = make("article", $("sensors"));
+  const title = make("h2", card);
+  sensor.card = { card, title: make("button", title), state: make("i", title), kind: make("div", card, "kind"), trouble: make("p", card, "trouble"), fields: [] };
+  const list = make("dl", card);
+  for (const [label, series, text] of FIELDS) {
+    const field = make("div", list);
+    make("dt", field).textContent = label;
+    const value = make("dd", field);
+    const number = make("span", value);
+    const line = series && make("canvas", value);
+    if (line) line.setAttribute("aria-hidden", "true");
+    sensor.card.fields.push({ field, number, line, series, text });
+  }
+  sensor.card.title.onclick = () => choose(sensor.space);
+}
+
+function tellSensors() {
+  everySensor().forEach((sensor, n) => {
+    const { status } = sensor;
+    if (!status) return;
+    if (!sensor.card) makeCard(sensor);
+    const { card, title, state, kind, trouble, fields } = sensor.card;
+    const isHere = isHeard() && robot.hub;
+    const word = isHere ? status.state : "unheard";
+    const isLossy = status.loss > WELL;
+    card.className = [word, isLossy ? "lossy" : "", shown().includes(sensor) ? "" : "off"].join(" ");
+    put(title, `${n + 1}  ${sensor.name}`);
+    press(title, only === sensor.space);
+    put(state, word + (status.frozen ? ", frozen" : ""));
+    put(kind, [status.family, status.model, status.port].filter(Boolean).join(" · "));
+    const told = isHere && status.trouble;
+    const lossWords = isLossy && isHere && `${percent(status.loss)} of its line is damaged or lost: check cable, ground and rate`;
+    put(trouble, told ? [told.what, told.remedy].filter(Boolean).join(": ") : lossWords || "");
+    for (const { field, number, line, series, text } of fields) {
+      put(number, isHere ? text(status) : "–");
+      field.className = series === "loss" && isLossy ? "amber" : "";
+      if (line) sparkline(line, sensor.history, series);
+    }
+  });
+}
+
+/** The last two minutes; the middle of a bare line is no trouble, so it begins at 0. */
+function sparkline(canvas, history, series) {
+  const { clientWidth: width, clientHeight: height } = canvas;
+  const now = performance.now();
+  const most = max(series === "loss" ? 0.01 : 1, ...history.map((one) => one[series]));
+  drawOn(canvas, () => {
+    ink(colours.edge, 1);
+    stroke([0, height - 0.5], [width, height - 0.5]);
+    ink(series === "loss" ? colours.slow : colours.accent, 1.5);
+    pen.lineJoin = "round";
+    stroke(...history.map((one) => [width - ((now - one.at) / HISTORY_MS) * width, height - 1 - (one[series] / (most * 1.15)) * (height - 3)]));
+  }, width, height);
+}
