@@ -141,8 +141,8 @@ impl<'a, S: Surroundings> Drive<'a, S> {
     fn read(&mut self, core: &mut LinkCore<'a, S>, open: &mut Open<S::Line>) -> io::Result<()> {
         let Open { line, session, allowance, backlog, watch, until, .. } = open;
         let around = core.around;
-        if !*watch {
-            // The telegram's end is near: what can be done before it is not done after it.
+        if !*watch && matches!(session, Driver::Lms(_)) {
+            // The telegram's end is near: what can be done before it is not done after it. Packets end all the time.
             core.output.prepare();
         }
         if *watch

@@ -113,7 +113,7 @@ impl Check {
             self.forget();
         }
         self.seen = self.seen.saturating_add(1);
-        let invalid = self.table.invalid(&scan.ranges()[..scan.beams().min(self.table.most())]);
+        let invalid = self.table.invalid(scan);
         let Met { inside, nearest } = self.table.met(scan);
         let is_enough = self.seen >= self.min_scans && !self.is_blind();
         let is_known = is_enough && !self.is_late && invalid <= self.table.most_invalid();

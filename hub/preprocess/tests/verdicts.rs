@@ -224,3 +224,20 @@ fn what_was_not_measured_is_looked_past_where_its_neighbours_were() {
     let none: Vec<usize> = (0..200).collect();
     assert_eq!(without(&none, 1.8), (200, Verdict::Unknown));
 }
+
+#[test]
+fn scans_of_a_head_that_changes_its_speed_follow_each_other() {
+    let settings = Settings { min_scans: 3, max_invalid: 0.0, ..Settings::default() };
+    let mut check = Check::new(Pose::default(), &settings, 200);
+    let mut next = |range: u16, spacing_deg: f32| {
+        let mut scan = turn(&[(7, range, -12.6)]);
+        [90, 91].iter().for_each(|&i| scan.arrays().ranges[i] = Scan::NOT_MEASURED);
+        scan.spacing = spacing_deg.to_radians();
+        let out = told(&mut check, &scan);
+        (out.verdict(), out.invalid_beams)
+    };
+    let near = [3.6, 3.61, 3.59].map(|spacing_deg| next(500, spacing_deg));
+    assert_eq!(near, [(Verdict::Unknown, 0), (Verdict::Unknown, 0), (Verdict::Stop, 0)]);
+    assert_eq!(next(5000, 3.6), (Verdict::Clear, 0));
+    assert_eq!(next(5000, 1.8), (Verdict::Unknown, 2), "its points are as near to each other as its beams");
+}

@@ -23,6 +23,8 @@ struct OfSensor {
     family: Rc<dyn Family>,
     /// How often a telegram was sent and not published.
     open: HashMap<u64, u32>,
+    /// What was published and not sent, until the next telegram tells whether bytes that nobody sent came before it.
+    strange: Vec<Vec<u8>>,
     /// The last telegrams that the line damaged, and nothing where it brought bytes between two.
     damaged: VecDeque<Vec<u8>>,
     /// Place behind the last telegram.
@@ -36,6 +38,7 @@ impl NothingInvented {
         let sensor = |family: &Rc<dyn Family>| OfSensor {
             family: family.clone(),
             open: HashMap::new(),
+            strange: Vec::new(),
             damaged: VecDeque::new(),
             end: 0,
             last: Default::default(),
@@ -61,6 +64,11 @@ impl Judge for NothingInvented {
                 if telegram.damage.is_some() {
                     of.damage(telegram.bytes);
                 }
+                for unit in std::mem::take(&mut of.strange) {
+                    if !of.family.is_collision(&unit, &mut of.damaged.iter().map(Vec::as_slice)) {
+                        say.broken(format!("sensor {sensor} did not send {unit:02X?}"));
+                    }
+                }
             }
             Event::Published { sensor, sample } if sample.topic == Topic::Telegram => {
                 let of = &mut self.sensors[sensor];
@@ -69,7 +77,7 @@ impl Judge for NothingInvented {
                     let mut damaged = of.damaged.iter().map(Vec::as_slice);
                     let is_clean = sample.header.reasons == 0;
                     if !is_known && is_clean && !of.family.is_collision(unit, &mut damaged) {
-                        say.broken(format!("sensor {sensor} did not send {unit:02X?}"));
+                        of.strange.push(unit.to_vec());
                     }
                 }
                 (of.last.0, of.last.1) = (sample.header.seq, sample.header.boot);
