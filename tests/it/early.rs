@@ -78,10 +78,12 @@ fn warnings_come_before_the_telegram_ends_and_its_zones_confirm_them() {
 
 #[test]
 fn a_warning_of_a_telegram_that_is_damaged_is_taken_back() {
-    let env = TestEnv::new();
-    let outcome = heard(&env, &["--fault=truncate=0.3"], 5, |line| line["withdrawn"] == true);
-    let (confirmed, withdrawn) = judge(&outcome);
-    assert!(confirmed > 0 && withdrawn >= 5, "{confirmed} and {withdrawn}");
+    hold_in_time(|| {
+        let env = TestEnv::in_time();
+        let outcome = heard(&env, &["--fault=truncate=0.3"], 5, |line| line["withdrawn"] == true);
+        let (confirmed, withdrawn) = judge(&outcome);
+        assert!(confirmed > 0 && withdrawn >= 5, "{confirmed} and {withdrawn}");
+    });
 }
 
 #[test]
