@@ -78,10 +78,28 @@ fn warnings_come_before_the_telegram_ends_and_its_zones_confirm_them() {
 
 #[test]
 fn a_warning_of_a_telegram_that_is_damaged_is_taken_back() {
+    hold_in_time(|| {
+        let env = TestEnv::in_time();
+        let outcome = heard(&env, &["--fault=truncate=0.3"], 5, |line| line["withdrawn"] == true);
+        let (confirmed, withdrawn) = judge(&outcome);
+        assert!(confirmed > 0 && withdrawn >= 5, "{confirmed} and {withdrawn}");
+    });
+}
+
+#[test]
+fn a_hub_warns_a_robot_in_python_only_while_it_wants_that() {
     let env = TestEnv::new();
-    let outcome = heard(&env, &["--fault=truncate=0.3"], 5, |line| line["withdrawn"] == true);
-    let (confirmed, withdrawn) = judge(&outcome);
-    assert!(confirmed > 0 && withdrawn >= 5, "{confirmed} and {withdrawn}");
+    let Some(mut command) = check_on(&env, "robot") else { return };
+    command.args(["--early", "front"]);
+    let flags = ["--seed=28", "--baud=500000", &format!("--world={}", env.file("post.toml", POST))];
+    let (hub, simulator) = (env.hub(&[env.link("front")]), env.simulator(&["front"], &flags));
+    let mut robot = Program::start(command);
+    robot.await_line("the post", |line| line["verdict"] == "stop");
+    until("it follows warnings", || env.subscribers("front/early") == 1);
+    robot.await_line("the post, after that", |line| line["verdict"] == "stop");
+    assert_eq!(robot.end(INT).code, Some(0));
+    until("nobody follows them", || env.subscribers("front/early") == 0);
+    assert_eq!((hub.end(TERM).code, simulator.end(TERM).code), (Some(0), Some(0)));
 }
 
 /// A sensor whose zones and warnings are said here.

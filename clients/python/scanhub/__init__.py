@@ -6,8 +6,9 @@
         print(scan.seq, scan.ranges_m[180])
 
 `scan.ranges_m` has metres, NaN where there is no reading; `scan.ranges` is a numpy view of the hub's memory that cannot be
-written, in device units and with codes. A hub that is not there is waited for, one
-that restarts too. docs/python.md has the rest.
+written, in device units and with codes. A hub that is not there is waited for, one that restarts too. `scanhub.robot()`
+follows the verdict over all sensors, `scanhub.publish("mount/tilt")` publishes the angles of a mount. docs/python.md has the
+rest.
 """
 
 from __future__ import annotations

@@ -191,7 +191,13 @@ def topics(domain: Domain) -> list[TopicName]:
 def forget_names(domain: Domain) -> None:
     """Where nobody is left in the domain: the next one there has other names. Only for who holds the lock `making`."""
     begin = prefix.of(domain)
-    if begin is not None and not iox2.Node.list(iox2.ServiceType.Ipc, _config(domain, begin)):
+    if begin is None:
+        return
+    try:
+        left = iox2.Node.list(iox2.ServiceType.Ipc, _config(domain, begin))
+    except iox2.NodeListFailure as error:
+        raise trouble.broken(domain, f"cannot list processes: {error}") from None
+    if not left:
         counter.remove(begin)
         prefix.forget(domain)
 

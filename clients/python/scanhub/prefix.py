@@ -52,8 +52,8 @@ def _read(domain: Domain, directory: Directory) -> str | None:
         return None
     with open(file, "rb") as opened:
         written = opened.read(64)
-    is_one = re.fullmatch(rb"(sh_[0-9a-z-]+_[0-9a-z]{5}_)\n", written)
-    return written[:-1].decode() if is_one and written.startswith(domain.prefix.encode()) else None
+    is_one = re.fullmatch(domain.prefix.encode() + rb"[0-9a-z]{5}_\n", written)
+    return written[:-1].decode() if is_one else None
 
 
 def _word() -> str:

@@ -3,6 +3,7 @@ woken, as with a hub's own. A name has one publisher: its lock says that it live
 
 from __future__ import annotations
 
+import contextlib
 import operator
 import os
 import time
@@ -10,7 +11,7 @@ import weakref
 
 from . import layout, memory, trouble
 from .errors import Failure, Impossible
-from .lock import NameLock, making
+from .lock import NameLock, holder, making
 from .names import LINKS, Domain, TopicName
 from .outlet import Outlet
 from .tilted import Tilt
@@ -92,8 +93,8 @@ class _Place:
     def _give_free(self) -> None:
         """The last one out takes the names of the shared memory along."""
         try:
-            with making(self._domain):
-                memory.forget_names(self._domain)
-        except (OSError, Failure):
-            pass
-        self._lock.release()
+            with contextlib.suppress(OSError, Failure), making(self._domain):
+                if all(holder(self._domain, lock) is None for lock in ("hub.lock", "listen.lock")):
+                    memory.forget_names(self._domain)
+        finally:
+            self._lock.release()

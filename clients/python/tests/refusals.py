@@ -27,6 +27,10 @@ def follow(*topics: str, timeout: float = 20.0):
     return next(scanhub.subscribe(*topics, domain=domain, root=root, timeout=timeout))
 
 
+def publish(name: str = "mount") -> scanhub.Publication:
+    return scanhub.publish(f"{name}/tilt", domain=domain, root=root)
+
+
 def names_that_are_none() -> None:
     for topic in ("front", "front/", "front/scans", "scan", "robot/zones", "Front/scan", "a.b.c/scan", ""):
         assert refusal(scanhub.Failure, lambda: scanhub.subscribe(topic)).remedy, topic
@@ -69,8 +73,9 @@ def somebody_elses_domain() -> None:
     child = os.fork()
     if child == 0:
         os.setresuid(65534, 65534, 65534)
-        said = refusal(scanhub.Denied, lambda: follow("front/scan"))
-        os._exit(0 if "belongs to user 0 (root) with mode 0755, this is user 65534" in said.message else 1)
+        refused = [refusal(scanhub.Denied, what) for what in (lambda: follow("front/scan"), publish)]
+        words = "belongs to user 0 (root) with mode 0755, this is user 65534"
+        os._exit(0 if all(words in said.message for said in refused) else 1)
     assert os.waitpid(child, 0)[1] == 0
 
 
@@ -96,18 +101,23 @@ def hub_of_another_layout() -> list:
     wake = hub.service("scanhub/v2/front/wake").event().open_or_create()
     scan = hub.service("scanhub/v2/front/scan").publish_subscribe(Scan).user_header(layout.Header)
     zones = hub.service("scanhub/v2/front/zones").publish_subscribe(iox2.Slice[ctypes.c_uint8])
-    return [lock, hub, wake, scan.open_or_create(), zones.open_or_create()]
+    tilt = hub.service("scanhub/v2/old/tilt").publish_subscribe(iox2.Slice[ctypes.c_uint8])
+    return [lock, hub, wake, scan.open_or_create(), zones.open_or_create(), tilt.open_or_create()]
 
 
 def other_layouts() -> None:
     held = hub_of_another_layout()
-    assert scanhub.sensors(domain=domain, root=root) == ["front"]
+    assert scanhub.sensors(domain=domain, root=root) == ["front", "old"]
     said = refusal(scanhub.Mismatch, lambda: follow("front/scan"))
     theirs, ours = "scanhub.Scan.v1 of 1220 bytes", "scanhub.Scan.v2 of 8 bytes"
     assert theirs in said.message and ours in said.message and "iceoryx2 0.10.0" in said.message, said
     assert said.message.index(theirs) < said.message.index(ours)
     said = refusal(scanhub.Mismatch, lambda: follow("front/zones"))
     assert "u8 of 1 bytes under ()" in said.message and "scanhub.Zones.v2 of 76 bytes" in said.message, said
+    said = refusal(scanhub.Mismatch, lambda: publish("old"))
+    assert "u8 of 1 bytes under ()" in said.message and "scanhub.Tilt.v2 of 16 bytes" in said.message, said
+    said = refusal(scanhub.Impossible, lambda: publish("front"))
+    assert "sensor of the hub" in said.message, said
     said = refusal(scanhub.Silent, lambda: follow("front/marks", "rear/scan", timeout=0.3))
     assert "front/marks, rear/scan" in said.message and "front/scan" in said.remedy, said
     said = refusal(scanhub.NoHub, lambda: scanhub.background("front", domain=domain, root=root))
@@ -120,9 +130,13 @@ def what_is_short() -> None:
     before = resource.getrlimit(resource.RLIMIT_NOFILE)
     # Fewer than one more port takes.
     resource.setrlimit(resource.RLIMIT_NOFILE, (len(os.listdir("/proc/self/fd")) + 6, before[1]))
-    said = refusal(scanhub.Short, lambda: follow("front/scan", "front/marks", timeout=1))
+    refused = [refusal(scanhub.Short, lambda: follow("front/scan", "front/marks", timeout=1))]
+    refused.append(refusal(scanhub.Short, publish))
     resource.setrlimit(resource.RLIMIT_NOFILE, before)
-    assert "descriptors are short" in said.message and "ulimit -n" in said.remedy, said
+    for said in refused:
+        assert "descriptors are short" in said.message and "ulimit -n" in said.remedy, said
+    # Whoever was refused has left the name.
+    publish().close()
     follower, looker = scanhub.subscribe("front/scan", domain=domain, root=root, timeout=1), Presence([place])
     looker.look()
     time.sleep(LOOK_EVERY)
