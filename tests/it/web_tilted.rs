@@ -223,7 +223,7 @@ fn the_page_of_the_demonstration_has_sweeps() {
 /// As in the documents, by the command that makes those of `web_page`: the hall of `docs/tilt.md`, once all has come that comes.
 #[test]
 fn the_picture_of_the_documents_from_the_side() {
-    let env = TestEnv::new();
+    let env = TestEnv::in_time();
     let directory = std::env::var_os("SCANHUB_PICTURES");
     let look = Look { width: 960, height: 480, ..Look::LAPTOP };
     let Some(mut page) = browse(&env, look) else { return };
