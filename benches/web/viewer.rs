@@ -20,7 +20,10 @@ pub(crate) fn read(url: &str, span: Duration) -> Outcome<f64> {
             Message::Text(text) => {
                 let told: Value = serde_json::from_str(&text)?;
                 let channels = told["channels"].as_array().into_iter().flatten();
-                let wanted = channels.filter(|channel| channel["topic"] != "/lines");
+                let word = |channel: &Value| channel["topic"].as_str()?.rsplit('/').next().map(str::to_owned);
+                let is_seldom =
+                    |word: String| ["lines", "cloud", "tilt", "tf_static"].contains(&word.as_str());
+                let wanted = channels.filter(|channel| !word(channel).is_some_and(is_seldom));
                 let wanted: Vec<Value> = wanted
                     .map(|channel| json!({ "id": channel["id"], "channelId": channel["id"] }))
                     .collect();

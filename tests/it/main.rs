@@ -101,4 +101,5 @@ mod web_empty;
 mod web_families;
 mod web_page;
 mod web_replay;
+mod web_tilted;
 mod web_tracks;

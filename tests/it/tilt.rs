@@ -30,16 +30,16 @@ pose = [0, 1500]
 ";
 
 /// The post, as somebody says who wants nothing to stand there.
-const NEAR: &str = "--near=1,2,-0.5,0.5,0.1,0.7";
+pub(crate) const NEAR: &str = "--near=1,2,-0.5,0.5,0.1,0.7";
 
-struct Hall {
-    env: TestEnv,
+pub(crate) struct Hall {
+    pub(crate) env: TestEnv,
     hub: Program,
     simulator: Option<Program>,
 }
 
 impl Hall {
-    fn new() -> Hall {
+    pub(crate) fn new() -> Hall {
         Hall::of_encoder("mount")
     }
 
@@ -54,7 +54,7 @@ impl Hall {
         Hall { env, hub, simulator: Some(simulator) }
     }
 
-    fn tilt(&self, more: &[&str]) -> Program {
+    pub(crate) fn tilt(&self, more: &[&str]) -> Program {
         let place =
             ["tilt", "front", "--angles=mount", "--axis-at=0,0,0.9", "--sensor-at=0.06,0,0.94", "--json"];
         self.env.start(&[&place[..], more].concat())
@@ -78,7 +78,7 @@ fn is_told(outcome: &Outcome, words: &str) -> bool {
     outcome.of_class("error").iter().any(|line| line["message"].to_string().contains(words))
 }
 
-fn numbers(list: &Value) -> Vec<f64> {
+pub(crate) fn numbers(list: &Value) -> Vec<f64> {
     list.as_array().expect("a list").iter().map(|value| value.as_f64().expect("a number")).collect()
 }
 
@@ -173,7 +173,7 @@ fn programs_in_other_languages_say_how_a_mount_stands_and_the_post_is_an_obstacl
     ends_well(hall);
 }
 
-fn ends_well(hall: Hall) {
+pub(crate) fn ends_well(hall: Hall) {
     let outcome = hall.hub.end(INT);
     assert_eq!(outcome.code, Some(0), "{outcome}");
 }

@@ -13,20 +13,20 @@ use serde_json::{Value, json};
 use crate::testkit::{INT, Outcome, Program, Recording, TestEnv, in_a_network, number, python, until};
 
 /// What turns a mount and what makes points of it, in one program.
-struct Made {
+pub(crate) struct Made {
     tilt: Publication<Tilt>,
     cloud: Publication<Cloud>,
     obstacles: Publication<Obstacles>,
     mount: SensorPublisher,
     room: SensorPublisher,
-    rounds: u32,
+    pub(crate) rounds: u32,
 }
 
 /// Points of a sample: as many as the beams of an LMS, so that a datagram has no room for them.
 const POINTS: u16 = 401;
 
 impl Made {
-    fn beside(env: &TestEnv) -> Made {
+    pub(crate) fn beside(env: &TestEnv) -> Made {
         let beside = |name: &str, maker: Maker| {
             PublishSession::beside(&env.place(), name, maker.topics(), TopicLimits::default()).unwrap()
         };
@@ -36,7 +36,7 @@ impl Made {
     }
 
     /// An angle, obstacles and two clouds, different ones each time.
-    fn round(&mut self) {
+    pub(crate) fn round(&mut self) {
         let (sweep, k) = (self.rounds, self.rounds as f32 / 8.0);
         let at = |header: Header, sensor| Header { sensor, ..header };
         let angle = Tilt { angle_rad: 0.5 + f64::from(k), rate_rad_s: [f64::NAN, -0.25][sweep as usize % 2] };
@@ -88,18 +88,18 @@ impl Made {
 }
 
 /// The round in which it was published.
-fn round(line: &Value) -> u64 {
+pub(crate) fn round(line: &Value) -> u64 {
     match line["angle_deg"].as_f64() {
         Some(angle_deg) => (8.0 * (angle_deg.to_radians() - 0.5)).round() as u64,
         None => number(line, "sweep"),
     }
 }
 
-const CLASSES: [&str; 3] = ["tilt", "cloud", "obstacles"];
-const TOPICS: [&str; 3] = ["mount/tilt", "room/cloud", "room/obstacles"];
+pub(crate) const CLASSES: [&str; 3] = ["tilt", "cloud", "obstacles"];
+pub(crate) const TOPICS: [&str; 3] = ["mount/tilt", "room/cloud", "room/obstacles"];
 
 /// A hub whose sensor is not there.
-fn hub(env: &TestEnv) -> Program {
+pub(crate) fn hub(env: &TestEnv) -> Program {
     env.hub(&[env.link("front")])
 }
 

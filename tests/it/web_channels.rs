@@ -97,7 +97,7 @@ impl Viewer {
 }
 
 /// Whether `value` is what `schema` says, as far as this project's schemas say it: types, words, properties and items.
-fn conforms(value: &Value, schema: &Value) -> bool {
+pub(crate) fn conforms(value: &Value, schema: &Value) -> bool {
     let is = |kind: &Value| match kind.as_str() {
         Some("object") => value.is_object(),
         Some("array") => value.is_array(),

@@ -190,8 +190,8 @@ Object.defineProperty(window, "scanhub", {
     aside: isAside(),
     sweeps: everySweep().map(({ name, sweep, obstacles, points }) => ({ name, ...sweep, obstacles, points: points?.map((xyz) => xyz.length / 3) })),
     shown: () => ages,
-    points: (name) => allPoints().filter((one) => one.name === name).flatMap(({ points, pose }) =>
-      [...points].flatMap((x, i, xs) => (i % 2 ? [] : inFrame(pose, x, xs[i + 1])))),
+    points: (name) => everySensor().filter((one) => one.name === name && one.scan && poseOf(one)).flatMap((one) =>
+      [...one.scan.points].flatMap((x, i, xs) => (i % 2 ? [] : inFrame(poseOf(one), x, xs[i + 1])))),
     screen: toScreen,
     place: toRobot,
     view: { x: view.x, y: view.y, scale: view.scale, turn: view.turn },

@@ -64,7 +64,7 @@ const hasOwn = () => everySensor().some((sensor) => sensor.status && !sensor.sta
 
 /** All points that are looked at, the frame that they are in, and what is said of one. */
 const allPoints = () => (isAside() ? pointsAside() : shown().filter((one) => one.scan && poseOf(one)).map((one) =>
-  ({ name: one.name, points: one.scan.points, pose: poseOf(one), words: (beam) => beamWords(one, beam) })));
+  ({ points: one.scan.points, pose: poseOf(one), words: (beam) => beamWords(one, beam) })));
 
 const MARGIN = 1.1;
 

@@ -1,0 +1,252 @@
+//! Three dimensions in the browser's picture and on its wire: channels are what `echo` says, and the page shows sweeps from the
+//! side while somebody looks at them so.
+
+use std::net::TcpStream;
+use std::path::Path;
+use std::process::Command;
+
+use ros::{POINT_CLOUD, Value as Told, read};
+use serde_json::Value;
+use tungstenite::{Message, WebSocket};
+
+use crate::browser::Look;
+use crate::pages::commands_on;
+use crate::testkit::{INT, Program, TestEnv, is_class, number, until};
+use crate::tilt::{Hall, NEAR, ends_well, numbers};
+use crate::tilted::{CLASSES, Made, TOPICS, hub, round};
+use crate::web::{channels, subscribe, view, view_as, web};
+use crate::web_channels::conforms;
+use crate::web_page::browse;
+
+/// The messages of a round: an angle, a sweep, and what that has found.
+fn say(made: &mut Made, viewer: &mut WebSocket<TcpStream>) -> [Vec<u8>; 3] {
+    made.round();
+    let mut heard: [Option<Vec<u8>>; 3] = Default::default();
+    while heard.iter().any(Option::is_none) {
+        let Message::Binary(frame) = viewer.read().expect("the server lives") else { continue };
+        let number = u32::from_le_bytes(frame[1..5].try_into().expect("four bytes"));
+        heard[number as usize] = Some(frame[13..].to_vec());
+    }
+    heard.map(Option::unwrap_or_default)
+}
+
+/// Whether a point cloud has the points of these lines, which are of one sweep.
+fn is_cloud(body: &[u8], lines: &[Value]) -> bool {
+    let told = read(&POINT_CLOUD, body).expect("a PointCloud2");
+    let byte = |value: &Told| if let Told::Number(byte) = value { *byte as u8 } else { panic!("a byte") };
+    let bytes: Vec<u8> = told.sequence("data").expect("data").iter().map(byte).collect();
+    let list = |key: &str| -> Vec<&Value> {
+        lines.iter().flat_map(|line| line[key].as_array().expect("a list")).collect()
+    };
+    let (points, beams, classes) = (list("points"), list("beams"), list("classes"));
+    let is_point = |(n, point): (usize, &[u8; 16])| {
+        let axes = point.as_chunks::<4>().0.iter().take(3).map(|axis| f64::from(f32::from_le_bytes(*axis)));
+        axes.zip(numbers(points[n])).all(|(axis, said)| (axis - said).abs() < 6e-4)
+            && *beams[n] == Value::from(u16::from_le_bytes([point[12], point[13]]))
+            && *classes[n] == Value::from(point[14])
+    };
+    let all = bytes.as_chunks::<16>().0;
+    told.text("header.frame_id") == Some("base_link")
+        && all.len() == points.len()
+        && all.iter().enumerate().all(is_point)
+}
+
+fn metadata(entity: &Value, key: &str) -> String {
+    let mut all = entity["metadata"].as_array().expect("a list").iter();
+    let value = all.find(|one| one["key"] == key).and_then(|one| one["value"].as_str());
+    value.unwrap_or_else(|| panic!("no {key} in {entity}")).to_owned()
+}
+
+/// Whether boxes are the obstacles of this line.
+fn are_obstacles(update: &Value, line: &Value) -> bool {
+    let entities = update["entities"].as_array().expect("a list");
+    let said = line["obstacles"].as_array().expect("a list");
+    let is_box = |(entity, one): (&Value, &Value)| {
+        let cube = &entity["cubes"][0];
+        let is_axis = |(n, axis): (usize, &str)| {
+            let number = |value: &Value| value.as_f64().expect("a number");
+            let (middle, size) = (number(&cube["pose"]["position"][axis]), number(&cube["size"][axis]));
+            let ends = (number(&one["low_m"][n]), number(&one["high_m"][n]));
+            (middle - size / 2.0 - ends.0).abs() < 6e-4 && (middle + size / 2.0 - ends.1).abs() < 6e-4
+        };
+        ["x", "y", "z"].into_iter().enumerate().all(is_axis)
+            && metadata(entity, "points") == one["points"].to_string()
+            && metadata(entity, "foreground") == one["foreground"].to_string()
+            && metadata(entity, "near") == one["near"].to_string()
+    };
+    metadata(&entities[0], "sweep") == line["sweep"].to_string()
+        && metadata(&entities[0], "complete") == line["complete"].to_string()
+        && metadata(&entities[0], "doubted") == line["doubted"].to_string()
+        && entities.len() == said.len() + 1
+        && entities[1..].iter().zip(said).all(is_box)
+}
+
+#[test]
+fn channels_of_mounts_and_sweeps_are_what_echo_says() {
+    for protocol in ["foxglove.sdk.v1", "foxglove.websocket.v1"] {
+        let env = TestEnv::new();
+        let _hub = hub(&env);
+        let mut made = Made::beside(&env);
+        let mut echo = env.echo(&TOPICS);
+        let (_server, host) = web(&env, &[]);
+        let mut viewer = view_as(&host, "/", None, protocol).expect("let in");
+        let told = channels(&mut viewer, ["/mount/tilt", "/room/cloud", "/room/obstacles"]);
+        until("obstacles are followed at once", || env.subscribers("room/obstacles") == 2);
+        let seldom = ["room/cloud", "mount/tilt"];
+        assert_eq!(seldom.map(|topic| env.subscribers(topic)), [1, 1], "nobody looks at them");
+        let wanted: Vec<(u32, &Value)> = (0..).zip(told.iter().map(|channel| &channel["id"])).collect();
+        subscribe(&mut viewer, &wanted);
+        until("all are followed", || seldom.map(|topic| env.subscribers(topic)) == [2, 2]);
+        let heard: Vec<_> = (0..4).map(|_| say(&mut made, &mut viewer)).collect();
+        let is_last =
+            |line: &Value, class| line["class"] == class && line["first"] != true && round(line) == 3;
+        until("echo says all of them, too", || {
+            CLASSES.iter().all(|class| echo.is_heard(|line| is_last(line, *class)))
+        });
+        let echo = echo.end(INT);
+        let lines = |class: &str, of: u64| {
+            echo.of_class(class).into_iter().filter(|line| round(line) == of).collect::<Vec<_>>()
+        };
+        let object = |body: &[u8], channel: &Value| {
+            let object = serde_json::from_slice::<Value>(body).expect("JSON");
+            let schema = serde_json::from_str(channel["schema"].as_str().expect("text")).expect("JSON");
+            assert!(conforms(&object, &schema), "{object}");
+            object
+        };
+        for (number, [tilt, cloud, obstacles]) in (0..).zip(&heard) {
+            let (tilt, said) = (object(tilt, &told[0]), &lines("tilt", number)[0]);
+            let close = |key: &str| match (tilt[key].as_f64(), said[key].as_f64()) {
+                (Some(told), Some(said)) => (told - said).abs() < 1e-4,
+                (told, said) => told.is_none() && said.is_none(),
+            };
+            assert!(close("angle_deg") && close("rate_deg_s"), "{tilt} {said}");
+            assert!(is_cloud(cloud, &lines("cloud", number)), "sweep {number}");
+            let found = object(obstacles, &told[2]);
+            let said = &lines("obstacles", number)[0];
+            assert!(are_obstacles(&found, said), "{found} {said}");
+        }
+        // Who does not look any more costs nothing.
+        drop(viewer);
+        until("nobody looks", || seldom.map(|topic| env.subscribers(topic)) == [0, 0]);
+    }
+}
+
+const SIDE: &str = "document.querySelector('[data-do=side]')";
+const SWEPT: &str = "document.querySelector('#swept').innerText";
+
+#[test]
+fn a_hall_is_seen_from_the_side_while_somebody_looks() {
+    let hall = Hall::new();
+    let Some(mut page) = browse(&hall.env, Look::LAPTOP) else { return };
+    let (_server, host) = web(&hall.env, &[]);
+    page.open(&format!("http://{host}/"));
+    page.await_true("window.scanhub?.beams > 100");
+    // Where nobody makes sweeps the page is as ever.
+    page.press("h");
+    let is_plain = format!("{SIDE}.hidden && !scanhub.aside && {SWEPT} === ''");
+    assert_eq!(page.ask(&is_plain), true);
+
+    let tilt = hall.tilt(&["--as=hall", NEAR]);
+    page.await_true(&format!("!{SIDE}.hidden && /^hall: /.test({SWEPT})"));
+    page.await_true("scanhub.obstacles > 0 && scanhub.beams > 100");
+    assert_eq!(hall.env.subscribers("hall/cloud"), 0, "points are not seen from above");
+    page.press("h");
+    page.await_true(&format!("scanhub.aside && {SIDE}.ariaPressed === 'true'"));
+    page.await_true("scanhub.swept > 1000 && scanhub.obstacles > 0 && scanhub.reason === null");
+    assert_eq!(hall.env.subscribers("hall/cloud"), 1);
+    page.await_true(&format!("/^hall: [1-9][0-9]* obstacles?, nearest 1\\.[3-5] m/.test({SWEPT})"));
+    assert_eq!(page.ask("document.querySelector('#map').ariaLabel.includes('from the side')"), true);
+    // To the right is ahead, and up is up.
+    let place = "scanhub.screen(1, -2).map(Math.round).join() !== scanhub.screen(0, 0).map(Math.round).join() && \
+                 scanhub.screen(1, -2)[0] > scanhub.screen(0, 0)[0] && scanhub.screen(1, -2)[1] < scanhub.screen(0, 0)[1]";
+    assert_eq!(page.ask(place), true);
+    page.mouse("mouseMoved", (500.0, 400.0), false);
+    page.await_true("/above the floor/.test(document.querySelector('#readout').innerText)");
+
+    // Layers, turns and the way back are on the keyboard.
+    page.press("o");
+    page.await_true("scanhub.obstacles === 0");
+    page.press("o");
+    let before = page.ask("scanhub.swept").as_u64().expect("a number");
+    for key in ["s", "b", "f"] {
+        page.press(key);
+    }
+    page.await_true("scanhub.swept === 0");
+    for key in ["s", "b", "f"] {
+        page.press(key);
+    }
+    page.await_true(&format!("scanhub.swept > {}", before / 2));
+    page.press("]");
+    page.await_true("scanhub.view.turn > 0.2");
+    page.press("c");
+    page.await_true("scanhub.view.turn === 0");
+    // Held, it stands; then it goes on.
+    page.press(" ");
+    page.await_true("document.querySelector('#verdict').innerText.includes('held')");
+    let sweep = page.ask("scanhub.sweeps[0].sweep");
+    page.press(" ");
+    page.await_true(&format!("scanhub.sweeps[0].sweep !== {sweep}"));
+
+    // What makes the sweeps is gone: they are not there any more, and that is said.
+    assert_eq!(tilt.end(INT).code, Some(0));
+    page.await_true("scanhub.swept === 0 && /hall: no sweep any more/.test(scanhub.reason)");
+    assert_eq!(page.ask("/scanhub tilt/.test(scanhub.reason)"), true, "and where to look");
+    page.press("h");
+    page.await_true("!scanhub.aside && scanhub.beams > 100 && scanhub.reason === null");
+    assert!(page.complaints.is_empty(), "{:?}", page.complaints);
+    ends_well(hall);
+}
+
+/// The demonstration of a scanner on a mount tells the address of its page, which has sweeps.
+#[test]
+fn the_page_of_the_demonstration_has_sweeps() {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_scanhub"));
+    let home = std::env::temp_dir().join(format!("scanhub-home-{}-page", std::process::id()));
+    command.args(["demo", "--world", "tilt"]).env_clear().env("XDG_STATE_HOME", &home);
+    let mut demo = Program::start(command);
+    let host = loop {
+        if let Some((_, host)) = demo.next_text().split_once("browser: http://") {
+            break host.trim_end_matches('/').to_owned();
+        }
+    };
+    let mut viewer = view(&host, "/", None).expect("let in");
+    let [cloud] = channels(&mut viewer, ["/hall/cloud"]);
+    subscribe(&mut viewer, &[(0, &cloud["id"])]);
+    let points = loop {
+        let Message::Binary(frame) = viewer.read().expect("the server lives") else { continue };
+        break read(&POINT_CLOUD, &frame[13..]).expect("a PointCloud2").number("width");
+    };
+    assert!(points > Some(100.0), "{points:?}");
+    assert_eq!(demo.end(INT).code, Some(0));
+}
+
+/// As in the documents, by the command that makes those of `web_page`: the hall of `docs/tilt.md`, once all has come that comes.
+#[test]
+fn the_picture_of_the_documents_from_the_side() {
+    let env = TestEnv::in_time();
+    let directory = std::env::var_os("SCANHUB_PICTURES");
+    let look = Look { width: 960, height: 480, ..Look::LAPTOP };
+    let Some(mut page) = browse(&env, look) else { return };
+    let _simulator =
+        env.simulator(&["front"], &["--world=tilt", "--angles=mount", "--baud=500000", "--seed=3"]);
+    let _hub = env.hub(&[env.link("front")]);
+    env.await_info("front", |info| info["state"] == "streaming");
+    let command = commands_on("docs/tilt.md", &["scanhub tilt front --angles"]).remove(0);
+    let mut tilt = env.start(&[command, vec!["--json".to_owned()]].concat());
+    tilt.await_line("a sweep", is_class("obstacles"));
+    let (_server, host) = web(&env, &[]);
+    page.open(&format!("http://{host}/"));
+    page.await_true(&format!("{SIDE}?.hidden === false"));
+    page.press("h");
+    page.await_true("scanhub.aside && scanhub.swept > 1000");
+    if let Some(directory) = &directory {
+        // A pole, a box, and somebody who walks.
+        let seen = "scanhub.swept > 10_000 && scanhub.obstacles >= 3 && scanhub.sweeps[0].complete === 'true' \
+                    && document.querySelector('#sensors article.streaming:not(.lossy)') !== null";
+        page.await_true(seen);
+        page.photograph(&Path::new(directory).join("web-side.png"));
+    }
+    assert!(page.complaints.is_empty(), "{:?}", page.complaints);
+    let outcome = tilt.end(INT);
+    assert!(outcome.code == Some(0) && number(&outcome.of_class("summary")[0], "points") > 1000, "{outcome}");
+}
