@@ -18,15 +18,14 @@ pub(super) struct Layout {
     beyond: u16,
     first_angle: f64,
     step: f64,
-    spacing: f32,
 }
 
 impl Layout {
     /// That of `scan`, of which at most `most` beams are looked at.
     pub(super) fn of(scan: &Scan, most: usize) -> Layout {
-        let ScanHead { unit_um, valid_to, no_return, beyond, first_angle, step, spacing, .. } = **scan;
+        let ScanHead { unit_um, valid_to, no_return, beyond, first_angle, step, .. } = **scan;
         let count = scan.beams().min(most);
-        Layout { count, unit_um, valid_to, no_return, beyond, first_angle, step, spacing }
+        Layout { count, unit_um, valid_to, no_return, beyond, first_angle, step }
     }
 
     /// Whether scans of so many beams and this unit are of it.
@@ -182,8 +181,8 @@ impl Table {
     }
 
     /// Beams without a reading among those that can tell something of the largest circle. One that was not measured counts
-    /// where nothing was over more than two spacings of the sensor's own points.
-    pub(super) fn invalid(&self, ranges: &[u16]) -> u16 {
+    /// where nothing was over more than two spacings of the sensor's own points, which are `spacing` radians.
+    pub(super) fn invalid(&self, ranges: &[u16], spacing: f32) -> u16 {
         let Layout { valid_to, no_return, beyond, .. } = self.layout;
         let is_invalid = |value: u16| {
             let is_no_return = self.no_return_is_far & (value == no_return);
@@ -192,11 +191,11 @@ impl Table {
         };
         let beams = ranges.iter().zip(&self.tells);
         let invalid: u16 = beams.map(|(&value, &tells)| u16::from(is_invalid(value)) & tells).sum();
-        if invalid == 0 { 0 } else { invalid - self.looked_past(ranges) }
+        if invalid == 0 { 0 } else { invalid - self.looked_past(ranges, spacing) }
     }
 
     /// Of the beams that can tell something, those that were not measured and have measured ones near enough on both sides.
-    fn looked_past(&self, ranges: &[u16]) -> u16 {
+    fn looked_past(&self, ranges: &[u16], spacing: f32) -> u16 {
         let is_measured = |value: &u16| *value != Scan::NOT_MEASURED;
         let (Some(first), Some(last)) =
             (ranges.iter().position(is_measured), ranges.iter().rposition(is_measured))
@@ -204,7 +203,7 @@ impl Table {
             return 0;
         };
         let step = self.layout.step.abs();
-        let most = (2.0 * f64::from(self.layout.spacing) / step * (1.0 + ROUNDING)) as usize;
+        let most = (2.0 * f64::from(spacing) / step * (1.0 + ROUNDING)) as usize;
         // Where beams go all around, the first follows the last.
         let is_whole_turn = (ranges.len() as f64 * step - TAU).abs() < step / 2.0;
         let across = if is_whole_turn { first + ranges.len() - 1 - last } else { usize::MAX - 1 };
@@ -224,23 +223,14 @@ impl Table {
         past
     }
 
-    /// What the beams of `scan` met, which is of the table's layout: the exact point counts where there is one.
-    pub(super) fn met(&mut self, scan: &Scan) -> Met {
-        let ranges = &scan.ranges()[..self.layout.count];
-        match scan.exact_angles() {
-            [] => Met { inside: self.inside(ranges), nearest: self.nearest(ranges) },
-            angles => self.met_exactly(ranges, angles),
+    /// What the beams met that have these `ranges`, the first ones of a scan of the table's layout: the exact points count
+    /// where there are `angles`.
+    pub(super) fn met(&mut self, ranges: &[u16], angles: &[f32]) -> Met {
+        if !angles.is_empty() {
+            return self.met_exactly(ranges, angles);
         }
-    }
-
-    /// Beams whose readings are inside each circle, of the first ones of a scan of the table's layout.
-    pub(super) fn inside(&self, ranges: &[u16]) -> [u16; ZONES] {
-        std::array::from_fn(|zone| self.inside[zone].count(ranges))
-    }
-
-    /// The beam of the nearest point of the same, and its distance from the robot's centre in mm, rounded down.
-    pub(super) fn nearest(&mut self, ranges: &[u16]) -> Option<(u16, u32)> {
-        self.nearest.find(ranges).map(|(beam, square)| self.at_distance(beam, square))
+        let nearest = self.nearest.find(ranges).map(|(beam, square)| self.at_distance(beam, square));
+        Met { inside: std::array::from_fn(|zone| self.inside[zone].count(ranges)), nearest }
     }
 
     /// Only what is near enough to be inside a circle, or the nearest, is computed.
