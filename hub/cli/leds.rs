@@ -25,7 +25,7 @@ pub(crate) struct Leds {
     /// How long a better verdict must last before it is shown; a worse one is shown at once
     #[arg(long, default_value = "300ms", value_name = "DURATION", value_parser = duration::parse)]
     hold: Duration,
-    /// Show early warnings too, before a telegram is complete (docs/early.md)
+    /// Show early warnings too, before a scan is complete (docs/early.md)
     #[arg(long)]
     early: bool,
     #[command(flatten)]

@@ -1,4 +1,4 @@
-//! What the first part of a scan tells, before the rest of it arrived. Refuses to know how it was found.
+//! What a part of a scan tells, before the rest of it arrived. Refuses to know how it was found.
 
 use bytemuck::{Pod, Zeroable};
 #[cfg(feature = "ipc")]
@@ -6,8 +6,8 @@ use iceoryx2::prelude::ZeroCopySend;
 
 use crate::Verdict;
 
-/// The payload of topic `early`, 12 bytes: a warning by a telegram that is not complete. Its checksum was not seen, so the
-/// zones of the same number confirm it; a sample with [`Early::WITHDRAWN`] takes it back.
+/// The payload of topic `early`, 12 bytes: a warning by a telegram that is not complete, or by a turn that is not over. The
+/// first zones of its number or a greater one are of its scan and confirm it; a sample with [`Early::WITHDRAWN`] takes it back.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Pod, Zeroable)]
 #[cfg_attr(feature = "ipc", derive(ZeroCopySend), type_name("scanhub.Early.v2"))]
 #[repr(C)]
@@ -20,14 +20,14 @@ pub struct Early {
     pub beam: u16,
     /// Distance of that point from the robot's centre, in mm.
     pub distance_mm: u32,
-    /// Bytes of the telegram that had arrived.
+    /// Bytes of the telegram that had arrived; 0 of a turn.
     pub bytes_seen: u16,
     /// Beams of the scan that had arrived.
     pub beams_seen: u16,
 }
 
 impl Early {
-    /// Flag: what was said under this number does not hold. The telegram was damaged or broke off.
+    /// Flag: what was said under this number does not hold.
     pub const WITHDRAWN: u8 = 1;
 
     /// Returns the verdict; unknown if it is none.

@@ -18,6 +18,7 @@ mod doctor;
 mod doctor_broken;
 mod doctor_machine;
 mod early;
+mod early_robots;
 mod ends;
 mod flood;
 mod foreground;

@@ -110,8 +110,8 @@ impl RobotFollower {
         RobotFollower { session: self.session.by(wait), ..self }
     }
 
-    /// Takes early warnings too ([`Early`](schema::Early)): the verdict becomes worse before a telegram is complete, and is taken
-    /// back if that turns out damaged. To be said before the first wait.
+    /// Takes early warnings too ([`Early`](schema::Early)): the verdict becomes worse before a scan is complete, and is taken
+    /// back if that does not come to be. To be said before the first wait.
     pub fn with_early(self) -> RobotFollower {
         RobotFollower { source: self.source.with_early(), ..self }
     }

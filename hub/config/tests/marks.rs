@@ -39,7 +39,7 @@ fn what_does_not_fit_is_refused() {
         ("early.pieces=1", "pieces = 1\n  a whole number from 2 to 8"),
         (
             "link.side.early.pieces=4",
-            "pieces, and an ld sends packets, which are short\n  early warnings are for an LMS",
+            "pieces, and an ld sends packets, which are short\n  it warns by each packet anyway",
         ),
     ] {
         let failure = Config::load(&sources(&[setting])).expect_err(setting);

@@ -11,6 +11,8 @@ use lms::variant::Baud;
 use lms::{Identity, Settings};
 use port::Source;
 
+use crate::early::Begun;
+
 /// A session of one of the families.
 #[expect(clippy::large_enum_variant, reason = "there is one per open port")]
 pub(crate) enum Driver {
@@ -78,6 +80,21 @@ impl Driver {
     /// What it is in words, where its head turns; nothing before that is known.
     pub(crate) fn kind(&self) -> Option<String> {
         if let Driver::Turning(session) = self { session.kind() } else { None }
+    }
+
+    /// From now on a telegram of an LMS is looked at `pieces` times while it arrives. A turn comes in packets anyway.
+    pub(crate) fn look_in(&mut self, pieces: u8) {
+        if let Driver::Lms(session) = self {
+            session.look_in(pieces);
+        }
+    }
+
+    /// The scan that is arriving, once nothing is left to be drained.
+    pub(crate) fn begun(&self) -> Option<Begun<'_>> {
+        match self {
+            Driver::Lms(session) => session.begun().map(Begun::Telegram),
+            Driver::Turning(session) => session.begun().map(Begun::Turn),
+        }
     }
 
     /// What it turned out to be, where its head turns, if another model is configured.

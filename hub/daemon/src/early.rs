@@ -1,45 +1,107 @@
-//! Warnings by the part of a telegram that is there, while the rest of it is on the line: a telegram of 361 values takes
-//! 14.6 ms at 500 kBd, and what is near stands in it long before its checksum. Says slow or stop, never clear; what it said of
-//! a telegram that does not become a scan it takes back. Refuses to know topics, and whether anybody listens.
+//! Warnings by the part of a scan that is there, while the rest of it is on the line or not even measured: a telegram of 361
+//! values takes 14.6 ms at 500 kBd, a turn of a head 100 ms, and what is near stands in it long before its end. Says slow or
+//! stop, never clear; what it said of a scan that is not published, or that looks better as it goes on, it takes back. Refuses
+//! to know topics, and whether anybody listens.
 
-use lms::session::Begun;
+use line::Turn;
+use lms::Nanos;
 use preprocess::zones::{Check, Warning};
-use schema::{Early, Verdict};
+use scanner::Turning;
+use schema::{Early, Family, Scan, Verdict};
 
-/// What was said of the telegram that is arriving.
+/// A scan that is arriving.
+pub(crate) enum Begun<'a> {
+    /// A telegram of an LMS.
+    Telegram(lms::session::Begun<'a>),
+    /// A turn of a head, with its points so far.
+    Turn(Turn<'a>),
+}
+
+impl Begun<'_> {
+    /// Which one, of those of its session.
+    pub(crate) fn number(&self) -> u64 {
+        match self {
+            Begun::Telegram(telegram) => telegram.offset,
+            Begun::Turn(turn) => turn.number,
+        }
+    }
+
+    /// When it began.
+    pub(crate) fn first(&self) -> Nanos {
+        match self {
+            Begun::Telegram(telegram) => telegram.first,
+            Begun::Turn(turn) => turn.first,
+        }
+    }
+}
+
+/// What was said of the scan that is arriving.
 pub(crate) struct EarlyWarner {
-    /// The ranges of that telegram so far.
+    family: Family,
+    /// The ranges of a telegram so far.
     ranges: Box<[u16]>,
+    /// A turn as its points so far have it.
+    turn: Box<Scan>,
     said: Option<Said>,
 }
 
 /// A warning that nothing has confirmed.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 struct Said {
-    /// Of the telegram's first byte.
-    offset: u64,
-    early: Early,
+    /// Of which scan of its session.
+    number: u64,
+    word: Word,
+}
+
+/// A warning, or what takes it back, and its number in the topics: the zones of its scan have no lesser one.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) struct Word {
+    pub(crate) seq: u64,
+    pub(crate) early: Early,
 }
 
 impl EarlyWarner {
-    /// For scans of at most `beams` beams.
-    pub(crate) fn new(beams: usize) -> EarlyWarner {
-        EarlyWarner { ranges: vec![0; beams].into(), said: None }
+    /// For scans of at most `beams` beams of a scanner of `family`.
+    pub(crate) fn new(family: Family, beams: usize) -> EarlyWarner {
+        let turn = Scan::zeroed(Turning::len(beams));
+        EarlyWarner { family, ranges: vec![0; beams].into(), turn, said: None }
     }
 
-    /// What `check` makes of the scan that is arriving, if that is worse than what was said of it.
-    pub(crate) fn warn(&mut self, begun: &Begun<'_>, check: &mut Check) -> Option<Early> {
-        let values = &begun.values;
-        let seen = scanner::decode_first(values, begun.mode, &mut self.ranges);
-        let warning = check.early(values.count(), scanner::unit_um(values), &self.ranges[..seen])?;
+    /// What has to be said now that `check` knows as much of a scan as has `begun`: what was said of it is taken back if it does
+    /// not hold any more, and a warning is said if it is worse than what was. `next_seq` is the number of the next telegram.
+    pub(crate) fn look(&mut self, begun: &Begun<'_>, check: &mut Check, next_seq: u64) -> [Option<Word>; 2] {
+        let early = self.judge(begun, check);
+        let told = early.map_or(Verdict::Clear as u8, |early| early.verdict);
+        let withdrawn = if self.verdict() > told { self.withdraw(None) } else { None };
+        let worse = early.filter(|_| told > self.verdict()).map(|early| {
+            let seq = self.said.map_or(next_seq, |said| said.word.seq);
+            let word = Word { seq, early };
+            self.said = Some(Said { number: begun.number(), word });
+            word
+        });
+        [withdrawn, worse]
+    }
+
+    /// What `check` makes of the part of a scan that is there, if it is a warning.
+    fn judge(&mut self, begun: &Begun<'_>, check: &mut Check) -> Option<Early> {
+        let (warning, bytes_seen, beams_seen) = match begun {
+            Begun::Telegram(telegram) => {
+                let values = &telegram.values;
+                let seen = scanner::decode_first(values, telegram.mode, &mut self.ranges);
+                let (unit_um, ranges) = (scanner::unit_um(values), &self.ranges[..seen]);
+                (check.early(values.count(), unit_um, ranges, &[])?, telegram.bytes, seen)
+            }
+            Begun::Turn(turn) => {
+                let scan = &mut self.turn;
+                Turning::of(turn, self.family).decode(turn.beams, scan);
+                let warning = check.early(scan.beams(), scan.unit_um, scan.ranges(), scan.exact_angles())?;
+                let seen = scan.ranges().iter().filter(|range| **range != Scan::NOT_MEASURED).count();
+                (warning, 0, seen)
+            }
+        };
         let Warning { verdict, beam, distance_mm } = warning;
-        if self.said.is_some_and(|said| said.early.verdict >= verdict as u8) {
-            return None;
-        }
-        let (bytes_seen, beams_seen) = (begun.bytes as u16, seen as u16);
-        let early = Early { verdict: verdict as u8, flags: 0, beam, distance_mm, bytes_seen, beams_seen };
-        self.said = Some(Said { offset: begun.offset, early });
-        Some(early)
+        let (bytes_seen, beams_seen) = (bytes_seen as u16, beams_seen as u16);
+        Some(Early { verdict: verdict as u8, flags: 0, beam, distance_mm, bytes_seen, beams_seen })
     }
 
     /// Whether there is a warning that nothing has confirmed.
@@ -47,17 +109,25 @@ impl EarlyWarner {
         self.said.is_some()
     }
 
-    /// The scan of the telegram at `offset` was published, and what was said of it holds.
-    pub(crate) fn confirm(&mut self, offset: u64) {
-        self.said = self.said.filter(|said| said.offset != offset);
+    /// The scan `number` was published, and what was said of it holds.
+    pub(crate) fn confirm(&mut self, number: u64) {
+        self.said = self.said.filter(|said| said.number != number);
     }
 
-    /// What has to be taken back, now that the telegram that is arriving begins at `offset`, if one is.
-    pub(crate) fn withdraw(&mut self, offset: Option<u64>) -> Option<Early> {
-        let said = self.said.take_if(|said| Some(said.offset) != offset)?;
-        Some(Early { flags: Early::WITHDRAWN, ..said.early })
+    /// What has to be taken back now that the scan that is arriving is `number`, if one is.
+    pub(crate) fn withdraw(&mut self, number: Option<u64>) -> Option<Word> {
+        let Word { seq, early } = self.said.take_if(|said| Some(said.number) != number)?.word;
+        Some(Word { seq, early: Early { flags: Early::WITHDRAWN, ..early } })
+    }
+
+    fn verdict(&self) -> u8 {
+        self.said.map_or(Verdict::Clear as u8, |said| said.word.early.verdict)
     }
 }
 
 // A worse verdict is a greater number.
+const _: () = assert!((Verdict::Clear as u8) < Verdict::Slow as u8);
 const _: () = assert!((Verdict::Slow as u8) < Verdict::Stop as u8);
+
+#[cfg(test)]
+mod tests;

@@ -4,12 +4,13 @@
 use config::{Link, Processing};
 use lms::Nanos;
 use lms::reply::Reply;
-use lms::session::{Begun, Received};
+use lms::session::Received;
 use lms::variant::{Mode, Variant};
 use schema::{Background, Failure, Family, Flags, Pose, Scan, Verb, Wake, Zones};
 
-use crate::early::EarlyWarner;
+use crate::early::{Begun, EarlyWarner, Word};
 use crate::pipeline::Pipeline;
+use crate::process_turn::micros;
 use crate::surroundings::Surroundings;
 use crate::topics::Topics;
 
@@ -52,7 +53,7 @@ pub(crate) struct LinkOutput<'a, S: Surroundings> {
     around: &'a S,
     pub(crate) topics: Topics<'a, S>,
     pipeline: Pipeline,
-    early: EarlyWarner,
+    pub(crate) early: EarlyWarner,
     /// When the last verdict of the zones is too old to stand; `Nanos::MAX` if none stands.
     stale_at: Nanos,
     /// The sensor, as it turned out to be, sees too little of its circles.
@@ -63,7 +64,7 @@ impl<'a, S: Surroundings> LinkOutput<'a, S> {
     /// The output of `link` into `topics`; nothing is published yet.
     pub(crate) fn new(link: &'a Link, around: &'a S, topics: Topics<'a, S>) -> Self {
         let pipeline = Pipeline::new(&link.processing, link.beams());
-        let early = EarlyWarner::new(link.beams());
+        let early = EarlyWarner::new(link.family(), link.beams());
         LinkOutput { link, around, topics, pipeline, early, stale_at: Nanos::MAX, is_blind: false }
     }
 
@@ -103,34 +104,46 @@ impl<'a, S: Surroundings> LinkOutput<'a, S> {
         Processed { is_suspect, stands_for: Some(stands_for) }
     }
 
-    /// In how many pieces a telegram is read: 1, unless somebody wants to be warned early.
+    /// In how many pieces a telegram of an LMS is read: 1, unless somebody wants to be warned early.
     pub(crate) fn pieces(&self) -> u8 {
         if self.topics.wants_early() { self.pipeline.pieces() } else { 1 }
     }
 
-    /// Publishes what the telegram that is arriving tells already, `begun`, if that is a warning and somebody wants it; and
-    /// takes back what was said of one that is gone.
+    /// Publishes what the scan that is arriving tells already, `begun`, if that is a warning and somebody wants it; and takes
+    /// back what was said of one that is gone, or of this one where it is not true any more.
     pub(crate) fn foresee(&mut self, begun: Option<&Begun<'_>>) {
-        self.withdraw(begun.map(|begun| begun.offset));
-        if let Some(begun) = begun.filter(|_| self.topics.wants_early())
-            && let Some(early) = self.early.warn(begun, &mut self.pipeline.zones)
-        {
-            let variant = Variant::of_beams(begun.values.count());
-            let period_us = scanner::period_us(variant, self.link.baud.rate());
-            self.topics.early(&early, begun.first, begun.last, begun.reasons, period_us);
+        self.withdraw(begun.map(Begun::number));
+        let Some(begun) = begun.filter(|_| self.topics.wants_early()) else { return };
+        let [withdrawn, worse] = self.early.look(begun, &mut self.pipeline.zones, self.topics.next_seq());
+        self.take_back(withdrawn);
+        if let Some(word) = worse {
+            let (first, last, reasons, period_us) = match begun {
+                Begun::Telegram(telegram) => {
+                    let variant = Variant::of_beams(telegram.values.count());
+                    let period_us = scanner::period_us(variant, self.link.baud.rate());
+                    (telegram.first, telegram.last, telegram.reasons, period_us)
+                }
+                Begun::Turn(turn) => (turn.first, turn.last, turn.reasons, micros(turn.period)),
+            };
+            self.topics.early(&word, first, last, reasons, period_us);
         }
     }
 
-    /// Whether something was said of a telegram that is not complete.
+    /// Whether something was said of a scan that is not complete.
     pub(crate) fn has_warned(&self) -> bool {
         self.early.has_said()
     }
 
-    /// Takes back what was said of another telegram than that at `offset`.
-    fn withdraw(&mut self, offset: Option<u64>) {
-        if let Some(withdrawn) = self.early.withdraw(offset) {
+    /// Takes back what was said of another scan than `number`.
+    fn withdraw(&mut self, number: Option<u64>) {
+        let withdrawn = self.early.withdraw(number);
+        self.take_back(withdrawn);
+    }
+
+    fn take_back(&mut self, withdrawn: Option<Word>) {
+        if let Some(word) = withdrawn {
             let now = self.around.now();
-            self.topics.early(&withdrawn, now, now, 0, 0);
+            self.topics.early(&word, now, now, 0, 0);
         }
     }
 
@@ -190,6 +203,7 @@ impl<'a, S: Surroundings> LinkOutput<'a, S> {
 
     /// As [`learn`](Self::learn), of a time without scans.
     pub(crate) fn learn_silence(&mut self) {
+        self.withdraw(None);
         self.pipeline.stale(&mut Zones::default());
     }
 
@@ -201,6 +215,8 @@ impl<'a, S: Surroundings> LinkOutput<'a, S> {
 
     /// Publishes that nothing is known of the zones as of `now`, and wakes the consumers.
     pub(crate) fn publish_stale(&mut self, now: Nanos) {
+        // Scans in a row are counted anew: what is arriving may not be enough.
+        self.withdraw(None);
         self.topics.stale(&mut self.pipeline, now);
         self.topics.wake(Wake::Status);
     }
@@ -245,6 +261,7 @@ impl<'a, S: Surroundings> LinkOutput<'a, S> {
 
     /// Goes on as `processing` says from the next scan on. Where none come, the topics say at once how it is now.
     pub(crate) fn change(&mut self, processing: &Processing, now: Nanos) {
+        self.withdraw(None);
         self.pipeline.change(processing);
         if self.stale_at == Nanos::MAX {
             self.topics.stale(&mut self.pipeline, now);

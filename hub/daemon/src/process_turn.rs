@@ -6,6 +6,7 @@ use lms::Nanos;
 use scanner::Turning;
 use schema::Scan;
 
+use crate::early::Begun;
 use crate::process_telegram::{LinkOutput, Processed, RecordedContext, limit};
 use crate::surroundings::Surroundings;
 
@@ -32,28 +33,23 @@ impl<S: Surroundings> LinkOutput<'_, S> {
     ) -> Processed {
         self.recall(recorded);
         let period_us = recorded.stretched(micros(turn.period));
+        if self.has_warned() {
+            // Points that came last may show that what seemed near is the robot's own body.
+            self.foresee(Some(&Begun::Turn(*turn)));
+        }
         self.topics.begin_scan(turn.first, turn.last, turn.reasons, period_us);
-        let (turning, beams) = (self.turning(turn), turn.beams);
+        let (turning, beams) = (Turning::of(turn, self.family()), turn.beams);
         let decode = |scan: &mut Scan| turning.decode(beams, scan);
         let stands_for = limit(period_us);
         self.publish_scan(beams, Turning::len(beams), decode, stands_for, is_behind);
+        self.early.confirm(turn.number);
         Processed { is_suspect: turn.reasons != 0, stands_for: Some(stands_for) }
     }
 
     /// Lets all that has a memory learn from a turn that is not published.
     pub(crate) fn learn_turn(&mut self, turn: &Turn<'_>) {
-        let (turning, beams) = (self.turning(turn), turn.beams);
+        let (turning, beams) = (Turning::of(turn, self.family()), turn.beams);
         self.learn_scan(Turning::len(beams), |scan: &mut Scan| turning.decode(beams, scan));
-    }
-
-    fn turning<'t>(&self, turn: &Turn<'t>) -> Turning<'t> {
-        Turning {
-            family: self.family(),
-            points: turn.points,
-            period_ns: turn.period,
-            points_per_second: turn.points_per_second,
-            incomplete: turn.incomplete,
-        }
     }
 }
 

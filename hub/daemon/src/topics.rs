@@ -11,6 +11,7 @@ use schema::{
     Status, Wake, Zones,
 };
 
+use crate::early::Word;
 use crate::pipeline::{Outputs, Pipeline, Relearned};
 use crate::surroundings::Surroundings;
 use prepared_publisher::PreparedPublisher;
@@ -171,18 +172,23 @@ impl<'a, S: Surroundings> Topics<'a, S> {
         relearned
     }
 
-    /// Whether anybody wants to be warned before a telegram is complete.
+    /// The number of the next telegram.
+    pub(crate) fn next_seq(&self) -> u64 {
+        self.next_seq
+    }
+
+    /// Whether anybody wants to be warned before a scan is complete.
     pub(crate) fn wants_early(&self) -> bool {
         self.early.is_heard()
     }
 
-    /// Publishes `early`, which the first bytes of the next telegram tell, of the time from `first` to `last`, and wakes those
-    /// who wait for that alone. `reasons` are why it is suspect already.
-    pub(crate) fn early(&mut self, early: &Early, first: Nanos, last: Nanos, reasons: u8, period_us: u32) {
+    /// Publishes `word`, which a part of a scan from `first` to `last` tells, and wakes those who wait for that alone. `reasons`
+    /// are why it is suspect already.
+    pub(crate) fn early(&mut self, word: &Word, first: Nanos, last: Nanos, reasons: u8, period_us: u32) {
         let now = self.around.now();
         let quality = if reasons == 0 { Quality::Clean } else { Quality::Suspect };
         let mut header = Header {
-            seq: self.next_seq,
+            seq: word.seq,
             stamp_first_ns: first,
             stamp_last_ns: last,
             wall_ns: wall(self.around, first, now),
@@ -195,7 +201,7 @@ impl<'a, S: Surroundings> Topics<'a, S> {
         header.set_sent_at(now);
         let mut loan = self.early.loan(0);
         if let Some(payload) = Publisher::<Early, S>::payload_mut(&mut loan) {
-            *payload = *early;
+            *payload = word.early;
         }
         self.early.send(loan, &header, &mut self.due);
         if self.due.take(Ring::Early) {

@@ -1,7 +1,7 @@
 //! The family as a configuration and a hub see it.
 
-use line::Nanos;
 use line::family::{Features, Turning, Wanted};
+use line::{Nanos, Turn};
 
 use crate::model::Model;
 use crate::session::{Session, Settings};
@@ -27,6 +27,10 @@ impl Turning for Session {
 
     fn beams(&self) -> Option<usize> {
         self.beams()
+    }
+
+    fn begun(&self) -> Option<Turn<'_>> {
+        self.turns.begun().map(|begun| self.dated(begun))
     }
 
     fn other_model(&self) -> Option<line::family::Model> {

@@ -43,7 +43,7 @@ pub struct Session {
     /// The clock of the packets before the one with this number, of those handed out last, if another sequence began there.
     clock_before: Option<(usize, SensorClock)>,
     sequence: Sequence,
-    turns: Turns,
+    pub(crate) turns: Turns,
     phase: Phase,
     baud: u32,
     change_baud: bool,
@@ -298,15 +298,22 @@ impl Session {
     }
 
     fn show(&mut self, closed: Closed) -> Turn<'_> {
-        let packet = self.current.map_or(0, |current| current.packet);
-        let stamp = |at: Nanos| self.clock_of(packet).time(at).unwrap_or(self.now);
-        let (first, last) = (stamp(closed.first), stamp(closed.last));
-        let (first, last) = self.reads.date_turn(first, last);
+        let first = self.dated(closed).first;
+        self.reads.end_turn(first);
         self.trouble = None;
         if let Phase::Hearing { turned_at, has_turned, .. } = &mut self.phase {
             (*turned_at, *has_turned) = (self.now, true);
         }
+        self.dated(closed)
+    }
+
+    /// A turn that is over, or that is being measured, by the hub's clock.
+    pub(crate) fn dated(&self, closed: Closed) -> Turn<'_> {
+        let packet = self.current.map_or(usize::MAX, |current| current.packet);
+        let stamp = |at: Nanos| self.clock_of(packet).time(at).unwrap_or(self.now);
+        let (first, last) = self.reads.turn_dates(stamp(closed.first), stamp(closed.last));
         Turn {
+            number: closed.number,
             points: self.turns.points(&closed),
             first,
             last,

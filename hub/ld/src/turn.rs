@@ -18,6 +18,8 @@ pub(crate) struct Turns {
     reached: Option<f32>,
     /// From the edge of a turn to the zero.
     edge: f32,
+    /// The number of the last one that began.
+    number: u64,
     counts: TurnCounts,
 }
 
@@ -36,6 +38,7 @@ struct Open {
 /// A turn that is over, with times of the scanner's clock; its points stay until the next one begins.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Closed {
+    pub(crate) number: u64,
     pub(crate) len: usize,
     pub(crate) first: Nanos,
     pub(crate) last: Nanos,
@@ -62,6 +65,7 @@ impl Turns {
             open: None,
             reached: None,
             edge: 0.0,
+            number: 0,
             counts: TurnCounts::default(),
         }
     }
@@ -76,7 +80,12 @@ impl Turns {
         self.counts
     }
 
-    /// The points of a turn that was closed just now.
+    /// The turn that is being measured, as if it ended here.
+    pub(crate) fn begun(&self) -> Option<Closed> {
+        self.open.map(|open| self.end(&open))
+    }
+
+    /// The points of the turn that was closed just now, or that is being measured.
     pub(crate) fn points(&self, closed: &Closed) -> &[Point] {
         &self.points[..closed.len]
     }
@@ -128,7 +137,7 @@ impl Turns {
                 self.open.iter_mut().for_each(|open| open.incomplete |= lacks_end);
                 let closed = self.close();
                 self.counts.missed += edges - 1;
-                self.open = Some(fresh(0, lacks(start) || edges > 1));
+                self.open(fresh(0, lacks(start) || edges > 1));
                 self.reached = Some(start);
                 if closed.is_some() {
                     return closed;
@@ -144,7 +153,7 @@ impl Turns {
             if is_over && progress.point != point {
                 progress.point = point;
                 let closed = self.close();
-                self.open = Some(fresh(point, false));
+                self.open(fresh(point, false));
                 if closed.is_some() {
                     return closed;
                 }
@@ -174,25 +183,42 @@ impl Turns {
         (self.len, self.reached) = (0, None);
     }
 
+    fn open(&mut self, open: Open) {
+        self.number += 1;
+        self.open = Some(open);
+    }
+
     /// The open turn is over; nothing if there is none, or too little of it.
     fn close(&mut self) -> Option<Closed> {
+        let open = self.open.take();
+        let closed = open.map(|open| self.end(&open));
         let len = core::mem::take(&mut self.len);
-        let open = self.open.take()?;
-        let due = f32::from(TURN) / open.step.max(1e-3);
-        if (len as f32) < due / 2.0 {
+        if (len as f32) < open?.due() / 2.0 {
             self.counts.short += 1;
             return None;
         }
         self.counts.turns += 1;
-        self.counts.incomplete += u64::from(open.incomplete);
-        Some(Closed {
-            len,
+        self.counts.incomplete += u64::from(open?.incomplete);
+        closed
+    }
+
+    fn end(&self, open: &Open) -> Closed {
+        Closed {
+            number: self.number,
+            len: self.len,
             first: open.first as Nanos,
             last: open.last as Nanos,
-            period: (due * open.point_ns) as Nanos,
+            period: (open.due() * open.point_ns) as Nanos,
             incomplete: open.incomplete,
             reasons: open.reasons,
-        })
+        }
+    }
+}
+
+impl Open {
+    /// Points of a whole turn.
+    fn due(&self) -> f32 {
+        f32::from(TURN) / self.step.max(1e-3)
     }
 }
 

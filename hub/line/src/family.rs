@@ -4,7 +4,7 @@
 
 use core::fmt;
 
-use crate::{Nanos, Session};
+use crate::{Nanos, Session, Turn};
 
 /// A session with a scanner of such a family.
 pub trait Turning: Session + Sized {
@@ -19,6 +19,10 @@ pub trait Turning: Session + Sized {
 
     /// Beams of the grid that turns are for; nothing before it is known what is at the other end.
     fn beams(&self) -> Option<usize>;
+
+    /// The turn that is being measured, as if it ended with the points that are known, once [`Session::poll_output`] wants to
+    /// wait; nothing between turns.
+    fn begun(&self) -> Option<Turn<'_>>;
 
     /// What it turned out to be where another model is wanted; of models that cannot be told apart, one.
     fn other_model(&self) -> Option<Model> {

@@ -97,10 +97,15 @@ impl Reads {
         self.last_packet
     }
 
-    /// From when to when a turn was that seems to be from `first` to `last`: it does not begin before the one before it.
-    pub fn date_turn(&mut self, first: Nanos, last: Nanos) -> (Nanos, Nanos) {
-        self.last_turn = first.max(self.last_turn);
-        (self.last_turn, last.max(self.last_turn))
+    /// From when to when a turn is that seems to be from `first` to `last`: it does not begin before the one before it.
+    pub fn turn_dates(&self, first: Nanos, last: Nanos) -> (Nanos, Nanos) {
+        let first = first.max(self.last_turn);
+        (first, last.max(first))
+    }
+
+    /// A turn was over that began at `first`.
+    pub fn end_turn(&mut self, first: Nanos) {
+        self.last_turn = first;
     }
 }
 

@@ -28,6 +28,8 @@ pub struct Packets {
 /// A turn of the head.
 #[derive(Clone, Copy, Debug)]
 pub struct Turn<'a> {
+    /// Which one: no other of the session has this number, not even one that came to no end.
+    pub number: u64,
     /// Its points as they came, to be put on a [`Grid`](crate::grid::Grid).
     pub points: &'a [Point],
     /// When beam 0 was measured: the first point, or where it would have been.

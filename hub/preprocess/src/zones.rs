@@ -113,8 +113,9 @@ impl Check {
             self.forget();
         }
         self.seen = self.seen.saturating_add(1);
-        let invalid = self.table.invalid(scan);
-        let Met { inside, nearest } = self.table.met(scan);
+        let ranges = &scan.ranges()[..scan.beams().min(self.table.most())];
+        let invalid = self.table.invalid(ranges, scan.spacing);
+        let Met { inside, nearest } = self.table.met(ranges, scan.exact_angles());
         let is_enough = self.seen >= self.min_scans && !self.is_blind();
         let is_known = is_enough && !self.is_late && invalid <= self.table.most_invalid();
         for (streak, &beams) in self.streaks.iter_mut().zip(&inside).take(self.table.circles()) {
@@ -127,21 +128,23 @@ impl Check {
         self.write_circles(&inside, out);
     }
 
-    /// What the first `ranges` of a scan tell that is not complete, of so many beams `count` and `unit_um` as the last one: the
-    /// zone that it will violate whatever else it brings, if any. A scan whose first one has yet to be seen tells nothing.
-    pub fn early(&mut self, count: usize, unit_um: u32, ranges: &[u16]) -> Option<Warning> {
+    /// What the `ranges` of a scan tell that is not complete, of so many beams `count` and `unit_um` as the last one: the zone
+    /// that it violates if nothing else comes, if any. These are the first ones; or all, with their exact `angles`, of a scan
+    /// that has such: then a nearer point may still take the place of one. A scan whose first one has yet to be seen tells
+    /// nothing.
+    pub fn early(&mut self, count: usize, unit_um: u32, ranges: &[u16], angles: &[f32]) -> Option<Warning> {
         if !self.table.layout().is_of(count, unit_um) || self.is_blind() {
             return None;
         }
         let ranges = &ranges[..ranges.len().min(count).min(self.table.most())];
-        let inside = self.table.inside(ranges);
+        let Met { inside, nearest } = self.table.met(ranges, angles);
         let will_be = |zone: &usize| {
             inside[*zone] >= self.min_beams && self.streaks[*zone].saturating_add(1) >= self.min_scans
         };
         let smallest = self.table.circles().checked_sub(1)?;
         let zone = (0..=smallest).rev().find(will_be)?;
         let verdict = if zone == smallest { Verdict::Stop } else { Verdict::Slow };
-        let (beam, distance_mm) = self.table.nearest(ranges)?;
+        let (beam, distance_mm) = nearest?;
         Some(Warning { verdict, beam, distance_mm })
     }
 

@@ -45,7 +45,7 @@ fn a_part_of_a_scan_warns_of_what_it_shows_and_the_whole_confirms_it() {
             let whole = scan(&mut random, near);
             let mut before = None;
             for seen in [0, 1, random.usize(..BEAMS), random.usize(..BEAMS), BEAMS] {
-                let early = check.early(BEAMS, 1000, &whole.ranges()[..seen]);
+                let early = check.early(BEAMS, 1000, &whole.ranges()[..seen], &[]);
                 let mut part = whole.clone();
                 part.arrays().ranges[seen..].fill(FAR);
                 scans.push(part);
@@ -74,11 +74,34 @@ fn a_part_of_a_scan_warns_of_what_it_shows_and_the_whole_confirms_it() {
 fn scans_of_another_form_warn_of_nothing() {
     let mut check = Check::new(Pose::default(), &Settings::default(), BEAMS);
     let near = [300; BEAMS];
-    assert_eq!(check.early(BEAMS, 1000, &near), None, "nothing is known of the sensor");
+    assert_eq!(check.early(BEAMS, 1000, &near, &[]), None, "nothing is known of the sensor");
     check.update(&scan(&mut Rng::with_seed(1), 0), &mut Zones::unknown());
-    assert_eq!(check.early(BEAMS, 1000, &near).map(|warning| warning.verdict), Some(Verdict::Stop));
-    assert_eq!(check.early(BEAMS + 1, 1000, &near), None, "more beams");
-    assert_eq!(check.early(BEAMS, 10_000, &near), None, "another unit");
+    assert_eq!(check.early(BEAMS, 1000, &near, &[]).map(|warning| warning.verdict), Some(Verdict::Stop));
+    assert_eq!(check.early(BEAMS + 1, 1000, &near, &[]), None, "more beams");
+    assert_eq!(check.early(BEAMS, 10_000, &near, &[]), None, "another unit");
     check.stale(&mut Zones::unknown());
-    assert_eq!(check.early(BEAMS, 1000, &[]), None);
+    assert_eq!(check.early(BEAMS, 1000, &[], &[]), None);
+}
+
+/// A turn of a head: a second of arc more or less in how far its own points are apart does not make another sensor of it.
+#[test]
+fn turns_of_which_none_takes_as_long_as_another_are_counted_in_a_row() {
+    let settings = Settings { min_scans: 2, ..Settings::default() };
+    let mut check = Check::new(Pose::default(), &settings, BEAMS);
+    let mut turn = Scan::zeroed(Scan::len(BEAMS, schema::Contents::TURNING));
+    let mut verdicts = Vec::new();
+    for number in 0..3 {
+        let head = ScanHead::turning(schema::Family::Ld, BEAMS);
+        let arrays = turn.begin(ScanHead { spacing: head.spacing + number as f32 * 5e-6, ..head });
+        arrays.ranges.fill(500);
+        arrays.upper.fill(0);
+        let step = head.step;
+        arrays.angles.iter_mut().enumerate().for_each(|(i, angle)| *angle = (i as f64 * step) as f32);
+        let early = check.early(BEAMS, 1000, turn.ranges(), turn.exact_angles());
+        let mut out = Zones::unknown();
+        check.update(&turn, &mut out);
+        verdicts.push((early.map(|warning| warning.verdict), out.verdict()));
+    }
+    let known = (Some(Verdict::Stop), Verdict::Stop);
+    assert_eq!(verdicts, [(None, Verdict::Unknown), known, known]);
 }

@@ -2,8 +2,8 @@
 
 use core::fmt;
 
-use line::Nanos;
 use line::family::{Condition, Features, Turning, Wanted};
+use line::{Nanos, Turn};
 
 use crate::model::{Mode, Model};
 use crate::session::{Session, Settings};
@@ -32,6 +32,10 @@ impl Turning for Session {
 
     fn beams(&self) -> Option<usize> {
         self.beams()
+    }
+
+    fn begun(&self) -> Option<Turn<'_>> {
+        self.begun_turn()
     }
 
     fn other_model(&self) -> Option<line::family::Model> {

@@ -15,6 +15,8 @@ pub(crate) struct Turns {
     open: [Open; 2],
     /// The number of the first one since the sequence began; nothing before that is known.
     number: Option<i64>,
+    /// The same among all turns; the second one has the next.
+    serial: u64,
     /// The last turn of which it is known that points are missing.
     lacking: i64,
     /// Degrees from the edge of a turn to the zero.
@@ -35,6 +37,7 @@ struct Open {
 /// A turn that is over, with times of the scanner's clock; its points stay until the next point comes.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Closed {
+    pub(crate) number: u64,
     points: usize,
     len: usize,
     pub(crate) first: Nanos,
@@ -53,6 +56,18 @@ pub(crate) struct Pace {
     pub(crate) point_ns: f64,
 }
 
+impl Pace {
+    /// Points of a whole turn.
+    fn due(&self) -> f64 {
+        360.0 / self.step.max(1e-3)
+    }
+
+    /// How long one takes, in nanoseconds.
+    fn turn_ns(&self) -> f64 {
+        self.due() * self.point_ns
+    }
+}
+
 impl Turns {
     pub(crate) fn new() -> Self {
         const NONE: Point = Point { angle: 0.0, range: NO_RETURN, intensity: 0 };
@@ -61,6 +76,7 @@ impl Turns {
             at: 0,
             open: [Open::default(); 2],
             number: None,
+            serial: 0,
             lacking: i64::MIN,
             edge: 0.0,
             counts: TurnCounts::default(),
@@ -77,7 +93,13 @@ impl Turns {
         self.counts
     }
 
-    /// The points of a turn that was closed just now.
+    /// The first of the turns that are being measured, as if it ended here.
+    pub(crate) fn begun(&self, pace: Pace) -> Option<Closed> {
+        let open = &self.open[0];
+        Some(self.end(open, open.first?, pace.turn_ns()))
+    }
+
+    /// The points of a turn that was closed just now, or that is being measured.
     pub(crate) fn points(&self, closed: &Closed) -> &[Point] {
         &self.points[closed.points][..closed.len]
     }
@@ -86,6 +108,7 @@ impl Turns {
     pub(crate) fn give_up(&mut self) {
         self.counts.short += u64::from(self.open[0].len > 0);
         self.open = [Open::default(); 2];
+        self.serial += 2;
         (self.number, self.lacking) = (None, i64::MIN);
     }
 
@@ -124,40 +147,51 @@ impl Turns {
     /// All points before `angle` were put. The turn that is over with it, if there is one; then this is to be called
     /// once more.
     pub(crate) fn reach(&mut self, angle: f64, pace: Pace) -> Option<Closed> {
-        let (turn, due) = (self.turn_of(angle), 360.0 / pace.step.max(1e-3));
+        let turn = self.turn_of(angle);
         while let Some(number) = self.number.filter(|number| turn > *number) {
             let open = self.open[0];
             if open.len == 0 && self.open[1].len == 0 {
                 self.counts.missed += (turn - number) as u64;
                 self.number = Some(turn);
+                self.serial += 2;
                 self.open = [self.fresh(turn), self.fresh(turn + 1)];
                 return None;
             }
-            let (points, next) = (self.at, self.open[1].first);
+            // A head may change its speed: from edge to edge is what this turn took.
+            let usual = pace.turn_ns();
+            let took = open.first.zip(self.open[1].first).map(|(first, next)| next - first);
+            let took = took.filter(|took| (0.5 * usual..2.0 * usual).contains(took));
+            let is_enough = open.len as f64 >= pace.due() / 2.0;
+            let closed =
+                open.first.filter(|_| is_enough).map(|first| self.end(&open, first, took.unwrap_or(usual)));
             self.at ^= 1;
+            self.serial += 1;
             self.open = [self.open[1], self.fresh(number + 2)];
             self.number = Some(number + 1);
-            let Some(first) = open.first.filter(|_| open.len as f64 >= due / 2.0) else {
+            let Some(closed) = closed else {
                 self.counts.short += u64::from(open.len > 0);
                 self.counts.missed += u64::from(open.len == 0);
                 continue;
             };
             self.counts.turns += 1;
             self.counts.incomplete += u64::from(open.incomplete);
-            // A head may change its speed: from edge to edge is what this turn took.
-            let usual = due * pace.point_ns;
-            let took = next.map(|next| next - first).filter(|took| (0.5 * usual..2.0 * usual).contains(took));
-            return Some(Closed {
-                points,
-                len: open.len,
-                first: first as Nanos,
-                last: open.last.max(first) as Nanos,
-                period: took.unwrap_or(usual) as Nanos,
-                incomplete: open.incomplete,
-                reasons: open.reasons,
-            });
+            return Some(closed);
         }
         None
+    }
+
+    /// The first of the open turns, which began at `first` and takes so many nanoseconds.
+    fn end(&self, open: &Open, first: f64, period: f64) -> Closed {
+        Closed {
+            number: self.serial,
+            points: self.at,
+            len: open.len,
+            first: first as Nanos,
+            last: open.last.max(first) as Nanos,
+            period: period as Nanos,
+            incomplete: open.incomplete,
+            reasons: open.reasons,
+        }
     }
 
     fn fresh(&self, turn: i64) -> Open {

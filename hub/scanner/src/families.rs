@@ -4,7 +4,7 @@
 use std::fmt;
 
 use line::family::{Condition, Features, Model, Turning as _, Wanted};
-use line::{Heard, Nanos, Output};
+use line::{Heard, Nanos, Output, Turn};
 use schema::Family;
 
 /// Declares the families: number and crate of one stand in a line.
@@ -94,6 +94,12 @@ impl Session {
     /// Beams of the grid that turns are for; nothing before it is known what is at the other end.
     pub fn beams(&self) -> Option<usize> {
         each!(self, session => line::family::Turning::beams(session))
+    }
+
+    /// The turn that is being measured, as if it ended with the points that are known, once [`line::Session::poll_output`] wants
+    /// to wait; nothing between turns.
+    pub fn begun(&self) -> Option<Turn<'_>> {
+        each!(self, session => line::family::Turning::begun(session))
     }
 
     /// What it turned out to be where another model is wanted.

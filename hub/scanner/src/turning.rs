@@ -1,6 +1,7 @@
 //! Puts a turn of a scanner whose points fall where they like on a grid of beams, as a scan. Refuses to know what the
 //! scanner speaks.
 
+use line::Turn;
 use line::grid::{Grid, Point};
 use schema::{Code, Contents, Family, Scan, ScanArrays, ScanHead};
 
@@ -19,7 +20,18 @@ pub struct Turning<'a> {
     pub incomplete: bool,
 }
 
-impl Turning<'_> {
+impl<'a> Turning<'a> {
+    /// `turn` of a scanner of `family`.
+    pub fn of(turn: &Turn<'a>, family: Family) -> Turning<'a> {
+        Turning {
+            family,
+            points: turn.points,
+            period_ns: turn.period,
+            points_per_second: turn.points_per_second,
+            incomplete: turn.incomplete,
+        }
+    }
+
     /// Returns the bytes of the scan of so many beams.
     pub const fn len(beams: usize) -> usize {
         Scan::len(beams, Contents::TURNING)

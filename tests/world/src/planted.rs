@@ -75,11 +75,13 @@ pub enum Defect {
     UnturnedHead,
     /// Now and then all points of a turn are a degree beside their places.
     WrongPlaces,
+    /// A warning that does not hold is not taken back.
+    KeptWarning,
 }
 
 impl Defect {
     /// All of them.
-    pub const ALL: [Defect; 33] = [
+    pub const ALL: [Defect; 34] = [
         Defect::LostWake,
         Defect::OneRing,
         Defect::LostByte,
@@ -113,6 +115,7 @@ impl Defect {
         Defect::DeafScanner,
         Defect::UnturnedHead,
         Defect::WrongPlaces,
+        Defect::KeptWarning,
     ];
 }
 

@@ -12,7 +12,7 @@ use std::rc::Rc;
 use lms::Nanos;
 use schema::ipc::{LoanError, Medium, Payload, SendError};
 use schema::limits::TopicLimits;
-use schema::{Header, Topic, Verdict, limits};
+use schema::{Early, Header, Topic, Verdict, limits};
 
 use crate::consumer::Number;
 use crate::event::Event;
@@ -245,6 +245,9 @@ impl<P: Payload + ?Sized> Medium<P> for Carrier<P> {
         let mut header = *header;
         let topic = P::TOPIC;
         if topic == Topic::Telegram && planted.strikes(Defect::UnsentTelegram, 100) {
+            return Ok(0);
+        }
+        if topic == Topic::Early && planted.is(Defect::KeptWarning) && bytes[1] == Early::WITHDRAWN {
             return Ok(0);
         }
         if topic == Topic::Zones && planted.is(Defect::SurvivingVerdict) && bytes[0] == UNKNOWN {

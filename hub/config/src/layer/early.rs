@@ -20,12 +20,12 @@ impl EarlyLayer {
         put(&mut early.pieces, self.pieces, |value| whole(origin, "pieces", value, 2..=8))
     }
 
-    /// [`Kind::Configuration`](schema::Kind::Configuration) if it is said for a scanner of a `family` that has no such warnings.
+    /// [`Kind::Configuration`](schema::Kind::Configuration) if it is said for a scanner of a `family` whose packets are pieces already.
     pub(super) fn check_family(&self, origin: &Origin, family: Family) -> Result<(), Failure> {
         let foreign = self.pieces.as_ref().filter(|_| family != Family::Lms);
         foreign.map_or(Ok(()), |pieces| {
             let what = format!("pieces, and an {} sends packets, which are short", family.name());
-            Err(origin.refuse(Some(pieces.span()), what, "early warnings are for an LMS"))
+            Err(origin.refuse(Some(pieces.span()), what, "it warns by each packet anyway"))
         })
     }
 }

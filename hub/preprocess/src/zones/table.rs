@@ -180,10 +180,9 @@ impl Table {
         self.most_invalid
     }
 
-    /// Beams without a reading among those of `scan` that can tell something of the largest circle. One that was not measured
-    /// counts where nothing was over more than two spacings of the sensor's own points, which change with a head's speed.
-    pub(super) fn invalid(&self, scan: &Scan) -> u16 {
-        let ranges = &scan.ranges()[..self.layout.count];
+    /// Beams without a reading among those that can tell something of the largest circle. One that was not measured counts
+    /// where nothing was over more than two spacings of the sensor's own points, which are `spacing` radians.
+    pub(super) fn invalid(&self, ranges: &[u16], spacing: f32) -> u16 {
         let Layout { valid_to, no_return, beyond, .. } = self.layout;
         let is_invalid = |value: u16| {
             let is_no_return = self.no_return_is_far & (value == no_return);
@@ -192,7 +191,7 @@ impl Table {
         };
         let beams = ranges.iter().zip(&self.tells);
         let invalid: u16 = beams.map(|(&value, &tells)| u16::from(is_invalid(value)) & tells).sum();
-        if invalid == 0 { 0 } else { invalid - self.looked_past(ranges, scan.spacing) }
+        if invalid == 0 { 0 } else { invalid - self.looked_past(ranges, spacing) }
     }
 
     /// Of the beams that can tell something, those that were not measured and have measured ones near enough on both sides.
@@ -224,23 +223,14 @@ impl Table {
         past
     }
 
-    /// What the beams of `scan` met, which is of the table's layout: the exact point counts where there is one.
-    pub(super) fn met(&mut self, scan: &Scan) -> Met {
-        let ranges = &scan.ranges()[..self.layout.count];
-        match scan.exact_angles() {
-            [] => Met { inside: self.inside(ranges), nearest: self.nearest(ranges) },
-            angles => self.met_exactly(ranges, angles),
+    /// What the beams met that have these `ranges`, the first ones of a scan of the table's layout: the exact points count
+    /// where there are `angles`.
+    pub(super) fn met(&mut self, ranges: &[u16], angles: &[f32]) -> Met {
+        if !angles.is_empty() {
+            return self.met_exactly(ranges, angles);
         }
-    }
-
-    /// Beams whose readings are inside each circle, of the first ones of a scan of the table's layout.
-    pub(super) fn inside(&self, ranges: &[u16]) -> [u16; ZONES] {
-        std::array::from_fn(|zone| self.inside[zone].count(ranges))
-    }
-
-    /// The beam of the nearest point of the same, and its distance from the robot's centre in mm, rounded down.
-    pub(super) fn nearest(&mut self, ranges: &[u16]) -> Option<(u16, u32)> {
-        self.nearest.find(ranges).map(|(beam, square)| self.at_distance(beam, square))
+        let nearest = self.nearest.find(ranges).map(|(beam, square)| self.at_distance(beam, square));
+        Met { inside: std::array::from_fn(|zone| self.inside[zone].count(ranges)), nearest }
     }
 
     /// Only what is near enough to be inside a circle, or the nearest, is computed.

@@ -303,14 +303,27 @@ impl Session {
     }
 
     pub(super) fn show(&mut self, closed: Closed) -> Turn<'_> {
-        let stamp = |at: Nanos| self.clock.time(at).unwrap_or(self.now);
-        let (first, last) = (stamp(closed.first), stamp(closed.last));
-        let (first, last) = self.reads.date_turn(first, last);
+        let first = self.dated(closed).first;
+        self.reads.end_turn(first);
         self.trouble = None;
         if let Phase::Hearing { turned_at, has_turned, .. } = &mut self.phase {
             (*turned_at, *has_turned) = (self.now, true);
         }
+        self.dated(closed)
+    }
+
+    /// The turn that is being measured, as if it ended with the points that are known.
+    pub(crate) fn begun_turn(&self) -> Option<Turn<'_>> {
+        let pace = self.framer.kind().and_then(|kind| self.pace(kind))?;
+        self.turns.begun(pace).map(|begun| self.dated(begun))
+    }
+
+    /// A turn that is over, or that is being measured, by the hub's clock.
+    fn dated(&self, closed: Closed) -> Turn<'_> {
+        let stamp = |at: Nanos| self.clock.time(at).unwrap_or(self.now);
+        let (first, last) = self.reads.turn_dates(stamp(closed.first), stamp(closed.last));
         Turn {
+            number: closed.number,
             points: self.turns.points(&closed),
             first,
             last,

@@ -3,6 +3,7 @@
 
 mod accounts;
 mod bytes;
+mod early;
 mod eeprom;
 mod liveness;
 mod lost_on_line;
@@ -72,6 +73,7 @@ pub(crate) fn all(setup: &Setup, plan: &Plan) -> Vec<Box<dyn Judge>> {
         Box::new(turns::Turns::new(sensors)),
         Box::new(lost_on_line::LostOnLine::new(sensors)),
         Box::new(prompt::Prompt::default()),
+        Box::new(early::Early::default()),
         Box::new(recording::Recording::new(plan.seed)),
         Box::new(verdict::OfRobot::new(setup, plan)),
         Box::new(liveness::Liveness::new(sensors)),

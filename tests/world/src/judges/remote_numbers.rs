@@ -96,10 +96,9 @@ impl OfTopic {
         let steps =
             last.filter(|(_, last)| last.epoch == head.epoch).map(|(_, last)| head.sequence - last.sequence);
         if let (Some(steps), Some((last_came, _))) = (steps.filter(|steps| *steps > 0), last) {
-            let distance_ns = (came - last_came) / u64::from(steps);
-            if distance_ns <= LONGEST {
-                self.distances_ns.push_back(distance_ns);
-            }
+            // Two ways of a bridge may be unequally late.
+            let distance_ns = came.checked_sub(last_came).map(|apart| apart / u64::from(steps));
+            self.distances_ns.extend(distance_ns.filter(|distance_ns| *distance_ns <= LONGEST));
             if self.distances_ns.len() > KEPT {
                 self.distances_ns.pop_front();
             }

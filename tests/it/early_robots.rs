@@ -1,0 +1,134 @@
+//! The robot's verdict with early warnings and without: Rust, Python and C take the same ones, and nobody takes one unasked.
+
+use std::process::Command;
+
+use crate::client_c::installed::{Installed, source};
+use crate::early::POST;
+use crate::python::check_on;
+use crate::testkit::{INT, Program, TERM, TestEnv, is_class, until};
+use scanhub_client::{Publication, PublishSession, RobotFollower, SensorPublisher};
+use schema::limits::TopicLimits;
+use schema::{Early, Header, Topic, Verdict, Wake, Zones};
+use serde_json::Value;
+
+#[test]
+fn a_hub_warns_a_robot_in_python_only_while_it_wants_that() {
+    let env = TestEnv::new();
+    let Some(mut command) = check_on(&env, "robot") else { return };
+    command.args(["--early", "front"]);
+    let flags = ["--seed=28", "--baud=500000", &format!("--world={}", env.file("post.toml", POST))];
+    let (hub, simulator) = (env.hub(&[env.link("front")]), env.simulator(&["front"], &flags));
+    let mut robot = Program::start(command);
+    robot.await_line("the post", |line| line["verdict"] == "stop");
+    until("it follows warnings", || env.subscribers("front/early") == 1);
+    robot.await_line("the post, after that", |line| line["verdict"] == "stop");
+    assert_eq!(robot.end(INT).code, Some(0));
+    until("nobody follows them", || env.subscribers("front/early") == 0);
+    assert_eq!((hub.end(TERM).code, simulator.end(TERM).code), (Some(0), Some(0)));
+}
+
+/// A sensor whose zones and warnings are said here.
+struct Warning {
+    zones: Publication<Zones>,
+    early: Publication<Early>,
+    sensor: SensorPublisher,
+}
+
+impl Warning {
+    /// The header of what is said of scan `seq`, whose zones hold for longer than a test.
+    fn of_scan(&self, seq: u64) -> Header {
+        Header { seq, period_us: 1_000_000_000, ..self.zones.header() }
+    }
+
+    fn zones(&mut self, seq: u64, verdict: Verdict) {
+        let header = self.of_scan(seq);
+        let zones = Zones { verdict: verdict as u8, ..Zones::unknown() };
+        self.zones.send_with(&header, |sample| *sample = zones).expect("there is room");
+        self.sensor.wake(Wake::Telegram).expect("they are woken");
+    }
+
+    fn warn(&mut self, seq: u64, flags: u8) {
+        let header = self.of_scan(seq);
+        let stop = Early { verdict: 2, flags, beam: 40, distance_mm: 500, bytes_seen: 240, beams_seen: 116 };
+        self.early.send_with(&header, |sample| *sample = stop).expect("there is room");
+        self.sensor.wake(Wake::Early).expect("they are woken");
+    }
+}
+
+/// Programs that follow the verdict of `robot1.front`, each with warnings or without.
+fn robots(env: &TestEnv) -> Vec<(bool, Program)> {
+    let mut commands = Vec::new();
+    for early in [false, true] {
+        if let Some(mut command) = check_on(env, "robot") {
+            command.args(early.then_some("--early")).arg("robot1.front");
+            commands.push((early, command));
+        }
+        let Some(installed) = Installed::once() else { continue };
+        for way in ["doorbell", "poll"] {
+            let mut command = Command::new(installed.compile(env, &source("robot.c"), &[]));
+            command.args([way, "robot1.front"]).args(early.then_some("early"));
+            command.env("SCANHUB_DOMAIN", env.place().name()).env_remove("XDG_RUNTIME_DIR");
+            command.env("RUNTIME_DIRECTORY", env.place().root().parent().expect("it has one"));
+            commands.push((early, command));
+        }
+    }
+    commands.into_iter().map(|(early, command)| (early, Program::start(command))).collect()
+}
+
+/// What a line says of the robot, in C by its number.
+fn verdict(line: &Value) -> Option<Verdict> {
+    let said = |verdict: &Verdict| line["verdict"] == verdict.name() || line["verdict"] == *verdict as u64;
+    Verdict::ALL.into_iter().find(said)
+}
+
+#[test]
+fn robots_in_all_languages_take_warnings_if_they_are_wanted() {
+    let env = TestEnv::new();
+    let topics = [Topic::Zones, Topic::Early];
+    let session = PublishSession::open(&env.place(), &topics, TopicLimits::default()).expect("nobody else");
+    let sensor = session.sensor("robot1.front").expect("a name");
+    let (zones, early) = (sensor.topic().expect("room"), sensor.topic().expect("room"));
+    let mut sensor = Warning { zones, early, sensor };
+    let mut robots = robots(&env);
+    let in_domain = || RobotFollower::in_domain(vec![env.place()], &["robot1.front"]).expect("a name");
+    let mut in_rust = [(false, in_domain()), (true, in_domain().with_early())];
+    let all = robots.len() as u64 + 2;
+    until("zones are followed by all, and warnings by those who want them", || {
+        for (_, robot) in &mut in_rust {
+            robot.now().expect("a domain");
+        }
+        let followers = |topic: &str| env.subscribers(&format!("robot1.front/{topic}"));
+        (followers("zones"), followers("early")) == (all, all / 2)
+    });
+    let mut hear = |warned: bool, wanted: Verdict| {
+        for (_, robot) in in_rust.iter_mut().filter(|(early, _)| *early || !warned) {
+            until("the verdict in Rust", || robot.now().expect("a domain").verdict() == wanted);
+        }
+        for (_, robot) in robots.iter_mut().filter(|(early, _)| *early || !warned) {
+            let line = robot.await_line(wanted.name(), |line| verdict(line) == Some(wanted));
+            assert_eq!(line["nearest_mm"].as_u64(), (wanted == Verdict::Stop).then_some(500), "{line}");
+        }
+    };
+    sensor.zones(7, Verdict::Clear);
+    hear(false, Verdict::Clear);
+    sensor.warn(8, 0);
+    hear(true, Verdict::Stop);
+    sensor.warn(8, Early::WITHDRAWN);
+    hear(true, Verdict::Clear);
+    sensor.warn(8, 0);
+    hear(true, Verdict::Stop);
+    sensor.zones(8, Verdict::Clear);
+    hear(false, Verdict::Clear);
+    sensor.zones(9, Verdict::Slow);
+    hear(false, Verdict::Slow);
+    assert_eq!(in_rust[0].1.now().expect("a domain").nearest(), None);
+    for (early, robot) in robots {
+        let outcome = robot.end(INT);
+        let mut said: Vec<Verdict> = outcome.of_class("robot").iter().filter_map(verdict).collect();
+        said.retain(|verdict| *verdict != Verdict::Unknown);
+        said.dedup();
+        let (clear, stop, slow) = (Verdict::Clear, Verdict::Stop, Verdict::Slow);
+        let wanted = if early { vec![clear, stop, clear, stop, clear, slow] } else { vec![clear, slow] };
+        assert_eq!(said, wanted, "{outcome}");
+    }
+}
