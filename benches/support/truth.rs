@@ -1,5 +1,6 @@
 //! What the simulator says that it sent: the truth that everything received is compared with.
 
+use std::collections::HashMap;
 use std::path::Path;
 
 use serde_json::Value;
@@ -11,6 +12,8 @@ use super::Outcome;
 #[derive(Clone, Debug)]
 pub(crate) struct Sent {
     pub(crate) hash: String,
+    /// Its number among all that the sensor sent.
+    pub(crate) index: u64,
     /// CLOCK_MONOTONIC after its last byte was written.
     pub(crate) at_ns: u64,
 }
@@ -42,10 +45,27 @@ impl Truth {
                 truth.aborted_ns.extend(value["sent_ns"].as_u64());
             } else if value["kind"] == "data" && value["fault"].is_null() {
                 let hash = value["sha256"].as_str().unwrap_or_default().to_owned();
-                truth.sent.push(Sent { hash, at_ns: value["sent_ns"].as_u64().unwrap_or_default() });
+                let number = |key: &str| value[key].as_u64().unwrap_or_default();
+                truth.sent.push(Sent { hash, index: number("index"), at_ns: number("sent_ns") });
             }
         }
         Ok(truth)
+    }
+
+    /// When each was due of a sensor that sends one each `every_ns`: some of its neighbours left in time. And for how long it
+    /// sent nothing in all although it should have.
+    pub(crate) fn due(&self, every_ns: u64) -> (HashMap<&str, u64>, u64) {
+        let begin = |sent: &Sent| sent.at_ns.saturating_sub(sent.index * every_ns);
+        let begins: Vec<u64> = self.sent.iter().map(begin).collect();
+        let least = |n: usize| {
+            let around = n.saturating_sub(NEIGHBOURS)..(n + NEIGHBOURS).min(begins.len());
+            begins[around].iter().copied().min().unwrap_or_default()
+        };
+        let least: Vec<u64> = (0..begins.len()).map(least).collect();
+        let due = self.sent.iter().zip(&least);
+        let due = due.map(|(sent, begin)| (sent.hash.as_str(), begin + sent.index * every_ns)).collect();
+        let stood = least.windows(2).map(|pair| pair[1].saturating_sub(pair[0])).sum();
+        (due, stood)
     }
 
     /// How many left from `from_ns` on and before `to_ns`.
@@ -53,6 +73,9 @@ impl Truth {
         self.sent.iter().filter(|sent| (from_ns..to_ns).contains(&sent.at_ns)).count()
     }
 }
+
+/// Telegrams on either side of which one left in time.
+const NEIGHBOURS: usize = 200;
 
 /// SHA-256 as the truth writes it.
 pub(crate) fn hash(bytes: &[u8]) -> String {

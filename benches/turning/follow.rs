@@ -1,12 +1,13 @@
-//! A consumer of scans as a process of its own, and what its lines tell: what it missed, what was incomplete, and how even
-//! the stamps are.
+//! Consumers of scans and of packets as processes of their own, and what their lines tell: what was missed and what was
+//! incomplete, how even the stamps of scans are, and how right those of packets.
 
+use std::collections::HashMap;
 use std::io::Write;
 
 use schema::Scan;
 
 use crate::support::child::Line;
-use crate::support::{Outcome, consumer};
+use crate::support::{Outcome, consumer, truth};
 
 /// Follows the scans of `sensor` for ever; prints each: `scan STAMP_NS MISSED INCOMPLETE`.
 pub(crate) fn scans(domain: &str, sensor: &str) -> Outcome<()> {
@@ -17,6 +18,31 @@ pub(crate) fn scans(domain: &str, sensor: &str) -> Outcome<()> {
         let incomplete = u8::from(scan.is_incomplete());
         writeln!(out, "scan {} {} {incomplete}", scan.header().stamp_first_ns, scan.missed)?;
     }
+}
+
+/// Follows the packets of `sensor`, of `len` bytes each, for ever; prints of each sample: `packets STAMP_NS HASH`, when the last
+/// packet was there, and which one it is.
+pub(crate) fn packets(domain: &str, sensor: &str, len: usize) -> Outcome<()> {
+    let mut samples = consumer::subscribe::<[u8]>(domain, sensor)?;
+    let mut out = std::io::stdout().lock();
+    loop {
+        let Some(sample) = samples.next()? else { continue };
+        // Answers have other lengths.
+        if let Some(last) = sample.rchunks_exact(len).next().filter(|_| sample.len() % len == 0) {
+            writeln!(out, "packets {} {}", sample.header().stamp_last_ns, truth::hash(last))?;
+        }
+    }
+}
+
+/// By how much the stamps that a consumer of packets printed are off at most, in ms, where each was `due` at that time.
+pub(crate) fn off_ms(lines: &[Line], due: &HashMap<&str, u64>) -> Outcome<f64> {
+    let mut worst: Option<u64> = None;
+    for line in lines {
+        if let Some(due) = line.words().last().and_then(|hash| due.get(hash)) {
+            worst = worst.max(Some(line.number(1)?.abs_diff(*due)));
+        }
+    }
+    Ok(worst.ok_or("no packet is known to the simulator")? as f64 / 1e6)
 }
 
 /// What a consumer printed.

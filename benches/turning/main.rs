@@ -18,6 +18,7 @@ use support::child::Child;
 use support::figures::{self, Figure, Target};
 use support::options::Options;
 use support::stage::{PATIENCE, PROGRAM, Stage};
+use support::truth::Truth;
 use support::work::Work;
 use support::{Outcome, clock, consumer};
 
@@ -25,6 +26,7 @@ fn main() -> ExitCode {
     let play = |words: &[&str]| match *words {
         ["coalesce", turn, ref ports @ ..] => floor::coalesce(turn.parse()?, ports),
         ["follow", domain, sensor] => follow::scans(domain, sensor),
+        ["packets", domain, sensor, len] => follow::packets(domain, sensor, len.parse()?),
         _ => support::play(words),
     };
     support::main_with(play, measure)
@@ -36,8 +38,12 @@ struct Fleet {
     model: &'static str,
     /// Bytes that one sends in a turn, about.
     turn: usize,
+    /// Bytes of a packet, and nanoseconds from one to the next.
+    packet: (usize, u64),
     load: &'static str,
     missed: &'static str,
+    off: &'static str,
+    stood: &'static str,
     uneven: &'static str,
     incomplete: &'static str,
 }
@@ -47,8 +53,11 @@ const FLEETS: [Fleet; 2] = [
         family: "ld",
         model: "ld19",
         turn: 450 / 12 * 47,
+        packet: (47, 12 * 1_000_000_000 / 4_500),
         load: "8 LD19: processor time",
         missed: "8 LD19: scans that a consumer missed, and packets that the hub lost",
+        off: "LD19, 20 stalls of 0.5 s: stamps of packets off by at most",
+        stood: "LD19, 20 stalls of 0.5 s: for so long the simulator was kept from sending",
         uneven: "LD19, 20 stalls of 0.5 s: stamps of scans uneven by at most",
         incomplete: "LD19, 20 stalls of 0.5 s: turns marked incomplete",
     },
@@ -56,8 +65,11 @@ const FLEETS: [Fleet; 2] = [
         family: "rplidar",
         model: "s2",
         turn: 3_200 / 40 * 84,
+        packet: (84, 40 * 1_000_000_000 / 32_000),
         load: "8 RPLIDAR S2: processor time",
         missed: "8 RPLIDAR S2: scans that a consumer missed, and packets that the hub lost",
+        off: "RPLIDAR S2, 20 stalls of 0.5 s: stamps of packets off by at most",
+        stood: "RPLIDAR S2, 20 stalls of 0.5 s: for so long the simulator was kept from sending",
         uneven: "RPLIDAR S2, 20 stalls of 0.5 s: stamps of scans uneven by at most",
         incomplete: "RPLIDAR S2, 20 stalls of 0.5 s: turns marked incomplete",
     },
@@ -97,14 +109,18 @@ fn load(fleet: &Fleet, options: &Options) -> Outcome<[Figure; 2]> {
 }
 
 /// Stops the hub for half a second, again and again, while two scanners go on.
-fn stalls(fleet: &Fleet, options: &Options) -> Outcome<[Figure; 2]> {
+fn stalls(fleet: &Fleet, options: &Options) -> Outcome<[Figure; 4]> {
     let stage = Stage::new()?;
     let sensors = &SENSORS[..2];
-    let _simulator = fleet.simulate(&stage, sensors)?;
+    let alone = |sensor: &&str| stage.simulate_one(sensor, &fleet.flags());
+    let simulators: Vec<Child> = sensors.iter().map(alone).collect::<Outcome<_>>()?;
     let (hub, consumers) = fleet.start_hub(&stage, sensors, 1)?;
+    let (len, every_ns) = fleet.packet;
+    let stamps = |sensor: &&str| stage.part(&["packets", stage.domain.name(), sensor, &len.to_string()]);
+    let stamps: Vec<Child> = sensors.iter().map(stamps).collect::<Outcome<_>>()?;
     let process = Pid::from_raw(hub.guard.pid() as i32).ok_or("no process")?;
     thread::sleep(SETTLING);
-    consumers.iter().for_each(|consumer| drop(consumer.lines_so_far()));
+    consumers.iter().chain(&stamps).for_each(|consumer| drop(consumer.lines_so_far()));
     for round in 0..options.count(20) as u64 {
         // Another phase of the turn each time.
         thread::sleep(Duration::from_millis(1500 + 17 * (round % 10)));
@@ -120,7 +136,19 @@ fn stalls(fleet: &Fleet, options: &Options) -> Outcome<[Figure; 2]> {
         incomplete.push(scans.incomplete as f64);
     }
     hub.guard.kill()?;
+    drop(simulators);
+    let (mut off, mut stood) = (Vec::new(), Vec::new());
+    for (sensor, stamps) in sensors.iter().zip(&stamps) {
+        let truth = Truth::read(&stage.own_truth(sensor), sensor)?;
+        let (due, stood_ns) = truth.due(every_ns);
+        off.push(follow::off_ms(&stamps.lines_so_far(), &due)?);
+        stood.push(stood_ns as f64 / 1e6);
+    }
+    let none = Vec::new;
     Ok([
+        Figure { name: fleet.off, unit: "ms", hub: off, floor: none(), target: Target::Most(5.0) },
+        // Where that is much, a real scanner would have sent: stamps are off by it, and uneven.
+        Figure { name: fleet.stood, unit: "ms", hub: stood, floor: none(), target: Target::None },
         Figure { name: fleet.uneven, unit: "ms", hub: uneven, floor: Vec::new(), target: Target::Most(5.0) },
         Figure {
             name: fleet.incomplete,
@@ -135,8 +163,11 @@ fn stalls(fleet: &Fleet, options: &Options) -> Outcome<[Figure; 2]> {
 impl Fleet {
     /// Scanners of this kind at the other end of ptys, in a simulator of their own.
     fn simulate(&self, stage: &Stage, sensors: &[&str]) -> Outcome<Child> {
-        let flags = ["--family", self.family, "--model", self.model, "--world", "room"];
-        stage.simulate_as(sensors, &flags)
+        stage.simulate_as(sensors, &self.flags())
+    }
+
+    fn flags(&self) -> [&'static str; 6] {
+        ["--family", self.family, "--model", self.model, "--world", "room"]
     }
 
     /// The hub and so many consumers of each sensor, once scans come.

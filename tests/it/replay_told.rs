@@ -56,5 +56,37 @@ fn a_recorded_status_tells_mode_and_beams() {
     }
 }
 
+#[test]
+fn telegrams_alone_that_may_be_of_two_kinds_are_refused_until_it_is_said_which() {
+    // Of types 82h and 85h, which look alike.
+    for (model, mode) in [("a1", "express"), ("s1", "denseboost")] {
+        let env = TestEnv::in_time();
+        let mode = format!("mode={mode}");
+        let words = ["--family=rplidar", &format!("--model={model}"), "--world=room", "--seed=5"];
+        let simulator = env.simulator(&["front"], &words);
+        let set = ["family=rplidar", &mode].map(|set| format!("--set=link.front.{set}"));
+        let hub = env.hub(&[vec![env.link("front")], set.to_vec()].concat());
+        // From here on nobody asks the scanner anything.
+        env.await_info("front", |info| info["state"] == "streaming");
+        let recorder = recorder(&env, "telegrams.mcap", &["front/telegram"]);
+        let mut echo = env.echo(&["front/scan"]);
+        echo.await_lines(15, "a scan", is_class("scan"));
+        assert_eq!(recorder.end(INT).code, Some(0));
+        assert_eq!((echo.end(INT).code, hub.end(TERM).code), (Some(0), Some(0)));
+        assert_eq!(simulator.end(TERM).code, Some(0));
+
+        let (recording, rows) = (env.word("telegrams.mcap"), env.word("rows.csv"));
+        for words in [vec!["replay", "--no-system-config", &recording], vec!["convert", &recording, &rows]] {
+            let outcome = env.run(&words);
+            assert_eq!(outcome.code, Some(66), "{model}: {outcome}");
+            let said = ["does not tell of which kind its packets are", "link.NAME.model or mode is set"];
+            assert!(said.iter().all(|words| outcome.errors.contains(words)), "{model}: {outcome}");
+        }
+        // What the refusal says helps.
+        replay(&env, "telegrams.mcap", &["--rate=max", &format!("--set=link.front.{mode}")]);
+        assert!(samples(&env.path("replayed.mcap"), "front/scan").len() > 5, "{model}");
+    }
+}
+
 /// How far times of the day may be off to each other: how long a point takes is measured, better the longer that is done.
 const OFF_NS: u64 = 40_000_000;
