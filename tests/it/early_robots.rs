@@ -5,7 +5,7 @@ use std::process::Command;
 use crate::client_c::installed::{Installed, source};
 use crate::early::POST;
 use crate::python::check_on;
-use crate::testkit::{INT, Program, TERM, TestEnv, is_class, until};
+use crate::testkit::{INT, Program, TERM, TestEnv, until};
 use scanhub_client::{Publication, PublishSession, RobotFollower, SensorPublisher};
 use schema::limits::TopicLimits;
 use schema::{Early, Header, Topic, Verdict, Wake, Zones};
