@@ -1,7 +1,7 @@
 //! What the tracker is worth: simulated people in a simulated house, scored by the package `motmetrics`.
 //!
 //! ```sh
-//! cargo run --release -p scanhub-track --example proof -- --seeds 301..311
+//! cargo run --release -p scanhub-track --example proof -- --seeds 501..511
 //! ```
 //!
 //! `PROOF_PYTHON` names a Python that has `motmetrics` and numpy below 2.
