@@ -107,7 +107,11 @@ impl Foreground {
 
     /// Returns the beams in the foreground with their ranges in device units, in the order of the beams.
     pub fn readings(&self) -> impl Iterator<Item = (usize, u16)> + '_ {
-        (0..self.scan_beams()).filter(|&i| self.contains(i)).zip(self.ranges().iter().copied())
+        let bytes = self.bits().iter().enumerate().filter(|(_, byte)| **byte != 0);
+        let of_byte = |(at, &byte): (usize, &u8)| {
+            (0..8).filter(move |bit| byte >> bit & 1 == 1).map(move |bit| 8 * at + bit)
+        };
+        bytes.flat_map(of_byte).take_while(|&i| i < self.scan_beams()).zip(self.ranges().iter().copied())
     }
 
     /// Returns the ranges of the foreground beams in device units.

@@ -20,7 +20,8 @@ pub(crate) struct Assignment {
     group: Vec<usize>,
     legs: Vec<usize>,
     places: Vec<usize>,
-    order: Vec<usize>,
+    /// Group and number of each edge.
+    order: Vec<(usize, usize)>,
 }
 
 impl Assignment {
@@ -28,55 +29,61 @@ impl Assignment {
     pub(crate) fn solve(
         &mut self,
         (legs, places): (usize, usize),
-        edges: &mut [Edge],
+        edges: &[Edge],
         pairs: &mut Vec<(usize, usize)>,
     ) {
         self.group.clear();
         self.group.extend(0..legs + places);
-        for edge in &*edges {
+        for edge in edges {
             let (a, b) = (self.root(edge.leg), self.root(legs + edge.place));
             self.group[a.max(b)] = a.min(b);
         }
         self.order.clear();
-        for edge in &*edges {
+        for (i, edge) in edges.iter().enumerate() {
             let root = self.root(edge.leg);
-            self.order.push(root);
+            self.order.push((root, i));
         }
         // By group, in the order in which they came.
-        let mut done = 0;
-        while done < edges.len() {
-            let Some(group) = self.order.iter().copied().filter(|&group| group != usize::MAX).min() else {
-                break;
-            };
-            let mine = |order: &[usize]| order.iter().filter(|&&one| one == group).count();
-            let count = mine(&self.order);
-            done += count;
-            let of_group = (0..edges.len()).filter(|&i| self.order[i] == group);
-            if count == 1 {
-                pairs.extend(of_group.map(|i| (edges[i].leg, edges[i].place)));
-            } else {
-                self.legs.clear();
-                self.places.clear();
-                for i in of_group {
-                    if !self.legs.contains(&edges[i].leg) {
-                        self.legs.push(edges[i].leg);
-                    }
-                    if !self.places.contains(&edges[i].place) {
-                        self.places.push(edges[i].place);
-                    }
-                }
-                self.compete(edges, group, pairs);
+        self.order.sort_unstable();
+        let order = std::mem::take(&mut self.order);
+        for group in order.chunk_by(|a, b| a.0 == b.0) {
+            if let &[(_, alone)] = group {
+                pairs.push((edges[alone].leg, edges[alone].place));
+                continue;
             }
-            self.order.iter_mut().filter(|one| **one == group).for_each(|one| *one = usize::MAX);
+            self.legs.clear();
+            self.places.clear();
+            for &(_, i) in group {
+                if !self.legs.contains(&edges[i].leg) {
+                    self.legs.push(edges[i].leg);
+                }
+                if !self.places.contains(&edges[i].place) {
+                    self.places.push(edges[i].place);
+                }
+            }
+            self.compete(edges, group, pairs);
         }
+        self.order = order;
     }
 
-    fn compete(&self, edges: &[Edge], group: usize, pairs: &mut Vec<(usize, usize)>) {
+    fn compete(&self, edges: &[Edge], group: &[(usize, usize)], pairs: &mut Vec<(usize, usize)>) {
+        // The two legs of one person, mostly.
+        if let (&[leg, other_leg], &[place, other_place]) = (&self.legs[..], &self.places[..]) {
+            let find = |leg: usize, place: usize| {
+                group.iter().map(|&(_, i)| &edges[i]).find(|one| (one.leg, one.place) == (leg, place))
+            };
+            let straight = [find(leg, place), find(other_leg, other_place)];
+            let crossed = [find(leg, other_place), find(other_leg, place)];
+            let gain = |two: &[Option<&Edge>; 2]| two.iter().flatten().map(|edge| edge.gain).sum::<f64>();
+            let best = if gain(&crossed) > gain(&straight) { crossed } else { straight };
+            pairs.extend(best.into_iter().flatten().map(|edge| (edge.leg, edge.place)));
+            return;
+        }
         // The solver wants at least as many columns as rows.
         let turn = self.legs.len() > self.places.len();
         let (rows, columns) = if turn { (&self.places, &self.legs) } else { (&self.legs, &self.places) };
         let mut weights = Matrix::new(rows.len(), columns.len(), 0_i64);
-        for (edge, _) in edges.iter().zip(&self.order).filter(|(_, of)| **of == group) {
+        for edge in group.iter().map(|&(_, i)| &edges[i]) {
             let (row, column) = if turn { (edge.place, edge.leg) } else { (edge.leg, edge.place) };
             let place = |list: &[usize], what| list.iter().position(|&one| one == what);
             if let (Some(row), Some(column)) = (place(rows, row), place(columns, column)) {
@@ -136,7 +143,7 @@ mod tests {
                 }
             }
             let mut pairs = Vec::new();
-            assignment.solve((legs, places), &mut edges, &mut pairs);
+            assignment.solve((legs, places), &edges, &mut pairs);
             let gain = |&(leg, place): &(usize, usize)| {
                 edges.iter().find(|edge| (edge.leg, edge.place) == (leg, place)).unwrap().gain
             };

@@ -8,10 +8,14 @@ pub fn minus(a: Point, b: Point) -> Point {
     [a[0] - b[0], a[1] - b[1]]
 }
 
+/// Returns the square of the length of a vector.
+pub fn length2([x, y]: Point) -> f64 {
+    x * x + y * y
+}
+
 /// Returns the distance of two points.
 pub fn distance(a: Point, b: Point) -> f64 {
-    let [x, y] = minus(a, b);
-    (x * x + y * y).sqrt()
+    length2(minus(a, b)).sqrt()
 }
 
 /// Returns the middle of a segment.

@@ -29,6 +29,8 @@ pub(crate) struct Person {
     /// How fast he walks when he does.
     pub(crate) pace: f64,
     pub(crate) room: Option<usize>,
+    /// The door by which he came into that room, if he was seen to.
+    pub(crate) came_by: Option<usize>,
     /// Share of the scans that see him and show both legs, of late.
     pub(crate) both: f64,
 }
@@ -73,6 +75,7 @@ impl Person {
             absent_s: 0.0,
             pace: 1.1,
             room: None,
+            came_by: None,
             both: if legs.len() > 1 { 1.0 } else { 0.0 },
         }
     }

@@ -67,7 +67,8 @@ fn has_vote(leg: &Leg) -> bool {
 }
 
 fn cell(off: Point) -> Option<usize> {
-    let [x, y] = off.map(|value| (value / CELL_M).round() + REACH as f64);
+    // Cells lie around the multiples of their side.
+    let [x, y] = off.map(|value| value * (1.0 / CELL_M) + (REACH as f64 + 0.5));
     let is_in = |value: f64| (0.0..ACROSS as f64).contains(&value);
     (is_in(x) && is_in(y)).then_some(y as usize * ACROSS + x as usize)
 }

@@ -60,6 +60,8 @@ pub(crate) struct Sight {
     farther: Vec<(u8, f64)>,
     is_foreground: Vec<bool>,
     legs: Vec<Leg>,
+    /// Beams that end at something that stands there.
+    standing: Vec<usize>,
     /// Beams of the cluster that is open, and where they end.
     points: Vec<(usize, Point)>,
 }
@@ -76,6 +78,7 @@ impl Sight {
             farther: Vec::new(),
             is_foreground: Vec::new(),
             legs: Vec::with_capacity(LEGS),
+            standing: Vec::new(),
             points: Vec::new(),
         }
     }
@@ -84,19 +87,23 @@ impl Sight {
     pub(crate) fn take(&mut self, scan: &Scan, foreground: &Foreground) {
         self.fit(scan);
         let unit_m = f64::from(scan.unit_um) * 1e-6;
-        let exact = scan.exact_angles();
-        for (i, &value) in scan.ranges().iter().enumerate() {
-            let range = if value <= scan.valid_to {
+        let beams = self.ranges.iter_mut().zip(&mut self.farthest).zip(&mut self.farther);
+        for (&value, ((range, farthest), farther)) in scan.ranges().iter().zip(beams) {
+            *range = if value <= scan.valid_to {
                 f64::from(value) * unit_m
             } else if value == scan.no_return || value == scan.beyond {
                 f64::INFINITY
             } else {
                 f64::NAN
             };
-            self.ranges[i] = range;
-            self.reach(i, range);
-            if let Some(&angle) = exact.get(i).filter(|angle| angle.is_finite()) {
-                self.directions[i] = self.sensor.direction(f64::from(angle));
+            // Most beams end where they always do.
+            if *range > *farthest || farther.0 > 0 {
+                reach(*range, farthest, farther);
+            }
+        }
+        for (direction, &angle) in self.directions.iter_mut().zip(scan.exact_angles()) {
+            if angle.is_finite() {
+                *direction = self.sensor.direction(f64::from(angle));
             }
         }
         self.is_foreground.fill(false);
@@ -159,21 +166,7 @@ impl Sight {
     pub(crate) fn capacity(&self) -> usize {
         let of_beams = self.directions.capacity() + self.ranges.capacity() + self.farthest.capacity();
         let flags = self.farther.capacity() + self.is_foreground.capacity();
-        of_beams + flags + self.legs.capacity() + self.points.capacity()
-    }
-
-    /// Beam `i` reaches `range`: single readings that are too far are noise.
-    fn reach(&mut self, i: usize, range: f64) {
-        let (scans, least) = &mut self.farther[i];
-        if range > self.farthest[i] {
-            (*scans, *least) = (*scans + 1, least.min(range));
-            if *scans == SCANS_FARTHER {
-                self.farthest[i] = *least;
-                (*scans, *least) = (0, f64::INFINITY);
-            }
-        } else if !range.is_nan() {
-            (*scans, *least) = (0, f64::INFINITY);
-        }
+        of_beams + flags + self.legs.capacity() + self.standing.capacity() + self.points.capacity()
     }
 
     /// Makes the tables for scans such as `scan`.
@@ -193,6 +186,7 @@ impl Sight {
         self.farther.resize(count, (0, f64::INFINITY));
         self.is_foreground.clear();
         self.is_foreground.resize(count, false);
+        self.standing.reserve(count);
         self.points.reserve(count);
     }
 
@@ -201,18 +195,19 @@ impl Sight {
         let mut points = std::mem::take(&mut self.points);
         points.clear();
         let step = self.step.abs();
-        for i in 0..self.ranges.len() {
+        let beams = self.ranges.iter().zip(&self.farthest).zip(&self.is_foreground).enumerate();
+        let stands = beams.filter(|(_, ((range, farthest), is_foreground))| {
+            range.is_finite() && (**range < **farthest - BEFORE_M || **is_foreground)
+        });
+        let mut standing = std::mem::take(&mut self.standing);
+        standing.clear();
+        standing.extend(stands.map(|(i, _)| i));
+        for &i in &standing {
             let range = self.ranges[i];
-            let stands = range.is_finite() && (self.is_foreground[i] || range < self.farthest[i] - BEFORE_M);
-            if !stands {
-                self.close(&points);
-                points.clear();
-                continue;
-            }
             let (place, direction) = (self.sensor.place, self.directions[i]);
             let point = [place[0] + range * direction[0], place[1] + range * direction[1]];
-            if let Some(&(_, last)) = points.last()
-                && distance(last, point) > 0.08 + 1.5 * range * step
+            if let Some(&(before, last)) = points.last()
+                && (before + 1 != i || distance(last, point) > 0.08 + 1.5 * range * step)
             {
                 self.close(&points);
                 points.clear();
@@ -220,7 +215,7 @@ impl Sight {
             points.push((i, point));
         }
         self.close(&points);
-        self.points = points;
+        (self.points, self.standing) = (points, standing);
     }
 
     /// Makes legs of neighbouring points.
@@ -264,5 +259,18 @@ impl Sight {
             sigma_m,
             is_fresh: 2 * fresh > points.len() && !is_short,
         });
+    }
+}
+
+/// A beam reaches `range`: single readings that are too far are noise.
+fn reach(range: f64, farthest: &mut f64, (scans, least): &mut (u8, f64)) {
+    if range > *farthest {
+        (*scans, *least) = (*scans + 1, least.min(range));
+        if *scans == SCANS_FARTHER {
+            *farthest = *least;
+            (*scans, *least) = (0, f64::INFINITY);
+        }
+    } else if !range.is_nan() {
+        (*scans, *least) = (0, f64::INFINITY);
     }
 }

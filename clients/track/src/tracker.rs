@@ -6,7 +6,7 @@ use schema::{Foreground, Scan};
 
 use crate::assignment::{Assignment, Edge};
 use crate::filter::Side;
-use crate::geometry::{Point, distance, distance_to_segment, minus};
+use crate::geometry::{Point, distance, distance_to_segment, length2, minus};
 use crate::passage::LONGEST_S;
 use crate::person::{Life, Person};
 use crate::picture::{Event, Kind, Misplaced, Picture, Track};
@@ -140,25 +140,27 @@ impl Tracker {
             };
             // What the background has learned holds who is known and stands, and makes nobody known.
             let (place, stands) = (person.filter.place(), person.is_known() && person.speed() < 0.5);
-            for (side, which) in Side::BOTH.into_iter().enumerate() {
-                let (expected, variance) = person.filter.leg(which);
-                for (leg, found) in legs.iter().enumerate() {
-                    let off = minus(found.at, expected);
-                    let off2 = off[0] * off[0] + off[1] * off[1];
-                    if off2 > 1.0 || !(found.is_fresh || stands) {
+            let reach = FARTHEST_LEG_M + 2.0 * person.filter.variance().sqrt().min(0.5);
+            let expected = Side::BOTH.map(|side| person.filter.leg(side));
+            for (leg, found) in legs.iter().enumerate() {
+                if length2(minus(found.at, place)) >= reach * reach || !(found.is_fresh || stands) {
+                    continue;
+                }
+                for (side, (expected, variance)) in expected.into_iter().enumerate() {
+                    let off2 = length2(minus(found.at, expected));
+                    let variance = variance + found.sigma_m * found.sigma_m;
+                    if off2 > 1.0 || off2 >= gate * variance {
                         continue;
                     }
-                    let variance = variance + found.sigma_m * found.sigma_m;
                     let gain = gate - off2 / variance - 2.0 * (variance / 0.0025).ln().max(0.0);
-                    let reach = FARTHEST_LEG_M + 2.0 * person.filter.variance().sqrt().min(0.5);
-                    if gain > 0.0 && distance(found.at, place) < reach {
+                    if gain > 0.0 {
                         self.edges.push(Edge { leg, place: 2 * number + side, gain });
                     }
                 }
             }
         }
         pairs.clear();
-        self.assignment.solve((legs.len(), 2 * self.persons.len()), &mut self.edges, pairs);
+        self.assignment.solve((legs.len(), 2 * self.persons.len()), &self.edges, pairs);
         // By person, the surer leg first.
         pairs.sort_unstable_by_key(|&(leg, place)| (place / 2, (legs[leg].sigma_m * 1e6) as u64, leg));
         let mut i = 1;
@@ -272,16 +274,16 @@ impl Tracker {
         while i < self.persons.len() {
             let one = &self.persons[i];
             let is_same = |other: &Person| {
-                let near = distance(one.filter.place(), other.filter.place()) < SAME_M;
+                if length2(minus(one.filter.place(), other.filter.place())) >= SAME_M * SAME_M {
+                    return false;
+                }
                 let alone = one.both + other.both < 0.35;
                 let known =
                     !matches!(one.life, Life::Away { .. }) && !matches!(other.life, Life::Away { .. });
                 let grown = at_ns - other.born_ns > 600_000_000 && at_ns - one.born_ns > 600_000_000;
                 let unseen = (at_ns - one.seen_ns).max(at_ns - other.seen_ns) > 300_000_000;
                 let very_near = distance(one.filter.place(), other.filter.place()) < 0.2;
-                known
-                    && grown
-                    && (near && alone || very_near && unseen && (one.both < 0.3 || other.both < 0.3))
+                known && grown && (alone || very_near && unseen && (one.both < 0.3 || other.both < 0.3))
             };
             match (i + 1..self.persons.len()).find(|&j| is_same(&self.persons[j])) {
                 Some(other) => {

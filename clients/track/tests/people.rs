@@ -1,5 +1,5 @@
 //! The tracker from outside, in the house of the proof: the same tracks however scans come, latecomers and clocks that jump,
-//! identities that are never used again, a sensor that dies, legs of real people.
+//! identities that are never used again, a sensor that dies and comes back.
 
 #[allow(dead_code)]
 #[path = "../examples/proof/house.rs"]

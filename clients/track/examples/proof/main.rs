@@ -1,17 +1,20 @@
 //! What the tracker is worth: simulated people in a simulated house, scored by the package `motmetrics`.
 //!
 //! ```sh
-//! cargo run --release -p scanhub-track --example proof -- --seeds 301..311
+//! cargo run --release -p scanhub-track --example proof -- --seeds 501..511
 //! ```
 //!
 //! `PROOF_PYTHON` names a Python that has `motmetrics` and numpy below 2.
 
 mod baseline;
+mod diagnosis;
+mod hours;
 mod house;
 mod oracle;
 mod run;
 mod walkers;
 
+use std::collections::BTreeMap;
 use std::io::Write;
 use std::process::{Command, Stdio};
 
@@ -23,6 +26,9 @@ fn main() {
     let arguments: Vec<String> = std::env::args().skip(1).collect();
     let value = |flag: &str| arguments.iter().position(|a| a == flag).and_then(|i| arguments.get(i + 1));
     let number = |text: &str| text.parse::<u64>().unwrap_or_else(|_| usage());
+    if let Some(hours) = value("--hours") {
+        return hours::run(number(hours), value("--people").map_or(8, |text| number(text) as usize));
+    }
     let (from, to) = value("--seeds").map_or((1, 11), |range| {
         range.split_once("..").map_or_else(|| usage(), |(a, b)| (number(a), number(b)))
     });
@@ -74,7 +80,9 @@ fn main() {
 }
 
 fn usage() -> ! {
-    eprintln!("proof [--seeds FROM..TO] [--seconds N] [--quick]");
+    eprintln!(
+        "proof [--seeds FROM..TO] [--seconds N] [--people N] [--quick] [--why] | proof --hours N [--people N]"
+    );
     std::process::exit(2);
 }
 
@@ -112,7 +120,37 @@ fn tell(name: &str, outcomes: &[Outcome]) {
         time_s / sum(&|o| o.tracker_s),
     );
     let offset = outcomes.iter().map(|o| o.offset_error_s.abs()).fold(0.0, f64::max);
-    println!("<!-- late {}, worst clock offset left {:.1} ms -->", sum(&|o| o.late as f64), 1000.0 * offset);
+    let bounds: Vec<f64> = outcomes.iter().filter_map(|o| Some(score(&o.oracle_csv)?[0])).collect();
+    println!(
+        "<!-- late {}, worst clock offset left {:.1} ms, IDF1 of perfect places with the oracle's identities {:.3} -->",
+        sum(&|o| o.late as f64),
+        1000.0 * offset,
+        bounds.iter().sum::<f64>() / bounds.len() as f64
+    );
+    if std::env::args().any(|argument| argument == "--why") {
+        why(outcomes);
+    }
+}
+
+/// Says why identities were lost, and which places are how far off.
+fn why(outcomes: &[Outcome]) {
+    let (mut causes, mut errors) = (BTreeMap::new(), BTreeMap::new());
+    for diagnosis in outcomes.iter().filter_map(|outcome| outcome.diagnosis.as_ref()) {
+        for (cause, count) in &diagnosis.causes {
+            *causes.entry(*cause).or_insert(0) += count;
+        }
+        for (class, (squares, count)) in &diagnosis.errors {
+            let sum = errors.entry(*class).or_insert((0.0, 0));
+            *sum = (sum.0 + squares, sum.1 + count);
+        }
+    }
+    causes.iter().for_each(|(cause, count)| println!("{count:6} {cause}"));
+    for (class, (squares, count)) in &errors {
+        println!(
+            "{count:6} {class}: RMS {:.0} mm, squares {squares:.1} m2",
+            1000.0 * (squares / *count as f64).sqrt()
+        );
+    }
 }
 
 fn score(csv: &str) -> Option<Vec<f64>> {

@@ -17,6 +17,48 @@ pub(crate) fn guess(crowd: &Crowd, crossing: &Crossing) -> bool {
     best.is_some_and(|best| best.walker == crossing.walker)
 }
 
+/// Which identity each walker has at which second, by somebody who sees everything in the rooms and takes whoever comes out of
+/// the corridor for the one whom the oracle names: no tracker that does not see into the corridor, and knows no single
+/// one's pace, is expected to do better.
+pub(crate) struct Identities {
+    /// Entries and exits by their time: when, who, whether out.
+    events: Vec<(f64, usize, bool)>,
+    next: usize,
+    /// Of each walker.
+    pub(crate) now: Vec<usize>,
+    /// Who is inside, as far as is known: since when, and as whom.
+    inside: Vec<(f64, usize)>,
+}
+
+impl Identities {
+    pub(crate) fn new(crowd: &Crowd) -> Identities {
+        let through = crowd.crossings.iter();
+        let through =
+            through.flat_map(|one| [(one.entered_s, one.walker, false), (one.left_s, one.walker, true)]);
+        let still = crowd.walkers.iter().enumerate();
+        let still = still.filter_map(|(who, walker)| Some((walker.entered_s?, who, false)));
+        let mut events: Vec<_> = through.chain(still).collect();
+        events.sort_by(|a, b| a.0.total_cmp(&b.0));
+        Identities { events, next: 0, now: (0..crowd.walkers.len()).collect(), inside: Vec::new() }
+    }
+
+    /// Moves to `now_s`.
+    pub(crate) fn advance(&mut self, now_s: f64) {
+        while let Some(&(at_s, who, is_out)) = self.events.get(self.next).filter(|event| event.0 <= now_s) {
+            self.next += 1;
+            if !is_out {
+                self.inside.push((at_s, self.now[who]));
+                continue;
+            }
+            let likely = |one: &usize| hazard(at_s - self.inside[*one].0);
+            let best = (0..self.inside.len()).max_by(|a, b| likely(a).total_cmp(&likely(b)));
+            if let Some(best) = best {
+                self.now[who] = self.inside.swap_remove(best).1;
+            }
+        }
+    }
+}
+
 /// Density of the time inside over what is left of it, by the walkers' own distribution.
 fn hazard(after_s: f64) -> f64 {
     let way = CORRIDOR[1] - CORRIDOR[0];

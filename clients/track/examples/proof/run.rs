@@ -11,6 +11,7 @@ use track::geometry::{Point, distance, distance_to_border};
 use track::{Kind, People, Picture, Site};
 
 use crate::baseline::Nearest;
+use crate::diagnosis::Diagnosis;
 use crate::house::{self, BEAMS, Eye};
 use crate::walkers::{Crossing, Crowd};
 
@@ -41,6 +42,8 @@ pub(crate) enum Way {
 pub(crate) struct Outcome {
     /// Lines for the score.
     pub(crate) csv: String,
+    /// The same for perfect places with the identities of the oracle.
+    pub(crate) oracle_csv: String,
     /// Squared distances of confirmed tracks from the person, and how many.
     pub(crate) squares: (f64, usize),
     /// Ways through the corridor: seen, kept by the tracker, guessed right by the oracle.
@@ -55,6 +58,8 @@ pub(crate) struct Outcome {
     pub(crate) tracks: usize,
     pub(crate) offset_error_s: f64,
     pub(crate) late: u64,
+    /// Why identities were lost.
+    pub(crate) diagnosis: Option<Diagnosis>,
 }
 
 struct Sent {
@@ -143,6 +148,8 @@ fn judge(site: &Site, truths: &[Vec<Point>], pictures: &[Picture], crowd: &Crowd
         room.is_some_and(|room| distance_to_border(&site.rooms[room].polygon, place) > 0.1)
     };
     let is_told = std::env::args().any(|argument| argument == "--events");
+    let mut diagnosis = Diagnosis::new(crowd.walkers.len());
+    let mut oracle = crate::oracle::Identities::new(crowd);
     let mut next = 0;
     // Who was where by which track: for each person his track over time.
     let mut known: Vec<Vec<(f64, u64)>> = vec![Vec::new(); crowd.walkers.len()];
@@ -157,8 +164,13 @@ fn judge(site: &Site, truths: &[Vec<Point>], pictures: &[Picture], crowd: &Crowd
         }
         let picture = &pictures[next - 1];
         let ahead = now_s - at_s(picture);
+        diagnosis.take(now_s, truth, &is_scored, picture, &crowd.crossings);
+        oracle.advance(now_s);
         for (who, place) in truth.iter().enumerate().filter(|(_, place)| is_scored(**place)) {
             outcome.csv += &format!("{frame},0,{who},{:.3},{:.3}\n", place[0], place[1]);
+            for (kind, id) in [(0, who), (1, oracle.now[who])] {
+                outcome.oracle_csv += &format!("{frame},{kind},{id},{:.3},{:.3}\n", place[0], place[1]);
+            }
         }
         for track in &picture.tracks {
             let at = [track.place[0] + ahead * track.velocity[0], track.place[1] + ahead * track.velocity[1]];
@@ -178,16 +190,6 @@ fn judge(site: &Site, truths: &[Vec<Point>], pictures: &[Picture], crowd: &Crowd
                     outcome.squares.0 += off * off;
                     outcome.squares.1 += 1;
                 }
-                if let (true, Some((then, id))) = (is_told, known[who].last())
-                    && *id != track.id
-                {
-                    let old = picture.tracks.iter().find(|old| old.id == *id);
-                    let near: Vec<_> = truth.iter().filter(|other| distance(**other, at) < 1.5).collect();
-                    println!(
-                        "{now_s:.1}: {who} was {id} at {then:.1}, is {} {:.2?}; old {old:.2?}; near {near:.2?}",
-                        track.id, at
-                    );
-                }
                 known[who].push((now_s, track.id));
             }
         }
@@ -200,6 +202,7 @@ fn judge(site: &Site, truths: &[Vec<Point>], pictures: &[Picture], crowd: &Crowd
         }
     }
     outcome.tracks = ids.len();
+    outcome.diagnosis = Some(diagnosis);
     let mut told: Vec<(f64, usize, bool)> = Vec::new();
     for event in pictures.iter().flat_map(|picture| &picture.events) {
         if let Kind::Door { door, from, .. } = event.kind {

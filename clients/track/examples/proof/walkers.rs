@@ -41,8 +41,8 @@ pub(crate) struct Walker {
     room: usize,
     /// For how long he has wanted to go and could not.
     stuck_s: f64,
-    /// When somebody went into the corridor.
-    entered_s: Option<f64>,
+    /// When he went into the corridor, if he is there.
+    pub(crate) entered_s: Option<f64>,
 }
 
 /// Somebody came out of the corridor on the other side.

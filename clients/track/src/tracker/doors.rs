@@ -2,6 +2,7 @@
 
 use super::Tracker;
 use crate::geometry::{Point, distance, distance_to_segment};
+use crate::passage::{Gone, New};
 use crate::person::{Life, Person};
 use crate::picture::Kind;
 
@@ -70,11 +71,13 @@ impl Tracker {
             let behind = |door: usize| distance_to_segment(place, self.site.doors[door].between);
             match door.filter(|&door| behind(door) < 1.5) {
                 Some(door) if behind(door) > BEHIND_DOOR_M => {
-                    self.persons[number].room = to;
+                    (self.persons[number].room, self.persons[number].came_by) = (to, Some(door));
                     self.tell(at_ns, number, Kind::Door { door, from, to });
                 }
                 // He was not seen at the door, or is in a wall.
-                None if to.is_some() && at_ns - person.seen_ns < AWAY_NS => self.persons[number].room = to,
+                None if to.is_some() && at_ns - person.seen_ns < AWAY_NS => {
+                    (self.persons[number].room, self.persons[number].came_by) = (to, None);
+                }
                 _ => {}
             }
         }
@@ -85,7 +88,9 @@ impl Tracker {
             let off = |&door: &usize| distance_to_segment(place, self.site.doors[door].between);
             let leads =
                 |&door: &usize| [self.site.doors[door].from, self.site.doors[door].to].contains(&room);
-            let door = (0..self.site.doors.len()).filter(leads).min_by(|a, b| off(a).total_cmp(&off(b)));
+            let nearest =
+                || (0..self.site.doors.len()).filter(leads).min_by(|a, b| off(a).total_cmp(&off(b)));
+            let door = person.came_by.filter(leads).or_else(nearest);
             if let Some(door) = door {
                 self.persons[number].life = Life::Away { since_ns, door };
             }
@@ -101,7 +106,7 @@ impl Tracker {
         let before_door_m = if is_inside { INSIDE_DOOR_M } else { BEFORE_DOOR_M };
         // Everyone away, at the door that he would have come out of.
         let arrival = |(old, person): (usize, &Person)| {
-            let Life::Away { since_ns, door: entry } = person.life else { return None };
+            let Life::Away { door: entry, .. } = person.life else { return None };
             let exits = (0..self.site.doors.len()).filter(|&door| {
                 let ends = [self.site.doors[door].from, self.site.doors[door].to];
                 let gap =
@@ -109,14 +114,20 @@ impl Tracker {
                 (ends.contains(&person.room) || gap) && off(door) < before_door_m
             });
             let exit = exits.min_by(|&a, &b| off(a).total_cmp(&off(b)))?;
-            let after_s = (born_ns as f64 - since_ns as f64) * 1e-9;
+            let after_s = (born_ns as f64 - person.at_ns as f64) * 1e-9;
             // He was born while the other was seen: another one.
-            if after_s < 0.0 && exit != entry || after_s < -0.5 {
+            let way_m = distance(born_at, person.filter.place());
+            if after_s < -0.75 || after_s < -0.25 && way_m > 0.7 {
                 return None;
             }
-            let way_m = distance(born_at, person.filter.place());
-            let likely = self.site.arrival([entry, exit], way_m, person.pace, after_s);
-            Some((likely, old, exit))
+            let gone = Gone {
+                entry: person.came_by,
+                at: person.filter.place(),
+                speed: person.speed(),
+                pace: person.pace,
+            };
+            let seen = New { exit, at: born_at, velocity: new.filter.velocity(), is_out: is_inside };
+            Some((self.site.likelihood(&gone, &seen, after_s), old, exit))
         };
         let best = self.persons.iter().enumerate().filter_map(arrival).max_by(|a, b| a.0.total_cmp(&b.0));
         let best = best.filter(|best| best.0 > 1e-4).map(|(_, old, exit)| (old, Some(exit)));
@@ -130,6 +141,7 @@ impl Tracker {
                     (known.id, known.born_ns, known.pace, Life::Known);
                 new.room = self.site.room_at(new.filter.place()).or(new.room);
                 let to = new.room;
+                new.came_by = if from == to { known.came_by } else { exit };
                 self.persons[old] = new;
                 if let Some(door) = exit.filter(|_| from != to) {
                     self.tell(at_ns, old, Kind::Door { door, from, to });
