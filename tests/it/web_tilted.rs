@@ -225,7 +225,7 @@ fn the_page_of_the_demonstration_has_sweeps() {
 fn the_picture_of_the_documents_from_the_side() {
     let env = TestEnv::in_time();
     let directory = std::env::var_os("SCANHUB_PICTURES");
-    let look = Look { width: 960, height: 480, ..Look::LAPTOP };
+    let look = Look { width: 1120, height: 440, ..Look::LAPTOP };
     let Some(mut page) = browse(&env, look) else { return };
     let _simulator =
         env.simulator(&["front"], &["--world=tilt", "--angles=mount", "--baud=500000", "--seed=3"]);
