@@ -149,6 +149,7 @@ fn a_hall_is_seen_from_the_side_while_somebody_looks() {
     let tilt = hall.tilt(&["--as=hall", NEAR]);
     page.await_true(&format!("!{SIDE}.hidden && /^hall: /.test({SWEPT})"));
     page.await_true("scanhub.obstacles > 0 && scanhub.beams > 100");
+    assert_eq!(page.ask(&format!("{SIDE}.offsetHeight >= 40")), true);
     assert_eq!(hall.env.subscribers("hall/cloud"), 0, "points are not seen from above");
     page.press("h");
     page.await_true(&format!("scanhub.aside && {SIDE}.ariaPressed === 'true'"));
@@ -225,7 +226,7 @@ fn the_page_of_the_demonstration_has_sweeps() {
 fn the_picture_of_the_documents_from_the_side() {
     let env = TestEnv::in_time();
     let directory = std::env::var_os("SCANHUB_PICTURES");
-    let look = Look { width: 1120, height: 440, ..Look::LAPTOP };
+    let look = Look { width: 1200, height: 440, ..Look::LAPTOP };
     let Some(mut page) = browse(&env, look) else { return };
     let _simulator =
         env.simulator(&["front"], &["--world=tilt", "--angles=mount", "--baud=500000", "--seed=3"]);
@@ -240,9 +241,11 @@ fn the_picture_of_the_documents_from_the_side() {
     page.press("h");
     page.await_true("scanhub.aside && scanhub.swept > 1000");
     if let Some(directory) = &directory {
-        // A pole, a box, and somebody who walks.
-        let seen = "scanhub.swept > 10_000 && scanhub.obstacles >= 3 && scanhub.sweeps[0].complete === 'true' \
-                    && document.querySelector('#sensors article.streaming:not(.lossy)') !== null";
+        // A pole and a box, and whoever walks.
+        let seen = "scanhub.swept > 10_000 && scanhub.sweeps[0].complete === 'true' \
+                    && scanhub.sweeps[0].obstacles.filter((one) => one.near === 'true').length >= 2 \
+                    && document.querySelector('#sensors article.streaming:not(.lossy)') !== null \
+                    && document.querySelector('#news').innerText === ''";
         page.await_true(seen);
         page.photograph(&Path::new(directory).join("web-side.png"));
     }
