@@ -42,8 +42,8 @@ fn is_cloud(body: &[u8], lines: &[Value]) -> bool {
     let is_point = |(n, point): (usize, &[u8; 16])| {
         let axes = point.as_chunks::<4>().0.iter().take(3).map(|axis| f64::from(f32::from_le_bytes(*axis)));
         axes.zip(numbers(points[n])).all(|(axis, said)| (axis - said).abs() < 6e-4)
-            && *beams[n] == Value::from(u16::from_le_bytes([point[12], point[13]]))
-            && *classes[n] == Value::from(point[14])
+            && beams[n].as_u64() == Some(u16::from_le_bytes([point[12], point[13]]).into())
+            && classes[n].as_u64() == Some(point[14].into())
     };
     let all = bytes.as_chunks::<16>().0;
     told.text("header.frame_id") == Some("base_link")
@@ -51,10 +51,11 @@ fn is_cloud(body: &[u8], lines: &[Value]) -> bool {
         && all.iter().enumerate().all(is_point)
 }
 
-fn metadata(entity: &Value, key: &str) -> String {
+/// The number or the truth that an entity says of `key`.
+fn metadata(entity: &Value, key: &str) -> Value {
     let mut all = entity["metadata"].as_array().expect("a list").iter();
     let value = all.find(|one| one["key"] == key).and_then(|one| one["value"].as_str());
-    value.unwrap_or_else(|| panic!("no {key} in {entity}")).to_owned()
+    serde_json::from_str(value.unwrap_or_else(|| panic!("no {key} in {entity}"))).expect("JSON")
 }
 
 /// Whether boxes are the obstacles of this line.
@@ -70,13 +71,13 @@ fn are_obstacles(update: &Value, line: &Value) -> bool {
             (middle - size / 2.0 - ends.0).abs() < 6e-4 && (middle + size / 2.0 - ends.1).abs() < 6e-4
         };
         ["x", "y", "z"].into_iter().enumerate().all(is_axis)
-            && metadata(entity, "points") == one["points"].to_string()
-            && metadata(entity, "foreground") == one["foreground"].to_string()
-            && metadata(entity, "near") == one["near"].to_string()
+            && metadata(entity, "points") == one["points"]
+            && metadata(entity, "foreground") == one["foreground"]
+            && metadata(entity, "near") == one["near"]
     };
-    metadata(&entities[0], "sweep") == line["sweep"].to_string()
-        && metadata(&entities[0], "complete") == line["complete"].to_string()
-        && metadata(&entities[0], "doubted") == line["doubted"].to_string()
+    metadata(&entities[0], "sweep") == line["sweep"]
+        && metadata(&entities[0], "complete") == line["complete"]
+        && metadata(&entities[0], "doubted") == line["doubted"]
         && entities.len() == said.len() + 1
         && entities[1..].iter().zip(said).all(is_box)
 }
