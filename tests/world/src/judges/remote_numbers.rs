@@ -96,7 +96,7 @@ impl OfTopic {
         let steps =
             last.filter(|(_, last)| last.epoch == head.epoch).map(|(_, last)| head.sequence - last.sequence);
         if let (Some(steps), Some((last_came, _))) = (steps.filter(|steps| *steps > 0), last) {
-            // Two ways of a bridge may be unequally late.
+            // One that came earlier by its time tells no period.
             let distance_ns = came.checked_sub(last_came).map(|apart| apart / u64::from(steps));
             self.distances_ns.extend(distance_ns.filter(|distance_ns| *distance_ns <= LONGEST));
             if self.distances_ns.len() > KEPT {
