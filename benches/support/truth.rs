@@ -52,8 +52,8 @@ impl Truth {
         Ok(truth)
     }
 
-    /// When each was due, by its hash, of a sensor that sends one each `every_ns`: some of its neighbours left in time. And for how long it
-    /// sent nothing in all although it should have.
+    /// When each was due, by its hash, of a sensor that sends one each `every_ns`: some of its neighbours left in time. And for
+    /// how long it sent nothing in all although it should have.
     pub(crate) fn due(&self, every_ns: u64) -> (HashMap<&str, Vec<u64>>, u64) {
         let begin = |sent: &Sent| sent.at_ns.saturating_sub(sent.index * every_ns);
         let begins: Vec<u64> = self.sent.iter().map(begin).collect();
