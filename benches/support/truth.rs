@@ -52,9 +52,9 @@ impl Truth {
         Ok(truth)
     }
 
-    /// When each was due of a sensor that sends one each `every_ns`: some of its neighbours left in time. And for how long it
-    /// sent nothing in all although it should have.
-    pub(crate) fn due(&self, every_ns: u64) -> (HashMap<&str, u64>, u64) {
+    /// When each was due, by its hash, of a sensor that sends one each `every_ns`: some of its neighbours left in time. And for
+    /// how long it sent nothing in all although it should have.
+    pub(crate) fn due(&self, every_ns: u64) -> (HashMap<&str, Vec<u64>>, u64) {
         let begin = |sent: &Sent| sent.at_ns.saturating_sub(sent.index * every_ns);
         let begins: Vec<u64> = self.sent.iter().map(begin).collect();
         let least = |n: usize| {
@@ -62,8 +62,10 @@ impl Truth {
             begins[around].iter().copied().min().unwrap_or_default()
         };
         let least: Vec<u64> = (0..begins.len()).map(least).collect();
-        let due = self.sent.iter().zip(&least);
-        let due = due.map(|(sent, begin)| (sent.hash.as_str(), begin + sent.index * every_ns)).collect();
+        let mut due: HashMap<&str, Vec<u64>> = HashMap::new();
+        for (sent, begin) in self.sent.iter().zip(&least) {
+            due.entry(&sent.hash).or_default().push(begin + sent.index * every_ns);
+        }
         let stood = least.windows(2).map(|pair| pair[1].saturating_sub(pair[0])).sum();
         (due, stood)
     }

@@ -34,13 +34,14 @@ pub(crate) fn packets(domain: &str, sensor: &str, len: usize) -> Outcome<()> {
     }
 }
 
-/// By how much the stamps that a consumer of packets printed are off at most, in ms, where each was `due` at that time.
-pub(crate) fn off_ms(lines: &[Line], due: &HashMap<&str, u64>) -> Outcome<f64> {
+/// By how much the stamps that a consumer of packets printed are off at most, in ms, where each was `due` at one of those times.
+pub(crate) fn off_ms(lines: &[Line], due: &HashMap<&str, Vec<u64>>) -> Outcome<f64> {
     let mut worst: Option<u64> = None;
     for line in lines {
-        if let Some(due) = line.words().last().and_then(|hash| due.get(hash)) {
-            worst = worst.max(Some(line.number(1)?.abs_diff(*due)));
-        }
+        let stamp = line.number(1)?;
+        let due = line.words().last().and_then(|hash| due.get(hash));
+        let off = due.and_then(|due| due.iter().map(|due| due.abs_diff(stamp)).min());
+        worst = worst.max(off);
     }
     Ok(worst.ok_or("no packet is known to the simulator")? as f64 / 1e6)
 }

@@ -30,7 +30,7 @@ impl Turning for Session {
     }
 
     fn begun(&self) -> Option<Turn<'_>> {
-        self.turns.begun().map(|begun| self.dated(begun))
+        self.begun_turn()
     }
 
     fn other_model(&self) -> Option<line::family::Model> {

@@ -13,7 +13,6 @@ mod model;
 pub mod packet;
 mod sequence;
 mod session;
-mod turn;
 
 pub use heard::{Trouble, Why};
 pub use line::{Heard, Packets, Tally, Turn, TurnCounts};

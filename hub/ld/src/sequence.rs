@@ -28,6 +28,8 @@ struct Seen {
     span: u16,
     speed: u16,
     millis: u16,
+    /// Degrees of the first point, clockwise over all turns.
+    angle: f64,
     /// The scanner's clock since the sequence began, in whole milliseconds and as fine as it is known.
     whole: Nanos,
     time: Nanos,
@@ -40,15 +42,19 @@ pub(crate) enum Place {
     First {
         /// When its last point was measured, by the scanner's clock.
         time: Nanos,
+        /// Degrees of its first point, clockwise over all turns.
+        angle: f64,
     },
     /// It goes on.
     Next {
         /// As in [`Place::First`].
         time: Nanos,
+        /// As in [`Place::First`].
+        angle: f64,
         /// Packets between the last one and this one.
         missing: u32,
-        /// From the last one's last point to this one's first, in hundredths of a degree; more than a turn after a long gap.
-        gap: f32,
+        /// Where the last one's last point was.
+        from: f64,
     },
     /// The last one came again.
     Again,
@@ -60,7 +66,7 @@ impl Place {
     /// When its last point was measured, by the scanner's clock; nothing if that is not known.
     pub(crate) fn time(self) -> Option<Nanos> {
         match self {
-            Place::First { time } | Place::Next { time, .. } => Some(time),
+            Place::First { time, .. } | Place::Next { time, .. } => Some(time),
             Place::Again | Place::Odd => None,
         }
     }
@@ -123,7 +129,7 @@ impl Sequence {
     fn first(&mut self, packet: &Packet<'_>) -> Place {
         let seen = Seen::first(packet);
         (self.last, self.odd, self.odds) = (Some(seen), None, 0);
-        Place::First { time: seen.time }
+        Place::First { time: seen.time, angle: seen.angle }
     }
 
     fn next(&mut self, last: &Seen, packet: &Packet<'_>, step: &Step) -> Place {
@@ -137,8 +143,11 @@ impl Sequence {
         let time = (last.time + passed as Nanos).clamp(whole, whole + MILLIS - 1);
         self.lost += u64::from(missing.saturating_sub(self.odds));
         (self.odd, self.odds) = (None, 0);
-        self.last = Some(Seen { whole, time, ..Seen::first(packet) });
-        Place::Next { time, missing, gap: step.advance - f32::from(last.span) }
+        let (start, about) =
+            (f64::from(packet.start()) / 100.0, last.angle + f64::from(step.advance) / 100.0);
+        let angle = start + 360.0 * ((about - start) / 360.0 + 0.5) as u64 as f64;
+        self.last = Some(Seen { angle, whole, time, ..Seen::first(packet) });
+        Place::Next { time, angle, missing, from: last.angle + f64::from(last.span) / 100.0 }
     }
 
     /// How `packet` follows `last`; nothing if it cannot.
@@ -188,6 +197,7 @@ impl Seen {
             span: packet.span(),
             speed: packet.speed(),
             millis: packet.millis(),
+            angle: f64::from(packet.start()) / 100.0,
             whole,
             time: whole + MILLIS / 2,
         }
@@ -231,9 +241,10 @@ mod tests {
         for n in 0..2_000 {
             let place = place(&mut sequence, &packet(n));
             let time = place.time().expect("timed");
-            if let (Place::Next { missing, gap, .. }, Some(before)) = (place, before) {
+            if let (Place::Next { missing, angle, from, .. }, Some(before)) = (place, before) {
                 assert_eq!(missing, 0);
-                assert!((gap - 80.0).abs() < 1.0, "{gap}");
+                assert!((angle - from - 0.8).abs() < 0.01, "{angle} {from}");
+                assert!((angle - f64::from(n) * 9.6).abs() < 0.02, "{n}: {angle}");
                 let passed = time - before;
                 assert!(n < 100 || passed.abs_diff(2_666_667) < 20_000, "{n}: {passed}");
             }
@@ -250,11 +261,11 @@ mod tests {
             (0..100).for_each(|n| {
                 place(&mut sequence, &packet(n));
             });
-            let Place::Next { missing, gap: angle, .. } = place(&mut sequence, &packet(100 + gap)) else {
+            let Place::Next { missing, angle, from, .. } = place(&mut sequence, &packet(100 + gap)) else {
                 panic!("{gap}");
             };
             assert_eq!(missing, gap);
-            assert!((angle - (gap * 960 + 80) as f32).abs() < 20.0, "{gap}: {angle}");
+            assert!((angle - from - f64::from(gap * 960 + 80) / 100.0).abs() < 0.2, "{gap}: {angle} {from}");
             assert_eq!(sequence.came_and_lost(), (101, u64::from(gap)));
         }
     }

@@ -4,14 +4,16 @@
 
 mod driven;
 
-use line::{MILLIS, Nanos, Packets, Reads, Received, SensorClock, State, Tally, Turn, TurnCounts, line_time};
+use line::{
+    Closed, MILLIS, Nanos, Pace, Packets, Reads, Received, SensorClock, State, Tally, Turn, TurnCounts,
+    Turns, line_time,
+};
 
 use crate::framer::{Framer, Span};
 use crate::heard::Trouble;
 use crate::model::Model;
-use crate::packet::{LEN, Packet};
+use crate::packet::{LEN, POINTS, Packet};
 use crate::sequence::{Place, Sequence};
-use crate::turn::{Closed, Progress, Turns};
 
 /// What a session shall do.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -43,7 +45,9 @@ pub struct Session {
     /// The clock of the packets before the one with this number, of those handed out last, if another sequence began there.
     clock_before: Option<(usize, SensorClock)>,
     sequence: Sequence,
-    pub(crate) turns: Turns,
+    turns: Turns<MOST_POINTS>,
+    /// Of the packet whose points were put last.
+    pace: Option<Pace>,
     phase: Phase,
     baud: u32,
     change_baud: bool,
@@ -79,9 +83,9 @@ enum Phase {
 struct Current {
     span: Span,
     places: [Place; MOST],
-    /// The first one that is not done, and how far it is.
+    /// The first one that is not done, and whether its points are.
     packet: usize,
-    progress: Progress,
+    is_put: bool,
 }
 
 impl Session {
@@ -95,6 +99,7 @@ impl Session {
             clock_before: None,
             sequence: Sequence::new(),
             turns: Turns::new(),
+            pace: None,
             phase: Phase::Listening { shown: State::Probing, next_at: now + LISTEN },
             baud: settings.baud(),
             change_baud: false,
@@ -228,7 +233,7 @@ impl Session {
         let at = first.unwrap_or(last.saturating_sub(packet_time * span.packets as u64));
         // One that came twice is dated by its arrival, and the next one by the scanner's clock.
         let last = self.reads.date_packet(last.max(at));
-        self.current = Some(Current { span, places, packet: 0, progress: Progress::default() });
+        self.current = Some(Current { span, places, packet: 0, is_put: false });
         self.cut |= self.framer.tally().packets == span.packets as u64 && self.framer.tally().discarded > 0;
         self.hear();
         Received {
@@ -286,13 +291,20 @@ impl Session {
             };
             let place = current.places[current.packet];
             let reasons = if current.packet == 0 { current.span.reasons } else { 0 };
-            let point_ns = self.sequence.point_ns();
-            let closed = self.turns.add(&packet, place, reasons, point_ns, &mut current.progress);
-            if closed.is_some() {
-                return closed;
+            let step = f64::from(packet.span()) / 100.0 / (POINTS - 1) as f64;
+            let pace = Pace { step, point_ns: f64::from(self.sequence.point_ns()) };
+            self.pace = Some(pace);
+            if !core::mem::replace(&mut current.is_put, true) {
+                put(&mut self.turns, &packet, place, reasons, pace);
             }
-            current.packet += 1;
-            current.progress = Progress::default();
+            if let Place::First { angle, .. } | Place::Next { angle, .. } = place
+                && let Some(closed) = self.turns.reach(angle + f64::from(packet.span()) / 100.0, pace)
+            {
+                return Some(closed);
+            }
+            if let Some(current) = &mut self.current {
+                (current.packet, current.is_put) = (current.packet + 1, false);
+            }
         }
         None
     }
@@ -307,8 +319,13 @@ impl Session {
         self.dated(closed)
     }
 
+    /// The turn that is being measured, as if it ended with the points that are known.
+    pub(crate) fn begun_turn(&self) -> Option<Turn<'_>> {
+        self.turns.begun(self.pace?).map(|begun| self.dated(begun))
+    }
+
     /// A turn that is over, or that is being measured, by the hub's clock.
-    pub(crate) fn dated(&self, closed: Closed) -> Turn<'_> {
+    fn dated(&self, closed: Closed) -> Turn<'_> {
         let packet = self.current.map_or(usize::MAX, |current| current.packet);
         let stamp = |at: Nanos| self.clock_of(packet).time(at).unwrap_or(self.now);
         let (first, last) = self.reads.turn_dates(stamp(closed.first), stamp(closed.last));
@@ -326,6 +343,32 @@ impl Session {
     }
 }
 
+/// Puts the points of `packet`, which is at `place`, into turns.
+fn put(turns: &mut Turns<MOST_POINTS>, packet: &Packet<'_>, place: Place, reasons: u8, pace: Pace) {
+    let (last, angle) = match place {
+        Place::Again => return,
+        Place::Odd => return turns.doubt(),
+        Place::First { time, angle } => {
+            turns.give_up();
+            (time, angle)
+        }
+        Place::Next { time, angle, missing, from } => {
+            if missing > 0 {
+                // Up to the points beside it nothing is.
+                turns.lacks(from + pace.step, angle - pace.step);
+            }
+            (time, angle)
+        }
+    };
+    for i in 0..POINTS {
+        let point = packet.point(i);
+        let time = last as f64 - pace.point_ns * (POINTS - 1 - i) as f64;
+        turns.put(angle + pace.step * i as f64, time, point.range, point.intensity, reasons, pace);
+    }
+}
+
+/// Points of an STL27L that turns five times a second, and some; what is more does not fit into a turn.
+const MOST_POINTS: usize = 4_400;
 /// How long is listened at one rate before the next: a stream has a packet each 3 ms.
 const LISTEN: Nanos = 300 * MILLIS;
 /// Without a packet for so long the session begins again.

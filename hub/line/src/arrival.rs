@@ -53,10 +53,10 @@ impl Arrivals {
         let read = |n: usize| self.reads[n % Arrivals::CAPACITY];
         let n = (oldest + 1..self.next).rev().find(|&n| read(n - 1).0 <= offset)?;
         let ((begin, before), (end, now)) = (read(n - 1), read(n));
-        let is_rest = n > oldest + 1 && begin - read(n - 2).0 >= TTY;
-        let at_once = if is_rest { 0 } else { packet_len as u64 };
-        let sent = (end - begin).saturating_sub(at_once) as f64 * byte_ns;
-        if offset >= end || sent > 1.25 * now.saturating_sub(before) as f64 {
+        let is_rest = n > oldest + 1 && begin - read(n - 2).0 >= TTY as u64;
+        let sent = (end - begin).saturating_sub(packet_len as u64) as f64 * byte_ns;
+        // Behind what a tty hands out at once it may hand out some more a moment later, which says nothing.
+        if offset >= end || is_rest || sent > 1.25 * now.saturating_sub(before) as f64 {
             return None;
         }
         // So few find room anywhere: if they were dropped that came then, these would have been too.
@@ -64,12 +64,32 @@ impl Arrivals {
         let came = if end - begin <= ROOM { now.saturating_sub(behind as Nanos) } else { 0 };
         Some(came.max(before))
     }
+
+    /// As [`earliest`](Self::earliest), of a byte before which others are missing. Of what had waited in a tty that was full it is
+    /// known where nearly nothing waited behind it: it came when there was room again, or shortly before.
+    pub fn earliest_behind_gap(&self, offset: u64, byte_ns: f64, packet_len: usize) -> Option<Nanos> {
+        self.earliest(offset, byte_ns, packet_len).or_else(|| {
+            let oldest = self.next.saturating_sub(Arrivals::CAPACITY);
+            let read = |n: usize| self.reads[n % Arrivals::CAPACITY];
+            let newest = self.next.checked_sub(1)?;
+            let is_more = |n: &usize| {
+                let ((begin, before), (end, now)) = (read(n - 1), read(*n));
+                (end - begin) as f64 * byte_ns > 1.25 * now.saturating_sub(before) as f64
+            };
+            // Since the first of those that brought more than was sent since the one before, one behind the other.
+            let first = (oldest + 1..=newest).rev().take_while(is_more).last()?;
+            let ((begin, since), (end, now)) = (read(first - 1), read(newest));
+            let behind = end.saturating_sub(offset + ROOM) as f64 * byte_ns;
+            let was_full = end - begin >= TTY as u64;
+            (was_full && behind <= 1.25 * now.saturating_sub(since) as f64).then_some(since)
+        })
+    }
 }
 
 /// Bytes that every adapter keeps for a host that is late.
 const ROOM: u64 = 256;
 /// Bytes that a tty hands out at once, whatever waits behind them.
-const TTY: u64 = 4_095;
+pub(crate) const TTY: usize = 4_095;
 
 #[cfg(test)]
 mod tests {
@@ -131,5 +151,29 @@ mod tests {
         arrivals.note(at(2_500), 4_095);
         arrivals.note(at(2_501), 60);
         assert_eq!(arrivals.earliest(4_300, byte_ns, 84), None);
+    }
+
+    #[test]
+    fn what_comes_to_a_full_tty_finds_room_once_it_is_read() {
+        let (mut arrivals, byte_ns) = (Arrivals::default(), 15_000.0);
+        let at = |millis: Nanos| millis * MILLIS;
+        arrivals.note(at(1_000), 420);
+        // A tty may take its time to hand out more.
+        let reads = [(1_500, 4_095), (1_501, 4_095), (1_502, 900), (1_507, 4_095)];
+        reads.iter().for_each(|&(ms, len)| arrivals.note(at(ms), len));
+        let end = 420 + 3 * 4_095 + 900;
+        assert_eq!(arrivals.earliest_behind_gap(end - 100, byte_ns, 84), Some(at(1_500)));
+        let early = arrivals.earliest_behind_gap(end - 4_000, byte_ns, 84);
+        assert_eq!(early, None, "it waited, or what is behind it did");
+        arrivals.note(at(1_508), 2_000);
+        assert_eq!(arrivals.earliest_behind_gap(end + 1_700, byte_ns, 84), Some(at(1_500)));
+        assert_eq!(arrivals.earliest_behind_gap(end + 500, byte_ns, 84), None);
+        assert_eq!(arrivals.earliest(end + 1_700, byte_ns, 84), None);
+        arrivals.note(at(1_513), 336);
+        assert_eq!(
+            arrivals.earliest_behind_gap(end + 2_100, byte_ns, 84),
+            Some(at(1_508)),
+            "as without a gap"
+        );
     }
 }

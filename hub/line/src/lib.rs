@@ -17,6 +17,7 @@ mod sensor_clock;
 mod session;
 pub mod suspect;
 mod turning;
+mod turns;
 
 pub use arrival::Arrivals;
 pub use buffer::{Buffer, Tally};
@@ -24,6 +25,7 @@ pub use reads::Reads;
 pub use sensor_clock::SensorClock;
 pub use session::{Account, Control, Output, Received, Session, State};
 pub use turning::{Heard, Packets, Turn, TurnCounts};
+pub use turns::{Closed, Pace, Turns};
 
 /// A point in time or a span, in nanoseconds of one monotonic clock that the caller chooses.
 pub type Nanos = u64;

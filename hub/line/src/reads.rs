@@ -1,6 +1,7 @@
 //! What a session of packets keeps of its reads: when bytes came, for how long the line may be left alone, and the stamps
 //! before which no later ones go. Refuses to know what a packet is.
 
+use crate::arrival::TTY;
 use crate::{Arrivals, MILLIS, Nanos, Output};
 
 /// The reads of one session.
@@ -37,10 +38,12 @@ impl Reads {
         self.room = room;
     }
 
-    /// A read at `now` brought `len` bytes. While a scanner streams, packets are read some at once.
+    /// A read at `now` brought `len` bytes. While a scanner streams, packets are read some at once. What waited is read without
+    /// a rest: as long as a tty is full, what comes finds no room.
     pub fn note(&mut self, now: Nanos, len: usize, is_streaming: bool) {
         self.arrivals.note(now, len);
-        self.rest_until = if is_streaming && (1..self.room).contains(&len) { now + REST } else { 0 };
+        let is_all = (1..self.room.min(TTY)).contains(&len);
+        self.rest_until = if is_streaming && is_all { now + REST } else { 0 };
         self.last_byte = if len > 0 { now } else { self.last_byte };
     }
 

@@ -15,7 +15,6 @@ mod request;
 mod sequence;
 mod session;
 mod told;
-mod turn;
 
 pub use line::{Heard, Packets, Tally, Turn, TurnCounts};
 pub use model::{Mode, Model};

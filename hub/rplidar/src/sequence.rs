@@ -106,8 +106,8 @@ impl Sequence {
     }
 
     /// A packet of several points came; `late` says by how many nanoseconds more than usual, if its first point was
-    /// measured at that time.
-    pub(crate) fn place(&mut self, came: Came, late: impl Fn(f64) -> f64) -> Place {
+    /// measured at that time, and whether it is behind a gap.
+    pub(crate) fn place(&mut self, came: Came, late: impl Fn(f64, bool) -> f64) -> Place {
         self.came += 1;
         let Some(last) = self.last else { return self.first(came.start) };
         let angle = clockwise(last.start, came.start);
@@ -122,12 +122,13 @@ impl Sequence {
         };
         let turn = Turn { advance, packet_ns: came.packet_ns };
         let is_next = came.adjoins() && self.odds == 0 && (angle - advance).abs() <= 0.25 * advance;
-        if is_next && turn.missing(late(last.time + came.packet_ns)) == 0.0 {
+        if is_next && turn.missing(late(last.time + came.packet_ns, false)) == 0.0 {
             let is_even = (angle - advance).abs() <= 0.08 * advance;
             self.lessons = if is_even { self.lessons + 1 } else { LESSONS };
             self.advance += (angle - advance) / 4.0;
             return self.next(last, came, angle, 1.0, Step::Next);
         }
+        let late = |time: f64| late(time, true);
         let angle = angle + 360.0 * turn.missing(late(last.time + turn.time(angle)));
         let packets = f64::from((angle / advance + 0.5) as u32);
         // In a long gap a head may have changed its speed: then the time tells better how many there were.
@@ -146,7 +147,7 @@ impl Sequence {
     }
 
     /// A packet of one point came: such points may lie before ones that came before them.
-    pub(crate) fn place_point(&mut self, came: Came, late: impl Fn(f64) -> f64) -> Place {
+    pub(crate) fn place_point(&mut self, came: Came, late: impl Fn(f64, bool) -> f64) -> Place {
         self.came += 1;
         let Some(last) = self.last else { return self.first(came.start) };
         let angle = clockwise(last.start, came.start);
@@ -161,6 +162,7 @@ impl Sequence {
             return self.next_point(last, came, angle, points, Step::Next);
         };
         let turn = Turn { advance, packet_ns: came.packet_ns };
+        let late = |time: f64| late(time, angle > AHEAD);
         let due = last.time + turn.time(angle.max(advance));
         let turns = turn.missing(late(due));
         if angle <= AHEAD && turns == 0.0 {
@@ -314,7 +316,7 @@ mod tests {
             for n in 0..400 {
                 let at = BEGIN + f64::from(n) * 8e6;
                 let came = Came { start: (start % 360.0) as f32, skipped: 0, packet_ns: 8e6 };
-                let place = sequence.place(came, |time| at - begun - time);
+                let place = sequence.place(came, |time, _| at - begun - time);
                 if place.step == Step::First {
                     begun = at - BEGIN;
                 }

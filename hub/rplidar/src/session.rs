@@ -10,7 +10,7 @@ mod outgoing;
 mod reply;
 mod stream;
 
-use line::{MILLIS, Nanos, Reads, SensorClock, State, Tally, TurnCounts};
+use line::{MILLIS, Nanos, Reads, SensorClock, State, Tally, TurnCounts, Turns};
 
 use crate::framer::{Expect, Framer};
 use crate::model::{Mode, Model};
@@ -18,7 +18,6 @@ use crate::offers::Offers;
 use crate::packet::Kind;
 use crate::sequence::Sequence;
 use crate::told::{Health, Info, Trouble, Why};
-use crate::turn::Turns;
 
 use self::dialogue::Ask;
 use self::outgoing::Outgoing;
@@ -58,7 +57,7 @@ pub struct Session {
     pub(crate) reads: Reads,
     clock: SensorClock,
     sequence: Sequence,
-    turns: Turns,
+    turns: Turns<MOST_POINTS>,
     phase: Phase,
     /// What to show until measured data come.
     shown: State,
@@ -281,6 +280,8 @@ impl Session {
     }
 }
 
+/// Points of an S2 that turns four times a second; what is more does not fit into a turn.
+const MOST_POINTS: usize = 8_192;
 /// Without a packet for so long the session begins again.
 const SILENCE: Nanos = 1_000 * MILLIS;
 /// The slowest head turns once in this.

@@ -37,7 +37,7 @@ pub(crate) struct Tty {
 
 /// Bytes that a tty holds, as a pty of Linux does; more are lost.
 const ROOM: usize = 17_024;
-/// Those of them of which it tells; the rest waits in the driver's buffers.
+/// Those of them of which it tells, and that it hands out at once; the rest waits in the driver's buffers.
 const LINE_DISCIPLINE: usize = 4_095;
 
 impl Tty {
@@ -149,9 +149,9 @@ impl Tty {
         self.buffer.len().min(LINE_DISCIPLINE)
     }
 
-    /// Reads what there is into `into`.
+    /// Reads what there is into `into`, at most what the line discipline holds.
     pub(crate) fn read(&mut self, into: &mut [u8], log: &Log, now: Nanos) -> usize {
-        let len = into.len().min(self.buffer.len());
+        let len = into.len().min(self.waiting());
         for (place, byte) in into.iter_mut().zip(self.buffer.drain(..len)) {
             *place = byte;
         }

@@ -4,7 +4,7 @@ use line::{MILLIS, Nanos, State};
 
 use super::outgoing::Outgoing;
 use super::reply::{Reply, number};
-use super::{Phase, Session};
+use super::{Phase, SILENCE, Session};
 use crate::framer::Expect;
 use crate::model::{Mode, Motor};
 use crate::offers::{Offer, Offers};
@@ -306,6 +306,8 @@ impl Session {
             // It is asked anyway; and what another rate makes of a stream may be text, again and again.
             Phase::Draining { .. } | Phase::Asking { ask: Ask::Info, .. } => {}
             Phase::Booting { .. } => self.phase = Phase::Booting { until: self.now + SETTLE },
+            // What is left of a packet may be text too. One that boots sends nothing for a while before it greets.
+            Phase::Hearing { silent_at, .. } if silent_at.abs_diff(self.now + SILENCE) < HUSHED => {}
             _ => {
                 self.resyncs += u64::from(matches!(self.phase, Phase::Hearing { .. }));
                 self.begin(State::Starting);
@@ -384,6 +386,8 @@ const PATIENT: u8 = 8;
 const FAR: Nanos = 500 * MILLIS;
 /// A real A1 has booted after 0.67 s.
 const BOOT: Nanos = 1_500 * MILLIS;
+/// For so long, and longer, it sends nothing before its greeting.
+const HUSHED: Nanos = 200 * MILLIS;
 /// It answers 4 ms after its greeting.
 const SETTLE: Nanos = 10 * MILLIS;
 /// An unwell scanner is asked again after so long.

@@ -1,14 +1,13 @@
 //! What becomes of packets: they are dated and handed out, and their points go into turns. Of a packet of several points these
 //! are known once the next one came, and only if nothing was between.
 
-use line::{MILLIS, Nanos, Packets, Received, SensorClock, State, Turn, line_time};
+use line::{Closed, MILLIS, Nanos, Pace, Packets, Received, SensorClock, State, Turn, Turns, line_time};
 
 use super::dialogue::Ask;
-use super::{Phase, SILENCE, Session};
+use super::{MOST_POINTS, Phase, SILENCE, Session};
 use crate::framer::{Expect, Span};
 use crate::packet::Kind;
 use crate::sequence::{Came, Place, Step};
-use crate::turn::{Closed, Pace};
 
 /// Packets on their way into turns.
 #[derive(Clone, Copy, Debug)]
@@ -106,15 +105,19 @@ impl Session {
                     packet_ns,
                 };
                 let at = self.reads.arrivals().latest(end(n), pace).saturating_sub(packet_time);
-                let late = |time: f64| {
+                let late = |time: f64, is_behind_gap: bool| {
                     let Some(due) = self.clock.time((time + behind_first) as Nanos) else { return 0.0 };
                     if at <= due {
                         return -((due - at) as f64);
                     }
+                    let (arrivals, byte_ns) = (self.reads.arrivals(), packet_ns / len as f64);
+                    let least = if is_behind_gap {
+                        arrivals.earliest_behind_gap(end(n), byte_ns, len)
+                    } else {
+                        arrivals.earliest(end(n), byte_ns, len)
+                    };
                     // One that waited is late for another reason.
-                    let least =
-                        self.reads.arrivals().earliest(end(n), packet_ns / len as f64, len).unwrap_or(0);
-                    least.saturating_sub(packet_time + due) as f64
+                    least.unwrap_or(0).saturating_sub(packet_time + due) as f64
                 };
                 let before = self.sequence;
                 let place = match kind {
@@ -337,7 +340,7 @@ impl Session {
 }
 
 /// The points of `held`, which `next` follows at `place`.
-fn put(turns: &mut crate::turn::Turns, kind: Kind, held: &Held, next: &[u8], place: Place, pace: Pace) {
+fn put(turns: &mut Turns<MOST_POINTS>, kind: Kind, held: &Held, next: &[u8], place: Place, pace: Pace) {
     let step = (place.angle - held.place.angle) / kind.points() as f64;
     for i in 0..kind.points() {
         let point = kind.point(&held.bytes[..kind.bytes()], next, i);

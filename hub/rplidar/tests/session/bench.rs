@@ -8,6 +8,8 @@ use crate::encode::Sample;
 use crate::head::Head;
 
 pub(crate) const SECOND: Nanos = 1_000 * MILLIS;
+/// Bytes that a tty hands out at once.
+const TTY: usize = 4_095;
 
 /// A turn as it was handed out.
 #[derive(Debug)]
@@ -73,7 +75,7 @@ impl Bench {
     }
 
     pub(crate) fn read(&mut self, is_timeout: bool) {
-        let room = self.session.spare().len();
+        let room = self.session.spare().len().min(TTY);
         let mut bytes = self.head.read(self.now, room);
         if self.session.rate() != self.head.baud {
             // Another rate makes noise of it.

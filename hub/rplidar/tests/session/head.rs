@@ -358,6 +358,15 @@ impl Head {
         self.sent.push(Sent { bytes, intact, at });
     }
 
+    /// What is left of a packet comes next, and is text.
+    pub(crate) fn leave_text(&mut self, now: Nanos) {
+        self.send_until(now);
+        for _ in 0..60 {
+            self.free_at = self.free_at.max(now) + line_time(1, self.baud);
+            self.line.push_back((self.free_at, b'0'));
+        }
+    }
+
     /// What is on the line is lost, and so are the next bytes up to `until`.
     pub(crate) fn cut(&mut self, until: Nanos) {
         self.send_until(until);

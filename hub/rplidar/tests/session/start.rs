@@ -302,6 +302,21 @@ fn a_greeting_in_the_midst_of_a_stream_begins_again_at_once() {
 }
 
 #[test]
+fn ranges_that_are_text_are_no_greeting() {
+    // A single point is believed if another one follows it.
+    for (mode, lost) in [(Mode::Standard, 65), (Mode::DenseBoost, 60)] {
+        let mut bench = Bench::new(Settings { mode: Some(mode), ..of(Model::S2) }, Head::new(Model::S2, 1));
+        bench.run(3 * SECOND);
+        for _ in 0..20 {
+            bench.head.leave_text(bench.now);
+            bench.run(bench.now + 33 * MILLIS);
+        }
+        let account = bench.session.account();
+        assert_eq!((account.resyncs, account.damaged), (0, 20 * lost), "{mode:?}");
+    }
+}
+
+#[test]
 fn nothing_is_said_that_a_scanner_keeps() {
     for model in Model::ALL {
         let mut bench = Bench::new(Settings::default(), Head::new(model, 1));

@@ -252,7 +252,11 @@ impl OfSensor {
         };
         let is_crowded = self.crowded_at.is_some_and(|crowded_at| at < crowded_at + CROWDED);
         let settles = if self.exactness.has_clock { SETTLED } else { LEARNED };
-        let is_settled = self.settled_at.is_some_and(|settled_at| settled_at + settles < at) && !is_crowded;
+        // A hub that stands still learns nothing meanwhile.
+        let learned_at = if self.exactness.has_clock { Some(at) } else { self.prompt_at };
+        let is_learned =
+            |settled_at: Nanos| learned_at.is_some_and(|learned_at| settled_at + settles < learned_at);
+        let is_settled = self.settled_at.is_some_and(is_learned) && !is_crowded;
         let (mut points, mut shift) = (found(0), 0);
         if points.contains(&None) {
             shift = self.shift(&told);

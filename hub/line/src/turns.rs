@@ -3,13 +3,13 @@
 //! turn is over only when the head is past its end by more than a point can be late, and until then there are two. Knows
 //! no bytes and no hub's clock.
 
-use line::grid::{NO_RETURN, Point};
-use line::{Nanos, TurnCounts};
+use crate::grid::{NO_RETURN, Point};
+use crate::{Nanos, TurnCounts};
 
-/// The turn that is being measured, and the next one.
+/// The turn that is being measured, and the next one, of `N` points at the most.
 #[derive(Clone, Debug)]
-pub(crate) struct Turns {
-    points: [[Point; CAPACITY]; 2],
+pub struct Turns<const N: usize> {
+    points: [[Point; N]; 2],
     /// Which of both holds the points of the first one.
     at: usize,
     open: [Open; 2],
@@ -36,24 +36,30 @@ struct Open {
 
 /// A turn that is over, with times of the scanner's clock; its points stay until the next point comes.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct Closed {
-    pub(crate) number: u64,
+pub struct Closed {
+    /// Which one: no other has this number, not even one that came to no end.
+    pub number: u64,
     points: usize,
     len: usize,
-    pub(crate) first: Nanos,
-    pub(crate) last: Nanos,
-    pub(crate) period: Nanos,
-    pub(crate) incomplete: bool,
-    pub(crate) reasons: u8,
+    /// When it began: at its edge.
+    pub first: Nanos,
+    /// When its last point was measured.
+    pub last: Nanos,
+    /// How long it took.
+    pub period: Nanos,
+    /// Whether points of it are missing.
+    pub incomplete: bool,
+    /// Why its points are suspect, bits of [`crate::suspect`].
+    pub reasons: u8,
 }
 
 /// How fast the head turns past points.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct Pace {
+pub struct Pace {
     /// Degrees from one point to the next.
-    pub(crate) step: f64,
+    pub step: f64,
     /// Nanoseconds from one point to the next.
-    pub(crate) point_ns: f64,
+    pub point_ns: f64,
 }
 
 impl Pace {
@@ -68,11 +74,13 @@ impl Pace {
     }
 }
 
-impl Turns {
-    pub(crate) fn new() -> Self {
+impl<const N: usize> Turns<N> {
+    /// Nothing is known yet.
+    #[expect(clippy::new_without_default, reason = "turns of which nothing is known are no default")]
+    pub fn new() -> Self {
         const NONE: Point = Point { angle: 0.0, range: NO_RETURN, intensity: 0 };
         Turns {
-            points: [[NONE; CAPACITY]; 2],
+            points: [[NONE; N]; 2],
             at: 0,
             open: [Open::default(); 2],
             number: None,
@@ -84,28 +92,29 @@ impl Turns {
     }
 
     /// From now on turns are for a grid of so many beams; the open ones are given up.
-    pub(crate) fn begin(&mut self, beams: usize) {
+    pub fn begin(&mut self, beams: usize) {
         self.edge = 180.0 / beams as f64;
         self.give_up();
     }
 
-    pub(crate) fn counts(&self) -> TurnCounts {
+    /// How many there were of which kind.
+    pub fn counts(&self) -> TurnCounts {
         self.counts
     }
 
     /// The first of the turns that are being measured, as if it ended here.
-    pub(crate) fn begun(&self, pace: Pace) -> Option<Closed> {
+    pub fn begun(&self, pace: Pace) -> Option<Closed> {
         let open = &self.open[0];
         Some(self.end(open, open.first?, pace.turn_ns()))
     }
 
     /// The points of a turn that was closed just now, or that is being measured.
-    pub(crate) fn points(&self, closed: &Closed) -> &[Point] {
+    pub fn points(&self, closed: &Closed) -> &[Point] {
         &self.points[closed.points][..closed.len]
     }
 
     /// The open turns come to no end, and no angle that is known goes on.
-    pub(crate) fn give_up(&mut self) {
+    pub fn give_up(&mut self) {
         self.counts.short += u64::from(self.open[0].len > 0);
         self.open = [Open::default(); 2];
         self.serial += 2;
@@ -113,7 +122,7 @@ impl Turns {
     }
 
     /// A point at `angle`, in degrees clockwise over all turns, measured at `time`.
-    pub(crate) fn put(&mut self, angle: f64, time: f64, range: u16, intensity: u8, reasons: u8, pace: Pace) {
+    pub fn put(&mut self, angle: f64, time: f64, range: u16, intensity: u8, reasons: u8, pace: Pace) {
         let turn = self.turn_of(angle);
         // Turns are measured from their edge on.
         let number = *self.number.get_or_insert(turn + 1);
@@ -135,7 +144,7 @@ impl Turns {
     }
 
     /// Between these angles points are missing.
-    pub(crate) fn lacks(&mut self, from: f64, to: f64) {
+    pub fn lacks(&mut self, from: f64, to: f64) {
         let Some(number) = self.number else { return };
         let (from, to) = (self.turn_of(from), self.turn_of(to));
         for (turn, open) in (number..).zip(&mut self.open) {
@@ -144,9 +153,14 @@ impl Turns {
         self.lacking = self.lacking.max(to);
     }
 
+    /// Of the turn that is being measured something may be missing, nobody knows where.
+    pub fn doubt(&mut self) {
+        self.open[0].incomplete |= self.number.is_some();
+    }
+
     /// All points before `angle` were put. The turn that is over with it, if there is one; then this is to be called
     /// once more.
-    pub(crate) fn reach(&mut self, angle: f64, pace: Pace) -> Option<Closed> {
+    pub fn reach(&mut self, angle: f64, pace: Pace) -> Option<Closed> {
         let turn = self.turn_of(angle);
         while let Some(number) = self.number.filter(|number| turn > *number) {
             let open = self.open[0];
@@ -206,16 +220,13 @@ impl Turns {
     }
 }
 
-/// Points of an S2 that turns four times a second; what is more does not fit into a turn.
-const CAPACITY: usize = 8_192;
-
 #[cfg(test)]
 mod tests {
     use super::*;
 
     #[test]
     fn a_turn_takes_the_time_from_its_edge_to_the_next_one() {
-        let mut turns = Turns::new();
+        let mut turns = Turns::<400>::new();
         turns.begin(360);
         // Points of a degree each; the head is faster as soon as the turn is over.
         for n in 0..735 {
