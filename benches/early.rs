@@ -159,7 +159,7 @@ impl Scanner {
 
     fn hub(&self, stage: &Stage) -> Outcome<Child> {
         let mut command = stage.hub_command(PROGRAM, &[SENSOR]);
-        self.keys.iter().for_each(|key| drop(command.arg(format!("--set=link.{SENSOR}.{key}"))));
+        command.args(self.keys.iter().map(|key| format!("--set=link.{SENSOR}.{key}")));
         let hub = Child::of(command, std::process::Stdio::null())?;
         hub.await_line("ready", PATIENCE)?;
         Ok(hub)

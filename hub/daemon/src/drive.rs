@@ -245,9 +245,13 @@ impl<'a, S: Surroundings> Drive<'a, S> {
         let pieces = core.output.pieces();
         session.look_in(pieces);
         if pieces > 1 || core.output.has_warned() {
-            // What waited in the port warns of nothing that is still to come.
-            let begun = session.begun().filter(|begun| self.behind_at.is_none_or(|at| begun.first() > at));
-            core.output.foresee(begun.as_ref());
+            match session.begun() {
+                // What waited in the port warns of nothing that is still to come.
+                Some(begun) if self.behind_at.is_some_and(|at| begun.first() <= at) => {
+                    core.output.withdraw(Some(begun.number()));
+                }
+                begun => core.output.foresee(begun.as_ref()),
+            }
         }
         self.identity.keep_first(session);
         let (state, is_new) = core.diagnosis.examine(session);

@@ -72,9 +72,10 @@ impl EarlyWarner {
     pub(crate) fn look(&mut self, begun: &Begun<'_>, check: &mut Check, next_seq: u64) -> [Option<Word>; 2] {
         let early = self.judge(begun, check);
         let told = early.map_or(Verdict::Clear as u8, |early| early.verdict);
+        // Packets of the turn that came since may have the numbers of its zones, so what is said anew keeps its number.
+        let seq = self.said.map_or(next_seq, |said| said.word.seq);
         let withdrawn = if self.verdict() > told { self.withdraw(None) } else { None };
         let worse = early.filter(|_| told > self.verdict()).map(|early| {
-            let seq = self.said.map_or(next_seq, |said| said.word.seq);
             let word = Word { seq, early };
             self.said = Some(Said { number: begun.number(), word });
             word

@@ -135,7 +135,7 @@ impl<'a, S: Surroundings> LinkOutput<'a, S> {
     }
 
     /// Takes back what was said of another scan than `number`.
-    fn withdraw(&mut self, number: Option<u64>) {
+    pub(crate) fn withdraw(&mut self, number: Option<u64>) {
         let withdrawn = self.early.withdraw(number);
         self.take_back(withdrawn);
     }

@@ -294,7 +294,17 @@ impl Session {
             let step = f64::from(packet.span()) / 100.0 / (POINTS - 1) as f64;
             let pace = Pace { step, point_ns: f64::from(self.sequence.point_ns()) };
             self.pace = Some(pace);
-            if !core::mem::replace(&mut current.is_put, true) {
+            if !current.is_put {
+                if let Place::Next { angle, missing, from, .. } = place
+                    && missing > 0
+                {
+                    // Up to the points beside it nothing is; they may be in a turn that is not open yet.
+                    self.turns.lacks(from + pace.step, angle - pace.step);
+                    if let Some(closed) = self.turns.reach(angle, pace) {
+                        return Some(closed);
+                    }
+                }
+                current.is_put = true;
                 put(&mut self.turns, &packet, place, reasons, pace);
             }
             if let Place::First { angle, .. } | Place::Next { angle, .. } = place
@@ -352,13 +362,7 @@ fn put(turns: &mut Turns<MOST_POINTS>, packet: &Packet<'_>, place: Place, reason
             turns.give_up();
             (time, angle)
         }
-        Place::Next { time, angle, missing, from } => {
-            if missing > 0 {
-                // Up to the points beside it nothing is.
-                turns.lacks(from + pace.step, angle - pace.step);
-            }
-            (time, angle)
-        }
+        Place::Next { time, angle, .. } => (time, angle),
     };
     for i in 0..POINTS {
         let point = packet.point(i);

@@ -126,7 +126,11 @@ impl<const N: usize> Turns<N> {
         let turn = self.turn_of(angle);
         // Turns are measured from their edge on.
         let number = *self.number.get_or_insert(turn + 1);
-        let Some(which) = usize::try_from(turn - number).ok().filter(|which| *which < 2) else { return };
+        let Some(which) = usize::try_from(turn - number).ok().filter(|which| *which < 2) else {
+            // Whoever did not reach it before its points come loses them.
+            self.lacking = self.lacking.max(turn);
+            return;
+        };
         let Some(place) = self.points[self.at ^ which].get_mut(self.open[which].len) else {
             self.open[which].incomplete = true;
             return;
@@ -237,5 +241,28 @@ mod tests {
         let pace = Pace { step: 1.0, point_ns: 0.9e6 };
         let closed = turns.reach(735.0, pace).expect("a turn");
         assert_eq!((closed.len, closed.period), (360, 360_000_000));
+    }
+
+    #[test]
+    fn a_turn_of_which_points_came_before_it_was_reached_lacks_them() {
+        let mut turns = Turns::<400>::new();
+        turns.begin(360);
+        let pace = Pace { step: 1.0, point_ns: 1e6 };
+        let put = |turns: &mut Turns<400>, from: u32, to: u32| {
+            (from..to).map(f64::from).for_each(|at| turns.put(at, 1e6 * at, 1_000, 0, 0, pace));
+        };
+        put(&mut turns, 0, 600);
+        // A gap over an edge, and points on both sides of the next one.
+        turns.lacks(601.0, 1_074.0);
+        put(&mut turns, 1_075, 1_086);
+        let (mut told, mut count) = ([(0, false); 2], 0);
+        for at in 1_086..1_450 {
+            while let Some(closed) = turns.reach(f64::from(at), pace) {
+                told[count] = (closed.len, closed.incomplete);
+                count += 1;
+            }
+            put(&mut turns, at, at + 1);
+        }
+        assert_eq!(told, [(240, true), (354, true)]);
     }
 }

@@ -81,7 +81,7 @@ impl Heard {
 #[test]
 fn a_warning_that_is_not_withdrawn_is_confirmed_by_its_turn() {
     let mut random = Rng::with_seed(28);
-    let (mut heard, mut confirmed) = (Heard::default(), 0);
+    let (mut heard, mut confirmed, mut packets) = (Heard::default(), 0, 0);
     for _ in 0..400 {
         let own: Vec<Sector> = (0..random.usize(..3))
             .map(|_| {
@@ -108,19 +108,27 @@ fn a_warning_that_is_not_withdrawn_is_confirmed_by_its_turn() {
             // What stands there often stands there for some turns.
             let points = if random.u8(..3) == 0 { points(&mut random, late) } else { again.clone() };
             let is_over = random.u8(..4) > 0;
-            let end = if is_over { points.len() } else { random.usize(..points.len()) };
+            let end = if is_over { points.len() - 1 } else { random.usize(..points.len()) };
             let mut seen = 0;
             while seen < end {
-                seen = (seen + random.usize(1..24)).min(end);
+                (seen, packets) = ((seen + random.usize(1..24)).min(end), packets + 1);
                 warner.withdraw(Some(number)).into_iter().for_each(|word| heard.hear(word));
                 let begun = Begun::Turn(turn(number, &points[..seen]));
-                let words = warner.look(&begun, &mut check, number);
+                let words = warner.look(&begun, &mut check, packets);
                 words.into_iter().flatten().for_each(|word| heard.hear(word));
             }
             if is_over {
+                // The packet that ends the turn has some of its points.
+                packets += 1;
+                if warner.has_said() {
+                    let begun = Begun::Turn(turn(number, &points));
+                    let words = warner.look(&begun, &mut check, packets);
+                    words.into_iter().flatten().for_each(|word| heard.hear(word));
+                }
                 let zones = zones(&mut check, &turn(number, &points));
                 warner.confirm(number);
                 let said = heard.stands.take();
+                assert!(said.as_ref().is_none_or(|word| word.seq < packets), "{said:?} of {packets}");
                 let holds = |word: &Word| zones.verdict().worse(word.early.verdict()) == zones.verdict();
                 assert!(said.as_ref().is_none_or(holds), "{said:?} and {:?}", zones.verdict());
                 confirmed += usize::from(said.is_some());
