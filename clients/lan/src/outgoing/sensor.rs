@@ -55,6 +55,11 @@ impl Turns {
         }
         self.last.iter().rev().find(|(seq, _)| *seq == header.seq).map(|(_, number)| *number)
     }
+
+    /// The number of the turn that is being measured, of which an early warning is, whatever its own number.
+    fn next(&self) -> u64 {
+        self.last.back().map_or(0, |(_, number)| number + 1)
+    }
 }
 
 /// The background as it went out last.
@@ -178,8 +183,11 @@ impl Sensor {
         let Some(every) = track.every else { return };
         numbering.miss(header.sensor, topic, sample.missed);
         let mut stamp_ns = header.wall_ns;
-        let is_of_telegram = topic == Topic::Telegram || header.family == Family::Lms as u8;
-        let number = if is_of_telegram { Some(header.seq) } else { turns.number(&header) };
+        let number = match topic {
+            _ if topic == Topic::Telegram || header.family == Family::Lms as u8 => Some(header.seq),
+            Topic::Early => Some(turns.next()),
+            _ => turns.number(&header),
+        };
         let mut is_due = every.get() == 1 || number.is_some_and(|number| number.is_multiple_of(every.get()));
         match sample.payload {
             PayloadRef::Status(_) => stamp_ns = now.wall_ns,

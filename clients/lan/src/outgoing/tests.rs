@@ -4,7 +4,7 @@ use std::num::NonZeroU64;
 use std::time::Duration;
 
 use schema::datagram::{Announce, Datagram, HEAD, Head, MTU_LEAST, MTU_SAFE, StreamStats};
-use schema::{Background, BackgroundHead, Flags, Header, Status, Topic, Verdict, Zones};
+use schema::{Background, BackgroundHead, Early, Family, Flags, Header, Status, Topic, Verdict, Zones};
 
 use super::{Form, Outgoing, PayloadRef, Sample, Transmit};
 use crate::{Key, Stamp};
@@ -37,6 +37,7 @@ impl Taken {
 }
 
 const ZONES: u8 = Topic::Zones as u8 + 1;
+const EARLY: u8 = Topic::Early as u8 + 1;
 const BACKGROUND: u8 = Topic::Background as u8 + 1;
 
 fn outgoing(form: Form) -> Outgoing {
@@ -99,6 +100,35 @@ fn what_is_thinned_has_no_number_and_what_is_unknown_is_not_thinned() {
     assert_eq!(send(4, Verdict::Clear), [(ZONES, 2)]);
     assert!(out.wants(front, Topic::Zones) && out.wants(front, Topic::Status), "its status says its type");
     assert!(!out.wants(front, Topic::Scan));
+}
+
+#[test]
+fn warnings_of_a_turn_are_no_turn_of_their_own_and_go_with_its_zones() {
+    let mut out = outgoing(Form::Sealed);
+    let thinned = |topic| NonZeroU64::new(2).filter(|_| matches!(topic, Topic::Zones | Topic::Early));
+    let front = out.follow("front", thinned);
+    let of = |seq| {
+        let mut header = Header { family: Family::Ld as u8, ..header(1, 0, seq) };
+        header.set_sent_at(1_000 + seq);
+        header
+    };
+    let mut gone = Vec::new();
+    for turn in 0..6 {
+        let mut taken = Taken::default();
+        let warning = Early { verdict: Verdict::Slow as u8, ..Early::default() };
+        // The packets of a turn have numbers, and its last one is that of its zones.
+        for (seq, payload) in [
+            (20 * turn + 7, PayloadRef::Early(&warning)),
+            (20 * turn + 19, PayloadRef::Zones(&zones(Verdict::Slow))),
+        ] {
+            let sample = Sample { header: Some(&of(seq)), missed: 0, payload };
+            out.sample(front, &sample, at(0), &mut taken);
+        }
+        let topics = taken.numbers().into_iter().map(|(topic, _)| topic);
+        gone.push(topics.filter(|topic| *topic != Announce::NUMBER).collect::<Vec<u8>>());
+    }
+    let both = vec![EARLY, ZONES];
+    assert_eq!(gone, [both.clone(), vec![], both.clone(), vec![], both, vec![]]);
 }
 
 #[test]

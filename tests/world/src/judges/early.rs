@@ -16,10 +16,19 @@ pub(crate) struct Early {
     sensors: BTreeMap<usize, OfSensor>,
 }
 
+/// A warning.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+struct Said {
+    seq: u64,
+    verdict: Verdict,
+    /// Its scan has exactly its number, and no greater one.
+    is_of_telegram: bool,
+}
+
 #[derive(Default)]
 struct OfSensor {
-    /// The number and the verdict of the warning that stands.
-    stands: Option<(u64, Verdict)>,
+    /// The warning that stands.
+    stands: Option<Said>,
     /// The number of the last zones.
     zones: Option<u64>,
     /// A sample had no memory, so that nobody knows what stands.
@@ -65,21 +74,26 @@ impl OfSensor {
         if self.zones.is_some_and(|zones| seq <= zones) {
             return Some("a warning of a scan whose zones were there".to_owned());
         }
+        let said = Said { seq, verdict, is_of_telegram: early.bytes_seen > 0 };
         let before = self.stands.take();
         if early.is_withdrawn() {
-            let is_of = before == Some((seq, verdict)) || std::mem::take(&mut self.is_unknown);
+            let is_of = before.is_some_and(|before| (before.seq, before.verdict) == (seq, verdict));
+            let is_of = is_of || std::mem::take(&mut self.is_unknown);
             return (!is_of).then(|| format!("{before:?} stood, something else was taken back"));
         }
-        self.stands = Some((seq, verdict));
+        self.stands = Some(said);
         self.is_unknown = false;
-        None
+        let is_worse = |before: &Said| before.seq == seq && before.verdict.worse(verdict) != before.verdict;
+        before
+            .filter(|before| !is_worse(before))
+            .map(|before| format!("{before:?} stood, and {said:?} is no worse"))
     }
 
     /// What is wrong with the warning that stands, now that the zones say `verdict`.
     fn tell(&mut self, seq: u64, verdict: Verdict) -> Option<String> {
         self.zones = Some(seq);
-        let (_, said) = self.stands.take_if(|(of, _)| seq >= *of)?;
-        let holds = verdict.worse(said) == verdict;
-        (!holds).then(|| format!("a warning said {}, the zones {}", said.name(), verdict.name()))
+        let said = self.stands.take_if(|said| seq >= said.seq)?;
+        let holds = verdict.worse(said.verdict) == verdict && (seq == said.seq || !said.is_of_telegram);
+        (!holds).then(|| format!("{said:?}, the zones say {}", verdict.name()))
     }
 }

@@ -23,8 +23,11 @@ struct OfSensor {
     family: Rc<dyn Family>,
     /// How often a telegram was sent and not published.
     open: HashMap<u64, u32>,
-    /// What was published and not sent, until the next telegram tells whether bytes that nobody sent came before it.
+    /// What was published and not sent, until the next telegram tells whether bytes that nobody sent came before it: more was
+    /// read than the telegrams have that are known.
     strange: Vec<Vec<u8>>,
+    /// Place behind the last byte that was read.
+    read: u64,
     /// The last telegrams that the line damaged, and nothing where it brought bytes between two.
     damaged: VecDeque<Vec<u8>>,
     /// Place behind the last telegram.
@@ -39,6 +42,7 @@ impl NothingInvented {
             family: family.clone(),
             open: HashMap::new(),
             strange: Vec::new(),
+            read: 0,
             damaged: VecDeque::new(),
             end: 0,
             last: Default::default(),
@@ -64,12 +68,9 @@ impl Judge for NothingInvented {
                 if telegram.damage.is_some() {
                     of.damage(telegram.bytes);
                 }
-                for unit in std::mem::take(&mut of.strange) {
-                    if !of.family.is_collision(&unit, &mut of.damaged.iter().map(Vec::as_slice)) {
-                        say.broken(format!("sensor {sensor} did not send {unit:02X?}"));
-                    }
-                }
+                of.judge_strange(sensor, say);
             }
+            Event::Read { sensor, to, .. } => self.sensors[sensor].read = to,
             Event::Published { sensor, sample } if sample.topic == Topic::Telegram => {
                 let of = &mut self.sensors[sensor];
                 for unit in of.family.units(&sample.bytes) {
@@ -79,6 +80,9 @@ impl Judge for NothingInvented {
                     if !is_known && is_clean && !of.family.is_collision(unit, &mut damaged) {
                         of.strange.push(unit.to_vec());
                     }
+                }
+                if of.read <= of.end {
+                    of.judge_strange(sensor, say);
                 }
                 (of.last.0, of.last.1) = (sample.header.seq, sample.header.boot);
                 of.last.2.clear();
@@ -102,6 +106,15 @@ impl Judge for NothingInvented {
 }
 
 impl OfSensor {
+    /// Says what is strange and is no mixture of what the line damaged.
+    fn judge_strange(&mut self, sensor: usize, say: &mut Say<'_>) {
+        for unit in std::mem::take(&mut self.strange) {
+            if !self.family.is_collision(&unit, &mut self.damaged.iter().map(Vec::as_slice)) {
+                say.broken(format!("sensor {sensor} did not send {unit:02X?}"));
+            }
+        }
+    }
+
     /// The line damaged `telegram`.
     fn damage(&mut self, telegram: &[u8]) {
         self.damaged.truncate(REMEMBERED - 1);
