@@ -846,13 +846,14 @@ static inline enum scanhub_result scanhub_read_events(const struct scanhub_datag
     return SCANHUB_OK;
 }
 
-/* A warning by a telegram that was not complete: slow or stop, never clear. The zones of the same number confirm it. */
+/* A warning by a scan that was not complete, a telegram or a turn: slow or stop, never clear. The first zones with its number or
+ * a greater one confirm it, or it is withdrawn. */
 struct scanhub_early {
     uint8_t verdict;       /* SCANHUB_SLOW or SCANHUB_STOP */
     uint8_t withdrawn;     /* 1: what was said under this number does not hold */
     uint16_t beam;         /* of the nearest point so far */
     uint32_t distance_mm;  /* of that, from the robot's centre */
-    uint16_t bytes_seen;   /* of the telegram */
+    uint16_t bytes_seen;   /* of the telegram; 0 of a turn */
     uint16_t beams_seen;   /* of the scan */
 };
 static inline enum scanhub_result scanhub_read_early(const struct scanhub_datagram *datagram,

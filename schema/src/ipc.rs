@@ -70,8 +70,8 @@ pub type Notifier = port::notifier::Notifier<Service>;
 /// Sleeps until it is woken.
 pub type Listener = port::listener::Listener<Service>;
 
-/// Returns the node of a hub or listener in `domain`, for who holds its [`HubLock`](crate::HubLock) or
-/// [`ListenLock`](crate::ListenLock). Cleans up what dead ones and consumers left.
+/// Returns the node of who publishes in `domain` and holds its [`HubLock`](crate::HubLock),
+/// [`ListenLock`](crate::ListenLock) or a [`NameLock`](crate::NameLock) of it. Cleans up what dead ones and consumers left.
 ///
 /// # Errors
 ///

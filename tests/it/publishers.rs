@@ -163,6 +163,29 @@ fn a_name_has_one_publisher_in_all_languages() {
     }
 }
 
+/// Who has settled how the names of shared memory begin has joined as well, before another one that ends looks who is there.
+#[test]
+fn who_comes_while_another_goes_is_found() {
+    let env = TestEnv::new();
+    let place = env.place();
+    std::thread::scope(|scope| {
+        for name in ["left", "right"] {
+            let place = &place;
+            scope.spawn(move || {
+                for round in 0..100 {
+                    let topics = Maker::Mount.topics();
+                    let sensor = PublishSession::beside(place, name, topics, TopicLimits::default());
+                    let mount = sensor.expect("the name is free").topic::<Tilt>().expect("it is alone");
+                    let published = ipc::published(place).expect("a domain");
+                    assert!(published.contains(&(name.to_owned(), Topic::Tilt)), "{name} in {round}");
+                    drop(mount);
+                }
+            });
+        }
+    });
+    assert_eq!(env.left_behind(), Vec::<std::path::PathBuf>::new());
+}
+
 #[test]
 fn one_that_is_killed_leaves_its_name_and_its_followers() {
     let env = TestEnv::new();

@@ -78,6 +78,14 @@ fn what_cannot_be_followed_is_told_in_words() {
 }
 
 #[test]
+fn names_of_their_own_come_and_go() {
+    let env = TestEnv::new();
+    let Some(command) = check_on(&env, "own_names") else { return };
+    passed(command);
+    assert_eq!(env.left_behind(), Vec::<std::path::PathBuf>::new());
+}
+
+#[test]
 fn models_and_the_flow_of_data_on_request() {
     let env = TestEnv::new();
     let Some(command) = check_on(&env, "models") else { return };

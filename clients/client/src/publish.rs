@@ -140,7 +140,7 @@ impl PublishSession {
             let what = format!("{name:?} is no name to publish under: it is a sensor of the hub");
             return Err(Failure::new(Kind::Configuration, what, "any other name, for example house"));
         }
-        PublishSession::with(domain, limits, ipc::client_node(domain)?, lock).sensor(name)
+        PublishSession::with(domain, limits, ipc::hub_node(domain)?, lock).sensor(name)
     }
 
     fn with(domain: &Domain, limits: TopicLimits, node: Node, lock: Place) -> PublishSession {

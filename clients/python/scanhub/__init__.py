@@ -19,10 +19,11 @@ from typing import Callable
 from . import memory
 from .control import background, control
 from .errors import Denied, Failure, Held, Impossible, Mismatch, NoHub, NoTopic, Refused, Short, Silent, Taken
+from .lock import is_held
 from .model import Background, Shown
-from .names import TopicName, candidates, check_sensor, home, is_remote, parse
+from .names import Domain, TopicName, candidates, check_sensor, home, is_remote, parse
 from .people import Event, Site, Track, Tracks
-from .presence import Presence, find
+from .presence import find
 from .processed import Corner, Early, Foreground, Line, Lines, Mark, Marks, Motion, Segment, Zone, Zones
 from .publication import Publication
 from .sample import Sample
@@ -110,8 +111,8 @@ def robot(
     *sensors: str, domain: str | None = None, root: str | os.PathLike[str] | None = None, early: bool = False
 ) -> RobotFollower:
     """Follows the verdict over the zones of `sensors`. Without names: all sensors of the hub; in a domain without a hub
-    the sensors of other machines that are published there. With `early` it becomes worse before a telegram is complete, and
-    is taken back if that turns out damaged.
+    the sensors of other machines that are published there. With `early` it becomes worse before a scan (a telegram or a
+    turn) is complete, and goes back if the warning is withdrawn.
 
     Iterate over the result, which does not end, or call `now()` in a loop of your own. The verdict becomes `unknown` by
     itself when no recent data arrived, with a hub or without one. Raises Impossible at once if a name is invalid.
@@ -135,9 +136,16 @@ def publish(
         raise Impossible(f"Python does not publish {name.topic}", f"{Tilt.topic}, as in mount/tilt; Rust publishes all")
     if is_remote(name.sensor):
         raise Impossible(f"{name.sensor} is no name of a mount", "one without a dot, for example mount")
-    presence = Presence(candidates(domain, root))
-    presence.look()
-    return Publication(name, presence.domain or home(domain, root))
+    live = next((place for place in candidates(domain, root) if _lives(place)), None)
+    return Publication(name, live or home(domain, root))
+
+
+def _lives(place: Domain) -> bool:
+    """One that cannot be looked at counts as none, as in Rust."""
+    try:
+        return is_held(place)
+    except (Denied, OSError):
+        return False
 
 
 def topics(*, domain: str | None = None, root: str | os.PathLike[str] | None = None) -> list[TopicName]:

@@ -10,7 +10,6 @@ import os
 import struct
 from typing import Iterator
 
-from . import prefix
 from .directory import directory_of, made_directory
 from .errors import Taken
 from .names import Domain
@@ -21,20 +20,32 @@ class NameLock:
 
     def __init__(self, domain: Domain, name: str) -> None:
         self._file = _acquire(domain, name)
+        _of_names.add(self._file)
         try:
-            # A process id that is read means that there is a prefix, too.
             os.ftruncate(self._file, 0)
-            with making(domain):
-                prefix.settle(domain)
             os.pwrite(self._file, b"%d\n" % os.getpid(), 0)
         except BaseException:
             self.release()
             raise
 
     def release(self) -> None:
-        """Gives the name free. Closing is not enough: a child has a copy of the descriptor."""
+        """Gives the name free. Closing is not enough: a process that is just being started has a copy of the descriptor."""
         fcntl.fcntl(self._file, fcntl.F_OFD_SETLK, _whole_file(fcntl.F_UNLCK))
+        _of_names.discard(self._file)
         os.close(self._file)
+
+
+_of_names: set[int] = set()
+"""Descriptors of the names that this process has."""
+
+
+def _leave_the_parents() -> None:
+    """A copy in a child would keep a name taken when the parent is killed."""
+    while _of_names:
+        os.close(_of_names.pop())
+
+
+os.register_at_fork(after_in_child=_leave_the_parents)
 
 
 @contextlib.contextmanager
@@ -65,6 +76,11 @@ def holder(domain: Domain, lock: str) -> int | None:
         return None if struct.unpack(_FLOCK, asked)[0] == fcntl.F_UNLCK else _written(file)
     finally:
         os.close(file)
+
+
+def is_held(domain: Domain) -> bool:
+    """Whether a hub or a listener is there, also one that is just starting. Denied, OSError."""
+    return any(holder(domain, lock) is not None for lock in ("hub.lock", "listen.lock"))
 
 
 def _acquire(domain: Domain, name: str) -> int:

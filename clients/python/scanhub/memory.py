@@ -53,6 +53,10 @@ class Membership(Kept):
         """Removes what dead processes left in the domain."""
         self._node.try_cleanup_dead_nodes()
 
+    def leave(self) -> None:
+        """Ends the stay, as soon as nothing that was made of it is in use."""
+        self._node = None
+
     def service(self, name: str) -> Any:
         """The builder of a service."""
         return self._node.service_builder(iox2.ServiceName.new(name))

@@ -7,6 +7,7 @@ import ctypes
 import errno
 import os
 import time
+import traceback
 from typing import Any, Callable
 
 import iceoryx2 as iox2
@@ -86,6 +87,8 @@ def _made(membership: Membership, name: str, ours: str, make: Callable[[], Any])
         except (OSError, Failure):
             raise
         except Exception as error:  # Each pattern has its own type of error, which share no other parent.
+            # Who keeps the failure keeps its frames, and what they hold keeps this process in the domain.
+            traceback.clear_frames(error.__traceback__)
             trouble.check_in_flux(membership.domain, name, ours, str(error), time.monotonic() >= give_up_at)
         time.sleep(0.01)
 

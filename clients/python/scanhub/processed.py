@@ -183,7 +183,8 @@ class Motion(Sample):
 
 
 class Early(Sample):
-    """A warning by a telegram that was not complete. The zones of the same number confirm it, or it is withdrawn."""
+    """A warning by a scan that was not complete, a telegram or a turn. The first zones with its number or a greater one
+    confirm it, or it is withdrawn."""
 
     topic = "early"
     struct = layout.Early
@@ -210,7 +211,7 @@ class Early(Sample):
 
     @property
     def bytes_seen(self) -> int:
-        """Bytes of the telegram that had arrived."""
+        """Bytes of the telegram that had arrived; 0 of a turn."""
         return self._fields.bytes_seen
 
     @property

@@ -7,11 +7,12 @@ import contextlib
 import operator
 import os
 import time
+import traceback
 import weakref
 
-from . import layout, memory, trouble
+from . import layout, memory, prefix, trouble
 from .errors import Failure, Impossible
-from .lock import NameLock, holder, making
+from .lock import NameLock, is_held, making
 from .names import LINKS, Domain, TopicName
 from .outlet import Outlet
 from .tilted import Tilt
@@ -32,12 +33,15 @@ class Publication:
 
     def send(self, angle_rad: float, *, rate_rad_s: float | None = None, stamp_ns: int | None = None) -> None:
         """Says that the mount was at `angle_rad`, right-handed around its axis, at `stamp_ns` of `time.monotonic_ns()`
-        (None: now), and how fast the angle grew (None: not known). Short if there is no memory for it: its number is used up.
+        (None: now), and how fast the angle grew (None: not known). Impossible if that is no time; Short if there is no
+        memory for it: its number is used up.
         """
         if not self._end.alive or self._process != os.getpid():
             raise Failure("this publication has ended", "publish again; a child publishes under a name of its own")
         now_ns, wall_ns = time.monotonic_ns(), time.time_ns()
         at_ns = now_ns if stamp_ns is None else operator.index(stamp_ns)
+        if not 0 <= at_ns < 1 << 64:
+            raise Impossible(f"stamp_ns {at_ns} is no time", "a time of time.monotonic_ns(), or None for now")
         tilt = layout.Tilt(angle_rad, float("nan") if rate_rad_s is None else rate_rad_s)
         header = layout.Header(
             seq=self._next,
@@ -77,9 +81,18 @@ class _Place:
             if any(other.sensor == name.sensor and other.topic in LINKS for other in memory.topics(domain)):
                 what = f'"{name.sensor}" is no name to publish under: it is a sensor of the hub'
                 raise Impossible(what, "any other name, for example house")
-            membership = memory.Membership(domain)
-            membership.clean_up()
-            self.outlet = Outlet(membership, name, Tilt)
+            # In one step: a name without a process is forgotten by the next one that ends.
+            with making(domain):
+                prefix.settle(domain)
+                membership = memory.Membership(domain)
+            try:
+                membership.clean_up()
+                self.outlet = Outlet(membership, name, Tilt)
+            except BaseException as error:
+                membership.leave()
+                # Who keeps the failure keeps its frames, and what they hold keeps this process in the domain.
+                traceback.clear_frames(error.__traceback__)
+                raise
         except BaseException:
             self._give_free()
             raise
@@ -94,7 +107,7 @@ class _Place:
         """The last one out takes the names of the shared memory along."""
         try:
             with contextlib.suppress(OSError, Failure), making(self._domain):
-                if all(holder(self._domain, lock) is None for lock in ("hub.lock", "listen.lock")):
+                if not is_held(self._domain):
                     memory.forget_names(self._domain)
         finally:
             self._lock.release()

@@ -220,13 +220,14 @@ struct scanhub_zones_v2 {
     struct scanhub_zone_v2 zone_array[8]; /* the largest first */
 };
 
-/* A warning by a telegram that was not complete. The zones of the same number confirm it. */
+/* A warning by a scan that was not complete, a telegram or a turn. The first zones with its number or a greater one confirm it,
+ * or it is withdrawn. */
 struct scanhub_early_v2 {
     uint8_t verdict;      /* SCANHUB_VERDICT_SLOW or SCANHUB_VERDICT_STOP */
     uint8_t flags;        /* 1 withdrawn: what was said under this number does not hold */
     uint16_t beam;        /* of the nearest point so far */
     uint32_t distance_mm; /* of that, from the robot's centre */
-    uint16_t bytes_seen;  /* of the telegram */
+    uint16_t bytes_seen;  /* of the telegram; 0 of a turn */
     uint16_t beams_seen;  /* of the scan */
 };
 
@@ -487,8 +488,8 @@ int scanhub_open(struct scanhub_attachment **handle, const char *domain, const c
 int scanhub_open_robot(struct scanhub_attachment **handle, const char *domain, const char *sensors, int wait);
 
 /*
- * The same, with early warnings (docs/early.md): the verdict becomes worse before a telegram is complete, and goes back if that
- * turns out damaged.
+ * The same, with early warnings (docs/early.md): the verdict becomes worse before a scan (a telegram or a turn) is complete,
+ * and goes back if the warning is withdrawn.
  */
 int scanhub_open_robot_early(struct scanhub_attachment **handle, const char *domain, const char *sensors, int wait);
 
