@@ -256,7 +256,11 @@ fn the_picture_of_the_documents_from_the_side() {
                     && scanhub.sweeps[0].obstacles.filter((one) => one.near === 'true').length >= 2 \
                     && document.querySelector('#sensors article.streaming:not(.lossy)') !== null \
                     && document.querySelector('#news').innerText === ''";
-        page.await_true(seen);
+        // Words come a moment after their sweep.
+        let is_told = format!("{SWEPT} === `hall: ${{scanhub.sweeps[0].words}}`");
+        page.await_true(&format!(
+            "{seen} && {is_told} && scanhub.obstacles === scanhub.sweeps[0].obstacles.length"
+        ));
         page.photograph(&Path::new(directory).join("web-side.png"));
     }
     assert!(page.complaints.is_empty(), "{:?}", page.complaints);
