@@ -130,6 +130,12 @@ fn keys_and_the_mouse_change_the_picture() {
     page.await_true(&format!("{fits} === 'true'"));
     page.mouse("mouseMoved", (195.0, 300.0), false);
     page.await_true("/from the robot/.test(document.querySelector('#readout').innerText)");
+    let paper = "getComputedStyle(document.body).backgroundColor";
+    let before = page.ask(paper);
+    page.press("n");
+    page.await_true(&format!("{paper} !== {before}"));
+    page.press("n");
+    page.await_true(&format!("{paper} === {before}"));
     page.press("?");
     page.await_true("document.querySelector('#help').open");
     page.press("Escape");

@@ -186,8 +186,17 @@ fn a_hall_is_seen_from_the_side_while_somebody_looks() {
     page.press(" ");
     page.await_true("document.querySelector('#verdict').innerText.includes('held')");
     let sweep = page.ask("scanhub.sweeps[0].sweep");
+    page.press("h");
+    page.await_true("!scanhub.aside && scanhub.beams > 100");
+    page.press("h");
+    page.await_true("scanhub.aside && scanhub.swept > 1000");
+    assert_eq!(page.ask("scanhub.sweeps[0].sweep"), sweep);
     page.press(" ");
     page.await_true(&format!("scanhub.sweeps[0].sweep !== {sweep}"));
+    // Who comes back waits for points, and nothing is wrong meanwhile.
+    let waits = "/^Waiting for the next sweep\\s*$/.test(scanhub.reason)";
+    page.await_true(&format!("scanhub.sweeps[0].sweep && ({SIDE}.click(), {SIDE}.click(), {waits})"));
+    page.await_true("scanhub.swept > 1000 && scanhub.reason === null");
 
     // What makes the sweeps is gone: they are not there any more, and that is said.
     assert_eq!(tilt.end(INT).code, Some(0));
@@ -247,7 +256,11 @@ fn the_picture_of_the_documents_from_the_side() {
                     && scanhub.sweeps[0].obstacles.filter((one) => one.near === 'true').length >= 2 \
                     && document.querySelector('#sensors article.streaming:not(.lossy)') !== null \
                     && document.querySelector('#news').innerText === ''";
-        page.await_true(seen);
+        // Words come a moment after their sweep.
+        let is_told = format!("{SWEPT} === `hall: ${{scanhub.sweeps[0].words}}`");
+        page.await_true(&format!(
+            "{seen} && {is_told} && scanhub.obstacles === scanhub.sweeps[0].obstacles.length"
+        ));
         page.photograph(&Path::new(directory).join("web-side.png"));
     }
     assert!(page.complaints.is_empty(), "{:?}", page.complaints);

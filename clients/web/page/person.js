@@ -48,7 +48,6 @@ const actions = {
   },
   side: () => {
     view = views[isAside() ? 0 : 1];
-    for (const one of sweeps.values()) one.points = null;
     tape = null;
     isFitDue = true;
     place();
@@ -75,7 +74,7 @@ const actions = {
   },
   layers: () => press(buttonOf("layers"), $("layers").classList.toggle("open")),
   theme: () => {
-    document.documentElement.dataset.theme = isDark ? "light" : "dark";
+    document.documentElement.style.colorScheme = isDark ? "light" : "dark";
     readColours();
   },
   help: () => ($("help").open ? $("help").close() : $("help").showModal()),

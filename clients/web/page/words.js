@@ -66,7 +66,10 @@ function lose(one, left) {
 /** Forgets what is too old to be what is there. */
 function age(now) {
   for (const one of everySensor()) if (one.scan && now - one.scan.at > max(OLD_MS, 3000 * one.scan.period)) lose(one, blind());
-  for (const one of everySweep()) if (one.sweep && now > one.until) lose(one, empty());
+  for (const one of everySweep()) {
+    if (!isAside()) one.points = null; // Nobody follows them.
+    if (one.sweep && now > one.until) lose(one, empty());
+  }
   for (const one of people.values()) if (one.persons.length && now - one.at > OLD_MS) lose(one, { persons: [] });
 }
 
@@ -108,7 +111,8 @@ function explain() {
     trouble = { what: `${first.name}: ${what}`, remedy };
   }
   if (!trouble && isAside() && !pointsAside().length) {
-    trouble = { what: $("swept").textContent, remedy: "Does the mount swing from turn to turn, and does scanhub tilt run?" };
+    trouble = everySweep().some(({ sweep }) => sweep) ? { what: "Waiting for the next sweep", remedy: "" }
+      : { what: $("swept").textContent, remedy: "Does the mount swing from turn to turn, and does scanhub tilt run?" };
   }
   const box = $("reason");
   box.hidden = !trouble;

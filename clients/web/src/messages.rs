@@ -13,7 +13,7 @@ use serde::Serialize;
 use crate::board::Channel;
 
 pub use replay::{replay, replay_channel};
-pub use scene_update::{lines, marks, obstacles, obstacles_last, tracks, zones};
+pub use scene_update::{lines, marks, obstacles, tracks, zones};
 pub use tilt::{tilt, tilt_channel};
 
 /// Scans of a sensor, as `sensor_msgs/msg/LaserScan`.
@@ -61,9 +61,9 @@ pub fn cloud_channel(name: &str) -> Channel {
     of_ros(beside_scan(name, "cloud"), POINT_CLOUD, false)
 }
 
-/// What the last sweep has found, as `foxglove.SceneUpdate`.
+/// What the last sweep has found, as `foxglove.SceneUpdate`. Not for who comes later: it holds from when it comes.
 pub fn obstacles_channel(name: &str) -> Channel {
-    scene_update::channel(&beside_scan(name, "obstacles"))
+    Channel { is_kept: false, ..scene_update::channel(&beside_scan(name, "obstacles")) }
 }
 
 /// The verdict and the hub, see [`robot`].

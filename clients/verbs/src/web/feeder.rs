@@ -307,7 +307,6 @@ impl Sink for Feeder<'_> {
         picture::note(&mut self.scene, names, notice);
         if notice == Notice::HubGone {
             self.clear();
-            self.tilted.forget();
             self.status_at = Instant::now();
         }
         Ok(())
@@ -338,7 +337,6 @@ impl Sink for Feeder<'_> {
             }
         }
         self.put_progress(now);
-        self.tilted.age(now);
         // What a player shows while it waits stands.
         if !self.progress.is_some_and(|progress| progress.stands()) && self.scene.age(clock::now_ns()) {
             self.clear();

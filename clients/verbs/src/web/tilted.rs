@@ -1,8 +1,6 @@
 //! What mounts say and what programs like `tilt` make of it, as channels. Angles and points are followed only while a viewer
 //! asks for them. Refuses to know sensors.
 
-use std::time::{Duration, Instant};
-
 use ::web::{Board, ChannelId, messages};
 use scanhub_client::streams::Sample;
 use schema::{Maker, SweepPoints, Topic};
@@ -23,8 +21,6 @@ struct Sweeps {
     obstacles: ChannelId,
     /// Of the sweep that comes.
     points: SweepPoints,
-    /// When the last one says nothing any more.
-    old_at: Option<Instant>,
 }
 
 impl<'a> Tilted<'a> {
@@ -55,7 +51,6 @@ impl<'a> Tilted<'a> {
                 cloud: self.board.channel(messages::cloud_channel(name)),
                 obstacles: self.board.channel(messages::obstacles_channel(name)),
                 points: SweepPoints::default(),
-                old_at: None,
             });
             self.sweeps.len() - 1
         });
@@ -96,28 +91,9 @@ impl<'a> Tilted<'a> {
             Sample::Obstacles(found) => {
                 let sweeps = self.sweeps(&name.sensor);
                 let header = found.header();
-                let lasts = Duration::from_nanos(messages::obstacles_last(header));
-                sweeps.old_at = Instant::now().checked_add(lasts);
                 board.put(sweeps.obstacles, header.wall_ns, &messages::obstacles(header, found));
             }
             _ => {}
-        }
-    }
-
-    /// Takes down what says nothing any more at `now`, for who comes later; those who are there know how long it holds.
-    pub(super) fn age(&mut self, now: Instant) {
-        for sweeps in &mut self.sweeps {
-            if sweeps.old_at.take_if(|old_at| now >= *old_at).is_some() {
-                self.board.clear(sweeps.obstacles);
-            }
-        }
-    }
-
-    /// The hub is gone, and with it what was seen.
-    pub(super) fn forget(&mut self) {
-        for sweeps in &mut self.sweeps {
-            sweeps.old_at = None;
-            self.board.clear(sweeps.obstacles);
         }
     }
 }
@@ -139,5 +115,9 @@ mod tests {
             [Topic::Tilt, Topic::Cloud, Topic::Obstacles].map(|topic| tilted.wants(topic))
         };
         assert_eq!(wants(&tilted), [false, false, true]);
+        assert!(
+            !board.is_wanted(tilted.sweeps[0].obstacles),
+            "how long they hold is told from when they come"
+        );
     }
 }

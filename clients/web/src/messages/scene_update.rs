@@ -11,7 +11,7 @@ use serde::Serialize;
 use super::{bytes, json};
 use crate::board::Channel;
 
-pub use obstacles::{obstacles, obstacles_last};
+pub use obstacles::obstacles;
 
 pub(super) fn channel(topic: &str) -> Channel {
     json(topic.to_owned(), "foxglove.SceneUpdate", include_str!("scene_update.json"))

@@ -7,9 +7,9 @@ use super::{Colour, Cube, Deletion, Entity, Pose, Quaternion, Text, Time, Update
 
 /// A box for each obstacle, with metadata `distance_m`, `points`, `foreground` and `near`, behind an entity without a sign
 /// whose metadata are those of the sweep: `sweep`, `generation`, `complete`, `doubted`, `left_out`, and in `words` what it has found. All of them live for as
-/// long as they say something, see [`obstacles_last`].
+/// long as they say something.
 pub fn obstacles(header: &Header, found: &Obstacles) -> Vec<u8> {
-    let lifetime = || Time::of(obstacles_last(header));
+    let lifetime = || Time::of(lasts_ns(header));
     let mut sweep = Entity { lifetime: lifetime(), ..Entity::new("sweep".to_owned(), header.wall_ns) };
     sweep.tell("sweep", found.sweep.to_string());
     sweep.tell("generation", found.generation.to_string());
@@ -40,7 +40,7 @@ pub fn obstacles(header: &Header, found: &Obstacles) -> Vec<u8> {
 }
 
 /// How long a sweep says what stands there, in ns: until two more could have come, and some time to find that out.
-pub fn obstacles_last(header: &Header) -> u64 {
+fn lasts_ns(header: &Header) -> u64 {
     2 * header.stamp_last_ns.saturating_sub(header.stamp_first_ns).min(LONGEST_NS) + PATIENCE_NS
 }
 
@@ -111,6 +111,6 @@ mod tests {
         other = Obstacles { flags: Obstacles::DOUBTED, ..Obstacles::default() };
         assert_eq!(words(&other), "sweep doubted, its angles contradict what is known");
         assert_eq!((&one["texts"][0]["text"], &one["frame_id"]), (&"1.00 m".into(), &"base_link".into()));
-        assert_eq!(obstacles_last(&Header { stamp_last_ns: u64::MAX, ..header }), 121_000_000_000);
+        assert_eq!(lasts_ns(&Header { stamp_last_ns: u64::MAX, ..header }), 121_000_000_000);
     }
 }
