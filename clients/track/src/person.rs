@@ -20,7 +20,7 @@ pub(crate) struct Person {
     pub(crate) seen_ns: u64,
     /// When each sensor saw him last; 0 never.
     pub(crate) seen_by_ns: [u64; crate::site::SENSORS],
-    /// Scans that spoke for him, at most [`MOST_SUPPORT`].
+    /// Scans that spoke for him, at most [`MOST_SUPPORT`]; one of a slow sensor counts up to twice.
     pub(crate) support: f64,
     /// Scans that showed both legs.
     pub(crate) pairs: f64,
@@ -50,6 +50,9 @@ pub(crate) enum Life {
 /// So many scans make somebody known.
 const ENOUGH: f64 = 8.0;
 pub(crate) const MOST_SUPPORT: f64 = 20.0;
+/// Longest time between two scans of a sensor of which each counts as one. Those of a slower one count up to twice: else
+/// somebody would not be known for a second at 7.5 Hz.
+const FULL_S: f64 = 0.0625;
 /// Nobody is known sooner.
 const SOONEST_NS: u64 = 300_000_000;
 /// Who was seen within this time is not hidden.
@@ -90,15 +93,15 @@ impl Person {
         }
     }
 
-    /// A scan of `sensor` showed `legs` of his.
-    pub(crate) fn seen(&mut self, sensor: usize, legs: usize) {
+    /// A scan of `sensor`, `since_s` after its last one, showed `legs` of his.
+    pub(crate) fn seen(&mut self, sensor: usize, since_s: f64, legs: usize) {
         self.seen_ns = self.at_ns;
         self.seen_by_ns[sensor] = self.at_ns;
         self.absent_s = 0.0;
         let both = if legs > 1 { 1.0 } else { 0.0 };
         self.pairs += both;
         self.both += 0.05 * (both - self.both);
-        self.support = (self.support + 1.0).min(MOST_SUPPORT);
+        self.support = (self.support + (since_s / FULL_S).clamp(1.0, 2.0)).min(MOST_SUPPORT);
         let speed = self.speed();
         if speed > 0.5 {
             // Who turns or gives way is slower than his pace.
@@ -138,5 +141,32 @@ impl Person {
             .filter(|(_, at)| lately(at))
             .map(|(sensor, _): (u32, _)| 1 << sensor)
             .sum()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn somebody_is_known_after_eight_scans_or_fewer_of_a_slow_sensor() {
+        const MS: u64 = 1_000_000;
+        let legs = [-0.1, 0.1].map(|y| Leg { at: [2.0, y], sigma_m: 0.03, is_fresh: true });
+        let known_after_ms = |every_ms: u64| {
+            let mut person = Person::new(1, MS, &legs);
+            let mut after_ms = 0;
+            while !person.is_sure() {
+                after_ms += every_ms;
+                person.predict(MS * (1 + after_ms));
+                person.seen(0, every_ms as f64 * 1e-3, 2);
+            }
+            after_ms
+        };
+        assert_eq!(known_after_ms(10), 300);
+        assert_eq!(known_after_ms(50), 350);
+        assert_eq!(known_after_ms(60), 420);
+        assert_eq!(known_after_ms(100), 500);
+        assert_eq!(known_after_ms(133), 532);
+        assert_eq!(known_after_ms(200), 800);
     }
 }

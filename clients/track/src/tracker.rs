@@ -36,6 +36,8 @@ const GONE_TENTATIVE_S: f64 = 0.25;
 const FORGOTTEN_NS: u64 = 400_000_000;
 /// Who is hidden for so long is.
 const HIDDEN_NS: u64 = 120_000_000_000;
+/// Between two scans of the slowest sensor; what is longer is a gap.
+const SLOWEST_S: f64 = 0.2;
 /// Scans that are not farther apart show the same.
 const AT_ONCE_NS: u64 = 45_000_000;
 /// Two who are nearer, and of whom never two pairs of legs are seen, are one.
@@ -81,13 +83,13 @@ impl Tracker {
     /// Takes the next scan in the order of time.
     pub(crate) fn take(&mut self, sensor: usize, at_ns: u64, scan: &Scan, foreground: &Foreground) {
         self.sights[sensor].take(scan, foreground);
-        let since_s = (at_ns.saturating_sub(self.scan_ns[sensor]) as f64 * 1e-9).min(0.1);
+        let since_s = (at_ns.saturating_sub(self.scan_ns[sensor]) as f64 * 1e-9).min(SLOWEST_S);
         self.scan_ns[sensor] = at_ns;
         self.compare_poses(sensor, at_ns);
         self.walk(at_ns);
         let mut pairs = std::mem::take(&mut self.pairs);
         self.associate(sensor, &mut pairs);
-        self.correct(sensor, &pairs);
+        self.correct(sensor, since_s, &pairs);
         self.miss(sensor, since_s, &pairs);
         self.bear(sensor, at_ns, &pairs);
         self.pairs = pairs;
@@ -174,7 +176,7 @@ impl Tracker {
         }
     }
 
-    fn correct(&mut self, sensor: usize, pairs: &[(usize, usize)]) {
+    fn correct(&mut self, sensor: usize, since_s: f64, pairs: &[(usize, usize)]) {
         let legs = self.sights[sensor].legs();
         for of_one in pairs.chunk_by(|a, b| a.1 / 2 == b.1 / 2) {
             let person = &mut self.persons[of_one[0].1 / 2];
@@ -192,7 +194,7 @@ impl Tracker {
                 *sum += ahead / 2.0;
                 *weight += speed * speed;
             }
-            person.seen(sensor, of_one.len());
+            person.seen(sensor, since_s, of_one.len());
         }
     }
 
