@@ -185,11 +185,11 @@ fn a_hall_is_seen_from_the_side_while_somebody_looks() {
     // Held, it stands; then it goes on.
     page.press(" ");
     page.await_true("document.querySelector('#verdict').innerText.includes('held')");
-    let sweep = page.ask("scanhub.sweeps[0].sweep");
+    let [sweep, points] = ["scanhub.sweeps[0].sweep", "scanhub.swept"].map(|what| page.ask(what));
     page.press("h");
     page.await_true("!scanhub.aside && scanhub.beams > 100");
     page.press("h");
-    page.await_true("scanhub.aside && scanhub.swept > 1000");
+    page.await_true(&format!("scanhub.aside && scanhub.swept > 0 && scanhub.swept === {points}"));
     assert_eq!(page.ask("scanhub.sweeps[0].sweep"), sweep);
     page.press(" ");
     page.await_true(&format!("scanhub.sweeps[0].sweep !== {sweep}"));
