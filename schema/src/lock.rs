@@ -110,8 +110,8 @@ impl Drop for Publishing {
     }
 }
 
-/// Held while services are made in a domain or what is left of unfinished ones is swept away, by hub and listener in
-/// turn.
+/// Held while services are made in a domain or what is left of unfinished ones is swept away, by hub, listener and programs
+/// under a name of their own in turn.
 pub(crate) struct MakingLock {
     _held: Held,
 }
