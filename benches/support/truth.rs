@@ -22,6 +22,8 @@ pub(crate) struct Sent {
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Truth {
     pub(crate) sent: Vec<Sent>,
+    /// What found no room at the host, or not all of it: the rest of a later one may make it whole again.
+    overrun: Vec<Sent>,
     /// When each telegram of measured data ended that the sensor broke off, because it was asked something.
     pub(crate) aborted_ns: Vec<u64>,
     /// Only known once the simulator has ended.
@@ -43,10 +45,11 @@ impl Truth {
                 truth.eeprom_writes = value["eeprom_writes"].as_u64();
             } else if value["kind"] == "data" && value["fault"] == "aborted" {
                 truth.aborted_ns.extend(value["sent_ns"].as_u64());
-            } else if value["kind"] == "data" && value["fault"].is_null() {
+            } else if value["kind"] == "data" && (value["fault"].is_null() || value["fault"] == "overrun") {
                 let hash = value["sha256"].as_str().unwrap_or_default().to_owned();
                 let number = |key: &str| value[key].as_u64().unwrap_or_default();
-                truth.sent.push(Sent { hash, index: number("index"), at_ns: number("sent_ns") });
+                let sent = Sent { hash, index: number("index"), at_ns: number("sent_ns") };
+                if value["fault"].is_null() { &mut truth.sent } else { &mut truth.overrun }.push(sent);
             }
         }
         Ok(truth)
@@ -55,15 +58,17 @@ impl Truth {
     /// When each was due, by its hash, of a sensor that sends one each `every_ns`: some of its neighbours left in time. And for
     /// how long it sent nothing in all although it should have.
     pub(crate) fn due(&self, every_ns: u64) -> (HashMap<&str, Vec<u64>>, u64) {
-        let begin = |sent: &Sent| sent.at_ns.saturating_sub(sent.index * every_ns);
-        let begins: Vec<u64> = self.sent.iter().map(begin).collect();
+        let mut all: Vec<&Sent> = self.sent.iter().chain(&self.overrun).collect();
+        all.sort_by_key(|sent| sent.index);
+        let begin = |sent: &&Sent| sent.at_ns.saturating_sub(sent.index * every_ns);
+        let begins: Vec<u64> = all.iter().map(begin).collect();
         let least = |n: usize| {
             let around = n.saturating_sub(NEIGHBOURS)..(n + NEIGHBOURS).min(begins.len());
             begins[around].iter().copied().min().unwrap_or_default()
         };
         let least: Vec<u64> = (0..begins.len()).map(least).collect();
         let mut due: HashMap<&str, Vec<u64>> = HashMap::new();
-        for (sent, begin) in self.sent.iter().zip(&least) {
+        for (sent, begin) in all.into_iter().zip(&least) {
             due.entry(&sent.hash).or_default().push(begin + sent.index * every_ns);
         }
         let stood = least.windows(2).map(|pair| pair[1].saturating_sub(pair[0])).sum();

@@ -34,16 +34,18 @@ pub(crate) fn packets(domain: &str, sensor: &str, len: usize) -> Outcome<()> {
     }
 }
 
-/// By how much the stamps that a consumer of packets printed are off at most, in ms, where each was `due` at one of those times.
-pub(crate) fn off_ms(lines: &[Line], due: &HashMap<&str, Vec<u64>>) -> Outcome<f64> {
-    let mut worst: Option<u64> = None;
+/// Of the stamps that a consumer of packets printed, each of which was `due` at one of those times: by how much they are off at
+/// most, in ms, and how many by more than `limit_ms`.
+pub(crate) fn off_ms(lines: &[Line], due: &HashMap<&str, Vec<u64>>, limit_ms: f64) -> Outcome<(f64, usize)> {
+    let mut off_ms = Vec::new();
     for line in lines {
         let stamp = line.number(1)?;
         let due = line.words().last().and_then(|hash| due.get(hash));
         let off = due.and_then(|due| due.iter().map(|due| due.abs_diff(stamp)).min());
-        worst = worst.max(off);
+        off_ms.extend(off.map(|ns| ns as f64 / 1e6));
     }
-    Ok(worst.ok_or("no packet is known to the simulator")? as f64 / 1e6)
+    let worst = off_ms.iter().copied().reduce(f64::max).ok_or("no packet is known to the simulator")?;
+    Ok((worst, off_ms.iter().filter(|off| **off > limit_ms).count()))
 }
 
 /// What a consumer printed.

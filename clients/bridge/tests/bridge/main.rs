@@ -52,10 +52,19 @@ fn router(env: &TestEnv, listen: &str, connect: &[&str]) -> Program {
     bridge(env, &flags).0
 }
 
-/// By sensor and topic, the last value of each of these keys that a bridge accounted.
+/// By sensor and topic, the value of each of these keys in the last account of a bridge: in one before it, a sensor that is
+/// received may have had no name yet.
 fn account(outcome: &Outcome, keys: &[&str]) -> BTreeMap<String, Vec<u64>> {
-    let mut rows = BTreeMap::new();
-    for line in outcome.of_class("bridge").iter().filter(|line| !line[keys[0]].is_null()) {
+    let (mut rows, mut is_whole) = (BTreeMap::new(), false);
+    for line in outcome.lines() {
+        // The end of an account of what is received.
+        is_whole |= line["class"] == "bridge_refused";
+        if line["class"] != "bridge" || line[keys[0]].is_null() {
+            continue;
+        }
+        if std::mem::take(&mut is_whole) {
+            rows.clear();
+        }
         let name = format!("{}/{}", text(&line["sensor"]), text(&line["topic"]));
         rows.insert(name, keys.iter().map(|key| line[key].as_u64().unwrap_or_default()).collect());
     }

@@ -3,6 +3,7 @@
 
 use std::collections::{HashMap, HashSet};
 
+use schema::Topic;
 use schema::datagram::{Announce, Head, LIVES, StreamStats};
 
 /// All lives of gateways that were heard, as long as the account keeps them apart.
@@ -35,8 +36,8 @@ pub(super) struct Sensor {
     last: [Option<u32>; TOPICS],
 }
 
-/// More than there are topics.
-const TOPICS: usize = 8;
+/// By number, of which none is 0.
+const TOPICS: usize = Topic::ALL.len() + 1;
 
 impl PeerTable {
     /// Whether nothing of the life that sent `head`, which `stats` has taken, came before.
@@ -185,8 +186,8 @@ impl Delays {
 mod tests {
     use super::*;
 
+    use schema::Zones;
     use schema::datagram::{Announced, HEAD, Packed};
-    use schema::{Topic, Zones};
 
     const MS: u64 = 1_000_000;
 
@@ -242,8 +243,10 @@ mod tests {
         life.announce(0, &announce, 0, 0);
         assert_eq!(life.sensor(0).advance(zones, 75), 0);
         assert_eq!(life.sensor(0).advance(Topic::Scan.number(), 82), 2);
-        assert_eq!(life.sensor(0).advance(Topic::Marks.number(), u32::MAX), 0);
-        assert_eq!(life.sensor(0).advance(Topic::Marks.number(), 1), 1);
+        for topic in Topic::ALL.into_iter().filter(|topic| ![Topic::Zones, Topic::Scan].contains(topic)) {
+            assert_eq!(life.sensor(0).advance(topic.number(), u32::MAX), 0, "{topic:?}");
+            assert_eq!(life.sensor(0).advance(topic.number(), 1), 1, "{topic:?}");
+        }
     }
 
     #[test]
