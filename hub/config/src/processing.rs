@@ -36,7 +36,7 @@ pub struct Early {
 
 impl Default for Early {
     fn default() -> Self {
-        Early { pieces: 3 }
+        Early { pieces: 2 }
     }
 }
 

@@ -10,7 +10,7 @@ use crate::processing::Early;
 
 /// Section `early`.
 #[derive(Clone, Deserialize)]
-#[serde(deny_unknown_fields, expecting = "keys of early, as { pieces = 3 }")]
+#[serde(deny_unknown_fields, expecting = "keys of early, as { pieces = 2 }")]
 pub(super) struct EarlyLayer {
     pieces: Option<Spanned<i64>>,
 }
