@@ -182,6 +182,11 @@ impl People {
                 self.compare_clocks();
             }
         }
+        // Nothing that is still waited for changes these.
+        if until_ns < u64::MAX && self.next_picture_ns > 0 && self.next_picture_ns <= until_ns {
+            self.pictures_until(until_ns + 1, show);
+            self.taken_ns = self.taken_ns.max(self.next_picture_ns - PICTURE_NS);
+        }
     }
 
     /// Pictures before `at_ns`.
@@ -314,5 +319,23 @@ polygon = [[0, 0], [6, 0], [6, 6], [0, 6]]
         assert_eq!(capacity(&people), begin);
         assert!(gone.len() >= 200, "{}", gone.len());
         assert_eq!(people.counts().late, 0);
+    }
+
+    #[test]
+    fn a_picture_comes_as_soon_as_nothing_before_it_is_waited_for() {
+        const MS: u64 = 1_000_000;
+        const BEGIN: u64 = 1_700_000_000_000_000_000;
+        let mut people = People::new(Site::parse("room.toml", ROOM).expect("a room"), 80 * MS);
+        let (scan, foreground) = (scan(None), Foreground::of(BEAMS));
+        let mut take = |after_ms: u64| {
+            let mut pictures = Vec::new();
+            let show = |picture: &Picture| pictures.push((picture.wall_ns - BEGIN) / MS);
+            people.take(0, BEGIN + after_ms * MS, &scan, &foreground, show);
+            (pictures, people.counts().late)
+        };
+        assert_eq!([take(0), take(100)], [(vec![], 0), (vec![], 0)]);
+        assert_eq!(take(200), (vec![40, 80, 120], 0));
+        assert_eq!(take(110), (vec![], 1), "a picture that was shown holds");
+        assert_eq!(take(240), (vec![160], 1));
     }
 }
