@@ -44,7 +44,8 @@ pub(super) struct Table {
     pose: Pose,
     circles: usize,
     radii_mm: [u16; ZONES],
-    sectors: [Sector; SECTORS],
+    /// The robot's own body: so many of these.
+    sectors: ([Sector; SECTORS], usize),
     margin_mm: u16,
     exact: bool,
     no_return_is_far: bool,
@@ -77,14 +78,13 @@ impl Table {
         let mut radii_mm = [0; ZONES];
         radii_mm[..circles].copy_from_slice(&settings.radii_mm[..circles]);
         let mut sectors = [Sector { from_mdeg: 0, to_mdeg: -1, range_mm: 0 }; SECTORS];
-        for (sector, given) in sectors.iter_mut().zip(settings.self_min) {
-            *sector = *given;
-        }
+        let count = settings.self_min.len().min(SECTORS);
+        sectors[..count].copy_from_slice(&settings.self_min[..count]);
         let mut table = Table {
             pose,
             circles,
             radii_mm,
-            sectors,
+            sectors: (sectors, count),
             margin_mm: settings.margin_mm,
             exact: settings.exact,
             no_return_is_far: settings.no_return_is_far,
@@ -280,12 +280,13 @@ impl Table {
 
     /// Where the robot's own body ends along a beam.
     fn self_min_mm(&self, angle: f64) -> u64 {
-        if self.sectors.is_empty() {
+        let sectors = &self.sectors.0[..self.sectors.1];
+        if sectors.is_empty() {
             return 0;
         }
         let angle_mdeg = in_sector_mdeg(angle);
         let here = |sector: &&Sector| (sector.from_mdeg..=sector.to_mdeg).contains(&angle_mdeg);
-        self.sectors.iter().filter(here).map(|sector| u64::from(sector.range_mm)).max().unwrap_or(0)
+        sectors.iter().filter(here).map(|sector| u64::from(sector.range_mm)).max().unwrap_or(0)
     }
 
     /// The ranges in mm between which a beam is inside a circle, 0 and 0 if it never is: `q` is s.u and `square` |s|^2,
