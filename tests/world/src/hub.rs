@@ -99,7 +99,13 @@ fn begin(world: &mut World, shared: &Rc<Shared>, boot: u64) -> Result<Ending, Fa
         }
     };
     if !ending.is_killed {
-        links.into_iter().for_each(|link| link.link.end());
+        let now = world.now();
+        for Running { link, around, .. } in links {
+            around.clock.pass(now);
+            link.end();
+        }
+        // What they say last wakes whoever sleeps.
+        world.ring();
         if let Some(keeper) = &mut keeper {
             keeper.turn(world.now(), wall_ns(world.now()), true);
         }
