@@ -293,17 +293,18 @@ impl Session {
             let reasons = if current.packet == 0 { current.span.reasons } else { 0 };
             let step = f64::from(packet.span()) / 100.0 / (POINTS - 1) as f64;
             let pace = Pace { step, point_ns: f64::from(self.sequence.point_ns()) };
-            self.pace = Some(pace);
             if !current.is_put {
                 if let Place::Next { angle, missing, from, .. } = place
                     && missing > 0
                 {
                     // Up to the points beside it nothing is; they may be in a turn that is not open yet.
                     self.turns.lacks(from + pace.step, angle - pace.step);
-                    if let Some(closed) = self.turns.reach(angle, pace) {
+                    // The head may be slower now than it was in a turn that ends here.
+                    if let Some(closed) = self.turns.reach(angle, self.pace.unwrap_or(pace)) {
                         return Some(closed);
                     }
                 }
+                self.pace = Some(pace);
                 current.is_put = true;
                 put(&mut self.turns, &packet, place, reasons, pace);
             }

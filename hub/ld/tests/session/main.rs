@@ -16,6 +16,7 @@ struct Told {
     /// Points of which range and angle do not belong together.
     wrong: usize,
     first: Nanos,
+    period: Nanos,
     incomplete: bool,
 }
 
@@ -108,8 +109,8 @@ impl Bench {
                         off.min(36_000.0 - off) > 2.0
                     });
                     let wrong = wrong.count();
-                    let (first, incomplete) = (turn.first, turn.incomplete);
-                    self.log.turns.push(Told { points, wrong, first, incomplete });
+                    let (first, period, incomplete) = (turn.first, turn.period, turn.incomplete);
+                    self.log.turns.push(Told { points, wrong, first, period, incomplete });
                 }
             }
         }
@@ -266,6 +267,21 @@ fn what_a_full_buffer_drops_is_missing_and_told() {
     let lost = bench.session.account().lost;
     assert!((92..=95).contains(&lost), "{lost}");
     assert_eq!(bench.session.state(), State::Streaming);
+}
+
+#[test]
+fn a_turn_that_ends_in_a_gap_went_as_fast_as_before_it() {
+    let mut bench = Bench::new(of(Model::Ld19), Head::new(Model::Ld19, 450.0, 3, Damage::default()));
+    // In the twentieth turn it gets slower, but is where it was, a turn aside.
+    bench.run(SECOND + 1_970 * MILLIS);
+    bench.head.points = 450.0 * 19.7 / 18.7;
+    bench.head.cut(bench.now + 200 * MILLIS);
+    bench.now += 200 * MILLIS;
+    bench.read(true);
+    bench.run(4 * SECOND);
+    assert_eq!(bench.session.account().resyncs, 0);
+    let told = bench.log.turns.iter().find(|told| told.incomplete).expect("one with a gap");
+    assert!(told.period.abs_diff(100 * MILLIS) < MILLIS, "{}", told.period);
 }
 
 #[test]
