@@ -154,8 +154,10 @@ impl Sequence {
         let angle = clockwise(last.start, came.start);
         let angle = if angle > 360.0 - BACK { angle - 360.0 } else { angle };
         self.is_whole &= came.adjoins();
-        // What is left of points that lost bytes, or had one too many.
+        // What is left of points that lost bytes, or had one too many; what took less time than points do was none.
         let points = f64::from(1 + (came.skipped + 3) / POINT);
+        let early = if came.adjoins() { 0.0 } else { -late(last.time + points * came.packet_ns, false) };
+        let points = f64::from((points - early.max(0.0) / came.packet_ns).max(1.0) as u32);
         let Some(advance) = self.advance() else {
             if angle > WIDEST {
                 return self.first(came.start);
@@ -343,5 +345,27 @@ mod tests {
         let behind = place(39.0 + 256.8, (39.0 + 256.4) * advance);
         assert!(matches!(behind.step, Step::Gap { .. }), "{behind:?}");
         assert_eq!(((behind.time - BEGIN) / packet_ns).round(), 39.0 + 257.0);
+    }
+
+    #[test]
+    fn what_a_line_puts_between_points_are_no_points() {
+        let (mut sequence, packet_ns, advance) = (Sequence::new(), 217e3, 0.78);
+        let mut place = |n: u32, skipped: u32| {
+            let start = (f64::from(n) * advance % 360.0) as f32;
+            let came = Came { start, skipped, packet_ns };
+            sequence.place_point(came, |time, _| BEGIN + f64::from(n) * packet_ns - time)
+        };
+        (0..3_000).for_each(|n| {
+            place(n, 0);
+        });
+        // 4,693 bytes at once, then 12 after each point, and once a piece of ten points that are gone.
+        place(3_001, 4_693);
+        (3_002..3_050).for_each(|n| {
+            place(n, 12);
+        });
+        let last = place(3_060, 48);
+        assert_eq!(last.step, Step::Next);
+        assert!(((last.time - BEGIN) / packet_ns - 3_060.0).abs() < 1.5, "{last:?}");
+        assert_eq!(sequence.came_and_lost().1, 1 + 10);
     }
 }
