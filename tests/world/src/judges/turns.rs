@@ -5,6 +5,7 @@
 //! A stamp can only be right once the hub has heard a packet without delay: before that, nobody can tell a line that is
 //! late from a scanner that is.
 
+mod found;
 mod points;
 mod sent;
 
@@ -12,7 +13,7 @@ use std::cell::Cell;
 use std::collections::{HashMap, VecDeque};
 use std::rc::Rc;
 
-use lms::{MILLIS, Nanos};
+use lms::{MICROS, MILLIS, Nanos};
 use schema::datagram::Packed;
 use schema::{Header, Scan, State, Status, Topic};
 use sim::ld::TruePoint;
@@ -26,6 +27,8 @@ use crate::topics::Sample;
 /// What each sensor whose head turns measured.
 pub(crate) struct Turns {
     sensors: Vec<OfSensor>,
+    /// Until when the hub does not run, or did not lately.
+    stalled_until: Nanos,
     figures: Figures,
 }
 
@@ -87,7 +90,7 @@ impl Turns {
             arrived_at: 0,
             off: Cell::default(),
         };
-        Turns { sensors: sensors.iter().map(sensor).collect(), figures: Figures::default() }
+        Turns { sensors: sensors.iter().map(sensor).collect(), stalled_until: 0, figures: Figures::default() }
     }
 }
 
@@ -120,9 +123,15 @@ impl Judge for Turns {
                 self.sensors[sensor].begin();
                 self.sensors[sensor].forget_beams(true);
             }
-            Event::HubBegins { .. } => self.sensors.iter_mut().for_each(OfSensor::begin),
+            Event::HubBegins { .. } => {
+                self.stalled_until = 0;
+                self.sensors.iter_mut().for_each(OfSensor::begin);
+            }
+            Event::Stalled { until } => self.stalled_until = until,
+            Event::Healed => self.stalled_until = self.stalled_until.min(at),
             Event::Published { sensor, sample } if self.sensors[sensor].family.turns() => {
-                match self.sensors[sensor].publish(at, sample) {
+                let waited = at < self.stalled_until + CATCHES_UP;
+                match self.sensors[sensor].publish(at, sample, waited) {
                     Ok(figures) => self.figures.add(&figures),
                     Err(words) => say.broken(format!("sensor {sensor}: {words}")),
                 }
@@ -193,8 +202,8 @@ impl OfSensor {
         Some(self.points[first + packet.points - 1].truth.at_ns)
     }
 
-    /// What is wrong with what is published, if it is a scan.
-    fn publish(&mut self, at: Nanos, sample: &Sample) -> Result<Figures, String> {
+    /// What is wrong with what is published, if it is a scan; it may be of packets that `waited` for a hub that stood still.
+    fn publish(&mut self, at: Nanos, sample: &Sample, waited: bool) -> Result<Figures, String> {
         match sample.topic {
             Topic::Status => {
                 let status: Status = bytemuck::pod_read_unaligned(&sample.bytes);
@@ -231,14 +240,14 @@ impl OfSensor {
                 if self.seen.is_some_and(|seen| sample.header.seq > seen) {
                     self.foreign_at = Some(at);
                 }
-                self.check(at, &sample.header, &scan)
+                self.check(at, &sample.header, &scan, waited)
             }
             _ => Ok(Figures::default()),
         }
     }
 
     /// What is wrong with `scan`, whose `header` says when its first beam was measured.
-    fn check(&self, at: Nanos, header: &Header, scan: &Scan) -> Result<Figures, String> {
+    fn check(&self, at: Nanos, header: &Header, scan: &Scan, waited: bool) -> Result<Figures, String> {
         let stamp = header.stamp_first_ns;
         let is_marked = scan.is_incomplete() || header.reasons != 0;
         let is_foreign = self.foreign_at.is_some_and(|foreign_at| at < foreign_at + FOREIGN);
@@ -258,6 +267,13 @@ impl OfSensor {
             |settled_at: Nanos| learned_at.is_some_and(|learned_at| settled_at + settles < learned_at);
         let is_settled = self.settled_at.is_some_and(is_learned) && !is_crowded;
         let (mut points, mut shift) = (found(0), 0);
+        // Of packets without a clock that waited it is seen later how many whole turns are missing in a gap between them.
+        let is_open = waited && scan.is_incomplete() && !self.exactness.has_clock;
+        if let Some(gap) = points.iter().position(Option::is_none).filter(|gap| is_open && *gap > 0)
+            && self.is_of_later_turn(&told[gap..], Nanos::from(header.period_us) * MICROS, lenience)
+        {
+            return Ok(Figures { scans: 1, incomplete: 1, ..Figures::default() });
+        }
         if points.contains(&None) {
             shift = self.shift(&told);
             points = found(shift);
@@ -313,52 +329,12 @@ impl OfSensor {
         }
         Ok(figures)
     }
-
-    /// The point that `told` is, if it was measured `shift` after what is told, or less than `lenience` beside.
-    fn find(&self, told: &Told, shift: i64, lenience: Nanos) -> Option<&Point> {
-        let at_ns = told.at_ns.saturating_add_signed(shift);
-        let begin = self.points.partition_point(|point| point.truth.at_ns + lenience < at_ns);
-        let near = self.points.range(begin..).take_while(|point| point.truth.at_ns <= at_ns + lenience);
-        near.into_iter().find(|point| point.is(told, &self.exactness))
-    }
-
-    /// How many points of `told` are where nothing was measured within 5 cm.
-    fn wrong(&self, told: &[Told], shift: i64) -> u64 {
-        let exactness = Exactness { angle_deg: 1.0, range_mm: 50.0, ..self.exactness };
-        let is_wrong = |told: &&Told| {
-            let at_ns = told.at_ns.saturating_add_signed(shift);
-            let begin = self.points.partition_point(|point| point.truth.at_ns + FAR_NS < at_ns);
-            let mut near = self.points.range(begin..).take_while(|point| point.truth.at_ns <= at_ns + FAR_NS);
-            !near.any(|point| point.is(told, &exactness))
-        };
-        told.iter().filter(is_wrong).count() as u64
-    }
-
-    /// By how much most points were measured later than is told. From turn to turn a head is nearly where it was before: of the
-    /// turns that fit, the one that fits best.
-    fn shift(&self, told: &[Told]) -> i64 {
-        let Some(first) = told.iter().find(|told| told.range_mm.is_some()) else { return 0 };
-        let fit = |told: &mut dyn Iterator<Item = &Told>, shift: i64| {
-            told.filter(|told| self.find(told, shift, NEAR).is_some()).count()
-        };
-        let some = told.len().div_ceil(16);
-        let candidates = self.points.iter().filter(|point| point.is(first, &self.exactness));
-        let shifts = candidates.map(|point| point.truth.at_ns as i64 - first.at_ns as i64);
-        let mut shifts: Vec<_> =
-            shifts.map(|shift| (fit(&mut told.iter().step_by(some), shift), shift)).collect();
-        let most = shifts.iter().map(|(count, _)| *count).max().unwrap_or(0);
-        shifts.retain(|(count, _)| count + 1 >= most);
-        let best = shifts.iter().max_by_key(|(_, shift)| (fit(&mut told.iter(), *shift), -shift.abs()));
-        best.map_or(0, |(_, shift)| *shift)
-    }
 }
 
 /// A point may lie so far before one that was measured before it.
 const BACK_DEG: f64 = 40.0;
 /// The first point of a packet was measured no longer before the last one.
 const LONGEST: Nanos = 60 * MILLIS;
-/// A wrong point is where nothing was measured in so long.
-const FAR_NS: Nanos = 15 * MILLIS;
 /// A stamp is off by no more; a later point by a tenth of the time since it more, while the head changes its speed.
 const NEAR: Nanos = 5 * MILLIS;
 /// A packet is on its way, or in the port, for no longer.
@@ -375,6 +351,8 @@ const LONG_GAP: Nanos = 300 * MILLIS;
 const CROWDED: Nanos = 9_000 * MILLIS;
 /// For so long after a packet that nobody sent turns may have points of it.
 const FOREIGN: Nanos = 2_000 * MILLIS;
+/// A hub that stood still has read all that waited within so long.
+const CATCHES_UP: Nanos = 10 * MILLIS;
 /// Nobody switches a power off and on sooner.
 const POWER_OFF: Nanos = 50 * MILLIS;
 /// What was measured is remembered for so long, and so many packets are.
