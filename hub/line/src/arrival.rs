@@ -51,7 +51,28 @@ impl Arrivals {
     pub fn earliest(&self, offset: u64, byte_ns: f64, packet_len: usize) -> Option<Nanos> {
         let oldest = self.next.saturating_sub(Arrivals::CAPACITY);
         let read = |n: usize| self.reads[n % Arrivals::CAPACITY];
-        let n = (oldest + 1..self.next).rev().find(|&n| read(n - 1).0 <= offset)?;
+        // Of what waited in a tty that was full the last piece is shorter, and some more may come a moment later.
+        let is_rest = |n: usize| {
+            n > oldest + 2 && {
+                let ((first, since), (begin, before)) = (read(n - 2), read(n - 1));
+                let sent = (begin - first) as f64 * byte_ns;
+                first - read(n - 3).0 >= TTY as u64 && sent > 1.25 * before.saturating_sub(since) as f64
+            }
+        };
+        let n = self.read_of(offset).filter(|&n| !is_rest(n))?;
+        self.came(n, offset, byte_ns, packet_len)
+    }
+
+    /// The read that brought byte number `offset`, or the newest one before.
+    fn read_of(&self, offset: u64) -> Option<usize> {
+        let oldest = self.next.saturating_sub(Arrivals::CAPACITY);
+        (oldest + 1..self.next).rev().find(|&n| self.reads[(n - 1) % Arrivals::CAPACITY].0 <= offset)
+    }
+
+    /// When byte number `offset` of read `n` was there at the earliest, if all that waited before was read.
+    fn came(&self, n: usize, offset: u64, byte_ns: f64, packet_len: usize) -> Option<Nanos> {
+        let oldest = self.next.saturating_sub(Arrivals::CAPACITY);
+        let read = |n: usize| self.reads[n % Arrivals::CAPACITY];
         let ((begin, before), (end, now)) = (read(n - 1), read(n));
         let is_rest = n > oldest + 1 && begin - read(n - 2).0 >= TTY as u64;
         let sent = (end - begin).saturating_sub(packet_len as u64) as f64 * byte_ns;
@@ -68,7 +89,8 @@ impl Arrivals {
     /// As [`earliest`](Self::earliest), of a byte before which others are missing. Of what had waited in a tty that was full it is
     /// known where nearly nothing waited behind it: it came when there was room again, or shortly before.
     pub fn earliest_behind_gap(&self, offset: u64, byte_ns: f64, packet_len: usize) -> Option<Nanos> {
-        self.earliest(offset, byte_ns, packet_len).or_else(|| {
+        let came = self.read_of(offset).and_then(|n| self.came(n, offset, byte_ns, packet_len));
+        came.or_else(|| {
             let oldest = self.next.saturating_sub(Arrivals::CAPACITY);
             let read = |n: usize| self.reads[n % Arrivals::CAPACITY];
             let newest = self.next.checked_sub(1)?;
@@ -151,6 +173,13 @@ mod tests {
         arrivals.note(at(2_500), 4_095);
         arrivals.note(at(2_501), 60);
         assert_eq!(arrivals.earliest(4_300, byte_ns, 84), None);
+        // Also behind the last piece of what waited, which is shorter.
+        arrivals.note(at(3_500), 4_095);
+        arrivals.note(at(3_501), 4_056);
+        arrivals.note(at(3_507), 70);
+        let rest = 84 + 84 + 4_095 + 60 + 4_095 + 4_056;
+        assert_eq!(arrivals.earliest(rest + 40, byte_ns, 84), None);
+        assert_eq!(arrivals.earliest_behind_gap(rest + 40, byte_ns, 84), Some(at(3_504)));
     }
 
     #[test]
