@@ -49,32 +49,58 @@ impl Arrivals {
     /// those of a packet of `packet_len` maybe at once; nothing where that is not known: more came at once than was sent
     /// since the read before, so it had waited.
     pub fn earliest(&self, offset: u64, byte_ns: f64, packet_len: usize) -> Option<Nanos> {
-        let oldest = self.next.saturating_sub(Arrivals::CAPACITY);
-        let read = |n: usize| self.reads[n % Arrivals::CAPACITY];
         // Of what waited in a tty that was full the last piece is shorter, and some more may come a moment later.
         let is_rest = |n: usize| {
-            n > oldest + 2 && {
-                let ((first, since), (begin, before)) = (read(n - 2), read(n - 1));
-                let sent = (begin - first) as f64 * byte_ns;
-                first - read(n - 3).0 >= TTY as u64 && sent > 1.25 * before.saturating_sub(since) as f64
-            }
+            n > self.oldest() + 2
+                && self.read(n - 2).0 - self.read(n - 3).0 >= TTY as u64
+                && self.brought_more(n - 1, byte_ns)
         };
         let n = self.read_of(offset).filter(|&n| !is_rest(n))?;
         self.came(n, offset, byte_ns, packet_len)
     }
 
+    /// As [`earliest`](Self::earliest), of a byte before which others are missing, so that it is no rest of what waited. Of what
+    /// had waited in a tty that was full it is known where nearly nothing waited behind it: it came when there was room again, or
+    /// shortly before.
+    pub fn earliest_behind_gap(&self, offset: u64, byte_ns: f64, packet_len: usize) -> Option<Nanos> {
+        let came = self.read_of(offset).and_then(|n| self.came(n, offset, byte_ns, packet_len));
+        came.or_else(|| {
+            let newest = self.next.checked_sub(1)?;
+            // Since the first of those that brought more than was sent since the one before, one behind the other.
+            let reads = (self.oldest() + 1..=newest).rev();
+            let first = reads.take_while(|&n| self.brought_more(n, byte_ns)).last()?;
+            let ((begin, since), (end, now)) = (self.read(first - 1), self.read(newest));
+            let behind = end.saturating_sub(offset + ROOM) as f64 * byte_ns;
+            let was_full = end - begin >= TTY as u64;
+            (was_full && behind <= 1.25 * now.saturating_sub(since) as f64).then_some(since)
+        })
+    }
+
+    /// The oldest read that is known.
+    fn oldest(&self) -> usize {
+        self.next.saturating_sub(Arrivals::CAPACITY)
+    }
+
+    /// The number of the byte after the last one of read `n`, and when it was.
+    fn read(&self, n: usize) -> (u64, Nanos) {
+        self.reads[n % Arrivals::CAPACITY]
+    }
+
     /// The read that brought byte number `offset`, or the newest one before.
     fn read_of(&self, offset: u64) -> Option<usize> {
-        let oldest = self.next.saturating_sub(Arrivals::CAPACITY);
-        (oldest + 1..self.next).rev().find(|&n| self.reads[(n - 1) % Arrivals::CAPACITY].0 <= offset)
+        (self.oldest() + 1..self.next).rev().find(|&n| self.read(n - 1).0 <= offset)
+    }
+
+    /// Whether read `n` brought more than was sent since the one before.
+    fn brought_more(&self, n: usize, byte_ns: f64) -> bool {
+        let ((begin, before), (end, now)) = (self.read(n - 1), self.read(n));
+        (end - begin) as f64 * byte_ns > 1.25 * now.saturating_sub(before) as f64
     }
 
     /// When byte number `offset` of read `n` was there at the earliest, if all that waited before was read.
     fn came(&self, n: usize, offset: u64, byte_ns: f64, packet_len: usize) -> Option<Nanos> {
-        let oldest = self.next.saturating_sub(Arrivals::CAPACITY);
-        let read = |n: usize| self.reads[n % Arrivals::CAPACITY];
-        let ((begin, before), (end, now)) = (read(n - 1), read(n));
-        let is_rest = n > oldest + 1 && begin - read(n - 2).0 >= TTY as u64;
+        let ((begin, before), (end, now)) = (self.read(n - 1), self.read(n));
+        let is_rest = n > self.oldest() + 1 && begin - self.read(n - 2).0 >= TTY as u64;
         let sent = (end - begin).saturating_sub(packet_len as u64) as f64 * byte_ns;
         // Behind what a tty hands out at once it may hand out some more a moment later, which says nothing.
         if offset >= end || is_rest || sent > 1.25 * now.saturating_sub(before) as f64 {
@@ -84,27 +110,6 @@ impl Arrivals {
         let behind = (end - offset) as f64 * byte_ns;
         let came = if end - begin <= ROOM { now.saturating_sub(behind as Nanos) } else { 0 };
         Some(came.max(before))
-    }
-
-    /// As [`earliest`](Self::earliest), of a byte before which others are missing. Of what had waited in a tty that was full it is
-    /// known where nearly nothing waited behind it: it came when there was room again, or shortly before.
-    pub fn earliest_behind_gap(&self, offset: u64, byte_ns: f64, packet_len: usize) -> Option<Nanos> {
-        let came = self.read_of(offset).and_then(|n| self.came(n, offset, byte_ns, packet_len));
-        came.or_else(|| {
-            let oldest = self.next.saturating_sub(Arrivals::CAPACITY);
-            let read = |n: usize| self.reads[n % Arrivals::CAPACITY];
-            let newest = self.next.checked_sub(1)?;
-            let is_more = |n: &usize| {
-                let ((begin, before), (end, now)) = (read(n - 1), read(*n));
-                (end - begin) as f64 * byte_ns > 1.25 * now.saturating_sub(before) as f64
-            };
-            // Since the first of those that brought more than was sent since the one before, one behind the other.
-            let first = (oldest + 1..=newest).rev().take_while(is_more).last()?;
-            let ((begin, since), (end, now)) = (read(first - 1), read(newest));
-            let behind = end.saturating_sub(offset + ROOM) as f64 * byte_ns;
-            let was_full = end - begin >= TTY as u64;
-            (was_full && behind <= 1.25 * now.saturating_sub(since) as f64).then_some(since)
-        })
     }
 }
 
