@@ -10,6 +10,18 @@ pub struct Arrivals {
     total: u64,
 }
 
+/// How a scanner sends: bytes `byte_ns` nanoseconds apart on the whole, but those of a packet of `packet_len` maybe at once, or as
+/// fast as a line of `pace` bits per second lets them.
+#[derive(Clone, Copy, Debug)]
+pub struct Flow {
+    /// Nanoseconds from one byte to the next in the mean.
+    pub byte_ns: f64,
+    /// Bytes of a packet.
+    pub packet_len: usize,
+    /// Bits per second of the line, if it is one.
+    pub pace: Option<u32>,
+}
+
 impl Arrivals {
     /// A packet in pieces of 16 bytes, and the one that begins inside it.
     const CAPACITY: usize = 8;
@@ -45,32 +57,29 @@ impl Arrivals {
         latest
     }
 
-    /// When byte number `offset` was there at the earliest, in a stream of which bytes come `byte_ns` apart on the whole, but
-    /// those of a packet of `packet_len` maybe at once; nothing where that is not known: more came at once than was sent
-    /// since the read before, so it had waited.
-    pub fn earliest(&self, offset: u64, byte_ns: f64, packet_len: usize) -> Option<Nanos> {
+    /// When byte number `offset` of a stream was there at the earliest; nothing where that is not known: more came at once than
+    /// was sent since the read before, so it had waited.
+    pub fn earliest(&self, offset: u64, flow: Flow) -> Option<Nanos> {
         // Of what waited in a tty that was full the last piece is shorter, and some more may come a moment later.
         let is_rest = |n: usize| {
             n > self.oldest() + 2
                 && self.read(n - 2).0 - self.read(n - 3).0 >= TTY as u64
-                && self.brought_more(n - 1, byte_ns)
+                && self.brought_more(n - 1, flow)
         };
         let n = self.read_of(offset).filter(|&n| !is_rest(n))?;
-        self.came(n, offset, byte_ns, packet_len)
+        self.came(n, offset, flow)
     }
 
     /// As [`earliest`](Self::earliest), of a byte before which others are missing, so that it is no rest of what waited. Of what
     /// had waited in a tty that was full it is known where nearly nothing waited behind it: it came when there was room again, or
     /// shortly before.
-    pub fn earliest_behind_gap(&self, offset: u64, byte_ns: f64, packet_len: usize) -> Option<Nanos> {
-        let came = self.read_of(offset).and_then(|n| self.came(n, offset, byte_ns, packet_len));
-        came.or_else(|| {
-            let newest = self.next.checked_sub(1)?;
+    pub fn earliest_behind_gap(&self, offset: u64, flow: Flow) -> Option<Nanos> {
+        let n = self.read_of(offset)?;
+        self.came(n, offset, flow).or_else(|| {
             // Since the first of those that brought more than was sent since the one before, one behind the other.
-            let reads = (self.oldest() + 1..=newest).rev();
-            let first = reads.take_while(|&n| self.brought_more(n, byte_ns)).last()?;
-            let ((begin, since), (end, now)) = (self.read(first - 1), self.read(newest));
-            let behind = end.saturating_sub(offset + ROOM) as f64 * byte_ns;
+            let first = (self.oldest() + 1..=n).rev().take_while(|&n| self.brought_more(n, flow)).last()?;
+            let ((begin, since), (end, now)) = (self.read(first - 1), self.read(n));
+            let behind = end.saturating_sub(offset + ROOM) as f64 * flow.byte_ns;
             let was_full = end - begin >= TTY as u64;
             (was_full && behind <= 1.25 * now.saturating_sub(since) as f64).then_some(since)
         })
@@ -92,23 +101,28 @@ impl Arrivals {
     }
 
     /// Whether read `n` brought more than was sent since the one before.
-    fn brought_more(&self, n: usize, byte_ns: f64) -> bool {
+    fn brought_more(&self, n: usize, flow: Flow) -> bool {
         let ((begin, before), (end, now)) = (self.read(n - 1), self.read(n));
-        (end - begin) as f64 * byte_ns > 1.25 * now.saturating_sub(before) as f64
+        (end - begin) as f64 * flow.byte_ns > 1.25 * now.saturating_sub(before) as f64
     }
 
     /// When byte number `offset` of read `n` was there at the earliest, if all that waited before was read.
-    fn came(&self, n: usize, offset: u64, byte_ns: f64, packet_len: usize) -> Option<Nanos> {
+    fn came(&self, n: usize, offset: u64, flow: Flow) -> Option<Nanos> {
         let ((begin, before), (end, now)) = (self.read(n - 1), self.read(n));
         let is_rest = n > self.oldest() + 1 && begin - self.read(n - 2).0 >= TTY as u64;
-        let sent = (end - begin).saturating_sub(packet_len as u64) as f64 * byte_ns;
+        let sent = (end - begin).saturating_sub(flow.packet_len as u64) as f64 * flow.byte_ns;
         // Behind what a tty hands out at once it may hand out some more a moment later, which says nothing.
         if offset >= end || is_rest || sent > 1.25 * now.saturating_sub(before) as f64 {
             return None;
         }
+        let line_time = |bytes: u64| flow.pace.map_or(0, |baud| line_time(bytes as usize, baud));
+        let packet = flow.packet_len as u64;
+        // The packet took its time on the line, as far as it is of this read.
+        let before = (before + line_time((offset + 1 - begin).min(packet))).min(now);
         // So few find room anywhere: if they were dropped that came then, these would have been too.
-        let behind = (end - offset) as f64 * byte_ns;
-        let came = if end - begin <= ROOM { now.saturating_sub(behind as Nanos) } else { 0 };
+        let idle = (packet as f64 * flow.byte_ns) as Nanos;
+        let behind = ((end - offset) as f64 * flow.byte_ns) as Nanos + idle.saturating_sub(line_time(packet));
+        let came = if end - begin <= ROOM { now.saturating_sub(behind) } else { 0 };
         Some(came.max(before))
     }
 }
@@ -142,72 +156,78 @@ mod tests {
         assert_eq!(arrivals.latest(300, Some(1_000_000)), 3_000_000 - 39 * byte);
     }
 
+    /// Bytes that come one by one, `byte_ns` apart.
+    fn evenly(byte_ns: f64) -> Flow {
+        Flow { byte_ns, packet_len: 0, pace: None }
+    }
+
     #[test]
     fn what_had_waited_may_have_been_there_long_before() {
-        let (mut arrivals, byte_ns) = (Arrivals::default(), 100_000.0);
+        let (mut arrivals, flow) = (Arrivals::default(), evenly(100_000.0));
         let at = |millis: Nanos| millis * MILLIS;
         arrivals.note(at(1_000), 50);
         arrivals.note(at(1_005), 50);
-        assert_eq!(arrivals.earliest(10, byte_ns, 0), None, "nothing was read before");
-        assert_eq!(arrivals.earliest(60, byte_ns, 0), Some(at(1_001)));
+        assert_eq!(arrivals.earliest(10, flow), None, "nothing was read before");
+        assert_eq!(arrivals.earliest(60, flow), Some(at(1_001)));
         arrivals.note(at(2_005), 100);
-        assert_eq!(arrivals.earliest(100, byte_ns, 0), Some(at(1_995)), "nothing was sent before");
+        assert_eq!(arrivals.earliest(100, flow), Some(at(1_995)), "nothing was sent before");
         arrivals.note(at(3_005), 4_000);
         assert_eq!(
-            arrivals.earliest(4_100, byte_ns, 0),
+            arrivals.earliest(4_100, flow),
             Some(at(2_005)),
             "behind it others may have found no room"
         );
         arrivals.note(at(3_010), 700);
-        assert_eq!(arrivals.earliest(4_300, byte_ns, 0), None, "all of it waited");
+        assert_eq!(arrivals.earliest(4_300, flow), None, "all of it waited");
         arrivals.note(at(3_015), 50);
-        assert_eq!(arrivals.earliest(4_910, byte_ns, 0), Some(at(3_011)));
+        assert_eq!(arrivals.earliest(4_910, flow), Some(at(3_011)));
     }
 
     #[test]
     fn packets_come_in_one_piece() {
-        let (mut arrivals, byte_ns) = (Arrivals::default(), 100_000.0);
+        let (mut arrivals, flow) = (Arrivals::default(), evenly(100_000.0));
+        let packets = Flow { packet_len: 84, ..flow };
+        let on_a_line = Flow { pace: Some(400_000), ..packets };
         let at = |millis: Nanos| millis * MILLIS;
         arrivals.note(at(1_000), 84);
         // Nothing was sent for a while, then a packet as fast as the line goes.
         arrivals.note(at(1_500), 16);
         arrivals.note(at(1_505), 68);
-        assert_eq!(arrivals.earliest(167, byte_ns, 0), None);
-        assert_eq!(arrivals.earliest(167, byte_ns, 84), Some(at(1_505) - 100_000));
+        assert_eq!(arrivals.earliest(167, flow), None);
+        assert_eq!(arrivals.earliest(167, packets), Some(at(1_500)), "at once, and nothing since");
+        assert_eq!(arrivals.earliest(167, on_a_line), Some(at(1_500) + line_time(68, 400_000)));
         // What a read leaves had waited, however little it is.
         arrivals.note(at(2_500), 4_095);
         arrivals.note(at(2_501), 60);
-        assert_eq!(arrivals.earliest(4_300, byte_ns, 84), None);
+        assert_eq!(arrivals.earliest(4_300, packets), None);
         // Also behind the last piece of what waited, which is shorter.
         arrivals.note(at(3_500), 4_095);
         arrivals.note(at(3_501), 4_056);
         arrivals.note(at(3_507), 70);
         let rest = 84 + 84 + 4_095 + 60 + 4_095 + 4_056;
-        assert_eq!(arrivals.earliest(rest + 40, byte_ns, 84), None);
-        assert_eq!(arrivals.earliest_behind_gap(rest + 40, byte_ns, 84), Some(at(3_504)));
+        assert_eq!(arrivals.earliest(rest + 40, packets), None);
+        assert_eq!(arrivals.earliest_behind_gap(rest + 40, packets), Some(at(3_501)));
     }
 
     #[test]
     fn what_comes_to_a_full_tty_finds_room_once_it_is_read() {
-        let (mut arrivals, byte_ns) = (Arrivals::default(), 15_000.0);
+        let mut arrivals = Arrivals::default();
+        let packets = Flow { packet_len: 84, ..evenly(15_000.0) };
         let at = |millis: Nanos| millis * MILLIS;
         arrivals.note(at(1_000), 420);
         // A tty may take its time to hand out more.
         let reads = [(1_500, 4_095), (1_501, 4_095), (1_502, 900), (1_507, 4_095)];
         reads.iter().for_each(|&(ms, len)| arrivals.note(at(ms), len));
         let end = 420 + 3 * 4_095 + 900;
-        assert_eq!(arrivals.earliest_behind_gap(end - 100, byte_ns, 84), Some(at(1_500)));
-        let early = arrivals.earliest_behind_gap(end - 4_000, byte_ns, 84);
+        assert_eq!(arrivals.earliest_behind_gap(end - 100, packets), Some(at(1_500)));
+        let early = arrivals.earliest_behind_gap(end - 4_000, packets);
         assert_eq!(early, None, "it waited, or what is behind it did");
         arrivals.note(at(1_508), 2_000);
-        assert_eq!(arrivals.earliest_behind_gap(end + 1_700, byte_ns, 84), Some(at(1_500)));
-        assert_eq!(arrivals.earliest_behind_gap(end + 500, byte_ns, 84), None);
-        assert_eq!(arrivals.earliest(end + 1_700, byte_ns, 84), None);
+        assert_eq!(arrivals.earliest_behind_gap(end + 1_700, packets), Some(at(1_500)));
+        assert_eq!(arrivals.earliest_behind_gap(end + 500, packets), None);
+        assert_eq!(arrivals.earliest(end + 1_700, packets), None);
         arrivals.note(at(1_513), 336);
-        assert_eq!(
-            arrivals.earliest_behind_gap(end + 2_100, byte_ns, 84),
-            Some(at(1_508)),
-            "as without a gap"
-        );
+        assert_eq!(arrivals.earliest_behind_gap(end + 1_700, packets), Some(at(1_500)), "known later, too");
+        assert_eq!(arrivals.earliest_behind_gap(end + 2_100, packets), Some(at(1_508)), "as without a gap");
     }
 }

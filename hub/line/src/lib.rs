@@ -19,7 +19,7 @@ pub mod suspect;
 mod turning;
 mod turns;
 
-pub use arrival::Arrivals;
+pub use arrival::{Arrivals, Flow};
 pub use buffer::{Buffer, Tally};
 pub use reads::Reads;
 pub use sensor_clock::SensorClock;

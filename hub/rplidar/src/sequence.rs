@@ -135,8 +135,9 @@ impl Sequence {
         let angle = angle + 360.0 * turn.missing(late(last.time + turn.time(angle)));
         let packets = f64::from((angle / advance + 0.5) as u32);
         // In a long gap a head may have changed its speed: then the time tells better how many there were.
-        let most = 0.1 * packets;
-        let off = (late(last.time + packets * came.packet_ns) / came.packet_ns).clamp(-most, most) as i32;
+        let most = f64::from((0.1 * packets) as u32);
+        let late_by = late(last.time + packets * came.packet_ns) / came.packet_ns;
+        let off = (late_by + 0.5f64.copysign(late_by)).clamp(-most, most) as i32;
         let packets = packets + f64::from(off);
         let tolerance = advance * ((0.25 + 0.01 * packets).min(0.5) + f64::from(off.abs()));
         let late = late(last.time + packets * came.packet_ns);
@@ -333,6 +334,23 @@ mod tests {
             }
             assert_eq!(sequence.came_and_lost(), (400, 0), "{steps}");
         }
+    }
+
+    /// Packets are counted by the time where the angle leaves it open, to the nearest.
+    #[test]
+    fn over_a_long_gap_the_time_tells_how_many_packets_there_were() {
+        let (mut sequence, packet_ns, advance) = (Sequence::new(), 12e6, 32.57);
+        let mut place = |n: f64, angle: f64| {
+            let came = Came { start: (angle % 360.0) as f32, skipped: 0, packet_ns };
+            sequence.place(came, |time, _| BEGIN + n * packet_ns - time)
+        };
+        (0..40).map(f64::from).for_each(|n| {
+            place(n, n * advance);
+        });
+        // The head turned by 0.2 % slower.
+        let behind = place(39.0 + 256.8, (39.0 + 256.4) * advance);
+        assert!(matches!(behind.step, Step::Gap { .. }), "{behind:?}");
+        assert_eq!(((behind.time - BEGIN) / packet_ns).round(), 39.0 + 257.0);
     }
 
     #[test]

@@ -1,7 +1,9 @@
 //! What becomes of packets: they are dated and handed out, and their points go into turns. Of a packet of several points these
 //! are known once the next one came, and only if nothing was between.
 
-use line::{Closed, MILLIS, Nanos, Pace, Packets, Received, SensorClock, State, Turn, Turns, line_time};
+use line::{
+    Closed, Flow, MILLIS, Nanos, Pace, Packets, Received, SensorClock, State, Turn, Turns, line_time,
+};
 
 use super::dialogue::Ask;
 use super::{MOST_POINTS, Phase, SILENCE, Session};
@@ -110,11 +112,12 @@ impl Session {
                     if at <= due {
                         return -((due - at) as f64);
                     }
-                    let (arrivals, byte_ns) = (self.reads.arrivals(), packet_ns / len as f64);
+                    let flow = Flow { byte_ns: packet_ns / len as f64, packet_len: len, pace };
+                    let arrivals = self.reads.arrivals();
                     let least = if is_behind_gap {
-                        arrivals.earliest_behind_gap(end(n), byte_ns, len)
+                        arrivals.earliest_behind_gap(end(n), flow)
                     } else {
-                        arrivals.earliest(end(n), byte_ns, len)
+                        arrivals.earliest(end(n), flow)
                     };
                     // One that waited is late for another reason.
                     least.unwrap_or(0).saturating_sub(packet_time + due) as f64
