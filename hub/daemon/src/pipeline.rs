@@ -300,10 +300,17 @@ impl BackgroundStage {
         spare: &mut Foreground,
     ) -> Option<Relearned> {
         let before = self.model.generation();
-        let out = out.unwrap_or(spare);
-        self.model.update(scan, out);
-        // Also if nobody wants it: the segments of the next scan are supported by the points of this one.
-        self.cutter.update(scan, out);
+        match out {
+            Some(out) => {
+                self.model.update(scan, out);
+                self.cutter.update(scan, out);
+            }
+            // The segments of the next scan are supported by the points of this one.
+            None => {
+                self.model.update(scan, spare);
+                self.cutter.pass(scan, spare);
+            }
+        }
         let scans = u32::from(!self.model.is_frozen());
         self.learned = self.learned.saturating_add(scans);
         self.handed_on.1 = self.handed_on.1.saturating_add(scans);

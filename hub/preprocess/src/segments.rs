@@ -83,31 +83,19 @@ impl Segmenter {
             None => left_out = left_out.saturating_add(1),
         };
         let mut open: Option<Open> = None;
-        let (mut ranges, exact_angles) = (ranges.iter(), scan.exact_angles());
-        for (byte, &bits) in bits.iter().enumerate() {
-            let mut rest = bits;
-            while rest != 0 {
-                let beam = 8 * byte + rest.trailing_zeros() as usize;
-                rest &= rest - 1;
-                let (Some(&range), Some(&even)) = (ranges.next(), self.directions.get(beam)) else { break };
-                let range_mm = f64::from(range) * unit_mm;
-                let exact = exact_angles.get(beam).filter(|exact| exact.is_finite());
-                let exact = exact.map(|&exact| f64::from(exact));
-                let (x, y) = exact.map_or(even, |exact| self.pose.direction(exact));
-                let point = (range_mm * x, range_mm * y);
-                now.add(point);
-                match &mut open {
-                    Some(open) if open.last + 1 == beam && self.joins(open, range_mm, exact) => {
-                        open.add(beam, range, (range_mm, exact), point);
-                    }
-                    _ => {
-                        if let Some(done) = open.replace(Open::new(beam, range, (range_mm, exact), point)) {
-                            put(&done, &self.pose);
-                        }
+        self.each_point(scan, bits, ranges, |beam, range, seen, point| {
+            now.add(point);
+            match &mut open {
+                Some(open) if open.last + 1 == beam && self.joins(open, seen) => {
+                    open.add(beam, range, seen, point);
+                }
+                _ => {
+                    if let Some(done) = open.replace(Open::new(beam, range, seen, point)) {
+                        put(&done, &self.pose);
                     }
                 }
             }
-        }
+        });
         if let Some(done) = open {
             put(&done, &self.pose);
         }
@@ -118,8 +106,44 @@ impl Segmenter {
         self.room = replace(&mut self.before, now);
     }
 
+    /// As [`update`](Self::update) for a foreground of which nobody wants the segments: what supports the next ones is remembered.
+    pub fn pass(&mut self, scan: &Scan, foreground: &mut Foreground) {
+        self.point(scan);
+        let mut now = take(&mut self.room);
+        now.used = 0;
+        let head = **foreground;
+        let ForegroundArrays { bits, ranges, .. } = foreground.begin(head);
+        self.each_point(scan, bits, ranges, |_, _, _, point| now.add(point));
+        self.room = replace(&mut self.before, now);
+    }
+
+    /// Says of each beam whose bit is set its `ranges`, in mm too and with its exact angle, if it has one, and its point.
+    fn each_point(
+        &self,
+        scan: &Scan,
+        bits: &[u8],
+        ranges: &[u16],
+        mut say: impl FnMut(usize, u16, (f64, Option<f64>), (f64, f64)),
+    ) {
+        let unit_mm = f64::from(scan.unit_um) / 1000.0;
+        let (mut ranges, exact_angles) = (ranges.iter(), scan.exact_angles());
+        for (byte, &bits) in bits.iter().enumerate() {
+            let mut rest = bits;
+            while rest != 0 {
+                let beam = 8 * byte + rest.trailing_zeros() as usize;
+                rest &= rest - 1;
+                let (Some(&range), Some(&even)) = (ranges.next(), self.directions.get(beam)) else { return };
+                let range_mm = f64::from(range) * unit_mm;
+                let exact = exact_angles.get(beam).filter(|exact| exact.is_finite());
+                let exact = exact.map(|&exact| f64::from(exact));
+                let (x, y) = exact.map_or(even, |exact| self.pose.direction(exact));
+                say(beam, range, (range_mm, exact), (range_mm * x, range_mm * y));
+            }
+        }
+    }
+
     /// A point at `next_mm` on the next beam, and at this `exact` angle, belongs to the last one of `open`.
-    fn joins(&self, open: &Open, next_mm: f64, exact: Option<f64>) -> bool {
+    fn joins(&self, open: &Open, (next_mm, exact): (f64, Option<f64>)) -> bool {
         let range_mm = open.last_mm;
         let step = open.last_exact.zip(exact).map_or(self.step, |(last, next)| Step::of(next - last));
         let most = range_mm * step.slope + NOISE_MM;
