@@ -16,12 +16,12 @@ use crate::framer::{Expect, Framer};
 use crate::model::{Mode, Model};
 use crate::offers::Offers;
 use crate::packet::Kind;
-use crate::sequence::Sequence;
+use crate::sequence::{Place, Sequence, Step};
 use crate::told::{Health, Info, Trouble, Why};
 
 use self::dialogue::Ask;
 use self::outgoing::Outgoing;
-use self::stream::{Current, Held, Measure};
+use self::stream::{Current, Held, MOST, Measure};
 
 /// What a session shall do.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -84,8 +84,9 @@ pub struct Session {
     /// The grid, once it is known, and whether it is known what this stream is.
     beams: Option<usize>,
     is_learned: bool,
-    /// Packets that were handed out and are not in turns yet.
+    /// Packets that were handed out and are not in turns yet, and the places of those of the last span.
     current: Option<Current>,
+    places: [Place; MOST],
     held: Option<Held>,
     /// Since when nobody follows.
     idle_since: Option<Nanos>,
@@ -148,6 +149,7 @@ impl Session {
             beams: None,
             is_learned: false,
             current: None,
+            places: [Place { step: Step::Odd, angle: 0.0, time: 0.0 }; MOST],
             held: None,
             idle_since: None,
             now,

@@ -16,7 +16,6 @@ use crate::sequence::{Came, Place, Step};
 pub(super) struct Current {
     kind: Kind,
     span: Span,
-    places: [Place; MOST],
     /// The first one that is not done, and whether its points are.
     packet: usize,
     is_put: bool,
@@ -98,7 +97,6 @@ impl Session {
         if let Some(point_ns) = self.point_ns {
             let behind_first = point_ns * (kind.points() - 1) as f64;
             let packet_ns = point_ns * kind.points() as f64;
-            let mut places = [Place { step: Step::Odd, angle: 0.0, time: 0.0 }; MOST];
             let mut count = 0;
             for (n, bytes) in self.framer.bytes(span).chunks_exact(len).enumerate() {
                 let came = Came {
@@ -140,23 +138,23 @@ impl Session {
                 if place.step != Step::Odd {
                     self.clock.note((place.time + behind_first) as Nanos, at);
                 }
-                places[n] = place;
+                self.places[n] = place;
                 count += 1;
             }
             if count < span.packets {
                 self.framer.cut(&mut span, count);
             }
             let stamp = |n: usize| {
-                let place = &places[n];
+                let place = &self.places[n];
                 let is_placed = place.step != Step::Odd;
                 self.clock.time((place.time + behind_first) as Nanos).filter(|_| is_placed)
             };
             stamps = stamp(0).zip(stamp(span.packets - 1));
-            self.current = Some(Current { kind, span, places, packet: 0, is_put: false });
+            self.current = Some(Current { kind, span, packet: 0, is_put: false });
             self.learn(kind);
             let tally = self.framer.tally();
             self.cut |= tally.packets == span.packets as u64 && tally.discarded > 0;
-            self.scanner_time = places[..span.packets]
+            self.scanner_time = self.places[..span.packets]
                 .iter()
                 .rev()
                 .find(|place| place.step != Step::Odd)
@@ -255,7 +253,7 @@ impl Session {
         while let Some(current) = &mut self.current {
             let (kind, span, packet) = (current.kind, current.span, current.packet);
             let is_put = core::mem::replace(&mut current.is_put, true);
-            let place = current.places.get(packet).copied().filter(|_| packet < span.packets);
+            let place = self.places.get(packet).copied().filter(|_| packet < span.packets);
             let (Some(place), Some(pace)) = (place, self.pace(kind)) else {
                 self.current = None;
                 return None;
@@ -360,5 +358,5 @@ const LATE: f64 = 15e6;
 /// Some heads have to turn before they measure.
 const SPIN_UP: Nanos = 3_000 * MILLIS;
 /// Packets of one sample at the most, and its bytes.
-const MOST: usize = 128;
+pub(super) const MOST: usize = 128;
 const LONGEST: usize = 800;
