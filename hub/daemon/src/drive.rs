@@ -38,6 +38,8 @@ pub(crate) struct Drive<'a, S: Surroundings> {
     follows_by: Nanos,
     /// Where the sensor was found the last time that it had to be sought.
     found: Option<u32>,
+    /// In how many pieces a telegram is read, as of the last scan: as many as who follows early warnings wants.
+    pieces: u8,
 }
 
 /// A session on an open line, and what it waits for.
@@ -82,6 +84,7 @@ impl<'a, S: Surroundings> Drive<'a, S> {
             behind_at: None,
             follows_by: Nanos::MAX,
             found: None,
+            pieces: 1,
         }
     }
 
@@ -184,7 +187,7 @@ impl<'a, S: Surroundings> Drive<'a, S> {
         let Open { line, session, .. } = open;
         let around = core.around;
         let recorded = core.recorded();
-        let mut published = false;
+        let (mut published, mut is_scan) = (false, !core.stats.is_streaming());
         (open.watch, open.until) = loop {
             match session.poll_output() {
                 Output::SetRate(baud) => {
@@ -214,7 +217,7 @@ impl<'a, S: Surroundings> Drive<'a, S> {
                         let is_of_backlog = is_behind && open.allowance.is_none();
                         self.follows_by = if is_of_backlog { 0 } else { received.last.saturating_add(limit) };
                     }
-                    published = true;
+                    (published, is_scan) = (true, true);
                 }
                 Output::Heard(Heard::Turning(line::Heard::Packets(mut received))) => {
                     let counted = line.line_errors();
@@ -233,7 +236,7 @@ impl<'a, S: Surroundings> Drive<'a, S> {
                     if let Some(limit) = core.publish_turn(&turn, &recorded, is_behind) {
                         self.follows_by = if is_behind { 0 } else { turn.last.saturating_add(limit) };
                     }
-                    published = true;
+                    (published, is_scan) = (true, true);
                 }
                 Output::Rest(until) => break (false, until),
                 Output::Wait { until, .. } => break (true, until),
@@ -242,9 +245,12 @@ impl<'a, S: Surroundings> Drive<'a, S> {
         if published {
             self.line_errors.wait();
         }
-        let pieces = core.output.pieces();
-        session.look_in(pieces);
-        if pieces > 1 || core.output.has_warned() {
+        // Whether anybody follows is asked once a scan: that takes a look at the places of all who might.
+        if is_scan {
+            self.pieces = core.output.pieces();
+        }
+        session.look_in(self.pieces);
+        if self.pieces > 1 || core.output.has_warned() {
             match session.begun() {
                 // What waited in the port warns of nothing that is still to come.
                 Some(begun) if self.behind_at.is_some_and(|at| begun.first() <= at) => {

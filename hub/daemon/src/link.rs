@@ -113,7 +113,7 @@ impl<'a, S: Surroundings> LinkCore<'a, S> {
         recorded: &RecordedContext,
     ) {
         let processed = self.output.process_packets(received, recorded);
-        self.output.topics.wake(Wake::Telegram);
+        self.output.topics.wake_for_packets();
         self.stats.note(processed);
     }
 

@@ -18,8 +18,7 @@ impl<S: Surroundings> LinkOutput<'_, S> {
         recorded: &RecordedContext,
     ) -> Processed {
         self.recall(recorded);
-        // Packets are no scans: how long one takes, their turn says.
-        self.topics.telegram(received, received.reasons, 0);
+        self.topics.packets(received, received.reasons);
         Processed { is_suspect: received.reasons != 0, stands_for: None }
     }
 

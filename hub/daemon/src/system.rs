@@ -1,6 +1,6 @@
 //! This machine as the surroundings of a link: its clocks, ports, shared memory, files, and service manager. Decides nothing.
 
-use std::cell::{OnceCell, RefCell};
+use std::cell::{Cell, OnceCell, RefCell};
 use std::fs::File;
 use std::io;
 use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
@@ -9,7 +9,7 @@ use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
-use lms::Nanos;
+use lms::{MILLIS, Nanos};
 use port::{Allowance, Dial, Port, PortError, Source, clock};
 use rustix::event::{PollFd, PollFlags, poll};
 use schema::ipc::{Node, Payload, SharedMemory, Waker};
@@ -32,6 +32,8 @@ pub(crate) struct System<'a> {
     learned: Option<Handle<'a>>,
     /// The connection that is being made.
     dial: RefCell<Option<Dial>>,
+    /// When requests, the hub's end and the line were looked at last.
+    looked_at: Cell<Nanos>,
     /// What outlives a killed hub; nothing where it cannot be written: then the sensor is asked.
     record: OnceCell<Option<File>>,
 }
@@ -64,7 +66,8 @@ impl<'a> System<'a> {
         learned: Option<Handle<'a>>,
     ) -> Result<System<'a>, Failure> {
         let waker = Waker::new(hub.node, sensor)?;
-        Ok(System { hub, waker, worked, learned, dial: RefCell::default(), record: OnceCell::new() })
+        let (dial, looked_at, record) = (RefCell::default(), Cell::default(), OnceCell::new());
+        Ok(System { hub, waker, worked, learned, dial, looked_at, record })
     }
 
     /// Drives `link` until the hub shall end.
@@ -77,11 +80,27 @@ impl<'a> System<'a> {
                 On::Nothing => None,
                 On::Opening => dial.as_ref().map(|dial| (dial.as_fd(), PollFlags::IN)),
                 On::Bytes(line) => Some((line.as_fd(), PollFlags::IN)),
+                On::Loss(_) if self.sleeps(until) => {
+                    woken = Woken::Timeout;
+                    continue;
+                }
                 On::Loss(line) => Some((line.as_fd(), PollFlags::empty())),
             };
             woken = self.wait(requests, port, until);
         }
         link.end();
+    }
+
+    /// Sleeps until `until`, if that is soon and everything else was looked at a moment ago: a look at descriptors, one of
+    /// them a tty's, costs more than the sleep.
+    fn sleeps(&self, until: Nanos) -> bool {
+        let now = clock::now();
+        let is_soon = until <= now + SHORT && now < self.looked_at.get() + UNSEEN;
+        if is_soon {
+            std::thread::sleep(Duration::from_nanos(until.saturating_sub(now)));
+            self.worked.store(true, Ordering::Relaxed);
+        }
+        is_soon
     }
 
     /// Waits until one of the events at the descriptor, `until`, a request, or the hub's end.
@@ -91,7 +110,9 @@ impl<'a> System<'a> {
         port: Option<(BorrowedFd<'_>, PollFlags)>,
         until: Nanos,
     ) -> Woken {
-        let span = clock::span(clock::now(), until);
+        let now = clock::now();
+        self.looked_at.set(now);
+        let span = clock::span(now, until);
         let [stop, requests] =
             [self.hub.stop.as_fd(), requests.as_fd()].map(|fd| PollFd::from_borrowed_fd(fd, PollFlags::IN));
         let woken = match port {
@@ -273,3 +294,7 @@ impl Line for Port {
 fn is_ready(fd: &PollFd<'_>) -> bool {
     !fd.revents().is_empty()
 }
+
+/// A rest that is not longer is slept through, if requests, the hub's end and the loss of a line do not wait for longer than that.
+const SHORT: Nanos = 20 * MILLIS;
+const UNSEEN: Nanos = 50 * MILLIS;

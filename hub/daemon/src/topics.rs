@@ -4,7 +4,7 @@
 mod prepared_publisher;
 
 use line::Received;
-use lms::Nanos;
+use lms::{MILLIS, Nanos};
 use schema::ipc::DueRings;
 use schema::{
     Background, Early, Failure, Family, Flags, Foreground, Header, Lines, Marks, Motion, Quality, Ring, Scan,
@@ -41,6 +41,9 @@ pub(crate) struct Topics<'a, S: Surroundings> {
     /// Its wall clock is that of a recording.
     is_recalled: bool,
     next_seq: u64,
+    /// Whether anybody follows packets, and when that was asked.
+    has_followers: bool,
+    asked_at: Nanos,
 }
 
 impl<'a, S: Surroundings> Topics<'a, S> {
@@ -64,6 +67,8 @@ impl<'a, S: Surroundings> Topics<'a, S> {
             header,
             is_recalled: false,
             next_seq: 0,
+            has_followers: false,
+            asked_at: 0,
         })
     }
 
@@ -102,11 +107,31 @@ impl<'a, S: Surroundings> Topics<'a, S> {
     /// Publishes the telegram and takes its number and stamps for all that follows from it.
     /// `reasons` are why it is suspect.
     pub(crate) fn telegram<M>(&mut self, received: &Received<'_, M>, reasons: u8, period_us: u32) {
+        self.begin_telegram(received, reasons, period_us);
+        self.telegram.send_bytes(received.bytes, &self.header, &mut self.due);
+    }
+
+    /// As [`telegram`](Self::telegram), of packets, of which there are many and which most do not follow: whether anybody does is
+    /// asked now and then.
+    pub(crate) fn packets<M>(&mut self, received: &Received<'_, M>, reasons: u8) {
+        // Packets are no scans: how long one takes, their turn says.
+        self.begin_telegram(received, reasons, 0);
+        if received.last >= self.asked_at + UNASKED {
+            self.asked_at = received.last;
+            self.has_followers = self.telegram.is_heard();
+        }
+        if self.has_followers {
+            self.telegram.send_bytes(received.bytes, &self.header, &mut self.due);
+        } else {
+            self.telegram.skip();
+        }
+    }
+
+    fn begin_telegram<M>(&mut self, received: &Received<'_, M>, reasons: u8, period_us: u32) {
         self.header.seq = self.next_seq;
         self.next_seq += 1;
         self.begin_scan(received.first, received.last, reasons, period_us);
         self.header.flags |= if received.estimated { Flags::STAMP_ESTIMATED } else { 0 };
-        self.telegram.send_bytes(received.bytes, &self.header, &mut self.due);
     }
 
     /// Takes over when a scan that the last telegram completed was measured, from its first beam to its last, and why it is
@@ -251,6 +276,13 @@ impl<'a, S: Surroundings> Topics<'a, S> {
         self.around.tell(why);
     }
 
+    /// Wakes whoever got the packets that were published just now: who follows scans alone sleeps on.
+    pub(crate) fn wake_for_packets(&mut self) {
+        if self.telegram.has_reached() {
+            self.wake(Wake::Telegram);
+        }
+    }
+
     /// Wakes who sleeps at the bell, if that is due: a call of the system that nobody needs is not made.
     fn ring(&mut self, ring: Ring) {
         if self.due.take(ring) {
@@ -349,6 +381,9 @@ fn of_moment(last: &Header, now: u64, wall_ns: u64) -> Header {
         ..*last
     }
 }
+
+/// Whoever begins to follow packets gets them after so long.
+const UNASKED: Nanos = 20 * MILLIS;
 
 #[cfg(test)]
 mod tests {

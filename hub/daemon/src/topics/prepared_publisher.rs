@@ -67,12 +67,14 @@ impl<P: Payload + ?Sized, M: Medium<P>> PreparedPublisher<P, M> {
                 }
             }
             Loan::Lacking => self.topic.fail(),
-            // Its number is used up: nobody is there to miss it.
-            Loan::Unwanted => {
-                self.topic.skip(1);
-                self.reached = 0;
-            }
+            Loan::Unwanted => self.skip(),
         }
+    }
+
+    /// A sample is not made. Its number is used up: nobody is there to miss it.
+    pub(super) fn skip(&mut self) {
+        self.topic.skip(1);
+        self.reached = 0;
     }
 
     /// Samples without memory.
@@ -88,6 +90,11 @@ impl<P: Payload + ?Sized, M: Medium<P>> PreparedPublisher<P, M> {
     /// Whether anybody is attached.
     pub(super) fn is_heard(&self) -> bool {
         self.topic.subscribers() > 0
+    }
+
+    /// Whether anybody got the last sample.
+    pub(super) fn has_reached(&self) -> bool {
+        self.reached > 0
     }
 
     /// Consumers that are attached and did not get the last sample.
