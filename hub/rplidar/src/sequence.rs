@@ -50,6 +50,8 @@ pub(crate) enum Step {
     Gap {
         /// Degrees, as in [`Place::angle`].
         from: f64,
+        /// So long it took, in nanoseconds, by the packets that were counted.
+        ns: f64,
     },
     /// It does not belong here.
     Odd,
@@ -147,7 +149,8 @@ impl Sequence {
         if turn.is_apart(late) {
             return self.first(came.start);
         }
-        self.next(last, came, angle, packets, Step::Gap { from: last.angle })
+        let ns = packets * came.packet_ns;
+        self.next(last, came, angle, packets, Step::Gap { from: last.angle, ns })
     }
 
     /// A packet of one point came: such points may lie before ones that came before them.
@@ -174,7 +177,8 @@ impl Sequence {
         if angle <= AHEAD && turns == 0.0 {
             self.doubtful += (came.skipped + 3) / POINT;
             let is_gap = !came.adjoins() && self.doubtful > GAP;
-            let step = if is_gap { Step::Gap { from: last.angle } } else { Step::Next };
+            let ns = points * came.packet_ns;
+            let step = if is_gap { Step::Gap { from: last.angle, ns } } else { Step::Next };
             return self.next_point(last, came, angle, points, step);
         }
         let late = late(due + turn.time(360.0 * turns));
@@ -187,7 +191,8 @@ impl Sequence {
         let angle = angle + 360.0 * turns;
         let points = (angle / advance + 0.5) as u32;
         let is_gap = points > GAP;
-        let step = if is_gap { Step::Gap { from: last.angle } } else { Step::Next };
+        let ns = f64::from(points) * came.packet_ns;
+        let step = if is_gap { Step::Gap { from: last.angle, ns } } else { Step::Next };
         self.next_point(last, came, angle, f64::from(points.max(1)), step)
     }
 

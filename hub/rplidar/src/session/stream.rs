@@ -135,6 +135,12 @@ impl Session {
                     self.turns.give_up();
                     self.held = None;
                 }
+                if let Step::Gap { ns, .. } = place.step
+                    && ns * UNSTEADY > packet_ns / 2.0
+                {
+                    let most = (ns * UNSTEADY + packet_ns) as Nanos + MILLIS;
+                    self.clock.doubt((place.time + behind_first) as Nanos, most);
+                }
                 if place.step != Step::Odd {
                     self.clock.note((place.time + behind_first) as Nanos, at);
                 }
@@ -279,7 +285,7 @@ impl Session {
         let bytes = &self.framer.bytes(span)[packet * kind.bytes()..][..kind.bytes()];
         match place.step {
             Step::First => self.turns.give_up(),
-            Step::Gap { from } => {
+            Step::Gap { from, .. } => {
                 self.turns.lacks(from - kind.most_before(), place.angle + kind.most_behind());
             }
             Step::Next => {}
@@ -353,6 +359,8 @@ fn put(turns: &mut Turns<MOST_POINTS>, kind: Kind, held: &Held, next: &[u8], pla
 
 /// A stream of which nobody was told how long a point takes is measured so long before it has turns.
 const SOON: Nanos = 250 * MILLIS;
+/// The share by which heads turn faster or slower over a gap than before it.
+const UNSTEADY: f64 = 0.005;
 /// Nanoseconds by which packets come late that came in one piece.
 const LATE: f64 = 15e6;
 /// Some heads have to turn before they measure.
