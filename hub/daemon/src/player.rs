@@ -43,6 +43,8 @@ struct LinkPlace {
     media: AtomicU64,
     has_ended: AtomicBool,
     telegrams: AtomicU64,
+    /// Those of them that were published when a lap ended last.
+    of_laps: AtomicU64,
 }
 
 /// A link's place at a player.
@@ -109,8 +111,9 @@ impl Player {
     /// [`Kind::Short`](schema::Kind) if descriptors are.
     pub(crate) fn new(play: Play, links: usize, length_ns: Option<Nanos>) -> Result<Player, Failure> {
         let place = |_| -> Result<LinkPlace, Failure> {
-            let (media, telegrams) = Default::default();
-            Ok(LinkPlace { event: EventFd::new()?, media, has_ended: AtomicBool::new(false), telegrams })
+            let (media, telegrams, of_laps) = Default::default();
+            let (event, has_ended) = (EventFd::new()?, AtomicBool::new(false));
+            Ok(LinkPlace { event, media, has_ended, telegrams, of_laps })
         };
         Ok(Player {
             playback: Mutex::new(Playback::new(play, links)),
@@ -251,8 +254,16 @@ impl PlayerHandle<'_> {
 
     /// The link is at the end of lap number `lap`.
     pub(crate) fn end(self, lap: u32, now: Nanos) -> Turn {
-        self.place().has_ended.store(true, Ordering::Relaxed);
-        let turn = self.ask(|playback| playback.end(self.number, lap, now));
+        let place = self.place();
+        place.has_ended.store(true, Ordering::Relaxed);
+        let telegrams = place.telegrams.load(Ordering::Relaxed);
+        let has_played = place.of_laps.swap(telegrams, Ordering::Relaxed) < telegrams;
+        let turn = self.ask(|playback| {
+            if has_played {
+                playback.note_played();
+            }
+            playback.end(self.number, lap, now)
+        });
         if let Turn::Restart(_) = turn {
             self.place().media.store(0, Ordering::Relaxed);
             self.place().has_ended.store(false, Ordering::Relaxed);

@@ -1,6 +1,7 @@
 //! The topics of one link: numbers every sample, fills it in place, sends it, wakes the consumers. A sample for which
 //! there is no memory is counted and its number used up, so that consumers see the gap; nothing ever waits for one.
 
+mod moment;
 mod prepared_publisher;
 
 use line::Received;
@@ -14,6 +15,7 @@ use schema::{
 use crate::early::Word;
 use crate::pipeline::{Outputs, Pipeline, Relearned};
 use crate::surroundings::Surroundings;
+use moment::{of_moment, wall};
 use prepared_publisher::PreparedPublisher;
 
 /// A topic in the surroundings of a link.
@@ -363,50 +365,5 @@ fn with_room(scan: &mut Box<Scan>, len: usize) -> &mut Scan {
     scan
 }
 
-/// Nanoseconds since 1970 of the moment that the clock of `around` called `stamp`; it says `now`.
-fn wall(around: &impl Surroundings, stamp: Nanos, now: Nanos) -> u64 {
-    around.wall_ns().saturating_sub(now.saturating_sub(stamp))
-}
-
-/// The header of what is said at `now` without a telegram: its number is that of `last`, the last one's.
-fn of_moment(last: &Header, now: u64, wall_ns: u64) -> Header {
-    Header {
-        stamp_first_ns: now,
-        stamp_last_ns: now,
-        wall_ns,
-        quality: Quality::Clean as u8,
-        reasons: 0,
-        flags: last.flags & !Flags::STAMP_ESTIMATED,
-        hub_time: [0; 3],
-        ..*last
-    }
-}
-
 /// Whoever begins to follow packets gets them after so long.
 const UNASKED: Nanos = 20 * MILLIS;
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn what_is_said_without_a_telegram_has_nothing_of_its_doubts() {
-        let flags = Flags::SIMULATED | Flags::STAMP_ESTIMATED;
-        let last = Header {
-            seq: 7,
-            period_us: 26_640,
-            quality: 1,
-            reasons: 4,
-            flags,
-            hub_time: [9; 3],
-            ..Header::default()
-        };
-        let header = of_moment(&last, 5, 6);
-        assert_eq!((header.quality, header.reasons, header.flags), (0, 0, Flags::SIMULATED));
-        assert_eq!(header.hub_time_ns(), None);
-        assert_eq!(
-            (header.seq, header.period_us, header.stamp_first_ns, header.stamp_last_ns, header.wall_ns),
-            (7, 26_640, 5, 5, 6)
-        );
-    }
-}

@@ -121,6 +121,11 @@ impl Playback {
         self.play_now(link, Due { at: due, stretch: (1.0 / rate).max(1.0) })
     }
 
+    /// A link that did not ask whose turn it was has played something in this lap.
+    pub(super) fn note_played(&mut self) {
+        self.has_played = true;
+    }
+
     /// `link`, which plays lap number `lap`, has nothing more in it.
     pub(super) fn end(&mut self, link: usize, lap: u32, now: Nanos) -> Turn {
         if self.lap != lap {
