@@ -259,9 +259,7 @@ impl PlayerHandle<'_> {
         let telegrams = place.telegrams.load(Ordering::Relaxed);
         let has_played = place.of_laps.swap(telegrams, Ordering::Relaxed) < telegrams;
         let turn = self.ask(|playback| {
-            if has_played {
-                playback.note_played();
-            }
+            playback.has_played |= has_played;
             playback.end(self.number, lap, now)
         });
         if let Turn::Restart(_) = turn {

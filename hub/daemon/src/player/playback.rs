@@ -34,8 +34,8 @@ pub(super) struct Playback {
     links: Vec<Next>,
     /// Times that it started again.
     lap: u32,
-    /// Whether this lap had a telegram.
-    has_played: bool,
+    /// Whether this lap had a telegram, also of a link that did not ask whose turn it was.
+    pub(super) has_played: bool,
     /// When the first lap began, and when nothing came any more.
     began_at: Option<Nanos>,
     over_at: Option<Nanos>,
@@ -119,11 +119,6 @@ impl Playback {
             return Turn::At(due);
         }
         self.play_now(link, Due { at: due, stretch: (1.0 / rate).max(1.0) })
-    }
-
-    /// A link that did not ask whose turn it was has played something in this lap.
-    pub(super) fn note_played(&mut self) {
-        self.has_played = true;
     }
 
     /// `link`, which plays lap number `lap`, has nothing more in it.
