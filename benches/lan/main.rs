@@ -3,6 +3,8 @@
 //! carries to a listener, and one that is pulled for a while; what a million damaged datagrams do to one; and how long scans are. All of it in network
 //! namespaces of its own. It does not tell what a real switch does.
 
+#[path = "../../tests/testkit/child.rs"]
+mod child;
 mod damage;
 mod hop;
 mod load;

@@ -5,12 +5,14 @@ use std::fs;
 use std::io::{BufRead, BufReader};
 use std::net::TcpStream;
 use std::path::{Path, PathBuf};
-use std::process::{Child, Command, Stdio};
+use std::process::{Command, Stdio};
 use std::thread;
 use std::time::{Duration, Instant};
 
 use serde_json::{Value, json};
 use tungstenite::{Message, WebSocket};
+
+use crate::testkit::{Child, spawn};
 
 /// Far longer than anything takes.
 const PATIENCE: Duration = Duration::from_secs(60);
@@ -52,7 +54,7 @@ impl Browser {
             command.args(["--headless=new", "--no-sandbox", "--disable-gpu", "--hide-scrollbars"]);
             command.args(["--remote-debugging-port=0", "--no-first-run", "--disable-dev-shm-usage"]);
             command.arg(format!("--user-data-dir={}", profile.display())).arg("about:blank");
-            command.stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::piped()).spawn().ok()
+            spawn(command.stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::piped())).ok()
         });
         let mut process = spawned?;
         let mut lines = BufReader::new(process.stderr.take()?).lines().map_while(Result::ok);
@@ -168,8 +170,7 @@ impl Browser {
 
 impl Drop for Browser {
     fn drop(&mut self) {
-        let _ = self.process.kill();
-        let _ = self.process.wait();
+        self.process.end();
         let _ = fs::remove_dir_all(&self.profile);
     }
 }

@@ -8,7 +8,7 @@ use std::collections::HashSet;
 use std::path::Path;
 use std::process::{Command, Output};
 
-use crate::testkit::{INT, KILL, Program, TERM, TestEnv, hash, is_class, number};
+use crate::testkit::{INT, KILL, Program, TERM, TestEnv, hash, is_class, number, output};
 use installed::{Installed, header_directory, is_there, source};
 use schema::{Code, Contents, Header, Scan};
 use serde_json::Value;
@@ -53,8 +53,8 @@ fn the_header_has_the_layout_of_schema() {
             cc.args(["-x", "c++"]);
         }
         cc.arg("-I").arg(header_directory()).arg(env.path("layout.c")).arg("-o").arg(env.path("layout"));
-        succeeded(&cc.output().expect("a compiler"));
-        let said = succeeded(&Command::new(env.path("layout")).output().expect("it runs"));
+        succeeded(&output(cc).expect("a compiler"));
+        let said = succeeded(&output(Command::new(env.path("layout"))).expect("it runs"));
         assert_eq!(said.lines().collect::<Vec<_>>(), layout::expected(), "{compiler} {standard}");
     }
 }
@@ -73,7 +73,7 @@ fn both_headers_go_into_one_program() {
         cc.args(["-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic", "-c", &file, "-o"]);
         cc.arg(env.path("both.o")).arg("-I").arg(header_directory());
         cc.arg("-I").arg(Path::new(env!("CARGO_MANIFEST_DIR")).join("clients/c"));
-        succeeded(&cc.output().expect("a compiler"));
+        succeeded(&output(cc).expect("a compiler"));
     }
 }
 
@@ -89,8 +89,8 @@ fn what_the_header_computes_is_what_schema_computes() {
         let mut cc = Command::new("cc");
         cc.args(["-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic", "-fsanitize=undefined"]);
         cc.args(["-fno-sanitize-recover=all", "-I"]).arg(header_directory()).arg(env.path("computes.c"));
-        succeeded(&cc.arg("-o").arg(env.path("computes")).output().expect("a compiler"));
-        let said = succeeded(&Command::new(env.path("computes")).output().expect("it runs"));
+        succeeded(&output(cc.arg("-o").arg(env.path("computes"))).expect("a compiler"));
+        let said = succeeded(&output(Command::new(env.path("computes"))).expect("it runs"));
         let mut lines = said.lines();
         let head = format!("{} {} {}", scan.beams(), scan.collapsed, u8::from(scan.is_incomplete()));
         assert_eq!(lines.next(), Some(head.as_str()));
@@ -333,13 +333,8 @@ fn what_is_installed_is_taken_away_again() {
     let run = |words: &[&str]| {
         let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("clients/c/install.sh");
         let mut command = Command::new(script);
-        command
-            .args(words)
-            .args(["--library"])
-            .arg(&installed.library)
-            .env("DESTDIR", &destination)
-            .output()
-            .expect("sh")
+        command.args(words).arg("--library").arg(&installed.library).env("DESTDIR", &destination);
+        output(command).expect("sh")
     };
     for _ in 0..2 {
         succeeded(&run(&["--prefix", "/opt/robot"]));
@@ -354,7 +349,7 @@ fn what_is_installed_is_taken_away_again() {
     assert!(description.contains("prefix=/opt/robot\n"), "{description}");
     assert!(description.contains(concat!("Version: ", env!("CARGO_PKG_VERSION"), "\n")), "{description}");
     succeeded(&run(&["--prefix", "/opt/robot", "--remove"]));
-    let left = Command::new("find").arg(&destination).args(["!", "-type", "d"]).output().expect("find");
+    let left = output(Command::new("find").arg(&destination).args(["!", "-type", "d"])).expect("find");
     assert_eq!(succeeded(&left), "");
     assert_eq!(run(&["--prefix", "here"]).status.code(), Some(2));
 }

@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 
 use crate::testkit;
-use crate::testkit::{Outcome, TestEnv, skip};
+use crate::testkit::{Outcome, TestEnv, output, skip};
 
 fn text(outcome: &Outcome) -> String {
     String::from_utf8_lossy(&outcome.out).into_owned()
@@ -155,7 +155,7 @@ fn every_verb_has_an_example_a_page_and_a_completion() {
     // The shell itself says what it would complete; there is a bash on most machines.
     let script = env.file("completion", &completions[0]);
     let ask = "source \"$0\"; COMP_WORDS=(scanhub ec); COMP_CWORD=1; _scanhub scanhub ec scanhub; echo \"${COMPREPLY[*]}\"";
-    match Command::new("bash").args(["-c", ask, &script]).output() {
+    match output(Command::new("bash").args(["-c", ask, &script])) {
         Ok(said) => assert_eq!(String::from_utf8_lossy(&said.stdout).trim(), "echo"),
         Err(error) => skip("bash", error),
     }
@@ -170,7 +170,7 @@ fn completed(env: &TestEnv, words: &[&str]) -> Option<Vec<String>> {
     let path = format!("{}:{}", program.parent()?.display(), std::env::var("PATH").unwrap_or_default());
     let mut bash = Command::new("bash");
     bash.args(["-c", ask, &script, "scanhub"]).args(words).env("PATH", path);
-    let said = match bash.output() {
+    let said = match output(bash) {
         Ok(said) => said,
         Err(error) => {
             skip("bash", error);
@@ -221,7 +221,7 @@ fn what_is_installed_can_be_taken_away() {
     let install = |arguments: &[&str]| {
         let mut command = Command::new("sh");
         command.arg(concat!(env!("CARGO_MANIFEST_DIR"), "/hub/dist/install.sh")).args(arguments);
-        let done = command.env("DESTDIR", env.path("root")).output().expect("a shell");
+        let done = output(command.env("DESTDIR", env.path("root"))).expect("a shell");
         assert!(done.status.success(), "{done:?}");
         String::from_utf8_lossy(&done.stderr).into_owned()
     };

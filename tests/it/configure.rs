@@ -3,11 +3,11 @@
 
 use std::fs::File;
 use std::io::{Read, Write};
-use std::process::{Child, Stdio};
+use std::process::Stdio;
 use std::thread;
 
 use crate::testkit;
-use crate::testkit::{INT, TERM, TestEnv, hold_in_time, number, terminal, until};
+use crate::testkit::{Child, INT, TERM, TestEnv, hold_in_time, number, spawn, terminal, until};
 use rustix::process::{Pid, Signal, kill_process};
 use serde_json::Value;
 
@@ -31,7 +31,7 @@ impl Person {
         let mut command = env.command(&[&["configure"], arguments].concat());
         command.stdin(Stdio::from(screen.try_clone().unwrap()));
         command.stdout(Stdio::piped()).stderr(Stdio::from(screen));
-        Person { process: command.spawn().unwrap(), keys }
+        Person { process: spawn(command).unwrap(), keys }
     }
 
     /// Reads until it asks, answers by `act`, and waits for its end.
@@ -205,7 +205,7 @@ fn everything_else_than_yes_writes_nothing() {
     let (_keys, screen) = terminal();
     let mut unseen = env.command(&["configure", &port, "unit=cm"]);
     unseen.stdin(Stdio::from(screen)).stdout(Stdio::null()).stderr(Stdio::null());
-    let mut process = unseen.spawn().unwrap();
+    let mut process = spawn(unseen).unwrap();
     until("it does not ask", || process.try_wait().unwrap().is_some());
     assert_eq!(process.wait().unwrap().code(), Some(2));
     assert_eq!(number(&probe(&env, "front"), "unit_mm"), 1);

@@ -3,7 +3,7 @@
 use std::process::Stdio;
 
 use crate::testkit;
-use crate::testkit::TestEnv;
+use crate::testkit::{Child, TestEnv, spawn};
 use serde_json::json;
 
 #[test]
@@ -27,7 +27,8 @@ fn a_stream_becomes_a_recording_that_plays() {
     let (reader, writer) = std::io::pipe().expect("a pipe");
     drop(reader);
     let mut command = env.command(&["convert", &mcap, "-"]);
-    let closed = command.stdout(writer).stderr(Stdio::piped()).output().expect("it ends");
+    command.stdin(Stdio::null()).stdout(writer).stderr(Stdio::piped());
+    let closed = spawn(command).and_then(Child::wait_with_output).expect("it ends");
     assert_eq!((closed.status.code(), &closed.stderr[..]), (Some(0), &b""[..]), "{closed:?}");
     // A simulated sensor has the recording.
     let _simulator =

@@ -6,7 +6,7 @@ use std::path::Path;
 use std::process::Command;
 
 use crate::testkit;
-use crate::testkit::{INT, Outcome, Program, is_there, number, shared_memory, until};
+use crate::testkit::{INT, Outcome, Program, is_there, number, output, shared_memory, until};
 
 /// Runs the demonstration in an empty environment; `end` may wait for something and hasten its end.
 fn demo(arguments: &[&str], end: impl FnOnce(Program) -> Outcome) -> Outcome {
@@ -21,7 +21,7 @@ fn demo(arguments: &[&str], end: impl FnOnce(Program) -> Outcome) -> Outcome {
     assert!(!is_there(format!("/tmp/scanhub-{name}").as_ref()), "its directory is left");
     let uid = rustix::process::getuid().as_raw();
     assert!(!is_there(format!("/tmp/scanhub-{uid}/{name}").as_ref()), "its domain is left");
-    assert_eq!(processes(&name), [] as [String; 0]);
+    assert_eq!(outcome.left, [] as [String; 0]);
     outcome
 }
 
@@ -92,7 +92,8 @@ fn headless_in_an_empty_environment() {
         );
         // Another terminal finds it by its name alone.
         let mut list = Command::new(env!("CARGO_BIN_EXE_scanhub"));
-        let list = list.args(["list", "--json", "--domain", domain]).env_clear().output().expect("it starts");
+        list.args(["list", "--json", "--domain", domain]).env_clear();
+        let list = output(list).expect("it starts");
         assert!(
             list.status.success() && String::from_utf8_lossy(&list.stdout).contains("\"rear\""),
             "{list:?}"

@@ -5,7 +5,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-use crate::testkit::{TestEnv, skip};
+use crate::testkit::{TestEnv, output, skip};
 
 /// How much a unit may be exposed, by the measure of systemd-analyze, in tenths.
 const MOST_EXPOSED: u32 = 15;
@@ -34,7 +34,7 @@ fn files(directory: &Path) -> Vec<String> {
 }
 
 fn install(destination: &Path, words: &[&str]) -> (Option<i32>, String) {
-    let output = Command::new(dist().join("install.sh")).args(words).env("DESTDIR", destination).output();
+    let output = output(Command::new(dist().join("install.sh")).args(words).env("DESTDIR", destination));
     let output = output.unwrap_or_else(|error| panic!("install.sh: {error}"));
     let text = [output.stdout, output.stderr].concat();
     (output.status.code(), String::from_utf8_lossy(&text).into_owned())
@@ -98,7 +98,7 @@ fn what_is_kept_lies_in_one_closed_directory() {
 fn units_leave_little_open() {
     for unit in ["scanhub.service", "scanhub-gateway.service"] {
         let path = dist().join(unit);
-        let analyze = |words: &[&str]| Command::new("systemd-analyze").args(words).arg(&path).output();
+        let analyze = |words: &[&str]| output(Command::new("systemd-analyze").args(words).arg(&path));
         let limit = format!("--threshold={MOST_EXPOSED}");
         let Ok(output) = analyze(&["security", "--offline=true", "--no-pager", &limit]) else {
             skip("systemd-analyze", "there is none");

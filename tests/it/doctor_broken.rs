@@ -7,7 +7,7 @@ use std::os::unix::fs::{PermissionsExt, symlink};
 use std::os::unix::process::CommandExt;
 use std::process::Command;
 
-use crate::testkit::{Findings, Line, Program, TestEnv, open_line, side_by_side, skip};
+use crate::testkit::{Findings, Line, Program, TestEnv, open_line, side_by_side, skip, succeeds};
 
 /// What a simulated sensor has, and what the doctor says of it.
 const SENSORS: [(&str, &[&str], &str, &str, &str); 10] = [
@@ -112,7 +112,7 @@ fn who_may_not_open_the_port() {
         command
     };
     let mut attempt = as_nobody(Command::new(env!("CARGO_BIN_EXE_scanhub")));
-    if !attempt.arg("--version").output().is_ok_and(|output| output.status.success()) {
+    if !succeeds(attempt.arg("--version")) {
         skip("open-directory", "the program lies where other users cannot start it");
         return;
     }

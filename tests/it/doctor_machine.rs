@@ -2,14 +2,16 @@
 //! remedy, and has no complaint of the other. `--nocapture` shows them as a table. What an administrator may have
 //! written is laid out below a directory of the test.
 
-use std::fs::{self, OpenOptions};
-use std::io::Write;
+use std::fs;
 use std::os::unix::fs::{PermissionsExt, symlink};
 use std::path::Path;
 use std::process::Command;
 use std::sync::atomic::AtomicBool;
 
-use crate::testkit::{Findings, KILL, Program, TERM, TestEnv, in_a_network, is_class, shared_memory, skip};
+use crate::testkit::{
+    Findings, KILL, Program, TERM, TestEnv, in_a_network, is_class, shared_memory, skip, succeeds,
+    write_program,
+};
 use config::Gateway;
 use schema::Domain;
 use tools::doctor::{Bridge, Subjects, System, examine};
@@ -111,10 +113,7 @@ fn what_an_administrator_may_have_left() {
     laid_out(&env).complain("the service does not run", "service", "failed", "systemctl status scanhub");
     remove("usr/local/bin/scanhub");
     laid_out(&env).complain("the service's program is gone", "service", "failed", "install.sh");
-    // A child writes it: who starts it must not find it open for writing.
-    let write = "printf '#!/bin/sh\\necho scanhub 0.0.1\\n' > \"$0\" && chmod 755 \"$0\"";
-    let written = Command::new("sh").args(["-c", write]).arg(at("usr/local/bin/scanhub")).status();
-    assert!(written.is_ok_and(|status| status.success()));
+    write_program(at("usr/local/bin/scanhub"), "#!/bin/sh\necho scanhub 0.0.1\n");
     let stale = laid_out(&env);
     stale.complain("the service is of another version", "service", "warning", "restart scanhub");
     assert!(stale.said("service").1.contains("version 0.0.1"), "{:?}", stale.said("service"));
@@ -143,8 +142,7 @@ fn what_is_short() {
         command.args(&unshare[1..]).args(["sh", "-c", &format!("{mount} && exec \"$@\""), "sh"]);
         command
     };
-    let attempt = mounted("size=64k", "true").arg("true").output();
-    if !attempt.is_ok_and(|output| output.status.success()) {
+    if !succeeds(mounted("size=64k", "true").arg("true")) {
         skip("mounts", "this user may not make a mount namespace");
         return;
     }
@@ -249,10 +247,10 @@ fn two_hubs_and_one_that_was_replaced() {
     let env = TestEnv::new();
     let link = env.link("absent");
     let program = env.path("scanhub");
-    fs::copy(env!("CARGO_BIN_EXE_scanhub"), &program).expect("can be copied");
-    let append =
-        OpenOptions::new().append(true).open(&program).and_then(|mut file| file.write_all(b"another build"));
-    append.expect("can be written");
+    // For the reason that `write_program` gives, another process writes it.
+    let mut copy = Command::new("sh");
+    copy.args(["-c", "cp \"$1\" \"$0\" && echo another build >> \"$0\""]).arg(&program);
+    assert!(succeeds(copy.arg(env!("CARGO_BIN_EXE_scanhub"))), "can be copied");
     let run_at = |program: &Path, root: &Path| {
         let inner = env.command_at(root, &["run", "--json", "--no-system-config", &link]);
         let mut command = Command::new(program);

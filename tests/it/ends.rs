@@ -6,7 +6,7 @@ use std::os::unix::fs::symlink;
 use std::process::Stdio;
 
 use crate::testkit;
-use crate::testkit::{INT, KILL, Program, TERM, TestEnv, is_class, is_there, until};
+use crate::testkit::{INT, KILL, Program, TERM, TestEnv, is_class, is_there, spawn, until};
 use rustix::pipe::{PipeFlags, pipe_with};
 use serde_json::Value;
 
@@ -63,7 +63,8 @@ fn a_reader_that_has_enough_is_no_failure() {
     let _hub = hub(&env);
     for format in ["--json", "--csv"] {
         let mut command = env.command(&["echo", "front/scan", format]);
-        let mut echo = command.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().expect("starts");
+        command.stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::piped());
+        let mut echo = spawn(command).expect("starts");
         let mut line = String::new();
         let mut reader = BufReader::with_capacity(1, echo.stdout.take().expect("a pipe"));
         let read = reader.read_line(&mut line);
@@ -82,8 +83,8 @@ fn every_line_is_one_write() {
     // A pipe that keeps writes apart: what is read at once was written at once.
     let (read, write) = pipe_with(PipeFlags::DIRECT | PipeFlags::CLOEXEC).expect("a pipe");
     let mut command = env.command(&["echo", "--json", "front/scan", "front/telegram", "front/status"]);
-    let mut echo = command.stdout(write).stderr(Stdio::null()).spawn().expect("starts");
-    drop(command);
+    command.stdin(Stdio::null()).stdout(write).stderr(Stdio::null());
+    let mut echo = spawn(command).expect("starts");
     for _ in 0..60 {
         let mut buffer = [0; 8192];
         let len = rustix::io::read(&read, &mut buffer).expect("a line");
@@ -102,7 +103,8 @@ fn a_killed_echo_leaves_whole_lines() {
         let path = env.path(&format!("lines{number}"));
         let file = File::create(&path).expect("a file");
         let mut command = env.command(&["echo", "--json", "front/scan", "front/telegram"]);
-        let mut echo = command.stdout(file).stderr(Stdio::null()).spawn().expect("starts");
+        command.stdin(Stdio::null()).stdout(file).stderr(Stdio::null());
+        let mut echo = spawn(command).expect("starts");
         until("some lines", || fs::metadata(&path).is_ok_and(|metadata| metadata.len() > 40_000));
         echo.kill().expect("is killed");
         echo.wait().expect("is dead");

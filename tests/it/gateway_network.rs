@@ -5,11 +5,11 @@ use std::net::Ipv4Addr;
 use std::process::{Command, Stdio};
 
 use crate::testkit::{
-    Outcome, Program, Receiver, TERM, TestEnv, USR1, in_a_network, ip, is_class, number, read, skip, until,
+    Outcome, Program, Receiver, TERM, TestEnv, USR1, in_a_network, ip, is_class, number, read, skip, spawn,
+    succeeds, until,
 };
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::pipe::fcntl_setpipe_size;
-use rustix::process::{Pid, kill_process};
 use schema::datagram::{Announce, Datagram, Row, StreamStats};
 use schema::{Background, Topic};
 use serde_json::Value;
@@ -124,15 +124,14 @@ fn what_a_full_queue_drops_is_counted() {
         let receiver = Receiver::new(OURS);
         receiver.await_more(10, |datagram| datagram.head.topic == Topic::Scan.number());
         let limit = "qdisc add dev ours root tbf rate 64kbit burst 2000 limit 4000";
-        if !Command::new("tc").args(limit.split(' ')).status().is_ok_and(|status| status.success()) {
+        if !succeeds(Command::new("tc").args(limit.split(' '))) {
             skip("tc", "there is no queue that can be limited here");
             return;
         }
         let failing = await_state(&mut gateway, "failing");
         assert_eq!(failing["to"], "ours");
         await_growth(&mut gateway, "send_failed");
-        let free = Command::new("tc").args(["qdisc", "del", "dev", "ours", "root"]).status();
-        assert!(free.is_ok_and(|status| status.success()));
+        assert!(succeeds(Command::new("tc").args(["qdisc", "del", "dev", "ours", "root"])));
         await_state(&mut gateway, "well");
         await_growth(&mut gateway, "sent");
         let outcome = gateway.end(TERM);
@@ -152,8 +151,8 @@ fn a_reader_that_does_not_read_delays_nothing() {
         fcntl_setpipe_size(&writer, 8192).expect("a small one");
         let mut command = env.command(&["gateway", "--json", "--no-system-config", "--interface=lo"]);
         command.stdout(writer.try_clone().expect("another end")).stdin(Stdio::null());
-        let mut gateway = command.spawn().expect("a gateway");
-        let signal = |signal| kill_process(Pid::from_child(&gateway), signal).expect("it lives");
+        let mut gateway = spawn(command).expect("a gateway");
+        let signal = |signal| gateway.signal(signal).expect("it lives");
         let is_scan = |datagram: &schema::datagram::Datagram<'_>| datagram.head.topic == Topic::Scan.number();
         receiver.await_more(3, is_scan);
         let now = Timespec { tv_sec: 0, tv_nsec: 0 };

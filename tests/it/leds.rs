@@ -9,7 +9,8 @@ use std::thread;
 use std::time::Duration;
 
 use crate::testkit::{
-    INT, KILL, Program, Sender, TERM, TestEnv, hold_in_time, in_a_network, is_class, number, terminal, until,
+    INT, KILL, Program, Sender, TERM, TestEnv, hold_in_time, in_a_network, is_class, number, spawn, terminal,
+    until,
 };
 use rustix::process::Signal;
 use rustix::time::{ClockId, clock_gettime};
@@ -307,8 +308,7 @@ fn on_a_terminal_one_line_is_drawn_over_itself() {
         let mut command = env.command(&["leds", "front", "--for=1s", "--timeout=200ms"]);
         command.env_remove("NO_COLOR").envs(no_color.map(|value| ("NO_COLOR", value)));
         command.stdin(Stdio::null()).stderr(Stdio::null()).stdout(Stdio::from(screen));
-        let mut process = command.spawn().unwrap();
-        drop(command);
+        let mut process = spawn(command).unwrap();
         let mut seen = Vec::new();
         // A terminal that nobody has open any more ends by an error.
         let _ = keys.read_to_end(&mut seen);

@@ -5,7 +5,9 @@ use std::fs::{File, OpenOptions};
 use std::io::{ErrorKind, Write};
 use std::process::Command;
 
-use crate::testkit::{INT, Outcome, TERM, TestEnv, is_class, only, own_program, run_again, sequence, skip};
+use crate::testkit::{
+    INT, Outcome, TERM, TestEnv, is_class, only, own_program, run_again, sequence, skip, status, succeeds,
+};
 use rustix::process::Signal;
 
 /// Where the namespace is made: the test that shall run in it.
@@ -21,10 +23,9 @@ fn in_a_namespace(name: &str, test: impl FnOnce()) {
     if !rustix::process::getuid().is_root() {
         unshare.arg("--map-root-user");
     }
-    let allowed = |mut command: Command| command.output().is_ok_and(|output| output.status.success());
     let mut attempt = Command::new("unshare");
     attempt.args(unshare.get_args()).args(["mount", "-t", "tmpfs", "tmpfs", "/dev/shm"]);
-    if !allowed(attempt) {
+    if !succeeds(attempt) {
         skip("mounts", "this user may not make a mount namespace");
         return;
     }
@@ -35,12 +36,12 @@ fn in_a_namespace(name: &str, test: impl FnOnce()) {
 /// A new and empty /dev/shm of so many bytes.
 fn mount(bytes: u64) {
     let size = format!("size={bytes}");
-    let mounted = Command::new("mount").args(["-t", "tmpfs", "-o", &size, "tmpfs", "/dev/shm"]).status();
+    let mounted = status(Command::new("mount").args(["-t", "tmpfs", "-o", &size, "tmpfs", "/dev/shm"]));
     assert!(mounted.is_ok_and(|status| status.success()), "no tmpfs of {bytes} bytes");
 }
 
 fn unmount() {
-    assert!(Command::new("umount").arg("/dev/shm").status().is_ok_and(|status| status.success()));
+    assert!(status(Command::new("umount").arg("/dev/shm")).is_ok_and(|status| status.success()));
 }
 
 /// Takes all of /dev/shm but so many bytes.

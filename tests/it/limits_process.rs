@@ -5,7 +5,7 @@ use std::io::{BufRead, BufReader};
 use std::path::PathBuf;
 use std::process::{Command, Stdio};
 
-use crate::testkit::{Outcome, Program, TERM, TestEnv};
+use crate::testkit::{Outcome, Program, TERM, TestEnv, spawn};
 use rustix::process::{Pid, kill_process};
 
 /// Starts the program with at most this, in the words of ulimit.
@@ -35,7 +35,8 @@ fn a_hub_without_address_space_leaves_no_segment_behind() {
         let mut command = Command::new("sh");
         command.args(["-c", &format!("ulimit -v {limit} && exec \"$0\" \"$@\"")]);
         command.arg(inner.get_program()).args(inner.get_args()).env("SCANHUB_END_WITH_PARENT", "1");
-        let mut hub = command.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().expect("a shell");
+        command.stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::piped());
+        let mut hub = spawn(command).expect("a shell");
         let mut line = String::new();
         BufReader::new(hub.stdout.take().expect("a pipe")).read_line(&mut line).expect("text");
         is_up = line.contains("ready");

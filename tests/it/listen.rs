@@ -4,8 +4,8 @@
 use std::io::Read;
 
 use crate::testkit::{
-    self, INT, Outcome, Program, Sender, TestEnv, in_a_network, is_class, number, skip, terminal, until,
-    wall_ns,
+    self, INT, Outcome, Program, Sender, TestEnv, in_a_network, is_class, number, skip, spawn, succeeds,
+    terminal, until, wall_ns,
 };
 use schema::datagram::{DatagramError, HEAD, WINDOW};
 use schema::{
@@ -167,7 +167,7 @@ fn joined(interface: &str) -> usize {
 
 /// Runs `ip` with these words.
 fn ip(words: &str) -> bool {
-    std::process::Command::new("ip").args(words.split(' ')).status().is_ok_and(|status| status.success())
+    succeeds(std::process::Command::new("ip").args(words.split(' ')))
 }
 
 #[test]
@@ -176,9 +176,9 @@ fn on_a_terminal_the_account_is_drawn_over_itself() {
         let env = TestEnv::new();
         let (mut keys, screen) = terminal();
         let mut command = env.command(&["listen", "--stats", "--interface=lo"]);
-        command.stdout(screen).stderr(std::process::Stdio::null());
-        let mut process = command.spawn().expect("starts");
-        drop(command);
+        let null = std::process::Stdio::null;
+        command.stdin(null()).stdout(screen).stderr(null());
+        let mut process = spawn(command).expect("starts");
         until("the groups are joined", || joined("lo") == 4);
         Sender::new(HUB, 7, 0, "front").send(Topic::Zones, &zones(Verdict::Clear));
         let mut text = String::new();
@@ -192,7 +192,7 @@ fn on_a_terminal_the_account_is_drawn_over_itself() {
         };
         read("#0/zones");
         read("\x1b[3A\x1b[J");
-        rustix::process::kill_process(rustix::process::Pid::from_child(&process), INT).expect("it lives");
+        process.signal(INT).expect("it lives");
         assert!(process.wait().expect("it ends").success());
     });
 }

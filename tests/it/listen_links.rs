@@ -4,7 +4,7 @@
 use std::collections::BTreeSet;
 use std::os::fd::OwnedFd;
 
-use crate::testkit::{INT, Machine, TestEnv, command_in, in_a_network, ip, skip, until};
+use crate::testkit::{INT, Machine, TestEnv, command_in, in_a_network, ip, skip, status, until};
 use rustix::net::{AddressFamily, RecvFlags, SocketFlags, SocketType, eth, recv, socket_with};
 
 /// What comes to the network of the test of IGMP, version 2.
@@ -106,7 +106,7 @@ fn speaks_version_2(machine: &Machine, interface: &str) -> bool {
     let mut version = command_in(&machine.network(), "sh");
     let path = format!("/proc/sys/net/ipv4/conf/{interface}/force_igmp_version");
     version.args(["-c", &format!("echo 2 > {path}")]);
-    let is_done = version.status().is_ok_and(|status| status.success());
+    let is_done = status(version).is_ok_and(|status| status.success());
     if !is_done {
         skip("igmp", "its version cannot be chosen here");
     }

@@ -1,7 +1,7 @@
 //! `scanhub listen --publish`: remote sensors as local ones, for every verb that follows, through loss, restarts and
 //! kills.
 
-use crate::testkit::{INT, KILL, Program, Sender, TERM, TestEnv, in_a_network, number, until};
+use crate::testkit::{INT, KILL, Program, Sender, TERM, TestEnv, in_a_network, number, output, until};
 use rustix::process::{Pid, Resource, Rlimit, getrlimit, prlimit};
 use schema::datagram::Announce;
 use schema::{Marks, Scan, ScanHead, State, Status, Topic, Verdict, Zones};
@@ -87,7 +87,7 @@ fn a_remote_sensor_is_as_a_local_one() {
         let listed = env.run(&["list", "--json"]).of_class("topic");
         let topics: Vec<_> = listed.iter().map(|line| &line["topic"]).collect();
         assert_eq!(topics, ["telegram", "scan", "zones", "status"], "those that were announced");
-        let domains = env.command(&["list", "--domains", "--json"]).output().expect("runs");
+        let domains = output(env.command(&["list", "--domains", "--json"])).expect("runs");
         assert!(String::from_utf8_lossy(&domains.stdout).contains(&program.pid().to_string()));
         env.await_info(FRONT, |info| info["state"] == "silent" && info["last_error"] != "");
 

@@ -7,6 +7,7 @@ mod testkit;
 mod background;
 mod browser;
 mod chart;
+mod children;
 mod client_c;
 mod config;
 mod configure;

@@ -3,7 +3,7 @@
 use std::os::unix::fs::{PermissionsExt, chown, symlink};
 use std::os::unix::process::CommandExt;
 
-use crate::testkit::{Line, Program, TERM, TestEnv, skip, until};
+use crate::testkit::{Line, Program, TERM, TestEnv, skip, succeeds, until};
 use rustix::process::geteuid;
 use serde_json::Value;
 
@@ -95,8 +95,7 @@ fn what_this_user_may_not_open() {
 /// Whether another user may run the program where it lies.
 fn command_can_run(user: u32) -> bool {
     let mut command = std::process::Command::new(env!("CARGO_BIN_EXE_scanhub"));
-    command.arg("--help").uid(user).gid(user).stdout(std::process::Stdio::null());
-    command.status().is_ok_and(|status| status.success())
+    succeeds(command.arg("--help").uid(user).gid(user))
 }
 
 #[test]

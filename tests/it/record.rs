@@ -5,7 +5,7 @@ use std::path::Path;
 
 use crate::testkit;
 use crate::testkit::{
-    HUP, INT, KILL, Kept, Outcome, Program, Recording, TERM, TestEnv, hash, is_class, number, python,
+    HUP, INT, KILL, Kept, Outcome, Program, Recording, TERM, TestEnv, hash, is_class, number, output, python,
     unbroken,
 };
 use serde_json::Value;
@@ -138,7 +138,7 @@ fn a_kill_leaves_all_that_was_told() {
 
 /// What the reader of other people, which `python` starts, says.
 fn said(mut python: std::process::Command) -> Value {
-    let outcome = python.current_dir(env!("CARGO_MANIFEST_DIR")).output().unwrap();
+    let outcome = output(python.current_dir(env!("CARGO_MANIFEST_DIR"))).unwrap();
     assert!(outcome.status.success(), "{}", String::from_utf8_lossy(&outcome.stderr));
     serde_json::from_slice(&outcome.stdout).unwrap()
 }

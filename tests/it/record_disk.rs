@@ -10,7 +10,8 @@ use std::thread;
 use std::time::{Duration, Instant};
 
 use crate::testkit::{
-    INT, Kept, Outcome, Program, Recording, TestEnv, is_class, number, scan, skip, unbroken, until,
+    INT, Kept, Outcome, Program, Recording, TestEnv, is_class, number, scan, skip, spawn, succeeds, unbroken,
+    until,
 };
 use serde_json::Value;
 
@@ -136,8 +137,7 @@ fn a_full_disk_is_waited_for() {
     let place = env.path("small");
     fs::create_dir(&place).unwrap();
     let mount = format!("mount -t tmpfs -o size=256k none {0} && echo > {0}/filler", place.display());
-    let trial = Command::new("unshare").args(["-rm", "sh", "-c", &mount]).output();
-    if !trial.is_ok_and(|outcome| outcome.status.success()) {
+    if !succeeds(Command::new("unshare").args(["-rm", "sh", "-c", &mount])) {
         skip("mounts", "this user may not make a file system of its own (unshare -rm, mount)");
         return;
     }
@@ -172,7 +172,7 @@ fn what_cannot_be_held_is_left_out_and_said() {
     env.file("stream", stream);
     // A pipe that nobody reads: as slow as a disk can be. Held open so that the shell need not wait for its reader.
     let pipe = env.path("pipe");
-    assert!(Command::new("mkfifo").arg(&pipe).status().unwrap().success());
+    assert!(succeeds(Command::new("mkfifo").arg(&pipe)));
     let open = fs::File::options().read(true).write(true).open(&pipe).unwrap();
     let shell = format!("exec \"$@\" 2>&1 > {}", pipe.display());
     let topics = ["record", "--json", "-o", "-", "front/telegram", "front/scan", "front/status"];
@@ -206,7 +206,7 @@ fn signals_that_come_together_are_one() {
     let _others = sensor(&env);
     // So little room that it waits for who reads, also at its end.
     let pipe = env.path("pipe");
-    assert!(Command::new("mkfifo").arg(&pipe).status().unwrap().success());
+    assert!(succeeds(Command::new("mkfifo").arg(&pipe)));
     let open = fs::File::options().read(true).write(true).open(&pipe).unwrap();
     rustix::pipe::fcntl_setpipe_size(&open, 4096).unwrap();
     let shell = format!("exec \"$@\" 2>&1 > {}", pipe.display());
@@ -258,14 +258,15 @@ fn a_recording_whose_reader_went_away_has_failed() {
         assert_eq!(outcome.status.code(), Some(1), "{said}");
         assert!(said.contains("the reader of the recording is gone"), "{said}");
     };
-    let begin = env.command(&["record", "-o", "-"]).stdout(writer).stderr(Stdio::piped()).output();
-    refused(begin.unwrap());
+    let begin = |words: &[&str], writer: io::PipeWriter| {
+        let mut command = env.command(&[&["record", "-o", "-"], words].concat());
+        spawn(command.stdin(Stdio::null()).stdout(writer).stderr(Stdio::piped())).unwrap()
+    };
+    refused(begin(&[], writer).wait_with_output().unwrap());
     // A connection that breaks in the middle of it looks the same.
     let _others = sensor(&env);
     let (mut reader, writer) = io::pipe().unwrap();
-    let mut command = env.command(&["record", "-o", "-", "--for=60s"]);
-    let recorder = command.stdout(writer).stderr(Stdio::piped()).spawn().unwrap();
-    drop(command);
+    let recorder = begin(&["--for=60s"], writer);
     reader.read_exact(&mut [0; 20_000]).unwrap();
     drop(reader);
     refused(recorder.wait_with_output().unwrap());

@@ -1,10 +1,10 @@
 //! What is refused: the exit code of each kind of failure, and a message that names the place, the value and the
 //! remedy; with `--json` an object, on stdout unless that belongs to the line that says that all is up.
 
-use std::process::Command;
+use std::process::{Command, Stdio};
 
 use crate::testkit;
-use crate::testkit::{Outcome, TERM, TestEnv, side_by_side};
+use crate::testkit::{Child, Outcome, TERM, TestEnv, side_by_side, spawn};
 use serde_json::Value;
 
 /// Runs the program, which must refuse with `code` and `kind` and say all of `words`, in text and in JSON.
@@ -275,7 +275,9 @@ fn a_disk_that_is_full_is_told() {
         &["doctor", "--no-system-config", "/dev/null"],
     ] {
         let full = std::fs::File::options().write(true).open("/dev/full").expect("there is one");
-        let done = env.command(verb).stdout(full).output().expect("it starts");
+        let mut command = env.command(verb);
+        command.stdin(Stdio::null()).stdout(full).stderr(Stdio::piped());
+        let done = spawn(command).and_then(Child::wait_with_output).expect("it starts");
         let said = String::from_utf8_lossy(&done.stderr);
         assert!(
             done.status.code() == Some(1) && said.contains("cannot write: No space"),

@@ -4,7 +4,8 @@
 use std::process::Command;
 
 use crate::testkit::{
-    HUP, INT, MEASURED, Program, TERM, TestEnv, bytes_of, hash, is_class, number, sequence, skip, terminal,
+    HUP, INT, MEASURED, Program, TERM, TestEnv, bytes_of, hash, is_class, number, sequence, skip, succeeds,
+    terminal,
 };
 use serde_json::Value;
 
@@ -127,7 +128,7 @@ fn what_cannot_be_changed_is_said_and_what_cannot_be_changes_nothing() {
 
 #[test]
 fn a_hub_ends_with_its_terminal_unless_nohup_says_otherwise() {
-    if Command::new("setsid").arg("--version").output().is_err() {
+    if !succeeds(Command::new("setsid").arg("--version")) {
         return skip("setsid", "there is none");
     }
     for (nohup, survives) in [(&[][..], false), (&["nohup"], true)] {

@@ -4,7 +4,7 @@
 use std::collections::BTreeMap;
 use std::process::Command;
 
-use crate::testkit::{INT, MEASURED, Recording, TestEnv, hold_in_time, is_class, number, python};
+use crate::testkit::{INT, MEASURED, Recording, TestEnv, hold_in_time, is_class, number, output, python};
 use lms::variant::Unit;
 use schema::datagram::Packed;
 use schema::{Code, Header, Pose, Scan, file};
@@ -40,7 +40,7 @@ fn published(recording: &Recording) -> BTreeMap<(String, u64), (Header, Box<Scan
 /// What other people's reader `verb` says of the file at `path`: all messages.
 fn said(mut python: Command, verb: &str, path: &str) -> Vec<Value> {
     python.args(["tests/testkit/read.py", verb, path]).current_dir(env!("CARGO_MANIFEST_DIR"));
-    let outcome = python.output().expect("Python");
+    let outcome = output(python).expect("Python");
     assert!(outcome.status.success(), "{verb} {path}: {}", String::from_utf8_lossy(&outcome.stderr));
     serde_json::from_slice(&outcome.stdout).expect("a list of messages")
 }

@@ -10,7 +10,9 @@ use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant};
 
 use crate::testkit;
-use crate::testkit::{INT, TERM, TestEnv, hold_in_time, is_class, number, open_line, sequence, terminal};
+use crate::testkit::{
+    INT, TERM, TestEnv, hold_in_time, is_class, number, open_line, sequence, spawn, terminal,
+};
 use rustix::process::Signal;
 use serde_json::Value;
 
@@ -249,7 +251,7 @@ fn confirmed(env: &TestEnv, arguments: &[&str]) -> (String, Option<i32>) {
     let mut command = env.command(arguments);
     let screens = [0; 3].map(|_| Stdio::from(screen.try_clone().unwrap()));
     let [stdin, stdout, stderr] = screens;
-    let mut process = command.stdin(stdin).stdout(stdout).stderr(stderr).spawn().expect("it starts");
+    let mut process = spawn(command.stdin(stdin).stdout(stdout).stderr(stderr)).expect("it starts");
     drop((command, screen));
     let (mut seen, mut byte) = (Vec::new(), [0]);
     // A terminal that nobody has open any more ends by an error.

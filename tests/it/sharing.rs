@@ -7,7 +7,7 @@ use std::os::unix::process::CommandExt;
 use std::process::Command;
 
 use crate::testkit;
-use crate::testkit::{INT, Program, TERM, is_class, number, until};
+use crate::testkit::{INT, Program, TERM, is_class, number, succeeds, until};
 use serde_json::{Value, json};
 
 const PAGE: &str = include_str!("../../docs/sharing.md");
@@ -33,7 +33,7 @@ fn among_users(name: &str, test: impl FnOnce()) {
         command
     };
     let is_root = rustix::process::getuid().is_root();
-    if !is_root || !unshare("true").output().is_ok_and(|output| output.status.success()) {
+    if !is_root || !succeeds(unshare("true")) {
         testkit::skip("root", "only root can be two users, and needs namespaces and `ip` for it");
         return;
     }

@@ -2,7 +2,7 @@
 
 use std::process::{Command, Output};
 
-use crate::testkit::{only, own_program, skip, skip_verdict};
+use crate::testkit::{only, output, own_program, skip, skip_verdict};
 
 /// Set where the test is to be left out.
 const INSIDE: &str = "SCANHUB_TEST_SKIP";
@@ -33,7 +33,7 @@ fn a_test_that_is_left_out_says_so_or_fails() {
         // What passes is not shown by itself.
         command.args(&only("skips::a_test_that_is_left_out_says_so_or_fails")[..2]);
         command.env(INSIDE, "1").env("SCANHUB_REQUIRE", required).env_remove("RUST_TEST_NOCAPTURE");
-        command.output().expect("it runs")
+        output(command).expect("it runs")
     };
     let left_out = again("cc");
     assert!(left_out.status.success(), "{left_out:?}");

@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 
 use crate::testkit;
-use crate::testkit::{INT, KILL, Outcome, Program, TERM, TestEnv, is_class, until};
+use crate::testkit::{INT, KILL, Outcome, Program, TERM, TestEnv, is_class, succeeds, until};
 
 /// Where the namespace is made: the test that shall run in it.
 const INSIDE: &str = "SCANHUB_TEST_STRANGERS";
@@ -31,7 +31,7 @@ pub(crate) fn beside_a_stranger(name: &str, test: impl FnOnce()) {
         command
     };
     let is_root = rustix::process::getuid().is_root();
-    if !is_root || !unshare("true").output().is_ok_and(|output| output.status.success()) {
+    if !is_root || !succeeds(unshare("true")) {
         testkit::skip("root", "only root can be two users, and needs a mount namespace for it");
         return;
     }
@@ -60,7 +60,7 @@ pub(crate) fn stranger(script: &str) {
 fn tried(script: &str) -> bool {
     let mut shell = Command::new("sh");
     shell.args(["-c", script]).uid(STRANGER).gid(STRANGER).current_dir("/tmp");
-    shell.output().expect("there is a shell").status.success()
+    succeeds(shell)
 }
 
 /// A directory of root with what `doctor --clean` removes from a domain, and its owner's alone.

@@ -6,17 +6,19 @@ use std::process::{Command, Output, Stdio};
 
 use serde_json::Value;
 
+use crate::testkit::spawn;
+
 /// Runs the verb with `input` on its stdin.
 fn telegram(words: &[&str], input: &[u8]) -> Output {
-    let mut program = Command::new(env!("CARGO_BIN_EXE_scanhub"))
+    let mut command = Command::new(env!("CARGO_BIN_EXE_scanhub"));
+    command
         .arg("telegram")
         .args(words)
         .env_remove("SCANHUB_DOMAIN")
         .stdin(Stdio::piped())
         .stdout(Stdio::piped())
-        .stderr(Stdio::piped())
-        .spawn()
-        .expect("it starts");
+        .stderr(Stdio::piped());
+    let mut program = spawn(command).expect("it starts");
     let mut stdin = program.stdin.take().expect("a pipe");
     let input = input.to_vec();
     // It may write before it has read everything.

@@ -1,27 +1,29 @@
-//! A test that runs once more, in a process to which something was done before: another network, other mounts, other
-//! users. Makes sure that it did run there.
+//! Runs a test again in a prepared process: in another network, with other mounts or as another user. Makes sure that
+//! it did run there.
 
 use std::io::{BufRead, BufReader};
 use std::process::{Command, Stdio};
 
-/// Where the tests are that this process belongs to.
+use super::child::spawn;
+
+/// Returns the path of the test binary.
 pub(crate) fn own_program() -> std::path::PathBuf {
     std::env::current_exe().unwrap_or_else(|error| panic!("no path: {error}"))
 }
 
-/// The words after which this program runs the test `name` (with its modules) and nothing else.
+/// Returns the arguments with which the test binary runs only the test `name` (with its modules).
 pub(crate) fn only(name: &str) -> [&str; 3] {
     ["--exact", name, "--nocapture"]
 }
 
-/// Runs what ends in running the test `name` by itself, and shows what it says.
+/// Runs `command`, which runs the test `name` and no other, and prints its output.
 ///
 /// # Panics
 ///
-/// If the test failed there, or there is none of that name.
+/// If the test fails there, or if there is no test of this name.
 pub(crate) fn run_again(name: &str, mut command: Command) {
     command.stdin(Stdio::null()).stdout(Stdio::piped());
-    let mut child = command.spawn().unwrap_or_else(|error| panic!("{name} does not start again: {error}"));
+    let mut child = spawn(command).unwrap_or_else(|error| panic!("{name} does not start again: {error}"));
     let out = child.stdout.take().expect("a pipe");
     let mut passed = false;
     for line in BufReader::new(out).lines().map_while(Result::ok) {
@@ -32,8 +34,8 @@ pub(crate) fn run_again(name: &str, mut command: Command) {
     assert!(status.success() && passed, "{name} failed where it ran again: {status}");
 }
 
-/// Runs `test`, which is called `name`, in a process of its own: it opens descriptors that processes which other tests
-/// start would inherit, whose number counts.
+/// Runs `test`, whose name is `name`, in a separate process: for a test that opens descriptors whose number counts, and
+/// that children of other tests would inherit.
 ///
 /// # Panics
 ///

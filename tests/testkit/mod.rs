@@ -3,6 +3,7 @@
 #![allow(dead_code, unused_imports)] // Every test file takes what it needs.
 
 mod again;
+mod child;
 mod findings;
 mod gentle;
 mod in_time;
@@ -35,6 +36,7 @@ use schema::Domain;
 use serde_json::Value;
 
 pub(crate) use again::{in_own_process, only, own_program, run_again};
+pub(crate) use child::{Child, end_runs_of, output, spawn, status, succeeds, write_program};
 pub(crate) use findings::Findings;
 pub(crate) use gentle::{compute_gently, gentle, side_by_side, wait_gently};
 pub(crate) use in_time::hold_in_time;
@@ -312,7 +314,7 @@ fn scanhub() -> &'static str {
             let mut cargo = Command::new(env!("CARGO"));
             cargo.args(["build", "--quiet", "--package=scanhub", "--bin=scanhub"]);
             cargo.args(built.components().any(|word| word.as_os_str() == "release").then_some("--release"));
-            assert!(cargo.status().is_ok_and(|status| status.success()), "cargo cannot build scanhub");
+            assert!(status(cargo).is_ok_and(|status| status.success()), "cargo cannot build scanhub");
             built.display().to_string()
         })
     })

@@ -1,14 +1,15 @@
-//! A network of a test's own: the test runs again in a new network namespace, in which only the loopback is.
+//! Runs a test again in a new network namespace, which has only the loopback.
 
 use std::process::Command;
 use std::sync::OnceLock;
 
+use super::child::succeeds;
 use super::{only, own_program, run_again, skip};
 
-/// Where the namespace is made: the test that shall run in it.
+/// Set in the process that runs in the namespace.
 const INSIDE: &str = "SCANHUB_TEST_NETWORK";
 
-/// Runs `test`, which is called `name`, in a network namespace of its own; says so if the system does not allow that.
+/// Runs `test`, whose name is `name`, in a network namespace of its own. Skips it if the system does not allow that.
 pub(crate) fn in_a_network(name: &str, test: impl FnOnce()) {
     if std::env::var_os(INSIDE).is_some() {
         return test();
@@ -21,8 +22,7 @@ pub(crate) fn in_a_network(name: &str, test: impl FnOnce()) {
     let mut attempt = Command::new("unshare");
     attempt.args(unshare.get_args()).args(["ip", "link", "set", "lo", "up"]);
     static ALLOWED: OnceLock<bool> = OnceLock::new();
-    let succeeds = || attempt.output().is_ok_and(|output| output.status.success());
-    if !*ALLOWED.get_or_init(succeeds) {
+    if !*ALLOWED.get_or_init(|| succeeds(attempt)) {
         skip("netns", "this user may not make a network namespace, or there is no `ip`");
         return;
     }

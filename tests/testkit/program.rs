@@ -1,16 +1,17 @@
-//! The program as a child of a test: read line by line, ended by its id, and ended in any case.
+//! The program as a child of a test. Its output is read line by line.
 
 use std::fmt;
 use std::io::{BufRead, BufReader, Read};
-use std::process::{Child, Command, Stdio};
+use std::process::{Command, Stdio};
 use std::sync::mpsc::{Receiver, RecvTimeoutError, channel};
 use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant};
 
-use rustix::process::{Pid, Signal, kill_process};
+use rustix::process::Signal;
 use serde_json::Value;
 
 use super::PATIENCE;
+use super::child::{Child, spawn};
 use super::in_time::ends_after;
 
 pub(crate) const INT: Signal = Signal::INT;
@@ -19,18 +20,18 @@ pub(crate) const KILL: Signal = Signal::KILL;
 pub(crate) const HUP: Signal = Signal::HUP;
 pub(crate) const USR1: Signal = Signal::USR1;
 
-/// A running child.
+/// A running program.
 pub(crate) struct Program {
     name: String,
     process: Child,
-    /// Its stdout, a line or what is left of one each.
+    /// Lines of its stdout. The last one may lack its line feed.
     pieces: Receiver<Vec<u8>>,
-    /// What was received of it.
+    /// Bytes that were received from `pieces`.
     out: Vec<u8>,
     errors: Option<JoinHandle<String>>,
 }
 
-/// What came of a child.
+/// Result of a program that has ended.
 pub(crate) struct Outcome {
     /// Its exit code; `None` if a signal ended it.
     pub(crate) code: Option<i32>,
@@ -38,20 +39,23 @@ pub(crate) struct Outcome {
     pub(crate) out: Vec<u8>,
     /// All of its stderr.
     pub(crate) errors: String,
+    /// Command lines of the processes that it left. They have been ended.
+    pub(crate) left: Vec<String>,
     name: String,
 }
 
 impl Program {
+    /// Starts `command` with an empty stdin.
     pub(crate) fn start(command: Command) -> Program {
         Program::start_with(command, Stdio::null())
     }
 
-    /// As [`Program::start`], with this as its stdin.
+    /// Starts `command` with this stdin.
     pub(crate) fn start_with(mut command: Command, stdin: impl Into<Stdio>) -> Program {
         let words: Vec<_> = command.get_args().map(|word| word.to_string_lossy()).collect();
         let name = words.join(" ");
         command.stdin(stdin).stdout(Stdio::piped()).stderr(Stdio::piped());
-        let mut process = command.spawn().unwrap_or_else(|error| panic!("cannot start {name}: {error}"));
+        let mut process = spawn(command).unwrap_or_else(|error| panic!("cannot start {name}: {error}"));
         let (send, pieces) = channel();
         let stdout = process.stdout.take();
         thread::spawn(move || {
@@ -72,17 +76,18 @@ impl Program {
         Program { name, process, pieces, out: Vec::new(), errors: Some(errors) }
     }
 
-    /// Waits for its line that says that it is up.
+    /// Waits for its line of class `ready`.
     pub(crate) fn ready(mut self) -> Program {
         self.await_line("ready", |line| line["class"] == "ready");
         self
     }
 
+    /// Returns its process ID.
     pub(crate) fn pid(&self) -> u32 {
         self.process.id()
     }
 
-    /// How long its threads were ready to run and did not get a processor so far; nothing where the kernel does not count
+    /// Returns how long its threads have been ready to run without a processor. Zero where the kernel does not count
     /// it.
     fn kept_waiting(&self) -> Duration {
         let tasks = std::fs::read_dir(format!("/proc/{}/task", self.pid())).into_iter().flatten().flatten();
@@ -93,19 +98,19 @@ impl Program {
         Duration::from_nanos(counted.sum())
     }
 
-    /// It has ended.
+    /// Returns whether it has ended.
     pub(crate) fn is_over(&self) -> bool {
         let status = std::fs::read_to_string(format!("/proc/{}/stat", self.pid())).unwrap_or_default();
-        // What comes behind the name in brackets is its state, if it is there.
+        // The state follows the name in brackets.
         status.rsplit_once(')').is_none_or(|(_, rest)| rest.trim_start().starts_with(['Z', 'X']))
     }
 
-    /// It ends without a word on stdout.
+    /// Returns whether it ends without any output on stdout.
     pub(crate) fn is_over_before_it_says(&mut self) -> bool {
         self.receive(Instant::now() + PATIENCE) == Err(RecvTimeoutError::Disconnected)
     }
 
-    /// Its first line from now on that is `wanted`.
+    /// Waits for the next line that is `wanted`, and returns it.
     pub(crate) fn await_line(&mut self, what: &str, wanted: impl Fn(&Value) -> bool) -> Value {
         let give_up_at = Instant::now() + PATIENCE;
         loop {
@@ -116,19 +121,19 @@ impl Program {
         }
     }
 
-    /// Whether a line that it said so far is `wanted`.
+    /// Returns whether a line that was received so far is `wanted`.
     pub(crate) fn has_said(&self, wanted: impl Fn(&Value) -> bool) -> bool {
         let lines = self.out.split(|byte| *byte == b'\n');
         lines.filter_map(|line| serde_json::from_slice(line).ok()).any(|line| wanted(&line))
     }
 
-    /// Whether a line that it has said by now is `wanted`.
+    /// Receives the lines that it has written by now, and returns whether any line is `wanted`.
     pub(crate) fn is_heard(&mut self, wanted: impl Fn(&Value) -> bool) -> bool {
         while self.receive(Instant::now()).is_ok() {}
         self.has_said(wanted)
     }
 
-    /// Its next `count` lines from now on that are `wanted`.
+    /// Waits for the next `count` lines that are `wanted`, and returns them.
     pub(crate) fn await_lines(
         &mut self,
         count: usize,
@@ -138,7 +143,7 @@ impl Program {
         (0..count).map(|_| self.await_line(what, &wanted)).collect()
     }
 
-    /// Waits for a line that begins with `text`; for children that do not speak JSON.
+    /// Waits for a line that begins with `text`, for programs that do not print JSON.
     pub(crate) fn await_text(&mut self, text: &str) {
         let give_up_at = Instant::now() + PATIENCE;
         let mut line = Vec::new();
@@ -149,7 +154,7 @@ impl Program {
         }
     }
 
-    /// Its next line; for children that do not speak JSON.
+    /// Waits for the next line, and returns it, for programs that do not print JSON.
     pub(crate) fn next_text(&mut self) -> String {
         let begin = self.out.len();
         let give_up_at = Instant::now() + PATIENCE;
@@ -167,8 +172,7 @@ impl Program {
 
     /// Sends a signal.
     pub(crate) fn signal(&self, signal: Signal) {
-        let pid = Pid::from_child(&self.process);
-        kill_process(pid, signal).unwrap_or_else(|error| panic!("{}: no {signal:?}: {error}", self.name));
+        self.process.signal(signal).unwrap_or_else(|error| panic!("{}: no {signal:?}: {error}", self.name));
     }
 
     /// Sends a signal and waits for the end.
@@ -196,6 +200,7 @@ impl Program {
             code: status.code(),
             out: std::mem::take(&mut self.out),
             errors: errors.and_then(Result::ok).unwrap_or_default(),
+            left: self.process.family(),
             name: self.name.clone(),
         }
     }
@@ -213,7 +218,8 @@ impl Program {
     }
 
     fn give_up(&mut self, what: &str, why: RecvTimeoutError) -> ! {
-        let _ = self.process.kill();
+        // With its descendants, because any of them keeps stderr open.
+        self.process.end();
         let errors = self.errors.take().and_then(|errors| errors.join().ok()).unwrap_or_default();
         let out = String::from_utf8_lossy(&self.out);
         let tail: Vec<_> = out.lines().rev().take(5).collect();
@@ -224,22 +230,11 @@ impl Program {
 impl Drop for Program {
     fn drop(&mut self) {
         ends_after(self.kept_waiting());
-        // First the gentle way: it may have children or files of its own.
-        let _ = kill_process(Pid::from_child(&self.process), Signal::TERM);
-        let give_up_at = Instant::now() + Duration::from_secs(2);
-        while let Ok(None) = self.process.try_wait() {
-            if Instant::now() > give_up_at {
-                let _ = self.process.kill();
-                let _ = self.process.wait();
-                return;
-            }
-            thread::sleep(Duration::from_millis(5));
-        }
     }
 }
 
 impl Outcome {
-    /// Its stdout as lines of JSON.
+    /// Parses its stdout as lines of JSON.
     pub(crate) fn lines(&self) -> Vec<Value> {
         let text = String::from_utf8_lossy(&self.out);
         assert!(text.is_empty() || text.ends_with('\n'), "half a line: {self}");
@@ -248,7 +243,7 @@ impl Outcome {
             .collect()
     }
 
-    /// Its lines of `class`.
+    /// Returns its lines of `class`.
     pub(crate) fn of_class(&self, class: &str) -> Vec<Value> {
         self.lines().into_iter().filter(|line| line["class"] == class).collect()
     }
@@ -256,7 +251,7 @@ impl Outcome {
 
 impl fmt::Display for Outcome {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Outcome { name, code, out, errors } = self;
+        let Outcome { name, code, out, errors, .. } = self;
         write!(f, "scanhub {name}: exit {code:?}\n{}\n{errors}", String::from_utf8_lossy(out))
     }
 }

@@ -1,11 +1,11 @@
-//! A terminal at which a person sits: a pty of which the test has the person's side, and what stands on its screen.
+//! A pseudoterminal whose other side the test has, and the content of its screen.
 
 use std::ffi::OsStr;
 use std::fs::File;
 use std::io::{Read, Write};
 use std::os::fd::{AsFd, OwnedFd};
 use std::os::unix::ffi::OsStrExt;
-use std::process::{Child, Command, Stdio};
+use std::process::{Command, Stdio};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex};
 use std::thread::{self, JoinHandle};
@@ -13,13 +13,14 @@ use std::time::{Duration, Instant};
 
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::fs::{Mode, OFlags};
-use rustix::process::{Pid, Signal, kill_process};
+use rustix::process::Signal;
 use rustix::pty::{OpenptFlags, grantpt, openpt, ptsname, unlockpt};
 use rustix::termios::{Termios, Winsize, tcgetattr, tcsetwinsize};
 
+use super::child::{Child, spawn, succeeds};
 use super::{PATIENCE, skip};
 
-/// The person's side of a new terminal, and the program's.
+/// Returns both sides of a new terminal: the test's, and the program's.
 pub(crate) fn terminal() -> (File, OwnedFd) {
     let keys = openpt(OpenptFlags::RDWR | OpenptFlags::NOCTTY | OpenptFlags::CLOEXEC).unwrap();
     grantpt(&keys).unwrap();
@@ -30,37 +31,37 @@ pub(crate) fn terminal() -> (File, OwnedFd) {
     (keys.into(), screen)
 }
 
-/// Whether a test can sit at a terminal of its own here; says why not.
+/// Returns whether a test can start a program in a terminal of its own. Skips the test if not.
 pub(crate) fn can_sit() -> bool {
-    let can_sit = Command::new("setsid").arg("true").status().is_ok_and(|status| status.success());
+    let can_sit = succeeds(Command::new("setsid").arg("true"));
     if !can_sit {
         skip("setsid", "there is none (Debian: apt-get install util-linux)");
     }
     can_sit
 }
 
-/// A program with a terminal of its own, at which the test sits.
+/// A program in a terminal of its own.
 pub(crate) struct Sitting {
     process: Child,
-    /// The person's side, until it is closed.
+    /// The test's side of the terminal, until it is closed.
     keys: Option<File>,
     screen: OwnedFd,
     before: Termios,
     seen: Arc<Mutex<Vec<u8>>>,
-    /// Sees what is written, until it is told that nobody looks any more.
+    /// Reads the output of the program until `closed` is set.
     eye: Option<JoinHandle<()>>,
     closed: Arc<AtomicBool>,
     size: (u16, u16),
 }
 
 impl Sitting {
-    /// Starts `command` on a terminal of `size`, columns and rows, which is the one of its session.
+    /// Starts `command` in a terminal of `size`, columns and rows. It is the controlling terminal of a new session.
     pub(crate) fn start(command: &Command, size: (u16, u16)) -> Sitting {
         Sitting::begin(command, size, &["-c"], None)
     }
 
-    /// As [`Sitting::start`], with `errors` for its stderr, and if it is not `told` on a terminal that is of no session:
-    /// nobody is sent a signal when it is closed.
+    /// Starts `command` like [`Sitting::start`], with `errors` as its stderr. Unless it is `told`, the terminal is not
+    /// the controlling one, so that closing it sends no signal.
     pub(crate) fn start_for_hang_up(
         command: &Command,
         size: (u16, u16),
@@ -85,7 +86,7 @@ impl Sitting {
         }
         setsid.env("TERM", "xterm").stdin(program()).stdout(program());
         setsid.stderr(errors.map_or_else(program, Stdio::from));
-        let process = setsid.spawn().unwrap();
+        let process = spawn(&mut setsid).unwrap();
         drop(setsid);
         let seen = Arc::new(Mutex::new(Vec::new()));
         let closed = Arc::new(AtomicBool::new(false));
@@ -97,7 +98,7 @@ impl Sitting {
                 if poll(&mut fds, Some(&LOOK)).unwrap() == 0 {
                     continue;
                 }
-                // A terminal that nobody has open any more ends by an error.
+                // Reading fails once no process has the terminal open.
                 let Ok(len @ 1..) = from.read(&mut piece) else { return };
                 to.lock().unwrap().extend_from_slice(&piece[..len]);
             }
@@ -105,17 +106,17 @@ impl Sitting {
         Sitting { process, keys: Some(keys), screen, before, seen, eye: Some(eye), closed, size }
     }
 
-    /// Its process id.
+    /// Returns its process ID.
     pub(crate) fn pid(&self) -> u32 {
         self.process.id()
     }
 
-    /// All that was written on it.
+    /// Returns all of its output.
     pub(crate) fn text(&self) -> String {
         String::from_utf8_lossy(&self.seen.lock().unwrap()).into_owned()
     }
 
-    /// The rows of its screen.
+    /// Returns the rows of its screen.
     pub(crate) fn rows(&self) -> Vec<String> {
         shown(&self.text(), self.size.0.into(), self.size.1.into())
     }
@@ -139,7 +140,7 @@ impl Sitting {
         self.keys.as_mut().expect("it is open").write_all(keys.as_bytes()).unwrap();
     }
 
-    /// Makes the terminal so large.
+    /// Sets the size of the terminal, columns and rows.
     pub(crate) fn resize(&mut self, size: (u16, u16)) {
         self.size = size;
         resize(&self.screen, size);
@@ -147,10 +148,10 @@ impl Sitting {
 
     /// Sends a signal.
     pub(crate) fn signal(&self, signal: Signal) {
-        kill_process(Pid::from_child(&self.process), signal).unwrap();
+        self.process.signal(signal).unwrap();
     }
 
-    /// Closes the terminal and waits for the end: the exit code, and how long that took.
+    /// Closes the terminal and waits for the end. Returns the exit code and the time until the end.
     pub(crate) fn hang_up(mut self) -> (Option<i32>, Duration) {
         self.closed.store(true, Ordering::Relaxed);
         self.eye.take().map(JoinHandle::join).transpose().unwrap();
@@ -170,7 +171,8 @@ impl Sitting {
         }
     }
 
-    /// Waits for the end: the exit code, what stands below the picture, and whether the terminal is as it was.
+    /// Waits for the end. Returns the exit code, the text below the picture, and whether the terminal has its old
+    /// modes.
     pub(crate) fn end(self) -> (Option<i32>, String, bool) {
         let (code, text, is_as_before) = self.end_of_lines();
         let (picture, below) = text.rsplit_once("\x1b[?1049l").unwrap_or(("", &text));
@@ -179,18 +181,18 @@ impl Sitting {
         (code, below.replace("\x1b[?25h", ""), is_whole)
     }
 
-    /// The same of a program that draws no picture: with all that it wrote.
+    /// Does the same for a program that draws no picture, and returns all of its output.
     pub(crate) fn end_of_lines(mut self) -> (Option<i32>, String, bool) {
         let code = self.wait();
         let give_up_at = Instant::now() + PATIENCE;
         let after = tcgetattr(&self.screen).unwrap();
         let is_as_before = (after.input_modes, after.output_modes, after.local_modes)
             == (self.before.input_modes, self.before.output_modes, self.before.local_modes);
-        // All of it is here once the last of it is.
+        // A mark behind the output shows that all of it has been read.
         let mark = "\u{1}end";
         File::from(self.screen.try_clone().unwrap()).write_all(mark.as_bytes()).unwrap();
         while !self.text().ends_with(mark) {
-            assert!(Instant::now() < give_up_at, "the terminal keeps what was written");
+            assert!(Instant::now() < give_up_at, "the terminal does not return the output");
             thread::sleep(Duration::from_millis(10));
         }
         let text = self.text();
@@ -198,22 +200,15 @@ impl Sitting {
     }
 }
 
-impl Drop for Sitting {
-    fn drop(&mut self) {
-        let _ = self.process.kill();
-        let _ = self.process.wait();
-    }
-}
-
-/// Between two looks whether anybody looks on.
+/// Interval at which the reader checks whether the terminal is closed.
 const LOOK: Timespec = Timespec { tv_sec: 0, tv_nsec: 20_000_000 };
 
 fn resize(terminal: impl AsFd, (columns, rows): (u16, u16)) {
     tcsetwinsize(terminal, Winsize { ws_col: columns, ws_row: rows, ws_xpixel: 0, ws_ypixel: 0 }).unwrap();
 }
 
-/// What stands on a screen on which `text` was written: its rows. Knows what programs use that place each sign: cursor
-/// positions (CSI H), clearing (CSI J) and the alternate screen; colours say nothing here.
+/// Returns the rows of a screen after `text` was written to it. Interprets cursor positions (CSI H), clearing (CSI J)
+/// and the alternate screen, and ignores colors.
 fn shown(text: &str, columns: usize, rows: usize) -> Vec<String> {
     let mut screen = vec![vec![' '; columns]; rows];
     let (mut row, mut column) = (0, 0);

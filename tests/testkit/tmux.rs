@@ -1,37 +1,44 @@
-//! A window of tmux, a terminal that other people wrote: what stands in it is what it made of the program's output. A server
-//! of its own, on a socket in the test's directory, gone with the test.
+//! A program in a window of tmux, to test its output on an independent implementation of a terminal. The tmux server
+//! has a socket in the directory of the test, and ends with the test.
 
-use std::path::PathBuf;
-use std::process::{Command, Output};
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output, Stdio};
 use std::thread;
 use std::time::{Duration, Instant};
 
+use super::child::{Child, output, spawn, succeeds};
 use super::{PATIENCE, TestEnv, skip};
 
 /// A session with one window.
 pub(crate) struct Tmux {
     socket: PathBuf,
+    /// The command that made the session. The server descends from it.
+    _session: Child,
 }
 
 impl Tmux {
-    /// Runs the shell's `line` in a window of `size`, columns and rows; nothing, and why, where there is no tmux.
+    /// Runs `line` in a shell in a window of `size`, columns and rows. If there is no tmux, skips the test and returns
+    /// `None`.
     pub(crate) fn start(env: &TestEnv, line: &str, (columns, rows): (u16, u16)) -> Option<Tmux> {
-        if Command::new("tmux").arg("-V").output().is_err() {
+        if !succeeds(Command::new("tmux").arg("-V")) {
             skip("tmux", "there is none (Debian: apt-get install tmux)");
             return None;
         }
-        let tmux = Tmux { socket: env.path("tmux") };
+        let socket = env.path("tmux");
         let (columns, rows) = (columns.to_string(), rows.to_string());
-        tmux.tell(&["-f", "/dev/null", "new-session", "-d", "-x", &columns, "-y", &rows, line]);
-        Some(tmux)
+        let words = ["-f", "/dev/null", "new-session", "-d", "-x", &columns, "-y", &rows, line];
+        let mut begin = command(&socket, &words);
+        let mut session = spawn(begin.stdin(Stdio::null()).stdout(Stdio::null())).expect("tmux starts");
+        assert!(session.wait().is_ok_and(|status| status.success()), "tmux {words:?}");
+        Some(Tmux { socket, _session: session })
     }
 
-    /// Types keys, as tmux calls them.
+    /// Types keys, by their names in tmux.
     pub(crate) fn press(&self, keys: &[&str]) {
         self.tell(&[&["send-keys"], keys].concat());
     }
 
-    /// Makes the window so large.
+    /// Sets the size of the window, columns and rows.
     pub(crate) fn resize(&self, (columns, rows): (u16, u16)) {
         self.tell(&["resize-window", "-x", &columns.to_string(), "-y", &rows.to_string()]);
     }
@@ -55,22 +62,23 @@ impl Tmux {
     }
 
     fn tell(&self, words: &[&str]) -> Output {
-        let output = self.command(words).output().unwrap_or_else(|error| panic!("tmux {words:?}: {error}"));
+        let output =
+            output(command(&self.socket, words)).unwrap_or_else(|error| panic!("tmux {words:?}: {error}"));
         assert!(output.status.success(), "tmux {words:?}: {}", String::from_utf8_lossy(&output.stderr));
         output
-    }
-
-    fn command(&self, words: &[&str]) -> Command {
-        let mut command = Command::new("tmux");
-        // UTF-8, whatever the locale; not the server of whoever runs the test.
-        command.arg("-u").arg("-S").arg(&self.socket).args(words);
-        command.env_remove("TMUX").env_remove("NO_COLOR");
-        command
     }
 }
 
 impl Drop for Tmux {
     fn drop(&mut self) {
-        let _ = self.command(&["kill-server"]).output();
+        let _ = output(command(&self.socket, &["kill-server"]));
     }
+}
+
+fn command(socket: &Path, words: &[&str]) -> Command {
+    let mut command = Command::new("tmux");
+    // UTF-8, whatever the locale, and never the server of the person who runs the test.
+    command.arg("-u").arg("-S").arg(socket).args(words);
+    command.env_remove("TMUX").env_remove("NO_COLOR");
+    command
 }

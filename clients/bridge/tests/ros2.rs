@@ -6,18 +6,23 @@ use std::io::{BufRead, BufReader};
 use std::net::TcpListener;
 use std::os::unix::fs::DirBuilderExt;
 use std::path::{Path, PathBuf};
-use std::process::{Child, Command, Stdio};
+use std::process::{Command, Stdio};
 use std::thread;
 use std::time::{Duration, Instant};
 
 use serde_json::Value;
+
+#[path = "../../../tests/testkit/child.rs"]
+mod child;
+
+use child::{Child, output, spawn, status, succeeds};
 
 const BRIDGE: &str = env!("CARGO_BIN_EXE_scanhub-bridge");
 /// The program beside the bridge; built if it is not there.
 fn scanhub() -> PathBuf {
     let program = Path::new(BRIDGE).with_file_name("scanhub");
     if !program.is_file() {
-        let built = Command::new(env!("CARGO")).args(["build", "--quiet", "--package=scanhub"]).status();
+        let built = status(Command::new(env!("CARGO")).args(["build", "--quiet", "--package=scanhub"]));
         assert!(built.is_ok_and(|status| status.success()), "cargo cannot build scanhub");
     }
     program
@@ -45,7 +50,7 @@ impl Place {
         command.args(arguments).args(["--domain", "ros2", "--root", &self.path("root")]);
         command.env("STATE_DIRECTORY", self.path("state")).env_remove("ROS_DOMAIN_ID");
         command.stdin(Stdio::null()).stdout(out).stderr(Stdio::null());
-        Running(command.spawn().expect("a program"))
+        Running(spawn(command).expect("a program"))
     }
 }
 
@@ -60,16 +65,8 @@ struct Running(Child);
 impl Running {
     /// Ends it by a signal; returns its exit code.
     fn end(mut self) -> Option<i32> {
-        let id = self.0.id().to_string();
-        assert!(Command::new("kill").args(["-TERM", &id]).status().is_ok_and(|status| status.success()));
+        self.0.signal(rustix::process::Signal::TERM).expect("it lives");
         self.0.wait().ok().and_then(|status| status.code())
-    }
-}
-
-impl Drop for Running {
-    fn drop(&mut self) {
-        let _ = self.0.kill();
-        let _ = self.0.wait();
     }
 }
 
@@ -84,8 +81,7 @@ fn skip(need: &str, why: &str) {
 fn python() -> Option<PathBuf> {
     let made = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../target/venv/bin/python");
     let python = std::env::var_os("SCANHUB_PYTHON").map_or(made, PathBuf::from);
-    let has_all = Command::new(&python).args(["-c", "import zenoh_ros2_sdk, rosbags"]).output();
-    has_all.is_ok_and(|outcome| outcome.status.success()).then_some(python)
+    succeeds(Command::new(&python).args(["-c", "import zenoh_ros2_sdk, rosbags"])).then_some(python)
 }
 
 fn free_port() -> u16 {
@@ -120,7 +116,7 @@ fn others_find_every_topic_and_decode_every_message() {
     }
     let mut judge = Command::new(python);
     judge.args(["-B", concat!(env!("CARGO_MANIFEST_DIR"), "/tests/ros2.py"), &port, "42", "5"]);
-    let outcome = judge.args(echoes.iter().map(|(_, path)| path)).output().expect("Python");
+    let outcome = output(judge.args(echoes.iter().map(|(_, path)| path))).expect("Python");
     let (said, why) = (String::from_utf8_lossy(&outcome.stdout), String::from_utf8_lossy(&outcome.stderr));
     assert!(outcome.status.success(), "{said}{why}");
     let said: Value = serde_json::from_str(said.lines().last().unwrap_or_default()).expect("an object");
@@ -216,7 +212,7 @@ fn said(domain: &str, flags: &[&str]) -> (Option<i32>, String) {
     let mut command = Command::new(env!("CARGO_BIN_EXE_scanhub-bridge"));
     // Nobody is at this port.
     command.args(["--connect=tcp/127.0.0.1:1", "--check"]).args(flags).env("ROS_DOMAIN_ID", domain);
-    let output = command.stdin(Stdio::null()).output().expect("a program");
+    let output = output(command).expect("a program");
     (output.status.code(), String::from_utf8_lossy(&output.stderr).into_owned())
 }
 

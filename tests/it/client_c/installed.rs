@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 use std::sync::OnceLock;
 
-use crate::testkit::{TestEnv, gentle, skip};
+use crate::testkit::{TestEnv, gentle, output, skip};
 
 /// A place where the library and its header are.
 pub(crate) struct Installed {
@@ -37,7 +37,7 @@ impl Installed {
                 .expect("a place for a link");
             let mut command = Command::new(top().join("clients/c/install.sh"));
             command.arg("--prefix").arg(&prefix).arg("--library").arg(&library).env_remove("DESTDIR");
-            done(&command.output().expect("there is a shell")).unwrap_or_else(|said| panic!("{said}"));
+            done(&output(command).expect("there is a shell")).unwrap_or_else(|said| panic!("{said}"));
             Installed { prefix, library }
         }))
     }
@@ -72,7 +72,7 @@ impl Installed {
     /// The program of `source` with the library in it; nothing where pkg-config does not say how.
     pub(crate) fn compile_static(&self, env: &TestEnv, source: &Path) -> Option<PathBuf> {
         let mut ask = self.with_packages(Command::new("pkg-config"));
-        let Ok(said) = ask.args(["--static", "--libs-only-l", "scanhub"]).output() else {
+        let Ok(said) = output(ask.args(["--static", "--libs-only-l", "scanhub"])) else {
             skip("pkg-config", "there is none, which says how the library gets into a program");
             return None;
         };
@@ -92,7 +92,7 @@ impl Installed {
         let mut configure = self.with_packages(gentle("cmake"));
         configure.arg("-S").arg(source).arg("-B").arg(&build);
         for command in [&mut configure, gentle("cmake").arg("--build").arg(&build)] {
-            done(&command.output().expect("it is there")).unwrap_or_else(|said| panic!("{said}"));
+            done(&output(command).expect("it is there")).unwrap_or_else(|said| panic!("{said}"));
         }
         Some(build)
     }
@@ -110,7 +110,7 @@ impl Installed {
         let mut command = gentle(compiler);
         command.args(STRICT).args(flags).arg("-I").arg(self.prefix.join("include")).arg(source);
         command.args(libraries).arg("-o").arg(&program);
-        done(&command.output().expect("a compiler")).map(|_| program)
+        done(&output(command).expect("a compiler")).map(|_| program)
     }
 
     fn shared(&self) -> Vec<String> {
@@ -126,7 +126,7 @@ impl Installed {
 
 /// Whether there is such a tool; says so if not.
 pub(crate) fn is_there(name: &str) -> bool {
-    let found = Command::new(name).arg("--version").output().is_ok();
+    let found = output(Command::new(name).arg("--version")).is_ok();
     if !found {
         skip(name, "there is none");
     }

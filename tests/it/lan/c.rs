@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-use crate::testkit::{gentle, skip};
+use crate::testkit::{gentle, output, skip};
 
 use super::readers::{self, Reader};
 
@@ -11,7 +11,7 @@ use super::readers::{self, Reader};
 fn reader() -> Option<PathBuf> {
     let top = Path::new(env!("CARGO_MANIFEST_DIR"));
     let program = Path::new(env!("CARGO_TARGET_TMPDIR")).join("lan-reader");
-    if Command::new("cc").arg("--version").output().is_err() {
+    if output(Command::new("cc").arg("--version")).is_err() {
         skip("cc", "there is no C compiler");
         return None;
     }
@@ -23,7 +23,7 @@ fn reader() -> Option<PathBuf> {
             .arg(top.join("tests/it/lan/reader.c"))
             .arg("-o")
             .arg(&program);
-        cc.output().expect("a compiler")
+        output(cc).expect("a compiler")
     };
     if !compile(&["-fsanitize=address,undefined", "-fno-sanitize-recover=all"]).status.success() {
         eprintln!("without a watch over memory: this compiler has none");

@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::path::Path;
 use std::process::Command;
 
-use crate::testkit::{gentle, skip};
+use crate::testkit::{gentle, output, skip, succeeds};
 
 /// A capture file as it grows: pcap 2.4, in which every packet begins with its IPv4 header (link type 101).
 #[derive(Default)]
@@ -14,7 +14,7 @@ pub(crate) struct Capture {
 
 /// Whether there is a tshark; says so if not.
 pub(crate) fn has_tshark() -> bool {
-    let found = Command::new("tshark").arg("--version").output().is_ok_and(|output| output.status.success());
+    let found = succeeds(Command::new("tshark").arg("--version"));
     if !found {
         skip("tshark", "there is none (Debian: apt-get install tshark)");
     }
@@ -69,7 +69,7 @@ impl Capture {
         for name in &names {
             tshark.args(["-e", name]);
         }
-        let output = tshark.output().expect("tshark");
+        let output = output(tshark).expect("tshark");
         let errors = String::from_utf8_lossy(&output.stderr);
         assert!(output.status.success() && !errors.contains("Lua"), "{errors}");
         let text = String::from_utf8(output.stdout).expect("text");

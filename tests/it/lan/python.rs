@@ -4,7 +4,7 @@
 use std::path::Path;
 use std::process::Command;
 
-use crate::testkit::skip;
+use crate::testkit::{output, skip, succeeds};
 
 use super::readers::{self, Reader};
 use super::vectors;
@@ -14,7 +14,7 @@ fn reader() -> Option<Reader> {
     let top = Path::new(env!("CARGO_MANIFEST_DIR"));
     let python = std::env::var("SCANHUB_PYTHON").unwrap_or("python3".to_owned());
     let recent = "import sys; sys.exit(sys.version_info < (3, 9))";
-    if !Command::new(&python).args(["-c", recent]).status().is_ok_and(|status| status.success()) {
+    if !succeeds(Command::new(&python).args(["-c", recent])) {
         skip("python", format!("there is no {python}, or it is older than 3.9"));
         return None;
     }
@@ -50,7 +50,7 @@ fn the_module_puts_parts_together() {
         let top = Path::new(env!("CARGO_MANIFEST_DIR"));
         let mut command = Command::new(std::env::var("SCANHUB_PYTHON").unwrap_or("python3".to_owned()));
         command.arg("-B").arg(top.join("tests/it/lan/reader.py")).args(order);
-        let output = command.env("PYTHONPATH", top.join("clients/python")).output().expect("runs");
+        let output = output(command.env("PYTHONPATH", top.join("clients/python"))).expect("runs");
         assert_eq!(String::from_utf8_lossy(&output.stdout).trim(), whole, "{output:?}");
     }
 }

@@ -2,11 +2,13 @@
 //! is right.
 
 use std::io::{BufRead, BufReader, Write};
-use std::process::{Child, ChildStdin, ChildStdout, Command, Stdio};
+use std::process::{ChildStdin, ChildStdout, Command, Stdio};
 
 use schema::datagram::{Datagram, Packed};
 use schema::{Counter, Scan};
 use serde_json::{Map, Value, json};
+
+use crate::testkit::{Child, spawn};
 
 use super::{damaged, keyed_vectors, vectors};
 
@@ -19,7 +21,7 @@ pub(crate) struct Reader {
 
 impl Reader {
     pub(crate) fn start(command: &mut Command) -> Reader {
-        let mut child = command.stdin(Stdio::piped()).stdout(Stdio::piped()).spawn().expect("a program");
+        let mut child = spawn(command.stdin(Stdio::piped()).stdout(Stdio::piped())).expect("a program");
         let (input, output) = (child.stdin.take().expect("a pipe"), child.stdout.take().expect("a pipe"));
         Reader { child, input, output: BufReader::new(output) }
     }

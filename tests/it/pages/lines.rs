@@ -2,7 +2,6 @@
 //! pages use, and a spare sensor at every port that they name. What cannot be run is named here, with the reason.
 
 use std::fs;
-use std::os::unix::process::CommandExt;
 use std::process::Command;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::thread;
@@ -12,7 +11,9 @@ use rustix::process::{Pid, Signal, kill_process_group};
 
 use super::blocks::blocks;
 use super::shell::{commands, lines};
-use crate::testkit::{PATIENCE, Program, Sender, TestEnv, in_a_network, is_class, side_by_side};
+use crate::testkit::{
+    PATIENCE, Program, Sender, TestEnv, in_a_network, is_class, side_by_side, write_program,
+};
 use schema::Topic;
 
 /// Commands that are not run, by how their line begins or what is in it, and what makes sure of them. Those of the program
@@ -89,9 +90,7 @@ impl Desk {
              exec '{}' \"$@\" --domain \"{name}$other\" --root '{root}'\n",
             env!("CARGO_BIN_EXE_scanhub"),
         );
-        let program = env.file("bin/scanhub", script);
-        let mode = std::os::unix::fs::PermissionsExt::from_mode(0o755);
-        fs::set_permissions(program, mode).expect("it is ours");
+        write_program(env.path("bin/scanhub"), script);
         env.file("capture.bin", stream.out);
         (Desk { env, count: AtomicUsize::new(0) }, [simulator, hub])
     }
@@ -120,7 +119,7 @@ impl Desk {
         // A single command is the shell's own process, so that what ends it ends that.
         let exec = if commands(line).len() == 1 { "exec " } else { "" };
         let path = format!("{}:{}", self.env.word("bin"), std::env::var("PATH").unwrap_or_default());
-        shell.arg("-c").arg(format!("{exec}{typed}")).current_dir(&here).process_group(0).env("PATH", path);
+        shell.arg("-c").arg(format!("{exec}{typed}")).current_dir(&here).env("PATH", path);
         shell.env("HOME", &here).env("XDG_STATE_HOME", here.join("state")).env_remove("STATE_DIRECTORY");
         shell.env("SCANHUB_END_WITH_PARENT", "1").env("SCANHUB_LOG", "error").env_remove("SCANHUB_CONFIG");
         let program = Program::start(shell);

@@ -10,7 +10,7 @@ use serde_json::Value;
 
 use super::blocks::Block;
 use crate::client_c::installed::Installed;
-use crate::testkit::{TestEnv, gentle, python};
+use crate::testkit::{TestEnv, gentle, output, python};
 
 /// Something to start.
 pub(crate) struct Example {
@@ -95,7 +95,7 @@ fn of_rust(source: &Path, env: &TestEnv) -> Result<PathBuf, String> {
     let directory = library.parent().expect("a directory");
     command.arg(format!("-Ldependency={}", directory.join("deps").display()));
     command.arg(format!("--extern={LIBRARY}={}", library.display()));
-    let output = command.output().expect("a compiler");
+    let output = output(command).expect("a compiler");
     if !output.status.success() {
         return Err(String::from_utf8_lossy(&output.stderr).into_owned());
     }
@@ -119,7 +119,7 @@ fn build_library() -> PathBuf {
     if !cfg!(debug_assertions) {
         command.arg("--release");
     }
-    let output = command.current_dir(env!("CARGO_MANIFEST_DIR")).output().expect("Cargo");
+    let output = output(command.current_dir(env!("CARGO_MANIFEST_DIR"))).expect("Cargo");
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
     let messages = String::from_utf8(output.stdout).expect("text");
     let messages = messages.lines().filter_map(|line| serde_json::from_str::<Value>(line).ok());

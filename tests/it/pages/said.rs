@@ -8,7 +8,7 @@ use serde_json::Value;
 
 use super::blocks::{Block, blocks};
 use super::is_program;
-use crate::testkit::{TERM, TestEnv};
+use crate::testkit::{TERM, TestEnv, output};
 
 /// Texts that are no examples, by how they begin, and what makes sure of them.
 const TEXTS: [(&str, &str, &str); 8] = [
@@ -127,7 +127,7 @@ fn a_wrong_world_is_refused_as_the_page_says() {
     let env = TestEnv::new();
     env.file("w.toml", "[[thing]]\nradius_m = 0.04\n");
     let mut command = env.command(&["simulate", "--world=w.toml", "--port=front"]);
-    let output = command.current_dir(env.path("")).output().expect("it runs");
+    let output = output(command.current_dir(env.path(""))).expect("it runs");
     let said = String::from_utf8_lossy(&output.stderr);
     assert_eq!(output.status.code(), Some(78), "{said}");
     for line in block.text.lines() {

@@ -1,6 +1,7 @@
 //! Who may know whom: walls between the crates, read from the manifests and from what Cargo makes of them.
 
 use super::tree::{Tree, find};
+use crate::testkit::output;
 use std::collections::BTreeSet;
 use std::process::Command;
 
@@ -373,23 +374,10 @@ pub(crate) fn shared_memory_is_pinned(tree: &Tree) -> Vec<String> {
 
 /// Names of the crates that `package` is built from, itself included, as Cargo resolves it on this machine.
 pub(crate) fn built_from(package: &str, features: &[&str]) -> BTreeSet<String> {
-    let output = Command::new(env!("CARGO"))
-        .current_dir(env!("CARGO_MANIFEST_DIR"))
-        .args([
-            "tree",
-            "--offline",
-            "--edges",
-            "normal",
-            "--prefix",
-            "none",
-            "--format",
-            "{p}",
-            "--package",
-            package,
-        ])
-        .args(features)
-        .output()
-        .expect("cargo can be called");
+    let mut cargo = Command::new(env!("CARGO"));
+    cargo.current_dir(env!("CARGO_MANIFEST_DIR")).args(["tree", "--offline", "--edges", "normal"]);
+    cargo.args(["--prefix", "none", "--format", "{p}", "--package", package]).args(features);
+    let output = output(cargo).expect("cargo can be called");
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
     let listing = String::from_utf8(output.stdout).expect("names are text");
     // "name v1.2.3 (path or *)": two versions of a crate are two crates.

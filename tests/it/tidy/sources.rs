@@ -142,6 +142,20 @@ pub(crate) fn consent_is_given_by_persons(tree: &Tree) -> Vec<String> {
     breaches
 }
 
+/// Finds tests that start children themselves. The testkit ends its children with all their descendants.
+pub(crate) fn tests_start_children_in_one_file(tree: &Tree) -> Vec<String> {
+    // The second file is a program and not a test.
+    const ALLOWED: [&str; 2] = ["tests/testkit/child.rs", "tests/world/src/main.rs"];
+    let is_checked =
+        |path: &str| (path.starts_with("tests/") || path.contains("/tests/")) && !ALLOWED.contains(&path);
+    let mut breaches = find(tree, &[".spawn()", ".output()"], is_checked);
+    // Telegrams and HTTP responses have a status, too.
+    breaches.extend(find(tree, &[".status()"], |path| {
+        is_checked(path) && tree.text(path).contains("Command::new")
+    }));
+    breaches
+}
+
 pub(crate) fn files_begin_with_a_description(tree: &Tree) -> Vec<String> {
     let described = |text: &str| text.starts_with("//! ");
     let files = tree.files(".rs").into_iter().filter(|(_, text)| !described(text));

@@ -33,6 +33,20 @@ fn unsafe_code_is_rare_and_explained() {
 }
 
 #[test]
+fn tests_start_children_in_one_file() {
+    holds(sources::tests_start_children_in_one_file, |tree| {
+        let plant = |path: &str, call: &str| {
+            tree.with(path, &format!("//! A test.\nlet begun = Command::new(\"true\"){call};\n"))
+        };
+        vec![
+            plant("tests/it/planted.rs", ".spawn()"),
+            plant("tests/testkit/planted.rs", ".output()"),
+            plant("clients/bridge/tests/planted.rs", ".status()"),
+        ]
+    });
+}
+
+#[test]
 fn shared_memory_is_built_in_one_module() {
     holds(sources::shared_memory_is_built_in_one_module, |tree| {
         vec![

@@ -2,12 +2,12 @@
 
 use std::process::Command;
 
-use crate::testkit::{INT, Program, TestEnv};
+use crate::testkit::{INT, Program, TestEnv, output};
 use crate::{address, bridge, lonely};
 
 /// Runs `openssl` in the directory of this test.
 fn openssl(env: &TestEnv, words: &str) {
-    let output = Command::new("openssl").args(words.split(' ')).current_dir(env.path("")).output();
+    let output = output(Command::new("openssl").args(words.split(' ')).current_dir(env.path("")));
     let output = output.expect("openssl is installed");
     assert!(output.status.success(), "openssl {words}: {}", String::from_utf8_lossy(&output.stderr));
 }

@@ -1,15 +1,11 @@
 //! Two machines and a bridge on each: what the hub of one publishes is on the other.
 
 use std::cell::Cell;
-use std::ffi::OsStr;
-use std::fs;
-use std::os::unix::fs::PermissionsExt;
-use std::path::Path;
 use std::process::Command;
 
 use serde_json::Value;
 
-use crate::testkit::{INT, TestEnv, number, until};
+use crate::testkit::{INT, TestEnv, number, output, succeeds, until, write_program};
 use crate::{NO_FLAGS, account, address, agree, bridge, linked, lonely, refused};
 
 /// By the number of the scan, what `name` saw.
@@ -115,19 +111,12 @@ impl TestEnv {
 fn alone(env: &TestEnv, beside: Option<&str>) -> String {
     let program = env.command(&["bridge", "--connect=tcp/127.0.0.1:1"]).get_program().to_owned();
     let alone = env.path("scanhub");
-    // By processes of their own: what another thread starts just now may hold a file that this process writes, and what is
-    // written cannot run.
-    let copy = |from: &OsStr, to: &Path| {
-        let done = Command::new("cp").arg(from).arg(to).status();
-        assert!(done.is_ok_and(|status| status.success()), "can be copied");
-    };
-    copy(&program, &alone);
+    // For the reason that `write_program` gives, another process writes it.
+    assert!(succeeds(Command::new("cp").arg(program).arg(&alone)), "can be copied");
     if let Some(script) = beside {
-        let source = env.file("source", format!("#!/bin/sh\n{script}\n"));
-        fs::set_permissions(&source, fs::Permissions::from_mode(0o755)).expect("it is there");
-        copy(source.as_ref(), &env.path("scanhub-bridge"));
+        write_program(env.path("scanhub-bridge"), format!("#!/bin/sh\n{script}\n"));
     }
-    let outcome = Command::new(&alone).arg("bridge").env("PATH", env.path("nothing")).output().expect("runs");
+    let outcome = output(Command::new(&alone).arg("bridge").env("PATH", env.path("nothing"))).expect("runs");
     let errors = String::from_utf8_lossy(&outcome.stderr).into_owned();
     assert_eq!(outcome.status.code(), Some(78), "{errors}");
     assert!(errors.trim_end().lines().count() == 1, "in one line: {errors}");

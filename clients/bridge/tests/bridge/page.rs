@@ -5,7 +5,7 @@ use std::path::Path;
 use std::process::Command;
 
 use crate::bridge;
-use crate::testkit::{INT, TestEnv};
+use crate::testkit::{INT, TestEnv, output};
 
 /// The blocks of the page in this language.
 fn blocks(language: &str) -> Vec<String> {
@@ -24,7 +24,7 @@ fn the_commands_of_the_page_run() {
     let mut running = Vec::new();
     for line in blocks("sh").iter().flat_map(|block| block.lines()) {
         if let Some(words) = line.strip_prefix("openssl ") {
-            let output = Command::new("openssl").args(words.split(' ')).current_dir(env.path("")).output();
+            let output = output(Command::new("openssl").args(words.split(' ')).current_dir(env.path("")));
             let output = output.expect("openssl is installed");
             assert!(output.status.success(), "{line}: {}", String::from_utf8_lossy(&output.stderr));
         } else if let Some(words) = line.strip_prefix("scanhub bridge ") {

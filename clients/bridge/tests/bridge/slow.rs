@@ -5,14 +5,12 @@ use std::process::Command;
 
 use serde_json::Value;
 
-use crate::testkit::{INT, TERM, TestEnv, in_a_network, number, skip, wall_ns};
+use crate::testkit::{INT, TERM, TestEnv, in_a_network, number, skip, succeeds, wall_ns};
 use crate::{NO_FLAGS, account, address, agree, bridge, linked};
 
 /// Lets no more than 0.5 Mbit/s through the loopback, whose packets are those of a network.
 fn slow_down() -> bool {
-    let run = |program: &str, words: &str| {
-        Command::new(program).args(words.split(' ')).status().is_ok_and(|status| status.success())
-    };
+    let run = |program: &str, words: &str| succeeds(Command::new(program).args(words.split(' ')));
     run("ip", "link set lo mtu 1500")
         && run("tc", "qdisc add dev lo root tbf rate 500kbit burst 5000 latency 200ms")
 }

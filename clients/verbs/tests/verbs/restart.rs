@@ -1,8 +1,9 @@
 //! A hub that is killed and comes back, as those see it who follow it.
 
-use std::process::{Child, Command};
+use std::process::{Command, Stdio};
 use std::time::Duration;
 
+use crate::child::{Child, spawn};
 use crate::fake::{FakeHub, Place, Verb, until};
 use scanhub_client::Subscription;
 use schema::ipc::PortFactory;
@@ -33,20 +34,14 @@ impl Hub {
         let mut command = Command::new(std::env::current_exe().unwrap());
         command.args(["--exact", "restart::hub_process", "--ignored", "--nocapture"]);
         command.env("FAKE_DOMAIN", place.domain.name()).env("FAKE_BASE", &place.base);
-        Hub(command.env("FAKE_BOOT", boot.to_string()).stdout(std::process::Stdio::null()).spawn().unwrap())
+        command.env("FAKE_BOOT", boot.to_string()).stdin(Stdio::null()).stdout(Stdio::null());
+        Hub(spawn(command).unwrap())
     }
 
     fn kill(mut self, place: &Place) {
         self.0.kill().unwrap();
         self.0.wait().unwrap();
         assert_eq!(holder(place.domain.root()), Ok(None));
-    }
-}
-
-impl Drop for Hub {
-    fn drop(&mut self) {
-        let _ = self.0.kill();
-        let _ = self.0.wait();
     }
 }
 

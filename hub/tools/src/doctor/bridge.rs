@@ -75,11 +75,15 @@ fn finding(said: Said) -> Finding {
 }
 
 #[cfg(test)]
+#[path = "../../../../tests/testkit/child.rs"]
+mod child;
+
+#[cfg(test)]
 mod tests {
     use std::fs;
-    use std::os::unix::fs::PermissionsExt;
 
     use super::super::finding::State;
+    use super::child::write_program;
     use super::*;
 
     /// What is found with a program that is this text of a shell.
@@ -87,9 +91,7 @@ mod tests {
         let place = std::env::temp_dir().join(format!("scanhub-doctor-bridge-{}-{name}", std::process::id()));
         fs::create_dir_all(&place).unwrap();
         if let Some(script) = script {
-            let path = place.join(PROGRAM);
-            fs::write(&path, format!("#!/bin/sh\n{script}\n")).unwrap();
-            fs::set_permissions(&path, PermissionsExt::from_mode(0o755)).unwrap();
+            write_program(place.join(PROGRAM), format!("#!/bin/sh\n{script}\n"));
         }
         let examined = Bridge { connect: vec!["tcp/r:1".into()], config: None, places: vec![place.clone()] };
         let found = bridge(&examined).into_iter().map(|it| (it.state, it.finding, it.remedy)).collect();

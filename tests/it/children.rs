@@ -1,0 +1,151 @@
+//! No process of a test stays: the testkit ends each child with its descendants, and the processes of interrupted runs.
+
+use std::fs;
+use std::io::{BufRead, BufReader};
+use std::os::unix::process::ExitStatusExt;
+use std::process::{Command, Stdio};
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::thread;
+
+use rustix::process::Signal;
+
+use crate::testkit::{
+    Child, Program, TestEnv, can_sit, end_runs_of, only, output, own_program, spawn, status, until,
+    write_program,
+};
+
+/// Variable that the testkit sets: the test binary that a process descends from.
+const RUN: &str = "SCANHUB_TEST_RUN";
+/// Set in the process that acts as the next run of the tests.
+const INSIDE: &str = "SCANHUB_TEST_NEXT_RUN";
+
+/// Whether a process runs; a zombie does not.
+fn runs(pid: &str) -> bool {
+    let stat = fs::read_to_string(format!("/proc/{pid}/stat")).unwrap_or_default();
+    stat.rsplit_once(')').is_some_and(|(_, rest)| !rest.trim_start().starts_with(['Z', 'X']))
+}
+
+/// Starts a shell with `script`, and returns its first line.
+fn shell(script: &str) -> (Child, String) {
+    let mut shell = Command::new("sh");
+    shell.args(["-c", script]).stdin(Stdio::null()).stdout(Stdio::piped());
+    let mut shell = spawn(shell).expect("there is a shell");
+    let mut line = String::new();
+    let out = shell.stdout.take().expect("a pipe");
+    BufReader::new(out).read_line(&mut line).expect("text");
+    (shell, line.trim().to_owned())
+}
+
+#[test]
+fn dropping_a_script_ends_its_children() {
+    // As the shell script that starts Debian's browser: it does not `exec`.
+    let (script, child) = shell("sleep 1000 & echo $!; wait");
+    assert!(runs(&child));
+    drop(script);
+    assert!(!runs(&child), "the child of the script still runs");
+    // The script has ended before its child.
+    let (mut script, child) = shell("sleep 1000 & echo $!");
+    assert!(script.wait().is_ok_and(|status| status.success()) && runs(&child));
+    drop(script);
+    assert!(!runs(&child), "the child of an ended script still runs");
+    // A program that ignores TERM, as does its child.
+    let (script, child) = shell("trap '' TERM; sleep 1000 & echo $!; wait");
+    drop(script);
+    assert!(!runs(&child), "TERM was ignored");
+}
+
+#[test]
+fn dropping_a_program_ends_its_daemons() {
+    if !can_sit() {
+        return;
+    }
+    let (mut script, daemon) = shell("setsid --fork sh -c 'echo $$; exec sleep 1000'");
+    assert!(script.wait().is_ok_and(|status| status.success()));
+    assert_eq!(script.family().len(), 1, "{:?}", script.family());
+    drop(script);
+    assert!(!runs(&daemon), "the daemon still runs");
+}
+
+#[test]
+fn outcome_names_leftover_processes() {
+    let mut script = Command::new("sh");
+    script.args(["-c", "sleep 1000 > /dev/null 2>&1 & exit 0"]);
+    let outcome = Program::start(script).wait();
+    assert_eq!((outcome.code, outcome.left.len()), (Some(0), 1), "{outcome}: {:?}", outcome.left);
+}
+
+/// Starts a process that looks like a descendant of the test binary in `run`.
+fn pretend(run: &str) -> Child {
+    let (child, _) = shell(&format!("echo; export {RUN}='{run}'; exec sleep 1000"));
+    until("it sleeps", || child.family() == ["sleep 1000"]);
+    child
+}
+
+fn is_killed(mut child: Child) -> bool {
+    let status = child.try_wait().expect("a child");
+    status.is_some_and(|status| status.signal() == Some(Signal::KILL.as_raw()))
+}
+
+#[test]
+fn ends_processes_of_interrupted_runs() {
+    let (env, own) = (TestEnv::new(), std::process::id());
+    let (mut ended, run) = shell(&format!("echo ${RUN}"));
+    ended.wait().expect("it ends");
+    let start = run.rsplit(':').next().expect("the start time of this process");
+    let (target, gone) = (env.word("target"), ended.id());
+    // The second: another process has the ID of the test binary by now.
+    let left = [format!("{target}:{gone}:5"), format!("{target}:{own}:5")].map(|run| pretend(&run));
+    // The test binary runs; it started too late; it is in another directory; it is not named.
+    let kept = [
+        format!("{target}:{own}:{start}"),
+        format!("{target}:{gone}:6"),
+        format!("{target}x:{gone}:5"),
+        target.clone(),
+    ];
+    let mut kept = kept.map(|run| pretend(&run));
+    end_runs_of(&target, 6);
+    assert!(left.into_iter().all(is_killed));
+    for child in &mut kept {
+        assert_eq!(child.try_wait().ok(), Some(None), "{:?}", child.family());
+    }
+}
+
+#[test]
+fn first_child_ends_interrupted_runs() {
+    const NAME: &str = "children::first_child_ends_interrupted_runs";
+    if std::env::var_os(INSIDE).is_some() {
+        assert!(status(Command::new("true")).is_ok_and(|status| status.success()));
+        return;
+    }
+    let (mut ended, run) = shell(&format!("echo ${RUN}"));
+    ended.wait().expect("it ends");
+    let target = run.rsplitn(3, ':').nth(2).expect("the target directory");
+    let left = pretend(&format!("{target}:{}:5", ended.id()));
+    let mut next = Command::new(own_program());
+    let next = output(next.args(only(NAME)).env(INSIDE, "1")).expect("it runs");
+    assert!(next.status.success(), "{next:?}");
+    assert!(is_killed(left));
+}
+
+#[test]
+fn written_programs_start_at_once() {
+    let env = TestEnv::new();
+    let is_over = AtomicBool::new(false);
+    thread::scope(|scope| {
+        // Their forks would inherit a file that this process has open for writing.
+        for _ in 0..4 {
+            scope.spawn(|| {
+                while !is_over.load(Ordering::Relaxed) {
+                    status(Command::new("true")).expect("there is one");
+                }
+            });
+        }
+        let failed = (0..200).find_map(|number| {
+            let program = env.path(&format!("program{number}"));
+            write_program(&program, "#!/bin/sh\n");
+            output(Command::new(&program)).err()
+        });
+        is_over.store(true, Ordering::Relaxed);
+        assert!(failed.is_none(), "{failed:?}");
+    });
+}

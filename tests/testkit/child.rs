@@ -1,0 +1,313 @@
+//! Starts every child process of a test, and ends it together with all its descendants.
+//!
+//! A child runs in a process group of its own, so that dropping its [`Child`] also ends what it has started, such as
+//! the browser of a shell script that does not `exec`. A descendant may leave the group: a daemon or a program in a
+//! new session does. Two environment variables therefore mark all descendants: [`RUN`] names the test binary, and
+//! [`CHILD`] the child.
+#![allow(dead_code)] // Every user of this file needs a part of it.
+
+use std::borrow::BorrowMut;
+use std::fs;
+use std::io::{self, Read, Write};
+use std::ops::{Deref, DerefMut};
+use std::os::unix::fs::MetadataExt;
+use std::os::unix::process::CommandExt;
+use std::path::Path;
+use std::process::{Command, ExitStatus, Output, Stdio};
+use std::sync::OnceLock;
+use std::sync::atomic::{AtomicU32, Ordering};
+use std::thread;
+use std::time::{Duration, Instant};
+
+use rustix::process::{
+    Pid, Signal, WaitId, WaitIdOptions, geteuid, kill_process, kill_process_group, waitid,
+};
+
+/// Target directory, process ID and start time of the test binary, with colons between. `.ci/run` searches for it, too.
+const RUN: &str = "SCANHUB_TEST_RUN";
+/// The child that a process descends from: process ID and start time of the test binary, and a number. A test that runs
+/// again in another process appends the numbers of its own children.
+const CHILD: &str = "SCANHUB_TEST_CHILD";
+/// Set by `.ci/run`: processes of a test binary that started at this time or later are left for its check.
+const SINCE: &str = "SCANHUB_TEST_SINCE";
+
+/// Time that a program has to end by itself after TERM.
+const GRACE: Duration = Duration::from_secs(2);
+/// Time in which the kernel ends killed processes, however busy the machine is.
+const KILL_LIMIT: Duration = Duration::from_secs(60);
+const POLL_INTERVAL: Duration = Duration::from_millis(5);
+
+/// A child process of a test. Dropping it ends the child and all its descendants, and waits for their end.
+pub(crate) struct Child {
+    process: std::process::Child,
+    /// Value of [`CHILD`] in the environment of the child.
+    mark: String,
+}
+
+/// Starts `command` in a process group of its own.
+///
+/// The child must not read from the terminal of the person who runs the tests, because it is not in that terminal's
+/// foreground: set its stdin.
+///
+/// # Errors
+///
+/// If the program cannot be started.
+pub(crate) fn spawn(mut command: impl BorrowMut<Command>) -> io::Result<Child> {
+    static NEXT: AtomicU32 = AtomicU32::new(0);
+    static ONCE: OnceLock<()> = OnceLock::new();
+    ONCE.get_or_init(end_earlier_runs);
+    let own = std::process::id();
+    let started = start_time(own as i32).unwrap_or_default();
+    let mark = format!("{own}.{started}.{}", NEXT.fetch_add(1, Ordering::Relaxed));
+    let mark = std::env::var(CHILD).map_or(mark.clone(), |outer| format!("{outer}/{mark}"));
+    let command = command.borrow_mut();
+    command.env(RUN, run()).env(CHILD, &mark);
+    // `setsid` makes a session and a group with its own process ID. It would fork if it were the leader of a group
+    // already.
+    if command.get_program() != "setsid" {
+        command.process_group(0);
+    }
+    Ok(Child { process: command.spawn()?, mark })
+}
+
+/// Runs `command` to its end with an empty stdin, and returns its output.
+///
+/// # Errors
+///
+/// If the program cannot be started or its output cannot be read.
+pub(crate) fn output(mut command: impl BorrowMut<Command>) -> io::Result<Output> {
+    let command = command.borrow_mut();
+    spawn(command.stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::piped()))?.wait_with_output()
+}
+
+/// Runs `command` to its end with an empty stdin. Its output goes where that of the test goes, unless it is set.
+///
+/// # Errors
+///
+/// If the program cannot be started.
+pub(crate) fn status(mut command: impl BorrowMut<Command>) -> io::Result<ExitStatus> {
+    spawn(command.borrow_mut().stdin(Stdio::null()))?.wait()
+}
+
+/// Returns whether `command` can be started and succeeds. Discards its output.
+pub(crate) fn succeeds(command: impl BorrowMut<Command>) -> bool {
+    output(command).is_ok_and(|output| output.status.success())
+}
+
+/// Writes an executable file, for example a shell script, that a test may start at once.
+///
+/// A child process writes the file. If this process did, another thread could fork a child that inherits the open
+/// file, and the kernel refuses to execute a file that any process has open for writing ("Text file busy").
+///
+/// # Panics
+///
+/// If it cannot be written.
+pub(crate) fn write_program(path: impl AsRef<Path>, content: impl AsRef<[u8]>) {
+    let path = path.as_ref();
+    let mut shell = Command::new("sh");
+    shell.args(["-c", "cat > \"$0\" && chmod 755 \"$0\""]).arg(path);
+    let mut shell = spawn(shell.stdin(Stdio::piped())).expect("there is a shell");
+    let written = shell.stdin.take().map(|mut stdin| stdin.write_all(content.as_ref()));
+    let status = shell.wait();
+    assert!(
+        written.is_some_and(|it| it.is_ok()) && status.is_ok_and(|it| it.success()),
+        "cannot write {}",
+        path.display()
+    );
+}
+
+impl Child {
+    /// Sends a signal to the program, and not to its descendants.
+    ///
+    /// # Errors
+    ///
+    /// If its exit status was read: another process may have its ID by now.
+    pub(crate) fn signal(&self, signal: Signal) -> rustix::io::Result<()> {
+        self.has_ended()?;
+        kill_process(Pid::from_child(&self.process), signal)
+    }
+
+    /// Returns whether the program has ended, and leaves its exit status to be read. An error if that was read already.
+    fn has_ended(&self) -> rustix::io::Result<bool> {
+        let flags = WaitIdOptions::EXITED | WaitIdOptions::NOHANG | WaitIdOptions::NOWAIT;
+        Ok(waitid(WaitId::Pid(Pid::from_child(&self.process)), flags)?.is_some())
+    }
+
+    /// Waits for the end, and returns what it wrote to the pipes that were not taken.
+    ///
+    /// # Errors
+    ///
+    /// If a pipe cannot be read.
+    pub(crate) fn wait_with_output(mut self) -> io::Result<Output> {
+        drop(self.stdin.take());
+        let errors = self.stderr.take();
+        let errors = thread::spawn(|| read_all(errors));
+        let stdout = read_all(self.stdout.take())?;
+        let stderr = errors.join().expect("reading does not panic")?;
+        Ok(Output { status: self.wait()?, stdout, stderr })
+    }
+
+    /// Ends the program and all its descendants, and waits for their end.
+    pub(crate) fn end(&mut self) {
+        let id = Pid::from_child(&self.process);
+        // Nothing else can have the ID of the process and of its group until the process is reaped.
+        let is_reaped = self.has_ended().is_err();
+        if !is_reaped {
+            // TERM first, so that the program can end its children and remove its files.
+            let _ = kill_process(id, Signal::TERM);
+            let give_up_at = Instant::now() + GRACE;
+            while self.has_ended() == Ok(false) && Instant::now() < give_up_at {
+                thread::sleep(POLL_INTERVAL);
+            }
+            let _ = kill_process(id, Signal::KILL);
+            let _ = kill_process_group(id, Signal::KILL);
+        }
+        end_all(|| self.living(!is_reaped));
+        if !is_reaped {
+            let _ = self.process.wait();
+        }
+    }
+
+    /// Returns the command lines of its living descendants, and its own if it lives.
+    pub(crate) fn family(&self) -> Vec<String> {
+        let text = |pid| fs::read(format!("/proc/{pid}/cmdline")).unwrap_or_default();
+        let line = |pid| String::from_utf8_lossy(&text(pid)).trim_end_matches('\0').replace('\0', " ");
+        self.living(false).into_iter().map(line).collect()
+    }
+
+    /// Returns the process IDs of its living descendants, and its own if it lives. The group counts if `is_group_ours`.
+    fn living(&self, is_group_ours: bool) -> Vec<i32> {
+        let id = self.process.id() as i32;
+        // Process IDs ascend until the highest is reached, so a descendant has a higher one unless they began again.
+        let lowest = if newest_process().is_some_and(|newest| newest >= id) { id } else { 1 };
+        let is_marked = |pid: &i32| {
+            let mark = variable(*pid, CHILD).unwrap_or_default();
+            mark.strip_prefix(&self.mark).is_some_and(|rest| rest.is_empty() || rest.starts_with('/'))
+        };
+        let is_in_group = |pid: &i32| is_group_ours && group(*pid) == Some(id);
+        processes().filter(|pid| *pid >= lowest && (is_marked(pid) || is_in_group(pid))).collect()
+    }
+}
+
+impl Deref for Child {
+    type Target = std::process::Child;
+
+    fn deref(&self) -> &std::process::Child {
+        &self.process
+    }
+}
+
+impl DerefMut for Child {
+    fn deref_mut(&mut self) -> &mut std::process::Child {
+        &mut self.process
+    }
+}
+
+impl Drop for Child {
+    fn drop(&mut self) {
+        self.end();
+    }
+}
+
+/// Reads all bytes of a pipe. Returns none if there is no pipe.
+fn read_all(pipe: Option<impl Read>) -> io::Result<Vec<u8>> {
+    let mut bytes = Vec::new();
+    pipe.map_or(Ok(0), |mut pipe| pipe.read_to_end(&mut bytes))?;
+    Ok(bytes)
+}
+
+/// Kills the processes that `living` returns, until it returns none.
+fn end_all(living: impl Fn() -> Vec<i32>) {
+    let give_up_at = Instant::now() + KILL_LIMIT;
+    loop {
+        let pids = living();
+        if pids.is_empty() {
+            return;
+        }
+        pids.iter().filter_map(|pid| Pid::from_raw(*pid)).for_each(|pid| {
+            let _ = kill_process(pid, Signal::KILL);
+        });
+        if Instant::now() > give_up_at {
+            // A panic while another one unwinds would abort the test binary.
+            assert!(thread::panicking(), "killed processes do not end: {pids:?}");
+            return;
+        }
+        thread::sleep(POLL_INTERVAL);
+    }
+}
+
+/// Ends what interrupted runs of this target directory left.
+fn end_earlier_runs() {
+    let since = std::env::var(SINCE).ok().and_then(|text| text.parse().ok()).unwrap_or(u64::MAX);
+    end_runs_of(run().rsplitn(3, ':').nth(2).unwrap_or_default(), since);
+}
+
+/// Ends this user's processes of test binaries in `target` that started before `since` and have ended.
+pub(crate) fn end_runs_of(target: &str, since: u64) {
+    let user = geteuid().as_raw();
+    let is_left = |pid: &i32| {
+        let is_of_user = fs::metadata(format!("/proc/{pid}")).is_ok_and(|it| it.uid() == user);
+        let run = if is_of_user { variable(*pid, RUN) } else { None };
+        run.is_some_and(|run| has_ended_before(&run, target, since))
+    };
+    end_all(|| processes().filter(is_left).collect());
+}
+
+/// Whether the value `run` of [`RUN`] names a test binary of `target` that started before `since` and has ended.
+fn has_ended_before(run: &str, target: &str, since: u64) -> bool {
+    let [start, pid, directory] = run.rsplitn(3, ':').collect::<Vec<_>>()[..] else { return false };
+    let (Ok(start), Ok(pid)) = (start.parse::<u64>(), pid.parse()) else { return false };
+    directory == target && start < since && start_time(pid) != Some(start)
+}
+
+/// Returns the value of [`RUN`] for the children of this process.
+fn run() -> &'static str {
+    static RUN: OnceLock<String> = OnceLock::new();
+    RUN.get_or_init(|| {
+        let program = std::env::current_exe().unwrap_or_default();
+        // Cargo names a directory in the target directory, but not to unit tests. They are in target/debug/deps.
+        let target = option_env!("CARGO_TARGET_TMPDIR").map(Path::new).and_then(Path::parent);
+        let target = target.or(program.ancestors().nth(3)).unwrap_or(Path::new("/"));
+        let own = std::process::id();
+        format!("{}:{own}:{}", target.display(), start_time(own as i32).unwrap_or_default())
+    })
+}
+
+/// Returns the IDs of all processes.
+fn processes() -> impl Iterator<Item = i32> {
+    let entries = fs::read_dir("/proc").into_iter().flatten().flatten();
+    entries.filter_map(|entry| entry.file_name().to_str()?.parse().ok())
+}
+
+/// Returns the process ID that the kernel assigned last.
+fn newest_process() -> Option<i32> {
+    fs::read_to_string("/proc/loadavg").ok()?.split_whitespace().last()?.parse().ok()
+}
+
+/// Returns the value of a variable in the environment that a process was started with.
+fn variable(pid: i32, name: &str) -> Option<String> {
+    let environment = fs::read(format!("/proc/{pid}/environ")).ok()?;
+    let mut lines = environment.split(|byte| *byte == 0);
+    let value = lines.find_map(|line| line.strip_prefix(name.as_bytes())?.strip_prefix(b"="))?;
+    Some(String::from_utf8_lossy(value).into_owned())
+}
+
+/// Returns the process group of a process that has not ended.
+fn group(pid: i32) -> Option<i32> {
+    stat(pid)?.get(2)?.parse().ok()
+}
+
+/// Returns when a process started, in clock ticks since boot. `None` if there is none, or if it has ended.
+fn start_time(pid: i32) -> Option<u64> {
+    stat(pid)?.get(19)?.parse().ok()
+}
+
+/// Returns the fields of `/proc/PID/stat` from the third one on (see proc_pid_stat(5)) of a process that has not ended.
+fn stat(pid: i32) -> Option<Vec<String>> {
+    let text = fs::read_to_string(format!("/proc/{pid}/stat")).ok()?;
+    // The second field is the name in brackets, which may contain spaces and brackets.
+    let (_, fields) = text.rsplit_once(')')?;
+    let fields: Vec<_> = fields.split_whitespace().map(str::to_owned).collect();
+    // A zombie has ended, but its parent has not read its exit status yet.
+    fields.first().is_some_and(|state| !["Z", "X"].contains(&state.as_str())).then_some(fields)
+}
