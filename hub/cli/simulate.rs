@@ -103,6 +103,9 @@ pub(crate) struct Simulate {
     /// In which pieces bytes arrive: uart (16 bytes) or usb (62)
     #[arg(long, default_value = "uart", value_name = "KIND")]
     chunk: String,
+    /// Let the sensors wait while the hub does not read. On a real line, bytes are lost then. For tests on a busy machine
+    #[arg(long)]
+    lossless: bool,
 }
 
 impl Simulate {
@@ -135,6 +138,7 @@ impl Simulate {
             errors: self.error.iter().map(|text| options::parse_error(text)).collect::<Result<_, _>>()?,
             pollution: self.pollution,
             chunk: self.chunk.parse()?,
+            lossless: self.lossless,
             scanner,
         })
     }

@@ -247,7 +247,7 @@ fn a_request_is_answered_and_both_are_woken() {
     let client = ipc::ControlClient::open(&node).unwrap().expect("the hub made it");
     assert!(!ipc::take_wakeups(&[client.responses()]).unwrap());
     let pending = client.ask(&Request::new("front", Verb::Pause)).unwrap();
-    ipc::sleep(&[server.requests()], Duration::from_secs(20)).unwrap();
+    ipc::sleep(&[server.requests()], Duration::from_secs(60)).unwrap();
     let asked = server.receive().unwrap().expect("was asked");
     assert_eq!(asked.request(), Some(Request::new("front", Verb::Pause)));
     assert!(server.receive().unwrap().is_none() && !ipc::take_wakeups(&[server.requests()]).unwrap());

@@ -12,10 +12,8 @@ use std::time::{Duration, Instant};
 use serde_json::{Value, json};
 use tungstenite::{Message, WebSocket};
 
-use crate::testkit::{Child, spawn};
+use crate::testkit::{Child, PATIENCE, spawn};
 
-/// Far longer than anything takes.
-const PATIENCE: Duration = Duration::from_secs(60);
 /// Where Debian has it, with a window and without.
 const NAMES: [&str; 2] = ["chromium", "chromium-headless-shell"];
 
@@ -80,7 +78,11 @@ impl Browser {
         let screen =
             json!({ "width": width, "height": height, "deviceScaleFactor": ratio, "mobile": is_phone });
         browser.call("Emulation.setDeviceMetricsOverride", screen);
-        let features = json!([{ "name": "prefers-color-scheme", "value": scheme }]);
+        // Without movement the picture is where it is to be with the next frame, however long a frame takes here.
+        let features = json!([
+            { "name": "prefers-color-scheme", "value": scheme },
+            { "name": "prefers-reduced-motion", "value": "reduce" },
+        ]);
         browser.call("Emulation.setEmulatedMedia", json!({ "features": features }));
         Some(browser)
     }
@@ -97,15 +99,14 @@ impl Browser {
         told["result"]["value"].clone()
     }
 
-    /// Waits until `script` is true on the page; how long that took.
-    pub(crate) fn await_true(&mut self, script: &str) -> Duration {
-        let begun = Instant::now();
+    /// Waits until `script` is true on the page.
+    pub(crate) fn await_true(&mut self, script: &str) {
+        let give_up_at = Instant::now() + PATIENCE;
         while self.ask(script) != Value::Bool(true) {
             let seen = |browser: &mut Browser| browser.ask("JSON.stringify(window.scanhub)");
-            assert!(begun.elapsed() < PATIENCE, "{script} is not to be seen: {}", seen(self));
+            assert!(Instant::now() < give_up_at, "{script} is not to be seen: {}", seen(self));
             thread::sleep(Duration::from_millis(20));
         }
-        begun.elapsed()
     }
 
     /// Types `key`, as `KeyboardEvent.key` has it.

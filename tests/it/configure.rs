@@ -7,7 +7,7 @@ use std::process::Stdio;
 use std::thread;
 
 use crate::testkit;
-use crate::testkit::{Child, INT, TERM, TestEnv, hold_in_time, number, spawn, terminal, until};
+use crate::testkit::{Child, INT, TERM, TestEnv, number, spawn, terminal, until};
 use rustix::process::{Pid, Signal, kill_process};
 use serde_json::Value;
 
@@ -155,30 +155,28 @@ fn marks_become_available_by_the_command_that_is_named() {
 
 #[test]
 fn the_way_back_brings_back_what_was_changed() {
-    hold_in_time(|| {
-        let env = TestEnv::in_time();
-        let _simulator = env.simulator(&["front"], &["--baud=38400"]);
-        let port = env.word("front");
-        let done = |settings: &[&str]| {
-            let seen = Person::start(&env, &[&[&port[..]], settings].concat()).types("yes\n");
-            assert_eq!(seen.code, Some(0), "{}", seen.errors);
-            assert!(seen.errors.contains("EEPROM wears out after a few thousand writes."), "{}", seen.errors);
-            seen.out
-        };
-        let hex = probe(&env, "front")["configuration"].as_str().unwrap().to_owned();
-        let out = done(&["power_on_baud=keep"]);
-        let change = "9600 Bd -> 38400 Bd: the present rate of the line becomes permanent";
-        assert!(out.contains(change), "{out}");
-        let back = format!("to go back: scanhub configure {port} power_on_baud=9600\n");
-        assert!(out.contains(&back), "{out}");
-        assert_eq!(probe(&env, "front")["permanent_rate"], true);
-        // What was permanent before, the sensor does not tell.
-        let out = done(&["power_on_baud=9600"]);
-        assert!(out.contains("cannot be restored") && !out.contains("to go back"), "{out}");
-        assert_eq!(probe(&env, "front")["permanent_rate"], false);
-        let out = done(&["unit=cm", "power_on_baud=keep"]);
-        assert!(out.contains(&format!("{port} configuration={hex} power_on_baud=9600\n")), "{out}");
-    });
+    let env = TestEnv::new();
+    let _simulator = env.simulator(&["front"], &["--baud=38400"]);
+    let port = env.word("front");
+    let done = |settings: &[&str]| {
+        let seen = Person::start(&env, &[&[&port[..]], settings].concat()).types("yes\n");
+        assert_eq!(seen.code, Some(0), "{}", seen.errors);
+        assert!(seen.errors.contains("EEPROM wears out after a few thousand writes."), "{}", seen.errors);
+        seen.out
+    };
+    let hex = probe(&env, "front")["configuration"].as_str().unwrap().to_owned();
+    let out = done(&["power_on_baud=keep"]);
+    let change = "9600 Bd -> 38400 Bd: the present rate of the line becomes permanent";
+    assert!(out.contains(change), "{out}");
+    let back = format!("to go back: scanhub configure {port} power_on_baud=9600\n");
+    assert!(out.contains(&back), "{out}");
+    assert_eq!(probe(&env, "front")["permanent_rate"], true);
+    // What was permanent before, the sensor does not tell.
+    let out = done(&["power_on_baud=9600"]);
+    assert!(out.contains("cannot be restored") && !out.contains("to go back"), "{out}");
+    assert_eq!(probe(&env, "front")["permanent_rate"], false);
+    let out = done(&["unit=cm", "power_on_baud=keep"]);
+    assert!(out.contains(&format!("{port} configuration={hex} power_on_baud=9600\n")), "{out}");
 }
 
 #[test]

@@ -1,9 +1,7 @@
 //! What users ask of a running hub: a sensor is stopped, streams again, is begun anew with; and what is refused.
 
 use crate::testkit;
-use crate::testkit::{
-    INT, Outcome, REAL_ANSWERS, TERM, TestEnv, hold_in_time, is_class, number, sequence, until,
-};
+use crate::testkit::{INT, Outcome, REAL_ANSWERS, TERM, TestEnv, is_class, number, sequence, until};
 use serde_json::Value;
 
 fn control(env: &TestEnv, sensor: &str, verb: &str) -> Outcome {
@@ -27,52 +25,50 @@ fn await_state(env: &TestEnv, sensor: &str, state: &str) -> Value {
 
 #[test]
 fn a_paused_sensor_stops_and_a_resumed_one_goes_on_without_a_gap() {
-    hold_in_time(|| {
-        let env = TestEnv::in_time();
-        let hub = env.hub(&[env.link("front"), env.link("rear")]);
-        let mut consumers = ["front/telegram", "front/scan", "rear/scan"].map(|topic| env.echo(&[topic]));
-        let simulator = env.simulator(&["front", "rear"], &["--seed=31", "--baud=500000", REAL_ANSWERS]);
-        for consumer in &mut consumers[1..] {
-            consumer.await_lines(20, "a scan", is_class("scan"));
-        }
-        taken(&env, "front", "pause");
-        await_state(&env, "front", "paused");
-        // It is the sensor that was stopped: it sends nothing any more while the other one goes on.
-        let mut sent = 0;
-        until("the sensor is stopped", || {
-            let before = std::mem::replace(&mut sent, env.truth("front").len());
-            consumers[2].await_lines(10, "a scan of the other sensor", is_class("scan"));
-            before == sent
-        });
-        // The second of two statuses is one of the pause.
-        let statuses = env.run(&["echo", "front/status", "-n", "2", "--timeout", "5s"]);
-        assert_eq!(statuses.code, Some(0), "{statuses}");
-        let paused = env.info("front");
-        consumers[2].await_lines(40, "a scan of the other sensor", is_class("scan"));
-        let later = env.info("front");
-        assert_eq!((&later["state"], &later["last_error"]), (&"paused".into(), &"".into()));
-        assert_eq!(later["counters"]["telegrams"], paused["counters"]["telegrams"]);
-        assert_eq!(env.truth("front").len(), sent);
-        // Once more changes nothing.
-        taken(&env, "front", "pause");
-        taken(&env, "front", "resume");
-        let before = number(&paused["counters"], "telegrams");
-        consumers[1].await_lines(40, "a scan after the pause", |line| {
-            line["class"] == "scan" && number(line, "seq") >= before
-        });
-        let resumed = await_state(&env, "front", "streaming");
-        assert_eq!(resumed["counters"]["resyncs"], 0, "{resumed}");
-
-        let [telegrams, scans, others] = consumers.map(|consumer| consumer.end(INT));
-        for (outcome, class) in [(&telegrams, "telegram"), (&scans, "scan"), (&others, "scan")] {
-            sequence(&outcome.of_class(class), "topic_seq");
-            assert_eq!(outcome.of_class("summary")[0]["lost"], 0);
-        }
-        sequence(&telegrams.of_class("telegram"), "seq");
-        assert_eq!(hub.end(TERM).code, Some(0));
-        assert_eq!(simulator.end(TERM).code, Some(0));
-        assert_eq!((env.simulated("front").1, env.simulated("rear").1), (0, 0), "EEPROM");
+    let env = TestEnv::new();
+    let hub = env.hub(&[env.link("front"), env.link("rear")]);
+    let mut consumers = ["front/telegram", "front/scan", "rear/scan"].map(|topic| env.echo(&[topic]));
+    let simulator = env.simulator(&["front", "rear"], &["--seed=31", "--baud=500000", REAL_ANSWERS]);
+    for consumer in &mut consumers[1..] {
+        consumer.await_lines(20, "a scan", is_class("scan"));
+    }
+    taken(&env, "front", "pause");
+    await_state(&env, "front", "paused");
+    // It is the sensor that was stopped: it sends nothing any more while the other one goes on.
+    let mut sent = 0;
+    until("the sensor is stopped", || {
+        let before = std::mem::replace(&mut sent, env.truth("front").len());
+        consumers[2].await_lines(10, "a scan of the other sensor", is_class("scan"));
+        before == sent
     });
+    // The second of two statuses is one of the pause.
+    let statuses = env.run(&["echo", "front/status", "-n", "2", "--timeout", "5s"]);
+    assert_eq!(statuses.code, Some(0), "{statuses}");
+    let paused = env.info("front");
+    consumers[2].await_lines(40, "a scan of the other sensor", is_class("scan"));
+    let later = env.info("front");
+    assert_eq!((&later["state"], &later["last_error"]), (&"paused".into(), &"".into()));
+    assert_eq!(later["counters"]["telegrams"], paused["counters"]["telegrams"]);
+    assert_eq!(env.truth("front").len(), sent);
+    // Once more changes nothing.
+    taken(&env, "front", "pause");
+    taken(&env, "front", "resume");
+    let before = number(&paused["counters"], "telegrams");
+    consumers[1].await_lines(40, "a scan after the pause", |line| {
+        line["class"] == "scan" && number(line, "seq") >= before
+    });
+    let resumed = await_state(&env, "front", "streaming");
+    assert_eq!(resumed["counters"]["resyncs"], 0, "{resumed}");
+
+    let [telegrams, scans, others] = consumers.map(|consumer| consumer.end(INT));
+    for (outcome, class) in [(&telegrams, "telegram"), (&scans, "scan"), (&others, "scan")] {
+        sequence(&outcome.of_class(class), "topic_seq");
+        assert_eq!(outcome.of_class("summary")[0]["lost"], 0);
+    }
+    sequence(&telegrams.of_class("telegram"), "seq");
+    assert_eq!(hub.end(TERM).code, Some(0));
+    assert_eq!(simulator.end(TERM).code, Some(0));
+    assert_eq!((env.simulated("front").1, env.simulated("rear").1), (0, 0), "EEPROM");
 }
 
 #[test]

@@ -6,7 +6,7 @@ use std::net::TcpListener;
 use std::thread;
 use std::time::{Duration, Instant};
 
-use crate::testkit::{INT, Line, Program, TERM, TestEnv, bytes_of, is_class, number, scan};
+use crate::testkit::{INT, Line, Program, TERM, TestEnv, bytes_of, is_class, number, scan, until};
 use fastrand::Rng;
 
 /// Garbage that a framer has to work for: noise, start bytes, and heads of telegrams that never end.
@@ -126,13 +126,13 @@ fn a_serial_server_that_sends_garbage_at_full_speed() {
     let bytes = || number(&env.info("front")["counters"], "bytes_read");
     // The counters are as old as the last status: a second.
     let (before, since, idle) = (bytes(), Instant::now(), worked(hub.pid()));
-    thread::sleep(Duration::from_secs(3));
+    until("a part of it is read", || bytes() > before + 300_000);
     let worked = worked(hub.pid()).saturating_sub(idle);
     let (read, took) = (bytes() - before, since.elapsed());
     let most = 100_000.0 * (took.as_secs_f64() + 2.0);
     let share = worked.as_secs_f64() / took.as_secs_f64();
     eprintln!("{read} bytes in {took:?}, {:.1} % of a processor", 100.0 * share);
-    assert!(read as f64 <= most && read > 100_000, "{read} bytes in {took:?}");
+    assert!(read as f64 <= most, "{read} bytes in {took:?}");
     assert!(share < 0.5, "{:.1} % of a processor, in a program that is not optimized", 100.0 * share);
     let outcome = hub.end(TERM);
     assert_eq!(outcome.code, Some(0), "{outcome}");

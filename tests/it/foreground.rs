@@ -12,7 +12,6 @@ mod score;
 #[path = "../../benches/support/seen.rs"]
 mod seen;
 
-use crate::testkit::compute_gently;
 use boxes::Boxes;
 use lms::variant::Unit;
 use method::{Hub, Method};
@@ -34,7 +33,6 @@ fn scores(frames: &[Frame]) -> (Score, Score) {
 
 #[test]
 fn people_are_told_from_rooms() {
-    compute_gently();
     // Some way below what ten runs have on average: a single run has some luck.
     for (name, world, unit, recall, precision, wrong_per_scan) in [
         ("the room of Fig. 8", "fig8", Unit::Mm, 0.98, 0.95, 0.1),
@@ -54,7 +52,6 @@ fn people_are_told_from_rooms() {
 
 #[test]
 fn boxes_are_learned_and_forgotten() {
-    compute_gently();
     let scene = Scene { name: "the room of Fig. 8", world: "fig8", unit: Unit::Mm, mixed: true };
     let mut boxes = Boxes::default();
     boxes.add(|| hub(Kind::Multi), &play(&scene, SEED));
@@ -68,7 +65,6 @@ fn boxes_are_learned_and_forgotten() {
 /// Who begins with what another one had learned, of which a file has one range a beam, tells no more wrong than who went on.
 #[test]
 fn a_model_taken_back_is_right_at_once() {
-    compute_gently();
     for world in ["fig8", "faint"] {
         let frames = play(&Scene { name: world, world, unit: Unit::Mm, mixed: true }, SEED);
         // Before the walker, and while somebody is there.

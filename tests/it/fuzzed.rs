@@ -9,7 +9,6 @@ mod targets;
 use std::fs;
 use std::path::Path;
 
-use crate::testkit::compute_gently;
 use fastrand::Rng;
 
 /// Inputs of one target that were worth keeping.
@@ -45,7 +44,6 @@ fn mutated(random: &mut Rng, corpus: &[Vec<u8>]) -> Vec<u8> {
 }
 
 fn run(name: &str) {
-    compute_gently();
     let (_, target) = targets::TARGETS.into_iter().find(|(known, _)| *known == name).expect("a target");
     let corpus = corpus(name);
     corpus.iter().for_each(|input| target(input));

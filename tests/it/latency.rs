@@ -1,12 +1,8 @@
 //! `scanhub latency` with a hub that streams: the stretches of an age add up, limits end in exit 5, and remote sensors have
 //! the part of their way that is here.
 
-use std::sync::atomic::{AtomicBool, Ordering};
-use std::thread;
-use std::time::Duration;
-
 use crate::testkit;
-use crate::testkit::{INT, Outcome, Sender, TERM, TestEnv, hold_in_time, in_a_network, number, until};
+use crate::testkit::{INT, Outcome, Sender, TERM, TestEnv, in_a_network, number, until};
 use schema::{Topic, Verdict, Zones};
 use serde_json::{Value, json};
 
@@ -30,66 +26,60 @@ fn count(line: &Value, span: &str) -> u64 {
 
 #[test]
 fn ages_of_a_stream_are_split_and_judged() {
-    hold_in_time(|| {
-        let env = TestEnv::in_time();
-        let simulator = env.simulator(&["front"], &["--seed=71", "--baud=500000"]);
-        let hub = env.hub(&[env.link("front")]);
-        env.await_info("front", |info| info["state"] == "streaming");
-        for wait in ["doorbell", "event", "spin"] {
-            let by = format!("--wait={wait}");
-            let outcome = env.run(&["latency", "front/scan", "-n", "20", "--json", &by, "--max-p99=1h"]);
-            assert_eq!(outcome.code, Some(0), "{outcome}");
-            let conditions = &outcome.lines()[0];
-            assert_eq!((&conditions["class"], &conditions["wait"]), (&json!("conditions"), &json!(wait)));
-            assert!(conditions["clock_read_ns"].as_f64().is_some_and(|ns| ns > 0.0), "{conditions}");
-            let all = conditions["realtime"] == true && conditions["memory_locked"] == true;
-            assert_eq!(conditions["refused"] == json!([]), all, "what is missing is explained: {conditions}");
-            let line = told(&outcome);
-            assert_eq!((number(&line, "received"), number(&line, "ahead")), (20, 0), "{line}");
-            assert_eq!(line["flags"][0], "simulated");
-            assert_eq!(count(&line, "age") + number(&line, "before"), 20, "{line}");
-            assert_eq!(
-                (count(&line, "hub"), count(&line, "wake")),
-                (count(&line, "age"), count(&line, "age"))
-            );
-            // Of a telegram whose stamps were computed, on a busy machine, nothing is known of the line.
-            assert!(count(&line, "line") <= 20 && count(&line, "line") == count(&line, "total"), "{line}");
-            for part in ["hub", "wake"] {
-                assert!(number(&line[part], "max_ns") <= number(&line["age"], "max_ns"), "{line}");
-            }
-            assert_eq!(line["network"], Value::Null);
-            let summary = &outcome.of_class("summary")[0];
-            assert_eq!((number(summary, "received"), &summary["topic"]), (20, &json!("scan")));
+    let env = TestEnv::new();
+    let simulator = env.simulator(&["front"], &["--seed=71", "--baud=500000"]);
+    let hub = env.hub(&[env.link("front")]);
+    env.await_info("front", |info| info["state"] == "streaming");
+    for wait in ["doorbell", "event", "spin"] {
+        let by = format!("--wait={wait}");
+        let outcome = env.run(&["latency", "front/scan", "-n", "20", "--json", &by, "--max-p99=1h"]);
+        assert_eq!(outcome.code, Some(0), "{outcome}");
+        let conditions = &outcome.lines()[0];
+        assert_eq!((&conditions["class"], &conditions["wait"]), (&json!("conditions"), &json!(wait)));
+        assert!(conditions["clock_read_ns"].as_f64().is_some_and(|ns| ns > 0.0), "{conditions}");
+        let all = conditions["realtime"] == true && conditions["memory_locked"] == true;
+        assert_eq!(conditions["refused"] == json!([]), all, "what is missing is explained: {conditions}");
+        let line = told(&outcome);
+        assert_eq!((number(&line, "received"), number(&line, "ahead")), (20, 0), "{line}");
+        assert_eq!(line["flags"][0], "simulated");
+        assert_eq!(count(&line, "age") + number(&line, "before"), 20, "{line}");
+        assert_eq!((count(&line, "hub"), count(&line, "wake")), (count(&line, "age"), count(&line, "age")));
+        // Of a telegram whose stamps were computed, on a busy machine, nothing is known of the line.
+        assert!(count(&line, "line") <= 20 && count(&line, "line") == count(&line, "total"), "{line}");
+        for part in ["hub", "wake"] {
+            assert!(number(&line[part], "max_ns") <= number(&line["age"], "max_ns"), "{line}");
         }
-        let outcome =
-            env.run(&["latency", "front/scan", "front/telegram", "-n20", "--json", "--max-p99=1us"]);
-        assert_eq!(
-            (outcome.code, &outcome.of_class("error")[0]["kind"]),
-            (Some(5), &json!("check")),
-            "{outcome}"
-        );
-        assert_eq!(outcome.of_class("latency").len(), 2, "{outcome}");
-        let mut latency = env.start(&["latency", "front/scan", "--json"]);
-        let line = latency.await_line("a time on the line", |line| count(line, "line") > 0);
-        // 732 bytes of ten bits.
-        assert!(number(&line["line"], "max_ns") > 14_000_000, "{line}");
-        assert!(number(&line["total"], "min_ns") > number(&line["line"], "min_ns"), "{line}");
-        assert_eq!(latency.end(INT).code, Some(0));
-        // A status says something without a telegram: it has an age, and nothing else.
-        let mut latency = env.start(&["latency", "front/status", "--json", "--no-realtime"]);
-        let line = latency.await_line("a status", |line| line["age"] != Value::Null);
-        assert_eq!((&line["line"], &line["hub"], &line["total"]), (&Value::Null, &Value::Null, &Value::Null));
-        let outcome = latency.end(INT);
-        assert_eq!((outcome.code, &outcome.lines()[0]["realtime"]), (Some(0), &json!(false)), "{outcome}");
-        assert!(number(&told(&outcome), "before") <= 1, "the one that is kept for late joiners");
-        let text = env.run(&["latency", "front/scan", "-n", "5"]);
-        let out = String::from_utf8_lossy(&text.out).into_owned();
-        assert!(out.contains("p99.9") && out.contains("\nwake ") && !out.contains(" ##"), "{text}");
-        assert!(text.errors.contains("wait by doorbell") && text.errors.contains("ns to read"), "{text}");
-        assert_eq!(env.run(&["latency"]).code, Some(2));
-        assert_eq!(env.run(&["latency", "front/scan", "--wait=long"]).code, Some(2));
-        assert_eq!((hub.end(TERM).code, simulator.end(TERM).code), (Some(0), Some(0)));
-    });
+        assert_eq!(line["network"], Value::Null);
+        let summary = &outcome.of_class("summary")[0];
+        assert_eq!((number(summary, "received"), &summary["topic"]), (20, &json!("scan")));
+    }
+    let outcome = env.run(&["latency", "front/scan", "front/telegram", "-n20", "--json", "--max-p99=1us"]);
+    assert_eq!(
+        (outcome.code, &outcome.of_class("error")[0]["kind"]),
+        (Some(5), &json!("check")),
+        "{outcome}"
+    );
+    assert_eq!(outcome.of_class("latency").len(), 2, "{outcome}");
+    let mut latency = env.start(&["latency", "front/scan", "--json"]);
+    let line = latency.await_line("a time on the line", |line| count(line, "line") > 0);
+    // 732 bytes of ten bits.
+    assert!(number(&line["line"], "max_ns") > 14_000_000, "{line}");
+    assert!(number(&line["total"], "min_ns") > number(&line["line"], "min_ns"), "{line}");
+    assert_eq!(latency.end(INT).code, Some(0));
+    // A status says something without a telegram: it has an age, and nothing else.
+    let mut latency = env.start(&["latency", "front/status", "--json", "--no-realtime"]);
+    let line = latency.await_line("a status", |line| line["age"] != Value::Null);
+    assert_eq!((&line["line"], &line["hub"], &line["total"]), (&Value::Null, &Value::Null, &Value::Null));
+    let outcome = latency.end(INT);
+    assert_eq!((outcome.code, &outcome.lines()[0]["realtime"]), (Some(0), &json!(false)), "{outcome}");
+    assert!(number(&told(&outcome), "before") <= 1, "the one that is kept for late joiners");
+    let text = env.run(&["latency", "front/scan", "-n", "5"]);
+    let out = String::from_utf8_lossy(&text.out).into_owned();
+    assert!(out.contains("p99.9") && out.contains("\nwake ") && !out.contains(" ##"), "{text}");
+    assert!(text.errors.contains("wait by doorbell") && text.errors.contains("ns to read"), "{text}");
+    assert_eq!(env.run(&["latency"]).code, Some(2));
+    assert_eq!(env.run(&["latency", "front/scan", "--wait=long"]).code, Some(2));
+    assert_eq!((hub.end(TERM).code, simulator.end(TERM).code), (Some(0), Some(0)));
 }
 
 #[test]
@@ -106,21 +96,11 @@ fn of_a_remote_sensor_the_way_on_this_machine_is_known() {
         let zones = Zones { verdict: Verdict::Clear as u8, ..Zones::unknown() };
         let known = |line: &Value| line["class"] == "latency" && line["age"] != Value::Null;
         sender.stamp_ns = testkit::wall_ns() - 50_000_000;
-        let done = AtomicBool::new(false);
-        let line = thread::scope(|scope| {
-            // What comes before it says itself that it is attached is left out.
-            scope.spawn(|| {
-                for _ in 0..2_000 {
-                    if done.load(Ordering::Relaxed) {
-                        break;
-                    }
-                    sender.send(Topic::Zones, &zones);
-                    thread::sleep(Duration::from_millis(10));
-                }
-            });
-            let line = latency.await_line("ages", known);
-            done.store(true, Ordering::Relaxed);
-            line
+        // What comes before it says itself that it is attached is left out.
+        let mut line = Value::Null;
+        until("ages", || {
+            sender.send(Topic::Zones, &zones);
+            latency.printed(known).map(|printed| line = printed).is_some()
         });
         assert_eq!(line["flags"], json!(["simulated", "remote"]), "{line}");
         assert!(number(&line["network"], "min_ns") > 49_000_000, "{line}");

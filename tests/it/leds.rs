@@ -4,13 +4,9 @@ use std::fs;
 use std::io::Read;
 use std::path::PathBuf;
 use std::process::Stdio;
-use std::sync::atomic::{AtomicBool, Ordering};
-use std::thread;
-use std::time::Duration;
 
 use crate::testkit::{
-    INT, KILL, Program, Sender, TERM, TestEnv, hold_in_time, in_a_network, is_class, number, spawn, terminal,
-    until,
+    INT, KILL, Program, Sender, TERM, TestEnv, in_a_network, is_class, number, spawn, terminal, until,
 };
 use rustix::process::Signal;
 use rustix::time::{ClockId, clock_gettime};
@@ -84,44 +80,42 @@ impl Diodes {
 
 #[test]
 fn the_lights_follow_the_verdict_and_stop_is_lit_when_nobody_says_anything() {
-    hold_in_time(|| {
-        let env = TestEnv::in_time();
-        let diodes = Diodes::new(&env);
-        let [root, led] = diodes.flags();
-        // Before there is a hub.
-        let leds = env.start(&["leds", "front", "--json", &root, &led]);
-        diodes.await_lit("rd");
-        let open = world(&env, "open", STRIP);
-        let sensor = simulator(&env, &open);
-        let hub = env.hub(&[env.link("front")]);
-        diodes.await_lit("gn mk");
-        // The sensor falls silent, then the hub.
-        assert_eq!(sensor.end(TERM).code, Some(0));
-        diodes.await_lit("rd");
-        let _sensor = simulator(&env, &open);
-        diodes.await_lit("gn mk");
-        drop(hub.end(KILL));
-        diodes.await_lit("rd");
-        let hub = env.hub(&[env.link("front")]);
-        diodes.await_lit("gn mk");
-        // The reader's own end: nobody watches any more.
-        let outcome = leds.end(INT);
-        assert_eq!((outcome.code, diodes.lit().as_deref()), (Some(0), Some("rd")), "{outcome}");
-        assert_eq!(hub.end(TERM).code, Some(0));
+    let env = TestEnv::new();
+    let diodes = Diodes::new(&env);
+    let [root, led] = diodes.flags();
+    // Before there is a hub.
+    let leds = env.start(&["leds", "front", "--json", &root, &led]);
+    diodes.await_lit("rd");
+    let open = world(&env, "open", STRIP);
+    let sensor = simulator(&env, &open);
+    let hub = env.hub(&[env.link("front")]);
+    diodes.await_lit("gn mk");
+    // The sensor falls silent, then the hub.
+    assert_eq!(sensor.end(TERM).code, Some(0));
+    diodes.await_lit("rd");
+    let _sensor = simulator(&env, &open);
+    diodes.await_lit("gn mk");
+    drop(hub.end(KILL));
+    diodes.await_lit("rd");
+    let hub = env.hub(&[env.link("front")]);
+    diodes.await_lit("gn mk");
+    // The reader's own end: nobody watches any more.
+    let outcome = leds.end(INT);
+    assert_eq!((outcome.code, diodes.lit().as_deref()), (Some(0), Some("rd")), "{outcome}");
+    assert_eq!(hub.end(TERM).code, Some(0));
 
-        let lines = outcome.of_class("leds");
-        let verdicts: Vec<_> = lines.iter().map(|line| line["verdict"].as_str().unwrap()).collect();
-        assert_eq!((verdicts[0], verdicts[verdicts.len() - 1]), ("unknown", "unknown"), "{outcome}");
-        for line in &lines {
-            let is_clear = line["verdict"] == "clear";
-            assert_eq!((&line["green"], &line["red"]), (&is_clear.into(), &(!is_clear).into()), "{line}");
-            assert_eq!(line["mark"], line["marks"].as_u64().is_some_and(|marks| marks > 0), "{line}");
-        }
-        for pair in lines.windows(2) {
-            let shown = |line: &Value| (line["verdict"].clone(), line["marks"].clone());
-            assert!(shown(&pair[0]) != shown(&pair[1]), "no change: {pair:#?}");
-        }
-    });
+    let lines = outcome.of_class("leds");
+    let verdicts: Vec<_> = lines.iter().map(|line| line["verdict"].as_str().unwrap()).collect();
+    assert_eq!((verdicts[0], verdicts[verdicts.len() - 1]), ("unknown", "unknown"), "{outcome}");
+    for line in &lines {
+        let is_clear = line["verdict"] == "clear";
+        assert_eq!((&line["green"], &line["red"]), (&is_clear.into(), &(!is_clear).into()), "{line}");
+        assert_eq!(line["mark"], line["marks"].as_u64().is_some_and(|marks| marks > 0), "{line}");
+    }
+    for pair in lines.windows(2) {
+        let shown = |line: &Value| (line["verdict"].clone(), line["marks"].clone());
+        assert!(shown(&pair[0]) != shown(&pair[1]), "no change: {pair:#?}");
+    }
 }
 
 #[test]
@@ -227,7 +221,6 @@ fn a_worse_verdict_is_shown_at_once_and_a_better_one_only_when_it_has_stood() {
         listener.await_line("a sensor", |line| line["kind"] == "published");
         let mut say = |verdict: Verdict| {
             front.send(Topic::Zones, &Zones { verdict: verdict as u8, ..Zones::unknown() });
-            now_ns()
         };
         // Others see what is said as it is said.
         let leds = |hold: &[&str]| {
@@ -243,22 +236,16 @@ fn a_worse_verdict_is_shown_at_once_and_a_better_one_only_when_it_has_stood() {
         for program in [&mut usual, &mut long, &mut none] {
             program.await_line("stop at once, whatever the hold", is("stop"));
         }
-        let said_ns = say(Verdict::Clear);
-        let is_shown = AtomicBool::new(false);
-        let shown_ns = thread::scope(|scope| {
-            // Again and again: however late this machine is, it stands.
-            scope.spawn(|| {
-                while !is_shown.load(Ordering::Relaxed) {
-                    thread::sleep(Duration::from_millis(100));
-                    say(Verdict::Clear);
-                }
-            });
-            none.await_line("clear at once", is("clear"));
-            let shown = usual.await_line("clear", is("clear"));
-            is_shown.store(true, Ordering::Relaxed);
-            number(&shown, "stamp_ns")
+        let said_ns = now_ns();
+        let mut shown = Value::Null;
+        // It stands as long as it is said again.
+        until("clear when it has stood", || {
+            say(Verdict::Clear);
+            usual.printed(is("clear")).map(|line| shown = line).is_some()
         });
-        assert!(shown_ns - said_ns > 250_000_000, "it had stood for {} ms", (shown_ns - said_ns) / 1_000_000);
+        none.await_line("clear at once", is("clear"));
+        let stood_ns = number(&shown, "stamp_ns") - said_ns;
+        assert!(stood_ns > 250_000_000, "it had stood for {} ms", stood_ns / 1_000_000);
         let outcome = long.end(INT);
         let verdicts: Vec<_> = outcome.of_class("leds").iter().map(|line| line["verdict"].clone()).collect();
         assert_eq!(verdicts, ["unknown", "stop", "unknown"], "at the end nobody watches: {outcome}");

@@ -2,10 +2,11 @@
 //! what is refused.
 
 use std::io::Read;
+use std::time::Duration;
 
 use crate::testkit::{
-    self, INT, Outcome, Program, Sender, TestEnv, in_a_network, is_class, number, skip, spawn, succeeds,
-    terminal, until, wall_ns,
+    self, INT, Outcome, Program, Sender, TestEnv, in_a_network, is_class, let_pass, number, skip, spawn,
+    succeeds, terminal, until, wall_ns,
 };
 use schema::datagram::{DatagramError, HEAD, WINDOW};
 use schema::{
@@ -352,7 +353,7 @@ fn each_refusal_has_its_reason() {
         for wait_ms in [1100, 0] {
             sender.send(Topic::Zones, &zones(Verdict::Slow));
             others.iter_mut().for_each(|other| other.send(Topic::Zones, &zones(Verdict::Clear)));
-            std::thread::sleep(std::time::Duration::from_millis(wait_ms));
+            let_pass(Duration::from_millis(wait_ms));
         }
         Sender::new(64, 7, 0, "front").send(Topic::Zones, &zones(Verdict::Clear));
         sender.empty(255);
@@ -386,7 +387,7 @@ fn two_gateways_with_one_number_are_told_once() {
         for _ in 0..80 {
             gateways.iter_mut().for_each(|gateway| gateway.send(Topic::Zones, &zones(Verdict::Clear)));
             // As far apart as they send: what comes in one moment is no second gateway.
-            std::thread::sleep(std::time::Duration::from_millis(50));
+            let_pass(Duration::from_millis(50));
         }
         let line = program.await_line("the remedy", |line| line["kind"] == "trouble");
         let message = line["message"].as_str().unwrap_or_default();

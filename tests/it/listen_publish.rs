@@ -1,7 +1,11 @@
 //! `scanhub listen --publish`: remote sensors as local ones, for every verb that follows, through loss, restarts and
 //! kills.
 
-use crate::testkit::{INT, KILL, Program, Sender, TERM, TestEnv, in_a_network, number, output, until};
+use std::time::Duration;
+
+use crate::testkit::{
+    INT, KILL, Program, Sender, TERM, TestEnv, in_a_network, let_pass, number, output, until,
+};
 use rustix::process::{Pid, Resource, Rlimit, getrlimit, prlimit};
 use schema::datagram::Announce;
 use schema::{Marks, Scan, ScanHead, State, Status, Topic, Verdict, Zones};
@@ -377,7 +381,7 @@ fn there_is_room_for_sixteen_sensors() {
                 sender.announce(&[Topic::Zones]);
                 sender.send(Topic::Zones, &zones(Verdict::Clear));
             }
-            std::thread::sleep(std::time::Duration::from_millis(wait_ms));
+            let_pass(Duration::from_millis(wait_ms));
         }
         let line = program.await_line("one too many", |line| line["kind"] == "trouble");
         assert!(line["message"].as_str().is_some_and(|text| text.contains("16 published")), "{line}");

@@ -1,8 +1,6 @@
 //! Two machines with one state directory, as after a disk was copied, whose gateways begin in one epoch: they send under one
 //! number. Who listens hears one of them and is told, and no sample of the other one is ever taken for the first one's.
 
-use std::time::{Duration, Instant};
-
 use crate::testkit::{INT, Machine, Outcome, Program, TERM, TestEnv, in_a_network, is_class, number};
 use serde_json::{Value, json};
 
@@ -66,11 +64,7 @@ fn two_machines_with_one_state_directory_are_told_and_never_mixed() {
         publisher.await_line("a sensor", |line| line["kind"] == "published");
         let mut echo = env.echo(&["5f3a12bc00d1e2f3.front/scan"]);
         let second = other.gateway();
-        let begin = Instant::now();
         listener.await_line("that there are two", is_told);
-        let took = begin.elapsed();
-        eprintln!("two machines with one state directory: told {took:?} after the second one began");
-        assert!(took < Duration::from_secs(3), "{took:?}");
         echo.await_lines(100, "scans of the first one", is_class("scan"));
         let echoed = echo.end(INT);
         assert_eq!(beams(&echoed), [361], "{echoed}");

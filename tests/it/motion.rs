@@ -1,50 +1,47 @@
 //! The topic `motion`, from a line to consumers: found only while somebody follows, by the keys of a link, and the background
 //! that needs it.
 
-use crate::testkit::{INT, TERM, TestEnv, hold_in_time, is_class, number, sequence};
+use crate::testkit::{INT, TERM, TestEnv, accounted, is_class, number};
+use serde_json::Value;
 
 const STREAM: [&str; 2] = ["--seed=51", "--baud=500000"];
 
 #[test]
 fn a_robot_that_stands_is_said_to_stand_and_a_map_is_kept_if_wanted() {
-    hold_in_time(|| {
-        let env = TestEnv::in_time();
-        let set =
-            ["--set=motion.max_step=0.3", "--set=link.rear.background.method=moving"].map(str::to_owned);
-        let hub = env.hub(&[&[env.link("front"), env.link("rear")], &set[..]].concat());
-        let simulator = env.simulator(&["front", "rear"], &STREAM);
-        env.await_info("front", |info| info["state"] == "streaming");
-        // It is there before anybody wants it, and nobody's.
-        let topics = env.run(&["list", "--json"]);
-        let topic = topics.lines().into_iter().find(|line| line["topic"] == "motion");
-        let topic = topic.unwrap_or_else(|| panic!("{topics}"));
-        assert_eq!((&topic["payload"], number(&topic, "subscribers")), (&"scanhub.Motion.v2".into(), 0));
-        let mut front = env.echo(&["front/scan", "front/motion"]);
-        let mut rear = env.echo(&["rear/foreground", "rear/background"]);
-        let found = front.await_lines(30, "motion", is_class("motion"));
-        assert_eq!((&found[0]["method"], found[0]["dx_m"].is_null()), (&"first".into(), true));
-        for line in &found[1..] {
-            let [dx, dy, x] = ["dx_m", "dy_m", "x_m"].map(|key| line[key].as_f64().unwrap_or(1.0));
-            assert!(dx.hypot(dy) < 0.02 && x.abs() < 0.05, "{line}");
-            assert!(line["covariance"].as_array().is_some_and(|numbers| numbers.len() == 9), "{line}");
-            assert!(
-                ["beams", "points", "lines", "both"].contains(&line["method"].as_str().unwrap()),
-                "{line}"
-            );
-        }
-        rear.await_lines(20, "a foreground", is_class("foreground"));
-        let known = |line: &serde_json::Value| line["class"] == "background" && number(line, "taught") > 0;
-        rear.await_line("what stands", known);
-        let refused = env.run(&["background", "rear", "load", "none.json"]);
-        assert_ne!(refused.code, Some(0), "{refused}");
-        let outcome = front.end(INT);
-        let (of_motion, of_scans) = (outcome.of_class("motion"), outcome.of_class("scan"));
-        // Each scan has its motion, under the same number.
-        let scans = sequence(&of_scans, "seq");
-        assert!(sequence(&of_motion, "seq").iter().all(|seq| scans.contains(seq)), "{outcome}");
-        sequence(&of_motion, "topic_seq");
-        drop(rear);
-        assert_eq!(number(&env.info("front")["counters"], "loan_failed"), 0);
-        assert_eq!((hub.end(TERM).code, simulator.end(TERM).code), (Some(0), Some(0)));
-    });
+    let env = TestEnv::new();
+    let set = ["--set=motion.max_step=0.3", "--set=link.rear.background.method=moving"].map(str::to_owned);
+    let hub = env.hub(&[&[env.link("front"), env.link("rear")], &set[..]].concat());
+    let simulator = env.simulator(&["front", "rear"], &STREAM);
+    env.await_info("front", |info| info["state"] == "streaming");
+    // It is there before anybody wants it, and nobody's.
+    let topics = env.run(&["list", "--json"]);
+    let topic = topics.lines().into_iter().find(|line| line["topic"] == "motion");
+    let topic = topic.unwrap_or_else(|| panic!("{topics}"));
+    assert_eq!((&topic["payload"], number(&topic, "subscribers")), (&"scanhub.Motion.v2".into(), 0));
+    let mut front = env.echo(&["front/scan", "front/motion"]);
+    let mut rear = env.echo(&["rear/foreground", "rear/background"]);
+    let found = front.await_lines(30, "motion", is_class("motion"));
+    assert_eq!((&found[0]["method"], found[0]["dx_m"].is_null()), (&"first".into(), true));
+    for line in &found[1..] {
+        let [dx, dy, x] = ["dx_m", "dy_m", "x_m"].map(|key| line[key].as_f64().unwrap_or(1.0));
+        assert!(dx.hypot(dy) < 0.02 && x.abs() < 0.05, "{line}");
+        assert!(line["covariance"].as_array().is_some_and(|numbers| numbers.len() == 9), "{line}");
+        assert!(["beams", "points", "lines", "both"].contains(&line["method"].as_str().unwrap()), "{line}");
+    }
+    rear.await_lines(20, "a foreground", is_class("foreground"));
+    let known = |line: &Value| line["class"] == "background" && number(line, "taught") > 0;
+    rear.await_line("what stands", known);
+    let refused = env.run(&["background", "rear", "load", "none.json"]);
+    assert_ne!(refused.code, Some(0), "{refused}");
+    let outcome = front.end(INT);
+    let (of_motion, of_scans) = (outcome.of_class("motion"), outcome.of_class("scan"));
+    // Each scan has its motion, under the same number.
+    let seqs = |lines: &[Value]| lines.iter().map(|line| number(line, "seq")).collect::<Vec<_>>();
+    let (of_scans, of_motion) = (seqs(&of_scans), seqs(&of_motion));
+    assert!(of_motion.iter().filter(|seq| of_scans.contains(seq)).count() > 20, "{outcome}");
+    accounted(&outcome, "scan");
+    accounted(&outcome, "motion");
+    drop(rear);
+    assert_eq!(number(&env.info("front")["counters"], "loan_failed"), 0);
+    assert_eq!((hub.end(TERM).code, simulator.end(TERM).code), (Some(0), Some(0)));
 }

@@ -234,13 +234,7 @@ fn keys() {
     let words = ["replay", "--no-system-config", "--paused", &log(&env, 300, 100)];
     let mut sitting = Sitting::start(&env.command(&words), (100, 30));
     sitting.await_words("paused; space continues");
-    let says = |sitting: &Sitting, word: &str| {
-        let give_up_at = std::time::Instant::now() + testkit::PATIENCE;
-        while !sitting.text().contains(word) {
-            assert!(std::time::Instant::now() < give_up_at, "no {word:?}: {}", sitting.text());
-            std::thread::sleep(std::time::Duration::from_millis(10));
-        }
-    };
+    let says = |sitting: &Sitting, word: &str| testkit::until(word, || sitting.text().contains(word));
     sitting.press(".");
     says(&sitting, "  1 telegrams  paused");
     sitting.press("\x1b[C");

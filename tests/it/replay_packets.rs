@@ -11,10 +11,6 @@ use schema::file::{self, Writer};
 use schema::{Family, Flags, Header, Reasons, Scan, Topic};
 use serde_json::Value;
 
-/// How far stamps may be off to each other: both sessions learn how late packets come and how clocks drift, and on a machine
-/// that is busy the first ones come late.
-const OFF_NS: i64 = 5_000_000;
-
 /// A recorder of `flags` that is attached.
 pub(crate) fn recorder(env: &TestEnv, name: &str, flags: &[&str]) -> Program {
     let file = env.word(name);
@@ -68,13 +64,13 @@ pub(crate) fn scan(payload: &[u8]) -> Box<Scan> {
     scan
 }
 
-/// Whether the scans of both are the same, but for those of the first half second, in which a session learns.
-fn check_scans(recorded: &[(Header, Vec<u8>)], replayed: &[(Header, Vec<u8>)], learning: usize) {
+/// Whether the scans of both are the same. Their stamps are not compared: while the hub ran, they followed from when it got a
+/// processor. What they are in time is held in virtual time (`tests/world`, judge `turns`).
+fn check_scans(recorded: &[(Header, Vec<u8>)], replayed: &[(Header, Vec<u8>)]) {
     let by_seq: BTreeMap<u64, _> =
         replayed.iter().map(|(header, payload)| (header.seq, (header, payload))).collect();
     let (mut compared, mut incomplete, mut suspect) = (0, 0, 0);
-    let mut first: Option<(&Header, &Header)> = None;
-    for (header, payload) in &recorded[learning..] {
+    for (header, payload) in recorded {
         let (played, bytes) = by_seq.get(&header.seq).unwrap_or_else(|| panic!("no scan of {}", header.seq));
         let (then, now) = (scan(payload), scan(bytes));
         assert_eq!(then.ranges(), now.ranges(), "{}", header.seq);
@@ -86,30 +82,17 @@ fn check_scans(recorded: &[(Header, Vec<u8>)], replayed: &[(Header, Vec<u8>)], l
         let line_error = Reasons::LINE_ERROR;
         assert_eq!(header.reasons & !line_error, played.reasons & !line_error, "{}", header.seq);
         assert_eq!(played.flags & Flags::REPLAYED, Flags::REPLAYED);
-        let (begin, begin_played) = *first.get_or_insert((header, played));
-        for of in [|header: &Header| header.stamp_first_ns, |header: &Header| header.stamp_last_ns] {
-            let (then, now) = (of(header) - begin.stamp_first_ns, of(played) - begin_played.stamp_first_ns);
-            assert!(then.abs_diff(now) < OFF_NS as u64, "{then} ns then, {now} ns now");
-        }
-        let wall_off = header.wall_ns.abs_diff(played.wall_ns);
-        assert!(wall_off < OFF_NS as u64, "wall clock off by {wall_off} ns");
-        assert!(
-            header.period_us.abs_diff(played.period_us) < 200,
-            "{} {}",
-            header.period_us,
-            played.period_us
-        );
         compared += 1;
         incomplete += u32::from(then.is_incomplete());
         suspect += u32::from(header.reasons != 0);
     }
-    assert!(compared + learning >= recorded.len() && compared > 20, "{compared} of {}", recorded.len());
+    assert!(compared == recorded.len() && compared > 20, "{compared} of {}", recorded.len());
     assert!(incomplete > 0 && suspect > 0, "the faults did nothing: {incomplete} {suspect}");
 }
 
 #[test]
 fn scans_are_those_that_were_recorded() {
-    let env = TestEnv::in_time();
+    let env = TestEnv::new();
     record(&env, "ld19", &[], 45);
     let recorded = samples(&env.path("all.mcap"), "front/scan");
     let packets = samples(&env.path("telegrams.mcap"), "front/telegram");
@@ -126,7 +109,7 @@ fn scans_are_those_that_were_recorded() {
             bytes(&replayed) == bytes(&samples(&env.path(name), "front/telegram")),
             "{name}: not bit for bit"
         );
-        check_scans(&recorded, &samples(&file, "front/scan"), 0);
+        check_scans(&recorded, &samples(&file, "front/scan"));
     }
     let info = |words: &[&str]| {
         let file = env.word("all.mcap");
@@ -146,11 +129,11 @@ fn scans_are_those_that_were_recorded() {
 
 #[test]
 fn beams_are_those_that_were_recorded() {
-    let env = TestEnv::in_time();
+    let env = TestEnv::new();
     record(&env, "stl27l", &["model=stl27l", "beams=1000"], 25);
     let recorded = samples(&env.path("all.mcap"), "front/scan");
     replay(&env, "all.mcap", &[]);
-    check_scans(&recorded, &samples(&env.path("replayed.mcap"), "front/scan"), 0);
+    check_scans(&recorded, &samples(&env.path("replayed.mcap"), "front/scan"));
     // Telegrams alone do not say into how many beams they were put: the model's, which they do say.
     replay(&env, "telegrams.mcap", &["--rate=max"]);
     let replayed = samples(&env.path("replayed.mcap"), "front/scan");
@@ -166,18 +149,15 @@ fn a_part_of_it_and_again() {
     assert!((0.9..=2.0).contains(&end["position_s"].as_f64().expect("seconds")), "{end}");
     let replayed = samples(&env.path("replayed.mcap"), "front/scan");
     assert!((8..=12).contains(&replayed.len()), "{} scans in a second", replayed.len());
-    let walls =
-        |samples: &[(Header, Vec<u8>)]| samples.iter().map(|(header, _)| header.wall_ns).collect::<Vec<_>>();
-    for wall_ns in walls(&replayed) {
-        let near = walls(&recorded).into_iter().map(|then| then.abs_diff(wall_ns)).min();
-        assert!(near.is_some_and(|off| off < OFF_NS as u64), "{near:?}");
-    }
-    let pairs = replayed.windows(2).map(|pair| pair[1].0.stamp_first_ns - pair[0].0.stamp_first_ns);
+    let ranges_of = |(_, payload): &(Header, Vec<u8>)| scan(payload).ranges().to_vec();
+    let mut rest = recorded.iter().map(ranges_of);
+    // The first and the last may be of a part of a turn.
+    let inner = &replayed[1..replayed.len() - 1];
     assert!(
-        pairs.clone().all(|ns| (30_000_000..70_000_000).contains(&ns)),
-        "{:?}",
-        pairs.collect::<Vec<_>>()
+        inner.iter().map(ranges_of).all(|ranges| rest.any(|then| then == ranges)),
+        "other scans, or another order"
     );
+    assert!(replayed.windows(2).all(|pair| pair[0].0.stamp_first_ns < pair[1].0.stamp_first_ns));
     let file = env.word("telegrams.mcap");
     let player =
         env.start(&["replay", "--json", "--no-system-config", "--loop", "--rate=max", &file]).ready();
@@ -217,9 +197,10 @@ fn bytes_of_a_line_are_played_by_the_scanners_own_clock() {
     let known: Vec<_> =
         places.iter().zip(&scans).filter_map(|(place, line)| Some(((*place)?, line))).collect();
     for pair in known.windows(2) {
-        let passed = |at: usize| recorded[at].0.stamp_first_ns as i64;
-        let (was, is) = (passed(pair[1].0) - passed(pair[0].0), stamps(pair[1].1) - stamps(pair[0].1));
-        assert!((was - is).abs() < 2 * OFF_NS, "{was} ns then, {is} ns now");
+        // Stamps follow from that clock alone: ten turns in a second.
+        let turns = (pair[1].0 - pair[0].0) as f64;
+        let passed_s = (stamps(pair[1].1) - stamps(pair[0].1)) as f64 / 1e9;
+        assert!((0.08..0.12).contains(&(passed_s / turns)), "{passed_s} s for {turns} turns");
     }
 }
 

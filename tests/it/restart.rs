@@ -9,7 +9,7 @@ use serde_json::Value;
 #[test]
 fn consumers_outlive_several_hubs() {
     // A hub that gets no time is stale, as it should be, and not gone.
-    let env = TestEnv::in_time();
+    let env = TestEnv::new();
     let simulator = env.simulator(&["front"], &["--seed=21"]);
     let link = [env.link("front")];
     let mut hub = env.hub(&link);

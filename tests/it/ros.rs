@@ -4,7 +4,7 @@
 use std::collections::BTreeMap;
 use std::process::Command;
 
-use crate::testkit::{INT, MEASURED, Recording, TestEnv, hold_in_time, is_class, number, output, python};
+use crate::testkit::{INT, MEASURED, Recording, TestEnv, is_class, number, output, python};
 use lms::variant::Unit;
 use schema::datagram::Packed;
 use schema::{Code, Header, Pose, Scan, file};
@@ -120,74 +120,68 @@ fn check_transforms(said: &[Value]) {
 
 #[test]
 fn others_read_every_message_made_live_and_later() {
-    hold_in_time(|| {
-        let env = TestEnv::in_time();
-        let _simulator = env.simulator(&["front", "rear"], &["--world=room", "--seed=5", "--mode=0x01"]);
-        let _hub = env.hub(&[link(&env, "front", &FRONT), link(&env, "rear", &REAR)].concat());
-        for sensor in ["front", "rear"] {
-            env.await_info(sensor, |info| info["state"] == "streaming");
-        }
-        // What goes on around it is recorded from before until after.
-        let [all, live, later] = ["all.mcap", "live.mcap", "later.mcap"].map(|name| env.word(name));
-        let mut around = env.start(&["record", "--all", "--json", "-o", &all]);
-        around.await_line("samples", |line| is_class("recording")(line) && number(line, "samples") >= 100);
-        let mut recorder = env.start(&["record", "--ros2", "--json", "-o", &live]);
-        recorder.await_line("scans", |line| is_class("recording")(line) && number(line, "samples") >= 100);
-        let outcome = recorder.end(INT);
-        assert_eq!(outcome.code, Some(0), "{outcome}");
-        assert_eq!(around.end(INT).code, Some(0));
-        let outcome = env.run(&["convert", &all, &later, "--ros2", "--json"]);
-        assert_eq!(outcome.code, Some(0), "{outcome}");
-        let account = outcome.of_class("converted").pop().expect("an account");
-        assert_eq!(
-            (&account["to"], &account["sensors"]),
-            (&"ROS 2".into(), &Value::from(vec!["front", "rear"]))
-        );
+    let env = TestEnv::new();
+    let _simulator = env.simulator(&["front", "rear"], &["--world=room", "--seed=5", "--mode=0x01"]);
+    let _hub = env.hub(&[link(&env, "front", &FRONT), link(&env, "rear", &REAR)].concat());
+    for sensor in ["front", "rear"] {
+        env.await_info(sensor, |info| info["state"] == "streaming");
+    }
+    // What goes on around it is recorded from before until after.
+    let [all, live, later] = ["all.mcap", "live.mcap", "later.mcap"].map(|name| env.word(name));
+    let mut around = env.start(&["record", "--all", "--json", "-o", &all]);
+    around.await_line("samples", |line| is_class("recording")(line) && number(line, "samples") >= 100);
+    let mut recorder = env.start(&["record", "--ros2", "--json", "-o", &live]);
+    recorder.await_line("scans", |line| is_class("recording")(line) && number(line, "samples") >= 100);
+    let outcome = recorder.end(INT);
+    assert_eq!(outcome.code, Some(0), "{outcome}");
+    assert_eq!(around.end(INT).code, Some(0));
+    let outcome = env.run(&["convert", &all, &later, "--ros2", "--json"]);
+    assert_eq!(outcome.code, Some(0), "{outcome}");
+    let account = outcome.of_class("converted").pop().expect("an account");
+    assert_eq!((&account["to"], &account["sensors"]), (&"ROS 2".into(), &Value::from(vec!["front", "rear"])));
 
-        let recording = Recording::whole(&env.path("all.mcap"));
-        let published = published(&recording);
-        let is_at_an_end = |(topic, log_time): &(String, u64)| {
-            let mut times = published.keys().filter(|(of, _)| of == topic).map(|(_, time)| time);
-            let last = times.clone().next_back();
-            Some(log_time) < times.next() || Some(log_time) > last
-        };
-        for (name, path) in [("live.mcap", &live), ("later.mcap", &later)] {
-            let ours = Recording::whole(&env.path(name));
-            assert!(ours.kept.iter().all(|kept| kept.encoding == "cdr"), "{name} has other messages");
-            let scans = ours.kept.iter().filter(|kept| kept.topic != "/tf_static").count();
-            assert!(scans > 60, "{name}: {scans} scans");
-            if name == "later.mcap" {
-                let telegrams = ["front/telegram", "rear/telegram"].map(|topic| recording.of(topic)).concat();
-                let measured =
-                    telegrams.iter().filter(|kept| u64::from(kept.payload()[4]) == MEASURED).count();
-                assert_eq!((number(&account, "scans"), scans), (scans as u64, measured));
+    let recording = Recording::whole(&env.path("all.mcap"));
+    let published = published(&recording);
+    let is_at_an_end = |(topic, log_time): &(String, u64)| {
+        let mut times = published.keys().filter(|(of, _)| of == topic).map(|(_, time)| time);
+        let last = times.clone().next_back();
+        Some(log_time) < times.next() || Some(log_time) > last
+    };
+    for (name, path) in [("live.mcap", &live), ("later.mcap", &later)] {
+        let ours = Recording::whole(&env.path(name));
+        assert!(ours.kept.iter().all(|kept| kept.encoding == "cdr"), "{name} has other messages");
+        let scans = ours.kept.iter().filter(|kept| kept.topic != "/tf_static").count();
+        assert!(scans > 60, "{name}: {scans} scans");
+        if name == "later.mcap" {
+            let telegrams = ["front/telegram", "rear/telegram"].map(|topic| recording.of(topic)).concat();
+            let measured = telegrams.iter().filter(|kept| u64::from(kept.payload()[4]) == MEASURED).count();
+            assert_eq!((number(&account, "scans"), scans), (scans as u64, measured));
+        }
+        for (verb, modules) in [("mcap_ros2", "mcap_ros2, mcap"), ("rosbags", "rosbags, mcap")] {
+            let Some(python) = python(modules) else { continue };
+            let said = said(python, verb, path);
+            assert_eq!(said.len(), ours.kept.len(), "{verb} of {name}");
+            let mut checked = 0;
+            for line in said.iter().filter(|line| line["topic"] != "/tf_static") {
+                let topic = line["topic"].as_str().unwrap_or_default().to_owned();
+                let key = (topic, number(line, "log_time"));
+                match published.get(&key) {
+                    Some(scan) => check_scan(line, scan),
+                    // A telegram was recorded, and its scan was not: the recorder attaches to topics one by one.
+                    None => assert!(is_at_an_end(&key), "{verb} of {name}: nobody published {key:?}"),
+                }
+                checked += usize::from(published.contains_key(&key));
             }
-            for (verb, modules) in [("mcap_ros2", "mcap_ros2, mcap"), ("rosbags", "rosbags, mcap")] {
-                let Some(python) = python(modules) else { continue };
-                let said = said(python, verb, path);
-                assert_eq!(said.len(), ours.kept.len(), "{verb} of {name}");
-                let mut checked = 0;
-                for line in said.iter().filter(|line| line["topic"] != "/tf_static") {
-                    let topic = line["topic"].as_str().unwrap_or_default().to_owned();
-                    let key = (topic, number(line, "log_time"));
-                    match published.get(&key) {
-                        Some(scan) => check_scan(line, scan),
-                        // A telegram was recorded, and its scan was not: the recorder attaches to topics one by one.
-                        None => assert!(is_at_an_end(&key), "{verb} of {name}: nobody published {key:?}"),
-                    }
-                    checked += usize::from(published.contains_key(&key));
-                }
-                assert!(checked > 60, "{verb} of {name}: {checked} scans were published");
-                check_transforms(&said);
-                if verb == "rosbags" {
-                    let of_frames = |line: &&Value| line["topic"] == "/tf_static";
-                    let all_latched =
-                        said.iter().filter(of_frames).all(|line| line["durability"] == "TRANSIENT_LOCAL");
-                    assert!(all_latched, "listeners to frames would not hear them");
-                }
+            assert!(checked > 60, "{verb} of {name}: {checked} scans were published");
+            check_transforms(&said);
+            if verb == "rosbags" {
+                let of_frames = |line: &&Value| line["topic"] == "/tf_static";
+                let all_latched =
+                    said.iter().filter(of_frames).all(|line| line["durability"] == "TRANSIENT_LOCAL");
+                assert!(all_latched, "listeners to frames would not hear them");
             }
         }
-    });
+    }
 }
 
 #[test]

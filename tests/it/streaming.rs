@@ -2,7 +2,7 @@
 //! arrives, bit for bit and in order, and all verbs tell the same of it.
 
 use crate::testkit::{
-    INT, MEASURED, REAL_ANSWERS, TERM, TestEnv, bytes_of, hash, hold_in_time, is_class, number, sequence,
+    INT, MEASURED, REAL_ANSWERS, TERM, TestEnv, bytes_of, hash, is_class, number, sequence,
 };
 use lms::framer::{Found, Framer};
 use lms::measured::Measured;
@@ -12,45 +12,43 @@ use serde_json::Value;
 
 #[test]
 fn everything_sent_arrives_bit_for_bit_and_in_order() {
-    hold_in_time(|| {
-        let env = TestEnv::in_time();
-        let hub = env.hub(&[env.link("front"), env.link("rear")]);
-        let sensors = ["front", "rear"];
-        // They listen before anything is sent: nothing may be missing from the very first on.
-        let mut consumers =
-            sensors.map(|sensor| ["telegram", "scan"].map(|topic| env.echo(&[&format!("{sensor}/{topic}")])));
-        let simulator = env.simulator(&sensors, &["--seed=11", REAL_ANSWERS]);
-        for [telegrams, scans] in &mut consumers {
-            telegrams.await_lines(300, "a measured telegram", |line| line["command"] == MEASURED);
-            scans.await_lines(300, "a scan", is_class("scan"));
+    let env = TestEnv::new();
+    let hub = env.hub(&[env.link("front"), env.link("rear")]);
+    let sensors = ["front", "rear"];
+    // They listen before anything is sent: nothing may be missing from the very first on.
+    let mut consumers =
+        sensors.map(|sensor| ["telegram", "scan"].map(|topic| env.echo(&[&format!("{sensor}/{topic}")])));
+    let simulator = env.simulator(&sensors, &["--seed=11", REAL_ANSWERS]);
+    for [telegrams, scans] in &mut consumers {
+        telegrams.await_lines(300, "a measured telegram", |line| line["command"] == MEASURED);
+        scans.await_lines(300, "a scan", is_class("scan"));
+    }
+    for (sensor, [telegrams, scans]) in sensors.into_iter().zip(consumers) {
+        let truth = env.truth(sensor);
+        let telegrams = telegrams.end(INT).of_class("telegram");
+        let scans = scans.end(INT).of_class("scan");
+        let intact: Vec<_> =
+            truth.iter().filter(|sent| sent.is_intact_scan()).map(|sent| &sent.hash).collect();
+        let measured: Vec<_> = telegrams.iter().filter(|line| line["command"] == MEASURED).collect();
+        let arrived: Vec<_> = measured.iter().map(|line| hash(&bytes_of(line))).collect();
+        let span = intact.len().min(arrived.len());
+        assert!(span >= 300, "{} sent, {} received", intact.len(), arrived.len());
+        assert!(arrived[..span].iter().eq(intact[..span].iter().copied()), "not what {sensor} sent");
+        assert_eq!(sequence(&telegrams, "seq")[0], 0);
+        assert_eq!(sequence(&telegrams, "topic_seq")[0], 0);
+        assert_eq!(sequence(&scans, "topic_seq")[0], 0);
+        for (scan, telegram) in scans.iter().zip(measured) {
+            assert_eq!(scan["seq"], telegram["seq"]);
+            assert_eq!(scan["stamp_ns"], telegram["stamp_ns"]);
+            check_scan(scan, &bytes_of(telegram));
         }
-        for (sensor, [telegrams, scans]) in sensors.into_iter().zip(consumers) {
-            let truth = env.truth(sensor);
-            let telegrams = telegrams.end(INT).of_class("telegram");
-            let scans = scans.end(INT).of_class("scan");
-            let intact: Vec<_> =
-                truth.iter().filter(|sent| sent.is_intact_scan()).map(|sent| &sent.hash).collect();
-            let measured: Vec<_> = telegrams.iter().filter(|line| line["command"] == MEASURED).collect();
-            let arrived: Vec<_> = measured.iter().map(|line| hash(&bytes_of(line))).collect();
-            let span = intact.len().min(arrived.len());
-            assert!(span >= 300, "{} sent, {} received", intact.len(), arrived.len());
-            assert!(arrived[..span].iter().eq(intact[..span].iter().copied()), "not what {sensor} sent");
-            assert_eq!(sequence(&telegrams, "seq")[0], 0);
-            assert_eq!(sequence(&telegrams, "topic_seq")[0], 0);
-            assert_eq!(sequence(&scans, "topic_seq")[0], 0);
-            for (scan, telegram) in scans.iter().zip(measured) {
-                assert_eq!(scan["seq"], telegram["seq"]);
-                assert_eq!(scan["stamp_ns"], telegram["stamp_ns"]);
-                check_scan(scan, &bytes_of(telegram));
-            }
-        }
-        assert_eq!(hub.end(TERM).code, Some(0));
-        assert_eq!(simulator.end(TERM).code, Some(0));
-        for sensor in sensors {
-            let (sent, eeprom_writes) = env.simulated(sensor);
-            assert_eq!((sent, eeprom_writes), (env.truth(sensor).len() as u64, 0));
-        }
-    });
+    }
+    assert_eq!(hub.end(TERM).code, Some(0));
+    assert_eq!(simulator.end(TERM).code, Some(0));
+    for sensor in sensors {
+        let (sent, eeprom_writes) = env.simulated(sensor);
+        assert_eq!((sent, eeprom_writes), (env.truth(sensor).len() as u64, 0));
+    }
 }
 
 /// Whether a line of class `scan` says what a telegram in measuring mode 1 (13 bits of range, 3 of reflector level)

@@ -10,12 +10,10 @@ mod tree;
 mod within;
 mod written;
 
-use crate::testkit::compute_gently;
 use tree::{Tree, Wall};
 
 /// The wall stands in `tree` and would be missed in each of `broken`.
 fn holds(wall: Wall, broken: impl Fn(&Tree) -> Vec<Tree>) {
-    compute_gently();
     let tree = Tree::load();
     let breaches = wall(&tree);
     assert!(breaches.is_empty(), "{}", breaches.join("\n"));

@@ -1,10 +1,18 @@
 //! `scanhub track` and `scanhub site`, from telegrams to who is where: one person from room to room, the same tracks again of a
 //! recording, a site file with a sensor that there is not, a plan that is drawn once.
 
+use std::path::Path;
+use std::sync::Arc;
+use std::sync::mpsc::channel;
+use std::thread;
+
 use crate::pages::programs_on;
 use crate::recorded_world::{BEGIN_NS, recorded_world};
-use crate::testkit::{INT, Outcome, Program, Recording, TERM, TestEnv, is_class, number, until};
+use crate::testkit::{INT, PATIENCE, Program, TERM, TestEnv, in_own_process, is_class, number, until};
+use config::Sources;
+use daemon::{Play, Player, Replay};
 use schema::datagram::Packed;
+use schema::ipc::{self, Node, Payload, Subscriber};
 use schema::{Event, EventKind, TrackState, Tracks};
 use sim::world::World;
 
@@ -64,7 +72,7 @@ pub(crate) fn replay(env: &TestEnv, file: &str) -> Program {
 
 #[test]
 fn somebody_goes_from_room_to_room_and_is_counted() {
-    let env = TestEnv::in_time();
+    let env = TestEnv::new();
     let site = env.file("site.toml", SITE);
     let _replay = replay(&env, &recorded(&env, 28));
     let mut counts = env.start(&["track", "--site", &site, "--count=middle", "--delay=2s", "--json"]);
@@ -113,72 +121,116 @@ fn somebody_goes_from_room_to_room_and_is_counted() {
 /// Follows people under the name `house`, until it misses nothing any more, and records telegrams and tracks to `file`.
 fn follow_and_record(env: &TestEnv, site: &str, file: &str) -> (Program, Program) {
     let track = env.start(&["track", "--site", site, "--as=house", "--delay=2s", "--json"]);
-    let listed = |sensor: &str, topic: &str| {
-        let listed = env.run(&["list", "--json"]).of_class("topic");
-        listed.into_iter().find(|line| line["sensor"] == sensor && line["topic"] == topic)
-    };
-    until("the tracker publishes", || listed("house", "events").is_some());
-    for (sensor, topic) in
-        [("hall", "scan"), ("kitchen", "scan"), ("hall", "foreground"), ("kitchen", "foreground")]
-    {
-        until("it follows the sensors", || {
-            listed(sensor, topic).is_some_and(|line| number(&line, "subscribers") > 0)
-        });
-    }
+    await_follower(env);
     let topics = ["hall/telegram", "kitchen/telegram", "house/tracks", "house/events"];
     let record = env.start(&[&["record", "--json", "-o", file][..], &topics].concat());
-    for (sensor, topic) in topics.iter().filter_map(|topic| topic.split_once('/')) {
-        until("it is recorded", || {
-            listed(sensor, topic).is_some_and(|line| number(&line, "subscribers") > 0)
-        });
+    for topic in topics {
+        until("it is recorded", || env.subscribers(topic) > 0);
     }
     (track, record)
 }
 
-/// What was published of a tracker in the first twenty seconds of the world: instants and payloads of tracks and events.
-fn published(file: &str) -> [Vec<(u64, Vec<u8>)>; 2] {
-    let recording = Recording::whole(file.as_ref());
-    ["house/tracks", "house/events"].map(|topic| {
-        let kept = recording.of(topic).into_iter().map(|kept| (kept.wall_ns(), kept.payload().to_vec()));
-        kept.filter(|(wall_ns, _)| *wall_ns <= BEGIN_NS + 20_000_000_000).collect()
+/// Waits until the tracker `house` publishes and follows the sensors.
+fn await_follower(env: &TestEnv) {
+    until("the tracker publishes", || {
+        let listed = env.run(&["list", "--json"]).of_class("topic");
+        listed.iter().any(|line| line["sensor"] == "house" && line["topic"] == "events")
+    });
+    for topic in ["hall/scan", "kitchen/scan", "hall/foreground", "kitchen/foreground"] {
+        until("it follows the sensors", || env.subscribers(topic) > 0);
+    }
+}
+
+/// Times of the wall clock and payloads of a tracker's samples.
+type Published = Vec<(u64, Vec<u8>)>;
+
+/// Plays `file` to a tracker, and each telegram only when the tracker has nearly caught up: however busy the machine is, it
+/// misses nothing. Returns the tracks and events that it published of the first twenty seconds of the world.
+fn tracked(env: &TestEnv, site: &str, file: &str) -> [Published; 2] {
+    let sources = Sources { set: vec!["background.scans=100".to_owned()], ..Sources::default() };
+    let play = Play { is_paused: true, ..Play::default() };
+    let replay = Replay { file: Path::new(file), sensor: None, sources: &sources, play, holds: true };
+    let domain = env.place();
+    let (tell, ready) = channel();
+    thread::scope(|scope| {
+        let hub = scope.spawn(|| {
+            daemon::replay(&replay, &domain, |_, player| tell.send(player.clone()).expect("waits"))
+        });
+        let player = EndsPlayer(ready.recv_timeout(PATIENCE).expect("is up"));
+        let delay = format!("--delay={}ms", DELAY_NS / 1_000_000);
+        let track = env.start(&["track", "--site", site, "--as=house", &delay, "--json"]);
+        await_follower(env);
+        let node = ipc::client_node(&domain).expect("a node");
+        let telegrams = ["hall", "kitchen"].map(|sensor| attach::<[u8]>(&node, sensor));
+        let (tracks, events) = (attach::<Tracks>(&node, "house"), attach::<Event>(&node, "house"));
+        let (mut published, mut played_ns) = ([Published::new(), Published::new()], 0);
+        while played_ns < BEGIN_NS + END_NS + DELAY_NS + LEAD_NS {
+            let before = player.0.progress().telegrams;
+            player.0.step();
+            until("the next telegram is played", || player.0.progress().telegrams > before);
+            until("the tracker catches up", || {
+                for telegram in &telegrams {
+                    take::<[u8]>(telegram, |wall_ns, _| played_ns = played_ns.max(wall_ns));
+                }
+                take::<Tracks>(&tracks, |wall_ns, payload| published[0].push((wall_ns, packed(payload))));
+                take::<Event>(&events, |wall_ns, payload| published[1].push((wall_ns, packed(payload))));
+                let shown_ns = published[0].last().map_or(BEGIN_NS + 1_000_000_000, |(wall_ns, _)| *wall_ns);
+                played_ns < shown_ns + DELAY_NS + LEAD_NS
+            });
+        }
+        let outcome = track.end(INT);
+        let summary = &outcome.of_class("summary")[0];
+        assert!(["missed", "late", "failed"].iter().all(|key| number(summary, key) == 0), "{outcome}");
+        drop(player);
+        hub.join().expect("ends").expect("ends well");
+        published.iter_mut().for_each(|samples| samples.retain(|(wall_ns, _)| *wall_ns <= BEGIN_NS + END_NS));
+        published
     })
 }
 
-/// Nothing was missed and nothing came late on the way to the tracker.
-fn is_complete(outcome: &Outcome) -> bool {
-    let summary = &outcome.of_class("summary")[0];
-    ["missed", "late", "failed"].iter().all(|key| number(summary, key) == 0)
+/// Time that the tracker waits for scans of other sensors.
+const DELAY_NS: u64 = 100_000_000;
+/// Time of scans that the tracker may be behind: less than a topic keeps for it, and more than is between two of its pictures.
+const LEAD_NS: u64 = 250_000_000;
+/// End of what is compared, from the begin of the world.
+const END_NS: u64 = 20_000_000_000;
+
+/// Ends the player in any case: the hub's thread is waited for.
+struct EndsPlayer(Arc<Player>);
+
+impl Drop for EndsPlayer {
+    fn drop(&mut self) {
+        self.0.end();
+    }
 }
 
-/// Plays `file` to a tracker and records it to `again`; `false` if the machine stood still for so long that the tracker missed
-/// scans, which it says.
-fn played(env: &TestEnv, site: &str, file: &str, again: &str) -> bool {
-    let replay = replay(env, file);
-    let (mut track, record) = follow_and_record(env, site, again);
-    env.run(&["control", "hall", "resume"]);
-    track.await_line("somebody", |line| line["kind"] == "appeared");
-    track.await_line("who goes through the door", |line| line["kind"] == "door");
-    track.await_line("all that is compared", |line| {
-        line["class"] == "tracks" && number(line, "wall_ns") >= BEGIN_NS + 20_000_000_000
-    });
-    let outcome = track.end(INT);
-    assert_eq!(record.end(INT).code, Some(0));
-    replay.end(INT);
-    is_complete(&outcome)
+fn attach<P: Payload + ?Sized>(node: &Node, sensor: &str) -> Subscriber<P> {
+    let topic = P::open(node, sensor).expect("a topic").expect("is there");
+    P::subscriber(&topic).expect("a place")
+}
+
+fn take<P: Payload + ?Sized>(from: &Subscriber<P>, mut each: impl FnMut(u64, &P)) {
+    while let Some(sample) = P::receive(from).expect("works") {
+        each(sample.user_header().wall_ns, P::read(&sample));
+    }
+}
+
+fn packed(payload: &impl Packed) -> Vec<u8> {
+    let mut room = vec![0; 100_000];
+    let len = payload.pack(&mut room).expect("there is room");
+    room.truncate(len);
+    room
 }
 
 #[test]
 fn a_replay_of_a_recording_gives_the_same_tracks_bit_for_bit() {
-    let env = TestEnv::in_time();
-    let site = env.file("site.toml", SITE);
-    let world = recorded(&env, 26);
-    for attempt in 0..3 {
-        let [file, again] = ["first", "again"].map(|name| env.word(&format!("{name}{attempt}.mcap")));
-        if !played(&env, &site, &world, &file) || !played(&env, &site, &file, &again) {
-            continue;
-        }
-        let ([tracks, events], [tracks_again, events_again]) = (published(&file), published(&again));
+    in_own_process("track::a_replay_of_a_recording_gives_the_same_tracks_bit_for_bit", || {
+        let env = TestEnv::new();
+        let site = env.file("site.toml", SITE);
+        let file = recorded(&env, 22);
+        let [tracks, events] = tracked(&env, &site, &file);
         assert!(tracks.len() > 300 && events.len() >= 2, "{} tracks, {} events", tracks.len(), events.len());
+        let [tracks_again, events_again] = tracked(&env, &site, &file);
         assert!(tracks == tracks_again, "{} and {} tracks", tracks.len(), tracks_again.len());
         assert_eq!(events, events_again);
         // And they say what the lines said.
@@ -194,15 +246,13 @@ fn a_replay_of_a_recording_gives_the_same_tracks_bit_for_bit() {
             last.tracks().iter().any(|track| track.state() == TrackState::Confirmed)
         }));
         assert!(last.sensors().iter().map(|sensor| sensor.name()).eq(["hall", "kitchen"]));
-        return;
-    }
-    panic!("three times the machine stood still for longer than topics keep samples");
+    });
 }
 
 /// What `track` says on its lines, the program of the page says while it goes on.
 #[test]
 fn events_come_to_a_program_in_python_live_in_order_and_none_is_lost() {
-    let env = TestEnv::in_time();
+    let env = TestEnv::new();
     let Some(example) = programs_on("docs/tracks.md", "house/events", &env).pop() else { return };
     let site = env.file("site.toml", SITE);
     let to_and_fro =

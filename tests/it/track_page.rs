@@ -44,7 +44,7 @@ fn play(env: &TestEnv, file: &str, sensor: &str) -> Program {
 #[test]
 fn somebody_goes_from_the_hall_to_the_kitchen_as_the_page_says() {
     in_a_network("track_page::somebody_goes_from_the_hall_to_the_kitchen_as_the_page_says", || {
-        let [robot, kitchen] = [TestEnv::in_time(), TestEnv::in_time()];
+        let [robot, kitchen] = [TestEnv::new(), TestEnv::new()];
         let site = robot.file("house.toml", text_on(PAGE, "toml", "[[sensor]]"));
         let checked = robot.run(&["site", "check", &site]);
         assert_eq!(checked.code, Some(0), "{checked}");

@@ -3,7 +3,6 @@
 
 use std::fs::{self, File};
 use std::process::Command;
-use std::time::Duration;
 
 use crate::testkit;
 use crate::testkit::{INT, KILL, Sitting, TERM, TestEnv, Tmux, can_sit};
@@ -205,10 +204,9 @@ fn a_terminal_that_is_closed_is_a_quiet_end() {
             let file = File::create(&errors).expect("a file");
             let watch = Sitting::start_for_hang_up(&env.command(&["watch"]), SIZE, told, file);
             watch.await_words(if streams { "1 front    streaming" } else { "no hub: waiting for it" });
-            let (code, took) = watch.hang_up();
+            let code = watch.hang_up();
             let errors = fs::read_to_string(errors).expect("its errors");
             assert_eq!((code, errors.as_str()), (Some(0), ""), "told {told}, streams {streams}");
-            assert!(took < Duration::from_secs(5), "{took:?}, told {told}, streams {streams}");
         }
     }
 }

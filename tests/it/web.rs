@@ -2,10 +2,9 @@
 
 use std::io::{Read, Write};
 use std::net::TcpStream;
-use std::thread;
-use std::time::{Duration, Instant};
+use std::time::Instant;
 
-use crate::testkit::{INT, PATIENCE, Program, TestEnv, is_class};
+use crate::testkit::{INT, PATIENCE, Program, TestEnv, is_class, until};
 use serde_json::{Value, json};
 use tungstenite::client::IntoClientRequest;
 use tungstenite::{Message, WebSocket};
@@ -75,11 +74,11 @@ pub(crate) fn text(socket: &mut WebSocket<TcpStream>) -> Value {
 
 /// The channels of these `topics`, which there will be; messages that come before they are told are not looked at.
 pub(crate) fn channels<const N: usize>(viewer: &mut WebSocket<TcpStream>, topics: [&str; N]) -> [Value; N] {
-    let begun = Instant::now();
+    let give_up_at = Instant::now() + PATIENCE;
     let mut told: Vec<Value> = Vec::new();
     let of = |told: &[Value], topic: &str| told.iter().find(|channel| channel["topic"] == topic).cloned();
     while !topics.iter().all(|topic| of(&told, topic).is_some()) {
-        assert!(begun.elapsed() < PATIENCE, "{topics:?} are not all in {told:?}");
+        assert!(Instant::now() < give_up_at, "{topics:?} are not all in {told:?}");
         told.extend(text(viewer)["channels"].as_array().into_iter().flatten().cloned());
     }
     topics.map(|topic| of(&told, topic).expect("it is there"))
@@ -149,10 +148,10 @@ fn viewers_get_the_messages_of_foxglove_whatever_others_send() {
     );
     assert_eq!([&zones["encoding"], &zones["schemaName"]], ["json", "foxglove.SceneUpdate"]);
     subscribe(&mut viewer, &[(70, &scan["id"]), (71, &zones["id"]), (72, &9999.into())]);
-    let begun = Instant::now();
+    let give_up_at = Instant::now() + PATIENCE;
     let mut seen = [0_u32; 2];
     while seen.iter().any(|count| *count < 5) {
-        assert!(begun.elapsed() < PATIENCE, "{seen:?}");
+        assert!(Instant::now() < give_up_at, "{seen:?}");
         let Message::Binary(frame) = viewer.read().expect("the server lives") else { continue };
         let subscription = u32::from_le_bytes(frame[1..5].try_into().expect("four bytes"));
         assert_eq!(frame[0], 1);
@@ -187,11 +186,7 @@ fn as_many_come_in_as_there_is_room_for() {
     assert_eq!(status(&ask(&host, &format!("GET / HTTP/1.1\r\nHost: {host}\r\n\r\n"))), "200");
     drop(idle);
     let _ = viewers.pop().map(|mut one| one.close(None));
-    let begun = Instant::now();
-    while view(&host, "/", None).is_err() {
-        assert!(begun.elapsed() < PATIENCE, "the place of who went is free");
-        thread::sleep(Duration::from_millis(20));
-    }
+    until("the place of who went is free", || view(&host, "/", None).is_ok());
     assert_eq!(server.end(INT).code, Some(0));
 }
 

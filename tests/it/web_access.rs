@@ -4,7 +4,7 @@
 use serde_json::{Value, json};
 
 use crate::browser::{Browser, Look};
-use crate::testkit::TestEnv;
+use crate::testkit::{TestEnv, until};
 use crate::web::web;
 use crate::web_page::browse;
 
@@ -90,32 +90,37 @@ fn the_keyboard_alone_is_enough() {
     assert!(page.complaints.is_empty(), "{:?}", page.complaints);
 }
 
+/// Roles and names of what a screen reader finds on the page.
+fn tree(page: &mut Browser) -> Vec<(String, String)> {
+    let tree = page.call("Accessibility.getFullAXTree", json!({}));
+    let nodes = tree["nodes"].as_array().expect("nodes").iter().filter(|node| node["ignored"] != true);
+    let text = |value: &Value| value.as_str().unwrap_or_default().to_owned();
+    nodes.map(|node| (text(&node["role"]["value"]), text(&node["name"]["value"]))).collect()
+}
+
+/// The names of the nodes with `role`.
+fn named<'a>(nodes: &'a [(String, String)], role: &str) -> Vec<&'a str> {
+    nodes.iter().filter(|node| node.0 == role).map(|node| node.1.as_str()).collect()
+}
+
 #[test]
 fn who_hears_the_page_is_told_names_states_and_the_verdict() {
     let env = TestEnv::new();
     let Some((mut page, _programs)) = look_at(&env, Look::LAPTOP) else { return };
-    let tree = page.call("Accessibility.getFullAXTree", json!({}));
-    let nodes: Vec<(String, String)> = tree["nodes"]
-        .as_array()
-        .expect("nodes")
-        .iter()
-        .filter(|node| node["ignored"] != true)
-        .map(|node| {
-            [&node["role"]["value"], &node["name"]["value"]]
-                .map(|text| text.as_str().unwrap_or_default().to_owned())
-        })
-        .map(|[role, name]| (role, name))
-        .collect();
-    let named = |role: &str| {
-        nodes.iter().filter(|node| node.0 == role).map(|node| node.1.as_str()).collect::<Vec<_>>()
-    };
+    let words = ["SLOW", "CLEAR", "STOP"];
+    // On a busy machine the verdict of a moment may be unknown.
+    let mut nodes = Vec::new();
+    until("the tree has a verdict", || {
+        nodes = tree(&mut page);
+        words.iter().any(|word| named(&nodes, "StaticText").contains(word))
+    });
+    let named = |role| named(&nodes, role);
     assert!(named("button").len() >= 11 && named("button").iter().all(|name| !name.is_empty()), "{nodes:?}");
     assert!(named("image").iter().any(|name| name.contains("from above")), "{:?}", named("image"));
     assert!(
         named("complementary").contains(&"Sensors") && named("navigation").contains(&"Picture"),
         "{nodes:?}"
     );
-    assert!(named("StaticText").iter().any(|text| ["SLOW", "CLEAR", "STOP"].contains(text)), "{nodes:?}");
     for word in ["rate", "age p50 / p99", "damaged on the line", "streaming"] {
         assert!(named("StaticText").contains(&word), "{word} of {:?}", named("StaticText"));
     }
@@ -128,13 +133,16 @@ fn who_hears_the_page_is_told_names_states_and_the_verdict() {
 fn who_does_not_bear_movement_gets_none() {
     let env = TestEnv::new();
     let Some((mut page, _programs)) = look_at(&env, Look::LAPTOP) else { return };
-    // How many places the picture has on its way back from a larger one.
+    // How many places the picture has on its way back from a larger one, until it stands for 20 frames.
     let places = "new Promise((done) => {
         const scales = new Set();
-        const until = performance.now() + 1500;
+        let [last, still] = [0, 0];
         const look = () => {
-            scales.add(scanhub.view.scale);
-            if (performance.now() < until) requestAnimationFrame(look); else done(scales.size);
+            const { scale } = scanhub.view;
+            scales.add(scale);
+            still = scale === last ? still + 1 : 0;
+            last = scale;
+            if (still < 20) requestAnimationFrame(look); else done(scales.size);
         };
         requestAnimationFrame(look);
     })";

@@ -1,13 +1,10 @@
 //! Sensors of every family and form in one picture: equal beams and exact angles, upside down, fields that overlap, and those
 //! of other machines. Where the page draws points is compared with where the hub's scans and poses put them.
 
-use std::thread;
-use std::time::{Duration, Instant};
-
 use serde_json::Value;
 
 use crate::browser::{Browser, Look};
-use crate::testkit::{INT, PATIENCE, Sender, TestEnv, in_a_network, number, until};
+use crate::testkit::{INT, Sender, TestEnv, in_a_network, number, until};
 use crate::web::web;
 use crate::web_page::browse;
 use scene::{Place, Scene};
@@ -115,15 +112,13 @@ fn sensors_of_other_machines_stand_in_the_list_and_not_on_this_robot() {
         // It announces itself and says something all the time, as remote ones do: however long the rest took, it is there
         // again.
         let mut say = |page: &mut Browser, wanted: &str| {
-            let begun = Instant::now();
-            while page.ask(wanted) != Value::Bool(true) {
-                assert!(begun.elapsed() < PATIENCE, "{wanted}");
+            until(wanted, || {
                 sender.announce(&said);
                 sender.send(Topic::Status, &Status { state: State::Streaming as u8, ..Status::default() });
                 sender.send(Topic::Scan, &*scan);
                 sender.send(Topic::Zones, &Zones { verdict: Verdict::Stop as u8, ..Zones::unknown() });
-                thread::sleep(Duration::from_millis(30));
-            }
+                page.ask(wanted) == Value::Bool(true)
+            });
         };
         let card = "[...document.querySelectorAll('#sensors h2')].some((one) => /robot1\\.front/.test(one.innerText))";
         say(&mut page, card);

@@ -2,7 +2,7 @@
 //! has and that is gone afterwards.
 
 use crate::browser::Look;
-use crate::testkit::{INT, Program, TestEnv, hold_in_time, is_class, shared_memory};
+use crate::testkit::{INT, Program, TestEnv, is_class, shared_memory};
 use crate::web_page::browse;
 
 /// Starts what shows `file`, and waits for its address.
@@ -14,11 +14,14 @@ fn show(env: &TestEnv, file: &str, flags: &[&str]) -> (Program, String) {
     (web, url)
 }
 
+/// Scans of a log that plays for two minutes: longer than a page takes to be there.
+const SCANS: u64 = 600;
+
 /// A CARMEN log of a wall that comes nearer with every scan, five of them a second.
 fn log(env: &TestEnv, scans: u64) -> String {
     let line = |n: u64| {
         let stamp = 1000.0 + 0.2 * n as f64;
-        let range = format!(" {:.2}", 8.0 - 0.01 * n as f64).repeat(181);
+        let range = format!(" {:.2}", 8.0 - 0.01 * (n % 600) as f64).repeat(181);
         format!("FLASER 181{range} 0 0 0 0 0 0 {stamp:.6} host {stamp:.6}\n")
     };
     env.file("wall.log", (0..scans).map(line).collect::<String>())
@@ -26,26 +29,23 @@ fn log(env: &TestEnv, scans: u64) -> String {
 
 #[test]
 fn the_keys_of_a_player_are_on_the_page() {
-    hold_in_time(play);
-}
-
-fn play() {
-    let env = TestEnv::in_time();
+    let env = TestEnv::new();
     let Some(mut page) = browse(&env, Look::LAPTOP) else { return };
-    let (server, url) = show(&env, &log(&env, 100), &[]);
+    let (server, url) = show(&env, &log(&env, SCANS), &[]);
     page.open(&url);
     page.await_true("window.scanhub?.beams === 181 && scanhub.player && !scanhub.player.paused");
     let own = format!("sh_web-{}_", server.pid());
     assert!(!shared_memory(&own).is_empty(), "a hub of its own");
     assert_eq!(
-        page.ask("document.querySelector('#line').max > 19 && document.querySelector('#line').value > 0"),
+        page.ask("document.querySelector('#line').max > 119 && document.querySelector('#line').value > 0"),
         true
     );
 
     // Paused by a key: the picture stands, longer than a scan is what is there.
     page.press("p");
     page.await_true("scanhub.player.paused && /paused/.test(document.querySelector('#played').innerText)");
-    page.ask("new Promise((done) => setTimeout(done, 1500))");
+    page.ask("window.pausedAt = performance.now()");
+    page.await_true("performance.now() - window.pausedAt > 1500");
     let before = page.ask("scanhub.player.telegrams").as_u64().expect("a number");
     assert_eq!(page.ask("scanhub.beams"), 181);
     assert_eq!(page.ask("scanhub.reason"), serde_json::Value::Null);
@@ -70,7 +70,9 @@ fn play() {
     page.press("p");
     page.await_true("scanhub.player.over && /at its end/.test(document.querySelector('#played').innerText)");
     assert_eq!(
-        page.ask("document.querySelector('[data-order=step]').disabled && scanhub.player.telegrams === 100"),
+        page.ask(&format!(
+            "document.querySelector('[data-order=step]').disabled && scanhub.player.telegrams === {SCANS}"
+        )),
         true
     );
     assert_eq!(page.ask("scanhub.beams"), 181, "what was seen last stands");

@@ -16,7 +16,7 @@ use crate::tilt::{Hall, NEAR, ends_well, numbers};
 use crate::tilted::{CLASSES, Made, TOPICS, hub, round};
 use crate::web::{channels, subscribe, view, view_as, web};
 use crate::web_channels::conforms;
-use crate::web_page::browse;
+use crate::web_page::{browse, hold};
 
 /// The messages of a round: an angle, a sweep, and what that has found.
 fn say(made: &mut Made, viewer: &mut WebSocket<TcpStream>) -> [Vec<u8>; 3] {
@@ -183,14 +183,14 @@ fn a_hall_is_seen_from_the_side_while_somebody_looks() {
     page.press("c");
     page.await_true("scanhub.view.turn === 0");
     // Held, it stands; then it goes on.
-    page.press(" ");
-    page.await_true("document.querySelector('#verdict').innerText.includes('held')");
+    hold(&mut page, "scanhub.swept > 1000 && scanhub.sweeps[0].sweep !== null");
     let [sweep, points] = ["scanhub.sweeps[0].sweep", "scanhub.swept"].map(|what| page.ask(what));
     page.press("h");
     page.await_true("!scanhub.aside && scanhub.beams > 100");
     page.press("h");
-    page.await_true(&format!("scanhub.aside && scanhub.swept > 0 && scanhub.swept === {points}"));
-    assert_eq!(page.ask("scanhub.sweeps[0].sweep"), sweep);
+    page.await_true(&format!(
+        "scanhub.aside && scanhub.swept > 0 && scanhub.swept === {points} && scanhub.sweeps[0].sweep === {sweep}"
+    ));
     page.press(" ");
     page.await_true(&format!("scanhub.sweeps[0].sweep !== {sweep}"));
     // Who comes back waits for points, and nothing is wrong meanwhile.
@@ -234,7 +234,7 @@ fn the_page_of_the_demonstration_has_sweeps() {
 /// As in the documents, by the command that makes those of `web_page`: the hall of `docs/tilt.md`, once all has come that comes.
 #[test]
 fn the_picture_of_the_documents_from_the_side() {
-    let env = TestEnv::in_time();
+    let env = TestEnv::new();
     let directory = std::env::var_os("SCANHUB_PICTURES");
     let look = Look { width: 1200, height: 440, ..Look::LAPTOP };
     let Some(mut page) = browse(&env, look) else { return };

@@ -6,7 +6,7 @@ use crate::browser::{Browser, Look};
 use crate::testkit::{INT, TestEnv, until};
 use crate::track::{SITE, recorded, replay};
 use crate::web::web;
-use crate::web_page::browse;
+use crate::web_page::{browse, hold};
 
 /// Pixels of the colour of people in a square around where the first one is drawn.
 const GREEN: &str = "(() => {
@@ -27,10 +27,10 @@ fn number(page: &mut Browser, script: &str) -> f64 {
 
 #[test]
 fn people_stand_in_the_picture_where_the_tracker_sees_them() {
-    let env = TestEnv::in_time();
+    let env = TestEnv::new();
     let Some(mut page) = browse(&env, Look::LAPTOP) else { return };
     let site = env.file("site.toml", SITE);
-    let hub = replay(&env, &recorded(&env, 40));
+    let hub = replay(&env, &recorded(&env, 60));
     let mut track = env.start(&["track", "--site", &site, "--as=house", "--delay=2s", "--json"]);
     until("the tracker publishes and follows the sensors", || {
         let listed = env.run(&["list", "--json"]).of_class("topic");
@@ -48,9 +48,7 @@ fn people_stand_in_the_picture_where_the_tracker_sees_them() {
     page.await_true("document.querySelector('#people').innerText === '1 person: kitchen 1'");
     page.await_true("scanhub.tracks === 1 && scanhub.people[0].tail.length > 10");
     // What is held stays to be looked at.
-    page.press(" ");
-    page.await_true("document.querySelector('#verdict').innerText.includes('held')");
-    assert_eq!(page.ask("scanhub.people[0].state"), "confirmed");
+    hold(&mut page, "scanhub.people[0]?.state === 'confirmed' && scanhub.points('kitchen').length > 100");
     assert!(number(&mut page, GREEN) > 40.0, "a circle, a tail and a number are drawn");
     let place = ["x", "y"].map(|axis| number(&mut page, &format!("scanhub.people[0].{axis}")));
     let reach = ["x", "y"].map(|axis| number(&mut page, &format!("scanhub.people[0].reach.{axis}")));

@@ -64,6 +64,11 @@ impl Machine {
         Ipv4Addr::new(10, 76, self.number, 2)
     }
 
+    /// Returns the path of the file that lists its UDP sockets.
+    pub(crate) fn udp_sockets(&self) -> PathBuf {
+        PathBuf::from(format!("/proc/{}/net/udp", self.holder.id()))
+    }
+
     /// Returns the path of its network namespace.
     pub(crate) fn network(&self) -> PathBuf {
         format!("/proc/{}/ns/net", self.holder.id()).into()

@@ -5,8 +5,6 @@
 mod again;
 mod child;
 mod findings;
-mod gentle;
-mod in_time;
 mod line;
 mod machine;
 mod network;
@@ -17,6 +15,7 @@ mod recording;
 mod relay;
 mod robot;
 mod sender;
+mod side_by_side;
 mod skip;
 mod supervisor;
 mod telegrams;
@@ -38,8 +37,6 @@ use serde_json::Value;
 pub(crate) use again::{in_own_process, only, own_program, run_again};
 pub(crate) use child::{Child, end_runs_of, output, spawn, status, succeeds, write_program};
 pub(crate) use findings::Findings;
-pub(crate) use gentle::{compute_gently, gentle, side_by_side, wait_gently};
-pub(crate) use in_time::hold_in_time;
 pub(crate) use line::{Line, open_line};
 pub(crate) use machine::{Machine, command_in, ip};
 pub(crate) use network::in_a_network;
@@ -50,14 +47,15 @@ pub(crate) use recording::{Kept, Recording, unbroken};
 pub(crate) use relay::Relay;
 pub(crate) use robot::Robot;
 pub(crate) use sender::{Sender, wall_ns};
+pub(crate) use side_by_side::side_by_side;
 pub(crate) use skip::{skip, verdict as skip_verdict};
 pub(crate) use supervisor::Supervisor;
-pub(crate) use telegrams::{MEASURED, Sent, bytes_of, hash, is_class, number, scan, sequence};
+pub(crate) use telegrams::{MEASURED, Sent, accounted, bytes_of, hash, is_class, number, scan, sequence};
 pub(crate) use terminal::{Sitting, can_sit, terminal};
 pub(crate) use tmux::Tmux;
 
-/// Far longer than anything takes on a busy machine.
-pub(crate) const PATIENCE: Duration = Duration::from_secs(20);
+/// Limit of every wait. It only bounds a hang: no test depends on how long something takes.
+pub(crate) const PATIENCE: Duration = Duration::from_secs(60);
 
 /// Flag of a simulator whose sensors take as long to answer as real ones do.
 pub(crate) const REAL_ANSWERS: &str = "--fault=answer=0";
@@ -76,15 +74,8 @@ pub(crate) struct TestEnv {
 }
 
 impl TestEnv {
-    /// A new one. What its programs do may take its time.
+    /// A new one.
     pub(crate) fn new() -> TestEnv {
-        wait_gently();
-        TestEnv::in_time()
-    }
-
-    /// One for a test that holds something about time: how fast a line is read, what comes while nobody reads. Its programs
-    /// come before those of other tests.
-    pub(crate) fn in_time() -> TestEnv {
         static NEXT: AtomicU32 = AtomicU32::new(0);
         let domain = format!("t{}-{}", std::process::id(), NEXT.fetch_add(1, Ordering::Relaxed));
         // Not TMPDIR: root and prefix of a domain have to be short.
@@ -191,8 +182,14 @@ impl TestEnv {
     }
 
     /// A simulator with a port of each of these names that is up; its truth is in the file `truth`. Its sensors answer soon
-    /// unless `flags` have faults or [`REAL_ANSWERS`]: few tests are about that wait, and all would wait.
+    /// unless `flags` have faults or [`REAL_ANSWERS`]: few tests are about that wait, and all would wait. A hub that does not
+    /// get a processor loses nothing: the sensors wait for it.
     pub(crate) fn simulator<S: AsRef<str>>(&self, ports: &[&str], flags: &[S]) -> Program {
+        self.simulator_on_real_lines(ports, &with(flags, &["--lossless"]))
+    }
+
+    /// As [`TestEnv::simulator`], on lines that lose what a hub does not read.
+    pub(crate) fn simulator_on_real_lines<S: AsRef<str>>(&self, ports: &[&str], flags: &[S]) -> Program {
         let ports: Vec<_> = ports.iter().map(|port| format!("--port={}", self.word(port))).collect();
         let truth = format!("--truth={}", self.word("truth"));
         let has_faults = flags.iter().any(|flag| flag.as_ref().starts_with("--fault"));
@@ -330,10 +327,24 @@ pub(crate) fn shared_memory(prefix: &str) -> Vec<PathBuf> {
 /// Waits until `is_so`.
 pub(crate) fn until(what: &str, mut is_so: impl FnMut() -> bool) {
     let give_up_at = Instant::now() + PATIENCE;
-    while !is_so() {
+    let mut pause = Duration::from_millis(1);
+    loop {
+        let begun = Instant::now();
+        if is_so() {
+            return;
+        }
+        let took = begun.elapsed();
         assert!(Instant::now() < give_up_at, "waited in vain: {what}");
-        thread::sleep(Duration::from_millis(20));
+        // A check that starts a program leaves the processors to others for most of the time.
+        thread::sleep(pause.max(2 * took).min(Duration::from_millis(100)));
+        pause = (2 * pause).min(Duration::from_millis(20));
     }
+}
+
+/// Lets `span` pass, for a program that has to find by its own clock that at least this time has passed. It may be longer: no
+/// test depends on that.
+pub(crate) fn let_pass(span: Duration) {
+    thread::sleep(span);
 }
 
 /// Whether anything is at `path`, be it a symlink to nothing.

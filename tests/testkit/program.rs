@@ -12,7 +12,6 @@ use serde_json::Value;
 
 use super::PATIENCE;
 use super::child::{Child, spawn};
-use super::in_time::ends_after;
 
 pub(crate) const INT: Signal = Signal::INT;
 pub(crate) const TERM: Signal = Signal::TERM;
@@ -87,17 +86,6 @@ impl Program {
         self.process.id()
     }
 
-    /// Returns how long its threads have been ready to run without a processor. Zero where the kernel does not count
-    /// it.
-    fn kept_waiting(&self) -> Duration {
-        let tasks = std::fs::read_dir(format!("/proc/{}/task", self.pid())).into_iter().flatten().flatten();
-        let counted = tasks.filter_map(|task| {
-            let text = std::fs::read_to_string(task.path().join("schedstat")).ok()?;
-            text.split(' ').nth(1)?.parse::<u64>().ok()
-        });
-        Duration::from_nanos(counted.sum())
-    }
-
     /// Returns whether it has ended.
     pub(crate) fn is_over(&self) -> bool {
         let status = std::fs::read_to_string(format!("/proc/{}/stat", self.pid())).unwrap_or_default();
@@ -131,6 +119,13 @@ impl Program {
     pub(crate) fn is_heard(&mut self, wanted: impl Fn(&Value) -> bool) -> bool {
         while self.receive(Instant::now()).is_ok() {}
         self.has_said(wanted)
+    }
+
+    /// Returns the first line that is `wanted` among all that it has printed so far.
+    pub(crate) fn printed(&mut self, wanted: impl Fn(&Value) -> bool) -> Option<Value> {
+        while self.receive(Instant::now()).is_ok() {}
+        let lines = self.out.split(|byte| *byte == b'\n');
+        lines.filter_map(|line| serde_json::from_slice(line).ok()).find(|line| wanted(line))
     }
 
     /// Waits for the next `count` lines that are `wanted`, and returns them.
@@ -177,7 +172,6 @@ impl Program {
 
     /// Sends a signal and waits for the end.
     pub(crate) fn end(self, signal: Signal) -> Outcome {
-        ends_after(self.kept_waiting());
         self.signal(signal);
         self.wait()
     }
@@ -224,12 +218,6 @@ impl Program {
         let out = String::from_utf8_lossy(&self.out);
         let tail: Vec<_> = out.lines().rev().take(5).collect();
         panic!("scanhub {}: waited in vain ({why}) for {what}; it said last: {tail:#?}\n{errors}", self.name);
-    }
-}
-
-impl Drop for Program {
-    fn drop(&mut self) {
-        ends_after(self.kept_waiting());
     }
 }
 

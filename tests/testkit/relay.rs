@@ -1,7 +1,9 @@
-//! What is between two machines: takes what one sends and passes it on to others, not all of it, not in its order, and
-//! some of it twice. Its log is the truth about what the others heard.
+//! A relay between two machines: takes what one sends and passes it on to others, not all of it, not in its order, and some
+//! of it twice. It waits while the receive buffer of a machine fills up, so that the kernel drops nothing when a listener does
+//! not get a processor. Its log is therefore the truth about what the others received.
 
 use std::net::{Ipv4Addr, UdpSocket};
+use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard};
 use std::thread::{self, JoinHandle};
@@ -10,7 +12,7 @@ use rustix::net::sockopt::set_ip_multicast_if;
 use schema::Topic;
 use schema::datagram::{Announce, GROUPS, PORT, group};
 
-use super::{Machine, Receiver, read};
+use super::{Machine, Receiver, read, until};
 
 /// Passes on until it is dropped; nothing is lost, doubled or moved before it is told to.
 pub(crate) struct Relay {
@@ -20,7 +22,8 @@ pub(crate) struct Relay {
 }
 
 struct Inner {
-    out: Vec<UdpSocket>,
+    /// Sockets to the other machines, and the file in which each lists its UDP sockets.
+    out: Vec<(UdpSocket, PathBuf)>,
     /// All that came.
     taken: Vec<Vec<u8>>,
     /// All that was passed on, in this order.
@@ -63,13 +66,13 @@ impl Relay {
         Relay { inner, stop, thread: Some(thread) }
     }
 
-    /// Passes on to the machine `to` as well from now on; how many were passed on before.
+    /// Passes on to the machine `to` as well from now on; how many were passed on before. Listeners there have to be up.
     pub(crate) fn connect(&self, to: &Machine) -> usize {
         let socket = UdpSocket::bind((Ipv4Addr::UNSPECIFIED, 0)).expect("a port");
         set_ip_multicast_if(&socket, &to.here()).expect("the cable is plugged in");
         socket.set_multicast_loop_v4(false).expect("it is IPv4");
         let mut inner = self.inner();
-        inner.out.push(socket);
+        inner.out.push((socket, to.udp_sockets()));
         inner.log.len()
     }
 
@@ -128,12 +131,26 @@ impl Inner {
         let topic = Topic::of_number(read(datagram).head.topic);
         let [a, b, c] = GROUPS;
         let group = Ipv4Addr::new(a, b, c, topic.map_or(Announce::GROUP, group));
-        for out in &self.out {
+        for (out, sockets) in &self.out {
+            until("listeners read", || most_waiting(sockets) < MOST_WAITING);
             let sent = out.send_to(datagram, (group, PORT));
             assert_eq!(sent.expect("the cable takes it"), datagram.len());
         }
         self.log.push(datagram.to_vec());
     }
+}
+
+/// Bytes that may wait at a socket before the relay waits: a fraction of the smallest receive buffer that a listener has.
+const MOST_WAITING: u64 = 64 << 10;
+
+/// Bytes that wait at the fullest of the UDP sockets that the file `sockets` lists (proc(5), `rx_queue`).
+fn most_waiting(sockets: &Path) -> u64 {
+    let text = std::fs::read_to_string(sockets).expect("the machine is there");
+    let waiting = |line: &str| {
+        let queues = line.split_whitespace().nth(4)?;
+        u64::from_str_radix(queues.split_once(':')?.1, 16).ok()
+    };
+    text.lines().filter_map(waiting).max().unwrap_or(0)
 }
 
 impl Drop for Relay {

@@ -5,6 +5,8 @@ use lms::variant::Unit;
 use serde_json::Value;
 use sha2::{Digest, Sha256};
 
+use super::Outcome;
+
 /// Command of a measured-value telegram.
 pub(crate) const MEASURED: u64 = 0xB0;
 
@@ -68,6 +70,26 @@ pub(crate) fn sequence(lines: &[Value], key: &str) -> Vec<u64> {
     for pair in numbers.windows(2) {
         assert_eq!(pair[1], pair[0] + 1, "a gap in {key}");
     }
+    numbers
+}
+
+/// The numbers of the samples of `topic` that a client printed. They are in order, and each one that is missing between the
+/// first and the last was reported as missed: a client that does not get a processor for long may miss some.
+pub(crate) fn accounted(outcome: &Outcome, topic: &str) -> Vec<u64> {
+    let mut lines = outcome.of_class(topic);
+    // What a client reports of a silence by itself has no number.
+    lines.retain(|line| line["stale"] != true && line["topic_seq"].is_u64());
+    let numbers: Vec<u64> = lines.iter().map(|line| number(line, "topic_seq")).collect();
+    assert!(numbers.is_sorted_by(|one, next| one < next), "out of order: {numbers:?}");
+    let (Some(first), Some(last)) = (numbers.first(), numbers.last()) else { return numbers };
+    let notices = outcome.of_class("notice");
+    let missed = notices.iter().filter(|line| line["kind"] == "missed" && line["topic"] == topic);
+    let missed: u64 = missed.map(|line| number(line, "missed")).sum();
+    assert_eq!(
+        numbers.len() as u64 + missed,
+        last - first + 1,
+        "{topic}: a gap that was not reported: {outcome}"
+    );
     numbers
 }
 

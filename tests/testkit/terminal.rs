@@ -151,13 +151,12 @@ impl Sitting {
         self.process.signal(signal).unwrap();
     }
 
-    /// Closes the terminal and waits for the end. Returns the exit code and the time until the end.
-    pub(crate) fn hang_up(mut self) -> (Option<i32>, Duration) {
+    /// Closes the terminal and waits for the end. Returns the exit code.
+    pub(crate) fn hang_up(mut self) -> Option<i32> {
         self.closed.store(true, Ordering::Relaxed);
         self.eye.take().map(JoinHandle::join).transpose().unwrap();
         drop(self.keys.take());
-        let closed_at = Instant::now();
-        (self.wait(), closed_at.elapsed())
+        self.wait()
     }
 
     fn wait(&mut self) -> Option<i32> {

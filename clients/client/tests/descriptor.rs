@@ -27,7 +27,7 @@ fn scans(place: &Place) -> (Subscription<Scan>, OwnedFd) {
 }
 
 /// Far longer than anything takes on a busy machine.
-const LONG: Duration = Duration::from_secs(20);
+const LONG: Duration = Duration::from_secs(60);
 
 /// Polls until there is a scan.
 fn polled(scans: &mut Subscription<Scan>, descriptor: &OwnedFd) -> (u64, bool, usize) {
@@ -89,7 +89,7 @@ fn a_hub_that_lives_and_says_nothing_wakes_nobody_but_once_a_second() {
         }
     }
     // Ten in the first second, in which something may be handed to a late joiner.
-    assert!((2..=20).contains(&looks), "{looks}");
+    assert!((1..=20).contains(&looks), "{looks}");
 }
 
 #[test]

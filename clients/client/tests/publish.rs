@@ -23,7 +23,7 @@ fn next(followed: &mut Subscription<Marks>) -> (u64, bool, u64, u8) {
 }
 
 fn follow(place: &Place, sensor: &str) -> Subscription<Marks> {
-    Subscription::in_domain(place.places(), sensor).unwrap().timeout(Duration::from_secs(10))
+    Subscription::in_domain(place.places(), sensor).unwrap().timeout(Duration::from_secs(60))
 }
 
 #[test]
@@ -122,7 +122,7 @@ fn telegrams_have_the_length_that_they_have() {
     let mut bytes = session.sensor("tracker.near").unwrap().topic::<[u8]>().unwrap();
     let mut followed = Subscription::<[u8]>::in_domain(place.places(), "tracker.near")
         .unwrap()
-        .timeout(Duration::from_secs(10));
+        .timeout(Duration::from_secs(60));
     assert!(followed.try_next().unwrap().is_none());
     bytes.send_bytes(&[1, 2, 3]).unwrap();
     assert_eq!(*followed.next().unwrap().unwrap(), [1, 2, 3]);
@@ -150,7 +150,7 @@ fn one_process_publishes_beside_the_hub_and_no_name_of_its_sensors() {
     assert!(topic("tracker.near").is_ok() && session.check_room(&Topic::ALL).is_ok());
     // The hub goes on.
     let scans = Subscription::<Scan>::in_domain(place.places(), "front").unwrap();
-    let mut scans = scans.timeout(Duration::from_secs(10));
+    let mut scans = scans.timeout(Duration::from_secs(60));
     assert!(scans.try_next().unwrap().is_none());
     hub.front().scan(&[1000]);
     assert_eq!(scans.next().unwrap().unwrap().beams(), 1);
@@ -202,7 +202,7 @@ fn samples_of_any_length_ring_the_bell_of_those_who_sleep_at_it() {
     let mut scans = sensor.topic_for::<Scan>(&TopicLimits { beams: 2_160, ..*sensor.limits() }).unwrap();
     let mut followed = Subscription::<Scan>::in_domain(place.places(), "tracker.near")
         .unwrap()
-        .timeout(Duration::from_secs(10));
+        .timeout(Duration::from_secs(60));
     assert!(followed.try_next().unwrap().is_none());
     let node = ipc::client_node(&place.domain).unwrap();
     let bell = Bell::open(&node, "tracker.near").unwrap().expect("the sensor has one");

@@ -44,8 +44,14 @@ const everySensor = () => [...sensors.values()];
 const everySweep = () => [...sweeps.values()];
 const sweepAt = (topic) => owner(sweeps, topic, empty);
 
-/** The hub is gone: what was seen is not there any more, except for the background. */
+/** The hub has exited: what was seen is not there any more, except for the background. A held picture stands until it is released. */
 function forget() {
+  if (kept) {
+    kept.clear();
+    isHeldGone = true;
+    return;
+  }
+  isHeldGone = false;
   for (const sensor of sensors.values()) Object.assign(sensor, blind());
   for (const one of sweeps.values()) Object.assign(one, empty());
   [circles, beams, marks, walls, corners] = [[], [], [], [], []];

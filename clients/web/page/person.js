@@ -68,6 +68,7 @@ const actions = {
   hold: () => {
     const waiting = kept;
     kept = waiting ? null : new Map();
+    if (waiting && isHeldGone) forget();
     for (const [topic, [buffer, offset]] of waiting ?? []) show(topic, buffer, offset);
     press(buttonOf("hold"), Boolean(kept));
     tell();

@@ -155,7 +155,7 @@ function takeStatus(status, topic) {
   sensor.name = status.name;
   sensor.history.push({ at: now, hz: status.hz ?? 0, loss, age: status.age_p99_ms ?? 0 });
   while (now - sensor.history[0].at > HISTORY_MS) sensor.history.shift();
-  if (status.trouble) Object.assign(sensor, blind());
+  if (status.trouble && !kept) Object.assign(sensor, blind());
   isFitDue = true;
 }
 
@@ -174,6 +174,7 @@ const ofJson = { robot: takeRobot, status: takeStatus, zones: takeZones, lines: 
 /** What makes the words beside the picture, and not the picture. */
 const BESIDE = ["robot", "status", "replay"];
 let kept = null; // what came for the picture while it is held, the newest of each topic
+let isHeldGone = false; // what the held picture shows is to be forgotten when it is released
 
 const lastWord = (topic) => topic.slice(topic.lastIndexOf("/") + 1);
 

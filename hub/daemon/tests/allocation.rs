@@ -48,7 +48,7 @@ impl Sensor {
 
     /// Writes all of it, however long a busy machine keeps the hub from reading.
     fn say(&self, mut bytes: &[u8]) {
-        let give_up_at = Instant::now() + Duration::from_secs(30);
+        let give_up_at = Instant::now() + Duration::from_secs(60);
         while !bytes.is_empty() {
             match rustix::io::write(&self.line, bytes) {
                 Ok(len) => bytes = &bytes[len..],
@@ -92,7 +92,7 @@ impl Sensor {
 
 /// Sends scans until `count` more were published.
 fn stream(sensor: &mut Sensor, subscriber: &Subscriber<Scan>, count: u64) {
-    let give_up_at = Instant::now() + Duration::from_secs(30);
+    let give_up_at = Instant::now() + Duration::from_secs(60);
     for number in 0..count {
         sensor.send_scan();
         let mut next_scan = Instant::now() + Duration::from_millis(50);
@@ -161,7 +161,7 @@ fn windows(letter: char, follow_all: bool, set: &[&str]) -> [(u64, u64, i64); 4]
         let domain = domain.clone();
         move || daemon::run(&|| Config::load(&sources), &domain, |_| send.send(()).unwrap_or_default())
     });
-    ready.recv_timeout(Duration::from_secs(20)).expect("the hub is up");
+    ready.recv_timeout(Duration::from_secs(60)).expect("the hub is up");
     let node = ipc::client_node(domain).expect("a node");
     let topic = Scan::open(&node, "heap").expect("a topic").expect("is there");
     let subscriber = Scan::subscriber(&topic).expect("a subscriber");

@@ -36,6 +36,8 @@ pub(crate) struct Line<'a> {
     pub(crate) encoder: Option<Encoder>,
     /// Where that goes.
     pub(crate) say: &'a (dyn Fn(usize, Report) + Sync),
+    /// Whether bytes wait while the host's buffer is full. Otherwise they are lost, as in a UART that nobody reads.
+    pub(crate) lossless: bool,
 }
 
 /// Something that is done to a simulated sensor from outside while it runs.
@@ -76,6 +78,8 @@ struct Way {
     /// The host's port, where it runs at another rate.
     mistuned: Mistuned,
     sent: u64,
+    /// Bytes that wait for room in the host's buffer; only on a lossless line.
+    held: Vec<u8>,
 }
 
 impl Line<'_> {
@@ -103,6 +107,9 @@ impl Line<'_> {
             while let Some(carried) = self.wire.poll_transmit(&mut *self.machine, machine_ns) {
                 self.hand_over(carried, &mut way)?;
             }
+            if self.wait_for_room(&mut way, stops)? == Wake::Stop {
+                return Ok(self.summary(&way));
+            }
             if count > 0 && self.is_tuned() {
                 let arrival = Arrival {
                     not_before: self.time.of_machine(quiet_ns.saturating_sub(PTY_DELAY_NS)),
@@ -129,10 +136,33 @@ impl Line<'_> {
             let look_ns = if self.socket.is_some() { now_ns + LOOK_NS } else { Nanos::MAX };
             let watched = self.socket.as_ref().and_then(|socket| socket.waits_for(way.is_open));
             if wait(stops, watched, due_ns.min(look_ns)) == Wake::Stop {
-                let eeprom_writes = self.machine.eeprom_writes();
-                return Ok(Summary { port: self.port, sent: way.sent, eeprom_writes });
+                return Ok(self.summary(&way));
             }
         }
+    }
+
+    fn summary(self, way: &Way) -> Summary {
+        Summary { eeprom_writes: self.machine.eeprom_writes(), port: self.port, sent: way.sent }
+    }
+
+    /// Waits until the host has taken all held bytes or has closed its side. The sensor's time stands still meanwhile.
+    fn wait_for_room(&mut self, way: &mut Way, stops: [BorrowedFd<'_>; 2]) -> Result<Wake, Failure> {
+        let begun_ns = now_ns();
+        while !way.held.is_empty() {
+            let Some(socket) = self.socket.as_mut().filter(|_| way.is_open) else { break };
+            let taken = socket.write(&way.held)?;
+            way.held.drain(..taken);
+            if way.held.is_empty() {
+                break;
+            }
+            if wait(stops, None, now_ns() + ROOM_NS) == Wake::Stop {
+                return Ok(Wake::Stop);
+            }
+            way.is_open = socket.is_open(true);
+        }
+        way.held.clear();
+        self.time.zero_ns += now_ns() - begun_ns;
+        Ok(Wake::Line)
     }
 
     fn suffer(&mut self, event: Event, machine_ns: Nanos) {
@@ -182,7 +212,11 @@ impl Line<'_> {
                     fault = fault.or(Some(Fault::Baud));
                     bytes = way.mistuned.receive(rates, &bytes, idle_after);
                 }
-                if !socket.write(&bytes)? {
+                if self.lossless {
+                    way.held.append(&mut bytes);
+                    let taken = socket.write(&way.held)?;
+                    way.held.drain(..taken);
+                } else if socket.write(&bytes)? < bytes.len() {
                     fault = fault.or(Some(Fault::Overrun));
                 }
             }
@@ -218,6 +252,8 @@ fn same_rate(a: u32, b: u32) -> bool {
 const MOST_LATE_NS: Nanos = 100 * MILLIS;
 /// A byte may lie in the kernel for so long before it can be read: a worker thread carries it over.
 const PTY_DELAY_NS: Nanos = 2 * MILLIS;
+/// Interval at which a lossless line checks for room in the host's buffer.
+const ROOM_NS: Nanos = MILLIS;
 /// How often the port is looked at even if nothing happens: nothing announces that it was opened, and how well it is
 /// known when a byte came depends on it. At 9600, where every host begins, this proves to a strict sensor that a request
 /// was written without gaps.

@@ -67,6 +67,8 @@ pub struct SimulateOptions {
     pub mode: Option<Mode>,
     /// How many bytes the host's hardware hands over at once.
     pub chunk: ChunkSize,
+    /// Whether the sensors wait while the host's buffer is full, instead of losing bytes as on a real line.
+    pub lossless: bool,
     /// Which scanner of another family the ports are in place of an LMS; then what only an LMS has must be left as it is.
     pub scanner: Option<Scanner>,
 }
@@ -123,6 +125,7 @@ impl Default for SimulateOptions {
             unit: None,
             mode: None,
             chunk: ChunkSize::Uart,
+            lossless: false,
             scanner: None,
         }
     }

@@ -65,10 +65,19 @@ impl Server {
         }
     }
 
-    /// Gives `bytes` to the host; returns whether there was room for all. What has no room is lost, as in a UART that
-    /// nobody reads.
-    pub(crate) fn write(&mut self, bytes: &[u8]) -> bool {
-        self.host.as_mut().is_some_and(|host| host.write_all(bytes).is_ok())
+    /// Gives `bytes` to the host; returns how many of them its buffer had room for.
+    pub(crate) fn write(&mut self, bytes: &[u8]) -> usize {
+        let Some(host) = &mut self.host else { return 0 };
+        let mut rest = bytes;
+        while !rest.is_empty() {
+            match host.write(rest) {
+                Ok(count) if count > 0 => rest = &rest[count..],
+                Err(error) if error.kind() == ErrorKind::Interrupted => {}
+                // A connection that broke is noticed by the next read.
+                _ => break,
+            }
+        }
+        bytes.len() - rest.len()
     }
 
     /// What to wait for: bytes of the host, else a host.

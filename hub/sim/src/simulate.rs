@@ -87,6 +87,7 @@ pub fn simulate_with(
             event: &event,
             encoder,
             say: &say,
+            lossless: options.lossless,
         });
     }
     on_ready(&ready);

@@ -77,11 +77,10 @@ impl Socket {
         }
     }
 
-    /// Gives `bytes` to the host; returns whether there was room for all. What has no room is lost, as in a UART that
-    /// nobody reads.
-    pub(crate) fn write(&mut self, bytes: &[u8]) -> Result<bool, Failure> {
+    /// Gives `bytes` to the host; returns how many of them its buffer had room for.
+    pub(crate) fn write(&mut self, bytes: &[u8]) -> Result<usize, Failure> {
         match self {
-            Socket::Pty { pty, .. } => Ok(pty.write(bytes)? == bytes.len()),
+            Socket::Pty { pty, .. } => pty.write(bytes),
             Socket::Tcp(server) => Ok(server.write(bytes)),
         }
     }

@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 use std::sync::OnceLock;
 
-use crate::testkit::{TestEnv, gentle, output, skip};
+use crate::testkit::{TestEnv, output, skip};
 
 /// A place where the library and its header are.
 pub(crate) struct Installed {
@@ -89,9 +89,9 @@ impl Installed {
             return None;
         }
         let build = env.path("cmake");
-        let mut configure = self.with_packages(gentle("cmake"));
+        let mut configure = self.with_packages(Command::new("cmake"));
         configure.arg("-S").arg(source).arg("-B").arg(&build);
-        for command in [&mut configure, gentle("cmake").arg("--build").arg(&build)] {
+        for command in [&mut configure, Command::new("cmake").arg("--build").arg(&build)] {
             done(&output(command).expect("it is there")).unwrap_or_else(|said| panic!("{said}"));
         }
         Some(build)
@@ -107,7 +107,7 @@ impl Installed {
     ) -> Result<PathBuf, String> {
         let name = source.file_stem().expect("a file");
         let program = env.path(&format!("{}-{}", name.display(), flags.concat().len() + libraries.len()));
-        let mut command = gentle(compiler);
+        let mut command = Command::new(compiler);
         command.args(STRICT).args(flags).arg("-I").arg(self.prefix.join("include")).arg(source);
         command.args(libraries).arg("-o").arg(&program);
         done(&output(command).expect("a compiler")).map(|_| program)

@@ -19,6 +19,8 @@
             exit(EXIT_FAILURE);                                                                      \
         }                                                                                            \
     } while (0)
+/* Limit of a wait, in milliseconds. It only bounds a hang. */
+#define PATIENCE_MS 60000
 #define SAYS(text) MUST(strstr(scanhub_error(), text) != NULL)
 
 static struct scanhub_attachment *open_scans(const char *sensor, int wait)
@@ -132,7 +134,7 @@ static void publications(const char *sensor)
     MUST(scanhub_unpublish((struct scanhub_publication *)angles) == SCANHUB_REFUSED_ARGUMENT);
     MUST(scanhub_take(angles, &sample) == 0);
     MUST(scanhub_send_tilt(mount, 7, -0.5, 2) == 0);
-    MUST(scanhub_wait(angles, 20000) == 1 && scanhub_take(angles, &sample) == 1);
+    MUST(scanhub_wait(angles, PATIENCE_MS) == 1 && scanhub_take(angles, &sample) == 1);
     const struct scanhub_tilt_v2 *tilt = sample.payload;
     MUST(sample.length == sizeof *tilt && sample.header->stamp_first_ns == 7 && sample.header->stamp_last_ns == 7);
     MUST(sample.header->topic_seq == 1 && tilt->angle_rad == -0.5 && tilt->rate_rad_s == 2);
@@ -177,7 +179,7 @@ static void *leaves_it_open(void *sensor)
 {
     struct scanhub_sample sample;
     struct scanhub_attachment *handle = open_scans(sensor, SCANHUB_WAIT_EVENT);
-    MUST(scanhub_wait(handle, 20000) == 1 && scanhub_take(handle, &sample) == 1);
+    MUST(scanhub_wait(handle, PATIENCE_MS) == 1 && scanhub_take(handle, &sample) == 1);
     return NULL;
 }
 
@@ -189,7 +191,7 @@ static void threads(const char *sensor)
     pthread_t thread;
     MUST(pthread_create(&thread, NULL, elsewhere, handle) == 0 && pthread_join(thread, NULL) == 0);
     struct scanhub_sample sample;
-    MUST(scanhub_wait(handle, 20000) == 1 && scanhub_take(handle, &sample) == 1);
+    MUST(scanhub_wait(handle, PATIENCE_MS) == 1 && scanhub_take(handle, &sample) == 1);
     MUST(pthread_create(&thread, NULL, releases, &sample) == 0 && pthread_join(thread, NULL) == 0);
     /* It is still there, to be given back by who took it. */
     MUST(sample.payload != NULL && scanhub_release(&sample) == 0 && sample.payload == NULL);
@@ -203,7 +205,7 @@ static void children(const char *sensor)
     struct scanhub_attachment *handle = open_scans(sensor, SCANHUB_WAIT_EVENT);
     struct scanhub_sample sample;
     int status;
-    MUST(scanhub_wait(handle, 20000) == 1 && scanhub_take(handle, &sample) == 1);
+    MUST(scanhub_wait(handle, PATIENCE_MS) == 1 && scanhub_take(handle, &sample) == 1);
     const pid_t child = fork();
     MUST(child >= 0);
     if (child == 0) {
@@ -215,7 +217,7 @@ static void children(const char *sensor)
     MUST(waitpid(child, &status, 0) == child && WIFEXITED(status) && WEXITSTATUS(status) == EXIT_SUCCESS);
     MUST(scanhub_release(&sample) == 0);
     for (int i = 0; i < 20; i++) {
-        MUST(scanhub_wait(handle, 20000) == 1 && scanhub_take(handle, &sample) == 1);
+        MUST(scanhub_wait(handle, PATIENCE_MS) == 1 && scanhub_take(handle, &sample) == 1);
         MUST(scanhub_release(&sample) == 0);
     }
     MUST(scanhub_close(handle) == 0);
@@ -227,10 +229,10 @@ static void polls(const char *sensor)
     struct scanhub_attachment *handle = open_scans(sensor, SCANHUB_WAIT_EVENT);
     struct scanhub_sample sample;
     struct pollfd fds = {scanhub_fd(handle), POLLIN, 0};
-    MUST(fds.fd >= 0 && scanhub_wait(handle, 20000) == 1);
+    MUST(fds.fd >= 0 && scanhub_wait(handle, PATIENCE_MS) == 1);
     while (scanhub_take(handle, &sample) == 1)
         MUST(scanhub_release(&sample) == 0);
-    MUST(scanhub_wait(handle, 20000) == 1);
+    MUST(scanhub_wait(handle, PATIENCE_MS) == 1);
     MUST(poll(&fds, 1, 0) == 1);
     MUST(scanhub_close(handle) == 0);
 }
@@ -240,7 +242,7 @@ static void samples(const char *sensor)
     struct scanhub_attachment *handle = open_scans(sensor, SCANHUB_WAIT_DOORBELL);
     struct scanhub_sample lent[4], fifth, copy;
     for (int i = 0; i < 4; i++) {
-        MUST(scanhub_wait(handle, 20000) == 1);
+        MUST(scanhub_wait(handle, PATIENCE_MS) == 1);
         MUST(scanhub_take(handle, &lent[i]) == 1 && lent[i].length == sizeof(struct scanhub_scan_v2) + 3 * 361);
         MUST(i == 0 || lent[i].header->topic_seq == lent[i - 1].header->topic_seq + 1 + lent[i].missed);
     }
@@ -253,7 +255,7 @@ static void samples(const char *sensor)
     MUST(scanhub_release(&copy) == SCANHUB_REFUSED_ARGUMENT);
     SAYS("not lent");
     MUST(scanhub_release(NULL) == SCANHUB_REFUSED_ARGUMENT);
-    MUST(scanhub_wait(handle, 20000) == 1 && scanhub_wait(handle, 20000) == 1);
+    MUST(scanhub_wait(handle, PATIENCE_MS) == 1 && scanhub_wait(handle, PATIENCE_MS) == 1);
     MUST(scanhub_take(handle, &fifth) == 1);
     copy = fifth;
     MUST(scanhub_close(handle) == 0);
@@ -267,7 +269,7 @@ static void robots(const char *sensor)
     struct scanhub_sample lent[4], copy;
     MUST(scanhub_open_robot(&handle, NULL, sensor, SCANHUB_WAIT_DOORBELL) == 0);
     for (int i = 0; i < 4; i++)
-        MUST(scanhub_wait(handle, 20000) == 1 && scanhub_take(handle, &lent[i]) == 1);
+        MUST(scanhub_wait(handle, PATIENCE_MS) == 1 && scanhub_take(handle, &lent[i]) == 1);
     for (int i = 0; i < 4; i++) {
         const struct scanhub_robot *robot = lent[i].payload;
         MUST(robot->count == 1 && strcmp(robot->sensors[0].name, sensor) == 0 && robot->worst == robot->sensors[0].name);
@@ -319,7 +321,7 @@ int main(int argc, char **argv)
     /* Left open, with a sample: the end of the process is an end, too. */
     struct scanhub_attachment *left = open_scans(sensor, SCANHUB_WAIT_EVENT);
     struct scanhub_sample sample;
-    MUST(scanhub_wait(left, 20000) == 1 && scanhub_take(left, &sample) == 1);
+    MUST(scanhub_wait(left, PATIENCE_MS) == 1 && scanhub_take(left, &sample) == 1);
     puts("all refused");
     return EXIT_SUCCESS;
 }

@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-use crate::testkit::{gentle, output, skip};
+use crate::testkit::{output, skip};
 
 use super::readers::{self, Reader};
 
@@ -16,7 +16,7 @@ fn reader() -> Option<PathBuf> {
         return None;
     }
     let compile = |watch: &[&str]| {
-        let mut cc = gentle("cc");
+        let mut cc = Command::new("cc");
         cc.args(["-std=c99", "-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Werror", "-g"]).args(watch);
         cc.arg("-I")
             .arg(top.join("clients/c"))

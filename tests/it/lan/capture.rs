@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::path::Path;
 use std::process::Command;
 
-use crate::testkit::{gentle, output, skip, succeeds};
+use crate::testkit::{output, skip, succeeds};
 
 /// A capture file as it grows: pcap 2.4, in which every packet begins with its IPv4 header (link type 101).
 #[derive(Default)]
@@ -56,7 +56,7 @@ impl Capture {
         let head = head.into_iter().flat_map(u32::to_le_bytes);
         std::fs::write(&path, head.chain(self.packets.iter().copied()).collect::<Vec<u8>>()).expect("a file");
         let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("clients/wireshark/scanhub.lua");
-        let mut tshark = gentle("tshark");
+        let mut tshark = Command::new("tshark");
         tshark.arg("-X").arg(format!("lua_script:{}", script.display())).arg("-r").arg(&path);
         // Twice, as in Wireshark: what is found on the way stays what it was. A home of its own, so that no other
         // settings and no installed copy of the dissector are in the way.

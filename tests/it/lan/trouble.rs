@@ -1,7 +1,5 @@
 //! What happens to networks and programs, as heard at the other end of the cable: the gateway outlives it, what it could
-//! not send is counted, and it sends again. How long that took is printed.
-
-use std::time::Instant;
+//! not send is counted, and it sends again.
 
 use crate::testkit::{
     INT, KILL, Machine, Outcome, Program, Receiver, Relay, Robot, TERM, TestEnv, in_a_network, ip, is_class,
@@ -27,14 +25,6 @@ fn await_failures(gateway: &mut Program, to: &str, more: u64) {
         |line: &Value| (line["class"] == "lan_to" && line["to"] == to).then(|| number(line, "send_failed"));
     let before = count(&gateway.await_line("an account", |line| count(line).is_some())).unwrap_or_default();
     gateway.await_line("failures", |line| count(line).is_some_and(|failed| failed >= before + more));
-}
-
-/// Waits for scans, and says how long it took.
-fn await_scans(what: &str, receiver: &Receiver) {
-    let since = Instant::now();
-    receiver.await_more(1, is_scan);
-    eprintln!("{what}: heard again after {} ms", since.elapsed().as_millis());
-    receiver.await_more(20, is_scan);
 }
 
 /// What was sent to `to` in all, and what was not.
@@ -71,7 +61,7 @@ fn a_cable_is_pulled_and_an_address_taken() {
             await_link(&mut gateway, "eth0", "down");
             await_failures(&mut gateway, "eth0", 150);
             robot.machine.run(&plug);
-            await_scans(&pull, &receiver);
+            receiver.await_more(20, is_scan);
             await_link(&mut gateway, "eth0", "up");
         }
         let outcome = gateway.end(TERM);
@@ -97,7 +87,7 @@ fn a_queue_is_full() {
         await_failures(&mut gateway, "eth0", 100);
         // What waits in it goes with it.
         robot.machine.run("tc qdisc change dev eth0 root tbf rate 1gbit burst 100kb limit 1mb");
-        await_scans("full queue", &receiver);
+        receiver.await_more(20, is_scan);
         await_link(&mut gateway, "eth0", "well");
         let outcome = gateway.end(TERM);
         let (sent, failed) = sent(&outcome, "eth0");
@@ -122,7 +112,7 @@ fn hosts_that_are_not_there_disturb_nobody() {
         await_failures(&mut gateway, no_route, 100);
         assert!(far.heard().is_empty());
         robot.machine.run(&format!("ip route add 10.99.0.0/24 via {here}"));
-        await_scans("a route", &far);
+        far.await_more(20, is_scan);
         await_link(&mut gateway, no_route, "well");
         let outcome = gateway.end(TERM);
         let heard = receiver.finish();
@@ -147,9 +137,7 @@ fn hubs_and_gateways_are_killed() {
         let mut listener = env.start(&["listen", "--json", "--topic=scan"]).ready();
         // Scans of another life than those before.
         let mut again = |what: &str, key: &str, before: &Value| {
-            let since = Instant::now();
             let line = listener.await_line(what, |line| line["class"] == "scan" && line[key] != before[key]);
-            eprintln!("{what}: heard after {} ms", since.elapsed().as_millis());
             listener.await_lines(20, "scans", is_class("scan"));
             line
         };

@@ -4,16 +4,13 @@
 use std::fs;
 use std::process::Command;
 use std::sync::atomic::{AtomicUsize, Ordering};
-use std::thread;
 use std::time::{Duration, Instant};
 
 use rustix::process::{Pid, Signal, kill_process_group};
 
 use super::blocks::blocks;
 use super::shell::{commands, lines};
-use crate::testkit::{
-    PATIENCE, Program, Sender, TestEnv, in_a_network, is_class, side_by_side, write_program,
-};
+use crate::testkit::{Program, Sender, TestEnv, in_a_network, is_class, side_by_side, until, write_program};
 use schema::Topic;
 
 /// Commands that are not run, by how their line begins or what is in it, and what makes sure of them. Those of the program
@@ -126,11 +123,10 @@ impl Desk {
         let group = Pid::from_raw(program.pid() as i32).expect("a process");
         // These look at everything and then end, however long that takes.
         let ends = ["scanhub doctor", "scanhub probe"].iter().any(|verb| line.starts_with(verb));
-        let patience = if ends { PATIENCE } else { LONG_ENOUGH };
-        let end_at = Instant::now() + patience;
-        while !program.is_over() && Instant::now() < end_at {
-            thread::sleep(Duration::from_millis(20));
-        }
+        // Any other may last. It is ended when it can be, and has had time for something to go wrong.
+        until(line, || program.is_over() || !ends && catches_interrupts(group));
+        let begun = Instant::now();
+        until(line, || program.is_over() || begun.elapsed() > TIME_TO_FAIL);
         let is_ended = !program.is_over() && kill_process_group(group, Signal::INT).is_ok();
         let outcome = program.wait();
         let is_bounded = [" --for ", " -n "].iter().any(|flag| line.contains(flag));
@@ -146,8 +142,25 @@ impl Desk {
     }
 }
 
-/// What does not end by itself has begun by then.
-const LONG_ENOUGH: Duration = Duration::from_millis(1500);
+/// Time in which a command that lasts may fail. A longer or shorter time does not let a right one fail.
+const TIME_TO_FAIL: Duration = Duration::from_millis(1200);
+
+/// Whether there are programs of this project in `group`, and all of them have a handler for SIGINT (proc(5), `SigCgt`).
+fn catches_interrupts(group: Pid) -> bool {
+    let processes = fs::read_dir("/proc").into_iter().flatten().flatten().map(|entry| entry.path());
+    let ours = processes.filter_map(|process| {
+        let stat = fs::read_to_string(process.join("stat")).ok()?;
+        let (name, rest) = stat.rsplit_once(") ")?;
+        let is_ours =
+            name.ends_with("(scanhub") && rest.split(' ').nth(2)? == group.as_raw_nonzero().to_string();
+        let status = is_ours.then(|| fs::read_to_string(process.join("status")).ok()).flatten()?;
+        let caught = status.lines().find_map(|line| line.strip_prefix("SigCgt:"))?;
+        let caught = u64::from_str_radix(caught.trim(), 16).ok()?;
+        Some(caught >> (Signal::INT.as_raw() - 1) & 1 == 1)
+    });
+    let catches: Vec<bool> = ours.collect();
+    !catches.is_empty() && catches.iter().all(|catches| *catches)
+}
 
 /// What is wrong with those of `lines` that can be run.
 fn wrong_with(desk: &Desk, lines: &[(String, String)]) -> Vec<String> {

@@ -10,7 +10,7 @@ use serde_json::Value;
 
 use super::blocks::Block;
 use crate::client_c::installed::Installed;
-use crate::testkit::{TestEnv, gentle, output, python};
+use crate::testkit::{TestEnv, output, python};
 
 /// Something to start.
 pub(crate) struct Example {
@@ -89,7 +89,7 @@ fn of_cpp(source: &Path, env: &TestEnv) -> Result<Option<PathBuf>, String> {
 /// By the compiler itself, with the library that Cargo makes.
 fn of_rust(source: &Path, env: &TestEnv) -> Result<PathBuf, String> {
     let program = env.path(&format!("{}-rust", source.file_stem().expect("a name").display()));
-    let mut command = gentle(std::env::var_os("RUSTC").unwrap_or_else(|| "rustc".into()));
+    let mut command = Command::new(std::env::var_os("RUSTC").unwrap_or_else(|| "rustc".into()));
     command.args(["--edition=2024", "-Dwarnings", "-o"]).arg(&program).arg(source);
     let library = library();
     let directory = library.parent().expect("a directory");
@@ -113,7 +113,7 @@ fn library() -> &'static Path {
 }
 
 fn build_library() -> PathBuf {
-    let mut command = gentle(env!("CARGO"));
+    let mut command = Command::new(env!("CARGO"));
     command.args(["build", "--offline", "--message-format=json", "--quiet", "--lib"]);
     command.arg("--package=scanhub-client");
     if !cfg!(debug_assertions) {

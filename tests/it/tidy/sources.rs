@@ -156,6 +156,54 @@ pub(crate) fn tests_start_children_in_one_file(tree: &Tree) -> Vec<String> {
     breaches
 }
 
+/// Tests that sleep: what stands in for a device or a person, or plays a list of actions at real speed. All others wait for an
+/// event, by `until` and its like of the test kits. Each says why.
+const SLEEPS: [&str; 12] = [
+    // Waits for events: the kits of the programs, of the library, of the simulator and of its other tests.
+    "tests/testkit/",
+    "tests/it/browser.rs",
+    "clients/client/tests/fake/",
+    "clients/bridge/tests/ros2.rs",
+    "hub/sim/tests/port/main.rs",
+    // Carries bytes as a serial server does.
+    "tests/it/serial_server.rs",
+    // A sensor at its pace.
+    "tests/it/vendor.rs",
+    "hub/daemon/tests/allocation.rs",
+    // Actions at real speed.
+    "tests/it/real_speed/",
+    // Senders at their pace, until what they send was seen.
+    "clients/verbs/tests/verbs/",
+    // Time in which a program may fail.
+    "tests/it/pages/lines.rs",
+    "tests/it/replayed.rs",
+];
+
+/// Tests that compare a time that passed with a number. They fail on a busy machine, unless the number is one that the
+/// program may not fall below.
+const COMPARES: [&str; 4] = [
+    // Share of a processor, and bytes in a second: a busy machine makes both less.
+    "tests/it/flood.rs",
+    "tests/it/web_crowd.rs",
+    // Wakes in three seconds: a busy machine makes them fewer.
+    "clients/client/tests/descriptor.rs",
+    // Its report says how fast the world was.
+    "tests/world/src/main.rs",
+];
+
+/// Tests wait for events, never for a time, and hold no program to a time on a machine that others use too.
+pub(crate) fn tests_do_not_depend_on_time(tree: &Tree) -> Vec<String> {
+    let is_of = |path: &str, listed: &[&str]| listed.iter().any(|listed| path.starts_with(listed));
+    let is_held =
+        |path: &str| is_test(path) && !path.starts_with("benches/") && !path.starts_with("tests/it/tidy");
+    let mut breaches =
+        find(tree, &["thread::sleep", "sleep(Duration"], |path| is_held(path) && !is_of(path, &SLEEPS));
+    breaches.extend(find(tree, &[".elapsed()"], |path| {
+        is_held(path) && !is_of(path, &SLEEPS) && !is_of(path, &COMPARES)
+    }));
+    breaches
+}
+
 pub(crate) fn files_begin_with_a_description(tree: &Tree) -> Vec<String> {
     let described = |text: &str| text.starts_with("//! ");
     let files = tree.files(".rs").into_iter().filter(|(_, text)| !described(text));

@@ -17,6 +17,20 @@ fn clocks_are_read_in_few_places() {
 }
 
 #[test]
+fn tests_do_not_depend_on_time() {
+    holds(sources::tests_do_not_depend_on_time, |tree| {
+        vec![
+            tree.with("tests/it/planted.rs", "//! Sleeps.\nstd::thread::sleep(Duration::from_secs(1));\n"),
+            tree.with("hub/lms/tests/planted.rs", "//! Sleeps.\nsleep(Duration::from_secs(1));\n"),
+            tree.with(
+                "clients/lan/tests/planted.rs",
+                "//! Compares.\nassert!(begun.elapsed() < Duration::from_secs(1));\n",
+            ),
+        ]
+    });
+}
+
+#[test]
 fn unsafe_code_is_rare_and_explained() {
     holds(sources::unsafe_code_is_rare_and_explained, |tree| {
         let listed = "hub/daemon/src/bus_error.rs";

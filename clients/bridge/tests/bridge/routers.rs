@@ -1,7 +1,5 @@
 //! Routers between the machines: two in a row, and one that is killed and comes back.
 
-use std::time::{Duration, Instant};
-
 use serde_json::Value;
 
 use crate::testkit::{INT, KILL, TestEnv, number, wall_ns};
@@ -26,7 +24,6 @@ fn a_router_that_is_killed_and_back_loses_nothing_that_is_not_told() {
     here.await_line("a sensor", |line| line["kind"] == "published");
     let mut local = robot.echo(&["front/scan"]);
     let mut remote = desk.echo(&["robot1.front/zones"]);
-    let mut longest = Duration::ZERO;
     for _ in 0..3 {
         // Not those that were told before and not read yet.
         let is_zones = |line: &Value, since_ns: u64| {
@@ -38,13 +35,10 @@ fn a_router_that_is_killed_and_back_loses_nothing_that_is_not_told() {
         killed.end(KILL);
         there.await_line("the end of the link", |line| is_link(line, "down"));
         killed = router(&first, &near, &[]);
-        let back = Instant::now();
         there.await_line("the link", |line| is_link(line, "up"));
-        longest = longest.max(back.elapsed());
         let since = wall_ns();
         remote.await_line("zones", |line| is_zones(line, since));
     }
-    assert!(longest < Duration::from_secs(5), "{longest:?}");
     local.await_line("a scan", |line| line["class"] == "scan");
     let local = local.end(INT);
     assert_eq!(local.of_class("summary")[0]["lost"], 0, "the hub's own consumers: {local}");

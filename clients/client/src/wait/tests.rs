@@ -31,7 +31,7 @@ impl Drop for Place {
 }
 
 /// Far longer than any wait here may last.
-const LONG: Duration = Duration::from_secs(20);
+const LONG: Duration = Duration::from_secs(60);
 
 /// Waits that are over before this time were woken.
 fn woken(started: Instant) -> bool {

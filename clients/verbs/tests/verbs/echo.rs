@@ -2,7 +2,7 @@
 
 use std::io::{self, Write};
 use std::sync::atomic::AtomicBool;
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use crate::fake::{FakeHub, Place, Verb};
 use schema::{Counter, Flags, Kind, Verdict};
@@ -172,9 +172,8 @@ fn several_sensors_wake_one_echo() {
 #[test]
 fn no_hub() {
     let place = Place::new();
-    let began = Instant::now();
     let (end, out, _) = start(&place, &["front/scan"], Format::Json, count(1)).join();
-    assert_eq!((end.unwrap_err().kind, began.elapsed() < Duration::from_secs(1)), (Kind::NoHub, true));
+    assert_eq!(end.unwrap_err().kind, Kind::NoHub);
     assert!(out.lines().all(|line| line.contains("summary")), "{out}");
 
     let waiting = start(&place, &["front/scan"], Format::Json, Bounds::default());

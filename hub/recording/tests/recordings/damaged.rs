@@ -5,7 +5,6 @@ use std::collections::BTreeMap;
 use std::fs;
 use std::ops::Range;
 use std::path::PathBuf;
-use std::time::{Duration, Instant};
 
 use crate::written::{SENSORS, Written};
 use fastrand::Rng;
@@ -175,7 +174,6 @@ fn every_intact_telegram_is_found() {
     let chunks: Vec<_> = summary.chunk_indexes.iter().map(chunk).collect();
     let path = std::env::temp_dir().join(format!("scanhub-damaged-{}", std::process::id()));
     let (mut intact, mut estimated, mut unreadable, mut bare) = (0, 0, 0, 0);
-    let started = Instant::now();
     for seed in 0..MUTATIONS {
         let mutation = Mutation::of(&written.bytes, &mut Rng::with_seed(seed));
         let name = format!("seed {seed}, {}", mutation.name);
@@ -247,9 +245,7 @@ fn every_intact_telegram_is_found() {
     println!(
         "{intact} intact telegrams, {estimated} of them with a harmed header; {unreadable} no recording, {bare} a stream"
     );
-    println!("{:.1} ms a file", started.elapsed().as_secs_f64() * 1000.0 / MUTATIONS as f64);
     assert!(intact > MUTATIONS * 70 && unreadable < MUTATIONS / 20);
-    assert!(started.elapsed() < Duration::from_secs(600));
 }
 
 const MUTATIONS: u64 = 1_000;

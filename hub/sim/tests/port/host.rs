@@ -1,4 +1,4 @@
-//! A host with a port open: says requests with their gaps, and finds the telegrams in what comes.
+//! A host with a port open: writes requests, and finds the telegrams in what arrives.
 
 use std::os::fd::OwnedFd;
 use std::path::Path;
@@ -9,6 +9,8 @@ use lms::framer::{Found, Framer};
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::fs::{Mode, OFlags, open};
 use rustix::termios::{OptionalActions, tcgetattr, tcsetattr};
+
+use crate::PATIENCE;
 
 /// A host with the port open.
 pub(crate) struct Host {
@@ -32,20 +34,7 @@ impl Host {
         tcsetattr(&self.port, OptionalActions::Now, &termios).unwrap();
     }
 
-    /// Says `request` with the gaps that the sensor wants.
-    pub(crate) fn say(&self, request: Request, rate: u32) {
-        let byte_time = Duration::from_nanos(lms::line_time(1, rate)) + Duration::from_micros(80);
-        let mut next = Instant::now();
-        for &byte in request.encode(0).bytes() {
-            while Instant::now() < next {
-                std::hint::spin_loop();
-            }
-            assert_eq!(rustix::io::write(&self.port, &[byte]), Ok(1));
-            next = Instant::now() + byte_time;
-        }
-    }
-
-    /// Says `request` as most drivers do: at once, for the UART to space.
+    /// Writes `request` as most drivers do: at once, for the UART to space.
     pub(crate) fn write(&self, request: Request) {
         let encoded = request.encode(0);
         assert_eq!(rustix::io::write(&self.port, encoded.bytes()), Ok(encoded.bytes().len()));
@@ -76,17 +65,14 @@ impl Host {
         }
     }
 
-    /// Asks until it is answered: a request may be said too slowly on a busy machine.
-    pub(crate) fn ask(&mut self, request: Request, rate: u32) -> Vec<u8> {
-        for _ in 0..10 {
-            self.say(request, rate);
-            let end = Instant::now() + Duration::from_secs(1);
-            while let Some(telegram) = self.telegram(end.saturating_duration_since(Instant::now())) {
-                if telegram[4] == request.command() | 0x80 {
-                    return telegram;
-                }
+    /// Sends `request` and returns the reply to it; telegrams before that are skipped.
+    pub(crate) fn ask(&mut self, request: Request) -> Vec<u8> {
+        self.write(request);
+        loop {
+            let telegram = self.telegram(PATIENCE).unwrap_or_else(|| panic!("no answer to {request:?}"));
+            if telegram[4] == request.command() | 0x80 {
+                return telegram;
             }
         }
-        panic!("no answer to {request:?}");
     }
 }

@@ -28,11 +28,12 @@ use sim::truth::Record;
 use host::Host;
 use simulator::{Folder, Simulator};
 
-/// Far longer than anything takes.
-const PATIENCE: Duration = Duration::from_secs(20);
+/// Limit of every wait. It only bounds a hang.
+const PATIENCE: Duration = Duration::from_secs(60);
 
 fn options(port: PathBuf) -> SimulateOptions {
-    SimulateOptions { ports: vec![port], baud: Some(Baud::B500000), seed: 5, ..SimulateOptions::default() }
+    let baud = Some(Baud::B500000);
+    SimulateOptions { ports: vec![port], baud, seed: 5, ..SimulateOptions::default() }
 }
 
 fn is_data(record: &Record) -> bool {
@@ -47,17 +48,18 @@ fn from_9600_to_a_stream_at_500k_bit_for_bit_as_the_truth_says() {
     let simulator = Simulator::start(SimulateOptions {
         baud: Some(Baud::B9600),
         truth: Some(truth.clone()),
+        lossless: true,
         ..options(port.clone())
     });
     assert_eq!(simulator.ready[0].port, port);
     assert_eq!(fs::read_link(&port).ok(), simulator.ready[0].pty);
     let mut host = Host::open(&port, 9_600);
-    let status = host.ask(Request::Status, 9_600);
+    let status = host.ask(Request::Status);
     let Some(Reply::Status(status)) = Reply::decode(Telegram::check(&status).unwrap()) else { panic!() };
     assert_eq!(status.variant(), Some(Variant::HALF));
-    host.ask(Request::Baud(Baud::B500000), 9_600);
+    host.ask(Request::Baud(Baud::B500000));
     host.set_rate(500_000);
-    let begin = host.ask(Request::Stream, 500_000);
+    let begin = host.ask(Request::Stream);
     assert_eq!(begin[4], 0xA0);
     let received: Vec<Vec<u8>> = (0..40).map(|_| host.telegram(PATIENCE).expect("a scan")).collect();
     let (summaries, records) = simulator.end();
@@ -69,9 +71,6 @@ fn from_9600_to_a_stream_at_500k_bit_for_bit_as_the_truth_says() {
         assert_eq!((Record::hash(telegram), record.fault), (record.sha256, None));
         assert_eq!(record.length, 732);
     }
-    // They were sent at the pace of the sensor, whatever the machine did in between.
-    let span = (sent[39].sent_ns - sent[0].sent_ns) as f64 / 39.0;
-    assert!((span / 26_640_000.0 - 1.0).abs() < 0.1, "{span} ns");
     let lines: Vec<serde_json::Value> =
         fs::read_to_string(&truth).unwrap().lines().map(|line| serde_json::from_str(line).unwrap()).collect();
     assert_eq!(lines.len(), records.len() + 1);
@@ -106,7 +105,7 @@ fn a_closed_port_loses_what_is_sent_and_keeps_nothing_for_the_next_host() {
     let simulator = Simulator::start(options(port.clone()));
     let mut host = Host::open(&port, 500_000);
     rustix::termios::ioctl_tiocexcl(&host.port).unwrap();
-    host.ask(Request::Stream, 500_000);
+    host.ask(Request::Stream);
     simulator.record_where(|record| is_data(record) && record.fault.is_none());
     drop(host);
     for _ in 0..5 {
@@ -128,14 +127,16 @@ fn at_another_rate_nothing_is_understood_on_either_side() {
     let folder = Folder::new("rate");
     let port = folder.path("front");
     let simulator = Simulator::start(options(port.clone()));
-    let mut host = Host::open(&port, 38_400);
-    host.say(Request::Status, 38_400);
-    assert_eq!(host.telegram(Duration::from_millis(300)), None, "answered at the wrong rate");
-    host.set_rate(500_000);
-    host.ask(Request::Stream, 500_000);
+    let mut host = Host::open(&port, 500_000);
+    host.ask(Request::Stream);
     host.set_rate(250_000);
-    for _ in 0..3 {
-        simulator.record_where(|record| record.fault == Some(Fault::Baud));
+    simulator.records.try_iter().for_each(drop);
+    host.write(Request::Status);
+    let mut garbled = 0;
+    while garbled < 4 {
+        let record = simulator.record();
+        assert!(!record.is_reply, "answered at the wrong rate");
+        garbled += usize::from(record.fault == Some(Fault::Baud));
     }
     // What is in the host's buffer now was garbled, except for a scan that came before.
     let mut buffer = vec![0; 30_000];
@@ -151,10 +152,32 @@ fn a_host_that_does_not_read_loses_what_has_no_room() {
     let port = folder.path("front");
     let simulator = Simulator::start(SimulateOptions { speed: 10.0, ..options(port.clone()) });
     let mut host = Host::open(&port, 500_000);
-    host.ask(Request::Stream, 500_000);
+    host.ask(Request::Stream);
     simulator.record_where(|record| record.fault == Some(Fault::Overrun));
     drop(host);
     simulator.end();
+}
+
+#[test]
+fn a_lossless_line_waits_for_a_host_that_does_not_read() {
+    let folder = Folder::new("lossless");
+    let ports = ["waits", "loses"].map(|name| folder.path(name));
+    let start = |port: &PathBuf, lossless| {
+        Simulator::start(SimulateOptions { lossless, speed: 10.0, ..options(port.clone()) })
+    };
+    let [waits, loses] = [start(&ports[0], true), start(&ports[1], false)];
+    let mut hosts = ports.each_ref().map(|port| Host::open(port, 500_000));
+    hosts.iter_mut().for_each(|host| drop(host.ask(Request::Stream)));
+    for _ in 0..100 {
+        loses.record_where(|record| record.fault == Some(Fault::Overrun));
+    }
+    let received: Vec<Vec<u8>> = (0..40).map(|_| hosts[0].telegram(PATIENCE).expect("a scan")).collect();
+    loses.end();
+    let (_, records) = waits.end();
+    let sent: Vec<&Record> = records.iter().filter(|record| is_data(record)).collect();
+    for (telegram, record) in received.iter().zip(sent) {
+        assert_eq!((Record::hash(telegram), record.fault), (record.sha256, None));
+    }
 }
 
 #[test]
@@ -168,18 +191,19 @@ fn a_replay_is_sent_once_in_order_and_then_the_line_is_silent() {
     bytes.extend(scans.concat());
     fs::write(&file, bytes).unwrap();
     let replay = Some(file);
-    let simulator = Simulator::start(SimulateOptions { replay, ..options(port.clone()) });
+    let lossless = true;
+    let simulator = Simulator::start(SimulateOptions { replay, lossless, ..options(port.clone()) });
     let mut host = Host::open(&port, 500_000);
-    let status = host.ask(Request::Status, 500_000);
+    let status = host.ask(Request::Status);
     let Some(Reply::Status(status)) = Reply::decode(Telegram::check(&status).unwrap()) else { panic!() };
     assert_eq!((status.unit(), status.mode().0), (Some(Unit::Cm), 1));
-    host.ask(Request::Stream, 500_000);
+    host.ask(Request::Stream);
     for (number, scan) in scans.iter().enumerate() {
         let telegram = host.telegram(PATIENCE).expect("a scan");
         assert!(&telegram == scan, "not scan {number}; sent: {:?}", simulator.faults());
     }
-    assert_eq!(host.telegram(Duration::from_millis(200)), None);
-    host.ask(Request::Status, 500_000);
+    // It still answers; the count below says that nothing else was sent.
+    host.ask(Request::Status);
     let (summaries, records) = simulator.end();
     assert_eq!(records.iter().filter(|record| is_data(record)).count(), 100);
     assert_eq!(summaries[0].sent, records.len() as u64);
@@ -192,7 +216,7 @@ fn lost_bytes_damage_exactly_the_telegrams_that_the_truth_names() {
     let faults = Faults { loss: 0.00135, burst: 1.89, ..Faults::default() };
     let simulator = Simulator::start(SimulateOptions { faults, speed: 2.0, ..options(port.clone()) });
     let mut host = Host::open(&port, 500_000);
-    host.ask(Request::Stream, 500_000);
+    host.ask(Request::Stream);
     let received: Vec<[u8; 32]> =
         (0..60).map(|_| Record::hash(&host.telegram(PATIENCE).expect("a scan"))).collect();
     let (_, records) = simulator.end();
@@ -212,7 +236,7 @@ fn two_ports_and_what_is_refused() {
     let simulator = Simulator::start(SimulateOptions { ports: ports.clone(), truth, ..options("".into()) });
     for port in &ports {
         let mut host = Host::open(port, 500_000);
-        host.ask(Request::Stream, 500_000);
+        host.ask(Request::Stream);
         host.telegram(PATIENCE).expect("a scan");
     }
     let (summaries, records) = simulator.end();

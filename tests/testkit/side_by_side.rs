@@ -1,0 +1,21 @@
+//! Calls of one function for several items, each in its own thread: for tests that mostly wait.
+
+use std::panic::resume_unwind;
+use std::thread;
+
+/// Calls `each` for every one of `items`, all at the same time, each in a thread of its own.
+///
+/// # Panics
+///
+/// With the panic of the first call that panicked.
+pub(crate) fn side_by_side<T: Send, R: Send>(
+    items: impl IntoIterator<Item = T>,
+    each: impl Fn(T) -> R + Sync,
+) -> Vec<R> {
+    let each = &each;
+    thread::scope(|scope| {
+        let begun: Vec<_> = items.into_iter().map(|item| scope.spawn(move || each(item))).collect();
+        let done = begun.into_iter().map(|thread| thread.join().unwrap_or_else(|panic| resume_unwind(panic)));
+        done.collect()
+    })
+}
