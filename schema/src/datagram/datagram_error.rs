@@ -20,10 +20,11 @@ pub enum DatagramError {
     Unauthenticated,
     /// A key is given and the MAC is not of it.
     Mac,
-    /// A key is given, and no announcement of the sensor came that was sent just now: it may be an old one, sent again.
-    Untimely,
     /// A later epoch of the same hub was seen.
     Epoch,
+    /// A key is given, and the sensor or the topic was not announced within 5 s of this machine's clock: the datagram may be
+    /// a recorded one.
+    Untimely,
     /// Of another sender than the hub's epoch was taken from, which is not known to be the same gateway's: of another one
     /// with the same number.
     Twin,
@@ -48,8 +49,8 @@ impl DatagramError {
         DatagramError::Crc,
         DatagramError::Unauthenticated,
         DatagramError::Mac,
-        DatagramError::Untimely,
         DatagramError::Epoch,
+        DatagramError::Untimely,
         DatagramError::Twin,
         DatagramError::Stale,
         DatagramError::Capacity,
@@ -68,8 +69,8 @@ impl DatagramError {
             DatagramError::Crc => "crc",
             DatagramError::Unauthenticated => "unauthenticated",
             DatagramError::Mac => "mac",
-            DatagramError::Untimely => "untimely",
             DatagramError::Epoch => "epoch",
+            DatagramError::Untimely => "untimely",
             DatagramError::Twin => "twin",
             DatagramError::Stale => "stale",
             DatagramError::Capacity => "capacity",
