@@ -1,6 +1,6 @@
 //! `scanhub web` on the command line.
 
-use std::net::SocketAddr;
+use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 use std::path::PathBuf;
 
 use clap::Args;
@@ -14,16 +14,17 @@ pub(crate) struct Web {
     /// Sensors to show [default: all]
     #[arg(value_name = "SENSOR")]
     sensors: Vec<String>,
-    /// Address to listen on. If the port is in use, the next free one. An address that other machines reach needs --token
-    #[arg(long, default_value = "127.0.0.1:8080", value_name = "ADDRESS:PORT")]
+    /// Address to listen on: an IP address, a port, or both. 0.0.0.0 or :: for other machines, which needs --token. If the
+    /// port is in use, the next free one
+    #[arg(long, default_value = "127.0.0.1:8080", value_name = "ADDRESS:PORT", value_parser = listen_address)]
     listen: SocketAddr,
     /// Word that page and viewers must know: it goes into the address, as ?token=WORD. It travels unencrypted
     #[arg(long, value_name = "WORD", env = "SCANHUB_WEB_TOKEN", hide_env_values = true, value_parser = word)]
     token: Option<String>,
-    /// Let everybody look who reaches the address, without a token
+    /// Serve everyone who can reach the address, without a token
     #[arg(long, conflicts_with = "token")]
     open: bool,
-    /// Let viewers come that are served from this URL. Can be repeated
+    /// Accept viewers that are served from this URL. Can be repeated
     #[arg(long = "allow-origin", value_name = "URL")]
     origins: Vec<String>,
     /// Show this recording instead of a hub: a private hub plays it, and the page has the keys of the player. Files: MCAP,
@@ -35,6 +36,24 @@ pub(crate) struct Web {
     pub(crate) is_looped: bool,
     #[command(flatten)]
     limits: Limits,
+}
+
+/// Port that `web` listens on if `--listen` names only an address.
+const DEFAULT_PORT: u16 = 8080;
+
+/// Parses `ADDRESS:PORT`, an address without a port, or a port without an address, which means this machine only.
+fn listen_address(text: &str) -> Result<SocketAddr, String> {
+    let without_brackets = text.strip_prefix('[').and_then(|rest| rest.strip_suffix(']')).unwrap_or(text);
+    if let Ok(address) = text.parse() {
+        return Ok(address);
+    }
+    if let Ok(ip) = without_brackets.parse::<IpAddr>() {
+        return Ok(SocketAddr::new(ip, DEFAULT_PORT));
+    }
+    if let Ok(port) = text.parse() {
+        return Ok(SocketAddr::from((Ipv4Addr::LOCALHOST, port)));
+    }
+    Err("use an IP address, a port, or both, such as 8090, 0.0.0.0 or [::]:8090".to_owned())
 }
 
 /// It goes into an address as it is.
@@ -66,3 +85,39 @@ impl Web {
 /// What it is for, for the end of the help.
 pub(crate) const VIEWERS: &str = "\
 Open the printed address in a browser. Foxglove and Lichtblick: open connection, Foxglove WebSocket, the same address with ws:.";
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn listen_takes_a_port_an_address_or_both() {
+        for (text, expected) in [
+            ("8090", "127.0.0.1:8090"),
+            ("0", "127.0.0.1:0"),
+            ("0.0.0.0", "0.0.0.0:8080"),
+            ("::", "[::]:8080"),
+            ("[::]", "[::]:8080"),
+            ("::1", "[::1]:8080"),
+            ("192.168.1.7", "192.168.1.7:8080"),
+            ("0.0.0.0:8090", "0.0.0.0:8090"),
+            ("[::]:8090", "[::]:8090"),
+        ] {
+            assert_eq!(listen_address(text), Ok(expected.parse().unwrap()), "{text}");
+        }
+        for bad in [
+            "",
+            "65536",
+            "-1",
+            ":8090",
+            "robot",
+            "robot:8090",
+            "0.0.0.0:",
+            "1.2.3",
+            "[0.0.0.0",
+            "http://0.0.0.0",
+        ] {
+            assert!(listen_address(bad).is_err(), "{bad}");
+        }
+    }
+}

@@ -57,8 +57,8 @@ pub fn web(
 ) -> Result<(), Failure> {
     options.sensors.iter().try_for_each(|sensor| as_word(check_followed(sensor)))?;
     if !options.listen.ip().is_loopback() && options.token.is_none() && !options.open {
-        let what = format!("everybody who reaches {} could look", options.listen);
-        let hint = "give them a word: --token WORD, or let everybody: --open";
+        let what = format!("other machines could watch at {}", options.listen);
+        let hint = "set a token for viewers (--token WORD), or allow everyone (--open)";
         return Err(Failure::new(Kind::Usage, what, hint));
     }
     if options.token.as_deref().is_some_and(|token| !is_word(token)) {
@@ -72,7 +72,8 @@ pub fn web(
     let (tell, events) = mpsc::channel();
     let mut output = Output::new(out);
     let url = url(server.address(), &options.names, options.token.as_deref());
-    if let Err(end) = told::ready(&mut output, &url, options.json) {
+    let is_local = server.address().ip().is_loopback();
+    if let Err(end) = told::ready(&mut output, &url, is_local, options.json) {
         return quiet(Err(end));
     }
     let wanted = [&picture::TOPICS[..], Maker::Mount.topics(), Maker::Tilted.topics()].concat();
@@ -155,6 +156,7 @@ mod tests {
         for listen in ["0.0.0.0:0", "[::]:0"] {
             let failure = web(&options(listen), None, &mut Vec::new(), &stop).unwrap_err();
             assert_eq!(failure.kind, Kind::Usage);
+            assert_eq!(failure.message, format!("other machines could watch at {listen}"));
             assert!(failure.hint.contains("--token"), "{failure}");
             let open = WebOptions { open: true, ..options(listen) };
             assert!(
@@ -162,6 +164,24 @@ mod tests {
             );
         }
         assert!(web(&options("127.0.0.1:0"), None, &mut Vec::new(), &stop).is_ok());
+    }
+
+    #[test]
+    fn text_output_shows_how_other_machines_get_access() {
+        let stop = AtomicBool::new(true);
+        let text = |options: &WebOptions| {
+            let mut out = Vec::new();
+            web(options, None, &mut out, &stop).unwrap();
+            String::from_utf8(out).unwrap()
+        };
+        let local = text(&options("127.0.0.1:0"));
+        let [ready, others] = &local.lines().collect::<Vec<_>>()[..] else { panic!("{local}") };
+        assert!(ready.starts_with("ready http://127.0.0.1:"), "{local}");
+        assert_eq!(*others, "for other machines: --listen 0.0.0.0 --token WORD");
+        let open = text(&WebOptions { open: true, ..options("0.0.0.0:0") });
+        assert_eq!(open.lines().count(), 1, "{open}");
+        let json = text(&WebOptions { json: true, ..options("127.0.0.1:0") });
+        assert_eq!(json.lines().count(), 1, "{json}");
     }
 
     /// A player that breaks down over what a viewer wants.
@@ -211,7 +231,8 @@ mod tests {
         let (ordered, end) = thread::scope(|scope| {
             let verb = scope.spawn(|| web(&options("127.0.0.1:0"), Some(&Broken), &mut Told(tell), &stop));
             let ready = told.recv_timeout(Duration::from_secs(60)).unwrap_or_default();
-            let ordered = order(ready.trim().trim_start_matches("ready http://").trim_end_matches('/'));
+            let address = ready.lines().next().unwrap_or_default();
+            let ordered = order(address.trim().trim_start_matches("ready http://").trim_end_matches('/'));
             // Else it would serve on for ever.
             stop.store(ordered.is_err(), Ordering::Relaxed);
             (ordered, verb.join().unwrap())

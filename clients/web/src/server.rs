@@ -241,7 +241,7 @@ struct Shortage {
 }
 
 fn cannot(address: SocketAddr, error: &io::Error) -> Failure {
-    let hint = "name an address of this machine and a free port: --listen 127.0.0.1:8080";
+    let hint = "name an address of this machine, or a free port: --listen 8090";
     Failure::new(Kind::Failed, format!("cannot listen on {address}: {error}"), hint)
 }
 

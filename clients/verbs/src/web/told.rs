@@ -7,7 +7,8 @@ use serde::Serialize;
 
 use crate::output::{End, Output};
 
-pub(crate) fn ready(output: &mut Output<'_>, url: &str, json: bool) -> Result<(), End> {
+/// Prints the address; as text also the flags for access from other machines, if the address is local.
+pub(crate) fn ready(output: &mut Output<'_>, url: &str, is_local: bool, json: bool) -> Result<(), End> {
     #[derive(Serialize)]
     struct Ready<'a> {
         class: &'static str,
@@ -16,7 +17,13 @@ pub(crate) fn ready(output: &mut Output<'_>, url: &str, json: bool) -> Result<()
     }
     match json {
         true => output.json(&Ready { class: "ready", url, pid: std::process::id() }),
-        false => output.line(|line| write!(line, "ready {url}")),
+        false => {
+            output.line(|line| write!(line, "ready {url}"))?;
+            match is_local {
+                true => output.line(|line| write!(line, "for other machines: --listen 0.0.0.0 --token WORD")),
+                false => Ok(()),
+            }
+        }
     }
 }
 
@@ -25,7 +32,7 @@ pub(crate) fn event(output: &mut Output<'_>, event: &Event, json: bool) -> Resul
         Event::Viewer(visit) => client(output, visit, json),
         Event::Short(error) => {
             let hint = "raise the limit of descriptors: ulimit -n";
-            short(output, &format!("nobody can be let in: {error}"), hint, json)
+            short(output, &format!("cannot accept viewers: {error}"), hint, json)
         }
     }
 }
