@@ -60,8 +60,8 @@ pub(crate) use watch::Watch;
 pub(crate) use web::Web;
 pub(crate) use zones::Zones;
 
-/// Serve laser scanners on serial lines to many programs: a hub that publishes telegrams and scans in shared
-/// memory, and programs that read them.
+/// Share laser scanners (SICK LMS 2xx, LDROBOT, RPLIDAR) between programs. One hub reads the ports; any number of programs get
+/// the scans.
 #[derive(Debug, Parser)]
 #[command(version, max_term_width = 100)]
 pub(crate) struct Cli {
@@ -88,10 +88,10 @@ impl Cli {
 /// What every verb takes.
 #[derive(Args, Clone, Debug)]
 pub(crate) struct Everywhere {
-    /// Domain of the hub: 1 to 16 of a-z, 0-9 and -
+    /// Name of the hub, if several run on this machine: 1 to 16 of a-z, 0-9 and -
     #[arg(long, global = true, env = "SCANHUB_DOMAIN", default_value = DEFAULT_DOMAIN, value_name = "NAME")]
     pub(crate) domain: String,
-    /// Use the domain in this directory instead of the usual ones
+    /// Use the hub in this directory
     #[arg(long, global = true, value_name = "DIR")]
     pub(crate) root: Option<PathBuf>,
     /// Print one JSON object per line
@@ -135,7 +135,7 @@ pub(crate) enum Verb {
     Configure(configure::Configure),
     /// Print a default configuration, check one, or show the values in effect and their origin
     Config(Config),
-    /// Check every condition of a working setup, and say what to do if one is not met
+    /// Check the setup and show how to fix what is wrong
     Doctor(doctor::Doctor),
     /// List the sensors and topics of the running hub
     List {
@@ -174,7 +174,7 @@ pub(crate) enum Verb {
     Zones(Zones),
     /// Follow people across the sensors and rooms of a site, and count them at doors
     Track(Track),
-    /// See in three dimensions with a scanner on a mount that tilts it: points, background and obstacles
+    /// 3D from a tilting scanner: points, background, obstacles
     Tilt(Tilt),
     /// Check and draw the plan of sensors, rooms and doors that people are followed in
     Site(Site),
@@ -182,7 +182,7 @@ pub(crate) enum Verb {
     #[command(after_help = leds::MEANING)]
     Leds(Leds),
     /// Send what the hub publishes as UDP datagrams, one sample each, to multicast groups and to hosts
-    #[command(after_help = gateway::GROUPS)]
+    #[command(after_help = gateway::groups())]
     Gateway(Gateway),
     /// Receive what gateways of other machines send, and show what was lost
     #[command(after_help = listen::SIGNALS)]
@@ -251,7 +251,7 @@ pub(crate) struct Demo {
     #[arg(long = "for", value_name = "DURATION", value_parser = duration::parse)]
     pub(crate) run_for: Option<Duration>,
     /// demo: two sensors on a robot. house: four sensors in two rooms, and people who are followed from room to room. tilt: a
-    /// sensor on a mount, of which obstacles in three dimensions are made
+    /// tilting scanner that finds obstacles in 3D
     #[arg(long, default_value = "demo", value_name = "WORLD", value_parser = worlds())]
     pub(crate) world: World,
     /// Seed of rooms and people

@@ -1,12 +1,14 @@
 //! `scanhub gateway` on the command line.
 
+use std::collections::BTreeMap;
 use std::io::{IsTerminal, stdout};
 use std::path::PathBuf;
 use std::time::Duration;
 
 use clap::Args;
 use config::Sources;
-use schema::{Failure, Kind};
+use schema::datagram::{Announce, GROUPS, PORT, group};
+use schema::{Failure, Kind, Topic};
 use verbs::{GatewayLook, GatewayOptions, duration};
 
 use super::{Configured, Everywhere};
@@ -19,7 +21,8 @@ pub(crate) struct Gateway {
     #[arg(long, value_name = "NAME")]
     interface: Option<String>,
     /// Topics to send: front/scan, */scan for all sensors or front/* for all topics. With :every=4, only the samples of
-    /// every fourth telegram. Can be repeated [default: all topics except telegrams and lines, of all sensors]
+    /// every fourth telegram. Can be repeated [default: all topics except telegram, lines, motion, early and cloud, of
+    /// all sensors]
     #[arg(long = "topic", value_name = "SENSOR/TOPIC[:every=N]")]
     topics: Vec<String>,
     // Help for people, in which brackets are no link.
@@ -30,8 +33,7 @@ pub(crate) struct Gateway {
     /// Send only telegrams, without a header, each sensor on its own port
     #[arg(long, conflicts_with = "background_every")]
     bare: bool,
-    /// File with the key of which every datagram gets a MAC, so that `listen --key-file` knows who sent it; `scanhub key
-    /// new` makes one
+    /// Authenticate every datagram with the key in this file, for `listen --key-file`. `scanhub key new` creates one
     #[arg(long, value_name = "FILE", conflicts_with = "bare")]
     key_file: Option<PathBuf>,
     /// How many networks datagrams to the groups may cross, including the first one [default: 1]
@@ -103,7 +105,59 @@ fn background_every(said: &config::Gateway) -> Result<Option<Duration>, Failure>
     every.transpose()
 }
 
-/// Where it sends, for the end of the help.
-pub(crate) const GROUPS: &str = "groups, port 22200: 239.255.76.80 announce, status; .81 zones, marks, foreground; \
-.82 scan, background; .83 telegram\nbare: 239.255.76.83, port 22201 for the first sensor, 22202 for the second ..\n\
-SIGUSR1: print the counts so far";
+/// Returns the groups and their topics, for the end of the help.
+pub(crate) fn groups() -> String {
+    let mut text = format!("Groups, port {PORT}:\n");
+    for (address, topics) in groups_and_topics() {
+        text += &format!("  {address}  {topics}\n");
+    }
+    text + "bare: 239.255.76.83, port 22201 for the first sensor, 22202 for the second ..\nSIGUSR1: print the counts so far"
+}
+
+/// The address of each multicast group, and the names of the topics that are sent to it.
+fn groups_and_topics() -> Vec<(String, String)> {
+    let mut groups = BTreeMap::from([(Announce::GROUP, vec!["announce"])]);
+    for topic in Topic::ALL {
+        groups.entry(group(topic)).or_default().push(topic.name());
+    }
+    let [a, b, c] = GROUPS;
+    let row = |(last, topics): (u8, Vec<&str>)| (format!("{a}.{b}.{c}.{last}"), topics.join(", "));
+    groups.into_iter().map(row).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use verbs::network::Selection;
+
+    /// Reads a file of this repository, without line breaks, backquotes and the marks of doc comments.
+    fn words_of(path: &str) -> String {
+        let path = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join(path);
+        let text = std::fs::read_to_string(path).unwrap().replace(['`'], "").replace("///", "");
+        text.split_whitespace().collect::<Vec<_>>().join(" ")
+    }
+
+    #[test]
+    fn help_and_pages_name_the_topics_that_are_not_sent_by_default() {
+        let left_out: Vec<_> =
+            Topic::ALL.into_iter().filter(|topic| !Selection::is_default(*topic)).collect();
+        let names: Vec<_> = left_out.iter().map(|topic| topic.name()).collect();
+        let (last, first) = names.split_last().unwrap();
+        let sentence = format!("all topics except {} and {last}", first.join(", "));
+        let pages = ["docs/configuration.md", "docs/datagram.md", "docs/bridge.md"];
+        for path in pages.iter().chain(&["hub/cli/gateway.rs", "clients/bridge/src/main.rs"]) {
+            assert!(words_of(path).contains(&sentence), "{path} does not say: {sentence}");
+        }
+    }
+
+    #[test]
+    fn help_and_page_list_every_topic_with_its_group() {
+        let (help, page) = (groups(), words_of("docs/datagram.md"));
+        for (address, topics) in groups_and_topics() {
+            assert!(help.contains(&format!("{address}  {topics}\n")), "{help}");
+            assert!(page.contains(&format!("| {address} | {topics} |")), "{address} | {topics}");
+        }
+        let all: usize = groups_and_topics().iter().map(|(_, topics)| topics.split(", ").count()).sum();
+        assert_eq!(all, Topic::ALL.len() + 1);
+    }
+}

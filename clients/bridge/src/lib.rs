@@ -49,7 +49,8 @@ pub struct BridgeOptions {
 /// What goes out.
 #[derive(Clone, Debug)]
 pub struct SendOptions {
-    /// `SENSOR/TOPIC`, `*/TOPIC` or `SENSOR/*`, with `:every=N` if it is to be thinned; none: all but telegrams, of all sensors.
+    /// `SENSOR/TOPIC`, `*/TOPIC` or `SENSOR/*`, with `:every=N` to thin it; none: the default topics of all
+    /// sensors, as `scanhub gateway` sends them.
     pub topics: Vec<String>,
     /// Where the domain of the hub may be.
     pub places: Vec<Domain>,

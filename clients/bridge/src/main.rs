@@ -30,8 +30,8 @@ struct Cli {
     #[arg(long, value_name = "FILE")]
     config: Option<PathBuf>,
     /// Topics to send: front/scan, */scan for all sensors or front/* for all topics. With :every=4, only the samples of
-    /// every fourth telegram. Can be repeated [default: all topics except telegrams, of all sensors]. With --publish the
-    /// topics to receive, too: then only */scan and its like
+    /// every fourth telegram. Can be repeated [default: all topics except telegram, lines, motion, early and cloud, of
+    /// all sensors]. With --publish, also the topics to receive: then only */scan and its like
     #[arg(long = "topic", value_name = "SENSOR/TOPIC[:every=N]")]
     topics: Vec<String>,
     /// Publish what other machines send in this machine's domain, as HUB.SENSOR; then nothing is sent without --send
@@ -70,10 +70,10 @@ struct Cli {
     /// Frame of a sensor in ROS 2, for example front=laser [default: its name]
     #[arg(long = "frame", value_name = "SENSOR=FRAME", requires = "ros2")]
     frames: Vec<String>,
-    /// Domain of the hub: 1 to 16 of a-z, 0-9 and -
+    /// Name of the hub, if several run on this machine: 1 to 16 of a-z, 0-9 and -
     #[arg(long, env = "SCANHUB_DOMAIN", default_value = DEFAULT_DOMAIN, value_name = "NAME")]
     domain: String,
-    /// Use the domain in this directory instead of the usual ones
+    /// Use the hub in this directory
     #[arg(long, value_name = "DIR")]
     root: Option<PathBuf>,
     /// Print one JSON object per line

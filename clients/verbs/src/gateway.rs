@@ -31,7 +31,8 @@ use uplink::Uplink;
 pub struct GatewayOptions {
     /// The network interface of the groups; without one nothing goes to groups.
     pub interface: Option<String>,
-    /// `SENSOR/TOPIC`, `*/TOPIC` or `SENSOR/*`, with `:every=N` if it is to be thinned; none: all but telegrams and lines, of all sensors.
+    /// `SENSOR/TOPIC`, `*/TOPIC` or `SENSOR/*`, with `:every=N` to thin it; none: the default topics of all
+    /// sensors, see [`Selection::is_default`].
     pub topics: Vec<String>,
     /// `HOST:PORT` of those that get copies; a name is asked for again while it runs, as its address may change.
     pub to: Vec<String>,

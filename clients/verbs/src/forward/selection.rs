@@ -20,8 +20,8 @@ struct Entry {
 
 impl Selection {
     /// What `texts` name, as words of topics (`SENSOR/TOPIC`), with `:every=N` behind it if the samples are to be thinned. Nothing
-    /// named is all sensors, and of these telegrams if `bare`, else all other topics but lines, motion and early warnings,
-    /// which cost time only where they are followed, and clouds, which are many bytes.
+    /// named means all sensors. It then means telegrams if `bare`, and otherwise the topics that
+    /// [`is_default`](Self::is_default) accepts.
     ///
     /// # Errors
     ///
@@ -41,18 +41,23 @@ impl Selection {
             entries.push(entry);
         }
         if entries.is_empty() {
-            let wanted = |topic: &Topic| match topic {
-                Topic::Telegram => bare,
-                Topic::Lines | Topic::Motion | Topic::Early | Topic::Cloud => false,
-                _ => !bare,
+            let is_sent = |topic: &Topic| match bare {
+                true => *topic == Topic::Telegram,
+                false => Selection::is_default(*topic),
             };
-            let all = Topic::ALL.into_iter().filter(wanted);
+            let all = Topic::ALL.into_iter().filter(is_sent);
             entries.extend(all.map(|topic| Entry {
                 word: Word { sensor: None, topic: Some(topic) },
                 every: NonZeroU64::MIN,
             }));
         }
         Ok(Selection { entries })
+    }
+
+    /// Returns whether `topic` is sent unless topics are named. Telegrams and clouds are many bytes; lines, motion and early
+    /// warnings cost CPU time only while they have a subscriber.
+    pub fn is_default(topic: Topic) -> bool {
+        !matches!(topic, Topic::Telegram | Topic::Lines | Topic::Motion | Topic::Early | Topic::Cloud)
     }
 
     /// Every how manieth sample of this topic goes out, if any do: what names it closest wins.
