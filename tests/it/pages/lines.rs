@@ -15,9 +15,10 @@ use schema::Topic;
 
 /// Commands that are not run, by how their line begins or what is in it, and what makes sure of them. Those of the program
 /// are read by `hub/cli/examples.rs`.
-const NOT_RUN: [(&str, &str); 16] = [
+const NOT_RUN: [(&str, &str); 17] = [
     ("sudo ", "changes the machine; tests/it/dist.rs and tests/it/client_c.rs install elsewhere"),
     ("sudoedit ", "an editor"),
+    ("curl ", "installs Rust, which built this test"),
     ("systemctl ", "asks the machine's service manager; tests/it/service.rs has one of its own"),
     ("cargo build", "builds for minutes; this test was built so"),
     ("cargo test", "this is it"),
