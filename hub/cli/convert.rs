@@ -85,7 +85,9 @@ impl Convert {
             words += &format!("; the log was read as {encoding}");
         }
         if *left_out > 0 {
-            words += &format!("; left out: {left_out} telegrams that are no whole scans");
+            let (plural, what) =
+                if *left_out == 1 { ("", "a complete scan") } else { ("s", "complete scans") };
+            words += &format!("; {left_out} telegram{plural} dropped (not {what})");
         }
         if !damage.is_none() {
             words += &format!("; missing in {}: {damage}", self.input.display());

@@ -42,7 +42,7 @@ const EXAMPLES: &[(&str, &[&str])] = &[
         "run",
         &[
             "scanhub run --link front=/dev/ttyUSB0",
-            "scanhub run --link front=/dev/ttyUSB0 --set zones.radii=[1.2,0.7]",
+            "scanhub run --link front=/dev/ttyUSB0 --set 'zones.radii=[1.2,0.7]'",
             "scanhub run --config robot.toml",
         ],
     ),
@@ -50,7 +50,7 @@ const EXAMPLES: &[(&str, &[&str])] = &[
         "replay",
         &[
             "scanhub replay walk.mcap",
-            "scanhub replay walk.mcap --rate max --set zones.radii=[1.2,0.7]",
+            "scanhub replay walk.mcap --rate max --set 'zones.radii=[1.2,0.7]'",
             "scanhub replay walk.mcap --start 1m --end 90s --loop --paused",
         ],
     ),
@@ -126,7 +126,7 @@ const EXAMPLES: &[(&str, &[&str])] = &[
         ],
     ),
     ("watch", &["scanhub watch", "scanhub watch front"]),
-    ("web", &["scanhub web", "scanhub web --listen 0.0.0.0:8080 --token carrot"]),
+    ("web", &["scanhub web", "scanhub web --listen 8090", "scanhub web --listen 0.0.0.0 --token carrot"]),
     (
         "record",
         &[
@@ -156,7 +156,7 @@ const EXAMPLES: &[(&str, &[&str])] = &[
     ("site", &["scanhub site check house.toml"]),
     ("site check", &["scanhub site check house.toml --svg house.svg"]),
     ("leds", &["scanhub leds front", "scanhub leds robot --led green=led0"]),
-    ("gateway", &["scanhub gateway --interface eth0 --topic */zones --topic front/scan:every=4"]),
+    ("gateway", &["scanhub gateway --interface eth0 --topic '*/zones' --topic front/scan:every=4"]),
     (
         "bridge",
         &[
@@ -214,6 +214,16 @@ mod tests {
             }
         }
         command.debug_assert();
+    }
+
+    #[test]
+    fn every_example_runs_in_zsh_unchanged() {
+        let of_help = EXAMPLES.iter().flat_map(|(_, lines)| lines.iter().map(|line| (*line).to_owned()));
+        let of_pages = blocks::blocks().into_iter().filter(|block| block.language == "sh");
+        let of_pages = of_pages.flat_map(|block| shell::lines(&block.text));
+        for line in of_help.chain(of_pages) {
+            assert_eq!(shell::patterns(&line), Vec::<String>::new(), "{line}");
+        }
     }
 
     #[test]

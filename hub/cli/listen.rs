@@ -24,7 +24,7 @@ pub(crate) struct Listen {
     /// Hub to listen to, by its 16 hex digits or its name from --name [default: all]
     #[arg(long = "hub", value_name = "HUB")]
     hubs: Vec<String>,
-    /// File with the key that gateways have: nothing else is believed, and nothing that is sent again. Clocks must agree
+    /// Accept only datagrams that are authenticated with the key in this file, and each of them once. Clocks must agree
     /// within 5 s
     #[arg(long, value_name = "FILE")]
     key_file: Option<PathBuf>,

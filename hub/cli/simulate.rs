@@ -15,8 +15,8 @@ pub(crate) struct Simulate {
     /// Where to create each sensor's pty, as a symlink
     #[arg(long, value_name = "PATH")]
     port: Vec<PathBuf>,
-    /// Where a sensor is found as behind a serial server in raw mode; port 0 is any that is free. The line `ready` says
-    /// which; the hub opens it as tcp:HOST:PORT. These sensors come after those of --port
+    /// Offer the scanner on this TCP address, like a serial server. Port 0: any free port, shown in the line `ready`. The hub
+    /// opens it as tcp:HOST:PORT. These scanners come after those of --port
     #[arg(long, value_name = "HOST:PORT")]
     tcp: Vec<String>,
     /// Rate of the line: 9600, 19200, 38400 or 500000 [default: the permanent rate]
@@ -43,8 +43,8 @@ pub(crate) struct Simulate {
     /// their order. Worlds with a mount are told in docs/worlds.md
     #[arg(long, value_name = "NAME", conflicts_with = "replay")]
     pub(crate) angles: Vec<String>,
-    /// Recording to send instead: MCAP file, telegram stream or CARMEN log, plain or gzipped; of family ld an MCAP file or
-    /// the bytes that one sent. Of family rplidar there is none
+    /// Recording to send instead: MCAP file, telegram stream or CARMEN log, plain or gzipped. Family ld:
+    /// an MCAP file or raw bytes. Not available for rplidar
     #[arg(long, value_name = "FILE")]
     replay: Option<PathBuf>,
     /// Which sensor of the recording, if it has several: one for all ports, or one for each in their order

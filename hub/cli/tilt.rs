@@ -17,13 +17,13 @@ pub(crate) struct Tilt {
     /// Name under which a program publishes the angles of the mount
     #[arg(long, value_name = "MOUNT", value_parser = own_name)]
     angles: String,
-    /// Publish topics NAME/cloud and NAME/obstacles, for other programs. Nothing else is called so
+    /// Also publish the topics NAME/cloud and NAME/obstacles. NAME must not be in use
     #[arg(long = "as", value_name = "NAME", value_parser = own_name)]
     name: Option<String>,
     /// A point of the mount's axis in the robot's frame, in metres: x ahead, y left, z above the floor
     #[arg(long, value_name = "X,Y,Z", value_parser = numbers::<3>, allow_hyphen_values = true)]
     axis_at: [f64; 3],
-    /// Way of the axis: angles grow right-handed around it. Around y, a greater angle looks farther down
+    /// Direction of the mount's axis. Angles are right-handed: around y, a larger angle tilts the scanner down
     #[arg(long, default_value = "0,1,0", value_name = "X,Y,Z", value_parser = axis, allow_hyphen_values = true)]
     axis: [f64; 3],
     /// Where the beams come from while the mount is level [default: the point of --axis-at]
@@ -38,10 +38,10 @@ pub(crate) struct Tilt {
     /// The scanner hangs
     #[arg(long)]
     upside_down: bool,
-    /// Whatever is in this box is an obstacle, whether it stands there always or not: from and to in x, y and z, in metres
+    /// Report every object in this box, even if it is background: MIN_X,MAX_X,MIN_Y,MAX_Y,MIN_Z,MAX_Z, in meters
     #[arg(long, value_name = "X,X,Y,Y,Z,Z", value_parser = cuboid, allow_hyphen_values = true)]
     near: Option<[[f64; 2]; 3]>,
-    /// In so many sweeps something has to be met to become background
+    /// Sweeps in which a surface must be seen before it is background
     #[arg(long, default_value_t = Settings::default().sweeps, value_name = "N", value_parser = clap::value_parser!(u16).range(1..))]
     sweeps: u16,
     /// Stop after this time, for example 10s, 250ms, 5m
@@ -59,19 +59,19 @@ fn own_name(name: &str) -> Result<String, String> {
 
 fn number(text: &str) -> Result<f64, String> {
     let number = text.trim().parse().ok().filter(|number: &f64| number.is_finite());
-    number.ok_or_else(|| format!("{text:?} is no number"))
+    number.ok_or_else(|| format!("{text:?} is not a number"))
 }
 
 /// `N` numbers with commas between them.
 fn numbers<const N: usize>(text: &str) -> Result<[f64; N], String> {
     let numbers = text.split(',').map(number).collect::<Result<Vec<_>, _>>()?;
-    numbers.try_into().map_err(|numbers: Vec<_>| format!("{} numbers, and not {N}", numbers.len()))
+    numbers.try_into().map_err(|numbers: Vec<_>| format!("expected {N} numbers, found {}", numbers.len()))
 }
 
 fn axis(text: &str) -> Result<[f64; 3], String> {
     let axis = numbers(text)?;
     if axis == [0.0; 3] {
-        Err("an axis without a direction; 0,1,0 is from right to left".into())
+        Err("the axis must not be 0,0,0; for example, 0,1,0 points from right to left".into())
     } else {
         Ok(axis)
     }
@@ -83,8 +83,7 @@ fn cuboid(text: &str) -> Result<[[f64; 2]; 3], String> {
     match cuboid.iter().all(|[from, to]| from < to) {
         true => Ok(cuboid),
         false => {
-            Err("each first number has to be less than the second: from x, to x, from y, to y, from z, to z"
-                .into())
+            Err("each minimum must be less than its maximum: MIN_X,MAX_X,MIN_Y,MAX_Y,MIN_Z,MAX_Z".into())
         }
     }
 }

@@ -14,13 +14,13 @@ pub(crate) struct Track {
     /// The site file: sensors, rooms and doors
     #[arg(long, value_name = "FILE")]
     site: PathBuf,
-    /// Publish topics NAME/tracks and NAME/events, for other programs. No sensor of the hub is called so
+    /// Also publish the topics NAME/tracks and NAME/events. NAME must not be in use
     #[arg(long = "as", value_name = "NAME", value_parser = tracker)]
     name: Option<String>,
     /// Print only how many went through this door, each time that somebody does. Can be repeated
     #[arg(long, value_name = "DOOR")]
     count: Vec<String>,
-    /// How long the scan of a sensor is waited for when others have sent later ones
+    /// How long to wait for a sensor's scan after other sensors have sent later ones
     #[arg(long, default_value = "80ms", value_name = "DURATION", value_parser = duration::parse)]
     delay: Duration,
     /// Stop after this time, for example 10s, 250ms, 5m

@@ -98,7 +98,7 @@ fn a_sensor_that_is_not_well_is_no_good_set_up() {
     let port = env.word("dirty");
     let (findings, _) = doctor(&env, &[&port], 0);
     let (found, text) = state(&findings, "health", Some(&port));
-    assert!(found == "warning" && text.contains("window is dirty, lets through 20 %"), "{text}");
+    assert!(found == "warning" && text.contains("window is dirty, 20 % clear"), "{text}");
     drop(dirty);
     let _broken = env.simulator(&["broken"], &["--type=lms211", "--status=0x13", "--error=3:18"]);
     let port = env.word("broken");

@@ -20,7 +20,7 @@ impl Diagnosis {
 /// Nobody answers, or nobody that speaks so.
 pub(crate) const UNREACHED: Diagnosis = Diagnosis {
     finding: "no router is reached",
-    remedy: "it must run at the address that is named (`scanhub bridge --listen ..` or zenohd), and no firewall be between",
+    remedy: "start a router there (`scanhub bridge --listen ..` or zenohd), and check the firewall",
 };
 
 /// Parts of what is said, in lower case, and what they mean. The first that fits does: what is said of users and certificates says

@@ -127,11 +127,10 @@ impl<P: Payload + ?Sized> Subscription<P> {
         self.session.wait_for(Some(longest))
     }
 
-    /// Returns what is readable while there may be a sample, for who waits for other things as well: to be polled, never
-    /// read. It is the same for as long as the subscription lives, whatever becomes of the hub.
-    /// [`try_next`](Self::try_next) makes it unreadable by answering `None`; until then poll does not sleep. It also gets
-    /// readable when there is nothing: each second, ten times a second while there is no hub, and when other topics of the
-    /// sensor have something.
+    /// Returns a descriptor to poll, never to read. It can be readable although no sample has arrived: every second, ten
+    /// times a second while there is no hub, and when another topic of the sensor has a sample. It stays the same for as
+    /// long as the subscription exists, even if the hub restarts. While it is readable, `poll` returns at once, until
+    /// [`try_next`](Self::try_next) returns `None`.
     ///
     /// # Errors
     ///

@@ -13,6 +13,7 @@ use schema::{
 };
 use serde::Serialize;
 
+use crate::control::done;
 use crate::names::as_word;
 use crate::output::{Output, quiet};
 use crate::{file, json, text};
@@ -69,7 +70,7 @@ pub fn background(
         quiet(if *json {
             output.json(&json::control(sensor, verb))
         } else {
-            output.line(|line| write!(line, "{sensor}: {} taken", verb.name()))
+            output.line(|line| write!(line, "{sensor}: {}", done(verb)))
         })
     };
     match order {

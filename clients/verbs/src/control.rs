@@ -35,6 +35,20 @@ pub fn control(options: &ControlOptions, out: &mut dyn Write, stop: &AtomicBool)
     quiet(if options.json {
         output.json(&json::control(sensor, *verb))
     } else {
-        output.line(|line| write!(line, "{sensor}: {} taken", verb.name()))
+        output.line(|line| write!(line, "{sensor}: {}", done(*verb)))
     })
+}
+
+/// Returns the past form of `verb`, for the line that confirms an accepted request.
+pub(crate) fn done(verb: Verb) -> &'static str {
+    match verb {
+        Verb::Pause => "paused",
+        Verb::Resume => "resumed",
+        Verb::Resync => "session restarted",
+        Verb::Show => "background shown",
+        Verb::Reset => "background reset",
+        Verb::Freeze => "background frozen",
+        Verb::Thaw => "background learning resumed",
+        Verb::Load => "background loaded",
+    }
 }

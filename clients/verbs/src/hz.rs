@@ -221,7 +221,7 @@ impl<'a> Line<'a> {
         match (self.hz, self.jitter_ms, self.min_ms, self.max_ms) {
             (Some(hz), Some(jitter), Some(min), Some(max)) => write!(
                 line,
-                "{name:<16} {hz:8.2} Hz jitter {jitter:6.2} min {min:6.2} max {max:8.2} ms lost {}{}",
+                "{name:<16} {hz:8.2} Hz  jitter {jitter:.1} ms, interval {min:.1} to {max:.1} ms, missed {}{}",
                 self.lost,
                 self.loss.as_ref().map_or(String::new(), |loss| format!(", {loss}"))
             ),

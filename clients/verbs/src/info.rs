@@ -158,7 +158,7 @@ fn pose(pose: &Pose) -> String {
 fn marks(sensor: &str, status: &Status) -> String {
     match (status.has_reflector_bits(), status.reflector_remedy()) {
         (None, _) if status.family() != Some(Family::Lms) => {
-            format!("those above link.{sensor}.marks.level, if that is set")
+            format!("off, unless link.{sensor}.marks.level is set")
         }
         (None, _) if status.is_replayed() => {
             format!("unavailable: the recording does not contain its measuring mode; set link.{sensor}.mode")

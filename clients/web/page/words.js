@@ -105,7 +105,7 @@ function explain() {
   const [first] = shown();
   let trouble = robot.trouble ?? (robot.hub ? null : { what: "No hub", remedy: "scanhub run" });
   if (!isOpen) trouble = { what: "No connection to scanhub web", remedy: "It ended, or the network between is cut. This page tries again by itself." };
-  else if (!isHeard()) trouble = { what: "scanhub web is silent", remedy: "It does not say anything any more: look at the terminal where it runs." };
+  else if (!isHeard()) trouble = { what: "No data from scanhub web", remedy: "Look at its terminal." };
   else if (!trouble && first?.status?.trouble && shown().every(({ scan }) => !scan)) {
     const { what, remedy } = first.status.trouble;
     trouble = { what: `${first.name}: ${what}`, remedy };
@@ -126,7 +126,7 @@ const FIELDS = [
   ["rate", "hz", ({ hz }) => (hz === null ? "–" : `${hz.toFixed(1)} Hz`)],
   ["age p50 / p99", "age", ({ age_p50_ms: half, age_p99_ms: most }) => (half === null ? "–" : `${half.toFixed(1)} / ${most.toFixed(1)} ms`)],
   ["damaged on the line", "loss", ({ loss }) => percent(loss)],
-  ["lost line / here", null, ({ lost_on_line: line, lost }) => `${line ?? "–"} / ${lost}`],
+  ["lost on the line; missed by this program", null, ({ lost_on_line: line, lost }) => `${line ?? "–"} / ${lost}`],
 ];
 const percent = (share) => `${(100 * share).toFixed(!share ? 0 : share < 0.1 ? 2 : 1)} %`;
 const WELL = 0.001;

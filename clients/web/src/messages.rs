@@ -114,9 +114,9 @@ fn hub_words(scene: &Scene, domain: &str) -> String {
     if !scene.hub_lives {
         return "no hub".to_owned();
     }
-    let pid = if scene.hub_pid == 0 { String::new() } else { format!(" {}", scene.hub_pid) };
-    let load = scene.hub_percent.map_or(String::new(), |load| format!(", {load:.1} % of a processor"));
-    format!("{domain}: hub{pid}{load}")
+    let pid = if scene.hub_pid == 0 { String::new() } else { format!(", hub process {}", scene.hub_pid) };
+    let load = scene.hub_percent.map_or(String::new(), |load| format!(", CPU {load:.1} %"));
+    format!("domain {domain}{pid}{load}")
 }
 
 /// State, rate, ages and losses of `sensor`, and where it sits as far as that was told.
@@ -295,9 +295,9 @@ mod tests {
     #[test]
     fn a_hub_in_words() {
         let mut scene = Scene { hub_lives: true, ..Scene::default() };
-        assert_eq!(hub_words(&scene, "default"), "default: hub");
+        assert_eq!(hub_words(&scene, "default"), "domain default");
         (scene.hub_pid, scene.hub_percent) = (77, Some(1.26));
-        assert_eq!(hub_words(&scene, "default"), "default: hub 77, 1.3 % of a processor");
+        assert_eq!(hub_words(&scene, "default"), "domain default, hub process 77, CPU 1.3 %");
     }
 
     #[test]

@@ -57,7 +57,7 @@ impl Sources {
     pub(crate) fn settings(&self) -> impl Iterator<Item = Said> {
         self.set.iter().map(|flag| {
             let remedy = "write --set link.NAME.KEY=VALUE, as link.front.angle=100, or for all links --set \
-                          zones.radii=[1.2,0.7]";
+                          'zones.radii=[1.2,0.7]'";
             of_flag(format!("--set {flag}"), setting(flag), "not a setting", remedy)
         })
     }

@@ -181,7 +181,7 @@ impl<'a> Diagnosis<'a> {
         let name = &self.link.name;
         if let Some((is, Scanner::Turning(turning))) = driver.other_model().zip(Some(self.link.scanner)) {
             return Some(format!(
-                "the configuration says model {}, and it is {}, or speaks like it: set link.{name}.model",
+                "model {} is configured, but the scanner is a {} or compatible with it: set link.{name}.model",
                 turning.model.name, is.name
             ));
         }
@@ -189,7 +189,8 @@ impl<'a> Diagnosis<'a> {
         let Scanner::Turning(turning) = self.link.scanner else { return None };
         (beams < model.beams && beams == self.link.beams() && turning.is_auto()).then(|| {
             format!(
-                "its turns have {} points, and there is room for {}: set link.{name}.model or link.{name}.beams",
+                "the scanner measures {} points per revolution, but topics have room for {}: set link.{name}.model or \
+                 link.{name}.beams",
                 model.beams,
                 self.link.beams()
             )

@@ -68,9 +68,23 @@ impl<'a> Reload<'a> {
             }
         }
         for (name, what) in later {
-            tracing::warn!("{name}: {}: takes effect at the next start", what.join(", "));
+            tracing::warn!("{name}: {}", postponed(&what));
         }
     }
+}
+
+/// Returns the message for changes that a running hub cannot apply: keys, or the link itself.
+fn postponed(changes: &[&str]) -> String {
+    let pronoun = if changes.len() == 1 { "it" } else { "them" };
+    let what = match changes {
+        ["link added" | "link removed"] => changes[0].to_owned(),
+        [first @ .., before, last] => {
+            let first: String = first.iter().map(|key| format!("{key}, ")).collect();
+            format!("{first}{before} and {last} changed")
+        }
+        keys => format!("{} changed", keys.concat()),
+    };
+    format!("{what}; restart the hub to apply {pronoun}")
 }
 
 impl Differences {

@@ -40,6 +40,20 @@ pub(crate) fn of_the_program(line: &str) -> Vec<Vec<String>> {
     ours.collect()
 }
 
+/// Returns the words of `line` that a shell may take for a pattern: zsh refuses a pattern that matches no file.
+pub(crate) fn patterns(line: &str) -> Vec<String> {
+    let (mut quote, mut plain) = (None, String::new());
+    for sign in without_comment(line).chars() {
+        match (quote, sign) {
+            (None, '\'' | '"') => quote = Some(sign),
+            (Some(open), _) if open == sign => quote = None,
+            (None, _) => plain.push(sign),
+            _ => {}
+        }
+    }
+    plain.split(' ').filter(|word| word.contains(['[', '*', '?'])).map(str::to_owned).collect()
+}
+
 fn without_comment(line: &str) -> &str {
     let mut quote = None;
     let mut before = ' ';
@@ -91,4 +105,6 @@ fn lines_are_read_as_a_shell_does() {
     assert_eq!(commands(line), wanted);
     assert_eq!(of_the_program(line), [wanted[0], wanted[1], &["scanhub", "h", "i"]]);
     assert_eq!(commands(""), [[""; 0]]);
+    let line = "scanhub a 'x[1]' \"*\" b=[2] c? d '*'e* # f*";
+    assert_eq!(patterns(line), ["b=[2]", "c?", "e*"]);
 }

@@ -90,9 +90,9 @@ impl Prepared {
         connect.extend(checked("--connect", &options.connect)?);
         let is_silent = config.get_json("scouting/multicast/enabled").is_ok_and(|said| said != "true");
         if listen.is_empty() && connect.is_empty() && is_silent {
-            let hint = "--connect tcp/HOST:7447 names a router, --listen tcp/0.0.0.0:7447 makes this one a router, and \
-                        --config FILE says it in Zenoh's words";
-            return Err(Failure::new(Kind::Configuration, "nobody to connect to is named", hint));
+            let hint = "name one (--connect tcp/HOST:7447), or accept connections (--listen tcp/0.0.0.0:7447); \
+                        --config FILE can do both";
+            return Err(Failure::new(Kind::Configuration, "no router", hint));
         }
         let listens = !listen.is_empty();
         for (key, endpoints) in [("listen/endpoints", &listen), ("connect/endpoints", &connect)] {

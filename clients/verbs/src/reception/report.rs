@@ -83,7 +83,7 @@ impl<'a> Report<'a> {
             Some(key) => write!(line, "only datagrams with key {key} are believed"),
             None => write!(
                 line,
-                "no key: whoever can send here is believed; see `scanhub key new` and --key-file"
+                "no key: any machine on this network can send false data; see `scanhub key new` and --key-file"
             ),
         })?;
         self.notes.line(|line| match interfaces {

@@ -25,7 +25,7 @@ pub(super) fn page(shown: &[(usize, &Sensor)], area: Rect) -> Vec<Line<'static>>
             of(sensor, &|status| Some(percent(status.damaged())))
         }),
         row("lost on the line, last 10 s", &|sensor| of(sensor, &|status| status.lost_share().map(percent))),
-        row("scans lost behind the hub", &|sensor| sensor.lost.to_string()),
+        row("scans this program missed", &|sensor| sensor.lost.to_string()),
     ];
     lines.extend(shares.map(Line::raw));
     // The last line is the measure's.

@@ -226,20 +226,20 @@ fn last_row(area: Rect) -> Rect {
 }
 
 const FEW_KEYS: &str = "q quit  ? help";
-const KEYS: &str = "q quit  ? help  +- zoom  x read  n counters  space hold";
+const KEYS: &str = "q quit  ? help  +- zoom  x read  n counters  space freeze";
 
 /// What keys do, and what signs mean; narrow enough for 60 columns, low enough for 16 rows.
 const HELP: &str = "\
-+ - wheel, hjkl, c    zoom, pan, all of it
++ - wheel, hjkl, c    zoom, pan, fit
 tab  0 1 2 ..         next sensor, all, one of them
 f b m z               foreground, background, marks, zones
 t g i e               trails, grid, intensity, lines
 x, arrows; mouse      read what is there    n counters
-space                 hold the picture
+space                 freeze
 R  F                  background: reset; freeze, thaw
 ? q Esc Ctrl-C        this help, quit
 
-dots  where a beam ends; small grey ones the background
+dots  where a beam hit something; small gray: background
 o ,   foreground, its trail (coloured: without the signs)
 * @   reflector mark, corner   ^ 1 2 robot, sensors
 0.60! circle around the robot, in m, with something inside";

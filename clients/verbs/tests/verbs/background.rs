@@ -126,14 +126,14 @@ fn a_model_is_saved_forgotten_and_loaded_again() {
     assert_eq!(say(ModelOrder::Show), "front: generation 4: 3 of 181 beams known, 1 far, in 10 mm\n");
     let saved = format!("front: 3 of 181 beams saved to {}\n", file.display());
     assert_eq!(say(keep(&file)), saved);
-    assert_eq!(say(ModelOrder::Freeze), "front: freeze taken\n");
+    assert_eq!(say(ModelOrder::Freeze), "front: background frozen\n");
     assert!(say(ModelOrder::Show).ends_with(", frozen\n"));
-    assert_eq!(say(ModelOrder::Thaw), "front: thaw taken\n");
-    assert_eq!(say(ModelOrder::Reset), "front: reset taken\n");
+    assert_eq!(say(ModelOrder::Thaw), "front: background learning resumed\n");
+    assert_eq!(say(ModelOrder::Reset), "front: background reset\n");
     assert_eq!(say(ModelOrder::Show), "front: generation 5: 0 of 181 beams known, 0 far, in 10 mm\n");
     let loaded = saved_model(&file, "front", false, &mut &b""[..]).unwrap();
     assert_eq!(loaded, model());
-    assert_eq!(say(ModelOrder::Load(loaded)), "front: load taken\n");
+    assert_eq!(say(ModelOrder::Load(loaded)), "front: background loaded\n");
     let (end, out) = ask(&place, "front", ModelOrder::Show, true);
     assert_eq!(end, Ok(()));
     assert_eq!(
@@ -247,7 +247,7 @@ fn a_model_that_knows_nothing_takes_no_others_place() {
     say(ModelOrder::Freeze).0.unwrap();
     let (_, out) = say(ModelOrder::Reset);
     let hint = "it is frozen: nothing is learned until `scanhub background front thaw`";
-    assert_eq!(out, format!("front: reset taken\n{hint}\n"));
+    assert_eq!(out, format!("front: background reset\n{hint}\n"));
     for to in [file.clone(), "-".into()] {
         let (end, out) = say(ModelOrder::Save { file: to, force: true });
         let failure = end.unwrap_err();

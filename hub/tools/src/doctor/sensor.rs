@@ -159,7 +159,7 @@ fn health(report: &Report) -> Finding {
     }
     if report.is_polluted() == Some(true) {
         let percent = status.and_then(|status| status.window_percent());
-        let percent = percent.map_or(String::new(), |percent| format!(", lets through {percent} %"));
+        let percent = percent.map_or(String::new(), |percent| format!(", {percent} % clear"));
         complaints.insert(0, format!("its window is dirty{percent}"));
     }
     if status.is_some_and(|status| status.is_defective()) {
@@ -289,7 +289,7 @@ mod tests {
         dim[18] = 20;
         let found = health(&report(dim, 0x10, &[]));
         assert_eq!(found.state, Verdict::Warning, "{found}");
-        assert!(found.finding.contains("window is dirty, lets through 20 %"), "{found}");
+        assert!(found.finding.contains("window is dirty, 20 % clear"), "{found}");
         let (state, text) = verdict("health", 122, 0, 0x10, &[]);
         assert!(state == Verdict::Warning && text.contains("laser is off"), "{text}");
         let (state, text) = verdict("health", 8, 1, 0x14, &[4, 29]);

@@ -48,7 +48,10 @@ fn settings(heard: &Overheard, link: Option<&Link>) -> Finding {
     if set != turning.features.auto && (set.baud, set.beams) != (model.baud, model.beams) {
         return Finding::warning(
             NAME,
-            format!("the configuration says model {}, it is {}, or speaks like it", set.name, model.name),
+            format!(
+                "model {} is configured, but the scanner is a {} or compatible with it",
+                set.name, model.name
+            ),
             format!("--set link.{name}.model={}, or plug in the other scanner", model.name),
         );
     }

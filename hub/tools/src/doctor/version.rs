@@ -47,7 +47,7 @@ fn judge(own: String, hub: Option<(u32, Option<Running>)>) -> Finding {
             Finding::warning(NAME, text, restart)
         }
         Some((_, Some(Running { is_gone: true, .. }))) => {
-            Finding::ok(NAME, format!("{own}; the hub runs the same program, whose file is gone"))
+            Finding::ok(NAME, format!("{own}; the hub runs this version; its file was replaced"))
         }
         Some((_, Some(Running { build: Build::Same, .. }))) => {
             Finding::ok(NAME, format!("{own}; the hub runs the same program"))

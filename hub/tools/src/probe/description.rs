@@ -138,7 +138,7 @@ impl fmt::Display for Description {
         };
         row("condition", self.condition.as_ref().map(condition))?;
         let remedy = if dirty { ": clean it" } else { "" };
-        let window = |percent| format!("lets through {percent} % of what it did when clean{remedy}");
+        let window = |percent| format!("{percent} % clear{remedy}");
         row("window", self.window_percent.map(window))?;
         row("laser", self.laser_on.map(|on| if on { "on" } else { "off" }.to_owned()))?;
         row("hours", self.hours.map(|hours| hours.to_string()))?;

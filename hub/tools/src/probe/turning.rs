@@ -3,6 +3,8 @@
 
 use std::fmt;
 
+use line::family::Model;
+use schema::Family;
 use serde::Serialize;
 
 use crate::listen::Overheard;
@@ -49,6 +51,21 @@ impl Turning {
     }
 }
 
+impl Turning {
+    /// Returns the models that a scanner cannot be distinguished from, unless it has identified itself.
+    fn alike(&self) -> String {
+        let features = Family::parse(self.family).and_then(scanner::features);
+        let models = features.map_or(&[][..], |features| features.models);
+        let found = models.iter().find(|model| Some(model.name) == self.model);
+        let Some(found) = found.filter(|_| self.identity.is_none()) else { return String::new() };
+        let is_alike = |model: &&Model| {
+            model.name != found.name && (model.baud, model.beams) == (found.baud, found.beams)
+        };
+        let names: Vec<_> = models.iter().filter(is_alike).map(|model| model.name).collect();
+        if names.is_empty() { String::new() } else { format!(" (or {}: same protocol)", names.join(", ")) }
+    }
+}
+
 impl fmt::Display for Turning {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let mut row = |label: &str, value: Option<String>| match value {
@@ -56,8 +73,7 @@ impl fmt::Display for Turning {
             None => Ok(()),
         };
         row("family", Some(self.family.to_owned()))?;
-        let like = if self.identity.is_none() { ", or one that speaks like it" } else { "" };
-        row("model", self.model.map(|model| format!("{model}{like}")))?;
+        row("model", self.model.map(|model| format!("{model}{}", self.alike())))?;
         row("rate", Some(format!("{} Bd", self.baud)))?;
         row("identity", self.identity.clone())?;
         row("health", self.health.clone())?;
