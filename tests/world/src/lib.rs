@@ -31,4 +31,4 @@ pub use event::{Detail, Figures, Violation};
 pub use plan::{Action, Plan};
 pub use planted::Defect;
 pub use runner::{Runner, Totals};
-pub use world::{Outcome, run, run_with};
+pub use world::{Outcome, is_found, run};

@@ -52,6 +52,10 @@ impl Shared {
 pub(crate) struct Log {
     inner: RefCell<Inner>,
     detail: Detail,
+    /// Judges of which one violation is enough.
+    sought: &'static [&'static str],
+    /// Whether one of them has found something.
+    is_found: Cell<bool>,
 }
 
 struct Inner {
@@ -62,9 +66,14 @@ struct Inner {
 }
 
 impl Log {
-    pub(crate) fn new(judges: Vec<Box<dyn Judge>>, detail: Detail) -> Log {
+    pub(crate) fn new(judges: Vec<Box<dyn Judge>>, detail: Detail, sought: &'static [&'static str]) -> Log {
         let inner = Inner { history: History::new(), judges, violations: Vec::new(), published: 0 };
-        Log { inner: RefCell::new(inner), detail }
+        Log { inner: RefCell::new(inner), detail, sought, is_found: Cell::new(false) }
+    }
+
+    /// Returns whether a judge whose violation is sought has found one.
+    pub(crate) fn is_found(&self) -> bool {
+        self.is_found.get()
     }
 
     /// `event` happened at `at`.
@@ -80,6 +89,9 @@ impl Log {
         for judge in judges {
             let name = judge.name();
             judge.note(at, event, &mut Say { judge: name, at_ns: at, violations });
+        }
+        if violations.last().is_some_and(|last| self.sought.contains(&last.judge)) {
+            self.is_found.set(true);
         }
     }
 

@@ -41,19 +41,14 @@ pub struct Outcome {
 
 /// Lets happen what `plan` says, and tells standard error so much of it.
 pub fn run(plan: &Plan, detail: Detail) -> Outcome {
-    run_with(plan, detail, None)
+    World::new(plan, detail, None, &[]).live()
 }
 
-/// As [`run`], with `defect` around the hub.
-pub fn run_with(plan: &Plan, detail: Detail, defect: Option<Defect>) -> Outcome {
-    let mut world = World::new(plan, detail, defect);
-    while world.now() < world.end {
-        world.rest_without_hub();
-        if world.now() < world.end {
-            hub::live(&mut world);
-        }
-    }
-    world.close()
+/// Returns whether one of `judges` finds a violation in what `plan` says, with `defect` around the hub. The world ends with
+/// the first one.
+pub fn is_found(plan: &Plan, defect: Option<Defect>, judges: &'static [&'static str]) -> bool {
+    let outcome = World::new(plan, Detail::Nothing, defect, judges).live();
+    outcome.violations.iter().any(|violation| judges.contains(&violation.judge))
 }
 
 /// Something that is to be done at its time, or when everything is made well again.
@@ -103,7 +98,7 @@ pub(crate) struct World {
 }
 
 impl World {
-    fn new(plan: &Plan, detail: Detail, defect: Option<Defect>) -> World {
+    fn new(plan: &Plan, detail: Detail, defect: Option<Defect>, sought: &'static [&'static str]) -> World {
         let setup = Rc::new(Setup::of_plan(plan));
         let sensors = setup.sensors(|sensor| object::changes(plan, sensor, setup.sensors.len()));
         let ports =
@@ -113,7 +108,7 @@ impl World {
             wall_ahead: Cell::new(WALL_NS),
             ports: ports.collect(),
             board: RefCell::new(Board::new(setup.sensors.len())),
-            log: Log::new(judges::all(&setup, plan), detail),
+            log: Log::new(judges::all(&setup, plan), detail, sought),
             planted: Planted::new(defect),
             files: RefCell::default(),
             disk_is_full: Cell::new(false),
@@ -151,13 +146,23 @@ impl World {
         world
     }
 
+    fn live(mut self) -> Outcome {
+        while !self.is_over() {
+            self.rest_without_hub();
+            if !self.is_over() {
+                hub::live(&mut self);
+            }
+        }
+        self.close()
+    }
+
     pub(crate) fn now(&self) -> Nanos {
         self.shared.clock.get()
     }
 
     /// Whether it is over.
     pub(crate) fn is_over(&self) -> bool {
-        self.now() >= self.end
+        self.now() >= self.end || self.shared.log.is_found()
     }
 
     /// How long things may still go wrong.

@@ -1,7 +1,11 @@
 //! The judges are shown to bite: each of some defects that are built into the models around the hub is found within 200 seeds,
 //! by the judge whose business it is.
 
-use world::{Defect, Detail, Plan, run_with};
+use std::sync::Mutex;
+use std::sync::atomic::{AtomicUsize, Ordering};
+use std::thread;
+
+use world::{Defect, Detail, Plan, is_found, run};
 
 fn judge(defect: Defect) -> &'static [&'static str] {
     match defect {
@@ -48,22 +52,52 @@ const OF_HEADS: [(Defect, &str); 11] = [
     (Defect::KeptWarning, "s1"),
 ];
 
+/// First seeds by which a defect was found when this was written, where that is not 0. Seeds that find nothing are not played
+/// again; if one of these finds nothing either, all are.
+const FOUND_BY: [(Defect, &str, u64); 14] = [
+    (Defect::MergedTurn, "", 1),
+    (Defect::OtherBeams, "", 1),
+    (Defect::StampedOnArrival, "", 22),
+    (Defect::UnmarkedTurn, "", 3),
+    (Defect::UncountedLoss, "", 9),
+    (Defect::RemoteHalf, "", 1),
+    (Defect::RemoteUnchecked, "", 1),
+    (Defect::UnmarkedNeighbour, "", 3),
+    (Defect::UnturnedHead, "", 3),
+    (Defect::WrongPlaces, "", 1),
+    (Defect::UnmarkedTurn, "s1", 3),
+    (Defect::StampedOnArrival, "a1", 45),
+    (Defect::UncountedLoss, "c1", 3),
+    (Defect::DeafScanner, "a1::streaming", 3),
+];
+
+/// Returns the seed by which `defect` is found in worlds with `model` alone, or in all if it is empty.
+fn found_by(defect: Defect, model: &str) -> Option<u64> {
+    let finds = |seed: &u64| {
+        let model = Some(model.to_owned()).filter(|model| !model.is_empty());
+        is_found(&Plan { model, ..Plan::of_seed(*seed, 40) }, Some(defect), judge(defect))
+    };
+    let known = FOUND_BY.iter().find(|(of, with, _)| (*of, *with) == (defect, model));
+    let seed = known.map_or(0, |(.., seed)| *seed);
+    [seed].into_iter().chain(0..200).find(finds)
+}
+
 #[test]
 fn every_planted_defect_is_found() {
-    let mut missed = Vec::new();
-    let of_all = Defect::ALL.into_iter().map(|defect| (defect, None));
-    for (defect, model) in of_all.chain(OF_HEADS.map(|(defect, model)| (defect, Some(model.to_owned())))) {
-        let finds = |seed: &u64| {
-            let plan = Plan { model: model.clone(), ..Plan::of_seed(*seed, 40) };
-            let outcome = run_with(&plan, Detail::Nothing, Some(defect));
-            outcome.violations.iter().any(|violation| judge(defect).contains(&violation.judge))
-        };
-        match (0..200).find(finds) {
-            Some(seed) => println!("{defect:?} is found by {:?} with seed {seed} {model:?}", judge(defect)),
-            None => missed.push((defect, model)),
+    let of_all = Defect::ALL.into_iter().map(|defect| (defect, ""));
+    let planted: Vec<(Defect, &str)> = of_all.chain(OF_HEADS).collect();
+    let (next, missed) = (AtomicUsize::new(0), Mutex::new(Vec::new()));
+    let seek = || {
+        while let Some(&(defect, model)) = planted.get(next.fetch_add(1, Ordering::Relaxed)) {
+            match found_by(defect, model) {
+                Some(seed) => println!("{defect:?} is found by {:?} with seed {seed} {model}", judge(defect)),
+                None => missed.lock().expect("whole").push((defect, model)),
+            }
         }
-    }
-    assert_eq!(missed, []);
+    };
+    let threads = thread::available_parallelism().map_or(1, usize::from);
+    thread::scope(|scope| (0..threads).for_each(|_| drop(scope.spawn(seek))));
+    assert_eq!(missed.into_inner().expect("whole"), []);
 }
 
 /// What happens between the machines, and a defect that shows when nothing else happens.
@@ -76,19 +110,19 @@ const BETWEEN_MACHINES: [(&str, Defect); 3] = [
 #[test]
 fn what_happens_between_machines_alone_shows_its_defect() {
     for (name, defect) in BETWEEN_MACHINES {
-        let finds = |seed: &u64, defect: Option<Defect>| {
-            let mut plan = Plan::of_seed(*seed, 40);
+        let alone = |seed: u64| {
+            let mut plan = Plan::of_seed(seed, 40);
             plan.actions.retain(|action| action.name() == name);
-            let outcome = run_with(&plan, Detail::Nothing, defect);
-            !plan.actions.is_empty()
-                && outcome.violations.iter().any(|found| match defect {
-                    Some(defect) => judge(defect).contains(&found.judge),
-                    None => true,
-                })
+            plan
         };
-        let found = (0..200).find(|seed| finds(seed, Some(defect)));
+        let finds = |seed: &u64| {
+            let plan = alone(*seed);
+            !plan.actions.is_empty() && is_found(&plan, Some(defect), judge(defect))
+        };
+        let found = (0..200).find(finds);
         let seed = found.unwrap_or_else(|| panic!("{name}: nobody finds {defect:?}"));
         println!("{name}: {defect:?} is found by {:?} with seed {seed}", judge(defect));
-        assert!(!finds(&seed, None), "{name}, seed {seed}: something is found without it");
+        let without = run(&alone(seed), Detail::Nothing).violations;
+        assert_eq!(without, [], "{name}, seed {seed}: something is found without it");
     }
 }

@@ -1,18 +1,19 @@
 //! What once went wrong stays mended, and a world depends on nothing but its plan.
 
+use std::sync::atomic::AtomicBool;
+use std::thread;
+
 use world::{Detail, Plan, Runner, corpus, run};
 
 #[test]
 fn what_was_mended_stays_so() {
-    for (why, plan) in corpus::corpus() {
-        let outcome = run(&plan, Detail::Nothing);
-        assert_eq!(outcome.violations, [], "{why}\n{plan}");
-    }
+    let plans: Vec<Plan> = corpus::corpus().into_iter().map(|(_, plan)| plan).collect();
+    are_well(plans);
 }
 
 #[test]
 fn the_same_seed_has_the_same_hash() {
-    let plans: Vec<Plan> = (0..20).map(|seed| Plan::of_seed(seed, 20)).collect();
+    let plans: Vec<Plan> = (0..10).map(|seed| Plan::of_seed(seed, 20)).collect();
     let hashes =
         |plans: &[Plan]| -> Vec<u64> { plans.iter().map(|plan| run(plan, Detail::Nothing).hash).collect() };
     let first = hashes(&plans);
@@ -31,11 +32,17 @@ fn the_hash_of_a_world_is_known() {
 /// The first of those that `.ci/run` has.
 #[test]
 fn worlds_are_well() {
-    let plans = (0..40).map(|seed| Plan::of_seed(seed, 60)).collect();
-    let runner = Runner { plans, twice: 0, threads: 2 };
-    let totals = runner.run(&std::sync::atomic::AtomicBool::new(false), |_| ());
-    for (plan, outcome, is_same) in &totals.failed {
-        println!("the same twice: {is_same}; {:#?}\n{plan}", outcome.violations);
+    are_well((0..20).map(|seed| Plan::of_seed(seed, 60)).collect());
+}
+
+/// Checks that no judge finds a violation in these worlds.
+fn are_well(plans: Vec<Plan>) {
+    let count = plans.len();
+    let threads = thread::available_parallelism().map_or(1, usize::from);
+    let runner = Runner { plans, twice: 0, threads };
+    let totals = runner.run(&AtomicBool::new(false), |_| ());
+    for (plan, outcome, _) in &totals.failed {
+        println!("{:#?}\n{plan}", outcome.violations);
     }
-    assert_eq!((totals.worlds, totals.failed.len()), (40, 0));
+    assert_eq!((totals.worlds, totals.failed.len()), (count, 0));
 }
