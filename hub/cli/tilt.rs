@@ -117,9 +117,9 @@ mod tests {
     #[test]
     fn places_and_boxes_are_read_and_what_is_none_is_refused() {
         assert_eq!(numbers("0.1, -2,3"), Ok([0.1, -2.0, 3.0]));
-        assert_eq!(numbers::<3>("1,2").unwrap_err(), "2 numbers, and not 3");
-        assert_eq!(numbers::<1>("inf").unwrap_err(), "\"inf\" is no number");
-        assert!(axis("0,0,0").unwrap_err().contains("direction"));
+        assert_eq!(numbers::<3>("1,2").unwrap_err(), "expected 3 numbers, found 2");
+        assert_eq!(numbers::<1>("inf").unwrap_err(), "\"inf\" is not a number");
+        assert!(axis("0,0,0").unwrap_err().contains("must not be 0,0,0"));
         assert_eq!(cuboid("0,1,-1,1,0.1,2"), Ok([[0.0, 1.0], [-1.0, 1.0], [0.1, 2.0]]));
         assert!(cuboid("1,0,-1,1,0.1,2").unwrap_err().contains("less"));
     }

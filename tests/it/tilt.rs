@@ -208,7 +208,7 @@ fn angles_that_stop_are_told_and_a_name_that_is_not_there_too() {
     let none = hall.env.run(&["tilt", "front", "--angles=none", "--axis-at=0,0,1", "--timeout=2s"]);
     assert!(none.code == Some(3) && none.errors.contains("none"), "{none}");
     let wrong = hall.env.run(&["tilt", "front", "--angles=mount", "--axis-at=0,0"]);
-    assert!(wrong.code == Some(2) && wrong.errors.contains("2 numbers, and not 3"), "{wrong}");
+    assert!(wrong.code == Some(2) && wrong.errors.contains("expected 3 numbers, found 2"), "{wrong}");
     let nowhere = hall.env.run(&["simulate", "--port=x", "--angles=mount"]);
     assert!(nowhere.code == Some(2) && nowhere.errors.contains("--world tilt"), "{nowhere}");
 }
