@@ -57,12 +57,7 @@ impl Domain {
     ///
     /// [`Kind::Configuration`] as [`Domain::at`].
     pub fn of_hub(name: &str, base: Option<&Path>, environment: &Environment) -> Result<Domain, Failure> {
-        let base = match (base, &environment.runtime_directory, &environment.xdg_runtime_dir) {
-            (Some(base), _, _) => base.to_owned(),
-            (None, Some(service), _) => service.clone(),
-            (None, None, Some(user)) => user.join("scanhub"),
-            (None, None, None) => environment.fallback(),
-        };
+        let base = base.map_or_else(|| environment.base_of_hub(), Path::to_owned);
         Domain::at(name, &base)
     }
 
@@ -130,14 +125,25 @@ impl Environment {
         }
     }
 
-    /// Returns every directory that may hold domains, in the order in which clients look.
+    /// Returns every directory that may hold domains, in the order in which clients look. A hub of a login session is found
+    /// even from outside of it: sudo, ssh and cron do not set XDG_RUNTIME_DIR.
     pub fn bases(&self) -> Vec<PathBuf> {
         let mut bases: Vec<PathBuf> = self.runtime_directory.iter().cloned().collect();
         bases.push(SERVICE_BASE.into());
-        bases.extend(self.xdg_runtime_dir.iter().map(|user| user.join("scanhub")));
+        let user = self.xdg_runtime_dir.clone().unwrap_or_else(|| format!("/run/user/{}", self.uid).into());
+        bases.push(user.join("scanhub"));
         bases.push(self.fallback());
         bases.dedup();
         bases
+    }
+
+    /// Returns the directory that a hub with this environment puts its domain into.
+    pub(crate) fn base_of_hub(&self) -> PathBuf {
+        match (&self.runtime_directory, &self.xdg_runtime_dir) {
+            (Some(service), _) => service.clone(),
+            (None, Some(user)) => user.join("scanhub"),
+            (None, None) => self.fallback(),
+        }
     }
 
     fn fallback(&self) -> PathBuf {
@@ -195,12 +201,14 @@ mod tests {
 
     #[test]
     fn a_client_looks_everywhere_in_order() {
-        let roots: Vec<_> = Domain::candidates("a", None, &environment(None, Some("/run/user/7")))
-            .unwrap()
-            .iter()
-            .map(|domain| domain.root().display().to_string())
-            .collect();
-        assert_eq!(roots, ["/run/scanhub/a", "/run/user/7/scanhub/a", "/tmp/scanhub-7/a"]);
+        let roots = |environment: &Environment| -> Vec<String> {
+            let places = Domain::candidates("a", None, environment).unwrap();
+            places.iter().map(|domain| domain.root().display().to_string()).collect()
+        };
+        let expected = ["/run/scanhub/a", "/run/user/7/scanhub/a", "/tmp/scanhub-7/a"];
+        assert_eq!(roots(&environment(None, Some("/run/user/7"))), expected);
+        assert_eq!(roots(&environment(None, None)), expected, "outside of the login session");
+        assert_eq!(roots(&environment(None, Some("/x")))[1], "/x/scanhub/a");
     }
 
     #[test]

@@ -45,6 +45,8 @@ mod lock;
 mod prefix;
 #[cfg(feature = "files")]
 pub mod regular;
+#[cfg(feature = "ipc")]
+mod running;
 #[cfg(feature = "json")]
 mod saved;
 #[cfg(feature = "ipc")]
@@ -87,6 +89,8 @@ pub use zones::{Verdict, ZONES, Zone, Zones};
 pub use directory::Directory;
 #[cfg(feature = "ipc")]
 pub use lock::{HubLock, ListenLock, NameLock, holder, publisher};
+#[cfg(feature = "ipc")]
+pub use running::RunningHub;
 #[cfg(feature = "json")]
 pub use saved::{SavedModel, as_json, unit_in_mm};
 #[cfg(feature = "ipc")]

@@ -136,6 +136,65 @@ fn consumers_under_another_user_get_what_the_page_says() {
     });
 }
 
+/// Domain of the hubs that [`names_the_user_whose_hub_runs`] starts. Hubs of other tests are visible in /proc too.
+const DOMAIN: &str = "--domain=whose";
+
+/// The program as sudo starts it: without the variables of a login session.
+fn by_sudo(user: u32, arguments: &[&str]) -> Program {
+    let mut command = scanhub(user, arguments);
+    command.env_remove("XDG_RUNTIME_DIR").env_remove("RUNTIME_DIRECTORY");
+    Program::start(command)
+}
+
+/// Checks that verbs of `caller` find no hub and suggest a command, and that this command lists the topics of `hub`, which
+/// belongs to `owner`.
+fn follows_the_suggestion(caller: &dyn Fn(&[&str]) -> Program, owner: u32, hub: &Program) {
+    let sudo = if owner == 0 { "sudo".to_owned() } else { format!("sudo -u '#{owner}'") };
+    let suggested = format!("process {}: {sudo} /mnt/scanhub ", hub.pid());
+    for verb in [&["list"][..], &["info"], &["control", "front", "pause"], &["echo", "front/scan", "-n", "1"]]
+    {
+        let outcome = caller(&[verb, &[DOMAIN]].concat()).wait();
+        assert_eq!(outcome.code, Some(3), "{outcome}");
+        assert!(outcome.errors.contains("no hub of this user in domain whose"), "{outcome}");
+        let rest = outcome.errors.split(&suggested).nth(1).and_then(|rest| rest.split(';').next());
+        let words: Vec<&str> = rest.unwrap_or_else(|| panic!("{suggested}: {outcome}")).split(' ').collect();
+        let listed = by_sudo(owner, &words).wait();
+        assert!(listed.code == Some(0) && listed.to_string().contains("front/scan"), "{words:?}: {listed}");
+    }
+    // A verb that waits for a hub names it, too.
+    let mut echo = caller(&["echo", "front/scan", "--json", DOMAIN]);
+    let notice = echo.await_line("no hub", |line| line["kind"] == "hub_gone");
+    assert!(notice["hint"].as_str().is_some_and(|hint| hint.contains(&suggested)), "{notice}");
+    assert_eq!(echo.end(INT).code, Some(0));
+}
+
+#[test]
+fn names_the_user_whose_hub_runs() {
+    among_users("sharing::names_the_user_whose_hub_runs", || {
+        fs::create_dir("/run/user").expect("an empty /run");
+        own(HUB, "/run/scanhub");
+        for user in [HUB, OTHER] {
+            own(user, &format!("/run/user/{user}"));
+            own(user, &format!("/tmp/{user}"));
+        }
+        let run = ["run", "--json", "--no-system-config", "--link=front=tcp:127.0.0.1:9", DOMAIN];
+        let other = |arguments: &[&str]| start(OTHER, arguments);
+        let root = |arguments: &[&str]| by_sudo(0, arguments);
+
+        let service = start(HUB, &run).ready();
+        follows_the_suggestion(&other, HUB, &service);
+        assert_eq!(service.end(TERM).code, Some(0));
+
+        let of_root = by_sudo(0, &run).ready();
+        follows_the_suggestion(&other, 0, &of_root);
+        assert_eq!(of_root.end(TERM).code, Some(0));
+
+        let of_session = start(OTHER, &run).ready();
+        follows_the_suggestion(&root, OTHER, &of_session);
+        assert_eq!(of_session.end(TERM).code, Some(0));
+    });
+}
+
 /// What the page says of the service is a configuration that a gateway takes.
 #[test]
 fn the_page_s_configuration_is_one() {

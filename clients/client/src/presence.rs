@@ -1,12 +1,19 @@
 //! Is there a hub, or a listener that stands for hubs of other machines, and where? Asks the locks of the places that a
 //! domain may be at; refuses to open anything there.
 
+use std::path::Path;
 use std::time::{Duration, Instant};
 
-use schema::{Domain, Failure, Kind, holder, publisher};
+use schema::{Domain, Environment, Failure, Kind, RunningHub, holder, publisher};
 
 /// How often the locks are looked at.
 const LOOK_EVERY: Duration = Duration::from_millis(100);
+
+/// Maximum number of hubs of other users or domains that a message names.
+const MAX_HUBS: usize = 3;
+
+/// Remedy for a user who needs the data of another user's hub.
+const SHARING: &str = "to have its data under this user: docs/sharing.md";
 
 /// How often the locks are looked at although the hub is heard.
 const MAKE_SURE_EVERY: Duration = Duration::from_secs(1);
@@ -112,19 +119,8 @@ impl Presence {
         if let Some(short) = self.short() {
             return short;
         }
-        let name = self.places.first().map(Domain::name).unwrap_or_default();
-        let roots: Vec<_> = self.places.iter().map(|place| place.root().display().to_string()).collect();
-        match &self.denied {
-            Some(Failure { message, hint, .. }) => Failure::new(
-                Kind::NoHub,
-                format!("no hub of this user in domain {name}: {message}"),
-                hint.clone(),
-            ),
-            None => {
-                let hint = format!("start one with `scanhub run`; looked at {}", roots.join(", "));
-                Failure::new(Kind::NoHub, format!("no hub in domain {name}"), hint)
-            }
-        }
+        let hubs = RunningHub::all(Path::new("/"));
+        no_hub(&self.places, self.denied.as_ref(), &hubs, &Environment::of_process())
     }
 
     /// Why it is not known whether there is a hub: there was not even a descriptor to look with.
@@ -147,6 +143,42 @@ impl Presence {
         }
         None
     }
+}
+
+/// Returns the failure for a domain without a hub at `places`. `denied` is the failure to open one of them, `hubs` are the
+/// hubs of this machine, and `caller` is the environment of this process.
+fn no_hub(places: &[Domain], denied: Option<&Failure>, hubs: &[RunningHub], caller: &Environment) -> Failure {
+    let name = places.first().map(Domain::name).unwrap_or_default();
+    // The hub that is meant comes first: one of this domain, then one of this user.
+    let mut hubs: Vec<&RunningHub> = hubs.iter().collect();
+    hubs.sort_by_key(|hub| (hub.domain != name, hub.uid != caller.uid));
+    let is_elsewhere = hubs.first().is_some_and(|hub| hub.domain == name && hub.uid != caller.uid);
+    let mut hints: Vec<String> = hubs.iter().take(MAX_HUBS).map(|hub| elsewhere(hub, name, caller)).collect();
+    if hubs.len() > MAX_HUBS {
+        hints.push(format!("{} more hubs run", hubs.len() - MAX_HUBS));
+    }
+    let message = match denied {
+        Some(denied) => format!("no hub of this user in domain {name}: {}", denied.message),
+        None if is_elsewhere => format!("no hub of this user in domain {name}"),
+        None => format!("no hub in domain {name}"),
+    };
+    match denied {
+        Some(denied) => hints.push(denied.hint.clone()),
+        None if is_elsewhere => hints.push(SHARING.to_owned()),
+        None => {
+            let roots: Vec<_> = places.iter().map(|place| place.root().display().to_string()).collect();
+            hints.push(format!("start one with `scanhub run`; looked at {}", roots.join(", ")));
+        }
+    }
+    Failure::new(Kind::NoHub, message, hints.join("; "))
+}
+
+/// Returns who runs `hub`, and the command that reaches it, for a caller that asked for domain `name`.
+fn elsewhere(hub: &RunningHub, name: &str, caller: &Environment) -> String {
+    let RunningHub { pid, uid, user, domain, .. } = hub;
+    let whose = if *uid == caller.uid { "this user".to_owned() } else { format!("user {user}") };
+    let domain = if domain == name { String::new() } else { format!(" in domain {domain}") };
+    format!("{whose} runs one{domain}, process {pid}: {}", hub.command("list", name, caller))
 }
 
 /// Returns the hub at the first live one of `places`, waiting a moment for one that is just starting.
@@ -188,6 +220,65 @@ mod tests {
         assert!(presence.looked_at() > long_ago && presence.asked_at == long_ago);
         (presence.looked_at, presence.heard_at) = (long_ago, long_ago);
         assert_eq!(presence.look(), Change { gone: Some(Who::Hub), back: None });
+    }
+
+    #[test]
+    fn without_a_hub_the_hubs_of_others_are_named() {
+        let root = std::env::temp_dir().join(format!("scanhub-presence-{}", std::process::id()));
+        let hubs = |processes: &[(u32, u32, &str)]| {
+            let _ = std::fs::remove_dir_all(&root);
+            let put = |path: &str, text: &str| {
+                let path = root.join(path);
+                std::fs::create_dir_all(path.parent().unwrap()).unwrap();
+                std::fs::write(path, text).unwrap();
+            };
+            put("etc/passwd", "root:x:0:0::/root:/bin/sh\nscanhub:x:998:998::/:/bin/false\n");
+            for (pid, uid, words) in processes {
+                put(&format!("proc/{pid}/comm"), "scanhub\n");
+                put(&format!("proc/{pid}/status"), &format!("Uid:\t{uid}\t{uid}\t{uid}\t{uid}\n"));
+                put(&format!("proc/{pid}/cmdline"), &format!("scanhub\0{}\0", words.replace(' ', "\0")));
+            }
+            let hubs = RunningHub::all(&root);
+            assert_eq!(hubs.len(), processes.len());
+            hubs
+        };
+        let caller = Environment { uid: 1000, ..Environment::default() };
+        let places = Domain::candidates("scanhub", None, &caller).unwrap();
+        let said = |hubs: &[RunningHub], denied| {
+            let failure = no_hub(&places, denied, hubs, &caller);
+            assert_eq!(failure.kind, Kind::NoHub);
+            (failure.message, failure.hint)
+        };
+        let (message, hint) = said(&hubs(&[]), None);
+        assert_eq!(message, "no hub in domain scanhub");
+        assert!(hint.starts_with("start one with `scanhub run`; looked at /run/scanhub/scanhub, "), "{hint}");
+
+        let (message, hint) = said(&hubs(&[(7, 0, "run --link front=/dev/ttyUSB0")]), None);
+        assert_eq!(message, "no hub of this user in domain scanhub");
+        assert!(hint.starts_with("user root runs one, process 7: sudo scanhub list; "), "{hint}");
+        assert!(hint.contains("docs/sharing.md") && !hint.contains("start one"), "{hint}");
+
+        // The service's directory cannot be opened.
+        let denied = Failure::new(Kind::Failed, "/run/scanhub belongs to user 998", "choose another --root");
+        let (message, hint) = said(&hubs(&[(7, 998, "run")]), Some(&denied));
+        assert!(message.ends_with("in domain scanhub: /run/scanhub belongs to user 998"), "{message}");
+        assert!(
+            hint.starts_with("user scanhub runs one, process 7: sudo -u scanhub scanhub list; "),
+            "{hint}"
+        );
+        assert_eq!(said(&hubs(&[]), Some(&denied)).1, denied.hint);
+
+        let (message, hint) =
+            said(&hubs(&[(7, 1000, "run --domain lab"), (8, 0, "replay --domain x a")]), None);
+        assert_eq!(message, "no hub in domain scanhub");
+        let own = "this user runs one in domain lab, process 7: scanhub list --domain lab; ";
+        let root_s =
+            "user root runs one in domain x, process 8: sudo scanhub list --domain x; start one with ";
+        assert!(hint.starts_with(&[own, root_s].concat()), "{hint}");
+
+        let many: Vec<_> = (1..6).map(|pid| (pid, 1000, "run --domain lab")).collect();
+        assert!(said(&hubs(&many), None).1.contains("; 2 more hubs run; start one"));
+        std::fs::remove_dir_all(&root).unwrap();
     }
 
     #[test]

@@ -97,7 +97,7 @@ def candidates(name: str | None = None, base: str | os.PathLike[str] | None = No
             what = f"domain {name} at {domain.root} is too long: root and prefix have {_length(domain)} bytes"
             raise Impossible(f"{what}, at most {_LIMIT - 1} are possible", "choose a shorter root or domain")
         return [domain]
-    bases = [place for place in (_service(), "/run/scanhub", _user(), _fallback()) if place]
+    bases = [place for place in (_service(), "/run/scanhub", _session(), _fallback()) if place]
     domains = [_at(name, base) for base in dict.fromkeys(bases)]
     return [domain for domain in domains if _fits(domain)]
 
@@ -128,6 +128,11 @@ def _user() -> str | None:
     """The place of a user who has logged in."""
     user = _of_environment("XDG_RUNTIME_DIR")
     return user and os.path.join(user, "scanhub")
+
+
+def _session() -> str:
+    """The place of a user, which clients find outside of the login session too, such as under sudo, ssh or cron."""
+    return _user() or f"/run/user/{os.getuid()}/scanhub"
 
 
 def _fallback() -> str:

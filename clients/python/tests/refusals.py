@@ -47,7 +47,9 @@ def places_in_their_order() -> None:
     variables = ("SCANHUB_DOMAIN", "RUNTIME_DIRECTORY", "XDG_RUNTIME_DIR")
     before = {name: os.environ.pop(name, None) for name in variables}
     fallback = f"/tmp/scanhub-{os.getuid()}"
-    assert [place.root for place in names.candidates()] == ["/run/scanhub/scanhub", f"{fallback}/scanhub"]
+    session = f"/run/user/{os.getuid()}/scanhub"
+    expected = ["/run/scanhub/scanhub", f"{session}/scanhub", f"{fallback}/scanhub"]
+    assert [place.root for place in names.candidates()] == expected
     os.environ.update(SCANHUB_DOMAIN="a", RUNTIME_DIRECTORY="/run/one:/run/two", XDG_RUNTIME_DIR="/run/user/7")
     expected = ["/run/one/a", "/run/scanhub/a", "/run/user/7/scanhub/a", f"{fallback}/a"]
     assert [place.root for place in names.candidates()] == expected

@@ -329,7 +329,7 @@ impl<'a> Run<'a> {
                 }
                 if !self.waiting_said {
                     self.waiting_said = true;
-                    self.notice(sink, Notice::HubGone)?;
+                    self.notice(sink, Notice::NoHub(self.session.no_hub()))?;
                 }
             }
             Some(seen) if now - seen >= GRACE => self.check_sensors(sink)?,

@@ -120,7 +120,7 @@ impl Forwarder {
         }
         if !self.discovery.has_begun() && !self.waiting_said && now - self.started >= GRACE {
             self.waiting_said = true;
-            tell(Notice::HubGone)?;
+            tell(Notice::NoHub(self.session.no_hub()))?;
         }
         Ok(self.discover(now, carrier)?)
     }

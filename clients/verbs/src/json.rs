@@ -233,7 +233,7 @@ pub(crate) fn status<'a>(sensor: &'a str, status: &'a Status) -> impl Serialize 
 }
 
 /// Class `notice`: a line for each of `names`, or one without a name.
-pub(crate) fn notices(output: &mut Output<'_>, names: &[&TopicName], notice: Notice) -> Result<(), End> {
+pub(crate) fn notices(output: &mut Output<'_>, names: &[&TopicName], notice: &Notice) -> Result<(), End> {
     #[derive(Serialize)]
     struct Line<'a> {
         class: &'static str,
@@ -241,19 +241,22 @@ pub(crate) fn notices(output: &mut Output<'_>, names: &[&TopicName], notice: Not
         sensor: Option<&'a str>,
         topic: Option<&'static str>,
         missed: u64,
+        #[serde(skip_serializing_if = "Option::is_none")]
+        hint: Option<&'a str>,
     }
-    let (kind, missed) = match notice {
-        Notice::Missed(missed) => ("missed", missed),
-        Notice::Stale => ("stale", 0),
-        Notice::HubGone => ("hub_gone", 0),
-        Notice::HubBack => ("hub_back", 0),
+    let (kind, missed, hint) = match notice {
+        Notice::Missed(missed) => ("missed", *missed, None),
+        Notice::Stale => ("stale", 0, None),
+        Notice::NoHub(failure) => ("hub_gone", 0, Some(failure.hint.as_str())),
+        Notice::HubGone => ("hub_gone", 0, None),
+        Notice::HubBack => ("hub_back", 0, None),
     };
     if names.is_empty() {
-        return output.json(&Line { class: "notice", kind, sensor: None, topic: None, missed });
+        return output.json(&Line { class: "notice", kind, sensor: None, topic: None, missed, hint });
     }
     names.iter().try_for_each(|name| {
         let (sensor, topic) = (Some(name.sensor.as_str()), Some(name.topic.name()));
-        output.json(&Line { class: "notice", kind, sensor, topic, missed })
+        output.json(&Line { class: "notice", kind, sensor, topic, missed, hint })
     })
 }
 

@@ -286,10 +286,10 @@ impl Sink for Board<'_> {
             return Ok(());
         }
         if self.look == LedsLook::Json {
-            return json::notices(&mut self.out, names, notice);
+            return json::notices(&mut self.out, names, &notice);
         }
         self.wipe()?;
-        self.notes.line(|line| text::notice(line, names, notice))?;
+        self.notes.line(|line| text::notice(line, names, &notice))?;
         match self.look {
             LedsLook::Terminal { .. } => self.draw(),
             LedsLook::Json | LedsLook::Lines => Ok(()),

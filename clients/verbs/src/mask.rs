@@ -169,7 +169,7 @@ impl Sink for Look<'_> {
             return Err(Failure::new(Kind::Failed, "the hub went away", "try again when it is back").into());
         }
         (self.progress)(None);
-        self.notes.line(|line| text::notice(line, names, notice))
+        self.notes.line(|line| text::notice(line, names, &notice))
     }
 
     fn tick(&mut self, now: Instant) -> Result<(), End> {

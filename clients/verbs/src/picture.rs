@@ -73,12 +73,12 @@ pub(crate) fn take(scene: &mut Scene, name: &TopicName, sample: &Sample) {
 }
 
 /// Takes note of what went wrong in the streams of `names`.
-pub(crate) fn note(scene: &mut Scene, names: &[&TopicName], notice: Notice) {
+pub(crate) fn note(scene: &mut Scene, names: &[&TopicName], notice: &Notice) {
     match (notice, names) {
         (Notice::Missed(missed), [name]) if name.topic == Topic::Scan => {
-            scene.sensor(&name.sensor).lost += missed;
+            scene.sensor(&name.sensor).lost += *missed;
         }
-        (Notice::HubGone, _) => scene.hub_gone(),
+        (Notice::NoHub(_) | Notice::HubGone, _) => scene.hub_gone(),
         (Notice::HubBack, _) => scene.hub_lives = true,
         _ => {}
     }

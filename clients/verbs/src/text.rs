@@ -9,7 +9,7 @@ use std::fmt;
 use std::io::{self, Write};
 
 use scanhub_client::streams::Sample;
-use schema::{Flags, Header, PacketFacts, Reasons, Scan, Status, Telegram, in_degrees};
+use schema::{Failure, Flags, Header, PacketFacts, Reasons, Scan, Status, Telegram, in_degrees};
 
 use crate::follow::Notice;
 use crate::names::TopicName;
@@ -36,8 +36,11 @@ pub(crate) fn sample(line: &mut Vec<u8>, name: &TopicName, sample: &Sample) -> i
 }
 
 /// One notice, for stderr; news of the hub are the same for all streams.
-pub(crate) fn notice(line: &mut Vec<u8>, names: &[&TopicName], notice: Notice) -> io::Result<()> {
+pub(crate) fn notice(line: &mut Vec<u8>, names: &[&TopicName], notice: &Notice) -> io::Result<()> {
     match notice {
+        Notice::NoHub(Failure { message, hint, .. }) => {
+            return write!(line, "{message}, waiting for one: {hint}");
+        }
         Notice::HubGone => return write!(line, "no hub, waiting for one"),
         Notice::HubBack => return write!(line, "the hub is here"),
         Notice::Missed(_) | Notice::Stale => {}

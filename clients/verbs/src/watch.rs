@@ -167,8 +167,11 @@ impl Sink for Watcher<'_> {
     }
 
     fn notice(&mut self, names: &[&TopicName], notice: Notice) -> Result<(), End> {
-        picture::note(&mut self.scene, names, notice);
+        picture::note(&mut self.scene, names, &notice);
         self.changed = true;
+        if let Notice::NoHub(Failure { message, hint, .. }) = notice {
+            self.tell(format!("{message}: {hint}"), Instant::now());
+        }
         Ok(())
     }
 

@@ -78,9 +78,9 @@ impl<'a> Report<'a> {
             self.lost += missed;
         }
         if self.look == RecordLook::Json {
-            return json::notices(&mut self.out, names, notice);
+            return json::notices(&mut self.out, names, &notice);
         }
-        self.note(|line| text::notice(line, names, notice))
+        self.note(|line| text::notice(line, names, &notice))
     }
 
     /// News of the disk.

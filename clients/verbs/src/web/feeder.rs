@@ -304,8 +304,8 @@ impl Sink for Feeder<'_> {
     }
 
     fn notice(&mut self, names: &[&TopicName], notice: Notice) -> Result<(), End> {
-        picture::note(&mut self.scene, names, notice);
-        if notice == Notice::HubGone {
+        picture::note(&mut self.scene, names, &notice);
+        if notice.is_without_hub() {
             self.clear();
             self.status_at = Instant::now();
         }

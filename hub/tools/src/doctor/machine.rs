@@ -11,7 +11,7 @@ use rustix::process::{Resource, getrlimit, getuid};
 use schema::ipc::Nodes;
 use schema::limits::TopicLimits;
 use schema::shortage::SHARED_MEMORY;
-use schema::{Domain, Failure};
+use schema::{Domain, Environment, Failure, RunningHub};
 
 use super::finding::Finding;
 use super::hub::Hub;
@@ -42,6 +42,8 @@ pub(crate) struct Facts {
     pub(crate) others: Vec<(PathBuf, u32)>,
     /// Such places that are another user's, with whose they are.
     pub(crate) closed: Vec<(PathBuf, u32)>,
+    /// Hubs of the same name that other users run.
+    pub(crate) foreign: Vec<RunningHub>,
     /// Processes at the domain's place, and the dead ones at others where no hub is.
     pub(crate) nodes: Result<Nodes, Failure>,
     /// Files in shared memory that may be the domain's and that nobody holds.
@@ -114,6 +116,10 @@ impl Facts {
             closed: elsewhere()
                 .filter(|place| schema::holder(place.root()).is_err())
                 .filter_map(|place| Some((place.root().to_owned(), owner(place)?)))
+                .collect(),
+            foreign: RunningHub::all(Path::new("/"))
+                .into_iter()
+                .filter(|hub| hub.uid != user && hub.domain == domain.name())
                 .collect(),
             nodes,
             segments: if is_empty { segments::abandoned(&domain.prefix(), user) } else { Vec::new() },
@@ -241,6 +247,12 @@ pub(crate) fn hubs(facts: &Facts, name_of: impl Fn(u32) -> String) -> Finding {
                 "; only user {owner} can see what runs at {root}: sudo -u {owner} scanhub doctor; {SHARING}"
             );
         }
+        let is_said = |hub: &&RunningHub| facts.closed.iter().any(|(_, owner)| *owner == hub.uid);
+        for hub in facts.foreign.iter().filter(|hub| !is_said(hub)) {
+            let RunningHub { pid, user, .. } = hub;
+            let command = hub.command("doctor", &facts.name, &Environment::of_process());
+            text += &format!("; user {user} runs one, process {pid}: {command}");
+        }
         return Finding::ok(NAME, text);
     }
     Finding::warning(
@@ -276,6 +288,7 @@ pub(super) mod tests {
 
     use super::*;
     use crate::doctor::finding::State;
+    use crate::doctor::system::tests::Laid;
 
     const ROOMY: Memory = Memory { size: 64 << 20, free: 60 << 20, free_files: None, is_read_only: false };
 
@@ -292,6 +305,7 @@ pub(super) mod tests {
             is_stopped: false,
             others: Vec::new(),
             closed: Vec::new(),
+            foreign: Vec::new(),
             nodes: Ok(Nodes::default()),
             segments: Vec::new(),
             lock: None,
@@ -355,6 +369,16 @@ pub(super) mod tests {
         says(&hubs(&facts()), State::Ok, &["scanhub"]);
         let closed = Facts { closed: vec![("/run/scanhub/scanhub".into(), 8)], ..facts() };
         says(&hubs(&closed), State::Ok, &["/run/scanhub/scanhub", "sudo -u u8 scanhub doctor"]);
+        let files = [
+            ("etc/passwd", "robot:x:9:9::/:\n"),
+            ("proc/41/comm", "scanhub\n"),
+            ("proc/41/status", "Uid:\t9\t9\t9\t9\n"),
+            ("proc/41/cmdline", "scanhub\0run\0"),
+        ];
+        let laid = Laid::out("foreign-hub", 7, &files);
+        let foreign = Facts { foreign: RunningHub::all(&laid.path("")), ..facts() };
+        let command = "user robot runs one, process 41: sudo -u robot scanhub doctor";
+        says(&hubs(&foreign), State::Ok, &["no other hub", command]);
         let two = Facts { others: vec![("/tmp/scanhub-7/scanhub".into(), 9)], ..facts() };
         says(&hubs(&two), State::Warning, &["/tmp/scanhub-7/scanhub (process 9)", "--domain"]);
     }

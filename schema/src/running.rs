@@ -1,0 +1,257 @@
+//! Finds the hubs that run on this machine under any user, as /proc shows them. Shared memory is for one user, so a client
+//! of another user finds no hub. Its message then names the user whose hub runs, and the command that reaches it.
+
+use std::ffi::OsStr;
+use std::fs;
+use std::os::unix::ffi::OsStrExt;
+use std::path::{Path, PathBuf};
+
+use crate::{DEFAULT_DOMAIN, Environment};
+
+/// A process that runs a hub: `scanhub run` or `scanhub replay`.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct RunningHub {
+    /// Process ID.
+    pub pid: u32,
+    /// ID of the user that it runs as.
+    pub uid: u32,
+    /// Name of that user; `#` and the ID, as `sudo -u` takes it, if the user has no name.
+    pub user: String,
+    /// Domain of the hub.
+    pub domain: String,
+    /// Directory that contains its domain. `None` if only its environment says, which other users cannot read.
+    base: Option<PathBuf>,
+    /// The program, as it was started.
+    program: String,
+}
+
+impl RunningHub {
+    /// Returns the hubs on the machine whose files are below `root`, by process ID. Processes that this user may not see
+    /// are missing.
+    pub fn all(root: &Path) -> Vec<RunningHub> {
+        let users = fs::read_to_string(root.join("etc/passwd")).unwrap_or_default();
+        let processes = fs::read_dir(root.join("proc")).into_iter().flatten().flatten();
+        let mut hubs: Vec<RunningHub> = processes
+            .filter_map(|process| {
+                let pid = process.file_name().to_str()?.parse().ok()?;
+                RunningHub::of_process(&process.path(), pid, &users)
+            })
+            .collect();
+        hubs.sort_by_key(|hub| hub.pid);
+        hubs
+    }
+
+    /// Returns the hub that the process at `path` runs.
+    fn of_process(path: &Path, pid: u32, users: &str) -> Option<RunningHub> {
+        let text = |name: &str| fs::read_to_string(path.join(name)).ok();
+        if text("comm")?.trim_end() != "scanhub" {
+            return None;
+        }
+        let command_line = fs::read(path.join("cmdline")).ok()?;
+        let command = CommandLine::parse(&command_line)?;
+        let uid = text("status")?.lines().find_map(|line| line.strip_prefix("Uid:"))?.to_owned();
+        let uid: u32 = uid.split_whitespace().next()?.parse().ok()?;
+        let entry = users.lines().find(|line| line.split(':').nth(2) == Some(&uid.to_string()));
+        let user = entry.and_then(|entry| entry.split(':').next());
+        let user = user.map_or_else(|| format!("#{uid}"), str::to_owned);
+        let environment = fs::read(path.join("environ")).unwrap_or_default();
+        let variable = |name: &str| {
+            let mut all = environment.split(|&byte| byte == 0);
+            let value = all.find_map(|entry| entry.strip_prefix(name.as_bytes())?.strip_prefix(b"="))?;
+            (!value.is_empty()).then(|| OsStr::from_bytes(value).to_owned())
+        };
+        let directory = |name: &str| crate::domain::first_path(variable(name)?);
+        let base = match command.root {
+            // A relative one counts from the process's working directory, which other users cannot read.
+            Some(root) => Some(fs::read_link(path.join("cwd")).map_or(root.clone(), |cwd| cwd.join(root))),
+            None if environment.is_empty() => None,
+            None => Some(
+                Environment {
+                    runtime_directory: directory("RUNTIME_DIRECTORY"),
+                    xdg_runtime_dir: directory("XDG_RUNTIME_DIR"),
+                    uid,
+                }
+                .base_of_hub(),
+            ),
+        };
+        let domain = command.domain.or_else(|| variable("SCANHUB_DOMAIN")?.into_string().ok());
+        Some(RunningHub {
+            pid,
+            uid,
+            user,
+            domain: domain.unwrap_or_else(|| DEFAULT_DOMAIN.to_owned()),
+            base,
+            program: command.program,
+        })
+    }
+
+    /// Returns the command with which the user of `caller` runs `verb` in the domain of this hub. `domain` is the one that
+    /// the caller has asked for.
+    pub fn command(&self, verb: &str, domain: &str, caller: &Environment) -> String {
+        // sudo resets the environment of the command.
+        let (sudo, environment, domain) = if self.uid == caller.uid {
+            (String::new(), caller.clone(), domain)
+        } else {
+            let sudo =
+                if self.uid == 0 { "sudo ".to_owned() } else { format!("sudo -u {} ", quoted(&self.user)) };
+            (sudo, Environment { uid: self.uid, ..Environment::default() }, DEFAULT_DOMAIN)
+        };
+        let mut command = format!("{sudo}{} {verb}", quoted(&self.program));
+        if self.domain != domain {
+            command += &format!(" --domain {}", self.domain);
+        }
+        if let Some(base) = self.base.as_ref().filter(|base| !environment.bases().contains(base)) {
+            command += &format!(" --root {}", quoted(&base.to_string_lossy()));
+        }
+        command
+    }
+}
+
+/// Command line of a hub.
+#[derive(Debug, Default, PartialEq, Eq)]
+struct CommandLine {
+    program: String,
+    domain: Option<String>,
+    root: Option<PathBuf>,
+}
+
+impl CommandLine {
+    /// Parses `/proc/PID/cmdline`; `None` if it does not start a hub.
+    fn parse(bytes: &[u8]) -> Option<CommandLine> {
+        let text = bytes.strip_suffix(&[0]).unwrap_or(bytes);
+        let mut words = text.split(|&byte| byte == 0).map(|word| String::from_utf8_lossy(word));
+        let program = Path::new(&*words.next()?).to_owned();
+        // A program on the usual path needs no directory.
+        let is_usual =
+            program.parent().is_some_and(|directory| USUAL.iter().any(|usual| directory == Path::new(usual)));
+        let name = if is_usual { program.file_name()?.into() } else { program.into_os_string() };
+        let mut command = CommandLine { program: name.into_string().ok()?, ..CommandLine::default() };
+        let mut verb = None;
+        while let Some(word) = words.next() {
+            let (flag, mut value) = match word.split_once('=') {
+                Some((flag, value)) => (flag, Some(value.to_owned())),
+                None => (&*word, None),
+            };
+            if ["--domain", "--root"].contains(&flag) && value.is_none() {
+                value = words.next().map(|value| value.into_owned());
+            }
+            match flag {
+                "--domain" => command.domain = value,
+                "--root" => command.root = value.map(PathBuf::from),
+                _ if !word.starts_with('-') && verb.is_none() => verb = Some(word.into_owned()),
+                _ => {}
+            }
+        }
+        ["run", "replay"].contains(&verb?.as_str()).then_some(command)
+    }
+}
+
+/// Returns `word` as a shell takes it.
+fn quoted(word: &str) -> String {
+    let is_plain = |c: char| c.is_ascii_alphanumeric() || "-_./:@+,".contains(c);
+    if !word.is_empty() && word.chars().all(is_plain) {
+        return word.to_owned();
+    }
+    format!("'{}'", word.replace('\'', r"'\''"))
+}
+
+/// Directories that sudo looks for programs in (sudoers(5), `secure_path`).
+const USUAL: [&str; 6] = ["/usr/local/sbin", "/usr/local/bin", "/usr/sbin", "/usr/bin", "/sbin", "/bin"];
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const PASSWD: &str = "root:x:0:0:root:/root:/bin/sh\nscanhub:x:998:997::/:/usr/sbin/nologin\nalice:x:1000:1000::/home/alice:/bin/sh\n";
+
+    /// A made-up machine that is removed with the value.
+    struct Machine(PathBuf);
+
+    impl Machine {
+        fn new(test: &str) -> Machine {
+            let root = std::env::temp_dir().join(format!("scanhub-running-{test}-{}", std::process::id()));
+            fs::create_dir_all(root.join("etc")).unwrap();
+            fs::write(root.join("etc/passwd"), PASSWD).unwrap();
+            Machine(root)
+        }
+
+        /// Adds a process; other users cannot read an environment of `None`.
+        fn process(&self, pid: u32, uid: u32, command: &[&str], environment: Option<&str>) {
+            let path = self.0.join(format!("proc/{pid}"));
+            fs::create_dir_all(&path).unwrap();
+            let program = command.first().and_then(|program| program.rsplit('/').next()).unwrap_or("sh");
+            fs::write(path.join("comm"), format!("{program}\n")).unwrap();
+            fs::write(path.join("status"), format!("Name:\t{program}\nUid:\t{uid}\t{uid}\t{uid}\t{uid}\n"))
+                .unwrap();
+            let words: Vec<u8> = command.iter().flat_map(|word| [word.as_bytes(), &[0]].concat()).collect();
+            fs::write(path.join("cmdline"), words).unwrap();
+            if let Some(environment) = environment {
+                fs::write(path.join("environ"), environment.replace(' ', "\0")).unwrap();
+            }
+        }
+    }
+
+    impl Drop for Machine {
+        fn drop(&mut self) {
+            let _ = fs::remove_dir_all(&self.0);
+        }
+    }
+
+    fn user(uid: u32) -> Environment {
+        Environment {
+            uid,
+            xdg_runtime_dir: Some(format!("/run/user/{uid}").into()),
+            ..Environment::default()
+        }
+    }
+
+    #[test]
+    fn finds_hubs_of_all_users() {
+        let machine = Machine::new("all");
+        machine.process(10, 0, &["sudo", "scanhub", "run"], None);
+        machine.process(11, 0, &["scanhub", "run", "--link", "front=/dev/ttyUSB0"], None);
+        machine.process(12, 998, &["/usr/local/bin/scanhub", "--json", "run"], None);
+        machine.process(13, 1000, &["./scanhub", "--domain", "lab", "replay", "a.mcap"], None);
+        machine.process(14, 1000, &["scanhub", "list"], None);
+        machine.process(15, 1000, &["scanhub", "echo", "run"], None);
+        machine.process(16, 0, &[], None);
+        let hubs = RunningHub::all(&machine.0);
+        let found: Vec<_> =
+            hubs.iter().map(|hub| (hub.pid, hub.user.as_str(), hub.domain.as_str())).collect();
+        assert_eq!(found, [(11, "root", "scanhub"), (12, "scanhub", "scanhub"), (13, "alice", "lab")]);
+        assert_eq!(RunningHub::all(Path::new("/nowhere")), []);
+    }
+
+    #[test]
+    fn names_the_command_that_reaches_a_hub() {
+        let command = |uid, words: &[&str], environment: Option<&str>, caller: u32| {
+            let machine =
+                Machine::new(&format!("command-{uid}-{caller}-{}", words.join("").replace('/', "_")));
+            machine.process(7, uid, words, environment);
+            let [hub] = &RunningHub::all(&machine.0)[..] else { panic!("one hub") };
+            hub.command("list", "scanhub", &user(caller))
+        };
+        let run = ["scanhub", "run"];
+        assert_eq!(command(0, &run, None, 1000), "sudo scanhub list");
+        assert_eq!(
+            command(998, &["/usr/local/bin/scanhub", "run"], None, 1000),
+            "sudo -u scanhub scanhub list"
+        );
+        assert_eq!(command(1000, &run, None, 1001), "sudo -u alice scanhub list");
+        assert_eq!(command(65_531, &run, None, 0), "sudo -u '#65531' scanhub list");
+        // Root can read where the hub is: sudo does not pass the variable on, and a client looks there anyway.
+        let logged_in = Some("HOME=/home/alice XDG_RUNTIME_DIR=/run/user/1000");
+        assert_eq!(command(1000, &run, logged_in, 0), "sudo -u alice scanhub list");
+        let elsewhere = Some("XDG_RUNTIME_DIR=/run/user/1000 SCANHUB_DOMAIN=lab");
+        assert_eq!(
+            command(0, &run, elsewhere, 1000),
+            "sudo scanhub list --domain lab --root /run/user/1000/scanhub"
+        );
+        let flags = ["/opt/scanhub", "run", "--root=/srv/a b", "--domain=lab"];
+        assert_eq!(command(0, &flags, None, 1000), "sudo /opt/scanhub list --domain lab --root '/srv/a b'");
+        assert_eq!(
+            command(1000, &["scanhub", "run", "--domain", "lab"], logged_in, 1000),
+            "scanhub list --domain lab"
+        );
+    }
+}
