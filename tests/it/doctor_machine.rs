@@ -78,6 +78,12 @@ fn well_kept(env: &TestEnv) -> Findings {
 
 /// What is found on the machine below the environment's directory `machine`, for the user 1000.
 fn laid_out(env: &TestEnv) -> Findings {
+    // The ports of this machine are unknown to a test.
+    with_ports(env).of_machine().without(&["ports", "multicast"])
+}
+
+/// All findings, including the ports of this machine and the adapters of the made-up one.
+fn with_ports(env: &TestEnv) -> Findings {
     let subjects = Subjects {
         ports: Vec::new(),
         config: None,
@@ -91,9 +97,37 @@ fn laid_out(env: &TestEnv) -> Findings {
     let mut lines = Vec::new();
     let mut tell =
         |finding: &tools::doctor::Finding| lines.push(serde_json::to_value(finding).expect("is JSON"));
-    // Of this machine's ports no test knows anything.
     let _ = examine(&subjects, &AtomicBool::new(false), &mut tell);
-    Findings::in_lines(lines).of_machine().without(&["ports", "multicast"])
+    Findings::in_lines(lines)
+}
+
+#[test]
+fn names_what_keeps_an_adapter_from_having_a_port() {
+    let env = TestEnv::new();
+    let put = |path: &str, text: &str| {
+        let path = env.path("machine").join(path);
+        fs::create_dir_all(path.parent().expect("a directory")).expect("can be created");
+        fs::write(path, text).expect("can be written");
+    };
+    put("sys/bus/usb/devices/1-1/idVendor", "1a86\n");
+    put("sys/bus/usb/devices/1-1/idProduct", "7523\n");
+    let ports = || {
+        let findings = with_ports(&env);
+        // It is a failure only where this machine has no port to examine.
+        let (state, finding) = findings.said("ports");
+        assert!(["warning", "failed"].contains(&state), "{state}");
+        (state.to_owned(), finding.to_owned(), findings)
+    };
+    let (state, finding, findings) = ports();
+    assert!(
+        finding.contains("(CH340, 1a86:7523) has no port: the kernel module ch341 is not loaded"),
+        "{finding}"
+    );
+    findings.complain("an adapter without its module", "ports", &state, "sudo modprobe ch341");
+    put("proc/812/comm", "brltty\n");
+    let (state, finding, findings) = ports();
+    assert!(finding.contains("brltty, process 812"), "{finding}");
+    findings.complain("an adapter that brltty takes away", "ports", &state, "sudo apt remove brltty");
 }
 
 #[test]

@@ -1,5 +1,7 @@
 //! Reads all sources of a configuration into the values in effect; the last one wins.
 
+use std::path::Path;
+
 use port::Source;
 use schema::{Failure, Kind};
 
@@ -49,10 +51,22 @@ fn check_ports(links: &[Link]) -> Result<(), Failure> {
                 (one, another) => format!("{one} is {another}"),
             };
             let message = format!("links {} and {} have the same port: {names}", other.name, link.name);
-            return Err(Failure::new(Kind::Configuration, message, "name the port of each sensor"));
+            let is_by_id = |port: &Source| matches!(port, Source::Tty(path) if is_by_serial_number(path));
+            let hint = if other.port != link.port && (is_by_id(&other.port) || is_by_id(&link.port)) {
+                "adapters with the same serial number share their name in by-id: use the names in /dev/serial/by-path, which \
+                 scanhub probe lists"
+            } else {
+                "name the port of each sensor"
+            };
+            return Err(Failure::new(Kind::Configuration, message, hint));
         }
     }
     Ok(())
+}
+
+/// Returns whether udev has made the name of an adapter's serial number.
+fn is_by_serial_number(path: &Path) -> bool {
+    path.parent().is_some_and(|parent| parent.ends_with("serial/by-id"))
 }
 
 impl Gateway {
@@ -199,10 +213,33 @@ mod tests {
         let moved = refusal(&["link.b.port=/dev/x"], &["a=/dev/x", "b=/dev/y"]);
         assert!(refusal(&[], &["a=tcp:h:1", "b=tcp:h:1"]).contains("have the same port: tcp:h:1"));
         std::fs::remove_file(&own).unwrap();
+        assert!(named.ends_with("name the port of each sensor"), "{named}");
         assert!(twice.starts_with("links a and c have the same port: /dev/x\n"), "{twice}");
         assert!(named.contains(&format!("same port: /dev/null is {}\n", own.display())), "{named}");
         assert!(moved.starts_with("links a and b have the same port: /dev/x\n"), "{moved}");
         assert!(Config::load(&sources(&[], &["a=file:x", "b=file:x", "c=tcp:h:1", "d=tcp:h:2"])).is_ok());
+    }
+
+    #[test]
+    fn adapters_with_one_serial_number_need_names_by_path() {
+        let root = std::env::temp_dir().join(format!("scanhub-twins-{}", std::process::id()));
+        let [by_id, by_path] = ["by-id", "by-path"].map(|kind| root.join("serial").join(kind));
+        for directory in [&by_id, &by_path] {
+            std::fs::create_dir_all(directory).unwrap();
+        }
+        let [first, second, shared] = [by_path.join("first"), by_path.join("second"), by_id.join("shared")];
+        std::os::unix::fs::symlink("/dev/null", &first).unwrap();
+        std::os::unix::fs::symlink("/dev/zero", &second).unwrap();
+        // Since the restart, the shared name stands for the second adapter.
+        std::os::unix::fs::symlink("/dev/zero", &shared).unwrap();
+        let links =
+            |front: &Path| [format!("front={}", front.display()), format!("rear={}", second.display())];
+        let load = |links: [String; 2]| Config::load(&Sources { links: links.into(), ..Sources::default() });
+        let refusal = load(links(&shared)).unwrap_err();
+        let by_socket = load(links(&first)).map(|config| config.links.len());
+        std::fs::remove_dir_all(&root).unwrap();
+        assert!(refusal.hint.contains("use the names in /dev/serial/by-path"), "{refusal}");
+        assert_eq!(by_socket, Ok(2));
     }
 
     #[test]

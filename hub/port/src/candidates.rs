@@ -13,10 +13,14 @@ use super::holder::{Holder, holders};
 /// A serial line of this machine.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Candidate {
-    /// The permanent name, if there is one: below `/dev/serial`, else the device.
+    /// Permanent name: the one below `/dev/serial/by-id` unless another adapter shares it, otherwise the one below
+    /// `/dev/serial/by-path`, otherwise the device.
     pub name: PathBuf,
     /// The device itself.
     pub device: PathBuf,
+    /// Name below `/dev/serial/by-id` that this adapter shares with another one, because both have the same serial number or
+    /// none. It stands for one of them, and for the other one perhaps after a restart.
+    pub shared_name: Option<PathBuf>,
     /// Its driver, such as `ftdi_sio`.
     pub driver: Option<String>,
     /// Maker and product, as its adapter reports them.
@@ -25,6 +29,24 @@ pub struct Candidate {
     pub holder: Option<Holder>,
     /// Whether this user may open it.
     pub is_permitted: bool,
+}
+
+impl Candidate {
+    /// Returns what a user should know before naming the port `path`, and what to do about it.
+    pub fn caution(&self, path: &Path) -> Option<(String, String)> {
+        if self.device.ends_with(PI_5_DEBUG) {
+            let what = "the debug connector of a Raspberry Pi 5, not pins 8 and 10 of its header: /dev/serial0 names it by default";
+            let remedy = "for a scanner at pins 8 and 10, put dtparam=uart0=on into /boot/firmware/config.txt, restart, and use \
+                          /dev/ttyAMA0";
+            return Some((what.to_owned(), remedy.to_owned()));
+        }
+        let shared = self.shared_name.as_ref().filter(|shared| *shared == path)?.display();
+        let what = format!(
+            "two adapters with the same serial number, or without one, share {shared}: after a restart, it may name the other \
+             one"
+        );
+        Some((what, format!("use the name {}, which belongs to the USB socket", self.name.display())))
+    }
 }
 
 impl fmt::Display for Candidate {
@@ -51,10 +73,17 @@ pub fn candidates() -> Vec<Candidate> {
 
 /// The serial lines in `sys` and `dev` below `root`.
 pub fn found_in(root: &Path) -> Vec<Candidate> {
-    let stable: Vec<(PathBuf, PathBuf)> = ["by-id", "by-path"]
+    // Names with the devices that they stand for.
+    let [by_id, by_path] = ["by-id", "by-path"].map(|kind| -> Vec<(PathBuf, PathBuf)> {
+        let names = entries(&root.join("dev/serial").join(kind)).into_iter();
+        names.filter_map(|name| Some((name.canonicalize().ok()?, name))).collect()
+    });
+    let identities: Vec<(PathBuf, Vec<String>)> = entries(&root.join("sys/class/tty"))
         .iter()
-        .flat_map(|kind| entries(&root.join("dev/serial").join(kind)))
-        .filter_map(|name| Some((name.canonicalize().ok()?, name)))
+        .filter_map(|class| {
+            let device = root.join("dev").join(class.file_name()?);
+            Some((device, identity_of(&class.join("device").canonicalize().ok()?)?))
+        })
         .collect();
     let mut found: Vec<Candidate> = entries(&root.join("sys/class/tty"))
         .iter()
@@ -65,9 +94,18 @@ pub fn found_in(root: &Path) -> Vec<Candidate> {
             if word(&class.join("type")).as_deref() == Some("0") || !device.exists() {
                 return None;
             }
-            let name = stable.iter().find(|(real, _)| *real == device).map(|(_, name)| name);
+            let own = identities.iter().find(|(other, _)| *other == device).map(|(_, identity)| identity);
+            let same = identities.iter().filter(|(_, identity)| Some(identity) == own);
+            let twins: Vec<&PathBuf> = same.map(|(device, _)| device).collect();
+            let is_shared = twins.len() > 1;
+            let named = |names: &[(PathBuf, PathBuf)]| {
+                names.iter().find(|(real, _)| *real == device).map(|(_, name)| name.clone())
+            };
+            let shared_name = by_id.iter().find(|(real, _)| is_shared && twins.contains(&real));
+            let name = if is_shared { None } else { named(&by_id) };
             Some(Candidate {
-                name: name.unwrap_or(&device).clone(),
+                name: name.or_else(|| named(&by_path)).unwrap_or_else(|| device.clone()),
+                shared_name: shared_name.map(|(_, name)| name.clone()),
                 driver: driver_of(&hardware),
                 product: product_of(&hardware),
                 device,
@@ -114,9 +152,25 @@ fn driver_of(hardware: &Path) -> Option<String> {
     Some(driver.file_name()?.to_string_lossy().into_owned())
 }
 
+/// Returns the USB device that `hardware` belongs to.
+fn usb_of(hardware: &Path) -> Option<&Path> {
+    hardware.ancestors().find(|directory| directory.join("idVendor").exists())
+}
+
+/// Returns the properties from which udev derives the name below `/dev/serial/by-id` (60-serial.rules, usb_id): the IDs and
+/// strings of the USB device, its interface and the port. `None` if `hardware` is not a USB adapter.
+fn identity_of(hardware: &Path) -> Option<Vec<String>> {
+    let usb = usb_of(hardware)?;
+    let of_device =
+        ["idVendor", "idProduct", "manufacturer", "product", "serial"].map(|key| word(&usb.join(key)));
+    let interface = hardware.ancestors().find_map(|part| word(&part.join("bInterfaceNumber")));
+    let port = word(&hardware.join("port_number"));
+    Some(of_device.into_iter().chain([interface, port]).map(Option::unwrap_or_default).collect())
+}
+
 /// What the USB device above `hardware` calls itself.
 fn product_of(hardware: &Path) -> Option<String> {
-    let usb = hardware.ancestors().find(|directory| directory.join("idVendor").exists())?;
+    let usb = usb_of(hardware)?;
     let words = ["manufacturer", "product"].map(|key| word(&usb.join(key)));
     let words: Vec<String> = words.into_iter().flatten().collect();
     if words.is_empty() {
@@ -127,13 +181,13 @@ fn product_of(hardware: &Path) -> Option<String> {
 }
 
 /// What stands in a file, if anything does.
-fn word(path: &Path) -> Option<String> {
+pub(super) fn word(path: &Path) -> Option<String> {
     let text = fs::read_to_string(path).ok()?;
     let text = text.trim();
     (!text.is_empty()).then(|| text.to_owned())
 }
 
-fn entries(directory: &Path) -> Vec<PathBuf> {
+pub(super) fn entries(directory: &Path) -> Vec<PathBuf> {
     let mut paths: Vec<PathBuf> =
         fs::read_dir(directory).into_iter().flatten().flatten().map(|entry| entry.path()).collect();
     paths.sort();
@@ -142,38 +196,80 @@ fn entries(directory: &Path) -> Vec<PathBuf> {
 
 /// An adapter that collects bytes for longer blurs the stamps.
 pub const PROMPT_MS: u8 = 2;
+/// The first UART of the processor of a Raspberry Pi 5 (alias `serial10` in its device tree); only the debug connector has it.
+const PI_5_DEBUG: &str = "ttyAMA10";
 /// Majors of the ends of ptys that are opened by name (Linux, devices.txt).
 const UNIX98_PTYS: RangeInclusive<u32> = 136..=143;
 
 #[cfg(test)]
-mod tests {
+pub(super) mod tests {
     use super::*;
     use rustix::pty::{OpenptFlags, grantpt, openpt, ptsname};
     use std::os::unix::fs::symlink;
 
-    /// A machine with a USB adapter, a UART on the board, one that is not there, and a terminal without hardware.
-    fn machine(root: &Path) {
-        let directory = |path: &str| fs::create_dir_all(root.join(path)).unwrap();
-        let file = |path: &str, text: &str| fs::write(root.join(path), text).unwrap();
-        let link = |target: &str, path: &str| symlink(root.join(target), root.join(path)).unwrap();
-        for name in ["ttyUSB0", "ttyS0", "ttyS1", "tty1"] {
-            directory("dev/serial/by-id");
-            directory(&format!("sys/class/tty/{name}"));
-            file(&format!("dev/{name}"), "");
+    /// A made-up machine: files below a directory that is removed with the value.
+    pub(crate) struct Machine {
+        pub(crate) root: PathBuf,
+    }
+
+    impl Machine {
+        pub(crate) fn new(test: &str) -> Machine {
+            let root = std::env::temp_dir().join(format!("scanhub-machine-{test}-{}", std::process::id()));
+            fs::create_dir_all(&root).unwrap();
+            Machine { root: root.canonicalize().unwrap() }
         }
-        directory("sys/bus/ftdi_sio");
-        directory("sys/usb1/1-1/1-1:1.0/ttyUSB0");
-        file("sys/usb1/1-1/idVendor", "0403\n");
-        file("sys/usb1/1-1/manufacturer", "FTDI\n");
-        file("sys/usb1/1-1/product", "USB-RS422 Cable\n");
-        file("sys/usb1/1-1/1-1:1.0/ttyUSB0/latency_timer", "16\n");
-        link("sys/bus/ftdi_sio", "sys/usb1/1-1/1-1:1.0/ttyUSB0/driver");
-        link("sys/usb1/1-1/1-1:1.0/ttyUSB0", "sys/class/tty/ttyUSB0/device");
-        link("dev/ttyUSB0", "dev/serial/by-id/usb-FTDI_USB-RS422-if00-port0");
-        directory("sys/pnp");
-        for (name, kind) in [("ttyS0", "4\n"), ("ttyS1", "0\n")] {
-            link("sys/pnp", &format!("sys/class/tty/{name}/device"));
-            file(&format!("sys/class/tty/{name}/type"), kind);
+
+        pub(crate) fn directory(&self, path: &str) {
+            fs::create_dir_all(self.root.join(path)).unwrap();
+        }
+
+        pub(crate) fn file(&self, path: &str, text: &str) {
+            let path = self.root.join(path);
+            fs::create_dir_all(path.parent().unwrap()).unwrap();
+            fs::write(path, text).unwrap();
+        }
+
+        pub(crate) fn link(&self, target: &str, path: &str) {
+            let path = self.root.join(path);
+            fs::create_dir_all(path.parent().unwrap()).unwrap();
+            let _ = fs::remove_file(&path);
+            symlink(self.root.join(target), path).unwrap();
+        }
+
+        /// Plugs a USB device in at `place`, with one interface.
+        pub(crate) fn usb(&self, place: &str, id: &str, serial: &str) {
+            let (vendor, product) = id.split_once(':').unwrap();
+            let device = format!("sys/devices/usb1/{place}");
+            for (key, text) in [("idVendor", vendor), ("idProduct", product), ("serial", serial)] {
+                self.file(&format!("{device}/{key}"), &format!("{text}\n"));
+            }
+            self.file(&format!("{device}/{place}:1.0/bInterfaceNumber"), "00\n");
+            self.link(&device, &format!("sys/bus/usb/devices/{place}"));
+            self.link(&format!("{device}/{place}:1.0"), &format!("sys/bus/usb/devices/{place}:1.0"));
+        }
+
+        /// Adds the tty `name` that `driver` creates for the USB device at `place`.
+        pub(crate) fn tty(&self, name: &str, place: &str, driver: &str) {
+            let hardware = format!("sys/devices/usb1/{place}/{place}:1.0/{name}");
+            self.file(&format!("{hardware}/port_number"), "0\n");
+            self.directory(&format!("sys/bus/usb-serial/drivers/{driver}"));
+            self.link(&format!("sys/bus/usb-serial/drivers/{driver}"), &format!("{hardware}/driver"));
+            self.link(&hardware, &format!("sys/class/tty/{name}/device"));
+            self.file(&format!("dev/{name}"), "");
+        }
+
+        /// Adds a UART on the board, with the type that its driver found.
+        fn uart(&self, name: &str, kind: &str) {
+            self.directory("sys/devices/pnp");
+            self.link("sys/devices/pnp", &format!("sys/class/tty/{name}/device"));
+            self.file(&format!("sys/class/tty/{name}/type"), kind);
+            self.file(&format!("dev/{name}"), "");
+        }
+    }
+
+    impl Drop for Machine {
+        fn drop(&mut self) {
+            let _ = fs::remove_dir_all(&self.root);
         }
     }
 
@@ -192,20 +288,76 @@ mod tests {
 
     #[test]
     fn what_is_known_without_opening() {
-        let root = std::env::temp_dir().join(format!("scanhub-candidates-{}", std::process::id()));
-        fs::create_dir_all(&root).unwrap();
-        let root = root.canonicalize().unwrap();
-        machine(&root);
-        let found = found_in(&root);
-        let latency = latency_of(&root.join("sys/class/tty/ttyUSB0/device"));
-        fs::remove_dir_all(&root).unwrap();
+        let machine = Machine::new("known");
+        machine.usb("1-1", "0403:6001", "A1");
+        machine.file("sys/devices/usb1/1-1/manufacturer", "FTDI\n");
+        machine.file("sys/devices/usb1/1-1/product", "USB-RS422 Cable\n");
+        machine.tty("ttyUSB0", "1-1", "ftdi_sio");
+        machine.file("sys/devices/usb1/1-1/1-1:1.0/ttyUSB0/latency_timer", "16\n");
+        let by_id = "dev/serial/by-id/usb-FTDI_USB-RS422-if00-port0";
+        machine.link("dev/ttyUSB0", by_id);
+        machine.uart("ttyS0", "4\n");
+        // A UART that the board does not have, and a terminal without hardware.
+        machine.uart("ttyS1", "0\n");
+        machine.directory("sys/class/tty/tty1");
+        machine.file("dev/tty1", "");
+        let root = &machine.root;
+        let found = found_in(root);
         let [adapter, board] = &found[..] else { panic!("{found:?}") };
-        assert_eq!(adapter.name, root.join("dev/serial/by-id/usb-FTDI_USB-RS422-if00-port0"));
-        assert_eq!(adapter.device, root.join("dev/ttyUSB0"));
+        assert_eq!((&adapter.name, &adapter.device), (&root.join(by_id), &root.join("dev/ttyUSB0")));
         assert_eq!(adapter.driver.as_deref(), Some("ftdi_sio"));
-        assert_eq!(latency, Some(16));
+        assert_eq!(latency_of(&root.join("sys/class/tty/ttyUSB0/device")), Some(16));
         assert!(adapter.to_string().ends_with("port0 (FTDI USB-RS422 Cable)"), "{adapter}");
         assert_eq!((&board.name, &board.driver), (&root.join("dev/ttyS0"), &None));
         assert_eq!(board.to_string(), root.join("dev/ttyS0").display().to_string());
+        assert_eq!([adapter, board].map(|port| port.caution(&port.name)), [None, None]);
+    }
+
+    #[test]
+    fn two_adapters_with_one_serial_number_are_named_by_their_sockets() {
+        let machine = Machine::new("twins");
+        for (tty, place) in [("ttyUSB0", "1-1"), ("ttyUSB1", "1-2")] {
+            machine.usb(place, "10c4:ea60", "0001");
+            machine.tty(tty, place, "cp210x");
+            machine.link(
+                &format!("dev/{tty}"),
+                &format!("dev/serial/by-path/pci-0000:00:14.0-usb-0:{place}:1.0-port0"),
+            );
+        }
+        let by_id = "dev/serial/by-id/usb-Silicon_Labs_CP2102_0001-if00-port0";
+        // udev gives the name to one of them; after a restart, to the other one.
+        for owner in ["ttyUSB0", "ttyUSB1"] {
+            machine.link(&format!("dev/{owner}"), by_id);
+            let found = found_in(&machine.root);
+            let names: Vec<_> = found.iter().map(|candidate| candidate.name.file_name().unwrap()).collect();
+            assert_eq!(
+                names,
+                ["pci-0000:00:14.0-usb-0:1-1:1.0-port0", "pci-0000:00:14.0-usb-0:1-2:1.0-port0"]
+            );
+            for candidate in &found {
+                assert_eq!(candidate.shared_name, Some(machine.root.join(by_id)), "{owner}");
+                let (what, remedy) = candidate.caution(&machine.root.join(by_id)).unwrap();
+                assert_eq!(candidate.caution(&candidate.name), None);
+                assert!(what.contains("same serial number") && what.contains("_0001-if00"), "{what}");
+                assert!(remedy.contains("by-path/pci-0000:00:14.0-usb-0:1-"), "{remedy}");
+            }
+        }
+        // Different serial numbers give different names.
+        machine.usb("1-2", "10c4:ea60", "0002");
+        let found = found_in(&machine.root);
+        assert!(found.iter().all(|candidate| candidate.shared_name.is_none()), "{found:?}");
+        assert!(found.iter().any(|candidate| candidate.name == machine.root.join(by_id)), "{found:?}");
+    }
+
+    #[test]
+    fn the_debug_connector_of_a_raspberry_pi_5_is_named() {
+        let machine = Machine::new("pi");
+        machine.uart("ttyAMA10", "32\n");
+        machine.link("dev/ttyAMA10", "dev/serial0");
+        let found = found_in(&machine.root);
+        let [debug] = &found[..] else { panic!("{found:?}") };
+        let (what, remedy) = debug.caution(Path::new("/dev/serial0")).unwrap();
+        assert!(what.contains("debug connector") && what.contains("/dev/serial0"), "{what}");
+        assert!(remedy.contains("dtparam=uart0=on") && remedy.contains("/dev/ttyAMA0"), "{remedy}");
     }
 }

@@ -13,6 +13,7 @@ mod rights;
 mod source;
 mod tcp;
 mod tty;
+mod usb_adapter;
 
 use std::io;
 use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
@@ -30,6 +31,7 @@ pub use rights::{Ownership, Rights};
 pub use source::Source;
 pub use tcp::{Dial, Tcp};
 pub use tty::Tty;
+pub use usb_adapter::{PortlessAdapter, Reason};
 
 /// An open line to a sensor; reads and writes never block.
 pub enum Port {

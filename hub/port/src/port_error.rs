@@ -11,6 +11,7 @@ use schema::{Failure, Kind};
 use super::candidates::{Candidate, candidates};
 use super::holder::{Holder, holder, is_own};
 use super::rights::Rights;
+use super::usb_adapter::PortlessAdapter;
 use crate::Source;
 
 /// Only the reason; equal as long as nothing changes.
@@ -63,7 +64,7 @@ impl PortError {
         let told = self.to_string();
         let failure = |kind, hint: &str| Failure::new(kind, format!("{name}: {told}"), hint);
         match self {
-            PortError::Missing => missing(path, &candidates()),
+            PortError::Missing => missing(path, &candidates(), &portless()),
             PortError::Denied => {
                 let (what, remedy) = Rights::of(path).explain(path);
                 Failure::new(Kind::PortPermission, what, remedy)
@@ -77,11 +78,11 @@ impl PortError {
                 holder => busy(path, holder),
             },
             PortError::NotTty if path.is_dir() => {
-                let hint = format!("it is a directory; {}", instead(&name, &candidates()));
+                let hint = format!("it is a directory; {}", instead(&name, &candidates(), &portless()));
                 failure(Kind::PortNotTty, &hint)
             }
             PortError::NotTty => failure(Kind::PortNotTty, "name a tty, or tcp:HOST:PORT"),
-            PortError::Dead => failure(Kind::PortMissing, &instead(&name, &candidates())),
+            PortError::Dead => failure(Kind::PortMissing, &instead(&name, &candidates(), &portless())),
             PortError::Short(Errno::AGAIN) => failure(Kind::Short, "raise the limit of threads (ulimit -u)"),
             PortError::Short(_) => failure(Kind::Short, "raise the limit of open descriptors (ulimit -n)"),
             PortError::Rate { wanted, .. } => failure(Kind::PortRate, remedy_of_rate(*wanted)),
@@ -143,7 +144,12 @@ impl From<Errno> for PortError {
     }
 }
 
-fn missing(path: &Path, there: &[Candidate]) -> Failure {
+/// The adapters of this machine that have no port.
+fn portless() -> Vec<PortlessAdapter> {
+    PortlessAdapter::all(Path::new("/"))
+}
+
+fn missing(path: &Path, there: &[Candidate], portless: &[PortlessAdapter]) -> Failure {
     let name = path.display().to_string();
     let what = match path.read_link() {
         Ok(target) => format!("{name}: no such port: it points to {}, which is not there", target.display()),
@@ -152,23 +158,24 @@ fn missing(path: &Path, there: &[Candidate]) -> Failure {
         }
         Err(_) => format!("{name}: no such port"),
     };
-    Failure::new(Kind::PortMissing, what, instead(&name, there))
+    Failure::new(Kind::PortMissing, what, instead(&name, there, portless))
 }
 
-/// What is there instead of `name`, what is called alike first.
-fn instead(name: &str, there: &[Candidate]) -> String {
+/// Returns what to do where `name` does not exist: an adapter without a port may be the one, otherwise the ports of this machine
+/// are named, the most similar names first.
+fn instead(name: &str, there: &[Candidate], portless: &[PortlessAdapter]) -> String {
     let mut there: Vec<&Candidate> = there.iter().collect();
     there.sort_by_key(|candidate| {
         let names = [&candidate.name, &candidate.device];
         names.map(|known| strsim::levenshtein(name, &known.to_string_lossy())).into_iter().min()
     });
-    match &there[..] {
-        [] => "no serial line is plugged in".to_owned(),
-        there => {
-            let names: Vec<String> = there.iter().map(|candidate| candidate.to_string()).collect();
-            format!("there are: {}", names.join(", "))
-        }
+    let mut hints: Vec<String> =
+        portless.iter().map(|adapter| format!("{adapter}; {}", adapter.remedy())).collect();
+    if !there.is_empty() {
+        let names: Vec<String> = there.iter().map(|candidate| candidate.to_string()).collect();
+        hints.push(format!("there are: {}", names.join(", ")));
     }
+    if hints.is_empty() { "no serial line is plugged in".to_owned() } else { hints.join("; ") }
 }
 
 fn busy(path: &Path, holder: Option<Holder>) -> Failure {
@@ -209,6 +216,7 @@ fn remedy_of_rate(wanted: u32) -> &'static str {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::usb_adapter::Reason;
 
     #[test]
     fn what_the_kernel_says_and_what_it_means() {
@@ -240,6 +248,7 @@ mod tests {
         let candidate = |name: &str, device: &str| Candidate {
             name: name.into(),
             device: device.into(),
+            shared_name: None,
             driver: Some("ftdi_sio".to_owned()),
             product: None,
             holder: None,
@@ -251,13 +260,26 @@ mod tests {
             candidate("/dev/ttyS0", "/dev/ttyS0"),
         ];
         let first = |name: &str| {
-            let hint = missing(Path::new(name), &there).hint;
+            let hint = missing(Path::new(name), &there, &[]).hint;
             hint.split([' ', ',']).nth(2).map(str::to_owned).unwrap_or_default()
         };
         assert_eq!(first("/dev/ttyUSB1"), "/dev/serial/by-id/usb-FTDI-A-if00-port0");
         assert_eq!(first("/dev/serial/by-id/usb-Prolific-if00-port1"), there[1].name.display().to_string());
         assert_eq!(first("/dev/ttyS1"), "/dev/ttyS0");
-        assert_eq!(missing(Path::new("/dev/x"), &[]).hint, "no serial line is plugged in");
+        let adapter = PortlessAdapter {
+            usb: "1-1".to_owned(),
+            id: "1a86:7523".to_owned(),
+            chip: "CH340",
+            module: "ch341",
+            reason: Reason::NotLoaded,
+        };
+        let hint = missing(Path::new("/dev/ttyUSB7"), &there[2..], &[adapter]).hint;
+        assert!(hint.starts_with("USB adapter 1-1 (CH340, 1a86:7523) has no port: "), "{hint}");
+        assert!(
+            hint.contains("sudo modprobe ch341") && hint.ends_with("; there are: /dev/ttyS0 (ftdi_sio)"),
+            "{hint}"
+        );
+        assert_eq!(missing(Path::new("/dev/x"), &[], &[]).hint, "no serial line is plugged in");
     }
 
     #[test]

@@ -24,7 +24,7 @@ mod version;
 
 use std::sync::atomic::AtomicBool;
 
-use port::{Candidate, Source, candidates};
+use port::{Candidate, PortlessAdapter, Source, candidates};
 use schema::limits::TopicLimits;
 use schema::{Domain, Failure, Kind, ipc};
 
@@ -81,7 +81,11 @@ pub fn examine(
     let home = subjects.places.iter().find(|place| matches!(schema::holder(place.root()), Ok(Some(_))));
     let domain = home.unwrap_or(&subjects.domain);
     let hub = Hub::find(domain);
-    let ports = choose(subjects, &there, hub.as_ref(), &mut tell);
+    let portless = PortlessAdapter::all(&subjects.system.path("/"));
+    let ports = choose(subjects, &there, &portless, hub.as_ref(), &mut tell);
+    for adapter in &portless {
+        tell(line::without_port(adapter, ports.is_empty()));
+    }
     let (system, pid) = (&subjects.system, hub.as_ref().map(|hub| hub.pid));
     if subjects.clean {
         let elsewhere = subjects.places.iter().filter(|place| place.root() != domain.root());
@@ -125,6 +129,7 @@ pub fn examine(
 fn choose(
     subjects: &Subjects,
     there: &[Candidate],
+    portless: &[PortlessAdapter],
     hub: Option<&Hub>,
     tell: &mut impl FnMut(Finding),
 ) -> Vec<Subject> {
@@ -155,7 +160,7 @@ fn choose(
             .map(|link| Subject { source: link.port.clone(), link: Some(link.clone()), named: true })
             .collect();
     }
-    if there.is_empty() {
+    if there.is_empty() && portless.is_empty() {
         tell(Finding::failed(
             "ports",
             "no serial line on this machine",

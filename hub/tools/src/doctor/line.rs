@@ -5,7 +5,10 @@ use std::path::Path;
 use std::sync::atomic::AtomicBool;
 
 use lms::variant::Baud;
-use port::{Candidate, Holder, PROMPT_MS, Port, PortError, Rights, Source, all_holders, is_tty, latency_ms};
+use port::{
+    Candidate, Holder, PROMPT_MS, Port, PortError, PortlessAdapter, Rights, Source, all_holders, is_tty,
+    latency_ms,
+};
 use schema::{Failure, Kind};
 
 use super::Subject;
@@ -185,6 +188,12 @@ fn candidate<'a>(path: &Path, there: &'a [Candidate]) -> Option<&'a Candidate> {
     there.iter().find(|candidate| candidate.device == device)
 }
 
+/// Reports an adapter without a port, which is a failure if there is no other port to examine.
+pub(crate) fn without_port(adapter: &PortlessAdapter, is_only: bool) -> Finding {
+    let finding = if is_only { Finding::failed } else { Finding::warning };
+    finding("ports", adapter.to_string(), adapter.remedy())
+}
+
 /// Whether it is there, and under a name that stays.
 fn presence(source: &Source, path: &Path, candidate: Option<&Candidate>) -> Finding {
     const NAME: &str = "port";
@@ -196,6 +205,9 @@ fn presence(source: &Source, path: &Path, candidate: Option<&Candidate>) -> Find
         return Finding::ok(NAME, format!("{}, no hardware behind it", device.display()));
     };
     let text = candidate.map(describe).unwrap_or_default();
+    if let Some((what, remedy)) = candidate.and_then(|candidate| candidate.caution(path)) {
+        return Finding::warning(NAME, format!("{text}; {what}"), remedy);
+    }
     if name != device && path == device {
         let remedy = format!("use the name {}, which does not change", name.display());
         return Finding::warning(
@@ -299,6 +311,48 @@ mod tests {
         let slow = of(Some(16));
         assert_eq!(slow.state, State::Warning);
         assert!(slow.remedy.contains("/sys/class/tty/ttyUSB0/device/latency_timer"), "{slow}");
+    }
+
+    #[test]
+    fn a_name_that_may_stand_for_another_port_is_reported() {
+        // Files that exist everywhere stand for the names.
+        let [device, by_path, shared] = ["/dev/null", "/dev/zero", "/dev/full"].map(Path::new);
+        let twin = Candidate {
+            name: by_path.to_owned(),
+            device: device.to_owned(),
+            shared_name: Some(shared.to_owned()),
+            driver: Some("cp210x".to_owned()),
+            product: None,
+            holder: None,
+            is_permitted: true,
+        };
+        let of = |path: &Path, port: &Candidate| presence(&Source::Tty(path.to_owned()), path, Some(port));
+        let found = of(shared, &twin);
+        assert!(found.state == State::Warning && found.finding.contains("same serial number"), "{found}");
+        assert!(found.remedy.contains("/dev/zero"), "{found}");
+        assert_eq!(of(by_path, &twin).state, State::Ok);
+        let numbered = of(device, &twin);
+        assert!(numbered.state == State::Warning && numbered.remedy.contains("/dev/zero"), "{numbered}");
+        let [name, device] = ["/dev/ttyAMA10"; 2].map(Into::into);
+        let debug = of(shared, &Candidate { name, device, shared_name: None, ..twin });
+        assert!(
+            debug.finding.contains("debug connector") && debug.remedy.contains("/dev/ttyAMA0"),
+            "{debug}"
+        );
+    }
+
+    #[test]
+    fn adapters_without_a_port_fail_only_if_there_is_none() {
+        let adapter = PortlessAdapter {
+            usb: "1-1".to_owned(),
+            id: "1a86:7523".to_owned(),
+            chip: "CH340",
+            module: "ch341",
+            reason: port::Reason::Brltty { pid: 7 },
+        };
+        assert_eq!(without_port(&adapter, true).state, State::Failed);
+        let found = without_port(&adapter, false);
+        assert!(found.state == State::Warning && found.remedy.contains("brltty"), "{found}");
     }
 
     #[test]
