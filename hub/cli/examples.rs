@@ -72,7 +72,10 @@ const EXAMPLES: &[(&str, &[&str])] = &[
             "scanhub simulate --family rplidar --model a1 --tcp 127.0.0.1:0",
         ],
     ),
-    ("probe", &["scanhub probe", "scanhub probe /dev/ttyUSB0"]),
+    (
+        "probe",
+        &["scanhub probe", "scanhub probe /dev/ttyUSB0", "scanhub probe /dev/ttyUSB0 --toml >> scanhub.toml"],
+    ),
     ("configure", &["scanhub configure /dev/ttyUSB0 unit=mm"]),
     (
         "config",

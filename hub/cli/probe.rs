@@ -4,25 +4,32 @@ use std::io::{IsTerminal, Write, stderr};
 use std::sync::atomic::AtomicBool;
 
 use clap::Args;
-use port::Candidate;
+use port::{Candidate, PortlessAdapter};
 use schema::Failure;
 use serde::Serialize;
-use tools::probe::{list, probe, source};
+use tools::probe::{Ports, probe, source};
 
 #[derive(Args, Debug)]
 pub(crate) struct Probe {
     /// Port to look at: a tty or tcp:HOST:PORT; without one, the ports of this machine are listed
     #[arg(value_name = "PORT")]
     port: Option<String>,
+    /// Print only the link for a configuration file
+    #[arg(long, requires = "port", conflicts_with = "json")]
+    toml: bool,
 }
 
 impl Probe {
     pub(crate) fn run(&self, json: bool, stop: &AtomicBool) -> Result<(), Failure> {
         let Some(port) = &self.port else {
-            for candidate in list()? {
-                crate::print(&if json { crate::line(&Line::of(&candidate)) } else { describe(&candidate) })?;
+            let ports = Ports::of_machine();
+            for candidate in &ports.candidates {
+                crate::print(&if json { crate::line(&Line::of(candidate)) } else { describe(candidate) })?;
             }
-            return Ok(());
+            for adapter in &ports.portless {
+                crate::print(&if json { crate::line(&Adapter::of(adapter)) } else { explain(adapter) })?;
+            }
+            return ports.check();
         };
         let mut progress = Progress::new();
         let found = probe(&source(port)?, stop, |rate| progress.show(&format!("looking at {rate} Bd")));
@@ -33,8 +40,10 @@ impl Probe {
         let found = found?;
         crate::print(&if json {
             crate::line(&found)
+        } else if self.toml {
+            found.link.toml()
         } else {
-            format!("{port}\n{}", found.to_string().trim_end())
+            format!("{port}\n{found}")
         })
     }
 }
@@ -90,10 +99,15 @@ struct Line<'a> {
     /// The process that has it open.
     holder: Option<u32>,
     program: Option<&'a str>,
+    /// The name below by-id that another adapter has too.
+    shared_name: Option<String>,
+    caution: Option<String>,
+    remedy: Option<String>,
 }
 
 impl<'a> Line<'a> {
     fn of(candidate: &'a Candidate) -> Line<'a> {
+        let (caution, remedy) = caution(candidate).unzip();
         Line {
             class: "candidate",
             port: candidate.name.display().to_string(),
@@ -103,8 +117,46 @@ impl<'a> Line<'a> {
             permitted: candidate.is_permitted,
             holder: candidate.holder.as_ref().map(|holder| holder.pid),
             program: candidate.holder.as_ref().map(|holder| holder.program.as_str()),
+            shared_name: candidate.shared_name.as_ref().map(|name| name.display().to_string()),
+            caution,
+            remedy,
         }
     }
+}
+
+/// Class `adapter`.
+#[derive(Serialize)]
+struct Adapter<'a> {
+    class: &'static str,
+    usb: &'a str,
+    id: &'a str,
+    chip: &'a str,
+    module: &'a str,
+    problem: String,
+    remedy: String,
+}
+
+impl<'a> Adapter<'a> {
+    fn of(adapter: &'a PortlessAdapter) -> Adapter<'a> {
+        Adapter {
+            class: "adapter",
+            usb: &adapter.usb,
+            id: &adapter.id,
+            chip: adapter.chip,
+            module: adapter.module,
+            problem: adapter.to_string(),
+            remedy: adapter.remedy(),
+        }
+    }
+}
+
+/// Returns the caution about a port, including one about the name that it shares.
+fn caution(candidate: &Candidate) -> Option<(String, String)> {
+    candidate.caution(candidate.shared_name.as_ref().unwrap_or(&candidate.name))
+}
+
+fn explain(adapter: &PortlessAdapter) -> String {
+    format!("{adapter}\n  {}", adapter.remedy())
 }
 
 fn describe(candidate: &Candidate) -> String {
@@ -117,5 +169,6 @@ fn describe(candidate: &Candidate) -> String {
     let device = (name != device).then(|| device.display().to_string());
     let facts: Vec<String> =
         [device, product.clone(), driver.clone(), Some(state)].into_iter().flatten().collect();
-    format!("{}  {}", name.display(), facts.join(", "))
+    let caution = caution(candidate).map(|(what, remedy)| format!("\n  {what}; {remedy}"));
+    format!("{}  {}{}", name.display(), facts.join(", "), caution.unwrap_or_default())
 }

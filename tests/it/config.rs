@@ -23,9 +23,9 @@ fn printed(env: &TestEnv, arguments: &[&str]) -> String {
 fn the_default_can_be_loaded_and_is_what_holds_without_it() {
     let env = TestEnv::new();
     let default = env.file("default.toml", printed(&env, &["config", "default"]));
-    let ok = "ok: 2 links: front at /dev/ttyUSB0, rear at /dev/ttyUSB1\n";
+    let ok = "ok: 1 link: front at /dev/ttyUSB0\n";
     assert_eq!(printed(&env, &["config", "check", &default]), ok);
-    let links = ["--link=front=/dev/ttyUSB0", "--link=rear=/dev/ttyUSB1"];
+    let links = ["--link=front=/dev/ttyUSB0"];
     assert_eq!(printed(&env, &[&["config", "check", "--no-system-config"], &links[..]].concat()), ok);
     let values = |arguments: &[&str]| -> Vec<_> {
         let outcome = env.run(&[&["config", "show", "--json", "--no-system-config"], arguments].concat());
@@ -33,7 +33,7 @@ fn the_default_can_be_loaded_and_is_what_holds_without_it() {
         lines.iter().map(|line| (line["key"].clone(), line["value"].clone())).collect()
     };
     let without = values(&links);
-    assert!(without.len() > 60, "{without:?}");
+    assert!(without.len() > 40, "{without:?}");
     assert_eq!(values(&["--config", &default]), without);
 }
 

@@ -36,6 +36,54 @@ fn a_sensor_tells_of_itself_and_is_left_as_it_was() {
     assert_eq!(env.simulated("front").1, 0);
 }
 
+/// The last line is a command for a shell; `--toml` prints a section for a file. Both start a hub that streams.
+#[test]
+fn what_is_found_can_be_run_at_once() {
+    let families: [(&str, &[&str], &str); 3] = [
+        ("lms", &["--type=lms211"], "family=lms,type=lms211"),
+        ("ld", &["--family=ld", "--model=ld19", "--world=room"], "family=ld,model=ld19"),
+        ("rplidar", &["--family=rplidar", "--model=a2m8", "--world=room"], "family=rplidar,model=a2m8"),
+    ];
+    for (family, flags, keys) in families {
+        let env = TestEnv::new();
+        let simulator = env.simulator(&["front"], flags);
+        let port = env.word("front");
+        let probed = env.run(&["probe", &port]);
+        let text = String::from_utf8_lossy(&probed.out).into_owned();
+        let next = text.lines().last().and_then(|line| line.strip_prefix("next: scanhub run --link "));
+        let link = next.unwrap_or_else(|| panic!("{probed}"));
+        assert_eq!(link, format!("front={port},{keys}"), "{probed}");
+        let json = env.run(&["probe", &port, "--json"]);
+        assert_eq!(json.lines()[0]["link"], link, "{json}");
+        let toml = env.run(&["probe", &port, "--toml"]);
+        assert_eq!((toml.code, toml.errors.as_str()), (Some(0), ""), "{toml}");
+        let section = String::from_utf8_lossy(&toml.out).into_owned();
+        assert!(section.starts_with("[[link]]\nname = \"front\"\nport = "), "{section}");
+        let file = env.file("scanhub.toml", &section);
+        for flags in [&["--link", link][..], &["--config", file.as_str()]] {
+            let hub = env.hub(flags);
+            let info = env.await_info("front", |info| info["state"] == "streaming");
+            assert_eq!(info["family"], family, "{info}");
+            assert_eq!(hub.end(TERM).code, Some(0));
+        }
+        assert_eq!(simulator.end(TERM).code, Some(0));
+    }
+}
+
+#[test]
+fn a_section_needs_a_port() {
+    let env = TestEnv::new();
+    let outcome = env.run(&["probe", "--toml"]);
+    assert_eq!((outcome.code, outcome.out.len()), (Some(2), 0), "{outcome}");
+    assert!(outcome.errors.contains("PORT"), "{outcome}");
+    let outcome = env.run(&["probe", "/dev/null", "--toml", "--json"]);
+    assert_eq!(
+        (outcome.code, &outcome.of_class("error")[0]["kind"]),
+        (Some(2), &"usage".into()),
+        "{outcome}"
+    );
+}
+
 #[test]
 fn a_dirty_window_is_told_whatever_the_status_byte_says() {
     let env = TestEnv::new();

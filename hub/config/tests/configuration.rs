@@ -71,6 +71,26 @@ fn the_page_holds() {
     assert_eq!(shown.early, early);
 }
 
+/// The output of `config default` has a section for each family; all but the first are comments.
+#[test]
+fn the_default_has_a_section_for_each_family() {
+    let is_setting = |line: &&str| *line == "[[link]]" || line.contains(" = ");
+    let all: Vec<&str> = config::DEFAULT
+        .lines()
+        .map(|line| line.strip_prefix("# ").filter(is_setting).unwrap_or(line))
+        .collect();
+    let file = Scratch::new("default.toml", all.join("\n"));
+    let config = load(&[&file], &[]).unwrap_or_else(|refusal| panic!("{refusal}"));
+    let families: Vec<Family> = config.links.iter().map(config::Link::family).collect();
+    assert_eq!(families, Family::ALL);
+    for features in Family::ALL.into_iter().filter_map(scanner::features) {
+        let names = features.models.iter().map(|model| model.name).chain(features.modes.iter().copied());
+        for name in names {
+            assert!(config::DEFAULT.contains(name), "{name} is missing");
+        }
+    }
+}
+
 #[test]
 fn a_scanner_is_refused_at_its_place() {
     let file = Scratch::new(

@@ -2,14 +2,16 @@
 //! then asks the sensor, and leaves the sensor as it was.
 
 mod description;
+mod suggestion;
 mod turning;
 
 use std::fmt;
+use std::path::Path;
 use std::sync::atomic::AtomicBool;
 
 use lms::inquiry::{Inquiry, Report};
 use lms::variant::Baud;
-use port::{Candidate, Port, Source, candidates, clock};
+use port::{Candidate, Port, PortlessAdapter, Source, candidates, clock, found_in};
 use schema::{Failure, Family, Kind};
 use serde::Serialize;
 
@@ -17,6 +19,8 @@ use crate::drive::drive;
 use crate::listen::{Overheard, listen, not_heard, turning};
 pub use description::Description;
 pub(crate) use description::{hex, measuring};
+pub use suggestion::SuggestedLink;
+use suggestion::candidate_of;
 pub use turning::Turning;
 
 /// What is at the other end of a port.
@@ -38,19 +42,68 @@ impl fmt::Display for Found {
     }
 }
 
-/// The serial lines of this machine.
-///
-/// [`Kind::PortMissing`] if there is none.
-pub fn list() -> Result<Vec<Candidate>, Failure> {
-    let found = candidates();
-    if found.is_empty() {
-        return Err(Failure::new(
-            Kind::PortMissing,
-            "no serial line on this machine",
-            "plug in an adapter for RS-422 (500 kBd) or RS-232; `dmesg` shows whether the kernel saw it",
-        ));
+/// Scanner at a port, with the link that a configuration needs for it; class `probe`.
+#[derive(Clone, Debug, Serialize)]
+pub struct Probed {
+    #[serde(flatten)]
+    found: Found,
+    /// Value of `--link`.
+    #[serde(rename = "link")]
+    flag: String,
+    /// Link for a configuration.
+    #[serde(skip)]
+    pub link: SuggestedLink,
+    /// Caution about the port, and its remedy.
+    #[serde(skip)]
+    caution: Option<(String, String)>,
+}
+
+impl Probed {
+    fn new(found: Found, link: SuggestedLink, caution: Option<(String, String)>) -> Probed {
+        Probed { found, flag: link.flag(), link, caution }
     }
-    Ok(found)
+}
+
+impl fmt::Display for Probed {
+    /// The rows, then the next command.
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{}", self.found)?;
+        if let Some((what, remedy)) = &self.caution {
+            writeln!(f, "  {:<16}{what}; {remedy}", "port")?;
+        }
+        write!(f, "next: {}", self.link.command())
+    }
+}
+
+/// The ports of this machine, and the adapters that have none.
+#[derive(Clone, Debug)]
+pub struct Ports {
+    /// The serial lines.
+    pub candidates: Vec<Candidate>,
+    /// USB serial adapters without a port.
+    pub portless: Vec<PortlessAdapter>,
+}
+
+impl Ports {
+    /// Looks at this machine; opens nothing.
+    pub fn of_machine() -> Ports {
+        Ports { candidates: candidates(), portless: PortlessAdapter::all(Path::new("/")) }
+    }
+
+    /// Checks that there is a serial line.
+    ///
+    /// # Errors
+    ///
+    /// Returns [`Kind::PortMissing`] if there is none.
+    pub fn check(&self) -> Result<(), Failure> {
+        const PLUG_IN: &str =
+            "plug in an adapter for RS-422 (500 kBd) or RS-232; `dmesg` shows whether the kernel saw it";
+        if !self.candidates.is_empty() {
+            return Ok(());
+        }
+        let remedy = self.portless.first().map_or(PLUG_IN.to_owned(), PortlessAdapter::remedy);
+        Err(Failure::new(Kind::PortMissing, "no serial line on this machine", remedy))
+    }
 }
 
 /// Finds out what is at `source`: listens for those that speak unasked before anything is sent, then asks. Calls `look` with
@@ -58,11 +111,25 @@ pub fn list() -> Result<Vec<Candidate>, Failure> {
 ///
 /// The port kinds if the port cannot be used, [`Kind::Timeout`] if nobody answers, [`Kind::Interrupted`] if `stop` is
 /// set.
-pub fn probe(source: &Source, stop: &AtomicBool, look: impl FnMut(u32)) -> Result<Found, Failure> {
+pub fn probe(source: &Source, stop: &AtomicBool, look: impl FnMut(u32)) -> Result<Probed, Failure> {
     let (port, first) = open(source, stop)?;
-    Ok(match find(&port, first, source, None, stop, look)? {
-        Answer::Asked(report) => Found::Lms(Box::new(Description::new(source.name(), &report))),
-        Answer::Heard(heard) => Found::Turning(Box::new(Turning::new(source.name(), &heard))),
+    let there = found_in(Path::new("/"));
+    let caution = candidate_of(source, &there).and_then(|port| port.caution(Path::new(&source.name())));
+    let answer = find(&port, first, source, None, stop, look).map_err(|failure| match &caution {
+        Some((what, remedy)) if failure.kind == Kind::Timeout => {
+            Failure { hint: format!("it is {what}; {remedy}; or {}", failure.hint), ..failure }
+        }
+        _ => failure,
+    })?;
+    Ok(match answer {
+        Answer::Asked(report) => {
+            let found = Found::Lms(Box::new(Description::new(source.name(), &report)));
+            Probed::new(found, SuggestedLink::for_lms(source, &there, &report, first), caution)
+        }
+        Answer::Heard(heard) => {
+            let found = Found::Turning(Box::new(Turning::new(source.name(), &heard)));
+            Probed::new(found, SuggestedLink::for_turning(source, &there, &heard), caution)
+        }
     })
 }
 
