@@ -149,13 +149,14 @@ impl Presence {
 /// hubs of this machine, and `caller` is the environment of this process.
 fn no_hub(places: &[Domain], denied: Option<&Failure>, hubs: &[RunningHub], caller: &Environment) -> Failure {
     let name = places.first().map(Domain::name).unwrap_or_default();
-    // The hub that is meant comes first: one of this domain, then one of this user.
-    let mut hubs: Vec<&RunningHub> = hubs.iter().collect();
-    hubs.sort_by_key(|hub| (hub.domain != name, hub.uid != caller.uid));
-    let is_elsewhere = hubs.first().is_some_and(|hub| hub.domain == name && hub.uid != caller.uid);
+    let is_meant = |hub: &&RunningHub| hub.domain == name && hub.uid != caller.uid;
+    let is_elsewhere = hubs.iter().any(|hub| is_meant(&hub));
+    // Hubs of other domains count only if no other user has one of this domain; those of this user come first.
+    let mut hubs: Vec<&RunningHub> = hubs.iter().filter(|hub| !is_elsewhere || is_meant(hub)).collect();
+    hubs.sort_by_key(|hub| hub.uid != caller.uid);
     let mut hints: Vec<String> = hubs.iter().take(MAX_HUBS).map(|hub| elsewhere(hub, name, caller)).collect();
     if hubs.len() > MAX_HUBS {
-        hints.push(format!("{} more hubs run", hubs.len() - MAX_HUBS));
+        hints.push(format!("and {} more", hubs.len() - MAX_HUBS));
     }
     let message = match denied {
         Some(denied) => format!("no hub of this user in domain {name}: {}", denied.message),
@@ -258,6 +259,9 @@ mod tests {
         assert!(hint.starts_with("user root runs one, process 7: sudo scanhub list; "), "{hint}");
         assert!(hint.contains("docs/sharing.md") && !hint.contains("start one"), "{hint}");
 
+        let others = [(6, 1000, "run --domain lab"), (7, 0, "run"), (8, 0, "run --domain x")];
+        assert_eq!(said(&hubs(&others), None).1, hint, "hubs of other domains are not meant");
+
         // The service's directory cannot be opened.
         let denied = Failure::new(Kind::Failed, "/run/scanhub belongs to user 998", "choose another --root");
         let (message, hint) = said(&hubs(&[(7, 998, "run")]), Some(&denied));
@@ -277,7 +281,7 @@ mod tests {
         assert!(hint.starts_with(&[own, root_s].concat()), "{hint}");
 
         let many: Vec<_> = (1..6).map(|pid| (pid, 1000, "run --domain lab")).collect();
-        assert!(said(&hubs(&many), None).1.contains("; 2 more hubs run; start one"));
+        assert!(said(&hubs(&many), None).1.contains("; and 2 more; start one"));
         std::fs::remove_dir_all(&root).unwrap();
     }
 

@@ -5,12 +5,14 @@ use super::holds;
 use super::tree::{Tree, code};
 
 /// What names a family, but for its crate, its simulator, tests, benches and pages; each says why.
-const MAY: [&str; 10] = [
+const MAY: [&str; 11] = [
     // The workspace's crates.
     "Cargo.toml",
     // The list of the families, and what it is built with.
     "hub/scanner/Cargo.toml",
     "hub/scanner/src/families.rs",
+    // The configuration that users start from, with a section for each.
+    "hub/config/src/default.toml",
     // Number and name, in each language that reads scans, and what can be said of its packets.
     "schema/src/scan/family.rs",
     "schema/src/file/layout.txt",
