@@ -28,13 +28,13 @@ pub(crate) struct Record {
     /// File to write; - for stdout [default: scanhub-DATE-TIME.mcap]
     #[arg(short, long, value_name = "FILE")]
     output: Option<PathBuf>,
-    /// Overwrite an existing file; with --split, continue after the existing numbers
+    /// Overwrite an existing file; with --split, continue after the existing numbers, and let --keep remove older files
     #[arg(short, long)]
     force: bool,
     /// Start another file after this size or time: 512MiB, 1h; the files are called FILE-0001.mcap ..
     #[arg(long, value_name = "SIZE|DURATION", value_parser = Split::parse)]
     split: Option<Split>,
-    /// Keep this number of files; remove the oldest
+    /// Keep only the last COUNT files of this run; with --force, files FILE-NNNN.mcap of earlier runs count too
     #[arg(long, value_name = "COUNT", requires = "split", value_parser = clap::value_parser!(u32).range(1..))]
     keep: Option<u32>,
     #[command(flatten)]

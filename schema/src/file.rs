@@ -14,6 +14,8 @@ use mcap::{Attachment, McapError, WriteOptions};
 
 use crate::{Header, Topic};
 pub use compression::Compression;
+/// First bytes of every MCAP file.
+pub use mcap::MAGIC;
 
 /// Encoding of the messages, and of the text that describes them.
 pub const ENCODING: &str = "scanhub.v2";

@@ -89,6 +89,49 @@ fn a_recording_goes_on_in_files_of_which_the_last_stay() {
 }
 
 #[test]
+fn keeps_the_last_files_of_all_runs_when_forced() {
+    let env = TestEnv::new();
+    let [_simulator, hub] = sensor(&env);
+    let file = env.word("walk.mcap");
+    let words = ["record", "--split=1h", "--keep=2", "--force", "-o", &file];
+    let names = || {
+        let names = fs::read_dir(env.path("walk.mcap").parent().unwrap()).unwrap();
+        let names = names.map(|entry| entry.unwrap().file_name().into_string().unwrap());
+        let mut names: Vec<_> = names.filter(|name| name.starts_with("walk")).collect();
+        names.sort();
+        names
+    };
+    let removed = [1, 2, 3].map(|_| {
+        let mut recorder = env.start(&[&words[..], &["--json"]].concat());
+        let first = recorder.await_line("its first line", is_class("recording"));
+        await_samples(&mut recorder, 10);
+        files(&recorder.end(INT));
+        number(&first, "older_removed")
+    });
+    assert_eq!(removed, [0, 0, 1]);
+    assert_eq!(names(), ["walk-0002.mcap", "walk-0003.mcap"]);
+    // A file that another recorder writes stays, and does not count.
+    let mut other = env.start(&["record", "--json", "--force", "-o", &env.word("walk-0001.mcap")]);
+    await_samples(&mut other, 10);
+    fs::write(env.path("walk-0000.mcap"), "my notes").unwrap();
+    let outcome = env.run(&[&words[..], &["-n", "50"]].concat());
+    let text = String::from_utf8_lossy(&outcome.out).into_owned();
+    let first = format!(
+        "records into {}; its first sample removes 1 file of an earlier run (--keep)",
+        env.word("walk-0004.mcap")
+    );
+    assert_eq!((outcome.code, text.lines().next()), (Some(0), Some(&first[..])), "{outcome}");
+    let all = ["walk-0000.mcap", "walk-0001.mcap", "walk-0003.mcap", "walk-0004.mcap"];
+    assert_eq!(names(), all);
+    files(&other.end(INT));
+    // A run that records nothing removes nothing, and neither does one that is refused.
+    assert_eq!(hub.end(INT).code, Some(0));
+    assert_eq!(env.run(&[&words[..], &["-n", "50"]].concat()).code, Some(3));
+    assert_eq!(env.run(&["record", "--split=1h", "--keep=2", "-o", &file]).code, Some(73));
+    assert_eq!(names(), all);
+}
+
+#[test]
 fn a_file_that_may_not_grow_is_followed_by_another() {
     let env = TestEnv::new();
     let _others = sensor(&env);

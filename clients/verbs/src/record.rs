@@ -58,7 +58,7 @@ pub struct RecordOptions {
     pub force: bool,
     /// When it goes on in the next file.
     pub split: Option<Split>,
-    /// How many of the files stay; the oldest go first.
+    /// Number of files that are kept; the oldest are removed first. With `force`, files of earlier runs count too.
     pub keep: Option<usize>,
     /// How it tells of itself.
     pub look: RecordLook,
@@ -107,12 +107,12 @@ pub fn record(
         Ok(disk) => disk,
         Err(end) => return quiet(Err(end)),
     };
-    let first = disk.path();
+    let (first, older) = (disk.path(), disk.surplus_older());
     let over = AtomicBool::new(false);
     let terminal = out.as_fd().try_clone_to_owned().ok();
     let (mut out, mut notes) = (LossyWriter::around(out, &over), LossyWriter::around(notes, &over));
     let mut report = Report::new(options.look, &mut out, &mut notes, terminal);
-    let begun = report.begin(&first);
+    let begun = report.begin(&first, older);
     let mut recorder = Recorder {
         progress: disk.progress(),
         tracks: Vec::new(),
@@ -157,7 +157,8 @@ fn begin(options: &RecordOptions, queue: &Arc<Queue>) -> Result<Disk, End> {
         true => Err(File::from(io::stdout().as_fd().try_clone_to_owned().map_err(failed)?)),
         false => {
             output_error::check(path, options.force)?;
-            Ok(Files::new(path, options.split.is_some(), options.force, options.keep))
+            let run = wall_ns.to_string();
+            Ok(Files::new(path, options.split.is_some(), options.force, options.keep, &run))
         }
     };
     let form = if options.ros2 { Form::Ros2 } else { Form::Hub };

@@ -33,6 +33,8 @@ pub(super) struct Disk {
     batch: Batch,
     /// Bytes and samples of the files before.
     bytes: u64,
+    /// Whether a sample was written. Before that, no older file is removed: a run without a hub must not cost one.
+    has_samples: bool,
     trouble: Option<Trouble>,
     look_at: Instant,
     most_index: usize,
@@ -79,6 +81,7 @@ impl Disk {
             statuses: Vec::new(),
             batch: Batch::new(),
             bytes: 0,
+            has_samples: false,
             trouble: None,
             look_at: Instant::now() + LOOK_EVERY,
             most_index: MOST_INDEX,
@@ -88,6 +91,11 @@ impl Disk {
     /// Where it says how far it came.
     pub(super) fn progress(&self) -> Arc<WriterProgress> {
         self.progress.clone()
+    }
+
+    /// Returns how many files of earlier runs are removed as soon as a sample is written.
+    pub(super) fn surplus_older(&self) -> usize {
+        self.files.as_ref().map_or(0, Files::surplus_older)
     }
 
     /// The name of the file that is being written.
@@ -184,6 +192,11 @@ impl Disk {
         stats.bytes = self.bytes + self.part.written;
         stats.samples += self.batch.count();
         self.part.samples += self.batch.count();
+        drop(stats);
+        if !self.has_samples && self.batch.count() > 0 {
+            self.has_samples = true;
+            self.prune();
+        }
         self.batch.clear();
         Ok(())
     }
@@ -202,12 +215,20 @@ impl Disk {
         let mut part = Part::begin(Place::File(file, path.clone()), self.style, facts)?;
         part.repeat(&self.tracks, &self.statuses)?;
         part.add(&self.tracks, &self.batch)?;
-        files.prune();
         self.count_gone();
         self.bytes += self.part.written;
+        // Replacing the part closes the old file, which unlocks it. Only then can it be removed.
         self.part = part;
+        self.prune();
         self.progress.stats().news.push(News::File(path));
         Ok(())
+    }
+
+    /// Removes files beyond those that are kept.
+    fn prune(&mut self) {
+        if let Some(files) = self.files.as_mut().filter(|_| self.has_samples) {
+            files.prune();
+        }
     }
 
     /// What was written to a file that is gone is in none.
@@ -295,7 +316,7 @@ mod tests {
     fn disk(name: &str, split: Option<Split>, sensors: &[&str]) -> (PathBuf, Disk) {
         let place = std::env::temp_dir().join(format!("scanhub-{name}-{}", std::process::id()));
         fs::create_dir_all(&place).unwrap();
-        let files = Files::new(&place.join("walk.mcap"), split.is_some(), false, None);
+        let files = Files::new(&place.join("walk.mcap"), split.is_some(), false, None, "");
         let style = Style { form: Form::Hub, compression: Compression::None };
         let disk = Disk::begin(Arc::new(Queue::new()), Ok(files), split, style, BTreeMap::new()).unwrap();
         for sensor in sensors {
@@ -331,6 +352,22 @@ mod tests {
         disk.step(now, false).unwrap();
         disk.step(now + 2 * hour, false).unwrap();
         assert_eq!(names(&place), ["walk-0001.mcap", "walk-0002.mcap"]);
+        fs::remove_dir_all(place).unwrap();
+    }
+
+    #[test]
+    fn keeps_one_file_where_one_is_wanted() {
+        let (place, mut disk) = disk("one", None, &["front"]);
+        disk.files = Some(Files::new(&place.join("run.mcap"), true, false, Some(1), "run 1"));
+        disk.facts.insert("started_ns".to_owned(), "run 1".to_owned());
+        for number in 1..4 {
+            push(&disk, 0);
+            disk.step(Instant::now(), false).unwrap();
+            disk.renew().unwrap();
+            disk.write().unwrap();
+            assert_eq!(names(&place), [&format!("run-{number:04}.mcap")[..], "walk.mcap"]);
+            assert!(!disk.progress.stats().news.iter().any(|news| matches!(news, News::Gone(..))));
+        }
         fs::remove_dir_all(place).unwrap();
     }
 

@@ -1,10 +1,16 @@
-//! The files of a run: their names, when the next one starts, and which of them are kept. Refuses to know what is in
-//! them.
+//! The files of a run: their names, when the next one starts, and which of them are kept.
+//!
+//! With `--force`, files of earlier runs count as kept files too. Each file is checked again just before it is removed, so
+//! that neither a file that another recorder writes nor a file of another kind is ever lost.
 
 use std::fs::{self, File};
-use std::io::{self, ErrorKind};
+use std::io::{self, ErrorKind, Read};
+use std::os::unix::fs::OpenOptionsExt;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
+
+use rustix::fs::OFlags;
+use schema::file::MAGIC;
 
 use super::lock;
 use crate::duration;
@@ -70,25 +76,43 @@ pub(super) struct Files {
     number: u32,
     /// How many it has made.
     count: u32,
+    /// Text near the beginning of each file of this run, and of no other file.
+    run: String,
+    /// Files of this run, the current one last.
     made: Vec<PathBuf>,
+    /// Files of earlier runs that count as kept files, the lowest number first.
+    older: Vec<PathBuf>,
 }
 
 impl Files {
-    /// Called `path`, or with numbers behind its stem if the run `is_split`. What is there already is in the way, but for a
-    /// run that `overwrites`: it does so, or goes on behind the numbers that there are. Of those made, the last `keep` stay.
-    pub(super) fn new(path: &Path, is_split: bool, overwrites: bool, keep: Option<usize>) -> Files {
-        Files { path: path.to_owned(), is_split, overwrites, keep, number: 0, count: 0, made: Vec::new() }
+    /// Creates the files of a run: one that is called `path`, or with numbers after its stem if the run `is_split`. An existing
+    /// file is an error, unless the run `overwrites` it; a split run then continues after the existing numbers. The last
+    /// `keep` files stay. All files of the run contain `run` within their first [`HEAD`] bytes.
+    pub(super) fn new(
+        path: &Path,
+        is_split: bool,
+        overwrites: bool,
+        keep: Option<usize>,
+        run: &str,
+    ) -> Files {
+        let (path, run, made, older) = (path.to_owned(), run.to_owned(), Vec::new(), Vec::new());
+        Files { path, is_split, overwrites, keep, number: 0, count: 0, run, made, older }
     }
 
     /// The first one.
     ///
     /// [`ErrorKind::AlreadyExists`] if something is in the way, [`ErrorKind::ResourceBusy`] if another run writes it.
     pub(super) fn first(&mut self) -> io::Result<(PathBuf, File)> {
-        let last = if self.is_split { self.last() } else { 0 };
+        let existing = if self.is_split { self.existing() } else { Vec::new() };
+        let last = existing.last().copied().unwrap_or(0);
         if last > 0 && !self.overwrites {
             let name = self.name(last);
             let what = format!("files of an earlier run exist, the last one is {}", name.display());
             return Err(io::Error::new(ErrorKind::AlreadyExists, what));
+        }
+        if self.keep.is_some() {
+            let paths = existing.iter().map(|number| self.name(*number));
+            self.older = paths.filter(|path| is_finished_recording(path)).collect();
         }
         self.make(last + 1, self.overwrites && !self.is_split)
     }
@@ -104,11 +128,35 @@ impl Files {
         }
     }
 
-    /// Removes the oldest ones, if there are more than are kept. One that cannot be removed is nobody's any more.
+    /// Returns how many files of earlier runs the next [`prune`](Self::prune) removes.
+    pub(super) fn surplus_older(&self) -> usize {
+        self.surplus().min(self.older.len())
+    }
+
+    /// Removes the oldest files, those of earlier runs first, until no more than `keep` are left. A file that cannot be
+    /// removed no longer counts.
     pub(super) fn prune(&mut self) {
-        while self.keep.is_some_and(|keep| self.made.len() > keep.max(1)) {
-            let _ = fs::remove_file(self.made.remove(0));
+        for _ in 0..self.surplus() {
+            // Something else may have the name by now.
+            let (path, is_removable) = if self.older.is_empty() {
+                let path = self.made.remove(0);
+                let is_ours = is_of_run(&path, &self.run);
+                (path, is_ours)
+            } else {
+                let path = self.older.remove(0);
+                let is_finished = is_finished_recording(&path);
+                (path, is_finished)
+            };
+            if is_removable {
+                let _ = fs::remove_file(path);
+            }
         }
+    }
+
+    /// Returns by how many files there are more than are kept. The current one is always kept.
+    fn surplus(&self) -> usize {
+        let keep = self.keep.map_or(usize::MAX, |keep| keep.max(1));
+        (self.older.len() + self.made.len()).saturating_sub(keep)
     }
 
     /// How many it has made.
@@ -139,11 +187,11 @@ impl Files {
         (stem, ending.unwrap_or_default())
     }
 
-    /// The greatest number that a name in the directory has; 0 if there is none.
-    fn last(&self) -> u32 {
+    /// Returns the numbers of the names in the directory that belong to these files, in ascending order.
+    fn existing(&self) -> Vec<u32> {
         let (stem, ending) = self.around();
         let place = self.path.parent().filter(|place| !place.as_os_str().is_empty());
-        let Ok(entries) = fs::read_dir(place.unwrap_or(Path::new("."))) else { return 0 };
+        let Ok(entries) = fs::read_dir(place.unwrap_or(Path::new("."))) else { return Vec::new() };
         let names = entries.flatten().map(|entry| entry.file_name());
         let number = |name: &str| {
             let digits = name.strip_prefix(&stem)?.strip_prefix('-')?.strip_suffix(&ending)?;
@@ -151,8 +199,39 @@ impl Files {
             let number = digits.parse().ok().filter(|number| *number < 1_000_000)?;
             (format!("{number:04}") == digits).then_some(number)
         };
-        names.filter_map(|name| number(name.to_str()?)).max().unwrap_or(0)
+        let mut numbers: Vec<u32> = names.filter_map(|name| number(name.to_str()?)).collect();
+        numbers.sort_unstable();
+        numbers
     }
+}
+
+/// Returns whether the file at `path` is a recording that no recorder writes. `false` if the file system has no locks, because
+/// then a recorder cannot be detected.
+fn is_finished_recording(path: &Path) -> bool {
+    head(path).is_ok_and(|(head, is_taken)| head.starts_with(MAGIC) && is_taken == Some(false))
+}
+
+/// Returns whether the file at `path` was written by `run`, and no other recorder writes it now.
+fn is_of_run(path: &Path, run: &str) -> bool {
+    let contains = |head: &[u8]| String::from_utf8_lossy(head).contains(run);
+    head(path).is_ok_and(|(head, is_taken)| contains(&head) && is_taken != Some(true))
+}
+
+/// Returns the first [`HEAD`] bytes of the regular file at `path`, and whether it is locked, if the file system has locks.
+///
+/// # Errors
+///
+/// The file cannot be read, or is not a regular file. A link to one is refused too.
+fn head(path: &Path) -> io::Result<(Vec<u8>, Option<bool>)> {
+    // Without NONBLOCK, opening a pipe would wait for its writer.
+    let flags = OFlags::NOFOLLOW | OFlags::NONBLOCK;
+    let file = File::options().read(true).custom_flags(flags.bits().cast_signed()).open(path)?;
+    if !file.metadata()?.is_file() {
+        return Err(ErrorKind::InvalidInput.into());
+    }
+    let mut head = Vec::new();
+    (&file).take(HEAD).read_to_end(&mut head)?;
+    Ok((head, lock::is_taken(&file)))
 }
 
 /// Opens a file that no other run writes, empty.
@@ -172,6 +251,8 @@ fn open(path: &Path, overwrites: bool) -> io::Result<File> {
     Ok(file)
 }
 
+/// Bytes that contain the description of the run, which is the first record of a recording.
+const HEAD: u64 = 4096;
 /// Somebody else has the name.
 const TAKEN: [ErrorKind; 2] = [ErrorKind::AlreadyExists, ErrorKind::ResourceBusy];
 
@@ -247,20 +328,110 @@ mod tests {
         assert_eq!(usual_name(1_700_000_000_000_000_000), Path::new("scanhub-20231114-221320.mcap"));
     }
 
+    /// The beginning of a file that `run` wrote.
+    fn recording(run: &str) -> Vec<u8> {
+        [MAGIC, run.as_bytes()].concat()
+    }
+
+    #[test]
+    fn keeps_the_newest_files_of_all_runs_when_forced() {
+        let place = std::env::temp_dir().join(format!("scanhub-keep-{}", std::process::id()));
+        fs::create_dir_all(&place).unwrap();
+        let at = |name: &str| place.join(name);
+        let names = || {
+            let mut names: Vec<_> = fs::read_dir(&place).unwrap().map(|it| it.unwrap().file_name()).collect();
+            names.sort();
+            names.into_iter().map(|name| name.into_string().unwrap()).collect::<Vec<_>>()
+        };
+        for number in [2, 3, 9, 10, 11] {
+            fs::write(at(&format!("walk-{number:04}.mcap")), recording("run 1")).unwrap();
+        }
+        // None of these is a recording of an earlier run that has ended.
+        fs::write(at("target.mcap"), recording("run 1")).unwrap();
+        std::os::unix::fs::symlink(at("target.mcap"), at("walk-0001.mcap")).unwrap();
+        fs::write(at("walk-0004.mcap"), "my notes").unwrap();
+        fs::write(at("walk-0005.mcap"), "").unwrap();
+        fs::create_dir(at("walk-0006.mcap")).unwrap();
+        let written = File::create(at("walk-0007.mcap")).unwrap();
+        fs::write(at("walk-0007.mcap"), recording("run 0")).unwrap();
+        lock::take(&written).unwrap();
+        for other in ["walk-fast-0001.mcap", "walk-20261122.mcap", "walk.mcap", "walk-0001.bag"] {
+            fs::write(at(other), recording("run 1")).unwrap();
+        }
+        let others = [
+            "target.mcap",
+            "walk-0001.bag",
+            "walk-0001.mcap",
+            "walk-0004.mcap",
+            "walk-0005.mcap",
+            "walk-0006.mcap",
+            "walk-0007.mcap",
+            "walk-20261122.mcap",
+            "walk-fast-0001.mcap",
+            "walk.mcap",
+        ];
+        let kept = || names().into_iter().filter(|name| !others.contains(&&name[..])).collect::<Vec<_>>();
+
+        let refused = Files::new(&at("walk.mcap"), true, false, Some(3), "run 2").first().unwrap_err();
+        assert_eq!((refused.kind(), kept().len()), (ErrorKind::AlreadyExists, 5));
+
+        let mut files = Files::new(&at("walk.mcap"), true, true, Some(3), "run 2");
+        let make = |files: &mut Files, is_first: bool| {
+            let (path, mut file) = if is_first { files.first() } else { files.next() }.unwrap();
+            io::Write::write_all(&mut file, &recording("run 2")).unwrap();
+            path
+        };
+        assert_eq!(make(&mut files, true), at("walk-0012.mcap"));
+        assert_eq!((files.surplus_older(), kept().len()), (3, 6), "nothing is removed yet");
+        files.prune();
+        assert_eq!(kept(), ["walk-0010.mcap", "walk-0011.mcap", "walk-0012.mcap"]);
+        assert_eq!(files.surplus_older(), 0);
+        for _ in 13..17 {
+            make(&mut files, false);
+            files.prune();
+        }
+        assert_eq!(kept(), ["walk-0014.mcap", "walk-0015.mcap", "walk-0016.mcap"]);
+        assert!(others.iter().all(|name| names().iter().any(|there| there == name)), "{:?}", names());
+        drop(written);
+        fs::remove_dir_all(place).unwrap();
+    }
+
+    #[test]
+    fn does_not_remove_a_file_that_is_recorded_into_meanwhile() {
+        let place = std::env::temp_dir().join(format!("scanhub-meanwhile-{}", std::process::id()));
+        fs::create_dir_all(&place).unwrap();
+        let path = place.join("walk-0001.mcap");
+        fs::write(&path, recording("run 1")).unwrap();
+        let mut files = Files::new(&place.join("walk.mcap"), true, true, Some(1), "run 2");
+        files.first().unwrap();
+        assert_eq!(files.surplus_older(), 1);
+        let other = File::open(&path).unwrap();
+        lock::take(&other).unwrap();
+        files.prune();
+        assert!(path.exists());
+        fs::remove_dir_all(place).unwrap();
+    }
+
     #[test]
     fn files_of_others_stay() {
         let place = std::env::temp_dir().join(format!("scanhub-files-{}", std::process::id()));
         fs::create_dir_all(&place).unwrap();
         let at = |name: &str| place.join(name);
-        let mut files = Files::new(&at("walk.mcap"), true, false, Some(2));
+        let mut files = Files::new(&at("walk.mcap"), true, false, Some(2), "run 1");
         assert_eq!(files.first().unwrap().0, at("walk-0001.mcap"));
+        fs::write(at("walk-0001.mcap"), "of run 1").unwrap();
         fs::write(at("walk-0002.mcap"), "another's").unwrap();
         assert_eq!(files.next().unwrap().0, at("walk-0003.mcap"));
         assert_eq!(files.next().unwrap().0, at("walk-0004.mcap"));
-        assert_eq!(files.count(), 3);
+        assert_eq!((files.count(), files.surplus_older()), (3, 0));
         files.prune();
         assert!(!at("walk-0001.mcap").exists() && at("walk-0003.mcap").exists());
-        let taken = Files::new(&at("walk-0002.mcap"), false, false, None).first().unwrap_err();
+        // A file that another run has made under a name of this run.
+        fs::write(at("walk-0003.mcap"), recording("run 2")).unwrap();
+        assert_eq!(files.next().unwrap().0, at("walk-0005.mcap"));
+        files.prune();
+        assert_eq!(fs::read(at("walk-0003.mcap")).unwrap(), recording("run 2"));
+        let taken = Files::new(&at("walk-0002.mcap"), false, false, None, "").first().unwrap_err();
         assert_eq!(taken.kind(), ErrorKind::AlreadyExists);
         // Those of an earlier run are not mixed with those of the next one.
         for other in
@@ -268,12 +439,12 @@ mod tests {
         {
             fs::write(at(other), "another's").unwrap();
         }
-        let earlier = Files::new(&at("walk.mcap"), true, false, None).first().unwrap_err();
-        assert!(earlier.kind() == ErrorKind::AlreadyExists && earlier.to_string().contains("walk-0004.mcap"));
-        let mut behind = Files::new(&at("walk.mcap"), true, true, None);
-        assert_eq!((behind.first().unwrap().0, behind.count()), (at("walk-0005.mcap"), 1));
+        let earlier = Files::new(&at("walk.mcap"), true, false, None, "").first().unwrap_err();
+        assert!(earlier.kind() == ErrorKind::AlreadyExists && earlier.to_string().contains("walk-0005.mcap"));
+        let mut behind = Files::new(&at("walk.mcap"), true, true, None, "");
+        assert_eq!((behind.first().unwrap().0, behind.count()), (at("walk-0006.mcap"), 1));
         assert_eq!(fs::read(at("walk-0002.mcap")).unwrap(), b"another's");
-        let mut one = Files::new(&at("one"), false, true, None);
+        let mut one = Files::new(&at("one"), false, true, None, "");
         assert_eq!((one.first().unwrap().0, one.next().unwrap().0), (at("one"), at("one-0002")));
         fs::remove_dir_all(place).unwrap();
     }
@@ -283,12 +454,12 @@ mod tests {
         let place = std::env::temp_dir().join(format!("scanhub-writer-{}", std::process::id()));
         fs::create_dir_all(&place).unwrap();
         let path = place.join("walk.mcap");
-        let (_, mut file) = Files::new(&path, false, false, None).first().unwrap();
+        let (_, mut file) = Files::new(&path, false, false, None, "").first().unwrap();
         io::Write::write_all(&mut file, b"mine").unwrap();
-        let busy = Files::new(&path, false, true, None).first().unwrap_err();
+        let busy = Files::new(&path, false, true, None, "").first().unwrap_err();
         assert_eq!((busy.kind(), fs::read(&path).unwrap()), (ErrorKind::ResourceBusy, b"mine".to_vec()));
         drop(file);
-        assert!(Files::new(&path, false, true, None).first().is_ok());
+        assert!(Files::new(&path, false, true, None, "").first().is_ok());
         assert_eq!(fs::read(&path).unwrap(), b"");
         fs::remove_dir_all(place).unwrap();
     }

@@ -20,6 +20,16 @@ pub(super) fn take(file: &File) -> io::Result<()> {
     }
 }
 
+/// Returns whether a process has taken `file`, or `None` if the file system has no locks.
+pub(super) fn is_taken(file: &File) -> Option<bool> {
+    // A shared lock needs no write permission. It is released when `file` is closed.
+    match file.try_lock_shared() {
+        Ok(()) => Some(false),
+        Err(TryLockError::WouldBlock) => Some(true),
+        Err(TryLockError::Error(_)) => None,
+    }
+}
+
 /// The process that has `file`, where the kernel tells it.
 fn holder(file: &File) -> Option<u32> {
     let place = file.metadata().ok()?;

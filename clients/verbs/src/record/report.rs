@@ -63,13 +63,21 @@ impl<'a> Report<'a> {
         }
     }
 
-    /// Where it goes.
-    pub(super) fn begin(&mut self, path: &Path) -> Result<(), End> {
+    /// Writes the first line: the file at `path`, and how many files of earlier runs are removed once it has samples.
+    pub(super) fn begin(&mut self, path: &Path, older: usize) -> Result<(), End> {
         self.files.push(path.to_owned());
         if self.look == RecordLook::Json {
-            return self.recording(&RecordStats::default(), 0);
+            let first = Progress { older_removed: Some(older), ..self.at(&RecordStats::default(), 0) };
+            return self.out.json(&first);
         }
-        self.out.line(|line| write!(line, "records into {}", path.display()))
+        self.out.line(|line| {
+            write!(line, "records into {}", path.display())?;
+            match older {
+                0 => Ok(()),
+                1 => write!(line, "; its first sample removes 1 file of an earlier run (--keep)"),
+                _ => write!(line, "; its first sample removes {older} files of earlier runs (--keep)"),
+            }
+        })
     }
 
     /// News of the hub, and of what was not received.
@@ -167,7 +175,10 @@ impl<'a> Report<'a> {
         self.next = Instant::now() + EVERY;
         match self.look {
             RecordLook::Lines => Ok(()),
-            RecordLook::Json => self.recording(written, left_out),
+            RecordLook::Json => {
+                let progress = self.at(written, left_out);
+                self.out.json(&progress)
+            }
             RecordLook::Terminal => {
                 // A line that wraps would not be drawn over: one that does not fit all the same is cut.
                 let columns = self.terminal.as_ref().and_then(columns).unwrap_or(usize::MAX - 2);
@@ -222,8 +233,8 @@ impl<'a> Report<'a> {
         })
     }
 
-    fn recording(&mut self, written: &RecordStats, left_out: u64) -> Result<(), End> {
-        self.out.json(&Progress {
+    fn at(&self, written: &RecordStats, left_out: u64) -> Progress {
+        Progress {
             class: "recording",
             file: self.files.last().map(|file| file.display().to_string()),
             bytes: written.bytes,
@@ -231,7 +242,8 @@ impl<'a> Report<'a> {
             lost: self.lost,
             left_out,
             seconds: self.begun.elapsed().as_secs_f64(),
-        })
+            older_removed: None,
+        }
     }
 
     /// How far it is, each part with its rank: what is lost is wanted longest.
@@ -282,6 +294,9 @@ struct Progress {
     lost: u64,
     left_out: u64,
     seconds: f64,
+    /// Only in the first line.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    older_removed: Option<usize>,
 }
 
 /// Class `recorded`: the last line.
