@@ -138,13 +138,14 @@ struct Replayed {
     laps: u32,
     position_s: f64,
     took_s: f64,
+    paused_s: f64,
 }
 
 impl Replayed {
     fn of(played: &Progress) -> Replayed {
-        let Progress { telegrams, lap: laps, position_ns, took_ns, .. } = *played;
-        let [position_s, took_s] = [position_ns, took_ns].map(|ns| ns as f64 / 1e9);
-        Replayed { class: "replayed", telegrams, laps, position_s, took_s }
+        let Progress { telegrams, lap: laps, position_ns, took_ns, paused_ns, .. } = *played;
+        let [position_s, took_s, paused_s] = [position_ns, took_ns, paused_ns].map(|ns| ns as f64 / 1e9);
+        Replayed { class: "replayed", telegrams, laps, position_s, took_s, paused_s }
     }
 }
 

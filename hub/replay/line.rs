@@ -55,12 +55,16 @@ fn wipe() {
 
 /// What was played, when it is over.
 pub(super) fn summary(played: &Progress) -> String {
-    let Progress { telegrams, position_ns, took_ns, pace, lap, .. } = *played;
-    let took = match took_ns {
-        ..1_000_000_000 => format!("{} ms", took_ns.div_ceil(1_000_000)),
-        _ => format!("{:.1} s", took_ns as f64 / 1e9),
+    let Progress { telegrams, position_ns, took_ns, paused_ns, pace, lap, .. } = *played;
+    let span = |ns: u64| match ns {
+        ..1_000_000_000 => format!("{} ms", ns.div_ceil(1_000_000)),
+        _ => format!("{:.1} s", ns as f64 / 1e9),
     };
-    let mut words = format!("replayed {telegrams} telegrams up to {}, in {took}", clock(position_ns));
+    let mut words =
+        format!("replayed {telegrams} telegrams up to {}, in {}", clock(position_ns), span(took_ns));
+    if paused_ns > 0 {
+        words += &format!(" and {} of pauses", span(paused_ns));
+    }
     if pace == Pace::Max && lap == 0 && took_ns > 0 {
         words += &format!(", {:.0} times as fast as it was recorded", position_ns as f64 / took_ns as f64);
     }
@@ -145,6 +149,7 @@ mod tests {
             lap: 0,
             telegrams: 7,
             took_ns: 1,
+            paused_ns: 0,
             now_ns: 2,
         };
         let begin = "1:05.2 [##########..........] 2:10.5  x0.5  7 telegrams  ";
@@ -182,11 +187,15 @@ mod tests {
             lap: 0,
             telegrams: 7,
             took_ns: 30_000_000,
+            paused_ns: 0,
             now_ns: 2,
         };
         let words = "replayed 7 telegrams up to 1:00.0, in 30 ms, 2000 times as fast as it was recorded";
         assert_eq!(summary(&played), words);
         let slow = Progress { pace: Pace::Times(1.0), took_ns: 61_000_000_000, ..played };
         assert_eq!(summary(&slow), "replayed 7 telegrams up to 1:00.0, in 61.0 s");
+        let paused = Progress { paused_ns: 12_340_000_000, ..played };
+        let words = "replayed 7 telegrams up to 1:00.0, in 30 ms and 12.3 s of pauses, 2000 times as fast as it was recorded";
+        assert_eq!(summary(&paused), words);
     }
 }

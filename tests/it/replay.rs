@@ -49,6 +49,7 @@ fn it_waits_for_a_word_plays_everything_with_its_times_and_ends() {
     let end = replayed(&player.wait());
     assert_eq!((number(&end, "telegrams"), number(&end, "laps")), (12, 0));
     assert_eq!(end["position_s"], 0.88);
+    assert!(end["paused_s"].as_f64() > Some(0.0), "{end}");
     consumer.await_line("its end", |line| line["kind"] == "hub_gone");
     let outcome = consumer.end(INT);
     assert_eq!(walls(&outcome), (0..12).map(|scan| scan * 80).collect::<Vec<_>>());

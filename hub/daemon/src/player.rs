@@ -71,8 +71,10 @@ pub struct Progress {
     pub lap: u32,
     /// Telegrams published, of all links and laps.
     pub telegrams: u64,
-    /// How long it has been played, in ns, pauses too.
+    /// Time that it has played, in ns, without pauses.
     pub took_ns: u64,
+    /// Time that it has been paused since everything was ready to play, in ns.
+    pub paused_ns: u64,
     /// CLOCK_MONOTONIC of this answer, in ns.
     pub now_ns: u64,
 }
@@ -191,6 +193,7 @@ impl Player {
             lap: playback.lap(),
             telegrams: self.links.iter().map(|link| link.telegrams.load(Ordering::Relaxed)).sum(),
             took_ns: playback.took(now),
+            paused_ns: playback.paused(now),
             now_ns: now,
         }
     }

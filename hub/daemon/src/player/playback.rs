@@ -39,6 +39,9 @@ pub(super) struct Playback {
     /// When the first lap began, and when nothing came any more.
     began_at: Option<Nanos>,
     over_at: Option<Nanos>,
+    /// Start of the current pause, and total duration of the earlier ones, both within the time since `began_at`.
+    paused_at: Option<Nanos>,
+    paused: Nanos,
     /// Whether what comes next is to be played, as soon as all have said what they have.
     owes_step: bool,
     /// Whether links that wait have to ask again.
@@ -90,6 +93,8 @@ impl Playback {
             has_played: false,
             began_at: None,
             over_at: None,
+            paused_at: None,
+            paused: 0,
             owes_step: false,
             is_news: false,
         }
@@ -150,14 +155,14 @@ impl Playback {
     /// Plays, or waits; `position` is the media time where nothing is waited for.
     pub(super) fn pause(&mut self, is_paused: bool, now: Nanos, position: Nanos) {
         self.hold(now, position);
-        self.play.is_paused = is_paused;
+        self.set_paused(is_paused, now);
         self.owes_step = false;
     }
 
     /// Pauses after what comes next.
     pub(super) fn step(&mut self, now: Nanos, position: Nanos) {
         self.hold(now, position);
-        self.play.is_paused = true;
+        self.set_paused(true, now);
         self.owes_step = true;
         self.pay_step();
     }
@@ -186,10 +191,24 @@ impl Playback {
         self.links.iter().all(|next| *next == Next::Ended)
     }
 
-    /// How long it has been played, pauses too.
+    /// Returns how long it has played, without pauses.
     pub(super) fn took(&self, now: Nanos) -> Nanos {
         let until = self.over_at.unwrap_or(now);
-        self.began_at.map_or(0, |began_at| until.saturating_sub(began_at))
+        let since_start = self.began_at.map_or(0, |began_at| until.saturating_sub(began_at));
+        since_start.saturating_sub(self.paused(now))
+    }
+
+    /// Returns how long it has been paused since everything was ready to play.
+    pub(super) fn paused(&self, now: Nanos) -> Nanos {
+        let until = self.over_at.unwrap_or(now);
+        self.paused + self.paused_at.map_or(0, |paused_at| until.saturating_sub(paused_at))
+    }
+
+    /// Sets whether it is paused. A pause counts from the moment at which playback could have run.
+    fn set_paused(&mut self, is_paused: bool, now: Nanos) {
+        self.paused = self.paused(now);
+        self.play.is_paused = is_paused;
+        self.paused_at = self.began_at.filter(|_| is_paused).map(|_| now);
     }
 
     /// Whether links that wait have to ask again since the last call.
@@ -229,7 +248,10 @@ impl Playback {
     fn start(&mut self, now: Nanos) {
         if self.is_begun && self.anchor.is_none() && !self.links.contains(&Next::Unknown) {
             self.anchor = Some((now, self.play.start_ns));
-            self.began_at.get_or_insert(now);
+            if self.began_at.is_none() {
+                self.began_at = Some(now);
+                self.set_paused(self.play.is_paused, now);
+            }
             self.is_news = true;
         }
     }
@@ -330,6 +352,28 @@ mod tests {
         assert_eq!(playback.turn(0, 2 * SECOND, 200 * SECOND), Turn::At(201 * SECOND - 1));
         playback.pause(true, 200 * SECOND + 5, 0);
         assert_eq!(playback.turn(0, 2 * SECOND, 300 * SECOND), Turn::Wait);
+    }
+
+    #[test]
+    fn pauses_are_not_playing_time() {
+        let mut playback = Playback::new(Play { pace: Pace::Max, is_paused: true, ..Play::default() }, 1);
+        assert_eq!(playback.turn(0, 0, 90 * SECOND), Turn::Wait);
+        // Time before the start does not count at all.
+        playback.pause(true, 95 * SECOND, 0);
+        playback.begin(100 * SECOND);
+        let times =
+            |playback: &Playback, at: Nanos| (playback.took(at * SECOND), playback.paused(at * SECOND));
+        assert_eq!(times(&playback, 130), (0, 30 * SECOND));
+        playback.pause(false, 160 * SECOND, 0);
+        assert_eq!(times(&playback, 162), (2 * SECOND, 60 * SECOND));
+        playback.pause(true, 163 * SECOND, 0);
+        playback.step(164 * SECOND, 0);
+        assert!(is_now(playback.turn(0, 0, 165 * SECOND), 165 * SECOND));
+        playback.pause(false, 170 * SECOND, 0);
+        assert_eq!(times(&playback, 170), (3 * SECOND, 67 * SECOND));
+        assert_eq!(playback.end(0, 0, 171 * SECOND), Turn::Over);
+        playback.pause(true, 172 * SECOND, 0);
+        assert_eq!(times(&playback, 180), (4 * SECOND, 67 * SECOND), "it is over");
     }
 
     #[test]
