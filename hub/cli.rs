@@ -300,6 +300,12 @@ pub(crate) struct Echo {
     /// Print comma-separated values
     #[arg(long, conflicts_with_all = ["json", "raw"])]
     pub(crate) csv: bool,
+    /// With --csv: ranges in meters
+    #[arg(long, requires = "csv", conflicts_with_all = ["json", "raw"])]
+    pub(crate) meters: bool,
+    /// With --csv: columns intensity_0 .. after the ranges
+    #[arg(long, requires = "csv", conflicts_with_all = ["json", "raw"])]
+    pub(crate) intensities: bool,
     /// Print raw bytes: telegrams, or the payload of another topic
     #[arg(long, conflicts_with = "json")]
     pub(crate) raw: bool,

@@ -20,6 +20,7 @@ use std::sync::atomic::AtomicBool;
 use clap::error::ErrorKind;
 use config::Config;
 use rustix::process::Signal;
+use schema::csv::ScanColumns;
 use schema::{Domain, Failure, Kind, Printable, json_line};
 use serde::Serialize;
 use signal_hook::consts::{SIGHUP, SIGINT, SIGQUIT, SIGTERM, SIGUSR1};
@@ -109,7 +110,9 @@ fn dispatch(cli: &Cli) -> Result<(), Failure> {
         Verb::Echo(echo) => {
             let format = match (everywhere.json, echo.csv, echo.raw) {
                 (true, ..) => Format::Json,
-                (_, true, _) => Format::Csv,
+                (_, true, _) => {
+                    Format::Csv(ScanColumns { meters: echo.meters, intensities: echo.intensities })
+                }
                 (_, _, true) => Format::Raw,
                 _ => Format::Text,
             };

@@ -5,8 +5,8 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
 
 use clap::Args;
-use recording::Damage;
 use recording::convert::{self, ConvertOptions, Converted};
+use recording::{Damage, Form, Unread};
 use schema::Failure;
 use schema::file::Compression;
 use serde::Serialize;
@@ -19,8 +19,8 @@ pub(crate) struct Convert {
     /// Recording to read, damaged or not: MCAP file, telegram stream or CARMEN log, plain or gzipped
     #[arg(value_name = "IN")]
     input: PathBuf,
-    /// Output file; its ending selects the format: .mcap, .bin (telegram stream), .log (CARMEN) or .csv (a row per scan),
-    /// the last three also with .gz; - is a telegram stream on stdout
+    /// Output file; its ending selects the format: .mcap, .bin (telegram stream), .log (CARMEN) or .csv (a row per scan, or
+    /// per mark), the last three also with .gz; - is a telegram stream on stdout
     #[arg(value_name = "OUT")]
     output: PathBuf,
     /// Convert only this sensor; for a stream or a log, the name that it gets [default: front]
@@ -32,6 +32,15 @@ pub(crate) struct Convert {
     /// With --ros2 or .csv: measuring mode of a recording that does not contain it, such as 0x01
     #[arg(long)]
     mode: Option<String>,
+    /// With .csv: topic to write, SENSOR/scan or SENSOR/marks [default: the scans]
+    #[arg(long, value_name = "SENSOR/TOPIC")]
+    topic: Option<String>,
+    /// With .csv: ranges in meters
+    #[arg(long)]
+    meters: bool,
+    /// With .csv: columns intensity_0 .. after the ranges
+    #[arg(long)]
+    intensities: bool,
     /// Compression of an MCAP file: zstd, lz4 or none [default: zstd]
     #[arg(long, value_name = "NAME", value_parser = Compression::parse)]
     compression: Option<Compression>,
@@ -51,6 +60,9 @@ impl Convert {
             ros2: self.ros2,
             compression: self.compression,
             mode: self.mode.as_deref().map(options::parse_mode).transpose()?,
+            topic: self.topic.clone(),
+            meters: self.meters,
+            intensities: self.intensities,
         };
         let is_watched = stderr().is_terminal() && !json;
         let progress = |done: u64, all: u64| {
@@ -76,8 +88,13 @@ impl Convert {
     }
 
     fn words(&self, converted: &Converted) -> String {
-        let Converted { telegrams, scans, left_out, took_ns, encoding, damage, .. } = converted;
-        let mut words = format!("{}: {telegrams} telegrams, {scans} scans", self.output.display());
+        let Converted { telegrams, scans, marks, left_out, unread, took_ns, encoding, damage, .. } =
+            converted;
+        let what = match marks {
+            Some(marks) => format!("{marks} marks in {scans} scans"),
+            None => format!("{telegrams} telegrams, {scans} scans"),
+        };
+        let mut words = format!("{}: {what}", self.output.display());
         if let Some(seconds) = took_ns.map(seconds) {
             words += &format!(", {seconds:.3} s");
         }
@@ -88,6 +105,9 @@ impl Convert {
             let (plural, what) =
                 if *left_out == 1 { ("", "a complete scan") } else { ("s", "complete scans") };
             words += &format!("; {left_out} telegram{plural} dropped (not {what})");
+        }
+        if *unread != Unread::default() {
+            words += &format!("; left out of the log: {unread}");
         }
         if !damage.is_none() {
             words += &format!("; missing in {}: {damage}", self.input.display());
@@ -110,6 +130,17 @@ struct Line<'a> {
     left_out: u64,
     seconds: Option<f64>,
     missing: Missing,
+    marks: Option<u64>,
+    log_left_out: Option<LogLeftOut>,
+}
+
+/// Data of a log that is not in the output.
+#[derive(Serialize)]
+struct LogLeftOut {
+    poses: u64,
+    odometry: u64,
+    remissions: u64,
+    lines: u64,
 }
 
 /// What was missing of the recording.
@@ -126,6 +157,8 @@ struct Missing {
 
 impl<'a> Line<'a> {
     fn of(convert: &'a Convert, converted: &'a Converted) -> Self {
+        let Unread { poses, odometry, remissions, lines } = converted.unread;
+        let is_log = converted.forms.0 == Form::Carmen;
         let Damage { telegrams, bytes, chunks, estimated, is_headless, is_cut, is_harmed } = converted.damage;
         Line {
             class: "converted",
@@ -147,6 +180,8 @@ impl<'a> Line<'a> {
                 end: is_cut,
                 checksum: is_harmed,
             },
+            marks: converted.marks,
+            log_left_out: is_log.then_some(LogLeftOut { poses, odometry, remissions, lines }),
         }
     }
 }

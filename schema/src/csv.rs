@@ -1,30 +1,170 @@
-//! A scan as a line of CSV. Refuses to know where lines go.
+//! Scans and marks as rows of CSV.
 
 use std::io::{self, Write};
 
-use crate::{Header, Scan, in_degrees};
+use crate::{Header, Marks, Scan, in_degrees};
 
-/// Writes the names of the columns of scans with so many beams, without a line's end.
-///
-/// # Errors
-///
-/// The error of `out`, or of what it writes to.
-pub fn columns(line: &mut impl Write, beams: usize) -> io::Result<()> {
-    write!(line, "seq,topic_seq,stamp_ns,wall_ns,quality,unit_um,first_angle_deg,step_deg")?;
-    (0..beams).try_for_each(|i| write!(line, ",range_{i}"))
+/// Columns of a scan that depend on options.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct ScanColumns {
+    /// Ranges in meters instead of device units. Column `unit_um` is then 1000000.
+    pub meters: bool,
+    /// Columns `intensity_0` .. after the ranges.
+    pub intensities: bool,
 }
 
-/// Writes the columns of `scan`, without a line's end: ranges in device units, nothing where there is no reading.
-///
-/// # Errors
-///
-/// The error of what it writes to.
-pub fn row(line: &mut impl Write, header: &Header, scan: &Scan) -> io::Result<()> {
+impl ScanColumns {
+    /// Writes the names of the columns of scans with `beams` beams, without a line end.
+    ///
+    /// # Errors
+    ///
+    /// The error of `line`.
+    pub fn names(self, line: &mut impl Write, beams: usize) -> io::Result<()> {
+        write!(line, "{STAMPS},unit_um,first_angle_deg,step_deg")?;
+        (0..beams).try_for_each(|i| write!(line, ",range_{i}"))?;
+        let intensities = if self.intensities { beams } else { 0 };
+        (0..intensities).try_for_each(|i| write!(line, ",intensity_{i}"))
+    }
+
+    /// Writes the columns of `scan`, without a line end. A range without a reading and an intensity that the sensor does not
+    /// send are empty.
+    ///
+    /// # Errors
+    ///
+    /// The error of `line`.
+    pub fn row(self, line: &mut impl Write, header: &Header, scan: &Scan) -> io::Result<()> {
+        stamps(line, header)?;
+        let unit_um = if self.meters { UM_PER_M } else { scan.unit_um };
+        write!(line, ",{unit_um},{},{}", in_degrees(scan.first_angle), in_degrees(scan.step))?;
+        for i in 0..scan.beams() {
+            match (scan.distance_m(i), scan.range(i)) {
+                (Some(range_m), _) if self.meters => write!(line, ",{range_m}")?,
+                (_, Some(range)) => write!(line, ",{range}")?,
+                (_, None) => write!(line, ",")?,
+            }
+        }
+        let intensities = scan.intensities();
+        for i in 0..if self.intensities { scan.beams() } else { 0 } {
+            match intensities.get(i) {
+                Some(intensity) => write!(line, ",{intensity}")?,
+                None => write!(line, ",")?,
+            }
+        }
+        Ok(())
+    }
+}
+
+/// Columns of marks. A scan has one row for each of its marks, or a single row without a mark.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct MarkColumns {
+    /// Ranges in meters instead of millimeters.
+    pub meters: bool,
+}
+
+impl MarkColumns {
+    /// Writes a line with the names of the columns.
+    ///
+    /// # Errors
+    ///
+    /// The error of `out`.
+    pub fn names(self, out: &mut impl Write) -> io::Result<()> {
+        let range = if self.meters { "range_m" } else { "range_mm" };
+        writeln!(out, "{STAMPS},marks,mark,angle_deg,{range},peak,weight,first_beam,last_beam,edge")
+    }
+
+    /// Writes the lines of `marks`: column `marks` is their number, or empty if the sensor's mode has no marks. Without a mark,
+    /// the columns after it are empty.
+    ///
+    /// # Errors
+    ///
+    /// The error of `out`.
+    pub fn rows(self, out: &mut impl Write, header: &Header, marks: &Marks) -> io::Result<()> {
+        for (number, mark) in marks.marks().iter().enumerate() {
+            stamps(out, header)?;
+            let (count, angle_deg) = (marks.marks().len(), f64::from(mark.angle_mdeg) / 1000.0);
+            let range = f64::from(mark.range_dmm) / if self.meters { 10_000.0 } else { 10.0 };
+            write!(out, ",{count},{number},{angle_deg},{range},{},{}", mark.peak, mark.weight)?;
+            writeln!(out, ",{},{},{}", mark.first_beam, mark.last_beam, mark.edge)?;
+        }
+        if marks.marks().is_empty() {
+            stamps(out, header)?;
+            let count = if marks.is_available() { "0" } else { "" };
+            writeln!(out, ",{count},,,,,,,,")?;
+        }
+        Ok(())
+    }
+}
+
+fn stamps(line: &mut impl Write, header: &Header) -> io::Result<()> {
     let (stamp_ns, wall_ns) = (header.stamp_first_ns, header.wall_ns);
-    write!(line, "{},{},{stamp_ns},{wall_ns},{}", header.seq, header.topic_seq, header.quality().name())?;
-    write!(line, ",{},{},{}", scan.unit_um, in_degrees(scan.first_angle), in_degrees(scan.step))?;
-    (0..scan.beams()).try_for_each(|i| match scan.range(i) {
-        Some(range) => write!(line, ",{range}"),
-        None => write!(line, ","),
-    })
+    write!(line, "{},{},{stamp_ns},{wall_ns},{}", header.seq, header.topic_seq, header.quality().name())
+}
+
+const STAMPS: &str = "seq,topic_seq,stamp_ns,wall_ns,quality";
+const UM_PER_M: u32 = 1_000_000;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::{Contents, Mark, ScanHead};
+
+    fn text(write: impl FnOnce(&mut Vec<u8>) -> io::Result<()>) -> String {
+        let mut line = Vec::new();
+        write(&mut line).unwrap();
+        String::from_utf8(line).unwrap()
+    }
+
+    #[test]
+    fn a_scan_has_ranges_in_meters_and_intensities_on_request() {
+        let head = ScanHead {
+            unit_um: 250,
+            contents: Contents::UPPER,
+            intensity_bits: 8,
+            valid_to: 39_999,
+            ..ScanHead::default()
+        };
+        let mut scan = Scan::of(head, &[1, 40_000, 12_345]);
+        scan.arrays().upper.copy_from_slice(&[7, 0, 255]);
+        let (header, plain) = (Header { seq: 5, ..Header::default() }, ScanColumns::default());
+        let all = ScanColumns { meters: true, intensities: true };
+        let begin =
+            "seq,topic_seq,stamp_ns,wall_ns,quality,unit_um,first_angle_deg,step_deg,range_0,range_1,range_2";
+        assert_eq!(text(|line| plain.names(line, 3)), begin);
+        assert_eq!(text(|line| all.names(line, 3)), format!("{begin},intensity_0,intensity_1,intensity_2"));
+        assert_eq!(text(|line| plain.row(line, &header, &scan)), "5,0,0,0,clean,250,0,0,1,,12345");
+        assert_eq!(
+            text(|line| all.row(line, &header, &scan)),
+            "5,0,0,0,clean,1000000,0,0,0.00025,,3.08625,7,0,255"
+        );
+        scan.intensity_bits = 0;
+        let empty = text(|line| ScanColumns { intensities: true, ..plain }.row(line, &header, &scan));
+        assert_eq!(empty, "5,0,0,0,clean,250,0,0,1,,12345,,,");
+    }
+
+    #[test]
+    fn a_scan_has_a_row_for_each_mark() {
+        let mut marks = Marks { count: 2, ..Marks::default() };
+        marks.mark_array[1] = Mark {
+            angle_mdeg: -90_500,
+            range_dmm: 12_345,
+            weight: 17,
+            peak: 9,
+            edge: 1,
+            first_beam: 0,
+            last_beam: 2,
+        };
+        let header = Header { seq: 5, ..Header::default() };
+        let rows = |meters, marks: &Marks| text(|out| MarkColumns { meters }.rows(out, &header, marks));
+        let first = "5,0,0,0,clean,2,0,0,0,0,0,0,0,0\n";
+        assert_eq!(rows(false, &marks), format!("{first}5,0,0,0,clean,2,1,-90.5,1234.5,9,17,0,2,1\n"));
+        assert!(rows(true, &marks).ends_with(",2,1,-90.5,1.2345,9,17,0,2,1\n"));
+        assert_eq!(rows(false, &Marks::default()), "5,0,0,0,clean,0,,,,,,,,\n");
+        let unavailable = Marks { flags: Marks::UNAVAILABLE, ..Marks::default() };
+        assert_eq!(rows(false, &unavailable), "5,0,0,0,clean,,,,,,,,,\n");
+        let columns = |row: &str| row.trim_end().split(',').count();
+        assert_eq!(
+            columns(&rows(false, &unavailable)),
+            columns(&text(|out| MarkColumns::default().names(out)))
+        );
+    }
 }

@@ -66,6 +66,70 @@ fn bytes_between_telegrams_are_counted_by_whoever_reads_them() {
 }
 
 #[test]
+fn reports_what_it_leaves_out_of_a_log() {
+    let env = TestEnv::new();
+    let scan = |time: &str| format!("FLASER 181{} 1 2 3 1 2 3 {time} host 1\n", " 1.25".repeat(181));
+    let lines = ["ODOM 1 2 3 0 0 0 9.5 host 1\n", &scan("10.123457"), &scan("11.5"), "SYNC laser\n"];
+    let log = env.file("a.log", lines.concat());
+    let outcome = env.run(&["convert", &log, &env.word("a.mcap"), "--json"]);
+    let line = outcome.of_class("converted").pop().unwrap_or_else(|| panic!("{outcome}"));
+    let left_out = json!({"poses": 2, "odometry": 1, "remissions": 0, "lines": 1});
+    assert_eq!(
+        (&line["log_left_out"], &line["marks"], &line["left_out"]),
+        (&left_out, &json!(null), &json!(0))
+    );
+    let outcome = env.run(&["convert", &log, &env.word("a.bin")]);
+    let says = "; left out of the log: 2 poses, 1 line of odometry, 1 other line";
+    assert!(outcome.errors.contains(says), "{outcome}");
+    let outcome = env.run(&["convert", &env.word("a.mcap"), &env.word("b.log"), "--json"]);
+    let line = outcome.of_class("converted").pop().unwrap_or_else(|| panic!("{outcome}"));
+    assert_eq!(
+        (&line["log_left_out"], &line["left_out"], &line["scans"]),
+        (&json!(null), &json!(0), &json!(2))
+    );
+    let back = std::fs::read_to_string(env.path("b.log")).expect("a log");
+    assert!(back.contains(" 10.123457 scanhub 0.000000\n"), "{back}");
+}
+
+#[test]
+fn rows_of_a_hub_have_meters_intensities_and_marks() {
+    let env = TestEnv::new();
+    let _simulator = env.simulator(&["front"], &["--world=room", "--mode=0x01"]);
+    let _hub = env.hub(&[env.link("front")]);
+    env.await_info("front", |info| info["state"] == "streaming");
+    let recording = env.word("walk.mcap");
+    assert_eq!(env.run(&["record", "-n", "100", "-o", &recording]).code, Some(0));
+    let [scans, marks] = ["scans.csv", "marks.csv"].map(|name| env.word(name));
+    let outcome = env.run(&["convert", &recording, &scans, "--meters", "--intensities"]);
+    assert_eq!(outcome.code, Some(0), "{outcome}");
+    let text = std::fs::read_to_string(&scans).expect("rows");
+    let names: Vec<&str> = text.lines().next().expect("names").split(',').collect();
+    let row: Vec<&str> = text.lines().nth(1).expect("a row").split(',').collect();
+    let values = |begin: &str| -> Vec<&str> {
+        names.iter().zip(&row).filter(|(name, _)| name.starts_with(begin)).map(|(_, value)| *value).collect()
+    };
+    let (ranges, intensities) = (values("range_"), values("intensity_"));
+    assert_eq!((names.len(), names.len()), (row.len(), 8 + 2 * ranges.len()));
+    assert_eq!((values("unit_um"), ranges.len()), (vec!["1000000"], intensities.len()));
+    let meters: Vec<f64> = ranges.iter().filter_map(|range| range.parse().ok()).collect();
+    assert!(meters.len() > 90 && meters.iter().all(|range| (0.0..82.0).contains(range)), "{ranges:?}");
+    assert!(intensities.iter().all(|intensity| intensity.parse::<u8>().is_ok()), "{intensities:?}");
+    let outcome = env.run(&["convert", &recording, &marks, "--topic=front/marks", "--json"]);
+    let line = outcome.of_class("converted").pop().unwrap_or_else(|| panic!("{outcome}"));
+    let text = std::fs::read_to_string(&marks).expect("rows");
+    assert!(
+        text.starts_with("seq,topic_seq,stamp_ns,wall_ns,quality,marks,mark,angle_deg,range_mm,"),
+        "{text}"
+    );
+    let rows = text.lines().skip(1).filter(|row| row.split(',').nth(6) != Some("")).count();
+    assert_eq!((&line["marks"], &line["telegrams"]), (&json!(rows), &json!(0)));
+    let words = ["echo", "front/scan", "--csv", "--meters", "--intensities", "-n", "1", "--timeout=30s"];
+    let outcome = env.run(&words);
+    let text = String::from_utf8_lossy(&outcome.out).into_owned();
+    assert!(text.contains(",intensity_0,") && text.contains(",1000000,"), "{outcome}");
+}
+
+#[test]
 fn what_cannot_be_converted_is_refused() {
     let env = TestEnv::new();
     let stream = env.file("a.bin", testkit::scan(1));
@@ -79,5 +143,14 @@ fn what_cannot_be_converted_is_refused() {
     ] {
         let outcome = env.run(&arguments);
         assert!(outcome.code == Some(code) && outcome.errors.contains(says), "{outcome}");
+    }
+    for (output, option, says) in [
+        ("x.mcap", "--meters", "scanhub convert IN OUT.csv --meters"),
+        ("x.log", "--intensities", "scanhub convert IN OUT.csv --intensities"),
+        ("x.bin", "--topic=front/marks", "scanhub convert IN OUT.csv --topic SENSOR/marks"),
+        ("x.csv", "--topic=front/zones", "scanhub echo SENSOR/TOPIC --json"),
+    ] {
+        let outcome = env.run(&["convert", &stream, output, option]);
+        assert!(outcome.code == Some(2) && outcome.errors.contains(says), "{outcome}");
     }
 }

@@ -4,7 +4,8 @@ use std::io::Write;
 use std::sync::atomic::AtomicBool;
 
 use scanhub_client::streams::Sample;
-use schema::{Domain, Failure, Header, Kind, Scan, Topic, csv};
+use schema::csv::ScanColumns;
+use schema::{Domain, Failure, Header, Kind, Scan, Topic};
 
 use crate::follow::{Bounds, Notice, Sink, follow};
 use crate::names::TopicName;
@@ -35,7 +36,7 @@ pub enum Format {
     /// An object per line, notices and summary too.
     Json,
     /// Columns, scans only; notices and summary go to `notes`.
-    Csv,
+    Csv(ScanColumns),
     /// The payloads' bytes, one after the other; notices and summary go to `notes`.
     Raw,
 }
@@ -56,7 +57,7 @@ pub fn echo(
     let Selection { named, of_all } = Selection::parse(&options.topics)?;
     check(options.format, &named, &of_all)?;
     let mut echo =
-        Echo { format: options.format, out: Output::new(out), notes: Output::new(notes), columns: None };
+        Echo { format: options.format, out: Output::new(out), notes: Output::new(notes), beams: None };
     quiet(follow(&named, &of_all, &options.places, &options.bounds, stop, &mut echo))
 }
 
@@ -64,7 +65,8 @@ struct Echo<'a> {
     format: Format,
     out: Output<'a>,
     notes: Output<'a>,
-    columns: Option<usize>,
+    /// Number of beams in the last line of column names.
+    beams: Option<usize>,
 }
 
 impl Sink for Echo<'_> {
@@ -72,8 +74,8 @@ impl Sink for Echo<'_> {
         match (self.format, sample) {
             (Format::Text, _) => self.out.line(|line| text::sample(line, name, sample)),
             (Format::Raw, _) => self.out.raw(sample.bytes()),
-            (Format::Csv, Sample::Scan(scan)) => self.csv(scan.header(), scan),
-            (Format::Csv, _) => Ok(()),
+            (Format::Csv(columns), Sample::Scan(scan)) => self.csv(columns, scan.header(), scan),
+            (Format::Csv(_), _) => Ok(()),
             (Format::Json, _) => show::json(sample, &name.sensor, &mut self.out),
         }
     }
@@ -90,19 +92,19 @@ impl Sink for Echo<'_> {
         match self.format {
             Format::Json => self.out.json(&json::summary(name, stats)),
             Format::Text => self.out.line(|line| text::summary(line, name, stats)),
-            Format::Csv | Format::Raw => self.notes.line(|line| text::summary(line, name, stats)),
+            Format::Csv(_) | Format::Raw => self.notes.line(|line| text::summary(line, name, stats)),
         }
     }
 }
 
 impl Echo<'_> {
     /// A line of columns; the names of the columns first, and again if their number changes.
-    fn csv(&mut self, header: &Header, scan: &Scan) -> Result<(), End> {
-        if self.columns != Some(scan.beams()) {
-            self.columns = Some(scan.beams());
-            self.out.line(|line| csv::columns(line, scan.beams()))?;
+    fn csv(&mut self, columns: ScanColumns, header: &Header, scan: &Scan) -> Result<(), End> {
+        if self.beams != Some(scan.beams()) {
+            self.beams = Some(scan.beams());
+            self.out.line(|line| columns.names(line, scan.beams()))?;
         }
-        self.out.line(|line| csv::row(line, header, scan))
+        self.out.line(|line| columns.row(line, header, scan))
     }
 }
 
@@ -110,11 +112,11 @@ fn check(format: Format, named: &[TopicName], of_all: &[Topic]) -> Result<(), Fa
     let usage = |what: &str| Err(Failure::new(Kind::Usage, what, "for example `scanhub echo front/scan`"));
     match (format, named) {
         (_, []) if of_all.is_empty() => usage("echo needs a topic"),
-        (Format::Csv | Format::Raw, _) if !of_all.is_empty() => {
+        (Format::Csv(_) | Format::Raw, _) if !of_all.is_empty() => {
             usage("--csv and --raw take one topic of one sensor")
         }
-        (Format::Csv, [one]) if one.topic == Topic::Scan => Ok(()),
-        (Format::Csv, _) => usage("--csv takes one topic, which must be a scan"),
+        (Format::Csv(_), [one]) if one.topic == Topic::Scan => Ok(()),
+        (Format::Csv(_), _) => usage("--csv takes one topic, which must be a scan"),
         (Format::Raw, [_, _, ..]) => usage("--raw takes one topic"),
         (Format::Raw, [one]) if one.is_robot() => usage("--raw takes the topic of a sensor"),
         _ => Ok(()),

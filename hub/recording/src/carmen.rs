@@ -1,10 +1,16 @@
 //! CARMEN logs: text lines of which `FLASER n r1 .. rn ..`, `ROBOTLASER1` and `RAWLASER1` are scans in metres. They become
-//! the telegrams that an LMS 2xx would have sent. Poses and all other lines are skipped.
+//! the telegrams that an LMS 2xx would have sent. Poses and all other lines are not read, but counted ([`Unread`]).
 
 mod census;
 mod log;
 
+use std::fmt;
+
 use lms::measured;
+#[cfg(feature = "mcap")]
+use lms::reply::Reply;
+#[cfg(feature = "mcap")]
+use lms::telegram::Telegram;
 use lms::variant::{Unit, Variant};
 
 use crate::{Encoding, Frame};
@@ -20,8 +26,25 @@ pub(crate) struct Sweep {
     pub(crate) form: LineForm,
     /// Metres, from right to left.
     pub(crate) ranges_m: Vec<f64>,
-    /// Seconds since 1970 (or since the log's start), where the line has all its fields after the ranges.
-    pub(crate) time_s: Option<f64>,
+    /// Nanoseconds since 1970 (or since the log's start), where the line has all its fields after the ranges.
+    pub(crate) time_ns: Option<u64>,
+    /// Whether the line has a pose other than 0.
+    pub(crate) has_pose: bool,
+    /// Whether the line has remissions.
+    pub(crate) has_remissions: bool,
+}
+
+/// Data of a log that no other format holds, so that a conversion loses it.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Unread {
+    /// Scans with a pose other than 0.
+    pub poses: u64,
+    /// Lines of odometry.
+    pub odometry: u64,
+    /// Scans with remissions.
+    pub remissions: u64,
+    /// Other lines, except comments and empty ones.
+    pub lines: u64,
 }
 
 /// How a scan is written. A log may have each scan in two of them.
@@ -33,6 +56,24 @@ pub(crate) enum LineForm {
     RobotLaser,
     /// `RAWLASER1`: the same without what is of the robot.
     RawLaser,
+}
+
+/// Lists the counts that are not 0.
+impl fmt::Display for Unread {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let parts = [
+            (self.poses, "pose", "poses"),
+            (self.odometry, "line of odometry", "lines of odometry"),
+            (self.remissions, "scan's remissions", "scans' remissions"),
+            (self.lines, "other line", "other lines"),
+        ];
+        let parts: Vec<String> = parts
+            .into_iter()
+            .filter(|(count, ..)| *count > 0)
+            .map(|(count, one, many)| format!("{count} {}", if count == 1 { one } else { many }))
+            .collect();
+        f.write_str(&parts.join(", "))
+    }
 }
 
 impl LineForm {
@@ -74,13 +115,19 @@ impl Sweep {
             })
             .collect::<Result<Vec<f64>, String>>()?;
         // Before the time: two poses; remissions, two poses and five numbers; remissions.
-        let before = match form {
-            LineForm::Flaser => Some(6),
-            LineForm::RobotLaser => remissions(fields.next()).map(|remissions| remissions + 11),
-            LineForm::RawLaser => remissions(fields.next()),
+        let (remissions, numbers) = match form {
+            LineForm::Flaser => (Some(0), 6),
+            LineForm::RobotLaser => (remissions(fields.next()), 11),
+            LineForm::RawLaser => (remissions(fields.next()), 0),
         };
-        let time_s = before.and_then(|before| fields.nth(before)).and_then(|time| time.parse().ok());
-        Ok(Some(Sweep { form, ranges_m, time_s }))
+        let mut sweep =
+            Sweep { form, ranges_m, time_ns: None, has_pose: false, has_remissions: remissions > Some(0) };
+        let Some(remissions) = remissions else { return Ok(Some(sweep)) };
+        let mut rest = fields.skip(remissions);
+        let poses: Vec<&str> = rest.by_ref().take(numbers).take(POSES).collect();
+        sweep.has_pose = poses.iter().any(|field| field.parse().is_ok_and(|number: f64| number != 0.0));
+        sweep.time_ns = rest.nth(numbers.saturating_sub(POSES)).and_then(nanoseconds);
+        Ok(Some(sweep))
     }
 
     /// The variant whose beams it has.
@@ -111,13 +158,33 @@ impl Sweep {
     pub(crate) fn frame(&self, own: Encoding, encoding: Encoding) -> Frame {
         let words = self.words(own, encoding);
         let telegram = measured::encode(0, encoding.unit, &words, STATUS).bytes().to_vec();
-        Frame { telegram, wall_ns: self.wall_ns(), ..Frame::default() }
+        Frame { telegram, wall_ns: self.time_ns, ..Frame::default() }
     }
+}
 
-    /// Its time in ns.
-    pub(crate) fn wall_ns(&self) -> Option<u64> {
-        self.time_s.filter(|time_s| *time_s > 0.0).map(|time_s| (time_s * 1e9) as u64)
-    }
+/// Returns the nanoseconds in `text`, a number of seconds; `None` if it is not positive. A double has only a quarter of a
+/// microsecond at today's times, so the decimals are read as they are.
+fn nanoseconds(text: &str) -> Option<u64> {
+    let (whole, fraction) = text.split_once('.').unwrap_or((text, ""));
+    let is_digits = |text: &str| text.bytes().all(|byte| byte.is_ascii_digit());
+    let ns = if !whole.is_empty() && is_digits(whole) && is_digits(fraction) {
+        let decimals: u64 = format!("{fraction:0<9.9}").parse().ok()?;
+        let rounded_up = fraction.as_bytes().get(9).is_some_and(|digit| *digit >= b'5');
+        let seconds: u64 = whole.parse().ok()?;
+        seconds.checked_mul(1_000_000_000)?.checked_add(decimals + u64::from(rounded_up))?
+    } else {
+        // Such as 1.07e9.
+        text.parse().ok().map(|seconds: f64| (seconds * 1e9).round() as u64)?
+    };
+    (ns > 0).then_some(ns)
+}
+
+/// Returns whether `telegram` is the [`configuration`] reply that stands for the encoding of a log, and that no scanner sent.
+#[cfg(feature = "mcap")]
+pub(crate) fn is_made_up(telegram: &[u8]) -> bool {
+    let reply = Telegram::check(telegram).and_then(Reply::decode);
+    let Some(Reply::Configuration(reply)) = reply else { return false };
+    reply.unit().is_some_and(|unit| configuration(Encoding { unit, mode: reply.mode() }) == telegram)
 }
 
 /// The reply in which a sensor says that its values are as `encoding` has them.
@@ -153,6 +220,8 @@ fn variant(beams: usize) -> Option<Variant> {
     Variant::of_beams(whole)
 }
 
+/// Numbers of two poses.
+const POSES: usize = 6;
 /// What is subtracted from the greatest value for a range beyond the mode's (Telegram listing 10.8).
 pub const BEYOND: u16 = 8;
 /// The same for the last beam of a scan that has none there: a code without a meaning, which no sensor sends.
@@ -181,7 +250,7 @@ mod tests {
     #[test]
     fn a_scan_becomes_the_telegram_of_a_sensor() {
         let sweep = Sweep::parse(&line(180, "2.5")).unwrap().unwrap();
-        assert_eq!(sweep.time_s, Some(1_071_078_720.5));
+        assert_eq!((sweep.time_ns, sweep.has_pose), (Some(1_071_078_720_500_000_000), true));
         let mm = encoding(Unit::Mm, 1);
         let frame = sweep.frame(mm, mm);
         assert_eq!(frame.wall_ns, Some(1_071_078_720_500_000_000));
@@ -230,8 +299,8 @@ mod tests {
         ] {
             let sweep = Sweep::parse(&line).unwrap().unwrap();
             assert_eq!(
-                (sweep.ranges_m.len(), sweep.ranges_m[360], sweep.time_s),
-                (361, 2.5, Some(12.25)),
+                (sweep.ranges_m.len(), sweep.ranges_m[360], sweep.time_ns),
+                (361, 2.5, Some(12_250_000_000)),
                 "{line}"
             );
         }
@@ -248,6 +317,46 @@ mod tests {
         assert!(Sweep::parse("FLASER 17 1").unwrap_err().contains("17 beams"));
         assert!(Sweep::parse("FLASER 181 1 2").unwrap_err().contains("2 ranges"));
         assert!(Sweep::parse(&line(101, "2,5")).unwrap_err().contains("2,5"));
-        assert_eq!(Sweep::parse(&line(101, "1").replace("1071078720.5", "x")).unwrap().unwrap().time_s, None);
+        assert_eq!(
+            Sweep::parse(&line(101, "1").replace("1071078720.5", "x")).unwrap().unwrap().time_ns,
+            None
+        );
+    }
+
+    #[test]
+    fn times_are_read_to_the_nanosecond() {
+        for (text, ns) in [
+            ("1071078720.123456", Some(1_071_078_720_123_456_000)),
+            ("1071078720.999999999", Some(1_071_078_720_999_999_999)),
+            ("1071078720.9999999995", Some(1_071_078_721_000_000_000)),
+            ("1071078720.", Some(1_071_078_720_000_000_000)),
+            ("7", Some(7_000_000_000)),
+            ("1.5e3", Some(1_500_000_000_000)),
+            ("0.000000", None),
+            ("-1.5", None),
+            ("nan", None),
+            ("", None),
+            ("99999999999999999999", None),
+        ] {
+            assert_eq!(nanoseconds(text), ns, "{text}");
+        }
+    }
+
+    #[test]
+    fn a_scan_says_whether_it_has_a_pose_and_remissions() {
+        let has = |line: &str| {
+            let sweep = Sweep::parse(line).unwrap().unwrap();
+            (sweep.has_pose, sweep.has_remissions)
+        };
+        let ranges = vec!["2.5"; 181].join(" ");
+        assert_eq!(has(&format!("FLASER 181 {ranges} 0 0.0 0 0 0 0 12.25 host 1")), (false, false));
+        assert_eq!(has(&format!("FLASER 181 {ranges} 0 0 0 0 0 -0.1 12.25 host 1")), (true, false));
+        let sensor = "0 -1.570796 3.141593 0.017453 81.91 0.01 0";
+        let robot = |remissions: &str, poses: &str| {
+            has(&format!("ROBOTLASER1 {sensor} 181 {ranges} {remissions} {poses} 1 2 3 4 5 12.25 host 1"))
+        };
+        assert_eq!(robot("2 7 8", "0 0 0 0 0 0"), (false, true), "speeds are no pose");
+        assert_eq!(robot("0", "0 0 0 1 0 0"), (true, false));
+        assert_eq!(has(&format!("RAWLASER1 {sensor} 181 {ranges} 1 9 12.25 host 1")), (false, true));
     }
 }

@@ -6,7 +6,7 @@ use lms::telegram::Telegram;
 use lms::variant::{Mode, Unit, Variant};
 use schema::Family;
 
-use crate::{Damage, Unfit};
+use crate::{Damage, Unfit, Unread};
 
 /// What kind of recording it is.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -55,6 +55,8 @@ pub struct Contents {
     pub bits: u16,
     /// Ranges of a log that its unit and mode cannot say.
     pub unfit: Unfit,
+    /// Data of a log that its scans do not contain.
+    pub unread: Unread,
     /// What is missing in the file; [`telegrams`](crate::Recording::telegrams) returns those that are present.
     pub damage: Damage,
 }
@@ -86,6 +88,7 @@ impl Contents {
             mode: None,
             bits: 0,
             unfit: Unfit::default(),
+            unread: Unread::default(),
             damage: Damage::default(),
         }
     }

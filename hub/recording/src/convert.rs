@@ -3,6 +3,7 @@
 
 mod copy;
 mod decoded;
+mod marks;
 mod output;
 mod scans;
 mod target;
@@ -17,10 +18,11 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 use flate2::write::GzEncoder;
 use lms::variant::{Baud, Mode, Unit};
+use schema::csv::{MarkColumns, ScanColumns};
 use schema::file::{Compression, Writer};
-use schema::{Failure, Kind, Topic, check_followed};
+use schema::{Failure, Flags, Header, Kind, Topic, check_followed};
 
-use crate::{Damage, Encoding, Form, Frame, Recording, carmen};
+use crate::{Damage, Encoding, Form, Frame, Recording, Unread, carmen};
 use decoded::Sight;
 use output::{Place, unwritable};
 use target::target_of;
@@ -43,6 +45,12 @@ pub struct ConvertOptions {
     pub ros2: bool,
     /// For scans: the measuring mode of a recording that does not contain it.
     pub mode: Option<Mode>,
+    /// For CSV: `SENSOR/scan` or `SENSOR/marks`.
+    pub topic: Option<String>,
+    /// For CSV: ranges in meters.
+    pub meters: bool,
+    /// For CSV: columns for intensities.
+    pub intensities: bool,
     /// How an MCAP file is packed, if not as usual.
     pub compression: Option<Compression>,
 }
@@ -58,10 +66,15 @@ pub struct Converted {
     pub sensors: Vec<String>,
     /// Telegrams that were written.
     pub telegrams: u64,
-    /// How many of them are scans.
+    /// Scans that were written; of marks, scans whose marks were written.
     pub scans: u64,
-    /// Telegrams that the form cannot hold: in a CARMEN log all but whole scans, for ROS 2 and in columns all but scans.
+    /// Marks that were written; `None` if these were not asked for.
+    pub marks: Option<u64>,
+    /// Telegrams that the form cannot hold: in a CARMEN log all but whole scans, for ROS 2 and in columns all but scans. The
+    /// reply that stands for the encoding of a log does not count.
     pub left_out: u64,
+    /// Data of a log that no telegram holds.
+    pub unread: Unread,
     /// From the first telegram to the last one, in ns, as stamps say: the recording's, or those that were made for it.
     /// Nothing if there are neither.
     pub took_ns: Option<u64>,
@@ -82,10 +95,10 @@ pub fn convert(
     stop: &AtomicBool,
     mut progress: impl FnMut(u64, u64),
 ) -> Result<Converted, Failure> {
-    let target = target_of(options)?;
+    let (target, chosen) = target_of(options)?;
     let whole = Recording::open(&options.input)?;
     let place = Place::check(&options.output, &options.input, options.force)?;
-    let recording = match &options.sensor {
+    let recording = match chosen {
         Some(sensor) if whole.contents().form == Form::Mcap => whole.of(sensor)?,
         Some(sensor) => {
             let named = check_followed(sensor).map(|()| whole);
@@ -100,12 +113,18 @@ pub fn convert(
         sensors: contents.sensors.clone(),
         telegrams: 0,
         scans: 0,
+        marks: None,
         left_out: 0,
+        unread: contents.unread,
         took_ns: None,
         damage: contents.damage,
         is_closed: false,
     };
-    let encoding = encoding(&recording, target)?;
+    // Marks are copied, whatever is known of the scans.
+    let encoding = match target {
+        Target::MarksCsv => Encoding { unit: Unit::Cm, mode: Mode(0) },
+        _ => encoding(&recording, target)?,
+    };
     let is_of_all = matches!(target, Target::Recording(Form::Mcap) | Target::Ros2);
     if !(contents.form == Form::Mcap && is_of_all) {
         // Refuses to choose of several sensors, before anything is written.
@@ -118,23 +137,25 @@ pub fn convert(
         unwritable(&options.output, &error)
     };
     let mut first_ns = None;
+    let mut done = 0_u64;
     let mut count = |written: Written, at_ns: Option<u64>| {
         if let Some(at_ns) = at_ns.filter(|_| written != Written::LeftOut) {
             let since_ns = at_ns.saturating_sub(*first_ns.get_or_insert(at_ns));
             converted.took_ns = converted.took_ns.max(Some(since_ns));
         }
-        converted.telegrams += u64::from(written != Written::LeftOut);
-        converted.scans += u64::from(written == Written::Scan);
+        converted.telegrams += u64::from(matches!(written, Written::Scan | Written::Other));
+        converted.scans += u64::from(matches!(written, Written::Scan | Written::Marks));
         converted.left_out += u64::from(written == Written::LeftOut);
-        if converted.telegrams.is_multiple_of(STEP) {
-            progress(converted.telegrams, contents.telegrams);
+        done += 1;
+        if done.is_multiple_of(STEP) {
+            progress(done, contents.telegrams);
         }
         if stop.load(Ordering::Relaxed) {
             return Err(Failure::new(Kind::Interrupted, "interrupted before the end", ""));
         }
         Ok(())
     };
-    let sensor = options.sensor.as_deref().unwrap_or(SENSOR);
+    let sensor = chosen.unwrap_or(SENSOR);
     let compression = options.compression.unwrap_or_default();
     let written = match target {
         Target::Recording(Form::Mcap) if contents.form == Form::Mcap => {
@@ -145,12 +166,21 @@ pub fn convert(
             converted.sensors = vec![sensor.to_owned()];
             write_mcap(&recording, sensor, encoding, file, &mut count, &failed)
         }
-        Target::Ros2 => Ros2::begin(&mut file, compression, form_name(contents.form))
-            .map_err(&failed)
-            .and_then(|view| write_view(&recording, options, encoding, view, &mut count, &failed)),
+        Target::Ros2 => {
+            Ros2::begin(&mut file, compression, form_name(contents.form)).map_err(&failed).and_then(|view| {
+                write_view(&recording, sensor, encoding, options.mode, view, &mut count, &failed)
+            })
+        }
         Target::Csv => {
-            let view = Csv::begin(Packing::of(&options.output, &mut file));
-            write_view(&recording, options, encoding, view, &mut count, &failed)
+            let columns = ScanColumns { meters: options.meters, intensities: options.intensities };
+            let view = Csv::begin(Packing::of(&options.output, &mut file), columns);
+            write_view(&recording, sensor, encoding, options.mode, view, &mut count, &failed)
+        }
+        Target::MarksCsv => {
+            let out = Packing::of(&options.output, &mut file);
+            let columns = MarkColumns { meters: options.meters };
+            let written = marks::write(&recording, columns, out, &mut count, &failed);
+            written.map(|written| converted.marks = Some(written))
         }
         Target::Recording(form) => {
             let out = Packing::of(&options.output, &mut file);
@@ -169,6 +199,8 @@ pub fn convert(
 enum Written {
     Scan,
     Other,
+    /// The marks of a scan.
+    Marks,
     LeftOut,
 }
 
@@ -199,8 +231,12 @@ fn write_bytes(
     let told = carmen::line_of(encoding);
     out.write_all(told.as_bytes()).map_err(failed)?;
     let mut first_ns = None;
-    for frame in recording.telegrams(encoding)? {
+    for (number, frame) in recording.telegrams(encoding)?.enumerate() {
         let at_ns = times.wall_ns(&frame);
+        // The line above says the same.
+        if number == 0 && is_made_up(&frame.telegram, frame.header.as_ref()) {
+            continue;
+        }
         let line = scans::line(&frame.telegram, mode, at_ns, *first_ns.get_or_insert(at_ns));
         out.write_all(line.as_deref().unwrap_or_default().as_bytes()).map_err(failed)?;
         count(if line.is_some() { Written::Scan } else { Written::LeftOut }, Some(at_ns))?;
@@ -239,15 +275,15 @@ fn write_mcap(
 /// The scans into `view`.
 fn write_view(
     recording: &Recording,
-    options: &ConvertOptions,
+    sensor: &str,
     encoding: Encoding,
+    mode: Option<Mode>,
     mut view: impl View,
     count: &mut impl FnMut(Written, Option<u64>) -> Result<(), Failure>,
     failed: &impl Fn(io::Error) -> Failure,
 ) -> Result<(), Failure> {
-    let sensor = options.sensor.as_deref().unwrap_or(SENSOR);
     let mut is_empty = true;
-    decoded::each(recording, sensor, encoding, options.mode, &mut |sight| {
+    decoded::each(recording, sensor, encoding, mode, &mut |sight| {
         let Some(written) = view.see(&sight).map_err(failed)? else { return Ok(()) };
         let Sight::Scan(_, header, _) = sight else { return count(written, None) };
         is_empty = false;
@@ -258,7 +294,19 @@ fn write_view(
         let hint = "scans are decoded from topic telegram, or taken from topic scan";
         return Err(Failure::new(Kind::Input, message, hint));
     }
+    if view.lacks_intensities() {
+        let message = format!("no scan in {} has intensities", recording.path().display());
+        let hint = "leave --intensities out; an LMS sends reflector levels only in some measuring modes, such as 0x01";
+        return Err(Failure::new(Kind::Input, message, hint));
+    }
     view.finish().map_err(failed)
+}
+
+/// Returns whether `telegram`, the first one of a sensor, is the reply that [`frames`] made for a log: no scanner sent it, so
+/// that nothing is lost without it.
+fn is_made_up(telegram: &[u8], header: Option<&Header>) -> bool {
+    let is_estimated = header.is_none_or(|header| header.flags & Flags::STAMP_ESTIMATED != 0);
+    is_estimated && carmen::is_made_up(telegram)
 }
 
 /// How the values are encoded, where that can be said without loss or is not asked.

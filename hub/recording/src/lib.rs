@@ -18,7 +18,7 @@ mod stream;
 mod survey;
 mod virtual_time;
 
-pub use carmen::{BEYOND, Unfit};
+pub use carmen::{BEYOND, Unfit, Unread};
 pub use contents::{Contents, Form};
 pub use damage::Damage;
 pub use open::{Encoding, Recording};

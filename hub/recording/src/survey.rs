@@ -18,7 +18,7 @@ pub(crate) fn survey_log(path: &Path, reader: impl BufRead) -> Result<Contents, 
     loop {
         match log.next() {
             Ok(Some(sweep)) => {
-                contents.note_scan(sweep.variant(), sweep.wall_ns());
+                contents.note_scan(sweep.variant(), sweep.time_ns);
                 census.note(&sweep.ranges_m);
             }
             Ok(None) => break,
@@ -36,6 +36,7 @@ pub(crate) fn survey_log(path: &Path, reader: impl BufRead) -> Result<Contents, 
             }
         }
     }
+    contents.unread = log.unread;
     let (encoding, unfit) = census.encoding(log.told);
     (contents.unit, contents.mode, contents.unfit) = (Some(encoding.unit), Some(encoding.mode), unfit);
     // Where no line is right it is the format that is wrong, not the file.

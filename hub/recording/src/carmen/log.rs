@@ -5,7 +5,7 @@ use std::io::{self, BufRead, Read};
 
 use lms::variant::{Mode, Unit};
 
-use super::{LineForm, Sweep};
+use super::{LineForm, Sweep, Unread};
 use crate::Encoding;
 
 /// Reads a log.
@@ -17,6 +17,8 @@ pub(crate) struct Log<R> {
     form: Option<LineForm>,
     /// What the log says itself.
     pub(crate) told: Option<Encoding>,
+    /// Data of the lines so far that the scans do not contain.
+    pub(crate) unread: Unread,
 }
 
 /// Why there is no next scan.
@@ -30,7 +32,7 @@ pub(crate) enum Wrong {
 
 impl<R: BufRead> Log<R> {
     pub(crate) fn new(reader: R) -> Self {
-        Log { reader, line: 0, form: None, told: None }
+        Log { reader, line: 0, form: None, told: None, unread: Unread::default() }
     }
 
     /// The next scan. A last line without its end that is no scan is where the recording broke off, not a mistake.
@@ -48,9 +50,19 @@ impl<R: BufRead> Log<R> {
                 self.told = self.told.or(Some(encoding));
             }
             match Sweep::parse(&line) {
-                Ok(None) => {}
-                Ok(Some(sweep)) if *self.form.get_or_insert(sweep.form) != sweep.form => {}
-                Ok(sweep) => return Ok(sweep),
+                Ok(None) => match line.split_ascii_whitespace().next() {
+                    Some("ODOM") => self.unread.odometry += 1,
+                    Some(word) if !word.starts_with('#') => self.unread.lines += 1,
+                    _ => {}
+                },
+                Ok(Some(sweep)) if *self.form.get_or_insert(sweep.form) != sweep.form => {
+                    self.unread.lines += 1;
+                }
+                Ok(Some(sweep)) => {
+                    self.unread.poses += u64::from(sweep.has_pose);
+                    self.unread.remissions += u64::from(sweep.has_remissions);
+                    return Ok(Some(sweep));
+                }
                 Err(_) if is_last => return Ok(None),
                 Err(wrong) => return Err(Wrong::Line(wrong)),
             }

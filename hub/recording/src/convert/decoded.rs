@@ -11,6 +11,7 @@ use lms::variant::Mode;
 use schema::datagram::Packed;
 use schema::{Failure, Family, Header, Kind, Pose, Scan, Status, Topic};
 
+use super::is_made_up;
 use super::times::Times;
 use super::turns::Turns;
 use crate::mcap::reader::Item;
@@ -33,6 +34,8 @@ struct Sensor {
     is_decoded: bool,
     /// Where its head turns.
     turns: Option<Turns>,
+    /// Whether none of its telegrams has been read.
+    is_first: bool,
 }
 
 /// Calls `tell` with all that is in `recording`, in its order. What came without the name of a sensor is of `name`; `mode`
@@ -52,7 +55,7 @@ pub(super) fn each(
             let told = (form == Form::Carmen).then_some(encoding.mode);
             let contents = recording.contents();
             let mode = contents.mode.or(told).or(mode).or(contents.readable());
-            let mut sensor = Sensor { mode, is_decoded: true, turns: Turns::of(recording)? };
+            let mut sensor = Sensor { mode, is_decoded: true, turns: Turns::of(recording)?, is_first: true };
             sensor.check(recording, name)?;
             let mut times = Times::of(recording);
             let mut scan = Box::<Scan>::default();
@@ -66,10 +69,11 @@ pub(super) fn each(
                     })?;
                     continue;
                 }
-                tell(match sensor.decode(&frame.telegram, &mut scan) {
-                    true => Sight::Scan(name, header, &scan),
-                    false => Sight::Other,
-                })?;
+                match sensor.decode(&frame.telegram, &mut scan) {
+                    true => tell(Sight::Scan(name, header, &scan))?,
+                    false if number == 0 && is_made_up(&frame.telegram, None) => {}
+                    false => tell(Sight::Other)?,
+                }
             }
             Ok(())
         }
@@ -89,7 +93,7 @@ fn each_of_mcap(
         let has_scans = known.channels.has_scans(name);
         let turns = if has_scans { None } else { Turns::of(&recording.of(name)?)? };
         let is_decoded = contents.scans > 0 && (mode.is_some() || !has_scans);
-        let sensor = Sensor { mode, is_decoded, turns };
+        let sensor = Sensor { mode, is_decoded, turns, is_first: true };
         sensor.check(recording, name)?;
         sensors.insert(name.clone(), sensor);
     }
@@ -106,10 +110,12 @@ fn each_of_mcap(
                     })?;
                     continue;
                 }
-                tell(match sensor.decode(&sighting.telegram, &mut scan) && sensor.is_decoded {
-                    true => Sight::Scan(&sighting.sensor, sighting.header, &scan),
-                    false => Sight::Other,
-                })?;
+                let is_first = std::mem::replace(&mut sensor.is_first, false);
+                match sensor.decode(&sighting.telegram, &mut scan) && sensor.is_decoded {
+                    true => tell(Sight::Scan(&sighting.sensor, sighting.header, &scan))?,
+                    false if is_first && is_made_up(&sighting.telegram, Some(&sighting.header)) => {}
+                    false => tell(Sight::Other)?,
+                }
             }
             Item::Record(record) => {
                 let Some((place, header, payload)) = known.message(&record) else { continue };

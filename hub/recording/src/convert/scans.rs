@@ -30,7 +30,10 @@ pub(super) fn line(telegram: &[u8], mode: Mode, at_ns: u64, first_ns: u64) -> Op
     for &range in ranges {
         line += &format!(" {:.decimals$}", f64::from(range) * f64::from(unit.mm()) / 1000.0);
     }
-    let seconds = |ns: u64| format!("{}.{:06}", ns / 1_000_000_000, ns / 1000 % 1_000_000);
+    let seconds = |ns: u64| {
+        let micros = ns.saturating_add(500) / 1000;
+        format!("{}.{:06}", micros / 1_000_000, micros % 1_000_000)
+    };
     line += &format!(" 0 0 0 0 0 0 {} scanhub {}\n", seconds(at_ns), seconds(at_ns.saturating_sub(first_ns)));
     Some(line)
 }
@@ -49,7 +52,7 @@ mod tests {
         let telegram = measured::encode(0, Unit::Cm, &words, 0x10);
         let line =
             line(telegram.bytes(), Mode(1), 1_071_078_720_123_456_789, 1_071_078_720_000_000_000).unwrap();
-        assert!(line.ends_with(" 12.34 0 0 0 0 0 0 1071078720.123456 scanhub 0.123456\n"), "{line}");
+        assert!(line.ends_with(" 12.34 0 0 0 0 0 0 1071078720.123457 scanhub 0.123457\n"), "{line}");
         let sweep = Sweep::parse(&line).unwrap().unwrap();
         assert_eq!(sweep.ranges_m[..4], [5.0, 81.91, 81.83, 12.34]);
         let cm = Encoding { unit: Unit::Cm, mode: Mode(0) };

@@ -1,8 +1,8 @@
-//! What a recording becomes, by the name of the file and the options. Refuses to know how.
+//! Output format of a conversion, from the name of the file and the options.
 
 use std::path::Path;
 
-use schema::{Failure, Kind};
+use schema::{Failure, Kind, Topic};
 
 use super::ConvertOptions;
 use crate::Form;
@@ -14,8 +14,10 @@ pub enum Target {
     Recording(Form),
     /// An MCAP file with only messages of ROS 2.
     Ros2,
-    /// A row of columns for each scan.
+    /// CSV with a row for each scan.
     Csv,
+    /// CSV with a row for each mark.
+    MarksCsv,
 }
 
 impl Target {
@@ -24,15 +26,73 @@ impl Target {
         match self {
             Target::Recording(form) => form_name(form),
             Target::Ros2 => "ROS 2",
-            Target::Csv => "CSV",
+            Target::Csv | Target::MarksCsv => "CSV",
         }
     }
 }
 
-/// What the name of the file and the options tell.
-pub(super) fn target_of(options: &ConvertOptions) -> Result<Target, Failure> {
+/// Returns the output format, and the sensor that the options choose.
+///
+/// # Errors
+///
+/// Returns [`Kind::Usage`] if the format is unknown, or an option does not fit it.
+pub(super) fn target_of(options: &ConvertOptions) -> Result<(Target, Option<&str>), Failure> {
+    let (target, sensor) = match (format_of(options)?, options.topic.as_deref()) {
+        (target, None) => (target, options.sensor.as_deref()),
+        (Target::Csv, Some(topic)) => {
+            let (target, sensor) = of_topic(topic)?;
+            if options.sensor.as_deref().is_some_and(|other| other != sensor) {
+                return usage("--sensor and --topic name different sensors", "leave --sensor out");
+            }
+            (target, Some(sensor))
+        }
+        (_, Some(_)) => {
+            return usage("--topic is for CSV", "scanhub convert IN OUT.csv --topic SENSOR/marks");
+        }
+    };
+    match target {
+        Target::MarksCsv if options.mode.is_some() => {
+            usage("--mode is for scans; marks are copied as they were recorded", "leave --mode out")
+        }
+        Target::MarksCsv if options.intensities => usage(
+            "--intensities is for scans; columns peak and weight of a mark are its intensities",
+            "leave --intensities out",
+        ),
+        Target::Recording(_) | Target::Ros2 if options.intensities => {
+            let hint =
+                "scanhub convert IN OUT.csv --intensities; MCAP files, also with --ros2, always have them";
+            usage("--intensities is for CSV", hint)
+        }
+        Target::Recording(_) | Target::Ros2 if options.meters => {
+            let hint = "scanhub convert IN OUT.csv --meters; a CARMEN log and --ros2 always have meters";
+            usage("--meters is for CSV", hint)
+        }
+        target => Ok((target, sensor)),
+    }
+}
+
+/// Returns the format of `topic` as CSV, and its sensor.
+fn of_topic(topic: &str) -> Result<(Target, &str), Failure> {
+    let (sensor, name) = topic.rsplit_once('/').unwrap_or((topic, ""));
+    match Topic::parse(name) {
+        Some(Topic::Scan) => Ok((Target::Csv, sensor)),
+        Some(Topic::Marks) => Ok((Target::MarksCsv, sensor)),
+        Some(_) => {
+            let hint =
+                "`scanhub replay IN` publishes every topic, and `scanhub echo SENSOR/TOPIC --json` prints it";
+            usage(&format!("{topic} cannot be CSV: only scan and marks can"), hint)
+        }
+        None => usage(&format!("{topic:?} is not a topic"), "for example --topic front/marks"),
+    }
+}
+
+fn usage<T>(message: &str, hint: &str) -> Result<T, Failure> {
+    Err(Failure::new(Kind::Usage, message, hint))
+}
+
+/// Returns the format that the file's name and `--ros2` select.
+fn format_of(options: &ConvertOptions) -> Result<Target, Failure> {
     let target = ending(&options.output)?;
-    let usage = |message: &str, hint: &str| Err(Failure::new(Kind::Usage, message, hint));
     match (target, options.ros2) {
         (Target::Recording(Form::Mcap), true) => Ok(Target::Ros2),
         (Target::Csv | Target::Recording(Form::Telegrams | Form::Carmen), _)

@@ -1,9 +1,9 @@
-//! Scans for other programs: messages of ROS 2, and lines of CSV. Refuses to know how scans are found.
+//! Writes scans for other programs: as messages of ROS 2, and as lines of CSV.
 
 use std::io::{self, Write};
 
 use ros::bag::{self, Bag};
-use schema::csv;
+use schema::csv::ScanColumns;
 use schema::file::{Compression, Writer};
 
 use super::decoded::Sight;
@@ -13,6 +13,11 @@ use super::{CHUNK, Packing, Written};
 pub(super) trait View {
     /// Writes what was seen; answers what became of it, unless it was no telegram.
     fn see(&mut self, sight: &Sight<'_>) -> io::Result<Option<Written>>;
+
+    /// Returns whether intensities were requested, and no scan had any.
+    fn lacks_intensities(&self) -> bool {
+        false
+    }
 
     /// Writes the end.
     fn finish(self) -> io::Result<()>;
@@ -65,13 +70,16 @@ impl<W: Write> View for Ros2<W> {
 /// A row for each scan, below the names of the columns, which come again if their number changes.
 pub(super) struct Csv<W: Write> {
     out: Packing<W>,
-    columns: Option<usize>,
+    columns: ScanColumns,
+    /// Number of beams in the last line of column names.
+    beams: Option<usize>,
+    has_intensities: bool,
     line: Vec<u8>,
 }
 
 impl<W: Write> Csv<W> {
-    pub(super) fn begin(out: Packing<W>) -> Self {
-        Csv { out, columns: None, line: Vec::new() }
+    pub(super) fn begin(out: Packing<W>, columns: ScanColumns) -> Self {
+        Csv { out, columns, beams: None, has_intensities: false, line: Vec::new() }
     }
 }
 
@@ -81,15 +89,20 @@ impl<W: Write> View for Csv<W> {
             return Ok(matches!(sight, Sight::Other).then_some(Written::LeftOut));
         };
         self.line.clear();
-        if self.columns != Some(scan.beams()) {
-            self.columns = Some(scan.beams());
-            csv::columns(&mut self.line, scan.beams())?;
+        if self.beams != Some(scan.beams()) {
+            self.beams = Some(scan.beams());
+            self.columns.names(&mut self.line, scan.beams())?;
             self.line.push(b'\n');
         }
-        csv::row(&mut self.line, header, scan)?;
+        self.has_intensities |= !scan.intensities().is_empty();
+        self.columns.row(&mut self.line, header, scan)?;
         self.line.push(b'\n');
         self.out.write_all(&self.line)?;
         Ok(Some(Written::Scan))
+    }
+
+    fn lacks_intensities(&self) -> bool {
+        self.columns.intensities && !self.has_intensities
     }
 
     fn finish(self) -> io::Result<()> {

@@ -10,9 +10,11 @@ use crate::real;
 use lms::measured;
 use lms::reply;
 use lms::variant::{Mode, Unit};
-use recording::convert::{ConvertOptions, Target, convert};
+use recording::convert::{ConvertOptions, Converted, Target, convert};
 use recording::{Encoding, Form, Frame, Recording};
-use schema::Flags;
+use schema::datagram::Packed;
+use schema::file::Writer;
+use schema::{Flags, Header, Mark, Marks, Topic};
 
 const CM: Encoding = Encoding { unit: Unit::Cm, mode: Mode(0) };
 
@@ -119,11 +121,119 @@ fn a_stream_gets_times_and_loses_none_of_its_telegrams() {
     assert_eq!(headers[30].wall_ns - headers[1].wall_ns, 29 * 26_640_000);
     converted(&mcap, &again, None).unwrap();
     assert_eq!(telegrams(&again), scans);
-    // A reply is no scan.
+    // The log contains the encoding, so the reply is not lost.
     let account = converted(&mcap, &log, None).unwrap();
-    assert_eq!((account.telegrams, account.left_out), (30, 1));
+    assert_eq!((account.telegrams, account.left_out), (30, 0));
     let read = frames(&log, Encoding { unit: Unit::Mm, mode: Mode(4) });
     assert!(read.iter().map(|frame| &frame.telegram).eq(&scans[1..]));
+}
+
+/// Converts, and returns the lines of the output.
+fn rows(options: &ConvertOptions) -> (Converted, Vec<String>) {
+    let account = convert(options, &AtomicBool::new(false), |_, _| {}).unwrap();
+    let text = fs::read_to_string(&options.output).unwrap();
+    (account, text.lines().map(str::to_owned).collect())
+}
+
+#[test]
+fn rows_have_intensities_and_meters_on_request() {
+    let folder = Folder::new("columns");
+    // Three reflector bits above the range.
+    let words: Vec<u16> = (0..181).map(|i| 1234 + i | (i % 8) << 13).collect();
+    let scan = measured::encode(0, Unit::Mm, &words, 0x10);
+    let told = reply::configuration(0, Mode(1), Unit::Mm, 0x10);
+    let input = folder.file("a.bin", &[told.bytes(), scan.bytes()].concat());
+    let plain = ConvertOptions { input, output: folder.0.join("a.csv"), force: true, ..Default::default() };
+    let (_, lines) = rows(&plain);
+    let cells = |line: &str| line.split(',').map(str::to_owned).collect::<Vec<_>>();
+    let [names, row] = [&lines[0], &lines[1]].map(|line| cells(line));
+    assert_eq!(
+        (names.len(), &names[5][..], &names[8][..], &names[188][..]),
+        (189, "unit_um", "range_0", "range_180")
+    );
+    assert_eq!((&row[5][..], &row[8][..], &row[188][..]), ("1000", "1234", "1414"));
+    let (_, lines) = rows(&ConvertOptions { meters: true, intensities: true, ..plain.clone() });
+    let [names, row] = [&lines[0], &lines[1]].map(|line| cells(line));
+    assert_eq!((names.len(), &names[189][..], &names[369][..]), (370, "intensity_0", "intensity_180"));
+    assert_eq!((&row[5][..], &row[8][..], &row[188][..]), ("1000000", "1.234", "1.414"));
+    assert_eq!((row.len(), &row[189..194]), (370, &["0", "1", "2", "3", "4"].map(String::from)[..]));
+
+    let log = format!("FLASER 181{} 0 0 0 0 0 0 12.5 host 1\n", " 1.25".repeat(181));
+    let input = folder.file("a.log", log.as_bytes());
+    let none =
+        ConvertOptions { input, output: folder.0.join("b.csv"), intensities: true, ..Default::default() };
+    let failure = convert(&none, &AtomicBool::new(false), |_, _| {}).unwrap_err();
+    assert_eq!(failure.kind.exit_code(), 66);
+    assert!(failure.message.contains("has intensities") && !folder.0.join("b.csv").exists(), "{failure}");
+}
+
+#[test]
+fn recorded_marks_become_rows() {
+    let folder = Folder::new("marks");
+    let mut writer = Writer::begin(Vec::new(), "", Default::default()).unwrap();
+    let mut marks = Marks { count: 2, ..Marks::default() };
+    for (number, mark) in marks.mark_array[..2].iter_mut().enumerate() {
+        *mark = Mark { angle_mdeg: 45_500, range_dmm: 20_000 + number as u32, peak: 3, ..Mark::default() };
+    }
+    for (round, sensor, marks) in
+        [(0, "front", marks), (0, "rear", marks), (1, "front", Marks::default()), (2, "front", marks)]
+    {
+        let header = Header { seq: round, topic_seq: round, wall_ns: 1000 + round, ..Header::default() };
+        let mut room = [0; 2048];
+        let len = marks.pack(&mut room).unwrap();
+        writer.sample(sensor, Topic::Marks, &header, &room[..len]).unwrap();
+    }
+    let input = folder.file("a.mcap", &writer.finish().unwrap());
+    let output = folder.0.join("marks.csv");
+    let topic = Some("front/marks".to_owned());
+    let options = ConvertOptions { input: input.clone(), output, topic, force: true, ..Default::default() };
+    let (account, lines) = rows(&options);
+    assert_eq!((account.marks, account.scans, account.telegrams, account.left_out), (Some(4), 3, 0, 0));
+    assert_eq!(
+        lines,
+        [
+            "seq,topic_seq,stamp_ns,wall_ns,quality,marks,mark,angle_deg,range_mm,peak,weight,first_beam,last_beam,edge",
+            "0,0,0,1000,clean,2,0,45.5,2000,3,0,0,0,0",
+            "0,0,0,1000,clean,2,1,45.5,2000.1,3,0,0,0,0",
+            "1,1,0,1001,clean,0,,,,,,,,",
+            "2,2,0,1002,clean,2,0,45.5,2000,3,0,0,0,0",
+            "2,2,0,1002,clean,2,1,45.5,2000.1,3,0,0,0,0",
+        ]
+    );
+    let (_, lines) = rows(&ConvertOptions { meters: true, ..options.clone() });
+    assert!(lines[0].contains(",range_m,") && lines[2].contains(",2.0001,"), "{lines:?}");
+
+    let stream = folder.file("a.bin", measured::encode(0, Unit::Cm, &[7; 181], 0x10).bytes());
+    let topic = |topic: &str| Some(topic.to_owned());
+    for (changed, code, says) in [
+        (ConvertOptions { topic: topic("side/marks"), ..options.clone() }, 3, "no sensor \"side\""),
+        (ConvertOptions { topic: topic("front/zones"), ..options.clone() }, 2, "only scan and marks"),
+        (ConvertOptions { topic: topic("front"), ..options.clone() }, 2, "is not a topic"),
+        (ConvertOptions { sensor: topic("rear"), ..options.clone() }, 2, "different sensors"),
+        (ConvertOptions { intensities: true, ..options.clone() }, 2, "--intensities is for scans"),
+        (ConvertOptions { mode: Some(Mode(1)), ..options.clone() }, 2, "--mode is for scans"),
+        (ConvertOptions { output: folder.0.join("a.log"), ..options.clone() }, 2, "--topic is for CSV"),
+        (ConvertOptions { input: stream, ..options.clone() }, 3, "no recorded marks"),
+        (
+            ConvertOptions { topic: None, meters: true, output: folder.0.join("b.mcap"), ..options.clone() },
+            2,
+            "--meters is for CSV",
+        ),
+        (
+            ConvertOptions {
+                topic: None,
+                intensities: true,
+                output: folder.0.join("b.log"),
+                ..options.clone()
+            },
+            2,
+            "--intensities is for CSV",
+        ),
+    ] {
+        let failure = convert(&changed, &AtomicBool::new(false), |_, _| {}).unwrap_err();
+        assert!(failure.message.contains(says) && !failure.hint.is_empty(), "{says}: {failure}");
+        assert_eq!(failure.kind.exit_code(), code, "{failure}");
+    }
 }
 
 #[test]
