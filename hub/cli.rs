@@ -267,6 +267,16 @@ fn worlds() -> impl TypedValueParser<Value = World> {
         .map(|name| World::parse(&name).expect("one of the possible names"))
 }
 
+/// Parses the window of `hz`. A shorter one could never hold two samples that are far enough apart for a rate.
+fn window(text: &str) -> Result<Duration, String> {
+    match duration::parse(text)? {
+        window if window >= MIN_WINDOW => Ok(window),
+        _ => Err(format!("{text:?} is too short for a rate: at least {MIN_WINDOW:?}")),
+    }
+}
+
+const MIN_WINDOW: Duration = Duration::from_millis(500);
+
 fn families() -> impl TypedValueParser<Value = Families> {
     PossibleValuesParser::new(Families::names())
         .map(|name| Families::parse(&name).expect("one of the possible names"))
@@ -318,8 +328,8 @@ pub(crate) struct Hz {
     /// Topics to follow: front/scan, */scan for all sensors, front/* for all topics [default: all]
     #[arg(value_name = "SENSOR/TOPIC")]
     pub(crate) topics: Vec<String>,
-    /// Time span that each line covers
-    #[arg(long, default_value = "10s", value_name = "DURATION", value_parser = duration::parse)]
+    /// Time span that each line covers, at least 0.5s
+    #[arg(long, default_value = "10s", value_name = "DURATION", value_parser = window)]
     pub(crate) window: Duration,
     #[command(flatten)]
     pub(crate) limits: Limits,

@@ -4,7 +4,7 @@
 use std::collections::HashMap;
 use std::fs::File;
 use std::io::{Read, Write};
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use schema::Family;
 use serde::Serialize;
@@ -74,7 +74,7 @@ struct Summary<'a> {
     sent: u64,
     received: u64,
     lost: u64,
-    hz: f64,
+    hz: Option<f64>,
     seconds: f64,
     nearest_mm: Option<u64>,
     hub_cpu_percent: f64,
@@ -206,14 +206,14 @@ impl Account {
                 serde_json::to_string(&summary).unwrap_or_default()
             } else {
                 format!(
-                    "{:6} {}: {sent} telegrams sent, {} received, {lost} lost in {:.1} s, {} on the line, {:.2} Hz, nearest \
+                    "{:6} {}: {sent} telegrams sent, {} received, {lost} lost in {:.1} s, {} on the line, {} Hz, nearest \
                      {}, hub {:.1} % of a processor, {} EEPROM writes",
                     summary.sensor,
                     summary.state,
                     summary.received,
                     summary.seconds,
                     sensor.lost_on_line.map_or("unknown".into(), |lost| lost.to_string()),
-                    summary.hz,
+                    summary.hz.map_or("unknown".into(), |hz| format!("{hz:.2}")),
                     sensor.nearest_mm.map_or("nothing".into(), |mm| format!("{mm} mm")),
                     summary.hub_cpu_percent,
                     summary.eeprom_writes,
@@ -261,9 +261,11 @@ impl Sensor {
         }
     }
 
-    /// Telegrams per second from the first to the last; of a head that turns, turns.
-    pub(crate) fn hz(&self) -> f64 {
-        if self.seconds() > 0.0 { (self.received_count - 1) as f64 / self.seconds() } else { 0.0 }
+    /// Returns the telegrams per second from the first to the last, or revolutions of a rotating scanner. `None` while they
+    /// span less than [`schema::MIN_RATE_SPAN`].
+    pub(crate) fn hz(&self) -> Option<f64> {
+        let span = Duration::from_nanos(self.last_ns.saturating_sub(self.first_ns));
+        schema::rate_hz(self.received_count.saturating_sub(1), span)
     }
 
     fn seconds(&self) -> f64 {

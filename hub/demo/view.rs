@@ -61,11 +61,11 @@ fn sensor_lines(sensor: &Sensor) -> [String; 3] {
     };
     [
         format!(
-            "{:6} {:9} {:6} Bd  {:5.2} Hz   {} telegrams   {} lost, {} on the line",
+            "{:6} {:9} {:6} Bd  {:>5} Hz   {} telegrams   {} lost, {} on the line",
             sensor.name,
             sensor.state,
             sensor.baud,
-            sensor.hz(),
+            sensor.hz().map_or("-".into(), |hz| format!("{hz:.2}")),
             sensor.received_count,
             lost,
             sensor.lost_on_line.unwrap_or_default(),

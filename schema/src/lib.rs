@@ -21,6 +21,7 @@ mod motion;
 mod obstacles;
 mod pose;
 mod printable;
+mod rate;
 mod scan;
 mod sliced;
 mod status;
@@ -70,6 +71,7 @@ pub use motion::{Motion, MotionMethod};
 pub use obstacles::{OBSTACLES, Obstacle, Obstacles};
 pub use pose::Pose;
 pub use printable::{Printable, escape_json, json_line};
+pub use rate::{MIN_RATE_SPAN, rate_hz};
 pub use scan::{
     BEAMS, Code, Contents, Family, Intensities, PacketFacts, Scan, ScanArrays, ScanHead, ScanWord,
     in_degrees, in_sector_mdeg,

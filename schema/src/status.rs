@@ -29,7 +29,7 @@ pub struct Status {
     pub baud: u32,
     /// CLOCK_MONOTONIC when the state began, in ns.
     pub since_ns: u64,
-    /// Scans per second, in mHz.
+    /// Scans per second, in mHz; 0 while it is not measured, see [`Status::rate_hz`].
     pub rate_mhz: u32,
     /// Field of view in degrees: 100 or 180; 0 unknown.
     pub angle_deg: u16,
@@ -73,6 +73,12 @@ impl Status {
     pub fn reflector_remedy(&self) -> Option<String> {
         let is_wanted = self.has_reflector_bits() == Some(false) && !self.is_replayed();
         is_wanted.then(|| format!("scanhub configure {} mode=0x01", self.port()))
+    }
+
+    /// Returns the scans per second. `None` while a stream that just started has not been measured.
+    pub fn rate_hz(&self) -> Option<f64> {
+        let is_measured = self.rate_mhz != 0 || self.state() != Some(State::Streaming);
+        is_measured.then(|| f64::from(self.rate_mhz) / 1000.0)
     }
 
     /// Returns the share of the line's bytes that were in nothing over the last 10 s, 0 to 1: those of a stream, without

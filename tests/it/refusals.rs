@@ -54,6 +54,8 @@ fn what_is_no_command_line() {
         (&["echo", "front/scan", "-n", "many"], "many"),
         (&["echo", "front/scan", "--for", "10"], "10"),
         (&["echo", "front/scan", "--csv", "--raw"], "--raw"),
+        (&["echo", "front/scan", "--meters"], "--meters"),
+        (&["hz", "front/scan", "--window=0.1s"], "at least 500ms"),
         (&["simulate"], "--port"),
         (&["simulate", "--port=a", "--world=room", "--replay=x"], "--replay"),
         (&["run", "--link"], "--link"),

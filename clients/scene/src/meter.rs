@@ -1,6 +1,7 @@
 //! Rate of the scans of a sensor and their age on arrival, over a short window. Time is an argument.
 
 use std::collections::VecDeque;
+use std::time::Duration;
 
 use schema::{Flags, Header};
 
@@ -26,10 +27,10 @@ impl Meter {
         }
     }
 
-    /// Scans per second; nothing before there are two.
+    /// Returns the scans per second, or `None` while they span less than [`schema::MIN_RATE_SPAN`].
     pub fn hz(&self) -> Option<f64> {
         let (first, last) = (self.scans.front()?.0, self.scans.back()?.0);
-        (last > first).then(|| (self.scans.len() - 1) as f64 * 1e9 / (last - first) as f64)
+        schema::rate_hz(self.scans.len() as u64 - 1, Duration::from_nanos(last - first))
     }
 
     /// Mean and greatest age on arrival, from the telegram's last byte, in ms.
@@ -94,8 +95,10 @@ mod tests {
         let mut meter = Meter::default();
         meter.scan(&header(1000, Flags::STAMP_ESTIMATED), 2_000_000_000);
         meter.scan(&header(1100, Flags::STAMP_ESTIMATED), 2_100_000_000);
+        assert_eq!(meter.hz(), None, "0.1 s are too short for a rate");
+        meter.scan(&header(1200, Flags::STAMP_ESTIMATED), 2_200_000_000);
         assert_eq!((meter.hz().map(f64::round), meter.age_ms()), (Some(10.0), None));
-        meter.scan(&header(5, 0), 2_200_000_000);
+        meter.scan(&header(5, 0), 2_300_000_000);
         assert_eq!(meter.hz(), None);
     }
 }

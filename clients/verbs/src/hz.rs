@@ -177,7 +177,7 @@ impl LineWindow {
     }
 }
 
-/// Class `hz`; what two arrivals would be needed for is null.
+/// Class `hz`. Rate, jitter and extremes are null while the arrivals span less than [`schema::MIN_RATE_SPAN`].
 #[derive(Serialize)]
 struct Line<'a> {
     class: &'static str,
@@ -209,7 +209,7 @@ impl<'a> Line<'a> {
             max_ms: rate.map(|rate| rate.max_ms),
             received: window.received(),
             lost: window.lost(),
-            window_s: window.seconds(),
+            window_s: window.span().as_secs_f64(),
             damaged: line.map(|line| line.status.damaged()),
             lost_on_line: line.and_then(LineWindow::lost_on_line),
             loss: line.and_then(|line| line.status.line_loss()),

@@ -113,7 +113,7 @@ fn properties(sensor: &str, status: &Status, now_ns: u64) -> Vec<Vec<String>> {
             "  view",
             known(format!("{} deg in steps of {step_deg}", status.angle_deg), status.angle_deg != 0),
         ),
-        row("  rate", format!("{:.2} Hz", f64::from(status.rate_mhz) / 1000.0)),
+        row("  rate", status.rate_hz().map_or_else(|| "unknown".into(), |hz| format!("{hz:.2} Hz"))),
         row("  line", line(status)),
         row("  pose", pose(&status.pose)),
         row("  marks", marks(sensor, status)),

@@ -192,7 +192,7 @@ pub(crate) fn status<'a>(sensor: &'a str, status: &'a Status) -> impl Serialize 
         unit_mm: Option<u8>,
         angle_deg: Option<u16>,
         step_deg: Option<f64>,
-        hz: f64,
+        hz: Option<f64>,
         port: &'a str,
         since_ns: u64,
         #[serde(serialize_with = "counters")]
@@ -215,7 +215,7 @@ pub(crate) fn status<'a>(sensor: &'a str, status: &'a Status) -> impl Serialize 
         unit_mm: known(status.unit_mm, 0),
         angle_deg: known(status.angle_deg, 0),
         step_deg: known(status.resolution_cdeg, 0).map(|step| f64::from(step) / 100.0),
-        hz: f64::from(status.rate_mhz) / 1000.0,
+        hz: status.rate_hz(),
         port: status.port(),
         since_ns: status.since_ns,
         counters: &status.counters,

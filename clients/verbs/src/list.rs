@@ -6,7 +6,7 @@ use std::sync::atomic::AtomicBool;
 
 use scanhub_client::streams::find;
 use schema::ipc::{self, Node, Payload, PortFactory};
-use schema::{Domain, Failure, Family, Pace, State, Status, Topic, publisher};
+use schema::{Domain, Failure, Family, Pace, Status, Topic, publisher};
 use serde::{Serialize, Serializer};
 
 use crate::info::statuses;
@@ -39,7 +39,7 @@ pub fn list(options: &ListOptions, out: &mut dyn Write, stop: &AtomicBool) -> Re
             // Of families other than LMS a telegram is no scan, and how many come is told by `hz`.
             let is_of_scans =
                 |status: &&Status| line.topic != Topic::Telegram || status.family() == Some(Family::Lms);
-            line.hz = status.as_ref().filter(is_of_scans).and_then(rate_hz);
+            line.hz = status.as_ref().filter(is_of_scans).and_then(Status::rate_hz);
         }
     }
     let mut output = Output::new(out);
@@ -134,12 +134,6 @@ fn line<P: Payload + ?Sized>(node: &Node, sensor: &str) -> Result<Option<Line>, 
         hz: None,
         subscribers: service.dynamic_config().number_of_subscribers(),
     }))
-}
-
-/// The rate of the scans; none yet of a stream that just began, which has not been measured.
-fn rate_hz(status: &Status) -> Option<f64> {
-    let is_unmeasured = status.rate_mhz == 0 && status.state() == Some(State::Streaming);
-    (!is_unmeasured).then(|| f64::from(status.rate_mhz) / 1000.0)
 }
 
 fn name<S: Serializer>(topic: &Topic, serializer: S) -> Result<S::Ok, S::Error> {

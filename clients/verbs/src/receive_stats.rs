@@ -62,11 +62,11 @@ impl ReceiveStats {
         }
     }
 
-    /// Samples per second between the first that was received as it was sent and the last, if there were two.
+    /// Returns the samples per second from the first sample that was received as it was sent to the last one. `None` if these
+    /// are less than [`schema::MIN_RATE_SPAN`] apart.
     pub(crate) fn hz(&self) -> Option<f64> {
         let ((live, first), last) = (self.live?, self.last?);
-        let seconds = (last - first).as_secs_f64();
-        (seconds > 0.0).then(|| (live - 1) as f64 / seconds)
+        schema::rate_hz(live - 1, last - first)
     }
 
     /// The silence since the last sample became too long just now; said once per silence.
@@ -117,7 +117,9 @@ mod tests {
         assert_eq!((stats.received, stats.hz()), (2, None));
         stats.count(start + Duration::from_millis(10), 0, 0, false);
         assert_eq!((stats.received, stats.hz()), (3, None));
+        stats.count(start + Duration::from_millis(209), 0, 0, false);
+        assert_eq!(stats.hz(), None, "0.2 s have not passed");
         stats.count(start + Duration::from_millis(1010), 0, 0, false);
-        assert_eq!((stats.received, stats.hz()), (4, Some(1.0)));
+        assert_eq!((stats.received, stats.hz()), (5, Some(2.0)));
     }
 }

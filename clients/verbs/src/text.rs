@@ -130,13 +130,11 @@ pub(crate) fn scan(line: &mut Vec<u8>, header: &Header, scan: &Scan) -> io::Resu
 /// What follows the name of a sample of topic `status`.
 pub(crate) fn status(line: &mut Vec<u8>, status: &Status) -> io::Result<()> {
     let state = status.state().map_or("unknown", |state| state.name());
-    write!(
-        line,
-        "{state} {} Bd {:.2} Hz {}",
-        status.baud,
-        f64::from(status.rate_mhz) / 1000.0,
-        status.port()
-    )?;
+    write!(line, "{state} {} Bd ", status.baud)?;
+    if let Some(hz) = status.rate_hz() {
+        write!(line, "{hz:.2} Hz ")?;
+    }
+    write!(line, "{}", status.port())?;
     if let Some(loss) = status.line_loss() {
         write!(line, " {loss}")?;
     }

@@ -50,31 +50,29 @@ impl Window {
         self.arrivals.iter().map(|(_, missed)| missed).sum()
     }
 
-    /// From the first arrival in the window to the last, in seconds.
-    pub(crate) fn seconds(&self) -> f64 {
+    /// Returns the time from the first arrival in the window to the last.
+    pub(crate) fn span(&self) -> Duration {
         match (self.arrivals.front(), self.arrivals.back()) {
-            (Some((first, _)), Some((last, _))) => (*last - *first).as_secs_f64(),
-            _ => 0.0,
+            (Some((first, _)), Some((last, _))) => *last - *first,
+            _ => Duration::ZERO,
         }
     }
 
-    /// The rate, if there are two arrivals at different times.
+    /// Returns the rate, or `None` if the arrivals span less than [`schema::MIN_RATE_SPAN`].
     pub(crate) fn rate(&self) -> Option<Rate> {
-        let seconds = self.seconds();
-        if seconds <= 0.0 {
-            return None;
-        }
+        let span = self.span();
         let times_ms = || {
             self.arrivals
                 .iter()
                 .zip(self.arrivals.iter().skip(1))
                 .map(|(a, b)| (b.0 - a.0).as_secs_f64() * 1e3)
         };
-        let count = times_ms().count() as f64;
-        let mean = seconds * 1e3 / count;
-        let variance = times_ms().map(|time| (time - mean).powi(2)).sum::<f64>() / count;
+        let count = times_ms().count();
+        let hz = schema::rate_hz(count as u64, span)?;
+        let mean = span.as_secs_f64() * 1e3 / count as f64;
+        let variance = times_ms().map(|time| (time - mean).powi(2)).sum::<f64>() / count as f64;
         Some(Rate {
-            hz: count / seconds,
+            hz,
             jitter_ms: variance.sqrt(),
             min_ms: times_ms().fold(f64::INFINITY, f64::min),
             max_ms: times_ms().fold(0.0, f64::max),
@@ -91,6 +89,11 @@ mod tests {
         let start = Instant::now();
         let mut window = Window::new(Duration::from_secs(1));
         assert_eq!(window.rate(), None);
+        let mut burst = Window::new(Duration::from_secs(1));
+        for at_us in [0, 1, 3] {
+            burst.arrived(start + Duration::from_micros(at_us), 0);
+        }
+        assert_eq!((burst.received(), burst.rate()), (3, None));
         for (at_ms, missed) in [(0, 9), (500, 0), (600, 1), (800, 0), (1200, 0)] {
             window.arrived(start + Duration::from_millis(at_ms), missed);
         }

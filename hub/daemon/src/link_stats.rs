@@ -7,7 +7,7 @@ use lms::header::Reject;
 use lms::reply::Reply;
 use lms::telegram::Telegram;
 use lms::variant::{Mode, Variant};
-use schema::{Counter, Counters, Pose, State, Status};
+use schema::{Counter, Counters, MIN_RATE_SPAN, Pose, State, Status};
 
 use crate::driver::Driver;
 use crate::process_telegram::Processed;
@@ -85,7 +85,7 @@ impl LinkStats {
         self.recent.gauge(now, &mut counters);
         self.status.counters = counters;
         let (since, scans) = *self.measured_at.get_or_insert((now, self.scans));
-        if now > since {
+        if u128::from(now.saturating_sub(since)) >= MIN_RATE_SPAN.as_nanos() {
             self.status.rate_mhz = ((self.scans - scans) * 1_000_000_000_000 / (now - since)) as u32;
         }
         if now > since + RATE_WINDOW {

@@ -5,6 +5,7 @@ use std::sync::atomic::AtomicBool;
 use std::time::Duration;
 
 use crate::fake::{FakeHub, Place, Verb};
+use schema::csv::ScanColumns;
 use schema::{Counter, Flags, Kind, Verdict};
 use verbs::{Bounds, EchoOptions, Format, echo};
 
@@ -78,7 +79,7 @@ fn telegrams_and_status_as_json() {
         out.lines().take(2).collect::<Vec<_>>(),
         [
             r#"{"class":"telegram","sensor":"front","seq":0,"topic_seq":0,"stamp_ns":1000000000,"wall_ns":1700000000000000000,"boot":"0000000000000001","quality":"clean","address":128,"command":160,"length":3,"data":"02800300a00010160a"}"#,
-            r#"{"class":"status","sensor":"front","state":"streaming","family":"lms","model":null,"baud":500000,"mode":null,"type":"","unit_mm":null,"angle_deg":null,"step_deg":null,"hz":0.0,"port":"/dev/ttyUSB0","since_ns":0,"counters":{"bytes_read":0,"bytes_in_telegrams":0,"bytes_acknowledge":0,"bytes_discarded":0,"bytes_buffered":0,"telegrams":0,"suspect":0,"aborted":0,"resyncs":0,"reconnects":0,"lost_in_restart":0,"wakeups":0,"loan_failed":0,"rejected_address":0,"rejected_length":0,"rejected_command":0,"rejected_count":0,"rejected_crc":3,"rejected_vetoed":0,"rejected_superseded":0,"line_errors":0,"bytes_damaged":0,"damaged_ppm":0,"due_on_line":0,"lost_on_line":0,"lost_ppm":0},"last_error":"","pose":{"x_m":0.0,"y_m":0.0,"yaw_rad":0.0,"upside_down":false},"marks":{"available":null,"remedy":null},"damaged":0.0,"lost_on_line":null}"#,
+            r#"{"class":"status","sensor":"front","state":"streaming","family":"lms","model":null,"baud":500000,"mode":null,"type":"","unit_mm":null,"angle_deg":null,"step_deg":null,"hz":null,"port":"/dev/ttyUSB0","since_ns":0,"counters":{"bytes_read":0,"bytes_in_telegrams":0,"bytes_acknowledge":0,"bytes_discarded":0,"bytes_buffered":0,"telegrams":0,"suspect":0,"aborted":0,"resyncs":0,"reconnects":0,"lost_in_restart":0,"wakeups":0,"loan_failed":0,"rejected_address":0,"rejected_length":0,"rejected_command":0,"rejected_count":0,"rejected_crc":3,"rejected_vetoed":0,"rejected_superseded":0,"line_errors":0,"bytes_damaged":0,"damaged_ppm":0,"due_on_line":0,"lost_on_line":0,"lost_ppm":0},"last_error":"","pose":{"x_m":0.0,"y_m":0.0,"yaw_rad":0.0,"upside_down":false},"marks":{"available":null,"remedy":null},"damaged":0.0,"lost_on_line":null}"#,
         ]
     );
     assert_eq!(out.lines().filter(|line| line.contains("summary")).count(), 2);
@@ -88,7 +89,7 @@ fn telegrams_and_status_as_json() {
 fn scans_as_columns_and_as_bytes() {
     let place = Place::new();
     let mut hub = FakeHub::new(&place.domain, &["front"], 1);
-    let csv = start(&place, &["front/scan"], Format::Csv, count(2));
+    let csv = start(&place, &["front/scan"], Format::Csv(ScanColumns::default()), count(2));
     let raw = start(&place, &["front/scan"], Format::Raw, count(1));
     hub.front().scan.await_subscribers(2);
     hub.front().scan(&[1000, 0x1FFF]);
@@ -237,7 +238,7 @@ fn what_the_hub_does_not_have() {
     assert_eq!((failure.kind, failure.hint.as_str()), (Kind::NoTopic, "there are front, rear"));
     for (topics, format, kind) in [
         (&["front/zone"][..], Format::Text, Kind::Usage),
-        (&["front/status"], Format::Csv, Kind::Usage),
+        (&["front/status"], Format::Csv(ScanColumns::default()), Kind::Usage),
         (&["front/scan", "rear/scan"], Format::Raw, Kind::Usage),
         (&[], Format::Text, Kind::Usage),
     ] {
