@@ -50,6 +50,7 @@ COUNTERS = (
     "due_on_line",
     "lost_on_line",
     "lost_ppm",
+    "scanner_restarts",
 )
 
 AUTHENTICATED, SIMULATED, REPLAYED, STAMP_ESTIMATED, SUSPECT = 1, 2, 4, 8, 16

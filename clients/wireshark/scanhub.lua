@@ -33,6 +33,7 @@ local COUNTERS = {
     "suspect", "aborted", "resyncs", "reconnects", "lost_in_restart", "wakeups", "loan_failed", "rejected_address",
     "rejected_length", "rejected_command", "rejected_count", "rejected_crc", "rejected_vetoed",
     "rejected_superseded", "line_errors", "bytes_damaged", "damaged_ppm", "due_on_line", "lost_on_line", "lost_ppm",
+    "scanner_restarts",
 }
 
 -- Fields -----------------------------------------------------------------------------------------------------------

@@ -290,6 +290,7 @@ counters! {
     DueOnLine "due_on_line" "Scans that the sensor must have sent, by its period; 0 while the period is not known.",
     LostOnLine "lost_on_line" "Scans of `due_on_line` that did not arrive.",
     LostPpm "lost_ppm" "Share of `lost_on_line` in the scans due in the last 10 s, in millionths: a gauge.",
+    ScannerRestarts "scanner_restarts" "Restarts of the scanner that the hub did not request, such as after a brown-out.",
 }
 
 #[cfg(test)]

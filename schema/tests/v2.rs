@@ -308,7 +308,7 @@ fn counters_in_order() {
         "bytes_read bytes_in_telegrams bytes_acknowledge bytes_discarded bytes_buffered telegrams suspect aborted \
          resyncs reconnects lost_in_restart wakeups loan_failed rejected_address rejected_length rejected_command \
          rejected_count rejected_crc rejected_vetoed rejected_superseded line_errors bytes_damaged damaged_ppm \
-         due_on_line lost_on_line lost_ppm"
+         due_on_line lost_on_line lost_ppm scanner_restarts"
     );
     let names: Vec<_> = State::ALL.iter().map(|state| state.name()).collect();
     assert_eq!(names.join(" "), "absent probing switching starting streaming silent paused");

@@ -142,5 +142,6 @@ COUNTERS = (
     "due_on_line",
     "lost_on_line",
     "lost_ppm",
+    "scanner_restarts",
 )
 """The counters that have a name, in their order."""

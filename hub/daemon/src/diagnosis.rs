@@ -1,5 +1,5 @@
 //! What is wrong with a link, in words for its status: the session's trouble, a unit that is not the configured one,
-//! more bytes than its line can bring, consumers that get nothing. Refuses to know when a status goes out.
+//! more bytes than its line can bring, a line that damages most bytes, a scanner that restarts, consumers that get nothing. Refuses to know when a status goes out.
 
 use config::{Link, Scanner};
 use line::Session as _;
@@ -9,6 +9,7 @@ use port::Source;
 use schema::{State, Status};
 
 use crate::driver::{Driver, Trouble};
+use crate::recent::LineHealth;
 
 /// What is known to be wrong with one link.
 pub(crate) struct Diagnosis<'a> {
@@ -21,6 +22,10 @@ pub(crate) struct Diagnosis<'a> {
     doubt: String,
     /// The port brings more than its line can.
     is_flooded: bool,
+    /// Share of the bytes that the line damages, in percent, while it damages most of them.
+    damaged_percent: Option<u32>,
+    /// The most restarts of the scanner in 10 s since the last 10 s without one.
+    restarts: u64,
     /// Consumers that got nothing, as of the last status.
     unserved: usize,
     /// Statuses in a row that said that there are some.
@@ -48,6 +53,8 @@ impl<'a> Diagnosis<'a> {
             words: String::new(),
             doubt: String::new(),
             is_flooded: false,
+            damaged_percent: None,
+            restarts: 0,
             unserved: 0,
             unserved_for: 0,
             told_mode: Status::MODE_UNKNOWN,
@@ -107,6 +114,26 @@ impl<'a> Diagnosis<'a> {
         self.is_flooded = false;
     }
 
+    /// Notes the state of the line in the last ten seconds, once a status.
+    pub(crate) fn watch_line(&mut self, line: LineHealth) {
+        // Where scans do not arrive, bytes of a scanner that was received count too, unless nothing is wrong.
+        let is_troubled = self.facts.is_some_and(|facts| facts.trouble.is_some());
+        let is_received = is_troubled && line.telegrams >= FEW_TELEGRAMS;
+        let share = if is_received { line.damaged.max(line.discarded) } else { line.damaged };
+        let percent = (100.0 * share).round() as u32;
+        let damaged_percent = match self.damaged_percent {
+            None => Some(percent).filter(|&percent| percent >= MOST_DAMAGED),
+            // A number that changes every second would be logged every second.
+            Some(before) if before.abs_diff(percent) < COARSE => Some(before),
+            Some(_) => Some(percent).filter(|&percent| percent >= MOST_DAMAGED - COARSE),
+        };
+        let restarts = if line.restarts == 0 { 0 } else { self.restarts.max(line.restarts) };
+        if (damaged_percent, restarts) != (self.damaged_percent, self.restarts) {
+            (self.damaged_percent, self.restarts) = (damaged_percent, restarts);
+            self.facts = None;
+        }
+    }
+
     /// Notes how many consumers are attached and get nothing, once a status.
     pub(crate) fn watch_unserved(&mut self, consumers: usize) {
         let before = self.unserved_for;
@@ -148,6 +175,20 @@ impl<'a> Diagnosis<'a> {
                  server must be in raw mode at that rate",
                 self.link.most_rate()
             );
+        }
+        // These come before everything that was concluded from what arrived.
+        if let Some(percent) = self.damaged_percent {
+            return format!(
+                "{percent} % of the bytes are damaged on the line: check cable, ground and adapter; `scanhub doctor {}` says more",
+                self.link.name
+            );
+        }
+        match self.restarts {
+            0 => {}
+            1 => return "the scanner restarted: is its supply strong enough?".to_owned(),
+            count => {
+                return format!("the scanner restarted {count} times in 10 s: is its supply strong enough?");
+            }
         }
         let is_server = matches!(self.link.port, Source::Tcp { .. });
         match driver.trouble() {
@@ -217,5 +258,11 @@ fn state_of(session: &Driver) -> State {
     }
 }
 
+/// Share of damaged bytes from which on nothing is concluded from the others, in percent.
+const MOST_DAMAGED: u32 = 50;
+/// Steps in which that share is reported.
+const COARSE: u32 = 10;
+/// Fewer telegrams in 10 s may be chance matches in the bytes of another scanner.
+const FEW_TELEGRAMS: u64 = 3;
 /// Statuses after which consumers without samples are more than ones that are just attaching.
 const UNSERVED_LIMIT: u32 = 3;

@@ -165,6 +165,7 @@ impl<'a, S: Surroundings> LinkCore<'a, S> {
                 self.output.topics.wake(Wake::Status);
             }
             self.hand_on(false);
+            self.diagnosis.watch_line(self.stats.health());
             self.diagnosis.watch_unserved(self.output.topics.unreached(self.stats.is_streaming()));
             self.diagnosis.tell_mode(self.stats.last());
         }

@@ -11,7 +11,7 @@ use schema::{Counter, Counters, MIN_RATE_SPAN, Pose, State, Status};
 
 use crate::driver::Driver;
 use crate::process_telegram::Processed;
-use crate::recent::Recent;
+use crate::recent::{LineHealth, Recent};
 
 /// The link's statistics, across all sessions on its port.
 pub(crate) struct LinkStats {
@@ -22,6 +22,8 @@ pub(crate) struct LinkStats {
     past: Counters,
     /// What the line took away lately.
     recent: Recent,
+    /// As of the last status.
+    health: LineHealth,
     /// Counters as they were when the rate was last computed.
     measured_at: Option<(Nanos, u64)>,
     /// Scans published.
@@ -45,6 +47,7 @@ impl LinkStats {
             mode: link.mode,
             past: Counters::default(),
             recent: Recent::new(),
+            health: LineHealth::default(),
             measured_at: None,
             scans: 0,
             wakeups: 0,
@@ -82,7 +85,7 @@ impl LinkStats {
         counters[Counter::Wakeups] = self.wakeups;
         counters[Counter::LoanFailed] = loan_failed;
         counters[Counter::LineErrors] = self.line_errors;
-        self.recent.gauge(now, &mut counters);
+        self.health = self.recent.gauge(now, &mut counters);
         self.status.counters = counters;
         let (since, scans) = *self.measured_at.get_or_insert((now, self.scans));
         if u128::from(now.saturating_sub(since)) >= MIN_RATE_SPAN.as_nanos() {
@@ -131,6 +134,11 @@ impl LinkStats {
         &self.status
     }
 
+    /// Returns the state of the line in the ten seconds before the last status.
+    pub(crate) fn health(&self) -> LineHealth {
+        self.health
+    }
+
     /// Whether telegrams come.
     pub(crate) fn is_streaming(&self) -> bool {
         self.status.state == State::Streaming as u8
@@ -175,6 +183,7 @@ fn add(counters: &mut Counters, driver: &Driver) {
     counters[Counter::BytesBuffered] = account.buffered;
     counters[Counter::Telegrams] += account.telegrams;
     counters[Counter::Resyncs] += account.resyncs;
+    counters[Counter::ScannerRestarts] += account.restarts;
     counters[Counter::BytesDamaged] += account.damaged;
     counters[Counter::DueOnLine] += account.due;
     counters[Counter::LostOnLine] += account.lost;

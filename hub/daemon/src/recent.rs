@@ -1,4 +1,4 @@
-//! What the line took away lately: shares of the last ten seconds, made of counters that only grow. Time is an argument.
+//! State of the line and of the scanner in the last ten seconds, computed from counters that only grow. Time is an argument.
 
 use std::collections::VecDeque;
 
@@ -11,29 +11,49 @@ pub(crate) struct Recent {
     looks: VecDeque<(Nanos, Counters)>,
 }
 
+/// State of a line and its scanner in the last ten seconds.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub(crate) struct LineHealth {
+    /// Share of the bytes that were damaged while scans arrived, 0 to 1.
+    pub(crate) damaged: f64,
+    /// Share of the bytes that were in nothing, 0 to 1.
+    pub(crate) discarded: f64,
+    /// Telegrams that arrived.
+    pub(crate) telegrams: u64,
+    /// Restarts of the scanner.
+    pub(crate) restarts: u64,
+}
+
 impl Recent {
     /// Nothing was looked at yet.
     pub(crate) fn new() -> Recent {
         Recent { looks: VecDeque::with_capacity(LOOKS) }
     }
 
-    /// Sets the gauges of `counters`, which are those of `now`.
-    pub(crate) fn gauge(&mut self, now: Nanos, counters: &mut Counters) {
+    /// Sets the gauges of `counters`, which are those of `now`, and returns the state of the line.
+    pub(crate) fn gauge(&mut self, now: Nanos, counters: &mut Counters) -> LineHealth {
         while self.looks.get(1).is_some_and(|(at, _)| now.saturating_sub(*at) >= WINDOW) {
             self.looks.pop_front();
         }
         let zero = Counters::default();
         let since = self.looks.front().map_or(&zero, |(_, counters)| counters);
+        let grown = |counter| counters[counter].saturating_sub(since[counter]);
         let ppm = |part: Counter, whole: Counter| {
-            let grown = |counter| counters[counter].saturating_sub(since[counter]);
             (1_000_000 * grown(part)).checked_div(grown(whole)).unwrap_or(0).min(1_000_000)
         };
         let damaged = ppm(Counter::BytesDamaged, Counter::BytesRead);
         let lost = ppm(Counter::LostOnLine, Counter::DueOnLine);
+        let health = LineHealth {
+            damaged: damaged as f64 / 1e6,
+            discarded: ppm(Counter::BytesDiscarded, Counter::BytesRead) as f64 / 1e6,
+            telegrams: grown(Counter::Telegrams),
+            restarts: grown(Counter::ScannerRestarts),
+        };
         (counters[Counter::DamagedPpm], counters[Counter::LostPpm]) = (damaged, lost);
         if self.looks.back().is_none_or(|(at, _)| now.saturating_sub(*at) >= STEP) {
             self.looks.push_back((now, *counters));
         }
+        health
     }
 }
 
@@ -57,7 +77,10 @@ mod tests {
                 counters[Counter::BytesDamaged] += 500;
                 counters[Counter::LostOnLine] += 10;
             }
-            recent.gauge(second * 1_000 * MILLIS, &mut counters);
+            counters[Counter::ScannerRestarts] += u64::from(second == 12 || second == 17);
+            let health = recent.gauge(second * 1_000 * MILLIS, &mut counters);
+            let restarts = [12..22, 17..27].iter().filter(|range| range.contains(&second)).count();
+            assert_eq!(health.restarts, restarts as u64, "{second}");
             let told = (counters[Counter::DamagedPpm], counters[Counter::LostPpm]);
             match second {
                 0..10 | 29.. => assert_eq!(told, (0, 0), "{second}"),

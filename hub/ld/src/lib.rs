@@ -11,6 +11,7 @@ pub mod framer;
 mod heard;
 mod model;
 pub mod packet;
+mod restarts;
 mod sequence;
 mod session;
 

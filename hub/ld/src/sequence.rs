@@ -101,6 +101,15 @@ impl Sequence {
         if self.lessons > 0 { 1e9 / self.points_per_second } else { 0.0 }
     }
 
+    /// Returns the nanoseconds from one packet to the next as they were learned last, also by an earlier stream; 0 before.
+    pub(crate) fn packet_ns(&self) -> f64 {
+        if self.points_per_second > 0.0 {
+            POINTS as f64 * 1e9 / f64::from(self.points_per_second)
+        } else {
+            0.0
+        }
+    }
+
     /// Packets that came, and those that did not although the ones before and after them did.
     pub(crate) fn came_and_lost(&self) -> (u64, u64) {
         (self.came, self.lost)

@@ -5,7 +5,7 @@
 mod driven;
 
 use line::{
-    Closed, MILLIS, Nanos, Pace, Packets, Reads, Received, SensorClock, State, Tally, Turn, TurnCounts,
+    Closed, Flow, MILLIS, Nanos, Pace, Packets, Reads, Received, SensorClock, State, Tally, Turn, TurnCounts,
     Turns, line_time,
 };
 
@@ -13,6 +13,7 @@ use crate::framer::{Framer, Span};
 use crate::heard::Trouble;
 use crate::model::Model;
 use crate::packet::{LEN, POINTS, Packet};
+use crate::restarts::Restarts;
 use crate::sequence::{Place, Sequence};
 
 /// What a session shall do.
@@ -65,6 +66,9 @@ pub struct Session {
     /// Bytes of streams that were in nothing, and all of those when it was last looked.
     damaged: (u64, u64),
     resyncs: u64,
+    restarts: Restarts,
+    /// Bytes of streams that were in nothing, and bytes of packets, when the last revolution ended.
+    turned_with: (u64, u64),
     cut: bool,
 }
 
@@ -112,6 +116,8 @@ impl Session {
             quiet_since: (now, 0),
             damaged: (0, 0),
             resyncs: 0,
+            restarts: Restarts::default(),
+            turned_with: (0, 0),
             cut: false,
         }
     }
@@ -196,10 +202,18 @@ impl Session {
                 self.listen(State::Silent);
             }
             Phase::Hearing { turned_at, .. } if self.now >= turned_at + STILL => {
-                self.trouble = Some(Trouble::StandsStill);
+                // Where most bytes are damaged, a missing revolution says nothing about the head.
+                let (damaged, in_packets) = self.turned_with;
+                let is_damaged = self.damaged.0 - damaged > self.framer.tally().in_packets - in_packets;
+                self.trouble = (!is_damaged).then_some(Trouble::StandsStill);
             }
             _ => {}
         }
+    }
+
+    /// Starts to wait for the end of the next revolution.
+    fn await_turn(&mut self) {
+        self.turned_with = (self.damaged.0, self.framer.tally().in_packets);
     }
 
     /// Packets came: dates them, and remembers them for turns.
@@ -210,17 +224,27 @@ impl Session {
         let packet_time = line_time(LEN, self.baud);
         let mut places = [Place::Odd; MOST];
         self.clock_before = None;
+        let flow = Flow { byte_ns: self.sequence.packet_ns() / LEN as f64, packet_len: LEN, pace };
         let (bytes, _) = self.framer.bytes(span).as_chunks::<LEN>();
         for (number, bytes) in bytes.iter().enumerate() {
             let Ok(packet) = Packet::check(bytes) else { continue };
             let place = self.sequence.place(&packet);
+            let end = span.offset + ((number + 1) * LEN - 1) as u64;
             if matches!(place, Place::First { .. }) {
+                let arrivals = self.reads.arrivals();
+                let earliest = arrivals.earliest_behind_gap(end, flow);
+                let arrival = earliest.map(|earliest| (earliest, arrivals.latest(end, pace)));
+                self.restarts.note_first(packet.millis(), arrival);
                 let before = core::mem::replace(&mut self.clock, SensorClock::new());
                 self.clock_before.get_or_insert((number, before));
             }
             if let Some(time) = place.time() {
-                let end = span.offset + ((number + 1) * LEN - 1) as u64;
                 self.clock.note(time, self.reads.arrivals().latest(end, pace).saturating_sub(packet_time));
+            }
+            if let Place::Next { time, .. } = place
+                && let Some(measured) = self.clock.time(time)
+            {
+                self.restarts.note_next(packet.millis(), measured + packet_time);
             }
             places[number] = place;
         }
@@ -266,6 +290,7 @@ impl Session {
             Phase::Listening { .. } => {
                 self.trouble = None;
                 self.phase = Phase::Hearing { turned_at: self.now, has_turned: false, silent_at };
+                self.await_turn();
             }
             Phase::Paused => {}
         }
@@ -327,6 +352,7 @@ impl Session {
         if let Phase::Hearing { turned_at, has_turned, .. } = &mut self.phase {
             (*turned_at, *has_turned) = (self.now, true);
         }
+        self.await_turn();
         self.dated(closed)
     }
 

@@ -241,6 +241,8 @@ pub struct Account {
     pub rejected_checksum: u64,
     /// How often the session began again.
     pub resyncs: u64,
+    /// Restarts of the scanner that the session did not request. First contact is not one.
+    pub restarts: u64,
     /// Whether the first transmission came after a piece of one: what was in flight when the port was opened.
     pub began_with_a_cut: bool,
 }

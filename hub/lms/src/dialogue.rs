@@ -42,6 +42,13 @@ pub(crate) struct Dialogue {
     /// The sensor keeps another variant than the wanted one.
     pub(crate) variant_refused: bool,
     pub(crate) resyncs: u64,
+    /// Restarts of the sensor.
+    pub(crate) restarts: u64,
+    /// Whether a telegram has arrived since the session began or the last banner. Without it, a banner is first contact, or
+    /// a copy of the last one.
+    is_in_contact: bool,
+    /// Rate of the last stream, until a request stops it or the sensor is found again.
+    pub(crate) streamed_at: Option<Baud>,
     /// Bytes came since it began to listen, or to search for another round.
     pub(crate) heard: bool,
     /// When the last telegram came.
@@ -65,6 +72,9 @@ impl Dialogue {
             is_paused: false,
             variant_refused: false,
             resyncs: 0,
+            restarts: 0,
+            is_in_contact: false,
+            streamed_at: None,
             heard: false,
             quiet_since: now,
         };
@@ -193,8 +203,11 @@ impl Dialogue {
         self.quiet_since = now;
         self.sensor.learn(reply.as_ref(), telegram);
         if telegram.command() == POWER_ON {
+            self.restarts += u64::from(core::mem::take(&mut self.is_in_contact));
+            self.streamed_at = None;
             return self.on_power_on(now);
         }
+        self.is_in_contact = true;
         if is_data(telegram.command()) {
             let measured = match reply {
                 Some(Reply::Measured(measured)) if measured.partial().is_none() => Some(measured),
@@ -238,6 +251,7 @@ impl Dialogue {
                     self.stream(telegram, measured, now);
                 } else {
                     self.sensor.streams = true;
+                    self.note_found(false);
                     self.proceed(Progress::BEGIN, now);
                 }
             }
@@ -272,6 +286,7 @@ impl Dialogue {
             Phase::Probing { .. } if self.is_paused => self.stop(now),
             Phase::Probing { .. } => {
                 self.found_at = Some(self.baud);
+                self.note_found(matches!(reply, Some(Reply::Status(_))) && !self.sensor.streams);
                 // Somebody is there after all.
                 self.trouble
                     .take_if(|trouble| matches!(trouble, Trouble::NoAnswer { .. } | Trouble::Silence));
@@ -285,6 +300,13 @@ impl Dialogue {
             Phase::Paused { .. } => self.on_stopped(reply, now),
             Phase::Streaming { .. } | Phase::Listening { .. } | Phase::Following => {}
         }
+    }
+
+    /// Counts a restart whose banner was lost: the sensor streamed and no request stopped it, but now it `is_idle` or has
+    /// another rate.
+    fn note_found(&mut self, is_idle: bool) {
+        let has_restarted = self.streamed_at.take().is_some_and(|baud| baud != self.baud || is_idle);
+        self.restarts += u64::from(has_restarted);
     }
 
     /// No reply to the open request: again, or on without it.
@@ -337,6 +359,7 @@ impl Dialogue {
         self.trouble = None;
         self.variant_refused = !as_asked;
         self.sensor.streams = true;
+        self.streamed_at = Some(self.baud);
         let silent_at = self.silent_at(now);
         // A reply that is under way may answer; half a request must be forgotten before the next one.
         let unsaid = self.open.take_if(|open| !open.is_out());

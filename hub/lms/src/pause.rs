@@ -37,6 +37,7 @@ impl Dialogue {
     /// The sensor hears at this rate, and shall stop.
     pub(crate) fn stop(&mut self, now: Nanos) {
         self.phase = Phase::Paused { stops_left: STOPS };
+        self.streamed_at = None;
         self.heard = false;
         self.ask(Request::Stop, now, TRIES);
     }

@@ -354,6 +354,7 @@ impl line::Session for Session {
             damaged: self.damage.damaged(tally),
             rejected_checksum: tally.rejected[Reject::Crc as usize],
             resyncs: self.dialogue.resyncs,
+            restarts: self.dialogue.restarts,
             began_with_a_cut: self.cut,
         }
     }

@@ -50,6 +50,7 @@ impl Dialogue {
             Step::Configuration => (Request::Configuration, TRIES),
             Step::Stream => (Request::Stream, MORE_TRIES),
         };
+        self.streamed_at = None;
         self.phase = Phase::Starting { step, progress };
         self.ask(request, now, tries);
     }

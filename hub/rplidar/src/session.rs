@@ -99,6 +99,12 @@ pub struct Session {
     /// Bytes of streams that were in nothing, and all of those when it was last looked.
     damaged: (u64, u64),
     resyncs: u64,
+    /// Restarts of the scanner that were not requested.
+    restarts: u64,
+    /// Rate of the last stream, until a greeting is received.
+    streamed_at: Option<u32>,
+    /// Bytes of streams that were in nothing, and bytes of packets, when the last revolution ended.
+    turned_with: (u64, u64),
     cut: bool,
 }
 
@@ -158,6 +164,9 @@ impl Session {
             quiet_since: None,
             damaged: (0, 0),
             resyncs: 0,
+            restarts: 0,
+            streamed_at: None,
+            turned_with: (0, 0),
             cut: false,
         };
         session.begin(State::Probing);
@@ -252,10 +261,18 @@ impl Session {
                 self.begin(State::Silent);
             }
             Phase::Hearing { turned_at, .. } if now >= turned_at + STILL => {
-                self.trouble = Some(Trouble::StandsStill);
+                // Where most bytes are damaged, a missing revolution says nothing about the head.
+                let (damaged, in_packets) = self.turned_with;
+                let is_damaged = self.damaged.0 - damaged > self.framer.tally().in_packets - in_packets;
+                self.trouble = (!is_damaged).then_some(Trouble::StandsStill);
             }
             _ => {}
         }
+    }
+
+    /// Starts to wait for the end of the next revolution.
+    fn await_turn(&mut self) {
+        self.turned_with = (self.damaged.0, self.framer.tally().in_packets);
     }
 
     /// Whether it was sought for a short time only: then what goes on to stream is not asked, for at its rate it would have

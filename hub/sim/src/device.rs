@@ -22,6 +22,11 @@ pub trait Device {
     /// The power goes off and on. Returns whether a telegram was broken off.
     fn power_cycle(&mut self, now: Nanos) -> bool;
 
+    /// The voltage dips at `now`, and the sensor restarts by itself. Returns whether a telegram was broken off.
+    fn brown_out(&mut self, now: Nanos) -> bool {
+        self.power_cycle(now)
+    }
+
     /// Breaks off what it is sending; a stream continues with a whole telegram.
     fn break_off(&mut self, now: Nanos);
 

@@ -137,6 +137,20 @@ impl Head {
         point as f64 / f64::from(self.settings.model.points_per_second())
     }
 
+    /// It starts at `now`: packets come after `boot_ns`, from a head that gets up to speed with a time constant of
+    /// `spin_up_s` seconds. Returns whether a packet was broken off.
+    fn restart(&mut self, now: Nanos, boot_ns: Nanos, spin_up_s: f64) -> bool {
+        let broken = self.outlet.break_off(now);
+        self.power_ns = now;
+        self.turns_ns = now + boot_ns;
+        let HeadSettings { turns_per_second, wander, seed, .. } = self.settings;
+        (self.rotation, self.sent) = (Rotation::new(turns_per_second, wander, spin_up_s, seed), 0);
+        if let Source::Recorded { passed_ms, .. } = &mut self.source {
+            *passed_ms = 0;
+        }
+        broken
+    }
+
     /// Packet number `number` of a room.
     fn measure(&mut self, number: u64) -> [u8; LEN] {
         let first = number * POINTS as u64;
@@ -202,15 +216,12 @@ impl Device for Head {
     fn receive(&mut self, _: u8, _: Arrival) {}
 
     fn power_cycle(&mut self, now: Nanos) -> bool {
-        let broken = self.outlet.break_off(now);
-        self.power_ns = now;
-        self.turns_ns = now + self.settings.boot_ns;
-        let HeadSettings { turns_per_second, wander, seed, .. } = self.settings;
-        (self.rotation, self.sent) = (Rotation::new(turns_per_second, wander, 0.0, seed), 0);
-        if let Source::Recorded { passed_ms, .. } = &mut self.source {
-            *passed_ms = 0;
-        }
-        broken
+        self.restart(now, self.settings.boot_ns, 0.0)
+    }
+
+    /// Its clock begins again, and its motor has to get up to speed.
+    fn brown_out(&mut self, now: Nanos) -> bool {
+        self.restart(now, RESTART_NS, SPIN_UP_S)
     }
 
     fn break_off(&mut self, now: Nanos) {
@@ -261,6 +272,11 @@ pub fn recorded(path: &Path, sensor: Option<&str>) -> Result<Vec<[u8; LEN]>, Fai
     }
     Ok(packets)
 }
+
+/// From a dip of the voltage to the first packet, and the time constant with which the motor gets up to speed again. Invented:
+/// what a real one does is not published.
+const RESTART_NS: Nanos = 300 * MILLIS;
+const SPIN_UP_S: f64 = 0.2;
 
 /// Between which ranges a model measures, by its data sheet.
 fn reach_mm(model: Model) -> std::ops::RangeInclusive<f64> {

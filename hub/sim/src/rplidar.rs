@@ -15,7 +15,7 @@ mod stream;
 use line::{MILLIS, Nanos};
 
 use crate::device::{Chunk, Device};
-use crate::fault::{Schedule, Window};
+use crate::fault::Window;
 use crate::outlet::Outlet;
 use crate::request_decoder::{Arrival, Dropped};
 use crate::room::Room;
@@ -45,7 +45,6 @@ pub struct Unit {
     boots_ns: Option<Nanos>,
     /// From when on it hears.
     hears_ns: Nanos,
-    brownouts: Schedule,
     stalls: Window,
     /// What the motor did when something held it.
     held: Option<Option<Motion>>,
@@ -66,7 +65,6 @@ impl Unit {
             health,
             boots_ns: None,
             hears_ns: 0,
-            brownouts: Schedule::brownouts(&settings.faults, seed),
             stalls: Window::held(&settings.faults, seed),
             held: None,
             writes: 0,
@@ -131,12 +129,6 @@ impl Unit {
         self.settings.habits = habits;
     }
 
-    /// The voltage dips at `now`: it starts anew, and its banner comes where measurements came. Returns whether a packet
-    /// was broken off.
-    pub fn brown_out(&mut self, now: Nanos) -> bool {
-        self.restart(now, RESTART_NS)
-    }
-
     /// Something holds its head from `now` on for `span`.
     pub fn hold(&mut self, now: Nanos, span: Nanos) {
         self.stalls = Window::once(now, span);
@@ -192,9 +184,6 @@ impl Unit {
 
     /// What has happened by `now` is done.
     fn advance(&mut self, now: Nanos) {
-        if self.brownouts.take(now).is_some() {
-            self.brown_out(now);
-        }
         if self.boots_ns.is_some_and(|at| at <= now) {
             let at_ns = self.boots_ns.take().unwrap_or(now);
             self.outlet.send(answers::banner(self.settings.model), at_ns, true);
@@ -316,7 +305,7 @@ impl Device for Unit {
         let data_ns = self.outlet.next_ns().or_else(|| self.stream?.due_ns(self.motor));
         // While it is held its end is still ahead.
         let held_ns = self.stalls.next_ns(if self.held.is_some() { 0 } else { Nanos::MAX });
-        let times = [data_ns, self.boots_ns, Some(self.brownouts.next_ns()), Some(held_ns)];
+        let times = [data_ns, self.boots_ns, Some(held_ns)];
         times.into_iter().flatten().filter(|&at| at < Nanos::MAX).min()
     }
 
@@ -342,6 +331,11 @@ impl Device for Unit {
             None => self.motor = motion,
         }
         broken
+    }
+
+    /// It restarts while its motor continues, and its banner comes where measurements came.
+    fn brown_out(&mut self, now: Nanos) -> bool {
+        self.restart(now, RESTART_NS)
     }
 
     fn break_off(&mut self, now: Nanos) {

@@ -37,6 +37,7 @@ pub struct Wire {
     lateness: Lateness,
     unplug: Window,
     power: Schedule,
+    brownouts: Schedule,
     /// Whether the adapter is in its socket.
     plugged: bool,
     /// Bytes of the telegram on the line that were sent, the last of them, and why they did not arrive as they were.
@@ -64,6 +65,7 @@ impl Wire {
             lateness: Lateness::new(faults, seed),
             unplug: Window::unplugs(faults, seed),
             power: Schedule::power_cycles(faults, seed),
+            brownouts: Schedule::brownouts(faults, seed),
             plugged: true,
             position: 0,
             last: 0,
@@ -112,6 +114,9 @@ impl Wire {
         if self.power.take(now).is_some() {
             self.cycle_power(machine, now);
         }
+        if self.brownouts.take(now).is_some() {
+            self.power_broke |= machine.brown_out(now);
+        }
         loop {
             if self.queue.front().is_some_and(|(at, _)| *at <= now)
                 && let Some((_, mut carried)) = self.queue.pop_front()
@@ -142,7 +147,7 @@ impl Wire {
         extras
             .chain(machine.poll_timeout())
             .chain(self.queue.front().map(|(at, _)| *at))
-            .chain([self.power.next_ns(), self.unplug.next_ns(now)])
+            .chain([self.power.next_ns(), self.brownouts.next_ns(), self.unplug.next_ns(now)])
             .filter(|&at| at < Nanos::MAX)
             .min()
     }

@@ -1,12 +1,12 @@
-//! Finds out of what family a scanner whose head turns is, for a person at a terminal: listens to those that speak unasked,
-//! and sends them nothing; asks the others what and how they are, and tells them nothing but to stop. Refuses to know
-//! families; the list of them says how they are.
+//! Finds out of what family a rotating scanner is, and how well its line carries what it measures, for a person at a
+//! terminal. A scanner that speaks unasked is only listened to. The others are asked what and how they are, then they measure
+//! for a second, and are stopped as a hub stops them. The list of families says which is which.
 
 use std::fmt;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
-use line::family::{Features, Model, Wanted};
+use line::family::{Condition, Features, Model, Wanted};
 use line::{Account, Heard, MILLIS, Nanos, Output, Session as _};
 use port::{Port, clock};
 use rustix::event::{PollFd, PollFlags, poll};
@@ -26,7 +26,7 @@ pub(crate) struct Overheard {
     pub(crate) account: Account,
     /// What it said of itself, if it was asked.
     pub(crate) said: Option<Introduction>,
-    /// Packets that came unasked.
+    /// Packets of measured data.
     pub(crate) packets: u64,
     /// Points that it measures in a second; 0 as long as no turn was whole.
     pub(crate) points_per_second: f64,
@@ -48,6 +48,20 @@ impl Overheard {
     }
 }
 
+impl Overheard {
+    /// Returns whether the line damages so many bytes that the others say nothing about the scanner.
+    pub(crate) fn is_unreliable(&self) -> bool {
+        self.damaged() > MOST_DAMAGED
+    }
+
+    /// Returns what the line does to the bytes and what to do about it, if it damages more than one in a hundred.
+    pub(crate) fn line_trouble(&self) -> Option<String> {
+        let damaged = self.damaged();
+        (damaged > WELL)
+            .then(|| format!("{:.0} % of the bytes are damaged on the line: {LINE_REMEDY}", 100.0 * damaged))
+    }
+}
+
 impl fmt::Display for Overheard {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let name = self.model.map_or("a scanner".to_owned(), |model| model.name.to_uppercase());
@@ -63,8 +77,8 @@ pub(crate) fn turning() -> Vec<(Family, &'static Features)> {
     known
 }
 
-/// Looks at `port` for a scanner of `family`, at all its rates unless the port has a rate of its own; `look` sees each of
-/// them. What came, if it was enough to be no accident; else how many bytes.
+/// Looks at `port` for a scanner of `family`, at all its rates unless the port has its own rate; `look` sees each of
+/// them. Returns what was received, if it was too much for a chance match; otherwise the number of bytes.
 ///
 /// [`Kind::PortMissing`] if the port goes away, [`Kind::Interrupted`] if `stop` is set.
 pub(crate) fn listen(
@@ -80,12 +94,12 @@ pub(crate) fn listen(
     port.try_baud(session.rate()).map_err(|error| gone(port, &error))?;
     let mut heard = Turns::default();
     let (first_rate, mut rate, mut rates) = (session.rate(), 0, 0);
-    // Who is asked may not hear it, or be late with an answer.
-    let mut rounds = if features.speaks_unasked { 1 } else { 2 };
+    // A scanner that is asked may miss it, or be late with an answer, or the line damages the answer.
+    let mut rounds = if features.speaks_unasked { 1 } else { 3 };
     loop {
         if !fixed_rate && rate != session.rate() {
             (rate, rates) = (session.rate(), rates + 1);
-            if rates > 1 && rate == first_rate {
+            if rates > 1 && rate == first_rate && heard.said.is_none() {
                 rounds -= 1;
             }
             if rounds == 0 {
@@ -95,19 +109,24 @@ pub(crate) fn listen(
         }
         let until = heard.drain(port, &mut session).map_err(|error| gone(port, &error))?;
         if stop.load(Ordering::Relaxed) {
+            let _ = heard.end(port, &mut session);
             return Err(Failure::new(Kind::Interrupted, "interrupted", ""));
         }
         let now = clock::now();
         let is_heard = heard.packets >= ENOUGH;
-        let limit = match features.speaks_unasked {
-            true if is_heard => LONGEST,
-            true => SILENT,
-            false => UNANSWERED,
+        let limit = match (&heard.said, heard.measures_since) {
+            (Some(said), _) if said.condition == Condition::Error => now,
+            (Some(_), Some(since)) => since + SECOND,
+            (Some(_), None) => heard.said_at + BEGINS,
+            (None, Some(since)) if is_heard && heard.turns >= TURNS => since + SECOND,
+            (None, _) if is_heard => begun + LONGEST,
+            (None, _) if features.speaks_unasked => begun + SILENT,
+            (None, _) => begun + UNANSWERED,
         };
-        if heard.turns >= TURNS || heard.said.is_some() || now >= begun + limit {
+        if now >= limit {
             break;
         }
-        let until = until.min(begun + limit);
+        let until = until.min(limit);
         let mut fds = [PollFd::new(port, PollFlags::IN)];
         // An interrupted wait is a short one.
         let _ = poll(&mut fds, Some(&clock::span(now, until.min(now + LOOK))));
@@ -118,16 +137,21 @@ pub(crate) fn listen(
             session.handle_timeout(now);
         }
     }
-    let trouble = session.trouble().map(|trouble| trouble.to_string());
+    let mut trouble = session.trouble().map(|trouble| trouble.to_string());
+    if heard.packets == 0 && heard.said.as_ref().is_some_and(|said| said.condition != Condition::Error) {
+        trouble.get_or_insert_with(|| "it answers, but does not begin to measure".to_owned());
+    }
+    let (account, model) = (session.account(), session.model());
+    heard.end(port, &mut session).map_err(|error| gone(port, &error))?;
     if heard.packets < ENOUGH && heard.said.is_none() {
-        return Ok(Err(session.account().read));
+        return Ok(Err(account.read));
     }
     let Turns { packets, period, points_per_second, said, .. } = heard;
     Ok(Ok(Overheard {
         family,
-        model: session.model(),
+        model,
         rate: session.rate(),
-        account: session.account(),
+        account,
         said,
         packets,
         points_per_second: f64::from(points_per_second),
@@ -161,11 +185,16 @@ pub(crate) fn not_heard(name: &str, family: Family, features: &Features, bytes: 
 #[derive(Default)]
 struct Turns {
     packets: u64,
+    /// Time of the first packet.
+    measures_since: Option<Nanos>,
     turns: u32,
     /// Of the last turn.
     period: Nanos,
     points_per_second: f32,
     said: Option<Introduction>,
+    said_at: Nanos,
+    /// State of the line DTR that the session requested last.
+    dtr: Option<bool>,
 }
 
 impl Turns {
@@ -176,18 +205,33 @@ impl Turns {
                 Output::SetRate(rate) => {
                     port.try_baud(rate)?;
                 }
-                // Its motor stays as it is.
-                Output::SetDtr(_) => {}
-                Output::Transmit { byte, .. } => {
-                    // What is sent after it has said all would have it measure.
-                    self.said = session.introduction();
+                // Its motor stays as it is until the scanner measures.
+                Output::SetDtr(on) => {
+                    self.dtr = Some(on);
                     if self.said.is_some() {
-                        return Ok(clock::now());
+                        port.set_dtr(on)?;
+                    }
+                }
+                Output::Transmit { byte, .. } => {
+                    if self.said.is_none() {
+                        self.said = session.introduction();
+                        self.said_at = clock::now();
+                        match &self.said {
+                            // The session would reset it next.
+                            Some(said) if said.condition == Condition::Error => return Ok(self.said_at),
+                            Some(_) => self.dtr.map_or(Ok(()), |on| port.set_dtr(on))?,
+                            None => {}
+                        }
                     }
                     port.write(byte)?;
                     session.transmitted(clock::now());
                 }
-                Output::Heard(Heard::Packets(received)) => self.packets += received.message.count as u64,
+                Output::Heard(Heard::Packets(received)) => {
+                    if !received.message.is_reply {
+                        self.measures_since.get_or_insert_with(clock::now);
+                        self.packets += received.message.count as u64;
+                    }
+                }
                 Output::Heard(Heard::Turn(turn)) => {
                     self.turns += 1;
                     self.period = turn.period;
@@ -201,14 +245,45 @@ impl Turns {
             }
         }
     }
+
+    /// Stops a scanner that was told to measure, and its motor, as a hub does at its end.
+    fn end(&self, port: &Port, session: &mut Session) -> std::io::Result<()> {
+        let measures = self.said.as_ref().is_some_and(|said| said.condition != Condition::Error);
+        if !measures || !session.end(clock::now()) {
+            return Ok(());
+        }
+        loop {
+            match session.poll_output() {
+                Output::SetDtr(on) => port.set_dtr(on)?,
+                Output::Transmit { byte, .. } => {
+                    port.write(byte)?;
+                    session.transmitted(clock::now());
+                }
+                Output::SetRate(_) | Output::Heard(_) => {}
+                Output::Rest(_) | Output::Wait { .. } => return Ok(()),
+            }
+        }
+    }
 }
+
+/// Remedy for a line that damages bytes.
+pub(crate) const LINE_REMEDY: &str =
+    "a shorter or shielded cable, ground beside the signal, 3.3 V levels; another adapter";
+/// Share of damaged bytes up to which a line is well.
+const WELL: f64 = 0.01;
+/// Share of damaged bytes from which on the others say nothing about the scanner.
+const MOST_DAMAGED: f64 = 0.5;
 
 /// Other bytes pass a checksum of 8 bits now and then: not so often.
 const ENOUGH: u64 = 20;
 /// Whole turns that tell how it is.
 const TURNS: u32 = 5;
 /// No answer at any rate takes less than that, behind a network none at one.
-const UNANSWERED: Nanos = 1_400 * MILLIS;
+const UNANSWERED: Nanos = 2_000 * MILLIS;
+/// Time for which measured data are listened to.
+const SECOND: Nanos = 1_000 * MILLIS;
+/// A scanner whose motor has to get up to speed measures by then, even if many answers are damaged before.
+const BEGINS: Nanos = 7_000 * MILLIS;
 /// No packet at two rates takes less than that.
 const SILENT: Nanos = 650 * MILLIS;
 /// A head that turns twice a second has turned often enough.

@@ -140,8 +140,6 @@ pub(crate) trait Scanner {
 /// What happens to a scanner beside its line.
 #[derive(Clone, Copy, Debug)]
 pub(crate) enum Ailment {
-    /// Its voltage dips: it starts anew by itself.
-    BrownOut,
     /// Something holds its head for so long.
     Held { span: Nanos },
     /// It says that it is well (0), may not be for long (1), or is not (2); if it is stubborn, also after it booted.

@@ -95,6 +95,11 @@ impl Sensor {
         self.scanner.device_mut().power_cycle(self.now);
     }
 
+    /// Its voltage dips.
+    pub(crate) fn brown_out(&mut self) {
+        self.scanner.device_mut().brown_out(self.now);
+    }
+
     /// Another one is there instead, as `action` says.
     pub(crate) fn exchange(&mut self, action: &Action) {
         self.eeprom_writes += self.scanner.device().eeprom_writes();

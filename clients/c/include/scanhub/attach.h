@@ -403,7 +403,8 @@ enum scanhub_counter {
     SCANHUB_COUNTER_DAMAGED_PPM, /* of the last 10 s, in millionths */
     SCANHUB_COUNTER_DUE_ON_LINE, /* 0: what was lost on the line is not known */
     SCANHUB_COUNTER_LOST_ON_LINE,
-    SCANHUB_COUNTER_LOST_PPM /* of the last 10 s, in millionths */
+    SCANHUB_COUNTER_LOST_PPM, /* of the last 10 s, in millionths */
+    SCANHUB_COUNTER_SCANNER_RESTARTS /* that the hub did not request */
 };
 
 struct scanhub_pose_v2 {

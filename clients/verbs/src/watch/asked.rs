@@ -13,9 +13,11 @@ fn what_a_person_asks_for_is_drawn() {
     let mut scene = scene();
     let counters = View { counters: true, ..View::new(false) };
     let page = text(&screen(&scene, &counters, (80, 40)));
-    for row in
-        ["damaged on the line, last 10 s          0.00 %", "suspect                                      3"]
-    {
+    for row in [
+        "damaged on the line, last 10 s          0.00 %",
+        "suspect                                      3",
+        "scanner_restarts                             0",
+    ] {
         assert!(page.contains(row), "{row}:\n{page}");
     }
     assert!(page.lines().nth(1).unwrap().ends_with("         front          rear"), "{page}");

@@ -104,6 +104,7 @@ impl line::Session for Session {
             damaged: self.damaged.0,
             rejected_checksum: tally.rejected_checksum,
             resyncs: self.resyncs,
+            restarts: self.restarts.count(),
             began_with_a_cut: self.cut,
         }
     }

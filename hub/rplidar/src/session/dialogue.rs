@@ -141,8 +141,12 @@ impl Session {
 
     /// Tries the next rate, and says for how long already.
     pub(super) fn seek_on(&mut self) {
-        let since = self.quiet_since.get_or_insert((self.now, self.framer.tally().read)).0;
-        if let Some(baud) = self.next_rate() {
+        let (since, read) = *self.quiet_since.get_or_insert((self.now, self.framer.tally().read));
+        // A scanner that lost its power is soon back at the rate at which it streamed. Its greeting is not missed there.
+        let may_boot = self.streamed_at == Some(self.baud)
+            && self.framer.tally().read == read
+            && self.now < since + POWER_ON;
+        if let Some(baud) = self.next_rate().filter(|_| !may_boot) {
             self.baud = baud;
             self.change_baud = true;
         }
@@ -285,6 +289,7 @@ impl Session {
             _ if self.settings.listen_only => {}
             Some(Health::Error(_)) if !self.was_reset => {
                 self.was_reset = true;
+                self.streamed_at = None;
                 self.outgoing.push(&Request::RESET);
                 self.phase = Phase::Booting { until: self.now + BOOT };
             }
@@ -304,12 +309,20 @@ impl Session {
         match self.phase {
             Phase::Paused { .. } | Phase::Listening { .. } => {}
             // It is asked anyway; and what another rate makes of a stream may be text, again and again.
-            Phase::Draining { .. } | Phase::Asking { ask: Ask::Info, .. } => {}
+            Phase::Draining { .. } | Phase::Asking { ask: Ask::Info, .. } => {
+                let is_behind_hush =
+                    self.reads.hush_ended().is_some_and(|ended| self.now < ended + GREETING_TIME);
+                if is_behind_hush && self.streamed_at.take_if(|baud| *baud == self.baud).is_some() {
+                    self.restarts += 1;
+                }
+            }
             Phase::Booting { .. } => self.phase = Phase::Booting { until: self.now + SETTLE },
             // What is left of a packet may be text too. One that boots sends nothing for a while before it greets.
             Phase::Hearing { silent_at, .. } if silent_at.abs_diff(self.now + SILENCE) < HUSHED => {}
             _ => {
                 self.resyncs += u64::from(matches!(self.phase, Phase::Hearing { .. }));
+                self.restarts += 1;
+                self.streamed_at = None;
                 self.begin(State::Starting);
                 self.outgoing = Outgoing::default();
                 self.phase = Phase::Booting { until: self.now + SETTLE };
@@ -388,6 +401,10 @@ const FAR: Nanos = 500 * MILLIS;
 const BOOT: Nanos = 1_500 * MILLIS;
 /// For so long, and longer, it sends nothing before its greeting.
 const HUSHED: Nanos = 200 * MILLIS;
+/// Time from power-on to the greeting, and some.
+const POWER_ON: Nanos = 3_000 * MILLIS;
+/// A greeting of 64 bytes takes 6 ms at the lowest rate, and an adapter that collects bytes 16 more, twice.
+const GREETING_TIME: Nanos = 50 * MILLIS;
 /// It answers 4 ms after its greeting.
 const SETTLE: Nanos = 10 * MILLIS;
 /// An unwell scanner is asked again after so long.

@@ -150,6 +150,7 @@ impl line::Session for Session {
             lost,
             damaged: self.damaged.0,
             resyncs: self.resyncs,
+            restarts: self.restarts,
             began_with_a_cut: self.cut,
             rejected_checksum: tally.rejected_checksum,
         }

@@ -67,6 +67,7 @@ impl Session {
             Phase::Asking { ask: Ask::Scan(_), .. } | Phase::Listening { .. } | Phase::Hearing { .. } => {
                 self.end_stream();
                 self.hear();
+                self.await_turn();
                 if let Phase::Hearing { turned_at, silent_at, .. } = &mut self.phase {
                     (*turned_at, *silent_at) = (self.now + SPIN_UP, self.now + SPIN_UP);
                 }
@@ -193,8 +194,10 @@ impl Session {
             _ => {
                 self.trouble = None;
                 self.phase = Phase::Hearing { turned_at: self.now, has_turned: false, silent_at };
+                self.await_turn();
             }
         }
+        self.streamed_at = Some(self.baud);
         self.damaged.1 = discarded;
     }
 
@@ -319,6 +322,7 @@ impl Session {
         if let Phase::Hearing { turned_at, has_turned, .. } = &mut self.phase {
             (*turned_at, *has_turned) = (self.now, true);
         }
+        self.await_turn();
         self.dated(closed)
     }
 

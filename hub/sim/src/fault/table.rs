@@ -75,7 +75,7 @@ faults! {
     unplug_every, 0.0 to 86400.0, 0.0, "as silence_every";
     power_at, 0.0 to 86400.0, 0.0, "time of the first power cycle, in seconds; 0: within power_every";
     power_every, 0.0 to 86400.0, 0.0, "mean seconds to the next; 0: once";
-    brownout_at, 0.0 to 86400.0, 0.0, "of an RPLIDAR: time of the first restart by itself, as power_at";
+    brownout_at, 0.0 to 86400.0, 0.0, "time of the first brown-out, which restarts the sensor, as power_at";
     brownout_every, 0.0 to 86400.0, 0.0, "as power_every";
     hold, 0.0 to 86400.0, 0.0, "of an RPLIDAR: seconds for which something holds its head";
     hold_at, 0.0 to 86400.0, 0.0, "as silence_at";

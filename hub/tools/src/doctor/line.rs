@@ -96,10 +96,12 @@ pub(crate) fn examine(
     tell(Finding::ok("access", format!("can be opened, is a serial line{}", whose(path))));
     // Opened, most adapters hand over at once.
     tell(latency(path, latency_ms(path)));
-    tell(rate(subject, &port, first));
-    let answered = ask(subject, &port, first, stop, tell)?;
-    // Where nobody answered, what came may have come at another rate.
-    let now = if answered { port.line_errors() } else { 0 };
+    let answer = ask(subject, &port, first, stop)?;
+    // Without an answer, bytes may have arrived at another rate.
+    let now = if answer.is_ok() { port.line_errors() } else { 0 };
+    let found = answer.as_ref().ok().and_then(|answer| answer.0);
+    tell(rate(subject, &port, first, found));
+    report(answer).into_iter().for_each(&mut *tell);
     tell(line_errors(port.counts(), now));
     Ok(())
 }
@@ -121,7 +123,8 @@ fn server(
     match probe::open(&subject.source, stop) {
         Ok((port, first)) => {
             tell(Finding::ok("access", "connected; its rate was set there, by hand"));
-            ask(subject, &port, first, stop, tell).map(drop)
+            report(ask(subject, &port, first, stop)?).into_iter().for_each(tell);
+            Ok(())
         }
         Err(failure) if failure.kind == Kind::Interrupted => Err(failure),
         Err(failure) => {
@@ -131,26 +134,23 @@ fn server(
     }
 }
 
-/// Examines the sensor at `port`, which is open at `first`; whether one answered.
-fn ask(
-    subject: &Subject,
-    port: &Port,
-    first: Baud,
-    stop: &AtomicBool,
-    tell: &mut dyn FnMut(Finding),
-) -> Result<bool, Failure> {
+/// What a sensor that answered is: the rate at which a rotating scanner was found, and the findings. Otherwise the reason
+/// why none answered.
+type Examined = Result<(Option<u32>, Vec<Finding>), Finding>;
+
+/// Examines the sensor at `port`, which is open at `first`.
+fn ask(subject: &Subject, port: &Port, first: Baud, stop: &AtomicBool) -> Result<Examined, Failure> {
     let (source, link) = (&subject.source, subject.link.as_ref());
-    let findings = match probe::find(port, first, source, link.map(config::Link::family), stop, |_| {}) {
-        Ok(Answer::Asked(report)) => sensor::examine(&source.name(), &report, link),
-        Ok(Answer::Heard(heard)) => turning::examine(&heard, link),
-        Err(failure) if failure.kind == Kind::Interrupted => return Err(failure),
-        Err(failure) => {
-            tell(Finding::failed("sensor", failure.message, failure.hint));
-            return Ok(false);
-        }
-    };
-    findings.into_iter().for_each(tell);
-    Ok(true)
+    match probe::find(port, first, source, link.map(config::Link::family), stop, |_| {}) {
+        Ok(Answer::Asked(report)) => Ok(Ok((None, sensor::examine(&source.name(), &report, link)))),
+        Ok(Answer::Heard(heard)) => Ok(Ok((Some(heard.rate), turning::examine(&heard, link)))),
+        Err(failure) if failure.kind == Kind::Interrupted => Err(failure),
+        Err(failure) => Ok(Err(Finding::failed("sensor", failure.message, failure.hint))),
+    }
+}
+
+fn report(examined: Examined) -> Vec<Finding> {
+    examined.map_or_else(|finding| vec![finding], |(_, findings)| findings)
 }
 
 /// The hub has it; whoever has it too takes bytes away from it. The service manager keeps it for the next hub.
@@ -259,10 +259,11 @@ fn latency(path: &Path, ms: Option<u8>) -> Finding {
     )
 }
 
-/// Whether it can have the rate to stream at.
-fn rate(subject: &Subject, port: &Port, first: Baud) -> Finding {
+/// Checks whether the port can have the rate to stream at: that of the rotating scanner that was `found`, else the link's.
+fn rate(subject: &Subject, port: &Port, first: Baud, found: Option<u32>) -> Finding {
     const NAME: &str = "rate";
-    let wanted = subject.link.as_ref().map_or(Baud::B500000.rate(), config::Link::rate);
+    let link_rate = subject.link.as_ref().map_or(Baud::B500000.rate(), config::Link::rate);
+    let wanted = found.unwrap_or(link_rate);
     let outcome = port.set_baud(wanted);
     let given = port.baud().filter(|&given| given != wanted);
     // The inquiry begins at the rate at which it was opened.
@@ -271,7 +272,8 @@ fn rate(subject: &Subject, port: &Port, first: Baud) -> Finding {
         (Ok(()), _) => {
             let near =
                 given.map_or(String::new(), |given| format!(": the driver sets {given} Bd, close enough"));
-            Finding::ok(NAME, format!("{wanted} Bd is possible{near}"))
+            let state = if found.is_some() { "in use" } else { "possible" };
+            Finding::ok(NAME, format!("{wanted} Bd is {state}{near}"))
         }
         (Err(error), Some(link)) if link.scanner != config::Scanner::Lms => Finding::failed(
             NAME,

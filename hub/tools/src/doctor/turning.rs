@@ -6,25 +6,38 @@ use line::family::Condition;
 use scanner::Introduction;
 
 use super::finding::Finding;
-use crate::listen::Overheard;
+use crate::listen::{LINE_REMEDY, Overheard};
 
 /// What follows from what was `heard`.
 pub(crate) fn examine(heard: &Overheard, link: Option<&Link>) -> Vec<Finding> {
     let text = format!("{heard}, family {}", heard.family.name());
-    match &heard.said {
-        Some(said) => {
-            let sensor = Finding::ok("sensor", format!("{text}, {}", said.identity));
-            vec![sensor, settings(heard, link), well(said)]
-        }
-        None => vec![Finding::ok("sensor", text), settings(heard, link), health(heard), loss(heard)],
+    let mut findings = vec![match &heard.said {
+        Some(said) => Finding::ok("sensor", format!("{text}, {}", said.identity)),
+        None => Finding::ok("sensor", text),
+    }];
+    findings.push(loss(heard));
+    let is_reported = heard.said.is_some();
+    if heard.is_unreliable() && !is_reported {
+        let why = "not judged: the line damages most bytes";
+        findings.extend(["settings", "health"].map(|name| Finding::skipped(name, why)));
+        return findings;
     }
+    findings.extend([
+        settings(heard, link),
+        heard.said.as_ref().map_or_else(|| health(heard), |said| well(said, heard)),
+    ]);
+    findings
 }
 
-/// What it says of its health.
-fn well(said: &Introduction) -> Finding {
+/// Returns the health that it reports, and whether it measures.
+fn well(said: &Introduction, heard: &Overheard) -> Finding {
     const NAME: &str = "health";
     let remedy = "see whether its head turns freely; power it off and on again; if it stays so, a repair";
     match said.condition {
+        Condition::Good | Condition::Warning | Condition::Unknown if heard.packets == 0 => {
+            let trouble = heard.trouble.as_deref().unwrap_or("it does not measure");
+            Finding::failed(NAME, trouble, remedy)
+        }
         Condition::Unknown => Finding::warning(NAME, "it does not say how it is", remedy),
         Condition::Good => Finding::ok(NAME, said.health.clone()),
         Condition::Warning => Finding::warning(NAME, said.health.clone(), remedy),
@@ -84,10 +97,15 @@ fn health(heard: &Overheard) -> Finding {
 fn loss(heard: &Overheard) -> Finding {
     const NAME: &str = "line-loss";
     let (damaged, lost) = (100.0 * heard.damaged(), heard.account.lost);
+    if heard.packets == 0 {
+        return Finding::skipped(NAME, "it does not measure");
+    }
     let text = format!("{damaged:.1} % of the bytes damaged, {lost} of {} packets lost", heard.account.due);
-    if lost * WELL > heard.account.due || heard.damaged() * WELL as f64 > 1.0 {
-        let remedy = "a shorter or shielded cable, ground beside the signal, 3.3 V levels; another adapter";
-        return Finding::warning(NAME, text, remedy);
+    if heard.is_unreliable() {
+        return Finding::failed(NAME, text, LINE_REMEDY);
+    }
+    if lost * WELL > heard.account.due || heard.line_trouble().is_some() {
+        return Finding::warning(NAME, text, LINE_REMEDY);
     }
     Finding::ok(NAME, text)
 }
@@ -132,14 +150,23 @@ mod tests {
             let findings = examine(heard, None);
             findings.iter().map(|finding| (finding.name, finding.state)).collect::<Vec<_>>()
         };
-        let names = ["sensor", "settings", "health", "line-loss"];
+        let names = ["sensor", "line-loss", "settings", "health"];
         assert_eq!(said(&heard()), names.map(|name| (name, State::Ok)));
         let still = Overheard { turns_per_second: 0.0, ..heard() };
-        assert_eq!(said(&still)[2], ("health", State::Failed));
+        assert_eq!(said(&still)[3], ("health", State::Failed));
         let lossy = Overheard { account: Account { lost: 3, ..heard().account }, ..heard() };
-        assert_eq!(said(&lossy)[3], ("line-loss", State::Warning));
+        assert_eq!(said(&lossy)[1], ("line-loss", State::Warning));
         let damaged = Overheard { account: Account { damaged: 100, ..heard().account }, ..heard() };
-        assert_eq!(said(&damaged)[3], ("line-loss", State::Warning));
+        assert_eq!(said(&damaged)[1], ("line-loss", State::Warning));
+        // Where most bytes are damaged, a head that seems to stand still may turn.
+        let account = Account { damaged: 40_000, ..heard().account };
+        let unreliable = [
+            ("sensor", State::Ok),
+            ("line-loss", State::Failed),
+            ("settings", State::Skipped),
+            ("health", State::Skipped),
+        ];
+        assert_eq!(said(&Overheard { account, ..still }), unreliable);
     }
 
     #[test]

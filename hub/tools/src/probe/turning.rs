@@ -21,7 +21,7 @@ pub struct Turning {
     identity: Option<String>,
     /// How it says that it is, in words.
     health: Option<String>,
-    /// Of one that speaks unasked.
+    /// Packets of measured data, within about a second.
     packets: Option<u64>,
     /// Share of the bytes that were in no packet.
     damaged: Option<f64>,
@@ -34,6 +34,7 @@ impl Turning {
     /// What was `heard` at `port`.
     pub(crate) fn new(port: String, heard: &Overheard) -> Turning {
         let known = |value: f64| (value > 0.0).then(|| (value * 100.0).round() / 100.0);
+        let is_heard = heard.packets > 0 || heard.said.is_none();
         Turning {
             class: "probe",
             port,
@@ -42,11 +43,12 @@ impl Turning {
             baud: heard.rate,
             identity: heard.said.as_ref().map(|said| said.identity.clone()),
             health: heard.said.as_ref().map(|said| said.health.clone()).filter(|words| !words.is_empty()),
-            packets: heard.said.is_none().then_some(heard.packets),
-            damaged: heard.said.is_none().then(|| heard.damaged()),
+            packets: is_heard.then_some(heard.packets),
+            damaged: is_heard.then(|| heard.damaged()),
             points_per_second: known(heard.points_per_second),
             turns_per_second: known(heard.turns_per_second),
-            trouble: heard.trouble.clone(),
+            // Where the line damages bytes, what else is wrong may follow from it.
+            trouble: heard.line_trouble().or_else(|| heard.trouble.clone()),
         }
     }
 }

@@ -239,9 +239,6 @@ impl Scanner for AtLine {
 
     fn suffer(&mut self, ailment: Ailment, now: Nanos) {
         match ailment {
-            Ailment::BrownOut => {
-                self.unit.brown_out(now);
-            }
             Ailment::Held { span } => self.unit.hold(now, span),
             Ailment::Unwell { status, is_stubborn } => {
                 self.unit.set_health(now, (status, 0x8001), is_stubborn);
