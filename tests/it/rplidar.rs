@@ -96,7 +96,7 @@ fn its_motor_rests_while_nobody_follows() {
 }
 
 #[test]
-fn probe_asks_what_it_is_and_nothing_else() {
+fn probe_asks_what_it_is_and_listens_to_its_line() {
     let env = TestEnv::new();
     for (model, rate) in [("a1", 115_200), ("s2", 1_000_000)] {
         let simulator = simulator(&env, model, &[]);
@@ -111,9 +111,57 @@ fn probe_asks_what_it_is_and_nothing_else() {
         assert!(text(found, "identity").contains("firmware"), "{found}");
         assert_eq!(simulator.end(TERM).code, Some(0));
         assert_eq!(env.simulated("front").1, 0);
-        let asked = env.truth("front");
-        assert!(asked.len() == 2 && asked.iter().all(|sent| sent.is_reply), "more than what it is, and how");
+        assert!(number(found, "packets") > 20 && found["damaged"].as_f64() == Some(0.0), "{found}");
+        assert!(found["trouble"].is_null(), "{found}");
+        let sent = env.truth("front");
+        assert!(sent[..2].iter().all(|sent| sent.is_reply), "first what it is, and how");
     }
+}
+
+#[test]
+fn a_line_that_damages_most_bytes_is_told_before_anything_else() {
+    let env = TestEnv::new();
+    let port = env.word("front");
+    let _simulator = simulator(&env, "s2", &["--fault=loss=0.01,burst=1"]);
+    let probed = env.run(&["probe", &port, "--json"]);
+    let [found] = &probed.lines()[..] else { panic!("{probed}") };
+    assert!(found["damaged"].as_f64().is_some_and(|share| share > 0.4), "{found}");
+    assert!(text(found, "trouble").contains("of the bytes are damaged on the line"), "{found}");
+
+    let outcome = env.run(&["doctor", &port, "--json", "--no-system-config"]);
+    assert_eq!(outcome.code, Some(5), "{outcome}");
+    let of = |name: &str| {
+        let found = outcome.of_class("check");
+        let found = found.into_iter().find(|line| line["name"] == name && !line["port"].is_null());
+        found.unwrap_or_else(|| panic!("no {name}: {outcome}"))
+    };
+    assert!(text(&of("rate"), "finding").contains("1000000 Bd is in use"), "{outcome}");
+    assert!(text(&of("line-loss"), "finding").contains("% of the bytes damaged"), "{outcome}");
+    assert_eq!(
+        (text(&of("line-loss"), "state"), text(&of("health"), "state")),
+        ("failed", "ok"),
+        "{outcome}"
+    );
+
+    let _hub = hub(&env, &["model=s2"]);
+    let mut status = env.echo(&["front/status"]);
+    let is_told = |line: &Value| text(line, "last_error").contains("% of the bytes are damaged on the line");
+    status.await_line("what the line does", is_told);
+    let statuses = status.end(INT).of_class("status");
+    assert!(!statuses.iter().any(|line| text(line, "last_error").contains("head")), "{statuses:#?}");
+}
+
+#[test]
+fn a_scanner_that_restarts_is_counted_and_told() {
+    let env = TestEnv::new();
+    let _simulator = simulator(&env, "a1", &["--fault=brownout_at=4,brownout_every=3"]);
+    let hub = hub(&env, &["model=a1"]);
+    let restarts = |info: &Value| number(&info["counters"], "scanner_restarts");
+    let info = env.await_info("front", |info| text(info, "last_error").contains("times in 10 s"));
+    assert!(restarts(&info) >= 2, "{info}");
+    assert!(text(&info, "last_error").ends_with("is its supply strong enough?"), "{info}");
+    let log = hub.end(TERM).errors;
+    assert!(log.contains("the scanner restarted"), "{log}");
 }
 
 #[test]

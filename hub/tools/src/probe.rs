@@ -1,5 +1,5 @@
 //! `scanhub probe`: what is at the other end of a port, of whatever family. Opens it, listens for scanners that speak unasked,
-//! then asks the sensor, and leaves the sensor as it was.
+//! then asks the sensor, and changes no setting.
 
 mod description;
 mod suggestion;

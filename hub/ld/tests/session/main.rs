@@ -245,7 +245,7 @@ fn a_host_that_stops_dates_what_waited_for_it() {
             bench.run(20 * SECOND);
             let worst = bench.judge();
             assert!(worst < 5 * MILLIS, "{model:?} {drift}: {worst}");
-            assert_eq!(bench.session.account().lost, 0);
+            assert_eq!((bench.session.account().lost, bench.session.account().restarts), (0, 0));
             bench.intact_packets_came_once_in_order();
         }
     }
@@ -266,7 +266,26 @@ fn what_a_full_buffer_drops_is_missing_and_told() {
     assert!(counts.incomplete > before.incomplete && counts.missed + counts.short >= 1, "{counts:?}");
     let lost = bench.session.account().lost;
     assert!((92..=95).contains(&lost), "{lost}");
-    assert_eq!(bench.session.state(), State::Streaming);
+    assert_eq!((bench.session.state(), bench.session.account().restarts), (State::Streaming, 0));
+}
+
+#[test]
+fn a_host_that_stops_for_long_is_not_a_restart_of_the_scanner() {
+    for stall in [2, 9, 29, 30, 31, 64] {
+        let head = Head::new(Model::Ld19, 450.0, 3, Damage::default());
+        let mut bench = Bench::new(of(Model::Ld19), head);
+        bench.run(3 * SECOND);
+        // The tty keeps what arrives first, and the rest finds no room.
+        bench.now += stall * SECOND;
+        bench.head.cut(bench.now);
+        bench.read(true);
+        bench.run(bench.now + 3 * SECOND);
+        assert_eq!(
+            (bench.session.state(), bench.session.account().restarts),
+            (State::Streaming, 0),
+            "{stall}"
+        );
+    }
 }
 
 #[test]
@@ -294,6 +313,7 @@ fn a_second_without_a_packet_begins_again() {
     bench.run(6 * SECOND);
     assert_eq!((bench.session.state(), bench.session.trouble()), (State::Streaming, None));
     assert_eq!((bench.session.account().resyncs, bench.session.account().lost), (1, 0));
+    assert_eq!(bench.session.account().restarts, 0, "its clock went on");
     bench.judge();
 }
 
@@ -335,6 +355,7 @@ fn a_pause_is_quiet_and_ends() {
     bench.run(6 * SECOND);
     assert_eq!(bench.session.state(), State::Streaming);
     assert!(bench.log.turns.len() > turns + 5);
+    assert_eq!(bench.session.account().restarts, 0);
     bench.judge();
 }
 

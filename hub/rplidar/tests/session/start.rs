@@ -63,6 +63,7 @@ fn a_stream_that_is_text_at_another_rate_is_no_greeting_again_and_again() {
         let mut bench = Bench::new(Settings::default(), head);
         let took = bench.until(3 * SECOND, is_streaming);
         assert!(took < 2 * SECOND, "{took}");
+        assert_eq!(bench.session.account().restarts, 0);
     }
 }
 
@@ -120,6 +121,7 @@ fn a_scanner_that_is_not_well_is_booted_once() {
         let took = bench.until(3 * SECOND, is_streaming);
         assert_eq!((bench.session.trouble(), bench.session.health()), (None, Some(Health::Good)));
         assert_eq!(bench.head.requests.iter().filter(|request| **request == 0x40).count(), 1, "{took}");
+        assert_eq!(bench.session.account().restarts, 0, "the session requested it");
     }
 }
 
@@ -284,6 +286,31 @@ fn a_second_without_data_begins_again() {
     bench.until(4 * SECOND, is_streaming);
     assert_eq!((bench.session.trouble(), bench.session.account().resyncs), (None, 1));
     assert_eq!(bench.session.account().lost, 0, "silence is no loss on the line");
+    assert_eq!(bench.session.account().restarts, 1);
+}
+
+#[test]
+fn a_scanner_that_starts_with_the_session_has_not_restarted() {
+    for model in [Model::A1, Model::S2] {
+        for settings in [of(model), Settings::default()] {
+            let mut head = Head::new(model, 1);
+            head.boot(0);
+            let mut bench = Bench::new(settings, head);
+            bench.until(4 * SECOND, is_streaming);
+            assert_eq!(bench.session.account().restarts, 0, "{model:?}");
+        }
+    }
+}
+
+#[test]
+fn a_cable_that_is_plugged_in_again_is_not_a_restart() {
+    let mut bench = Bench::new(of(Model::A1), Head::new(Model::A1, 1));
+    bench.run(3 * SECOND);
+    bench.head.is_on = false;
+    bench.run(6 * SECOND);
+    bench.head.is_on = true;
+    bench.until(4 * SECOND, is_streaming);
+    assert_eq!(bench.session.account().restarts, 0);
 }
 
 #[test]
@@ -297,6 +324,7 @@ fn a_greeting_in_the_midst_of_a_stream_begins_again_at_once() {
             assert!((671 * MILLIS..700 * MILLIS).contains(&took), "{model:?} {mode:?}: {took}");
             bench.until(SECOND, is_streaming);
             assert_eq!((bench.session.account().resyncs, bench.session.trouble()), (1, None));
+            assert_eq!(bench.session.account().restarts, 1, "{model:?} {mode:?}");
         }
     }
 }
@@ -313,6 +341,7 @@ fn ranges_that_are_text_are_no_greeting() {
         }
         let account = bench.session.account();
         assert_eq!((account.resyncs, account.damaged), (0, 20 * lost), "{mode:?}");
+        assert_eq!(account.restarts, 0, "{mode:?}");
     }
 }
 

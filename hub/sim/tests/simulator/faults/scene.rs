@@ -76,6 +76,8 @@ impl Scene {
         bench.to_host = Box::new(|_, _| Vec::new());
         bench.run(40 * MILLIS);
         let verdict = self.account(&bench, seed);
+        let has_power = self.faults.power_at + self.faults.power_every == 0.0;
+        assert!(!has_power || bench.session.account().restarts == 0, "{}", self.name(seed));
         let effects = Effects::of(&bench);
         Verdict { effects, resyncs: bench.session.account().resyncs, back_ms: back / MILLIS, ..verdict }
     }

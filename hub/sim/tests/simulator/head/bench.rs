@@ -5,7 +5,7 @@ use ld::packet::LEN;
 use ld::{Heard, Session, Settings};
 use line::grid::Point;
 use line::{MILLIS, Nanos, Output, Session as _};
-use sim::device::Part;
+use sim::device::{Device as _, Part};
 use sim::fault::Faults;
 use sim::layers::Layers;
 use sim::ld::{Head, HeadSettings, Packets};
@@ -135,6 +135,10 @@ impl Bench {
 
     pub(crate) fn cycle_power(&mut self) {
         self.wire.cycle_power(&mut self.head, self.now);
+    }
+
+    pub(crate) fn brown_out(&mut self) {
+        self.head.brown_out(self.now);
     }
 
     /// Every intact packet came once and in order.

@@ -108,7 +108,62 @@ fn a_power_cycle_is_a_silence_and_a_new_beginning() {
     assert_eq!((bench.session.state(), bench.session.account().resyncs), (State::Streaming, 1));
     assert!(bench.turns.len() > 25, "{}", bench.turns.len());
     bench.judge_turns(5 * SECOND, 0.05, 2.0);
-    assert_eq!(bench.session.account().lost, 0);
+    assert_eq!((bench.session.account().lost, bench.session.account().restarts), (0, 1));
+}
+
+#[test]
+fn every_brown_out_is_a_restart() {
+    for model in Model::ALL {
+        let mut bench = Bench::new(HeadSettings::of(model), &still("wall640"), "", 3);
+        bench.run(4 * SECOND);
+        for restarts in 1..=12 {
+            bench.brown_out();
+            // Odd times, so that the clock of 30 s stands elsewhere each time.
+            bench.run(bench.now + 2 * SECOND + restarts * 417 * MILLIS);
+            assert_eq!(bench.session.account().restarts, restarts, "{model:?}");
+            assert_eq!(
+                (bench.session.state(), bench.session.trouble()),
+                (State::Streaming, None),
+                "{model:?}"
+            );
+        }
+        let turns = bench.turns.len();
+        bench.run(bench.now + 2 * SECOND);
+        assert!(bench.turns.len() > turns + 10, "{model:?}");
+    }
+}
+
+#[test]
+fn what_only_looks_like_a_restart_is_none() {
+    for faults in [
+        "",
+        "stall=0.5,stall_at=2,stall_every=2,delay=0.003",
+        "stall=40,stall_at=5",
+        "silence=0.7,silence_at=3,silence_every=3",
+        "silence=2.5,silence_at=3,silence_every=6",
+        "silence=40,silence_at=5",
+        "unplug=2,unplug_at=3,unplug_every=7",
+        "loss=0.004,burst=6,insert=0.001,flip=0.001,flip_bits=2",
+        "flood=2000,flood_every=0.3",
+        "abort=0.1,repeat=0.1",
+    ] {
+        // The clock wraps three times.
+        let mut bench = Bench::new(HeadSettings::of(Model::Ld19), &still("bare"), faults, 11);
+        bench.run(100 * SECOND);
+        assert_eq!(bench.session.account().restarts, 0, "{faults}");
+    }
+}
+
+#[test]
+fn a_line_that_damages_most_bytes_does_not_accuse_the_head() {
+    let mut bench = Bench::new(HeadSettings::of(Model::Ld19), &still("room"), "loss=0.08", 5);
+    bench.run(4 * SECOND);
+    for _ in 0..100 {
+        bench.run(bench.now + 100 * MILLIS);
+        assert_ne!(bench.session.trouble(), Some(ld::Trouble::StandsStill));
+    }
+    let account = bench.session.account();
+    assert!(account.damaged > 2 * account.in_telegrams, "{account:?}");
 }
 
 #[test]

@@ -6,7 +6,9 @@ use lms::command::Request;
 use lms::variant::Baud;
 use lms::{MILLIS, Nanos, Trouble};
 use sim::device::Device as _;
+use sim::fault::Faults;
 use sim::machine::{Habits, Settings, Start};
+use sim::wire::Wire;
 
 use super::bench::{Bench, sensor_with};
 
@@ -42,6 +44,7 @@ fn in_the_middle_of_a_scan() {
                 (1, None),
                 "{boot} {phase}"
             );
+            assert_eq!(bench.session.account().restarts, 1, "{boot} {phase}");
         }
     }
     println!("streaming within {} ms of the banner", slowest / MILLIS);
@@ -82,7 +85,7 @@ fn a_banner_that_is_heard_is_answered_at_once() {
     bench.machine.power_cycle(now);
     bench.run(300 * MILLIS);
     bench.until("asked", 100 * MILLIS, |bench| bench.said.len() > said);
-    assert_eq!(bench.session.account().resyncs, 1);
+    assert_eq!((bench.session.account().resyncs, bench.session.account().restarts), (1, 1));
     bench.until("streaming", 3_000 * MILLIS, |bench| bench.is_streaming());
 
     let settings = Settings { start: Start::PowerOn, ..booting(60_000 * MILLIS) };
@@ -94,7 +97,7 @@ fn a_banner_that_is_heard_is_answered_at_once() {
         "{bench}"
     );
     bench.until("streaming", LIMIT, Bench::is_streaming);
-    assert_eq!(bench.session.trouble(), None);
+    assert_eq!((bench.session.trouble(), bench.session.account().restarts), (None, 0), "first contact");
 }
 
 #[test]
@@ -135,6 +138,43 @@ fn a_pause_outlasts_the_power() {
     assert_eq!((bench.session.state(), bench.said.len()), (State::Paused, said));
     bench.session.control(Control::Resume, bench.now);
     bench.until("streaming", LIMIT, Bench::is_streaming);
+    assert_eq!(bench.session.account().restarts, 1);
+}
+
+#[test]
+fn a_restart_is_counted_once_at_every_rate_and_however_long_it_takes() {
+    for baud in [Baud::B9600, Baud::B38400, Baud::B500000] {
+        for boot in [50, 900, 1_700, 2_500, 4_100, 20_000] {
+            let wanted = lms::Settings { baud, ..super::bench::WANTED };
+            let mut bench = Bench::wanting(wanted, sensor_with(booting(boot * MILLIS)), 0);
+            for restarts in 1..=3 {
+                bench.until("streaming", SEARCHING, Bench::is_streaming);
+                bench.run(2_000 * MILLIS);
+                let now = bench.now;
+                bench.machine.brown_out(now);
+                bench.run((boot + 1_100) * MILLIS);
+                bench.until("streaming", SEARCHING, Bench::is_streaming);
+                assert_eq!(bench.session.account().restarts, restarts, "{baud:?} {boot}: {bench}");
+            }
+        }
+    }
+}
+
+#[test]
+fn a_cable_and_a_user_do_not_restart_a_sensor() {
+    let mut bench = Bench::new(sensor_with(Settings::default()), 0);
+    bench.until("streaming", 3_000 * MILLIS, Bench::is_streaming);
+    bench.wire = Wire::new(&"silence=3,silence_every=6".parse().expect("faults"), 1);
+    bench.run(40_000 * MILLIS);
+    bench.wire = Wire::new(&Faults::default(), 1);
+    bench.until("streaming", SEARCHING, Bench::is_streaming);
+    assert!(bench.session.account().resyncs > 3);
+    for control in [Control::Resync, Control::Pause, Control::Resume] {
+        bench.session.control(control, bench.now);
+        bench.run(3_000 * MILLIS);
+    }
+    bench.until("streaming", SEARCHING, Bench::is_streaming);
+    assert_eq!(bench.session.account().restarts, 0);
 }
 
 #[test]
@@ -152,4 +192,5 @@ fn a_reset_by_somebody_else_is_a_power_cycle() {
     let scans = bench.received.len();
     bench.run(2_000 * MILLIS);
     assert!(bench.is_streaming() && bench.received.len() > scans, "{bench}");
+    assert_eq!(bench.session.account().restarts, 1);
 }

@@ -2,13 +2,13 @@
 
 use line::grid::NO_RETURN;
 use line::{Heard, MILLIS, Nanos, Output, Session as _, State, line_time};
-use rplidar::{Mode, Model as Known, Session, Settings};
+use rplidar::{Mode, Model as Known, Session, Settings, Trouble};
 use sim::device::Device as _;
 use sim::layers::Layers;
 use sim::rplidar::{Model, UnitSettings, UnitStart};
 use sim::world::World;
 
-use super::bench::{Bench, SECOND};
+use super::bench::{Bench, SECOND, Sent};
 
 /// A turn as it was handed out.
 struct Told {
@@ -164,6 +164,58 @@ fn one_that_somebody_left_streaming_or_unwell_streams_in_three_seconds() {
             assert!(begun(&talk), "{model:?} {start:?} {health}: {:?}", talk.session.trouble());
         }
     }
+}
+
+#[test]
+fn every_brown_out_is_a_restart_and_so_is_a_power_cycle() {
+    for model in Model::ALL {
+        let settings = Settings { model: Known::named(model.name()), ..Settings::default() };
+        let mut talk = Talk::new(settings, UnitSettings::of(model), "brownout_at=4,brownout_every=5");
+        talk.run(30 * SECOND);
+        let is_banner = |sent: &&Sent| sent.bytes.starts_with(b"RP LIDAR");
+        let banners = talk.bench.sent.iter().filter(is_banner).count() as u64;
+        assert!(banners >= 4, "{model:?}: {banners}");
+        assert_eq!(talk.session.account().restarts, banners, "{model:?}");
+
+        // A power cycle takes longer than the silence after which the session searches.
+        let mut talk = Talk::new(settings, UnitSettings::of(model), "");
+        for restarts in 1..=4 {
+            talk.run(talk.bench.now + 7 * SECOND + restarts * 130 * MILLIS);
+            assert_eq!(talk.session.state(), State::Streaming, "{model:?}");
+            talk.bench.cycle_power();
+            talk.run(talk.bench.now + 3 * SECOND);
+            assert_eq!(talk.session.account().restarts, restarts, "{model:?}");
+        }
+    }
+}
+
+#[test]
+fn what_only_looks_like_a_restart_is_none() {
+    for model in Model::ALL {
+        for faults in [
+            "silence=0.5,silence_every=3",
+            "silence=3,silence_every=8",
+            "stall=1.5,stall_every=4",
+            "loss=0.002",
+        ] {
+            let settings = Settings { model: Known::named(model.name()), ..Settings::default() };
+            let mut talk = Talk::new(settings, UnitSettings::of(model), faults);
+            talk.run(30 * SECOND);
+            assert_eq!(talk.session.account().restarts, 0, "{model:?} {faults}");
+        }
+    }
+}
+
+#[test]
+fn a_line_that_damages_most_bytes_does_not_accuse_the_head() {
+    let mut talk = Talk::new(Settings::default(), UnitSettings::of(Model::S2), "loss=0.02");
+    talk.run(6 * SECOND);
+    for _ in 0..100 {
+        talk.run(talk.bench.now + 100 * MILLIS);
+        assert_ne!(talk.session.trouble(), Some(Trouble::StandsStill));
+    }
+    let account = talk.session.account();
+    assert!(account.damaged > 2 * account.in_telegrams, "{account:?}");
 }
 
 #[test]
