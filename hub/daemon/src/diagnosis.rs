@@ -176,7 +176,7 @@ impl<'a> Diagnosis<'a> {
                 self.link.most_rate()
             );
         }
-        // These come before everything that was concluded from what arrived.
+        // Damage and restarts explain most other findings, so they come first.
         if let Some(percent) = self.damaged_percent {
             return format!(
                 "{percent} % of the bytes are damaged on the line: check cable, ground and adapter; `scanhub doctor {}` says more",

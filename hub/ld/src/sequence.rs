@@ -101,7 +101,7 @@ impl Sequence {
         if self.lessons > 0 { 1e9 / self.points_per_second } else { 0.0 }
     }
 
-    /// Returns the nanoseconds from one packet to the next as they were learned last, also by an earlier stream; 0 before.
+    /// Returns the last known time from one packet to the next, in nanoseconds. It outlives its stream; 0 is unknown.
     pub(crate) fn packet_ns(&self) -> f64 {
         if self.points_per_second > 0.0 {
             POINTS as f64 * 1e9 / f64::from(self.points_per_second)

@@ -202,7 +202,7 @@ impl Session {
                 self.listen(State::Silent);
             }
             Phase::Hearing { turned_at, .. } if self.now >= turned_at + STILL => {
-                // Where most bytes are damaged, a missing revolution says nothing about the head.
+                // A revolution may also be missing because most bytes are damaged.
                 let (damaged, in_packets) = self.turned_with;
                 let is_damaged = self.damaged.0 - damaged > self.framer.tally().in_packets - in_packets;
                 self.trouble = (!is_damaged).then_some(Trouble::StandsStill);

@@ -9,8 +9,6 @@ use crate::{Arrivals, MILLIS, Nanos, Output};
 pub struct Reads {
     arrivals: Arrivals,
     last_byte: Nanos,
-    /// Time of the first byte after the last [`HUSH`].
-    hush_ended: Option<Nanos>,
     /// Bytes that the next read has room for.
     room: usize,
     /// Until when nothing has to be read.
@@ -27,7 +25,6 @@ impl Reads {
         Reads {
             arrivals: Arrivals::default(),
             last_byte: now,
-            hush_ended: None,
             room: 0,
             rest_until: 0,
             last_packet: 0,
@@ -47,12 +44,7 @@ impl Reads {
         self.arrivals.note(now, len);
         let is_all = (1..self.room.min(TTY)).contains(&len);
         self.rest_until = if is_streaming && is_all { now + REST } else { 0 };
-        if len > 0 {
-            if now >= self.last_byte + HUSH {
-                self.hush_ended = Some(now);
-            }
-            self.last_byte = now;
-        }
+        self.last_byte = if len > 0 { now } else { self.last_byte };
     }
 
     /// The line is to be looked at again at once.
@@ -68,11 +60,6 @@ impl Reads {
     /// When the last byte came, or the session began.
     pub fn last_byte(&self) -> Nanos {
         self.last_byte
-    }
-
-    /// Returns the time of the first byte after the last silence of at least 200 ms; `None` if there was none.
-    pub fn hush_ended(&self) -> Option<Nanos> {
-        self.hush_ended
     }
 
     /// The packet that comes next is suspect for these `reasons`, bits of [`crate::suspect`].
@@ -127,5 +114,3 @@ impl Reads {
 
 /// A stream is read so late after bytes of it were: some packets at once, and a tenth of what a tty keeps.
 const REST: Nanos = 5 * MILLIS;
-/// A scanner that restarts sends nothing for at least this long.
-const HUSH: Nanos = 200 * MILLIS;

@@ -31,8 +31,11 @@ pub(crate) enum Found {
     Stream(Span),
     /// Packets without anything between them.
     Packets(Kind, Span),
-    /// The text that a scanner sends when it booted.
-    Greeting,
+    /// The text that a scanner sends when it booted. Other bytes may be text too, but hardly ever contain the word `LIDAR`.
+    Greeting {
+        /// Whether the text contains that word.
+        is_named: bool,
+    },
 }
 
 /// Bytes in the framer's buffer, until the next ones come.
@@ -61,8 +64,10 @@ pub(crate) struct Framer {
     is_released: bool,
     /// Bytes discarded since the last packet.
     skipped: u32,
-    /// Printable ones among them, in a row.
+    /// Printable ones among them, in a row, the last of them, and whether they contain [`NAME`].
     text: usize,
+    last_text: [u8; NAME.len()],
+    is_named: bool,
     /// There were packets that look alike, and it was not said what they are.
     is_alike: bool,
 }
@@ -100,6 +105,8 @@ impl Framer {
             is_released: false,
             skipped: 0,
             text: 0,
+            last_text: [0; NAME.len()],
+            is_named: false,
             is_alike: false,
         }
     }
@@ -155,7 +162,7 @@ impl Framer {
                 Step::Wait => return None,
                 Step::Discard => {
                     if self.discard() {
-                        return Some(Found::Greeting);
+                        return Some(Found::Greeting { is_named: self.is_named });
                     }
                 }
             }
@@ -198,6 +205,11 @@ impl Framer {
     /// Whether there were packets of which it was not said what they are.
     pub(crate) fn is_alike(&self) -> bool {
         self.is_alike
+    }
+
+    /// Returns the number of bytes that were discarded since the last packet.
+    pub(crate) fn skipped(&self) -> u32 {
+        self.skipped
     }
 
     pub(crate) fn tally(&self) -> &Tally {
@@ -299,12 +311,16 @@ impl Framer {
 
     /// Gives up the first open byte, and whether a greeting ends with it.
     fn discard(&mut self) -> bool {
-        let is_text =
-            self.buffer.open().first().is_some_and(|byte| matches!(byte, b' '..=b'~' | b'\r' | b'\n'));
+        let byte = self.buffer.open().first().copied().unwrap_or_default();
+        let is_text = matches!(byte, b' '..=b'~' | b'\r' | b'\n');
+        self.last_text.rotate_left(1);
+        self.last_text[NAME.len() - 1] = byte;
         self.buffer.discard(1);
         self.is_locked = false;
         self.skipped = self.skipped.saturating_add(1);
+        self.is_named &= self.text > 0;
         self.text = if is_text { self.text + 1 } else { 0 };
+        self.is_named |= self.last_text == *NAME;
         self.text == GREETING
     }
 }
@@ -335,3 +351,5 @@ const RUN: usize = 6;
 const NEAR: f32 = 30.0;
 /// A scanner that booted sends 64 bytes of text, of which some may be missing.
 const GREETING: usize = 40;
+/// Part of that text, near its beginning.
+const NAME: &[u8; 5] = b"LIDAR";

@@ -137,8 +137,8 @@ impl Head {
         point as f64 / f64::from(self.settings.model.points_per_second())
     }
 
-    /// It starts at `now`: packets come after `boot_ns`, from a head that gets up to speed with a time constant of
-    /// `spin_up_s` seconds. Returns whether a packet was broken off.
+    /// Restarts the scanner at `now`. It sends packets after `boot_ns`, from a head that gets up to speed with a time constant
+    /// of `spin_up_s` seconds. Returns whether a packet was broken off.
     fn restart(&mut self, now: Nanos, boot_ns: Nanos, spin_up_s: f64) -> bool {
         let broken = self.outlet.break_off(now);
         self.power_ns = now;
@@ -219,7 +219,7 @@ impl Device for Head {
         self.restart(now, self.settings.boot_ns, 0.0)
     }
 
-    /// Its clock begins again, and its motor has to get up to speed.
+    /// Restarts the scanner: the clock begins again, and the motor has to get up to speed.
     fn brown_out(&mut self, now: Nanos) -> bool {
         self.restart(now, RESTART_NS, SPIN_UP_S)
     }
@@ -273,9 +273,9 @@ pub fn recorded(path: &Path, sensor: Option<&str>) -> Result<Vec<[u8; LEN]>, Fai
     Ok(packets)
 }
 
-/// From a dip of the voltage to the first packet, and the time constant with which the motor gets up to speed again. Invented:
-/// what a real one does is not published.
+/// Time from a dip of the voltage to the first packet. Invented: it is not published.
 const RESTART_NS: Nanos = 300 * MILLIS;
+/// Time constant with which the motor gets up to speed after it. Invented, too.
 const SPIN_UP_S: f64 = 0.2;
 
 /// Between which ranges a model measures, by its data sheet.

@@ -333,7 +333,7 @@ impl Device for Unit {
         broken
     }
 
-    /// It restarts while its motor continues, and its banner comes where measurements came.
+    /// Restarts the scanner while its motor continues. The banner then stands in the middle of a stream.
     fn brown_out(&mut self, now: Nanos) -> bool {
         self.restart(now, RESTART_NS)
     }

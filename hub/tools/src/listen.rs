@@ -1,6 +1,7 @@
-//! Finds out of what family a rotating scanner is, and how well its line carries what it measures, for a person at a
-//! terminal. A scanner that speaks unasked is only listened to. The others are asked what and how they are, then they measure
-//! for a second, and are stopped as a hub stops them. The list of families says which is which.
+//! Finds the family of a rotating scanner, and the share of bytes that its line damages, for a person at a terminal.
+//!
+//! The module sends nothing to a scanner that streams by itself. From other scanners it requests identity and health, lets
+//! them measure for a second, and stops them as a hub does.
 
 use std::fmt;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -49,7 +50,7 @@ impl Overheard {
 }
 
 impl Overheard {
-    /// Returns whether the line damages so many bytes that the others say nothing about the scanner.
+    /// Returns whether the line damages most bytes, which makes every conclusion from the others unreliable.
     pub(crate) fn is_unreliable(&self) -> bool {
         self.damaged() > MOST_DAMAGED
     }
@@ -94,7 +95,7 @@ pub(crate) fn listen(
     port.try_baud(session.rate()).map_err(|error| gone(port, &error))?;
     let mut heard = Turns::default();
     let (first_rate, mut rate, mut rates) = (session.rate(), 0, 0);
-    // A scanner that is asked may miss it, or be late with an answer, or the line damages the answer.
+    // A scanner may miss a request or respond late, and the line may damage the response.
     let mut rounds = if features.speaks_unasked { 1 } else { 3 };
     loop {
         if !fixed_rate && rate != session.rate() {
@@ -246,7 +247,7 @@ impl Turns {
         }
     }
 
-    /// Stops a scanner that was told to measure, and its motor, as a hub does at its end.
+    /// Stops a scanner that measures on request, and its motor, as a hub does at its end.
     fn end(&self, port: &Port, session: &mut Session) -> std::io::Result<()> {
         let measures = self.said.as_ref().is_some_and(|said| said.condition != Condition::Error);
         if !measures || !session.end(clock::now()) {
@@ -271,7 +272,7 @@ pub(crate) const LINE_REMEDY: &str =
     "a shorter or shielded cable, ground beside the signal, 3.3 V levels; another adapter";
 /// Share of damaged bytes up to which a line is well.
 const WELL: f64 = 0.01;
-/// Share of damaged bytes from which on the others say nothing about the scanner.
+/// Share of damaged bytes that makes conclusions from the others unreliable.
 const MOST_DAMAGED: f64 = 0.5;
 
 /// Other bytes pass a checksum of 8 bits now and then: not so often.
@@ -280,7 +281,7 @@ const ENOUGH: u64 = 20;
 const TURNS: u32 = 5;
 /// No answer at any rate takes less than that, behind a network none at one.
 const UNANSWERED: Nanos = 2_000 * MILLIS;
-/// Time for which measured data are listened to.
+/// Minimum time for which measured data are received.
 const SECOND: Nanos = 1_000 * MILLIS;
 /// A scanner whose motor has to get up to speed measures by then, even if many answers are damaged before.
 const BEGINS: Nanos = 7_000 * MILLIS;

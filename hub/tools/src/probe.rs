@@ -1,5 +1,5 @@
-//! `scanhub probe`: what is at the other end of a port, of whatever family. Opens it, listens for scanners that speak unasked,
-//! then asks the sensor, and changes no setting.
+//! `scanhub probe`: finds the sensor at a port, whatever its family. Opens the port, listens for scanners that stream by
+//! themselves, then sends requests. No setting changes.
 
 mod description;
 mod suggestion;

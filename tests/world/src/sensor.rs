@@ -95,7 +95,7 @@ impl Sensor {
         self.scanner.device_mut().power_cycle(self.now);
     }
 
-    /// Its voltage dips.
+    /// Lets the voltage of the scanner dip.
     pub(crate) fn brown_out(&mut self) {
         self.scanner.device_mut().brown_out(self.now);
     }

@@ -304,21 +304,23 @@ impl Session {
         }
     }
 
-    /// It booted: what the scanner was told before is forgotten.
-    pub(super) fn booted(&mut self) {
+    /// Handles the text of a scanner that booted, and forgot what it was told. `is_named` as of
+    /// [`Found::Greeting`](crate::framer::Found::Greeting).
+    pub(super) fn booted(&mut self, is_named: bool) {
         match self.phase {
             Phase::Paused { .. } | Phase::Listening { .. } => {}
             // It is asked anyway; and what another rate makes of a stream may be text, again and again.
             Phase::Draining { .. } | Phase::Asking { ask: Ask::Info, .. } => {
-                let is_behind_hush =
-                    self.reads.hush_ended().is_some_and(|ended| self.now < ended + GREETING_TIME);
-                if is_behind_hush && self.streamed_at.take_if(|baud| *baud == self.baud).is_some() {
-                    self.restarts += 1;
-                }
+                let has_streamed = self.streamed_at.take_if(|baud| is_named && *baud == self.baud).is_some();
+                self.restarts += u64::from(has_streamed);
             }
             Phase::Booting { .. } => self.phase = Phase::Booting { until: self.now + SETTLE },
             // What is left of a packet may be text too. One that boots sends nothing for a while before it greets.
-            Phase::Hearing { silent_at, .. } if silent_at.abs_diff(self.now + SILENCE) < HUSHED => {}
+            Phase::Hearing { silent_at, .. }
+                if silent_at.abs_diff(self.now + SILENCE) < HUSHED
+                    || self.framer.skipped() > Kind::LONGEST as u32 + GREETING => {}
+            // A stream whose beginning was damaged is text here and there.
+            Phase::Asking { .. } if !is_named => {}
             _ => {
                 self.resyncs += u64::from(matches!(self.phase, Phase::Hearing { .. }));
                 self.restarts += 1;
@@ -403,8 +405,8 @@ const BOOT: Nanos = 1_500 * MILLIS;
 const HUSHED: Nanos = 200 * MILLIS;
 /// Time from power-on to the greeting, and some.
 const POWER_ON: Nanos = 3_000 * MILLIS;
-/// A greeting of 64 bytes takes 6 ms at the lowest rate, and an adapter that collects bytes 16 more, twice.
-const GREETING_TIME: Nanos = 50 * MILLIS;
+/// Bytes of a greeting.
+const GREETING: u32 = 64;
 /// It answers 4 ms after its greeting.
 const SETTLE: Nanos = 10 * MILLIS;
 /// An unwell scanner is asked again after so long.

@@ -107,7 +107,7 @@ impl line::Session for Session {
                 Found::Packets(kind, span) => {
                     return Output::Heard(Heard::Packets(self.receive(kind, span)));
                 }
-                Found::Greeting => self.booted(),
+                Found::Greeting { is_named } => self.booted(is_named),
             }
         }
         self.expire();

@@ -28,7 +28,7 @@ pub struct UnitSettings {
     pub stubborn: bool,
     /// How it deviates from the manual; what only an LMS has is ignored.
     pub habits: Habits,
-    /// What else goes wrong in the scanner: times in which something holds its head.
+    /// Faults of the scanner: times in which something holds its head.
     pub faults: Faults,
     /// How many bytes the host's hardware hands over at once.
     pub chunk: ChunkSize,

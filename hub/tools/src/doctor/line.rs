@@ -134,8 +134,7 @@ fn server(
     }
 }
 
-/// What a sensor that answered is: the rate at which a rotating scanner was found, and the findings. Otherwise the reason
-/// why none answered.
+/// Rate at which a rotating scanner was found, and the findings about the sensor. Otherwise the reason why none answered.
 type Examined = Result<(Option<u32>, Vec<Finding>), Finding>;
 
 /// Examines the sensor at `port`, which is open at `first`.
@@ -259,7 +258,7 @@ fn latency(path: &Path, ms: Option<u8>) -> Finding {
     )
 }
 
-/// Checks whether the port can have the rate to stream at: that of the rotating scanner that was `found`, else the link's.
+/// Checks whether the port can have the rate to stream at: the rate of the rotating scanner that was `found`, or the link's rate.
 fn rate(subject: &Subject, port: &Port, first: Baud, found: Option<u32>) -> Finding {
     const NAME: &str = "rate";
     let link_rate = subject.link.as_ref().map_or(Baud::B500000.rate(), config::Link::rate);
