@@ -107,7 +107,7 @@ impl Convert {
             words += &format!("; {left_out} telegram{plural} dropped (not {what})");
         }
         if *unread != Unread::default() {
-            words += &format!("; left out of the log: {unread}");
+            words += &format!("; dropped from the log: {unread}");
         }
         if !damage.is_none() {
             words += &format!("; missing in {}: {damage}", self.input.display());
@@ -131,12 +131,12 @@ struct Line<'a> {
     seconds: Option<f64>,
     missing: Missing,
     marks: Option<u64>,
-    log_left_out: Option<LogLeftOut>,
+    log_dropped: Option<LogDropped>,
 }
 
 /// Data of a log that is not in the output.
 #[derive(Serialize)]
-struct LogLeftOut {
+struct LogDropped {
     poses: u64,
     odometry: u64,
     remissions: u64,
@@ -181,7 +181,7 @@ impl<'a> Line<'a> {
                 checksum: is_harmed,
             },
             marks: converted.marks,
-            log_left_out: is_log.then_some(LogLeftOut { poses, odometry, remissions, lines }),
+            log_dropped: is_log.then_some(LogDropped { poses, odometry, remissions, lines }),
         }
     }
 }
