@@ -6,6 +6,7 @@ use crate::testkit::{INT, Sender, TERM, TestEnv, bytes_of, hash, in_a_network, i
 use rustix::process::Signal;
 use rustix::time::{ClockId, clock_gettime};
 use schema::{Topic, Verdict, Zones};
+use serde_json::Value;
 
 #[test]
 fn a_hub_that_was_stopped() {
@@ -46,10 +47,14 @@ fn a_hub_that_was_stopped() {
 
     let stamps: Vec<u64> = lines.iter().map(|line| number(line, "stamp_ns")).collect();
     assert!(stamps.is_sorted(), "stamps run backwards: {stamps:?}");
-    // Nothing that waited looks newer than it is.
+    // Nothing that waited looks newer than it is, or it says that its stamp is an estimate: where the kernel's own threads wait
+    // for a processor, the line falls silent before all that waited was read.
     let sent = places.iter().map(|&place| truth[place].sent_ns);
-    let waited: Vec<_> = sent.zip(&stamps).filter(|(sent, _)| (stopped..continued).contains(sent)).collect();
-    assert!(waited.len() > 10 && waited.iter().all(|(sent, stamp)| *stamp < sent), "{waited:?}");
+    let is_estimate = |line: &Value| line["flags"].to_string().contains("stamp_estimated");
+    let waited = sent.zip(&stamps).zip(lines.iter().map(is_estimate));
+    let waited: Vec<_> = waited.filter(|((sent, _), _)| (stopped..continued).contains(sent)).collect();
+    let is_right = |((sent, stamp), is_estimate): &((u64, &u64), bool)| *stamp < sent || *is_estimate;
+    assert!(waited.len() > 10 && waited.iter().all(is_right), "{waited:?}");
 
     // Each scan has a verdict; what the zones' numbers are ahead of the scans' by was said because scans stayed out. That
     // is not said again between those that waited.

@@ -76,10 +76,10 @@ pub(crate) fn sequence(lines: &[Value], key: &str) -> Vec<u64> {
 /// The numbers of the samples of `topic` that a client printed. They are in order, and each one that is missing between the
 /// first and the last was reported as missed: a client that does not get a processor for long may miss some.
 pub(crate) fn accounted(outcome: &Outcome, topic: &str) -> Vec<u64> {
-    let mut lines = outcome.of_class(topic);
+    let lines = outcome.of_class(topic);
     // What a client reports of a silence by itself has no number.
-    lines.retain(|line| line["stale"] != true && line["topic_seq"].is_u64());
-    let numbers: Vec<u64> = lines.iter().map(|line| number(line, "topic_seq")).collect();
+    let mut numbers: Vec<u64> = lines.iter().filter_map(|line| line["topic_seq"].as_u64()).collect();
+    numbers.dedup();
     assert!(numbers.is_sorted_by(|one, next| one < next), "out of order: {numbers:?}");
     let (Some(first), Some(last)) = (numbers.first(), numbers.last()) else { return numbers };
     let notices = outcome.of_class("notice");
