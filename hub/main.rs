@@ -202,10 +202,15 @@ fn say_ready(ready: &daemon::Ready, domain: &Domain, json: bool) {
             pid: std::process::id(),
             boot: format!("{:016x}", ready.boot),
             sensors: &ready.sensors,
+            waiting: &ready.waiting,
         })
     } else {
         let place = domain.root().display();
-        format!("ready {} in {place}, sensors: {}", domain.name(), ready.sensors.join(", "))
+        let waiting = match &ready.waiting[..] {
+            [] => String::new(),
+            waiting => format!("; waiting for the port of {}", waiting.join(", ")),
+        };
+        format!("ready {} in {place}, sensors: {}{waiting}", domain.name(), ready.sensors.join(", "))
     });
 }
 
@@ -243,6 +248,7 @@ struct HubReady<'a> {
     pid: u32,
     boot: String,
     sensors: &'a [String],
+    waiting: &'a [String],
 }
 
 /// The line that says that the simulator is up.

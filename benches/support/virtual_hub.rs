@@ -5,13 +5,14 @@
 use std::cell::{Cell, RefCell};
 use std::collections::VecDeque;
 use std::io;
+use std::path::Path;
 use std::rc::Rc;
 
 use config::Config;
 use daemon::surroundings::{Learned, Line, Surroundings, Wait, Woken};
 use daemon::{LiveLink, Orders};
 use lms::Nanos;
-use port::{Allowance, PortError, Source, clock};
+use port::{Allowance, Alteration, PortError, Source, clock};
 use schema::ipc::{self, Node, Payload, SharedMemory, Waker};
 use schema::limits::TopicLimits;
 use schema::{Domain, Failure, HubLock, Ring, Wake, shortage};
@@ -121,6 +122,10 @@ impl Surroundings for Around<'_> {
         error.explain(source)
     }
 
+    fn altering_program(&self, _: &Source) -> Option<String> {
+        None
+    }
+
     fn take_kept(&self, _: &str, _: &Source, _: u32) -> Option<Bytes> {
         None
     }
@@ -171,6 +176,14 @@ impl Line for Bytes {
         Ok(None)
     }
 
+    fn altered(&self) -> io::Result<Option<Alteration>> {
+        Ok(None)
+    }
+
+    fn restore(&self, _: u32) -> io::Result<()> {
+        Ok(())
+    }
+
     fn set_dtr(&self, _: bool) -> io::Result<()> {
         Ok(())
     }
@@ -185,6 +198,10 @@ impl Line for Bytes {
 
     fn line_errors(&self) -> u64 {
         0
+    }
+
+    fn device(&self) -> Option<&Path> {
+        None
     }
 
     fn is_simulated(&self) -> bool {

@@ -40,7 +40,7 @@ pub struct Status {
     /// See [`Status::port`].
     pub port_text: [u8; 128],
     /// See [`Status::last_error`].
-    pub last_error_text: [u8; 160],
+    pub last_error_text: [u8; Status::MAX_ERROR_LEN],
     /// See [`Counter`].
     pub counters: Counters,
     /// The pose of the sensor, as configured.
@@ -161,7 +161,10 @@ impl Status {
         text::read(&self.last_error_text)
     }
 
-    /// Sets the last error: at most 160 bytes, the rest is cut.
+    /// Maximum length of the last error, in bytes.
+    pub const MAX_ERROR_LEN: usize = 160;
+
+    /// Sets the last error: at most [`Self::MAX_ERROR_LEN`] bytes, the rest is cut.
     pub fn set_last_error(&mut self, value: &str) {
         text::write(&mut self.last_error_text, value);
     }

@@ -3,6 +3,8 @@
 use std::fs;
 use std::os::unix::fs::symlink;
 
+use serde_json::json;
+
 use crate::testkit::{Outcome, TERM, TestEnv, until};
 
 fn error_of(outcome: &Outcome) -> serde_json::Value {
@@ -11,20 +13,18 @@ fn error_of(outcome: &Outcome) -> serde_json::Value {
 }
 
 #[test]
-fn the_second_hub_is_told_who_has_the_port_and_gets_it_once_it_is_free() {
+fn second_hub_waits_for_the_port_and_names_the_first_one() {
     let (env, other) = (TestEnv::new(), TestEnv::new());
     let _simulator = env.simulator(&["front"], &["--seed=71", "--baud=500000"]);
     let first = env.hub(&[env.link("front")]);
     env.await_info("front", |info| info["state"] == "streaming");
-    let link = [env.link("front")];
-    let refused = other.run(&["run", "--json", &link[0]]);
-    let error = error_of(&refused);
-    assert_eq!((refused.code, &error["kind"]), (Some(4), &"port_busy".into()), "{refused}");
-    let pid = format!("process {}", first.pid());
-    assert!(error["message"].as_str().is_some_and(|message| message.contains(&pid)), "{refused}");
+    let second = other.hub(&[env.link("front")]);
+    assert!(second.has_said(|line| line["waiting"] == json!(["front"])));
+    let holder = format!("in use by process {} (scanhub)", first.pid());
+    let info = other.info("front");
+    assert!(info["last_error"].as_str().is_some_and(|error| error.contains(&holder)), "{info}");
     assert_eq!(env.info("front")["state"], "streaming", "was disturbed");
     assert_eq!(first.end(TERM).code, Some(0));
-    let second = other.hub(&link);
     other.await_info("front", |info| info["state"] == "streaming");
     assert_eq!(second.end(TERM).code, Some(0));
 }

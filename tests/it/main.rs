@@ -4,6 +4,7 @@
 #[path = "../testkit/mod.rs"]
 mod testkit;
 
+mod altered_port;
 mod background;
 mod browser;
 mod chart;
@@ -53,6 +54,7 @@ mod listen_twins;
 mod logs;
 mod mask;
 mod motion;
+mod other_scanner;
 mod pages;
 mod ports;
 mod probe;

@@ -1,9 +1,10 @@
-//! The ways in which a port cannot be used: each has its exit code, its message and its remedy.
+//! The ways in which a port cannot be used: each has its message and its remedy. A hub ends only at a port that is not a
+//! serial line, and waits for all others.
 
 use std::os::unix::fs::{PermissionsExt, chown, symlink};
 use std::os::unix::process::CommandExt;
 
-use crate::testkit::{Line, Program, TERM, TestEnv, skip, succeeds, until};
+use crate::testkit::{Line, Program, TERM, TestEnv, is_class, skip, succeeds, until};
 use rustix::process::geteuid;
 use serde_json::Value;
 
@@ -82,9 +83,13 @@ fn what_this_user_may_not_open() {
         }
         command.uid(NOBODY).gid(NOBODY);
     }
-    let outcome = Program::start(command).wait();
-    assert_eq!(outcome.code, Some(4), "{outcome}");
-    let text = said(&outcome.errors, "port_permission");
+    let mut hub = Program::start(command);
+    let ready = hub.await_line("ready", is_class("ready"));
+    assert_eq!(ready["waiting"], serde_json::json!(["front"]), "{ready}");
+    let outcome = hub.end(TERM);
+    assert_eq!(outcome.code, Some(0), "{outcome}");
+    let lines: Vec<_> = outcome.errors.lines().filter(|line| line.contains("front: absent")).collect();
+    let [text] = lines[..] else { panic!("not one line for one reason: {outcome}") };
     let user = if is_root { "nobody" } else { "user" };
     let remedy = if is_root { "udev rule" } else { "chmod u+rw" };
     for says in [&env.word("front"), "no permission", user, &format!("mode {mode:03o}"), remedy] {
@@ -105,12 +110,36 @@ fn what_another_process_has() {
     let hub = env.hub(&[env.link("front")]);
     line.await_open();
     let other = TestEnv::new();
-    let text = refused(&other, &env.word("front"), "port_busy");
-    let holder = format!("in use by process {} (scanhub)", hub.pid());
-    assert!(text.contains(&holder) && text.contains("stop it first"), "{text}");
-    // On a pty the exclusive mode outlives a close; whoever comes next finds none.
+    let _simulator = other.simulator(&["rear"], &["--seed=73", "--baud=500000"]);
+    let mut second = other.start(&["run", "--json", &env.link("front"), &other.link("rear")]);
+    let ready = second.await_line("ready", is_class("ready"));
+    assert_eq!(
+        (&ready["sensors"], &ready["waiting"]),
+        (&serde_json::json!(["front", "rear"]), &serde_json::json!(["front"]))
+    );
+    let info = other.info("front");
+    let text = info["last_error"].as_str().unwrap_or_default();
+    let holder = format!("in use by process {} (scanhub); stop it first", hub.pid());
+    assert!(info["state"] == "absent" && text.contains(&holder), "{info}");
+    other.await_info("rear", |info| info["state"] == "streaming");
+    let list = other.run(&["list"]);
+    assert!(String::from_utf8_lossy(&list.out).contains("absent"), "{list}");
+    // On a pty the exclusive mode outlives a close; the next process finds none.
     assert_eq!(hub.end(TERM).code, Some(0));
-    until("the line is closed", || !line.is_open());
-    let _hub = other.hub(&[env.link("front")]);
+    let taken = |info: &Value| info["state"] != "absent" && info["last_error"] == "";
+    other.await_info("front", taken);
     line.await_open();
+    let outcome = second.end(TERM);
+    assert_eq!(outcome.code, Some(0), "{outcome}");
+    let lines = outcome.errors.lines().filter(|line| line.contains("front: absent")).count();
+    assert_eq!(lines, 1, "not one line for one reason: {outcome}");
+}
+
+#[test]
+fn ready_without_json_names_what_the_hub_waits_for() {
+    let env = TestEnv::new();
+    let mut hub = env.start(&["run", &env.link("front"), &env.link("rear")]);
+    let ready = hub.next_text();
+    assert!(ready.ends_with(", sensors: front, rear; waiting for the port of front, rear"), "{ready}");
+    assert_eq!(hub.end(TERM).code, Some(0));
 }

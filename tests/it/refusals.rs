@@ -371,9 +371,8 @@ fn ports_that_cannot_be_used() {
     let _simulator = env.simulator(&["front"], &["--baud=500000"]);
     let hub = env.hub(&[env.link("front")]);
     env.await_info("front", |info| info["state"] == "streaming");
-    let other = TestEnv::new();
-    let pid = format!("process {}", hub.pid());
-    refused(&other, &["run", &env.link("front")], 4, "port_busy", &[&env.word("front"), &pid, "stop it"]);
+    let (port, pid) = (env.word("front"), format!("process {}", hub.pid()));
+    refused(&TestEnv::new(), &["probe", &port], 4, "port_busy", &[&port, &pid, "stop it"]);
     assert_eq!(env.info("front")["state"], "streaming", "was disturbed");
 }
 

@@ -31,9 +31,15 @@ fn what_is_sent_while_a_killed_hub_is_replaced_waits_in_the_line() {
         supervisor.hear("READY=1");
     }
     live(&mut telegrams, &mut boots);
-    // Nobody but the one who keeps it has the line, and it is still locked.
+    // Only the service manager has the line, and it is still locked.
     assert_eq!(hub.end(KILL).code, None);
-    assert_eq!(env.run(&["run", &flags[0]]).code, Some(4), "a hub of nobody's finds it busy");
+    let elsewhere = TestEnv::new();
+    let other = elsewhere.hub(&flags);
+    assert!(
+        other.has_said(|line| line["waiting"] == serde_json::json!(["front"])),
+        "it found the line free"
+    );
+    assert_eq!(other.end(TERM).code, Some(0));
     hub = env.service(&mut supervisor, &flags, None).ready();
     live(&mut telegrams, &mut boots);
     assert_eq!(hub.end(TERM).code, Some(0));

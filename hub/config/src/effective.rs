@@ -54,7 +54,12 @@ impl List {
         let Link { name, port, scanner, processing, .. } = link;
         let of = |key: &'static str| (name.as_str(), key);
         self.put(of("port"), json!(port.name()), DEFAULT);
-        self.put(of("family"), json!(link.family().name()), DEFAULT);
+        // A family that no source sets follows from the model.
+        let by_model = match scanner {
+            Scanner::Turning(turning) => format!("default of {}", turning.model.name),
+            Scanner::Lms => DEFAULT.to_owned(),
+        };
+        self.put(of("family"), json!(link.family().name()), &by_model);
         match scanner {
             Scanner::Lms => self.lms(link),
             Scanner::Turning(turning) => {

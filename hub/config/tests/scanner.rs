@@ -41,6 +41,9 @@ fn a_link_has_a_family_and_what_its_family_needs() {
             8192,
         ),
         (&[family, "link.front.beams=2"], set("auto", Some(2)), 230_400, 2),
+        // A model implies its family.
+        (&["link.front.model=LD19"], set("ld19", None), 230_400, 450),
+        (&["link.front.model=s2"], Some(("rplidar", "s2", None)), 1_000_000, 3200),
         // Room for every model but the one that the remedy of a status names.
         (&[family, "link.front.model=auto"], set("auto", None), 230_400, 720),
         // What it does anyway may be said.
@@ -65,8 +68,26 @@ fn a_link_has_a_family_and_what_its_family_needs() {
         (&[], "famly=ld", "unknown key `famly`\n  did you mean `family`?"),
         (
             &[],
+            "model=ld18",
+            "link front: model = \"ld18\"\n  auto, or one of: ld06, ld19, stl19p, stl27l, ld14p, a1, a2m8, a2m12, a3, s1, \
+             s2, s3, c1; an LMS says itself what it is, `type`",
+        ),
+        (
+            &["link.front.family=lms"],
+            "model=lms291",
+            "link front: model = \"lms291\", and an lms says itself what it is\n  leave it out; `type`",
+        ),
+        (
+            &["link.front.family=lms"],
             "model=ld19",
-            "link front: model = \"ld19\", and an lms says itself what it is\n  leave it out; `type`",
+            "link front: model = \"ld19\" is of family ld, but --set link.front.family=lms says lms\n  leave `family` \
+             out, or set family = \"ld\"",
+        ),
+        (
+            &[family],
+            "model=s2",
+            "link front: model = \"s2\" is of family rplidar, but --set link.front.family=ld says ld\n  leave `family` \
+             out, or set family = \"rplidar\"",
         ),
         (
             &[],

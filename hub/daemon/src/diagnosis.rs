@@ -1,13 +1,17 @@
-//! What is wrong with a link, in words for its status: the session's trouble, a unit that is not the configured one,
-//! more bytes than its line can bring, a line that damages most bytes, a scanner that restarts, consumers that get nothing. Refuses to know when a status goes out.
+//! Finds the problem of a link that its status reports: the session's problem, a unit other than the configured one, more
+//! bytes than the line can carry, a line that damages most bytes, bytes of another scanner, settings that another process
+//! changed, a scanner that restarts, and subscribers that receive nothing.
+
+use std::path::Path;
 
 use config::{Link, Scanner};
 use line::Session as _;
-use lms::Notice;
 use lms::variant::Unit;
+use lms::{MILLIS, Nanos, Notice};
 use port::Source;
 use schema::{State, Status};
 
+use crate::byte_rate::{ByteRate, with_commas};
 use crate::driver::{Driver, Trouble};
 use crate::recent::LineHealth;
 
@@ -20,6 +24,12 @@ pub(crate) struct Diagnosis<'a> {
     words: String,
     /// Why the port went away the last time, if it did so without a byte.
     doubt: String,
+    /// Device of the open port, for a message that has no room for the configured name.
+    device: Option<String>,
+    /// Rate of the bytes that arrive while nothing is streaming.
+    byte_rate: ByteRate,
+    /// Message about settings that another process changed, and the time until which it is shown.
+    altered: Option<(String, Nanos)>,
     /// The port brings more than its line can.
     is_flooded: bool,
     /// Share of the bytes that the line damages, in percent, while it damages most of them.
@@ -39,6 +49,8 @@ pub(crate) struct Diagnosis<'a> {
 struct Facts {
     state: State,
     trouble: Option<Trouble>,
+    /// Rate of the bytes that arrive in place of what the session is [missing](line::Session::missing).
+    bytes_per_second: Option<u64>,
     other_model: Option<&'static str>,
     unit: Option<Unit>,
     notice: Option<Notice>,
@@ -52,6 +64,9 @@ impl<'a> Diagnosis<'a> {
             facts: None,
             words: String::new(),
             doubt: String::new(),
+            device: None,
+            byte_rate: ByteRate::default(),
+            altered: None,
             is_flooded: false,
             damaged_percent: None,
             restarts: 0,
@@ -61,13 +76,18 @@ impl<'a> Diagnosis<'a> {
         }
     }
 
-    /// Looks at `session`. The state of the link, and whether anything is new since the last look.
-    pub(crate) fn examine(&mut self, driver: &Driver) -> (State, bool) {
+    /// Looks at `driver`, at `now`. The state of the link, and whether anything is new since the last look.
+    pub(crate) fn examine(&mut self, driver: &Driver, now: Nanos) -> (State, bool) {
+        if self.altered.take_if(|(_, until)| now >= *until).is_some() {
+            self.facts = None;
+        }
+        let bytes_per_second = self.measure(driver, now);
         let state = if self.is_doubtful(driver) { State::Absent } else { state_of(driver) };
         let sensor = driver.lms().map(lms::Session::sensor);
         let facts = Facts {
             state,
             trouble: driver.trouble(),
+            bytes_per_second,
             other_model: driver.other_model().map(|model| model.name),
             unit: sensor.and_then(|sensor| sensor.unit),
             notice: sensor.and_then(|sensor| sensor.notices().next()),
@@ -84,6 +104,29 @@ impl<'a> Diagnosis<'a> {
             self.words = self.trouble(driver);
         }
         (state, is_new)
+    }
+
+    /// Returns the rate of the bytes that arrive in place of what the session is missing, if it is missing something.
+    fn measure(&mut self, driver: &Driver, now: Nanos) -> Option<u64> {
+        if driver.state() == line::State::Streaming {
+            self.byte_rate = ByteRate::default();
+            return None;
+        }
+        let read = driver.account().read;
+        self.byte_rate.note(now, read);
+        driver.missing().and_then(|_| self.byte_rate.shown(now, read))
+    }
+
+    /// The port is open, as `device` if that is known.
+    pub(crate) fn open(&mut self, device: Option<&Path>) {
+        self.device = device.map(|device| device.display().to_string());
+        self.byte_rate = ByteRate::default();
+    }
+
+    /// Another process has changed the settings of the port, which the hub has set again at `now`; `words` say so.
+    pub(crate) fn note_altered(&mut self, words: String, now: Nanos) {
+        self.altered = Some((words, now + ALTERED_SHOWN));
+        self.facts = None;
     }
 
     /// What is wrong, in words; empty if nothing is.
@@ -176,6 +219,9 @@ impl<'a> Diagnosis<'a> {
                 self.link.most_rate()
             );
         }
+        if let Some((words, _)) = &self.altered {
+            return words.clone();
+        }
         // Damage and restarts explain most other findings, so they come first.
         if let Some(percent) = self.damaged_percent {
             return format!(
@@ -189,6 +235,10 @@ impl<'a> Diagnosis<'a> {
             count => {
                 return format!("the scanner restarted {count} times in 10 s: is its supply strong enough?");
             }
+        }
+        let rate = self.facts.and_then(|facts| facts.bytes_per_second);
+        if let Some((missing, rate)) = driver.missing().zip(rate) {
+            return self.other_bytes(missing, rate);
         }
         let is_server = matches!(self.link.port, Source::Tcp { .. });
         match driver.trouble() {
@@ -205,6 +255,24 @@ impl<'a> Diagnosis<'a> {
                 }
                 None => String::new(),
             }),
+        }
+    }
+
+    /// Returns the message that `rate` bytes per second arrive, but none of what is `missing`.
+    fn other_bytes(&self, missing: &str, rate: u64) -> String {
+        let is_server = matches!(self.link.port, Source::Tcp { .. });
+        let other_rate = if is_server { ", or does the server use another rate" } else { "" };
+        let words = |port: &str| {
+            format!(
+                "{} bytes/s arrive, but no {missing}; is it another scanner{other_rate}? Try: scanhub probe {port}",
+                with_commas(rate)
+            )
+        };
+        let message = words(&self.link.port.name());
+        match &self.device {
+            // The command at its end would be cut.
+            Some(device) if message.len() > Status::MAX_ERROR_LEN => words(device),
+            _ => message,
         }
     }
 
@@ -264,5 +332,7 @@ const MOST_DAMAGED: u32 = 50;
 const COARSE: u32 = 10;
 /// Fewer telegrams in 10 s may be chance matches in the bytes of another scanner.
 const FEW_TELEGRAMS: u64 = 3;
+/// Time for which a status reports that another process changed the port's settings.
+const ALTERED_SHOWN: Nanos = 10_000 * MILLIS;
 /// Statuses after which consumers without samples are more than ones that are just attaching.
 const UNSERVED_LIMIT: u32 = 3;

@@ -23,6 +23,7 @@ use crate::control::Flow;
 use crate::driver::{Driver, Heard};
 use crate::identity_cache::IdentityCache;
 use crate::link::LinkCore;
+use crate::settings_check::SettingsCheck;
 use crate::surroundings::{Learned, Line, On, Surroundings, Woken};
 
 /// What outlives a session on a port, for the next one.
@@ -50,6 +51,8 @@ pub(crate) struct Open<L> {
     allowance: Option<Allowance>,
     /// What waited in the port when it was opened, until all of it was read.
     backlog: Option<Backlog>,
+    /// When to read the port's settings back.
+    settings_check: SettingsCheck,
     /// Whether bytes are waited for.
     watch: bool,
     /// Until when the session waits.
@@ -63,7 +66,8 @@ impl<L: Line> Open<L> {
     pub(crate) fn new(line: L, session: Driver, baud: u32, now: Nanos) -> Open<L> {
         let allowance = line.allowance(baud);
         let backlog = Backlog::new(line.waiting().unwrap_or(0), now);
-        Open { line, session, allowance, backlog, watch: true, until: 0, rest: None }
+        let settings_check = SettingsCheck::default();
+        Open { line, session, allowance, backlog, settings_check, watch: true, until: 0, rest: None }
     }
 
     /// What to wait for, and until when. Also while bytes are left alone the port may go away.
@@ -142,7 +146,7 @@ impl<'a, S: Surroundings> Drive<'a, S> {
     }
 
     fn read(&mut self, core: &mut LinkCore<'a, S>, open: &mut Open<S::Line>) -> io::Result<()> {
-        let Open { line, session, allowance, backlog, watch, until, .. } = open;
+        let Open { line, session, allowance, backlog, settings_check, watch, until, .. } = open;
         let around = core.around;
         if !*watch && matches!(session, Driver::Lms(_)) {
             // The telegram's end is near: what can be done before it is not done after it. Packets end all the time.
@@ -164,6 +168,9 @@ impl<'a, S: Surroundings> Drive<'a, S> {
         let len = line.read(spare)?;
         let now = around.now();
         session.commit(now, len);
+        if len > 0 {
+            settings_check.note_bytes(now);
+        }
         if let Some(waited) = backlog {
             if waited.take(len, session.rate(), now) {
                 self.behind_at = Some(now);
@@ -194,6 +201,7 @@ impl<'a, S: Surroundings> Drive<'a, S> {
                     self.set_baud(core, line, baud)?;
                     // What waited is discarded.
                     open.backlog = None;
+                    open.settings_check.pass();
                 }
                 Output::SetDtr(on) => line.set_dtr(on)?,
                 Output::Transmit { byte, not_before } => {
@@ -244,6 +252,10 @@ impl<'a, S: Surroundings> Drive<'a, S> {
         };
         if published {
             self.line_errors.wait();
+            open.settings_check.pass();
+        }
+        if open.settings_check.is_due(session.state(), around.now()) && restore(core, line, session.rate())? {
+            open.backlog = None;
         }
         // Whether anybody follows is asked once a scan: that takes a look at the places of all who might.
         if is_scan {
@@ -260,7 +272,7 @@ impl<'a, S: Surroundings> Drive<'a, S> {
             }
         }
         self.identity.keep_first(session);
-        let (state, is_new) = core.diagnosis.examine(session);
+        let (state, is_new) = core.diagnosis.examine(session, around.now());
         if is_new && let Some(found) = session.found_at() {
             self.found = Some(found);
             rates(core).iter().for_each(|rates| rates.keep_rate(&core.link.port.name(), found));
@@ -290,6 +302,16 @@ impl<'a, S: Surroundings> Drive<'a, S> {
         }
         Ok(())
     }
+}
+
+/// Makes the hub's settings of `line` again, at `baud`, if another process has changed them; returns whether it has.
+fn restore<S: Surroundings>(core: &mut LinkCore<'_, S>, line: &S::Line, baud: u32) -> io::Result<bool> {
+    let Some(alteration) = line.altered()? else { return Ok(false) };
+    line.restore(baud)?;
+    let program = core.around.altering_program(&core.link.port);
+    let program = program.map(|program| format!("; {program}")).unwrap_or_default();
+    core.diagnosis.note_altered(format!("{alteration}{program}"), core.around.now());
+    Ok(true)
 }
 
 /// Where rates are kept, if anywhere.

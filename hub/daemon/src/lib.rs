@@ -3,6 +3,7 @@
 
 mod backlog;
 pub mod bus_error;
+mod byte_rate;
 mod control;
 mod diagnosis;
 mod drive;
@@ -24,6 +25,7 @@ mod reload;
 mod replay;
 mod replay_hub;
 mod service;
+mod settings_check;
 mod signals;
 mod supervise;
 pub mod surroundings;

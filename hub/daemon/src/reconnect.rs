@@ -6,7 +6,7 @@ use std::io;
 use line::{Control, Session as _};
 use lms::{Identity, MILLIS, Nanos};
 use port::{PortError, Source};
-use schema::{Failure, Flags, Kind, State};
+use schema::{Failure, Flags, State};
 
 use crate::control::{ControlQueue, Flow};
 use crate::drive::{Drive, Open};
@@ -40,8 +40,9 @@ impl<'a, S: Surroundings> LiveLink<'a, S> {
     ///
     /// # Errors
     ///
-    /// The link cannot work: an absent port can, one that is busy, forbidden or no tty cannot; as
-    /// [`Surroundings::medium`].
+    /// Returns an error of kind [`Kind::PortNotTty`] if the port is not a serial line at all, or [`Kind::Short`] if
+    /// descriptors or memory are; also those of [`Surroundings::medium`]. The link waits for a port that is missing, in
+    /// use or forbidden, or that cannot have the rate.
     pub fn new(
         link: &'a config::Link,
         number: u8,
@@ -63,20 +64,28 @@ impl<'a, S: Surroundings> LiveLink<'a, S> {
             }
             Ok(None) => {
                 let words = format!("{}: not connected yet", link.port.name());
-                live.leave(Away::for_lack_of_a_port(words));
-                Ok(live)
-            }
-            Err(failure) if failure.kind == Kind::PortMissing => {
-                live.leave(Away::for_lack_of_a_port(said(failure)));
+                live.leave(Away { words, ..Away::default() });
                 Ok(live)
             }
             // Only a hub plays recordings.
-            Err(failure) if failure.kind == Kind::PortNotTty => {
+            Err(error @ PortError::NotTty) => {
+                let failure = around.explain(&error, &link.port);
                 let hint = format!("{}, or file:PATH for a recording", failure.hint);
                 Err(Failure { hint, ..failure })
             }
-            Err(failure) => Err(failure),
+            Err(error @ PortError::Short(_)) => Err(around.explain(&error, &link.port)),
+            Err(error) => {
+                let mut away = Away::default();
+                away.learn(&error, around.now(), |error| said(around.explain(error, &link.port)));
+                live.leave(away);
+                Ok(live)
+            }
         }
+    }
+
+    /// Returns whether the link waits for its port, which could not be opened.
+    pub fn is_waiting(&self) -> bool {
+        matches!(&self.phase, Phase::Away { away, .. } if away.error.is_some())
     }
 
     /// Does what there is to do after a wait that ended as `woken` says, and returns what to wait for next.
@@ -119,7 +128,7 @@ impl<'a, S: Surroundings> LiveLink<'a, S> {
 
     /// The line at the hub's start, and whether it is the one that a killed hub had and somebody kept, with what lies in it;
     /// nothing if a connection has to be made.
-    fn first_line(&self) -> Result<Option<(S::Line, bool)>, Failure> {
+    fn first_line(&self) -> Result<Option<(S::Line, bool)>, PortError> {
         let (link, around) = (self.core.link, self.core.around);
         let (name, source, baud) = (&link.name, &link.port, link.rate());
         if let Source::Tcp { .. } = source {
@@ -131,7 +140,7 @@ impl<'a, S: Surroundings> LiveLink<'a, S> {
         }
         match around.open(source, baud) {
             Some(Ok(line)) => Ok(Some((line, false))),
-            Some(Err(error)) => Err(around.explain(&error, source)),
+            Some(Err(error)) => Err(error),
             None => Ok(None),
         }
     }
@@ -158,6 +167,7 @@ impl<'a, S: Surroundings> LiveLink<'a, S> {
         let core = &mut self.core;
         let now = core.around.now();
         core.around.keep(&core.link.name, &line);
+        core.diagnosis.open(line.device());
         core.output.topics.set_flags(if line.is_simulated() { Flags::SIMULATED } else { 0 });
         let mut session = Driver::new(core.link, core.is_recording(), now);
         if let Some(known) = known {

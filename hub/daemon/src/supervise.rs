@@ -33,6 +33,8 @@ pub struct Ready {
     pub boot: u64,
     /// The sensors' names.
     pub sensors: Vec<String>,
+    /// Names of the sensors whose port cannot be opened yet.
+    pub waiting: Vec<String>,
 }
 
 /// The links of a hub that plays a recording.
@@ -42,6 +44,14 @@ pub(crate) struct ReplaySet<'a> {
     pub(crate) parts: Vec<Recorded>,
     /// Whether the hub stays when everything was played.
     pub(crate) holds: bool,
+}
+
+/// How a link starts.
+enum Start {
+    /// With an open port, or with a recording; a serial server may still be dialed.
+    Open,
+    /// Without its port, which cannot be opened yet.
+    Waiting,
 }
 
 /// The end of a hub that plays a recording.
@@ -68,8 +78,11 @@ impl EndOfPlayback<'_> {
 /// Runs the hub in `domain` until SIGINT or SIGTERM; `on_ready` is called once, when all topics exist. `read` tells the
 /// configuration: at the start, and at each SIGHUP, which changes what can be changed while links stream.
 ///
-/// What `read` fails with at the start, [`Kind::DomainHeld`] if another hub has the domain, [`Kind::Short`] if memory is, the port kinds if a port is there
-/// but cannot be used, [`Kind::Failed`] if shared memory refuses.
+/// # Errors
+///
+/// Returns the error of `read` at the start, [`Kind::DomainHeld`] if another hub has the domain, [`Kind::Short`] if memory
+/// or descriptors are, [`Kind::PortNotTty`] if a port is not a serial line, and [`Kind::Failed`] if shared memory
+/// refuses. The hub waits for a port that cannot be opened for another reason.
 pub fn run(
     read: &dyn Fn() -> Result<Config, Failure>,
     domain: &Domain,
@@ -101,8 +114,9 @@ pub(crate) fn serve(
     let config = &config;
     let node = ipc::hub_node(domain)?;
     node.try_cleanup_dead_nodes();
-    let ready =
-        Ready { boot: random(), sensors: config.links.iter().map(|link| link.name.clone()).collect() };
+    let sensors = config.links.iter().map(|link| link.name.clone()).collect();
+    let mut ready = Ready { boot: random(), sensors, waiting: Vec::new() };
+    let boot = ready.boot;
     // By the port, not by the name: a line that somebody keeps cannot be opened by anybody.
     service.assign(|line| {
         let owner = config.links.iter().find(|link| Port::is_at(line, &link.port));
@@ -134,9 +148,9 @@ pub(crate) fn serve(
                 .zip(parts.next())
                 .map(|(player, recorded)| ReplayPart { recorded, handle: PlayerHandle { player, number } });
             let body = move || {
-                let report = |outcome| drop(report.send(outcome));
+                let report = |outcome| drop(report.send((number, outcome)));
                 match System::new(hub, &link.name, worked, learned) {
-                    Ok(system) => run_link(link, number as u8, ready.boot, &system, queue, part, report),
+                    Ok(system) => run_link(link, number as u8, boot, &system, queue, part, report),
                     Err(failure) => report(Err(failure)),
                 }
             };
@@ -150,7 +164,18 @@ pub(crate) fn serve(
             }
         }
         drop(report);
-        let mut outcome = reports.iter().take(config.links.len()).find(Result::is_err).unwrap_or(Ok(()));
+        let mut outcome = Ok(());
+        for (number, start) in reports.iter().take(config.links.len()) {
+            match start {
+                Ok(Start::Open) => {}
+                Ok(Start::Waiting) => ready.waiting.push(config.links[number].name.clone()),
+                Err(failure) => {
+                    outcome = Err(failure);
+                    break;
+                }
+            }
+        }
+        ready.waiting.sort_by_key(|name| ready.sensors.iter().position(|sensor| sensor == name));
         if outcome.is_ok() {
             outcome = shortage::allocate(domain);
         }
@@ -184,7 +209,7 @@ fn begin(
 }
 
 /// Runs `link`, number `number` in the hub's life `boot`, until the hub ends, with a recording as `part` of several or alone.
-/// `report` is called once, when it is clear whether the link can work.
+/// `report` is called once, when it is clear how the link starts.
 fn run_link(
     link: &Link,
     number: u8,
@@ -192,16 +217,18 @@ fn run_link(
     system: &System<'_>,
     queue: ControlQueue,
     part: Option<ReplayPart<'_>>,
-    report: impl FnOnce(Result<(), Failure>),
+    report: impl FnOnce(Result<Start, Failure>),
 ) {
     match &link.port {
         Source::File { path, paced } => match LinkCore::new(link, number, boot, system, queue) {
-            Ok(core) => replay::run(core, part, path, *paced, report),
+            Ok(core) => {
+                replay::run(core, part, path, *paced, |outcome| report(outcome.map(|()| Start::Open)));
+            }
             Err(failure) => report(Err(failure)),
         },
         Source::Tty(_) | Source::Tcp { .. } => match LiveLink::new(link, number, boot, system, queue) {
             Ok(live) => {
-                report(Ok(()));
+                report(Ok(if live.is_waiting() { Start::Waiting } else { Start::Open }));
                 system.drive(live);
             }
             Err(failure) => report(Err(failure)),

@@ -3,9 +3,10 @@
 //! that the same hub runs in made-up time. Refuses to know what is read and published.
 
 use std::io;
+use std::path::Path;
 
 use lms::Nanos;
-use port::{Allowance, PortError, Source};
+use port::{Allowance, Alteration, PortError, Source};
 use schema::ipc::{Medium, Payload};
 use schema::{Background, Failure, Pose, Ring, Wake};
 
@@ -37,6 +38,10 @@ pub trait Surroundings {
 
     /// Returns `error` in words, with its circumstances and a remedy.
     fn explain(&self, error: &PortError, source: &Source) -> Failure;
+
+    /// Returns the program that may have changed the settings of the port at `source`, as the end of a message; `None` if
+    /// none is known.
+    fn altering_program(&self, source: &Source) -> Option<String>;
 
     /// Returns the line at `source` that was kept open for link `name` while the hub before this one was killed.
     fn take_kept(&self, name: &str, source: &Source, baud: u32) -> Option<Self::Line>;
@@ -109,6 +114,20 @@ pub trait Line {
     /// The line is gone.
     fn set_baud(&self, baud: u32) -> io::Result<Option<io::Error>>;
 
+    /// Returns the settings that another process has made since the hub's; `None` if they are unchanged.
+    ///
+    /// # Errors
+    ///
+    /// Returns an error if the line is lost.
+    fn altered(&self) -> io::Result<Option<Alteration>>;
+
+    /// Makes the hub's settings again, at `baud`, and discards what arrived with others.
+    ///
+    /// # Errors
+    ///
+    /// Returns an error if the line is lost, or if it cannot have these settings any more.
+    fn restore(&self, baud: u32) -> io::Result<()>;
+
     /// Asserts DTR of a serial port, or clears it; a line without one ignores it.
     ///
     /// # Errors
@@ -124,6 +143,9 @@ pub trait Line {
 
     /// Returns the errors that the driver counted since the last call.
     fn line_errors(&self) -> u64;
+
+    /// Returns the device that the port's name resolved to; `None` if it has none, such as a serial server.
+    fn device(&self) -> Option<&Path>;
 
     /// Returns whether another program simulates the sensor.
     fn is_simulated(&self) -> bool;

@@ -10,7 +10,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
 use lms::{MILLIS, Nanos};
-use port::{Allowance, Dial, Port, PortError, Source, clock};
+use port::{Allowance, Alteration, Dial, Port, PortError, Source, clock};
 use rustix::event::{PollFd, PollFlags, poll};
 use schema::ipc::{Node, Payload, SharedMemory, Waker};
 use schema::limits::TopicLimits;
@@ -197,6 +197,13 @@ impl Surroundings for System<'_> {
         error.explain(source)
     }
 
+    fn altering_program(&self, source: &Source) -> Option<String> {
+        match source {
+            Source::Tty(path) => port::altering_program(path),
+            Source::Tcp { .. } | Source::File { .. } => None,
+        }
+    }
+
     fn take_kept(&self, name: &str, source: &Source, baud: u32) -> Option<Port> {
         let mut adopted = None;
         while let Some(line) = self.hub.service.take(name) {
@@ -270,6 +277,14 @@ impl Line for Port {
         self.try_baud(baud)
     }
 
+    fn altered(&self) -> io::Result<Option<Alteration>> {
+        self.altered()
+    }
+
+    fn restore(&self, baud: u32) -> io::Result<()> {
+        self.restore(baud)
+    }
+
     fn set_dtr(&self, on: bool) -> io::Result<()> {
         self.set_dtr(on)
     }
@@ -284,6 +299,10 @@ impl Line for Port {
 
     fn line_errors(&self) -> u64 {
         self.line_errors()
+    }
+
+    fn device(&self) -> Option<&Path> {
+        self.device()
     }
 
     fn is_simulated(&self) -> bool {

@@ -9,8 +9,6 @@ pub enum Trouble {
     NoPackets {
         /// The only rate at which was listened; `None`: at all of them.
         baud: Option<u32>,
-        /// Whether anything comes that is no packet.
-        noise: bool,
         /// For how long already, in steps that grow.
         seconds: u32,
     },
@@ -23,18 +21,13 @@ pub enum Trouble {
 impl fmt::Display for Trouble {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
-            Trouble::NoPackets { baud, noise, seconds } => {
-                f.write_str(if *noise { "bytes but no packets at " } else { "nothing comes at " })?;
+            Trouble::NoPackets { baud, seconds } => {
+                f.write_str("no packets at ")?;
                 match baud {
                     Some(baud) => write!(f, "{baud}")?,
                     None => f.write_str("230400 and 921600")?,
                 }
-                let remedy = if *noise {
-                    "another scanner? stop the hub and run `scanhub probe`"
-                } else {
-                    "power, cable, other port?"
-                };
-                write!(f, " baud for {seconds} s: {remedy}")
+                write!(f, " baud for {seconds} s: power, cable, other port?")
             }
             Trouble::Silence => f.write_str("no packet for one second"),
             Trouble::StandsStill => f.write_str("packets come, but the head does not turn: is it blocked?"),

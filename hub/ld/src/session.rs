@@ -61,8 +61,8 @@ pub struct Session {
     current: Option<Current>,
     now: Nanos,
     trouble: Option<Trouble>,
-    /// Since when no packet came, and bytes read by then.
-    quiet_since: (Nanos, u64),
+    /// Time since which no packet has arrived.
+    quiet_since: Nanos,
     /// Bytes of streams that were in nothing, and all of those when it was last looked.
     damaged: (u64, u64),
     resyncs: u64,
@@ -113,7 +113,7 @@ impl Session {
             current: None,
             now,
             trouble: None,
-            quiet_since: (now, 0),
+            quiet_since: now,
             damaged: (0, 0),
             resyncs: 0,
             restarts: Restarts::default(),
@@ -166,7 +166,7 @@ impl Session {
 
     fn listen(&mut self, shown: State) {
         self.phase = Phase::Listening { shown, next_at: self.now + LISTEN };
-        self.quiet_since = (self.now, self.framer.tally().read);
+        self.quiet_since = self.now;
         self.sequence.end();
         self.turns.give_up();
         self.is_learned = false;
@@ -182,13 +182,11 @@ impl Session {
             self.baud = next;
             self.change_baud = true;
         }
-        let (since, read) = self.quiet_since;
-        let seconds = (self.now.saturating_sub(since) / (1_000 * MILLIS)) as u32;
+        let seconds = (self.now.saturating_sub(self.quiet_since) / (1_000 * MILLIS)) as u32;
         if seconds > 0 {
-            let noise = self.framer.tally().read > read + NOISE;
             let seconds = 1 << seconds.ilog2();
             let baud = (rates.len() == 1).then_some(self.baud);
-            self.trouble = Some(Trouble::NoPackets { baud, noise, seconds });
+            self.trouble = Some(Trouble::NoPackets { baud, seconds });
         }
     }
 
@@ -406,7 +404,5 @@ const LISTEN: Nanos = 300 * MILLIS;
 const SILENCE: Nanos = 1_000 * MILLIS;
 /// The slowest head turns twice a second.
 const STILL: Nanos = 2_000 * MILLIS;
-/// So few bytes may be what an adapter makes of a cable that is plugged in.
-const NOISE: u64 = 64;
 /// Packets of one sample at the most: of an STL27L, which sends one each 0.56 ms.
 const MOST: usize = 17;

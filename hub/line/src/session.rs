@@ -66,6 +66,10 @@ pub trait Session {
     /// Why it is not where it should be; nothing if it is.
     fn trouble(&self) -> Option<Self::Trouble>;
 
+    /// Returns the name of the transmissions that the session misses, such as `LMS replies`, while its
+    /// [`trouble`](Self::trouble) is that none of them arrive. Other bytes may arrive meanwhile.
+    fn missing(&self) -> Option<&'static str>;
+
     /// The rate at which it listens, and talks if it does, in bits per second.
     fn rate(&self) -> u32;
 
@@ -116,6 +120,10 @@ macro_rules! delegate_session {
 
         fn state(&self) -> $crate::State {
             $each!(self, session => session.state())
+        }
+
+        fn missing(&self) -> Option<&'static str> {
+            $each!(self, session => session.missing())
         }
 
         fn rate(&self) -> u32 {

@@ -331,6 +331,10 @@ impl line::Session for Session {
         self.trouble()
     }
 
+    fn missing(&self) -> Option<&'static str> {
+        matches!(self.trouble(), Some(Trouble::NoAnswer { .. })).then_some("LMS replies")
+    }
+
     fn rate(&self) -> u32 {
         self.dialogue.baud.rate()
     }

@@ -17,20 +17,21 @@ mod usb_adapter;
 
 use std::io;
 use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
+use std::path::Path;
 use std::sync::atomic::AtomicBool;
 
 use schema::Failure;
 
 pub use allowance::Allowance;
 pub use candidates::{Candidate, PROMPT_MS, candidates, found_in, is_tty, latency_ms};
-pub use holder::{Holder, all_holders, holder};
+pub use holder::{Holder, all_holders, altering_program, holder};
 pub use kernel::Counts;
 pub use line_errors::LineErrors;
 pub use port_error::PortError;
 pub use rights::{Ownership, Rights};
 pub use source::Source;
 pub use tcp::{Dial, Tcp};
-pub use tty::Tty;
+pub use tty::{Alteration, Tty};
 pub use usb_adapter::{PortlessAdapter, Reason};
 
 /// An open line to a sensor; reads and writes never block.
@@ -76,7 +77,7 @@ impl Port {
     /// Whether another program simulates the sensor.
     pub fn simulated(&self) -> bool {
         match self {
-            Port::Tty(tty) => tty.simulated,
+            Port::Tty(tty) => tty.is_simulated(),
             Port::Tcp(_) => false,
         }
     }
@@ -171,6 +172,39 @@ impl Port {
     pub fn counts(&self) -> Option<Counts> {
         match self {
             Port::Tty(tty) => tty.counts(),
+            Port::Tcp(_) => None,
+        }
+    }
+
+    /// Returns the settings that another process has made since those of this process; `None` if they are unchanged, or
+    /// made elsewhere.
+    ///
+    /// # Errors
+    ///
+    /// Returns an error if the line is lost.
+    pub fn altered(&self) -> io::Result<Option<Alteration>> {
+        match self {
+            Port::Tty(tty) => tty.altered(),
+            Port::Tcp(_) => Ok(None),
+        }
+    }
+
+    /// Makes the settings of this process again, at `baud`, and discards the input that arrived with others.
+    ///
+    /// # Errors
+    ///
+    /// Returns an error if the line is lost, or if the driver refuses the settings.
+    pub fn restore(&self, baud: u32) -> io::Result<()> {
+        match self {
+            Port::Tty(tty) => tty.restore(baud),
+            Port::Tcp(_) => Ok(()),
+        }
+    }
+
+    /// Returns the device that the port's name resolved to when it was opened; `None` for a serial server.
+    pub fn device(&self) -> Option<&Path> {
+        match self {
+            Port::Tty(tty) => Some(tty.device()),
             Port::Tcp(_) => None,
         }
     }

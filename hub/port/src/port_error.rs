@@ -9,7 +9,7 @@ use rustix::io::Errno;
 use schema::{Failure, Kind};
 
 use super::candidates::{Candidate, candidates};
-use super::holder::{Holder, holder, is_own};
+use super::holder::{Holder, holder, is_own, lock_owner};
 use super::rights::Rights;
 use super::usb_adapter::PortlessAdapter;
 use crate::Source;
@@ -75,7 +75,7 @@ impl PortError {
                     format!("{name}: in use by another link of this hub"),
                     "name the port of each sensor",
                 ),
-                holder => busy(path, holder),
+                holder => busy(path, holder.or_else(|| lock_owner(path))),
             },
             PortError::NotTty if path.is_dir() => {
                 let hint = format!("it is a directory; {}", instead(&name, &candidates(), &portless()));

@@ -1,15 +1,17 @@
 //! A serial line: opened exclusively, raw, and at a rate that the driver has confirmed.
 
 use std::cell::Cell;
+use std::fmt;
 use std::io::{self, ErrorKind};
 use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
 use std::os::unix::fs::MetadataExt;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use rustix::fs::{FlockOperation, Mode, OFlags, flock, fstat, open};
 use rustix::io::Errno;
 use rustix::termios::{
-    ControlModes, InputModes, OptionalActions, ioctl_tiocexcl, ioctl_tiocnxcl, tcgetattr, tcsetattr,
+    ControlModes, InputModes, LocalModes, OptionalActions, OutputModes, SpecialCodeIndex, Termios,
+    ioctl_tiocexcl, ioctl_tiocnxcl, tcgetattr, tcsetattr,
 };
 
 use super::PortError;
@@ -20,8 +22,10 @@ use super::line_settings;
 /// An open serial line, exclusive and raw; reads and writes never block.
 pub struct Tty {
     line: OwnedFd,
-    /// Whether another program plays the sensor.
-    pub(crate) simulated: bool,
+    /// Device that the port's name resolved to when it was opened.
+    device: PathBuf,
+    /// Settings of this process, to detect those of another one.
+    settings: Cell<Settings>,
     /// The driver's count of errors when it was last looked at; nothing if it has none.
     errors: Cell<Option<u32>>,
 }
@@ -52,25 +56,20 @@ impl Tty {
     }
 
     fn begin(line: OwnedFd, path: &Path, baud: u32) -> Result<Tty, PortError> {
-        let mut termios = tcgetattr(&line)?;
+        let termios = tcgetattr(&line)?;
         // Before the exclusive mode: who does not get the lock must not end that of its owner.
         flock(&line, FlockOperation::NonBlockingLockExclusive).map_err(|error| match error {
             Errno::WOULDBLOCK => PortError::Busy,
             error => error.into(),
         })?;
         ioctl_tiocexcl(&line)?;
-        let simulated = path.canonicalize().is_ok_and(|real| real.starts_with("/dev/pts"));
-        let tty = Tty { line, simulated, errors: Cell::new(None) };
+        let device = path.canonicalize().unwrap_or_else(|_| path.to_owned());
+        let tty = Tty { line, device, settings: Cell::new(Settings::of(&termios)), errors: Cell::new(None) };
         // Not all drivers have this, and a sensor streams without it.
         if let Err(error) = kernel::hand_over_at_once(&tty.line) {
             tracing::debug!(%error, "{}: no low latency", path.display());
         }
-        // No parity, and no byte is dropped or doubled for its errors; the modem's lines mean nothing here.
-        termios.make_raw();
-        termios.input_modes.remove(InputModes::IXOFF | InputModes::IXANY | InputModes::INPCK);
-        termios.control_modes.insert(ControlModes::CREAD | ControlModes::CLOCAL);
-        tcsetattr(&tty.line, OptionalActions::Now, &termios)?;
-        tty.check(line_settings::apply(&tty.line, baud), baud)?;
+        tty.configure(termios, baud)?;
         if let Some(ms) = latency_ms(path).filter(|&ms| ms > PROMPT_MS) {
             tracing::warn!(
                 "{}: the adapter collects bytes for {ms} ms, so stamps are off by as much; a udev rule ends that: \
@@ -80,6 +79,54 @@ impl Tty {
         }
         tty.errors.set(tty.counts().map(|counts| counts.errors()));
         Ok(tty)
+    }
+
+    /// Makes the line raw, at `baud`; `termios` are its settings until now.
+    fn configure(&self, mut termios: Termios, baud: u32) -> Result<(), PortError> {
+        // No parity, and no byte is dropped or doubled for its errors; the modem's lines mean nothing here.
+        termios.make_raw();
+        termios.input_modes.remove(InputModes::IXOFF | InputModes::IXANY | InputModes::INPCK);
+        termios.control_modes.insert(ControlModes::CREAD | ControlModes::CLOCAL);
+        tcsetattr(&self.line, OptionalActions::Now, &termios)?;
+        self.check(line_settings::apply(&self.line, baud), baud)?;
+        self.settings.set(Settings::of(&tcgetattr(&self.line)?));
+        Ok(())
+    }
+
+    /// Returns the settings that another process has made since those of this process; `None` if they are unchanged.
+    ///
+    /// # Errors
+    ///
+    /// Returns an error if the line is lost.
+    pub(crate) fn altered(&self) -> io::Result<Option<Alteration>> {
+        let (own, now) = (self.settings.get(), Settings::of(&tcgetattr(&self.line)?));
+        Ok((now != own).then_some(match now.speed {
+            speed if speed != own.speed => Alteration::Rate(speed),
+            _ => Alteration::Settings,
+        }))
+    }
+
+    /// Makes the settings of this process again, at `baud`, and discards the input that arrived with others.
+    ///
+    /// # Errors
+    ///
+    /// Returns an error if the line is lost, or if the driver refuses the settings.
+    pub(crate) fn restore(&self, baud: u32) -> io::Result<()> {
+        let configured = self.configure(tcgetattr(&self.line)?, baud);
+        line_settings::clear_input(&self.line).map_err(|_| self.gone())?;
+        // With other settings every byte is an error.
+        self.line_errors();
+        configured.map_err(|refusal| io::Error::other(refusal.to_string()))
+    }
+
+    /// Returns the device that the port's name resolved to when it was opened.
+    pub(crate) fn device(&self) -> &Path {
+        &self.device
+    }
+
+    /// Returns whether another program simulates the sensor.
+    pub(crate) fn is_simulated(&self) -> bool {
+        self.device.starts_with("/dev/pts")
     }
 
     /// What the driver counted since it was loaded, if it counts.
@@ -102,6 +149,9 @@ impl Tty {
 
     pub(crate) fn set_baud(&self, baud: u32) -> io::Result<()> {
         let applied = self.check(line_settings::apply_baud(&self.line, baud), baud);
+        if let Some(speed) = self.baud() {
+            self.settings.set(Settings { speed, ..self.settings.get() });
+        }
         line_settings::clear_input(&self.line).map_err(|_| self.gone())?;
         // At a wrong rate every byte is an error.
         self.line_errors();
@@ -129,6 +179,8 @@ impl Tty {
 
     pub(crate) fn read(&self, buffer: &mut [u8]) -> io::Result<usize> {
         match rustix::io::read(&self.line, buffer) {
+            // With VMIN = 0, as some programs set it, an empty buffer reads like the end of the line.
+            Ok(0) if self.baud().is_some() => Ok(0),
             Ok(0) | Err(Errno::IO) => Err(hung_up()),
             Err(Errno::AGAIN | Errno::INTR) => Ok(0),
             other => Ok(other?),
@@ -169,6 +221,60 @@ impl Drop for Tty {
     }
 }
 
+/// Settings of a line on which it depends whether bytes arrive as they were sent.
+#[derive(Clone, Copy, PartialEq, Eq)]
+struct Settings {
+    /// In bits per second.
+    speed: u32,
+    input: InputModes,
+    output: OutputModes,
+    control: ControlModes,
+    local: LocalModes,
+    /// Number of bytes that a read waits for.
+    min: u8,
+}
+
+impl Settings {
+    fn of(termios: &Termios) -> Settings {
+        Settings {
+            speed: termios.output_speed(),
+            input: termios.input_modes,
+            output: termios.output_modes,
+            control: termios.control_modes & CHARACTER,
+            local: termios.local_modes,
+            min: termios.special_codes[SpecialCodeIndex::VMIN],
+        }
+    }
+}
+
+/// A change of an open line's settings by another process.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Alteration {
+    /// The rate, in bits per second, perhaps with other settings.
+    Rate(u32),
+    /// Other settings, at the same rate.
+    Settings,
+}
+
+impl fmt::Display for Alteration {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Alteration::Rate(baud) => write!(f, "the port was set to {baud} baud by another process"),
+            Alteration::Settings => f.write_str("the port's settings were changed by another process"),
+        }
+    }
+}
+
+/// Control modes other than the rate, which has its own field, and HUPCL, which decides nothing while the line is open.
+const CHARACTER: ControlModes = ControlModes::CSIZE
+    .union(ControlModes::CSTOPB)
+    .union(ControlModes::CREAD)
+    .union(ControlModes::PARENB)
+    .union(ControlModes::PARODD)
+    .union(ControlModes::CMSPAR)
+    .union(ControlModes::CLOCAL)
+    .union(ControlModes::CRTSCTS);
+
 /// How the kernel tells that the adapter was unplugged, the pty's other side closed, or the line hung up.
 fn hung_up() -> io::Error {
     io::Error::new(ErrorKind::UnexpectedEof, "the line hung up")
@@ -189,7 +295,7 @@ fn is_near(given: u32, wanted: u32) -> bool {
 }
 
 #[cfg(test)]
-mod tests {
+pub(crate) mod tests {
     use super::*;
 
     #[test]
@@ -197,6 +303,55 @@ mod tests {
         assert!(is_near(500_000, 500_000) && is_near(485_000, 500_000) && is_near(515_000, 500_000));
         // What drivers make of 500 kBd that cannot do it.
         assert!(!is_near(460_800, 500_000) && !is_near(9600, 500_000) && !is_near(0, 500_000));
+    }
+
+    /// The other end of a pty whose slave is at the path.
+    pub(crate) fn pty() -> (OwnedFd, PathBuf) {
+        use rustix::pty::{OpenptFlags, grantpt, openpt, ptsname, unlockpt};
+        let master = openpt(OpenptFlags::RDWR | OpenptFlags::NOCTTY).expect("a pty");
+        grantpt(&master).and_then(|()| unlockpt(&master)).expect("a slave");
+        let name = ptsname(&master, Vec::new()).expect("a name").into_string().expect("ASCII");
+        (master, name.into())
+    }
+
+    #[test]
+    fn changes_by_another_process_are_detected_and_undone() {
+        let (other, path) = pty();
+        let tty = Tty::open(&path, 500_000).expect("it is free");
+        let change = |change: &dyn Fn(&mut Termios)| {
+            let mut termios = tcgetattr(&other).expect("a terminal");
+            change(&mut termios);
+            tcsetattr(&other, OptionalActions::Now, &termios).expect("a terminal");
+            tty.altered().expect("it is connected")
+        };
+        assert_eq!(change(&|_| {}), None);
+        tty.set_baud(38_400).expect("a pty takes every rate");
+        tty.set_dtr(true).expect("it is connected");
+        assert_eq!(change(&|_| {}), None, "changes by this process");
+        let rate = |termios: &mut Termios| termios.set_speed(9600).expect("a valid rate");
+        let parity = |termios: &mut Termios| termios.input_modes.insert(InputModes::ISTRIP);
+        let lines = |termios: &mut Termios| termios.local_modes.insert(LocalModes::ICANON);
+        for (by, alteration) in [
+            (&rate as &dyn Fn(&mut Termios), Alteration::Rate(9600)),
+            (&parity, Alteration::Settings),
+            (&lines, Alteration::Settings),
+        ] {
+            assert_eq!(change(by), Some(alteration));
+            tty.restore(38_400).expect("it is connected");
+            assert_eq!((tty.altered().expect("it is connected"), tty.baud()), (None, Some(38_400)));
+        }
+    }
+
+    #[test]
+    fn an_empty_read_is_no_hang_up_unless_the_line_is_lost() {
+        let (other, path) = pty();
+        let tty = Tty::open(&path, 500_000).expect("it is free");
+        let mut termios = tcgetattr(&other).expect("a terminal");
+        termios.special_codes[SpecialCodeIndex::VMIN] = 0;
+        tcsetattr(&other, OptionalActions::Now, &termios).expect("a terminal");
+        assert_eq!(tty.read(&mut [0; 8]).expect("it is connected"), 0);
+        drop(other);
+        assert_eq!(tty.read(&mut [0; 8]).map_err(|error| error.kind()), Err(ErrorKind::UnexpectedEof));
     }
 
     #[test]

@@ -94,7 +94,7 @@ pub struct Session {
     /// As [`line::family::Turning::scanner_time`].
     pub(crate) scanner_time: Option<Nanos>,
     trouble: Option<Trouble>,
-    /// Since when nothing answers, and bytes read by then.
+    /// Time since which no response has arrived, and the number of bytes read by then.
     quiet_since: Option<(Nanos, u64)>,
     /// Bytes of streams that were in nothing, and all of those when it was last looked.
     damaged: (u64, u64),

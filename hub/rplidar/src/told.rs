@@ -82,8 +82,6 @@ pub enum Trouble {
     NoAnswer {
         /// The only rate at which was asked; `None`: at all of them.
         baud: Option<u32>,
-        /// Whether anything comes that is no answer.
-        noise: bool,
         /// For how long already, in steps that grow.
         seconds: u32,
     },
@@ -104,15 +102,13 @@ pub enum Trouble {
 impl fmt::Display for Trouble {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
-            Trouble::NoAnswer { baud, noise, seconds } => {
-                f.write_str(if *noise { "bytes but no answer at " } else { "no answer at " })?;
+            Trouble::NoAnswer { baud, seconds } => {
+                f.write_str("no answer at ")?;
                 match baud {
                     Some(baud) => write!(f, "{baud}")?,
                     None => f.write_str("115200, 256000, 460800 and 1000000")?,
                 }
-                let remedy =
-                    if *noise { "another scanner? stop the hub and run `scanhub probe`" } else { "power, cable, other port?" };
-                write!(f, " baud for {seconds} s: {remedy}")
+                write!(f, " baud for {seconds} s: power, cable, other port?")
             }
             Trouble::Silence => f.write_str("no measured data for one second"),
             Trouble::StandsStill => f.write_str("packets come, but the head does not turn: is it blocked?"),

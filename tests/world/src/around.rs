@@ -103,6 +103,10 @@ impl Surroundings for Around<'_> {
         Failure::new(kind, format!("{}: {error}", source.name()), "")
     }
 
+    fn altering_program(&self, _: &Source) -> Option<String> {
+        None
+    }
+
     fn take_kept(&self, name: &str, _: &Source, baud: u32) -> Option<OpenLine> {
         let handle = self.shared.kept.borrow().get(name).cloned()?;
         let mut tty = self.shared.ports[handle.port].borrow_mut();

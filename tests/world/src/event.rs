@@ -34,6 +34,8 @@ pub(crate) enum Event<'a> {
     Flushed { sensor: usize, from: u64, to: u64 },
     /// The port has another rate: what a session knew of bytes before is void.
     Retuned { sensor: usize },
+    /// Another process has set the port to another rate.
+    Altered { sensor: usize },
     /// The hub has read so many bytes, up to this one.
     Read { sensor: usize, len: usize, to: u64 },
     /// A sample went to whoever is attached.
@@ -202,6 +204,7 @@ impl Event<'_> {
             }
             Event::Flushed { sensor, from, to } => numbers(&[7, sensor as u64, from, to]),
             Event::Retuned { sensor } => numbers(&[8, sensor as u64]),
+            Event::Altered { sensor } => numbers(&[31, sensor as u64]),
             Event::Read { sensor, to, .. } => numbers(&[9, sensor as u64, to]),
             Event::Published { sensor, sample } => {
                 numbers(&[10, sensor as u64, sample.topic as u64]);

@@ -2,11 +2,12 @@
 
 use std::cell::Cell;
 use std::io;
+use std::path::Path;
 use std::rc::Rc;
 
 use daemon::surroundings::Line;
 use lms::Nanos;
-use port::Allowance;
+use port::{Allowance, Alteration};
 
 use crate::planted::{Defect, eeprom_request};
 use crate::shared::Shared;
@@ -111,6 +112,17 @@ impl Line for OpenLine {
         Ok(None)
     }
 
+    fn altered(&self) -> io::Result<Option<Alteration>> {
+        let Handle { shared, port, device } = &*self.handle;
+        let tty = shared.ports[*port].borrow();
+        let is_told = self.check(tty.is_there(*device))? && !shared.planted.is(Defect::HiddenRate);
+        Ok(tty.altered().filter(|_| is_told).map(Alteration::Rate))
+    }
+
+    fn restore(&self, baud: u32) -> io::Result<()> {
+        self.set_baud(baud).map(drop)
+    }
+
     fn set_dtr(&self, _: bool) -> io::Result<()> {
         Ok(())
     }
@@ -128,6 +140,10 @@ impl Line for OpenLine {
 
     fn line_errors(&self) -> u64 {
         0
+    }
+
+    fn device(&self) -> Option<&Path> {
+        None
     }
 
     fn is_simulated(&self) -> bool {

@@ -77,11 +77,13 @@ pub enum Defect {
     WrongPlaces,
     /// A warning that does not hold is not taken back.
     KeptWarning,
+    /// The port does not tell that another process set its rate.
+    HiddenRate,
 }
 
 impl Defect {
     /// All of them.
-    pub const ALL: [Defect; 34] = [
+    pub const ALL: [Defect; 35] = [
         Defect::LostWake,
         Defect::OneRing,
         Defect::LostByte,
@@ -116,6 +118,7 @@ impl Defect {
         Defect::UnturnedHead,
         Defect::WrongPlaces,
         Defect::KeptWarning,
+        Defect::HiddenRate,
     ];
 }
 

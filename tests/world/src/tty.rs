@@ -27,6 +27,8 @@ pub(crate) struct Tty {
     pub(crate) refuses: Option<PortError>,
     is_open: bool,
     rate: u32,
+    /// Rate that the hub has set; another process may have set another one.
+    own_rate: u32,
     mistuned: Mistuned,
     buffer: VecDeque<u8>,
     /// Bytes that went into the buffer, ever.
@@ -51,6 +53,7 @@ impl Tty {
             refuses: None,
             is_open: false,
             rate: 9_600,
+            own_rate: 9_600,
             mistuned: Mistuned::default(),
             buffer: VecDeque::with_capacity(ROOM),
             put: 0,
@@ -113,7 +116,7 @@ impl Tty {
             return Err(PortError::Busy);
         }
         self.is_open = true;
-        self.rate = rate;
+        (self.rate, self.own_rate) = (rate, rate);
         log.tell(now, &Event::Opened { sensor: self.number, offset: self.taken() });
         Ok(device)
     }
@@ -124,7 +127,7 @@ impl Tty {
         if !self.is_there(device) || self.is_elsewhere {
             return false;
         }
-        self.rate = rate;
+        (self.rate, self.own_rate) = (rate, rate);
         log.tell(now, &Event::Opened { sensor: self.number, offset: self.taken() });
         true
     }
@@ -168,8 +171,22 @@ impl Tty {
     /// Changes the rate, and discards what arrived.
     pub(crate) fn set_rate(&mut self, rate: u32, log: &Log, now: Nanos) {
         self.flush(log, now);
-        self.rate = rate;
+        (self.rate, self.own_rate) = (rate, rate);
         log.tell(now, &Event::Retuned { sensor: self.number });
+    }
+
+    /// Another process sets the rate.
+    pub(crate) fn alter(&mut self, rate: u32, log: &Log, now: Nanos) {
+        self.advance(now, log);
+        if self.is_open && rate != self.rate {
+            self.rate = rate;
+            log.tell(now, &Event::Altered { sensor: self.number });
+        }
+    }
+
+    /// Rate that another process has set since the hub did.
+    pub(crate) fn altered(&self) -> Option<u32> {
+        (self.rate != self.own_rate).then_some(self.rate)
     }
 
     /// The adapter is pulled out.

@@ -34,6 +34,7 @@ fn judge(defect: Defect) -> &'static [&'static str] {
         Defect::DeafScanner | Defect::UnturnedHead => &["liveness"],
         Defect::WrongPlaces => &["turns"],
         Defect::KeptWarning => &["early"],
+        Defect::HiddenRate => &["settings"],
     }
 }
 

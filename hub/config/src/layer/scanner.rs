@@ -66,9 +66,26 @@ impl ScannerDraft {
     /// What it says; `refuse` makes the failure of a place, of what is said there and of the remedy.
     pub(super) fn finish(self, refuse: impl Fn(&str, String, &str) -> Failure) -> Result<Scanner, Failure> {
         let ScannerDraft { family, model, beams, mode, stop_when_idle } = self;
-        let family = family.map_or(Family::Lms, |(family, _)| family);
-        let name = family.name();
         let model = model.filter(|(model, _)| !model.eq_ignore_ascii_case(AUTO));
+        let implied = model.as_ref().and_then(|(model, _)| family_of(model));
+        let set = family.as_ref().map(|(family, _)| *family);
+        if let (Some((model, place)), Some((family, family_place)), Some(implied)) =
+            (&model, &family, implied)
+            && implied != *family
+        {
+            let [implied, family] = [implied.name(), family.name()];
+            let what =
+                format!("model = \"{model}\" is of family {implied}, but {family_place} says {family}");
+            return Err(refuse(place, what, &format!("leave `family` out, or set family = \"{implied}\"")));
+        }
+        if let (Some((model, place)), None, None) = (&model, set, implied) {
+            let known = Family::ALL.into_iter().filter_map(features).flat_map(|features| features.models);
+            let names = auto_or(known.map(|model| model.name));
+            let remedy = format!("{names}; an LMS says itself what it is, `type` is what is expected of it");
+            return Err(refuse(place, format!("model = \"{model}\""), &remedy));
+        }
+        let family = set.or(implied).unwrap_or(Family::Lms);
+        let name = family.name();
         let mode = mode.filter(|(mode, _)| mode != AUTO);
         let rest = stop_when_idle.filter(|(stops, _)| *stops);
         let known = features(family);
@@ -109,6 +126,16 @@ impl ScannerDraft {
         turning.stop_when_idle = rest.is_some();
         Ok(Scanner::Turning(turning))
     }
+}
+
+/// Returns the family of the model called `model`, whose name belongs to one family alone.
+fn family_of(model: &str) -> Option<Family> {
+    let has = |family: &Family| {
+        features(*family).is_some_and(|features| {
+            features.models.iter().any(|known| known.name.eq_ignore_ascii_case(model))
+        })
+    };
+    Family::ALL.into_iter().find(has)
 }
 
 /// The mode called `mode` of a family called `name`; else what is wrong, and the remedy.

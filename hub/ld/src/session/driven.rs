@@ -85,6 +85,10 @@ impl line::Session for Session {
         self.trouble.filter(|_| !matches!(self.phase, Phase::Paused))
     }
 
+    fn missing(&self) -> Option<&'static str> {
+        matches!(self.trouble(), Some(Trouble::NoPackets { .. })).then_some("LDROBOT packets")
+    }
+
     fn rate(&self) -> u32 {
         self.baud
     }

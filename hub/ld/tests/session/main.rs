@@ -337,7 +337,7 @@ fn where_nobody_speaks_it_says_so_in_steps() {
         }
     }
     assert_eq!(bauds[..3], [921_600, 230_400, 921_600]);
-    let steps = [1, 2, 4, 8, 16].map(|seconds| Trouble::NoPackets { baud: None, noise: false, seconds });
+    let steps = [1, 2, 4, 8, 16].map(|seconds| Trouble::NoPackets { baud: None, seconds });
     assert_eq!(troubles[1..], steps.map(Some));
     assert!(steps[0].to_string().contains("230400 and 921600"));
 }

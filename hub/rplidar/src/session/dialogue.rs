@@ -157,10 +157,8 @@ impl Session {
     pub(super) fn complain(&mut self, since: Nanos) {
         let seconds = (self.now.saturating_sub(since) / (1_000 * MILLIS)) as u32;
         if seconds > 0 && self.trouble != Some(Trouble::Alike) {
-            let read = self.quiet_since.map_or(0, |(_, read)| read);
-            let noise = self.framer.tally().read > read + NOISE;
             let baud = self.next_rate().is_none().then_some(self.baud);
-            self.trouble = Some(Trouble::NoAnswer { baud, noise, seconds: 1 << seconds.ilog2() });
+            self.trouble = Some(Trouble::NoAnswer { baud, seconds: 1 << seconds.ilog2() });
         }
     }
 
@@ -411,8 +409,6 @@ const GREETING: u32 = 64;
 const SETTLE: Nanos = 10 * MILLIS;
 /// An unwell scanner is asked again after so long.
 const AGAIN: Nanos = 2_000 * MILLIS;
-/// So few bytes may be what an adapter makes of a cable that is plugged in.
-const NOISE: u64 = 64;
 /// Turns per minute that are asked for: of an S1, its maker's choice.
 const SPEED: u16 = 600;
 /// The duty cycle that is asked for, of 1,023: of an A2, its maker's choice.

@@ -132,6 +132,10 @@ impl line::Session for Session {
         self.trouble.or(self.no_mode.map(Trouble::NoMode)).or(warning).filter(|_| !is_paused)
     }
 
+    fn missing(&self) -> Option<&'static str> {
+        matches!(self.trouble(), Some(Trouble::NoAnswer { .. })).then_some("RPLIDAR replies")
+    }
+
     fn rate(&self) -> u32 {
         self.baud
     }

@@ -76,7 +76,7 @@ fn where_the_rate_is_fixed_it_stays() {
     bench.run(5 * SECOND);
     assert!(bench.log.bauds.is_empty());
     let told = bench.session.trouble().expect("told");
-    assert!(matches!(told, Trouble::NoAnswer { baud: Some(256_000), noise: false, seconds: 2.. }), "{told}");
+    assert!(matches!(told, Trouble::NoAnswer { baud: Some(256_000), seconds: 2.. }), "{told}");
     bench.head.is_on = true;
     bench.until(3 * SECOND, is_streaming);
     assert_eq!(bench.session.trouble(), None);

@@ -1,6 +1,7 @@
 //! What can go wrong: one file for each kind, with its name, its keys and what it does. A plan draws, prints and parses all of
 //! them alike. What an action breaks it mends itself after a while, or when everything is made well again.
 
+mod altered;
 mod brown_out;
 mod consumers;
 mod deaf;
@@ -107,6 +108,7 @@ pub(crate) const KINDS: &[Kind] = &[
     unwell::KIND,
     deaf::KIND,
     router_killed::KIND,
+    altered::KIND,
 ];
 
 /// Gateway and listener of a world with these actions have a key.

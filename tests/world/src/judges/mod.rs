@@ -20,6 +20,7 @@ mod remote_nothing_invented;
 mod remote_numbers;
 mod remote_verdict;
 mod resources;
+mod settings;
 mod turns;
 mod verdict;
 
@@ -77,6 +78,7 @@ pub(crate) fn all(setup: &Setup, plan: &Plan) -> Vec<Box<dyn Judge>> {
         Box::new(recording::Recording::new(plan.seed)),
         Box::new(verdict::OfRobot::new(setup, plan)),
         Box::new(liveness::Liveness::new(sensors)),
+        Box::new(settings::Settings::new(sensors.len())),
         Box::new(resources::Resources),
         Box::new(eeprom::Eeprom),
         Box::new(remote_nothing_invented::RemoteNothingInvented::new(&terms)),
