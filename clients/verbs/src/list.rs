@@ -21,14 +21,15 @@ pub struct ListOptions {
     pub places: Vec<Domain>,
 }
 
-/// Writes the topics of every sensor of the hub to `out`, with rate, consumers, payload type and revision.
+/// Writes the topics of every sensor of the hub to `out`, with rate, consumers, payload type and revision. As text, the
+/// problem of each sensor that has one follows.
 ///
 /// [`Kind::NoHub`](schema::Kind) within a second if there is none, [`Kind::Interrupted`](schema::Kind) if `stop` is set.
 pub fn list(options: &ListOptions, out: &mut dyn Write, stop: &AtomicBool) -> Result<(), Failure> {
     let domain = find(&options.places)?;
     let node = ipc::client_node(&domain)?;
     let sensors = ipc::sensors(&domain)?;
-    let mut lines = Vec::new();
+    let (mut lines, mut problems) = (Vec::new(), Vec::new());
     for sensor in &sensors {
         of_sensor(&node, sensor, &mut lines)?;
     }
@@ -41,6 +42,10 @@ pub fn list(options: &ListOptions, out: &mut dyn Write, stop: &AtomicBool) -> Re
                 |status: &&Status| line.topic != Topic::Telegram || status.family() == Some(Family::Lms);
             line.hz = status.as_ref().filter(is_of_scans).and_then(Status::rate_hz);
         }
+        if let Some(status) = status.filter(|status| !status.last_error().is_empty()) {
+            let state = status.state().map_or("unknown", State::name);
+            problems.push(format!("{sensor}: {state}: {}", status.last_error()));
+        }
     }
     let mut output = Output::new(out);
     if options.json {
@@ -48,7 +53,9 @@ pub fn list(options: &ListOptions, out: &mut dyn Write, stop: &AtomicBool) -> Re
     }
     let mut rows = vec![["TOPIC", "HZ", "CONSUMERS", "PAYLOAD", "REVISION"].map(String::from).to_vec()];
     rows.extend(lines.iter().map(Line::row));
-    quiet(table(&mut output, &rows))
+    quiet(table(&mut output, &rows).and_then(|()| {
+        problems.iter().try_for_each(|problem| output.line(|line| write!(line, "{problem}")))
+    }))
 }
 
 /// Writes every live domain below `bases` (`--root`, or [`Environment::bases`](schema::Environment::bases)) to `out`.

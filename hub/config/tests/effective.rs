@@ -174,3 +174,11 @@ fn the_default_is_what_holds_without_a_word() {
     let all = Config::load(&sources(&[&all], &[], &[])).unwrap();
     assert!(all.links[0].family.is_some() && all.links[0].unit.is_some());
 }
+
+#[test]
+fn family_implied_by_the_model_names_the_model() {
+    let links = ["front=/dev/ttyUSB0,model=ld19", "rear=/dev/ttyUSB1,family=ld,model=ld19"];
+    let values = values(&sources(&[], &links, &[])).unwrap();
+    assert_eq!(shown(&values, "link.front.family"), (&json!("ld"), "default of ld19"));
+    assert_eq!(shown(&values, "link.rear.family"), (&json!("ld"), "--link rear=/dev/ttyUSB1,family=ld,model=ld19"));
+}

@@ -141,6 +141,16 @@ fn a_link_has_a_family_and_what_its_family_needs() {
 }
 
 #[test]
+fn every_model_belongs_to_one_family() {
+    let features = schema::Family::ALL.into_iter().filter_map(scanner::features);
+    let mut names: Vec<_> = features.flat_map(|features| features.models).map(|model| model.name).collect();
+    let count = names.len();
+    names.sort_unstable();
+    names.dedup();
+    assert_eq!(names.len(), count, "{names:?}");
+}
+
+#[test]
 fn a_mode_and_rest_are_for_those_that_have_them() {
     let family = "link.front.family=rplidar";
     let front = |set: &[&str]| load(&[&[family], set].concat()).map(|mut config| config.links.swap_remove(0));

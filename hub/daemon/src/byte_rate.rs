@@ -63,7 +63,7 @@ pub(crate) fn with_commas(number: u64) -> String {
 
 /// Longer than a search at all rates, so that the rate of the host's port does not change the result.
 const WINDOW: Nanos = 5_000 * MILLIS;
-/// Number of bytes that an adapter may make of a cable that is plugged in.
+/// Number of bytes that an adapter may deliver when a cable is plugged in.
 const NOISE: u64 = 64;
 
 #[cfg(test)]

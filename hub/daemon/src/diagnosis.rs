@@ -49,7 +49,7 @@ pub(crate) struct Diagnosis<'a> {
 struct Facts {
     state: State,
     trouble: Option<Trouble>,
-    /// Rate of the bytes that arrive in place of what the session is [missing](line::Session::missing).
+    /// Rate of the bytes that arrive while the session is [missing](line::Session::missing) something.
     bytes_per_second: Option<u64>,
     other_model: Option<&'static str>,
     unit: Option<Unit>,
@@ -106,7 +106,7 @@ impl<'a> Diagnosis<'a> {
         (state, is_new)
     }
 
-    /// Returns the rate of the bytes that arrive in place of what the session is missing, if it is missing something.
+    /// Measures the rate of the bytes that arrive at `now`. Returns it while the session is missing something.
     fn measure(&mut self, driver: &Driver, now: Nanos) -> Option<u64> {
         if driver.state() == line::State::Streaming {
             self.byte_rate = ByteRate::default();
@@ -117,13 +117,13 @@ impl<'a> Diagnosis<'a> {
         driver.missing().and_then(|_| self.byte_rate.shown(now, read))
     }
 
-    /// The port is open, as `device` if that is known.
+    /// Handles that the port has been opened, as `device` if that is known.
     pub(crate) fn open(&mut self, device: Option<&Path>) {
         self.device = device.map(|device| device.display().to_string());
         self.byte_rate = ByteRate::default();
     }
 
-    /// Another process has changed the settings of the port, which the hub has set again at `now`; `words` say so.
+    /// Takes the message `words` about settings that another process had changed, and that the hub has restored at `now`.
     pub(crate) fn note_altered(&mut self, words: String, now: Nanos) {
         self.altered = Some((words, now + ALTERED_SHOWN));
         self.facts = None;
@@ -258,7 +258,7 @@ impl<'a> Diagnosis<'a> {
         }
     }
 
-    /// Returns the message that `rate` bytes per second arrive, but none of what is `missing`.
+    /// Returns the message that `rate` bytes per second arrive, but none of the `missing` transmissions.
     fn other_bytes(&self, missing: &str, rate: u64) -> String {
         let is_server = matches!(self.link.port, Source::Tcp { .. });
         let other_rate = if is_server { ", or does the server use another rate" } else { "" };

@@ -254,7 +254,8 @@ impl<'a, S: Surroundings> Drive<'a, S> {
             self.line_errors.wait();
             open.settings_check.pass();
         }
-        if open.settings_check.is_due(session.state(), around.now()) && restore(core, line, session.rate())? {
+        let now = around.now();
+        if open.settings_check.is_due(session.state(), now) && restore(core, line, session.rate())? {
             open.backlog = None;
         }
         // Whether anybody follows is asked once a scan: that takes a look at the places of all who might.
@@ -272,12 +273,12 @@ impl<'a, S: Surroundings> Drive<'a, S> {
             }
         }
         self.identity.keep_first(session);
-        let (state, is_new) = core.diagnosis.examine(session, around.now());
+        let (state, is_new) = core.diagnosis.examine(session, now);
         if is_new && let Some(found) = session.found_at() {
             self.found = Some(found);
             rates(core).iter().for_each(|rates| rates.keep_rate(&core.link.port.name(), found));
         }
-        if (is_new || core.is_due(around.now())) && core.show_session(session, state) {
+        if (is_new || core.is_due(now)) && core.show_session(session, state) {
             self.identity.keep(session, around.now());
             if core.stops_when_idle() {
                 session.followed(around.now(), core.output.topics.is_followed());

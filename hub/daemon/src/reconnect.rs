@@ -40,9 +40,9 @@ impl<'a, S: Surroundings> LiveLink<'a, S> {
     ///
     /// # Errors
     ///
-    /// Returns an error of kind [`Kind::PortNotTty`] if the port is not a serial line at all, or [`Kind::Short`] if
-    /// descriptors or memory are; also those of [`Surroundings::medium`]. The link waits for a port that is missing, in
-    /// use or forbidden, or that cannot have the rate.
+    /// Returns an error of kind [`PortNotTty`](schema::Kind::PortNotTty) if the port is not a serial line at all, an error
+    /// of kind [`Short`](schema::Kind::Short) if descriptors or memory run out, and those of [`Surroundings::medium`]. The
+    /// link waits for a port that is missing, in use or forbidden, or that cannot have the rate.
     pub fn new(
         link: &'a config::Link,
         number: u8,

@@ -59,7 +59,7 @@ mod tests {
             due.collect::<Vec<_>>()
         };
         assert!(looks(1..10_000, 27).is_empty(), "a stream is never checked");
-        // The last telegram came at 9,990 ms.
+        // The last telegram arrived at 9,990 ms.
         assert_eq!(looks(10_000..10_700, u64::MAX), [10_291, 10_592]);
     }
 

@@ -46,7 +46,7 @@ pub(crate) struct ReplaySet<'a> {
     pub(crate) holds: bool,
 }
 
-/// How a link starts.
+/// Outcome of the start of a link.
 enum Start {
     /// With an open port, or with a recording; a serial server may still be dialed.
     Open,

@@ -34,7 +34,8 @@ pub fn all_holders(path: &Path) -> Vec<Holder> {
     device.and_then(|device| holders(&[&device]).pop()).unwrap_or_default()
 }
 
-/// Returns the other process that has locked `path`, whichever user it belongs to; `None` if it has exited, or if none has.
+/// Returns the other process that has locked `path`, whichever user it belongs to. Returns `None` if no running
+/// process has locked it.
 pub(super) fn lock_owner(path: &Path) -> Option<Holder> {
     let file = fs::metadata(path).ok()?;
     let device = file.dev();

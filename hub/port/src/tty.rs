@@ -265,7 +265,7 @@ impl fmt::Display for Alteration {
     }
 }
 
-/// Control modes other than the rate, which has its own field, and HUPCL, which decides nothing while the line is open.
+/// Control modes other than the rate, which has its own field, and HUPCL, which only matters when the line is closed.
 const CHARACTER: ControlModes = ControlModes::CSIZE
     .union(ControlModes::CSTOPB)
     .union(ControlModes::CREAD)
@@ -305,7 +305,7 @@ pub(crate) mod tests {
         assert!(!is_near(460_800, 500_000) && !is_near(9600, 500_000) && !is_near(0, 500_000));
     }
 
-    /// The other end of a pty whose slave is at the path.
+    /// Creates a pty; returns its master and the path of its slave.
     pub(crate) fn pty() -> (OwnedFd, PathBuf) {
         use rustix::pty::{OpenptFlags, grantpt, openpt, ptsname, unlockpt};
         let master = openpt(OpenptFlags::RDWR | OpenptFlags::NOCTTY).expect("a pty");

@@ -77,7 +77,7 @@ pub enum Defect {
     WrongPlaces,
     /// A warning that does not hold is not taken back.
     KeptWarning,
-    /// The port does not tell that another process set its rate.
+    /// The port hides that another process set its rate.
     HiddenRate,
 }
 

@@ -175,7 +175,7 @@ impl Tty {
         log.tell(now, &Event::Retuned { sensor: self.number });
     }
 
-    /// Another process sets the rate.
+    /// Sets the rate as another process does.
     pub(crate) fn alter(&mut self, rate: u32, log: &Log, now: Nanos) {
         self.advance(now, log);
         if self.is_open && rate != self.rate {
@@ -184,7 +184,7 @@ impl Tty {
         }
     }
 
-    /// Rate that another process has set since the hub did.
+    /// Returns the rate that another process has set since the hub did.
     pub(crate) fn altered(&self) -> Option<u32> {
         (self.rate != self.own_rate).then_some(self.rate)
     }
