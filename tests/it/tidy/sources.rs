@@ -206,7 +206,7 @@ pub(crate) fn tests_do_not_depend_on_time(tree: &Tree) -> Vec<String> {
 
 pub(crate) fn files_begin_with_a_description(tree: &Tree) -> Vec<String> {
     let described = |text: &str| text.starts_with("//! ");
-    let files = tree.files(".rs").into_iter().filter(|(_, text)| !described(text));
+    let files = tree.files(".rs").filter(|(_, text)| !described(text));
     files.map(|(path, _)| format!("{path} does not begin with a description of the module")).collect()
 }
 
