@@ -2,7 +2,7 @@
 //! on them.
 
 use std::fs;
-use std::io::{BufRead, BufReader};
+use std::io::{BufRead, BufReader, ErrorKind};
 use std::net::TcpStream;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
@@ -153,7 +153,11 @@ impl Browser {
         }
         self.socket.send(Message::text(call.to_string())).expect("the browser lives");
         loop {
-            let told = self.socket.read().unwrap_or_else(|error| panic!("{method}: {error}"));
+            let told = match self.socket.read() {
+                // The test's process was stopped and continued, for example by a virtual machine that was suspended.
+                Err(tungstenite::Error::Io(error)) if error.kind() == ErrorKind::Interrupted => continue,
+                told => told.unwrap_or_else(|error| panic!("{method}: {error}")),
+            };
             let Message::Text(text) = told else { continue };
             let told: Value = serde_json::from_str(&text).expect("JSON");
             if told["id"] == self.calls {

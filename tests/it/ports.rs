@@ -4,7 +4,7 @@
 use std::os::unix::fs::{PermissionsExt, chown, symlink};
 use std::os::unix::process::CommandExt;
 
-use crate::testkit::{Line, Program, TERM, TestEnv, is_class, skip, succeeds, until};
+use crate::testkit::{Line, Program, TERM, TestEnv, is_class, skip, succeeds};
 use rustix::process::geteuid;
 use serde_json::Value;
 

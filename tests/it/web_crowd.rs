@@ -176,7 +176,7 @@ fn where_descriptors_are_short_who_is_there_is_served_and_who_comes_waits() {
     let mut late = connect(&host);
     late.write_all(format!("GET / HTTP/1.1\r\nHost: {host}\r\n\r\n").as_bytes()).expect("a backlog");
     let short = server.await_line("what it is short of", is_class("web_short"));
-    assert!(short["message"].as_str().is_some_and(|text| text.contains("nobody can be let in")), "{short}");
+    assert!(short["message"].as_str().is_some_and(|text| text.contains("cannot accept viewers")), "{short}");
     assert!(short["hint"].as_str().is_some_and(|text| text.contains("ulimit -n")), "{short}");
     let (begun, before) = (Instant::now(), worked(&server));
     await_messages(&mut viewer, 80);

@@ -6,7 +6,7 @@ use std::sync::atomic::AtomicBool;
 
 use scanhub_client::streams::find;
 use schema::ipc::{self, Node, Payload, PortFactory};
-use schema::{Domain, Failure, Family, Pace, Status, Topic, publisher};
+use schema::{Domain, Failure, Family, Pace, State, Status, Topic, publisher};
 use serde::{Serialize, Serializer};
 
 use crate::info::statuses;

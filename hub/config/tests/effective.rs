@@ -163,15 +163,20 @@ fn every_key_of_the_page_is_shown() {
 }
 
 #[test]
-fn the_default_is_what_holds_without_a_word() {
+fn default_file_sets_the_defaults_and_shows_every_family() {
     let file = Scratch::new("default.toml", DEFAULT);
     let written = Config::load(&sources(&[&file], &[], &[])).unwrap();
-    assert_eq!(written, Config::load(&sources(&[], &LINKS, &[])).unwrap());
-    assert!(DEFAULT.lines().count() <= 24, "more than a screen");
-    assert!(DEFAULT.lines().all(|line| line.len() <= 90), "wider than a screen");
-    // What is commented out can be said, too.
-    let all = Scratch::new("all.toml", &DEFAULT.replace("\n# ", "\n"));
+    assert_eq!(written, Config::load(&sources(&[], &LINKS[..1], &[])).unwrap());
+    assert!(DEFAULT.lines().count() <= 48, "more than two screens");
+    assert!(DEFAULT.lines().all(|line| line.len() <= 120), "wider than a screen");
+    // Every commented-out line is valid, and there is a link of each family.
+    let is_key = |line: &str| line.starts_with('[') || line.split_once(" = ").is_some_and(|(key, _)| !key.contains(' '));
+    let line = |line: &str| line.strip_prefix("# ").filter(|rest| is_key(rest)).unwrap_or(line).to_owned();
+    let all: Vec<String> = DEFAULT.lines().map(line).collect();
+    let all = Scratch::new("all.toml", &all.join("\n"));
     let all = Config::load(&sources(&[&all], &[], &[])).unwrap();
+    let families: Vec<_> = all.links.iter().map(|link| link.family()).collect();
+    assert_eq!(families, schema::Family::ALL);
     assert!(all.links[0].family.is_some() && all.links[0].unit.is_some());
 }
 
