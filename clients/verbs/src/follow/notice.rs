@@ -23,11 +23,6 @@ pub enum Notice {
 }
 
 impl Notice {
-    /// Returns whether there is no hub from now on.
-    pub(crate) fn is_without_hub(&self) -> bool {
-        matches!(self, Notice::NoHub(_) | Notice::HubGone)
-    }
-
     /// Tells it of `names`, or of the domain if there are none: lines of JSON to `out`, or text to `notes`.
     pub(crate) fn tell(
         &self,

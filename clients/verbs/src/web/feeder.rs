@@ -305,7 +305,7 @@ impl Sink for Feeder<'_> {
 
     fn notice(&mut self, names: &[&TopicName], notice: Notice) -> Result<(), End> {
         picture::note(&mut self.scene, names, &notice);
-        if notice.is_without_hub() {
+        if matches!(notice, Notice::NoHub(_) | Notice::HubGone) {
             self.clear();
             self.status_at = Instant::now();
         }
