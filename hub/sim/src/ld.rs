@@ -137,14 +137,13 @@ impl Head {
         point as f64 / f64::from(self.settings.model.points_per_second())
     }
 
-    /// Restarts the scanner at `now`. It sends packets after `boot_ns`, from a head that gets up to speed with a time constant
-    /// of `spin_up_s` seconds. Returns whether a packet was broken off.
-    fn restart(&mut self, now: Nanos, boot_ns: Nanos, spin_up_s: f64) -> bool {
+    /// Restarts the scanner at `now`; packets follow after `boot_ns`. Returns whether a packet was broken off.
+    fn restart(&mut self, now: Nanos, boot_ns: Nanos) -> bool {
         let broken = self.outlet.break_off(now);
         self.power_ns = now;
         self.turns_ns = now + boot_ns;
         let HeadSettings { turns_per_second, wander, seed, .. } = self.settings;
-        (self.rotation, self.sent) = (Rotation::new(turns_per_second, wander, spin_up_s, seed), 0);
+        (self.rotation, self.sent) = (Rotation::new(turns_per_second, wander, 0.0, seed), 0);
         if let Source::Recorded { passed_ms, .. } = &mut self.source {
             *passed_ms = 0;
         }
@@ -216,12 +215,12 @@ impl Device for Head {
     fn receive(&mut self, _: u8, _: Arrival) {}
 
     fn power_cycle(&mut self, now: Nanos) -> bool {
-        self.restart(now, self.settings.boot_ns, 0.0)
+        self.restart(now, self.settings.boot_ns)
     }
 
-    /// Restarts the scanner: the clock begins again, and the motor has to get up to speed.
+    /// Restarts the scanner: the clock begins again, while the inertia of the head keeps it turning.
     fn brown_out(&mut self, now: Nanos) -> bool {
-        self.restart(now, RESTART_NS, SPIN_UP_S)
+        self.restart(now, RESTART_NS)
     }
 
     fn break_off(&mut self, now: Nanos) {
@@ -275,8 +274,6 @@ pub fn recorded(path: &Path, sensor: Option<&str>) -> Result<Vec<[u8; LEN]>, Fai
 
 /// Time from a dip of the voltage to the first packet. Invented: it is not published.
 const RESTART_NS: Nanos = 300 * MILLIS;
-/// Time constant with which the motor gets up to speed after it. Invented, too.
-const SPIN_UP_S: f64 = 0.2;
 
 /// Between which ranges a model measures, by its data sheet.
 fn reach_mm(model: Model) -> std::ops::RangeInclusive<f64> {

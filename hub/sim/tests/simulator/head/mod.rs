@@ -117,6 +117,12 @@ fn every_brown_out_is_a_restart() {
         let mut bench = Bench::new(HeadSettings::of(model), &still("wall640"), "", 3);
         bench.run(4 * SECOND);
         for restarts in 1..=12 {
+            // A voltage that falls makes the head slower first.
+            let turns_per_second = f64::from(model.turns_per_second());
+            for slow in 0..restarts {
+                bench.head.set_speed(turns_per_second * (1.0 - 0.03 * slow as f64));
+                bench.run(bench.now + 30 * MILLIS);
+            }
             bench.brown_out();
             // Odd times, so that the clock of 30 s stands elsewhere each time.
             bench.run(bench.now + 2 * SECOND + restarts * 417 * MILLIS);

@@ -178,7 +178,8 @@ fn every_brown_out_is_a_restart_and_so_is_a_power_cycle() {
             banners.clone().filter(|sent| sent.at + 1_100 * MILLIS < talk.bench.now).count() as u64;
         let restarts = talk.session.account().restarts;
         assert!(recognized >= 3, "{model:?}: {recognized}");
-        assert!((recognized..=banners.count() as u64).contains(&restarts), "{model:?}: {restarts}");
+        // One of 256 completes them to a packet with a right checksum, and is lost.
+        assert!((recognized - 1..=banners.count() as u64).contains(&restarts), "{model:?}: {restarts}");
 
         // A power cycle takes longer than the silence after which the session searches.
         let mut talk = Talk::new(settings, UnitSettings::of(model), "");
