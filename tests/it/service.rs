@@ -35,10 +35,7 @@ fn what_is_sent_while_a_killed_hub_is_replaced_waits_in_the_line() {
     assert_eq!(hub.end(KILL).code, None);
     let elsewhere = TestEnv::new();
     let other = elsewhere.hub(&flags);
-    assert!(
-        other.has_said(|line| line["waiting"] == serde_json::json!(["front"])),
-        "it found the line free"
-    );
+    assert!(other.has_said(|line| line["waiting"] == serde_json::json!(["front"])), "it found the line free");
     assert_eq!(other.end(TERM).code, Some(0));
     hub = env.service(&mut supervisor, &flags, None).ready();
     live(&mut telegrams, &mut boots);

@@ -53,9 +53,11 @@ pub fn list(options: &ListOptions, out: &mut dyn Write, stop: &AtomicBool) -> Re
     }
     let mut rows = vec![["TOPIC", "HZ", "CONSUMERS", "PAYLOAD", "REVISION"].map(String::from).to_vec()];
     rows.extend(lines.iter().map(Line::row));
-    quiet(table(&mut output, &rows).and_then(|()| {
-        problems.iter().try_for_each(|problem| output.line(|line| write!(line, "{problem}")))
-    }))
+    quiet(
+        table(&mut output, &rows).and_then(|()| {
+            problems.iter().try_for_each(|problem| output.line(|line| write!(line, "{problem}")))
+        }),
+    )
 }
 
 /// Writes every live domain below `bases` (`--root`, or [`Environment::bases`](schema::Environment::bases)) to `out`.

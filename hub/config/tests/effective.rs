@@ -170,7 +170,9 @@ fn default_file_sets_the_defaults_and_shows_every_family() {
     assert!(DEFAULT.lines().count() <= 48, "more than two screens");
     assert!(DEFAULT.lines().all(|line| line.len() <= 120), "wider than a screen");
     // Every commented-out line is valid, and there is a link of each family.
-    let is_key = |line: &str| line.starts_with('[') || line.split_once(" = ").is_some_and(|(key, _)| !key.contains(' '));
+    let is_key = |line: &str| {
+        line.starts_with('[') || line.split_once(" = ").is_some_and(|(key, _)| !key.contains(' '))
+    };
     let line = |line: &str| line.strip_prefix("# ").filter(|rest| is_key(rest)).unwrap_or(line).to_owned();
     let all: Vec<String> = DEFAULT.lines().map(line).collect();
     let all = Scratch::new("all.toml", &all.join("\n"));
@@ -185,5 +187,8 @@ fn family_implied_by_the_model_names_the_model() {
     let links = ["front=/dev/ttyUSB0,model=ld19", "rear=/dev/ttyUSB1,family=ld,model=ld19"];
     let values = values(&sources(&[], &links, &[])).unwrap();
     assert_eq!(shown(&values, "link.front.family"), (&json!("ld"), "default of ld19"));
-    assert_eq!(shown(&values, "link.rear.family"), (&json!("ld"), "--link rear=/dev/ttyUSB1,family=ld,model=ld19"));
+    assert_eq!(
+        shown(&values, "link.rear.family"),
+        (&json!("ld"), "--link rear=/dev/ttyUSB1,family=ld,model=ld19")
+    );
 }
