@@ -7,7 +7,15 @@
 mod browser;
 #[path = "../support/mod.rs"]
 mod support;
+#[path = "../../tests/testkit/child.rs"]
+mod test_child;
 mod viewer;
+
+/// The part of the tests' kit that the browser's driver needs.
+mod testkit {
+    pub(crate) use crate::support::stage::PATIENCE;
+    pub(crate) use crate::test_child::{Child, spawn};
+}
 
 use std::collections::HashMap;
 use std::process::{Command, ExitCode, Stdio};

@@ -16,7 +16,7 @@ use schema::file::ENCODING;
 fn bounded(env: &TestEnv, arguments: &[&str]) -> Outcome {
     let own = env.command(arguments);
     let mut command = Command::new("sh");
-    command.args(["-c", "ulimit -v 90000 && ulimit -t 2 && exec \"$0\" \"$@\""]).arg(own.get_program());
+    command.args(["-c", "ulimit -v 96000 && ulimit -t 2 && exec \"$0\" \"$@\""]).arg(own.get_program());
     command.args(own.get_args());
     let changed = own.get_envs().map(|(key, value)| (key.to_owned(), value.map(ToOwned::to_owned)));
     for (key, value) in changed.collect::<Vec<_>>() {

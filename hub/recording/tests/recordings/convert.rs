@@ -139,7 +139,7 @@ fn rows(options: &ConvertOptions) -> (Converted, Vec<String>) {
 fn rows_have_intensities_and_meters_on_request() {
     let folder = Folder::new("columns");
     // Three reflector bits above the range.
-    let words: Vec<u16> = (0..181).map(|i| 1234 + i | (i % 8) << 13).collect();
+    let words: Vec<u16> = (0..181).map(|i| (1234 + i) | ((i % 8) << 13)).collect();
     let scan = measured::encode(0, Unit::Mm, &words, 0x10);
     let told = reply::configuration(0, Mode(1), Unit::Mm, 0x10);
     let input = folder.file("a.bin", &[told.bytes(), scan.bytes()].concat());
