@@ -1,5 +1,5 @@
-// The picture in a browser. It speaks foxglove.sdk.v1 with the server that sent this page, as any other viewer does, keeps
-// the newest of each sensor, and draws that in the robot's coordinates: x ahead, y to the left, in metres.
+// Data of the picture. The page is a viewer of foxglove.sdk.v1 like any other. It keeps the newest data of each sensor
+// and draws it in the robot's coordinates: x ahead, y left, in meters.
 
 const { PI, abs, atan2, ceil, floor, hypot, max, min } = Math;
 const $ = (id) => document.getElementById(id);
@@ -44,7 +44,7 @@ const everySensor = () => [...sensors.values()];
 const everySweep = () => [...sweeps.values()];
 const sweepAt = (topic) => owner(sweeps, topic, empty);
 
-/** The hub has exited: what was seen is not there any more, except for the background. A held picture stands until it is released. */
+/** Clears all but the background, because the hub has exited. A frozen picture stays until its release. */
 function forget() {
   if (kept) {
     kept.clear();

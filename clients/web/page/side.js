@@ -1,4 +1,4 @@
-// Sweeps of tilted scanners from the side: up is x of the view, and to the right, which is ahead if nothing is turned, is -y.
+// Sweeps of tilted scanners from the side: up is x of the view, right is -y (ahead, unless turned).
 
 const CLASSES = ["unknown", "background", "foreground", "behind"];
 /** How classes look, not by colour alone, and with which layer; the last ones lie above. */

@@ -96,7 +96,7 @@ function fit() {
   const goal = { scale, x, y };
   const now = view.goal ?? view;
   const moved = hypot(goal.x - now.x, goal.y - now.y) * scale;
-  // A picture that breathes cannot be read: as long as all is in it and not too small, it stays.
+  // A moving view is hard to read: keep it while it fits.
   const isOut = scale * MARGIN < now.scale * 0.99 || moved > 0.12 * min(middle.width, middle.height);
   if (isOut || now.scale < 0.6 * scale || !view.isFitted) Object.assign(view, { goal, isFitted: true });
 }

@@ -174,7 +174,7 @@ const ofJson = { robot: takeRobot, status: takeStatus, zones: takeZones, lines: 
 /** What makes the words beside the picture, and not the picture. */
 const BESIDE = ["robot", "status", "replay"];
 let kept = null; // what came for the picture while it is held, the newest of each topic
-let isHeldGone = false; // what the held picture shows is to be forgotten when it is released
+let isHeldGone = false; // clear the frozen picture at its release
 
 const lastWord = (topic) => topic.slice(topic.lastIndexOf("/") + 1);
 
