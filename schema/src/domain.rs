@@ -152,7 +152,7 @@ impl Environment {
 }
 
 /// Refuses a domain's name that is not `[a-z0-9-]{1,16}`.
-fn check_name(name: &str) -> Result<(), Failure> {
+pub(crate) fn check_name(name: &str) -> Result<(), Failure> {
     let allowed = |c: char| c.is_ascii_lowercase() || c.is_ascii_digit() || c == '-';
     if (1..=16).contains(&name.len()) && name.chars().all(allowed) {
         return Ok(());

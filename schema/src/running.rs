@@ -75,14 +75,17 @@ impl RunningHub {
             ),
         };
         let domain = command.domain.or_else(|| variable("SCANHUB_DOMAIN")?.into_string().ok());
-        Some(RunningHub {
-            pid,
-            uid,
-            user,
-            domain: domain.unwrap_or_else(|| DEFAULT_DOMAIN.to_owned()),
-            base,
-            program: command.program,
-        })
+        let domain = domain.unwrap_or_else(|| DEFAULT_DOMAIN.to_owned());
+        // Any user can start a process with any command line, and the name becomes part of a suggested command.
+        crate::domain::check_name(&domain).ok()?;
+        // A relative path counts from the process's working directory.
+        let program = if command.program.contains('/') && !command.program.starts_with('/') {
+            let directory = fs::read_link(path.join("cwd"));
+            directory.map_or("scanhub".to_owned(), |it| it.join(&command.program).display().to_string())
+        } else {
+            command.program
+        };
+        Some(RunningHub { pid, uid, user, domain, base, program })
     }
 
     /// Returns the command with which the user of `caller` runs `verb` in the domain of this hub. `domain` is the one that
@@ -215,6 +218,7 @@ mod tests {
         machine.process(14, 1000, &["scanhub", "list"], None);
         machine.process(15, 1000, &["scanhub", "echo", "run"], None);
         machine.process(16, 0, &[], None);
+        machine.process(17, 1000, &["scanhub", "run", "--domain", "x; id"], None);
         let hubs = RunningHub::all(&machine.0);
         let found: Vec<_> =
             hubs.iter().map(|hub| (hub.pid, hub.user.as_str(), hub.domain.as_str())).collect();
@@ -249,6 +253,8 @@ mod tests {
         );
         let flags = ["/opt/scanhub", "run", "--root=/srv/a b", "--domain=lab"];
         assert_eq!(command(0, &flags, None, 1000), "sudo /opt/scanhub list --domain lab --root '/srv/a b'");
+        // Its working directory cannot be read.
+        assert_eq!(command(0, &["./scanhub", "run"], None, 1000), "sudo scanhub list");
         assert_eq!(
             command(1000, &["scanhub", "run", "--domain", "lab"], logged_in, 1000),
             "scanhub list --domain lab"

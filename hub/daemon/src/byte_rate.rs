@@ -10,6 +10,8 @@ pub(crate) struct ByteRate {
     /// Result of the last complete window, in bytes per second; `None` before there is one, or if almost nothing arrived.
     last: Option<u64>,
     is_complete: bool,
+    /// Consecutive windows in which almost nothing arrived.
+    quiet: u32,
     /// Rate in the last message, in bytes per second.
     shown: u64,
 }
@@ -19,7 +21,12 @@ impl ByteRate {
     pub(crate) fn note(&mut self, now: Nanos, read: u64) {
         let (since, _) = *self.window.get_or_insert((now, read));
         if now >= since + WINDOW {
-            self.last = self.of_window(now, read);
+            let rate = self.of_window(now, read);
+            self.quiet = if rate.is_some() { 0 } else { self.quiet + 1 };
+            // Noise near the limit must not change the message with every window: each change is a log line.
+            if rate.is_some() || self.quiet >= QUIET_WINDOWS {
+                self.last = rate;
+            }
             self.is_complete = true;
             self.window = Some((now, read));
         }
@@ -63,6 +70,8 @@ pub(crate) fn with_commas(number: u64) -> String {
 
 /// Longer than a search at all rates, so that the rate of the host's port does not change the result.
 const WINDOW: Nanos = 5_000 * MILLIS;
+/// Windows without bytes after which there is no rate any more.
+const QUIET_WINDOWS: u32 = 3;
 /// Number of bytes that an adapter may deliver when a cable is plugged in.
 const NOISE: u64 = 64;
 
@@ -98,12 +107,20 @@ mod tests {
     }
 
     #[test]
-    fn bytes_that_begin_or_end_are_noticed_within_two_windows() {
+    fn bytes_that_begin_or_end_are_noticed_within_a_few_windows() {
         let mut bytes = ByteRate::default();
         assert_eq!(shown(&mut bytes, (0, 3_600), |_| 0), [None]);
         assert_eq!(shown(&mut bytes, (3_600, 10), |_| 17_625).last(), Some(&Some(17_600)));
-        assert_eq!(shown(&mut bytes, (3_610, 10), |_| 0).last(), Some(&None));
-        assert_eq!(shown(&mut bytes, (3_620, 10), |_| 10).last(), Some(&None), "noise of a cable");
+        assert_eq!(shown(&mut bytes, (3_610, 20), |_| 0).last(), Some(&None));
+        assert_eq!(shown(&mut bytes, (3_630, 10), |_| 10).last(), Some(&None), "noise of a cable");
+    }
+
+    #[test]
+    fn noise_near_the_limit_does_not_change_the_message() {
+        let mut bytes = ByteRate::default();
+        let noise = |tenth| if tenth / 50 % 2 == 0 { 20 } else { 10 };
+        let texts = shown(&mut bytes, (0, 600), noise);
+        assert!(texts.len() <= 3, "{texts:?}");
     }
 
     #[test]

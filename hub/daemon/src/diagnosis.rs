@@ -121,6 +121,9 @@ impl<'a> Diagnosis<'a> {
     pub(crate) fn open(&mut self, device: Option<&Path>) {
         self.device = device.map(|device| device.display().to_string());
         self.byte_rate = ByteRate::default();
+        // These describe the previous connection.
+        self.altered = None;
+        self.damaged_percent = None;
     }
 
     /// Takes the message `words` about settings that another process had changed, and that the hub has restored at `now`.

@@ -45,7 +45,12 @@ impl Candidate {
             "two adapters with the same serial number, or without one, share {shared}: after a restart, it may name the other \
              one"
         );
-        Some((what, format!("use the name {}, which belongs to the USB socket", self.name.display())))
+        let remedy = if self.name == self.device {
+            "there is no name below /dev/serial/by-path: name each adapter by its USB socket in a udev rule (KERNELS)".to_owned()
+        } else {
+            format!("use the name {}, which belongs to the USB socket", self.name.display())
+        };
+        Some((what, remedy))
     }
 }
 

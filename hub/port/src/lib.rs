@@ -189,11 +189,12 @@ impl Port {
         }
     }
 
-    /// Makes the settings of this process again, at `baud`, and discards the input that arrived with others.
+    /// Makes the settings of this process again, at `baud`, and discards the input that arrived with others. A rate that the
+    /// driver refuses stays as it is; a search tries others.
     ///
     /// # Errors
     ///
-    /// Returns an error if the line is lost, or if the driver refuses the settings.
+    /// Returns an error if the line is lost.
     pub fn restore(&self, baud: u32) -> io::Result<()> {
         match self {
             Port::Tty(tty) => tty.restore(baud),

@@ -69,13 +69,14 @@ impl PortError {
                 let (what, remedy) = Rights::of(path).explain(path);
                 Failure::new(Kind::PortPermission, what, remedy)
             }
-            PortError::Busy => match holder(path) {
+            // The owner of the lock is certain; a program that only has the port open may be harmless.
+            PortError::Busy => match lock_owner(path).or_else(|| holder(path)) {
                 None if is_own(path) => Failure::new(
                     Kind::PortBusy,
                     format!("{name}: in use by another link of this hub"),
                     "name the port of each sensor",
                 ),
-                holder => busy(path, holder.or_else(|| lock_owner(path))),
+                holder => busy(path, holder),
             },
             PortError::NotTty if path.is_dir() => {
                 let hint = format!("it is a directory; {}", instead(&name, &candidates(), &portless()));

@@ -88,9 +88,9 @@ impl Tty {
         termios.input_modes.remove(InputModes::IXOFF | InputModes::IXANY | InputModes::INPCK);
         termios.control_modes.insert(ControlModes::CREAD | ControlModes::CLOCAL);
         tcsetattr(&self.line, OptionalActions::Now, &termios)?;
-        self.check(line_settings::apply(&self.line, baud), baud)?;
+        let checked = self.check(line_settings::apply(&self.line, baud), baud);
         self.settings.set(Settings::of(&tcgetattr(&self.line)?));
-        Ok(())
+        checked
     }
 
     /// Returns the settings that another process has made since those of this process; `None` if they are unchanged.
@@ -106,17 +106,21 @@ impl Tty {
         }))
     }
 
-    /// Makes the settings of this process again, at `baud`, and discards the input that arrived with others.
+    /// Makes the settings of this process again, at `baud`, and discards the input that arrived with others. A rate that the
+    /// driver refuses stays as it is; a search tries others.
     ///
     /// # Errors
     ///
-    /// Returns an error if the line is lost, or if the driver refuses the settings.
+    /// Returns an error if the line is lost.
     pub(crate) fn restore(&self, baud: u32) -> io::Result<()> {
         let configured = self.configure(tcgetattr(&self.line)?, baud);
         line_settings::clear_input(&self.line).map_err(|_| self.gone())?;
         // With other settings every byte is an error.
         self.line_errors();
-        configured.map_err(|refusal| io::Error::other(refusal.to_string()))
+        match configured {
+            Ok(()) | Err(PortError::Rate { .. }) => Ok(()),
+            Err(error) => Err(io::Error::other(error.to_string())),
+        }
     }
 
     /// Returns the device that the port's name resolved to when it was opened.
