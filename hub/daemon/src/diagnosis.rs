@@ -121,8 +121,7 @@ impl<'a> Diagnosis<'a> {
     pub(crate) fn open(&mut self, device: Option<&Path>) {
         self.device = device.map(|device| device.display().to_string());
         self.byte_rate = ByteRate::default();
-        // These describe the previous connection.
-        self.altered = None;
+        // This describes the previous connection.
         self.damaged_percent = None;
     }
 
