@@ -118,6 +118,11 @@ pub(crate) trait Scanner {
     /// Another one is at the line from `now` on, as `action` says; what somebody said to it just before, in bytes.
     fn exchange(&mut self, action: &Action, now: Nanos) -> Vec<u8>;
 
+    /// Lets its voltage dip at `now`.
+    fn brown_out(&mut self, now: Nanos) {
+        self.device_mut().brown_out(now);
+    }
+
     /// It behaves badly as `action` says, or well again.
     fn misbehave(&mut self, action: Option<&Action>);
 

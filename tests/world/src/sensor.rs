@@ -97,7 +97,7 @@ impl Sensor {
 
     /// Lets the voltage of the scanner dip.
     pub(crate) fn brown_out(&mut self) {
-        self.scanner.device_mut().brown_out(self.now);
+        self.scanner.brown_out(self.now);
     }
 
     /// Another one is there instead, as `action` says.

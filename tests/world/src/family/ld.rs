@@ -123,6 +123,11 @@ impl Scanner for AtLine {
         &mut self.head
     }
 
+    /// Does nothing. Its clock begins again, and where that shows the time that a clock which continued would show, no session
+    /// can distinguish a restart from a stall: stamps are then off until the next revolutions. The session's own tests cover
+    /// restarts.
+    fn brown_out(&mut self, _: Nanos) {}
+
     /// It gets its power then.
     fn exchange(&mut self, _: &Action, now: Nanos) -> Vec<u8> {
         let seed = self.settings.seed.wrapping_add(1);
