@@ -30,11 +30,11 @@ pub(super) fn line(telegram: &[u8], mode: Mode, at_ns: u64, first_ns: u64) -> Op
     for &range in ranges {
         line += &format!(" {:.decimals$}", f64::from(range) * f64::from(unit.mm()) / 1000.0);
     }
-    let seconds = |ns: u64| {
-        let micros = ns.saturating_add(500) / 1000;
-        format!("{}.{:06}", micros / 1_000_000, micros % 1_000_000)
-    };
-    line += &format!(" 0 0 0 0 0 0 {} scanhub {}\n", seconds(at_ns), seconds(at_ns.saturating_sub(first_ns)));
+    // The difference is taken from rounded times, so that a log that is converted and written again has the same one.
+    let micros = |ns: u64| ns.saturating_add(500) / 1000;
+    let seconds = |micros: u64| format!("{}.{:06}", micros / 1_000_000, micros % 1_000_000);
+    let (at, since) = (micros(at_ns), micros(at_ns).saturating_sub(micros(first_ns)));
+    line += &format!(" 0 0 0 0 0 0 {} scanhub {}\n", seconds(at), seconds(since));
     Some(line)
 }
 
@@ -53,6 +53,10 @@ mod tests {
         let line =
             line(telegram.bytes(), Mode(1), 1_071_078_720_123_456_789, 1_071_078_720_000_000_000).unwrap();
         assert!(line.ends_with(" 12.34 0 0 0 0 0 0 1071078720.123457 scanhub 0.123457\n"), "{line}");
+        // As with the rounded times of a log: 123 457 - 100 000.
+        let first = 1_071_078_720_000_000_000 + 100_000_400;
+        let again = super::line(telegram.bytes(), Mode(1), 1_071_078_720_123_456_500, first).unwrap();
+        assert!(again.ends_with(" scanhub 0.023457\n"), "{again}");
         let sweep = Sweep::parse(&line).unwrap().unwrap();
         assert_eq!(sweep.ranges_m[..4], [5.0, 81.91, 81.83, 12.34]);
         let cm = Encoding { unit: Unit::Cm, mode: Mode(0) };
