@@ -92,7 +92,7 @@ pub use directory::Directory;
 #[cfg(feature = "ipc")]
 pub use lock::{HubLock, ListenLock, NameLock, holder, publisher};
 #[cfg(feature = "ipc")]
-pub use running::RunningHub;
+pub use running::{RunningHub, shell_word};
 #[cfg(feature = "json")]
 pub use saved::{SavedModel, as_json, unit_in_mm};
 #[cfg(feature = "ipc")]

@@ -95,16 +95,19 @@ impl RunningHub {
         let (sudo, environment, domain) = if self.uid == caller.uid {
             (String::new(), caller.clone(), domain)
         } else {
-            let sudo =
-                if self.uid == 0 { "sudo ".to_owned() } else { format!("sudo -u {} ", quoted(&self.user)) };
+            let sudo = if self.uid == 0 {
+                "sudo ".to_owned()
+            } else {
+                format!("sudo -u {} ", shell_word(&self.user))
+            };
             (sudo, Environment { uid: self.uid, ..Environment::default() }, DEFAULT_DOMAIN)
         };
-        let mut command = format!("{sudo}{} {verb}", quoted(&self.program));
+        let mut command = format!("{sudo}{} {verb}", shell_word(&self.program));
         if self.domain != domain {
             command += &format!(" --domain {}", self.domain);
         }
         if let Some(base) = self.base.as_ref().filter(|base| !environment.bases().contains(base)) {
-            command += &format!(" --root {}", quoted(&base.to_string_lossy()));
+            command += &format!(" --root {}", shell_word(&base.to_string_lossy()));
         }
         command
     }
@@ -149,9 +152,9 @@ impl CommandLine {
     }
 }
 
-/// Returns `word` as a shell takes it.
-fn quoted(word: &str) -> String {
-    let is_plain = |c: char| c.is_ascii_alphanumeric() || "-_./:@+,".contains(c);
+/// Returns `word` as one word of a shell. Brackets, which zsh expands, blanks and an empty word need quotes.
+pub fn shell_word(word: &str) -> String {
+    let is_plain = |c: char| c.is_ascii_alphanumeric() || "-_./:@+,=".contains(c);
     if !word.is_empty() && word.chars().all(is_plain) {
         return word.to_owned();
     }

@@ -171,7 +171,7 @@ fn the_way_back_brings_back_what_was_changed() {
     let back = format!("to go back: scanhub configure {port} power_on_baud=9600\n");
     assert!(out.contains(&back), "{out}");
     assert_eq!(probe(&env, "front")["permanent_rate"], true);
-    // What was permanent before, the sensor does not tell.
+    // The sensor does not report the previous permanent rate.
     let out = done(&["power_on_baud=9600"]);
     assert!(out.contains("cannot be restored") && !out.contains("to go back"), "{out}");
     assert_eq!(probe(&env, "front")["permanent_rate"], false);

@@ -88,8 +88,8 @@ fn judge(outcome: &Outcome) -> (usize, usize) {
         }
         assert!(of_seq == seq || !is_telegram, "no zones: {line}");
         let holds = of_scan["verdict"] == "stop" || of_scan["verdict"] == line["verdict"];
-        // Of a turn with holes too little is known to be sure that it is no worse, and of a scan that waited for a hub
-        // without a processor nothing is known of now.
+        // A revolution with gaps may be worse than it looks. A scan that waited for a busy hub says nothing about the
+        // present.
         let waited = of_scan["flags"].to_string().contains("stamp_estimated");
         let is_unsure =
             of_scan["verdict"] == "unknown" && (waited || line["verdict"] == "slow" && !is_telegram);

@@ -96,7 +96,7 @@ fn of_a_remote_sensor_the_way_on_this_machine_is_known() {
         let zones = Zones { verdict: Verdict::Clear as u8, ..Zones::unknown() };
         let known = |line: &Value| line["class"] == "latency" && line["age"] != Value::Null;
         sender.stamp_ns = testkit::wall_ns() - 50_000_000;
-        // What comes before it says itself that it is attached is left out.
+        // Samples from before its own report that it is attached do not count.
         let mut line = Value::Null;
         until("ages", || {
             sender.send(Topic::Zones, &zones);

@@ -99,7 +99,7 @@ fn the_lights_follow_the_verdict_and_stop_is_lit_when_nobody_says_anything() {
     diodes.await_lit("rd");
     let hub = env.hub(&[env.link("front")]);
     diodes.await_lit("gn mk");
-    // The reader's own end: nobody watches any more.
+    // The reader ends by itself, so no program watches the verdict any more.
     let outcome = leds.end(INT);
     assert_eq!((outcome.code, diodes.lit().as_deref()), (Some(0), Some("rd")), "{outcome}");
     assert_eq!(hub.end(TERM).code, Some(0));
@@ -238,7 +238,7 @@ fn a_worse_verdict_is_shown_at_once_and_a_better_one_only_when_it_has_stood() {
         }
         let said_ns = now_ns();
         let mut shown = Value::Null;
-        // It stands as long as it is said again.
+        // The verdict is valid while it is repeated.
         until("clear when it has stood", || {
             say(Verdict::Clear);
             usual.printed(is("clear")).map(|line| shown = line).is_some()

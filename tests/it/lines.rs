@@ -16,7 +16,7 @@ fn lines_come_while_they_are_followed_and_as_the_link_says() {
     let hub = env.hub(&[&[env.link("front"), env.link("rear")], &set[..]].concat());
     let simulator = env.simulator(&["front", "rear"], &STREAM);
     env.await_info("front", |info| info["state"] == "streaming");
-    // It is there before anybody wants it, and nobody's.
+    // The topic exists before it has a subscriber.
     let topics = env.run(&["list", "--json"]);
     let topic = |line: &&Value| line["topic"] == "lines" && line["sensor"] == "front";
     let topic = topics.lines().iter().find(topic).cloned().unwrap_or_else(|| panic!("{topics}"));

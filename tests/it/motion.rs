@@ -13,7 +13,7 @@ fn a_robot_that_stands_is_said_to_stand_and_a_map_is_kept_if_wanted() {
     let hub = env.hub(&[&[env.link("front"), env.link("rear")], &set[..]].concat());
     let simulator = env.simulator(&["front", "rear"], &STREAM);
     env.await_info("front", |info| info["state"] == "streaming");
-    // It is there before anybody wants it, and nobody's.
+    // The topic exists before it has a subscriber.
     let topics = env.run(&["list", "--json"]);
     let topic = topics.lines().into_iter().find(|line| line["topic"] == "motion");
     let topic = topic.unwrap_or_else(|| panic!("{topics}"));

@@ -61,7 +61,7 @@ fn each_scan_has_its_marks_zones_and_foreground() {
     assert!(marks.iter().any(|line| line["marks"].as_array().is_some_and(|marks| !marks.is_empty())));
     assert!(zones.iter().all(|line| number(line, "nearest_mm") > 0 && line["verdict"] != "unknown"));
     assert!(foregrounds.iter().all(|line| line["beams"].as_array().is_some_and(Vec::is_empty)));
-    // Who did not follow from the beginning misses nothing of what nobody wanted.
+    // A late subscriber missed nothing, because nothing was published before.
     let late = env.run(&["echo", "--json", "front/marks", "front/foreground", "-n", "20"]);
     ["marks", "foreground"].iter().for_each(|topic| drop(accounted(&late, topic)));
     for (consumer, topic) in consumers.into_iter().zip(topics) {
@@ -100,7 +100,7 @@ fn a_silence_is_said_once_and_late_joiners_know_at_once() {
     // Five statuses later nothing was added to it.
     let mut statuses = env.echo(&["front/status", "front/scan", "front/background"]);
     let statuses = statuses.await_lines(5, "a status", is_class("status"));
-    // Who comes meanwhile gets no scan, which is nobody's fault.
+    // A subscriber that attaches meanwhile gets no scan, which is not an error.
     assert!(statuses.iter().all(|status| status["last_error"] == ""), "{statuses:?}");
     assert_eq!(env.run(&["control", "front", "resume"]).code, Some(0));
     let next = zones.await_line("what comes after it", |line| {
@@ -114,7 +114,7 @@ fn a_silence_is_said_once_and_late_joiners_know_at_once() {
     let absent = env.await_info("front", |info| info["state"] == "absent");
     let line = last_word(&env);
     let last = scans.end(INT).of_class("scan").pop().expect("a scan");
-    // Of the last telegram, but said later.
+    // It belongs to the last telegram and is published later.
     assert!(number(&line, "seq") >= number(&last, "seq"), "{line}");
     assert!(number(&line, "stamp_ns") > number(&last, "stamp_ns"), "{line}");
     assert_eq!(absent["last_error"].as_str().map(str::is_empty), Some(false));
@@ -123,7 +123,7 @@ fn a_silence_is_said_once_and_late_joiners_know_at_once() {
 #[test]
 fn a_background_is_asked_held_begun_anew_and_brought_back() {
     let env = TestEnv::new();
-    // A wall where nobody walks, learned in a second.
+    // A wall without people, learned in a second.
     let _simulator = env.simulator(&["front"], &["--seed=52", "--baud=500000", "--world=bare"]);
     let _hub = env.hub(&[env.link("front"), "--set=background.scans=20".into()]);
     let mut generations = env.echo(&["front/background"]);

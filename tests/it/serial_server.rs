@@ -130,7 +130,7 @@ fn scans_that_waited_for_a_hub_at_a_standstill_say_nothing_of_now() {
     assert!(is_estimated(&first), "{first}");
     let waited = number(&last, "seq") - number(&first, "seq");
     eprintln!("{waited} scans were too old to tell of now");
-    // Five are sent in a second: those of the last one may be of now.
+    // The server sends five per second, so those of the last second may be recent.
     assert!(waited >= WAITING as u64 - 6, "{waited}: {first} {last}");
     consumer.end(INT);
     assert_eq!(hub.end(TERM).code, Some(0));

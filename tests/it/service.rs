@@ -98,7 +98,7 @@ fn scans_go_on_with_the_first_telegram_of_the_next_hub() {
         ["unit_um", "count"].map(|key| number(&scan, key)),
         ["unit_um", "count"].map(|key| number(&scans[0], key))
     );
-    // Its status is asked all the same, its type is known.
+    // The hub requests the status anyway; the type is known.
     let info = env.await_info("front", |info| info["counters"]["telegrams"].as_u64() > Some(100));
     assert_eq!((&info["type"], &info["mode"]), (&"LMS200;301063;V02.30".into(), &1.into()), "{info}");
     assert_eq!(hub.end(TERM).code, Some(0));

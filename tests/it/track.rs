@@ -193,10 +193,10 @@ const DELAY_NS: u64 = 400_000_000;
 /// Time of scans that the tracker may be behind: less than a topic keeps for it and than it waits for other sensors, and more
 /// than is between two of its pictures.
 const LEAD_NS: u64 = 200_000_000;
-/// End of what is compared, from the begin of the world.
+/// End of the compared span, from the start of the world.
 const END_NS: u64 = 20_000_000_000;
 
-/// Ends the player in any case: the hub's thread is waited for.
+/// Ends the player even after a panic, because the test joins the hub's thread.
 struct EndsPlayer(Arc<Player>);
 
 impl Drop for EndsPlayer {

@@ -131,7 +131,7 @@ fn keys_and_the_mouse_change_the_picture() {
     page.await_true(&format!("{fits} === 'false'"));
     page.press("c");
     page.await_true(&format!("{fits} === 'true'"));
-    // A browser that has no processor drops movements of the mouse: a hand goes on.
+    // A busy browser drops movements of the mouse, so keep moving it, as a person does.
     let mut steps = (0..).map(|step| 195.0 + f64::from(step % 2));
     until("the place under the mouse is read out", || {
         page.mouse("mouseMoved", (steps.next().expect("endless"), 300.0), false);

@@ -14,7 +14,7 @@ fn show(env: &TestEnv, file: &str, flags: &[&str]) -> (Program, String) {
     (web, url)
 }
 
-/// Scans of a log that plays for two minutes: longer than a page takes to be there.
+/// Scans of a log that plays for two minutes, which is longer than a page takes to load.
 const SCANS: u64 = 600;
 
 /// A CARMEN log of a wall that comes nearer with every scan, five of them a second.

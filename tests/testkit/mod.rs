@@ -74,7 +74,7 @@ pub(crate) struct TestEnv {
 }
 
 impl TestEnv {
-    /// A new one.
+    /// Creates one with a name of its own.
     pub(crate) fn new() -> TestEnv {
         static NEXT: AtomicU32 = AtomicU32::new(0);
         let domain = format!("t{}-{}", std::process::id(), NEXT.fetch_add(1, Ordering::Relaxed));
@@ -188,7 +188,7 @@ impl TestEnv {
         self.simulator_on_real_lines(ports, &with(flags, &["--lossless"]))
     }
 
-    /// As [`TestEnv::simulator`], on lines that lose what a hub does not read.
+    /// Starts a simulator like [`TestEnv::simulator`], on lines that lose what a hub does not read.
     pub(crate) fn simulator_on_real_lines<S: AsRef<str>>(&self, ports: &[&str], flags: &[S]) -> Program {
         let ports: Vec<_> = ports.iter().map(|port| format!("--port={}", self.word(port))).collect();
         let truth = format!("--truth={}", self.word("truth"));
@@ -341,8 +341,8 @@ pub(crate) fn until(what: &str, mut is_so: impl FnMut() -> bool) {
     }
 }
 
-/// Lets `span` pass, for a program that has to find by its own clock that at least this time has passed. It may be longer: no
-/// test depends on that.
+/// Waits until at least `span` has passed, for a program that must notice this by its own clock. No test fails if it takes
+/// longer.
 pub(crate) fn let_pass(span: Duration) {
     thread::sleep(span);
 }

@@ -3,7 +3,7 @@
 use std::panic::resume_unwind;
 use std::thread;
 
-/// Calls `each` for every one of `items`, all at the same time, each in a thread of its own.
+/// Calls `each` for every one of `items`, all at the same time, each in a separate thread.
 ///
 /// # Panics
 ///

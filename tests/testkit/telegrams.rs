@@ -73,11 +73,11 @@ pub(crate) fn sequence(lines: &[Value], key: &str) -> Vec<u64> {
     numbers
 }
 
-/// The numbers of the samples of `topic` that a client printed. They are in order, and each one that is missing between the
-/// first and the last was reported as missed: a client that does not get a processor for long may miss some.
+/// Returns the numbers of the samples of `topic` that a client printed, after checking that they are in order and that the
+/// client reported every gap as missed. A client on a busy machine may miss some.
 pub(crate) fn accounted(outcome: &Outcome, topic: &str) -> Vec<u64> {
     let lines = outcome.of_class(topic);
-    // What a client reports of a silence by itself has no number.
+    // A client's own report of a silence has no number.
     let mut numbers: Vec<u64> = lines.iter().filter_map(|line| line["topic_seq"].as_u64()).collect();
     numbers.dedup();
     assert!(numbers.is_sorted_by(|one, next| one < next), "out of order: {numbers:?}");

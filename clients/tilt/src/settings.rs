@@ -21,7 +21,7 @@ pub struct Settings {
     pub bin_rad: f64,
     /// So far before the background is foreground, in metres.
     pub threshold_m: f64,
-    /// In so many sweeps something has to be met to become background.
+    /// Sweeps in which a surface must be seen before it is background.
     pub sweeps: u16,
     /// A sweep in which a greater share of the known background is not where it was contradicts its angles.
     pub doubt: f64,

@@ -21,7 +21,7 @@ pub struct ListOptions {
     pub places: Vec<Domain>,
 }
 
-/// Writes the topics of every sensor of the hub to `out`, with rate, consumers, payload type and revision. As text, the
+/// Writes the topics of every sensor of the hub to `out`, with rate, subscribers, payload type and revision. As text, the
 /// problem of each sensor that has one follows.
 ///
 /// [`Kind::NoHub`](schema::Kind) within a second if there is none, [`Kind::Interrupted`](schema::Kind) if `stop` is set.

@@ -36,7 +36,7 @@ pub(crate) struct Line<'a> {
     pub(crate) encoder: Option<Encoder>,
     /// Where that goes.
     pub(crate) say: &'a (dyn Fn(usize, Report) + Sync),
-    /// Whether bytes wait while the host's buffer is full. Otherwise they are lost, as in a UART that nobody reads.
+    /// Whether bytes wait while the host's buffer is full. Otherwise they are lost, as in a UART that no program reads.
     pub(crate) lossless: bool,
 }
 

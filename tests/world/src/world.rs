@@ -44,8 +44,8 @@ pub fn run(plan: &Plan, detail: Detail) -> Outcome {
     World::new(plan, detail, None, &[]).live()
 }
 
-/// Returns whether one of `judges` finds a violation in what `plan` says, with `defect` around the hub. The world ends with
-/// the first one.
+/// Returns whether one of `judges` finds a violation while `plan` is played with `defect` around the hub. The world ends
+/// with the first violation.
 pub fn is_found(plan: &Plan, defect: Option<Defect>, judges: &'static [&'static str]) -> bool {
     let outcome = World::new(plan, Detail::Nothing, defect, judges).live();
     outcome.violations.iter().any(|violation| judges.contains(&violation.judge))

@@ -302,7 +302,7 @@ impl Session {
         }
     }
 
-    /// Handles the text of a scanner that booted, and forgot what it was told. `is_named` as of
+    /// Handles the greeting of a scanner that booted and lost its settings. `is_named` as of
     /// [`Found::Greeting`](crate::framer::Found::Greeting).
     pub(super) fn booted(&mut self, is_named: bool) {
         match self.phase {

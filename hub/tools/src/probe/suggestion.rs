@@ -53,7 +53,7 @@ impl SuggestedLink {
 
     /// Returns the command that runs a hub for this scanner, as a shell takes it.
     pub fn command(&self) -> String {
-        format!("scanhub run --link {}", quoted(&self.flag()))
+        format!("scanhub run --link {}", schema::shell_word(&self.flag()))
     }
 
     /// Returns the section of a configuration file, without the end of its last line.
@@ -89,15 +89,6 @@ fn permanent_name(source: &Source, there: &[Candidate]) -> String {
 /// Returns whether udev's own rules made the name.
 fn is_by_udev(path: &Path) -> bool {
     path.parent().is_some_and(|parent| parent.ends_with("serial/by-id") || parent.ends_with("serial/by-path"))
-}
-
-/// Returns `word` as a shell takes it. Brackets, which zsh expands, and blanks need quotes.
-fn quoted(word: &str) -> String {
-    let is_plain = |c: char| c.is_ascii_alphanumeric() || "-_./:@+,=".contains(c);
-    if word.chars().all(is_plain) {
-        return word.to_owned();
-    }
-    format!("'{}'", word.replace('\'', r"'\''"))
 }
 
 /// Returns `text` as a string of TOML.
