@@ -8,7 +8,7 @@ use config::{Link, Scanner};
 use line::Session as _;
 use lms::variant::Unit;
 use lms::{MILLIS, Nanos, Notice};
-use port::Source;
+use port::{Alteration, Source};
 use schema::{State, Status};
 
 use crate::byte_rate::{ByteRate, with_commas};
@@ -28,8 +28,8 @@ pub(crate) struct Diagnosis<'a> {
     device: Option<String>,
     /// Rate of the bytes that arrive while nothing is streaming.
     byte_rate: ByteRate,
-    /// Message about settings that another process changed, and the time until which it is shown.
-    altered: Option<(String, Nanos)>,
+    /// Settings that another process changed.
+    altered: Option<Altered>,
     /// The port brings more than its line can.
     is_flooded: bool,
     /// Share of the bytes that the line damages, in percent, while it damages most of them.
@@ -42,6 +42,14 @@ pub(crate) struct Diagnosis<'a> {
     unserved_for: u32,
     /// The measuring mode of which was said whether it has marks.
     told_mode: u8,
+}
+
+/// A change of the port's settings by another process, and the message about it.
+struct Altered {
+    alteration: Alteration,
+    words: String,
+    /// Time until which the message is shown.
+    until: Nanos,
 }
 
 /// What the words are made from.
@@ -78,7 +86,7 @@ impl<'a> Diagnosis<'a> {
 
     /// Looks at `driver`, at `now`. The state of the link, and whether anything is new since the last look.
     pub(crate) fn examine(&mut self, driver: &Driver, now: Nanos) -> (State, bool) {
-        if self.altered.take_if(|(_, until)| now >= *until).is_some() {
+        if self.altered.take_if(|altered| now >= altered.until).is_some() {
             self.facts = None;
         }
         let bytes_per_second = self.measure(driver, now);
@@ -125,10 +133,22 @@ impl<'a> Diagnosis<'a> {
         self.damaged_percent = None;
     }
 
-    /// Takes the message `words` about settings that another process had changed, and that the hub has restored at `now`.
-    pub(crate) fn note_altered(&mut self, words: String, now: Nanos) {
-        self.altered = Some((words, now + ALTERED_SHOWN));
+    /// Takes the message `words` about the `alteration` that the hub has undone at `now`.
+    pub(crate) fn note_altered(&mut self, alteration: Alteration, words: String, now: Nanos) {
+        self.altered = Some(Altered { alteration, words, until: now + ALTERED_SHOWN });
         self.facts = None;
+    }
+
+    /// Returns whether the message already tells of this `alteration`, which the hub has undone again at `now`. The message
+    /// then stays, because another program that sets the port all the time is not worth a search of all processes each time.
+    pub(crate) fn is_told_of(&mut self, alteration: Alteration, now: Nanos) -> bool {
+        match &mut self.altered {
+            Some(altered) if altered.alteration == alteration => {
+                altered.until = now + ALTERED_SHOWN;
+                true
+            }
+            _ => false,
+        }
     }
 
     /// What is wrong, in words; empty if nothing is.
@@ -221,8 +241,8 @@ impl<'a> Diagnosis<'a> {
                 self.link.most_rate()
             );
         }
-        if let Some((words, _)) = &self.altered {
-            return words.clone();
+        if let Some(altered) = &self.altered {
+            return altered.words.clone();
         }
         // Damage and restarts explain most other findings, so they come first.
         if let Some(percent) = self.damaged_percent {

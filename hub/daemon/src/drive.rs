@@ -198,6 +198,8 @@ impl<'a, S: Surroundings> Drive<'a, S> {
         (open.watch, open.until) = loop {
             match session.poll_output() {
                 Output::SetRate(baud) => {
+                    // Setting the rate hides what another process has changed.
+                    restore(core, line, baud)?;
                     self.set_baud(core, line, baud)?;
                     // What waited is discarded.
                     open.backlog = None;
@@ -309,9 +311,12 @@ impl<'a, S: Surroundings> Drive<'a, S> {
 fn restore<S: Surroundings>(core: &mut LinkCore<'_, S>, line: &S::Line, baud: u32) -> io::Result<bool> {
     let Some(alteration) = line.altered()? else { return Ok(false) };
     line.restore(baud)?;
-    let program = core.around.altering_program(&core.link.port);
-    let program = program.map(|program| format!("; {program}")).unwrap_or_default();
-    core.diagnosis.note_altered(format!("{alteration}{program}"), core.around.now());
+    let now = core.around.now();
+    if !core.diagnosis.is_told_of(alteration, now) {
+        let program = core.around.altering_program(&core.link.port);
+        let program = program.map(|program| format!("; {program}")).unwrap_or_default();
+        core.diagnosis.note_altered(alteration, format!("{alteration}{program}"), now);
+    }
     Ok(true)
 }
 
