@@ -286,11 +286,38 @@ fn newest_process() -> Option<i32> {
 
 /// Returns the value of a variable in the environment that a process was started with.
 fn variable(pid: i32, name: &str) -> Option<String> {
-    let environment = fs::read(format!("/proc/{pid}/environ")).ok()?;
+    let mut environment = environment(pid)?;
+    let give_up_at = Instant::now() + GRACE;
+    // A process that starts another program has none for a moment.
+    while environment.is_empty() && has_environment(pid) && Instant::now() < give_up_at {
+        thread::sleep(Duration::from_millis(1));
+        environment = self::environment(pid)?;
+    }
     let mut lines = environment.split(|byte| *byte == 0);
     let value = lines.find_map(|line| line.strip_prefix(name.as_bytes())?.strip_prefix(b"="))?;
     Some(String::from_utf8_lossy(value).into_owned())
 }
+
+/// Returns the first 256 kB of a process' environment. It is empty if the process starts another program between the two
+/// system calls; more than one `read` could return a part of it.
+fn environment(pid: i32) -> Option<Vec<u8>> {
+    let mut bytes = vec![0; 1 << 18];
+    let len = fs::File::open(format!("/proc/{pid}/environ")).ok()?.read(&mut bytes).ok()?;
+    bytes.truncate(len);
+    Some(bytes)
+}
+
+/// Returns whether a process has an environment, or will have one when its program is loaded.
+fn has_environment(pid: i32) -> bool {
+    let Some(fields) = stat(pid) else { return false };
+    let field =
+        |number: usize| fields.get(number - 3).and_then(|field| field.parse::<u64>().ok()).unwrap_or(0);
+    let (flags, start, end) = (field(9), field(50), field(51));
+    flags & PF_KTHREAD == 0 && (end == 0 || start != end)
+}
+
+/// Flag of a kernel thread, which never has an environment (linux/sched.h).
+const PF_KTHREAD: u64 = 0x0020_0000;
 
 /// Returns the process group of a process that has not ended.
 fn group(pid: i32) -> Option<i32> {
