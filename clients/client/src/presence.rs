@@ -94,6 +94,10 @@ impl Presence {
         self.asked_at = Some(now);
         self.denied = None;
         let found = self.live();
+        if found.is_none() && self.short().is_some() {
+            // Without a descriptor to look with, it is not known to be gone.
+            return Change::default();
+        }
         let change = Change::between(self.hub.as_ref(), found.as_ref());
         self.hub = found;
         change
