@@ -49,8 +49,8 @@ impl Line {
         poll(&mut fds, Some(&now)).is_ok() && !fds[0].revents().contains(PollFlags::HUP)
     }
 
-    /// The rate to which the hub has set the line when it says its first request, and the command of that.
-    pub(crate) fn await_request(&self) -> (u32, u8) {
+    /// Waits for the first request of the hub, and returns its command.
+    pub(crate) fn await_request(&self) -> u8 {
         let mut said = Vec::new();
         super::until("a request is said", || {
             let mut bytes = [0; 16];
@@ -58,8 +58,7 @@ impl Line {
             said.extend(&bytes[..len]);
             said.len() >= REQUEST
         });
-        let rate = tcgetattr(&self.0).expect("a terminal").output_speed();
-        (rate, said[COMMAND])
+        said[COMMAND]
     }
 
     /// Sends all of `bytes`, in the pace of whoever reads them; what the other end says meanwhile is not heard.

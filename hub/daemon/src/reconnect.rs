@@ -174,6 +174,10 @@ impl<'a, S: Surroundings> LiveLink<'a, S> {
             session.recall(known);
         }
         if let Some(rate) = self.drive.last_rate(core) {
+            tracing::debug!(
+                "{}: the search begins at {rate} baud, where the scanner was found",
+                core.link.name
+            );
             session.seek_first(rate);
         }
         if core.control.is_paused() {
