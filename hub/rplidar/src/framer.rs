@@ -309,7 +309,7 @@ impl Framer {
         Span { at: self.buffer.take(len, packets), len, packets, offset, skipped, reasons }
     }
 
-    /// Gives up the first open byte, and whether a greeting ends with it.
+    /// Gives up the first open byte. Returns whether a greeting is found with it.
     fn discard(&mut self) -> bool {
         let byte = self.buffer.open().first().copied().unwrap_or_default();
         let is_text = matches!(byte, b' '..=b'~' | b'\r' | b'\n');
@@ -320,8 +320,10 @@ impl Framer {
         self.skipped = self.skipped.saturating_add(1);
         self.is_named &= self.text > 0;
         self.text = if is_text { self.text + 1 } else { 0 };
-        self.is_named |= self.last_text == *NAME;
-        self.text == GREETING
+        let is_name = self.last_text == *NAME && !self.is_named;
+        self.is_named |= is_name;
+        // Text may precede the greeting, so that its name comes late.
+        self.text == GREETING || is_name && self.text > GREETING
     }
 }
 

@@ -313,10 +313,12 @@ impl Session {
                 self.restarts += u64::from(has_streamed);
             }
             Phase::Booting { .. } => self.phase = Phase::Booting { until: self.now + SETTLE },
-            // What is left of a packet may be text too. One that boots sends nothing for a while before it greets.
+            // What is left of a packet may be text too. One that boots sends nothing for a while before it greets. The name
+            // is proof enough: a supply that dips makes other bytes of what came before.
             Phase::Hearing { silent_at, .. }
-                if silent_at.abs_diff(self.now + SILENCE) < HUSHED
-                    || self.framer.skipped() > Kind::LONGEST as u32 + GREETING => {}
+                if !is_named
+                    && (silent_at.abs_diff(self.now + SILENCE) < HUSHED
+                        || self.framer.skipped() > Kind::LONGEST as u32 + GREETING) => {}
             // A stream whose beginning was damaged is text here and there.
             Phase::Asking { .. } if !is_named => {}
             _ => {

@@ -47,6 +47,8 @@ pub(crate) struct Head {
     pub(crate) deaf_to: Vec<u8>,
     /// Whether it is there.
     pub(crate) is_on: bool,
+    /// Bytes that it sends before its greeting.
+    pub(crate) junk: Vec<u8>,
     pub(crate) dtr: bool,
     /// What another rate makes of its bytes is text.
     pub(crate) is_text: bool,
@@ -110,6 +112,7 @@ impl Head {
             heals: true,
             deaf_to: Vec::new(),
             is_on: true,
+            junk: Vec::new(),
             dtr: true,
             is_text: false,
             motor: None,
@@ -316,7 +319,8 @@ impl Head {
         {
             self.doing = Doing::Nothing;
             let text = b"RP LIDAR System.\r\nFirmware Ver 1.29, HW Ver 7\r\nModel: 18\r\n......";
-            for (n, byte) in text[..64].iter().enumerate() {
+            let text = [&self.junk[..], &text[..64]].concat();
+            for (n, byte) in text.iter().enumerate() {
                 self.line.push_back((until + line_time(n + 1, self.baud), *byte));
             }
         }

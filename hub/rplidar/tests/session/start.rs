@@ -329,6 +329,23 @@ fn a_greeting_in_the_midst_of_a_stream_begins_again_at_once() {
 }
 
 #[test]
+fn a_greeting_after_other_bytes_is_a_restart() {
+    // A supply that dips sends other bytes first, some of them text.
+    let junk = [vec![0x00; 1], vec![0xFF, 0x00, 0x80], vec![0xA5; 300], vec![b'x'; 45], vec![0xF0; 2_000]];
+    for (model, junk) in
+        [Model::A1, Model::S2].into_iter().flat_map(|model| junk.each_ref().map(|it| (model, it)))
+    {
+        let mut bench = Bench::new(of(model), Head::new(model, 1));
+        bench.run(3 * SECOND);
+        bench.head.junk.clone_from(junk);
+        bench.head.boot(bench.now);
+        bench.until(4 * SECOND, |bench| bench.session.account().restarts > 0);
+        bench.until(4 * SECOND, is_streaming);
+        assert_eq!(bench.session.account().restarts, 1, "{model:?} after {} bytes", junk.len());
+    }
+}
+
+#[test]
 fn ranges_that_are_text_are_no_greeting() {
     // A single point is believed if another one follows it.
     for (mode, lost) in [(Mode::Standard, 65), (Mode::DenseBoost, 60)] {
