@@ -8,6 +8,7 @@ use std::path::{Path, PathBuf};
 
 use rustix::fs::{Access, access, major, minor};
 
+use super::PortError;
 use super::holder::{Holder, holders};
 
 /// A serial line of this machine.
@@ -123,19 +124,36 @@ pub fn found_in(root: &Path) -> Vec<Candidate> {
     found
 }
 
-/// Whether `path` is a terminal, according to the kernel. It is not opened, because opening other devices can do harm: a
-/// watchdog, a pipe that waits for its other end.
+/// Returns whether `path` is a terminal, according to the kernel. It is not opened, because opening other devices can do
+/// harm: a watchdog, a pipe that waits for its other end.
 pub fn is_tty(path: &Path) -> bool {
-    let Ok(metadata) = path.metadata() else { return false };
+    check_tty(path).is_ok()
+}
+
+/// As [`is_tty`], with the reason if it is none.
+///
+/// # Errors
+///
+/// [`PortError::Dead`] if no device is behind a device file, as in a container whose /dev has a file for an adapter that is
+/// unplugged. [`PortError::NotTty`] if it is another device, or not a device. Those of the kernel if the name cannot be
+/// resolved.
+pub fn check_tty(path: &Path) -> Result<(), PortError> {
+    check_tty_in(path, Path::new("/sys/dev/char"))
+}
+
+/// As [`check_tty`], where the kernel lists its devices in `known`.
+fn check_tty_in(path: &Path, known: &Path) -> Result<(), PortError> {
+    let metadata = path.metadata().map_err(|error| PortError::of_io(&error))?;
     if !metadata.file_type().is_char_device() {
-        return false;
+        return Err(PortError::NotTty);
     }
     let (major, minor) = (major(metadata.rdev()), minor(metadata.rdev()));
-    let known = Path::new("/sys/dev/char");
     match fs::read_link(known.join(format!("{major}:{minor}/subsystem"))) {
-        Ok(subsystem) => subsystem.ends_with("tty"),
+        Ok(subsystem) if subsystem.ends_with("tty") => Ok(()),
+        Ok(_) => Err(PortError::NotTty),
         // Ptys are not listed; without sysfs nothing is, and the terminal has to say it itself.
-        Err(_) => UNIX98_PTYS.contains(&major) || !known.exists(),
+        Err(_) if UNIX98_PTYS.contains(&major) || !known.exists() => Ok(()),
+        Err(_) => Err(PortError::Dead),
     }
 }
 
@@ -289,6 +307,23 @@ pub(super) mod tests {
         for other in ["/dev/null", "/dev/zero", "/dev", "/etc/hostname", "/dev/no-such-port"] {
             assert!(!is_tty(Path::new(other)), "{other}");
         }
+    }
+
+    #[test]
+    fn a_device_file_without_a_device_is_not_another_device() {
+        let machine = Machine::new("static-dev");
+        let known = machine.root.join("sys/dev/char");
+        let check = |path: &str| check_tty_in(Path::new(path), &known);
+        assert_eq!(check("/dev/null"), Ok(()), "without sysfs the device has to say it itself");
+        machine.directory("sys/dev/char");
+        assert_eq!(check("/dev/null"), Err(PortError::Dead));
+        for (subsystem, expected) in [("mem", Err(PortError::NotTty)), ("tty", Ok(()))] {
+            machine.directory(&format!("sys/class/{subsystem}"));
+            machine.link(&format!("sys/class/{subsystem}"), "sys/dev/char/1:3/subsystem");
+            assert_eq!(check("/dev/null"), expected);
+        }
+        assert_eq!(check("/etc/hostname"), Err(PortError::NotTty));
+        assert_eq!(check("/dev/no-such-port"), Err(PortError::Missing));
     }
 
     #[test]

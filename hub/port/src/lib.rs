@@ -23,7 +23,7 @@ use std::sync::atomic::AtomicBool;
 use schema::Failure;
 
 pub use allowance::Allowance;
-pub use candidates::{Candidate, PROMPT_MS, candidates, found_in, is_tty, latency_ms};
+pub use candidates::{Candidate, PROMPT_MS, candidates, check_tty, found_in, is_tty, latency_ms};
 pub use holder::{Holder, all_holders, altering_program, holder};
 pub use kernel::Counts;
 pub use line_errors::LineErrors;

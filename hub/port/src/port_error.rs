@@ -100,8 +100,15 @@ impl PortError {
             }
             PortError::Interrupted => Failure::new(Kind::Interrupted, "interrupted", ""),
             PortError::Recording => failure(Kind::Configuration, "name a tty, or tcp:HOST:PORT"),
+            PortError::Other(Errno::LOOP) => failure(
+                Kind::PortNotTty,
+                "its symbolic links form a loop: correct them, or name another port",
+            ),
+            PortError::Other(Errno::NAMETOOLONG) => {
+                failure(Kind::PortNotTty, "name a port with a shorter path")
+            }
             PortError::Other(_) => {
-                failure(Kind::PortNotTty, "name a tty; the kernel's log (dmesg) may show more")
+                failure(Kind::PortNotTty, "the kernel refuses it; its log (dmesg) may show why")
             }
         }
     }
@@ -228,7 +235,8 @@ mod tests {
             (Errno::NXIO.into(), Kind::PortMissing, "no line behind it"),
             (Errno::MFILE.into(), Kind::Short, "ulimit -n"),
             (PortError::Short(Errno::AGAIN), Kind::Short, "ulimit -u"),
-            (Errno::LOOP.into(), Kind::PortNotTty, "dmesg"),
+            (Errno::LOOP.into(), Kind::PortNotTty, "its symbolic links form a loop"),
+            (Errno::INVAL.into(), Kind::PortNotTty, "the kernel refuses it"),
             (Errno::PERM.into(), Kind::PortPermission, "/dev/full"),
             (Errno::BUSY.into(), Kind::PortBusy, "stop it first"),
             (

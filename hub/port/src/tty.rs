@@ -15,7 +15,7 @@ use rustix::termios::{
 };
 
 use super::PortError;
-use super::candidates::{PROMPT_MS, is_tty, latency_ms};
+use super::candidates::{PROMPT_MS, check_tty, is_tty, latency_ms};
 use super::kernel::{self, Counts};
 use super::line_settings;
 
@@ -34,10 +34,7 @@ impl Tty {
     /// Opens `path` at `baud`. What lies in the line's buffer stays there: it may be what a hub that crashed did not
     /// read.
     pub(crate) fn open(path: &Path, baud: u32) -> Result<Tty, PortError> {
-        path.metadata().map_err(|error| PortError::of_io(&error))?;
-        if !is_tty(path) {
-            return Err(PortError::NotTty);
-        }
+        check_tty(path)?;
         let flags = OFlags::RDWR | OFlags::NOCTTY | OFlags::NONBLOCK | OFlags::CLOEXEC;
         Tty::begin(open(path, flags, Mode::empty())?, path, baud)
     }

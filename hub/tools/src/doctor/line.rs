@@ -6,7 +6,7 @@ use std::sync::atomic::AtomicBool;
 
 use lms::variant::Baud;
 use port::{
-    Candidate, Holder, PROMPT_MS, Port, PortError, PortlessAdapter, Rights, Source, all_holders, is_tty,
+    Candidate, Holder, PROMPT_MS, Port, PortError, PortlessAdapter, Rights, Source, all_holders, check_tty,
     latency_ms,
 };
 use schema::{Failure, Kind};
@@ -41,8 +41,8 @@ pub(crate) fn examine(
         tell(Finding::skipped("port", "a link of the hub, which does not report its port"));
         return Ok(());
     }
-    if path.exists() && !is_tty(path) {
-        tell(refused(PortError::NotTty.explain(&subject.source)));
+    if let Err(error @ (PortError::NotTty | PortError::Dead | PortError::Other(_))) = check_tty(path) {
+        tell(refused(error.explain(&subject.source)));
         return Ok(());
     }
     tell(presence(&subject.source, path, candidate));
