@@ -21,7 +21,7 @@ use clap::error::ErrorKind;
 use config::Config;
 use rustix::process::Signal;
 use schema::csv::ScanColumns;
-use schema::{Domain, Failure, Kind, Printable, json_line};
+use schema::{Domain, Failure, Kind, Printable, RunningHub, json_line};
 use serde::Serialize;
 use signal_hook::consts::{SIGHUP, SIGINT, SIGQUIT, SIGTERM, SIGUSR1};
 use tracing::level_filters::LevelFilter;
@@ -97,7 +97,10 @@ fn dispatch(cli: &Cli) -> Result<(), Failure> {
         Verb::Man(man) => man.run(),
         Verb::Config(config) => config.run(everywhere),
         Verb::Doctor(doctor) => doctor.run(everywhere, &*interrupt()?),
-        Verb::List { domains: true } => verbs::list_domains(&everywhere.bases(), everywhere.json, &mut out),
+        Verb::List { domains: true } => {
+            let hubs = if everywhere.root.is_none() { RunningHub::all(Path::new("/")) } else { Vec::new() };
+            verbs::list_domains(&everywhere.bases(), &hubs, everywhere.json, &mut out)
+        }
         Verb::List { domains: false } => {
             let options = ListOptions { json: everywhere.json, places: everywhere.places()? };
             verbs::list(&options, &mut out, &*interrupt()?)

@@ -17,10 +17,10 @@ pub struct RunningHub {
     pub uid: u32,
     /// Name of that user; `#` and the ID, as `sudo -u` takes it, if the user has no name.
     pub user: String,
-    /// Domain of the hub.
-    pub domain: String,
+    /// Domain of the hub. `None` if only its environment may say, which other users cannot read.
+    pub domain: Option<String>,
     /// Directory that contains its domain. `None` if only its environment says, which other users cannot read.
-    base: Option<PathBuf>,
+    pub base: Option<PathBuf>,
     /// The program, as it was started.
     program: String,
 }
@@ -54,9 +54,9 @@ impl RunningHub {
         let entry = users.lines().find(|line| line.split(':').nth(2) == Some(&uid.to_string()));
         let user = entry.and_then(|entry| entry.split(':').next());
         let user = user.map_or_else(|| format!("#{uid}"), str::to_owned);
-        let environment = fs::read(path.join("environ")).unwrap_or_default();
+        let environment = fs::read(path.join("environ")).ok();
         let variable = |name: &str| {
-            let mut all = environment.split(|&byte| byte == 0);
+            let mut all = environment.as_deref().unwrap_or_default().split(|&byte| byte == 0);
             let value = all.find_map(|entry| entry.strip_prefix(name.as_bytes())?.strip_prefix(b"="))?;
             (!value.is_empty()).then(|| OsStr::from_bytes(value).to_owned())
         };
@@ -64,7 +64,7 @@ impl RunningHub {
         let base = match command.root {
             // A relative one counts from the process's working directory, which other users cannot read.
             Some(root) => Some(fs::read_link(path.join("cwd")).map_or(root.clone(), |cwd| cwd.join(root))),
-            None if environment.is_empty() => None,
+            None if environment.is_none() => None,
             None => Some(
                 Environment {
                     runtime_directory: directory("RUNTIME_DIRECTORY"),
@@ -75,9 +75,11 @@ impl RunningHub {
             ),
         };
         let domain = command.domain.or_else(|| variable("SCANHUB_DOMAIN")?.into_string().ok());
-        let domain = domain.unwrap_or_else(|| DEFAULT_DOMAIN.to_owned());
+        let domain = domain.or_else(|| environment.is_some().then(|| DEFAULT_DOMAIN.to_owned()));
         // Any user can start a process with any command line, and the name becomes part of a suggested command.
-        crate::domain::check_name(&domain).ok()?;
+        if let Some(domain) = &domain {
+            crate::domain::check_name(domain).ok()?;
+        }
         // A relative path counts from the process's working directory.
         let program = if command.program.contains('/') && !command.program.starts_with('/') {
             let directory = fs::read_link(path.join("cwd"));
@@ -88,8 +90,20 @@ impl RunningHub {
         Some(RunningHub { pid, uid, user, domain, base, program })
     }
 
+    /// Returns who runs the hub, and the command that reaches it, for a client of `caller` that has asked for `domain`.
+    pub fn whereabouts(&self, verb: &str, domain: &str, caller: &Environment) -> String {
+        let whose =
+            if self.uid == caller.uid { "this user".to_owned() } else { format!("user {}", self.user) };
+        let of_domain = match &self.domain {
+            Some(own) if own == domain => String::new(),
+            Some(own) => format!(" in domain {own}"),
+            None => " in an unknown domain".to_owned(),
+        };
+        format!("{whose} runs one{of_domain}, process {}: {}", self.pid, self.command(verb, domain, caller))
+    }
+
     /// Returns the command with which the user of `caller` runs `verb` in the domain of this hub. `domain` is the one that
-    /// the caller has asked for.
+    /// the caller has asked for. If the hub's domain is unknown, the command lists the domains of the hub's user.
     pub fn command(&self, verb: &str, domain: &str, caller: &Environment) -> String {
         // sudo resets the environment of the command.
         let (sudo, environment, domain) = if self.uid == caller.uid {
@@ -102,9 +116,11 @@ impl RunningHub {
             };
             (sudo, Environment { uid: self.uid, ..Environment::default() }, DEFAULT_DOMAIN)
         };
-        let mut command = format!("{sudo}{} {verb}", shell_word(&self.program));
-        if self.domain != domain {
-            command += &format!(" --domain {}", self.domain);
+        let program = shell_word(&self.program);
+        let Some(own) = &self.domain else { return format!("{sudo}{program} list --domains") };
+        let mut command = format!("{sudo}{program} {verb}");
+        if own != domain {
+            command += &format!(" --domain {own}");
         }
         if let Some(base) = self.base.as_ref().filter(|base| !environment.bases().contains(base)) {
             command += &format!(" --root {}", shell_word(&base.to_string_lossy()));
@@ -222,10 +238,21 @@ mod tests {
         machine.process(15, 1000, &["scanhub", "echo", "run"], None);
         machine.process(16, 0, &[], None);
         machine.process(17, 1000, &["scanhub", "run", "--domain", "x; id"], None);
+        machine.process(18, 1000, &["scanhub", "run"], Some(""));
+        machine.process(19, 1000, &["scanhub", "run"], Some("SCANHUB_DOMAIN=lab"));
         let hubs = RunningHub::all(&machine.0);
         let found: Vec<_> =
-            hubs.iter().map(|hub| (hub.pid, hub.user.as_str(), hub.domain.as_str())).collect();
-        assert_eq!(found, [(11, "root", "scanhub"), (12, "scanhub", "scanhub"), (13, "alice", "lab")]);
+            hubs.iter().map(|hub| (hub.pid, hub.user.as_str(), hub.domain.as_deref())).collect();
+        assert_eq!(
+            found,
+            [
+                (11, "root", None),
+                (12, "scanhub", None),
+                (13, "alice", Some("lab")),
+                (18, "alice", Some("scanhub")),
+                (19, "alice", Some("lab")),
+            ]
+        );
         assert_eq!(RunningHub::all(Path::new("/nowhere")), []);
     }
 
@@ -239,13 +266,12 @@ mod tests {
             hub.command("list", "scanhub", &user(caller))
         };
         let run = ["scanhub", "run"];
-        assert_eq!(command(0, &run, None, 1000), "sudo scanhub list");
-        assert_eq!(
-            command(998, &["/usr/local/bin/scanhub", "run"], None, 1000),
-            "sudo -u scanhub scanhub list"
-        );
-        assert_eq!(command(1000, &run, None, 1001), "sudo -u alice scanhub list");
-        assert_eq!(command(65_531, &run, None, 0), "sudo -u '#65531' scanhub list");
+        // Its domain may be in its environment, which other users cannot read.
+        assert_eq!(command(0, &run, None, 1000), "sudo scanhub list --domains");
+        let named = ["/usr/local/bin/scanhub", "run", "--domain", "scanhub"];
+        assert_eq!(command(998, &named, None, 1000), "sudo -u scanhub scanhub list");
+        assert_eq!(command(1000, &run, None, 1001), "sudo -u alice scanhub list --domains");
+        assert_eq!(command(65_531, &run, Some("A=b"), 0), "sudo -u '#65531' scanhub list");
         // Root can read where the hub is: sudo does not pass the variable on, and a client looks there anyway.
         let logged_in = Some("HOME=/home/alice XDG_RUNTIME_DIR=/run/user/1000");
         assert_eq!(command(1000, &run, logged_in, 0), "sudo -u alice scanhub list");
@@ -257,7 +283,7 @@ mod tests {
         let flags = ["/opt/scanhub", "run", "--root=/srv/a b", "--domain=lab"];
         assert_eq!(command(0, &flags, None, 1000), "sudo /opt/scanhub list --domain lab --root '/srv/a b'");
         // Its working directory cannot be read.
-        assert_eq!(command(0, &["./scanhub", "run"], None, 1000), "sudo scanhub list");
+        assert_eq!(command(0, &["./scanhub", "run"], None, 1000), "sudo scanhub list --domains");
         assert_eq!(
             command(1000, &["scanhub", "run", "--domain", "lab"], logged_in, 1000),
             "scanhub list --domain lab"

@@ -192,6 +192,41 @@ fn names_the_user_whose_hub_runs() {
         let of_session = start(OTHER, &run).ready();
         follows_the_suggestion(&root, OTHER, &of_session);
         assert_eq!(of_session.end(TERM).code, Some(0));
+
+        // Other users cannot read the variable, so they are not told a domain.
+        let mut command = scanhub(0, &run[..run.len() - 1]);
+        command.env_remove("XDG_RUNTIME_DIR").env("SCANHUB_DOMAIN", "whose");
+        let of_variable = Program::start(command).ready();
+        let pid = of_variable.pid();
+        let suggested = format!("in an unknown domain, process {pid}: sudo /mnt/scanhub list --domains");
+        let outcome = other(&["list", DOMAIN]).wait();
+        assert!(outcome.code == Some(3) && outcome.errors.contains(&suggested), "{outcome}");
+        let listed = by_sudo(0, &["list", "--domains", "--json"]).wait();
+        let is_it = |line: &&Value| line["pid"] == json!(pid);
+        assert!(
+            listed.of_class("domain").iter().any(|line| line["domain"] == "whose" && is_it(&line)),
+            "{listed}"
+        );
+        let listed = other(&["list", "--domains", "--json"]).wait();
+        let unreachable = listed.of_class("unreachable");
+        let line = unreachable.iter().find(is_it).expect("a line");
+        let remedy = json!("sudo /mnt/scanhub list --domains");
+        assert_eq!(
+            (&line["domain"], &line["user"], &line["remedy"]),
+            (&Value::Null, &json!("root"), &remedy)
+        );
+        // Viewers of a page do not read of other users; the terminal does.
+        let mut web = other(&["web", "--listen", "127.0.0.1:0", DOMAIN]);
+        web.await_text(&format!("no hub of this user in domain whose; user root runs one {suggested}"));
+        assert_eq!(web.end(TERM).code, Some(0));
+        assert_eq!(of_variable.end(TERM).code, Some(0));
+
+        // A hub of this user below another directory is listed.
+        let below = start(OTHER, &[&run[..], &["--root", &format!("/tmp/{OTHER}")]].concat()).ready();
+        let listed = other(&["list", "--domains", "--json"]).wait();
+        let root = json!(format!("/tmp/{OTHER}/whose"));
+        assert!(listed.of_class("domain").iter().any(|line| line["root"] == root), "{listed}");
+        assert_eq!(below.end(TERM).code, Some(0));
     });
 }
 

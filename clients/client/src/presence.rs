@@ -120,11 +120,18 @@ impl Presence {
 
     /// The failure for callers that cannot wait for a hub.
     pub(crate) fn no_hub(&self) -> Failure {
-        if let Some(short) = self.short() {
-            return short;
-        }
-        let hubs = RunningHub::all(Path::new("/"));
-        no_hub(&self.places, self.denied.as_ref(), &hubs, &Environment::of_process())
+        self.no_hub_beside(|| RunningHub::all(Path::new("/")))
+    }
+
+    /// Returns [`Presence::no_hub`] without the hubs of other users and domains, for readers on other machines. It does not
+    /// read /proc, so it can be called often.
+    pub(crate) fn no_hub_here(&self) -> Failure {
+        self.no_hub_beside(Vec::new)
+    }
+
+    fn no_hub_beside(&self, hubs: impl FnOnce() -> Vec<RunningHub>) -> Failure {
+        let of_process = Environment::of_process();
+        self.short().unwrap_or_else(|| no_hub(&self.places, self.denied.as_ref(), &hubs(), &of_process))
     }
 
     /// Why it is not known whether there is a hub: there was not even a descriptor to look with.
@@ -153,12 +160,15 @@ impl Presence {
 /// hubs of this machine, and `caller` is the environment of this process.
 fn no_hub(places: &[Domain], denied: Option<&Failure>, hubs: &[RunningHub], caller: &Environment) -> Failure {
     let name = places.first().map(Domain::name).unwrap_or_default();
-    let is_meant = |hub: &&RunningHub| hub.domain == name && hub.uid != caller.uid;
+    // The domain of another user's hub may be unknown.
+    let is_meant =
+        |hub: &&RunningHub| hub.uid != caller.uid && hub.domain.as_ref().is_none_or(|domain| domain == name);
     let is_elsewhere = hubs.iter().any(|hub| is_meant(&hub));
     // Hubs of other domains count only if no other user has one of this domain; those of this user come first.
     let mut hubs: Vec<&RunningHub> = hubs.iter().filter(|hub| !is_elsewhere || is_meant(hub)).collect();
     hubs.sort_by_key(|hub| hub.uid != caller.uid);
-    let mut hints: Vec<String> = hubs.iter().take(MAX_HUBS).map(|hub| elsewhere(hub, name, caller)).collect();
+    let mut hints: Vec<String> =
+        hubs.iter().take(MAX_HUBS).map(|hub| hub.whereabouts("list", name, caller)).collect();
     if hubs.len() > MAX_HUBS {
         hints.push(format!("and {} more", hubs.len() - MAX_HUBS));
     }
@@ -176,14 +186,6 @@ fn no_hub(places: &[Domain], denied: Option<&Failure>, hubs: &[RunningHub], call
         }
     }
     Failure::new(Kind::NoHub, message, hints.join("; "))
-}
-
-/// Returns who runs `hub`, and the command that reaches it, for a caller that asked for domain `name`.
-fn elsewhere(hub: &RunningHub, name: &str, caller: &Environment) -> String {
-    let RunningHub { pid, uid, user, domain, .. } = hub;
-    let whose = if *uid == caller.uid { "this user".to_owned() } else { format!("user {user}") };
-    let domain = if domain == name { String::new() } else { format!(" in domain {domain}") };
-    format!("{whose} runs one{domain}, process {pid}: {}", hub.command("list", name, caller))
 }
 
 /// Returns the hub at the first live one of `places`, waiting a moment for one that is just starting.
@@ -258,17 +260,23 @@ mod tests {
         assert_eq!(message, "no hub in domain scanhub");
         assert!(hint.starts_with("start one with `scanhub run`; looked at /run/scanhub/scanhub, "), "{hint}");
 
-        let (message, hint) = said(&hubs(&[(7, 0, "run --link front=/dev/ttyUSB0")]), None);
+        let (message, hint) = said(&hubs(&[(7, 0, "run")]), None);
+        assert_eq!(message, "no hub of this user in domain scanhub");
+        let unknown = "user root runs one in an unknown domain, process 7: sudo scanhub list --domains; ";
+        assert!(hint.starts_with(unknown), "{hint}");
+
+        let named = (7, 0, "run --domain scanhub");
+        let (message, hint) = said(&hubs(&[named]), None);
         assert_eq!(message, "no hub of this user in domain scanhub");
         assert!(hint.starts_with("user root runs one, process 7: sudo scanhub list; "), "{hint}");
         assert!(hint.contains("docs/sharing.md") && !hint.contains("start one"), "{hint}");
 
-        let others = [(6, 1000, "run --domain lab"), (7, 0, "run"), (8, 0, "run --domain x")];
+        let others = [(6, 1000, "run --domain lab"), named, (8, 0, "run --domain x")];
         assert_eq!(said(&hubs(&others), None).1, hint, "hubs of other domains are not meant");
 
         // The service's directory cannot be opened.
         let denied = Failure::new(Kind::Failed, "/run/scanhub belongs to user 998", "choose another --root");
-        let (message, hint) = said(&hubs(&[(7, 998, "run")]), Some(&denied));
+        let (message, hint) = said(&hubs(&[(7, 998, "run --domain scanhub")]), Some(&denied));
         assert!(message.ends_with("in domain scanhub: /run/scanhub belongs to user 998"), "{message}");
         assert!(
             hint.starts_with("user scanhub runs one, process 7: sudo -u scanhub scanhub list; "),

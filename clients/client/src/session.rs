@@ -118,6 +118,11 @@ impl Session {
         self.presence.no_hub()
     }
 
+    /// Returns [`Session::no_hub`] without the hubs of other users and domains, for readers on other machines.
+    pub fn no_hub_here(&self) -> Failure {
+        self.presence.no_hub_here()
+    }
+
     /// Counts the domains joined: ports of an earlier one must be opened again.
     pub fn number(&self) -> u32 {
         self.number

@@ -6,7 +6,9 @@ use std::sync::atomic::AtomicBool;
 
 use scanhub_client::streams::find;
 use schema::ipc::{self, Node, Payload, PortFactory};
-use schema::{Domain, Failure, Family, Pace, State, Status, Topic, publisher};
+use schema::{
+    DEFAULT_DOMAIN, Domain, Environment, Failure, Family, Pace, RunningHub, State, Status, Topic, publisher,
+};
 use serde::{Serialize, Serializer};
 
 use crate::info::statuses;
@@ -60,14 +62,33 @@ pub fn list(options: &ListOptions, out: &mut dyn Write, stop: &AtomicBool) -> Re
     )
 }
 
-/// Writes every live domain below `bases` (`--root`, or [`Environment::bases`](schema::Environment::bases)) to `out`.
-pub fn list_domains(bases: &[PathBuf], json: bool, out: &mut dyn Write) -> Result<(), Failure> {
+/// Writes every live domain below `bases` (`--root`, or [`Environment::bases`](schema::Environment::bases)) to `out`. Of
+/// `hubs`, those below another directory follow, and then those that this user cannot reach, with the command that does.
+///
+/// # Errors
+///
+/// Returns an error if `out` cannot be written to.
+pub fn list_domains(
+    bases: &[PathBuf],
+    hubs: &[RunningHub],
+    json: bool,
+    out: &mut dyn Write,
+) -> Result<(), Failure> {
     #[derive(Serialize)]
     struct Line {
         class: &'static str,
         domain: String,
         root: PathBuf,
         pid: u32,
+    }
+    /// A hub whose files this user cannot read, or does not find.
+    #[derive(Serialize)]
+    struct Unreachable<'a> {
+        class: &'static str,
+        domain: Option<&'a str>,
+        pid: u32,
+        user: &'a str,
+        remedy: String,
     }
     let mut lines = Vec::new();
     for base in bases {
@@ -82,16 +103,54 @@ pub fn list_domains(bases: &[PathBuf], json: bool, out: &mut dyn Write) -> Resul
             }
         }
     }
+    let caller = Environment::of_process();
+    let mut unreachable = Vec::new();
+    for hub in hubs {
+        if lines.iter().any(|line| line.pid == hub.pid) {
+            continue;
+        }
+        let place = hub.domain.as_ref().zip(hub.base.as_ref());
+        let place = place.and_then(|(domain, base)| Domain::at(domain, base).ok());
+        match place {
+            Some(place) if publisher(place.root()) == Ok(Some(hub.pid)) => {
+                let root = place.root().to_owned();
+                lines.push(Line { class: "domain", domain: place.name().to_owned(), root, pid: hub.pid });
+            }
+            place => unreachable.push(Unreachable {
+                class: "unreachable",
+                domain: hub.domain.as_deref(),
+                pid: hub.pid,
+                user: &hub.user,
+                remedy: match place {
+                    Some(place) if hub.uid == caller.uid => format!(
+                        "it is starting, or it runs in a container: it does not hold {} here",
+                        place.root().display()
+                    ),
+                    _ => hub.command("list", DEFAULT_DOMAIN, &caller),
+                },
+            }),
+        }
+    }
     lines.sort_by(|a, b| a.root.cmp(&b.root));
     let mut output = Output::new(out);
     if json {
-        return quiet(lines.iter().try_for_each(|line| output.json(line)));
+        return quiet(
+            lines
+                .iter()
+                .try_for_each(|line| output.json(line))
+                .and_then(|()| unreachable.iter().try_for_each(|line| output.json(line))),
+        );
     }
     let mut rows = vec![["DOMAIN", "PID", "ROOT"].map(String::from).to_vec()];
     rows.extend(
         lines.iter().map(|it| vec![it.domain.clone(), it.pid.to_string(), it.root.display().to_string()]),
     );
-    quiet(table(&mut output, &rows))
+    quiet(table(&mut output, &rows).and_then(|()| {
+        unreachable.iter().try_for_each(|Unreachable { domain, pid, user, remedy, .. }| {
+            let domain = domain.map_or_else(String::new, |domain| format!(" in domain {domain}"));
+            output.line(|line| write!(line, "user {user} runs a hub{domain}, process {pid}: {remedy}"))
+        })
+    }))
 }
 
 /// Class `topic`; the rate is the hub's own measurement of the scans, null where it does not say one and for topics that

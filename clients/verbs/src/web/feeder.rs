@@ -227,7 +227,7 @@ impl<'a> Feeder<'a> {
             let mut session = Session::new(self.options.places.clone());
             let failure = session.look().err();
             match session.publishes() {
-                None => Some(failure.unwrap_or_else(|| session.no_hub())),
+                None => Some(failure.unwrap_or_else(|| session.no_hub_here())),
                 Some(Who::Hub) => None,
                 Some(Who::Listener) => Some(Failure::new(
                     Kind::NoTopic,
@@ -305,6 +305,12 @@ impl Sink for Feeder<'_> {
 
     fn notice(&mut self, names: &[&TopicName], notice: Notice) -> Result<(), End> {
         picture::note(&mut self.scene, names, &notice);
+        if let Notice::NoHub(failure) = &notice
+            && !self.options.json
+        {
+            // Only this terminal reads of other users' hubs; viewers read the trouble of `look`.
+            told::no_hub(&mut self.output, failure)?;
+        }
         if matches!(notice, Notice::NoHub(_) | Notice::HubGone) {
             self.clear();
             self.status_at = Instant::now();

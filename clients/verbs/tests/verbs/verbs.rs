@@ -62,10 +62,10 @@ fn topics_of_a_hub() {
 fn live_domains() {
     let place = Place::new();
     let mut out = Vec::new();
-    list_domains(std::slice::from_ref(&place.base), true, &mut out).unwrap();
+    list_domains(std::slice::from_ref(&place.base), &[], true, &mut out).unwrap();
     assert!(out.is_empty());
     let _hub = FakeHub::new(&place.domain, &[], 1);
-    list_domains(std::slice::from_ref(&place.base), true, &mut out).unwrap();
+    list_domains(std::slice::from_ref(&place.base), &[], true, &mut out).unwrap();
     let (name, root, pid) = (place.domain.name(), place.domain.root().display(), std::process::id());
     let expected =
         format!("{{\"class\":\"domain\",\"domain\":\"{name}\",\"root\":\"{root}\",\"pid\":{pid}}}\n");

@@ -42,7 +42,7 @@ pub(crate) struct Facts {
     pub(crate) others: Vec<(PathBuf, u32)>,
     /// Such places that are another user's, with whose they are.
     pub(crate) closed: Vec<(PathBuf, u32)>,
-    /// Hubs of the same name that other users run.
+    /// Hubs of the same or an unknown name that other users run.
     pub(crate) foreign: Vec<RunningHub>,
     /// Processes at the domain's place, and the dead ones at others where no hub is.
     pub(crate) nodes: Result<Nodes, Failure>,
@@ -119,7 +119,8 @@ impl Facts {
                 .collect(),
             foreign: RunningHub::all(Path::new("/"))
                 .into_iter()
-                .filter(|hub| hub.uid != user && hub.domain == domain.name())
+                .filter(|hub| hub.uid != user)
+                .filter(|hub| hub.domain.as_ref().is_none_or(|own| own == domain.name()))
                 .collect(),
             nodes,
             segments: if is_empty { segments::abandoned(&domain.prefix(), user) } else { Vec::new() },
@@ -249,9 +250,7 @@ pub(crate) fn hubs(facts: &Facts, name_of: impl Fn(u32) -> String) -> Finding {
         }
         let is_said = |hub: &&RunningHub| facts.closed.iter().any(|(_, owner)| *owner == hub.uid);
         for hub in facts.foreign.iter().filter(|hub| !is_said(hub)) {
-            let RunningHub { pid, user, .. } = hub;
-            let command = hub.command("doctor", &facts.name, &Environment::of_process());
-            text += &format!("; user {user} runs one, process {pid}: {command}");
+            text += &format!("; {}", hub.whereabouts("doctor", &facts.name, &Environment::of_process()));
         }
         return Finding::ok(NAME, text);
     }
@@ -373,12 +372,16 @@ pub(super) mod tests {
             ("etc/passwd", "robot:x:9:9::/:\n"),
             ("proc/41/comm", "scanhub\n"),
             ("proc/41/status", "Uid:\t9\t9\t9\t9\n"),
-            ("proc/41/cmdline", "scanhub\0run\0"),
+            ("proc/41/cmdline", "scanhub\0run\0--domain=scanhub\0"),
+            ("proc/42/comm", "scanhub\n"),
+            ("proc/42/status", "Uid:\t9\t9\t9\t9\n"),
+            ("proc/42/cmdline", "scanhub\0run\0"),
         ];
         let laid = Laid::out("foreign-hub", 7, &files);
         let foreign = Facts { foreign: RunningHub::all(&laid.path("")), ..facts() };
         let command = "user robot runs one, process 41: sudo -u robot scanhub doctor";
-        says(&hubs(&foreign), State::Ok, &["no other hub", command]);
+        let unknown = "runs one in an unknown domain, process 42: sudo -u robot scanhub list --domains";
+        says(&hubs(&foreign), State::Ok, &["no other hub", command, unknown]);
         let two = Facts { others: vec![("/tmp/scanhub-7/scanhub".into(), 9)], ..facts() };
         says(&hubs(&two), State::Warning, &["/tmp/scanhub-7/scanhub (process 9)", "--domain"]);
     }
