@@ -31,3 +31,20 @@ fn bytes_of_another_scanner_are_reported_with_their_rate() {
         }
     }
 }
+
+#[test]
+fn a_silent_line_may_have_another_scanner() {
+    for (family, says) in [
+        ("lms", "no answer at 9600, 19200, 38400 or 500000 baud"),
+        ("rplidar", "no answer at 115200, 256000, 460800 and 1000000 baud"),
+        ("ld", "no packets at 230400 and 921600 baud"),
+    ] {
+        let env = TestEnv::new();
+        let _simulator = env.simulator(&["front"], &["--fault=mute=1"]);
+        let _hub = env.hub(&[format!("{},family={family}", env.link("front"))]);
+        let error = |info: &Value| info["last_error"].as_str().unwrap_or_default().to_owned();
+        let info = env.await_info("front", |info| error(info).starts_with(says));
+        let remedy = format!(" Another scanner? Try: scanhub probe {}", env.word("front"));
+        assert!(error(&info).ends_with(&remedy), "{info}");
+    }
+}

@@ -264,10 +264,12 @@ impl<'a> Diagnosis<'a> {
         }
         let is_server = matches!(self.link.port, Source::Tcp { .. });
         match driver.trouble() {
-            Some(Trouble::Lms(lms::Trouble::NoAnswer { .. })) if is_server => format!(
-                "no answer at {} baud, the rate set in the serial server: check power, cable, rate",
+            Some(Trouble::Lms(lms::Trouble::NoAnswer { .. })) if is_server => self.with_probe(&format!(
+                "no answer at {} baud, the rate set in the serial server: power, cable, rate?",
                 self.link.baud.rate()
-            ),
+            )),
+            // Nothing says which scanner it is, if there is one.
+            Some(trouble) if driver.missing().is_some() => self.with_probe(&trouble.to_string()),
             Some(trouble) => trouble.to_string(),
             None => self.mismatch(driver).unwrap_or_else(|| match driver.lms() {
                 _ if self.unserved_for >= UNSERVED_LIMIT => self.unserved(),
@@ -284,17 +286,25 @@ impl<'a> Diagnosis<'a> {
     fn other_bytes(&self, missing: &str, rate: u64) -> String {
         let is_server = matches!(self.link.port, Source::Tcp { .. });
         let other_rate = if is_server { ", or does the server use another rate" } else { "" };
-        let words = |port: &str| {
-            format!(
-                "{} bytes/s arrive, but no {missing}; is it another scanner{other_rate}? Try: scanhub probe {port}",
-                with_commas(rate)
-            )
-        };
-        let message = words(&self.link.port.name());
+        let bytes = with_commas(rate);
+        self.try_probe(&format!(
+            "{bytes} bytes/s arrive, but no {missing}; is it another scanner{other_rate}?"
+        ))
+    }
+
+    /// Returns `words` about a scanner that does not reply, with the command that searches for all scanners.
+    fn with_probe(&self, words: &str) -> String {
+        self.try_probe(&format!("{words} Another scanner?"))
+    }
+
+    /// Returns `words` with the command that probes the port.
+    fn try_probe(&self, words: &str) -> String {
+        let message = |port: &str| format!("{words} Try: scanhub probe {port}");
+        let named = message(&self.link.port.name());
         match &self.device {
             // The command at its end would be cut.
-            Some(device) if message.len() > Status::MAX_ERROR_LEN => words(device),
-            _ => message,
+            Some(device) if named.len() > Status::MAX_ERROR_LEN => message(device),
+            _ => named,
         }
     }
 
