@@ -162,6 +162,9 @@ fn a_scanner_that_restarts_is_counted_and_told() {
     assert!(text(&info, "last_error").ends_with("is its supply strong enough?"), "{info}");
     let log = hub.end(TERM).errors;
     assert!(log.contains("the scanner restarted"), "{log}");
+    for count in ["restarted: ", "restarted 2 times"] {
+        assert_eq!(log.matches(&format!("the scanner {count}")).count(), 1, "once for each count: {log}");
+    }
 }
 
 #[test]

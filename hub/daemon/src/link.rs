@@ -247,11 +247,14 @@ impl<'a, S: Surroundings> LinkCore<'a, S> {
     }
 }
 
-/// Takes over `state` and `error`, and logs them if they are new; whether they are.
+/// Takes over `state` and `error`, and logs them if they are new; whether they are. An error that stays through several
+/// states is logged once.
 fn update(stats: &mut LinkStats, link: &Link, state: State, error: &str, now: Nanos) -> bool {
+    let told = stats.last().last_error_text;
     let (changed, name) = (stats.update(state, error, now), &link.name);
     match error {
         _ if !changed => {}
+        _ if stats.last().last_error_text == told => tracing::info!("{name}: {}", state.name()),
         "" => tracing::info!("{name}: {}", state.name()),
         error => tracing::warn!("{name}: {}: {error}", state.name()),
     }
