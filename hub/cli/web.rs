@@ -14,7 +14,7 @@ pub(crate) struct Web {
     /// Sensors to show [default: all]
     #[arg(value_name = "SENSOR")]
     sensors: Vec<String>,
-    /// Address to listen on: an IP address, a port, or both. 0.0.0.0 or :: for other machines, which needs --token. If the
+    /// Address to listen on: an IP address or localhost, a port, or both. 0.0.0.0 or :: for other machines, which needs --token. If the
     /// port is in use, the next free one
     #[arg(long, default_value = "127.0.0.1:8080", value_name = "ADDRESS:PORT", value_parser = listen_address)]
     listen: SocketAddr,
@@ -39,9 +39,10 @@ pub(crate) struct Web {
 }
 
 /// Port that `web` listens on if `--listen` names only an address.
-const DEFAULT_PORT: u16 = 8080;
+const DEFAULT_PORT: u16 = verbs::WEB_PORT;
 
-/// Parses `ADDRESS:PORT`, an address without a port, or a port without an address, which means this machine only.
+/// Parses `ADDRESS:PORT`, an address without a port, or a port without an address, which means this machine only, as does
+/// `localhost`.
 fn listen_address(text: &str) -> Result<SocketAddr, String> {
     let without_brackets = text.strip_prefix('[').and_then(|rest| rest.strip_suffix(']')).unwrap_or(text);
     if let Ok(address) = text.parse() {
@@ -50,7 +51,11 @@ fn listen_address(text: &str) -> Result<SocketAddr, String> {
     if let Ok(ip) = without_brackets.parse::<IpAddr>() {
         return Ok(SocketAddr::new(ip, DEFAULT_PORT));
     }
-    if let Ok(port) = text.parse() {
+    if text == "localhost" {
+        return Ok(SocketAddr::from((Ipv4Addr::LOCALHOST, DEFAULT_PORT)));
+    }
+    let port = text.strip_prefix("localhost:").or_else(|| text.strip_prefix(':')).unwrap_or(text);
+    if let Ok(port) = port.parse() {
         return Ok(SocketAddr::from((Ipv4Addr::LOCALHOST, port)));
     }
     Err("use an IP address, a port, or both, such as 8090, 0.0.0.0 or [::]:8090".to_owned())
@@ -95,6 +100,9 @@ mod tests {
         for (text, expected) in [
             ("8090", "127.0.0.1:8090"),
             ("0", "127.0.0.1:0"),
+            (":8090", "127.0.0.1:8090"),
+            ("localhost:8090", "127.0.0.1:8090"),
+            ("localhost", "127.0.0.1:8080"),
             ("0.0.0.0", "0.0.0.0:8080"),
             ("::", "[::]:8080"),
             ("[::]", "[::]:8080"),
@@ -109,7 +117,9 @@ mod tests {
             "",
             "65536",
             "-1",
-            ":8090",
+            ":",
+            "localhost:",
+            "::8090x",
             "robot",
             "robot:8090",
             "0.0.0.0:",

@@ -79,4 +79,4 @@ pub use track::{TrackOptions, track};
 #[cfg(feature = "tui")]
 pub use watch::{WatchOptions, watch};
 #[cfg(feature = "web")]
-pub use web::{WebOptions, web};
+pub use web::{WEB_PORT, WebOptions, web};

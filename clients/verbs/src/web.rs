@@ -44,6 +44,9 @@ pub struct WebOptions {
     pub places: Vec<Domain>,
 }
 
+/// Port that is served if none is named.
+pub const WEB_PORT: u16 = 8080;
+
 /// Serves the picture until the bounds are reached or `stop` is set; says on `out` where, and who comes and goes. Viewers
 /// have the keys of `player`, if there is one, whose hub no one else has.
 ///
@@ -72,8 +75,7 @@ pub fn web(
     let (tell, events) = mpsc::channel();
     let mut output = Output::new(out);
     let url = url(server.address(), &options.names, options.token.as_deref());
-    let is_local = server.address().ip().is_loopback();
-    if let Err(end) = told::ready(&mut output, &url, is_local, options.json) {
+    if let Err(end) = told::ready(&mut output, &url, options) {
         return quiet(Err(end));
     }
     let wanted = [&picture::TOPICS[..], Maker::Mount.topics(), Maker::Tilted.topics()].concat();
@@ -177,7 +179,7 @@ mod tests {
         let local = text(&options("127.0.0.1:0"));
         let [ready, others] = &local.lines().collect::<Vec<_>>()[..] else { panic!("{local}") };
         assert!(ready.starts_with("ready http://127.0.0.1:"), "{local}");
-        assert_eq!(*others, "for other machines: --listen 0.0.0.0 --token WORD");
+        assert_eq!(*others, "for other machines: --listen 0.0.0.0:0 --token WORD");
         let open = text(&WebOptions { open: true, ..options("0.0.0.0:0") });
         assert_eq!(open.lines().count(), 1, "{open}");
         let json = text(&WebOptions { json: true, ..options("127.0.0.1:0") });

@@ -3,28 +3,38 @@
 use std::io::Write;
 
 use ::web::{Event, Visit};
+use schema::Failure;
 use serde::Serialize;
 
+use super::{WEB_PORT, WebOptions};
 use crate::output::{End, Output};
 
-/// Prints the address; as text also the flags for access from other machines, if the address is local.
-pub(crate) fn ready(output: &mut Output<'_>, url: &str, is_local: bool, json: bool) -> Result<(), End> {
+/// Prints the address; as text also the flags for access from other machines, if `options` name a local address.
+pub(crate) fn ready(output: &mut Output<'_>, url: &str, options: &WebOptions) -> Result<(), End> {
     #[derive(Serialize)]
     struct Ready<'a> {
         class: &'static str,
         url: &'a str,
         pid: u32,
     }
-    match json {
-        true => output.json(&Ready { class: "ready", url, pid: std::process::id() }),
-        false => {
-            output.line(|line| write!(line, "ready {url}"))?;
-            match is_local {
-                true => output.line(|line| write!(line, "for other machines: --listen 0.0.0.0 --token WORD")),
-                false => Ok(()),
-            }
-        }
+    if options.json {
+        return output.json(&Ready { class: "ready", url, pid: std::process::id() });
     }
+    output.line(|line| write!(line, "ready {url}"))?;
+    if !options.listen.ip().is_loopback() {
+        return Ok(());
+    }
+    let port = match options.listen.port() {
+        WEB_PORT => String::new(),
+        port => format!(":{port}"),
+    };
+    let token = options.token.as_deref().unwrap_or("WORD");
+    output.line(|line| write!(line, "for other machines: --listen 0.0.0.0{port} --token {token}"))
+}
+
+/// Prints why there is no hub to serve yet, and the command that reaches another one.
+pub(crate) fn no_hub(output: &mut Output<'_>, failure: &Failure) -> Result<(), End> {
+    output.line(|line| write!(line, "{}; {}", failure.message, failure.hint))
 }
 
 pub(crate) fn event(output: &mut Output<'_>, event: &Event, json: bool) -> Result<(), End> {
