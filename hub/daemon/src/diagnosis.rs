@@ -247,8 +247,7 @@ impl<'a> Diagnosis<'a> {
         // Damage and restarts explain most other findings, so they come first.
         if let Some(percent) = self.damaged_percent {
             return format!(
-                "{percent} % of the bytes are damaged on the line: check cable, ground and adapter; `scanhub doctor {}` says more",
-                self.link.name
+                "{percent} % of the bytes are damaged on the line: check the cable, its ground and termination, and the adapter"
             );
         }
         match self.restarts {

@@ -121,7 +121,7 @@ impl Tty {
     }
 
     /// Returns the device that the port's name resolved to when it was opened.
-    pub(crate) fn device(&self) -> &Path {
+    pub fn device(&self) -> &Path {
         &self.device
     }
 

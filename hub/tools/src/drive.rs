@@ -19,7 +19,8 @@ pub(crate) fn drive<C: Conversation>(
     stop: &AtomicBool,
     mut look: impl FnMut(&C),
 ) -> Result<(), Failure> {
-    while let Some(until) = drain(port, talk).map_err(|error| gone(port, &error))? {
+    let mut refused = Vec::new();
+    while let Some(until) = drain(port, talk, &mut refused).map_err(|error| gone(port, &error))? {
         look(talk);
         if stop.load(Ordering::Relaxed) {
             return Err(Failure::new(Kind::Interrupted, "interrupted", ""));
@@ -38,13 +39,24 @@ pub(crate) fn drive<C: Conversation>(
     Ok(())
 }
 
-/// Does what `talk` wants until it wants to wait, or is over.
-fn drain<C: Conversation>(port: &Port, talk: &mut C) -> std::io::Result<Option<Nanos>> {
+/// Does what `talk` wants until it wants to wait, or is over. A rate that the port refuses is logged if it is not among those
+/// `refused`.
+fn drain<C: Conversation>(
+    port: &Port,
+    talk: &mut C,
+    refused: &mut Vec<u32>,
+) -> std::io::Result<Option<Nanos>> {
     loop {
         match talk.poll_output() {
             Output::SetBaud(baud) => {
-                if let Some(error) = port.try_baud(baud.rate())? {
-                    tracing::warn!("{error}");
+                if let Some(error) = port.try_baud(baud.rate())?
+                    && !refused.contains(&baud.rate())
+                {
+                    refused.push(baud.rate());
+                    match port {
+                        Port::Tty(tty) => tracing::warn!("{}: {error}", tty.device().display()),
+                        Port::Tcp(_) => tracing::warn!("{error}"),
+                    }
                 }
             }
             Output::Transmit { byte, not_before } => {

@@ -273,7 +273,7 @@ pub(crate) const LINE_REMEDY: &str =
 /// Share of damaged bytes up to which a line is well.
 const WELL: f64 = 0.01;
 /// Share of damaged bytes that makes conclusions from the others unreliable.
-const MOST_DAMAGED: f64 = 0.5;
+pub(crate) const MOST_DAMAGED: f64 = 0.5;
 
 /// Other bytes pass a checksum of 8 bits now and then: not so often.
 const ENOUGH: u64 = 20;

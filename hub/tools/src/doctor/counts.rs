@@ -5,6 +5,7 @@ use port::Counts;
 use schema::{Counter, Status};
 
 use super::finding::Finding;
+use crate::listen::MOST_DAMAGED;
 
 const NAME: &str = "line-errors";
 
@@ -50,14 +51,26 @@ pub(crate) fn line_loss(status: &Status) -> Finding {
     const NAME: &str = "line-loss";
     let due = status.counters[Counter::DueOnLine];
     let all = match status.lost_on_line() {
+        // Those that are damaged are missing, too, but too little arrives to count them.
+        Some(0) | None if status.line_loss().is_some() => {
+            format!("how many {} are lost is not known", status.sent())
+        }
         Some(lost) => format!("{lost} of {due} {} lost since the hub's start", status.sent()),
         None => format!("how many {} are lost is not known", status.sent()),
     };
     let text = format!("{:.2} % of the bytes damaged in the last 10 s, {all}", 100.0 * status.damaged());
     match status.line_loss() {
+        Some(loss) if is_mostly_damaged(status) => {
+            Finding::failed(NAME, format!("{loss}; {text}"), LOSS_REMEDY)
+        }
         Some(loss) => Finding::warning(NAME, format!("{loss}; {text}"), LOSS_REMEDY),
         None => Finding::ok(NAME, text),
     }
+}
+
+/// Returns whether the line damages most bytes, which makes every conclusion from the others unreliable.
+pub(crate) fn is_mostly_damaged(status: &Status) -> bool {
+    status.damaged() > MOST_DAMAGED
 }
 
 fn is_large(errors: u64, bytes: u64) -> bool {
@@ -72,7 +85,8 @@ fn remedy(is_lost: bool) -> &'static str {
     }
 }
 
-const LOSS_REMEDY: &str = "the cable and its ground; the adapter: one with an FT232R or newer, in a socket of the \
+/// Remedy for a line that takes bytes away.
+pub(crate) const LOSS_REMEDY: &str = "the cable and its ground; the adapter: one with an FT232R or newer, in a socket of the \
      machine; of a UART its FIFO (setserial -g); 120 ohm of termination at the receiving end; docs/wiring.md";
 /// A byte that was cut when the rate changed, and one more.
 const FEW: u64 = 2;
@@ -115,6 +129,13 @@ mod tests {
         status.counters[Counter::DamagedPpm] = 430_000;
         let now = line_loss(&status);
         assert!(now.state == State::Warning && now.finding.starts_with("41 % lost on the line"), "{now}");
+        status.counters[Counter::DamagedPpm] = 510_000;
+        let most = line_loss(&status);
+        assert_eq!(most.state, State::Failed, "as of a port that no hub has: {most}");
+        status.counters[Counter::LostOnLine] = 0;
+        status.counters[Counter::LostPpm] = 0;
+        let unknown = line_loss(&status).finding;
+        assert!(unknown.ends_with("how many scans are lost is not known"), "{unknown}");
         for word in ["cable", "FIFO", "adapter", "termination"] {
             assert!(now.remedy.contains(word), "{now}");
         }

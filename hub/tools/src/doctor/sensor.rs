@@ -9,6 +9,7 @@ use lms::inquiry::Report;
 use lms::variant::{Unit, Variant};
 use schema::{State, Status};
 
+use super::counts::{LOSS_REMEDY, is_mostly_damaged};
 use super::finding::Finding;
 
 /// What follows from what the sensor at `port` said of itself.
@@ -60,14 +61,17 @@ fn link_of_the_hub(name: &str, status: &Status) -> Finding {
             kind => kind,
         }
     );
+    // `info` shows no more of a damaged line than this check.
+    let remedy =
+        if is_mostly_damaged(status) { LOSS_REMEDY.to_owned() } else { format!("scanhub info {name}") };
     match (status.state(), status.last_error()) {
         (Some(State::Streaming | State::Paused), "") => {
             Finding::ok(NAME, format!("{text}, {} Bd", status.baud))
         }
         (Some(State::Streaming | State::Paused), error) => {
-            Finding::warning(NAME, format!("{text}: {error}"), format!("scanhub info {name}"))
+            Finding::warning(NAME, format!("{text}: {error}"), remedy)
         }
-        (_, error) => Finding::failed(NAME, format!("{text}: {error}"), format!("scanhub info {name}")),
+        (_, error) => Finding::failed(NAME, format!("{text}: {error}"), remedy),
     }
 }
 
