@@ -5,7 +5,7 @@
 
 use std::fs::{self, File};
 use std::io::{self, ErrorKind, Read};
-use std::os::unix::fs::OpenOptionsExt;
+use std::os::unix::fs::{MetadataExt, OpenOptionsExt};
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
@@ -112,7 +112,7 @@ impl Files {
         }
         if self.keep.is_some() {
             let paths = existing.iter().map(|number| self.name(*number));
-            self.older = paths.filter(|path| is_finished_recording(path)).collect();
+            self.older = paths.filter(|path| lock_finished(path).is_some()).collect();
         }
         self.make(last + 1, self.overwrites && !self.is_split)
     }
@@ -138,16 +138,17 @@ impl Files {
     pub(super) fn prune(&mut self) {
         for _ in 0..self.surplus() {
             // Something else may have the name by now.
-            let (path, is_removable) = if self.older.is_empty() {
+            let (path, removable) = if self.older.is_empty() {
                 let path = self.made.remove(0);
-                let is_ours = is_of_run(&path, &self.run);
-                (path, is_ours)
+                let ours = lock_of_run(&path, &self.run);
+                (path, ours)
             } else {
                 let path = self.older.remove(0);
-                let is_finished = is_finished_recording(&path);
-                (path, is_finished)
+                let finished = lock_finished(&path);
+                (path, finished)
             };
-            if is_removable {
+            // No recorder can take the file until its name has been removed.
+            if let Some(_lock) = removable {
                 let _ = fs::remove_file(path);
             }
         }
@@ -205,24 +206,26 @@ impl Files {
     }
 }
 
-/// Returns whether the file at `path` is a recording that no recorder writes. `false` if the file system has no locks, because
-/// then a recorder cannot be detected.
-fn is_finished_recording(path: &Path) -> bool {
-    head(path).is_ok_and(|(head, is_taken)| head.starts_with(MAGIC) && is_taken == Some(false))
+/// Returns the file at `path` if it is a recording that no recorder writes; none takes it until it is closed. `None` if the
+/// file system has no locks, because then a recorder cannot be detected.
+fn lock_finished(path: &Path) -> Option<File> {
+    let (file, head, is_taken) = head(path).ok()?;
+    (head.starts_with(MAGIC) && is_taken == Some(false)).then_some(file)
 }
 
-/// Returns whether the file at `path` was written by `run`, and no other recorder writes it now.
-fn is_of_run(path: &Path, run: &str) -> bool {
-    let contains = |head: &[u8]| String::from_utf8_lossy(head).contains(run);
-    head(path).is_ok_and(|(head, is_taken)| contains(&head) && is_taken != Some(true))
+/// Returns the file at `path` if `run` has written it, and no other recorder writes it; none takes it until it is closed.
+fn lock_of_run(path: &Path, run: &str) -> Option<File> {
+    let (file, head, is_taken) = head(path).ok()?;
+    (String::from_utf8_lossy(&head).contains(run) && is_taken != Some(true)).then_some(file)
 }
 
-/// Returns the first [`HEAD`] bytes of the regular file at `path`, and whether it is locked, if the file system has locks.
+/// Returns the regular file at `path` with its first [`HEAD`] bytes, and whether another process has locked it, if the file
+/// system has locks. If none has, this process has it until it closes the file.
 ///
 /// # Errors
 ///
 /// The file cannot be read, or is not a regular file. A link to one is refused too.
-fn head(path: &Path) -> io::Result<(Vec<u8>, Option<bool>)> {
+fn head(path: &Path) -> io::Result<(File, Vec<u8>, Option<bool>)> {
     // Without NONBLOCK, opening a pipe would wait for its writer.
     let flags = OFlags::NOFOLLOW | OFlags::NONBLOCK;
     let file = File::options().read(true).custom_flags(flags.bits().cast_signed()).open(path)?;
@@ -231,7 +234,8 @@ fn head(path: &Path) -> io::Result<(Vec<u8>, Option<bool>)> {
     }
     let mut head = Vec::new();
     (&file).take(HEAD).read_to_end(&mut head)?;
-    Ok((head, lock::is_taken(&file)))
+    let is_taken = lock::is_taken(&file);
+    Ok((file, head, is_taken))
 }
 
 /// Opens a file that no other run writes, empty.
@@ -246,6 +250,10 @@ fn open(path: &Path, overwrites: bool) -> io::Result<File> {
     let file = options.open(path)?;
     if file.metadata()?.is_file() {
         lock::take(&file)?;
+        if file.metadata()?.nlink() == 0 {
+            // Another run removed it as an old file between the open and the lock.
+            return Err(io::Error::new(ErrorKind::ResourceBusy, "another recorder has just removed it"));
+        }
         file.set_len(0)?;
     }
     Ok(file)
@@ -409,6 +417,22 @@ mod tests {
         lock::take(&other).unwrap();
         files.prune();
         assert!(path.exists());
+        fs::remove_dir_all(place).unwrap();
+    }
+
+    #[test]
+    fn no_recorder_takes_a_file_that_is_being_removed() {
+        let place = std::env::temp_dir().join(format!("scanhub-removed-{}", std::process::id()));
+        fs::create_dir_all(&place).unwrap();
+        let path = place.join("walk-0001.mcap");
+        fs::write(&path, recording("run 1")).unwrap();
+        let busy = |path: &Path| open(path, true).map(drop).map_err(|error| error.kind());
+        for lock in [lock_finished(&path), lock_of_run(&path, "run 1")] {
+            assert!(lock.is_some());
+            assert_eq!(busy(&path), Err(ErrorKind::ResourceBusy));
+        }
+        assert_eq!(fs::read(&path).unwrap(), recording("run 1"), "it was not emptied");
+        assert_eq!(busy(&path), Ok(()));
         fs::remove_dir_all(place).unwrap();
     }
 
