@@ -139,7 +139,7 @@ pub fn convert(
     let mut first_ns = None;
     let mut done = 0_u64;
     let mut count = |written: Written, at_ns: Option<u64>| {
-        if let Some(at_ns) = at_ns.filter(|_| written != Written::LeftOut) {
+        if let Some(at_ns) = at_ns.filter(|_| !matches!(written, Written::Added | Written::LeftOut)) {
             let since_ns = at_ns.saturating_sub(*first_ns.get_or_insert(at_ns));
             converted.took_ns = converted.took_ns.max(Some(since_ns));
         }
@@ -201,12 +201,19 @@ enum Written {
     Other,
     /// The marks of a scan.
     Marks,
+    /// The reply that says how the values of a log are encoded, which the log does not contain.
+    Added,
     LeftOut,
 }
 
 impl Written {
     fn of(is_scan: bool) -> Written {
         if is_scan { Written::Scan } else { Written::Other }
+    }
+
+    /// Returns what was written with `frame`, number `number` of those that [`frames`] returns for a recording of `form`.
+    fn of_frame(form: Form, number: usize, frame: &Frame) -> Written {
+        if form == Form::Carmen && number == 0 { Written::Added } else { Written::of(frame.is_scan()) }
     }
 }
 
@@ -221,9 +228,9 @@ fn write_bytes(
 ) -> Result<(), Failure> {
     let mut times = Times::of(recording);
     if form == Form::Telegrams {
-        for frame in frames(recording, encoding)? {
+        for (number, frame) in frames(recording, encoding)?.enumerate() {
             out.write_all(&frame.telegram).map_err(failed)?;
-            count(Written::of(frame.is_scan()), frame.wall_ns)?;
+            count(Written::of_frame(recording.contents().form, number, &frame), frame.wall_ns)?;
         }
         return out.finish().map_err(failed);
     }
@@ -267,7 +274,7 @@ fn write_mcap(
             writer.close_chunk().map_err(failed)?;
             bytes = 0;
         }
-        count(Written::of(frame.is_scan()), Some(header.wall_ns))?;
+        count(Written::of_frame(recording.contents().form, number, &frame), Some(header.wall_ns))?;
     }
     writer.finish().map_err(failed).map(drop)
 }
