@@ -52,7 +52,8 @@ class Presence:
             return self.denied
         looked = ", ".join(place.root for place in self._places)
         name = self._places[0].name if self._places else ""
-        return NoHub(f"no hub in domain {name}", f"start one with `scanhub run`; looked at {looked}")
+        start = "start one with `scanhub run`; `scanhub list --domains` shows the hubs of other domains and users"
+        return NoHub(f"no hub in domain {name}", f"{start}; looked at {looked}")
 
     def _live(self) -> tuple[Domain, int, bool] | None:
         self.denied = None

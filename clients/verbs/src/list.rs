@@ -45,8 +45,12 @@ pub fn list(options: &ListOptions, out: &mut dyn Write, stop: &AtomicBool) -> Re
             line.hz = status.as_ref().filter(is_of_scans).and_then(Status::rate_hz);
         }
         if let Some(status) = status.filter(|status| !status.last_error().is_empty()) {
-            let state = status.state().map_or("unknown", State::name);
-            problems.push(format!("{sensor}: {state}: {}", status.last_error()));
+            // A port that is in use or forbidden is not absent; the message says what it is.
+            let state = match status.state() {
+                Some(State::Absent) => String::new(),
+                state => format!("{}: ", state.map_or("unknown", State::name)),
+            };
+            problems.push(format!("{sensor}: {state}{}", status.last_error()));
         }
     }
     let mut output = Output::new(out);

@@ -70,12 +70,12 @@ fn a_link_has_a_family_and_what_its_family_needs() {
             &[],
             "model=ld18",
             "link front: model = \"ld18\"\n  auto, or one of: ld06, ld19, stl19p, stl27l, ld14p, a1, a2m8, a2m12, a3, s1, \
-             s2, s3, c1; an LMS says itself what it is, `type`",
+             s2, s3, c1; leave it out for an LMS, which reports its model; `type`",
         ),
         (
             &["link.front.family=lms"],
             "model=lms291",
-            "link front: model = \"lms291\", and an lms says itself what it is\n  leave it out; `type`",
+            "link front: model = \"lms291\", but a scanner of family lms reports its model\n  leave it out; `type`",
         ),
         (
             &["link.front.family=lms"],

@@ -81,7 +81,9 @@ impl ScannerDraft {
         if let (Some((model, place)), None, None) = (&model, set, implied) {
             let known = Family::ALL.into_iter().filter_map(features).flat_map(|features| features.models);
             let names = auto_or(known.map(|model| model.name));
-            let remedy = format!("{names}; an LMS says itself what it is, `type` is what is expected of it");
+            let remedy = format!(
+                "{names}; leave it out for an LMS, which reports its model; `type` is the expected one"
+            );
             return Err(refuse(place, format!("model = \"{model}\""), &remedy));
         }
         let family = set.or(implied).unwrap_or(Family::Lms);
@@ -96,8 +98,9 @@ impl ScannerDraft {
         let Some(features) = known else {
             let own = [
                 model.map(|(model, place)| {
-                    let what = format!("model = \"{model}\", and an {name} says itself what it is");
-                    (place, what, "leave it out; `type` is what is expected of it")
+                    let what =
+                        format!("model = \"{model}\", but a scanner of family {name} reports its model");
+                    (place, what, "leave it out; `type` is the expected model")
                 }),
                 beams.map(|(beams, place)| {
                     let what = format!("beams = {beams}, and an {name} has its own");
