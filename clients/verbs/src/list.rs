@@ -45,7 +45,7 @@ pub fn list(options: &ListOptions, out: &mut dyn Write, stop: &AtomicBool) -> Re
             line.hz = status.as_ref().filter(is_of_scans).and_then(Status::rate_hz);
         }
         if let Some(status) = status.filter(|status| !status.last_error().is_empty()) {
-            // A port that is in use or forbidden is not absent; the message says what it is.
+            // A port that is in use or forbidden is not absent; the message has the reason.
             let state = match status.state() {
                 Some(State::Absent) => String::new(),
                 state => format!("{}: ", state.map_or("unknown", State::name)),
@@ -66,8 +66,8 @@ pub fn list(options: &ListOptions, out: &mut dyn Write, stop: &AtomicBool) -> Re
     )
 }
 
-/// Writes every live domain below `bases` (`--root`, or [`Environment::bases`](schema::Environment::bases)) to `out`. Of
-/// `hubs`, those below another directory follow, and then those that this user cannot reach, with the command that does.
+/// Writes every live domain below `bases` (`--root`, or [`Environment::bases`](schema::Environment::bases)) to `out`,
+/// including those of `hubs` below another directory. Hubs that this user cannot reach follow, with a command that does.
 ///
 /// # Errors
 ///

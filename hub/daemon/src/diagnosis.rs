@@ -267,7 +267,7 @@ impl<'a> Diagnosis<'a> {
                 "no answer at {} baud, the rate set in the serial server: power, cable, rate?",
                 self.link.baud.rate()
             )),
-            // Nothing says which scanner it is, if there is one.
+            // The scanner may be of another family, or at a rate that this family does not have.
             Some(trouble) if driver.missing().is_some() => self.with_probe(&trouble.to_string()),
             Some(trouble) => trouble.to_string(),
             None => self.mismatch(driver).unwrap_or_else(|| match driver.lms() {

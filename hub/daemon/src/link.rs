@@ -247,7 +247,7 @@ impl<'a, S: Surroundings> LinkCore<'a, S> {
     }
 }
 
-/// Takes over `state` and `error`, and logs them if they are new; whether they are. An error that stays through several
+/// Takes over `state` and `error`, and logs them if they are new. Returns whether they are. An error that stays through several
 /// states is logged once.
 fn update(stats: &mut LinkStats, link: &Link, state: State, error: &str, now: Nanos) -> bool {
     let told = stats.last().last_error_text;

@@ -130,7 +130,7 @@ pub fn is_tty(path: &Path) -> bool {
     check_tty(path).is_ok()
 }
 
-/// As [`is_tty`], with the reason if it is none.
+/// Checks that `path` is a terminal, as [`is_tty`] does.
 ///
 /// # Errors
 ///
@@ -141,7 +141,7 @@ pub fn check_tty(path: &Path) -> Result<(), PortError> {
     check_tty_in(path, Path::new("/sys/dev/char"))
 }
 
-/// As [`check_tty`], where the kernel lists its devices in `known`.
+/// Checks `path` as [`check_tty`] does; the kernel lists its devices in `known`.
 fn check_tty_in(path: &Path, known: &Path) -> Result<(), PortError> {
     let metadata = path.metadata().map_err(|error| PortError::of_io(&error))?;
     if !metadata.file_type().is_char_device() {

@@ -201,7 +201,7 @@ enum Written {
     Other,
     /// The marks of a scan.
     Marks,
-    /// The reply that says how the values of a log are encoded, which the log does not contain.
+    /// A reply with the encoding of a log's values, which the log itself does not contain.
     Added,
     LeftOut,
 }

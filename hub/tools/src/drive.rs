@@ -39,7 +39,7 @@ pub(crate) fn drive<C: Conversation>(
     Ok(())
 }
 
-/// Does what `talk` wants until it wants to wait, or is over. A rate that the port refuses is logged if it is not among those
+/// Carries out the actions of `talk` until it waits or ends. A rate that the port refuses is logged if it is not among those
 /// `refused`.
 fn drain<C: Conversation>(
     port: &Port,
