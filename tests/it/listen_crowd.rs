@@ -32,7 +32,7 @@ fn prove(sender: &mut Sender, mut await_heard: impl FnMut(&mut Sender)) {
     await_heard(sender);
 }
 
-/// Sends `verdict` until `echo` says it: what a client reads too late is unknown to it.
+/// Sends `verdict` until `echo` prints it. A verdict that a client reads too late is printed as unknown.
 fn await_verdict(sender: &mut Sender, echo: &mut Program, verdict: Verdict) {
     let mut said = Value::Null;
     while said["verdict"] != verdict.name() {

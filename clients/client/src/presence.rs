@@ -95,7 +95,7 @@ impl Presence {
         self.denied = None;
         let found = self.live();
         if found.is_none() && self.short().is_some() {
-            // Without a descriptor to look with, it is not known to be gone.
+            // The look failed for lack of a descriptor, so the hub may still run.
             return Change::default();
         }
         let change = Change::between(self.hub.as_ref(), found.as_ref());

@@ -139,9 +139,9 @@ impl<'a> Diagnosis<'a> {
         self.facts = None;
     }
 
-    /// Returns whether the message already tells of this `alteration`, which the hub has undone again at `now`. The message
-    /// then stays, because another program that sets the port all the time is not worth a search of all processes each time.
-    pub(crate) fn is_told_of(&mut self, alteration: Alteration, now: Nanos) -> bool {
+    /// Returns whether the message already names this `alteration`, which the hub has undone again at `now`. The message then
+    /// stays: a program that keeps changing the port is not worth a search of all processes each time.
+    pub(crate) fn has_message_about(&mut self, alteration: Alteration, now: Nanos) -> bool {
         match &mut self.altered {
             Some(altered) if altered.alteration == alteration => {
                 altered.until = now + ALTERED_SHOWN;
@@ -267,7 +267,7 @@ impl<'a> Diagnosis<'a> {
                 "no answer at {} baud, the rate set in the serial server: power, cable, rate?",
                 self.link.baud.rate()
             )),
-            // The scanner may be of another family, or at a rate that this family does not have.
+            // Another family's scanner may be connected, or one at a rate that this family does not have.
             Some(trouble) if driver.missing().is_some() => self.with_probe(&trouble.to_string()),
             Some(trouble) => trouble.to_string(),
             None => self.mismatch(driver).unwrap_or_else(|| match driver.lms() {

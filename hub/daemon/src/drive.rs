@@ -312,7 +312,7 @@ fn restore<S: Surroundings>(core: &mut LinkCore<'_, S>, line: &S::Line, baud: u3
     let Some(alteration) = line.altered()? else { return Ok(false) };
     line.restore(baud)?;
     let now = core.around.now();
-    if !core.diagnosis.is_told_of(alteration, now) {
+    if !core.diagnosis.has_message_about(alteration, now) {
         let program = core.around.altering_program(&core.link.port);
         let program = program.map(|program| format!("; {program}")).unwrap_or_default();
         core.diagnosis.note_altered(alteration, format!("{alteration}{program}"), now);

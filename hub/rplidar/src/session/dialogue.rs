@@ -313,8 +313,8 @@ impl Session {
                 self.restarts += u64::from(has_streamed);
             }
             Phase::Booting { .. } => self.phase = Phase::Booting { until: self.now + SETTLE },
-            // What is left of a packet may be text too. One that boots sends nothing for a while before it greets. A name
-            // proves it even after other bytes, which a scanner sends while its supply drops.
+            // The rest of a packet may be text too, but a scanner that boots pauses before its greeting. A name proves a
+            // greeting even after other bytes, which a scanner sends while its supply drops.
             Phase::Hearing { silent_at, .. }
                 if !is_named
                     && (silent_at.abs_diff(self.now + SILENCE) < HUSHED
