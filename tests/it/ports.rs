@@ -123,7 +123,7 @@ fn what_another_process_has() {
     assert!(info["state"] == "absent" && text.contains(&holder), "{info}");
     other.await_info("rear", |info| info["state"] == "streaming");
     let list = other.run(&["list"]);
-    let reason = format!("front: absent: {text}");
+    let reason = format!("front: {text}");
     assert!(String::from_utf8_lossy(&list.out).lines().any(|line| line == reason), "{list}");
     // On a pty the exclusive mode outlives a close; the next process finds none.
     assert_eq!(hub.end(TERM).code, Some(0));

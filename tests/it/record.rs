@@ -107,12 +107,14 @@ fn files_are_packed_as_they_are_told() {
     let file = env.word("walk.mcap");
     let bytes_each = [(&[][..], "zstd"), (&["--compression=lz4"], "lz4"), (&["--compression=none"], "")].map(
         |(flags, wanted)| {
-            let words = [&["record", "--json", "--force", "--for=2s", "-o", &file][..], flags].concat();
-            let samples = number(&recorded(&env.run(&words)), "samples");
+            let words = [&["record", "--json", "--force", "-o", &file][..], flags].concat();
+            let mut recorder = env.start(&words);
+            recorder.await_line("samples", |line| is_class("recording")(line) && number(line, "samples") > 500);
+            let samples = number(&recorded(&recorder.end(INT)), "samples");
             assert_eq!(Recording::whole(&env.path("walk.mcap")).kept.len() as u64, samples);
             let bytes = std::fs::read(&file).unwrap();
             let chunks = mcap::Summary::read(&bytes).unwrap().unwrap().chunk_indexes;
-            assert!(chunks.len() > 5 && chunks.iter().all(|chunk| chunk.compression == wanted), "{wanted}");
+            assert!(!chunks.is_empty() && chunks.iter().all(|chunk| chunk.compression == wanted), "{wanted}");
             bytes.len() as u64 / samples
         },
     );

@@ -252,11 +252,10 @@ impl Recorder<'_> {
         stop.store(false, Ordering::Relaxed);
         let told = self.end_gap();
         self.queue.end();
-        let ended_at = Instant::now();
+        let mut looks = 0;
         while !writing.is_finished() {
-            if ended_at.elapsed() < SAME_WISH {
-                stop.store(false, Ordering::Relaxed);
-            } else if stop.load(Ordering::Relaxed) {
+            looks += 1;
+            if stop.swap(false, Ordering::Relaxed) && looks > SAME_WISH {
                 let what = "the disk had not stored the end of the recording when a second signal came";
                 return Err(Failure::new(Kind::Failed, what, REPAIR).into());
             }
@@ -325,6 +324,7 @@ impl Sink for Recorder<'_> {
 /// So often it is looked what the writing thread says.
 const LOOK_EVERY: Duration = Duration::from_millis(50);
 /// Signals that come together are one wish to stop: a shell that loses its terminal sends another SIGHUP than the terminal.
-const SAME_WISH: Duration = Duration::from_secs(1);
+/// They come within a second, but a busy machine may not run this process for as long. So looks are counted, and not time.
+const SAME_WISH: u32 = 20;
 /// What can be done with a file that has no end.
 const REPAIR: &str = "what is in the file can be read; `scanhub convert` gives it an index";
