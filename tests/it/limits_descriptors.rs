@@ -59,11 +59,18 @@ fn a_client_works_or_says_how_many_it_needs() {
         is_short(&limited(&env, limit, &["echo", "front/status"]).wait());
     }
     side_by_side(verbs, |verb| {
-        for limit in [5, 6, 8, 10, 12, 14, 16, 18, 20, 22, 24, 26, 28, 30, 32, 40] {
-            let outcome = limited(&env, limit, verb).wait();
+        for limit in [5, 6, 8, 10, 12, 14, 16, 18, 20, 22, 24, 26, 28, 30, 32, 64] {
+            let mut outcome = limited(&env, limit, verb).wait();
+            until("the hub answers in time, however busy the machine is", || {
+                let is_late = outcome.code == Some(3);
+                if is_late {
+                    outcome = limited(&env, limit, verb).wait();
+                }
+                !is_late
+            });
             if outcome.code != Some(0) {
                 is_short(&outcome);
-                assert!(limit < 40, "{outcome}");
+                assert!(limit < 64, "{outcome}");
             }
         }
     });
