@@ -150,6 +150,8 @@ impl Session {
         let period = self.period(telegram, reply.as_ref());
         let mut first = self.arrivals.stamp(span.offset, baud);
         let last = self.arrivals.stamp(span.offset + len - 1, baud);
+        // A line may have held back only the end of a telegram.
+        let estimated = first.estimated || last.estimated;
         let due = period.and(self.due(&first, span.offset, len));
         // What is read later may tell that bytes were older than was thought; those before them were older still, but
         // that has been said.
@@ -193,7 +195,7 @@ impl Session {
             message: Message { telegram, reply, mode, offset: span.offset },
             first: first.at,
             last,
-            estimated: first.estimated,
+            estimated,
             reasons: framed.reasons | if slow { suspect::SLOW } else { 0 },
         }
     }

@@ -106,6 +106,9 @@ pub(crate) struct Telegram<'a> {
     pub(crate) bytes: &'a [u8],
     /// Place of its first byte, and of the one behind its last, among all bytes that went into the port.
     pub(crate) span: (u64, u64),
+    /// Time at which its first bytes went into the port, and its baud rate.
+    pub(crate) first_at: Nanos,
+    pub(crate) rate: u32,
     /// Why it did not go into the port as it should have been.
     pub(crate) damage: Option<&'static str>,
     /// The sensor did not send all of it.

@@ -4,7 +4,7 @@
 use std::cell::Cell;
 
 use lms::telegram::Writer;
-use schema::{Counter, Header, Scan, ScanHead, Status, Topic};
+use schema::{Counter, Flags, Header, Scan, ScanHead, Status, Topic};
 
 /// A defect.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -79,11 +79,17 @@ pub enum Defect {
     KeptWarning,
     /// The port hides that another process set its rate.
     HiddenRate,
+    /// An estimated stamp of a telegram is not marked.
+    UnmarkedEstimate,
+    /// Every stamp is marked as an estimate.
+    NeedlessEstimate,
+    /// No early warning is sent.
+    UnsentWarning,
 }
 
 impl Defect {
     /// All of them.
-    pub const ALL: [Defect; 35] = [
+    pub const ALL: [Defect; 38] = [
         Defect::LostWake,
         Defect::OneRing,
         Defect::LostByte,
@@ -119,6 +125,9 @@ impl Defect {
         Defect::WrongPlaces,
         Defect::KeptWarning,
         Defect::HiddenRate,
+        Defect::UnmarkedEstimate,
+        Defect::NeedlessEstimate,
+        Defect::UnsentWarning,
     ];
 }
 
@@ -176,6 +185,12 @@ impl Spoiler {
         if planted.is(Defect::UnmarkedNeighbour) {
             (header.reasons, header.quality) = (0, 0);
         }
+        if topic == Topic::Telegram && planted.is(Defect::UnmarkedEstimate) {
+            header.flags &= !Flags::STAMP_ESTIMATED;
+        }
+        if topic == Topic::Telegram && planted.is(Defect::NeedlessEstimate) {
+            header.flags |= Flags::STAMP_ESTIMATED;
+        }
         if topic != Topic::Scan {
             return;
         }
@@ -220,6 +235,8 @@ impl Spoiler {
             Defect::WrongChecksum,
             Defect::UnmarkedNeighbour,
             Defect::WrongPlaces,
+            Defect::UnmarkedEstimate,
+            Defect::NeedlessEstimate,
         ];
         mine.into_iter().any(|defect| planted.is(defect))
     }

@@ -247,6 +247,9 @@ impl<P: Payload + ?Sized> Medium<P> for Carrier<P> {
         if topic == Topic::Telegram && planted.strikes(Defect::UnsentTelegram, 100) {
             return Ok(0);
         }
+        if topic == Topic::Early && planted.is(Defect::UnsentWarning) {
+            return Ok(0);
+        }
         if topic == Topic::Early && planted.is(Defect::KeptWarning) && bytes[1] == Early::WITHDRAWN {
             return Ok(0);
         }

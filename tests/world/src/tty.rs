@@ -33,8 +33,17 @@ pub(crate) struct Tty {
     buffer: VecDeque<u8>,
     /// Bytes that went into the buffer, ever.
     put: u64,
-    /// Where the telegram began that is on the line, and why it is damaged.
-    begun: Option<(u64, Option<&'static str>)>,
+    /// Telegram that is on the line.
+    begun: Option<Begun>,
+}
+
+/// Telegram that is on the line.
+struct Begun {
+    /// Place of its first byte, and when that went into the port.
+    first: u64,
+    first_at: Nanos,
+    /// Why it is damaged.
+    damage: Option<&'static str>,
 }
 
 /// Bytes that a tty holds, as a pty of Linux does; more are lost.
@@ -89,17 +98,19 @@ impl Tty {
                 bytes.truncate(ROOM - buffer.len());
             }
             if matches!(part, Some(Part::Telegram | Part::End(_))) {
-                begun.get_or_insert((*put, None));
+                begun.get_or_insert(Begun { first: *put, first_at: at, damage: None });
             }
-            if let Some((_, known)) = begun {
-                *known = known.or(damage);
+            if let Some(begun) = begun {
+                begun.damage = begun.damage.or(damage);
             }
             *put += bytes.len() as u64;
             buffer.extend(bytes);
             if let Some(Part::End(Sent { telegram, aborted, is_reply })) = part
-                && let Some((first, damage)) = begun.take()
+                && let Some(Begun { first, first_at, damage }) = begun.take()
             {
-                let telegram = Telegram { bytes: &telegram, span: (first, *put), damage, aborted, is_reply };
+                let span = (first, *put);
+                let telegram =
+                    Telegram { bytes: &telegram, span, first_at, rate: sent_at, damage, aborted, is_reply };
                 log.tell(at, &Event::Sent { sensor: *number, telegram: &telegram });
             }
         });
@@ -215,8 +226,8 @@ impl Tty {
         let from = self.taken();
         self.buffer.clear();
         if from < self.put {
-            if let Some((_, damage)) = &mut self.begun {
-                *damage = damage.or(Some("flushed"));
+            if let Some(begun) = &mut self.begun {
+                begun.damage = begun.damage.or(Some("flushed"));
             }
             log.tell(now, &Event::Flushed { sensor: self.number, from, to: self.put });
         }

@@ -35,11 +35,13 @@ fn judge(defect: Defect) -> &'static [&'static str] {
         Defect::WrongPlaces => &["turns"],
         Defect::KeptWarning => &["early"],
         Defect::HiddenRate => &["settings"],
+        Defect::UnmarkedEstimate | Defect::NeedlessEstimate => &["stamps"],
+        Defect::UnsentWarning => &["early"],
     }
 }
 
 /// Defects of turns and of requests, in worlds with nothing but this scanner, whose head turns.
-const OF_HEADS: [(Defect, &str); 11] = [
+const OF_HEADS: [(Defect, &str); 12] = [
     (Defect::MergedTurn, "a1:express"),
     (Defect::UnmarkedTurn, "s1"),
     (Defect::StampedOnArrival, "a1"),
@@ -51,11 +53,12 @@ const OF_HEADS: [(Defect, &str); 11] = [
     (Defect::WrongPlaces, "c1"),
     (Defect::KeptWarning, "ld19"),
     (Defect::KeptWarning, "s1"),
+    (Defect::UnsentWarning, "ld19"),
 ];
 
 /// First seeds by which a defect was found when this was written, where that is not 0. Seeds that find nothing are not played
 /// again; if one of these finds nothing either, all are.
-const FOUND_BY: [(Defect, &str, u64); 14] = [
+const FOUND_BY: [(Defect, &str, u64); 16] = [
     (Defect::MergedTurn, "", 1),
     (Defect::OtherBeams, "", 1),
     (Defect::StampedOnArrival, "", 22),
@@ -66,6 +69,8 @@ const FOUND_BY: [(Defect, &str, u64); 14] = [
     (Defect::UnmarkedNeighbour, "", 3),
     (Defect::UnturnedHead, "", 3),
     (Defect::WrongPlaces, "", 1),
+    (Defect::UnmarkedEstimate, "", 2),
+    (Defect::UnsentWarning, "", 51),
     (Defect::UnmarkedTurn, "s1", 3),
     (Defect::StampedOnArrival, "a1", 45),
     (Defect::UncountedLoss, "c1", 3),

@@ -1,11 +1,13 @@
 //! A warning before its scan is complete says slow or stop, never clear, and it is true of the scan or taken back: before the
-//! next zones of its number or a greater one, which are of its scan, unless these are at least as bad.
+//! next zones of its number or a greater one, which are of its scan, unless these are at least as bad. And it is in time:
+//! while nothing goes wrong, no zones say stop without a warning before them, which was sent when three quarters of the scan
+//! had arrived at most.
 
 use std::collections::BTreeMap;
 
 use bytemuck::pod_read_unaligned;
-use lms::Nanos;
-use schema::{Topic, Verdict, Zones};
+use lms::{MILLIS, Nanos};
+use schema::{Scan, Topic, Verdict, Zones};
 
 use super::{Judge, Say};
 use crate::event::Event;
@@ -14,6 +16,7 @@ use crate::event::Event;
 #[derive(Default)]
 pub(crate) struct Early {
     sensors: BTreeMap<usize, OfSensor>,
+    healed_at: Option<Nanos>,
 }
 
 /// A warning.
@@ -23,6 +26,8 @@ struct Said {
     verdict: Verdict,
     /// Its scan has exactly its number, and no greater one.
     is_of_telegram: bool,
+    /// Beams that had arrived.
+    beams_seen: u16,
 }
 
 #[derive(Default)]
@@ -33,6 +38,9 @@ struct OfSensor {
     zones: Option<u64>,
     /// A sample had no memory, so that nobody knows what stands.
     is_unknown: bool,
+    /// Scans since the hub found the scanner, and beams of the last one.
+    scans: usize,
+    beams: usize,
 }
 
 impl Judge for Early {
@@ -40,14 +48,19 @@ impl Judge for Early {
         "early"
     }
 
-    fn note(&mut self, _: Nanos, event: &Event<'_>, say: &mut Say<'_>) {
+    fn note(&mut self, at: Nanos, event: &Event<'_>, say: &mut Say<'_>) {
         match *event {
             Event::Published { sensor, sample } => {
                 let of = self.sensors.entry(sensor).or_default();
                 let seq = sample.header.seq;
+                let is_well = self.healed_at.is_some_and(|healed_at| at > healed_at + RECOVERED);
                 let wrong = match sample.topic {
+                    Topic::Scan => {
+                        (of.scans, of.beams) = (of.scans + 1, Scan::of_bytes(&sample.bytes).beams());
+                        None
+                    }
                     Topic::Early => of.warn(seq, &pod_read_unaligned(&sample.bytes)),
-                    Topic::Zones => of.tell(seq, pod_read_unaligned::<Zones>(&sample.bytes).verdict()),
+                    Topic::Zones => of.tell(seq, &pod_read_unaligned(&sample.bytes), is_well),
                     _ => None,
                 };
                 if let Some(wrong) = wrong {
@@ -58,7 +71,11 @@ impl Judge for Early {
                 let of = self.sensors.entry(sensor).or_default();
                 (of.stands, of.is_unknown) = (None, true);
             }
+            Event::Opened { sensor, .. } | Event::Retuned { sensor } | Event::Exchanged { sensor } => {
+                self.sensors.entry(sensor).or_default().scans = 0;
+            }
             Event::HubEnds { .. } => self.sensors.clear(),
+            Event::Healed => self.healed_at = Some(at),
             _ => {}
         }
     }
@@ -74,7 +91,8 @@ impl OfSensor {
         if self.zones.is_some_and(|zones| seq <= zones) {
             return Some("a warning of a scan whose zones were there".to_owned());
         }
-        let said = Said { seq, verdict, is_of_telegram: early.bytes_seen > 0 };
+        let beams_seen = early.beams_seen;
+        let said = Said { seq, verdict, is_of_telegram: early.bytes_seen > 0, beams_seen };
         let before = self.stands.take();
         if early.is_withdrawn() {
             let is_of = before.is_some_and(|before| (before.seq, before.verdict) == (seq, verdict));
@@ -89,11 +107,26 @@ impl OfSensor {
             .map(|before| format!("{before:?} stood, and {said:?} is no worse"))
     }
 
-    /// What is wrong with the warning that stands, now that the zones say `verdict`.
-    fn tell(&mut self, seq: u64, verdict: Verdict) -> Option<String> {
+    /// What is wrong with the warning that stands, or that there is none, now that there are `zones`; nothing goes wrong if all
+    /// `is_well`.
+    fn tell(&mut self, seq: u64, zones: &Zones, is_well: bool) -> Option<String> {
         self.zones = Some(seq);
-        let said = self.stands.take_if(|said| seq >= said.seq)?;
+        let verdict = zones.verdict();
+        let said = self.stands.take_if(|said| seq >= said.seq);
+        let is_soon = zones.nearest().is_some_and(|(beam, _)| 5 * usize::from(beam) < 3 * self.beams);
+        if is_well && self.scans > SETTLED && verdict == Verdict::Stop && is_soon {
+            let is_in_time = |said: &Said| 4 * usize::from(said.beams_seen) <= 3 * self.beams;
+            if !said.as_ref().is_some_and(is_in_time) {
+                return Some(format!("{said:?} stood before a scan of {} beams, {zones:?}", self.beams));
+            }
+        }
+        let said = said?;
         let holds = verdict.worse(said.verdict) == verdict && (seq == said.seq || !said.is_of_telegram);
         (!holds).then(|| format!("{said:?}, the zones say {}", verdict.name()))
     }
 }
+
+/// Time after the last fault from which nothing is due to it any more.
+const RECOVERED: Nanos = 3_000 * MILLIS;
+/// Scans of a stream after which the session knows its rhythm.
+const SETTLED: usize = 20;

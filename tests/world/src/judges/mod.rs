@@ -21,6 +21,7 @@ mod remote_numbers;
 mod remote_verdict;
 mod resources;
 mod settings;
+mod stamps;
 mod turns;
 mod verdict;
 
@@ -72,6 +73,7 @@ pub(crate) fn all(setup: &Setup, plan: &Plan) -> Vec<Box<dyn Judge>> {
         Box::new(nothing_invented::NothingInvented::new(sensors)),
         Box::new(nothing_lost::NothingLost::new(sensors)),
         Box::new(turns::Turns::new(sensors)),
+        Box::new(stamps::Stamps::new(sensors)),
         Box::new(lost_on_line::LostOnLine::new(sensors)),
         Box::new(prompt::Prompt::default()),
         Box::new(early::Early::default()),
