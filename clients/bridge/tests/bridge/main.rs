@@ -11,6 +11,7 @@ mod page;
 mod routers;
 mod slow;
 
+use std::cell::RefCell;
 use std::collections::BTreeMap;
 use std::net::TcpListener;
 
@@ -54,9 +55,25 @@ fn router(env: &TestEnv, listen: &str, connect: &[&str]) -> Program {
 
 /// By sensor and topic, the value of each of these keys in the last account of a bridge: in one before it, a sensor that is
 /// received may have had no name yet.
-fn account(outcome: &Outcome, keys: &[&str]) -> BTreeMap<String, Vec<u64>> {
+fn account(outcome: &Outcome, keys: &[&str]) -> Account {
+    last_account(&outcome.lines(), keys)
+}
+
+/// The account that a running bridge has printed last.
+fn account_so_far(program: &mut Program, keys: &[&str]) -> Account {
+    let lines = RefCell::new(Vec::new());
+    program.is_heard(|line| {
+        lines.borrow_mut().push(line.clone());
+        false
+    });
+    last_account(&lines.into_inner(), keys)
+}
+
+type Account = BTreeMap<String, Vec<u64>>;
+
+fn last_account(lines: &[Value], keys: &[&str]) -> Account {
     let (mut rows, mut is_whole) = (BTreeMap::new(), false);
-    for line in outcome.lines() {
+    for line in lines {
         // The end of an account of what is received.
         is_whole |= line["class"] == "bridge_refused";
         if line["class"] != "bridge" || line[keys[0]].is_null() {

@@ -2,12 +2,11 @@
 //! the robot waits.
 
 use std::process::Command;
-use std::time::Duration;
 
 use serde_json::Value;
 
-use crate::testkit::{INT, TERM, TestEnv, in_a_network, let_pass, skip, succeeds};
-use crate::{NO_FLAGS, account, address, agree, bridge, linked};
+use crate::testkit::{INT, TERM, TestEnv, in_a_network, skip, succeeds, until};
+use crate::{Account, NO_FLAGS, account, account_so_far, address, agree, bridge, linked};
 
 /// Lets no more than 0.5 Mbit/s through the loopback, whose packets are those of a network.
 fn slow_down() -> bool {
@@ -39,13 +38,22 @@ fn on_a_slow_link_the_newest_comes_first() {
         assert_eq!(local.of_class("summary")[0]["lost"], 0, "{local}");
         // What waits on the link when a bridge ends is cut off: nothing new comes, and it gets empty.
         assert_eq!(hub.end(TERM).code, Some(0));
-        let_pass(Duration::from_secs(3));
+        let mut received = || account_so_far(&mut here, &["received", "lost"]);
+        until("all samples have arrived", || {
+            let samples = |account: Account| -> Vec<(String, u64)> {
+                let rows = account.into_iter().filter(|(name, _)| !name.ends_with("/announce"));
+                rows.map(|(name, row)| (name, row.iter().sum())).collect()
+            };
+            let sent = samples(account_so_far(&mut there, &["sent"]));
+            sent.len() > 4 && sent == samples(received())
+        });
         let sent = there.end(INT);
-        let received = {
-            here.await_line("what is under way", |line| line["class"] == "bridge_published");
-            let_pass(Duration::from_secs(3));
-            here.end(INT)
-        };
+        let counts = account(&sent, &["sent"]);
+        until("the last announcements have arrived", || {
+            let received = received();
+            counts.iter().all(|(name, row)| received.get(name).is_some_and(|it| it[0] + it[1] == row[0]))
+        });
+        let received = here.end(INT);
         agree(&sent, &received);
         let replaced: u64 = account(&sent, &["sent", "replaced"]).values().map(|row| row[1]).sum();
         assert!(replaced > 100, "it was not slow: {sent}");
