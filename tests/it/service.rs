@@ -116,7 +116,13 @@ fn scans_go_on_with_the_first_telegram_of_the_next_hub() {
     let first =
         samples.await_line("a measured telegram", |line| of_next(line) && line["command"] == MEASURED);
     let scan = samples.await_line("its scan", |line| of_next(line) && line["class"] == "scan");
-    assert_eq!(scan["seq"], first["seq"], "{scan}");
+    // A client on a busy machine may miss the first ones; it reports that.
+    let has_missed = samples.has_said(|line| line["kind"] == "missed");
+    assert!(has_missed || scan["seq"] == first["seq"], "{scan} {first}");
+    assert!(
+        number(&scan, "topic_seq") > 0 || number(&scan, "seq") <= number(&first, "seq"),
+        "{scan} {first}"
+    );
     assert_eq!(
         ["unit_um", "count"].map(|key| number(&scan, key)),
         ["unit_um", "count"].map(|key| number(&scans[0], key))

@@ -59,7 +59,7 @@ fn account(outcome: &Outcome, keys: &[&str]) -> Account {
     last_account(&outcome.lines(), keys)
 }
 
-/// The account that a running bridge has printed last.
+/// Returns the counters that a running bridge has printed last.
 fn account_so_far(program: &mut Program, keys: &[&str]) -> Account {
     let lines = RefCell::new(Vec::new());
     program.is_heard(|line| {

@@ -1,7 +1,7 @@
 //! A warning before its scan is complete says slow or stop, never clear, and it is true of the scan or taken back: before the
-//! next zones of its number or a greater one, which are of its scan, unless these are at least as bad. And it is in time:
-//! while nothing goes wrong, no zones say stop without a warning before them, which was sent when three quarters of the scan
-//! had arrived at most.
+//! next zones of its number or a greater one, which are of its scan, unless these are at least as bad. While nothing goes
+//! wrong, no warning is withdrawn, and no zones say stop without an earlier warning. That warning was sent when at most three
+//! quarters of the scan had arrived.
 
 use std::collections::BTreeMap;
 
@@ -59,7 +59,7 @@ impl Judge for Early {
                         (of.scans, of.beams) = (of.scans + 1, Scan::of_bytes(&sample.bytes).beams());
                         None
                     }
-                    Topic::Early => of.warn(seq, &pod_read_unaligned(&sample.bytes)),
+                    Topic::Early => of.warn(seq, &pod_read_unaligned(&sample.bytes), is_well),
                     Topic::Zones => of.tell(seq, &pod_read_unaligned(&sample.bytes), is_well),
                     _ => None,
                 };
@@ -83,7 +83,7 @@ impl Judge for Early {
 
 impl OfSensor {
     /// What is wrong with a warning, or with what takes it back.
-    fn warn(&mut self, seq: u64, early: &schema::Early) -> Option<String> {
+    fn warn(&mut self, seq: u64, early: &schema::Early, is_well: bool) -> Option<String> {
         let verdict = early.verdict();
         if !matches!(verdict, Verdict::Slow | Verdict::Stop) {
             return Some(format!("a warning says {}", verdict.name()));
@@ -95,6 +95,9 @@ impl OfSensor {
         let said = Said { seq, verdict, is_of_telegram: early.bytes_seen > 0, beams_seen };
         let before = self.stands.take();
         if early.is_withdrawn() {
+            if is_well && self.scans > SETTLED {
+                return Some("a warning was withdrawn although nothing went wrong".to_owned());
+            }
             let is_of = before.is_some_and(|before| (before.seq, before.verdict) == (seq, verdict));
             let is_of = is_of || std::mem::take(&mut self.is_unknown);
             return (!is_of).then(|| format!("{before:?} stood, something else was taken back"));
@@ -107,7 +110,7 @@ impl OfSensor {
             .map(|before| format!("{before:?} stood, and {said:?} is no worse"))
     }
 
-    /// What is wrong with the warning that stands, or that there is none, now that there are `zones`; nothing goes wrong if all
+    /// Returns the error of the current warning, or of a missing one, now that there are `zones`. Nothing goes wrong while all
     /// `is_well`.
     fn tell(&mut self, seq: u64, zones: &Zones, is_well: bool) -> Option<String> {
         self.zones = Some(seq);

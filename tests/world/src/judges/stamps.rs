@@ -1,6 +1,6 @@
-//! The stamps of a scan's telegram are right, or they are marked as estimates: without the mark they are the times at which
-//! the telegram's first and last bytes went into the port, whatever held the hub up. And an estimate is an exception: while
-//! nothing goes wrong, no stamp of a streaming scanner is one. Only families whose samples are single telegrams; `turns`
+//! The stamps of a scan's telegram are right, or they are marked as estimates. Without the mark, they are the times at which
+//! the telegram's first and last bytes went into the port, even if the hub was held up. While nothing goes wrong, no stamp of
+//! a streaming scanner is an estimate. Only families whose samples are single telegrams; `turns`
 //! checks the others.
 
 use std::collections::{BTreeMap, VecDeque};
@@ -19,7 +19,8 @@ pub(crate) struct Stamps {
     families: Vec<Rc<dyn Family>>,
     sensors: BTreeMap<usize, OfSensor>,
     healed_at: Option<Nanos>,
-    /// Until this time, bytes may have come that took no time on the line: what was read with them looks earlier than it was.
+    /// Until this time, bytes may arrive that took no time on the line. Telegrams that are read with them look earlier than
+    /// they were.
     crowded_until: Nanos,
 }
 
@@ -28,7 +29,7 @@ struct OfSensor {
     sent: VecDeque<Sent>,
     /// Place after the last byte that the hub has read.
     read: u64,
-    /// Scans that were published since the line was opened or retuned, and since a reply came between them.
+    /// Scans that were published since the line was opened or retuned, and since the last reply.
     in_a_row: usize,
 }
 
@@ -104,11 +105,11 @@ impl OfSensor {
             return (is_well && !is_new)
                 .then(|| "a stamp is an estimate although nothing went wrong".to_owned());
         }
-        // Beside damaged bytes, or slower than usual: it is marked as suspect.
+        // It is marked as suspect: it follows damaged bytes, or took longer than usual.
         if header.reasons != 0 {
             return None;
         }
-        // Scans of a simulated scene repeat, so any telegram that has been read may be it.
+        // Scans of a simulated scene repeat, so every telegram that has been read is compared.
         let is_it = |sent: &&Sent| sent.end <= self.read && sent.bytes == bytes;
         let is_right = |sent: &Sent| {
             let most = EXACT + line_time(PIECE, sent.rate);
