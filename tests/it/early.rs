@@ -213,17 +213,18 @@ fn nothing_is_judged_while_nobody_follows() {
     }
 }
 
-/// The same post, there for a moment each half second.
+/// The same post, there for a moment each half second, in a room without anything else in the circles.
 fn blinking() -> String {
     let wall = POST.split_once("[[thing]]").and_then(|(_, post)| post.split_once("[[thing]]"));
     let (_, wall) = wall.expect("two things");
-    let times = (0..80).map(|n| 3.0 + 0.47 * f64::from(n));
+    let times = (0..160).map(|n| 3.0 + 0.47 * f64::from(n));
     let posts = times.map(|from_s| {
         let until_s = from_s + 0.11;
         format!(
             "[[thing]]\nradius_mm = 60\npose = [460, 200]\nfrom_s = {from_s:.2}\nuntil_s = {until_s:.2}\n"
         )
     });
+    let wall = wall.replace("-1000", "-1500");
     format!("[noise]\nerrors = 0\n[[thing]]{wall}{}", posts.collect::<String>())
 }
 
@@ -235,9 +236,10 @@ const BEFORE_ZONES_NS: u64 = 60_000_000;
 fn followed(lines: &[Value], shown: &[Value]) -> usize {
     let (warnings, zones) = (numbered(lines, "early"), numbered(lines, "zones"));
     let stamp = |line: &Value| number(line, "stamp_ns");
-    let is_followed = |pair: &[Numbered<'_>]| {
-        let [warning, withdrawn] = [pair[0].line, pair[1].line];
-        if warning["verdict"] != "stop" || withdrawn["withdrawn"] != true || pair[1].missed > 0 {
+    let is_followed = |three: &[Numbered<'_>]| {
+        let [warning, withdrawn, later] = [0, 1, 2].map(|at| three[at].line);
+        let missed = three[1].missed + three[2].missed;
+        if warning["verdict"] != "stop" || withdrawn["withdrawn"] != true || missed > 0 {
             return false;
         }
         let seq = number(withdrawn, "seq");
@@ -247,6 +249,11 @@ fn followed(lines: &[Value], shown: &[Value]) -> usize {
             return false;
         };
         let (last, next) = (zones[next - 1].line, stamp(zones[next].line) + BEFORE_ZONES_NS);
+        // The light also changes for a silence, which has the number of the scan before it, and for a new warning.
+        let is_alone = stamp(last) < stamp(warning) && stamp(later) >= next;
+        if !is_alone || last["verdict"] == "unknown" {
+            return false;
+        }
         let begun = stamp(warning)..stamp(withdrawn);
         let on = shown.iter().rposition(|light| light["verdict"] == "stop" && begun.contains(&stamp(light)));
         let off = on.and_then(|on| shown[on..].iter().find(|light| light["verdict"] != "stop"));
@@ -254,7 +261,7 @@ fn followed(lines: &[Value], shown: &[Value]) -> usize {
             off["verdict"] == last["verdict"] && (stamp(withdrawn)..next).contains(&stamp(off))
         })
     };
-    warnings.windows(2).filter(|pair| is_followed(pair)).count()
+    warnings.windows(3).filter(|three| is_followed(three)).count()
 }
 
 #[test]

@@ -38,6 +38,8 @@ struct OfSensor {
     zones: Option<u64>,
     /// A sample had no memory, so that nobody knows what stands.
     is_unknown: bool,
+    /// A warning was withdrawn although nothing had gone wrong.
+    is_needless: bool,
     /// Scans since the hub found the scanner, and beams of the last one.
     scans: usize,
     beams: usize,
@@ -95,9 +97,7 @@ impl OfSensor {
         let said = Said { seq, verdict, is_of_telegram: early.bytes_seen > 0, beams_seen };
         let before = self.stands.take();
         if early.is_withdrawn() {
-            if is_well && self.scans > SETTLED {
-                return Some("a warning was withdrawn although nothing went wrong".to_owned());
-            }
+            self.is_needless = is_well && self.scans > SETTLED;
             let is_of = before.is_some_and(|before| (before.seq, before.verdict) == (seq, verdict));
             let is_of = is_of || std::mem::take(&mut self.is_unknown);
             return (!is_of).then(|| format!("{before:?} stood, something else was taken back"));
@@ -114,6 +114,10 @@ impl OfSensor {
     /// `is_well`.
     fn tell(&mut self, seq: u64, zones: &Zones, is_well: bool) -> Option<String> {
         self.zones = Some(seq);
+        // A hub that ends withdraws its warning, and sends no zones after that.
+        if std::mem::take(&mut self.is_needless) {
+            return Some("a warning was withdrawn although nothing went wrong".to_owned());
+        }
         let verdict = zones.verdict();
         let said = self.stands.take_if(|said| seq >= said.seq);
         let is_soon = zones.nearest().is_some_and(|(beam, _)| 5 * usize::from(beam) < 3 * self.beams);
