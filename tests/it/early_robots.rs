@@ -1,4 +1,5 @@
-//! The robot's verdict with early warnings and without: Rust, Python and C take the same ones, and nobody takes one unasked.
+//! The robot's verdict with early warnings and without them. Rust, Python, C and the lights take the same ones, and only if
+//! they are requested.
 
 use std::process::Command;
 
@@ -35,6 +36,16 @@ struct Warning {
 }
 
 impl Warning {
+    /// One called `robot1.front`, alone in the domain of `env`.
+    fn new(env: &TestEnv) -> Warning {
+        let topics = [Topic::Zones, Topic::Early];
+        let session =
+            PublishSession::open(&env.place(), &topics, TopicLimits::default()).expect("nobody else");
+        let sensor = session.sensor("robot1.front").expect("a name");
+        let (zones, early) = (sensor.topic().expect("room"), sensor.topic().expect("room"));
+        Warning { zones, early, sensor }
+    }
+
     /// The header of what is said of scan `seq`, whose zones hold for longer than a test.
     fn of_scan(&self, seq: u64) -> Header {
         Header { seq, period_us: 1_000_000_000, ..self.zones.header() }
@@ -84,11 +95,7 @@ fn verdict(line: &Value) -> Option<Verdict> {
 #[test]
 fn robots_in_all_languages_take_warnings_if_they_are_wanted() {
     let env = TestEnv::new();
-    let topics = [Topic::Zones, Topic::Early];
-    let session = PublishSession::open(&env.place(), &topics, TopicLimits::default()).expect("nobody else");
-    let sensor = session.sensor("robot1.front").expect("a name");
-    let (zones, early) = (sensor.topic().expect("room"), sensor.topic().expect("room"));
-    let mut sensor = Warning { zones, early, sensor };
+    let mut sensor = Warning::new(&env);
     let mut robots = robots(&env);
     let in_domain = || RobotFollower::in_domain(vec![env.place()], &["robot1.front"]).expect("a name");
     let mut in_rust = [(false, in_domain()), (true, in_domain().with_early())];
@@ -130,5 +137,44 @@ fn robots_in_all_languages_take_warnings_if_they_are_wanted() {
         let (clear, stop, slow) = (Verdict::Clear, Verdict::Stop, Verdict::Slow);
         let wanted = if early { vec![clear, stop, clear, stop, clear, slow] } else { vec![clear, slow] };
         assert_eq!(said, wanted, "{outcome}");
+    }
+}
+
+#[test]
+fn lights_follow_warnings_and_withdrawals_without_any_zones() {
+    for follows_early in [false, true] {
+        let env = TestEnv::new();
+        let mut sensor = Warning::new(&env);
+        let early: &[&str] = if follows_early { &["--early"] } else { &[] };
+        let mut leds = env.start(&[&["leds", "robot1.front", "--hold=0s", "--json"], early].concat());
+        let followers = ["robot1.front/zones", "robot1.front/early"];
+        until("it follows", || followers.map(|topic| env.subscribers(topic)) == [1, follows_early.into()]);
+        let mut shows = |is_of_warning: bool, wanted: Verdict| {
+            if follows_early || !is_of_warning {
+                let is_it = |line: &Value| line["class"] == "leds" && verdict(line) == Some(wanted);
+                leds.await_line(wanted.name(), is_it);
+            }
+        };
+        sensor.zones(7, Verdict::Clear);
+        shows(false, Verdict::Clear);
+        sensor.warn(8, 0);
+        shows(true, Verdict::Stop);
+        sensor.warn(8, Early::WITHDRAWN);
+        shows(true, Verdict::Clear);
+        sensor.warn(9, 0);
+        shows(true, Verdict::Stop);
+        sensor.zones(9, Verdict::Clear);
+        shows(true, Verdict::Clear);
+        sensor.zones(10, Verdict::Slow);
+        shows(false, Verdict::Slow);
+        let outcome = leds.end(INT);
+        let lights = outcome.of_class("leds");
+        let mut shown: Vec<Verdict> = lights.iter().filter_map(verdict).collect();
+        shown.retain(|verdict| *verdict != Verdict::Unknown);
+        shown.dedup();
+        let (clear, stop, slow) = (Verdict::Clear, Verdict::Stop, Verdict::Slow);
+        let wanted =
+            if follows_early { vec![clear, stop, clear, stop, clear, slow] } else { vec![clear, slow] };
+        assert_eq!(shown, wanted, "{outcome}");
     }
 }
