@@ -109,7 +109,8 @@ fn files_are_packed_as_they_are_told() {
         |(flags, wanted)| {
             let words = [&["record", "--json", "--force", "-o", &file][..], flags].concat();
             let mut recorder = env.start(&words);
-            recorder.await_line("samples", |line| is_class("recording")(line) && number(line, "samples") > 500);
+            recorder
+                .await_line("samples", |line| is_class("recording")(line) && number(line, "samples") > 500);
             let samples = number(&recorded(&recorder.end(INT)), "samples");
             assert_eq!(Recording::whole(&env.path("walk.mcap")).kept.len() as u64, samples);
             let bytes = std::fs::read(&file).unwrap();

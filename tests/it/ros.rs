@@ -22,9 +22,11 @@ fn link(env: &TestEnv, name: &str, pose: &Pose) -> Vec<String> {
     words
 }
 
+type Published = (Header, Box<Scan>);
+
 /// The scans of a recording as the hub published them, by topic of ROS and wall clock. Scans that waited in the port may
 /// have the same time.
-fn published(recording: &Recording) -> BTreeMap<(String, u64), Vec<(Header, Box<Scan>)>> {
+fn published(recording: &Recording) -> BTreeMap<(String, u64), Vec<Published>> {
     let of = |sensor: &str| {
         let kept = recording.of(&format!("{sensor}/scan"));
         let scans = kept.into_iter().map(|kept| {
