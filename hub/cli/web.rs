@@ -58,7 +58,7 @@ fn listen_address(text: &str) -> Result<SocketAddr, String> {
     if let Ok(port) = port.parse() {
         return Ok(SocketAddr::from((Ipv4Addr::LOCALHOST, port)));
     }
-    Err("use an IP address, a port, or both, such as 8090, 0.0.0.0 or [::]:8090".to_owned())
+    Err("use localhost or an IP address, a port, or both, such as 8090, 0.0.0.0 or [::]:8090".to_owned())
 }
 
 /// It goes into an address as it is.

@@ -162,9 +162,10 @@ fn a_scanner_that_restarts_is_counted_and_told() {
     assert!(text(&info, "last_error").ends_with("is its supply strong enough?"), "{info}");
     let log = hub.end(TERM).errors;
     assert!(log.contains("the scanner restarted"), "{log}");
-    for count in ["restarted: ", "restarted 2 times"] {
-        assert_eq!(log.matches(&format!("the scanner {count}")).count(), 1, "once for each count: {log}");
-    }
+    let said: Vec<_> =
+        log.lines().map(|line| line.split_once("the scanner restarted").map(|(_, end)| end)).collect();
+    let is_repeated = said.windows(2).any(|pair| pair[0].is_some() && pair[0] == pair[1]);
+    assert!(!is_repeated, "once for each count: {log}");
 }
 
 #[test]

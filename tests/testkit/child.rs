@@ -35,6 +35,8 @@ const SINCE: &str = "SCANHUB_TEST_SINCE";
 const GRACE: Duration = Duration::from_secs(2);
 /// Time in which the kernel ends killed processes, however busy the machine is.
 const KILL_LIMIT: Duration = Duration::from_secs(60);
+/// Time that a process has to load its program. Longer than a look at all processes may take if one has no environment at all.
+const EXEC_LIMIT: Duration = Duration::from_millis(200);
 const POLL_INTERVAL: Duration = Duration::from_millis(5);
 
 /// A child process of a test. Dropping it ends the child and all its descendants, and waits for their end.
@@ -287,7 +289,7 @@ fn newest_process() -> Option<i32> {
 /// Returns the value of a variable in the environment that a process was started with.
 fn variable(pid: i32, name: &str) -> Option<String> {
     let mut environment = environment(pid)?;
-    let give_up_at = Instant::now() + GRACE;
+    let give_up_at = Instant::now() + EXEC_LIMIT;
     // A process that starts another program has none for a moment.
     while environment.is_empty() && has_environment(pid) && Instant::now() < give_up_at {
         thread::sleep(Duration::from_millis(1));

@@ -120,18 +120,15 @@ impl Presence {
 
     /// The failure for callers that cannot wait for a hub.
     pub(crate) fn no_hub(&self) -> Failure {
-        self.no_hub_beside(|| RunningHub::all(Path::new("/")))
-    }
-
-    /// Returns [`Presence::no_hub`] without the hubs of other users and domains, for readers on other machines. It does not
-    /// read /proc, so it can be called often.
-    pub(crate) fn no_hub_here(&self) -> Failure {
-        self.no_hub_beside(Vec::new)
-    }
-
-    fn no_hub_beside(&self, hubs: impl FnOnce() -> Vec<RunningHub>) -> Failure {
+        let hubs = || RunningHub::all(Path::new("/"));
         let of_process = Environment::of_process();
         self.short().unwrap_or_else(|| no_hub(&self.places, self.denied.as_ref(), &hubs(), &of_process))
+    }
+
+    /// Returns [`Presence::no_hub`] without other users, their hubs and their directories, for readers on other machines. It
+    /// does not read /proc, so it can be called often.
+    pub(crate) fn no_hub_here(&self) -> Failure {
+        self.short().unwrap_or_else(|| no_hub(&self.places, None, &[], &Environment::of_process()))
     }
 
     /// Why it is not known whether there is a hub: there was not even a descriptor to look with.
@@ -149,7 +146,9 @@ impl Presence {
                 // 0: it has the lock and not yet written who it is.
                 Ok((None | Some(0), _)) => {}
                 Ok((Some(pid), who)) => return Some(Holder { domain: place.clone(), pid, who }),
-                Err(failure) => self.denied = Some(failure),
+                // A shortage says less about the other places than about this look.
+                Err(failure) if self.short().is_none() => self.denied = Some(failure),
+                Err(_) => {}
             }
         }
         None
@@ -161,14 +160,13 @@ impl Presence {
 fn no_hub(places: &[Domain], denied: Option<&Failure>, hubs: &[RunningHub], caller: &Environment) -> Failure {
     let name = places.first().map(Domain::name).unwrap_or_default();
     let is_named = |hub: &RunningHub| hub.uid != caller.uid && hub.domain.as_deref() == Some(name);
-    let is_known = hubs.iter().any(is_named);
-    // A hub whose domain is unknown may be the one, unless another one is.
-    let is_meant =
-        |hub: &&RunningHub| is_named(hub) || !is_known && hub.uid != caller.uid && hub.domain.is_none();
-    let is_elsewhere = hubs.iter().any(|hub| is_meant(&hub));
-    // Hubs of other domains count only if no other user has one of this domain; those of this user come first.
-    let mut hubs: Vec<&RunningHub> = hubs.iter().filter(|hub| !is_elsewhere || is_meant(hub)).collect();
-    hubs.sort_by_key(|hub| hub.uid != caller.uid);
+    let is_elsewhere = hubs.iter().any(is_named);
+    // A hub of another user whose domain is unknown may be the one.
+    let may_be_elsewhere =
+        is_elsewhere || hubs.iter().any(|hub| hub.uid != caller.uid && hub.domain.is_none());
+    // Other hubs count only if no other user has one of this domain; those of this user come first.
+    let mut hubs: Vec<&RunningHub> = hubs.iter().filter(|hub| !is_elsewhere || is_named(hub)).collect();
+    hubs.sort_by_key(|hub| (hub.uid != caller.uid, hub.domain.is_some()));
     let mut hints: Vec<String> =
         hubs.iter().take(MAX_HUBS).map(|hub| hub.whereabouts("list", name, caller)).collect();
     if hubs.len() > MAX_HUBS {
@@ -176,7 +174,7 @@ fn no_hub(places: &[Domain], denied: Option<&Failure>, hubs: &[RunningHub], call
     }
     let message = match denied {
         Some(denied) => format!("no hub of this user in domain {name}: {}", denied.message),
-        None if is_elsewhere => format!("no hub of this user in domain {name}"),
+        None if may_be_elsewhere => format!("no hub of this user in domain {name}"),
         None => format!("no hub in domain {name}"),
     };
     match denied {
@@ -265,7 +263,11 @@ mod tests {
         let (message, hint) = said(&hubs(&[(7, 0, "run")]), None);
         assert_eq!(message, "no hub of this user in domain scanhub");
         let unknown = "user root runs one in an unknown domain, process 7: sudo scanhub list --domains; ";
-        assert!(hint.starts_with(unknown), "{hint}");
+        assert!(hint.starts_with(unknown) && hint.contains("start one"), "{hint}");
+        let own = [(6, 1000, "run --domain lab"), (7, 0, "run")];
+        let (_, hint) = said(&hubs(&own), None);
+        assert!(hint.starts_with("this user runs one in domain lab, process 6: scanhub list"), "{hint}");
+        assert!(hint.contains(unknown), "{hint}");
 
         let named = (7, 0, "run --domain scanhub");
         let (message, hint) = said(&hubs(&[named]), None);
@@ -275,6 +277,13 @@ mod tests {
 
         let others = [(6, 1000, "run --domain lab"), named, (8, 0, "run --domain x"), (9, 0, "run")];
         assert_eq!(said(&hubs(&others), None).1, hint, "hubs of other domains are not meant");
+
+        // A page is read by anybody.
+        let mut presence = Presence::new(places.clone());
+        presence.denied = Some(Failure::new(Kind::Failed, "it belongs to user 998", "sudo -u scanhub"));
+        let here = presence.no_hub_here();
+        let text = format!("{} {}", here.message, here.hint);
+        assert!(!text.contains("998") && !text.contains("sudo"), "{text}");
 
         // The service's directory cannot be opened.
         let denied = Failure::new(Kind::Failed, "/run/scanhub belongs to user 998", "choose another --root");

@@ -286,25 +286,26 @@ impl<'a> Diagnosis<'a> {
         let is_server = matches!(self.link.port, Source::Tcp { .. });
         let other_rate = if is_server { ", or does the server use another rate" } else { "" };
         let bytes = with_commas(rate);
-        self.try_probe(&format!(
-            "{bytes} bytes/s arrive, but no {missing}; is it another scanner{other_rate}?"
-        ))
+        let words = format!("{bytes} bytes/s arrive, but no {missing}; is it another scanner{other_rate}?");
+        self.try_probe(&words, "")
     }
 
     /// Returns `words` about a scanner that does not reply, with the command that searches for all scanners.
     fn with_probe(&self, words: &str) -> String {
-        self.try_probe(&format!("{words} Another scanner?"))
+        self.try_probe(words, " Another scanner?")
     }
 
-    /// Returns `words` with the command that probes the port.
-    fn try_probe(&self, words: &str) -> String {
-        let message = |port: &str| format!("{words} Try: scanhub probe {port}");
-        let named = message(&self.link.port.name());
-        match &self.device {
-            // The command at its end would be cut.
-            Some(device) if named.len() > Status::MAX_ERROR_LEN => message(device),
-            _ => named,
-        }
+    /// Returns `words` with a question and the command that probes the port, if it can be probed and the whole command fits
+    /// into a status.
+    fn try_probe(&self, words: &str, question: &str) -> String {
+        let ports = match self.link.port {
+            Source::Tty(_) | Source::Tcp { .. } => vec![Some(self.link.port.name()), self.device.clone()],
+            _ => Vec::new(),
+        };
+        let message = |port: String| format!("{words}{question} Try: scanhub probe {port}");
+        let mut messages = ports.into_iter().flatten().map(message);
+        let whole = messages.find(|message| message.len() <= Status::MAX_ERROR_LEN);
+        whole.unwrap_or_else(|| words.to_owned())
     }
 
     /// What the configuration says otherwise than the scanner.

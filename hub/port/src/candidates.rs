@@ -2,6 +2,7 @@
 
 use std::fmt;
 use std::fs;
+use std::io;
 use std::ops::RangeInclusive;
 use std::os::unix::fs::{FileTypeExt, MetadataExt};
 use std::path::{Path, PathBuf};
@@ -151,9 +152,14 @@ fn check_tty_in(path: &Path, known: &Path) -> Result<(), PortError> {
     match fs::read_link(known.join(format!("{major}:{minor}/subsystem"))) {
         Ok(subsystem) if subsystem.ends_with("tty") => Ok(()),
         Ok(_) => Err(PortError::NotTty),
-        // Ptys are not listed; without sysfs nothing is, and the terminal has to say it itself.
-        Err(_) if UNIX98_PTYS.contains(&major) || !known.exists() => Ok(()),
-        Err(_) => Err(PortError::Dead),
+        // Ptys are not listed; without sysfs nothing is.
+        Err(error)
+            if error.kind() == io::ErrorKind::NotFound && !UNIX98_PTYS.contains(&major) && known.exists() =>
+        {
+            Err(PortError::Dead)
+        }
+        // The terminal has to say it itself.
+        Err(_) => Ok(()),
     }
 }
 
@@ -322,7 +328,7 @@ pub(super) mod tests {
             machine.link(&format!("sys/class/{subsystem}"), "sys/dev/char/1:3/subsystem");
             assert_eq!(check("/dev/null"), expected);
         }
-        assert_eq!(check("/etc/hostname"), Err(PortError::NotTty));
+        assert_eq!(check("/proc/self/exe"), Err(PortError::NotTty));
         assert_eq!(check("/dev/no-such-port"), Err(PortError::Missing));
     }
 

@@ -147,8 +147,8 @@ impl Files {
                 let finished = lock_finished(&path);
                 (path, finished)
             };
-            // No recorder can take the file until its name has been removed.
-            if let Some(_lock) = removable {
+            // The file stays locked until its name has been removed.
+            if removable.as_ref().is_some_and(|file| is_at(file, &path)) {
                 let _ = fs::remove_file(path);
             }
         }
@@ -232,9 +232,10 @@ fn head(path: &Path) -> io::Result<(File, Vec<u8>, Option<bool>)> {
     if !file.metadata()?.is_file() {
         return Err(ErrorKind::InvalidInput.into());
     }
+    // Another recorder could write the file between a look and the lock.
+    let is_taken = lock::is_taken(&file);
     let mut head = Vec::new();
     (&file).take(HEAD).read_to_end(&mut head)?;
-    let is_taken = lock::is_taken(&file);
     Ok((file, head, is_taken))
 }
 
@@ -247,17 +248,32 @@ fn open(path: &Path, overwrites: bool) -> io::Result<File> {
         true => options.create(true).truncate(false),
         false => options.create_new(true),
     };
-    let file = options.open(path)?;
-    if file.metadata()?.is_file() {
-        lock::take(&file)?;
-        if file.metadata()?.nlink() == 0 {
-            // Another run removed it as an old file between the open and the lock.
-            return Err(io::Error::new(ErrorKind::ResourceBusy, "another recorder has just removed it"));
-        }
-        file.set_len(0)?;
+    let mut file = options.open(path)?;
+    if !file.metadata()?.is_file() {
+        return Ok(file);
     }
+    lock::take(&file)?;
+    // Another run may remove it as an old file between the open and the lock.
+    for _ in 0..TRIES {
+        if is_at(&file, path) {
+            break;
+        }
+        file = options.open(path)?;
+        lock::take(&file)?;
+    }
+    file.set_len(0)?;
     Ok(file)
 }
+
+/// Returns whether `file` is the one that `path` names.
+fn is_at(file: &File, path: &Path) -> bool {
+    let id = |metadata: fs::Metadata| (metadata.dev(), metadata.ino());
+    let named = path.symlink_metadata().map(id);
+    file.metadata().map(id).is_ok_and(|own| named.is_ok_and(|named| named == own))
+}
+
+/// Opens of a file that other runs remove at the same time. Some file systems never report the same inode twice.
+const TRIES: usize = 3;
 
 /// Bytes that contain the description of the run, which is the first record of a recording.
 const HEAD: u64 = 4096;

@@ -52,9 +52,7 @@ pub(crate) fn line_loss(status: &Status) -> Finding {
     let due = status.counters[Counter::DueOnLine];
     let all = match status.lost_on_line() {
         // Those that are damaged are missing, too, but too little arrives to count them.
-        Some(0) | None if status.line_loss().is_some() => {
-            format!("how many {} are lost is not known", status.sent())
-        }
+        Some(0) if is_mostly_damaged(status) => format!("how many {} are lost is not known", status.sent()),
         Some(lost) => format!("{lost} of {due} {} lost since the hub's start", status.sent()),
         None => format!("how many {} are lost is not known", status.sent()),
     };

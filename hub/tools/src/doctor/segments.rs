@@ -62,7 +62,19 @@ const ALWAYS_LEFT: u64 = 16;
 
 #[cfg(test)]
 mod tests {
+    use std::path::Path;
+    use std::time::{Duration, Instant};
+
     use super::*;
+
+    /// Waits until no process has `path` open: a child that another test starts has a copy of all descriptors for a moment.
+    fn await_unheld(prefix: &str, user: u32, path: &Path) {
+        let give_up_at = Instant::now() + Duration::from_secs(60);
+        while !unheld(prefix, user).iter().any(|file| file.path == path) {
+            assert!(Instant::now() < give_up_at, "{} is still open", path.display());
+            std::thread::sleep(Duration::from_millis(1));
+        }
+    }
 
     #[test]
     fn a_file_counts_once_nobody_holds_it_and_for_its_owner_alone() {
@@ -73,6 +85,7 @@ mod tests {
         let user = file.metadata().unwrap().uid();
         let open = abandoned(&prefix, user);
         drop(file);
+        await_unheld(&prefix, user, &path);
         let short = PathBuf::from(format!("{SHARED_MEMORY}/{prefix}b"));
         fs::write(&short, "16 bytes are few").unwrap();
         let beside = lock(&prefix, user);
@@ -84,6 +97,7 @@ mod tests {
             fs::write(&counter, "16 bytes are few").unwrap();
             let is_spared = !unheld(&prefix, user).iter().any(|file| file.path == counter);
             drop(held);
+            await_unheld(&prefix, user, &data);
             let is_left = unheld(&prefix, user).iter().any(|file| file.path == counter);
             [data, counter].iter().for_each(|path| fs::remove_file(path).unwrap());
             (is_spared, is_left)

@@ -100,10 +100,9 @@ fn loss(heard: &Overheard) -> Finding {
     if heard.packets == 0 {
         return Finding::skipped(NAME, "it does not measure");
     }
-    let is_troubled = heard.is_unreliable() || heard.line_trouble().is_some();
     let packets = match lost {
         // Those that are damaged are missing, too, but too little arrives to count them.
-        0 if is_troubled => "how many packets are lost is not known".to_owned(),
+        0 if heard.is_unreliable() => "how many packets are lost is not known".to_owned(),
         lost => format!("{lost} of {} packets lost", heard.account.due),
     };
     let text = format!("{damaged:.1} % of the bytes damaged, {packets}");
@@ -165,7 +164,7 @@ mod tests {
         let damaged = Overheard { account: Account { damaged: 100, ..heard().account }, ..heard() };
         assert_eq!(said(&damaged)[1], ("line-loss", State::Warning));
         let text = examine(&damaged, None)[1].to_string();
-        assert!(text.contains("how many packets are lost is not known"), "{text}");
+        assert!(text.contains(", 0 of "), "{text}");
         // Where most bytes are damaged, a head that seems to stand still may turn.
         let account = Account { damaged: 40_000, ..heard().account };
         let unreliable = [
@@ -174,7 +173,10 @@ mod tests {
             ("settings", State::Skipped),
             ("health", State::Skipped),
         ];
-        assert_eq!(said(&Overheard { account, ..still }), unreliable);
+        let most = Overheard { account, ..still };
+        assert_eq!(said(&most), unreliable);
+        let text = examine(&most, None)[1].to_string();
+        assert!(text.contains("how many packets are lost is not known"), "{text}");
     }
 
     #[test]
