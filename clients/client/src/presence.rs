@@ -146,7 +146,7 @@ impl Presence {
                 // 0: it has the lock and not yet written who it is.
                 Ok((None | Some(0), _)) => {}
                 Ok((Some(pid), who)) => return Some(Holder { domain: place.clone(), pid, who }),
-                // A shortage says less about the other places than about this look.
+                // After a shortage, the other places could not be looked at either.
                 Err(failure) if self.short().is_none() => self.denied = Some(failure),
                 Err(_) => {}
             }
@@ -278,7 +278,7 @@ mod tests {
         let others = [(6, 1000, "run --domain lab"), named, (8, 0, "run --domain x"), (9, 0, "run")];
         assert_eq!(said(&hubs(&others), None).1, hint, "hubs of other domains are not meant");
 
-        // A page is read by anybody.
+        // Any user may read a page.
         let mut presence = Presence::new(places.clone());
         presence.denied = Some(Failure::new(Kind::Failed, "it belongs to user 998", "sudo -u scanhub"));
         let here = presence.no_hub_here();

@@ -158,7 +158,7 @@ fn check_tty_in(path: &Path, known: &Path) -> Result<(), PortError> {
         {
             Err(PortError::Dead)
         }
-        // The terminal has to say it itself.
+        // Opening it will show whether it is a terminal.
         Err(_) => Ok(()),
     }
 }
