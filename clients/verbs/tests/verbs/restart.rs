@@ -134,8 +134,16 @@ fn a_client_that_comes_between_two_hubs() {
     let timeout = Duration::from_millis(50);
     let mut scans = Subscription::<Scan>::in_domain(place.places(), "front").unwrap().timeout(timeout);
     assert!(scans.next().unwrap().is_none() && !scans.hub_lives());
-    let _hub = Hub::start(&place, 2);
-    until("a scan", || scans.next().unwrap().is_some_and(|scan| scan.header().boot == 2 && !scan.restarted));
+    let hub = Hub::start(&place, 2);
+    // It looks for a hub all the time, so it may come while the hub starts.
+    let mut is_heard = false;
+    let mut hear = || {
+        is_heard |= scans.next().unwrap().is_some_and(|scan| scan.header().boot == 2 && !scan.restarted);
+        is_heard
+    };
+    let pid = hub.0.id();
+    until("the second hub", || hear() || holder(place.domain.root()) == Ok(Some(pid)));
+    until("a scan of the second hub", hear);
 }
 
 #[test]
