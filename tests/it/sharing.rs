@@ -217,7 +217,7 @@ fn names_the_user_whose_hub_runs() {
             (&line["domain"], &line["user"], &line["remedy"]),
             (&Value::Null, &json!("root"), &remedy)
         );
-        // The terminal of the web server names the other user; its page does not.
+        // The terminal of the web server names the hub of the other user.
         let mut web = other(&["web", "--listen", "127.0.0.1:0", DOMAIN]);
         web.await_text("no hub of this user in domain whose");
         assert_eq!(web.end(TERM).code, Some(0));

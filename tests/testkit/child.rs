@@ -35,7 +35,7 @@ const SINCE: &str = "SCANHUB_TEST_SINCE";
 const GRACE: Duration = Duration::from_secs(2);
 /// Time in which the kernel ends killed processes, however busy the machine is.
 const KILL_LIMIT: Duration = Duration::from_secs(60);
-/// Time that a process has to load its program. Longer than a look at all processes may take if one has no environment at all.
+/// Time that a process has to load its program. It is short, because the environment of another process may stay empty.
 const EXEC_LIMIT: Duration = Duration::from_millis(200);
 const POLL_INTERVAL: Duration = Duration::from_millis(5);
 

@@ -120,16 +120,18 @@ impl Presence {
 
     /// The failure for callers that cannot wait for a hub.
     pub(crate) fn no_hub(&self) -> Failure {
-        let hubs = || RunningHub::all(Path::new("/"));
-        let of_process = Environment::of_process();
-        self.short().unwrap_or_else(|| no_hub(&self.places, self.denied.as_ref(), &hubs(), &of_process))
+        self.no_hub_beside(|| RunningHub::all(Path::new("/")))
     }
 
     /// Returns [`Presence::no_hub`] without the hubs of other users and domains, for readers on other machines. A directory
     /// that cannot be opened is named with its owner. It does not read /proc, so it can be called often.
     pub(crate) fn no_hub_here(&self) -> Failure {
+        self.no_hub_beside(Vec::new)
+    }
+
+    fn no_hub_beside(&self, hubs: impl FnOnce() -> Vec<RunningHub>) -> Failure {
         let of_process = Environment::of_process();
-        self.short().unwrap_or_else(|| no_hub(&self.places, self.denied.as_ref(), &[], &of_process))
+        self.short().unwrap_or_else(|| no_hub(&self.places, self.denied.as_ref(), &hubs(), &of_process))
     }
 
     /// Why it is not known whether there is a hub: there was not even a descriptor to look with.
@@ -147,7 +149,7 @@ impl Presence {
                 // 0: it has the lock and not yet written who it is.
                 Ok((None | Some(0), _)) => {}
                 Ok((Some(pid), who)) => return Some(Holder { domain: place.clone(), pid, who }),
-                // After a shortage, the other places could not be looked at either.
+                // A shortage is kept, because the other places fail for it, too.
                 Err(failure) if self.short().is_none() => self.denied = Some(failure),
                 Err(_) => {}
             }

@@ -133,22 +133,22 @@ impl<'a> Diagnosis<'a> {
         self.damaged_percent = None;
     }
 
-    /// Takes the message `words` about the `alteration` that the hub has undone at `now`.
-    pub(crate) fn note_altered(&mut self, alteration: Alteration, words: String, now: Nanos) {
-        self.altered = Some(Altered { alteration, words, until: now + ALTERED_SHOWN });
-        self.facts = None;
-    }
-
-    /// Returns whether the message already names this `alteration`, which the hub has undone again at `now`. The message then
-    /// stays: a program that keeps changing the port is not worth a search of all processes each time.
-    pub(crate) fn has_message_about(&mut self, alteration: Alteration, now: Nanos) -> bool {
-        match &mut self.altered {
-            Some(altered) if altered.alteration == alteration => {
-                altered.until = now + ALTERED_SHOWN;
-                true
+    /// Notes the `alteration` that the hub has undone at `now`. `program` searches for the program that made it. A message that
+    /// already names the alteration stays: a program that keeps changing the port is not worth a search each time.
+    pub(crate) fn note_altered(
+        &mut self,
+        alteration: Alteration,
+        program: impl FnOnce() -> Option<String>,
+        now: Nanos,
+    ) {
+        let words = match self.altered.take() {
+            Some(altered) if altered.alteration == alteration => altered.words,
+            _ => {
+                self.facts = None;
+                program().map_or_else(|| alteration.to_string(), |program| format!("{alteration}; {program}"))
             }
-            _ => false,
-        }
+        };
+        self.altered = Some(Altered { alteration, words, until: now + ALTERED_SHOWN });
     }
 
     /// What is wrong, in words; empty if nothing is.

@@ -311,12 +311,8 @@ impl<'a, S: Surroundings> Drive<'a, S> {
 fn restore<S: Surroundings>(core: &mut LinkCore<'_, S>, line: &S::Line, baud: u32) -> io::Result<bool> {
     let Some(alteration) = line.altered()? else { return Ok(false) };
     line.restore(baud)?;
-    let now = core.around.now();
-    if !core.diagnosis.has_message_about(alteration, now) {
-        let program = core.around.altering_program(&core.link.port);
-        let program = program.map(|program| format!("; {program}")).unwrap_or_default();
-        core.diagnosis.note_altered(alteration, format!("{alteration}{program}"), now);
-    }
+    let program = || core.around.altering_program(&core.link.port);
+    core.diagnosis.note_altered(alteration, program, core.around.now());
     Ok(true)
 }
 
