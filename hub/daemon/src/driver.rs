@@ -144,12 +144,11 @@ impl Driver {
 
 impl line::Session for Driver {
     type Heard<'a> = Heard<'a>;
-    type Why = ();
     type Trouble = Trouble;
 
     line::delegate_session!(each);
 
-    fn poll_output(&mut self) -> Output<Heard<'_>, ()> {
+    fn poll_output(&mut self) -> Output<Heard<'_>> {
         match self {
             Driver::Lms(session) => session.poll_output().map(Heard::Lms),
             Driver::Turning(session) => session.poll_output().map(Heard::Turning),

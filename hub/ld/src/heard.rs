@@ -34,16 +34,3 @@ impl fmt::Display for Trouble {
         }
     }
 }
-
-/// What a wait is for.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Why {
-    /// Packets would have been heard by then.
-    Listening,
-    /// The stream should have gone on.
-    Silence,
-    /// A packet is held back until the line was idle for so long.
-    Held,
-    /// Nothing is expected by any time.
-    Never,
-}

@@ -15,7 +15,7 @@ mod restarts;
 mod sequence;
 mod session;
 
-pub use heard::{Trouble, Why};
+pub use heard::Trouble;
 pub use line::{Heard, Packets, Tally, Turn, TurnCounts};
 pub use model::Model;
 pub use session::{Session, Settings};

@@ -76,22 +76,14 @@ impl Reads {
         if end > self.doubt.0 { core::mem::take(&mut self.doubt.1) } else { 0 }
     }
 
-    /// What to wait for at `now`: the end of a rest, or `until` for a `reason`, or if a packet is held back until the line
-    /// was idle for `hold`, that for the reason `held`.
-    pub fn wait<H, W>(
-        &self,
-        now: Nanos,
-        (until, reason): (Nanos, W),
-        hold: Option<Nanos>,
-        held: W,
-    ) -> Output<H, W> {
+    /// Returns what to wait for at `now`: the end of a rest, or bytes until the deadline `until`. If the framer holds a packet
+    /// back until the line was idle for `hold`, the deadline is the end of that time, if it comes first.
+    pub fn wait<H>(&self, now: Nanos, until: Nanos, hold: Option<Nanos>) -> Output<H> {
         if self.rest_until > now {
             return Output::Rest(self.rest_until);
         }
-        match hold.map(|hold| self.last_byte + hold) {
-            Some(hold) if hold < until => Output::Wait { until: hold, reason: held },
-            _ => Output::Wait { until, reason },
-        }
+        let held_until = hold.map_or(Nanos::MAX, |hold| self.last_byte + hold);
+        Output::Wait { until: until.min(held_until) }
     }
 
     /// When a packet was over that seems to be over at `last`: not before the one before it.

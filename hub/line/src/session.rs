@@ -12,8 +12,6 @@ pub trait Session {
     type Heard<'a>
     where
         Self: 'a;
-    /// What a deadline is for.
-    type Why;
     /// Why it is not where it should be; shown, it is said in words.
     type Trouble: Copy + PartialEq + fmt::Display;
 
@@ -58,7 +56,7 @@ pub trait Session {
     fn transmitted(&mut self, now: Nanos);
 
     /// What the session wants next.
-    fn poll_output(&mut self) -> Output<Self::Heard<'_>, Self::Why>;
+    fn poll_output(&mut self) -> Output<Self::Heard<'_>>;
 
     /// How far it is.
     fn state(&self) -> State;
@@ -138,7 +136,7 @@ macro_rules! delegate_session {
 
 /// What a session wants, in the order in which it wants it.
 #[derive(Debug)]
-pub enum Output<H, W> {
+pub enum Output<H> {
     /// Set the port to this rate, in bits per second, and forget what it had received, then go on draining.
     SetRate(u32),
     /// Assert the line DTR of a serial port, or clear it; other ports have none. Then go on draining.
@@ -159,21 +157,19 @@ pub enum Output<H, W> {
     Wait {
         /// The deadline; [`Nanos::MAX`] is none.
         until: Nanos,
-        /// What it is for.
-        reason: W,
     },
 }
 
-impl<H, W> Output<H, W> {
-    /// The same with what was heard as `f` has it, and without what a wait is for.
-    pub fn map<T>(self, f: impl FnOnce(H) -> T) -> Output<T, ()> {
+impl<H> Output<H> {
+    /// Returns the same output, with `f` applied to what arrived.
+    pub fn map<T>(self, f: impl FnOnce(H) -> T) -> Output<T> {
         match self {
             Output::SetRate(rate) => Output::SetRate(rate),
             Output::SetDtr(on) => Output::SetDtr(on),
             Output::Transmit { byte, not_before } => Output::Transmit { byte, not_before },
             Output::Heard(heard) => Output::Heard(f(heard)),
             Output::Rest(until) => Output::Rest(until),
-            Output::Wait { until, .. } => Output::Wait { until, reason: () },
+            Output::Wait { until } => Output::Wait { until },
         }
     }
 }

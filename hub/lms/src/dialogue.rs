@@ -9,8 +9,8 @@ use crate::identity::Identity;
 use crate::measured::Measured;
 use crate::outgoing::{FORGOTTEN, NAK_PAUSE, Outgoing};
 use crate::phase::{
-    BESIDE_VALUES, OVERLOOKED, PAUSE, Phase, Progress, QUESTION_PAUSE, QUESTION_ROUNDS, QUESTIONS, Reason,
-    SILENCE, Settings, Step,
+    BESIDE_VALUES, OVERLOOKED, PAUSE, Phase, Progress, QUESTION_PAUSE, QUESTION_ROUNDS, QUESTIONS, SILENCE,
+    Settings, Step,
 };
 use crate::reply::{POWER_ON, Reply};
 use crate::search::POWER_ON_BAUD;
@@ -137,20 +137,23 @@ impl Dialogue {
         }
     }
 
-    pub(crate) fn deadline(&self) -> (Nanos, Reason) {
-        let reply = self.open.as_ref().map_or(Nanos::MAX, Outgoing::give_up_at);
-        let (own, reason) = match self.phase {
+    /// Returns when the dialogue has to act without a byte: the end of its phase or of the wait for a reply, or the time at
+    /// which the next byte of a request may leave.
+    pub(crate) fn deadline(&self) -> Nanos {
+        let phase_ends_at = match self.phase {
             Phase::Listening { give_up_at, quiet_at, .. } => {
-                (if self.heard { give_up_at } else { quiet_at }, Reason::Listening)
+                if self.heard {
+                    give_up_at
+                } else {
+                    quiet_at
+                }
             }
-            Phase::Streaming { silent_at, .. } => (silent_at, Reason::Silence),
-            _ => (Nanos::MAX, Reason::Never),
+            Phase::Streaming { silent_at, .. } => silent_at,
+            _ => Nanos::MAX,
         };
-        let request =
-            self.open.as_ref().and_then(Outgoing::byte).map_or(Nanos::MAX, |(_, not_before)| not_before);
-        [(reply, Reason::Reply), (request, Reason::Request)]
-            .into_iter()
-            .fold((own, reason), |a, b| if b.0 < a.0 { b } else { a })
+        let Some(request) = &self.open else { return phase_ends_at };
+        let next_byte_at = request.byte().map_or(Nanos::MAX, |(_, not_before)| not_before);
+        phase_ends_at.min(request.give_up_at()).min(next_byte_at)
     }
 
     pub(crate) fn handle_timeout(&mut self, now: Nanos) {

@@ -44,7 +44,7 @@ pub mod variant;
 pub use identity::Identity;
 pub use inquiry::Inquiry;
 pub use notice::Notice;
-pub use phase::{Reason, SILENCE, Settings};
+pub use phase::{SILENCE, Settings};
 pub use sensor::{Sensor, Trouble};
 pub use session::Session;
 

@@ -21,21 +21,6 @@ pub struct Settings {
     pub fixed_rate: bool,
 }
 
-/// Why a session waits until its deadline.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Reason {
-    /// A running stream would have been heard by then.
-    Listening,
-    /// A request may leave.
-    Request,
-    /// The reply should have come.
-    Reply,
-    /// The stream should have gone on.
-    Silence,
-    /// Nothing is expected by any time.
-    Never,
-}
-
 #[derive(Clone, Copy, Debug)]
 pub(crate) enum Phase {
     /// Listening without sending, for a sensor that streams. The state is `shown` during this time; afterwards comes

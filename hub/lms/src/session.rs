@@ -14,7 +14,7 @@ use crate::header::Reject;
 use crate::identity::Identity;
 use crate::measured::MEASURED;
 use crate::outgoing::SOON;
-use crate::phase::{Phase, Reason, Settings};
+use crate::phase::{Phase, Settings};
 use crate::reply::Reply;
 use crate::sensor::{Sensor, Trouble};
 use crate::telegram::Telegram;
@@ -22,15 +22,6 @@ use crate::variant::{BYTES_PER_TURN, Baud, Mode};
 use line::{Account, Control, Output, State, suspect};
 
 pub use begun::Begun;
-
-/// What a deadline is for.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Why {
-    /// A step of the conversation.
-    Dialogue(Reason),
-    /// A telegram is held back until the line was idle for so long.
-    Held,
-}
 
 /// What a telegram says.
 #[derive(Clone, Copy, Debug)]
@@ -209,7 +200,6 @@ impl Session {
 
 impl line::Session for Session {
     type Heard<'a> = Received<'a>;
-    type Why = Why;
     type Trouble = Trouble;
 
     fn spare(&mut self) -> &mut [u8] {
@@ -283,7 +273,7 @@ impl line::Session for Session {
         }
     }
 
-    fn poll_output(&mut self) -> Output<Received<'_>, Why> {
+    fn poll_output(&mut self) -> Output<Received<'_>> {
         while let Some(found) = self.framer.advance() {
             match found {
                 Advance::Telegram(span) => return Output::Heard(self.receive(span)),
@@ -316,13 +306,9 @@ impl line::Session for Session {
         {
             return Output::Rest(until);
         }
-        let (until, reason) = self.dialogue.deadline();
-        match self.framer.hold() {
-            Some(hold) if self.last_byte + hold < until => {
-                Output::Wait { until: self.last_byte + hold, reason: Why::Held }
-            }
-            _ => Output::Wait { until, reason: Why::Dialogue(reason) },
-        }
+        // A telegram may be held back until the line was idle for a while.
+        let held_until = self.framer.hold().map_or(Nanos::MAX, |hold| self.last_byte + hold);
+        Output::Wait { until: self.dialogue.deadline().min(held_until) }
     }
 
     fn state(&self) -> State {

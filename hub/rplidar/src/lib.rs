@@ -19,4 +19,4 @@ mod told;
 pub use line::{Heard, Packets, Tally, Turn, TurnCounts};
 pub use model::{Mode, Model};
 pub use session::{Session, Settings};
-pub use told::{Health, Info, Trouble, Why};
+pub use told::{Health, Info, Trouble};

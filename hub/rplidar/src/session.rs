@@ -17,7 +17,7 @@ use crate::model::{Mode, Model};
 use crate::offers::Offers;
 use crate::packet::Kind;
 use crate::sequence::{Place, Sequence, Step};
-use crate::told::{Health, Info, Trouble, Why};
+use crate::told::{Health, Info, Trouble};
 
 use self::dialogue::Ask;
 use self::outgoing::Outgoing;
@@ -282,19 +282,19 @@ impl Session {
         is_young && self.next_rate().is_some()
     }
 
-    /// When something is due, and what.
-    fn deadline(&self) -> (Nanos, Why) {
+    /// Returns when the session has to act without a byte.
+    fn deadline(&self) -> Nanos {
         match self.phase {
             Phase::Listening { since } => {
                 let seconds = self.now.saturating_sub(since) / SILENCE;
-                (since + (seconds + 1) * SILENCE, Why::Answer)
+                since + (seconds + 1) * SILENCE
             }
-            Phase::Paused { .. } => (Nanos::MAX, Why::Never),
-            Phase::Draining { until, at_most, .. } => (until.min(at_most), Why::Draining),
-            Phase::Asking { until, .. } => (until, Why::Answer),
-            Phase::Booting { until } => (until, Why::Booting),
-            Phase::Unwell { until } => (until, Why::Unwell),
-            Phase::Hearing { silent_at, .. } => (silent_at, Why::Silence),
+            Phase::Paused { .. } => Nanos::MAX,
+            Phase::Draining { until, at_most, .. } => until.min(at_most),
+            Phase::Asking { until, .. } => until,
+            Phase::Booting { until } => until,
+            Phase::Unwell { until } => until,
+            Phase::Hearing { silent_at, .. } => silent_at,
         }
     }
 }

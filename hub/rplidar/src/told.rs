@@ -127,22 +127,3 @@ impl fmt::Display for Trouble {
         }
     }
 }
-
-/// What a wait is for.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Why {
-    /// The line should be quiet by then.
-    Draining,
-    /// An answer should have come.
-    Answer,
-    /// The scanner should have booted.
-    Booting,
-    /// An unwell scanner is asked again.
-    Unwell,
-    /// The stream should have gone on.
-    Silence,
-    /// A packet is held back until the line was idle for so long.
-    Held,
-    /// Nothing is expected by any time.
-    Never,
-}

@@ -140,13 +140,12 @@ impl Session {
 
 impl line::Session for Session {
     type Heard<'a> = Heard<'a>;
-    type Why = ();
     type Trouble = Trouble;
 
     line::delegate_session!(each);
 
-    fn poll_output(&mut self) -> Output<Heard<'_>, ()> {
-        each!(self, session => session.poll_output().map(|heard| heard))
+    fn poll_output(&mut self) -> Output<Heard<'_>> {
+        each!(self, session => session.poll_output())
     }
 
     fn trouble(&self) -> Option<Trouble> {

@@ -3,11 +3,10 @@
 use line::{Account, Control, Heard, Nanos, Output, State};
 
 use super::{MOST, Phase, Session};
-use crate::heard::{Trouble, Why};
+use crate::heard::Trouble;
 
 impl line::Session for Session {
     type Heard<'a> = Heard<'a>;
-    type Why = Why;
     type Trouble = Trouble;
 
     fn spare(&mut self) -> &mut [u8] {
@@ -50,7 +49,7 @@ impl line::Session for Session {
         self.now = now;
     }
 
-    fn poll_output(&mut self) -> Output<Heard<'_>, Why> {
+    fn poll_output(&mut self) -> Output<Heard<'_>> {
         if let Some(closed) = self.advance_turns() {
             return Output::Heard(Heard::Turn(self.show(closed)));
         }
@@ -65,11 +64,11 @@ impl line::Session for Session {
             return Output::SetRate(self.baud);
         }
         let until = match self.phase {
-            Phase::Listening { next_at, .. } => (next_at, Why::Listening),
-            Phase::Hearing { silent_at, .. } => (silent_at, Why::Silence),
-            Phase::Paused => (Nanos::MAX, Why::Never),
+            Phase::Listening { next_at, .. } => next_at,
+            Phase::Hearing { silent_at, .. } => silent_at,
+            Phase::Paused => Nanos::MAX,
         };
-        self.reads.wait(self.now, until, self.framer.hold(), Why::Held)
+        self.reads.wait(self.now, until, self.framer.hold())
     }
 
     fn state(&self) -> State {

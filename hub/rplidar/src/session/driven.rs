@@ -6,11 +6,10 @@ use super::reply::Reply;
 use super::{Phase, Session};
 use crate::framer::{Found, Span};
 use crate::request::Head;
-use crate::told::{Health, Trouble, Why};
+use crate::told::{Health, Trouble};
 
 impl line::Session for Session {
     type Heard<'a> = Heard<'a>;
-    type Why = Why;
     type Trouble = Trouble;
 
     fn spare(&mut self) -> &mut [u8] {
@@ -77,7 +76,7 @@ impl line::Session for Session {
         }
     }
 
-    fn poll_output(&mut self) -> Output<Heard<'_>, Why> {
+    fn poll_output(&mut self) -> Output<Heard<'_>> {
         loop {
             if let Some(on) = self.change_dtr.take() {
                 return Output::SetDtr(on);
@@ -114,7 +113,7 @@ impl line::Session for Session {
         if self.change_dtr.is_some() || self.change_baud || self.outgoing.next().is_some() {
             return self.poll_output();
         }
-        self.reads.wait(self.now, self.deadline(), self.framer.hold(), Why::Held)
+        self.reads.wait(self.now, self.deadline(), self.framer.hold())
     }
 
     fn state(&self) -> State {
