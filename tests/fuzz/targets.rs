@@ -24,7 +24,7 @@ use lms_configure::eeprom::Write;
 /// A target by its name.
 pub type Target = (&'static str, fn(&[u8]));
 
-/// All of them; the names are those of the corpus' folders.
+/// All targets. The corpus of each is `corpus/NAME.txt`.
 pub const TARGETS: [Target; 8] = [
     ("framer", framer),
     ("replies", replies),

@@ -1,7 +1,7 @@
-//! The fuzzer's targets without the fuzzer: over the corpus that it has left, over pieces of it and over seeded noise.
-//! `tests/fuzz/README.md` tells how to look for more.
+//! Runs the fuzzer's targets without the fuzzer: on the inputs of the corpora, on mutations of them, and on noise from
+//! fixed seeds. `tests/fuzz/README.md` says how to search for more inputs.
 
-// Public for the fuzzer, which has them as a crate.
+// Public because `cargo fuzz` uses the same file as a crate.
 #[allow(unreachable_pub)]
 #[path = "../fuzz/targets.rs"]
 mod targets;
@@ -11,17 +11,26 @@ use std::path::Path;
 
 use fastrand::Rng;
 
-/// Inputs of one target that were worth keeping.
+/// Returns the inputs in the corpus of `target`: each line has the bytes of one in hex, and a name after a space if it
+/// was written by hand.
 fn corpus(target: &str) -> Vec<Vec<u8>> {
-    let directory = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/fuzz/corpus").join(target);
-    let mut entries: Vec<_> =
-        fs::read_dir(&directory).expect("a corpus").map(|entry| entry.expect("an entry").path()).collect();
-    entries.sort();
-    assert!(!entries.is_empty(), "{} is empty", directory.display());
-    entries.iter().map(|path| fs::read(path).expect("a readable input")).collect()
+    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join(format!("tests/fuzz/corpus/{target}.txt"));
+    let text = fs::read_to_string(&path).unwrap_or_else(|error| panic!("{}: {error}", path.display()));
+    let inputs: Vec<Vec<u8>> = text.lines().map(input).collect();
+    assert!(!inputs.is_empty(), "{} is empty", path.display());
+    inputs
 }
 
-/// One input with a few bytes changed, doubled, dropped or taken from another one.
+/// Returns the bytes of one line of a corpus.
+fn input(line: &str) -> Vec<u8> {
+    let hex = line.split(' ').next().unwrap_or_default().as_bytes();
+    let (pairs, rest) = hex.as_chunks::<2>();
+    assert!(rest.is_empty() && !pairs.is_empty(), "not an input in hex: {line}");
+    let digit = |byte: u8| char::from(byte).to_digit(16).unwrap_or_else(|| panic!("not hex: {line}")) as u8;
+    pairs.iter().map(|&[high, low]| digit(high) << 4 | digit(low)).collect()
+}
+
+/// Returns one input of `corpus` with a few bytes changed, inserted, cut off or copied from another input.
 fn mutated(random: &mut Rng, corpus: &[Vec<u8>]) -> Vec<u8> {
     let mut input = corpus[random.usize(..corpus.len())].clone();
     for _ in 0..random.usize(1..8) {
@@ -39,7 +48,7 @@ fn mutated(random: &mut Rng, corpus: &[Vec<u8>]) -> Vec<u8> {
             _ => input.insert(at, random.u8(..)),
         }
     }
-    input.truncate(MOST);
+    input.truncate(MAX_LENGTH);
     input
 }
 
@@ -102,7 +111,7 @@ fn recording() {
     run("recording");
 }
 
-/// Inputs beside those of the corpus, for each target.
+/// Number of inputs for each target in addition to those of the corpus.
 const ROUNDS: u32 = 4_000;
-/// Bytes of the longest one.
-const MOST: usize = 4_096;
+/// Maximum length of a mutated input, in bytes.
+const MAX_LENGTH: usize = 4_096;
