@@ -1,8 +1,8 @@
-//! How much earlier does a warning come by the part of a scan that is there, and what does it cost? Posts stand in the smaller
-//! circle, one after the other at places all over the scan; a warning and the zones of the same scan are compared by when the
-//! hub sent them: of an LMS, and of scanners whose head turns. On a line that loses bytes in bursts, warnings are withdrawn, and
-//! counted. The hub's processor time with a follower of `early` beside one of `zones` alone. It does not tell what a robot
-//! gains: its brakes are slower.
+//! How much earlier does a warning from a partial scan arrive, and what does it cost? Posts appear in the smaller zone,
+//! one after the other, at positions all over the scan. A warning is compared with the zones of the same scan by the
+//! times at which the hub sent them, for an LMS and for rotating scanners. On a line that loses bytes in bursts, some
+//! warnings are withdrawn, and counted. The CPU time of the hub with a subscriber to `early` is compared with that for
+//! `zones` alone. The bench does not measure what a robot gains: its brakes are slower.
 
 mod support;
 
@@ -16,12 +16,10 @@ use std::time::{Duration, Instant};
 use scanhub_client::{Early, Header, Zones};
 use schema::Scan;
 use schema::ipc::Payload;
-use support::child::Child;
 use support::figures::{self, Cell, Figure, Target};
-use support::options::Options;
-use support::stage::{PATIENCE, PROGRAM, Stage};
-use support::work::Work;
-use support::{Outcome, consumer};
+use support::stage::{Child, PATIENCE, PROGRAM, Stage};
+use support::usage::Work;
+use support::{Options, Outcome, consumer};
 
 const SENSOR: &str = "front";
 
@@ -57,7 +55,7 @@ const SCANNERS: [Scanner; 3] = [
             "LMS: warnings, burst line",
             "LMS: withdrawn, burst line",
         ],
-        load: "LMS: hub's processor time, beside zones",
+        load: "LMS: hub's CPU time, beside zones",
     },
     Scanner {
         name: "LD19",
@@ -72,7 +70,7 @@ const SCANNERS: [Scanner; 3] = [
             "LD19: warnings, burst line",
             "LD19: withdrawn, burst line",
         ],
-        load: "LD19: hub's processor time, beside zones",
+        load: "LD19: hub's CPU time, beside zones",
     },
     Scanner {
         name: "RPLIDAR S2",
@@ -87,7 +85,7 @@ const SCANNERS: [Scanner; 3] = [
             "S2: warnings, burst line",
             "S2: withdrawn, burst line",
         ],
-        load: "S2: hub's processor time, beside zones",
+        load: "S2: hub's CPU time, beside zones",
     },
 ];
 
@@ -111,11 +109,11 @@ fn measure(options: &Options) -> Outcome<()> {
             name,
             unit: "1",
             hub,
-            floor: Vec::new(),
+            baseline: Vec::new(),
             target,
         }));
-        let [hub, floor] = told.shares;
-        figures.push(Figure { name: scanner.load, unit: "%", hub, floor, target: Target::Ratio(1.5) });
+        let [hub, baseline] = told.shares;
+        figures.push(Figure { name: scanner.load, unit: "%", hub, baseline, target: Target::Ratio(1.5) });
     }
     figures::print_cells("early", options.json, &cells);
     figures::print("early", options.json, &figures);
@@ -129,7 +127,7 @@ struct Told {
     gains: BTreeMap<usize, Vec<f64>>,
     /// Warnings, and those withdrawn, on a clean line and on one that loses bytes.
     counts: [Vec<f64>; 4],
-    /// The hub's processor time in percent, with a follower of `early` and without.
+    /// The hub's CPU time in percent, with a follower of `early` and without.
     shares: [Vec<f64>; 2],
 }
 

@@ -1,18 +1,16 @@
-//! Does everything that two sensors send arrive, in order, bit for bit and in time? 2 x 1500 telegrams from ptys at
-//! 500 kBd through the running hub into a process per sensor, compared with what the simulator says that it sent. And:
-//! how long does a start take with an idle sensor at each of the four rates, beside a bare host that knows the rate?
-//! It does not tell what damaged bytes do: that is what the tests of the framer are for.
+//! Does everything that two sensors send arrive, in order, bit for bit and in time? 2 x 1500 telegrams from ptys at 500
+//! kBd through the running hub into a process per sensor, compared with what the simulator says that it sent. And how
+//! long does a start take with an idle sensor at each of the four rates, compared with a bare host that knows the rate?
+//! Damaged bytes are left to the tests of the framer.
 
 mod support;
 
 use std::process::ExitCode;
 
-use support::Outcome;
-use support::child::Child;
 use support::figures::{self, Figure, Target};
-use support::options::Options;
-use support::stage::{PATIENCE, SENSORS, Stage};
+use support::stage::{Child, PATIENCE, SENSORS, Stage};
 use support::truth::Truth;
+use support::{Options, Outcome};
 
 fn main() -> ExitCode {
     support::main(measure)
@@ -69,26 +67,26 @@ fn transport(count: usize) -> Outcome<Vec<Figure>> {
         found.iter_mut().zip(values).for_each(|(series, value)| series.push(value));
     }
     let [received, lost, altered, disordered, before, hz] = found;
-    let figure = |name, unit, hub, target| Figure { name, unit, hub, floor: Vec::new(), target };
+    let figure = |name, unit, hub, target| Figure { name, unit, hub, baseline: Vec::new(), target };
     Ok(vec![
         figure("telegrams received", "1", received, Target::None),
         figure("lost", "1", lost, Target::Most(0.0)),
         figure("not bit for bit", "1", altered, Target::Most(0.0)),
         figure("out of order", "1", disordered, Target::Most(0.0)),
         figure("sent before the first received", "1", before, Target::Most(0.0)),
-        Figure { floor: vec![NOMINAL_HZ; 2], ..figure("rate", "Hz", hz, Target::None) },
+        Figure { baseline: vec![NOMINAL_HZ; 2], ..figure("rate", "Hz", hz, Target::None) },
     ])
 }
 
-/// Starts of the hub and of the floor, each with a sensor that was just powered on at `rate`.
+/// Starts of the hub and of the baseline, each with a sensor that was just powered on at `rate`.
 fn starts(pairs: usize, rate: u32, streaming: &'static str, first: &'static str) -> Outcome<[Figure; 2]> {
-    let new = |name| Figure { name, unit: "ms", hub: Vec::new(), floor: Vec::new(), target: Target::None };
+    let new = |name| Figure { name, unit: "ms", hub: Vec::new(), baseline: Vec::new(), target: Target::None };
     let mut figures = [new(streaming), new(first)];
     for _ in 0..pairs {
         let start = start_hub(rate)?;
         figures.iter_mut().zip(start).for_each(|(figure, value)| figure.hub.push(value));
-        let start = start_floor(rate)?;
-        figures.iter_mut().zip(start).for_each(|(figure, value)| figure.floor.push(value));
+        let start = start_baseline(rate)?;
+        figures.iter_mut().zip(start).for_each(|(figure, value)| figure.baseline.push(value));
     }
     Ok(figures)
 }
@@ -109,7 +107,7 @@ fn start_hub(rate: u32) -> Outcome<[f64; 2]> {
 }
 
 /// The same of a host that knows the rate.
-fn start_floor(rate: u32) -> Outcome<[f64; 2]> {
+fn start_baseline(rate: u32) -> Outcome<[f64; 2]> {
     let stage = Stage::new()?;
     let _simulator = stage.simulate(&ONE, rate)?;
     let host = stage.part(&["host", &stage.port(ONE[0]), &rate.to_string()])?;

@@ -1,7 +1,7 @@
-//! What does the hub cost while two sensors stream? Its processor time and its sleeps per telegram, with one sleeping
-//! consumer per sensor, beside a bare reader of the same ptys that does nothing but the system calls and wakes a
-//! process per telegram. Each run is long; runs of the hub and of the floor take turns on the same two lines. It does
-//! not tell what consumers cost, nor what happens on a real adapter.
+//! What does the hub cost while two sensors stream? Its CPU time and its sleeps per telegram, with one sleeping
+//! subscriber per sensor, compared with a bare reader of the same ptys that makes only the necessary system calls and
+//! wakes a process per telegram. Each run is long; runs of the hub and of the baseline alternate on the same two lines.
+//! The bench does not measure what subscribers cost, or what happens on a real adapter.
 
 mod support;
 
@@ -10,13 +10,11 @@ use std::thread;
 use std::time::Duration;
 
 use schema::{Counter, Status};
-use support::child::Child;
 use support::figures::{self, Figure, Target};
-use support::options::Options;
-use support::stage::{PATIENCE, SENSORS, Stage};
+use support::stage::{Child, PATIENCE, SENSORS, Stage};
 use support::truth::Truth;
-use support::work::Work;
-use support::{Outcome, clock, consumer};
+use support::usage::Work;
+use support::{Options, Outcome, clock, consumer};
 
 fn main() -> ExitCode {
     support::main(measure)
@@ -28,25 +26,25 @@ fn measure(options: &Options) -> Outcome<()> {
     let span = Duration::from_secs(options.seconds(20));
     // The first hub sets the sensors going; from then on they stream to whoever reads.
     start_hub(&stage)?.0.guard.kill()?;
-    let (mut hub, mut floor) = (Series::default(), Series::default());
+    let (mut hub, mut baseline) = (Series::default(), Series::default());
     for pair in 0..options.pairs() {
         if pair % 2 == 0 {
             hub.push(load_of_hub(&stage, span)?);
-            floor.push(load_of_floor(&stage, span)?);
+            baseline.push(load_of_baseline(&stage, span)?);
         } else {
-            floor.push(load_of_floor(&stage, span)?);
+            baseline.push(load_of_baseline(&stage, span)?);
             hub.push(load_of_hub(&stage, span)?);
         }
     }
-    let figure = |name, unit, hub, floor, target| Figure { name, unit, hub, floor, target };
+    let figure = |name, unit, hub, baseline, target| Figure { name, unit, hub, baseline, target };
     let figures = [
-        figure("processor time per telegram", "us", hub.busy_us, floor.busy_us, Target::Ratio(2.0)),
-        figure("of it in threads that read", "us", hub.readers_us, floor.readers_us, Target::None),
-        figure("sleeps per telegram", "1", hub.sleeps, floor.sleeps, Target::Most(6.0)),
-        figure("of it in threads that read", "1", hub.readers_sleeps, floor.readers_sleeps, Target::None),
-        figure("preemptions per telegram", "1", hub.preempted, floor.preempted, Target::None),
+        figure("CPU time per telegram", "us", hub.busy_us, baseline.busy_us, Target::Ratio(2.0)),
+        figure("of it in threads that read", "us", hub.readers_us, baseline.readers_us, Target::None),
+        figure("sleeps per telegram", "1", hub.sleeps, baseline.sleeps, Target::Most(6.0)),
+        figure("of it in threads that read", "1", hub.readers_sleeps, baseline.readers_sleeps, Target::None),
+        figure("preemptions per telegram", "1", hub.preempted, baseline.preempted, Target::None),
         figure("counter wakeups per telegram", "1", hub.wakeups, Vec::new(), Target::None),
-        figure("telegrams per run", "1", hub.telegrams, floor.telegrams, Target::None),
+        figure("telegrams per run", "1", hub.telegrams, baseline.telegrams, Target::None),
     ];
     figures::print("hub_load", options.json, &figures);
     Ok(())
@@ -97,12 +95,12 @@ fn load_of_hub(stage: &Stage, span: Duration) -> Outcome<Load> {
     Ok(load)
 }
 
-fn load_of_floor(stage: &Stage, span: Duration) -> Outcome<Load> {
-    let floor = stage.bare(&SENSORS, 0)?;
-    floor.await_line("woken", PATIENCE)?;
+fn load_of_baseline(stage: &Stage, span: Duration) -> Outcome<Load> {
+    let baseline = stage.bare(&SENSORS, 0)?;
+    baseline.await_line("woken", PATIENCE)?;
     thread::sleep(SETTLING);
-    let load = observe(stage, floor.guard.pid(), span)?;
-    floor.guard.kill()?;
+    let load = observe(stage, baseline.guard.pid(), span)?;
+    baseline.guard.kill()?;
     Ok(load)
 }
 
@@ -120,11 +118,11 @@ fn start_hub(stage: &Stage) -> Outcome<(Child, Vec<Child>)> {
 fn observe(stage: &Stage, pid: u32, span: Duration) -> Outcome<Load> {
     let leader = std::fs::read_to_string(format!("/proc/{pid}/comm"))?;
     let is_reader = |name: &str| SENSORS.contains(&name);
-    // The floor's readers have their process's name; its first thread only waits for them.
-    let is_floor = !leader.starts_with("scanhub");
+    // The baseline's readers have their process's name; its first thread only waits for them.
+    let is_baseline = !leader.starts_with("scanhub");
     let look = || -> Outcome<(u64, Work, Work)> {
         let all = Work::of(pid, |_| true)?;
-        Ok((clock::now(), all, if is_floor { all } else { Work::of(pid, is_reader)? }))
+        Ok((clock::now(), all, if is_baseline { all } else { Work::of(pid, is_reader)? }))
     };
     let before = look()?;
     thread::sleep(span);

@@ -1,6 +1,6 @@
-//! What does a consumer in another language wait longer than one in Rust? From the last byte that the hub read to the scan
-//! in the hands of one process, which is alone at the hub; the languages take turns at it. Rust sleeps at the bell, as it
-//! does by itself; the floor is Rust. It does not tell what a program makes of the scan.
+//! How much longer does a subscriber in another language wait than one in Rust? Measured from the last byte that the
+//! hub read to the scan in one process, which is the only subscriber; the languages alternate. Rust sleeps on the
+//! doorbell, its default, and is the baseline. The bench does not measure what a program does with the scan.
 
 mod support;
 
@@ -8,11 +8,9 @@ use std::path::Path;
 use std::process::{Command, ExitCode, Stdio};
 use std::time::Duration;
 
-use support::Outcome;
-use support::child::Child;
 use support::figures::{self, Figure, Target, percentile};
-use support::options::Options;
-use support::stage::{PATIENCE, Stage};
+use support::stage::{Child, PATIENCE, Stage};
+use support::{Options, Outcome};
 
 /// A language beside Rust.
 struct Language {
@@ -47,20 +45,20 @@ fn measure(options: &Options) -> Outcome<()> {
             let last = [stage.domain.name(), SENSOR, &(count + SETTLING).to_string()].map(str::to_owned);
             Child::start(&words[0], &[&words[1..], &last].concat())
         };
-        let (mut others, mut floors) = (Vec::new(), Vec::new());
+        let (mut others, mut baselines) = (Vec::new(), Vec::new());
         for pair in 0..options.pairs() {
             if pair % 2 == 0 {
                 others.push(ages(&own()?, count)?);
-                floors.push(ages(&rust()?, count)?);
+                baselines.push(ages(&rust()?, count)?);
             } else {
-                floors.push(ages(&rust()?, count)?);
+                baselines.push(ages(&rust()?, count)?);
                 others.push(ages(&own()?, count)?);
             }
         }
         let targets = [(0.5, Target::Ratio(ratio)), (0.9, Target::None), (0.99, Target::None)];
         for (name, (part, target)) in names.into_iter().zip(targets) {
             let at = |runs: &[Vec<f64>]| runs.iter().filter_map(|run| percentile(run, part)).collect();
-            figures.push(Figure { name, unit: "us", hub: at(&others), floor: at(&floors), target });
+            figures.push(Figure { name, unit: "us", hub: at(&others), baseline: at(&baselines), target });
         }
     }
     figures::print("languages", options.json, &figures);

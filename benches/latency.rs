@@ -1,7 +1,7 @@
-//! How old is a telegram when a consumer has it? From the last byte written into the pty (the simulator's own stamp) to
-//! the sample in the hands of another process that sleeps at the client library, at 37.5 Hz from each of two sensors,
-//! beside a bare chain with the same late read: pty, process, eventfd, process. Sent and received are matched by hash.
-//! It does not tell when a beam was measured, nor what an adapter adds.
+//! How old is a telegram when a subscriber receives it? Measured from the last byte written into the pty, by the
+//! simulator's own stamp, to the sample in another process that sleeps in the client library, at 37.5 Hz from each of
+//! two sensors. The baseline is a bare chain with the same late read: pty, process, eventfd, process. Sent and received
+//! telegrams are matched by hash. The bench does not measure when a beam was measured, or what an adapter adds.
 
 mod support;
 
@@ -9,12 +9,10 @@ use std::collections::HashMap;
 use std::process::ExitCode;
 use std::time::Duration;
 
-use support::Outcome;
-use support::child::{Child, Line};
 use support::figures::{self, Figure, Target, percentile};
-use support::options::Options;
-use support::stage::{PATIENCE, SENSORS, Stage};
+use support::stage::{Child, Line, PATIENCE, SENSORS, Stage};
 use support::truth::Truth;
+use support::{Options, Outcome};
 
 fn main() -> ExitCode {
     support::main(measure)
@@ -26,23 +24,23 @@ fn measure(options: &Options) -> Outcome<()> {
     let count = options.count(800);
     // The first hub sets the sensors going; from then on they stream to whoever reads.
     through_hub(&stage, SETTLING)?;
-    let (mut hub, mut floor) = (Vec::new(), Vec::new());
+    let (mut hub, mut baseline) = (Vec::new(), Vec::new());
     for pair in 0..options.pairs() {
         if pair % 2 == 0 {
             hub.push(through_hub(&stage, count)?);
-            floor.push(through_floor(&stage, count)?);
+            baseline.push(through_baseline(&stage, count)?);
         } else {
-            floor.push(through_floor(&stage, count)?);
+            baseline.push(through_baseline(&stage, count)?);
             hub.push(through_hub(&stage, count)?);
         }
     }
     drop(simulator);
     let sent = sent(&stage)?;
     let series = |runs: &[Run]| -> Outcome<Vec<_>> { runs.iter().map(|run| run.latencies(&sent)).collect() };
-    let (hub, floor) = (series(&hub)?, series(&floor)?);
+    let (hub, baseline) = (series(&hub)?, series(&baseline)?);
     let figure = |name, of: fn(&Latencies) -> &[f64], part, target| {
         let at = |runs: &[Latencies]| runs.iter().filter_map(|run| percentile(of(run), part)).collect();
-        Figure { name, unit: "us", hub: at(&hub), floor: at(&floor), target }
+        Figure { name, unit: "us", hub: at(&hub), baseline: at(&baseline), target }
     };
     let sizes = |runs: &[Latencies]| runs.iter().map(|run| run.whole.len() as f64).collect();
     let figures = [
@@ -52,7 +50,13 @@ fn measure(options: &Options) -> Outcome<()> {
         figure("max", |run| &run.whole, 1.0, Target::None),
         figure("until read, p50", |run| &run.read, 0.5, Target::None),
         figure("until read, p99", |run| &run.read, 0.99, Target::None),
-        Figure { name: "telegrams", unit: "1", hub: sizes(&hub), floor: sizes(&floor), target: Target::None },
+        Figure {
+            name: "telegrams",
+            unit: "1",
+            hub: sizes(&hub),
+            baseline: sizes(&baseline),
+            target: Target::None,
+        },
     ];
     figures::print("latency", options.json, &figures);
     Ok(())
@@ -114,10 +118,10 @@ fn through_hub(stage: &Stage, count: usize) -> Outcome<Run> {
     Ok(run)
 }
 
-fn through_floor(stage: &Stage, count: usize) -> Outcome<Run> {
+fn through_baseline(stage: &Stage, count: usize) -> Outcome<Run> {
     let count = count + SETTLING;
-    let floor = stage.bare(&SENSORS, count)?;
-    let lines = floor.lines_until("end", patience(count))?;
+    let baseline = stage.bare(&SENSORS, count)?;
+    let lines = baseline.lines_until("end", patience(count))?;
     let of = |what: &str, sensor: usize| -> Vec<&Line> {
         let number = sensor.to_string();
         lines.iter().filter(|line| line.words().get(..2) == Some(&[what, &number])).collect()

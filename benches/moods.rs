@@ -1,7 +1,8 @@
-//! How long does it take to have a stream, whatever mood the sensor is in? Each of the four rates, idle, streaming or left
-//! in installation mode; a sensor that just got its power and answers quickly, beside a host that knows its rate and asks
-//! nothing; and a sensor whose power is cycled in the middle of a scan while another one streams. It does not tell how
-//! long a real sensor boots: that is up to a minute, and passes before its banner.
+//! How long does it take to have a stream, whatever state the sensor is in? Each of the four rates, with the sensor
+//! idle, streaming or left in installation mode; a sensor that was just powered on and replies quickly, compared with a
+//! host that knows its rate and sends no request for information; and a sensor whose power is cycled in the middle of a
+//! scan while another one streams. The bench does not measure how long a real sensor boots: that is up to a minute, and
+//! passes before its boot message.
 
 mod support;
 
@@ -10,12 +11,10 @@ use std::process::ExitCode;
 
 use lms::reply::Reply;
 use serde_json::Value;
-use support::Outcome;
-use support::child::Line;
 use support::figures::{self, Figure, Target};
-use support::options::Options;
-use support::stage::{PATIENCE, Stage};
+use support::stage::{Line, PATIENCE, Stage};
 use support::truth::{Truth, hash};
+use support::{Options, Outcome};
 
 fn main() -> ExitCode {
     support::main(measure)
@@ -26,7 +25,13 @@ fn measure(options: &Options) -> Outcome<()> {
     for (rate, state, name) in STARTS {
         let times = (0..options.pairs()).map(|_| start(rate, state)).collect::<Outcome<Vec<f64>>>()?;
         let most = if (rate, state) == ("500000", "streaming") { 500.0 } else { 5_000.0 };
-        figures.push(Figure { name, unit: "ms", hub: times, floor: Vec::new(), target: Target::Most(most) });
+        figures.push(Figure {
+            name,
+            unit: "ms",
+            hub: times,
+            baseline: Vec::new(),
+            target: Target::Most(most),
+        });
     }
     figures.extend(cold_starts(options.pairs())?);
     figures.push(stale(options.pairs())?);
@@ -64,8 +69,13 @@ fn cold_starts(count: usize) -> Outcome<[Figure; 2]> {
         let host = stage.part(&["host", "blindly", &stage.port("front"), "9600"])?;
         least.push((host.await_line("scan", PATIENCE)?.number(1)? - host.started_ns) as f64 / 1e6);
     }
-    let figure =
-        |name, hub, most| Figure { name, unit: "ms", hub, floor: least.clone(), target: Target::Most(most) };
+    let figure = |name, hub, most| Figure {
+        name,
+        unit: "ms",
+        hub,
+        baseline: least.clone(),
+        target: Target::Most(most),
+    };
     Ok([figure("power on, quick answers", first, 700.0), figure("the same, the next start", again, 700.0)])
 }
 
@@ -82,7 +92,7 @@ fn stale(count: usize) -> Outcome<Figure> {
         hub.push((adopted - process.started_ns) as f64 / 1e6);
     }
     let target = Target::Most(150.0);
-    Ok(Figure { name: "500000 Bd, streaming, adopted", unit: "ms", hub, floor: Vec::new(), target })
+    Ok(Figure { name: "500000 Bd, streaming, adopted", unit: "ms", hub, baseline: Vec::new(), target })
 }
 
 /// Cycles the power of one of two sensors: from its banner to its first telegram, and what the other one lost.
@@ -125,7 +135,7 @@ fn power_cycles(count: usize) -> Outcome<[Figure; 3]> {
         writes.push(eeprom.into_iter().flatten().sum::<u64>() as f64);
     }
     let figure =
-        |name, unit, hub, most| Figure { name, unit, hub, floor: Vec::new(), target: Target::Most(most) };
+        |name, unit, hub, most| Figure { name, unit, hub, baseline: Vec::new(), target: Target::Most(most) };
     Ok([
         figure("power cycle: banner to telegram", "ms", back, 5_000.0),
         figure("power cycle: lost of the other", "1", lost, 0.0),

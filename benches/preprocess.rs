@@ -1,11 +1,11 @@
-//! What the processors of the hub cost for one scan of 361 beams, with somebody who walks through the room of the
-//! paper's Fig. 8. Targets: zones, marks and background together 1 us with the method `paper`, 3 us with `multi`; 5 us
-//! with segments.
+//! What do the hub's processors cost for one scan of 361 beams, with a person who walks through the room of the paper's
+//! Fig. 8? Targets: zones, marks and background together 1 us with the method `paper`, 3 us with `multi`; 5 us with
+//! segments.
 
 #![allow(missing_docs)] // criterion's macros make public functions
 
-#[path = "support/seen.rs"]
-mod seen;
+#[path = "../tests/testkit/decoded_scan.rs"]
+mod decoded_scan;
 
 use std::hint::black_box;
 
@@ -30,7 +30,7 @@ fn scans(world: &str, count: u64) -> Vec<Box<Scan>> {
     let room = Room::new(&world.parse().expect("a world that the program brings along"), 1);
     let scan = |number| {
         let end_ns = number * Variant::HALF.turns() * MIRROR_TURN;
-        seen::scan(&room.scan(Variant::HALF, Unit::Mm, seen::MODE, end_ns), Unit::Mm)
+        decoded_scan::scan(&room.scan(Variant::HALF, Unit::Mm, decoded_scan::MODE, end_ns), Unit::Mm)
     };
     (1..=count).map(scan).collect()
 }

@@ -1,11 +1,10 @@
-//! What a scan costs the hub's thread from loan to wake-up, with 0 to 200 consumers: awake, asleep at the bell, asleep at the
-//! event. And what a datagram costs: packing and sealing, reading and checking. Publishing is told as processor time of the
-//! thread that publishes, with some 0.3 us for looking at that clock; what consumers do meanwhile is not in it.
+//! What does a scan cost the hub's thread from loan to wake-up, with 0 to 200 subscribers: awake, asleep on the
+//! doorbell, asleep on the event? And what does a datagram cost: packing and sealing, reading and checking? Publishing
+//! is measured as CPU time of the publishing thread, including some 0.3 us for reading that clock; what subscribers do
+//! in the meantime is not included.
 
 #![allow(missing_docs)] // criterion's macros make public functions
 
-#[path = "lan/source.rs"]
-mod source;
 #[path = "support/mod.rs"]
 mod support;
 
@@ -19,7 +18,7 @@ use rustix::time::{ClockId, clock_gettime};
 use schema::datagram::{Datagram, HEAD, Head, MTU_ETHERNET, Packed};
 use schema::ipc::{self, Bell, Node, Payload};
 use schema::{Foreground, Marks, Ring, Scan, Topic, Zones};
-use source::{SENSOR, Source};
+use support::source::{self, SENSOR, Source};
 use support::stage::{PATIENCE, Stage};
 use support::{Outcome, clock};
 

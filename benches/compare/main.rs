@@ -1,50 +1,44 @@
-//! What does a message from one process to N others cost by this hub's topics, and what by the mechanisms that a user
-//! would take instead? UDP multicast, Unix sockets, TCP and pipes beside topics with each of their waits, and under all of
-//! them the bare wake-ups. One run after the other, in turning order, so that what the machine does meets them all.
-//! It does not tell what a network or another machine adds.
+//! What does a message from one process to N others cost with this hub's topics, and with the mechanisms that users
+//! would take instead? UDP multicast, Unix sockets, TCP and pipes next to topics with each of their waits, and the bare
+//! wake-ups as baselines. The runs alternate, so that other load on the machine affects all of them. The bench does not
+//! measure what a network or another machine adds.
 
-mod datagrams;
-mod floors;
+mod baselines;
 mod message;
-mod receiver;
+mod process;
+mod report;
 mod run;
-mod schedule;
-mod sender;
-mod streams;
+mod sockets;
 #[path = "../support/mod.rs"]
 mod support;
-mod table;
-mod targets;
 mod topic;
-mod way;
 
 use std::fmt;
 use std::io::IsTerminal;
 use std::process::ExitCode;
 use std::thread::available_parallelism;
 
+use message::{PHASES, Way};
+use process::Task;
 use run::{Case, Measured};
-use sender::Task;
-use support::Outcome;
-use support::options::Options;
 use support::stage::Stage;
-use way::Way;
+use support::{Options, Outcome};
 
-/// One result of each pair, in the order in which they were taken.
+/// Results of a mechanism in one phase, one per run.
 pub(crate) struct Cell {
     pub(crate) case: Case,
-    /// Position in the schedule.
+    /// Index of the phase in the schedule.
     pub(crate) phase: usize,
     pub(crate) runs: Vec<Measured>,
 }
 
 impl Cell {
-    /// Messages come at a rate.
+    /// Returns whether messages are sent at a rate.
     fn is_paced(&self) -> bool {
-        schedule::PHASES[self.phase].period_ns > 0
+        PHASES[self.phase].period_ns > 0
     }
 
-    /// The same messages, receivers and rate.
+    /// Returns whether the messages, receivers and rate are the same.
     fn is_beside(&self, other: &Cell) -> bool {
         let place = |cell: &Cell| (cell.case.payload, cell.case.receivers, cell.phase);
         place(self) == place(other)
@@ -54,7 +48,7 @@ impl Cell {
 impl fmt::Display for Cell {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let Case { way, payload, receivers } = self.case;
-        write!(f, "{}, {payload} B to {receivers}, {}", way.name(), schedule::PHASES[self.phase].name)
+        write!(f, "{}, {payload} B to {receivers}, {}", way.name(), PHASES[self.phase].name)
     }
 }
 
@@ -62,7 +56,7 @@ fn main() -> ExitCode {
     support::main_with(play, measure)
 }
 
-/// A process of a run.
+/// Plays a process of a run.
 fn play(words: &[&str]) -> Outcome<()> {
     let [part, way, payload, receivers, domain, place, ref rest @ ..] = *words else {
         return Err(format!("no part {words:?}").into());
@@ -70,8 +64,8 @@ fn play(words: &[&str]) -> Outcome<()> {
     let way = Way::named(way)?;
     let task = Task { way, payload: payload.parse()?, receivers: receivers.parse()?, domain, place };
     match (part, rest) {
-        ("send", []) => sender::play(&task),
-        ("receive", [number, address]) => receiver::play(&task, number.parse()?, address),
+        ("send", []) => process::send_all(&task),
+        ("receive", [number, address]) => process::receive_all(&task, number.parse()?, address),
         _ => Err(format!("no part {words:?}").into()),
     }
 }
@@ -90,15 +84,13 @@ fn measure(options: &Options) -> Outcome<()> {
         }
     }
     drop(stage);
-    table::print(options, processors, pairs, &cells);
-    targets::print(options, &cells);
-    match &options.draw {
-        Some(directory) => Ok(table::draw(directory, &cells)?),
-        None => Ok(()),
-    }
+    report::print_tables(options, processors, pairs, &cells);
+    report::print_targets(options, &cells);
+    Ok(())
 }
 
-/// All mechanisms with the same messages and the same number of receivers, `pairs` times, each time another one first.
+/// Runs all mechanisms with the same messages and the same number of receivers, `pairs` times, each time starting with
+/// another one.
 fn compare(
     stage: &Stage,
     payload: usize,
@@ -110,8 +102,8 @@ fn compare(
     let mut cases: Vec<_> = ways.map(|way| Case { way, payload, receivers }).collect();
     let mut cells: Vec<Cell> = Vec::new();
     for case in &cases {
-        let phases = 1..schedule::PHASES.len();
-        let phases = phases.filter(|phase| schedule::PHASES[*phase].count(case.way) > 0);
+        let phases = 1..PHASES.len();
+        let phases = phases.filter(|phase| PHASES[*phase].count(case.way) > 0);
         cells.extend(phases.map(|phase| Cell { case: *case, phase, runs: Vec::new() }));
     }
     for _ in 0..pairs {
@@ -127,14 +119,14 @@ fn compare(
     Ok(cells)
 }
 
-/// Says how far it is to who watches.
+/// Prints the progress on a terminal.
 fn tell(progress: &str) {
     if std::io::stderr().is_terminal() {
         eprintln!("{progress}");
     }
 }
 
-/// A telegram of 361 values.
+/// Length of a telegram of 361 beams.
 const TELEGRAM: usize = 732;
 const MEBIBYTE: usize = 1 << 20;
 const PAYLOADS: [usize; 4] = [TELEGRAM, message::SCAN, 1 << 16, MEBIBYTE];

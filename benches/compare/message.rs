@@ -1,4 +1,5 @@
-//! What is sent by every mechanism: bytes with a number at both ends. Refuses to know how they travel.
+//! What is compared: the mechanisms, the messages that each of them carries, and the phases in which they are sent.
+//! Sender and receivers know all of these.
 
 use std::hint::black_box;
 
@@ -6,14 +7,112 @@ use schema::{Contents, Scan};
 
 use crate::support::Outcome;
 
-/// What a message says of itself.
+/// A mechanism that carries messages from one process to others, and what the receivers wait for.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Way {
+    /// A topic of the hub; receivers sleep on its doorbell.
+    Doorbell,
+    /// A topic; receivers sleep on its event.
+    Event,
+    /// A topic; receivers poll its doorbell without pause.
+    Spin,
+    /// The scan topic itself, received with the client library as programs do.
+    Subscription,
+    /// Datagrams to a UDP multicast group on the loopback.
+    Multicast,
+    /// A Unix datagram socket for each receiver.
+    UnixDatagram,
+    /// A Unix stream socket for each.
+    UnixStream,
+    /// A TCP connection on the loopback for each.
+    Tcp,
+    /// A pipe for each.
+    Pipe,
+    /// Only a wake-up by futex.
+    FutexBaseline,
+    /// Only a wake-up by eventfd.
+    EventfdBaseline,
+    /// Only a cache line that another processor changes.
+    SpinBaseline,
+}
+
+impl Way {
+    /// All mechanisms in the order of the tables.
+    pub(crate) const ALL: [Way; 12] = [
+        Way::Doorbell,
+        Way::Event,
+        Way::Spin,
+        Way::Subscription,
+        Way::Multicast,
+        Way::UnixDatagram,
+        Way::UnixStream,
+        Way::Tcp,
+        Way::Pipe,
+        Way::FutexBaseline,
+        Way::EventfdBaseline,
+        Way::SpinBaseline,
+    ];
+
+    /// Returns the name in tables and on command lines.
+    pub(crate) fn name(self) -> &'static str {
+        match self {
+            Way::Doorbell => "topic, doorbell",
+            Way::Event => "topic, event",
+            Way::Spin => "topic, spinning",
+            Way::Subscription => "topic, Subscription::next",
+            Way::Multicast => "UDP multicast",
+            Way::UnixDatagram => "Unix datagrams",
+            Way::UnixStream => "Unix streams",
+            Way::Tcp => "TCP",
+            Way::Pipe => "pipes",
+            Way::FutexBaseline => "baseline: futex",
+            Way::EventfdBaseline => "baseline: eventfd",
+            Way::SpinBaseline => "baseline: cache line",
+        }
+    }
+
+    /// Returns the mechanism of this name.
+    pub(crate) fn named(name: &str) -> Outcome<Way> {
+        Ok(Way::ALL.into_iter().find(|way| way.name() == name).ok_or_else(|| format!("no way {name}"))?)
+    }
+
+    /// Returns whether users would take this mechanism instead of topics.
+    pub(crate) fn is_alternative(self) -> bool {
+        matches!(self, Way::Multicast | Way::UnixDatagram | Way::UnixStream | Way::Tcp | Way::Pipe)
+    }
+
+    /// Returns whether this is a baseline, which wakes and carries no data.
+    pub(crate) fn is_baseline(self) -> bool {
+        matches!(self, Way::FutexBaseline | Way::EventfdBaseline | Way::SpinBaseline)
+    }
+
+    /// Returns whether the sender never waits for its receivers, so that slow ones miss messages.
+    pub(crate) fn loses(self) -> bool {
+        !self.is_baseline() && !matches!(self, Way::UnixDatagram | Way::UnixStream | Way::Tcp | Way::Pipe)
+    }
+
+    /// Returns whether the mechanism is run with this number of receivers and messages of this size. A receiver that
+    /// spins needs its own processor, and so does the sender. A baseline is between two processes. The client library
+    /// is compared only with the messages that it is used for.
+    pub(crate) fn runs(self, receivers: usize, payload: usize, processors: usize) -> bool {
+        match self {
+            Way::Spin => receivers < processors,
+            Way::SpinBaseline => receivers == 1 && processors > 1,
+            Way::FutexBaseline | Way::EventfdBaseline => receivers == 1,
+            Way::Subscription => receivers == 1 && payload == SCAN,
+            _ => true,
+        }
+    }
+}
+
+/// Identification of a message, at both of its ends.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct Label {
-    /// Position of its phase in the schedule.
+    /// Index of its phase in [`PHASES`].
     pub(crate) phase: usize,
     /// Number in its phase, from 0.
     pub(crate) number: u64,
-    /// It only says that the phase is over.
+    /// Whether it only reports that the phase is over.
     pub(crate) is_end: bool,
 }
 
@@ -28,8 +127,8 @@ impl Label {
         bytes[tail..].copy_from_slice(&number);
     }
 
-    /// What the message in `bytes` says, once all of it has been looked at: a byte of each cache line. An error if its
-    /// ends are of different messages.
+    /// Reads a byte of each cache line of a message, and returns its label. Fails if its ends belong to different
+    /// messages.
     pub(crate) fn read(bytes: &[u8]) -> Outcome<Label> {
         black_box(bytes.iter().step_by(CACHE_LINE).fold(0u64, |sum, byte| sum + u64::from(*byte)));
         let [number, kind] = [&bytes[..NUMBER], &bytes[NUMBER..HEAD]].map(word);
@@ -44,30 +143,30 @@ fn word(bytes: &[u8]) -> u64 {
     bytes.iter().rev().fold(0, |word, byte| word << 8 | u64::from(*byte))
 }
 
-/// A message in the sender's own memory, written anew each time: what is sent was just computed.
+/// A message in the sender's own memory. It is written again for each send, because real data was just computed.
 pub(crate) struct Draft {
     contents: Vec<u8>,
     bytes: Vec<u8>,
 }
 
 impl Draft {
-    /// Of messages of `len` bytes.
+    /// Creates messages of `len` bytes.
     pub(crate) fn new(len: usize) -> Draft {
         Draft { contents: contents(len), bytes: contents(len) }
     }
 
-    /// What was written.
+    /// Returns the message.
     pub(crate) fn bytes(&self) -> &[u8] {
         &self.bytes
     }
 
-    /// Writes a whole message.
+    /// Writes a complete message.
     pub(crate) fn write(&mut self, label: Label) {
         self.bytes.copy_from_slice(&self.contents);
         label.write(&mut self.bytes);
     }
 
-    /// Writes one that is no longer than it must be.
+    /// Writes a message of the minimum length.
     pub(crate) fn write_short(&mut self, label: Label) -> &[u8] {
         let bytes = &mut self.bytes[..SHORT];
         label.write(bytes);
@@ -75,17 +174,51 @@ impl Draft {
     }
 }
 
-/// What a message of `len` bytes says between its ends.
+/// Returns the bytes of a message of `len` bytes between its ends.
 pub(crate) fn contents(len: usize) -> Vec<u8> {
     (0..len).map(|i| i as u8).collect()
 }
 
-/// Beams of the hub's own messages: 180 degrees in halves.
+/// Beams of the hub's own messages: 180 degrees at 0.5 degrees.
 pub(crate) const BEAMS: usize = 361;
-/// Length of a scan of so many.
+/// Length of a scan of [`BEAMS`] beams.
 pub(crate) const SCAN: usize = Scan::len(BEAMS, Contents::UPPER);
 /// Length of the shortest message.
 pub(crate) const SHORT: usize = HEAD + NUMBER;
 const NUMBER: usize = size_of::<u64>();
 const HEAD: usize = 2 * NUMBER;
 const CACHE_LINE: usize = 64;
+
+/// Messages at one rate.
+pub(crate) struct Phase {
+    /// Name in tables.
+    pub(crate) name: &'static str,
+    /// Time from one message to the next, in ns; 0 for no pause.
+    pub(crate) period_ns: u64,
+    /// Maximum number of messages.
+    count: usize,
+    /// Time after which the phase ends in any case, in ns: some mechanisms cannot keep the rate.
+    most_ns: u64,
+}
+
+impl Phase {
+    /// Returns the number of messages of `way`. Baselines are always paced: a wake-up that no receiver waits for is not
+    /// one.
+    pub(crate) fn count(&self, way: Way) -> usize {
+        if way.is_baseline() && self.period_ns == 0 { 0 } else { self.count }
+    }
+
+    /// Returns when the phase ends in any case, in ns from its start. Receivers of a baseline detect the end by the
+    /// count alone.
+    pub(crate) fn most_ns(&self, way: Way) -> u64 {
+        if way.is_baseline() { u64::MAX } else { self.most_ns }
+    }
+}
+
+/// The phases in their order. The first one fills memory and caches, and does not count.
+pub(crate) const PHASES: [Phase; 4] = [
+    Phase { name: "warm-up", period_ns: 1_000_000, count: 20, most_ns: 40_000_000 },
+    Phase { name: "37.5 Hz", period_ns: 26_666_667, count: 28, most_ns: 900_000_000 },
+    Phase { name: "1 kHz", period_ns: 1_000_000, count: 400, most_ns: 500_000_000 },
+    Phase { name: "flat out", period_ns: 0, count: 2000, most_ns: 300_000_000 },
+];

@@ -1,17 +1,15 @@
 //! One mechanism with one number of receivers and one length of messages: starts the processes, leads them through all
-//! phases, and makes figures of what they say. Refuses to know what the figures are compared with.
+//! phases, and computes figures from what they print.
 
 use std::os::unix::net::UnixDatagram;
 
-use super::schedule::PHASES;
-use super::sender::control;
-use super::way::Way;
+use super::message::{PHASES, Way};
+use super::process::control;
 use crate::support::Outcome;
-use crate::support::child::{Child, Line};
 use crate::support::figures::percentile;
-use crate::support::stage::{PATIENCE, Stage};
+use crate::support::stage::{Child, Line, PATIENCE, Stage};
 
-/// A mechanism among so many processes.
+/// A mechanism with a number of receivers and a length of messages.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct Case {
     pub(crate) way: Way,
@@ -20,29 +18,29 @@ pub(crate) struct Case {
     pub(crate) receivers: usize,
 }
 
-/// What one phase of it took.
+/// Figures of one phase.
 #[derive(Clone, Debug)]
 pub(crate) struct Measured {
-    /// From just before the send until it is in hand, of all receivers: p50, p99, p99.9, in us.
+    /// Time from just before the send until the message is received, of all receivers: p50, p99, p99.9, in us.
     pub(crate) latency: [Option<f64>; 3],
-    /// The same of the last receiver of each message that all of them got.
+    /// The same for the last receiver of each message that all of them received.
     pub(crate) last: [Option<f64>; 3],
-    /// Processor time of the sender for a message, with its writing and the wait until it is due, in us.
+    /// CPU time of the sender per message, including writing it and waiting until it is due, in us.
     pub(crate) sender_us: f64,
-    /// What of it is sending alone, in us; only looked at where messages are paced.
+    /// The part of it that is sending, in us; only measured where messages are paced.
     pub(crate) sending_us: Option<f64>,
-    /// Processor time of a receiver for a message, in us; nothing if none came.
+    /// CPU time of a receiver per message, in us; `None` if no message arrived.
     pub(crate) receiver_us: Option<f64>,
-    /// Messages that a receiver got, a second.
+    /// Messages per second that a receiver received.
     pub(crate) rate_hz: f64,
     /// Messages that were not received, in %.
     pub(crate) missed_percent: f64,
-    /// Messages that were sent, in % of those that the rate asks for; nothing if there is no rate.
+    /// Messages that were sent, in % of those that the rate requires; `None` without a rate.
     pub(crate) kept_percent: Option<f64>,
 }
 
 impl Case {
-    /// Runs it; one result for each phase that it has, with the phase's position.
+    /// Runs it, and returns one result for each phase that it has, with the index of the phase.
     pub(crate) fn measure(&self, stage: &Stage) -> Outcome<Vec<(usize, Measured)>> {
         let place = stage.port("compare");
         let [payload, receivers] = [self.payload, self.receivers].map(|number| number.to_string());
@@ -64,10 +62,10 @@ impl Case {
         let mut measured = Vec::new();
         for (number, phase) in PHASES.iter().enumerate() {
             tell.send(GO)?;
-            let mut sent = Account::of(&sender, "sent")?;
+            let mut sent = Report::of(&sender, "sent")?;
             let sending_ns = sent.numbers.remove(0);
             let took =
-                receivers.iter().map(|child| Account::of(child, "took")).collect::<Outcome<Vec<_>>>()?;
+                receivers.iter().map(|child| Report::of(child, "took")).collect::<Outcome<Vec<_>>>()?;
             if number > 0 && phase.count(self.way) > 0 {
                 let mut figures = figures(&sent, &took)?;
                 if phase.period_ns > 0 {
@@ -87,23 +85,23 @@ impl Case {
     }
 }
 
-/// What a process says of a phase.
-struct Account {
+/// What a process reports of a phase.
+struct Report {
     busy_ns: u64,
-    /// Time spent in sending and times of the sender; number and time of a receiver in turn.
+    /// Time spent sending and times of the sender; number and time of each message, alternating, of a receiver.
     numbers: Vec<u64>,
 }
 
-impl Account {
-    fn of(child: &Child, word: &str) -> Outcome<Account> {
+impl Report {
+    fn of(child: &Child, word: &str) -> Outcome<Report> {
         let Line { text, .. } = child.await_line(word, PATIENCE)?;
         let mut numbers = text.split_whitespace().skip(1).map(str::parse);
         let busy_ns = numbers.next().ok_or("no account")??;
-        Ok(Account { busy_ns, numbers: numbers.collect::<Result<_, _>>()? })
+        Ok(Report { busy_ns, numbers: numbers.collect::<Result<_, _>>()? })
     }
 }
 
-fn figures(sent: &Account, took: &[Account]) -> Outcome<Measured> {
+fn figures(sent: &Report, took: &[Report]) -> Outcome<Measured> {
     let mut all = Vec::new();
     let mut last = vec![(0usize, 0u64); sent.numbers.len()];
     let mut end_ns = 0;
@@ -134,7 +132,7 @@ fn figures(sent: &Account, took: &[Account]) -> Outcome<Measured> {
     })
 }
 
-/// p50, p99 and p99.9 of times in ns, in us.
+/// Returns p50, p99 and p99.9 of times in ns, in us.
 fn percentiles(times: Vec<u64>) -> [Option<f64>; 3] {
     let mut sorted: Vec<f64> = times.iter().map(|time| *time as f64 / 1e3).collect();
     sorted.sort_by(f64::total_cmp);

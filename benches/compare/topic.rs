@@ -1,5 +1,6 @@
-//! Topics: a service with the settings of the hub's own, for messages of any length, and the hub's own topic of scans for
-//! comparison. Published as the hub does: loaned, written in place, sent, then all are woken once.
+//! Topics: a service with the settings of the hub's own for messages of any length, and the hub's own topic of scans
+//! for comparison. They are published as the hub does it: loaned, written in place, sent, and then all subscribers are
+//! woken once.
 
 use iceoryx2::prelude::ServiceName;
 use scanhub_client::Subscription;
@@ -9,13 +10,11 @@ use schema::ipc::{
 use schema::limits::TopicLimits;
 use schema::{Domain, Environment, Header, HubLock, Ring, Scan, ScanHead, Topic, Wake, limits};
 
-use super::message::{BEAMS, Label, SCAN, SHORT, contents};
-use super::receiver::Inlet;
-use super::sender::{Outlet, Task};
-use super::way::Way;
+use super::message::{BEAMS, Label, SCAN, SHORT, Way, contents};
+use super::process::{Inlet, Outlet, Task};
 use crate::support::{Outcome, clock, consumer};
 
-/// The membership of a process that publishes.
+/// Membership of a publishing process.
 struct Hub {
     waker: Waker,
     node: Node,
@@ -30,7 +29,7 @@ impl Hub {
         Ok(Hub { waker: Waker::new(&node, SENSOR)?, node, _lock: lock })
     }
 
-    /// Sends what was written, and wakes all.
+    /// Sends the written sample, and wakes all subscribers.
     fn send<P: Payload + ?Sized>(&self, written: Option<SampleMut<P>>) -> Outcome<()> {
         let sample = written.ok_or("nothing was written")?;
         sample.send().map_err(|error| format!("not sent: {error:?}"))?;
@@ -101,18 +100,18 @@ impl Outlet for Bytes {
     }
 }
 
-/// A subscriber of it.
+/// A subscriber to the topic of bytes.
 pub(crate) struct BytesInlet {
     subscriber: Subscriber<[u8]>,
     wait: Wait,
     _node: Node,
 }
 
-/// What it waits at, as the client library does.
+/// What a subscriber waits for, as in the client library.
 enum Wait {
-    /// How often the bell was rung when samples were last looked for; whether it sleeps.
+    /// The doorbell, its count when samples were last received, and whether the subscriber sleeps.
     Bell(Bell, u32, bool),
-    /// Whether wake-ups were taken since it slept.
+    /// The event, and whether wake-ups were taken since the last sleep.
     Event(Box<Listener>, bool),
 }
 
@@ -148,7 +147,8 @@ impl Inlet for BytesInlet {
 }
 
 impl Wait {
-    /// Sleeps or looks until there may be something; returns at once if there may be since samples were looked for.
+    /// Sleeps or spins until there may be a sample; returns at once if one may have arrived since samples were last
+    /// received.
     fn wait(&mut self) -> Outcome<()> {
         match self {
             Wait::Bell(bell, rung, sleeps) => {
@@ -215,13 +215,13 @@ impl Outlet for Scans {
     }
 }
 
-/// The client library at it.
+/// A subscriber to scans that uses the client library.
 pub(crate) struct ScansInlet(Subscription<Scan>);
 
 impl ScansInlet {
     pub(crate) fn new(task: &Task) -> Outcome<ScansInlet> {
         let mut scans = consumer::subscribe::<Scan>(task.domain, SENSOR)?;
-        // Joins the domain; nothing is sent yet.
+        // Joins the domain; no message has been sent yet.
         scans.try_next()?;
         Ok(ScansInlet(scans))
     }
@@ -239,7 +239,7 @@ impl Inlet for ScansInlet {
     }
 }
 
-/// The sensor whose consumers are woken.
+/// The sensor whose subscribers are woken.
 pub(crate) const SENSOR: &str = "front";
 const SERVICE: &str = "compare";
 const LONG: std::time::Duration = std::time::Duration::from_secs(10);

@@ -1,38 +1,42 @@
-//! Consumers, each a process that follows both sensors with a thread for each: of raw bytes, of datagrams, of the hub's
-//! scans, of its results. Every few scans they say how many they have had, so that a load is never that of consumers who
-//! fell behind.
+//! Programs that use the data of both sensors, each a process with a thread per sensor: of raw bytes, of datagrams, of
+//! the hub's scans, and of the hub's results. They regularly report how many scans they have received, which shows
+//! whether one of them falls behind.
 
 use std::hint::black_box;
 use std::path::Path;
 use std::thread;
 
+use daemon::scanner;
+use lms::measured::Measured;
 use lms::telegram::Telegram;
-use lms::variant::Unit;
+use lms::variant::{Mode, Unit};
+use preprocess::{background, marks, segments, zones};
 use rustix::fs::{OFlags, fcntl_setfl};
-use schema::{Foreground, Scan, Zones};
+use schema::limits::TopicLimits;
+use schema::{Foreground, Marks, Pose, Scan, Zones};
 
+use crate::datagrams;
 use crate::line::account::Parser;
-use crate::rivals::Discarding;
+use crate::line::parsers::Discarding;
+use crate::support::baseline::Line;
 use crate::support::consumer::subscribe;
-use crate::support::line::Line;
 use crate::support::stage::SENSORS;
 use crate::support::{Outcome, clock};
-use crate::unit;
-use crate::work::Work;
 
-/// Reads two serial lines, at most `most` bytes at once, by the plainest of programs: a thread for each line sleeps in
-/// `read`, so that there is no call beside that one, and finds telegrams with six states. One byte is what programs for
-/// a UART of 16 bytes do; more than 16 are never there.
+/// Reads two serial lines, at most `most` bytes at once, like the simplest of programs: a thread per line blocks in
+/// `read`, so there is no other system call, and finds telegrams with a state machine of six states. One byte at a time
+/// is how programs read a UART with 16 bytes; more than 16 are never available.
 pub(crate) fn bytes(ports: [&str; 2], most: usize) -> Outcome<()> {
     for_both(|number, progress| {
         let line = Line::open(Path::new(ports[number]), RATE)?;
         fcntl_setfl(&line, OFlags::RDWR)?;
         let header = lms::measured::encode(0, Unit::Mm, &[0; BEAMS], 0x10).bytes()[..7].try_into()?;
-        let (mut parser, mut work, mut bytes) = (Discarding::new(header), Work::new(), vec![0; most]);
+        let (mut parser, mut processors, mut bytes) =
+            (Discarding::new(header), Processors::new(), vec![0; most]);
         loop {
             let len = line.read(&mut bytes)?;
             parser.read(&bytes[..len], &mut |accepted| {
-                if Telegram::check(accepted.bytes).is_some_and(|telegram| work.take(telegram)) {
+                if Telegram::check(accepted.bytes).is_some_and(|telegram| processors.take(telegram)) {
                     progress.note();
                 }
             });
@@ -40,21 +44,21 @@ pub(crate) fn bytes(ports: [&str; 2], most: usize) -> Outcome<()> {
     })
 }
 
-/// Receives the bare telegrams of a unit at `port` for the first sensor, and the next one for the second.
+/// Receives bare telegrams at `port` for the first sensor, and at the next one for the second.
 pub(crate) fn datagrams(port: u16) -> Outcome<()> {
     for_both(|number, progress| {
-        let (ear, mut work) = (unit::ear(port + number as u16)?, Work::new());
+        let (socket, mut processors) = (datagrams::receiver(port + number as u16)?, Processors::new());
         let mut datagram = [0; 2048];
         loop {
-            let len = ear.recv(&mut datagram)?;
-            if Telegram::check(&datagram[..len]).is_some_and(|telegram| work.take(telegram)) {
+            let len = socket.recv(&mut datagram)?;
+            if Telegram::check(&datagram[..len]).is_some_and(|telegram| processors.take(telegram)) {
                 progress.note();
             }
         }
     })
 }
 
-/// Follows the hub's scans and looks at every range.
+/// Receives the hub's scans and reads every range.
 pub(crate) fn scans(domain: &str) -> Outcome<()> {
     for_both(|number, progress| {
         let mut scans = subscribe::<Scan>(domain, SENSORS[number])?;
@@ -66,7 +70,7 @@ pub(crate) fn scans(domain: &str) -> Outcome<()> {
     })
 }
 
-/// Follows the hub's verdicts and what stands before the background, and looks at both.
+/// Receives the hub's zones and foreground, and reads both.
 pub(crate) fn results(domain: &str) -> Outcome<()> {
     for_both(|number, progress| {
         let mut foreground = subscribe::<Foreground>(domain, SENSORS[number])?;
@@ -74,7 +78,7 @@ pub(crate) fn results(domain: &str) -> Outcome<()> {
         loop {
             let Some(foreground) = foreground.next()? else { continue };
             black_box((foreground.beams, foreground.segments().len()));
-            // Those of the same scan, and what was said of silences before.
+            // Takes the zones of the same scan, and those that reported a silence before it.
             while let Some(zones) = zones.try_next()? {
                 black_box((zones.verdict(), zones.nearest()));
                 if zones.header().seq >= foreground.header().seq {
@@ -102,25 +106,69 @@ fn for_both(follow: impl Fn(usize, &mut Progress) -> Outcome<()> + Sync) -> Outc
     Ok(())
 }
 
-/// How many scans of a sensor a consumer has had.
+/// Number of scans of a sensor that a subscriber has received.
 struct Progress {
     sensor: &'static str,
     count: u64,
 }
 
 impl Progress {
-    /// One more. Now and then says so: `had SENSOR COUNT NS`.
+    /// Counts a scan, and prints the number now and then: `had SENSOR COUNT NS`.
     fn note(&mut self) {
         self.count += 1;
-        if self.count.is_multiple_of(SAID_EVERY) {
+        if self.count.is_multiple_of(REPORT_INTERVAL) {
             println!("had {} {} {}", self.sensor, self.count, clock::now());
         }
     }
 }
 
-/// Beams of a scan of 180 degrees in halves.
+/// Beams of a scan.
 const BEAMS: usize = 361;
-/// The simulated sensors stream at this rate.
+/// Baud rate of the simulated sensors.
 const RATE: u32 = 500_000;
-/// Somewhat less than a second.
-const SAID_EVERY: u64 = 32;
+/// Scans between two reports, somewhat less than a second.
+const REPORT_INTERVAL: u64 = 32;
+
+/// Everything that is computed from the scans of one sensor, with the same code and settings as in the hub: decoding,
+/// zones, marks, background, and foreground with its segments.
+struct Processors {
+    zones: zones::Check,
+    marks: marks::MarkDetector,
+    model: background::Model,
+    cutter: segments::Segmenter,
+    scan: Box<Scan>,
+    near: Zones,
+    found: Marks,
+    foreground: Box<Foreground>,
+}
+
+impl Processors {
+    fn new() -> Box<Processors> {
+        let TopicLimits { beams, contents, .. } = TopicLimits::default();
+        Box::new(Processors {
+            zones: zones::Check::new(Pose::default(), &zones::Settings::default(), beams),
+            marks: marks::MarkDetector::new(marks::Settings::default()),
+            model: background::Model::new(background::Settings::default(), beams),
+            cutter: segments::Segmenter::new(Pose::default(), beams),
+            scan: Scan::zeroed(Scan::len(beams, contents)),
+            near: Zones::default(),
+            found: Marks::default(),
+            foreground: Foreground::of(beams),
+        })
+    }
+
+    /// Processes `telegram`, and returns whether it was a scan.
+    fn take(&mut self, telegram: Telegram<'_>) -> bool {
+        let Some(measured) = Measured::decode(telegram) else { return false };
+        scanner::decode(&measured, MODE, &mut self.scan);
+        self.zones.update(&self.scan, &mut self.near);
+        self.marks.update(&self.scan, &mut self.found);
+        self.model.update(&self.scan, &mut self.foreground);
+        self.cutter.update(&self.scan, &mut self.foreground);
+        black_box((self.near.verdict(), self.found.marks().len(), self.foreground.segments().len()));
+        true
+    }
+}
+
+/// Measuring mode of the sensors here, the factory setting.
+pub(crate) const MODE: Mode = Mode(1);

@@ -1,47 +1,44 @@
-//! What do consumers of two sensors cost their machine (the paper's Fig. 7), if
+//! What do programs that use two sensors cost their machine (the paper's Fig. 7), if
+//!
 //! a. each reads the raw bytes, one by one, from two lines of its own, and does everything itself,
-//! b. does the same, but reads what is there in one go,
-//! c. gets bare telegrams by multicast, as from the paper's unit, and does the rest itself,
-//! d. takes the scans of the hub,
-//! e. takes the zones and the foreground of the hub?
+//! b. does the same, but reads all bytes that have arrived,
+//! c. receives bare telegrams by multicast, as from the paper's unit, and does the rest itself,
+//! d. receives the scans of the hub,
+//! e. receives the zones and the foreground of the hub?
 //!
-//! Consumers are processes, and all of them get 37.5 scans a second of each sensor; a table says whether they did. What
-//! stands for hardware (simulators; in c the unit) is left out: its own time is taken from the machine's.
+//! Each program is a process, and each receives 37.5 scans per second of each sensor; a table shows whether it did.
+//! Processes that stand for hardware (simulators, and in c the unit) are not counted: their time is subtracted from
+//! that of the machine.
 //!
-//! Two accounts of each run. `/proc/stat` is the paper's: the whole machine, interrupts with the system, and whatever
-//! else runs there. Where the kernel counts by ticks (CONFIG_TICK_CPU_ACCOUNTING) it charges one of 1 to 10 ms to
-//! whoever runs when it falls, and most of those here run for less than 0.1 ms at once. How far that is off is measured,
-//! in the table "/proc/stat, of what the scheduler counted": exact would be 100 %, and it is more if others
-//! ended meanwhile, who are then missing in the scheduler's count. The account of the processes is the scheduler's, in nanoseconds
-//! (schedstat); only its division in user and system is by ticks, of a process's whole life. Targets are of that one. It
-//! has no part of what threads of the kernel do for a pty, which is more where more ptys are: a table has these.
+//! There are two counts for each run. `/proc/stat` is the paper's: the whole machine, with interrupts as system time,
+//! and whatever else runs there. Where the kernel counts by ticks (CONFIG_TICK_CPU_ACCOUNTING), it charges a tick of 1
+//! to 10 ms to the thread that runs when it falls, and most threads here run for less than 0.1 ms at a time. The table
+//! "/proc/stat, as a share of the scheduler's count" measures the error: 100 % would be exact. It is more if other
+//! processes ended during the run, because the scheduler's count then lacks them.
 //!
-//! It does not tell what a real UART costs: a pty has no interrupts.
+//! The count of the processes is the scheduler's, in nanoseconds (schedstat); only its division into user and system
+//! time is by ticks, over the whole run time of a process. The targets refer to this count. It does not include what
+//! threads of the kernel do for a pty, which is more where there are more ptys: another table shows these.
+//!
+//! The bench does not measure what a real UART costs: a pty has no interrupts. It needs an otherwise idle machine.
 
-mod account;
 mod consumer;
+mod cpu_time;
+mod datagrams;
 #[path = "../../hub/lms/tests/line/mod.rs"]
-#[allow(dead_code)] // Of the comparison of parsers only what a parser is.
+#[allow(dead_code)] // Only the simplest parser is used.
 mod line;
-mod load;
-#[path = "../framing/rivals.rs"]
-#[allow(dead_code)] // The plainest one.
-mod rivals;
-mod setup;
+mod set_up;
 #[path = "../support/mod.rs"]
 mod support;
-mod tables;
-mod unit;
-mod work;
 
 use std::io::IsTerminal;
 use std::process::ExitCode;
 use std::time::Duration;
 
-use setup::{SetUp, WORD};
-use support::Outcome;
-use support::options::Options;
-use tables::{Run, Tables};
+use set_up::{Host, Load, SetUp, WORD};
+use support::figures::{self, Cell, Figure, Target};
+use support::{Options, Outcome};
 
 fn main() -> ExitCode {
     support::main_with(play, measure)
@@ -53,7 +50,7 @@ fn play(words: &[&str]) -> Outcome<()> {
         [WORD, "datagrams", port] => consumer::datagrams(port.parse()?),
         [WORD, "scans", domain] => consumer::scans(domain),
         [WORD, "results", domain] => consumer::results(domain),
-        [WORD, "unit", port] => unit::send(port.parse()?),
+        [WORD, "unit", port] => datagrams::send(port.parse()?),
         _ => support::play(words),
     }
 }
@@ -69,14 +66,14 @@ fn measure(options: &Options) -> Outcome<()> {
     let span = Duration::from_secs(seconds);
     let mut runs = Vec::new();
     for pair in 0..pairs {
-        // What the unit takes whom nobody hears.
+        // The CPU time of the sender without receivers.
         let deaf = SetUp::Datagrams.start(0)?.watch(span)?.outside;
         for (turn, &count) in counts.iter().enumerate() {
             let mut set_ups = SetUp::ALL;
             set_ups.rotate_left((pair + turn) % SetUp::ALL.len());
             for set_up in set_ups {
                 if std::io::stderr().is_terminal() {
-                    eprintln!("{} of {pairs}: {count} consumers, {}", pair + 1, set_up.name());
+                    eprintln!("{} of {pairs}: {count} subscribers, {}", pair + 1, set_up.name());
                 }
                 let load = set_up.start(count)?.watch(span)?;
                 runs.push(Run {
@@ -88,5 +85,133 @@ fn measure(options: &Options) -> Outcome<()> {
             }
         }
     }
-    Tables::of(&runs, counts)?.print(options)
+    Tables::of(&runs, counts)?.print(options);
+    Ok(())
 }
+
+/// One run of a set-up.
+struct Run {
+    set_up: SetUp,
+    count: usize,
+    host: Host,
+    load: Load,
+}
+
+/// All runs.
+struct Tables<'a> {
+    runs: &'a [Run],
+    counts: &'a [usize],
+    processors: usize,
+}
+
+/// One table.
+struct Table {
+    name: &'static str,
+    unit: &'static str,
+    rows: &'static [SetUp],
+    value: Value,
+}
+
+/// Value of a run that a table shows.
+type Value = fn(&Run) -> f64;
+
+impl<'a> Tables<'a> {
+    /// Creates the tables of runs with these numbers of subscribers.
+    fn of(runs: &'a [Run], counts: &'a [usize]) -> Outcome<Tables<'a>> {
+        Ok(Tables { runs, counts, processors: cpu_time::processors()? })
+    }
+
+    /// Prints the tables.
+    fn print(&self, options: &Options) {
+        figures::print_cells(BENCH, options.json, &self.cells());
+        figures::print(BENCH, options.json, &self.figures());
+    }
+
+    fn cells(&self) -> Vec<Cell> {
+        let mut cells = Vec::new();
+        for Table { name, unit, rows, value } in TABLES {
+            self.table(name.into(), unit, rows, value, &mut cells);
+        }
+        // As a share of all processors, like in the paper.
+        let all = self.processors;
+        let parts: [(&str, Value); 2] =
+            [("system", |run| run.host.machine.system), ("user", |run| run.host.machine.user)];
+        for (part, value) in parts {
+            let table = format!("{part}, /proc/stat, of all {all} processors");
+            let from = cells.len();
+            self.table(table, "%", &SetUp::ALL, value, &mut cells);
+            let values = cells[from..].iter_mut().flat_map(|cell| &mut cell.values);
+            values.for_each(|value| *value /= all as f64);
+        }
+        cells
+    }
+
+    fn table(&self, table: String, unit: &'static str, rows: &[SetUp], value: Value, cells: &mut Vec<Cell>) {
+        for &set_up in rows {
+            for &count in self.counts {
+                let (row, column) = (set_up.name().into(), consumers(count));
+                let values = self.series(set_up, count, value);
+                cells.push(Cell { table: table.clone(), row, column, unit, values });
+            }
+        }
+    }
+
+    /// Returns the figures of the hub's results next to raw bytes. The targets are the paper's: a sixth of the system
+    /// time, a third of the user time.
+    fn figures(&self) -> Vec<Figure> {
+        let of = |name, value: Value, target| {
+            let [hub, baseline] =
+                [SetUp::Results, SetUp::Bytes].map(|set_up| self.series(set_up, FOUR, value));
+            Figure { name, unit: "%", hub, baseline, target }
+        };
+        vec![
+            of("system, processes", |run| run.host.processes.system, Target::Ratio(0.166)),
+            of("user, processes", |run| run.host.processes.user, Target::Ratio(0.333)),
+            of("system, /proc/stat", |run| run.host.machine.system, Target::None),
+            of("user, /proc/stat", |run| run.host.machine.user, Target::None),
+        ]
+    }
+
+    fn series(&self, set_up: SetUp, count: usize, value: Value) -> Vec<f64> {
+        self.chosen(set_up, count).map(value).collect()
+    }
+
+    fn chosen(&self, set_up: SetUp, count: usize) -> impl Iterator<Item = &Run> {
+        self.runs.iter().filter(move |run| run.set_up == set_up && run.count == count)
+    }
+}
+
+fn consumers(count: usize) -> String {
+    if count == 1 { "1 subscriber".into() } else { format!("{count} subscribers") }
+}
+
+const fn load(name: &'static str, rows: &'static [SetUp], value: Value) -> Table {
+    Table { name, unit: "%", rows, value }
+}
+
+const BENCH: &str = "host_load";
+/// Number of consumers in the paper's set-up, to which its figures belong.
+const FOUR: usize = 4;
+/// Set-ups with a hub.
+const WITH_HUB: [SetUp; 2] = [SetUp::Scans, SetUp::Results];
+/// Load is in percent of one processor.
+const TABLES: [Table; 11] = [
+    load("system, processes of the host", &SetUp::ALL, |run| run.host.processes.system),
+    load("user, processes of the host", &SetUp::ALL, |run| run.host.processes.user),
+    load("system, the hub's part", &WITH_HUB, |run| run.load.hub.system),
+    load("user, the hub's part", &WITH_HUB, |run| run.load.hub.user),
+    load("system, /proc/stat", &SetUp::ALL, |run| run.host.machine.system),
+    load("user, /proc/stat", &SetUp::ALL, |run| run.host.machine.user),
+    load("threads of the kernel", &SetUp::ALL, |run| run.load.kernel),
+    load("left out: simulators or unit", &SetUp::ALL, |run| run.load.outside.total()),
+    Table {
+        name: "minimum of scans a second of each sensor",
+        unit: "Hz",
+        rows: &SetUp::ALL,
+        value: |run| run.load.hz,
+    },
+    load("/proc/stat, as a share of the scheduler's count", &SetUp::ALL, |run| {
+        100.0 * run.load.machine.total() / run.load.all_processes
+    }),
+    load("stolen by the hypervisor", &SetUp::ALL, |run| run.load.stolen),
+];

@@ -1,19 +1,15 @@
-//! What does the network add? Age of a scan at an application behind a gateway, beside a datagram behind an eventfd; the
-//! gateway's processor time, beside a thread that sends the same datagrams; how many it can send; what a healthy cable
-//! carries to a listener, and one that is pulled for a while; what a million damaged datagrams do to one; and how long scans are. All of it in network
-//! namespaces of its own. It does not tell what a real switch does.
+//! What does the network add? Measures the age of a scan that a gateway sent, compared with a datagram that an eventfd
+//! triggers; the gateway's CPU time, compared with a thread that sends the same datagrams; how many it can send; what
+//! arrives over a good cable, and over one that is unplugged for a while; how a listener handles a million damaged
+//! datagrams; and how long scans are. Everything runs in separate network namespaces, with `unshare`, `nsenter` and
+//! `ip`. The bench does not measure what a real switch does.
 
 #[path = "../../tests/testkit/child.rs"]
 mod child;
-mod damage;
-mod hop;
-mod load;
+mod gateway;
 #[path = "../../tests/testkit/machine.rs"]
 #[allow(dead_code)] // Tests use more of it.
 mod machine;
-mod pulled;
-mod sizes;
-mod source;
 #[path = "../support/mod.rs"]
 mod support;
 mod wire;
@@ -23,16 +19,18 @@ use std::thread;
 use std::time::Duration;
 
 use machine::Machine;
-use support::Outcome;
+use schema::datagram::{DatagramError, HEAD, Head, MTU_ETHERNET, MTU_SAFE, PORT, Packed};
+use schema::{Contents, Scan, ScanHead, Topic, Verdict, Zones};
 use support::figures::{self, Figure, Target};
-use support::options::Options;
+use support::source;
 use support::stage::{PATIENCE, SENSORS, Stage};
+use support::{Options, Outcome, clock};
 use wire::{Program, is_of, number, sum};
 
 fn main() -> ExitCode {
-    let is_sender = std::env::args().skip(1).eq(hop::PART);
+    let is_sender = std::env::args().skip(1).eq(gateway::PART);
     let outcome = match (wire::inside(), is_sender) {
-        (true, true) => hop::sender().map(|()| ExitCode::SUCCESS),
+        (true, true) => gateway::sender().map(|()| ExitCode::SUCCESS),
         (true, false) => return support::main(measure),
         (false, _) => wire::enter(),
     };
@@ -43,17 +41,17 @@ fn main() -> ExitCode {
 }
 
 fn measure(options: &Options) -> Outcome<()> {
-    let tell = |figures: Vec<Figure>| figures::print("lan", options.json, &figures);
-    tell(sizes::figures());
-    tell(hop::figures(options.pairs())?);
-    tell(load::figures(options.pairs())?);
-    tell(damage::figures(options.count(1_000_000) as u64)?);
-    tell(healthy(options.seconds(60))?);
-    tell(pulled::figures()?);
+    let print = |figures: Vec<Figure>| figures::print("lan", options.json, &figures);
+    print(sizes());
+    print(gateway::latency(options.pairs())?);
+    print(gateway::cpu_time(options.pairs())?);
+    print(damaged_datagrams(options.count(1_000_000) as u64)?);
+    print(healthy(options.seconds(60))?);
+    print(link_down()?);
     Ok(())
 }
 
-/// Two sensors, all topics, a cable between two machines.
+/// Sends all topics of two sensors over a cable between two machines.
 fn healthy(seconds: u64) -> Outcome<Vec<Figure>> {
     let stage = Stage::new()?;
     let machine = Machine::new(2);
@@ -71,17 +69,175 @@ fn healthy(seconds: u64) -> Outcome<Vec<Figure>> {
     let mut rates = Vec::new();
     for sensor in SENSORS {
         let lines: Vec<_> = sent.iter().filter(|(_, line)| is_of(line, sensor, "scan")).collect();
-        // The first accounts are of sensors that are not streaming yet, the last may be of a fraction of a second.
+        // The first statistics are from before the sensors stream, the last may cover a fraction of a second.
         let [(from_ns, first), .., (to_ns, last), _] = lines[..] else { return Err("too short".into()) };
         let count = number(last, "sent") - number(first, "sent");
         rates.push(count as f64 / ((to_ns - from_ns) as f64 / 1e9));
     }
     let count = |key: &str| sum(&heard, key);
-    let figure = |name, hub, target| Figure { name, unit: "1", hub, floor: Vec::new(), target };
+    let figure = |name, hub, target| Figure { name, unit: "1", hub, baseline: Vec::new(), target };
     Ok(vec![
         Figure { unit: "Hz", ..figure("cable: scans of each sensor", rates, Target::None) },
         figure("cable: datagrams received", vec![count("received")], Target::None),
         figure("cable: lost", vec![count("lost")], Target::Most(0.0)),
-        figure("cable: doubled or moved", vec![count("duplicate") + count("reordered")], Target::Most(0.0)),
+        figure(
+            "cable: duplicated or reordered",
+            vec![count("duplicate") + count("reordered")],
+            Target::Most(0.0),
+        ),
+    ])
+}
+
+/// Beams of 100 degrees at 1, 0.5 and 0.25 degrees and of 180 degrees at 1 and 0.5, with the names without and with
+/// intensities.
+const VARIANTS: [(usize, &str, &str); 5] = [
+    (101, "size: 100/1", "size: 100/1, intensities"),
+    (201, "size: 100/0.5", "size: 100/0.5, intensities"),
+    (401, "size: 100/0.25", "size: 100/0.25, intensities"),
+    (181, "size: 180/1", "size: 180/1, intensities"),
+    (361, "size: 180/0.5", "size: 180/0.5, intensities"),
+];
+
+/// Returns the lengths of a scan's datagram for each variant of the LMS, without the headers of IP and UDP.
+fn sizes() -> Vec<Figure> {
+    let variant = |(count, plain, full)| [size(plain, count, 0), size(full, count, Contents::UPPER)];
+    VARIANTS.into_iter().flat_map(variant).collect()
+}
+
+fn size(name: &'static str, count: usize, contents: u8) -> Figure {
+    let scan = Scan::of(ScanHead { contents, ..ScanHead::default() }, &vec![0; count]);
+    let len = scan.pack(&mut [0; MTU_ETHERNET]).map(|packed| HEAD + packed);
+    let hub = len.map(|len| len as f64).into_iter().collect();
+    Figure { name, unit: "B", hub, baseline: Vec::new(), target: Target::Most(MTU_SAFE as f64) }
+}
+
+/// Damaged datagrams between two intact ones; a listener's buffer certainly holds this number.
+const INTERVAL: u64 = 50;
+
+/// Sends `count` damaged and random datagrams to a listener: what does it accept, what does it report, and does its
+/// memory grow?
+fn damaged_datagrams(count: u64) -> Outcome<Vec<Figure>> {
+    let mut command = Command::new(wire::PROGRAM);
+    command.args(["listen", "--json", "--interface=lo", "--topic=zones"]);
+    let listener = Program::start(command, "ready")?;
+    let (socket, to) = (wire::sender()?, wire::address(Topic::Zones));
+    let mut random = fastrand::Rng::with_seed(6);
+    let mut buffer = [0; MTU_ETHERNET];
+    let scan = sealed(&mut buffer, Topic::Scan, 0, &*source::scan())?;
+    let whole = [scan, sealed(&mut buffer, Topic::Zones, 0, &Zones::unknown())?];
+    let (mut sequence, mut begin_kb) = (0, 0);
+    for n in 1..=count {
+        socket.send_to(&damaged(&mut random, &whole), to)?;
+        if n % INTERVAL == 0 {
+            let zones = Zones { verdict: Verdict::Stop as u8, ..Zones::unknown() };
+            socket.send_to(&sealed(&mut buffer, Topic::Zones, sequence, &zones)?, to)?;
+            sequence += 1;
+            listener.await_class("zones")?;
+        }
+        if n == count / 10 {
+            begin_kb = resident_kb(&listener)?;
+        }
+    }
+    let grown_kb = resident_kb(&listener)?.saturating_sub(begin_kb);
+    let lines = listener.end()?;
+    let of_class = |class| lines.iter().map(|(_, line)| line).filter(move |line| line["class"] == class);
+    let refused = of_class("lan_refused").next().ok_or("no statistics")?;
+    let counts = DatagramError::ALL.map(|reason| (reason.name(), number(refused, reason.name())));
+    let counted: u64 = counts.iter().map(|(_, count)| count).sum();
+    for (name, count) in counts.iter().filter(|(_, count)| *count > 0) {
+        eprintln!("refused as {name}: {count}");
+    }
+    let received: u64 = of_class("lan").map(|line| number(line, "received")).sum();
+    let figure = |name, hub, target| Figure { name, unit: "1", hub: vec![hub], baseline: Vec::new(), target };
+    let most = |name, hub: u64| figure(name, hub as f64, Target::Most(0.0));
+    Ok(vec![
+        figure("damaged: sent", count as f64, Target::None),
+        most("damaged: refused without reason", count - counted.min(count)),
+        most("damaged: accepted and not sent", received.saturating_sub(u64::from(sequence))),
+        most("intact: sent and not accepted", u64::from(sequence).saturating_sub(received)),
+        Figure { unit: "kB", ..figure("damaged: memory grown", grown_kb as f64, Target::Most(512.0)) },
+    ])
+}
+
+fn sealed(
+    buffer: &mut [u8],
+    topic: Topic,
+    sequence: u32,
+    payload: &(impl Packed + ?Sized),
+) -> Outcome<Vec<u8>> {
+    let len = payload.pack(&mut buffer[HEAD..]).ok_or("it does not fit")?;
+    let head = Head { topic: topic.number(), hub: 1, epoch: 1, sequence, revision: 1, ..Head::default() };
+    Ok(head.seal(buffer, len).ok_or("it does not fit")?.to_vec())
+}
+
+/// Returns one of `whole` with some bits, its end, or all of its rest changed; or noise.
+fn damaged(random: &mut fastrand::Rng, whole: &[Vec<u8>]) -> Vec<u8> {
+    let mut bytes = whole[random.usize(..whole.len())].clone();
+    match random.u8(..5) {
+        0 => (0..random.usize(1..4)).for_each(|_| {
+            let bit = random.usize(..8 * bytes.len());
+            bytes[bit / 8] ^= 1 << (bit % 8);
+        }),
+        1 => bytes.truncate(random.usize(..bytes.len())),
+        2 => bytes.extend((0..random.usize(1..40)).map(|_| random.u8(..))),
+        3 => {
+            let begin = random.usize(..bytes.len());
+            bytes[begin..].iter_mut().for_each(|byte| *byte = random.u8(..));
+            bytes[begin] ^= 1;
+        }
+        _ => bytes = (0..random.usize(..MTU_ETHERNET)).map(|_| random.u8(..)).collect(),
+    }
+    // Flips may have canceled each other.
+    if whole.contains(&bytes) {
+        bytes[0] ^= 0x80;
+    }
+    bytes
+}
+
+fn resident_kb(program: &Program) -> Outcome<u64> {
+    let text = std::fs::read_to_string(format!("/proc/{}/status", program.pid()))?;
+    let line = text.lines().find(|line| line.starts_with("VmRSS")).ok_or("no memory")?;
+    Ok(line.split_whitespace().nth(1).ok_or("no number")?.parse()?)
+}
+
+/// Time for which the gateway's link is down.
+const DOWN: Duration = Duration::from_secs(10);
+
+/// Takes the gateway's link down: when is it received again, and does another machine notice?
+fn link_down() -> Outcome<Vec<Figure>> {
+    let stage = Stage::new()?;
+    let (pulled, other) = (Machine::new(3), Machine::new(4));
+    let listener = |machine: &Machine, flag: &str| {
+        let mut listen = Command::new("nsenter");
+        listen.arg(format!("--net={}", machine.network().display()));
+        listen.args([wire::PROGRAM, "listen", "--json", flag]);
+        Program::start(listen, "ready")
+    };
+    let (there, elsewhere) = (listener(&pulled, "--topic=scan")?, listener(&other, "--stats")?);
+    let _simulator = stage.simulate(&SENSORS, 500_000)?;
+    let hub = stage.hub(&SENSORS)?;
+    hub.await_line("ready", PATIENCE)?;
+    let copies = format!("--to={}:{PORT}", other.there());
+    let gateway = wire::gateway(&stage, &pulled.end(), &[wire::all_topics(), vec![copies]].concat())?;
+    there.await_after(0, "scan")?;
+    pulled.run("ip link set eth0 down");
+    thread::sleep(DOWN);
+    pulled.run("ip link set eth0 up");
+    let plugged_ns = clock::now();
+    let heard_ns = there.await_after(plugged_ns, "scan")?;
+    let sent = gateway.end()?;
+    let heard = elsewhere.end()?;
+    drop(there.end()?);
+    let last = sent.iter().rev().take_while(|(_, line)| line["class"] != "lan_link");
+    let missed =
+        last.filter(|(_, line)| line["class"] == "lan").map(|(_, line)| wire::number(line, "missed"));
+    let figure =
+        |name, unit, value, target| Figure { name, unit, hub: vec![value], baseline: vec![], target };
+    let again_ms = (heard_ns - plugged_ns) as f64 / 1e6;
+    Ok(vec![
+        figure("down for 10 s: until received again", "ms", again_ms, Target::Most(1000.0)),
+        figure("the same: received by another machine", "1", sum(&heard, "received"), Target::None),
+        figure("the same: lost by another machine", "1", sum(&heard, "lost"), Target::Most(0.0)),
+        figure("the same: missed by the gateway", "1", missed.max().unwrap_or(0) as f64, Target::Most(0.0)),
     ])
 }

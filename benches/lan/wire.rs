@@ -1,4 +1,4 @@
-//! The network namespace that the bench runs in, its sockets on the loopback, and programs that speak JSON.
+//! The network namespace in which the bench runs, its sockets on the loopback, and programs that print JSON.
 
 use std::net::{Ipv4Addr, UdpSocket};
 use std::process::{Command, ExitCode, Stdio};
@@ -13,20 +13,18 @@ use schema::Topic;
 use schema::datagram::{GROUPS, PORT, group};
 use serde_json::Value;
 
-use crate::support::child::Guard;
-use crate::support::stage::{PATIENCE, Stage};
+use crate::support::stage::{Guard, PATIENCE, Stage};
 use crate::support::{Outcome, clock};
 
 pub(crate) const PROGRAM: &str = env!("CARGO_BIN_EXE_scanhub");
 const INSIDE: &str = "SCANHUB_BENCH_NETWORK";
 
-/// Whether this is the process that runs in a namespace of its own.
+/// Returns whether this process runs in its own network namespace.
 pub(crate) fn inside() -> bool {
     env::var_os(INSIDE).is_some()
 }
 
-/// Runs this program again in a network namespace, in which only the loopback is; without an error code if the system
-/// does not allow that.
+/// Runs this program again in a network namespace that has only the loopback.
 pub(crate) fn enter() -> Outcome<ExitCode> {
     let mut unshare = Command::new("unshare");
     unshare.arg("--net");
@@ -41,8 +39,8 @@ pub(crate) fn enter() -> Outcome<ExitCode> {
     Ok(if status.success() { ExitCode::SUCCESS } else { ExitCode::FAILURE })
 }
 
-/// Hears the groups on the loopback.
-pub(crate) fn ear() -> Outcome<UdpSocket> {
+/// Returns a socket that receives the groups on the loopback.
+pub(crate) fn receiver() -> Outcome<UdpSocket> {
     let socket = UdpSocket::bind((Ipv4Addr::UNSPECIFIED, PORT))?;
     for last in 80..84 {
         socket
@@ -53,24 +51,24 @@ pub(crate) fn ear() -> Outcome<UdpSocket> {
     Ok(socket)
 }
 
-/// Sends to the groups on the loopback.
-pub(crate) fn mouth() -> Outcome<UdpSocket> {
+/// Returns a socket that sends to the groups on the loopback.
+pub(crate) fn sender() -> Outcome<UdpSocket> {
     let socket = UdpSocket::bind((Ipv4Addr::UNSPECIFIED, 0))?;
     set_ip_multicast_if(&socket, &Ipv4Addr::LOCALHOST)?;
     Ok(socket)
 }
 
-/// Where the datagrams of `topic` go.
+/// Returns the address of the datagrams of `topic`.
 pub(crate) fn address(topic: Topic) -> (Ipv4Addr, u16) {
     (Ipv4Addr::new(GROUPS[0], GROUPS[1], GROUPS[2], group(topic)), PORT)
 }
 
-/// Flags of a gateway that sends everything.
+/// Returns the flags of a gateway that sends all topics.
 pub(crate) fn all_topics() -> Vec<String> {
     Topic::ALL.iter().map(|topic| format!("--topic=*/{}", topic.name())).collect()
 }
 
-/// The gateway of `stage`.
+/// Starts the gateway of `stage`.
 pub(crate) fn gateway(stage: &Stage, interface: &str, flags: &[String]) -> Outcome<Program> {
     let mut command = Command::new(PROGRAM);
     command
@@ -79,14 +77,14 @@ pub(crate) fn gateway(stage: &Stage, interface: &str, flags: &[String]) -> Outco
     Program::start(command, "gateway")
 }
 
-/// A program that speaks JSON.
+/// A program that prints JSON.
 pub(crate) struct Program {
     guard: Guard,
     lines: Receiver<(u64, Value)>,
 }
 
 impl Program {
-    /// Starts it and waits for its first line, which is of this class.
+    /// Starts a program, and waits for its first line of this class.
     pub(crate) fn start(mut command: Command, class: &str) -> Outcome<Program> {
         command.env("SCANHUB_END_WITH_PARENT", "1").env("SCANHUB_LOG", "error");
         let mut process = command.stdin(Stdio::null()).stdout(Stdio::piped()).spawn()?;
@@ -110,7 +108,7 @@ impl Program {
         self.guard.pid()
     }
 
-    /// The next line of this class; others are dropped.
+    /// Returns the next line of this class, and drops the lines before it.
     pub(crate) fn await_class(&self, class: &str) -> Outcome<Value> {
         loop {
             let (_, line) = self.lines.recv_timeout(PATIENCE).map_err(|_| format!("no {class} came"))?;
@@ -120,7 +118,7 @@ impl Program {
         }
     }
 
-    /// When the first line of this class after `since_ns` came; those before it are dropped.
+    /// Returns when the first line of this class after `since_ns` arrived, and drops the lines before it.
     pub(crate) fn await_after(&self, since_ns: u64, class: &str) -> Outcome<u64> {
         loop {
             let (at_ns, line) = self.lines.recv_timeout(PATIENCE).map_err(|_| format!("no {class} came"))?;
@@ -130,7 +128,7 @@ impl Program {
         }
     }
 
-    /// Ends it; the lines that were not yet taken, each with when it came.
+    /// Ends the program, and returns its remaining lines with the times at which they arrived.
     pub(crate) fn end(self) -> Outcome<Vec<(u64, Value)>> {
         let pid = Pid::from_raw(self.pid() as i32).ok_or("no process")?;
         kill_process(pid, Signal::TERM)?;
@@ -143,18 +141,18 @@ impl Program {
     }
 }
 
-/// Whether a line is of the account of this sensor and topic.
+/// Returns whether a line has statistics of this sensor and topic.
 pub(crate) fn is_of(line: &Value, sensor: &str, topic: &str) -> bool {
     line["class"] == "lan" && line["sensor"] == sensor && line["topic"] == topic
 }
 
-/// What the rows of an account have under `key`, in all.
+/// Returns the sum of `key` over all lines of statistics.
 pub(crate) fn sum(lines: &[(u64, Value)], key: &str) -> f64 {
     let rows = lines.iter().filter(|(_, line)| line["class"] == "lan");
     rows.map(|(_, line)| number(line, key)).sum::<u64>() as f64
 }
 
-/// A number in a line; 0 if it is not there.
+/// Returns a number of a line; 0 if it does not have it.
 pub(crate) fn number(line: &Value, key: &str) -> u64 {
     line[key].as_u64().unwrap_or_default()
 }

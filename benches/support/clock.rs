@@ -1,4 +1,4 @@
-//! The clock of every stamp here and in the hub, CLOCK_MONOTONIC, and the waits that are named by it.
+//! CLOCK_MONOTONIC, the clock of every stamp here and in the hub, and waits until a time of it.
 
 use std::os::fd::AsFd;
 
@@ -6,7 +6,7 @@ use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::io::Errno;
 use rustix::time::{ClockId, clock_gettime};
 
-/// Nanoseconds of CLOCK_MONOTONIC.
+/// Returns nanoseconds of CLOCK_MONOTONIC.
 pub(crate) fn now() -> u64 {
     let now = clock_gettime(ClockId::Monotonic);
     now.tv_sec as u64 * 1_000_000_000 + now.tv_nsec as u64
@@ -17,7 +17,7 @@ pub(crate) fn rest(until: u64) {
     let _ = poll(&mut [], Some(&span(until)));
 }
 
-/// Waits until `file` can be read or, if there is such a time, `until`; whether it can be read.
+/// Waits until `file` is readable or, if given, until `until`. Returns whether it is readable.
 pub(crate) fn readable(file: impl AsFd, until: Option<u64>) -> Result<bool, Errno> {
     let mut fds = [PollFd::new(&file, PollFlags::IN)];
     match poll(&mut fds, until.map(span).as_ref()) {

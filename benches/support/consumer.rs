@@ -1,15 +1,20 @@
-//! A consumer of the hub as a process of its own: follows a topic with the client library, wakes by event, stamps what
-//! it has in its hands.
+//! Subscribers as separate processes: they receive a topic with the client library, sleep until they are woken, and
+//! print when a sample had arrived. For a crowd, many subscribers share a process, each in its own thread and with its
+//! own membership, queue and wake-ups, as if it were a process.
 
 use std::io::Write;
+use std::sync::{Arc, Barrier};
+use std::thread;
+use std::time::Duration;
 
 use scanhub_client::Subscription;
 use schema::ipc::Payload;
-use schema::{Domain, Environment, Header, Scan, Status, Zones};
+use schema::{Domain, Environment, Header, Scan, Status, Zones, limits};
 
+use super::stage::PATIENCE;
 use super::{Outcome, clock, truth};
 
-/// Follows the scans of `sensor` for ever; prints when the first of each hub's life came.
+/// Receives the scans of `sensor` forever, and prints the time of the first scan of each run of the hub.
 pub(crate) fn scans(domain: &str, sensor: &str) -> Outcome<()> {
     let mut scans = subscribe::<Scan>(domain, sensor)?;
     let mut boot = 0;
@@ -23,7 +28,7 @@ pub(crate) fn scans(domain: &str, sensor: &str) -> Outcome<()> {
     }
 }
 
-/// Follows the scans of `sensor` for ever; prints each as it comes: `scanned SENSOR RECEIVED_NS BOOT`.
+/// Receives the scans of `sensor` forever, and prints each: `scanned SENSOR RECEIVED_NS BOOT`.
 pub(crate) fn each_scan(domain: &str, sensor: &str) -> Outcome<()> {
     let mut scans = subscribe::<Scan>(domain, sensor)?;
     println!("attaching {sensor}");
@@ -33,9 +38,9 @@ pub(crate) fn each_scan(domain: &str, sensor: &str) -> Outcome<()> {
     }
 }
 
-/// Follows the telegrams of `sensor` until `count` of measured data came, then prints them; with 0 for ever, and
-/// prints each as it comes. A line is `telegram SENSOR RECEIVED_NS BOOT MISSED INTACT HASH
-/// READ_NS`, the last the hub's stamp of the last byte.
+/// Receives telegrams of `sensor` until `count` with measured data have arrived, and then prints them; with 0, receives
+/// forever and prints each at once. A line is `telegram SENSOR RECEIVED_NS BOOT MISSED INTACT HASH READ_NS`, the last
+/// the hub's stamp of the last byte.
 pub(crate) fn telegrams(domain: &str, sensor: &str, count: usize) -> Outcome<()> {
     let mut telegrams = subscribe::<[u8]>(domain, sensor)?;
     let mut kept = Vec::with_capacity(count);
@@ -62,8 +67,8 @@ pub(crate) fn telegrams(domain: &str, sensor: &str, count: usize) -> Outcome<()>
     Ok(())
 }
 
-/// Follows the scans or the zones of `sensor` until `count` came, then prints for each how old its telegram's last byte
-/// was when the sample was in hand: `aged SENSOR NS`.
+/// Receives scans or zones of `sensor` until `count` have arrived. Then prints for each how old the telegram's last
+/// byte was on receipt: `aged SENSOR NS`.
 pub(crate) fn ages(topic: &str, domain: &str, sensor: &str, count: usize) -> Outcome<()> {
     let ages = match topic {
         "zones" => collect_ages::<Zones>(domain, sensor, count)?,
@@ -85,7 +90,7 @@ fn collect_ages<P: Payload + ?Sized>(domain: &str, sensor: &str, count: usize) -
     Ok(ages)
 }
 
-/// Follows the status of `sensor` for ever; prints each: `status SENSOR STATE SINCE_NS BOOT`.
+/// Receives the status of `sensor` forever, and prints each: `status SENSOR STATE SINCE_NS BOOT`.
 pub(crate) fn statuses(domain: &str, sensor: &str) -> Outcome<()> {
     let mut statuses = subscribe::<Status>(domain, sensor)?;
     println!("attaching {sensor}");
@@ -96,7 +101,7 @@ pub(crate) fn statuses(domain: &str, sensor: &str) -> Outcome<()> {
     }
 }
 
-/// Subscribes in the place where the hub of this domain puts itself.
+/// Subscribes to a topic of the hub of this domain.
 pub(crate) fn subscribe<P: Payload + ?Sized>(domain: &str, sensor: &str) -> Outcome<Subscription<P>> {
     let places = Domain::candidates(domain, None, &Environment::of_process())?;
     Ok(Subscription::in_domain(places, sensor)?)
@@ -114,4 +119,96 @@ fn write(out: &mut impl Write, sensor: &str, found: &Found) -> Outcome<()> {
     let intact = lms::telegram::Telegram::check(bytes).is_some();
     let (boot, read, hash) = (header.boot, header.stamp_last_ns, truth::hash(bytes));
     Ok(writeln!(out, "telegram {sensor} {now} {boot} {missed} {intact} {hash} {read}")?)
+}
+
+/// Subscribes to the scans of `sensor` `count` times, and receives for `seconds` from the moment at which each
+/// subscriber has a scan. Prints for each `followed RECEIVED MISSED PUBLISHED`, the last from its own first sample to
+/// its last.
+pub(crate) fn follow(domain: &str, sensor: &str, count: usize, seconds: u64) -> Outcome<()> {
+    let all = Arc::new(Barrier::new(count + 1));
+    let threads: Vec<_> = (0..count)
+        .map(|_| {
+            let (domain, sensor, all) = (domain.to_owned(), sensor.to_owned(), all.clone());
+            thread::spawn(move || {
+                count_scans(&domain, &sensor, &all, seconds).map_err(|error| error.to_string())
+            })
+        })
+        .collect();
+    all.wait();
+    println!("following {count}");
+    for thread in threads {
+        let Counted { received, missed, published } =
+            thread.join().map_err(|_| "a subscriber panicked")??;
+        println!("followed {received} {missed} {published}");
+    }
+    println!("end");
+    Ok(())
+}
+
+/// Takes all samples that `count` subscribers may hold, prints their number, and keeps them.
+pub(crate) fn hold(domain: &str, sensor: &str, count: usize) -> Outcome<()> {
+    let mut consumers = (0..count).map(|_| subscribe::<Scan>(domain, sensor)).collect::<Outcome<Vec<_>>>()?;
+    let mut held = Vec::new();
+    for consumer in &mut consumers {
+        for _ in 0..limits::BORROWED {
+            held.extend(consumer.next()?);
+        }
+    }
+    println!("holding {}", held.len());
+    loop {
+        thread::park();
+    }
+}
+
+/// Attaches `count` subscribers and keeps them. Prints their number, and the reason if one is refused.
+pub(crate) fn stay(domain: &str, sensor: &str, count: usize) -> Outcome<()> {
+    let mut consumers = Vec::new();
+    for _ in 0..count {
+        let mut consumer = subscribe::<Scan>(domain, sensor)?.timeout(PATIENCE);
+        if let Err(failure) = consumer.next() {
+            println!("refused {} {}", consumers.len(), failure.message);
+            break;
+        }
+        consumers.push(consumer);
+    }
+    println!("staying {}", consumers.len());
+    loop {
+        for consumer in &mut consumers {
+            while consumer.try_next()?.is_some() {}
+        }
+        thread::sleep(Duration::from_millis(50));
+    }
+}
+
+struct Counted {
+    received: u64,
+    missed: u64,
+    published: u64,
+}
+
+fn count_scans(domain: &str, sensor: &str, all: &Barrier, seconds: u64) -> Outcome<Counted> {
+    let last = |scan: Option<scanhub_client::Received<Scan>>| {
+        Ok::<_, &str>(scan.ok_or("no scan arrived")?.header().topic_seq)
+    };
+    let attached = || -> Outcome<_> {
+        let mut scans = subscribe::<Scan>(domain, sensor)?.timeout(PATIENCE);
+        last(scans.next()?)?;
+        Ok(scans)
+    };
+    let attached = attached();
+    // The others do not wait for a subscriber that fails.
+    all.wait();
+    let mut scans = attached?;
+    // Samples that queued up while others attached do not count.
+    while scans.try_next()?.is_some() {}
+    let first = last(scans.next()?)?;
+    let end = clock::now() + seconds * 1_000_000_000;
+    let mut counted = Counted { received: 1, missed: 0, published: 1 };
+    while clock::now() < end {
+        let scan = scans.next()?.ok_or("no scan arrived")?;
+        counted.received += 1;
+        counted.missed += scan.missed;
+        counted.published = scan.header().topic_seq - first + 1;
+    }
+    Ok(counted)
 }

@@ -1,60 +1,59 @@
-//! Figures with their spread: a series per run, beside that of the floor, and the ratio run by run; or cells of tables.
-//! Printed as a table for people or as a line of JSON each. Says whether a target was met; refuses to fail because of it.
+//! Figures with their spread: a series of values, one per run, next to those of the baseline, with the ratio run by
+//! run; or cells of tables. They are printed as tables, or with `--json` as one line each (`SPREAD` is `{median, least,
+//! most}` or null):
 //!
-//! The lines, from which the tables of benches/README.md are made (`SPREAD` is `{median, least, most}` or null; further
-//! keys may stand in any of them):
-//! `{class: "measurement", bench, name, unit, runs, hub: SPREAD, floor: SPREAD, ratio: SPREAD, target, met}`
-//! `{class: "cell", bench, table, row, column, value: SPREAD, unit}`
+//! - `{class: "measurement", bench, name, unit, runs, hub: SPREAD, baseline: SPREAD, ratio: SPREAD, target, met}`
+//! - `{class: "cell", bench, table, row, column, value: SPREAD, unit}`
 
 use serde_json::{Value, json};
 
-/// What was measured under one name.
+/// A figure with one value per run.
 pub(crate) struct Figure {
     pub(crate) name: &'static str,
     pub(crate) unit: &'static str,
     /// One value per run.
     pub(crate) hub: Vec<f64>,
-    /// One value per run of the floor; empty if the figure has none.
-    pub(crate) floor: Vec<f64>,
+    /// One value per run of the baseline; empty if the figure has none.
+    pub(crate) baseline: Vec<f64>,
     pub(crate) target: Target,
 }
 
-/// A place in a table of several mechanisms or conditions. Tables, rows and columns stand in order of appearance.
+/// A cell of a table of several mechanisms or conditions. Tables, rows and columns are printed in order of appearance.
 #[derive(Clone, Debug)]
 pub(crate) struct Cell {
     pub(crate) table: String,
     pub(crate) row: String,
     pub(crate) column: String,
     pub(crate) unit: &'static str,
-    /// One value per run; none where nothing could be measured.
+    /// One value per run; empty if it could not be measured.
     pub(crate) values: Vec<f64>,
 }
 
-/// What a figure should be.
+/// Target of a figure.
 #[derive(Clone, Copy)]
 pub(crate) enum Target {
-    /// Whatever it is.
+    /// No target.
     None,
-    /// The hub's median at most so.
+    /// Maximum of the hub's median.
     Most(f64),
-    /// The hub's median at least so.
+    /// Minimum of the hub's median.
     Least(f64),
-    /// The median of the ratios at most so.
+    /// Maximum of the median of the ratios.
     Ratio(f64),
 }
 
-/// The middle, the least and the greatest of a series.
+/// Median, minimum and maximum of a series.
 pub(crate) struct Spread(f64, f64, f64);
 
 impl Spread {
-    /// That of `values`, in any order; nothing if there are none.
+    /// Returns the spread of `values`, in any order; `None` if there are none.
     pub(crate) fn of(values: &[f64]) -> Option<Spread> {
         let mut sorted = values.to_vec();
         sorted.sort_by(f64::total_cmp);
         Some(Spread(percentile(&sorted, 0.5)?, *sorted.first()?, *sorted.last()?))
     }
 
-    /// As it stands in tables.
+    /// Returns the spread as it is in tables.
     pub(crate) fn text(&self) -> String {
         let Spread(middle, least, most) = self;
         if least == most {
@@ -63,7 +62,7 @@ impl Spread {
         format!("{} [{} .. {}]", short(*middle), short(*least), short(*most))
     }
 
-    /// As it stands in lines.
+    /// Returns the spread as it is in lines of JSON.
     pub(crate) fn json(&self) -> Value {
         json!({ "median": self.0, "least": self.1, "most": self.2 })
     }
@@ -73,13 +72,13 @@ impl Figure {
     fn ratios(&self) -> Vec<f64> {
         self.hub
             .iter()
-            .zip(&self.floor)
-            .filter(|(_, floor)| **floor > 0.0)
-            .map(|(hub, floor)| hub / floor)
+            .zip(&self.baseline)
+            .filter(|(_, baseline)| **baseline > 0.0)
+            .map(|(hub, baseline)| hub / baseline)
             .collect()
     }
 
-    /// The target in words, and whether it was met.
+    /// Returns the target as text, and whether it was met.
     fn verdict(&self) -> Option<(String, bool)> {
         match self.target {
             Target::None => None,
@@ -93,26 +92,27 @@ impl Figure {
 /// Prints `figures` of `bench`.
 pub(crate) fn print(bench: &str, json: bool, figures: &[Figure]) {
     if !json {
-        println!("{:34} {:>30} {:>30} {:>22}  target", bench, "hub", "floor", "ratio");
+        println!("{:34} {:>30} {:>30} {:>22}  target", bench, "hub", "baseline", "ratio");
     }
     for figure in figures {
-        let spreads = [&figure.hub, &figure.floor, &figure.ratios()].map(|series| Spread::of(series));
+        let spreads = [&figure.hub, &figure.baseline, &figure.ratios()].map(|series| Spread::of(series));
         let verdict = figure.verdict();
         if json {
-            let [hub, floor, ratio] = spreads.map(|spread| spread.map(|spread| spread.json()));
+            let [hub, baseline, ratio] = spreads.map(|spread| spread.map(|spread| spread.json()));
             let line = json!({
                 "class": "measurement", "bench": bench, "name": figure.name, "unit": figure.unit,
-                "runs": figure.hub.len(), "hub": hub, "floor": floor, "ratio": ratio,
+                "runs": figure.hub.len(), "hub": hub, "baseline": baseline, "ratio": ratio,
                 "target": verdict.as_ref().map(|(words, _)| words), "met": verdict.as_ref().map(|(_, met)| met),
             });
             println!("{line}");
         } else {
-            let [hub, floor, ratio] = spreads.map(|spread| spread.map_or("-".into(), |spread| spread.text()));
+            let [hub, baseline, ratio] =
+                spreads.map(|spread| spread.map_or("-".into(), |spread| spread.text()));
             let verdict = verdict.map_or(String::new(), |(words, met)| {
                 format!("{words}: {}", if met { "met" } else { "MISSED" })
             });
             let name = format!("{}, {}", figure.name, figure.unit);
-            println!("{name:34} {hub:>30} {floor:>30} {ratio:>22}  {verdict}");
+            println!("{name:34} {hub:>30} {baseline:>30} {ratio:>22}  {verdict}");
         }
     }
 }
@@ -150,7 +150,7 @@ pub(crate) fn print_cells(bench: &str, json: bool, cells: &[Cell]) {
     }
 }
 
-/// Each name once, in order of appearance.
+/// Returns each name once, in order of appearance.
 fn appearing<'a>(names: impl Iterator<Item = &'a String>) -> Vec<&'a String> {
     let mut found = Vec::new();
     for name in names {
@@ -161,7 +161,8 @@ fn appearing<'a>(names: impl Iterator<Item = &'a String>) -> Vec<&'a String> {
     found
 }
 
-/// The value below which `part` of the `sorted` values lie: nearest rank, the middle of two for the median.
+/// Returns the value below which `part` of the `sorted` values lie: nearest rank, and for the median the mean of the
+/// middle two.
 pub(crate) fn percentile(sorted: &[f64], part: f64) -> Option<f64> {
     let last = sorted.len().checked_sub(1)?;
     if part == 0.5 {

@@ -1,50 +1,46 @@
-//! What the comparisons with bare floors share: a stage with simulator, hub and consumers as processes, the floors,
-//! the processes' accounts, and figures with their spread. Refuses to judge: a bench prints what it measured.
-#![allow(dead_code)] // Every bench takes what it needs.
+//! Shared by the benches that start processes: a stage with simulator, hub and subscribers, minimal programs to compare
+//! them with, CPU time and memory of processes, and figures with their spread. A bench prints what it measured; a
+//! missed target is not an error.
 
-pub(crate) mod bare;
-pub(crate) mod chart;
-pub(crate) mod child;
+#![allow(dead_code)] // Every bench uses a part of it.
+
+pub(crate) mod baseline;
 pub(crate) mod clock;
 pub(crate) mod consumer;
-pub(crate) mod crowd;
 pub(crate) mod figures;
-pub(crate) mod host;
-pub(crate) mod line;
-pub(crate) mod memory;
-pub(crate) mod options;
+pub(crate) mod source;
 pub(crate) mod stage;
 pub(crate) mod truth;
-pub(crate) mod work;
+pub(crate) mod usage;
 
 use std::error::Error;
 use std::process::ExitCode;
 
 use rustix::process::{Signal, set_parent_process_death_signal};
 
-/// What may go wrong, in words.
+/// Result of a step of a bench; the error is a message.
 pub(crate) type Outcome<T> = Result<T, Box<dyn Error>>;
 
-/// The body of every bench: plays the part that the command line names (a bench starts itself as consumer and as
-/// floor), else measures.
-pub(crate) fn main(measure: impl FnOnce(&options::Options) -> Outcome<()>) -> ExitCode {
+/// The body of every bench: plays the part that the command line names, because a bench starts itself as subscriber and
+/// as baseline. Otherwise it measures.
+pub(crate) fn main(measure: impl FnOnce(&Options) -> Outcome<()>) -> ExitCode {
     main_with(play, measure)
 }
 
-/// As [`main`], of a bench that has parts of its own; those that it does not know are for [`play`].
+/// The same for a bench with its own parts; it passes those that it does not know to [`play`].
 pub(crate) fn main_with(
     play: impl FnOnce(&[&str]) -> Outcome<()>,
-    measure: impl FnOnce(&options::Options) -> Outcome<()>,
+    measure: impl FnOnce(&Options) -> Outcome<()>,
 ) -> ExitCode {
     let words: Vec<String> = std::env::args().skip(1).collect();
     let outcome = match words.iter().map(String::as_str).collect::<Vec<_>>()[..] {
-        // What this process does for another one ends with that.
+        // A part ends with the process that started it.
         [PART, ref part @ ..] => {
             set_parent_process_death_signal(Some(Signal::TERM)).map_err(Into::into).and_then(|()| play(part))
         }
-        _ => stage::Stage::sweep()
-            .and_then(|()| options::Options::parse(&words))
-            .and_then(|options| measure(&options)),
+        _ => {
+            stage::Stage::sweep().and_then(|()| Options::parse(&words)).and_then(|options| measure(&options))
+        }
     };
     match outcome {
         Ok(()) => ExitCode::SUCCESS,
@@ -64,17 +60,83 @@ pub(crate) fn play(words: &[&str]) -> Outcome<()> {
         ["ages", topic, domain, sensor, count] => consumer::ages(topic, domain, sensor, count.parse()?),
         ["consume", "status", domain, sensor] => consumer::statuses(domain, sensor),
         ["crowd", domain, sensor, count, seconds] => {
-            crowd::follow(domain, sensor, count.parse()?, seconds.parse()?)
+            consumer::follow(domain, sensor, count.parse()?, seconds.parse()?)
         }
-        ["hold", domain, sensor, count] => crowd::hold(domain, sensor, count.parse()?),
-        ["stay", domain, sensor, count] => crowd::stay(domain, sensor, count.parse()?),
-        ["bare", count, ref ports @ ..] => bare::chain(ports, count.parse()?),
-        ["sleeper", number, count] => bare::sleeper(number, count.parse()?),
-        ["host", "blindly", port, rate] => host::start_blindly(port.as_ref(), rate.parse()?),
-        ["host", port, rate] => host::start(port.as_ref(), rate.parse()?),
+        ["hold", domain, sensor, count] => consumer::hold(domain, sensor, count.parse()?),
+        ["stay", domain, sensor, count] => consumer::stay(domain, sensor, count.parse()?),
+        ["bare", count, ref ports @ ..] => baseline::chain(ports, count.parse()?),
+        ["sleeper", number, count] => baseline::sleeper(number, count.parse()?),
+        ["host", "blindly", port, rate] => baseline::start_blindly(port.as_ref(), rate.parse()?),
+        ["host", port, rate] => baseline::start(port.as_ref(), rate.parse()?),
         _ => Err(format!("no part {words:?}").into()),
     }
 }
 
 /// First word of the command line of a part.
 pub(crate) const PART: &str = "part";
+
+/// Options of a bench. What the user left out has a default in the bench.
+#[derive(Clone, Debug, Default)]
+pub(crate) struct Options {
+    /// Print one line of JSON per figure instead of tables.
+    pub(crate) json: bool,
+    /// Measure less, in a few minutes, where a bench takes long.
+    pub(crate) quick: bool,
+    pairs: Option<usize>,
+    seconds: Option<u64>,
+    count: Option<usize>,
+}
+
+impl Options {
+    pub(crate) fn parse(words: &[String]) -> Outcome<Options> {
+        let mut options = Options::default();
+        let mut words = words.iter();
+        while let Some(word) = words.next() {
+            let mut value = || {
+                // Cargo passes --bench to every bench.
+                let value = words.next().filter(|value| *value != "--bench");
+                value.ok_or_else(|| format!("{word} needs a value"))
+            };
+            match word.as_str() {
+                "--json" => options.json = true,
+                "--quick" => options.quick = true,
+                "--pairs" => options.pairs = Some(number(word, value()?)?),
+                "--seconds" => options.seconds = Some(number(word, value()?)?),
+                "--count" => options.count = Some(number(word, value()?)?),
+                "--bench" => {}
+                _ => {
+                    let known = "--json, --quick, --pairs N, --seconds N, --count N";
+                    return Err(format!("{word} is not an option of this bench; use {known}").into());
+                }
+            }
+        }
+        Ok(options)
+    }
+
+    /// Returns the number of pairs of a run of the hub and a run of the baseline.
+    pub(crate) fn pairs(&self) -> usize {
+        self.pairs_or(5)
+    }
+
+    /// Returns the same for a bench whose default is not five.
+    pub(crate) fn pairs_or(&self, default: usize) -> usize {
+        self.pairs.unwrap_or(default).clamp(1, 100)
+    }
+
+    /// Returns the length of a run in seconds.
+    pub(crate) fn seconds(&self, default: u64) -> u64 {
+        self.seconds.unwrap_or(default).clamp(1, 3600)
+    }
+
+    /// Returns the number of telegrams or repetitions.
+    pub(crate) fn count(&self, default: usize) -> usize {
+        self.count.unwrap_or(default).clamp(1, 1_000_000)
+    }
+}
+
+/// Returns `value` as a number of at least 1.
+fn number<T: TryFrom<u64>>(flag: &str, value: &str) -> Outcome<T> {
+    let number =
+        value.parse::<u64>().ok().filter(|&number| number > 0).and_then(|number| number.try_into().ok());
+    Ok(number.ok_or_else(|| format!("{flag} {value}: expected a number of at least 1"))?)
+}

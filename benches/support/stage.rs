@@ -1,22 +1,26 @@
-//! Where it all takes place: a domain and a directory of its own, gone afterwards, and the processes in it.
+//! Where a bench runs: its own domain and directory, and the processes in it. Processes are read line by line and ended
+//! by their ID, however the bench ends.
 
+use std::io::{BufRead, BufReader};
 use std::path::{Path, PathBuf};
-use std::process::{Command, Stdio};
-use std::time::Duration;
+use std::process::{Child as Process, Command, Stdio};
+use std::sync::mpsc::{Receiver, channel};
+use std::thread;
+use std::time::{Duration, Instant};
 
+use rustix::process::{Pid, Signal, kill_process};
 use schema::{Domain, Environment};
 
-use super::child::Child;
-use super::{Outcome, PART};
+use super::{Outcome, PART, clock};
 
-/// A domain and a directory.
+/// A domain and a directory of this process. Both are removed when it is dropped.
 pub(crate) struct Stage {
     pub(crate) domain: Domain,
     directory: PathBuf,
 }
 
 impl Stage {
-    /// A new one of this process.
+    /// Creates the domain and the directory of this process.
     pub(crate) fn new() -> Outcome<Stage> {
         let stage = Stage::of(std::process::id())?;
         std::fs::create_dir_all(&stage.directory)?;
@@ -29,7 +33,7 @@ impl Stage {
         Ok(Stage { domain, directory: std::env::temp_dir().join(format!("scanhub-{name}")) })
     }
 
-    /// Removes what benches left that were interrupted.
+    /// Removes what interrupted benches left behind.
     pub(crate) fn sweep() -> Outcome<()> {
         for entry in std::fs::read_dir(std::env::temp_dir())? {
             let name = entry?.file_name().to_string_lossy().into_owned();
@@ -41,42 +45,42 @@ impl Stage {
         Ok(())
     }
 
-    /// A file that parts may agree upon.
+    /// Returns the path of a file in the directory.
     pub(crate) fn file(&self, name: &str) -> PathBuf {
         self.directory.join(name)
     }
 
-    /// The file with the truth.
+    /// Returns the path of the file in which the simulator logs what it sent.
     pub(crate) fn truth(&self) -> PathBuf {
         self.directory.join("truth")
     }
 
-    /// Where the pty of `sensor` appears.
+    /// Returns the path at which the pty of `sensor` appears.
     pub(crate) fn port(&self, sensor: &str) -> String {
         self.directory.join(sensor).display().to_string()
     }
 
-    /// Sensors at the other end of ptys, idle, at `rate`.
+    /// Starts a simulator with idle sensors at ptys, at `rate`.
     pub(crate) fn simulate(&self, sensors: &[&str], rate: u32) -> Outcome<Child> {
         self.simulator(sensors, &self.truth(), &["--baud", &rate.to_string()])
     }
 
-    /// Sensors that stream at 500 kBd to whoever opens their ptys, in a simulator of their own that writes no truth.
+    /// Starts a simulator with sensors that stream at 500 kBd to any program that opens their ptys. It logs nothing.
     pub(crate) fn simulate_streaming(&self, sensors: &[&str]) -> Outcome<Child> {
         self.simulate_as(sensors, &["--baud", "500000", "--state", "streaming"])
     }
 
-    /// Sensors at the other end of ptys, as `flags` say, in a simulator of their own that writes no truth.
+    /// Starts a simulator with sensors at ptys and more `flags`. It logs nothing.
     pub(crate) fn simulate_as(&self, sensors: &[&str], flags: &[&str]) -> Outcome<Child> {
         self.simulator(sensors, Path::new("/dev/null"), flags)
     }
 
-    /// A sensor in a simulator of its own, as `flags` say, with its truth in [`Stage::own_truth`].
+    /// Starts a simulator with one sensor and more `flags`. It logs to [`Stage::own_truth`].
     pub(crate) fn simulate_one(&self, sensor: &str, flags: &[&str]) -> Outcome<Child> {
         self.simulator(&[sensor], &self.own_truth(sensor), flags)
     }
 
-    /// The file with the truth of a sensor that has a simulator of its own.
+    /// Returns the path of the log of a sensor that has its own simulator.
     pub(crate) fn own_truth(&self, sensor: &str) -> PathBuf {
         self.directory.join(format!("truth-{sensor}"))
     }
@@ -94,28 +98,23 @@ impl Stage {
         Ok(child)
     }
 
-    /// The hub; its first line says that it is up.
+    /// Starts the hub. Its first line says that it is up.
     pub(crate) fn hub(&self, sensors: &[&str]) -> Outcome<Child> {
-        self.hub_of(PROGRAM, sensors)
+        Child::of(self.hub_command(PROGRAM, sensors), Stdio::null())
     }
 
-    /// The hub with places for a crowd.
+    /// Starts the hub with room for [`CROWD`] subscribers.
     pub(crate) fn hub_for_crowd(&self, sensors: &[&str]) -> Outcome<Child> {
         let mut command = self.hub_command(PROGRAM, sensors);
         command.arg(format!("--set=limits.consumers={CROWD}"));
         Child::of(command, Stdio::null())
     }
 
-    /// The hub of another build of the program.
-    pub(crate) fn hub_of(&self, program: &str, sensors: &[&str]) -> Outcome<Child> {
-        Child::of(self.hub_command(program, sensors), Stdio::null())
-    }
-
-    /// What starts the hub.
+    /// Returns the command that starts the hub.
     pub(crate) fn hub_command(&self, program: &str, sensors: &[&str]) -> Command {
         let mut command = Command::new(program);
         command.args(["run", "--domain", self.domain.name()]);
-        // What it keeps goes with the stage.
+        // The state of the hub is removed with the stage.
         command.env("XDG_STATE_HOME", &self.directory).env_remove("STATE_DIRECTORY");
         sensors.iter().for_each(|sensor| {
             command.args(["--link", &format!("{sensor}={}", self.port(sensor))]);
@@ -123,12 +122,12 @@ impl Stage {
         command
     }
 
-    /// This program as a consumer of `topic`, with more `words`.
+    /// Starts this program as a subscriber of `topic`, with more `words`.
     pub(crate) fn consumer(&self, topic: &str, sensor: &str, words: &[&str]) -> Outcome<Child> {
         self.part(&[&["consume", topic, self.domain.name(), sensor], words].concat())
     }
 
-    /// This program as the floor that reads `count` telegrams from each port.
+    /// Starts this program as the baseline that reads `count` telegrams from each port.
     pub(crate) fn bare(&self, sensors: &[&str], count: usize) -> Outcome<Child> {
         let ports: Vec<String> = sensors.iter().map(|sensor| self.port(sensor)).collect();
         let mut words: Vec<&str> = ports.iter().map(String::as_str).collect();
@@ -137,7 +136,7 @@ impl Stage {
         self.part(&words)
     }
 
-    /// This program in one of its parts.
+    /// Starts this program in one of its parts.
     pub(crate) fn part(&self, words: &[&str]) -> Outcome<Child> {
         let words: Vec<String> = std::iter::once(&PART).chain(words).map(|word| word.to_string()).collect();
         Child::start(&std::env::current_exe()?.display().to_string(), &words)
@@ -146,7 +145,7 @@ impl Stage {
 
 impl Drop for Stage {
     fn drop(&mut self) {
-        // All of it is ours alone: the domain's name has our process id.
+        // The domain's name contains this process's ID, so nothing here belongs to another process.
         let _ = std::fs::remove_dir_all(&self.directory);
         let _ = std::fs::remove_dir_all(self.domain.root());
         let entries = std::fs::read_dir("/dev/shm").into_iter().flatten().flatten();
@@ -159,9 +158,150 @@ impl Drop for Stage {
 
 /// The two sensors of a vehicle.
 pub(crate) const SENSORS: [&str; 2] = ["front", "rear"];
-/// Consumers of a topic that [`Stage::hub_for_crowd`] has places for.
+/// Number of subscribers of a topic that [`Stage::hub_for_crowd`] has room for.
 pub(crate) const CROWD: usize = 200;
-/// Far longer than anything takes.
+/// Timeout, far longer than any step takes.
 pub(crate) const PATIENCE: Duration = Duration::from_secs(20);
 /// The program of this build.
 pub(crate) const PROGRAM: &str = env!("CARGO_BIN_EXE_scanhub");
+
+/// A process that is ended when this value is dropped.
+pub(crate) struct Guard(Process);
+
+impl Guard {
+    /// Takes over a process that was started.
+    pub(crate) fn new(process: Process) -> Guard {
+        Guard(process)
+    }
+
+    /// Returns the process ID.
+    pub(crate) fn pid(&self) -> u32 {
+        self.0.id()
+    }
+
+    /// Ends the process as a crash would. Fails if it ended before.
+    pub(crate) fn kill(mut self) -> Outcome<()> {
+        if let Some(status) = self.0.try_wait()? {
+            return Err(format!("process {} ended early: {status}", self.pid()).into());
+        }
+        self.0.kill()?;
+        self.wait()
+    }
+
+    /// Waits until the process has ended.
+    pub(crate) fn wait(mut self) -> Outcome<()> {
+        self.0.wait()?;
+        Ok(())
+    }
+}
+
+impl Drop for Guard {
+    fn drop(&mut self) {
+        if let (Ok(None), Some(pid)) = (self.0.try_wait(), Pid::from_raw(self.0.id() as i32)) {
+            let _ = kill_process(pid, Signal::TERM);
+        }
+        let deadline = Instant::now() + Duration::from_secs(2);
+        while let Ok(None) = self.0.try_wait() {
+            if Instant::now() > deadline {
+                let _ = self.0.kill();
+                let _ = self.0.wait();
+                return;
+            }
+            thread::sleep(Duration::from_millis(1));
+        }
+    }
+}
+
+/// A guarded process with the lines that it prints.
+pub(crate) struct Child {
+    pub(crate) guard: Guard,
+    lines: Receiver<Line>,
+    /// CLOCK_MONOTONIC just before the start.
+    pub(crate) started_ns: u64,
+}
+
+/// A line that a process printed, with the time at which it was read.
+#[derive(Clone, Debug)]
+pub(crate) struct Line {
+    pub(crate) at_ns: u64,
+    pub(crate) text: String,
+}
+
+impl Line {
+    /// Returns the words of the line.
+    pub(crate) fn words(&self) -> Vec<&str> {
+        self.text.split_whitespace().collect()
+    }
+
+    /// Returns word number `i` as a number.
+    pub(crate) fn number(&self, i: usize) -> Outcome<u64> {
+        let word =
+            self.text.split_whitespace().nth(i).ok_or_else(|| format!("no word {i}: {}", self.text))?;
+        Ok(word.parse()?)
+    }
+}
+
+impl Child {
+    /// Starts `program` with `arguments`.
+    pub(crate) fn start(program: &str, arguments: &[String]) -> Outcome<Child> {
+        let mut command = Command::new(program);
+        command.args(arguments);
+        Child::of(command, Stdio::null())
+    }
+
+    /// Starts `command` with this stdin.
+    pub(crate) fn of(mut command: Command, stdin: Stdio) -> Outcome<Child> {
+        command.stdin(stdin).stdout(Stdio::piped());
+        // The child ends with this process, and logs only errors.
+        command.env("SCANHUB_END_WITH_PARENT", "1").env("SCANHUB_LOG", "error");
+        let started_ns = clock::now();
+        let mut process = command.spawn()?;
+        let stdout = process.stdout.take();
+        let guard = Guard::new(process);
+        let stdout = BufReader::new(stdout.ok_or("no pipe")?);
+        let (send, lines) = channel();
+        thread::spawn(move || {
+            for text in stdout.lines().map_while(Result::ok) {
+                if send.send(Line { at_ns: clock::now(), text }).is_err() {
+                    return;
+                }
+            }
+        });
+        Ok(Child { guard, lines, started_ns })
+    }
+
+    /// Returns the next line that begins with `word`, and drops the lines before it.
+    pub(crate) fn await_line(&self, word: &str, patience: Duration) -> Outcome<Line> {
+        let end = Instant::now() + patience;
+        loop {
+            match self.lines.recv_timeout(end.saturating_duration_since(Instant::now())) {
+                Ok(line) if line.text.starts_with(word) => return Ok(line),
+                Ok(_) => {}
+                Err(_) => return Err(format!("no line {word:?} came").into()),
+            }
+        }
+    }
+
+    /// Returns the next line.
+    pub(crate) fn next_line(&self, patience: Duration) -> Outcome<Line> {
+        self.lines.recv_timeout(patience).map_err(|_| "no line came".into())
+    }
+
+    /// Returns all lines before the one that is `word`.
+    pub(crate) fn lines_until(&self, word: &str, patience: Duration) -> Outcome<Vec<Line>> {
+        let end = Instant::now() + patience;
+        let mut lines = Vec::new();
+        loop {
+            match self.lines.recv_timeout(end.saturating_duration_since(Instant::now())) {
+                Ok(line) if line.text == word => return Ok(lines),
+                Ok(line) => lines.push(line),
+                Err(_) => return Err(format!("no line {word:?} came after {} lines", lines.len()).into()),
+            }
+        }
+    }
+
+    /// Returns the lines that have arrived, without waiting.
+    pub(crate) fn lines_so_far(&self) -> Vec<Line> {
+        self.lines.try_iter().collect()
+    }
+}

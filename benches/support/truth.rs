@@ -1,4 +1,4 @@
-//! What the simulator says that it sent: the truth that everything received is compared with.
+//! What the simulator logs that it sent. Everything that is received is compared with it.
 
 use std::collections::HashMap;
 use std::path::Path;
@@ -8,34 +8,34 @@ use sha2::{Digest, Sha256};
 
 use super::Outcome;
 
-/// A telegram of measured data that left whole.
+/// A telegram of measured data that was sent completely.
 #[derive(Clone, Debug)]
 pub(crate) struct Sent {
     pub(crate) hash: String,
-    /// Its number among all that the sensor sent.
+    /// Index among all telegrams that the sensor sent.
     pub(crate) index: u64,
     /// CLOCK_MONOTONIC after its last byte was written.
     pub(crate) at_ns: u64,
 }
 
-/// What one sensor sent, in its order.
+/// What one sensor sent, in order.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Truth {
     pub(crate) sent: Vec<Sent>,
-    /// What found no room at the host, or not all of it: the rest of a later one may make it whole again.
+    /// Telegrams for which the host had no room, or not enough: the rest of a later one may complete it.
     overrun: Vec<Sent>,
-    /// When each telegram of measured data ended that the sensor broke off, because it was asked something.
+    /// Times at which the sensor aborted a telegram of measured data to answer a request.
     pub(crate) aborted_ns: Vec<u64>,
-    /// Only known once the simulator has ended.
+    /// Number of EEPROM writes; known once the simulator has ended.
     pub(crate) eeprom_writes: Option<u64>,
 }
 
 impl Truth {
-    /// The truth of `sensor` in the file at `path`.
+    /// Reads what `sensor` sent from the file at `path`.
     pub(crate) fn read(path: &Path, sensor: &str) -> Outcome<Truth> {
         let mut truth = Truth::default();
         for line in std::fs::read_to_string(path)?.lines() {
-            // The last line may be in the writing.
+            // The last line may be incomplete.
             let Ok(value) = serde_json::from_str::<Value>(line) else { continue };
             let port = value["port"].as_str().unwrap_or_default();
             if port.rsplit('/').next() != Some(sensor) {
@@ -55,15 +55,15 @@ impl Truth {
         Ok(truth)
     }
 
-    /// When each was due, by its hash, of a sensor that sends one each `every_ns`: some of its neighbours left in time. And for
-    /// how long it sent nothing in all although it should have.
+    /// For a sensor that sends one telegram every `every_ns`: returns the times at which each telegram was due, by its
+    /// hash, because some of its neighbors were sent in time; and for how long in all the sensor was kept from sending.
     pub(crate) fn due(&self, every_ns: u64) -> (HashMap<&str, Vec<u64>>, u64) {
         let mut all: Vec<&Sent> = self.sent.iter().chain(&self.overrun).collect();
         all.sort_by_key(|sent| sent.index);
         let begin = |sent: &&Sent| sent.at_ns.saturating_sub(sent.index * every_ns);
         let begins: Vec<u64> = all.iter().map(begin).collect();
         let least = |n: usize| {
-            let around = n.saturating_sub(NEIGHBOURS)..(n + NEIGHBOURS).min(begins.len());
+            let around = n.saturating_sub(NEIGHBORS)..(n + NEIGHBORS).min(begins.len());
             begins[around].iter().copied().min().unwrap_or_default()
         };
         let least: Vec<u64> = (0..begins.len()).map(least).collect();
@@ -75,16 +75,16 @@ impl Truth {
         (due, stood)
     }
 
-    /// How many left from `from_ns` on and before `to_ns`.
+    /// Returns the number of telegrams sent from `from_ns` on and before `to_ns`.
     pub(crate) fn count(&self, from_ns: u64, to_ns: u64) -> usize {
         self.sent.iter().filter(|sent| (from_ns..to_ns).contains(&sent.at_ns)).count()
     }
 }
 
-/// Telegrams on either side of which one left in time.
-const NEIGHBOURS: usize = 200;
+/// Number of telegrams on either side, one of which was sent in time.
+const NEIGHBORS: usize = 200;
 
-/// SHA-256 as the truth writes it.
+/// Returns the SHA-256 of `bytes` as the simulator writes it.
 pub(crate) fn hash(bytes: &[u8]) -> String {
     Sha256::digest(bytes).iter().map(|byte| format!("{byte:02x}")).collect()
 }

@@ -1,39 +1,29 @@
-//! That `multi` tells people from a room, and better than the paper's method: one run of each scene that has a target, as
-//! `benches/foreground` measures ten. What the simulated world or a method changes shows here first.
+//! Checks that `multi` separates people from a room, and better than the paper's method: one run of each scene that has
+//! a target. `benches/perception` measures ten. A change of the simulated world or of a method shows here first.
 
-#[path = "../../benches/foreground/boxes.rs"]
-mod boxes;
-#[path = "../../benches/foreground/method.rs"]
-mod method;
-#[path = "../../benches/foreground/play.rs"]
-mod play;
-#[path = "../../benches/foreground/score.rs"]
-mod score;
-#[path = "../../benches/support/seen.rs"]
-mod seen;
+#[path = "../testkit/foreground.rs"]
+mod scenes;
 
-use boxes::Boxes;
 use lms::variant::Unit;
-use method::{Hub, Method};
-use play::{Due, Frame, Scene, play};
 use preprocess::background::{Class, Method as Kind, Model, Settings};
 use schema::{Background, Foreground};
-use score::Score;
 
-/// None of the seeds that were tuned on.
+use scenes::{Boxes, Detector, Expected, HubDetector, LabeledScan, Scene, Score, play};
+
+/// A seed that no parameter was tuned on.
 const SEED: u64 = 20;
 
-fn hub(method: Kind) -> Box<dyn Method> {
-    Box::new(Hub::new(Settings { method, ..Settings::default() }))
+fn hub(method: Kind) -> Box<dyn Detector> {
+    Box::new(HubDetector::new(Settings { method, ..Settings::default() }))
 }
 
-fn scores(frames: &[Frame]) -> (Score, Score) {
+fn scores(frames: &[LabeledScan]) -> (Score, Score) {
     (Score::of(&mut *hub(Kind::Multi), frames), Score::of(&mut *hub(Kind::Paper), frames))
 }
 
 #[test]
 fn people_are_told_from_rooms() {
-    // Some way below what ten runs have on average: a single run has some luck.
+    // The limits are somewhat below the average of ten runs, because a single run varies.
     for (name, world, unit, recall, precision, wrong_per_scan) in [
         ("the room of Fig. 8", "fig8", Unit::Mm, 0.98, 0.95, 0.1),
         ("a corridor", "corridor", Unit::Cm, 0.9, 0.95, 0.1),
@@ -62,12 +52,13 @@ fn boxes_are_learned_and_forgotten() {
     );
 }
 
-/// Who begins with what another one had learned, of which a file has one range a beam, tells no more wrong than who went on.
+/// A model that starts with a saved background, which has one range per beam, reports no more wrong beams than one that
+/// continues.
 #[test]
 fn a_model_taken_back_is_right_at_once() {
     for world in ["fig8", "faint"] {
         let frames = play(&Scene { name: world, world, unit: Unit::Mm, mixed: true }, SEED);
-        // Before the walker, and while somebody is there.
+        // Before the walker arrives, and while a person is present.
         for at in [LEARNED, 800] {
             let mut model = Model::new(Settings::default(), BEAMS);
             let mut out = Foreground::of(BEAMS);
@@ -80,9 +71,9 @@ fn a_model_taken_back_is_right_at_once() {
                 let (mut found, mut wrong) = (0, 0);
                 for frame in &frames[at..at + 200] {
                     model.update(&frame.scan, &mut out);
-                    for (class, due) in model.classes().iter().zip(&frame.due) {
-                        found += u32::from(*class == Class::Foreground && *due == Due::Foreground);
-                        wrong += u32::from(*class == Class::Foreground && *due == Due::Other);
+                    for (class, due) in model.classes().iter().zip(&frame.expected) {
+                        found += u32::from(*class == Class::Foreground && *due == Expected::Foreground);
+                        wrong += u32::from(*class == Class::Foreground && *due == Expected::Other);
                     }
                 }
                 (found, wrong)
@@ -95,7 +86,7 @@ fn a_model_taken_back_is_right_at_once() {
     }
 }
 
-/// Of each scan.
+/// Beams of each scan.
 const BEAMS: usize = 361;
-/// Scans after which everything in these rooms is known.
+/// Number of scans after which everything in these rooms is known.
 const LEARNED: usize = 560;

@@ -2,8 +2,8 @@
 //! parameters; and something else with others. Two sensors of simulated rooms with people, recorded in made-up time, and
 //! replayed telegram by telegram.
 
-#[path = "../../benches/support/rooms.rs"]
-mod rooms;
+#[path = "../testkit/recorded_rooms.rs"]
+mod recorded_rooms;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::mpsc::channel;
@@ -13,7 +13,7 @@ use std::time::{Duration, Instant};
 use crate::testkit::{PATIENCE, TestEnv, in_own_process};
 use config::Sources;
 use daemon::{Play, Player, Replay};
-use rooms::{Followers, LEARNING, Published, SENSORS};
+use recorded_rooms::{LEARNING, Published, SENSORS, Subscribers};
 use schema::ipc;
 use schema::{Flags, Topic};
 
@@ -24,7 +24,9 @@ const SILENCE: u64 = 300;
 /// Records two sensors; where, and what was published of each.
 fn record(env: &TestEnv) -> (PathBuf, Vec<Vec<Published>>) {
     let (file, mut published) = (env.path("two.mcap"), vec![Vec::new(), Vec::new()]);
-    rooms::record(&env.place(), &file, SCANS, Some(SILENCE), |number, sample| published[number].push(sample));
+    recorded_rooms::record(&env.place(), &file, SCANS, Some(SILENCE), |number, sample| {
+        published[number].push(sample)
+    });
     (file, published)
 }
 
@@ -47,7 +49,7 @@ fn replay(env: &TestEnv, file: &Path, play: Play, set: &[&str]) -> Vec<Vec<Publi
         });
         let player: Arc<Player> = ready.recv_timeout(PATIENCE).expect("is up");
         let node = ipc::client_node(&domain).expect("a node");
-        let followers = SENSORS.map(|(name, _)| Followers::attach(&node, name));
+        let followers = SENSORS.map(|(name, _)| Subscribers::attach(&node, name));
         let mut published = vec![Vec::new(), Vec::new()];
         let mut telegrams = 0;
         let mut take = |published: &mut Vec<Vec<Published>>| {

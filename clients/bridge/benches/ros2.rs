@@ -1,7 +1,8 @@
-//! What the way through a graph of ROS 2 costs: how long a scan takes from shared memory until a plain Zenoh subscriber has
-//! decoded it, beside the same bytes from a plain Zenoh publisher in the same run; how many come; how busy the bridge is.
+//! What does a scan cost on its way through a graph of ROS 2? How long does it take from shared memory until a plain
+//! Zenoh subscriber has decoded it, compared with the same bytes from a plain Zenoh publisher in the same run; how many
+//! arrive; how busy is the bridge?
 //!
-//! `cargo bench -p scanhub-bridge --bench ros2 [-- SECONDS]` (default 20), with `cargo build --release` before it.
+//! `cargo bench -p scanhub-bridge --bench ros2 [-- SECONDS]` (default 20), after `cargo build --release`.
 
 mod stage;
 
@@ -107,5 +108,5 @@ fn measure(stage: &Stage, run_for: Duration) {
         theirs[1],
         ours[0] / theirs[0]
     );
-    println!("processor time of the bridge: {:.2} % of a core", busy as f64 / elapsed.as_secs_f64());
+    println!("CPU time of the bridge: {:.2} % of a core", busy as f64 / elapsed.as_secs_f64());
 }

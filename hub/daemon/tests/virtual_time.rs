@@ -1,7 +1,7 @@
 //! Links that are driven in made-up time publish what those of lines do: every telegram, its scan, the moments that were
 //! told. Nobody sleeps here.
 
-#[path = "../../../benches/support/virtual_hub.rs"]
+#[path = "../../../tests/testkit/virtual_hub.rs"]
 mod virtual_hub;
 
 use std::fs;

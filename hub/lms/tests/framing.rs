@@ -1,15 +1,13 @@
 //! The framer's promises on a lossy line, by the thousand: no intact telegram is lost, no wrong one looks clean, and
-//! none is late by more than the hold. The same on 400,000 telegrams, beside other parsers: `benches/framing`.
+//! none is late by more than the hold. Two other parsers read the same line for comparison.
 
 mod line;
-#[path = "../../../benches/framing/rivals.rs"]
-mod rivals;
 
 use line::account::{Account, framer};
+use line::parsers::{Discarding, Rewinding};
 use line::scene::Scene;
 use line::{Line, TELEGRAM};
 use lms::framer::Tally;
-use rivals::{Discarding, Rewinding};
 
 #[test]
 fn no_intact_telegram_is_lost_and_none_is_late() {

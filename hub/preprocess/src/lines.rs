@@ -226,7 +226,7 @@ const NUMBERS: f64 = 4.0;
 /// Points of one line are at most so far apart: PLE's own for real scans.
 const GAP_M: f64 = 1.0;
 /// Where there are more lines than allowed, leaving out a beam is as bad as an error of this. On logs of four sensors (aces,
-/// Freiburg, Intel, Orebro: `cargo bench --bench lines`) ten vertices cover more beams so than RANSAC's, and fit better.
+/// Freiburg, Intel, Orebro: `cargo bench --bench perception`) ten vertices cover more beams so than RANSAC's, and fit better.
 const LOSS_M: f64 = 0.2;
 /// Lines are neighbours if fewer beams than this are between them.
 const NEIGHBOURS: f32 = 4.5;

@@ -110,24 +110,6 @@ fn nothing_promises_safety() {
 }
 
 #[test]
-fn tables_are_of_the_last_runs() {
-    let planted =
-        "{\"class\":\"measurement\",\"bench\":\"planted\",\"name\":\"nobody measured\",\"runs\":1}\n";
-    holds(written::tables_are_of_the_last_runs, |tree| {
-        let page = tree.text("benches/README.md");
-        vec![
-            tree.with("benches/last/planted.jsonl", planted),
-            tree.with("benches/last/planted.jsonl", "no line\n"),
-            tree.with(
-                "benches/README.md",
-                &page.replace("<!-- Until here. -->", "0 by hand\n<!-- Until here. -->"),
-            ),
-            tree.with("benches/README.md", &page.replace("<!-- Until here. -->", "")),
-        ]
-    });
-}
-
-#[test]
 fn the_first_consumer_is_compiled() {
     holds(written::the_first_consumer_is_compiled, |tree| {
         let (page, example) = ("docs/first-consumer.md", "clients/examples/first.rs");

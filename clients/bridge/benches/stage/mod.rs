@@ -1,6 +1,7 @@
-//! What the benches of the bridge play on: programs in directories of their own, which end with the bench, plain sessions of
-//! Zenoh beside them, and how busy a process is.
-#![allow(dead_code)] // Each bench takes what it needs.
+//! Where the benches of the bridge run: programs in separate directories, which end with the bench, plain Zenoh
+//! sessions next to them, and the CPU time of a process.
+
+#![allow(dead_code)] // Each bench uses a part of it.
 
 use std::fs::{self, DirBuilder, File};
 use std::net::{SocketAddr, TcpListener, TcpStream};
@@ -15,34 +16,34 @@ use scanhub_client::streams::{Session, Source};
 use scanhub_client::{Domain, Topic};
 use zenoh::{Config, Wait};
 
-/// Places for what runs, gone with it.
+/// A directory for the programs of a bench, removed when it is dropped.
 pub(crate) struct Stage {
     place: PathBuf,
     scanhub: PathBuf,
 }
 
-/// A program.
+/// A running program.
 pub(crate) struct Running {
     child: Child,
     out: PathBuf,
 }
 
-/// A machine: what runs there has one domain.
+/// A simulated machine: all programs on it share a domain.
 pub(crate) struct Machine<'a> {
     stage: &'a Stage,
     pub(crate) root: PathBuf,
 }
 
 const BRIDGE: &str = env!("CARGO_BIN_EXE_scanhub-bridge");
-/// The sensors of a robot.
+/// Sensors of a robot.
 pub(crate) const SENSORS: [&str; 2] = ["front", "rear"];
 
 impl Stage {
-    /// Nothing if the program is not there that has a hub.
+    /// Creates the directory; `None` if the program with the hub was not built.
     pub(crate) fn new(name: &str) -> Option<Stage> {
         let scanhub = Path::new(BRIDGE).with_file_name("scanhub");
         if !scanhub.is_file() {
-            eprintln!("{} is not there: cargo build --release", scanhub.display());
+            eprintln!("{} was not built: run cargo build --release", scanhub.display());
             return None;
         }
         let place = std::env::temp_dir().join(format!("scanhub-bench-{name}-{}", std::process::id()));
@@ -64,7 +65,7 @@ impl Drop for Stage {
 }
 
 impl Machine<'_> {
-    /// A hub of two simulated sensors at 500 kBd.
+    /// Starts a hub of two simulated sensors at 500 kBd.
     pub(crate) fn robot(&self) -> [Running; 2] {
         let port = |name: &str| self.root.join(format!("tty-{name}")).display().to_string();
         let ports = SENSORS.map(|name| format!("--port={}", port(name)));
@@ -89,7 +90,7 @@ impl Machine<'_> {
         Running { child, out }
     }
 
-    /// Follows topics in shared memory there, once each of them was there.
+    /// Subscribes to topics in the shared memory of this machine, and waits until all of them exist.
     pub(crate) fn follow<const N: usize>(&self, topics: [(&str, Topic); N]) -> (Session, [Source; N]) {
         let mut memory = Session::new(vec![Domain::at("bench", &self.root).expect("a name")]);
         let mut sources = topics.map(|(sensor, topic)| Source::new(sensor, topic));
@@ -105,32 +106,36 @@ impl Machine<'_> {
 }
 
 impl Running {
-    /// Processor time so far, in clock ticks of a hundredth of a second.
+    /// Returns the CPU time so far, in clock ticks of a hundredth of a second.
     pub(crate) fn ticks(&self) -> u64 {
         let stat = fs::read_to_string(format!("/proc/{}/stat", self.child.id())).unwrap_or_default();
         let after_name = stat.rsplit(") ").next().unwrap_or_default();
         after_name.split(' ').skip(11).take(2).filter_map(|number| number.parse::<u64>().ok()).sum()
     }
 
-    /// What it has told so far, one object a line.
+    /// Returns what the program has printed so far, one object per line.
     pub(crate) fn told(&self) -> Vec<serde_json::Value> {
         let text = fs::read_to_string(&self.out).unwrap_or_default();
         text.lines().filter_map(|line| serde_json::from_str(line).ok()).collect()
     }
 
-    /// Waits until it tells something like this.
+    /// Waits until the program prints a line that `what` accepts.
     pub(crate) fn tells(&self, what: impl Fn(&serde_json::Value) -> bool) -> serde_json::Value {
         let begun = Instant::now();
         loop {
             if let Some(line) = self.told().into_iter().find(&what) {
                 return line;
             }
-            assert!(begun.elapsed() < Duration::from_secs(30), "it is not told: {:?}", self.told().last());
+            assert!(
+                begun.elapsed() < Duration::from_secs(30),
+                "the expected line was not printed; last line: {:?}",
+                self.told().last()
+            );
             thread::sleep(Duration::from_millis(20));
         }
     }
 
-    /// Ends it in order, and returns what it told.
+    /// Ends the program with SIGINT, and returns what it printed.
     pub(crate) fn end(mut self) -> Vec<serde_json::Value> {
         if let Some(process) = rustix::process::Pid::from_raw(self.child.id() as i32) {
             rustix::process::kill_process(process, rustix::process::Signal::INT).expect("it is ours");
@@ -151,21 +156,21 @@ fn make(place: &Path) {
     DirBuilder::new().mode(0o700).create(place).expect("a new directory");
 }
 
-/// An address that nobody listens at.
+/// Returns an address on which no program listens.
 pub(crate) fn free_port() -> SocketAddr {
     TcpListener::bind("127.0.0.1:0").and_then(|it| it.local_addr()).expect("a port")
 }
 
-/// Waits until somebody listens there.
+/// Waits until a program listens on the address.
 pub(crate) fn listened(at: SocketAddr) {
     let begun = Instant::now();
     while TcpStream::connect(at).is_err() {
-        assert!(begun.elapsed() < Duration::from_secs(30), "nobody listens at {at}");
+        assert!(begun.elapsed() < Duration::from_secs(30), "no program listens on {at}");
         thread::sleep(Duration::from_millis(1));
     }
 }
 
-/// A plain session of Zenoh at a router.
+/// Opens a plain Zenoh session at a router.
 pub(crate) fn session(router: SocketAddr) -> zenoh::Session {
     let mut config = Config::default();
     for (key, value) in [
@@ -178,10 +183,10 @@ pub(crate) fn session(router: SocketAddr) -> zenoh::Session {
     zenoh::open(config).wait().expect("a session")
 }
 
-/// Nanoseconds of something, by whatever thread they are measured.
+/// Durations in nanoseconds, measured by any thread.
 pub(crate) type Times = Arc<Mutex<Vec<u64>>>;
 
-/// The value below which this share of all is, in us.
+/// Returns the value below which this share of all lies, in us.
 pub(crate) fn percentile(values: &mut [u64], share: f64) -> f64 {
     values.sort_unstable();
     let place = ((values.len() as f64 - 1.0) * share).max(0.0) as usize;

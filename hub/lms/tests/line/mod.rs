@@ -1,11 +1,12 @@
 //! A line that loses bytes in bursts, on a virtual clock: what a reader gets when, and what the sensor had sent.
-//! Shared by the test of the framer's promises and by the comparison of parsers (`benches/framing`).
+//! Shared by the test of the framer's promises and by the benches `line_loss` and `host_load`.
 //!
 //! Losses come in bursts (paper III.B.4: 0.135 % of the bytes, 40.8 % of the telegrams): one begins at a byte with
 //! probability 7.14e-4, its length is geometric with mean 1.89. The sensor sends 508 bytes of a telegram, pauses,
 //! sends the rest; the reader sees pieces of 16, as a UART's FIFO hands them over.
 
 pub(crate) mod account;
+pub(crate) mod parsers;
 pub(crate) mod scene;
 
 use fastrand::Rng;

@@ -2,7 +2,7 @@
 //! to know how many neighbouring beams make an object: `runs` decides that.
 //!
 //! All beams take the same steps, whatever they hit, so that the compiler can vectorise them. The constants were found
-//! on seeds 0 to 9 of the simulated scenes, by `benches/foreground`.
+//! on seeds 0 to 9 of the simulated scenes, by `benches/perception`.
 
 use super::runs::Runs;
 use super::settings::Limits;

@@ -1,0 +1,206 @@
+//! What do subscribers of one sensor cost the hub, when does the last of them have a scan, and how much memory does a
+//! hub with 200 subscribers take? Subscribers sleep on the doorbell or on the event, and the sensor at the other end of
+//! a pty keeps its rate.
+
+use std::collections::BTreeMap;
+use std::sync::Barrier;
+use std::thread;
+use std::time::Duration;
+
+use scanhub_client::Wait;
+use schema::Scan;
+
+use crate::growth::{Quantity, Sweep};
+use crate::support::consumer::subscribe;
+use crate::support::figures::{self, Cell, Figure, Target, percentile};
+use crate::support::stage::{Child, PATIENCE, SENSORS, Stage};
+use crate::support::truth::Truth;
+use crate::support::usage::{Resident, Work, segments};
+use crate::support::{Options, Outcome, clock};
+
+/// Measures 1 to 200 subscribers, for each way to wait.
+pub(crate) fn consumers(options: &Options) -> Outcome<()> {
+    let stage = Stage::new()?;
+    let _simulator = stage.simulate(&[SENSOR], 500_000)?;
+    for wait in ["doorbell", "event"] {
+        let quantity = |name, unit, linear| Quantity { name, unit, linear };
+        let quantities = vec![
+            quantity("CPU time per telegram", "us", Some(1.0)),
+            quantity("last subscriber, p50", "us", Some(1.0)),
+            quantity("last subscriber, p99", "us", Some(1.0)),
+            quantity("own memory of the hub", "kB", Some(1.0)),
+            quantity("shared memory touched by it", "kB", Some(1.0)),
+            quantity("shared memory of the domain", "kB", Some(1.0)),
+            quantity("missed", "1", None),
+        ];
+        let mut sweep = Sweep::new(
+            &format!("subscribers of one sensor, waiting for the {wait}"),
+            "subscribers",
+            quantities,
+        );
+        for _ in 0..options.pairs().min(3) {
+            // One hub for all numbers: subscribers that leave give their memory back.
+            let hub = stage.hub_for_crowd(&[SENSOR])?;
+            hub.await_line("ready", PATIENCE)?;
+            let mut runs = Vec::new();
+            for count in CONSUMERS {
+                runs.push((count, run(&stage, &hub, count, options.seconds(8), wait)?));
+            }
+            runs.into_iter().for_each(|(count, values)| sweep.add(count, &values));
+            hub.guard.kill()?;
+        }
+        sweep.print(options.json);
+    }
+    Ok(())
+}
+
+/// Subscribes to the scans of `sensor` `count` times, and receives for `seconds` from the moment at which each
+/// subscriber has a scan. Prints for each scan how many subscribers got it and when the last one did, `last SEQ COUNT
+/// AGE_NS`, and `missed COUNT`.
+pub(crate) fn follow(domain: &str, sensor: &str, count: usize, seconds: u64, wait: &str) -> Outcome<()> {
+    let wait = if wait == "event" { Wait::Event } else { Wait::Doorbell };
+    let all = Barrier::new(count + 1);
+    let follow = || -> Result<(Vec<(u64, u64)>, u64), String> {
+        let attached = subscribe::<Scan>(domain, sensor).map(|scans| scans.wait_by(wait).timeout(PATIENCE));
+        let attached = attached.and_then(|mut scans| {
+            scans.next()?.map(drop).map_or(Err("no scan arrived".into()), |()| Ok(scans))
+        });
+        // The others do not wait for a subscriber that fails.
+        all.wait();
+        let mut scans = attached.map_err(|error| error.to_string())?;
+        let words = |failure: schema::Failure| failure.to_string();
+        // Samples that queued up, or were missed, while others attached do not count.
+        while scans.try_next().map_err(words)?.is_some() {}
+        let end = clock::now() + seconds * 1_000_000_000;
+        let (mut ages, mut missed) = (Vec::with_capacity(50 * seconds as usize), 0);
+        while clock::now() < end {
+            let scan = scans.next().map_err(words)?.ok_or("no scan arrived")?;
+            let header = scan.header();
+            ages.push((header.seq, clock::now().saturating_sub(header.stamp_last_ns)));
+            missed += scan.missed;
+        }
+        Ok((ages, missed))
+    };
+    thread::scope(|scope| {
+        let threads: Vec<_> = (0..count).map(|_| scope.spawn(follow)).collect();
+        all.wait();
+        println!("following {count}");
+        let (mut last, mut all_missed) = (BTreeMap::<u64, (usize, u64)>::new(), 0);
+        for thread in threads {
+            let (ages, missed) = thread.join().map_err(|_| "a subscriber panicked")??;
+            all_missed += missed;
+            for (seq, age) in ages {
+                let entry = last.entry(seq).or_default();
+                *entry = (entry.0 + 1, entry.1.max(age));
+            }
+        }
+        last.iter().for_each(|(seq, (count, age))| println!("last {seq} {count} {age}"));
+        println!("missed {all_missed}");
+        println!("end");
+        Ok(())
+    })
+}
+
+/// Starts `count` subscribers in a few processes, and waits until each has a scan.
+fn start(stage: &Stage, sensor: &str, count: usize, seconds: u64, wait: &str) -> Outcome<Vec<Child>> {
+    let processes = PROCESSES.min(count);
+    let part = |number: usize| {
+        let share = (count * (number + 1) / processes - count * number / processes).to_string();
+        stage.part(&["followers", stage.domain.name(), sensor, &share, &seconds.to_string(), wait])
+    };
+    let crowd: Vec<Child> = (0..processes).map(part).collect::<Outcome<_>>()?;
+    crowd.iter().try_for_each(|child| child.await_line("following", PATIENCE).map(drop))?;
+    Ok(crowd)
+}
+
+/// Returns the values of the sweep for `count` subscribers.
+fn run(stage: &Stage, hub: &Child, count: usize, seconds: u64, wait: &str) -> Outcome<[f64; 7]> {
+    let crowd = start(stage, SENSOR, count, seconds, wait)?;
+    // Ends before the first subscriber leaves.
+    let look = || -> Outcome<(u64, Work)> { Ok((clock::now(), Work::of(hub.guard.pid(), |_| true)?)) };
+    let before = look()?;
+    thread::sleep(Duration::from_millis(900 * seconds));
+    let after = look()?;
+    let memory = Resident::of(hub.guard.pid())?;
+    let shared: f64 = segments(&stage.domain)?.values().map(|(_, bytes)| bytes).sum();
+    let telegrams = Truth::read(&stage.truth(), SENSOR)?.count(before.0, after.0);
+    let (mut last, mut missed) = (BTreeMap::<u64, (u64, u64)>::new(), 0);
+    for child in &crowd {
+        for line in child.lines_until("end", PATIENCE + Duration::from_secs(seconds))? {
+            if line.text.starts_with("missed") {
+                missed += line.number(1)?;
+                continue;
+            }
+            let entry = last.entry(line.number(1)?).or_default();
+            *entry = (entry.0 + line.number(2)?, entry.1.max(line.number(3)?));
+        }
+    }
+    let of_all = last.values().filter(|(got, _)| *got == count as u64);
+    let mut ages: Vec<f64> = of_all.map(|(_, age)| *age as f64 / 1e3).collect();
+    ages.sort_by(f64::total_cmp);
+    let at = |part| percentile(&ages, part).ok_or("no scan reached all subscribers");
+    Ok([
+        after.1.since(before.1).busy_ns as f64 / 1e3 / telegrams as f64,
+        at(0.5)?,
+        at(0.99)?,
+        memory.own / 1024.0,
+        memory.shared / 1024.0,
+        shared / 1024.0,
+        missed as f64,
+    ])
+}
+
+const SENSOR: &str = "front";
+const CONSUMERS: [usize; 5] = [1, 4, 16, 64, 200];
+const PROCESSES: usize = 4;
+
+/// Number and bytes of files, by the ends of their names.
+type Kinds = BTreeMap<String, (usize, f64)>;
+
+/// Measures the memory of a hub with two links and 100 subscribers to the scans of each.
+pub(crate) fn memory(options: &Options) -> Outcome<()> {
+    let stage = Stage::new()?;
+    let _simulator = stage.simulate(&SENSORS, 500_000)?;
+    let hub = stage.hub_for_crowd(&SENSORS)?;
+    hub.await_line("ready", PATIENCE)?;
+    let alone = segments(&stage.domain)?;
+    // They stay until they are ended, so that the first ones are still attached when the last ones are.
+    let (seconds, long) = (options.seconds(8), 3600);
+    let crowds: Vec<_> =
+        SENSORS.iter().map(|sensor| start(&stage, sensor, 100, long, "doorbell")).collect::<Outcome<_>>()?;
+    thread::sleep(Duration::from_secs(seconds));
+    let resident = Resident::of(hub.guard.pid())?;
+    let full = segments(&stage.domain)?;
+    drop(crowds);
+    let figure = |name, bytes: f64, target| {
+        let hub = vec![bytes / 1024.0 / 1024.0];
+        Figure { name, unit: "MiB", hub, baseline: Vec::new(), target }
+    };
+    let sum = |kinds: &Kinds| kinds.values().map(|(_, bytes)| bytes).sum();
+    let rows = [
+        figure("resident, 2 links, 200 subscribers", resident.all, Target::Most(16.0)),
+        figure("of this, own", resident.own, Target::None),
+        figure("of this, program and libraries", resident.files, Target::None),
+        figure("of this, shared memory touched", resident.shared, Target::None),
+        figure("shared memory, no subscriber", sum(&alone), Target::None),
+        figure("shared memory, 200 subscribers", sum(&full), Target::None),
+    ];
+    figures::print("consumers", options.json, &rows);
+    figures::print_cells("consumers", options.json, &cells("no subscriber", &alone));
+    figures::print_cells("consumers", options.json, &cells("200 subscribers", &full));
+    Ok(())
+}
+
+fn cells(when: &str, kinds: &Kinds) -> Vec<Cell> {
+    let cell = |kind: &String, column: &str, unit, value| Cell {
+        table: format!("shared memory of two links, {when}"),
+        row: format!(".{kind}"),
+        column: column.to_owned(),
+        unit,
+        values: vec![value],
+    };
+    let row = |(kind, (count, bytes)): (&String, &(usize, f64))| {
+        [cell(kind, "segments", "1", *count as f64), cell(kind, "taken", "kB", bytes / 1024.0)]
+    };
+    kinds.iter().flat_map(row).collect()
+}

@@ -1,0 +1,145 @@
+//! Quantities over a number of subscribers, sensors or beams: a table, and a fit that says how they grow.
+
+use crate::support::figures::{self, Cell, percentile};
+
+/// A quantity that is measured for each number.
+pub(crate) struct Quantity {
+    pub(crate) name: &'static str,
+    pub(crate) unit: &'static str,
+    /// Exponent of the quantity if the total grows linearly: 0 for a cost per item, 1 for the cost of all items. `None`
+    /// if the growth is not evaluated.
+    pub(crate) linear: Option<f64>,
+}
+
+/// Values of several quantities, measured for several numbers.
+pub(crate) struct Sweep {
+    title: String,
+    /// What is counted.
+    counted: &'static str,
+    quantities: Vec<Quantity>,
+    /// The numbers in order, each with the values of all runs by quantity.
+    rows: Vec<(usize, Vec<Vec<f64>>)>,
+}
+
+/// How a quantity grows, from the medians of its runs.
+#[derive(Clone, Copy, Debug)]
+struct Growth {
+    /// Parameters of `fixed + each * n`, by least squares of relative errors.
+    fixed: f64,
+    each: f64,
+    /// Slope of the logarithms for large numbers: 1 for a quantity that grows linearly.
+    exponent: f64,
+}
+
+impl Sweep {
+    /// Creates a sweep without values.
+    pub(crate) fn new(title: &str, counted: &'static str, quantities: Vec<Quantity>) -> Sweep {
+        Sweep { title: title.to_owned(), counted, quantities, rows: Vec::new() }
+    }
+
+    /// Adds the values of one run with `number`: one for each quantity, in their order.
+    pub(crate) fn add(&mut self, number: usize, values: &[f64]) {
+        if self.rows.last().is_none_or(|(last, _)| *last != number) {
+            self.rows.push((number, vec![Vec::new(); self.quantities.len()]));
+        }
+        if let Some((_, row)) = self.rows.last_mut() {
+            row.iter_mut().zip(values).for_each(|(cell, value)| cell.push(*value));
+        }
+    }
+
+    /// Prints the values and how they grow.
+    pub(crate) fn print(&self, is_json: bool) {
+        figures::print_cells("consumers", is_json, &self.cells());
+        figures::print_cells("consumers", is_json, &self.growths(is_json));
+    }
+
+    fn cells(&self) -> Vec<Cell> {
+        let cell = |number: usize, quantity: &Quantity, values: &[f64]| Cell {
+            table: self.title.clone(),
+            row: format!("{number} {}", self.counted),
+            column: quantity.name.to_owned(),
+            unit: quantity.unit,
+            values: values.to_vec(),
+        };
+        let row = |(number, row): &(usize, Vec<Vec<f64>>)| {
+            let cells = self.quantities.iter().zip(row);
+            cells.map(|(quantity, values)| cell(*number, quantity, values)).collect::<Vec<_>>()
+        };
+        self.rows.iter().flat_map(row).collect()
+    }
+
+    /// Returns the fits, and prints which quantities grow worse than linearly.
+    fn growths(&self, json: bool) -> Vec<Cell> {
+        let mut cells = Vec::new();
+        for (at, quantity) in self.quantities.iter().enumerate() {
+            let (Some(linear), Some(growth)) = (quantity.linear, Growth::of(&self.medians(at))) else {
+                continue;
+            };
+            let columns = [
+                ("fixed", quantity.unit, growth.fixed),
+                ("for each", quantity.unit, growth.each),
+                ("exponent", "1", growth.exponent),
+                ("exponent of linear growth", "1", linear),
+            ];
+            cells.extend(columns.map(|(column, unit, value)| Cell {
+                table: format!("growth, {}", self.title),
+                row: quantity.name.to_owned(),
+                column: column.to_owned(),
+                unit,
+                values: vec![value],
+            }));
+            if !json && growth.exponent > linear + BEYOND {
+                println!("{}: {} grows WORSE THAN LINEARLY", self.title, quantity.name);
+            }
+        }
+        cells
+    }
+
+    /// The median of quantity `at` for each number.
+    fn medians(&self, at: usize) -> Vec<(f64, f64)> {
+        let median = |(number, row): &(usize, Vec<Vec<f64>>)| {
+            let mut sorted = row[at].clone();
+            sorted.sort_by(f64::total_cmp);
+            Some((*number as f64, percentile(&sorted, 0.5)?))
+        };
+        self.rows.iter().filter_map(median).collect()
+    }
+}
+
+impl Growth {
+    /// Returns `None` for fewer than three numbers, or if a value is zero.
+    fn of(points: &[(f64, f64)]) -> Option<Growth> {
+        let greatest = points.last()?.0;
+        if points.len() < 3 || points.iter().any(|&(n, value)| n <= 0.0 || value <= 0.0) {
+            return None;
+        }
+        let (fixed, each) = line(points.iter().map(|&(n, value)| (n, value, 1.0 / (value * value))))?;
+        let far = points.iter().filter(|(n, _)| n * FAR >= greatest);
+        let near = points.len().saturating_sub(3);
+        // At least three, or the slope would be the spread of two runs.
+        let far: Vec<_> =
+            if far.clone().count() < 3 { points[near..].to_vec() } else { far.copied().collect() };
+        let (_, exponent) = line(far.iter().map(|(n, value)| (n.ln(), value.ln(), 1.0)))?;
+        Some(Growth { fixed, each, exponent })
+    }
+}
+
+/// Returns a and b of the line `a + b x` that is nearest to the points with their weights.
+fn line(points: impl Iterator<Item = (f64, f64, f64)>) -> Option<(f64, f64)> {
+    let [mut weights, mut x, mut y, mut xx, mut xy] = [0.0; 5];
+    for (at, value, weight) in points {
+        weights += weight;
+        x += weight * at;
+        y += weight * value;
+        xx += weight * at * at;
+        xy += weight * at * value;
+    }
+    let spread = weights * xx - x * x;
+    let slope = (weights * xy - x * y) / spread;
+    (spread > 0.0).then(|| ((y - slope * x) / weights, slope))
+}
+
+/// Numbers within this factor of the largest one count as large.
+const FAR: f64 = 16.0;
+/// An exponent that is larger than that of linear growth by this much is not explained by the spread of a few runs.
+const BEYOND: f64 = 0.25;

@@ -1,0 +1,410 @@
+//! What do sensors cost the hub: on lines, at their own rate; and in virtual time, as fast as they can be processed?
+//! And what do beams cost?
+
+use std::path::Path;
+use std::thread;
+use std::time::Duration;
+
+use config::{Config, Sources};
+use lms::Nanos;
+use lms::measured;
+use lms::telegram::STX;
+use lms::variant::{MIRROR_TURN, Mode, Unit, Variant};
+use rustix::time::{ClockId, clock_gettime};
+use schema::ipc::{self, Node, Payload, Subscriber};
+use schema::{Background, Failure, Foreground, Kind, Marks, Scan, Status, Zones};
+use sim::room::Room;
+
+use crate::growth::{Quantity, Sweep};
+use crate::support::figures::{self, Figure, Target, percentile};
+use crate::support::stage::{Child, PATIENCE, Stage};
+use crate::support::truth::Truth;
+use crate::support::usage::{Resident, Work, segments};
+use crate::support::{Options, Outcome, clock};
+use crate::virtual_hub::{VirtualLink, virtual_hub};
+
+/// Numbers of sensors on lines.
+const ON_LINES: [usize; 5] = [1, 2, 4, 8, 16];
+/// Scans of a sensor on a line that do not count.
+const SETTLING: usize = 80;
+
+/// Measures 1 to 16 sensors, each with its own simulator at the other end of a pty and a subscriber to its scans. The
+/// rate shows whether simulators and hub, on the same processors, keep up with the sensors.
+pub(crate) fn on_lines(options: &Options) -> Outcome<()> {
+    let quantity = |name, unit, linear| Quantity { name, unit, linear };
+    let quantities = vec![
+        quantity("CPU time per telegram", "us", Some(0.0)),
+        quantity("last byte read to subscriber, p50", "us", Some(0.0)),
+        quantity("last byte read to subscriber, p99", "us", Some(0.0)),
+        quantity("own memory of the hub", "kB", Some(1.0)),
+        quantity("shared memory touched by it", "kB", Some(1.0)),
+        quantity("shared memory of the domain", "kB", Some(1.0)),
+        quantity("rate of the slowest sensor", "Hz", None),
+    ];
+    let mut sweep = Sweep::new("sensors on ptys", "sensors", quantities);
+    for sensors in ON_LINES {
+        for _ in 0..options.pairs().min(3) {
+            match run_on_lines(sensors, options.seconds(10)) {
+                Ok(values) => sweep.add(sensors, &values),
+                Err(error) => eprintln!("{sensors} sensors on ptys: {error}"),
+            }
+        }
+    }
+    sweep.print(options.json);
+    Ok(())
+}
+
+/// Returns the values of the sweep.
+fn run_on_lines(sensors: usize, seconds: u64) -> Outcome<[f64; 7]> {
+    let stage = Stage::new()?;
+    let names: Vec<String> = (0..sensors).map(|number| format!("s{number}")).collect();
+    let names: Vec<&str> = names.iter().map(String::as_str).collect();
+    let _simulators: Vec<Child> =
+        names.iter().map(|name| stage.simulate_one(name, &["--baud", "500000"])).collect::<Outcome<_>>()?;
+    let hub = stage.hub(&names)?;
+    hub.await_line("ready", PATIENCE)?;
+    let count = SETTLING + (seconds as f64 * RATE) as usize;
+    let start = |name: &&str| stage.part(&["ages", "scan", stage.domain.name(), name, &count.to_string()]);
+    let consumers: Vec<Child> = names.iter().map(start).collect::<Outcome<_>>()?;
+    let patience = PATIENCE + Duration::from_secs(4 * seconds);
+    // Wait until all sensors stream and the timing of each line is known.
+    for consumer in &consumers {
+        consumer.await_line("attaching", PATIENCE)?;
+    }
+    thread::sleep(Duration::from_millis((SETTLING as f64 / RATE * 1e3) as u64));
+    let look = || -> Outcome<(u64, Work)> { Ok((clock::now(), Work::of(hub.guard.pid(), |_| true)?)) };
+    let before = look()?;
+    thread::sleep(Duration::from_secs(seconds));
+    let after = look()?;
+    let memory = Resident::of(hub.guard.pid())?;
+    let shared: f64 = segments(&stage.domain)?.values().map(|(_, bytes)| bytes).sum();
+    let mut ages = Vec::new();
+    for consumer in &consumers {
+        let lines = consumer.lines_until("end", patience)?;
+        for line in lines.iter().filter(|line| line.text.starts_with("aged")).skip(SETTLING) {
+            ages.push(line.number(2)? as f64 / 1e3);
+        }
+    }
+    ages.sort_by(f64::total_cmp);
+    let mut counts = Vec::new();
+    for name in &names {
+        counts.push(Truth::read(&stage.own_truth(name), name)?.count(before.0, after.0));
+    }
+    let slowest = *counts.iter().min().ok_or("no sensor")? as f64 / ((after.0 - before.0) as f64 / 1e9);
+    let telegrams = counts.iter().sum::<usize>() as f64;
+    let at = |part| percentile(&ages, part).ok_or("no scan arrived");
+    Ok([
+        after.1.since(before.1).busy_ns as f64 / 1e3 / telegrams,
+        at(0.5)?,
+        at(0.99)?,
+        memory.own / 1024.0,
+        memory.shared / 1024.0,
+        shared / 1024.0,
+        slowest,
+    ])
+}
+
+/// Measures 1 to 1,000 sensors in virtual time: how many could one core serve if their bytes cost nothing to receive?
+/// Many sensors are distributed over several hubs, because a hub has at most 256 links and a process not enough
+/// descriptors for more.
+pub(crate) fn in_virtual_time(options: &Options) -> Outcome<()> {
+    let quantity = |name, unit, linear| Quantity { name, unit, linear };
+    let quantities = vec![
+        quantity("CPU time per telegram, all topics subscribed", "us", Some(0.0)),
+        quantity("no subscriber", "us", Some(0.0)),
+        quantity("sensors per core, all topics subscribed", "1", None),
+        quantity("no subscriber", "1", None),
+        quantity("telegrams not received", "1", None),
+        quantity("descriptors per sensor and its subscribers", "1", None),
+    ];
+    let mut sweep = Sweep::new("sensors in virtual time", "sensors", quantities);
+    let mut of_most = Vec::new();
+    let telegrams = options.count(20_000);
+    // Leaves out numbers of sensors for which there are too few telegrams.
+    for sensors in IN_VIRTUAL_TIME.into_iter().filter(|sensors| sensors * 4 <= telegrams) {
+        // Setting up many sensors takes longer than measuring them, and they are many values.
+        for _ in 0..if sensors > SHARE { 1 } else { runs(options) } {
+            let both = run_in_virtual_time(sensors, Variant::HALF, telegrams, true).and_then(|followed| {
+                Ok((followed, run_in_virtual_time(sensors, Variant::HALF, telegrams, false)?))
+            });
+            let (followed, alone) = match both {
+                Ok(both) => both,
+                // This machine does not have room for more.
+                Err(error) => {
+                    eprintln!("{sensors} sensors in virtual time: {error}");
+                    continue;
+                }
+            };
+            let per_core = |us: f64| 1e6 / (us * RATE);
+            let descriptors = followed.descriptors / sensors as f64;
+            let lost = followed.lost;
+            sweep.add(
+                sensors,
+                &[followed.us, alone.us, per_core(followed.us), per_core(alone.us), lost, descriptors],
+            );
+            of_most.extend((sensors == MOST).then_some(followed.us));
+        }
+    }
+    sweep.print(options.json);
+    if !of_most.is_empty() {
+        let figure = Figure {
+            name: "per telegram of 1000 sensors",
+            unit: "us",
+            hub: of_most,
+            baseline: Vec::new(),
+            // This number of sensors at their full rate on one core.
+            target: Target::Most((1e7 / (MOST as f64 * RATE)).floor() / 10.0),
+        };
+        figures::print("consumers", options.json, &[figure]);
+    }
+    Ok(())
+}
+
+/// Measures all variants of the LMS, with 16 sensors.
+pub(crate) fn beams_in_virtual_time(options: &Options) -> Outcome<()> {
+    let quantities = vec![Quantity { name: "CPU time per telegram", unit: "us", linear: Some(1.0) }];
+    let mut sweep = Sweep::new("beams in virtual time, 16 sensors", "beams", quantities);
+    let mut variants = Variant::ALL;
+    variants.sort_by_key(|variant| variant.beams());
+    for variant in variants {
+        for _ in 0..runs(options) {
+            sweep.add(variant.beams(), &[run_in_virtual_time(16, variant, options.count(20_000), true)?.us]);
+        }
+    }
+    sweep.print(options.json);
+    Ok(())
+}
+
+struct Cost {
+    /// CPU time per telegram, in us.
+    us: f64,
+    lost: f64,
+    descriptors: f64,
+}
+
+/// Runs `sensors` in several hubs, which begin together.
+fn run_in_virtual_time(sensors: usize, variant: Variant, telegrams: usize, followed: bool) -> Outcome<Cost> {
+    let stage = Stage::new()?;
+    let begin = stage.file("begin");
+    let name = begin.display().to_string();
+    let hubs = sensors.div_ceil(SHARE);
+    let beams = variant.beams().to_string();
+    let mut parts = Vec::new();
+    for number in 0..hubs {
+        let share = (sensors * (number + 1) / hubs - sensors * number / hubs).to_string();
+        let telegrams = telegrams.div_ceil(hubs).to_string();
+        parts.push(stage.part(&["driven", &name, &beams, &share, &telegrams, &followed.to_string()])?);
+    }
+    // Learning takes far less than a millisecond per telegram.
+    let patience = PATIENCE + Duration::from_millis(sensors as u64 * 760);
+    parts.iter().try_for_each(|part: &Child| part.await_line("ready", patience).map(drop))?;
+    std::fs::write(&begin, "")?;
+    let (mut ns, mut published, mut received, mut descriptors) = (0.0, 0.0, 0.0, 0.0);
+    for part in &parts {
+        let cost = part.await_line("cost", patience)?;
+        ns += cost.number(1)? as f64;
+        published += cost.number(2)? as f64;
+        received += cost.number(3)? as f64;
+        descriptors += cost.number(4)? as f64;
+    }
+    parts.into_iter().try_for_each(|part| part.guard.wait())?;
+    Ok(Cost { us: ns / published / 1e3, lost: published - received, descriptors })
+}
+
+fn runs(options: &Options) -> usize {
+    options.pairs().min(3)
+}
+
+const IN_VIRTUAL_TIME: [usize; 6] = [1, 4, 16, 64, 250, MOST];
+const MOST: usize = 1000;
+/// Sensors of one hub. The descriptors of the hub and its subscribers belong to one process.
+const SHARE: usize = 125;
+/// Scans per second of a sensor with 361 beams.
+const RATE: f64 = 37.5;
+
+/// Drives a hub in virtual time: telegrams of the simulated room of Fig. 8 go through framer, session, decoding and all
+/// processors into topics in shared memory. Nothing sleeps or waits, so the CPU time of a telegram remains. Each topic
+/// has a subscriber that takes all samples if `followed`, and otherwise none.
+///
+/// Runs `sensors` with `beams` beams until all have learned their background, prints `ready`, and once there is a file
+/// `begin`, runs at least `telegrams` more. Prints `cost NS PUBLISHED RECEIVED DESCRIPTORS`.
+pub(crate) fn drive(
+    begin: &Path,
+    beams: usize,
+    sensors: usize,
+    telegrams: usize,
+    followed: bool,
+) -> Outcome<()> {
+    let variant = Variant::of_beams(beams).ok_or("no variant has so many beams")?;
+    let stage = Stage::new()?;
+    let config = config(sensors, variant)?;
+    virtual_hub(&config, &stage.domain, |links| {
+        let node = ipc::client_node(&stage.domain)?;
+        let followed = config.links.iter().filter(|_| followed);
+        let subscribers: Vec<Subscribers> =
+            followed.map(|link| Subscribers::attach(&node, &link.name)).collect::<Result<_, _>>()?;
+        let descriptors = std::fs::read_dir("/proc/self/fd")?.count();
+        let mut stream = Stream::new(variant);
+        let learning = (LEARNED_NS / stream.period) as usize / TOGETHER;
+        let mut turn = |links: &mut [VirtualLink<'_>]| -> Outcome<Costs> {
+            let before = cpu_ns();
+            let published = stream.turn(links);
+            let busy_ns = cpu_ns() - before;
+            let received = subscribers.iter().map(Subscribers::take).sum::<Result<usize, _>>()?;
+            Ok(Costs { busy_ns, published, received })
+        };
+        for _ in 0..learning {
+            turn(links)?;
+        }
+        println!("ready");
+        let deadline = clock::now() + PATIENCE.as_nanos() as u64;
+        while !begin.exists() {
+            if clock::now() > deadline {
+                return Err("the start file did not appear".into());
+            }
+            std::thread::sleep(Duration::from_millis(5));
+        }
+        let mut all = Costs::default();
+        for _ in 0..telegrams.div_ceil(TOGETHER * sensors) {
+            let Costs { busy_ns, published, received } = turn(links)?;
+            all.busy_ns += busy_ns;
+            all.published += published;
+            all.received += received;
+        }
+        println!("cost {} {} {} {descriptors}", all.busy_ns, all.published, all.received);
+        Ok(())
+    })?
+}
+
+/// Costs of a few telegrams of each sensor.
+#[derive(Default)]
+struct Costs {
+    busy_ns: u64,
+    published: usize,
+    received: usize,
+}
+
+/// Telegrams of the sensors. All of them see the same, each at a different moment.
+struct Stream {
+    telegrams: Vec<Vec<u8>>,
+    period: Nanos,
+    now: Nanos,
+    number: usize,
+}
+
+impl Stream {
+    fn new(variant: Variant) -> Stream {
+        let room = Room::new(&"fig8".parse().expect("a world that the program brings along"), 1);
+        let period = variant.turns() * MIRROR_TURN;
+        let telegram = |number| {
+            let words = room.scan(variant, Unit::Mm, MODE, number * period);
+            measured::encode(0, Unit::Mm, &words, 0x10).bytes().to_vec()
+        };
+        // A telegram that ends with a start byte would wait for the next one.
+        let telegrams = (1..=SEEN).map(telegram).filter(|bytes| bytes.last() != Some(&STX)).collect();
+        Stream { telegrams, period, now: clock::now(), number: 0 }
+    }
+
+    /// Passes the next telegrams of each sensor to the hub in three reads, like the hub reads them: the first bytes,
+    /// most of it, the end. Returns how many were published.
+    fn turn(&mut self, links: &mut [VirtualLink<'_>]) -> usize {
+        let mut published = 0;
+        for _ in 0..TOGETHER {
+            for piece in 0..3 {
+                for (sensor, link) in links.iter_mut().enumerate() {
+                    let telegram = &self.telegrams[(self.number + 37 * sensor) % self.telegrams.len()];
+                    let cuts = [0, 16, telegram.len() - 156, telegram.len()];
+                    published += link.read(self.now, &telegram[cuts[piece]..cuts[piece + 1]]);
+                }
+                self.now += self.period / 3;
+            }
+            self.number += 1;
+        }
+        published
+    }
+}
+
+/// A subscriber to each topic of a sensor, which never sleeps.
+struct Subscribers {
+    telegram: Subscriber<[u8]>,
+    scan: Subscriber<Scan>,
+    marks: Subscriber<Marks>,
+    zones: Subscriber<Zones>,
+    foreground: Subscriber<Foreground>,
+    background: Subscriber<Background>,
+    status: Subscriber<Status>,
+}
+
+impl Subscribers {
+    fn attach(node: &Node, sensor: &str) -> Result<Subscribers, Failure> {
+        Ok(Subscribers {
+            telegram: subscriber::<[u8]>(node, sensor)?,
+            scan: subscriber::<Scan>(node, sensor)?,
+            marks: subscriber::<Marks>(node, sensor)?,
+            zones: subscriber::<Zones>(node, sensor)?,
+            foreground: subscriber::<Foreground>(node, sensor)?,
+            background: subscriber::<Background>(node, sensor)?,
+            status: subscriber::<Status>(node, sensor)?,
+        })
+    }
+
+    /// Takes all samples, and returns the number of scans for which all others have arrived.
+    fn take(&self) -> Outcome<usize> {
+        let counts = [
+            take::<Scan>(&self.scan)?,
+            take::<[u8]>(&self.telegram)?,
+            take::<Marks>(&self.marks)?,
+            take::<Zones>(&self.zones)?,
+            take::<Foreground>(&self.foreground)?,
+        ];
+        take::<Background>(&self.background)?;
+        take::<Status>(&self.status)?;
+        Ok(counts.into_iter().min().unwrap_or_default())
+    }
+}
+
+fn subscriber<P: Payload + ?Sized>(node: &Node, sensor: &str) -> Result<Subscriber<P>, Failure> {
+    let service = P::open(node, sensor)?;
+    let service =
+        service.ok_or_else(|| Failure::new(Kind::NoTopic, format!("{sensor} has no topics"), ""))?;
+    P::subscriber(&service)
+}
+
+fn take<P: Payload + ?Sized>(subscriber: &Subscriber<P>) -> Outcome<usize> {
+    let mut count = 0;
+    while P::receive(subscriber).map_err(|error| format!("not received: {error:?}"))?.is_some() {
+        count += 1;
+    }
+    Ok(count)
+}
+
+/// Returns the default configuration with all processors.
+fn config(sensors: usize, variant: Variant) -> Result<Config, Failure> {
+    let names = (0..sensors).map(|number| format!("s{number}"));
+    let set = names.clone().flat_map(|name| {
+        let keys = [
+            format!("mode={}", MODE.0),
+            format!("angle={}", variant.angle_deg),
+            format!("resolution={}", f64::from(variant.resolution_cdeg) / 100.0),
+        ];
+        keys.map(|key| format!("link.{name}.{key}"))
+    });
+    let links = names.clone().map(|name| format!("{name}=file:nothing")).collect();
+    Config::load(&Sources { links, set: set.collect(), ..Sources::default() })
+}
+
+/// Returns the CPU time of this thread.
+fn cpu_ns() -> u64 {
+    let used = clock_gettime(ClockId::ThreadCPUTime);
+    used.tv_sec as u64 * 1_000_000_000 + used.tv_nsec as u64
+}
+
+/// Time until a background is known: ten seconds, and some more.
+const LEARNED_NS: Nanos = 10_500_000_000;
+/// 13 bits of range, 3 of intensity.
+const MODE: Mode = Mode(1);
+/// Number of different telegrams.
+const SEEN: u64 = 512;
+/// Telegrams of each sensor before the subscribers take them. The shortest queue holds four samples, and a sample may
+/// be published later than its telegram.
+const TOGETHER: usize = 3;

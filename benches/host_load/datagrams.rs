@@ -1,0 +1,63 @@
+//! Stands for the paper's unit between two sensors and a network, as far as its datagrams are concerned: bare telegrams
+//! to a multicast group on the loopback, one port per sensor, at the sensors' rate.
+
+use std::net::{Ipv4Addr, UdpSocket};
+
+use lms::variant::{MIRROR_TURN, Unit, Variant};
+use rustix::net::sockopt::{
+    set_ip_add_membership, set_ip_multicast_if, set_ip_multicast_ttl, set_socket_reuseaddr,
+};
+use rustix::net::{AddressFamily, SocketAddrV4, SocketFlags, SocketType, bind, socket_with};
+use sim::room::Room;
+
+use crate::consumer::MODE;
+use crate::support::{Outcome, clock};
+
+/// Sends forever, to `port` for the first sensor and to the next one for the second; prints `ready` first.
+pub(crate) fn send(port: u16) -> Outcome<()> {
+    let socket = UdpSocket::bind((Ipv4Addr::LOCALHOST, 0))?;
+    set_ip_multicast_if(&socket, &Ipv4Addr::LOCALHOST)?;
+    // Datagrams leave this machine by no route.
+    set_ip_multicast_ttl(&socket, 0)?;
+    let rooms = [0, 1].map(telegrams);
+    println!("ready");
+    let begin = clock::now();
+    for number in 0.. {
+        for (sensor, telegrams) in rooms.iter().enumerate() {
+            // Sensors are not synchronized; here they are half a scan apart.
+            clock::rest(begin + number * PERIOD + sensor as u64 * PERIOD / 2);
+            let telegram = &telegrams[number as usize % telegrams.len()];
+            socket.send_to(telegram, (GROUP, port + sensor as u16))?;
+        }
+    }
+    Ok(())
+}
+
+/// Returns a socket that receives what is sent to `port` of the group, like any number of others.
+pub(crate) fn receiver(port: u16) -> Outcome<UdpSocket> {
+    let socket = socket_with(AddressFamily::INET, SocketType::DGRAM, SocketFlags::CLOEXEC, None)?;
+    set_socket_reuseaddr(&socket, true)?;
+    bind(&socket, &SocketAddrV4::new(GROUP, port))?;
+    set_ip_add_membership(&socket, &GROUP, &Ipv4Addr::LOCALHOST)?;
+    Ok(socket.into())
+}
+
+/// Returns the first of two ports that only this bench uses.
+pub(crate) fn port() -> u16 {
+    20_000 + (std::process::id() % 5_000) as u16 * 2
+}
+
+/// Returns the telegrams of ten seconds.
+fn telegrams(sensor: u64) -> Vec<Vec<u8>> {
+    let room = Room::of_port(&"room".parse().expect("a world that the program brings along"), 1, sensor);
+    let telegram = |number: u64| {
+        let words = room.scan(Variant::HALF, Unit::Mm, MODE, number * PERIOD);
+        lms::measured::encode(0, Unit::Mm, &words, 0x10).bytes().to_vec()
+    };
+    (1..=375).map(telegram).collect()
+}
+
+/// A group that never leaves this machine, by its scope and the time to live.
+const GROUP: Ipv4Addr = Ipv4Addr::new(239, 255, 76, 90);
+/// Time from scan to scan of 361 beams, in ns.
+const PERIOD: u64 = 2 * MIRROR_TURN;

@@ -1,0 +1,199 @@
+//! The ways in which data of two sensors gets to subscribers, each as processes on a stage: which of them belong to the
+//! host, which only stand for hardware outside of it, and what CPU time they need.
+
+use std::thread;
+use std::time::Duration;
+
+use crate::cpu_time::{Share, Snapshot, Span};
+use crate::datagrams;
+use crate::support::Outcome;
+use crate::support::stage::{Child, PATIENCE, SENSORS, Stage};
+
+/// How data gets to the subscribers.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum SetUp {
+    /// Each has two serial lines of its own, reads them byte by byte and does everything itself.
+    Bytes,
+    /// The same, but each reads all bytes that have arrived.
+    Blocks,
+    /// Each receives bare telegrams by multicast and does the rest itself.
+    Datagrams,
+    /// Each receives the scans of the hub.
+    Scans,
+    /// Each receives the zones and the foreground of the hub.
+    Results,
+}
+
+impl SetUp {
+    /// All set-ups in the order of the tables.
+    pub(crate) const ALL: [SetUp; 5] =
+        [SetUp::Bytes, SetUp::Blocks, SetUp::Datagrams, SetUp::Scans, SetUp::Results];
+
+    /// Returns the name in tables.
+    pub(crate) fn name(self) -> &'static str {
+        match self {
+            SetUp::Bytes => "raw bytes",
+            SetUp::Blocks => "raw bytes in blocks",
+            SetUp::Datagrams => "datagrams",
+            SetUp::Scans => "hub, scans",
+            SetUp::Results => "hub, zones and foreground",
+        }
+    }
+
+    /// Starts it for `count` subscribers; with none, only the sender of datagrams runs.
+    pub(crate) fn start(self, count: usize) -> Outcome<Processes> {
+        let stage = Stage::new()?;
+        let part = |words: &[&str]| stage.part(&[&[WORD], words].concat());
+        let domain = stage.domain.name();
+        let (mut consumers, mut hub, mut outside) = (Vec::new(), None, Vec::new());
+        match self {
+            SetUp::Bytes | SetUp::Blocks => {
+                let most = if self == SetUp::Bytes { "1" } else { "4096" };
+                for number in 0..count {
+                    let lines = SENSORS.map(|sensor| format!("{sensor}-{number}"));
+                    outside.push(stage.simulate_streaming(&lines.each_ref().map(String::as_str))?);
+                    let [front, rear] = lines.map(|line| stage.port(&line));
+                    consumers.push(part(&["bytes", most, &front, &rear])?);
+                }
+            }
+            SetUp::Datagrams => {
+                let port = datagrams::port().to_string();
+                for _ in 0..count {
+                    consumers.push(part(&["datagrams", &port])?);
+                }
+                let sender = part(&["unit", &port])?;
+                sender.await_line("ready", PATIENCE)?;
+                outside.push(sender);
+            }
+            SetUp::Scans | SetUp::Results => {
+                outside.push(stage.simulate_streaming(&SENSORS)?);
+                hub.insert(stage.hub(&SENSORS)?).await_line("ready", PATIENCE)?;
+                let topics = if self == SetUp::Scans { "scans" } else { "results" };
+                for _ in 0..count {
+                    consumers.push(part(&[topics, domain])?);
+                }
+            }
+        }
+        for consumer in &consumers {
+            for sensor in SENSORS {
+                consumer.await_line(&format!("had {sensor}"), PATIENCE)?;
+            }
+        }
+        Ok(Processes { consumers, hub, outside, _stage: stage })
+    }
+}
+
+/// All processes of a set-up; they are ended in this order.
+pub(crate) struct Processes {
+    pub(crate) consumers: Vec<Child>,
+    pub(crate) hub: Option<Child>,
+    /// Processes that stand for hardware.
+    pub(crate) outside: Vec<Child>,
+    _stage: Stage,
+}
+
+impl Processes {
+    /// Measures for `span`.
+    pub(crate) fn watch(&self, span: Duration) -> Outcome<Load> {
+        thread::sleep(SETTLING);
+        let before = Snapshot::take()?;
+        thread::sleep(span);
+        let after = Snapshot::take()?;
+        Load::of(&Span::new(&before, &after), self, self.hz(before.at_ns(), after.at_ns())?)
+    }
+
+    /// Returns the scans per second of the subscriber and sensor with the fewest; 0 without subscribers.
+    fn hz(&self, from_ns: u64, to_ns: u64) -> Outcome<f64> {
+        let mut least: Option<f64> = None;
+        for consumer in &self.consumers {
+            let lines = consumer.lines_so_far();
+            for sensor in SENSORS {
+                let mut counts = Vec::new();
+                for line in lines.iter().filter(|line| line.text.starts_with(&format!("had {sensor} "))) {
+                    counts.push((line.number(2)?, line.number(3)?));
+                }
+                counts.retain(|(_, at_ns)| (from_ns..to_ns).contains(at_ns));
+                let hz = match counts[..] {
+                    [(first, from_ns), .., (last, to_ns)] => {
+                        (last - first) as f64 * 1e9 / (to_ns - from_ns) as f64
+                    }
+                    // Too slow, or the time is too short for a rate.
+                    _ => 0.0,
+                };
+                least = Some(least.map_or(hz, |least| least.min(hz)));
+            }
+        }
+        Ok(least.unwrap_or_default())
+    }
+}
+
+/// Second word of the command line of a part of this bench.
+pub(crate) const WORD: &str = "host-load";
+/// Time after which buffers, caches and timing are as they will stay.
+const SETTLING: Duration = Duration::from_secs(2);
+
+/// CPU time during a run, in percent of one processor.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Load {
+    /// The whole machine by `/proc/stat`.
+    pub(crate) machine: Share,
+    /// Subscribers and hub by the scheduler.
+    pub(crate) processes: Share,
+    /// Part of `processes`: the hub.
+    pub(crate) hub: Share,
+    /// Threads of the kernel.
+    pub(crate) kernel: f64,
+    /// Processes that stand for hardware.
+    pub(crate) outside: Share,
+    /// This process.
+    pub(crate) bench: Share,
+    /// All processes and threads of the kernel that existed at the end.
+    pub(crate) all_processes: f64,
+    /// Time that the hypervisor took away.
+    pub(crate) stolen: f64,
+    /// Scans per second of the subscriber and sensor with the fewest.
+    pub(crate) hz: f64,
+}
+
+/// The host's part by both counts, in percent of one processor.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Host {
+    /// By `/proc/stat`, without processes that are not part of the host.
+    pub(crate) machine: Share,
+    /// By the scheduler: subscribers and hub.
+    pub(crate) processes: Share,
+}
+
+impl Load {
+    /// Returns the CPU time in `span` of these processes.
+    pub(crate) fn of(span: &Span<'_>, children: &Processes, hz: f64) -> Outcome<Load> {
+        let hub = span.of(&pids(&children.hub))?;
+        Ok(Load {
+            machine: span.machine(),
+            processes: span.of(&pids(&children.consumers))?.plus(hub),
+            hub,
+            kernel: span.kernel(),
+            outside: span.of(&pids(&children.outside))?,
+            bench: span.of(&[std::process::id()])?,
+            all_processes: span.all_processes(),
+            stolen: span.stolen(),
+            hz,
+        })
+    }
+
+    /// Returns the host's part. On a loopback, a datagram is delivered within the system call of the sender; on a
+    /// network, the receiver's interrupt does that. The time that a sender needs beyond one without receivers, `deaf`,
+    /// therefore belongs to the host. Other set-ups do not need `deaf`.
+    pub(crate) fn of_host(&self, deaf: Option<Share>) -> Host {
+        let delivery = deaf.map_or(0.0, |deaf| (self.outside.total() - deaf.total()).max(0.0));
+        let delivery = Share { user: 0.0, system: delivery };
+        Host {
+            machine: self.machine.less(self.outside).less(self.bench).plus(delivery),
+            processes: self.processes.plus(delivery),
+        }
+    }
+}
+
+fn pids<'a>(children: impl IntoIterator<Item = &'a Child>) -> Vec<u32> {
+    children.into_iter().map(|child| child.guard.pid()).collect()
+}

@@ -1,0 +1,110 @@
+//! What does a line that loses bytes cost? The paper's Fig. 6: five minutes of telegrams, of which 0.135 % of the bytes
+//! are lost in bursts, read by three parsers. A telegram that the line damaged cannot be restored; whatever else is
+//! missing, the parser discarded. `--count N` sets the number of telegrams, `--pairs N` that of lines.
+//! `hub/lms/tests/framing.rs` checks the same in other surroundings.
+
+#[path = "../hub/lms/tests/line/mod.rs"]
+#[allow(dead_code)] // The test uses the other surroundings.
+mod line;
+mod support;
+
+use std::process::ExitCode;
+
+use line::Line;
+use line::account::{Account, framer};
+use line::parsers::{Discarding, Rewinding};
+use line::scene::Scene;
+use support::figures::{self, Cell, Figure, Target};
+use support::{Options, Outcome};
+
+/// Telegrams of a line, as in the paper: 300 s at 37.5 Hz.
+const TELEGRAMS: usize = 11_250;
+const PARSERS: [&str; 3] = ["six states, discard", "rewind to STX + 1", "hub"];
+/// Index of the hub's parser.
+const HUB: usize = 2;
+
+fn main() -> ExitCode {
+    support::main(measure)
+}
+
+fn measure(options: &Options) -> Outcome<()> {
+    let telegrams = options.count(TELEGRAMS);
+    let runs: Vec<Run> = (0..options.pairs() as u64).map(|seed| Run::new(telegrams, seed)).collect();
+    if !options.json {
+        println!(
+            "{telegrams} telegrams a line, {} lines; the paper lost 0.135 % of bytes, 40.8 % of telegrams",
+            runs.len()
+        );
+    }
+    figures::print("line_loss", options.json, &figures(&runs));
+    figures::print_cells("line_loss", options.json, &cells(&runs));
+    Ok(())
+}
+
+/// A line, and what each parser made of it.
+struct Run {
+    bytes_lost_percent: f64,
+    accounts: [Account; 3],
+}
+
+impl Run {
+    fn new(telegrams: usize, seed: u64) -> Run {
+        let line = Line::new(Scene::Furnished, telegrams, seed);
+        let mut accounts = [Account::default(); 3];
+        let [discarding, rewinding, speculative] = &mut accounts;
+        discarding.take(&line, &mut Discarding::new(line.header));
+        rewinding.take(&line, &mut Rewinding::new(line.header));
+        speculative.take(&line, &mut framer(&line));
+        let lost = line.sent.len() - line.received.len();
+        Run { bytes_lost_percent: lost as f64 * 100.0 / line.sent.len() as f64, accounts }
+    }
+}
+
+/// Returns a number of telegrams as a percentage.
+fn percent(account: &Account, of: u64) -> f64 {
+    of as f64 * 100.0 / account.telegrams as f64
+}
+
+/// Returns the figures of the hub's parser, starting with those of the line itself, as in the paper's columns.
+fn figures(runs: &[Run]) -> Vec<Figure> {
+    let figure = |name, unit, hub: Vec<f64>, target| Figure { name, unit, hub, baseline: Vec::new(), target };
+    let ours = |value: fn(&Account) -> f64| runs.iter().map(|run| value(&run.accounts[HUB])).collect();
+    let bytes = runs.iter().map(|run| run.bytes_lost_percent).collect();
+    vec![
+        figure("bytes lost (paper: 0.135)", "%", bytes, Target::None),
+        figure(
+            "telegrams lost (paper: 40.8)",
+            "%",
+            ours(|account| percent(account, account.lost)),
+            Target::None,
+        ),
+        figure("damaged by the line", "%", ours(|account| percent(account, account.damaged)), Target::None),
+        figure("intact, not delivered", "1", ours(|account| account.intact_lost as f64), Target::Most(0.0)),
+        figure("wrong, not marked", "1", ours(|account| account.wrong_clean as f64), Target::Most(0.0)),
+    ]
+}
+
+/// Returns a row for each parser.
+fn cells(runs: &[Run]) -> Vec<Cell> {
+    type Column = (&'static str, &'static str, fn(&Account) -> f64);
+    const COLUMNS: [Column; 7] = [
+        ("damaged", "1", |account| account.damaged as f64),
+        ("delivered", "1", |account| (account.telegrams - account.lost) as f64),
+        ("collateral: intact, not delivered", "1", |account| account.intact_lost as f64),
+        ("collateral", "%", |account| percent(account, account.intact_lost)),
+        ("telegrams lost", "%", |account| percent(account, account.lost)),
+        ("wrong content accepted", "1", |account| account.wrong as f64),
+        ("of it unmarked", "1", |account| account.wrong_clean as f64),
+    ];
+    let mut cells = Vec::new();
+    for (parser, name) in PARSERS.into_iter().enumerate() {
+        cells.extend(COLUMNS.into_iter().map(|(column, unit, value)| Cell {
+            table: "telegrams of a line that loses 0.135 % of the bytes".into(),
+            row: name.into(),
+            column: column.into(),
+            unit,
+            values: runs.iter().map(|run| value(&run.accounts[parser])).collect(),
+        }));
+    }
+    cells
+}

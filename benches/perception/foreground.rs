@@ -1,0 +1,291 @@
+//! How well are people separated from the background? The two methods of the hub next to two simple ones, in scenes of
+//! the simulated world in which the truth of each beam is known.
+//!
+//! A beam counts as foreground if it meets a person with all of its spot. A beam reported as foreground is wrong if it
+//! meets what was there from the start, what was behind an object that was taken away, or an object that was put down
+//! or moved more than 20 s ago. Not counted are beams that graze a person or a moved object, beams without a reading,
+//! and objects that were put down or moved in the last 20 s. Recall is the share of the foreground beams that are
+//! found, precision the share of the reported beams that are right, and wrong beams are per scan, over all 2000 scans
+//! including the first ones.
+
+use std::ops::Range;
+
+use lms::variant::{Unit, Variant};
+use preprocess::background::{Method as Kind, Model, Settings, Start};
+use preprocess::segments::Segmenter;
+use schema::{Foreground, Pose, Scan};
+
+use crate::figures::{self, Cell, Figure, Target};
+use crate::scenes::{Boxes, Detector, HubDetector, LabeledScan, Scene, Score, play};
+
+const SCENES: [Scene; 11] = [
+    Scene { name: "Fig. 8", world: "fig8", unit: Unit::Mm, mixed: true },
+    Scene { name: "Fig. 8, no mixed pixels", world: "fig8", unit: Unit::Mm, mixed: false },
+    Scene { name: "corridor, in cm", world: "corridor", unit: Unit::Cm, mixed: true },
+    Scene { name: "a person walks up to the sensor", world: "approach", unit: Unit::Mm, mixed: true },
+    Scene { name: "a person stands there first", world: "standing", unit: Unit::Mm, mixed: true },
+    Scene { name: "a door opens", world: "door", unit: Unit::Mm, mixed: true },
+    Scene { name: "a chair is moved", world: "chair", unit: Unit::Mm, mixed: true },
+    Scene { name: "a glass wall", world: "glass", unit: Unit::Mm, mixed: true },
+    Scene { name: "a wall with few readings", world: "faint", unit: Unit::Mm, mixed: true },
+    Scene { name: "sun", world: "sun", unit: Unit::Mm, mixed: true },
+    Scene { name: "a crowd", world: "crowd", unit: Unit::Mm, mixed: true },
+];
+
+/// Targets of `multi`: name of the figure, row, table, target.
+const TARGETS: [(&str, &str, &str, Target); 11] = [
+    ("recall in Fig. 8", "Fig. 8", RECALL, Target::Least(0.99)),
+    ("precision in Fig. 8", "Fig. 8", PRECISION, Target::Least(0.95)),
+    ("wrong beams a scan in Fig. 8", "Fig. 8", WRONG, Target::Most(0.2)),
+    ("recall in a corridor", "corridor, in cm", RECALL, Target::Least(0.95)),
+    ("wrong beams a scan in a corridor", "corridor, in cm", WRONG, Target::Most(0.4)),
+    ("recall at the sensor", "a person walks up to the sensor", RECALL, Target::Least(0.95)),
+    ("wrong beams a scan at the sensor", "a person walks up to the sensor", WRONG, Target::Most(0.4)),
+    ("precision before a wall with few readings", "a wall with few readings", PRECISION, Target::Least(0.9)),
+    (
+        "wrong beams a scan before a wall with few readings",
+        "a wall with few readings",
+        WRONG,
+        Target::Most(0.25),
+    ),
+    ("percent of a box new after N", NEW, BOX, Target::Most(0.0)),
+    ("percent of a box left after 2N", LEFT, BOX, Target::Most(0.0)),
+];
+const BOX: &str = "of a box in Fig. 8";
+const NEW: &str = "put down: new after N scans";
+const LEFT: &str = "taken away: left after 2N";
+const RECALL: &str = "recall";
+const PRECISION: &str = "precision";
+const WRONG: &str = "wrong beams a scan";
+
+const METHODS: [&str; 5] = ["multi", "paper", "paper, first scan", "teach-in", "mixtures (MOG2)"];
+
+fn settings(name: &str) -> Option<Settings> {
+    let paper = Settings { method: Kind::Paper, ..Settings::default() };
+    match name {
+        "multi" => Some(Settings { method: Kind::Multi, ..Settings::default() }),
+        "paper" => Some(paper),
+        "paper, first scan" => Some(Settings { start: Start::FirstScan, ..paper }),
+        _ => None,
+    }
+}
+
+fn method(name: &str) -> Box<dyn Detector> {
+    match settings(name) {
+        Some(settings) => Box::new(HubDetector::new(settings)),
+        None if name == "teach-in" => Box::new(TeachIn::new(Variant::HALF.beams())),
+        None => Box::new(Mixtures::new(Variant::HALF.beams())),
+    }
+}
+
+/// Measures the methods in all scenes with these `seeds`.
+pub(crate) fn measure(seeds: Range<u64>, is_json: bool) {
+    let mut boxes = [Boxes::default(); METHODS.len()];
+    let mut bytes = [Bytes::default(); METHODS.len()];
+    let mut cells = Vec::new();
+    for (number, scene) in SCENES.iter().enumerate() {
+        let mut scores = [Score::default(); METHODS.len()];
+        for seed in seeds.clone() {
+            let run = play(scene, seed);
+            for (m, name) in METHODS.into_iter().enumerate() {
+                scores[m] += Score::of(&mut *method(name), &run);
+                if number == 0 {
+                    boxes[m].add(|| method(name), &run);
+                    if let Some(settings) = settings(name) {
+                        bytes[m].add(settings, &run);
+                    }
+                }
+            }
+        }
+        cells.extend(METHODS.iter().zip(&scores).flat_map(|(name, score)| scored(scene, name, score)));
+    }
+    // One table for each of these quantities, although they are counted scene by scene.
+    cells.sort_by_key(|cell| [RECALL, PRECISION, WRONG].iter().position(|table| cell.table == *table));
+    for (name, boxes) in METHODS.iter().zip(&boxes) {
+        let rows = [NEW, "taken away: left after N", LEFT];
+        let values = rows.into_iter().zip(boxes.percents());
+        cells.extend(values.map(|(row, percent)| cell(BOX, row, name, "%", percent)));
+    }
+    for (name, bytes) in METHODS.iter().zip(&bytes).filter(|(name, _)| settings(name).is_some()) {
+        let rows = ["scans", "foreground", "foreground when empty"];
+        let values = rows.into_iter().zip(bytes.per_second());
+        cells.extend(values.map(|(row, bytes)| cell("payloads in Fig. 8", row, name, "B/s", bytes)));
+    }
+    let value = |table: &str, row: &str| {
+        let is_it = |cell: &&Cell| cell.table == table && cell.row == row && cell.column == METHODS[0];
+        cells.iter().find(is_it).map_or(Vec::new(), |cell| cell.values.clone())
+    };
+    let figure = |name, hub, target| Figure { name, unit: "1", hub, baseline: Vec::new(), target };
+    let mut figures =
+        Vec::from(TARGETS.map(|(name, row, table, target)| figure(name, value(table, row), target)));
+    let [scans, foreground, _] = bytes[0].per_second();
+    figures.push(figure(
+        "bytes of scans for one of foreground",
+        vec![scans / foreground],
+        Target::Least(10.0),
+    ));
+    figures::print("perception, foreground", is_json, &figures);
+    figures::print_cells("perception, foreground", is_json, &cells);
+}
+
+fn scored(scene: &Scene, method: &str, score: &Score) -> [Cell; 3] {
+    [(RECALL, score.recall()), (PRECISION, score.precision()), (WRONG, score.wrong_per_scan())]
+        .map(|(table, value)| cell(table, scene.name, method, "1", value))
+}
+
+fn cell(table: &str, row: &str, method: &str, unit: &'static str, value: f64) -> Cell {
+    // Without a person or without an answer, the share is not a number.
+    let values = if value.is_finite() { vec![value] } else { Vec::new() };
+    Cell { table: table.into(), row: row.into(), column: method.into(), unit, values }
+}
+
+/// Payload bytes of several runs, without headers.
+#[derive(Clone, Copy, Debug, Default)]
+struct Bytes {
+    scans: u64,
+    scan: u64,
+    foreground: u64,
+    /// Number of scans without foreground, and their bytes.
+    empty: (u64, u64),
+}
+
+impl Bytes {
+    /// Adds a `run` with the method of `settings`.
+    fn add(&mut self, settings: Settings, run: &[LabeledScan]) {
+        let beams = Variant::HALF.beams();
+        let mut model = Model::new(settings, beams);
+        let mut cutter = Segmenter::new(Pose::default(), beams);
+        let mut out = Foreground::of(beams);
+        for frame in run {
+            model.update(&frame.scan, &mut out);
+            cutter.update(&frame.scan, &mut out);
+            let foreground =
+                Foreground::HEAD + beams.div_ceil(8) + 2 * out.ranges().len() + 16 * out.segments().len();
+            self.scans += 1;
+            self.scan += Scan::len(beams, 0) as u64;
+            self.foreground += foreground as u64;
+            if out.beams == 0 {
+                self.empty = (self.empty.0 + 1, self.empty.1 + foreground as u64);
+            }
+        }
+    }
+
+    /// Returns bytes per second at 37.5 Hz: of scans, of the foreground, and of the foreground while it is empty.
+    fn per_second(&self) -> [f64; 3] {
+        let per_second = |bytes: u64, scans: u64| bytes as f64 / scans as f64 * 1e3 / 26.64;
+        [
+            per_second(self.scan, self.scans),
+            per_second(self.foreground, self.scans),
+            per_second(self.empty.1, self.empty.0),
+        ]
+    }
+}
+
+/// A teach-in that never adapts. The background of a beam is the median of its first [`TEACH_SCANS`] readings; what is
+/// nearer by more than 30 mm (60 in cm mode) is foreground.
+struct TeachIn {
+    scans: usize,
+    readings_mm: Vec<Vec<u32>>,
+    background_mm: Vec<Option<u32>>,
+}
+
+/// 5 s. The room of Fig. 8 is empty for the first 8 s.
+const TEACH_SCANS: usize = 187;
+
+impl TeachIn {
+    fn new(beams: usize) -> TeachIn {
+        TeachIn { scans: 0, readings_mm: vec![Vec::new(); beams], background_mm: vec![None; beams] }
+    }
+}
+
+impl Detector for TeachIn {
+    fn update(&mut self, scan: &Scan, foreground: &mut [bool]) {
+        self.scans += 1;
+        let threshold_mm = if scan.unit_um == 10_000 { 60 } else { 30 };
+        for (i, is_foreground) in foreground.iter_mut().enumerate() {
+            let reading = scan.distance_mm(i);
+            *is_foreground =
+                reading.zip(self.background_mm[i]).is_some_and(|(mm, wall_mm)| mm + threshold_mm < wall_mm);
+            if self.scans <= TEACH_SCANS {
+                self.readings_mm[i].extend(reading);
+            }
+            if self.scans == TEACH_SCANS {
+                let readings = &mut self.readings_mm[i];
+                readings.sort_unstable();
+                self.background_mm[i] = readings.get(readings.len() / 2).copied();
+            }
+        }
+    }
+}
+
+/// The adaptive Gaussian mixture of Zivkovic (ICPR 2004), which computer vision uses for the background of images, with
+/// one mixture for each beam. At most five Gaussians, learning rate 1/375 (1/n at first). The heaviest ones that
+/// together weigh .9 are background. A reading within four standard deviations is background, one within three adapts
+/// the Gaussian. Weights decay by a prior of .05. The standard deviation starts at 15 mm and stays between 5 and 40 mm,
+/// twice as much in cm mode. Only what is nearer than the heaviest Gaussian counts as foreground.
+struct Mixtures {
+    scans: f64,
+    beams: Vec<Vec<Gaussian>>,
+}
+
+#[derive(Clone, Copy)]
+struct Gaussian {
+    weight: f64,
+    mean_mm: f64,
+    variance: f64,
+}
+
+impl Mixtures {
+    fn new(beams: usize) -> Mixtures {
+        Mixtures { scans: 0.0, beams: vec![Vec::new(); beams] }
+    }
+}
+
+impl Detector for Mixtures {
+    fn update(&mut self, scan: &Scan, foreground: &mut [bool]) {
+        self.scans += 1.0;
+        let rate = (1.0 / self.scans).max(1.0 / 375.0);
+        let scale = if scan.unit_um == 10_000 { 2.0 } else { 1.0 };
+        for (i, is_foreground) in foreground.iter_mut().enumerate() {
+            let Some(mm) = scan.distance_mm(i).map(f64::from) else {
+                *is_foreground = false;
+                continue;
+            };
+            let beam = &mut self.beams[i];
+            let heaviest_mm = beam.first().map(|gaussian| gaussian.mean_mm);
+            let is_background = mix(beam, mm, rate, scale);
+            *is_foreground = !is_background && heaviest_mm.is_some_and(|wall_mm| mm < wall_mm);
+        }
+    }
+}
+
+/// Updates `beam` with a reading, and returns whether the reading is background.
+fn mix(beam: &mut Vec<Gaussian>, mm: f64, rate: f64, scale: f64) -> bool {
+    const PRIOR: f64 = 0.05;
+    let (mut is_background, mut met, mut before) = (false, false, 0.0);
+    for gaussian in beam.iter_mut() {
+        let off = mm - gaussian.mean_mm;
+        is_background |= before < 0.9 && !met && off * off < 16.0 * gaussian.variance;
+        before += gaussian.weight;
+        gaussian.weight = (1.0 - rate) * gaussian.weight - rate * PRIOR;
+        if !met && off * off < 9.0 * gaussian.variance {
+            met = true;
+            gaussian.weight += rate;
+            let share = rate / gaussian.weight;
+            gaussian.mean_mm += share * off;
+            let (least, most) = ((5.0 * scale).powi(2), (40.0 * scale).powi(2));
+            gaussian.variance =
+                (gaussian.variance + share * (off * off - gaussian.variance)).clamp(least, most);
+        }
+    }
+    beam.retain(|gaussian| gaussian.weight > 0.0);
+    if !met {
+        beam.truncate(4);
+        let weight = if beam.is_empty() { 1.0 } else { rate };
+        beam.push(Gaussian { weight, mean_mm: mm, variance: (15.0 * scale).powi(2) });
+    }
+    let total: f64 = beam.iter().map(|gaussian| gaussian.weight).sum();
+    beam.iter_mut().for_each(|gaussian| gaussian.weight /= total);
+    beam.sort_by(|a, b| b.weight.total_cmp(&a.weight));
+    is_background
+}

@@ -1,0 +1,427 @@
+//! How near are the lines of a scan to its beams, and how long does it take to find them? Both forms of the hub's
+//! method next to simple methods with the same number of vertices, on rooms drawn at random as in the experiment of PLE
+//! (Schaefer, Buescher, Luft, Burgard, IROS 2018), and on logs of real sensors.
+//!
+//! J vertices make J - 1 lines. The ratio is to iterative end-point fit on the same scans, as in PLE's publication, and
+//! the target is PLE's own ratio. The lines have to cover .97 of the beams of a room.
+
+use std::f64::consts::{PI, TAU};
+use std::ops::Range;
+use std::time::Instant;
+
+use fastrand::Rng;
+use preprocess::lines::{LineFinder, Settings, Stop};
+use schema::{Lines, Pose, Scan};
+
+use crate::figures::{self, Cell, Figure, Target};
+use crate::recordings::{self, normal, scan};
+
+const VERTICES: [usize; 5] = [10, 20, 30, 40, 50];
+/// Ratios that PLE publishes, and those of its optimized form.
+const PLE: [[f64; 5]; 2] = [[0.68, 0.86, 0.85, 0.87, 0.85], [0.44, 0.65, 0.67, 0.71, 0.71]];
+/// Maximum time for a scan of 360 beams, in us.
+const TIME_US: [f64; 2] = [100.0, 1000.0];
+const NAMES: [[&str; 5]; 2] = [
+    ["10 vertices: RMSE", "20 vertices: RMSE", "30 vertices: RMSE", "40 vertices: RMSE", "50 vertices: RMSE"],
+    [
+        "10 vertices, polished: RMSE",
+        "20 vertices, polished: RMSE",
+        "30 vertices, polished: RMSE",
+        "40 vertices, polished: RMSE",
+        "50 vertices, polished: RMSE",
+    ],
+];
+
+/// Measures on drawn rooms and on logs; `is_quick` takes one set of rooms and few scans of each log.
+pub(crate) fn measure(is_quick: bool, is_json: bool) {
+    let mut figures = Vec::new();
+    let mut cells = Vec::new();
+    of_rooms(if is_quick { 1..2 } else { 1..5 }, &mut figures, &mut cells);
+    of_logs(if is_quick { 20 } else { 200 }, &mut cells);
+    figures::print("perception, lines", is_json, &figures);
+    figures::print_cells("perception, lines", is_json, &cells);
+}
+
+/// Returns the hub's line finder, limited only by the number of vertices. Points farther apart than `gap_m` are not
+/// connected.
+fn hub(count: usize, polish: bool, gap_m: f64) -> LineFinder {
+    // Two beams, as for the others: all beams of a room count.
+    let settings = Settings { max: count as u8 - 1, min_points: 2, polish, stop: Stop::Number(gap_m) };
+    LineFinder::new(Pose::default(), settings, 1081)
+}
+
+/// Returns the mean score and the time per scan in us.
+fn run(finder: &mut LineFinder, scans: &[Box<Scan>]) -> (Score, f64) {
+    let mut lines = Lines::default();
+    let mut scores = Vec::new();
+    let mut taken_us = 0.0;
+    for scan in scans {
+        let begin = Instant::now();
+        finder.update(scan, &mut lines);
+        taken_us += 1e6 * begin.elapsed().as_secs_f64();
+        scores.push(Found::of(&lines).score(scan));
+    }
+    (mean(&scores), taken_us / scans.len().max(1) as f64)
+}
+
+fn of_rooms(seeds: Range<u64>, figures: &mut Vec<Figure>, cells: &mut Vec<Cell>) {
+    let draws: Vec<Vec<Box<Scan>>> = seeds.map(|seed| draw_rooms(seed, RAYS)).collect();
+    for (form, polish) in [false, true].into_iter().enumerate() {
+        let mut times = Vec::new();
+        for (number, &count) in VERTICES.iter().enumerate() {
+            let (mut ours, mut theirs, mut shares) = (Vec::new(), Vec::new(), Vec::new());
+            for scans in &draws {
+                let (score, time_us) = run(&mut hub(count, polish, f64::INFINITY), scans);
+                ours.push(score.rmse);
+                shares.push(score.share);
+                times.push(time_us);
+                let scores: Vec<Score> =
+                    scans.iter().map(|scan| end_points(scan, count).score(scan)).collect();
+                theirs.push(mean(&scores).rmse);
+            }
+            let (name, target) = (NAMES[form][number], Target::Ratio(PLE[form][number]));
+            figures.push(Figure { name, unit: "m", hub: ours, baseline: theirs, target });
+            cells.push(Cell {
+                table: "rooms: share of the beams".to_owned(),
+                row: if polish { "polished".to_owned() } else { "plain".to_owned() },
+                column: count.to_string(),
+                unit: "1",
+                values: shares,
+            });
+        }
+        let longer = draw_rooms(1, 1081);
+        let of_longer = VERTICES.map(|count| run(&mut hub(count, polish, f64::INFINITY), &longer).1);
+        let name = if polish { "time of 1081 beams, polished" } else { "time of 1081 beams" };
+        figures.push(Figure {
+            name,
+            unit: "us",
+            hub: of_longer.to_vec(),
+            baseline: Vec::new(),
+            target: Target::None,
+        });
+        let name = if polish { "time, polished" } else { "time" };
+        figures.push(Figure {
+            name,
+            unit: "us",
+            hub: times,
+            baseline: Vec::new(),
+            target: Target::Most(TIME_US[form]),
+        });
+    }
+}
+
+fn of_logs(most: usize, cells: &mut Vec<Cell>) {
+    let logs = recordings::logs();
+    if logs.is_empty() {
+        eprintln!("left out: SCANHUB_DATA names no folder with carmen/*.log.gz");
+    }
+    for (name, scans) in logs {
+        let every = scans.len().div_ceil(most).max(1);
+        let scans: Vec<Box<Scan>> = scans.into_iter().map(|(scan, _)| scan).step_by(every).collect();
+        type Baseline = fn(&Scan, usize) -> Found;
+        let baselines: [(&str, Baseline); 3] =
+            [("end-point fit", end_points), ("split and merge", split_and_merge), ("RANSAC", ransac)];
+        for count in VERTICES {
+            let mut put = |row: &str, score: Score| {
+                for (what, unit, value) in [("RMSE", "m", score.rmse), ("share", "1", score.share)] {
+                    cells.push(Cell {
+                        table: format!("{name}: {what}"),
+                        row: row.to_owned(),
+                        column: count.to_string(),
+                        unit,
+                        values: vec![value],
+                    });
+                }
+            };
+            for (row, baseline) in baselines {
+                let scores: Vec<Score> = scans.iter().map(|scan| baseline(scan, count).score(scan)).collect();
+                put(row, mean(&scores));
+            }
+            put("hub", run(&mut hub(count, false, 1.0), &scans).0);
+            put("hub, polished", run(&mut hub(count, true, 1.0), &scans).0);
+        }
+    }
+}
+
+/// Lines that a method found in a scan, in the order of their beams.
+struct Found {
+    /// First beam, last beam, and the line: distance from the sensor and direction of its nearest point.
+    lines: Vec<(usize, usize, f64, f64)>,
+}
+
+/// Score of one scan.
+#[derive(Clone, Copy, Debug)]
+struct Score {
+    /// Root mean square of the distances along the beams that meet a line, in meters.
+    rmse: f64,
+    /// Share of the beams with a range that meet a line.
+    share: f64,
+}
+
+impl Found {
+    /// Returns the lines that the hub found, for a sensor at the robot's center.
+    fn of(lines: &Lines) -> Found {
+        let line = |line: &schema::Line| {
+            (usize::from(line.first), usize::from(line.last), f64::from(line.r_m), f64::from(line.alpha_rad))
+        };
+        Found { lines: lines.lines().iter().map(line).collect() }
+    }
+
+    fn score(&self, scan: &Scan) -> Score {
+        let (mut square, mut met) = (0.0, 0);
+        let mut is_met = vec![false; scan.beams()];
+        for &(first, last, r, alpha) in &self.lines {
+            for (beam, is_met) in is_met.iter_mut().enumerate().take(last + 1).skip(first) {
+                let Some(range) = scan.distance_m(beam).filter(|_| !*is_met) else { continue };
+                let off = range - r / (scan.angle(beam) - alpha).cos();
+                square += off * off;
+                met += 1;
+                *is_met = true;
+            }
+        }
+        let readings = (0..scan.beams()).filter(|&beam| scan.distance_m(beam).is_some()).count();
+        Score {
+            rmse: (square / f64::from(met.max(1))).sqrt(),
+            share: f64::from(met) / readings.max(1) as f64,
+        }
+    }
+}
+
+/// Returns the mean of `scores`.
+fn mean(scores: &[Score]) -> Score {
+    let mean = |of: fn(&Score) -> f64| scores.iter().map(of).sum::<f64>() / scores.len().max(1) as f64;
+    Score { rmse: mean(|score| score.rmse), share: mean(|score| score.share) }
+}
+
+/// A beam that has a range, and where it ends.
+#[derive(Clone, Copy)]
+struct Point {
+    beam: usize,
+    x: f64,
+    y: f64,
+}
+
+fn points(scan: &Scan) -> Vec<Point> {
+    let point = |beam| {
+        let (range, angle) = (scan.distance_m(beam)?, scan.angle(beam));
+        Some(Point { beam, x: range * angle.cos(), y: range * angle.sin() })
+    };
+    (0..scan.beams()).filter_map(point).collect()
+}
+
+/// Returns the distance from the sensor and the direction of the nearest point of the line through (x, y) with this
+/// normal.
+fn normal_form(normal: (f64, f64), x: f64, y: f64) -> (f64, f64) {
+    let r = normal.0 * x + normal.1 * y;
+    let turned = if r < 0.0 { -1.0 } else { 1.0 };
+    (turned * r, (turned * normal.1).atan2(turned * normal.0))
+}
+
+fn through(a: Point, b: Point) -> (f64, f64) {
+    let length = (b.x - a.x).hypot(b.y - a.y).max(1e-12);
+    normal_form(((b.y - a.y) / length, (a.x - b.x) / length), a.x, a.y)
+}
+
+/// Returns the point that is farthest from the straight line between two points.
+fn farthest(points: &[Point], first: usize, last: usize) -> (f64, usize) {
+    let (a, b) = (points[first], points[last]);
+    let length = (b.x - a.x).hypot(b.y - a.y);
+    let distance = |p: Point| {
+        if length < 1e-9 {
+            return (p.x - a.x).hypot(p.y - a.y);
+        }
+        ((p.x - a.x) * (b.y - a.y) - (p.y - a.y) * (b.x - a.x)).abs() / length
+    };
+    (first + 1..last)
+        .map(|i| (distance(points[i]), i))
+        .fold((0.0, first), |best, one| if one.0 > best.0 { one } else { best })
+}
+
+/// Returns the indices of the vertices of the polyline, starting with both ends. Each further vertex is the farthest
+/// point of all.
+fn vertices(points: &[Point], count: usize) -> Vec<usize> {
+    let mut vertices = vec![0, points.len() - 1];
+    let mut splits = vec![farthest(points, 0, points.len() - 1)];
+    while vertices.len() < count.min(points.len()) {
+        let best = (0..splits.len()).max_by(|&a, &b| splits[a].0.total_cmp(&splits[b].0)).unwrap_or(0);
+        let (distance, at) = splits[best];
+        if distance == 0.0 {
+            break;
+        }
+        vertices.insert(best + 1, at);
+        splits[best] = farthest(points, vertices[best], at);
+        splits.insert(best + 1, farthest(points, at, vertices[best + 2]));
+    }
+    vertices
+}
+
+/// Returns the beams that meet the line between the ends that its outermost points have on it.
+fn met(points: &[Point], (r, alpha): (f64, f64)) -> Option<(usize, usize, f64, f64)> {
+    let (first, last) = (points.first()?, points.last()?);
+    let (sin, cos) = alpha.sin_cos();
+    // Angle by which a point appears to the left of the end on the line, in radians.
+    let left_of = |p: &Point, end: &Point| {
+        let off = end.x * cos + end.y * sin - r;
+        let (x, y) = (end.x - off * cos, end.y - off * sin);
+        (x * p.y - y * p.x).atan2(x * p.x + y * p.y)
+    };
+    let mut inside = points.iter().filter(|p| left_of(p, first) >= -1e-3 && left_of(p, last) <= 1e-3);
+    let begin = inside.next()?;
+    let end = inside.next_back().unwrap_or(begin);
+    Some((begin.beam, end.beam, r, alpha))
+}
+
+/// Iterative end-point fit: the polyline through some of the points.
+fn end_points(scan: &Scan, count: usize) -> Found {
+    let points = points(scan);
+    let mut lines = Vec::new();
+    if points.len() > 1 {
+        for pair in vertices(&points, count).windows(2) {
+            let (a, b) = (points[pair[0]], points[pair[1]]);
+            let (r, alpha) = through(a, b);
+            lines.push((a.beam, b.beam, r, alpha));
+        }
+    }
+    Found { lines }
+}
+
+/// Returns the line of orthogonal least squares, and the sum of the squares.
+fn regression(points: &[Point]) -> ((f64, f64), f64) {
+    let n = points.len() as f64;
+    let (x, y) = points.iter().fold((0.0, 0.0), |(x, y), p| (x + p.x / n, y + p.y / n));
+    let (mut xx, mut xy, mut yy) = (0.0, 0.0, 0.0);
+    for p in points {
+        xx += (p.x - x) * (p.x - x);
+        xy += (p.x - x) * (p.y - y);
+        yy += (p.y - y) * (p.y - y);
+    }
+    let along = 0.5 * (2.0 * xy).atan2(xx - yy);
+    let normal = (-along.sin(), along.cos());
+    let error = normal.0 * normal.0 * xx + 2.0 * normal.0 * normal.1 * xy + normal.1 * normal.1 * yy;
+    (normal_form(normal, x, y), error.max(0.0))
+}
+
+/// Split and merge: cuts into twice as many pieces as end-point fit, then merges the neighbors whose common line is
+/// nearest to their points until few enough are left.
+fn split_and_merge(scan: &Scan, count: usize) -> Found {
+    let points = points(scan);
+    if points.len() < 2 {
+        return Found { lines: Vec::new() };
+    }
+    let cuts = vertices(&points, 2 * count);
+    let mut pieces: Vec<(usize, usize)> = cuts.windows(2).map(|pair| (pair[0], pair[1])).collect();
+    for piece in pieces.iter_mut().skip(1) {
+        piece.0 += 1;
+    }
+    pieces.retain(|piece| piece.0 <= piece.1);
+    let error = |first: usize, last: usize| regression(&points[first..=last]).1;
+    while pieces.len() > count - 1 {
+        let price = |i: usize| {
+            let (one, two) = (pieces[i], pieces[i + 1]);
+            error(one.0, two.1) - error(one.0, one.1) - error(two.0, two.1)
+        };
+        let prices: Vec<f64> = (0..pieces.len() - 1).map(price).collect();
+        let cheapest = (0..prices.len()).min_by(|&a, &b| prices[a].total_cmp(&prices[b])).unwrap_or(0);
+        pieces[cheapest].1 = pieces.remove(cheapest + 1).1;
+    }
+    let line = |&(first, last): &(usize, usize)| {
+        let (one, points) = (points[first], &points[first..=last]);
+        // A single point is a line across its beam.
+        let alone = (one.x.hypot(one.y), one.y.atan2(one.x));
+        met(points, if points.len() > 1 { regression(points).0 } else { alone })
+    };
+    Found { lines: pieces.iter().filter_map(line).collect() }
+}
+
+/// Number of lines that RANSAC tries for each line that it finds.
+const TRIES: usize = 200;
+/// Maximum distance of a point that belongs to a line of RANSAC, in meters.
+const NEAR_M: f64 = 0.05;
+
+/// RANSAC: of random lines through two points, takes the one with the longest row of near points, removes these points,
+/// and repeats.
+fn ransac(scan: &Scan, count: usize) -> Found {
+    let mut random = Rng::with_seed(1);
+    let mut left = points(scan);
+    let mut lines = Vec::new();
+    while lines.len() + 1 < count && left.len() > 2 {
+        let mut best = 0..0;
+        for _ in 0..TRIES {
+            let first = random.usize(..left.len());
+            let second = random.usize(first.saturating_sub(10)..(first + 11).min(left.len()));
+            if first != second {
+                let row = row(&left, first, through(left[first], left[second]));
+                best = if row.len() > best.len() { row } else { best };
+            }
+        }
+        if best.len() < 2 {
+            break;
+        }
+        lines.extend(met(&left[best.clone()], regression(&left[best.clone()]).0));
+        left.drain(best);
+    }
+    // If two lines cover a beam, the first one counts: it has more points.
+    Found { lines }
+}
+
+/// Returns the points around one of them that are near the line, without a break in their beams.
+fn row(points: &[Point], at: usize, (r, alpha): (f64, f64)) -> std::ops::Range<usize> {
+    let near = |p: &Point| (p.x * alpha.cos() + p.y * alpha.sin() - r).abs() < NEAR_M;
+    let (mut first, mut end) = (at, at + 1);
+    while first > 0 && near(&points[first - 1]) && points[first].beam - points[first - 1].beam <= 2 {
+        first -= 1;
+    }
+    while end < points.len() && near(&points[end]) && points[end].beam - points[end - 1].beam <= 2 {
+        end += 1;
+    }
+    first..end
+}
+
+/// Number of scans in a set.
+const SCANS: usize = 260;
+/// Number of rays of a scan in the experiment.
+const RAYS: usize = 360;
+const CORNERS: [usize; 7] = [3, 4, 5, 6, 12, 36, 180];
+/// Standard deviation of the noise of a ray: of the angle in degrees, of the range in meters.
+const NOISE: (f64, f64) = (0.2, 0.03);
+
+/// Returns the set of scans of `seed`, each with `rays` rays over a full turn including both ends: the first and the
+/// last ray have the same direction.
+fn draw_rooms(seed: u64, rays: usize) -> Vec<Box<Scan>> {
+    let mut random = Rng::with_seed(seed);
+    (0..SCANS).map(|_| room(&mut random, rays)).collect()
+}
+
+fn room(random: &mut Rng, rays: usize) -> Box<Scan> {
+    let corners = CORNERS[random.usize(..CORNERS.len())];
+    let (turned, scale) = (random.f64(), 5.0 + 5.0 * random.f64());
+    let mean = (corners * corners) as f64 / 5.0;
+    let distances: Vec<f64> =
+        (0..corners).map(|_| scale * (poisson(random, mean) + 1.0) / (mean + 1.0)).collect();
+    let (each, step) = (TAU / corners as f64, TAU / (rays - 1) as f64);
+    let ranges: Vec<f64> = (0..rays)
+        .map(|ray| {
+            let angle = ray as f64 * step - PI + NOISE.0.to_radians() * normal(random);
+            let from_first = (angle - turned).rem_euclid(TAU);
+            let corner = ((from_first / each) as usize).min(corners - 1);
+            let (one, two) = (distances[corner], distances[(corner + 1) % corners]);
+            let inside = from_first - corner as f64 * each;
+            // The wall from one corner to the next, by the law of sines.
+            let wall = one * two * each.sin() / (one * inside.sin() + two * (each - inside).sin());
+            wall + NOISE.1 * normal(random)
+        })
+        .collect();
+    scan(-PI, step, &ranges)
+}
+
+/// Returns a Poisson-distributed number with this `mean`.
+fn poisson(random: &mut Rng, mean: f64) -> f64 {
+    let (mut time, mut count) = (0.0, 0.0);
+    loop {
+        time -= (1.0 - random.f64()).ln();
+        if time > mean {
+            return count;
+        }
+        count += 1.0;
+    }
+}

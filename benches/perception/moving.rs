@@ -1,0 +1,164 @@
+//! How well does a robot that drives distinguish moving from static objects? `background.method = "moving"` on
+//! simulated drives with known truth, next to `multi` where the robot stands, and on recordings of a model car with
+//! another car whose position is known.
+//!
+//! A beam counts as foreground if it meets a person with all of its spot, in space that was seen free at least five
+//! times. Not counted are beams at a person's edge, people where nothing was seen before, and the first 12 s.
+
+use std::ops::Range;
+use std::time::Instant;
+
+use preprocess::background::{Class, Method, Model, Settings};
+use preprocess::lines::{self, LineFinder};
+use preprocess::motion::{self, MotionEstimator};
+use schema::{Foreground, Lines, Motion, Pose, Scan};
+
+use crate::figures::{self, Cell, Figure, Target};
+use crate::recordings;
+use crate::worlds::{self, Drive};
+
+/// Measures on simulated drives with these `seeds` and on recorded ones.
+pub(crate) fn measure(seeds: Range<u64>, is_json: bool) {
+    let (mut figures, mut cells) = (Vec::new(), Vec::new());
+    of_drives(seeds, &mut figures);
+    of_recordings(&mut cells);
+    figures::print("perception, moving", is_json, &figures);
+    figures::print_cells("perception, moving", is_json, &cells);
+}
+
+/// The processors that the method needs, in the order in which the hub runs them.
+struct Processors {
+    lines: LineFinder,
+    motion: MotionEstimator,
+    model: Model,
+    found: Lines,
+    out: Box<Foreground>,
+}
+
+impl Processors {
+    fn new(method: Method, beams: usize) -> Processors {
+        let settings = Settings { method, ..Settings::default() };
+        Processors {
+            lines: LineFinder::new(Pose::default(), lines::Settings::default(), beams),
+            motion: MotionEstimator::new(Pose::default(), motion::Settings::default(), beams),
+            model: Model::new(settings, beams),
+            found: Lines::default(),
+            out: Foreground::of(beams),
+        }
+    }
+
+    fn update(&mut self, scan: &Scan) -> &[Class] {
+        if self.model.method() == Method::Moving {
+            let mut motion = Motion::default();
+            self.lines.update(scan, &mut self.found);
+            self.motion.update(scan, &self.found, &mut motion);
+            self.model.follow(&Pose::default(), &motion);
+        }
+        self.model.update(scan, &mut self.out);
+        self.model.classes()
+    }
+}
+
+/// Returns recall and precision of `method` from scan `from` on, and the time in us per scan. A map with the true poses
+/// says which beams are foreground.
+fn run(drive: &Drive, method: Method, from: usize) -> (f64, f64, f64) {
+    let beams = drive.scans[0].beams();
+    let mut processors = Processors::new(method, beams);
+    let mut free = worlds::Seen::default();
+    let (mut due, mut found, mut wrong, mut taken_us) = (0, 0, 0, 0.0);
+    for (at, scan) in drive.scans.iter().enumerate() {
+        let begin = Instant::now();
+        let classes = processors.update(scan);
+        taken_us += 1e6 * begin.elapsed().as_secs_f64();
+        if at >= from {
+            for (beam, class) in classes.iter().enumerate() {
+                let (is_person, is_reported) = (drive.people[at][beam], *class == Class::Foreground);
+                let is_edge = [beam.wrapping_sub(1), beam + 1]
+                    .iter()
+                    .any(|&other| drive.people[at].get(other).is_some_and(|person| *person != is_person));
+                if is_edge {
+                    continue;
+                }
+                let is_expected = is_person && free.is_free(&drive.places[at], scan, beam);
+                due += usize::from(is_expected);
+                found += usize::from(is_expected && is_reported);
+                wrong += usize::from(!is_person && is_reported);
+            }
+        }
+        free.look(&drive.places[at], scan);
+    }
+    let share = |part: usize, of: usize| part as f64 / of.max(1) as f64;
+    (share(found, due), share(found, found + wrong), taken_us / drive.scans.len() as f64)
+}
+
+fn of_drives(seeds: Range<u64>, figures: &mut Vec<Figure>) {
+    let mut put =
+        |name, unit, hub, baseline, target| figures.push(Figure { name, unit, hub, baseline, target });
+    let of = |speed: f64, beams: usize, method: Method| -> [Vec<f64>; 3] {
+        let mut columns = [Vec::new(), Vec::new(), Vec::new()];
+        for seed in seeds.clone() {
+            let drive = worlds::Drive::with_walkers(seed, beams, 1500, 3, speed);
+            let (recall, precision, time_us) = run(&drive, method, 450);
+            [recall, precision, time_us].into_iter().zip(&mut columns).for_each(|(value, of)| of.push(value));
+        }
+        columns
+    };
+    let [recall, precision, time_us] = of(0.02, 361, Method::Moving);
+    put("driving: recall", "1", recall, Vec::new(), Target::Least(0.95));
+    put("driving: precision", "1", precision, Vec::new(), Target::Least(0.90));
+    put("driving: time a scan, 361 beams", "us", time_us, Vec::new(), Target::None);
+    let [recall, precision, time_us] = of(0.02, 1081, Method::Moving);
+    put("driving, 1081 beams: recall", "1", recall, Vec::new(), Target::Least(0.95));
+    put("driving, 1081 beams: precision", "1", precision, Vec::new(), Target::Least(0.90));
+    put("driving: time a scan, 1081 beams", "us", time_us, Vec::new(), Target::None);
+    let [moving, multi] = [Method::Moving, Method::Multi].map(|method| of(0.0, 361, method));
+    let less = |of: usize| multi[of].iter().zip(&moving[of]).map(|(multi, moving)| multi - moving).collect();
+    put("standing: recall; multi", "1", moving[0].clone(), multi[0].clone(), Target::None);
+    put("standing: precision; multi", "1", moving[1].clone(), multi[1].clone(), Target::None);
+    put("standing: recall below multi's", "1", less(0), Vec::new(), Target::Most(0.01));
+    put("standing: precision below multi's", "1", less(1), Vec::new(), Target::Most(0.01));
+}
+
+/// Adds the scores for the other car while it moves: the share of its beams that are reported, and other beams that
+/// are, per scan.
+fn of_recordings(cells: &mut Vec<Cell>) {
+    let recordings = recordings::with_another();
+    if recordings.is_empty() {
+        eprintln!("left out: SCANHUB_DATA names no folder with moving/*.jsonl.gz");
+    }
+    for (drive, others) in recordings {
+        let mut processors = Processors::new(Method::Moving, 360);
+        let (mut due, mut found, mut wrong, mut scans) = (0, 0, 0, 0);
+        for (at, scan) in drive.scans.iter().enumerate() {
+            let classes = processors.update(scan);
+            let (Some(position), Some(other)) = (drive.positions[at], others[at]) else { continue };
+            scans += 1;
+            let before = others[at.saturating_sub(1)].unwrap_or(other);
+            let moves = (other.x - before.x).hypot(other.y - before.y) > 0.05 / 13.0;
+            for (beam, class) in classes.iter().enumerate() {
+                let Some(range) = scan.distance_m(beam) else { continue };
+                let angle = scan.angle(beam);
+                let (x, y) = position.point((range * angle.cos(), range * angle.sin()));
+                let far = (x - other.x).hypot(y - other.y);
+                let is_reported = *class == Class::Foreground;
+                due += usize::from(far < 0.2 && moves);
+                found += usize::from(far < 0.2 && moves && is_reported);
+                wrong += usize::from(far > 0.4 && is_reported);
+            }
+        }
+        let share = f64::from(found as u32) / f64::from(due.max(1) as u32);
+        for (column, value) in [
+            ("beams on the other car", f64::from(due as u32)),
+            ("share of them found", share),
+            ("other beams reported, per scan", f64::from(wrong as u32) / f64::from(scans.max(1))),
+        ] {
+            cells.push(Cell {
+                table: "another car".to_owned(),
+                row: drive.name.clone(),
+                column: column.to_owned(),
+                unit: "1",
+                values: vec![value],
+            });
+        }
+    }
+}

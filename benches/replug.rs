@@ -1,0 +1,271 @@
+//! What does a pulled plug cost? A pty that plays a streaming sensor is removed under a running hub and comes back
+//! under its name, every other time with another number, twenty times in all. How long until the hub reports the port
+//! as absent, how long until a subscriber has a telegram again, and what does the hub cost in between? The same for
+//! rotating scanners, which also lose their power for a moment.
+//!
+//! The bench does not measure how long the kernel takes to notice an adapter, or udev to name it.
+
+mod support;
+
+use std::collections::VecDeque;
+use std::ffi::OsStr;
+use std::fs;
+use std::os::fd::OwnedFd;
+use std::os::unix::ffi::OsStrExt;
+use std::os::unix::fs::symlink;
+use std::os::unix::net::UnixStream;
+use std::path::{Path, PathBuf};
+use std::process::{ExitCode, Stdio};
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex};
+use std::thread::{self, JoinHandle};
+use std::time::Duration;
+
+use lms::variant::{MIRROR_TURN, Unit};
+use rustix::event::{PollFd, PollFlags, Timespec, poll};
+use rustix::fs::{Mode, OFlags, fcntl_setfl, open};
+use rustix::pty::{OpenptFlags, grantpt, openpt, ptsname, unlockpt};
+use rustix::termios::{OptionalActions, tcgetattr, tcsetattr};
+use sim::options::{Scanner, SimulateOptions};
+use sim::{Event, simulate_with};
+
+use support::figures::{self, Figure, Target};
+use support::stage::{Child, PATIENCE, PROGRAM, Stage};
+use support::usage::Work;
+use support::{Options, Outcome, clock};
+
+fn main() -> ExitCode {
+    support::main(measure)
+}
+
+fn measure(options: &Options) -> Outcome<()> {
+    let stage = Stage::new()?;
+    let name = stage.port("front");
+    let mut plug = Plug::at(&name)?;
+    let hub = stage.hub(&["front"])?;
+    hub.await_line("ready", PATIENCE)?;
+    let telegrams = stage.consumer("telegram", "front", &["0"])?;
+    let statuses = stage.consumer("status", "front", &[])?;
+    telegrams.await_line("telegram", PATIENCE)?;
+    let (mut noticed, mut back, mut busy, mut torn) = (Vec::new(), Vec::new(), Vec::new(), 0.0);
+    for round in 0..options.count(20) {
+        // A different phase of the stream in each round.
+        clock::rest(clock::now() + (300 + 11 * (round as u64 % 20)) * MILLIS);
+        telegrams.lines_so_far();
+        statuses.lines_so_far();
+        let pulled = plug.pull(&name)?;
+        let absent = statuses.await_line("status front absent", PATIENCE)?.number(3)?;
+        noticed.push(absent.saturating_sub(pulled) as f64 / 1e6);
+        let (before, begun) = (Work::of(hub.guard.pid(), |_| true)?, clock::now());
+        // A different phase of the hub's polls, too.
+        clock::rest(begun + (1_000 + 37 * (round as u64 % 20)) * MILLIS);
+        let work = Work::of(hub.guard.pid(), |_| true)?.since(before);
+        busy.push(100.0 * work.busy_ns as f64 / (clock::now() - begun) as f64);
+        // Drops what arrived before the sensor was unplugged.
+        telegrams.lines_so_far();
+        let other_number = (round % 2 == 1).then(make_pty).transpose()?;
+        plug = Plug::at(&name)?;
+        let line = telegrams.await_line("telegram", PATIENCE)?;
+        back.push((line.number(2)? - plug.since) as f64 / 1e6);
+        torn += f64::from(u8::from(line.words().get(5) != Some(&"true")));
+        drop(other_number);
+    }
+    drop((telegrams, statuses, hub));
+    plug.pull(&name)?;
+    let figure = |name, unit, hub, target| Figure { name, unit, hub, baseline: Vec::new(), target };
+    let worst = |values: &[f64]| vec![values.iter().copied().fold(0.0, f64::max)];
+    let mut figures = vec![
+        figure("unplugged until absent, longest", "ms", worst(&noticed), Target::Most(50.0)),
+        figure("unplugged until absent", "ms", noticed, Target::None),
+        figure("plugged in until a telegram, longest", "ms", worst(&back), Target::Most(500.0)),
+        figure("plugged in until a telegram", "ms", back, Target::None),
+        figure("hub while absent, maximum", "% of a core", worst(&busy), Target::Most(2.0)),
+        figure("hub while absent", "% of a core", busy, Target::None),
+        figure("torn telegrams", "1", vec![torn], Target::Most(0.0)),
+    ];
+    drop(stage);
+    figures.extend(rotating_scanners(options)?);
+    figures::print("replug", options.json, &figures);
+    Ok(())
+}
+
+/// A streaming sensor that is plugged in under a name.
+struct Plug {
+    pulled: Arc<AtomicBool>,
+    sensor: JoinHandle<OwnedFd>,
+    /// Time at which its name appeared.
+    since: u64,
+}
+
+impl Plug {
+    fn at(name: &str) -> Outcome<Plug> {
+        let (line, pty) = make_pty()?;
+        let pulled = Arc::new(AtomicBool::new(false));
+        let sensor = thread::spawn({
+            let pulled = pulled.clone();
+            move || stream(line, &pulled)
+        });
+        symlink(OsStr::from_bytes(&pty), name)?;
+        Ok(Plug { pulled, sensor, since: clock::now() })
+    }
+
+    /// Unplugs the sensor, and returns the time.
+    fn pull(self, name: &str) -> Outcome<u64> {
+        self.pulled.store(true, Ordering::Relaxed);
+        let line = self.sensor.join().map_err(|_| "the sensor panicked")?;
+        fs::remove_file(name)?;
+        let at = clock::now();
+        drop(line);
+        Ok(at)
+    }
+}
+
+/// Sends scans like a sensor, two mirror turns apart and each in two parts, while a program has the line open.
+fn stream(line: OwnedFd, pulled: &AtomicBool) -> OwnedFd {
+    let mut at = clock::now();
+    let mut heard = [0; 256];
+    for number in 0_u16.. {
+        let words: [u16; 361] = std::array::from_fn(|beam| 500 + (number % 1000) + beam as u16);
+        let scan = lms::measured::encode(0, Unit::Mm, &words, 0x10);
+        let (first, second) = scan.bytes().split_at(508);
+        for part in [first, second] {
+            at += MIRROR_TURN;
+            clock::rest(at);
+            if pulled.load(Ordering::Relaxed) {
+                break;
+            }
+            while rustix::io::read(&line, &mut heard).is_ok_and(|len| len > 0) {}
+            if is_open(&line) {
+                let _ = rustix::io::write(&line, part);
+            }
+        }
+        if pulled.load(Ordering::Relaxed) {
+            break;
+        }
+    }
+    line
+}
+
+fn is_open(line: &OwnedFd) -> bool {
+    let mut fds = [PollFd::new(line, PollFlags::IN)];
+    let now = Timespec { tv_sec: 0, tv_nsec: 0 };
+    poll(&mut fds, Some(&now)).is_ok() && !fds[0].revents().contains(PollFlags::HUP)
+}
+
+/// Returns a raw pty and the name of its other end.
+fn make_pty() -> Outcome<(OwnedFd, Vec<u8>)> {
+    let line = openpt(OpenptFlags::RDWR | OpenptFlags::NOCTTY | OpenptFlags::CLOEXEC)?;
+    grantpt(&line)?;
+    unlockpt(&line)?;
+    let name = ptsname(&line, Vec::new())?;
+    fcntl_setfl(&line, OFlags::RDWR | OFlags::NONBLOCK)?;
+    // A pty reports that it is closed only after it was opened once.
+    let other = open(&*name, OFlags::RDWR | OFlags::NOCTTY | OFlags::CLOEXEC, Mode::empty())?;
+    let mut termios = tcgetattr(&other)?;
+    termios.make_raw();
+    tcsetattr(&other, OptionalActions::Now, &termios)?;
+    Ok((line, name.into_bytes()))
+}
+
+const MILLIS: u64 = 1_000_000;
+
+/// A rotating scanner with the names of its figures.
+struct RotatingScanner {
+    family: &'static str,
+    scanner: Scanner,
+    back: &'static str,
+    powered: &'static str,
+}
+
+const SCANNERS: [RotatingScanner; 2] = [
+    RotatingScanner {
+        family: "ld",
+        scanner: Scanner::Ld(sim::ld::Model::Ld19),
+        back: "LD19: plugged in until a scan, longest",
+        powered: "LD19: powered on until a scan, without 0.5 s of booting, longest",
+    },
+    RotatingScanner {
+        family: "rplidar",
+        scanner: Scanner::Rplidar { model: sim::rplidar::Model::A1, mode: 3 },
+        back: "RPLIDAR A1: plugged in until a scan, longest",
+        powered: "RPLIDAR A1: powered on until a scan, without 0.5 s of booting, longest",
+    },
+];
+
+/// Measures all rotating scanners, at ptys of the simulator in this process: the adapter is unplugged for two seconds,
+/// or the power is off for a moment. How long until a subscriber has a scan of a whole revolution again?
+fn rotating_scanners(options: &Options) -> Outcome<Vec<Figure>> {
+    let mut figures = Vec::new();
+    for scanner in &SCANNERS {
+        figures.extend(scanner.measure(options)?);
+    }
+    Ok(figures)
+}
+
+impl RotatingScanner {
+    fn measure(&self, options: &Options) -> Outcome<[Figure; 2]> {
+        let stage = Stage::new()?;
+        let port = PathBuf::from(stage.port("front"));
+        let events = Arc::new(Mutex::new(VecDeque::new()));
+        let (stop, stopped) = UnixStream::pair()?;
+        let simulator = thread::spawn({
+            let (events, port) = (events.clone(), port.clone());
+            let scanner = Some(self.scanner);
+            let options =
+                SimulateOptions { ports: vec![port], scanner, boot: BOOT, ..SimulateOptions::default() };
+            let next = move |_: &Path| events.lock().ok()?.pop_front();
+            move || simulate_with(&options, &stopped, |_| {}, |_| {}, next, |_, _| {})
+        });
+        await_name(&port);
+        let mut command = stage.hub_command(PROGRAM, &["front"]);
+        command.arg(format!("--set=link.front.family={}", self.family));
+        let hub = Child::of(command, Stdio::null())?;
+        hub.await_line("ready", PATIENCE)?;
+        let scans = stage.consumer("each", "front", &[])?;
+        scans.await_line("scanned", PATIENCE)?;
+        let inject =
+            |event: Event| events.lock().map(|mut events| events.push_back(event)).map_err(|_| "poisoned");
+        let (mut back, mut powered) = (Vec::new(), Vec::new());
+        for round in 0..options.count(10) as u64 {
+            // A different phase of the revolution in each round.
+            clock::rest(clock::now() + (1_000 + 37 * (round % 10)) * MILLIS);
+            inject(Event::Unplug(OUT))?;
+            while port.exists() {
+                clock::rest(clock::now() + MILLIS);
+            }
+            scans.lines_so_far();
+            await_name(&port);
+            let since = clock::now();
+            back.push((scans.await_line("scanned", PATIENCE)?.number(2)? - since) as f64 / 1e6);
+            clock::rest(clock::now() + (1_000 + 41 * (round % 10)) * MILLIS);
+            inject(Event::PowerCycle)?;
+            // By then, whatever was in transit has arrived, and the scanner has sent nothing else.
+            clock::rest(clock::now() + BOOT.as_nanos() as u64);
+            let since = clock::now();
+            scans.lines_so_far();
+            powered.push((scans.await_line("scanned", PATIENCE)?.number(2)? - since) as f64 / 1e6);
+        }
+        drop((scans, hub, stop));
+        simulator.join().map_err(|_| "the simulator panicked")??;
+        let worst = |values: &[f64]| vec![values.iter().copied().fold(0.0, f64::max)];
+        let figure = |name, values: &[f64], target| Figure {
+            name,
+            unit: "ms",
+            hub: worst(values),
+            baseline: Vec::new(),
+            target,
+        };
+        Ok([figure(self.back, &back, Target::Most(500.0)), figure(self.powered, &powered, Target::None)])
+    }
+}
+
+fn await_name(port: &Path) {
+    while !port.exists() {
+        clock::rest(clock::now() + MILLIS);
+    }
+}
+
+/// Time from power-on to the boot message.
+const BOOT: Duration = Duration::from_millis(500);
+/// Time for which an adapter is unplugged, in ns.
+const OUT: u64 = 2_000 * MILLIS;

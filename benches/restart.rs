@@ -1,0 +1,330 @@
+//! What does a crash of the hub cost its subscribers? The hub is killed with SIGKILL and started again, twenty times in
+//! all, without a service manager that keeps its lines, while a process per sensor receives its telegrams. How long
+//! until the services are up and until each subscriber has a telegram, compared with a bare reader that opens the same
+//! streaming ptys and wakes a process? Counts damaged telegrams, telegrams missed within a run, and writes to the
+//! sensors' EEPROM.
+//!
+//! Then the same under a service manager that keeps the line of one sensor open: how long is the silence, and what is
+//! lost? The bench does not measure how long a service manager takes to notice.
+
+#[path = "../tests/testkit/supervisor.rs"]
+mod supervisor;
+mod support;
+
+use std::collections::HashSet;
+use std::process::ExitCode;
+use std::thread;
+use std::time::Duration;
+
+use supervisor::Supervisor;
+use support::figures::{self, Figure, Target};
+use support::stage::{Child, PATIENCE, PROGRAM, SENSORS, Stage};
+use support::truth::Truth;
+use support::{Options, Outcome, clock};
+
+fn main() -> ExitCode {
+    support::main(measure)
+}
+
+fn measure(options: &Options) -> Outcome<()> {
+    let stage = Stage::new()?;
+    let simulator = stage.simulate(&SENSORS, 500_000)?;
+    let follow = |sensor: &&str| stage.consumer("telegram", sensor, &["0"]);
+    let consumers: Vec<Child> = SENSORS.iter().map(follow).collect::<Outcome<_>>()?;
+    let mut runs = Runs { stage: &stage, consumers: &consumers, hub: None, torn: 0, missed: 0, received: 0 };
+    runs.restart()?;
+    let (mut hub, mut baseline) = (Vec::new(), Vec::new());
+    // A series of kills, then the same number of starts of the baseline, on the same streams.
+    let each = options.count(20).div_ceil(options.pairs());
+    for _ in 0..options.pairs() {
+        for _ in 0..each {
+            thread::sleep(run_time(hub.len()));
+            hub.push(runs.restart()?);
+        }
+        runs.kill()?;
+        for _ in 0..each {
+            thread::sleep(run_time(baseline.len()));
+            baseline.push(start_baseline(&stage)?);
+        }
+        runs.restart()?;
+    }
+    runs.kill()?;
+    let (torn, missed, received) = (runs.torn as f64, runs.missed as f64, runs.received as f64);
+    drop(consumers);
+    drop(simulator);
+    let writes: Outcome<Vec<_>> = SENSORS
+        .iter()
+        .map(|sensor| Ok(Truth::read(&stage.truth(), sensor)?.eeprom_writes.ok_or("no summary")?))
+        .collect();
+    let writes = writes?.iter().sum::<u64>() as f64;
+    let figure = |name, of: fn(&Start) -> f64, target| {
+        let baseline = baseline.iter().map(of).collect();
+        Figure { name, unit: "ms", hub: hub.iter().map(of).collect(), baseline, target }
+    };
+    let count =
+        |name, value, target| Figure { name, unit: "1", hub: vec![value], baseline: Vec::new(), target };
+    let mut figures = vec![
+        figure("exec to services up", |start| start.up_ms, Target::Most(50.0)),
+        figure("exec to first telegram, sooner", |start| start.first_ms[0], Target::Most(500.0)),
+        figure("exec to first telegram, later", |start| start.first_ms[1], Target::Most(500.0)),
+        count("telegrams received", received, Target::None),
+        count("of them torn", torn, Target::Most(0.0)),
+        count("missed within a run", missed, Target::Most(0.0)),
+        count("EEPROM writes", writes, Target::Most(0.0)),
+    ];
+    drop(stage);
+    figures.extend(with_kept_line(options.count(20))?);
+    figures::print("restart", options.json, &figures);
+    Ok(())
+}
+
+/// Times of a start, in ms from exec.
+struct Start {
+    up_ms: f64,
+    /// First telegram of the subscriber that was served first, and of the other one.
+    first_ms: [f64; 2],
+}
+
+impl Start {
+    fn new(started_ns: u64, up_ns: u64, mut first_ns: [u64; 2]) -> Start {
+        first_ns.sort_unstable();
+        let since = |at: u64| (at - started_ns) as f64 / 1e6;
+        Start { up_ms: since(up_ns), first_ms: first_ns.map(since) }
+    }
+}
+
+/// The runs of the hub, and the subscribers, which outlive them.
+struct Runs<'a> {
+    stage: &'a Stage,
+    consumers: &'a [Child],
+    hub: Option<Child>,
+    torn: u64,
+    missed: u64,
+    received: u64,
+}
+
+impl Runs<'_> {
+    fn kill(&mut self) -> Outcome<()> {
+        if let Some(hub) = self.hub.take() {
+            hub.guard.kill()?;
+        }
+        for consumer in self.consumers {
+            for line in consumer.lines_so_far() {
+                self.count(&line.words());
+            }
+        }
+        Ok(())
+    }
+
+    /// Kills the hub, if one runs, and starts the next. Returns when each subscriber has a telegram of it.
+    fn restart(&mut self) -> Outcome<Start> {
+        self.kill()?;
+        let hub = self.stage.hub(&SENSORS)?;
+        let up_ns = hub.await_line("ready", PATIENCE)?.at_ns;
+        let mut first_ns = [0; 2];
+        for (first_ns, consumer) in first_ns.iter_mut().zip(self.consumers) {
+            // What the last hub sent just before its end may still be in the pipe.
+            while *first_ns < hub.started_ns {
+                let line = consumer.await_line("telegram", PATIENCE)?;
+                self.count(&line.words());
+                *first_ns = line.number(2)?;
+            }
+        }
+        let start = Start::new(hub.started_ns, up_ns, first_ns);
+        self.hub = Some(hub);
+        Ok(start)
+    }
+
+    fn count(&mut self, words: &[&str]) {
+        if let ["telegram", _, _, _, missed, intact, ..] = words {
+            self.received += 1;
+            self.missed += missed.parse().unwrap_or(1);
+            self.torn += u64::from(*intact != "true");
+        }
+    }
+}
+
+fn start_baseline(stage: &Stage) -> Outcome<Start> {
+    let baseline = stage.bare(&SENSORS, 0)?;
+    let up_ns = baseline.await_line("ready", PATIENCE)?.at_ns;
+    let mut first_ns = [0; 2];
+    while first_ns.contains(&0) {
+        let line = baseline.await_line("woken", PATIENCE)?;
+        let first_ns = &mut first_ns[line.number(1)? as usize];
+        if *first_ns == 0 {
+            *first_ns = line.number(2)?;
+        }
+    }
+    let start = Start::new(baseline.started_ns, up_ns, first_ns);
+    baseline.guard.kill()?;
+    Ok(start)
+}
+
+/// Returns the length of run number `n`: a different phase of the stream each time.
+fn run_time(n: usize) -> Duration {
+    Duration::from_millis(700 + 11 * (n as u64 % 20))
+}
+
+/// Measures a hub whose line a service manager keeps open, as with the unit in hub/dist: `kills` at times that are
+/// spread evenly over a telegram, and half as many in the 0.6 ms in which a telegram is read, the only time in which it
+/// has left the line and is not yet sent. What a subscriber received is compared with what the simulated sensor sent.
+fn with_kept_line(kills: usize) -> Outcome<Vec<Figure>> {
+    let spread = run_with_kept_line(kills, |n| PERIOD_NS * (2 * n + 1) / (2 * kills as u64))?;
+    let reading = run_with_kept_line(kills.div_ceil(2), |_| PERIOD_NS - READING_NS / 2)?;
+    let series = |name, hub, target| Figure { name, unit: "ms", hub, baseline: Vec::new(), target };
+    let count = |name, value: usize, target| Figure {
+        name,
+        unit: "1",
+        hub: vec![value as f64],
+        baseline: Vec::new(),
+        target,
+    };
+    let longest = |silences: &[f64]| silences.iter().copied().fold(0.0, f64::max);
+    Ok(vec![
+        series("kept: silence of telegrams", spread.telegrams_ms.clone(), Target::None),
+        series("kept: longest silence", vec![longest(&spread.telegrams_ms)], Target::Most(300.0)),
+        series("kept: silence of scans", spread.scans_ms.clone(), Target::None),
+        series("kept: longest silence", vec![longest(&spread.scans_ms)], Target::Most(300.0)),
+        count("kept: kills", kills, Target::None),
+        count("kept: telegrams sent", spread.sent, Target::None),
+        count("kept: telegrams lost", spread.lost, Target::Most(0.0)),
+        count("kept: of these, while none was being read", spread.lost_otherwise, Target::Most(0.0)),
+        count("kept: aborted by the sensor", spread.aborted, Target::None),
+        count("kept, while reading: kills", kills.div_ceil(2), Target::None),
+        count("kept, while reading: lost", reading.lost, Target::None),
+        count(
+            "kept, while reading: of these, while none was being read",
+            reading.lost_otherwise,
+            Target::Most(0.0),
+        ),
+    ])
+}
+
+/// Results of several kills.
+#[derive(Default)]
+struct Cost {
+    /// Time from the last telegram of a run to the first of the next one, on receipt.
+    telegrams_ms: Vec<f64>,
+    /// The same for scans.
+    scans_ms: Vec<f64>,
+    /// Complete telegrams of measured data from the first that was received to the last.
+    sent: usize,
+    lost: usize,
+    /// Those of them that no hub should have been reading when it was killed: a hub that is woken late reads what has
+    /// arrived.
+    lost_otherwise: usize,
+    /// Telegrams that the sensor aborted in this time to answer the next hub.
+    aborted: usize,
+}
+
+/// A subscriber, with the time of the last sample of each run.
+struct Receiver {
+    process: Child,
+    /// Words of a line: when the sample was received, and the run that it belongs to.
+    words: (usize, usize),
+    boot: u64,
+    last_ns: u64,
+    silences_ms: Vec<f64>,
+    /// All lines that it printed.
+    lines: Vec<Vec<String>>,
+}
+
+impl Receiver {
+    fn new(process: Child, words: (usize, usize)) -> Receiver {
+        Receiver { process, words, boot: 0, last_ns: 0, silences_ms: Vec::new(), lines: Vec::new() }
+    }
+
+    /// Waits for the next sample.
+    fn next(&mut self) -> Outcome<()> {
+        let line = self.process.next_line(PATIENCE)?;
+        let words = line.words();
+        if words.len() <= self.words.1 {
+            return Ok(());
+        }
+        let (at_ns, boot) = (line.number(self.words.0)?, line.number(self.words.1)?);
+        if boot != self.boot && self.boot != 0 {
+            self.silences_ms.push((at_ns - self.last_ns) as f64 / 1e6);
+        }
+        (self.boot, self.last_ns) = (boot, at_ns);
+        self.lines.push(words.into_iter().map(str::to_owned).collect());
+        Ok(())
+    }
+
+    /// Receives until there is a sample at or after `until_ns`, and until there have been `silences` changes of the
+    /// run.
+    fn follow(&mut self, until_ns: u64, silences: usize) -> Outcome<()> {
+        while self.last_ns < until_ns || self.silences_ms.len() < silences {
+            self.next()?;
+        }
+        Ok(())
+    }
+}
+
+/// Kills the hub `kills` times, number n at the time `moment(n)` after the last byte of a telegram.
+fn run_with_kept_line(kills: usize, moment: impl Fn(u64) -> u64) -> Outcome<Cost> {
+    let stage = Stage::new()?;
+    let sensor = SENSORS[0];
+    let simulator = stage.simulate_one(sensor, &["--baud", "500000"])?;
+    let mut supervisor = Supervisor::new(stage.file("notify").display().to_string());
+    let command = stage.hub_command(PROGRAM, &[sensor]);
+    let mut start = || -> Outcome<Child> {
+        let (command, stdin) = supervisor.service(&command, None);
+        let hub = Child::of(command, stdin)?;
+        hub.await_line("ready", PATIENCE)?;
+        supervisor.hear(&format!("FDNAME={sensor}"));
+        Ok(hub)
+    };
+    let mut hub = start()?;
+    let mut telegrams = Receiver::new(stage.consumer("telegram", sensor, &["0"])?, (2, 3));
+    let mut scans = Receiver::new(stage.part(&["consume", "each", stage.domain.name(), sensor])?, (2, 3));
+    let mut killed_ns = Vec::new();
+    for n in 0..kills {
+        let settled_ns = clock::now() + SETTLING.as_nanos() as u64;
+        telegrams.follow(settled_ns, n)?;
+        scans.follow(settled_ns, n)?;
+        let last_byte_ns: u64 = telegrams.lines.last().ok_or("no telegram")?[7].parse()?;
+        clock::rest(last_byte_ns + moment(n as u64) + PERIOD_NS);
+        killed_ns.push(clock::now());
+        hub.guard.kill()?;
+        thread::sleep(RESTART);
+        hub = start()?;
+    }
+    let settled_ns = clock::now() + SETTLING.as_nanos() as u64;
+    telegrams.follow(settled_ns, kills)?;
+    scans.follow(settled_ns, kills)?;
+    hub.guard.kill()?;
+    drop(simulator);
+    let truth = Truth::read(&stage.own_truth(sensor), sensor)?;
+    let received: HashSet<&str> = telegrams.lines.iter().map(|words| words[6].as_str()).collect();
+    let is_received = |hash: &String| received.contains(hash.as_str());
+    let first = truth.sent.iter().position(|sent| is_received(&sent.hash)).ok_or("nothing was sent")?;
+    let last = truth.sent.iter().rposition(|sent| is_received(&sent.hash)).ok_or("nothing was sent")?;
+    let span = &truth.sent[first..=last];
+    let lost: Vec<u64> = span.iter().filter(|sent| !is_received(&sent.hash)).map(|sent| sent.at_ns).collect();
+    let is_reading = |end_ns: u64, killed_ns: u64| {
+        (end_ns.saturating_sub(READING_NS + NOISE_NS)..end_ns + LATE_NS).contains(&killed_ns)
+    };
+    let otherwise = |end_ns: &&u64| !killed_ns.iter().any(|killed_ns| is_reading(**end_ns, *killed_ns));
+    let meanwhile = span[0].at_ns..span[span.len() - 1].at_ns;
+    Ok(Cost {
+        telegrams_ms: telegrams.silences_ms,
+        scans_ms: scans.silences_ms,
+        sent: span.len(),
+        lost: lost.len(),
+        lost_otherwise: lost.iter().filter(otherwise).count(),
+        aborted: truth.aborted_ns.iter().filter(|at_ns| meanwhile.contains(*at_ns)).count(),
+    })
+}
+
+/// Time from one telegram of 361 beams to the next: two turns of the mirror.
+const PERIOD_NS: u64 = 26_640_000;
+/// Time before a telegram's end at which the hub begins to read.
+const READING_NS: u64 = 600_000;
+/// Difference between the times that two processes report for the same event.
+const NOISE_NS: u64 = 400_000;
+/// Delay of a hub that shares its processors.
+const LATE_NS: u64 = 4_000_000;
+/// Time after which the hub certainly knows the sensor's timing.
+const SETTLING: Duration = Duration::from_millis(700);
+/// Pause of a service manager: RestartSec of the unit.
+const RESTART: Duration = Duration::from_millis(20);

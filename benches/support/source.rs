@@ -1,0 +1,64 @@
+//! A hub without sensors: publishes the same scan whenever it is told to.
+
+use schema::ipc::{self, Node, Payload, Publisher, TopicService, Waker};
+use schema::limits::TopicLimits;
+use schema::{Domain, Header, HubLock, Ring, Scan, ScanHead, Status, Wake};
+
+use super::Outcome;
+
+/// Name of its only sensor.
+pub(crate) const SENSOR: &str = "front";
+
+/// A hub without sensors, which publishes the same scan whenever it is told to.
+pub(crate) struct Source {
+    publisher: Publisher<Scan>,
+    waker: Waker,
+    next: u64,
+    _service: TopicService<Scan>,
+    /// Every hub has this topic. A gateway would request it again and again if it did not exist.
+    _status: TopicService<Status>,
+    _node: Node,
+    _lock: HubLock,
+}
+
+impl Source {
+    pub(crate) fn open(domain: &Domain) -> Outcome<Source> {
+        let lock = HubLock::acquire(domain.root())?;
+        let node = ipc::hub_node(domain)?;
+        // Maximum number of subscribers in any bench.
+        let limits = TopicLimits { consumers: 200, ..TopicLimits::default() };
+        let waker = Waker::new(&node, SENSOR)?;
+        let service = Scan::create(&node, SENSOR, &limits)?;
+        Ok(Source {
+            publisher: Scan::publisher(&service, &limits)?,
+            waker,
+            next: 0,
+            _service: service,
+            _status: Status::create(&node, SENSOR, &limits)?,
+            _node: node,
+            _lock: lock,
+        })
+    }
+
+    /// Publishes a scan with this stamp of the wall clock, and wakes the subscribers.
+    pub(crate) fn publish(&mut self, wall_ns: u64) -> Outcome<()> {
+        let scan = scan();
+        let loan = Scan::loan(&self.publisher, scan.bytes().len());
+        let mut sample = loan.map_err(|error| format!("no loan: {error:?}"))?;
+        let header = Header { seq: self.next, topic_seq: self.next, boot: 1, wall_ns, ..Header::default() };
+        self.next += 1;
+        *sample.user_header_mut() = header;
+        let to = Scan::write(&mut sample).begin(**scan);
+        to.ranges.copy_from_slice(scan.ranges());
+        sample.send().map_err(|error| format!("not sent: {error:?}"))?;
+        self.waker.ring(Ring::First);
+        self.waker.tell(Wake::Telegram)?;
+        Ok(())
+    }
+}
+
+/// Returns a scan of 361 beams in mm, as scanners send by default.
+pub(crate) fn scan() -> Box<Scan> {
+    let ranges: [u16; 361] = std::array::from_fn(|beam| 1000 + beam as u16);
+    Scan::of(ScanHead::lms(ranges.len(), -90_000, 500, 1, 13), &ranges)
+}

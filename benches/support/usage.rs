@@ -1,0 +1,104 @@
+//! CPU time and memory of a process and memory of its domain, as the kernel counts them.
+
+use std::collections::BTreeMap;
+use std::fs::{read_dir, read_to_string};
+use std::os::unix::fs::MetadataExt;
+
+use schema::Domain;
+
+use super::Outcome;
+
+/// CPU time and context switches of a process, or of some of its threads.
+#[derive(Clone, Copy, Debug, Default)]
+pub(crate) struct Work {
+    /// CPU time, in ns.
+    pub(crate) busy_ns: u64,
+    /// Number of times that a thread went to sleep.
+    pub(crate) voluntary: u64,
+    /// Number of times that a thread was preempted.
+    pub(crate) involuntary: u64,
+}
+
+impl Work {
+    /// Returns the counters of the threads of `pid` whose names `wanted` accepts.
+    pub(crate) fn of(pid: u32, wanted: impl Fn(&str) -> bool) -> Outcome<Work> {
+        let mut work = Work::default();
+        for task in read_dir(format!("/proc/{pid}/task"))? {
+            let task = task?.path();
+            if !wanted(read_to_string(task.join("comm"))?.trim()) {
+                continue;
+            }
+            let schedstat = read_to_string(task.join("schedstat"))?;
+            work.busy_ns += schedstat.split_whitespace().next().ok_or("no schedstat")?.parse::<u64>()?;
+            let status = read_to_string(task.join("status"))?;
+            work.voluntary += field(&status, "voluntary_ctxt_switches:")?;
+            work.involuntary += field(&status, "nonvoluntary_ctxt_switches:")?;
+        }
+        Ok(work)
+    }
+
+    /// Returns what was added since `before`.
+    pub(crate) fn since(&self, before: Work) -> Work {
+        Work {
+            busy_ns: self.busy_ns.saturating_sub(before.busy_ns),
+            voluntary: self.voluntary.saturating_sub(before.voluntary),
+            involuntary: self.involuntary.saturating_sub(before.involuntary),
+        }
+    }
+}
+
+fn field(status: &str, name: &str) -> Outcome<u64> {
+    let line = status.lines().find_map(|line| line.strip_prefix(name)).ok_or_else(|| format!("no {name}"))?;
+    Ok(line.trim().parse()?)
+}
+
+/// Resident memory of a process, in bytes.
+#[derive(Clone, Copy, Debug, Default)]
+pub(crate) struct Resident {
+    /// All of it.
+    pub(crate) all: f64,
+    /// Heap and stacks.
+    pub(crate) own: f64,
+    /// Pages of programs and libraries.
+    pub(crate) files: f64,
+    /// Pages of shared memory that the process has touched. Subscribers share them.
+    pub(crate) shared: f64,
+}
+
+impl Resident {
+    /// Reads the memory of `pid`.
+    pub(crate) fn of(pid: u32) -> Outcome<Resident> {
+        let status = read_to_string(format!("/proc/{pid}/status"))?;
+        let field = |name: &str| -> Outcome<f64> {
+            let line = status.lines().find_map(|line| line.strip_prefix(name));
+            let kb =
+                line.and_then(|line| line.split_whitespace().next()).ok_or_else(|| format!("no {name}"))?;
+            Ok(kb.parse::<f64>()? * 1024.0)
+        };
+        Ok(Resident {
+            all: field("VmRSS:")?,
+            own: field("RssAnon:")?,
+            files: field("RssFile:")?,
+            shared: field("RssShmem:")?,
+        })
+    }
+}
+
+/// Returns number and bytes of the files of `domain` in /dev/shm, by the ends of their names, which say what they are
+/// for.
+pub(crate) fn segments(domain: &Domain) -> Outcome<BTreeMap<String, (usize, f64)>> {
+    let mut kinds = BTreeMap::<String, (usize, f64)>::new();
+    for entry in read_dir("/dev/shm")? {
+        let entry = entry?;
+        let name = entry.file_name().to_string_lossy().into_owned();
+        if !name.starts_with(&domain.prefix()) {
+            continue;
+        }
+        // A process that exits at this moment removes its files.
+        let Ok(metadata) = entry.metadata() else { continue };
+        let kind = kinds.entry(name.rsplit('.').next().unwrap_or_default().to_owned()).or_default();
+        kind.0 += 1;
+        kind.1 += metadata.blocks() as f64 * 512.0;
+    }
+    Ok(kinds)
+}

@@ -1,0 +1,492 @@
+//! What does a bridge cost, and what does it lose? How long does a scan take from shared memory to a plain Zenoh client
+//! behind a router, compared with a plain publisher; all topics of two sensors for minutes; a router that is killed
+//! again and again; a link that is too slow. Routers are bridges that listen. The bench does not measure a real
+//! network.
+//!
+//! `cargo bench -p scanhub-bridge --bench bridge [-- MINUTES] [hop|killed|slow|loss ..]` (default: 10, all), after
+//! `cargo build --release`.
+
+mod stage;
+
+use std::collections::{BTreeMap, HashMap, VecDeque};
+use std::io::{ErrorKind, Read, Write};
+use std::net::{Shutdown, SocketAddr, TcpListener, TcpStream};
+use std::sync::{Arc, Mutex};
+use std::thread;
+use std::time::{Duration, Instant};
+
+use scanhub_client::streams::{Session, Source};
+use scanhub_client::{Flags, Topic, clock};
+use schema::datagram::{Datagram, HEAD, Head};
+use serde_json::Value;
+use socket2::{Domain, Protocol, Socket, Type};
+use zenoh::Wait;
+
+use stage::{SENSORS, Stage, Times, free_port, listened, percentile, session};
+
+/// One row of the table.
+struct Row {
+    what: String,
+    value: String,
+    /// The target, and whether it was met.
+    target: Option<(&'static str, bool)>,
+}
+
+fn row(what: &str, value: impl Into<String>, target: Option<(&'static str, bool)>) -> Row {
+    Row { what: what.to_owned(), value: value.into(), target }
+}
+
+fn main() {
+    let words: Vec<String> = std::env::args().skip(1).filter(|word| !word.starts_with("--")).collect();
+    let minutes = words.iter().find_map(|word| word.parse().ok()).unwrap_or(10.0);
+    let is_selected = |part: &str| words.iter().all(|word| word.parse::<f64>().is_ok() || word == part);
+    type Part<'a> = (&'static str, &'a dyn Fn(&Stage) -> Vec<Row>);
+    let in_minutes = |stage: &Stage| loss(stage, minutes);
+    let parts: [Part<'_>; 4] =
+        [("hop", &latency), ("killed", &killed_router), ("slow", &slow_link), ("loss", &in_minutes)];
+    for (name, part) in parts {
+        if is_selected(name) || words.iter().any(|word| word == name) {
+            let Some(stage) = Stage::new(name) else { return };
+            for Row { what, value, target } in part(&stage) {
+                let target = target.map_or(String::new(), |(target, is_met)| {
+                    format!(" ({target}: {})", if is_met { "met" } else { "missed" })
+                });
+                println!("{what}: {value}{target}");
+            }
+        }
+    }
+}
+
+/// Number of runs.
+const RUNS: usize = 5;
+/// Length of a run.
+const RUN: Duration = Duration::from_secs(10);
+
+/// How long does a scan take from shared memory over a router to a plain client, compared with the same bytes from a
+/// plain publisher over the same router in the same run?
+fn latency(stage: &Stage) -> Vec<Row> {
+    let (robot, between) = (stage.machine("robot"), stage.machine("router"));
+    let at = free_port();
+    let _router = between.bridge(&[&format!("--listen=tcp/{at}")]);
+    listened(at);
+    let _hub = robot.robot();
+    let _bridge = robot.bridge(&[&format!("--connect=tcp/{at}")]);
+    let (mut memory, mut sources) = robot.follow(SENSORS.map(|sensor| (sensor, Topic::Scan)));
+
+    // By sensor and number of the telegram: when a scan was in shared memory, on CLOCK_MONOTONIC.
+    let mut sent: HashMap<(u8, u32), u64> = HashMap::new();
+    let (through, plain): (Arc<Mutex<Vec<_>>>, Times) = Default::default();
+    let (listener, speaker) = (session(at), session(at));
+    let arrivals = through.clone();
+    let _ours = listener
+        .declare_subscriber("scanhub/*/*/scan")
+        .callback(move |sample| {
+            let now_ns = clock::now_ns();
+            let bytes = sample.payload().to_bytes();
+            let head = Datagram::read(&bytes).expect("a datagram").head;
+            arrivals.lock().expect("no panic").push(((head.sensor, head.counter), now_ns));
+        })
+        .wait()
+        .expect("a subscriber");
+    let ages = plain.clone();
+    let _bare = listener
+        .declare_subscriber("bare/scan")
+        .callback(move |sample| {
+            let now_ns = clock::now_ns();
+            let bytes = sample.payload().to_bytes();
+            let sent_ns = Datagram::read(&bytes).expect("a datagram").head.stamp_ns;
+            ages.lock().expect("no panic").push(now_ns.saturating_sub(sent_ns));
+        })
+        .wait()
+        .expect("a subscriber");
+    let publisher = speaker.declare_publisher("bare/scan").express(true).wait().expect("a publisher");
+    thread::sleep(Duration::from_secs(1));
+
+    let mut pairs = Vec::new();
+    let mut buffer = vec![0; HEAD + usize::from(u16::MAX)];
+    for _ in 0..RUNS {
+        let begun = Instant::now();
+        while begun.elapsed() < RUN {
+            memory.look().expect("a domain");
+            for source in &mut sources {
+                while let Some(sample) = source.receive(&mut memory).expect("a sample") {
+                    let Some(header) = sample.header().copied() else { continue };
+                    let sent_ns = header.stamp_last_ns + header.hub_time_ns().unwrap_or_default();
+                    sent.insert((header.sensor, header.seq as u32), sent_ns);
+                    let len = sample.pack(&mut buffer[HEAD..]).expect("it fits");
+                    let head = Head { topic: Topic::Scan.number(), revision: 1, ..Head::default() };
+                    let head = Head { stamp_ns: clock::now_ns(), ..head };
+                    let bytes = head.seal(&mut buffer, len).expect("it fits");
+                    publisher.put(bytes).wait().expect("to send");
+                }
+            }
+            memory.wait_for(Some(Duration::from_millis(5))).expect("to wait");
+        }
+        thread::sleep(Duration::from_millis(200));
+        let ours = std::mem::take(&mut *through.lock().expect("no panic")).into_iter();
+        let ours = ours.filter_map(|(key, now_ns): (_, u64)| Some(now_ns.saturating_sub(sent.remove(&key)?)));
+        let both = [ours.collect(), std::mem::take(&mut *plain.lock().expect("no panic"))];
+        pairs.push(both.map(|mut times: Vec<u64>| [0.5, 0.99].map(|share| percentile(&mut times, share))));
+    }
+    pairs.sort_by(|a, b| (a[0][0] / a[1][0]).total_cmp(&(b[0][0] / b[1][0])));
+    let [ours, theirs] = pairs[RUNS / 2];
+    let ratio = |pair: &[[f64; 2]; 2]| pair[0][0] / pair[1][0];
+    let times = ratio(&pairs[RUNS / 2]);
+    let spread = format!("{:.2} to {:.2}", ratio(&pairs[0]), ratio(&pairs[RUNS - 1]));
+    let value = |[p50, p99]: [f64; 2]| format!("p50 {p50:.0} us, p99 {p99:.0} us");
+    vec![
+        row("shared memory over a router to a plain client", value(ours), None),
+        row("plain publisher over the same router to the same client", value(theirs), None),
+        row(
+            "p50 beside p50, median of five runs",
+            format!("{times:.2} times, {spread}"),
+            Some(("at most 2", times <= 2.0)),
+        ),
+    ]
+}
+
+/// Number of times that the router is killed.
+const TIMES: usize = 20;
+/// Time for which the router is away.
+const AWAY: Duration = Duration::from_millis(700);
+
+/// How soon do scans arrive again after a router was killed and started again, and do both ends know what was lost?
+fn killed_router(stage: &Stage) -> Vec<Row> {
+    let [robot, between, desk] = ["robot", "router", "desk"].map(|name| stage.machine(name));
+    let at = free_port();
+    let listen = format!("--listen=tcp/{at}");
+    let mut router = between.bridge(&[&listen]);
+    listened(at);
+    let connect = format!("--connect=tcp/{at}");
+    let here = desk.bridge(&[&connect, "--publish"]);
+    here.tells(|line| line["class"] == "bridge_link" && line["state"] == "up");
+    let there = robot.bridge(&[&connect, "--topic=*/*"]);
+    there.tells(|line| line["class"] == "bridge_link" && line["state"] == "up");
+    let _hub = robot.robot();
+    let name =
+        here.tells(|line| line["kind"] == "published")["sensor"].as_str().unwrap_or_default().to_owned();
+    let mut local = robot.follow(SENSORS.map(|sensor| (sensor, Topic::Scan)));
+    let mut remote = desk.follow([(&name, Topic::Scan)]);
+    let (mut missed, mut heard, mut is_first) = (0, 0, true);
+    let mut look = |local: &mut (Session, [Source; 2])| {
+        for source in &mut local.1 {
+            while let Some(sample) = source.receive(&mut local.0).expect("a sample") {
+                // Samples that waited here in the meantime do not count.
+                missed += if is_first { 0 } else { sample.missed() };
+                heard += 1;
+            }
+        }
+        is_first = false;
+    };
+    look(&mut local);
+    let mut back_ms = Vec::new();
+    for _ in 0..TIMES {
+        drop(router);
+        let killed = Instant::now();
+        while killed.elapsed() < AWAY {
+            look(&mut local);
+            newest(&mut remote);
+            thread::sleep(Duration::from_millis(10));
+        }
+        router = between.bridge(&[&listen]);
+        let back = Instant::now();
+        while !newest(&mut remote) {
+            assert!(back.elapsed() < Duration::from_secs(30), "no scan arrives any more");
+            look(&mut local);
+            thread::sleep(Duration::from_millis(1));
+        }
+        back_ms.push(back.elapsed().as_secs_f64() * 1e3);
+        let well = Instant::now();
+        while well.elapsed() < Duration::from_secs(1) {
+            look(&mut local);
+            newest(&mut remote);
+            thread::sleep(Duration::from_millis(10));
+        }
+    }
+    look(&mut local);
+    let sent = there.end();
+    thread::sleep(Duration::from_secs(1));
+    let totals = compare(&sent, &here.end());
+    back_ms.sort_by(f64::total_cmp);
+    let longest = back_ms[TIMES - 1];
+    vec![
+        row(
+            "router killed and started 20 times: from its start to the next scan, median and longest",
+            format!("{:.0} ms, {longest:.0} ms", back_ms[TIMES / 2]),
+            Some(("at most 1000 ms", longest <= 1000.0)),
+        ),
+        row(
+            "samples sent, received, lost, replaced",
+            format!("{}, {}, {}, {}", totals.sent, totals.received, totals.lost, totals.replaced),
+            None,
+        ),
+        totals.agreement(),
+        row("scans that a local subscriber missed", format!("{missed} of {heard}"), Some(("0", missed == 0))),
+    ]
+}
+
+/// Takes what has arrived, and returns whether a scan of a remote sensor was among it.
+fn newest((memory, sources): &mut (Session, [Source; 1])) -> bool {
+    let mut came = false;
+    memory.look().expect("a domain");
+    for source in sources {
+        while let Some(sample) = source.receive(memory).expect("a sample") {
+            came |= sample.header().is_some_and(|header| header.flags & Flags::REMOTE != 0);
+        }
+    }
+    came
+}
+
+/// All topics of two sensors over a router for minutes: what is lost, and how busy are the bridges?
+fn loss(stage: &Stage, minutes: f64) -> Vec<Row> {
+    let [robot, between, desk] = ["robot", "router", "desk"].map(|name| stage.machine(name));
+    let at = free_port();
+    let _router = between.bridge(&[&format!("--listen=tcp/{at}")]);
+    listened(at);
+    let here = desk.bridge(&[&format!("--connect=tcp/{at}"), "--publish"]);
+    here.tells(|line| line["class"] == "bridge_link" && line["state"] == "up");
+    let there = robot.bridge(&[&format!("--connect=tcp/{at}"), "--topic=*/*"]);
+    there.tells(|line| line["class"] == "bridge_link" && line["state"] == "up");
+    let _hub = robot.robot();
+    here.tells(|line| line["kind"] == "published");
+    thread::sleep(Duration::from_secs(3));
+    let (begun, before) = (Instant::now(), [there.ticks(), here.ticks()]);
+    thread::sleep(Duration::from_secs_f64(60.0 * minutes));
+    let seconds = begun.elapsed().as_secs_f64();
+    let busy = [there.ticks() - before[0], here.ticks() - before[1]].map(|ticks| ticks as f64 / seconds);
+    let sent = there.end();
+    thread::sleep(Duration::from_secs(1));
+    let totals = compare(&sent, &here.end());
+    let all = totals.sent + totals.replaced + totals.missed;
+    vec![
+        row(
+            &format!(
+                "all topics of two sensors over a router for {minutes} minutes: samples lost on the way"
+            ),
+            format!("{} of {}", totals.lost, totals.sent),
+            Some(("0", totals.lost == 0)),
+        ),
+        row(
+            "of these, replaced by newer ones before they were sent, or missed in the hub",
+            format!("{} of {all}", totals.replaced + totals.missed),
+            None,
+        ),
+        totals.agreement(),
+        row("bytes a second", format!("{:.0}", totals.bytes as f64 / seconds), None),
+        row(
+            "CPU time of the bridge that sends",
+            format!("{:.2} % of a core", busy[0]),
+            Some(("at most 3 %", busy[0] <= 3.0)),
+        ),
+        row("of the one that publishes", format!("{:.2} % of a core", busy[1]), None),
+    ]
+}
+
+const SLOW_RUN: Duration = Duration::from_secs(40);
+const BYTES_A_SECOND: f64 = 500_000.0 / 8.0;
+const DELAY: Duration = Duration::from_millis(100);
+
+/// A link of 0.5 Mbit/s and 100 ms each way, with all topics of two sensors: how old are scans when they arrive, and do
+/// both ends know what did not arrive?
+fn slow_link(stage: &Stage) -> Vec<Row> {
+    let [robot, desk] = ["robot", "desk"].map(|name| stage.machine(name));
+    let at = free_port();
+    let there = robot.bridge(&[&format!("--listen=tcp/{at}"), "--topic=*/*"]);
+    listened(at);
+    let here = desk.bridge(&[&format!("--connect=tcp/{}", relay(at, BYTES_A_SECOND, DELAY)), "--publish"]);
+    here.tells(|line| line["class"] == "bridge_link" && line["state"] == "up");
+    let _hub = robot.robot();
+    let published =
+        SENSORS.map(|name| here.tells(|line| line["kind"] == "published" && is_called(line, name)));
+    let names = published.map(|line| line["sensor"].as_str().unwrap_or_default().to_owned());
+    let (mut local, mut beside) = robot.follow(SENSORS.map(|sensor| (sensor, Topic::Scan)));
+    let (mut memory, mut sources) = desk.follow([(&names[0], Topic::Scan), (&names[1], Topic::Scan)]);
+    thread::sleep(Duration::from_secs(3));
+    let (mut ages, mut missed, mut heard) = (Vec::new(), 0, 0);
+    let mut is_first = true;
+    let begun = Instant::now();
+    while begun.elapsed() < SLOW_RUN {
+        memory.look().expect("a domain");
+        for source in &mut sources {
+            while let Some(sample) = source.receive(&mut memory).expect("a sample") {
+                let header = sample.header().filter(|header| header.flags & Flags::REMOTE != 0);
+                // What waited here in the meantime is older.
+                if let Some(header) = header.filter(|_| !is_first) {
+                    ages.push(clock::wall_ns().saturating_sub(header.wall_ns));
+                }
+            }
+        }
+        for source in &mut beside {
+            while let Some(sample) = source.receive(&mut local).expect("a sample") {
+                missed += if is_first { 0 } else { sample.missed() };
+                heard += 1;
+            }
+        }
+        is_first = false;
+        memory.wait_for(Some(Duration::from_millis(5))).expect("to wait");
+    }
+    let sent = there.end();
+    thread::sleep(Duration::from_secs(2));
+    let totals = compare(&sent, &here.end());
+    let [p50, p99] = [0.5, 0.99].map(|share| percentile(&mut ages, share) / 1e3);
+    vec![
+        row(
+            "0.5 Mbit/s, 100 ms each way, all topics of two sensors: age of a scan, median and p99",
+            format!("{p50:.0} ms, {p99:.0} ms, {} scans", ages.len()),
+            Some(("p99 at most 600 ms", p99 <= 600.0)),
+        ),
+        row(
+            "samples sent, received, lost, replaced",
+            format!("{}, {}, {}, {}", totals.sent, totals.received, totals.lost, totals.replaced),
+            None,
+        ),
+        totals.agreement(),
+        row("scans that a local subscriber missed", format!("{missed} of {heard}"), Some(("0", missed == 0))),
+    ]
+}
+
+fn is_called(line: &Value, name: &str) -> bool {
+    line["sensor"].as_str().is_some_and(|said| said.ends_with(&format!(".{name}")))
+}
+
+/// Bytes that the sockets of the relay hold at either end.
+const SOCKET: usize = 4096;
+/// Bytes that are passed on at once: a packet of a network, not one of the loopback.
+const PACKET: usize = 1448;
+
+/// A long, slow connection between `to` and programs that connect to the returned address: a number of bytes per
+/// second, each after the same delay, in both directions, and no more in transit than that needs. (Kernels with netem
+/// and tbf do the same to a network namespace.)
+fn relay(to: SocketAddr, bytes_a_second: f64, delay: Duration) -> SocketAddr {
+    let listener = socket();
+    listener.bind(&SocketAddr::from(([127, 0, 0, 1], 0)).into()).expect("a port");
+    listener.listen(8).expect("it is bound");
+    let listener = TcpListener::from(listener);
+    let at = listener.local_addr().expect("it is bound");
+    // The thread ends with the bench.
+    thread::spawn(move || {
+        for near in listener.incoming().map_while(Result::ok) {
+            let far = socket();
+            if far.connect(&to.into()).is_err() {
+                // The listener has exited.
+                continue;
+            }
+            let far = TcpStream::from(far);
+            near.set_nodelay(true).expect("TCP");
+            for (from, to) in [(&near, &far), (&far, &near)] {
+                let both = [from, to].map(|stream| stream.try_clone().expect("a descriptor"));
+                thread::spawn(move || pass(both, bytes_a_second, delay));
+            }
+        }
+    });
+    at
+}
+
+/// Returns one end of the connection, with the packets and the buffers of a network.
+fn socket() -> Socket {
+    let socket = Socket::new(Domain::IPV4, Type::STREAM, Some(Protocol::TCP)).expect("a socket");
+    socket.set_tcp_mss(PACKET as u32).expect("a size");
+    socket.set_recv_buffer_size(SOCKET).expect("a size");
+    socket.set_send_buffer_size(SOCKET).expect("a size");
+    socket.set_tcp_nodelay(true).expect("TCP");
+    socket
+}
+
+fn pass([mut from, mut to]: [TcpStream; 2], bytes_a_second: f64, delay: Duration) {
+    let mut in_transit: VecDeque<(Instant, Vec<u8>)> = VecDeque::new();
+    let mut room_at = Instant::now();
+    let mut packet = [0; PACKET];
+    loop {
+        let now = Instant::now();
+        while in_transit.front().is_some_and(|(at, _)| *at <= now)
+            && let Some((_, bytes)) = in_transit.pop_front()
+        {
+            if to.write_all(&bytes).is_err() {
+                return;
+            }
+        }
+        let next = in_transit.front().map_or(now + delay, |(at, _)| *at);
+        if room_at > now {
+            thread::sleep(room_at.min(next).saturating_duration_since(now));
+            continue;
+        }
+        let wait = next.saturating_duration_since(now).max(Duration::from_millis(1));
+        from.set_read_timeout(Some(wait)).expect("a time");
+        match from.read(&mut packet) {
+            // What is in transit still arrives.
+            Ok(0) => {
+                for (at, bytes) in in_transit {
+                    thread::sleep(at.saturating_duration_since(Instant::now()));
+                    let _ = to.write_all(&bytes);
+                }
+                let _ = to.shutdown(Shutdown::Write);
+                return;
+            }
+            Ok(len) => {
+                room_at = Instant::now().max(room_at) + Duration::from_secs_f64(len as f64 / bytes_a_second);
+                in_transit.push_back((room_at + delay, packet[..len].to_vec()));
+            }
+            Err(error) if matches!(error.kind(), ErrorKind::WouldBlock | ErrorKind::TimedOut) => {}
+            Err(_) => return,
+        }
+    }
+}
+
+/// Sums over all sensors and topics, without announcements.
+#[derive(Default)]
+struct Totals {
+    sent: u64,
+    bytes: u64,
+    missed: u64,
+    replaced: u64,
+    received: u64,
+    lost: u64,
+    /// Rows in which the two ends differ.
+    wrong: Vec<String>,
+}
+
+impl Totals {
+    /// Returns whether both ends report the same.
+    fn agreement(&self) -> Row {
+        let first = self.wrong.first().map_or(String::new(), |first| format!(", the first {first}"));
+        let value = format!("{}{first}", self.wrong.len());
+        row("rows of the statistics in which the two ends differ", value, Some(("0", self.wrong.is_empty())))
+    }
+}
+
+/// Compares the last statistics of sender and receiver, row by row.
+fn compare(sender: &[Value], receiver: &[Value]) -> Totals {
+    let (there, here) = (last(sender, "sent"), last(receiver, "received"));
+    let mut totals = Totals::default();
+    for (name, row) in &there {
+        let number = |row: &Value, key: &str| row[key].as_u64().unwrap_or_default();
+        let other = here.get(name).cloned().unwrap_or_default();
+        let [sent, replaced, missed, bytes] =
+            ["sent", "replaced", "missed", "bytes"].map(|key| number(row, key));
+        let [received, lost, announced] = ["received", "lost", "replaced"].map(|key| number(&other, key));
+        // Announcements do not count themselves, and the last one is not announced.
+        let is_announce = name.ends_with("/announce");
+        if sent != received + lost || !is_announce && replaced != announced {
+            totals.wrong.push(format!("{name}: {row} and {other}"));
+        }
+        if !is_announce {
+            totals.sent += sent;
+            totals.bytes += bytes;
+            totals.missed += missed;
+            totals.replaced += replaced;
+            totals.received += received;
+            totals.lost += lost;
+        }
+    }
+    totals
+}
+
+/// Returns the last line of statistics that has this key, by sensor and topic.
+fn last(lines: &[Value], key: &str) -> BTreeMap<String, Value> {
+    let mut rows = BTreeMap::new();
+    for line in lines.iter().filter(|line| line["class"] == "bridge" && line[key].is_u64()) {
+        let word = |key: &str| line[key].as_str().unwrap_or_default().to_owned();
+        rows.insert(format!("{}/{}", word("sensor"), word("topic")), line.clone());
+    }
+    rows
+}

@@ -1,0 +1,18 @@
+//! Scans as the hub publishes them, from the values that a simulated LMS sends: the hub's own decoder splits them.
+
+use daemon::scanner;
+use lms::measured::{self, Measured};
+use lms::variant::{Mode, Unit};
+use schema::Scan;
+
+/// Measuring mode of the scans: 13 bits of range, 3 of intensity.
+pub(crate) const MODE: Mode = Mode(1);
+
+/// Returns the scan that the hub publishes for the values `words` of an LMS, in `unit` and [`MODE`].
+pub(crate) fn scan(words: &[u16], unit: Unit) -> Box<Scan> {
+    let telegram = measured::encode(0, unit, words, 0x10);
+    let measured = Measured::decode(telegram.telegram()).expect("as many words as a variant has");
+    let mut scan = Scan::zeroed(scanner::len(&measured));
+    scanner::decode(&measured, MODE, &mut scan);
+    scan
+}

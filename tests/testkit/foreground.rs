@@ -1,0 +1,250 @@
+//! Scenes of the simulated world in which the truth of each beam is known, and scores of the methods that separate
+//! foreground from background. `benches/perception` measures ten runs of each scene, `tests/it/foreground.rs` one.
+
+#[path = "decoded_scan.rs"]
+mod decoded_scan;
+
+use std::ops::AddAssign;
+
+use lms::variant::{Unit, Variant};
+use preprocess::background::{Class, Model, Settings};
+use schema::{Foreground, Scan};
+use sim::labeled_scan::Met;
+use sim::room::Room;
+use sim::world::World;
+
+/// A scene of the simulated world: 2000 scans, 53 s.
+#[derive(Clone, Copy)]
+pub(crate) struct Scene {
+    /// Name in tables.
+    pub(crate) name: &'static str,
+    /// Name of its world.
+    pub(crate) world: &'static str,
+    pub(crate) unit: Unit,
+    /// Whether beams matching as wide as real ones. At an edge, such a beam measures one surface, the other, or a range in
+    /// between.
+    pub(crate) mixed: bool,
+}
+
+const SCANS: u64 = 2_000;
+
+/// Correct answer for a beam.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Expected {
+    /// Foreground: the beam meets a person.
+    Foreground,
+    /// Not foreground: the beam meets what was there from the start, what was behind an object that has been taken
+    /// away, or an object that was put down or moved more than [`OLD_S`] ago.
+    Other,
+    /// An object that was put down, moved or opened recently. It is foreground until it has been learned, and each
+    /// method takes a different time, so both answers matching right.
+    New,
+    /// Not counted: the beam grazes a leg, or has no reading.
+    Neither,
+}
+
+/// Age in seconds from which an object is background: twice the time that the paper's method takes at most.
+const OLD_S: f64 = 20.0;
+
+/// One scan with the correct answers.
+pub(crate) struct LabeledScan {
+    pub(crate) scan: Box<Scan>,
+    pub(crate) expected: Vec<Expected>,
+    pub(crate) met: Vec<Met>,
+}
+
+/// Returns the scans of `scene` with random numbers from `seed`.
+pub(crate) fn play(scene: &Scene, seed: u64) -> Vec<LabeledScan> {
+    let world: World = scene.world.parse().expect("a world that the program brings along");
+    let mut layers = world.layers().expect("a world with noise");
+    layers.spot &= scene.mixed;
+    let room = Room::new(&world.with_layers(layers), seed);
+    (1..=SCANS).map(|number| frame(&room, scene.unit, number)).collect()
+}
+
+fn frame(room: &Room, unit: Unit, number: u64) -> LabeledScan {
+    let end_ns = number * Variant::HALF.turns() * lms::variant::MIRROR_TURN;
+    let look = room.labeled_scan(Variant::HALF, unit, decoded_scan::MODE, end_ns);
+    let scan = decoded_scan::scan(&look.words, unit);
+    let expected = (0..look.truth.len()).map(|i| expected_of(&scan, i, look.truth[i], end_ns)).collect();
+    LabeledScan { scan, expected, met: look.truth }
+}
+
+fn expected_of(scan: &Scan, i: usize, met: Met, end_ns: u64) -> Expected {
+    match met {
+        _ if scan.range(i).is_none() => Expected::Neither,
+        Met::Person => Expected::Foreground,
+        Met::Box { since_ns } if end_ns.saturating_sub(since_ns) as f64 <= OLD_S * 1e9 => Expected::New,
+        Met::Static { .. } | Met::Box { .. } => Expected::Other,
+        Met::Grazed | Met::Invalid => Expected::Neither,
+    }
+}
+
+/// A method that separates foreground from background, scan by scan.
+pub(crate) trait Detector {
+    /// Writes for each beam of `scan` whether it is foreground.
+    fn update(&mut self, scan: &Scan, foreground: &mut [bool]);
+}
+
+/// A method of the hub.
+pub(crate) struct HubDetector {
+    model: Model,
+    out: Box<Foreground>,
+}
+
+impl HubDetector {
+    /// Creates the method with an empty background.
+    pub(crate) fn new(settings: Settings) -> HubDetector {
+        let beams = Variant::HALF.beams();
+        HubDetector { model: Model::new(settings, beams), out: Foreground::of(beams) }
+    }
+}
+
+impl Detector for HubDetector {
+    fn update(&mut self, scan: &Scan, foreground: &mut [bool]) {
+        self.model.update(scan, &mut self.out);
+        for (is_foreground, class) in foreground.iter_mut().zip(self.model.classes()) {
+            *is_foreground = *class == Class::Foreground;
+        }
+    }
+}
+
+/// Beams by correct and given answer.
+#[derive(Clone, Copy, Debug, Default)]
+pub(crate) struct Score {
+    scans: u64,
+    found: u64,
+    missed: u64,
+    wrong: u64,
+}
+
+impl Score {
+    /// Runs `method` on `frames` in their order and counts its answers.
+    pub(crate) fn of(method: &mut dyn Detector, frames: &[LabeledScan]) -> Score {
+        let mut score = Score { scans: frames.len() as u64, ..Score::default() };
+        let mut foreground = vec![false; frames.first().map_or(0, |frame| frame.expected.len())];
+        for frame in frames {
+            method.update(&frame.scan, &mut foreground);
+            for (expected, &is_reported) in frame.expected.iter().zip(&foreground) {
+                match (expected, is_reported) {
+                    (Expected::Foreground, true) => score.found += 1,
+                    (Expected::Foreground, false) => score.missed += 1,
+                    (Expected::Other, true) => score.wrong += 1,
+                    _ => {}
+                }
+            }
+        }
+        score
+    }
+
+    /// Returns the share of the foreground beams that were found.
+    pub(crate) fn recall(&self) -> f64 {
+        self.found as f64 / (self.found + self.missed) as f64
+    }
+
+    /// Returns the share of the beams reported as foreground that matching.
+    pub(crate) fn precision(&self) -> f64 {
+        self.found as f64 / (self.found + self.wrong) as f64
+    }
+
+    /// Returns the number of beams per scan that were reported as foreground and matching not.
+    pub(crate) fn wrong_per_scan(&self) -> f64 {
+        self.wrong as f64 / self.scans as f64
+    }
+}
+
+impl AddAssign for Score {
+    fn add_assign(&mut self, other: Score) {
+        self.scans += other.scans;
+        self.found += other.found;
+        self.missed += other.missed;
+        self.wrong += other.wrong;
+    }
+}
+
+/// Number of scans until a surface becomes background: the default for 361 beams.
+const N: usize = 375;
+
+/// Beams of two boxes in the room of Fig. 8, over several runs: one is put down, the other is taken away.
+#[derive(Clone, Copy, Debug, Default)]
+pub(crate) struct Boxes {
+    /// Beams that meet box 1, N scans after it was put down. Counts those that matching still foreground.
+    new: Share,
+    /// Beams that met box 2, N and 2N scans after it was taken away. Counts those that would not be foreground if it
+    /// stood there again.
+    gone: [Share; 2],
+}
+
+/// A number of beams, and how many of them have a property.
+#[derive(Clone, Copy, Debug, Default)]
+struct Share {
+    of: u64,
+    matching: u64,
+}
+
+impl Share {
+    fn count(&mut self, is: bool) {
+        self.of += 1;
+        self.matching += u64::from(is);
+    }
+
+    fn percent(&self) -> f64 {
+        100.0 * self.matching as f64 / self.of as f64
+    }
+}
+
+impl Boxes {
+    /// Adds a run of `frames`. `make` creates the method with an empty background.
+    pub(crate) fn add(&mut self, make: impl Fn() -> Box<dyn Detector>, frames: &[LabeledScan]) {
+        let first = |is: fn(&Met) -> bool| {
+            frames.iter().position(|frame| frame.met.iter().any(is)).expect("boxes come and go in this room")
+        };
+        let at = first(is_new) + N;
+        let answers = answers(&mut *make(), &frames[..at], &frames[at].scan);
+        for (i, _) in frames[at].met.iter().enumerate().filter(|(_, met)| is_new(met)) {
+            self.new.count(answers[i]);
+        }
+
+        let taken = first(is_bare);
+        let stood = &frames[taken - 1];
+        for (gone, at) in self.gone.iter_mut().zip([taken + N, taken + 2 * N]) {
+            let now = &frames[at];
+            // Beams at its edges may have measured what was behind it.
+            let inside = |i: &usize| now.met[i - 1..=i + 1].iter().all(is_bare);
+            let beams: Vec<usize> = (1..stood.met.len() - 1).filter(inside).collect();
+            let mut scan = now.scan.clone();
+            let span = beams[0]..=beams[beams.len() - 1];
+            scan.arrays().ranges[span.clone()].copy_from_slice(&stood.scan.ranges()[span]);
+            let answers = self::answers(&mut *make(), &frames[..at], &scan);
+            let met_box = beams.into_iter().filter(|&i| is_still(&stood.met[i]));
+            met_box.for_each(|i| gone.count(!answers[i]));
+        }
+    }
+
+    /// Returns the percentage of box 1 that is foreground N scans after it was put down, and those of box 2 that matching
+    /// background N and 2N scans after it was taken away.
+    pub(crate) fn percents(&self) -> [f64; 3] {
+        [self.new.percent(), self.gone[0].percent(), self.gone[1].percent()]
+    }
+}
+
+fn is_new(met: &Met) -> bool {
+    matches!(met, Met::Box { .. })
+}
+
+/// Whether the beam meets the place from which an object was taken away.
+fn is_bare(met: &Met) -> bool {
+    matches!(met, Met::Static { since_ns: 1.. })
+}
+
+fn is_still(met: &Met) -> bool {
+    matches!(met, Met::Static { since_ns: 0 })
+}
+
+/// Returns the answers of `method` for `scan` after it has seen `before`.
+fn answers(method: &mut dyn Detector, before: &[LabeledScan], scan: &Scan) -> Vec<bool> {
+    let mut foreground = vec![false; scan.beams()];
+    before.iter().for_each(|frame| method.update(&frame.scan, &mut foreground));
+    method.update(scan, &mut foreground);
+    foreground
+}

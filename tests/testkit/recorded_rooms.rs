@@ -1,0 +1,145 @@
+//! A recording of two sensors in simulated rooms with people: a hub in virtual time, whose topics are all written to a
+//! file.
+
+#[path = "virtual_hub.rs"]
+mod virtual_hub;
+
+use std::collections::BTreeMap;
+use std::fs::File;
+use std::path::Path;
+
+use config::{Config, Sources};
+use lms::Nanos;
+use lms::variant::{MIRROR_TURN, Mode, Unit, Variant};
+use schema::datagram::Packed;
+use schema::file::Writer;
+use schema::ipc::{self, Node, Payload, Subscriber};
+use schema::{Background, Domain, Foreground, Header, Marks, Scan, Topic, Zones};
+use sim::room::Room;
+use sim::world::World;
+
+/// Names of the sensors, and their worlds.
+pub(crate) const SENSORS: [(&str, &str); 2] = [("front", "fig8"), ("rear", "demo")];
+/// Setting with which backgrounds are learned within the recording.
+pub(crate) const LEARNING: &str = "background.scans=40";
+
+/// Returns the time from one scan to the next.
+pub(crate) fn period() -> Nanos {
+    Variant::HALF.turns() * MIRROR_TURN
+}
+
+/// Drives a hub in `domain` in virtual time: a telegram with the mode, and `scans` scans of each sensor. Writes
+/// everything that it publishes to `file`, and passes it to `keep` with the index of the sensor. Before scan number
+/// `silence`, no byte of a sensor arrives for a second.
+pub(crate) fn record(
+    domain: &Domain,
+    file: &Path,
+    scans: u64,
+    silence: Option<u64>,
+    mut keep: impl FnMut(usize, Published),
+) {
+    let sources = Sources {
+        files: Vec::new(),
+        links: SENSORS.map(|(name, _)| format!("{name}=file:nothing")).to_vec(),
+        set: ["link.front.mode=1", "link.rear.mode=1", LEARNING].map(str::to_owned).to_vec(),
+    };
+    let config = Config::load(&sources).expect("a configuration");
+    let rooms = SENSORS.map(|(_, name)| Room::new(&name.parse::<World>().expect("a world"), 7));
+    let mut writer = Writer::begin(File::create(file).expect("a file"), "", BTreeMap::new()).expect("begins");
+    let driven = virtual_hub::virtual_hub(&config, domain, |links| {
+        let node = ipc::client_node(domain).expect("a node");
+        let subscribers = SENSORS.map(|(name, _)| Subscribers::attach(&node, name));
+        for scan in 0..=scans {
+            for (number, room) in rooms.iter().enumerate() {
+                let silent_ns = if silence.is_some_and(|silence| scan >= silence) { SECOND } else { 0 };
+                let at = SECOND + number as u64 * 9_000_000 + scan * period() + silent_ns;
+                let telegram = if scan == 0 {
+                    lms::reply::configuration(0, Mode(1), Unit::Mm, 0x10)
+                } else {
+                    let look = room.labeled_scan(Variant::HALF, Unit::Mm, Mode(1), at);
+                    lms::measured::encode(0, Unit::Mm, &look.words, 0x10)
+                };
+                links[number].read(at, telegram.bytes());
+                // What the hub publishes at the start does not belong to a telegram.
+                let is_of_one = |sample: &Published| scan > 0 || sample.header.hub_time_ns().is_some();
+                for sample in subscribers[number].take().into_iter().filter(is_of_one) {
+                    let (name, _) = SENSORS[number];
+                    writer.sample(name, sample.topic, &sample.header, &sample.payload).expect("is written");
+                    keep(number, sample);
+                }
+            }
+            if scan % 4 == 0 {
+                writer.close_chunk().expect("is written");
+            }
+        }
+    });
+    assert_eq!(driven, Ok(()));
+    writer.finish().expect("ends");
+}
+
+/// A sample as it was published.
+#[derive(Debug, PartialEq)]
+pub(crate) struct Published {
+    pub(crate) topic: Topic,
+    pub(crate) header: Header,
+    pub(crate) payload: Vec<u8>,
+}
+
+/// Subscribers to everything that is computed from a sensor's telegrams.
+pub(crate) struct Subscribers {
+    telegram: Subscriber<[u8]>,
+    scan: Subscriber<Scan>,
+    marks: Subscriber<Marks>,
+    zones: Subscriber<Zones>,
+    foreground: Subscriber<Foreground>,
+    background: Subscriber<Background>,
+}
+
+impl Subscribers {
+    pub(crate) fn attach(node: &Node, sensor: &str) -> Subscribers {
+        Subscribers {
+            telegram: attach::<[u8]>(node, sensor),
+            scan: attach::<Scan>(node, sensor),
+            marks: attach::<Marks>(node, sensor),
+            zones: attach::<Zones>(node, sensor),
+            foreground: attach::<Foreground>(node, sensor),
+            background: attach::<Background>(node, sensor),
+        }
+    }
+
+    /// Returns the samples that have arrived since the last call, topic by topic.
+    pub(crate) fn take(&self) -> Vec<Published> {
+        let mut taken = Vec::new();
+        drain::<[u8]>(&self.telegram, &mut taken, |telegram| telegram.to_vec());
+        drain::<Scan>(&self.scan, &mut taken, packed);
+        drain::<Marks>(&self.marks, &mut taken, packed);
+        drain::<Zones>(&self.zones, &mut taken, packed);
+        drain::<Foreground>(&self.foreground, &mut taken, packed);
+        drain::<Background>(&self.background, &mut taken, packed);
+        taken
+    }
+}
+
+fn attach<P: Payload + ?Sized>(node: &Node, sensor: &str) -> Subscriber<P> {
+    let service = P::open(node, sensor).expect("a topic").expect("is there");
+    P::subscriber(&service).expect("a place")
+}
+
+fn drain<P: Payload + ?Sized>(from: &Subscriber<P>, to: &mut Vec<Published>, bytes: impl Fn(&P) -> Vec<u8>) {
+    while let Some(sample) = P::receive(from).expect("works") {
+        to.push(Published {
+            topic: P::TOPIC,
+            header: *sample.user_header(),
+            payload: bytes(P::read(&sample)),
+        });
+    }
+}
+
+fn packed(payload: &(impl Packed + ?Sized)) -> Vec<u8> {
+    let mut room = vec![0; 4096];
+    let len = payload.pack(&mut room).expect("there is room");
+    room.truncate(len);
+    room
+}
+
+const SECOND: Nanos = 1_000 * lms::MILLIS;

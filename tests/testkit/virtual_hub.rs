@@ -1,0 +1,214 @@
+//! The hub's links in virtual time: bytes are passed in with the time at which they arrived, and the topics are
+//! published in shared memory by the same code as those of a line. Many sensors can be driven faster than in real time.
+//! What a session sends to a sensor is discarded.
+
+use std::cell::{Cell, RefCell};
+use std::collections::VecDeque;
+use std::io;
+use std::path::Path;
+use std::rc::Rc;
+
+use config::Config;
+use daemon::surroundings::{Learned, Line, Surroundings, Wait, Woken};
+use daemon::{LiveLink, Orders};
+use lms::Nanos;
+use port::{Allowance, Alteration, PortError, Source, clock};
+use schema::ipc::{self, Node, Payload, SharedMemory, Waker};
+use schema::limits::TopicLimits;
+use schema::{Domain, Failure, HubLock, Ring, Wake, shortage};
+
+/// A link in virtual time. Its port must be a recording in the configuration: it streams from the start, and its scans
+/// are read in the configured mode.
+pub(crate) struct VirtualLink<'a> {
+    around: &'a Around<'a>,
+    link: LiveLink<'a, Around<'a>>,
+    until: Nanos,
+}
+
+/// Creates the links of `config` in `domain`, whatever their ports are, and passes them to `drive`. They end with it.
+///
+/// # Errors
+///
+/// The domain is held by another hub, or its topics cannot be created.
+pub(crate) fn virtual_hub<T>(
+    config: &Config,
+    domain: &Domain,
+    drive: impl FnOnce(&mut [VirtualLink<'_>]) -> T,
+) -> Result<T, Failure> {
+    shortage::raise_descriptor_limit().expect("a limit can be raised");
+    let _lock = HubLock::acquire(domain.root())?;
+    let node = ipc::hub_node(domain)?;
+    let (_orders, queues) = Orders::new(config.links.iter().map(|link| link.name.as_str()))?;
+    let around = config.links.iter().map(|link| Around::new(&node, &link.name));
+    let around = around.collect::<Result<Vec<_>, _>>()?;
+    let mut links = Vec::with_capacity(config.links.len());
+    for (((number, link), around), queue) in config.links.iter().enumerate().zip(&around).zip(queues) {
+        let mut link = LiveLink::new(link, number as u8, 0, around, queue)?;
+        let Wait { until, .. } = link.turn(Woken::Timeout);
+        links.push(VirtualLink { around, link, until });
+    }
+    shortage::allocate(domain)?;
+    Ok(drive(&mut links))
+}
+
+impl VirtualLink<'_> {
+    /// Passes `bytes` that arrived in one read at `now`: publishes what became due before, and what is complete with
+    /// them. Returns the number of telegrams.
+    pub(crate) fn read(&mut self, now: Nanos, bytes: &[u8]) -> usize {
+        self.around.telegrams.set(0);
+        while self.until < now {
+            self.around.now.set(self.until);
+            self.turn(Woken::Timeout);
+        }
+        self.around.now.set(now);
+        self.around.line.0.borrow_mut().extend(bytes);
+        while !self.around.line.0.borrow().is_empty() {
+            self.turn(Woken::Ready);
+        }
+        self.around.telegrams.get()
+    }
+
+    fn turn(&mut self, woken: Woken) {
+        let Wait { until, .. } = self.link.turn(woken);
+        self.until = until;
+    }
+}
+
+/// The platform of a link: a clock that stands still, bytes, and the shared memory of a domain.
+struct Around<'a> {
+    node: &'a Node,
+    waker: Waker,
+    now: Cell<Nanos>,
+    /// Nanoseconds from the clock to 1970.
+    wall_ahead_ns: u64,
+    line: Bytes,
+    /// Telegrams published since this was set to 0.
+    telegrams: Cell<usize>,
+}
+
+/// Bytes that have arrived and were not read.
+#[derive(Clone, Default)]
+struct Bytes(Rc<RefCell<VecDeque<u8>>>);
+
+impl<'a> Around<'a> {
+    fn new(node: &'a Node, sensor: &str) -> Result<Self, Failure> {
+        let wall_ahead_ns = clock::wall_ns() - clock::now();
+        Ok(Around {
+            node,
+            waker: Waker::new(node, sensor)?,
+            now: Cell::new(0),
+            wall_ahead_ns,
+            line: Bytes::default(),
+            telegrams: Cell::new(0),
+        })
+    }
+}
+
+impl Surroundings for Around<'_> {
+    type Line = Bytes;
+    type Medium<P: Payload + ?Sized> = SharedMemory<P>;
+
+    fn now(&self) -> Nanos {
+        self.now.get()
+    }
+
+    fn wall_ns(&self) -> u64 {
+        self.now.get() + self.wall_ahead_ns
+    }
+
+    fn pause(&self, _: Nanos) {}
+
+    fn open(&self, _: &Source, _: u32) -> Option<Result<Bytes, PortError>> {
+        Some(Ok(self.line.clone()))
+    }
+
+    fn explain(&self, error: &PortError, source: &Source) -> Failure {
+        error.explain(source)
+    }
+
+    fn altering_program(&self, _: &Source) -> Option<String> {
+        None
+    }
+
+    fn take_kept(&self, _: &str, _: &Source, _: u32) -> Option<Bytes> {
+        None
+    }
+
+    fn keep(&self, _: &str, _: &Bytes) {}
+
+    fn release(&self, _: &str) {}
+
+    fn medium<P: Payload + ?Sized>(&self, sensor: &str) -> Result<SharedMemory<P>, Failure> {
+        SharedMemory::new(self.node, sensor, &TopicLimits::default())
+    }
+
+    fn ring(&self, ring: Ring) {
+        self.waker.ring(ring);
+    }
+
+    fn tell(&self, why: Wake) {
+        if why == Wake::Telegram {
+            self.telegrams.set(self.telegrams.get() + 1);
+        }
+        self.waker.tell(why).expect("subscribers can be woken");
+    }
+
+    fn recall(&self, _: &str, _: &mut [u8]) -> Option<usize> {
+        None
+    }
+
+    fn remember(&self, _: &str, _: &[u8]) {}
+
+    fn learned(&self) -> Option<&dyn Learned> {
+        None
+    }
+}
+
+impl Line for Bytes {
+    fn read(&self, buffer: &mut [u8]) -> io::Result<usize> {
+        let mut bytes = self.0.borrow_mut();
+        let len = buffer.len().min(bytes.len());
+        buffer.iter_mut().zip(bytes.drain(..len)).for_each(|(place, byte)| *place = byte);
+        Ok(len)
+    }
+
+    fn write(&self, _: u8) -> io::Result<()> {
+        Ok(())
+    }
+
+    fn set_baud(&self, _: u32) -> io::Result<Option<io::Error>> {
+        Ok(None)
+    }
+
+    fn altered(&self) -> io::Result<Option<Alteration>> {
+        Ok(None)
+    }
+
+    fn restore(&self, _: u32) -> io::Result<()> {
+        Ok(())
+    }
+
+    fn set_dtr(&self, _: bool) -> io::Result<()> {
+        Ok(())
+    }
+
+    fn waiting(&self) -> Option<usize> {
+        None
+    }
+
+    fn allowance(&self, _: u32) -> Option<Allowance> {
+        None
+    }
+
+    fn line_errors(&self) -> u64 {
+        0
+    }
+
+    fn device(&self) -> Option<&Path> {
+        None
+    }
+
+    fn is_simulated(&self) -> bool {
+        false
+    }
+}
