@@ -1,5 +1,5 @@
-//! Does everything that two sensors send arrive, in order, bit for bit and in time? 2 x 1500 telegrams from ptys at 500
-//! kBd through the running hub into a process per sensor, compared with what the simulator says that it sent. And how
+//! Does everything that two sensors send arrive, in order, bit for bit and in time? 2 x 1500 telegrams pass from ptys
+//! at 500 kBd through the running hub into a process per sensor, and are compared with the log of the simulator. How
 //! long does a start take with an idle sensor at each of the four rates, compared with a bare host that knows the rate?
 //! Damaged bytes are left to the tests of the framer.
 

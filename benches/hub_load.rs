@@ -1,7 +1,7 @@
-//! What does the hub cost while two sensors stream? Its CPU time and its sleeps per telegram, with one sleeping
-//! subscriber per sensor, compared with a bare reader of the same ptys that makes only the necessary system calls and
-//! wakes a process per telegram. Each run is long; runs of the hub and of the baseline alternate on the same two lines.
-//! The bench does not measure what subscribers cost, or what happens on a real adapter.
+//! What does the hub cost while two sensors stream? Measures its CPU time and its sleeps per telegram, with one
+//! sleeping subscriber per sensor. The baseline is a bare reader of the same ptys that makes only the necessary system
+//! calls and wakes a process per telegram. Each run is long; runs of the hub and of the baseline alternate on the same
+//! two lines. The bench does not measure what subscribers cost, or what happens on a real adapter.
 
 mod support;
 

@@ -37,7 +37,7 @@ fn measure(options: &Options) -> Outcome<()> {
     let hub = stage.hub(&[SENSOR])?;
     hub.await_line("ready", PATIENCE)?;
     let count = options.count(800);
-    let rust = || stage.part(&["ages", "scan", stage.domain.name(), SENSOR, &(count + SETTLING).to_string()]);
+    let rust = || stage.part(&["ages", stage.domain.name(), SENSOR, &(count + SETTLING).to_string()]);
     let mut figures = Vec::new();
     for Language { figures: names, ratio, consumer } in LANGUAGES {
         let Some(words) = consumer()? else { continue };

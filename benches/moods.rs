@@ -1,8 +1,10 @@
-//! How long does it take to have a stream, whatever state the sensor is in? Each of the four rates, with the sensor
-//! idle, streaming or left in installation mode; a sensor that was just powered on and replies quickly, compared with a
-//! host that knows its rate and sends no request for information; and a sensor whose power is cycled in the middle of a
-//! scan while another one streams. The bench does not measure how long a real sensor boots: that is up to a minute, and
-//! passes before its boot message.
+//! How long does it take until a sensor streams? It starts in these states:
+//!
+//! - at each of the four rates, idle, streaming or left in installation mode
+//! - just powered on, with quick replies, compared with a host that knows its rate and sends no request for information
+//! - power-cycled in the middle of a scan while another sensor streams
+//!
+//! The bench does not measure how long a real sensor boots: that is up to a minute, and passes before its boot message.
 
 mod support;
 

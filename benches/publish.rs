@@ -1,7 +1,7 @@
 //! What does a scan cost the hub's thread from loan to wake-up, with 0 to 200 subscribers: awake, asleep on the
 //! doorbell, asleep on the event? And what does a datagram cost: packing and sealing, reading and checking? Publishing
-//! is measured as CPU time of the publishing thread, including some 0.3 us for reading that clock; what subscribers do
-//! in the meantime is not included.
+//! is measured as CPU time of the publishing thread, including some 0.3 us for reading that clock. The CPU time of
+//! subscribers is not included.
 
 #![allow(missing_docs)] // criterion's macros make public functions
 

@@ -123,7 +123,7 @@ impl Runs<'_> {
         let up_ns = hub.await_line("ready", PATIENCE)?.at_ns;
         let mut first_ns = [0; 2];
         for (first_ns, consumer) in first_ns.iter_mut().zip(self.consumers) {
-            // What the last hub sent just before its end may still be in the pipe.
+            // The last telegrams of the killed hub may still be in the pipe.
             while *first_ns < hub.started_ns {
                 let line = consumer.await_line("telegram", PATIENCE)?;
                 self.count(&line.words());
@@ -165,9 +165,10 @@ fn run_time(n: usize) -> Duration {
     Duration::from_millis(700 + 11 * (n as u64 % 20))
 }
 
-/// Measures a hub whose line a service manager keeps open, as with the unit in hub/dist: `kills` at times that are
-/// spread evenly over a telegram, and half as many in the 0.6 ms in which a telegram is read, the only time in which it
-/// has left the line and is not yet sent. What a subscriber received is compared with what the simulated sensor sent.
+/// Measures a hub whose line a service manager keeps open, as with the unit in hub/dist. The hub is killed `kills`
+/// times, spread evenly over a telegram, and half as many times in the 0.6 ms in which a telegram is read: the only
+/// time in which it has left the line and is not yet sent. The telegrams of a subscriber are compared with those that
+/// the simulated sensor sent.
 fn with_kept_line(kills: usize) -> Outcome<Vec<Figure>> {
     let spread = run_with_kept_line(kills, |n| PERIOD_NS * (2 * n + 1) / (2 * kills as u64))?;
     let reading = run_with_kept_line(kills.div_ceil(2), |_| PERIOD_NS - READING_NS / 2)?;
@@ -205,13 +206,13 @@ fn with_kept_line(kills: usize) -> Outcome<Vec<Figure>> {
 struct Cost {
     /// Time from the last telegram of a run to the first of the next one, on receipt.
     telegrams_ms: Vec<f64>,
-    /// The same for scans.
+    /// Time from the last scan of a run to the first of the next one, on receipt.
     scans_ms: Vec<f64>,
     /// Complete telegrams of measured data from the first that was received to the last.
     sent: usize,
     lost: usize,
-    /// Those of them that no hub should have been reading when it was killed: a hub that is woken late reads what has
-    /// arrived.
+    /// Lost telegrams that no hub should have been reading when it was killed. A hub that is woken late reads all bytes
+    /// that have arrived.
     lost_otherwise: usize,
     /// Telegrams that the sensor aborted in this time to answer the next hub.
     aborted: usize,

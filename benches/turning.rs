@@ -350,7 +350,7 @@ fn off_ms(lines: &[Line], due: &HashMap<&str, Vec<u64>>, limit_ms: f64) -> Outco
     Ok((worst, off_ms.iter().filter(|off| **off > limit_ms).count()))
 }
 
-/// What a subscriber to scans printed.
+/// The output of a subscriber to scans.
 #[derive(Default)]
 struct Scans {
     stamps_ns: Vec<u64>,

@@ -319,8 +319,8 @@ const NO_BROWSER: &str = "there is no browser (Debian: apt-get install chromium)
 /// Time after which the programs run as they will for hours.
 const SETTLING: Duration = Duration::from_secs(2);
 
-/// A viewer without a picture: subscribes to what the page subscribes to, and reads as fast as possible for `span`.
-/// Returns the bytes of messages per second after the first second.
+/// Plays a viewer without a picture: subscribes to the same channels as the page, and reads as fast as possible for
+/// `span`. Returns the bytes of messages per second after the first second.
 fn view(url: &str, span: Duration) -> Outcome<f64> {
     let mut socket = connect(url)?;
     let (begun, mut bytes, mut since) = (Instant::now(), 0, None);

@@ -1,4 +1,4 @@
-//! What is compared: the mechanisms, the messages that each of them carries, and the phases in which they are sent.
+//! The mechanisms that are compared, the messages that each of them carries, and the phases in which they are sent.
 //! Sender and receivers know all of these.
 
 use std::hint::black_box;
@@ -112,7 +112,7 @@ pub(crate) struct Label {
     pub(crate) phase: usize,
     /// Number in its phase, from 0.
     pub(crate) number: u64,
-    /// Whether it only reports that the phase is over.
+    /// Whether it only reports the end of its phase.
     pub(crate) is_end: bool,
 }
 

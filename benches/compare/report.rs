@@ -1,4 +1,4 @@
-//! The tables, one for each length of messages, number of receivers and rate, and the targets: what topics should cost
+//! The tables, one for each length of messages, number of receivers and rate. The targets say what topics should cost
 //! compared with the baselines and the cheapest socket.
 
 use serde_json::{Value, json};

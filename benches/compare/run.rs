@@ -85,7 +85,7 @@ impl Case {
     }
 }
 
-/// What a process reports of a phase.
+/// Report of a process about one phase.
 struct Report {
     busy_ns: u64,
     /// Time spent sending and times of the sender; number and time of each message, alternating, of a receiver.

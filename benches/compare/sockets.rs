@@ -216,7 +216,7 @@ pub(crate) struct Streams {
     draft: Draft,
 }
 
-/// Where receivers connect.
+/// The addresses on which receivers connect.
 enum Listener {
     Unix(UnixListener, String),
     Tcp(TcpListener),

@@ -107,7 +107,7 @@ pub(crate) struct BytesInlet {
     _node: Node,
 }
 
-/// What a subscriber waits for, as in the client library.
+/// How a subscriber waits, as in the client library.
 enum Wait {
     /// The doorbell, its count when samples were last received, and whether the subscriber sleeps.
     Bell(Bell, u32, bool),

@@ -64,7 +64,7 @@ fn run_on_lines(sensors: usize, seconds: u64) -> Outcome<[f64; 7]> {
     let hub = stage.hub(&names)?;
     hub.await_line("ready", PATIENCE)?;
     let count = SETTLING + (seconds as f64 * RATE) as usize;
-    let start = |name: &&str| stage.part(&["ages", "scan", stage.domain.name(), name, &count.to_string()]);
+    let start = |name: &&str| stage.part(&["ages", stage.domain.name(), name, &count.to_string()]);
     let consumers: Vec<Child> = names.iter().map(start).collect::<Outcome<_>>()?;
     let patience = PATIENCE + Duration::from_secs(4 * seconds);
     // Wait until all sensors stream and the timing of each line is known.

@@ -24,8 +24,8 @@ use crate::support::stage::SENSORS;
 use crate::support::{Outcome, clock};
 
 /// Reads two serial lines, at most `most` bytes at once, like the simplest of programs: a thread per line blocks in
-/// `read`, so there is no other system call, and finds telegrams with a state machine of six states. One byte at a time
-/// is how programs read a UART with 16 bytes; more than 16 are never available.
+/// `read` and finds telegrams with a state machine of six states. There is no other system call. One byte at a time is
+/// how programs read a UART with 16 bytes; more than 16 are never available.
 pub(crate) fn bytes(ports: [&str; 2], most: usize) -> Outcome<()> {
     for_both(|number, progress| {
         let line = Line::open(Path::new(ports[number]), RATE)?;

@@ -1,5 +1,5 @@
-//! The ways in which data of two sensors gets to subscribers, each as processes on a stage: which of them belong to the
-//! host, which only stand for hardware outside of it, and what CPU time they need.
+//! The ways in which data of two sensors gets to programs. Each way is a set of processes on a stage; some belong to
+//! the host, and some only stand for hardware outside of it. Measures their CPU time.
 
 use std::thread;
 use std::time::Duration;

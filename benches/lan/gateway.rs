@@ -96,8 +96,8 @@ fn bare_run() -> Outcome<Run> {
     application.end()
 }
 
-/// The process that a bare run wakes: sends a datagram with the next number each time that the eventfd, its stdin, is
-/// signaled.
+/// Plays the process that a bare run wakes: sends a datagram with the next number each time that the eventfd, its
+/// stdin, is signaled.
 pub(crate) fn sender() -> Outcome<()> {
     set_parent_process_death_signal(Some(Signal::TERM))?;
     let socket = wire::sender()?;

@@ -1,8 +1,13 @@
-//! What does the network add? Measures the age of a scan that a gateway sent, compared with a datagram that an eventfd
-//! triggers; the gateway's CPU time, compared with a thread that sends the same datagrams; how many it can send; what
-//! arrives over a good cable, and over one that is unplugged for a while; how a listener handles a million damaged
-//! datagrams; and how long scans are. Everything runs in separate network namespaces, with `unshare`, `nsenter` and
-//! `ip`. The bench does not measure what a real switch does.
+//! What does the network add? Everything runs in separate network namespaces, with `unshare`, `nsenter` and `ip`. The
+//! parts are:
+//!
+//! - the age of a scan that a gateway sent, compared with a datagram that an eventfd triggers
+//! - the gateway's CPU time, compared with a thread that sends the same datagrams, and how many it can send
+//! - what arrives over a good cable, and over one that is unplugged for a while
+//! - how a listener handles a million damaged datagrams
+//! - how long the datagrams of scans are
+//!
+//! The bench does not measure what a real switch does.
 
 #[path = "../../tests/testkit/child.rs"]
 mod child;

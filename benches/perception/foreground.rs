@@ -1,12 +1,13 @@
 //! How well are people separated from the background? The two methods of the hub next to two simple ones, in scenes of
 //! the simulated world in which the truth of each beam is known.
 //!
-//! A beam counts as foreground if it meets a person with all of its spot. A beam reported as foreground is wrong if it
-//! meets what was there from the start, what was behind an object that was taken away, or an object that was put down
-//! or moved more than 20 s ago. Not counted are beams that graze a person or a moved object, beams without a reading,
-//! and objects that were put down or moved in the last 20 s. Recall is the share of the foreground beams that are
-//! found, precision the share of the reported beams that are right, and wrong beams are per scan, over all 2000 scans
-//! including the first ones.
+//! A beam counts as foreground if it meets a person with all of its spot. A reported beam is wrong in three cases: it
+//! meets something that has always been in the scene, it meets what was behind an object that was taken away, or it
+//! meets an object that was put down or moved more than 20 s ago. Not counted are beams that graze a person or a moved
+//! object, beams without a reading, and objects that were put down or moved in the last 20 s.
+//!
+//! Recall is the share of the foreground beams that are found, precision the share of the reported beams that are
+//! right. Wrong beams are per scan, over all 2000 scans including the first ones.
 
 use std::ops::Range;
 

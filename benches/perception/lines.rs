@@ -1,6 +1,6 @@
 //! How near are the lines of a scan to its beams, and how long does it take to find them? Both forms of the hub's
-//! method next to simple methods with the same number of vertices, on rooms drawn at random as in the experiment of PLE
-//! (Schaefer, Buescher, Luft, Burgard, IROS 2018), and on logs of real sensors.
+//! method next to simple methods with the same number of vertices. Rooms are drawn at random as in the experiment of
+//! PLE (Schaefer, Buescher, Luft, Burgard, IROS 2018), and logs are of real sensors.
 //!
 //! J vertices make J - 1 lines. The ratio is to iterative end-point fit on the same scans, as in PLE's publication, and
 //! the target is PLE's own ratio. The lines have to cover .97 of the beams of a room.

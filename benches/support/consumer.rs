@@ -9,7 +9,7 @@ use std::time::Duration;
 
 use scanhub_client::Subscription;
 use schema::ipc::Payload;
-use schema::{Domain, Environment, Header, Scan, Status, Zones, limits};
+use schema::{Domain, Environment, Header, Scan, Status, limits};
 
 use super::stage::PATIENCE;
 use super::{Outcome, clock, truth};
@@ -67,27 +67,19 @@ pub(crate) fn telegrams(domain: &str, sensor: &str, count: usize) -> Outcome<()>
     Ok(())
 }
 
-/// Receives scans or zones of `sensor` until `count` have arrived. Then prints for each how old the telegram's last
-/// byte was on receipt: `aged SENSOR NS`.
-pub(crate) fn ages(topic: &str, domain: &str, sensor: &str, count: usize) -> Outcome<()> {
-    let ages = match topic {
-        "zones" => collect_ages::<Zones>(domain, sensor, count)?,
-        _ => collect_ages::<Scan>(domain, sensor, count)?,
-    };
-    ages.iter().for_each(|age| println!("aged {sensor} {age}"));
-    println!("end");
-    Ok(())
-}
-
-fn collect_ages<P: Payload + ?Sized>(domain: &str, sensor: &str, count: usize) -> Outcome<Vec<u64>> {
-    let mut samples = subscribe::<P>(domain, sensor)?;
+/// Receives scans of `sensor` until `count` have arrived. Then prints for each how old the telegram's last byte was on
+/// receipt: `aged SENSOR NS`.
+pub(crate) fn ages(domain: &str, sensor: &str, count: usize) -> Outcome<()> {
+    let mut scans = subscribe::<Scan>(domain, sensor)?;
     let mut ages = Vec::with_capacity(count);
     println!("attaching {sensor}");
     while ages.len() < count {
-        let Some(sample) = samples.next()? else { continue };
-        ages.push(clock::now().saturating_sub(sample.header().stamp_last_ns));
+        let Some(scan) = scans.next()? else { continue };
+        ages.push(clock::now().saturating_sub(scan.header().stamp_last_ns));
     }
-    Ok(ages)
+    ages.iter().for_each(|age| println!("aged {sensor} {age}"));
+    println!("end");
+    Ok(())
 }
 
 /// Receives the status of `sensor` forever, and prints each: `status SENSOR STATE SINCE_NS BOOT`.

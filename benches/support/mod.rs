@@ -21,13 +21,13 @@ use rustix::process::{Signal, set_parent_process_death_signal};
 /// Result of a step of a bench; the error is a message.
 pub(crate) type Outcome<T> = Result<T, Box<dyn Error>>;
 
-/// The body of every bench: plays the part that the command line names, because a bench starts itself as subscriber and
-/// as baseline. Otherwise it measures.
+/// Runs a bench: plays the part that the command line names, because a bench starts itself as subscriber and as
+/// baseline. Otherwise it measures.
 pub(crate) fn main(measure: impl FnOnce(&Options) -> Outcome<()>) -> ExitCode {
     main_with(play, measure)
 }
 
-/// The same for a bench with its own parts; it passes those that it does not know to [`play`].
+/// Runs a bench that has its own parts. It passes the parts that it does not know to [`play`].
 pub(crate) fn main_with(
     play: impl FnOnce(&[&str]) -> Outcome<()>,
     measure: impl FnOnce(&Options) -> Outcome<()>,
@@ -57,7 +57,7 @@ pub(crate) fn play(words: &[&str]) -> Outcome<()> {
         ["consume", "scan", domain, sensor] => consumer::scans(domain, sensor),
         ["consume", "each", domain, sensor] => consumer::each_scan(domain, sensor),
         ["consume", "telegram", domain, sensor, count] => consumer::telegrams(domain, sensor, count.parse()?),
-        ["ages", topic, domain, sensor, count] => consumer::ages(topic, domain, sensor, count.parse()?),
+        ["ages", domain, sensor, count] => consumer::ages(domain, sensor, count.parse()?),
         ["consume", "status", domain, sensor] => consumer::statuses(domain, sensor),
         ["crowd", domain, sensor, count, seconds] => {
             consumer::follow(domain, sensor, count.parse()?, seconds.parse()?)
@@ -75,7 +75,7 @@ pub(crate) fn play(words: &[&str]) -> Outcome<()> {
 /// First word of the command line of a part.
 pub(crate) const PART: &str = "part";
 
-/// Options of a bench. What the user left out has a default in the bench.
+/// Options of a bench. Each has a default, which depends on the bench.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Options {
     /// Print one line of JSON per figure instead of tables.
@@ -113,7 +113,7 @@ impl Options {
         Ok(options)
     }
 
-    /// Returns the number of pairs of a run of the hub and a run of the baseline.
+    /// Returns the number of pairs, each a run of the hub and one of the baseline.
     pub(crate) fn pairs(&self) -> usize {
         self.pairs_or(5)
     }

@@ -1,4 +1,4 @@
-//! A hub without sensors: publishes the same scan whenever it is told to.
+//! A hub without sensors, which publishes the same scan on request.
 
 use schema::ipc::{self, Node, Payload, Publisher, TopicService, Waker};
 use schema::limits::TopicLimits;
@@ -9,7 +9,7 @@ use super::Outcome;
 /// Name of its only sensor.
 pub(crate) const SENSOR: &str = "front";
 
-/// A hub without sensors, which publishes the same scan whenever it is told to.
+/// A hub without sensors, which publishes the same scan on request.
 pub(crate) struct Source {
     publisher: Publisher<Scan>,
     waker: Waker,

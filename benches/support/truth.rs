@@ -1,4 +1,4 @@
-//! What the simulator logs that it sent. Everything that is received is compared with it.
+//! The log of the simulator: the telegrams that it sent. Everything that is received is compared with it.
 
 use std::collections::HashMap;
 use std::path::Path;
@@ -18,7 +18,7 @@ pub(crate) struct Sent {
     pub(crate) at_ns: u64,
 }
 
-/// What one sensor sent, in order.
+/// The telegrams of one sensor, in order.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Truth {
     pub(crate) sent: Vec<Sent>,
@@ -55,8 +55,9 @@ impl Truth {
         Ok(truth)
     }
 
-    /// For a sensor that sends one telegram every `every_ns`: returns the times at which each telegram was due, by its
-    /// hash, because some of its neighbors were sent in time; and for how long in all the sensor was kept from sending.
+    /// Returns the times at which each telegram was due, by its hash, and for how long in all the sensor was kept from
+    /// sending. The sensor sends one telegram every `every_ns`, and some of the neighbors of each telegram were sent in
+    /// time.
     pub(crate) fn due(&self, every_ns: u64) -> (HashMap<&str, Vec<u64>>, u64) {
         let mut all: Vec<&Sent> = self.sent.iter().chain(&self.overrun).collect();
         all.sort_by_key(|sent| sent.index);

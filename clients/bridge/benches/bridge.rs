@@ -1,7 +1,12 @@
-//! What does a bridge cost, and what does it lose? How long does a scan take from shared memory to a plain Zenoh client
-//! behind a router, compared with a plain publisher; all topics of two sensors for minutes; a router that is killed
-//! again and again; a link that is too slow. Routers are bridges that listen. The bench does not measure a real
-//! network.
+//! What does a bridge cost, and what does it lose? Routers are bridges that listen. The parts are:
+//!
+//! - `hop`: the time of a scan from shared memory to a plain Zenoh client behind a router, compared with a plain
+//!   publisher
+//! - `killed`: a router that is killed again and again
+//! - `slow`: a link that is too slow
+//! - `loss`: all topics of two sensors for minutes
+//!
+//! The bench does not measure a real network.
 //!
 //! `cargo bench -p scanhub-bridge --bench bridge [-- MINUTES] [hop|killed|slow|loss ..]` (default: 10, all), after
 //! `cargo build --release`.
@@ -310,7 +315,7 @@ fn slow_link(stage: &Stage) -> Vec<Row> {
         for source in &mut sources {
             while let Some(sample) = source.receive(&mut memory).expect("a sample") {
                 let header = sample.header().filter(|header| header.flags & Flags::REMOTE != 0);
-                // What waited here in the meantime is older.
+                // Samples that waited here in the meantime are older.
                 if let Some(header) = header.filter(|_| !is_first) {
                     ages.push(clock::wall_ns().saturating_sub(header.wall_ns));
                 }
@@ -413,7 +418,7 @@ fn pass([mut from, mut to]: [TcpStream; 2], bytes_a_second: f64, delay: Duration
         let wait = next.saturating_duration_since(now).max(Duration::from_millis(1));
         from.set_read_timeout(Some(wait)).expect("a time");
         match from.read(&mut packet) {
-            // What is in transit still arrives.
+            // Bytes in transit still arrive.
             Ok(0) => {
                 for (at, bytes) in in_transit {
                     thread::sleep(at.saturating_duration_since(Instant::now()));

@@ -1,6 +1,6 @@
-//! What does a scan cost on its way through a graph of ROS 2? How long does it take from shared memory until a plain
-//! Zenoh subscriber has decoded it, compared with the same bytes from a plain Zenoh publisher in the same run; how many
-//! arrive; how busy is the bridge?
+//! What does a scan cost on its way through a graph of ROS 2? Measures the time from shared memory until a plain Zenoh
+//! subscriber has decoded it, compared with the same bytes from a plain Zenoh publisher in the same run. Counts how
+//! many arrive, and the CPU time of the bridge.
 //!
 //! `cargo bench -p scanhub-bridge --bench ros2 [-- SECONDS]` (default 20), after `cargo build --release`.
 
