@@ -84,7 +84,6 @@ fn dispatch(cli: &Cli) -> Result<(), Failure> {
         Verb::Simulate(simulate) => run_simulator(simulate, everywhere),
         Verb::Telegram(telegram) => match &telegram.way {
             Way::Decode(decode) => tools::telegram::decode(&decode.options(everywhere.json), &mut out),
-            Way::Encode(encode) => tools::telegram::encode(&encode.options(everywhere.json), &mut out),
         },
         Verb::Probe(probe) => probe.run(everywhere.json, &*interrupt()?),
         Verb::Configure(configure) => configure.run(everywhere.json, &*interrupt_by(&ENDS)?),

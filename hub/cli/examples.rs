@@ -108,16 +108,12 @@ const EXAMPLES: &[(&str, &[&str])] = &[
     ("latency", &["scanhub latency front/scan --for 10s --max-p99 1ms"]),
     (
         "telegram",
-        &[
-            "scanhub telegram decode recording.bin",
-            "scanhub telegram encode status | scanhub telegram decode",
-        ],
+        &["scanhub telegram decode recording.bin", "echo 02 00 01 00 31 15 12 | scanhub telegram decode"],
     ),
     (
         "telegram decode",
         &["scanhub telegram decode recording.bin", "echo 02 00 01 00 31 15 12 | scanhub telegram decode"],
     ),
-    ("telegram encode", &["scanhub telegram encode status"]),
     (
         "convert",
         &[

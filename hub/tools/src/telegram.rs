@@ -1,14 +1,9 @@
-//! `scanhub telegram`: explains bytes of a line or of a text, and encodes telegrams by name. Touches no port: what is
-//! encoded here is printed, not sent.
+//! `scanhub telegram`: explains the telegrams of an LMS in a recording, in a stream of bytes, or in hexadecimal text.
 
-mod arguments;
-mod encode;
 mod find;
 mod input;
 mod show;
 mod unpack;
-
-pub use encode::{EncodeOptions, encode, names};
 
 use std::fs::File;
 use std::io::{self, ErrorKind, Read, Write};
@@ -42,7 +37,7 @@ pub struct DecodeOptions {
 /// [`Kind::Check`] if there is no telegram in it, [`Kind::Input`] if it cannot be read; [`Kind::NoTopic`] and
 /// [`Kind::Usage`] if it has no such sensor, or several and none is chosen.
 pub fn decode(options: &DecodeOptions, out: &mut dyn Write) -> Result<(), Failure> {
-    let said = options.mode.as_deref().map(arguments::byte).transpose()?.map(Mode);
+    let said = options.mode.as_deref().map(parse_mode).transpose()?;
     let file = options.file.as_deref().filter(|path| *path != Path::new("-"));
     let name = file.map_or("stdin".into(), |path| path.display().to_string());
     let (reader, told): (Box<dyn Read>, _) = match (file, &options.sensor) {
@@ -90,6 +85,17 @@ pub fn decode(options: &DecodeOptions, out: &mut dyn Write) -> Result<(), Failur
         }
         Ok(()) => Ok(()),
     }
+}
+
+/// Parses a measuring mode: `1`, `0x01` or `01h`.
+fn parse_mode(text: &str) -> Result<Mode, Failure> {
+    let hex = text.strip_prefix("0x").or(text.strip_prefix("0X")).or(text.strip_suffix(['h', 'H']));
+    let (digits, radix) = hex.map_or((text, 10), |digits| (digits, 16));
+    // `from_str_radix` accepts a sign.
+    let byte = u8::from_str_radix(digits, radix).ok().filter(|_| !digits.starts_with('+'));
+    byte.map(Mode).ok_or_else(|| {
+        Failure::new(Kind::Configuration, format!("mode {text:?} is not a byte"), "for example --mode 0x01")
+    })
 }
 
 fn unreadable(name: &str, error: &io::Error) -> Failure {
