@@ -149,7 +149,9 @@ struct Missing {
     telegrams: u64,
     bytes: u64,
     chunks: u64,
+    /// Always 0: telegrams outside intact chunks, whose stamps had to be estimated, are not read.
     stamps: u64,
+    /// Always false: a file without its beginning is refused.
     begin: bool,
     end: bool,
     checksum: bool,
@@ -159,7 +161,7 @@ impl<'a> Line<'a> {
     fn of(convert: &'a Convert, converted: &'a Converted) -> Self {
         let Unread { poses, odometry, remissions, lines } = converted.unread;
         let is_log = converted.forms.0 == Form::Carmen;
-        let Damage { telegrams, bytes, chunks, estimated, is_headless, is_cut, is_harmed } = converted.damage;
+        let Damage { telegrams, bytes, chunks, is_cut, is_harmed } = converted.damage;
         Line {
             class: "converted",
             input: &convert.input,
@@ -175,8 +177,8 @@ impl<'a> Line<'a> {
                 telegrams,
                 bytes,
                 chunks,
-                stamps: estimated,
-                begin: is_headless,
+                stamps: 0,
+                begin: false,
                 end: is_cut,
                 checksum: is_harmed,
             },
@@ -192,5 +194,5 @@ fn seconds(ns: u64) -> f64 {
 
 /// How a recording is repaired, for the end of the help.
 pub(crate) const REPAIR: &str = "\
-MCAP to MCAP copies everything and writes a new index: a cut or damaged file becomes a complete file with everything
-that could be read. Damage is reported but is not a failure: the exit code is 0 if the output is complete.";
+MCAP to MCAP copies everything and writes a new index: a cut or damaged file becomes a complete file with all
+messages that can be read. Damage is reported but is not a failure: the exit code is 0 if the output is complete.";

@@ -17,30 +17,25 @@ pub(crate) fn recording(data: &[u8]) {
     let contents = recording.contents();
     let mut telegrams = 0;
     if contents.sensors.is_empty() {
-        telegrams += read(&recording, data);
+        telegrams += read(&recording);
     }
     for sensor in &contents.sensors {
         let part = recording.of(sensor).expect("a sensor that it names");
-        telegrams += read(&part, data);
+        telegrams += read(&part);
     }
     assert_eq!(telegrams, contents.telegrams, "{contents:?}");
     assert!(contents.scans <= contents.telegrams);
 }
 
 /// How many telegrams it gives; as many as it says.
-fn read(recording: &Recording, data: &[u8]) -> u64 {
+fn read(recording: &Recording) -> u64 {
     let (contents, encoding) = (recording.contents(), Encoding { unit: Unit::Mm, mode: Mode(1) });
     let mut telegrams = 0;
     for frame in recording.telegrams(encoding).expect("it was chosen") {
         telegrams += 1;
-        // In a file whose checksums are right whatever may stand where telegrams should be.
-        let is_searched = contents.form == Form::Mcap && contents.damage.is_harmed;
+        // In an MCAP file with right checksums, anything can stand where a telegram should be.
         if contents.form != Form::Mcap && contents.family == Family::Lms as u8 {
             assert!(Telegram::check(&frame.telegram).is_some());
-        }
-        if is_searched && !frame.telegram.is_empty() {
-            let len = frame.telegram.len();
-            assert!(data.windows(len).any(|bytes| bytes == frame.telegram), "nobody sent it");
         }
     }
     assert_eq!(telegrams, contents.telegrams, "{contents:?}");

@@ -1,28 +1,25 @@
-//! What is missing in a recording, as counts and as text. Refuses to know how that was found.
+//! What is missing in a recording, as counts and as text.
 
 use std::fmt;
 
-/// What is missing; all zero if the file is intact.
+/// Parts of a recording that could not be read; all zero if the file is intact.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Damage {
-    /// Telegrams whose numbers are missing between others: the file lost them, or the recorder did.
+    /// Telegrams whose numbers are missing between others. Either the file or the recorder lost them.
     pub telegrams: u64,
-    /// Bytes that are in nothing that could be read.
+    /// Bytes that were not read: those of damaged chunks and records, those after a place where the structure of the file is
+    /// lost, and those outside the telegrams of a stream.
     pub bytes: u64,
-    /// Packed chunks of which nothing could be read.
+    /// Chunks that were skipped because they are damaged.
     pub chunks: u64,
-    /// Telegrams whose header is missing: their stamps are estimated.
-    pub estimated: u64,
-    /// The start of the file is missing, even if only a byte: its description of itself may be gone.
-    pub is_headless: bool,
-    /// The file ends without its index, as after a kill.
+    /// Whether the file ends without its index, as after a kill.
     pub is_cut: bool,
-    /// The structure of the file is wrong somewhere: a checksum, a length, an order.
+    /// Whether the file differs from what was written: a checksum or a length is wrong.
     pub is_harmed: bool,
 }
 
 impl Damage {
-    /// Whether nothing is missing.
+    /// Returns whether nothing is missing.
     pub fn is_none(&self) -> bool {
         *self == Damage::default()
     }
@@ -38,10 +35,8 @@ impl fmt::Display for Damage {
         };
         let parts = [
             counted(self.telegrams, "telegram", "telegrams"),
+            counted(self.chunks, "chunk", "chunks"),
             counted(self.bytes, "byte outside any telegram", "bytes outside any telegram"),
-            counted(self.chunks, "packed chunk", "packed chunks"),
-            counted(self.estimated, "stamp, which is estimated", "stamps, which are estimated"),
-            self.is_headless.then(|| "the beginning of the file".to_owned()),
             self.is_cut.then(|| "the end of the file, with its index".to_owned()),
         ];
         let parts: Vec<_> = parts.into_iter().flatten().collect();
@@ -58,10 +53,10 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_is_missing_in_words() {
+    fn lists_what_is_missing() {
         assert_eq!(Damage::default().to_string(), "nothing");
-        let damage = Damage { telegrams: 2, estimated: 1, is_cut: true, ..Damage::default() };
-        let words = "2 telegrams, 1 stamp, which is estimated, the end of the file, with its index";
+        let damage = Damage { telegrams: 2, chunks: 1, is_cut: true, ..Damage::default() };
+        let words = "2 telegrams, 1 chunk, the end of the file, with its index";
         assert_eq!(damage.to_string(), words);
         let damage = Damage { is_harmed: true, ..Damage::default() };
         assert_eq!(damage.to_string(), "no telegram, but a checksum is wrong");

@@ -1,58 +1,98 @@
-//! Recordings of the hub: what an MCAP file contains about each sensor, and its telegrams. Refuses to know how samples
-//! were written, and what other programs have added.
+//! MCAP files that the hub recorded: each sensor's telegrams, and what the file says about the sensors.
 
-mod channels;
-mod chunk;
-mod exact;
-mod headless;
-mod knowledge;
-mod originals;
-pub(crate) mod reader;
+mod catalog;
 mod records;
-mod salvage;
-mod seen;
-mod source;
-mod window;
 
 use std::collections::{BTreeMap, HashSet};
 use std::io::{self, Read};
 use std::sync::Arc;
 
+use lms::telegram::Telegram;
 use lms::variant::Mode;
 use schema::datagram::Packed;
 use schema::{Family, Header, Pace, Scan, Status, Topic};
 
-use crate::open::is_end;
 use crate::{Contents, Damage, Form, Frame};
-pub(crate) use exact::parse;
-pub(crate) use headless::is_mcap;
-use knowledge::MOST_LIVES;
-pub(crate) use knowledge::{Knowledge, message};
-pub(crate) use originals::Originals;
-use reader::{Item, Reader, Sighting};
+pub(crate) use catalog::Catalog;
 pub(crate) use records::Record;
-use source::Source;
+use records::Records;
 
-/// What is known of a file that was read through.
+/// A part of a file.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(crate) enum Item {
+    /// A telegram of a sensor.
+    Telegram(Sample),
+    /// Any other record.
+    Record(Record),
+}
+
+/// A message of topic `telegram`.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(crate) struct Sample {
+    pub(crate) sensor: String,
+    pub(crate) header: Header,
+    pub(crate) telegram: Vec<u8>,
+}
+
+/// Reads a file from its beginning to its end.
+pub(crate) struct Reader<R> {
+    records: Records<R>,
+    catalog: Catalog,
+    /// Whether messages were read whose channel was not known yet.
+    has_unknown: bool,
+}
+
+impl<R: Read> Reader<R> {
+    /// Reads `input`, about which `catalog` is known already.
+    fn new(input: R, catalog: Catalog) -> Self {
+        Reader { records: Records::new(input), catalog, has_unknown: false }
+    }
+
+    /// Returns the next telegram or record; `None` at the end.
+    ///
+    /// # Errors
+    ///
+    /// Returns the errors of [`Records::next`] and [`Catalog::note`].
+    pub(crate) fn next(&mut self) -> io::Result<Option<Item>> {
+        let Some(record) = self.records.next()? else { return Ok(None) };
+        self.catalog.note(&record)?;
+        Ok(Some(match self.telegram(&record) {
+            Some(sample) => Item::Telegram(sample),
+            None => Item::Record(record),
+        }))
+    }
+
+    fn telegram(&mut self, record: &Record) -> Option<Sample> {
+        let (message, data) = record.message()?;
+        let (sensor, (header, telegram)) = match self.catalog.place(message.channel_id) {
+            Some(place) => {
+                let place = place.filter(|place| place.topic == Topic::Telegram)?;
+                (place.sensor.clone(), catalog::sample(&message, data)?)
+            }
+            // The channel's record is lost. A telegram of an LMS shows by itself that it is one.
+            None => {
+                self.has_unknown = true;
+                let sample = catalog::sample(&message, data)?;
+                Telegram::check(sample.1)?;
+                (format!("sensor{}", sample.0.sensor), sample)
+            }
+        };
+        Some(Sample { sensor, header, telegram: telegram.to_vec() })
+    }
+}
+
+/// Contents of a file that was read to its end.
 #[derive(Debug)]
 pub(crate) struct Survey {
     whole: Contents,
     sensors: BTreeMap<String, Contents>,
-    knowledge: Knowledge,
-    is_sound: bool,
-    numbers: BTreeMap<String, Numbers>,
-    /// Number of the first telegram of which a hub made something, by sensor and life.
+    catalog: Catalog,
+    /// Header of each sensor's last telegram.
+    last: BTreeMap<String, Header>,
+    /// Number of the first telegram that the hub processed further, by sensor and run of the hub.
     understood: BTreeMap<String, BTreeMap<u64, u64>>,
-    /// Pairs of sensor and life in it.
-    lives: usize,
-}
-
-/// The last telegram of a sensor whose number is known.
-#[derive(Clone, Copy, Debug, Default)]
-struct Numbers {
-    last: Option<Header>,
-    /// Telegrams after it whose numbers are not.
-    estimated: u64,
+    /// Number of pairs of sensor and run in it.
+    runs: usize,
 }
 
 impl Default for Survey {
@@ -60,127 +100,118 @@ impl Default for Survey {
         Survey {
             whole: Contents::new(Form::Mcap),
             sensors: BTreeMap::new(),
-            knowledge: Knowledge::default(),
-            is_sound: true,
-            numbers: BTreeMap::new(),
+            catalog: Catalog::default(),
+            last: BTreeMap::new(),
             understood: BTreeMap::new(),
-            lives: 0,
+            runs: 0,
         }
     }
 }
 
 impl Survey {
-    /// Reads the file that `open` opens through: once if it is sound.
+    /// Reads the file that `open` opens. A damaged file may be read twice, because its index can name channels whose first
+    /// chunk is lost.
     ///
-    /// `is_headless`: its beginning is missing.
-    pub(crate) fn of<R: Read>(open: impl Fn() -> io::Result<R>, is_headless: bool) -> io::Result<Survey> {
-        let failed = match Survey::read(Reader::sound(open()?)) {
-            Err(error) if is_end(&error) => error,
-            other => return other,
-        };
-        let knowledge = Knowledge::of(Source::of(open()?, false))?;
-        let mut survey = Survey::read(Reader::harmed(open()?, knowledge))?;
-        survey.is_sound = false;
-        let is_cut = failed.kind() == io::ErrorKind::UnexpectedEof && survey.whole.damage.is_cut;
-        survey.tell(|damage| (damage.is_headless, damage.is_harmed) = (is_headless, !is_cut));
-        Ok(survey)
+    /// # Errors
+    ///
+    /// Returns the errors of `open` and of [`Reader::next`].
+    pub(crate) fn of<R: Read>(open: impl Fn() -> io::Result<R>) -> io::Result<Survey> {
+        let (survey, is_complete) = Survey::read(Reader::new(open()?, Catalog::default()))?;
+        if is_complete {
+            return Ok(survey);
+        }
+        Survey::read(Reader::new(open()?, survey.catalog)).map(|(survey, _)| survey)
     }
 
-    fn read<R: Read>(mut reader: Reader<R>) -> io::Result<Survey> {
+    /// Reads a file, and returns whether all of its messages have known channels.
+    fn read<R: Read>(mut reader: Reader<R>) -> io::Result<(Survey, bool)> {
         let mut survey = Survey::default();
         while let Some(item) = reader.next()? {
             match item {
-                Item::Telegram(sighting) => survey.note(&sighting),
-                Item::Record(record) => survey.note_record(&reader.knowledge, &record),
+                Item::Telegram(sample) => survey.note(&sample),
+                Item::Record(record) => survey.note_record(&reader.catalog, &record),
             }
         }
-        survey.whole.sensors = reader.knowledge.channels.sensors();
+        survey.whole.sensors = reader.catalog.sensors();
         for sensor in &survey.whole.sensors {
             of_sensor(&mut survey.sensors, sensor);
         }
-        // Those whose names are lost.
         let named: HashSet<_> = survey.whole.sensors.iter().collect();
-        let others = survey.sensors.keys().filter(|name| !named.contains(name));
-        let others: Vec<_> = others.cloned().collect();
-        survey.whole.sensors.extend(others);
-        if let Some(account) = reader.account() {
-            survey.tell(|damage| {
-                (damage.bytes, damage.chunks) = (account.passed, account.chunks);
-                damage.is_cut = !account.has_end;
-            });
+        let nameless: Vec<_> = survey.sensors.keys().filter(|name| !named.contains(name)).cloned().collect();
+        survey.whole.sensors.extend(nameless);
+        let damage = reader.records.damage();
+        for contents in std::iter::once(&mut survey.whole).chain(survey.sensors.values_mut()) {
+            contents.damage = Damage { telegrams: contents.damage.telegrams, ..damage };
         }
-        survey.knowledge = reader.knowledge;
-        Ok(survey)
+        survey.catalog = reader.catalog;
+        Ok((survey, !reader.has_unknown))
     }
 
-    /// What is in the file.
+    /// Returns the contents of the whole file.
     pub(crate) fn contents(&self) -> Contents {
         self.whole.clone()
     }
 
-    /// What is in it of `sensor`.
+    /// Returns the contents that belong to `sensor`.
     pub(crate) fn contents_of(&self, sensor: &str) -> Contents {
         let contents = self.sensors.get(sensor).cloned().unwrap_or(Contents::new(Form::Mcap));
         Contents { sensors: vec![sensor.to_owned()], ..contents }
     }
 
-    /// All that is in the file, as `input` has it.
+    /// Reads the file again, from `input`.
     pub(crate) fn reader<R: Read>(&self, input: R) -> Reader<R> {
-        if self.is_sound { Reader::sound(input) } else { Reader::harmed(input, self.knowledge.clone()) }
+        Reader::new(input, self.catalog.clone())
     }
 
-    /// What the file says beside its telegrams.
-    pub(crate) fn knowledge(&self) -> &Knowledge {
-        &self.knowledge
+    /// Returns the channels of the file.
+    pub(crate) fn catalog(&self) -> &Catalog {
+        &self.catalog
     }
 
-    /// Number of the first telegram of `sensor` of which the hub with this `boot` made something. Nothing if that is in
-    /// no file, or in one that is harmed.
+    /// Returns the number of the first telegram of `sensor` that the hub with this `boot` processed further; `None` if the
+    /// file does not contain it, or is damaged.
     pub(crate) fn understood(&self, sensor: &str, boot: u64) -> Option<u64> {
         self.understood.get(sensor)?.get(&boot).copied().filter(|_| !self.whole.damage.is_harmed)
     }
 
-    /// Says of the whole file and of each sensor what `tell` says.
-    fn tell(&mut self, tell: impl Fn(&mut Damage)) {
-        tell(&mut self.whole.damage);
-        self.sensors.values_mut().for_each(|contents| tell(&mut contents.damage));
-    }
-
-    fn note(&mut self, sighting: &Sighting) {
-        let numbers = self.numbers.entry(sighting.sensor.clone()).or_default();
-        let mut missing = 0;
-        if sighting.is_estimated {
-            numbers.estimated += 1;
-        } else {
-            let header = sighting.header;
-            if let Some(last) = numbers.last.filter(|last| last.boot == header.boot) {
-                missing =
-                    header.topic_seq.saturating_sub(last.topic_seq.saturating_add(1 + numbers.estimated));
+    fn note(&mut self, sample: &Sample) {
+        let Sample { sensor, header, telegram } = sample;
+        let missing = match self.last.get_mut(sensor) {
+            Some(last) => {
+                let last = std::mem::replace(last, *header);
+                let is_same_run = last.boot == header.boot;
+                if is_same_run {
+                    header.topic_seq.saturating_sub(last.topic_seq.saturating_add(1))
+                } else {
+                    0
+                }
             }
-            *numbers = Numbers { last: Some(header), estimated: 0 };
-        }
-        for contents in [&mut self.whole, of_sensor(&mut self.sensors, &sighting.sensor)] {
-            contents.note(sighting.header.family, &sighting.telegram, Some(sighting.header.wall_ns));
+            None => {
+                self.last.insert(sensor.clone(), *header);
+                0
+            }
+        };
+        for contents in [&mut self.whole, of_sensor(&mut self.sensors, sensor)] {
+            contents.note(header.family, telegram, Some(header.wall_ns));
             contents.damage.telegrams = contents.damage.telegrams.saturating_add(missing);
-            contents.damage.estimated += u64::from(sighting.is_estimated);
         }
     }
 
-    /// The measuring mode stands in a status too; what was made of a scan says that it was known by then.
-    fn note_record(&mut self, knowledge: &Knowledge, record: &Record) {
-        let Some((place, header, payload)) = knowledge.message(record) else { return };
+    /// Takes over what statuses say about the scanner, and which telegrams the hub processed further.
+    fn note_record(&mut self, catalog: &Catalog, record: &Record) {
+        let Some((place, header, payload)) = catalog.message(record) else { return };
         let is_of_scan = place.topic.row().pace == Pace::Scan && place.topic != Topic::Telegram;
-        // What is said without a telegram was not sent after one.
+        // A sample without a hub time was not caused by a telegram.
         if is_of_scan && header.hub_time_ns().is_some() {
-            let lives = match self.understood.get_mut(&place.sensor) {
-                Some(lives) => lives,
+            let runs = match self.understood.get_mut(&place.sensor) {
+                Some(runs) => runs,
                 None => self.understood.entry(place.sensor.clone()).or_default(),
             };
-            match lives.get_mut(&header.boot) {
+            match runs.get_mut(&header.boot) {
                 Some(first) => *first = header.seq.min(*first),
-                None if self.lives < MOST_LIVES => {
-                    lives.insert(header.boot, header.seq);
-                    self.lives += 1;
+                None if self.runs < MOST_RUNS => {
+                    runs.insert(header.boot, header.seq);
+                    self.runs += 1;
                 }
                 None => {}
             }
@@ -196,10 +227,10 @@ impl Survey {
         let mut status = Status::default();
         if place.topic == Topic::Status && status.unpack(payload) {
             let mode = (status.mode != Status::MODE_UNKNOWN).then_some(Mode(status.mode));
-            let told = if place.is_old() { None } else { told(&status) };
+            let rotating = if place.is_old { None } else { rotating(&status) };
             for contents in [&mut self.whole, of_sensor(&mut self.sensors, &place.sensor)] {
                 contents.mode = contents.mode.or(mode);
-                if let Some((model, way)) = told {
+                if let Some((model, way)) = rotating {
                     contents.model = contents.model.or(Some(model));
                     contents.way = contents.way.or(way);
                     contents.step_cdeg = contents.step_cdeg.or(Some(status.resolution_cdeg));
@@ -209,8 +240,8 @@ impl Survey {
     }
 }
 
-/// The names of the model and of the way of measuring that `status` tells, of a scanner whose head turns.
-fn told(status: &Status) -> Option<(&'static str, Option<&'static str>)> {
+/// Returns the model and the scan mode that `status` names, if the scanner is a rotating one.
+fn rotating(status: &Status) -> Option<(&'static str, Option<&'static str>)> {
     let features = scanner::features(Family::of_number(status.family)?)?;
     let name = status.model()?;
     let model = features.models.iter().map(|model| model.name).find(|known| *known == name)?;
@@ -239,7 +270,7 @@ impl<R: Read> Iterator for Frames<R> {
 
     fn next(&mut self) -> Option<Frame> {
         loop {
-            if let Item::Telegram(Sighting { sensor, header, telegram, .. }) = self.reader.next().ok()??
+            if let Item::Telegram(Sample { sensor, header, telegram }) = self.reader.next().ok()??
                 && sensor == self.sensor
             {
                 return Some(Frame {
@@ -254,3 +285,6 @@ impl<R: Read> Iterator for Frames<R> {
         }
     }
 }
+
+/// Maximum number of runs of a hub that are remembered: one in each minute of a month.
+const MOST_RUNS: usize = 50_000;

@@ -2,7 +2,7 @@
 //! with it is reported, before anything is sent from it. Nothing is kept in memory.
 
 use std::fmt;
-use std::io::{self, BufRead, BufReader, Read};
+use std::io::{self, BufRead, BufReader, Read, Seek, SeekFrom};
 use std::path::{Path, PathBuf};
 
 use line::family::{Model, Wanted};
@@ -11,7 +11,7 @@ use schema::{Failure, Family, Kind, regular};
 
 use crate::carmen::{self, Log};
 #[cfg(feature = "mcap")]
-use crate::mcap::{Knowledge, reader::Reader};
+use crate::mcap::{Catalog, Reader};
 use crate::packed::Packed;
 use crate::packets::Packets;
 use crate::stream::Telegrams;
@@ -70,14 +70,12 @@ impl Recording {
             return Err(refused(&path, "is empty"));
         }
         if head.starts_with(MCAP) {
-            return Recording::open_mcap(path, false);
+            return Recording::open_mcap(path);
         }
         let form = if carmen::is_log(head) { Form::Carmen } else { Form::Telegrams };
-        #[cfg(feature = "mcap")]
-        if form != Form::Carmen
-            && crate::mcap::is_mcap(self::reader(&path)?).map_err(|error| unreadable(&path, &error))?
-        {
-            return Recording::open_mcap(path, true);
+        if ends_as_mcap(&path).map_err(|error| unreadable(&path, &error))? {
+            let what = "is the end of an MCAP file, without its beginning";
+            return Err(refused(&path, what));
         }
         let contents = match form {
             Form::Carmen => survey_log(&path, reader)?,
@@ -99,15 +97,14 @@ impl Recording {
     }
 
     #[cfg(feature = "mcap")]
-    fn open_mcap(path: PathBuf, is_headless: bool) -> Result<Recording, Failure> {
-        let survey = crate::mcap::Survey::of(|| open(&path), is_headless)
-            .map_err(|error| unreadable(&path, &error))?;
+    fn open_mcap(path: PathBuf) -> Result<Recording, Failure> {
+        let survey = crate::mcap::Survey::of(|| open(&path)).map_err(|error| unreadable(&path, &error))?;
         let contents = survey.contents();
         Ok(Recording { path, contents, survey: survey.into(), sensor: None })
     }
 
     #[cfg(not(feature = "mcap"))]
-    fn open_mcap(path: PathBuf, _: bool) -> Result<Recording, Failure> {
+    fn open_mcap(path: PathBuf) -> Result<Recording, Failure> {
         let message = format!("recording {} is an MCAP file, which this build does not read", path.display());
         Err(Failure::new(Kind::Input, message, "build it with feature mcap of scanhub-recording"))
     }
@@ -278,10 +275,10 @@ impl Recording {
         Ok(Box::new(std::iter::empty()))
     }
 
-    /// All that is in an MCAP file, and what is known of it.
+    /// Reads all records of an MCAP file, and returns its channels.
     #[cfg(feature = "mcap")]
-    pub(crate) fn reader(&self) -> Result<(Reader<impl Read + use<>>, &Knowledge), Failure> {
-        Ok((self.survey.reader(reader(&self.path)?), self.survey.knowledge()))
+    pub(crate) fn reader(&self) -> Result<(Reader<impl Read + use<>>, &Catalog), Failure> {
+        Ok((self.survey.reader(reader(&self.path)?), self.survey.catalog()))
     }
 
     /// The sensor that was chosen.
@@ -330,6 +327,16 @@ fn open(path: &Path) -> io::Result<Box<dyn BufRead + Send>> {
         return Ok(Box::new(BufReader::with_capacity(BUFFER, Packed::new(file))));
     }
     Ok(Box::new(file))
+}
+
+/// Returns whether the file ends with the magic bytes of MCAP. Telegrams in it would otherwise be taken for a stream.
+fn ends_as_mcap(path: &Path) -> io::Result<bool> {
+    let mut file = regular::open(path)?;
+    let end = file.metadata()?.len().saturating_sub(MCAP.len() as u64);
+    file.seek(SeekFrom::Start(end))?;
+    let mut tail = Vec::new();
+    file.read_to_end(&mut tail)?;
+    Ok(tail == MCAP)
 }
 
 pub(crate) fn unreadable(path: &Path, error: &io::Error) -> Failure {

@@ -1,5 +1,4 @@
-//! Copies an MCAP file: every readable message, all channels, also those of other programs, and a new index. Refuses to
-//! know what the messages mean, except for telegrams, whose headers may have been estimated.
+//! Copies an MCAP file: every message that can be read, of all channels including those of other programs, and a new index.
 
 use std::collections::BTreeMap;
 use std::io::{self, Write};
@@ -10,10 +9,9 @@ use schema::{Failure, Topic};
 
 use super::{CHUNK, Written};
 use crate::Recording;
-use crate::mcap::reader::Item;
-use crate::mcap::{Originals, Record, message, parse};
+use crate::mcap::{Catalog, Item, Record, Sample};
 
-/// Copies `recording` into `file`; `count` hears of each telegram.
+/// Copies `recording` into `file`, and calls `count` for each telegram.
 pub(super) fn copy(
     recording: &Recording,
     compression: Compression,
@@ -21,27 +19,24 @@ pub(super) fn copy(
     count: &mut impl FnMut(Written, Option<u64>) -> Result<(), Failure>,
     failed: &impl Fn(io::Error) -> Failure,
 ) -> Result<(), Failure> {
-    let (mut reader, known) = recording.reader()?;
-    let originals = &known.originals;
+    let (mut reader, catalog) = recording.reader()?;
     let sensor = recording.chosen();
     let writer =
-        Writer::packed(file, &originals.profile, compression, originals.facts.clone()).map_err(failed)?;
-    let mut copy = Copy { writer, originals, channels: BTreeMap::new(), has_facts: false, bytes: 0 };
+        Writer::packed(file, &catalog.profile, compression, catalog.facts.clone()).map_err(failed)?;
+    let mut copy = Copy { writer, catalog, channels: BTreeMap::new(), has_facts: false, bytes: 0 };
     while let Some(item) = reader.next().map_err(|error| recording.broken(&error))? {
         match item {
-            Item::Telegram(sighting) if sensor.is_none_or(|sensor| *sensor == sighting.sensor) => {
-                let is_scan = crate::is_scan(sighting.header.family, &sighting.telegram);
-                let len = sighting.telegram.len();
-                let header = &sighting.header;
-                let written =
-                    copy.writer.sample(&sighting.sensor, Topic::Telegram, header, &sighting.telegram);
-                written.and_then(|()| copy.wrote(len)).map_err(failed)?;
+            Item::Telegram(sample) if sensor.is_none_or(|sensor| *sensor == sample.sensor) => {
+                let Sample { sensor, header, telegram } = &sample;
+                let is_scan = crate::is_scan(header.family, telegram);
+                let written = copy.writer.sample(sensor, Topic::Telegram, header, telegram);
+                written.and_then(|()| copy.wrote(telegram.len())).map_err(failed)?;
                 count(Written::of(is_scan), Some(header.wall_ns))?;
             }
             Item::Telegram(_) => {}
             Item::Record(record) => {
                 let place =
-                    message(&record).and_then(|(head, _)| known.channels.place(head.channel_id).flatten());
+                    record.message().and_then(|(message, _)| catalog.place(message.channel_id).flatten());
                 let is_chosen =
                     sensor.is_none_or(|sensor| place.is_some_and(|place| place.sensor == *sensor));
                 if is_chosen || record.opcode != op::MESSAGE {
@@ -55,11 +50,12 @@ pub(super) fn copy(
 
 struct Copy<'a, W: Write> {
     writer: Writer<W>,
-    originals: &'a Originals,
-    /// Numbers of the channels in the new file, by those in the old one.
+    catalog: &'a Catalog,
+    /// Channel numbers in the new file, by those in the old file.
     channels: BTreeMap<u16, u16>,
-    /// The new file begins with the facts of the old one.
+    /// Whether the facts of the old file were met, with which the new one begins.
     has_facts: bool,
+    /// Bytes in the open chunk.
     bytes: usize,
 }
 
@@ -67,7 +63,7 @@ impl<W: Write> Copy<'_, W> {
     fn record(&mut self, record: &Record) -> io::Result<()> {
         match record.opcode {
             op::MESSAGE => self.message(record),
-            op::METADATA | op::ATTACHMENT => match parse(record) {
+            op::METADATA | op::ATTACHMENT => match record.parse() {
                 Some(Parsed::Metadata(metadata)) if metadata.name == METADATA && !self.has_facts => {
                     self.has_facts = true;
                     Ok(())
@@ -88,13 +84,13 @@ impl<W: Write> Copy<'_, W> {
         }
     }
 
-    /// Copies a message, unless nothing tells what it is.
+    /// Copies a message, unless its channel is unknown.
     fn message(&mut self, record: &Record) -> io::Result<()> {
-        let Some((mut head, data)) = message(record) else { return Ok(()) };
+        let Some((mut head, data)) = record.message() else { return Ok(()) };
         head.channel_id = match self.channels.get(&head.channel_id) {
             Some(&id) => id,
             None => {
-                let Some((channel, schema)) = self.originals.channel(head.channel_id) else { return Ok(()) };
+                let Some((channel, schema)) = self.catalog.channel(head.channel_id) else { return Ok(()) };
                 let schema = schema.map(|(name, language, text)| (&name[..], &language[..], &text[..]));
                 let id = self.writer.copied_channel(channel, schema)?;
                 self.channels.insert(head.channel_id, id);

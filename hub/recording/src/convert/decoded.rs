@@ -14,7 +14,7 @@ use schema::{Failure, Family, Header, Kind, Pose, Scan, Status, Topic};
 use super::is_made_up;
 use super::times::Times;
 use super::turns::Turns;
-use crate::mcap::reader::Item;
+use crate::mcap::Item;
 use crate::{Encoding, Form, Recording};
 
 /// What comes next in a recording.
@@ -85,12 +85,12 @@ fn each_of_mcap(
     mode: Option<Mode>,
     tell: &mut impl FnMut(Sight<'_>) -> Result<(), Failure>,
 ) -> Result<(), Failure> {
-    let (mut reader, known) = recording.reader()?;
+    let (mut reader, catalog) = recording.reader()?;
     let mut sensors = BTreeMap::new();
     for name in &recording.contents().sensors {
         let contents = recording.of(name)?.contents().clone();
         let mode = contents.mode.or(mode).or(contents.readable());
-        let has_scans = known.channels.has_scans(name);
+        let has_scans = catalog.has_scans(name);
         let turns = if has_scans { None } else { Turns::of(&recording.of(name)?)? };
         let is_decoded = contents.scans > 0 && (mode.is_some() || !has_scans);
         let sensor = Sensor { mode, is_decoded, turns, is_first: true };
@@ -100,25 +100,25 @@ fn each_of_mcap(
     let mut scan = Box::<Scan>::default();
     while let Some(item) = reader.next().map_err(|error| recording.broken(&error))? {
         match item {
-            Item::Telegram(sighting) => {
-                let Some(sensor) = sensors.get_mut(&sighting.sensor) else { continue };
-                if sighting.header.family != Family::Lms as u8 {
+            Item::Telegram(sample) => {
+                let Some(sensor) = sensors.get_mut(&sample.sensor) else { continue };
+                if sample.header.family != Family::Lms as u8 {
                     let Some(turns) = &mut sensor.turns else { continue };
-                    let name = &sighting.sensor;
-                    turns.each(&sighting.header, &sighting.telegram, |header, scan| {
+                    let name = &sample.sensor;
+                    turns.each(&sample.header, &sample.telegram, |header, scan| {
                         tell(Sight::Scan(name, header, scan))
                     })?;
                     continue;
                 }
                 let is_first = std::mem::replace(&mut sensor.is_first, false);
-                match sensor.decode(&sighting.telegram, &mut scan) && sensor.is_decoded {
-                    true => tell(Sight::Scan(&sighting.sensor, sighting.header, &scan))?,
-                    false if is_first && is_made_up(&sighting.telegram, Some(&sighting.header)) => {}
+                match sensor.decode(&sample.telegram, &mut scan) && sensor.is_decoded {
+                    true => tell(Sight::Scan(&sample.sensor, sample.header, &scan))?,
+                    false if is_first && is_made_up(&sample.telegram, Some(&sample.header)) => {}
                     false => tell(Sight::Other)?,
                 }
             }
             Item::Record(record) => {
-                let Some((place, header, payload)) = known.message(&record) else { continue };
+                let Some((place, header, payload)) = catalog.message(&record) else { continue };
                 let Some(sensor) = sensors.get_mut(&place.sensor) else { continue };
                 if place.has_scans() && !sensor.is_decoded && Scan::unpack_into(&mut scan, payload) {
                     tell(Sight::Scan(&place.sensor, header, &scan))?;

@@ -7,7 +7,7 @@ use schema::datagram::Packed;
 use schema::{Failure, Kind, Marks, Topic};
 
 use super::{Packing, Written};
-use crate::mcap::reader::Item;
+use crate::mcap::Item;
 use crate::{Form, Recording};
 
 /// Writes the marks of the chosen sensor of `recording`, and returns their number.
@@ -26,10 +26,10 @@ pub(super) fn write(
     columns.names(&mut lines).map_err(failed)?;
     let (mut samples, mut written) = (0, 0);
     if recording.contents().form == Form::Mcap {
-        let (mut reader, known) = recording.reader()?;
+        let (mut reader, catalog) = recording.reader()?;
         while let Some(item) = reader.next().map_err(|error| recording.broken(&error))? {
             let Item::Record(record) = item else { continue };
-            let Some((place, header, payload)) = known.message(&record) else { continue };
+            let Some((place, header, payload)) = catalog.message(&record) else { continue };
             let mut marks = Marks::default();
             if place.topic != Topic::Marks
                 || recording.chosen() != Some(&place.sensor)

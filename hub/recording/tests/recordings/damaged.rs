@@ -1,257 +1,224 @@
-//! A recording that is cut, flipped, blanked, shortened, without its beginning or doubled anywhere gives every telegram whose bytes are all
-//! there, once, in order and bit for bit, and nothing that was never in it.
+//! Damaged MCAP files: of a file that was cut or changed anywhere, the intact chunks are read, and nothing that was never in
+//! the file.
 
-use std::collections::BTreeMap;
 use std::fs;
 use std::ops::Range;
-use std::path::PathBuf;
 
-use crate::written::{SENSORS, Written};
 use fastrand::Rng;
 use lms::variant::{Mode, Unit};
-use recording::{Encoding, Frame, Recording};
-use schema::Flags;
-use schema::file::ENCODING;
+use recording::{Damage, Encoding, Recording};
+use schema::file::Compression;
 
-const MM: Encoding = Encoding { unit: Unit::Mm, mode: Mode(1) };
+use crate::folder::Folder;
+use crate::written::{self, Known, SENSORS, Written};
 
-/// What became of a file: for each byte of the new one, where it was in the old one.
-struct Mutation {
-    name: String,
+/// A recording, and where its records are.
+struct Whole {
     bytes: Vec<u8>,
-    /// `None`: it is another byte now.
-    origin: Vec<Option<usize>>,
-    /// Where what is there twice begins.
-    doubled: Option<usize>,
+    telegrams: Vec<Known>,
+    /// Bytes of each chunk, each of which has [`PER_CHUNK`] telegrams.
+    chunks: Vec<Range<usize>>,
+    /// Ends of all records outside chunks, after the end of the magic bytes.
+    ends: Vec<usize>,
 }
 
-impl Mutation {
-    fn of(bytes: &[u8], random: &mut Rng) -> Mutation {
-        let len = bytes.len();
-        let mut mutated = Mutation {
-            name: String::new(),
-            bytes: bytes.to_vec(),
-            origin: (0..len).map(Some).collect(),
-            doubled: None,
-        };
-        let from = random.usize(..len);
-        let some = from..(from + random.usize(1..20_000)).min(len);
-        match random.u8(..7) {
-            0 => {
-                mutated.name = format!("cut at {from}");
-                mutated.bytes.truncate(from);
-                mutated.origin.truncate(from);
+impl Whole {
+    fn new(rounds: u64, compression: Compression) -> Whole {
+        let Written { bytes, telegrams } = written::packed(rounds, 7, compression);
+        let (mut chunks, mut ends) = (Vec::new(), vec![MAGIC]);
+        while let Some(&at) = ends.last().filter(|at| **at < bytes.len() - MAGIC) {
+            let end = at + HEAD + u64::from_le_bytes(*bytes[at + 1..].first_chunk().unwrap()) as usize;
+            if bytes[at] == mcap::records::op::CHUNK {
+                chunks.push(at..end);
             }
-            1 => {
-                let places: Vec<_> = (0..random.usize(1..=16)).map(|_| random.usize(..len)).collect();
-                mutated.name = format!("flips at {places:?}");
-                for place in places {
-                    mutated.bytes[place] ^= 1 << random.u8(..8);
-                    mutated.origin[place] = None;
-                }
-            }
-            2 => {
-                let pages = from / 4096 * 4096..(from / 4096 * 4096 + 4096 * random.usize(1..4)).min(len);
-                mutated.name = format!("zeroes in {pages:?}");
-                for place in pages {
-                    mutated.origin[place] = mutated.origin[place].filter(|_| mutated.bytes[place] == 0);
-                    mutated.bytes[place] = 0;
-                }
-            }
-            3 => {
-                mutated.name = format!("without {some:?}");
-                mutated.bytes.drain(some.clone());
-                mutated.origin.drain(some);
-            }
-            4 => {
-                let kept = from / 2..(from / 2 + random.usize(1..100_000)).min(len);
-                mutated.name = format!("nothing but {kept:?}");
-                mutated.bytes = bytes[kept.clone()].to_vec();
-                mutated.origin = kept.map(Some).collect();
-            }
-            5 => {
-                mutated.name = format!("without the first {from}");
-                mutated.bytes.drain(..from);
-                mutated.origin.drain(..from);
-            }
-            _ => {
-                mutated.name = format!("{some:?} twice");
-                mutated.doubled = Some(some.start);
-                let (again, of_it) = (bytes[some.clone()].to_vec(), mutated.origin[some.clone()].to_vec());
-                mutated.bytes.splice(some.end..some.end, again);
-                mutated.origin.splice(some.end..some.end, of_it);
-            }
+            ends.push(end);
         }
-        mutated
+        assert_eq!(chunks.len() * PER_CHUNK, telegrams.len());
+        Whole { bytes, telegrams, chunks, ends }
     }
 
-    /// Where each of the `len` bytes of the old file is in the new one: it may be there twice.
-    fn places(&self, len: usize) -> Vec<[Option<usize>; 2]> {
-        let mut places = vec![[None; 2]; len];
-        for (at, old) in self.origin.iter().enumerate() {
-            if let Some(old) = old {
-                let [first, second] = &mut places[*old];
-                *(if first.is_none() { first } else { second }) = Some(at);
-            }
-        }
-        places
+    /// The telegrams of the chunks that `is_left` accepts, one sensor after the other.
+    fn telegrams(&self, is_left: impl Fn(usize) -> bool) -> Vec<Known> {
+        let chunks = self.telegrams.chunks(PER_CHUNK).enumerate();
+        let left: Vec<_> =
+            chunks.filter(|(number, _)| is_left(*number)).flat_map(|(_, known)| known).collect();
+        let of =
+            |sensor| left.iter().filter(move |known| known.sensor == sensor).map(|known| (*known).clone());
+        SENSORS.into_iter().flat_map(of).collect()
     }
 
-    /// Whether the old bytes from `begin` to `end` are at one of `places`, side by side.
-    fn has(&self, places: [Option<usize>; 2], begin: usize, end: usize) -> bool {
-        let is_there =
-            |at: usize| (begin..end).enumerate().all(|(i, old)| self.origin.get(at + i) == Some(&Some(old)));
-        places.into_iter().flatten().any(is_there)
+    /// Positions in chunk `number` at which a change is found by the checksum: the checksum itself, and its records.
+    fn content(&self, number: usize) -> Vec<usize> {
+        let chunk = self.chunks[number].clone();
+        let compression = chunk.start + HEAD + 8 + 8 + 8 + 4;
+        let records = compression + 4 + usize::from(self.bytes[compression]) + 8;
+        let step = (chunk.end - records) / 7;
+        [compression - 3].into_iter().chain((records..chunk.end).step_by(step).take(7)).collect()
     }
 }
 
-/// Where each telegram of `written` begins in its bytes.
-fn positions(written: &Written) -> Vec<usize> {
-    let mut from = 0;
-    let mut positions = Vec::new();
-    for known in &written.telegrams {
-        let message: Vec<u8> = [schema_bytes(known), known.telegram.clone()].concat();
-        let found = written.bytes[from..].windows(message.len()).position(|bytes| bytes == message);
-        from += found.expect("a telegram that is in the file") + HEADER;
-        positions.push(from);
-    }
-    positions
-}
-
-fn schema_bytes(known: &crate::written::Known) -> Vec<u8> {
-    // As the writer has it: numbers, stamps, and the rest.
-    let header = known.header;
-    let mut bytes = Vec::new();
-    for word in [
-        header.seq,
-        header.topic_seq,
-        header.stamp_first_ns,
-        header.stamp_last_ns,
-        header.wall_ns,
-        header.boot,
-    ] {
-        bytes.extend(word.to_le_bytes());
-    }
-    bytes.extend([header.sensor, header.quality, header.flags, header.family]);
-    bytes.extend(header.period_us.to_le_bytes());
-    bytes.extend(header.hub_pid.to_le_bytes());
-    bytes.push(header.reasons);
-    bytes.extend(header.hub_time);
-    bytes
-}
-
-/// All telegrams that a recording gives, by sensor; none if it is no recording any more.
-fn read(path: &PathBuf) -> Option<(Recording, BTreeMap<String, Vec<Frame>>)> {
-    let recording = Recording::open(path).ok()?;
-    let of = |sensor: &String| {
-        let part = recording.of(sensor).unwrap();
-        let frames: Vec<_> = part.telegrams(MM).unwrap().collect();
-        assert_eq!(frames.len() as u64, part.contents().telegrams);
-        (sensor.clone(), frames)
+/// Returns the telegrams that are read from `bytes`, one sensor after the other, and the reported damage.
+fn read(folder: &Folder, bytes: &[u8]) -> (Vec<Known>, Damage) {
+    let recording = Recording::open(folder.file("damaged.mcap", bytes)).unwrap();
+    let contents = recording.contents();
+    let of = |sensor: &'static str| {
+        let frames = contents.sensors.iter().any(|name| name == sensor).then(|| {
+            recording.of(sensor).unwrap().telegrams(Encoding { unit: Unit::Mm, mode: Mode(1) }).unwrap()
+        });
+        frames.into_iter().flatten().map(move |frame| Known {
+            sensor,
+            header: frame.header.unwrap(),
+            telegram: frame.telegram,
+        })
     };
-    let by_sensor = recording.contents().sensors.iter().map(of).collect();
-    Some((recording, by_sensor))
-}
-
-/// Where it is said which channel has the telegrams of `sensor`: at its first one, and in the index.
-fn channels(written: &Written, sensor: &str) -> Vec<Range<usize>> {
-    let name = format!("{sensor}/telegram");
-    let named = |&at: &usize| written.bytes[at..].starts_with(name.as_bytes());
-    let end = name.len() + 4 + ENCODING.len() + 4;
-    (0..written.bytes.len()).filter(named).map(|at| at - CHANNEL..at + end).collect()
+    let known: Vec<_> = SENSORS.into_iter().flat_map(of).collect();
+    let is_nameless = contents.sensors.iter().any(|name| !SENSORS.contains(&&name[..]));
+    assert!(is_nameless || known.len() as u64 == contents.telegrams, "{contents:?}");
+    (known, contents.damage)
 }
 
 #[test]
-fn every_intact_telegram_is_found() {
-    let written = crate::written::recording(100, 7);
-    let positions = positions(&written);
-    let channels = SENSORS.map(|sensor| (sensor, channels(&written, sensor)));
-    let summary = mcap::Summary::read(&written.bytes).unwrap().unwrap();
-    let chunk = |index: &mcap::records::ChunkIndex| {
-        let begin = index.chunk_start_offset as usize;
-        begin..begin + index.chunk_length as usize
-    };
-    let chunks: Vec<_> = summary.chunk_indexes.iter().map(chunk).collect();
-    let path = std::env::temp_dir().join(format!("scanhub-damaged-{}", std::process::id()));
-    let (mut intact, mut estimated, mut unreadable, mut bare) = (0, 0, 0, 0);
-    for seed in 0..MUTATIONS {
-        let mutation = Mutation::of(&written.bytes, &mut Rng::with_seed(seed));
-        let name = format!("seed {seed}, {}", mutation.name);
-        fs::write(&path, &mutation.bytes).unwrap();
-        let places = mutation.places(written.bytes.len());
-        let is_there = |at: usize, len: usize| mutation.has(places[at], at, at + len);
-        let mut known = written.telegrams.iter().zip(&positions);
-        let is_any_left = known.any(|(known, &at)| is_there(at, known.telegram.len()));
-        let Some((recording, by_sensor)) = read(&path) else {
-            assert!(!is_any_left, "{name}: no recording any more");
-            unreadable += 1;
-            continue;
-        };
-        if recording.contents().form != recording::Form::Mcap {
-            // Nothing but telegrams without what was before them: they are a stream.
-            let is_whole = |at: usize, len: usize| at >= BEFORE && is_there(at - BEFORE, BEFORE + len);
-            let mut known = written.telegrams.iter().zip(&positions);
-            assert!(!known.any(|(known, &at)| is_whole(at, known.telegram.len())), "{name}");
-            bare += 1;
-            continue;
+fn cut_at_any_byte_is_read_to_the_last_whole_chunk() {
+    let folder = Folder::new("cut");
+    for compression in [Compression::None, Compression::Zstd] {
+        let whole = Whole::new(12, compression);
+        let len = whole.bytes.len();
+        let is_near_end = |at: usize| whole.ends.iter().any(|end| end.abs_diff(at) <= 2);
+        for cut in (MAGIC..len).filter(|at| at % 499 == 0 || is_near_end(*at)) {
+            let (telegrams, damage) = read(&folder, &whole.bytes[..cut]);
+            let expected = whole.telegrams(|number| whole.chunks[number].end <= cut);
+            assert!(telegrams == expected, "{compression:?}, cut at {cut}: {} telegrams", telegrams.len());
+            let used = whole.ends.iter().rfind(|end| **end <= cut).unwrap();
+            let bytes = (cut - used) as u64;
+            assert_eq!(damage, Damage { bytes, is_cut: true, ..Damage::default() }, "cut at {cut}");
         }
-        let is_any_there = |parts: &[Range<usize>]| parts.iter().any(|part| is_there(part.start, part.len()));
-        // Other channels of the sensor have its name, and only a chunk that is whole says that they have its number.
-        let is_chunk_there = is_any_there(&chunks);
-        let told = channels.each_ref().map(|(sensor, its)| (*sensor, is_chunk_there || is_any_there(its)));
-        let is_told = |sensor: &str| told.contains(&(sensor, true));
-        let mut left = by_sensor;
-        for (known, at) in written.telegrams.iter().zip(&positions) {
-            // Cut from all but three bytes of its header, a second one cannot be told from another that is alike.
-            if mutation.doubled.is_some_and(|begin| (at - 3..=*at).contains(&begin)) {
-                let is_guess = |frame: &Frame| frame.header.unwrap().flags & Flags::STAMP_ESTIMATED != 0;
-                left.values_mut().for_each(|frames| {
-                    frames.retain(|frame| frame.telegram != known.telegram || !is_guess(frame));
-                });
-            }
-        }
-        for (known, &at) in written.telegrams.iter().zip(&positions) {
-            if !is_there(at, known.telegram.len()) {
-                continue;
-            }
-            intact += 1;
-            let message = at - BEFORE;
-            let is_message_whole = mutation.has(places[message], message, at + known.telegram.len());
-            // In the order of the file: what stands before it in its list was there before.
-            let is_named = recording.contents().sensors.iter().any(|sensor| sensor == known.sensor)
-                && is_told(known.sensor);
-            let number = format!("sensor{}", known.header.sensor);
-            let called = if is_named { known.sensor } else { &number };
-            let (own, others): (Vec<_>, Vec<_>) = left.iter_mut().partition(|(sensor, _)| *sensor == called);
-            let taken = own.into_iter().chain(others).find_map(|(sensor, frames)| {
-                let place = frames.iter().position(|frame| frame.telegram == known.telegram)?;
-                (place == 0 || sensor == called).then(|| (sensor.clone(), place, frames.remove(place)))
-            });
-            let Some((sensor, place, frame)) = taken else {
-                panic!("{name}: the telegram at {at} is missing")
-            };
-            assert_eq!(place, 0, "{name}: the telegram at {at} is not in order");
-            if is_message_whole {
-                assert_eq!((&sensor[..], frame.header), (called, Some(known.header)), "{name}, {at}");
-            } else {
-                estimated += u64::from(frame.header.unwrap().flags & Flags::STAMP_ESTIMATED != 0);
-            }
-        }
-        for (sensor, frames) in left {
-            assert_eq!(frames, [], "{name}: {sensor} has what it should not");
-        }
+        assert_eq!(read(&folder, &whole.bytes), (whole.telegrams(|_| true), Damage::default()));
     }
-    let _ = fs::remove_file(&path);
-    println!(
-        "{intact} intact telegrams, {estimated} of them with a harmed header; {unreadable} no recording, {bare} a stream"
-    );
-    assert!(intact > MUTATIONS * 70 && unreadable < MUTATIONS / 20);
 }
 
-const MUTATIONS: u64 = 1_000;
-/// Opcode, length, numbers of channel and schema, and length of the name.
-const CHANNEL: usize = 1 + 8 + 2 + 2 + 4;
-/// Opcode, length, channel, sequence and times.
-const MESSAGE: usize = 1 + 8 + 2 + 4 + 8 + 8;
-const HEADER: usize = 64;
-const BEFORE: usize = MESSAGE + HEADER;
+#[test]
+fn flipped_byte_costs_one_chunk() {
+    let folder = Folder::new("flipped");
+    for compression in [Compression::None, Compression::Lz4, Compression::Zstd] {
+        let whole = Whole::new(20, compression);
+        for (number, chunk) in whole.chunks.iter().enumerate() {
+            for at in whole.content(number) {
+                let mut bytes = whole.bytes.clone();
+                bytes[at] = !bytes[at];
+                let name = format!("{compression:?}, byte {at} of chunk {number}");
+                let (telegrams, damage) = read(&folder, &bytes);
+                assert!(telegrams == whole.telegrams(|other| other != number), "{name}: {damage}");
+                // The numbers show a gap only between telegrams.
+                let is_inside = (1..whole.chunks.len() - 1).contains(&number);
+                let expected = Damage {
+                    telegrams: if is_inside { PER_CHUNK as u64 } else { 0 },
+                    bytes: chunk.len() as u64,
+                    chunks: 1,
+                    is_harmed: true,
+                    ..Damage::default()
+                };
+                assert_eq!(damage, expected, "{name}");
+            }
+        }
+    }
+}
+
+#[test]
+fn reading_ends_at_an_impossible_length() {
+    let folder = Folder::new("framing");
+    let whole = Whole::new(20, Compression::None);
+    let (length, last) = (whole.bytes.len(), 1 + 7);
+    for (number, chunk) in whole.chunks.iter().enumerate() {
+        // The length of the chunk contradicts its fields; the length of the next record leads beyond the end of the file;
+        // no record has opcode 0.
+        for (start, at, left) in [
+            (chunk.start, chunk.start + 1, number),
+            (chunk.start, chunk.start + last, number),
+            (chunk.end, chunk.end + last, number + 1),
+            (chunk.start, chunk.start, number),
+        ] {
+            let mut bytes = whole.bytes.clone();
+            bytes[at] = if at == start { 0 } else { bytes[at] ^ 0x40 };
+            let (telegrams, damage) = read(&folder, &bytes);
+            assert!(telegrams == whole.telegrams(|other| other < left), "byte {at}: {damage}");
+            let expected = Damage { bytes: (length - start) as u64, is_harmed: true, ..Damage::default() };
+            assert_eq!(damage, expected, "byte {at}");
+        }
+    }
+}
+
+#[test]
+fn sensors_whose_names_are_lost_are_called_by_their_numbers() {
+    let folder = Folder::new("nameless");
+    let whole = Whole::new(20, Compression::Zstd);
+    // Only the first chunk and the index name the sensors.
+    let mut bytes = whole.bytes[..whole.chunks[3].end].to_vec();
+    bytes[whole.content(0)[1]] ^= 0x10;
+    let recording = Recording::open(folder.file("damaged.mcap", &bytes)).unwrap();
+    assert_eq!(recording.contents().sensors, ["sensor0", "sensor1"]);
+    assert_eq!(recording.contents().telegrams, 3 * PER_CHUNK as u64);
+    let rear = recording.of("sensor1").unwrap();
+    let frames = rear.telegrams(Encoding { unit: Unit::Mm, mode: Mode(1) }).unwrap();
+    let expected = whole.telegrams(|number| (1..4).contains(&number));
+    let expected = expected.iter().filter(|known| known.sensor == "rear").map(|known| &known.telegram);
+    assert!(frames.map(|frame| frame.telegram).eq(expected.cloned()));
+}
+
+#[test]
+fn nothing_is_invented_whatever_is_damaged() {
+    let folder = Folder::new("any");
+    for seed in 0..300 {
+        let mut random = Rng::with_seed(seed);
+        let whole = Whole::new(12, if seed % 2 == 0 { Compression::None } else { Compression::Lz4 });
+        let len = whole.bytes.len();
+        let (mut bytes, from) = (whole.bytes.clone(), random.usize(MAGIC..len));
+        let some = from..(from + random.usize(1..5_000)).min(len);
+        let first = match random.u8(..4) {
+            0 => {
+                let places: Vec<_> = (0..random.usize(1..=16)).map(|_| random.usize(MAGIC..len)).collect();
+                places.iter().for_each(|at| bytes[*at] ^= 1 << random.u8(..8));
+                *places.iter().min().unwrap()
+            }
+            1 => {
+                bytes[some].fill(0);
+                from
+            }
+            2 => {
+                bytes.drain(some);
+                from
+            }
+            _ => {
+                let again = bytes[some.clone()].to_vec();
+                bytes.splice(some.end..some.end, again);
+                some.end
+            }
+        };
+        let (telegrams, damage) = read(&folder, &bytes);
+        let is_same =
+            |one: &Known, other: &Known| one.header == other.header && one.telegram == other.telegram;
+        for read in &telegrams {
+            assert!(whole.telegrams.iter().any(|known| is_same(read, known)), "seed {seed}: {read:?}");
+        }
+        for known in whole.telegrams(|number| whole.chunks[number].end <= first) {
+            assert!(telegrams.contains(&known), "seed {seed}, first change at {first}: {damage}");
+        }
+    }
+}
+
+#[test]
+fn file_without_its_beginning_is_refused() {
+    let folder = Folder::new("headless");
+    let bytes = &Whole::new(20, Compression::None).bytes;
+    for begin in [1, MAGIC, bytes.len() / 3] {
+        let failure = Recording::open(folder.file("rest.mcap", &bytes[begin..])).unwrap_err();
+        assert!(failure.message.ends_with("is the end of an MCAP file, without its beginning"), "{failure}");
+        assert_eq!(failure.kind.exit_code(), 66);
+    }
+    fs::remove_file(folder.0.join("rest.mcap")).unwrap();
+}
+
+/// Telegrams in a chunk: four of each sensor.
+const PER_CHUNK: usize = 8;
+const MAGIC: usize = mcap::MAGIC.len();
+/// Bytes of opcode and length.
+const HEAD: usize = 1 + 8;

@@ -1,5 +1,5 @@
-//! Records that are shorter, longer or otherwise than they say: whatever stands in attachments, metadata and indices, a
-//! file is read, its telegrams are had, and it is written anew without a panic.
+//! Records with wrong lengths and contents: whatever attachments, metadata and indices contain, all telegrams of the file
+//! are read and copied, without a panic.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -97,7 +97,7 @@ fn with_record(whole: &[u8], record: &[u8]) -> Vec<u8> {
 const MAGIC: usize = 8;
 
 #[test]
-fn an_attachment_that_is_too_short_is_told_and_left_out() {
+fn an_attachment_that_is_too_short_is_reported_and_dropped() {
     let scratch = Scratch::new("short");
     let whole = crate::written::recording(8, 1);
     let telegrams = whole.telegrams.len() as u64;
@@ -124,7 +124,7 @@ fn attachments(path: &Path) -> u32 {
 }
 
 #[test]
-fn whatever_stands_in_a_record_nobody_panics_and_no_telegram_is_lost() {
+fn no_content_of_a_record_causes_a_panic_or_costs_a_telegram() {
     let scratch = Scratch::new("any");
     let whole = crate::written::recording(4, 2);
     let telegrams = whole.telegrams.len() as u64;
