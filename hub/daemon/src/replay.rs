@@ -1,8 +1,7 @@
-//! A link whose other end is a recording. What is recorded comes in its order and at its times to each other, or as fast as it can be read. Nobody hears what the hub would say, so
-//! nothing is asked.
+//! A link whose other end is a recording. Telegrams are played in their order, with the times between them that were recorded, or
+//! as fast as they can be read. The hub sends no requests, because nothing could answer them.
 
 mod frames;
-mod packets;
 mod recorded;
 mod stream;
 
@@ -115,7 +114,6 @@ impl<'a, 'p> ReplayLink<'a, 'p> {
             let ended = match &mut recorded {
                 Recorded::Stream(stream) => stream::play(self, stream),
                 Recorded::Frames(frames) => frames::play(self, frames),
-                Recorded::Packets(frames) => packets::play(self, frames),
             };
             let Some(limit) = ended else { return };
             self.link.output.stand_until(limit.map_or(Nanos::MAX, |limit| clock::now() + limit));

@@ -1,30 +1,33 @@
-//! CARMEN logs: text lines of which `FLASER n r1 .. rn ..`, `ROBOTLASER1` and `RAWLASER1` are scans in metres. They become
-//! the telegrams that an LMS 2xx would have sent. Poses and all other lines are not read, but counted ([`Unread`]).
-
-mod census;
-mod log;
+//! CARMEN logs: text files in which lines that start with `FLASER n r1 .. rn ..`, `ROBOTLASER1` and `RAWLASER1` are scans in
+//! meters.
+//!
+//! [`Log`] reads the scans, [`Census`] chooses the unit and the bits in which their ranges are whole values, and
+//! [`Sweep::frame`] turns a scan into the telegram that an LMS 2xx would have sent. In the other direction, [`scan_line`] writes a
+//! telegram as a line. Poses and all other lines are not read, but counted ([`Unread`]).
 
 use std::fmt;
+use std::io::{self, BufRead, Read};
+use std::path::Path;
 
 use lms::measured;
+#[cfg(feature = "mcap")]
+use lms::measured::Measured;
 #[cfg(feature = "mcap")]
 use lms::reply::Reply;
 #[cfg(feature = "mcap")]
 use lms::telegram::Telegram;
-use lms::variant::{Unit, Variant};
+use lms::variant::{Mode, Unit, Variant};
 
-use crate::{Encoding, Frame};
-pub(crate) use census::Census;
-pub use census::Unfit;
-#[cfg(feature = "mcap")]
-pub(crate) use log::line_of;
-pub(crate) use log::{Log, Wrong, is_log};
+use schema::{Failure, Kind};
+
+use crate::open::{is_end, unreadable};
+use crate::{Contents, Encoding, Form, Frame};
 
 /// A scan of a log.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct Sweep {
     pub(crate) form: LineForm,
-    /// Metres, from right to left.
+    /// Ranges in meters, from right to left.
     pub(crate) ranges_m: Vec<f64>,
     /// Nanoseconds since 1970 (or since the log's start), where the line has all its fields after the ranges.
     pub(crate) time_ns: Option<u64>,
@@ -47,14 +50,14 @@ pub struct Unread {
     pub lines: u64,
 }
 
-/// How a scan is written. A log may have each scan in two of them.
+/// Kind of line that a scan is written in. A log may have each scan in two of them.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum LineForm {
     /// `FLASER`: ranges, two poses, time.
     Flaser,
     /// `ROBOTLASER1`: seven fields of the sensor, ranges, remissions, two poses and five fields of the robot, time.
     RobotLaser,
-    /// `RAWLASER1`: the same without what is of the robot.
+    /// `RAWLASER1`: the same without the fields of the robot.
     RawLaser,
 }
 
@@ -88,11 +91,15 @@ impl LineForm {
 }
 
 impl Sweep {
-    /// The scan that `line` is. `Ok(None)` if it is another kind of line, `Err` with what is wrong with it.
+    /// Parses `line`; `Ok(None)` if it is another kind of line.
+    ///
+    /// # Errors
+    ///
+    /// Returns a description of the mistake in the line.
     pub(crate) fn parse(line: &str) -> Result<Option<Sweep>, String> {
         let mut fields = line.split_ascii_whitespace();
         let Some(form) = fields.next().and_then(LineForm::of) else { return Ok(None) };
-        // Type, start angle, field of view in radians, resolution, greatest range, accuracy, remission mode.
+        // Type, start angle, field of view in radians, resolution, maximum range, accuracy, remission mode.
         let view = match form {
             LineForm::Flaser => None,
             LineForm::RobotLaser | LineForm::RawLaser => {
@@ -130,14 +137,14 @@ impl Sweep {
         Ok(Some(sweep))
     }
 
-    /// The variant whose beams it has.
+    /// Returns the variant with this number of beams.
     pub(crate) fn variant(&self) -> Option<Variant> {
         variant(self.ranges_m.len())
     }
 
-    /// The value words as `encoding` has them, in a log whose ranges are encoded as `own` says: a code of it stays that
-    /// code. A range that does not go into `encoding` is rounded, or too far; what is no number is no return. The beam that
-    /// logs of 180 and 360 beams leave out at the end is [`LEFT_OUT`].
+    /// Returns the value words in `encoding`, for a log whose ranges are encoded as `own`: its codes stay the same codes. A
+    /// range that does not fit into `encoding` is rounded, or becomes the code of a range beyond it. NaN, infinite and negative
+    /// ranges become "no return". Logs of 180 and 360 beams lack the last beam, which becomes [`LEFT_OUT`].
     pub(crate) fn words(&self, own: Encoding, encoding: Encoding) -> Vec<u16> {
         let greatest = encoding.mode.max_value();
         let word = |&range_m: &f64| {
@@ -154,7 +161,7 @@ impl Sweep {
         words
     }
 
-    /// The telegram that a sensor with address 0 would have sent; see [`words`](Self::words).
+    /// Returns the telegram that a scanner with address 0 would have sent; see [`words`](Self::words).
     pub(crate) fn frame(&self, own: Encoding, encoding: Encoding) -> Frame {
         let words = self.words(own, encoding);
         let telegram = measured::encode(0, encoding.unit, &words, STATUS).bytes().to_vec();
@@ -187,18 +194,18 @@ pub(crate) fn is_made_up(telegram: &[u8]) -> bool {
     reply.unit().is_some_and(|unit| configuration(Encoding { unit, mode: reply.mode() }) == telegram)
 }
 
-/// The reply in which a sensor says that its values are as `encoding` has them.
+/// Returns the reply in which a scanner reports that its values have this encoding.
 #[cfg(feature = "mcap")]
 pub(crate) fn configuration(encoding: Encoding) -> Vec<u8> {
     lms::reply::configuration(0, encoding.mode, encoding.unit, STATUS).bytes().to_vec()
 }
 
-/// A range in whole units.
+/// Returns a range in units, rounded.
 fn units(range_m: f64, unit: Unit) -> f64 {
     (range_m * 1000.0 / f64::from(unit.mm())).round()
 }
 
-/// How much less than the greatest value a range is, if so little that it is a code.
+/// Returns the distance of a range from the maximum value, if it is small enough for a code.
 fn code(range_m: f64, encoding: Encoding) -> Option<u16> {
     let below = f64::from(encoding.mode.max_value()) - units(range_m, encoding.unit);
     (0.0..=f64::from(BEYOND)).contains(&below).then_some(below as u16)
@@ -209,7 +216,7 @@ fn count(field: Option<&str>) -> Result<usize, String> {
     field.parse().map_err(|_| format!("{field:?} is not a number of beams"))
 }
 
-/// Remissions are as many as are said, which is none where there are none.
+/// Parses the number of remissions that follow.
 fn remissions(field: Option<&str>) -> Option<usize> {
     field?.parse().ok().filter(|count| *count < 10_000)
 }
@@ -220,13 +227,275 @@ fn variant(beams: usize) -> Option<Variant> {
     Variant::of_beams(whole)
 }
 
-/// Numbers of two poses.
+/// Reads the scans of a log in their order. If the log has each scan in several kinds of lines, only those of the first kind are
+/// used.
+pub(crate) struct Log<R> {
+    reader: R,
+    /// Number of the last line, from 1.
+    pub(crate) line: u64,
+    /// Kind of line of the first scan.
+    form: Option<LineForm>,
+    /// Encoding that the log names itself.
+    pub(crate) told: Option<Encoding>,
+    /// Data of the lines so far that the scans do not contain.
+    pub(crate) unread: Unread,
+}
+
+/// Reason why no scan can be returned.
+#[derive(Debug)]
+pub(crate) enum Wrong {
+    /// The line is wrong, as described.
+    Line(String),
+    /// The file cannot be read.
+    File(io::Error),
+}
+
+impl<R: BufRead> Log<R> {
+    pub(crate) fn new(reader: R) -> Self {
+        Log { reader, line: 0, form: None, told: None, unread: Unread::default() }
+    }
+
+    /// Returns the next scan. A last line without its end that is not a scan is where the recording broke off, not a mistake.
+    pub(crate) fn next(&mut self) -> Result<Option<Sweep>, Wrong> {
+        let mut bytes = Vec::new();
+        loop {
+            bytes.clear();
+            if self.reader.by_ref().take(LONGEST).read_until(b'\n', &mut bytes).map_err(Wrong::File)? == 0 {
+                return Ok(None);
+            }
+            self.line += 1;
+            let is_last = bytes.last() != Some(&b'\n') && bytes.len() < LONGEST as usize;
+            let line = String::from_utf8_lossy(&bytes);
+            if let Some(encoding) = told(&line) {
+                self.told = self.told.or(Some(encoding));
+            }
+            match Sweep::parse(&line) {
+                Ok(None) => match line.split_ascii_whitespace().next() {
+                    Some("ODOM") => self.unread.odometry += 1,
+                    Some(word) if !word.starts_with('#') => self.unread.lines += 1,
+                    _ => {}
+                },
+                Ok(Some(sweep)) if *self.form.get_or_insert(sweep.form) != sweep.form => {
+                    self.unread.lines += 1;
+                }
+                Ok(Some(sweep)) => {
+                    self.unread.poses += u64::from(sweep.has_pose);
+                    self.unread.remissions += u64::from(sweep.has_remissions);
+                    return Ok(Some(sweep));
+                }
+                Err(_) if is_last => return Ok(None),
+                Err(wrong) => return Err(Wrong::Line(wrong)),
+            }
+        }
+    }
+
+    /// Returns the next scan of a log that was read before: wrong lines are skipped, and it ends where the file cannot be read.
+    pub(crate) fn following(&mut self) -> Option<Sweep> {
+        loop {
+            match self.next() {
+                Ok(sweep) => return sweep,
+                Err(Wrong::Line(_)) => {}
+                Err(Wrong::File(_)) => return None,
+            }
+        }
+    }
+}
+
+/// Returns the line in which a log names the encoding of its ranges. Other programs ignore it.
+#[cfg(feature = "mcap")]
+pub(crate) fn encoding_line(encoding: Encoding) -> String {
+    format!("{TOLD} {} mm, {} bits\n", encoding.unit.mm(), encoding.mode.range_bits())
+}
+
+fn told(line: &str) -> Option<Encoding> {
+    let mut fields = line.strip_prefix(TOLD)?.split([' ', ',']).filter(|field| !field.is_empty());
+    let (mm, bits) = (fields.next()?, fields.nth(1)?);
+    let unit = [Unit::Mm, Unit::Cm, Unit::Dm].into_iter().find(|unit| unit.mm().to_string() == mm)?;
+    let mode = MODES.into_iter().find(|mode: &Mode| mode.range_bits().to_string() == bits)?;
+    Some(Encoding { unit, mode })
+}
+
+/// Reads the log at `path`, and returns its contents.
+///
+/// # Errors
+///
+/// Returns [`Kind::Input`] if it cannot be read, or if none of its lines is a valid scan.
+pub(crate) fn survey(path: &Path, reader: impl BufRead) -> Result<Contents, Failure> {
+    let mut contents = Contents::new(Form::Carmen);
+    let (mut log, mut census, mut refusal) = (Log::new(reader), Census::default(), None);
+    loop {
+        match log.next() {
+            Ok(Some(sweep)) => {
+                contents.note_scan(sweep.variant(), sweep.time_ns);
+                census.note(&sweep.ranges_m);
+            }
+            Ok(None) => break,
+            Err(Wrong::File(error)) if is_end(&error) && contents.scans > 0 => {
+                contents.damage.is_cut = true;
+                break;
+            }
+            Err(Wrong::File(error)) => return Err(unreadable(path, &error)),
+            Err(Wrong::Line(wrong)) => {
+                let message = format!("{}:{}: {wrong}", path.display(), log.line);
+                let hint = "a scan is: FLASER 361 RANGE... in meters";
+                refusal.get_or_insert(Failure::new(Kind::Input, message, hint));
+                contents.damage.telegrams += 1;
+                contents.damage.is_harmed = true;
+            }
+        }
+    }
+    contents.unread = log.unread;
+    let (encoding, unfit) = census.encoding(log.told);
+    (contents.unit, contents.mode, contents.unfit) = (Some(encoding.unit), Some(encoding.mode), unfit);
+    // If no line is right, the format is wrong, not the file.
+    match refusal.filter(|_| contents.scans == 0) {
+        Some(refusal) => Err(refusal),
+        None => Ok(contents),
+    }
+}
+
+/// Returns whether `head`, the beginning of a file, looks like a log.
+pub(crate) fn is_log(head: &[u8]) -> bool {
+    head.split(|&byte| byte == b'\n').any(|line| FIRST_WORDS.iter().any(|word| line.starts_with(word)))
+}
+
+/// Statistics of the ranges of a log, from which their encoding is chosen. In a log, a code of the scanner is one of the
+/// largest ranges that the encoding can hold.
+#[derive(Clone, Copy, Debug, Default)]
+pub(crate) struct Census {
+    /// Number of ranges that are not whole centimeters, and that are not whole millimeters.
+    finer: [u64; 2],
+    /// Longest range that a value can hold.
+    farthest_m: f64,
+    /// Number of ranges that no value can hold.
+    beyond: u64,
+}
+
+/// Ranges of a log that no LMS 2xx could have sent together.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Unfit {
+    /// Ranges that are rounded.
+    pub rounded: u64,
+    /// Ranges that are too far for any value.
+    pub beyond: u64,
+}
+
+impl Census {
+    /// Counts a scan.
+    pub(crate) fn note(&mut self, ranges_m: &[f64]) {
+        for &range_m in ranges_m.iter().filter(|range_m| range_m.is_finite() && **range_m >= 0.0) {
+            if units(range_m, COARSEST.unit) > f64::from(COARSEST.mode.max_value()) {
+                self.beyond += 1;
+                continue;
+            }
+            self.farthest_m = self.farthest_m.max(range_m);
+            for (finer, unit) in self.finer.iter_mut().zip([Unit::Cm, Unit::Mm]) {
+                let range = range_m * 1000.0 / f64::from(unit.mm());
+                *finer += u64::from((range - range.round()).abs() > WHOLE);
+            }
+        }
+    }
+
+    /// Chooses the encoding, and counts the ranges that do not fit into it. The encoding is the one that the log names itself
+    /// (`told`) if all ranges fit into it. Otherwise it is centimeters if all ranges are whole centimeters, or millimeters, with
+    /// as few bits as the longest range needs.
+    pub(crate) fn encoding(&self, told: Option<Encoding>) -> (Encoding, Unfit) {
+        let order = if self.finer[0] == 0 { [Unit::Cm, Unit::Mm] } else { [Unit::Mm, Unit::Cm] };
+        let of_unit = |unit: Unit| MODES.map(|mode| Encoding { unit, mode });
+        let all = told.into_iter().chain(order.into_iter().flat_map(of_unit));
+        let fits = |encoding: &Encoding| self.reaches(*encoding) && self.is_whole(encoding.unit);
+        let encoding = all.clone().find(fits).or_else(|| all.clone().find(|it| self.reaches(*it)));
+        let encoding = encoding.unwrap_or(COARSEST);
+        let rounded = self.finer[usize::from(encoding.unit == Unit::Mm)];
+        (encoding, Unfit { rounded, beyond: self.beyond })
+    }
+
+    fn reaches(&self, encoding: Encoding) -> bool {
+        units(self.farthest_m, encoding.unit) <= f64::from(encoding.mode.max_value())
+    }
+
+    fn is_whole(&self, unit: Unit) -> bool {
+        match unit {
+            Unit::Cm => self.finer[0] == 0,
+            Unit::Mm => self.finer[1] == 0,
+            // Not counted: only a log that names decimeters itself has them.
+            Unit::Dm => true,
+        }
+    }
+}
+
+impl Unfit {
+    /// Returns whether all ranges fit.
+    pub fn is_none(&self) -> bool {
+        *self == Unfit::default()
+    }
+}
+
+/// Lists the counts that are not 0.
+impl fmt::Display for Unfit {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let counted = |count: u64, what: &str| (count > 0).then(|| format!("{count} {what}"));
+        let parts = [
+            counted(self.rounded, "ranges are finer than the unit in which an LMS 2xx reaches that far"),
+            counted(self.beyond, "ranges are too long for a value of an LMS 2xx"),
+        ];
+        f.write_str(&parts.into_iter().flatten().collect::<Vec<_>>().join(", "))
+    }
+}
+
+#[cfg(feature = "mcap")]
+/// Returns the line of a scan at `at_ns` since 1970, in a log that begins at `first_ns`; `None` if `telegram` is not a whole
+/// scan. A code is written as the range that its value would be, as in logs of the scanner. A line cannot hold reflector levels,
+/// field bits, address and status: they are lost.
+pub(crate) fn scan_line(telegram: &[u8], mode: Mode, at_ns: u64, first_ns: u64) -> Option<String> {
+    let measured = Measured::decode(Telegram::check(telegram)?)?;
+    if measured.partial().is_some() || Variant::of_beams(measured.count()).is_none() {
+        return None;
+    }
+    let (greatest, unit) = (mode.max_value(), measured.unit());
+    let decimals = match unit {
+        Unit::Mm => 3,
+        Unit::Cm => 2,
+        Unit::Dm => 1,
+    };
+    let ranges: Vec<u16> = measured.words().map(|word| word & greatest).collect();
+    let ranges = match &ranges[..] {
+        // A scan from a log without a last beam has none in a new log either.
+        [ranges @ .., last] if *last == greatest - LEFT_OUT && matches!(ranges.len(), 180 | 360) => ranges,
+        ranges => ranges,
+    };
+    let mut line = format!("FLASER {}", ranges.len());
+    for &range in ranges {
+        line += &format!(" {:.decimals$}", f64::from(range) * f64::from(unit.mm()) / 1000.0);
+    }
+    // Subtract rounded times, so that a log that is converted and written again has the same difference.
+    let micros = |ns: u64| ns.saturating_add(500) / 1000;
+    let seconds = |micros: u64| format!("{}.{:06}", micros / 1_000_000, micros % 1_000_000);
+    let (at, since) = (micros(at_ns), micros(at_ns).saturating_sub(micros(first_ns)));
+    line += &format!(" 0 0 0 0 0 0 {} scanhub {}\n", seconds(at), seconds(since));
+    Some(line)
+}
+
+/// First words of the lines at the beginning of a log.
+const FIRST_WORDS: [&[u8]; 6] =
+    [b"FLASER ", b"ROBOTLASER1 ", b"RAWLASER1 ", b"PARAM ", b"ODOM ", b"# message formats"];
+/// Beginning of the line that names the encoding of the ranges.
+const TOLD: &str = "# LMS 2xx values:";
+/// Maximum length of a line in bytes.
+const LONGEST: u64 = 1 << 20;
+/// Measuring modes without reflector levels, by the bits of a range: 13, 14, 15.
+const MODES: [Mode; 3] = [Mode(0x00), Mode(0x04), Mode(0x06)];
+/// Encoding with the longest maximum range.
+const COARSEST: Encoding = Encoding { unit: Unit::Cm, mode: Mode(0x06) };
+/// Tolerance for a whole number of units. The text has the exact value; the error of a double is smaller.
+const WHOLE: f64 = 1e-6;
+/// Number of fields of two poses.
 const POSES: usize = 6;
-/// What is subtracted from the greatest value for a range beyond the mode's (Telegram listing 10.8).
+/// Distance from the maximum value of the code for a range beyond the mode's (Telegram listing 10.8).
 pub const BEYOND: u16 = 8;
-/// The same for the last beam of a scan that has none there: a code without a meaning, which no sensor sends.
+/// The same for a last beam that the log lacks: a code without a meaning, which no scanner sends.
 pub(crate) const LEFT_OUT: u16 = 7;
-/// Logs say the field of view with a step more or less.
+/// Tolerance of the field of view, in degrees: logs round it to a step more or less.
 const VIEW_DEG: f64 = 1.5;
 /// Status byte of a healthy LMS type 6 (Telegram listing 8).
 const STATUS: u8 = 0x10;
@@ -358,5 +627,79 @@ mod tests {
         assert_eq!(robot("2 7 8", "0 0 0 0 0 0"), (false, true), "speeds are no pose");
         assert_eq!(robot("0", "0 0 0 1 0 0"), (true, false));
         assert_eq!(has(&format!("RAWLASER1 {sensor} 181 {ranges} 1 9 12.25 host 1")), (false, true));
+    }
+
+    fn chosen(ranges_m: &[f64], told: Option<Encoding>) -> (u8, u8, Unfit) {
+        let mut census = Census::default();
+        census.note(ranges_m);
+        let (encoding, unfit) = census.encoding(told);
+        (encoding.unit.mm(), encoding.mode.range_bits(), unfit)
+    }
+
+    #[test]
+    fn unit_and_bits_are_those_that_lose_nothing() {
+        let none = Unfit::default();
+        assert_eq!(chosen(&[], None), (10, 13, none));
+        assert_eq!(chosen(&[20.0, 0.01, 81.91, f64::NAN, -1.0], None), (10, 13, none));
+        assert_eq!(chosen(&[81.92], None), (10, 14, none));
+        assert_eq!(chosen(&[163.84], None), (10, 15, none));
+        assert_eq!(chosen(&[1.234, 8.191], None), (1, 13, none));
+        assert_eq!(chosen(&[1.234, 16.383], None), (1, 14, none));
+        assert_eq!(chosen(&[1.234, 16.384], None), (1, 15, none));
+        assert_eq!(chosen(&[32.767, 32.763], None), (1, 15, none));
+    }
+
+    #[test]
+    fn what_no_sensor_sends_is_counted() {
+        assert_eq!(chosen(&[1.234, 2.0, 81.91], None), (10, 13, Unfit { rounded: 1, beyond: 0 }));
+        assert_eq!(chosen(&[1.23456, 9.0, 9.001], None), (1, 14, Unfit { rounded: 1, beyond: 0 }));
+        assert_eq!(chosen(&[1.5, 1e30, 1000.0], None), (10, 13, Unfit { rounded: 0, beyond: 2 }));
+        let unfit = Unfit { rounded: 2, beyond: 1 };
+        assert!(
+            unfit.to_string().contains("2 ranges are finer")
+                && unfit.to_string().contains("1 ranges are too long")
+        );
+    }
+
+    #[test]
+    fn what_the_log_says_itself_holds_if_it_can() {
+        let mm = |mode| Some(Encoding { unit: Unit::Mm, mode: Mode(mode) });
+        assert_eq!(chosen(&[8.185], mm(0x04)), (1, 14, Unfit::default()));
+        assert_eq!(chosen(&[8.185], None), (1, 13, Unfit::default()));
+        assert_eq!(chosen(&[20.0], mm(0x04)), (10, 13, Unfit::default()));
+        assert_eq!(
+            chosen(&[1.234], Some(Encoding { unit: Unit::Cm, mode: Mode(0) })),
+            (1, 13, Unfit::default())
+        );
+    }
+
+    #[cfg(feature = "mcap")]
+    #[test]
+    fn a_line_is_read_as_it_was_written() {
+        let mut words = vec![1234; 181];
+        (words[0], words[1], words[2]) = (0xE000 | 500, 8191, 8183);
+        let telegram = measured::encode(0, Unit::Cm, &words, 0x10);
+        let line = scan_line(telegram.bytes(), Mode(1), 1_071_078_720_123_456_789, 1_071_078_720_000_000_000)
+            .unwrap();
+        assert!(line.ends_with(" 12.34 0 0 0 0 0 0 1071078720.123457 scanhub 0.123457\n"), "{line}");
+        // As with the rounded times of a log: 123 457 - 100 000.
+        let first = 1_071_078_720_000_000_000 + 100_000_400;
+        let again = scan_line(telegram.bytes(), Mode(1), 1_071_078_720_123_456_500, first).unwrap();
+        assert!(again.ends_with(" scanhub 0.023457\n"), "{again}");
+        let sweep = Sweep::parse(&line).unwrap().unwrap();
+        assert_eq!(sweep.ranges_m[..4], [5.0, 81.91, 81.83, 12.34]);
+        let cm = Encoding { unit: Unit::Cm, mode: Mode(0) };
+        assert_eq!(sweep.words(cm, cm)[..4], [500, 8191, 8183, 1234]);
+        words[180] = 8191 - LEFT_OUT;
+        let line = scan_line(measured::encode(0, Unit::Cm, &words, 0x10).bytes(), Mode(1), 1, 1).unwrap();
+        assert!(line.starts_with("FLASER 180 5.00 81.91 81.83 12.34"), "{line}");
+    }
+
+    #[cfg(feature = "mcap")]
+    #[test]
+    fn what_is_no_whole_scan_has_no_line() {
+        assert_eq!(scan_line(lms::reply::mode(0, true, 0x10).bytes(), Mode(0), 1, 0), None);
+        let part = measured::encode(0, Unit::Cm, &[7; 61], 0x10);
+        assert_eq!(scan_line(part.bytes(), Mode(0), 1, 0), None);
     }
 }

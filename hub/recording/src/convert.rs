@@ -1,14 +1,9 @@
-//! Writes a recording again, in the same format or another. A damaged file becomes an intact one with everything that
-//! could be read from it. Refuses to know who calls it, and how progress is shown.
+//! Writes a recording in the same format or another. A damaged file becomes an intact one with everything that can be read
+//! from it.
 
 mod copy;
-mod decoded;
-mod marks;
 mod output;
 mod scans;
-mod target;
-mod times;
-mod turns;
 mod views;
 
 use std::cell::Cell;
@@ -16,19 +11,15 @@ use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
 
-use flate2::write::GzEncoder;
 use lms::variant::{Baud, Mode, Unit};
 use schema::csv::{MarkColumns, ScanColumns};
 use schema::file::{Compression, Writer};
 use schema::{Failure, Flags, Header, Kind, Topic, check_followed};
 
 use crate::{Damage, Encoding, Form, Frame, Recording, Unread, carmen};
-use decoded::Sight;
-use output::{Place, unwritable};
-use target::target_of;
-pub use target::{Target, form_name};
-use times::Times;
-use views::{Csv, Ros2, View};
+use output::{Packing, Place, unwritable};
+use scans::{Sight, Times};
+use views::{Csv, Ros2, View, write_marks};
 
 /// What to convert.
 #[derive(Clone, Debug, Default)]
@@ -84,6 +75,30 @@ pub struct Converted {
     pub is_closed: bool,
 }
 
+/// Format that a recording is converted to.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Target {
+    /// A recording again, of this form.
+    Recording(Form),
+    /// An MCAP file with only messages of ROS 2.
+    Ros2,
+    /// CSV with a row for each scan.
+    Csv,
+    /// CSV with a row for each mark.
+    MarksCsv,
+}
+
+impl Target {
+    /// Returns the name of the format.
+    pub fn name(self) -> &'static str {
+        match self {
+            Target::Recording(form) => form_name(form),
+            Target::Ros2 => "ROS 2",
+            Target::Csv | Target::MarksCsv => "CSV",
+        }
+    }
+}
+
 /// Converts according to `options` until `stop` is set; calls `progress` with the telegrams written and their total. A
 /// closed stdout is not an error.
 ///
@@ -120,14 +135,14 @@ pub fn convert(
         damage: contents.damage,
         is_closed: false,
     };
-    // Marks are copied, whatever is known of the scans.
+    // Marks are copied, whatever the encoding of the scans.
     let encoding = match target {
         Target::MarksCsv => Encoding { unit: Unit::Cm, mode: Mode(0) },
         _ => encoding(&recording, target)?,
     };
     let is_of_all = matches!(target, Target::Recording(Form::Mcap) | Target::Ros2);
     if !(contents.form == Form::Mcap && is_of_all) {
-        // Refuses to choose of several sensors, before anything is written.
+        // Fails before anything is written if the file has several sensors and none was chosen.
         drop(recording.telegrams(encoding)?);
     }
     let mut file = place.create()?;
@@ -179,7 +194,7 @@ pub fn convert(
         Target::MarksCsv => {
             let out = Packing::of(&options.output, &mut file);
             let columns = MarkColumns { meters: options.meters };
-            let written = marks::write(&recording, columns, out, &mut count, &failed);
+            let written = write_marks(&recording, columns, out, &mut count, &failed);
             written.map(|written| converted.marks = Some(written))
         }
         Target::Recording(form) => {
@@ -217,7 +232,7 @@ impl Written {
     }
 }
 
-/// Telegrams one after the other, or the lines of a log.
+/// Writes a stream of telegrams, or a log.
 fn write_bytes(
     recording: &Recording,
     form: Form,
@@ -235,7 +250,7 @@ fn write_bytes(
         return out.finish().map_err(failed);
     }
     let mode = encoding.mode;
-    let told = carmen::line_of(encoding);
+    let told = carmen::encoding_line(encoding);
     out.write_all(told.as_bytes()).map_err(failed)?;
     let mut first_ns = None;
     for (number, frame) in recording.telegrams(encoding)?.enumerate() {
@@ -244,14 +259,14 @@ fn write_bytes(
         if number == 0 && is_made_up(&frame.telegram, frame.header.as_ref()) {
             continue;
         }
-        let line = scans::line(&frame.telegram, mode, at_ns, *first_ns.get_or_insert(at_ns));
+        let line = carmen::scan_line(&frame.telegram, mode, at_ns, *first_ns.get_or_insert(at_ns));
         out.write_all(line.as_deref().unwrap_or_default().as_bytes()).map_err(failed)?;
         count(if line.is_some() { Written::Scan } else { Written::LeftOut }, Some(at_ns))?;
     }
     out.finish().map_err(failed)
 }
 
-/// Telegrams without header into an MCAP file.
+/// Writes telegrams that have no header into an MCAP file.
 fn write_mcap(
     recording: &Recording,
     sensor: &str,
@@ -279,7 +294,7 @@ fn write_mcap(
     writer.finish().map_err(failed).map(drop)
 }
 
-/// The scans into `view`.
+/// Writes the scans in the format of `view`.
 fn write_view(
     recording: &Recording,
     sensor: &str,
@@ -290,7 +305,7 @@ fn write_view(
     failed: &impl Fn(io::Error) -> Failure,
 ) -> Result<(), Failure> {
     let mut is_empty = true;
-    decoded::each(recording, sensor, encoding, mode, &mut |sight| {
+    scans::each(recording, sensor, encoding, mode, &mut |sight| {
         let Some(written) = view.see(&sight).map_err(failed)? else { return Ok(()) };
         let Sight::Scan(_, header, _) = sight else { return count(written, None) };
         is_empty = false;
@@ -309,17 +324,19 @@ fn write_view(
     view.finish().map_err(failed)
 }
 
-/// Returns whether `telegram`, the first one of a sensor, is the reply that [`frames`] made for a log: no scanner sent it, so
-/// that nothing is lost without it.
+/// Returns whether `telegram`, the first one of a sensor, is the reply that [`frames`] adds to a log. No scanner sent it, so
+/// nothing is lost without it.
 fn is_made_up(telegram: &[u8], header: Option<&Header>) -> bool {
     let is_estimated = header.is_none_or(|header| header.flags & Flags::STAMP_ESTIMATED != 0);
     is_estimated && carmen::is_made_up(telegram)
 }
 
-/// How the values are encoded, where that can be said without loss or is not asked.
+/// Returns the encoding of the values, if `target` needs it.
 ///
-/// [`Kind::Input`] of a log whose ranges no sensor could have sent, and for a log, of values of which nobody knows
-/// where a range ends.
+/// # Errors
+///
+/// Returns [`Kind::Input`] for a log with ranges that no scanner could have sent, and if a log cannot be written because the
+/// measuring mode is unknown.
 fn encoding(recording: &Recording, target: Target) -> Result<Encoding, Failure> {
     let contents = recording.contents();
     let unfit = contents.unfit;
@@ -350,7 +367,7 @@ fn encoding(recording: &Recording, target: Target) -> Result<Encoding, Failure> 
     Ok(Encoding { unit: contents.unit.unwrap_or(Unit::Cm), mode: mode.unwrap_or(Mode(0)) })
 }
 
-/// What becomes of `recording`: its telegrams, and before those of a log the reply that says how their values are encoded.
+/// Returns the telegrams of `recording`. Those of a log begin with the reply that contains the encoding of the values.
 fn frames(recording: &Recording, encoding: Encoding) -> Result<impl Iterator<Item = Frame> + use<>, Failure> {
     let contents = recording.contents();
     let told = (contents.form == Form::Carmen).then(|| {
@@ -362,34 +379,107 @@ fn frames(recording: &Recording, encoding: Encoding) -> Result<impl Iterator<Ite
     Ok(told.into_iter().chain(recording.telegrams(encoding)?))
 }
 
-/// Packed if the name of the file says so.
-enum Packing<W: Write> {
-    Plain(W),
-    Gzip(GzEncoder<W>),
+/// Returns the output format, and the sensor that the options choose.
+///
+/// # Errors
+///
+/// Returns [`Kind::Usage`] if the format is unknown, or an option does not fit it.
+fn target_of(options: &ConvertOptions) -> Result<(Target, Option<&str>), Failure> {
+    let (target, sensor) = match (format_of(options)?, options.topic.as_deref()) {
+        (target, None) => (target, options.sensor.as_deref()),
+        (Target::Csv, Some(topic)) => {
+            let (target, sensor) = of_topic(topic)?;
+            if options.sensor.as_deref().is_some_and(|other| other != sensor) {
+                return usage("--sensor and --topic name different sensors", "leave --sensor out");
+            }
+            (target, Some(sensor))
+        }
+        (_, Some(_)) => {
+            return usage("--topic is for CSV", "scanhub convert IN OUT.csv --topic SENSOR/marks");
+        }
+    };
+    match target {
+        Target::MarksCsv if options.mode.is_some() => {
+            usage("--mode is for scans; marks are copied as they were recorded", "leave --mode out")
+        }
+        Target::MarksCsv if options.intensities => usage(
+            "--intensities is for scans; columns peak and weight of a mark are its intensities",
+            "leave --intensities out",
+        ),
+        Target::Recording(_) | Target::Ros2 if options.intensities => {
+            let hint =
+                "scanhub convert IN OUT.csv --intensities; MCAP files, also with --ros2, always have them";
+            usage("--intensities is for CSV", hint)
+        }
+        Target::Recording(_) | Target::Ros2 if options.meters => {
+            let hint = "scanhub convert IN OUT.csv --meters; a CARMEN log and --ros2 always have meters";
+            usage("--meters is for CSV", hint)
+        }
+        target => Ok((target, sensor)),
+    }
 }
 
-impl<W: Write> Packing<W> {
-    fn of(path: &Path, file: W) -> Self {
-        match path.extension() {
-            Some(ending) if ending.eq_ignore_ascii_case("gz") => {
-                Packing::Gzip(GzEncoder::new(file, flate2::Compression::default()))
-            }
-            _ => Packing::Plain(file),
+/// Returns the format of `topic` as CSV, and its sensor.
+fn of_topic(topic: &str) -> Result<(Target, &str), Failure> {
+    let (sensor, name) = topic.rsplit_once('/').unwrap_or((topic, ""));
+    match Topic::parse(name) {
+        Some(Topic::Scan) => Ok((Target::Csv, sensor)),
+        Some(Topic::Marks) => Ok((Target::MarksCsv, sensor)),
+        Some(_) => {
+            let hint =
+                "`scanhub replay IN` publishes every topic, and `scanhub echo SENSOR/TOPIC --json` prints it";
+            usage(&format!("{topic} cannot be CSV: only scan and marks can"), hint)
+        }
+        None => usage(&format!("{topic:?} is not a topic"), "for example --topic front/marks"),
+    }
+}
+
+fn usage<T>(message: &str, hint: &str) -> Result<T, Failure> {
+    Err(Failure::new(Kind::Usage, message, hint))
+}
+
+/// Returns the format that the file's name and `--ros2` select.
+fn format_of(options: &ConvertOptions) -> Result<Target, Failure> {
+    let target = ending(&options.output)?;
+    match (target, options.ros2) {
+        (Target::Recording(Form::Mcap), true) => Ok(Target::Ros2),
+        (Target::Csv | Target::Recording(Form::Telegrams | Form::Carmen), _)
+            if options.compression.is_some() =>
+        {
+            usage("--compression is for MCAP files", "add .gz to OUT, which compresses it")
+        }
+        (_, true) => usage("--ros2 makes an MCAP file", "scanhub convert IN OUT.mcap --ros2"),
+        (Target::Recording(_), _) if options.mode.is_some() => {
+            usage("--mode is for scans; telegrams are copied as they are", "with --ros2, or OUT.csv")
+        }
+        (target, false) => Ok(target),
+    }
+}
+
+/// Returns the format that the ending of a file selects.
+fn ending(path: &Path) -> Result<Target, Failure> {
+    let name = path.file_name().map(|name| name.to_string_lossy().to_lowercase()).unwrap_or_default();
+    let plain = name.strip_suffix(".gz").unwrap_or(&name);
+    match plain.rsplit_once('.') {
+        _ if name == "-" => Ok(Target::Recording(Form::Telegrams)),
+        Some((_, "mcap")) if plain == name => Ok(Target::Recording(Form::Mcap)),
+        Some((_, "log" | "clf")) => Ok(Target::Recording(Form::Carmen)),
+        Some((_, "bin" | "raw")) => Ok(Target::Recording(Form::Telegrams)),
+        Some((_, "csv")) => Ok(Target::Csv),
+        _ => {
+            let message = format!("the ending of {} is not a known format", path.display());
+            let hint = ".mcap; .log (CARMEN), .bin (telegram stream), .csv, also with .gz; or - for stdout";
+            Err(Failure::new(Kind::Usage, message, hint))
         }
     }
+}
 
-    fn write_all(&mut self, bytes: &[u8]) -> io::Result<()> {
-        match self {
-            Packing::Plain(file) => file.write_all(bytes),
-            Packing::Gzip(encoder) => encoder.write_all(bytes),
-        }
-    }
-
-    fn finish(self) -> io::Result<()> {
-        match self {
-            Packing::Plain(_) => Ok(()),
-            Packing::Gzip(encoder) => encoder.finish().map(drop),
-        }
+/// Returns the name of a recording's format.
+pub fn form_name(form: Form) -> &'static str {
+    match form {
+        Form::Telegrams => "telegram stream",
+        Form::Carmen => "CARMEN log",
+        Form::Mcap => "MCAP",
     }
 }
 
@@ -397,5 +487,5 @@ impl<W: Write> Packing<W> {
 const SENSOR: &str = "front";
 /// Bytes of telegrams in a chunk.
 const CHUNK: usize = 256 * 1024;
-/// How often progress is reported.
+/// Telegrams between two reports of progress.
 const STEP: u64 = 512;

@@ -8,19 +8,15 @@ mod carmen;
 mod contents;
 #[cfg(feature = "mcap")]
 pub mod convert;
-mod damage;
 #[cfg(feature = "mcap")]
 mod mcap;
 mod open;
 mod packed;
-mod packets;
 mod stream;
-mod survey;
 mod virtual_time;
 
 pub use carmen::{BEYOND, Unfit, Unread};
-pub use contents::{Contents, Form};
-pub use damage::Damage;
+pub use contents::{Contents, Damage, Form};
 pub use open::{Encoding, Recording};
 pub use virtual_time::VirtualTime;
 

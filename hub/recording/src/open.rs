@@ -13,9 +13,7 @@ use crate::carmen::{self, Log};
 #[cfg(feature = "mcap")]
 use crate::mcap::{Catalog, Reader};
 use crate::packed::Packed;
-use crate::packets::Packets;
-use crate::stream::Telegrams;
-use crate::survey::{survey_log, survey_packets, survey_stream};
+use crate::stream::{Packets, Telegrams, survey_packets, survey_telegrams};
 use crate::{Contents, Form, Frame, VirtualTime};
 
 /// How a log's metres become value words; a telegram stream is what it is.
@@ -78,8 +76,8 @@ impl Recording {
             return Err(refused(&path, what));
         }
         let contents = match form {
-            Form::Carmen => survey_log(&path, reader)?,
-            _ => match survey_stream(&path, reader)? {
+            Form::Carmen => carmen::survey(&path, reader)?,
+            _ => match survey_telegrams(&path, reader)? {
                 contents if contents.telegrams == 0 => survey_packets(&path)?.unwrap_or(contents),
                 contents => contents,
             },

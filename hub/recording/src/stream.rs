@@ -1,15 +1,23 @@
-//! Telegrams from a stream of bytes as they arrived on a line: bytes outside any telegram are skipped and counted. A
-//! stream has no stamps.
+//! Streams of bytes as they arrived on a line. They contain the telegrams of an LMS or the packets of a rotating scanner, and
+//! other bytes, which are skipped and counted. A stream has no stamps; if the scanner has a clock, it says when packets were
+//! measured.
 
-use std::io::Read;
+use std::io::{self, Read};
+use std::path::Path;
 
+use line::family::Wanted;
+use line::{Heard, MILLIS, Nanos, Output, Session as _, line_time};
 use lms::framer::{Found, Framer, VETO_HOLD};
+use schema::{Failure, Family};
 
-/// Reads telegrams; ends with the stream.
+use crate::open::{is_end, reader, unreadable};
+use crate::{Contents, Form, Frame};
+
+/// Reads telegrams of an LMS; ends with the stream.
 pub(crate) struct Telegrams<R> {
     reader: R,
     framer: Framer,
-    /// Whether the reader has said that there is no more.
+    /// Whether the reader is at its end.
     ended: bool,
 }
 
@@ -18,14 +26,14 @@ impl<R: Read> Telegrams<R> {
         Telegrams { reader, framer: Framer::default(), ended: false }
     }
 
-    /// Bytes so far that were in no telegram; at the end all of them.
+    /// Returns the number of bytes so far outside telegrams. It is complete at the end.
     pub(crate) fn discarded(&self) -> u64 {
         let open = if self.ended { self.framer.buffered() as u64 } else { 0 };
         self.framer.tally().discarded + open
     }
 
-    /// The next whole telegram, or `None` at the end.
-    pub(crate) fn next(&mut self) -> std::io::Result<Option<Vec<u8>>> {
+    /// Returns the next whole telegram; `None` at the end.
+    pub(crate) fn next(&mut self) -> io::Result<Option<Vec<u8>>> {
         loop {
             while let Some(found) = self.framer.poll() {
                 if let Found::Telegram(framed) = found {
@@ -41,9 +49,150 @@ impl<R: Read> Telegrams<R> {
                     self.framer.release(VETO_HOLD);
                 }
                 Ok(len) => self.framer.commit(len),
-                Err(error) if error.kind() == std::io::ErrorKind::Interrupted => {}
+                Err(error) if error.kind() == io::ErrorKind::Interrupted => {}
                 Err(error) => return Err(error),
             }
         }
     }
 }
+
+/// Reads packets of a rotating scanner; ends with the stream.
+pub(crate) struct Packets<R> {
+    reader: R,
+    session: scanner::Session,
+    family: Family,
+    /// The scanner's clock at the last packets.
+    last: Option<Nanos>,
+    /// Time since the first packets.
+    passed: Nanos,
+    ended: bool,
+}
+
+impl<R: Read> Packets<R> {
+    /// Reads packets of `family`; `None` if that family sends no packets.
+    pub(crate) fn of(family: Family, reader: R) -> Option<Packets<R>> {
+        let wanted = Wanted { fixed_rate: true, listen_only: true, ..Wanted::default() };
+        let session = scanner::Session::begin(family, wanted, 0)?;
+        Some(Packets { reader, session, family, last: None, passed: 0, ended: false })
+    }
+
+    /// Returns the number of bytes so far outside packets. It is complete at the end.
+    pub(crate) fn discarded(&self) -> u64 {
+        let account = self.session.account();
+        account.discarded + if self.ended { account.buffered } else { 0 }
+    }
+
+    /// Returns the next packets; `None` at the end.
+    pub(crate) fn next(&mut self) -> io::Result<Option<Frame>> {
+        loop {
+            if let Some(frame) = self.heard() {
+                return Ok(Some(frame));
+            }
+            if self.ended {
+                return Ok(None);
+            }
+            match self.reader.read(self.session.spare()) {
+                Ok(0) => {
+                    self.ended = true;
+                    self.session.commit(0, 0);
+                    // No more bytes can refute packets that are held back.
+                    self.session.handle_timeout(IDLE);
+                }
+                Ok(len) => self.session.commit(0, len),
+                Err(error) if error.kind() == io::ErrorKind::Interrupted => {}
+                Err(error) => return Err(error),
+            }
+        }
+    }
+
+    fn heard(&mut self) -> Option<Frame> {
+        let (telegram, reasons) = loop {
+            match self.session.poll_output() {
+                Output::Heard(Heard::Packets(received)) => break (received.bytes.to_vec(), received.reasons),
+                Output::Transmit { .. } => self.session.transmitted(0),
+                Output::Heard(Heard::Turn(_)) | Output::SetRate(_) | Output::SetDtr(_) => {}
+                Output::Rest(_) | Output::Wait { .. } => return None,
+            }
+        };
+        let took = line_time(telegram.len(), self.session.rate());
+        let scanner_ns = Some(self.pass(took));
+        Some(Frame { telegram, family: self.family as u8, scanner_ns, reasons, ..Frame::default() })
+    }
+
+    /// Returns the time of the last packets, which took this long on the line, since the first ones. It never goes back.
+    fn pass(&mut self, took: Nanos) -> Nanos {
+        let Some(at) = self.session.scanner_time() else {
+            self.passed += took;
+            return self.passed;
+        };
+        self.passed += match self.last {
+            None => 0,
+            // A clock that went back belongs to a scanner that restarted.
+            Some(last) => at.checked_sub(last).unwrap_or(took),
+        };
+        self.last = Some(at);
+        self.passed
+    }
+}
+
+/// Reads the stream at `path` for telegrams of an LMS.
+///
+/// # Errors
+///
+/// Returns [`Kind::Input`](schema::Kind::Input) if it cannot be read.
+pub(crate) fn survey_telegrams(path: &Path, reader: impl Read) -> Result<Contents, Failure> {
+    let mut contents = Contents::new(Form::Telegrams);
+    let mut telegrams = Telegrams::new(reader);
+    loop {
+        match telegrams.next() {
+            Ok(Some(bytes)) => contents.note(Family::Lms as u8, &bytes, None),
+            Ok(None) => break,
+            Err(error) if is_end(&error) && contents.telegrams > 0 => {
+                contents.damage.is_cut = true;
+                break;
+            }
+            Err(error) => return Err(unreadable(path, &error)),
+        }
+    }
+    contents.damage.bytes = telegrams.discarded();
+    Ok(contents)
+}
+
+/// Reads the stream at `path` for packets of each family, and returns those of the family that most bytes belong to; `None` if
+/// there are none.
+///
+/// # Errors
+///
+/// Returns [`Kind::Input`](schema::Kind::Input) if it cannot be read.
+pub(crate) fn survey_packets(path: &Path) -> Result<Option<Contents>, Failure> {
+    let mut best: Option<(u64, Contents)> = None;
+    for family in Family::ALL {
+        let Some(mut packets) = Packets::of(family, reader(path)?) else { continue };
+        let (mut contents, mut bytes) = (Contents::new(Form::Telegrams), 0);
+        loop {
+            match packets.next() {
+                Ok(Some(frame)) => {
+                    contents.note(frame.family, &frame.telegram, None);
+                    contents.scanner_ns = frame.scanner_ns;
+                    bytes += frame.telegram.len() as u64;
+                }
+                Ok(None) => break,
+                Err(error) if is_end(&error) && contents.telegrams > 0 => {
+                    contents.damage.is_cut = true;
+                    break;
+                }
+                Err(error) => return Err(unreadable(path, &error)),
+            }
+        }
+        contents.damage.bytes = packets.discarded();
+        if bytes > best.as_ref().map_or(BY_CHANCE, |(bytes, _)| *bytes) {
+            best = Some((bytes, contents));
+        }
+    }
+    Ok(best.map(|(_, contents)| contents))
+}
+
+/// Time after which a session no longer holds packets back.
+const IDLE: Nanos = 100 * MILLIS;
+/// Number of bytes up to which packets may be noise that passed a short checksum.
+const BY_CHANCE: u64 = 100;

@@ -18,10 +18,8 @@ use super::{LONGEST_GAP, period};
 pub(crate) enum Recorded {
     /// Bytes as they came down a line, without stamps.
     Stream(Stream),
-    /// Telegram by telegram.
+    /// Telegrams, or packets of a rotating scanner.
     Frames(Frames),
-    /// Packets of a scanner whose head turns.
-    Packets(Frames),
 }
 
 /// A stream of telegrams, with whatever came between them.
@@ -30,9 +28,11 @@ pub(crate) struct Stream {
     pub(super) mode: Option<Mode>,
 }
 
-/// Telegrams that are known to be whole.
+/// Telegrams or packets that are known to be whole.
 pub(crate) struct Frames {
     recording: Recording,
+    /// Whether they are telegrams of an LMS.
+    pub(super) is_lms: bool,
     /// Of a log the metres, of others nothing.
     encoding: Encoding,
     mode: Option<Mode>,
@@ -75,9 +75,10 @@ impl Recorded {
         check_family(&recording, link)?;
         if link.family() != Family::Lms {
             let encoding = Encoding { unit: Unit::Mm, mode: Mode(0) };
-            let mut frames = Frames { recording, encoding, mode: None, origin: None, is_told_later: false };
+            let mut frames =
+                Frames { recording, is_lms: false, encoding, mode: None, origin: None, is_told_later: false };
             frames.origin = frames.read()?.next().as_ref().and_then(Origin::of);
-            return Ok(Recorded::Packets(frames));
+            return Ok(Recorded::Frames(frames));
         }
         tell_of_log(&recording, &link.name);
         let contents = recording.contents();
@@ -87,7 +88,8 @@ impl Recorded {
             return Ok(Recorded::Stream(Stream { recording, mode }));
         }
         let encoding = Encoding { unit: contents.unit.unwrap_or(Unit::Mm), mode: mode.unwrap_or(Mode(0)) };
-        let mut frames = Frames { recording, encoding, mode, origin: None, is_told_later: false };
+        let mut frames =
+            Frames { recording, is_lms: true, encoding, mode, origin: None, is_told_later: false };
         let mut first = frames.read()?.take(ASKED_WITHIN).peekable();
         frames.origin = first.peek().and_then(Origin::of);
         let begin = first.peek().and_then(|frame| frame.header).filter(is_first);
@@ -104,13 +106,13 @@ impl Recorded {
     pub(crate) fn origin(&self) -> Option<Origin> {
         match self {
             Recorded::Stream(_) => None,
-            Recorded::Frames(frames) | Recorded::Packets(frames) => frames.origin,
+            Recorded::Frames(frames) => frames.origin,
         }
     }
 
     /// Lets its media time begin at `origin`, at which that of others begins.
     pub(crate) fn set_origin(&mut self, origin: Origin) {
-        if let Recorded::Frames(frames) | Recorded::Packets(frames) = self {
+        if let Recorded::Frames(frames) = self {
             frames.origin = Some(origin);
         }
     }
@@ -122,9 +124,8 @@ impl Recorded {
 
     /// Why no scan can be read, in words; empty if they can.
     pub(super) fn trouble(&self, name: &str) -> String {
-        let (Recorded::Stream(Stream { mode, recording })
-        | Recorded::Frames(Frames { mode, recording, .. })
-        | Recorded::Packets(Frames { mode, recording, .. })) = self;
+        let (Recorded::Stream(Stream { mode, recording }) | Recorded::Frames(Frames { mode, recording, .. })) =
+            self;
         if recording.contents().telegrams == 0 {
             return "there is no telegram in the recording".to_owned();
         }
@@ -136,9 +137,7 @@ impl Recorded {
 
     /// Media time of its end, as far as that is known.
     pub(crate) fn length(&self) -> Option<Nanos> {
-        let (Recorded::Stream(Stream { recording, .. })
-        | Recorded::Frames(Frames { recording, .. })
-        | Recorded::Packets(Frames { recording, .. })) = self;
+        let (Recorded::Stream(Stream { recording, .. }) | Recorded::Frames(Frames { recording, .. })) = self;
         let contents = recording.contents();
         match (contents.span, self.begin_ns()) {
             (Some((_, last_ns)), Some(begin_ns)) => Some(last_ns.saturating_sub(begin_ns)),
@@ -150,7 +149,7 @@ impl Recorded {
     /// Media time of its last telegram, for which all of it is read where it has stamps.
     pub(crate) fn end(&self) -> Result<Nanos, Failure> {
         match self {
-            Recorded::Frames(frames) | Recorded::Packets(frames) if frames.has_stamps() => {
+            Recorded::Frames(frames) if frames.has_stamps() => {
                 let mut timeline = frames.timeline();
                 Ok(frames.read()?.map(|frame| timeline.media(&frame)).last().unwrap_or(0))
             }

@@ -1,17 +1,22 @@
-//! Writes scans for other programs: as messages of ROS 2, and as lines of CSV.
+//! Writes scans for other programs, as messages of ROS 2 and as CSV, and recorded marks as CSV.
 
 use std::io::{self, Write};
 
 use ros::bag::{self, Bag};
-use schema::csv::ScanColumns;
+use schema::csv::{MarkColumns, ScanColumns};
+use schema::datagram::Packed;
 use schema::file::{Compression, Writer};
+use schema::{Failure, Kind, Marks, Topic};
 
-use super::decoded::Sight;
-use super::{CHUNK, Packing, Written};
+use super::output::Packing;
+use super::scans::Sight;
+use super::{CHUNK, Written};
+use crate::mcap::Item;
+use crate::{Form, Recording};
 
-/// Something that scans are written into.
+/// A format that scans are written in.
 pub(super) trait View {
-    /// Writes what was seen; answers what became of it, unless it was no telegram.
+    /// Writes a part of a recording. Returns what became of it; `None` if it was not a telegram.
     fn see(&mut self, sight: &Sight<'_>) -> io::Result<Option<Written>>;
 
     /// Returns whether intensities were requested, and no scan had any.
@@ -23,11 +28,11 @@ pub(super) trait View {
     fn finish(self) -> io::Result<()>;
 }
 
-/// An MCAP file of messages of ROS 2 alone.
+/// An MCAP file with only messages of ROS 2.
 pub(super) struct Ros2<W: Write> {
     writer: Writer<W>,
     bag: Bag,
-    /// Beams since the last chunk.
+    /// Beams in the open chunk.
     beams: usize,
 }
 
@@ -67,7 +72,7 @@ impl<W: Write> View for Ros2<W> {
     }
 }
 
-/// A row for each scan, below the names of the columns, which come again if their number changes.
+/// A row for each scan, after the names of the columns. The names are repeated if the number of beams changes.
 pub(super) struct Csv<W: Write> {
     out: Packing<W>,
     columns: ScanColumns,
@@ -108,4 +113,51 @@ impl<W: Write> View for Csv<W> {
     fn finish(self) -> io::Result<()> {
         self.out.finish()
     }
+}
+
+/// Writes the marks of the chosen sensor of `recording`, and returns their number.
+///
+/// # Errors
+///
+/// Returns [`Kind::NoTopic`] if none were recorded. Otherwise the error of `count`, or of the output as `failed` makes it.
+pub(super) fn write_marks(
+    recording: &Recording,
+    columns: MarkColumns,
+    mut out: Packing<impl Write>,
+    count: &mut impl FnMut(Written, Option<u64>) -> Result<(), Failure>,
+    failed: &impl Fn(io::Error) -> Failure,
+) -> Result<u64, Failure> {
+    let mut lines = Vec::new();
+    columns.names(&mut lines).map_err(failed)?;
+    let (mut samples, mut written) = (0, 0);
+    if recording.contents().form == Form::Mcap {
+        let (mut reader, catalog) = recording.reader()?;
+        while let Some(item) = reader.next().map_err(|error| recording.broken(&error))? {
+            let Item::Record(record) = item else { continue };
+            let Some((place, header, payload)) = catalog.message(&record) else { continue };
+            let mut marks = Marks::default();
+            if place.topic != Topic::Marks
+                || recording.chosen() != Some(&place.sensor)
+                || !marks.unpack(payload)
+            {
+                continue;
+            }
+            columns.rows(&mut lines, &header, &marks).map_err(failed)?;
+            out.write_all(&lines).map_err(failed)?;
+            lines.clear();
+            samples += 1;
+            written += marks.marks().len() as u64;
+            count(Written::Marks, Some(header.wall_ns))?;
+        }
+    }
+    if samples == 0 {
+        let path = recording.path().display();
+        let message = format!("there are no recorded marks in {path}");
+        let hint = format!(
+            "`scanhub replay {path}` finds marks in the scans, and meanwhile `scanhub record SENSOR/marks` records them"
+        );
+        return Err(Failure::new(Kind::NoTopic, message, hint));
+    }
+    out.finish().map_err(failed)?;
+    Ok(written)
 }
