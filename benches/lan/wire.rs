@@ -1,11 +1,11 @@
 //! The network namespace in which the bench runs, its sockets on the loopback, and programs that print JSON.
 
+use std::env;
 use std::net::{Ipv4Addr, UdpSocket};
 use std::process::{Command, ExitCode, Stdio};
 use std::sync::mpsc::{Receiver, channel};
 use std::thread;
 use std::time::Duration;
-use std::{env, fs};
 
 use rustix::net::sockopt::{set_ip_multicast_if, set_socket_recv_buffer_size_force};
 use rustix::process::{Pid, Signal, kill_process};
@@ -31,11 +31,10 @@ pub(crate) fn enter() -> Outcome<ExitCode> {
     if !rustix::process::getuid().is_root() {
         unshare.arg("--map-root-user");
     }
-    let state = env::temp_dir().join(format!("scanhub-lan-{}", std::process::id()));
+    let state = tempfile::tempdir()?;
     unshare.args(["sh", "-c", "ip link set lo up && exec \"$@\"", "sh"]).arg(env::current_exe()?);
-    unshare.args(env::args().skip(1)).env(INSIDE, "1").env("XDG_STATE_HOME", &state);
+    unshare.args(env::args().skip(1)).env(INSIDE, "1").env("XDG_STATE_HOME", state.path());
     let status = unshare.env_remove("STATE_DIRECTORY").status()?;
-    let _ = fs::remove_dir_all(state);
     Ok(if status.success() { ExitCode::SUCCESS } else { ExitCode::FAILURE })
 }
 

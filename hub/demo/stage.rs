@@ -3,7 +3,7 @@
 
 use std::fs::{File, OpenOptions};
 use std::io::{self, Write};
-use std::os::unix::fs::{DirBuilderExt, OpenOptionsExt};
+use std::os::unix::fs::OpenOptionsExt;
 use std::path::PathBuf;
 use std::process::Stdio;
 use std::sync::mpsc;
@@ -11,6 +11,7 @@ use std::sync::mpsc;
 use rustix::fs::{CWD, FileType, Mode, OFlags, mknodat};
 use schema::{Failure, Family, Kind};
 use serde_json::Value;
+use tempfile::TempDir;
 
 use super::process::{Child, Line};
 use crate::own_domain::OwnDomain;
@@ -23,7 +24,7 @@ pub(super) struct Stage {
     pub(super) domain: OwnDomain,
     pub(super) world: World,
     pub(super) sensors: Vec<Sensor>,
-    directory: PathBuf,
+    directory: TempDir,
     /// There is a picture on the terminal, into which nobody may write.
     quiet: bool,
 }
@@ -33,15 +34,10 @@ impl Stage {
     pub(super) fn new(quiet: bool, world: World, sensors: Vec<Sensor>) -> Result<Stage, Failure> {
         let domain = OwnDomain::new("demo")?;
         let name = domain.name().to_owned();
-        let directory = std::env::temp_dir().join(format!("scanhub-{name}"));
-        // Not one that is there already: it may be another user's.
-        std::fs::DirBuilder::new().mode(0o700).create(&directory).map_err(|error| {
-            let message = format!("cannot make {}: {error}", directory.display());
-            Failure::new(
-                Kind::Failed,
-                message,
-                "set TMPDIR to a directory that this user may write, or remove what is in the way",
-            )
+        let directory = tempfile::Builder::new().prefix(&format!("scanhub-{name}-")).tempdir();
+        let directory = directory.map_err(|error| {
+            let message = format!("cannot create a temporary directory: {error}");
+            Failure::new(Kind::Failed, message, "set TMPDIR to a directory that this user may write")
         })?;
         Ok(Stage { domain, world, sensors, directory, quiet })
     }
@@ -53,7 +49,7 @@ impl Stage {
     }
 
     fn log(&self) -> PathBuf {
-        self.directory.join("log")
+        self.directory.path().join("log")
     }
 
     /// Where a process says what goes wrong.
@@ -68,7 +64,7 @@ impl Stage {
     }
 
     fn truth(&self, family: Family) -> PathBuf {
-        self.directory.join(format!("truth-{}", family.name()))
+        self.directory.path().join(format!("truth-{}", family.name()))
     }
 
     /// The reading ends of what the simulators will tell: pipes, because a demonstration may run for days.
@@ -88,7 +84,7 @@ impl Stage {
     }
 
     fn port(&self, sensor: &str) -> String {
-        self.directory.join(sensor).display().to_string()
+        self.directory.path().join(sensor).display().to_string()
     }
 
     pub(super) fn start_hub(&self, lines: mpsc::Sender<Line>) -> Result<Child, Failure> {
@@ -109,7 +105,7 @@ impl Stage {
             &[&["run".into(), "--json".into(), "--no-system-config".into(), FORGETS.into()], &links[..]]
                 .concat(),
             &self.domain,
-            &self.directory,
+            self.directory.path(),
             None,
             self.errors(),
         )?;
@@ -120,7 +116,13 @@ impl Stage {
         let start = |(of, Sensor { name: sensor, .. }): (usize, &Sensor)| {
             let topics = ["telegram", "scan", "status"].map(|topic| format!("{sensor}/{topic}"));
             let arguments = [&["echo".into(), "--json".into()], &topics[..]].concat();
-            Child::start(&arguments, &self.domain, &self.directory, Some((of, lines.clone())), self.errors())
+            Child::start(
+                &arguments,
+                &self.domain,
+                self.directory.path(),
+                Some((of, lines.clone())),
+                self.errors(),
+            )
         };
         self.sensors.iter().enumerate().map(start).collect()
     }
@@ -128,7 +130,7 @@ impl Stage {
     /// What follows people, where there is a site to follow them in.
     pub(super) fn start_tracker(&self, lines: &mpsc::Sender<Line>) -> Result<Option<Child>, Failure> {
         let Some(site) = self.world.site() else { return Ok(None) };
-        let path = self.directory.join("site.toml");
+        let path = self.directory.path().join("site.toml");
         std::fs::write(&path, site).map_err(|error| {
             let hint = "set TMPDIR to a directory that this user may write and that has room";
             Failure::new(Kind::Failed, format!("cannot write {}: {error}", path.display()), hint)
@@ -136,7 +138,7 @@ impl Stage {
         let site = path.display().to_string();
         let arguments = ["track", "--site", &site, "--as", "people", "--delay", DELAY].map(str::to_owned);
         let listener = Some((TRACKER, lines.clone()));
-        Child::start(&arguments, &self.domain, &self.directory, listener, self.errors()).map(Some)
+        Child::start(&arguments, &self.domain, self.directory.path(), listener, self.errors()).map(Some)
     }
 
     pub(super) fn start_simulators(
@@ -164,7 +166,7 @@ impl Stage {
             Vec::new()
         };
         let arguments = [&["simulate".into()], &world[..], &ports[..], &rest[..], &angles[..]].concat();
-        let simulator = Child::start(&arguments, &self.domain, &self.directory, None, self.errors())?;
+        let simulator = Child::start(&arguments, &self.domain, self.directory.path(), None, self.errors())?;
         Ok(simulator.await_ready(SIMULATOR, lines)?.0)
     }
 
@@ -175,13 +177,13 @@ impl Stage {
         }
         let arguments: Vec<String> = TILTED_VERB.iter().map(|word| (*word).to_owned()).collect();
         let listener = Some((TILTED, lines.clone()));
-        Child::start(&arguments, &self.domain, &self.directory, listener, self.errors()).map(Some)
+        Child::start(&arguments, &self.domain, self.directory.path(), listener, self.errors()).map(Some)
     }
 
     /// The picture for a browser, and its address.
     pub(super) fn start_web(&self) -> Result<(Child, String), Failure> {
         let arguments = ["web".into(), "--json".into()];
-        let web = Child::start(&arguments, &self.domain, &self.directory, None, self.errors())?;
+        let web = Child::start(&arguments, &self.domain, self.directory.path(), None, self.errors())?;
         // Who comes and goes is not told here.
         let (web, ready) = web.await_ready(WEB, mpsc::channel().0)?;
         let ready: Value = serde_json::from_str(&ready).unwrap_or_default();
@@ -189,13 +191,6 @@ impl Stage {
             Some(url) => Ok((web, url.to_owned())),
             None => Err(super::ended(WEB)),
         }
-    }
-}
-
-impl Drop for Stage {
-    fn drop(&mut self) {
-        // Ours alone: its name has our process id.
-        let _ = std::fs::remove_dir_all(&self.directory);
     }
 }
 

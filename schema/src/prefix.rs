@@ -94,8 +94,8 @@ mod tests {
 
     #[test]
     fn a_word_is_kept_and_never_the_same_twice() {
-        let base = std::env::temp_dir().join(format!("shp{}", std::process::id()));
-        let root = base.join("a-1");
+        let base = tempfile::tempdir().unwrap();
+        let root = base.path().join("a-1");
         assert_eq!(of(&root), Ok(None), "there is no such directory");
         let settle = |root: &Path| settle(root, &MakingLock::wait(root).unwrap());
         let first = settle(&root).unwrap();
@@ -106,6 +106,5 @@ mod tests {
             assert_eq!(of(&root), Ok(None), "{written:?}");
         }
         assert_ne!(settle(&root).unwrap(), first);
-        fs::remove_dir_all(&base).unwrap();
     }
 }

@@ -74,16 +74,15 @@ mod tests {
 
     #[test]
     fn what_is_no_regular_file_or_too_long_is_refused_at_once() {
-        let directory = std::env::temp_dir().join(format!("scanhub-regular-{}", std::process::id()));
-        fs::create_dir_all(&directory).unwrap();
-        let [pipe, file, link] = ["pipe", "file", "link"].map(|name| directory.join(name));
+        let directory = tempfile::tempdir().unwrap();
+        let [pipe, file, link] = ["pipe", "file", "link"].map(|name| directory.path().join(name));
         mknodat(CWD, &pipe, FileType::Fifo, Mode::RUSR | Mode::WUSR, 0).unwrap();
         fs::write(&file, "1234567").unwrap();
         std::os::unix::fs::symlink(&file, &link).unwrap();
         let refused = |path: &Path| read(path, 7).map_err(|error| (error.kind(), error.to_string()));
         let is = |what: &str| Err((ErrorKind::InvalidInput, format!("it is {what}, not a regular file")));
         assert_eq!(refused(&pipe), is("a pipe"));
-        assert_eq!(refused(&directory), is("a directory"));
+        assert_eq!(refused(directory.path()), is("a directory"));
         assert_eq!(refused(Path::new("/dev/zero")), is("a device"));
         assert_eq!(refused(&file).as_deref(), Ok(&b"1234567"[..]));
         assert_eq!(refused(&link).as_deref(), Ok(&b"1234567"[..]));
@@ -92,7 +91,7 @@ mod tests {
         assert!(read(Path::new("/proc/self/status"), 1 << 16).unwrap().len() > 100);
         fs::write(&file, b"\xFF").unwrap();
         assert_eq!(read_text(&file, 6).unwrap_err().kind(), ErrorKind::InvalidData);
-        fs::remove_dir_all(&directory).unwrap();
+        fs::remove_file(&file).unwrap();
         assert_eq!(read(&file, 6).unwrap_err().kind(), ErrorKind::NotFound);
     }
 }

@@ -182,24 +182,26 @@ const USUAL: [&str; 6] = ["/usr/local/sbin", "/usr/local/bin", "/usr/sbin", "/us
 
 #[cfg(test)]
 mod tests {
+    use tempfile::TempDir;
+
     use super::*;
 
     const PASSWD: &str = "root:x:0:0:root:/root:/bin/sh\nscanhub:x:998:997::/:/usr/sbin/nologin\nalice:x:1000:1000::/home/alice:/bin/sh\n";
 
-    /// A made-up machine that is removed with the value.
-    struct Machine(PathBuf);
+    /// A made-up machine: files below a temporary directory.
+    struct Machine(TempDir);
 
     impl Machine {
-        fn new(test: &str) -> Machine {
-            let root = std::env::temp_dir().join(format!("scanhub-running-{test}-{}", std::process::id()));
-            fs::create_dir_all(root.join("etc")).unwrap();
-            fs::write(root.join("etc/passwd"), PASSWD).unwrap();
+        fn new() -> Machine {
+            let root = TempDir::new().unwrap();
+            fs::create_dir(root.path().join("etc")).unwrap();
+            fs::write(root.path().join("etc/passwd"), PASSWD).unwrap();
             Machine(root)
         }
 
         /// Adds a process; other users cannot read an environment of `None`.
         fn process(&self, pid: u32, uid: u32, command: &[&str], environment: Option<&str>) {
-            let path = self.0.join(format!("proc/{pid}"));
+            let path = self.0.path().join(format!("proc/{pid}"));
             fs::create_dir_all(&path).unwrap();
             let program = command.first().and_then(|program| program.rsplit('/').next()).unwrap_or("sh");
             fs::write(path.join("comm"), format!("{program}\n")).unwrap();
@@ -213,12 +215,6 @@ mod tests {
         }
     }
 
-    impl Drop for Machine {
-        fn drop(&mut self) {
-            let _ = fs::remove_dir_all(&self.0);
-        }
-    }
-
     fn user(uid: u32) -> Environment {
         Environment {
             uid,
@@ -229,7 +225,7 @@ mod tests {
 
     #[test]
     fn finds_hubs_of_all_users() {
-        let machine = Machine::new("all");
+        let machine = Machine::new();
         machine.process(10, 0, &["sudo", "scanhub", "run"], None);
         machine.process(11, 0, &["scanhub", "run", "--link", "front=/dev/ttyUSB0"], None);
         machine.process(12, 998, &["/usr/local/bin/scanhub", "--json", "run"], None);
@@ -240,7 +236,7 @@ mod tests {
         machine.process(17, 1000, &["scanhub", "run", "--domain", "x; id"], None);
         machine.process(18, 1000, &["scanhub", "run"], Some(""));
         machine.process(19, 1000, &["scanhub", "run"], Some("SCANHUB_DOMAIN=lab"));
-        let hubs = RunningHub::all(&machine.0);
+        let hubs = RunningHub::all(machine.0.path());
         let found: Vec<_> =
             hubs.iter().map(|hub| (hub.pid, hub.user.as_str(), hub.domain.as_deref())).collect();
         assert_eq!(
@@ -259,10 +255,9 @@ mod tests {
     #[test]
     fn names_the_command_that_reaches_a_hub() {
         let command = |uid, words: &[&str], environment: Option<&str>, caller: u32| {
-            let machine =
-                Machine::new(&format!("command-{uid}-{caller}-{}", words.join("").replace('/', "_")));
+            let machine = Machine::new();
             machine.process(7, uid, words, environment);
-            let [hub] = &RunningHub::all(&machine.0)[..] else { panic!("one hub") };
+            let [hub] = &RunningHub::all(machine.0.path())[..] else { panic!("one hub") };
             hub.command("list", "scanhub", &user(caller))
         };
         let run = ["scanhub", "run"];

@@ -167,23 +167,19 @@ fn refused(what: String) -> io::Error {
 
 #[cfg(test)]
 mod tests {
+    use tempfile::TempDir;
+
     use super::*;
     use std::os::unix::fs::{PermissionsExt, symlink};
 
-    /// A directory that is not there yet, and goes with the value.
-    struct Place(PathBuf);
+    /// Path of a directory that does not exist yet, below a temporary one.
+    struct Place(PathBuf, #[expect(dead_code, reason = "it is removed when it is dropped")] TempDir);
 
     impl Place {
-        fn new(name: &str) -> (Place, StateDirectory) {
-            let path =
-                std::env::temp_dir().join(format!("scanhub-state-{}-{name}", std::process::id())).join("a");
-            (Place(path.clone()), StateDirectory::at(path))
-        }
-    }
-
-    impl Drop for Place {
-        fn drop(&mut self) {
-            let _ = fs::remove_dir_all(self.0.parent().unwrap());
+        fn new() -> (Place, StateDirectory) {
+            let parent = TempDir::new().unwrap();
+            let path = parent.path().join("a");
+            (Place(path.clone(), parent), StateDirectory::at(path))
         }
     }
 
@@ -207,7 +203,7 @@ mod tests {
 
     #[test]
     fn what_was_written_is_read_by_this_user_alone() {
-        let (place, state) = Place::new("written");
+        let (place, state) = Place::new();
         assert_eq!(state.read("f", 9), Ok(None));
         for text in ["first", "second", ""] {
             state.write("f", text).unwrap();
@@ -219,7 +215,7 @@ mod tests {
 
     #[test]
     fn what_a_crash_left_is_replaced() {
-        let (place, state) = Place::new("crash");
+        let (place, state) = Place::new();
         fs::create_dir_all(&place.0).unwrap();
         let other = place.0.join("other");
         fs::write(&other, "untouched").unwrap();
@@ -232,7 +228,7 @@ mod tests {
 
     #[test]
     fn what_is_not_ours_is_not_believed() {
-        let (place, state) = Place::new("foreign");
+        let (place, state) = Place::new();
         state.write("f", "12345").unwrap();
         let refused = |state: &StateDirectory, name, says: &str| {
             let failure = state.read(name, 5).unwrap_err();
@@ -263,7 +259,7 @@ mod tests {
 
     #[test]
     fn a_name_that_is_taken_by_a_directory_stays_as_it_is() {
-        let (place, state) = Place::new("taken");
+        let (place, state) = Place::new();
         fs::create_dir_all(state.path("f").join("full")).unwrap();
         state.write("f", "text").unwrap_err();
         assert_eq!(fs::read_dir(&place.0).unwrap().count(), 1, "nothing is left beside it");

@@ -2,18 +2,18 @@
 //! are telegrams.
 
 use std::fs;
-use std::path::PathBuf;
-use std::sync::atomic::{AtomicU64, Ordering};
 
 use lms::telegram::Telegram;
 use lms::variant::{Mode, Unit};
 use recording::{Encoding, Form, Recording};
 use schema::Family;
+use tempfile::NamedTempFile;
 
 /// Any bytes as a file.
 pub(crate) fn recording(data: &[u8]) {
-    let file = File::of(data);
-    let Ok(recording) = Recording::open(&file.0) else { return };
+    let file = NamedTempFile::new().expect("a temporary file");
+    fs::write(&file, data).expect("a writable file");
+    let Ok(recording) = Recording::open(file.path()) else { return };
     let contents = recording.contents();
     let mut telegrams = 0;
     if contents.sensors.is_empty() {
@@ -40,23 +40,4 @@ fn read(recording: &Recording) -> u64 {
     }
     assert_eq!(telegrams, contents.telegrams, "{contents:?}");
     telegrams
-}
-
-/// A file of its own, also where several targets run at once.
-struct File(PathBuf);
-
-impl File {
-    fn of(data: &[u8]) -> File {
-        static NUMBER: AtomicU64 = AtomicU64::new(0);
-        let number = NUMBER.fetch_add(1, Ordering::Relaxed);
-        let path = std::env::temp_dir().join(format!("scanhub-fuzz-{}-{number}", std::process::id()));
-        fs::write(&path, data).expect("a file for temporary things");
-        File(path)
-    }
-}
-
-impl Drop for File {
-    fn drop(&mut self) {
-        let _ = fs::remove_file(&self.0);
-    }
 }

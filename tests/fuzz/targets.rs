@@ -218,20 +218,19 @@ pub fn configuration(data: &[u8]) {
     use config::{Config, Sources};
     let text = String::from_utf8_lossy(data);
     let mut pieces = text.split('\0');
-    let path = std::env::temp_dir().join(format!("scanhub-fuzz-{}.toml", std::process::id()));
+    let path = tempfile::NamedTempFile::new().expect("a temporary file").into_temp_path();
     std::fs::write(&path, pieces.next().unwrap_or_default()).expect("a writable directory");
     let (mut set, mut links) = (Vec::new(), Vec::new());
     for (number, piece) in pieces.enumerate() {
         if number % 2 == 0 { &mut set } else { &mut links }.push(piece.to_owned());
     }
-    match Config::load(&Sources { files: vec![path.clone()], set, links }) {
+    match Config::load(&Sources { files: vec![path.to_path_buf()], set, links }) {
         Ok(config) => assert!(!config.links.is_empty()),
         Err(failure) => {
             assert_eq!(failure.kind.exit_code(), 78, "{failure}");
             assert!(!failure.message.is_empty());
         }
     }
-    let _ = std::fs::remove_file(&path);
 }
 
 /// Any scans, whoever sends such, with any settings, through all processors.

@@ -11,14 +11,16 @@ use crate::testkit::{INT, Outcome, Program, is_there, number, output, shared_mem
 /// Runs the demonstration in an empty environment; `end` may wait for something and hasten its end.
 fn demo(arguments: &[&str], end: impl FnOnce(Program) -> Outcome) -> Outcome {
     let mut command = Command::new(env!("CARGO_BIN_EXE_scanhub"));
-    let home = std::env::temp_dir().join(format!("scanhub-home-{}-{}", std::process::id(), arguments.len()));
-    command.arg("demo").args(arguments).env_clear().env("XDG_STATE_HOME", &home);
+    let place = tempfile::tempdir().expect("a directory");
+    let [home, temporary] = ["home", "temporary"].map(|name| place.path().join(name));
+    fs::create_dir(&temporary).expect("a directory");
+    command.arg("demo").args(arguments).env_clear().env("XDG_STATE_HOME", &home).env("TMPDIR", &temporary);
     let program = Program::start(command);
     let name = format!("demo-{}", program.pid());
     let outcome = end(program);
     assert!(!is_there(&home), "it kept something");
     assert_eq!(shared_memory(&format!("sh_{name}_")), [] as [&Path; 0]);
-    assert!(!is_there(format!("/tmp/scanhub-{name}").as_ref()), "its directory is left");
+    assert_eq!(fs::read_dir(&temporary).expect("it is there").count(), 0, "its directory is left");
     let uid = rustix::process::getuid().as_raw();
     assert!(!is_there(format!("/tmp/scanhub-{uid}/{name}").as_ref()), "its domain is left");
     assert_eq!(outcome.left, [] as [String; 0]);
@@ -107,13 +109,13 @@ fn headless_in_an_empty_environment() {
 
 #[test]
 fn where_the_users_own_place_is_too_long_for_a_domain() {
-    let place = format!("/tmp/scanhub-demo-{}/{}", std::process::id(), "long".repeat(20));
-    fs::create_dir_all(&place).expect("a directory");
+    let directory = tempfile::tempdir().expect("a directory");
+    let place = directory.path().join("long".repeat(20));
+    fs::create_dir(&place).expect("a directory");
     let mut command = Command::new(env!("CARGO_BIN_EXE_scanhub"));
     command.args(["demo", "--headless", "--for", "1s", "--json"]).env_clear().env("XDG_RUNTIME_DIR", &place);
     let outcome = Program::start(command).wait();
     let left = fs::read_dir(&place).expect("it is there").count();
-    fs::remove_dir_all(format!("/tmp/scanhub-demo-{}", std::process::id())).expect("it is ours");
     assert_eq!((outcome.code, left), (Some(0), 0), "{outcome}");
     nothing_was_lost(&outcome);
 }

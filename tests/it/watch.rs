@@ -177,7 +177,8 @@ fn a_demonstration_shows_it() {
         return;
     }
     let mut command = Command::new(env!("CARGO_BIN_EXE_scanhub"));
-    command.args(["demo", "--for=3s"]);
+    let temporary = tempfile::tempdir().expect("a directory");
+    command.args(["demo", "--for=3s"]).env("TMPDIR", temporary.path());
     let demo = Sitting::start(&command, (80, 30));
     let name = format!("demo-{}", demo.pid());
     demo.await_words("1 front    streaming");
@@ -185,7 +186,7 @@ fn a_demonstration_shows_it() {
     let (code, below, is_whole) = demo.end();
     assert!(code == Some(0) && is_whole, "{code:?} {below:?}");
     assert_eq!(below.matches(" 0 lost in ").count(), 2, "{below:?}");
-    assert!(!std::env::temp_dir().join(format!("scanhub-{name}")).exists(), "its directory is left");
+    assert_eq!(std::fs::read_dir(&temporary).expect("it is there").count(), 0, "its directory is left");
     assert!(testkit::shared_memory(&format!("sh_{name}_")).is_empty(), "its domain is left");
 }
 

@@ -212,8 +212,8 @@ fn a_hall_is_seen_from_the_side_while_somebody_looks() {
 #[test]
 fn the_page_of_the_demonstration_has_sweeps() {
     let mut command = Command::new(env!("CARGO_BIN_EXE_scanhub"));
-    let home = std::env::temp_dir().join(format!("scanhub-home-{}-page", std::process::id()));
-    command.args(["demo", "--world", "tilt"]).env_clear().env("XDG_STATE_HOME", &home);
+    let home = tempfile::tempdir().expect("a directory");
+    command.args(["demo", "--world", "tilt"]).env_clear().env("XDG_STATE_HOME", home.path());
     let mut demo = Program::start(command);
     let host = loop {
         if let Some((_, host)) = demo.next_text().split_once("browser: http://") {

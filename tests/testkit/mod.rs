@@ -22,8 +22,8 @@ mod telegrams;
 mod terminal;
 mod tmux;
 
-use std::fs;
-use std::os::unix::fs::DirBuilderExt;
+use std::fs::{self, Permissions};
+use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::sync::OnceLock;
@@ -33,6 +33,7 @@ use std::time::{Duration, Instant};
 
 use schema::Domain;
 use serde_json::Value;
+use tempfile::TempDir;
 
 pub(crate) use again::{in_own_process, only, own_program, run_again};
 pub(crate) use child::{Child, end_runs_of, output, spawn, status, succeeds, write_program};
@@ -67,7 +68,7 @@ pub(crate) const PROGRAM: &str = "SCANHUB_TEST_PROGRAM";
 
 /// A domain and a directory of one test.
 pub(crate) struct TestEnv {
-    directory: PathBuf,
+    directory: TempDir,
     domain: String,
     /// Where its programs run, if not where the test does.
     network: Option<PathBuf>,
@@ -78,10 +79,10 @@ impl TestEnv {
     pub(crate) fn new() -> TestEnv {
         static NEXT: AtomicU32 = AtomicU32::new(0);
         let domain = format!("t{}-{}", std::process::id(), NEXT.fetch_add(1, Ordering::Relaxed));
-        // Not TMPDIR: root and prefix of a domain have to be short.
-        let directory = PathBuf::from(format!("/tmp/{domain}"));
-        let made = fs::DirBuilder::new().recursive(true).mode(0o755).create(&directory);
-        made.unwrap_or_else(|error| panic!("{}: {error}", directory.display()));
+        // Not TMPDIR: root and prefix of a domain must be short.
+        let mut builder = tempfile::Builder::new();
+        builder.prefix(&domain).rand_bytes(4).permissions(Permissions::from_mode(0o755));
+        let directory = builder.tempdir_in("/tmp").unwrap_or_else(|error| panic!("/tmp: {error}"));
         TestEnv { directory, domain, network: None }
     }
 
@@ -94,11 +95,11 @@ impl TestEnv {
 
     /// Where its hub is, for consumers in the test itself.
     pub(crate) fn place(&self) -> Domain {
-        Domain::at(&self.domain, &self.directory).unwrap_or_else(|failure| panic!("{failure}"))
+        Domain::at(&self.domain, self.directory.path()).unwrap_or_else(|failure| panic!("{failure}"))
     }
 
     pub(crate) fn path(&self, name: &str) -> PathBuf {
-        self.directory.join(name)
+        self.directory.path().join(name)
     }
 
     /// `path` as an argument.
@@ -119,7 +120,7 @@ impl TestEnv {
 
     /// The program with `arguments`, in this domain.
     pub(crate) fn command<S: AsRef<str>>(&self, arguments: &[S]) -> Command {
-        self.command_at(&self.directory, arguments)
+        self.command_at(self.directory.path(), arguments)
     }
 
     /// As [`TestEnv::command`], with the domain in another directory.
@@ -294,7 +295,6 @@ impl TestEnv {
 
 impl Drop for TestEnv {
     fn drop(&mut self) {
-        let _ = fs::remove_dir_all(&self.directory);
         for path in shared_memory(&format!("sh_{}_", self.domain)) {
             let _ = fs::remove_file(path);
         }

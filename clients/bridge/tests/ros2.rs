@@ -11,6 +11,7 @@ use std::thread;
 use std::time::{Duration, Instant};
 
 use serde_json::Value;
+use tempfile::TempDir;
 
 #[path = "../../../tests/testkit/child.rs"]
 mod child;
@@ -28,20 +29,20 @@ fn scanhub() -> PathBuf {
     program
 }
 
-/// A directory of this test, with a domain in it; removed at the end.
-struct Place(PathBuf);
+/// A temporary directory with a domain in it.
+struct Place(TempDir);
 
 impl Place {
-    fn new(name: &str) -> Place {
-        let path = std::env::temp_dir().join(format!("scanhub-ros2-{}-{name}", std::process::id()));
-        for part in ["", "root", "state"] {
-            DirBuilder::new().mode(0o700).create(path.join(part)).expect("a new directory");
+    fn new() -> Place {
+        let place = TempDir::new().expect("a new directory");
+        for part in ["root", "state"] {
+            DirBuilder::new().mode(0o700).create(place.path().join(part)).expect("a new directory");
         }
-        Place(path)
+        Place(place)
     }
 
     fn path(&self, name: &str) -> String {
-        self.0.join(name).display().to_string()
+        self.0.path().join(name).display().to_string()
     }
 
     /// A program in the domain, which ends with the test.
@@ -51,12 +52,6 @@ impl Place {
         command.env("STATE_DIRECTORY", self.path("state")).env_remove("ROS_DOMAIN_ID");
         command.stdin(Stdio::null()).stdout(out).stderr(Stdio::null());
         Running(spawn(command).expect("a program"))
-    }
-}
-
-impl Drop for Place {
-    fn drop(&mut self) {
-        let _ = fs::remove_dir_all(&self.0);
     }
 }
 
@@ -94,7 +89,7 @@ fn others_find_every_topic_and_decode_every_message() {
         return skip("python-packages", "there is no zenoh-ros2-sdk: .ci/run installs it");
     };
     let scanhub = scanhub();
-    let place = Place::new("graph");
+    let place = Place::new();
     let (front, rear, port) = (place.path("front"), place.path("rear"), free_port().to_string());
     let simulate = ["simulate", "--port", &front, "--port", &rear, "--baud=500000", "--seed=5"];
     let _simulator = place.start(&scanhub, &simulate, Stdio::null());
@@ -191,8 +186,8 @@ fn the_examples_of_the_page_run() {
     let lines: Vec<_> = page.lines().filter_map(|line| line.strip_prefix("scanhub bridge ")).collect();
     assert_eq!(lines.len(), 2, "{lines:?}");
     let (port, mut running) = (free_port().to_string(), Vec::new());
-    for (number, line) in lines.into_iter().enumerate() {
-        let place = Place::new(&format!("page{number}"));
+    for line in lines {
+        let place = Place::new();
         let line = line.replace("0.0.0.0", "127.0.0.1").replace("7447", &port);
         let words: Vec<&str> = line.split_whitespace().collect();
         let mut program = place.start(Path::new(BRIDGE), &words, Stdio::piped());

@@ -234,11 +234,10 @@ mod tests {
 
     #[test]
     fn without_a_hub_the_hubs_of_others_are_named() {
-        let root = std::env::temp_dir().join(format!("scanhub-presence-{}", std::process::id()));
         let hubs = |processes: &[(u32, u32, &str)]| {
-            let _ = std::fs::remove_dir_all(&root);
+            let root = tempfile::tempdir().unwrap();
             let put = |path: &str, text: &str| {
-                let path = root.join(path);
+                let path = root.path().join(path);
                 std::fs::create_dir_all(path.parent().unwrap()).unwrap();
                 std::fs::write(path, text).unwrap();
             };
@@ -248,7 +247,7 @@ mod tests {
                 put(&format!("proc/{pid}/status"), &format!("Uid:\t{uid}\t{uid}\t{uid}\t{uid}\n"));
                 put(&format!("proc/{pid}/cmdline"), &format!("scanhub\0{}\0", words.replace(' ', "\0")));
             }
-            let hubs = RunningHub::all(&root);
+            let hubs = RunningHub::all(root.path());
             assert_eq!(hubs.len(), processes.len());
             hubs
         };
@@ -301,7 +300,6 @@ mod tests {
 
         let many: Vec<_> = (1..6).map(|pid| (pid, 1000, "run --domain lab")).collect();
         assert!(said(&hubs(&many), None).1.contains("; and 2 more; start one"));
-        std::fs::remove_dir_all(&root).unwrap();
     }
 
     #[test]

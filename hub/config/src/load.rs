@@ -206,13 +206,13 @@ mod tests {
 
     #[test]
     fn one_port_is_for_one_link() {
-        let own = std::env::temp_dir().join(format!("scanhub-port-{}", std::process::id()));
+        let directory = tempfile::tempdir().unwrap();
+        let own = directory.path().join("port");
         std::os::unix::fs::symlink("/dev/null", &own).unwrap();
         let twice = refusal(&[], &["a=/dev/x", "b=/dev/y", "c=/dev/x"]);
         let named = refusal(&[], &["a=/dev/null", &format!("b={}", own.display())]);
         let moved = refusal(&["link.b.port=/dev/x"], &["a=/dev/x", "b=/dev/y"]);
         assert!(refusal(&[], &["a=tcp:h:1", "b=tcp:h:1"]).contains("have the same port: tcp:h:1"));
-        std::fs::remove_file(&own).unwrap();
         assert!(named.ends_with("name the port of each sensor"), "{named}");
         assert!(twice.starts_with("links a and c have the same port: /dev/x\n"), "{twice}");
         assert!(named.contains(&format!("same port: /dev/null is {}\n", own.display())), "{named}");
@@ -222,8 +222,8 @@ mod tests {
 
     #[test]
     fn adapters_with_one_serial_number_need_names_by_path() {
-        let root = std::env::temp_dir().join(format!("scanhub-twins-{}", std::process::id()));
-        let [by_id, by_path] = ["by-id", "by-path"].map(|kind| root.join("serial").join(kind));
+        let root = tempfile::tempdir().unwrap();
+        let [by_id, by_path] = ["by-id", "by-path"].map(|kind| root.path().join("serial").join(kind));
         for directory in [&by_id, &by_path] {
             std::fs::create_dir_all(directory).unwrap();
         }
@@ -237,17 +237,16 @@ mod tests {
         let load = |links: [String; 2]| Config::load(&Sources { links: links.into(), ..Sources::default() });
         let refusal = load(links(&shared)).unwrap_err();
         let by_socket = load(links(&first)).map(|config| config.links.len());
-        std::fs::remove_dir_all(&root).unwrap();
         assert!(refusal.hint.contains("use the names in /dev/serial/by-path"), "{refusal}");
         assert_eq!(by_socket, Ok(2));
     }
 
     #[test]
     fn a_file_error_has_line_and_column() {
-        let path = std::env::temp_dir().join(format!("scanhub-config-{}.toml", std::process::id()));
+        let path = tempfile::NamedTempFile::new().unwrap().into_temp_path();
         let load = |text: &str| {
             std::fs::write(&path, text).unwrap();
-            Config::load(&Sources { files: vec![path.clone()], ..Sources::default() })
+            Config::load(&Sources { files: vec![path.to_path_buf()], ..Sources::default() })
         };
         let error = load("[[link]]\nname = \"front\"\nprot = \"/dev/x\"\n").unwrap_err().to_string();
         assert!(error.contains(&format!("{}:3:1: unknown key `prot`", path.display())), "{error}");
@@ -281,6 +280,5 @@ mod tests {
         let set = refusal(&["link.front.baud=\"500000\""], &[]);
         assert!(set.starts_with("--set link.front.baud=") && set.contains("without quotes"), "{set}");
         assert!(load("[[link]]\nname = \"a\"\nport = \"x\"\nangle = 100\n").is_ok());
-        std::fs::remove_file(&path).unwrap();
     }
 }

@@ -2,27 +2,21 @@
 //! value and remedy.
 
 use std::fs;
-use std::path::PathBuf;
 
 use config::{Config, Gateway, Processing, Scanner, Sources};
 use preprocess::background::{Candidate, Method, Start};
 use preprocess::zones::Sector;
 use schema::{Background, BackgroundHead, Family, Kind, as_json};
+use tempfile::TempPath;
 
-/// A file that goes with the test.
-struct Scratch(PathBuf);
+/// A temporary file.
+struct Scratch(TempPath);
 
 impl Scratch {
     fn new(name: &str, text: impl AsRef<[u8]>) -> Scratch {
-        let path = std::env::temp_dir().join(format!("scanhub-{}-{name}", std::process::id()));
-        fs::write(&path, text).expect("a file");
-        Scratch(path)
-    }
-}
-
-impl Drop for Scratch {
-    fn drop(&mut self) {
-        let _ = fs::remove_file(&self.0);
+        let file = tempfile::Builder::new().suffix(name).tempfile().expect("a file");
+        fs::write(&file, text).expect("a writable file");
+        Scratch(file.into_temp_path())
     }
 }
 
@@ -31,7 +25,7 @@ const LINKS: [&str; 2] = ["front=/dev/ttyUSB0", "rear=/dev/ttyUSB1"];
 
 fn load(files: &[&Scratch], set: &[&str]) -> Result<Config, String> {
     let sources = Sources {
-        files: files.iter().map(|file| file.0.clone()).collect(),
+        files: files.iter().map(|file| file.0.to_path_buf()).collect(),
         set: set.iter().map(|flag| (*flag).to_owned()).collect(),
         links: if files.is_empty() { LINKS.map(str::to_owned).into() } else { Vec::new() },
     };
@@ -350,7 +344,7 @@ fn the_gateway_has_a_section_that_needs_no_links() {
     let second = Scratch::new("gateway-2.toml", "[gateway]\nbackground_every = \"10s\"\ntopics = []\n");
     let gateway = |files: &[&Scratch], set: &[&str]| {
         let sources = Sources {
-            files: files.iter().map(|file| file.0.clone()).collect(),
+            files: files.iter().map(|file| file.0.to_path_buf()).collect(),
             set: set.iter().map(|flag| (*flag).to_owned()).collect(),
             links: Vec::new(),
         };

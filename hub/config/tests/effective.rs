@@ -2,29 +2,23 @@
 //! shown is what the hub works with.
 
 use std::fs;
-use std::path::PathBuf;
 
 use config::{Config, DEFAULT, Gateway, Sources, Value, values};
 use serde_json::{Value as Json, json};
+use tempfile::TempPath;
 
-/// A file that goes with the test.
-struct Scratch(PathBuf);
+/// A temporary file.
+struct Scratch(TempPath);
 
 impl Scratch {
     fn new(name: &str, text: &str) -> Scratch {
-        let path = std::env::temp_dir().join(format!("scanhub-{}-{name}", std::process::id()));
-        fs::write(&path, text).expect("a file");
-        Scratch(path)
+        let file = tempfile::Builder::new().suffix(name).tempfile().expect("a file");
+        fs::write(&file, text).expect("a writable file");
+        Scratch(file.into_temp_path())
     }
 
     fn place(&self, line_and_column: &str) -> String {
         format!("{}:{line_and_column}", self.0.display())
-    }
-}
-
-impl Drop for Scratch {
-    fn drop(&mut self) {
-        let _ = fs::remove_file(&self.0);
     }
 }
 
@@ -33,7 +27,11 @@ const LINKS: [&str; 2] = ["front=/dev/ttyUSB0", "rear=/dev/ttyUSB1"];
 
 fn sources(files: &[&Scratch], links: &[&str], set: &[&str]) -> Sources {
     let owned = |flags: &[&str]| flags.iter().map(|flag| (*flag).to_owned()).collect();
-    Sources { files: files.iter().map(|file| file.0.clone()).collect(), links: owned(links), set: owned(set) }
+    Sources {
+        files: files.iter().map(|file| file.0.to_path_buf()).collect(),
+        links: owned(links),
+        set: owned(set),
+    }
 }
 
 /// Value and origin of `key`.

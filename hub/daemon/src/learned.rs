@@ -302,8 +302,8 @@ mod tests {
 
     #[test]
     fn the_rate_is_known_of_this_link_at_this_port() {
-        let root = std::env::temp_dir().join(format!("scanhub-learned-{}", std::process::id()));
-        let state = StateDirectory::at(root.join("state"));
+        let root = tempfile::tempdir().unwrap();
+        let state = StateDirectory::at(root.path().join("state"));
         let port = "/dev/serial/by-id/usb-FTDI 1";
         let begin = |link: &str| {
             let sources = Sources { links: vec![link.to_owned()], ..Sources::default() };
@@ -326,7 +326,6 @@ mod tests {
         // What cannot be believed is as good as nothing.
         state.write("front.rate", &"9".repeat(10_000)).unwrap();
         assert_eq!(known("front", port), None);
-        std::fs::remove_dir_all(&root).unwrap();
     }
 
     #[test]

@@ -217,12 +217,11 @@ mod tests {
             config.links.iter().map(|link| (link.name.as_str(), link.variant.angle_deg)).collect();
         assert_eq!(named, [("front", 100), ("left", 180)]);
         assert_eq!(config.links[1].port, Source::File { path: file.to_owned(), paced: true });
-        let place = std::env::temp_dir().join(format!("scanhub-replay-{}.toml", std::process::id()));
+        let place = tempfile::NamedTempFile::new().unwrap().into_temp_path();
         std::fs::write(&place, "[[link]]\nname = \"rear\"\nport = \"/dev/x\"\nbaud = 38400\n[[link]]\nname = \"up\"\nport = \"y\"\n").unwrap();
-        let sources = Sources { files: vec![place.clone()], ..Sources::default() };
+        let sources = Sources { files: vec![place.to_path_buf()], ..Sources::default() };
         let config = configuration(&sources, &[sensor("rear")], file).unwrap();
         let left_out = left_out(&sources, &[sensor("rear")], &config).unwrap();
-        std::fs::remove_file(&place).unwrap();
         assert_eq!(
             (config.links.len(), config.links[0].baud.rate(), left_out),
             (1, 38_400, vec!["up".to_owned()])

@@ -236,16 +236,16 @@ pub(super) mod tests {
     use rustix::pty::{OpenptFlags, grantpt, openpt, ptsname};
     use std::os::unix::fs::symlink;
 
-    /// A made-up machine: files below a directory that is removed with the value.
+    /// A made-up machine: files below a temporary directory.
     pub(crate) struct Machine {
         pub(crate) root: PathBuf,
+        _directory: tempfile::TempDir,
     }
 
     impl Machine {
-        pub(crate) fn new(test: &str) -> Machine {
-            let root = std::env::temp_dir().join(format!("scanhub-machine-{test}-{}", std::process::id()));
-            fs::create_dir_all(&root).unwrap();
-            Machine { root: root.canonicalize().unwrap() }
+        pub(crate) fn new() -> Machine {
+            let directory = tempfile::tempdir().unwrap();
+            Machine { root: directory.path().canonicalize().unwrap(), _directory: directory }
         }
 
         pub(crate) fn directory(&self, path: &str) {
@@ -296,12 +296,6 @@ pub(super) mod tests {
         }
     }
 
-    impl Drop for Machine {
-        fn drop(&mut self) {
-            let _ = fs::remove_dir_all(&self.root);
-        }
-    }
-
     #[test]
     fn what_is_a_terminal_is_known_without_opening() {
         let pty = openpt(OpenptFlags::RDWR | OpenptFlags::NOCTTY).unwrap();
@@ -317,7 +311,7 @@ pub(super) mod tests {
 
     #[test]
     fn a_device_file_without_a_device_is_not_another_device() {
-        let machine = Machine::new("static-dev");
+        let machine = Machine::new();
         let known = machine.root.join("sys/dev/char");
         let check = |path: &str| check_tty_in(Path::new(path), &known);
         assert_eq!(check("/dev/null"), Ok(()), "without sysfs the device has to say it itself");
@@ -334,7 +328,7 @@ pub(super) mod tests {
 
     #[test]
     fn what_is_known_without_opening() {
-        let machine = Machine::new("known");
+        let machine = Machine::new();
         machine.usb("1-1", "0403:6001", "A1");
         machine.file("sys/devices/usb1/1-1/manufacturer", "FTDI\n");
         machine.file("sys/devices/usb1/1-1/product", "USB-RS422 Cable\n");
@@ -361,7 +355,7 @@ pub(super) mod tests {
 
     #[test]
     fn two_adapters_with_one_serial_number_are_named_by_their_sockets() {
-        let machine = Machine::new("twins");
+        let machine = Machine::new();
         for (tty, place) in [("ttyUSB0", "1-1"), ("ttyUSB1", "1-2")] {
             machine.usb(place, "10c4:ea60", "0001");
             machine.tty(tty, place, "cp210x");
@@ -397,7 +391,7 @@ pub(super) mod tests {
 
     #[test]
     fn the_debug_connector_of_a_raspberry_pi_5_is_named() {
-        let machine = Machine::new("pi");
+        let machine = Machine::new();
         machine.uart("ttyAMA10", "32\n");
         machine.link("dev/ttyAMA10", "dev/serial0");
         let found = found_in(&machine.root);

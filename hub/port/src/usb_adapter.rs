@@ -194,8 +194,8 @@ mod tests {
     use crate::candidates::tests::Machine;
 
     /// A machine with one adapter that has no port.
-    fn machine(test: &str, id: &str) -> Machine {
-        let machine = Machine::new(test);
+    fn machine(id: &str) -> Machine {
+        let machine = Machine::new();
         machine.usb("1-1.2", id, "");
         machine.file("proc/sys/kernel/osrelease", "6.8.0-45-generic\n");
         machine
@@ -209,7 +209,7 @@ mod tests {
 
     #[test]
     fn names_brltty_if_it_runs() {
-        let machine = machine("brltty", "1a86:7523");
+        let machine = machine("1a86:7523");
         machine.directory("sys/bus/usb/drivers/ch341");
         machine.file("proc/812/comm", "brltty\n");
         let adapter = only(&machine);
@@ -230,7 +230,7 @@ mod tests {
             ("067b:2303", "pl2303"),
             ("0483:5740", "cdc_acm"),
         ] {
-            let machine = machine(&format!("module-{module}"), id);
+            let machine = machine(id);
             let adapter = only(&machine);
             assert_eq!((adapter.module, &adapter.reason), (module, &Reason::NotLoaded), "no list of modules");
             assert!(
@@ -257,7 +257,7 @@ mod tests {
 
     #[test]
     fn names_what_has_the_adapter_although_the_driver_is_loaded() {
-        let machine = machine("bound", "10c4:ea60");
+        let machine = machine("10c4:ea60");
         machine.directory("sys/bus/usb/drivers/cp210x");
         assert_eq!(only(&machine).reason, Reason::NotBound);
         machine.directory("sys/bus/usb/drivers/usbfs");
@@ -278,7 +278,7 @@ mod tests {
 
     #[test]
     fn an_adapter_with_a_port_is_fine() {
-        let machine = machine("fine", "1a86:7523");
+        let machine = machine("1a86:7523");
         machine.tty("ttyUSB0", "1-1.2", "ch341");
         assert_eq!(PortlessAdapter::all(&machine.root), []);
         fs::remove_file(machine.root.join("dev/ttyUSB0")).unwrap();
@@ -286,7 +286,7 @@ mod tests {
         assert_eq!(adapter.reason, Reason::NoDevice { tty: "ttyUSB0".to_owned() });
         assert!(adapter.remedy().contains("--device /dev/ttyUSB0"), "{}", adapter.remedy());
         // Not a serial adapter.
-        let other = Machine::new("other");
+        let other = Machine::new();
         other.usb("1-1", "046d:c52b", "");
         assert_eq!(PortlessAdapter::all(&other.root), []);
     }

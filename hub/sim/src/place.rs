@@ -84,9 +84,8 @@ mod tests {
 
     #[test]
     fn only_what_a_simulator_left_behind_is_replaced() {
-        let directory = std::env::temp_dir().join(format!("scanhub-place-{}", std::process::id()));
-        fs::create_dir_all(&directory).unwrap();
-        let path = directory.join("port");
+        let directory = tempfile::tempdir().unwrap();
+        let path = directory.path().join("port");
         let link = || fs::read_link(&path).unwrap();
 
         drop(Place::new(&path, Path::new("/dev/pts/ptmx")).unwrap());
@@ -121,8 +120,7 @@ mod tests {
         fs::write(&path, "mine").unwrap();
         assert_eq!(Place::new(&path, Path::new("/dev/pts/0")).unwrap_err().kind.exit_code(), 4);
         assert_eq!(fs::read(&path).unwrap(), b"mine");
-        let deep = directory.join("no/port");
+        let deep = directory.path().join("no/port");
         assert_eq!(Place::new(&deep, Path::new("/dev/pts/0")).unwrap_err().kind, Kind::PortMissing);
-        fs::remove_dir_all(&directory).unwrap();
     }
 }

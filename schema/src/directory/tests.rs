@@ -3,30 +3,26 @@
 use std::fs::{self, Permissions};
 use std::os::unix::fs::{PermissionsExt, symlink};
 
+use tempfile::TempDir;
+
 use super::*;
 
 /// `HERE/base/domain`, each with mode 0700.
-struct Here(PathBuf);
+struct Here(TempDir);
 
 impl Here {
-    fn new(name: &str) -> Here {
-        let here = std::env::temp_dir().join(format!("shd{}-{name}", std::process::id()));
-        Directory::make(&here.join("base/domain")).unwrap();
-        Here(here)
+    fn new() -> Here {
+        let here = Here(TempDir::new().unwrap());
+        Directory::make(&here.at("base/domain")).unwrap();
+        here
     }
 
     fn at(&self, path: &str) -> PathBuf {
-        self.0.join(path)
+        self.0.path().join(path)
     }
 
     fn mode(&self, path: &str, mode: u32) {
         fs::set_permissions(self.at(path), Permissions::from_mode(mode)).unwrap();
-    }
-}
-
-impl Drop for Here {
-    fn drop(&mut self) {
-        let _ = fs::remove_dir_all(&self.0);
     }
 }
 
@@ -38,7 +34,7 @@ fn refusal(opened: Result<Option<Directory>, Failure>) -> String {
 
 #[test]
 fn what_is_missing_is_nothing_or_made_for_this_user_alone() {
-    let here = Here::new("made");
+    let here = Here::new();
     assert!(Directory::open(&here.at("base/domain")).unwrap().is_some());
     for absent in ["base/other", "other/domain", "a/b/c"] {
         assert!(Directory::open(&here.at(absent)).unwrap().is_none(), "{absent}");
@@ -51,7 +47,7 @@ fn what_is_missing_is_nothing_or_made_for_this_user_alone() {
 
 #[test]
 fn base_and_domain_are_this_users_alone() {
-    let here = Here::new("alone");
+    let here = Here::new();
     let path = here.at("base/domain");
     let own = user();
     let said = refusal(Walk::to(&path, own + 1, false));
@@ -72,7 +68,7 @@ fn base_and_domain_are_this_users_alone() {
 
 #[test]
 fn links_are_followed_above_the_base_where_nobody_else_makes_them() {
-    let here = Here::new("links");
+    let here = Here::new();
     symlink(here.at("base"), here.at("link")).unwrap();
     symlink("domain", here.at("base/alias")).unwrap();
     for (path, link) in [("link/domain", "link"), ("base/alias", "base/alias")] {
@@ -98,7 +94,7 @@ fn links_are_followed_above_the_base_where_nobody_else_makes_them() {
 
 #[test]
 fn files_are_regular_ones() {
-    let here = Here::new("files");
+    let here = Here::new();
     let directory = Directory::make(&here.at("base/domain")).unwrap();
     assert!(directory.file("hub.lock").unwrap().is_none());
     directory.file_or_new("hub.lock").unwrap();

@@ -71,8 +71,8 @@ mod tests {
 
     #[test]
     fn what_is_not_a_domains_stays() {
-        let base = std::env::temp_dir().join(format!("shc{}", std::process::id()));
-        let root = base.join("a");
+        let base = tempfile::tempdir().unwrap();
+        let root = base.path().join("a");
         let directory = Directory::make(&root).unwrap();
         fs::create_dir(root.join("nodes")).unwrap();
         symlink(root.join("full"), root.join("link.lock")).unwrap();
@@ -90,6 +90,5 @@ mod tests {
         }
         assert!(take_away(&directory, &root) && !root.exists());
         assert!(take_away(&directory, &root), "it is gone already");
-        fs::remove_dir_all(&base).unwrap();
     }
 }

@@ -90,15 +90,14 @@ mod tests {
 
     #[test]
     fn it_is_the_one_that_the_library_would_make() {
-        let base = std::env::temp_dir().join(format!("shk{}", std::process::id()));
+        let base = tempfile::tempdir().unwrap();
         let prefix = format!("sh_k{}_", std::process::id());
-        fs::create_dir(&base).unwrap();
         let join = || {
             let mut config = Config::default();
             config.global.prefix = FileName::new(prefix.as_bytes()).unwrap();
-            config
-                .global
-                .set_root_path(&iceoryx2::prelude::Path::new(base.as_os_str().as_encoded_bytes()).unwrap());
+            config.global.set_root_path(
+                &iceoryx2::prelude::Path::new(base.path().as_os_str().as_encoded_bytes()).unwrap(),
+            );
             let builder = NodeBuilder::new().signal_handling_mode(SignalHandlingMode::Disabled);
             builder.config(&config).create::<Service>().unwrap()
         };
@@ -126,7 +125,6 @@ mod tests {
         ensure(&prefix).unwrap();
         let mended = files();
         remove(&prefix);
-        fs::remove_dir_all(&base).unwrap();
 
         let content = |count: u32| {
             let mut content = CONTENT;

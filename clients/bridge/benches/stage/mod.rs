@@ -14,11 +14,12 @@ use std::time::{Duration, Instant};
 
 use scanhub_client::streams::{Session, Source};
 use scanhub_client::{Domain, Topic};
+use tempfile::TempDir;
 use zenoh::{Config, Wait};
 
 /// A directory for the programs of a bench, removed when it is dropped.
 pub(crate) struct Stage {
-    place: PathBuf,
+    place: TempDir,
     scanhub: PathBuf,
 }
 
@@ -46,21 +47,15 @@ impl Stage {
             eprintln!("{} was not built: run cargo build --release", scanhub.display());
             return None;
         }
-        let place = std::env::temp_dir().join(format!("scanhub-bench-{name}-{}", std::process::id()));
-        make(&place);
+        let prefix = format!("scanhub-bench-{name}-");
+        let place = tempfile::Builder::new().prefix(&prefix).tempdir().expect("a new directory");
         Some(Stage { place, scanhub })
     }
 
     pub(crate) fn machine(&self, name: &str) -> Machine<'_> {
-        let root = self.place.join(name);
+        let root = self.place.path().join(name);
         make(&root);
         Machine { stage: self, root }
-    }
-}
-
-impl Drop for Stage {
-    fn drop(&mut self) {
-        let _ = fs::remove_dir_all(&self.place);
     }
 }
 

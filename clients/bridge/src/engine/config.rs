@@ -213,11 +213,9 @@ mod tests {
 
     /// What becomes of a file with this `text`.
     fn of_file(name: &str, text: &str, connect: &[&str]) -> Result<Prepared, Failure> {
-        let path = std::env::temp_dir().join(format!("scanhub-bridge-{}-{name}", std::process::id()));
-        std::fs::write(&path, text).unwrap();
-        let read = Prepared::read(&options(connect, &[], Some(&path)), NOW_S);
-        std::fs::remove_file(&path).unwrap();
-        read
+        let file = tempfile::Builder::new().suffix(name).tempfile().unwrap();
+        std::fs::write(&file, text).unwrap();
+        Prepared::read(&options(connect, &[], Some(file.path())), NOW_S)
     }
 
     #[test]

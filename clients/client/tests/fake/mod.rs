@@ -16,10 +16,12 @@ use schema::{
     Background, Domain, Failure, Foreground, Header, HubLock, Marks, Scan, ScanHead, State, Status, Verdict,
     Wake, Zones,
 };
+use tempfile::TempDir;
 
 /// A domain that goes with the test.
 pub(crate) struct Place {
     pub(crate) base: PathBuf,
+    _directory: TempDir,
     pub(crate) domain: Domain,
 }
 
@@ -27,8 +29,10 @@ impl Place {
     pub(crate) fn new() -> Place {
         static NEXT: AtomicU32 = AtomicU32::new(0);
         let name = format!("c{}-{}", std::process::id(), NEXT.fetch_add(1, Ordering::Relaxed));
-        let base = PathBuf::from(format!("/tmp/sh{name}"));
-        Place { domain: Domain::at(&name, &base).unwrap(), base }
+        // Not TMPDIR: root and prefix of a domain must be short.
+        let directory = tempfile::Builder::new().prefix("sh").tempdir_in("/tmp").unwrap();
+        let base = directory.path().to_owned();
+        Place { domain: Domain::at(&name, &base).unwrap(), base, _directory: directory }
     }
 
     pub(crate) fn places(&self) -> Vec<Domain> {
@@ -38,7 +42,6 @@ impl Place {
 
 impl Drop for Place {
     fn drop(&mut self) {
-        let _ = std::fs::remove_dir_all(&self.base);
         // The node management of a domain outlives its nodes.
         for entry in std::fs::read_dir("/dev/shm").into_iter().flatten().flatten() {
             if entry.file_name().to_string_lossy().starts_with(&self.domain.prefix()) {

@@ -119,13 +119,15 @@ const MOST: u32 = 16;
 
 #[cfg(test)]
 mod tests {
+    use tempfile::TempDir;
+
     use super::*;
 
-    struct Place(PathBuf);
+    struct Place(TempDir);
 
     impl Place {
-        fn new(name: &str) -> Place {
-            Place(std::env::temp_dir().join(format!("scanhub-life-{}-{name}", std::process::id())))
+        fn new() -> Place {
+            Place(TempDir::new().unwrap())
         }
 
         fn begin(&self, interface: &str, now_s: u64) -> Life {
@@ -133,19 +135,13 @@ mod tests {
         }
 
         fn begin_on(&self, interface: &str, now_s: u64, machine: Option<u64>) -> Life {
-            Life::begin(&self.0, "d", interface, now_s, machine).unwrap()
-        }
-    }
-
-    impl Drop for Place {
-        fn drop(&mut self) {
-            let _ = std::fs::remove_dir_all(&self.0);
+            Life::begin(self.0.path(), "d", interface, now_s, machine).unwrap()
         }
     }
 
     #[test]
     fn each_life_has_a_greater_epoch() {
-        let place = Place::new("epoch");
+        let place = Place::new();
         let (hub, epoch) = {
             let life = place.begin("eth0", 1000);
             (life.hub, life.epoch)
@@ -159,7 +155,7 @@ mod tests {
 
     #[test]
     fn two_at_once_are_two() {
-        let place = Place::new("two");
+        let place = Place::new();
         let first = place.begin("eth0", 1);
         let (second, elsewhere) = (place.begin("eth0", 1), place.begin("wlan0", 1));
         assert!(first.hub != second.hub && first.hub != elsewhere.hub && second.hub != elsewhere.hub);
@@ -171,7 +167,7 @@ mod tests {
 
     #[test]
     fn a_copy_on_another_machine_is_another_gateway() {
-        let place = Place::new("copy");
+        let place = Place::new();
         let of = |life: Life| (life.hub, life.epoch, life.is_renumbered);
         // Kept before machines were told apart, and where they cannot be.
         let (hub, ..) = of(place.begin("eth0", 7));
@@ -185,9 +181,9 @@ mod tests {
 
     #[test]
     fn what_is_no_number_is_replaced() {
-        let place = Place::new("torn");
+        let place = Place::new();
         let hub = place.begin("eth0", 7).hub;
-        let path = place.0.join("gateway-d-eth0-1");
+        let path = place.0.path().join("gateway-d-eth0-1");
         for torn in ["", "0123", "0123456789abcdef 4294967295\n", "0123456789abcdef 12\n", &"x".repeat(60)] {
             std::fs::write(&path, torn).unwrap();
             let life = place.begin("eth0", 8);

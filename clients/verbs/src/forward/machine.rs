@@ -28,7 +28,8 @@ mod tests {
 
     #[test]
     fn an_id_is_always_the_same_number() {
-        let path = std::env::temp_dir().join(format!("scanhub-machine-{}", std::process::id()));
+        let directory = tempfile::tempdir().unwrap();
+        let path = directory.path().join("machine-id");
         let of = |text: &str| {
             std::fs::write(&path, text).unwrap();
             machine(&path)

@@ -143,39 +143,29 @@ const TRIGGER: &str = "trigger";
 #[cfg(test)]
 mod tests {
     use super::*;
-    use std::sync::atomic::{AtomicU32, Ordering};
+    use tempfile::TempDir;
 
-    /// A directory that stands in for the kernel's.
-    struct Root(PathBuf);
+    /// A directory that replaces the kernel's.
+    struct Root(TempDir);
 
     impl Root {
         fn new() -> Root {
-            static NEXT: AtomicU32 = AtomicU32::new(0);
-            let name = format!("shl{}-{}", std::process::id(), NEXT.fetch_add(1, Ordering::Relaxed));
-            let root = Root(std::env::temp_dir().join(name));
-            fs::create_dir(&root.0).unwrap();
-            root
+            Root(TempDir::new().unwrap())
         }
 
         fn plug(&self, name: &str, trigger: &str) {
-            fs::create_dir(self.0.join(name)).unwrap();
+            fs::create_dir(self.0.path().join(name)).unwrap();
             for (file, content) in [(BRIGHTNESS, "77\n"), ("max_brightness", "255\n"), (TRIGGER, trigger)] {
-                fs::write(self.0.join(name).join(file), content).unwrap();
+                fs::write(self.0.path().join(name).join(file), content).unwrap();
             }
         }
 
         fn unplug(&self, name: &str) {
-            fs::remove_dir_all(self.0.join(name)).unwrap();
+            fs::remove_dir_all(self.0.path().join(name)).unwrap();
         }
 
         fn brightness(&self, name: &str) -> String {
-            fs::read_to_string(self.0.join(name).join(BRIGHTNESS)).unwrap()
-        }
-    }
-
-    impl Drop for Root {
-        fn drop(&mut self) {
-            let _ = fs::remove_dir_all(&self.0);
+            fs::read_to_string(self.0.path().join(name).join(BRIGHTNESS)).unwrap()
         }
     }
 
@@ -183,11 +173,11 @@ mod tests {
     fn a_light_is_written_where_it_changes() {
         let (root, now) = (Root::new(), Instant::now());
         root.plug("red", "[none] timer\n");
-        let (mut red, trigger) = Device::open(&root.0, "red").unwrap();
+        let (mut red, trigger) = Device::open(root.0.path(), "red").unwrap();
         assert_eq!((trigger, root.brightness("red").as_str()), (None, "0\n"));
         assert_eq!((red.show(true, now), root.brightness("red").as_str()), (None, "255\n"));
         // Somebody else's doing is not undone, so nothing was written.
-        fs::write(root.0.join("red").join(BRIGHTNESS), "3\n").unwrap();
+        fs::write(root.0.path().join("red").join(BRIGHTNESS), "3\n").unwrap();
         assert_eq!((red.show(true, now), root.brightness("red").as_str()), (None, "3\n"));
         assert_eq!((red.show(false, now), root.brightness("red").as_str()), (None, "0\n"));
     }
@@ -196,9 +186,9 @@ mod tests {
     fn a_light_that_blinks_by_itself_is_taken_from_what_makes_it() {
         let root = Root::new();
         root.plug("red", "none timer [heartbeat]\n");
-        let (_, trigger) = Device::open(&root.0, "red").unwrap();
+        let (_, trigger) = Device::open(root.0.path(), "red").unwrap();
         assert_eq!(trigger.as_deref(), Some("heartbeat"));
-        assert_eq!(fs::read_to_string(root.0.join("red").join(TRIGGER)).unwrap(), "none\n");
+        assert_eq!(fs::read_to_string(root.0.path().join("red").join(TRIGGER)).unwrap(), "none\n");
     }
 
     #[test]
@@ -208,10 +198,10 @@ mod tests {
             if !plugged.is_empty() {
                 root.plug(plugged, "");
             }
-            let nowhere = Device::open(&root.0.join("nowhere"), "red").err().unwrap();
+            let nowhere = Device::open(&root.0.path().join("nowhere"), "red").err().unwrap();
             assert!(nowhere.message.ends_with("/nowhere is no directory"), "{nowhere}");
             for name in ["blue", "", "..", "red/../red"] {
-                let failure = Device::open(&root.0, name).err().unwrap();
+                let failure = Device::open(root.0.path(), name).err().unwrap();
                 assert_eq!(failure.kind, Kind::Configuration, "{name}");
                 assert!(failure.message.contains(&format!("no light {name:?}")), "{failure}");
                 assert!(failure.hint.starts_with(hint), "{failure}");
@@ -223,7 +213,7 @@ mod tests {
     fn one_that_is_unplugged_is_told_once_and_taken_up_when_it_is_back() {
         let (root, start) = (Root::new(), Instant::now());
         root.plug("red", "[none]\n");
-        let (mut red, _) = Device::open(&root.0, "red").unwrap();
+        let (mut red, _) = Device::open(root.0.path(), "red").unwrap();
         root.unplug("red");
         let Some(News::Failed(failure)) = red.show(true, start) else { panic!("nothing told") };
         assert!(failure.message.contains("red/brightness cannot be written"), "{failure}");
@@ -236,15 +226,15 @@ mod tests {
         );
         assert_eq!(red.show(true, start + 2 * AGAIN), Some(News::Back));
         assert_eq!(root.brightness("red"), "255\n");
-        assert_eq!(fs::read_to_string(root.0.join("red").join(TRIGGER)).unwrap(), "none\n");
+        assert_eq!(fs::read_to_string(root.0.path().join("red").join(TRIGGER)).unwrap(), "none\n");
     }
 
     #[test]
     fn what_the_kernel_says_is_no_number_is_told() {
         let root = Root::new();
         root.plug("red", "[none]\n");
-        let (mut red, _) = Device::open(&root.0, "red").unwrap();
-        fs::write(root.0.join("red").join("max_brightness"), "bright\n").unwrap();
+        let (mut red, _) = Device::open(root.0.path(), "red").unwrap();
+        fs::write(root.0.path().join("red").join("max_brightness"), "bright\n").unwrap();
         let Some(News::Failed(failure)) = red.show(true, Instant::now()) else { panic!("nothing told") };
         assert!(failure.message.contains("its max_brightness is \"bright\""), "{failure}");
     }

@@ -65,8 +65,8 @@ mod tests {
 
     #[test]
     fn listeners_that_keep_at_once_forget_nothing() {
-        let root = std::env::temp_dir().join(format!("scanhub-epochs-at-once-{}", std::process::id()));
-        let epochs = || Epochs::of(&Key::new(&[1; 32]), Some(StateDirectory::at(&root)));
+        let root = tempfile::tempdir().unwrap();
+        let epochs = || Epochs::of(&Key::new(&[1; 32]), Some(StateDirectory::at(root.path())));
         std::thread::scope(|scope| {
             for listener in 0..8u64 {
                 let epochs = epochs();
@@ -77,13 +77,12 @@ mod tests {
             }
         });
         assert_eq!(epochs().read().unwrap().len(), 80);
-        std::fs::remove_dir_all(&root).unwrap();
     }
 
     #[test]
     fn no_more_are_kept_than_a_listener_knows() {
-        let root = std::env::temp_dir().join(format!("scanhub-epochs-many-{}", std::process::id()));
-        let epochs = Epochs::of(&Key::new(&[1; 32]), Some(StateDirectory::at(&root)));
+        let root = tempfile::tempdir().unwrap();
+        let epochs = Epochs::of(&Key::new(&[1; 32]), Some(StateDirectory::at(root.path())));
         let many = |from: u64, count: u64| (from..from + count).map(|hub| (hub, hub as u32 + 1)).collect();
         epochs.keep(&many(0, GATEWAYS as u64)).unwrap();
         epochs.keep(&many(50_000, 10)).unwrap();
@@ -91,21 +90,20 @@ mod tests {
         let kept = epochs.read().unwrap();
         assert_eq!((kept.len(), kept.contains_key(&10)), (GATEWAYS, false), "the oldest lives are forgotten");
         assert_eq!((kept.get(&7), kept.get(&50_009)), (Some(&1), Some(&50_010)));
-        std::fs::remove_dir_all(&root).unwrap();
     }
 
     #[test]
     fn the_greatest_of_all_listeners_is_kept() {
-        let root = std::env::temp_dir().join(format!("scanhub-epochs-{}", std::process::id()));
-        let epochs = |key| Epochs::of(&Key::new(&[key; 32]), Some(StateDirectory::at(&root)));
+        let root = tempfile::tempdir().unwrap();
+        let epochs = |key| Epochs::of(&Key::new(&[key; 32]), Some(StateDirectory::at(root.path())));
         assert_eq!(epochs(1).read().unwrap(), HashMap::new());
         epochs(1).keep(&HashMap::from([(5, 7), (6, 1)])).unwrap();
         epochs(1).keep(&HashMap::from([(5, 6), (7, u32::MAX)])).unwrap();
         assert_eq!(epochs(1).read().unwrap(), HashMap::from([(5, 7), (6, 1), (7, u32::MAX)]));
         assert_eq!(epochs(2).read().unwrap(), HashMap::new(), "another key");
-        std::fs::write(StateDirectory::at(&root).path(&epochs(1).name), "torn\n5 9 \nffff 3\n").unwrap();
+        std::fs::write(StateDirectory::at(root.path()).path(&epochs(1).name), "torn\n5 9 \nffff 3\n")
+            .unwrap();
         assert_eq!(epochs(1).read().unwrap(), HashMap::from([(0xffff, 3)]));
-        std::fs::remove_dir_all(&root).unwrap();
         assert_eq!(Epochs::of(&Key::new(&[1; 32]), None).keep(&HashMap::from([(5, 7)])), Ok(()));
     }
 }

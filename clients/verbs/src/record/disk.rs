@@ -304,19 +304,18 @@ const LOOK_EVERY: Duration = Duration::from_secs(1);
 #[cfg(test)]
 mod tests {
     use std::fs;
-    use std::path::Path;
 
     use schema::file::Compression;
     use schema::{Header, Status};
+    use tempfile::TempDir;
 
     use super::super::part::Form;
     use super::*;
 
-    /// A recording in a directory of its own, of the status of these sensors.
-    fn disk(name: &str, split: Option<Split>, sensors: &[&str]) -> (PathBuf, Disk) {
-        let place = std::env::temp_dir().join(format!("scanhub-{name}-{}", std::process::id()));
-        fs::create_dir_all(&place).unwrap();
-        let files = Files::new(&place.join("walk.mcap"), split.is_some(), false, None, "");
+    /// Starts a recording of the status of these sensors, in its own directory.
+    fn disk(split: Option<Split>, sensors: &[&str]) -> (TempDir, Disk) {
+        let place = TempDir::new().unwrap();
+        let files = Files::new(&place.path().join("walk.mcap"), split.is_some(), false, None, "");
         let style = Style { form: Form::Hub, compression: Compression::None };
         let disk = Disk::begin(Arc::new(Queue::new()), Ok(files), split, style, BTreeMap::new()).unwrap();
         for sensor in sensors {
@@ -332,7 +331,7 @@ mod tests {
         assert!(pushed);
     }
 
-    fn names(place: &Path) -> Vec<String> {
+    fn names(place: &TempDir) -> Vec<String> {
         let names = fs::read_dir(place).unwrap().map(|entry| entry.unwrap().file_name());
         let mut names: Vec<_> = names.map(|name| name.to_string_lossy().into_owned()).collect();
         names.sort();
@@ -342,7 +341,7 @@ mod tests {
     #[test]
     fn a_file_in_which_nothing_came_lasts() {
         let hour = Duration::from_secs(3600);
-        let (place, mut disk) = disk("lasts", Some(Split::Time(hour)), &["front"]);
+        let (place, mut disk) = disk(Some(Split::Time(hour)), &["front"]);
         let now = Instant::now();
         for hours in 1..5 {
             disk.step(now + hours * hour, false).unwrap();
@@ -352,13 +351,12 @@ mod tests {
         disk.step(now, false).unwrap();
         disk.step(now + 2 * hour, false).unwrap();
         assert_eq!(names(&place), ["walk-0001.mcap", "walk-0002.mcap"]);
-        fs::remove_dir_all(place).unwrap();
     }
 
     #[test]
     fn keeps_one_file_where_one_is_wanted() {
-        let (place, mut disk) = disk("one", None, &["front"]);
-        disk.files = Some(Files::new(&place.join("run.mcap"), true, false, Some(1), "run 1"));
+        let (place, mut disk) = disk(None, &["front"]);
+        disk.files = Some(Files::new(&place.path().join("run.mcap"), true, false, Some(1), "run 1"));
         disk.facts.insert("started_ns".to_owned(), "run 1".to_owned());
         for number in 1..4 {
             push(&disk, 0);
@@ -368,24 +366,22 @@ mod tests {
             assert_eq!(names(&place), [&format!("run-{number:04}.mcap")[..], "walk.mcap"]);
             assert!(!disk.progress.stats().news.iter().any(|news| matches!(news, News::Gone(..))));
         }
-        fs::remove_dir_all(place).unwrap();
     }
 
     #[test]
     fn an_index_that_grew_too_large_ends_a_file() {
-        let (place, mut disk) = disk("index", None, &["front"]);
+        let (place, mut disk) = disk(None, &["front"]);
         disk.most_index = 1000;
         for _ in 0..9 {
             push(&disk, 0);
             disk.step(Instant::now(), false).unwrap();
         }
         assert_eq!(names(&place), ["walk-0002.mcap", "walk.mcap"]);
-        fs::remove_dir_all(place).unwrap();
     }
 
     #[test]
     fn what_a_sensor_said_that_is_gone_is_not_said_again() {
-        let (place, mut disk) = disk("gone", None, &["front", "rear"]);
+        let (_place, mut disk) = disk(None, &["front", "rear"]);
         (0..2).for_each(|track| push(&disk, track));
         disk.step(Instant::now(), false).unwrap();
         let mut next = || {
@@ -398,17 +394,15 @@ mod tests {
         disk.renew().unwrap();
         disk.write().unwrap();
         assert!(both == again && disk.part.written < both, "{both} {again} {}", disk.part.written);
-        fs::remove_dir_all(place).unwrap();
     }
 
     #[test]
     fn a_file_that_was_cut_is_lost() {
-        let (place, mut disk) = disk("cut", None, &["front"]);
+        let (place, mut disk) = disk(None, &["front"]);
         push(&disk, 0);
         disk.step(Instant::now(), false).unwrap();
         assert!(disk.part.look().is_ok());
-        File::options().write(true).open(place.join("walk.mcap")).unwrap().set_len(100).unwrap();
+        File::options().write(true).open(place.path().join("walk.mcap")).unwrap().set_len(100).unwrap();
         assert_eq!(disk.part.look().map_err(|error| error.kind()), Err(ErrorKind::NotFound));
-        fs::remove_dir_all(place).unwrap();
     }
 }

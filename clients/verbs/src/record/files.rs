@@ -359,11 +359,11 @@ mod tests {
 
     #[test]
     fn keeps_the_newest_files_of_all_runs_when_forced() {
-        let place = std::env::temp_dir().join(format!("scanhub-keep-{}", std::process::id()));
-        fs::create_dir_all(&place).unwrap();
+        let directory = tempfile::tempdir().unwrap();
+        let place = directory.path();
         let at = |name: &str| place.join(name);
         let names = || {
-            let mut names: Vec<_> = fs::read_dir(&place).unwrap().map(|it| it.unwrap().file_name()).collect();
+            let mut names: Vec<_> = fs::read_dir(place).unwrap().map(|it| it.unwrap().file_name()).collect();
             names.sort();
             names.into_iter().map(|name| name.into_string().unwrap()).collect::<Vec<_>>()
         };
@@ -417,13 +417,12 @@ mod tests {
         assert_eq!(kept(), ["walk-0014.mcap", "walk-0015.mcap", "walk-0016.mcap"]);
         assert!(others.iter().all(|name| names().iter().any(|there| there == name)), "{:?}", names());
         drop(written);
-        fs::remove_dir_all(place).unwrap();
     }
 
     #[test]
     fn does_not_remove_a_file_that_is_recorded_into_meanwhile() {
-        let place = std::env::temp_dir().join(format!("scanhub-meanwhile-{}", std::process::id()));
-        fs::create_dir_all(&place).unwrap();
+        let directory = tempfile::tempdir().unwrap();
+        let place = directory.path();
         let path = place.join("walk-0001.mcap");
         fs::write(&path, recording("run 1")).unwrap();
         let mut files = Files::new(&place.join("walk.mcap"), true, true, Some(1), "run 2");
@@ -433,13 +432,12 @@ mod tests {
         lock::take(&other).unwrap();
         files.prune();
         assert!(path.exists());
-        fs::remove_dir_all(place).unwrap();
     }
 
     #[test]
     fn no_recorder_takes_a_file_that_is_being_removed() {
-        let place = std::env::temp_dir().join(format!("scanhub-removed-{}", std::process::id()));
-        fs::create_dir_all(&place).unwrap();
+        let directory = tempfile::tempdir().unwrap();
+        let place = directory.path();
         let path = place.join("walk-0001.mcap");
         fs::write(&path, recording("run 1")).unwrap();
         let busy = |path: &Path| open(path, true).map(drop).map_err(|error| error.kind());
@@ -449,13 +447,12 @@ mod tests {
         }
         assert_eq!(fs::read(&path).unwrap(), recording("run 1"), "it was not emptied");
         assert_eq!(busy(&path), Ok(()));
-        fs::remove_dir_all(place).unwrap();
     }
 
     #[test]
     fn files_of_others_stay() {
-        let place = std::env::temp_dir().join(format!("scanhub-files-{}", std::process::id()));
-        fs::create_dir_all(&place).unwrap();
+        let directory = tempfile::tempdir().unwrap();
+        let place = directory.path();
         let at = |name: &str| place.join(name);
         let mut files = Files::new(&at("walk.mcap"), true, false, Some(2), "run 1");
         assert_eq!(files.first().unwrap().0, at("walk-0001.mcap"));
@@ -486,13 +483,12 @@ mod tests {
         assert_eq!(fs::read(at("walk-0002.mcap")).unwrap(), b"another's");
         let mut one = Files::new(&at("one"), false, true, None, "");
         assert_eq!((one.first().unwrap().0, one.next().unwrap().0), (at("one"), at("one-0002")));
-        fs::remove_dir_all(place).unwrap();
     }
 
     #[test]
     fn a_file_has_one_writer() {
-        let place = std::env::temp_dir().join(format!("scanhub-writer-{}", std::process::id()));
-        fs::create_dir_all(&place).unwrap();
+        let directory = tempfile::tempdir().unwrap();
+        let place = directory.path();
         let path = place.join("walk.mcap");
         let (_, mut file) = Files::new(&path, false, false, None, "").first().unwrap();
         io::Write::write_all(&mut file, b"mine").unwrap();
@@ -501,6 +497,5 @@ mod tests {
         drop(file);
         assert!(Files::new(&path, false, true, None, "").first().is_ok());
         assert_eq!(fs::read(&path).unwrap(), b"");
-        fs::remove_dir_all(place).unwrap();
     }
 }

@@ -5,7 +5,9 @@ use std::fs;
 use std::path::Path;
 use std::sync::atomic::AtomicBool;
 
-use crate::folder::{Folder, converted};
+use tempfile::TempDir;
+
+use crate::folder::{converted, file};
 use crate::real;
 use lms::measured;
 use lms::reply;
@@ -19,8 +21,8 @@ use schema::{Flags, Header, Mark, Marks, Topic};
 const CM: Encoding = Encoding { unit: Unit::Cm, mode: Mode(0) };
 
 /// Names of all files in `folder`.
-fn names(folder: &Folder) -> Vec<String> {
-    let mut names: Vec<_> = fs::read_dir(&folder.0)
+fn names(folder: &TempDir) -> Vec<String> {
+    let mut names: Vec<_> = fs::read_dir(folder.path())
         .unwrap()
         .map(|entry| entry.unwrap().file_name().into_string().unwrap())
         .collect();
@@ -44,9 +46,9 @@ fn messages(bytes: &[u8]) -> Vec<(String, u32, u64, u64, Vec<u8>)> {
 
 #[test]
 fn an_mcap_file_keeps_all_messages_of_all_channels() {
-    let folder = Folder::new("copy");
+    let folder = TempDir::new().unwrap();
     let written = crate::written::recording(20, 11);
-    let (whole, copy) = (folder.file("whole.mcap", &written.bytes), folder.0.join("copy.mcap"));
+    let (whole, copy) = (file(&folder, "whole.mcap", &written.bytes), folder.path().join("copy.mcap"));
     let account = converted(&whole, &copy, None).unwrap();
     assert_eq!((account.telegrams, account.scans, account.left_out), (40, 36, 0));
     assert_eq!(account.telegrams, written.telegrams.len() as u64);
@@ -55,7 +57,7 @@ fn an_mcap_file_keeps_all_messages_of_all_channels() {
     assert!(messages(&bytes) == messages(&written.bytes));
     let told = |bytes: &[u8]| mcap::Summary::read(bytes).unwrap().unwrap().metadata_indexes.len();
     assert_eq!(told(&bytes), 1);
-    let rear = folder.0.join("rear.mcap");
+    let rear = folder.path().join("rear.mcap");
     assert_eq!(converted(&whole, &rear, Some("rear")).unwrap().telegrams, 20);
     let only = messages(&fs::read(&rear).unwrap());
     assert!(only.len() == 200 && only.iter().all(|(topic, ..)| topic.starts_with("rear/")));
@@ -63,7 +65,7 @@ fn an_mcap_file_keeps_all_messages_of_all_channels() {
 
 #[test]
 fn a_file_that_was_cut_or_harmed_is_whole_afterwards() {
-    let folder = Folder::new("repair");
+    let folder = TempDir::new().unwrap();
     let written = crate::written::recording(20, 12);
     let all = messages(&written.bytes);
     let mut harmed = written.bytes.clone();
@@ -71,8 +73,8 @@ fn a_file_that_was_cut_or_harmed_is_whole_afterwards() {
     harmed[middle] ^= 0x10;
     let cut = &written.bytes[..written.bytes.len() * 2 / 3];
     for (name, bytes) in [("cut", cut), ("harmed", &harmed)] {
-        let broken = folder.file(&format!("{name}-in.mcap"), bytes);
-        let whole = folder.0.join(format!("{name}-out.mcap"));
+        let broken = file(&folder, &format!("{name}-in.mcap"), bytes);
+        let whole = folder.path().join(format!("{name}-out.mcap"));
         let account = converted(&broken, &whole, None).unwrap();
         assert!(!account.damage.is_none(), "{name}");
         assert_eq!(account.damage.is_cut, name == "cut");
@@ -91,14 +93,15 @@ fn a_file_that_was_cut_or_harmed_is_whole_afterwards() {
 
 #[test]
 fn a_stream_gets_times_and_loses_none_of_its_telegrams() {
-    let folder = Folder::new("stream");
+    let folder = TempDir::new().unwrap();
     let mut scans: Vec<Vec<u8>> = vec![reply::configuration(0, Mode(4), Unit::Mm, 0x10).bytes().to_vec()];
     scans.extend((0..30).map(|first| {
         let words: Vec<u16> = (0..361).map(|i| 500 + first + i).collect();
         measured::encode(0, Unit::Mm, &words, 0x10).bytes().to_vec()
     }));
-    let stream = folder.file("a.bin", &[b"noise", &scans.concat()[..]].concat());
-    let (mcap, again, log) = (folder.0.join("a.mcap"), folder.0.join("b.bin.gz"), folder.0.join("a.log.gz"));
+    let stream = file(&folder, "a.bin", &[b"noise", &scans.concat()[..]].concat());
+    let (mcap, again, log) =
+        (folder.path().join("a.mcap"), folder.path().join("b.bin.gz"), folder.path().join("a.log.gz"));
     let account = converted(&stream, &mcap, Some("left")).unwrap();
     assert_eq!((account.forms, account.telegrams), ((Form::Telegrams, Target::Recording(Form::Mcap)), 31));
     // As the stamps say that it gets: a reply takes its time on the line.
@@ -106,7 +109,7 @@ fn a_stream_gets_times_and_loses_none_of_its_telegrams() {
         account.took_ns.is_some_and(|ns| (29 * 26_640_000..30 * 26_640_000).contains(&ns)),
         "{account:?}"
     );
-    assert_eq!(converted(&stream, &folder.0.join("c.bin"), None).unwrap().took_ns, None);
+    assert_eq!(converted(&stream, &folder.path().join("c.bin"), None).unwrap().took_ns, None);
     let recording = Recording::open(&mcap).unwrap();
     assert_eq!(
         (&recording.contents().sensors[..], recording.contents().mode),
@@ -135,13 +138,14 @@ fn rows(options: &ConvertOptions) -> (Converted, Vec<String>) {
 
 #[test]
 fn rows_have_intensities_and_meters_on_request() {
-    let folder = Folder::new("columns");
+    let folder = TempDir::new().unwrap();
     // Three reflector bits above the range.
     let words: Vec<u16> = (0..181).map(|i| (1234 + i) | ((i % 8) << 13)).collect();
     let scan = measured::encode(0, Unit::Mm, &words, 0x10);
     let told = reply::configuration(0, Mode(1), Unit::Mm, 0x10);
-    let input = folder.file("a.bin", &[told.bytes(), scan.bytes()].concat());
-    let plain = ConvertOptions { input, output: folder.0.join("a.csv"), force: true, ..Default::default() };
+    let input = file(&folder, "a.bin", &[told.bytes(), scan.bytes()].concat());
+    let plain =
+        ConvertOptions { input, output: folder.path().join("a.csv"), force: true, ..Default::default() };
     let (_, lines) = rows(&plain);
     let cells = |line: &str| line.split(',').map(str::to_owned).collect::<Vec<_>>();
     let [names, row] = [&lines[0], &lines[1]].map(|line| cells(line));
@@ -157,17 +161,24 @@ fn rows_have_intensities_and_meters_on_request() {
     assert_eq!((row.len(), &row[189..194]), (370, &["0", "1", "2", "3", "4"].map(String::from)[..]));
 
     let log = format!("FLASER 181{} 0 0 0 0 0 0 12.5 host 1\n", " 1.25".repeat(181));
-    let input = folder.file("a.log", log.as_bytes());
-    let none =
-        ConvertOptions { input, output: folder.0.join("b.csv"), intensities: true, ..Default::default() };
+    let input = file(&folder, "a.log", log.as_bytes());
+    let none = ConvertOptions {
+        input,
+        output: folder.path().join("b.csv"),
+        intensities: true,
+        ..Default::default()
+    };
     let failure = convert(&none, &AtomicBool::new(false), |_, _| {}).unwrap_err();
     assert_eq!(failure.kind.exit_code(), 66);
-    assert!(failure.message.contains("has intensities") && !folder.0.join("b.csv").exists(), "{failure}");
+    assert!(
+        failure.message.contains("has intensities") && !folder.path().join("b.csv").exists(),
+        "{failure}"
+    );
 }
 
 #[test]
 fn recorded_marks_become_rows() {
-    let folder = Folder::new("marks");
+    let folder = TempDir::new().unwrap();
     let mut writer = Writer::begin(Vec::new(), "", Default::default()).unwrap();
     let mut marks = Marks { count: 2, ..Marks::default() };
     for (number, mark) in marks.mark_array[..2].iter_mut().enumerate() {
@@ -181,8 +192,8 @@ fn recorded_marks_become_rows() {
         let len = marks.pack(&mut room).unwrap();
         writer.sample(sensor, Topic::Marks, &header, &room[..len]).unwrap();
     }
-    let input = folder.file("a.mcap", &writer.finish().unwrap());
-    let output = folder.0.join("marks.csv");
+    let input = file(&folder, "a.mcap", &writer.finish().unwrap());
+    let output = folder.path().join("marks.csv");
     let topic = Some("front/marks".to_owned());
     let options = ConvertOptions { input: input.clone(), output, topic, force: true, ..Default::default() };
     let (account, lines) = rows(&options);
@@ -201,7 +212,7 @@ fn recorded_marks_become_rows() {
     let (_, lines) = rows(&ConvertOptions { meters: true, ..options.clone() });
     assert!(lines[0].contains(",range_m,") && lines[2].contains(",2.0001,"), "{lines:?}");
 
-    let stream = folder.file("a.bin", measured::encode(0, Unit::Cm, &[7; 181], 0x10).bytes());
+    let stream = file(&folder, "a.bin", measured::encode(0, Unit::Cm, &[7; 181], 0x10).bytes());
     let topic = |topic: &str| Some(topic.to_owned());
     for (changed, code, says) in [
         (ConvertOptions { topic: topic("side/marks"), ..options.clone() }, 3, "no sensor \"side\""),
@@ -210,10 +221,15 @@ fn recorded_marks_become_rows() {
         (ConvertOptions { sensor: topic("rear"), ..options.clone() }, 2, "different sensors"),
         (ConvertOptions { intensities: true, ..options.clone() }, 2, "--intensities is for scans"),
         (ConvertOptions { mode: Some(Mode(1)), ..options.clone() }, 2, "--mode is for scans"),
-        (ConvertOptions { output: folder.0.join("a.log"), ..options.clone() }, 2, "--topic is for CSV"),
+        (ConvertOptions { output: folder.path().join("a.log"), ..options.clone() }, 2, "--topic is for CSV"),
         (ConvertOptions { input: stream, ..options.clone() }, 3, "no recorded marks"),
         (
-            ConvertOptions { topic: None, meters: true, output: folder.0.join("b.mcap"), ..options.clone() },
+            ConvertOptions {
+                topic: None,
+                meters: true,
+                output: folder.path().join("b.mcap"),
+                ..options.clone()
+            },
             2,
             "--meters is for CSV",
         ),
@@ -221,7 +237,7 @@ fn recorded_marks_become_rows() {
             ConvertOptions {
                 topic: None,
                 intensities: true,
-                output: folder.0.join("b.log"),
+                output: folder.path().join("b.log"),
                 ..options.clone()
             },
             2,
@@ -237,9 +253,9 @@ fn recorded_marks_become_rows() {
 #[test]
 fn a_stream_of_a_real_sensor_comes_back() {
     let Some(data) = real::recordings() else { return };
-    let folder = Folder::new("real");
+    let folder = TempDir::new().unwrap();
     let capture = data.join("captures/lms200_38400.bin");
-    let (mcap, again) = (folder.0.join("capture.mcap"), folder.0.join("capture.bin"));
+    let (mcap, again) = (folder.path().join("capture.mcap"), folder.path().join("capture.bin"));
     converted(&capture, &mcap, None).unwrap();
     converted(&mcap, &again, None).unwrap();
     assert!(fs::read(&capture).unwrap() == fs::read(&again).unwrap());
@@ -247,14 +263,14 @@ fn a_stream_of_a_real_sensor_comes_back() {
 
 #[test]
 fn what_cannot_be_done_is_refused_and_leaves_nothing() {
-    let folder = Folder::new("refused");
-    let noise = folder.file("noise.mcap", &[0x42; 900]);
-    let failure = converted(&noise, &folder.0.join("out.mcap"), None).unwrap_err();
+    let folder = TempDir::new().unwrap();
+    let noise = file(&folder, "noise.mcap", &[0x42; 900]);
+    let failure = converted(&noise, &folder.path().join("out.mcap"), None).unwrap_err();
     assert!(failure.kind.exit_code() == 66 && failure.message.contains("no telegram"), "{failure}");
     fs::remove_file(noise).unwrap();
-    let input = folder.file("in.mcap", &crate::written::recording(8, 13).bytes);
-    let there = folder.file("there.bin", b"mine");
-    std::os::unix::fs::symlink(&input, folder.0.join("link.mcap")).unwrap();
+    let input = file(&folder, "in.mcap", &crate::written::recording(8, 13).bytes);
+    let there = file(&folder, "there.bin", b"mine");
+    std::os::unix::fs::symlink(&input, folder.path().join("link.mcap")).unwrap();
     for (output, sensor, says) in [
         ("in.mcap", None, "both read and written"),
         ("link.mcap", None, "both read and written"),
@@ -265,11 +281,11 @@ fn what_cannot_be_done_is_refused_and_leaves_nothing() {
         ("out.mcap.gz", None, "is not a known format"),
         ("no/such/out.mcap", None, "cannot write"),
     ] {
-        let failure = converted(&input, &folder.0.join(output), sensor).unwrap_err();
+        let failure = converted(&input, &folder.path().join(output), sensor).unwrap_err();
         assert!(failure.message.contains(says) && !failure.hint.is_empty(), "{output}: {failure}");
     }
     let options =
-        ConvertOptions { input, output: folder.0.join("stopped.mcap"), ..ConvertOptions::default() };
+        ConvertOptions { input, output: folder.path().join("stopped.mcap"), ..ConvertOptions::default() };
     let failure = convert(&options, &AtomicBool::new(true), |_, _| {}).unwrap_err();
     assert_eq!(failure.kind.exit_code(), 130);
     assert_eq!(names(&folder), ["in.mcap", "link.mcap", "there.bin"]);

@@ -1,7 +1,6 @@
 //! Damaged MCAP files: of a file that was cut or changed anywhere, the intact chunks are read, and nothing that was never in
 //! the file.
 
-use std::fs;
 use std::ops::Range;
 
 use fastrand::Rng;
@@ -9,7 +8,9 @@ use lms::variant::{Mode, Unit};
 use recording::{Damage, Encoding, Recording};
 use schema::file::Compression;
 
-use crate::folder::Folder;
+use tempfile::TempDir;
+
+use crate::folder::file;
 use crate::written::{self, Known, SENSORS, Written};
 
 /// A recording, and where its records are.
@@ -58,8 +59,8 @@ impl Whole {
 }
 
 /// Returns the telegrams that are read from `bytes`, one sensor after the other, and the reported damage.
-fn read(folder: &Folder, bytes: &[u8]) -> (Vec<Known>, Damage) {
-    let recording = Recording::open(folder.file("damaged.mcap", bytes)).unwrap();
+fn read(folder: &TempDir, bytes: &[u8]) -> (Vec<Known>, Damage) {
+    let recording = Recording::open(file(folder, "damaged.mcap", bytes)).unwrap();
     let contents = recording.contents();
     let of = |sensor: &'static str| {
         let frames = contents.sensors.iter().any(|name| name == sensor).then(|| {
@@ -79,7 +80,7 @@ fn read(folder: &Folder, bytes: &[u8]) -> (Vec<Known>, Damage) {
 
 #[test]
 fn cut_at_any_byte_is_read_to_the_last_whole_chunk() {
-    let folder = Folder::new("cut");
+    let folder = TempDir::new().unwrap();
     for compression in [Compression::None, Compression::Zstd] {
         let whole = Whole::new(12, compression);
         let len = whole.bytes.len();
@@ -98,7 +99,7 @@ fn cut_at_any_byte_is_read_to_the_last_whole_chunk() {
 
 #[test]
 fn flipped_byte_costs_one_chunk() {
-    let folder = Folder::new("flipped");
+    let folder = TempDir::new().unwrap();
     for compression in [Compression::None, Compression::Lz4, Compression::Zstd] {
         let whole = Whole::new(20, compression);
         for (number, chunk) in whole.chunks.iter().enumerate() {
@@ -125,7 +126,7 @@ fn flipped_byte_costs_one_chunk() {
 
 #[test]
 fn reading_ends_at_an_impossible_length() {
-    let folder = Folder::new("framing");
+    let folder = TempDir::new().unwrap();
     let whole = Whole::new(20, Compression::None);
     let (length, last) = (whole.bytes.len(), 1 + 7);
     for (number, chunk) in whole.chunks.iter().enumerate() {
@@ -149,12 +150,12 @@ fn reading_ends_at_an_impossible_length() {
 
 #[test]
 fn sensors_whose_names_are_lost_are_called_by_their_numbers() {
-    let folder = Folder::new("nameless");
+    let folder = TempDir::new().unwrap();
     let whole = Whole::new(20, Compression::Zstd);
     // Only the first chunk and the index name the sensors.
     let mut bytes = whole.bytes[..whole.chunks[3].end].to_vec();
     bytes[whole.content(0)[1]] ^= 0x10;
-    let recording = Recording::open(folder.file("damaged.mcap", &bytes)).unwrap();
+    let recording = Recording::open(file(&folder, "damaged.mcap", &bytes)).unwrap();
     assert_eq!(recording.contents().sensors, ["sensor0", "sensor1"]);
     assert_eq!(recording.contents().telegrams, 3 * PER_CHUNK as u64);
     let rear = recording.of("sensor1").unwrap();
@@ -166,7 +167,7 @@ fn sensors_whose_names_are_lost_are_called_by_their_numbers() {
 
 #[test]
 fn nothing_is_invented_whatever_is_damaged() {
-    let folder = Folder::new("any");
+    let folder = TempDir::new().unwrap();
     for seed in 0..300 {
         let mut random = Rng::with_seed(seed);
         let whole = Whole::new(12, if seed % 2 == 0 { Compression::None } else { Compression::Lz4 });
@@ -207,14 +208,13 @@ fn nothing_is_invented_whatever_is_damaged() {
 
 #[test]
 fn file_without_its_beginning_is_refused() {
-    let folder = Folder::new("headless");
+    let folder = TempDir::new().unwrap();
     let bytes = &Whole::new(20, Compression::None).bytes;
     for begin in [1, MAGIC, bytes.len() / 3] {
-        let failure = Recording::open(folder.file("rest.mcap", &bytes[begin..])).unwrap_err();
+        let failure = Recording::open(file(&folder, "rest.mcap", &bytes[begin..])).unwrap_err();
         assert!(failure.message.ends_with("is the end of an MCAP file, without its beginning"), "{failure}");
         assert_eq!(failure.kind.exit_code(), 66);
     }
-    fs::remove_file(folder.0.join("rest.mcap")).unwrap();
 }
 
 /// Telegrams in a chunk: four of each sensor.

@@ -2,7 +2,6 @@
 
 use std::fs;
 use std::io::{Read, Write};
-use std::path::PathBuf;
 
 use crate::real;
 use flate2::Compression;
@@ -13,24 +12,15 @@ use lms::reply;
 use lms::telegram::Telegram;
 use lms::variant::{Mode, Unit, Variant};
 use recording::{Encoding, Form, Recording};
+use tempfile::NamedTempFile;
 
 const MM: Encoding = Encoding { unit: Unit::Mm, mode: Mode(1) };
 
-/// A file of this test run that is gone with it.
-struct File(PathBuf);
-
-impl File {
-    fn new(name: &str, bytes: &[u8]) -> File {
-        let path = std::env::temp_dir().join(format!("scanhub-{}-{name}", std::process::id()));
-        fs::write(&path, bytes).unwrap();
-        File(path)
-    }
-}
-
-impl Drop for File {
-    fn drop(&mut self) {
-        let _ = fs::remove_file(&self.0);
-    }
+/// Creates a temporary file whose name ends with `name`.
+fn temporary(name: &str, bytes: &[u8]) -> NamedTempFile {
+    let file = tempfile::Builder::new().suffix(name).tempfile().unwrap();
+    fs::write(&file, bytes).unwrap();
+    file
 }
 
 fn gzip(bytes: &[u8]) -> Vec<u8> {
@@ -55,8 +45,8 @@ fn a_stream_gives_its_telegrams_bit_for_bit_and_says_what_the_sensor_was() {
     let last = reply::mode(0, true, 0x10);
     bytes.extend_from_slice(&[&[0x06], last.bytes()].concat());
     for (name, stored) in [("stream.bin", bytes.clone()), ("stream.bin.gz", gzip(&bytes))] {
-        let file = File::new(name, &stored);
-        let recording = Recording::open(&file.0).unwrap();
+        let file = temporary(name, &stored);
+        let recording = Recording::open(file.path()).unwrap();
         let contents = recording.contents();
         assert_eq!((contents.form, contents.telegrams, contents.scans), (Form::Telegrams, 4, 2));
         assert_eq!(contents.variant, Some(Variant::HALF));
@@ -78,8 +68,8 @@ fn a_log_becomes_telegrams() {
     }
     // Where the recording broke off.
     log += "FLASER 361 1.0 1.0";
-    let file = File::new("log.gz", &gzip(log.as_bytes()));
-    let recording = Recording::open(&file.0).unwrap();
+    let file = temporary("log.gz", &gzip(log.as_bytes()));
+    let recording = Recording::open(file.path()).unwrap();
     assert_eq!((recording.contents().form, recording.contents().scans), (Form::Carmen, 2));
     assert_eq!(recording.contents().variant, Some(Variant::HALF));
     assert_eq!(recording.encoding(), Some(Encoding { unit: Unit::Mm, mode: Mode(0) }));
@@ -114,11 +104,11 @@ fn what_is_no_recording_is_refused_with_place_value_and_remedy() {
         ("a.mcap", b"\x89MCAP0\r\nmore".to_vec(), "which this build does not read"),
         ("cut.gz", gzip(&scan(7))[..40].to_vec(), "cannot read"),
     ] {
-        let file = File::new(name, &bytes);
-        let failure = Recording::open(&file.0).unwrap_err();
+        let file = temporary(name, &bytes);
+        let failure = Recording::open(file.path()).unwrap_err();
         assert!(failure.message.contains(says), "{failure}");
         // A line may bring nothing but noise.
-        let line = Recording::open_line(&file.0).ok();
+        let line = Recording::open_line(file.path()).ok();
         assert_eq!(line.map(|line| line.contents().telegrams), (says == "no telegram in it").then_some(0));
     }
 }
@@ -128,8 +118,8 @@ fn what_is_there_of_a_packed_file_that_is_cut_is_read() {
     // So much that what is cut off is not all of it, and different enough not to be packed to nothing.
     let telegrams: Vec<Vec<u8>> = (0..400).map(scan).collect();
     let packed = gzip(&telegrams.concat());
-    let file = File::new("cut.bin.gz", &packed[..packed.len() * 2 / 3]);
-    let recording = Recording::open(&file.0).unwrap();
+    let file = temporary("cut.bin.gz", &packed[..packed.len() * 2 / 3]);
+    let recording = Recording::open(file.path()).unwrap();
     let contents = recording.contents();
     assert!(contents.damage.is_cut && (1..400).contains(&contents.telegrams), "{contents:?}");
     let read: Vec<_> = recording.telegrams(MM).unwrap().map(|frame| frame.telegram).collect();
@@ -142,16 +132,16 @@ fn a_log_with_harmed_lines_gives_the_others() {
         format!("FLASER 181 {} 0 0 0 0 0 0 {at} host {at}\n", vec![range; 181].join(" "))
     };
     let log: String = (1..4000).map(|at| line(at, if at == 7 { "1.\0" } else { "1.5" })).collect();
-    let file = File::new("harmed.log", log.as_bytes());
-    let recording = Recording::open(&file.0).unwrap();
+    let file = temporary("harmed.log", log.as_bytes());
+    let recording = Recording::open(file.path()).unwrap();
     let damage = recording.contents().damage;
     assert_eq!((recording.contents().scans, damage.telegrams, damage.is_harmed), (3998, 1, true));
     let walls: Vec<_> =
         recording.telegrams(MM).unwrap().map(|frame| frame.wall_ns.unwrap() / 1_000_000_000).collect();
     assert!(walls.iter().copied().eq((1..4000).filter(|at| *at != 7)));
     let packed = gzip(log.as_bytes());
-    let cut = File::new("cut.log.gz", &packed[..packed.len() * 2 / 3]);
-    let recording = Recording::open(&cut.0).unwrap();
+    let cut = temporary("cut.log.gz", &packed[..packed.len() * 2 / 3]);
+    let recording = Recording::open(cut.path()).unwrap();
     let contents = recording.contents();
     assert!(contents.damage.is_cut && contents.scans > 0, "{contents:?}");
     assert_eq!(recording.telegrams(MM).unwrap().count() as u64, contents.telegrams);

@@ -9,34 +9,19 @@ use fastrand::Rng;
 use mcap::records::op;
 use recording::convert::{ConvertOptions, Converted, convert};
 use schema::{Failure, Kind};
+use tempfile::TempDir;
 
-/// A directory of this test.
-struct Scratch(PathBuf);
-
-impl Scratch {
-    fn new(name: &str) -> Scratch {
-        let path = std::env::temp_dir().join(format!("scanhub-hostile-{name}-{}", std::process::id()));
-        fs::create_dir_all(&path).unwrap();
-        Scratch(path)
-    }
-
-    /// Writes `bytes` anew as MCAP.
-    fn convert(&self, bytes: &[u8]) -> Result<Converted, Failure> {
-        let (input, output) = (self.0.join("in.mcap"), self.0.join("out.mcap"));
-        fs::write(&input, bytes).unwrap();
-        let options = ConvertOptions { input, output, force: true, ..ConvertOptions::default() };
-        convert(&options, &AtomicBool::new(false), |_, _| {})
-    }
-
-    fn copy(&self) -> PathBuf {
-        self.0.join("out.mcap")
-    }
+/// Converts `bytes` to MCAP, in `folder`.
+fn convert_again(folder: &TempDir, bytes: &[u8]) -> Result<Converted, Failure> {
+    let (input, output) = (folder.path().join("in.mcap"), copy(folder));
+    fs::write(&input, bytes).unwrap();
+    let options = ConvertOptions { input, output, force: true, ..ConvertOptions::default() };
+    convert(&options, &AtomicBool::new(false), |_, _| {})
 }
 
-impl Drop for Scratch {
-    fn drop(&mut self) {
-        let _ = fs::remove_dir_all(&self.0);
-    }
+/// Path of the converted file.
+fn copy(folder: &TempDir) -> PathBuf {
+    folder.path().join("out.mcap")
 }
 
 fn record(opcode: u8, body: &[u8]) -> Vec<u8> {
@@ -98,22 +83,23 @@ const MAGIC: usize = 8;
 
 #[test]
 fn an_attachment_that_is_too_short_is_reported_and_dropped() {
-    let scratch = Scratch::new("short");
+    let folder = TempDir::new().unwrap();
     let whole = crate::written::recording(8, 1);
     let telegrams = whole.telegrams.len() as u64;
     let sound =
-        scratch.convert(&with_record(&whole.bytes, &record(op::ATTACHMENT, &attachment(b"abc")))).unwrap();
+        convert_again(&folder, &with_record(&whole.bytes, &record(op::ATTACHMENT, &attachment(b"abc"))))
+            .unwrap();
     assert!(sound.damage.is_none() && sound.telegrams == telegrams, "{sound:?}");
-    assert_eq!(attachments(&scratch.copy()), 1);
+    assert_eq!(attachments(&copy(&folder)), 1);
     // Each length that it may have had before somebody cut it: 1 to 4 bytes less lack a part of its checksum.
     for data in [&b""[..], b"abc"] {
         let body = attachment(data);
         for len in 0..body.len() {
             let cut = record(op::ATTACHMENT, &body[..len]);
-            let converted = scratch.convert(&with_record(&whole.bytes, &cut)).unwrap();
+            let converted = convert_again(&folder, &with_record(&whole.bytes, &cut)).unwrap();
             assert_eq!(converted.telegrams, telegrams, "{len}: {converted:?}");
             assert!(converted.damage.bytes > 0 && converted.damage.is_harmed, "{len}: {converted:?}");
-            assert_eq!(attachments(&scratch.copy()), 0, "{len}");
+            assert_eq!(attachments(&copy(&folder)), 0, "{len}");
         }
     }
 }
@@ -125,7 +111,7 @@ fn attachments(path: &Path) -> u32 {
 
 #[test]
 fn no_content_of_a_record_causes_a_panic_or_costs_a_telegram() {
-    let scratch = Scratch::new("any");
+    let folder = TempDir::new().unwrap();
     let whole = crate::written::recording(4, 2);
     let telegrams = whole.telegrams.len() as u64;
     let (mut random, others) = (Rng::with_seed(3), others());
@@ -145,7 +131,7 @@ fn no_content_of_a_record_causes_a_panic_or_costs_a_telegram() {
             }
         }
         let file = with_record(&whole.bytes, &record(opcode, &body));
-        match scratch.convert(&file) {
+        match convert_again(&folder, &file) {
             Ok(converted) => assert_eq!(converted.telegrams, telegrams, "{round}: {opcode} {body:?}"),
             Err(failure) => assert_eq!(failure.kind, Kind::Configuration, "{round}: {opcode} {body:?}"),
         }

@@ -5,7 +5,9 @@ use std::fs;
 use std::io::Read;
 use std::path::Path;
 
-use crate::folder::{Folder, converted};
+use tempfile::TempDir;
+
+use crate::folder::{converted, file};
 use crate::real;
 use lms::measured;
 use lms::reply;
@@ -14,7 +16,7 @@ use recording::{Encoding, Frame, Recording, Unread};
 
 #[test]
 fn a_log_comes_back_from_an_mcap_file() {
-    let folder = Folder::new("log");
+    let folder = TempDir::new().unwrap();
     let log: String = (0..5)
         .map(|scan| {
             let ranges: Vec<_> =
@@ -22,8 +24,8 @@ fn a_log_comes_back_from_an_mcap_file() {
             format!("FLASER 181 {} 1 2 3 4 5 6 12{scan}.25 host 1\n", ranges.join(" "))
         })
         .collect();
-    let log = folder.file("a.log", log.as_bytes());
-    let (mcap, again) = (folder.0.join("a.mcap"), folder.0.join("b.log"));
+    let log = file(&folder, "a.log", log.as_bytes());
+    let (mcap, again) = (folder.path().join("a.mcap"), folder.path().join("b.log"));
     converted(&log, &mcap, None).unwrap();
     // Millimetres up to 8.4 m do not go into 13 bits.
     let contents = Recording::open(&mcap).unwrap().contents().clone();
@@ -60,8 +62,8 @@ fn sweeps(log: &Path) -> Vec<(Vec<i64>, i64)> {
 
 /// Converts `log` to MCAP and back, to a stream and back, and to one by the other: the same ranges everywhere, the same
 /// codes, and the same times where there are any.
-fn assert_comes_back(folder: &Folder, name: &str, log: &Path) {
-    let there = |ending: &str| folder.0.join(format!("{name}{ending}"));
+fn assert_comes_back(folder: &TempDir, name: &str, log: &Path) {
+    let there = |ending: &str| folder.path().join(format!("{name}{ending}"));
     let (mcap, stream, both) = (there(".mcap"), there(".bin.gz"), there("-mcap.bin"));
     converted(log, &mcap, None).unwrap();
     converted(log, &stream, None).unwrap();
@@ -100,7 +102,7 @@ fn log(count: usize, ranges: &[&str]) -> String {
 
 #[test]
 fn ranges_and_codes_of_every_kind_of_log_come_back() {
-    let folder = Folder::new("kinds");
+    let folder = TempDir::new().unwrap();
     for (name, count, ranges) in [
         ("cm-far", 180, &["20.00", "81.91", "81.90", "81.87", "81.83", "81.82", "0.00"][..]),
         ("cm-near", 361, &["1.23", "7.00"]),
@@ -109,7 +111,7 @@ fn ranges_and_codes_of_every_kind_of_log_come_back() {
         ("mm-14", 401, &["1.234", "9.001", "16.383", "16.379"]),
         ("mm-15", 181, &["1.234", "32.767", "32.759", "32.763", "20.001"]),
     ] {
-        let log = folder.file(&format!("{name}.log"), log(count, ranges).as_bytes());
+        let log = file(&folder, &format!("{name}.log"), log(count, ranges).as_bytes());
         assert_comes_back(&folder, name, &log);
     }
     let sensor = "0 -1.570796 3.141593 0.017453 81.91 0.01 0";
@@ -122,18 +124,18 @@ fn ranges_and_codes_of_every_kind_of_log_come_back() {
             )
         })
         .collect();
-    let recording = Recording::open(folder.file("both.log", both.as_bytes())).unwrap();
+    let recording = Recording::open(file(&folder, "both.log", both.as_bytes())).unwrap();
     assert_eq!(recording.contents().scans, 3, "each scan stands there twice");
     for word in ["RAWLASER1", "ROBOTLASER1"] {
         let lines: String =
             both.lines().filter(|line| line.starts_with(word)).map(|line| format!("{line}\n")).collect();
-        assert_comes_back(&folder, word, &folder.file(&format!("{word}.log"), lines.as_bytes()));
+        assert_comes_back(&folder, word, &file(&folder, &format!("{word}.log"), lines.as_bytes()));
     }
 }
 
 #[test]
 fn times_come_back_to_the_microsecond() {
-    let folder = Folder::new("times");
+    let folder = TempDir::new().unwrap();
     let mut random = fastrand::Rng::with_seed(40);
     let mut at_us = 1_071_078_720_000_000_u64;
     let log: String = (0..910)
@@ -143,8 +145,8 @@ fn times_come_back_to_the_microsecond() {
             format!("FLASER 181{} 0 0 0 0 0 0 {time} host 1\n", " 1.25".repeat(181))
         })
         .collect();
-    let (mcap, again) = (folder.0.join("a.mcap"), folder.0.join("b.log"));
-    converted(&folder.file("a.log", log.as_bytes()), &mcap, None).unwrap();
+    let (mcap, again) = (folder.path().join("a.mcap"), folder.path().join("b.log"));
+    converted(&file(&folder, "a.log", log.as_bytes()), &mcap, None).unwrap();
     converted(&mcap, &again, None).unwrap();
     let again = fs::read_to_string(again).unwrap();
     let times = |log: &str| -> Vec<String> {
@@ -159,7 +161,7 @@ fn times_come_back_to_the_microsecond() {
 
 #[test]
 fn counts_the_data_of_a_log_that_no_telegram_holds() {
-    let folder = Folder::new("unread");
+    let folder = TempDir::new().unwrap();
     let ranges = " 1.25".repeat(181);
     let sensor = "0 -1.570796 3.141593 0.017453 81.91 0.01 0";
     let flaser = |poses: &str, at: u32| format!("FLASER 181{ranges} {poses} {at}.5 host 1\n");
@@ -171,26 +173,27 @@ fn counts_the_data_of_a_log_that_no_telegram_holds() {
         flaser("0 0 0 0.0 0 0", 12),
         format!("ROBOTLASER1 {sensor} 181{ranges} 0 1 2 3 1 2 3 0 0 0 0 0 12.7 host 1\n"),
     ];
-    let log = folder.file("a.log", log.concat().as_bytes());
+    let log = file(&folder, "a.log", log.concat().as_bytes());
     let unread = Unread { poses: 2, odometry: 2, remissions: 0, lines: 2 };
     assert_eq!(unread.to_string(), "2 poses, 2 lines of odometry, 2 other lines");
     for output in ["a.mcap", "a.bin", "b.log", "a.csv"] {
-        let account = converted(&log, &folder.0.join(output), None).unwrap();
+        let account = converted(&log, &folder.path().join(output), None).unwrap();
         assert_eq!((account.scans, account.unread), (3, unread), "{output}");
     }
-    assert_eq!(Recording::open(folder.0.join("a.mcap")).unwrap().contents().unread, Unread::default());
+    assert_eq!(Recording::open(folder.path().join("a.mcap")).unwrap().contents().unread, Unread::default());
     let lines: String = (0..2)
         .map(|at| format!("RAWLASER1 {sensor} 181{ranges} 181{} 1{at}.5 host 1\n", " 9".repeat(181)))
         .collect();
-    let account = converted(&folder.file("raw.log", lines.as_bytes()), &folder.0.join("raw.mcap"), None);
+    let account =
+        converted(&file(&folder, "raw.log", lines.as_bytes()), &folder.path().join("raw.mcap"), None);
     assert_eq!(account.unwrap().unread, Unread { remissions: 2, ..Unread::default() });
 }
 
 #[test]
 fn the_reply_that_stands_for_an_encoding_is_not_left_out() {
-    let folder = Folder::new("stands");
-    let log = folder.file("a.log", log(181, &["1.234", "9.001"]).as_bytes());
-    let there = |name: &str| folder.0.join(name);
+    let folder = TempDir::new().unwrap();
+    let log = file(&folder, "a.log", log(181, &["1.234", "9.001"]).as_bytes());
+    let there = |name: &str| folder.path().join(name);
     for way in ["a.mcap", "a.bin"] {
         let account = converted(&log, &there(way), None).unwrap();
         assert_eq!((account.telegrams, account.scans, account.left_out), (3, 3, 0), "{way}");
@@ -200,7 +203,7 @@ fn the_reply_that_stands_for_an_encoding_is_not_left_out() {
         }
     }
     // Replies that a scanner sent are.
-    let recorded = folder.file("hub.mcap", &crate::written::recording(20, 14).bytes);
+    let recorded = file(&folder, "hub.mcap", &crate::written::recording(20, 14).bytes);
     for output in ["hub.log", "hub.csv"] {
         let account = converted(&recorded, &there(output), Some("front")).unwrap();
         assert_eq!((account.telegrams, account.left_out), (18, 2), "{output}");
@@ -209,12 +212,12 @@ fn the_reply_that_stands_for_an_encoding_is_not_left_out() {
 
 #[test]
 fn a_range_where_others_have_codes_stays_a_range_on_its_way_through_a_log() {
-    let folder = Folder::new("told");
+    let folder = TempDir::new().unwrap();
     // 8.185 m in 14 bits; in 13 bits it would be a code.
     let scan = measured::encode(0, Unit::Mm, &[8185; 181], 0x10);
     let told = reply::configuration(0, Mode(4), Unit::Mm, 0x10);
-    let stream = folder.file("a.bin", &[told.bytes(), scan.bytes()].concat());
-    let log = folder.0.join("a.log");
+    let stream = file(&folder, "a.bin", &[told.bytes(), scan.bytes()].concat());
+    let log = folder.path().join("a.log");
     converted(&stream, &log, None).unwrap();
     let recording = Recording::open(&log).unwrap();
     assert_eq!(recording.encoding(), Some(Encoding { unit: Unit::Mm, mode: Mode(4) }));
@@ -223,15 +226,15 @@ fn a_range_where_others_have_codes_stays_a_range_on_its_way_through_a_log() {
 
 #[test]
 fn a_log_that_no_sensor_could_have_sent_is_refused_with_the_reason() {
-    let folder = Folder::new("unfit");
+    let folder = TempDir::new().unwrap();
     for (name, ranges, says) in [
         ("fine", &["1.23456", "2"][..], "ranges are finer"),
         ("far", &["1.234", "2", "81.91"], "ranges are finer"),
         ("farther", &["1.5", "1000.0"], "too long"),
     ] {
-        let input = folder.file(&format!("{name}.log"), log(361, ranges).as_bytes());
+        let input = file(&folder, &format!("{name}.log"), log(361, ranges).as_bytes());
         for output in ["out.mcap", "out.bin", "out.log"] {
-            let failure = converted(&input, &folder.0.join(output), None).unwrap_err();
+            let failure = converted(&input, &folder.path().join(output), None).unwrap_err();
             assert_eq!(failure.kind.exit_code(), 66);
             let all = format!("{failure} {}", failure.hint);
             assert!(all.contains("cannot become telegrams without loss"), "{name}: {all}");
@@ -241,14 +244,14 @@ fn a_log_that_no_sensor_could_have_sent_is_refused_with_the_reason() {
         let recording = Recording::open(&input).unwrap();
         assert_eq!(recording.telegrams(recording.encoding().unwrap()).unwrap().count(), 3);
     }
-    assert_eq!(fs::read_dir(&folder.0).unwrap().count(), 3);
+    assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 3);
 }
 
 #[test]
 fn a_log_in_an_mcap_file_says_how_long_each_scan_stands() {
-    let folder = Folder::new("gaps");
-    let log = folder.file("a.log", log(181, &["1.5"]).as_bytes());
-    let mcap = folder.0.join("a.mcap");
+    let folder = TempDir::new().unwrap();
+    let log = file(&folder, "a.log", log(181, &["1.5"]).as_bytes());
+    let mcap = folder.path().join("a.mcap");
     converted(&log, &mcap, None).unwrap();
     let recording = Recording::open(&mcap).unwrap();
     let frames: Vec<Frame> = recording.telegrams(recording.encoding().unwrap()).unwrap().collect();
@@ -264,7 +267,7 @@ fn a_log_in_an_mcap_file_says_how_long_each_scan_stands() {
 #[test]
 fn logs_of_real_sensors_come_back() {
     let Some(data) = real::recordings() else { return };
-    let folder = Folder::new("real-logs");
+    let folder = TempDir::new().unwrap();
     for name in ["aces", "freiburg-079", "intel", "orebro"] {
         assert_comes_back(&folder, name, &data.join(format!("carmen/{name}-corrected.log.gz")));
         let (scans, own) = (sweeps(&data.join(format!("carmen/{name}-corrected.log.gz"))), {

@@ -1,29 +1,19 @@
 //! Recordings of the hub: each sensor's telegrams come out as they went in, with what the hub knew of them.
 
 use std::fs;
-use std::path::PathBuf;
 
 use crate::written::{Known, SENSORS};
 use lms::variant::{Mode, Unit, Variant};
 use recording::{Encoding, Form, Recording};
+use tempfile::NamedTempFile;
 
 const MM: Encoding = Encoding { unit: Unit::Mm, mode: Mode(1) };
 
-/// A file of this test run that is gone with it.
-struct File(PathBuf);
-
-impl File {
-    fn new(name: &str, bytes: &[u8]) -> File {
-        let path = std::env::temp_dir().join(format!("scanhub-mcap-{}-{name}", std::process::id()));
-        fs::write(&path, bytes).unwrap();
-        File(path)
-    }
-}
-
-impl Drop for File {
-    fn drop(&mut self) {
-        let _ = fs::remove_file(&self.0);
-    }
+/// Creates a temporary file with these bytes.
+fn file(bytes: &[u8]) -> NamedTempFile {
+    let file = NamedTempFile::new().unwrap();
+    fs::write(&file, bytes).unwrap();
+    file
 }
 
 /// The telegrams of `sensor` as `recording` gives them.
@@ -41,8 +31,8 @@ fn read(recording: &Recording, sensor: &'static str) -> Vec<Known> {
 #[test]
 fn each_sensor_has_its_telegrams() {
     let written = crate::written::recording(20, 1);
-    let file = File::new("whole", &written.bytes);
-    let recording = Recording::open(&file.0).unwrap();
+    let file = file(&written.bytes);
+    let recording = Recording::open(file.path()).unwrap();
     let contents = recording.contents();
     assert_eq!((contents.form, contents.telegrams, contents.scans), (Form::Mcap, 40, 36));
     assert_eq!(contents.sensors, SENSORS);
@@ -62,8 +52,8 @@ fn each_sensor_has_its_telegrams() {
 
 #[test]
 fn a_sensor_has_to_be_chosen_of_several() {
-    let file = File::new("choice", &crate::written::recording(4, 2).bytes);
-    let recording = Recording::open(&file.0).unwrap();
+    let file = file(&crate::written::recording(4, 2).bytes);
+    let recording = Recording::open(file.path()).unwrap();
     let refused = [(recording.telegrams(MM).err().unwrap(), 2), (recording.of("left").unwrap_err(), 3)];
     for (failure, code) in refused {
         assert_eq!(failure.kind.exit_code(), code);
@@ -75,8 +65,8 @@ fn a_sensor_has_to_be_chosen_of_several() {
 #[test]
 fn what_was_written_before_a_kill_is_there() {
     let written = crate::written::recording(20, 3);
-    let file = File::new("killed", &written.bytes[..written.bytes.len() / 2]);
-    let recording = Recording::open(&file.0).unwrap();
+    let file = file(&written.bytes[..written.bytes.len() / 2]);
+    let recording = Recording::open(file.path()).unwrap();
     assert!(recording.contents().damage.is_cut);
     let rear = read(&recording, "rear");
     assert!(rear.len() >= 8, "{}", rear.len());
@@ -91,8 +81,8 @@ fn telegrams_alone_are_a_stream() {
         written.telegrams.iter().flat_map(|known| [before, &known.telegram].concat()).collect::<Vec<u8>>()
     };
     for before in [&[][..], &[5; 95], &[0; 95]] {
-        let file = File::new("stream", &telegrams(before));
-        let contents = Recording::open(&file.0).unwrap().contents().clone();
+        let file = file(&telegrams(before));
+        let contents = Recording::open(file.path()).unwrap().contents().clone();
         assert_eq!((contents.form, contents.telegrams), (Form::Telegrams, 80));
     }
 }

@@ -4,7 +4,9 @@
 use std::fs;
 use std::path::Path;
 
-use crate::folder::{Folder, converted};
+use tempfile::TempDir;
+
+use crate::folder::{converted, file};
 use crate::written::{self, Known, SENSORS, Written};
 use bytemuck::bytes_of;
 use lms::measured;
@@ -46,10 +48,10 @@ fn messages(bytes: &[u8]) -> Vec<(String, String, Vec<u8>)> {
 
 #[test]
 fn its_telegrams_are_all_there() {
-    let folder = Folder::new("old");
+    let folder = TempDir::new().unwrap();
     let (old, new) = (written::of_version_1(20, 21, &Topic::ALL), written::recording(20, 21));
     assert_eq!(old.telegrams, new.telegrams, "both say the same");
-    let (file, copy) = (folder.file("old.mcap", &old.bytes), folder.0.join("copy.mcap"));
+    let (file, copy) = (file(&folder, "old.mcap", &old.bytes), folder.path().join("copy.mcap"));
     let contents = Recording::open(&file).unwrap().contents().clone();
     assert_eq!((contents.form, contents.telegrams, contents.scans), (Form::Mcap, 40, 36));
     assert_eq!((&contents.sensors[..], contents.mode), (&SENSORS.map(String::from)[..], Some(Mode(4))));
@@ -70,13 +72,13 @@ fn its_telegrams_are_all_there() {
 
 #[test]
 fn its_scans_are_those_of_its_telegrams() {
-    let folder = Folder::new("old-scans");
+    let folder = TempDir::new().unwrap();
     let payload = written::scan_of_version_1();
     assert!(Scan::room(&payload).is_some(), "nothing but the encoding says that it is none of today");
-    let old = folder.file("old.mcap", &written::of_version_1(20, 22, &Topic::ALL).bytes);
-    let new = folder.file("new.mcap", &written::recording(20, 22).bytes);
+    let old = file(&folder, "old.mcap", &written::of_version_1(20, 22, &Topic::ALL).bytes);
+    let new = file(&folder, "new.mcap", &written::recording(20, 22).bytes);
     let rows = |file: &Path, name: &str| {
-        let out = folder.0.join(name);
+        let out = folder.path().join(name);
         assert_eq!(converted(file, &out, Some("rear")).unwrap().scans, 18);
         fs::read_to_string(out).unwrap()
     };
@@ -84,7 +86,7 @@ fn its_scans_are_those_of_its_telegrams() {
     assert_eq!(expected.lines().next().unwrap().matches("range_").count(), 181);
     assert!(rows(&old, "old.csv") == expected);
     let ros = |file: &Path, name: &str| {
-        let output = folder.0.join(name);
+        let output = folder.path().join(name);
         let options =
             ConvertOptions { input: file.to_owned(), output, ros2: true, ..ConvertOptions::default() };
         assert_eq!(convert(&options, &Default::default(), |_, _| {}).unwrap().scans, 36);
@@ -96,9 +98,9 @@ fn its_scans_are_those_of_its_telegrams() {
 
 #[test]
 fn without_telegrams_there_is_nothing_to_convert() {
-    let folder = Folder::new("old-alone");
-    let old = folder.file("old.mcap", &written::of_version_1(4, 23, &[Topic::Scan, Topic::Status]).bytes);
-    let failure = converted(&old, &folder.0.join("out.csv"), Some("front")).unwrap_err();
+    let folder = TempDir::new().unwrap();
+    let old = file(&folder, "old.mcap", &written::of_version_1(4, 23, &[Topic::Scan, Topic::Status]).bytes);
+    let failure = converted(&old, &folder.path().join("out.csv"), Some("front")).unwrap_err();
     assert_eq!(failure.kind, Kind::Input);
     assert!(failure.message.starts_with("there is no scan in "), "{failure}");
 }
@@ -107,7 +109,7 @@ fn without_telegrams_there_is_nothing_to_convert() {
 /// and is taken; one of version 1 is not asked, and that is refused, not guessed.
 #[test]
 fn its_scans_do_not_stand_in_for_telegrams_that_cannot_be_read() {
-    let folder = Folder::new("old-mode");
+    let folder = TempDir::new().unwrap();
     let telegram = measured::encode(0, Unit::Mm, &[0x3FFF; 181], 0x10).bytes().to_vec();
     let made = |encoding, scan: &[u8]| {
         let mut writer = Writer::begin(Vec::new(), "", Default::default()).unwrap();
@@ -117,9 +119,9 @@ fn its_scans_do_not_stand_in_for_telegrams_that_cannot_be_read() {
             let message = [bytes_of(&Header::default()), payload].concat();
             writer.message(channel, 0, 0, &message).unwrap();
         }
-        folder.file("in.mcap", &writer.finish().unwrap())
+        file(&folder, "in.mcap", &writer.finish().unwrap())
     };
-    let converted = |file: &Path, name: &str| converted(file, &folder.0.join(name), Some("front"));
+    let converted = |file: &Path, name: &str| converted(file, &folder.path().join(name), Some("front"));
     let today = Scan::of(ScanHead::lms(181, -90_000, 1000, 1, 13), &[700; 181]);
     assert_eq!(converted(&made(ENCODING, today.bytes()), "today.csv").unwrap().scans, 1);
     let failure = converted(&made(ENCODING_V1, &written::scan_of_version_1()), "old.csv").unwrap_err();

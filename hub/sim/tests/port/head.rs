@@ -52,7 +52,7 @@ fn hear(session: &mut Session, host: &Host, turns: usize) -> Vec<[u8; LEN]> {
 #[test]
 fn every_model_is_heard_bit_for_bit_as_the_truth_says() {
     for model in [Model::Ld19, Model::Stl27l] {
-        let folder = Folder::new(model.name());
+        let folder = Folder::new();
         let port = folder.path("front");
         let simulator = Simulator::start(SimulateOptions {
             ports: vec![port.clone()],
@@ -79,7 +79,7 @@ fn every_model_is_heard_bit_for_bit_as_the_truth_says() {
 
 #[test]
 fn faults_are_told_and_what_an_ld_has_not_is_refused() {
-    let folder = Folder::new("ld-faults");
+    let folder = Folder::new();
     let port = folder.path("front");
     let scanner = Some(Scanner::Ld(Model::Ld06));
     let of = || SimulateOptions { ports: vec![port.clone()], scanner, ..SimulateOptions::default() };

@@ -42,7 +42,7 @@ fn is_data(record: &Record) -> bool {
 
 #[test]
 fn from_9600_to_a_stream_at_500k_bit_for_bit_as_the_truth_says() {
-    let folder = Folder::new("stream");
+    let folder = Folder::new();
     let (port, truth) = (folder.path("front"), folder.path("truth.jsonl"));
     std::os::unix::fs::symlink("/dev/pts/999999", &port).unwrap();
     let simulator = Simulator::start(SimulateOptions {
@@ -84,7 +84,7 @@ fn from_9600_to_a_stream_at_500k_bit_for_bit_as_the_truth_says() {
 
 #[test]
 fn requests_that_are_written_at_once_are_all_answered_at_9600() {
-    let folder = Folder::new("unspaced");
+    let folder = Folder::new();
     let port = folder.path("front");
     let faults = Faults { answer: 0.001, ..Faults::default() };
     let baud = Some(Baud::B9600);
@@ -100,7 +100,7 @@ fn requests_that_are_written_at_once_are_all_answered_at_9600() {
 
 #[test]
 fn a_closed_port_loses_what_is_sent_and_keeps_nothing_for_the_next_host() {
-    let folder = Folder::new("closed");
+    let folder = Folder::new();
     let port = folder.path("front");
     let simulator = Simulator::start(options(port.clone()));
     let mut host = Host::open(&port, 500_000);
@@ -124,7 +124,7 @@ fn a_closed_port_loses_what_is_sent_and_keeps_nothing_for_the_next_host() {
 
 #[test]
 fn at_another_rate_nothing_is_understood_on_either_side() {
-    let folder = Folder::new("rate");
+    let folder = Folder::new();
     let port = folder.path("front");
     let simulator = Simulator::start(options(port.clone()));
     let mut host = Host::open(&port, 500_000);
@@ -149,7 +149,7 @@ fn at_another_rate_nothing_is_understood_on_either_side() {
 
 #[test]
 fn a_host_that_does_not_read_loses_what_has_no_room() {
-    let folder = Folder::new("overrun");
+    let folder = Folder::new();
     let port = folder.path("front");
     let simulator = Simulator::start(SimulateOptions { speed: 10.0, ..options(port.clone()) });
     let mut host = Host::open(&port, 500_000);
@@ -161,7 +161,7 @@ fn a_host_that_does_not_read_loses_what_has_no_room() {
 
 #[test]
 fn a_lossless_line_waits_for_a_host_that_does_not_read() {
-    let folder = Folder::new("lossless");
+    let folder = Folder::new();
     let ports = ["waits", "loses"].map(|name| folder.path(name));
     let start = |port: &PathBuf, lossless| {
         Simulator::start(SimulateOptions { lossless, speed: 10.0, ..options(port.clone()) })
@@ -183,7 +183,7 @@ fn a_lossless_line_waits_for_a_host_that_does_not_read() {
 
 #[test]
 fn a_replay_is_sent_once_in_order_and_then_the_line_is_silent() {
-    let folder = Folder::new("replay");
+    let folder = Folder::new();
     let (port, file) = (folder.path("front"), folder.path("stream.bin"));
     let scans: Vec<Vec<u8>> =
         (0..100u16).map(|i| measured::encode(3, Unit::Cm, &[700 + i; 361], 0x11).bytes().to_vec()).collect();
@@ -212,7 +212,7 @@ fn a_replay_is_sent_once_in_order_and_then_the_line_is_silent() {
 
 #[test]
 fn lost_bytes_damage_exactly_the_telegrams_that_the_truth_names() {
-    let folder = Folder::new("loss");
+    let folder = Folder::new();
     let port = folder.path("front");
     let faults = Faults { loss: 0.00135, burst: 1.89, ..Faults::default() };
     let simulator = Simulator::start(SimulateOptions { faults, speed: 2.0, ..options(port.clone()) });
@@ -231,7 +231,7 @@ fn lost_bytes_damage_exactly_the_telegrams_that_the_truth_names() {
 
 #[test]
 fn two_ports_and_what_is_refused() {
-    let folder = Folder::new("two");
+    let folder = Folder::new();
     let ports = vec![folder.path("front"), folder.path("rear")];
     let truth = Some(folder.path("truth"));
     let simulator = Simulator::start(SimulateOptions { ports: ports.clone(), truth, ..options("".into()) });
@@ -280,7 +280,7 @@ fn two_ports_and_what_is_refused() {
 
 #[test]
 fn an_unplugged_port_is_gone_and_comes_back_under_its_name() {
-    let folder = Folder::new("unplug");
+    let folder = Folder::new();
     let port = folder.path("front");
     let faults: Faults = "unplug=0.3,unplug_at=1,unplug_every=1".parse().unwrap();
     let state = Start::In(Operating::All);

@@ -1,6 +1,5 @@
 //! The verb in a thread, a place for its files, and what it says of itself.
 
-use std::fs;
 use std::io::Write;
 use std::os::unix::net::UnixStream;
 use std::path::PathBuf;
@@ -14,27 +13,20 @@ use sim::fault::Fault;
 use sim::options::SimulateOptions;
 use sim::truth::{Record, Summary};
 use sim::{Ready, simulate};
+use tempfile::TempDir;
 
 use crate::PATIENCE;
 
-/// A directory of this test that is gone with it.
-pub(crate) struct Folder(PathBuf);
+/// A temporary directory.
+pub(crate) struct Folder(TempDir);
 
 impl Folder {
-    pub(crate) fn new(name: &str) -> Folder {
-        let path = std::env::temp_dir().join(format!("scanhub-port-{}-{name}", std::process::id()));
-        fs::create_dir_all(&path).unwrap();
-        Folder(path)
+    pub(crate) fn new() -> Folder {
+        Folder(TempDir::new().unwrap())
     }
 
     pub(crate) fn path(&self, name: &str) -> PathBuf {
-        self.0.join(name)
-    }
-}
-
-impl Drop for Folder {
-    fn drop(&mut self) {
-        let _ = fs::remove_dir_all(&self.0);
+        self.0.path().join(name)
     }
 }
 

@@ -36,7 +36,7 @@ fn say(host: &Host, request: &[u8]) {
 #[test]
 fn what_a_host_reads_is_what_the_truth_says_and_it_starts_anew_after_a_dip_and_a_power_cycle() {
     for (model, mode) in [(Model::A1, 1), (Model::S2, 1)] {
-        let folder = Folder::new(&format!("unit-{}", model.name()));
+        let folder = Folder::new();
         let (port, truth) = (folder.path("front"), folder.path("truth.jsonl"));
         let simulator = Simulator::start(SimulateOptions {
             ports: vec![port.clone()],
@@ -74,7 +74,7 @@ fn what_a_host_reads_is_what_the_truth_says_and_it_starts_anew_after_a_dip_and_a
 
 #[test]
 fn a_host_at_another_rate_hears_noise_and_what_it_has_not_is_refused() {
-    let folder = Folder::new("unit-rate");
+    let folder = Folder::new();
     let port = folder.path("front");
     let of = |model| SimulateOptions {
         ports: vec![port.clone()],

@@ -80,23 +80,19 @@ mod child;
 
 #[cfg(test)]
 mod tests {
-    use std::fs;
-
     use super::super::finding::State;
     use super::child::write_program;
     use super::*;
 
     /// What is found with a program that is this text of a shell.
-    fn of(name: &str, script: Option<&str>) -> Vec<(State, String, String)> {
-        let place = std::env::temp_dir().join(format!("scanhub-doctor-bridge-{}-{name}", std::process::id()));
-        fs::create_dir_all(&place).unwrap();
+    fn of(script: Option<&str>) -> Vec<(State, String, String)> {
+        let place = tempfile::tempdir().unwrap();
         if let Some(script) = script {
-            write_program(place.join(PROGRAM), format!("#!/bin/sh\n{script}\n"));
+            write_program(place.path().join(PROGRAM), format!("#!/bin/sh\n{script}\n"));
         }
-        let examined = Bridge { connect: vec!["tcp/r:1".into()], config: None, places: vec![place.clone()] };
-        let found = bridge(&examined).into_iter().map(|it| (it.state, it.finding, it.remedy)).collect();
-        fs::remove_dir_all(&place).unwrap();
-        found
+        let examined =
+            Bridge { connect: vec!["tcp/r:1".into()], config: None, places: vec![place.path().to_owned()] };
+        bridge(&examined).into_iter().map(|it| (it.state, it.finding, it.remedy)).collect()
     }
 
     fn version() -> String {
@@ -110,11 +106,11 @@ mod tests {
 
     #[test]
     fn a_program_that_is_missing_or_another_one_is_told() {
-        let missing = of("missing", None);
+        let missing = of(None);
         assert!(missing[0].0 == State::Failed && missing[0].2.contains("cargo install"), "{missing:?}");
-        let other = of("other", Some("echo scanhub-bridge 0.0.7"));
+        let other = of(Some("echo scanhub-bridge 0.0.7"));
         assert!(other[0].0 == State::Failed && other[0].1.contains("version 0.0.7"), "{other:?}");
-        let broken = of("broken", Some("echo no such library >&2; exit 127"));
+        let broken = of(Some("echo no such library >&2; exit 127"));
         assert!(broken[0].0 == State::Failed && broken[0].1.contains("does not run"), "{broken:?}");
     }
 
@@ -126,10 +122,10 @@ mod tests {
             )
         };
         let script = format!("{}\n{}\n{}\necho nonsense\nexit 5", version(), line("warning"), line("failed"));
-        let found = of("found", Some(&script));
+        let found = of(Some(&script));
         let said = "--connect=tcp/r:1".to_owned();
         assert_eq!(found, [(State::Warning, said.clone(), "do".into()), (State::Failed, said, "do".into())]);
-        let silent = of("silent", Some(&format!("{}\necho what >&2; exit 2", version())));
+        let silent = of(Some(&format!("{}\necho what >&2; exit 2", version())));
         assert!(silent[0].0 == State::Failed && silent[0].1.contains("what"), "{silent:?}");
     }
 }

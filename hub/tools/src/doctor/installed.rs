@@ -162,7 +162,7 @@ mod tests {
 
     #[test]
     fn a_service_is_absent_broken_asleep_or_well() {
-        let laid = Laid::out("service", 0, &[]);
+        let laid = Laid::out(0, &[]);
         let of = |hub| service(&laid.system, hub);
         assert_eq!(of(None).state, State::Skipped);
         laid.put("etc/systemd/system/scanhub.service", SERVICE);
@@ -197,7 +197,7 @@ mod tests {
 
     #[test]
     fn a_rule_is_of_this_version_and_in_effect() {
-        let laid = Laid::out("rules", 0, &[("dev/ttyUSB0", ""), ("sys/usb/idVendor", "0403\n")]);
+        let laid = Laid::out(0, &[("dev/ttyUSB0", ""), ("sys/usb/idVendor", "0403\n")]);
         fs::create_dir_all(laid.path("sys/class/tty/ttyUSB0")).unwrap();
         laid.link(laid.path("sys/usb").to_str().unwrap(), "sys/class/tty/ttyUSB0/device");
         let there = found_in(&laid.path(""));

@@ -89,7 +89,7 @@ mod tests {
 
     #[test]
     fn the_last_file_that_says_it_wins() {
-        let laid = Laid::out("logout", 1000, &[("etc/passwd", "robot:x:1000:1000::/:\n")]);
+        let laid = Laid::out(1000, &[("etc/passwd", "robot:x:1000:1000::/:\n")]);
         let state = |user| logout(&laid.system, user).state;
         assert_eq!(state(1000), State::Ok, "no logind");
         std::fs::create_dir_all(laid.path("run/systemd/users")).unwrap();

@@ -377,7 +377,7 @@ pub(super) mod tests {
             ("proc/42/status", "Uid:\t9\t9\t9\t9\n"),
             ("proc/42/cmdline", "scanhub\0run\0"),
         ];
-        let laid = Laid::out("foreign-hub", 7, &files);
+        let laid = Laid::out(7, &files);
         let foreign = Facts { foreign: RunningHub::all(&laid.path("")), ..facts() };
         let command = "user robot runs one, process 41: sudo -u robot scanhub doctor";
         let unknown = "runs one in an unknown domain, process 42: sudo -u robot scanhub list --domains";

@@ -68,7 +68,7 @@ mod tests {
     fn an_interface_that_is_named_is_there_up_and_plugged_in() {
         let head = "Inter-|   Receive\n face |bytes\n";
         let files = [("sys/class/net/lo/flags", "0x9\n"), ("proc/net/dev", &format!("{head}    lo: 1 2\n"))];
-        let laid = Laid::out("multicast", 7, &files);
+        let laid = Laid::out(7, &files);
         let of = |name: &str| multicast(&laid.system, Some(name));
         assert_eq!(multicast(&laid.system, None).state, State::Skipped);
         assert_eq!(of("lo").state, State::Ok);

@@ -101,7 +101,7 @@ mod tests {
 
     #[test]
     fn the_same_bytes_are_the_same_program() {
-        let laid = Laid::out("program", 7, &[("else", "#!/bin/sh\necho scanhub 9.9.9\n")]);
+        let laid = Laid::out(7, &[("else", "#!/bin/sh\necho scanhub 9.9.9\n")]);
         let own = std::env::current_exe().unwrap();
         assert_eq!(compare(&own, false).unwrap(), Build::Same);
         std::fs::copy(&own, laid.path("copy")).unwrap();

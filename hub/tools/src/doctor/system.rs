@@ -77,19 +77,19 @@ impl System {
 pub(super) mod tests {
     use super::*;
 
-    /// Files below a directory of a test, gone with it.
+    /// Files below a temporary directory.
     pub(crate) struct Laid {
         root: PathBuf,
+        _directory: tempfile::TempDir,
         pub(crate) system: System,
     }
 
     impl Laid {
         /// `files` by path and content, looked at by `user`.
-        pub(crate) fn out(test: &str, user: u32, files: &[(&str, &str)]) -> Laid {
-            let root = std::env::temp_dir().join(format!("scanhub-{test}-{}", std::process::id()));
-            fs::create_dir_all(&root).unwrap();
-            let root = root.canonicalize().unwrap();
-            let laid = Laid { system: System::at(&root, user), root };
+        pub(crate) fn out(user: u32, files: &[(&str, &str)]) -> Laid {
+            let directory = tempfile::tempdir().unwrap();
+            let root = directory.path().canonicalize().unwrap();
+            let laid = Laid { system: System::at(&root, user), root, _directory: directory };
             for (path, content) in files {
                 laid.put(path, content);
             }
@@ -113,24 +113,18 @@ pub(super) mod tests {
         }
     }
 
-    impl Drop for Laid {
-        fn drop(&mut self) {
-            let _ = fs::remove_dir_all(&self.root);
-        }
-    }
-
     #[test]
     fn of_two_files_of_one_name_the_first_directorys_counts() {
         let files =
             [("etc/x.d/b.conf", "1"), ("usr/x.d/b.conf", "2"), ("usr/x.d/a.conf", "3"), ("etc/x.d/c", "4")];
-        let laid = Laid::out("drop-ins", 7, &files);
+        let laid = Laid::out(7, &files);
         let found = laid.system.drop_ins(&["etc/x.d".to_owned(), "usr/x.d".to_owned()]);
         assert_eq!(found, [laid.path("usr/x.d/a.conf"), laid.path("etc/x.d/b.conf")]);
     }
 
     #[test]
     fn users_have_names() {
-        let laid = Laid::out("users", 7, &[("etc/passwd", "root:x:0:0::/:\nrobot:x:7:7::/:\n")]);
+        let laid = Laid::out(7, &[("etc/passwd", "root:x:0:0::/:\nrobot:x:7:7::/:\n")]);
         assert_eq!([7, 8].map(|user| laid.system.name_of(user)), ["robot", "8"]);
     }
 }

@@ -121,14 +121,10 @@ mod tests {
 
     /// Returns the link as `run` loads it, from the flag and from the section.
     fn loaded(link: &SuggestedLink) -> Link {
-        static COUNT: std::sync::atomic::AtomicUsize = std::sync::atomic::AtomicUsize::new(0);
-        let number = COUNT.fetch_add(1, std::sync::atomic::Ordering::Relaxed);
-        let file =
-            std::env::temp_dir().join(format!("scanhub-suggested-{}-{number}.toml", std::process::id()));
+        let file = tempfile::NamedTempFile::new().unwrap();
         std::fs::write(&file, link.toml()).unwrap();
         let load = |sources: Sources| Config::load(&sources).map(|config| config.links);
-        let by_file = load(Sources { files: vec![file.clone()], ..Sources::default() });
-        std::fs::remove_file(&file).unwrap();
+        let by_file = load(Sources { files: vec![file.path().to_owned()], ..Sources::default() });
         let by_flag = load(Sources { links: vec![link.flag()], ..Sources::default() });
         assert_eq!(by_file, by_flag, "{}", link.toml());
         let [loaded] = &by_flag.unwrap_or_else(|failure| panic!("{}: {failure}", link.flag()))[..] else {
@@ -189,12 +185,12 @@ mod tests {
 
     #[test]
     fn a_name_that_changes_is_replaced() {
-        let root = std::env::temp_dir().join(format!("scanhub-names-{}", std::process::id()));
+        let directory = tempfile::tempdir().unwrap();
+        let root = directory.path().canonicalize().unwrap();
         let (by_id, by_path) = (root.join("serial/by-id/a"), root.join("serial/by-path/b"));
         for path in [&by_id, &by_path] {
             std::fs::create_dir_all(path.parent().unwrap()).unwrap();
         }
-        let root = root.canonicalize().unwrap();
         let device = root.join("ttyUSB0");
         std::fs::write(&device, "").unwrap();
         for link in [&by_id, &by_path, &root.join("lidar")] {
@@ -217,6 +213,5 @@ mod tests {
         (there[0].name, there[0].shared_name) = (by_path.clone(), Some(by_id.clone()));
         assert_eq!(name(&by_id, &there), by_path.display().to_string());
         assert_eq!(name(Path::new("/dev/no-such-port"), &there), "/dev/no-such-port");
-        std::fs::remove_dir_all(&root).unwrap();
     }
 }

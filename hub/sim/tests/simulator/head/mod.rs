@@ -205,14 +205,13 @@ fn the_same_seed_says_the_same_and_what_was_recorded_is_said_again() {
     };
     let packets = said(5);
     assert!(packets == said(5) && packets != said(6));
-    let path = std::env::temp_dir().join(format!("scanhub-head-{}", std::process::id()));
+    let path = tempfile::NamedTempFile::new().expect("a file").into_temp_path();
     let mut bytes = packets[0][20..].to_vec();
     packets.iter().for_each(|packet| bytes.extend(packet));
     std::fs::write(&path, &bytes).expect("written");
     let found = recorded(&path, None).expect("packets");
     std::fs::write(&path, b"nothing").expect("written");
     let none = recorded(&path, None).expect_err("no packets");
-    std::fs::remove_file(&path).expect("removed");
     assert!(none.message.contains("no packet"), "{none}");
     assert_eq!(found, packets);
     for looped in [false, true] {
