@@ -5,6 +5,7 @@
 
 mod support;
 
+use scanhub_drivers::lms;
 use std::process::ExitCode;
 
 use support::figures::{self, Figure, Target};

@@ -10,11 +10,10 @@ use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
-use lms::Nanos;
-use lms::variant::{MIRROR_TURN, Unit, Variant};
 use preprocess::background::{Method, Model, Settings};
 use preprocess::segments::Segmenter;
-use schema::{Background, Foreground, Pose, Scan};
+use scanhub_drivers::lms::variant::{MIRROR_TURN, Unit, Variant};
+use schema::{Background, Foreground, Nanos, Pose, Scan};
 use sim::room::Room;
 
 /// Number of scans, as in the paper's figure.

@@ -1,9 +1,9 @@
 //! What does a line that loses bytes cost? The paper's Fig. 6: five minutes of telegrams, of which 0.135 % of the bytes
 //! are lost in bursts, read by three parsers. A telegram that the line damaged cannot be restored; whatever else is
 //! missing, the parser discarded. `--count N` sets the number of telegrams, `--pairs N` that of lines.
-//! `hub/lms/tests/framing.rs` checks the same in other surroundings.
+//! `hub/drivers/tests/lms/framing.rs` checks the same in other surroundings.
 
-#[path = "../hub/lms/tests/line/mod.rs"]
+#[path = "../hub/drivers/tests/lms/line/mod.rs"]
 #[allow(dead_code)] // The test uses the other surroundings.
 mod line;
 mod support;

@@ -11,7 +11,7 @@ mod support;
 use std::collections::HashSet;
 use std::process::ExitCode;
 
-use lms::reply::Reply;
+use scanhub_drivers::lms::reply::Reply;
 use serde_json::Value;
 use support::figures::{self, Figure, Target};
 use support::stage::{Line, PATIENCE, Stage};

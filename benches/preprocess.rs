@@ -10,10 +10,10 @@ mod decoded_scan;
 use std::hint::black_box;
 
 use criterion::{Criterion, criterion_group, criterion_main};
-use lms::variant::{MIRROR_TURN, Unit, Variant};
 use preprocess::background::{self, Method, Model};
 use preprocess::segments::Segmenter;
 use preprocess::{marks, zones};
+use scanhub_drivers::lms::variant::{MIRROR_TURN, Unit, Variant};
 use schema::{Foreground, Marks, Pose, Scan, Zones};
 use sim::room::Room;
 

@@ -6,12 +6,12 @@
 use criterion::{Criterion, criterion_group, criterion_main};
 use daemon::scanner;
 use fastrand::Rng;
-use lms::crc::crc;
-use lms::framer::{Found, Framer};
-use lms::header::Expect;
-use lms::measured::{self, Measured};
-use lms::telegram::Telegram;
-use lms::variant::{Mode, Unit};
+use scanhub_drivers::lms::crc::crc;
+use scanhub_drivers::lms::framer::{Found, Framer};
+use scanhub_drivers::lms::header::Expect;
+use scanhub_drivers::lms::measured::{self, Measured};
+use scanhub_drivers::lms::telegram::Telegram;
+use scanhub_drivers::lms::variant::{Mode, Unit};
 use schema::{Contents, Scan};
 use std::hint::black_box;
 

@@ -21,11 +21,12 @@ use std::sync::{Arc, Mutex};
 use std::thread::{self, JoinHandle};
 use std::time::Duration;
 
-use lms::variant::{MIRROR_TURN, Unit};
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::fs::{Mode, OFlags, fcntl_setfl, open};
 use rustix::pty::{OpenptFlags, grantpt, openpt, ptsname, unlockpt};
 use rustix::termios::{OptionalActions, tcgetattr, tcsetattr};
+use scanhub_drivers::lms;
+use scanhub_drivers::lms::variant::{MIRROR_TURN, Unit};
 use sim::options::{Scanner, SimulateOptions};
 use sim::{Event, simulate_with};
 

@@ -6,13 +6,12 @@ use std::thread;
 use std::time::Duration;
 
 use config::{Config, Sources};
-use lms::Nanos;
-use lms::measured;
-use lms::telegram::STX;
-use lms::variant::{MIRROR_TURN, Mode, Unit, Variant};
 use rustix::time::{ClockId, clock_gettime};
+use scanhub_drivers::lms::measured;
+use scanhub_drivers::lms::telegram::STX;
+use scanhub_drivers::lms::variant::{MIRROR_TURN, Mode, Unit, Variant};
 use schema::ipc::{self, Node, Payload, Subscriber};
-use schema::{Background, Failure, Foreground, Kind, Marks, Scan, Status, Zones};
+use schema::{Background, Failure, Foreground, Kind, Marks, Nanos, Scan, Status, Zones};
 use sim::room::Room;
 
 use crate::growth::{Quantity, Sweep};

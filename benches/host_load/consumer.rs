@@ -7,11 +7,12 @@ use std::path::Path;
 use std::thread;
 
 use daemon::scanner;
-use lms::measured::Measured;
-use lms::telegram::Telegram;
-use lms::variant::{Mode, Unit};
 use preprocess::{background, marks, segments, zones};
 use rustix::fs::{OFlags, fcntl_setfl};
+use scanhub_drivers::lms;
+use scanhub_drivers::lms::measured::Measured;
+use scanhub_drivers::lms::telegram::Telegram;
+use scanhub_drivers::lms::variant::{Mode, Unit};
 use schema::limits::TopicLimits;
 use schema::{Foreground, Marks, Pose, Scan, Zones};
 

@@ -3,11 +3,12 @@
 
 use std::net::{Ipv4Addr, UdpSocket};
 
-use lms::variant::{MIRROR_TURN, Unit, Variant};
 use rustix::net::sockopt::{
     set_ip_add_membership, set_ip_multicast_if, set_ip_multicast_ttl, set_socket_reuseaddr,
 };
 use rustix::net::{AddressFamily, SocketAddrV4, SocketFlags, SocketType, bind, socket_with};
+use scanhub_drivers::lms;
+use scanhub_drivers::lms::variant::{MIRROR_TURN, Unit, Variant};
 use sim::room::Room;
 
 use crate::consumer::MODE;

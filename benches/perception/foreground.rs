@@ -11,9 +11,9 @@
 
 use std::ops::Range;
 
-use lms::variant::{Unit, Variant};
 use preprocess::background::{Method as Kind, Model, Settings, Start};
 use preprocess::segments::Segmenter;
+use scanhub_drivers::lms::variant::{Unit, Variant};
 use schema::{Foreground, Pose, Scan};
 
 use crate::figures::{self, Cell, Figure, Target};

@@ -12,13 +12,14 @@ use std::path::Path;
 use std::process::{Command, Stdio};
 use std::thread;
 
-use lms::command::Request;
-use lms::framer::{Found, Framer};
-use lms::variant::Baud;
 use rustix::event::{EventfdFlags, eventfd};
 use rustix::fs::{Mode, OFlags, open};
 use rustix::io::Errno;
 use rustix::termios::{OptionalActions, tcgetattr, tcsetattr};
+use scanhub_drivers::lms;
+use scanhub_drivers::lms::command::Request;
+use scanhub_drivers::lms::framer::{Found, Framer};
+use scanhub_drivers::lms::variant::Baud;
 
 use super::stage::Guard;
 use super::{Outcome, PART, clock, truth};
@@ -191,7 +192,7 @@ impl Host {
     /// Sends `request` until the scanner replies.
     fn request(&mut self, request: Request) -> Outcome<()> {
         for _ in 0..TRIES {
-            let byte_time = lms::line_time(1, self.rate) + GAP;
+            let byte_time = schema::line_time(1, self.rate) + GAP;
             for &byte in request.encode(0).bytes() {
                 let next = clock::now() + byte_time;
                 self.line.write(byte)?;

@@ -2,6 +2,7 @@
 //! print when a sample had arrived. For a crowd, many subscribers share a process, each in its own thread and with its
 //! own membership, queue and wake-ups, as if it were a process.
 
+use scanhub_drivers::lms;
 use std::io::Write;
 use std::sync::{Arc, Barrier};
 use std::thread;

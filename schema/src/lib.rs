@@ -29,6 +29,7 @@ mod sweep;
 mod telegram;
 mod text;
 mod tilt;
+mod time;
 mod topic;
 mod tracks;
 mod zones;
@@ -80,6 +81,7 @@ pub use status::{COUNTERS, Counter, Counters, State, Status};
 pub use sweep::SweepPoints;
 pub use telegram::Telegram;
 pub use tilt::Tilt;
+pub use time::{MICROS, MILLIS, Nanos, line_time};
 pub use topic::{
     CONTROL, CONTROL_REQUEST, CONTROL_RESPONSE, Maker, Pace, ROBOT, Ring, Row, Topic, WAKE, Wake,
     check_followed, check_sensor, is_remote, of_service,

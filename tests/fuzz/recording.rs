@@ -3,9 +3,9 @@
 
 use std::fs;
 
-use lms::telegram::Telegram;
-use lms::variant::{Mode, Unit};
 use recording::{Encoding, Form, Recording};
+use scanhub_drivers::lms::telegram::Telegram;
+use scanhub_drivers::lms::variant::{Mode, Unit};
 use schema::Family;
 use tempfile::NamedTempFile;
 

@@ -7,19 +7,21 @@ mod recording;
 mod scans;
 mod surroundings;
 
-use line::Control;
-use line::{Output, Session as _};
-use lms::Session;
-use lms::command::Request;
-use lms::explain::explain;
-use lms::framer::{Found, Framer, SUFFIX_HOLD, Tally, VETO_HOLD};
-use lms::header::Expect;
-use lms::measured::Measured;
-use lms::reply::Reply;
-use lms::telegram::{FRAME, MAX_LENGTH, STX, Telegram, Writer};
-use lms::variant::{Baud, Variant};
-use lms::{MILLIS, Nanos, Settings};
 use lms_configure::eeprom::Write;
+use scanhub_drivers::line::Control;
+use scanhub_drivers::line::{Output, Session as _};
+use scanhub_drivers::lms;
+use scanhub_drivers::lms::Session;
+use scanhub_drivers::lms::Settings;
+use scanhub_drivers::lms::command::Request;
+use scanhub_drivers::lms::explain::explain;
+use scanhub_drivers::lms::framer::{Found, Framer, SUFFIX_HOLD, Tally, VETO_HOLD};
+use scanhub_drivers::lms::header::Expect;
+use scanhub_drivers::lms::measured::Measured;
+use scanhub_drivers::lms::reply::Reply;
+use scanhub_drivers::lms::telegram::{FRAME, MAX_LENGTH, STX, Telegram, Writer};
+use scanhub_drivers::lms::variant::{Baud, Variant};
+use schema::{MILLIS, Nanos};
 
 /// A target by its name.
 pub type Target = (&'static str, fn(&[u8]));

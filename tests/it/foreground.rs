@@ -4,8 +4,8 @@
 #[path = "../testkit/foreground.rs"]
 mod scenes;
 
-use lms::variant::Unit;
 use preprocess::background::{Class, Method as Kind, Model, Settings};
+use scanhub_drivers::lms::variant::Unit;
 use schema::{Background, Foreground};
 
 use scenes::{Boxes, Detector, Expected, HubDetector, LabeledScan, Scene, Score, play};

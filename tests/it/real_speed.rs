@@ -6,7 +6,7 @@ mod judges;
 mod sensors;
 mod stage;
 
-use lms::MILLIS;
+use schema::MILLIS;
 use stage::Stage;
 use world::Plan;
 

@@ -4,7 +4,8 @@
 use std::collections::BTreeMap;
 use std::fs::File;
 
-use lms::variant::{MIRROR_TURN, Mode, Unit, Variant};
+use scanhub_drivers::lms;
+use scanhub_drivers::lms::variant::{MIRROR_TURN, Mode, Unit, Variant};
 use schema::file::Writer;
 use schema::{Header, Topic};
 use sim::room::Room;

@@ -5,7 +5,8 @@ use std::path::PathBuf;
 
 use crate::testkit;
 use crate::testkit::{INT, KILL, Outcome, Program, TestEnv, bytes_of, number, sequence, skip};
-use lms::variant::{Mode, Unit};
+use scanhub_drivers::lms;
+use scanhub_drivers::lms::variant::{Mode, Unit};
 use serde_json::Value;
 
 /// Publishes `file` with `option` behind its name to a consumer of `topics` that was there before, so that it gets the

@@ -4,7 +4,8 @@ use std::collections::BTreeMap;
 
 use crate::testkit;
 use crate::testkit::{INT, Outcome, Program, Sitting, TERM, TestEnv, is_class, number};
-use lms::variant::{Mode, Unit};
+use scanhub_drivers::lms;
+use scanhub_drivers::lms::variant::{Mode, Unit};
 use schema::datagram::Packed;
 use schema::file::Writer;
 use schema::{Header, Marks, Topic};

@@ -5,7 +5,8 @@ use std::collections::BTreeMap;
 use std::process::Command;
 
 use crate::testkit::{INT, MEASURED, Recording, TestEnv, is_class, number, output, python};
-use lms::variant::Unit;
+use scanhub_drivers::lms;
+use scanhub_drivers::lms::variant::Unit;
 use schema::datagram::Packed;
 use schema::{Code, Header, Pose, Scan, file};
 use serde_json::Value;

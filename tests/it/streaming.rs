@@ -4,9 +4,10 @@
 use crate::testkit::{
     INT, MEASURED, REAL_ANSWERS, TERM, TestEnv, bytes_of, hash, is_class, number, sequence,
 };
-use lms::framer::{Found, Framer};
-use lms::measured::Measured;
-use lms::telegram::Telegram;
+use scanhub_drivers::lms;
+use scanhub_drivers::lms::framer::{Found, Framer};
+use scanhub_drivers::lms::measured::Measured;
+use scanhub_drivers::lms::telegram::Telegram;
 use schema::Topic;
 use serde_json::Value;
 

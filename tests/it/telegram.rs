@@ -4,16 +4,16 @@
 use std::io::Write as _;
 use std::process::{Command, Output, Stdio};
 
-use lms::command::Request;
-use lms::configuration::{self, Configuration};
-use lms::errors::Errors;
-use lms::measured;
-use lms::operating::{self, Operating};
-use lms::parameters::{Password, Raw, Span, Spans};
-use lms::reply::{self, Health, Reply};
-use lms::telegram::Encoded;
-use lms::variant::{Baud, Mode, Unit, Variant};
 use lms_configure::eeprom::{PowerOn, Write};
+use scanhub_drivers::lms::command::Request;
+use scanhub_drivers::lms::configuration::{self, Configuration};
+use scanhub_drivers::lms::errors::Errors;
+use scanhub_drivers::lms::measured;
+use scanhub_drivers::lms::operating::{self, Operating};
+use scanhub_drivers::lms::parameters::{Password, Raw, Span, Spans};
+use scanhub_drivers::lms::reply::{self, Health, Reply};
+use scanhub_drivers::lms::telegram::Encoded;
+use scanhub_drivers::lms::variant::{Baud, Mode, Unit, Variant};
 use serde_json::Value;
 
 use crate::testkit::spawn;

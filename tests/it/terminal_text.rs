@@ -4,7 +4,7 @@
 use std::fs;
 
 use crate::testkit::{Outcome, TERM, TestEnv};
-use lms::telegram::Writer;
+use scanhub_drivers::lms::telegram::Writer;
 
 /// C0, DEL and C1, as a terminal takes them for a command.
 const HOSTILE: &str = "\u{1b}]0;x\u{7}\u{9b}31m\u{7f}\u{85}\u{9d}";

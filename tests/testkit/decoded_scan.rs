@@ -1,8 +1,8 @@
 //! Scans as the hub publishes them, from the values that a simulated LMS sends: the hub's own decoder splits them.
 
 use daemon::scanner;
-use lms::measured::{self, Measured};
-use lms::variant::{Mode, Unit};
+use scanhub_drivers::lms::measured::{self, Measured};
+use scanhub_drivers::lms::variant::{Mode, Unit};
 use schema::Scan;
 
 /// Measuring mode of the scans: 13 bits of range, 3 of intensity.

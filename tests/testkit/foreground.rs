@@ -6,8 +6,9 @@ mod decoded_scan;
 
 use std::ops::AddAssign;
 
-use lms::variant::{Unit, Variant};
 use preprocess::background::{Class, Model, Settings};
+use scanhub_drivers::lms;
+use scanhub_drivers::lms::variant::{Unit, Variant};
 use schema::{Foreground, Scan};
 use sim::labeled_scan::Met;
 use sim::room::Room;

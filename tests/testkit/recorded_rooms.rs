@@ -9,12 +9,12 @@ use std::fs::File;
 use std::path::Path;
 
 use config::{Config, Sources};
-use lms::Nanos;
-use lms::variant::{MIRROR_TURN, Mode, Unit, Variant};
+use scanhub_drivers::lms;
+use scanhub_drivers::lms::variant::{MIRROR_TURN, Mode, Unit, Variant};
 use schema::datagram::Packed;
 use schema::file::Writer;
 use schema::ipc::{self, Node, Payload, Subscriber};
-use schema::{Background, Domain, Foreground, Header, Marks, Scan, Topic, Zones};
+use schema::{Background, Domain, Foreground, Header, Marks, Nanos, Scan, Topic, Zones};
 use sim::room::Room;
 use sim::world::World;
 
@@ -142,4 +142,4 @@ fn packed(payload: &(impl Packed + ?Sized)) -> Vec<u8> {
     room
 }
 
-const SECOND: Nanos = 1_000 * lms::MILLIS;
+const SECOND: Nanos = 1_000 * schema::MILLIS;

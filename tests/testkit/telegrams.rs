@@ -1,7 +1,8 @@
 //! What a test knows of telegrams: the lines in which programs tell of them, and whether they are what was sent.
 
-use lms::telegram::Telegram;
-use lms::variant::Unit;
+use scanhub_drivers::lms;
+use scanhub_drivers::lms::telegram::Telegram;
+use scanhub_drivers::lms::variant::Unit;
 use serde_json::Value;
 use sha2::{Digest, Sha256};
 

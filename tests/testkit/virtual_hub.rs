@@ -11,11 +11,10 @@ use std::rc::Rc;
 use config::Config;
 use daemon::surroundings::{Learned, Line, Surroundings, Wait, Woken};
 use daemon::{LiveLink, Orders};
-use lms::Nanos;
 use port::{Allowance, Alteration, PortError, Source, clock};
 use schema::ipc::{self, Node, Payload, SharedMemory, Waker};
 use schema::limits::TopicLimits;
-use schema::{Domain, Failure, HubLock, Ring, Wake, shortage};
+use schema::{Domain, Failure, HubLock, Nanos, Ring, Wake, shortage};
 
 /// A link in virtual time. Its port must be a recording in the configuration: it streams from the start, and its scans
 /// are read in the configured mode.

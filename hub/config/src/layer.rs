@@ -12,9 +12,9 @@ mod sight;
 
 use std::rc::Rc;
 
-use lms::family::Family;
-use lms::variant::{Baud, Mode, Unit, Variant};
 use port::Source;
+use scanhub_drivers::lms::family::Family;
+use scanhub_drivers::lms::variant::{Baud, Mode, Unit, Variant};
 use schema::limits::TopicLimits;
 use schema::{Failure, Kind, check_sensor};
 use serde::Deserialize;

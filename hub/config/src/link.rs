@@ -1,9 +1,9 @@
 //! The links of a hub, each with its port and the settings of its sensor: values in effect. Refuses to know where they
 //! were set.
 
-use lms::family::Family;
-use lms::variant::{Baud, MAX_BEAMS, Mode, Unit, Variant};
 use port::Source;
+use scanhub_drivers::lms::family::Family;
+use scanhub_drivers::lms::variant::{Baud, MAX_BEAMS, Mode, Unit, Variant};
 use schema::limits::TopicLimits;
 use schema::{Background, Contents};
 

@@ -88,8 +88,8 @@ impl Gateway {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use lms::family::Family;
-    use lms::variant::{Baud, Mode, Unit, Variant};
+    use scanhub_drivers::lms::family::Family;
+    use scanhub_drivers::lms::variant::{Baud, Mode, Unit, Variant};
 
     fn sources(set: &[&str], links: &[&str]) -> Sources {
         let owned = |flags: &[&str]| flags.iter().map(|flag| (*flag).to_owned()).collect();

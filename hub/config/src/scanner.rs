@@ -1,7 +1,7 @@
 //! The scanner of a link: its family, and what is set for one whose head turns. Refuses to know
 //! where it was set, and what is set for an LMS.
 
-use line::family::{Features, Model, Wanted};
+use scanhub_drivers::line::family::{Features, Model, Wanted};
 use schema::Family;
 
 /// A family of scanners, with what is set for one of them. What is set for an LMS is in its [`Link`](crate::Link).

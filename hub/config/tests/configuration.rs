@@ -1,6 +1,7 @@
 //! What is made of the scans, as it is configured: who wins over whom, what cannot be, and that each refusal names place,
 //! value and remedy.
 
+use scanhub_drivers::scanner;
 use std::fs;
 
 use config::{Config, Gateway, Processing, Scanner, Sources};

@@ -1,6 +1,7 @@
 //! Which scanner a link has, wherever that is said, and that what its family does not have is refused with place, value and remedy.
 
 use config::{Config, Link, Scanner, Sources};
+use scanhub_drivers::scanner;
 use schema::Kind;
 
 fn load(set: &[&str]) -> Result<Config, String> {

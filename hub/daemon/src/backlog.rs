@@ -1,7 +1,7 @@
 //! What waited in a tty before this hub opened it, because a killed hub had it before: nobody knows for how long. A driver tells
 //! only part of how much it is; but what waited comes faster than the line could bring it. Time is an argument.
 
-use lms::{MILLIS, Nanos, line_time};
+use schema::{MILLIS, Nanos, line_time};
 
 /// What waited and was not read yet.
 #[derive(Clone, Debug)]

@@ -1,6 +1,6 @@
 //! Measures the rate of bytes that arrive while the session receives nothing that it understands, for a message.
 
-use lms::{MILLIS, Nanos};
+use schema::{MILLIS, Nanos};
 
 /// Rate of the bytes that a session has read, over windows of some seconds.
 #[derive(Clone, Copy, Debug, Default)]

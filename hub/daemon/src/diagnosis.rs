@@ -5,11 +5,12 @@
 use std::path::Path;
 
 use config::{Link, Scanner};
-use line::Session as _;
-use lms::variant::Unit;
-use lms::{MILLIS, Nanos, Notice};
 use port::{Alteration, Source};
-use schema::{State, Status};
+use scanhub_drivers::line::Session as _;
+use scanhub_drivers::lms::Notice;
+use scanhub_drivers::lms::variant::Unit;
+use scanhub_drivers::{line, lms};
+use schema::{MILLIS, Nanos, State, Status};
 
 use crate::byte_rate::{ByteRate, with_commas};
 use crate::driver::{Driver, Trouble};

@@ -13,10 +13,11 @@
 
 use std::io;
 
-use line::{Nanos, Output, Session as _, suspect};
-use lms::Identity;
 use port::{Allowance, LineErrors, Source};
-use schema::State;
+use scanhub_drivers::line;
+use scanhub_drivers::line::{Output, Session as _, suspect};
+use scanhub_drivers::lms::Identity;
+use schema::{Nanos, State};
 
 use crate::backlog::Backlog;
 use crate::control::Flow;

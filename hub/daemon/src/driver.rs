@@ -5,11 +5,13 @@
 use std::fmt;
 
 use config::{Link, Scanner};
-use line::family::Model;
-use line::{Nanos, Output};
-use lms::variant::Baud;
-use lms::{Identity, Settings};
 use port::Source;
+use scanhub_drivers::line::Output;
+use scanhub_drivers::line::family::Model;
+use scanhub_drivers::lms::variant::Baud;
+use scanhub_drivers::lms::{Identity, Settings};
+use scanhub_drivers::{line, lms, scanner};
+use schema::Nanos;
 
 use crate::early::Begun;
 
@@ -146,7 +148,7 @@ impl line::Session for Driver {
     type Heard<'a> = Heard<'a>;
     type Trouble = Trouble;
 
-    line::delegate_session!(each);
+    scanhub_drivers::delegate_session!(each);
 
     fn poll_output(&mut self) -> Output<Heard<'_>> {
         match self {

@@ -3,11 +3,11 @@
 //! stop, never clear; what it said of a scan that is not published, or that looks better as it goes on, it takes back. Refuses
 //! to know topics, and whether anybody listens.
 
-use line::Turn;
-use lms::Nanos;
 use preprocess::zones::{Check, Warning};
-use scanner::Turning;
-use schema::{Early, Family, Scan, Verdict};
+use scanhub_drivers::line::Turn;
+use scanhub_drivers::scanner::Turning;
+use scanhub_drivers::{lms, scanner};
+use schema::{Early, Family, Nanos, Scan, Verdict};
 
 /// A scan that is arriving.
 pub(crate) enum Begun<'a> {

@@ -3,7 +3,8 @@
 //! once a second while the sensor streams. Refuses to know what of a sensor is worth to be known, where the record lies, and
 //! whether the line was its own all the while.
 
-use lms::{Identity, MILLIS, Nanos};
+use scanhub_drivers::lms::Identity;
+use schema::{MILLIS, Nanos};
 
 use crate::driver::Driver;
 use crate::surroundings::Surroundings;

@@ -12,9 +12,8 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
 use config::{Config, Link};
-use lms::{MILLIS, Nanos};
 use port::Source;
-use schema::{Age, Background, Failure, Pose, StateDirectory};
+use schema::{Age, Background, Failure, MILLIS, Nanos, Pose, StateDirectory};
 
 use crate::event_fd::EventFd;
 use crate::surroundings::Learned;

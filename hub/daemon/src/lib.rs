@@ -38,6 +38,6 @@ pub use player::{Pace, Play, Player, Progress};
 pub use reconnect::LiveLink;
 pub use reload::{Read, Reload};
 pub use replay_hub::{Replay, replay};
-pub use scanner;
+pub use scanhub_drivers::scanner;
 pub use service::Service;
 pub use supervise::{Ready, run};

@@ -2,11 +2,11 @@
 //! when it has to do something although nothing came. Refuses to know where bytes come from, and how a wait is done.
 
 use config::{Link, Processing, Scanner};
-use line::Control;
-use lms::session::Received;
-use lms::{MILLIS, Nanos};
 use port::Source;
-use schema::{Failure, Shown, State, Verb, Wake};
+use scanhub_drivers::line;
+use scanhub_drivers::line::Control;
+use scanhub_drivers::lms::session::Received;
+use schema::{Failure, MILLIS, Nanos, Shown, State, Verb, Wake};
 
 use crate::control::{ControlQueue, Flow};
 use crate::diagnosis::Diagnosis;

@@ -1,13 +1,13 @@
 //! What a link reports of itself: the state of a session and the hub's own counts as the payload of topic `status`.
 
 use config::Link;
-use line::Session as _;
-use lms::Nanos;
-use lms::header::Reject;
-use lms::reply::Reply;
-use lms::telegram::Telegram;
-use lms::variant::{Mode, Variant};
-use schema::{Counter, Counters, MIN_RATE_SPAN, Pose, State, Status};
+use scanhub_drivers::line::Session as _;
+use scanhub_drivers::lms;
+use scanhub_drivers::lms::header::Reject;
+use scanhub_drivers::lms::reply::Reply;
+use scanhub_drivers::lms::telegram::Telegram;
+use scanhub_drivers::lms::variant::{Mode, Variant};
+use schema::{Counter, Counters, MIN_RATE_SPAN, Nanos, Pose, State, Status};
 
 use crate::driver::Driver;
 use crate::process_telegram::Processed;

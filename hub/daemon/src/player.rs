@@ -6,9 +6,8 @@ mod playback;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
-use lms::Nanos;
 use port::clock;
-use schema::Failure;
+use schema::{Failure, Nanos};
 
 use crate::event_fd::EventFd;
 pub use playback::Play;

@@ -2,11 +2,11 @@
 //! Refuses to know whether it came down a line or was recorded, and when the next one comes.
 
 use config::{Link, Processing};
-use lms::Nanos;
-use lms::reply::Reply;
-use lms::session::Received;
-use lms::variant::{Mode, Variant};
-use schema::{Background, Failure, Family, Flags, Pose, Scan, Verb, Wake, Zones};
+use scanhub_drivers::lms::reply::Reply;
+use scanhub_drivers::lms::session::Received;
+use scanhub_drivers::lms::variant::{Mode, Variant};
+use scanhub_drivers::{line, scanner};
+use schema::{Background, Failure, Family, Flags, Nanos, Pose, Scan, Verb, Wake, Zones};
 
 use crate::early::{Begun, EarlyWarner, Word};
 use crate::pipeline::Pipeline;
@@ -295,6 +295,6 @@ pub(crate) fn limit(period_us: u32) -> Nanos {
 }
 
 /// A verdict stands for two scan periods and so much longer.
-const GRACE: Nanos = 20 * lms::MILLIS;
+const GRACE: Nanos = 20 * schema::MILLIS;
 /// The same for scans of no variant, which have no nominal period: two of 361 beams at 38400 baud and the grace.
-const NO_PERIOD: Nanos = 480 * lms::MILLIS;
+const NO_PERIOD: Nanos = 480 * schema::MILLIS;

@@ -1,10 +1,9 @@
 //! What a link makes of a scanner whose head turns and that sends packets: the packets themselves, and of each turn a scan and
 //! what follows from it. Refuses to know how packets become turns.
 
-use line::{Received, Turn};
-use lms::Nanos;
-use scanner::Turning;
-use schema::Scan;
+use scanhub_drivers::line::{Received, Turn};
+use scanhub_drivers::scanner::Turning;
+use schema::{Nanos, Scan};
 
 use crate::early::Begun;
 use crate::process_telegram::{LinkOutput, Processed, RecordedContext, limit};
@@ -53,5 +52,5 @@ impl<S: Surroundings> LinkOutput<'_, S> {
 }
 
 pub(crate) fn micros(period: Nanos) -> u32 {
-    u32::try_from(period / line::MICROS).unwrap_or(u32::MAX)
+    u32::try_from(period / schema::MICROS).unwrap_or(u32::MAX)
 }

@@ -2,8 +2,7 @@
 
 use std::collections::VecDeque;
 
-use lms::{MILLIS, Nanos};
-use schema::{Counter, Counters};
+use schema::{Counter, Counters, MILLIS, Nanos};
 
 /// The counters of the last ten seconds.
 pub(crate) struct Recent {

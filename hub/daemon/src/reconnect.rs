@@ -3,10 +3,10 @@
 
 use std::io;
 
-use line::{Control, Session as _};
-use lms::{Identity, MILLIS, Nanos};
 use port::{PortError, Source};
-use schema::{Failure, Flags, State};
+use scanhub_drivers::line::{Control, Session as _};
+use scanhub_drivers::lms::Identity;
+use schema::{Failure, Flags, MILLIS, Nanos, State};
 
 use crate::control::{ControlQueue, Flow};
 use crate::drive::{Drive, Open};

@@ -2,9 +2,8 @@
 //! stream is lost for it; what belongs to a line waits for the next start, which is said. One that cannot be changes nothing.
 
 use config::{Background, Config, Link, Processing, Scanner};
-use line::family::Wanted;
-use lms::Nanos;
-use schema::Failure;
+use scanhub_drivers::line::family::Wanted;
+use schema::{Failure, Nanos};
 
 use crate::control::Orders;
 use crate::service::Service;

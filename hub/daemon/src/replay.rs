@@ -8,11 +8,11 @@ mod stream;
 use std::os::fd::AsFd;
 use std::path::Path;
 
-use lms::reply::Reply;
-use lms::variant::Variant;
-use lms::{MILLIS, Nanos};
 use port::clock;
-use schema::{Failure, Flags, State};
+use scanhub_drivers::lms::reply::Reply;
+use scanhub_drivers::lms::variant::Variant;
+use scanhub_drivers::{lms, scanner};
+use schema::{Failure, Flags, MILLIS, Nanos, State};
 
 use crate::control::Flow;
 use crate::driver::Driver;

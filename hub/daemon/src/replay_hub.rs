@@ -5,11 +5,10 @@ use std::path::Path;
 use std::sync::Arc;
 
 use config::{Config, Scanner, Sources};
-use line::family::Model;
-use lms::Nanos;
 use port::Source;
 use recording::Recording;
-use schema::{Domain, Failure, Family, Kind, check_sensor};
+use scanhub_drivers::line::family::Model;
+use schema::{Domain, Failure, Family, Kind, Nanos, check_sensor};
 
 use crate::player::{Play, Player, Progress};
 use crate::replay::{Origin, Recorded, tell_of_damage};

@@ -6,8 +6,8 @@ use std::os::fd::{AsFd, OwnedFd};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Mutex, PoisonError};
 
-use lms::Nanos;
 use rustix::io::{FdFlags, fcntl_setfd};
+use schema::Nanos;
 use sd_notify::NotifyState;
 
 /// The service manager; without one, as by default, nothing of this does anything.

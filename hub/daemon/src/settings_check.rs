@@ -1,8 +1,8 @@
 //! Decides when the hub reads an open port's settings back, because another process may have changed them: bytes arrive, but
 //! no telegram. A port that was open before the hub, or a program of root, is not kept out by the hub's lock.
 
-use line::State;
-use lms::{MILLIS, Nanos};
+use scanhub_drivers::line::State;
+use schema::{MILLIS, Nanos};
 
 /// Deadline of the next check of an open port.
 #[derive(Clone, Copy, Debug, Default)]

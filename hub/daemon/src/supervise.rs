@@ -7,11 +7,10 @@ use std::sync::mpsc;
 use std::thread;
 
 use config::{Config, Link};
-use lms::{MILLIS, Nanos};
 use port::{Port, Source, clock};
 use rustix::event::{EventfdFlags, PollFd, PollFlags, Timespec, eventfd, poll};
 use schema::ipc::{self, Node};
-use schema::{Domain, Failure, HubLock, Kind, StateDirectory, shortage};
+use schema::{Domain, Failure, HubLock, Kind, MILLIS, Nanos, StateDirectory, shortage};
 
 use crate::control::{ControlQueue, ControlServer};
 use crate::learned::{Keeper, Writer};

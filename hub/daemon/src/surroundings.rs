@@ -5,10 +5,9 @@
 use std::io;
 use std::path::Path;
 
-use lms::Nanos;
 use port::{Allowance, Alteration, PortError, Source};
 use schema::ipc::{Medium, Payload};
-use schema::{Background, Failure, Pose, Ring, Wake};
+use schema::{Background, Failure, Nanos, Pose, Ring, Wake};
 
 use crate::control::ControlQueue;
 

@@ -9,12 +9,11 @@ use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
-use lms::{MILLIS, Nanos};
 use port::{Allowance, Alteration, Dial, Port, PortError, Source, clock};
 use rustix::event::{PollFd, PollFlags, poll};
 use schema::ipc::{Node, Payload, SharedMemory, Waker};
 use schema::limits::TopicLimits;
-use schema::{Directory, Failure, Ring, Wake};
+use schema::{Directory, Failure, MILLIS, Nanos, Ring, Wake};
 
 use crate::control::ControlQueue;
 use crate::learned::Handle;

@@ -4,12 +4,11 @@
 mod moment;
 mod prepared_publisher;
 
-use line::Received;
-use lms::{MILLIS, Nanos};
+use scanhub_drivers::line::Received;
 use schema::ipc::DueRings;
 use schema::{
-    Background, Early, Failure, Family, Flags, Foreground, Header, Lines, Marks, Motion, Quality, Ring, Scan,
-    Status, Wake, Zones,
+    Background, Early, Failure, Family, Flags, Foreground, Header, Lines, MILLIS, Marks, Motion, Nanos,
+    Quality, Ring, Scan, Status, Wake, Zones,
 };
 
 use crate::early::Word;

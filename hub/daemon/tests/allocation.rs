@@ -13,14 +13,15 @@ use std::time::{Duration, Instant};
 
 use config::{Config, Sources};
 use counting::{HELD, TAKEN, WATCHED};
-use lms::command::Request;
-use lms::reply::{self, Health};
-use lms::telegram::ACK;
-use lms::variant::{Baud, Mode, Unit, Variant};
 use rustix::fs::{OFlags, fcntl_setfl};
 use rustix::io::Errno;
 use rustix::process::{Signal, getpid, kill_process};
 use rustix::pty::{OpenptFlags, grantpt, openpt, ptsname, unlockpt};
+use scanhub_drivers::lms;
+use scanhub_drivers::lms::command::Request;
+use scanhub_drivers::lms::reply::{self, Health};
+use scanhub_drivers::lms::telegram::ACK;
+use scanhub_drivers::lms::variant::{Baud, Mode, Unit, Variant};
 use schema::ipc::{self, Payload, Subscriber};
 use schema::{Domain, Foreground, Marks, Scan};
 

@@ -7,7 +7,8 @@ mod virtual_hub;
 use std::fs;
 
 use config::{Config, Sources};
-use lms::variant::Unit;
+use scanhub_drivers::lms;
+use scanhub_drivers::lms::variant::Unit;
 use schema::ipc::{self, Payload};
 use schema::{Domain, Marks, Scan, State, Status};
 use virtual_hub::virtual_hub;

@@ -5,13 +5,15 @@
 //! The only code that sends a request of [`crate::eeprom`], and it needs [`Consent`]. A write that was not
 //! acknowledged is not simply repeated: first the configuration is read, to see whether it was done.
 
-use lms::command::{self, Request};
-use lms::exchange::{Conversation, Exchange, Heard, MODE_TIMEOUT, MORE_TRIES, Output, Say, TRIES};
-use lms::framer::TelegramSpan;
-use lms::operating::{ON_REQUEST, Operating, PARTIAL, STREAM};
-use lms::reply::Reply;
-use lms::telegram::Encoded;
-use lms::{MILLIS, Nanos};
+use scanhub_drivers::lms::command::{self, Request};
+use scanhub_drivers::lms::exchange::{
+    Conversation, Exchange, Heard, MODE_TIMEOUT, MORE_TRIES, Output, Say, TRIES,
+};
+use scanhub_drivers::lms::framer::TelegramSpan;
+use scanhub_drivers::lms::operating::{ON_REQUEST, Operating, PARTIAL, STREAM};
+use scanhub_drivers::lms::reply::Reply;
+use scanhub_drivers::lms::telegram::Encoded;
+use schema::{MILLIS, Nanos};
 
 use crate::eeprom::{PowerOn, Write};
 use crate::plan::{Consent, OwnedConfiguration, Plan};

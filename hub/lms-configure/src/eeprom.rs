@@ -1,7 +1,7 @@
 //! Requests that write a sensor's EEPROM, which wears out after a few thousand writes. They work in installation mode
 //! only (Telegram listing 7-1). This module encodes and decodes them, and sends none.
 
-use lms::telegram::{Encoded, MAX_LENGTH, Telegram, Writer};
+use scanhub_drivers::lms::telegram::{Encoded, MAX_LENGTH, Telegram, Writer};
 
 /// A request that writes the EEPROM.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -132,7 +132,7 @@ pub const CONFIGURATION_2: u8 = 0x7C;
 #[cfg(test)]
 mod tests {
     use super::*;
-    use lms::command::{EEPROM_WRITES, Request};
+    use scanhub_drivers::lms::command::{EEPROM_WRITES, Request};
 
     const PRINTED: [u8; 34] = [
         0, 0, 0x46, 0, 0, 0, 1, 0, 0, 2, 2, 2, 0, 0, 0x0A, 0x0A, 0x50, 0x64, 0, 0x0A, 0x0A, 0x50, 0x80, 0,

@@ -3,7 +3,6 @@
 //! sensor by itself: the hub is built without it.
 //!
 //! Sans-I/O as `lms`: no port, no clock, no heap.
-#![no_std]
 #![forbid(unsafe_code)]
 
 mod change;

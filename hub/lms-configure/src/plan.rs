@@ -1,10 +1,10 @@
 //! A planned change of the EEPROM settings, and a person's consent to it. A plan is only values. It can be carried out
 //! only with consent, which is for one plan as it was shown.
 
-use lms::configuration::{Configuration, ITEMS, Item, LEN};
-use lms::inquiry::Report;
-use lms::parameters::Password;
-use lms::variant::Baud;
+use scanhub_drivers::lms::configuration::{Configuration, ITEMS, Item, LEN};
+use scanhub_drivers::lms::inquiry::Report;
+use scanhub_drivers::lms::parameters::Password;
+use scanhub_drivers::lms::variant::Baud;
 
 use crate::eeprom::PowerOn;
 
@@ -103,10 +103,9 @@ impl Consent {
 
 #[cfg(test)]
 mod tests {
-    extern crate std;
     use super::*;
-    use lms::configuration::factory;
-    use lms::variant::{Mode, Unit};
+    use scanhub_drivers::lms::configuration::factory;
+    use scanhub_drivers::lms::variant::{Mode, Unit};
     use std::vec::Vec;
 
     #[test]

@@ -2,7 +2,7 @@
 //! second of that at once, because a network holds data back and catches up. The rest waits in the connection, and is
 //! older than it seems when it is read. Refuses to know a clock, and what the bytes are.
 
-use lms::{MILLIS, Nanos, line_time};
+use schema::{MILLIS, Nanos, line_time};
 
 /// What may be read, and for how long there has been more.
 #[derive(Clone, Debug)]

@@ -1,8 +1,8 @@
 //! The only place in the hub that reads the clock.
 
-use lms::Nanos;
 use rustix::event::Timespec;
 use rustix::time::{ClockId, clock_gettime};
+use schema::Nanos;
 
 /// CLOCK_MONOTONIC, the clock of every stamp and deadline.
 pub fn now() -> Nanos {

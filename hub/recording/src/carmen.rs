@@ -9,14 +9,14 @@ use std::fmt;
 use std::io::{self, BufRead, Read};
 use std::path::Path;
 
-use lms::measured;
+use scanhub_drivers::lms::measured;
 #[cfg(feature = "mcap")]
-use lms::measured::Measured;
+use scanhub_drivers::lms::measured::Measured;
 #[cfg(feature = "mcap")]
-use lms::reply::Reply;
+use scanhub_drivers::lms::reply::{self, Reply};
 #[cfg(feature = "mcap")]
-use lms::telegram::Telegram;
-use lms::variant::{Mode, Unit, Variant};
+use scanhub_drivers::lms::telegram::Telegram;
+use scanhub_drivers::lms::variant::{Mode, Unit, Variant};
 
 use schema::{Failure, Kind};
 
@@ -197,7 +197,7 @@ pub(crate) fn is_made_up(telegram: &[u8]) -> bool {
 /// Returns the reply in which a scanner reports that its values have this encoding.
 #[cfg(feature = "mcap")]
 pub(crate) fn configuration(encoding: Encoding) -> Vec<u8> {
-    lms::reply::configuration(0, encoding.mode, encoding.unit, STATUS).bytes().to_vec()
+    reply::configuration(0, encoding.mode, encoding.unit, STATUS).bytes().to_vec()
 }
 
 /// Returns a range in units, rounded.
@@ -503,9 +503,9 @@ const STATUS: u8 = 0x10;
 #[cfg(test)]
 mod tests {
     use super::*;
-    use lms::measured::Measured;
-    use lms::telegram::Telegram;
-    use lms::variant::Mode;
+    use scanhub_drivers::lms::measured::Measured;
+    use scanhub_drivers::lms::telegram::Telegram;
+    use scanhub_drivers::lms::variant::Mode;
 
     fn line(count: usize, range: &str) -> String {
         let ranges = vec![range; count].join(" ");
@@ -698,7 +698,7 @@ mod tests {
     #[cfg(feature = "mcap")]
     #[test]
     fn what_is_no_whole_scan_has_no_line() {
-        assert_eq!(scan_line(lms::reply::mode(0, true, 0x10).bytes(), Mode(0), 1, 0), None);
+        assert_eq!(scan_line(reply::mode(0, true, 0x10).bytes(), Mode(0), 1, 0), None);
         let part = measured::encode(0, Unit::Cm, &[7; 61], 0x10);
         assert_eq!(scan_line(part.bytes(), Mode(0), 1, 0), None);
     }

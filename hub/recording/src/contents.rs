@@ -2,10 +2,10 @@
 
 use std::fmt;
 
-use lms::measured::Measured;
-use lms::reply::Reply;
-use lms::telegram::Telegram;
-use lms::variant::{Mode, Unit, Variant};
+use scanhub_drivers::lms::measured::Measured;
+use scanhub_drivers::lms::reply::Reply;
+use scanhub_drivers::lms::telegram::Telegram;
+use scanhub_drivers::lms::variant::{Mode, Unit, Variant};
 use schema::Family;
 
 use crate::{Unfit, Unread};

@@ -11,7 +11,7 @@ use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
 
-use lms::variant::{Baud, Mode, Unit};
+use scanhub_drivers::lms::variant::{Baud, Mode, Unit};
 use schema::csv::{MarkColumns, ScanColumns};
 use schema::file::{Compression, Writer};
 use schema::{Failure, Flags, Header, Kind, Topic, check_followed};
@@ -372,7 +372,7 @@ fn frames(recording: &Recording, encoding: Encoding) -> Result<impl Iterator<Ite
     let contents = recording.contents();
     let told = (contents.form == Form::Carmen).then(|| {
         let telegram = carmen::configuration(encoding);
-        let took_ns = lms::line_time(telegram.len(), Baud::B500000.rate());
+        let took_ns = schema::line_time(telegram.len(), Baud::B500000.rate());
         let wall_ns = contents.span.map(|(first_ns, _)| first_ns.saturating_sub(took_ns));
         Frame { telegram, wall_ns, ..Frame::default() }
     });

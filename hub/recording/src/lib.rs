@@ -20,7 +20,7 @@ pub use contents::{Contents, Damage, Form};
 pub use open::{Encoding, Recording};
 pub use virtual_time::VirtualTime;
 
-use lms::measured::MEASURED;
+use scanhub_drivers::lms::measured::MEASURED;
 use schema::Family;
 
 /// One telegram of a recording, or the packets that arrived together.
@@ -35,7 +35,7 @@ pub struct Frame {
     pub wall_ns: Option<u64>,
     /// When it was measured by the scanner's own clock, in nanoseconds from the first one on, where that is all there is.
     pub scanner_ns: Option<u64>,
-    /// Why it is suspect, bits of [`line::suspect`].
+    /// Why it is suspect, bits of [`scanhub_drivers::line::suspect`].
     pub reasons: u8,
     /// What the hub knew of it when it was recorded: numbers, stamps, quality. Streams and logs have none.
     pub header: Option<schema::Header>,

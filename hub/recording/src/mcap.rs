@@ -7,8 +7,9 @@ use std::collections::{BTreeMap, HashSet};
 use std::io::{self, Read};
 use std::sync::Arc;
 
-use lms::telegram::Telegram;
-use lms::variant::Mode;
+use scanhub_drivers::lms::telegram::Telegram;
+use scanhub_drivers::lms::variant::Mode;
+use scanhub_drivers::scanner;
 use schema::datagram::Packed;
 use schema::{Family, Header, Pace, Scan, Status, Topic};
 

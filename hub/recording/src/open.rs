@@ -5,8 +5,9 @@ use std::fmt;
 use std::io::{self, BufRead, BufReader, Read, Seek, SeekFrom};
 use std::path::{Path, PathBuf};
 
-use line::family::{Model, Wanted};
-use lms::variant::{Mode, Unit};
+use scanhub_drivers::line::family::{Model, Wanted};
+use scanhub_drivers::lms::variant::{Mode, Unit};
+use scanhub_drivers::scanner;
 use schema::{Failure, Family, Kind, regular};
 
 use crate::carmen::{self, Log};

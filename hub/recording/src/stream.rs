@@ -5,10 +5,11 @@
 use std::io::{self, Read};
 use std::path::Path;
 
-use line::family::Wanted;
-use line::{Heard, MILLIS, Nanos, Output, Session as _, line_time};
-use lms::framer::{Found, Framer, VETO_HOLD};
-use schema::{Failure, Family};
+use scanhub_drivers::line::family::Wanted;
+use scanhub_drivers::line::{Heard, Output, Session as _};
+use scanhub_drivers::lms::framer::{Found, Framer, VETO_HOLD};
+use scanhub_drivers::scanner;
+use schema::{Failure, Family, MILLIS, Nanos, line_time};
 
 use crate::open::{is_end, reader, unreadable};
 use crate::{Contents, Form, Frame};

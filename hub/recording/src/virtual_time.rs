@@ -2,7 +2,8 @@
 //! what it waits for in between comes when it is due. So it makes of the packets what was made of them then. Refuses to know
 //! where they are from, and what becomes of that.
 
-use line::{Nanos, Output, Session};
+use scanhub_drivers::line::{Output, Session};
+use schema::Nanos;
 
 /// `S` in a time that its owner tells.
 pub struct VirtualTime<S> {

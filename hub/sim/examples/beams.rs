@@ -2,9 +2,11 @@
 //! and what share of the bins stays empty, against the number of bins; and how long a turn takes to be put there. The
 //! tables of docs/scanners.md: `cargo run --release -p scanhub-sim --example beams`.
 
-use line::family::Turning;
-use line::grid::{Grid, Point};
-use line::{Heard, MILLIS, Nanos, Output, Session, line_time};
+use scanhub_drivers::line::family::Turning;
+use scanhub_drivers::line::grid::{Grid, Point};
+use scanhub_drivers::line::{Heard, Output, Session};
+use scanhub_drivers::{ld, rplidar};
+use schema::{MILLIS, Nanos, line_time};
 use sim::Arrival;
 use sim::device::Device;
 use sim::ld::{Head, HeadSettings, Packets};

@@ -7,15 +7,15 @@
 
 use std::ops::Range;
 
-use lms::command::{self, EEPROM_WRITES, Request};
-use lms::family::Family;
-use lms::operating::Operating as Asked;
-use lms::parameters::Password;
-use lms::reply::{self, Health};
-use lms::telegram::{Encoded, REPLY, Telegram, Writer};
-use lms::variant::{Baud, MIRROR_TURN, Variant};
-use lms::{MILLIS, Nanos};
 use lms_configure::eeprom::{self, PowerOn, Write};
+use scanhub_drivers::lms::command::{self, EEPROM_WRITES, Request};
+use scanhub_drivers::lms::family::Family;
+use scanhub_drivers::lms::operating::Operating as Asked;
+use scanhub_drivers::lms::parameters::Password;
+use scanhub_drivers::lms::reply::{self, Health};
+use scanhub_drivers::lms::telegram::{Encoded, REPLY, Telegram, Writer};
+use scanhub_drivers::lms::variant::{Baud, MIRROR_TURN, Variant};
+use schema::{MILLIS, Nanos};
 
 use crate::machine::Machine;
 use crate::operating::Operating;

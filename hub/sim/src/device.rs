@@ -4,7 +4,7 @@
 //! To drive one, call [`Device::poll_transmit`] until it returns `None`, pass the host's bytes, and call again at
 //! [`Device::poll_timeout`].
 
-use line::Nanos;
+use schema::Nanos;
 
 use crate::request_decoder::{Arrival, Dropped};
 

@@ -1,8 +1,8 @@
 //! What the sensor keeps without power: configuration and permanent rate, as bytes where the protocol has bytes, and how
 //! many requests asked to write them. Automatic code never does; tests check the count.
 
-use lms::configuration::{OLD_LEN, REAL_TIME_INDICES, factory};
-use lms::variant::{Baud, Mode, Unit};
+use scanhub_drivers::lms::configuration::{OLD_LEN, REAL_TIME_INDICES, factory};
+use scanhub_drivers::lms::variant::{Baud, Mode, Unit};
 
 use crate::settings::Settings;
 

@@ -1,7 +1,7 @@
 //! One scan of a world: the values that the sensor would send, and for each the object that its beam really hit. Knows
 //! neither shapes nor noise.
 
-use lms::Nanos;
+use schema::Nanos;
 
 /// A scan, and the truth for it.
 #[derive(Clone, Debug, PartialEq)]

@@ -1,7 +1,8 @@
 //! What makes a measured range different from the true one, layer by layer, each with its own switch. Two layers have no
 //! switch: ranges are sent in whole units, and a range beyond the greatest value is sent as a code. Knows no shapes.
 
-use lms::Nanos;
+use scanhub_drivers::lms;
+use schema::Nanos;
 
 /// Which layers act, and how strongly. A share or a length of 0 switches its layer off.
 #[derive(Clone, Copy, Debug, PartialEq)]

@@ -3,12 +3,11 @@
 
 use std::path::Path;
 
-pub use ld::Model;
-use ld::packet::{CLOCK_TURN, Contents, LEN, POINTS, Packet, TURN};
-use line::{MILLIS, Nanos};
-use lms::variant::{Mode, Unit};
 use recording::{Encoding, Recording};
-use schema::{Failure, Family, Kind};
+pub use scanhub_drivers::ld::Model;
+use scanhub_drivers::ld::packet::{CLOCK_TURN, Contents, LEN, POINTS, Packet, TURN};
+use scanhub_drivers::lms::variant::{Mode, Unit};
+use schema::{Failure, Family, Kind, MILLIS, Nanos};
 
 use crate::device::{Chunk, Device};
 use crate::outlet::Outlet;

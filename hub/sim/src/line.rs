@@ -4,8 +4,7 @@
 use std::os::fd::BorrowedFd;
 use std::path::{Path, PathBuf};
 
-use lms::{MILLIS, Nanos};
-use schema::Failure;
+use schema::{Failure, MILLIS, Nanos};
 
 use crate::device::{Device, Part};
 use crate::fault::{Fault, Faults};

@@ -6,9 +6,9 @@
 
 use std::collections::VecDeque;
 
-use lms::telegram::{ACK, NAK, REPLY, Telegram};
-use lms::variant::{Baud, MIRROR_TURN, Variant};
-use lms::{MILLIS, Nanos};
+use scanhub_drivers::lms::telegram::{ACK, NAK, REPLY, Telegram};
+use scanhub_drivers::lms::variant::{Baud, MIRROR_TURN, Variant};
+use schema::{MILLIS, Nanos};
 
 use crate::answer::{After, Answer};
 use crate::device::{Chunk, Device, Part, Sent};

@@ -4,7 +4,7 @@
 use std::cmp::Reverse;
 use std::f64::consts::PI;
 
-use lms::Nanos;
+use schema::Nanos;
 
 use crate::shape::Point;
 use crate::solid::Plane;

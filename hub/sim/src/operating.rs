@@ -1,12 +1,12 @@
 //! The operating modes: what a sensor sends continuously after a request 20h, or once after the request for one value, and
 //! the layout of such a telegram (Telegram listing, 20h, 30h to 3Fh and 75h). Knows nothing about the line.
 
-use lms::command::Request;
-use lms::measured::{Frame, encode_with};
-use lms::operating::{self as mode, Operating as Asked};
-use lms::telegram::{REPLY, Writer};
-use lms::variant::{MIRROR_TURN, Mode, Unit, Variant};
-use lms::{Nanos, line_time};
+use scanhub_drivers::lms::command::Request;
+use scanhub_drivers::lms::measured::{Frame, encode_with};
+use scanhub_drivers::lms::operating::{self as mode, Operating as Asked};
+use scanhub_drivers::lms::telegram::{REPLY, Writer};
+use scanhub_drivers::lms::variant::{MIRROR_TURN, Mode, Unit, Variant};
+use schema::{Nanos, line_time};
 
 use crate::room::Room;
 

@@ -4,8 +4,9 @@ use std::path::PathBuf;
 use std::str::FromStr;
 use std::time::Duration;
 
-use lms::family::Family;
-use lms::variant::{Baud, Mode, Unit, Variant};
+use scanhub_drivers::ld;
+use scanhub_drivers::lms::family::Family;
+use scanhub_drivers::lms::variant::{Baud, Mode, Unit, Variant};
 use schema::{Failure, Kind};
 
 use crate::fault::Faults;

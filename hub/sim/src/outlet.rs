@@ -3,7 +3,7 @@
 
 use std::collections::VecDeque;
 
-use line::Nanos;
+use schema::Nanos;
 
 use crate::device::{Chunk, Part, Sent};
 use crate::transmission::{ChunkSize, Transmission};

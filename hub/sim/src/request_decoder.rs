@@ -4,8 +4,8 @@
 
 use std::fmt;
 
-use lms::telegram::{FRAME, MAX_LENGTH, STX};
-use lms::{MICROS, MILLIS, Nanos, line_time};
+use scanhub_drivers::lms::telegram::{FRAME, MAX_LENGTH, STX};
+use schema::{MICROS, MILLIS, Nanos, line_time};
 
 /// When a byte was written by the host, as far as that is known.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -151,7 +151,7 @@ const MAX_GAP: Nanos = 6 * MILLIS;
 #[cfg(test)]
 mod tests {
     use super::*;
-    use lms::command::Request;
+    use scanhub_drivers::lms::command::Request;
 
     /// When a status request is heard whose bytes are known to come with `gap` of idle time between them.
     fn heard_at(decoder: &mut RequestDecoder, start: Nanos, gap: Nanos, width: Nanos) -> Option<Nanos> {

@@ -5,9 +5,8 @@ mod beam;
 
 use std::sync::Arc;
 
-use lms::Nanos;
-use lms::variant::{Mode, Unit, Variant};
-use schema::{Scan, ScanHead};
+use scanhub_drivers::lms::variant::{Mode, Unit, Variant};
+use schema::{Nanos, Scan, ScanHead};
 
 use crate::labeled_scan::{LabeledScan, Mark, Met};
 use crate::layers::{self, Dice};

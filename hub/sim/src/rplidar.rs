@@ -12,7 +12,7 @@ mod requests;
 mod settings;
 mod stream;
 
-use line::{MILLIS, Nanos};
+use schema::{MILLIS, Nanos};
 
 use crate::device::{Chunk, Device};
 use crate::fault::Window;

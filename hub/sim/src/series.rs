@@ -1,8 +1,8 @@
 //! Scans that were measured once and are told again and again, for simulations in which hours pass in seconds: to measure a
 //! scan takes far longer than to send it. Knows no geometry, and nothing of who sends them.
 
-use lms::Nanos;
-use lms::variant::{MIRROR_TURN, Mode, Unit, Variant};
+use scanhub_drivers::lms::variant::{MIRROR_TURN, Mode, Unit, Variant};
+use schema::Nanos;
 
 use crate::room::Room;
 

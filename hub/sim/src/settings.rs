@@ -1,8 +1,8 @@
 //! The sensor at the start of a simulation: its type and EEPROM, the state in which an earlier host left it, and its bad
 //! habits. Plain values; [`crate::machine`] acts on them.
 
-use lms::variant::{Baud, Mode, Unit, Variant};
-use lms::{MILLIS, Nanos};
+use scanhub_drivers::lms::variant::{Baud, Mode, Unit, Variant};
+use schema::{MILLIS, Nanos};
 
 use crate::operating::Operating;
 use crate::transmission::ChunkSize;

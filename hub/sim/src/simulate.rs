@@ -4,11 +4,10 @@
 use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
 use std::path::{Path, PathBuf};
 
-use lms::Nanos;
-use lms::variant::{Baud, Mode, Variant};
 use recording::{Encoding, Frame, Recording};
 use rustix::event::{EventfdFlags, eventfd};
-use schema::{Failure, Kind};
+use scanhub_drivers::lms::variant::{Baud, Mode, Variant};
+use schema::{Failure, Kind, Nanos};
 
 use crate::device::Device;
 use crate::ld::{Head, HeadSettings, Packets, recorded};

@@ -1,7 +1,7 @@
 //! Where the sensor's scans come from: a room that is measured for each scan, or a recording that is played from start to
 //! end. Knows neither requests nor the line.
 
-use lms::variant::Variant;
+use scanhub_drivers::lms::variant::Variant;
 
 use crate::operating::{Operating, Shot};
 use crate::room::Room;

@@ -1,8 +1,8 @@
 //! One telegram (or single byte) on its way out: which of its bytes have passed the line at a given time, and in which
 //! chunks the receiver's hardware hands them over. Refuses to know what the bytes mean and who asked for them.
 
-use lms::variant::{BYTES_PER_TURN, MIRROR_TURN};
-use lms::{Nanos, line_time};
+use scanhub_drivers::lms::variant::{BYTES_PER_TURN, MIRROR_TURN};
+use schema::{Nanos, line_time};
 
 /// How many bytes the receiving hardware collects before its driver sees them.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -120,7 +120,7 @@ impl<T> Transmission<T> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use lms::MICROS;
+    use schema::MICROS;
 
     fn times(mut transmission: Transmission<()>) -> Vec<(usize, Nanos, bool)> {
         let mut all = Vec::new();

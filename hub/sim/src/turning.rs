@@ -2,7 +2,7 @@
 
 use std::f64::consts::TAU;
 
-use line::Nanos;
+use schema::Nanos;
 
 /// How a head turns, from the moment on at which its motor begins.
 #[derive(Clone, Copy, Debug, PartialEq)]

@@ -4,7 +4,7 @@
 use std::ops::Range;
 use std::sync::LazyLock;
 
-use lms::Nanos;
+use schema::Nanos;
 
 use crate::scene::Surface;
 use crate::shape::{Point, Shape};

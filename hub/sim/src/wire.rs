@@ -6,7 +6,7 @@
 
 use std::collections::VecDeque;
 
-use lms::Nanos;
+use schema::Nanos;
 
 use crate::device::{Chunk, Device, Part, Sent};
 use crate::fault::{Blemishes, Extra, Fate, Fault, Faults, Lateness, Noise, Schedule, Window};

@@ -1,7 +1,7 @@
 //! A scene with its random parts drawn from a seed, seen by one sensor: what is around it at a given time. Knows neither
 //! units nor codes.
 
-use lms::Nanos;
+use schema::Nanos;
 
 use crate::labeled_scan::Mark;
 use crate::layers::Layers;

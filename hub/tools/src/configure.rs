@@ -8,10 +8,10 @@ mod wanted;
 
 use std::sync::atomic::AtomicBool;
 
-use lms::family::Family;
-use lms::parameters::Password;
 use lms_configure::{Change, Plan, Step};
 use port::{Source, clock};
+use scanhub_drivers::lms::family::Family;
+use scanhub_drivers::lms::parameters::Password;
 use schema::{Failure, Kind};
 
 use crate::drive::drive;

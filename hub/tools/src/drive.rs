@@ -4,11 +4,10 @@
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
-use lms::exchange::{Conversation, Output};
-use lms::{MILLIS, Nanos};
 use port::{Port, clock};
 use rustix::event::{PollFd, PollFlags, poll};
-use schema::{Failure, Kind};
+use scanhub_drivers::lms::exchange::{Conversation, Output};
+use schema::{Failure, Kind, MILLIS, Nanos};
 
 /// Drives `talk` on `port`; `look` sees it whenever it waits. A rate that the port cannot have is passed over.
 ///

@@ -7,12 +7,12 @@ use std::fmt;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
-use line::family::{Condition, Features, Model, Wanted};
-use line::{Account, Heard, MILLIS, Nanos, Output, Session as _};
 use port::{Port, clock};
 use rustix::event::{PollFd, PollFlags, poll};
-use scanner::{Introduction, Session, features};
-use schema::{Failure, Family, Kind};
+use scanhub_drivers::line::family::{Condition, Features, Model, Wanted};
+use scanhub_drivers::line::{Account, Heard, Output, Session as _};
+use scanhub_drivers::scanner::{Introduction, Session, features};
+use schema::{Failure, Family, Kind, MILLIS, Nanos};
 
 use crate::drive::gone;
 

@@ -9,9 +9,9 @@ use std::fmt;
 use std::path::Path;
 use std::sync::atomic::AtomicBool;
 
-use lms::inquiry::{Inquiry, Report};
-use lms::variant::Baud;
 use port::{Candidate, Port, PortlessAdapter, Source, candidates, clock, found_in};
+use scanhub_drivers::lms::inquiry::{Inquiry, Report};
+use scanhub_drivers::lms::variant::Baud;
 use schema::{Failure, Family, Kind};
 use serde::Serialize;
 

@@ -9,7 +9,7 @@ use std::fs::File;
 use std::io::{self, ErrorKind, Read, Write};
 use std::path::{Path, PathBuf};
 
-use lms::variant::Mode;
+use scanhub_drivers::lms::variant::Mode;
 use schema::{Failure, Kind};
 
 use find::Finder;

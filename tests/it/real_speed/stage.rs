@@ -2,9 +2,8 @@
 
 use std::time::{Duration, Instant};
 
-use lms::{MILLIS, Nanos};
 use rustix::process::Signal;
-use schema::Topic;
+use schema::{MILLIS, Nanos, Topic};
 use serde_json::Value;
 use sim::Event;
 use world::Action;

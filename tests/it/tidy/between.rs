@@ -6,8 +6,8 @@ use super::{crates, holds};
 fn schema_knows_nobody() {
     holds(crates::schema_knows_nobody, |tree| {
         vec![
-            tree.with_line("schema/Cargo.toml", "[dependencies]", "scanhub-lms.workspace = true"),
-            tree.with_line("schema/Cargo.toml", "[dev-dependencies]", "scanhub-lms.workspace = true"),
+            tree.with_line("schema/Cargo.toml", "[dependencies]", "scanhub-drivers.workspace = true"),
+            tree.with_line("schema/Cargo.toml", "[dev-dependencies]", "scanhub-drivers.workspace = true"),
         ]
     });
 }
@@ -21,34 +21,46 @@ fn schema_without_ipc_needs_no_shared_memory() {
 }
 
 #[test]
-fn families_know_the_line_alone() {
-    holds(crates::families_know_the_line_alone, |tree| {
-        let planted = |family: &str| {
-            let (manifest, lib) = (format!("hub/{family}/Cargo.toml"), format!("hub/{family}/src/lib.rs"));
-            let (text, code) = (tree.text(&lib), format!("hub/{family}/src/planted.rs"));
-            vec![
-                tree.with_line(&manifest, "[dependencies]", "serialport.workspace = true"),
-                tree.with_line(&manifest, "[dev-dependencies]", "scanhub-sim.workspace = true"),
-                tree.with(&lib, &text.replace("#![no_std]", "")),
-                tree.with(&lib, &text.replace("#![forbid(unsafe_code)]", "")),
-                tree.with(&code, "//! A heap.\nextern crate alloc;\n"),
-                tree.with(&code, "//! A thread.\nuse std::thread;\n"),
-            ]
-        };
-        let another = tree.with_line("hub/ld/Cargo.toml", "[dependencies]", "scanhub-lms.workspace = true");
-        ["lms", "ld", "rplidar"].into_iter().flat_map(planted).chain([another]).collect()
+fn drivers_only_compute() {
+    holds(crates::drivers_only_compute, |tree| {
+        let (manifest, lib) = ("hub/drivers/Cargo.toml", "hub/drivers/src/lib.rs");
+        let planted =
+            |code: &str| tree.with("hub/drivers/src/lms/planted.rs", &format!("//! A driver.\n{code}\n"));
+        vec![
+            tree.with_line(manifest, "[dependencies]", "serialport.workspace = true"),
+            tree.with_line(manifest, "[dependencies]", "scanhub-port.workspace = true"),
+            tree.with(lib, &tree.text(lib).replace("#![forbid(unsafe_code)]", "")),
+            planted("use std::thread;"),
+            planted("use std::{fmt, net};"),
+            planted("let text = std::fs::read_to_string(path);"),
+            planted("let now = std::time::Instant::now();"),
+            planted("use schema::ipc::Payload;"),
+        ]
     });
 }
 
 #[test]
-fn the_line_knows_no_family() {
-    holds(crates::the_line_knows_no_family, |tree| {
-        let lib = tree.text("hub/line/src/lib.rs");
+fn no_family_names_another() {
+    holds(crates::no_family_names_another, |tree| {
+        let planted = |path: &str, code: &str| tree.with(path, &format!("//! A driver.\n{code}\n"));
         vec![
-            tree.with_line("hub/line/Cargo.toml", "[dependencies]", "scanhub-lms.workspace = true"),
-            tree.with_line("hub/line/Cargo.toml", "[dev-dependencies]", "scanhub-ld.workspace = true"),
-            tree.with("hub/line/src/lib.rs", &lib.replace("#![no_std]", "")),
-            tree.with("hub/line/src/planted.rs", "//! A thread.\nuse std::thread;\n"),
+            planted("hub/drivers/src/ld/planted.rs", "use crate::lms::telegram::Telegram;"),
+            planted("hub/drivers/src/rplidar.rs", "let session: ld::Session;"),
+            planted("hub/drivers/src/lms/session.rs", "use crate::{line, rplidar};"),
+            planted("hub/drivers/src/line/session.rs", "use crate::lms::SILENCE;"),
+        ]
+    });
+}
+
+#[test]
+fn the_rplidar_simulator_is_independent() {
+    holds(crates::the_rplidar_simulator_is_independent, |tree| {
+        let planted =
+            |code: &str| tree.with("hub/sim/src/rplidar/planted.rs", &format!("//! A unit.\n{code}\n"));
+        vec![
+            planted("use scanhub_drivers::rplidar::packet::Kind;"),
+            planted("use scanhub_drivers::{\n    line, rplidar,\n};"),
+            planted("let kind = scanhub_drivers::rplidar::packet::Kind::Dense;"),
         ]
     });
 }
@@ -59,7 +71,7 @@ fn preprocess_only_computes() {
         let planted = |code: &str| tree.with("hub/preprocess/src/planted.rs", &format!("//! So.\n{code}\n"));
         let lib = tree.text("hub/preprocess/src/lib.rs");
         vec![
-            tree.with_line("hub/preprocess/Cargo.toml", "[dependencies]", "scanhub-lms.workspace = true"),
+            tree.with_line("hub/preprocess/Cargo.toml", "[dependencies]", "scanhub-drivers.workspace = true"),
             tree.with_line("hub/preprocess/Cargo.toml", "[dependencies]", "iceoryx2.workspace = true"),
             tree.with("hub/preprocess/src/lib.rs", &lib.replace("#![forbid(unsafe_code)]", "")),
             planted("use std::time::Instant;"),
@@ -92,10 +104,10 @@ fn clients_know_only_schema() {
     holds(crates::clients_know_only_schema, |tree| {
         let (client, verbs) = ("clients/client/Cargo.toml", "clients/verbs/Cargo.toml");
         vec![
-            tree.with_line(client, "[dependencies]", "scanhub-lms.workspace = true"),
+            tree.with_line(client, "[dependencies]", "scanhub-drivers.workspace = true"),
             tree.with_line(client, "[dependencies]", "scanhub-verbs.workspace = true"),
             tree.with_line(client, "[dev-dependencies]", "scanhub-ros.workspace = true"),
-            tree.with_line(verbs, "[dependencies]", "scanhub-lms.workspace = true"),
+            tree.with_line(verbs, "[dependencies]", "scanhub-drivers.workspace = true"),
         ]
     });
 }
@@ -169,21 +181,10 @@ fn the_ends_of_a_network_only_compute() {
 }
 
 #[test]
-fn the_scanner_only_translates() {
-    holds(crates::the_scanner_only_translates, |tree| {
-        let (manifest, lib) = ("hub/scanner/Cargo.toml", "hub/scanner/src/lib.rs");
-        vec![
-            tree.with_line(manifest, "[dependencies]", "scanhub-recording.workspace = true"),
-            tree.with(lib, &tree.text(lib).replace("#![forbid(unsafe_code)]", "")),
-        ]
-    });
-}
-
-#[test]
 fn the_library_for_c_knows_clients() {
     holds(crates::the_library_for_c_knows_clients, |tree| {
         vec![
-            tree.with_line("clients/c/Cargo.toml", "[dependencies]", "scanhub-lms.workspace = true"),
+            tree.with_line("clients/c/Cargo.toml", "[dependencies]", "scanhub-drivers.workspace = true"),
             tree.with_line("clients/c/Cargo.toml", "[dependencies]", "iceoryx2.workspace = true"),
             tree.with_line("clients/c/Cargo.toml", "[dependencies]", "scanhub-verbs.workspace = true"),
             tree.with_line("clients/verbs/Cargo.toml", "[dependencies]", "scanhub-c.workspace = true"),

@@ -8,7 +8,7 @@ fn what_writes_the_eeprom_is_protocol_alone() {
         let (manifest, lib) = ("hub/lms-configure/Cargo.toml", "hub/lms-configure/src/lib.rs");
         vec![
             tree.with_line(manifest, "[dependencies]", "scanhub-port.workspace = true"),
-            tree.with(lib, &tree.text(lib).replace("#![no_std]", "")),
+            tree.with(lib, &tree.text(lib).replace("#![forbid(unsafe_code)]", "")),
             tree.with("hub/lms-configure/src/planted.rs", "//! A file.\nuse std::fs;\n"),
         ]
     });
@@ -18,7 +18,7 @@ fn what_writes_the_eeprom_is_protocol_alone() {
 fn few_crates_can_write_the_eeprom() {
     holds(crates::few_crates_can_write_the_eeprom, |tree| {
         let line = "scanhub-lms-configure.workspace = true";
-        ["hub/port/Cargo.toml", "hub/lms/Cargo.toml", "clients/client/Cargo.toml", "Cargo.toml"]
+        ["hub/port/Cargo.toml", "hub/drivers/Cargo.toml", "clients/client/Cargo.toml", "Cargo.toml"]
             .map(|manifest| tree.with_line(manifest, "[dependencies]", line))
             .to_vec()
     });
@@ -32,13 +32,19 @@ fn nobody_writes_the_eeprom() {
                 "hub/daemon/src/planted.rs",
                 "//! Writes.\nlet telegram = Writer::new(0, 0x77).finish();\n",
             ),
-            tree.with("hub/lms/src/planted.rs", "//! Knows.\npub const CONFIGURE: u8 = 0x77;\n"),
-            tree.with("hub/lms/src/planted.rs", "//! Writes.\nlet telegram = Writer::new(address, 0x66);\n"),
-            tree.with("hub/lms/src/explain/planted.rs", "//! Writes.\nlet telegram = Writer::new(0, SET);\n"),
-            tree.with("hub/lms/src/dialogue.rs", "//! Talks.\nuse crate::eeprom::Write;\n"),
-            tree.with("hub/lms/src/session.rs", "//! Talks.\nuse crate::{Nanos, eeprom};\n"),
+            tree.with("hub/drivers/src/lms/planted.rs", "//! Knows.\npub const CONFIGURE: u8 = 0x77;\n"),
             tree.with(
-                "hub/lms/src/outgoing.rs",
+                "hub/drivers/src/lms/planted.rs",
+                "//! Writes.\nlet telegram = Writer::new(address, 0x66);\n",
+            ),
+            tree.with(
+                "hub/drivers/src/lms/explain/planted.rs",
+                "//! Writes.\nlet telegram = Writer::new(0, SET);\n",
+            ),
+            tree.with("hub/drivers/src/lms/dialogue.rs", "//! Talks.\nuse crate::eeprom::Write;\n"),
+            tree.with("hub/drivers/src/lms/session.rs", "//! Talks.\nuse crate::{Nanos, eeprom};\n"),
+            tree.with(
+                "hub/drivers/src/lms/outgoing.rs",
                 "//! Sends.\nlet request = crate::eeprom::Write::Field(&[]);\n",
             ),
             tree.with("hub/daemon/src/link.rs", "//! A link.\nuse lms_configure::Change;\n"),

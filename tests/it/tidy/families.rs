@@ -1,16 +1,15 @@
-//! How many files name a family of scanners: one more family is a crate, a module of the simulator, and a line in each of
-//! these.
+//! How many files name a family of scanners: one more family is a module of the drivers, one of the simulator, and a line in
+//! each of these.
 
 use super::holds;
 use super::tree::{Tree, code};
 
-/// What names a family, but for its crate, its simulator, tests, benches and pages; each says why.
-const MAY: [&str; 11] = [
-    // The workspace's crates.
-    "Cargo.toml",
-    // The list of the families, and what it is built with.
-    "hub/scanner/Cargo.toml",
-    "hub/scanner/src/families.rs",
+/// What names a family, but for its driver, its simulator, tests, benches and pages; each says why.
+const MAY: [&str; 10] = [
+    // The modules of the drivers.
+    "hub/drivers/src/lib.rs",
+    // The list of the families.
+    "hub/drivers/src/scanner/families.rs",
     // The configuration that users start from, with a section for each.
     "hub/config/src/default.toml",
     // Number and name, in each language that reads scans, and what can be said of its packets.
@@ -23,7 +22,7 @@ const MAY: [&str; 11] = [
     "clients/wireshark/scanhub.lua",
 ];
 
-/// Words for a family, beside the name of its crate.
+/// Words for a family, beside the name of its module.
 const FAMILIES: [(&str, &[&str]); 2] = [
     ("ld", &["ldrobot", "ld06", "ld19", "stl19p", "stl27l", "ld14p"]),
     ("rplidar", &["slamtec", "a1m8", "a2m8", "a2m12"]),
@@ -41,7 +40,8 @@ fn named<'a>(tree: &'a Tree, name: &str, words: &[&str]) -> Vec<&'a str> {
     const OWN: [&str; 7] = [".ci/", "hub/sim/", "tests/", "benches/", "docs/", "README.md", "CHANGELOG.md"];
     let own = |path: &str| {
         OWN.iter().any(|own| path.starts_with(own))
-            || path.starts_with(&format!("hub/{name}/"))
+            || path == format!("hub/drivers/src/{name}.rs")
+            || path.starts_with(&format!("hub/drivers/src/{name}/"))
             || path.contains("tests")
             || path.ends_with(".lock")
     };
@@ -63,7 +63,7 @@ fn a_family_is_a_line_in_few_files() {
         vec![
             tree.with("hub/daemon/src/drive.rs", "//! Drives.\nlet trouble = ld::Trouble::Silence;\n"),
             tree.with("hub/daemon/src/drive.rs", "//! Drives.\nlet trouble = rplidar::Trouble::Silence;\n"),
-            tree.with_line("hub/config/Cargo.toml", "[dependencies]", "scanhub-ld.workspace = true"),
+            tree.with("hub/config/src/planted.rs", "//! Settings.\nuse scanhub_drivers::ld::Model;\n"),
             tree.with("hub/tools/src/probe.rs", "//! Probes.\nif model == \"LD19\" {\n"),
             tree.with("clients/c/planted.h", "#define FAMILY_LD 1\n"),
         ]

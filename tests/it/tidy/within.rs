@@ -9,7 +9,7 @@ fn clocks_are_read_in_few_places() {
             tree.with("hub/daemon/src/link.rs", "//! A link.\nlet now = std::time::Instant::now();\n"),
             tree.with("hub/sim/src/room.rs", "//! A room.\nlet now = SystemTime::now();\n"),
             tree.with(
-                "hub/lms/src/session.rs",
+                "hub/drivers/src/lms/session.rs",
                 "//! A session.\nlet now = rustix::time::clock_gettime(id);\n",
             ),
         ]
@@ -21,7 +21,7 @@ fn tests_do_not_depend_on_time() {
     holds(sources::tests_do_not_depend_on_time, |tree| {
         vec![
             tree.with("tests/it/planted.rs", "//! Sleeps.\nstd::thread::sleep(Duration::from_secs(1));\n"),
-            tree.with("hub/lms/tests/planted.rs", "//! Sleeps.\nsleep(Duration::from_secs(1));\n"),
+            tree.with("hub/drivers/tests/planted.rs", "//! Sleeps.\nsleep(Duration::from_secs(1));\n"),
             tree.with(
                 "clients/lan/tests/planted.rs",
                 "//! Compares.\nassert!(begun.elapsed() < Duration::from_secs(1));\n",

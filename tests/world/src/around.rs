@@ -7,11 +7,10 @@ use std::sync::Arc;
 
 use daemon::Slots;
 use daemon::surroundings::{Learned, Surroundings};
-use lms::{MICROS, Nanos};
 use port::{PortError, Source};
 use rustix::io::Errno;
 use schema::ipc::Payload;
-use schema::{Failure, Kind, Ring, Wake};
+use schema::{Failure, Kind, MICROS, Nanos, Ring, Wake};
 
 use crate::event::Event;
 use crate::line::{Handle, LinkClock, OpenLine};

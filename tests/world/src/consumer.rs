@@ -6,10 +6,9 @@ use std::collections::VecDeque;
 use std::rc::Rc;
 
 use bytemuck::pod_read_unaligned;
-use lms::{MICROS, MILLIS, Nanos};
 use scanhub_client::clock::Moment;
 use scanhub_client::streams::{Freshness, Noted, Numbers};
-use schema::{Topic, Verdict, Zones};
+use schema::{MICROS, MILLIS, Nanos, Topic, Verdict, Zones};
 
 use crate::event::Event;
 use crate::shared::Shared;

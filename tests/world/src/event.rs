@@ -1,9 +1,8 @@
 //! Everything that happens in a world, as the judges see it and as its hash has it. Refuses to know what is right.
 
 use lan::outgoing;
-use lms::Nanos;
 use schema::datagram::{Datagram, DatagramError, Row};
-use schema::{Header, Ring, Status, Topic, Verdict, Zones};
+use schema::{Header, Nanos, Ring, Status, Topic, Verdict, Zones};
 use sim::ld::TruePoint;
 
 use crate::consumer::Number;

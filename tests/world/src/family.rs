@@ -8,9 +8,8 @@ mod rplidar;
 use std::rc::Rc;
 use std::sync::{Arc, LazyLock};
 
-use ::lms::variant::{Mode, Unit, Variant};
-use ::lms::{MILLIS, Nanos};
-use schema::Scan;
+use scanhub_drivers::lms::variant::{Mode, Unit, Variant};
+use schema::{MILLIS, Nanos, Scan};
 use sim::device::Device;
 use sim::layers::Layers;
 use sim::ld::TruePoint;
@@ -169,7 +168,7 @@ pub(crate) fn draw(random: &mut fastrand::Rng) -> Vec<Rc<dyn Family>> {
 /// The scanner that a plan calls so, otherwise as `random` draws it; nothing if there is none: `ld19`, `a1`, `a1:boost`,
 /// `a1:boost:streaming`.
 pub(crate) fn named(text: &str, random: &mut fastrand::Rng) -> Option<Rc<dyn Family>> {
-    match ::ld::Model::named(text) {
+    match scanhub_drivers::ld::Model::named(text) {
         Some(model) => Some(Rc::new(ld::Ld::of(model, random))),
         None => Some(Rc::new(rplidar::Rplidar::named(text, random)?)),
     }

@@ -5,8 +5,7 @@ use std::rc::Rc;
 
 use daemon::surroundings::{On, Wait, Woken};
 use daemon::{Files, Keeper, LiveLink, Orders, Reload, Service};
-use lms::{MICROS, MILLIS, Nanos};
-use schema::{Background, Failure, Kind};
+use schema::{Background, Failure, Kind, MICROS, MILLIS, Nanos};
 
 use crate::around::Around;
 use crate::event::Event;

@@ -6,8 +6,8 @@ use std::path::Path;
 use std::rc::Rc;
 
 use daemon::surroundings::Line;
-use lms::Nanos;
 use port::{Allowance, Alteration};
+use schema::Nanos;
 
 use crate::planted::{Defect, eeprom_request};
 use crate::shared::Shared;

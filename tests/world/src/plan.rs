@@ -4,7 +4,7 @@
 use std::fmt;
 use std::str::FromStr;
 
-use lms::{MILLIS, Nanos};
+use schema::{MILLIS, Nanos};
 use sim::fault::Faults;
 
 use crate::actions::{self, KINDS, Kind};

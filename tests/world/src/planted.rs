@@ -3,7 +3,7 @@
 
 use std::cell::Cell;
 
-use lms::telegram::Writer;
+use scanhub_drivers::lms::telegram::Writer;
 use schema::{Counter, Flags, Header, Scan, ScanHead, Status, Topic};
 
 /// A defect.

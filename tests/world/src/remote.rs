@@ -14,10 +14,9 @@ use std::num::NonZeroU64;
 use std::time::Duration;
 
 use lan::{Key, Stamp};
-use lms::{MICROS, MILLIS, Nanos};
 use scanhub_client::clock::Moment;
-use schema::Topic;
 use schema::datagram::{MTU_ETHERNET, MTU_LEAST, MTU_SAFE};
+use schema::{MICROS, MILLIS, Nanos, Topic};
 
 use crate::actions;
 use crate::event::Event;

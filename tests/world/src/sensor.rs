@@ -3,7 +3,7 @@
 
 use std::collections::VecDeque;
 
-use lms::{MICROS, Nanos, line_time};
+use schema::{MICROS, Nanos, line_time};
 use sim::Arrival;
 use sim::fault::Faults;
 use sim::ld::TruePoint;

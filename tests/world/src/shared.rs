@@ -5,8 +5,7 @@ use std::cell::{Cell, RefCell};
 use std::collections::BTreeMap;
 use std::rc::Rc;
 
-use lms::Nanos;
-use schema::Ring;
+use schema::{Nanos, Ring};
 
 use crate::event::{Detail, Event, Figures, Violation};
 use crate::hash::History;

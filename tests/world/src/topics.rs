@@ -9,10 +9,9 @@ use std::fmt::Debug;
 use std::marker::PhantomData;
 use std::rc::Rc;
 
-use lms::Nanos;
 use schema::ipc::{LoanError, Medium, Payload, SendError};
 use schema::limits::TopicLimits;
-use schema::{Early, Header, Topic, Verdict, limits};
+use schema::{Early, Header, Nanos, Topic, Verdict, limits};
 
 use crate::consumer::Number;
 use crate::event::Event;

@@ -3,8 +3,8 @@
 
 use std::collections::VecDeque;
 
-use lms::Nanos;
 use port::PortError;
+use schema::Nanos;
 use sim::device::{Part, Sent};
 use sim::noise::Mistuned;
 use sim::wire::Carried;

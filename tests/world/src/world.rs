@@ -6,8 +6,7 @@ use std::collections::{BTreeMap, VecDeque};
 use std::rc::Rc;
 
 use daemon::Orders;
-use lms::{MILLIS, Nanos};
-use schema::{Topic, Verb};
+use schema::{MILLIS, Nanos, Topic, Verb};
 use sim::fault::Faults;
 
 use crate::actions::object;

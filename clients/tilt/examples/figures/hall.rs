@@ -3,7 +3,7 @@
 
 use std::collections::HashMap;
 
-use lms::variant::{Mode, Unit, Variant};
+use scanhub_drivers::lms::variant::{Mode, Unit, Variant};
 use schema::{Scan, ScanHead};
 use sim::labeled_scan::Met;
 use sim::mount::{Mount as Motor, Report};

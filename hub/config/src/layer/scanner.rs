@@ -1,8 +1,9 @@
 //! The keys that say of which family a link's scanner is, and what only some families have. Refuses to know what a family
 //! speaks.
 
-use ::scanner::features;
-use line::family::Features;
+use scanhub_drivers::line;
+use scanhub_drivers::line::family::Features;
+use scanhub_drivers::scanner::features;
 use schema::{Failure, Family};
 use toml::Spanned;
 

@@ -3,8 +3,8 @@
 
 use std::rc::Rc;
 
-use lms::variant::Unit;
 use preprocess::zones::{Check, Settings};
+use scanhub_drivers::lms::variant::Unit;
 use schema::{Failure, Kind, Scan, ScanHead, Zones};
 
 use super::processing::Sections;

@@ -6,9 +6,8 @@ use std::sync::mpsc::{Receiver, Sender};
 use std::sync::{Arc, PoisonError};
 
 use config::Processing;
-use line::{Control, Session as _};
-use lms::Nanos;
-use schema::{Failure, Kind};
+use scanhub_drivers::line::{Control, Session as _};
+use schema::{Failure, Kind, Nanos};
 
 use super::{Changed, Outcome, QueuedRequest};
 use crate::driver::Driver;

@@ -2,8 +2,8 @@
 //! drawn, points come out of order.
 
 use fastrand::Rng;
-use line::grid::{NO_RETURN, Point};
 use preprocess::zones::{Sector, Settings};
+use scanhub_drivers::line::grid::{NO_RETURN, Point};
 use schema::{Pose, Zones};
 
 use super::*;

@@ -4,7 +4,7 @@
 //!
 //! Media time is counted from the recording's first telegram, in nanoseconds.
 
-use lms::Nanos;
+use schema::Nanos;
 
 use super::Pace;
 
@@ -286,13 +286,13 @@ fn next_of(links: &[Next]) -> Option<Nanos> {
 }
 
 /// A recording that was interrupted does not keep its listeners waiting for longer, at its own pace.
-const LONGEST_SILENCE: Nanos = 10_000 * lms::MILLIS;
+const LONGEST_SILENCE: Nanos = 10_000 * schema::MILLIS;
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
-    const SECOND: Nanos = 1_000 * lms::MILLIS;
+    const SECOND: Nanos = 1_000 * schema::MILLIS;
 
     /// One of `links` that is up, from `start` seconds on.
     fn begun(links: usize, play: Play) -> Playback {

@@ -4,14 +4,14 @@
 //! A telegram of an LMS is a scan by itself. The packets of a rotating scanner pass through a session that runs in the time of
 //! the recording. It builds the same scans as the hub that recorded them, with the same times between them.
 
-use line::{Heard, Received, Turn, suspect};
-use lms::reply::Reply;
-use lms::session::Message;
-use lms::telegram::Telegram;
-use lms::variant::Mode;
-use lms::{Nanos, SILENCE};
 use recording::{Frame, VirtualTime};
-use schema::{Flags, Header, State};
+use scanhub_drivers::line::{Heard, Received, Turn, suspect};
+use scanhub_drivers::lms::SILENCE;
+use scanhub_drivers::lms::reply::Reply;
+use scanhub_drivers::lms::session::Message;
+use scanhub_drivers::lms::telegram::Telegram;
+use scanhub_drivers::lms::variant::Mode;
+use schema::{Flags, Header, Nanos, State};
 
 use super::recorded::{Frames, told};
 use super::{LONGEST_GAP, ReplayLink, STANDS, period, variant_of};

@@ -5,12 +5,11 @@ use std::io::{self, Read};
 use std::path::Path;
 
 use config::Link;
-use lms::Nanos;
-use lms::reply::Reply;
-use lms::telegram::Telegram;
-use lms::variant::{Mode, Unit, Variant};
 use recording::{Encoding, Form, Frame, Recording};
-use schema::{Failure, Family, Header, Kind};
+use scanhub_drivers::lms::reply::Reply;
+use scanhub_drivers::lms::telegram::Telegram;
+use scanhub_drivers::lms::variant::{Mode, Unit, Variant};
+use schema::{Failure, Family, Header, Kind, Nanos};
 
 use super::{LONGEST_GAP, period};
 
@@ -355,7 +354,7 @@ const ASKED_WITHIN: usize = 500;
 mod tests {
     use super::*;
 
-    const SECOND: Nanos = 1_000 * lms::MILLIS;
+    const SECOND: Nanos = 1_000 * schema::MILLIS;
 
     fn frame(wall_s: u64, header: Option<Header>) -> Frame {
         Frame { wall_ns: Some(wall_s * SECOND), header, ..Frame::default() }

@@ -1,11 +1,11 @@
 //! Plays bytes as they came down a line: they take the way that a line's bytes take, at the pace of the scans. What is
 //! damaged in them is found out as on a line.
 
-use line::{Output, Session as _};
-use lms::Nanos;
-use lms::measured::MEASURED;
 use port::clock;
-use schema::State;
+use scanhub_drivers::line::{Output, Session as _};
+use scanhub_drivers::lms;
+use scanhub_drivers::lms::measured::MEASURED;
+use schema::{Nanos, State};
 
 use super::recorded::{Stream, read};
 use super::{ReplayLink, STANDS, variant_of};

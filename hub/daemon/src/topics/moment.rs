@@ -1,8 +1,7 @@
 //! The times of a header: the wall clock of a stamp, and the header of what is said at a moment without a telegram. Refuses to know
 //! topics.
 
-use lms::Nanos;
-use schema::{Flags, Header, Quality};
+use schema::{Flags, Header, Nanos, Quality};
 
 use crate::surroundings::Surroundings;
 

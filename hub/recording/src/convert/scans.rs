@@ -6,15 +6,16 @@
 
 use std::collections::BTreeMap;
 
-use line::family::Wanted;
-use line::{Heard, Nanos};
-use lms::measured::Measured;
-use lms::reply::Reply;
-use lms::telegram::Telegram;
-use lms::variant::{Baud, Mode, Variant};
-use scanner::Turning;
+use scanhub_drivers::line::Heard;
+use scanhub_drivers::line::family::Wanted;
+use scanhub_drivers::lms::measured::Measured;
+use scanhub_drivers::lms::reply::Reply;
+use scanhub_drivers::lms::telegram::Telegram;
+use scanhub_drivers::lms::variant::{Baud, Mode, Variant};
+use scanhub_drivers::scanner::Turning;
+use scanhub_drivers::{line, scanner};
 use schema::datagram::Packed;
-use schema::{Failure, Family, Flags, Header, Kind, Pose, Quality, Scan, Status, Topic};
+use schema::{Failure, Family, Flags, Header, Kind, Nanos, Pose, Quality, Scan, Status, Topic};
 
 use super::is_made_up;
 use crate::mcap::Item;
@@ -223,7 +224,7 @@ impl Turns {
                 stamp_first_ns: turn.first,
                 stamp_last_ns: turn.last,
                 wall_ns: wall_ns(turn.first),
-                period_us: u32::try_from(turn.period / line::MICROS).unwrap_or(u32::MAX),
+                period_us: u32::try_from(turn.period / schema::MICROS).unwrap_or(u32::MAX),
                 quality: quality as u8,
                 reasons: turn.reasons,
                 hub_time: [0; 3],
@@ -300,7 +301,7 @@ fn scan_ns(variant: Variant) -> u64 {
 }
 
 fn line_ns(frame: &Frame) -> u64 {
-    lms::line_time(frame.telegram.len(), Baud::B500000.rate())
+    schema::line_time(frame.telegram.len(), Baud::B500000.rate())
 }
 
 /// Maximum period, which fits into a header.

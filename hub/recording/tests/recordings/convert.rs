@@ -9,11 +9,11 @@ use tempfile::TempDir;
 
 use crate::folder::{converted, file};
 use crate::real;
-use lms::measured;
-use lms::reply;
-use lms::variant::{Mode, Unit};
 use recording::convert::{ConvertOptions, Converted, Target, convert};
 use recording::{Encoding, Form, Frame, Recording};
+use scanhub_drivers::lms::measured;
+use scanhub_drivers::lms::reply;
+use scanhub_drivers::lms::variant::{Mode, Unit};
 use schema::datagram::Packed;
 use schema::file::Writer;
 use schema::{Flags, Header, Mark, Marks, Topic};

@@ -4,8 +4,8 @@
 use std::ops::Range;
 
 use fastrand::Rng;
-use lms::variant::{Mode, Unit};
 use recording::{Damage, Encoding, Recording};
+use scanhub_drivers::lms::variant::{Mode, Unit};
 use schema::file::Compression;
 
 use tempfile::TempDir;

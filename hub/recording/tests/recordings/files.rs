@@ -6,12 +6,12 @@ use std::io::{Read, Write};
 use crate::real;
 use flate2::Compression;
 use flate2::write::GzEncoder;
-use lms::command::Request;
-use lms::measured::{self, Measured};
-use lms::reply;
-use lms::telegram::Telegram;
-use lms::variant::{Mode, Unit, Variant};
 use recording::{Encoding, Form, Recording};
+use scanhub_drivers::lms::command::Request;
+use scanhub_drivers::lms::measured::{self, Measured};
+use scanhub_drivers::lms::reply;
+use scanhub_drivers::lms::telegram::Telegram;
+use scanhub_drivers::lms::variant::{Mode, Unit, Variant};
 use tempfile::NamedTempFile;
 
 const MM: Encoding = Encoding { unit: Unit::Mm, mode: Mode(1) };

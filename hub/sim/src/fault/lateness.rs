@@ -1,7 +1,7 @@
 //! What arrives late but arrives: a line that is stuck for a while, and pieces that are each late by a random time. The
 //! order never changes.
 
-use lms::Nanos;
+use schema::Nanos;
 
 use super::schedule::Window;
 use super::{Faults, random};

@@ -1,7 +1,7 @@
 //! Faults that happen at a time: when the next one is, how long it lasts, and what garbage it brings. Times are the
 //! sensor's, from 0 on.
 
-use lms::{MILLIS, Nanos};
+use schema::{MILLIS, Nanos};
 
 use super::{Fault, Faults, random};
 

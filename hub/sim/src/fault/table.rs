@@ -4,8 +4,7 @@
 use std::fmt;
 use std::str::FromStr;
 
-use lms::Nanos;
-use schema::{Failure, Kind};
+use schema::{Failure, Kind, Nanos};
 
 use crate::settings::Habits;
 

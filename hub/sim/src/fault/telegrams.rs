@@ -3,6 +3,7 @@
 
 use super::bytes::happens;
 use super::{Fault, Faults, random};
+use scanhub_drivers::lms;
 
 /// What is wrong with the telegram on the line.
 #[derive(Clone, Debug)]

@@ -1,7 +1,7 @@
 //! A room seen beam by beam, each at its own time and angle, all around: what a head that turns measures. Knows neither
 //! packets nor the order of beams.
 
-use lms::Nanos;
+use schema::Nanos;
 
 use super::{Room, Sight, told};
 use crate::layers::{Dice, Layers};

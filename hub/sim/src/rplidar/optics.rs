@@ -6,7 +6,7 @@
 //! decoder of the type 0x84 has the shift as a formula; it is taken for all of such a scanner's modes. Where the formula
 //! has no solution, at an edge, nothing comes back.
 
-use line::Nanos;
+use schema::Nanos;
 
 use super::models::Model;
 use super::packets::Reading;

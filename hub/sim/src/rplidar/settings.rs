@@ -1,6 +1,6 @@
 //! A scanner at the start of a simulation, and what will go wrong in it. Plain values; [`crate::rplidar`] acts on them.
 
-use line::{MILLIS, Nanos};
+use schema::{MILLIS, Nanos};
 
 use super::models::Model;
 use crate::fault::Faults;

@@ -1,7 +1,7 @@
 //! What a scanner sends unasked: which point is measured when and where the head is then, and when a packet has all its
 //! points. Knows neither requests nor the line.
 
-use line::Nanos;
+use schema::Nanos;
 
 use super::models::{Form, Mode, Model};
 use super::optics::Optics;

@@ -2,11 +2,12 @@
 
 use std::time::{Duration, Instant};
 
-use ld::packet::LEN;
-use ld::{Heard, Model, Session, Settings};
-use line::{Nanos, Output, Session as _, State};
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
-use schema::Failure;
+use scanhub_drivers::ld::packet::LEN;
+use scanhub_drivers::ld::{Heard, Model, Session, Settings};
+use scanhub_drivers::line::{Output, Session as _, State};
+use scanhub_drivers::lms;
+use schema::{Failure, Nanos};
 use sim::fault::Faults;
 use sim::options::{Scanner, SimulateOptions};
 use sim::pty::now_ns;

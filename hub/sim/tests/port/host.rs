@@ -4,11 +4,12 @@ use std::os::fd::OwnedFd;
 use std::path::Path;
 use std::time::{Duration, Instant};
 
-use lms::command::Request;
-use lms::framer::{Found, Framer};
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::fs::{Mode, OFlags, open};
 use rustix::termios::{OptionalActions, tcgetattr, tcsetattr};
+use scanhub_drivers::lms;
+use scanhub_drivers::lms::command::Request;
+use scanhub_drivers::lms::framer::{Found, Framer};
 
 use crate::PATIENCE;
 

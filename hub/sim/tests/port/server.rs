@@ -6,7 +6,8 @@ use std::net::TcpStream;
 use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
-use lms::command::Request;
+use scanhub_drivers::ld;
+use scanhub_drivers::lms::command::Request;
 use schema::Kind;
 use sim::fault::Faults;
 use sim::options::{Scanner, SimulateOptions};

@@ -2,10 +2,10 @@
 
 use std::fmt;
 
-use lms::configuration::{Item, availability_words};
-use lms::family::Family;
-use lms::variant::{Mode, Unit};
 use lms_configure::{Plan, eeprom::PowerOn};
+use scanhub_drivers::lms::configuration::{Item, availability_words};
+use scanhub_drivers::lms::family::Family;
+use scanhub_drivers::lms::variant::{Mode, Unit};
 use serde::Serialize;
 
 use super::wanted::{AVAILABILITY, MODE, SENSITIVITIES, SENSITIVITY, UNIT};

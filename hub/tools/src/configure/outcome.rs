@@ -2,8 +2,8 @@
 
 use std::fmt;
 
-use lms::operating;
 use lms_configure::{Change, Failing, Outcome, OwnedConfiguration, Plan, Step};
+use scanhub_drivers::lms::operating;
 use schema::{Failure, Kind};
 use serde::Serialize;
 

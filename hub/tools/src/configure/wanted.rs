@@ -1,10 +1,10 @@
 //! `KEY=VALUE` of the command line: the settings, their valid values, and what each changes in a configuration. What the
 //! sensor's type does not support is refused with the reason.
 
-use lms::family::Family;
-use lms::inquiry::Report;
-use lms::variant::{Mode, Unit};
 use lms_configure::{OwnedConfiguration, Plan, eeprom::PowerOn};
+use scanhub_drivers::lms::family::Family;
+use scanhub_drivers::lms::inquiry::Report;
+use scanhub_drivers::lms::variant::{Mode, Unit};
 use schema::{Failure, Kind};
 
 /// Everything that is wanted.
@@ -190,9 +190,9 @@ const LEVEL_2: u8 = 4;
 #[cfg(test)]
 mod tests {
     use super::*;
-    use lms::configuration::factory;
-    use lms::parameters::Password;
-    use lms::variant::Baud;
+    use scanhub_drivers::lms::configuration::factory;
+    use scanhub_drivers::lms::parameters::Password;
+    use scanhub_drivers::lms::variant::Baud;
 
     fn plan() -> Plan {
         let old = OwnedConfiguration::new(&factory(Mode(1), Unit::Mm)).unwrap();

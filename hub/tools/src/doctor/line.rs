@@ -4,11 +4,11 @@
 use std::path::Path;
 use std::sync::atomic::AtomicBool;
 
-use lms::variant::Baud;
 use port::{
     Candidate, Holder, PROMPT_MS, Port, PortError, PortlessAdapter, Rights, Source, all_holders, check_tty,
     latency_ms,
 };
+use scanhub_drivers::lms::variant::Baud;
 use schema::{Failure, Kind};
 
 use super::Subject;

@@ -2,11 +2,11 @@
 //! ask.
 
 use config::Link;
-use lms::condition::{Condition, Severity};
-use lms::errors::Fault;
-use lms::family::Family;
-use lms::inquiry::Report;
-use lms::variant::{Unit, Variant};
+use scanhub_drivers::lms::condition::{Condition, Severity};
+use scanhub_drivers::lms::errors::Fault;
+use scanhub_drivers::lms::family::Family;
+use scanhub_drivers::lms::inquiry::Report;
+use scanhub_drivers::lms::variant::{Unit, Variant};
 use schema::{State, Status};
 
 use super::counts::{LOSS_REMEDY, is_mostly_damaged};
@@ -205,11 +205,11 @@ const INSTALLATION: u8 = 0x00;
 mod tests {
     use super::*;
     use crate::doctor::finding::State as Verdict;
-    use lms::exchange::{Conversation, Output};
-    use lms::status_report::Health;
-    use lms::telegram::{Telegram, Writer};
-    use lms::variant::{Baud, Mode};
-    use lms::{Inquiry, configuration};
+    use scanhub_drivers::lms::exchange::{Conversation, Output};
+    use scanhub_drivers::lms::status_report::Health;
+    use scanhub_drivers::lms::telegram::{Telegram, Writer};
+    use scanhub_drivers::lms::variant::{Baud, Mode};
+    use scanhub_drivers::lms::{Inquiry, configuration};
 
     /// What an inquiry makes of a sensor with this status report, status byte and errors.
     fn report(status: [u8; 152], condition: u8, errors: &[u8]) -> Report {

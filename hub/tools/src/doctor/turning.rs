@@ -2,8 +2,8 @@
 //! what it says; refuses to listen and to ask.
 
 use config::{Link, Scanner};
-use line::family::Condition;
-use scanner::Introduction;
+use scanhub_drivers::line::family::Condition;
+use scanhub_drivers::scanner::Introduction;
 
 use super::finding::Finding;
 use crate::listen::{LINE_REMEDY, Overheard};
@@ -122,7 +122,7 @@ const WELL: u64 = 100;
 mod tests {
     use super::*;
     use crate::doctor::finding::State;
-    use line::Account;
+    use scanhub_drivers::line::Account;
     use schema::Family;
 
     fn heard() -> Overheard {

@@ -2,13 +2,14 @@
 
 use std::fmt;
 
-use lms::command::Request;
-use lms::condition::Condition;
-use lms::configuration::availability_words;
-use lms::inquiry::Report;
-use lms::operating;
-use lms::reply::Reply;
-use lms::variant::Mode;
+use scanhub_drivers::lms;
+use scanhub_drivers::lms::command::Request;
+use scanhub_drivers::lms::condition::Condition;
+use scanhub_drivers::lms::configuration::availability_words;
+use scanhub_drivers::lms::inquiry::Report;
+use scanhub_drivers::lms::operating;
+use scanhub_drivers::lms::reply::Reply;
+use scanhub_drivers::lms::variant::Mode;
 use serde::Serialize;
 
 /// A sensor; what it did not report is null.

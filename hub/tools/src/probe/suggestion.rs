@@ -2,10 +2,10 @@
 
 use std::path::{Path, PathBuf};
 
-use lms::family::Family as Type;
-use lms::inquiry::Report;
-use lms::variant::Baud;
 use port::{Candidate, Source};
+use scanhub_drivers::lms::family::Family as Type;
+use scanhub_drivers::lms::inquiry::Report;
+use scanhub_drivers::lms::variant::Baud;
 use schema::Family;
 
 use crate::listen::Overheard;
@@ -111,8 +111,8 @@ const NAME: &str = "front";
 mod tests {
     use super::*;
     use config::{Config, Link, Scanner, Sources};
-    use lms::inquiry::Inquiry;
-    use scanner::features;
+    use scanhub_drivers::lms::inquiry::Inquiry;
+    use scanhub_drivers::scanner::features;
 
     fn link(port: &str, settings: &[(&'static str, &str)]) -> SuggestedLink {
         let settings = settings.iter().map(|(key, value)| (*key, (*value).to_owned())).collect();

@@ -3,7 +3,8 @@
 
 use std::fmt;
 
-use line::family::Model;
+use scanhub_drivers::line::family::Model;
+use scanhub_drivers::scanner;
 use schema::Family;
 use serde::Serialize;
 

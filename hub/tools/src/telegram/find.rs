@@ -4,10 +4,10 @@
 
 use std::io;
 
-use lms::crc::crc;
-use lms::explain::name;
-use lms::framer::{Found, Framer, VETO_HOLD};
-use lms::telegram::{ACK, FRAME, MAX_LENGTH, MAX_TELEGRAM, NAK, REPLY, STX, Telegram};
+use scanhub_drivers::lms::crc::crc;
+use scanhub_drivers::lms::explain::name;
+use scanhub_drivers::lms::framer::{Found, Framer, VETO_HOLD};
+use scanhub_drivers::lms::telegram::{ACK, FRAME, MAX_LENGTH, MAX_TELEGRAM, NAK, REPLY, STX, Telegram};
 
 /// A part of the stream.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -186,9 +186,10 @@ const MOST_PENDING: usize = 64 * 1024;
 #[cfg(test)]
 mod tests {
     use super::*;
-    use lms::command::Request;
-    use lms::reply;
-    use lms::variant::Unit;
+    use scanhub_drivers::lms;
+    use scanhub_drivers::lms::command::Request;
+    use scanhub_drivers::lms::reply;
+    use scanhub_drivers::lms::variant::Unit;
 
     fn found(bytes: &[u8], piece: usize) -> Vec<(u64, String)> {
         let mut items = Vec::new();

@@ -3,10 +3,11 @@
 use std::fmt::Write as _;
 use std::io::{self, Write};
 
-use lms::explain::{Field, Headline, Value, explain};
-use lms::reply::Reply;
-use lms::telegram::{REPLY, Telegram};
-use lms::variant::Mode;
+use scanhub_drivers::lms;
+use scanhub_drivers::lms::explain::{Field, Headline, Value, explain};
+use scanhub_drivers::lms::reply::Reply;
+use scanhub_drivers::lms::telegram::{REPLY, Telegram};
+use scanhub_drivers::lms::variant::Mode;
 use schema::Printable;
 use serde::Serialize;
 

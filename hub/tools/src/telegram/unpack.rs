@@ -5,8 +5,8 @@ use std::fs::File;
 use std::io::{self, Read};
 use std::path::Path;
 
-use lms::variant::{Mode, Unit};
 use recording::{Encoding, Form, Frame, Recording};
+use scanhub_drivers::lms::variant::{Mode, Unit};
 use schema::{Failure, Family, Kind};
 
 /// Bytes, and the measuring mode of their values where the recording tells it.

@@ -1,7 +1,6 @@
 //! Consumers come late and leave, are killed while they hold samples, and stop for a while.
 
-use lms::MILLIS;
-use schema::Topic;
+use schema::{MILLIS, Topic};
 
 use super::{Key, Kind, SENSOR};
 use crate::consumer::Habit;

@@ -1,6 +1,6 @@
 //! The hub is ended in order, and another one is started after a while.
 
-use lms::MILLIS;
+use schema::MILLIS;
 
 use super::{Key, Kind};
 use crate::plan::Action;

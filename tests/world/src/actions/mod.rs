@@ -37,7 +37,7 @@ mod unplug;
 mod unwell;
 mod wall_step;
 
-use lms::Nanos;
+use schema::Nanos;
 use sim::fault::Faults;
 
 use crate::plan::Action;

@@ -1,6 +1,6 @@
 //! The gateway's process does not run for a while, or the listener's.
 
-use lms::MILLIS;
+use schema::MILLIS;
 
 use super::{Key, Kind};
 use crate::plan::Action;

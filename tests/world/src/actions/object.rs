@@ -1,7 +1,7 @@
 //! Something is inside a circle for a while: a post ahead of a sensor, inside the larger circle or inside both. Of all that
 //! happens only this is known from the start, for the scans are measured before.
 
-use lms::{MILLIS, Nanos};
+use schema::{MILLIS, Nanos};
 use sim::series::Changes;
 
 use super::{Key, Kind, SENSOR};

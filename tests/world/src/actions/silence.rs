@@ -1,6 +1,6 @@
 //! Nothing arrives for a while, or everything arrives late.
 
-use lms::{MILLIS, Nanos};
+use schema::{MILLIS, Nanos};
 use sim::fault::Faults;
 
 use super::{Key, Kind, SENSOR};

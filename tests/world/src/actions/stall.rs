@@ -1,6 +1,6 @@
 //! The hub's process does not run for a while.
 
-use lms::MILLIS;
+use schema::MILLIS;
 
 use super::{Key, Kind};
 use crate::event::Event;

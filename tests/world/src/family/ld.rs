@@ -1,10 +1,9 @@
 //! LDROBOT: a head that turns and tells of what it measures in packets, unasked. What it measures has no noise, so that each
 //! point that is told can be found among those that are true.
 
-use ld::Model;
-use ld::packet::{LEN, POINTS, Packet};
-use lms::{MILLIS, Nanos};
-use schema::Scan;
+use scanhub_drivers::ld::Model;
+use scanhub_drivers::ld::packet::{LEN, POINTS, Packet};
+use schema::{MILLIS, Nanos, Scan};
 use sim::ChunkSize;
 use sim::device::Device;
 use sim::ld::{Head, HeadSettings, Packets, TruePoint};
@@ -89,7 +88,7 @@ impl Family for Ld {
 
     fn begin(&self, unit: &[u8]) -> Option<Begin> {
         let packet = Packet::check(unit.first_chunk()?).ok()?;
-        let on_line = lms::line_time(LEN, self.settings.model.baud());
+        let on_line = schema::line_time(LEN, self.settings.model.baud());
         Some(Begin { clockwise_deg: f64::from(packet.angle(0)) / 100.0, points: POINTS, on_line })
     }
 }

@@ -2,11 +2,11 @@
 
 use std::sync::{Arc, LazyLock, Mutex, PoisonError};
 
-use lms::command::Request;
-use lms::measured::MEASURED;
-use lms::variant::{Baud, Mode, Unit, Variant};
-use lms::{MILLIS, Nanos};
-use schema::Scan;
+use scanhub_drivers::lms;
+use scanhub_drivers::lms::command::Request;
+use scanhub_drivers::lms::measured::MEASURED;
+use scanhub_drivers::lms::variant::{Baud, Mode, Unit, Variant};
+use schema::{MILLIS, Nanos, Scan};
 use sim::ChunkSize;
 use sim::device::Device;
 use sim::machine::{Habits, Machine, Settings, Start};
@@ -66,7 +66,7 @@ impl Family for Lms {
         let len = 2 * self.variant.beams() + 10;
         let rate = self.baud.rate();
         let turns = (len - 1) / lms::variant::BYTES_PER_TURN;
-        let on_line = lms::line_time(len, rate) + turns as Nanos * lms::variant::MIRROR_TURN;
+        let on_line = schema::line_time(len, rate) + turns as Nanos * lms::variant::MIRROR_TURN;
         let period = self.variant.period(len, rate);
         (period, period + on_line)
     }

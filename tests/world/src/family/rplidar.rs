@@ -2,9 +2,8 @@
 //! measures has no noise, so that each point that is told can be found among those that are true. It has no EEPROM; what it
 //! would keep is changed by one request only, and each of these counts as a write.
 
-use ::rplidar::packet::Kind;
-use lms::{MILLIS, Nanos};
-use schema::Scan;
+use scanhub_drivers::rplidar::packet::Kind;
+use schema::{MILLIS, Nanos, Scan};
 use sim::device::Device;
 use sim::ld::TruePoint;
 use sim::machine::Habits;
@@ -312,7 +311,7 @@ fn request(command: u8, payload: &[u8]) -> Vec<u8> {
 }
 
 fn line_time(unit: &[u8], model: Model) -> Nanos {
-    lms::line_time(unit.len(), model.baud())
+    schema::line_time(unit.len(), model.baud())
 }
 
 /// The models that are drawn, fast ones seldom: their points take long to measure.

@@ -3,8 +3,7 @@
 
 use std::collections::BTreeMap;
 
-use lms::Nanos;
-use schema::Topic;
+use schema::{Nanos, Topic};
 
 use super::{Judge, Say};
 use crate::consumer::Number;

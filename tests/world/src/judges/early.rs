@@ -6,8 +6,7 @@
 use std::collections::BTreeMap;
 
 use bytemuck::pod_read_unaligned;
-use lms::{MILLIS, Nanos};
-use schema::{Scan, Topic, Verdict, Zones};
+use schema::{MILLIS, Nanos, Scan, Topic, Verdict, Zones};
 
 use super::{Judge, Say};
 use crate::event::Event;

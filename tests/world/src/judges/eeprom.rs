@@ -1,6 +1,6 @@
 //! Nothing that a hub says to a sensor writes its EEPROM.
 
-use lms::Nanos;
+use schema::Nanos;
 
 use super::{Judge, Say};
 use crate::event::Event;

@@ -3,8 +3,7 @@
 
 use std::rc::Rc;
 
-use lms::{MILLIS, Nanos};
-use schema::{State, Status, Topic};
+use schema::{MILLIS, Nanos, State, Status, Topic};
 
 use super::{Judge, Say};
 use crate::event::{Event, Figures};

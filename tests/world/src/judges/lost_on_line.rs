@@ -4,8 +4,7 @@
 use std::collections::VecDeque;
 use std::rc::Rc;
 
-use lms::{MILLIS, Nanos};
-use schema::{Counter, State, Status, Topic};
+use schema::{Counter, MILLIS, Nanos, State, Status, Topic};
 use sim::ld::TruePoint;
 
 use super::{Judge, Say};

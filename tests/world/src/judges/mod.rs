@@ -25,7 +25,7 @@ mod stamps;
 mod turns;
 mod verdict;
 
-use lms::Nanos;
+use schema::Nanos;
 
 use crate::event::{Event, Figures, Violation};
 use crate::plan::Plan;

@@ -5,9 +5,8 @@ use std::collections::hash_map::Entry;
 use std::collections::{HashMap, VecDeque};
 use std::rc::Rc;
 
-use lms::Nanos;
 use schema::datagram::Packed;
-use schema::{Scan, Topic};
+use schema::{Nanos, Scan, Topic};
 
 use super::{Judge, Say};
 use crate::event::Event;

@@ -4,8 +4,7 @@
 use std::collections::VecDeque;
 use std::rc::Rc;
 
-use lms::{MILLIS, Nanos};
-use schema::{State, Status, Topic};
+use schema::{MILLIS, Nanos, State, Status, Topic};
 
 use super::{Judge, Say};
 use crate::event::{Event, Telegram};

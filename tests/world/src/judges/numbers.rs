@@ -4,8 +4,7 @@
 use std::collections::BTreeMap;
 use std::rc::Rc;
 
-use lms::Nanos;
-use schema::{Header, Topic};
+use schema::{Header, Nanos, Topic};
 
 use super::{Judge, Say};
 use crate::event::Event;

@@ -3,8 +3,7 @@
 
 use std::collections::BTreeMap;
 
-use lms::{MILLIS, Nanos};
-use schema::{Ring, Topic};
+use schema::{MILLIS, Nanos, Ring, Topic};
 
 use super::{Judge, Say};
 use crate::consumer::Number;

@@ -6,13 +6,12 @@ use std::collections::BTreeMap;
 use std::io::{self, Write};
 
 use bytemuck::pod_read_unaligned;
-use lms::Nanos;
-use lms::variant::{Mode, Unit};
 use recording::{Encoding, Recording as File};
 use rustix::fs::{MemfdFlags, memfd_create};
+use scanhub_drivers::lms::variant::{Mode, Unit};
 use schema::datagram::Packed;
 use schema::file::Writer;
-use schema::{Header, Status, Topic};
+use schema::{Header, Nanos, Status, Topic};
 
 use super::{Judge, Say};
 use crate::consumer::Number;

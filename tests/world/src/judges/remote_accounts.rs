@@ -4,9 +4,8 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use lms::Nanos;
-use schema::Topic;
 use schema::datagram::{Announce, Datagram};
+use schema::{Nanos, Topic};
 
 use super::{Judge, Say};
 use crate::event::{Arrival, Event};

@@ -3,9 +3,8 @@
 
 use std::collections::BTreeMap;
 
-use lms::Nanos;
-use schema::Topic;
 use schema::datagram::Announce;
+use schema::{Nanos, Topic};
 
 use super::{Judge, Say};
 use crate::consumer::Number;

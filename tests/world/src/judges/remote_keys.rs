@@ -4,7 +4,7 @@
 
 use std::collections::{HashMap, HashSet};
 
-use lms::Nanos;
+use schema::Nanos;
 use schema::datagram::DatagramError;
 
 use super::{Judge, Say};

@@ -8,9 +8,8 @@
 
 use std::collections::{BTreeMap, BTreeSet, HashSet};
 
-use lms::{MILLIS, Nanos};
 use schema::datagram::{Announce, Announced, Datagram, DatagramError, Head, Packed, WINDOW};
-use schema::{Flags, Header, Quality, State, Status, Topic, Zones};
+use schema::{Flags, Header, MILLIS, Nanos, Quality, State, Status, Topic, Zones};
 
 use super::{Judge, Say};
 use crate::event::{Arrival, Event};

@@ -4,9 +4,8 @@
 
 use std::collections::{BTreeMap, VecDeque};
 
-use lms::{MILLIS, Nanos};
 use schema::datagram::Head;
-use schema::{Flags, Header, Topic};
+use schema::{Flags, Header, MILLIS, Nanos, Topic};
 
 use super::{Judge, Say};
 use crate::event::{Arrival, Event};

@@ -1,6 +1,6 @@
 //! What was taken comes back: when all is over no line is open, no loan is out, no sample is held.
 
-use lms::Nanos;
+use schema::Nanos;
 
 use super::{Judge, Say};
 use crate::event::Event;

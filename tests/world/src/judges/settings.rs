@@ -1,8 +1,7 @@
 //! A port that another process sets to another rate has the hub's again soon: the hub does not read for a second what arrives
 //! at the wrong rate.
 
-use lms::{MILLIS, Nanos};
-use schema::Topic;
+use schema::{MILLIS, Nanos, Topic};
 
 use super::{Judge, Say};
 use crate::event::Event;

@@ -6,8 +6,7 @@
 use std::collections::{BTreeMap, VecDeque};
 use std::rc::Rc;
 
-use lms::{MILLIS, Nanos, line_time};
-use schema::{Flags, Header, Topic};
+use schema::{Flags, Header, MILLIS, Nanos, Topic, line_time};
 
 use super::{Judge, Say};
 use crate::event::{Event, Telegram};

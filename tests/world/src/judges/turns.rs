@@ -13,9 +13,8 @@ use std::cell::Cell;
 use std::collections::{HashMap, VecDeque};
 use std::rc::Rc;
 
-use lms::{MICROS, MILLIS, Nanos};
 use schema::datagram::Packed;
-use schema::{Header, Scan, State, Status, Topic};
+use schema::{Header, MICROS, MILLIS, Nanos, Scan, State, Status, Topic};
 use sim::ld::TruePoint;
 
 use self::points::{Point, Told, told};

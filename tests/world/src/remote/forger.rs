@@ -4,7 +4,7 @@
 use std::collections::VecDeque;
 
 use lan::Key;
-use lms::Nanos;
+use schema::Nanos;
 use schema::datagram::{Datagram, HEAD, Head, LanFlags, MAC};
 
 /// What somebody sends who has not the key.

@@ -3,11 +3,10 @@
 
 use lan::Stamp;
 use lan::outgoing::{ANNOUNCE_EVERY, Form, Outgoing, PayloadRef, Sample as Outbound, Transmit};
-use lms::{MILLIS, Nanos};
 use scanhub_client::clock::Moment;
 use scanhub_client::streams::{Noted, Numbers, ZonesState};
-use schema::Topic;
 use schema::datagram::Datagram;
+use schema::{MILLIS, Nanos, Topic};
 
 use super::payload::lend;
 use super::{Terms, WAKES};

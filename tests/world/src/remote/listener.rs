@@ -6,9 +6,8 @@ use std::collections::{HashMap, VecDeque};
 use lan::Stamp;
 use lan::incoming::{Arrived, Incoming};
 use lan::republish::Republisher;
-use lms::Nanos;
-use schema::Topic;
 use schema::datagram::{Datagram, DatagramError, HEAD, Head};
+use schema::{Nanos, Topic};
 
 use super::robot::GATEWAY;
 use super::topics::Memory;

@@ -1,10 +1,9 @@
 //! A robot that follows the zones of remote sensors, with the client library's own rules. Refuses to know how they came.
 
-use lms::Nanos;
 use scanhub_client::Robot;
 use scanhub_client::streams::ZonesState;
 use schema::datagram::Packed;
-use schema::{Topic, Verdict, Zones};
+use schema::{Nanos, Topic, Verdict, Zones};
 
 use super::Terms;
 use super::topics::{Memory, Published};

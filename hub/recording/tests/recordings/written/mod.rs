@@ -4,9 +4,9 @@ use std::collections::BTreeMap;
 
 use bytemuck::bytes_of;
 use fastrand::Rng;
-use lms::measured;
-use lms::reply;
-use lms::variant::{Mode, Unit};
+use scanhub_drivers::lms::measured;
+use scanhub_drivers::lms::reply;
+use scanhub_drivers::lms::variant::{Mode, Unit};
 use schema::datagram::Packed;
 use schema::file::{self, Compression, ENCODING_V1, Foreign, Writer};
 use schema::{

@@ -1,8 +1,9 @@
 //! What a fault did that the account of telegrams does not show: a scene that finds nothing of it is about nothing.
 
-use lms::telegram::NAK;
-use lms::variant::MIRROR_TURN;
-use lms::{MILLIS, Nanos};
+use scanhub_drivers::lms;
+use scanhub_drivers::lms::telegram::NAK;
+use scanhub_drivers::lms::variant::MIRROR_TURN;
+use schema::{MILLIS, Nanos};
 
 use crate::session::bench::{Bench, Sent};
 

@@ -1,8 +1,8 @@
 //! One run: a sensor that streams, a wire with faults, a session; then a while without faults, and the account.
 
-use line::Session as _;
-use lms::variant::Baud;
-use lms::{MILLIS, Nanos};
+use scanhub_drivers::line::Session as _;
+use scanhub_drivers::lms::variant::Baud;
+use schema::{MILLIS, Nanos};
 use sim::fault::Faults;
 use sim::machine::{Habits, Machine, Settings, Start};
 use sim::operating::Operating;

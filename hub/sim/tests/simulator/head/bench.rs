@@ -1,10 +1,12 @@
 //! A head, its line with faults and a session, in virtual time; what the session tells is judged by what the head really
 //! measured.
 
-use ld::packet::LEN;
-use ld::{Heard, Session, Settings};
-use line::grid::Point;
-use line::{MILLIS, Nanos, Output, Session as _};
+use scanhub_drivers::ld::packet::LEN;
+use scanhub_drivers::ld::{Heard, Session, Settings};
+use scanhub_drivers::line;
+use scanhub_drivers::line::grid::Point;
+use scanhub_drivers::line::{Output, Session as _};
+use schema::{MILLIS, Nanos};
 use sim::device::{Device as _, Part};
 use sim::fault::Faults;
 use sim::layers::Layers;

@@ -3,8 +3,10 @@
 mod bench;
 
 use bench::{Bench, still};
-use ld::Model;
-use line::{MILLIS, Nanos, Session as _, State};
+use scanhub_drivers::ld::Model;
+use scanhub_drivers::line::{Session as _, State};
+use scanhub_drivers::{ld, line};
+use schema::{MILLIS, Nanos};
 use sim::ld::{HeadSettings, Packets, recorded};
 use sim::world::World;
 

@@ -1,14 +1,15 @@
 //! Random bytes and random orders of events: nothing panics, everything comes to its end, and nothing is said that was
 //! not to be.
 
-use lms::configuration::factory;
-use lms::exchange::{Conversation, Output};
-use lms::framer::Tally;
-use lms::parameters::Password;
-use lms::telegram::{FRAME, Telegram, Writer};
-use lms::variant::{Baud, Mode, Unit};
-use lms::{Inquiry, MILLIS, Nanos};
 use lms_configure::{Change, Consent, OwnedConfiguration, Plan};
+use scanhub_drivers::lms::Inquiry;
+use scanhub_drivers::lms::configuration::factory;
+use scanhub_drivers::lms::exchange::{Conversation, Output};
+use scanhub_drivers::lms::framer::Tally;
+use scanhub_drivers::lms::parameters::Password;
+use scanhub_drivers::lms::telegram::{FRAME, Telegram, Writer};
+use scanhub_drivers::lms::variant::{Baud, Mode, Unit};
+use schema::{MILLIS, Nanos};
 
 /// Drives `talk` until it is over, by what comes to mind; returns the telegrams that it said.
 fn drive<C: Conversation>(talk: &mut C, seed: u64) -> Vec<Vec<u8>> {

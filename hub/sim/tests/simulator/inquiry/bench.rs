@@ -3,11 +3,11 @@
 
 use std::collections::VecDeque;
 
-use lms::command::Request;
-use lms::exchange::{Conversation, Output};
-use lms::telegram::{Encoded, FRAME};
-use lms::variant::Baud;
-use lms::{MICROS, MILLIS, Nanos, line_time};
+use scanhub_drivers::lms::command::Request;
+use scanhub_drivers::lms::exchange::{Conversation, Output};
+use scanhub_drivers::lms::telegram::{Encoded, FRAME};
+use scanhub_drivers::lms::variant::Baud;
+use schema::{MICROS, MILLIS, Nanos, line_time};
 use sim::Arrival;
 use sim::device::{Device as _, Part};
 use sim::fault::Faults;

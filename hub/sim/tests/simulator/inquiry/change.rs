@@ -1,12 +1,13 @@
 //! Changing what a sensor keeps for ever, with consent: written once, read back, and the stream goes on; and what is
 //! known when it goes wrong.
 
-use lms::configuration::Configuration;
-use lms::parameters::Password;
-use lms::telegram::{NAK, Writer};
-use lms::variant::{Baud, Mode, Unit};
-use lms::{Inquiry, MILLIS, Nanos};
 use lms_configure::{Change, Consent, Failing, Outcome, Plan, Step, eeprom::PowerOn};
+use scanhub_drivers::lms::Inquiry;
+use scanhub_drivers::lms::configuration::Configuration;
+use scanhub_drivers::lms::parameters::Password;
+use scanhub_drivers::lms::telegram::{NAK, Writer};
+use scanhub_drivers::lms::variant::{Baud, Mode, Unit};
+use schema::{MILLIS, Nanos};
 use sim::device::Device as _;
 use sim::machine::{Habits, Machine, Settings};
 use sim::operating::Operating;

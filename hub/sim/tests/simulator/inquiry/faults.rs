@@ -1,9 +1,10 @@
 //! The fault table against conversations that come to an end: they end, what they tell is true, and a change writes no
 //! more often than it may and never unnoticed.
 
-use lms::variant::Baud;
-use lms::{Inquiry, MILLIS};
 use lms_configure::Change;
+use scanhub_drivers::lms::Inquiry;
+use scanhub_drivers::lms::variant::Baud;
+use schema::MILLIS;
 use sim::device::Device as _;
 use sim::fault::Faults;
 use sim::machine::{Habits, Machine};

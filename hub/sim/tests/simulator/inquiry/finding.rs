@@ -1,9 +1,10 @@
 //! A sensor that answers: found at whatever rate, in whatever mode, and left as it was.
 
-use lms::command::Request;
-use lms::telegram::{Encoded, Writer};
-use lms::variant::{Baud, Mode, Unit};
-use lms::{Inquiry, MILLIS};
+use scanhub_drivers::lms::Inquiry;
+use scanhub_drivers::lms::command::Request;
+use scanhub_drivers::lms::telegram::{Encoded, Writer};
+use scanhub_drivers::lms::variant::{Baud, Mode, Unit};
+use schema::MILLIS;
 use sim::device::Device as _;
 use sim::machine::{Settings, Start};
 use sim::operating::Operating;

@@ -1,7 +1,8 @@
 //! A line that loses bytes, a sensor that overlooks requests, one that hears nothing, and none at all.
 
-use lms::variant::Baud;
-use lms::{Inquiry, MILLIS};
+use scanhub_drivers::lms::Inquiry;
+use scanhub_drivers::lms::variant::Baud;
+use schema::MILLIS;
 use sim::machine::Habits;
 
 use super::bench::{Bench, make_stream, sensor};

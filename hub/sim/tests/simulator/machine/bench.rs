@@ -1,6 +1,6 @@
 //! A sensor with a clock of its own, and everything that it has sent.
 
-use lms::{MICROS, MILLIS, Nanos, line_time};
+use schema::{MICROS, MILLIS, Nanos, line_time};
 use sim::Arrival;
 use sim::device::{Chunk, Device as _, Part, Sent};
 use sim::machine::{Machine, Settings};

@@ -1,13 +1,13 @@
 //! Bad habits of a sensor, each alone.
 
-use lms::command::Request;
-use lms::operating::Operating;
-use lms::parameters::Password;
-use lms::reply::Reply;
-use lms::telegram::{ACK, NAK};
-use lms::variant::{Baud, Variant};
-use lms::{MICROS, MILLIS, line_time};
 use lms_configure::eeprom::{PowerOn, Write};
+use scanhub_drivers::lms::command::Request;
+use scanhub_drivers::lms::operating::Operating;
+use scanhub_drivers::lms::parameters::Password;
+use scanhub_drivers::lms::reply::Reply;
+use scanhub_drivers::lms::telegram::{ACK, NAK};
+use scanhub_drivers::lms::variant::{Baud, Variant};
+use schema::{MICROS, MILLIS, line_time};
 use sim::device::Device as _;
 use sim::machine::{Habits, Settings};
 use sim::{Arrival, Dropped};

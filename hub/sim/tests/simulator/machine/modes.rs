@@ -1,9 +1,9 @@
 //! A sensor that some host left doing something else than sending whole scans, and what it tells once when asked.
 
-use lms::measured::Measured;
-use lms::telegram::{Telegram, Writer};
-use lms::variant::{Baud, MIRROR_TURN, Unit, Variant};
-use lms::{MILLIS, Nanos};
+use scanhub_drivers::lms::measured::Measured;
+use scanhub_drivers::lms::telegram::{Telegram, Writer};
+use scanhub_drivers::lms::variant::{Baud, MIRROR_TURN, Unit, Variant};
+use schema::{MILLIS, Nanos};
 use sim::machine::{Settings, Start};
 use sim::operating::Operating;
 

@@ -1,10 +1,10 @@
 //! What a power cycle, a reset and a former owner do to a sensor.
 
-use lms::command::Request;
-use lms::reply::Reply;
-use lms::telegram::{ACK, Telegram, Writer};
-use lms::variant::{Baud, Unit, Variant};
-use lms::{MILLIS, Nanos};
+use scanhub_drivers::lms::command::Request;
+use scanhub_drivers::lms::reply::Reply;
+use scanhub_drivers::lms::telegram::{ACK, Telegram, Writer};
+use scanhub_drivers::lms::variant::{Baud, Unit, Variant};
+use schema::{MILLIS, Nanos};
 use sim::device::Device as _;
 use sim::machine::{Settings, Start};
 use sim::operating::Operating;

@@ -1,7 +1,7 @@
 //! What the wire does to bytes, and whether it says the truth of it.
 
-use lms::variant::Baud;
-use lms::{MILLIS, Nanos};
+use scanhub_drivers::lms::variant::Baud;
+use schema::{MILLIS, Nanos};
 use sim::ChunkSize;
 use sim::device::Part;
 use sim::fault::{Fault, Faults};

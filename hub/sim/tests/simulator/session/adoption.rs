@@ -1,9 +1,10 @@
 //! A sensor that streams already when the session begins: left by a hub that was killed, or by another program.
 
-use line::{Control, Session as _, State};
-use lms::command::Request;
-use lms::variant::{Baud, Mode, Unit};
-use lms::{MICROS, MILLIS, Settings};
+use scanhub_drivers::line::{Control, Session as _, State};
+use scanhub_drivers::lms::Settings;
+use scanhub_drivers::lms::command::Request;
+use scanhub_drivers::lms::variant::{Baud, Mode, Unit};
+use schema::{MICROS, MILLIS};
 use sim::device::Device as _;
 use sim::machine::{self, Start};
 use sim::operating::Operating;

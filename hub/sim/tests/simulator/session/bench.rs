@@ -3,12 +3,14 @@
 
 use std::collections::VecDeque;
 
-use line::State;
-use line::{Output, Session as _};
-use lms::Session;
-use lms::command::Request;
-use lms::variant::{Baud, Mode, Variant};
-use lms::{MICROS, MILLIS, Nanos, Settings, line_time};
+use scanhub_drivers::line::State;
+use scanhub_drivers::line::{Output, Session as _};
+use scanhub_drivers::lms;
+use scanhub_drivers::lms::Session;
+use scanhub_drivers::lms::Settings;
+use scanhub_drivers::lms::command::Request;
+use scanhub_drivers::lms::variant::{Baud, Mode, Variant};
+use schema::{MICROS, MILLIS, Nanos, line_time};
 use sim::Arrival;
 use sim::device::{Device as _, Part};
 use sim::fault::{Fault, Faults};

@@ -1,8 +1,10 @@
 //! What a user may ask of a running session: pause, resume, resync.
 
-use line::{Control, Session as _, State};
-use lms::variant::Baud;
-use lms::{MILLIS, Nanos, Trouble};
+use scanhub_drivers::line::{Control, Session as _, State};
+use scanhub_drivers::lms;
+use scanhub_drivers::lms::Trouble;
+use scanhub_drivers::lms::variant::Baud;
+use schema::{MILLIS, Nanos};
 use sim::operating::Operating;
 
 use super::bench::{Bench, make_stream, sensor};

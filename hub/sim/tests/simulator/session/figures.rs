@@ -1,7 +1,7 @@
 //! The figure of a start: every rate, idle, streaming or left in installation mode, to the first scan.
 
-use lms::MILLIS;
-use lms::variant::Baud;
+use scanhub_drivers::lms::variant::Baud;
+use schema::MILLIS;
 use sim::machine::{Settings, Start};
 use sim::operating::Operating;
 

@@ -1,8 +1,9 @@
 //! A line whose rate somebody set by hand, as that of a serial server: it is talked to at that rate and no other.
 
-use line::State;
-use lms::variant::Baud;
-use lms::{MILLIS, Settings, Trouble};
+use scanhub_drivers::line::State;
+use scanhub_drivers::lms::variant::Baud;
+use scanhub_drivers::lms::{Settings, Trouble};
+use schema::MILLIS;
 
 use super::bench::{Bench, WANTED, make_stream, sensor};
 

@@ -1,8 +1,10 @@
 //! A sensor that overlooks requests, says NAK, answers late or twice, refuses: it streams all the same.
 
-use line::{Session as _, State};
-use lms::variant::{Baud, Mode, Variant};
-use lms::{MILLIS, Trouble};
+use scanhub_drivers::line::{Session as _, State};
+use scanhub_drivers::lms;
+use scanhub_drivers::lms::Trouble;
+use scanhub_drivers::lms::variant::{Baud, Mode, Variant};
+use schema::MILLIS;
 use sim::machine::{Habits, Settings, Start};
 use sim::operating::Operating;
 

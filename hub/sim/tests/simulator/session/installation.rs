@@ -1,8 +1,9 @@
 //! What somebody left behind in a sensor: the installation mode, in which it does not measure, and a rate in its
 //! EEPROM, which is none of ours to change.
 
-use lms::variant::Baud;
-use lms::{MILLIS, Notice};
+use scanhub_drivers::lms::Notice;
+use scanhub_drivers::lms::variant::Baud;
+use schema::MILLIS;
 use sim::device::Device as _;
 use sim::machine::{Habits, Settings, Start};
 use sim::operating::Operating;

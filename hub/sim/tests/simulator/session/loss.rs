@@ -1,8 +1,8 @@
 //! A line that loses bytes in bursts, as the paper's did: what is intact is delivered, in order and bit for bit.
 
-use line::Session as _;
-use lms::variant::Baud;
-use lms::{MILLIS, Nanos};
+use scanhub_drivers::line::Session as _;
+use scanhub_drivers::lms::variant::Baud;
+use schema::{MILLIS, Nanos};
 use sim::fault::{Faults, Loss};
 
 use super::bench::{Bench, sensor};

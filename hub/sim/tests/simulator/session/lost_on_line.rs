@@ -1,8 +1,9 @@
 //! How much of a stream the line loses, as a session finds out from when scans come, beside what was really sent.
 
-use line::{Control, Session as _};
-use lms::variant::Baud;
-use lms::{MILLIS, Nanos};
+use scanhub_drivers::line::{Control, Session as _};
+use scanhub_drivers::lms;
+use scanhub_drivers::lms::variant::Baud;
+use schema::{MILLIS, Nanos};
 use sim::fault::{Faults, Loss};
 
 use super::bench::{Bench, sensor};

@@ -1,9 +1,10 @@
 //! A sensor that streams something else than what is wanted: means, sub-ranges, partial scans, reflectivity, another
 //! variant, at any rate. It is stopped and started as wanted, never waited out.
 
-use line::State;
-use lms::variant::{Baud, Variant};
-use lms::{MILLIS, Nanos};
+use scanhub_drivers::line::State;
+use scanhub_drivers::lms;
+use scanhub_drivers::lms::variant::{Baud, Variant};
+use schema::{MILLIS, Nanos};
 use sim::device::Device as _;
 use sim::machine::{Machine, Settings, Start};
 use sim::operating::Operating;

@@ -1,8 +1,10 @@
 //! What a sensor says of itself beside its scans: it is known, told in words, and streams go on.
 
-use lms::condition::Condition;
-use lms::variant::Baud;
-use lms::{MILLIS, Notice};
+use scanhub_drivers::lms;
+use scanhub_drivers::lms::Notice;
+use scanhub_drivers::lms::condition::Condition;
+use scanhub_drivers::lms::variant::Baud;
+use schema::MILLIS;
 use sim::machine::{Settings, Start};
 use sim::operating::Operating;
 

@@ -1,10 +1,12 @@
 //! A sensor whose power goes and comes: in the middle of a scan, in the middle of the conversation, and one that needs
 //! a minute to start.
 
-use line::{Control, Session as _, State};
-use lms::command::Request;
-use lms::variant::Baud;
-use lms::{MILLIS, Nanos, Trouble};
+use scanhub_drivers::line::{Control, Session as _, State};
+use scanhub_drivers::lms;
+use scanhub_drivers::lms::Trouble;
+use scanhub_drivers::lms::command::Request;
+use scanhub_drivers::lms::variant::Baud;
+use schema::{MILLIS, Nanos};
 use sim::device::Device as _;
 use sim::fault::Faults;
 use sim::machine::{Habits, Settings, Start};

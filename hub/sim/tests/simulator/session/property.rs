@@ -1,15 +1,17 @@
 //! Whatever happens in whatever order: nothing panics, no byte is unaccounted for, no request writes the EEPROM, and
 //! once a healthy sensor is there, its stream is. One seed reproduces a run.
 
-use line::{Control, State};
-use line::{Output, Session as _};
-use lms::Session;
-use lms::command::{EEPROM_WRITES, Request};
-use lms::reply::{self, Health};
-use lms::telegram::{FRAME, REPLY, STX, Telegram, Writer};
-use lms::variant::{Baud, Mode, Unit, Variant};
-use lms::{MILLIS, Nanos, Settings, line_time};
 use lms_configure::eeprom::Write;
+use scanhub_drivers::line::{Control, State};
+use scanhub_drivers::line::{Output, Session as _};
+use scanhub_drivers::lms;
+use scanhub_drivers::lms::Session;
+use scanhub_drivers::lms::Settings;
+use scanhub_drivers::lms::command::{EEPROM_WRITES, Request};
+use scanhub_drivers::lms::reply::{self, Health};
+use scanhub_drivers::lms::telegram::{FRAME, REPLY, STX, Telegram, Writer};
+use scanhub_drivers::lms::variant::{Baud, Mode, Unit, Variant};
+use schema::{MILLIS, Nanos, line_time};
 use sim::machine::{self, Start};
 use sim::operating::Operating;
 

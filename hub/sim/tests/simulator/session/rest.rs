@@ -1,9 +1,9 @@
 //! How often the host looks at the line, and how soon it has what it waits for: once a session has learned how long a
 //! telegram takes, it lets it come, and is there when it ends.
 
-use line::Session as _;
-use lms::variant::{Baud, Variant};
-use lms::{MICROS, MILLIS};
+use scanhub_drivers::line::Session as _;
+use scanhub_drivers::lms::variant::{Baud, Variant};
+use schema::{MICROS, MILLIS};
 use sim::ChunkSize;
 use sim::machine::{Machine, Settings};
 use sim::room::Room;

@@ -1,8 +1,9 @@
 //! A sensor that is idle at one of its rates.
 
-use line::{Session as _, State};
-use lms::MILLIS;
-use lms::variant::{Baud, Mode, Unit, Variant};
+use scanhub_drivers::line::{Session as _, State};
+use scanhub_drivers::lms;
+use scanhub_drivers::lms::variant::{Baud, Mode, Unit, Variant};
+use schema::MILLIS;
 
 use sim::machine::{Habits, Settings, Start};
 use sim::operating::Operating;

@@ -1,8 +1,9 @@
 //! A host that does not run for a while: what waited for it is dated by the beat of the stream, not by when it was read.
 
-use line::Session as _;
-use lms::variant::{Baud, Variant};
-use lms::{MICROS, MILLIS, Nanos};
+use scanhub_drivers::line::Session as _;
+use scanhub_drivers::lms;
+use scanhub_drivers::lms::variant::{Baud, Variant};
+use schema::{MICROS, MILLIS, Nanos};
 use sim::machine::{Machine, Settings};
 use sim::room::Room;
 use sim::source::Source;

@@ -1,8 +1,10 @@
 //! A sensor that refuses, a line that loses a request or a reply, a stream that stops: the session streams all the same.
 
-use line::{Session as _, State};
-use lms::variant::{Baud, Unit, Variant};
-use lms::{MILLIS, Trouble};
+use scanhub_drivers::line::{Session as _, State};
+use scanhub_drivers::lms;
+use scanhub_drivers::lms::Trouble;
+use scanhub_drivers::lms::variant::{Baud, Unit, Variant};
+use schema::MILLIS;
 use sim::machine::{Habits, Machine, Settings};
 use sim::room::Room;
 use sim::source::Source;

@@ -1,6 +1,6 @@
 //! What is answered to each request, and what follows from it: streams, the motor, a new start.
 
-use line::MILLIS;
+use schema::MILLIS;
 use sim::device::Device as _;
 use sim::rplidar::{Form, Model, UnitSettings, UnitStart};
 use sim::world::World;

@@ -1,6 +1,6 @@
 //! A scanner of Slamtec and its line in virtual time: what a host asks goes in, what it sends comes out.
 
-use line::{MILLIS, Nanos, line_time};
+use schema::{MILLIS, Nanos, line_time};
 use sim::Arrival;
 use sim::device::{Device as _, Part};
 use sim::fault::Faults;

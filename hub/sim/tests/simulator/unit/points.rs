@@ -1,6 +1,6 @@
 //! Points beside what was measured: each form of packet of each model, and what is odd about an A1.
 
-use line::Nanos;
+use schema::Nanos;
 use sim::layers::Layers;
 use sim::rplidar::{Form, Model, UnitSettings};
 use sim::world::World;

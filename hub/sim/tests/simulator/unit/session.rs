@@ -1,8 +1,9 @@
 //! The hub's session with a scanner of Slamtec: what it makes of the bytes beside what the scanner measured.
 
-use line::grid::NO_RETURN;
-use line::{Heard, MILLIS, Nanos, Output, Session as _, State, line_time};
-use rplidar::{Mode, Model as Known, Session, Settings, Trouble};
+use scanhub_drivers::line::grid::NO_RETURN;
+use scanhub_drivers::line::{Heard, Output, Session as _, State};
+use scanhub_drivers::rplidar::{Mode, Model as Known, Session, Settings, Trouble};
+use schema::{MILLIS, Nanos, line_time};
 use sim::device::Device as _;
 use sim::layers::Layers;
 use sim::rplidar::{Model, UnitSettings, UnitStart};

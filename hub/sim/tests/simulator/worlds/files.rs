@@ -2,8 +2,8 @@
 
 use std::collections::BTreeSet;
 
-use lms::variant::{Mode, Unit, Variant};
 use proptest::prelude::*;
+use scanhub_drivers::lms::variant::{Mode, Unit, Variant};
 use schema::Failure;
 use sim::labeled_scan::Met;
 use sim::room::Room;

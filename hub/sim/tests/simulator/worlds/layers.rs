@@ -1,6 +1,6 @@
 //! Each layer of noise is seen to act, and to be off when it is switched off.
 
-use lms::variant::{Mode, Unit, Variant};
+use scanhub_drivers::lms::variant::{Mode, Unit, Variant};
 use sim::labeled_scan::Met;
 use sim::layers::Layers;
 use sim::room::Room;

@@ -6,8 +6,8 @@ mod layers;
 mod tilted;
 mod truth;
 
-use lms::Nanos;
-use lms::variant::{Mode, Unit, Variant};
+use scanhub_drivers::lms::variant::{Mode, Unit, Variant};
+use schema::Nanos;
 use sim::labeled_scan::LabeledScan;
 use sim::room::Room;
 use sim::world::World;

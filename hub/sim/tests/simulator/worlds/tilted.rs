@@ -1,7 +1,6 @@
 //! What a tilted sensor measures, against the geometry of what stands there.
 
-use lms::Nanos;
-use schema::{Scan, ScanHead};
+use schema::{Nanos, Scan, ScanHead};
 use sim::labeled_scan::Met;
 use sim::layers::Layers;
 use sim::mount::Mount;

@@ -1,6 +1,6 @@
 //! The truth beside the words, against a world that lacks the thing or the person in question.
 
-use lms::Nanos;
+use schema::Nanos;
 use sim::labeled_scan::{LabeledScan, Met};
 use sim::layers::Layers;
 use sim::room::Room;

@@ -1,7 +1,6 @@
 //! A point as a head measured it and as a scan tells it, and whether both are the same.
 
-use lms::Nanos;
-use schema::{Code, Scan};
+use schema::{Code, Nanos, Scan};
 use sim::ld::TruePoint;
 
 use crate::event::Figures;

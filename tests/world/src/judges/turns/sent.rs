@@ -2,7 +2,7 @@
 
 use std::collections::hash_map::Entry;
 
-use lms::Nanos;
+use schema::Nanos;
 
 use super::{LONG_GAP, MOST, OfSensor, PROMPT};
 use crate::event::Telegram;

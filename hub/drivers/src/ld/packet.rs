@@ -1,0 +1,206 @@
+//! The one kind of packet that the scanners send: 47 bytes with 12 points, in both directions. Source: the manuals of LD06
+//! and LD19, "data packet format".
+
+use crate::line;
+use crate::line::grid::Point;
+
+/// Bytes of a packet.
+pub const LEN: usize = 47;
+/// Points of a packet.
+pub const POINTS: usize = 12;
+/// What every packet begins with: the start byte, and kind and number of points.
+pub const HEADER: [u8; 2] = [0x54, 0x2C];
+/// A turn in the packet's unit of angles, a hundredth of a degree.
+pub const TURN: u16 = 36_000;
+/// The milliseconds of a packet begin again after so many.
+pub const CLOCK_TURN: u16 = 30_000;
+/// The widest angle of a packet: a head that measures slower than it turns by so much is none.
+const WIDEST: u16 = 4_500;
+/// The greatest range; greater values are codes.
+pub const LONGEST: u16 = 0xFFEF;
+
+/// A packet whose checksum is right and whose angles are angles.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Packet<'a> {
+    bytes: &'a [u8; LEN],
+}
+
+/// Why bytes that begin like a packet are none.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Reject {
+    /// The checksum is wrong.
+    Checksum,
+    /// The angles are none, or too far apart.
+    Angle,
+}
+
+impl<'a> Packet<'a> {
+    /// The packet that `bytes` are.
+    ///
+    /// # Errors
+    ///
+    /// They are none, for this reason.
+    pub fn check(bytes: &'a [u8; LEN]) -> Result<Packet<'a>, Reject> {
+        let packet = Packet { bytes };
+        if bytes[..2] != HEADER || crc(&bytes[..LEN - 1]) != bytes[LEN - 1] {
+            return Err(Reject::Checksum);
+        }
+        let (start, end) = (packet.start(), packet.word(END));
+        if start > TURN || end > TURN || packet.span() > WIDEST { Err(Reject::Angle) } else { Ok(packet) }
+    }
+
+    /// Its bytes.
+    pub fn bytes(&self) -> &'a [u8; LEN] {
+        self.bytes
+    }
+
+    /// Speed of the head in degrees per second.
+    pub fn speed(&self) -> u16 {
+        self.word(2)
+    }
+
+    /// Angle of the first point in hundredths of a degree, clockwise.
+    pub fn start(&self) -> u16 {
+        self.word(4)
+    }
+
+    /// From the first point to the last one, in hundredths of a degree.
+    pub fn span(&self) -> u16 {
+        ((u32::from(self.word(END)) + u32::from(TURN) - u32::from(self.start())) % u32::from(TURN)) as u16
+    }
+
+    /// The scanner's clock in milliseconds, modulo [`CLOCK_TURN`].
+    pub fn millis(&self) -> u16 {
+        self.word(END + 2) % CLOCK_TURN
+    }
+
+    /// Angle of point `i` in hundredths of a degree, clockwise, from the first point's on: of those between the first and
+    /// the last the packet does not tell more than that they lie evenly.
+    pub fn angle(&self, i: usize) -> f32 {
+        f32::from(self.start()) + f32::from(self.span()) * i as f32 / (POINTS - 1) as f32
+    }
+
+    /// Range in millimetres and intensity of point `i`; a range of 0 is no return.
+    pub fn measured(&self, i: usize) -> (u16, u8) {
+        let at = FIRST_POINT + 3 * i;
+        (self.word(at), self.bytes[at + 2])
+    }
+
+    /// Point `i`, in radians counter-clockwise.
+    pub fn point(&self, i: usize) -> Point {
+        let (range, intensity) = self.measured(i);
+        // The highest values are codes.
+        let range = if (1..=LONGEST).contains(&range) { range } else { line::grid::NO_RETURN };
+        Point { angle: self.angle(i) * -RADIANS, range, intensity }
+    }
+
+    fn word(&self, at: usize) -> u16 {
+        u16::from_le_bytes([self.bytes[at], self.bytes[at + 1]])
+    }
+}
+
+/// What a packet is made of.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Contents {
+    /// Degrees per second.
+    pub speed: u16,
+    /// Angle of the first point in hundredths of a degree.
+    pub start: u16,
+    /// Range in millimetres and intensity of each point.
+    pub points: [(u16, u8); POINTS],
+    /// Angle of the last point in hundredths of a degree.
+    pub end: u16,
+    /// Milliseconds.
+    pub millis: u16,
+}
+
+impl Contents {
+    /// The bytes of the packet.
+    pub fn encode(&self) -> [u8; LEN] {
+        let mut bytes = [0; LEN];
+        bytes[..2].copy_from_slice(&HEADER);
+        bytes[2..4].copy_from_slice(&self.speed.to_le_bytes());
+        bytes[4..6].copy_from_slice(&self.start.to_le_bytes());
+        for (place, (range, intensity)) in bytes[FIRST_POINT..END].chunks_exact_mut(3).zip(self.points) {
+            place[..2].copy_from_slice(&range.to_le_bytes());
+            place[2] = intensity;
+        }
+        bytes[END..END + 2].copy_from_slice(&self.end.to_le_bytes());
+        bytes[END + 2..END + 4].copy_from_slice(&self.millis.to_le_bytes());
+        bytes[LEN - 1] = crc(&bytes[..LEN - 1]);
+        bytes
+    }
+}
+
+/// CRC-8 with the polynomial 4Dh, from 0, not reflected.
+pub fn crc(bytes: &[u8]) -> u8 {
+    bytes.iter().fold(0, |crc, byte| CRC[usize::from(crc ^ byte)])
+}
+
+const CRC: [u8; 256] = {
+    let mut table = [0; 256];
+    let mut i = 0;
+    while i < 256 {
+        let (mut crc, mut bit) = (i as u8, 0);
+        while bit < 8 {
+            crc = if crc & 0x80 != 0 { crc << 1 ^ 0x4D } else { crc << 1 };
+            bit += 1;
+        }
+        table[i] = crc;
+        i += 1;
+    }
+    table
+};
+
+const FIRST_POINT: usize = 6;
+const END: usize = FIRST_POINT + 3 * POINTS;
+/// Radians in a hundredth of a degree.
+const RADIANS: f32 = core::f32::consts::PI / 18_000.0;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// The packet that the manual of the LD06 explains.
+    const MANUAL: [u8; LEN] = [
+        0x54, 0x2C, 0x68, 0x08, 0xAB, 0x7E, 0xE0, 0x00, 0xE4, 0xDC, 0x00, 0xE2, 0xD9, 0x00, 0xE5, 0xD5, 0x00,
+        0xE3, 0xD3, 0x00, 0xE4, 0xD0, 0x00, 0xE9, 0xCD, 0x00, 0xE4, 0xCA, 0x00, 0xE2, 0xC7, 0x00, 0xE9, 0xC5,
+        0x00, 0xE5, 0xC2, 0x00, 0xE5, 0xC0, 0x00, 0xE5, 0xBE, 0x82, 0x3A, 0x1A, 0x50,
+    ];
+
+    #[test]
+    fn the_manuals_packet() {
+        let packet = Packet::check(&MANUAL).expect("intact");
+        assert_eq!((packet.speed(), packet.start(), packet.span()), (2_152, 32_427, 33_470 - 32_427));
+        assert_eq!((packet.measured(0), packet.measured(11)), ((224, 228), (192, 229)));
+        assert_eq!((packet.millis(), packet.bytes()[46]), (6_714, 0x50));
+        let last = packet.point(11);
+        assert!((last.angle.to_degrees() + 334.70).abs() < 1e-3, "{last:?}");
+        let points = core::array::from_fn(|i| packet.measured(i));
+        let contents = Contents { speed: 2_152, start: 32_427, points, end: 33_470, millis: 6_714 };
+        assert_eq!(contents.encode(), MANUAL);
+    }
+
+    #[test]
+    fn every_bit_counts() {
+        for bit in 0..LEN * 8 {
+            let mut bytes = MANUAL;
+            bytes[bit / 8] ^= 1 << (bit % 8);
+            assert_eq!(Packet::check(&bytes), Err(Reject::Checksum), "{bit}");
+        }
+    }
+
+    #[test]
+    fn angles_run_on_through_zero() {
+        let contents =
+            Contents { speed: 3_600, start: 35_560, points: [(1_000, 9); POINTS], end: 440, millis: 0 };
+        let bytes = contents.encode();
+        let packet = Packet::check(&bytes).expect("intact");
+        assert_eq!((packet.span(), packet.angle(0), packet.angle(11)), (880, 35_560.0, 36_440.0));
+        assert!((packet.angle(5) - 35_960.0).abs() < 0.01 && (packet.angle(6) - 36_040.0).abs() < 0.01);
+        for (start, end) in [(36_001, 100), (100, 36_001), (100, 90), (0, 4_501)] {
+            let bytes = Contents { start, end, ..contents }.encode();
+            assert_eq!(Packet::check(&bytes), Err(Reject::Angle), "{start} {end}");
+        }
+    }
+}

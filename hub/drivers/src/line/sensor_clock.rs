@@ -1,0 +1,238 @@
+//! The scanner's clock tied to the hub's. A packet can be late for many reasons and early for none: so the least delay of
+//! the last seconds is the truth about all packets of these seconds, also about those that waited while the host did not
+//! run. Both clocks drift against each other; by how much is learned. Knows no bytes.
+
+use schema::{MILLIS, Nanos};
+
+/// The least delays of the last seconds.
+#[derive(Clone, Debug)]
+pub struct SensorClock {
+    /// The least delay of each span, oldest first from `next` on.
+    least: [Option<Delay>; SensorClock::SPANS],
+    next: usize,
+    /// When the newest span began, and how long one is: drift is to be known soon, and later well.
+    since: Nanos,
+    span: Nanos,
+    /// Of all spans the one that says most.
+    best: Option<Delay>,
+    /// Nanoseconds by which the hub's clock gets ahead in each nanosecond of the scanner's.
+    drift: f64,
+    /// Times from the first one on may be off, beside those before, by the second one: until a span says more.
+    doubt: Option<(Nanos, Nanos)>,
+}
+
+/// From a time of the scanner's clock to the hub's.
+#[derive(Clone, Copy, Debug)]
+struct Delay {
+    at: Nanos,
+    offset: i64,
+}
+
+impl Delay {
+    /// What it says of the offset at `at`, where the clocks drift.
+    fn seen_from(self, at: Nanos, drift: f64) -> i64 {
+        self.offset + (drift * (at as i64 - self.at as i64) as f64) as i64
+    }
+}
+
+impl SensorClock {
+    const SPANS: usize = 16;
+
+    /// Nothing is known of it yet.
+    #[expect(clippy::new_without_default, reason = "a clock of which nothing is known is no default")]
+    pub fn new() -> Self {
+        SensorClock {
+            least: [None; Self::SPANS],
+            next: 0,
+            since: 0,
+            span: FIRST_SPAN,
+            best: None,
+            drift: 0.0,
+            doubt: None,
+        }
+    }
+
+    /// From `at` of the scanner's clock on, its times may be off by `most` beside those before: what took the time between them
+    /// was counted, not measured. Delays from before count until those of a span since are known as well.
+    pub fn doubt(&mut self, at: Nanos, most: Nanos) {
+        if self.best.is_some() {
+            self.doubt = Some((at, most));
+            self.begin_span(at);
+        }
+    }
+
+    /// What happened at `at` of the scanner's clock was known at `latest` of the hub's.
+    pub fn note(&mut self, at: Nanos, latest: Nanos) {
+        let delay = Delay { at, offset: latest as i64 - at as i64 };
+        if self.best.is_none() || at.saturating_sub(self.since) >= self.span {
+            if self.span < SPAN && self.known().count() == Self::SPANS {
+                self.join_pairs();
+            }
+            self.settle(at);
+            self.begin_span(at);
+            self.learn_drift();
+            let drift = self.drift;
+            self.best = self.known().min_by_key(|known| known.seen_from(at, drift));
+        }
+        let drift = self.drift;
+        let is_less =
+            |known: Option<Delay>| known.is_none_or(|known| delay.offset < known.seen_from(at, drift));
+        if is_less(self.least[self.next]) {
+            self.least[self.next] = Some(delay);
+        }
+        if is_less(self.best) {
+            self.best = Some(delay);
+        }
+    }
+
+    /// The hub's time at which it was `at` by the scanner's clock; nothing before anything was noted.
+    pub fn time(&self, at: Nanos) -> Option<Nanos> {
+        let best = self.best?;
+        Some(at.saturating_add_signed(best.seen_from(at, self.drift)))
+    }
+
+    fn begin_span(&mut self, at: Nanos) {
+        self.next = (self.next + 1) % Self::SPANS;
+        self.least[self.next] = None;
+        self.since = at;
+    }
+
+    /// A span is over, at `at`. Where it says as much as those before a doubt did, these were of other times.
+    fn settle(&mut self, at: Nanos) {
+        let Some((from, most)) = self.doubt else { return };
+        let seen = |known: Delay| known.seen_from(at, self.drift);
+        let before = self.known().filter(|known| known.at < from).map(seen).min();
+        let since = self.known().filter(|known| known.at >= from).map(seen).min();
+        let is_known = match (before, since) {
+            (Some(before), Some(since)) => since - before <= most as i64,
+            (before, _) => before.is_none(),
+        };
+        if is_known {
+            self.least.iter_mut().for_each(|place| *place = place.filter(|known| known.at >= from));
+            self.doubt = None;
+        }
+    }
+
+    /// Two spans become one, twice as long.
+    fn join_pairs(&mut self) {
+        let mut joined = [None; Self::SPANS];
+        for (n, delay) in self.known().enumerate() {
+            let place: &mut Option<Delay> = &mut joined[n / 2];
+            let drift = self.drift;
+            if place.is_none_or(|known| delay.offset < known.seen_from(delay.at, drift)) {
+                *place = Some(delay);
+            }
+        }
+        (self.least, self.next) = (joined, Self::SPANS / 2 - 1);
+        self.span *= 2;
+    }
+
+    fn known(&self) -> impl Iterator<Item = Delay> {
+        let (newer, older) = self.least.split_at(self.next + 1);
+        older.iter().chain(newer).copied().flatten()
+    }
+
+    /// The median of what pairs of an older and a newer span say, of those in which the host ran.
+    fn learn_drift(&mut self) {
+        if self.doubt.is_some() {
+            return;
+        }
+        let Some(least) = self.known().min_by_key(|known| known.offset) else { return };
+        let ran = |known: &Delay| {
+            let most = MOST_DRIFT * known.at.abs_diff(least.at) as f64;
+            ((known.offset - least.offset) as f64) < most + JITTER
+        };
+        let count = self.known().filter(ran).count();
+        if count < ENOUGH {
+            return;
+        }
+        let mut slopes = [0.0; (Self::SPANS / 2) * Self::SPANS.div_ceil(2)];
+        let mut len = 0;
+        for older in self.known().filter(ran).take(count / 2) {
+            for newer in self.known().filter(ran).skip(count / 2) {
+                let span = newer.at.saturating_sub(older.at).max(1);
+                slopes[len] = (newer.offset - older.offset) as f64 / span as f64;
+                len += 1;
+            }
+        }
+        let slopes = &mut slopes[..len];
+        slopes.sort_unstable_by(f64::total_cmp);
+        self.drift = slopes[len / 2].clamp(-MOST_DRIFT, MOST_DRIFT);
+    }
+}
+
+/// Spans get as long as this, and begin shorter.
+const SPAN: Nanos = 500 * MILLIS;
+const FIRST_SPAN: Nanos = SPAN / 8;
+/// Spans that tell a drift.
+const ENOUGH: usize = 6;
+/// No oscillator is off by more, not even one without a crystal.
+const MOST_DRIFT: f64 = 0.02;
+/// What a host that runs is late by, in nanoseconds.
+const JITTER: f64 = 4e6;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// The worst error in microseconds from `from` seconds on, for a scanner whose clock runs `drift` slow, a packet each
+    /// 2 ms with a delay of at least 100 us, and a host that stops for `stall` seconds each `every` seconds.
+    fn worst_us(drift: f64, stall: f64, every: f64, from: f64) -> f64 {
+        let mut clock = SensorClock::new();
+        let mut random = fastrand::Rng::with_seed(7);
+        let mut worst = 0.0f64;
+        for n in 0..10_000u64 {
+            let hub_s = n as f64 * 0.002;
+            let sensor_s = hub_s * (1.0 - drift);
+            let late_s = 0.000_1 + random.f64() * 0.003;
+            let phase = hub_s % every;
+            let stopped = if hub_s > 1.0 && phase < stall { stall - phase } else { 0.0 };
+            let nanos = |s: f64| ((s + 1_000.0) * 1e9) as Nanos;
+            clock.note(nanos(sensor_s), nanos(hub_s + late_s.max(stopped)));
+            let told = clock.time(nanos(sensor_s)).expect("tied");
+            if hub_s > from {
+                worst = worst.max((told as f64 - nanos(hub_s) as f64).abs() / 1e3);
+            }
+        }
+        worst
+    }
+
+    #[test]
+    fn late_packets_do_not_move_it() {
+        assert!(worst_us(0.0, 0.0, 1.0, 0.5) < 500.0);
+        assert!(worst_us(0.0, 0.5, 3.0, 0.5) < 500.0);
+        assert!(worst_us(0.0, 0.9, 5.0, 0.5) < 500.0);
+    }
+
+    #[test]
+    fn what_was_counted_wrong_is_known_soon_and_is_no_drift() {
+        let mut clock = SensorClock::new();
+        let (mut counted, mut wrong) = (0, 0);
+        for n in 0..40_000u64 {
+            let hub = 1_000_000_000_000 + n * MILLIS;
+            // Half a second of each two nothing arrives in time, then something is missing that was counted one too few.
+            let phase = n % 2_000;
+            if n > 4_000 && phase == 1_250 {
+                counted += MILLIS;
+                clock.doubt(hub - counted, 3 * MILLIS);
+            }
+            let waits = if n > 4_000 && (1_000..1_500).contains(&phase) { 1_500 - phase } else { 0 };
+            clock.note(hub - counted, hub + waits * MILLIS);
+            let off = clock.time(hub - counted).expect("tied").abs_diff(hub);
+            assert!(off <= 1_100_000, "{n}: {off}");
+            wrong += u64::from(off > 100_000);
+        }
+        assert!(wrong < 18 * 800, "{wrong} of 40,000");
+    }
+
+    #[test]
+    fn clocks_that_drift_are_followed() {
+        for drift in [-0.01, -0.000_5, 0.000_5, 0.01] {
+            let worst = worst_us(drift, 0.0, 1.0, 4.0);
+            assert!(worst < 1_000.0, "{drift}: {worst}");
+            let worst = worst_us(drift, 0.5, 5.0, 4.0);
+            assert!(worst < 1_500.0, "{drift}: {worst} with stalls");
+        }
+        assert!(worst_us(0.000_5, 0.5, 4.0, 0.5) < 2_500.0);
+    }
+}

@@ -1,0 +1,44 @@
+//! SICK LMS 2xx: the framer, telegrams in both directions, and the session with a scanner. The simulator is the second user of
+//! the protocol, so requests are decoded and replies are encoded here, too. There is no heap allocation.
+
+mod arrival;
+mod cadence;
+mod candidates;
+pub mod command;
+pub mod condition;
+pub mod configuration;
+pub mod crc;
+mod damage;
+mod dialogue;
+pub mod errors;
+pub mod exchange;
+pub mod explain;
+pub mod family;
+pub mod framer;
+pub mod header;
+mod identity;
+pub mod inquiry;
+pub mod measured;
+mod notice;
+pub mod operating;
+mod outgoing;
+pub mod parameters;
+mod pause;
+mod phase;
+pub mod reflectivity;
+pub mod reply;
+mod search;
+mod sensor;
+pub mod session;
+mod start;
+pub mod status_report;
+pub mod telegram;
+pub mod value;
+pub mod variant;
+
+pub use identity::Identity;
+pub use inquiry::Inquiry;
+pub use notice::Notice;
+pub use phase::{SILENCE, Settings};
+pub use sensor::{Sensor, Trouble};
+pub use session::Session;

@@ -1,0 +1,163 @@
+//! The first part of a sensor's configuration, which 74h reads and 77h writes: 34 bytes, 32 with older firmware
+//! (Telegram listing, 77h blocks A to P).
+
+use crate::lms::variant::{Mode, Unit};
+
+/// Data of a configuration, as the sensor keeps them.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Configuration<'a>(&'a [u8]);
+
+impl<'a> Configuration<'a> {
+    /// The configuration that `bytes` are; `None` if they are fewer than 32.
+    pub fn new(bytes: &'a [u8]) -> Option<Configuration<'a>> {
+        (bytes.len() >= OLD_LEN).then_some(Configuration(bytes))
+    }
+
+    /// The bytes as the sensor keeps them.
+    pub fn bytes(&self) -> &'a [u8] {
+        self.0
+    }
+
+    /// Objects nearer than so many centimetres are not seen.
+    pub fn blanking_cm(&self) -> u16 {
+        u16::from_le_bytes([self.0[0], self.0[1]])
+    }
+
+    /// Peak threshold of an LMS 200 or 211 and 221; of a 291 the sensitivity (0 to 3).
+    pub fn sensitivity(&self) -> u8 {
+        self.0[3]
+    }
+
+    /// Bit 0 availability level 3, bit 1 real-time indices, bit 2 availability level 2.
+    pub fn availability(&self) -> u8 {
+        self.0[4]
+    }
+
+    /// Whether telegrams of values end with two indices.
+    pub fn has_indices(&self) -> bool {
+        self.availability() & REAL_TIME_INDICES != 0
+    }
+
+    /// How values are split.
+    pub fn mode(&self) -> Mode {
+        Mode(self.0[5])
+    }
+
+    /// Unit of the ranges; `None` for an unknown code.
+    pub fn unit(&self) -> Option<Unit> {
+        Unit::of_code(self.0[6])
+    }
+}
+
+/// A factory-new configuration with this measuring mode and unit.
+pub fn factory(mode: Mode, unit: Unit) -> [u8; LEN] {
+    let mut bytes = [0; LEN];
+    bytes[2] = 0x70;
+    bytes[5] = mode.0;
+    bytes[6] = unit.code();
+    bytes[9] = 2;
+    bytes[10] = 2;
+    bytes[32] = 2;
+    bytes
+}
+
+/// One value of the configuration: where it is and what it is.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Item {
+    /// Its first byte.
+    pub at: usize,
+    /// Its bytes: one, or two for a word.
+    pub len: usize,
+    /// Its name.
+    pub name: &'static str,
+}
+
+/// All values in their order, without gaps.
+pub const ITEMS: [Item; 31] = {
+    const fn byte(at: usize, name: &'static str) -> Item {
+        Item { at, len: 1, name }
+    }
+    const fn word(at: usize, name: &'static str) -> Item {
+        Item { at, len: 2, name }
+    }
+    [
+        word(0, "blanking"),
+        byte(2, "stop threshold"),
+        byte(3, "peak threshold or sensitivity"),
+        byte(4, "availability"),
+        byte(5, "measuring mode"),
+        byte(6, "unit"),
+        byte(7, "temporary field"),
+        byte(8, "subtractive fields"),
+        byte(9, "multiple evaluation"),
+        byte(10, "restart"),
+        byte(11, "restart time"),
+        byte(12, "second multiple evaluation"),
+        byte(13, "contour A reference"),
+        byte(14, "contour A tolerance above"),
+        byte(15, "contour A tolerance below"),
+        byte(16, "contour A start"),
+        byte(17, "contour A stop"),
+        byte(18, "contour B reference"),
+        byte(19, "contour B tolerance above"),
+        byte(20, "contour B tolerance below"),
+        byte(21, "contour B start"),
+        byte(22, "contour B stop"),
+        byte(23, "contour C reference"),
+        byte(24, "contour C tolerance above"),
+        byte(25, "contour C tolerance below"),
+        byte(26, "contour C start"),
+        byte(27, "contour C stop"),
+        byte(28, "pixel oriented evaluation"),
+        byte(29, "single value evaluation"),
+        word(30, "restart times B and C"),
+        word(32, "multiple evaluation when dazzled"),
+    ]
+};
+
+/// What availability byte `byte` sets.
+pub fn availability_words(byte: u8) -> &'static str {
+    match byte & 7 {
+        0 => "level 1",
+        1 => "level 3",
+        2 => "level 1, real-time indices",
+        3 => "level 3, real-time indices",
+        4 => "level 2",
+        6 => "level 2, real-time indices",
+        5 => "levels 2 and 3",
+        _ => "levels 2 and 3, real-time indices",
+    }
+}
+
+/// Bytes of a configuration.
+pub const LEN: usize = 34;
+/// Bytes with older firmware.
+pub const OLD_LEN: usize = 32;
+/// Bit of the availability byte: telegrams of values carry indices.
+pub const REAL_TIME_INDICES: u8 = 2;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn items_leave_no_gap() {
+        let end = ITEMS.iter().fold(0, |at, item| {
+            assert_eq!(item.at, at, "{}", item.name);
+            at + item.len
+        });
+        assert_eq!(end, LEN);
+    }
+
+    #[test]
+    fn old_and_new_lengths() {
+        let mut bytes = factory(Mode(4), Unit::Mm);
+        bytes[4] = 3;
+        assert_eq!(Configuration::new(&bytes[..31]), None);
+        for len in [OLD_LEN, LEN] {
+            let configuration = Configuration::new(&bytes[..len]).unwrap();
+            assert_eq!((configuration.mode(), configuration.unit()), (Mode(4), Some(Unit::Mm)));
+            assert!(configuration.has_indices());
+        }
+    }
+}

@@ -1,0 +1,236 @@
+//! One request after the other, and what comes back: what [`crate::lms::inquiry`] and a change of the configuration have in common. Knows
+//! pace, tries and bytes; refuses to know what is asked, and why.
+
+use crate::lms::framer::{Advance, Framer, Tally, TelegramSpan};
+pub use crate::lms::outgoing::{MODE_TIMEOUT, Say};
+use crate::lms::outgoing::{NAK_PAUSE, Outgoing, SOON};
+pub use crate::lms::phase::{MORE_TRIES, TRIES};
+use crate::lms::reply::REFUSED;
+use crate::lms::telegram::{REPLY, Telegram};
+use crate::lms::variant::Baud;
+use schema::Nanos;
+
+/// What a conversation wants, in the order in which it wants it.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Output {
+    /// Set the port to this rate and forget what it had received, then go on draining.
+    SetBaud(Baud),
+    /// Write this byte, not before the time given, then say so by [`Conversation::transmitted`]. Do nothing else
+    /// meanwhile: the sensor drops a request whose bytes are more than 6 ms apart.
+    Transmit {
+        /// The byte.
+        byte: u8,
+        /// Earliest time to write it.
+        not_before: Nanos,
+    },
+    /// Read when the port has bytes; at the deadline, if a read finds none, call [`Conversation::handle_timeout`].
+    Wait {
+        /// The deadline.
+        until: Nanos,
+    },
+    /// It is over.
+    Done,
+}
+
+/// A conversation with a sensor that comes to an end, driven from outside as a [`crate::lms::Session`] is: bytes and times
+/// go in, and after every call that changes it [`Conversation::poll_output`] is drained until it wants to wait.
+pub trait Conversation {
+    /// Room for the next read; never empty once the outputs are drained.
+    fn spare(&mut self) -> &mut [u8];
+
+    /// A read returned at `now` and brought `len` bytes into [`Conversation::spare`].
+    fn commit(&mut self, now: Nanos, len: usize);
+
+    /// The deadline passed, and a read found nothing.
+    fn handle_timeout(&mut self, now: Nanos);
+
+    /// The byte of [`Output::Transmit`] was written at `now`.
+    fn transmitted(&mut self, now: Nanos);
+
+    /// What it wants next.
+    fn poll_output(&mut self) -> Output;
+}
+
+/// A line with at most one open request.
+#[derive(Clone, Debug)]
+pub struct Exchange<R> {
+    framer: Framer,
+    open: Option<Outgoing<R>>,
+    change_baud: bool,
+    /// The rate that the port is to have.
+    pub baud: Baud,
+    /// When it was last told something.
+    pub now: Nanos,
+    last_byte: Nanos,
+    /// The sensor's own address, once it has said it; 0 is for all.
+    pub address: u8,
+    /// Behind a server, whose first sign of a reply may be all of it.
+    pub behind_server: bool,
+}
+
+impl<R: Say> Exchange<R> {
+    /// On a port that is open at `baud`.
+    pub fn new(baud: Baud, now: Nanos) -> Self {
+        Exchange {
+            framer: Framer::default(),
+            open: None,
+            change_baud: false,
+            baud,
+            now,
+            last_byte: now,
+            address: 0,
+            behind_server: false,
+        }
+    }
+
+    /// As [`Conversation::spare`].
+    pub fn spare(&mut self) -> &mut [u8] {
+        self.framer.spare()
+    }
+
+    /// As [`Conversation::commit`].
+    pub fn commit(&mut self, now: Nanos, len: usize) {
+        self.now = now;
+        if len > 0 {
+            self.framer.commit(len);
+            self.last_byte = now;
+            let baud = self.baud;
+            self.open.iter_mut().for_each(|open| open.hear(baud));
+        }
+    }
+
+    /// A read found nothing; returns whether the open request has waited long enough.
+    pub fn handle_timeout(&mut self, now: Nanos) -> bool {
+        self.now = now;
+        self.framer.release(now.saturating_sub(self.last_byte));
+        self.open.as_ref().is_some_and(|open| now >= open.give_up_at())
+    }
+
+    /// As [`Conversation::transmitted`].
+    pub fn transmitted(&mut self, now: Nanos) {
+        self.now = now;
+        if let Some(open) = &mut self.open {
+            open.transmitted(now, self.baud);
+            if self.behind_server {
+                open.hear(self.baud);
+            }
+        }
+    }
+
+    /// Changes the rate, if it is another one.
+    pub fn set_baud(&mut self, baud: Baud) {
+        self.change_baud |= self.baud != baud;
+        self.baud = baud;
+    }
+
+    /// Says `request` from `not_before` on, at most `tries` times.
+    pub fn ask(&mut self, request: R, not_before: Nanos, tries: u8) {
+        self.open = Some(Outgoing::new(request, self.address, not_before, tries));
+    }
+
+    /// Says the open request once more from `at` on; `false` if its tries are used up or there is none.
+    pub fn again(&mut self, at: Nanos) -> bool {
+        let more = self.open.as_mut().is_some_and(|open| open.again(at));
+        if !more {
+            self.open = None;
+        }
+        more
+    }
+
+    /// A NAK came that is to be believed; returns whether there was a request, and whether it will be said again.
+    pub fn refused_checksum(&mut self) -> Option<bool> {
+        self.open.as_ref().is_some_and(Outgoing::is_out).then(|| self.again(self.now + NAK_PAUSE))
+    }
+
+    /// Takes the open request if `telegram` answers it, or refuses it.
+    pub fn answered(&mut self, command: u8) -> Option<R> {
+        let answers = |open: &mut Outgoing<R>| {
+            open.is_out() && (command == REFUSED || command == open.request.command() | REPLY)
+        };
+        self.open.take_if(answers).map(|open| open.request)
+    }
+
+    /// The next thing found in the bytes; an acknowledgement is taken note of.
+    pub fn advance(&mut self) -> Option<Heard> {
+        // Another rate is about to be set: what came at the old one is not looked at.
+        while !self.change_baud {
+            match self.framer.advance()? {
+                Advance::Telegram(span) => return Some(Heard::Telegram(span)),
+                Advance::Nak => return Some(Heard::Nak),
+                Advance::Ack => {
+                    if let Some(open) = self.open.as_mut().filter(|open| open.is_out()) {
+                        open.acknowledged(self.now, self.baud);
+                    }
+                }
+            }
+        }
+        None
+    }
+
+    /// The telegram that was found last.
+    pub fn view(&self, span: TelegramSpan) -> Telegram<'_> {
+        self.framer.view(span).telegram
+    }
+
+    /// What it wants, with a deadline of its user's own.
+    pub fn output(&mut self, own: Nanos) -> Output {
+        if core::mem::take(&mut self.change_baud) {
+            self.framer.clear();
+            return Output::SetBaud(self.baud);
+        }
+        self.framer.await_acknowledge(self.open.is_some());
+        let mut until = own;
+        if let Some(open) = &self.open {
+            match open.byte() {
+                Some((byte, not_before)) if not_before <= self.now + SOON => {
+                    return Output::Transmit { byte, not_before };
+                }
+                Some((_, not_before)) => until = until.min(not_before),
+                None => until = until.min(open.give_up_at()),
+            }
+        }
+        if let Some(hold) = self.framer.hold() {
+            until = until.min(self.last_byte + hold);
+        }
+        Output::Wait { until }
+    }
+
+    /// What became of the bytes, and how many are open.
+    pub fn tally(&self) -> (&Tally, usize) {
+        (self.framer.tally(), self.framer.buffered())
+    }
+}
+
+/// What came.
+#[derive(Clone, Copy, Debug)]
+pub enum Heard {
+    /// A telegram, to be seen by [`Exchange::view`].
+    Telegram(TelegramSpan),
+    /// A NAK.
+    Nak,
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::lms::command::Request;
+    use schema::{MILLIS, line_time};
+
+    #[test]
+    fn a_server_that_packs_the_longest_reply_is_waited_for() {
+        let until = |behind_server: bool| {
+            let mut exchange = Exchange::new(Baud::B9600, 0);
+            exchange.behind_server = behind_server;
+            exchange.ask(Request::Status, 0, 1);
+            loop {
+                match exchange.output(Nanos::MAX) {
+                    Output::Transmit { not_before, .. } => exchange.transmitted(not_before),
+                    Output::Wait { until } => return until - exchange.now,
+                    output => panic!("{output:?}"),
+                }
+            }
+        };
+        assert_eq!(until(false), 150 * MILLIS);
+        assert_eq!(until(true), 150 * MILLIS + line_time(161, 9600));
+    }
+}

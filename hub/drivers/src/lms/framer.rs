@@ -1,0 +1,391 @@
+//! Finds telegrams in a stream of bytes of which some are missing, without ever throwing away an intact one.
+//!
+//! A parser that collects a damaged telegram to its announced length swallows the head of the next one. So nothing
+//! is thrown away here before it was looked at: every position with an acceptable header is a *candidate*, and the
+//! first candidate to complete with a right checksum is the telegram. Because that checksum is weak, such a frame is
+//! *held* while another header begins inside it, or might begin with its last bytes: if that one succeeds, the frame
+//! was wrong. A gap in time may release a held frame; it never drops a byte.
+//!
+//! Knows no clock and no meaning beyond the header; accounts for every byte: in [`Tally`] always
+//! `read == in_telegrams + acknowledge + discarded + buffered`.
+
+use crate::line::suspect;
+use crate::lms::candidates::{Candidate, Candidates};
+use crate::lms::header::{Expect, Judgement, MAX_HEADER, Reject, State, judge};
+use crate::lms::measured::MEASURED;
+use crate::lms::telegram::{ACK, MAX_TELEGRAM, NAK, STX, Telegram};
+use schema::{MILLIS, Nanos};
+
+/// What became of the bytes; every field only grows.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Tally {
+    /// Bytes committed.
+    pub read: u64,
+    /// Bytes in delivered telegrams.
+    pub in_telegrams: u64,
+    /// ACK and NAK outside telegrams, while a reply was awaited.
+    pub acknowledge: u64,
+    /// Bytes that were in nothing.
+    pub discarded: u64,
+    /// Of these the bytes of measured-value telegrams that broke off for a reply.
+    pub broken_off: u64,
+    /// Delivered telegrams.
+    pub telegrams: u64,
+    /// Measured-value telegrams that broke off for a reply.
+    pub aborted: u64,
+    /// Delivered telegrams that had to wait for a header inside them to fail.
+    pub held: u64,
+    /// Refused start bytes among the discarded, by [`Reject`].
+    pub rejected: [u64; Reject::COUNT],
+}
+
+/// A telegram as it was found.
+#[derive(Clone, Copy, Debug)]
+pub struct Framed<'a> {
+    /// The telegram; it lies in the framer's buffer.
+    pub telegram: Telegram<'a>,
+    /// Number of its first byte among all bytes committed, from 0.
+    pub offset: u64,
+    /// Bits of [`suspect`]; 0 is clean.
+    pub reasons: u8,
+}
+
+/// The bytes of a telegram that has begun, as far as they are there: nothing of them is checked but the header.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Begun<'a> {
+    /// From its start byte on.
+    pub(crate) bytes: &'a [u8],
+    /// Number of its first byte among all bytes committed, from 0.
+    pub(crate) offset: u64,
+    /// Bits of [`suspect`] that are known already.
+    pub(crate) reasons: u8,
+}
+
+/// What was found next.
+#[derive(Clone, Copy, Debug)]
+pub enum Found<'a> {
+    /// A telegram.
+    Telegram(Framed<'a>),
+    /// A single ACK.
+    Ack,
+    /// A single NAK.
+    Nak,
+}
+
+/// [`Found`] without the bytes.
+#[derive(Clone, Copy, Debug)]
+pub(crate) enum Advance {
+    Telegram(TelegramSpan),
+    Ack,
+    Nak,
+}
+
+/// Where in the buffer a telegram lies, until the next bytes come.
+#[derive(Clone, Copy, Debug)]
+pub struct TelegramSpan {
+    at: usize,
+    end: usize,
+    pub(crate) offset: u64,
+    reasons: u8,
+}
+
+/// The framer with its buffer of twice the longest telegram.
+#[derive(Clone, Debug)]
+pub struct Framer {
+    buffer: [u8; CAPACITY],
+    /// `buffer[start..end]` are the bytes whose fate is open.
+    start: usize,
+    end: usize,
+    /// Every position before it was judged.
+    cursor: usize,
+    /// Positions with an acceptable header whose checksum was not looked at, ascending.
+    live: Candidates,
+    /// A frame with a right checksum that waits for a header inside it.
+    held: Option<Held>,
+    expect: Expect,
+    awaits_acknowledge: bool,
+    /// Bytes were discarded since the last telegram.
+    damage: bool,
+    tally: Tally,
+}
+
+#[derive(Clone, Copy, Debug)]
+struct Held {
+    at: usize,
+    end: usize,
+    header_inside: bool,
+}
+
+impl Default for Framer {
+    fn default() -> Self {
+        Framer {
+            buffer: [0; CAPACITY],
+            start: 0,
+            end: 0,
+            cursor: 0,
+            live: Candidates::new(),
+            held: None,
+            expect: Expect::Anything,
+            awaits_acknowledge: false,
+            damage: false,
+            tally: Tally::default(),
+        }
+    }
+}
+
+impl Framer {
+    /// Room for the next bytes, never empty after [`Framer::poll`] answered `None`: write into its beginning, then
+    /// [`Framer::commit`].
+    pub fn spare(&mut self) -> &mut [u8] {
+        if self.start == self.end {
+            self.shift(self.start);
+        } else if CAPACITY - self.end < MAX_TELEGRAM {
+            self.buffer.copy_within(self.start..self.end, 0);
+            self.shift(self.start);
+        }
+        &mut self.buffer[self.end..]
+    }
+
+    /// The first `len` bytes of [`Framer::spare`] are valid now.
+    pub fn commit(&mut self, len: usize) {
+        self.end += len;
+        assert!(self.end <= CAPACITY, "more bytes committed than there was room");
+        self.tally.read += len as u64;
+    }
+
+    /// What may come from now on. Bytes that were judged stay judged.
+    pub fn expect(&mut self, expect: Expect) {
+        self.expect = expect;
+    }
+
+    /// Whether single ACK and NAK bytes may come.
+    pub fn await_acknowledge(&mut self, awaits: bool) {
+        self.awaits_acknowledge = awaits;
+    }
+
+    /// The next telegram or acknowledgement in the bytes committed so far, or `None` until more come.
+    pub fn poll(&mut self) -> Option<Found<'_>> {
+        Some(match self.advance()? {
+            Advance::Telegram(span) => Found::Telegram(self.view(span)),
+            Advance::Ack => Found::Ack,
+            Advance::Nak => Found::Nak,
+        })
+    }
+
+    /// The telegram at a span that [`Framer::advance`] answered last.
+    pub(crate) fn view(&self, span: TelegramSpan) -> Framed<'_> {
+        let TelegramSpan { at, end, offset, reasons } = span;
+        Framed { telegram: Telegram::checked(&self.buffer[at..end]), offset, reasons }
+    }
+
+    /// As [`Framer::poll`], for a caller who must look at other things between finding and reading.
+    pub(crate) fn advance(&mut self) -> Option<Advance> {
+        loop {
+            self.judge_headers();
+            if let Some(held) = self.held
+                && self.cursor >= held.end
+                && !self.live.any_before(held.end)
+            {
+                return Some(Advance::Telegram(self.deliver(held)));
+            }
+            if let Some(candidate) = self.live.first_complete(self.end) {
+                self.complete(candidate);
+                continue;
+            }
+            if let Some(held) = self.held {
+                self.give_up_before(held);
+                return None;
+            }
+            let decided = self.live.first().map_or(self.cursor, |candidate| usize::from(candidate.at));
+            if self.awaits_acknowledge
+                && let Some(at) = (self.start..decided).find(|&at| matches!(self.buffer[at], ACK | NAK))
+            {
+                self.discard(at, None);
+                self.start = at + 1;
+                self.tally.acknowledge += 1;
+                return Some(if self.buffer[at] == ACK { Advance::Ack } else { Advance::Nak });
+            }
+            self.discard(decided, None);
+            return None;
+        }
+    }
+
+    /// How long the line must be idle until [`Framer::release`] may deliver the held frame; `None` if none is held.
+    pub fn hold(&self) -> Option<Nanos> {
+        self.held.map(|held| if self.live.any_before(held.end) { VETO_HOLD } else { SUFFIX_HOLD })
+    }
+
+    /// A read found nothing, and no byte came for `idle`: gives up waiting for headers inside the held frame.
+    pub fn release(&mut self, idle: Nanos) {
+        if self.hold().is_some_and(|hold| idle >= hold) {
+            self.refute_headers_inside();
+            self.cursor = self.held.map_or(self.cursor, |held| self.cursor.max(held.end));
+        }
+    }
+
+    /// Gives up all bytes that are still open, for example because the line's rate changes.
+    pub fn clear(&mut self) {
+        self.live = Candidates::new();
+        self.held = None;
+        self.discard(self.end, None);
+        self.cursor = self.end;
+        self.damage = false;
+    }
+
+    /// What the earliest open position waits for, after [`Framer::poll`] answered `None`.
+    pub fn state(&self) -> State {
+        match self.live.first() {
+            Some(candidate) if self.end + 2 < usize::from(candidate.end) => State::Body,
+            Some(_) => State::Crc,
+            None => match judge(&self.buffer[self.cursor..self.end], &self.expect) {
+                Judgement::Prefix(state) => state,
+                Judgement::Candidate { .. } | Judgement::Refused(_) => State::Stx,
+            },
+        }
+    }
+
+    /// The earliest telegram that has begun and was not delivered, after [`Framer::poll`] answered `None`.
+    pub(crate) fn begun(&self) -> Option<Begun<'_>> {
+        let held = self.held.map(|held| (held.at, held.end));
+        let live = || self.live.first().map(|candidate| (candidate.at.into(), candidate.end.into()));
+        let (at, end): (usize, usize) = held.or_else(live)?;
+        let reasons = if self.damage || at > self.start { suspect::NEIGHBOUR } else { 0 };
+        let offset = self.tally.read - (self.end - at) as u64;
+        Some(Begun { bytes: &self.buffer[at..end.min(self.end)], offset, reasons })
+    }
+
+    /// What became of the bytes.
+    pub fn tally(&self) -> &Tally {
+        &self.tally
+    }
+
+    /// Bytes whose fate is open.
+    pub fn buffered(&self) -> usize {
+        self.end - self.start
+    }
+
+    fn judge_headers(&mut self) {
+        while let Some(found) = self.buffer[self.cursor..self.end].iter().position(|&byte| byte == STX) {
+            let at = self.cursor + found;
+            let header = &self.buffer[at..self.end.min(at + MAX_HEADER)];
+            match judge(header, &self.expect) {
+                Judgement::Prefix(_) => {
+                    self.cursor = at;
+                    return;
+                }
+                Judgement::Candidate { len } => self.live.push(at, at + len),
+                Judgement::Refused(_) => {}
+            }
+            self.cursor = at + 1;
+        }
+        self.cursor = self.end.max(self.cursor);
+    }
+
+    /// Looks at the checksum of the earliest complete candidate: a wrong one ends it, a right one ends those that
+    /// began before it and the held frame that it began in.
+    fn complete(&mut self, candidate: Candidate) {
+        let (at, end) = (usize::from(candidate.at), usize::from(candidate.end));
+        let right = Telegram::check(&self.buffer[at..end]).is_some();
+        match &mut self.held {
+            // What began inside the held frame reaches into this telegram, so it is none.
+            Some(held) if right && held.end <= at => return self.refute_headers_inside(),
+            Some(held) => held.header_inside |= at < held.end,
+            None => {}
+        }
+        self.live.remove(candidate);
+        if right {
+            self.live.drop_before(at);
+            self.held = Some(Held { at, end, header_inside: self.live.any_before(end) });
+        }
+    }
+
+    fn refute_headers_inside(&mut self) {
+        if let Some(held) = &mut self.held {
+            held.header_inside |= self.live.any_before(held.end);
+            self.live.drop_before(held.end);
+        }
+    }
+
+    fn deliver(&mut self, held: Held) -> TelegramSpan {
+        let Held { at, end, header_inside } = held;
+        self.give_up_before(held);
+        self.held = None;
+        self.start = end;
+        self.live.drop_before(end);
+        self.tally.in_telegrams += (end - at) as u64;
+        self.tally.telegrams += 1;
+        self.tally.held += u64::from(header_inside);
+        let damage = core::mem::take(&mut self.damage) && self.tally.telegrams > 1;
+        let reasons = if damage { suspect::NEIGHBOUR } else { 0 }
+            | if header_inside { suspect::HEADER_INSIDE } else { 0 };
+        let offset = self.tally.read - (self.end - at) as u64;
+        TelegramSpan { at, end, offset, reasons }
+    }
+
+    /// Whatever becomes of `held`, what came before it is in nothing.
+    fn give_up_before(&mut self, held: Held) {
+        self.discard(held.at, Some((self.buffer[held.at + 4], held.end)));
+    }
+
+    /// Gives up the bytes before `to`; `winner` is the command of the telegram that begins there, and its end.
+    fn discard(&mut self, to: usize, winner: Option<(u8, usize)>) {
+        let reply = winner.is_some_and(|(command, _)| command != MEASURED);
+        let decided = winner.map_or(self.end, |(_, end)| end);
+        let mut until = to;
+        if reply && self.awaits_acknowledge && until > self.start && self.buffer[until - 1] == ACK {
+            until -= 1;
+            self.tally.acknowledge += 1;
+        }
+        let mut broken_off = 0;
+        for at in self.start..until {
+            if self.buffer[at] == STX && self.count_refusal(at, reply, decided) {
+                broken_off = broken_off.max(until - at);
+            }
+        }
+        self.tally.broken_off += broken_off as u64;
+        self.damage |= until > self.start && !reply;
+        self.tally.discarded += (until - self.start) as u64;
+        self.start = to;
+    }
+
+    /// Counts why the start byte at `at` was none, as it stood when the bytes before `decided` were there. Whether a scan
+    /// began there that broke off.
+    fn count_refusal(&mut self, at: usize, winner_is_reply: bool, decided: usize) -> bool {
+        let reject = match judge(&self.buffer[at..self.end.min(at + MAX_HEADER)], &self.expect) {
+            Judgement::Refused(reject) => reject,
+            Judgement::Prefix(_) => Reject::Superseded,
+            Judgement::Candidate { len } if at + len > decided => {
+                if winner_is_reply && self.buffer[at + 4] == MEASURED {
+                    self.tally.aborted += 1;
+                    return true;
+                }
+                Reject::Superseded
+            }
+            Judgement::Candidate { len } => match Telegram::check(&self.buffer[at..at + len]) {
+                Some(_) => Reject::Vetoed,
+                None => Reject::Crc,
+            },
+        };
+        self.tally.rejected[reject as usize] += 1;
+        false
+    }
+
+    /// The bytes before `by` are gone from the buffer.
+    fn shift(&mut self, by: usize) {
+        self.start -= by;
+        self.end -= by;
+        self.cursor -= by;
+        self.live.shift(by);
+        if let Some(held) = &mut self.held {
+            held.at -= by;
+            held.end -= by;
+        }
+    }
+}
+
+/// A held frame and a header that begins with its last byte must fit.
+pub(crate) const CAPACITY: usize = 2 * MAX_TELEGRAM;
+/// The longest pause inside a telegram (Telegram listing 4.3): a header inside a held frame is given up after it.
+pub const VETO_HOLD: Nanos = 14 * MILLIS;
+/// A frame whose last bytes might begin a header is delivered when nothing followed for so long.
+pub const SUFFIX_HOLD: Nanos = 2 * MILLIS;

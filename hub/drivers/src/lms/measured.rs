@@ -1,0 +1,213 @@
+//! Measured values as B0h, B6h, B7h and BFh carry them: a count word, one word a beam, and the two real-time indices
+//! where the sensor is set to send them. What the words mean in millimetres depends on the measuring mode, which no
+//! telegram of values carries.
+
+use crate::lms::telegram::{Encoded, REPLY, Telegram, Writer};
+use crate::lms::variant::{MAX_BEAMS, Unit};
+
+/// Command byte of a measured-value telegram.
+pub const MEASURED: u8 = 0xB0;
+
+/// View of measured values, from the count word on.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Measured<'a> {
+    count_word: u16,
+    values: &'a [u8],
+    indices: Option<(u8, u8)>,
+}
+
+impl<'a> Measured<'a> {
+    /// The view, if `telegram` is one: command B0h, a known unit, as many words as it says, nothing else but the two
+    /// real-time indices.
+    pub fn decode(telegram: Telegram<'a>) -> Option<Self> {
+        if telegram.command() != MEASURED || !telegram.is_reply() {
+            return None;
+        }
+        Measured::read(telegram.data())
+    }
+
+    /// The values that `data` are, from the count word on.
+    pub(crate) fn read(data: &'a [u8]) -> Option<Self> {
+        let [low, high, rest @ ..] = data else { return None };
+        let count_word = u16::from_le_bytes([*low, *high]);
+        Unit::of_code((count_word >> 14) as u8)?;
+        let count = usize::from(count_word & COUNT);
+        if count == 0 || count > MAX_BEAMS {
+            return None;
+        }
+        let (values, after) = rest.split_at_checked(2 * count)?;
+        let indices = match *after {
+            [] => None,
+            [scan, telegram] => Some((scan, telegram)),
+            _ => return None,
+        };
+        Some(Measured { count_word, values, indices })
+    }
+
+    /// Appends them to a reply; `None` if they do not fit into it.
+    pub(crate) fn write(&self, writer: Writer) -> Option<Writer> {
+        let writer = writer.word(self.count_word).reply_slice(self.values)?;
+        match self.indices {
+            Some((scan, telegram)) => writer.reply_slice(&[scan, telegram]),
+            None => Some(writer),
+        }
+    }
+
+    /// Number of beams: 1 to 401.
+    pub fn count(&self) -> usize {
+        self.values.len() / 2
+    }
+
+    /// Unit of the ranges.
+    pub fn unit(&self) -> Unit {
+        // decode() refused code 3.
+        Unit::of_code((self.count_word >> 14) as u8).unwrap_or(Unit::Mm)
+    }
+
+    /// Of a partial scan, its start in quarters of a degree (0 to 3); `None` for a whole scan.
+    pub fn partial(&self) -> Option<u8> {
+        (self.count_word & PARTIAL != 0).then_some((self.count_word >> 11) as u8 & 3)
+    }
+
+    /// Scan index and telegram index, both modulo 256, where the sensor is set to send them.
+    pub fn indices(&self) -> Option<(u8, u8)> {
+        self.indices
+    }
+
+    /// The values as sent: range in the low bits, reflector level or field bits above (see [`crate::lms::variant::Mode`]).
+    pub fn words(&self) -> impl ExactSizeIterator<Item = u16> + use<'a> {
+        words(self.values)
+    }
+}
+
+fn words(values: &[u8]) -> impl ExactSizeIterator<Item = u16> + use<'_> {
+    values.chunks_exact(2).map(|pair| u16::from_le_bytes([pair[0], pair[1]]))
+}
+
+/// The first values of a measured-value telegram that is not complete.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct FirstValues<'a> {
+    count: usize,
+    unit: Unit,
+    values: &'a [u8],
+}
+
+impl<'a> FirstValues<'a> {
+    /// Those of the telegram that begins with `bytes`, if its header is that of a whole scan.
+    pub(crate) fn of(bytes: &'a [u8]) -> Option<Self> {
+        let [_, _, _, _, MEASURED, low, high, rest @ ..] = bytes else { return None };
+        let count_word = u16::from_le_bytes([*low, *high]);
+        let count = usize::from(count_word & COUNT);
+        let unit = Unit::of_code((count_word >> 14) as u8)?;
+        let is_whole = count_word & PARTIAL == 0 && (1..=MAX_BEAMS).contains(&count);
+        let (values, _) = rest.split_at(rest.len().min(2 * count) & !1);
+        is_whole.then_some(FirstValues { count, unit, values })
+    }
+
+    /// Number of beams of the whole scan: 1 to 401.
+    pub fn count(&self) -> usize {
+        self.count
+    }
+
+    /// Unit of the ranges.
+    pub fn unit(&self) -> Unit {
+        self.unit
+    }
+
+    /// The values so far, as sent; see [`Measured::words`].
+    pub fn words(&self) -> impl ExactSizeIterator<Item = u16> + use<'a> {
+        words(self.values)
+    }
+}
+
+/// A measured-value telegram of a whole scan from the sensor at `address` (0 to 127): at most 401 `words` as they
+/// are, then `status`.
+pub fn encode(address: u8, unit: Unit, words: &[u16], status: u8) -> Encoded {
+    encode_with(address, Frame { unit, partial: None, indices: None }, words, status)
+}
+
+/// What a measured-value telegram says beside its values.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Frame {
+    /// Unit of the ranges.
+    pub unit: Unit,
+    /// Of a partial scan, its start in quarters of a degree (0 to 3).
+    pub partial: Option<u8>,
+    /// Scan index and telegram index.
+    pub indices: Option<(u8, u8)>,
+}
+
+/// As [`encode`], also for partial scans and with real-time indices.
+pub fn encode_with(address: u8, frame: Frame, words: &[u16], status: u8) -> Encoded {
+    let partial = frame.partial.map_or(0, |quarter| PARTIAL | u16::from(quarter & 3) << 11);
+    let count_word = words.len() as u16 | partial | u16::from(frame.unit.code()) << 14;
+    let mut writer = Writer::new(address | REPLY, MEASURED).word(count_word);
+    for &word in words {
+        writer = writer.word(word);
+    }
+    if let Some((scan, telegram)) = frame.indices {
+        writer = writer.byte(scan).byte(telegram);
+    }
+    writer.byte(status).finish()
+}
+
+/// Bits of the count word that are the count.
+pub(crate) const COUNT: u16 = 0x03FF;
+/// Bit of the count word that marks a partial scan.
+pub(crate) const PARTIAL: u16 = 1 << 13;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_synthetic_scan_of_the_reference() {
+        let words: [u16; 361] = core::array::from_fn(|i| 1000 + i as u16);
+        let encoded = encode(0, Unit::Mm, &words, 0x10);
+        assert_eq!(encoded.bytes().len(), 732);
+        assert_eq!(encoded.bytes()[..9], [0x02, 0x80, 0xD6, 0x02, 0xB0, 0x69, 0x41, 0xE8, 0x03]);
+        assert_eq!(encoded.bytes()[727..], [0x50, 0x05, 0x10, 0x86, 0x0C]);
+        let measured = Measured::decode(encoded.telegram()).unwrap();
+        assert_eq!((measured.count(), measured.unit(), measured.partial()), (361, Unit::Mm, None));
+        assert!(measured.words().eq(words));
+    }
+
+    #[test]
+    fn partial_scans_with_indices_both_ways() {
+        let words: [u16; 180] = core::array::from_fn(|i| i as u16);
+        let frame = Frame { unit: Unit::Cm, partial: Some(2), indices: Some((255, 7)) };
+        let encoded = encode_with(1, frame, &words, 0x11);
+        assert_eq!((encoded.bytes().len(), encoded.telegram().length()), (372, 0x016C + 2));
+        assert_eq!(encoded.telegram().data()[..2], [180, 0b0011_0000]);
+        let measured = Measured::decode(encoded.telegram()).unwrap();
+        assert_eq!(
+            (measured.unit(), measured.partial(), measured.indices()),
+            (Unit::Cm, Some(2), Some((255, 7)))
+        );
+        assert!(measured.words().eq(words));
+    }
+
+    #[test]
+    fn lengths_of_the_listing() {
+        for (beams, length) in [(181, 0x016E), (361, 0x02D6), (101, 0xCE), (201, 0x0196), (401, 0x0326)] {
+            let encoded = encode(0, Unit::Mm, &[0; MAX_BEAMS][..beams], 0x10);
+            assert_eq!(encoded.telegram().length(), length);
+            let frame = Frame { unit: Unit::Mm, partial: None, indices: Some((0, 0)) };
+            let with_indices = encode_with(0, frame, &[0; MAX_BEAMS][..beams], 0x10);
+            assert_eq!(with_indices.telegram().length(), length + 2);
+        }
+    }
+
+    #[test]
+    fn a_count_that_lies_is_refused() {
+        for (word, values) in [(361, 360), (361, 363), (0, 0), (402, 402), (0xC001, 1)] {
+            let mut writer = Writer::new(0x80, MEASURED).word(word);
+            for _ in 0..values {
+                writer = writer.word(0);
+            }
+            assert_eq!(Measured::decode(writer.byte(0x10).finish().telegram()), None, "{word} {values}");
+        }
+        let with_indices = Writer::new(0x80, MEASURED).word(1).word(7).byte(3).byte(4).byte(0x10).finish();
+        assert_eq!(Measured::decode(with_indices.telegram()).unwrap().indices(), Some((3, 4)));
+    }
+}

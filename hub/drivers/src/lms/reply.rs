@@ -1,0 +1,292 @@
+//! Replies: what a sensor says to a host's requests, and unasked in a stream. Every reply ends with a status byte, which
+//! is [`crate::lms::condition::Condition`]'s affair, not this file's.
+
+use crate::lms::command as request;
+use crate::lms::configuration::factory;
+use crate::lms::errors::Errors;
+use crate::lms::measured::{MEASURED, Measured};
+use crate::lms::parameters::Span;
+use crate::lms::reflectivity::{RangeFields, Reflectivities, Reflectivity};
+use crate::lms::telegram::{Encoded, REPLY, Telegram, Writer};
+use crate::lms::variant::{Mode, Unit, Variant};
+
+pub use crate::lms::configuration::Configuration;
+pub use crate::lms::status_report::{Health, StatusReport, status};
+
+/// A reply.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Reply<'a> {
+    /// 90h: what a sensor says when it is up, after power-on or a reset: type, number and firmware.
+    PowerOn(&'a [u8]),
+    /// 91h: the reset begins; 90h follows within 60 s.
+    Reset,
+    /// 92h: a well-formed command that this sensor cannot do, or not now.
+    Refused,
+    /// A0h: the operating mode (or rate) was changed, or not.
+    Mode {
+        /// Whether it was.
+        done: bool,
+    },
+    /// B0h: a scan, asked for or streamed.
+    Measured(Measured<'a>),
+    /// B1h.
+    Status(StatusReport<'a>),
+    /// B2h: none, if everything is well.
+    Errors(Errors<'a>),
+    /// B5h.
+    Counters {
+        /// Hours of operation, in units of two.
+        hours_by_2: u16,
+        /// How often the power came on.
+        power_ons: u16,
+    },
+    /// B6h: mean values.
+    Means {
+        /// Of how many scans.
+        shots: u8,
+        /// The values.
+        values: Measured<'a>,
+    },
+    /// B7h: a sub-range.
+    Range {
+        /// Which.
+        span: Span,
+        /// The values.
+        values: Measured<'a>,
+    },
+    /// BAh: type, number and firmware as ASCII, such as `LMS200;S18063;V02.19`.
+    Type(&'a [u8]),
+    /// BBh: the variant now in force, and whether it is the one asked for.
+    Variant {
+        /// Whether the switch was done.
+        done: bool,
+        /// Angle in degrees and resolution in 1/100 degree as the sensor says them.
+        angle_deg: u16,
+        /// See `angle_deg`.
+        resolution_cdeg: u16,
+    },
+    /// BEh: a sub-range with field values.
+    RangeFields(RangeFields<'a>),
+    /// BFh: mean values of a sub-range.
+    RangeMeans {
+        /// Of how many scans.
+        shots: u8,
+        /// Which.
+        span: Span,
+        /// The values.
+        values: Measured<'a>,
+    },
+    /// C4h: ranges, and reflectivities of a sub-range; LMS S14.
+    Reflectivity(Reflectivity<'a>),
+    /// E6h: to the change of the rate after power-on.
+    PowerOnSet {
+        /// The result; [`StatusReport::has_permanent_baud`] has the present state.
+        outcome: u8,
+        /// The byte that was set.
+        set: u8,
+    },
+    /// F4h.
+    Configuration(Configuration<'a>),
+    /// F5h: ranges and reflectivities.
+    Reflectivities(Reflectivities<'a>),
+    /// F7h: to the change of the configuration.
+    ConfigurationWritten {
+        /// Whether it was changed.
+        done: bool,
+        /// What is in force now.
+        configuration: Configuration<'a>,
+    },
+    /// FBh: second part of the configuration, 84 bytes.
+    Configuration2(&'a [u8]),
+    /// FCh: to the change of the second part.
+    Configuration2Written {
+        /// Whether it was changed.
+        done: bool,
+        /// What is in force now.
+        parameters: &'a [u8],
+    },
+    /// C0h, C1h, C2h, C5h, C6h, CAh, E9h and F6h, whose layout is not known here: the data as they are.
+    Unread {
+        /// The command byte.
+        command: u8,
+        /// Without the status byte.
+        data: &'a [u8],
+    },
+}
+
+impl<'a> Reply<'a> {
+    /// What `telegram` says; `None` if it is no reply of this list or its data are not as its kind needs them.
+    pub fn decode(telegram: Telegram<'a>) -> Option<Reply<'a>> {
+        if !telegram.is_reply() || telegram.status().is_none() {
+            return None;
+        }
+        let data = telegram.data();
+        Some(match (telegram.command(), data) {
+            (POWER_ON, name) => Reply::PowerOn(name.trim_ascii()),
+            (RESET, []) => Reply::Reset,
+            (REFUSED, _) => Reply::Refused,
+            (MODE, &[outcome, ..]) => Reply::Mode { done: outcome == 0 },
+            (MEASURED, data) => Reply::Measured(Measured::read(data)?),
+            (STATUS, data) => Reply::Status(StatusReport::new(data)?),
+            (ERRORS, data) => Reply::Errors(Errors::new(data)?),
+            (COUNTERS, &[a, b, c, d]) => Reply::Counters {
+                hours_by_2: u16::from_le_bytes([a, b]),
+                power_ons: u16::from_le_bytes([c, d]),
+            },
+            (MEANS, &[shots, ref rest @ ..]) => Reply::Means { shots, values: Measured::read(rest)? },
+            (RANGE, data) => {
+                let (span, rest) = data.split_at_checked(Span::LEN)?;
+                Reply::Range { span: Span::read(span)?, values: Measured::read(rest)? }
+            }
+            (TYPE, name) => Reply::Type(name.trim_ascii()),
+            (VARIANT, &[done, a, b, c, d]) => Reply::Variant {
+                done: done == 1,
+                angle_deg: u16::from_le_bytes([a, b]),
+                resolution_cdeg: u16::from_le_bytes([c, d]),
+            },
+            (RANGE_FIELDS, data) => Reply::RangeFields(RangeFields::new(data)?),
+            (RANGE_MEANS, &[shots, ref rest @ ..]) => {
+                let (span, rest) = rest.split_at_checked(Span::LEN)?;
+                Reply::RangeMeans { shots, span: Span::read(span)?, values: Measured::read(rest)? }
+            }
+            (REFLECTIVITY, data) => Reply::Reflectivity(Reflectivity::new(data)?),
+            (POWER_ON_SET, &[outcome, set]) => Reply::PowerOnSet { outcome, set },
+            (CONFIGURATION, data) => Reply::Configuration(Configuration::new(data)?),
+            (REFLECTIVITIES, data) => Reply::Reflectivities(Reflectivities::new(data)?),
+            (CONFIGURATION_WRITTEN, &[outcome, ref rest @ ..]) => {
+                Reply::ConfigurationWritten { done: outcome == 1, configuration: Configuration::new(rest)? }
+            }
+            (CONFIGURATION_2, parameters) => Reply::Configuration2(parameters),
+            (CONFIGURATION_2_WRITTEN, &[outcome, ref parameters @ ..]) => {
+                Reply::Configuration2Written { done: outcome == 1, parameters }
+            }
+            (command, data) if UNREAD.contains(&command) => Reply::Unread { command, data },
+            _ => return None,
+        })
+    }
+
+    /// The telegram that says it, from the sensor at `address`, ending with `status`; `None` if it is longer than a
+    /// telegram may be. Names are filled up with spaces to the 21 characters that they have.
+    pub fn encode(&self, address: u8, status: u8) -> Option<Encoded> {
+        let writer = Writer::new(address | REPLY, self.command());
+        let writer = match *self {
+            Reply::PowerOn(name) | Reply::Type(name) => {
+                let spaces = &[b' '; NAME_LEN][..NAME_LEN.saturating_sub(name.len())];
+                writer.reply_slice(name)?.slice(spaces)
+            }
+            Reply::Reset | Reply::Refused => writer,
+            Reply::Mode { done } => writer.byte(u8::from(!done)),
+            Reply::Measured(values) => values.write(writer)?,
+            Reply::Status(report) => writer.slice(report.bytes()),
+            Reply::Errors(errors) => writer.reply_slice(errors.bytes())?,
+            Reply::Counters { hours_by_2, power_ons } => writer.word(hours_by_2).word(power_ons),
+            Reply::Means { shots, values } => values.write(writer.byte(shots))?,
+            Reply::Range { span, values } => values.write(span.write(writer))?,
+            Reply::Variant { done, angle_deg, resolution_cdeg } => {
+                writer.byte(u8::from(done)).word(angle_deg).word(resolution_cdeg)
+            }
+            Reply::RangeFields(fields) => fields.write(writer)?,
+            Reply::RangeMeans { shots, span, values } => values.write(span.write(writer.byte(shots)))?,
+            Reply::Reflectivity(view) => writer.reply_slice(view.bytes())?,
+            Reply::PowerOnSet { outcome, set } => writer.byte(outcome).byte(set),
+            Reply::Configuration(configuration) => writer.reply_slice(configuration.bytes())?,
+            Reply::Reflectivities(view) => writer.reply_slice(view.bytes())?,
+            Reply::ConfigurationWritten { done, configuration } => {
+                writer.byte(u8::from(done)).reply_slice(configuration.bytes())?
+            }
+            Reply::Configuration2(parameters) => writer.reply_slice(parameters)?,
+            Reply::Configuration2Written { done, parameters } => {
+                writer.byte(u8::from(done)).reply_slice(parameters)?
+            }
+            Reply::Unread { data, .. } => writer.reply_slice(data)?,
+        };
+        Some(writer.byte(status).finish())
+    }
+
+    /// The command byte.
+    pub fn command(&self) -> u8 {
+        match self {
+            Reply::PowerOn(_) => POWER_ON,
+            Reply::Reset => RESET,
+            Reply::Refused => REFUSED,
+            Reply::Mode { .. } => MODE,
+            Reply::Measured(_) => MEASURED,
+            Reply::Status(_) => STATUS,
+            Reply::Errors(_) => ERRORS,
+            Reply::Counters { .. } => COUNTERS,
+            Reply::Means { .. } => MEANS,
+            Reply::Range { .. } => RANGE,
+            Reply::Type(_) => TYPE,
+            Reply::Variant { .. } => VARIANT,
+            Reply::RangeFields(_) => RANGE_FIELDS,
+            Reply::RangeMeans { .. } => RANGE_MEANS,
+            Reply::Reflectivity(_) => REFLECTIVITY,
+            Reply::PowerOnSet { .. } => POWER_ON_SET,
+            Reply::Configuration(_) => CONFIGURATION,
+            Reply::Reflectivities(_) => REFLECTIVITIES,
+            Reply::ConfigurationWritten { .. } => CONFIGURATION_WRITTEN,
+            Reply::Configuration2(_) => CONFIGURATION_2,
+            Reply::Configuration2Written { .. } => CONFIGURATION_2_WRITTEN,
+            Reply::Unread { command, .. } => *command,
+        }
+    }
+}
+
+/// A0h: mode or rate changed (or not), from `address`, ending with `status`.
+pub fn mode(address: u8, done: bool, status: u8) -> Encoded {
+    Writer::new(address | REPLY, MODE).byte(u8::from(!done)).byte(status).finish()
+}
+
+/// 92h: refused, from `address`, ending with `status`.
+pub fn refused(address: u8, status: u8) -> Encoded {
+    Writer::new(address | REPLY, REFUSED).byte(status).finish()
+}
+
+/// BAh: `name` is type, number and firmware, 20 or 21 ASCII characters by custom.
+pub fn kind(address: u8, name: &[u8], status: u8) -> Encoded {
+    Writer::new(address | REPLY, TYPE).slice(name).byte(status).finish()
+}
+
+/// BBh: whether the switch was done, and the variant in force.
+pub fn variant(address: u8, done: bool, variant: Variant, status: u8) -> Encoded {
+    Writer::new(address | REPLY, VARIANT)
+        .byte(u8::from(done))
+        .word(variant.angle_deg)
+        .word(variant.resolution_cdeg)
+        .byte(status)
+        .finish()
+}
+
+/// F4h: 34 bytes of a sensor as it left the factory, with this measuring mode and unit.
+pub fn configuration(address: u8, mode: Mode, unit: Unit, status: u8) -> Encoded {
+    Writer::new(address | REPLY, CONFIGURATION).slice(&factory(mode, unit)).byte(status).finish()
+}
+
+/// Command byte of what a sensor says when it is up.
+pub const POWER_ON: u8 = 0x90;
+/// Command byte of the beginning of a reset.
+pub const RESET: u8 = 0x91;
+/// Command byte of the refusal.
+pub const REFUSED: u8 = 0x92;
+
+const MODE: u8 = request::MODE | REPLY;
+const STATUS: u8 = request::STATUS | REPLY;
+const ERRORS: u8 = request::ERRORS | REPLY;
+const COUNTERS: u8 = request::COUNTERS | REPLY;
+const MEANS: u8 = request::MEANS | REPLY;
+const RANGE: u8 = request::RANGE | REPLY;
+const TYPE: u8 = request::TYPE | REPLY;
+const VARIANT: u8 = request::VARIANT | REPLY;
+const RANGE_FIELDS: u8 = request::RANGE_FIELDS | REPLY;
+const RANGE_MEANS: u8 = request::RANGE_MEANS | REPLY;
+const REFLECTIVITY: u8 = request::REFLECTIVITY | REPLY;
+const POWER_ON_SET: u8 = 0xE6;
+const CONFIGURATION: u8 = request::CONFIGURATION | REPLY;
+const REFLECTIVITIES: u8 = request::REFLECTIVITIES | REPLY;
+const CONFIGURATION_WRITTEN: u8 = 0xF7;
+const CONFIGURATION_2: u8 = request::CONFIGURATION_2 | REPLY;
+const CONFIGURATION_2_WRITTEN: u8 = 0xFC;
+/// Replies without a layout here.
+const UNREAD: [u8; 8] = [0xC0, 0xC1, 0xC2, 0xC5, 0xC6, 0xCA, 0xE9, 0xF6];
+/// Characters of type, number and firmware.
+const NAME_LEN: usize = 21;

@@ -1,0 +1,292 @@
+//! The sensor's long account of itself, B1h: 152 bytes of settings and health (Telegram listing 7-5, offsets checked
+//! against a real one).
+
+use crate::lms::telegram::{Encoded, REPLY, Writer};
+use crate::lms::variant::{Baud, Mode, Unit, Variant};
+
+/// Data of a status reply.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct StatusReport<'a>(&'a [u8; LEN]);
+
+impl<'a> StatusReport<'a> {
+    /// The report that `bytes` are; `None` if they are not 152.
+    pub fn new(bytes: &'a [u8]) -> Option<StatusReport<'a>> {
+        bytes.try_into().ok().map(StatusReport)
+    }
+
+    /// The bytes as they came.
+    pub fn bytes(&self) -> &'a [u8; LEN] {
+        self.0
+    }
+
+    /// Firmware as ASCII, such as `V02.19`.
+    pub fn software(&self) -> &'a [u8] {
+        self.0[..7].trim_ascii()
+    }
+
+    /// The operating mode, the byte after command 20h (24h: streaming, 25h: on request).
+    pub fn operating_mode(&self) -> u8 {
+        self.0[7]
+    }
+
+    /// Whether the sensor calls itself defective.
+    pub fn is_defective(&self) -> bool {
+        self.0[8] != 0
+    }
+
+    /// What the eight channels of the pollution measurement see, and after them the four of the reference.
+    pub fn pollution(&self) -> [u16; 12] {
+        core::array::from_fn(|i| self.word(18 + 2 * i))
+    }
+
+    /// What they saw of a clean window.
+    pub fn pollution_calibration(&self) -> [u16; 12] {
+        core::array::from_fn(|i| self.word(42 + 2 * i))
+    }
+
+    /// What the dirtiest channel of the window lets through, in percent of when it was clean; `None` if nobody measured
+    /// that.
+    pub fn window_percent(&self) -> Option<u16> {
+        let channels = self.pollution().into_iter().zip(self.pollution_calibration()).take(CHANNELS);
+        let percent = |(is, was): (u16, u16)| (u32::from(is) * 100).checked_div(u32::from(was));
+        channels.filter_map(percent).min().and_then(|percent| percent.try_into().ok())
+    }
+
+    /// Microseconds per 1/90 turn of the mirror; 148 is 13.32 ms a turn.
+    pub fn motor_us(&self) -> u16 {
+        self.word(66)
+    }
+
+    /// Laser power in percent of what it should be; a real one told 156 to 161.
+    pub fn laser_power_percent(&self) -> u16 {
+        self.word(82)
+    }
+
+    /// How values are split.
+    pub fn mode(&self) -> Mode {
+        Mode(self.0[101])
+    }
+
+    /// Angle and resolution in force; `None` if the sensor names a pair that no telegram can carry.
+    pub fn variant(&self) -> Option<Variant> {
+        Variant::new(self.word(106), self.word(108))
+    }
+
+    /// Rate of the line; `None` for an unknown divisor.
+    pub fn baud(&self) -> Option<Baud> {
+        baud_of_divisor(self.word(115))
+    }
+
+    /// Whether the rate after power-on is another than 9600: byte 119, 0 is the factory's.
+    pub fn has_permanent_baud(&self) -> bool {
+        self.0[118] != 0
+    }
+
+    /// The sensor's own address.
+    pub fn address(&self) -> u8 {
+        self.0[119]
+    }
+
+    /// Unit of the ranges; `None` for an unknown code.
+    pub fn unit(&self) -> Option<Unit> {
+        Unit::of_code(self.0[121])
+    }
+
+    /// Whether the laser is on.
+    pub fn is_laser_on(&self) -> bool {
+        self.0[122] != 0
+    }
+
+    fn word(&self, at: usize) -> u16 {
+        u16::from_le_bytes([self.0[at], self.0[at + 1]])
+    }
+}
+
+/// What a simulated sensor says of itself in a status reply.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Health {
+    /// Firmware, 7 ASCII characters.
+    pub software: [u8; 7],
+    /// The byte after the last 20h.
+    pub operating_mode: u8,
+    /// How values are split.
+    pub mode: Mode,
+    /// Angle and resolution in force.
+    pub variant: Variant,
+    /// Unit of the ranges.
+    pub unit: Unit,
+    /// Rate of the line.
+    pub baud: Baud,
+}
+
+impl Health {
+    /// The settings in their places, a motor at its nominal speed, the laser on, everything else 0.
+    pub fn report(&self) -> [u8; LEN] {
+        let mut data = [0; LEN];
+        data[..7].copy_from_slice(&self.software);
+        data[7] = self.operating_mode;
+        data[66..68].copy_from_slice(&148u16.to_le_bytes());
+        data[101] = self.mode.0;
+        data[106..108].copy_from_slice(&self.variant.angle_deg.to_le_bytes());
+        data[108..110].copy_from_slice(&self.variant.resolution_cdeg.to_le_bytes());
+        data[115..117].copy_from_slice(&divisor_of(self.baud).to_le_bytes());
+        data[121] = self.unit.code();
+        data[122] = 1;
+        data
+    }
+}
+
+/// B1h: the settings of `health`, see [`Health::report`].
+pub fn status(address: u8, health: &Health, status: u8) -> Encoded {
+    Writer::new(address | REPLY, crate::lms::command::STATUS | REPLY)
+        .slice(&health.report())
+        .byte(status)
+        .finish()
+}
+
+/// The word that stands for a rate: 16 MHz / (16 (n + 1)), with the upper bit set.
+fn divisor_of(baud: Baud) -> u16 {
+    match baud {
+        Baud::B500000 => 0x8001,
+        Baud::B38400 => 0x8019,
+        Baud::B19200 => 0x8033,
+        Baud::B9600 => 0x8067,
+    }
+}
+
+/// The rate that a word stands for.
+pub(crate) fn baud_of_divisor(divisor: u16) -> Option<Baud> {
+    Baud::ALL.into_iter().find(|&baud| divisor_of(baud) == divisor)
+}
+
+/// How the bytes of a value are read.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Kind {
+    /// ASCII.
+    Text,
+    /// One number of 1, 2 or 4 bytes.
+    Number,
+    /// Several words.
+    Words,
+    /// Bytes without a known meaning.
+    Bytes,
+}
+
+/// One value of the report: where it is and what it is.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Item {
+    /// Its first byte.
+    pub at: usize,
+    /// Its bytes.
+    pub len: usize,
+    /// Its name.
+    pub name: &'static str,
+    /// How it is read.
+    pub kind: Kind,
+}
+
+const fn item(at: usize, len: usize, name: &'static str, kind: Kind) -> Item {
+    Item { at, len, name, kind }
+}
+
+/// All values in their order, without gaps; the listing counts from the command byte, so its offsets are one more.
+pub const ITEMS: [Item; 50] = [
+    item(0, 7, "software version", Kind::Text),
+    item(7, 1, "operating mode", Kind::Number),
+    item(8, 1, "defective", Kind::Number),
+    item(9, 8, "reserved", Kind::Text),
+    item(17, 1, "variant type", Kind::Number),
+    item(18, 16, "pollution", Kind::Words),
+    item(34, 8, "pollution reference", Kind::Words),
+    item(42, 16, "pollution calibration", Kind::Words),
+    item(58, 8, "pollution reference calibration", Kind::Words),
+    item(66, 2, "motor", Kind::Number),
+    item(68, 2, "reserved", Kind::Bytes),
+    item(70, 2, "dark signal at 100 %", Kind::Number),
+    item(72, 2, "reserved", Kind::Bytes),
+    item(74, 2, "dark signal at 100 %", Kind::Number),
+    item(76, 2, "dark signal at 66 %", Kind::Number),
+    item(78, 2, "reserved", Kind::Bytes),
+    item(80, 2, "dark signal at 66 %", Kind::Number),
+    item(82, 2, "laser power", Kind::Number),
+    item(84, 2, "angle", Kind::Number),
+    item(86, 2, "peak threshold", Kind::Number),
+    item(88, 2, "angle of the reference", Kind::Number),
+    item(90, 2, "calibration of the reference", Kind::Number),
+    item(92, 2, "target stop threshold", Kind::Number),
+    item(94, 2, "target peak threshold", Kind::Number),
+    item(96, 2, "actual stop threshold", Kind::Number),
+    item(98, 2, "actual peak threshold", Kind::Number),
+    item(100, 1, "reserved", Kind::Bytes),
+    item(101, 1, "measuring mode", Kind::Number),
+    item(102, 2, "reference target filter", Kind::Number),
+    item(104, 2, "reference target filter", Kind::Number),
+    item(106, 2, "scan angle", Kind::Number),
+    item(108, 2, "resolution", Kind::Number),
+    item(110, 1, "restart", Kind::Number),
+    item(111, 2, "restart time", Kind::Number),
+    item(113, 2, "offset of field set 2", Kind::Number),
+    item(115, 2, "rate of the line", Kind::Number),
+    item(117, 1, "evaluations", Kind::Number),
+    item(118, 1, "permanent rate", Kind::Number),
+    item(119, 1, "address", Kind::Number),
+    item(120, 1, "field set", Kind::Number),
+    item(121, 1, "unit", Kind::Number),
+    item(122, 1, "laser", Kind::Number),
+    item(123, 7, "boot PROM version", Kind::Text),
+    item(130, 4, "calibration", Kind::Number),
+    item(134, 4, "calibration", Kind::Number),
+    item(138, 4, "calibration", Kind::Number),
+    item(142, 4, "calibration", Kind::Number),
+    item(146, 2, "M0, first", Kind::Number),
+    item(148, 2, "M0, second", Kind::Number),
+    item(150, 2, "calibration interval", Kind::Number),
+];
+
+/// A window that lets through less than so many percent is dirty (Telegram listing, errors 18 and 19).
+pub(crate) const DIRTY: u16 = 75;
+/// Channels of the pollution measurement that look through the window; the others are its reference.
+const CHANNELS: usize = 8;
+
+/// LENGTH 9Ah less command and status (Telegram listing 7-5).
+pub const LEN: usize = 152;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::lms::telegram::Telegram;
+
+    #[test]
+    fn items_leave_no_gap() {
+        let end = ITEMS.iter().fold(0, |at, item| {
+            assert_eq!(item.at, at, "{}", item.name);
+            at + item.len
+        });
+        assert_eq!(end, LEN);
+    }
+
+    #[test]
+    fn a_status_both_ways() {
+        for baud in Baud::ALL {
+            let health = Health {
+                software: *b"V02.19 ",
+                operating_mode: 0x24,
+                mode: Mode(1),
+                variant: Variant::HALF,
+                unit: Unit::Cm,
+                baud,
+            };
+            let encoded = status(0, &health, 0x10);
+            assert_eq!((encoded.bytes().len(), encoded.telegram().length()), (160, 0x9A));
+            let telegram = Telegram::check(encoded.bytes()).unwrap();
+            let report = StatusReport::new(telegram.data()).unwrap();
+            assert_eq!((report.software(), report.operating_mode()), (&b"V02.19"[..], 0x24));
+            assert_eq!((report.is_defective(), report.is_laser_on()), (false, true));
+            assert_eq!((report.mode(), report.variant()), (Mode(1), Some(Variant::HALF)));
+            assert_eq!((report.unit(), report.baud()), (Some(Unit::Cm), Some(baud)));
+            assert_eq!((report.motor_us(), report.has_permanent_baud(), report.address()), (148, false, 0));
+            assert_eq!((report.pollution(), report.laser_power_percent()), ([0; 12], 0));
+        }
+        assert_eq!(StatusReport::new(&[0; 151]), None);
+    }
+}

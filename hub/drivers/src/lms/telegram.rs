@@ -1,0 +1,206 @@
+//! One telegram: a view that exists only if its length and checksum are right, and the writer that makes one.
+//!
+//! `02 | ADR | LENGTH, 2 bytes | COMMAND | DATA .. | [STATUS, replies only] | CRC, 2 bytes` (Telegram listing 4).
+//! LENGTH counts command to status. What the data mean is for [`crate::lms::command`] and [`crate::lms::reply`].
+
+use crate::lms::crc::crc;
+use core::fmt;
+
+/// First byte of every telegram.
+pub const STX: u8 = 0x02;
+/// Single byte before a reply: address and checksum of the request were right.
+pub const ACK: u8 = 0x06;
+/// Single byte instead of a reply: the address was right, the checksum was not.
+pub const NAK: u8 = 0x15;
+/// Added to the sensor's own address in what it sends, and to a command in its reply.
+pub const REPLY: u8 = 0x80;
+/// STX, address, two length bytes, two checksum bytes: what LENGTH does not count.
+pub const FRAME: usize = 6;
+/// Greatest LENGTH: 401 values with real-time indices.
+pub const MAX_LENGTH: usize = 808;
+/// Longest telegram in bytes.
+pub const MAX_TELEGRAM: usize = MAX_LENGTH + FRAME;
+
+/// A whole telegram whose length and checksum are right, in the caller's buffer.
+#[derive(Clone, Copy, PartialEq, Eq)]
+pub struct Telegram<'a>(&'a [u8]);
+
+impl<'a> Telegram<'a> {
+    /// The telegram that `bytes` are, from STX to the second checksum byte; `None` if they are not exactly one.
+    pub fn check(bytes: &'a [u8]) -> Option<Self> {
+        let [STX, _, low, high, _, .., crc_low, crc_high] = *bytes else { return None };
+        let length = usize::from(u16::from_le_bytes([low, high]));
+        let whole = (1..=MAX_LENGTH).contains(&length) && bytes.len() == length + FRAME;
+        let (covered, _) = bytes.split_at(bytes.len() - 2);
+        (whole && crc(covered) == u16::from_le_bytes([crc_low, crc_high])).then_some(Telegram(bytes))
+    }
+
+    /// The telegram in bytes that [`Telegram::check`] has seen before.
+    pub(crate) fn checked(bytes: &'a [u8]) -> Self {
+        debug_assert!(Telegram::check(bytes).is_some());
+        Telegram(bytes)
+    }
+
+    /// All bytes, STX to checksum.
+    pub fn bytes(&self) -> &'a [u8] {
+        self.0
+    }
+
+    /// The address byte; from a sensor it is the sensor's own address + 80h.
+    pub fn address(&self) -> u8 {
+        self.0[1]
+    }
+
+    /// Whether a sensor sent it (and so a status byte ends its data).
+    pub fn is_reply(&self) -> bool {
+        self.address() & REPLY != 0
+    }
+
+    /// LENGTH: number of bytes from command to status.
+    pub fn length(&self) -> usize {
+        self.0.len() - FRAME
+    }
+
+    /// The command byte; a reply's is that of its request + 80h.
+    pub fn command(&self) -> u8 {
+        self.0[4]
+    }
+
+    /// The bytes between command and checksum, without the status byte of a reply.
+    pub fn data(&self) -> &'a [u8] {
+        let end = self.0.len() - 2 - usize::from(self.is_reply() && self.length() > 1);
+        &self.0[5..end]
+    }
+
+    /// The status byte of a reply (Telegram listing 8): bits 0 to 2 tell severity, bit 6 implausible values, bit 7
+    /// pollution. `None` in a request.
+    pub fn status(&self) -> Option<u8> {
+        (self.is_reply() && self.length() > 1).then(|| self.0[self.0.len() - 3])
+    }
+}
+
+impl fmt::Debug for Telegram<'_> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(
+            f,
+            "Telegram({:02X} of {} bytes, address {:02X})",
+            self.command(),
+            self.0.len(),
+            self.address()
+        )
+    }
+}
+
+/// Room for any telegram, and the way to write one.
+#[derive(Clone)]
+pub struct Writer {
+    bytes: [u8; MAX_TELEGRAM],
+    len: usize,
+}
+
+impl Writer {
+    /// Begins a telegram to `address` (or from it, with [`REPLY`] added) with `command`.
+    pub fn new(address: u8, command: u8) -> Self {
+        let mut bytes = [0; MAX_TELEGRAM];
+        bytes[..5].copy_from_slice(&[STX, address, 0, 0, command]);
+        Writer { bytes, len: 5 }
+    }
+
+    /// Appends one byte. A telegram longer than [`MAX_TELEGRAM`] cannot be said, and panics.
+    pub fn byte(mut self, byte: u8) -> Self {
+        self.bytes[self.len] = byte;
+        self.len += 1;
+        self
+    }
+
+    /// Appends a word, low byte first.
+    pub fn word(self, word: u16) -> Self {
+        let [low, high] = word.to_le_bytes();
+        self.byte(low).byte(high)
+    }
+
+    /// Appends bytes as they are.
+    pub fn slice(mut self, bytes: &[u8]) -> Self {
+        self.bytes[self.len..self.len + bytes.len()].copy_from_slice(bytes);
+        self.len += bytes.len();
+        self
+    }
+
+    /// Appends bytes as they are; `None` if they leave no room for the status byte that a reply ends with.
+    pub(crate) fn reply_slice(self, bytes: &[u8]) -> Option<Self> {
+        (self.length() + bytes.len() < MAX_LENGTH).then(|| self.slice(bytes))
+    }
+
+    /// LENGTH so far: command and what was appended.
+    pub fn length(&self) -> usize {
+        self.len - 4
+    }
+
+    /// Writes length and checksum. A reply appends its status byte before.
+    pub fn finish(mut self) -> Encoded {
+        let [low, high] = (self.length() as u16).to_le_bytes();
+        self.bytes[2] = low;
+        self.bytes[3] = high;
+        let sum = crc(&self.bytes[..self.len]);
+        Encoded(self.word(sum))
+    }
+}
+
+/// A telegram with its own storage.
+#[derive(Clone)]
+pub struct Encoded(Writer);
+
+impl Encoded {
+    /// A copy of `telegram`.
+    pub fn of(telegram: Telegram<'_>) -> Encoded {
+        let mut bytes = [0; MAX_TELEGRAM];
+        bytes[..telegram.0.len()].copy_from_slice(telegram.0);
+        Encoded(Writer { bytes, len: telegram.0.len() })
+    }
+
+    /// The telegram's bytes, STX to checksum.
+    pub fn bytes(&self) -> &[u8] {
+        &self.0.bytes[..self.0.len]
+    }
+
+    /// The telegram as a view.
+    pub fn telegram(&self) -> Telegram<'_> {
+        Telegram(self.bytes())
+    }
+}
+
+impl fmt::Debug for Encoded {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        self.telegram().fmt(f)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_view_exists_only_if_the_checksum_is_right() {
+        let good = [0x02, 0x80, 0x03, 0x00, 0xA0, 0x00, 0x10, 0x16, 0x0A];
+        let telegram = Telegram::check(&good).unwrap();
+        assert_eq!((telegram.address(), telegram.command(), telegram.length()), (0x80, 0xA0, 3));
+        assert_eq!((telegram.data(), telegram.status()), (&[0u8][..], Some(0x10)));
+        for at in 0..good.len() {
+            for bit in 0..8 {
+                let mut bad = good;
+                bad[at] ^= 1 << bit;
+                assert_eq!(Telegram::check(&bad), None, "byte {at} bit {bit}");
+            }
+            assert_eq!(Telegram::check(&good[..at]), None);
+        }
+    }
+
+    #[test]
+    fn writing_and_reading_agree() {
+        let encoded = Writer::new(0x00, 0x20).byte(0x24).finish();
+        assert_eq!(encoded.bytes(), [0x02, 0x00, 0x02, 0x00, 0x20, 0x24, 0x34, 0x08]);
+        assert_eq!(Telegram::check(encoded.bytes()), Some(encoded.telegram()));
+        assert_eq!(encoded.telegram().data(), [0x24]);
+        assert_eq!(encoded.telegram().status(), None);
+    }
+}

@@ -1,0 +1,200 @@
+//! What a sensor is set to: variant (angle and resolution), unit, measuring mode, rate of the line. Numbers of the
+//! protocol with their meaning, and the times that follow from them.
+
+use schema::Nanos;
+
+/// One mirror turn: 75 Hz nominal (Telegram listing 10; a real motor word of 148 gives 13.32 ms).
+pub const MIRROR_TURN: Nanos = 13_320_000;
+/// The sensor sends at most so many bytes per mirror turn, so 732 bytes come in two bursts.
+pub const BYTES_PER_TURN: usize = 508;
+/// Most beams in one telegram: 100 degrees at 0.25.
+pub const MAX_BEAMS: usize = 401;
+
+/// Angle and resolution of a scan.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Variant {
+    /// Field of view in degrees: 100 or 180.
+    pub angle_deg: u16,
+    /// Step between beams in 1/100 degree: 25, 50 or 100.
+    pub resolution_cdeg: u16,
+}
+
+impl Variant {
+    /// 180 degrees at 0.5: 361 beams, as LMS 200 and 291 leave the factory.
+    pub const HALF: Variant = Variant { angle_deg: 180, resolution_cdeg: 50 };
+
+    /// All variants that a telegram can carry; 180 at 0.25 is not one (401 values are the cap).
+    pub const ALL: [Variant; 5] = [
+        Variant { angle_deg: 180, resolution_cdeg: 100 },
+        Variant::HALF,
+        Variant { angle_deg: 100, resolution_cdeg: 100 },
+        Variant { angle_deg: 100, resolution_cdeg: 50 },
+        Variant { angle_deg: 100, resolution_cdeg: 25 },
+    ];
+
+    /// The variant of `angle_deg` degrees in steps of `resolution_cdeg` hundredths, if there is one.
+    pub fn new(angle_deg: u16, resolution_cdeg: u16) -> Option<Variant> {
+        Variant::ALL.into_iter().find(|v| v.angle_deg == angle_deg && v.resolution_cdeg == resolution_cdeg)
+    }
+
+    /// The variant whose telegrams carry `beams` values.
+    pub fn of_beams(beams: usize) -> Option<Variant> {
+        Variant::ALL.into_iter().find(|v| v.beams() == beams)
+    }
+
+    /// Values in a telegram: 101, 181, 201, 361 or 401.
+    pub fn beams(self) -> usize {
+        usize::from(self.angle_deg * 100 / self.resolution_cdeg) + 1
+    }
+
+    /// Mirror turns that make one scan: 1, 2 or 4.
+    pub fn turns(self) -> u64 {
+        u64::from(100 / self.resolution_cdeg)
+    }
+
+    /// Angle of the first beam in 1/1000 degree, counter-clockwise, 0 ahead: beams lie evenly to both sides of it.
+    pub fn first_angle_mdeg(self) -> i32 {
+        -500 * i32::from(self.angle_deg)
+    }
+
+    /// Time between telegrams of `telegram_len` bytes at `baud`: whole scans, as many as the line needs (Telegram
+    /// listing table 10-17).
+    pub fn period(self, telegram_len: usize, baud: u32) -> Nanos {
+        let scan = self.turns() * MIRROR_TURN;
+        scan * schema::line_time(telegram_len, baud).div_ceil(scan).max(1)
+    }
+}
+
+/// Unit of a range value.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Unit {
+    /// Centimetres.
+    Cm,
+    /// Millimetres.
+    Mm,
+    /// Ten centimetres (reserved in the listing, known to several drivers).
+    Dm,
+}
+
+impl Unit {
+    /// Millimetres per unit: 1, 10 or 100.
+    pub fn mm(self) -> u8 {
+        match self {
+            Unit::Cm => 10,
+            Unit::Mm => 1,
+            Unit::Dm => 100,
+        }
+    }
+
+    /// The unit of code 0, 1 or 2, as in bits 14 and 15 of a count word and in byte 6 of the configuration.
+    pub fn of_code(code: u8) -> Option<Unit> {
+        match code {
+            0 => Some(Unit::Cm),
+            1 => Some(Unit::Mm),
+            2 => Some(Unit::Dm),
+            _ => None,
+        }
+    }
+
+    /// Its code.
+    pub fn code(self) -> u8 {
+        match self {
+            Unit::Cm => 0,
+            Unit::Mm => 1,
+            Unit::Dm => 2,
+        }
+    }
+}
+
+/// The measuring-mode byte of the configuration: how the 16 bits of a value are split (Telegram listing, 77h
+/// block D).
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Mode(pub u8);
+
+impl Mode {
+    /// Low bits of a value that are the range: 13, 14 or 15.
+    pub fn range_bits(self) -> u8 {
+        match self.0 {
+            0x03 | 0x04 => 14,
+            0x05 | 0x06 | 0x0F => 15,
+            _ => 13,
+        }
+    }
+
+    /// Upper bits that are a reflector level: 3, 2, 1 or none; else they are field bits.
+    pub fn intensity_bits(self) -> u8 {
+        match self.0 {
+            0x01 => 3,
+            0x03 => 2,
+            0x05 => 1,
+            _ => 0,
+        }
+    }
+
+    /// Bits of a value that this mode never sets.
+    pub fn forbidden(self) -> u16 {
+        if self.0 == 0x0F { 0x8000 } else { 0 }
+    }
+
+    /// The greatest range value, which means "no return".
+    pub fn max_value(self) -> u16 {
+        (1 << self.range_bits()) - 1
+    }
+}
+
+/// A rate that the sensor's line can have.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub enum Baud {
+    /// 9,600 bits per second: power-on.
+    B9600,
+    /// 19,200.
+    B19200,
+    /// 38,400.
+    B38400,
+    /// 500,000: RS-422 only.
+    B500000,
+}
+
+impl Baud {
+    /// Every rate, slowest first.
+    pub const ALL: [Baud; 4] = [Baud::B9600, Baud::B19200, Baud::B38400, Baud::B500000];
+
+    /// Bits per second.
+    pub fn rate(self) -> u32 {
+        match self {
+            Baud::B9600 => 9_600,
+            Baud::B19200 => 19_200,
+            Baud::B38400 => 38_400,
+            Baud::B500000 => 500_000,
+        }
+    }
+
+    /// The rate of `rate` bits per second.
+    pub fn of_rate(rate: u32) -> Option<Baud> {
+        Baud::ALL.into_iter().find(|b| b.rate() == rate)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn beams_and_periods_of_the_listing() {
+        assert_eq!(Variant::ALL.map(Variant::beams), [181, 361, 101, 201, 401]);
+        assert_eq!(Variant::of_beams(361), Some(Variant::HALF));
+        assert_eq!(Variant::new(180, 25), None);
+        // Table 10-17: one telegram of 361 beams in 29, 15, 8, 1 scans.
+        let scans = Baud::ALL.map(|b| Variant::HALF.period(732, b.rate()) / (2 * MIRROR_TURN));
+        assert_eq!(scans, [29, 15, 8, 1]);
+        assert_eq!(Variant::new(100, 25).unwrap().period(812, 9_600) / MIRROR_TURN, 64);
+        assert_eq!(Variant::new(100, 25).unwrap().first_angle_mdeg(), -50_000);
+    }
+
+    #[test]
+    fn modes_split_a_value() {
+        assert_eq!((Mode(1).range_bits(), Mode(1).intensity_bits(), Mode(1).max_value()), (13, 3, 8191));
+        assert_eq!((Mode(4).range_bits(), Mode(4).intensity_bits()), (14, 0));
+        assert_eq!((Mode(5).range_bits(), Mode(5).intensity_bits()), (15, 1));
+    }
+}

@@ -1,0 +1,4 @@
+//! Sessions with scanners of LDROBOT.
+
+mod any_bytes;
+mod session;

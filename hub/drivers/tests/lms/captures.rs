@@ -1,0 +1,224 @@
+//! Recordings of real sensors through the framer: every telegram bit for bit at its place, nothing else, and a
+//! reason for every refused start byte. The recordings are no part of this project: without them the tests skip.
+
+#[path = "../../../../tests/testkit/skip.rs"]
+mod skip;
+
+use scanhub_drivers::lms::framer::{Found, Framer, Tally, VETO_HOLD};
+use scanhub_drivers::lms::header::{Expect, StreamHeader};
+use scanhub_drivers::lms::measured::MEASURED;
+use scanhub_drivers::lms::telegram::{ACK, STX};
+use skip::skip;
+use std::path::PathBuf;
+
+/// A file of `$SCANHUB_DATA/captures` or `../shared/data/captures`.
+fn capture(name: &str) -> Option<Vec<u8>> {
+    let beside = || PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../../../shared/data");
+    let path =
+        std::env::var_os("SCANHUB_DATA").map_or_else(beside, PathBuf::from).join("captures").join(name);
+    match std::fs::read(&path) {
+        Ok(bytes) => Some(bytes),
+        Err(error) => {
+            skip("recordings", format!("{}: {error}", path.display()));
+            None
+        }
+    }
+}
+
+/// Where a recording's table says that a telegram lies: offset and length, the last columns but the command.
+fn places(csv: &[u8], columns: (usize, Option<usize>), every_len: usize) -> Vec<(usize, usize)> {
+    let text = std::str::from_utf8(csv).expect("a table is text");
+    let number = |line: &str, column: usize| line.split(',').nth(column).and_then(|n| n.parse().ok());
+    text.lines()
+        .skip(1)
+        .map(|line| {
+            let len = columns.1.map_or(Some(every_len), |column| number(line, column));
+            (number(line, columns.0).expect("an offset"), len.expect("a length"))
+        })
+        .collect()
+}
+
+/// A line with a framer at its end, and what came of it.
+#[derive(Default)]
+struct Line {
+    framer: Framer,
+    /// Everything fed so far.
+    bytes: Vec<u8>,
+    /// Offset and length of what was found.
+    found: Vec<(usize, usize)>,
+    acknowledged: u64,
+    suspect: usize,
+}
+
+impl Line {
+    fn feed(&mut self, mut bytes: &[u8], piece: usize) {
+        self.bytes.extend(bytes);
+        while !bytes.is_empty() {
+            let spare = self.framer.spare();
+            let n = bytes.len().min(piece).min(spare.len());
+            spare[..n].copy_from_slice(&bytes[..n]);
+            self.framer.commit(n);
+            bytes = &bytes[n..];
+            self.drain();
+        }
+    }
+
+    fn drain(&mut self) {
+        while let Some(found) = self.framer.poll() {
+            match found {
+                Found::Telegram(framed) => {
+                    let (at, len) = (framed.offset as usize, framed.telegram.bytes().len());
+                    assert_eq!(framed.telegram.bytes(), &self.bytes[at..at + len], "not what the line said");
+                    self.found.push((at, len));
+                    self.suspect += usize::from(framed.reasons != 0);
+                }
+                Found::Ack | Found::Nak => self.acknowledged += 1,
+            }
+        }
+        let Tally { read, in_telegrams, acknowledge, discarded, .. } = *self.framer.tally();
+        assert_eq!(read, in_telegrams + acknowledge + discarded + self.framer.buffered() as u64);
+    }
+
+    /// Silence, then the end: gives up what is still open and prints a line of the table.
+    fn end(&mut self, legend: &str) -> Tally {
+        self.framer.release(VETO_HOLD);
+        self.drain();
+        self.framer.clear();
+        self.drain();
+        let tally = *self.framer.tally();
+        let [address, length, command, count, crc, vetoed, superseded] = tally.rejected;
+        eprintln!(
+            "{legend:<44} {:>7} bytes {:>4} telegrams {:>3} suspect {:>3} ack {:>5} discarded | address {address} \
+             length {length} command {command} count {count} crc {crc} vetoed {vetoed} superseded {superseded} \
+             aborted {}",
+            tally.read, tally.telegrams, self.suspect, tally.acknowledge, tally.discarded, tally.aborted
+        );
+        assert_eq!(tally.read, self.bytes.len() as u64);
+        self.assert_every_start_byte_has_a_reason(&tally);
+        tally
+    }
+
+    /// Each start byte outside the telegrams is refused for exactly one reason, or began what was aborted.
+    fn assert_every_start_byte_has_a_reason(&self, tally: &Tally) {
+        let inside = |at: usize| self.found.iter().any(|&(start, len)| (start..start + len).contains(&at));
+        let starts = (0..self.bytes.len()).filter(|&at| self.bytes[at] == STX && !inside(at)).count();
+        assert_eq!(starts as u64, tally.rejected.iter().sum::<u64>() + tally.aborted);
+    }
+}
+
+fn header_of(scan: &[u8]) -> StreamHeader {
+    scan[..7].try_into().expect("a telegram has seven bytes")
+}
+
+#[test]
+fn seven_sessions_with_a_sensor_whose_mode_is_unknown() {
+    let (Some(bytes), Some(csv)) = (capture("lms200_38400.bin"), capture("lms200_38400.csv")) else { return };
+    let places = places(&csv, (2, Some(3)), 0);
+    assert_eq!(places.len(), 427);
+    for awaits in [false, true] {
+        for piece in [1, 16, 333, 1628] {
+            let mut line = Line::default();
+            line.framer.await_acknowledge(awaits);
+            line.feed(&bytes, piece);
+            let tally = line.end(&format!("lms200_38400, anything, ack {awaits}, by {piece}"));
+            assert_eq!(line.found, places);
+            assert_eq!((tally.discarded, tally.acknowledge, line.suspect), (0, 0, 0));
+        }
+    }
+}
+
+#[test]
+fn seven_sessions_as_a_session_listens_to_them() {
+    let (Some(bytes), Some(csv)) = (capture("lms200_38400.bin"), capture("lms200_38400.csv")) else { return };
+    let places = places(&csv, (2, Some(3)), 0);
+    let command = |&(at, _): &(usize, usize)| bytes[at + 4];
+    let mut line = Line::default();
+    let (mut stream, mut expected) = (None, Vec::new());
+    for (i, &(at, len)) in places.iter().enumerate() {
+        let telegram = &bytes[at..at + len];
+        if telegram[4] == MEASURED {
+            stream = Some(header_of(telegram));
+            line.framer.await_acknowledge(false);
+        } else {
+            // The recorder left out what precedes each reply on the line.
+            line.framer.await_acknowledge(true);
+            line.feed(&[ACK], 1);
+        }
+        expected.push((line.bytes.len(), len));
+        // What may come changes in the middle of a scan, while which a request goes out, or behind a reply.
+        let open = places.get(i + 1).map(command).filter(|&command| command != MEASURED);
+        let (before, after) = telegram.split_at(if telegram[4] == MEASURED { len / 2 } else { len });
+        line.feed(before, 16);
+        if let Some(header) = stream {
+            line.framer.expect(Expect::Stream { header, reply: open });
+            line.framer.await_acknowledge(open.is_some() || telegram[4] != MEASURED);
+        }
+        line.feed(after, 16);
+    }
+    let tally = line.end("lms200_38400, as a session, with ack");
+    let replies = places.iter().filter(|place| command(place) != MEASURED).count() as u64;
+    assert_eq!(line.found, expected);
+    assert_eq!((tally.acknowledge, tally.discarded, line.suspect), (replies, 0, 0));
+}
+
+#[test]
+fn scans_with_reflector_levels() {
+    let (Some(bytes), Some(csv)) =
+        (capture("reflector_levels_cm_18s.bin"), capture("reflector_levels_cm_18s.csv"))
+    else {
+        return;
+    };
+    let places = places(&csv, (2, None), 732);
+    assert_eq!(places.len(), 675);
+    for expect in [Expect::Anything, Expect::Stream { header: header_of(&bytes), reply: None }] {
+        for piece in [1, 16, 560] {
+            let mut line = Line::default();
+            line.framer.expect(expect);
+            line.feed(&bytes, piece);
+            let known = if expect == Expect::Anything { "anything" } else { "stream" };
+            let tally = line.end(&format!("reflector_levels, {known}, by {piece}"));
+            assert_eq!(line.found, places);
+            assert_eq!(tally.discarded, 0);
+        }
+    }
+}
+
+#[test]
+fn a_wrong_rate_looks_like_no_telegram() {
+    let Some(bytes) = capture("host19200_while_sensor_38400.bin") else { return };
+    let header = [0x02, 0x80, 0xD6, 0x02, 0xB0, 0x69, 0x41];
+    for expect in [Expect::Anything, Expect::Stream { header, reply: None }] {
+        for awaits in [false, true] {
+            let mut line = Line::default();
+            line.framer.expect(expect);
+            line.framer.await_acknowledge(awaits);
+            line.feed(&bytes, 16);
+            let known = if expect == Expect::Anything { "anything" } else { "stream" };
+            let tally = line.end(&format!("host19200_while_sensor_38400, {known}, ack {awaits}"));
+            assert_eq!(line.found, []);
+            assert_eq!(tally.discarded + tally.acknowledge, bytes.len() as u64);
+            assert_eq!(tally.acknowledge, line.acknowledged);
+        }
+    }
+}
+
+#[test]
+fn a_scan_broken_off_by_a_reply() {
+    let Some(bytes) = capture("scan_interrupted_by_reply.bin") else { return };
+    let header = header_of(&bytes);
+    for expect in [Expect::Anything, Expect::Stream { header, reply: Some(0xBA) }] {
+        for piece in [1, 16, 732] {
+            let mut line = Line::default();
+            line.framer.expect(expect);
+            line.framer.await_acknowledge(true);
+            line.feed(&bytes, piece);
+            let known = if expect == Expect::Anything { "anything" } else { "stream" };
+            // 15 bytes of a scan, ACK, a reply of 29 bytes, the beginning of the next scan.
+            assert_eq!((line.found.as_slice(), bytes[20]), (&[(16, 29)][..], 0xBA));
+            assert_eq!(line.framer.buffered(), 687);
+            let tally = line.end(&format!("scan_interrupted_by_reply, {known}, by {piece}"));
+            assert_eq!(line.found.len(), 1);
+            assert_eq!((tally.aborted, tally.acknowledge, line.acknowledged), (1, 1, 0));
+        }
+    }
+}

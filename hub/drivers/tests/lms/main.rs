@@ -1,0 +1,8 @@
+//! The protocol of the SICK LMS 2xx: framing on lines that lose bytes, replies, and any bytes at all.
+
+mod any_bytes;
+mod captures;
+mod framer;
+mod framing;
+mod line;
+mod replies;

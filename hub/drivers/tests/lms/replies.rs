@@ -1,0 +1,166 @@
+//! Every reply both ways: those that are printed or captured, and those that the layout alone gives. What the documents
+//! print wrong is refused by its checksum.
+
+use scanhub_drivers::lms::condition::Condition;
+use scanhub_drivers::lms::configuration::Configuration;
+use scanhub_drivers::lms::errors::Errors;
+use scanhub_drivers::lms::measured::{self, Frame, Measured};
+use scanhub_drivers::lms::parameters::Span;
+use scanhub_drivers::lms::reflectivity::RangeFields;
+use scanhub_drivers::lms::reply::{self, Reply};
+use scanhub_drivers::lms::telegram::{Encoded, Telegram, Writer};
+use scanhub_drivers::lms::variant::{Mode, Unit, Variant};
+
+/// Bytes written as in a document: hexadecimal, and text between quotes.
+fn bytes(text: &str) -> Vec<u8> {
+    let mut bytes = Vec::new();
+    for (number, part) in text.split('"').enumerate() {
+        if number % 2 == 1 {
+            bytes.extend(part.as_bytes());
+        } else {
+            bytes.extend(
+                part.split_whitespace().map(|pair| u8::from_str_radix(pair, 16).expect("two digits")),
+            );
+        }
+    }
+    bytes
+}
+
+const ZEROS: &str = "00 00 00 00 00 00 00 00 00 00 00 00 00 00 00 00 00 00 00 00 00";
+
+#[test]
+fn printed_and_captured_replies_both_ways() {
+    let f4 = format!("02 80 24 00 F4 00 00 70 00 00 04 01 00 00 02 02 {ZEROS} 02 00 10 36 FE");
+    let f7 = format!("02 80 25 00 F7 01 00 00 70 00 00 00 01 00 00 02 02 {ZEROS} 02 00 10 C5 7A");
+    let (f4, f7) = (bytes(&f4), bytes(&f7));
+    let vectors: [(&str, Reply<'_>); 12] = [
+        ("02 80 03 00 A0 00 10 16 0A", Reply::Mode { done: true }),
+        ("02 81 03 00 A0 00 10 36 1A", Reply::Mode { done: true }),
+        ("02 80 03 00 A0 00 11 17 0A", Reply::Mode { done: true }),
+        ("02 80 02 00 91 10 79 30", Reply::Reset),
+        ("02 80 02 00 92 10 7F 33", Reply::Refused),
+        ("02 80 02 00 B2 10 3F 13", Reply::Errors(Errors::new(&[]).unwrap())),
+        (
+            "02 80 07 00 BB 01 B4 00 32 00 10 03 9D",
+            Reply::Variant { done: true, angle_deg: 180, resolution_cdeg: 50 },
+        ),
+        ("02 80 17 00 BA \"LMS200;301063;V02.10 \" 10 22 61", Reply::Type(b"LMS200;301063;V02.10")),
+        ("02 80 17 00 BA \"LMS200;S18063;V02.19 \" 10 85 6A", Reply::Type(b"LMS200;S18063;V02.19")),
+        ("02 80 17 00 BA \"LMS200;S18063;V02.19 \" 11 84 6A", Reply::Type(b"LMS200;S18063;V02.19")),
+        ("", Reply::Configuration(Configuration::new(&f4[5..39]).unwrap())),
+        (
+            "",
+            Reply::ConfigurationWritten {
+                done: true,
+                configuration: Configuration::new(&f7[6..40]).unwrap(),
+            },
+        ),
+    ];
+    for (text, expected) in vectors {
+        let bytes = match expected {
+            Reply::Configuration(_) => f4.clone(),
+            Reply::ConfigurationWritten { .. } => f7.clone(),
+            _ => bytes(text),
+        };
+        let telegram = Telegram::check(&bytes).unwrap_or_else(|| panic!("{text}: wrong checksum"));
+        assert_eq!(Reply::decode(telegram), Some(expected), "{text}");
+        let status = telegram.status().expect("a reply has one");
+        let again = expected.encode(telegram.address(), status).expect("it is short enough");
+        assert_eq!(again.bytes(), bytes, "{expected:?}");
+    }
+    assert_eq!(reply::configuration(0, Mode(4), Unit::Mm, 0x10).bytes(), f4);
+    assert_eq!(reply::mode(1, true, 0x10).bytes(), bytes("02 81 03 00 A0 00 10 36 1A"));
+    assert_eq!(reply::refused(0, 0x10).bytes(), bytes("02 80 02 00 92 10 7F 33"));
+    let name = b"LMS200;S18063;V02.19 ";
+    assert_eq!(reply::kind(0, name, 0x10).bytes()[26..], [0x10, 0x85, 0x6A]);
+    assert_eq!(reply::variant(0, true, Variant::HALF, 0x10).bytes()[11..], [0x03, 0x9D]);
+}
+
+/// What the documents print wrong, as far as the bytes are known (found by computing the checksums).
+#[test]
+fn misprints_are_refused() {
+    let a_zero_lost =
+        format!("02 80 25 00 F7 01 00 00 70 00 00 00 01 00 00 02 02 {} 02 00 10 C5 7A", &ZEROS[3..]);
+    for text in [
+        // Installation mode with the checksum of table 6-4, copied into programs.
+        "02 00 0A 00 20 00 \"SICK_LMS\" 5F B2",
+        // The power-on string of tables 6-2 and 7-5.
+        "02 80 17 00 90 \"LMS200;301063;V02.10 \" 10 63 56",
+        // STX and address swapped, and their checksum (7-105).
+        "00 02 01 00 69 7D 0A",
+        // Lost in print, as in 6-8.
+        &a_zero_lost,
+        // LENGTH 0, as in C1h, C2h and E6h.
+        "02 80 00 00 C1 10 00 00",
+    ] {
+        assert_eq!(Telegram::check(&bytes(text)), None, "{text}");
+    }
+    // As they should have been.
+    assert!(Telegram::check(&bytes("02 00 0A 00 20 00 \"SICK_LMS\" BE C5")).is_some());
+    let up = bytes("02 80 17 00 90 \"LMS200;301063;V02.10 \" 10 63 5E");
+    let up = Telegram::check(&up).map(Reply::decode);
+    assert_eq!(up, Some(Some(Reply::PowerOn(b"LMS200;301063;V02.10"))));
+}
+
+fn both_ways(reply: &Reply<'_>) -> Encoded {
+    let encoded = reply.encode(0, Condition::OK.0).expect("it is short enough");
+    assert_eq!(Reply::decode(encoded.telegram()).as_ref(), Some(reply));
+    encoded
+}
+
+#[test]
+fn every_other_reply_both_ways() {
+    let span = Span { first: 27, last: 28 };
+    let scan = measured::encode_with(
+        0,
+        Frame { unit: Unit::Mm, partial: None, indices: Some((1, 2)) },
+        &[7, 8],
+        0x10,
+    );
+    let Some(Reply::Measured(values)) = Reply::decode(scan.telegram()) else { panic!("no scan") };
+    both_ways(&Reply::Measured(values));
+    both_ways(&Reply::PowerOn(b"LMS200;301063;V02.10"));
+    both_ways(&Reply::Counters { hours_by_2: 4000, power_ons: 12 });
+    both_ways(&Reply::Mode { done: false });
+    both_ways(&Reply::Means { shots: 250, values });
+    both_ways(&Reply::Range { span, values });
+    both_ways(&Reply::RangeMeans { shots: 2, span, values });
+    both_ways(&Reply::PowerOnSet { outcome: 1, set: 0 });
+    both_ways(&Reply::Configuration2(&[3; 84]));
+    both_ways(&Reply::Configuration2Written { done: true, parameters: &[3; 84] });
+    for command in [0xC0, 0xC1, 0xC2, 0xC5, 0xC6, 0xCA, 0xE9, 0xF6] {
+        both_ways(&Reply::Unread { command, data: &[1, 2, 3] });
+    }
+    let errors = [0x84, 0x16, 0x01, 0x31];
+    assert_eq!(both_ways(&Reply::Errors(Errors::new(&errors).unwrap())).telegram().data(), errors);
+    let old = [0; 32];
+    let f4 = both_ways(&Reply::Configuration(Configuration::new(&old).unwrap()));
+    assert_eq!(f4.telegram().length(), 0x22);
+}
+
+#[test]
+fn what_does_not_fit_is_no_reply() {
+    let reply = |command: u8, data: &[u8]| {
+        let encoded = Writer::new(0x80, command).slice(data).byte(0x10).finish();
+        Reply::decode(encoded.telegram()).is_some()
+    };
+    assert!(!reply(0xB1, &[0; 151]) && !reply(0xB2, &[1]) && !reply(0xB5, &[0; 3]));
+    assert!(!reply(0xB6, &[]) && !reply(0xB7, &[1, 0, 2]) && !reply(0xBB, &[1]) && !reply(0xF4, &[0; 31]));
+    assert!(!reply(0xF5, &[1, 0]) && !reply(0xC4, &[1]) && !reply(0xBE, &[0; 5]) && !reply(0x99, &[]));
+    let request = Writer::new(0, 0xA0).byte(0).finish();
+    assert_eq!(Reply::decode(request.telegram()), None, "a host sends no reply");
+    assert!(Reply::Configuration2(&[0; 900]).encode(0, 0x10).is_none());
+    assert!(Reply::Type(&[b'x'; 900]).encode(0, 0x10).is_none());
+    // All that a telegram of values holds, and one byte more.
+    let frame = Frame { unit: Unit::Mm, partial: None, indices: Some((1, 2)) };
+    let longest = measured::encode_with(0, frame, &[7; 401], 0x10);
+    let values = Measured::decode(longest.telegram()).expect("is one");
+    let span = Span { first: 1, last: 401 };
+    assert!(Reply::Measured(values).encode(0, 0x10).is_some());
+    assert!(Reply::Means { shots: 2, values }.encode(0, 0x10).is_none());
+    assert!(Reply::Range { span, values }.encode(0, 0x10).is_none());
+    assert!(Reply::RangeMeans { shots: 2, span, values }.encode(0, 0x10).is_none());
+    let data = [&[1, 0, 101, 0, 101, 0][..], &[0; 8 * 101]].concat();
+    let fields = RangeFields::new(&data).expect("is one");
+    assert!(Reply::RangeFields(fields).encode(0, 0x10).is_none());
+}

@@ -1,0 +1,4 @@
+//! Sessions with scanners of Slamtec.
+
+mod any_bytes;
+mod session;
