@@ -493,7 +493,7 @@ const WHOLE: f64 = 1e-6;
 const POSES: usize = 6;
 /// Distance from the maximum value of the code for a range beyond the mode's (Telegram listing 10.8).
 pub const BEYOND: u16 = 8;
-/// The same for a last beam that the log lacks: a code without a meaning, which no scanner sends.
+/// Distance of the code for a last beam that the log lacks. The code has no meaning, and no scanner sends it.
 pub(crate) const LEFT_OUT: u16 = 7;
 /// Tolerance of the field of view, in degrees: logs round it to a step more or less.
 const VIEW_DEG: f64 = 1.5;

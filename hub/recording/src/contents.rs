@@ -150,7 +150,7 @@ pub struct Damage {
     pub chunks: u64,
     /// Whether the file ends without its index, as after a kill.
     pub is_cut: bool,
-    /// Whether the file differs from what was written: a checksum or a length is wrong.
+    /// Whether the file was changed after it was written: a checksum or a length is wrong.
     pub is_harmed: bool,
 }
 

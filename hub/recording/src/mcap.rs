@@ -287,5 +287,5 @@ impl<R: Read> Iterator for Frames<R> {
     }
 }
 
-/// Maximum number of runs of a hub that are remembered: one in each minute of a month.
+/// Maximum number of runs of a hub that are remembered: one per minute for a month.
 const MOST_RUNS: usize = 50_000;

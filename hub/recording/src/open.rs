@@ -328,7 +328,7 @@ fn open(path: &Path) -> io::Result<Box<dyn BufRead + Send>> {
     Ok(Box::new(file))
 }
 
-/// Returns whether the file ends with the magic bytes of MCAP. Telegrams in it would otherwise be taken for a stream.
+/// Returns whether the file ends with the magic bytes of MCAP. Telegrams in it would otherwise look like a stream.
 fn ends_as_mcap(path: &Path) -> io::Result<bool> {
     let mut file = regular::open(path)?;
     let end = file.metadata()?.len().saturating_sub(MCAP.len() as u64);

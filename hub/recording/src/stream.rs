@@ -1,6 +1,6 @@
 //! Streams of bytes as they arrived on a line. They contain the telegrams of an LMS or the packets of a rotating scanner, and
-//! other bytes, which are skipped and counted. A stream has no stamps; if the scanner has a clock, it says when packets were
-//! measured.
+//! other bytes, which are skipped and counted. A stream has no stamps. If the scanner has a clock, packets have times of that
+//! clock.
 
 use std::io::{self, Read};
 use std::path::Path;

@@ -1,5 +1,5 @@
-//! Plays a recording frame by frame: each telegram, or group of packets, once, in order and bit for bit, with what the hub
-//! that recorded it knew about it. Silences are those of the recording, however fast it is played.
+//! Plays a recording frame by frame: each telegram, or group of packets, once, in order and bit for bit, with the header that
+//! was recorded. Silences are those of the recording, however fast it is played.
 //!
 //! A telegram of an LMS is a scan by itself. The packets of a rotating scanner pass through a session that runs in the time of
 //! the recording. It builds the same scans as the hub that recorded them, with the same times between them.
@@ -86,7 +86,7 @@ struct Lap<'f> {
     /// Stamp of the last published frame; stamps never go back.
     last_stamp: Nanos,
     verdict: Option<Verdict>,
-    /// How long the last published verdict stays valid.
+    /// Duration for which the last published verdict stays valid.
     limit: Option<Nanos>,
     state: State,
 }
@@ -98,7 +98,7 @@ struct Verdict {
     of: Nanos,
     /// End of its validity, by the clock of the hub that recorded it.
     until_ns: Nanos,
-    /// The same as media time.
+    /// That end as media time.
     until: Nanos,
 }
 
@@ -112,7 +112,7 @@ struct When {
     begin: Nanos,
     /// Media time of its last byte.
     media: Nanos,
-    /// Whether it is before the start of what is played.
+    /// Whether it is before the start of the played part.
     is_skipped: bool,
 }
 

@@ -27,7 +27,7 @@ pub(crate) struct Stream {
     pub(super) mode: Option<Mode>,
 }
 
-/// Telegrams or packets that are known to be whole.
+/// Complete telegrams or packets, with their stamps.
 pub(crate) struct Frames {
     recording: Recording,
     /// Whether they are telegrams of an LMS.

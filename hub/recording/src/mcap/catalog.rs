@@ -1,5 +1,5 @@
-//! What an MCAP file says about its messages: profile, schemas and channels, and which channel has which topic of which
-//! sensor. The records are kept as they are, so that a copy of the file can repeat them.
+//! Catalog of an MCAP file: profile, schemas and channels, and the sensor and topic of each channel. The records are kept
+//! unchanged, so that a copy of the file can repeat them.
 
 use std::collections::{BTreeMap, HashSet};
 use std::io;
@@ -43,7 +43,7 @@ pub(crate) type Schema = (String, String, Vec<u8>);
 pub(crate) struct Catalog {
     /// Profile of the file, such as `ros2`.
     pub(crate) profile: String,
-    /// Who recorded what ([`METADATA`]).
+    /// Description of the recording: domain, host, version ([`METADATA`]).
     pub(crate) facts: BTreeMap<String, String>,
     schemas: BTreeMap<u16, Schema>,
     channels: BTreeMap<u16, (Channel, Option<Place>)>,

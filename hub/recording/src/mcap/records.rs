@@ -215,7 +215,7 @@ impl<R: Read> Records<R> {
         Ok(())
     }
 
-    /// Ends reading at a record that is incomplete, and of which `len` bytes exist.
+    /// Ends reading at an incomplete record that has `len` bytes.
     fn end_in_record(&mut self, len: u64) {
         self.is_ended = true;
         self.damage.bytes += len;
@@ -225,7 +225,7 @@ impl<R: Read> Records<R> {
         self.damage.is_harmed |= is_whole;
     }
 
-    /// Ends reading because the structure is lost; `len` bytes of what cannot be used were read.
+    /// Ends reading because the structure is lost. The last `len` bytes that were read cannot be used.
     fn end_here(&mut self, len: usize) -> io::Result<()> {
         self.is_ended = true;
         let rest = self.discard()?;
@@ -367,7 +367,7 @@ fn split_record(bytes: &[u8]) -> Option<(&[u8], &[u8])> {
     bytes.split_at_checked(HEAD + usize::try_from(length).ok().filter(|_| length <= longest(opcode))?)
 }
 
-/// Returns the length that the body of a chunk must have according to its fields, of which `body` is the beginning.
+/// Returns the length that a chunk must have according to the fields at the beginning of its `body`.
 fn chunk_length(body: &[u8]) -> Option<u64> {
     // Times of the first and the last message, uncompressed size, CRC.
     let (compression, rest) = body.get(8 + 8 + 8 + 4..)?.split_first_chunk()?;
