@@ -123,15 +123,14 @@ fn a_silence_is_said_once_and_late_joiners_know_at_once() {
 #[test]
 fn a_background_is_asked_held_begun_anew_and_brought_back() {
     let env = TestEnv::new();
-    // A wall without people, learned in a second.
-    let _simulator = env.simulator(&["front"], &["--seed=52", "--baud=500000", "--world=bare"]);
     let _hub = env.hub(&[env.link("front"), "--set=background.scans=20".into()]);
     let mut generations = env.echo(&["front/background"]);
+    // A wall without people, learned in a second. A subscriber that a busy machine runs too late misses the sample in which
+    // nothing is learned yet; the second generation is frozen in that state.
+    let _simulator = env.simulator(&["front"], &["--seed=52", "--baud=500000", "--world=bare"]);
     let first = generations.await_line("the first generation", is_class("background"));
-    assert_eq!(
-        (number(&first, "generation"), number(&first, "count"), number(&first, "taught")),
-        (0, 361, 0)
-    );
+    assert_eq!((number(&first, "generation"), number(&first, "count")), (0, 361), "{first}");
+    assert!(number(&first, "taught") == 0 || number(&first, "topic_seq") > 0, "{first}");
     until("it is learned", || number(&model(&env), "taught") > 300);
     let file = env.word("model.json");
     taken(&env, &["save", &file]);
