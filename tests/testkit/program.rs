@@ -88,9 +88,19 @@ impl Program {
 
     /// Returns whether it has ended.
     pub(crate) fn is_over(&self) -> bool {
-        let status = std::fs::read_to_string(format!("/proc/{}/stat", self.pid())).unwrap_or_default();
+        matches!(self.state(), None | Some('Z' | 'X'))
+    }
+
+    /// Returns whether a signal has stopped it.
+    pub(crate) fn is_stopped(&self) -> bool {
+        self.state() == Some('T')
+    }
+
+    /// Returns the state of its process in the kernel's letters.
+    fn state(&self) -> Option<char> {
+        let status = std::fs::read_to_string(format!("/proc/{}/stat", self.pid())).ok()?;
         // The state follows the name in brackets.
-        status.rsplit_once(')').is_none_or(|(_, rest)| rest.trim_start().starts_with(['Z', 'X']))
+        status.rsplit_once(')')?.1.trim_start().chars().next()
     }
 
     /// Returns whether it ends without any output on stdout.

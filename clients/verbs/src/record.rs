@@ -252,10 +252,9 @@ impl Recorder<'_> {
         stop.store(false, Ordering::Relaxed);
         let told = self.end_gap();
         self.queue.end();
-        let mut looks = 0;
+        let mut second = SecondStop::default();
         while !writing.is_finished() {
-            looks += 1;
-            if stop.swap(false, Ordering::Relaxed) && looks > SAME_WISH {
+            if second.poll(stop.swap(false, Ordering::Relaxed)) {
                 let what = "the disk had not stored the end of the recording when a second signal came";
                 return Err(Failure::new(Kind::Failed, what, REPAIR).into());
             }
@@ -321,10 +320,41 @@ impl Sink for Recorder<'_> {
     }
 }
 
+/// Distinguishes a second request to stop from the signals that belong to the first one. A shell that loses its terminal
+/// sends another SIGHUP than the terminal, and both may arrive after SIGINT. They come within a second, but a busy machine
+/// may not run this process for that long. Therefore polls are counted, and not time.
+#[derive(Default)]
+struct SecondStop {
+    polls: u32,
+}
+
+impl SecondStop {
+    /// Polls that take the signals of one request.
+    const SAME_REQUEST: u32 = 20;
+
+    /// Counts a poll. Returns whether a signal since the last poll is a second request to stop.
+    fn poll(&mut self, is_signaled: bool) -> bool {
+        self.polls += 1;
+        is_signaled && self.polls > Self::SAME_REQUEST
+    }
+}
+
 /// So often it is looked what the writing thread says.
 const LOOK_EVERY: Duration = Duration::from_millis(50);
-/// Signals that come together are one wish to stop: a shell that loses its terminal sends another SIGHUP than the terminal.
-/// They come within a second, but a busy machine may not run this process for as long. So looks are counted, and not time.
-const SAME_WISH: u32 = 20;
 /// What can be done with a file that has no end.
 const REPAIR: &str = "what is in the file can be read; `scanhub convert` gives it an index";
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_second_request_to_stop_comes_later_than_the_signals_of_the_first() {
+        let mut second = SecondStop::default();
+        // A signal at every poll, however long each of them takes.
+        assert!((0..SecondStop::SAME_REQUEST).all(|_| !second.poll(true)));
+        assert!(!second.poll(false));
+        assert!(second.poll(true));
+        assert!(LOOK_EVERY * SecondStop::SAME_REQUEST >= Duration::from_secs(1));
+    }
+}
