@@ -73,7 +73,9 @@ fn signal(pid: u32, signal: Signal) {
 }
 
 fn probe(env: &TestEnv, port: &str) -> Value {
-    env.run(&["probe", &env.word(port), "--json"]).lines()[0].clone()
+    let outcome = env.run(&["probe", &env.word(port), "--json"]);
+    assert_eq!(outcome.code, Some(0), "{outcome}");
+    outcome.lines()[0].clone()
 }
 
 #[test]

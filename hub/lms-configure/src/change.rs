@@ -323,6 +323,10 @@ impl Conversation for Change {
         }
     }
 
+    fn restart_if_late(&mut self, now: Nanos) -> bool {
+        self.exchange.restart_if_late(now)
+    }
+
     fn transmitted(&mut self, now: Nanos) {
         self.exchange.transmitted(now);
     }

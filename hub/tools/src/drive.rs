@@ -63,6 +63,9 @@ fn drain<C: Conversation>(
                 if not_before > now {
                     std::thread::sleep(Duration::from_nanos(not_before - now));
                 }
+                if talk.restart_if_late(clock::now()) {
+                    continue;
+                }
                 port.write(byte)?;
                 talk.transmitted(clock::now());
             }

@@ -44,6 +44,11 @@ pub trait Conversation {
     /// The deadline passed, and a read found nothing.
     fn handle_timeout(&mut self, now: Nanos);
 
+    /// Call it at `now`, immediately before the byte of [`Output::Transmit`] is written. Returns whether it is too late for
+    /// this byte, as on a machine that did not run the program for a few milliseconds. Then do not write it, and continue
+    /// draining: the request starts over.
+    fn restart_if_late(&mut self, now: Nanos) -> bool;
+
     /// The byte of [`Output::Transmit`] was written at `now`.
     fn transmitted(&mut self, now: Nanos);
 
@@ -104,6 +109,12 @@ impl<R: Say> Exchange<R> {
         self.now = now;
         self.framer.release(now.saturating_sub(self.last_byte));
         self.open.as_ref().is_some_and(|open| now >= open.give_up_at())
+    }
+
+    /// As [`Conversation::restart_if_late`].
+    pub fn restart_if_late(&mut self, now: Nanos) -> bool {
+        self.now = now;
+        self.open.as_mut().is_some_and(|open| open.restart_if_late(now, self.baud))
     }
 
     /// As [`Conversation::transmitted`].
@@ -232,5 +243,40 @@ mod tests {
         };
         assert_eq!(until(false), 150 * MILLIS);
         assert_eq!(until(true), 150 * MILLIS + line_time(161, 9600));
+    }
+
+    #[test]
+    fn a_request_whose_next_byte_is_late_starts_over_without_a_try() {
+        for (gap, is_late) in [(5 * MILLIS, false), (5 * MILLIS + 1, true)] {
+            let byte_ns = line_time(1, 9_600);
+            let mut exchange = Exchange::new(Baud::B9600, 0);
+            exchange.ask(Request::Status, 0, 1);
+            let request = Request::Status.encode(0);
+            let (mut written, mut now, mut restarts) = (0, 0, 0);
+            while written < request.bytes().len() {
+                match exchange.output(Nanos::MAX) {
+                    Output::Transmit { byte, not_before } => {
+                        // The fourth byte is late, once.
+                        let late = if written == 3 && restarts == 0 { byte_ns + gap } else { 0 };
+                        now = (now + late).max(not_before);
+                        if exchange.restart_if_late(now) {
+                            (written, restarts) = (0, restarts + 1);
+                            continue;
+                        }
+                        assert_eq!(byte, request.bytes()[written]);
+                        written += 1;
+                        exchange.transmitted(now);
+                    }
+                    Output::Wait { until } => {
+                        // The sensor forgets what it has received.
+                        assert_eq!((until - now, written), (10 * MILLIS, 0));
+                        now = until;
+                        assert!(!exchange.handle_timeout(now));
+                    }
+                    output => panic!("{output:?}"),
+                }
+            }
+            assert_eq!(restarts, u32::from(is_late), "{gap}");
+        }
     }
 }

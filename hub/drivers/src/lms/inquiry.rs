@@ -216,6 +216,10 @@ impl Conversation for Inquiry {
         }
     }
 
+    fn restart_if_late(&mut self, now: Nanos) -> bool {
+        self.exchange.restart_if_late(now)
+    }
+
     fn transmitted(&mut self, now: Nanos) {
         self.exchange.transmitted(now);
     }

@@ -49,6 +49,8 @@ pub(crate) struct Outgoing<R = Request> {
     encoded: Encoded,
     sent: usize,
     not_before: Nanos,
+    /// Earliest time at which the byte before the next one can have left, see [`Outgoing::restart_if_late`].
+    left_at: Nanos,
     tries: u8,
     tries_left: u8,
     /// Added to every wait for the acknowledgement.
@@ -71,6 +73,7 @@ impl<R: Say> Outgoing<R> {
             encoded,
             sent: 0,
             not_before,
+            left_at: 0,
             tries,
             tries_left: tries - 1,
             patience: 0,
@@ -141,6 +144,17 @@ impl<R: Say> Outgoing<R> {
         self.acknowledged
     }
 
+    /// Starts over with the first byte if `now` is too late for the next one, and returns whether it is. The sensor has
+    /// dropped the request, and it cannot have received its last byte. This does not count as a try.
+    pub(crate) fn restart_if_late(&mut self, now: Nanos, baud: Baud) -> bool {
+        let is_late = self.is_partly_out() && now > self.left_at + line_time(1, baud.rate()) + MOST_GAP;
+        self.left_at = now;
+        if is_late {
+            (self.sent, self.not_before) = (0, now + FORGOTTEN);
+        }
+        is_late
+    }
+
     /// When its last byte left; `None` while there are more.
     pub(crate) fn out_at(&self) -> Option<Nanos> {
         self.out_at
@@ -166,6 +180,8 @@ impl<R: Say> Outgoing<R> {
 pub(crate) const FORGOTTEN: Nanos = 10 * MILLIS;
 /// Between the end of a byte and the next: more than 55 us, far less than 6 ms (Telegram listing 4.3).
 const GAP: Nanos = 120 * MICROS;
+/// Longest time between the end of a byte and the next one: 6 ms (Telegram listing 4.3), less the time of the write.
+const MOST_GAP: Nanos = 5 * MILLIS;
 /// A byte that may leave within so long is asked for at once; a later one is waited for as for anything else.
 pub(crate) const SOON: Nanos = 5 * MILLIS;
 /// ACK or NAK comes within 60 ms (Telegram listing 4.3), and a reply was captured to begin within 100 ms; the rest is

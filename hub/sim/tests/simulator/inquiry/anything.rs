@@ -20,7 +20,11 @@ fn drive<C: Conversation>(talk: &mut C, seed: u64) -> Vec<Vec<u8>> {
             Output::Done => return said,
             Output::SetBaud(_) => request.clear(),
             Output::Transmit { byte, not_before } => {
-                now = now.max(not_before);
+                now = now.max(not_before) + if random.u8(..100) == 0 { 20 * MILLIS } else { 0 };
+                if talk.restart_if_late(now) {
+                    request.clear();
+                    continue;
+                }
                 request.push(byte);
                 if let [_, _, low, high, ..] = request[..]
                     && request.len() == usize::from(u16::from_le_bytes([low, high])) + FRAME
