@@ -1,9 +1,7 @@
 //! LDROBOT LD06, LD19, STL19P, STL27L and LD14P: the framer, packets, revolutions, and the session with a scanner that streams
 //! without a request. Nothing is ever sent to it. There is no heap allocation.
 
-mod family;
 pub mod framer;
-mod heard;
 mod model;
 pub mod packet;
 mod restarts;
@@ -11,6 +9,5 @@ mod sequence;
 mod session;
 
 pub use crate::line::{Heard, Packets, Tally, Turn, TurnCounts};
-pub use heard::Trouble;
 pub use model::Model;
-pub use session::{Session, Settings};
+pub use session::{Session, Settings, Trouble};

@@ -2,21 +2,32 @@
 //! with a rotating head also packets, revolutions, and the grid that a revolution is put on. This module names no family.
 
 mod arrival;
-mod buffer;
 pub mod family;
 pub mod framing;
 pub mod grid;
 mod reads;
 mod sensor_clock;
 mod session;
-pub mod suspect;
-mod turning;
 mod turns;
 
 pub use arrival::{Arrivals, Flow};
-pub use buffer::{Buffer, Tally};
+pub use family::{Heard, Packets, Turn, TurnCounts};
+pub use framing::{Buffer, Tally};
 pub use reads::Reads;
 pub use sensor_clock::SensorClock;
 pub use session::{Account, Control, Output, Received, Session, State};
-pub use turning::{Heard, Packets, Turn, TurnCounts};
 pub use turns::{Closed, Pace, Turns};
+
+/// Why a telegram or packet is suspect: bits of `reasons`. A family sets those that it can detect.
+pub mod suspect {
+    /// The error counters of the line have increased.
+    pub const LINE_ERROR: u8 = 1;
+    /// The bytes before it belonged to nothing: its neighbor was damaged.
+    pub const NEIGHBOUR: u8 = 2;
+    /// It took longer than usual.
+    pub const SLOW: u8 = 4;
+    /// Bits are set that no scanner sets.
+    pub const FORBIDDEN_BITS: u8 = 8;
+    /// Another acceptable header began inside it.
+    pub const HEADER_INSIDE: u8 = 16;
+}

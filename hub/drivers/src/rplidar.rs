@@ -1,7 +1,7 @@
 //! Slamtec RPLIDAR A1, A2, A3, S1, S2, S3 and C1: requests and responses, the framer, packets, revolutions, and the session with
 //! a scanner. No request changes a setting that the scanner keeps without power. There is no heap allocation.
 
-mod family;
+mod device_info;
 mod framer;
 mod model;
 mod offers;
@@ -9,9 +9,8 @@ pub mod packet;
 mod request;
 mod sequence;
 mod session;
-mod told;
 
 pub use crate::line::{Heard, Packets, Tally, Turn, TurnCounts};
+pub use device_info::{Health, Info};
 pub use model::{Mode, Model};
-pub use session::{Session, Settings};
-pub use told::{Health, Info, Trouble};
+pub use session::{Session, Settings, Trouble};

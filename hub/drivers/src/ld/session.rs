@@ -1,99 +1,103 @@
-//! A scanner behind a line, driven from outside as [`crate::line::Session`] says. It only listens: at the model's rate, or at
-//! both in turn until packets come. Then it learns how many points there are in a second, hands out packets as they come,
-//! and turns. Refuses to know a hub, and what becomes of a turn.
+//! The session with an LDROBOT scanner, which streams without a request. The session only receives: at the model's rate, or at
+//! both rates in turn until packets arrive. It learns how many points the scanner measures per second, and returns packets
+//! as they arrive, and revolutions.
 
-mod driven;
+use core::fmt;
 
-use crate::line::{
-    Closed, Flow, Pace, Packets, Reads, Received, SensorClock, State, Tally, Turn, TurnCounts, Turns,
-};
 use schema::{MILLIS, Nanos, line_time};
 
 use crate::ld::framer::{Framer, Span};
-use crate::ld::heard::Trouble;
 use crate::ld::model::Model;
 use crate::ld::packet::{LEN, POINTS, Packet};
 use crate::ld::restarts::Restarts;
 use crate::ld::sequence::{Place, Sequence};
+use crate::line::family::{self, Features, Turning, Wanted};
+use crate::line::{
+    self, Account, Closed, Control, Flow, Heard, Output, Pace, Packets, Reads, Received, SensorClock, State,
+    Tally, Turn, TurnCounts, Turns,
+};
 
-/// What a session shall do.
+/// Settings of a session.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Settings {
-    /// What is at the other end; `None` is sought.
+    /// The model. `None`: the session finds it out.
     pub model: Option<Model>,
-    /// Beams of the grid that turns are for; `None`: the model's, at most [`most_beams`](Self::most_beams).
+    /// Number of beams of the grid. `None`: the model's number, at most [`most_beams`](Self::most_beams).
     pub beams: Option<usize>,
-    /// The most beams that there is room for; `None`: as many as a grid can have.
+    /// Maximum number of beams. `None`: the maximum of a grid.
     pub most_beams: Option<usize>,
-    /// Whether the port has one rate and not the pace of a line: a serial server on the network, a recording.
+    /// Whether the port has one fixed rate and bytes do not arrive at the pace of a line, as with a serial server on the
+    /// network or a recording.
     pub fixed_rate: bool,
 }
 
 impl Settings {
-    /// The rate at which the port is to be opened, in bits per second.
+    /// Returns the rate at which the port is opened, in bits per second.
     pub fn baud(&self) -> u32 {
         self.model.unwrap_or(Model::Ld19).baud()
     }
 }
 
-/// One scanner's session.
+/// The session with one scanner.
 #[derive(Clone, Debug)]
 pub struct Session {
     settings: Settings,
     framer: Framer,
-    pub(crate) reads: Reads,
+    reads: Reads,
     clock: SensorClock,
-    /// The clock of the packets before the one with this number, of those handed out last, if another sequence began there.
+    /// If a new sequence began within the packets that were returned last: the number of its first packet among them, and
+    /// the clock of the packets before.
     clock_before: Option<(usize, SensorClock)>,
     sequence: Sequence,
     turns: Turns<MOST_POINTS>,
-    /// Of the packet whose points were put last.
+    /// Pace of the packet whose points were added last.
     pace: Option<Pace>,
     phase: Phase,
     baud: u32,
     change_baud: bool,
-    /// The grid, once it is known, and whether it is known what this stream is.
+    /// Number of beams, once it is known.
     beams: Option<usize>,
+    /// Whether the points per second of this stream are known.
     is_learned: bool,
-    /// As [`crate::line::family::Turning::scanner_time`].
-    pub(crate) scanner_time: Option<Nanos>,
-    /// Packets that were handed out and are not in turns yet.
+    scanner_time: Option<Nanos>,
+    /// Packets that were returned and whose points are not in revolutions yet.
     current: Option<Current>,
     now: Nanos,
     trouble: Option<Trouble>,
     /// Time since which no packet has arrived.
     quiet_since: Nanos,
-    /// Bytes of streams that were in nothing, and all of those when it was last looked.
+    /// Discarded bytes of streams, and all discarded bytes when the first number was updated.
     damaged: (u64, u64),
     resyncs: u64,
     restarts: Restarts,
-    /// Bytes of streams that were in nothing, and bytes of packets, when the last revolution ended.
+    /// Discarded bytes of streams, and bytes of packets, when the last revolution ended.
     turned_with: (u64, u64),
     cut: bool,
 }
 
 #[derive(Clone, Copy, Debug)]
 enum Phase {
-    /// No packets yet; at `next_at` another rate is tried.
+    /// No packets yet. At `next_at` the session tries another rate.
     Listening { shown: State, next_at: Nanos },
-    /// Packets come, by `silent_at` the next one; `turned_at` the last turn was over, or they began to come.
+    /// Packets arrive, the next one by `silent_at`. The last revolution ended at `turned_at`, or packets began to arrive then.
     Hearing { turned_at: Nanos, has_turned: bool, silent_at: Nanos },
-    /// Nobody wants anything.
+    /// A user paused the session.
     Paused,
 }
 
-/// Packets on their way into turns.
+/// Packets whose points are being added to revolutions.
 #[derive(Clone, Copy, Debug)]
 struct Current {
     span: Span,
     places: [Place; MOST],
-    /// The first one that is not done, and whether its points are.
+    /// Number of the first packet that is not finished.
     packet: usize,
+    /// Whether its points were added.
     is_put: bool,
 }
 
 impl Session {
-    /// A session on a port that is open at the rate of `settings`.
+    /// Creates a session on a port that is open at the rate of `settings`.
     pub fn new(settings: Settings, now: Nanos) -> Self {
         Session {
             settings,
@@ -122,48 +126,51 @@ impl Session {
         }
     }
 
-    /// What is at the other end, as far as that is known: of models that cannot be told apart, one.
+    /// Returns the model, once it is known. Of models that cannot be distinguished, it is one.
     pub fn model(&self) -> Option<Model> {
         self.settings.model.or_else(|| self.heard_model())
     }
 
-    /// What it turned out to be where another model is wanted: many of them speak alike.
-    pub(crate) fn other_model(&self) -> Option<Model> {
+    /// Returns the model of the scanner if it is not the one of the settings. Models with the same number of points per second
+    /// cannot be distinguished.
+    fn heard_other_model(&self) -> Option<Model> {
         let wanted = self.settings.model?;
         self.heard_model().filter(|heard| heard.points_per_second() != wanted.points_per_second())
     }
 
+    /// Returns the model that the points per second indicate.
     fn heard_model(&self) -> Option<Model> {
         self.sequence.points_per_second().map(Model::of_point_rate)
     }
 
-    /// Beams of the grid that turns are for; nothing before it is known what is at the other end.
+    /// Returns the number of beams of a scan, once the model is known.
     pub fn beams(&self) -> Option<usize> {
         self.beams
     }
 
-    /// Points that the scanner measures in a second; nothing before enough packets came.
+    /// Returns the points that the scanner measures per second, once enough packets have arrived.
     pub fn points_per_second(&self) -> Option<f32> {
         self.sequence.points_per_second()
     }
 
-    /// What became of the bytes.
+    /// Returns the counters of the framer.
     pub fn tally(&self) -> &Tally {
         self.framer.tally()
     }
 
-    /// How many turns there were of which kind.
+    /// Returns the numbers of revolutions by kind.
     pub fn turn_counts(&self) -> TurnCounts {
         self.turns.counts()
     }
 
-    /// The rates at which packets may come.
+    /// Returns the rates at which packets may arrive.
     fn rates(&self) -> &'static [u32] {
         const BOTH: [u32; 2] = [230_400, 921_600];
         let at = usize::from(self.baud == BOTH[1]);
         if self.settings.model.is_some() || self.settings.fixed_rate { &BOTH[at..=at] } else { &BOTH }
     }
 
+    /// Ends the stream, and waits for packets. The session shows the state `shown` meanwhile.
     fn listen(&mut self, shown: State) {
         self.phase = Phase::Listening { shown, next_at: self.now + LISTEN };
         self.quiet_since = self.now;
@@ -174,7 +181,7 @@ impl Session {
         self.reads.end_rest();
     }
 
-    /// Nothing was heard at this rate: tries the next one, and says for how long already.
+    /// Tries the next rate, because no packet arrived at this one, and updates the time in the trouble.
     fn listen_on(&mut self, shown: State) {
         self.phase = Phase::Listening { shown, next_at: self.now + LISTEN };
         let rates = self.rates();
@@ -190,7 +197,7 @@ impl Session {
         }
     }
 
-    /// Does what is due now that all bytes were looked at: bytes that are no packets keep nobody waiting.
+    /// Handles deadlines after all bytes were framed. Bytes that are no packets do not extend a deadline.
     fn expire(&mut self) {
         match self.phase {
             Phase::Listening { shown, next_at } if self.now >= next_at => self.listen_on(shown),
@@ -214,7 +221,7 @@ impl Session {
         self.turned_with = (self.damaged.0, self.framer.tally().in_packets);
     }
 
-    /// Packets came: dates them, and remembers them for turns.
+    /// Stamps the packets of `span`, and keeps them for revolutions.
     fn receive(&mut self, span: Span) -> Received<'_, Packets> {
         let mut span = span;
         span.reasons |= self.reads.take_doubt(span.offset + (span.packets * LEN) as u64);
@@ -253,7 +260,7 @@ impl Session {
         let latest = self.reads.arrivals().latest(last_byte, pace);
         let last = stamp(span.packets - 1).map_or(latest, |at| at + packet_time);
         let at = first.unwrap_or(last.saturating_sub(packet_time * span.packets as u64));
-        // One that came twice is dated by its arrival, and the next one by the scanner's clock.
+        // A packet that arrived twice is stamped by its arrival, and the next one by the scanner's clock.
         let last = self.reads.date_packet(last.max(at));
         self.current = Some(Current { span, places, packet: 0, is_put: false });
         self.cut |= self.framer.tally().packets == span.packets as u64 && self.framer.tally().discarded > 0;
@@ -268,7 +275,7 @@ impl Session {
         }
     }
 
-    /// The clock by which packet `number` of those handed out last is dated.
+    /// Returns the clock that stamps packet number `number` of those returned last.
     fn clock_of(&self, number: usize) -> &SensorClock {
         match &self.clock_before {
             Some((first, clock)) if number < *first => clock,
@@ -276,7 +283,7 @@ impl Session {
         }
     }
 
-    /// The stream begins or goes on.
+    /// Starts or extends the stream after packets have arrived.
     fn hear(&mut self) {
         let silent_at = self.now + SILENCE;
         let discarded = self.framer.tally().discarded;
@@ -303,7 +310,7 @@ impl Session {
         }
     }
 
-    /// Puts what was handed out into turns; one that is over.
+    /// Adds the points of the current packets to revolutions. Returns the first revolution that is complete.
     fn advance_turns(&mut self) -> Option<Closed> {
         while let Some(current) = &mut self.current {
             let (bytes, _) = self.framer.bytes(current.span).as_chunks::<LEN>();
@@ -320,9 +327,9 @@ impl Session {
                 if let Place::Next { angle, missing, from, .. } = place
                     && missing > 0
                 {
-                    // Up to the points beside it nothing is; they may be in a turn that is not open yet.
+                    // No point was received between the two angles. They may be in a revolution that has not begun yet.
                     self.turns.lacks(from + pace.step, angle - pace.step);
-                    // The head may be slower now than it was in a turn that ends here.
+                    // The head may be slower now than in the revolution that ends here.
                     if let Some(closed) = self.turns.reach(angle, self.pace.unwrap_or(pace)) {
                         return Some(closed);
                     }
@@ -343,6 +350,7 @@ impl Session {
         None
     }
 
+    /// Returns a complete revolution, and updates the state of the session.
     fn show(&mut self, closed: Closed) -> Turn<'_> {
         let first = self.dated(closed).first;
         self.reads.end_turn(first);
@@ -354,12 +362,12 @@ impl Session {
         self.dated(closed)
     }
 
-    /// The turn that is being measured, as if it ended with the points that are known.
-    pub(crate) fn begun_turn(&self) -> Option<Turn<'_>> {
+    /// Returns the revolution that is being measured, with the points that have arrived.
+    fn begun_turn(&self) -> Option<Turn<'_>> {
         self.turns.begun(self.pace?).map(|begun| self.dated(begun))
     }
 
-    /// A turn that is over, or that is being measured, by the hub's clock.
+    /// Converts a revolution to the hub's clock.
     fn dated(&self, closed: Closed) -> Turn<'_> {
         let packet = self.current.map_or(usize::MAX, |current| current.packet);
         let stamp = |at: Nanos| self.clock_of(packet).time(at).unwrap_or(self.now);
@@ -378,7 +386,188 @@ impl Session {
     }
 }
 
-/// Puts the points of `packet`, which is at `place`, into turns.
+impl line::Session for Session {
+    type Heard<'a> = Heard<'a>;
+    type Trouble = Trouble;
+
+    fn spare(&mut self) -> &mut [u8] {
+        let spare = self.framer.spare();
+        self.reads.offer(spare.len());
+        spare
+    }
+
+    fn commit(&mut self, now: Nanos, len: usize) {
+        self.now = now;
+        self.reads.note(now, len, self.state() == State::Streaming);
+        if len > 0 {
+            self.framer.commit(len);
+        }
+    }
+
+    fn handle_timeout(&mut self, now: Nanos) {
+        self.now = now;
+        self.framer.release(now.saturating_sub(self.reads.last_byte()));
+    }
+
+    fn control(&mut self, control: Control, now: Nanos) {
+        self.now = now;
+        match (control, self.phase) {
+            (Control::Pause, _) => {
+                self.listen(State::Paused);
+                self.phase = Phase::Paused;
+            }
+            (Control::Resume, Phase::Paused) => self.listen(State::Probing),
+            (Control::Resume, _) => {}
+            (Control::Resync, _) => {
+                self.resyncs += 1;
+                self.trouble = None;
+                self.listen(State::Probing);
+            }
+        }
+    }
+
+    fn transmitted(&mut self, now: Nanos) {
+        self.now = now;
+    }
+
+    fn poll_output(&mut self) -> Output<Heard<'_>> {
+        if let Some(closed) = self.advance_turns() {
+            return Output::Heard(Heard::Turn(self.show(closed)));
+        }
+        while let Some(span) = self.framer.advance(most_together(self.baud)) {
+            if !matches!(self.phase, Phase::Paused) {
+                return Output::Heard(Heard::Packets(self.receive(span)));
+            }
+        }
+        self.expire();
+        if core::mem::take(&mut self.change_baud) {
+            self.framer.clear();
+            return Output::SetRate(self.baud);
+        }
+        let until = match self.phase {
+            Phase::Listening { next_at, .. } => next_at,
+            Phase::Hearing { silent_at, .. } => silent_at,
+            Phase::Paused => Nanos::MAX,
+        };
+        self.reads.wait(self.now, until, self.framer.hold())
+    }
+
+    fn state(&self) -> State {
+        match self.phase {
+            Phase::Listening { shown, .. } => shown,
+            Phase::Hearing { has_turned: false, .. } => State::Starting,
+            Phase::Hearing { .. } => State::Streaming,
+            Phase::Paused => State::Paused,
+        }
+    }
+
+    fn trouble(&self) -> Option<Trouble> {
+        self.trouble.filter(|_| !matches!(self.phase, Phase::Paused))
+    }
+
+    fn missing(&self) -> Option<&'static str> {
+        matches!(self.trouble(), Some(Trouble::NoPackets { .. })).then_some("LDROBOT packets")
+    }
+
+    fn rate(&self) -> u32 {
+        self.baud
+    }
+
+    fn account(&self) -> Account {
+        let tally = self.framer.tally();
+        let (came, lost) = self.sequence.came_and_lost();
+        Account {
+            read: tally.read,
+            in_telegrams: tally.in_packets,
+            acknowledge: 0,
+            discarded: tally.discarded,
+            buffered: self.framer.buffered() as u64,
+            telegrams: tally.packets,
+            due: came + lost,
+            lost,
+            damaged: self.damaged.0,
+            rejected_checksum: tally.rejected_checksum,
+            resyncs: self.resyncs,
+            restarts: self.restarts.count(),
+            began_with_a_cut: self.cut,
+        }
+    }
+}
+
+impl Turning for Session {
+    const FEATURES: Features = Features {
+        models: &ALL,
+        // Enough for all models but the STL27L.
+        auto: family::Model { name: "auto", baud: Model::Ld19.baud(), beams: 720 },
+        modes: &[],
+        can_rest: false,
+        speaks_unasked: true,
+    };
+
+    fn begin(wanted: Wanted, now: Nanos) -> Self {
+        let Wanted { model, beams, most_beams, fixed_rate, .. } = wanted;
+        Session::new(Settings { model: model.and_then(Model::named), beams, most_beams, fixed_rate }, now)
+    }
+
+    fn model(&self) -> Option<family::Model> {
+        self.model().map(described)
+    }
+
+    fn beams(&self) -> Option<usize> {
+        self.beams()
+    }
+
+    fn begun(&self) -> Option<Turn<'_>> {
+        self.begun_turn()
+    }
+
+    fn other_model(&self) -> Option<family::Model> {
+        self.heard_other_model().map(described)
+    }
+
+    fn scanner_time(&self) -> Option<Nanos> {
+        self.scanner_time
+    }
+
+    fn doubt(&mut self, reasons: u8) {
+        self.reads.doubt(reasons);
+    }
+}
+
+/// Reason why a session does not stream.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Trouble {
+    /// No packets arrive.
+    NoPackets {
+        /// The only rate that the session tried. `None`: it tried both.
+        baud: Option<u32>,
+        /// Seconds without a packet, rounded down to 1, 2, 4, ..
+        seconds: u32,
+    },
+    /// No packet arrived for one second.
+    Silence,
+    /// Packets arrive, but the head does not rotate.
+    StandsStill,
+}
+
+impl fmt::Display for Trouble {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Trouble::NoPackets { baud, seconds } => {
+                f.write_str("no packets at ")?;
+                match baud {
+                    Some(baud) => write!(f, "{baud}")?,
+                    None => f.write_str("230400 and 921600")?,
+                }
+                write!(f, " baud for {seconds} s: power, cable, other port?")
+            }
+            Trouble::Silence => f.write_str("no packet for one second"),
+            Trouble::StandsStill => f.write_str("packets come, but the head does not turn: is it blocked?"),
+        }
+    }
+}
+
+/// Adds the points of `packet`, which is at `place` of the sequence, to `turns`.
 fn put(turns: &mut Turns<MOST_POINTS>, packet: &Packet<'_>, place: Place, reasons: u8, pace: Pace) {
     let (last, angle) = match place {
         Place::Again => return,
@@ -396,13 +585,34 @@ fn put(turns: &mut Turns<MOST_POINTS>, packet: &Packet<'_>, place: Place, reason
     }
 }
 
-/// Points of an STL27L that turns five times a second, and some; what is more does not fit into a turn.
+/// Describes a model for the configuration.
+const fn described(model: Model) -> family::Model {
+    family::Model { name: model.name(), baud: model.baud(), beams: model.beams() }
+}
+
+/// All models, described for the configuration.
+const ALL: [family::Model; Model::ALL.len()] = {
+    let mut all = [described(Model::Ld19); Model::ALL.len()];
+    let mut at = 0;
+    while at < all.len() {
+        all[at] = described(Model::ALL[at]);
+        at += 1;
+    }
+    all
+};
+
+/// Returns how many packets are returned together: as many as arrive in 10 ms.
+const fn most_together(baud: u32) -> usize {
+    if baud > 500_000 { MOST } else { 3 }
+}
+
+/// Maximum number of points in a revolution: more than an STL27L measures at five revolutions per second.
 const MOST_POINTS: usize = 4_400;
-/// How long is listened at one rate before the next: a stream has a packet each 3 ms.
+/// How long the session listens at one rate. A stream has a packet every 3 ms.
 const LISTEN: Nanos = 300 * MILLIS;
-/// Without a packet for so long the session begins again.
+/// After this time without a packet, the session begins again.
 const SILENCE: Nanos = 1_000 * MILLIS;
-/// The slowest head turns twice a second.
+/// After this time without a revolution, the head is blocked. The slowest head rotates twice per second.
 const STILL: Nanos = 2_000 * MILLIS;
-/// Packets of one sample at the most: of an STL27L, which sends one each 0.56 ms.
+/// Maximum number of packets that are returned together: those of an STL27L in 10 ms, one every 0.56 ms.
 const MOST: usize = 17;

@@ -1,119 +1,177 @@
-//! A family of scanners whose head turns and whose points fall where they like, as a configuration and a hub see it: the
-//! models that it has, what may be set for one, and how a session begins. So whoever offers all families needs a list of
-//! them and nothing else. Refuses to know what a family speaks.
+//! What is common to families of scanners with a rotating head: the session trait, the models and settings that a configuration
+//! can name, and the events of a session. A caller that supports all families needs only a list of them.
 
 use core::fmt;
 
-use crate::line::{Session, Turn};
+use crate::line::grid::Point;
+use crate::line::{Received, Session};
 use schema::Nanos;
 
-/// A session with a scanner of such a family.
+/// Session with a scanner whose head rotates.
 pub trait Turning: Session + Sized {
-    /// What may be set for one.
+    /// Models and settings of the family.
     const FEATURES: Features;
 
-    /// A session on a port that is open at the rate of the model that is `wanted`.
+    /// Creates a session on a port that is open at the rate of the model in `wanted`.
     fn begin(wanted: Wanted, now: Nanos) -> Self;
 
-    /// What is at the other end, as far as that is known: of models that cannot be told apart, one.
+    /// Returns the model, once it is known. Of models that cannot be distinguished, it is one.
     fn model(&self) -> Option<Model>;
 
-    /// Beams of the grid that turns are for; nothing before it is known what is at the other end.
+    /// Returns the number of beams of a scan, once the model is known.
     fn beams(&self) -> Option<usize>;
 
-    /// The turn that is being measured, as if it ended with the points that are known, once [`Session::poll_output`] wants to
-    /// wait; nothing between turns.
+    /// Returns the revolution that is being measured, with the points that have arrived. Call it when [`Session::poll_output`]
+    /// has returned a wait. `None` between revolutions.
     fn begun(&self) -> Option<Turn<'_>>;
 
-    /// What it turned out to be where another model is wanted; of models that cannot be told apart, one.
+    /// Returns the model if it is not the one of the settings. Of models that cannot be distinguished, it is one.
     fn other_model(&self) -> Option<Model> {
         None
     }
 
-    /// What has to be named before it can be read where nobody can be asked, in words; nothing if nothing has.
+    /// Returns the name of a setting that a recording needs before it can be read, in words.
     fn lacks(&self) -> Option<&'static str> {
         None
     }
 
-    /// Writes more of what it is, in a few letters: how it measures, and its firmware.
+    /// Writes the scan mode and the firmware version of the scanner, in short form.
     fn specify(&self, text: &mut dyn fmt::Write) {
         let _ = text;
     }
 
-    /// Writes what the scanner said of itself, such as its firmware, into `identity`, and how it says that it is into
-    /// `health`. Nothing before it was asked all that changes nothing; of one that is never asked, nothing at all.
+    /// Writes the identity that the scanner reported into `identity`, and its health into `health`. Returns `None` before it has
+    /// reported both, and always for a family that accepts no requests.
     fn introduction(&self, identity: &mut dyn fmt::Write, health: &mut dyn fmt::Write) -> Option<Condition> {
         let _ = (identity, health);
         None
     }
 
-    /// When the last packet that was handed out was measured, by the scanner's own clock, whose zero is any; nothing where it
-    /// has none. It begins again where the scanner does.
+    /// Returns the time at which the last returned packet was measured, by the scanner's own clock, if it has one. Its zero is
+    /// arbitrary. The clock restarts with the scanner.
     fn scanner_time(&self) -> Option<Nanos> {
         None
     }
 
-    /// The packets that are handed out next are suspect for these `reasons` too, bits of [`crate::line::suspect`]: of a recording,
-    /// which has nothing any more of what was damaged beside them. Where a family does not take it, its turns do not say it.
+    /// Adds `reasons`, bits of [`crate::line::suspect`], to the packets that are returned next. Used for a recording, which does not
+    /// contain the damaged bytes beside a packet.
     fn doubt(&mut self, reasons: u8) {
         let _ = reasons;
     }
 }
 
-/// How well a scanner says that it is.
+/// Health that a scanner reports.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Condition {
-    /// It did not say.
+    /// Not reported.
     Unknown,
-    /// Well.
+    /// The scanner works.
     Good,
-    /// It measures, and may not for long.
+    /// The scanner measures, but may fail soon.
     Warning,
-    /// It does not measure.
+    /// The scanner does not measure.
     Error,
 }
 
-/// What may be set for a scanner of a family.
+/// Models and settings of a family.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Features {
     /// The models.
     pub models: &'static [Model],
-    /// What counts where the model is to be found out: the rate to begin with, and beams for which there is room.
+    /// Values for an unknown model: the first rate, and the number of beams for which there is space.
     pub auto: Model,
-    /// Names of the ways in which it can measure; empty if there is nothing to choose.
+    /// Names of the scan modes. Empty if there is no choice.
     pub modes: &'static [&'static str],
-    /// Whether its motor can rest.
+    /// Whether the motor can be stopped.
     pub can_rest: bool,
-    /// Whether it speaks as soon as it has power: then nothing need be sent to it.
+    /// Whether the scanner streams as soon as it has power, without a request.
     pub speaks_unasked: bool,
 }
 
-/// A model of scanner.
+/// A model of a scanner.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Model {
-    /// Its name in configuration and words.
+    /// Name in the configuration and in messages.
     pub name: &'static str,
-    /// The rate at which it speaks, in bits per second.
+    /// Rate of its line, in bits per second.
     pub baud: u32,
-    /// Beams of a turn unless something else is asked for.
+    /// Default number of beams of a scan.
     pub beams: usize,
 }
 
-/// What is wanted of a session.
+/// Settings of a session, with names in place of a family's types.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Wanted {
-    /// Name of one of the [`Features::models`]; `None` is to be found out.
+    /// Name of one of the [`Features::models`]. `None`: the session finds it out.
     pub model: Option<&'static str>,
-    /// Name of one of the [`Features::modes`]; `None`: the best one.
+    /// Name of one of the [`Features::modes`]. `None`: the best one.
     pub mode: Option<&'static str>,
-    /// Beams of the grid; `None`: the model's, at most [`most_beams`](Self::most_beams).
+    /// Number of beams of the grid. `None`: the model's number, at most [`most_beams`](Self::most_beams).
     pub beams: Option<usize>,
-    /// The most beams that there is room for; `None`: as many as a grid can have.
+    /// Maximum number of beams. `None`: the maximum of a grid.
     pub most_beams: Option<usize>,
-    /// Whether the port has one rate and not the pace of a line: a serial server on the network, a recording.
+    /// Whether the port has one fixed rate and bytes do not arrive at the pace of a line, as with a serial server on the
+    /// network or a recording.
     pub fixed_rate: bool,
-    /// Whether nobody can be talked to: a recording.
+    /// Whether nothing can be sent, because the bytes are from a recording.
     pub listen_only: bool,
-    /// Whether the motor rests while nobody follows, where it [can](Features::can_rest).
+    /// Whether the motor stops while there are no subscribers, if it [can](Features::can_rest).
     pub stop_when_idle: bool,
+}
+
+/// Event from a session with a scanner whose head rotates.
+#[derive(Clone, Copy, Debug)]
+pub enum Heard<'a> {
+    /// Packets that arrived together, at most 10 ms of them, without other bytes between them. Each packet is in one of these
+    /// events, in the order of arrival.
+    Packets(Received<'a, Packets>),
+    /// A complete revolution, after its packets.
+    Turn(Turn<'a>),
+}
+
+/// Facts about packets that arrived together.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Packets {
+    /// Number of packets.
+    pub count: usize,
+    /// Whether each packet has a checksum, and it was right.
+    pub is_checked: bool,
+    /// Whether they are the response to a request, without points.
+    pub is_reply: bool,
+}
+
+/// A revolution of the head.
+#[derive(Clone, Copy, Debug)]
+pub struct Turn<'a> {
+    /// Number of the revolution. Incomplete revolutions have numbers, too.
+    pub number: u64,
+    /// Points in the order of arrival, for a [`Grid`](crate::line::grid::Grid).
+    pub points: &'a [Point],
+    /// Time at which beam 0 was, or would have been, measured.
+    pub first: Nanos,
+    /// Time at which the last point was measured.
+    pub last: Nanos,
+    /// Duration of a revolution.
+    pub period: Nanos,
+    /// Number of beams of the grid.
+    pub beams: usize,
+    /// Points that the scanner measures per second.
+    pub points_per_second: f32,
+    /// Whether packets are missing.
+    pub incomplete: bool,
+    /// Reasons for suspicion: bits of [`crate::line::suspect`]; 0 is clean.
+    pub reasons: u8,
+}
+
+/// Numbers of revolutions by kind. They only increase.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct TurnCounts {
+    /// Returned revolutions, including incomplete ones.
+    pub turns: u64,
+    /// Returned revolutions that are incomplete.
+    pub incomplete: u64,
+    /// Revolutions that were not returned, because less than half of the points arrived.
+    pub short: u64,
+    /// Revolutions without a packet.
+    pub missed: u64,
 }

@@ -1,42 +1,42 @@
-//! What begins at a place in a stream of packets of one length, of which bytes may be missing.
+//! Framing of packets with a fixed length, in a stream that may lack bytes: the check of a packet, and the buffer of a framer.
 //!
-//! A checksum of 8 bits is right by chance in 1 of 256, and a packet that lost bytes would take the head of the next one
-//! along. So a packet in which another header begins is believed only if a header follows it, or if what begins inside
-//! turns out to be none. Refuses to know what a packet says.
+//! An 8-bit checksum is right by chance in 1 of 256 cases, and a packet that lost bytes includes the beginning of the next one.
+//! A packet that contains another header is therefore accepted only if a header follows it, or if the bytes from the inner
+//! header on are no packet.
 
-/// Packets of one length, which begin with a header of two bytes.
+/// Format of packets that have a fixed length and begin with a header of two bytes.
 pub trait Format {
-    /// Why bytes that begin like a packet are none.
+    /// Reason why bytes that begin like a packet are not one.
     type Reject;
 
-    /// Bytes of a packet.
+    /// Returns the length of a packet, in bytes.
     fn packet_len(&self) -> usize;
 
-    /// Whether a header may begin here, as far as there are bytes; nothing may become one.
+    /// Returns whether `bytes` may be the beginning of a header. No bytes may be.
     fn begins(&self, bytes: &[u8]) -> bool;
 
-    /// Whether so many bytes are a packet, by themselves.
+    /// Checks the bytes of a packet.
     ///
     /// # Errors
     ///
-    /// They are none, for this reason.
+    /// Returns why they are not a packet.
     fn check(&self, packet: &[u8]) -> Result<(), Self::Reject>;
 }
 
-/// What begins at a place.
+/// Result of checking for a packet.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Verdict<R> {
     /// A packet.
     Packet,
-    /// None; the reason, if it began like one and failed by itself.
+    /// No packet. Contains the reason if the bytes begin like one and the check failed.
     Nothing(Option<R>),
-    /// More bytes will tell.
+    /// More bytes are needed.
     Open,
-    /// It would be a packet, if what begins inside is none, which more bytes will tell.
+    /// A packet, unless another one begins inside it. More bytes are needed to decide.
     Held,
 }
 
-/// What begins with `open`. If `is_released`, what begins inside is given up.
+/// Checks whether a packet begins at the first byte of `open`. If `is_released`, incomplete packets inside it are ignored.
 pub fn judge<F: Format>(format: &F, open: &[u8], is_released: bool) -> Verdict<F::Reject> {
     let len = format.packet_len();
     if !format.begins(open) {
@@ -60,5 +60,110 @@ pub fn judge<F: Format>(format: &F, open: &[u8], is_released: bool) -> Verdict<F
     Verdict::Packet
 }
 
-/// Bytes of a header.
+/// Counters of a framer. They only increase, and `read == in_packets + discarded + buffered`.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Tally {
+    /// Bytes committed.
+    pub read: u64,
+    /// Bytes of packets that were returned.
+    pub in_packets: u64,
+    /// Bytes that were in no packet.
+    pub discarded: u64,
+    /// Packets that were returned.
+    pub packets: u64,
+    /// Discarded headers whose packet had a wrong checksum.
+    pub rejected_checksum: u64,
+}
+
+/// Buffer of a framer: up to `N` open bytes, which are neither in a packet nor discarded yet.
+#[derive(Clone, Debug)]
+pub struct Buffer<const N: usize> {
+    bytes: [u8; N],
+    /// `bytes[start..end]` are open.
+    start: usize,
+    end: usize,
+    tally: Tally,
+}
+
+impl<const N: usize> Default for Buffer<N> {
+    fn default() -> Self {
+        Buffer { bytes: [0; N], start: 0, end: 0, tally: Tally::default() }
+    }
+}
+
+impl<const N: usize> Buffer<N> {
+    /// Returns the free space for the next bytes. Write to its beginning, then call [`Buffer::commit`]. Invalidates the results
+    /// of [`Buffer::take`].
+    pub fn spare(&mut self) -> &mut [u8] {
+        self.bytes.copy_within(self.start..self.end, 0);
+        self.end -= self.start;
+        self.start = 0;
+        &mut self.bytes[self.end..]
+    }
+
+    /// Adds the first `len` bytes of [`Buffer::spare`].
+    ///
+    /// # Panics
+    ///
+    /// Panics if there was no space for them.
+    pub fn commit(&mut self, len: usize) {
+        self.end += len;
+        assert!(self.end <= N, "more bytes committed than there was room");
+        self.tally.read += len as u64;
+    }
+
+    /// Returns the open bytes.
+    pub fn open(&self) -> &[u8] {
+        &self.bytes[self.start..self.end]
+    }
+
+    /// Returns the number of the first open byte among all committed bytes, from 0.
+    pub fn offset(&self) -> u64 {
+        self.tally.read - (self.end - self.start) as u64
+    }
+
+    /// Takes the first `len` open bytes, which are `packets` packets. Returns their position for [`Buffer::taken`].
+    pub fn take(&mut self, len: usize, packets: usize) -> usize {
+        let at = self.start;
+        self.start += len;
+        self.tally.packets += packets as u64;
+        self.tally.in_packets += len as u64;
+        at
+    }
+
+    /// Makes the last `len` bytes that were taken, which are `packets` packets, open again.
+    pub fn give_back(&mut self, len: usize, packets: usize) {
+        self.start -= len;
+        self.tally.packets -= packets as u64;
+        self.tally.in_packets -= len as u64;
+    }
+
+    /// Returns `len` bytes that [`Buffer::take`] took at position `at`.
+    pub fn taken(&self, at: usize, len: usize) -> &[u8] {
+        &self.bytes[at..at + len]
+    }
+
+    /// Discards the first `len` open bytes.
+    pub fn discard(&mut self, len: usize) {
+        self.start += len;
+        self.tally.discarded += len as u64;
+    }
+
+    /// Discards all open bytes, for example because the rate of the line changes.
+    pub fn clear(&mut self) {
+        self.discard(self.end - self.start);
+    }
+
+    /// Counts a discarded header whose packet had a wrong checksum.
+    pub fn reject_checksum(&mut self) {
+        self.tally.rejected_checksum += 1;
+    }
+
+    /// Returns the counters.
+    pub fn tally(&self) -> &Tally {
+        &self.tally
+    }
+}
+
+/// Length of a header, in bytes.
 const HEADER: usize = 2;

@@ -1,48 +1,60 @@
-//! A sensor behind a line, driven from outside as [`line::Session`] says: bytes and the time go in, bytes and telegrams and
-//! the next deadline come out.
+//! The session with an LMS: bytes and the time go in; telegrams, bytes to send and the next deadline come out.
 
-mod beat;
-mod begun;
-
-use crate::line;
-use crate::line::{Account, Control, Output, State, suspect};
-use crate::lms::arrival::{Arrivals, Rhythm};
+use crate::line::{self, Account, Control, Output, State, suspect};
+use crate::lms::arrival::{Arrivals, Rhythm, Stamp};
 use crate::lms::cadence::Cadence;
 use crate::lms::damage::Damage;
 use crate::lms::dialogue::Dialogue;
 use crate::lms::framer::{Advance, Framer, Tally, TelegramSpan};
 use crate::lms::header::Reject;
 use crate::lms::identity::Identity;
-use crate::lms::measured::MEASURED;
+use crate::lms::measured::{FirstValues, MEASURED};
 use crate::lms::outgoing::SOON;
 use crate::lms::phase::{Phase, Settings};
 use crate::lms::reply::Reply;
 use crate::lms::sensor::{Sensor, Trouble};
 use crate::lms::telegram::Telegram;
-use crate::lms::variant::{BYTES_PER_TURN, Baud, Mode};
+use crate::lms::variant::{BYTES_PER_TURN, Baud, Mode, Variant};
 use schema::Nanos;
 
-pub use begun::Begun;
-
-/// What a telegram says.
+/// A decoded telegram.
 #[derive(Clone, Copy, Debug)]
 pub struct Message<'a> {
     /// The telegram, in the session's buffer.
     pub telegram: Telegram<'a>,
-    /// What it says; `None` if it cannot be read.
+    /// The reply that it contains. `None` if it cannot be decoded.
     pub reply: Option<Reply<'a>>,
-    /// How measured values are split; `None` while the sensor has not reported it, if the angles of the values are not
-    /// known, or if they came at another rate than the wanted one, by which their period and their age are judged.
+    /// Mode, which defines how a value is split into range and intensity. `None` while the scanner has not reported it, if the angles of
+    /// the values are unknown, or if the telegram arrived at another rate than that of the settings.
     pub mode: Option<Mode>,
-    /// Number of its first byte among all bytes of the session, from 0.
+    /// Number of the first byte among all bytes of the session, from 0.
     pub offset: u64,
 }
 
 /// A telegram with its stamps.
 pub type Received<'a> = line::Received<'a, Message<'a>>;
 
-/// One sensor's session. A sensor that is exchanged within a second for one that streams already, with the same number
-/// of values and the same address, is taken for the same one.
+/// Measured values of a telegram that is not complete yet. It may turn out to be damaged.
+#[derive(Clone, Copy, Debug)]
+pub struct Begun<'a> {
+    /// The values that have arrived.
+    pub values: FirstValues<'a>,
+    /// Mode, which defines how a value is split into range and intensity.
+    pub mode: Mode,
+    /// Number of the first byte of the telegram among all bytes of the session, from 0.
+    pub offset: u64,
+    /// Bytes that have arrived.
+    pub bytes: usize,
+    /// Time at which the first byte arrived.
+    pub first: Nanos,
+    /// Time at which the last of these bytes arrived.
+    pub last: Nanos,
+    /// Reasons for suspicion so far: bits of [`crate::line::suspect`].
+    pub reasons: u8,
+}
+
+/// The session with one scanner. If the scanner is replaced within a second by one that streams already, with the same number
+/// of values and the same address, the session does not notice.
 #[derive(Clone, Debug)]
 pub struct Session {
     framer: Framer,
@@ -55,18 +67,19 @@ pub struct Session {
     last_scan: u64,
     now: Nanos,
     last_byte: Nanos,
-    /// Of the last byte of the last telegram.
+    /// Stamp of the last byte of the last telegram.
     last_stamp: Nanos,
     cut: bool,
-    /// What the next read has room for, and whether the last one left none: then more may be there already.
+    /// Size of the buffer of the next read.
     room: usize,
+    /// Whether the last read filled its buffer, so that more bytes may be waiting.
     has_more: bool,
-    /// Until when bytes that are there are not read.
+    /// Time until which waiting bytes are not read.
     left_until: Option<Nanos>,
 }
 
 impl Session {
-    /// A session on a port that is open at the rate of `settings`.
+    /// Creates a session on a port that is open at the rate of `settings`.
     pub fn new(settings: Settings, now: Nanos) -> Self {
         Session {
             framer: Framer::default(),
@@ -86,26 +99,25 @@ impl Session {
         }
     }
 
-    /// What a session before this one knew of the sensor a moment ago: scans begin at once if the sensor streams on as it did
-    /// then, and what its status says is asked all the same. To be said before anything is read.
+    /// Restores the identity that the previous session saved a moment ago. Scans are available at once if the scanner still
+    /// streams as it did then. The session still requests the status. Call it before the first read.
     pub fn recall(&mut self, known: Identity) {
         self.dialogue.recalled = Some(known);
     }
 
-    /// The rate that is asked first if nobody streams, in place of 9600: where a sensor that did not stream was
-    /// [found](Self::found_at) the last time. To be said before anything is read.
+    /// Sets the rate that is tried first, in place of 9,600, if no stream arrives: the rate at which the scanner was
+    /// [found](Self::found_at) the last time. Call it before the first read.
     pub fn seek_first(&mut self, baud: Baud) {
         self.dialogue.rest_at = baud;
         self.dialogue.first = baud;
     }
 
-    /// The rate at which a sensor that was sought answered; nothing if none had to be sought.
+    /// Returns the rate at which the search found the scanner. `None` if there was no search.
     pub fn found_at(&self) -> Option<Baud> {
         self.dialogue.found_at
     }
 
-    /// What the next session would have to ask if this one ended now; nothing if the sensor does not stream, or has not told
-    /// all of it.
+    /// Returns the identity for the next session. `None` if the scanner does not stream, or has not reported all of it.
     pub fn identity(&self) -> Option<Identity> {
         match self.dialogue.phase {
             Phase::Streaming { header, .. } => self.sensor().identity(header),
@@ -113,26 +125,56 @@ impl Session {
         }
     }
 
-    /// The rate at which it listens and talks.
+    /// Returns the rate of the line.
     pub fn baud(&self) -> Baud {
         self.dialogue.baud
     }
 
-    /// What it knows of the sensor.
+    /// Returns what the scanner has reported.
     pub fn sensor(&self) -> &Sensor {
         &self.dialogue.sensor
     }
 
-    /// Why it is not where it should be.
+    /// Returns why the session does not stream.
     pub fn trouble(&self) -> Option<Trouble> {
         self.dialogue.trouble()
     }
 
-    /// What became of the bytes.
+    /// Sets the number of reads per telegram to `pieces`, so that [`begun`](Self::begun) returns more values each time. With 0
+    /// and 1, a telegram is read when it is complete.
+    pub fn look_in(&mut self, pieces: u8) {
+        self.rhythm.look_in(pieces);
+    }
+
+    /// Returns the values of the scan that is arriving. Call it when [`poll_output`](line::Session::poll_output) has returned a wait.
+    /// `None` between scans, and while the mode of the scanner is not known.
+    pub fn begun(&self) -> Option<Begun<'_>> {
+        if !self.is_live() || !self.is_at_rate() {
+            return None;
+        }
+        let begun = self.framer.begun()?;
+        let values = FirstValues::of(begun.bytes)?;
+        let mode = self.dialogue.sensor.mode_of_scans()?;
+        let (baud, bytes) = (self.dialogue.baud.rate(), begun.bytes.len());
+        let first = self.arrivals.stamp(begun.offset, baud);
+        let last = self.arrivals.stamp(begun.offset + bytes as u64 - 1, baud);
+        Some(Begun {
+            values,
+            mode,
+            offset: begun.offset,
+            bytes,
+            first: first.at.max(self.last_stamp),
+            last: last.at.max(first.at).max(self.last_stamp),
+            reasons: begun.reasons,
+        })
+    }
+
+    /// Returns the counters of the framer.
     pub fn tally(&self) -> &Tally {
         self.framer.tally()
     }
 
+    /// Stamps a telegram, and passes it to the dialogue.
     fn receive(&mut self, span: TelegramSpan) -> Received<'_> {
         let baud = self.dialogue.baud.rate();
         let framed = self.framer.view(span);
@@ -145,8 +187,8 @@ impl Session {
         // A line may have held back only the end of a telegram.
         let estimated = first.estimated || last.estimated;
         let due = period.and(self.due(&first, span.offset, len));
-        // What is read later may tell that bytes were older than was thought; those before them were older still, but
-        // that has been said.
+        // A later read may show that bytes were older than their stamps. Those before them were older still, but their stamps
+        // are published.
         first.at = due.unwrap_or(first.at).max(self.last_stamp);
         let last = match due.and(self.rhythm.duration()) {
             Some(usual) => (first.at + usual).min(last.latest.unwrap_or(last.at)),
@@ -192,10 +234,41 @@ impl Session {
         }
     }
 
-    /// When the first byte arrived that is in no telegram yet.
+    /// Returns when the first byte arrived that is in no telegram yet.
     fn next_began(&self) -> Nanos {
         let open = self.tally().read - self.framer.buffered() as u64;
         self.arrivals.stamp(open, self.dialogue.baud.rate()).at
+    }
+
+    /// Returns the time between two scans like `telegram`, which decodes to `reply`, if it is part of a stream with a known period.
+    fn period(&self, telegram: Telegram<'_>, reply: Option<&Reply<'_>>) -> Option<Nanos> {
+        let Some(Reply::Measured(measured)) = reply.filter(|_| self.is_live()) else { return None };
+        let variant = Variant::of_beams(measured.count()).filter(|_| measured.partial().is_none())?;
+        Some(variant.period(telegram.bytes().len(), self.dialogue.baud.rate()))
+    }
+
+    /// Returns when the scan of `len` bytes at `offset` began, if it is part of a backlog of a host that did not run. The time follows
+    /// from its position in the backlog, limited by the time of the read.
+    fn due(&self, first: &Stamp, offset: u64, len: u64) -> Option<Nanos> {
+        let latest = first.latest?;
+        let slots = (offset - self.last_scan + len / 2) / len;
+        self.cadence.after(slots).map(|due| due.clamp(first.at, latest))
+    }
+
+    /// Returns whether a scanner streams, and not a recording.
+    fn is_live(&self) -> bool {
+        self.dialogue.state() == State::Streaming && !self.dialogue.settings.listen_only
+    }
+
+    /// Returns whether the line has the rate of the settings, so that periods and durations are those of that rate.
+    fn is_at_rate(&self) -> bool {
+        // Bytes that were read before a change of the rate arrived at the previous rate.
+        self.dialogue.change_baud.is_none() && self.dialogue.baud == self.dialogue.settings.baud
+    }
+
+    /// Returns whether bytes arrive at the pace of a line, unlike those of a recording or a network.
+    fn has_pace(&self) -> bool {
+        !(self.dialogue.settings.listen_only || self.dialogue.settings.fixed_rate)
     }
 }
 
@@ -229,14 +302,14 @@ impl line::Session for Session {
 
     fn may_leave(&self) -> bool {
         let begins = self.framer.buffered() == 0 && !self.has_more && self.left_until.is_none();
-        // An answer takes less time than a scan.
+        // A reply takes less time than a scan.
         let is_silent = self.dialogue.open.is_none();
         begins && is_silent && self.rhythm.duration().is_some() && self.has_pace() && self.is_live()
     }
 
     fn leave(&mut self, now: Nanos, waiting: usize) -> bool {
         self.now = now;
-        // More than a turn's bytes came while the host did not look: the read has to find out since when.
+        // If the bytes of more than a revolution wait, the host did not run. Then the read has to find out since when they wait.
         if (1..=BYTES_PER_TURN).contains(&waiting) && self.may_leave() {
             self.arrivals.sense(now, waiting);
             let begun = self.next_began();
@@ -268,7 +341,7 @@ impl line::Session for Session {
         if let Some(outgoing) = self.dialogue.outgoing() {
             outgoing.transmitted(now, baud);
             if is_fixed {
-                // From a network the first sign of a reply may be all of it.
+                // On a network, the first bytes of a reply may be all of it.
                 outgoing.hear(baud);
             }
         }
@@ -328,11 +401,11 @@ impl line::Session for Session {
         self.dialogue.baud.rate()
     }
 
-    /// What the sensor must have sent is known by its period, after the first scan of each stream. A stream ends when scans
-    /// stay out for a second, and where the sensor is asked something; of one whose period is not known, of parts of scans
-    /// and of a recording nothing was due. What is lost is known a second later. What the sensor breaks off to answer is no
-    /// damage. The session begins again when no measured data came for a second, when the sensor reported power-on, or when
-    /// a user asked for it.
+    /// The number of scans that the scanner must have sent follows from their period, after the first scan of each stream. A stream
+    /// ends when no scan arrives for a second, and when a request is sent. Nothing is due of a stream without a known period, of
+    /// partial scans, and of a recording. A loss is counted a second later. A scan that the scanner aborts to reply is not damage.
+    /// The session resynchronizes when no measured data arrive for a second, when the scanner reports power-on, and when a user
+    /// requests it.
     fn account(&self) -> Account {
         let tally = self.framer.tally();
         Account {

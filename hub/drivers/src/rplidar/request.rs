@@ -1,9 +1,9 @@
-//! What the session says to a scanner, and the heads of its answers. Source: the maker's description of the protocol. None of
-//! the requests that change what a scanner keeps is here, and none can be made outside this file.
+//! Requests to a scanner, and the descriptors of its responses, after the manufacturer's description of the protocol. Requests can be
+//! made only here. None of them changes a setting that the scanner keeps without power.
 
 use crate::rplidar::packet::Kind;
 
-/// A request as it goes down the line.
+/// An encoded request.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Request {
     bytes: [u8; Request::LONGEST],
@@ -13,17 +13,17 @@ pub(crate) struct Request {
 impl Request {
     const LONGEST: usize = 12;
 
-    /// Ends a stream; there is no answer.
+    /// Stops a stream. There is no response.
     pub(crate) const STOP: Request = Request::plain(0x25);
-    /// Boots the scanner.
+    /// Restarts the scanner.
     pub(crate) const RESET: Request = Request::plain(0x40);
-    /// Points one by one.
+    /// Starts the standard scan: single points.
     pub(crate) const SCAN: Request = Request::plain(0x20);
-    /// Model, versions, serial number.
+    /// Requests model, versions and serial number.
     pub(crate) const INFO: Request = Request::plain(0x50);
-    /// Whether it is well.
+    /// Requests the health.
     pub(crate) const HEALTH: Request = Request::plain(0x52);
-    /// How long a point takes, of scanners that do not list their modes.
+    /// Requests the time per point of a scanner that does not list its modes.
     pub(crate) const SAMPLE_TIMES: Request = Request::plain(0x59);
 
     const fn plain(command: u8) -> Request {
@@ -42,28 +42,28 @@ impl Request {
         request
     }
 
-    /// Points in packets, in the mode of this number.
+    /// Starts the scan mode with this number, whose packets contain several points.
     pub(crate) fn express(mode: u8) -> Request {
         Request::with(0x82, &[mode, 0, 0, 0, 0])
     }
 
-    /// What the scanner says of `key`, of the mode of this number if there is one.
+    /// Requests the value of `key`, of one mode if `mode` is given.
     pub(crate) fn configuration(key: u8, mode: Option<u8>) -> Request {
         let payload = [key, 0, 0, 0, mode.unwrap_or_default(), 0];
         Request::with(0x84, &payload[..if mode.is_some() { 6 } else { 4 }])
     }
 
-    /// Whether there is an accessory board.
+    /// Requests whether an accessory board controls the motor.
     pub(crate) fn board() -> Request {
         Request::with(0xFF, &[0; 4])
     }
 
-    /// The duty cycle of the motor, of 1,023.
+    /// Sets the duty cycle of the motor, 0 to 1,023.
     pub(crate) fn duty(duty: u16) -> Request {
         Request::with(0xF0, &duty.to_le_bytes())
     }
 
-    /// The speed of the head in turns per minute.
+    /// Sets the speed of the head, in revolutions per minute.
     pub(crate) fn speed(turns_per_minute: u16) -> Request {
         Request::with(0xA8, &turns_per_minute.to_le_bytes())
     }
@@ -73,30 +73,65 @@ impl Request {
     }
 }
 
+/// Requests that are sent byte by byte.
+#[derive(Clone, Copy, Debug, Default)]
+pub(crate) struct RequestQueue {
+    bytes: [u8; 32],
+    len: usize,
+    sent: usize,
+}
+
+impl RequestQueue {
+    /// Adds `request` after the requests that are queued, as far as there is room.
+    pub(crate) fn push(&mut self, request: &Request) {
+        for byte in request.bytes() {
+            if let Some(place) = self.bytes.get_mut(self.len) {
+                *place = *byte;
+                self.len += 1;
+            }
+        }
+    }
+
+    /// Returns the byte to send next.
+    pub(crate) fn next(&self) -> Option<u8> {
+        self.bytes[self.sent..self.len].first().copied()
+    }
+
+    /// Removes the byte that was sent. Returns whether the queue is empty now.
+    pub(crate) fn advance(&mut self) -> bool {
+        self.sent += 1;
+        let is_done = self.sent >= self.len;
+        if is_done {
+            *self = RequestQueue::default();
+        }
+        is_done
+    }
+}
+
 /// Keys of [`Request::configuration`].
 pub(crate) mod key {
-    /// How many modes there are.
+    /// Number of modes.
     pub(crate) const COUNT: u8 = 0x70;
-    /// How long a point takes in a mode, in 1/256 us.
+    /// Time per point of a mode, in 1/256 us.
     pub(crate) const SAMPLE_TIME: u8 = 0x71;
-    /// What kind of packets a mode has.
+    /// Kind of the packets of a mode.
     pub(crate) const ANSWER: u8 = 0x75;
-    /// The mode that the maker recommends.
+    /// Number of the mode that the manufacturer recommends.
     pub(crate) const TYPICAL: u8 = 0x7C;
-    /// What a mode is called.
+    /// Name of a mode.
     pub(crate) const NAME: u8 = 0x7F;
 }
 
-/// What an answer begins with.
+/// Descriptor at the beginning of a response.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Head {
-    /// So many bytes follow, once.
+    /// One response with this number of bytes follows.
     Reply(Answer, usize),
-    /// Packets of this kind follow until they are stopped.
+    /// A stream of these packets follows, until it is stopped.
     Stream(Kind),
 }
 
-/// What a reply answers.
+/// The request that a response belongs to.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Answer {
     /// [`Request::INFO`].
@@ -112,10 +147,10 @@ pub(crate) enum Answer {
 }
 
 impl Head {
-    /// Its bytes.
+    /// Length of a descriptor, in bytes.
     pub(crate) const LEN: usize = 7;
 
-    /// The head that `bytes` begin with; nothing if they do not, or are too few.
+    /// Decodes the descriptor that `bytes` begin with. Returns `None` if they begin with something else, or are too few.
     pub(crate) fn parse(bytes: &[u8]) -> Option<Head> {
         let &[START, 0x5A, a, b, c, d, answer] = bytes.first_chunk()? else { return None };
         let word = u32::from_le_bytes([a, b, c, d]);
@@ -131,7 +166,7 @@ impl Head {
         }
     }
 
-    /// Whether a head may begin here, as far as there are bytes.
+    /// Returns whether `bytes` may be the beginning of a descriptor.
     pub(crate) fn begins(bytes: &[u8]) -> bool {
         match bytes {
             [] => true,
@@ -142,7 +177,7 @@ impl Head {
 }
 
 const START: u8 = 0xA5;
-/// A name and some.
+/// Maximum length of a response: more than the longest name of a mode needs.
 const LONGEST_REPLY: usize = 64;
 
 #[cfg(test)]

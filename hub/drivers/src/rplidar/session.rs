@@ -1,134 +1,142 @@
-//! A scanner behind a line, driven from outside as [`crate::line::Session`] says: it is asked what it is and told to measure, then
-//! packets are handed out as they come, and turns. Refuses to know a hub, and what becomes of a turn.
+//! The session with an RPLIDAR: it requests the identity of the scanner, starts a scan mode, and returns packets as they arrive,
+//! and revolutions.
 //!
-//! A stream that somebody left is stopped, never taken over: express and dense packets look alike, and a scanner that
-//! measures answers no question.
+//! A stream that another program left running is stopped, never continued: express and dense packets look alike, and a
+//! scanner that measures answers no request.
 
 mod dialogue;
-mod driven;
-mod outgoing;
-mod reply;
 mod stream;
 
-use crate::line::{Reads, SensorClock, State, Tally, TurnCounts, Turns};
+use core::fmt;
+
 use schema::{MILLIS, Nanos};
 
-use crate::rplidar::framer::{Expect, Framer};
+use crate::line::family::{self, Condition, Features, Turning, Wanted};
+use crate::line::{
+    self, Account, Control, Heard, Output, Packets, Reads, Received, SensorClock, State, Tally, Turn,
+    TurnCounts, Turns,
+};
+
+use crate::rplidar::device_info::{Health, Info};
+use crate::rplidar::framer::{Expect, Found, Framer, Span};
 use crate::rplidar::model::{Mode, Model};
 use crate::rplidar::offers::Offers;
 use crate::rplidar::packet::Kind;
+use crate::rplidar::request::{Head, RequestQueue};
 use crate::rplidar::sequence::{Place, Sequence, Step};
-use crate::rplidar::told::{Health, Info, Trouble};
 
-use self::dialogue::Ask;
-use self::outgoing::Outgoing;
+use self::dialogue::{Ask, Reply};
 use self::stream::{Current, Held, MOST, Measure};
 
-/// What a session shall do.
+/// Settings of a session.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Settings {
-    /// What is at the other end; `None` is asked, at the rates of all models.
+    /// The model. `None`: the session requests it, at the rates of all models.
     pub model: Option<Model>,
-    /// How it shall measure; `None`: as fast as the line carries.
+    /// The scan mode. `None`: the fastest one that the line can carry.
     pub mode: Option<Mode>,
-    /// Beams of the grid that turns are for; `None`: the model's, at most [`most_beams`](Self::most_beams).
+    /// Number of beams of the grid. `None`: the model's number, at most [`most_beams`](Self::most_beams).
     pub beams: Option<usize>,
-    /// The most beams that there is room for; `None`: as many as a grid can have.
+    /// Maximum number of beams. `None`: the maximum of a grid.
     pub most_beams: Option<usize>,
-    /// Whether the port has one rate and not the pace of a line: a serial server on the network, a recording.
+    /// Whether the port has one fixed rate and bytes do not arrive at the pace of a line, as with a serial server on the
+    /// network or a recording.
     pub fixed_rate: bool,
-    /// Whether nobody is at the other end who could be asked: a recording.
+    /// Whether nothing can be sent, because the bytes are from a recording.
     pub listen_only: bool,
-    /// Whether the motor rests while nobody follows.
+    /// Whether the motor stops while there are no subscribers.
     pub stop_when_idle: bool,
 }
 
 impl Settings {
-    /// The rate at which the port is to be opened, in bits per second.
+    /// Returns the rate at which the port is opened, in bits per second.
     pub fn baud(&self) -> u32 {
         self.model.unwrap_or(Model::A1).baud()
     }
 }
 
-/// One scanner's session.
+/// The session with one scanner.
 #[derive(Clone, Debug)]
 pub struct Session {
     settings: Settings,
     framer: Framer,
-    pub(crate) reads: Reads,
+    reads: Reads,
     clock: SensorClock,
     sequence: Sequence,
     turns: Turns<MOST_POINTS>,
     phase: Phase,
-    /// What to show until measured data come.
+    /// The state that is shown until measured data arrive.
     shown: State,
     baud: u32,
     change_baud: bool,
-    /// What the line DTR shall be from now on.
+    /// Level that the DTR line has to get.
     change_dtr: Option<bool>,
-    outgoing: Outgoing,
+    outgoing: RequestQueue,
     info: Option<Info>,
     health: Option<Health>,
     offers: Offers,
-    /// Whether a scanner that is not well was booted already.
+    /// Whether a scanner that reported an error was already restarted.
     was_reset: bool,
-    /// Whether the motor obeys requests for a duty cycle.
+    /// Whether an accessory board controls the motor, by its duty cycle.
     has_board: bool,
-    /// The mode in use, if it is known here, and the wanted one if it is another.
+    /// The mode in use, if scanhub knows it.
     mode: Option<Mode>,
+    /// The mode of the settings, if the scanner cannot use it.
     no_mode: Option<Mode>,
-    /// Nanoseconds from one point to the next, once they are known, or what they are measured by.
+    /// Nanoseconds per point, once they are known.
     point_ns: Option<f64>,
+    /// Measurement of the time per point.
     measure: Option<Measure>,
-    /// The last mode of which somebody else was told, and by which key.
+    /// In a recording: the last mode in a request of the recorded program, and the key of that request.
     overheard: (u8, u8),
-    /// The grid, once it is known, and whether it is known what this stream is.
+    /// Number of beams, once it is known.
     beams: Option<usize>,
+    /// Whether the packets of this stream are identified.
     is_learned: bool,
-    /// Packets that were handed out and are not in turns yet, and the places of those of the last span.
+    /// Packets that were returned and whose points are not in revolutions yet.
     current: Option<Current>,
+    /// Positions of the packets of the last span.
     places: [Place; MOST],
     held: Option<Held>,
-    /// Since when nobody follows.
+    /// Time since which there are no subscribers.
     idle_since: Option<Nanos>,
     now: Nanos,
-    /// As [`crate::line::family::Turning::scanner_time`].
-    pub(crate) scanner_time: Option<Nanos>,
+    scanner_time: Option<Nanos>,
     trouble: Option<Trouble>,
     /// Time since which no response has arrived, and the number of bytes read by then.
     quiet_since: Option<(Nanos, u64)>,
-    /// Bytes of streams that were in nothing, and all of those when it was last looked.
+    /// Discarded bytes of streams, and all discarded bytes when the first number was updated.
     damaged: (u64, u64),
     resyncs: u64,
     /// Restarts of the scanner that were not requested.
     restarts: u64,
     /// Rate of the last stream, until a greeting is received.
     streamed_at: Option<u32>,
-    /// Bytes of streams that were in nothing, and bytes of packets, when the last revolution ended.
+    /// Discarded bytes of streams, and bytes of packets, when the last revolution ended.
     turned_with: (u64, u64),
     cut: bool,
 }
 
 #[derive(Clone, Copy, Debug)]
 enum Phase {
-    /// Nobody can be asked, and no packets come yet.
+    /// A recording. No packets have been read yet.
     Listening { since: Nanos },
-    /// It was told to stop. After so many attempts at this rate, and no later than `at_most`, it is asked.
+    /// The stop request was sent. The session sends the first request at `until`, or at `at_most` if bytes still arrive.
     Draining { attempts: u8, until: Nanos, at_most: Nanos },
-    /// An answer should come by `until`.
+    /// A response is expected by `until`.
     Asking { ask: Ask, attempts: u8, until: Nanos },
-    /// It was told to boot.
+    /// The restart request was sent.
     Booting { until: Nanos },
-    /// It is not well, and asked again later.
+    /// The scanner reports an error. The session requests the health again at `until`.
     Unwell { until: Nanos },
-    /// It measures; by `silent_at` the next packet comes. `turned_at` the last turn was over, or it began.
+    /// Packets arrive, the next one by `silent_at`. The last revolution ended at `turned_at`, or the stream began then.
     Hearing { turned_at: Nanos, has_turned: bool, silent_at: Nanos },
-    /// Nobody wants anything, or nobody follows.
+    /// A user paused the session, or, if `is_resting`, there are no subscribers.
     Paused { is_resting: bool },
 }
 
 impl Session {
-    /// A session on a port that is open at the rate of `settings`.
+    /// Creates a session on a port that is open at the rate of `settings`.
     pub fn new(settings: Settings, now: Nanos) -> Self {
         let mut session = Session {
             settings,
@@ -142,7 +150,7 @@ impl Session {
             baud: settings.baud(),
             change_baud: false,
             change_dtr: None,
-            outgoing: Outgoing::default(),
+            outgoing: RequestQueue::default(),
             info: None,
             health: None,
             offers: Offers::default(),
@@ -174,22 +182,23 @@ impl Session {
         session
     }
 
-    /// What is at the other end, as far as that is known.
+    /// Returns the model, once it is known.
     pub fn model(&self) -> Option<Model> {
         self.info.and_then(|info| info.model()).or(self.settings.model)
     }
 
-    /// How it measures, as far as that has a name here; nothing before it does.
-    pub(crate) fn mode(&self) -> Option<Mode> {
+    /// Returns the scan mode, once the scanner measures, if scanhub knows it.
+    fn mode(&self) -> Option<Mode> {
         self.mode
     }
 
-    /// Whether another model than this one is wanted.
-    pub(crate) fn is_wrong(&self, model: Model) -> bool {
+    /// Returns whether `model` is not the one of the settings.
+    fn is_unexpected(&self, model: Model) -> bool {
         self.settings.model.is_some_and(|wanted| wanted != model)
     }
 
-    /// What packets are that look like express and like dense ones, where no answer says it: the model's fastest ones.
+    /// Returns the kind of packets that look like both express and dense ones if no response has named it: the fastest kind of
+    /// the model.
     fn alike(&self) -> Option<Kind> {
         match (self.settings.mode, self.model()) {
             (Some(Mode::DenseBoost), _) => Some(Kind::Dense),
@@ -199,43 +208,43 @@ impl Session {
         }
     }
 
-    /// What it says that it is; nothing before it was asked.
+    /// Returns the identity that the scanner reported.
     pub fn info(&self) -> Option<Info> {
         self.info
     }
 
-    /// How it says that it is; nothing before it was asked.
+    /// Returns the health that the scanner reported.
     pub fn health(&self) -> Option<Health> {
         self.health
     }
 
-    /// Whether it was asked what it is and how it is, and has answered, or was asked in vain.
-    pub(crate) fn is_introduced(&self) -> bool {
+    /// Returns whether the scanner has reported its identity, and its health unless it does not respond to that request.
+    fn is_introduced(&self) -> bool {
         let is_asked = matches!(self.phase, Phase::Asking { ask: Ask::Info | Ask::Health, .. });
         self.info.is_some() && !is_asked && !matches!(self.phase, Phase::Draining { .. })
     }
 
-    /// Beams of the grid that turns are for; nothing before it is known what is at the other end.
+    /// Returns the number of beams of a scan, once the model is known.
     pub fn beams(&self) -> Option<usize> {
         self.beams
     }
 
-    /// Points that the scanner measures in a second; nothing before it is known.
+    /// Returns the points that the scanner measures per second, once they are known.
     pub fn points_per_second(&self) -> Option<f32> {
         self.point_ns.map(|ns| (1e9 / ns) as f32)
     }
 
-    /// What became of the bytes.
+    /// Returns the counters of the framer.
     pub fn tally(&self) -> &Tally {
         self.framer.tally()
     }
 
-    /// How many turns there were of which kind.
+    /// Returns the numbers of revolutions by kind.
     pub fn turn_counts(&self) -> TurnCounts {
         self.turns.counts()
     }
 
-    /// Does what is due now that all bytes were looked at: bytes that are nothing keep nobody waiting.
+    /// Handles deadlines after all bytes were framed. Bytes that belong to nothing do not extend a deadline.
     fn expire(&mut self) {
         let now = self.now;
         let is_idle =
@@ -276,8 +285,9 @@ impl Session {
         self.turned_with = (self.damaged.0, self.framer.tally().in_packets);
     }
 
-    /// Whether it was sought for a short time only: then what goes on to stream is not asked, for at its rate it would have
-    /// stopped. On a line that is never quiet it is asked all the same later.
+    /// Returns whether the search for the rate is young. During this time, a scanner that streams on after the stop request is
+    /// not asked at this rate, because at the right rate it would have stopped. Later a request is sent, because the line may never
+    /// be quiet.
     fn seeks_quickly(&self) -> bool {
         let is_young = self.quiet_since.is_none_or(|(since, _)| self.now < since + ROUNDS);
         is_young && self.next_rate().is_some()
@@ -298,15 +308,326 @@ impl Session {
             Phase::Hearing { silent_at, .. } => silent_at,
         }
     }
+
+    /// Returns the packets of a response for the caller.
+    fn reply(&self, span: Span) -> Received<'_, Packets> {
+        Received {
+            bytes: self.framer.bytes(span),
+            message: Packets { count: span.packets, is_checked: false, is_reply: true },
+            first: self.reads.last_byte(),
+            last: self.reads.last_byte(),
+            estimated: true,
+            reasons: 0,
+        }
+    }
 }
 
-/// Points of an S2 that turns four times a second; what is more does not fit into a turn.
+impl line::Session for Session {
+    type Heard<'a> = Heard<'a>;
+    type Trouble = Trouble;
+
+    fn spare(&mut self) -> &mut [u8] {
+        let spare = self.framer.spare();
+        self.reads.offer(spare.len());
+        spare
+    }
+
+    fn commit(&mut self, now: Nanos, len: usize) {
+        self.now = now;
+        self.reads.note(now, len, self.state() == State::Streaming);
+        if len > 0 {
+            self.framer.commit(len);
+            if let Phase::Draining { until, .. } = &mut self.phase {
+                *until = now + dialogue::QUIET;
+            }
+        }
+    }
+
+    fn handle_timeout(&mut self, now: Nanos) {
+        self.now = now;
+        self.framer.release(now.saturating_sub(self.reads.last_byte()));
+    }
+
+    fn control(&mut self, control: Control, now: Nanos) {
+        self.now = now;
+        match (control, self.phase) {
+            (Control::Pause, _) => self.rest(false),
+            (Control::Resume, Phase::Paused { is_resting: false }) => self.begin(State::Probing),
+            (Control::Resume, _) => {}
+            (Control::Resync, _) => {
+                self.resyncs += 1;
+                self.trouble = None;
+                self.begin(State::Probing);
+            }
+        }
+    }
+
+    fn followed(&mut self, now: Nanos, is_followed: bool) {
+        self.now = now;
+        if !is_followed {
+            self.idle_since.get_or_insert(now);
+            return;
+        }
+        self.idle_since = None;
+        if let Phase::Paused { is_resting: true } = self.phase {
+            self.begin(State::Starting);
+        }
+    }
+
+    fn end(&mut self, now: Nanos) -> bool {
+        self.now = now;
+        let is_at_work = !self.settings.listen_only && !matches!(self.phase, Phase::Paused { .. });
+        if is_at_work {
+            self.rest(false);
+        }
+        is_at_work
+    }
+
+    fn transmitted(&mut self, now: Nanos) {
+        self.now = now;
+        if self.outgoing.advance() {
+            self.sent();
+        }
+    }
+
+    fn poll_output(&mut self) -> Output<Heard<'_>> {
+        loop {
+            if let Some(on) = self.change_dtr.take() {
+                return Output::SetDtr(on);
+            }
+            if core::mem::take(&mut self.change_baud) {
+                self.framer.clear();
+                return Output::SetRate(self.baud);
+            }
+            if let Some(byte) = self.outgoing.next() {
+                return Output::Transmit { byte, not_before: 0 };
+            }
+            if let Some(closed) = self.advance_turns() {
+                return Output::Heard(Heard::Turn(self.show(closed)));
+            }
+            let most = self.framer.kind().map_or(1, |kind| self.most_together(kind));
+            let Some(found) = self.framer.advance(most) else { break };
+            match found {
+                Found::Reply(answer, span) => {
+                    let data = Reply::new(&self.framer.bytes(span)[Head::LEN..]);
+                    self.answered(answer, data);
+                    return Output::Heard(Heard::Packets(self.reply(span)));
+                }
+                Found::Stream(span) => {
+                    self.stream_begins();
+                    return Output::Heard(Heard::Packets(self.reply(span)));
+                }
+                Found::Packets(kind, span) => {
+                    return Output::Heard(Heard::Packets(self.receive(kind, span)));
+                }
+                Found::Greeting { is_named } => self.booted(is_named),
+            }
+        }
+        self.expire();
+        if self.change_dtr.is_some() || self.change_baud || self.outgoing.next().is_some() {
+            return self.poll_output();
+        }
+        self.reads.wait(self.now, self.deadline(), self.framer.hold())
+    }
+
+    fn state(&self) -> State {
+        match self.phase {
+            Phase::Hearing { has_turned: false, .. } => State::Starting,
+            Phase::Hearing { .. } => State::Streaming,
+            Phase::Paused { .. } => State::Paused,
+            _ => self.shown,
+        }
+    }
+
+    fn trouble(&self) -> Option<Trouble> {
+        let is_paused = matches!(self.phase, Phase::Paused { .. });
+        let warning = self.health.filter(|health| matches!(health, Health::Warning(_))).map(Trouble::Unwell);
+        self.trouble.or(self.no_mode.map(Trouble::NoMode)).or(warning).filter(|_| !is_paused)
+    }
+
+    fn missing(&self) -> Option<&'static str> {
+        matches!(self.trouble(), Some(Trouble::NoAnswer { .. })).then_some("RPLIDAR replies")
+    }
+
+    fn rate(&self) -> u32 {
+        self.baud
+    }
+
+    fn account(&self) -> Account {
+        let tally = self.framer.tally();
+        let (came, lost) = self.sequence.came_and_lost();
+        Account {
+            read: tally.read,
+            in_telegrams: tally.in_packets,
+            acknowledge: 0,
+            discarded: tally.discarded,
+            buffered: self.framer.buffered() as u64,
+            telegrams: tally.packets,
+            due: came + lost,
+            lost,
+            damaged: self.damaged.0,
+            resyncs: self.resyncs,
+            restarts: self.restarts,
+            began_with_a_cut: self.cut,
+            rejected_checksum: tally.rejected_checksum,
+        }
+    }
+}
+
+impl Turning for Session {
+    const FEATURES: Features = Features {
+        models: &MODELS,
+        // Enough for all models but the S2 and the S3.
+        auto: family::Model { name: "auto", baud: Model::A1.baud(), beams: 2_048 },
+        modes: &MODES,
+        can_rest: true,
+        speaks_unasked: false,
+    };
+
+    fn begin(wanted: Wanted, now: Nanos) -> Self {
+        let Wanted { model, mode, beams, most_beams, fixed_rate, listen_only, stop_when_idle } = wanted;
+        let (model, mode) = (model.and_then(Model::named), mode.and_then(Mode::named));
+        let settings = Settings { model, mode, beams, most_beams, fixed_rate, listen_only, stop_when_idle };
+        Session::new(settings, now)
+    }
+
+    fn model(&self) -> Option<family::Model> {
+        self.model().map(described)
+    }
+
+    fn beams(&self) -> Option<usize> {
+        self.beams()
+    }
+
+    fn begun(&self) -> Option<Turn<'_>> {
+        self.begun_turn()
+    }
+
+    fn other_model(&self) -> Option<family::Model> {
+        self.info().and_then(|info| info.model()).filter(|model| self.is_unexpected(*model)).map(described)
+    }
+
+    fn lacks(&self) -> Option<&'static str> {
+        (line::Session::trouble(self) == Some(Trouble::Alike)).then_some("model or mode")
+    }
+
+    fn specify(&self, text: &mut dyn fmt::Write) {
+        let _ = self.mode().map_or(Ok(()), |mode| write!(text, " {}", mode.name()));
+        if let Some(Info { firmware: (major, minor), .. }) = self.info() {
+            let _ = write!(text, " {major}.{minor:02}");
+        }
+    }
+
+    fn scanner_time(&self) -> Option<Nanos> {
+        self.scanner_time
+    }
+
+    fn doubt(&mut self, reasons: u8) {
+        self.reads.doubt(reasons);
+    }
+
+    fn introduction(&self, identity: &mut dyn fmt::Write, health: &mut dyn fmt::Write) -> Option<Condition> {
+        let info = self.info().filter(|_| self.is_introduced())?;
+        let (major, minor) = info.firmware;
+        let _ = write!(identity, "firmware {major}.{minor:02}, hardware {}, number ", info.hardware);
+        let _ = info.serial.iter().try_for_each(|byte| write!(identity, "{byte:02X}"));
+        let Some(said) = self.health() else { return Some(Condition::Unknown) };
+        let _ = write!(health, "{said}");
+        Some(match said {
+            Health::Good => Condition::Good,
+            Health::Warning(_) => Condition::Warning,
+            Health::Error(_) => Condition::Error,
+        })
+    }
+}
+
+/// Reason why a session does not stream as it should.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Trouble {
+    /// No response, or no packets in a recording.
+    NoAnswer {
+        /// The only rate that the session tried. `None`: it tried all.
+        baud: Option<u32>,
+        /// Seconds without a response, rounded down to 1, 2, 4, ..
+        seconds: u32,
+    },
+    /// No measured data arrived for one second.
+    Silence,
+    /// Packets arrive, but the head does not rotate.
+    StandsStill,
+    /// The scanner reports a warning or an error.
+    Unwell(Health),
+    /// The scanner responds, but does not begin to measure.
+    Refused,
+    /// A recording contains packets that may be of two kinds, and nothing shows which kind they are.
+    Alike,
+    /// The scanner does not have this mode, or the line is too slow for it. The scanner uses another mode.
+    NoMode(Mode),
+}
+
+impl fmt::Display for Trouble {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Trouble::NoAnswer { baud, seconds } => {
+                f.write_str("no answer at ")?;
+                match baud {
+                    Some(baud) => write!(f, "{baud}")?,
+                    None => f.write_str("115200, 256000, 460800 and 1000000")?,
+                }
+                write!(f, " baud for {seconds} s: power, cable, other port?")
+            }
+            Trouble::Silence => f.write_str("no measured data for one second"),
+            Trouble::StandsStill => f.write_str("packets come, but the head does not turn: is it blocked?"),
+            Trouble::Unwell(health) => write!(f, "the scanner reports: {health}"),
+            Trouble::Refused => f.write_str("the scanner answers, but does not begin to measure"),
+            Trouble::Alike => f.write_str(
+                "the packets may be of two kinds (82h or 85h), which nothing here tells: name the model or the mode",
+            ),
+            Trouble::NoMode(mode) => {
+                write!(
+                    f,
+                    "the scanner or its line cannot do mode {}: it measures in its fastest one",
+                    mode.name()
+                )
+            }
+        }
+    }
+}
+
+/// Describes a model for the configuration.
+const fn described(model: Model) -> family::Model {
+    family::Model { name: model.name(), baud: model.baud(), beams: model.beams() }
+}
+
+/// All models, described for the configuration.
+const MODELS: [family::Model; Model::ALL.len()] = {
+    let mut all = [described(Model::A1); Model::ALL.len()];
+    let mut at = 0;
+    while at < all.len() {
+        all[at] = described(Model::ALL[at]);
+        at += 1;
+    }
+    all
+};
+
+/// Names of all modes.
+const MODES: [&str; Mode::ALL.len()] = {
+    let mut all = [""; Mode::ALL.len()];
+    let mut at = 0;
+    while at < all.len() {
+        all[at] = Mode::ALL[at].name();
+        at += 1;
+    }
+    all
+};
+
+/// Maximum number of points in a revolution: those of an S2 at four revolutions per second.
 const MOST_POINTS: usize = 8_192;
-/// Without a packet for so long the session begins again.
+/// After this time without a packet, the session begins again.
 const SILENCE: Nanos = 1_000 * MILLIS;
-/// The slowest head turns once in this.
+/// After this time without a revolution, the head is blocked. The slowest head needs less for one.
 const STILL: Nanos = 2_000 * MILLIS;
-/// Nobody follows for so long before the motor rests: a program that is started again follows again.
+/// The motor stops after this time without subscribers. A program that restarts subscribes again in less.
 const IDLE: Nanos = 5_000 * MILLIS;
-/// All rates are tried twice in so long, where a stream goes on at each of them: one may not have heard that it shall stop.
+/// All rates are tried twice in this time if bytes arrive at each of them, because a stop request can be lost.
 const ROUNDS: Nanos = 8 * dialogue::DRAIN;

@@ -72,7 +72,7 @@ fn what_a_host_reads_is_what_the_truth_says() {
 #[test]
 fn it_restarts_after_a_dip_and_a_power_cycle() {
     for model in [Model::A1, Model::S2] {
-        let folder = Folder::new(&format!("restart-{}", model.name()));
+        let folder = Folder::new();
         let port = folder.path("front");
         let simulator = Simulator::start(SimulateOptions {
             ports: vec![port.clone()],

@@ -3,15 +3,13 @@
 use crate::line::State;
 use schema::{MILLIS, Nanos};
 
-use super::outgoing::Outgoing;
-use super::reply::{Reply, number};
-use super::{Phase, SILENCE, Session};
+use super::{Phase, SILENCE, Session, Trouble};
+use crate::rplidar::device_info::{Health, Info};
 use crate::rplidar::framer::Expect;
 use crate::rplidar::model::{Mode, Motor};
 use crate::rplidar::offers::{Offer, Offers};
 use crate::rplidar::packet::Kind;
-use crate::rplidar::request::{Answer, Request, key};
-use crate::rplidar::told::{Health, Info, Trouble};
+use crate::rplidar::request::{Answer, Request, RequestQueue, key};
 
 /// Questions in their order; those of a mode have its place among the offers.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -39,6 +37,26 @@ pub(super) enum Wanted {
     Express(u8),
 }
 
+/// A copy of a response, independent of the buffer of the framer.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Reply {
+    bytes: [u8; 64],
+    len: usize,
+}
+
+impl Reply {
+    pub(super) fn new(data: &[u8]) -> Reply {
+        let len = data.len().min(64);
+        let mut bytes = [0; 64];
+        bytes[..len].copy_from_slice(&data[..len]);
+        Reply { bytes, len }
+    }
+
+    pub(super) fn bytes(&self) -> &[u8] {
+        &self.bytes[..self.len]
+    }
+}
+
 impl Session {
     /// Begins the conversation anew, at the rate of the last one.
     pub(super) fn begin(&mut self, shown: State) {
@@ -56,7 +74,7 @@ impl Session {
     /// Tells it to stop, after so many attempts in vain.
     fn stop(&mut self, attempts: u8) {
         self.framer.expect(Expect::Answers);
-        self.outgoing = Outgoing::default();
+        self.outgoing = RequestQueue::default();
         self.outgoing.push(&Request::STOP);
         let (until, at_most) = (self.now + QUIET, self.now + DRAIN);
         self.phase = Phase::Draining { attempts, until, at_most };
@@ -67,7 +85,7 @@ impl Session {
         self.end_stream();
         self.framer.expect(Expect::Nothing);
         if !self.settings.listen_only {
-            self.outgoing = Outgoing::default();
+            self.outgoing = RequestQueue::default();
             self.outgoing.push(&Request::STOP);
             self.turn_head(false);
         }
@@ -327,7 +345,7 @@ impl Session {
                 self.restarts += 1;
                 self.streamed_at = None;
                 self.begin(State::Starting);
-                self.outgoing = Outgoing::default();
+                self.outgoing = RequestQueue::default();
                 self.phase = Phase::Booting { until: self.now + SETTLE };
             }
         }
@@ -389,6 +407,11 @@ impl Session {
         let is_standard = offer.kind.is_none_or(|kind| kind == Kind::Standard);
         self.ask(Ask::Scan(if is_standard { Wanted::Standard } else { Wanted::Express(offer.id) }), 0);
     }
+}
+
+/// Decodes a little-endian number of one to four bytes.
+fn number(data: &[u8]) -> u32 {
+    data.iter().take(4).rev().fold(0, |number, byte| number << 8 | u32::from(*byte))
 }
 
 /// A line on which nothing came for so long is quiet after a request to stop; and it is asked after so long, quiet or not.
