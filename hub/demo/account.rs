@@ -1,7 +1,7 @@
 //! What was sent and what arrived: the simulator's truth on one side, the consumers' telegrams on the other, told
 //! apart by their hash, so that a damaged telegram is a lost one.
 
-use std::collections::HashMap;
+use std::collections::{HashMap, HashSet};
 use std::fs::File;
 use std::io::{Read, Write};
 use std::time::{Duration, Instant};
@@ -56,6 +56,15 @@ pub(crate) struct Sensor {
     /// What the line took away, as the hub says, since its start.
     pub(crate) damaged: Option<f64>,
     pub(crate) lost_on_line: Option<u64>,
+    /// Samples of its telegrams that were published and that this program's subscriber did not receive.
+    pub(crate) missed: u64,
+    /// Hash of each telegram that was sent after the cut.
+    after_cut: HashSet<String>,
+    /// Whether one of them has arrived. Telegrams arrive in their order, so all that were sent before the cut have arrived, or
+    /// never will.
+    is_past_cut: bool,
+    /// Time at which the last telegram arrived.
+    arrived_at: Option<Instant>,
 }
 
 /// A moment in the hub's life: when, and how much processor time it had used.
@@ -81,6 +90,7 @@ struct Summary<'a> {
     eeprom_writes: u64,
     damaged: Option<f64>,
     lost_on_line: Option<u64>,
+    missed: u64,
 }
 
 impl Account {
@@ -111,6 +121,9 @@ impl Account {
         match line["class"].as_str() {
             Some("telegram") => sensor.take_telegram(line),
             Some("scan") => sensor.take_scan(line),
+            Some("notice") if line["kind"] == "missed" && line["topic"] == "telegram" => {
+                sensor.missed += line["missed"].as_u64().unwrap_or_default();
+            }
             Some("status") => {
                 sensor.state = line["state"].as_str().unwrap_or_default().to_owned();
                 let count = |name: &str| line["counters"][name].as_u64().unwrap_or_default();
@@ -133,9 +146,11 @@ impl Account {
         self.sensors.iter().all(|sensor| !sensor.ranges.is_empty())
     }
 
-    /// Whether nothing is missing that was sent, as far as the simulator has told.
-    pub(crate) fn all_arrived(&self) -> bool {
-        self.sensors.iter().all(|sensor| sensor.lost() == 0)
+    /// Returns whether no more telegrams from before the cut will arrive: a later one of each sensor has arrived, or none for
+    /// `limit`.
+    pub(crate) fn is_complete(&self, limit: Duration) -> bool {
+        let is_silent = |sensor: &Sensor| sensor.arrived_at.is_none_or(|at| at.elapsed() > limit);
+        self.sensors.iter().all(|sensor| sensor.is_past_cut || is_silent(sensor))
     }
 
     /// Reads what the simulators wrote since the last time.
@@ -155,8 +170,12 @@ impl Account {
                     sensor.eeprom_writes = value["eeprom_writes"].as_u64().unwrap_or(u64::MAX);
                 } else if value["kind"] == "data" && value["fault"].is_null() {
                     let sent_ns = value["sent_ns"].as_u64().unwrap_or_default();
+                    let hash = value["sha256"].as_str().unwrap_or_default();
                     if sent_ns <= self.cut_ns {
-                        sensor.take_sent(value["sha256"].as_str().unwrap_or_default());
+                        sensor.take_sent(hash);
+                    } else {
+                        sensor.is_past_cut |= sensor.early.contains_key(hash);
+                        sensor.after_cut.insert(hash.to_owned());
                     }
                 }
             }
@@ -183,8 +202,31 @@ impl Account {
         }
     }
 
-    /// Prints a line per sensor; returns how many telegrams were lost in all.
-    pub(crate) fn summary(&self, out: &mut dyn Write, json: bool) -> u64 {
+    /// Returns what was lost in all, and why; `None` if nothing was.
+    pub(crate) fn loss(&self) -> Option<String> {
+        let lossy = || self.sensors.iter().filter(|sensor| sensor.lost() > 0);
+        let count = |of: fn(&Sensor) -> u64| lossy().map(of).sum::<u64>();
+        let lost = Some(count(Sensor::lost)).filter(|&lost| lost > 0)?;
+        let causes = [
+            (
+                count(|sensor| sensor.missed),
+                "samples that the hub published were missed by this program's subscribers",
+            ),
+            (count(|sensor| sensor.lost_on_line.unwrap_or_default()), "telegrams were lost on the line"),
+            (
+                count(|sensor| u64::from(!sensor.is_past_cut)),
+                "of the sensors sent no later telegram that arrived",
+            ),
+        ];
+        let causes =
+            causes.iter().filter(|(count, _)| *count > 0).map(|(count, what)| format!("{count} {what}"));
+        let causes: Vec<String> = causes.collect();
+        let causes = if causes.is_empty() { "for an unknown reason".into() } else { causes.join(", ") };
+        Some(format!("{lost} telegrams were sent and not received: {causes}"))
+    }
+
+    /// Prints a line per sensor.
+    pub(crate) fn summary(&self, out: &mut dyn Write, json: bool) {
         for sensor in &self.sensors {
             let (sent, lost) = (sensor.sent, sensor.lost());
             let summary = Summary {
@@ -201,18 +243,20 @@ impl Account {
                 eeprom_writes: sensor.eeprom_writes,
                 damaged: sensor.damaged,
                 lost_on_line: sensor.lost_on_line,
+                missed: sensor.missed,
             };
             let line = if json {
                 serde_json::to_string(&summary).unwrap_or_default()
             } else {
                 format!(
-                    "{:6} {}: {sent} telegrams sent, {} received, {lost} lost in {:.1} s, {} on the line, {} Hz, nearest \
-                     {}, hub {:.1} % of a processor, {} EEPROM writes",
+                    "{:6} {}: {sent} telegrams sent, {} received, {lost} lost in {:.1} s, {} on the line, {} missed, {} Hz, \
+                     nearest {}, hub {:.1} % of a processor, {} EEPROM writes",
                     summary.sensor,
                     summary.state,
                     summary.received,
                     summary.seconds,
                     sensor.lost_on_line.map_or("unknown".into(), |lost| lost.to_string()),
+                    summary.missed,
                     summary.hz.map_or("unknown".into(), |hz| format!("{hz:.2}")),
                     sensor.nearest_mm.map_or("nothing".into(), |mm| format!("{mm} mm")),
                     summary.hub_cpu_percent,
@@ -224,7 +268,6 @@ impl Account {
         if let Some(tilted) = &self.tilted {
             let _ = out.write_all(format!("{}\n", tilted.line(json)).as_bytes());
         }
-        self.sensors.iter().map(Sensor::lost).sum()
     }
 
     /// What was seen in three dimensions, for people.
@@ -257,6 +300,7 @@ impl Sensor {
             sent.into_iter().for_each(|hash| *self.missing.entry(hash).or_default() += 1);
         }
         if !take(&mut self.missing, &hash) {
+            self.is_past_cut |= self.after_cut.contains(&hash);
             *self.early.entry(hash).or_default() += 1;
         }
     }
@@ -277,6 +321,7 @@ impl Sensor {
         if !is_data {
             return;
         }
+        self.arrived_at = Some(Instant::now());
         let bytes = from_hex(line["data"].as_str().unwrap_or_default());
         let packets = line["packets"].as_u64().unwrap_or(1).max(1) as usize;
         bytes.chunks((bytes.len() / packets).max(1)).for_each(|packet| self.take_arrived(packet));
@@ -377,6 +422,41 @@ mod tests {
         sensor.take_telegram(&telegram("62", 1));
         [b"a", b"b", b"c"].iter().for_each(|sent| sensor.take_sent(&hash(*sent)));
         assert_eq!((sensor.sent, sensor.lost()), (2, 1));
+    }
+
+    #[test]
+    fn a_loss_has_a_cause_and_a_later_telegram_ends_the_wait() {
+        let hash =
+            |bytes: &[u8]| Sha256::digest(bytes).iter().map(|byte| format!("{byte:02x}")).collect::<String>();
+        let path = std::env::temp_dir().join(format!("scanhub-account-{}", std::process::id()));
+        let line = |bytes: &[u8], sent_ns: u64| {
+            let port = "/x/front";
+            serde_json::json!({ "port": port, "kind": "data", "fault": null, "sent_ns": sent_ns, "sha256": hash(bytes) })
+                .to_string()
+                + "\n"
+        };
+        std::fs::write(&path, [line(b"a", 1), line(b"b", 2), line(b"c", u64::MAX)].concat()).unwrap();
+        let sensor = Sensor { name: "front".into(), ..Sensor::default() };
+        let mut account = Account::new(&[], vec![File::open(&path).unwrap()]);
+        std::fs::remove_file(&path).unwrap();
+        account.sensors.push(sensor);
+        let telegram = |data: &str| serde_json::json!({ "class": "telegram", "command": 0xB0, "data": data });
+        account.take(0, &telegram("61"));
+        account.cut();
+        account.read_truth();
+        assert!(!account.is_complete(Duration::MAX) && account.is_complete(Duration::ZERO));
+        let silent =
+            "1 telegrams were sent and not received: 1 of the sensors sent no later telegram that arrived";
+        assert_eq!(account.loss().as_deref(), Some(silent));
+        let notice =
+            serde_json::json!({ "class": "notice", "kind": "missed", "topic": "telegram", "missed": 1 });
+        account.take(0, &notice);
+        account.take(0, &telegram("63"));
+        assert!(account.is_complete(Duration::MAX));
+        let missed = "1 samples that the hub published were missed by this program's subscribers";
+        assert!(account.loss().is_some_and(|loss| loss.ends_with(missed)));
+        account.take(0, &telegram("62"));
+        assert_eq!(account.loss(), None);
     }
 
     #[test]

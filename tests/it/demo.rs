@@ -34,22 +34,32 @@ fn processes(domain: &str) -> Vec<String> {
     lines.filter(|line| line.split('\0').any(|word| word == domain)).collect()
 }
 
-/// Whether the last lines, one for each of `names`, say that nothing was lost of a stream that lived.
-fn nothing_was_lost_of(outcome: &Outcome, names: &[&str]) {
+/// Checks that the last lines, one for each of `names`, account for every telegram of a stream: it arrived, or a busy machine
+/// made the demonstration's subscriber miss it, and then the exit code and the message say so.
+fn accounts_for_all(outcome: &Outcome, names: &[&str]) {
     let lines = outcome.of_class("summary");
     let sensors: Vec<_> = lines.iter().map(|line| line["sensor"].as_str().unwrap_or_default()).collect();
     assert_eq!(sensors, names, "{outcome}");
+    let mut lost_in_all = 0;
     for line in &lines {
         assert_eq!((&line["class"], &line["state"]), (&"summary".into(), &"streaming".into()), "{outcome}");
-        assert_eq!((number(line, "lost"), number(line, "eeprom_writes")), (0, 0), "{outcome}");
-        let (sent, received) = (number(line, "sent"), number(line, "received"));
-        assert!(sent >= 20 && received >= sent, "{outcome}");
+        let [sent, received, lost, missed] =
+            ["sent", "received", "lost", "missed"].map(|key| number(line, key));
+        assert_eq!((sent - lost, number(line, "eeprom_writes")), (received, 0), "{outcome}");
+        assert!(received > 0 && (lost == 0 || missed > 0), "a loss without a cause: {outcome}");
         assert!(line["nearest_mm"].is_u64() && line["hub_cpu_percent"].is_f64(), "{outcome}");
+        lost_in_all += lost;
     }
+    ends_as_counted(outcome, lost_in_all);
 }
 
-fn nothing_was_lost(outcome: &Outcome) {
-    nothing_was_lost_of(outcome, &["front", "rear"]);
+fn ends_as_counted(outcome: &Outcome, lost: u64) {
+    assert_eq!(outcome.code, Some(if lost == 0 { 0 } else { 5 }), "{outcome}");
+    if lost > 0 {
+        let message = outcome.of_class("error")[0]["message"].to_string();
+        let begin = format!("\"{lost} telegrams were sent and not received: ");
+        assert!(message.starts_with(&begin) && message.contains("missed"), "{outcome}");
+    }
 }
 
 #[test]
@@ -60,11 +70,10 @@ fn of_another_family_or_of_all() {
         ("mixed", &["front", "side", "top"]),
     ] {
         let outcome = demo(&["--headless", "--for", "2s", "--json", "--family", family], Program::wait);
-        assert_eq!(outcome.code, Some(0), "{family}: {outcome}");
-        nothing_was_lost_of(&outcome, names);
-        // Turns, and not packets.
+        accounts_for_all(&outcome, names);
+        // Revolutions, and not packets. Simulated time stands still while a busy machine does not run the simulator.
         let last = &outcome.of_class("summary")[1];
-        assert!(last["hz"].as_f64().is_some_and(|hz| (5.0..12.0).contains(&hz)), "{last}");
+        assert!(last["hz"].is_null() || last["hz"].as_f64().is_some_and(|hz| hz < 12.0), "{last}");
     }
     let outcome = demo(&["--family", "sick"], Program::wait);
     assert!(outcome.code == Some(2) && outcome.errors.contains("lms, ld, rplidar, mixed"), "{outcome}");
@@ -72,11 +81,16 @@ fn of_another_family_or_of_all() {
 
 #[test]
 fn a_sensor_on_a_mount_sees_in_three_dimensions() {
-    // Two ways of the mount of 50 degrees at 30 degrees a second, and what comes before the first turn.
-    let outcome = demo(&["--world", "tilt", "--headless", "--for", "8s", "--json"], Program::wait);
-    assert_eq!(outcome.code, Some(0), "{outcome}");
+    let outcome = demo(&["--world", "tilt", "--headless", "--json"], |mut program| {
+        let ready = program.await_line("ready", testkit::is_class("ready"));
+        let mut echo = beside(ready["domain"].as_str().expect("a name"), &["echo", "hall/obstacles"]);
+        echo.await_lines(3, "a sweep", testkit::is_class("obstacles"));
+        assert_eq!(echo.end(INT).code, Some(0));
+        program.end(INT)
+    });
     let [front, hall] = &outcome.of_class("summary")[..] else { panic!("{outcome}") };
-    assert_eq!((&front["sensor"], number(front, "lost")), (&"front".into(), 0), "{outcome}");
+    assert_eq!(front["sensor"], "front", "{outcome}");
+    ends_as_counted(&outcome, number(front, "lost"));
     assert!(hall["sensor"] == "hall" && number(hall, "sweeps") >= 2, "{outcome}");
     let outcome = demo(&["--world", "tilt", "--family", "ld"], Program::wait);
     assert!(outcome.code == Some(2) && outcome.errors.contains("--family"), "{outcome}");
@@ -103,8 +117,7 @@ fn headless_in_an_empty_environment() {
         assert!(root.ends_with(domain), "{root}");
         program.wait()
     });
-    assert_eq!(outcome.code, Some(0), "{outcome}");
-    nothing_was_lost(&outcome);
+    accounts_for_all(&outcome, &["front", "rear"]);
 }
 
 #[test]
@@ -116,8 +129,8 @@ fn where_the_users_own_place_is_too_long_for_a_domain() {
     command.args(["demo", "--headless", "--for", "1s", "--json"]).env_clear().env("XDG_RUNTIME_DIR", &place);
     let outcome = Program::start(command).wait();
     let left = fs::read_dir(&place).expect("it is there").count();
-    assert_eq!((outcome.code, left), (Some(0), 0), "{outcome}");
-    nothing_was_lost(&outcome);
+    assert_eq!(left, 0, "{outcome}");
+    accounts_for_all(&outcome, &["front", "rear"]);
 }
 
 /// A verb of the program in `domain` of a demonstration that runs.
@@ -150,8 +163,7 @@ fn people_are_followed_from_room_to_room_in_the_house() {
         assert_eq!(echo.end(INT).code, Some(0));
         program.end(INT)
     });
-    assert_eq!(outcome.code, Some(0), "{outcome}");
-    nothing_was_lost_of(&outcome, &["hall", "hall-door", "kitchen", "kitchen-door"]);
+    accounts_for_all(&outcome, &["hall", "hall-door", "kitchen", "kitchen-door"]);
     let refused = demo(&["--world", "house", "--family", "mixed", "--headless"], Program::wait);
     assert!(refused.code == Some(2) && refused.errors.contains("one family"), "{refused}");
 }
@@ -165,13 +177,14 @@ fn interrupted() {
         until("a domain", || !shared_memory(&format!("sh_{name}_")).is_empty());
         program.end(INT)
     });
-    assert_eq!(outcome.code, Some(0), "{outcome}");
+    let lost = outcome.of_class("summary").iter().map(|line| number(line, "lost")).sum();
+    ends_as_counted(&outcome, lost);
 }
 
 #[test]
 fn the_picture_into_a_pipe() {
     let outcome = demo(&["--for", "2s"], Program::wait);
-    assert_eq!(outcome.code, Some(0), "{outcome}");
+    assert!([Some(0), Some(5)].contains(&outcome.code), "{outcome}");
     let text = String::from_utf8_lossy(&outcome.out);
     assert!(!text.contains('\x1b'), "controls a terminal that is none: {text:?}");
     for word in [
@@ -179,7 +192,7 @@ fn the_picture_into_a_pipe() {
         "front",
         "rear",
         "nearest",
-        "0 lost",
+        " lost",
         "scanhub echo front/scan --domain demo-",
         "browser: http://127.0.0.1:",
     ] {
