@@ -1,5 +1,7 @@
 //! `scanhub tilt`, from telegrams and angles to points and an obstacle: as its page walks through it, and with angles that stop.
 
+use std::cell::Cell;
+
 use scanhub_client::Subscription;
 use schema::Tilt;
 use serde_json::Value;
@@ -98,13 +100,18 @@ fn points_are_where_things_are_and_the_post_is_an_obstacle() {
     let before = number(&clouds.await_line("the end of a sweep", is_last), "sweep");
     let sweep = number(&clouds.await_line("the end of the next one", is_last), "sweep");
     assert!(sweep > before, "{sweep} {before}");
+    // A sweep may have few points, because a busy machine loses scans.
+    let count = Cell::new(0);
+    clouds.await_line("enough points", |line| {
+        count.set(count.get() + line["points"].as_array().map_or(0, Vec::len));
+        count.get() > 1_000
+    });
     let clouds = clouds.end(INT).of_class("cloud");
     let of_sweep: Vec<&Value> = clouds.iter().filter(|line| number(line, "sweep") == sweep).collect();
     let firsts = of_sweep.iter().filter(|line| line["first"] == true).count();
     assert!(firsts == 1 && of_sweep[0]["first"] == true, "{firsts}");
     let points = clouds.iter().flat_map(|line| line["points"].as_array().expect("a list")).map(numbers);
     let points: Vec<Vec<f64>> = points.collect();
-    assert!(points.len() > 1_000, "{}", points.len());
     let mut off: Vec<f64> = points.iter().map(|point| off(point)).collect();
     off.sort_by(f64::total_cmp);
     // A machine that stands still stamps scans late.
