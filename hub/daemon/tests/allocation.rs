@@ -17,18 +17,21 @@ use rustix::fs::{OFlags, fcntl_setfl};
 use rustix::io::Errno;
 use rustix::process::{Signal, getpid, kill_process};
 use rustix::pty::{OpenptFlags, grantpt, openpt, ptsname, unlockpt};
+use rustix::termios::tcgetattr;
 use scanhub_drivers::lms;
 use scanhub_drivers::lms::command::Request;
 use scanhub_drivers::lms::reply::{self, Health};
-use scanhub_drivers::lms::telegram::ACK;
+use scanhub_drivers::lms::telegram::{ACK, Encoded, FRAME, MAX_TELEGRAM, STX, Telegram};
 use scanhub_drivers::lms::variant::{Baud, Mode, Unit, Variant};
 use schema::ipc::{self, Payload, Subscriber};
 use schema::{Domain, Foreground, Marks, Scan};
 
-/// A sensor of few words at the other end of a pty: it streams when it is told to, and answers two questions.
+/// A scanner at the other end of a pty. Like a real one, it neither sends nor receives anything while the hub's port has
+/// another rate, and it streams until it is told to stop.
 struct Sensor {
     line: OwnedFd,
     heard: Vec<u8>,
+    streams: bool,
     scans: u64,
 }
 
@@ -44,7 +47,7 @@ impl Sensor {
         };
         let (line, name) = make().expect("a pty");
         let name = name.into_string().expect("a name of ASCII");
-        (Sensor { line, heard: Vec::new(), scans: 0 }, name)
+        (Sensor { line, heard: Vec::new(), streams: true, scans: 0 }, name)
     }
 
     /// Writes all of it, however long a busy machine keeps the hub from reading.
@@ -60,45 +63,94 @@ impl Sensor {
         }
     }
 
-    fn send_scan(&mut self) {
-        self.scans += 1;
-        let words = [1000 + (self.scans % 1000) as u16; 361];
-        self.say(lms::measured::encode(0, Unit::Mm, &words, 0x10).bytes());
+    fn is_tuned(&self) -> bool {
+        tcgetattr(&self.line).is_ok_and(|termios| termios.output_speed() == Baud::B500000.rate())
     }
 
-    /// Answers what was asked.
+    fn send_scan(&mut self) {
+        if self.streams && self.is_tuned() {
+            self.scans += 1;
+            let words = [1000 + (self.scans % 1000) as u16; 361];
+            self.say(lms::measured::encode(0, Unit::Mm, &words, 0x10).bytes());
+        }
+    }
+
+    /// Replies to all requests that have arrived.
     fn answer(&mut self) {
         let mut buffer = [0; 64];
-        let len = rustix::io::read(&self.line, &mut buffer).unwrap_or(0);
-        self.heard.extend(&buffer[..len]);
+        while let Ok(len @ 1..) = rustix::io::read(&self.line, &mut buffer) {
+            self.heard.extend(&buffer[..len]);
+        }
+        if !self.is_tuned() {
+            self.heard.clear();
+        }
+        while let Some(request) = self.next_request() {
+            if let Some(reply) = self.reply(request) {
+                self.say(&[&[ACK], reply.bytes()].concat());
+            }
+        }
+    }
+
+    /// Takes the next request out of the bytes that have arrived, once all of it has.
+    fn next_request(&mut self) -> Option<Request> {
+        loop {
+            let begin = self.heard.iter().position(|&byte| byte == STX).unwrap_or(self.heard.len());
+            self.heard.drain(..begin);
+            let [_, _, low, high, ..] = self.heard[..] else { return None };
+            let len = usize::from(u16::from_le_bytes([low, high])) + FRAME;
+            if len <= MAX_TELEGRAM && self.heard.len() < len {
+                return None;
+            }
+            let telegram = self.heard.get(..len).and_then(Telegram::check);
+            let request = telegram.and_then(Request::decode);
+            // A request that the hub broke off hides no later one.
+            self.heard.drain(..if telegram.is_some() { len } else { 1 });
+            if request.is_some() {
+                return request;
+            }
+        }
+    }
+
+    fn reply(&mut self, request: Request) -> Option<Encoded> {
         let health = Health {
             software: *b"V02.30 ",
-            operating_mode: 0x24,
+            operating_mode: if self.streams { 0x24 } else { 0x25 },
             mode: Mode(1),
             variant: Variant::HALF,
             unit: Unit::Mm,
             baud: Baud::B500000,
         };
-        let answer = if self.heard.ends_with(Request::Status.encode(0).bytes()) {
-            reply::status(0, &health, 0x10)
-        } else if self.heard.ends_with(Request::Type.encode(0).bytes()) {
-            reply::kind(0, b"LMS200;301063;V02.30 ", 0x10)
-        } else {
-            return;
-        };
-        self.heard.clear();
-        self.say(&[&[ACK], answer.bytes()].concat());
+        match request {
+            Request::Status => Some(reply::status(0, &health, 0x10)),
+            Request::Type => Some(reply::kind(0, b"LMS200;301063;V02.30 ", 0x10)),
+            Request::Configuration => Some(reply::configuration(0, Mode(1), Unit::Mm, 0x10)),
+            Request::Variant(variant) => Some(reply::variant(0, variant == Variant::HALF, variant, 0x10)),
+            Request::Baud(baud) => Some(reply::mode(0, baud == Baud::B500000, 0x10)),
+            Request::Stop | Request::Stream => {
+                self.streams = request == Request::Stream;
+                Some(reply::mode(0, true, 0x10))
+            }
+            _ => None,
+        }
     }
 }
 
 /// Sends scans until `count` more were published.
 fn stream(sensor: &mut Sensor, subscriber: &Subscriber<Scan>, count: u64) {
-    let give_up_at = Instant::now() + Duration::from_secs(60);
     for number in 0..count {
+        let give_up_at = Instant::now() + Duration::from_secs(60);
+        sensor.answer();
         sensor.send_scan();
         let mut next_scan = Instant::now() + Duration::from_millis(50);
         while !matches!(Scan::receive(subscriber), Ok(Some(_))) {
-            assert!(Instant::now() < give_up_at, "scan {number} of {count} did not come");
+            assert!(
+                Instant::now() < give_up_at,
+                "scan {number} of {count} was not published; the scanner streams: {}, the port has its rate: {}, {} bytes of \
+                 a request wait",
+                sensor.streams,
+                sensor.is_tuned(),
+                sensor.heard.len()
+            );
             sensor.answer();
             if Instant::now() > next_scan {
                 // Until the sensor was asked for its mode a scan cannot be read, and is none.
