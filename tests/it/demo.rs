@@ -71,9 +71,9 @@ fn of_another_family_or_of_all() {
     ] {
         let outcome = demo(&["--headless", "--for", "2s", "--json", "--family", family], Program::wait);
         accounts_for_all(&outcome, names);
-        // Revolutions, and not packets. Simulated time stands still while a busy machine does not run the simulator.
+        // Ten revolutions in a second, and not hundreds of packets. Stamps of a few scans are rough on a busy machine.
         let last = &outcome.of_class("summary")[1];
-        assert!(last["hz"].is_null() || last["hz"].as_f64().is_some_and(|hz| hz < 12.0), "{last}");
+        assert!(last["hz"].is_null() || last["hz"].as_f64().is_some_and(|hz| hz < 50.0), "{last}");
     }
     let outcome = demo(&["--family", "sick"], Program::wait);
     assert!(outcome.code == Some(2) && outcome.errors.contains("lms, ld, rplidar, mixed"), "{outcome}");
