@@ -1,5 +1,5 @@
-//! The background model of a sensor: the range at which each beam ends when nobody is there. Refuses to know how it is
-//! learned.
+//! The background model of a sensor, and the foreground of a scan. The model has the range at which each beam ends in
+//! an empty scene. The foreground has the beams of one scan that end in front of it, and the segments that they form.
 
 use std::fmt;
 
@@ -10,21 +10,22 @@ use iceoryx2::prelude::ZeroCopySend;
 use crate::datagram::Packed;
 use crate::sliced::sliced;
 
-/// What stands before the ranges of a [`Background`]. 32 bytes.
+/// Head of a [`Background`], before the ranges. 32 bytes.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Pod, Zeroable)]
 #[repr(C)]
 pub struct BackgroundHead {
-    /// Angle of beam 0 in radians, as of a scan.
+    /// Angle of beam 0 in radians, as in a scan.
     pub first_angle: f64,
     /// Angle from one beam to the next in radians; 0 before the first scan.
     pub step: f64,
-    /// Counts the models of this hub's life: one more after a reset, a load, and a change of beams or unit.
+    /// Number of the model in this run of the hub. It increases by 1 after a reset, a load, and a change of beams or
+    /// unit.
     pub generation: u32,
-    /// Micrometres per device unit.
+    /// Micrometers per device unit.
     pub unit_um: u32,
-    /// Beams whose background is known.
+    /// Number of beams whose background is known.
     pub taught: u16,
-    /// Beams of the model; 0 before the first scan.
+    /// Number of beams of the model; 0 before the first scan.
     pub count: u16,
     /// [`Background::FROZEN`] or 0.
     pub flags: u8,
@@ -33,60 +34,61 @@ pub struct BackgroundHead {
 }
 
 sliced! {
-    /// The payload of topic `background`: a [`BackgroundHead`], which its fields are read through, and behind it a range of two
-    /// bytes for every beam. Sent when a new generation starts, and with every scan if so configured.
+    /// The payload of topic `background`: a [`BackgroundHead`], whose fields can be read directly, followed by a range
+    /// of two bytes for every beam. The hub publishes it when a new generation starts, and with every scan if
+    /// configured.
     Background, BackgroundWord, "scanhub.Background.v2", BackgroundHead
 }
 
 impl Background {
-    /// Range of a beam whose background is not known.
+    /// Range of a beam whose background is unknown.
     pub const UNTAUGHT: u16 = 0;
-    /// Range of a beam whose background is beyond what the sensor measures.
+    /// Range of a beam whose background is beyond the sensor's maximum range.
     pub const FAR: u16 = u16::MAX;
-    /// Flag: nothing is learned until it is thawed.
+    /// Flag: learning is stopped.
     pub const FROZEN: u8 = 1;
 
-    /// Returns the bytes of a model of so many beams.
+    /// Returns the length in bytes of a model of `beams` beams.
     pub const fn len(beams: usize) -> usize {
         Background::HEAD + 2 * beams
     }
 
-    /// Returns a model with `head` and as many `ranges` as that shall have beams.
+    /// Returns a model with `head`, and a beam for each of `ranges`.
     pub fn of(head: BackgroundHead, ranges: &[u16]) -> Box<Background> {
         let mut model = Background::zeroed(Background::len(ranges.len()));
         model.begin(BackgroundHead { count: ranges.len() as u16, ..head }).copy_from_slice(ranges);
         model
     }
 
-    /// Writes `head` and returns the ranges, which have to be filled.
+    /// Writes `head` and returns the ranges, which the caller must fill.
     ///
     /// # Panics
     ///
-    /// If the memory is too short for them.
+    /// Panics if the memory is too short for them.
     pub fn begin(&mut self, head: BackgroundHead) -> &mut [u16] {
         **self = head;
         cast_slice_mut(&mut self.memory_mut()[Background::HEAD..Background::len(head.count.into())])
     }
 
-    /// Returns the ranges of the beams in device units, [`Background::UNTAUGHT`] or [`Background::FAR`].
+    /// Returns the ranges of the beams in device units. A range can be [`Background::UNTAUGHT`] or [`Background::FAR`].
     pub fn ranges(&self) -> &[u16] {
         let room = self.memory().len().saturating_sub(Background::HEAD) / 2;
         let beams = usize::from(self.count).min(room);
         self.memory().get(Background::HEAD..Background::len(beams)).map_or(&[], cast_slice)
     }
 
-    /// Returns the ranges, to be written.
+    /// Returns the ranges for writing.
     pub fn ranges_mut(&mut self) -> &mut [u16] {
         let head = **self;
         self.begin(head)
     }
 
-    /// Returns whether nothing is learned until it is thawed.
+    /// Returns whether learning is stopped.
     pub fn is_frozen(&self) -> bool {
         self.flags & Background::FROZEN != 0
     }
 
-    /// Returns the model in `bytes`, if they are as many as its count says.
+    /// Returns the model in `bytes`, or `None` if their length does not match its count.
     pub fn read(bytes: &[u8]) -> Option<Box<Background>> {
         let mut model = Background::zeroed(bytes.len());
         (model.unpack(bytes) && model.bytes().len() == bytes.len()).then_some(model)
@@ -103,6 +105,175 @@ impl fmt::Debug for Background {
     }
 }
 
+/// Maximum number of segments of a scan.
+pub const SEGMENTS: usize = 64;
+
+/// Head of a [`Foreground`], before the arrays. 24 bytes.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Pod, Zeroable)]
+#[repr(C)]
+pub struct ForegroundHead {
+    /// Generation of the background model that the scan was compared with.
+    pub generation: u32,
+    /// Micrometers per device unit.
+    pub unit_um: u32,
+    /// Number of beams of the scan.
+    pub count: u16,
+    /// Number of beams in the foreground.
+    pub beams: u16,
+    /// Number of segments, at most [`SEGMENTS`].
+    pub segments: u16,
+    /// Number of segments that did not fit.
+    pub left_out: u16,
+    /// Bit i is set if segment i is supported: it has several beams, or the foreground of the previous scan was near
+    /// it.
+    pub supported: u64,
+}
+
+sliced! {
+    /// The payload of topic `foreground`, one sample per scan even if it is empty. It starts with a [`ForegroundHead`],
+    /// whose fields can be read directly. The arrays follow:
+    ///
+    /// - [`SEGMENTS`] segments of 16 bytes,
+    /// - a bit for every beam of the scan, in pairs of bytes,
+    /// - a range of two bytes for every beam of the scan.
+    ///
+    /// In the arrays of segments and ranges, the used elements come first, and the others are 0.
+    Foreground, ForegroundWord, "scanhub.Foreground.v2", ForegroundHead
+}
+
+/// Neighboring foreground beams that belong together.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Pod, Zeroable)]
+#[cfg_attr(feature = "ipc", derive(ZeroCopySend), type_name("scanhub.Segment.v2"))]
+#[repr(C)]
+pub struct Segment {
+    /// First beam.
+    pub first: u16,
+    /// Last beam.
+    pub last: u16,
+    /// Lowest range in device units.
+    pub nearest: u16,
+    /// Distance from the first to the last point, in device units.
+    pub width: u16,
+    /// Mean of the points in the robot's frame: mm ahead of the center.
+    pub x_mm: i32,
+    /// Mean of the points in the robot's frame: mm to the left of the center.
+    pub y_mm: i32,
+}
+
+/// Arrays of a foreground, for writing.
+#[derive(Debug)]
+pub struct ForegroundArrays<'a> {
+    /// Room for [`SEGMENTS`] segments.
+    pub segments: &'a mut [Segment],
+    /// Beams in the foreground: beam i is bit i % 8 of byte i / 8.
+    pub bits: &'a mut [u8],
+    /// Ranges of the foreground beams in device units, in the order of the beams. There is room for all beams of the
+    /// scan.
+    pub ranges: &'a mut [u16],
+}
+
+impl Foreground {
+    /// Returns the length in bytes of a foreground for `beams` beams.
+    pub const fn len(beams: usize) -> usize {
+        BITS + set(beams) + 2 * beams
+    }
+
+    /// Returns an empty foreground of a scan of `beams` beams.
+    pub fn of(beams: usize) -> Box<Foreground> {
+        let mut foreground = Foreground::zeroed(Foreground::len(beams));
+        foreground.count = beams as u16;
+        foreground
+    }
+
+    /// Writes `head` and returns the arrays, which the caller must fill.
+    ///
+    /// # Panics
+    ///
+    /// Panics if the memory is too short for them.
+    pub fn begin(&mut self, head: ForegroundHead) -> ForegroundArrays<'_> {
+        **self = head;
+        let n = usize::from(head.count);
+        let (segments, rest) = self.memory_mut()[Foreground::HEAD..].split_at_mut(BITS - Foreground::HEAD);
+        let (bits, rest) = rest.split_at_mut(set(n));
+        ForegroundArrays {
+            segments: cast_slice_mut(segments),
+            bits: &mut bits[..n.div_ceil(8)],
+            ranges: cast_slice_mut(&mut rest[..2 * n]),
+        }
+    }
+
+    /// Returns whether beam `i` is in the foreground.
+    pub fn contains(&self, i: usize) -> bool {
+        self.bits().get(i / 8).is_some_and(|byte| byte >> (i % 8) & 1 == 1)
+    }
+
+    /// Returns index and range of each foreground beam, in the order of the beams. Ranges are in device units.
+    pub fn readings(&self) -> impl Iterator<Item = (usize, u16)> + '_ {
+        let bytes = self.bits().iter().enumerate().filter(|(_, byte)| **byte != 0);
+        let of_byte = |(at, &byte): (usize, &u8)| {
+            (0..8).filter(move |bit| byte >> bit & 1 == 1).map(move |bit| 8 * at + bit)
+        };
+        bytes.flat_map(of_byte).take_while(|&i| i < self.scan_beams()).zip(self.ranges().iter().copied())
+    }
+
+    /// Returns the ranges of the foreground beams in device units.
+    pub fn ranges(&self) -> &[u16] {
+        let (n, begin) = (usize::from(self.beams).min(self.scan_beams()), BITS + set(self.scan_beams()));
+        self.memory().get(begin..begin + 2 * n).map_or(&[], cast_slice)
+    }
+
+    /// Returns the used segments.
+    pub fn segments(&self) -> &[Segment] {
+        let all: &[Segment] = self.memory().get(Foreground::HEAD..BITS).map_or(&[], cast_slice);
+        &all[..usize::from(self.segments).min(all.len())]
+    }
+
+    /// Returns whether segment `i` is supported. A single beam without foreground near it in the previous scan is not,
+    /// and may come from a flickering edge.
+    pub fn has_support(&self, i: usize) -> bool {
+        i < self.segments().len() && self.supported >> i & 1 == 1
+    }
+
+    /// Returns a bit for every beam of the scan, as [`ForegroundArrays::bits`].
+    pub(crate) fn bits(&self) -> &[u8] {
+        self.memory().get(BITS..BITS + self.scan_beams().div_ceil(8)).unwrap_or_default()
+    }
+
+    /// Sets the first `len` bytes to 0. Returns `false` if there is too little memory.
+    pub(crate) fn clear(&mut self, len: usize) -> bool {
+        self.memory_mut().get_mut(..len).map(|memory| memory.fill(0)).is_some()
+    }
+
+    /// Returns the number of beams of the scan, or 0 if there is too little memory for them.
+    fn scan_beams(&self) -> usize {
+        let n = usize::from(self.count);
+        if Foreground::len(n) <= self.memory().len() { n } else { 0 }
+    }
+
+    fn used(&self) -> usize {
+        Foreground::len(self.scan_beams())
+    }
+}
+
+impl fmt::Debug for Foreground {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let readings: Vec<_> = self.readings().collect();
+        f.debug_struct("Foreground")
+            .field("head", &**self)
+            .field("readings", &readings)
+            .field("segments", &self.segments())
+            .finish()
+    }
+}
+
+/// Offset of the bits.
+const BITS: usize = Foreground::HEAD + SEGMENTS * size_of::<Segment>();
+
+/// Returns the length in bytes of a bit for every beam. It is even, because the ranges that follow take two bytes each.
+const fn set(beams: usize) -> usize {
+    2 * beams.div_ceil(16)
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -116,5 +287,20 @@ mod tests {
         for bytes in [&model.bytes()[..37], &[model.bytes(), &[0]].concat(), &[], &[0xFF; 816]] {
             assert_eq!(Background::read(bytes), None);
         }
+    }
+
+    #[test]
+    fn readings_pair_beams_with_ranges_and_segments_with_support() {
+        let mut foreground = Foreground::of(401);
+        let arrays = foreground.begin(ForegroundHead { count: 401, beams: 2, ..ForegroundHead::default() });
+        (arrays.bits[0], arrays.bits[50]) = (0x80, 1);
+        arrays.ranges[..2].copy_from_slice(&[700, 800]);
+        assert_eq!(foreground.readings().collect::<Vec<_>>(), [(7, 700), (400, 800)]);
+        assert!(!foreground.contains(401) && !foreground.contains(10_000));
+        foreground.supported = 0b101;
+        foreground.segments = 2;
+        assert_eq!([0, 1, 2, 64].map(|i| foreground.has_support(i)), [true, false, false, false]);
+        foreground.count = 2000;
+        assert_eq!(foreground.readings().count(), 0, "there is no memory for so many");
     }
 }

@@ -1,47 +1,42 @@
-//! A sample on a network: a datagram, or several if it is longer, readable without a library, checked before any of it is used. Refuses to know
-//! sockets, senders and what is missing between two datagrams. Needs neither shared memory nor a heap.
+//! A sample as one datagram, or as several if it is longer. Its format needs no library to read, and every field is checked
+//! before it is used.
+//!
+//! This module needs neither shared memory nor a heap. Sockets are in crate `lan`.
 
 mod announce;
-mod datagram_error;
-mod lives;
-mod numbers;
+mod gateway_runs;
 mod payload;
-mod standing;
 mod stream_stats;
-mod voices;
 
 use crc::{CRC_32_ISCSI, Crc, Table};
 
-pub use announce::{Announce, Announced};
-pub use datagram_error::DatagramError;
-pub use lives::LIVES;
-pub use numbers::{Fresh, Row, WINDOW};
-pub use payload::Packed;
-pub use standing::{Arrival, Standing};
-pub use stream_stats::{GivenUp, ROWS, StreamStats};
-
 use crate::Topic;
 
-/// Bytes before the payload.
+pub use announce::{Announce, Announced};
+pub use gateway_runs::{Arrival, LIVES, Standing};
+pub use payload::Packed;
+pub use stream_stats::{Fresh, GivenUp, ROWS, Row, StreamStats, WINDOW};
+
+/// Bytes of the header.
 pub const HEAD: usize = 48;
-/// Bytes of a MAC after the payload, if [`LanFlags::AUTHENTICATED`] is set.
+/// Bytes of the MAC after the payload, if [`LanFlags::AUTHENTICATED`] is set.
 pub const MAC: usize = 16;
-/// The longest datagram that is never fragmented where tunnels leave an MTU of 1400.
+/// Longest datagram that is never fragmented where tunnels leave an MTU of 1400.
 pub const MTU_SAFE: usize = 1372;
-/// The shortest limit that a gateway can be given: what every network has to carry. Longer samples go in parts.
+/// Lowest limit that a gateway accepts, which every network can carry. Longer samples are sent in parts.
 pub const MTU_LEAST: usize = 576;
-/// The longest datagram on an Ethernet.
+/// Longest datagram on an Ethernet.
 pub const MTU_ETHERNET: usize = 1472;
-/// The longest payload of a part.
+/// Longest payload of a part.
 pub const PART_LONGEST: usize = MTU_ETHERNET - HEAD;
-/// The most parts of a sample.
+/// Maximum number of parts of a sample.
 pub const PARTS: usize = 255;
 /// Port of all groups.
 pub const PORT: u16 = 22_200;
-/// The first three bytes of all groups, of which [`group`] is the last.
+/// First three bytes of all groups. [`group`] returns the last one.
 pub const GROUPS: [u8; 3] = [239, 255, 76];
 
-/// The bits of [`Head::flags`].
+/// Bits of [`Head::flags`].
 pub struct LanFlags;
 
 impl LanFlags {
@@ -49,45 +44,46 @@ impl LanFlags {
     pub const AUTHENTICATED: u8 = 1;
     /// The sensor is simulated.
     pub const SIMULATED: u8 = 2;
-    /// The sensor is a recording.
+    /// The sensor is a replayed recording.
     pub const REPLAYED: u8 = 4;
-    /// The stamp is an estimate.
+    /// The stamp is estimated.
     pub const STAMP_ESTIMATED: u8 = 8;
     /// The telegram is suspect.
     pub const SUSPECT: u8 = 16;
 }
 
-/// The header, before the payload.
+/// Header of a datagram, before the payload.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Head {
     /// [`Announce::NUMBER`], or a topic's [`Topic::number`].
     pub topic: u8,
     /// Bits of [`LanFlags`].
     pub flags: u8,
-    /// The gateway, a random number.
+    /// Random number of the gateway.
     pub hub: u64,
-    /// The gateway's life: seconds since 1970 at its start, or one more than the last one.
+    /// Run of the gateway: seconds since 1970 at its start, or one more than the previous run.
     pub epoch: u32,
-    /// Number of the sample among those of this sensor and topic, from 0, wrapping.
+    /// Sequence number of the sample within this sensor and topic. It starts at 0 and wraps.
     pub sequence: u32,
-    /// The wall clock of the telegram's first byte, ns since 1970; of announce and status that of sending.
+    /// Wall-clock time of the telegram's first byte, in ns since 1970. For announcements and `status`, the time of
+    /// sending.
     pub stamp_ns: u64,
     /// Position of the sensor's link in the hub's configuration.
     pub sensor: u8,
-    /// Which part of the sample this is, from 0.
+    /// Index of this part within the sample, from 0.
     pub part: u8,
-    /// In how many parts the sample comes; 1 for most.
+    /// Number of parts of the sample, mostly 1.
     pub parts: u8,
-    /// Of which family the sensor is, a number of [`Family`](crate::Family).
+    /// Family of the sensor, a number of [`Family`](crate::Family).
     pub family: u8,
-    /// Revision of the payload: a greater one only appends.
+    /// Revision of the payload. A higher revision only appends fields.
     pub revision: u16,
-    /// The lower half of the sample's `seq`: joins the samples of one telegram.
+    /// Lower half of the sample's `seq`, which the samples of one telegram share.
     pub counter: u32,
 }
 
 impl Default for Head {
-    /// All 0, and the only part.
+    /// Returns a header whose fields are 0, for a sample of one part.
     fn default() -> Self {
         Head {
             topic: 0,
@@ -106,20 +102,20 @@ impl Default for Head {
     }
 }
 
-/// A datagram whose header, lengths and checksum are right.
+/// A datagram with a valid header, consistent lengths and a correct checksum.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Datagram<'a> {
-    /// The header, before the payload.
+    /// Header, before the payload.
     pub head: Head,
-    /// The payload, or a part of it; [`Packed::unpack`] checks the content of a whole one.
+    /// Payload, or a part of it. [`Packed::unpack`] checks the content of a whole payload.
     pub payload: &'a [u8],
-    /// The MAC, if there is one. It is not checked here.
+    /// MAC, if the datagram has one. It is not checked here.
     pub mac: Option<&'a [u8; MAC]>,
 }
 
 impl Head {
-    /// Writes the header before a payload of `len` bytes that starts at [`HEAD`] in `buffer`, and the checksum; returns
-    /// the whole datagram, without a MAC. `None` if the buffer ends before the payload does, or if the length does not
+    /// Writes the header and the checksum before a payload of `len` bytes that starts at [`HEAD`] in `buffer`. Returns
+    /// the whole datagram, without a MAC, or `None` if the buffer ends before the payload does or the length does not
     /// fit into two bytes.
     pub fn seal<'a>(&self, buffer: &'a mut [u8], len: usize) -> Option<&'a [u8]> {
         let datagram = buffer.get_mut(..HEAD + len)?;
@@ -127,8 +123,8 @@ impl Head {
         Some(checked(datagram))
     }
 
-    /// As [`seal`](Head::seal), with the MAC behind the payload that `mac` makes of header and payload, the checksum in
-    /// them 0. `None` also if the buffer ends before the MAC does.
+    /// Does the same as [`seal`](Head::seal), and appends the MAC that `mac` computes from header and payload while the
+    /// checksum is 0. Also returns `None` if the buffer ends before the MAC does.
     pub fn seal_with<'a>(
         &self,
         buffer: &'a mut [u8],
@@ -142,7 +138,7 @@ impl Head {
         Some(checked(datagram))
     }
 
-    /// Writes the header, with a checksum of 0, to the beginning of `datagram`.
+    /// Writes the header to the start of `datagram`, with a checksum of 0.
     fn write(&self, datagram: &mut [u8], len: usize, flags: u8) -> Option<()> {
         let (head, _) = datagram.split_first_chunk_mut::<HEAD>()?;
         head[..4].copy_from_slice(MAGIC);
@@ -160,15 +156,15 @@ impl Head {
     }
 }
 
-/// `datagram` with its checksum, the place of which is 0.
+/// Writes the checksum into `datagram`, whose checksum field is 0, and returns it.
 fn checked(datagram: &mut [u8]) -> &[u8] {
     let crc = CRC.checksum(datagram);
     datagram[CRC_AT..HEAD].copy_from_slice(&crc.to_le_bytes());
     datagram
 }
 
-/// What the MAC of `bytes`, a datagram that has one and was [`read`](Datagram::read), covers, in three pieces: header and
-/// payload with a checksum of 0.
+/// Returns the three pieces of `bytes` that the MAC covers: header and payload with a checksum of 0. `bytes` is a
+/// datagram with a MAC that [`read`](Datagram::read) has accepted.
 pub fn covered(bytes: &[u8]) -> [&[u8]; 3] {
     let end = bytes.len().saturating_sub(MAC).max(HEAD);
     [&bytes[..CRC_AT], &[0; HEAD - CRC_AT], &bytes[HEAD..end]]
@@ -187,7 +183,7 @@ impl<'a> Datagram<'a> {
     ///
     /// # Errors
     ///
-    /// The reason of the first check that fails, in the order of [`DatagramError`].
+    /// Returns the reason of the first check that fails, in the order of [`DatagramError`].
     pub fn read(bytes: &'a [u8]) -> Result<Datagram<'a>, DatagramError> {
         let (head, _) = bytes.split_first_chunk::<HEAD>().ok_or(DatagramError::Short)?;
         if &head[..4] != MAGIC {
@@ -240,20 +236,101 @@ impl<'a> Datagram<'a> {
     }
 }
 
-/// Returns the last byte of the group that `topic` goes to: a group for each class of traffic, because switches filter by
-/// group and not by port. That of announcements is [`Announce::GROUP`].
+/// Returns the last byte of the group that `topic` is sent to. There is one group for each class of traffic, because
+/// switches filter by group and not by port. The group of announcements is [`Announce::GROUP`].
 pub fn group(topic: Topic) -> u8 {
     topic.row().group
 }
 
 const MAGIC: &[u8; 4] = b"SHUB";
 const VERSION: u8 = 2;
-/// Where the checksum stands; it is taken over the datagram with these four bytes as 0.
+/// Offset of the checksum, which is computed with these four bytes as 0.
 const CRC_AT: usize = 44;
 const CRC: Crc<u32, Table<16>> = Crc::<u32, Table<16>>::new(&CRC_32_ISCSI);
 
-// Payloads go out as they lie in memory.
+// Payloads are sent as they are in memory.
 const _: () = assert!(cfg!(target_endian = "little"));
+
+/// Reason why a datagram is refused. The reasons are in the order of the checks, and the first check that fails counts.
+/// [`Datagram::read`] returns those up to the checksum, and [`StreamStats`] the others.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub enum DatagramError {
+    /// Fewer bytes than a header.
+    Short,
+    /// No `SHUB` at the start.
+    Magic,
+    /// Another version.
+    Version,
+    /// The header is shorter than in this version or longer than the datagram, or the part's index is too high.
+    Header,
+    /// The lengths do not add up to the length of the datagram, or a part is too long.
+    Length,
+    /// The checksum is wrong.
+    Crc,
+    /// A key is required, and the datagram has no MAC.
+    Unauthenticated,
+    /// The MAC was not computed with the required key.
+    Mac,
+    /// A later epoch of the same gateway is known.
+    Epoch,
+    /// A key is required, and the sensor or topic was not announced within 5 s of this machine's clock. The datagram
+    /// may be a recorded one.
+    Untimely,
+    /// It comes from another sender than the other datagrams of this gateway and epoch, and is not known to come from
+    /// the same gateway. A second gateway probably has the same number.
+    Twin,
+    /// The sequence number is older than the window, so it is unknown whether the sample is a duplicate.
+    Stale,
+    /// There is no memory for another gateway that delivers, or for another of its topics.
+    Capacity,
+    /// This version does not have the topic.
+    Skipped,
+    /// The payload is shorter than its own counts require, contradicts itself or has no revision, or it is a single
+    /// part.
+    Payload,
+}
+
+impl DatagramError {
+    /// All reasons, in the order of the checks.
+    pub const ALL: [DatagramError; 15] = [
+        DatagramError::Short,
+        DatagramError::Magic,
+        DatagramError::Version,
+        DatagramError::Header,
+        DatagramError::Length,
+        DatagramError::Crc,
+        DatagramError::Unauthenticated,
+        DatagramError::Mac,
+        DatagramError::Epoch,
+        DatagramError::Untimely,
+        DatagramError::Twin,
+        DatagramError::Stale,
+        DatagramError::Capacity,
+        DatagramError::Skipped,
+        DatagramError::Payload,
+    ];
+
+    /// Returns the reason's name in all output.
+    pub fn name(self) -> &'static str {
+        match self {
+            DatagramError::Short => "short",
+            DatagramError::Magic => "magic",
+            DatagramError::Version => "version",
+            DatagramError::Header => "header",
+            DatagramError::Length => "length",
+            DatagramError::Crc => "crc",
+            DatagramError::Unauthenticated => "unauthenticated",
+            DatagramError::Mac => "mac",
+            DatagramError::Epoch => "epoch",
+            DatagramError::Untimely => "untimely",
+            DatagramError::Twin => "twin",
+            DatagramError::Stale => "stale",
+            DatagramError::Capacity => "capacity",
+            DatagramError::Skipped => "skipped",
+            DatagramError::Payload => "payload",
+        }
+    }
+}
 
 #[cfg(test)]
 mod tests {

@@ -1,8 +1,5 @@
-//! The format of a recording: samples as messages of an MCAP file, a channel for each sensor's topic. A message is the
-//! header of shared memory, followed by the payload as it is sent over a network (docs/recording.md). Refuses to know
-//! where samples come from, when a chunk is full, and what a disk does.
-
-mod compression;
+//! The format of a recording: samples as messages of an MCAP file, with a channel for each topic of a sensor. A message is
+//! the header of shared memory, followed by the payload as it is sent over a network (docs/recording.md).
 
 use std::collections::BTreeMap;
 use std::io::{self, BufWriter, Write};
@@ -12,66 +9,67 @@ use mcap::records::{Channel, MessageHeader, Metadata};
 use mcap::write::NoSeek;
 use mcap::{Attachment, McapError, WriteOptions};
 
-use crate::{Header, Topic};
-pub use compression::Compression;
+use crate::{Failure, Header, Kind, Topic};
+
 /// First bytes of every MCAP file.
 pub use mcap::MAGIC;
 
 /// Encoding of the messages, and of the text that describes them.
 pub const ENCODING: &str = "scanhub.v2";
-/// That of recordings of version 1: header, telegrams, marks, zones and statuses are as they are now, the others are not.
+/// Encoding of recordings of version 1. Header, telegrams, marks, zones and statuses are the same as today; the others
+/// differ.
 pub const ENCODING_V1: &str = "scanhub";
-/// Name of the metadata record at the start of a recording: who recorded what, where.
+/// Name of the metadata record at the start of a recording, which describes its origin.
 pub const METADATA: &str = "scanhub";
 
-/// Writes a recording into `W`. Everything written up to [`close_chunk`](Self::close_chunk) can be read even if nothing
-/// follows; until then it is only in memory.
+/// Writes a recording into `W`. Everything up to [`close_chunk`](Self::close_chunk) can be read even if the file ends
+/// there. Later samples are only in memory.
 pub struct Writer<W: Write> {
     mcap: mcap::Writer<NoSeek<BufWriter<W>>>,
-    /// Of each sensor, few enough to be looked through.
+    /// Channels of each sensor. They are few, so a linear search is enough.
     channels: BTreeMap<String, Vec<(Topic, u16)>>,
     message: Vec<u8>,
 }
 
-/// The description of a channel that is not one of the hub's topics.
+/// Description of a channel that does not belong to the hub.
 #[derive(Clone, Copy, Debug)]
 pub struct Foreign<'a> {
     /// Name of the channel.
     pub topic: &'a str,
     /// Encoding of its messages, such as `cdr`.
     pub encoding: &'a str,
-    /// Name of their type, its description, and in what language that is written, such as `ros2msg`.
+    /// Name of their type, its definition, and the language of the definition, such as `ros2msg`.
     pub schema: (&'a str, &'a str, &'a str),
     /// Metadata of the channel: keys and values.
     pub metadata: &'a [(&'a str, &'a str)],
 }
 
 impl<W: Write> Writer<W> {
-    /// Begins a recording of `profile` (empty, or `ros2`), of which `facts` are told; its chunks are not packed.
+    /// Starts a recording with `profile` (empty, or `ros2`) and the metadata `facts`. Its chunks are not compressed.
     ///
     /// # Errors
     ///
-    /// The error of what it is written to.
+    /// Returns the error of `out`.
     pub fn begin(out: W, profile: &str, facts: BTreeMap<String, String>) -> io::Result<Self> {
         Writer::packed(out, profile, Compression::None, facts)
     }
 
-    /// Returns the same with chunks that are packed by `compression`.
+    /// Does the same as [`begin`](Self::begin), with chunks that are compressed by `compression`.
     ///
     /// # Errors
     ///
-    /// The error of what it is written to.
+    /// Returns the error of `out`.
     pub fn packed(
         out: W,
         profile: &str,
         compression: Compression,
         facts: BTreeMap<String, String>,
     ) -> io::Result<Self> {
-        // A chunk is written when it is closed: a process that is killed leaves whole chunks and nothing else.
+        // A chunk is written when it is closed, so a process that is killed leaves only whole chunks.
         let options = WriteOptions::new()
             .compression(compression.of_library())
             .compression_level(compression.level())
-            // Chunks are short, and whoever writes them has one thread for that.
+            // Chunks are short, and the caller has a thread for writing them.
             .compression_threads(0)
             .profile(profile)
             .library("scanhub")
@@ -84,12 +82,12 @@ impl<W: Write> Writer<W> {
         Ok(writer)
     }
 
-    /// Writes a sample of `sensor`'s `topic`; `payload` is packed as for a network
+    /// Writes a sample of `sensor`'s `topic`. `payload` is packed as for a network
     /// ([`Packed`](crate::datagram::Packed)).
     ///
     /// # Errors
     ///
-    /// The error of what it is written to.
+    /// Returns the error of `W`.
     pub fn sample(&mut self, sensor: &str, topic: Topic, header: &Header, payload: &[u8]) -> io::Result<()> {
         let known = self.channels.get(sensor).and_then(|its| its.iter().find(|(its, _)| *its == topic));
         let channel = match known {
@@ -112,11 +110,11 @@ impl<W: Write> Writer<W> {
         written
     }
 
-    /// Makes a channel, or finds the one made before.
+    /// Creates a channel, or returns the existing one with this description.
     ///
     /// # Errors
     ///
-    /// The error of what it is written to.
+    /// Returns the error of `W`.
     pub fn channel(&mut self, foreign: &Foreign<'_>) -> io::Result<u16> {
         let (name, text, language) = foreign.schema;
         let schema = self.mcap.add_schema(name, language, text.as_bytes()).map_err(io_error)?;
@@ -125,21 +123,22 @@ impl<W: Write> Writer<W> {
         self.mcap.add_channel(schema, foreign.topic, foreign.encoding, &metadata).map_err(io_error)
     }
 
-    /// Writes a message of `time_ns` since 1970 into a channel.
+    /// Writes a message into a channel, at `time_ns` since 1970.
     ///
     /// # Errors
     ///
-    /// The error of what it is written to.
+    /// Returns the error of `W`.
     pub fn message(&mut self, channel_id: u16, sequence: u32, time_ns: u64, data: &[u8]) -> io::Result<()> {
         let header = MessageHeader { channel_id, sequence, log_time: time_ns, publish_time: time_ns };
         self.mcap.write_to_known_channel(&header, data).map_err(io_error)
     }
 
-    /// Makes a channel as another file has it, with name, language and text of its messages' type, if it has one.
+    /// Creates a channel like one of another file. `schema` has the name, language and definition of its messages'
+    /// type, if there is one.
     ///
     /// # Errors
     ///
-    /// The error of what it is written to.
+    /// Returns the error of `W`.
     pub fn copied_channel(
         &mut self,
         channel: &Channel,
@@ -155,47 +154,47 @@ impl<W: Write> Writer<W> {
         add().map_err(io_error)
     }
 
-    /// Writes a message as another file has it, into the channel that `header` names.
+    /// Writes a message of another file into the channel that `header` names.
     ///
     /// # Errors
     ///
-    /// The error of what it is written to.
+    /// Returns the error of `W`.
     pub fn copied_message(&mut self, header: &MessageHeader, data: &[u8]) -> io::Result<()> {
         self.mcap.write_to_known_channel(header, data).map_err(io_error)
     }
 
-    /// Writes a file within the file, as another one has it, behind a chunk that this closes.
+    /// Closes the chunk and writes an attachment of another file.
     ///
     /// # Errors
     ///
-    /// The error of what it is written to.
+    /// Returns the error of `W`.
     pub fn copied_attachment(&mut self, attachment: &Attachment<'_>) -> io::Result<()> {
         self.mcap.attach(attachment).map_err(io_error)
     }
 
-    /// Writes a metadata record called `name`, behind a chunk that this closes.
+    /// Closes the chunk and writes a metadata record called `name`.
     ///
     /// # Errors
     ///
-    /// The error of what it is written to.
+    /// Returns the error of `W`.
     pub fn note(&mut self, name: &str, facts: BTreeMap<String, String>) -> io::Result<()> {
         self.mcap.write_metadata(&Metadata { name: name.to_owned(), metadata: facts }).map_err(io_error)
     }
 
-    /// Hands all that was written to `W`.
+    /// Closes the chunk and passes everything to `W`.
     ///
     /// # Errors
     ///
-    /// The error of what it is written to.
+    /// Returns the error of `W`.
     pub fn close_chunk(&mut self) -> io::Result<()> {
         self.mcap.flush().map_err(io_error)
     }
 
-    /// Writes the index, without which a reader must read the whole file, and gives `W` back.
+    /// Writes the index, without which a reader must read the whole file, and returns `W`.
     ///
     /// # Errors
     ///
-    /// The error of what it is written to.
+    /// Returns the error of `W`.
     pub fn finish(mut self) -> io::Result<W> {
         self.mcap.finish().map_err(io_error)?;
         self.mcap.into_inner().into_inner().into_inner().map_err(io::IntoInnerError::into_error)
@@ -223,5 +222,46 @@ fn io_error(error: McapError) -> io::Error {
     }
 }
 
-/// What stands in a file about the messages, for whoever has nothing but the file.
+/// Description of the messages that every recording contains, for readers that have only the file.
 pub const LAYOUT: &str = include_str!("file/layout.txt");
+
+/// Compression of chunks.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Compression {
+    /// Uncompressed.
+    None,
+    /// LZ4.
+    Lz4,
+    /// Zstandard, the shortest.
+    #[default]
+    Zstd,
+}
+
+impl Compression {
+    /// Returns the compression called `zstd`, `lz4` or `none`.
+    ///
+    /// # Errors
+    ///
+    /// Returns [`Kind::Usage`] for any other text.
+    pub fn parse(text: &str) -> Result<Compression, Failure> {
+        match text {
+            "zstd" => Ok(Compression::Zstd),
+            "lz4" => Ok(Compression::Lz4),
+            "none" => Ok(Compression::None),
+            _ => Err(Failure::new(Kind::Usage, format!("no compression {text:?}"), "zstd, lz4 or none")),
+        }
+    }
+
+    fn of_library(self) -> Option<mcap::Compression> {
+        match self {
+            Compression::None => None,
+            Compression::Lz4 => Some(mcap::Compression::Lz4),
+            Compression::Zstd => Some(mcap::Compression::Zstd),
+        }
+    }
+
+    /// Higher levels take many times as long and save a few percent.
+    fn level(self) -> u32 {
+        u32::from(self == Compression::Zstd)
+    }
+}

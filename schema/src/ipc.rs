@@ -1,18 +1,12 @@
-//! From a topic to its service in shared memory, with all limits. Nobody but this module names the builders of iceoryx2:
-//! everybody else gets ports. Refuses to know when something is sent and who reads it.
+//! Services of topics in shared memory, with all limits. Only this module names the builders of iceoryx2; all other code uses
+//! its ports.
 
-mod bell;
 mod clean;
 mod control;
-mod counter;
-mod leftover;
-mod nodes;
-mod payload;
-mod sleep;
-mod strangers;
-mod topic_publisher;
-mod trouble;
-mod unheld;
+mod doorbell;
+pub(crate) mod isolation;
+mod open_failure;
+mod topic_service;
 mod wake;
 
 use std::os::unix::ffi::OsStrExt;
@@ -29,19 +23,19 @@ use iceoryx2::service::Service as _;
 use iceoryx2::service::port_factory::{event, publish_subscribe};
 
 use crate::lock::MakingLock;
-use crate::{Directory, Domain, Failure, Header, Kind, Maker, Topic, access, of_service, prefix};
+use crate::{Directory, Domain, Failure, Header, Kind, Maker, Topic, of_service};
 
-pub use self::bell::{Bell, Unsupported, sleep_at_bells};
-pub use self::clean::{Cleaned, clean};
+use self::clean::remove_unfinished_services;
+pub use self::clean::{Cleaned, Nodes, clean, is_unheld, nodes};
 pub use self::control::{Asked, ControlClient, ControlServer, Pending};
-pub use self::nodes::{Nodes, nodes};
-pub use self::payload::Payload;
-pub use self::sleep::{descriptor, sleep, take_wakeups};
-pub(crate) use self::strangers::in_the_way;
-pub use self::strangers::{Segment, strangers};
-pub use self::topic_publisher::{Medium, SharedMemory, TopicPublisher};
-pub use self::unheld::is_unheld;
-pub use self::wake::{DueRings, Waker, listener, open_wake};
+pub use self::doorbell::{Bell, Unsupported, sleep_at_bells};
+use self::isolation::{
+    PREFIX_FILE, access_failure, ensure_node_counter, ensure_prefix, prefix_of, read_prefix,
+    remove_node_counter,
+};
+pub use self::isolation::{Segment, strangers};
+pub use self::topic_service::{Medium, Payload, SharedMemory, TopicPublisher};
+pub use self::wake::{DueRings, Waker, descriptor, listener, open_wake, sleep, take_wakeups};
 pub use iceoryx2::port::update_connections::UpdateConnections;
 pub use iceoryx2::port::{LoanError, ReceiveError, SendError};
 /// Shared memory between processes; ports of it stay in their thread, nodes and services may move.
@@ -141,7 +135,7 @@ pub fn published(domain: &Domain) -> Result<Vec<(String, Topic)>, Failure> {
         }
         CallbackProgression::Continue
     });
-    listed.map_err(|error| access::failure(domain.root(), format!("cannot list topics: {error:?}")))?;
+    listed.map_err(|error| access_failure(domain.root(), format!("cannot list topics: {error:?}")))?;
     topics.sort_by(|(one, _), (other, _)| one.cmp(other));
     Ok(topics)
 }
@@ -159,8 +153,8 @@ fn node(domain: &Domain, cleanup: bool) -> Result<Node, Failure> {
     let root = domain.root();
     let _making = if cleanup {
         let making = MakingLock::wait(root)?;
-        prefix::settle(root, &making)?;
-        leftover::sweep(root);
+        ensure_prefix(root, &making)?;
+        remove_unfinished_services(root);
         Some(making)
     } else {
         None
@@ -174,7 +168,7 @@ fn node(domain: &Domain, cleanup: bool) -> Result<Node, Failure> {
         )
     };
     let mut config = config(root)?.ok_or_else(no_names)?;
-    counter::ensure(&config.global.prefix.to_string())?;
+    ensure_node_counter(&config.global.prefix.to_string())?;
     config.global.node.cleanup_dead_nodes_on_creation = cleanup;
     config.global.node.cleanup_dead_nodes_on_destruction = false;
     config.global.service.cleanup_dead_nodes_on_open = false;
@@ -185,7 +179,7 @@ fn node(domain: &Domain, cleanup: bool) -> Result<Node, Failure> {
         .signal_handling_mode(SignalHandlingMode::Disabled)
         .config(&config)
         .create::<Service>()
-        .map_err(|error| access::failure(root, format!("cannot join {}: {error:?}", domain.name())))
+        .map_err(|error| access_failure(root, format!("cannot join {}: {error:?}", domain.name())))
 }
 
 /// Returns whether the names of shared memory of the domain in `root` are those that `node` has. They are others after all
@@ -195,7 +189,7 @@ fn node(domain: &Domain, cleanup: bool) -> Result<Node, Failure> {
 ///
 /// As [`client_node`].
 pub fn is_member(node: &Node, root: &Path) -> Result<bool, Failure> {
-    let prefix = prefix::of(root)?;
+    let prefix = prefix_of(root)?;
     Ok(prefix.is_some_and(|prefix| node.config().global.prefix.as_bytes() == prefix.as_bytes()))
 }
 
@@ -204,21 +198,21 @@ pub(crate) fn forget_names(root: &Path) {
     let Ok(Some(directory)) = Directory::open(root) else { return };
     // Not while somebody else joins to publish.
     let Ok(_making) = MakingLock::wait(root) else { return };
-    if nodes::at(root).is_ok_and(|nodes| nodes == Nodes::default()) {
+    if clean::nodes_at(root).is_ok_and(|nodes| nodes == Nodes::default()) {
         forget(&directory, root);
     }
 }
 
 fn forget(directory: &Directory, root: &Path) {
-    if let Ok(Some(prefix)) = prefix::read(directory, root) {
-        counter::remove(&prefix);
+    if let Ok(Some(prefix)) = read_prefix(directory, root) {
+        remove_node_counter(&prefix);
     }
-    directory.remove(prefix::FILE.as_ref());
+    directory.remove(PREFIX_FILE.as_ref());
 }
 
 /// Nothing for a domain without names. In code, never from a file: the library would search the working directory for one.
 fn config(root: &Path) -> Result<Option<Config>, Failure> {
-    let Some(prefix) = prefix::of(root)? else { return Ok(None) };
+    let Some(prefix) = prefix_of(root)? else { return Ok(None) };
     let unusable = || Failure::new(Kind::Configuration, format!("{} cannot be a root", root.display()), "");
     let path = iceoryx2::prelude::Path::new(root.as_os_str().as_bytes()).map_err(|_| unusable())?;
     let mut config = Config::default();

@@ -12,7 +12,8 @@ use nix::errno::Errno;
 use nix::fcntl::{FcntlArg, fcntl};
 use nix::libc::{self, flock};
 
-use crate::{Directory, Failure, Kind, ipc, prefix, shortage};
+use crate::ipc::isolation::{ensure_prefix, read_prefix};
+use crate::{Directory, Failure, Kind, ipc, shortage};
 
 /// The lock of a hub on its domain; it ends with the value or with the process, however that ends. Drop it after the hub's
 /// node.
@@ -152,7 +153,7 @@ impl Held {
         // A process id that is read means that there is a prefix, too.
         file.set_len(0).map_err(|error| unusable(root, &error))?;
         let held = Held { file };
-        prefix::settle(root, &MakingLock::wait(root)?)?;
+        ensure_prefix(root, &MakingLock::wait(root)?)?;
         let pid = format!("{}\n", std::process::id());
         held.file.write_all_at(pid.as_bytes(), 0).map_err(|error| unusable(root, &error))?;
         Ok(held)
@@ -202,7 +203,7 @@ fn holder_of(root: &Path, name: &str) -> Result<Option<u32>, Failure> {
         return Ok(None);
     }
     // Whoever is just starting or ending has the lock, and an earlier one's process id may stand in it.
-    Ok(Some(if prefix::read(&directory, root)?.is_some() { pid_in(&file) } else { 0 }))
+    Ok(Some(if read_prefix(&directory, root)?.is_some() { pid_in(&file) } else { 0 }))
 }
 
 const HUB: &str = "hub.lock";

@@ -1,9 +1,7 @@
-//! One turn of a scanner: ranges in device units with their codes, and what comes with them. Refuses to know the sensor's
-//! protocol and modes: each scan contains the few numbers that are needed to read it.
+//! One revolution of a scanner: ranges in device units with their codes, and optional arrays. Each scan contains the few
+//! numbers that are needed to read it, so that a reader needs to know neither protocol nor mode of the scanner.
 
-mod code;
 mod family;
-mod lms;
 
 use std::fmt;
 
@@ -12,53 +10,54 @@ use bytemuck::{Pod, Zeroable, cast_slice, cast_slice_mut};
 use iceoryx2::prelude::ZeroCopySend;
 
 use crate::sliced::sliced;
-pub use code::Code;
+
 pub use family::{Family, PacketFacts};
 
-/// The most beams of a scan, of any family.
+/// Maximum number of beams of a scan, in any family.
 pub const BEAMS: usize = 8192;
 
-/// Bits of [`ScanHead::contents`]: which arrays there are beside the ranges, each with a value for every beam.
+/// Bits of [`ScanHead::contents`]: the arrays that a scan has in addition to the ranges, each with a value for every
+/// beam.
 pub struct Contents;
 
 impl Contents {
-    /// One byte: intensities, or of some modes of an LMS the field bits above the range.
+    /// One byte: intensities, or the field bits above the range in some modes of an LMS.
     pub const UPPER: u8 = 1;
     /// Two bytes: intensities.
     pub const WIDE: u8 = 2;
-    /// The exact angle in radians, a 32-bit float; nan where nothing was measured.
+    /// The exact angle in radians, a 32-bit float; NaN if nothing was measured.
     pub const ANGLES: u8 = 4;
-    /// Those of a turn on a grid of beams.
+    /// Arrays of a revolution on a grid of beams.
     pub const TURNING: u8 = Contents::UPPER | Contents::ANGLES;
-    /// All that there are.
+    /// All arrays.
     pub const ALL: u8 = 7;
 }
 
-/// What stands before the arrays of a [`Scan`]. 64 bytes.
+/// Head of a [`Scan`], before the arrays. 64 bytes.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Pod, Zeroable)]
 #[repr(C)]
 pub struct ScanHead {
-    /// Angle of beam 0 in radians: 0 is the sensor's own ahead, counter-clockwise positive seen from above.
+    /// Angle of beam 0 in radians. 0 is ahead of the sensor, and angles are counterclockwise as seen from above.
     pub first_angle: f64,
-    /// Angle from one beam to the next in radians; negative for a scanner that turns clockwise.
+    /// Angle from one beam to the next in radians; negative for a scanner that rotates clockwise.
     pub step: f64,
-    /// Angle between two points that the sensor itself measures, in radians: not that of the grid that they are put on.
+    /// Angle between two points that the sensor measures, in radians. The grid of beams may have another step.
     pub spacing: f32,
     /// Time from one beam to the next in ns.
     pub beam_time_ns: u32,
-    /// When beam 0 was measured, in ns after the sample's stamp; mostly before it.
+    /// Time at which beam 0 was measured, in ns after the sample's stamp; mostly negative.
     pub first_beam_ns: i32,
-    /// Micrometres per device unit.
+    /// Micrometers per device unit.
     pub unit_um: u32,
-    /// Beams, in the order of their measuring, at most [`BEAMS`].
+    /// Number of beams, at most [`BEAMS`]. They are in the order in which they were measured.
     pub count: u16,
-    /// The greatest value that is a range; all above are codes.
+    /// Highest value that is a range; all higher values are codes.
     pub valid_to: u16,
-    /// The code of a beam that nothing returned to.
+    /// Code of a beam without an echo.
     pub no_return: u16,
-    /// The code of an echo from beyond the range limit; [`no_return`](Self::no_return) where the family has none.
+    /// Code of an echo from beyond the range limit; [`no_return`](Self::no_return) if the family has none.
     pub beyond: u16,
-    /// Points that found their beam taken by a nearer one.
+    /// Number of points that were dropped because a nearer point has the same beam.
     pub collapsed: u16,
     /// See [`Family`].
     pub family: u8,
@@ -66,21 +65,21 @@ pub struct ScanHead {
     pub flags: u8,
     /// Bits of [`Contents`].
     pub contents: u8,
-    /// Bits of an intensity; 0: there are none.
+    /// Bits of an intensity; 0 if there are none.
     pub intensity_bits: u8,
-    /// Turns in which the beams were measured, beam i in turn i modulo this; 0 is 1.
+    /// Number of revolutions in which the beams were measured: beam i in revolution i modulo this number. 0 means 1.
     pub turns: u8,
     /// 0.
     pub reserved: u8,
-    /// Time of a turn in ns where there are several, else 0.
+    /// Time of a revolution in ns if there are several; otherwise 0.
     pub turn_ns: u32,
     /// 0.
     pub reserved2: [u8; 12],
 }
 
 sliced! {
-    /// The payload of topic `scan`: a [`ScanHead`], which its fields are read through, and behind it as many values as beams
-    /// of each array that there is: exact angles (4 bytes), ranges (2), wide intensities (2), upper bits (1).
+    /// The payload of topic `scan`: a [`ScanHead`], whose fields can be read directly, followed by the arrays with a
+    /// value for every beam: exact angles (4 bytes), ranges (2), wide intensities (2), upper bits (1).
     ///
     /// # Examples
     ///
@@ -95,7 +94,7 @@ sliced! {
     Scan, ScanWord, "scanhub.Scan.v2", ScanHead
 }
 
-/// The arrays of a scan that is written; those that there are not are empty.
+/// Arrays of a scan, for writing. An array that the scan does not have is empty.
 #[derive(Debug)]
 pub struct ScanArrays<'a> {
     /// Exact angles in radians.
@@ -111,24 +110,24 @@ pub struct ScanArrays<'a> {
 /// The intensities of a scan.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Intensities<'a> {
-    /// Of at most 8 bits, or none.
+    /// At most 8 bits each, or empty.
     Narrow(&'a [u8]),
-    /// Of more than 8 bits.
+    /// More than 8 bits each.
     Wide(&'a [u16]),
 }
 
 impl Scan {
-    /// The range of a beam that was not measured, of every family: neither a reading nor a missing echo.
+    /// Range of a beam that was not measured, in every family. It is neither a reading nor a missing echo.
     pub const NOT_MEASURED: u16 = u16::MAX;
-    /// Flag: packets of the turn are missing.
+    /// Flag: packets of the revolution are missing.
     pub const INCOMPLETE: u8 = 1;
 
-    /// Returns the bytes of a scan of so many beams with these arrays.
+    /// Returns the length in bytes of a scan of `beams` beams with the arrays of `contents`.
     pub const fn len(beams: usize, contents: u8) -> usize {
         Scan::HEAD + beams * per_beam(contents)
     }
 
-    /// Returns a scan with `head`, as many `ranges` as that shall have beams, and 0 in all other arrays.
+    /// Returns a scan with `head` and a beam for each of `ranges`. All other arrays are 0.
     pub fn of(head: ScanHead, ranges: &[u16]) -> Box<Scan> {
         let mut scan = Scan::zeroed(Scan::len(ranges.len(), head.contents));
         let head = ScanHead { count: ranges.len() as u16, ..head };
@@ -136,11 +135,11 @@ impl Scan {
         scan
     }
 
-    /// Writes `head` and returns the arrays, which have to be filled.
+    /// Writes `head` and returns the arrays, which the caller must fill.
     ///
     /// # Panics
     ///
-    /// If the memory is too short for them.
+    /// Panics if the memory is too short for them.
     pub fn begin(&mut self, head: ScanHead) -> ScanArrays<'_> {
         **self = head;
         let (n, contents) = (usize::from(head.count), head.contents);
@@ -163,17 +162,17 @@ impl Scan {
         self.array(Contents::ANGLES, 2)
     }
 
-    /// Returns the arrays, to be written.
+    /// Returns the arrays for writing.
     ///
     /// # Panics
     ///
-    /// If the memory is too short for as many beams as the head says.
+    /// Panics if the memory is too short for the head's number of beams.
     pub fn arrays(&mut self) -> ScanArrays<'_> {
         let head = **self;
         self.begin(head)
     }
 
-    /// Returns the bits above the ranges, as many as ranges; none if the sensor does not send them.
+    /// Returns the bits above the ranges, one value for each beam; empty if the sensor does not send them.
     #[inline]
     pub fn upper(&self) -> &[u8] {
         if self.has(Contents::UPPER) {
@@ -183,7 +182,7 @@ impl Scan {
         }
     }
 
-    /// Returns the intensities of the beams, as many as ranges; none if the sensor does not send them.
+    /// Returns the intensities, one for each beam; empty if the sensor does not send them.
     #[inline]
     pub fn intensities(&self) -> Intensities<'_> {
         if self.intensity_bits == 0 {
@@ -195,14 +194,14 @@ impl Scan {
         }
     }
 
-    /// Returns the exact angles in radians, as many as ranges, nan where nothing was measured; none of a scanner whose beams
-    /// are where [`angle`](Self::angle) says.
+    /// Returns the exact angles in radians, one for each beam, NaN if nothing was measured. Empty if
+    /// [`angle`](Self::angle) of the grid is exact.
     #[inline]
     pub fn exact_angles(&self) -> &[f32] {
         if self.has(Contents::ANGLES) { self.array(0, 4) } else { &[] }
     }
 
-    /// Returns the number of beams: `count`, as far as their values are there.
+    /// Returns the number of beams: `count`, unless there is memory for fewer.
     #[inline]
     pub fn beams(&self) -> usize {
         let room = self.memory().len().saturating_sub(Scan::HEAD) / per_beam(self.contents);
@@ -215,7 +214,7 @@ impl Scan {
         self.ranges().get(i).copied().filter(|&value| value <= self.valid_to)
     }
 
-    /// Returns why beam `i` has no valid reading; nothing if it has one or is not there.
+    /// Returns the reason why beam `i` has no valid reading. `None` if it has one or does not exist.
     #[inline]
     pub fn code(&self, i: usize) -> Option<Code> {
         let value = *self.ranges().get(i)?;
@@ -228,13 +227,13 @@ impl Scan {
         Some((u64::from(self.range(i)?) * u64::from(self.unit_um) / 1000) as u32)
     }
 
-    /// Returns the range of beam `i` in metres, if it is a valid reading.
+    /// Returns the range of beam `i` in meters, if it is a valid reading.
     #[inline]
     pub fn distance_m(&self, i: usize) -> Option<f64> {
         Some(f64::from(self.range(i)?) * f64::from(self.unit_um) / 1e6)
     }
 
-    /// Returns the angle of beam `i` in radians: the exact one where there is one, else that of the grid.
+    /// Returns the angle of beam `i` in radians: the exact angle if there is one, otherwise that of the grid.
     #[inline]
     pub fn angle(&self, i: usize) -> f64 {
         match self.exact_angles().get(i) {
@@ -243,19 +242,20 @@ impl Scan {
         }
     }
 
-    /// Returns the angle of beam `i` in degrees, without what radians lose of a whole number of millionths.
+    /// Returns the angle of beam `i` in degrees, rounded to a millionth.
     pub fn angle_deg(&self, i: usize) -> f64 {
         in_degrees(self.angle(i))
     }
 
-    /// Returns when beam `i` was measured, in ns after the sample's stamp, which an LMS sets at the end of its turn.
+    /// Returns the time at which beam `i` was measured, in ns after the sample's stamp. The stamp of an LMS is the end
+    /// of its last revolution.
     pub fn beam_ns(&self, i: usize) -> i64 {
         let turn = i % usize::from(self.turns.max(1));
         let [i, turn] = [i, turn].map(|number| number as i64);
         i64::from(self.first_beam_ns) + i * i64::from(self.beam_time_ns) + turn * i64::from(self.turn_ns)
     }
 
-    /// Returns whether packets of the turn are missing.
+    /// Returns whether packets of the revolution are missing.
     pub fn is_incomplete(&self) -> bool {
         self.flags & Scan::INCOMPLETE != 0
     }
@@ -265,7 +265,7 @@ impl Scan {
         self.contents & contents != 0
     }
 
-    /// The array behind those of `before`, with values of `size` bytes.
+    /// Returns the array after the arrays of `before`, with values of `size` bytes.
     #[inline]
     fn array<T: Pod>(&self, before: u8, size: usize) -> &[T] {
         let n = self.beams();
@@ -285,7 +285,7 @@ impl fmt::Debug for Scan {
 }
 
 impl Intensities<'_> {
-    /// Returns how many there are: as many as beams, or 0.
+    /// Returns the number of intensities: the number of beams, or 0.
     pub fn len(&self) -> usize {
         match self {
             Intensities::Narrow(values) => values.len(),
@@ -298,7 +298,7 @@ impl Intensities<'_> {
         self.len() == 0
     }
 
-    /// Returns that of beam `i`.
+    /// Returns the intensity of beam `i`.
     pub fn get(&self, i: usize) -> Option<u16> {
         match self {
             Intensities::Narrow(values) => values.get(i).map(|&value| value.into()),
@@ -306,27 +306,28 @@ impl Intensities<'_> {
         }
     }
 
-    /// Returns all of them in the order of the beams.
+    /// Returns all intensities in the order of the beams.
     pub fn iter(&self) -> impl Iterator<Item = u16> + '_ {
         (0..self.len()).filter_map(|i| self.get(i))
     }
 }
 
-/// Returns `radians` in degrees, to a millionth: what a decimal became in radians is that decimal again.
+/// Returns `radians` in degrees, rounded to a millionth. An angle that was converted from decimal degrees becomes the
+/// same decimal again.
 pub fn in_degrees(radians: f64) -> f64 {
     (radians.to_degrees() * 1e6).round() / 1e6 + 0.0
 }
 
-/// Returns `radians` in 1/1000 degree from -180,000 on, below 180,000, as sectors are given.
+/// Returns `radians` in 1/1000 degree, from -180,000 to below 180,000, as sectors are configured.
 pub fn in_sector_mdeg(radians: f64) -> i32 {
     let mdeg = (1000.0 * in_degrees(radians)).round() as i64 % 360_000;
     ((mdeg + 180_000).rem_euclid(360_000) - 180_000) as i32
 }
 
-/// Stands for the ranges among [`Contents`]: they are always there.
+/// Bit for the ranges, which every scan has, alongside [`Contents`].
 const RANGES: u8 = 0x80;
 
-/// Bytes of a beam in the arrays of `contents`.
+/// Returns the bytes of a beam in the arrays of `contents`.
 const fn width(contents: u8) -> usize {
     4 * bit(contents, Contents::ANGLES)
         + 2 * bit(contents, RANGES)
@@ -338,9 +339,73 @@ const fn bit(contents: u8, mask: u8) -> usize {
     if contents & mask != 0 { 1 } else { 0 }
 }
 
-/// Bytes of a beam in all arrays of a scan with `contents`.
+/// Returns the bytes of a beam in all arrays of a scan with `contents`.
 const fn per_beam(contents: u8) -> usize {
     width(contents & Contents::ALL | RANGES)
+}
+
+/// Reason why a beam has no valid reading. Its value is above the ranges. An LMS has its own values, and all other
+/// families have the same values at the upper end.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Code {
+    /// Nothing was measured.
+    NotMeasured,
+    /// No echo.
+    NoReturn,
+    /// An echo from beyond the range limit.
+    Beyond,
+    /// The object is too near to be measured.
+    TooNear,
+    /// The receiver was dazzled.
+    TooBright,
+    /// The signal is too weak for the noise.
+    Weak,
+    /// The measurement overflowed.
+    Overflow,
+    /// The sensor reported an error for this beam.
+    Error,
+}
+
+impl Code {
+    /// Returns the name in all output.
+    pub fn name(self) -> &'static str {
+        match self {
+            Code::NotMeasured => "not_measured",
+            Code::NoReturn => "no_return",
+            Code::Beyond => "beyond",
+            Code::TooNear => "too_near",
+            Code::TooBright => "too_bright",
+            Code::Weak => "weak",
+            Code::Overflow => "overflow",
+            Code::Error => "error",
+        }
+    }
+
+    /// Returns the value of the code in scans of all families except the LMS.
+    pub const fn value(self) -> u16 {
+        match self {
+            Code::NotMeasured => Scan::NOT_MEASURED,
+            Code::NoReturn => 0xFFFE,
+            Code::Beyond => 0xFFFD,
+            Code::TooNear => 0xFFFC,
+            Code::TooBright => 0xFFFB,
+            Code::Weak => 0xFFFA,
+            Code::Overflow => 0xFFF9,
+            Code::Error => 0xFFF8,
+        }
+    }
+
+    /// Returns the code of `value`, which is not a range, in a scan with `head`.
+    pub(super) fn of(head: &ScanHead, value: u16) -> Code {
+        if value == Scan::NOT_MEASURED {
+            return Code::NotMeasured;
+        }
+        if head.family == Family::Lms as u8 {
+            return family::lms_code(head, value);
+        }
+        let all = [Code::NoReturn, Code::Beyond, Code::TooNear, Code::TooBright, Code::Weak, Code::Overflow];
+        all.into_iter().find(|code| code.value() == value).unwrap_or(Code::Error)
+    }
 }
 
 #[cfg(test)]
@@ -349,7 +414,7 @@ mod tests {
 
     use super::*;
 
-    /// A scan of a clockwise turn, with all arrays.
+    /// Returns a scan of a clockwise revolution, with all arrays.
     fn turning() -> Box<Scan> {
         let head = ScanHead {
             step: -TAU / 4.0,
@@ -387,7 +452,7 @@ mod tests {
     fn a_count_beyond_the_memory_is_cut() {
         let mut scan = turning();
         scan.count = u16::MAX;
-        // 32 bytes behind the head, in whole words.
+        // 32 bytes after the head, in whole words.
         assert_eq!((scan.ranges().len(), scan.upper().len(), scan.exact_angles().len()), (3, 3, 3));
         assert_eq!(Scan::of_words(&[]).beams(), 0, "a stranger's");
     }

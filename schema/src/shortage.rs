@@ -1,48 +1,50 @@
-//! What is short on this machine: shared memory, descriptors, room for a domain's files. The shared-memory library
-//! reserves segments without allocating them, so with a full /dev/shm the first access ends the process with SIGBUS; for
-//! any other shortage it only says "internal error". Refuses to know what something is needed for.
+//! Checks of this machine's limits before something is created: shared memory, descriptors, and room for the files of a
+//! domain.
+//!
+//! The shared-memory library reserves segments without allocating them. With a full /dev/shm, the first access would end the
+//! process with SIGBUS, so a publisher allocates its segments here. For any other shortage, the library only reports "internal
+//! error".
 
-mod segments;
-
+use std::fs::{self, OpenOptions};
 use std::io;
+use std::os::unix::fs::{MetadataExt, OpenOptionsExt};
 use std::path::Path;
 
-use rustix::fs::{StatVfs, statvfs};
+use rustix::fs::{FallocateFlags, OFlags, StatVfs, fallocate, statvfs};
 use rustix::io::Errno;
 use rustix::param::page_size;
 use rustix::process::{Resource, getrlimit, setrlimit};
 
-use crate::{Failure, Kind};
+use crate::ipc::isolation::prefix_of;
+use crate::limits::TopicLimits;
+use crate::{Domain, Failure, Header, Kind, Topic, limits};
 
-pub use segments::{allocate, longest_segment, sensor_bytes};
-
-/// Where POSIX shared memory lives on Linux.
+/// Directory of POSIX shared memory on Linux.
 pub const SHARED_MEMORY: &str = "/dev/shm";
 
-/// What the segments of a consumer or of a client of the control service take, and some for others that come at the
-/// same time: each has a few pages.
+/// Memory for the segments of a subscriber or control client, with a reserve for others that start at the same time.
+/// Each segment has a few pages.
 const CLIENT_BYTES: u64 = 64 * 1024;
 
-/// Descriptors that one more topic or event takes, with some to spare.
+/// Descriptors that another topic or event needs, with a reserve.
 const PORT_DESCRIPTORS: u64 = 8;
 
-/// Descriptors that a client of the control service takes.
+/// Descriptors that a client of the control service needs.
 pub(crate) const CONTROL_DESCRIPTORS: u64 = 24;
 
-/// Fails if fewer than `needed` bytes of shared memory, in segments of at most `longest`, are free or allowed for this process.
+/// Fails if fewer than `needed` bytes of shared memory, in segments of at most `longest`, are free or allowed for this
+/// process.
 ///
 /// # Errors
 ///
-/// [`Kind::Short`] with what is free and what is needed.
+/// Returns [`Kind::Short`] with the free and the needed bytes.
 pub fn check_memory(needed: u64, longest: u64) -> Result<(), Failure> {
     check_place(Path::new(SHARED_MEMORY), needed).map_err(|what| memory(&what))?;
     check_file_size(longest)?;
     check_address_space(needed)
 }
 
-/// Fails if this process may not create files of `needed` bytes, because segments are files.
-///
-/// [`Kind::Short`] with the limit and what is needed.
+/// Fails with [`Kind::Short`] if this process may not create files of `needed` bytes. Segments are files.
 fn check_file_size(needed: u64) -> Result<(), Failure> {
     let limit = getrlimit(Resource::Fsize).current.unwrap_or(u64::MAX);
     if limit >= needed {
@@ -56,17 +58,18 @@ fn check_file_size(needed: u64) -> Result<(), Failure> {
     Err(Failure::new(Kind::Short, what, "raise the limit: `ulimit -f unlimited`, for a service LimitFSIZE"))
 }
 
-/// Fails if this process may not map `needed` more bytes and what creating them takes: the library would leave behind a
-/// segment that it cannot map.
+/// Fails if this process may not map `needed` more bytes and the memory for creating them. The library would leave a
+/// segment behind that it cannot map.
 ///
 /// # Errors
 ///
-/// [`Kind::Short`] with the limit and what is needed.
+/// Returns [`Kind::Short`] with the limit and the needed bytes.
 pub fn check_address_space(needed: u64) -> Result<(), Failure> {
     let Some(limit) = getrlimit(Resource::As).current else { return Ok(()) };
-    let taken = std::fs::read_to_string(MAPPED).ok().and_then(|text| text.split(' ').next()?.parse().ok());
+    let taken =
+        std::fs::read_to_string(PAGE_COUNTS).ok().and_then(|text| text.split(' ').next()?.parse().ok());
     let free = limit.saturating_sub(taken.unwrap_or(0) * page_size() as u64);
-    let needed = needed + MAKING_BYTES;
+    let needed = needed + CREATION_BYTES;
     if free >= needed {
         return Ok(());
     }
@@ -84,11 +87,11 @@ pub fn check_address_space(needed: u64) -> Result<(), Failure> {
 ///
 /// # Errors
 ///
-/// [`Kind::Short`] with the limit and what is needed.
+/// Returns [`Kind::Short`] with the limit and the needed number.
 pub fn check_descriptors(needed: u64) -> Result<(), Failure> {
     let limit = getrlimit(Resource::Nofile).current.unwrap_or(u64::MAX);
-    let open = match std::fs::read_dir(OPEN) {
-        // To list them needs one too.
+    let open = match std::fs::read_dir(OPEN_DESCRIPTORS) {
+        // Listing them needs a descriptor too.
         Ok(entries) => entries.count() as u64 - 1,
         Err(error) => without_list(&error, limit),
     };
@@ -102,18 +105,18 @@ pub fn check_descriptors(needed: u64) -> Result<(), Failure> {
     ))
 }
 
-/// Raises the limit of descriptors to the hard limit: a publisher needs about four for each consumer of a topic.
+/// Raises the limit of descriptors to the hard limit. A publisher needs about four for each subscriber of a topic.
 ///
 /// # Errors
 ///
-/// The system's error if it does not let it.
+/// Returns the system's error if it refuses.
 pub fn raise_descriptor_limit() -> io::Result<()> {
     let mut limit = getrlimit(Resource::Nofile);
     limit.current = limit.maximum;
     Ok(setrlimit(Resource::Nofile, limit)?)
 }
 
-/// Returns the failure that shared memory is short, in the words of `what`.
+/// Returns the failure that shared memory is short, with the message `what`.
 pub fn memory(what: &str) -> Failure {
     Failure::new(
         Kind::Short,
@@ -122,13 +125,13 @@ pub fn memory(what: &str) -> Failure {
     )
 }
 
-/// Refuses to make one more of a consumer's ports where there is no room for it: the library would make one that gets
-/// nothing, or end the process.
+/// Fails if there is no room for another port of a client. The library would create one that receives nothing, or end
+/// the process.
 pub(crate) fn check_client() -> Result<(), Failure> {
     check_descriptors(PORT_DESCRIPTORS).and_then(|()| check_memory(CLIENT_BYTES, CLIENT_BYTES))
 }
 
-/// What is so short that it may be why something failed in the domain at `root`.
+/// Returns a shortage that may be the reason why something failed in the domain at `root`.
 pub(crate) fn found(root: &Path) -> Option<Failure> {
     let files = || {
         let place = root.ancestors().find(|path| path.exists()).unwrap_or(root);
@@ -142,8 +145,8 @@ pub(crate) fn found(root: &Path) -> Option<Failure> {
         .err()
 }
 
-/// How many descriptors are open, of at most `limit`, where `error` came instead of their list. None that would be in
-/// the way if only the list is not there: not every container has /proc.
+/// Returns the number of open descriptors, at most `limit`, if listing them failed with `error`. Returns 0 if only the
+/// list is unavailable, because not every container has /proc.
 fn without_list(error: &io::Error, limit: u64) -> u64 {
     match Errno::from_io_error(error) {
         Some(Errno::MFILE | Errno::NFILE) => limit,
@@ -151,7 +154,7 @@ fn without_list(error: &io::Error, limit: u64) -> u64 {
     }
 }
 
-/// What is free at `place` and what is needed, if that is more.
+/// Fails with a message if fewer than `needed` bytes are free at `place`.
 fn check_place(place: &Path, needed: u64) -> Result<(), String> {
     let Ok(stat) = statvfs(place) else { return Ok(()) };
     let free = free(&stat);
@@ -161,19 +164,70 @@ fn check_place(place: &Path, needed: u64) -> Result<(), String> {
     Err(format!("{} kB free, {} kB needed", free / 1024, needed.div_ceil(1024)))
 }
 
-/// Bytes that are free in a file system; one that counts no blocks, as a tmpfs without a size, has no limit.
+/// Returns the free bytes of a file system. A file system without blocks, such as a tmpfs without a size, has no limit.
 fn free(stat: &StatVfs) -> u64 {
     if stat.f_blocks == 0 { u64::MAX } else { stat.f_bavail * stat.f_frsize }
 }
 
-/// Address space that making a few segments takes beside them: a heap for a thread, tables, a message about a failure.
-const MAKING_BYTES: u64 = 8 << 20;
+/// Address space that is needed while segments are created: the heap of a thread, tables, and a message about a
+/// failure.
+const CREATION_BYTES: u64 = 8 << 20;
 
-/// How many pages the own process has, first of all that are mapped.
-const MAPPED: &str = "/proc/self/statm";
+/// File with the number of pages of this process. The first number counts all that are mapped.
+const PAGE_COUNTS: &str = "/proc/self/statm";
 
-/// The list of the own open descriptors.
-const OPEN: &str = "/proc/self/fd";
+/// Directory of this process's open descriptors.
+const OPEN_DESCRIPTORS: &str = "/proc/self/fd";
+
+/// Allocates the memory of all segments that `domain` has reserved so far.
+///
+/// # Errors
+///
+/// Returns [`Kind::Short`] if there is not enough memory.
+pub fn allocate(domain: &Domain) -> Result<(), Failure> {
+    let Some(prefix) = prefix_of(domain.root())? else { return Ok(()) };
+    let user = rustix::process::geteuid().as_raw();
+    let entries = fs::read_dir(SHARED_MEMORY).into_iter().flatten().flatten();
+    for entry in entries.filter(|entry| entry.file_name().to_string_lossy().starts_with(&prefix)) {
+        // Skip segments of other users, and those that have been removed in between.
+        if !entry.metadata().is_ok_and(|metadata| metadata.is_file() && metadata.uid() == user) {
+            continue;
+        }
+        let flags = (OFlags::NOFOLLOW | OFlags::NONBLOCK).bits() as i32;
+        let Ok(segment) = OpenOptions::new().write(true).custom_flags(flags).open(entry.path()) else {
+            continue;
+        };
+        let Ok(metadata) = segment.metadata() else { continue };
+        if metadata.len() == 0 {
+            continue;
+        }
+        // After any other error, the allocation may succeed later.
+        if fallocate(&segment, FallocateFlags::empty(), 0, metadata.len()) == Err(Errno::NOSPC) {
+            let name = entry.file_name().to_string_lossy().into_owned();
+            return Err(memory(&format!("no room for {name}: {} kB", metadata.len() / 1024)));
+        }
+    }
+    Ok(())
+}
+
+/// Returns the bytes of all segments of one sensor's `topics` if they are created with `limits`: payloads with their
+/// headers, and the lists of each service.
+pub fn sensor_bytes(topics: &[Topic], limits: &TopicLimits) -> u64 {
+    let chunk =
+        |&topic: &Topic| limits::samples(topic, limits.consumers) * (topic.longest(limits) + CHUNK_HEADER);
+    let services = (topics.len() + 1) as u64 * SERVICE;
+    topics.iter().map(chunk).sum::<usize>() as u64 + services
+}
+
+/// Returns the bytes of the longest segment of one sensor's `topics` if they are created with `limits`.
+pub fn longest_segment(topics: &[Topic], limits: &TopicLimits) -> u64 {
+    topics.iter().map(|&topic| sensor_bytes(&[topic], limits)).max().unwrap_or_default()
+}
+
+/// Bytes before each sample, rounded up: the header, and the data of the shared-memory library.
+const CHUNK_HEADER: usize = size_of::<Header>() + 64;
+/// Bytes of the list of ports and processes of one service, rounded up.
+const SERVICE: u64 = 48 * 1024;
 
 #[cfg(test)]
 mod tests {

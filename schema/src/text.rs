@@ -1,4 +1,10 @@
-//! Text in a fixed field of bytes: UTF-8, padded with 0, cut at a character boundary if it is too long.
+//! Text in fixed-size fields of payloads, and text for a terminal.
+//!
+//! A field has UTF-8, padded with 0, and is cut at a character boundary if the text is too long. Names and errors may come from
+//! another machine, and must not move the cursor of a terminal or change its colors. All output is written through
+//! [`Printable`] or [`escape_json`].
+
+use std::fmt::{self, Write};
 
 /// Writes `text` into `field` and clears the rest.
 pub(crate) fn write(field: &mut [u8], text: &str) {
@@ -10,7 +16,7 @@ pub(crate) fn write(field: &mut [u8], text: &str) {
     field[end..].fill(0);
 }
 
-/// The text in `field`, up to the first 0; what is not UTF-8 ends it.
+/// Returns the text in `field`, up to the first 0 or the first byte that is not UTF-8.
 pub(crate) fn read(field: &[u8]) -> &str {
     let end = field.iter().position(|&byte| byte == 0).unwrap_or(field.len());
     match str::from_utf8(&field[..end]) {
@@ -19,8 +25,47 @@ pub(crate) fn read(field: &[u8]) -> &str {
     }
 }
 
+/// Shows control characters (C0, DEL and C1 of ECMA-48) as `?`, except line feeds.
+#[derive(Clone, Copy, Debug)]
+pub struct Printable<'a>(pub &'a str);
+
+impl fmt::Display for Printable<'_> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        self.0.chars().try_for_each(|c| f.write_char(if c.is_control() && c != '\n' { '?' } else { c }))
+    }
+}
+
+/// Replaces DEL and C1, which JSON allows but a terminal executes, by `\u` and four digits. They have the same meaning
+/// in JSON. Writers of JSON always escape C0.
+pub fn escape_json(line: &mut Vec<u8>) {
+    let code = |at: usize, line: &[u8]| match line[at] {
+        0x7f => Some((1, 0x7f)),
+        0xc2 => line.get(at + 1).filter(|byte| (0x80..0xa0).contains(*byte)).map(|&byte| (2, byte)),
+        _ => None,
+    };
+    let mut at = 0;
+    while at < line.len() {
+        let Some((length, code)) = code(at, line) else {
+            at += 1;
+            continue;
+        };
+        let escaped = format!("\\u{code:04x}");
+        at += escaped.len();
+        line.splice(at - escaped.len()..at - escaped.len() + length, escaped.into_bytes());
+    }
+}
+
+/// Returns the JSON `line` after [`escape_json`].
+pub fn json_line(line: String) -> String {
+    let mut line = line.into_bytes();
+    escape_json(&mut line);
+    String::from_utf8(line).unwrap_or_default()
+}
+
 #[cfg(test)]
 mod tests {
+    use crate::{Failure, Kind};
+
     use super::*;
 
     #[test]
@@ -37,5 +82,21 @@ mod tests {
     #[test]
     fn bytes_that_are_not_text_end_it() {
         assert_eq!(read(b"ab\xFFcd"), "ab");
+    }
+
+    #[test]
+    fn a_terminal_gets_text_alone() {
+        let text = "é \x1b[2J\x07\u{9b}31m\r\x7f,\n  ok";
+        assert_eq!(Printable(text).to_string(), "é ?[2J??31m??,\n  ok");
+        let failure = Failure::new(Kind::Failed, "no \x1b]0;x\x07", "try \u{9d}y");
+        assert_eq!(failure.to_string(), "no ?]0;x?\n  try ?y");
+    }
+
+    #[test]
+    fn a_line_of_json_says_the_same_without_control_characters() {
+        let text = "é\u{80}\x1b \u{9f}\x7f\u{a0}\u{9b}\u{9b}°\n";
+        let line = json_line(serde_json::to_string(text).unwrap());
+        assert_eq!(line, "\"é\\u0080\\u001b \\u009f\\u007f\u{a0}\\u009b\\u009b°\\n\"");
+        assert_eq!(serde_json::from_str::<String>(&line).unwrap(), text);
     }
 }

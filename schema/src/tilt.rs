@@ -1,31 +1,380 @@
-//! How a mount stands at an instant. Refuses to know what is mounted on it, and how the angle is measured.
+//! A scanner on a tilting mount: the angle of the mount, the points of each scan in three dimensions, the sweeps that they
+//! form, and the obstacles that were found in one sweep.
 
-use bytemuck::{Pod, Zeroable};
+use std::fmt;
+
+use bytemuck::{Pod, Zeroable, cast_slice, cast_slice_mut};
 #[cfg(feature = "ipc")]
 use iceoryx2::prelude::ZeroCopySend;
 
-/// The payload of topic `tilt`, 16 bytes: the angle of a mount. Both stamps of the sample are when the mount was there, not when
-/// that was said.
+use crate::Header;
+use crate::sliced::sliced;
+
+/// The payload of topic `tilt`, 16 bytes: the angle of a mount. Both stamps of the sample are the time at which the
+/// mount had this angle, not the time of the report.
 #[derive(Clone, Copy, Debug, PartialEq, Pod, Zeroable)]
 #[cfg_attr(feature = "ipc", derive(ZeroCopySend), type_name("scanhub.Tilt.v2"))]
 #[repr(C)]
 pub struct Tilt {
-    /// In radians, right-handed around the mount's axis.
+    /// Angle in radians, right-handed around the mount's axis.
     pub angle_rad: f64,
-    /// How fast it grows in radians a second; nan: not known.
+    /// Angular rate in radians per second; NaN if unknown.
     pub rate_rad_s: f64,
 }
 
 impl Default for Tilt {
-    /// Angle 0 with an unknown rate.
+    /// Returns angle 0 with an unknown rate.
     fn default() -> Self {
         Tilt { angle_rad: 0.0, rate_rad_s: f64::NAN }
     }
 }
 
 impl Tilt {
-    /// Returns how fast the angle grows in radians a second, if that is known.
+    /// Returns the angular rate in radians per second, if it is known.
     pub fn rate_rad_s(&self) -> Option<f64> {
         Some(self.rate_rad_s).filter(|rate| rate.is_finite())
+    }
+}
+
+/// Head of a [`Cloud`], before the points. 16 bytes.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Pod, Zeroable)]
+#[repr(C)]
+pub struct CloudHead {
+    /// Number of the sweep that the points belong to, from 0.
+    pub sweep: u32,
+    /// Generation of the background that the points were compared with. Each reset increases it by 1.
+    pub generation: u32,
+    /// Number of points.
+    pub count: u16,
+    /// Bits: [`FIRST`](Cloud::FIRST), [`LAST`](Cloud::LAST), [`COMPLETE`](Cloud::COMPLETE), [`DOUBTED`](Cloud::DOUBTED).
+    pub flags: u8,
+    /// 0.
+    pub reserved: [u8; 5],
+}
+
+sliced! {
+    /// The payload of topic `cloud`: a [`CloudHead`], whose fields can be read directly, followed by the points of one
+    /// scan. The samples of a sweep follow each other, from [`FIRST`](Self::FIRST) to [`LAST`](Self::LAST).
+    /// [`SweepPoints`] gathers whole sweeps. The stamps of a sample are the times of its first and its last point.
+    Cloud, CloudWord, "scanhub.Cloud.v2", CloudHead
+}
+
+/// One point. 16 bytes.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Pod, Zeroable)]
+#[repr(C)]
+pub struct CloudPoint {
+    /// Position in the robot's frame, in meters: ahead, to the left, above the floor.
+    pub at: [f32; 3],
+    /// Index of the beam in its scan.
+    pub beam: u16,
+    /// See [`PointClass`].
+    pub point_class: u8,
+    /// 0.
+    pub reserved: u8,
+}
+
+/// Class of a point compared with the background.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[repr(u8)]
+pub enum PointClass {
+    /// The background of the beam is unknown.
+    #[default]
+    Unknown,
+    /// The point is on the background.
+    Background,
+    /// The point is in front of the background.
+    Foreground,
+    /// The point is beyond the background: an object was removed.
+    Behind,
+}
+
+impl PointClass {
+    /// All classes, in the order of their numbers.
+    pub const ALL: [PointClass; 4] =
+        [PointClass::Unknown, PointClass::Background, PointClass::Foreground, PointClass::Behind];
+
+    /// Returns the name in all output.
+    pub const fn name(self) -> &'static str {
+        match self {
+            PointClass::Unknown => "unknown",
+            PointClass::Background => "background",
+            PointClass::Foreground => "foreground",
+            PointClass::Behind => "behind",
+        }
+    }
+}
+
+impl CloudPoint {
+    /// Returns the class; [`PointClass::Unknown`] if this version does not know its number.
+    pub fn class(&self) -> PointClass {
+        PointClass::ALL.get(usize::from(self.point_class)).copied().unwrap_or_default()
+    }
+}
+
+impl Cloud {
+    /// Flag: the first sample of its sweep.
+    pub const FIRST: u8 = 1;
+    /// Flag: the last sample of its sweep.
+    pub const LAST: u8 = 2;
+    /// Flag: the sweep went from one reversal of the mount to the next, and no angle was missing.
+    pub const COMPLETE: u8 = 4;
+    /// Flag: the sweep is unreliable, because its angles contradict the background. The class of all points is unknown.
+    pub const DOUBTED: u8 = 8;
+
+    /// Returns the length in bytes of a cloud of `points` points.
+    pub const fn len(points: usize) -> usize {
+        Cloud::HEAD + points * size_of::<CloudPoint>()
+    }
+
+    /// Returns a cloud with `head` and `points`.
+    pub fn of(head: CloudHead, points: &[CloudPoint]) -> Box<Cloud> {
+        let mut cloud = Cloud::zeroed(Cloud::len(points.len()));
+        cloud.begin(CloudHead { count: points.len() as u16, ..head }).copy_from_slice(points);
+        cloud
+    }
+
+    /// Writes `head` and returns the points, which the caller must fill.
+    ///
+    /// # Panics
+    ///
+    /// Panics if the memory is too short for them.
+    pub fn begin(&mut self, head: CloudHead) -> &mut [CloudPoint] {
+        **self = head;
+        cast_slice_mut(&mut self.memory_mut()[Cloud::HEAD..Cloud::len(head.count.into())])
+    }
+
+    /// Returns the points.
+    pub fn points(&self) -> &[CloudPoint] {
+        let room = self.memory().len().saturating_sub(Cloud::HEAD) / size_of::<CloudPoint>();
+        let count = usize::from(self.count).min(room);
+        self.memory().get(Cloud::HEAD..Cloud::len(count)).map_or(&[], cast_slice)
+    }
+
+    /// Returns whether `flag` is set.
+    pub fn has(&self, flag: u8) -> bool {
+        self.flags & flag != 0
+    }
+
+    fn used(&self) -> usize {
+        Cloud::len(self.points().len())
+    }
+}
+
+impl fmt::Debug for Cloud {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Cloud").field("head", &**self).field("points", &self.points()).finish()
+    }
+}
+
+/// Gathers the points of whole sweeps from the samples of topic `cloud`.
+///
+/// # Examples
+///
+/// ```
+/// use schema::{Cloud, CloudHead, CloudPoint, Header, SweepPoints};
+///
+/// let mut sweep = SweepPoints::default();
+/// for (topic_seq, flags) in [(7, Cloud::FIRST), (8, 0), (9, Cloud::LAST)] {
+///     let head = CloudHead { flags, ..CloudHead::default() };
+///     let sample = Cloud::of(head, &[CloudPoint::default(); 2]);
+///     let header = Header { topic_seq, ..Header::default() };
+///     let points = sweep.take(&header, &sample);
+///     assert_eq!(points.map(<[CloudPoint]>::len), (topic_seq == 9).then_some(6));
+/// }
+/// ```
+#[derive(Clone, Debug, Default)]
+pub struct SweepPoints {
+    points: Vec<CloudPoint>,
+    /// Publisher's run and number of the next sample of this sweep. `None` while waiting for the first sample of a
+    /// sweep.
+    next: Option<(u64, u64)>,
+}
+
+/// Maximum number of points of a sweep that is gathered.
+const MAX_SWEEP_POINTS: usize = 1 << 18;
+
+impl SweepPoints {
+    /// Adds a sample of topic `cloud`. With the last sample of a sweep, returns the points of the sweep. A sweep with a
+    /// missed sample, or with more than 262,144 points, is dropped.
+    pub fn take(&mut self, header: &Header, cloud: &Cloud) -> Option<&[CloudPoint]> {
+        let this = (header.boot, header.topic_seq);
+        if cloud.has(Cloud::FIRST) {
+            self.points.clear();
+        } else if self.next != Some(this) {
+            self.next = None;
+            return None;
+        }
+        let has_room = self.points.len() + cloud.points().len() <= MAX_SWEEP_POINTS;
+        let goes_on = has_room && !cloud.has(Cloud::LAST);
+        self.next = goes_on.then_some((header.boot, header.topic_seq.wrapping_add(1)));
+        if !has_room {
+            return None;
+        }
+        self.points.extend_from_slice(cloud.points());
+        cloud.has(Cloud::LAST).then_some(&self.points)
+    }
+}
+
+/// Maximum number of obstacles of a sweep.
+pub const OBSTACLES: usize = 64;
+
+/// The payload of topic `obstacles`, 3088 bytes: the obstacles of one sweep. It is published even if there are none.
+#[derive(Clone, Copy, Debug, PartialEq, Pod, Zeroable)]
+#[cfg_attr(feature = "ipc", derive(ZeroCopySend), type_name("scanhub.Obstacles.v2"))]
+#[repr(C)]
+pub struct Obstacles {
+    /// Number of the sweep, as in a [`Cloud`](crate::Cloud).
+    pub sweep: u32,
+    /// Generation of the background, as in a [`Cloud`](crate::Cloud).
+    pub generation: u32,
+    /// Number of obstacles that did not fit.
+    pub left_out: u32,
+    /// Number of obstacles, at most [`OBSTACLES`].
+    pub count: u8,
+    /// Bits: [`COMPLETE`](Self::COMPLETE), [`DOUBTED`](Self::DOUBTED).
+    pub flags: u8,
+    /// 0.
+    pub reserved: [u8; 2],
+    /// The obstacles, the nearest first; 0 beyond `count`.
+    pub obstacle_array: [Obstacle; OBSTACLES],
+}
+
+/// An object that was found in one sweep. Positions are in the robot's frame, in meters: ahead, to the left, above the
+/// floor.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Pod, Zeroable)]
+#[cfg_attr(feature = "ipc", derive(ZeroCopySend), type_name("scanhub.Obstacle.v2"))]
+#[repr(C)]
+pub struct Obstacle {
+    /// Mean of the points.
+    pub middle: [f32; 3],
+    /// Lowest coordinates of the points.
+    pub low: [f32; 3],
+    /// Highest coordinates of the points.
+    pub high: [f32; 3],
+    /// Horizontal distance of the nearest point from the robot's center, in meters.
+    pub distance_m: f32,
+    /// Number of points.
+    pub points: u32,
+    /// Bits: [`FOREGROUND`](Self::FOREGROUND), [`NEAR`](Self::NEAR).
+    pub flags: u8,
+    /// 0.
+    pub reserved: [u8; 3],
+}
+
+impl Obstacle {
+    /// Flag: some of its points are in front of the background.
+    pub const FOREGROUND: u8 = 1;
+    /// Flag: some of its points are in the space that must be free.
+    pub const NEAR: u8 = 2;
+
+    /// Returns whether `flag` is set.
+    pub fn has(&self, flag: u8) -> bool {
+        self.flags & flag != 0
+    }
+}
+
+impl Default for Obstacles {
+    fn default() -> Self {
+        Zeroable::zeroed()
+    }
+}
+
+impl Obstacles {
+    /// Flag: the sweep went from one reversal of the mount to the next, and no angle was missing.
+    pub const COMPLETE: u8 = 4;
+    /// Flag: the sweep is unreliable, because its angles contradict the background. The list is empty, whatever the
+    /// scene contains.
+    pub const DOUBTED: u8 = 8;
+
+    /// Returns the obstacles, the nearest first.
+    pub fn obstacles(&self) -> &[Obstacle] {
+        &self.obstacle_array[..usize::from(self.count).min(OBSTACLES)]
+    }
+
+    /// Adds an obstacle, or counts it as left out if there is no room for it.
+    pub fn push(&mut self, obstacle: Obstacle) {
+        match self.obstacle_array.get_mut(usize::from(self.count)) {
+            Some(place) => {
+                *place = obstacle;
+                self.count += 1;
+            }
+            None => self.left_out += 1,
+        }
+    }
+
+    /// Returns whether `flag` is set.
+    pub fn has(&self, flag: u8) -> bool {
+        self.flags & flag != 0
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn points_are_as_many_as_there_is_memory_for() {
+        let point = CloudPoint { at: [1.0, -2.0, 0.5], beam: 7, point_class: 2, reserved: 0 };
+        let head = CloudHead { sweep: 3, flags: Cloud::FIRST | Cloud::COMPLETE, ..CloudHead::default() };
+        let mut cloud = Cloud::of(head, &[CloudPoint::default(), point]);
+        assert_eq!((cloud.sweep, cloud.bytes().len(), cloud.points()[1]), (3, 48, point));
+        assert!(cloud.has(Cloud::FIRST) && !cloud.has(Cloud::LAST));
+        cloud.count = 9;
+        assert_eq!((cloud.points().len(), cloud.bytes().len()), (2, 48), "there is no memory for so many");
+    }
+
+    #[test]
+    fn numbers_of_classes() {
+        for (number, class) in PointClass::ALL.into_iter().enumerate() {
+            assert_eq!(class as usize, number);
+            assert_eq!(CloudPoint { point_class: number as u8, ..CloudPoint::default() }.class(), class);
+        }
+        assert_eq!(CloudPoint { point_class: 4, ..CloudPoint::default() }.class(), PointClass::Unknown);
+    }
+
+    /// Returns the number of points of each complete sweep. A sample has a number, flags and a count of points.
+    fn gathered(sweep: &mut SweepPoints, samples: &[(u64, u8, usize)]) -> Vec<usize> {
+        let mut whole = Vec::new();
+        for &(topic_seq, flags, count) in samples {
+            let head = CloudHead { flags, ..CloudHead::default() };
+            let cloud = Cloud::of(head, &vec![CloudPoint::default(); count]);
+            let header = Header { topic_seq, boot: topic_seq / 100, ..Header::default() };
+            whole.extend(sweep.take(&header, &cloud).map(<[CloudPoint]>::len));
+        }
+        whole
+    }
+
+    #[test]
+    fn sweeps_are_whole_or_left_out() {
+        let (first, last) = (Cloud::FIRST, Cloud::LAST);
+        let mut sweep = SweepPoints::default();
+        // A program that starts in the middle of a sweep waits for the next one.
+        assert_eq!(gathered(&mut sweep, &[(3, 0, 5), (4, last, 5)]), [0; 0]);
+        assert_eq!(gathered(&mut sweep, &[(5, first, 5), (6, 0, 2), (7, last, 1)]), [8]);
+        assert_eq!(gathered(&mut sweep, &[(8, first | last, 4), (9, last, 3)]), [4], "9 has no beginning");
+        assert_eq!(gathered(&mut sweep, &[(10, first, 5), (12, last, 5)]), [0; 0], "11 was missed");
+        assert_eq!(gathered(&mut sweep, &[(20, first, 5), (21, first, 2), (22, last, 1)]), [3]);
+        assert_eq!(gathered(&mut sweep, &[(99, first, 5), (100, last, 5)]), [0; 0], "another one sends it");
+    }
+
+    #[test]
+    fn no_sweep_is_too_long() {
+        let mut samples: Vec<_> = (0..33).map(|number| (number, 0, 8192)).collect();
+        samples[0].1 = Cloud::FIRST;
+        samples.push((33, Cloud::LAST, 1));
+        let mut sweep = SweepPoints::default();
+        assert_eq!(gathered(&mut sweep, &samples), [0; 0]);
+        samples.truncate(32);
+        samples[31].1 = Cloud::LAST;
+        assert_eq!(gathered(&mut sweep, &samples), [262_144]);
+    }
+
+    #[test]
+    fn what_is_too_many_is_left_out() {
+        let mut found = Obstacles { flags: Obstacles::COMPLETE, ..Obstacles::default() };
+        (0..=OBSTACLES as u32).for_each(|points| found.push(Obstacle { points, ..Obstacle::default() }));
+        assert_eq!((found.obstacles().len(), found.left_out), (OBSTACLES, 1));
+        assert_eq!(found.obstacles()[OBSTACLES - 1].points, OBSTACLES as u32 - 1);
+        assert!(found.has(Obstacles::COMPLETE) && !found.has(Obstacles::DOUBTED));
     }
 }

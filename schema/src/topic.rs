@@ -1,16 +1,182 @@
-//! The names of topics, their services and sensors. Refuses to know how a service is created.
-
-mod maker;
-mod table;
+//! The topics: their table, and the names of topics, services and sensors.
+//!
+//! One row of the table has everything that differs between topics. All code for each topic, here and in other crates, is
+//! generated from this table, so a new topic is a new row.
 
 use crate::limits::TopicLimits;
 use crate::{Failure, Kind};
 
-pub use maker::Maker;
-pub use table::{Pace, Ring, Row, Topic};
+/// Calls the macro `$each` with all rows of the table. A row is `VARIANT PAYLOAD, name, type, group, pace, ring,
+/// waiting, kept: description;`. Its columns are those of [`Row`]. A payload other than `[u8]` is a type of this crate.
+///
+/// # Examples
+///
+/// ```
+/// macro_rules! names {
+///     ($($topic:ident $payload:tt, $name:literal, $($column:tt),*: $description:literal;)*) => { [$($name),*] };
+/// }
+/// let names = schema::for_each_topic!(names);
+/// assert_eq!(names[1], "scan");
+/// ```
+#[macro_export]
+macro_rules! for_each_topic {
+    ($each:ident) => {
+        $each! {
+            Telegram [u8], "telegram", "u8[]", 83, Scan, First, 64, 0:
+                "Bytes of telegrams, including replies.";
+            Scan Scan, "scan", "scanhub.Scan.v2", 82, Scan, First, 64, 0:
+                "Decoded measurements.";
+            Marks Marks, "marks", "scanhub.Marks.v2", 81, Scan, Last, 16, 0:
+                "Reflector marks.";
+            Zones Zones, "zones", "scanhub.Zones.v2", 81, Scan, First, 16, 1:
+                "Verdicts about zones around the robot.";
+            Foreground Foreground, "foreground", "scanhub.Foreground.v2", 81, Scan, Last, 16, 0:
+                "Beams in front of the background.";
+            Background Background, "background", "scanhub.Background.v2", 82, Change, Last, 4, 1:
+                "The background model.";
+            Status Status, "status", "scanhub.Status.v2", 80, Second, Last, 4, 1:
+                "State, properties and counters of the link.";
+            Lines Lines, "lines", "scanhub.Lines.v2", 81, Scan, Last, 16, 0:
+                "Straight lines and their corners.";
+            Motion Motion, "motion", "scanhub.Motion.v2", 81, Scan, Last, 16, 0:
+                "Motion of the robot since the previous scan.";
+            Early Early, "early", "scanhub.Early.v2", 81, Change, Early, 16, 0:
+                "Early warnings from partial telegrams.";
+            Tracks Tracks, "tracks", "scanhub.Tracks.v2", 81, Scan, Last, 16, 0:
+                "Positions of people, from a tracker.";
+            Events Event, "events", "scanhub.Event.v2", 81, Change, Last, 64, 0:
+                "Events of people, from a tracker.";
+            Tilt Tilt, "tilt", "scanhub.Tilt.v2", 81, Scan, Last, 64, 0:
+                "The angle of a mount.";
+            Cloud Cloud, "cloud", "scanhub.Cloud.v2", 82, Change, Last, 128, 0:
+                "Points in three dimensions.";
+            Obstacles Obstacles, "obstacles", "scanhub.Obstacles.v2", 81, Change, Last, 16, 0:
+                "Obstacles in three dimensions.";
+        }
+    };
+}
+
+/// Expands to the type of a row's payload in [`for_each_topic!`](crate::for_each_topic), in any crate.
+///
+/// # Examples
+///
+/// ```
+/// assert_eq!(size_of::<schema::payload_type!(Marks)>(), 1028);
+/// let telegram: &schema::payload_type!([u8]) = &[2, 0x80];
+/// ```
+#[macro_export]
+macro_rules! payload_type {
+    ([u8]) => {
+        [u8]
+    };
+    ($payload:ident) => {
+        $crate::$payload
+    };
+}
+
+/// Properties of a topic, other than those of its payload.
+#[derive(Clone, Copy, Debug)]
+pub struct Row {
+    /// Name, as in `front/scan`.
+    pub name: &'static str,
+    /// Type of the payload, which is the same in all languages.
+    pub payload: &'static str,
+    /// Last byte of the topic's multicast group.
+    pub group: u8,
+    /// Publish rate.
+    pub pace: Pace,
+    /// Doorbell word that the hub rings after a sample.
+    pub ring: Ring,
+    /// Samples that are queued for a subscriber. One more drops the oldest. The topics that a recorder must not lose
+    /// have room for 1.7 s: with a queue of 16, a recorder lost 7 scans while its machine was stopped for 0.6 s.
+    pub waiting: usize,
+    /// Number of samples in the history for late joiners.
+    pub kept: usize,
+    /// Returns the length in bytes of the longest payload of a topic that is created with these limits.
+    pub longest: fn(&TopicLimits) -> usize,
+}
+
+/// Publish rate of a topic.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Pace {
+    /// With each scan.
+    Scan,
+    /// Every second, and after each change.
+    Second,
+    /// For each new value.
+    Change,
+}
+
+/// Words of a sensor's doorbell. There are three, so that a subscriber to `zones` need not wait for the marks of the
+/// same scan.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Ring {
+    /// Rung as soon as telegram, scan and zones are sent.
+    First,
+    /// Rung after all samples of a telegram are sent.
+    Last,
+    /// Rung for an early warning, before the telegram is complete.
+    Early,
+}
+
+impl Ring {
+    /// All words.
+    pub const ALL: [Ring; 3] = [Ring::First, Ring::Last, Ring::Early];
+}
+
+macro_rules! rows {
+    ($($topic:ident $payload:tt, $name:literal, $kind:literal, $group:literal, $pace:ident,
+        $ring:ident, $waiting:literal, $kept:literal: $about:literal;)*) => {
+        /// A topic that a sensor can have.
+        #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
+        pub enum Topic {
+            $(#[doc = $about] $topic,)*
+        }
+
+        impl Topic {
+            /// All topics, in the order of all output.
+            pub const ALL: [Topic; [$($name),*].len()] = [$(Topic::$topic),*];
+        }
+
+        /// One row for each of [`Topic::ALL`].
+        pub(super) const ROWS: [Row; Topic::ALL.len()] = [$(Row {
+            name: $name,
+            payload: $kind,
+            group: $group,
+            pace: Pace::$pace,
+            ring: Ring::$ring,
+            waiting: $waiting,
+            kept: $kept,
+            longest: longest!($payload),
+        },)*];
+    };
+}
+
+macro_rules! longest {
+    ([u8]) => {
+        |limits| limits.telegram
+    };
+    (Scan) => {
+        |limits| crate::Scan::len(limits.beams, limits.contents)
+    };
+    (Foreground) => {
+        |limits| crate::Foreground::len(limits.beams)
+    };
+    (Background) => {
+        |limits| crate::Background::len(limits.beams)
+    };
+    (Cloud) => {
+        |limits| crate::Cloud::len(limits.beams)
+    };
+    ($payload:tt) => {
+        |_| size_of::<crate::$payload>()
+    };
+}
+
+crate::for_each_topic!(rows);
 
 impl Topic {
-    /// What a hub publishes of each link.
+    /// Topics that a hub publishes for each link.
     pub const OF_LINKS: [Topic; 10] = [
         Topic::Telegram,
         Topic::Scan,
@@ -24,9 +190,9 @@ impl Topic {
         Topic::Early,
     ];
 
-    /// Returns what the table says of the topic.
+    /// Returns the topic's row of the table.
     pub const fn row(self) -> &'static Row {
-        &table::ROWS[self as usize]
+        &ROWS[self as usize]
     }
 
     /// Returns the topic's name, as in `front/scan`.
@@ -48,7 +214,7 @@ impl Topic {
         Topic::ALL.into_iter().find(|topic| topic.name() == name)
     }
 
-    /// Returns the topic's number on a network: from 1.
+    /// Returns the topic's number in datagrams, from 1.
     pub fn number(self) -> u8 {
         self as u8 + 1
     }
@@ -58,17 +224,17 @@ impl Topic {
         Topic::ALL.into_iter().find(|topic| topic.number() == number)
     }
 
-    /// Returns the payload's type, the same in all languages.
+    /// Returns the type of the payload, which is the same in all languages.
     pub fn payload(self) -> &'static str {
         self.row().payload
     }
 
-    /// Returns the bytes of the longest payload where the topic is made as `limits` say.
+    /// Returns the length in bytes of the longest payload if the topic is created with `limits`.
     pub fn longest(self, limits: &TopicLimits) -> usize {
         (self.row().longest)(limits)
     }
 
-    /// Returns the payload's revision: a greater one only appends.
+    /// Returns the revision of the payload. A higher revision only appends fields.
     pub fn revision(self) -> u32 {
         1
     }
@@ -79,29 +245,30 @@ impl Topic {
     }
 }
 
-/// Name of the service that takes requests for the hub's links.
+/// Name of the service that receives requests for the hub's links.
 pub const CONTROL: &str = "scanhub/v2/control";
-/// Name of the event that wakes the hub for a request.
+/// Name of the event that wakes the hub after a request.
 pub const CONTROL_REQUEST: &str = "scanhub/v2/control/request";
-/// Name of the event that wakes clients for a response.
+/// Name of the event that wakes clients after a response.
 pub const CONTROL_RESPONSE: &str = "scanhub/v2/control/response";
 
-/// Name of the service that wakes the consumers of a sensor, beside its topics.
+/// Name of the service that wakes the subscribers of a sensor.
 pub const WAKE: &str = "wake";
 
-/// Why consumers are woken: the event's id.
+/// Reason why subscribers are woken: the ID of the event.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(usize)]
 pub enum Wake {
     /// All samples of a telegram are sent.
     Telegram = 1,
-    /// The status changed, or something else was published without a telegram: zones that became unknown, a new background.
+    /// The status changed, or another sample was published without a telegram, such as zones that became unknown or a
+    /// new background.
     Status = 2,
-    /// The hub is up; sent automatically when the notifier is created.
+    /// The hub is up. The library sends it when the notifier is created.
     HubUp = 3,
-    /// The hub is down; sent automatically when the notifier is dropped or its process is found dead.
+    /// The hub is down. The library sends it when the notifier is dropped or its process is found dead.
     HubDown = 4,
-    /// A telegram that is not complete is a warning.
+    /// A partial telegram caused an early warning.
     Early = 5,
 }
 
@@ -112,21 +279,21 @@ impl Wake {
     }
 }
 
-/// Returns the sensor and topic that a service's name stands for, if it is one of ours: the other direction of
-/// [`Topic::service`]; the wake service has no topic.
+/// Returns the sensor and topic of a service's name, or `None` if it is not one of these names. Reverses
+/// [`Topic::service`]. The wake service has no topic.
 pub fn of_service(name: &str) -> Option<(&str, Option<Topic>)> {
     let (sensor, topic) = name.strip_prefix("scanhub/v2/")?.split_once('/')?;
     if topic == WAKE { Some((sensor, None)) } else { Some((sensor, Some(Topic::parse(topic)?))) }
 }
 
-/// Means all sensors of a hub, wherever a sensor's name is expected; so it cannot be a sensor's name.
+/// Stands for all sensors of a hub where a sensor's name is expected. No sensor can have this name.
 pub const ROBOT: &str = "robot";
 
-/// Refuses a sensor's name that is not `[a-z0-9_-]`, 1 to 24 of them, or [`ROBOT`].
+/// Checks a sensor's name: 1 to 24 of `[a-z0-9_-]`, and not [`ROBOT`].
 ///
 /// # Errors
 ///
-/// [`Kind::Configuration`] with an example.
+/// Returns [`Kind::Configuration`] with an example if the name is not valid.
 pub fn check_sensor(name: &str) -> Result<(), Failure> {
     if name == ROBOT {
         let what = format!("sensor name {ROBOT:?} is not possible: it stands for all sensors");
@@ -143,12 +310,12 @@ pub fn check_sensor(name: &str) -> Result<(), Failure> {
     ))
 }
 
-/// Refuses what no consumer can follow: neither a sensor's name nor that of a remote one, `HUB.SENSOR`, of which each
-/// half is as a sensor's name: [`Kind::Configuration`].
+/// Checks the name of a sensor, or of a remote sensor. The latter is `HUB.SENSOR`, and each half must be a valid name
+/// of a sensor.
 ///
 /// # Errors
 ///
-/// [`Kind::Configuration`] with an example.
+/// Returns [`Kind::Configuration`] with an example if the name is not valid.
 pub fn check_followed(name: &str) -> Result<(), Failure> {
     match name.split_once('.') {
         Some((hub, sensor)) => check_sensor(hub).and_then(|()| check_sensor(sensor)),
@@ -156,13 +323,59 @@ pub fn check_followed(name: &str) -> Result<(), Failure> {
     }
 }
 
-/// Returns whether the sensor is another machine's; a listener brings its topics here.
+/// Returns whether this is the name of a remote sensor, whose topics a listener publishes here.
 pub fn is_remote(sensor: &str) -> bool {
     sensor.contains('.')
 }
 
 fn service(sensor: &str, topic: &str) -> String {
     format!("scanhub/v2/{sensor}/{topic}")
+}
+
+/// Kind of a publisher. All topics under one name have the same publisher.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Maker {
+    /// A hub, for a link; or a listener, for a link of another machine.
+    Link,
+    /// A program that tracks people.
+    Tracker,
+    /// A program that tilts a mount or measures its angle.
+    Mount,
+    /// A program that computes points in three dimensions from a scanner on a mount.
+    Tilted,
+}
+
+impl Maker {
+    /// All kinds.
+    pub const ALL: [Maker; 4] = [Maker::Link, Maker::Tracker, Maker::Mount, Maker::Tilted];
+
+    /// Returns its topics, in the order of [`Topic::ALL`].
+    pub const fn topics(self) -> &'static [Topic] {
+        match self {
+            Maker::Link => &Topic::OF_LINKS,
+            Maker::Tracker => &[Topic::Tracks, Topic::Events],
+            Maker::Mount => &[Topic::Tilt],
+            Maker::Tilted => &[Topic::Cloud, Topic::Obstacles],
+        }
+    }
+
+    /// Returns the description of a name that has these topics.
+    pub const fn name(self) -> &'static str {
+        match self {
+            Maker::Link => "a sensor",
+            Maker::Tracker => "a tracker",
+            Maker::Mount => "a mount",
+            Maker::Tilted => "a cloud",
+        }
+    }
+}
+
+impl Topic {
+    /// Returns the kind of its publisher.
+    pub fn maker(self) -> Maker {
+        let has = |maker: &Maker| maker.topics().contains(&self);
+        Maker::ALL.into_iter().find(has).unwrap_or(Maker::Link)
+    }
 }
 
 #[cfg(test)]
@@ -194,5 +407,45 @@ mod tests {
         assert!(check_sensor("hub.front").is_err() && check_followed("00ab.front").is_ok());
         assert!(check_followed("front").is_ok() && check_followed("a.b.c").is_err());
         assert!(is_remote("hub.front") && !is_remote("front"));
+    }
+
+    #[allow(unreachable_pub)]
+    mod with_one_more {
+        use super::super::{Pace, Ring, Row};
+
+        rows! {
+            Telegram [u8], "telegram", "u8[]", 83, Scan, First, 16, 0: "Bytes.";
+            Beat Marks, "beat", "scanhub.Beat.v1", 82, Change, Last, 2, 1: "A throw-away topic.";
+        }
+    }
+
+    #[test]
+    fn a_row_is_all_that_a_topic_needs_here() {
+        use with_one_more::{ROWS, Topic};
+        assert_eq!(Topic::ALL, [Topic::Telegram, Topic::Beat]);
+        let row = &ROWS[Topic::Beat as usize];
+        assert_eq!((row.name, row.pace, row.ring), ("beat", super::Pace::Change, super::Ring::Last));
+        assert_eq!((row.waiting, row.kept), (2, 1));
+        let limits = crate::limits::TopicLimits::default();
+        assert_eq!((row.longest)(&limits), size_of::<crate::Marks>());
+        assert_eq!((ROWS[0].longest)(&limits), crate::Telegram::MAX);
+    }
+
+    #[test]
+    fn names_and_types_are_unique_and_a_status_goes_where_announcements_go() {
+        let rows = super::Topic::ALL.map(super::Topic::row);
+        for (number, row) in rows.iter().enumerate() {
+            let others = &rows[..number];
+            assert!(others.iter().all(|other| other.name != row.name && other.payload != row.payload));
+        }
+        assert_eq!(super::Topic::Status.row().group, crate::datagram::Announce::GROUP);
+    }
+
+    #[test]
+    fn every_topic_has_one_maker() {
+        let topics: Vec<Topic> = Maker::ALL.into_iter().flat_map(|maker| maker.topics()).copied().collect();
+        assert_eq!(topics, Topic::ALL);
+        assert_eq!((Topic::Early.maker(), Topic::Events.maker()), (Maker::Link, Maker::Tracker));
+        assert_eq!((Topic::Tilt.maker(), Topic::Obstacles.maker()), (Maker::Mount, Maker::Tilted));
     }
 }

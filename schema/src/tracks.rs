@@ -1,4 +1,4 @@
-//! Where people are at an instant, across the sensors of a site. Refuses to know how they are found.
+//! People across the sensors of a site: their positions at an instant, and events such as a person passing a door.
 
 use bytemuck::{Pod, Zeroable};
 #[cfg(feature = "ipc")]
@@ -6,24 +6,24 @@ use iceoryx2::prelude::ZeroCopySend;
 
 use crate::{Pose, text};
 
-/// The most persons in a sample.
+/// Maximum number of people in a sample.
 pub const TRACKS: usize = 64;
-/// The most sensors that a sample names.
+/// Maximum number of sensors that a sample names.
 pub const TRACK_SENSORS: usize = 32;
 
-/// The payload of topic `tracks`, 7432 bytes: all persons at one instant, in the map of the site. The instant is the sample's
-/// `wall_ns`.
+/// The payload of topic `tracks`, 7432 bytes: all people at one instant, on the map of the site. The instant is the
+/// sample's `wall_ns`.
 #[derive(Clone, Copy, Debug, PartialEq, Pod, Zeroable)]
 #[cfg_attr(feature = "ipc", derive(ZeroCopySend), type_name("scanhub.Tracks.v2"))]
 #[repr(C)]
 pub struct Tracks {
-    /// Persons, at most [`TRACKS`].
+    /// Number of people, at most [`TRACKS`].
     pub count: u8,
-    /// Sensors of the site, at most [`TRACK_SENSORS`].
+    /// Number of sensors of the site, at most [`TRACK_SENSORS`].
     pub sensors: u8,
     /// 0.
     pub reserved: [u8; 6],
-    /// The persons by their numbers; 0 beyond `count`.
+    /// The people by ID; 0 beyond `count`.
     pub track_array: [Track; TRACKS],
     /// The sensors in the order of the site; 0 beyond `sensors`.
     pub sensor_array: [TrackSensor; TRACK_SENSORS],
@@ -34,25 +34,25 @@ pub struct Tracks {
 #[cfg_attr(feature = "ipc", derive(ZeroCopySend), type_name("scanhub.Track.v2"))]
 #[repr(C)]
 pub struct Track {
-    /// His number, which nobody else ever gets while the tracker runs.
+    /// ID of the person, which no one else gets while the tracker runs.
     pub id: u64,
-    /// The middle between his legs: metres in the map.
+    /// Midpoint between the legs, along x, in meters on the map.
     pub x_m: f32,
-    /// The same, along y.
+    /// Midpoint between the legs, along y, in meters on the map.
     pub y_m: f32,
-    /// Metres per second along x.
+    /// Velocity along x, in meters per second.
     pub vx_m_s: f32,
-    /// Metres per second along y.
+    /// Velocity along y, in meters per second.
     pub vy_m_s: f32,
-    /// Covariance of the place, m2: xx, xy, yy.
+    /// Covariance of the position, in m2: xx, xy, yy.
     pub covariance: [f32; 3],
-    /// How sure it is that this is a person, 0 to 1.
+    /// Probability that this is a person, 0 to 1.
     pub score: f32,
-    /// Milliseconds since he was first seen.
+    /// Time since the person was first seen, in milliseconds.
     pub age_ms: u32,
-    /// Bit i: sensor i of the sample sees him.
+    /// Bit i is set if sensor i of the sample sees the person.
     pub sensors: u32,
-    /// Name of the room, UTF-8 and 0 behind it; see [`room_name`](Track::room_name).
+    /// Name of the room in UTF-8, padded with 0; see [`room_name`](Track::room_name).
     pub room_text: [u8; 24],
     /// See [`TrackState`].
     pub state: u8,
@@ -60,45 +60,45 @@ pub struct Track {
     pub reserved: [u8; 7],
 }
 
-/// One sensor of the site, and where it is in the map.
+/// One sensor of the site, with its pose on the map.
 #[derive(Clone, Copy, Debug, PartialEq, Pod, Zeroable)]
 #[cfg_attr(feature = "ipc", derive(ZeroCopySend), type_name("scanhub.TrackSensor.v2"))]
 #[repr(C)]
 pub struct TrackSensor {
-    /// Metres in the map.
+    /// Position along x, in meters on the map.
     pub x_m: f32,
-    /// The same, along y.
+    /// Position along y, in meters on the map.
     pub y_m: f32,
-    /// Where it looks, in radians counter-clockwise from x.
+    /// Direction ahead of the sensor, in radians counterclockwise from x.
     pub yaw_rad: f32,
-    /// 1: it hangs upside down.
+    /// 1 if it is mounted upside down.
     pub upside_down: u8,
     /// 0.
     pub reserved: [u8; 3],
-    /// As consumers know it, 0 behind it; see [`name`](TrackSensor::name).
+    /// Name as clients use it, padded with 0; see [`name`](TrackSensor::name).
     pub name_text: [u8; 56],
 }
 
-/// How well a person is known.
+/// State of a track.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(u8)]
 pub enum TrackState {
-    /// Perhaps a person.
+    /// The track may not be a person.
     Tentative,
-    /// A person who is seen.
+    /// The person is seen.
     Confirmed,
-    /// A person who is not seen, where nobody could be seen either.
+    /// The person is not seen, and is where no sensor could see them.
     Hidden,
-    /// A person on a way that no sensor sees.
+    /// The person is on a path that no sensor covers.
     BetweenRooms,
 }
 
 impl TrackState {
-    /// All, in the order of their numbers.
+    /// All states, in the order of their numbers.
     pub const ALL: [TrackState; 4] =
         [TrackState::Tentative, TrackState::Confirmed, TrackState::Hidden, TrackState::BetweenRooms];
 
-    /// Returns the word for it in all output.
+    /// Returns the name in all output.
     pub const fn name(self) -> &'static str {
         match self {
             TrackState::Tentative => "tentative",
@@ -122,7 +122,7 @@ impl Default for TrackSensor {
 }
 
 impl Tracks {
-    /// Returns the persons.
+    /// Returns the people.
     pub fn tracks(&self) -> &[Track] {
         &self.track_array[..usize::from(self.count).min(TRACKS)]
     }
@@ -139,7 +139,7 @@ impl Tracks {
         sensors.filter(move |(i, _)| bits >> i & 1 == 1).map(|(_, sensor)| sensor.name())
     }
 
-    /// Adds a person; leaves him out if there are [`TRACKS`] already.
+    /// Adds a person, unless there are [`TRACKS`] already.
     pub fn push(&mut self, track: Track) {
         if let Some(place) = self.track_array.get_mut(usize::from(self.count)) {
             *place = track;
@@ -147,7 +147,7 @@ impl Tracks {
         }
     }
 
-    /// Adds a sensor of the site; leaves it out if there are [`TRACK_SENSORS`] already.
+    /// Adds a sensor of the site, unless there are [`TRACK_SENSORS`] already.
     pub fn push_sensor(&mut self, sensor: TrackSensor) {
         if let Some(place) = self.sensor_array.get_mut(usize::from(self.sensors)) {
             *place = sensor;
@@ -157,12 +157,12 @@ impl Tracks {
 }
 
 impl Track {
-    /// Returns how well he is known; a number that is not known says as little as can be.
+    /// Returns the state; [`TrackState::Tentative`] if this version does not know its number.
     pub fn state(&self) -> TrackState {
         TrackState::ALL.get(usize::from(self.state)).copied().unwrap_or(TrackState::Tentative)
     }
 
-    /// Returns the room that he is in; nothing if he is in none.
+    /// Returns the name of the person's room, or `None` outside of all rooms.
     pub fn room_name(&self) -> Option<&str> {
         Some(text::read(&self.room_text)).filter(|room| !room.is_empty())
     }
@@ -174,7 +174,7 @@ impl Track {
 }
 
 impl TrackSensor {
-    /// Makes the sensor called `name`, which sits at `pose` in the map.
+    /// Creates the sensor `name` at `pose` on the map.
     pub fn new(name: &str, pose: &Pose) -> TrackSensor {
         let Pose { x_m, y_m, yaw_rad, upside_down, .. } = *pose;
         let (x_m, y_m, yaw_rad) = (x_m as f32, y_m as f32, yaw_rad as f32);
@@ -183,7 +183,7 @@ impl TrackSensor {
         sensor
     }
 
-    /// Returns where it sits in the map.
+    /// Returns the pose on the map.
     pub fn pose(&self) -> Pose {
         let TrackSensor { x_m, y_m, yaw_rad, upside_down, .. } = *self;
         let (x_m, y_m, yaw_rad) = (x_m.into(), y_m.into(), yaw_rad.into());
@@ -193,6 +193,92 @@ impl TrackSensor {
     /// Returns the name.
     pub fn name(&self) -> &str {
         text::read(&self.name_text)
+    }
+}
+
+/// The payload of topic `events`, 112 bytes. The time of the event is the sample's `wall_ns`.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Pod, Zeroable)]
+#[cfg_attr(feature = "ipc", derive(ZeroCopySend), type_name("scanhub.Event.v2"))]
+#[repr(C)]
+pub struct Event {
+    /// ID of the person in topic `tracks`.
+    pub id: u64,
+    /// See [`EventKind`].
+    pub kind: u8,
+    /// 0.
+    pub reserved: [u8; 7],
+    /// Name of the room after the event; empty outside of all rooms. See [`room_name`](Event::room_name).
+    pub room_text: [u8; 24],
+    /// Name of the door; empty for other events.
+    pub door_text: [u8; 24],
+    /// Name of the room that the person came from, or `outside`; empty for other events.
+    pub from_text: [u8; 24],
+    /// Name of the room that the person went to, or `outside`; empty for other events.
+    pub to_text: [u8; 24],
+}
+
+/// Kind of an event.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[repr(u8)]
+pub enum EventKind {
+    /// A person was confirmed.
+    Appeared,
+    /// A person was removed.
+    Left,
+    /// A person went through a door.
+    Door,
+}
+
+impl EventKind {
+    /// All kinds, in the order of their numbers.
+    pub const ALL: [EventKind; 3] = [EventKind::Appeared, EventKind::Left, EventKind::Door];
+
+    /// Returns the name in all output.
+    pub const fn name(self) -> &'static str {
+        match self {
+            EventKind::Appeared => "appeared",
+            EventKind::Left => "left",
+            EventKind::Door => "door",
+        }
+    }
+
+    /// Returns the kind with this number, or `None` if this version does not know it.
+    pub fn of_number(number: u8) -> Option<EventKind> {
+        EventKind::ALL.get(usize::from(number)).copied()
+    }
+}
+
+impl Event {
+    /// Creates an event of person `id`, who is in `room` after it.
+    pub fn new(kind: EventKind, id: u64, room: Option<&str>) -> Event {
+        let mut event = Event { id, kind: kind as u8, ..Event::default() };
+        text::write(&mut event.room_text, room.unwrap_or_default());
+        event
+    }
+
+    /// Adds the door and the rooms on both sides of it.
+    pub fn through(mut self, door: &str, from: &str, to: &str) -> Event {
+        text::write(&mut self.door_text, door);
+        text::write(&mut self.from_text, from);
+        text::write(&mut self.to_text, to);
+        self
+    }
+
+    /// Returns the kind of the event, or `None` if this version does not know it.
+    pub fn kind(&self) -> Option<EventKind> {
+        EventKind::of_number(self.kind)
+    }
+
+    /// Returns the name of the room after the event.
+    pub fn room_name(&self) -> Option<&str> {
+        Some(text::read(&self.room_text)).filter(|room| !room.is_empty())
+    }
+
+    /// Returns the door, the room that the person came from, and the room that they went to. `None` for other events.
+    pub fn door(&self) -> Option<(&str, &str, &str)> {
+        let [door, from, to] =
+            [&self.door_text, &self.from_text, &self.to_text].map(|field| text::read(field));
+        (self.kind() == Some(EventKind::Door)).then_some((door, from, to))
     }
 }
 
@@ -229,5 +315,20 @@ mod tests {
         (0..=TRACK_SENSORS).for_each(|_| tracks.push_sensor(TrackSensor::default()));
         assert_eq!((tracks.tracks().len(), tracks.sensors().len()), (TRACKS, TRACK_SENSORS));
         assert_eq!(tracks.tracks()[TRACKS - 1].id, TRACKS as u64 - 1);
+    }
+
+    #[test]
+    fn an_event_says_what_it_was_made_of() {
+        let appeared = Event::new(EventKind::Appeared, 3, None);
+        assert_eq!(
+            (appeared.kind(), appeared.room_name(), appeared.door()),
+            (Some(EventKind::Appeared), None, None)
+        );
+        let door = Event::new(EventKind::Door, 3, Some("kitchen")).through("left", "hall", "kitchen");
+        assert_eq!((door.room_name(), door.door()), (Some("kitchen"), Some(("left", "hall", "kitchen"))));
+        for (number, kind) in EventKind::ALL.into_iter().enumerate() {
+            assert_eq!((kind as usize, EventKind::of_number(number as u8)), (number, Some(kind)));
+        }
+        assert_eq!(EventKind::of_number(3), None);
     }
 }

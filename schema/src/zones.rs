@@ -1,45 +1,45 @@
-//! What is near the robot: circles around its centre, and the verdict. Refuses to know how beams and circles intersect.
+//! Zones around the robot's center with their verdict, and early warnings, which are verdicts from a partial scan.
 
 use bytemuck::{Pod, Zeroable};
 #[cfg(feature = "ipc")]
 use iceoryx2::prelude::ZeroCopySend;
 
-/// The most circles of a sensor.
+/// Maximum number of zones of a sensor.
 pub const ZONES: usize = 8;
 
-/// The payload of topic `zones`, 76 bytes: one sample per scan, and one with verdict unknown when scans stop.
+/// The payload of topic `zones`, 76 bytes. There is one sample per scan, and one with verdict unknown when scans stop.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Pod, Zeroable)]
 #[cfg_attr(feature = "ipc", derive(ZeroCopySend), type_name("scanhub.Zones.v2"))]
 #[repr(C)]
 pub struct Zones {
     /// See [`Zones::verdict`].
     pub verdict: u8,
-    /// Circles used, at most [`ZONES`].
+    /// Number of zones, at most [`ZONES`].
     pub count: u8,
-    /// The beam whose point is nearest to the robot's centre; [`Zones::NO_BEAM`] if no beam has a valid reading.
+    /// Beam of the point nearest to the robot's center; [`Zones::NO_BEAM`] if no beam has a valid reading.
     pub nearest_beam: u16,
-    /// That point's distance from the centre in mm, rounded down; [`Zones::NO_DISTANCE`] if there is none.
+    /// Distance of that point from the center in mm, rounded down; [`Zones::NO_DISTANCE`] if there is none.
     pub nearest_mm: u32,
-    /// Beams that see into the largest circle, without a valid reading.
+    /// Number of beams without a valid reading among those that cross the largest zone.
     pub invalid_beams: u16,
     /// [`Zones::PROVISIONAL`] or 0.
     pub flags: u8,
     /// 0.
     pub reserved: u8,
-    /// The circles, the largest first; 0 beyond `count`.
+    /// The zones, the largest first; 0 beyond `count`.
     pub zone_array: [Zone; ZONES],
 }
 
-/// One circle.
+/// One zone: a circle around the robot's center.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Pod, Zeroable)]
 #[cfg_attr(feature = "ipc", derive(ZeroCopySend), type_name("scanhub.Zone.v2"))]
 #[repr(C)]
 pub struct Zone {
-    /// Radius around the robot's centre in mm.
+    /// Radius in mm.
     pub radius_mm: u16,
-    /// Beams that hit something inside, in this scan.
+    /// Number of beams of this scan that end inside.
     pub beams: u16,
-    /// 1: there were enough of them in enough scans.
+    /// 1 if enough beams ended inside in enough scans.
     pub violated: u8,
     /// 0.
     pub reserved: [u8; 3],
@@ -52,14 +52,14 @@ impl Default for Zones {
 }
 
 impl Zones {
-    /// [`Zones::nearest_beam`] if there is none.
+    /// Value of [`Zones::nearest_beam`] if there is none.
     pub const NO_BEAM: u16 = u16::MAX;
-    /// [`Zones::nearest_mm`] if there is none.
+    /// Value of [`Zones::nearest_mm`] if there is none.
     pub const NO_DISTANCE: u32 = u32::MAX;
-    /// Flag: fewer scans were seen than a violation takes, so that nothing can be violated yet.
+    /// Flag: there were fewer scans than a violation requires, so no zone can be violated yet.
     pub const PROVISIONAL: u8 = 1;
 
-    /// Returns zones of which nothing is known: no circles, verdict unknown.
+    /// Returns a payload without zones, with verdict unknown.
     ///
     /// # Examples
     ///
@@ -67,7 +67,7 @@ impl Zones {
     /// use schema::{Verdict, Zones};
     ///
     /// assert_eq!(Zones::unknown().verdict(), Verdict::Unknown);
-    /// // What is seen inside outweighs what is not known.
+    /// // An object inside outweighs missing data.
     /// assert_eq!(Verdict::Unknown.worse(Verdict::Stop), Verdict::Stop);
     /// ```
     pub fn unknown() -> Zones {
@@ -79,41 +79,41 @@ impl Zones {
         }
     }
 
-    /// Returns the circles that are used, the largest first.
+    /// Returns the used zones, the largest first.
     pub fn zones(&self) -> &[Zone] {
         &self.zone_array[..usize::from(self.count).min(ZONES)]
     }
 
-    /// Returns the verdict; what this program does not know is unknown.
+    /// Returns the verdict; unknown if this version does not know its number.
     pub fn verdict(&self) -> Verdict {
         Verdict::of(self.verdict)
     }
 
-    /// Returns beam and distance from the robot's centre, in mm, of what is nearest to it.
+    /// Returns the beam of the nearest point, and its distance from the robot's center in mm.
     pub fn nearest(&self) -> Option<(u16, u32)> {
         (self.nearest_beam != Zones::NO_BEAM).then_some((self.nearest_beam, self.nearest_mm))
     }
 }
 
-/// The result for all circles.
+/// Result of all zones.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(u8)]
 pub enum Verdict {
-    /// Nothing is inside.
+    /// Nothing is inside any zone.
     Clear = 0,
-    /// Something is inside, but not inside the smallest circle.
+    /// Something is inside a zone, but not inside the smallest one.
     Slow = 1,
-    /// Something is inside the smallest circle.
+    /// Something is inside the smallest zone.
     Stop = 2,
-    /// Not known: too many beams without a reading, or no scans. Treat it as stop.
+    /// Unknown: too many beams have no reading, or there are no scans. Treat it as stop.
     Unknown = 3,
 }
 
 impl Verdict {
-    /// All verdicts, by their number.
+    /// All verdicts, in the order of their numbers.
     pub const ALL: [Verdict; 4] = [Verdict::Clear, Verdict::Slow, Verdict::Stop, Verdict::Unknown];
 
-    /// Returns the verdict of `number`; what this program does not know is unknown.
+    /// Returns the verdict with this number; unknown if this version does not know it.
     pub(crate) fn of(number: u8) -> Verdict {
         Verdict::ALL.into_iter().find(|verdict| *verdict as u8 == number).unwrap_or(Verdict::Unknown)
     }
@@ -128,7 +128,8 @@ impl Verdict {
         }
     }
 
-    /// Returns the worse of two: stop, then unknown, then slow, then clear. What is seen inside outweighs what is not known.
+    /// Returns the worse of two verdicts: stop, then unknown, then slow, then clear. An object inside outweighs missing
+    /// data.
     pub fn worse(self, other: Verdict) -> Verdict {
         let rank = |verdict| match verdict {
             Verdict::Clear => 0,
@@ -137,6 +138,41 @@ impl Verdict {
             Verdict::Stop => 3,
         };
         if rank(other) > rank(self) { other } else { self }
+    }
+}
+
+/// The payload of topic `early`, 12 bytes: an early warning from a partial telegram or revolution. The first zones with
+/// the same or a higher number belong to its scan and confirm it. A sample with [`Early::WITHDRAWN`] withdraws it.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Pod, Zeroable)]
+#[cfg_attr(feature = "ipc", derive(ZeroCopySend), type_name("scanhub.Early.v2"))]
+#[repr(C)]
+pub struct Early {
+    /// See [`Verdict`]: slow or stop, never clear or unknown.
+    pub verdict: u8,
+    /// [`Early::WITHDRAWN`] or 0.
+    pub flags: u8,
+    /// Beam of the nearest point so far.
+    pub beam: u16,
+    /// Distance of that point from the robot's center, in mm.
+    pub distance_mm: u32,
+    /// Bytes of the telegram that had arrived; 0 for a revolution.
+    pub bytes_seen: u16,
+    /// Beams of the scan that had arrived.
+    pub beams_seen: u16,
+}
+
+impl Early {
+    /// Flag: the warning with this number is withdrawn.
+    pub const WITHDRAWN: u8 = 1;
+
+    /// Returns the verdict; unknown if this version does not know its number.
+    pub fn verdict(&self) -> Verdict {
+        Verdict::of(self.verdict)
+    }
+
+    /// Returns whether the warning is withdrawn.
+    pub fn is_withdrawn(&self) -> bool {
+        self.flags & Early::WITHDRAWN != 0
     }
 }
 

@@ -1,50 +1,58 @@
-//! Removes what dead processes left in a domain, without a hub: their places in it, and the directory itself once nobody
-//! uses it. Files in shared memory that did not belong to a known dead process are not touched.
+//! Processes of a domain, and the removal of files that dead ones left. Files in shared memory that did not belong to a known
+//! dead process are not touched.
 
+use std::fs::OpenOptions;
+use std::os::fd::AsRawFd;
+use std::os::unix::fs::OpenOptionsExt;
 use std::path::Path;
 use std::time::Duration;
 
-use rustix::fs::FileType;
+use iceoryx2::node::NodeState;
+use iceoryx2::prelude::CallbackProgression;
+use nix::libc::{self, c_int};
+use rustix::fs::{FileType, OFlags};
 
-use super::{forget, hub_node, nodes};
+use super::isolation::access_failure;
+use super::{Node, config, forget, hub_node};
 use crate::{Directory, Domain, Failure, HubLock, ListenLock};
 
-/// What was removed.
+/// Result of a cleanup.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Cleaned {
-    /// Processes that had ended without leaving.
+    /// Processes that had ended without cleaning up.
     pub dead: usize,
-    /// Processes that still run; nothing of theirs was removed.
+    /// Processes that still run. Nothing that belongs to them was removed.
     pub alive: usize,
-    /// The domain's directory.
+    /// Whether the domain's directory was removed.
     pub root: bool,
 }
 
-/// Removes what dead processes left in `domain`. What running ones share with them stays, and so does the directory as
-/// long as one of them runs.
+/// Removes files that dead processes left in `domain`. Everything that a running process uses stays, and so does the
+/// directory while any process runs.
 ///
 /// # Errors
 ///
-/// [`Kind::DomainHeld`](crate::Kind) if a hub or a listener publishes there, which tidies up by itself;
-/// [`Kind::Failed`](crate::Kind) if the directory is another user's.
+/// Returns [`Kind::DomainHeld`](crate::Kind) if a hub or a listener publishes there, because it cleans up by itself.
+/// Returns [`Kind::Failed`](crate::Kind) if the directory belongs to another user.
 pub fn clean(domain: &Domain) -> Result<Cleaned, Failure> {
     let root = domain.root();
     let Some(directory) = Directory::open(root)? else { return Ok(Cleaned::default()) };
-    // Nobody begins to publish meanwhile.
+    // No process can start to publish while these locks are held.
     let _hub = HubLock::acquire(root)?;
     let _listener = ListenLock::acquire(root)?;
     let before = nodes(domain)?;
     let node = hub_node(domain)?;
-    node.blocking_cleanup_dead_nodes(PATIENCE);
+    node.blocking_cleanup_dead_nodes(CLEANUP_TIMEOUT);
     drop(node);
     let after = nodes(domain)?;
-    let root = after.alive == 0 && after.dead == 0 && take_away(&directory, root);
+    let root = after.alive == 0 && after.dead == 0 && remove_domain(&directory, root);
     Ok(Cleaned { dead: before.dead.saturating_sub(after.dead), alive: after.alive, root })
 }
 
-/// Removes the domain's `directory` at `root` with what nobody needs who is not there: empty directories, locks, names, and
-/// what a hub noted of its sensors for the next one. Whether all of it is gone; anything else in it stays.
-fn take_away(directory: &Directory, root: &Path) -> bool {
+/// Removes the domain's `directory` at `root` with everything that only running processes need: empty directories,
+/// locks, names, and the saved state of sensors. Returns whether the directory was removed. It stays if it contains
+/// anything else.
+fn remove_domain(directory: &Directory, root: &Path) -> bool {
     forget(directory, root);
     for (name, stat) in directory.entries() {
         let extension = Path::new(&name).extension();
@@ -59,13 +67,95 @@ fn take_away(directory: &Directory, root: &Path) -> bool {
     directory.remove_itself()
 }
 
-/// Of a dead process whose remains another one is just taking away.
-const PATIENCE: Duration = Duration::from_secs(1);
+/// Maximum wait for another process that is cleaning up after the same dead process.
+const CLEANUP_TIMEOUT: Duration = Duration::from_secs(1);
+
+/// Processes that have joined a domain.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Nodes {
+    /// Running processes.
+    pub alive: usize,
+    /// Processes that ended without cleaning up. Their files still exist.
+    pub dead: usize,
+}
+
+/// Returns the number of processes in `domain`; 0 if the domain does not exist.
+///
+/// # Errors
+///
+/// Returns [`Kind::Failed`](crate::Kind) with owner, mode and remedy if the directory belongs to another user.
+pub fn nodes(domain: &Domain) -> Result<Nodes, Failure> {
+    nodes_at(domain.root())
+}
+
+/// Returns the number of processes in the domain in `root`.
+pub(super) fn nodes_at(root: &Path) -> Result<Nodes, Failure> {
+    let mut nodes = Nodes::default();
+    let Some(config) = config(root)? else { return Ok(nodes) };
+    let listed = Node::list(&config, |state| {
+        match state {
+            NodeState::Alive(_) => nodes.alive += 1,
+            NodeState::Dead(_) => nodes.dead += 1,
+            NodeState::Inaccessible(_) | NodeState::Undefined(_) => {}
+        }
+        CallbackProgression::Continue
+    });
+    listed.map_err(|error| access_failure(root, format!("cannot list processes: {error:?}")))?;
+    Ok(nodes)
+}
+
+/// Removes unfinished service descriptions of the domain in `root`, which a hub leaves if it is killed while it creates
+/// a service. The library waits for them forever and cleans up only finished ones, so no later hub could create that
+/// service again.
+///
+/// The caller must hold the [`MakingLock`](crate::lock::MakingLock). Then no process creates services, and no process
+/// has opened an unfinished one. Finished descriptions are read-only.
+pub(super) fn remove_unfinished_services(root: &Path) {
+    let Ok(Some(directory)) = Directory::open(root) else { return };
+    let Some(services) = directory.below(SERVICES) else { return };
+    for (name, stat) in services.entries() {
+        let finished = stat.st_mode & 0o200 == 0;
+        if !finished && name.to_string_lossy().ends_with(SUFFIX) {
+            services.remove(&name);
+        }
+    }
+}
+
+/// The library's directory of service descriptions, below the root.
+const SERVICES: &str = "services";
+
+const SUFFIX: &str = ".service";
+
+/// Returns whether no process has the file at `path` open or mapped. Only then does the kernel grant a lease for
+/// writing (fcntl(2)). Only the kernel knows this: processes that this one cannot see, or in a container that shares
+/// the memory, count too.
+///
+/// Returns false if the answer is unknown, for example for a file of another user. A process that opens the file during
+/// this call waits until the call returns.
+#[allow(unsafe_code)]
+pub fn is_unheld(path: &Path) -> bool {
+    let flags = OFlags::NOFOLLOW | OFlags::NONBLOCK;
+    let opened = OpenOptions::new().read(true).custom_flags(flags.bits() as i32).open(path);
+    let Ok(file) = opened else { return false };
+    let control = |command: c_int, argument: c_int| {
+        // SAFETY: these commands take a number and touch no memory of this process, and the descriptor is open.
+        unsafe { libc::fcntl(file.as_raw_fd(), command, argument) == 0 }
+    };
+    // The default signal to the holder of a lease that another process waits for would end this process.
+    control(F_SETSIG, libc::SIGURG)
+        && control(libc::F_SETLEASE, libc::F_WRLCK)
+        && control(libc::F_SETLEASE, libc::F_UNLCK)
+}
+
+/// asm-generic/fcntl.h.
+const F_SETSIG: c_int = 10;
 
 #[cfg(test)]
 mod tests {
-    use std::fs;
+    use std::fs::{self, File};
     use std::os::unix::fs::symlink;
+
+    use memmap2::MmapOptions;
 
     use super::*;
 
@@ -80,7 +170,7 @@ mod tests {
         for file in ["hub.lock", "front.sensor", "prefix", "full/something.lock", "letter"] {
             fs::write(root.join(file), "").unwrap();
         }
-        assert!(!take_away(&directory, &root));
+        assert!(!remove_domain(&directory, &root));
         let mut left: Vec<_> = fs::read_dir(&root).unwrap().map(|entry| entry.unwrap().file_name()).collect();
         left.sort();
         assert_eq!(left, ["full", "letter", "link.lock"]);
@@ -88,7 +178,31 @@ mod tests {
         for file in ["link.lock", "letter", "full/something.lock"] {
             fs::remove_file(root.join(file)).unwrap();
         }
-        assert!(take_away(&directory, &root) && !root.exists());
-        assert!(take_away(&directory, &root), "it is gone already");
+        assert!(remove_domain(&directory, &root) && !root.exists());
+        assert!(remove_domain(&directory, &root), "it is gone already");
+    }
+
+    #[test]
+    fn whoever_has_it_open_or_mapped_holds_it() {
+        let path = Path::new(crate::shortage::SHARED_MEMORY).join(format!("shu{}", std::process::id()));
+        assert!(!is_unheld(&path), "it is not there");
+        let made = File::create_new(&path).unwrap();
+        made.set_len(4096).unwrap();
+        let is_unheld = || is_unheld(&path);
+        let written = is_unheld();
+        drop(made);
+        let free = is_unheld();
+        let opened = File::open(&path).unwrap();
+        let read = is_unheld();
+        let mapped = MmapOptions::new().len(4096).map_raw_read_only(&opened).unwrap();
+        drop(opened);
+        let only_mapped = is_unheld();
+        drop(mapped);
+        let free_again = is_unheld();
+        fs::remove_file(&path).unwrap();
+        assert_eq!([written, read, only_mapped], [false; 3]);
+        // A system without leases does not know.
+        assert_eq!(free, free_again);
+        assert!(free || fs::read_to_string("/proc/sys/fs/leases-enable").is_ok_and(|it| it.trim() == "0"));
     }
 }

@@ -8,7 +8,7 @@ use iceoryx2::prelude::{AllocationStrategy, EventId, PortFactory as _};
 use iceoryx2::service::port_factory::client::ClientCreateError;
 use iceoryx2::service::port_factory::request_response;
 
-use super::trouble::{Trouble, create, full, no_port, open};
+use super::open_failure::{OpenFailure, create, full, no_port, open};
 use super::{Listener, Node, Notifier, Service, WakeService, listener, name, take_wakeups};
 use crate::shortage::{CONTROL_DESCRIPTORS, check_descriptors};
 use crate::{Failure, Kind, Request, Response, limits, topic};
@@ -58,7 +58,7 @@ impl ControlServer {
                 .max_response_buffer_size(1)
                 .max_borrowed_responses_per_pending_response(1)
                 .open_or_create()
-                .map_err(Trouble::from)
+                .map_err(OpenFailure::from)
         })?;
         let (asked, answered) = (bell(node, topic::CONTROL_REQUEST)?, bell(node, topic::CONTROL_RESPONSE)?);
         let server = control
@@ -203,7 +203,7 @@ fn bell(node: &Node, service: &str) -> Result<WakeService, Failure> {
             .max_nodes(limits::CONTROL_NODES)
             .event_id_max_value(EVENT)
             .open_or_create()
-            .map_err(Trouble::from)
+            .map_err(OpenFailure::from)
     })
 }
 

@@ -1,30 +1,41 @@
-//! What wakes the consumers of one sensor: a bell for those that share this code, an event for all other languages. Hides
-//! from the hub which of the two is listened to.
+//! Waking the subscribers of a sensor: a doorbell for programs that use this code, and an event service for all other
+//! languages. The hub rings and notifies without knowing which of the two has subscribers.
+//!
+//! A thread can sleep on the events of several sensors at once. Waking up and taking the wake-ups are two calls, so that samples
+//! can be received in between. A pending wake-up loses nothing, and taking it costs several system calls.
+#![allow(unsafe_code)]
 
-use iceoryx2::port::listener::ListenerCreateError;
-use iceoryx2::prelude::EventId;
+use std::os::fd::BorrowedFd;
+use std::time::Duration;
 
-use super::bell::Ringer;
-use super::trouble::{Trouble, create, full, no_port, open};
+use iceoryx2::port::listener::{ListenerCreateError, ListenerWaitError};
+use iceoryx2::prelude::{EventId, FileDescriptorBased};
+use rustix::event::{PollFd, PollFlags, Timespec, poll};
+use rustix::io::Errno;
+
+use super::doorbell::DoorbellRinger;
+use super::open_failure::{OpenFailure, create, full, no_port, open};
 use super::{Listener, Node, Notifier, PortFactory, WakeService, name};
 use crate::shortage::check_client;
 use crate::{Failure, Kind, Ring, Topic, Wake, limits};
 
-/// The hub's end. When created, it wakes consumers with [`Wake::HubUp`]; when dropped, with [`Wake::HubDown`].
+/// The hub's end. It wakes subscribers with [`Wake::HubUp`] when it is created, and with [`Wake::HubDown`] when it is
+/// dropped.
 pub struct Waker {
-    ringer: Ringer,
+    ringer: DoorbellRinger,
     notifier: Notifier,
     service: WakeService,
 }
 
 impl Waker {
-    /// Makes that of `sensor`, to be made before its topics: who finds those sleeps at it.
+    /// Creates the waker of `sensor`. Create it before the sensor's topics, because a subscriber that finds a topic
+    /// sleeps at it.
     ///
     /// # Errors
     ///
-    /// [`Kind::Short`] if memory is, [`Kind::Failed`] if the service has another layout.
+    /// Returns [`Kind::Short`] if memory is short, and [`Kind::Failed`] if the service has another layout.
     pub fn new(node: &Node, sensor: &str) -> Result<Waker, Failure> {
-        let ringer = Ringer::hang(node, sensor)?;
+        let ringer = DoorbellRinger::hang(node, sensor)?;
         let service = create_service(node, sensor)?;
         let notifier = service
             .notifier_builder()
@@ -34,16 +45,16 @@ impl Waker {
         Ok(Waker { ringer, notifier, service })
     }
 
-    /// Wakes those who sleep at the bell for topics of `ring`, with one call.
+    /// Wakes all threads that sleep at the doorbell word `ring`, with one system call.
     pub fn ring(&self, ring: Ring) {
         self.ringer.ring(ring);
     }
 
-    /// Tells those who listen to the event `why`.
+    /// Sends the event `why` to its listeners.
     ///
     /// # Errors
     ///
-    /// [`Kind::Failed`] if some were not told.
+    /// Returns [`Kind::Failed`] if it could not be sent to some of them.
     pub fn tell(&self, why: Wake) -> Result<(), Failure> {
         if self.service.dynamic_config().number_of_listeners() == 0 {
             return Ok(());
@@ -53,11 +64,11 @@ impl Waker {
             .map_err(|error| Failure::new(Kind::Failed, format!("cannot wake consumers: {error:?}"), ""))
     }
 
-    /// Wakes all consumers for `why`, whatever they follow.
+    /// Wakes all subscribers for `why`, whatever topics they have.
     ///
     /// # Errors
     ///
-    /// As [`tell`](Waker::tell).
+    /// Returns the errors of [`tell`](Waker::tell).
     pub fn wake(&self, why: Wake) -> Result<(), Failure> {
         Ring::ALL.into_iter().for_each(|ring| self.ring(ring));
         self.tell(why)
@@ -69,17 +80,17 @@ impl Waker {
     }
 }
 
-/// The rings that are due: since they were last rung, somebody got a sample of which they tell.
+/// Doorbell words to ring: a subscriber has received a sample of one of their topics since they were last rung.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct DueRings([bool; Ring::ALL.len()]);
 
 impl DueRings {
-    /// Takes note that `reached` consumers got a sample of `topic`.
+    /// Records that `reached` subscribers received a sample of `topic`.
     pub fn note(&mut self, topic: Topic, reached: usize) {
         self.0[topic.row().ring as usize] |= reached > 0;
     }
 
-    /// Returns whether `ring` is due, and takes it as rung.
+    /// Returns whether `ring` must be rung, and records it as rung.
     pub fn take(&mut self, ring: Ring) -> bool {
         std::mem::take(&mut self.0[ring as usize])
     }
@@ -98,29 +109,75 @@ fn create_service(node: &Node, sensor: &str) -> Result<WakeService, Failure> {
             .notifier_dropped_event(EventId::new(Wake::HubDown as usize))
             .notifier_dead_event(EventId::new(Wake::HubDown as usize))
             .open_or_create()
-            .map_err(Trouble::from)
+            .map_err(OpenFailure::from)
     })
 }
 
-/// Returns the event service of `sensor`, or nothing as long as no hub has made it: for consumers.
+/// Returns the event service of `sensor`, for subscribers. `None` if no hub has created it yet.
 ///
 /// # Errors
 ///
-/// [`Kind::Short`] if memory or descriptors are short, [`Kind::Failed`] if the service is of another layout.
+/// Returns [`Kind::Short`] if memory or descriptors are short, and [`Kind::Failed`] if the service has another layout.
 pub fn open_wake(node: &Node, sensor: &str) -> Result<Option<WakeService>, Failure> {
     let service = name(&Wake::service(sensor))?;
     open(node, &service, node.service_builder(&service).event().open())
 }
 
-/// Returns a consumer's end of the event.
+/// Returns a listener of the event.
 ///
 /// # Errors
 ///
-/// [`Kind::Short`] if memory, descriptors or places for consumers are.
+/// Returns [`Kind::Short`] if memory, descriptors or places for subscribers are short.
 pub fn listener(wake: &WakeService) -> Result<Listener, Failure> {
     check_client()?;
     wake.listener_builder().create().map_err(|error| match error {
         ListenerCreateError::ExceedsMaxSupportedListeners => full(wake.name(), limits::LISTENERS),
         other => no_port(wake.name(), &other),
     })
+}
+
+/// Sleeps until one of `listeners` is woken, a signal arrives, or `timeout` elapses. Wake-ups stay pending. Take them
+/// with [`take_wakeups`], and then receive once more before the next sleep.
+///
+/// # Errors
+///
+/// Returns [`Kind::Short`] if the system cannot wait.
+pub fn sleep(listeners: &[&Listener], timeout: Duration) -> Result<(), Failure> {
+    let mut fds: Vec<PollFd<'_>> = listeners
+        .iter()
+        .map(|listener| PollFd::from_borrowed_fd(descriptor(listener), PollFlags::IN))
+        .collect();
+    let timeout = Timespec { tv_sec: timeout.as_secs() as i64, tv_nsec: i64::from(timeout.subsec_nanos()) };
+    match poll(&mut fds, Some(&timeout)) {
+        Ok(_) | Err(Errno::INTR) => Ok(()),
+        Err(error) => Err(broken(&error)),
+    }
+}
+
+/// Returns a descriptor that is readable while wake-ups of `listener` are pending, for programs that also wait for
+/// other things.
+pub fn descriptor(listener: &Listener) -> BorrowedFd<'_> {
+    // SAFETY: the descriptor is open while the listener lives, and the listener is borrowed as long as the result.
+    unsafe { BorrowedFd::borrow_raw(listener.file_descriptor().native_handle()) }
+}
+
+/// Takes all pending wake-ups of `listeners`, and returns whether there were any. To miss nothing, receive after this
+/// call.
+///
+/// # Errors
+///
+/// Returns [`Kind::Short`] if a listener does not work.
+pub fn take_wakeups(listeners: &[&Listener]) -> Result<bool, Failure> {
+    let mut any = false;
+    for listener in listeners {
+        match listener.try_wait(|_| any = true) {
+            Ok(_) | Err(ListenerWaitError::InterruptSignal) => {}
+            Err(error) => return Err(broken(&error)),
+        }
+    }
+    Ok(any)
+}
+
+fn broken(error: &dyn std::fmt::Debug) -> Failure {
+    Failure::new(Kind::Short, format!("cannot wait for the hub: {error:?}"), "`ulimit -n` may be too small")
 }

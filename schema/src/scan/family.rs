@@ -1,10 +1,11 @@
-//! The families of scanners, by number and name, and the scan of one whose head turns. Refuses to know what they speak.
+//! The families of scanners, by number and name, and what differs between their scans: the head of a scan, the codes of the
+//! SICK LMS 2xx, and the contents of packets.
 
 use std::f64::consts::TAU;
 
 use super::{Code, Contents, ScanHead};
 
-/// A family of scanners: what speaks one protocol.
+/// A family of scanners with one protocol.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(u8)]
 pub enum Family {
@@ -16,19 +17,19 @@ pub enum Family {
     Rplidar = 2,
 }
 
-/// What is said in a telegram of a family that sends packets.
+/// Contents of a telegram of a family that sends packets.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct PacketFacts {
     /// `data`, or `reply` to a request.
     pub kind: &'static str,
-    /// Whether a checksum was right; nothing where there is none.
+    /// Whether the checksums are correct; `None` if there are none.
     pub checked: Option<bool>,
     /// Number of packets.
     pub packets: usize,
 }
 
 impl Family {
-    /// All of them.
+    /// All families.
     pub const ALL: [Family; 3] = [Family::Lms, Family::Ld, Family::Rplidar];
 
     /// Returns the family's name in configurations and in all output.
@@ -45,17 +46,17 @@ impl Family {
         Family::ALL.into_iter().find(|family| family.name() == name)
     }
 
-    /// Returns whether its intensities are levels of reflectors, 0 where there is none: else they are counts of any surface,
-    /// and only the user knows from which on one is a reflector.
+    /// Returns whether the family's intensities are levels of reflectors, with 0 for any other surface. Otherwise they
+    /// are measured from every surface, and the user must configure the threshold for reflectors.
     pub fn has_reflector_levels(self) -> bool {
         self == Family::Lms
     }
 
-    /// Returns what is said in `bytes`, a telegram of the family; nothing if it sends no packets.
+    /// Returns the contents of `bytes`, a telegram of the family. `None` if the family does not send packets.
     pub fn packets(self, bytes: &[u8]) -> Option<PacketFacts> {
         match self {
             Family::Lms => None,
-            // It only speaks, and what is published had a checksum that was right.
+            // The scanner sends no replies, and every published packet had a correct checksum.
             Family::Ld => {
                 let packets = bytes.len() / LD_PACKET;
                 Some(PacketFacts { kind: "data", checked: Some(true), packets })
@@ -71,8 +72,9 @@ impl Family {
 }
 
 impl ScanHead {
-    /// Returns the head of a turn of a scanner of `family` that turns clockwise, put on a grid of `beams` equal bins of which
-    /// the first is ahead: ranges in millimetres, intensities of 8 bits, exact angles. Its times are to be set.
+    /// Returns the head of a revolution of a scanner of `family` that rotates clockwise. Its points are assigned to a
+    /// grid of `beams` equal bins, the first one ahead. Ranges are in millimeters, intensities have 8 bits, and angles
+    /// are exact. The caller sets the times.
     pub fn turning(family: Family, beams: usize) -> ScanHead {
         let step = -TAU / beams.max(1) as f64;
         ScanHead {
@@ -91,16 +93,16 @@ impl ScanHead {
     }
 }
 
-/// Bytes of a packet of an LDROBOT (manual of the LD19, "data packet format").
+/// Length of a packet of an LDROBOT (manual of the LD19, "data packet format").
 const LD_PACKET: usize = 47;
 
-/// What is said in packets or an answer of a scanner of Slamtec. Packets of one point have no checksum and nothing that says
-/// what they are; those with a head and a right checksum are no such ones (rplidar_sdk, `sl_lidar_cmd.h`).
+/// Returns the contents of an RPLIDAR's packets or response. Packets of one point have neither a checksum nor a
+/// type. Packets with a head and a correct checksum are of another type (rplidar_sdk, `sl_lidar_cmd.h`).
 fn slamtec_packets(bytes: &[u8]) -> PacketFacts {
     const CAPSULES: [usize; 3] = [84, 132, 170];
     const POINT: usize = 5;
     const HEAD: usize = 7;
-    // A packet may begin like an answer, whose head says how much follows: nothing, where a stream does.
+    // A packet may start like a response. The head of a response has its length, unless a stream follows.
     if let Some(&[0xA5, 0x5A, low, middle, high, ..]) = bytes.first_chunk::<HEAD>() {
         let len = u32::from_le_bytes([low, middle, high, 0]) as usize;
         if bytes.len() == HEAD || bytes.len() == HEAD + len {
@@ -120,8 +122,66 @@ fn slamtec_packets(bytes: &[u8]) -> PacketFacts {
     PacketFacts { kind: "data", checked: capsule.map(|_| true), packets }
 }
 
+impl ScanHead {
+    /// Returns the head of a scan of an LMS. Beam 0 is at `first_angle_mdeg`, and the next one `step_mdeg` further, in
+    /// 1/1000 degree. A step of 1000, 500 or 250 takes 1, 2 or 4 revolutions. Ranges have units of `unit_mm` and
+    /// `range_bits` bits, and their nine highest values are codes.
+    ///
+    /// The stamp is the time at which the LMS starts to send, after the last beam of the last revolution. The upper
+    /// bits are not intensities.
+    pub fn lms(
+        count: usize,
+        first_angle_mdeg: i32,
+        step_mdeg: u32,
+        unit_mm: u32,
+        range_bits: u8,
+    ) -> ScanHead {
+        let in_radians = |mdeg: f64| (mdeg / 1000.0).to_radians();
+        let step = in_radians(step_mdeg.into());
+        let greatest = ((1_u32 << range_bits.min(16)) - 1) as u16;
+        let turns = (1000 / step_mdeg.max(1)).max(1);
+        let beam_time_ns = step_mdeg * (TURN_NS / 360) / 1000;
+        let age_ns = (turns - 1) * TURN_NS + count.saturating_sub(1) as u32 * beam_time_ns;
+        ScanHead {
+            first_angle: in_radians(first_angle_mdeg.into()),
+            step,
+            spacing: step as f32,
+            beam_time_ns,
+            first_beam_ns: -(age_ns as i32),
+            unit_um: 1000 * unit_mm,
+            count: count as u16,
+            valid_to: greatest.saturating_sub(9),
+            no_return: greatest,
+            beyond: greatest.saturating_sub(8),
+            family: Family::Lms as u8,
+            contents: Contents::UPPER,
+            turns: turns as u8,
+            turn_ns: if turns > 1 { TURN_NS } else { 0 },
+            ..ScanHead::default()
+        }
+    }
+}
+
+/// Returns the code of `value`, which is not a range, in a scan with `head` (Telegram listing, B0h). Codes 3, 6 and 7
+/// are reserved.
+pub(super) fn lms_code(head: &ScanHead, value: u16) -> Code {
+    match head.no_return.checked_sub(value) {
+        Some(0) => Code::NoReturn,
+        Some(1) => Code::TooBright,
+        Some(4) => Code::Weak,
+        Some(5) => Code::Error,
+        Some(8) => Code::Beyond,
+        _ => Code::Overflow,
+    }
+}
+
+/// Time of one revolution of the mirror (75 Hz).
+const TURN_NS: u32 = 13_320_000;
+
 #[cfg(test)]
 mod tests {
+    use crate::Scan;
+
     use super::*;
 
     #[test]
@@ -133,11 +193,46 @@ mod tests {
         let info = [&[0xA5, 0x5A, 20, 0, 0, 0, 4][..], &[7; 20]].concat();
         assert_eq!(said(&info), ("reply", None, 1));
         assert_eq!(said(&[0xA5, 0x5A, 0x84, 0, 0, 0x40, 0x84]), ("reply", None, 1));
-        // The nibbles of the sum are A5h, and what follows gives it.
+        // The nibbles of the checksum are A5h, and so is the checksum of the rest.
         let mut capsule = [0; 132];
         (capsule[0], capsule[1], capsule[2]) = (0xA5, 0x5A, 0xA5);
         assert_eq!(said(&capsule), ("data", Some(true), 1));
         assert_eq!(said(&[capsule, capsule].concat()), ("data", Some(true), 2));
         assert_eq!(said(&[1; 15]), ("data", None, 3));
+    }
+
+    #[test]
+    fn the_nine_greatest_values_are_codes() {
+        for (bits, max) in [(13, 0x1FFF), (14, 0x3FFF), (15, 0x7FFF)] {
+            let scan = Scan::of(ScanHead::lms(4, 0, 500, 10, bits), &[max, max - 8, max - 9, 0]);
+            assert_eq!(scan.code(0), Some(Code::NoReturn));
+            assert_eq!(scan.code(1), Some(Code::Beyond));
+            assert_eq!((scan.code(2), scan.range(2)), (None, Some(max - 9)));
+            assert_eq!(scan.distance_mm(2), Some(u32::from(max - 9) * 10));
+            assert_eq!(scan.range(3), Some(0));
+            assert_eq!((scan.range(4), scan.code(4)), (None, None));
+        }
+    }
+
+    #[test]
+    fn half_degrees_are_measured_one_turn_later() {
+        let of = |count, step_mdeg| Scan::of(ScanHead::lms(count, 0, step_mdeg, 1, 13), &vec![0; count]);
+        let (turn_ns, half) = (i64::from(TURN_NS), of(361, 500));
+        assert_eq!(half.beam_ns(360), -turn_ns);
+        assert_eq!(half.beam_ns(359), -turn_ns * 500 / 360_000);
+        assert_eq!(half.beam_ns(0), -turn_ns - turn_ns / 2);
+        assert_eq!(of(181, 1000).beam_ns(180), 0);
+        assert_eq!(of(401, 250).beam_ns(398), -turn_ns - turn_ns * 500 / 360_000, "the third of four turns");
+    }
+
+    #[test]
+    fn intensities_only_where_the_mode_has_them() {
+        let mut scan = Scan::of(ScanHead::lms(2, 0, 500, 1, 13), &[1, 2]);
+        scan.arrays().upper[1] = 7;
+        assert_eq!((scan.upper(), scan.intensities().len()), (&[0, 7][..], 0));
+        scan.intensity_bits = 3;
+        assert!(scan.intensities().iter().eq([0, 7]));
+        scan.contents = 0;
+        assert!(scan.intensities().is_empty() && scan.upper().is_empty());
     }
 }

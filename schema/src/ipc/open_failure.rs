@@ -1,5 +1,4 @@
-//! What can fail when a service is created or opened, sorted by what to do: wait, try again later, or report it to the
-//! user. Refuses to know which service it is.
+//! Failures to create or open a service, classified by the remedy: wait, retry later, or report it to the user.
 
 use std::fmt::Debug;
 use std::path::Path;
@@ -16,93 +15,95 @@ use iceoryx2::service::builder::{ServiceCreateError, ServiceOpenError};
 use iceoryx2::service::service_name::ServiceName;
 
 use super::Node;
+use super::isolation::access_failure;
 use crate::limits::TopicLimits;
 use crate::lock::MakingLock;
-use crate::{Failure, Kind, access, is_remote, of_service, shortage};
+use crate::{Failure, Kind, is_remote, of_service, shortage};
 
-/// What there is to do about an error.
-pub(super) enum Trouble {
-    /// The service is not there, or is being made or taken away at this moment.
+/// Class of an error.
+pub(super) enum OpenFailure {
+    /// The service does not exist, or is being created or removed right now.
     Absent,
-    /// Everything is taken: too many processes.
+    /// There is no place for another process.
     Full,
-    /// Nothing helps.
+    /// A retry does not help.
     Broken(String),
 }
 
-impl From<ServiceOpenError> for Trouble {
-    fn from(error: ServiceOpenError) -> Trouble {
+impl From<ServiceOpenError> for OpenFailure {
+    fn from(error: ServiceOpenError) -> OpenFailure {
         use ServiceOpenError as E;
         match error {
             E::DoesNotExist | E::HangsInCreation | E::IsMarkedForDestruction | E::Interrupt => {
-                Trouble::Absent
+                OpenFailure::Absent
             }
-            // Seen while the hub makes it or cleans up after a dead one.
-            E::ServiceInCorruptedState => Trouble::Absent,
-            E::ExceedsMaxNumberOfNodes => Trouble::Full,
-            E::VersionMismatch => Trouble::Broken("the hub has another version of iceoryx2".into()),
+            // This happens while the hub creates the service or cleans up after a dead process.
+            E::ServiceInCorruptedState => OpenFailure::Absent,
+            E::ExceedsMaxNumberOfNodes => OpenFailure::Full,
+            E::VersionMismatch => OpenFailure::Broken("the hub has another version of iceoryx2".into()),
             E::IncompatiblePayload | E::IncompatibleMessagingPattern => {
-                Trouble::Broken("the hub uses another layout".into())
+                OpenFailure::Broken("the hub uses another layout".into())
             }
-            other => Trouble::Broken(format!("{other:?}")),
+            other => OpenFailure::Broken(format!("{other:?}")),
         }
     }
 }
 
-impl From<ServiceCreateError> for Trouble {
-    fn from(error: ServiceCreateError) -> Trouble {
+impl From<ServiceCreateError> for OpenFailure {
+    fn from(error: ServiceCreateError) -> OpenFailure {
         use ServiceCreateError as E;
         match error {
             E::AlreadyExists
             | E::IsBeingCreatedByAnotherInstance
             | E::ServiceInCorruptedState
-            | E::Interrupt => Trouble::Absent,
-            other => Trouble::Broken(format!("{other:?}")),
+            | E::Interrupt => OpenFailure::Absent,
+            other => OpenFailure::Broken(format!("{other:?}")),
         }
     }
 }
 
-impl From<TopicError> for Trouble {
-    fn from(error: TopicError) -> Trouble {
+impl From<TopicError> for OpenFailure {
+    fn from(error: TopicError) -> OpenFailure {
         match error {
             TopicError::PublishSubscribeOpenError(error) => error.into(),
             TopicError::PublishSubscribeCreateError(error) => ServiceCreateError::from(error).into(),
-            TopicError::SystemInFlux => Trouble::Absent,
+            TopicError::SystemInFlux => OpenFailure::Absent,
         }
     }
 }
 
-impl From<PublishSubscribeOpenError> for Trouble {
-    fn from(error: PublishSubscribeOpenError) -> Trouble {
+impl From<PublishSubscribeOpenError> for OpenFailure {
+    fn from(error: PublishSubscribeOpenError) -> OpenFailure {
         ServiceOpenError::from(error).into()
     }
 }
 
-impl From<EventError> for Trouble {
-    fn from(error: EventError) -> Trouble {
+impl From<EventError> for OpenFailure {
+    fn from(error: EventError) -> OpenFailure {
         match error {
             EventError::EventOpenError(error) => ServiceOpenError::from(error).into(),
             EventError::EventCreateError(error) => ServiceCreateError::from(error).into(),
-            EventError::SystemInFlux => Trouble::Absent,
+            EventError::SystemInFlux => OpenFailure::Absent,
         }
     }
 }
 
-impl From<ControlError> for Trouble {
-    fn from(error: ControlError) -> Trouble {
+impl From<ControlError> for OpenFailure {
+    fn from(error: ControlError) -> OpenFailure {
         match error {
             ControlError::RequestResponseOpenError(error) => ServiceOpenError::from(error).into(),
             ControlError::RequestResponseCreateError(error) => ServiceCreateError::from(error).into(),
-            ControlError::SystemInFlux => Trouble::Absent,
+            ControlError::SystemInFlux => OpenFailure::Absent,
         }
     }
 }
 
-/// Calls `make` until the service is there, two seconds at most: one that its last user is leaving comes back soon.
+/// Calls `make` until the service exists, for at most two seconds. A service that its last user is leaving can be
+/// created again soon.
 pub(super) fn create<T>(
     node: &Node,
     service: &ServiceName,
-    make: impl Fn() -> Result<T, Trouble>,
+    make: impl Fn() -> Result<T, OpenFailure>,
 ) -> Result<T, Failure> {
     let give_up_at = Instant::now() + Duration::from_secs(2);
     let root = node.config().global.root_path().to_string();
@@ -112,13 +113,13 @@ pub(super) fn create<T>(
         drop(making);
         match made {
             Ok(made) => return Ok(made),
-            Err(Trouble::Absent) if Instant::now() < give_up_at => sleep(Duration::from_millis(10)),
-            Err(trouble) => return Err(failure(node, service, trouble)),
+            Err(OpenFailure::Absent) if Instant::now() < give_up_at => sleep(Duration::from_millis(10)),
+            Err(failed) => return Err(failure(node, service, failed)),
         }
     }
 }
 
-/// A service that is not there is nothing, anything else that is wrong a failure.
+/// Returns `None` if the service does not exist, and a failure for any other error.
 pub(super) fn open<T, E>(
     node: &Node,
     service: &ServiceName,
@@ -127,14 +128,14 @@ pub(super) fn open<T, E>(
 where
     ServiceOpenError: From<E>,
 {
-    match opened.map_err(|error| Trouble::from(ServiceOpenError::from(error))) {
+    match opened.map_err(|error| OpenFailure::from(ServiceOpenError::from(error))) {
         Ok(opened) => Ok(Some(opened)),
-        Err(Trouble::Absent) => Ok(None),
-        Err(trouble) => Err(failure(node, service, trouble)),
+        Err(OpenFailure::Absent) => Ok(None),
+        Err(failed) => Err(failure(node, service, failed)),
     }
 }
 
-/// Why there is no publisher.
+/// Returns the failure for a publisher that cannot be created.
 pub(super) fn no_publisher(service: &ServiceName, error: PublisherCreateError) -> Failure {
     match error {
         PublisherCreateError::ExceedsMaxSupportedPublishers => Failure::new(
@@ -151,7 +152,7 @@ pub(super) fn no_publisher(service: &ServiceName, error: PublisherCreateError) -
     }
 }
 
-/// Why there is no place for one more consumer of the topic `service`, which was made for `limit` of them.
+/// Returns the failure if all `limit` places for subscribers of the topic `service` are taken.
 pub(super) fn no_place(service: &ServiceName, limit: usize) -> Failure {
     let (start, key) = match of_service(service.as_str()) {
         Some((sensor, _)) if is_remote(sensor) => ("start what publishes it", "--consumers"),
@@ -165,7 +166,7 @@ pub(super) fn no_place(service: &ServiceName, limit: usize) -> Failure {
     Failure { hint, ..full(service, limit) }
 }
 
-/// Why there is no place for one more consumer or client at `service`, of which there can be `limit`.
+/// Returns the failure if all `limit` places for subscribers or clients of `service` are taken.
 pub(super) fn full(service: &ServiceName, limit: usize) -> Failure {
     Failure::new(
         Kind::Short,
@@ -174,7 +175,7 @@ pub(super) fn full(service: &ServiceName, limit: usize) -> Failure {
     )
 }
 
-/// Why there is no other port: as a rule descriptors or places are short.
+/// Returns the failure for any other port that cannot be created. As a rule, descriptors or places are short.
 pub(super) fn no_port(service: &ServiceName, error: &dyn Debug) -> Failure {
     shortage::found(Path::new(shortage::SHARED_MEMORY)).unwrap_or_else(|| {
         let hint = "too many consumers, or `ulimit -n` is too small: about 4 descriptors for each";
@@ -182,19 +183,19 @@ pub(super) fn no_port(service: &ServiceName, error: &dyn Debug) -> Failure {
     })
 }
 
-fn failure(node: &Node, service: &ServiceName, trouble: Trouble) -> Failure {
-    match trouble {
-        Trouble::Full => Failure::new(
+fn failure(node: &Node, service: &ServiceName, failed: OpenFailure) -> Failure {
+    match failed {
+        OpenFailure::Full => Failure::new(
             Kind::Short,
             format!("{service} has no place for another process"),
             "stop some consumers",
         ),
-        Trouble::Absent => {
+        OpenFailure::Absent => {
             Failure::new(Kind::Failed, format!("{service} cannot be created"), "remove what is left of it")
         }
-        Trouble::Broken(what) => {
+        OpenFailure::Broken(what) => {
             let root = node.config().global.root_path().to_string();
-            access::failure(Path::new(&root), format!("{service}: {what}"))
+            access_failure(Path::new(&root), format!("{service}: {what}"))
         }
     }
 }

@@ -36,7 +36,7 @@ impl ModelWord {
     }
 }
 
-impl Word for ModelWord {
+impl FutexWord for ModelWord {
     fn fetch_add(&self, summand: u32, order: Ordering) -> u32 {
         self.value.fetch_add(summand, order)
     }

@@ -1,19 +1,19 @@
-//! Three words in shared memory on which all consumers of a sensor sleep, one for each ring: one call of the hub wakes all that
-//! sleep at a word, however many they are; an event needs one message for each. Refuses to know what was sent, and who
-//! sleeps.
+//! The doorbell of a sensor: three futex words in shared memory, one for each [`Ring`], at which subscribers sleep. One system
+//! call of the hub wakes all threads that sleep at a word; an event needs one message for each subscriber.
 //!
-//! The page is in /dev/shm under the domain's prefix. Consumers map it read-only. A killed hub leaves it, and the next hub
-//! continues with it, so that consumers that sleep meanwhile are woken; a hub that ends normally closes it.
+//! The page is in /dev/shm under the domain's prefix. Subscribers map it read-only. A killed hub leaves the page, and the
+//! next hub continues with it, so that subscribers that sleep meanwhile are woken. A hub that ends normally closes it.
+//!
+//! The operations on words, and their memory orders, must be right in all interleavings of hub and subscribers. The tests
+//! run all of them.
 #![allow(unsafe_code)]
-
-mod words;
 
 use std::fs::{File, OpenOptions};
 use std::io;
 use std::num::NonZeroU32;
 use std::os::unix::fs::OpenOptionsExt;
 use std::path::{Path, PathBuf};
-use std::sync::atomic::{AtomicU32, Ordering};
+use std::sync::atomic::{AtomicU32, Ordering, fence};
 
 use memmap2::{MmapOptions, MmapRaw};
 use rustix::fs::{FallocateFlags, OFlags, fallocate};
@@ -22,25 +22,26 @@ use rustix::thread::futex::{self, WaitFlags, WaitPtr, WaitvFlags};
 use rustix::time::{ClockId, Timespec};
 
 use super::Node;
-use super::strangers::{Segment, in_the_way};
+use super::isolation::{Segment, in_the_way};
 use crate::shortage::{SHARED_MEMORY, memory};
 use crate::{Failure, Kind, Ring};
 
-/// The hub's end; dropped it closes the bell and wakes all once more.
+/// The hub's end of a doorbell. Dropping it closes the doorbell and wakes all subscribers once more.
 #[derive(Debug)]
-pub(super) struct Ringer {
+pub(super) struct DoorbellRinger {
     page: Page,
     path: PathBuf,
 }
 
-impl Ringer {
-    /// The bell of `sensor`: that of a killed hub, which its consumers still have, else a new one.
+impl DoorbellRinger {
+    /// Opens the doorbell of `sensor` that a killed hub has left, which subscribers still have mapped, or creates a new
+    /// one.
     ///
-    /// [`Kind::Short`] if there is no memory for it, [`Kind::Failed`] if the place is taken by another user.
-    pub(super) fn hang(node: &Node, sensor: &str) -> Result<Ringer, Failure> {
+    /// Returns [`Kind::Short`] if there is no memory for it, and [`Kind::Failed`] if another user's file has its name.
+    pub(super) fn hang(node: &Node, sensor: &str) -> Result<DoorbellRinger, Failure> {
         let path = path(node, sensor);
-        match Ringer::open(&path) {
-            Ok(page) => Ok(Ringer { page, path }),
+        match DoorbellRinger::open(&path) {
+            Ok(page) => Ok(DoorbellRinger { page, path }),
             Err(Refused::Foreign(segment)) => Err(in_the_way(&segment)),
             Err(Refused::System(error)) if Errno::from_io_error(&error) == Some(Errno::NOSPC) => {
                 Err(memory(&format!("no room for {}: {} kB", path.display(), PAGE / 1024)))
@@ -52,9 +53,9 @@ impl Ringer {
         }
     }
 
-    /// Wakes all who sleep at the word of `ring`.
-    pub(super) fn ring(&self, ring: Ring) {
-        words::ring(self.page.words().of(ring));
+    /// Wakes all subscribers that sleep at `word`.
+    pub(super) fn ring(&self, word: Ring) {
+        ring(self.page.words().of(word));
     }
 
     fn open(path: &Path) -> Result<Page, Refused> {
@@ -66,33 +67,34 @@ impl Ringer {
             if page.words().closed.load(Ordering::Relaxed) == 0 {
                 return Ok(page);
             }
-            // Whose hub was killed while it ended: nobody may wait at it any more.
+            // Its hub was killed while it ended. No subscriber may sleep at this page any more.
             std::fs::remove_file(path)?;
         }
     }
 }
 
-impl Drop for Ringer {
+impl Drop for DoorbellRinger {
     fn drop(&mut self) {
-        // In this order: a hub that is killed in between leaves no page that looks alive and that nobody can find.
+        // A hub that is killed in between leaves no page that looks alive and has no name.
         let words = self.page.words();
-        words::close(&words.closed, words.of(Ring::First));
-        words::ring(words.of(Ring::Last));
-        words::ring(words.of(Ring::Early));
+        close(&words.closed, words.of(Ring::First));
+        ring(words.of(Ring::Last));
+        ring(words.of(Ring::Early));
         let _ = std::fs::remove_file(&self.path);
     }
 }
 
-/// A consumer's end, read-only.
+/// A subscriber's end of a doorbell, mapped read-only.
 #[derive(Debug)]
 pub struct Bell(Page);
 
 impl Bell {
-    /// Returns the bell of `sensor`, or nothing as long as no hub has hung it.
+    /// Returns the doorbell of `sensor`, or `None` if no hub has created it yet.
     ///
     /// # Errors
     ///
-    /// [`Kind::Short`] if memory or descriptors are, [`Kind::Failed`] if it is another user's.
+    /// Returns [`Kind::Short`] if memory or descriptors are short, and [`Kind::Failed`] if the file belongs to another
+    /// user.
     pub fn open(node: &Node, sensor: &str) -> Result<Option<Bell>, Failure> {
         let path = path(node, sensor);
         let mapped = own(OpenOptions::new().read(true), &path).and_then(|file| {
@@ -114,28 +116,28 @@ impl Bell {
         }
     }
 
-    /// Returns how often it was rung so, modulo 2^32. What was sent before that can be received after this.
+    /// Returns how often the hub has rung `ring`, modulo 2^32. A subscriber that receives after this call gets
+    /// everything that was sent before.
     pub fn rung(&self, ring: Ring) -> u32 {
-        words::rung(self.0.words().of(ring))
+        rung(self.0.words().of(ring))
     }
 
-    /// Returns whether its hub has ended: nobody rings it any more.
+    /// Returns whether its hub has ended and does not ring any more.
     pub fn is_closed(&self) -> bool {
         self.0.words().closed.load(Ordering::Relaxed) != 0
     }
 }
 
-/// Why there is no sleeping at bells: the system cannot wait for several words at once (Linux before 5.16, some
-/// containers).
+/// The system cannot wait for several words at once (Linux before 5.16, some containers).
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Unsupported;
 
-/// Sleeps until one of `bells` was rung, by the ring beside it, more often than the number there says, a signal comes, or
-/// CLOCK_MONOTONIC is at `until_ns`.
+/// Sleeps until one of `bells` has rung more often than its given count, a signal arrives, or CLOCK_MONOTONIC reaches
+/// `until_ns`.
 ///
 /// # Errors
 ///
-/// [`Unsupported`] if the system cannot wait for several words at once.
+/// Returns [`Unsupported`] if the system cannot wait for several words at once.
 pub fn sleep_at_bells(bells: &[(&Bell, Ring, u32)], until_ns: u64) -> Result<(), Unsupported> {
     let until =
         Timespec { tv_sec: (until_ns / 1_000_000_000) as i64, tv_nsec: (until_ns % 1_000_000_000) as i64 };
@@ -162,7 +164,7 @@ pub fn sleep_at_bells(bells: &[(&Bell, Ring, u32)], until_ns: u64) -> Result<(),
     }
 }
 
-/// What lies in the page, each on a cache line of its own.
+/// Words of the page, each on a separate cache line.
 #[repr(C)]
 struct Words {
     first: AtomicU32,
@@ -184,14 +186,14 @@ impl Words {
     }
 }
 
-/// The page, as long as it is mapped here.
+/// The page. It is mapped until this is dropped.
 #[derive(Debug)]
 struct Page(MmapRaw);
 
 impl Page {
     fn words(&self) -> &Words {
-        // SAFETY: the page is mapped as long as it is borrowed, starts at its own border, is longer than the words, and
-        // any bytes are words. Nobody shortens the file: it is this user's alone.
+        // SAFETY: the page is mapped while it is borrowed, starts at a page boundary, is longer than the words, and any
+        // bytes are valid words. The file belongs to this user alone, and no process truncates it.
         unsafe { &*self.0.as_ptr().cast() }
     }
 }
@@ -202,22 +204,22 @@ fn path(node: &Node, sensor: &str) -> PathBuf {
     Path::new(SHARED_MEMORY).join(format!("{}{sensor}.bell", node.config().global.prefix))
 }
 
-/// The file at `path`, if it is this user's alone: anybody may put a file there, or a pipe at which opening it waits. What
-/// another user has put there is a failure of another kind than those of the system.
+/// Opens the file at `path` if it belongs to this user alone. Any user can create a file there, or a pipe that would
+/// block.
 fn own(options: &mut OpenOptions, path: &Path) -> Result<File, Refused> {
     if let Some(segment) = Segment::at(path).filter(Segment::is_foreign) {
         return Err(Refused::Foreign(segment));
     }
     let flags = OFlags::NOFOLLOW | OFlags::NONBLOCK;
     let file = options.mode(0o600).custom_flags(flags.bits() as i32).open(path)?;
-    // It may have come in between.
+    // Another user may have created it after the first check.
     match Segment::of(path, &file.metadata()?) {
         segment if segment.is_foreign() => Err(Refused::Foreign(segment)),
         _ => Ok(file),
     }
 }
 
-/// Why there is no page.
+/// Reason why the page cannot be used.
 enum Refused {
     System(io::Error),
     Foreign(Segment),
@@ -234,3 +236,61 @@ impl From<Errno> for Refused {
         Refused::System(error.into())
     }
 }
+
+/// A word in shared memory at which threads of several processes can sleep.
+trait FutexWord {
+    fn fetch_add(&self, summand: u32, order: Ordering) -> u32;
+    fn load(&self, order: Ordering) -> u32;
+    fn store(&self, value: u32, order: Ordering);
+    fn fence(order: Ordering);
+    /// Wakes all threads that sleep at this word.
+    fn wake(&self);
+}
+
+/// Increments the counter `rung` and wakes all threads that sleep at it. A thread that sees the new count also sees
+/// everything that was sent before.
+fn ring(rung: &impl FutexWord) {
+    rung.fetch_add(1, Ordering::Release);
+    rung.wake();
+}
+
+/// Returns the counter `rung`. Everything that was sent before it was incremented can be received after this call.
+fn rung<W: FutexWord>(rung: &W) -> u32 {
+    // Only a relaxed load may touch memory that is mapped read-only.
+    let number = rung.load(Ordering::Relaxed);
+    W::fence(Ordering::Acquire);
+    number
+}
+
+/// Sets the word `closed` and wakes all threads once more. A thread that sees the new count also sees that the doorbell
+/// is closed.
+fn close<W: FutexWord>(closed: &W, rung: &W) {
+    closed.store(1, Ordering::Relaxed);
+    ring(rung);
+}
+
+impl FutexWord for AtomicU32 {
+    fn fetch_add(&self, summand: u32, order: Ordering) -> u32 {
+        self.fetch_add(summand, order)
+    }
+
+    fn load(&self, order: Ordering) -> u32 {
+        self.load(order)
+    }
+
+    fn store(&self, value: u32, order: Ordering) {
+        self.store(value, order);
+    }
+
+    fn fence(order: Ordering) {
+        fence(order);
+    }
+
+    fn wake(&self) {
+        // It is not an error if no thread sleeps, and no other error is possible for a mapped word.
+        let _ = futex::wake(self, futex::Flags::empty(), i32::MAX as u32);
+    }
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,333 @@
+//! Keeps a domain's shared memory apart from other users, who can all create files in /dev/shm:
+//!
+//! - The names of a domain start with a prefix that contains a random word. Without it, another user could occupy the names
+//!   before the hub starts. The prefix, `sh_DOMAIN_WORD_`, is stored in the file `prefix` of the domain's directory, which
+//!   only this user can read. It stays as long as any process uses it.
+//! - The node counter is the one segment that the shared-memory library opens to all users of the machine. Anyone who can
+//!   write to it can keep every later process out. It is therefore created here, for this user only, before the library looks
+//!   for it. The library uses the file that it finds.
+//! - Segments of other users under the domain's names are found by name, owner and mode, without opening them. The owner is
+//!   reported, because the library only reports "internal error".
+
+use std::fs::{File, Metadata, OpenOptions};
+use std::hash::{BuildHasher, RandomState};
+use std::io::{Read, Write};
+use std::os::unix::fs::{MetadataExt, OpenOptionsExt};
+use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicU32, Ordering};
+
+use rustix::fs::{CWD, RenameFlags, renameat_with};
+use rustix::io::Errno;
+
+use crate::directory::named;
+use crate::lock::MakingLock;
+use crate::shortage::{SHARED_MEMORY, memory};
+use crate::{Directory, Failure, Kind, shortage};
+
+/// Returns the reason for a failure in the domain in `root`: another user's directory or file with owner, mode and
+/// remedy, otherwise a shortage if there is one, otherwise `what`.
+pub(crate) fn access_failure(root: &Path, what: impl Into<String>) -> Failure {
+    let directory = Directory::open(root).err();
+    directory
+        .or_else(|| shortage::found(root))
+        .or_else(|| strangers(root).first().map(in_the_way))
+        .unwrap_or_else(|| {
+            Failure::new(
+                Kind::Failed,
+                what,
+                "IOX2_LOG_LEVEL=debug shows the messages of the shared-memory library",
+            )
+        })
+}
+
+/// A file in shared memory. Links are not followed.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Segment {
+    /// Path.
+    pub path: PathBuf,
+    /// User ID of the owner.
+    pub owner: u32,
+    /// Permission bits.
+    pub mode: u32,
+    /// Length in bytes.
+    pub bytes: u64,
+    is_file: bool,
+}
+
+impl Segment {
+    /// Returns a regular file at `path` with these properties.
+    pub fn new(path: impl Into<PathBuf>, owner: u32, mode: u32, bytes: u64) -> Segment {
+        Segment { path: path.into(), owner, mode, bytes, is_file: true }
+    }
+
+    pub(super) fn at(path: &Path) -> Option<Segment> {
+        Some(Segment::of(path, &path.symlink_metadata().ok()?))
+    }
+
+    pub(super) fn of(path: &Path, metadata: &Metadata) -> Segment {
+        Segment {
+            path: path.to_owned(),
+            owner: metadata.uid(),
+            mode: metadata.mode() & 0o7777,
+            bytes: metadata.len(),
+            is_file: metadata.is_file(),
+        }
+    }
+
+    /// Returns whether it is a regular file of this user.
+    pub(super) fn is_own(&self) -> bool {
+        self.owner == rustix::process::geteuid().as_raw() && self.is_file
+    }
+
+    /// Returns whether it is not a regular file of this user, or other users can write to it.
+    pub(super) fn is_foreign(&self) -> bool {
+        !self.is_own() || self.mode & 0o022 != 0
+    }
+}
+
+/// Returns the files under the names of the domain in `root` that do not belong to this user alone, sorted by path.
+/// Empty if the domain has no names.
+pub fn strangers(root: &Path) -> Vec<Segment> {
+    let Ok(Some(prefix)) = prefix_of(root) else { return Vec::new() };
+    let entries = std::fs::read_dir(SHARED_MEMORY).into_iter().flatten().flatten();
+    let named = entries.filter(|entry| entry.file_name().to_string_lossy().starts_with(&prefix));
+    let mut found: Vec<_> =
+        named.filter_map(|entry| Segment::at(&entry.path())).filter(Segment::is_foreign).collect();
+    found.sort_by(|a, b| a.path.cmp(&b.path));
+    found
+}
+
+/// Returns the failure to report if `segment` has a name that this process needs.
+pub(crate) fn in_the_way(segment: &Segment) -> Failure {
+    let (path, owner, mode) = (segment.path.display(), named(segment.owner), segment.mode);
+    let is_file = if segment.is_file { "" } else { " and is no file" };
+    Failure::new(
+        Kind::Failed,
+        format!(
+            "{path} belongs to user {owner} with mode {mode:04o}{is_file}: it is in the way, and is not opened"
+        ),
+        format!(
+            "let user {owner} or an administrator remove it (sudo rm {path}), or choose another --domain"
+        ),
+    )
+}
+
+/// Returns the prefix of the domain in `root`. `None` if no process has published there, or all have ended.
+///
+/// # Errors
+///
+/// Returns the errors of [`Directory::open`] and [`Directory::file`].
+pub(crate) fn prefix_of(root: &Path) -> Result<Option<String>, Failure> {
+    match Directory::open(root)? {
+        Some(directory) => read_prefix(&directory, root),
+        None => Ok(None),
+    }
+}
+
+/// Returns the prefix of the domain in `root`, and chooses one if the domain has none.
+///
+/// # Errors
+///
+/// Returns the errors of [`prefix_of`], and an error if the file cannot be written.
+pub(crate) fn ensure_prefix(root: &Path, _making: &MakingLock) -> Result<String, Failure> {
+    let directory = Directory::make(root)?;
+    if let Some(prefix) = read_prefix(&directory, root)? {
+        return Ok(prefix);
+    }
+    // The hash is keyed with random numbers of the system. Another user cannot create files with all names, but
+    // possibly with some.
+    let mut words = (0..).map(|number: u32| random_word(RandomState::new().hash_one(number)));
+    let prefixes = words.by_ref().map(|word| format!("{}{word}_", prefix_start(root)));
+    let prefix = prefixes.take(MAX_ATTEMPTS).find(|prefix| is_free(prefix)).ok_or_else(|| {
+        let what = format!("{SHARED_MEMORY} is full of files that start with {}", prefix_start(root));
+        Failure::new(Kind::Failed, what, "have them removed, or choose another --domain")
+    })?;
+    directory.replace(PREFIX_FILE, format!("{prefix}\n").as_bytes())?;
+    Ok(prefix)
+}
+
+fn random_word(mut random: u64) -> String {
+    let letters = std::iter::repeat_with(|| {
+        let letter = LETTERS[(random % LETTERS.len() as u64) as usize];
+        random /= LETTERS.len() as u64;
+        letter as char
+    });
+    letters.take(RANDOM_LETTERS).collect()
+}
+
+fn is_free(prefix: &str) -> bool {
+    let mut entries = std::fs::read_dir(SHARED_MEMORY).into_iter().flatten().flatten();
+    !entries.any(|entry| entry.file_name().to_string_lossy().starts_with(prefix))
+}
+
+/// Returns the prefix in the open `directory` of `root`. A prefix of another form was not written here, and counts as
+/// none.
+///
+/// # Errors
+///
+/// Returns the errors of [`Directory::file`].
+pub(crate) fn read_prefix(directory: &Directory, root: &Path) -> Result<Option<String>, Failure> {
+    let Some(file) = directory.file(PREFIX_FILE)? else { return Ok(None) };
+    let mut text = String::new();
+    let read = file.take(MAX_PREFIX_FILE_BYTES).read_to_string(&mut text);
+    let is_one = |prefix: &str| {
+        let random = prefix.strip_prefix(&prefix_start(root)).and_then(|rest| rest.strip_suffix('_'));
+        random.is_some_and(|it| it.len() == RANDOM_LETTERS && it.bytes().all(|byte| LETTERS.contains(&byte)))
+    };
+    Ok(read.ok().and_then(|_| text.strip_suffix('\n')).filter(|prefix| is_one(prefix)).map(str::to_owned))
+}
+
+fn prefix_start(root: &Path) -> String {
+    format!("sh_{}_", root.file_name().unwrap_or_default().to_string_lossy())
+}
+
+/// Name of the file in the domain's directory.
+pub(crate) const PREFIX_FILE: &str = "prefix";
+/// Length of the random word: 60 million words.
+const RANDOM_LETTERS: usize = 5;
+const LETTERS: &[u8] = b"0123456789abcdefghijklmnopqrstuvwxyz";
+const MAX_PREFIX_FILE_BYTES: u64 = 64;
+/// Number of words to try. They are not all taken by chance.
+const MAX_ATTEMPTS: usize = 16;
+
+/// Creates the node counter under `prefix`, unless it exists and belongs to this user alone.
+///
+/// # Errors
+///
+/// Returns [`Kind::Failed`] with file, owner and remedy if another user's file has its name or another user could write
+/// to it. Returns [`Kind::Short`] if there is no memory for it.
+pub(super) fn ensure_node_counter(prefix: &str) -> Result<(), Failure> {
+    let path = node_counter_path(prefix);
+    loop {
+        match Segment::at(&path) {
+            Some(segment) if !segment.is_own() => return Err(in_the_way(&segment)),
+            // It is the library's own counter, or an unfinished one that the library would wait for forever.
+            Some(segment) if segment.is_foreign() || segment.bytes != NODE_COUNTER_CONTENT.len() as u64 => {
+                remove_node_counter(prefix)
+            }
+            Some(_) => return Ok(()),
+            None => create_node_counter(&path)?,
+        }
+    }
+}
+
+/// Removes the node counter under `prefix`, which no process needs any more.
+pub(super) fn remove_node_counter(prefix: &str) {
+    let _ = std::fs::remove_file(node_counter_path(prefix));
+}
+
+/// Creates the file with its content in one step, unless another process is faster.
+fn create_node_counter(path: &Path) -> Result<(), Failure> {
+    // Threads of one process may create it at the same time.
+    static MADE: AtomicU32 = AtomicU32::new(0);
+    let number = MADE.fetch_add(1, Ordering::Relaxed);
+    let beside = path.with_extension(format!("new-{}-{number}", std::process::id()));
+    let written = OpenOptions::new().write(true).create_new(true).mode(0o600).open(&beside);
+    let written = written.and_then(|mut file: File| file.write_all(&NODE_COUNTER_CONTENT));
+    let placed =
+        written.and_then(|()| match renameat_with(CWD, &beside, CWD, path, RenameFlags::NOREPLACE) {
+            Err(Errno::EXIST) => Ok(()),
+            placed => Ok(placed?),
+        });
+    let _ = std::fs::remove_file(&beside);
+    placed.map_err(|error| match Errno::from_io_error(&error) {
+        Some(Errno::NOSPC) => memory(&format!("no room for {}: 16 bytes", path.display())),
+        _ => Failure::new(Kind::Failed, format!("{}: {error}", path.display()), "scanhub doctor --clean"),
+    })
+}
+
+fn node_counter_path(prefix: &str) -> PathBuf {
+    Path::new(SHARED_MEMORY).join(format!("{prefix}{NODE_COUNTER_NAME}"))
+}
+
+/// Name with the hash of a type, as iceoryx2 0.10.0 computes it (`DynamicStorageConfiguration::path_for_with_type`).
+/// The test below compares the two.
+const NODE_COUNTER_NAME: &str = "9204dd183d1c4d8e1ff592a30766ffa6765aa8b5_node.0_10_0.global_mgmt";
+
+/// Content that the library writes (`posix_shared_memory::Data`): its packed version, then the counter, from 0.
+const NODE_COUNTER_CONTENT: [u8; 16] = {
+    let (version, mut content) = ((10_u64 << 16).to_ne_bytes(), [0; 16]);
+    let mut i = 0;
+    while i < version.len() {
+        content[i] = version[i];
+        i += 1;
+    }
+    content
+};
+
+#[cfg(test)]
+mod tests {
+    use std::fs;
+
+    use iceoryx2::config::Config;
+    use iceoryx2::prelude::{FileName, NodeBuilder, SemanticString, SignalHandlingMode};
+
+    use crate::ipc::Service;
+
+    use super::*;
+
+    #[test]
+    fn a_word_is_kept_and_never_the_same_twice() {
+        let base = tempfile::tempdir().unwrap();
+        let root = base.path().join("a-1");
+        assert_eq!(prefix_of(&root), Ok(None), "there is no such directory");
+        let ensure_prefix = |root: &Path| ensure_prefix(root, &MakingLock::wait(root).unwrap());
+        let first = ensure_prefix(&root).unwrap();
+        assert!(first.starts_with("sh_a-1_") && first.len() == 13, "{first}");
+        assert_eq!((ensure_prefix(&root), prefix_of(&root)), (Ok(first.clone()), Ok(Some(first.clone()))));
+        for written in ["", "sh_a-1_four_\n", "sh_b_12345_\n", "sh_a-1_12/45_\n"] {
+            fs::write(root.join(PREFIX_FILE), written).unwrap();
+            assert_eq!(prefix_of(&root), Ok(None), "{written:?}");
+        }
+        assert_ne!(ensure_prefix(&root).unwrap(), first);
+    }
+
+    #[test]
+    fn it_is_the_one_that_the_library_would_make() {
+        let base = tempfile::tempdir().unwrap();
+        let prefix = format!("sh_k{}_", std::process::id());
+        let join = || {
+            let mut config = Config::default();
+            config.global.prefix = FileName::new(prefix.as_bytes()).unwrap();
+            config.global.set_root_path(
+                &iceoryx2::prelude::Path::new(base.path().as_os_str().as_encoded_bytes()).unwrap(),
+            );
+            let builder = NodeBuilder::new().signal_handling_mode(SignalHandlingMode::Disabled);
+            builder.config(&config).create::<Service>().unwrap()
+        };
+        let files = || {
+            let entries = fs::read_dir(SHARED_MEMORY).unwrap().flatten();
+            let own = entries.filter(|entry| entry.file_name().to_string_lossy().starts_with(&prefix));
+            own.map(|entry| (entry.path(), fs::read(entry.path()).unwrap())).collect::<Vec<_>>()
+        };
+        drop(join());
+        let theirs = files();
+        let mode = Segment::at(&node_counter_path(&prefix)).map(|it| it.mode);
+        remove_node_counter(&prefix);
+        let removed = files();
+        ensure_node_counter(&prefix).unwrap();
+        let ours = files();
+        drop(join());
+        let counted = files();
+        ensure_node_counter(&prefix).unwrap();
+        let kept = (files(), Segment::at(&node_counter_path(&prefix)).map(|it| it.mode));
+        remove_node_counter(&prefix);
+        drop(join());
+        ensure_node_counter(&prefix).unwrap();
+        let closed = Segment::at(&node_counter_path(&prefix)).map(|it| it.mode);
+        fs::write(node_counter_path(&prefix), "cut").unwrap();
+        ensure_node_counter(&prefix).unwrap();
+        let repaired = files();
+        remove_node_counter(&prefix);
+
+        let content = |count: u32| {
+            let mut content = NODE_COUNTER_CONTENT;
+            content[8..12].copy_from_slice(&count.to_ne_bytes());
+            vec![(node_counter_path(&prefix), content.to_vec())]
+        };
+        assert_eq!((theirs, mode), (content(1), Some(0o666)), "another version of the library");
+        assert_eq!((removed, ours, &counted), (vec![], content(0), &content(1)));
+        assert_eq!((kept, repaired), ((counted, Some(0o600)), content(0)));
+        assert_eq!(closed, Some(0o600), "the library's own, which is open to all, does not stay");
+    }
+}

@@ -1,0 +1,455 @@
+//! A topic in shared memory: its service, its subscriber, and its publisher, which numbers samples, writes them in place, and
+//! counts those that there is no memory for. The code for each payload is generated from the table of topics.
+
+use std::borrow::BorrowMut;
+use std::fmt::Debug;
+use std::marker::PhantomData;
+
+use iceoryx2::port::subscriber::SubscriberCreateError;
+use iceoryx2::prelude::{AttributeVerifier, IceoryxSend};
+use iceoryx2::service::builder::publish_subscribe::{
+    PublishSubscribeOpenError, PublishSubscribeOpenOrCreateError,
+};
+
+use super::open_failure::{OpenFailure, create, no_place, no_port, no_publisher, open};
+use super::{
+    LoanError, Node, PortFactory, Publisher, REVISION, ReceiveError, Sample, SampleMut, SendError,
+    Subscriber, TopicService, UpdateConnections, name, places,
+};
+use crate::limits::TopicLimits;
+use crate::shortage::check_client;
+use crate::{Failure, Header, Kind, Topic, limits};
+
+/// Payload of a topic: `[u8]` (telegram), or a type of this crate.
+pub trait Payload: Debug + 'static {
+    /// Topic of this payload.
+    const TOPIC: Topic;
+
+    /// Type in shared memory: the payload itself, or the words of a payload of variable length.
+    type Memory: IceoryxSend + Debug + ?Sized + 'static;
+
+    /// Returns the topic of `sensor`, for the hub. It is created with `limits` if it does not exist. If subscribers of
+    /// a dead hub keep it alive, it is reused with its number of places.
+    ///
+    /// # Errors
+    ///
+    /// Returns [`Kind::Short`] if memory or descriptors are short, and [`Kind::Failed`] if it exists with another
+    /// layout.
+    fn create(node: &Node, sensor: &str, limits: &TopicLimits) -> Result<TopicService<Self>, Failure>;
+
+    /// Returns the topic of `sensor`, for subscribers. `None` if no hub has created it yet.
+    ///
+    /// # Errors
+    ///
+    /// Returns [`Kind::Short`] if memory or descriptors are short, and [`Kind::Failed`] if it has another layout.
+    fn open(node: &Node, sensor: &str) -> Result<Option<TopicService<Self>>, Failure>;
+
+    /// Returns the publisher of a topic, with memory for the longest samples that `limits` allow.
+    ///
+    /// # Errors
+    ///
+    /// Returns [`Kind::DomainHeld`] if the topic already has a publisher.
+    fn publisher(topic: &TopicService<Self>, limits: &TopicLimits) -> Result<Publisher<Self>, Failure>;
+
+    /// Returns a subscriber of a topic.
+    ///
+    /// # Errors
+    ///
+    /// Returns [`Kind::Short`] if memory, descriptors or places for subscribers are short.
+    fn subscriber(topic: &TopicService<Self>) -> Result<Subscriber<Self>, Failure>;
+
+    /// Returns the oldest queued sample, or `None`.
+    ///
+    /// # Errors
+    ///
+    /// Returns [`ReceiveError::ExceedsMaxBorrows`] if [`limits::BORROWED`] samples are held, and
+    /// [`ReceiveError::ConnectionFailure`] if the publisher's memory cannot be mapped.
+    fn receive(subscriber: &Subscriber<Self>) -> Result<Option<Sample<Self>>, ReceiveError>;
+
+    /// Returns the payload of a sample, in shared memory.
+    fn read(sample: &Sample<Self>) -> &Self;
+
+    /// Loans memory for a sample with a default payload. A payload of variable length has `len` bytes, at least a head.
+    ///
+    /// # Errors
+    ///
+    /// Returns the library's error if there is no memory, or if `len` is more than the topic was created for.
+    fn loan(publisher: &Publisher<Self>, len: usize) -> Result<SampleMut<Self>, LoanError>;
+
+    /// Returns the payload of a loaned sample.
+    fn write(loan: &mut SampleMut<Self>) -> &mut Self;
+
+    /// A payload in the memory of this process.
+    type Owned: BorrowMut<Self>;
+
+    /// Returns a default payload in the memory of this process. A payload of variable length has `len` bytes, at least
+    /// a head.
+    fn owned(len: usize) -> Self::Owned;
+
+    /// Returns the used bytes of the payload.
+    fn bytes(&self) -> &[u8];
+}
+
+/// In iceoryx2, slices and values have two impl blocks with the same code. This macro generates both.
+macro_rules! payload {
+    ($payload:ty, $topic:expr, $memory:ty, $len:ident, $owned:ty, $make:expr,
+        |$builder:ident, $limits:ident| $sized:expr, |$publisher:ident| $loan:expr, $read:path, $write:path, $bytes:path) => {
+        impl Payload for $payload {
+            const TOPIC: Topic = $topic;
+
+            type Memory = $memory;
+
+            fn create(
+                node: &Node,
+                sensor: &str,
+                limits: &TopicLimits,
+            ) -> Result<TopicService<Self>, Failure> {
+                let (service, revision) = (name(&$topic.service(sensor))?, revision($topic)?);
+                create(node, &service, || {
+                    let builder = || {
+                        let builder = node.service_builder(&service).publish_subscribe::<$memory>();
+                        builder.user_header::<Header>()
+                    };
+                    let made = builder()
+                        .max_publishers(limits::PUBLISHERS)
+                        .max_subscribers(limits.consumers)
+                        .max_nodes(limits::NODES)
+                        .subscriber_max_buffer_size(limits::buffer($topic))
+                        .subscriber_max_borrowed_samples(limits::BORROWED)
+                        .history_size(limits::history($topic))
+                        .enable_safe_overflow(true)
+                        .open_or_create_with_attributes(&revision);
+                    match made {
+                        Err(PublishSubscribeOpenOrCreateError::PublishSubscribeOpenError(
+                            PublishSubscribeOpenError::DoesNotSupportRequestedAmountOfSubscribers,
+                        )) => builder().open_with_attributes(&revision).map_err(|error| error.into()),
+                        made => made.map_err(OpenFailure::from),
+                    }
+                })
+            }
+
+            fn open(node: &Node, sensor: &str) -> Result<Option<TopicService<Self>>, Failure> {
+                let service = name(&$topic.service(sensor))?;
+                let builder = node.service_builder(&service).publish_subscribe::<$memory>();
+                open(node, &service, builder.user_header::<Header>().open())
+            }
+
+            fn publisher(
+                topic: &TopicService<Self>,
+                $limits: &TopicLimits,
+            ) -> Result<Publisher<Self>, Failure> {
+                let samples = limits::samples($topic, places::<Self>(topic));
+                let $builder = topic
+                    .publisher_builder()
+                    .max_loaned_samples(limits::LOANED)
+                    .override_sample_preallocation(move |_| samples);
+                $sized.create().map_err(|error| no_publisher(topic.name(), error))
+            }
+
+            fn subscriber(topic: &TopicService<Self>) -> Result<Subscriber<Self>, Failure> {
+                check_client()?;
+                topic.subscriber_builder().create().map_err(|error| match error {
+                    SubscriberCreateError::ExceedsMaxSupportedSubscribers => {
+                        no_place(topic.name(), places::<Self>(topic))
+                    }
+                    other => no_port(topic.name(), &other),
+                })
+            }
+
+            fn receive(subscriber: &Subscriber<Self>) -> Result<Option<Sample<Self>>, ReceiveError> {
+                subscriber.receive()
+            }
+
+            fn read(sample: &Sample<Self>) -> &Self {
+                $read(sample)
+            }
+
+            fn loan($publisher: &Publisher<Self>, $len: usize) -> Result<SampleMut<Self>, LoanError> {
+                $loan
+            }
+
+            fn write(loan: &mut SampleMut<Self>) -> &mut Self {
+                $write(loan.payload_mut())
+            }
+
+            type Owned = $owned;
+
+            fn owned($len: usize) -> $owned {
+                $make
+            }
+
+            fn bytes(&self) -> &[u8] {
+                $bytes(self)
+            }
+        }
+    };
+}
+
+/// A payload of variable length is loaned with the longest length.
+macro_rules! payloads {
+    ($($topic:ident $payload:tt, $name:literal, $($column:tt),*: $about:literal;)*) => {
+        $(payloads!($payload, $topic);)*
+    };
+    ([u8], $topic:ident) => {
+        payload!(
+            [u8], Topic::$topic, [u8], len, Vec<u8>, vec![0; len],
+            |builder, limits| builder.initial_max_slice_len(limits.telegram),
+            |publisher| publisher.loan_slice(len),
+            std::convert::identity, std::convert::identity, std::convert::identity
+        );
+    };
+    (Scan, $topic:ident) => { payloads!(Scan, ScanWord, $topic); };
+    (Foreground, $topic:ident) => { payloads!(Foreground, ForegroundWord, $topic); };
+    (Background, $topic:ident) => { payloads!(Background, BackgroundWord, $topic); };
+    (Cloud, $topic:ident) => { payloads!(Cloud, CloudWord, $topic); };
+    ($payload:ident, $word:ident, $topic:ident) => {
+        payload!(
+            crate::$payload, Topic::$topic, [crate::$word], len, Box<crate::$payload>, crate::$payload::zeroed(len),
+            |builder, limits| {
+                let longest = Topic::$topic.longest(limits);
+                builder.initial_max_slice_len(crate::$payload::words(longest))
+            },
+            |publisher| publisher.loan_slice(crate::$payload::words(len)),
+            crate::$payload::of_words, crate::$payload::of_words_mut, crate::$payload::bytes
+        );
+    };
+    ($payload:tt, $topic:ident) => {
+        payload!(
+            crate::$payload, Topic::$topic, crate::$payload, _len, Box<crate::$payload>, Box::default(),
+            |builder, _limits| builder,
+            |publisher| publisher.loan(),
+            std::convert::identity, std::convert::identity, bytemuck::bytes_of
+        );
+    };
+}
+
+crate::for_each_topic!(payloads);
+
+fn revision(topic: Topic) -> Result<AttributeVerifier, Failure> {
+    let impossible = |_| Failure::new(Kind::Failed, "the payload's revision is no attribute", "");
+    let value = topic.revision().to_string();
+    let key = REVISION.try_into().map_err(|_| impossible(()))?;
+    let value = value.as_str().try_into().map_err(|_| impossible(()))?;
+    AttributeVerifier::new().require(&key, &value).map_err(|_| impossible(()))
+}
+
+/// Transport of a topic's samples: [`SharedMemory`], or in a simulation the memory of the process.
+pub trait Medium<P: Payload + ?Sized> {
+    /// A loaned sample.
+    type Loan;
+
+    /// Returns the number of subscribers of the topic.
+    fn subscribers(&self) -> usize;
+
+    /// Connects new subscribers, and sends them the history of the topic.
+    ///
+    /// # Errors
+    ///
+    /// Returns the reason why one of them could not be connected.
+    fn connect(&self) -> Result<(), impl Debug + use<Self, P>>;
+
+    /// Loans memory for a sample with a default payload. A payload of bytes has `len` bytes.
+    ///
+    /// # Errors
+    ///
+    /// Returns the library's error if there is no memory.
+    fn loan(&self, len: usize) -> Result<Self::Loan, LoanError>;
+
+    /// Returns the payload of `loan` for writing in place.
+    fn payload_mut(loan: &mut Self::Loan) -> &mut P;
+
+    /// Sends `loan` with `header`. Returns the number of subscribers that received it.
+    ///
+    /// # Errors
+    ///
+    /// Returns the library's error.
+    fn send(&self, loan: Self::Loan, header: &Header) -> Result<usize, SendError>;
+}
+
+/// A topic in the shared memory of a domain.
+#[derive(Debug)]
+pub struct SharedMemory<P: Payload + ?Sized> {
+    publisher: Publisher<P>,
+    service: TopicService<P>,
+}
+
+impl<P: Payload + ?Sized> SharedMemory<P> {
+    /// Creates the topic of `sensor` with payload `P` and `limits`, or takes over the topic of a dead process. The
+    /// [`Waker`](super::Waker) of the sensor must exist before.
+    ///
+    /// # Errors
+    ///
+    /// Returns [`Kind::DomainHeld`] if another process publishes the topic, [`Kind::Short`] if memory or descriptors
+    /// are short, and [`Kind::Failed`] if the topic exists with another layout.
+    pub fn new(node: &Node, sensor: &str, limits: &TopicLimits) -> Result<Self, Failure> {
+        let service = P::create(node, sensor, limits)?;
+        Ok(SharedMemory { publisher: P::publisher(&service, limits)?, service })
+    }
+
+    /// Returns the number of places for subscribers. A topic that was taken over may have another number than its
+    /// limits.
+    pub fn places(&self) -> usize {
+        places::<P>(&self.service)
+    }
+}
+
+impl<P: Payload + ?Sized> Medium<P> for SharedMemory<P> {
+    type Loan = SampleMut<P>;
+
+    fn subscribers(&self) -> usize {
+        self.service.dynamic_config().number_of_subscribers()
+    }
+
+    fn connect(&self) -> Result<(), impl Debug + use<P>> {
+        self.publisher.update_connections()
+    }
+
+    fn loan(&self, len: usize) -> Result<SampleMut<P>, LoanError> {
+        P::loan(&self.publisher, len)
+    }
+
+    fn payload_mut(loan: &mut SampleMut<P>) -> &mut P {
+        P::write(loan)
+    }
+
+    fn send(&self, mut loan: SampleMut<P>, header: &Header) -> Result<usize, SendError> {
+        *loan.user_header_mut() = *header;
+        loan.send()
+    }
+}
+
+/// Publishes the samples of one topic of one sensor. Their numbers start at 0 and have a gap where samples were lost
+/// before they could be sent.
+#[derive(Debug)]
+pub struct TopicPublisher<P: Payload + ?Sized, M = SharedMemory<P>> {
+    medium: M,
+    next: u64,
+    failed: u64,
+    payload: PhantomData<fn(&P)>,
+}
+
+impl<P: Payload + ?Sized> TopicPublisher<P> {
+    /// Creates a publisher into shared memory. Otherwise the same as [`over`](TopicPublisher::over).
+    ///
+    /// # Errors
+    ///
+    /// Returns the errors of [`SharedMemory::new`].
+    pub fn new(node: &Node, sensor: &str, limits: &TopicLimits) -> Result<Self, Failure> {
+        SharedMemory::new(node, sensor, limits).map(TopicPublisher::over)
+    }
+}
+
+impl<P: Payload + ?Sized, M: Medium<P>> TopicPublisher<P, M> {
+    /// Creates a publisher over `medium`. The first sample has number 0.
+    pub fn over(medium: M) -> Self {
+        TopicPublisher { medium, next: 0, failed: 0, payload: PhantomData }
+    }
+
+    /// Returns the number of the next sample.
+    pub fn next_number(&self) -> u64 {
+        self.next
+    }
+
+    /// Skips `count` numbers, so that subscribers count `count` missing samples.
+    pub fn skip(&mut self, count: u64) {
+        self.next += count;
+    }
+
+    /// Returns the number of subscribers of the topic.
+    pub fn subscribers(&self) -> usize {
+        self.medium.subscribers()
+    }
+
+    /// Connects new subscribers, and sends them the history of the topic. A subscriber that cannot be connected is
+    /// retried with the next sample.
+    ///
+    /// # Errors
+    ///
+    /// Returns the reason why one of them could not be connected.
+    pub fn connect(&self) -> Result<(), impl Debug + use<P, M>> {
+        self.medium.connect()
+    }
+
+    /// Returns the number of samples that were not sent for lack of memory.
+    pub fn failed(&self) -> u64 {
+        self.failed
+    }
+
+    /// Loans memory for a sample with a default payload. A payload of bytes has `len` bytes; any other payload has its
+    /// own length.
+    ///
+    /// # Errors
+    ///
+    /// Returns the library's error if there is no memory, or if bytes are longer than
+    /// [`Telegram::MAX`](crate::Telegram::MAX).
+    pub fn loan(&self, len: usize) -> Result<M::Loan, LoanError> {
+        self.medium.loan(len)
+    }
+
+    /// Sends `loan` with `header` and the next number of the topic. Returns the number of subscribers that received it.
+    ///
+    /// # Errors
+    ///
+    /// Returns the library's error. The number is then used, and the sample counts as failed.
+    pub fn send_loan(&mut self, loan: M::Loan, header: &Header) -> Result<usize, SendError> {
+        let header = Header { topic_seq: self.next, ..*header };
+        self.next += 1;
+        self.medium.send(loan, &header).inspect_err(|_| self.failed += 1)
+    }
+
+    /// Uses a number for a sample that there is no memory for.
+    pub fn fail(&mut self) {
+        self.next += 1;
+        self.failed += 1;
+    }
+
+    /// Sends a sample that `fill` writes in place, starting with a default payload. Its length is `len`, or that of a
+    /// payload of fixed length. Otherwise the same as [`send_loan`](TopicPublisher::send_loan).
+    ///
+    /// # Errors
+    ///
+    /// Returns [`Kind::Short`] if there is no memory for it, or if it is longer than the topic was created for. Its
+    /// number is then used.
+    pub fn send_len(
+        &mut self,
+        header: &Header,
+        len: usize,
+        fill: impl FnOnce(&mut P),
+    ) -> Result<usize, Failure> {
+        let mut loan = self.loan(len).map_err(|error| {
+            self.fail();
+            short(P::TOPIC, &error)
+        })?;
+        fill(M::payload_mut(&mut loan));
+        self.send_loan(loan, header).map_err(|error| short(P::TOPIC, &error))
+    }
+}
+
+impl<P: Payload, M: Medium<P>> TopicPublisher<P, M> {
+    /// Sends a sample that `fill` writes in place, starting with a default payload. Otherwise the same as
+    /// [`send_loan`](TopicPublisher::send_loan).
+    ///
+    /// # Errors
+    ///
+    /// Returns [`Kind::Short`] if there is no memory for it. Its number is then used.
+    pub fn send(&mut self, header: &Header, fill: impl FnOnce(&mut P)) -> Result<usize, Failure> {
+        self.send_len(header, 0, fill)
+    }
+}
+
+impl<M: Medium<[u8]>> TopicPublisher<[u8], M> {
+    /// Sends `bytes` as a sample. Otherwise the same as [`send`](TopicPublisher::send).
+    ///
+    /// # Errors
+    ///
+    /// Returns [`Kind::Short`] if there is no memory for it, or if it is longer than
+    /// [`Telegram::MAX`](crate::Telegram::MAX).
+    pub fn send_bytes(&mut self, header: &Header, bytes: &[u8]) -> Result<usize, Failure> {
+        self.send_len(header, bytes.len(), |sample| sample.copy_from_slice(bytes))
+    }
+}
+
+fn short(topic: Topic, error: &dyn Debug) -> Failure {
+    let what = format!("a sample of {} was not sent: {error:?}", topic.name());
+    Failure::new(Kind::Short, what, "drop samples that are held, or free some of /dev/shm")
+}
