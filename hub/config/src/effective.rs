@@ -1,6 +1,7 @@
-//! The configuration in effect, value by value, each with the place where it was set. Refuses to know how it is read: it
-//! shows the values that the hub would use.
+//! The values in effect, each with the place where it was set. They are the values that the hub would use. For the places, the
+//! sources are read again, key by key: the last source that has a key is its place.
 
+use std::collections::BTreeMap;
 use std::fmt;
 
 use preprocess::background::{Candidate, Method, Start};
@@ -9,32 +10,33 @@ use schema::limits::TopicLimits;
 use schema::{Failure, Pose};
 use serde::Serialize;
 use serde_json::{Value as Json, json};
+use toml::de::{DeTable, DeValue};
 
 use crate::gateway::Gateway;
 use crate::link::{Config, Link};
-use crate::places::Places;
 use crate::processing::{Background, Zones};
 use crate::scanner::Scanner;
-use crate::sources::Sources;
+use crate::sources::{Origin, Sources};
 
 /// One value in effect.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Value {
     class: &'static str,
-    /// The key as `--set` takes it.
+    /// Key, as `--set` takes it.
     pub key: String,
-    /// What it is, in the words and units of the configuration; null if there is nothing without a word.
+    /// Value in the units of the configuration; null if it is not set and has no default.
     pub value: Json,
-    /// Where it is set, `FILE:LINE:COLUMN` or a flag; else `default`, possibly with the value that it depends on.
+    /// Place where it is set, `FILE:LINE:COLUMN` or a flag. Otherwise `default`, possibly with the value that it
+    /// depends on.
     pub origin: String,
 }
 
-/// All values of the links, of their limits and of the gateway from `sources`.
+/// Returns all values of links, limits and gateway from `sources`.
 ///
-/// [`schema::Kind::Configuration`] with place, value and remedy.
+/// Returns [`schema::Kind::Configuration`] with place, value and remedy if a value is not valid.
 pub fn values(sources: &Sources) -> Result<Vec<Value>, Failure> {
     let (config, gateway) = (Config::load(sources)?, Gateway::load(sources)?);
-    let mut list = List { places: Places::of(sources)?, values: Vec::new() };
+    let mut list = List { places: ValueOrigins::of(sources)?, values: Vec::new() };
     for link in &config.links {
         list.link(link);
     }
@@ -45,7 +47,7 @@ pub fn values(sources: &Sources) -> Result<Vec<Value>, Failure> {
 }
 
 struct List {
-    places: Places,
+    places: ValueOrigins,
     values: Vec<Value>,
 }
 
@@ -158,7 +160,7 @@ impl List {
         self.put((link, "background.candidate_mm"), json!(learning.candidate_mm), DEFAULT);
         self.put((link, "background.scans"), json!(learning.scans), DEFAULT);
         self.put((link, "background.candidate"), json!(candidate), DEFAULT);
-        // Without a word it is what an earlier hub has kept, if that fits.
+        // If it is not set, the hub starts with the background that an earlier hub has saved, if that fits.
         let start = background.start_is_said.then_some(start);
         self.put((link, "background.start"), json!(start), DEFAULT);
         self.put((link, "background.keep"), json!(background.is_handed_on), DEFAULT);
@@ -183,13 +185,13 @@ impl List {
         }
     }
 
-    /// A value that belongs to no link.
+    /// Adds a value that does not belong to a link.
     fn put_general(&mut self, key: &str, value: Json) {
         let origin = self.places.of_key(key).unwrap_or(DEFAULT).to_owned();
         self.values.push(Value { class: CLASS, key: key.to_owned(), value, origin });
     }
 
-    /// A value of a link; `default` is what to say where nobody says it.
+    /// Adds a value of a link. `default` is its origin if no source sets it.
     fn put(&mut self, (link, key): (&str, &str), value: Json, default: &str) {
         let origin = self.places.of_link(link, key).unwrap_or(default).to_owned();
         self.values.push(Value { class: CLASS, key: format!("link.{link}.{key}"), value, origin });
@@ -197,26 +199,26 @@ impl List {
 }
 
 impl Value {
-    /// The value as it is written in a configuration; `-` for none.
+    /// Returns the value as it is written in a configuration; `-` for null.
     pub fn text(&self) -> String {
-        Written(&self.value).to_string()
+        TomlValue(&self.value).to_string()
     }
 }
 
-/// JSON as the TOML that says the same.
-struct Written<'a>(&'a Json);
+/// Formats JSON as the equivalent TOML.
+struct TomlValue<'a>(&'a Json);
 
-impl fmt::Display for Written<'_> {
+impl fmt::Display for TomlValue<'_> {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self.0 {
             Json::Null => f.write_str("-"),
             Json::Array(values) => {
-                let values: Vec<_> = values.iter().map(|value| Written(value).to_string()).collect();
+                let values: Vec<_> = values.iter().map(|value| TomlValue(value).to_string()).collect();
                 write!(f, "[{}]", values.join(", "))
             }
             Json::Object(keys) => {
                 let keys: Vec<_> =
-                    keys.iter().map(|(key, value)| format!("{key} = {}", Written(value))).collect();
+                    keys.iter().map(|(key, value)| format!("{key} = {}", TomlValue(value))).collect();
                 write!(f, "{{ {} }}", keys.join(", "))
             }
             plain => plain.fmt(f),
@@ -231,13 +233,60 @@ fn metres(mm: u16) -> f64 {
 const CLASS: &str = "value";
 const DEFAULT: &str = "default";
 
+/// Place of each key that is set, such as `link.front.zones.radii` and `zones.radii`.
+pub(crate) struct ValueOrigins(BTreeMap<String, String>);
+
+impl ValueOrigins {
+    /// Reads `sources`.
+    ///
+    /// Returns [`schema::Kind::Configuration`] with place, value and remedy if a source is not valid.
+    pub(crate) fn of(sources: &Sources) -> Result<ValueOrigins, Failure> {
+        let mut places = ValueOrigins(BTreeMap::new());
+        for said in sources.all() {
+            let (origin, _) = said?;
+            let table = DeTable::parse(origin.text()).map_err(|error| origin.explain(&error))?;
+            places.note(table.get_ref(), "", &origin);
+        }
+        Ok(places)
+    }
+
+    /// Returns the last place where `key` of link `link` is set. A value for one link takes precedence over one for all
+    /// links.
+    pub(crate) fn of_link(&self, link: &str, key: &str) -> Option<&str> {
+        self.of_key(&format!("link.{link}.{key}")).or_else(|| self.of_key(key))
+    }
+
+    /// Returns the last place where `key` is set.
+    pub(crate) fn of_key(&self, key: &str) -> Option<&str> {
+        self.0.get(key).map(String::as_str)
+    }
+
+    fn note(&mut self, table: &DeTable<'_>, path: &str, origin: &Origin) {
+        for (key, value) in table.iter() {
+            let path =
+                if path.is_empty() { key.get_ref().to_string() } else { format!("{path}.{}", key.get_ref()) };
+            match value.get_ref() {
+                DeValue::Table(table) => self.note(table, &path, origin),
+                DeValue::Array(links) if path == "link" => {
+                    for table in links.iter().filter_map(|link| link.get_ref().as_table()) {
+                        if let Some(name) = table.get("name").and_then(|name| name.get_ref().as_str()) {
+                            self.note(table, &format!("link.{name}"), origin);
+                        }
+                    }
+                }
+                _ => drop(self.0.insert(path, origin.place(Some(value.span())))),
+            }
+        }
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
 
     #[test]
     fn a_value_is_written_as_a_configuration_says_it() {
-        let written = |value: Json| Written(&value).to_string();
+        let written = |value: Json| TomlValue(&value).to_string();
         assert_eq!(written(json!("a \"b\"")), "\"a \\\"b\\\"\"");
         assert_eq!(written(json!([1.0, 0.6])), "[1.0, 0.6]");
         assert_eq!(

@@ -1,14 +1,5 @@
-//! One source of configuration on top of the others. Every value is checked in its own source, so that an error names
-//! file, line and column, or the flag.
-
-mod early;
-mod flags;
-mod gateway;
-mod limits;
-mod motion;
-mod processing;
-mod scanner;
-mod sight;
+//! Merges the sources of a configuration, one on top of the others. Every value is checked in its own source, so that an error
+//! names file, line and column, or the flag.
 
 use std::rc::Rc;
 
@@ -20,20 +11,17 @@ use schema::{Failure, Kind, check_sensor};
 use serde::Deserialize;
 use toml::Spanned;
 
+use crate::gateway::GatewayLayer;
 use crate::link::{Link, MAX_LINKS};
-use crate::origin::Origin;
-use crate::processing::Processing;
-use crate::scanner::Scanner;
-use early::EarlyLayer;
-pub(crate) use flags::{link, setting};
-use gateway::GatewayLayer;
-use limits::LimitsLayer;
-use motion::MotionLayer;
-use processing::{BackgroundLayer, LinesLayer, MarksLayer, PoseLayer, Sections, ZonesLayer};
-use scanner::{ScannerDraft, ScannerLayer, remedy_of_lms};
-use sight::Sight;
+use crate::processing::{
+    BackgroundLayer, EarlyLayer, LinesLayer, MarksLayer, MotionLayer, PoseLayer, Processing, Sections,
+    ZonesLayer,
+};
+use crate::scanner::{Scanner, ScannerDraft, ScannerLayer, remedy_of_lms};
+use crate::sources::Origin;
+use crate::zone_coverage::ZoneCoverage;
 
-/// What one source says. Knows the keys; what is not here is an unknown key.
+/// Contents of one source. All other keys are unknown.
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(crate) struct Layer {
@@ -46,7 +34,7 @@ pub(crate) struct Layer {
     background: Option<BackgroundLayer>,
     early: Option<EarlyLayer>,
     limits: Option<LimitsLayer>,
-    /// The hub's own configuration may be that of its gateway, too.
+    /// The gateway can use the hub's configuration file.
     pub(crate) gateway: Option<GatewayLayer>,
 }
 
@@ -63,7 +51,7 @@ struct LinkLayer {
     angle: Option<Spanned<f64>>,
     resolution: Option<Spanned<f64>>,
     unit: Option<Spanned<String>>,
-    /// A number of an LMS, a name of other families.
+    /// A number for an LMS, a name for other families.
     mode: Option<Spanned<toml::Value>>,
     idle: Option<Spanned<String>>,
     baud: Option<Spanned<u32>>,
@@ -80,7 +68,7 @@ struct LinkLayer {
 #[derive(Default)]
 pub(crate) struct Drafts {
     links: Vec<Draft>,
-    /// What was said for all links, in the order of the sources.
+    /// Sections for all links, in the order of the sources.
     general: Vec<(Rc<Origin>, Sections)>,
     limits: TopicLimits,
 }
@@ -91,18 +79,18 @@ struct Draft {
     place: String,
     port: Option<Source>,
     scanner: ScannerDraft,
-    family: Option<Said<Family>>,
-    angle_deg: Option<Said<u16>>,
-    resolution_cdeg: Option<Said<u16>>,
-    unit: Option<Said<Unit>>,
-    mode: Option<Said<Mode>>,
-    baud: Option<Said<Baud>>,
-    /// What was said for this link, in the order of the sources.
+    family: Option<Sourced<Family>>,
+    angle_deg: Option<Sourced<u16>>,
+    resolution_cdeg: Option<Sourced<u16>>,
+    unit: Option<Sourced<Unit>>,
+    mode: Option<Sourced<Mode>>,
+    baud: Option<Sourced<Baud>>,
+    /// Sections for this link, in the order of the sources.
     own: Vec<(Rc<Origin>, Sections)>,
 }
 
-/// A value, and where it was said last.
-struct Said<T> {
+/// A value, and the last place where it was set.
+struct Sourced<T> {
     value: T,
     place: String,
 }
@@ -112,11 +100,11 @@ impl Drafts {
         self.links.len()
     }
 
-    /// Lays `layer` over the others; only where `may_add` may it bring links that were not there.
+    /// Applies `layer` on top of the others. It may add links only if `may_add` is set.
     pub(crate) fn merge(&mut self, layer: Layer, origin: Origin, may_add: bool) -> Result<(), Failure> {
         let Layer { link, zones, marks, lines, motion, background, early, limits, gateway: _ } = layer;
         if let Some(section) = limits {
-            section.lay(&origin, &mut self.limits)?;
+            section.apply(&origin, &mut self.limits)?;
         }
         let origin = Rc::new(origin);
         merge(&mut self.links, link, &origin, may_add)?;
@@ -124,7 +112,7 @@ impl Drafts {
         Ok(())
     }
 
-    /// The links as they are when all has been said, and the limits of their topics.
+    /// Returns the links and the limits of their topics after all sources were merged.
     pub(crate) fn finish(self) -> Result<(Vec<Link>, TopicLimits), Failure> {
         let Drafts { links, general, limits } = self;
         let links: Result<_, _> = links.into_iter().map(|draft| draft.finish(&general)).collect();
@@ -133,7 +121,7 @@ impl Drafts {
 }
 
 impl Draft {
-    /// What was said for the link wins over what was said for all, wherever either stands.
+    /// Returns the link. Values for the link take precedence over values for all links, regardless of their order.
     fn finish(self, general: &[(Rc<Origin>, Sections)]) -> Result<Link, Failure> {
         let Draft { name, place, port, scanner, family, angle_deg, resolution_cdeg, unit, mode, baud, own } =
             self;
@@ -166,7 +154,7 @@ impl Draft {
                 "mode is only for recordings, port = \"file:PATH\"; leave it out",
             ));
         }
-        // The place of what clashes, or of what implies it.
+        // Place of the value that conflicts, or of the value that implies it.
         let type_place = family.as_ref().map_or(&place, |said| &said.place);
         let angle_place = angle_deg.as_ref().map_or(type_place, |said| &said.place);
         let step_place = resolution_cdeg.as_ref().map_or(angle_place, |said| &said.place);
@@ -175,7 +163,7 @@ impl Draft {
         let angle_deg = angle_deg.as_ref().map_or(factory.angle_deg, |said| said.value);
         let resolution_cdeg = resolution_cdeg.as_ref().map_or(factory.resolution_cdeg, |said| said.value);
         if family == Some(Family::Fast) {
-            // Its 181 values look like those of 180 degrees at 1.
+            // A scan with 181 values looks like one of 180 degrees with a resolution of 1 degree.
             let what =
                 "the beams of version S14 have other angles: 90 degrees at 0.5, which no telegram reports";
             return Err(refuse(
@@ -196,13 +184,13 @@ impl Draft {
         let mut processing = Processing::default();
         let said: Vec<_> = general.iter().chain(&own).collect();
         for (origin, sections) in &said {
-            sections.clone().lay(origin, &mut processing)?;
+            sections.clone().apply(origin, &mut processing)?;
         }
         let start =
             said.iter().rev().find_map(|(origin, sections)| Some(origin.place(Some(sections.start()?))));
         let mode = mode.map(|said| said.value);
         let mut link = Link { name, port, scanner, family, variant, unit, mode, baud, processing };
-        Sight { link: &link, place: &place, said }.check()?;
+        ZoneCoverage { link: &link, place: &place, said }.check()?;
         own.iter().try_for_each(|(origin, sections)| sections.check_family(origin, link.family()))?;
         let mut background = std::mem::take(&mut link.processing.background);
         background.read(&link).map_err(|failure| {
@@ -214,7 +202,7 @@ impl Draft {
     }
 }
 
-/// What `origin` says.
+/// Parses the text of `origin`.
 pub(crate) fn parse(origin: &Origin) -> Result<Layer, Failure> {
     toml::from_str(origin.text()).map_err(|error| origin.explain(&error))
 }
@@ -280,21 +268,21 @@ fn merge(
             })?);
         }
         let LinkLayer { family, model, beams, idle, .. } = link;
-        draft.scanner.lay(ScannerLayer { family, model, beams, idle }, origin)?;
+        draft.scanner.apply(ScannerLayer { family, model, beams, idle }, origin)?;
         if let Some(family) = link.lms_type {
             let value = Family::of_name(family.get_ref()).ok_or_else(|| {
                 let what = format!("type = \"{}\"", family.get_ref());
                 origin.refuse(Some(family.span()), what, "lms200, lms211, lms221 or lms291")
             })?;
-            draft.family = Some(Said { value, place: origin.place(Some(family.span())) });
+            draft.family = Some(Sourced { value, place: origin.place(Some(family.span())) });
         }
         if let Some(angle) = link.angle {
-            let value = whole(origin, &angle, 1.0, "angle", "100 or 180")?;
-            draft.angle_deg = Some(Said { value, place: origin.place(Some(angle.span())) });
+            let value = scaled(origin, &angle, 1.0, "angle", "100 or 180")?;
+            draft.angle_deg = Some(Sourced { value, place: origin.place(Some(angle.span())) });
         }
         if let Some(step) = link.resolution {
-            let value = whole(origin, &step, 100.0, "resolution", "0.25, 0.5 or 1")?;
-            draft.resolution_cdeg = Some(Said { value, place: origin.place(Some(step.span())) });
+            let value = scaled(origin, &step, 100.0, "resolution", "0.25, 0.5 or 1")?;
+            draft.resolution_cdeg = Some(Sourced { value, place: origin.place(Some(step.span())) });
         }
         if let Some(unit) = link.unit {
             let value = match unit.get_ref().as_str() {
@@ -305,18 +293,18 @@ fn merge(
                     return Err(origin.refuse(Some(unit.span()), what, "\"mm\" or \"cm\""));
                 }
             };
-            draft.unit = Some(Said { value, place: origin.place(Some(unit.span())) });
+            draft.unit = Some(Sourced { value, place: origin.place(Some(unit.span())) });
         }
         if let Some(mode) = link.mode {
             let place = origin.place(Some(mode.span()));
-            // The later one counts, of whichever family it is.
+            // The last one applies, whatever its family is.
             (draft.mode, draft.scanner.mode) = match mode.get_ref() {
                 toml::Value::String(name) => (None, Some((name.clone(), place))),
                 value => {
                     let number = value.as_integer().and_then(|number| u8::try_from(number).ok());
                     let known = number.map(Mode).filter(|mode| mode.has_ranges());
                     let refuse = || origin.refuse(Some(mode.span()), format!("mode = {value}"), MODES);
-                    (Some(Said { value: known.ok_or_else(refuse)?, place }), None)
+                    (Some(Sourced { value: known.ok_or_else(refuse)?, place }), None)
                 }
             };
         }
@@ -329,7 +317,7 @@ fn merge(
                     "500000, 38400, 19200 or 9600; it is of an LMS, and the rate of others is the model's",
                 )
             })?;
-            draft.baud = Some(Said { value, place: origin.place(Some(baud.span())) });
+            draft.baud = Some(Sourced { value, place: origin.place(Some(baud.span())) });
         }
         let LinkLayer { pose, zones, marks, lines, motion, background, early, .. } = link;
         draft.own.push((origin.clone(), Sections { pose, zones, marks, lines, motion, background, early }));
@@ -337,8 +325,8 @@ fn merge(
     Ok(())
 }
 
-/// `value * scale` as one of the numbers that `allowed` names.
-fn whole(
+/// Returns `value * scale` if a variant has this number. `allowed` lists the valid values in the failure.
+fn scaled(
     origin: &Origin,
     value: &Spanned<f64>,
     scale: f64,
@@ -351,5 +339,86 @@ fn whole(
     found.ok_or_else(|| origin.refuse(Some(value.span()), format!("{key} = {}", value.get_ref()), allowed))
 }
 
-/// The modes whose values are ranges (Telegram listing, 77h block D).
-const MODES: &str = "0x00 to 0x06, or 0x0F: 0x01 has 3 reflector bits, 0x03 has 2, 0x05 has 1";
+/// Modes whose values are ranges (Telegram listing, 77h block D).
+pub(crate) const MODES: &str = "0x00 to 0x06, or 0x0F: 0x01 has 3 reflector bits, 0x03 has 2, 0x05 has 1";
+
+/// Keys of section `limits`.
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields, expecting = "keys of limits, as { consumers = 32 }")]
+struct LimitsLayer {
+    consumers: Option<Spanned<i64>>,
+}
+
+impl LimitsLayer {
+    /// Applies the keys that are set to `limits`.
+    fn apply(self, origin: &Origin, limits: &mut TopicLimits) -> Result<(), Failure> {
+        let LimitsLayer { consumers } = self;
+        if let Some(consumers) = consumers {
+            let value = usize::try_from(*consumers.get_ref()).ok();
+            let value = value.filter(|value| TopicLimits::CONSUMERS.contains(value));
+            limits.consumers = value.ok_or_else(|| {
+                let what = format!("consumers = {}", consumers.get_ref());
+                let remedy =
+                    format!("{} to {}", TopicLimits::CONSUMERS.start(), TopicLimits::CONSUMERS.end());
+                origin.refuse(Some(consumers.span()), what, remedy)
+            })?;
+        }
+        Ok(())
+    }
+}
+
+/// Returns `link.NAME.KEY=VALUE`, or a key of all links such as `zones.margin=0.05`, as TOML. A value that is not valid
+/// TOML becomes text.
+pub(crate) fn set_as_toml(flag: &str) -> Option<String> {
+    let (path, value) = flag.split_once('=')?;
+    let (table, key) = path.split_once('.')?;
+    let (head, key) = match (table, key.split_once('.')) {
+        ("link", Some((name, key))) => (format!("[[link]]\nname = {}\n", quoted(name)), key),
+        ("link", None) => return None,
+        _ => (String::new(), path),
+    };
+    let is_key = |c: char| c.is_ascii_alphanumeric() || c == '_' || c == '-';
+    if key == "name" || key.split('.').any(|word| word.is_empty() || !word.chars().all(is_key)) {
+        return None;
+    }
+    Some(format!("{head}{key} = {}", to_toml(value)))
+}
+
+/// Returns `NAME=PORT`, followed by any number of `,KEY=VALUE`, as TOML.
+pub(crate) fn link_as_toml(flag: &str) -> Option<String> {
+    let (name, rest) = flag.split_once('=')?;
+    let is_set = |part: &&str| {
+        part.split_once('=')
+            .is_some_and(|(key, _)| key.chars().all(|c| c.is_ascii_lowercase() || c == '_' || c == '.'))
+    };
+    // The name of a port may contain a comma.
+    let parts: Vec<&str> = rest.split(',').collect();
+    let set = parts.iter().rev().take_while(|part| is_set(part)).count().min(parts.len() - 1);
+    let (port, set) = parts.split_at(parts.len() - set);
+    let mut text = format!("[[link]]\nname = {}\nport = {}", quoted(name), quoted(&port.join(",")));
+    for (key, value) in set.iter().filter_map(|part| part.split_once('=')) {
+        text = format!("{text}\n{key} = {}", to_toml(value));
+    }
+    Some(text)
+}
+
+/// Returns `value` as TOML. It becomes text unless it is valid TOML.
+fn to_toml(value: &str) -> String {
+    match toml::from_str::<toml::Table>(&format!("v = {value}")) {
+        Ok(table) if table.len() == 1 => value.to_owned(),
+        _ => quoted(value),
+    }
+}
+
+/// Returns `text` as a TOML string.
+fn quoted(text: &str) -> String {
+    let escaped: String = text
+        .chars()
+        .map(|c| match c {
+            '"' | '\\' => format!("\\{c}"),
+            c if c.is_control() => format!("\\u{:04X}", c as u32),
+            c => c.to_string(),
+        })
+        .collect();
+    format!("\"{escaped}\"")
+}

@@ -1,5 +1,5 @@
-//! The configuration of the hub: links with their ports, and the settings of their sensors. Several sources; the last one
-//! wins.
+//! The configuration of the hub: links with their ports, and the settings of their sensors. A later source takes
+//! precedence over an earlier one.
 
 mod effective;
 mod gateway;
@@ -7,11 +7,10 @@ mod layer;
 mod link;
 mod load;
 pub mod needs;
-mod origin;
-mod places;
 mod processing;
 mod scanner;
 mod sources;
+mod zone_coverage;
 
 pub use effective::{Value, values};
 pub use gateway::Gateway;
@@ -20,5 +19,5 @@ pub use processing::{Background, Processing, Zones};
 pub use scanner::{Scanner, Turning};
 pub use sources::Sources;
 
-/// A configuration to start from, with the default values.
+/// Configuration file to start from, with the default values.
 pub const DEFAULT: &str = include_str!("default.toml");

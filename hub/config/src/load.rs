@@ -78,7 +78,7 @@ impl Gateway {
         for layer in sources.files().chain(sources.settings()) {
             let (origin, layer) = layer?;
             if let Some(section) = layer.gateway {
-                section.lay(&origin, &mut gateway)?;
+                section.apply(&origin, &mut gateway)?;
             }
         }
         Ok(gateway)

@@ -1,5 +1,5 @@
-//! Whether a sensor sees enough of its largest circle to ever find something inside: a zone that nothing can violate is an
-//! error of the configuration. Refuses to know the real sensor; the hub checks again with its scans.
+//! Checks that a sensor's beams cover enough of its largest zone to ever detect a violation. A zone that cannot be
+//! violated is an error of the configuration. The real sensor is unknown here, so the hub checks again with its scans.
 
 use std::rc::Rc;
 
@@ -7,25 +7,24 @@ use preprocess::zones::{Check, Settings};
 use scanhub_drivers::lms::variant::Unit;
 use schema::{Failure, Kind, Scan, ScanHead, Zones};
 
-use super::processing::Sections;
 use crate::link::Link;
-use crate::origin::Origin;
-use crate::processing::Processing;
+use crate::processing::{Processing, Sections};
 use crate::scanner::Scanner;
+use crate::sources::Origin;
 
-/// A link with what was said about it.
-pub(super) struct Sight<'a> {
-    pub(super) link: &'a Link,
-    /// Where the link was begun.
-    pub(super) place: &'a str,
-    /// What was said for all links, then for this one, in the order of the sources.
-    pub(super) said: Vec<&'a (Rc<Origin>, Sections)>,
+/// A link with the sections that its settings come from.
+pub(crate) struct ZoneCoverage<'a> {
+    pub(crate) link: &'a Link,
+    /// Place where the link starts.
+    pub(crate) place: &'a str,
+    /// Sections for all links, then for this one, in the order of the sources.
+    pub(crate) said: Vec<&'a (Rc<Origin>, Sections)>,
 }
 
-impl Sight<'_> {
-    /// [`Kind::Configuration`] with the place of what hinders it if `processing` leaves fewer beams to the largest circle
-    /// than a violation takes.
-    pub(super) fn check(&self) -> Result<(), Failure> {
+impl ZoneCoverage<'_> {
+    /// Returns [`Kind::Configuration`] with the place of the cause if fewer beams can detect something in the largest
+    /// zone than a violation requires.
+    pub(crate) fn check(&self) -> Result<(), Failure> {
         let processing = &self.link.processing;
         let settings = processing.zones.settings();
         let (beams, min_beams) = (self.heads()[0].count.into(), settings.min_beams);
@@ -33,13 +32,13 @@ impl Sight<'_> {
             let what = format!("min_beams = {min_beams}, and a scan has {beams} beams");
             return Err(self.refuse(Sections::min_beams, what, "the default is one beam"));
         }
-        let telling = self.telling(processing, &settings);
-        if telling >= min_beams {
+        let detecting = self.detecting(processing, &settings);
+        if detecting >= min_beams {
             return Ok(());
         }
         let circle_m = f64::from(settings.radii_mm.first().copied().unwrap_or_default()) / 1000.0;
-        let meeting = self.telling(processing, &Settings { self_min: &[], ..settings });
-        let (place, what, remedy): (Place, _, _) = match (meeting, telling) {
+        let meeting = self.detecting(processing, &Settings { self_min: &[], ..settings });
+        let (place, what, remedy): (Place, _, _) = match (meeting, detecting) {
             (0, _) => (
                 Sections::pose,
                 format!("no beam sees into the circle of {circle_m} m"),
@@ -52,15 +51,15 @@ impl Sight<'_> {
             ),
             _ => (
                 Sections::min_beams,
-                format!("min_beams = {min_beams}, and {telling} can see the circle of {circle_m} m"),
+                format!("min_beams = {min_beams}, and {detecting} can see the circle of {circle_m} m"),
                 "set fewer beams, a larger circle, or another pose or self_min",
             ),
         };
         Err(self.refuse(place, what, remedy))
     }
 
-    /// Beams that can tell something of the largest circle, in the best of cases.
-    fn telling(&self, processing: &Processing, settings: &Settings<'_>) -> u16 {
+    /// Returns the maximum number of beams that can detect something in the largest zone.
+    fn detecting(&self, processing: &Processing, settings: &Settings<'_>) -> u16 {
         let of_head = |head: &ScanHead| {
             let beams = usize::from(head.count);
             let mut check = Check::new(processing.pose, settings, beams);
@@ -70,7 +69,8 @@ impl Sight<'_> {
         self.heads().iter().map(of_head).max().unwrap_or_default()
     }
 
-    /// What its scans may be like: the measuring mode of an LMS is not known here, nor its unit if none is expected.
+    /// Returns the possible heads of its scans. The measuring mode of an LMS is unknown here, and so is its unit if
+    /// none is configured.
     fn heads(&self) -> Vec<ScanHead> {
         let &Link { scanner, variant, unit, .. } = self.link;
         match scanner {
@@ -79,14 +79,14 @@ impl Sight<'_> {
                 let step_mdeg = u32::from(variant.resolution_cdeg) * 10;
                 let (beams, first) = (variant.beams(), variant.first_angle_mdeg());
                 units
-                    .map(|unit| ScanHead::lms(beams, first, step_mdeg, unit.mm().into(), MOST_RANGE_BITS))
+                    .map(|unit| ScanHead::lms(beams, first, step_mdeg, unit.mm().into(), MAX_RANGE_BITS))
                     .collect()
             }
             Scanner::Turning(turning) => vec![ScanHead::turning(turning.family, turning.most_beams())],
         }
     }
 
-    /// The place is where `place` was said last; where the link was begun if nobody said it.
+    /// Returns the failure at the last place where `place` is set, or at the start of the link if it is not set.
     fn refuse(&self, place: Place, what: String, remedy: &str) -> Failure {
         let at = |(origin, sections): &&(Rc<Origin>, Sections)| Some(origin.place(Some(place(sections)?)));
         let place = self.said.iter().rev().find_map(at).unwrap_or_else(|| self.place.to_owned());
@@ -97,5 +97,5 @@ impl Sight<'_> {
 
 type Place = fn(&Sections) -> Option<std::ops::Range<usize>>;
 
-/// Of all measuring modes (Telegram listing, 77h block D).
-const MOST_RANGE_BITS: u8 = 15;
+/// Highest value of all measuring modes (Telegram listing, 77h block D).
+const MAX_RANGE_BITS: u8 = 15;
