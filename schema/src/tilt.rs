@@ -223,9 +223,9 @@ pub const OBSTACLES: usize = 64;
 #[cfg_attr(feature = "ipc", derive(ZeroCopySend), type_name("scanhub.Obstacles.v2"))]
 #[repr(C)]
 pub struct Obstacles {
-    /// Number of the sweep, as in a [`Cloud`](crate::Cloud).
+    /// Number of the sweep, as in a [`Cloud`].
     pub sweep: u32,
-    /// Generation of the background, as in a [`Cloud`](crate::Cloud).
+    /// Generation of the background, as in a [`Cloud`].
     pub generation: u32,
     /// Number of obstacles that did not fit.
     pub left_out: u32,

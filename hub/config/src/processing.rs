@@ -335,7 +335,7 @@ impl Sections {
         Ok(())
     }
 
-    /// Returns [`Kind::Configuration`](schema::Kind::Configuration) if these sections, which belong to one link, set a
+    /// Returns [`Kind::Configuration`] if these sections, which belong to one link, set a
     /// key that a scanner of `family` does not have. A key for all links applies to the families that have it.
     pub(crate) fn check_family(&self, origin: &Origin, family: Family) -> Result<(), Failure> {
         if let Some(early) = &self.early {
@@ -602,7 +602,7 @@ impl EarlyLayer {
         put(&mut early.pieces, self.pieces, |value| whole(origin, "pieces", value, 2..=8))
     }
 
-    /// Returns [`Kind::Configuration`](schema::Kind::Configuration) if it is set for a `family` other than the LMS.
+    /// Returns [`Kind::Configuration`] if it is set for a `family` other than the LMS.
     /// Their packets are short already.
     pub(crate) fn check_family(&self, origin: &Origin, family: Family) -> Result<(), Failure> {
         let foreign = self.pieces.as_ref().filter(|_| family != Family::Lms);

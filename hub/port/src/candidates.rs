@@ -10,7 +10,7 @@ use std::path::{Path, PathBuf};
 use rustix::fs::{Access, access, major, minor};
 
 use super::PortError;
-use super::holder::{Holder, holders};
+use super::access::{Holder, holders};
 
 /// A serial line of this machine.
 #[derive(Clone, Debug, PartialEq, Eq)]

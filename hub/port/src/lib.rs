@@ -1,40 +1,99 @@
-//! Where a link's bytes come from: a serial line, on this machine or behind a serial server. No caller knows how it is
-//! opened, or what can go wrong then.
+//! Ports of links: a serial line of this machine, or one behind a serial server. The other crates of the hub open and
+//! use them only through [`Port`].
 
-mod allowance;
+mod access;
 mod candidates;
 pub mod clock;
-mod holder;
-mod kernel;
-mod line_errors;
-mod line_settings;
 mod port_error;
-mod rights;
-mod source;
 mod tcp;
 mod tty;
+mod uart;
 mod usb_adapter;
 
 use std::io;
 use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
 
 use schema::Failure;
 
-pub use allowance::Allowance;
+pub use access::{Holder, Ownership, Rights, all_holders, altering_program, holder};
 pub use candidates::{Candidate, PROMPT_MS, candidates, check_tty, found_in, is_tty, latency_ms};
-pub use holder::{Holder, all_holders, altering_program, holder};
-pub use kernel::Counts;
-pub use line_errors::LineErrors;
 pub use port_error::PortError;
-pub use rights::{Ownership, Rights};
-pub use source::Source;
-pub use tcp::{Dial, Tcp};
+pub use tcp::{Allowance, Dial, Tcp};
 pub use tty::{Alteration, Tty};
+pub use uart::{Counts, LineErrors};
 pub use usb_adapter::{PortlessAdapter, Reason};
 
-/// An open line to a sensor; reads and writes never block.
+/// Source of a link's bytes, as it is written in a configuration.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Source {
+    /// A serial line.
+    Tty(PathBuf),
+    /// A line behind a serial server (`tcp:HOST:PORT`), which must be set to the link's rate.
+    Tcp {
+        /// Name or address, an IPv6 address without its brackets.
+        host: String,
+        /// Port in raw TCP mode.
+        port: u16,
+    },
+    /// A recording (`file:PATH`), replayed with its scan period or, with `?rate=max`, as fast as it can be read.
+    File {
+        /// The recording.
+        path: PathBuf,
+        /// Whether the scan period is kept.
+        paced: bool,
+    },
+}
+
+impl Source {
+    /// Returns the source as it is written in a configuration.
+    pub fn name(&self) -> String {
+        match self {
+            Source::Tty(path) => path.display().to_string(),
+            Source::Tcp { host, port } if host.contains(':') => format!("tcp:[{host}]:{port}"),
+            Source::Tcp { host, port } => format!("tcp:{host}:{port}"),
+            Source::File { path, paced: true } => format!("file:{}", path.display()),
+            Source::File { path, paced: false } => format!("file:{}?rate=max", path.display()),
+        }
+    }
+
+    /// Parses the source in `text`.
+    ///
+    /// # Errors
+    ///
+    /// Returns a message if it is not valid.
+    pub fn parse(text: &str) -> Result<Source, &'static str> {
+        if let Some(server) = text.strip_prefix("tcp:") {
+            let (host, port) = server.rsplit_once(':').ok_or("tcp: without a port: write tcp:HOST:PORT")?;
+            let port =
+                port.parse().ok().filter(|&port| port > 0).ok_or("tcp: the port is a number to 65535")?;
+            let bare = host.strip_prefix('[').and_then(|host| host.strip_suffix(']'));
+            return match bare.unwrap_or(host) {
+                "" => Err("tcp: without a host: write tcp:HOST:PORT"),
+                host if bare.is_none() && host.contains(':') => {
+                    Err("an IPv6 address stands in brackets: tcp:[ADDRESS]:PORT")
+                }
+                host => Ok(Source::Tcp { host: host.to_owned(), port }),
+            };
+        }
+        let Some(file) = text.strip_prefix("file:") else {
+            return if text.is_empty() { Err("the port is empty") } else { Ok(Source::Tty(text.into())) };
+        };
+        let (path, paced) = match file.split_once('?') {
+            None => (file, true),
+            Some((path, "rate=max")) => (path, false),
+            Some(_) => return Err("the only option of a file is rate=max"),
+        };
+        if path.is_empty() {
+            Err("the file has no name")
+        } else {
+            Ok(Source::File { path: path.into(), paced })
+        }
+    }
+}
+
+/// An open port. Reads and writes never block.
 pub enum Port {
     /// A serial line, exclusive and raw.
     Tty(Tty),
@@ -43,15 +102,15 @@ pub enum Port {
 }
 
 impl Port {
-    /// Opens `source` at `baud`. Waits for a serial server, some seconds at most, or until `stop` is set.
+    /// Opens `source` at `baud`. Waits for a serial server for some seconds at most, or until `stop` is set.
     ///
-    /// A failure of one of the port kinds, with its remedy; of kind `short` without descriptors, of kind
-    /// `configuration` if it is a recording, of kind `interrupted` if `stop` is set.
+    /// Returns a failure of one of the kinds for ports, with its remedy. The kind is `short` without descriptors,
+    /// `configuration` for a recording, and `interrupted` if `stop` is set.
     pub fn open(source: &Source, baud: u32, stop: &AtomicBool) -> Result<Port, Failure> {
         Port::attempt(source, baud, stop).map_err(|refusal| refusal.explain(source))
     }
 
-    /// As [`Port::open`], for repeated tries: only the reason, without looking up its circumstances.
+    /// Does the same as [`Port::open`], for repeated attempts. It returns only the reason, without looking up details.
     pub fn attempt(source: &Source, baud: u32, stop: &AtomicBool) -> Result<Port, PortError> {
         match source {
             Source::Tty(path) => Tty::open(path, baud).map(Port::Tty),
@@ -60,21 +119,21 @@ impl Port {
         }
     }
 
-    /// Continues with `line`, which an earlier hub had opened, if it still is what `source` names.
+    /// Continues with `line`, which an earlier hub had opened, if `source` still names it.
     pub fn adopt(line: OwnedFd, source: &Source, baud: u32) -> Option<Port> {
         match source {
             Source::Tty(path) => Tty::adopt(line, path, baud).ok().map(Port::Tty),
-            // What stands in a connection that nobody reads is old, and the other end may have given up.
+            // Bytes in a connection that no program reads become old, and the server may have closed it.
             Source::Tcp { .. } | Source::File { .. } => None,
         }
     }
 
-    /// Whether `source` names the `line`, which is open.
+    /// Returns whether `source` names the open `line`.
     pub fn is_at(line: &OwnedFd, source: &Source) -> bool {
         matches!(source, Source::Tty(path) if Tty::is_at(line, path))
     }
 
-    /// Whether another program simulates the sensor.
+    /// Returns whether another program simulates the sensor.
     pub fn simulated(&self) -> bool {
         match self {
             Port::Tty(tty) => tty.is_simulated(),
@@ -82,7 +141,7 @@ impl Port {
         }
     }
 
-    /// Starts to open `source` if that takes time; nothing if [`Port::attempt`] returns at once.
+    /// Starts to open `source` if that takes time. `None` if [`Port::attempt`] returns at once.
     pub fn dial(source: &Source) -> Option<Result<Dial, PortError>> {
         match source {
             Source::Tcp { host, port } => Some(Dial::start(host, *port)),
@@ -90,8 +149,8 @@ impl Port {
         }
     }
 
-    /// Changes the rate, and discards what arrived at the old one. An error of kind `Unsupported` means that the driver
-    /// refused it or set another rate, or that it cannot be changed from here.
+    /// Changes the rate, and discards the bytes that arrived at the old one. An error of kind `Unsupported` means that
+    /// the driver rejected the rate or set another one, or that the rate cannot be changed from here.
     pub fn set_baud(&self, baud: u32) -> io::Result<()> {
         match self {
             Port::Tty(tty) => tty.set_baud(baud),
@@ -102,7 +161,7 @@ impl Port {
         }
     }
 
-    /// Asserts DTR, or clears it; what has no such line ignores it.
+    /// Asserts or clears DTR. A port without this line ignores it.
     pub fn set_dtr(&self, on: bool) -> io::Result<()> {
         match self {
             Port::Tty(tty) => tty.set_dtr(on),
@@ -110,7 +169,8 @@ impl Port {
         }
     }
 
-    /// As [`Port::set_baud`], for callers with other rates to try: returns the error if this rate is not possible.
+    /// Does the same as [`Port::set_baud`], for callers that can try other rates. Returns the error if this rate is not
+    /// possible.
     pub fn try_baud(&self, baud: u32) -> io::Result<Option<io::Error>> {
         match self.set_baud(baud) {
             Err(error) if error.kind() == io::ErrorKind::Unsupported => Ok(Some(error)),
@@ -118,7 +178,7 @@ impl Port {
         }
     }
 
-    /// Discards what arrived, and uses `baud` from now on; a serial server keeps its own rate.
+    /// Discards the bytes that have arrived, and uses `baud` from now on. A serial server keeps its rate.
     pub fn discard_input(&self, baud: u32) -> io::Result<()> {
         match self {
             Port::Tty(tty) => tty.set_baud(baud),
@@ -126,7 +186,7 @@ impl Port {
         }
     }
 
-    /// How many bytes there are to read; nothing if asking is not worth it.
+    /// Returns the number of bytes in the tty's input buffer, or `None` for a network port.
     pub fn waiting(&self) -> Option<usize> {
         match self {
             Port::Tty(tty) => tty.waiting(),
@@ -134,7 +194,7 @@ impl Port {
         }
     }
 
-    /// How much may be read of it: of a serial line, which has a rate, all that there is.
+    /// Returns the read budget of a network port. `None` for a tty, which is never throttled.
     pub fn allowance(&self, baud: u32) -> Option<Allowance> {
         match self {
             Port::Tty(_) => None,
@@ -142,7 +202,7 @@ impl Port {
         }
     }
 
-    /// Reads what there is: 0 bytes if nothing, an error if the line is gone.
+    /// Reads the available bytes, 0 if there are none. Returns an error if the line is lost.
     pub fn read(&self, buffer: &mut [u8]) -> io::Result<usize> {
         match self {
             Port::Tty(tty) => tty.read(buffer),
@@ -150,17 +210,16 @@ impl Port {
         }
     }
 
-    /// Writes one byte; a full line drops it, as a cable would, and the request is tried again.
+    /// Writes one byte. A full line drops it, as a cable would, and the session repeats the request.
     pub fn write(&self, byte: u8) -> io::Result<()> {
         match self {
             Port::Tty(tty) => tty.write(byte),
             Port::Tcp(tcp) => tcp.write(byte),
         }
     }
-}
 
-impl Port {
-    /// Errors that the driver counted on the line since the last call; 0, without asking it, if it counts none.
+    /// Returns the errors that the driver counted on the line since the last call. Returns 0, without a system call, if
+    /// it counts none.
     pub fn line_errors(&self) -> u64 {
         match self {
             Port::Tty(tty) => tty.line_errors(),
@@ -168,7 +227,7 @@ impl Port {
         }
     }
 
-    /// What the driver counted on the line since it was loaded, if it counts.
+    /// Returns the driver's counters since it was loaded, if it has any.
     pub fn counts(&self) -> Option<Counts> {
         match self {
             Port::Tty(tty) => tty.counts(),
@@ -176,8 +235,8 @@ impl Port {
         }
     }
 
-    /// Returns the settings that another process has made since those of this process; `None` if they are unchanged, or
-    /// made elsewhere.
+    /// Returns the settings that another process has changed. `None` if they are unchanged, or if the settings are made
+    /// elsewhere.
     ///
     /// # Errors
     ///
@@ -189,8 +248,8 @@ impl Port {
         }
     }
 
-    /// Makes the settings of this process again, at `baud`, and discards the input that arrived with others. A rate that the
-    /// driver refuses stays as it is; a search tries others.
+    /// Restores the settings of this process, at `baud`, and discards the input that arrived with others. If the driver
+    /// rejects the rate, the rate stays as it is, and a search tries others.
     ///
     /// # Errors
     ///
@@ -210,7 +269,7 @@ impl Port {
         }
     }
 
-    /// The rate that the driver reports; nothing if the rate is set elsewhere.
+    /// Returns the rate that the driver reports; `None` if the rate is set elsewhere.
     pub fn baud(&self) -> Option<u32> {
         match self {
             Port::Tty(tty) => tty.baud(),

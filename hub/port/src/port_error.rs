@@ -8,9 +8,8 @@ use std::path::Path;
 use rustix::io::Errno;
 use schema::{Failure, Kind};
 
+use super::access::{Holder, Rights, holder, is_own, lock_owner};
 use super::candidates::{Candidate, candidates};
-use super::holder::{Holder, holder, is_own, lock_owner};
-use super::rights::Rights;
 use super::usb_adapter::PortlessAdapter;
 use crate::Source;
 

@@ -1,6 +1,10 @@
-//! A serial line behind a serial server on the network, as a plain stream of bytes. Its rate is set in the server and
-//! cannot be changed from here. Resolving a name and connecting can block for an unknown time: a separate thread does
-//! both, and ends by itself.
+//! A serial line behind a serial server on the network: a plain stream of bytes. Its rate is set in the server and cannot be
+//! changed from here. Resolving a name and connecting can block for an unknown time, so a separate thread does both, and ends
+//! by itself.
+//!
+//! A connection can deliver more than any line. The read budget allows twice as much as the line carries, and up to one second
+//! of that at once, because a network delays data and catches up. The rest stays in the connection, and is older than it seems
+//! when it is read.
 
 use std::io::{self, ErrorKind, PipeReader, PipeWriter};
 use std::net::{SocketAddr, TcpStream, ToSocketAddrs};
@@ -15,21 +19,21 @@ use rustix::net::sockopt::{
     set_socket_keepalive, set_tcp_keepcnt, set_tcp_keepidle, set_tcp_keepintvl, set_tcp_nodelay,
     set_tcp_user_timeout,
 };
-use schema::shortage;
+use schema::{MILLIS, Nanos, line_time, shortage};
 
-use super::{Port, PortError};
+use crate::{Port, PortError};
 
-/// A connection to a serial server; reads and writes never block.
+/// A connection to a serial server. Reads and writes never block.
 pub struct Tcp {
     stream: TcpStream,
 }
 
 impl Tcp {
-    /// Connects to `port` of `host`, and waits for the outcome, or until `stop` is set.
+    /// Connects to `port` of `host`, and waits for the result, or until `stop` is set.
     pub(crate) fn open(host: &str, port: u16, stop: &AtomicBool) -> Result<Tcp, PortError> {
         let dial = Dial::start(host, port)?;
-        for _ in 0..LOOKS {
-            match dial.outcome.recv_timeout(LOOK) {
+        for _ in 0..MAX_POLLS {
+            match dial.outcome.recv_timeout(POLL_INTERVAL) {
                 Ok(outcome) => return outcome,
                 Err(_) if stop.load(Ordering::Relaxed) => return Err(PortError::Interrupted),
                 Err(_) => {}
@@ -46,11 +50,11 @@ impl Tcp {
         }
     }
 
-    /// Discards what arrived.
+    /// Discards the bytes that have arrived.
     pub(crate) fn forget(&self) -> io::Result<()> {
         let mut buffer = [0; 4096];
-        // Bounded, for somebody may send as fast as this reads.
-        for _ in 0..MOST_FORGOTTEN / buffer.len() {
+        // The loop is bounded, because the server may send as fast as this reads.
+        for _ in 0..MAX_DISCARDED / buffer.len() {
             if self.read(&mut buffer)? == 0 {
                 break;
             }
@@ -66,9 +70,9 @@ impl Tcp {
     }
 
     fn new(stream: TcpStream) -> Result<Tcp, Errno> {
-        // The bytes of a request leave one by one, as the sensor wants them.
+        // The bytes of a request are sent one by one, as the scanner requires.
         set_tcp_nodelay(&stream, true)?;
-        // A server that lost its power says nothing; the socket shall notice.
+        // A server that has lost power sends nothing. With keepalive, the socket reports an error.
         set_socket_keepalive(&stream, true)?;
         set_tcp_keepidle(&stream, Duration::from_secs(2))?;
         set_tcp_keepintvl(&stream, Duration::from_secs(1))?;
@@ -88,18 +92,18 @@ impl AsFd for Tcp {
 /// A connection attempt. Its descriptor is ready when the attempt has ended.
 pub struct Dial {
     outcome: Receiver<Result<Tcp, PortError>>,
-    /// Ready once its other end is gone.
+    /// Readable once the thread has dropped the other end.
     ready: PipeReader,
 }
 
 impl Dial {
-    /// Begins.
+    /// Starts an attempt.
     pub(crate) fn start(host: &str, port: u16) -> Result<Dial, PortError> {
         let (ready, open_end) = io::pipe().map_err(|error| PortError::of_io(&error))?;
         let (send, outcome) = channel();
         let host = host.to_owned();
-        let body = move || tell(connect(&host, port), &send, open_end);
-        // A thread is refused by AGAIN.
+        let body = move || report(connect(&host, port), &send, open_end);
+        // The system refuses a thread with AGAIN.
         let refuse = |error: io::Error| match PortError::of_io(&error) {
             PortError::Other(Errno::AGAIN) => PortError::Short(Errno::AGAIN),
             refusal => refusal,
@@ -108,7 +112,7 @@ impl Dial {
         Ok(Dial { outcome, ready })
     }
 
-    /// The result; a refusal if it has not ended.
+    /// Returns the result, or an error if the attempt has not ended.
     pub fn finish(self) -> Result<Port, PortError> {
         self.outcome.try_recv().unwrap_or(Err(PortError::TimedOut)).map(Port::Tcp)
     }
@@ -120,8 +124,8 @@ impl AsFd for Dial {
     }
 }
 
-fn tell(outcome: Result<Tcp, PortError>, send: &Sender<Result<Tcp, PortError>>, open_end: PipeWriter) {
-    // A caller that gave up waiting does not need the result.
+fn report(outcome: Result<Tcp, PortError>, send: &Sender<Result<Tcp, PortError>>, open_end: PipeWriter) {
+    // A caller that has stopped waiting does not need the result.
     let _ = send.send(outcome);
     drop(open_end);
 }
@@ -129,15 +133,15 @@ fn tell(outcome: Result<Tcp, PortError>, send: &Sender<Result<Tcp, PortError>>, 
 fn connect(host: &str, port: u16) -> Result<Tcp, PortError> {
     let addresses: Vec<SocketAddr> = match (host, port).to_socket_addrs() {
         Ok(addresses) => addresses.collect(),
-        // A look-up that lacks descriptors says that there is no such host.
-        Err(_) if shortage::check_descriptors(LOOK_UP).is_err() => {
+        // Without descriptors, a lookup reports that the host does not exist.
+        Err(_) if shortage::check_descriptors(LOOKUP_DESCRIPTORS).is_err() => {
             return Err(PortError::Short(Errno::MFILE));
         }
         Err(error) => return Err(failed(&error, PortError::NoHost)),
     };
     let mut last = PortError::NoHost("it has no address".to_owned());
     for address in addresses {
-        match TcpStream::connect_timeout(&address, CONNECT) {
+        match TcpStream::connect_timeout(&address, CONNECT_TIMEOUT) {
             Ok(stream) => return Ok(Tcp::new(stream)?),
             Err(error) if error.kind() == ErrorKind::TimedOut => last = PortError::TimedOut,
             Err(error) if error.kind() == ErrorKind::ConnectionRefused => last = PortError::Refused,
@@ -147,7 +151,8 @@ fn connect(host: &str, port: u16) -> Result<Tcp, PortError> {
     Err(last)
 }
 
-/// What is short here is neither the network's fault nor the server's, which `otherwise` tells of.
+/// Returns the reason for `error`. If this machine is short of something, neither the network nor the server is the
+/// cause. Otherwise `otherwise` creates the reason.
 fn failed(error: &io::Error, otherwise: fn(String) -> PortError) -> PortError {
     match PortError::of_io(error) {
         short @ PortError::Short(_) => short,
@@ -155,16 +160,91 @@ fn failed(error: &io::Error, otherwise: fn(String) -> PortError) -> PortError {
     }
 }
 
-/// Descriptors that looking up a name takes at the most: a file, and a socket for each of its servers.
-const LOOK_UP: u64 = 4;
-/// A serial server in the same house answers sooner.
-const CONNECT: Duration = Duration::from_secs(3);
-/// Bytes that are thrown away at the most: more than a minute of 500 kBd.
-const MOST_FORGOTTEN: usize = 1 << 24;
-/// Between two looks whether somebody wants to stop.
-const LOOK: Duration = Duration::from_millis(100);
-/// Six seconds for name and connection together.
-const LOOKS: u32 = 60;
+/// Maximum number of descriptors for looking up a name: a file, and a socket for each of its servers.
+const LOOKUP_DESCRIPTORS: u64 = 4;
+/// Timeout of a connection. A serial server in the same building replies sooner.
+const CONNECT_TIMEOUT: Duration = Duration::from_secs(3);
+/// Maximum number of bytes to discard: more than a minute at 500 kBd.
+const MAX_DISCARDED: usize = 1 << 24;
+/// Interval between checks of `stop`.
+const POLL_INTERVAL: Duration = Duration::from_millis(100);
+/// Number of checks: six seconds for name and connection together.
+const MAX_POLLS: u32 = 60;
+
+/// Read budget of a network port. The clock is an argument.
+#[derive(Clone, Debug)]
+pub struct Allowance {
+    /// Time that a byte costs.
+    byte_ns: Nanos,
+    /// Time until which the budget is spent.
+    spent: Nanos,
+    /// First and last time of the current period in which the budget was exhausted.
+    short: Option<(Nanos, Nanos)>,
+    /// Whether the last read filled its buffer, so that more bytes may be available.
+    is_full: bool,
+}
+
+impl Allowance {
+    /// Creates a full budget at time `now`, for a line of `baud`.
+    pub fn new(baud: u32, now: Nanos) -> Allowance {
+        let byte_ns = line_time(1, baud) / BUDGET_FACTOR;
+        Allowance { byte_ns, spent: now.saturating_sub(BURST), short: None, is_full: false }
+    }
+
+    /// Returns the number of bytes that may be read at `now`.
+    pub fn bytes(&self, now: Nanos) -> usize {
+        (now.saturating_sub(self.begin(now)) / self.byte_ns) as usize
+    }
+
+    /// Records that `len` bytes were read at `now` into a buffer of `room` bytes.
+    pub fn take(&mut self, len: usize, room: usize, now: Nanos) {
+        self.is_full = len > 0 && len == room;
+        self.spent = self.begin(now) + len as Nanos * self.byte_ns;
+    }
+
+    /// Returns when reading may resume, if the budget at `now` is too small to pay off. Until then, the caller only
+    /// waits for this time. `until` is the caller's next deadline, for which a single byte may be read.
+    pub fn rest(&mut self, now: Nanos, until: Nanos) -> Option<Nanos> {
+        let (any_at, enough_at) = (self.spent + self.byte_ns, self.spent + PORTION);
+        if now >= enough_at {
+            return None;
+        }
+        let since =
+            self.short.filter(|&(_, last)| now < last + RECOVERY_TIME).map_or(now, |(since, _)| since);
+        self.short = Some((since, now));
+        // An overdue action waits for the end of the available bytes, which was not reached.
+        Some(if until > now { until.clamp(any_at, enough_at) } else { enough_at })
+    }
+
+    /// Returns whether more bytes than the budget have been arriving for a while, as of `now`.
+    pub fn is_flooded(&self, now: Nanos) -> bool {
+        self.short.is_some_and(|(since, last)| now < last + RECOVERY_TIME && last >= since + FLOOD_THRESHOLD)
+    }
+
+    /// Returns whether the last bytes read may have been buffered in the connection, as of `now`: there were more bytes
+    /// than could be read, now or a moment ago.
+    pub fn is_behind(&self, now: Nanos) -> bool {
+        self.is_full || self.short.is_some_and(|(_, last)| now < last + SETTLE_TIME)
+    }
+
+    /// Returns the time from which the budget is still unspent.
+    fn begin(&self, now: Nanos) -> Nanos {
+        self.spent.max(now.saturating_sub(BURST))
+    }
+}
+
+/// Factor between the budget and the rate of the line.
+const BUDGET_FACTOR: Nanos = 2;
+/// Maximum time for which unspent budget accumulates.
+const BURST: Nanos = 1_000 * MILLIS;
+/// Amount of budget to wait for when it is exhausted.
+const PORTION: Nanos = 20 * MILLIS;
+/// Minimum duration of a flood. Bytes that a network delayed are normally read within a second.
+const FLOOD_THRESHOLD: Nanos = 1_500 * MILLIS;
+/// Time without exhaustion after which bytes count as new. A network that catches up delivers bytes in bursts.
+const SETTLE_TIME: Nanos = 200 * MILLIS;
+/// Time without exhaustion after which a period of it has ended.
+const RECOVERY_TIME: Nanos = 5_000 * MILLIS;
 
 #[cfg(test)]
 mod tests {
@@ -178,5 +258,107 @@ mod tests {
         assert!(matches!(of(Errno::HOSTUNREACH), PortError::Network(_)));
         let unknown = io::Error::other("Name or service not known");
         assert!(matches!(failed(&unknown, PortError::NoHost), PortError::NoHost(_)));
+    }
+
+    const BAUD: u32 = 500_000;
+    const SECOND: Nanos = 1_000 * MILLIS;
+
+    /// Reads from `begin` to `end` while more bytes are always available. Returns the number of bytes and of reads.
+    fn flooded(allowance: &mut Allowance, begin: Nanos, end: Nanos) -> (usize, u32) {
+        let (mut now, mut read, mut reads) = (begin, 0, 0);
+        while now < end {
+            match allowance.rest(now, Nanos::MAX) {
+                Some(until) => now = until,
+                None => {
+                    let len = allowance.bytes(now).min(900);
+                    allowance.take(len, len, now);
+                    (read, reads) = (read + len, reads + 1);
+                    now += 1;
+                }
+            }
+        }
+        (read, reads)
+    }
+
+    #[test]
+    fn a_flood_is_twice_the_line_behind_a_second_at_once() {
+        for baud in [500_000, 38_400, 9_600] {
+            let mut allowance = Allowance::new(baud, 9 * SECOND);
+            let second = baud as usize / 10 * 2;
+            let (read, _) = flooded(&mut allowance, 9 * SECOND, 10 * SECOND);
+            assert!((2 * second - second / 40..=2 * second).contains(&read), "{baud}: {read}");
+            let (read, reads) = flooded(&mut allowance, 10 * SECOND, 20 * SECOND);
+            assert!(
+                (10 * second - second / 40..=10 * second + second / 40).contains(&read),
+                "{baud}: {read}"
+            );
+            assert!(reads <= 2_000, "{baud}: {reads}");
+            assert!(allowance.is_flooded(20 * SECOND) && !allowance.is_flooded(30 * SECOND));
+            // A pause refills the budget, up to one second.
+            assert_eq!(allowance.bytes(90 * SECOND), second);
+        }
+    }
+
+    #[test]
+    fn a_line_as_it_should_be_is_read_whenever_it_brings_something() {
+        let mut allowance = Allowance::new(BAUD, SECOND);
+        for now in (SECOND..60 * SECOND).step_by(MILLIS as usize) {
+            assert_eq!(allowance.rest(now, Nanos::MAX), None);
+            allowance.take(50, 900, now);
+            assert!(!allowance.is_behind(now));
+        }
+        // Half a second of bytes was buffered in the network.
+        assert!(allowance.bytes(60 * SECOND) > 25_000);
+        allowance.take(25_000, 25_000, 60 * SECOND);
+        assert!(allowance.is_behind(60 * SECOND), "more may be there");
+        allowance.take(10, 900, 60 * SECOND);
+        assert_eq!(allowance.rest(60 * SECOND, Nanos::MAX), None);
+        assert!(!allowance.is_flooded(60 * SECOND) && !allowance.is_behind(60 * SECOND));
+    }
+
+    #[test]
+    fn whoever_reads_what_waited_is_behind_until_it_has_caught_up() {
+        for (standstill, longest_ms) in [(1, 1), (5, 3_500), (20, 19_000)] {
+            // The line sends all the time.
+            let arrived = |now: Nanos| (now / 20_000) as usize;
+            let mut allowance = Allowance::new(BAUD, 0);
+            let (mut now, mut read) = (standstill * SECOND, 0);
+            let mut caught_up = None;
+            while now < 60 * SECOND {
+                if let Some(until) = allowance.rest(now, Nanos::MAX) {
+                    now = until;
+                    continue;
+                }
+                let room = allowance.bytes(now).clamp(1, 900);
+                let len = room.min(arrived(now) - read);
+                allowance.take(len, room, now);
+                // Age of the first byte that was read.
+                let age = now - read as Nanos * 20_000;
+                read += len;
+                assert!(allowance.is_behind(now) || age <= 40 * MILLIS, "{age} ns old at {now}");
+                match caught_up {
+                    None if !allowance.is_behind(now) => caught_up = Some(now - standstill * SECOND),
+                    None => {}
+                    Some(_) => assert!(!allowance.is_behind(now), "once it has caught up"),
+                }
+                now += if len < room { MILLIS } else { 1 };
+            }
+            let took = caught_up.expect("it catches up");
+            assert!(took <= longest_ms * MILLIS, "{standstill} s: {took}");
+        }
+    }
+
+    #[test]
+    fn what_is_due_is_done_and_nobody_spins() {
+        let mut allowance = Allowance::new(BAUD, SECOND);
+        allowance.take(100_000, 100_000, SECOND);
+        assert_eq!(allowance.bytes(SECOND), 0);
+        let (byte, portion) = (SECOND + 10_000, SECOND + PORTION);
+        assert_eq!(allowance.rest(SECOND, SECOND + 1), Some(byte), "a byte has to be allowed");
+        assert_eq!(allowance.rest(SECOND, 0), Some(portion), "it is overdue");
+        assert_eq!(allowance.rest(SECOND, byte + 5), Some(byte + 5));
+        assert_eq!(allowance.rest(SECOND, Nanos::MAX), Some(portion));
+        assert_eq!((allowance.bytes(byte), allowance.bytes(portion)), (1, 2_000));
+        assert!(!allowance.is_flooded(portion), "it was short once");
     }
 }

@@ -1,9 +1,15 @@
 //! A serial line: opened exclusively, raw, and at a rate that the driver has confirmed.
+//!
+//! Rate, character and handshake are set by crate `serialport`, on a descriptor that was opened and locked here. Only settings
+//! that differ are set: each one reaches the driver separately, and a line that streams must not be disturbed. Two things are
+//! not taken from that crate: its `set_parity`, which makes the driver drop bytes with errors (IGNPAR), while here every byte
+//! counts; and the number of an error, which it does not keep.
 
 use std::cell::Cell;
 use std::fmt;
 use std::io::{self, ErrorKind};
-use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
+use std::mem::ManuallyDrop;
+use std::os::fd::{AsFd, AsRawFd, BorrowedFd, FromRawFd, OwnedFd};
 use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 
@@ -13,40 +19,40 @@ use rustix::termios::{
     ControlModes, InputModes, LocalModes, OptionalActions, OutputModes, SpecialCodeIndex, Termios,
     ioctl_tiocexcl, ioctl_tiocnxcl, tcgetattr, tcsetattr,
 };
+use serialport::{ClearBuffer, DataBits, FlowControl, SerialPort, StopBits, TTYPort};
 
 use super::PortError;
 use super::candidates::{PROMPT_MS, check_tty, is_tty, latency_ms};
-use super::kernel::{self, Counts};
-use super::line_settings;
+use super::uart::{Counts, set_low_latency};
 
-/// An open serial line, exclusive and raw; reads and writes never block.
+/// An open serial line, exclusive and raw. Reads and writes never block.
 pub struct Tty {
     line: OwnedFd,
     /// Device that the port's name resolved to when it was opened.
     device: PathBuf,
-    /// Settings of this process, to detect those of another one.
+    /// Settings that this process made, to detect changes by another one.
     settings: Cell<Settings>,
-    /// The driver's count of errors when it was last looked at; nothing if it has none.
+    /// The driver's count of errors when it was last read; `None` if it has none.
     errors: Cell<Option<u32>>,
 }
 
 impl Tty {
-    /// Opens `path` at `baud`. What lies in the line's buffer stays there: it may be what a hub that crashed did not
-    /// read.
+    /// Opens `path` at `baud`. The bytes in the line's buffer stay there, because a hub that crashed may not have read
+    /// them.
     pub(crate) fn open(path: &Path, baud: u32) -> Result<Tty, PortError> {
         check_tty(path)?;
         let flags = OFlags::RDWR | OFlags::NOCTTY | OFlags::NONBLOCK | OFlags::CLOEXEC;
         Tty::begin(open(path, flags, Mode::empty())?, path, baud)
     }
 
-    /// As [`Tty::open`], of a `line` that is open already.
+    /// Does the same as [`Tty::open`] with a `line` that is already open.
     ///
-    /// [`PortError::Missing`] if `path` names another line by now.
+    /// Returns [`PortError::Missing`] if `path` names another line by now.
     pub(crate) fn adopt(line: OwnedFd, path: &Path, baud: u32) -> Result<Tty, PortError> {
         if Tty::is_at(&line, path) { Tty::begin(line, path, baud) } else { Err(PortError::Missing) }
     }
 
-    /// Whether `path` names the `line`, which is open.
+    /// Returns whether `path` names the open `line`.
     pub(crate) fn is_at(line: &OwnedFd, path: &Path) -> bool {
         let open = fstat(line).map(|stat| stat.st_rdev);
         path.metadata().is_ok_and(|now| open == Ok(now.rdev())) && is_tty(path)
@@ -54,7 +60,7 @@ impl Tty {
 
     fn begin(line: OwnedFd, path: &Path, baud: u32) -> Result<Tty, PortError> {
         let termios = tcgetattr(&line)?;
-        // Before the exclusive mode: who does not get the lock must not end that of its owner.
+        // Lock before setting the exclusive mode: a process that does not get the lock must not end the owner's mode.
         flock(&line, FlockOperation::NonBlockingLockExclusive).map_err(|error| match error {
             Errno::WOULDBLOCK => PortError::Busy,
             error => error.into(),
@@ -62,8 +68,8 @@ impl Tty {
         ioctl_tiocexcl(&line)?;
         let device = path.canonicalize().unwrap_or_else(|_| path.to_owned());
         let tty = Tty { line, device, settings: Cell::new(Settings::of(&termios)), errors: Cell::new(None) };
-        // Not all drivers have this, and a sensor streams without it.
-        if let Err(error) = kernel::hand_over_at_once(&tty.line) {
+        // Not all drivers support low latency, and scanners stream without it.
+        if let Err(error) = set_low_latency(&tty.line) {
             tracing::debug!(%error, "{}: no low latency", path.display());
         }
         tty.configure(termios, baud)?;
@@ -78,19 +84,19 @@ impl Tty {
         Ok(tty)
     }
 
-    /// Makes the line raw, at `baud`; `termios` are its settings until now.
+    /// Makes the line raw, at `baud`. `termios` has the settings so far.
     fn configure(&self, mut termios: Termios, baud: u32) -> Result<(), PortError> {
-        // No parity, and no byte is dropped or doubled for its errors; the modem's lines mean nothing here.
+        // No parity, and no byte is dropped or doubled because of an error. The modem lines are not connected.
         termios.make_raw();
         termios.input_modes.remove(InputModes::IXOFF | InputModes::IXANY | InputModes::INPCK);
         termios.control_modes.insert(ControlModes::CREAD | ControlModes::CLOCAL);
         tcsetattr(&self.line, OptionalActions::Now, &termios)?;
-        let checked = self.check(line_settings::apply(&self.line, baud), baud);
+        let checked = self.check(apply_settings(&self.line, baud), baud);
         self.settings.set(Settings::of(&tcgetattr(&self.line)?));
         checked
     }
 
-    /// Returns the settings that another process has made since those of this process; `None` if they are unchanged.
+    /// Returns the settings that another process has changed; `None` if they are unchanged.
     ///
     /// # Errors
     ///
@@ -103,16 +109,16 @@ impl Tty {
         }))
     }
 
-    /// Makes the settings of this process again, at `baud`, and discards the input that arrived with others. A rate that the
-    /// driver refuses stays as it is; a search tries others.
+    /// Restores the settings of this process, at `baud`, and discards the input that arrived with others. If the driver
+    /// rejects the rate, the rate stays as it is, and a search tries others.
     ///
     /// # Errors
     ///
     /// Returns an error if the line is lost.
     pub(crate) fn restore(&self, baud: u32) -> io::Result<()> {
         let configured = self.configure(tcgetattr(&self.line)?, baud);
-        line_settings::clear_input(&self.line).map_err(|_| self.gone())?;
-        // With other settings every byte is an error.
+        clear_input(&self.line).map_err(|_| self.gone())?;
+        // With other settings, every byte counts as an error.
         self.line_errors();
         match configured {
             Ok(()) | Err(PortError::Rate { .. }) => Ok(()),
@@ -130,17 +136,17 @@ impl Tty {
         self.device.starts_with("/dev/pts")
     }
 
-    /// What the driver counted since it was loaded, if it counts.
+    /// Returns the driver's counters since it was loaded, if it has any.
     pub(crate) fn counts(&self) -> Option<Counts> {
         Counts::of(&self.line).ok()
     }
 
-    /// The rate that the driver says it has.
+    /// Returns the rate that the driver reports.
     pub(crate) fn baud(&self) -> Option<u32> {
         tcgetattr(&self.line).ok().map(|termios| termios.output_speed())
     }
 
-    /// Errors that the driver counted since it was last asked, be it by a change of the rate.
+    /// Returns the errors that the driver counted since the last call. A change of the rate also counts as a call.
     pub(crate) fn line_errors(&self) -> u64 {
         let Some(before) = self.errors.get() else { return 0 };
         let now = self.counts().map_or(before, |counts| counts.errors());
@@ -149,12 +155,12 @@ impl Tty {
     }
 
     pub(crate) fn set_baud(&self, baud: u32) -> io::Result<()> {
-        let applied = self.check(line_settings::apply_baud(&self.line, baud), baud);
+        let applied = self.check(apply_baud(&self.line, baud), baud);
         if let Some(speed) = self.baud() {
             self.settings.set(Settings { speed, ..self.settings.get() });
         }
-        line_settings::clear_input(&self.line).map_err(|_| self.gone())?;
-        // At a wrong rate every byte is an error.
+        clear_input(&self.line).map_err(|_| self.gone())?;
+        // At a wrong rate, every byte counts as an error.
         self.line_errors();
         applied.map_err(|refusal| match refusal {
             PortError::Rate { .. } => io::Error::new(ErrorKind::Unsupported, refusal.to_string()),
@@ -162,25 +168,26 @@ impl Tty {
         })
     }
 
-    /// A terminal of a program, and some adapters, have no such line. Asserted, it stays so when the line is closed.
+    /// Asserts or clears DTR. A pty and some adapters do not have it. If it is asserted, it stays so when the line is
+    /// closed.
     pub(crate) fn set_dtr(&self, on: bool) -> io::Result<()> {
         let mut termios = tcgetattr(&self.line)?;
         termios.control_modes.set(ControlModes::HUPCL, !on);
         tcsetattr(&self.line, OptionalActions::Now, &termios)?;
-        match line_settings::set_dtr(&self.line, on) {
+        match apply_dtr(&self.line, on) {
             Err(_) if self.baud().is_none() => Err(self.gone()),
             _ => Ok(()),
         }
     }
 
-    /// How many bytes there are to read, if the driver tells.
+    /// Returns the number of bytes in the input buffer, if the driver reports it.
     pub(crate) fn waiting(&self) -> Option<usize> {
         rustix::io::ioctl_fionread(&self.line).ok().map(|waiting| waiting as usize)
     }
 
     pub(crate) fn read(&self, buffer: &mut [u8]) -> io::Result<usize> {
         match rustix::io::read(&self.line, buffer) {
-            // With VMIN = 0, as some programs set it, an empty buffer reads like the end of the line.
+            // With VMIN = 0, which some programs set, an empty buffer reads like the end of the line.
             Ok(0) if self.baud().is_some() => Ok(0),
             Ok(0) | Err(Errno::IO) => Err(hung_up()),
             Err(Errno::AGAIN | Errno::INTR) => Ok(0),
@@ -196,14 +203,15 @@ impl Tty {
         }
     }
 
-    /// What came of the settings, by the rate that the driver made of the one that was `wanted`. A line that is gone says so
-    /// when it is asked; else the driver refused, and the library does not keep its error's number.
+    /// Checks the result of changing settings by the rate that the driver has set instead of `wanted`. A lost line
+    /// reports an error when its settings are read. Otherwise the driver rejected the settings, and the library does
+    /// not keep the number of the error.
     fn check(&self, told: serialport::Result<()>, wanted: u32) -> Result<(), PortError> {
         let given = tcgetattr(&self.line)?.output_speed();
         judge(told.map_err(|_| Errno::INVAL), given, wanted)
     }
 
-    /// Why nothing can be asked of the line.
+    /// Returns the error of a line whose settings cannot be read.
     fn gone(&self) -> io::Error {
         tcgetattr(&self.line).err().unwrap_or(Errno::IO).into()
     }
@@ -217,15 +225,15 @@ impl AsFd for Tty {
 
 impl Drop for Tty {
     fn drop(&mut self) {
-        // On a pty the exclusive mode would outlive the close. One that hung up needs it no more.
+        // The exclusive mode of a pty would outlive the close. A line that hung up does not need this.
         let _ = ioctl_tiocnxcl(&self.line);
     }
 }
 
-/// Settings of a line on which it depends whether bytes arrive as they were sent.
+/// Settings of a line that decide whether bytes arrive as they were sent.
 #[derive(Clone, Copy, PartialEq, Eq)]
 struct Settings {
-    /// In bits per second.
+    /// Rate in bits per second.
     speed: u32,
     input: InputModes,
     output: OutputModes,
@@ -251,9 +259,9 @@ impl Settings {
 /// A change of an open line's settings by another process.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Alteration {
-    /// The rate, in bits per second, perhaps with other settings.
+    /// The rate in bits per second, possibly with other settings.
     Rate(u32),
-    /// Other settings, at the same rate.
+    /// Settings other than the rate.
     Settings,
 }
 
@@ -266,7 +274,7 @@ impl fmt::Display for Alteration {
     }
 }
 
-/// Control modes other than the rate, which has its own field, and HUPCL, which only matters when the line is closed.
+/// Control modes that matter, except the rate, which has a separate field. HUPCL only matters when the line is closed.
 const CHARACTER: ControlModes = ControlModes::CSIZE
     .union(ControlModes::CSTOPB)
     .union(ControlModes::CREAD)
@@ -276,12 +284,13 @@ const CHARACTER: ControlModes = ControlModes::CSIZE
     .union(ControlModes::CLOCAL)
     .union(ControlModes::CRTSCTS);
 
-/// How the kernel tells that the adapter was unplugged, the pty's other side closed, or the line hung up.
+/// Returns the error of a read if the adapter was unplugged, the other end of a pty was closed, or the line hung up.
 fn hung_up() -> io::Error {
     io::Error::new(ErrorKind::UnexpectedEof, "the line hung up")
 }
 
-/// What a driver that was `told` a rate and has `given` means: some take another, some refuse what they cannot have.
+/// Checks the rate that a driver has `given` after it was set to `wanted`. Some drivers set another rate, and some
+/// reject a rate that they do not support.
 fn judge(told: Result<(), Errno>, given: u32, wanted: u32) -> Result<(), PortError> {
     match told {
         Ok(()) | Err(Errno::INVAL) if !is_near(given, wanted) => Err(PortError::Rate { wanted, given }),
@@ -289,10 +298,76 @@ fn judge(told: Result<(), Errno>, given: u32, wanted: u32) -> Result<(), PortErr
     }
 }
 
-/// Whether a UART at `given` understands one at `wanted`: in the middle of the last bit it may be half a bit off, both
-/// ends together, so 3 % is the most of one of them.
+/// Returns whether a UART at `given` can receive from one at `wanted`. In the middle of the last bit, both ends
+/// together may be off by half a bit, so each of them by at most 3 %.
 fn is_near(given: u32, wanted: u32) -> bool {
     u64::from(given.abs_diff(wanted)) * 100 <= u64::from(wanted) * 3
+}
+
+/// Sets 8 data bits, 1 stop bit, no handshake (Telegram listing 4), and `baud`.
+///
+/// # Errors
+///
+/// Returns an error if the driver rejects a setting or the line is lost. The library does not distinguish these.
+fn apply_settings(line: impl AsFd, baud: u32) -> serialport::Result<()> {
+    with_library(line, |port| {
+        if port.data_bits()? != DataBits::Eight {
+            port.set_data_bits(DataBits::Eight)?;
+        }
+        if port.stop_bits()? != StopBits::One {
+            port.set_stop_bits(StopBits::One)?;
+        }
+        if port.flow_control()? != FlowControl::None {
+            port.set_flow_control(FlowControl::None)?;
+        }
+        set_rate(port, baud)
+    })
+}
+
+/// Sets only the rate.
+///
+/// # Errors
+///
+/// Returns the errors of [`apply_settings`].
+fn apply_baud(line: impl AsFd, baud: u32) -> serialport::Result<()> {
+    with_library(line, |port| set_rate(port, baud))
+}
+
+/// Asserts or clears DTR.
+///
+/// # Errors
+///
+/// Returns an error if the line has no DTR, or is lost.
+fn apply_dtr(line: impl AsFd, on: bool) -> serialport::Result<()> {
+    with_library(line, |port| port.write_data_terminal_ready(on))
+}
+
+/// Discards the input.
+///
+/// # Errors
+///
+/// Returns an error if the line is lost.
+fn clear_input(line: impl AsFd) -> serialport::Result<()> {
+    with_library(line, |port| port.clear(ClearBuffer::Input))
+}
+
+fn set_rate(port: &mut TTYPort, baud: u32) -> serialport::Result<()> {
+    // The library returns an error if the rates of the two directions differ. Then set both.
+    if port.baud_rate().ok() == Some(baud) { Ok(()) } else { port.set_baud_rate(baud) }
+}
+
+/// Calls `set` with the library's view of `line`. This process must already have locked the line, because the view
+/// locks it too.
+#[allow(unsafe_code)]
+fn with_library<T>(
+    line: impl AsFd,
+    set: impl FnOnce(&mut TTYPort) -> serialport::Result<T>,
+) -> serialport::Result<T> {
+    let line = line.as_fd();
+    // SAFETY: the descriptor is open while it is borrowed, which is longer than the view lives. The view is never
+    // dropped, so it neither closes the descriptor nor ends its exclusive mode.
+    let mut port = ManuallyDrop::new(unsafe { TTYPort::from_raw_fd(line.as_raw_fd()) });
+    set(&mut port)
 }
 
 #[cfg(test)]
@@ -302,7 +377,7 @@ pub(crate) mod tests {
     #[test]
     fn rates_that_are_near_enough() {
         assert!(is_near(500_000, 500_000) && is_near(485_000, 500_000) && is_near(515_000, 500_000));
-        // What drivers make of 500 kBd that cannot do it.
+        // Rates that drivers set instead of 500 kBd if they do not support it.
         assert!(!is_near(460_800, 500_000) && !is_near(9600, 500_000) && !is_near(0, 500_000));
     }
 
@@ -361,7 +436,7 @@ pub(crate) mod tests {
         assert_eq!(judge(Ok(()), 500_000, 500_000), Ok(()));
         assert_eq!(judge(Ok(()), 460_800, 500_000), no_rate(460_800));
         assert_eq!(judge(Err(Errno::INVAL), 38_400, 500_000), no_rate(38_400));
-        // It has the rate, and cannot have something else.
+        // The driver has the rate, but rejects another setting.
         assert_eq!(judge(Err(Errno::INVAL), 500_000, 500_000), Err(PortError::Other(Errno::INVAL)));
         assert_eq!(judge(Err(Errno::IO), 38_400, 500_000), Err(PortError::Dead));
     }

@@ -1,0 +1,274 @@
+//! Access to a port: whether its owner, group and mode permit this process to open it, and which other process has it open.
+//!
+//! Permissions are read from files, so users of a directory service are not found. Each search for processes reads about all of
+//! them, so it runs once after an error, not repeatedly.
+
+use std::os::unix::fs::MetadataExt;
+use std::path::Path;
+use std::{fmt, fs};
+
+use rustix::fs::{major, minor};
+use rustix::process::{getegid, geteuid, getgroups};
+
+/// Everything that decides whether this process may open a port.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct Rights {
+    /// Owner, group and mode of the port; `None` if they cannot be read.
+    pub port: Option<Ownership>,
+    /// User ID of this process.
+    pub uid: u32,
+    /// Groups of this process.
+    pub groups: Vec<u32>,
+    /// Name of the user, or the ID if it has no name.
+    pub user: String,
+    /// Name of the port's group, or the ID if it has no name.
+    pub group: String,
+    /// Whether `/etc/group` lists the user in the port's group, whatever groups this process has.
+    pub is_listed: bool,
+}
+
+/// Owner, group and mode of a file.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Ownership {
+    /// User ID of the owner.
+    pub uid: u32,
+    /// Group ID.
+    pub gid: u32,
+    /// Permission bits.
+    pub mode: u32,
+}
+
+impl Rights {
+    /// Reads the permissions of this process at `path`.
+    pub fn of(path: &Path) -> Rights {
+        let port = fs::metadata(path).ok().map(|metadata| Ownership {
+            uid: metadata.uid(),
+            gid: metadata.gid(),
+            mode: metadata.mode() & 0o777,
+        });
+        let uid = geteuid().as_raw();
+        let mut groups: Vec<u32> =
+            getgroups().unwrap_or_default().iter().map(|group| group.as_raw()).collect();
+        groups.push(getegid().as_raw());
+        let user = entry("/etc/passwd", uid).map_or(uid.to_string(), |words| words[0].clone());
+        let gid = port.map_or(0, |port| port.gid);
+        let listed = entry("/etc/group", gid);
+        let is_listed = listed
+            .as_ref()
+            .and_then(|words| words.get(3))
+            .is_some_and(|members| members.split(',').any(|member| member == user));
+        let group = listed.map_or(gid.to_string(), |words| words[0].clone());
+        Rights { port, uid, groups, user, group, is_listed }
+    }
+
+    /// Returns the reason for a refusal, and the remedy.
+    pub fn explain(&self, path: &Path) -> (String, String) {
+        let Rights { user, group, .. } = self;
+        let path = path.display();
+        let Some(Ownership { uid, gid, mode }) = self.port else {
+            let remedy = "a directory above it is closed: check its parents with ls -ld".to_owned();
+            return (format!("{path}: no permission for user {user} to look at it"), remedy);
+        };
+        let what = format!("{path}: no permission for user {user}: group {group}, mode {mode:03o}");
+        let remedy = if uid == self.uid && mode & RW << 6 != RW << 6 {
+            format!("you own it, but its mode denies access: chmod u+rw {path}")
+        } else if uid == self.uid
+            || mode & RW == RW
+            || (self.groups.contains(&gid) && mode & RW << 3 == RW << 3)
+        {
+            format!("owner and mode allow it, so an access list or a container forbids it: getfacl {path}")
+        } else if gid == 0 || mode & RW << 3 != RW << 3 {
+            // A new device is in this state for a moment, until udev has processed it.
+            "no group may use it; a udev rule gives it to one: SUBSYSTEM==\"tty\", GROUP=\"dialout\", MODE=\"0660\""
+                .to_owned()
+        } else if self.is_listed {
+            format!("user {user} is in group {group}, but was not when this session started: log in again")
+        } else {
+            format!("sudo usermod -aG {group} {user}, then log in again")
+        };
+        (what, remedy)
+    }
+}
+
+/// Read and write permission, as the last digit of a mode.
+const RW: u32 = 0o6;
+
+/// Returns the fields of the line whose third field is `id`, in a file like `/etc/group`. There are at least three
+/// fields.
+fn entry(file: &str, id: u32) -> Option<Vec<String>> {
+    let text = fs::read_to_string(file).ok()?;
+    let id = id.to_string();
+    let words = |line: &str| line.split(':').map(str::to_owned).collect::<Vec<_>>();
+    text.lines().map(words).find(|words| words.get(2) == Some(&id))
+}
+
+/// A process that has a port open.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Holder {
+    /// Process ID.
+    pub pid: u32,
+    /// Name of its program, at most 15 bytes.
+    pub program: String,
+}
+
+impl fmt::Display for Holder {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "process {} ({})", self.pid, self.program)
+    }
+}
+
+/// Returns the first other process that has `path` open and that this user may see.
+pub fn holder(path: &Path) -> Option<Holder> {
+    all_holders(path).into_iter().next()
+}
+
+/// Returns all other processes that have `path` open and that this user may see.
+pub fn all_holders(path: &Path) -> Vec<Holder> {
+    let device = path.canonicalize().ok();
+    device.and_then(|device| holders(&[&device]).pop()).unwrap_or_default()
+}
+
+/// Returns the other process that has locked `path`, whichever user it belongs to. Returns `None` if no running
+/// process has locked it.
+pub(super) fn lock_owner(path: &Path) -> Option<Holder> {
+    let file = fs::metadata(path).ok()?;
+    let device = file.dev();
+    let key = format!("{:02x}:{:02x}:{}", major(device), minor(device), file.ino());
+    let locks = fs::read_to_string("/proc/locks").ok()?;
+    let pid = lock_owners(&locks, &key).find(|&pid| pid != std::process::id())?;
+    Path::new(&format!("/proc/{pid}")).exists().then(|| Holder { pid, program: name_of(pid) })
+}
+
+/// Returns the processes that hold a lock made by flock(2) on the file `key`, as in `/proc/locks` (proc_locks(5)).
+fn lock_owners<'a>(locks: &'a str, key: &'a str) -> impl Iterator<Item = u32> + 'a {
+    locks.lines().filter_map(move |line| match line.split_whitespace().collect::<Vec<_>>()[..] {
+        [_, "FLOCK", _, _, pid, file, ..] if file == key => pid.parse().ok(),
+        _ => None,
+    })
+}
+
+/// Returns the program that may have changed the settings of `path`, as part of a message: one that is known to try every
+/// port, or another process that has the port open.
+pub fn altering_program(path: &Path) -> Option<String> {
+    let running = |name: &str| pids().any(|pid| name_of(pid) == name);
+    let known = PORT_PROGRAMS.iter().find(|(name, _)| running(name));
+    known.map(|(name, remedy)| format!("{name} runs: {remedy}")).or_else(|| {
+        // The service manager only keeps the port for the hub.
+        let holder = all_holders(path).into_iter().find(|holder| holder.program != "systemd")?;
+        Some(format!("{holder} has it open"))
+    })
+}
+
+/// Returns whether this process has `path` open, apart from descriptors that it inherited from its parent.
+pub(super) fn is_own(path: &Path) -> bool {
+    let open = fs::read_dir("/proc/self/fd").into_iter().flatten().flatten();
+    let given = |entry: &fs::DirEntry| ["0", "1", "2"].iter().any(|number| entry.file_name() == *number);
+    let mut targets = open.filter(|entry| !given(entry)).filter_map(|entry| fs::read_link(entry.path()).ok());
+    path.canonicalize().is_ok_and(|device| targets.any(|target| target == device))
+}
+
+/// Returns, for each of `devices`, the other processes that have it open. The paths must be canonical. Reads all
+/// processes once.
+pub(super) fn holders(devices: &[&Path]) -> Vec<Vec<Holder>> {
+    let mut found: Vec<Vec<Holder>> = vec![Vec::new(); devices.len()];
+    for pid in pids().filter(|&pid| pid != std::process::id()) {
+        let open = fs::read_dir(format!("/proc/{pid}/fd")).into_iter().flatten().flatten();
+        for target in open.filter_map(|entry| fs::read_link(entry.path()).ok()) {
+            let at = devices.iter().position(|&device| device == target);
+            let known = at.and_then(|at| found.get_mut(at));
+            // List a process once, even if it has several descriptors of the device.
+            if let Some(known) = known.filter(|known| known.last().is_none_or(|last| last.pid != pid)) {
+                known.push(Holder { pid, program: name_of(pid) });
+            }
+        }
+    }
+    found
+}
+
+/// Returns the IDs of all processes.
+fn pids() -> impl Iterator<Item = u32> {
+    let entries = fs::read_dir("/proc").into_iter().flatten().flatten();
+    entries.filter_map(|entry| entry.file_name().to_str()?.parse().ok())
+}
+
+fn name_of(pid: u32) -> String {
+    let name = fs::read_to_string(format!("/proc/{pid}/comm")).unwrap_or_default();
+    match name.trim() {
+        "" => "no name".to_owned(),
+        name => name.to_owned(),
+    }
+}
+
+/// Programs that open every serial port that they find, and the remedy.
+const PORT_PROGRAMS: [(&str, &str); 2] = [
+    ("ModemManager", "sudo systemctl stop ModemManager"),
+    ("brltty", "without a Braille display, sudo apt remove brltty"),
+];
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn each_reason_has_its_remedy() {
+        let robot = Rights {
+            port: Some(Ownership { uid: 0, gid: 20, mode: 0o660 }),
+            uid: 1000,
+            groups: vec![1000],
+            user: "robot".to_owned(),
+            group: "dialout".to_owned(),
+            is_listed: false,
+        };
+        let port = |uid, gid, mode| Rights { port: Some(Ownership { uid, gid, mode }), ..robot.clone() };
+        for (rights, says) in [
+            (robot.clone(), "sudo usermod -aG dialout robot, then log in again"),
+            (Rights { is_listed: true, ..robot.clone() }, "is in group dialout, but was not"),
+            (Rights { groups: vec![1000, 20], ..robot.clone() }, "getfacl /dev/ttyUSB0"),
+            (port(0, 0, 0o600), "udev rule"),
+            (port(0, 20, 0o640), "udev rule"),
+            (port(1000, 20, 0o440), "chmod u+rw /dev/ttyUSB0"),
+            (port(1000, 20, 0o660), "getfacl"),
+            (Rights { port: None, ..robot.clone() }, "directory above it"),
+        ] {
+            let (what, remedy) = rights.explain(Path::new("/dev/ttyUSB0"));
+            assert!(remedy.contains(says), "{rights:?}: {remedy}");
+            assert!(what.contains("/dev/ttyUSB0") && what.contains("user robot"), "{what}");
+        }
+        let (what, _) = robot.explain(Path::new("/dev/ttyUSB0"));
+        assert!(what.contains("no permission") && what.ends_with("group dialout, mode 660"), "{what}");
+    }
+
+    #[test]
+    fn the_rights_of_this_process() {
+        let rights = Rights::of(Path::new("/dev/null"));
+        assert_eq!(rights.uid, geteuid().as_raw());
+        assert_eq!(rights.port.map(|port| port.uid), Some(0));
+        assert!(rights.groups.contains(&getegid().as_raw()));
+    }
+
+    #[test]
+    fn owners_of_a_lock_are_found_by_file() {
+        let locks = "1: POSIX  ADVISORY  WRITE 9177 00:05:93 0 EOF\n\
+                     2: FLOCK  ADVISORY  WRITE 812 00:05:94 0 EOF\n\
+                     3: FLOCK  ADVISORY  WRITE 4711 00:05:93 0 EOF\n\
+                     3: -> FLOCK  ADVISORY  WRITE 4712 00:05:93 0 EOF\n";
+        assert_eq!(lock_owners(locks, "00:05:93").collect::<Vec<_>>(), [4711]);
+        assert_eq!(lock_owners(locks, "00:05:95").count(), 0);
+    }
+
+    #[test]
+    fn lock_of_another_process_names_it() {
+        let (_other, port) = crate::tty::tests::pty();
+        let mut owner = std::process::Command::new("flock");
+        let owner = owner.arg(&port).args(["sh", "-c", "echo locked; exec cat"]);
+        let owner = owner.stdin(std::process::Stdio::piped()).stdout(std::process::Stdio::piped()).spawn();
+        let mut owner = owner.expect("flock is part of util-linux");
+        let mut word = String::new();
+        let output = owner.stdout.as_mut().expect("a pipe");
+        std::io::BufRead::read_line(&mut std::io::BufReader::new(output), &mut word).expect("text");
+        assert_eq!(lock_owner(&port).map(|owner| owner.pid), Some(owner.id()));
+        drop(owner.stdin.take());
+        owner.wait().expect("it ends");
+        assert_eq!(lock_owner(&port), None);
+    }
+}
