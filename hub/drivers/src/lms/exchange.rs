@@ -111,10 +111,10 @@ impl<R: Say> Exchange<R> {
         self.open.as_ref().is_some_and(|open| now >= open.give_up_at())
     }
 
-    /// As [`Conversation::restart_if_late`].
+    /// As [`Conversation::restart_if_late`]. Behind a server, the gaps on the line are not known.
     pub fn restart_if_late(&mut self, now: Nanos) -> bool {
         self.now = now;
-        self.open.as_mut().is_some_and(|open| open.restart_if_late(now, self.baud))
+        !self.behind_server && self.open.as_mut().is_some_and(|open| open.restart_if_late(now, self.baud))
     }
 
     /// As [`Conversation::transmitted`].
@@ -277,6 +277,36 @@ mod tests {
                 }
             }
             assert_eq!(restarts, u32::from(is_late), "{gap}");
+        }
+    }
+
+    #[test]
+    fn a_machine_that_is_always_late_does_not_restart_forever() {
+        for behind_server in [false, true] {
+            let mut exchange = Exchange::new(Baud::B9600, 0);
+            exchange.behind_server = behind_server;
+            exchange.ask(Request::Status, 0, 1);
+            let (mut now, mut restarts) = (0, 0);
+            loop {
+                match exchange.output(Nanos::MAX) {
+                    Output::Transmit { not_before, .. } => {
+                        now = now.max(not_before) + 50 * MILLIS;
+                        if exchange.restart_if_late(now) {
+                            restarts += 1;
+                        } else {
+                            exchange.transmitted(now);
+                        }
+                    }
+                    Output::Wait { until } => {
+                        now = until;
+                        if exchange.handle_timeout(now) {
+                            break;
+                        }
+                    }
+                    output => panic!("{output:?}"),
+                }
+            }
+            assert_eq!(restarts, if behind_server { 0 } else { 50 });
         }
     }
 }

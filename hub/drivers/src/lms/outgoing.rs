@@ -51,6 +51,8 @@ pub(crate) struct Outgoing<R = Request> {
     not_before: Nanos,
     /// Earliest time at which the byte before the next one can have left, see [`Outgoing::restart_if_late`].
     left_at: Nanos,
+    /// How often the request was started over because a byte was late.
+    restarts: u8,
     tries: u8,
     tries_left: u8,
     /// Added to every wait for the acknowledgement.
@@ -74,6 +76,7 @@ impl<R: Say> Outgoing<R> {
             sent: 0,
             not_before,
             left_at: 0,
+            restarts: 0,
             tries,
             tries_left: tries - 1,
             patience: 0,
@@ -145,11 +148,14 @@ impl<R: Say> Outgoing<R> {
     }
 
     /// Starts over with the first byte if `now` is too late for the next one, and returns whether it is. The sensor has
-    /// dropped the request, and it cannot have received its last byte. This does not count as a try.
+    /// dropped the request, and it cannot have received its last byte. This does not count as a try. After [`MAX_RESTARTS`] the
+    /// request is sent to its end all the same, so that the wait for its reply ends.
     pub(crate) fn restart_if_late(&mut self, now: Nanos, baud: Baud) -> bool {
-        let is_late = self.is_partly_out() && now > self.left_at + line_time(1, baud.rate()) + MOST_GAP;
+        let is_gap = self.is_partly_out() && now > self.left_at + line_time(1, baud.rate()) + MOST_GAP;
         self.left_at = now;
+        let is_late = is_gap && self.restarts < MAX_RESTARTS;
         if is_late {
+            self.restarts += 1;
             (self.sent, self.not_before) = (0, now + FORGOTTEN);
         }
         is_late
@@ -180,6 +186,8 @@ impl<R: Say> Outgoing<R> {
 pub(crate) const FORGOTTEN: Nanos = 10 * MILLIS;
 /// Between the end of a byte and the next: more than 55 us, far less than 6 ms (Telegram listing 4.3).
 const GAP: Nanos = 120 * MICROS;
+/// So often a request is started over because a byte was late. A machine that is late more often cannot send it.
+const MAX_RESTARTS: u8 = 50;
 /// Longest time between the end of a byte and the next one: 6 ms (Telegram listing 4.3), less the time of the write.
 const MOST_GAP: Nanos = 5 * MILLIS;
 /// A byte that may leave within so long is asked for at once; a later one is waited for as for anything else.
