@@ -20,6 +20,7 @@ pub(crate) struct Account {
     truths: Vec<(File, Vec<u8>)>,
     /// Telegrams whose last byte left after this moment do not count.
     cut_ns: u64,
+    cut_at: Option<Instant>,
     /// What was seen in three dimensions, if anything was.
     tilted: Option<Tilted>,
     hub: Option<Work>,
@@ -105,6 +106,7 @@ impl Account {
             sensors: sensors.collect(),
             truths: truths.into_iter().map(|truth| (truth, Vec::new())).collect(),
             cut_ns: u64::MAX,
+            cut_at: None,
             tilted: None,
             hub: None,
             news: None,
@@ -146,11 +148,17 @@ impl Account {
         self.sensors.iter().all(|sensor| !sensor.ranges.is_empty())
     }
 
-    /// Returns whether no more telegrams from before the cut will arrive: a later one of each sensor has arrived, or none for
-    /// `limit`.
+    /// Returns whether no more telegrams from before the cut will arrive: a later one of each sensor has arrived, or none of any
+    /// kind for `limit`, or six times as long has passed since the cut.
     pub(crate) fn is_complete(&self, limit: Duration) -> bool {
-        let is_silent = |sensor: &Sensor| sensor.arrived_at.is_none_or(|at| at.elapsed() > limit);
-        self.sensors.iter().all(|sensor| sensor.is_past_cut || is_silent(sensor))
+        let Some(cut_at) = self.cut_at else { return false };
+        // A sensor that has sent nothing by the cut has lost nothing.
+        let is_silent = |sensor: &Sensor| match sensor.arrived_at {
+            Some(at) => at.max(cut_at).elapsed() > limit,
+            None => sensor.sent == 0 || cut_at.elapsed() > limit,
+        };
+        let all_arrived = self.sensors.iter().all(|sensor| sensor.is_past_cut || is_silent(sensor));
+        all_arrived || cut_at.elapsed() > limit.saturating_mul(6)
     }
 
     /// Reads what the simulators wrote since the last time.
@@ -186,6 +194,7 @@ impl Account {
     pub(crate) fn cut(&mut self) {
         let now = rustix::time::clock_gettime(rustix::time::ClockId::Monotonic);
         self.cut_ns = now.tv_sec as u64 * 1_000_000_000 + now.tv_nsec as u64;
+        self.cut_at = Some(Instant::now());
     }
 
     /// Looks at the processor time of the hub, process `pid`.
