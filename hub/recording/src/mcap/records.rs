@@ -11,6 +11,7 @@
 
 use std::borrow::Cow;
 use std::io::{self, Read};
+use std::ops::RangeInclusive;
 
 use flate2::Crc;
 use mcap::records::{MessageHeader, Record as Parsed, op};
@@ -129,6 +130,12 @@ impl<R: Read> Records<R> {
         let len = HEAD as u64 + body.len() as u64;
         if (body.len() as u64) < length {
             self.end_in_record(len);
+            return Ok(None);
+        }
+        // The opcode of another record became that of a footer, or one that the format reserves.
+        let is_no_footer = opcode == op::FOOTER && length != FOOTER_LEN;
+        if is_no_footer || RESERVED.contains(&opcode) {
+            self.skip(len);
             return Ok(None);
         }
         match opcode {
@@ -411,6 +418,10 @@ const HEAD: usize = 1 + 8;
 const HEAD_OF_CHUNK: usize = 1024;
 /// Position of the checksum in the footer.
 const FOOTER_CRC: usize = 8 + 8;
+/// Length of a footer.
+const FOOTER_LEN: u64 = FOOTER_CRC as u64 + 4;
+/// Opcodes that no version of the format uses yet. Those from 80h are free for any program.
+const RESERVED: RangeInclusive<u8> = 0x10..=0x7F;
 /// Maximum length of all other records. A few times this is held in memory; recorders write chunks of less than half of it.
 const LONGEST: u64 = 8 << 20;
 /// Bytes that are read at a time.

@@ -125,6 +125,23 @@ fn flipped_byte_costs_one_chunk() {
 }
 
 #[test]
+fn chunk_with_another_opcode_costs_one_chunk() {
+    let folder = TempDir::new().unwrap();
+    let whole = Whole::new(20, Compression::Zstd);
+    // A footer, and an opcode that the format reserves.
+    for opcode in [0x02, 0x16] {
+        for (number, chunk) in whole.chunks.iter().enumerate() {
+            let mut bytes = whole.bytes.clone();
+            bytes[chunk.start] = opcode;
+            let (telegrams, damage) = read(&folder, &bytes);
+            let name = format!("opcode {opcode} at chunk {number}: {damage}");
+            assert!(telegrams == whole.telegrams(|other| other != number), "{name}");
+            assert!(damage.bytes == chunk.len() as u64 && damage.is_harmed, "{name}");
+        }
+    }
+}
+
+#[test]
 fn reading_ends_at_an_impossible_length() {
     let folder = TempDir::new().unwrap();
     let whole = Whole::new(20, Compression::None);
