@@ -65,7 +65,7 @@ pub(crate) fn scan(payload: &[u8]) -> Box<Scan> {
 }
 
 /// Checks that scans which were recorded are replayed as they were. Their stamps are not compared, because they depend on when the
-/// hub got a processor. Stamps and missing revolutions are checked in virtual time (`tests/world`, judge `turns`).
+/// hub got a processor. Stamps of a live stream are checked in virtual time (`tests/world`, judge `turns`).
 fn check_scans(recorded: &[(Header, Vec<u8>)], replayed: &[(Header, Vec<u8>)]) {
     let by_seq: BTreeMap<u64, _> =
         replayed.iter().map(|(header, payload)| (header.seq, (header, payload))).collect();

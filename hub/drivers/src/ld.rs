@@ -1,5 +1,5 @@
 //! LDROBOT LD06, LD19, STL19P, STL27L and LD14P: the framer, packets, revolutions, and the session with a scanner that streams
-//! without a request. Nothing is ever sent to it. There is no heap allocation.
+//! without a request. Nothing is ever sent to it.
 
 pub mod framer;
 mod model;

@@ -2,7 +2,7 @@
 //! [`Consent`] without which none is sent. A crate of its own, so that Cargo keeps it from everything that talks to a
 //! sensor by itself: the hub is built without it.
 //!
-//! Sans-I/O as `lms`: no port, no clock, no heap.
+//! Sans-I/O like the drivers: no port and no clock.
 #![forbid(unsafe_code)]
 
 mod change;

@@ -35,6 +35,8 @@ fn drivers_only_compute() {
             planted("let text = std::fs::read_to_string(path);"),
             planted("let now = std::time::Instant::now();"),
             planted("use schema::ipc::Payload;"),
+            planted("use schema::{Header, ipc};"),
+            planted("println!(\"a line\");"),
         ]
     });
 }
@@ -48,6 +50,7 @@ fn no_family_names_another() {
             planted("hub/drivers/src/rplidar.rs", "let session: ld::Session;"),
             planted("hub/drivers/src/lms/session.rs", "use crate::{line, rplidar};"),
             planted("hub/drivers/src/line/session.rs", "use crate::lms::SILENCE;"),
+            planted("hub/drivers/src/ld/planted.rs", "use crate::scanner::Session;"),
         ]
     });
 }
@@ -61,6 +64,9 @@ fn the_rplidar_simulator_is_independent() {
             planted("use scanhub_drivers::rplidar::packet::Kind;"),
             planted("use scanhub_drivers::{\n    line, rplidar,\n};"),
             planted("let kind = scanhub_drivers::rplidar::packet::Kind::Dense;"),
+            planted("use scanhub_drivers as drivers;"),
+            planted("use scanhub_drivers::{self as drivers};"),
+            planted("use scanhub_drivers::scanner::Session;"),
         ]
     });
 }

@@ -33,6 +33,7 @@ fn nobody_writes_the_eeprom() {
                 "//! Writes.\nlet telegram = Writer::new(0, 0x77).finish();\n",
             ),
             tree.with("hub/drivers/src/lms/planted.rs", "//! Knows.\npub const CONFIGURE: u8 = 0x77;\n"),
+            tree.with("hub/drivers/src/lms.rs", "//! Knows.\npub const CONFIGURE: u8 = 0x77;\n"),
             tree.with(
                 "hub/drivers/src/lms/planted.rs",
                 "//! Writes.\nlet telegram = Writer::new(address, 0x66);\n",

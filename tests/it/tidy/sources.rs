@@ -112,7 +112,7 @@ pub(crate) fn nobody_writes_the_eeprom(tree: &Tree) -> Vec<String> {
     });
     let named = ["lms_configure", "eeprom::", "::eeprom", "{eeprom", " eeprom,", " eeprom}"];
     breaches.extend(find(tree, &named, |path| !may_name(path)));
-    let lms = |path: &str| path.starts_with("hub/drivers/src/lms/");
+    let lms = |path: &str| path == "hub/drivers/src/lms.rs" || path.starts_with("hub/drivers/src/lms/");
     for (path, text) in tree.sources().filter(|(path, _)| lms(path)) {
         for (number, line) in code(text) {
             let constant = line.split_once(": u8 = ").map(|(_, value)| value.trim_end_matches(';'));

@@ -8,7 +8,7 @@ use crate::line::{Heard, Output, Turn};
 use crate::{ld, line, rplidar};
 use schema::{Family, Nanos};
 
-/// Declares the families: number and crate of one stand in a line.
+/// Declares the families. A line has the name and the module of one.
 macro_rules! families {
     ($($Family:ident $family:ident,)*) => {
         /// A session with a scanner of one of the families.
