@@ -1,5 +1,5 @@
-//! A sample as one datagram, or as several if it is longer. Its format needs no library to read, and every field is checked
-//! before it is used.
+//! A sample as one datagram, or as several if it is longer. Its format needs no library to read, and every field is
+//! checked before it is used.
 //!
 //! This module needs neither shared memory nor a heap. Sockets are in crate `lan`.
 

@@ -1,5 +1,5 @@
-//! The format of a recording: samples as messages of an MCAP file, with a channel for each topic of a sensor. A message is
-//! the header of shared memory, followed by the payload as it is sent over a network (docs/recording.md).
+//! The format of a recording: samples as messages of an MCAP file, with a channel for each topic of a sensor. A message
+//! is the header of shared memory, followed by the payload as it is sent over a network (docs/recording.md).
 
 use std::collections::BTreeMap;
 use std::io::{self, BufWriter, Write};

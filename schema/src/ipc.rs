@@ -1,5 +1,5 @@
-//! Services of topics in shared memory, with all limits. Only this module names the builders of iceoryx2; all other code uses
-//! its ports.
+//! Services of topics in shared memory, with all limits. Only this module names the builders of iceoryx2; all other
+//! code uses its ports.
 
 mod clean;
 mod control;

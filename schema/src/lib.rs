@@ -1,5 +1,6 @@
-//! The interface between hub and clients: topics with their payloads and names, the format of datagrams and recordings, and
-//! the services in shared memory. Without feature `ipc`, it is plain bytes and names, enough for a receiver on a network.
+//! The interface between hub and clients: topics with their payloads and names, the format of datagrams and recordings,
+//! and the services in shared memory. Without feature `ipc`, it is plain bytes and names, enough for a receiver on a
+//! network.
 
 mod background;
 mod control;

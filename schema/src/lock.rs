@@ -1,6 +1,6 @@
 //! Who publishes in a domain: at most one hub, one listener that publishes topics of other machines, and any number of
-//! programs beside them, each under a name of its own. Each holds a lock that ends with its process. Consumers ask who holds the locks and never hold one themselves. Refuses to know what is
-//! published.
+//! programs beside them, each under a name of its own. Each holds a lock that ends with its process. Consumers ask who
+//! holds the locks and never hold one themselves. Refuses to know what is published.
 
 use std::fs::File;
 use std::io;

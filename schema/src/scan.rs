@@ -1,5 +1,5 @@
-//! One revolution of a scanner: ranges in device units with their codes, and optional arrays. Each scan contains the few
-//! numbers that are needed to read it, so that a reader needs to know neither protocol nor mode of the scanner.
+//! One revolution of a scanner: ranges in device units with their codes, and optional arrays. Each scan contains the
+//! few numbers that are needed to read it, so that a reader needs to know neither protocol nor mode of the scanner.
 
 mod family;
 

@@ -1,9 +1,9 @@
 //! Checks of this machine's limits before something is created: shared memory, descriptors, and room for the files of a
 //! domain.
 //!
-//! The shared-memory library reserves segments without allocating them. With a full /dev/shm, the first access would end the
-//! process with SIGBUS, so a publisher allocates its segments here. For any other shortage, the library only reports "internal
-//! error".
+//! The shared-memory library reserves segments without allocating them. With a full /dev/shm, the first access would
+//! end the process with SIGBUS, so a publisher allocates its segments here. For any other shortage, the library only
+//! reports "internal error".
 
 use std::fs::{self, OpenOptions};
 use std::io;

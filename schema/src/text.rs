@@ -1,8 +1,8 @@
 //! Text in fixed-size fields of payloads, and text for a terminal.
 //!
-//! A field has UTF-8, padded with 0, and is cut at a character boundary if the text is too long. Names and errors may come from
-//! another machine, and must not move the cursor of a terminal or change its colors. All output is written through
-//! [`Printable`] or [`escape_json`].
+//! A field has UTF-8, padded with 0, and is cut at a character boundary if the text is too long. Names and errors may
+//! come from another machine, and must not move the cursor of a terminal or change its colors. All output is written
+//! through [`Printable`] or [`escape_json`].
 
 use std::fmt::{self, Write};
 

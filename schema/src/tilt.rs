@@ -1,5 +1,5 @@
-//! A scanner on a tilting mount: the angle of the mount, the points of each scan in three dimensions, the sweeps that they
-//! form, and the obstacles that were found in one sweep.
+//! A scanner on a tilting mount: the angle of the mount, the points of each scan in three dimensions, the sweeps that
+//! they form, and the obstacles that were found in one sweep.
 
 use std::fmt;
 

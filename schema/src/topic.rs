@@ -1,7 +1,7 @@
 //! The topics: their table, and the names of topics, services and sensors.
 //!
-//! One row of the table has everything that differs between topics. All code for each topic, here and in other crates, is
-//! generated from this table, so a new topic is a new row.
+//! One row of the table has everything that differs between topics. All code for each topic, here and in other crates,
+//! is generated from this table, so a new topic is a new row.
 
 use crate::limits::TopicLimits;
 use crate::{Failure, Kind};

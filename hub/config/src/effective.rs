@@ -1,5 +1,5 @@
-//! The values in effect, each with the place where it was set. They are the values that the hub would use. For the places, the
-//! sources are read again, key by key: the last source that has a key is its place.
+//! The values in effect, each with the place where it was set. They are the values that the hub would use. For the
+//! places, the sources are read again, key by key: the last source that has a key is its place.
 
 use std::collections::BTreeMap;
 use std::fmt;

@@ -1,5 +1,5 @@
-//! Section `gateway`: its values in effect, and its keys in one source. Topics, addresses and durations are text here; the
-//! gateway parses them.
+//! Section `gateway`: its values in effect, and its keys in one source. Topics, addresses and durations are text here;
+//! the gateway parses them.
 
 use std::path::PathBuf;
 

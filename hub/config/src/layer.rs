@@ -1,5 +1,5 @@
-//! Merges the sources of a configuration, one on top of the others. Every value is checked in its own source, so that an error
-//! names file, line and column, or the flag.
+//! Merges the sources of a configuration, one on top of the others. Every value is checked in its own source, so that
+//! an error names file, line and column, or the flag.
 
 use std::rc::Rc;
 

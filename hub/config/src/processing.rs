@@ -1,5 +1,5 @@
-//! Processing of a link's scans: sections pose, zones, marks, lines, motion, background and early, as values in effect and as
-//! keys of the sources.
+//! Processing of a link's scans: sections pose, zones, marks, lines, motion, background and early, as values in effect
+//! and as keys of the sources.
 //!
 //! Each value is checked in its own source. Meters, radians and degrees become the units of the processors.
 

@@ -1,5 +1,5 @@
-//! The scanner of a link: its family and the settings of a rotating scanner, as values in effect and as keys of the sources.
-//! The settings of an LMS are in [`Link`](crate::Link).
+//! The scanner of a link: its family and the settings of a rotating scanner, as values in effect and as keys of the
+//! sources. The settings of an LMS are in [`Link`](crate::Link).
 
 use scanhub_drivers::line;
 use scanhub_drivers::line::family::{Features, Model, Wanted};

@@ -1,5 +1,5 @@
-//! The sources of a configuration: files and flags, one layer each, and the place of each value in them, so that an error can
-//! name file, line and column, or the flag. `load.rs` combines the layers.
+//! The sources of a configuration: files and flags, one layer each, and the place of each value in them, so that an
+//! error can name file, line and column, or the flag. `load.rs` combines the layers.
 
 use std::ops::Range;
 use std::path::{Path, PathBuf};

@@ -1,7 +1,8 @@
-//! Access to a port: whether its owner, group and mode permit this process to open it, and which other process has it open.
+//! Access to a port: whether its owner, group and mode permit this process to open it, and which other process has it
+//! open.
 //!
-//! Permissions are read from files, so users of a directory service are not found. Each search for processes reads about all of
-//! them, so it runs once after an error, not repeatedly.
+//! Permissions are read from files, so users of a directory service are not found. Each search for processes reads
+//! about all of them, so it runs once after an error, not repeatedly.
 
 use std::os::unix::fs::MetadataExt;
 use std::path::Path;

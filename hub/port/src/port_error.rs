@@ -1,5 +1,5 @@
-//! Why a port cannot be opened, and what to do about it. The reason is found by trying; its circumstances (which process
-//! has it open, which other ports exist) are looked up once, when the failure is reported.
+//! Why a port cannot be opened, and what to do about it. The reason is found by trying; its circumstances (which
+//! process has it open, which other ports exist) are looked up once, when the failure is reported.
 
 use std::fmt;
 use std::io;

@@ -1,10 +1,10 @@
-//! A serial line behind a serial server on the network: a plain stream of bytes. Its rate is set in the server and cannot be
-//! changed from here. Resolving a name and connecting can block for an unknown time, so a separate thread does both, and ends
-//! by itself.
+//! A serial line behind a serial server on the network: a plain stream of bytes. Its rate is set in the server and
+//! cannot be changed from here. Resolving a name and connecting can block for an unknown time, so a separate thread
+//! does both, and ends by itself.
 //!
-//! A connection can deliver more than any line. The read budget allows twice as much as the line carries, and up to one second
-//! of that at once, because a network delays data and catches up. The rest stays in the connection, and is older than it seems
-//! when it is read.
+//! A connection can deliver more than any line. The read budget allows twice as much as the line carries, and up to one
+//! second of that at once, because a network delays data and catches up. The rest stays in the connection, and is older
+//! than it seems when it is read.
 
 use std::io::{self, ErrorKind, PipeReader, PipeWriter};
 use std::net::{SocketAddr, TcpStream, ToSocketAddrs};

@@ -1,9 +1,9 @@
 //! A serial line: opened exclusively, raw, and at a rate that the driver has confirmed.
 //!
-//! Rate, character and handshake are set by crate `serialport`, on a descriptor that was opened and locked here. Only settings
-//! that differ are set: each one reaches the driver separately, and a line that streams must not be disturbed. Two things are
-//! not taken from that crate: its `set_parity`, which makes the driver drop bytes with errors (IGNPAR), while here every byte
-//! counts; and the number of an error, which it does not keep.
+//! Rate, character and handshake are set by crate `serialport`, on a descriptor that was opened and locked here. Only
+//! settings that differ are set: each one reaches the driver separately, and a line that streams must not be disturbed.
+//! Two things are not taken from that crate: its `set_parity`, which makes the driver drop bytes with errors (IGNPAR),
+//! while here every byte counts; and the number of an error, which it does not keep.
 
 use std::cell::Cell;
 use std::fmt;

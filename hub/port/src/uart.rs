@@ -1,8 +1,8 @@
-//! Error counters of a UART, and the telegrams that an error may be in. The kernel provides the counters, and no safe crate
-//! does. A driver without them, such as a pty's, reports that, which is not an error.
+//! Error counters of a UART, and the telegrams that an error may be in. The kernel provides the counters, and no safe
+//! crate does. A driver without them, such as a pty's, reports that, which is not an error.
 //!
-//! The driver counts errors when bytes reach it, but not in which bytes. When a telegram has been read, an error may be in it,
-//! in another telegram of the same read, or in bytes that have arrived since: the start of the next telegram.
+//! The driver counts errors when bytes reach it, but not in which bytes. When a telegram has been read, an error may be
+//! in it, in another telegram of the same read, or in bytes that have arrived since: the start of the next telegram.
 #![allow(unsafe_code)]
 
 use std::os::fd::{AsFd, BorrowedFd};

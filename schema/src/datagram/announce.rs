@@ -6,7 +6,7 @@ use crate::{Topic, check_sensor, text};
 /// The payload of an announcement, made by a gateway or read from a datagram.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Announce {
-    /// The hub's life.
+    /// Run of the hub.
     pub boot: u64,
     name: [u8; NAME],
     kind: [u8; KIND],

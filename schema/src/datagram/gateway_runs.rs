@@ -1,12 +1,12 @@
-//! The runs of gateways that a receiver distinguishes: which of them continue, which one makes room for another, and which
-//! senders belong to a run.
+//! The runs of gateways that a receiver distinguishes: which of them continue, which one makes room for another, and
+//! which senders belong to a run.
 //!
 //! Anyone who can send can invent gateways. A run that is known to deliver is therefore never evicted for one that only
 //! announces itself, and the run that has been silent for longest goes first.
 //!
-//! Each gateway has its own number, so a second gateway with the same number is a copy, for example of its disk. The samples
-//! of both must not become one stream. They are distinguished by their senders and by the run of the hub (`boot`) that they
-//! announce. A sender is any number that differs between two of them. Time is an argument.
+//! Each gateway has its own number, so a second gateway with the same number is a copy, for example of its disk. The
+//! samples of both must not become one stream. They are distinguished by their senders and by the run of the hub
+//! (`boot`) that they announce. A sender is any number that differs between two of them. Time is an argument.
 
 use core::cmp::Ordering;
 

@@ -1,5 +1,6 @@
-//! Receive statistics: which samples arrived, which did not, and why datagrams were refused. They are exact and take bounded
-//! memory, no matter who sends. This module has no heap; time is an argument, and keys are checked in crate `lan`.
+//! Receive statistics: which samples arrived, which did not, and why datagrams were refused. They are exact and take
+//! bounded memory, no matter who sends. This module has no heap; time is an argument, and keys are checked in crate
+//! `lan`.
 
 use super::gateway_runs::Arrival;
 use super::gateway_runs::SenderMatch;

@@ -1,5 +1,5 @@
-//! Processes of a domain, and the removal of files that dead ones left. Files in shared memory that did not belong to a known
-//! dead process are not touched.
+//! Processes of a domain, and the removal of files that dead ones left. Files in shared memory that did not belong to a
+//! known dead process are not touched.
 
 use std::fs::OpenOptions;
 use std::os::fd::AsRawFd;

@@ -1,5 +1,5 @@
-//! The control service: a client's request, the hub's response, and the two events that wake each of them for the other.
-//! Refuses to know what a request means.
+//! The control service: a client's request, the hub's response, and the two events that wake each of them for the
+//! other. Refuses to know what a request means.
 
 use iceoryx2::active_request::ActiveRequest;
 use iceoryx2::pending_response::PendingResponse;

@@ -1,11 +1,12 @@
-//! The doorbell of a sensor: three futex words in shared memory, one for each [`Ring`], at which subscribers sleep. One system
-//! call of the hub wakes all threads that sleep at a word; an event needs one message for each subscriber.
+//! The doorbell of a sensor: three futex words in shared memory, one for each [`Ring`], at which subscribers sleep. One
+//! system call of the hub wakes all threads that sleep at a word; an event needs one message for each subscriber.
 //!
-//! The page is in /dev/shm under the domain's prefix. Subscribers map it read-only. A killed hub leaves the page, and the
-//! next hub continues with it, so that subscribers that sleep meanwhile are woken. A hub that ends normally closes it.
+//! The page is in /dev/shm under the domain's prefix. Subscribers map it read-only. A killed hub leaves the page, and
+//! the next hub continues with it, so that subscribers that sleep meanwhile are woken. A hub that ends normally closes
+//! it.
 //!
-//! The operations on words, and their memory orders, must be right in all interleavings of hub and subscribers. The tests
-//! run all of them.
+//! The operations on words, and their memory orders, must be right in all interleavings of hub and subscribers. The
+//! tests run all of them.
 #![allow(unsafe_code)]
 
 use std::fs::{File, OpenOptions};

@@ -1,13 +1,13 @@
 //! Keeps a domain's shared memory apart from other users, who can all create files in /dev/shm:
 //!
-//! - The names of a domain start with a prefix that contains a random word. Without it, another user could occupy the names
-//!   before the hub starts. The prefix, `sh_DOMAIN_WORD_`, is stored in the file `prefix` of the domain's directory, which
-//!   only this user can read. It stays as long as any process uses it.
-//! - The node counter is the one segment that the shared-memory library opens to all users of the machine. Anyone who can
-//!   write to it can keep every later process out. It is therefore created here, for this user only, before the library looks
-//!   for it. The library uses the file that it finds.
-//! - Segments of other users under the domain's names are found by name, owner and mode, without opening them. The owner is
-//!   reported, because the library only reports "internal error".
+//! - The names of a domain start with a prefix that contains a random word. Without it, another user could occupy the
+//!   names before the hub starts. The prefix, `sh_DOMAIN_WORD_`, is stored in the file `prefix` of the domain's
+//!   directory, which only this user can read. It stays as long as any process uses it.
+//! - The node counter is the one segment that the shared-memory library opens to all users of the machine. Anyone who
+//!   can write to it can keep every later process out. It is therefore created here, for this user only, before the
+//!   library looks for it. The library uses the file that it finds.
+//! - Segments of other users under the domain's names are found by name, owner and mode, without opening them. The
+//!   owner is reported, because the library only reports "internal error".
 
 use std::fs::{File, Metadata, OpenOptions};
 use std::hash::{BuildHasher, RandomState};

@@ -1,5 +1,6 @@
-//! A topic in shared memory: its service, its subscriber, and its publisher, which numbers samples, writes them in place, and
-//! counts those that there is no memory for. The code for each payload is generated from the table of topics.
+//! A topic in shared memory: its service, its subscriber, and its publisher, which numbers samples, writes them in
+//! place, and counts those that there is no memory for. The code for each payload is generated from the table of
+//! topics.
 
 use std::borrow::BorrowMut;
 use std::fmt::Debug;

@@ -1,8 +1,8 @@
 //! Waking the subscribers of a sensor: a doorbell for programs that use this code, and an event service for all other
 //! languages. The hub rings and notifies without knowing which of the two has subscribers.
 //!
-//! A thread can sleep on the events of several sensors at once. Waking up and taking the wake-ups are two calls, so that samples
-//! can be received in between. A pending wake-up loses nothing, and taking it costs several system calls.
+//! A thread can sleep on the events of several sensors at once. Waking up and taking the wake-ups are two calls, so
+//! that samples can be received in between. A pending wake-up loses nothing, and taking it costs several system calls.
 #![allow(unsafe_code)]
 
 use std::os::fd::BorrowedFd;

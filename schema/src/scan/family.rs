@@ -1,5 +1,5 @@
-//! The families of scanners, by number and name, and what differs between their scans: the head of a scan, the codes of the
-//! SICK LMS 2xx, and the contents of packets.
+//! The families of scanners, by number and name, and what differs between their scans: the head of a scan, the codes of
+//! the SICK LMS 2xx, and the contents of packets.
 
 use std::f64::consts::TAU;
 

@@ -1,6 +1,6 @@
-//! The interleavings of hubs and consumers, and the orders in which their memory may be seen, over a futex made of a lock and
-//! a condition variable. A wake-up is lost if a consumer sleeps when no hub will wake it any more: then the model ends its sleep
-//! and counts it.
+//! The interleavings of hubs and consumers, and the orders in which their memory may be seen, over a futex made of a
+//! lock and a condition variable. A wake-up is lost if a consumer sleeps when no hub will wake it any more: then the
+//! model ends its sleep and counts it.
 
 use std::sync::Arc;
 use std::sync::atomic::AtomicUsize;
