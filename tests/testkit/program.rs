@@ -138,6 +138,13 @@ impl Program {
         lines.filter_map(|line| serde_json::from_slice(line).ok()).find(|line| wanted(line))
     }
 
+    /// Returns the last line that is `wanted` among all that it has printed so far.
+    pub(crate) fn last_printed(&mut self, wanted: impl Fn(&Value) -> bool) -> Option<Value> {
+        while self.receive(Instant::now()).is_ok() {}
+        let lines = self.out.split(|byte| *byte == b'\n').rev();
+        lines.filter_map(|line| serde_json::from_slice(line).ok()).find(|line| wanted(line))
+    }
+
     /// Waits for the next `count` lines that are `wanted`, and returns them.
     pub(crate) fn await_lines(
         &mut self,
