@@ -1,72 +1,193 @@
-//! `scanhub doctor`: checks every condition of a working setup, and reports what was found and what to do. Changes no
-//! sensor, no file and no process, unless asked to remove what dead processes left. It opens a port that was named and that
-//! nobody holds, as the hub would: the port stays raw at the rate of the last question, and its driver hands over bytes at
-//! once.
+//! `scanhub doctor`: checks every condition of a working setup, and reports findings and remedies.
+//!
+//! It changes no scanner, no file and no process, unless the user requests the removal of files that dead processes left. It
+//! opens a port that was named and that no process holds, as the hub would: the port stays raw at the rate of the last
+//! request, and its driver returns bytes at once.
 
-mod bridge;
-mod counts;
-mod finding;
 mod hub;
-mod installed;
-mod leftovers;
-mod limits;
 mod line;
-mod logout;
 mod machine;
-mod multicast;
-mod program;
-mod segments;
 mod sensor;
-mod strangers;
+mod shared_memory;
 mod system;
-mod turning;
+mod systemd;
 mod version;
 
+use std::fmt;
 use std::sync::atomic::AtomicBool;
 
-use port::{Candidate, PortlessAdapter, Source, candidates};
-use schema::limits::TopicLimits;
-use schema::{Domain, Failure, Kind, ipc};
-
-pub use bridge::Bridge;
+pub use crate::bridge_program::Bridge;
 use config::{Config, Gateway, Link};
-pub use finding::{CHECKS, Finding, State};
 use hub::Hub;
 use machine::Facts;
+use port::{Candidate, PortlessAdapter, Source, candidates};
+use schema::limits::TopicLimits;
+use schema::{Domain, Failure, Kind, Printable, ipc};
+use serde::Serialize;
 pub use system::System;
 
-/// What to examine.
+/// The ports, the configuration and the machine to check.
 #[derive(Clone, Debug)]
 pub struct Subjects {
-    /// Ports as the user named them, or by the name of a link of the running hub; none: those of the configuration.
+    /// Ports as the user named them, or names of links of the running hub. If it is empty, those of the configuration.
     pub ports: Vec<Source>,
-    /// The configuration, or why it is refused; nothing if there is none.
+    /// The configuration, or the reason why it is invalid; `None` if there is none.
     pub config: Option<Result<Config, Failure>>,
     /// The gateway's section of the configuration.
     pub gateway: Gateway,
-    /// Where a hub would put its domain.
+    /// The domain that a hub would create.
     pub domain: Domain,
-    /// Where a client would look for it.
+    /// The locations in which a client would search for the domain.
     pub places: Vec<Domain>,
     /// The machine's files.
     pub system: System,
-    /// How a bridge to other machines would connect.
+    /// Connection of a bridge to other machines.
     pub bridge: Bridge,
-    /// Whether to first remove what dead processes left in the domain.
+    /// Whether to remove files that dead processes left in the domain, before the checks.
     pub clean: bool,
 }
 
-/// A port under examination, and what the configuration wants of it.
+/// A port to check, and its link in the configuration.
 pub(crate) struct Subject {
     pub(crate) source: Source,
     pub(crate) link: Option<Link>,
-    /// Whether somebody said that a sensor is there; anything else may be, and is not spoken to.
+    /// Whether the user or the configuration named the port. Another port may belong to any device, so nothing is sent to
+    /// it.
     pub(crate) named: bool,
 }
 
-/// Examines everything, and calls `tell` with each finding as soon as it is known.
+/// The names of all checks, in their order. docs/doctor.md has a line for each.
+pub const CHECKS: &[&str] = &[
+    "configuration",
+    "ports",
+    "clean",
+    "version",
+    "service",
+    "udev",
+    "memory",
+    "domain",
+    "hubs",
+    "strangers",
+    "leftovers",
+    "descriptors",
+    "file-size",
+    "logout",
+    "multicast",
+    "bridge",
+    "port",
+    "holder",
+    "access",
+    "latency",
+    "rate",
+    "sensor",
+    "settings",
+    "power-on",
+    "health",
+    "marks",
+    "line-errors",
+    "line-loss",
+];
+
+/// The result of a check.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "lowercase")]
+pub enum State {
+    /// As it should be.
+    Ok,
+    /// Works, but could work better.
+    Warning,
+    /// Cannot work in this way.
+    Failed,
+    /// Not checked. The finding has the reason.
+    Skipped,
+}
+
+/// Finding of one check; class `check`.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
+pub struct Finding {
+    class: &'static str,
+    /// Name of the check.
+    pub name: &'static str,
+    /// The result.
+    pub state: State,
+    /// The finding, as text.
+    pub finding: String,
+    /// The remedy, or an empty string.
+    pub remedy: String,
+    /// The port that the finding describes; `None` if it describes the machine.
+    pub port: Option<String>,
+    /// The link of the configuration that has this port.
+    pub link: Option<String>,
+}
+
+impl Finding {
+    /// Creates a finding of a check that passed.
+    pub(crate) fn ok(name: &'static str, finding: impl Into<String>) -> Finding {
+        Finding::new(name, State::Ok, finding, "")
+    }
+
+    /// Creates a finding of something that works, and that `remedy` improves.
+    pub(crate) fn warning(
+        name: &'static str,
+        finding: impl Into<String>,
+        remedy: impl Into<String>,
+    ) -> Finding {
+        Finding::new(name, State::Warning, finding, remedy)
+    }
+
+    /// Creates a finding of something that cannot work without `remedy`.
+    pub(crate) fn failed(
+        name: &'static str,
+        finding: impl Into<String>,
+        remedy: impl Into<String>,
+    ) -> Finding {
+        Finding::new(name, State::Failed, finding, remedy)
+    }
+
+    /// Creates a finding of a check that was not made, with the reason.
+    pub(crate) fn skipped(name: &'static str, why: impl Into<String>) -> Finding {
+        Finding::new(name, State::Skipped, why, "")
+    }
+
+    /// Returns this finding as one of a port and its link.
+    pub(crate) fn at(self, port: &str, link: Option<&str>) -> Finding {
+        Finding { port: Some(port.to_owned()), link: link.map(str::to_owned), ..self }
+    }
+
+    fn new(
+        name: &'static str,
+        state: State,
+        finding: impl Into<String>,
+        remedy: impl Into<String>,
+    ) -> Finding {
+        debug_assert!(CHECKS.contains(&name), "{name} is in no list");
+        let (finding, remedy) = (finding.into(), remedy.into());
+        Finding { class: "check", name, state, finding, remedy, port: None, link: None }
+    }
+}
+
+impl fmt::Display for Finding {
+    /// Writes one line, and a second line for a remedy.
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let state = match self.state {
+            State::Ok => "ok",
+            State::Warning => "warning",
+            State::Failed => "FAILED",
+            State::Skipped => "skipped",
+        };
+        write!(f, "{state:<8} {:<13} {}", self.name, Printable(&self.finding))?;
+        if !self.remedy.is_empty() {
+            write!(f, "\n{:23}{}", "", Printable(&self.remedy))?;
+        }
+        Ok(())
+    }
+}
+
+/// Makes all checks, and calls `tell` with each finding as soon as it is known.
 ///
-/// [`Kind::Check`] with the number of checks that failed, [`Kind::Interrupted`] if `stop` is set.
+/// # Errors
+///
+/// Returns [`Kind::Check`] with the number of checks that failed, and [`Kind::Interrupted`] if `stop` is set.
 pub fn examine(
     subjects: &Subjects,
     stop: &AtomicBool,
@@ -90,11 +211,11 @@ pub fn examine(
     if subjects.clean {
         let elsewhere = subjects.places.iter().filter(|place| place.root() != domain.root());
         let places: Vec<&Domain> = std::iter::once(domain).chain(elsewhere).collect();
-        tell(leftovers::clean(&places, system.user()));
+        tell(shared_memory::clean(&places, system.user()));
     }
     tell(version::version(system, pid));
-    tell(installed::service(system, pid));
-    tell(installed::rules(system, &there));
+    tell(systemd::service(system, pid));
+    tell(systemd::rules(system, &there));
     let limits = match &subjects.config {
         Some(Ok(config)) => config.topic_limits(),
         _ => vec![TopicLimits::default(); ports.len().max(1)],
@@ -103,13 +224,13 @@ pub fn examine(
     tell(machine::memory(&facts));
     tell(machine::domain(&facts));
     tell(machine::hubs(&facts, |user| system.name_of(user)));
-    tell(strangers::strangers(&ipc::strangers(domain.root()), |user| system.name_of(user)));
-    tell(leftovers::leftovers(&facts));
-    tell(limits::descriptors(&facts));
-    tell(limits::file_size(&facts));
-    tell(logout::logout(system, pid.and_then(program::user_of).unwrap_or(system.user())));
-    tell(multicast::multicast(system, subjects.gateway.interface.as_deref()));
-    bridge::bridge(&subjects.bridge).into_iter().for_each(&mut tell);
+    tell(shared_memory::strangers(&ipc::strangers(domain.root()), |user| system.name_of(user)));
+    tell(shared_memory::leftovers(&facts));
+    tell(machine::descriptors(&facts));
+    tell(machine::file_size(&facts));
+    tell(systemd::logout(system, pid.and_then(version::user_of).unwrap_or(system.user())));
+    tell(machine::multicast(system, subjects.gateway.interface.as_deref()));
+    subjects.bridge.check().into_iter().for_each(&mut tell);
     for subject in &ports {
         let (port, link) = (subject.source.name(), subject.link.as_ref().map(|link| link.name.as_str()));
         line::examine(subject, &there, hub.as_ref(), stop, &mut |finding| tell(finding.at(&port, link)))?;
@@ -125,7 +246,7 @@ pub fn examine(
     }
 }
 
-/// The ports that the user named, else those of the configuration, else all that there are.
+/// Returns the ports that the user named. If there are none, those of the configuration, or all ports of the machine.
 fn choose(
     subjects: &Subjects,
     there: &[Candidate],

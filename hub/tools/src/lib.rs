@@ -1,10 +1,9 @@
-//! The verbs that open a port or explain telegrams, without a hub: `probe`, `doctor`, `configure` and `telegram`. Each does
-//! its work once and ends, and reports progress to the person at the terminal.
+//! The commands that open a port or explain telegrams without a hub: `probe`, `doctor`, `configure` and `telegram`. Each
+//! runs once, and reports its progress to the user at the terminal.
 
 pub mod bridge_program;
 pub mod configure;
 pub mod doctor;
-mod drive;
-mod listen;
+mod driver;
 pub mod probe;
 pub mod telegram;

@@ -1,9 +1,8 @@
-//! `scanhub probe`: finds the sensor at a port, whatever its family. Opens the port, listens for scanners that stream by
-//! themselves, then sends requests. No setting changes.
+//! `scanhub probe`: finds the scanner at a port, whatever its family. Opens the port, listens for scanners that stream
+//! without a request, and then sends requests. Changes no settings.
 
 mod description;
 mod suggestion;
-mod turning;
 
 use std::fmt;
 use std::path::Path;
@@ -15,32 +14,12 @@ use scanhub_drivers::lms::variant::Baud;
 use schema::{Failure, Family, Kind};
 use serde::Serialize;
 
-use crate::drive::drive;
-use crate::listen::{Overheard, listen, not_heard, turning};
-pub use description::Description;
+use crate::driver::drive;
+use crate::driver::{DetectedScanner, detect, not_detected, turning};
+pub use description::{Description, Found, Turning};
 pub(crate) use description::{hex, measuring};
 pub use suggestion::SuggestedLink;
 use suggestion::candidate_of;
-pub use turning::Turning;
-
-/// What is at the other end of a port.
-#[derive(Clone, Debug, Serialize)]
-#[serde(untagged)]
-pub enum Found {
-    /// An LMS, which was asked.
-    Lms(Box<Description>),
-    /// A scanner whose head turns.
-    Turning(Box<Turning>),
-}
-
-impl fmt::Display for Found {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        match self {
-            Found::Lms(description) => description.fmt(f),
-            Found::Turning(turning) => turning.fmt(f),
-        }
-    }
-}
 
 /// Scanner at a port, with the link that a configuration needs for it; class `probe`.
 #[derive(Clone, Debug, Serialize)]
@@ -65,7 +44,7 @@ impl Probed {
 }
 
 impl fmt::Display for Probed {
-    /// The rows, then the next command.
+    /// Writes the rows, and then the next command.
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(f, "{}", self.found)?;
         if let Some((what, remedy)) = &self.caution {
@@ -85,7 +64,7 @@ pub struct Ports {
 }
 
 impl Ports {
-    /// Looks at this machine; opens nothing.
+    /// Lists the ports of this machine, without opening any.
     pub fn of_machine() -> Ports {
         Ports { candidates: candidates(), portless: PortlessAdapter::all(Path::new("/")) }
     }
@@ -106,11 +85,13 @@ impl Ports {
     }
 }
 
-/// Finds out what is at `source`: listens for those that speak unasked before anything is sent, then asks. Calls `look` with
+/// Finds the scanner at `source`. Listens for scanners that stream without a request before it sends one. Calls `look` with
 /// each rate at which it searches.
 ///
-/// The port kinds if the port cannot be used, [`Kind::Timeout`] if nobody answers, [`Kind::Interrupted`] if `stop` is
-/// set.
+/// # Errors
+///
+/// Returns the kinds of a port that cannot be used, [`Kind::Timeout`] if no scanner replies, and [`Kind::Interrupted`] if
+/// `stop` is set.
 pub fn probe(source: &Source, stop: &AtomicBool, look: impl FnMut(u32)) -> Result<Probed, Failure> {
     let (port, first) = open(source, stop)?;
     let there = found_in(Path::new("/"));
@@ -126,25 +107,27 @@ pub fn probe(source: &Source, stop: &AtomicBool, look: impl FnMut(u32)) -> Resul
             let found = Found::Lms(Box::new(Description::new(source.name(), &report)));
             Probed::new(found, SuggestedLink::for_lms(source, &there, &report, first), caution)
         }
-        Answer::Heard(heard) => {
+        Answer::Detected(heard) => {
             let found = Found::Turning(Box::new(Turning::new(source.name(), &heard)));
             Probed::new(found, SuggestedLink::for_turning(source, &there, &heard), caution)
         }
     })
 }
 
-/// What a scanner said.
+/// The scanner that was found.
 pub(crate) enum Answer {
-    /// An LMS, because it was asked.
+    /// An LMS, with its replies to the requests.
     Asked(Box<Report>),
-    /// A scanner whose head turns, which was heard or asked.
-    Heard(Box<Overheard>),
+    /// A rotating scanner.
+    Detected(Box<DetectedScanner>),
 }
 
-/// Finds out what is at `port`, which is open at `first`: of any family, or of `only` one. Before anything is sent, it is
-/// listened for those that speak unasked; then whoever must be asked is.
+/// Finds the scanner at `port`, which is open at `first`. The scanner may be of any family, or of `only` one. Listens for
+/// scanners that stream without a request before it sends one.
 ///
-/// [`Kind::Timeout`] if nobody answers; the rest as [`probe`].
+/// # Errors
+///
+/// Returns [`Kind::Timeout`] if no scanner replies; the other kinds are those of [`probe`].
 pub(crate) fn find(
     port: &Port,
     first: Baud,
@@ -157,14 +140,16 @@ pub(crate) fn find(
     for (family, features) in
         turning().into_iter().filter(|(family, _)| only.is_none_or(|only| only == *family))
     {
-        match listen(port, (family, features), stop, &mut look)? {
-            Ok(heard) => return Ok(Answer::Heard(Box::new(heard))),
-            Err(bytes) if only.is_some() => return Err(not_heard(&source.name(), family, features, bytes)),
+        match detect(port, (family, features), stop, &mut look)? {
+            Ok(heard) => return Ok(Answer::Detected(Box::new(heard))),
+            Err(bytes) if only.is_some() => {
+                return Err(not_detected(&source.name(), family, features, bytes));
+            }
             Err(_) => missed.push(family.name()),
         }
     }
     let _ = port.set_baud(first.rate());
-    match ask(port, first, source, stop, look) {
+    match request_report(port, first, source, stop, look) {
         Ok(report) => Ok(Answer::Asked(Box::new(report))),
         Err(failure) if failure.kind == Kind::Timeout && !missed.is_empty() => {
             let message = format!("{}; no sensor of family {} either", failure.message, missed.join(", "));
@@ -174,9 +159,11 @@ pub(crate) fn find(
     }
 }
 
-/// The port that `text` names: a tty, or `tcp:HOST:PORT`.
+/// Parses the name of a port: a tty, or `tcp:HOST:PORT`.
 ///
-/// [`Kind::Configuration`] if it can be none.
+/// # Errors
+///
+/// Returns [`Kind::Configuration`] if `text` does not name a port.
 pub fn source(text: &str) -> Result<Source, Failure> {
     Source::parse(text).map_err(|what| {
         Failure::new(
@@ -187,22 +174,24 @@ pub fn source(text: &str) -> Result<Source, Failure> {
     })
 }
 
-/// Opens `source` at the greatest rate that it can have, unless `stop` is set before it is open.
+/// Opens `source` at the highest rate that it supports, unless `stop` is set before it is open.
 pub(crate) fn open(source: &Source, stop: &AtomicBool) -> Result<(Port, Baud), Failure> {
     let open = |baud: Baud| Port::open(source, baud.rate(), stop).map(|port| (port, baud));
     let (port, baud) = open(Baud::B500000).or_else(|failure| match failure.kind {
         Kind::PortRate => open(Baud::B38400),
         _ => Err(failure),
     })?;
-    // What waits in its buffer may be older than the sensor's last power-on.
+    // Bytes in the input buffer may be older than the scanner's last power-on. Setting the rate discards them.
     let _ = port.set_baud(baud.rate());
     Ok((port, baud))
 }
 
-/// Asks the sensor at `port`, which is open at `first`.
+/// Requests identity, settings and state of the LMS at `port`, which is open at `first`.
 ///
-/// [`Kind::Timeout`] if nobody answers; the rest as [`probe`].
-pub(crate) fn ask(
+/// # Errors
+///
+/// Returns [`Kind::Timeout`] if no scanner replies; the other kinds are those of [`probe`].
+pub(crate) fn request_report(
     port: &Port,
     first: Baud,
     source: &Source,
@@ -210,7 +199,7 @@ pub(crate) fn ask(
     mut look: impl FnMut(u32),
 ) -> Result<Report, Failure> {
     let is_server = matches!(source, Source::Tcp { .. });
-    // Which rate a serial server has the sensor tells afterwards; the slowest one waits long enough for any.
+    // The scanner reports the rate of a serial server later. The slowest rate waits long enough for any.
     let now = clock::now();
     let mut inquiry = if is_server { Inquiry::at(Baud::B9600, now) } else { Inquiry::new(first, now) };
     let mut shown = None;
@@ -227,7 +216,7 @@ pub(crate) fn ask(
     if report.answers() { Ok(report) } else { Err(silence(source, first, &report)) }
 }
 
-/// Why a sensor that did not answer, at a port whose greatest rate is `first`, may have been silent.
+/// Returns the failure for a scanner that did not reply, with possible reasons. The highest rate of the port is `first`.
 fn silence(source: &Source, first: Baud, report: &Report) -> Failure {
     let name = source.name();
     let came = match report.bytes {
@@ -269,10 +258,10 @@ mod tests {
     use super::*;
 
     #[test]
-    fn rates_that_the_port_does_not_have_were_not_tried() {
+    fn names_only_rates_that_the_port_has() {
         let report = Inquiry::new(Baud::B38400, 0).report().clone();
-        let said = |first| silence(&Source::Tty("/dev/ttyS0".into()), first, &report).message;
-        assert!(said(Baud::B500000).contains("38400 or 500000 Bd; no byte"));
-        assert!(said(Baud::B38400).contains("no answer at 9600, 19200 or 38400 Bd; no byte"));
+        let message = |first| silence(&Source::Tty("/dev/ttyS0".into()), first, &report).message;
+        assert!(message(Baud::B500000).contains("38400 or 500000 Bd; no byte"));
+        assert!(message(Baud::B38400).contains("no answer at 9600, 19200 or 38400 Bd; no byte"));
     }
 }

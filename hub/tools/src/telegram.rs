@@ -3,7 +3,6 @@
 mod find;
 mod input;
 mod show;
-mod unpack;
 
 use std::fs::File;
 use std::io::{self, ErrorKind, Read, Write};
@@ -13,7 +12,7 @@ use scanhub_drivers::lms::variant::Mode;
 use schema::{Failure, Kind};
 
 use find::Finder;
-use input::Input;
+use input::{Input, is_framed, open_recording};
 use show::{Form, Show};
 
 /// Options of `telegram decode`.
@@ -41,8 +40,8 @@ pub fn decode(options: &DecodeOptions, out: &mut dyn Write) -> Result<(), Failur
     let file = options.file.as_deref().filter(|path| *path != Path::new("-"));
     let name = file.map_or("stdin".into(), |path| path.display().to_string());
     let (reader, told): (Box<dyn Read>, _) = match (file, &options.sensor) {
-        (Some(path), sensor) if sensor.is_some() || unpack::is_framed(path) => {
-            unpack::open(path, sensor.as_deref())?
+        (Some(path), sensor) if sensor.is_some() || is_framed(path) => {
+            open_recording(path, sensor.as_deref())?
         }
         (Some(path), _) => (Box::new(File::open(path).map_err(|error| unreadable(&name, &error))?), None),
         (None, None) => (Box::new(io::stdin()), None),

@@ -9,10 +9,12 @@ use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::termios::{QueueSelector, tcflush};
 use schema::{Failure, Kind};
 
-/// Asks for consent to `plan`, whose differences were shown.
+/// Asks a person for consent to `plan`, whose differences were shown.
 ///
-/// [`Kind::Usage`] if stdin or stderr, which has the question, is no terminal, [`Kind::Interrupted`] if `stop` is set, [`Kind::Failed`] if the answer is
-/// not yes.
+/// # Errors
+///
+/// Returns [`Kind::Usage`] if stdin, or stderr with the question, is not a terminal, [`Kind::Interrupted`] if `stop` is
+/// set, and [`Kind::Failed`] if the answer is not `yes`.
 pub(crate) fn person(plan: Plan, stop: &AtomicBool) -> Result<Consent, Failure> {
     let input = stdin();
     if !input.is_terminal() || !stderr().is_terminal() {
@@ -22,7 +24,7 @@ pub(crate) fn person(plan: Plan, stop: &AtomicBool) -> Result<Consent, Failure> 
             "run the same command in a terminal, with stdin and stderr not redirected",
         ));
     }
-    // What was typed before the question is no answer to it.
+    // Input that was typed before the question does not count as an answer.
     let _ = tcflush(&input, QueueSelector::IFlush);
     let question = "The EEPROM wears out after a few thousand writes. Write this? Type yes: ";
     let _ = stderr().write_all(question.as_bytes());
@@ -31,15 +33,15 @@ pub(crate) fn person(plan: Plan, stop: &AtomicBool) -> Result<Consent, Failure> 
             let _ = stderr().write_all(b"\n");
             return Err(Failure::new(Kind::Interrupted, "interrupted, nothing was written", ""));
         }
-        // A terminal has bytes once there is a whole line.
+        // A terminal becomes readable once it has a whole line.
         let mut fds = [PollFd::new(&input, PollFlags::IN)];
-        if poll(&mut fds, Some(&LOOK)).is_ok_and(|ready| ready > 0) {
+        if poll(&mut fds, Some(&STOP_CHECK_INTERVAL)).is_ok_and(|ready| ready > 0) {
             break;
         }
     }
     let mut answer = String::new();
     let read = input.read_line(&mut answer);
-    // An answer without an end, such as Ctrl-D, leaves the cursor behind the question.
+    // An answer without a newline, such as Ctrl-D, leaves the cursor on the line of the question.
     if !answer.ends_with('\n') {
         let _ = stderr().write_all(b"\n");
     }
@@ -49,5 +51,5 @@ pub(crate) fn person(plan: Plan, stop: &AtomicBool) -> Result<Consent, Failure> 
     Err(Failure::new(Kind::Failed, "not confirmed: nothing was written", "to write, answer: yes"))
 }
 
-/// Between two looks whether somebody interrupts.
-const LOOK: Timespec = Timespec { tv_sec: 0, tv_nsec: 100_000_000 };
+/// Interval between checks for an interrupt.
+const STOP_CHECK_INTERVAL: Timespec = Timespec { tv_sec: 0, tv_nsec: 100_000_000 };

@@ -1,26 +1,26 @@
-//! One port from the outside in: whether it exists, who holds it, whether this user may open it, what it can do; then the
-//! sensor at its other end.
+//! Checks one port from the outside in: existence, holders, permissions and rates. Then follow the scanner at its other end,
+//! and the bytes that the line has damaged or lost.
 
 use std::path::Path;
 use std::sync::atomic::AtomicBool;
 
 use port::{
-    Candidate, Holder, PROMPT_MS, Port, PortError, PortlessAdapter, Rights, Source, all_holders, check_tty,
-    latency_ms,
+    Candidate, Counts, Holder, PROMPT_MS, Port, PortError, PortlessAdapter, Rights, Source, all_holders,
+    check_tty, latency_ms,
 };
 use scanhub_drivers::lms::variant::Baud;
-use schema::{Failure, Kind};
+use schema::{Counter, Failure, Kind, Status};
 
-use super::Subject;
-use super::counts::{as_the_hub_counts, line_errors, line_loss};
-use super::finding::Finding;
 use super::hub::Hub;
-use super::{sensor, turning};
+use super::{Finding, Subject, sensor};
+use crate::driver::MOST_DAMAGED;
 use crate::probe::{self, Answer};
 
-/// Examines a port and its sensor.
+/// Checks a port and its scanner.
 ///
-/// [`Kind::Interrupted`] if `stop` is set; everything else is a finding.
+/// # Errors
+///
+/// Returns [`Kind::Interrupted`] if `stop` is set. Every other problem is a finding.
 pub(crate) fn examine(
     subject: &Subject,
     there: &[Candidate],
@@ -51,7 +51,7 @@ pub(crate) fn examine(
     }
     let holders = all_holders(path);
     if !holders.is_empty() {
-        // To open it would change its settings under who has it.
+        // Opening the port would change its settings under the process that has it.
         match hub.filter(|hub| holders.iter().any(|holder| holder.pid == hub.pid)) {
             Some(hub) => {
                 let link = hub.link(&subject.source.name());
@@ -75,7 +75,7 @@ pub(crate) fn examine(
     }
     tell(Finding::ok("holder", "nobody has it open"));
     if !subject.named {
-        // To open it alone would start some devices anew.
+        // Opening the port would restart some devices.
         tell(if candidate.is_none_or(|candidate| candidate.is_permitted) {
             Finding::ok("access", "may be opened")
         } else {
@@ -94,7 +94,7 @@ pub(crate) fn examine(
         }
     };
     tell(Finding::ok("access", format!("can be opened, is a serial line{}", whose(path))));
-    // Opened, most adapters hand over at once.
+    // The hub's settings of an open port make most adapters return bytes at once.
     tell(latency(path, latency_ms(path)));
     let answer = ask(subject, &port, first, stop)?;
     // Without an answer, bytes may have arrived at another rate.
@@ -106,14 +106,14 @@ pub(crate) fn examine(
     Ok(())
 }
 
-/// Examines a serial server and the sensor behind it.
+/// Checks a serial server and its scanner.
 fn server(
     subject: &Subject,
     hub: Option<&Hub>,
     stop: &AtomicBool,
     tell: &mut dyn FnMut(Finding),
 ) -> Result<(), Failure> {
-    // Most of them serve one at a time.
+    // Most servers accept one client at a time, so do not connect to the server of a link.
     if let Some(link) = hub.and_then(|hub| hub.link(&subject.source.name())) {
         tell(Finding::ok("holder", "it is a link of the hub"));
         tell(line_loss(link.1));
@@ -134,15 +134,15 @@ fn server(
     }
 }
 
-/// Rate at which a rotating scanner was found, and the findings about the sensor. Otherwise the reason why none answered.
+/// Rate at which a rotating scanner was found, and the findings about the scanner. Otherwise the reason why none replied.
 type Examined = Result<(Option<u32>, Vec<Finding>), Finding>;
 
-/// Examines the sensor at `port`, which is open at `first`.
+/// Checks the scanner at `port`, which is open at `first`.
 fn ask(subject: &Subject, port: &Port, first: Baud, stop: &AtomicBool) -> Result<Examined, Failure> {
     let (source, link) = (&subject.source, subject.link.as_ref());
     match probe::find(port, first, source, link.map(config::Link::family), stop, |_| {}) {
-        Ok(Answer::Asked(report)) => Ok(Ok((None, sensor::examine(&source.name(), &report, link)))),
-        Ok(Answer::Heard(heard)) => Ok(Ok((Some(heard.rate), turning::examine(&heard, link)))),
+        Ok(Answer::Asked(report)) => Ok(Ok((None, sensor::check_lms(&source.name(), &report, link)))),
+        Ok(Answer::Detected(heard)) => Ok(Ok((Some(heard.rate), sensor::check_rotating(&heard, link)))),
         Err(failure) if failure.kind == Kind::Interrupted => Err(failure),
         Err(failure) => Ok(Err(Finding::failed("sensor", failure.message, failure.hint))),
     }
@@ -152,7 +152,8 @@ fn report(examined: Examined) -> Vec<Finding> {
     examined.map_or_else(|finding| vec![finding], |(_, findings)| findings)
 }
 
-/// The hub has it; whoever has it too takes bytes away from it. The service manager keeps it for the next hub.
+/// Checks the holders of a port that the hub has open. Another process takes bytes away from the hub. Only the service
+/// manager may hold the port, too, because it keeps the port for the next hub.
 fn held(holders: &[Holder], hub: u32) -> Finding {
     const NAME: &str = "holder";
     let words: Vec<String> = holders.iter().map(ToString::to_string).collect();
@@ -167,7 +168,7 @@ fn held(holders: &[Holder], hub: u32) -> Finding {
     }
 }
 
-/// Group and mode of the port, in words.
+/// Returns group and mode of the port, as text.
 fn whose(path: &Path) -> String {
     let rights = Rights::of(path);
     rights.port.map_or(String::new(), |port| format!("; group {}, mode {:03o}", rights.group, port.mode))
@@ -181,7 +182,7 @@ fn recording(path: &Path) -> Finding {
     }
 }
 
-/// What the machine knows of the port.
+/// Returns the port in the list of the machine's ports.
 fn candidate<'a>(path: &Path, there: &'a [Candidate]) -> Option<&'a Candidate> {
     let device = path.canonicalize().ok()?;
     there.iter().find(|candidate| candidate.device == device)
@@ -193,7 +194,7 @@ pub(crate) fn without_port(adapter: &PortlessAdapter, is_only: bool) -> Finding 
     finding("ports", adapter.to_string(), adapter.remedy())
 }
 
-/// Whether it is there, and under a name that stays.
+/// Checks whether the port exists, and whether its name does not change.
 fn presence(source: &Source, path: &Path, candidate: Option<&Candidate>) -> Finding {
     const NAME: &str = "port";
     if !path.exists() {
@@ -227,7 +228,7 @@ fn describe(candidate: &Candidate) -> String {
     text
 }
 
-/// Why it cannot be opened.
+/// Returns the finding for a port that cannot be opened.
 fn refused(failure: Failure) -> Finding {
     let name = match failure.kind {
         Kind::PortBusy => "holder",
@@ -238,7 +239,7 @@ fn refused(failure: Failure) -> Finding {
     Finding::failed(name, failure.message, failure.hint)
 }
 
-/// Whether the adapter of an open port collects bytes, for so many milliseconds, before it hands them over.
+/// Checks whether the adapter of an open port delays bytes, for `ms` milliseconds.
 fn latency(path: &Path, ms: Option<u8>) -> Finding {
     const NAME: &str = "latency";
     let Some(ms) = ms else { return Finding::skipped(NAME, "the driver has no latency timer") };
@@ -258,14 +259,15 @@ fn latency(path: &Path, ms: Option<u8>) -> Finding {
     )
 }
 
-/// Checks whether the port can have the rate to stream at: the rate of the rotating scanner that was `found`, or the link's rate.
+/// Checks whether the port supports the rate of the stream: the rate of the rotating scanner that was `found`, or that of
+/// the link.
 fn rate(subject: &Subject, port: &Port, first: Baud, found: Option<u32>) -> Finding {
     const NAME: &str = "rate";
     let link_rate = subject.link.as_ref().map_or(Baud::B500000.rate(), config::Link::rate);
     let wanted = found.unwrap_or(link_rate);
     let outcome = port.set_baud(wanted);
     let given = port.baud().filter(|&given| given != wanted);
-    // The inquiry begins at the rate at which it was opened.
+    // The requests start at the rate at which the port was opened.
     let _ = port.set_baud(first.rate());
     match (outcome, &subject.link) {
         (Ok(()), _) => {
@@ -296,16 +298,108 @@ fn rate(subject: &Subject, port: &Port, first: Baud, found: Option<u32>) -> Find
     }
 }
 
-/// The first process of all: it has lines open only for a service.
+/// Process ID of the service manager, which holds ports only for a service.
 const SERVICE_MANAGER: u32 = 1;
+
+/// Name of the check of bytes that arrived damaged, or were lost before they could be read.
+const LINE_ERRORS: &str = "line-errors";
+
+/// Judges the counters that the driver of an open line has kept since it was loaded, if it counts errors. `now` is the
+/// number of errors while a scanner replied at its rate. At a wrong rate every byte is an error, and the search for a
+/// scanner tries wrong rates, so a few errors are ignored.
+fn line_errors(counts: Option<Counts>, now: u64) -> Finding {
+    let Some(counts) = counts else {
+        return Finding::skipped(LINE_ERRORS, "the driver does not count errors");
+    };
+    let Counts { received, framing, overrun, parity, breaks, buffer } = counts;
+    let text = format!(
+        "framing {framing}, parity {parity}, breaks {breaks}, overruns {} in {received} bytes since its driver was loaded",
+        overrun.wrapping_add(buffer)
+    );
+    let lost = overrun.wrapping_add(buffer);
+    if now > MAX_ERRORS_NOW {
+        return Finding::warning(
+            LINE_ERRORS,
+            format!("{now} errors while the sensor answered; {text}"),
+            errors_remedy(false),
+        );
+    }
+    if is_large(lost.into(), received.into()) {
+        return Finding::warning(LINE_ERRORS, text, errors_remedy(true));
+    }
+    if is_large(counts.errors().into(), received.into()) {
+        return Finding::warning(LINE_ERRORS, text, errors_remedy(false));
+    }
+    Finding::ok(LINE_ERRORS, text)
+}
+
+/// Judges the errors that the hub counted at one of its ports.
+fn as_the_hub_counts(status: &Status) -> Finding {
+    let (errors, bytes) = (status.counters[Counter::LineErrors], status.counters[Counter::BytesRead]);
+    let text = format!("the hub counted {errors} in {bytes} bytes");
+    if is_large(errors, bytes) {
+        Finding::warning(LINE_ERRORS, text, errors_remedy(false))
+    } else {
+        Finding::ok(LINE_ERRORS, text)
+    }
+}
+
+/// Judges the share of its stream that a line of the hub damages or loses.
+fn line_loss(status: &Status) -> Finding {
+    const NAME: &str = "line-loss";
+    let due = status.counters[Counter::DueOnLine];
+    let all = match status.lost_on_line() {
+        // Damaged scans are lost, too, but too few arrive to count them.
+        Some(0) if is_mostly_damaged(status) => format!("how many {} are lost is not known", status.sent()),
+        Some(lost) => format!("{lost} of {due} {} lost since the hub's start", status.sent()),
+        None => format!("how many {} are lost is not known", status.sent()),
+    };
+    let text = format!("{:.2} % of the bytes damaged in the last 10 s, {all}", 100.0 * status.damaged());
+    match status.line_loss() {
+        Some(loss) if is_mostly_damaged(status) => {
+            Finding::failed(NAME, format!("{loss}; {text}"), LOSS_REMEDY)
+        }
+        Some(loss) => Finding::warning(NAME, format!("{loss}; {text}"), LOSS_REMEDY),
+        None => Finding::ok(NAME, text),
+    }
+}
+
+/// Returns whether the line damages most bytes, which makes every conclusion from the others unreliable.
+pub(crate) fn is_mostly_damaged(status: &Status) -> bool {
+    status.damaged() > MOST_DAMAGED
+}
+
+/// Returns whether `errors` in `bytes` are more than the search for a scanner causes, and cost scans.
+fn is_large(errors: u64, bytes: u64) -> bool {
+    errors > MAX_SEARCH_ERRORS && errors.saturating_mul(BYTES_PER_ERROR) > bytes
+}
+
+/// Returns the remedy for bytes that were lost in the machine, or damaged on the line.
+fn errors_remedy(is_lost: bool) -> &'static str {
+    if is_lost {
+        "the machine did not fetch them in time: another USB socket, without a hub in between; a UART with a FIFO"
+    } else {
+        "the cable: ground, twisted pairs, 120 ohm across the receiving pair, away from motors; docs/wiring.md"
+    }
+}
+
+/// Remedy for a line that loses bytes.
+pub(crate) const LOSS_REMEDY: &str = "the cable and its ground; the adapter: one with an FT232R or newer, in a socket of the \
+     machine; of a UART its FIFO (setserial -g); 120 ohm of termination at the receiving end; docs/wiring.md";
+/// Maximum number of errors while a scanner replies: a byte that was cut when the rate changed, and one more.
+const MAX_ERRORS_NOW: u64 = 2;
+/// Maximum number of errors that the search for the rates of scanners causes.
+const MAX_SEARCH_ERRORS: u64 = 1000;
+/// Minimum number of bytes per error on a good line. One error in 7,000 bytes damages one of ten telegrams.
+const BYTES_PER_ERROR: u64 = 7000;
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::doctor::finding::State;
+    use crate::doctor::State;
 
     #[test]
-    fn what_the_hub_does_not_mind_is_no_finding() {
+    fn warns_of_slow_adapter() {
         let of = |ms| latency(Path::new("/dev/ttyUSB0"), ms);
         assert_eq!([of(None).state, of(Some(1)).state], [State::Skipped, State::Ok]);
         assert_eq!(of(Some(PROMPT_MS)).state, State::Ok);
@@ -315,7 +409,7 @@ mod tests {
     }
 
     #[test]
-    fn a_name_that_may_stand_for_another_port_is_reported() {
+    fn warns_of_name_that_may_change() {
         // Files that exist everywhere stand for the names.
         let [device, by_path, shared] = ["/dev/null", "/dev/zero", "/dev/full"].map(Path::new);
         let twin = Candidate {
@@ -343,7 +437,7 @@ mod tests {
     }
 
     #[test]
-    fn adapters_without_a_port_fail_only_if_there_is_none() {
+    fn adapter_without_port_fails_only_without_other_port() {
         let adapter = PortlessAdapter {
             usb: "1-1".to_owned(),
             id: "1a86:7523".to_owned(),
@@ -357,12 +451,63 @@ mod tests {
     }
 
     #[test]
-    fn who_reads_beside_the_hub_is_told() {
+    fn warns_of_process_that_reads_port_of_hub() {
         let holder = |pid, program: &str| Holder { pid, program: program.to_owned() };
         let (manager, hub, cat) = (holder(1, "systemd"), holder(7, "scanhub"), holder(9, "cat"));
         assert_eq!(held(std::slice::from_ref(&hub), 7).state, State::Ok);
         assert_eq!(held(&[manager, hub.clone()], 7).state, State::Ok);
         let two = held(&[hub, cat], 7);
         assert!(two.state == State::Warning && two.remedy.contains("process 9 (cat)"), "{two}");
+    }
+
+    #[test]
+    fn judges_errors_by_time_and_number() {
+        let healthy = Counts { received: 100_000_000, framing: 900, ..Counts::default() };
+        let of = |counts: Counts, now| line_errors(Some(counts), now);
+        assert_eq!(line_errors(None, 0).state, State::Skipped);
+        assert_eq!(of(healthy, 0).state, State::Ok);
+        assert_eq!(of(healthy, MAX_ERRORS_NOW).state, State::Ok);
+        let grown = of(healthy, 40);
+        assert!(grown.state == State::Warning && grown.finding.starts_with("40 errors while"), "{grown}");
+        assert!(grown.remedy.contains("120 ohm"), "{grown}");
+        let large = of(Counts { parity: 90_000, ..healthy }, 0);
+        assert!(large.state == State::Warning && large.remedy.contains("cable"), "{large}");
+        let lost = of(Counts { overrun: 10_000, buffer: 80_000, ..healthy }, 0);
+        assert!(lost.state == State::Warning && lost.remedy.contains("FIFO"), "{lost}");
+        assert!(lost.finding.contains("overruns 90000 in 100000000 bytes"), "{lost}");
+    }
+
+    #[test]
+    fn warns_of_line_that_loses_scans() {
+        let mut status = Status::default();
+        assert_eq!(line_loss(&status).state, State::Ok);
+        status.counters[Counter::DueOnLine] = 22_000;
+        status.counters[Counter::LostOnLine] = 9_000;
+        let past = line_loss(&status);
+        assert!(past.state == State::Ok && past.finding.contains("9000 of 22000 scans lost"), "{past}");
+        status.counters[Counter::LostPpm] = 408_000;
+        status.counters[Counter::DamagedPpm] = 430_000;
+        let now = line_loss(&status);
+        assert!(now.state == State::Warning && now.finding.starts_with("41 % lost on the line"), "{now}");
+        status.counters[Counter::DamagedPpm] = 510_000;
+        let most = line_loss(&status);
+        assert_eq!(most.state, State::Failed, "as of a port that no hub has: {most}");
+        status.counters[Counter::LostOnLine] = 0;
+        status.counters[Counter::LostPpm] = 0;
+        let unknown = line_loss(&status).finding;
+        assert!(unknown.ends_with("how many scans are lost is not known"), "{unknown}");
+        for word in ["cable", "FIFO", "adapter", "termination"] {
+            assert!(now.remedy.contains(word), "{now}");
+        }
+    }
+
+    #[test]
+    fn judges_errors_of_hub_by_its_bytes() {
+        let mut status = Status::default();
+        status.counters[Counter::BytesRead] = 1_000_000;
+        status.counters[Counter::LineErrors] = 10;
+        assert_eq!(as_the_hub_counts(&status).state, State::Ok);
+        status.counters[Counter::LineErrors] = 5000;
+        assert_eq!(as_the_hub_counts(&status).state, State::Warning);
     }
 }

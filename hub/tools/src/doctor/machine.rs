@@ -1,5 +1,6 @@
-//! What a hub needs from the machine, whatever its sensors are: shared memory, and its own domain. Each check judges facts
-//! that were gathered before, so that every verdict can be tested.
+//! Checks what a hub needs from the machine, whatever its sensors are: shared memory, its own domain, descriptors and file
+//! sizes, and the network interface of a gateway. Most checks judge [`Facts`] that were gathered before, so that tests can
+//! provide any facts.
 
 use std::fs;
 use std::os::unix::fs::MetadataExt;
@@ -13,18 +14,18 @@ use schema::limits::TopicLimits;
 use schema::shortage::SHARED_MEMORY;
 use schema::{Domain, Environment, Failure, RunningHub};
 
-use super::finding::Finding;
 use super::hub::Hub;
-use super::program;
-use super::segments::{self, Segment};
+use super::shared_memory::{self, SharedFile};
+use super::version::is_stopped;
+use super::{Finding, System};
 
-/// What is known of the machine and the domain.
+/// Facts about the machine and the domain.
 #[derive(Clone, Debug)]
 pub(crate) struct Facts {
     pub(crate) links: usize,
-    /// What the topics of each are made for.
+    /// Limits of the topics of each link.
     pub(crate) limits: Vec<TopicLimits>,
-    /// None: it cannot be looked at.
+    /// Shared memory; `None` if it cannot be read.
     pub(crate) memory: Option<Memory>,
     /// The domain's name.
     pub(crate) name: String,
@@ -34,37 +35,37 @@ pub(crate) struct Facts {
     pub(crate) place: Place,
     /// The hub's process, if one holds the domain.
     pub(crate) hub: Result<Option<u32>, Failure>,
-    /// Links of that hub whose status did not come.
+    /// Links of that hub whose status did not arrive.
     pub(crate) mute: Vec<String>,
     /// Whether that hub's process was stopped, by a signal or a debugger.
     pub(crate) is_stopped: bool,
-    /// Hubs of the same name at other places.
+    /// Hubs of the same name at other locations, with their processes.
     pub(crate) others: Vec<(PathBuf, u32)>,
-    /// Such places that are another user's, with whose they are.
+    /// Other locations that belong to another user, with their owners.
     pub(crate) closed: Vec<(PathBuf, u32)>,
     /// Hubs of the same or an unknown name that other users run.
     pub(crate) foreign: Vec<RunningHub>,
-    /// Processes at the domain's place, and the dead ones at others where no hub is.
+    /// Processes at the domain's location, and dead processes at other locations without a hub.
     pub(crate) nodes: Result<Nodes, Failure>,
-    /// Files in shared memory that may be the domain's and that nobody holds.
-    pub(crate) segments: Vec<Segment>,
-    /// The library's lock there, which the end of a hub leaves, and the next one takes.
+    /// Files in shared memory that may belong to the domain, and that no process holds.
+    pub(crate) segments: Vec<SharedFile>,
+    /// The library's lock of the domain, which a hub leaves at its exit, and which the next one takes.
     pub(crate) lock: Option<PathBuf>,
-    /// Hard limit of open descriptors; none: no limit.
+    /// Hard limit of open descriptors; `None` if there is no limit.
     pub(crate) descriptors: Option<u64>,
-    /// How many this process has open, as would a hub that was started in its place.
+    /// Number of descriptors that this process has open. A hub in its place would have the same number.
     pub(crate) open: u64,
-    /// Limit of a file's bytes; none: no limit.
+    /// Limit of the length of a file, in bytes; `None` if there is no limit.
     pub(crate) file_size: Option<u64>,
 }
 
 /// Shared memory.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Memory {
-    /// Bytes; 0 is no limit.
+    /// Size in bytes; 0 means no limit.
     pub(crate) size: u64,
     pub(crate) free: u64,
-    /// How many files it has room for; none: no limit.
+    /// Number of files that it has room for; `None` if there is no limit.
     pub(crate) free_files: Option<u64>,
     pub(crate) is_read_only: bool,
 }
@@ -75,12 +76,12 @@ pub(crate) struct Place {
     pub(crate) path: PathBuf,
     /// Permission bits.
     pub(crate) mode: u32,
-    /// Something can be made in it.
+    /// Whether this process can create files in it.
     pub(crate) writable: bool,
 }
 
 impl Facts {
-    /// Looks at everything; changes nothing.
+    /// Gathers all facts, without changing anything.
     pub(crate) fn gather(
         domain: &Domain,
         places: &[Domain],
@@ -98,10 +99,10 @@ impl Facts {
             let free = elsewhere().filter(|place| held(place).is_none() && owner(place) == Some(user));
             nodes.dead += free.filter_map(|place| Some(schema::ipc::nodes(place).ok()?.dead)).sum::<usize>();
         }
-        // Whoever lives there may be opening files: they are left in peace.
+        // A process that runs at this location may be opening files, so they do not count as left.
         let is_empty = nodes.as_ref().is_ok_and(|nodes| nodes.alive == 0) && held(domain).is_none();
         Facts {
-            // To list them needs one too.
+            // Listing the descriptors needs one, too.
             open: fs::read_dir("/proc/self/fd").map_or(0, |entries| entries.count() as u64 - 1),
             links: limits.len(),
             limits,
@@ -111,7 +112,7 @@ impl Facts {
             place: Place::nearest(root),
             hub: schema::holder(root),
             mute: hub.map(Hub::mute).unwrap_or_default(),
-            is_stopped: hub.is_some_and(|hub| program::is_stopped(hub.pid)),
+            is_stopped: hub.is_some_and(|hub| is_stopped(hub.pid)),
             others: elsewhere().filter_map(|place| Some((place.root().to_owned(), held(place)?))).collect(),
             closed: elsewhere()
                 .filter(|place| schema::holder(place.root()).is_err())
@@ -123,15 +124,15 @@ impl Facts {
                 .filter(|hub| hub.domain.as_ref().is_none_or(|own| own == domain.name()))
                 .collect(),
             nodes,
-            segments: if is_empty { segments::abandoned(&domain.prefix(), user) } else { Vec::new() },
-            lock: if is_empty { segments::lock(&domain.prefix(), user) } else { None },
+            segments: if is_empty { shared_memory::abandoned(&domain.prefix(), user) } else { Vec::new() },
+            lock: if is_empty { shared_memory::lock(&domain.prefix(), user) } else { None },
             descriptors: getrlimit(Resource::Nofile).maximum,
             file_size: getrlimit(Resource::Fsize).current,
         }
     }
 
-    /// The hub that lives at the domain's place.
-    pub(crate) fn lives(&self) -> Option<u32> {
+    /// Returns the process of the hub at the domain's location.
+    pub(crate) fn hub_pid(&self) -> Option<u32> {
         self.hub.as_ref().ok().copied().flatten()
     }
 }
@@ -162,7 +163,7 @@ impl Place {
     }
 }
 
-/// Whether shared memory has room for the links.
+/// Checks whether shared memory has room for the links.
 pub(crate) fn memory(facts: &Facts) -> Finding {
     const NAME: &str = "memory";
     let Some(Memory { size, free, free_files, is_read_only }) = facts.memory else {
@@ -174,7 +175,7 @@ pub(crate) fn memory(facts: &Facts) -> Finding {
         return Finding::failed(NAME, text, format!("sudo mount -o remount,rw,mode=1777 {SHARED_MEMORY}"));
     }
     let files = facts.links as u64 * FILES_OF_LINK + FILES;
-    if let Some(free_files) = free_files.filter(|&free| free < files && facts.lives().is_none()) {
+    if let Some(free_files) = free_files.filter(|&free| free < files && facts.hub_pid().is_none()) {
         let text = format!("{SHARED_MEMORY} has room for {free_files} files, {files} needed");
         return Finding::failed(NAME, text, format!("sudo mount -o remount,nr_inodes=10k {SHARED_MEMORY}"));
     }
@@ -183,7 +184,7 @@ pub(crate) fn memory(facts: &Facts) -> Finding {
     }
     let needed = needs::memory(&facts.limits);
     let has = format!("{SHARED_MEMORY} has {} kB, {} kB of them free", size / 1024, free / 1024);
-    if facts.lives().is_some() {
+    if facts.hub_pid().is_some() {
         return Finding::ok(NAME, format!("{has}; the hub has what it needs"));
     }
     let text = format!("{has}; {} kB needed for {}", needed / 1024, plural(facts.links as u64, "link"));
@@ -200,7 +201,7 @@ pub(crate) fn memory(facts: &Facts) -> Finding {
     Finding::failed(NAME, text, remedy)
 }
 
-/// Whether a hub of this user can take its place, or has it.
+/// Checks whether a hub of this user has the domain, or can create it.
 pub(crate) fn domain(facts: &Facts) -> Finding {
     const NAME: &str = "domain";
     let (root, place) = (facts.root.display(), &facts.place);
@@ -235,7 +236,8 @@ pub(crate) fn domain(facts: &Facts) -> Finding {
     Finding::ok(NAME, format!("{root}: free, yours, mode {:04o}", place.mode))
 }
 
-/// Whether there is one hub of this name for everybody who names no place; where another user's may be `name_of` tells whose.
+/// Checks whether there is only one hub of this name for clients that name no location. `name_of` returns the name of the
+/// owner of another location.
 pub(crate) fn hubs(facts: &Facts, name_of: impl Fn(u32) -> String) -> Finding {
     const NAME: &str = "hubs";
     let others: Vec<String> =
@@ -273,21 +275,106 @@ pub(crate) fn plural(count: u64, what: &str) -> String {
     }
 }
 
-/// How another user's hub can be heard.
+/// Remedy to receive data of another user's hub.
 const SHARING: &str = "to have its data here: `scanhub gateway --interface lo` under that user, and `scanhub listen --publish` \
                        under this one (docs/sharing.md)";
 
-/// Files in shared memory of each link, and of what belongs to no link, with some for the first consumers.
+/// Number of files in shared memory for each link, with some for the first subscribers.
 const FILES_OF_LINK: u64 = 24;
+/// Number of files in shared memory that belong to no link.
 const FILES: u64 = 8;
+
+/// Checks whether a hub may open enough descriptors.
+pub(crate) fn descriptors(facts: &Facts) -> Finding {
+    const NAME: &str = "descriptors";
+    let Some(limit) = facts.descriptors else { return Finding::ok(NAME, "no limit") };
+    let own = facts.open + DESCRIPTORS_AT_START + needs::descriptors(facts.links);
+    let remedy = "raise the hard limit: for this shell sudo prlimit --pid $$ --nofile=65536:65536, of a service LimitNOFILE=65536, \
+         of a container --ulimit nofile=65536";
+    let Some(rest) = limit.checked_sub(own) else {
+        let text = format!("{limit} at most, the hub needs {own}");
+        return Finding::failed(NAME, text, remedy);
+    };
+    let consumers = rest / DESCRIPTORS_OF_SUBSCRIBER;
+    let text = format!("{limit} at most: enough for about {consumers} consumers of a topic");
+    if consumers >= MIN_SUBSCRIBERS { Finding::ok(NAME, text) } else { Finding::warning(NAME, text, remedy) }
+}
+
+/// Checks whether a hub may create files as long as the longest segment. A signal ends a process that exceeds the limit.
+pub(crate) fn file_size(facts: &Facts) -> Finding {
+    const NAME: &str = "file-size";
+    let Some(limit) = facts.file_size else { return Finding::ok(NAME, "no limit") };
+    let longest = needs::longest_segment(&facts.limits);
+    let text = format!("{} kB at most; the longest segment has {} kB", limit / 1024, longest / 1024);
+    if limit >= longest {
+        return Finding::ok(NAME, text);
+    }
+    Finding::failed(NAME, text, "lift the limit: ulimit -f unlimited, LimitFSIZE= of a service")
+}
+
+/// Number of descriptors that a hub has open when it counts them: five for the signals, and its lock.
+const DESCRIPTORS_AT_START: u64 = 6;
+/// Number of descriptors for each subscriber to a topic.
+const DESCRIPTORS_OF_SUBSCRIBER: u64 = 4;
+/// Number of subscribers that a robot hardly exceeds.
+const MIN_SUBSCRIBERS: u64 = 50;
+
+/// Checks whether the interface that the configuration names for a gateway can send multicast datagrams. Sends nothing.
+/// Without such a name, a gateway sends nothing to groups, and a listener receives on every interface that has a link.
+pub(crate) fn multicast(system: &System, interface: Option<&str>) -> Finding {
+    const NAME: &str = "multicast";
+    let Some(name) = interface else {
+        return Finding::skipped(NAME, "no gateway.interface is named, so nothing is sent to groups");
+    };
+    // This list has the interfaces of this process's network. /sys may show those of another one.
+    let list = system.text("proc/net/dev").unwrap_or_default();
+    let names: Vec<&str> = list.lines().filter_map(|line| Some(line.split_once(':')?.0.trim())).collect();
+    if !names.contains(&name) {
+        return Finding::failed(
+            NAME,
+            format!("gateway.interface: there is no network interface {name:?}"),
+            format!("correct it, there are {}; or plug it in", names.join(", ")),
+        );
+    }
+    let directory = system.path("sys/class/net").join(name);
+    let number = |file: &str| {
+        let text = std::fs::read_to_string(directory.join(file)).ok()?;
+        u32::from_str_radix(text.trim().trim_start_matches("0x"), 16).ok()
+    };
+    let Some(flags) = number("flags") else {
+        return Finding::ok(
+            NAME,
+            format!("by {name}, as set in gateway.interface; its state is not shown here"),
+        );
+    };
+    if flags & LOOPBACK != 0 {
+        return Finding::ok(NAME, format!("by {name}, as set in gateway.interface: this machine only"));
+    }
+    if flags & MULTICAST == 0 {
+        let text = format!("gateway.interface: {name} carries no multicast");
+        return Finding::failed(NAME, text, "name another one, or hosts under gateway.to");
+    }
+    if flags & UP == 0 {
+        return Finding::warning(NAME, format!("{name} is down"), format!("sudo ip link set {name} up"));
+    }
+    if number("carrier") != Some(1) {
+        return Finding::warning(NAME, format!("{name} is up and has no link"), "plug its cable in");
+    }
+    Finding::ok(NAME, format!("by {name}, as set in gateway.interface; it is up"))
+}
+
+/// Flag of an interface that is up (linux/if.h, as the next two).
+const UP: u32 = 0x1;
+const LOOPBACK: u32 = 0x8;
+const MULTICAST: u32 = 0x1000;
 
 #[cfg(test)]
 pub(super) mod tests {
     use schema::Kind;
 
     use super::*;
-    use crate::doctor::finding::State;
-    use crate::doctor::system::tests::Laid;
+    use crate::doctor::State;
+    use crate::doctor::system::tests::TempRoot;
 
     const ROOMY: Memory = Memory { size: 64 << 20, free: 60 << 20, free_files: None, is_read_only: false };
 
@@ -323,7 +410,7 @@ pub(super) mod tests {
     }
 
     #[test]
-    fn memory_is_judged_by_what_the_links_need() {
+    fn compares_memory_with_need_of_links() {
         says(&memory(&facts()), State::Ok, &["61440 kB of them free", "2 links"]);
         let with = |memory: Memory| Facts { memory: Some(memory), ..facts() };
         let full = with(Memory { free: 1 << 10, ..ROOMY });
@@ -341,7 +428,7 @@ pub(super) mod tests {
     }
 
     #[test]
-    fn a_domain_is_free_held_foreign_or_impossible() {
+    fn judges_location_of_domain() {
         let root: PathBuf = facts().root;
         let there = |mode| Facts {
             place: Place { path: root.clone(), mode, writable: mode & 0o200 != 0 },
@@ -363,7 +450,7 @@ pub(super) mod tests {
     }
 
     #[test]
-    fn two_hubs_of_one_name_are_one_too_many() {
+    fn warns_of_two_hubs_with_same_name() {
         let hubs = |facts: &Facts| hubs(facts, |user| format!("u{user}"));
         says(&hubs(&facts()), State::Ok, &["scanhub"]);
         let closed = Facts { closed: vec![("/run/scanhub/scanhub".into(), 8)], ..facts() };
@@ -377,12 +464,52 @@ pub(super) mod tests {
             ("proc/42/status", "Uid:\t9\t9\t9\t9\n"),
             ("proc/42/cmdline", "scanhub\0run\0"),
         ];
-        let laid = Laid::out(7, &files);
-        let foreign = Facts { foreign: RunningHub::all(&laid.path("")), ..facts() };
+        let temp = TempRoot::new(7, &files);
+        let foreign = Facts { foreign: RunningHub::all(&temp.path("")), ..facts() };
         let command = "user robot runs one, process 41: sudo -u robot scanhub doctor";
         let unknown = "runs one in an unknown domain, process 42: sudo -u robot scanhub list --domains";
         says(&hubs(&foreign), State::Ok, &["no other hub", command, unknown]);
         let two = Facts { others: vec![("/tmp/scanhub-7/scanhub".into(), 9)], ..facts() };
         says(&hubs(&two), State::Warning, &["/tmp/scanhub-7/scanhub (process 9)", "--domain"]);
+    }
+
+    #[test]
+    fn counts_descriptors_in_subscribers() {
+        says(&descriptors(&facts()), State::Ok, &["4096", "990 consumers"]);
+        says(&descriptors(&Facts { descriptors: None, ..facts() }), State::Ok, &["no limit"]);
+        says(&descriptors(&Facts { descriptors: Some(152), ..facts() }), State::Warning, &["4 consumers"]);
+        says(&descriptors(&Facts { descriptors: Some(131), ..facts() }), State::Failed, &["needs 134"]);
+    }
+
+    #[test]
+    fn compares_file_size_with_longest_segment() {
+        says(&file_size(&facts()), State::Ok, &["no limit"]);
+        let of = |limit| file_size(&Facts { file_size: Some(limit), ..facts() });
+        says(&of(1 << 30), State::Ok, &["1048576 kB at most"]);
+        says(&of(100 << 10), State::Failed, &["100 kB at most", "ulimit -f unlimited", "LimitFSIZE="]);
+    }
+
+    #[test]
+    fn judges_interface_of_gateway() {
+        let head = "Inter-|   Receive\n face |bytes\n";
+        let files = [("sys/class/net/lo/flags", "0x9\n"), ("proc/net/dev", &format!("{head}    lo: 1 2\n"))];
+        let temp = TempRoot::new(7, &files);
+        let of = |name: &str| multicast(&temp.system, Some(name));
+        assert_eq!(multicast(&temp.system, None).state, State::Skipped);
+        assert_eq!(of("lo").state, State::Ok);
+        let missing = of("eth0");
+        assert!(missing.state == State::Failed && missing.remedy.contains("there are lo"), "{missing}");
+        temp.put("proc/net/dev", &format!("{head}    lo: 1 2\n  eth0: 3 4\n"));
+        assert_eq!(of("eth0").state, State::Ok, "its state is unknown");
+        for (flags, carrier, state) in [
+            ("0x1", "1", State::Failed),
+            ("0x1002", "0", State::Warning),
+            ("0x1003", "0", State::Warning),
+            ("0x1003", "1", State::Ok),
+        ] {
+            temp.put("sys/class/net/eth0/flags", flags);
+            temp.put("sys/class/net/eth0/carrier", carrier);
+            assert_eq!(of("eth0").state, state, "{flags} {carrier}");
+        }
     }
 }

@@ -1,30 +1,33 @@
-//! The sensor at the other end: whether it answers, is set as configured, and is healthy. Judges its answers; refuses to
-//! ask.
+//! Checks whether the scanner at a port has the configured settings, and is healthy. An LMS comes first, then a link of the
+//! hub, and last a rotating scanner. `probe` sends the requests.
 
-use config::Link;
+use config::{Link, Scanner};
+use scanhub_drivers::line::family::Condition as ReportedHealth;
 use scanhub_drivers::lms::condition::{Condition, Severity};
 use scanhub_drivers::lms::errors::Fault;
 use scanhub_drivers::lms::family::Family;
 use scanhub_drivers::lms::inquiry::Report;
 use scanhub_drivers::lms::variant::{Unit, Variant};
+use scanhub_drivers::scanner::Introduction;
 use schema::{State, Status};
 
-use super::counts::{LOSS_REMEDY, is_mostly_damaged};
-use super::finding::Finding;
+use super::Finding;
+use super::line::{LOSS_REMEDY, is_mostly_damaged};
+use crate::driver::{DetectedScanner, LINE_REMEDY};
 
-/// What follows from what the sensor at `port` said of itself.
-pub(crate) fn examine(port: &str, report: &Report, link: Option<&Link>) -> Vec<Finding> {
-    let mut told =
+/// Checks the LMS at `port` by its `report`.
+pub(crate) fn check_lms(port: &str, report: &Report, link: Option<&Link>) -> Vec<Finding> {
+    let mut status =
         Status { mode: report.status().map_or(Status::MODE_UNKNOWN, |it| it.mode().0), ..Status::default() };
-    told.set_port(port);
-    let mut findings = vec![answer(report)];
+    status.set_port(port);
+    let mut findings = vec![identity(report)];
     findings.extend(settings(port, report, link));
     findings.extend([power_on(port, report), health(report)]);
-    findings.extend(marks(&told, ""));
+    findings.extend(marks(&status, ""));
     findings
 }
 
-/// The port is the hub's: what it says of its link.
+/// Checks a link of the hub by its status. Returns `why_unknown` if the hub has no link of the port.
 pub(crate) fn as_the_hub_says(link: Option<(&str, &Status)>, why_unknown: &str) -> Vec<Finding> {
     match link {
         None => vec![Finding::skipped("sensor", why_unknown)],
@@ -35,7 +38,8 @@ pub(crate) fn as_the_hub_says(link: Option<(&str, &Status)>, why_unknown: &str) 
     }
 }
 
-/// Whether marks can be found; nothing as long as the mode is not known. Who needs none may leave it so.
+/// Checks whether the measuring mode has bits for reflectors. Returns `None` if the mode is unknown, or if a scanner without
+/// these bits needs no remedy.
 fn marks(status: &Status, when: &str) -> Option<Finding> {
     const NAME: &str = "marks";
     let Some(remedy) = status.reflector_remedy() else {
@@ -75,8 +79,8 @@ fn link_of_the_hub(name: &str, status: &Status) -> Finding {
     }
 }
 
-/// Who it is.
-fn answer(report: &Report) -> Finding {
+/// Reports type and rate.
+fn identity(report: &Report) -> Finding {
     const NAME: &str = "sensor";
     let kind = report.kind().map(|kind| String::from_utf8_lossy(kind).into_owned());
     let rate = report.baud.map_or(0, |baud| baud.rate());
@@ -85,7 +89,7 @@ fn answer(report: &Report) -> Finding {
     Finding::ok(NAME, text)
 }
 
-/// Whether type and unit are those of the configuration: a finding of each that is not.
+/// Checks whether type and unit are those of the configuration. Returns a finding for each difference.
 fn settings(port: &str, report: &Report, link: Option<&Link>) -> Vec<Finding> {
     const NAME: &str = "settings";
     let Some(status) = report.status() else {
@@ -123,7 +127,7 @@ fn settings(port: &str, report: &Report, link: Option<&Link>) -> Vec<Finding> {
     wrong
 }
 
-/// Whether a former owner has changed the rate at which it comes up, or left it in installation mode.
+/// Checks whether an earlier owner has changed the rate after power-on, or left the scanner in installation mode.
 fn power_on(port: &str, report: &Report) -> Finding {
     const NAME: &str = "power-on";
     let status = report.status();
@@ -144,7 +148,7 @@ fn power_on(port: &str, report: &Report) -> Finding {
     Finding::warning(NAME, whats.join("; "), remedies.join("; "))
 }
 
-/// What it complains of: itself, its window, its errors.
+/// Checks the state that the scanner reports: a defect, the window, the laser, and its errors.
 fn health(report: &Report) -> Finding {
     const NAME: &str = "health";
     let faults: Vec<Fault> = report.errors().map(|errors| errors.iter().collect()).unwrap_or_default();
@@ -156,10 +160,10 @@ fn health(report: &Report) -> Finding {
     if status.is_some_and(|status| !status.is_laser_on()) {
         complaints.insert(0, "its laser is off".to_owned());
     }
-    let told = report.status_byte.and_then(|byte| Condition(byte).severity());
-    if told >= Some(Severity::Warning) && told > worst {
-        complaints.insert(0, format!("its telegrams say {}", told.map_or("", Severity::name)));
-        worst = told;
+    let reported = report.status_byte.and_then(|byte| Condition(byte).severity());
+    if reported >= Some(Severity::Warning) && reported > worst {
+        complaints.insert(0, format!("its telegrams say {}", reported.map_or("", Severity::name)));
+        worst = reported;
     }
     if report.is_polluted() == Some(true) {
         let percent = status.and_then(|status| status.window_percent());
@@ -198,20 +202,132 @@ fn word(unit: Unit) -> &'static str {
     }
 }
 
-/// The operating mode in which the EEPROM can be written.
+/// Operating mode in which the EEPROM can be written.
 const INSTALLATION: u8 = 0x00;
+
+/// Checks a rotating scanner that was `heard`.
+pub(crate) fn check_rotating(heard: &DetectedScanner, link: Option<&Link>) -> Vec<Finding> {
+    let text = format!("{heard}, family {}", heard.family.name());
+    let mut findings = vec![match &heard.said {
+        Some(said) => Finding::ok("sensor", format!("{text}, {}", said.identity)),
+        None => Finding::ok("sensor", text),
+    }];
+    findings.push(loss(heard));
+    let is_reported = heard.said.is_some();
+    if heard.is_unreliable() && !is_reported {
+        let why = "not judged: the line damages most bytes";
+        findings.extend(["settings", "health"].map(|name| Finding::skipped(name, why)));
+        return findings;
+    }
+    findings.extend([
+        model(heard, link),
+        heard.said.as_ref().map_or_else(|| rotation(heard), |said| reported_health(said, heard)),
+    ]);
+    findings
+}
+
+/// Checks the health that the scanner reports, and whether it measures.
+fn reported_health(said: &Introduction, heard: &DetectedScanner) -> Finding {
+    const NAME: &str = "health";
+    let remedy = "see whether its head turns freely; power it off and on again; if it stays so, a repair";
+    match said.condition {
+        ReportedHealth::Good | ReportedHealth::Warning | ReportedHealth::Unknown if heard.packets == 0 => {
+            let trouble = heard.trouble.as_deref().unwrap_or("it does not measure");
+            Finding::failed(NAME, trouble, remedy)
+        }
+        ReportedHealth::Unknown => Finding::warning(NAME, "it does not say how it is", remedy),
+        ReportedHealth::Good => Finding::ok(NAME, said.health.clone()),
+        ReportedHealth::Warning => Finding::warning(NAME, said.health.clone(), remedy),
+        ReportedHealth::Error => Finding::failed(NAME, said.health.clone(), remedy),
+    }
+}
+
+/// Checks whether the scanner is the configured model, and whether topics have room for its points.
+fn model(heard: &DetectedScanner, link: Option<&Link>) -> Finding {
+    const NAME: &str = "settings";
+    let text = match (&heard.said, heard.model) {
+        (None, _) => {
+            format!("{:.0} points a second, {:.0} in a turn", heard.points_per_second, heard.points())
+        }
+        (Some(_), Some(model)) => format!("up to {} points in a turn", model.beams),
+        (Some(_), None) => "a model that is not known here".to_owned(),
+    };
+    let Some((model, link)) = heard.model.zip(link) else { return Finding::ok(NAME, text) };
+    let Scanner::Turning(turning) = link.scanner else { return Finding::ok(NAME, text) };
+    let (set, name) = (turning.model, &link.name);
+    if set != turning.features.auto && (set.baud, set.beams) != (model.baud, model.beams) {
+        return Finding::warning(
+            NAME,
+            format!(
+                "model {} is configured, but the scanner is a {} or compatible with it",
+                set.name, model.name
+            ),
+            format!("--set link.{name}.model={}, or plug in the other scanner", model.name),
+        );
+    }
+    if turning.is_auto() && link.beams() < model.beams {
+        return Finding::warning(
+            NAME,
+            format!("{text}, and there is room for {} beams", link.beams()),
+            format!("--set link.{name}.model={}, or link.{name}.beams", model.name),
+        );
+    }
+    Finding::ok(NAME, text)
+}
+
+/// Checks whether the head of a scanner that reports no health rotates.
+fn rotation(heard: &DetectedScanner) -> Finding {
+    const NAME: &str = "health";
+    if heard.turns_per_second > 0.0 {
+        return Finding::ok(NAME, format!("{:.1} turns a second", heard.turns_per_second));
+    }
+    let what = heard.trouble.as_deref().unwrap_or("packets come, but no turn was whole");
+    let (what, _) = what.split_once(": ").unwrap_or((what, ""));
+    Finding::failed(
+        NAME,
+        what,
+        "see whether its head turns freely, and whether it gets 5 V; power it off and on again",
+    )
+}
+
+/// Checks how many packets are damaged or lost.
+fn loss(heard: &DetectedScanner) -> Finding {
+    const NAME: &str = "line-loss";
+    let (damaged, lost) = (100.0 * heard.damaged(), heard.account.lost);
+    if heard.packets == 0 {
+        return Finding::skipped(NAME, "it does not measure");
+    }
+    let packets = match lost {
+        // Damaged packets are lost, too, but too few arrive to count them.
+        0 if heard.is_unreliable() => "how many packets are lost is not known".to_owned(),
+        lost => format!("{lost} of {} packets lost", heard.account.due),
+    };
+    let text = format!("{damaged:.1} % of the bytes damaged, {packets}");
+    if heard.is_unreliable() {
+        return Finding::failed(NAME, text, LINE_REMEDY);
+    }
+    if lost * MAX_LOSS > heard.account.due || heard.line_trouble().is_some() {
+        return Finding::warning(NAME, text, LINE_REMEDY);
+    }
+    Finding::ok(NAME, text)
+}
+
+/// A line that loses more than one packet out of this number needs a remedy.
+const MAX_LOSS: u64 = 100;
 
 #[cfg(test)]
 mod tests {
-    use super::*;
-    use crate::doctor::finding::State as Verdict;
+    use scanhub_drivers::line::Account;
     use scanhub_drivers::lms::exchange::{Conversation, Output};
     use scanhub_drivers::lms::status_report::Health;
     use scanhub_drivers::lms::telegram::{Telegram, Writer};
     use scanhub_drivers::lms::variant::{Baud, Mode};
     use scanhub_drivers::lms::{Inquiry, configuration};
 
-    /// What an inquiry makes of a sensor with this status report, status byte and errors.
+    use super::*;
+    use crate::doctor::State as Verdict;
+
+    /// Returns the report of an inquiry to a scanner with this status report, status byte and errors.
     fn report(status: [u8; 152], condition: u8, errors: &[u8]) -> Report {
         let mut inquiry = Inquiry::new(Baud::B38400, 0);
         let (mut now, mut request, mut reply) = (0, Vec::new(), Vec::new());
@@ -223,24 +339,25 @@ mod tests {
                     now = not_before.max(now);
                     request.push(byte);
                     inquiry.transmitted(now);
-                    if let Some(asked) = Telegram::check(&request) {
-                        let data: Vec<u8> = match asked.command() {
+                    if let Some(received) = Telegram::check(&request) {
+                        let data: Vec<u8> = match received.command() {
                             0x31 => status.to_vec(),
                             0x32 => errors.to_vec(),
                             0x3A => b"LMS200;301063;V02.30 ".to_vec(),
                             _ => configuration::factory(Mode(1), Unit::Mm).to_vec(),
                         };
-                        let told = Writer::new(0x80, asked.command() | 0x80).slice(&data).byte(condition);
-                        reply = told.finish().bytes().to_vec();
+                        let telegram =
+                            Writer::new(0x80, received.command() | 0x80).slice(&data).byte(condition);
+                        reply = telegram.finish().bytes().to_vec();
                         request.clear();
                     }
                 }
                 Output::Wait { until } => {
                     now = until;
-                    let told = std::mem::take(&mut reply);
-                    inquiry.spare()[..told.len()].copy_from_slice(&told);
-                    inquiry.commit(now, told.len());
-                    if told.is_empty() {
+                    let bytes = std::mem::take(&mut reply);
+                    inquiry.spare()[..bytes.len()].copy_from_slice(&bytes);
+                    inquiry.commit(now, bytes.len());
+                    if bytes.is_empty() {
                         inquiry.handle_timeout(now);
                     }
                 }
@@ -264,17 +381,17 @@ mod tests {
         health.report()
     }
 
-    /// Verdict and words of a check on a sensor of which byte `at` of the status is `byte`.
+    /// Returns the state and the text of a check on a scanner whose status has `byte` at index `at`.
     fn verdict(name: &str, at: usize, byte: u8, condition: u8, errors: &[u8]) -> (Verdict, String) {
         let mut status = healthy();
         status[at] = byte;
-        let findings = examine("/dev/ttyUSB0", &report(status, condition, errors), None);
+        let findings = check_lms("/dev/ttyUSB0", &report(status, condition, errors), None);
         let found = findings.iter().find(|finding| finding.name == name).expect("it is checked");
         (found.state, found.to_string())
     }
 
     #[test]
-    fn what_a_sensor_complains_of_is_told() {
+    fn reports_complaints_of_scanner() {
         let (state, text) = verdict("health", 8, 0, 0x10, &[]);
         assert_eq!(state, Verdict::Ok, "{text}");
         let (state, text) = verdict("health", 8, 0, 0x11, &[0x84, 22, 1, 49]);
@@ -287,7 +404,7 @@ mod tests {
         assert!(state == Verdict::Failed && text.contains("telegrams say error"), "{text}");
         let (state, text) = verdict("health", 8, 0, 0x10, &[0x83, 18]);
         assert!(state == Verdict::Ok && text.contains("1 in its memory"), "{text}");
-        // A clean channel gave 100, the first gives 20.
+        // A clean channel reported 100, the first one reports 20.
         let mut dim = healthy();
         dim[42] = 100;
         dim[18] = 20;
@@ -301,7 +418,7 @@ mod tests {
     }
 
     #[test]
-    fn what_a_former_owner_left_is_told() {
+    fn reports_settings_of_earlier_owner() {
         assert_eq!(verdict("power-on", 118, 0, 0x10, &[]).0, Verdict::Ok);
         let (state, text) = verdict("power-on", 118, 1, 0x10, &[]);
         assert!(
@@ -313,9 +430,9 @@ mod tests {
     }
 
     #[test]
-    fn a_mode_without_marks_is_told() {
+    fn reports_mode_without_reflector_bits() {
         let found = |mode: u8| {
-            examine("/dev/ttyUSB0", &report(with_mode(mode), 0x10, &[]), None).pop().expect("it is checked")
+            check_lms("/dev/ttyUSB0", &report(with_mode(mode), 0x10, &[]), None).pop().expect("it is checked")
         };
         assert_eq!((found(1).name, found(1).state), ("marks", Verdict::Ok));
         assert_eq!(
@@ -325,7 +442,7 @@ mod tests {
     }
 
     #[test]
-    fn what_the_configuration_says_otherwise_is_told() {
+    fn reports_settings_that_differ_from_configuration() {
         let link = Link {
             name: "front".into(),
             port: port::Source::Tty("/dev/ttyUSB0".into()),
@@ -346,20 +463,110 @@ mod tests {
     }
 
     #[test]
-    fn what_the_hub_says_is_passed_on() {
+    fn passes_on_status_of_hub() {
         let mut status = Status { state: State::Streaming as u8, baud: 500_000, ..Status::default() };
-        let told = |status: &Status| as_the_hub_says(Some(("front", status)), "");
-        assert_eq!(told(&status).iter().map(|finding| finding.state).collect::<Vec<_>>(), [Verdict::Ok]);
+        let findings = |status: &Status| as_the_hub_says(Some(("front", status)), "");
+        assert_eq!(findings(&status).iter().map(|finding| finding.state).collect::<Vec<_>>(), [Verdict::Ok]);
         status.mode = 0;
         status.set_port("/dev/ttyUSB0");
-        let [_, marks] = &told(&status)[..] else { panic!("of marks nothing") };
+        let [_, marks] = &findings(&status)[..] else { panic!("no finding about marks") };
         assert_eq!(marks.state, Verdict::Warning);
         assert_eq!(marks.remedy, "stop the hub first: scanhub configure /dev/ttyUSB0 mode=0x01");
         status.set_last_error("the window is dirty");
-        let dirty = &told(&status)[0];
+        let dirty = &findings(&status)[0];
         assert!(dirty.state == Verdict::Warning && dirty.finding.contains("window"), "{dirty}");
         status.state = State::Silent as u8;
-        assert_eq!(told(&status)[0].state, Verdict::Failed);
+        assert_eq!(findings(&status)[0].state, Verdict::Failed);
         assert_eq!(as_the_hub_says(None, "it is unknown")[0].state, Verdict::Skipped);
+    }
+
+    fn heard() -> DetectedScanner {
+        let (family, features) = crate::driver::turning()[0];
+        DetectedScanner {
+            family,
+            model: Some(features.models[1]),
+            rate: 230_400,
+            account: Account { in_telegrams: 9_400, due: 200, ..Account::default() },
+            said: None,
+            packets: 200,
+            points_per_second: 4_500.0,
+            turns_per_second: 10.0,
+            trouble: None,
+        }
+    }
+
+    fn link(set: &[&str]) -> Link {
+        let sources = config::Sources {
+            files: Vec::new(),
+            set: set.iter().map(|flag| format!("link.side.{flag}")).collect(),
+            links: vec!["side=/dev/ttyUSB0".to_owned()],
+        };
+        config::Config::load(&sources).expect("it is valid").links.remove(0)
+    }
+
+    #[test]
+    fn checks_rotating_scanner() {
+        let said = |heard: &DetectedScanner| {
+            let findings = check_rotating(heard, None);
+            findings.iter().map(|finding| (finding.name, finding.state)).collect::<Vec<_>>()
+        };
+        let names = ["sensor", "line-loss", "settings", "health"];
+        assert_eq!(said(&heard()), names.map(|name| (name, Verdict::Ok)));
+        let still = DetectedScanner { turns_per_second: 0.0, ..heard() };
+        assert_eq!(said(&still)[3], ("health", Verdict::Failed));
+        let lossy = DetectedScanner { account: Account { lost: 3, ..heard().account }, ..heard() };
+        assert_eq!(said(&lossy)[1], ("line-loss", Verdict::Warning));
+        let damaged = DetectedScanner { account: Account { damaged: 100, ..heard().account }, ..heard() };
+        assert_eq!(said(&damaged)[1], ("line-loss", Verdict::Warning));
+        let text = check_rotating(&damaged, None)[1].to_string();
+        assert!(text.contains(", 0 of "), "{text}");
+        // If most bytes are damaged, a head that seems to stand still may rotate.
+        let account = Account { damaged: 40_000, ..heard().account };
+        let unreliable = [
+            ("sensor", Verdict::Ok),
+            ("line-loss", Verdict::Failed),
+            ("settings", Verdict::Skipped),
+            ("health", Verdict::Skipped),
+        ];
+        let most = DetectedScanner { account, ..still };
+        assert_eq!(said(&most), unreliable);
+        let text = check_rotating(&most, None)[1].to_string();
+        assert!(text.contains("how many packets are lost is not known"), "{text}");
+    }
+
+    #[test]
+    fn checks_reported_health() {
+        let said = |condition| {
+            let said = Introduction { identity: "firmware 1.29".into(), health: "so".into(), condition };
+            let findings = check_rotating(&DetectedScanner { said: Some(said), ..heard() }, None);
+            findings.iter().map(|finding| (finding.name, finding.state)).next_back()
+        };
+        for (condition, state) in [
+            (ReportedHealth::Good, Verdict::Ok),
+            (ReportedHealth::Warning, Verdict::Warning),
+            (ReportedHealth::Unknown, Verdict::Warning),
+            (ReportedHealth::Error, Verdict::Failed),
+        ] {
+            assert_eq!(said(condition), Some(("health", state)));
+        }
+    }
+
+    #[test]
+    fn reports_model_that_differs_from_configuration() {
+        let family = format!("family={}", heard().family.name());
+        let judged = |heard: &DetectedScanner, set: &[&str]| {
+            model(heard, Some(&link(&[&[family.as_str()], set].concat())))
+        };
+        let models = crate::driver::turning()[0].1.models;
+        // A model with the same protocol counts as the same.
+        let (like, other) = (format!("model={}", models[0].name), format!("model={}", models[3].name));
+        assert_eq!(judged(&heard(), &[&like]).state, Verdict::Ok);
+        let wrong = judged(&heard(), &[&other]);
+        assert!(wrong.state == Verdict::Warning && wrong.finding.contains(models[3].name), "{wrong}");
+        assert!(wrong.remedy.contains("link.side.model="), "{wrong}");
+        let large = DetectedScanner { model: Some(models[3]), ..heard() };
+        assert_eq!(judged(&large, &[&other]).state, Verdict::Ok);
+        let room = judged(&large, &[]);
+        assert!(room.state == Verdict::Warning && room.finding.contains("room for 720"), "{room}");
     }
 }

@@ -1,5 +1,5 @@
-//! The machine's own files, as the doctor reads them: below a directory that need not be the root of this machine, so that
-//! tests can provide what an administrator may have written. Refuses to know what is in them.
+//! The machine's own files, below a directory that need not be the root of this machine, so that tests can provide files of
+//! an administrator.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -15,40 +15,40 @@ pub struct System {
 }
 
 impl System {
-    /// This machine, and the user of this process.
+    /// Returns this machine, and the user of this process.
     pub fn this() -> System {
         System::at("/", getuid().as_raw())
     }
 
-    /// A machine whose files are below `root`, for the user with this number.
+    /// Creates a machine whose files are below `root`, for the user with this ID.
     pub fn at(root: impl Into<PathBuf>, user: u32) -> System {
         System { root: root.into(), user }
     }
 
-    /// The user's number.
+    /// Returns the user's ID.
     pub(crate) fn user(&self) -> u32 {
         self.user
     }
 
-    /// Where `path` of that machine is.
+    /// Returns the path at which this process finds `path` of that machine.
     pub(crate) fn path(&self, path: impl AsRef<Path>) -> PathBuf {
         let path = path.as_ref();
         self.root.join(path.strip_prefix("/").unwrap_or(path))
     }
 
-    /// What stands in a file, if it can be read.
+    /// Returns the text of a file, or `None` if it cannot be read.
     pub(crate) fn text(&self, path: &str) -> Option<String> {
         regular::read_text(&self.path(path), regular::LONGEST).ok()
     }
 
-    /// `name` in the first of `directories` that has it, be it a symlink to nothing.
+    /// Returns the path of `name` in the first of `directories` that has it. A symlink without a target counts.
     pub(crate) fn first(&self, directories: &[&str], name: &str) -> Option<PathBuf> {
         let paths = directories.iter().map(|directory| self.path(directory).join(name));
         paths.into_iter().find(|path| path.symlink_metadata().is_ok())
     }
 
-    /// The files of `directories` whose names end with `.conf`, in the order of their names; of one name the first
-    /// directory has the only one that counts (systemd, for all that it reads so).
+    /// Returns the files of `directories` whose names end with `.conf`, in the order of their names. If several files have the
+    /// same name, only that of the first directory counts (as systemd reads drop-in files).
     pub(crate) fn drop_ins(&self, directories: &[String]) -> Vec<PathBuf> {
         let mut found: Vec<PathBuf> = Vec::new();
         for directory in directories {
@@ -64,7 +64,7 @@ impl System {
         found
     }
 
-    /// The name of the user with this number, else the number.
+    /// Returns the name of the user with this ID, or the ID if the user has no name.
     pub(crate) fn name_of(&self, user: u32) -> String {
         let known = self.text("etc/passwd").unwrap_or_default();
         let number = user.to_string();
@@ -78,22 +78,22 @@ pub(super) mod tests {
     use super::*;
 
     /// Files below a temporary directory.
-    pub(crate) struct Laid {
+    pub(crate) struct TempRoot {
         root: PathBuf,
         _directory: tempfile::TempDir,
         pub(crate) system: System,
     }
 
-    impl Laid {
-        /// `files` by path and content, looked at by `user`.
-        pub(crate) fn out(user: u32, files: &[(&str, &str)]) -> Laid {
+    impl TempRoot {
+        /// Creates `files` from paths and contents, for `user`.
+        pub(crate) fn new(user: u32, files: &[(&str, &str)]) -> TempRoot {
             let directory = tempfile::tempdir().unwrap();
             let root = directory.path().canonicalize().unwrap();
-            let laid = Laid { system: System::at(&root, user), root, _directory: directory };
+            let temp = TempRoot { system: System::at(&root, user), root, _directory: directory };
             for (path, content) in files {
-                laid.put(path, content);
+                temp.put(path, content);
             }
-            laid
+            temp
         }
 
         pub(crate) fn put(&self, path: &str, content: &str) {
@@ -114,17 +114,17 @@ pub(super) mod tests {
     }
 
     #[test]
-    fn of_two_files_of_one_name_the_first_directorys_counts() {
+    fn uses_first_of_files_with_same_name() {
         let files =
             [("etc/x.d/b.conf", "1"), ("usr/x.d/b.conf", "2"), ("usr/x.d/a.conf", "3"), ("etc/x.d/c", "4")];
-        let laid = Laid::out(7, &files);
-        let found = laid.system.drop_ins(&["etc/x.d".to_owned(), "usr/x.d".to_owned()]);
-        assert_eq!(found, [laid.path("usr/x.d/a.conf"), laid.path("etc/x.d/b.conf")]);
+        let temp = TempRoot::new(7, &files);
+        let found = temp.system.drop_ins(&["etc/x.d".to_owned(), "usr/x.d".to_owned()]);
+        assert_eq!(found, [temp.path("usr/x.d/a.conf"), temp.path("etc/x.d/b.conf")]);
     }
 
     #[test]
-    fn users_have_names() {
-        let laid = Laid::out(7, &[("etc/passwd", "root:x:0:0::/:\nrobot:x:7:7::/:\n")]);
-        assert_eq!([7, 8].map(|user| laid.system.name_of(user)), ["robot", "8"]);
+    fn returns_name_of_user() {
+        let temp = TempRoot::new(7, &[("etc/passwd", "root:x:0:0::/:\nrobot:x:7:7::/:\n")]);
+        assert_eq!([7, 8].map(|user| temp.system.name_of(user)), ["robot", "8"]);
     }
 }

@@ -1,8 +1,9 @@
-//! What a sensor reports about itself, for people and for programs: class `probe`. Text and keys; refuses to ask anything.
+//! Descriptions of a scanner that was found, as text and as JSON of class `probe`: [`Description`] of an LMS, and [`Turning`]
+//! of a rotating scanner.
 
 use std::fmt;
 
-use scanhub_drivers::lms;
+use scanhub_drivers::line::family::Model;
 use scanhub_drivers::lms::command::Request;
 use scanhub_drivers::lms::condition::Condition;
 use scanhub_drivers::lms::configuration::availability_words;
@@ -10,9 +11,32 @@ use scanhub_drivers::lms::inquiry::Report;
 use scanhub_drivers::lms::operating;
 use scanhub_drivers::lms::reply::Reply;
 use scanhub_drivers::lms::variant::Mode;
+use scanhub_drivers::{lms, scanner};
+use schema::Family;
 use serde::Serialize;
 
-/// A sensor; what it did not report is null.
+use crate::driver::DetectedScanner;
+
+/// The scanner at a port.
+#[derive(Clone, Debug, Serialize)]
+#[serde(untagged)]
+pub enum Found {
+    /// An LMS, which replied to requests.
+    Lms(Box<Description>),
+    /// A rotating scanner.
+    Turning(Box<Turning>),
+}
+
+impl fmt::Display for Found {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Found::Lms(description) => description.fmt(f),
+            Found::Turning(turning) => turning.fmt(f),
+        }
+    }
+}
+
+/// Description of an LMS. A value that it did not report is null.
 #[derive(Clone, Debug, Serialize)]
 pub struct Description {
     class: &'static str,
@@ -30,12 +54,12 @@ pub struct Description {
     unit_mm: Option<u8>,
     angle_deg: Option<u16>,
     step_deg: Option<f64>,
-    /// Whether it comes up at another rate than 9600.
+    /// Whether it starts at another rate than 9600 Bd.
     permanent_rate: Option<bool>,
     defective: Option<bool>,
     condition: Option<String>,
     polluted: Option<bool>,
-    /// What the window lets through, for the words alone.
+    /// Transmission of the window, in percent; only the text has it.
     #[serde(skip)]
     window_percent: Option<u16>,
     laser_on: Option<bool>,
@@ -43,7 +67,7 @@ pub struct Description {
     errors: Option<Vec<Fault>>,
     hours: Option<u32>,
     power_ons: Option<u16>,
-    /// The first part of the configuration in hex, as `configure` can restore it.
+    /// The first part of the configuration in hex. `configure` can restore it.
     configuration: Option<String>,
 }
 
@@ -56,7 +80,7 @@ struct Fault {
 }
 
 impl Description {
-    /// The description of the sensor at `port`, from its `report`.
+    /// Creates the description of the LMS at `port` from its `report`.
     pub fn new(port: String, report: &Report) -> Description {
         let kind = report.kind().map(|kind| String::from_utf8_lossy(kind).into_owned());
         let mut words = kind.iter().flat_map(|kind| kind.split(';')).map(|word| word.trim().to_owned());
@@ -131,11 +155,11 @@ impl fmt::Display for Description {
         let view = self.angle_deg.zip(self.step_deg);
         row("view", view.map(|(angle, step)| format!("{angle} degrees in steps of {step}")))?;
         row("availability", self.availability.map(|byte| availability_words(byte).to_owned()))?;
-        let told = if self.defective == Some(true) { "reports that it is defective; " } else { "" };
+        let defect = if self.defective == Some(true) { "reports that it is defective; " } else { "" };
         let dirty = self.polluted == Some(true);
         let condition = |condition: &String| {
-            let unsaid = if dirty && !condition.contains("polluted") { ", window polluted" } else { "" };
-            format!("{told}{condition}{unsaid}")
+            let pollution = if dirty && !condition.contains("polluted") { ", window polluted" } else { "" };
+            format!("{defect}{condition}{pollution}")
         };
         row("condition", self.condition.as_ref().map(condition))?;
         let remedy = if dirty { ": clean it" } else { "" };
@@ -156,7 +180,7 @@ impl fmt::Display for Description {
     }
 }
 
-/// How the values are split (Telegram listing, 77h block D).
+/// Returns the meaning of the bits of a value in measuring `mode` (Telegram listing, 77h block D).
 pub(crate) fn measuring(mode: Mode) -> String {
     let upper = match (mode.0, mode.intensity_bits()) {
         (0x00, _) => "fields A and B, dazzle",
@@ -173,7 +197,88 @@ pub(crate) fn measuring(mode: Mode) -> String {
     format!("{} bits of range, {upper}", mode.range_bits())
 }
 
-/// Bytes in lower hex, without spaces.
+/// Formats `bytes` as lowercase hex without spaces.
 pub(crate) fn hex(bytes: &[u8]) -> String {
     bytes.iter().map(|byte| format!("{byte:02x}")).collect()
+}
+
+/// Description of a rotating scanner. An unknown value is null.
+#[derive(Clone, Debug, Serialize)]
+pub struct Turning {
+    class: &'static str,
+    port: String,
+    family: &'static str,
+    model: Option<&'static str>,
+    baud: u32,
+    /// Firmware and serial number, as text.
+    identity: Option<String>,
+    /// Health that the scanner reports, as text.
+    health: Option<String>,
+    /// Number of packets with measured data, within about a second.
+    packets: Option<u64>,
+    /// Share of bytes that belong to no packet.
+    damaged: Option<f64>,
+    points_per_second: Option<f64>,
+    turns_per_second: Option<f64>,
+    trouble: Option<String>,
+}
+
+impl Turning {
+    /// Creates the description of the scanner that was `heard` at `port`.
+    pub(crate) fn new(port: String, heard: &DetectedScanner) -> Turning {
+        let known = |value: f64| (value > 0.0).then(|| (value * 100.0).round() / 100.0);
+        let is_heard = heard.packets > 0 || heard.said.is_none();
+        Turning {
+            class: "probe",
+            port,
+            family: heard.family.name(),
+            model: heard.model.map(|model| model.name),
+            baud: heard.rate,
+            identity: heard.said.as_ref().map(|said| said.identity.clone()),
+            health: heard.said.as_ref().map(|said| said.health.clone()).filter(|words| !words.is_empty()),
+            packets: is_heard.then_some(heard.packets),
+            damaged: is_heard.then(|| heard.damaged()),
+            points_per_second: known(heard.points_per_second),
+            turns_per_second: known(heard.turns_per_second),
+            // If the line damages bytes, any other problem may be a consequence.
+            trouble: heard.line_trouble().or_else(|| heard.trouble.clone()),
+        }
+    }
+
+    /// Returns the models that a scanner cannot be distinguished from, unless it has identified itself.
+    fn alike(&self) -> String {
+        let features = Family::parse(self.family).and_then(scanner::features);
+        let models = features.map_or(&[][..], |features| features.models);
+        let found = models.iter().find(|model| Some(model.name) == self.model);
+        let Some(found) = found.filter(|_| self.identity.is_none()) else { return String::new() };
+        let is_alike = |model: &&Model| {
+            model.name != found.name && (model.baud, model.beams) == (found.baud, found.beams)
+        };
+        let names: Vec<_> = models.iter().filter(is_alike).map(|model| model.name).collect();
+        if names.is_empty() { String::new() } else { format!(" (or {}: same protocol)", names.join(", ")) }
+    }
+}
+
+impl fmt::Display for Turning {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let mut row = |label: &str, value: Option<String>| match value {
+            Some(value) => writeln!(f, "  {label:<16}{value}"),
+            None => Ok(()),
+        };
+        row("family", Some(self.family.to_owned()))?;
+        row("model", self.model.map(|model| format!("{model}{}", self.alike())))?;
+        row("rate", Some(format!("{} Bd", self.baud)))?;
+        row("identity", self.identity.clone())?;
+        row("health", self.health.clone())?;
+        let heard = self.packets.zip(self.damaged);
+        row(
+            "packets",
+            heard.map(|(packets, damaged)| {
+                format!("{packets}, {:.1} % of the bytes damaged", 100.0 * damaged)
+            }),
+        )?;
+        row("points", self.points_per_second.map(|points| format!("{points:.0} a second")))?;
+        row("turns", self.turns_per_second.map(|turns| format!("{turns:.2} a second")))?;
+        row("trouble", self.trouble.clone())
+    }
 }

@@ -8,7 +8,7 @@ use scanhub_drivers::lms::inquiry::Report;
 use scanhub_drivers::lms::variant::Baud;
 use schema::Family;
 
-use crate::listen::Overheard;
+use crate::driver::DetectedScanner;
 
 /// A link for the scanner at a port.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -39,7 +39,11 @@ impl SuggestedLink {
     }
 
     /// Returns the link for a rotating scanner.
-    pub(crate) fn for_turning(source: &Source, there: &[Candidate], heard: &Overheard) -> SuggestedLink {
+    pub(crate) fn for_turning(
+        source: &Source,
+        there: &[Candidate],
+        heard: &DetectedScanner,
+    ) -> SuggestedLink {
         let mut settings = vec![("family", heard.family.name().to_owned())];
         settings.extend(heard.model.map(|model| ("model", model.name.to_owned())));
         SuggestedLink { port: permanent_name(source, there), settings }

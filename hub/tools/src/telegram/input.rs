@@ -1,21 +1,33 @@
-//! Raw bytes of a line, or bytes written in hexadecimal: detected from the first bytes, because raw bytes are hardly ever
-//! all letters. Knows no telegrams.
+//! The bytes to decode, from raw bytes, hexadecimal text or a recording. Text is detected by its first bytes, because raw
+//! bytes are hardly ever all printable characters.
 
+use std::collections::VecDeque;
+use std::fs::File;
 use std::io::{self, ErrorKind, Read};
+use std::path::Path;
 
-use recording::Recording;
+use recording::{Encoding, Form, Frame, Recording};
+use scanhub_drivers::lms::variant::{Mode, Unit};
+use schema::{Failure, Family, Kind};
 
-/// Where bytes come from, piece by piece.
+/// Length of a piece that is read at once.
+const PIECE: usize = 16 * 1024;
+
+/// Reads bytes in pieces, and converts hexadecimal text.
 pub(super) struct Input {
     reader: Box<dyn Read>,
     buffer: Vec<u8>,
-    /// Bytes of the buffer that were read ahead.
+    /// Number of bytes in the buffer that were read ahead.
     ahead: usize,
     is_text: bool,
 }
 
 impl Input {
-    /// Reads the first piece, to see what it is. [`ErrorKind::Unsupported`] if it has telegrams inside something else.
+    /// Reads the first piece, to detect its form.
+    ///
+    /// # Errors
+    ///
+    /// Returns [`ErrorKind::Unsupported`] if the input is an MCAP or gzip file.
     pub(super) fn new(reader: Box<dyn Read>) -> io::Result<Input> {
         let mut input = Input { reader, buffer: vec![0; PIECE], ahead: 0, is_text: false };
         input.ahead = input.read()?;
@@ -29,7 +41,11 @@ impl Input {
         Ok(input)
     }
 
-    /// The next bytes, `None` at the end. [`ErrorKind::InvalidData`] names the line and what is no byte.
+    /// Returns the next bytes, or `None` at the end.
+    ///
+    /// # Errors
+    ///
+    /// Returns [`ErrorKind::InvalidData`], with the line, if a word of hexadecimal text is not a byte.
     pub(super) fn next(&mut self) -> io::Result<Option<&[u8]>> {
         let mut len = match std::mem::take(&mut self.ahead) {
             0 => self.read()?,
@@ -65,7 +81,8 @@ impl Input {
     }
 }
 
-/// Pairs of digits with anything usual between them; text between double quotes is itself.
+/// Parses pairs of hexadecimal digits, with the usual separators and prefixes. Text between double quotes stands for its
+/// own bytes.
 pub(super) fn parse(text: &str) -> Result<Vec<u8>, String> {
     let mut bytes = Vec::new();
     for (line, text) in text.lines().enumerate() {
@@ -91,7 +108,74 @@ pub(super) fn parse(text: &str) -> Result<Vec<u8>, String> {
     Ok(bytes)
 }
 
-const PIECE: usize = 16 * 1024;
+/// Bytes, and the measuring mode of their values if the recording has it.
+type Unpacked = (Box<dyn Read>, Option<Mode>);
+
+/// Returns whether the file at `path` is an MCAP or gzip file. Does not read a pipe, whose bytes would be lost.
+pub(super) fn is_framed(path: &Path) -> bool {
+    let mut head = [0; 8];
+    let is_file = path.metadata().is_ok_and(|metadata| metadata.is_file());
+    is_file
+        && File::open(path)
+            .and_then(|mut file| file.read(&mut head))
+            .is_ok_and(|len| Recording::is_framed(&head[..len]))
+}
+
+/// Returns the telegrams of `sensor` in the recording at `path`, as the bytes of a line. A recording of one sensor needs no
+/// name.
+///
+/// # Errors
+///
+/// Returns [`Kind::Input`] if the file cannot be read or has no telegrams, [`Kind::NoTopic`] if it does not have this
+/// sensor, and [`Kind::Usage`] if a name is missing, or is given although the file has none.
+pub(super) fn open_recording(path: &Path, sensor: Option<&str>) -> Result<Unpacked, Failure> {
+    let mut recording = Recording::open(path)?;
+    if let Some(sensor) = sensor {
+        recording = recording.of(sensor)?;
+    }
+    let contents = recording.contents();
+    if !contents.is_lms() {
+        let family = recording.family().map_or("that is not known here", Family::name);
+        let message = format!(
+            "{} has packets of a scanner of family {family}, not telegrams of an LMS",
+            path.display()
+        );
+        return Err(Failure::new(Kind::Input, message, "`scanhub convert IN OUT.csv` makes scans of them"));
+    }
+    if !contents.damage.is_none() {
+        tracing::warn!("{}: missing: {}", path.display(), contents.damage);
+    }
+    match contents.form {
+        Form::Telegrams => Ok((recording.bytes()?, None)),
+        Form::Mcap => {
+            let mode = contents.mode;
+            // The recording has telegrams, so the encoding is not used.
+            let encoding = Encoding { unit: Unit::Mm, mode: mode.unwrap_or(Mode(0)) };
+            let bytes = Bytes { telegrams: recording.telegrams(encoding)?, left: VecDeque::new() };
+            Ok((Box::new(bytes), mode))
+        }
+        Form::Carmen => {
+            let message = format!("{} is a CARMEN log, which has ranges and no telegrams", path.display());
+            let hint = "`scanhub convert IN OUT.bin` makes telegrams of them";
+            Err(Failure::new(Kind::Input, message, hint))
+        }
+    }
+}
+
+/// Reader of the bytes of telegrams.
+struct Bytes {
+    telegrams: Box<dyn Iterator<Item = Frame> + Send>,
+    left: VecDeque<u8>,
+}
+
+impl Read for Bytes {
+    fn read(&mut self, room: &mut [u8]) -> io::Result<usize> {
+        if self.left.is_empty() {
+            self.left = self.telegrams.next().map(|frame| frame.telegram.into()).unwrap_or_default();
+        }
+        self.left.read(room)
+    }
+}
 
 #[cfg(test)]
 mod tests {

@@ -1,5 +1,5 @@
-//! `KEY=VALUE` of the command line: the settings, their valid values, and what each changes in a configuration. What the
-//! sensor's type does not support is refused with the reason.
+//! The settings of the command line, `KEY=VALUE`: their keys, their valid values, and what each changes in a configuration.
+//! A setting that the type of the scanner does not support is refused with the reason.
 
 use lms_configure::{OwnedConfiguration, Plan, eeprom::PowerOn};
 use scanhub_drivers::lms::family::Family;
@@ -7,9 +7,9 @@ use scanhub_drivers::lms::inquiry::Report;
 use scanhub_drivers::lms::variant::{Mode, Unit};
 use schema::{Failure, Kind};
 
-/// Everything that is wanted.
+/// All settings that the command line requests.
 #[derive(Clone, Debug)]
-pub(crate) struct Wanted(Vec<Setting>);
+pub(crate) struct SettingsRequest(Vec<Setting>);
 
 #[derive(Clone, Debug, PartialEq)]
 enum Setting {
@@ -23,19 +23,26 @@ enum Setting {
     Configuration(OwnedConfiguration),
 }
 
-impl Wanted {
-    /// [`Kind::Configuration`] with key, value and what is possible; [`Kind::Usage`] without any.
-    pub(crate) fn parse(settings: &[String]) -> Result<Wanted, Failure> {
+impl SettingsRequest {
+    /// Parses settings of the form `KEY=VALUE`.
+    ///
+    /// # Errors
+    ///
+    /// Returns [`Kind::Configuration`] with key, value and the valid values if a setting is invalid, and [`Kind::Usage`] if
+    /// there is none.
+    pub(crate) fn parse(settings: &[String]) -> Result<SettingsRequest, Failure> {
         if settings.is_empty() {
             let keys: Vec<String> = KEYS.iter().map(|(key, values, _)| format!("{key}={values}")).collect();
             return Err(Failure::new(Kind::Usage, "nothing to change", keys.join(", ")));
         }
-        settings.iter().map(|setting| parse(setting)).collect::<Result<_, _>>().map(Wanted)
+        settings.iter().map(|setting| parse(setting)).collect::<Result<_, _>>().map(SettingsRequest)
     }
 
-    /// Puts everything into `plan`.
+    /// Applies every setting to `plan`.
     ///
-    /// [`Kind::Configuration`] if this sensor cannot have it.
+    /// # Errors
+    ///
+    /// Returns [`Kind::Configuration`] if this scanner does not support a setting.
     pub(crate) fn apply(
         &self,
         plan: &mut Plan,
@@ -53,7 +60,7 @@ impl Wanted {
                 Setting::Availability(3) => bits(plan, LEVEL_2 | LEVEL_3, LEVEL_3),
                 Setting::Availability(2) => bits(plan, LEVEL_2 | LEVEL_3, LEVEL_2),
                 Setting::Availability(_) => bits(plan, LEVEL_2 | LEVEL_3, 0),
-                Setting::Indices(wanted) => bits(plan, INDICES, if wanted { INDICES } else { 0 }),
+                Setting::Indices(is_on) => bits(plan, INDICES, if is_on { INDICES } else { 0 }),
                 Setting::Sensitivity(byte) => {
                     let reason = match family {
                         Some(family) => family.refuses_sensitivity(),
@@ -66,7 +73,7 @@ impl Wanted {
                 }
                 Setting::PowerOn(power_on) => {
                     let is_set = report.status().is_some_and(|status| status.has_permanent_baud());
-                    // Which rate it keeps it does not tell, so keeping the present one is always a change.
+                    // The scanner does not report which rate it keeps, so keeping the present one is always a change.
                     let needed = power_on == PowerOn::KeepBaud || is_set;
                     plan.power_on = needed.then_some(power_on);
                 }
@@ -105,7 +112,7 @@ fn refused(key: &str, reason: &str) -> Failure {
 
 type Parse = fn(&str) -> Option<Setting>;
 
-/// The keys, what they may be, and how that is read.
+/// The keys, their valid values as text, and their parsers.
 const KEYS: [(&str, &str, Parse); 7] = [
     ("unit", "mm or cm", |value| match value {
         "mm" => Some(Setting::Unit(Unit::Mm)),
@@ -175,7 +182,7 @@ fn mode(value: &str) -> Option<u8> {
 /// Sensitivities of the LMS 291 by their number: 30, 25, 20 and 42 m at 10 % (Telegram listing, 77h block C).
 pub(crate) const SENSITIVITIES: [&str; 4] = ["standard", "medium", "low", "high"];
 
-/// Places in the configuration (Telegram listing, 77h blocks C to E).
+/// Index of the sensitivity in the configuration. All indices are from the Telegram listing, 77h blocks C to E.
 pub(crate) const SENSITIVITY: usize = 3;
 /// See [`SENSITIVITY`].
 pub(crate) const AVAILABILITY: usize = 4;
@@ -210,7 +217,7 @@ mod tests {
     fn applied(settings: &[&str], family: Option<Family>) -> Result<Plan, Failure> {
         let settings: Vec<String> = settings.iter().map(|setting| (*setting).to_owned()).collect();
         let mut plan = plan();
-        Wanted::parse(&settings)?.apply(&mut plan, family, &Report::default())?;
+        SettingsRequest::parse(&settings)?.apply(&mut plan, family, &Report::default())?;
         Ok(plan)
     }
 
@@ -256,6 +263,6 @@ mod tests {
         assert!(refusal("sensitivity=low", None).contains("not known"));
         let old = format!("configuration={}", "00".repeat(32));
         assert!(refusal(&old, None).contains("34 bytes, not 32"));
-        assert_eq!(Wanted::parse(&[]).unwrap_err().kind, Kind::Usage);
+        assert_eq!(SettingsRequest::parse(&[]).unwrap_err().kind, Kind::Usage);
     }
 }

@@ -1,7 +1,5 @@
-//! Finds the family of a rotating scanner, and the share of bytes that its line damages, for a person at a terminal.
-//!
-//! The module sends nothing to a scanner that streams by itself. From other scanners it requests identity and health, lets
-//! them measure for a second, and stops them as a hub does.
+//! Runs protocol state machines on an open port, for a user at a terminal: [`detect`] searches for a rotating scanner, and
+//! [`drive`] runs a conversation with an LMS. A thread of the hub does the same for a link, without an end.
 
 use std::fmt;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -9,47 +7,45 @@ use std::time::Duration;
 
 use port::{Port, clock};
 use rustix::event::{PollFd, PollFlags, poll};
+use scanhub_drivers::line::Session as _;
 use scanhub_drivers::line::family::{Condition, Features, Model, Wanted};
-use scanhub_drivers::line::{Account, Heard, Output, Session as _};
+use scanhub_drivers::line::{Account, Heard, Output};
+use scanhub_drivers::lms::exchange::{self, Conversation};
 use scanhub_drivers::scanner::{Introduction, Session, features};
 use schema::{Failure, Family, Kind, MILLIS, Nanos};
 
-use crate::drive::gone;
-
-/// What was heard of a scanner whose head turns.
+/// A rotating scanner that was detected, and what was received from it.
 #[derive(Clone, Debug)]
-pub(crate) struct Overheard {
+pub(crate) struct DetectedScanner {
     pub(crate) family: Family,
-    /// What speaks like it: of models that cannot be told apart, one.
+    /// Model that matches the received packets. Other models may match them, too.
     pub(crate) model: Option<Model>,
-    /// In bits per second.
+    /// Rate of the line, in bits per second.
     pub(crate) rate: u32,
     pub(crate) account: Account,
-    /// What it said of itself, if it was asked.
+    /// The scanner's reply to a request for its identity and health; `None` if it streams without a request.
     pub(crate) said: Option<Introduction>,
-    /// Packets of measured data.
+    /// Number of packets with measured data.
     pub(crate) packets: u64,
-    /// Points that it measures in a second; 0 as long as no turn was whole.
+    /// Points per second; 0 before the first complete revolution.
     pub(crate) points_per_second: f64,
-    /// Turns of the head in a second; 0 as long as none was whole.
+    /// Revolutions per second; 0 before the first complete one.
     pub(crate) turns_per_second: f64,
-    /// Why it is not where it should be, in words.
+    /// Problem of the scanner, as text.
     pub(crate) trouble: Option<String>,
 }
 
-impl Overheard {
-    /// Points in a turn.
+impl DetectedScanner {
+    /// Returns the number of points per revolution.
     pub(crate) fn points(&self) -> f64 {
         if self.turns_per_second > 0.0 { self.points_per_second / self.turns_per_second } else { 0.0 }
     }
 
-    /// Share of the bytes that were in nothing, 0 to 1, without a piece of what was in flight at first.
+    /// Returns the share of bytes that belong to no packet, 0 to 1. A fragment at the start of the stream does not count.
     pub(crate) fn damaged(&self) -> f64 {
         self.account.damaged as f64 / (self.account.in_telegrams + self.account.damaged).max(1) as f64
     }
-}
 
-impl Overheard {
     /// Returns whether the line damages most bytes, which makes every conclusion from the others unreliable.
     pub(crate) fn is_unreliable(&self) -> bool {
         self.damaged() > MOST_DAMAGED
@@ -58,19 +54,19 @@ impl Overheard {
     /// Returns what the line does to the bytes and what to do about it, if it damages more than one in a hundred.
     pub(crate) fn line_trouble(&self) -> Option<String> {
         let damaged = self.damaged();
-        (damaged > WELL)
+        (damaged > MAX_DAMAGED)
             .then(|| format!("{:.0} % of the bytes are damaged on the line: {LINE_REMEDY}", 100.0 * damaged))
     }
 }
 
-impl fmt::Display for Overheard {
+impl fmt::Display for DetectedScanner {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let name = self.model.map_or("a scanner".to_owned(), |model| model.name.to_uppercase());
         write!(f, "{name} at {} Bd", self.rate)
     }
 }
 
-/// The families whose heads turn: first those that speak unasked.
+/// Returns the families of rotating scanners. Families that stream without a request come first.
 pub(crate) fn turning() -> Vec<(Family, &'static Features)> {
     let known = Family::ALL.into_iter().filter_map(|family| Some((family, features(family)?)));
     let mut known: Vec<_> = known.collect();
@@ -78,22 +74,28 @@ pub(crate) fn turning() -> Vec<(Family, &'static Features)> {
     known
 }
 
-/// Looks at `port` for a scanner of `family`, at all its rates unless the port has its own rate; `look` sees each of
-/// them. Returns what was received, if it was too much for a chance match; otherwise the number of bytes.
+/// Searches `port` for a scanner of `family`, at all rates of the family unless the port has a fixed rate. Calls `look` with
+/// each rate. Returns the scanner, if more packets arrived than could match by chance; otherwise the number of bytes
+/// received.
 ///
-/// [`Kind::PortMissing`] if the port goes away, [`Kind::Interrupted`] if `stop` is set.
-pub(crate) fn listen(
+/// Sends nothing to a scanner that streams without a request. From other scanners it requests identity and health, lets
+/// them measure for a second, and stops them as a hub does.
+///
+/// # Errors
+///
+/// Returns [`Kind::PortMissing`] if the port disappears, and [`Kind::Interrupted`] if `stop` is set.
+pub(crate) fn detect(
     port: &Port,
     (family, features): (Family, &Features),
     stop: &AtomicBool,
     mut look: impl FnMut(u32),
-) -> Result<Result<Overheard, u64>, Failure> {
+) -> Result<Result<DetectedScanner, u64>, Failure> {
     let fixed_rate = port.baud().is_none();
     let wanted = Wanted { fixed_rate, listen_only: features.speaks_unasked, ..Wanted::default() };
     let begun = clock::now();
     let Some(mut session) = Session::begin(family, wanted, begun) else { return Ok(Err(0)) };
-    port.try_baud(session.rate()).map_err(|error| gone(port, &error))?;
-    let mut heard = Turns::default();
+    port.try_baud(session.rate()).map_err(|error| port_lost(port, &error))?;
+    let mut heard = Received::default();
     let (first_rate, mut rate, mut rates) = (session.rate(), 0, 0);
     // A scanner may miss a request or respond late, and the line may damage the response.
     let mut rounds = if features.speaks_unasked { 1 } else { 3 };
@@ -108,30 +110,30 @@ pub(crate) fn listen(
             }
             look(rate);
         }
-        let until = heard.drain(port, &mut session).map_err(|error| gone(port, &error))?;
+        let until = heard.drain(port, &mut session).map_err(|error| port_lost(port, &error))?;
         if stop.load(Ordering::Relaxed) {
             let _ = heard.end(port, &mut session);
             return Err(Failure::new(Kind::Interrupted, "interrupted", ""));
         }
         let now = clock::now();
-        let is_heard = heard.packets >= ENOUGH;
+        let is_detected = heard.packets >= MIN_PACKETS;
         let limit = match (&heard.said, heard.measures_since) {
             (Some(said), _) if said.condition == Condition::Error => now,
-            (Some(_), Some(since)) => since + SECOND,
-            (Some(_), None) => heard.said_at + BEGINS,
-            (None, Some(since)) if is_heard && heard.turns >= TURNS => since + SECOND,
-            (None, _) if is_heard => begun + LONGEST,
-            (None, _) if features.speaks_unasked => begun + SILENT,
-            (None, _) => begun + UNANSWERED,
+            (Some(_), Some(since)) => since + MEASURING_TIME,
+            (Some(_), None) => heard.said_at + SPIN_UP_TIMEOUT,
+            (None, Some(since)) if is_detected && heard.turns >= MIN_REVOLUTIONS => since + MEASURING_TIME,
+            (None, _) if is_detected => begun + REVOLUTIONS_TIMEOUT,
+            (None, _) if features.speaks_unasked => begun + PACKETS_TIMEOUT,
+            (None, _) => begun + REPLY_TIMEOUT,
         };
         if now >= limit {
             break;
         }
         let until = until.min(limit);
         let mut fds = [PollFd::new(port, PollFlags::IN)];
-        // An interrupted wait is a short one.
-        let _ = poll(&mut fds, Some(&clock::span(now, until.min(now + LOOK))));
-        let len = port.read(session.spare()).map_err(|error| gone(port, &error))?;
+        // An interrupted wait only ends early.
+        let _ = poll(&mut fds, Some(&clock::span(now, until.min(now + STOP_CHECK_INTERVAL))));
+        let len = port.read(session.spare()).map_err(|error| port_lost(port, &error))?;
         let now = clock::now();
         session.commit(now, len);
         if len == 0 && now >= until {
@@ -143,12 +145,12 @@ pub(crate) fn listen(
         trouble.get_or_insert_with(|| "it answers, but does not begin to measure".to_owned());
     }
     let (account, model) = (session.account(), session.model());
-    heard.end(port, &mut session).map_err(|error| gone(port, &error))?;
-    if heard.packets < ENOUGH && heard.said.is_none() {
+    heard.end(port, &mut session).map_err(|error| port_lost(port, &error))?;
+    if heard.packets < MIN_PACKETS && heard.said.is_none() {
         return Ok(Err(account.read));
     }
-    let Turns { packets, period, points_per_second, said, .. } = heard;
-    Ok(Ok(Overheard {
+    let Received { packets, period, points_per_second, said, .. } = heard;
+    Ok(Ok(DetectedScanner {
         family,
         model,
         rate: session.rate(),
@@ -161,8 +163,8 @@ pub(crate) fn listen(
     }))
 }
 
-/// Why a scanner of `family` at a port called `name` was not heard, although `bytes` came.
-pub(crate) fn not_heard(name: &str, family: Family, features: &Features, bytes: u64) -> Failure {
+/// Returns the failure for a port called `name` at which no scanner of `family` was detected, after `bytes` bytes arrived.
+pub(crate) fn not_detected(name: &str, family: Family, features: &Features, bytes: u64) -> Failure {
     let mut rates: Vec<u32> = features.models.iter().map(|model| model.baud).collect();
     rates.sort_unstable();
     rates.dedup();
@@ -182,14 +184,14 @@ pub(crate) fn not_heard(name: &str, family: Family, features: &Features, bytes: 
     Failure::new(Kind::Timeout, what, remedy)
 }
 
-/// What a session handed out.
+/// Statistics of the outputs of a session.
 #[derive(Default)]
-struct Turns {
+struct Received {
     packets: u64,
     /// Time of the first packet.
     measures_since: Option<Nanos>,
     turns: u32,
-    /// Of the last turn.
+    /// Period of the last revolution.
     period: Nanos,
     points_per_second: f32,
     said: Option<Introduction>,
@@ -198,15 +200,15 @@ struct Turns {
     dtr: Option<bool>,
 }
 
-impl Turns {
-    /// Does what `session` wants until it wants to wait; until when.
+impl Received {
+    /// Carries out the actions of `session` until it waits. Returns the end of the wait.
     fn drain(&mut self, port: &Port, session: &mut Session) -> std::io::Result<Nanos> {
         loop {
             match session.poll_output() {
                 Output::SetRate(rate) => {
                     port.try_baud(rate)?;
                 }
-                // Its motor stays as it is until the scanner measures.
+                // Before the scanner has replied, its motor stays as it is.
                 Output::SetDtr(on) => {
                     self.dtr = Some(on);
                     if self.said.is_some() {
@@ -247,7 +249,7 @@ impl Turns {
         }
     }
 
-    /// Stops a scanner that measures on request, and its motor, as a hub does at its end.
+    /// Stops a scanner that measures on request, and its motor, as a hub does when it exits.
     fn end(&self, port: &Port, session: &mut Session) -> std::io::Result<()> {
         let measures = self.said.as_ref().is_some_and(|said| said.condition != Condition::Error);
         if !measures || !session.end(clock::now()) {
@@ -270,24 +272,114 @@ impl Turns {
 /// Remedy for a line that damages bytes.
 pub(crate) const LINE_REMEDY: &str =
     "a shorter or shielded cable, ground beside the signal, 3.3 V levels; another adapter";
-/// Share of damaged bytes up to which a line is well.
-const WELL: f64 = 0.01;
+/// Maximum share of damaged bytes on a good line.
+const MAX_DAMAGED: f64 = 0.01;
 /// Share of damaged bytes that makes conclusions from the others unreliable.
 pub(crate) const MOST_DAMAGED: f64 = 0.5;
 
-/// Other bytes pass a checksum of 8 bits now and then: not so often.
-const ENOUGH: u64 = 20;
-/// Whole turns that tell how it is.
-const TURNS: u32 = 5;
-/// No answer at any rate takes less than that, behind a network none at one.
-const UNANSWERED: Nanos = 2_000 * MILLIS;
+/// Minimum number of packets of a scanner. Other bytes pass a checksum of 8 bits now and then, but not that often.
+const MIN_PACKETS: u64 = 20;
+/// Minimum number of complete revolutions for a measurement of the head's speed.
+const MIN_REVOLUTIONS: u32 = 5;
+/// Timeout for a reply at all rates of a family, or at one rate over a network.
+const REPLY_TIMEOUT: Nanos = 2_000 * MILLIS;
 /// Minimum time for which measured data are received.
-const SECOND: Nanos = 1_000 * MILLIS;
-/// A scanner whose motor has to get up to speed measures by then, even if many answers are damaged before.
-const BEGINS: Nanos = 7_000 * MILLIS;
-/// No packet at two rates takes less than that.
-const SILENT: Nanos = 650 * MILLIS;
-/// A head that turns twice a second has turned often enough.
-const LONGEST: Nanos = 4_000 * MILLIS;
-/// Between two looks whether somebody wants to stop.
-const LOOK: Nanos = 100 * MILLIS;
+const MEASURING_TIME: Nanos = 1_000 * MILLIS;
+/// Timeout for the first packet of a scanner whose motor has to spin up. It allows for many damaged replies.
+const SPIN_UP_TIMEOUT: Nanos = 7_000 * MILLIS;
+/// Timeout for the first packets of a scanner that streams without a request, at two rates.
+const PACKETS_TIMEOUT: Nanos = 650 * MILLIS;
+/// Timeout for [`MIN_REVOLUTIONS`]. It is long enough for a head that makes two revolutions per second.
+const REVOLUTIONS_TIMEOUT: Nanos = 4_000 * MILLIS;
+
+/// Runs `conversation` with an LMS on `port` until it ends. Calls `progress` before each wait. Skips rates that the port
+/// cannot have.
+///
+/// # Errors
+///
+/// Returns [`Kind::PortMissing`] if the port disappears, and [`Kind::Interrupted`] if `stop` is set.
+pub(crate) fn drive<C: Conversation>(
+    port: &Port,
+    conversation: &mut C,
+    stop: &AtomicBool,
+    mut progress: impl FnMut(&C),
+) -> Result<(), Failure> {
+    let mut refused = Vec::new();
+    while let Some(until) =
+        carry_out(port, conversation, &mut refused).map_err(|error| port_lost(port, &error))?
+    {
+        progress(conversation);
+        if stop.load(Ordering::Relaxed) {
+            return Err(Failure::new(Kind::Interrupted, "interrupted", ""));
+        }
+        let now = clock::now();
+        let mut fds = [PollFd::new(port, PollFlags::IN)];
+        // An interrupted wait only ends early.
+        let _ = poll(&mut fds, Some(&clock::span(now, until.min(now + STOP_CHECK_INTERVAL))));
+        let len = port.read(conversation.spare()).map_err(|error| port_lost(port, &error))?;
+        let now = clock::now();
+        conversation.commit(now, len);
+        if len == 0 && now >= until {
+            conversation.handle_timeout(now);
+        }
+    }
+    Ok(())
+}
+
+/// Carries out the actions of `conversation` until it waits or ends. Returns the end of the wait. Logs a rate that the port
+/// refuses, unless it is in `refused`, and adds it there.
+fn carry_out<C: Conversation>(
+    port: &Port,
+    conversation: &mut C,
+    refused: &mut Vec<u32>,
+) -> std::io::Result<Option<Nanos>> {
+    loop {
+        match conversation.poll_output() {
+            exchange::Output::SetBaud(baud) => {
+                if let Some(error) = port.try_baud(baud.rate())?
+                    && !refused.contains(&baud.rate())
+                {
+                    refused.push(baud.rate());
+                    match port {
+                        Port::Tty(tty) => tracing::warn!("{}: {error}", tty.device().display()),
+                        Port::Tcp(_) => tracing::warn!("{error}"),
+                    }
+                }
+            }
+            exchange::Output::Transmit { byte, not_before } => {
+                let now = clock::now();
+                if not_before > now {
+                    std::thread::sleep(Duration::from_nanos(not_before - now));
+                }
+                if conversation.restart_if_late(clock::now()) {
+                    continue;
+                }
+                port.write(byte)?;
+                conversation.transmitted(clock::now());
+            }
+            exchange::Output::Wait { until } => return Ok(Some(until)),
+            exchange::Output::Done => return Ok(None),
+        }
+    }
+}
+
+/// Returns the failure for a `port` that can no longer be used. A serial server that already has a client closes the
+/// connection of another one.
+fn port_lost(port: &Port, error: &std::io::Error) -> Failure {
+    if let Port::Tcp(_) = port {
+        return Failure::new(
+            Kind::PortBusy,
+            format!("the connection is over: {error}"),
+            "a serial server has one client at a time: end the other program that is connected to it, such as a hub, and try \
+             again; if there is none, was the server switched off?",
+        );
+    }
+    Failure::new(
+        Kind::PortMissing,
+        format!("the port went away: {error}"),
+        "was it unplugged? plug it in and try again",
+    )
+}
+
+/// Interval between checks for an interrupt, and between reports of progress.
+const STOP_CHECK_INTERVAL: Nanos = 100 * MILLIS;
