@@ -62,7 +62,7 @@ impl Default for Layers {
 /// The dice of one beam, thrown whether a layer needs them or not: a layer that is switched off leaves all others as
 /// they were.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct Dice {
+pub(crate) struct BeamRng {
     /// Where in its step the mirror was, standard normal.
     pub(crate) mirror: f64,
     /// Which surface a spot on two of them tells, 0 to 1.
@@ -80,10 +80,10 @@ pub(crate) struct Dice {
     pub(crate) dazzle: f64,
 }
 
-impl Dice {
+impl BeamRng {
     /// The next throw.
-    pub(crate) fn throw(random: &mut fastrand::Rng) -> Dice {
-        Dice {
+    pub(crate) fn throw(random: &mut fastrand::Rng) -> BeamRng {
+        BeamRng {
             mirror: gaussian(random),
             surface: random.f64(),
             between: random.f64(),
@@ -100,25 +100,25 @@ impl Dice {
 
 impl Layers {
     /// What a reading deviates from the truth, in millimetres, the device's bias left aside; more at an `edge`.
-    pub(crate) fn deviation_mm(&self, edge: bool, dice: &Dice) -> f64 {
+    pub(crate) fn deviation_mm(&self, edge: bool, dice: &BeamRng) -> f64 {
         dice.deviation * if edge && dice.tail < self.tail { TAIL_MM } else { self.sigma_mm }
     }
 
     /// The code that a beam tells although it could tell a range, counted from the greatest value.
-    pub(crate) fn error(&self, dice: &Dice) -> Option<u16> {
+    pub(crate) fn error(&self, dice: &BeamRng) -> Option<u16> {
         let of = |code: &&(f64, u16)| dice.code < code.0;
         (dice.error < self.errors).then(|| CODES.iter().find(of).map_or(NO_RETURN, |code| code.1))
     }
 
     /// Whether a beam loses its echo of so much `signal`: all do below [`LEAST_SIGNAL`] and none above twice that, and
     /// some are lost between two surfaces if the spot is `torn`.
-    pub(crate) fn loses(&self, signal: f64, torn: bool, dice: &Dice) -> bool {
+    pub(crate) fn loses(&self, signal: f64, torn: bool, dice: &BeamRng) -> bool {
         let faint = self.weak && dice.weak > signal / LEAST_SIGNAL - 1.0;
         faint || torn && dice.weak < WEAK_AT_EDGES
     }
 
     /// Whether the sun, which dazzles `share` of the beams that look into it, dazzles this one.
-    pub(crate) fn dazzles(&self, share: f64, dice: &Dice) -> bool {
+    pub(crate) fn dazzles(&self, share: f64, dice: &BeamRng) -> bool {
         self.dazzle && dice.dazzle < share
     }
 
@@ -130,9 +130,9 @@ impl Layers {
 }
 
 #[cfg(test)]
-impl Dice {
+impl BeamRng {
     /// Nothing off anywhere.
-    pub(crate) const CENTRE: Dice = Dice {
+    pub(crate) const CENTRE: BeamRng = BeamRng {
         mirror: 0.0,
         surface: 0.5,
         between: 0.5,

@@ -10,13 +10,13 @@ use scanhub_drivers::lms::variant::{Mode, Unit};
 use schema::{Failure, Family, Kind, MILLIS, Nanos};
 
 use crate::device::{Chunk, Device};
-use crate::outlet::Outlet;
 use crate::request_decoder::{Arrival, Dropped};
-use crate::room::{Beams, Room};
+use crate::room::Room;
+use crate::rotating::{Beams, Rotation, ahead_deg};
 use crate::transmission::ChunkSize;
-use crate::turning::{Rotation, ahead_deg};
+use crate::transmission::TxQueue;
 
-pub use crate::turning::TruePoint;
+pub use crate::rotating::TruePoint;
 
 /// How a scanner is.
 #[derive(Clone, Copy, Debug)]
@@ -72,7 +72,7 @@ pub struct Head {
     /// Packets sent since it turns.
     sent: u64,
     rotation: Rotation,
-    outlet: Outlet,
+    tx_queue: TxQueue,
 }
 
 enum Source {
@@ -94,8 +94,8 @@ impl Head {
         };
         let HeadSettings { turns_per_second, wander, seed, .. } = settings;
         let rotation = Rotation::new(turns_per_second, wander, 0.0, seed);
-        let outlet = Outlet::new(settings.model.baud(), settings.chunk);
-        Head { settings, source, power_ns: 0, turns_ns: 0, sent: 0, rotation, outlet }
+        let tx_queue = TxQueue::new(settings.model.baud(), settings.chunk);
+        Head { settings, source, power_ns: 0, turns_ns: 0, sent: 0, rotation, tx_queue }
     }
 
     /// Makes it turn so many times in a second from its next packet on. The inertia of a real head is the caller's: of two
@@ -114,7 +114,7 @@ impl Head {
     pub fn truth(&mut self, point: u64) -> TruePoint {
         let (at_ns, clockwise_deg) = self.place(point);
         let range_mm = match &mut self.source {
-            Source::Room(beams) => beams.look(at_ns, ahead_deg(clockwise_deg)).exact_mm,
+            Source::Room(beams) => beams.measure(at_ns, ahead_deg(clockwise_deg)).exact_mm,
             Source::Recorded { .. } => None,
         };
         TruePoint { at_ns, clockwise_deg, range_mm }
@@ -138,7 +138,7 @@ impl Head {
 
     /// Restarts the scanner at `now`; packets follow after `boot_ns`. Returns whether a packet was broken off.
     fn restart(&mut self, now: Nanos, boot_ns: Nanos) -> bool {
-        let broken = self.outlet.break_off(now);
+        let broken = self.tx_queue.break_off(now);
         self.power_ns = now;
         self.turns_ns = now + boot_ns;
         let HeadSettings { turns_per_second, wander, seed, .. } = self.settings;
@@ -156,7 +156,7 @@ impl Head {
         let model = self.settings.model;
         let Source::Room(beams) = &mut self.source else { return [0; LEN] };
         let points = places.map(|(at_ns, clockwise_deg)| {
-            let look = beams.look(at_ns, ahead_deg(clockwise_deg));
+            let look = beams.measure(at_ns, ahead_deg(clockwise_deg));
             match look.range_mm.filter(|range_mm| reach_mm(model).contains(range_mm)) {
                 Some(range_mm) => (range_mm.round() as u16, look.intensity),
                 None => (0, 0),
@@ -176,7 +176,7 @@ impl Head {
             Source::Room(_) => Some(self.place((number + 1) * POINTS as u64).0),
             Source::Recorded { packets, looped, passed_ms } => {
                 let is_there = (number as usize) < packets.len() || *looped && !packets.is_empty();
-                is_there.then(|| (self.turns_ns + passed_ms * MILLIS).max(self.outlet.free_ns()))
+                is_there.then(|| (self.turns_ns + passed_ms * MILLIS).max(self.tx_queue.free_ns()))
             }
         }
     }
@@ -198,17 +198,17 @@ impl Head {
 
 impl Device for Head {
     fn poll_transmit(&mut self, now: Nanos) -> Option<Chunk> {
-        if self.outlet.next_ns().is_none() {
+        if self.tx_queue.next_ns().is_none() {
             let start_ns = self.due_ns(self.sent).filter(|&at| at <= now)?;
             let packet = self.take(self.sent);
             self.sent += 1;
-            self.outlet.send(packet.to_vec(), start_ns, false);
+            self.tx_queue.send(packet.to_vec(), start_ns, false);
         }
-        self.outlet.take(now)
+        self.tx_queue.take(now)
     }
 
     fn poll_timeout(&self) -> Option<Nanos> {
-        self.outlet.next_ns().or_else(|| self.due_ns(self.sent))
+        self.tx_queue.next_ns().or_else(|| self.due_ns(self.sent))
     }
 
     fn receive(&mut self, _: u8, _: Arrival) {}
@@ -223,11 +223,11 @@ impl Device for Head {
     }
 
     fn break_off(&mut self, now: Nanos) {
-        self.outlet.break_off(now);
+        self.tx_queue.break_off(now);
     }
 
     fn rate(&self) -> u32 {
-        self.outlet.rate()
+        self.tx_queue.rate()
     }
 
     fn streams(&self) -> bool {

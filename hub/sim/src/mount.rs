@@ -6,8 +6,8 @@ use std::f64::consts::PI;
 
 use schema::Nanos;
 
+use crate::shape::Plane;
 use crate::shape::Point;
-use crate::solid::Plane;
 
 /// A mount whose axis lies across, and that swings evenly to and fro. Angles grow as it looks down.
 #[derive(Clone, Debug, PartialEq)]

@@ -10,9 +10,9 @@ use scanhub_drivers::lms::variant::{Baud, Mode, Unit, Variant};
 use schema::{Failure, Kind};
 
 use crate::fault::Faults;
+use crate::machine::Start;
 use crate::operating::Operating;
 use crate::rplidar;
-use crate::settings::Start;
 use crate::transmission::ChunkSize;
 use crate::world::World;
 

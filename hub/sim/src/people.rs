@@ -3,8 +3,8 @@
 
 use std::f64::consts::TAU;
 
+use crate::shape::Heights;
 use crate::shape::{Point, Shape};
-use crate::solid::Heights;
 
 /// What a world says of a person.
 #[derive(Clone, Debug, PartialEq)]

@@ -1,13 +1,19 @@
-//! The port: a pty that behaves like a serial line as far as a pty can, and the clock. The only file of this crate that
-//! reads the kernel's clock. Knows nothing about telegrams.
+//! A pty that behaves like a serial line as far as possible, the symlink at which a host finds it, and the clock. No other
+//! file of this crate reads the kernel's clock.
 //!
-//! Differences between a pty and a line, and what is done about them: a pty keeps what nobody reads (so nothing is written
-//! while the host's side is closed, and the rest is discarded then); its exclusive mode survives the last close (so it is
-//! cleared); before the first open it does not report that it is closed (so it is opened and closed once).
+//! A pty differs from a serial line in three ways:
+//!
+//! - It keeps bytes that no host reads. Nothing is written while the host's side is closed, and unread bytes are discarded
+//!   when it closes.
+//! - Its exclusive mode survives the last close, so it is cleared.
+//! - It does not report that it is closed before the first open, so it is opened and closed once.
 
 use std::ffi::OsStr;
+use std::fs::{self, Metadata};
+use std::io::ErrorKind;
 use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
 use std::os::unix::ffi::OsStrExt;
+use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
@@ -18,20 +24,20 @@ use rustix::termios::{OptionalActions, QueueSelector, ioctl_tiocnxcl, tcflush, t
 use rustix::time::{ClockId, clock_gettime};
 use schema::{Failure, Kind, Nanos};
 
-/// CLOCK_MONOTONIC in nanoseconds.
+/// Returns CLOCK_MONOTONIC in nanoseconds.
 pub fn now_ns() -> Nanos {
     let now = clock_gettime(ClockId::Monotonic);
     now.tv_sec as u64 * 1_000_000_000 + now.tv_nsec as u64
 }
 
-/// A pty whose other side is what a host opens.
+/// A pty. A host opens its other side.
 #[derive(Debug)]
 pub struct Pty {
     master: OwnedFd,
     name: PathBuf,
 }
 
-/// What ended a wait.
+/// Reason for the end of a wait.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Wake {
     /// Time, bytes, or the host's side was closed.
@@ -41,7 +47,11 @@ pub(crate) enum Wake {
 }
 
 impl Pty {
-    /// A new one, raw, its host's side closed.
+    /// Creates a pty in raw mode, whose host's side is closed.
+    ///
+    /// # Errors
+    ///
+    /// Returns [`Kind::Short`] if a pty cannot be created.
     pub fn open() -> Result<Pty, Failure> {
         let make = || -> io::Result<Pty> {
             let master = openpt(OpenptFlags::RDWR | OpenptFlags::NOCTTY | OpenptFlags::CLOEXEC)?;
@@ -51,7 +61,7 @@ impl Pty {
             fcntl_setfl(&master, OFlags::RDWR | OFlags::NONBLOCK)?;
             let pty = Pty { master, name: OsStr::from_bytes(name.as_bytes()).into() };
             let slave = pty.open_slave()?;
-            // Else what the sensor sends would be echoed back to it until the host has set its own mode.
+            // Otherwise the pty would echo the bytes of the scanner until the host has set its own mode.
             let mut termios = tcgetattr(&slave)?;
             termios.make_raw();
             tcsetattr(&slave, OptionalActions::Now, &termios)?;
@@ -66,24 +76,24 @@ impl Pty {
         })
     }
 
-    /// The host's side, such as `/dev/pts/4`.
+    /// Returns the path of the host's side, such as `/dev/pts/4`.
     pub fn name(&self) -> &Path {
         &self.name
     }
 
-    /// Whether a host has its side open.
+    /// Returns whether a host has its side open.
     pub fn is_open(&self) -> bool {
         let mut fds = [PollFd::new(&self.master, PollFlags::IN)];
         let now = Timespec { tv_sec: 0, tv_nsec: 0 };
         poll(&mut fds, Some(&now)).is_ok() && !fds[0].revents().contains(PollFlags::HUP)
     }
 
-    /// What the rate of the host's port is set to, in bits per second.
+    /// Returns the rate of the host's port in bits per second.
     pub fn rate(&self) -> u32 {
         tcgetattr(&self.master).map_or(0, |termios| termios.output_speed())
     }
 
-    /// Reads what the host has written; `0` if nothing.
+    /// Reads bytes that the host has written. Returns 0 if there are none.
     pub fn read(&self, buffer: &mut [u8]) -> Result<usize, Failure> {
         match io::read(&self.master, buffer) {
             Ok(count) => Ok(count),
@@ -93,7 +103,7 @@ impl Pty {
         }
     }
 
-    /// Gives `bytes` to the host; returns how many of them its buffer had room for.
+    /// Sends `bytes` to the host. Returns the number of bytes that fit into its buffer.
     pub fn write(&self, bytes: &[u8]) -> Result<usize, Failure> {
         let mut rest = bytes;
         while !rest.is_empty() {
@@ -107,14 +117,14 @@ impl Pty {
         Ok(bytes.len() - rest.len())
     }
 
-    /// What becomes readable when a host has written, and writable when it has read.
+    /// Returns the descriptor that becomes readable when a host has written, and writable when it has read.
     pub fn waits_for(&self) -> BorrowedFd<'_> {
         self.master.as_fd()
     }
 
-    /// After the host's side was closed: forgets what it has not read, and lets others than root open it again.
+    /// Discards unread bytes after the host's side was closed, and lets users other than root open it again.
     pub(crate) fn clean_up_after_close(&self) {
-        // Somebody else may have opened it exclusively in this moment: then there is nothing to clean up.
+        // If another host has opened it exclusively in the meantime, there is nothing to clean up.
         if let Ok(slave) = self.open_slave() {
             let _ = tcflush(&slave, QueueSelector::IFlush);
             let _ = ioctl_tiocnxcl(&slave);
@@ -132,11 +142,134 @@ pub(crate) fn wait(stops: [BorrowedFd<'_>; 2], line: Option<BorrowedFd<'_>>, dea
     let timeout = Timespec { tv_sec: (left / 1_000_000_000) as _, tv_nsec: (left % 1_000_000_000) as _ };
     let mut fds =
         [stops[0], stops[1], line.unwrap_or(stops[0])].map(|fd| PollFd::from_borrowed_fd(fd, PollFlags::IN));
-    // An interrupted wait is a short one.
+    // An interrupted wait only ends early.
     let _ = poll(&mut fds, Some(&timeout));
     if fds[..2].iter().any(|fd| !fd.revents().is_empty()) { Wake::Stop } else { Wake::Line }
 }
 
 fn broken(what: &str, name: &Path, errno: Errno) -> Failure {
     Failure::new(Kind::Failed, format!("cannot {what} the pty {}: {errno}", name.display()), "")
+}
+
+/// A symlink from a path that the user names to a pty, whose number is unknown before. It is removed on drop.
+#[derive(Debug)]
+pub(crate) struct PtySymlink {
+    path: PathBuf,
+    target: PathBuf,
+}
+
+impl PtySymlink {
+    /// Creates a symlink at `path` to `target`. Replaces a symlink without a target, or to a terminal that is younger than the
+    /// symlink, because a killed simulator left it. Anything else at `path` remains.
+    ///
+    /// # Errors
+    ///
+    /// Returns [`Kind::PortBusy`] if another simulator uses `path`, [`Kind::PortNotTty`] if something else exists there, and
+    /// [`Kind::PortMissing`], [`Kind::PortPermission`] or [`Kind::Failed`] if the symlink cannot be created.
+    pub(crate) fn new(path: &Path, target: &Path) -> Result<PtySymlink, Failure> {
+        match fs::symlink_metadata(path) {
+            Ok(there) if there.is_symlink() && is_left_behind(path) => {
+                fs::remove_file(path).map_err(|error| failure(path, &error))?;
+            }
+            Ok(there) if there.is_symlink() && is_terminal(path) => {
+                return Err(Failure::new(
+                    Kind::PortBusy,
+                    format!("port {} belongs to another simulator, which still runs", path.display()),
+                    "name another path, or end that one first",
+                ));
+            }
+            Ok(there) => {
+                let kind = if there.is_symlink() { "a symlink to something else" } else { "no symlink" };
+                return Err(Failure::new(
+                    Kind::PortNotTty,
+                    format!("port {} exists and is {kind}", path.display()),
+                    "name a path that is free, or remove what is there",
+                ));
+            }
+            Err(error) if error.kind() == ErrorKind::NotFound => {}
+            Err(error) => return Err(failure(path, &error)),
+        }
+        std::os::unix::fs::symlink(target, path).map_err(|error| failure(path, &error))?;
+        Ok(PtySymlink { path: path.to_owned(), target: target.to_owned() })
+    }
+}
+
+impl Drop for PtySymlink {
+    fn drop(&mut self) {
+        // Another simulator may have replaced the symlink in the meantime.
+        if fs::read_link(&self.path).is_ok_and(|target| target == self.target) {
+            let _ = fs::remove_file(&self.path);
+        }
+    }
+}
+
+/// Returns whether a killed simulator left the symlink at `path`. A terminal that is older than the symlink still belongs to
+/// the simulator that created the symlink. A younger terminal only has the same number.
+fn is_left_behind(path: &Path) -> bool {
+    let (Ok(terminal), Ok(link)) = (fs::metadata(path), fs::symlink_metadata(path)) else { return true };
+    let since = |metadata: &Metadata| (metadata.ctime(), metadata.ctime_nsec());
+    is_terminal(path) && since(&terminal) > since(&link)
+}
+
+fn is_terminal(path: &Path) -> bool {
+    fs::read_link(path).is_ok_and(|target| target.starts_with("/dev/pts"))
+}
+
+fn failure(path: &Path, error: &std::io::Error) -> Failure {
+    let (kind, hint) = match error.kind() {
+        ErrorKind::NotFound => (Kind::PortMissing, "its directory must exist"),
+        ErrorKind::PermissionDenied => {
+            (Kind::PortPermission, "name a path in a directory that this user may write to")
+        }
+        _ => (Kind::Failed, ""),
+    };
+    Failure::new(kind, format!("cannot make the symlink {}: {error}", path.display()), hint)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::pty::Pty;
+
+    #[test]
+    fn replaces_only_symlinks_of_killed_simulators() {
+        let directory = tempfile::tempdir().unwrap();
+        let path = directory.path().join("port");
+        let link = || fs::read_link(&path).unwrap();
+
+        drop(PtySymlink::new(&path, Path::new("/dev/pts/ptmx")).unwrap());
+        assert!(fs::symlink_metadata(&path).is_err(), "not removed at the end");
+
+        std::os::unix::fs::symlink("/nonexistent/tty", &path).unwrap();
+        let place = PtySymlink::new(&path, Path::new("/dev/pts/999998")).unwrap();
+        let second = PtySymlink::new(&path, Path::new("/dev/pts/999999")).unwrap();
+        drop(place);
+        assert_eq!(link(), Path::new("/dev/pts/999999"), "the second one's was removed");
+        drop(second);
+
+        let [one, other] = [(); 2].map(|()| Pty::open().unwrap());
+        let place = PtySymlink::new(&path, one.name()).unwrap();
+        assert_eq!(PtySymlink::new(&path, other.name()).unwrap_err().kind, Kind::PortBusy);
+        assert_eq!(link(), one.name(), "it was taken away from who has it");
+        drop(place);
+
+        // The simulator was killed, and a younger terminal has its number. Its change time is later.
+        std::os::unix::fs::symlink(one.name(), &path).unwrap();
+        let since = |metadata: Metadata| (metadata.ctime(), metadata.ctime_nsec());
+        let made = since(fs::symlink_metadata(&path).unwrap());
+        while since(fs::metadata(one.name()).unwrap()) <= made {
+            fs::set_permissions(one.name(), fs::metadata(one.name()).unwrap().permissions()).unwrap();
+        }
+        drop(PtySymlink::new(&path, other.name()).unwrap());
+
+        std::os::unix::fs::symlink("/dev/null", &path).unwrap();
+        let failure = PtySymlink::new(&path, Path::new("/dev/pts/0")).unwrap_err();
+        assert_eq!(failure.kind, Kind::PortNotTty);
+        fs::remove_file(&path).unwrap();
+        fs::write(&path, "mine").unwrap();
+        assert_eq!(PtySymlink::new(&path, Path::new("/dev/pts/0")).unwrap_err().kind.exit_code(), 4);
+        assert_eq!(fs::read(&path).unwrap(), b"mine");
+        let deep = directory.path().join("no/port");
+        assert_eq!(PtySymlink::new(&deep, Path::new("/dev/pts/0")).unwrap_err().kind, Kind::PortMissing);
+    }
 }

@@ -1,32 +1,28 @@
 //! What the sensor sees: a world, measured the way an LMS 2xx measures it. A pure function of world, seed and time;
 //! knows neither telegrams nor the line.
 
-mod beam;
-
 use std::sync::Arc;
 
 use scanhub_drivers::lms::variant::{Mode, Unit, Variant};
 use schema::{Nanos, Scan, ScanHead};
 
 use crate::labeled_scan::{LabeledScan, Mark, Met};
-use crate::layers::{self, Dice};
+use crate::layers::{self, BeamRng};
 use crate::series::{Changes, Series};
 use crate::spot::{Echo, echo};
-use crate::view::View;
+use crate::view::{View, WorldView};
 use crate::world::World;
-use crate::world_view::WorldView;
-
-pub(crate) use beam::{Beams, Look};
 
 /// A world with its furniture in place, as one sensor in it sees it.
 #[derive(Clone, Debug)]
 pub struct Room {
-    seed: u64,
-    sight: Sight,
+    pub(crate) seed: u64,
+    pub(crate) sight: Sight,
 }
 
+/// Rendering method of a room.
 #[derive(Clone, Debug)]
-enum Sight {
+pub(crate) enum Sight {
     /// No return anywhere.
     Empty,
     /// Every value is this.
@@ -182,7 +178,7 @@ fn look_along(
     look: &mut LabeledScan,
 ) {
     let (angle_mdeg, time_ns) = at;
-    let dice = Dice::throw(random);
+    let dice = BeamRng::throw(random);
     let echo = echo(view, angle_mdeg, stage.layers.spot, &dice);
     let time_s = time_ns as f64 / 1e9;
     let sun = stage.suns.iter().map(|sun| sun.share(angle_mdeg, time_s)).fold(0.0, f64::max);
@@ -192,8 +188,8 @@ fn look_along(
 }
 
 /// What a beam says that got `echo`, while the sun dazzles `sun` of its like.
-fn word(stage: &WorldView, echo: &Echo, sun: f64, unit: Unit, mode: Mode, dice: &Dice) -> u16 {
-    match told(stage, echo, sun, dice) {
+fn word(stage: &WorldView, echo: &Echo, sun: f64, unit: Unit, mode: Mode, dice: &BeamRng) -> u16 {
+    match reported_range(stage, echo, sun, dice) {
         Err(code) => mode.max_value() - code,
         Ok(range_mm) => {
             let range = range_value(range_mm / f64::from(unit.mm()), mode);
@@ -202,8 +198,9 @@ fn word(stage: &WorldView, echo: &Echo, sun: f64, unit: Unit, mode: Mode, dice: 
     }
 }
 
-/// The range that a beam tells that got `echo`, in millimetres, or why it tells none: a code counted from the greatest value.
-fn told(stage: &WorldView, echo: &Echo, sun: f64, dice: &Dice) -> Result<f64, u16> {
+/// Returns the range in millimeters that the scanner reports for a beam with this `echo`. Otherwise returns the code that it
+/// reports, counted down from the highest value.
+pub(crate) fn reported_range(stage: &WorldView, echo: &Echo, sun: f64, dice: &BeamRng) -> Result<f64, u16> {
     if stage.layers.dazzles(sun, dice) {
         Err(layers::DAZZLE)
     } else if echo.range_mm.is_infinite() || dice.code >= echo.returns {
@@ -229,7 +226,7 @@ fn range_value(units: f64, mode: Mode) -> u16 {
 }
 
 /// Level of a reflector.
-fn level(echo: &Echo, mode: Mode, dice: &Dice) -> u16 {
+fn level(echo: &Echo, mode: Mode, dice: &BeamRng) -> u16 {
     if echo.bright == 0.0 {
         return 0;
     }

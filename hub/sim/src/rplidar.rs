@@ -1,64 +1,118 @@
-//! A scanner of Slamtec, without a line and without a clock: it answers what a host asks, its motor gets up to speed, and
-//! its head measures point by point, each at its own time, which leave in packets of the mode that was asked for.
+//! A simulated RPLIDAR of Slamtec, without I/O. It replies to requests of a host, its motor spins up, and its head measures
+//! point by point, each at its own time. The points leave in packets of the requested mode.
 //!
-//! The sources of what it does are the vendor's protocol manual and driver, and what others measured of a real A1M8. Where
-//! these are silent it keeps silent too: what it does not know is not answered.
+//! The sources of this behavior are the vendor's protocol manual and driver, and published measurements of a real A1M8. The
+//! simulator does not reply to requests that they do not describe.
 
-mod answers;
 mod models;
 mod optics;
-mod packets;
-mod requests;
-mod settings;
-mod stream;
+mod protocol;
 
 use schema::{MILLIS, Nanos};
 
 use crate::device::{Chunk, Device};
-use crate::fault::Window;
-use crate::outlet::Outlet;
+use crate::fault::{Faults, Window};
+use crate::machine::Habits;
 use crate::request_decoder::{Arrival, Dropped};
 use crate::room::Room;
-use crate::settings::Habits;
-use crate::turning::{Rotation, TruePoint};
+use crate::rotating::{Rotation, TruePoint};
+use crate::transmission::{ChunkSize, TxQueue};
 
 use models::Motor;
 use optics::Optics;
-use requests::{Decoder, Request};
-use stream::{Motion, Stream};
+use protocol::{Decoder, Reading, Request};
 
 pub use models::{Form, Mode, Model};
-pub use settings::{UnitSettings, UnitStart};
 
-/// The scanner.
+/// Settings of a scanner at the start of a simulation.
+#[derive(Clone, Debug)]
+pub struct UnitSettings {
+    /// The model.
+    pub model: Model,
+    /// Number of the mode that the scanner recommends; by default that of the model.
+    pub typical: usize,
+    /// Mean revolutions per second; by default those of the model.
+    pub turns_per_second: f64,
+    /// Share by which the speed varies.
+    pub wander: f64,
+    /// State at time 0.
+    pub start: UnitStart,
+    /// Time from power-on to the boot message.
+    pub boot_ns: Nanos,
+    /// Status and code that the scanner reports. A status of 2 is an error, in which it does not measure.
+    pub health: (u8, u16),
+    /// Whether the status remains after a RESET.
+    pub stubborn: bool,
+    /// Deviations from the manual. Those that only an LMS has are ignored.
+    pub habits: Habits,
+    /// Faults of the scanner: times at which something holds its head.
+    pub faults: Faults,
+    /// Number of bytes that the host's hardware delivers at once.
+    pub chunk: ChunkSize,
+    /// Seed of the speed, the serial number, the deviations and the faults.
+    pub seed: u64,
+}
+
+/// State of a scanner at time 0.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum UnitStart {
+    /// The scanner waits for requests. Its motor is on or off as after power-on, and at full speed if it is on.
+    Idle,
+    /// The scanner streams in its typical mode, because an earlier host left the stream on.
+    Streaming,
+    /// The power is switched on now.
+    PowerOn,
+}
+
+impl UnitSettings {
+    /// Returns a `model` with factory settings that was switched on long ago.
+    pub fn of(model: Model) -> UnitSettings {
+        UnitSettings {
+            model,
+            typical: model.typical(),
+            turns_per_second: model.turns_per_second(),
+            wander: 0.005,
+            start: UnitStart::Idle,
+            boot_ns: 2_000 * MILLIS,
+            health: (0, 0),
+            stubborn: false,
+            habits: Habits::default(),
+            faults: Faults::default(),
+            chunk: ChunkSize::Uart,
+            seed: 0,
+        }
+    }
+}
+
+/// A simulated RPLIDAR.
 pub struct Unit {
     settings: UnitSettings,
     optics: Optics,
     decoder: Decoder,
-    outlet: Outlet,
+    tx_queue: TxQueue,
     random: fastrand::Rng,
-    /// Nothing while it rests.
+    /// Motion of the motor; `None` while it is off or held.
     motor: Option<Motion>,
     stream: Option<Stream>,
     health: (u8, u16),
-    /// When the banner leaves, while it starts.
+    /// Time of the boot message; `None` after the start-up.
     boots_ns: Option<Nanos>,
-    /// From when on it hears.
+    /// Time from which on the scanner receives requests.
     hears_ns: Nanos,
     stalls: Window,
-    /// What the motor did when something held it.
+    /// Motion of the motor to resume, while something holds the head.
     held: Option<Option<Motion>>,
     writes: u64,
 }
 
 impl Unit {
-    /// The scanner that `settings` describe, at time 0, in `room`.
+    /// Creates the scanner that `settings` describe, at time 0, in `room`.
     pub fn new(settings: UnitSettings, room: Room) -> Unit {
         let UnitSettings { model, seed, health, .. } = settings;
         let mut unit = Unit {
             optics: Optics::new(model, room, seed),
             decoder: Decoder::default(),
-            outlet: Outlet::new(model.baud(), settings.chunk),
+            tx_queue: TxQueue::new(model.baud(), settings.chunk),
             random: fastrand::Rng::with_seed(!seed),
             motor: None,
             stream: None,
@@ -86,36 +140,36 @@ impl Unit {
         unit
     }
 
-    /// Point number `point` of the stream as it is now, without noise; nothing where none began.
+    /// Returns point number `point` of the present stream, without noise. Returns `None` before the first point.
     pub fn truth(&mut self, point: u64) -> Option<TruePoint> {
         let (at_ns, head_deg) = self.stream?.place(point, self.motor)?;
         Some(self.optics.truth(at_ns, head_deg))
     }
 
-    /// When the first point of the stream as it is now was measured; nothing where none began.
+    /// Returns the time of the first point of the present stream, or `None` before the first point.
     pub fn begin_ns(&self) -> Option<Nanos> {
         self.stream?.begin_ns
     }
 
-    /// The mode in which it streams, if it does.
+    /// Returns the mode of the stream, or `None` if there is no stream.
     pub fn mode(&self) -> Option<Mode> {
         Some(self.stream?.mode)
     }
 
-    /// Packets of the stream as it is now that were begun; nothing where none began. The next one begins with the point
-    /// behind theirs.
+    /// Returns the number of packets of the present stream, including the current one. The next packet begins with the point
+    /// after their last one. Returns `None` before the first point.
     pub fn sent(&self) -> Option<u64> {
         self.begin_ns()?;
         Some(self.stream?.sent())
     }
 
-    /// Turns that its motor makes in a second, wander aside; nothing while it rests.
+    /// Returns the mean revolutions per second of the motor, or `None` while it is off.
     pub fn turns_per_second(&self) -> Option<f64> {
         Some(self.motor?.rotation.turns_per_second)
     }
 
-    /// Makes a motor that turns turn so many times in a second from the next packet of its stream on. The inertia of a real
-    /// head is the caller's.
+    /// Changes the speed of a motor that is on, from the next packet of the stream on. The caller has to simulate the inertia
+    /// of a real head.
     pub fn set_speed(&mut self, turns_per_second: f64) {
         let next = self.stream.and_then(|stream| stream.next_ns(self.motor));
         if let (Some(motor), Some(next_ns)) = (&mut self.motor, next) {
@@ -124,17 +178,17 @@ impl Unit {
         }
     }
 
-    /// From now on it deviates from the manual like this.
+    /// Changes the deviations from the manual from now on.
     pub fn set_habits(&mut self, habits: Habits) {
         self.settings.habits = habits;
     }
 
-    /// Something holds its head from `now` on for `span`.
+    /// Holds the head from `now` on for `span`.
     pub fn hold(&mut self, now: Nanos, span: Nanos) {
         self.stalls = Window::once(now, span);
     }
 
-    /// From now on it reports this status and code, also after a RESET if it is `stubborn`. A status of 2 ends a stream.
+    /// Changes the reported status and code. They remain after a RESET if `stubborn` is set. A status of 2 ends a stream.
     pub fn set_health(&mut self, now: Nanos, health: (u8, u16), stubborn: bool) {
         (self.health, self.settings.stubborn) = (health, stubborn);
         if health.0 == ERROR {
@@ -142,7 +196,7 @@ impl Unit {
         }
     }
 
-    /// A motor that begins at `now`, at this share of its usual speed.
+    /// Returns the motion of a motor that starts at `now`, with this share of its usual speed.
     fn motion(&self, now: Nanos, share: f64) -> Motion {
         let UnitSettings { turns_per_second, wander, seed, .. } = self.settings;
         let turns_per_second = turns_per_second * share;
@@ -150,7 +204,7 @@ impl Unit {
         Motion { since_ns: now, steady_ns: now + STEADY_NS, rotation }
     }
 
-    /// The motor does `motion` from now on. What it measures begins anew.
+    /// Changes the motion of the motor. The present stream restarts.
     fn turn(&mut self, motion: Option<Motion>) {
         self.motor = motion;
         if let Some(stream) = self.stream.filter(|stream| !stream.forced) {
@@ -158,20 +212,20 @@ impl Unit {
         }
     }
 
-    /// Streams in `mode`, as was asked for at `asked_ns`, as soon as the motor is steady.
+    /// Starts a stream in `mode` that was requested at `asked_ns`, as soon as the speed of the motor is steady.
     fn measure(&mut self, mode: Mode, forced: bool, asked_ns: Nanos) {
         self.stream = Some(Stream::new(self.settings.model, mode, forced, asked_ns, self.motor));
     }
 
     fn end_stream(&mut self, now: Nanos) {
         if self.stream.take().is_some() {
-            self.outlet.forget_data(now);
+            self.tx_queue.forget_data(now);
         }
     }
 
-    /// It starts anew; the banner leaves after `span`.
+    /// Restarts the scanner. The boot message is sent after `span`.
     fn restart(&mut self, now: Nanos, span: Nanos) -> bool {
-        let broken = self.outlet.break_off(now);
+        let broken = self.tx_queue.break_off(now);
         self.stream = None;
         self.decoder.forget();
         self.boots_ns = Some(now + span);
@@ -182,12 +236,12 @@ impl Unit {
         broken
     }
 
-    /// What has happened by `now` is done.
+    /// Carries out everything that is due by `now`.
     fn advance(&mut self, now: Nanos) {
         if self.boots_ns.is_some_and(|at| at <= now) {
             let at_ns = self.boots_ns.take().unwrap_or(now);
-            self.outlet.send(answers::banner(self.settings.model), at_ns, true);
-            self.hears_ns = self.outlet.free_ns() + HEARS_NS;
+            self.tx_queue.send(protocol::boot_message(self.settings.model), at_ns, true);
+            self.hears_ns = self.tx_queue.free_ns() + HEARS_NS;
         }
         match (self.stalls.holds(now), self.held) {
             (true, None) => {
@@ -202,12 +256,12 @@ impl Unit {
             }
             _ => {}
         }
-        if self.outlet.next_ns().is_none()
+        if self.tx_queue.next_ns().is_none()
             && let Some(stream) = &mut self.stream
             && let Some(at_ns) = stream.due_ns(self.motor).filter(|&at| at <= now)
             && let Some(packet) = stream.packet(self.motor, &mut self.optics)
         {
-            self.outlet.send(packet, at_ns, false);
+            self.tx_queue.send(packet, at_ns, false);
         }
     }
 
@@ -215,15 +269,15 @@ impl Unit {
         let Habits { late_reply_ns, doubles, .. } = self.settings.habits;
         let copies = if self.random.f64() < doubles { 2 } else { 1 };
         for _ in 0..copies {
-            self.outlet.send(telegram.clone(), now + ANSWER_NS + late_reply_ns, true);
+            self.tx_queue.send(telegram.clone(), now + ANSWER_NS + late_reply_ns, true);
         }
     }
 
-    /// Does what a host asked for at `now`.
-    fn obey(&mut self, request: Request, now: Nanos) {
+    /// Carries out a request that arrived at `now`.
+    fn handle_request(&mut self, request: Request, now: Nanos) {
         let is_motor_s = matches!(request, Request::Pwm(_) | Request::Rpm(_) | Request::Board);
         if !is_motor_s {
-            // By the manual any request ends a stream.
+            // By the manual, any other request ends a stream.
             self.end_stream(now);
         }
         let (model, typical) = (self.settings.model, self.settings.typical);
@@ -234,29 +288,29 @@ impl Unit {
             }
             Request::Scan => self.begin(0, false, now),
             Request::Force => self.begin(0, true, now),
-            // Number 0 is the first express mode to hosts that know no other.
+            // Number 0 selects the first express mode, for hosts without support for other modes.
             Request::Express(0) => {
                 let first = model.modes().iter().position(|mode| mode.form == Form::Express);
                 self.begin(first.unwrap_or(1), false, now);
             }
             Request::Express(number) => self.begin(usize::from(number), false, now),
-            Request::Info => self.reply(answers::info(model, self.settings.seed), now),
+            Request::Info => self.reply(protocol::info(model, self.settings.seed), now),
             Request::Health => {
                 let (status, code) = if self.held.is_some() { (ERROR, HELD) } else { self.health };
-                self.reply(answers::health(status, code), now);
+                self.reply(protocol::health(status, code), now);
             }
-            Request::SampleRate => self.reply(answers::sample_rate(model), now),
+            Request::SampleRate => self.reply(protocol::sample_rate(model), now),
             Request::Configuration { key, mode } => {
-                if let Some(answer) = answers::configuration(model, typical, key, mode) {
+                if let Some(answer) = protocol::configuration(model, typical, key, mode) {
                     self.reply(answer, now);
                 }
             }
             Request::SetConfiguration(key) => {
                 self.writes += 1;
-                self.reply(answers::is_set(key), now);
+                self.reply(protocol::is_set(key), now);
             }
             Request::Pwm(duty) if model.motor() == Motor::Pwm => {
-                self.steer(f64::from(duty) / f64::from(answers::PWM), now);
+                self.steer(f64::from(duty) / f64::from(protocol::PWM), now);
             }
             Request::Rpm(rpm) if model.motor() == Motor::Rpm => {
                 self.steer(f64::from(rpm) / (60.0 * model.turns_per_second()), now);
@@ -264,23 +318,23 @@ impl Unit {
             Request::Pwm(_) | Request::Rpm(_) => {}
             Request::Board => {
                 if model.motor() != Motor::Rpm {
-                    self.reply(answers::board(model.motor() == Motor::Pwm), now);
+                    self.reply(protocol::board(model.motor() == Motor::Pwm), now);
                 }
             }
         }
     }
 
-    /// Begins to stream in mode `number`, if it has one and is not in error.
+    /// Starts a stream in mode `number`, if the model has this mode and the scanner is not in error.
     fn begin(&mut self, number: usize, forced: bool, now: Nanos) {
         let Some(&mode) = self.settings.model.modes().get(number) else { return };
         if self.health.0 == ERROR {
             return;
         }
-        self.reply(answers::stream(&mode), now);
-        self.measure(mode, forced, self.outlet.free_ns());
+        self.reply(protocol::stream_descriptor(&mode), now);
+        self.measure(mode, forced, self.tx_queue.free_ns());
     }
 
-    /// The motor turns at this share of its usual speed.
+    /// Sets the speed of the motor to this share of its usual speed.
     fn steer(&mut self, share: f64, now: Nanos) {
         let wanted = (share > 0.0).then(|| self.motion(now, share));
         let speed = |motion: Motion| motion.rotation.turns_per_second;
@@ -298,12 +352,12 @@ impl Unit {
 impl Device for Unit {
     fn poll_transmit(&mut self, now: Nanos) -> Option<Chunk> {
         self.advance(now);
-        self.outlet.take(now)
+        self.tx_queue.take(now)
     }
 
     fn poll_timeout(&self) -> Option<Nanos> {
-        let data_ns = self.outlet.next_ns().or_else(|| self.stream?.due_ns(self.motor));
-        // While it is held its end is still ahead.
+        let data_ns = self.tx_queue.next_ns().or_else(|| self.stream?.due_ns(self.motor));
+        // While the head is held, the end of the window is still ahead.
         let held_ns = self.stalls.next_ns(if self.held.is_some() { 0 } else { Nanos::MAX });
         let times = [data_ns, self.boots_ns, Some(held_ns)];
         times.into_iter().flatten().filter(|&at| at < Nanos::MAX).min()
@@ -318,7 +372,7 @@ impl Device for Unit {
         let Habits { mute, overlooks, .. } = self.settings.habits;
         let is_overlooked = self.random.f64() < overlooks;
         if !mute && !is_overlooked {
-            self.obey(request, now);
+            self.handle_request(request, now);
         }
     }
 
@@ -333,17 +387,17 @@ impl Device for Unit {
         broken
     }
 
-    /// Restarts the scanner while its motor continues. The banner then stands in the middle of a stream.
+    /// Restarts the scanner while its motor continues. The boot message then arrives during a stream.
     fn brown_out(&mut self, now: Nanos) -> bool {
         self.restart(now, RESTART_NS)
     }
 
     fn break_off(&mut self, now: Nanos) {
-        self.outlet.break_off(now);
+        self.tx_queue.break_off(now);
     }
 
     fn rate(&self) -> u32 {
-        self.outlet.rate()
+        self.tx_queue.rate()
     }
 
     fn streams(&self) -> bool {
@@ -363,15 +417,107 @@ impl Device for Unit {
     }
 }
 
-/// A status of the health: it does not measure.
+/// Motion of a motor that is on.
+#[derive(Clone, Copy, Debug, PartialEq)]
+struct Motion {
+    since_ns: Nanos,
+    /// Time from which on the speed is steady enough to measure.
+    steady_ns: Nanos,
+    rotation: Rotation,
+}
+
+/// A stream of points in one mode. It determines the time and the head angle of each point, and the time at which a packet
+/// has all its points.
+#[derive(Clone, Copy, Debug)]
+struct Stream {
+    mode: Mode,
+    /// Whether the scanner measures at any speed of the motor.
+    forced: bool,
+    /// Time of the request.
+    asked_ns: Nanos,
+    /// Time of the first point; `None` while the motor is off.
+    begin_ns: Option<Nanos>,
+    /// Time from one point to the next.
+    sample_ns: f64,
+    /// Number of packets since the first point.
+    sent: u64,
+}
+
+impl Stream {
+    /// Creates a stream of `model` in `mode` that was requested at `asked_ns`. It starts as soon as `motor` is steady, or at
+    /// once if it is `forced`.
+    fn new(model: Model, mode: Mode, forced: bool, asked_ns: Nanos, motor: Option<Motion>) -> Stream {
+        let steady_ns = if forced { Some(0) } else { motor.map(|motion| motion.steady_ns) };
+        let begin_ns = steady_ns.map(|steady_ns| steady_ns.max(asked_ns));
+        let sample_ns = 1e3 * mode.sample_us * model.slowness();
+        Stream { mode, forced, asked_ns, begin_ns, sample_ns, sent: 0 }
+    }
+
+    /// Returns the time of point number `point`, and the clockwise angle of the head from its zero at this time, in degrees.
+    fn place(&self, point: u64, motor: Option<Motion>) -> Option<(Nanos, f64)> {
+        let at_ns = self.begin_ns? + (point as f64 * self.sample_ns) as Nanos;
+        let turns = motor
+            .map_or(0.0, |motion| motion.rotation.turns(at_ns.saturating_sub(motion.since_ns) as f64 / 1e9));
+        Some((at_ns, turns.fract() * 360.0))
+    }
+
+    /// Returns the number of packets, including the current one.
+    fn sent(&self) -> u64 {
+        self.sent
+    }
+
+    /// Returns the time of the first point of the next packet.
+    fn next_ns(&self, motor: Option<Motion>) -> Option<Nanos> {
+        self.place(self.sent * self.mode.form.points() as u64, motor).map(|(at_ns, _)| at_ns)
+    }
+
+    /// Returns the time at which the next packet has all its points.
+    fn due_ns(&self, motor: Option<Motion>) -> Option<Nanos> {
+        let points = self.mode.form.points() as u64 * (self.sent + 1);
+        // Ranges that are sent as a difference from the first range of the next packet wait for it.
+        let last = if self.mode.form == Form::Ultra { points } else { points - 1 };
+        self.place(last, motor).map(|(at_ns, _)| at_ns)
+    }
+
+    /// Returns the next packet, with points that `optics` measures.
+    fn packet(&mut self, motor: Option<Motion>, optics: &mut Optics) -> Option<Vec<u8>> {
+        let Mode { form, reach_m, .. } = self.mode;
+        let clock_us = (self.due_ns(motor)? / 1_000) as u32;
+        let first = self.sent * form.points() as u64;
+        let mut readings = Vec::with_capacity(form.points() + 1);
+        for point in first..=first + form.points() as u64 {
+            let (at_ns, head_deg) = self.place(point, motor)?;
+            let before = point.checked_sub(1).and_then(|point| self.place(point, motor));
+            let begins_turn = before.is_some_and(|(_, before_deg)| before_deg > head_deg);
+            let is_needed = form == Form::Ultra || readings.len() < form.points();
+            let reading =
+                if is_needed { optics.measure(at_ns, head_deg, reach_m) } else { Reading::default() };
+            readings.push(Reading { begins_turn, ..reading });
+        }
+        let next = readings.pop()?;
+        let is_first = self.sent == 0;
+        self.sent += 1;
+        Some(match form {
+            Form::Standard => protocol::standard(&readings[0]),
+            Form::Express => protocol::express(is_first, &readings),
+            Form::Ultra => protocol::ultra(is_first, &readings, &next),
+            Form::Dense => protocol::dense(is_first, &readings),
+            Form::UltraDense => protocol::ultra_dense(is_first, clock_us, &readings),
+        })
+    }
+}
+
+/// Health status of a scanner that does not measure.
 const ERROR: u8 = 2;
-/// The code that it reports while something holds its head. Invented: the real ones are not published.
+/// Health code while something holds the head. It is invented, because the real ones are not published.
 const HELD: u16 = 0x0001;
-/// From RESET to the banner, and from the banner to the first request that it hears: measured of a real A1.
+/// Time from RESET to the boot message, as measured on a real A1.
 const RESTART_NS: Nanos = 671 * MILLIS;
+/// Time from the boot message to the first request that the scanner receives, as measured on a real A1.
 const HEARS_NS: Nanos = 4 * MILLIS;
-/// From a request to its answer.
+/// Time from a request to its response.
 const ANSWER_NS: Nanos = MILLIS;
-/// How a motor gets up to speed: its time constant, and when it is near enough to measure.
+/// Time constant of the motor's spin-up, in seconds.
 const SPIN_UP_S: f64 = 0.4;
+/// Time after which the speed of the motor is steady enough to measure.
 const STEADY_NS: Nanos = 1_600 * MILLIS;

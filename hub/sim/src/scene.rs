@@ -4,8 +4,8 @@
 use crate::layers::Layers;
 use crate::mount::Mount;
 use crate::people::Plan;
+use crate::shape::Heights;
 use crate::shape::{Pose, Shape};
-use crate::solid::Heights;
 
 /// A world that was read.
 #[derive(Clone, Debug, PartialEq)]

@@ -2,7 +2,7 @@
 //! one, the other or a value between. Knows neither units nor codes.
 
 use crate::labeled_scan::Met;
-use crate::layers::Dice;
+use crate::layers::BeamRng;
 use crate::scene::Surface;
 use crate::shape::Shape;
 use crate::view::{Face, Hit, Kind, RAY_STEP, REACH, View};
@@ -55,7 +55,7 @@ impl Part<'_> {
 }
 
 /// The echo of the beam at `angle_mdeg`; without `wide` that of a line, else that of a spot.
-pub(crate) fn echo(view: &View, angle_mdeg: i32, wide: bool, dice: &Dice) -> Echo {
+pub(crate) fn echo(view: &View, angle_mdeg: i32, wide: bool, dice: &BeamRng) -> Echo {
     let rays = view.around(angle_mdeg);
     let spread = spread(view, rays, dice);
     let middle = [part(view, &rays[REACH], 1.0)];
@@ -94,7 +94,7 @@ fn told<'a>(
     near: Option<(Option<&'a Face>, f64)>,
     far: Option<(Option<&'a Face>, f64)>,
     share: f64,
-    dice: &Dice,
+    dice: &BeamRng,
 ) -> (Option<&'a Face>, f64) {
     let near = near.unwrap_or((None, f64::INFINITY));
     let Some(far) = far else { return near };
@@ -110,7 +110,7 @@ fn told<'a>(
 
 /// The faces that the spot covers, with the light that falls on each. The spot has a Gaussian profile; it ends where
 /// the light is down to 1/e^2.
-fn spread<'a>(view: &'a View, rays: &'a [Hit], dice: &Dice) -> Vec<Part<'a>> {
+fn spread<'a>(view: &'a View, rays: &'a [Hit], dice: &BeamRng) -> Vec<Part<'a>> {
     if rays.iter().all(|hit| hit.is_of(&rays[REACH])) {
         return vec![part(view, &rays[REACH], 1.0)];
     }
@@ -201,7 +201,7 @@ const MIXED: f64 = 0.3;
 mod tests {
     use super::*;
 
-    const DICE: Dice = Dice::CENTRE;
+    const DICE: BeamRng = BeamRng::CENTRE;
 
     fn view(faces: &[(Shape, Surface, Kind)]) -> View {
         let mut view = View::empty();
@@ -233,7 +233,7 @@ mod tests {
         ];
         let view = view(&edge);
         let told = |surface, between| {
-            let dice = Dice { surface, between, ..DICE };
+            let dice = BeamRng { surface, between, ..DICE };
             let echo = echo(&view, 0, true, &dice);
             assert!(echo.torn && echo.met == Met::Grazed, "{echo:?}");
             echo.range_mm.round()

@@ -1,20 +1,24 @@
-//! One telegram (or single byte) on its way out: which of its bytes have passed the line at a given time, and in which
-//! chunks the receiver's hardware hands them over. Refuses to know what the bytes mean and who asked for them.
+//! Transmission of bytes at the rate of the line, in the chunks that the receiver's hardware delivers: [`Transmission`] for
+//! one telegram or single byte, and [`TxQueue`] for everything that a rotating scanner sends.
+
+use std::collections::VecDeque;
 
 use scanhub_drivers::lms::variant::{BYTES_PER_TURN, MIRROR_TURN};
 use schema::{Nanos, line_time};
 
-/// How many bytes the receiving hardware collects before its driver sees them.
+use crate::device::{Chunk, Part, Sent};
+
+/// Number of bytes that the receiving hardware collects before its driver receives them.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum ChunkSize {
     /// A 16550's FIFO: 16 bytes.
     Uart,
-    /// A full-speed USB packet of a common adapter without its two status bytes: 62.
+    /// A full-speed USB packet of a common adapter, without its two status bytes: 62 bytes.
     Usb,
 }
 
 impl ChunkSize {
-    /// Bytes: 16 or 62.
+    /// Returns the number of bytes: 16 or 62.
     pub fn bytes(self) -> usize {
         match self {
             ChunkSize::Uart => 16,
@@ -23,54 +27,54 @@ impl ChunkSize {
     }
 }
 
-/// Bytes that leave one after the other from a point in time on.
+/// Transmission of bytes, one after the other from a start time on.
 #[derive(Debug)]
 pub(crate) struct Transmission<T> {
     bytes: Vec<u8>,
-    /// How many of them leave: all, or fewer if it was broken off.
+    /// Number of bytes to send: all, or fewer if the transmission was broken off.
     leaving: usize,
     handed: usize,
     start_ns: Nanos,
     rate: u32,
     chunk: usize,
-    /// What the sender wants to know at its end.
+    /// Value of the sender, for use at the end of the transmission.
     pub(crate) tag: T,
 }
 
 impl<T> Transmission<T> {
-    /// `bytes` (at least one) from `start_ns` on.
+    /// Creates a transmission of `bytes` (at least one) from `start_ns` on.
     pub(crate) fn new(bytes: Vec<u8>, start_ns: Nanos, rate: u32, chunk: ChunkSize, tag: T) -> Self {
         let leaving = bytes.len();
         Transmission { bytes, leaving, handed: 0, start_ns, rate, chunk: chunk.bytes(), tag }
     }
 
-    /// When the next chunk is complete.
+    /// Returns the time at which the next chunk is complete.
     pub(crate) fn next_chunk_ns(&self) -> Nanos {
         self.through_ns(self.chunk_end())
     }
 
-    /// When its last byte is through.
+    /// Returns the end of the last byte.
     pub(crate) fn end_ns(&self) -> Nanos {
         self.through_ns(self.leaving)
     }
 
-    /// When its first byte begins.
+    /// Returns the start of the first byte.
     pub(crate) fn start_ns(&self) -> Nanos {
         self.start_ns
     }
 
-    /// Starts at `at_ns` if it would have started earlier; only before its first byte was taken.
+    /// Delays the start to `at_ns`, unless it is later already. Call it before the first byte was taken.
     pub(crate) fn start_no_earlier(&mut self, at_ns: Nanos) {
         self.start_ns = self.start_ns.max(at_ns);
     }
 
-    /// Rate of the line.
+    /// Returns the rate of the line in bits per second.
     pub(crate) fn rate(&self) -> u32 {
         self.rate
     }
 
-    /// The next chunk, if it is complete at `now`, and whether the line is idle after it. It is empty where everything
-    /// that leaves was taken: broken off between two bursts.
+    /// Returns the next chunk, if it is complete at `now`, and whether the line is idle after it. The chunk is empty if the
+    /// transmission was broken off between two bursts.
     pub(crate) fn take_chunk(&mut self, now: Nanos) -> Option<(&[u8], bool)> {
         if self.next_chunk_ns() > now {
             return None;
@@ -80,30 +84,30 @@ impl<T> Transmission<T> {
         Some((&self.bytes[from..to], to == self.leaving || to % BYTES_PER_TURN == 0))
     }
 
-    /// Whether every byte that leaves was taken.
+    /// Returns whether every byte to send was taken.
     pub(crate) fn is_done(&self) -> bool {
         self.handed == self.leaving
     }
 
-    /// Whether it was broken off before its last byte.
+    /// Returns whether the transmission was broken off before its last byte.
     pub(crate) fn is_broken(&self) -> bool {
         self.leaving < self.bytes.len()
     }
 
-    /// Ends it with the byte that is in the transmitter at `now`.
+    /// Ends the transmission with the byte that is in the transmitter at `now`.
     pub(crate) fn break_off(&mut self, now: Nanos) {
         let byte_ns = line_time(1, self.rate);
         let begun = (0..self.leaving).take_while(|&i| self.through_ns(i + 1) - byte_ns <= now).count();
         self.leaving = begun.max(self.handed).max(1);
     }
 
-    /// All bytes, those that did not leave too.
+    /// Returns all bytes, including those that were not sent, and the tag.
     pub(crate) fn into_parts(self) -> (Vec<u8>, T) {
         (self.bytes, self.tag)
     }
 
-    /// When `count` (at least 1) bytes are through. Where 508 bytes need less than a mirror turn, the rest waits for
-    /// the next turn.
+    /// Returns the end of the first `count` (at least 1) bytes. If 508 bytes need less time than a turn of the mirror, the
+    /// rest waits for the next turn.
     fn through_ns(&self, count: usize) -> Nanos {
         let rate = self.rate;
         let turns = (count - 1) / BYTES_PER_TURN;
@@ -117,10 +121,85 @@ impl<T> Transmission<T> {
     }
 }
 
+/// Transmit queue of a rotating scanner. It sends one telegram after the other.
+#[derive(Debug)]
+pub(crate) struct TxQueue {
+    /// The transmissions. The tag is whether the telegram is a reply.
+    queue: VecDeque<Transmission<bool>>,
+    chunk: ChunkSize,
+    rate: u32,
+    free_ns: Nanos,
+}
+
+impl TxQueue {
+    /// Creates a queue that sends at `rate` bits per second, in chunks of the size `chunk`.
+    pub(crate) fn new(rate: u32, chunk: ChunkSize) -> TxQueue {
+        TxQueue { queue: VecDeque::new(), chunk, rate, free_ns: 0 }
+    }
+
+    /// Sends `telegram` after everything before it, at `at_ns` at the earliest.
+    pub(crate) fn send(&mut self, telegram: Vec<u8>, at_ns: Nanos, is_reply: bool) {
+        let start_ns = at_ns.max(self.free_ns);
+        let transmission = Transmission::new(telegram, start_ns, self.rate, self.chunk, is_reply);
+        self.free_ns = transmission.end_ns();
+        self.queue.push_back(transmission);
+    }
+
+    /// Returns the next chunk, if it is complete at `now`.
+    pub(crate) fn take(&mut self, now: Nanos) -> Option<Chunk> {
+        let rate = self.rate;
+        let front = self.queue.front_mut()?;
+        let (bytes, idle_after) = front.take_chunk(now)?;
+        let bytes = bytes.to_vec();
+        if !front.is_done() {
+            return Some(Chunk { bytes, rate, idle_after, part: Part::Telegram });
+        }
+        let front = self.queue.pop_front()?;
+        let aborted = front.is_broken();
+        let (telegram, is_reply) = front.into_parts();
+        Some(Chunk { bytes, rate, idle_after, part: Part::End(Sent { is_reply, telegram, aborted }) })
+    }
+
+    /// Returns the time at which the next chunk is complete, or `None` if the queue is empty.
+    pub(crate) fn next_ns(&self) -> Option<Nanos> {
+        self.queue.front().map(Transmission::next_chunk_ns)
+    }
+
+    /// Returns the end of the last telegram.
+    pub(crate) fn free_ns(&self) -> Nanos {
+        self.free_ns
+    }
+
+    /// Breaks off the current telegram and drops the rest. Returns whether a telegram was broken off.
+    pub(crate) fn break_off(&mut self, now: Nanos) -> bool {
+        self.queue.retain(|transmission| transmission.start_ns() <= now);
+        let mut broken = false;
+        self.free_ns = now;
+        for transmission in &mut self.queue {
+            transmission.break_off(now);
+            broken |= transmission.is_broken();
+            self.free_ns = transmission.end_ns().max(now);
+        }
+        broken
+    }
+
+    /// Drops the data whose transmission has not started.
+    pub(crate) fn forget_data(&mut self, now: Nanos) {
+        self.queue.retain(|transmission| transmission.tag || transmission.start_ns() <= now);
+        self.free_ns = self.queue.back().map_or(now, Transmission::end_ns);
+    }
+
+    /// Returns the rate of the line in bits per second.
+    pub(crate) fn rate(&self) -> u32 {
+        self.rate
+    }
+}
+
 #[cfg(test)]
 mod tests {
-    use super::*;
     use schema::MICROS;
+
+    use super::*;
 
     fn times(mut transmission: Transmission<()>) -> Vec<(usize, Nanos, bool)> {
         let mut all = Vec::new();
@@ -134,7 +213,7 @@ mod tests {
     }
 
     #[test]
-    fn half_degree_at_500k_comes_in_two_bursts() {
+    fn sends_half_degree_scan_at_500k_in_two_bursts() {
         let chunks = times(Transmission::new(vec![7; 732], 0, 500_000, ChunkSize::Uart, ()));
         assert_eq!(chunks.iter().map(|c| c.0).sum::<usize>(), 732);
         assert_eq!(chunks[0], (16, 320 * MICROS, false));
@@ -154,7 +233,7 @@ mod tests {
     }
 
     #[test]
-    fn broken_off_after_the_byte_in_the_transmitter() {
+    fn breaks_off_after_byte_in_transmitter() {
         let mut transmission = Transmission::new(vec![7; 732], 0, 500_000, ChunkSize::Uart, ());
         assert!(transmission.take_chunk(320 * MICROS).is_some());
         transmission.break_off(405 * MICROS);

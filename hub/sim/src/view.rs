@@ -1,15 +1,195 @@
-//! What is in each direction from a sensor at one moment, as a row of narrow rays: drawn shape by shape, the nearest wins.
-//! Knows neither beams nor noise.
+//! The surroundings of a scanner. [`WorldView`] is a scene whose random parts a seed has drawn, seen by one scanner. It draws
+//! a [`View`]: the nearest surface in each direction at one time, as a row of narrow rays.
 
 use std::ops::Range;
 use std::sync::LazyLock;
 
 use schema::Nanos;
 
-use crate::scene::Surface;
-use crate::shape::{Point, Shape};
+use crate::labeled_scan::Mark;
+use crate::layers::Layers;
+use crate::mount::Mount;
+use crate::people::{Person, jittered};
+use crate::scene::{Scene, Sun, Surface, Thing};
+use crate::shape::{Plane, Point, Pose, Shape};
 
-/// One shape that can be seen, in the frame of the sensor.
+/// A scene with its random parts, seen by one scanner.
+#[derive(Clone, Debug)]
+pub(crate) struct WorldView {
+    pub(crate) layers: Layers,
+    sensor: Pose,
+    mount: Option<Mount>,
+    /// Constant error of all ranges of this scanner.
+    pub(crate) bias_mm: f64,
+    /// View of all objects that never change; empty for a tilted scanner.
+    still: View,
+    /// The objects that never change; empty unless the scanner is tilted.
+    still_things: Vec<Thing>,
+    still_reflectors: Vec<Shape>,
+    changing: Vec<Thing>,
+    people: Vec<Person>,
+    pub(crate) suns: Vec<Sun>,
+}
+
+impl WorldView {
+    /// Creates the view of sensor number `sensor` in `scene`, with the random parts that `seed` draws.
+    pub(crate) fn new(scene: &Scene, seed: u64, sensor: u64) -> WorldView {
+        let mut random = fastrand::Rng::with_seed(seed);
+        let people = scene.people.iter().map(|plan| Person::new(plan, &mut random)).collect();
+        let mut things = scene.things.clone();
+        for thing in &mut things {
+            let place = (thing.pose.x_mm, thing.pose.y_mm);
+            (thing.pose.x_mm, thing.pose.y_mm) = jittered(place, thing.jitter_mm, &mut random);
+        }
+        let (still_things, changing): (Vec<_>, Vec<_>) = things.into_iter().partition(Thing::is_still);
+        let bias = fastrand::Rng::with_seed(!seed ^ sensor << 32).f64();
+        let mut stage = WorldView {
+            layers: scene.layers,
+            sensor: scene.sensors[sensor as usize].pose,
+            mount: scene.sensors[sensor as usize].mount.clone(),
+            bias_mm: scene.layers.bias_mm * (2.0 * bias - 1.0),
+            still: View::empty(),
+            still_things: Vec::new(),
+            still_reflectors: Vec::new(),
+            changing,
+            people,
+            suns: scene.suns.clone(),
+        };
+        if stage.mount.is_some() {
+            stage.still_things = still_things;
+            return stage;
+        }
+        for thing in still_things {
+            for shape in stage.seen(&thing, thing.pose) {
+                if thing.surface == Surface::Reflector {
+                    stage.still_reflectors.push(shape);
+                }
+                stage.still.draw(Face { shape, surface: thing.surface, kind: Kind::Static });
+            }
+        }
+        stage
+    }
+
+    /// Returns the shapes of `thing` at `pose`, in the frame of the scanner.
+    fn seen(&self, thing: &Thing, pose: Pose) -> Vec<Shape> {
+        let place = |point| self.eye(pose.outward(point));
+        thing.shapes.iter().map(|shape| shape.placed(place)).collect()
+    }
+
+    /// Transforms a point of the world to the frame of the scanner: x to its right, y ahead.
+    fn eye(&self, point: (f64, f64)) -> (f64, f64) {
+        let (ahead, left) = self.sensor.inward(point);
+        (-left, ahead)
+    }
+
+    /// Returns the faces of changing objects and of people at `time_ns`.
+    fn faces(&self, time_ns: Nanos) -> Vec<Face> {
+        let time_s = time_ns as f64 / 1e9;
+        let mut faces = Vec::new();
+        for thing in &self.changing {
+            let Some(spell) = thing.at(time_s) else { continue };
+            let kind = Kind::since(nanos(spell.since_s));
+            let shapes = self.seen(thing, spell.pose);
+            faces.extend(shapes.into_iter().map(|shape| Face { shape, surface: thing.surface, kind }));
+        }
+        for legs in self.people.iter().filter_map(|person| person.legs(time_s)) {
+            let leg = |leg: Shape| Face {
+                shape: leg.placed(|point| self.eye(point)),
+                surface: Surface::Plain,
+                kind: Kind::Person,
+            };
+            faces.extend(legs.map(leg));
+        }
+        faces
+    }
+
+    /// Returns whether the scanner is tilted, so that each beam has another plane.
+    pub(crate) fn is_tilted(&self) -> bool {
+        self.mount.is_some()
+    }
+
+    /// Returns the view ahead at `time_ns`.
+    pub(crate) fn view(&self, time_ns: Nanos) -> View {
+        let mut view = self.still.ahead();
+        self.draw(&mut view, time_ns);
+        view
+    }
+
+    /// Returns the view of all objects that never change, all around.
+    pub(crate) fn still(&self) -> &View {
+        &self.still
+    }
+
+    /// Changes `view` to the surroundings of the beam at `angle_deg` at `time_ns`. At first, `view` must be a clone of
+    /// [`WorldView::still`].
+    pub(crate) fn look_along(&self, view: &mut View, angle_deg: f64, time_ns: Nanos) {
+        view.narrow(&self.still, angle_deg);
+        self.draw(view, time_ns);
+    }
+
+    fn draw(&self, view: &mut View, time_ns: Nanos) {
+        if let Some(mount) = &self.mount {
+            return self.draw_cut(&mount.plane(time_ns), view, time_ns);
+        }
+        for face in self.faces(time_ns) {
+            view.draw(face);
+        }
+        for thing in &self.changing {
+            for spell in thing.left(time_ns as f64 / 1e9) {
+                for shape in self.seen(thing, spell.pose) {
+                    view.uncover(&shape, nanos(spell.since_s));
+                }
+            }
+        }
+    }
+
+    /// Draws everything that `plane` cuts.
+    fn draw_cut(&self, plane: &Plane, view: &mut View, time_ns: Nanos) {
+        let time_s = time_ns as f64 / 1e9;
+        let face = |shape, surface, kind| Face { shape, surface, kind };
+        if let Some(floor) = plane.cut_floor() {
+            view.draw(face(floor, Surface::Plain, Kind::Static));
+        }
+        for thing in self.still_things.iter().chain(&self.changing) {
+            let Some(spell) = thing.at(time_s) else { continue };
+            let kind = Kind::since(nanos(spell.since_s));
+            let shapes = self.seen(thing, spell.pose);
+            plane.cut(&shapes, thing.heights, thing.is_box, |cut| view.draw(face(cut, thing.surface, kind)));
+        }
+        for (part, heights) in self.people.iter().filter_map(|person| person.body(time_s)).flatten() {
+            let part = part.placed(|point| self.eye(point));
+            plane.cut(&[part], heights, false, |cut| view.draw(face(cut, Surface::Plain, Kind::Person)));
+        }
+        for thing in &self.changing {
+            for spell in thing.left(time_s) {
+                let shapes = self.seen(thing, spell.pose);
+                let since_ns = nanos(spell.since_s);
+                plane.cut(&shapes, thing.heights, thing.is_box, |cut| view.uncover(&cut, since_ns));
+            }
+        }
+    }
+
+    /// Returns the middle of each reflector that is visible at `time_ns`. There are none for a tilted scanner.
+    pub(crate) fn marks(&self, time_ns: Nanos) -> Vec<Mark> {
+        if self.is_tilted() {
+            return Vec::new();
+        }
+        let view = self.view(time_ns);
+        let moving = self.faces(time_ns).into_iter().filter(|face| face.surface == Surface::Reflector);
+        let fronts = self.still_reflectors.iter().copied().chain(moving.map(|face| face.shape));
+        let marks = fronts.map(|shape| {
+            let (right, ahead) = shape.front();
+            Mark { angle_deg: (-right).atan2(ahead).to_degrees(), range_mm: right.hypot(ahead) }
+        });
+        marks.filter(|mark| view.reaches(mark.angle_deg, mark.range_mm)).collect()
+    }
+}
+
+fn nanos(time_s: f64) -> Nanos {
+    (time_s * 1e9).round() as Nanos
+}
+
+/// A visible shape, in the frame of the scanner.
 #[derive(Clone, Debug)]
 pub(crate) struct Face {
     pub(crate) shape: Shape,
@@ -17,19 +197,19 @@ pub(crate) struct Face {
     pub(crate) kind: Kind,
 }
 
-/// What a face belongs to.
+/// Kind of object that a face belongs to.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Kind {
-    /// What was there at the start.
+    /// An object that has been in place since the start.
     Static,
-    /// Somebody's leg.
+    /// A leg of a person.
     Person,
-    /// A thing that came or moved at this time.
+    /// An object that appeared or moved at this time.
     Box { since_ns: Nanos },
 }
 
 impl Kind {
-    /// That of a thing that stands where it does since `since_ns`.
+    /// Returns the kind of an object that has been in place since `since_ns`.
     pub(crate) fn since(since_ns: Nanos) -> Kind {
         match since_ns {
             0 => Kind::Static,
@@ -38,41 +218,41 @@ impl Kind {
     }
 }
 
-/// Where a ray ends.
+/// End of a ray.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Hit {
-    /// Infinite where there is nothing.
+    /// Infinite if there is no surface.
     pub(crate) range_mm: f64,
-    /// Number of the face.
+    /// Index of the face.
     face: u32,
-    /// When the last thing went that had stood before this.
+    /// Time at which the last object in front of this surface was removed.
     pub(crate) since_ns: Nanos,
 }
 
 impl Hit {
-    /// Whether both end at the same face, and for as long.
+    /// Returns whether both rays end at the same face, and have done so for the same time.
     pub(crate) fn is_of(&self, other: &Hit) -> bool {
         self.face == other.face && self.since_ns == other.since_ns
     }
 }
 
-/// Rays of a moment that lie next to each other.
+/// Adjacent rays at one time.
 #[derive(Clone, Debug)]
 pub(crate) struct View {
     faces: Vec<Face>,
     hits: Vec<Hit>,
-    /// Number of the first ray.
+    /// Index of the first ray.
     first: usize,
 }
 
 impl View {
-    /// Nothing anywhere, all around.
+    /// Creates a view without surfaces, all around.
     pub(crate) fn empty() -> View {
         let nothing = Hit { range_mm: f64::INFINITY, face: u32::MAX, since_ns: 0 };
         View { faces: Vec::new(), hits: vec![nothing; DIRECTIONS.len()], first: 0 }
     }
 
-    /// The half of it that lies ahead.
+    /// Returns the half of the view that is ahead.
     pub(crate) fn ahead(&self) -> View {
         const RIGHT: usize = 90 * RAYS_PER_DEGREE as usize;
         const RAYS: usize = 180 * RAYS_PER_DEGREE as usize + 1 + 2 * REACH;
@@ -80,8 +260,8 @@ impl View {
         View { faces: self.faces.clone(), hits: self.hits[from..from + RAYS].to_vec(), first: RIGHT }
     }
 
-    /// Becomes what `still` has around the one beam at `angle_deg`. All faces that were drawn since it was one with `still`
-    /// are forgotten.
+    /// Copies the rays of `still` around the beam at `angle_deg`. Drops all faces that are not in `still`. The first faces
+    /// must be those of `still`.
     pub(crate) fn narrow(&mut self, still: &View, angle_deg: f64) {
         let middle = middle((angle_deg * 1e3) as i32) - still.first;
         self.faces.truncate(still.faces.len());
@@ -90,7 +270,7 @@ impl View {
         self.first = still.first + middle - REACH;
     }
 
-    /// Draws `face` over it.
+    /// Draws `face` over the present rays. The nearest face wins.
     pub(crate) fn draw(&mut self, face: Face) {
         let number = self.faces.len() as u32;
         for ray in rays(&face.shape, self.numbers()) {
@@ -108,7 +288,7 @@ impl View {
         self.faces.push(face);
     }
 
-    /// Marks what `shape` hid until `since_ns`. Only after everything is drawn.
+    /// Marks the surfaces that `shape` hid until `since_ns`. Call it after everything is drawn.
     pub(crate) fn uncover(&mut self, shape: &Shape, since_ns: Nanos) {
         for ray in rays(shape, self.numbers()) {
             let hit = &mut self.hits[ray - self.first];
@@ -118,19 +298,20 @@ impl View {
         }
     }
 
-    /// The ray at the sensor's angle `angle_mdeg` (0 ahead) and those around it, up to [`REACH`] to each side.
+    /// Returns the ray at the scanner's angle `angle_mdeg` (0 ahead), with [`REACH`] rays to each side.
     pub(crate) fn around(&self, angle_mdeg: i32) -> &[Hit] {
         let middle = middle(angle_mdeg) - self.first;
         &self.hits[middle - REACH..=middle + REACH]
     }
 
-    /// Whether what lies at the sensor's angle `angle_deg` and `range_mm` is within the field of view and nothing stands before it.
+    /// Returns whether a point at the scanner's angle `angle_deg` and `range_mm` is visible: within the field of view, and
+    /// not hidden by a surface.
     pub(crate) fn reaches(&self, angle_deg: f64, range_mm: f64) -> bool {
         let ray = ((angle_deg + 180.0) * f64::from(RAYS_PER_DEGREE)).round() as usize + REACH;
         (-90.0..=90.0).contains(&angle_deg) && self.hits[ray - self.first].range_mm > range_mm - 1.0
     }
 
-    /// Where the ray at `angle_deg` ends, and where a line between it and the next one does that meets the same face.
+    /// Returns the range of the nearest ray to `angle_deg`, and the exact range of its face at this angle.
     pub(crate) fn exact(&self, angle_deg: f64) -> (f64, Option<f64>) {
         let hit = &self.hits[middle((angle_deg * 1e3) as i32) - self.first];
         let face = self.face(hit).filter(|_| hit.range_mm.is_finite());
@@ -141,19 +322,19 @@ impl View {
         self.first..self.first + self.hits.len()
     }
 
-    /// What `hit` ends at, if at anything.
+    /// Returns the face at which `hit` ends, or `None` if there is no surface.
     pub(crate) fn face(&self, hit: &Hit) -> Option<&Face> {
         self.faces.get(hit.face as usize)
     }
 }
 
-/// Number of the ray at the sensor's angle `angle_mdeg`, -180 degrees to 180.
+/// Returns the index of the ray at the scanner's angle `angle_mdeg`, -180 to 180 degrees.
 fn middle(angle_mdeg: i32) -> usize {
     REACH + ((angle_mdeg + 180_000) * RAYS_PER_DEGREE / 1000) as usize
 }
 
-/// Numbers of the rays that can meet `shape`, of those that are `wanted`.
-fn rays(shape: &Shape, wanted: Range<usize>) -> impl Iterator<Item = usize> + use<> {
+/// Returns the indices in `range` of the rays that can meet `shape`.
+fn rays(shape: &Shape, range: Range<usize>) -> impl Iterator<Item = usize> + use<> {
     let span = shape.span_deg();
     // A span may reach in from both ends.
     [-360.0, 0.0, 360.0].into_iter().flat_map(move |turn| {
@@ -161,30 +342,30 @@ fn rays(shape: &Shape, wanted: Range<usize>) -> impl Iterator<Item = usize> + us
         let ray = |angle_deg: f64| (angle_deg + turn - BEHIND) * f64::from(RAYS_PER_DEGREE) + REACH as f64;
         let first_ray = ray(first).floor().max(0.0) as usize;
         let behind = (ray(first + width).ceil() + 1.0).max(0.0) as usize;
-        first_ray.max(wanted.start)..behind.min(wanted.end)
+        first_ray.max(range.start)..behind.min(range.end)
     })
 }
 
-/// Rays in a degree: 4 mm apart at 4 m, and each beam of each variant is on one.
+/// Number of rays per degree. They are 4 mm apart at 4 m, and each beam of each variant is on one.
 const RAYS_PER_DEGREE: i32 = 16;
-/// Rays to each side that the widest spot covers: more than a degree.
+/// Number of rays to each side that the widest spot covers: more than a degree.
 pub(crate) const REACH: usize = 20;
 /// Angle between two rays in radians.
 pub(crate) const RAY_STEP: f64 = std::f64::consts::PI / 180.0 / RAYS_PER_DEGREE as f64;
-/// Glass sends a beam back that falls on it within 3 degrees of a right angle.
+/// Minimum cosine of the angle of incidence at which glass reflects a beam back: within 3 degrees of a right angle.
 const GLASS_SHINES: f64 = 0.9986;
 
-/// Where the rays begin: behind the sensor, in degrees counter-clockwise from its right.
+/// Angle of the first ray: behind the scanner, in degrees counterclockwise from its right.
 const BEHIND: f64 = -90.0;
 
-/// Unit vectors of all rays, from behind over ahead to behind and as far beyond as a spot reaches.
+/// Unit vectors of all rays, for a full circle from behind the scanner, with [`REACH`] more rays at both ends.
 static DIRECTIONS: LazyLock<Vec<Point>> = LazyLock::new(|| {
     let count = 360 * RAYS_PER_DEGREE + 1 + 2 * REACH as i32;
     let angle = |ray: i32| f64::from(ray - REACH as i32) / f64::from(RAYS_PER_DEGREE) - 180.0;
     (0..count).map(|ray| direction(angle(ray))).collect()
 });
 
-/// The unit vector at the sensor's angle `angle_deg`.
+/// Returns the unit vector at the scanner's angle `angle_deg`.
 fn direction(angle_deg: f64) -> Point {
     let from_right = (angle_deg - BEHIND).to_radians();
     (from_right.cos(), from_right.sin())

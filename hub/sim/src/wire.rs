@@ -9,7 +9,7 @@ use std::collections::VecDeque;
 use schema::Nanos;
 
 use crate::device::{Chunk, Device, Part, Sent};
-use crate::fault::{Blemishes, Extra, Fate, Fault, Faults, Lateness, Noise, Schedule, Window};
+use crate::fault::{Extra, Fate, Fault, Faults, Lateness, Noise, Schedule, TelegramFaults, Window};
 use crate::request_decoder::Arrival;
 
 /// What arrives at once.
@@ -31,7 +31,7 @@ pub struct Carried {
 #[derive(Clone, Debug)]
 pub struct Wire {
     noise: Noise,
-    blemishes: Blemishes,
+    telegram_faults: TelegramFaults,
     extras: [Extra; 2],
     silence: Window,
     lateness: Lateness,
@@ -59,7 +59,7 @@ impl Wire {
     pub fn new(faults: &Faults, seed: u64) -> Wire {
         Wire {
             noise: Noise::new(faults, seed),
-            blemishes: Blemishes::new(faults, seed),
+            telegram_faults: TelegramFaults::new(faults, seed),
             extras: [Extra::floods(faults, seed), Extra::walls(faults, seed)],
             silence: Window::silences(faults, seed),
             lateness: Lateness::new(faults, seed),
@@ -168,7 +168,7 @@ impl Wire {
             let cause = if std::mem::take(&mut self.power_broke) { Fault::Power } else { Fault::Aborted };
             fault = fault.or(sent.aborted.then_some(cause));
             copy = self.end(sent, fault);
-        } else if machine.streams() && self.blemishes.breaks_at(self.position) {
+        } else if machine.streams() && self.telegram_faults.breaks_at(self.position) {
             machine.break_off(now);
         }
         self.push(now, Carried { bytes: arrived, rate, idle_after, part: Some(part), fault });
@@ -203,7 +203,7 @@ impl Wire {
             let position = self.position;
             self.position += 1;
             if position == 0 {
-                self.blemishes.begin(self.telegram_len);
+                self.telegram_faults.begin(self.telegram_len);
                 self.fault = None;
                 self.last = byte;
             }
@@ -214,7 +214,7 @@ impl Wire {
                 fault = fault.or(between.map(|_| cause));
             }
             let Fate { before, lost, flipped, doubled } = self.noise.next();
-            let (blemished, blemish) = self.blemishes.apply(position, byte);
+            let (blemished, blemish) = self.telegram_faults.apply(position, byte);
             fault = fault.or((position > 0 && !before.is_empty()).then_some(Fault::Insert));
             arrived.extend(foreign(before, between));
             fault = fault.or(blemish).or(lost.then_some(Fault::Loss));
@@ -236,7 +236,7 @@ impl Wire {
             self.header = sent.telegram[..HEADER.min(sent.telegram.len())].to_vec();
         }
         let is_whole = self.fault.or(fault).is_none();
-        (is_whole && self.blemishes.repeats()).then(|| sent.clone())
+        (is_whole && self.telegram_faults.repeats()).then(|| sent.clone())
     }
 
     /// Garbage that is due, inside a telegram or between two, and its name.

@@ -2,8 +2,6 @@
 //! where a world comes from, not what is in it.
 
 mod file;
-mod mount;
-mod origin;
 
 use std::path::Path;
 use std::str::FromStr;

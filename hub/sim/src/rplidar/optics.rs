@@ -9,9 +9,9 @@
 use schema::Nanos;
 
 use super::models::Model;
-use super::packets::Reading;
-use crate::room::{Beams, Look, Room};
-use crate::turning::{TruePoint, ahead_deg};
+use super::protocol::Reading;
+use crate::room::Room;
+use crate::rotating::{BeamReading, Beams, TruePoint, ahead_deg};
 
 /// A head in a room.
 pub(crate) struct Optics {
@@ -51,8 +51,8 @@ impl Optics {
     }
 
     /// Which point the laser meets: degrees clockwise from the head's zero, and what is seen there.
-    fn meet(&mut self, at_ns: Nanos, head_deg: f64) -> (f64, Option<Look>) {
-        let mut look_at = |clockwise_deg: f64| self.beams.look(at_ns, ahead_deg(clockwise_deg));
+    fn meet(&mut self, at_ns: Nanos, head_deg: f64) -> (f64, Option<BeamReading>) {
+        let mut look_at = |clockwise_deg: f64| self.beams.measure(at_ns, ahead_deg(clockwise_deg));
         if !self.model.triangulates() {
             return (head_deg, Some(look_at(head_deg)));
         }
@@ -81,7 +81,7 @@ impl Optics {
 
     /// Whether enough comes back. Scanners that triangulate lose most of what is indoors: what is dark, far or seen
     /// obliquely. How dark a surface is goes by its direction, in patches.
-    fn comes_back(&self, at_ns: Nanos, clockwise_deg: f64, look: &Look) -> bool {
+    fn comes_back(&self, at_ns: Nanos, clockwise_deg: f64, look: &BeamReading) -> bool {
         if !self.model.triangulates() {
             return true;
         }

@@ -1,23 +1,23 @@
-//! A scene from TOML: the keys and their valid values. Every value is checked where it is written, so that a failure names
-//! file, line and column. Described in `docs/worlds.md`.
+//! Parses a scene from TOML: the keys, their valid values, and the position of each value, so that a failure names file, line
+//! and column. `docs/worlds.md` describes the format.
 
-use std::ops::Range;
+use std::ops::{Range, RangeInclusive};
 
-use schema::Failure;
+use schema::{Failure, Kind};
 use serde::Deserialize;
 use toml::Spanned;
 
 use crate::layers::Layers;
+use crate::mount::{Fault, FaultKind, Mount};
 use crate::people::{Plan, Speed, Way, distance};
 use crate::scene::{Move, Scene, Sensor, Sun, Surface, Thing};
-use crate::shape::{Point, Pose, Shape};
-use crate::solid::Heights;
-use crate::world::mount::MountFile;
-use crate::world::origin::Origin;
+use crate::shape::{Heights, Point, Pose, Shape};
 
-/// The scene that `text` describes; `name` is how failures call it.
+/// Parses the scene that `text` describes. Failures use `name` as the name of the file.
 ///
-/// [`Kind::Configuration`] for whatever is no scene, with place, value and remedy.
+/// # Errors
+///
+/// Returns [`Kind::Configuration`], with position, value and remedy, if `text` does not describe a scene.
 pub(crate) fn parse(name: &str, text: &str) -> Result<Scene, Failure> {
     let origin = Origin { name, text };
     let file: SceneFile = toml::from_str(text).map_err(|error| origin.explain(&error))?;
@@ -44,7 +44,7 @@ pub(crate) fn parse(name: &str, text: &str) -> Result<Scene, Failure> {
     })
 }
 
-/// A sensor in the middle of its world that looks along y, so that angles are those of a page.
+/// Pose in the middle of the world, with y ahead, so that angles are those of a page.
 const MIDDLE: Pose = Pose { x_mm: 0.0, y_mm: 0.0, turn_deg: 90.0 };
 
 #[derive(Deserialize)]
@@ -135,7 +135,7 @@ enum SpeedFile {
 struct SunFile {
     from_deg: Option<Spanned<f64>>,
     to_deg: Option<Spanned<f64>>,
-    /// The key of when 0 was right: refused, because its values are possible in both frames.
+    /// Key of an earlier version, in which 0 was to the right. It is refused, because its values are valid in both frames.
     sector_deg: Option<Spanned<(Number, Number)>>,
     from_s: Option<Spanned<f64>>,
     until_s: Option<Spanned<f64>>,
@@ -317,7 +317,7 @@ impl SunFile {
     }
 }
 
-/// A coordinate in millimetres, an angle in degrees, a time in seconds.
+/// A coordinate in millimeters, an angle in degrees, or a time in seconds.
 #[derive(Clone, Copy, Deserialize)]
 #[serde(try_from = "f64")]
 struct Number(f64);
@@ -331,7 +331,7 @@ impl TryFrom<f64> for Number {
     }
 }
 
-/// A length in millimetres that is one.
+/// A length in millimeters, at least 1.
 #[derive(Clone, Copy, Deserialize)]
 #[serde(try_from = "f64")]
 struct Length(f64);
@@ -370,6 +370,145 @@ fn surface(origin: &Origin, name: &Spanned<String>) -> Result<Surface, Failure> 
         other => {
             let what = format!("surface = \"{other}\"");
             Err(origin.refuse(name.span(), what, "plain, dark, reflector, glass or faint"))
+        }
+    }
+}
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(crate) struct MountFile {
+    height_mm: Spanned<f64>,
+    arm_mm: Option<(f64, f64)>,
+    from_deg: Spanned<f64>,
+    to_deg: Spanned<f64>,
+    deg_s: Option<Spanned<f64>>,
+    reports_hz: Option<Spanned<f64>>,
+    #[serde(default)]
+    faults: Vec<Spanned<FaultFile>>,
+}
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct FaultFile {
+    kind: String,
+    from_s: Option<Spanned<f64>>,
+    until_s: Option<Spanned<f64>>,
+    by_deg: Option<Spanned<f64>>,
+    by_s: Option<Spanned<f64>>,
+}
+
+impl MountFile {
+    pub(crate) fn mount(&self, span: Range<usize>, origin: &Origin) -> Result<Mount, Failure> {
+        let within = |value: &Spanned<f64>, allowed| origin.number(&Some(value.clone()), 0.0, allowed);
+        let (from_deg, to_deg) = (within(&self.from_deg, -80.0..=80.0)?, within(&self.to_deg, -80.0..=80.0)?);
+        if to_deg - from_deg < 1.0 {
+            let what = format!("a mount that swings from {from_deg} to {to_deg} degrees");
+            return Err(origin.refuse(
+                span,
+                what,
+                "from_deg below to_deg, by a degree at least; down is positive",
+            ));
+        }
+        let faults = self.faults.iter().map(|fault| fault.get_ref().fault(fault.span(), origin));
+        Ok(Mount {
+            height_mm: within(&self.height_mm, 1.0..=10_000.0)?,
+            arm_mm: self.arm_mm.unwrap_or_default(),
+            from_deg,
+            to_deg,
+            deg_s: origin.number(&self.deg_s, 30.0, 1.0..=360.0)?,
+            reports_hz: origin.number(&self.reports_hz, 100.0, 1.0..=10_000.0)?,
+            faults: faults.collect::<Result<_, _>>()?,
+        })
+    }
+}
+
+impl FaultFile {
+    fn fault(&self, span: Range<usize>, origin: &Origin) -> Result<Fault, Failure> {
+        let (from_s, until_s) = origin.interval(&self.from_s, &self.until_s)?;
+        let by_deg = || origin.number(&self.by_deg, 8.0, -80.0..=80.0);
+        let kind = match self.kind.as_str() {
+            "halts" => FaultKind::Halts,
+            "silent" => FaultKind::Silent,
+            "stuck" => FaultKind::Stuck,
+            "jumps" => FaultKind::Jumps(by_deg()?),
+            "lies" => FaultKind::Lies(by_deg()?),
+            "late" => FaultKind::Late(origin.number(&self.by_s, 0.3, 0.0..=10.0)?),
+            other => {
+                let remedy = "halts, silent, stuck, jumps or lies with by_deg, late with by_s";
+                return Err(origin.refuse(span, format!("kind = \"{other}\""), remedy));
+            }
+        };
+        Ok(Fault { kind, from_s, until_s })
+    }
+}
+
+/// The text of a file, and its name in failures.
+pub(crate) struct Origin<'a> {
+    pub(crate) name: &'a str,
+    pub(crate) text: &'a str,
+}
+
+impl Origin<'_> {
+    /// Returns a value within `allowed`, or `usual` if there is none.
+    pub(crate) fn number(
+        &self,
+        value: &Option<Spanned<f64>>,
+        usual: f64,
+        allowed: RangeInclusive<f64>,
+    ) -> Result<f64, Failure> {
+        match value {
+            None => Ok(usual),
+            Some(value) if allowed.contains(value.get_ref()) => Ok(*value.get_ref()),
+            Some(value) => {
+                let remedy = format!("a number from {} to {}", allowed.start(), allowed.end());
+                Err(self.refuse(value.span(), format!("{} is out of range", value.get_ref()), remedy))
+            }
+        }
+    }
+
+    /// Returns start and end of an interval. By default, it is unlimited.
+    pub(crate) fn interval(
+        &self,
+        from: &Option<Spanned<f64>>,
+        until: &Option<Spanned<f64>>,
+    ) -> Result<(f64, f64), Failure> {
+        let from_s = self.number(from, 0.0, 0.0..=1e6)?;
+        let until_s = self.number(until, f64::INFINITY, 0.0..=1e6)?;
+        match until {
+            Some(until) if until_s <= from_s => {
+                let what = format!("until_s = {until_s}, and from_s = {from_s}");
+                Err(self.refuse(until.span(), what, "an end after the start"))
+            }
+            _ => Ok((from_s, until_s)),
+        }
+    }
+
+    /// Returns the failure for an invalid value at `span`, with the problem `what` and its `remedy`.
+    pub(crate) fn refuse(
+        &self,
+        span: Range<usize>,
+        what: impl std::fmt::Display,
+        remedy: impl Into<String>,
+    ) -> Failure {
+        let before = &self.text[..span.start.min(self.text.len())];
+        let line = before.matches('\n').count() + 1;
+        let column = before.chars().rev().take_while(|&c| c != '\n').count() + 1;
+        Failure::new(Kind::Configuration, format!("{}:{line}:{column}: {what}", self.name), remedy)
+    }
+
+    /// Returns the failure for an error of the TOML parser. For an unknown key, the remedy names the nearest known one.
+    pub(crate) fn explain(&self, error: &toml::de::Error) -> Failure {
+        let (span, message) = (error.span().unwrap_or_default(), error.message());
+        let names: Vec<&str> = message.split('`').skip(1).step_by(2).collect();
+        match names[..] {
+            [unknown, ref known @ ..] if message.starts_with("unknown field") => {
+                let likeness = |name: &str| strsim::jaro_winkler(name, unknown);
+                let nearest = known.iter().max_by(|a, b| likeness(a).total_cmp(&likeness(b)));
+                let nearest = nearest.map_or(String::new(), |name| format!("did you mean `{name}`? "));
+                let remedy = format!("{nearest}Known here: {}", known.join(", "));
+                self.refuse(span, format!("unknown key `{unknown}`"), remedy)
+            }
+            _ => self.refuse(span, message, "docs/worlds.md has the keys and their forms"),
         }
     }
 }

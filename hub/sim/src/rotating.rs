@@ -1,0 +1,163 @@
+//! Parts that all simulated rotating scanners share: the clockwise rotation of the head, and the measurement of a room beam
+//! by beam, each at its own time and angle.
+
+use std::f64::consts::TAU;
+
+use schema::Nanos;
+
+use crate::layers::{BeamRng, Layers};
+use crate::room::{Room, Sight, reported_range};
+use crate::spot::echo;
+use crate::view::View;
+
+/// Rotation of a head since the start of its motor.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(crate) struct Rotation {
+    /// Mean revolutions per second.
+    pub(crate) turns_per_second: f64,
+    wander: f64,
+    /// Time constant of the spin-up, in seconds; 0 means full speed at once.
+    pub(crate) spin_up_s: f64,
+    /// Angular frequency of the variation of the speed, in radians per second.
+    pace: f64,
+    /// Phase of the variation at the start, in radians.
+    phase: f64,
+    /// Time in seconds at which the mean speed was set, and the number of revolutions until then.
+    since: (f64, f64),
+}
+
+/// A point as the head measures it, without noise.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct TruePoint {
+    /// Time of the measurement.
+    pub at_ns: Nanos,
+    /// Clockwise angle from the head's zero, 0 to 360 degrees.
+    pub clockwise_deg: f64,
+    /// Distance of the surface in millimeters; `None` if there is none.
+    pub range_mm: Option<f64>,
+}
+
+impl Rotation {
+    /// Creates the rotation of a head with a mean speed of `turns_per_second` that varies by the share `wander`. The spin-up
+    /// has a time constant of `spin_up_s` seconds; 0 means full speed at once. `seed` selects the first angle and the phase of
+    /// the variation.
+    pub(crate) fn new(turns_per_second: f64, wander: f64, spin_up_s: f64, seed: u64) -> Rotation {
+        let phase = TAU * fastrand::Rng::with_seed(seed).f64();
+        // A head does not start at its zero.
+        Rotation {
+            turns_per_second,
+            wander,
+            spin_up_s,
+            pace: TAU / WANDER_S,
+            phase,
+            since: (0.0, phase / TAU),
+        }
+    }
+
+    /// Changes the mean speed from `seconds` on. Earlier angles can no longer be queried.
+    pub(crate) fn set_speed(&mut self, seconds: f64, turns_per_second: f64) {
+        self.since = (seconds, self.turns(seconds));
+        self.turns_per_second = turns_per_second;
+    }
+
+    /// Returns the number of revolutions until `seconds`, counted from the head's zero.
+    pub(crate) fn turns(&self, seconds: f64) -> f64 {
+        let (since, turned) = self.since;
+        let angle = |seconds: f64| (self.pace * seconds + self.phase).sin();
+        let swing = (angle(seconds) - angle(since)) / self.pace;
+        let missed = self.spin_up_s * (self.still(since) - self.still(seconds));
+        self.turns_per_second * (seconds - since - missed + self.wander * swing) + turned
+    }
+
+    /// Returns the revolutions per second at `seconds`.
+    pub(crate) fn speed(&self, seconds: f64) -> f64 {
+        let wander = self.wander * (self.pace * seconds + self.phase).cos();
+        self.turns_per_second * (1.0 - self.still(seconds) + wander)
+    }
+
+    /// Returns the share of the speed that is still missing at `seconds`.
+    fn still(&self, seconds: f64) -> f64 {
+        if self.spin_up_s > 0.0 { (-seconds / self.spin_up_s).exp() } else { 0.0 }
+    }
+}
+
+/// Converts a clockwise angle from the head's zero to a counterclockwise angle: 0 is ahead, -180 to 180 degrees.
+pub(crate) fn ahead_deg(clockwise_deg: f64) -> f64 {
+    if clockwise_deg > 180.0 { 360.0 - clockwise_deg } else { -clockwise_deg }
+}
+
+/// Measures a room beam by beam.
+#[derive(Clone, Debug)]
+pub(crate) struct Beams {
+    room: Room,
+    /// The static surroundings of the last beam. Each beam draws over it.
+    view: Option<View>,
+    /// The beams of each room of a series.
+    rooms: Vec<Beams>,
+}
+
+/// Result of one beam.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(crate) struct BeamReading {
+    /// Measured range in millimeters; `None` without an echo, or if the echo is too weak.
+    pub(crate) range_mm: Option<f64>,
+    /// Distance of the surface without noise, in millimeters; `None` if there is none.
+    pub(crate) exact_mm: Option<f64>,
+    /// Intensity of the echo, 0 to 255.
+    pub(crate) intensity: u8,
+    /// Strength of the echo relative to a white surface at 1 m; infinite in a world without noise.
+    pub(crate) signal: f64,
+}
+
+impl Beams {
+    pub(crate) fn new(room: Room) -> Beams {
+        let rooms = match &room.sight {
+            Sight::Series(series, _) => series.rooms().map(|room| Beams::new(room.clone())).collect(),
+            _ => Vec::new(),
+        };
+        Beams { room, view: None, rooms }
+    }
+
+    /// Measures the beam at `angle_deg` (0 ahead, counterclockwise, -180 to 180) at `at_ns`.
+    pub(crate) fn measure(&mut self, at_ns: Nanos, angle_deg: f64) -> BeamReading {
+        if let Sight::Series(series, changes) = &self.room.sight {
+            return self.rooms[series.number(changes, at_ns)].measure(at_ns, angle_deg);
+        }
+        let mut random = fastrand::Rng::with_seed(self.room.seed ^ at_ns.wrapping_mul(0x9E37_79B9_7F4A_7C15));
+        let dice = BeamRng::throw(&mut random);
+        let all = |range_mm: Option<f64>| BeamReading {
+            range_mm,
+            exact_mm: range_mm,
+            intensity: PLAIN as u8,
+            signal: f64::INFINITY,
+        };
+        let stage = match &self.room.sight {
+            Sight::Scene(stage) => stage,
+            Sight::Empty | Sight::Series(..) => return BeamReading { intensity: 0, ..all(None) },
+            Sight::Value(value) => return all(Some(f64::from(*value))),
+            Sight::Random => return all(Some(f64::from(random.u16(..12_000)))),
+        };
+        let view = self.view.get_or_insert_with(|| stage.still().clone());
+        stage.look_along(view, angle_deg, at_ns);
+        let angle_mdeg = (angle_deg * 1e3) as i32;
+        let echo = echo(view, angle_mdeg, stage.layers.spot, &dice);
+        let (ray_mm, exact_mm) = view.exact(angle_deg);
+        // Beams lie between the rays. The range to a single surface is corrected to the point where the beam meets it.
+        let is_one = echo.range_mm == ray_mm;
+        let off_mm = exact_mm.filter(|_| is_one).map_or(0.0, |exact_mm| exact_mm - ray_mm);
+        let time_s = at_ns as f64 / 1e9;
+        let sun = stage.suns.iter().map(|sun| sun.share(angle_mdeg, time_s)).fold(0.0, f64::max);
+        let range_mm = reported_range(stage, &echo, sun, &dice).ok().map(|range_mm| range_mm + off_mm);
+        let plain = PLAIN * echo.signal.min(1.0).powf(0.25);
+        let intensity = if echo.bright > 0.0 { plain.max(REFLECTOR * echo.bright) } else { plain };
+        let signal = if stage.layers != Layers::NONE { echo.signal } else { f64::INFINITY };
+        BeamReading { range_mm, exact_mm, intensity: range_mm.map_or(0, |_| intensity as u8), signal }
+    }
+}
+
+/// Period of the variation of the speed, in seconds.
+const WANDER_S: f64 = 7.3;
+/// Intensity of a plain surface nearby. The manual of the LD06 has 228 to 233 at 0.2 m.
+const PLAIN: f64 = 230.0;
+/// Intensity of a reflector.
+const REFLECTOR: f64 = 255.0;

@@ -1,0 +1,356 @@
+//! The wire format of an RPLIDAR: decodes requests, and encodes responses and packets of points.
+//!
+//! A request is `A5 command`. If the top bit of the command is set, a length, a payload of this length and the XOR of all
+//! bytes follow. A response is a descriptor and its data. Angles and ranges are rounded here to the resolution of the format.
+//! The driver has its own description of the protocol, so that an error in one of them is noticed.
+
+use super::models::{Mode, Model};
+
+/// A request of a host.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Request {
+    Stop,
+    Reset,
+    Scan,
+    /// Start the standard mode at any speed of the motor.
+    Force,
+    /// The number of a mode.
+    Express(u8),
+    Info,
+    Health,
+    SampleRate,
+    /// The key of a value, and the mode that it describes.
+    Configuration {
+        key: u32,
+        mode: u16,
+    },
+    /// The key of a value to store in the scanner.
+    SetConfiguration(u32),
+    /// Duty cycle of the motor, 0 to 1,023.
+    Pwm(u16),
+    /// Revolutions per minute.
+    Rpm(u16),
+    /// Capabilities of the accessory board.
+    Board,
+}
+
+/// Decoder of requests. It collects the bytes of one request.
+#[derive(Debug, Default)]
+pub(crate) struct Decoder {
+    bytes: Vec<u8>,
+}
+
+impl Decoder {
+    /// Adds a byte, and returns the request that it completes. Requests with a wrong checksum, a wrong length or an unknown
+    /// command are dropped.
+    pub(crate) fn hear(&mut self, byte: u8) -> Option<Request> {
+        if self.bytes.is_empty() && byte != START {
+            return None;
+        }
+        self.bytes.push(byte);
+        let (&command, payload) = match &self.bytes[..] {
+            [_] => return None,
+            [_, command] if command & PAYLOAD == 0 => (command, &[][..]),
+            [_, command, len, payload @ ..] if payload.len() == usize::from(*len) + 1 => (command, payload),
+            _ => return None,
+        };
+        let is_right = payload.is_empty() || self.bytes.iter().fold(0, |sum, byte| sum ^ byte) == 0;
+        let payload = &payload[..payload.len().saturating_sub(1)];
+        let request = if is_right { Request::of(command, payload) } else { None };
+        self.bytes.clear();
+        request
+    }
+
+    /// Drops the bytes of an incomplete request.
+    pub(crate) fn forget(&mut self) {
+        self.bytes.clear();
+    }
+}
+
+impl Request {
+    fn of(command: u8, payload: &[u8]) -> Option<Request> {
+        let word = |low: u8, high: u8| u16::from_le_bytes([low, high]);
+        Some(match (command, payload) {
+            (0x25, []) => Request::Stop,
+            (0x40, []) => Request::Reset,
+            (0x20, []) => Request::Scan,
+            (0x21, []) => Request::Force,
+            (0x50, []) => Request::Info,
+            (0x52, []) => Request::Health,
+            (0x59, []) => Request::SampleRate,
+            (0x82, [mode, _, _, _, _]) => Request::Express(*mode),
+            (0x84, [a, b, c, d, rest @ ..]) => {
+                let mode = if let [low, high, ..] = rest { word(*low, *high) } else { 0 };
+                Request::Configuration { key: u32::from_le_bytes([*a, *b, *c, *d]), mode }
+            }
+            (0x85, [a, b, c, d, ..]) => Request::SetConfiguration(u32::from_le_bytes([*a, *b, *c, *d])),
+            (0xF0, [low, high]) => Request::Pwm(word(*low, *high)),
+            (0xA8, [low, high]) => Request::Rpm(word(*low, *high)),
+            (0xFF, [_, _, _, _]) => Request::Board,
+            _ => return None,
+        })
+    }
+}
+
+/// First byte of every request.
+const START: u8 = 0xA5;
+/// The bit of a command that has a payload.
+const PAYLOAD: u8 = 0x80;
+
+/// Encodes a descriptor: `A5 5A`, the length of a response in 30 bits, 2 bits that announce further responses, and the type.
+fn descriptor(len: usize, follows: bool, answer: u8) -> Vec<u8> {
+    let word = len as u32 | u32::from(follows) << 30;
+    [&[0xA5, 0x5A][..], &word.to_le_bytes(), &[answer]].concat()
+}
+
+fn answer(data: &[u8], kind: u8) -> Vec<u8> {
+    [descriptor(data.len(), false, kind), data.to_vec()].concat()
+}
+
+/// Encodes the descriptor before the packets of a stream in `mode`.
+pub(crate) fn stream_descriptor(mode: &Mode) -> Vec<u8> {
+    descriptor(mode.form.packet_len(), true, mode.form.answer())
+}
+
+/// Encodes model, firmware, hardware, and a serial number that `seed` selects.
+pub(crate) fn info(model: Model, seed: u64) -> Vec<u8> {
+    let ([major, minor], hardware) = model.versions();
+    let mut random = fastrand::Rng::with_seed(seed ^ u64::from(model.id()) << 32);
+    let serial: [u8; 16] = std::array::from_fn(|_| random.u8(..));
+    answer(&[&[model.id(), minor, major, hardware][..], &serial].concat(), 0x04)
+}
+
+/// Encodes a health status (0 good, 1 warning, 2 error) and a code.
+pub(crate) fn health(status: u8, code: u16) -> Vec<u8> {
+    let [low, high] = code.to_le_bytes();
+    answer(&[status, low, high], 0x06)
+}
+
+/// Encodes the time per point in the standard mode and in the first express mode, in microseconds.
+pub(crate) fn sample_rate(model: Model) -> Vec<u8> {
+    let micros = |number: usize| (model.modes()[number].sample_us.round() as u16).to_le_bytes();
+    answer(&[micros(0), micros(1)].concat(), 0x15)
+}
+
+/// Encodes the value of `key` for mode number `mode`. Returns `None` if the scanner does not have this key or mode.
+pub(crate) fn configuration(model: Model, typical: usize, key: u32, mode: u16) -> Option<Vec<u8>> {
+    let of = model.modes().get(usize::from(mode));
+    let eighths = |value: f64| ((value * 256.0).round() as u32).to_le_bytes().to_vec();
+    let value = match key {
+        // Recommended revolutions per minute, and the duty cycle for them.
+        0x01 => {
+            let rpm = (60.0 * model.turns_per_second()).round() as u16;
+            [rpm.to_le_bytes(), PWM.to_le_bytes()].concat()
+        }
+        0x70 => (model.modes().len() as u16).to_le_bytes().to_vec(),
+        0x71 => eighths(of?.sample_us),
+        0x74 => eighths(of?.reach_m),
+        0x75 => vec![of?.form.answer()],
+        0x7C => (typical as u16).to_le_bytes().to_vec(),
+        0x7F => [of?.name.as_bytes(), &[0]].concat(),
+        _ => return None,
+    };
+    Some(answer(&[&key.to_le_bytes()[..], &value].concat(), 0x20))
+}
+
+/// Encodes the confirmation that a value of the configuration was stored.
+pub(crate) fn is_set(key: u32) -> Vec<u8> {
+    answer(&[key.to_le_bytes(), 0u32.to_le_bytes()].concat(), 0x21)
+}
+
+/// Encodes the capabilities of the accessory board: bit 0 means that it controls the motor.
+pub(crate) fn board(steers: bool) -> Vec<u8> {
+    answer(&[u8::from(steers), 0, 0, 0], 0xFF)
+}
+
+/// Encodes the boot message: 64 bytes of ASCII.
+pub(crate) fn boot_message(model: Model) -> Vec<u8> {
+    let ([major, minor], hardware) = model.versions();
+    let text = format!(
+        "RP LIDAR System.\r\nFirmware Ver {major}.{minor}, HW Ver {hardware}\r\nModel: {:02x}",
+        model.id()
+    );
+    let mut bytes = text.into_bytes();
+    bytes.resize(BOOT_MESSAGE_LEN - 2, b' ');
+    bytes.extend(b"\r\n");
+    bytes
+}
+
+/// Duty cycle for the recommended speed, of 1,023. It is the vendor's default.
+pub(crate) const PWM: u16 = 660;
+/// Length of the boot message in bytes.
+const BOOT_MESSAGE_LEN: usize = 64;
+
+/// A point before it is encoded, with full resolution.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub(crate) struct Reading {
+    /// Angle of the head, clockwise from its zero, 0 to 360 degrees.
+    pub(crate) head_deg: f64,
+    /// Angle of the point, seen from the middle of the head. It differs from `head_deg` if the laser is off-center.
+    pub(crate) clockwise_deg: f64,
+    /// Range in millimeters; 0 means no return.
+    pub(crate) range_mm: u16,
+    /// Strength of the return, 0 to 255; 0 means no return.
+    pub(crate) quality: u8,
+    /// Whether the point is the first one of a revolution.
+    pub(crate) begins_turn: bool,
+}
+
+/// Encodes a packet of type 0x81: quality and the flag of a new revolution with its inverse, the angle in 1/64 degree with a
+/// bit that is always 1, and the range in 1/4 millimeter.
+pub(crate) fn standard(reading: &Reading) -> Vec<u8> {
+    let flags = if reading.begins_turn { 0b01 } else { 0b10 };
+    let angle = sixty_fourths(reading.clockwise_deg) << 1 | 1;
+    let mut packet = vec![reading.quality & 0xFC | flags];
+    packet.extend(angle.to_le_bytes());
+    packet.extend(quarters(reading.range_mm).to_le_bytes());
+    packet
+}
+
+/// Encodes a packet of type 0x82: 16 pairs of points. Each point has its range, and its lag behind the head's angle, in
+/// 1/8 degree. The lag has 6 bits, and its upper two are the lowest bits of the range's word.
+pub(crate) fn express(is_first: bool, readings: &[Reading]) -> Vec<u8> {
+    let mut body = head(is_first, readings);
+    for pair in readings.chunks(2) {
+        let mut nibbles = 0;
+        for (place, reading) in pair.iter().enumerate() {
+            let behind_deg = (reading.head_deg - reading.clockwise_deg + 360.0) % 360.0;
+            let behind = (behind_deg * 8.0).round().min(63.0) as u16;
+            body.extend((quarters(reading.range_mm) | behind >> 4).to_le_bytes());
+            nibbles |= (behind as u8 & 0x0F) << (4 * place);
+        }
+        body.push(nibbles);
+    }
+    sealed(body)
+}
+
+/// Encodes a packet of type 0x84: 32 words. Each word has one range of 12 bits, on a scale whose steps grow with the range.
+/// Two differences of 10 bits follow, in steps of that scale: one from this range, and one from the range of the next word. A
+/// range that no difference reaches becomes no return. `next` is the first range of the next packet.
+pub(crate) fn ultra(is_first: bool, readings: &[Reading], next: &Reading) -> Vec<u8> {
+    let mut body = head(is_first, readings);
+    let majors: Vec<u16> =
+        readings.iter().step_by(3).chain([next]).map(|first| scaled(first.range_mm)).collect();
+    for (cabin, pair) in readings.chunks(3).zip(majors.windows(2)) {
+        let (here, there) = (unscaled(pair[0]), unscaled(pair[1]));
+        let base = if here.0 == 0 { there } else { here };
+        let word = u32::from(pair[0])
+            | predicted(cabin[1].range_mm, base) << 12
+            | predicted(cabin[2].range_mm, there) << 22;
+        body.extend(word.to_le_bytes());
+    }
+    sealed(body)
+}
+
+/// Encodes a packet of type 0x85: 40 ranges in millimeters.
+pub(crate) fn dense(is_first: bool, readings: &[Reading]) -> Vec<u8> {
+    let mut body = head(is_first, readings);
+    body.extend(readings.iter().flat_map(|reading| reading.range_mm.to_le_bytes()));
+    sealed(body)
+}
+
+/// Encodes a packet of type 0x86: the scanner's clock and state, and 32 pairs of 20 bits. Each point has a scale of 2 to
+/// 5 mm, a range on this scale, and the upper bits of the quality.
+pub(crate) fn ultra_dense(is_first: bool, clock: u32, readings: &[Reading]) -> Vec<u8> {
+    let mut body = clock.to_le_bytes().to_vec();
+    // The state of the scanner. The vendor's headers name it, without its values.
+    body.extend([0, 0]);
+    body.extend(head(is_first, readings));
+    for pair in readings.chunks(2) {
+        let values = [twenty_bits(&pair[0]), twenty_bits(&pair[1])];
+        values.iter().for_each(|value| body.extend((*value as u16).to_le_bytes()));
+        body.push((values[0] >> 16 | values[1] >> 16 << 4) as u8);
+    }
+    sealed(body)
+}
+
+/// Encodes the angle of the head at the first point, and whether the stream begins with this packet.
+fn head(is_first: bool, readings: &[Reading]) -> Vec<u8> {
+    let start = sixty_fourths(readings[0].head_deg) | u16::from(is_first) << 15;
+    start.to_le_bytes().to_vec()
+}
+
+/// Adds the checksum before `body`: the XOR of all its bytes, with four bits after each of the marks A and 5.
+fn sealed(body: Vec<u8>) -> Vec<u8> {
+    let sum = body.iter().fold(0, |sum, byte| sum ^ byte);
+    [vec![0xA0 | sum & 0x0F, 0x50 | sum >> 4], body].concat()
+}
+
+/// Converts 0 to 360 degrees to 1/64 degree.
+fn sixty_fourths(degrees: f64) -> u16 {
+    (degrees * 64.0).round() as u16 % (360 * 64)
+}
+
+/// Converts millimeters to 1/4 millimeter. A range that does not fit becomes no return.
+fn quarters(range_mm: u16) -> u16 {
+    range_mm.checked_mul(4).unwrap_or(0)
+}
+
+/// Start of each scale of the 12-bit ranges: the first number, its range in millimeters, and the logarithm of a step.
+const SCALES: [(u16, u16, u32); 5] =
+    [(3_328, 1 << 14, 4), (1_792, 1 << 12, 3), (1_280, 1 << 11, 2), (512, 1 << 9, 1), (0, 0, 0)];
+
+/// Returns the 12-bit number for `range_mm`, or 0 if the range is too long.
+fn scaled(range_mm: u16) -> u16 {
+    let scale = SCALES.into_iter().find(|(_, from_mm, _)| range_mm >= *from_mm);
+    let (from, from_mm, level) = scale.unwrap_or_default();
+    let number = from + ((range_mm - from_mm + half(level) as u16) >> level);
+    if number < 1 << 12 { number } else { 0 }
+}
+
+/// Returns the range of a 12-bit number in millimeters, and the logarithm of a step there.
+fn unscaled(number: u16) -> (i32, u32) {
+    let scale = SCALES.into_iter().find(|(from, ..)| number >= *from);
+    let (from, from_mm, level) = scale.unwrap_or_default();
+    (i32::from(from_mm) + (i32::from(number - from) << level), level)
+}
+
+/// Returns half of a step. Adding it before a shift rounds to the nearest step.
+fn half(level: u32) -> i32 {
+    (1 << level) / 2
+}
+
+/// Returns the 10 bits of the difference of `range_mm` from `base`. The lowest number means no return.
+fn predicted(range_mm: u16, (base_mm, level): (i32, u32)) -> u32 {
+    const NO_RETURN: i32 = -512;
+    let steps = (i32::from(range_mm) - base_mm + half(level)) >> level;
+    let is_told = range_mm > 0 && (-511..511).contains(&steps) && base_mm + (steps << level) > 0;
+    (if is_told { steps } else { NO_RETURN }) as u32 & 0x3FF
+}
+
+/// Encodes scale, range and quality in 20 bits.
+fn twenty_bits(reading: &Reading) -> u32 {
+    let (mm, quality) = (u32::from(reading.range_mm), u32::from(reading.quality));
+    match mm {
+        ..=2_046 => mm.div_ceil(2) << 2 | quality << 12,
+        2_047..=8_187 => 1 | ((mm - 2_045) / 3) << 2 | (quality >> 1) << 13,
+        8_188..=24_567 => 2 | ((mm - 8_185) / 4) << 2 | (quality >> 2) << 14,
+        _ => 3 | ((mm - 24_565) / 5).min(0x1FFF) << 2 | (quality >> 3) << 15,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn heard(bytes: &[u8]) -> Vec<Request> {
+        let mut decoder = Decoder::default();
+        bytes.iter().filter_map(|&byte| decoder.hear(byte)).collect()
+    }
+
+    #[test]
+    fn decodes_valid_requests_among_other_bytes() {
+        assert_eq!(heard(&[0x00, 0x25, 0xA5, 0x25, 0xA5, 0x50, 0x52]), [Request::Stop, Request::Info]);
+        let express = [0xA5, 0x82, 0x05, 3, 0, 0, 0, 0, 0xA5 ^ 0x82 ^ 0x05 ^ 3];
+        assert_eq!(heard(&express), [Request::Express(3)]);
+        for at in 2..express.len() {
+            let mut wrong = express;
+            wrong[at] ^= 4;
+            assert_eq!(heard(&wrong), [], "{at}");
+        }
+        let name = [0xA5, 0x84, 0x06, 0x7F, 0, 0, 0, 2, 0, 0xA5 ^ 0x84 ^ 0x06 ^ 0x7F ^ 2];
+        assert_eq!(heard(&name), [Request::Configuration { key: 0x7F, mode: 2 }]);
+        let pwm = [0xA5, 0xF0, 0x02, 0x94, 0x02, 0xC1];
+        assert_eq!(heard(&[&pwm[..], &[0xA5, 0x40]].concat()), [Request::Pwm(660), Request::Reset]);
+    }
+}
