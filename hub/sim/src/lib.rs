@@ -19,7 +19,6 @@ pub mod mount;
 pub mod noise;
 pub mod operating;
 pub mod options;
-mod people;
 pub mod pty;
 mod request_decoder;
 pub mod room;

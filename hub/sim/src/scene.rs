@@ -1,16 +1,17 @@
-//! A world as data: which objects are where, from when until when, and how they move. All in the world's frame, in
-//! millimetres and seconds. Knows neither files nor beams.
+//! A scene as data: its sensors, objects and people, the times at which they are present, and their motion. Lengths are in
+//! millimeters, in the frame of the world, and times in seconds. Everything is a function of time and a seed, so that two
+//! sensors, a test and a bench see the same person.
+
+use std::f64::consts::TAU;
 
 use crate::layers::Layers;
 use crate::mount::Mount;
-use crate::people::Plan;
-use crate::shape::Heights;
-use crate::shape::{Pose, Shape};
+use crate::shape::{Heights, Point, Pose, Shape};
 
-/// A world that was read.
+/// A scene that was parsed.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Scene {
-    /// The sensors that look at it.
+    /// The sensors in the scene.
     pub(crate) sensors: Vec<Sensor>,
     pub(crate) layers: Layers,
     pub(crate) things: Vec<Thing>,
@@ -18,47 +19,47 @@ pub struct Scene {
     pub(crate) suns: Vec<Sun>,
 }
 
-/// A sensor that looks at a world.
+/// A sensor in a scene.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct Sensor {
-    /// The beam ahead looks where the pose is turned to: 0 is along x. That of its mount, if it has one.
+    /// Pose of the sensor, or of its mount if it has one. A rotation of 0 directs the beam ahead along x.
     pub(crate) pose: Pose,
-    /// What tilts it. Without one it measures level, and sees everything whatever its height.
+    /// Mount that tilts the sensor. A sensor without a mount measures level, and sees objects of every height.
     pub(crate) mount: Option<Mount>,
 }
 
-/// How a surface answers to the beam.
+/// Reflection of a beam by a surface.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Surface {
     Plain,
     Dark,
     Reflector,
-    /// Glass: the beam goes through, but where it falls squarely.
+    /// Glass reflects a beam only at a right angle. Other beams pass through.
     Glass,
-    /// So glossy or so oblique to the eye that few beams come back; of the others nothing does.
+    /// A glossy or oblique surface that reflects only few beams.
     Faint,
 }
 
 /// A wall, a piece of furniture, a box, a door.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct Thing {
-    /// In its own frame.
+    /// Outline in the object's own frame.
     pub(crate) shapes: Vec<Shape>,
-    /// For tilted sensors.
+    /// Heights, for tilted sensors.
     pub(crate) heights: Heights,
-    /// Its shapes are the four sides of a box.
+    /// Whether the shapes are the four sides of a box.
     pub(crate) is_box: bool,
     pub(crate) pose: Pose,
     pub(crate) surface: Surface,
     pub(crate) from_s: f64,
     pub(crate) until_s: f64,
-    /// In the order of time, while the thing is there; each is over before the next begins.
+    /// Moves while the object is present, in the order of time. They do not overlap.
     pub(crate) moves: Vec<Move>,
-    /// The most by which the seed moves it.
+    /// Maximum distance by which the seed moves the object along each axis.
     pub(crate) jitter_mm: f64,
 }
 
-/// A thing is moved, evenly from one time to another.
+/// A move of an object, at a constant speed from one time to another.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Move {
     pub(crate) from_s: f64,
@@ -66,7 +67,7 @@ pub(crate) struct Move {
     pub(crate) by: Pose,
 }
 
-/// The sun dazzles a sector of a sensor.
+/// A sun that dazzles a sector of a sensor.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Sun {
     /// Angles of the sensor.
@@ -74,49 +75,49 @@ pub(crate) struct Sun {
     pub(crate) to_deg: f64,
     pub(crate) from_s: f64,
     pub(crate) until_s: f64,
-    /// How many of its beams are dazzled, 0 to 1.
+    /// Share of the beams in the sector that are dazzled, 0 to 1.
     pub(crate) share: f64,
 }
 
-/// Where a thing stands or stood, and since when it does or no longer does.
-pub(crate) struct Spell {
+/// Pose of an object, and the time at which the object arrived at it or left it.
+pub(crate) struct Presence {
     pub(crate) pose: Pose,
     pub(crate) since_s: f64,
 }
 
 impl Thing {
-    /// Whether it never changes.
+    /// Returns whether the object never changes.
     pub(crate) fn is_still(&self) -> bool {
         self.from_s <= 0.0 && self.until_s.is_infinite() && self.moves.is_empty()
     }
 
-    /// Where it stands at `time_s`, if it is there, and since when: 0 if since ever, the time itself while it moves.
-    pub(crate) fn at(&self, time_s: f64) -> Option<Spell> {
+    /// Returns the pose at `time_s`, if the object is present, and the time of its arrival there. This time is 0 if
+    /// the object has been there from the start, and `time_s` while it moves.
+    pub(crate) fn at(&self, time_s: f64) -> Option<Presence> {
         (self.from_s..self.until_s).contains(&time_s).then(|| {
             let begun = self.moves.iter().filter(|way| way.from_s <= time_s);
-            begun.fold(Spell { pose: self.pose, since_s: self.from_s.max(0.0) }, |spell, way| Spell {
-                pose: moved(spell.pose, way, time_s),
-                since_s: way.until_s.min(time_s),
+            begun.fold(Presence { pose: self.pose, since_s: self.from_s.max(0.0) }, |presence, way| {
+                Presence { pose: moved(presence.pose, way, time_s), since_s: way.until_s.min(time_s) }
             })
         })
     }
 
-    /// Where it stood before `time_s` and does not stand any more.
-    pub(crate) fn left(&self, time_s: f64) -> Vec<Spell> {
+    /// Returns the poses that the object had before `time_s` and has left.
+    pub(crate) fn left(&self, time_s: f64) -> Vec<Presence> {
         let mut left = Vec::new();
         let mut pose = self.pose;
         for way in self.moves.iter().filter(|way| way.from_s <= time_s) {
-            left.push(Spell { pose, since_s: way.until_s.min(time_s) });
+            left.push(Presence { pose, since_s: way.until_s.min(time_s) });
             pose = moved(pose, way, time_s);
         }
         if self.until_s <= time_s {
-            left.push(Spell { pose, since_s: self.until_s });
+            left.push(Presence { pose, since_s: self.until_s });
         }
         left
     }
 }
 
-/// Where `way` has brought what stood at `pose` until `time_s`.
+/// Returns the pose at `time_s` of an object that was at `pose` before the move `way`.
 fn moved(pose: Pose, way: &Move, time_s: f64) -> Pose {
     let lasts_s = way.until_s - way.from_s;
     let share = if lasts_s > 0.0 { ((time_s - way.from_s) / lasts_s).clamp(0.0, 1.0) } else { 1.0 };
@@ -128,7 +129,7 @@ fn moved(pose: Pose, way: &Move, time_s: f64) -> Pose {
 }
 
 impl Sun {
-    /// Share of the beams at `angle_mdeg` that it dazzles at `time_s`.
+    /// Returns the share of the beams at `angle_mdeg` that are dazzled at `time_s`.
     pub(crate) fn share(&self, angle_mdeg: i32, time_s: f64) -> f64 {
         let angle_deg = f64::from(angle_mdeg) / 1000.0;
         let shines = (self.from_s..self.until_s).contains(&time_s);
@@ -136,6 +137,225 @@ impl Sun {
         if shines && meets { self.share } else { 0.0 }
     }
 }
+
+/// Description of a person in a scene.
+#[derive(Clone, Debug, PartialEq)]
+pub(crate) struct Plan {
+    /// Path of the person.
+    pub(crate) way: Way,
+    /// Time at which the person appears.
+    pub(crate) from_s: f64,
+    /// Time at which the person disappears.
+    pub(crate) until_s: f64,
+    /// Maximum distance by which the seed moves each corner of the path along each axis.
+    pub(crate) jitter_mm: f64,
+    /// Radius of a leg with its trousers.
+    pub(crate) leg_mm: f64,
+}
+
+/// Path of a person.
+#[derive(Clone, Debug, PartialEq)]
+pub(crate) enum Way {
+    /// A closed curve within `reach` of `centre` that the seed selects.
+    Roam { centre: Point, reach: Point },
+    /// A polyline of corners, with a rest at each, in seconds. After the last corner, the person disappears, or walks to the
+    /// first corner if the path `repeats`.
+    Path { corners: Vec<(Point, f64)>, speed: Speed, repeats: bool },
+}
+
+/// Speed of a person on a path.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(crate) enum Speed {
+    /// The seed draws a speed between two bounds, in millimeters per second.
+    Between(f64, f64),
+    /// The person reaches the end of the path, after all rests, when they have to disappear.
+    InTime,
+}
+
+/// A person whose path a seed has drawn.
+#[derive(Clone, Debug)]
+pub(crate) struct Person {
+    from_s: f64,
+    until_s: f64,
+    leg_mm: f64,
+    /// Phase of the steps at the start, in double steps.
+    phase: f64,
+    course: Course,
+}
+
+#[derive(Clone, Debug)]
+enum Course {
+    /// `pace` is the number of cycles per second along the two axes.
+    Roam { centre: Point, reach: Point, pace: Point, phase: Point },
+    /// Time, position and distance walked at each corner, before and after the rest. If the path `repeats`, those of one lap.
+    Path { knots: Vec<(f64, Point, f64)>, repeats: bool },
+}
+
+/// Pose of a body.
+struct BodyPose {
+    place: Point,
+    /// Direction that the person faces, as a unit vector.
+    ahead: Point,
+    /// Number of double steps so far.
+    step: f64,
+}
+
+impl Person {
+    /// Creates the person of `plan`, with random parts from `random`.
+    pub(crate) fn new(plan: &Plan, random: &mut fastrand::Rng) -> Person {
+        let phase = random.f64();
+        let Plan { from_s, until_s, jitter_mm, leg_mm, .. } = *plan;
+        let course = match plan.way {
+            Way::Roam { centre, reach } => {
+                // Peak speed is 2 pi * reach * pace: 0.5 to 1.3 m/s, as people indoors walk.
+                let mut pace = |reach: f64| (500.0 + 800.0 * random.f64()) / (TAU * reach);
+                let pace = (pace(reach.0), pace(reach.1));
+                Course::Roam { centre, reach, pace, phase: (random.f64(), random.f64()) }
+            }
+            Way::Path { ref corners, speed, repeats } => {
+                let mut corners = corners.clone();
+                for (point, _) in &mut corners {
+                    *point = jittered(*point, jitter_mm, random);
+                }
+                if repeats {
+                    corners.push((corners[0].0, 0.0));
+                }
+                let rest_s: f64 = corners.iter().map(|corner| corner.1).sum();
+                let length: f64 = corners.windows(2).map(|pair| distance(pair[0].0, pair[1].0)).sum();
+                let speed = match speed {
+                    Speed::Between(slowest, fastest) => slowest + (fastest - slowest) * random.f64(),
+                    Speed::InTime => length / (until_s - from_s - rest_s),
+                };
+                Course::Path { knots: course(&corners, from_s, speed), repeats }
+            }
+        };
+        // A person with a speed disappears at the end of the path.
+        let until_s = match (&plan.way, &course) {
+            (Way::Path { speed: Speed::Between(..), .. }, Course::Path { knots, repeats: false }) => {
+                knots.last().map_or(until_s, |knot| knot.0)
+            }
+            _ => until_s,
+        };
+        Person { from_s, until_s, leg_mm, phase, course }
+    }
+
+    /// Returns both legs at `time_s`, as a sensor at the height of the shins sees them. Returns `None` while the person is not
+    /// present.
+    pub(crate) fn legs(&self, time_s: f64) -> Option<[Shape; 2]> {
+        self.stand(time_s).map(|stand| self.legs_of(&stand))
+    }
+
+    /// Returns legs, trunk and head at `time_s`, with their heights.
+    pub(crate) fn body(&self, time_s: f64) -> Option<[(Shape, Heights); 4]> {
+        let stand = self.stand(time_s)?;
+        let [left, right] = self.legs_of(&stand);
+        let part = |shape, from_mm, to_mm| (shape, Heights { from_mm, to_mm });
+        let upper = |radius| Shape::Post { centre: stand.place, radius };
+        Some([
+            part(left, 0.0, CROTCH_MM),
+            part(right, 0.0, CROTCH_MM),
+            part(upper(TRUNK_MM), CROTCH_MM, NECK_MM),
+            part(upper(HEAD_MM), NECK_MM, CROWN_MM),
+        ])
+    }
+
+    fn stand(&self, time_s: f64) -> Option<BodyPose> {
+        (self.from_s..self.until_s).contains(&time_s).then(|| self.course.stand(time_s))
+    }
+
+    fn legs_of(&self, stand: &BodyPose) -> [Shape; 2] {
+        let BodyPose { place, ahead, step } = *stand;
+        let stride = STRIDE_MM * (TAU * (step + self.phase)).sin();
+        [1.0, -1.0].map(|side| Shape::Post {
+            centre: (
+                place.0 + side * (stride * ahead.0 - HIP_MM * ahead.1),
+                place.1 + side * (stride * ahead.1 + HIP_MM * ahead.0),
+            ),
+            radius: self.leg_mm,
+        })
+    }
+}
+
+impl Course {
+    fn stand(&self, time_s: f64) -> BodyPose {
+        match self {
+            Course::Roam { centre, reach, pace, phase } => {
+                let turn = |pace: f64, phase: f64| (TAU * (pace * time_s + phase)).sin_cos();
+                let (sin_x, cos_x) = turn(pace.0, phase.0);
+                let (sin_y, cos_y) = turn(pace.1, phase.1);
+                let heading = (pace.0 * reach.0 * cos_x, pace.1 * reach.1 * cos_y);
+                let place = (centre.0 + reach.0 * sin_x, centre.1 + reach.1 * sin_y);
+                BodyPose { place, ahead: unit(heading), step: STEPS_HZ * time_s }
+            }
+            Course::Path { knots, repeats } => {
+                let (first, last) = (knots[0], knots[knots.len() - 1]);
+                let lap_s = last.0 - first.0;
+                let laps = if *repeats { ((time_s - first.0) / lap_s).floor() } else { 0.0 };
+                let time_s = time_s - laps * lap_s;
+                let next = knots.partition_point(|knot| knot.0 <= time_s).clamp(1, knots.len() - 1);
+                let ((t0, a, s0), (t1, b, s1)) = (knots[next - 1], knots[next]);
+                let share = if t1 > t0 { ((time_s - t0) / (t1 - t0)).min(1.0) } else { 1.0 };
+                // A person who rests looks along the path, and at its end back to where the path came from.
+                let mut legs = knots[next - 1..].windows(2).chain(knots.windows(2).rev());
+                let ahead = legs.find(|pair| pair[0].1 != pair[1].1);
+                let ahead =
+                    ahead.map_or((0.0, 1.0), |pair| (pair[1].1.0 - pair[0].1.0, pair[1].1.1 - pair[0].1.1));
+                BodyPose {
+                    place: (a.0 + (b.0 - a.0) * share, a.1 + (b.1 - a.1) * share),
+                    ahead: unit(ahead),
+                    step: (laps * last.2 + s0 + (s1 - s0) * share) / DOUBLE_STEP_MM,
+                }
+            }
+        }
+    }
+}
+
+/// Returns time, position and distance walked at each corner, before and after the rest, for a person who starts at `from_s`.
+fn course(corners: &[(Point, f64)], from_s: f64, speed: f64) -> Vec<(f64, Point, f64)> {
+    let (mut time_s, mut walked) = (from_s, 0.0);
+    let mut before = corners[0].0;
+    let mut knots = Vec::new();
+    for &(point, rest_s) in corners {
+        let way = distance(before, point);
+        walked += way;
+        time_s += if way > 0.0 { way / speed } else { 0.0 };
+        knots.push((time_s, point, walked));
+        time_s += rest_s;
+        knots.push((time_s, point, walked));
+        before = point;
+    }
+    knots
+}
+
+/// Returns `point`, moved by up to `max_mm` along both axes.
+pub(crate) fn jittered(point: Point, max_mm: f64, random: &mut fastrand::Rng) -> Point {
+    let mut off = || max_mm * (2.0 * random.f64() - 1.0);
+    (point.0 + off(), point.1 + off())
+}
+
+pub(crate) fn distance(a: Point, b: Point) -> f64 {
+    (a.0 - b.0).hypot(a.1 - b.1)
+}
+
+fn unit(way: Point) -> Point {
+    let length = way.0.hypot(way.1).max(1e-9);
+    (way.0 / length, way.1 / length)
+}
+
+/// Half of the distance between the legs, across the path.
+const HIP_MM: f64 = 110.0;
+/// Heights of an adult of 1.75 m, and the radii of trunk and head.
+const CROTCH_MM: f64 = 820.0;
+const NECK_MM: f64 = 1_480.0;
+const CROWN_MM: f64 = 1_750.0;
+const TRUNK_MM: f64 = 170.0;
+const HEAD_MM: f64 = 95.0;
+/// Maximum distance of a foot ahead of the body.
+const STRIDE_MM: f64 = 250.0;
+/// Double steps per second of a person who roams.
+const STEPS_HZ: f64 = 0.9;
+/// Length of a double step of a person on a path. With the stride above, one foot nearly stands while the other swings.
+const DOUBLE_STEP_MM: f64 = 1_400.0;
 
 #[cfg(test)]
 mod tests {
@@ -161,23 +381,118 @@ mod tests {
     }
 
     #[test]
-    fn a_box_comes_and_goes() {
+    fn box_appears_and_disappears() {
         let thing = thing(15.0, 20.0, &[]);
         assert!(thing.at(14.9).is_none() && thing.left(14.9).is_empty() && !thing.is_still());
-        assert_eq!(thing.at(16.0).map(|spell| spell.since_s), Some(15.0));
+        assert_eq!(thing.at(16.0).map(|presence| presence.since_s), Some(15.0));
         assert!(thing.at(20.0).is_none());
-        assert_eq!(thing.left(30.0).iter().map(|spell| spell.since_s).collect::<Vec<_>>(), [20.0]);
+        assert_eq!(thing.left(30.0).iter().map(|presence| presence.since_s).collect::<Vec<_>>(), [20.0]);
     }
 
     #[test]
-    fn a_door_turns_and_leaves_the_place_where_it_was() {
+    fn door_rotates_and_leaves_its_pose() {
         let by = Pose { x_mm: 0.0, y_mm: 0.0, turn_deg: 90.0 };
         let thing = thing(0.0, f64::INFINITY, &[Move { from_s: 10.0, until_s: 12.0, by }]);
-        let state = |time_s| thing.at(time_s).map(|spell| (spell.pose.turn_deg, spell.since_s));
+        let state = |time_s| thing.at(time_s).map(|presence| (presence.pose.turn_deg, presence.since_s));
         assert_eq!(state(9.0), Some((0.0, 0.0)));
         assert_eq!(state(11.0), Some((45.0, 11.0)));
         assert_eq!(state(20.0), Some((90.0, 12.0)));
         assert!(thing.left(9.0).is_empty());
         assert_eq!(thing.left(20.0).iter().map(|s| (s.pose, s.since_s)).collect::<Vec<_>>(), [(HERE, 12.0)]);
+    }
+
+    fn person(way: Way, from_s: f64, until_s: f64) -> Person {
+        let plan = Plan { way, from_s, until_s, jitter_mm: 0.0, leg_mm: 60.0 };
+        Person::new(&plan, &mut fastrand::Rng::with_seed(1))
+    }
+
+    fn body(person: &Person, time_s: f64) -> Point {
+        let [a, b] =
+            person.legs(time_s).expect("somebody is there").map(|leg| leg.placed(|p| p).front_of_post());
+        ((a.0 + b.0) / 2.0, (a.1 + b.1) / 2.0)
+    }
+
+    impl Shape {
+        fn front_of_post(&self) -> Point {
+            match *self {
+                Shape::Post { centre, .. } => centre,
+                Shape::Wall { from, .. } => from,
+            }
+        }
+    }
+
+    #[test]
+    fn roaming_person_walks_within_reach() {
+        let way = Way::Roam { centre: (0.0, 3000.0), reach: (1500.0, 800.0) };
+        let walker = person(way, 0.0, f64::INFINITY);
+        let mut fastest = 0.0f64;
+        for step in 0..6000 {
+            let time_s = f64::from(step) * 0.01;
+            let (now, then) = (body(&walker, time_s), body(&walker, time_s + 0.01));
+            fastest = fastest.max(distance(now, then) / 0.01);
+            assert!(now.0.abs() <= 1501.0 && (now.1 - 3000.0).abs() <= 801.0);
+        }
+        assert!((500.0..2000.0).contains(&fastest), "{fastest} mm/s");
+    }
+
+    #[test]
+    fn person_walks_path_with_rests() {
+        let corners = vec![((0.0, 0.0), 0.0), ((0.0, 2000.0), 3.0), ((1000.0, 2000.0), 0.0)];
+        let walker = person(
+            Way::Path { corners, speed: Speed::Between(500.0, 500.0), repeats: false },
+            10.0,
+            f64::INFINITY,
+        );
+        assert!(walker.legs(9.99).is_none() && walker.legs(19.01).is_none());
+        let near = |at_s: f64, place: Point| {
+            let body = body(&walker, at_s);
+            assert!(distance(body, place) < 1.0, "{at_s} s: {body:?}");
+        };
+        near(12.0, (0.0, 1000.0));
+        near(14.5, (0.0, 2000.0));
+        near(16.9, (0.0, 2000.0));
+        near(18.0, (500.0, 2000.0));
+    }
+
+    #[test]
+    fn person_walks_repeating_path_forever() {
+        let corners = vec![((0.0, 0.0), 1.0), ((0.0, 2000.0), 3.0)];
+        let walker = person(
+            Way::Path { corners, speed: Speed::Between(500.0, 500.0), repeats: true },
+            10.0,
+            f64::INFINITY,
+        );
+        assert!(walker.legs(9.99).is_none());
+        // A lap takes 12 s: 4 s each way and both rests.
+        for lap_s in [0.0, 12.0, 12_000.0] {
+            for (at_s, y) in [(10.5, 0.0), (13.0, 1000.0), (17.0, 2000.0), (20.0, 1000.0)] {
+                let body = body(&walker, lap_s + at_s);
+                assert!(distance(body, (0.0, y)) < 1.0, "{lap_s} + {at_s} s: {body:?}");
+            }
+        }
+        // Neither legs nor body jump from a lap to the next one.
+        let (before, after) =
+            (walker.stand(21.999).expect("is there"), walker.stand(22.001).expect("is there"));
+        assert!((before.step - after.step).abs() < 0.001, "{} and {}", before.step, after.step);
+    }
+
+    #[test]
+    fn person_stands_or_arrives_in_time() {
+        let stands = person(
+            Way::Path { corners: vec![((5.0, 7.0), 0.0)], speed: Speed::InTime, repeats: false },
+            0.0,
+            20.0,
+        );
+        assert_eq!(stands.legs(0.0), stands.legs(19.9));
+        assert!(stands.legs(20.0).is_none());
+        let corners = vec![((0.0, 0.0), 1.0), ((0.0, 2000.0), 0.0)];
+        let walks = person(Way::Path { corners, speed: Speed::InTime, repeats: false }, 2.0, 7.0);
+        assert!(distance(body(&walks, 5.0), (0.0, 1000.0)) < 1.0);
+        assert!(walks.legs(6.99).is_some() && walks.legs(7.0).is_none());
+        // No way at all is in time as well.
+        let corners = vec![((5.0, 7.0), 1.0), ((5.0, 7.0), 0.0)];
+        let waits = person(Way::Path { corners, speed: Speed::InTime, repeats: false }, 2.0, 7.0);
+        assert_eq!((waits.legs(2.0), waits.legs(7.0)), (waits.legs(6.99), None));
+        assert_eq!(body(&waits, 6.99), (5.0, 7.0));
     }
 }

@@ -9,8 +9,7 @@ use schema::Nanos;
 use crate::labeled_scan::Mark;
 use crate::layers::Layers;
 use crate::mount::Mount;
-use crate::people::{Person, jittered};
-use crate::scene::{Scene, Sun, Surface, Thing};
+use crate::scene::{Person, Scene, Sun, Surface, Thing, jittered};
 use crate::shape::{Plane, Point, Pose, Shape};
 
 /// A scene with its random parts, seen by one scanner.
@@ -87,9 +86,9 @@ impl WorldView {
         let time_s = time_ns as f64 / 1e9;
         let mut faces = Vec::new();
         for thing in &self.changing {
-            let Some(spell) = thing.at(time_s) else { continue };
-            let kind = Kind::since(nanos(spell.since_s));
-            let shapes = self.seen(thing, spell.pose);
+            let Some(presence) = thing.at(time_s) else { continue };
+            let kind = Kind::since(nanos(presence.since_s));
+            let shapes = self.seen(thing, presence.pose);
             faces.extend(shapes.into_iter().map(|shape| Face { shape, surface: thing.surface, kind }));
         }
         for legs in self.people.iter().filter_map(|person| person.legs(time_s)) {
@@ -135,9 +134,9 @@ impl WorldView {
             view.draw(face);
         }
         for thing in &self.changing {
-            for spell in thing.left(time_ns as f64 / 1e9) {
-                for shape in self.seen(thing, spell.pose) {
-                    view.uncover(&shape, nanos(spell.since_s));
+            for presence in thing.left(time_ns as f64 / 1e9) {
+                for shape in self.seen(thing, presence.pose) {
+                    view.uncover(&shape, nanos(presence.since_s));
                 }
             }
         }
@@ -151,9 +150,9 @@ impl WorldView {
             view.draw(face(floor, Surface::Plain, Kind::Static));
         }
         for thing in self.still_things.iter().chain(&self.changing) {
-            let Some(spell) = thing.at(time_s) else { continue };
-            let kind = Kind::since(nanos(spell.since_s));
-            let shapes = self.seen(thing, spell.pose);
+            let Some(presence) = thing.at(time_s) else { continue };
+            let kind = Kind::since(nanos(presence.since_s));
+            let shapes = self.seen(thing, presence.pose);
             plane.cut(&shapes, thing.heights, thing.is_box, |cut| view.draw(face(cut, thing.surface, kind)));
         }
         for (part, heights) in self.people.iter().filter_map(|person| person.body(time_s)).flatten() {
@@ -161,9 +160,9 @@ impl WorldView {
             plane.cut(&[part], heights, false, |cut| view.draw(face(cut, Surface::Plain, Kind::Person)));
         }
         for thing in &self.changing {
-            for spell in thing.left(time_s) {
-                let shapes = self.seen(thing, spell.pose);
-                let since_ns = nanos(spell.since_s);
+            for presence in thing.left(time_s) {
+                let shapes = self.seen(thing, presence.pose);
+                let since_ns = nanos(presence.since_s);
                 plane.cut(&shapes, thing.heights, thing.is_box, |cut| view.uncover(&cut, since_ns));
             }
         }

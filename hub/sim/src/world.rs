@@ -1,33 +1,37 @@
-//! The available worlds: some for tests of the sensor, made in code, and scenes as data: built-in ones, and files. Knows
-//! where a world comes from, not what is in it.
+//! The available worlds: some for tests of the scanner, built-in scenes, and scenes in TOML files.
+//!
+//! The parser checks each value of a file at its position, so that a failure names file, line and column. `docs/worlds.md`
+//! describes the format.
 
-mod file;
-
+use std::ops::{Range, RangeInclusive};
 use std::path::Path;
 use std::str::FromStr;
 use std::sync::Arc;
 
 use schema::{Failure, Kind, regular};
+use serde::Deserialize;
+use toml::Spanned;
 
 use crate::layers::Layers;
-use crate::mount::{Fault, Mount};
-use crate::scene::Scene;
+use crate::mount::{Fault, FaultKind, Mount};
+use crate::scene::{Move, Plan, Scene, Sensor, Speed, Sun, Surface, Thing, Way, distance};
+use crate::shape::{Heights, Point, Pose, Shape};
 
-/// What a sensor can be put into.
+/// The surroundings of the simulated scanners.
 #[derive(Clone, Debug, PartialEq)]
 pub enum World {
     /// Nothing within reach.
     Empty,
-    /// A wall bent around the sensor so that every value is 640: its bytes are `80 02` throughout, so each beam but
-    /// the last ends in what a header begins with.
+    /// A wall around the scanner at which every value is 640. Its bytes are `80 02` throughout, so each beam except the last
+    /// ends with the first bytes of a header.
     Wall640,
-    /// Words without meaning: every bit that the mode may set, at random.
+    /// Random values of all bits that the mode can set.
     Random,
-    /// Walls, things and people.
+    /// Walls, objects and people.
     Scene(Arc<Scene>),
 }
 
-/// The scenes that the program brings along: name and text.
+/// The built-in scenes: name and text.
 const SCENES: [(&str, &str); 16] = [
     ("room", include_str!("../../../tests/worlds/room.toml")),
     ("bare", include_str!("../../../tests/worlds/bare.toml")),
@@ -48,19 +52,21 @@ const SCENES: [(&str, &str); 16] = [
 ];
 
 impl World {
-    /// The names of all worlds that need no file.
+    /// Returns the names of all worlds that need no file.
     pub fn names() -> impl Iterator<Item = &'static str> {
         SCENES.iter().map(|(name, _)| *name).chain(["empty", "wall640", "random"])
     }
 
-    /// The world that `text` describes in TOML; `name` is how failures call it.
+    /// Parses the world that `text` describes in TOML. Failures use `name` as the name of the file.
     ///
-    /// [`Kind::Configuration`] if it is none, with place, value and remedy.
+    /// # Errors
+    ///
+    /// Returns [`Kind::Configuration`], with position, value and remedy, if `text` does not describe a world.
     pub fn of_toml(name: &str, text: &str) -> Result<World, Failure> {
-        file::parse(name, text).map(|scene| World::Scene(Arc::new(scene)))
+        parse_scene(name, text).map(|scene| World::Scene(Arc::new(scene)))
     }
 
-    /// How many sensors look at it.
+    /// Returns the number of sensors in the world.
     pub fn sensors(&self) -> usize {
         match self {
             World::Scene(scene) => scene.sensors.len(),
@@ -68,7 +74,7 @@ impl World {
         }
     }
 
-    /// What tilts its sensor number `sensor`, if anything does.
+    /// Returns the mount of sensor number `sensor`, or `None` if the sensor is not tilted.
     pub fn mount(&self, sensor: usize) -> Option<&Mount> {
         match self {
             World::Scene(scene) => scene.sensors.get(sensor)?.mount.as_ref(),
@@ -76,7 +82,7 @@ impl World {
         }
     }
 
-    /// The same world with `faults` of all its mounts, instead of those that they have.
+    /// Returns the world with `faults` in place of the faults of all its mounts.
     pub fn with_mount_faults(self, faults: &[Fault]) -> World {
         let World::Scene(scene) = self else { return self };
         let mut scene = Arc::unwrap_or_clone(scene);
@@ -85,7 +91,7 @@ impl World {
         World::Scene(Arc::new(scene))
     }
 
-    /// Its layers of noise, if it has any.
+    /// Returns the layers of noise, or `None` if the world has none.
     pub fn layers(&self) -> Option<Layers> {
         match self {
             World::Scene(scene) => Some(scene.layers),
@@ -93,7 +99,7 @@ impl World {
         }
     }
 
-    /// The same world with other layers of noise; one without layers stays as it is.
+    /// Returns the world with other layers of noise. A world without layers stays as it is.
     pub fn with_layers(self, layers: Layers) -> World {
         match self {
             World::Scene(scene) => World::Scene(Arc::new(Scene { layers, ..Arc::unwrap_or_clone(scene) })),
@@ -105,9 +111,12 @@ impl World {
 impl FromStr for World {
     type Err = Failure;
 
-    /// The world of this name, else of this file.
+    /// Returns the world with this name, or in this file.
     ///
-    /// [`Kind::Input`] if it is neither; [`Kind::Configuration`] if the file is wrong: with the place and a remedy.
+    /// # Errors
+    ///
+    /// Returns [`Kind::Input`] if there is neither, and [`Kind::Configuration`], with position and remedy, if the file is
+    /// invalid.
     fn from_str(text: &str) -> Result<World, Failure> {
         match text {
             "empty" => Ok(World::Empty),
@@ -127,4 +136,499 @@ fn read(path: &str) -> Result<String, Failure> {
         let message = format!("world {path:?} is not known, and as a file: {error}");
         Failure::new(Kind::Input, message, format!("a TOML file, or one of: {}", names.join(", ")))
     })
+}
+
+/// Parses the scene that `text` describes. Failures use `name` as the name of the file.
+///
+/// # Errors
+///
+/// Returns [`Kind::Configuration`], with position, value and remedy, if `text` does not describe a scene.
+fn parse_scene(name: &str, text: &str) -> Result<Scene, Failure> {
+    let origin = Origin { name, text };
+    let file: SceneFile = toml::from_str(text).map_err(|error| origin.explain(&error))?;
+    let sensor = |file: &SensorFile| {
+        let mount =
+            file.mount.as_ref().map(|mount| mount.get_ref().mount(mount.span(), &origin)).transpose()?;
+        Ok(Sensor { pose: pose(&origin, &file.pose)?, mount })
+    };
+    let sensors = file.sensor.iter().map(sensor).collect::<Result<Vec<_>, _>>()?;
+    Ok(Scene {
+        sensors: if sensors.is_empty() { vec![Sensor { pose: MIDDLE, mount: None }] } else { sensors },
+        layers: file.noise.layers(&origin)?,
+        things: file
+            .thing
+            .iter()
+            .map(|thing| thing.get_ref().thing(thing.span(), &origin))
+            .collect::<Result<_, _>>()?,
+        people: file
+            .person
+            .iter()
+            .map(|person| person.get_ref().plan(person.span(), &origin))
+            .collect::<Result<_, _>>()?,
+        suns: file.sun.iter().map(|sun| sun.sun(&origin)).collect::<Result<_, _>>()?,
+    })
+}
+
+/// Pose in the middle of the world, with y ahead, so that angles are those of a page.
+const MIDDLE: Pose = Pose { x_mm: 0.0, y_mm: 0.0, turn_deg: 90.0 };
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct SceneFile {
+    #[serde(default)]
+    sensor: Vec<SensorFile>,
+    #[serde(default)]
+    noise: NoiseFile,
+    #[serde(default)]
+    thing: Vec<Spanned<ThingFile>>,
+    #[serde(default)]
+    person: Vec<Spanned<PersonFile>>,
+    #[serde(default)]
+    sun: Vec<SunFile>,
+}
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct SensorFile {
+    pose: Spanned<Vec<Number>>,
+    mount: Option<Spanned<MountFile>>,
+}
+
+#[derive(Default, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct NoiseFile {
+    bias_mm: Option<Spanned<f64>>,
+    sigma_mm: Option<Spanned<f64>>,
+    tail: Option<Spanned<f64>>,
+    spot: Option<bool>,
+    errors: Option<Spanned<f64>>,
+    weak: Option<bool>,
+    dazzle: Option<bool>,
+    comb: Option<bool>,
+}
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct ThingFile {
+    line: Option<Vec<(Number, Number)>>,
+    #[serde(rename = "box")]
+    sides: Option<(Length, Length)>,
+    legs: Option<(Length, Length)>,
+    radius_mm: Option<Spanned<f64>>,
+    pose: Option<Spanned<Vec<Number>>>,
+    surface: Option<Spanned<String>>,
+    height_mm: Option<Spanned<f64>>,
+    above_mm: Option<Spanned<f64>>,
+    from_s: Option<Spanned<f64>>,
+    until_s: Option<Spanned<f64>>,
+    #[serde(default)]
+    moves: Vec<MoveFile>,
+    jitter_mm: Option<Spanned<f64>>,
+}
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct MoveFile {
+    from_s: Spanned<f64>,
+    until_s: Spanned<f64>,
+    by: Spanned<Vec<Number>>,
+}
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct PersonFile {
+    path: Option<Spanned<Vec<Vec<Number>>>>,
+    speed_mm_s: Option<Spanned<SpeedFile>>,
+    centre: Option<(Number, Number)>,
+    reach: Option<(Length, Length)>,
+    repeat: Option<Spanned<bool>>,
+    from_s: Option<Spanned<f64>>,
+    until_s: Option<Spanned<f64>>,
+    jitter_mm: Option<Spanned<f64>>,
+    leg_mm: Option<Spanned<f64>>,
+}
+
+#[derive(Clone, Copy, Deserialize)]
+#[serde(untagged)]
+enum SpeedFile {
+    Always(f64),
+    Between(f64, f64),
+}
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct SunFile {
+    from_deg: Option<Spanned<f64>>,
+    to_deg: Option<Spanned<f64>>,
+    /// Key of an earlier version, in which 0 was to the right. It is refused, because its values are valid in both frames.
+    sector_deg: Option<Spanned<(Number, Number)>>,
+    from_s: Option<Spanned<f64>>,
+    until_s: Option<Spanned<f64>>,
+    share: Option<Spanned<f64>>,
+}
+
+impl NoiseFile {
+    fn layers(&self, origin: &Origin) -> Result<Layers, Failure> {
+        let all = Layers::default();
+        let length = |value: &Option<Spanned<f64>>, usual| origin.number(value, usual, 0.0..=1_000.0);
+        let share = |value: &Option<Spanned<f64>>, usual| origin.number(value, usual, 0.0..=1.0);
+        Ok(Layers {
+            bias_mm: length(&self.bias_mm, all.bias_mm)?,
+            sigma_mm: length(&self.sigma_mm, all.sigma_mm)?,
+            tail: share(&self.tail, all.tail)?,
+            spot: self.spot.unwrap_or(all.spot),
+            errors: share(&self.errors, all.errors)?,
+            weak: self.weak.unwrap_or(all.weak),
+            dazzle: self.dazzle.unwrap_or(all.dazzle),
+            comb: self.comb.unwrap_or(all.comb),
+        })
+    }
+}
+
+impl ThingFile {
+    fn thing(&self, span: Range<usize>, origin: &Origin) -> Result<Thing, Failure> {
+        let (from_s, until_s) = origin.interval(&self.from_s, &self.until_s)?;
+        let mut moves: Vec<Move> = Vec::new();
+        for file in &self.moves {
+            let (start_s, end_s) = (*file.from_s.get_ref(), *file.until_s.get_ref());
+            let earliest_s = moves.last().map_or(from_s, |way| way.until_s);
+            if !(earliest_s <= start_s && start_s <= end_s) {
+                let what = format!("a move from {start_s} s until {end_s} s, after {earliest_s} s");
+                let remedy = "moves one after the other once it is put down, each with from_s <= until_s";
+                return Err(origin.refuse(file.from_s.span(), what, remedy));
+            }
+            if end_s > until_s {
+                let what = format!("a move until {end_s} s of what is taken away at {until_s} s");
+                return Err(origin.refuse(file.until_s.span(), what, "moves while it is there"));
+            }
+            moves.push(Move { from_s: start_s, until_s: end_s, by: pose(origin, &file.by)? });
+        }
+        Ok(Thing {
+            shapes: self.shapes(span, origin)?,
+            heights: self.heights(origin)?,
+            is_box: self.sides.is_some(),
+            pose: self.pose.as_ref().map_or(Ok(Pose { turn_deg: 0.0, ..MIDDLE }), |at| pose(origin, at))?,
+            surface: self.surface.as_ref().map_or(Ok(Surface::Plain), |name| surface(origin, name))?,
+            from_s,
+            until_s,
+            moves,
+            jitter_mm: origin.number(&self.jitter_mm, 0.0, 0.0..=1_000.0)?,
+        })
+    }
+
+    fn heights(&self, origin: &Origin) -> Result<Heights, Failure> {
+        let from_mm = origin.number(&self.above_mm, Heights::ALL.from_mm, 0.0..=10_000.0)?;
+        let to_mm = origin.number(&self.height_mm, Heights::ALL.to_mm, 1.0..=10_000.0)?;
+        match &self.above_mm {
+            Some(above) if from_mm >= to_mm => {
+                let what = format!("above_mm = {from_mm}, height_mm = {to_mm}");
+                Err(origin.refuse(above.span(), what, "both from the floor, the top above the bottom"))
+            }
+            _ => Ok(Heights { from_mm, to_mm }),
+        }
+    }
+
+    fn shapes(&self, span: Range<usize>, origin: &Origin) -> Result<Vec<Shape>, Failure> {
+        const REMEDY: &str = "one of: line = [[x, y], ..], box = [width, depth], radius_mm = R for a post, \
+                              legs = [width, depth] with the radius_mm of each";
+        let corners = |(width, depth): (Length, Length)| {
+            let (x, y) = (width.0 / 2.0, depth.0 / 2.0);
+            [(-x, -y), (x, -y), (x, y), (-x, y), (-x, -y)].map(|(x, y)| (Number(x), Number(y)))
+        };
+        let walls = |points: &[(Number, Number)]| {
+            let wall = |pair: &[(Number, Number)]| Shape::Wall { from: point(pair[0]), to: point(pair[1]) };
+            points.windows(2).map(wall).collect()
+        };
+        let radius = origin.number(&self.radius_mm, 0.0, 1.0..=10_000.0)?;
+        match (&self.line, &self.sides, &self.legs, &self.radius_mm) {
+            (Some(line), None, None, None) if line.len() >= 2 => Ok(walls(line)),
+            (None, Some(sides), None, None) => Ok(walls(&corners(*sides))),
+            (None, None, Some(legs), Some(_)) => {
+                let feet = corners(*legs);
+                Ok(feet[..4].iter().map(|&foot| Shape::Post { centre: point(foot), radius }).collect())
+            }
+            (None, None, None, Some(_)) => Ok(vec![Shape::Post { centre: (0.0, 0.0), radius }]),
+            _ => Err(origin.refuse(span, "a thing with no shape, or with more than one", REMEDY)),
+        }
+    }
+}
+
+impl PersonFile {
+    fn plan(&self, span: Range<usize>, origin: &Origin) -> Result<Plan, Failure> {
+        let (from_s, until_s) = origin.interval(&self.from_s, &self.until_s)?;
+        Ok(Plan {
+            way: self.way(span, origin, from_s, until_s)?,
+            from_s,
+            until_s,
+            jitter_mm: origin.number(&self.jitter_mm, 0.0, 0.0..=10_000.0)?,
+            leg_mm: origin.number(&self.leg_mm, 60.0, 1.0..=200.0)?,
+        })
+    }
+
+    fn way(&self, span: Range<usize>, origin: &Origin, from_s: f64, until_s: f64) -> Result<Way, Failure> {
+        let (path, speed) = match (&self.path, self.centre, self.reach, &self.speed_mm_s) {
+            (None, Some(centre), Some(reach), None) if self.repeat.is_none() => {
+                return Ok(Way::Roam { centre: point(centre), reach: (reach.0.0, reach.1.0) });
+            }
+            (Some(path), None, None, speed) => (path, speed),
+            _ => {
+                let remedy = "path = [[x, y], ..], or centre = [x, y] with reach = [x, y] and no speed";
+                return Err(origin.refuse(span, "a person with no path, or with two", remedy));
+            }
+        };
+        let corner = |values: &Vec<Number>| match values[..] {
+            [x, y] => Some(((x.0, y.0), 0.0)),
+            [x, y, rest_s] if rest_s.0 >= 0.0 => Some(((x.0, y.0), rest_s.0)),
+            _ => None,
+        };
+        let corners = path.get_ref().iter().map(corner).collect::<Option<Vec<_>>>();
+        let Some(corners) = corners.filter(|corners| !corners.is_empty()) else {
+            let remedy = "path = [[x, y], [x, y, seconds of rest], ..] in millimetres";
+            return Err(origin.refuse(path.span(), "a path without points", remedy));
+        };
+        let rest_s: f64 = corners.iter().map(|corner| corner.1).sum();
+        if corners.len() > 1 && rest_s >= until_s - from_s {
+            let what = format!("{rest_s} s of rest from {from_s} s until {until_s} s");
+            return Err(origin.refuse(path.span(), what, "rests that leave time to walk"));
+        }
+        let speed = match (speed, corners.len()) {
+            (None, 1) => Speed::InTime,
+            (None, _) if until_s.is_finite() => Speed::InTime,
+            (Some(speed), 2..) if until_s.is_infinite() => {
+                let (slowest, fastest) = match *speed.get_ref() {
+                    SpeedFile::Always(speed) => (speed, speed),
+                    SpeedFile::Between(slowest, fastest) => (slowest, fastest),
+                };
+                if !(1.0 <= slowest && slowest <= fastest && fastest <= 10_000.0) {
+                    let what = format!("speed_mm_s from {slowest} to {fastest}");
+                    return Err(origin.refuse(speed.span(), what, "1 to 10000 mm/s, the slower one first"));
+                }
+                Speed::Between(slowest, fastest)
+            }
+            _ => {
+                let what = "the person's speed is not set, or set by two keys";
+                let remedy = "give a path speed_mm_s or until_s; a person at one point has no speed";
+                return Err(origin.refuse(path.span(), what, remedy));
+            }
+        };
+        let repeats = self.repeat.as_ref().filter(|repeat| *repeat.get_ref());
+        let length: f64 = corners.windows(2).map(|pair| distance(pair[0].0, pair[1].0)).sum();
+        if let Some(repeat) = repeats.filter(|_| speed == Speed::InTime || length == 0.0) {
+            let remedy = "repeat = true only beside a path with several corners and speed_mm_s";
+            return Err(origin.refuse(repeat.span(), "a path that cannot be walked again and again", remedy));
+        }
+        Ok(Way::Path { corners, speed, repeats: repeats.is_some() })
+    }
+}
+
+impl SunFile {
+    fn sun(&self, origin: &Origin) -> Result<Sun, Failure> {
+        if let Some(sector) = &self.sector_deg {
+            let (from, to) = point(*sector.get_ref());
+            let what = format!("sector_deg = [{from}, {to}] counts angles from the right");
+            let [from, to] = [from, to].map(|deg| (deg * 1000.0 - 90_000.0).round() / 1000.0);
+            let remedy = format!("angles are counted from ahead now: from_deg = {from:?}, to_deg = {to:?}");
+            return Err(origin.refuse(sector.span(), what, remedy));
+        }
+        let from_deg = origin.number(&self.from_deg, -180.0, -180.0..=180.0)?;
+        let to_deg = origin.number(&self.to_deg, 180.0, -180.0..=180.0)?;
+        if let Some(to) = self.to_deg.as_ref().filter(|_| from_deg > to_deg) {
+            let what = format!("from_deg = {from_deg}, to_deg = {to_deg}");
+            return Err(origin.refuse(to.span(), what, "angles of the sensor, the smaller one first"));
+        }
+        let (from_s, until_s) = origin.interval(&self.from_s, &self.until_s)?;
+        let share = origin.number(&self.share, 1.0, 0.0..=1.0)?;
+        Ok(Sun { from_deg, to_deg, from_s, until_s, share })
+    }
+}
+
+/// A coordinate in millimeters, an angle in degrees, or a time in seconds.
+#[derive(Clone, Copy, Deserialize)]
+#[serde(try_from = "f64")]
+struct Number(f64);
+
+impl TryFrom<f64> for Number {
+    type Error = String;
+
+    fn try_from(value: f64) -> Result<Number, String> {
+        let known = value.abs() <= 1e6;
+        known.then_some(Number(value)).ok_or_else(|| format!("{value} is not between -1000000 and 1000000"))
+    }
+}
+
+/// A length in millimeters, at least 1.
+#[derive(Clone, Copy, Deserialize)]
+#[serde(try_from = "f64")]
+struct Length(f64);
+
+impl TryFrom<f64> for Length {
+    type Error = String;
+
+    fn try_from(value: f64) -> Result<Length, String> {
+        let known = (1.0..=1e6).contains(&value);
+        known.then_some(Length(value)).ok_or_else(|| format!("{value} is not between 1 and 1000000"))
+    }
+}
+
+fn point((x, y): (Number, Number)) -> Point {
+    (x.0, y.0)
+}
+
+fn pose(origin: &Origin, values: &Spanned<Vec<Number>>) -> Result<Pose, Failure> {
+    match values.get_ref()[..] {
+        [x, y] => Ok(Pose { x_mm: x.0, y_mm: y.0, turn_deg: 0.0 }),
+        [x, y, turn] => Ok(Pose { x_mm: x.0, y_mm: y.0, turn_deg: turn.0 }),
+        ref other => {
+            let what = format!("{} numbers are no pose", other.len());
+            Err(origin.refuse(values.span(), what, "[x, y] in millimetres, or [x, y, degrees]"))
+        }
+    }
+}
+
+fn surface(origin: &Origin, name: &Spanned<String>) -> Result<Surface, Failure> {
+    match name.get_ref().as_str() {
+        "plain" => Ok(Surface::Plain),
+        "dark" => Ok(Surface::Dark),
+        "reflector" => Ok(Surface::Reflector),
+        "glass" => Ok(Surface::Glass),
+        "faint" => Ok(Surface::Faint),
+        other => {
+            let what = format!("surface = \"{other}\"");
+            Err(origin.refuse(name.span(), what, "plain, dark, reflector, glass or faint"))
+        }
+    }
+}
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct MountFile {
+    height_mm: Spanned<f64>,
+    arm_mm: Option<(f64, f64)>,
+    from_deg: Spanned<f64>,
+    to_deg: Spanned<f64>,
+    deg_s: Option<Spanned<f64>>,
+    reports_hz: Option<Spanned<f64>>,
+    #[serde(default)]
+    faults: Vec<Spanned<FaultFile>>,
+}
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct FaultFile {
+    kind: String,
+    from_s: Option<Spanned<f64>>,
+    until_s: Option<Spanned<f64>>,
+    by_deg: Option<Spanned<f64>>,
+    by_s: Option<Spanned<f64>>,
+}
+
+impl MountFile {
+    fn mount(&self, span: Range<usize>, origin: &Origin) -> Result<Mount, Failure> {
+        let within = |value: &Spanned<f64>, allowed| origin.number(&Some(value.clone()), 0.0, allowed);
+        let (from_deg, to_deg) = (within(&self.from_deg, -80.0..=80.0)?, within(&self.to_deg, -80.0..=80.0)?);
+        if to_deg - from_deg < 1.0 {
+            let what = format!("a mount that swings from {from_deg} to {to_deg} degrees");
+            return Err(origin.refuse(
+                span,
+                what,
+                "from_deg below to_deg, by a degree at least; down is positive",
+            ));
+        }
+        let faults = self.faults.iter().map(|fault| fault.get_ref().fault(fault.span(), origin));
+        Ok(Mount {
+            height_mm: within(&self.height_mm, 1.0..=10_000.0)?,
+            arm_mm: self.arm_mm.unwrap_or_default(),
+            from_deg,
+            to_deg,
+            deg_s: origin.number(&self.deg_s, 30.0, 1.0..=360.0)?,
+            reports_hz: origin.number(&self.reports_hz, 100.0, 1.0..=10_000.0)?,
+            faults: faults.collect::<Result<_, _>>()?,
+        })
+    }
+}
+
+impl FaultFile {
+    fn fault(&self, span: Range<usize>, origin: &Origin) -> Result<Fault, Failure> {
+        let (from_s, until_s) = origin.interval(&self.from_s, &self.until_s)?;
+        let by_deg = || origin.number(&self.by_deg, 8.0, -80.0..=80.0);
+        let kind = match self.kind.as_str() {
+            "halts" => FaultKind::Halts,
+            "silent" => FaultKind::Silent,
+            "stuck" => FaultKind::Stuck,
+            "jumps" => FaultKind::Jumps(by_deg()?),
+            "lies" => FaultKind::Lies(by_deg()?),
+            "late" => FaultKind::Late(origin.number(&self.by_s, 0.3, 0.0..=10.0)?),
+            other => {
+                let remedy = "halts, silent, stuck, jumps or lies with by_deg, late with by_s";
+                return Err(origin.refuse(span, format!("kind = \"{other}\""), remedy));
+            }
+        };
+        Ok(Fault { kind, from_s, until_s })
+    }
+}
+
+/// The text of a file, and its name in failures.
+struct Origin<'a> {
+    name: &'a str,
+    text: &'a str,
+}
+
+impl Origin<'_> {
+    /// Returns a value within `allowed`, or `usual` if there is none.
+    fn number(
+        &self,
+        value: &Option<Spanned<f64>>,
+        usual: f64,
+        allowed: RangeInclusive<f64>,
+    ) -> Result<f64, Failure> {
+        match value {
+            None => Ok(usual),
+            Some(value) if allowed.contains(value.get_ref()) => Ok(*value.get_ref()),
+            Some(value) => {
+                let remedy = format!("a number from {} to {}", allowed.start(), allowed.end());
+                Err(self.refuse(value.span(), format!("{} is out of range", value.get_ref()), remedy))
+            }
+        }
+    }
+
+    /// Returns start and end of an interval. By default, it is unlimited.
+    fn interval(
+        &self,
+        from: &Option<Spanned<f64>>,
+        until: &Option<Spanned<f64>>,
+    ) -> Result<(f64, f64), Failure> {
+        let from_s = self.number(from, 0.0, 0.0..=1e6)?;
+        let until_s = self.number(until, f64::INFINITY, 0.0..=1e6)?;
+        match until {
+            Some(until) if until_s <= from_s => {
+                let what = format!("until_s = {until_s}, and from_s = {from_s}");
+                Err(self.refuse(until.span(), what, "an end after the start"))
+            }
+            _ => Ok((from_s, until_s)),
+        }
+    }
+
+    /// Returns the failure for an invalid value at `span`, with the problem `what` and its `remedy`.
+    fn refuse(&self, span: Range<usize>, what: impl std::fmt::Display, remedy: impl Into<String>) -> Failure {
+        let before = &self.text[..span.start.min(self.text.len())];
+        let line = before.matches('\n').count() + 1;
+        let column = before.chars().rev().take_while(|&c| c != '\n').count() + 1;
+        Failure::new(Kind::Configuration, format!("{}:{line}:{column}: {what}", self.name), remedy)
+    }
+
+    /// Returns the failure for an error of the TOML parser. For an unknown key, the remedy names the nearest known one.
+    fn explain(&self, error: &toml::de::Error) -> Failure {
+        let (span, message) = (error.span().unwrap_or_default(), error.message());
+        let names: Vec<&str> = message.split('`').skip(1).step_by(2).collect();
+        match names[..] {
+            [unknown, ref known @ ..] if message.starts_with("unknown field") => {
+                let likeness = |name: &str| strsim::jaro_winkler(name, unknown);
+                let nearest = known.iter().max_by(|a, b| likeness(a).total_cmp(&likeness(b)));
+                let nearest = nearest.map_or(String::new(), |name| format!("did you mean `{name}`? "));
+                let remedy = format!("{nearest}Known here: {}", known.join(", "));
+                self.refuse(span, format!("unknown key `{unknown}`"), remedy)
+            }
+            _ => self.refuse(span, message, "docs/worlds.md has the keys and their forms"),
+        }
+    }
 }
