@@ -1,8 +1,8 @@
-//! Injected faults. A user writes them as `loss=0.00135,burst=1.89`, and one table has the keys with their meaning and range
-//! for the parser, the printer and the help.
+//! Injected faults. A user writes them as `loss=0.00135,burst=1.89`, and one table has the keys with their meaning and
+//! range for the parser, the printer and the help.
 //!
-//! A seed causes the same damage in every run, for any size of chunks. [`crate::wire`] applies the faults between the scanner
-//! and the port, except the scanner's own deviations from the protocol.
+//! A seed causes the same damage in every run, for any size of chunks. [`crate::wire`] applies the faults between the
+//! scanner and the port, except the scanner's own deviations from the protocol.
 
 mod damage;
 mod schedule;
@@ -18,8 +18,8 @@ pub use damage::Loss;
 pub(crate) use damage::{Fate, Noise, TelegramFaults};
 pub(crate) use schedule::{Extra, Lateness, Schedule, Window};
 
-/// First cause for which a telegram did not reach the host intact, as recorded in the truth. A telegram is intact if all its
-/// bytes arrive as sent and next to each other.
+/// First cause for which a telegram did not reach the host intact, as recorded in the truth. A telegram is intact if
+/// all its bytes arrive as sent and next to each other.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Fault {
     /// The scanner broke off the telegram, for a request or by itself.
@@ -235,7 +235,8 @@ fn names() -> String {
     format!("keys: {}", TABLE.iter().map(|key| key.name).collect::<Vec<_>>().join(", "))
 }
 
-/// Returns random numbers for one `kind` of fault. Each kind has a separate sequence, so that it does not change the others.
+/// Returns random numbers for one `kind` of fault. Each kind has a separate sequence, so that it does not change the
+/// others.
 fn random(seed: u64, kind: u64) -> fastrand::Rng {
     fastrand::Rng::with_seed(seed ^ kind.wrapping_mul(0x9E37_79B9_7F4A_7C15))
 }

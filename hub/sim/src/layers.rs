@@ -1,5 +1,5 @@
-//! What makes a measured range different from the true one, layer by layer, each with its own switch. Two layers have no
-//! switch: ranges are sent in whole units, and a range beyond the greatest value is sent as a code. Knows no shapes.
+//! What makes a measured range different from the true one, layer by layer, each with its own switch. Two layers have
+//! no switch: ranges are sent in whole units, and a range beyond the greatest value is sent as a code. Knows no shapes.
 
 use scanhub_drivers::lms;
 use schema::Nanos;
@@ -15,8 +15,8 @@ pub struct Layers {
     /// stood still 316 of 348 beams were never off by 30 mm, and 22 more often than in one scan of a hundred: the tail
     /// belongs to a few beams.
     pub tail: f64,
-    /// Whether a beam is as wide as a real one: on two surfaces it reports one, the other or a value between, or too weak a
-    /// signal if they are far apart. Else it is a line without width.
+    /// Whether a beam is as wide as a real one: on two surfaces it reports one, the other or a value between, or too
+    /// weak a signal if they are far apart. Else it is a line without width.
     pub spot: bool,
     /// Share of the beams that report a code although they could report a range.
     pub errors: f64,
@@ -165,6 +165,6 @@ pub(crate) const NO_RETURN: u16 = 0;
 pub(crate) const DAZZLE: u16 = 1;
 pub(crate) const TOO_WEAK: u16 = 4;
 const OVERFLOW: u16 = 2;
-/// Codes of beams that could have told a range, by their summed shares: those of a recording of a real LMS 200, of beams
-/// that told a range in at least 16 of 20 scans.
+/// Codes of beams that could have told a range, by their summed shares: those of a recording of a real LMS 200, of
+/// beams that told a range in at least 16 of 20 scans.
 const CODES: [(f64, u16); 3] = [(0.57, NO_RETURN), (0.94, TOO_WEAK), (1.0, OVERFLOW)];

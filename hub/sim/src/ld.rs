@@ -1,5 +1,5 @@
-//! A scanner of LDROBOT, without a line and without a clock: its head turns and measures point by point, each at its own
-//! time, and each twelve of them leave as a packet. It never listens. Or it sends packets that were recorded.
+//! A scanner of LDROBOT, without a line and without a clock: its head turns and measures point by point, each at its
+//! own time, and each twelve of them leave as a packet. It never listens. Or it sends packets that were recorded.
 
 use std::path::Path;
 
@@ -98,8 +98,8 @@ impl Head {
         Head { settings, source, power_ns: 0, turns_ns: 0, sent: 0, rotation, tx_queue }
     }
 
-    /// Makes it turn so many times in a second from its next packet on. The inertia of a real head is the caller's: of two
-    /// packets in a row the second is 5 % faster or slower at the most.
+    /// Makes it turn so many times in a second from its next packet on. The inertia of a real head is the caller's: of
+    /// two packets in a row the second is 5 % faster or slower at the most.
     pub fn set_speed(&mut self, turns_per_second: f64) {
         self.rotation.set_speed(self.seconds(self.sent * POINTS as u64), turns_per_second);
     }

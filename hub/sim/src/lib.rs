@@ -1,9 +1,9 @@
 //! Simulated scanners on ptys or TCP servers, for tests, demonstrations and measurements without hardware.
 //!
-//! - [`machine`] is a SICK LMS 2xx, [`ld`] a scanner of LDROBOT, and [`rplidar`] one of Slamtec. They do no I/O, and time is
-//!   an argument.
-//! - [`world`] describes their surroundings, [`room`] measures them, [`mount`] tilts a scanner, and [`labeled_scan`] has the
-//!   true values.
+//! - [`machine`] is a SICK LMS 2xx, [`ld`] a scanner of LDROBOT, and [`rplidar`] one of Slamtec. They do no I/O, and
+//!   time is an argument.
+//! - [`world`] describes their surroundings, [`room`] measures them, [`mount`] tilts a scanner, and [`labeled_scan`]
+//!   has the true values.
 //! - [`wire`], [`fault`] and [`noise`] simulate the line.
 //! - [`pty`] is the only file that reads a clock.
 //! - [`simulate()`] is the command.

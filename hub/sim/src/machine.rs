@@ -1,11 +1,11 @@
-//! A simulated LMS, without I/O: bytes of the host and times go in, and chunks of bytes with the time of their transmission
-//! come out. It is driven as a [`Device`]; [`Source`] provides its measured values, and [`crate::wire`] damages the bytes
-//! later.
+//! A simulated LMS, without I/O: bytes of the host and times go in, and chunks of bytes with the time of their
+//! transmission come out. It is driven as a [`Device`]; [`Source`] provides its measured values, and [`crate::wire`]
+//! damages the bytes later.
 //!
-//! It supports every request on the way to a stream, every mode that sends measured values, and the part of the installation
-//! mode that changes the configuration and the permanent rate. Every other well-formed request is refused with 92h, as a
-//! real scanner does with requests that it does not support. It counts the requests that would write its EEPROM. Automatic
-//! code never sends one, and tests check the count.
+//! It supports every request on the way to a stream, every mode that sends measured values, and the part of the
+//! installation mode that changes the configuration and the permanent rate. Every other well-formed request is refused
+//! with 92h, as a real scanner does with requests that it does not support. It counts the requests that would write its
+//! EEPROM. Automatic code never sends one, and tests check the count.
 
 use std::collections::VecDeque;
 use std::ops::Range;
@@ -27,8 +27,8 @@ use crate::request_decoder::{Arrival, Dropped, Heard, RequestDecoder};
 use crate::source::Source;
 use crate::transmission::{ChunkSize, Transmission};
 
-/// A scanner at time 0: its type, its EEPROM, the state in which an earlier host left it, and the hardware at the host's end
-/// of its line.
+/// A scanner at time 0: its type, its EEPROM, the state in which an earlier host left it, and the hardware at the
+/// host's end of its line.
 #[derive(Clone, Debug)]
 pub struct Settings {
     /// Address of the scanner, 0 to 127. It replies to this address and to 0.
@@ -63,8 +63,8 @@ pub struct Settings {
     pub habits: Habits,
     /// Number of bytes that arrive at once.
     pub chunk: ChunkSize,
-    /// Speed of the simulation's time, relative to that of the host. The host measures the gaps of its requests by its own
-    /// clock.
+    /// Speed of the simulation's time, relative to that of the host. The host measures the gaps of its requests by its
+    /// own clock.
     pub speed: f64,
     /// Seed of the delays before replies, and of the deviations.
     pub seed: u64,
@@ -118,8 +118,8 @@ pub struct Habits {
     pub late_acknowledge_ns: Nanos,
     /// Additional delay of a reply. It is sent even if the next request arrives before.
     pub late_reply_ns: Nanos,
-    /// Additional duration of a change of mode, rate or variant: up to 3 s by the listing. The scanner answers a request
-    /// that arrives during the change at once, and then never sends the reply to the change.
+    /// Additional duration of a change of mode, rate or variant: up to 3 s by the listing. The scanner answers a
+    /// request that arrives during the change at once, and then never sends the reply to the change.
     pub late_mode_ns: Nanos,
     /// Additional duration of a write to the EEPROM. SICK's quick manual allows 7 s.
     pub late_write_ns: Nanos,
@@ -283,8 +283,8 @@ impl Machine {
         }
     }
 
-    /// Interrupts all transmissions for a request of the host. The current one ends with the byte in the transmitter, and
-    /// queued ones are dropped. Returns the time at which the line is free.
+    /// Interrupts all transmissions for a request of the host. The current one ends with the byte in the transmitter,
+    /// and queued ones are dropped. Returns the time at which the line is free.
     fn interrupt(&mut self, now: Nanos) -> Nanos {
         self.next_scan_ns = None;
         let mut is_first = true;
@@ -571,9 +571,9 @@ impl Device for Machine {
         }
     }
 
-    /// Switches the power off and on. The transmission ends with the byte in the transmitter, and only the EEPROM remains.
-    /// After the start-up, the scanner sends the boot message 90h at the permanent rate or at 9600. Returns whether a
-    /// telegram was broken off.
+    /// Switches the power off and on. The transmission ends with the byte in the transmitter, and only the EEPROM
+    /// remains. After the start-up, the scanner sends the boot message 90h at the permanent rate or at 9600. Returns
+    /// whether a telegram was broken off.
     fn power_cycle(&mut self, now: Nanos) -> bool {
         self.queue.retain(|transmission| transmission.start_ns() <= now);
         self.queue.truncate(1);
@@ -589,8 +589,8 @@ impl Device for Machine {
         broken
     }
 
-    /// Breaks off the current transmission, as if for a request that the scanner then ignored. A stream continues with a
-    /// complete scan.
+    /// Breaks off the current transmission, as if for a request that the scanner then ignored. A stream continues with
+    /// a complete scan.
     fn break_off(&mut self, now: Nanos) {
         if self.queue.front().is_some_and(|front| front.start_ns() <= now) {
             self.interrupt(now);
@@ -666,8 +666,8 @@ impl Eeprom {
         self.permanent_baud.unwrap_or(Baud::B9600)
     }
 
-    /// Returns the EEPROM with `data` as the leading bytes of its configuration, without excess bytes. Returns `None` if a
-    /// scanner does not accept these settings.
+    /// Returns the EEPROM with `data` as the leading bytes of its configuration, without excess bytes. Returns `None`
+    /// if a scanner does not accept these settings.
     fn rewritten(&self, data: &[u8]) -> Option<Eeprom> {
         let mut written = self.clone();
         let len = data.len().min(self.configuration.len());
@@ -685,8 +685,8 @@ const FATAL: u8 = 4;
 const COUNTED: [u8; 4] = [0x10, 0x27, 0x2C, 0x01];
 /// Reading of the pollution sensors of a clean window. Only the ratio to it matters.
 const POLLUTION_CLEAN: u16 = 1_000;
-/// Time from ACK to reply if nothing changes. Captured exchanges took 70 to 158 ms at 38400. Request and reply took 10 to
-/// 45 ms of this time.
+/// Time from ACK to reply if nothing changes. Captured exchanges took 70 to 158 ms at 38400. Request and reply took 10
+/// to 45 ms of this time.
 const THINKING_NS: Range<Nanos> = 55 * MILLIS..145 * MILLIS;
 /// Time from ACK to A0h or BBh. Captured exchanges took 66 to 94 ms; the listing allows 3 s.
 const MODE_NS: Range<Nanos> = 55 * MILLIS..85 * MILLIS;

@@ -1,5 +1,5 @@
-//! What a sensor is tilted by: how it is turned at each moment, and what its encoder says of it, which may be wrong. A pure
-//! function of time. Knows no beams.
+//! What a sensor is tilted by: how it is turned at each moment, and what its encoder says of it, which may be wrong. A
+//! pure function of time. Knows no beams.
 
 use std::cmp::Reverse;
 use std::f64::consts::PI;

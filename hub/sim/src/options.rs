@@ -70,7 +70,8 @@ pub struct SimulateOptions {
     pub chunk: ChunkSize,
     /// Whether the sensors wait while the host's buffer is full, instead of losing bytes as on a real line.
     pub lossless: bool,
-    /// Which scanner of another family the ports are in place of an LMS; then what only an LMS has must be left as it is.
+    /// Which scanner of another family the ports are in place of an LMS; then what only an LMS has must be left as it
+    /// is.
     pub scanner: Option<Scanner>,
 }
 

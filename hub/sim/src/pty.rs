@@ -1,10 +1,10 @@
-//! A pty that behaves like a serial line as far as possible, the symlink at which a host finds it, and the clock. No other
-//! file of this crate reads the kernel's clock.
+//! A pty that behaves like a serial line as far as possible, the symlink at which a host finds it, and the clock. No
+//! other file of this crate reads the kernel's clock.
 //!
 //! A pty differs from a serial line in three ways:
 //!
-//! - It keeps bytes that no host reads. Nothing is written while the host's side is closed, and unread bytes are discarded
-//!   when it closes.
+//! - It keeps bytes that no host reads. Nothing is written while the host's side is closed, and unread bytes are
+//!   discarded when it closes.
 //! - Its exclusive mode survives the last close, so it is cleared.
 //! - It does not report that it is closed before the first open, so it is opened and closed once.
 
@@ -159,13 +159,13 @@ pub(crate) struct PtySymlink {
 }
 
 impl PtySymlink {
-    /// Creates a symlink at `path` to `target`. Replaces a symlink without a target, or to a terminal that is younger than the
-    /// symlink, because a killed simulator left it. Anything else at `path` remains.
+    /// Creates a symlink at `path` to `target`. Replaces a symlink without a target, or to a terminal that is younger
+    /// than the symlink, because a killed simulator left it. Anything else at `path` remains.
     ///
     /// # Errors
     ///
-    /// Returns [`Kind::PortBusy`] if another simulator uses `path`, [`Kind::PortNotTty`] if something else exists there, and
-    /// [`Kind::PortMissing`], [`Kind::PortPermission`] or [`Kind::Failed`] if the symlink cannot be created.
+    /// Returns [`Kind::PortBusy`] if another simulator uses `path`, [`Kind::PortNotTty`] if something else exists
+    /// there, and [`Kind::PortMissing`], [`Kind::PortPermission`] or [`Kind::Failed`] if the symlink cannot be created.
     pub(crate) fn new(path: &Path, target: &Path) -> Result<PtySymlink, Failure> {
         match fs::symlink_metadata(path) {
             Ok(there) if there.is_symlink() && is_left_behind(path) => {
@@ -203,8 +203,8 @@ impl Drop for PtySymlink {
     }
 }
 
-/// Returns whether a killed simulator left the symlink at `path`. A terminal that is older than the symlink still belongs to
-/// the simulator that created the symlink. A younger terminal only has the same number.
+/// Returns whether a killed simulator left the symlink at `path`. A terminal that is older than the symlink still
+/// belongs to the simulator that created the symlink. A younger terminal only has the same number.
 fn is_left_behind(path: &Path) -> bool {
     let (Ok(terminal), Ok(link)) = (fs::metadata(path), fs::symlink_metadata(path)) else { return true };
     let since = |metadata: &Metadata| (metadata.ctime(), metadata.ctime_nsec());

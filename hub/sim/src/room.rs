@@ -58,8 +58,8 @@ impl Room {
         Room { seed: 0, sight: Sight::Series(series, changes) }
     }
 
-    /// The values of the scan whose last mirror turn ended at `end_ns`: as many as `variant` has beams, in `unit`, split
-    /// according to `mode`. The same arguments give the same values.
+    /// The values of the scan whose last mirror turn ended at `end_ns`: as many as `variant` has beams, in `unit`,
+    /// split according to `mode`. The same arguments give the same values.
     pub fn scan(&self, variant: Variant, unit: Unit, mode: Mode, end_ns: Nanos) -> Vec<u16> {
         match &self.sight {
             Sight::Series(series, changes) => series.scan(changes, (variant, unit, mode), end_ns),
@@ -198,8 +198,8 @@ fn word(stage: &WorldView, echo: &Echo, sun: f64, unit: Unit, mode: Mode, dice: 
     }
 }
 
-/// Returns the range in millimeters that the scanner reports for a beam with this `echo`. Otherwise returns the code that it
-/// reports, counted down from the highest value.
+/// Returns the range in millimeters that the scanner reports for a beam with this `echo`. Otherwise returns the code
+/// that it reports, counted down from the highest value.
 pub(crate) fn reported_range(stage: &WorldView, echo: &Echo, sun: f64, dice: &BeamRng) -> Result<f64, u16> {
     if stage.layers.dazzles(sun, dice) {
         Err(layers::DAZZLE)

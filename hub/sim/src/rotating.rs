@@ -1,5 +1,5 @@
-//! Parts that all simulated rotating scanners share: the clockwise rotation of the head, and the measurement of a room beam
-//! by beam, each at its own time and angle.
+//! Parts that all simulated rotating scanners share: the clockwise rotation of the head, and the measurement of a room
+//! beam by beam, each at its own time and angle.
 
 use std::f64::consts::TAU;
 
@@ -38,9 +38,9 @@ pub struct TruePoint {
 }
 
 impl Rotation {
-    /// Creates the rotation of a head with a mean speed of `turns_per_second` that varies by the share `wander`. The spin-up
-    /// has a time constant of `spin_up_s` seconds; 0 means full speed at once. `seed` selects the first angle and the phase of
-    /// the variation.
+    /// Creates the rotation of a head with a mean speed of `turns_per_second` that varies by the share `wander`. The
+    /// spin-up has a time constant of `spin_up_s` seconds; 0 means full speed at once. `seed` selects the first angle
+    /// and the phase of the variation.
     pub(crate) fn new(turns_per_second: f64, wander: f64, spin_up_s: f64, seed: u64) -> Rotation {
         let phase = TAU * fastrand::Rng::with_seed(seed).f64();
         // A head does not start at its zero.

@@ -1,8 +1,8 @@
-//! A simulated RPLIDAR of Slamtec, without I/O. It replies to requests of a host, its motor spins up, and its head measures
-//! point by point, each at its own time. The points leave in packets of the requested mode.
+//! A simulated RPLIDAR of Slamtec, without I/O. It replies to requests of a host, its motor spins up, and its head
+//! measures point by point, each at its own time. The points leave in packets of the requested mode.
 //!
-//! The sources of this behavior are the vendor's protocol manual and driver, and published measurements of a real A1M8. The
-//! simulator does not reply to requests that they do not describe.
+//! The sources of this behavior are the vendor's protocol manual and driver, and published measurements of a real A1M8.
+//! The simulator does not reply to requests that they do not describe.
 
 mod models;
 mod optics;
@@ -156,8 +156,8 @@ impl Unit {
         Some(self.stream?.mode)
     }
 
-    /// Returns the number of packets of the present stream, including the current one. The next packet begins with the point
-    /// after their last one. Returns `None` before the first point.
+    /// Returns the number of packets of the present stream, including the current one. The next packet begins with the
+    /// point after their last one. Returns `None` before the first point.
     pub fn sent(&self) -> Option<u64> {
         self.begin_ns()?;
         Some(self.stream?.sent())
@@ -168,8 +168,8 @@ impl Unit {
         Some(self.motor?.rotation.turns_per_second)
     }
 
-    /// Changes the speed of a motor that is on, from the next packet of the stream on. The caller has to simulate the inertia
-    /// of a real head.
+    /// Changes the speed of a motor that is on, from the next packet of the stream on. The caller has to simulate the
+    /// inertia of a real head.
     pub fn set_speed(&mut self, turns_per_second: f64) {
         let next = self.stream.and_then(|stream| stream.next_ns(self.motor));
         if let (Some(motor), Some(next_ns)) = (&mut self.motor, next) {
@@ -188,7 +188,8 @@ impl Unit {
         self.stalls = Window::once(now, span);
     }
 
-    /// Changes the reported status and code. They remain after a RESET if `stubborn` is set. A status of 2 ends a stream.
+    /// Changes the reported status and code. They remain after a RESET if `stubborn` is set. A status of 2 ends a
+    /// stream.
     pub fn set_health(&mut self, now: Nanos, health: (u8, u16), stubborn: bool) {
         (self.health, self.settings.stubborn) = (health, stubborn);
         if health.0 == ERROR {
@@ -426,8 +427,8 @@ struct Motion {
     rotation: Rotation,
 }
 
-/// A stream of points in one mode. It determines the time and the head angle of each point, and the time at which a packet
-/// has all its points.
+/// A stream of points in one mode. It determines the time and the head angle of each point, and the time at which a
+/// packet has all its points.
 #[derive(Clone, Copy, Debug)]
 struct Stream {
     mode: Mode,
@@ -444,8 +445,8 @@ struct Stream {
 }
 
 impl Stream {
-    /// Creates a stream of `model` in `mode` that was requested at `asked_ns`. It starts as soon as `motor` is steady, or at
-    /// once if it is `forced`.
+    /// Creates a stream of `model` in `mode` that was requested at `asked_ns`. It starts as soon as `motor` is steady,
+    /// or at once if it is `forced`.
     fn new(model: Model, mode: Mode, forced: bool, asked_ns: Nanos, motor: Option<Motion>) -> Stream {
         let steady_ns = if forced { Some(0) } else { motor.map(|motion| motion.steady_ns) };
         let begin_ns = steady_ns.map(|steady_ns| steady_ns.max(asked_ns));
@@ -453,7 +454,8 @@ impl Stream {
         Stream { mode, forced, asked_ns, begin_ns, sample_ns, sent: 0 }
     }
 
-    /// Returns the time of point number `point`, and the clockwise angle of the head from its zero at this time, in degrees.
+    /// Returns the time of point number `point`, and the clockwise angle of the head from its zero at this time, in
+    /// degrees.
     fn place(&self, point: u64, motor: Option<Motion>) -> Option<(Nanos, f64)> {
         let at_ns = self.begin_ns? + (point as f64 * self.sample_ns) as Nanos;
         let turns = motor

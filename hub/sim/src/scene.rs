@@ -1,6 +1,6 @@
-//! A scene as data: its sensors, objects and people, the times at which they are present, and their motion. Lengths are in
-//! millimeters, in the frame of the world, and times in seconds. Everything is a function of time and a seed, so that two
-//! sensors, a test and a bench see the same person.
+//! A scene as data: its sensors, objects and people, the times at which they are present, and their motion. Lengths are
+//! in millimeters, in the frame of the world, and times in seconds. Everything is a function of time and a seed, so
+//! that two sensors, a test and a bench see the same person.
 
 use std::f64::consts::TAU;
 
@@ -158,8 +158,8 @@ pub(crate) struct Plan {
 pub(crate) enum Way {
     /// A closed curve within `reach` of `centre` that the seed selects.
     Roam { centre: Point, reach: Point },
-    /// A polyline of corners, with a rest at each, in seconds. After the last corner, the person disappears, or walks to the
-    /// first corner if the path `repeats`.
+    /// A polyline of corners, with a rest at each, in seconds. After the last corner, the person disappears, or walks
+    /// to the first corner if the path `repeats`.
     Path { corners: Vec<(Point, f64)>, speed: Speed, repeats: bool },
 }
 
@@ -187,7 +187,8 @@ pub(crate) struct Person {
 enum Course {
     /// `pace` is the number of cycles per second along the two axes.
     Roam { centre: Point, reach: Point, pace: Point, phase: Point },
-    /// Time, position and distance walked at each corner, before and after the rest. If the path `repeats`, those of one lap.
+    /// Time, position and distance walked at each corner, before and after the rest. If the path `repeats`, those of
+    /// one lap.
     Path { knots: Vec<(f64, Point, f64)>, repeats: bool },
 }
 
@@ -239,8 +240,8 @@ impl Person {
         Person { from_s, until_s, leg_mm, phase, course }
     }
 
-    /// Returns both legs at `time_s`, as a sensor at the height of the shins sees them. Returns `None` while the person is not
-    /// present.
+    /// Returns both legs at `time_s`, as a sensor at the height of the shins sees them. Returns `None` while the person
+    /// is not present.
     pub(crate) fn legs(&self, time_s: f64) -> Option<[Shape; 2]> {
         self.stand(time_s).map(|stand| self.legs_of(&stand))
     }
@@ -310,7 +311,8 @@ impl Course {
     }
 }
 
-/// Returns time, position and distance walked at each corner, before and after the rest, for a person who starts at `from_s`.
+/// Returns time, position and distance walked at each corner, before and after the rest, for a person who starts at
+/// `from_s`.
 fn course(corners: &[(Point, f64)], from_s: f64, speed: f64) -> Vec<(f64, Point, f64)> {
     let (mut time_s, mut walked) = (from_s, 0.0);
     let mut before = corners[0].0;

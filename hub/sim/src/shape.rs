@@ -1,8 +1,8 @@
 //! Geometry of a world. Lengths are in millimeters.
 //!
-//! A [`Shape`] is flat and seen from the origin, with x to the right and y ahead. Angles are counted from x. For a tilted
-//! scanner, a [`Plane`] cuts everything that has a height into flat shapes. Its frame is that of the mount: x to the right, y
-//! ahead, z up, and the floor at 0.
+//! A [`Shape`] is flat and seen from the origin, with x to the right and y ahead. Angles are counted from x. For a
+//! tilted scanner, a [`Plane`] cuts everything that has a height into flat shapes. Its frame is that of the mount: x to
+//! the right, y ahead, z up, and the floor at 0.
 
 use std::f64::consts::TAU;
 
@@ -41,8 +41,8 @@ impl Shape {
         }
     }
 
-    /// Returns the cosine of the angle at which a ray in `direction` falls on the shape: 1 at a right angle, 0 along the
-    /// shape.
+    /// Returns the cosine of the angle at which a ray in `direction` falls on the shape: 1 at a right angle, 0 along
+    /// the shape.
     pub(crate) fn squareness(&self, direction: Point) -> f64 {
         match *self {
             Shape::Wall { from, to } => {
@@ -56,8 +56,9 @@ impl Shape {
         }
     }
 
-    /// Returns the angles at which the shape is seen from the origin: the first one in degrees, -180 to 180, and the width
-    /// counterclockwise from it. Returns `None` for a post around the origin, and for a wall that points at the origin.
+    /// Returns the angles at which the shape is seen from the origin: the first one in degrees, -180 to 180, and the
+    /// width counterclockwise from it. Returns `None` for a post around the origin, and for a wall that points at the
+    /// origin.
     pub(crate) fn span_deg(&self) -> Option<(f64, f64)> {
         let bearing = |point: Point| point.1.atan2(point.0).to_degrees();
         match *self {

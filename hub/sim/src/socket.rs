@@ -1,5 +1,5 @@
-//! The port that a host opens to reach a simulated scanner: a pty with a name, or a TCP server that passes bytes on as a
-//! serial server in raw mode does. A port that is dropped disappears like an adapter that was unplugged.
+//! The port that a host opens to reach a simulated scanner: a pty with a name, or a TCP server that passes bytes on as
+//! a serial server in raw mode does. A port that is dropped disappears like an adapter that was unplugged.
 
 use std::io::{ErrorKind, Read, Write};
 use std::net::{SocketAddr, TcpListener, TcpStream};
@@ -60,7 +60,8 @@ impl Socket {
         }
     }
 
-    /// Returns the rate of the host's port in bits per second, or `None` for a server, which has the rate of the scanner.
+    /// Returns the rate of the host's port in bits per second, or `None` for a server, which has the rate of the
+    /// scanner.
     pub(crate) fn rate(&self) -> Option<u32> {
         match self {
             Socket::Pty { pty, .. } => Some(pty.rate()),
@@ -84,8 +85,8 @@ impl Socket {
         }
     }
 
-    /// Returns the descriptor to wait for. A pty that no host has open is not waited for, because it would be ready all the
-    /// time.
+    /// Returns the descriptor to wait for. A pty that no host has open is not waited for, because it would be ready all
+    /// the time.
     pub(crate) fn waits_for(&self, is_open: bool) -> Option<BorrowedFd<'_>> {
         match self {
             Socket::Pty { pty, .. } => is_open.then(|| pty.waits_for()),

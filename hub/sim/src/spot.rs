@@ -1,5 +1,5 @@
-//! What one beam measures from the rays that its spot covers: an echo from one surface, or from two, of which it reports
-//! one, the other or a value between. Knows neither units nor codes.
+//! What one beam measures from the rays that its spot covers: an echo from one surface, or from two, of which it
+//! reports one, the other or a value between. Knows neither units nor codes.
 
 use crate::labeled_scan::Met;
 use crate::layers::BeamRng;

@@ -1,5 +1,5 @@
-//! Transmission of bytes at the rate of the line, in the chunks that the receiver's hardware delivers: [`Transmission`] for
-//! one telegram or single byte, and [`TxQueue`] for everything that a rotating scanner sends.
+//! Transmission of bytes at the rate of the line, in the chunks that the receiver's hardware delivers: [`Transmission`]
+//! for one telegram or single byte, and [`TxQueue`] for everything that a rotating scanner sends.
 
 use std::collections::VecDeque;
 
@@ -73,8 +73,8 @@ impl<T> Transmission<T> {
         self.rate
     }
 
-    /// Returns the next chunk, if it is complete at `now`, and whether the line is idle after it. The chunk is empty if the
-    /// transmission was broken off between two bursts.
+    /// Returns the next chunk, if it is complete at `now`, and whether the line is idle after it. The chunk is empty if
+    /// the transmission was broken off between two bursts.
     pub(crate) fn take_chunk(&mut self, now: Nanos) -> Option<(&[u8], bool)> {
         if self.next_chunk_ns() > now {
             return None;
@@ -106,8 +106,8 @@ impl<T> Transmission<T> {
         (self.bytes, self.tag)
     }
 
-    /// Returns the end of the first `count` (at least 1) bytes. If 508 bytes need less time than a turn of the mirror, the
-    /// rest waits for the next turn.
+    /// Returns the end of the first `count` (at least 1) bytes. If 508 bytes need less time than a turn of the mirror,
+    /// the rest waits for the next turn.
     fn through_ns(&self, count: usize) -> Nanos {
         let rate = self.rate;
         let turns = (count - 1) / BYTES_PER_TURN;

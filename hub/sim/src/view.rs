@@ -1,5 +1,5 @@
-//! The surroundings of a scanner. [`WorldView`] is a scene whose random parts a seed has drawn, seen by one scanner. It draws
-//! a [`View`]: the nearest surface in each direction at one time, as a row of narrow rays.
+//! The surroundings of a scanner. [`WorldView`] is a scene whose random parts a seed has drawn, seen by one scanner. It
+//! draws a [`View`]: the nearest surface in each direction at one time, as a row of narrow rays.
 
 use std::ops::Range;
 use std::sync::LazyLock;
@@ -259,8 +259,8 @@ impl View {
         View { faces: self.faces.clone(), hits: self.hits[from..from + RAYS].to_vec(), first: RIGHT }
     }
 
-    /// Copies the rays of `still` around the beam at `angle_deg`. Drops all faces that are not in `still`. The first faces
-    /// must be those of `still`.
+    /// Copies the rays of `still` around the beam at `angle_deg`. Drops all faces that are not in `still`. The first
+    /// faces must be those of `still`.
     pub(crate) fn narrow(&mut self, still: &View, angle_deg: f64) {
         let middle = middle((angle_deg * 1e3) as i32) - still.first;
         self.faces.truncate(still.faces.len());
@@ -303,8 +303,8 @@ impl View {
         &self.hits[middle - REACH..=middle + REACH]
     }
 
-    /// Returns whether a point at the scanner's angle `angle_deg` and `range_mm` is visible: within the field of view, and
-    /// not hidden by a surface.
+    /// Returns whether a point at the scanner's angle `angle_deg` and `range_mm` is visible: within the field of view,
+    /// and not hidden by a surface.
     pub(crate) fn reaches(&self, angle_deg: f64, range_mm: f64) -> bool {
         let ray = ((angle_deg + 180.0) * f64::from(RAYS_PER_DEGREE)).round() as usize + REACH;
         (-90.0..=90.0).contains(&angle_deg) && self.hits[ray - self.first].range_mm > range_mm - 1.0

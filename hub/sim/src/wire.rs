@@ -1,8 +1,8 @@
-//! The line between sensor and port with all its faults; time is an argument: the sensor's chunks go in, what arrives and
-//! why it differs comes out. One implementation for ptys and for tests in virtual time.
+//! The line between sensor and port with all its faults; time is an argument: the sensor's chunks go in, what arrives
+//! and why it differs comes out. One implementation for ptys and for tests in virtual time.
 //!
-//! Drive it like a [`Device`]: call [`Wire::poll_transmit`] until it returns `None`, pass the host's bytes, call again at
-//! [`Wire::poll_timeout`]. What the host's port does (another rate, no reader) comes after it.
+//! Drive it like a [`Device`]: call [`Wire::poll_transmit`] until it returns `None`, pass the host's bytes, call again
+//! at [`Wire::poll_timeout`]. What the host's port does (another rate, no reader) comes after it.
 
 use std::collections::VecDeque;
 

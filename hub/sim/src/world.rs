@@ -1,7 +1,7 @@
 //! The available worlds: some for tests of the scanner, built-in scenes, and scenes in TOML files.
 //!
-//! The parser checks each value of a file at its position, so that a failure names file, line and column. `docs/worlds.md`
-//! describes the format.
+//! The parser checks each value of a file at its position, so that a failure names file, line and column.
+//! `docs/worlds.md` describes the format.
 
 use std::ops::{Range, RangeInclusive};
 use std::path::Path;
@@ -22,8 +22,8 @@ use crate::shape::{Heights, Point, Pose, Shape};
 pub enum World {
     /// Nothing within reach.
     Empty,
-    /// A wall around the scanner at which every value is 640. Its bytes are `80 02` throughout, so each beam except the last
-    /// ends with the first bytes of a header.
+    /// A wall around the scanner at which every value is 640. Its bytes are `80 02` throughout, so each beam except the
+    /// last ends with the first bytes of a header.
     Wall640,
     /// Random values of all bits that the mode can set.
     Random,
@@ -115,8 +115,8 @@ impl FromStr for World {
     ///
     /// # Errors
     ///
-    /// Returns [`Kind::Input`] if there is neither, and [`Kind::Configuration`], with position and remedy, if the file is
-    /// invalid.
+    /// Returns [`Kind::Input`] if there is neither, and [`Kind::Configuration`], with position and remedy, if the file
+    /// is invalid.
     fn from_str(text: &str) -> Result<World, Failure> {
         match text {
             "empty" => Ok(World::Empty),
@@ -260,7 +260,8 @@ enum SpeedFile {
 struct SunFile {
     from_deg: Option<Spanned<f64>>,
     to_deg: Option<Spanned<f64>>,
-    /// Key of an earlier version, in which 0 was to the right. It is refused, because its values are valid in both frames.
+    /// Key of an earlier version, in which 0 was to the right. It is refused, because its values are valid in both
+    /// frames.
     sector_deg: Option<Spanned<(Number, Number)>>,
     from_s: Option<Spanned<f64>>,
     until_s: Option<Spanned<f64>>,

@@ -1,5 +1,5 @@
-//! The program `scanhub-bridge`: finds it, checks its version, and lets it check whether a bridge could connect. Zenoh is
-//! linked into that program, not into this one.
+//! The program `scanhub-bridge`: finds it, checks its version, and lets it check whether a bridge could connect. Zenoh
+//! is linked into that program, not into this one.
 
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
@@ -14,7 +14,8 @@ pub const PROGRAM: &str = "scanhub-bridge";
 /// Remedy if the program is missing.
 const INSTALL: &str = "in the directory of scanhub's source: cargo install --path clients/bridge";
 
-/// Returns the directories in which the program may be, in the order of the search: that of this program, and those of PATH.
+/// Returns the directories in which the program may be, in the order of the search: that of this program, and those of
+/// PATH.
 pub fn places() -> Vec<PathBuf> {
     let own = std::env::current_exe().ok().and_then(|path| path.parent().map(Path::to_owned));
     let path = std::env::var_os("PATH").unwrap_or_default();

@@ -1,5 +1,5 @@
-//! `scanhub configure`: changes the EEPROM settings of an LMS. Reads the settings, shows each difference, asks a person,
-//! writes, reads back, and reports the settings and the state of the scanner, above all after a failure.
+//! `scanhub configure`: changes the EEPROM settings of an LMS. Reads the settings, shows each difference, asks a
+//! person, writes, reads back, and reports the settings and the state of the scanner, above all after a failure.
 
 mod ask;
 mod settings;
@@ -54,8 +54,8 @@ pub enum News<'a> {
 ///
 /// Returns an error of one of these kinds:
 ///
-/// - [`Kind::Configuration`] for a key or a value that is unknown, or that this type of scanner does not support. Nothing
-///   has been written then.
+/// - [`Kind::Configuration`] for a key or a value that is unknown, or that this type of scanner does not support.
+///   Nothing has been written then.
 /// - [`Kind::Usage`] if there is no terminal at which a person could confirm.
 /// - The kinds of a port that cannot be used, [`Kind::Timeout`] if no scanner replies, and [`Kind::Interrupted`].
 /// - [`Kind::Failed`] with the state of the scanner, if the change failed or was not confirmed.

@@ -1,8 +1,8 @@
 //! `scanhub doctor`: checks every condition of a working setup, and reports findings and remedies.
 //!
-//! It changes no scanner, no file and no process, unless the user requests the removal of files that dead processes left. It
-//! opens a port that was named and that no process holds, as the hub would: the port stays raw at the rate of the last
-//! request, and its driver returns bytes at once.
+//! It changes no scanner, no file and no process, unless the user requests the removal of files that dead processes
+//! left. It opens a port that was named and that no process holds, as the hub would: the port stays raw at the rate of
+//! the last request, and its driver returns bytes at once.
 
 mod hub;
 mod line;
@@ -51,8 +51,8 @@ pub struct Subjects {
 pub(crate) struct Subject {
     pub(crate) source: Source,
     pub(crate) link: Option<Link>,
-    /// Whether the user or the configuration named the port. Another port may belong to any device, so nothing is sent to
-    /// it.
+    /// Whether the user or the configuration named the port. Another port may belong to any device, so nothing is sent
+    /// to it.
     pub(crate) named: bool,
 }
 

@@ -1,5 +1,5 @@
-//! Runs protocol state machines on an open port, for a user at a terminal: [`detect`] searches for a rotating scanner, and
-//! [`drive`] runs a conversation with an LMS. A thread of the hub does the same for a link, without an end.
+//! Runs protocol state machines on an open port, for a user at a terminal: [`detect`] searches for a rotating scanner,
+//! and [`drive`] runs a conversation with an LMS. A thread of the hub does the same for a link, without an end.
 
 use std::fmt;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -41,7 +41,8 @@ impl DetectedScanner {
         if self.turns_per_second > 0.0 { self.points_per_second / self.turns_per_second } else { 0.0 }
     }
 
-    /// Returns the share of bytes that belong to no packet, 0 to 1. A fragment at the start of the stream does not count.
+    /// Returns the share of bytes that belong to no packet, 0 to 1. A fragment at the start of the stream does not
+    /// count.
     pub(crate) fn damaged(&self) -> f64 {
         self.account.damaged as f64 / (self.account.in_telegrams + self.account.damaged).max(1) as f64
     }
@@ -74,9 +75,9 @@ pub(crate) fn turning() -> Vec<(Family, &'static Features)> {
     known
 }
 
-/// Searches `port` for a scanner of `family`, at all rates of the family unless the port has a fixed rate. Calls `look` with
-/// each rate. Returns the scanner, if more packets arrived than could match by chance; otherwise the number of bytes
-/// received.
+/// Searches `port` for a scanner of `family`, at all rates of the family unless the port has a fixed rate. Calls `look`
+/// with each rate. Returns the scanner, if more packets arrived than could match by chance; otherwise the number of
+/// bytes received.
 ///
 /// Sends nothing to a scanner that streams without a request. From other scanners it requests identity and health, lets
 /// them measure for a second, and stops them as a hub does.
@@ -163,7 +164,8 @@ pub(crate) fn detect(
     }))
 }
 
-/// Returns the failure for a port called `name` at which no scanner of `family` was detected, after `bytes` bytes arrived.
+/// Returns the failure for a port called `name` at which no scanner of `family` was detected, after `bytes` bytes
+/// arrived.
 pub(crate) fn not_detected(name: &str, family: Family, features: &Features, bytes: u64) -> Failure {
     let mut rates: Vec<u32> = features.models.iter().map(|model| model.baud).collect();
     rates.sort_unstable();
@@ -292,8 +294,8 @@ const PACKETS_TIMEOUT: Nanos = 650 * MILLIS;
 /// Timeout for [`MIN_REVOLUTIONS`]. It is long enough for a head that makes two revolutions per second.
 const REVOLUTIONS_TIMEOUT: Nanos = 4_000 * MILLIS;
 
-/// Runs `conversation` with an LMS on `port` until it ends. Calls `progress` before each wait. Skips rates that the port
-/// cannot have.
+/// Runs `conversation` with an LMS on `port` until it ends. Calls `progress` before each wait. Skips rates that the
+/// port cannot have.
 ///
 /// # Errors
 ///
@@ -326,8 +328,8 @@ pub(crate) fn drive<C: Conversation>(
     Ok(())
 }
 
-/// Carries out the actions of `conversation` until it waits or ends. Returns the end of the wait. Logs a rate that the port
-/// refuses, unless it is in `refused`, and adds it there.
+/// Carries out the actions of `conversation` until it waits or ends. Returns the end of the wait. Logs a rate that the
+/// port refuses, unless it is in `refused`, and adds it there.
 fn carry_out<C: Conversation>(
     port: &Port,
     conversation: &mut C,

@@ -1,5 +1,5 @@
-//! The commands that open a port or explain telegrams without a hub: `probe`, `doctor`, `configure` and `telegram`. Each
-//! runs once, and reports its progress to the user at the terminal.
+//! The commands that open a port or explain telegrams without a hub: `probe`, `doctor`, `configure` and `telegram`.
+//! Each runs once, and reports its progress to the user at the terminal.
 
 pub mod bridge_program;
 pub mod configure;

@@ -85,13 +85,13 @@ impl Ports {
     }
 }
 
-/// Finds the scanner at `source`. Listens for scanners that stream without a request before it sends one. Calls `look` with
-/// each rate at which it searches.
+/// Finds the scanner at `source`. Listens for scanners that stream without a request before it sends one. Calls `look`
+/// with each rate at which it searches.
 ///
 /// # Errors
 ///
-/// Returns the kinds of a port that cannot be used, [`Kind::Timeout`] if no scanner replies, and [`Kind::Interrupted`] if
-/// `stop` is set.
+/// Returns the kinds of a port that cannot be used, [`Kind::Timeout`] if no scanner replies, and [`Kind::Interrupted`]
+/// if `stop` is set.
 pub fn probe(source: &Source, stop: &AtomicBool, look: impl FnMut(u32)) -> Result<Probed, Failure> {
     let (port, first) = open(source, stop)?;
     let there = found_in(Path::new("/"));
@@ -122,8 +122,8 @@ pub(crate) enum Answer {
     Detected(Box<DetectedScanner>),
 }
 
-/// Finds the scanner at `port`, which is open at `first`. The scanner may be of any family, or of `only` one. Listens for
-/// scanners that stream without a request before it sends one.
+/// Finds the scanner at `port`, which is open at `first`. The scanner may be of any family, or of `only` one. Listens
+/// for scanners that stream without a request before it sends one.
 ///
 /// # Errors
 ///
@@ -216,7 +216,8 @@ pub(crate) fn request_report(
     if report.answers() { Ok(report) } else { Err(silence(source, first, &report)) }
 }
 
-/// Returns the failure for a scanner that did not reply, with possible reasons. The highest rate of the port is `first`.
+/// Returns the failure for a scanner that did not reply, with possible reasons. The highest rate of the port is
+/// `first`.
 fn silence(source: &Source, first: Baud, report: &Report) -> Failure {
     let name = source.name();
     let came = match report.bytes {

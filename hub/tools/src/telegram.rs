@@ -30,8 +30,8 @@ pub struct DecodeOptions {
     pub json: bool,
 }
 
-/// Explains all telegrams in a stream of bytes, in hexadecimal text or inside an MCAP recording, and accounts for the bytes
-/// between them. Bytes of a recording are those of its telegrams, in order.
+/// Explains all telegrams in a stream of bytes, in hexadecimal text or inside an MCAP recording, and accounts for the
+/// bytes between them. Bytes of a recording are those of its telegrams, in order.
 ///
 /// [`Kind::Check`] if there is no telegram in it, [`Kind::Input`] if it cannot be read; [`Kind::NoTopic`] and
 /// [`Kind::Usage`] if it has no such sensor, or several and none is chosen.

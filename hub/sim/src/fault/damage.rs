@@ -1,8 +1,8 @@
-//! Damage to bytes and telegrams. A byte is lost, flipped or doubled, or has random bytes before it. A telegram is truncated,
-//! broken off or sent twice, or has another length field.
+//! Damage to bytes and telegrams. A byte is lost, flipped or doubled, or has random bytes before it. A telegram is
+//! truncated, broken off or sent twice, or has another length field.
 //!
-//! The random numbers of each byte are drawn in any case, so that the same seed damages the same bytes in every run. Those of
-//! a telegram are drawn at its start.
+//! The random numbers of each byte are drawn in any case, so that the same seed damages the same bytes in every run.
+//! Those of a telegram are drawn at its start.
 
 use scanhub_drivers::lms;
 
@@ -102,7 +102,8 @@ impl Noise {
         }
     }
 
-    /// Returns the mask of flipped bits. The lowest bit is sent first, so a run continues in the low bits of the next byte.
+    /// Returns the mask of flipped bits. The lowest bit is sent first, so a run continues in the low bits of the next
+    /// byte.
     fn flipped(&mut self) -> u8 {
         let mut first = 0;
         if self.bits_left == 0 {

@@ -1,5 +1,5 @@
-//! Faults that happen at a time: [`Schedule`] has points in time, [`Window`] spans of time, [`Extra`] garbage that arrives
-//! now and then, and [`Lateness`] the delays of chunks. Times are those of the scanner, from 0 on.
+//! Faults that happen at a time: [`Schedule`] has points in time, [`Window`] spans of time, [`Extra`] garbage that
+//! arrives now and then, and [`Lateness`] the delays of chunks. Times are those of the scanner, from 0 on.
 
 use schema::{MILLIS, Nanos};
 
@@ -157,8 +157,8 @@ impl Extra {
         if inside == self.wants_inside { self.schedule.next_ns() } else { Nanos::MAX }
     }
 
-    /// Returns the garbage, if it is due before the byte that ends at `now`. `header` has the first bytes of the stream's
-    /// telegrams.
+    /// Returns the garbage, if it is due before the byte that ends at `now`. `header` has the first bytes of the
+    /// stream's telegrams.
     pub(crate) fn take(&mut self, now: Nanos, inside: bool, header: &[u8]) -> Option<Vec<u8>> {
         if self.due_ns(inside) > now {
             return None;

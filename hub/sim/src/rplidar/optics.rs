@@ -1,10 +1,10 @@
-//! What a head sees point by point: where a point is that its laser meets, which of them come back, and how strong. Knows
-//! neither packets nor requests.
+//! What a head sees point by point: where a point is that its laser meets, which of them come back, and how strong.
+//! Knows neither packets nor requests.
 //!
 //! The laser of a scanner that triangulates sits beside its lens. So the angle of a point lies behind the head's by a
 //! shift that depends on its range, and points at the edge of something near come out of angular order. The vendor's
-//! decoder of the type 0x84 has the shift as a formula; it is taken for all of such a scanner's modes. Where the formula
-//! has no solution, at an edge, nothing comes back.
+//! decoder of the type 0x84 has the shift as a formula; it is taken for all of such a scanner's modes. Where the
+//! formula has no solution, at an edge, nothing comes back.
 
 use schema::Nanos;
 
@@ -31,7 +31,8 @@ impl Optics {
         TruePoint { at_ns, clockwise_deg, range_mm: look.and_then(|look| look.exact_mm) }
     }
 
-    /// The point measured at `at_ns` while the head was at `head_deg`, as the scanner has it in a mode that reaches so far.
+    /// The point measured at `at_ns` while the head was at `head_deg`, as the scanner has it in a mode that reaches so
+    /// far.
     pub(crate) fn measure(&mut self, at_ns: Nanos, head_deg: f64, reach_m: f64) -> Reading {
         let (clockwise_deg, look) = self.meet(at_ns, head_deg);
         let behind_deg = self.behind_of_nothing_deg(at_ns);
@@ -69,8 +70,9 @@ impl Optics {
         (behind(None), None)
     }
 
-    /// How far behind the head a point is told to be of which nothing came back. A real A1 tells 12 % of its points out of
-    /// angular order, and the first one of a turn anywhere from 351 to 359.5 degrees; which rule it follows is not known.
+    /// How far behind the head a point is told to be of which nothing came back. A real A1 tells 12 % of its points out
+    /// of angular order, and the first one of a turn anywhere from 351 to 359.5 degrees; which rule it follows is not
+    /// known.
     fn behind_of_nothing_deg(&self, at_ns: Nanos) -> f64 {
         if !self.model.triangulates() {
             return 0.0;
@@ -92,9 +94,9 @@ impl Optics {
     }
 }
 
-/// By how many degrees a point at `range_mm` lies behind the head, with the steps that the vendor's decoder has: 8 degrees
-/// less k / 1024 less k^3 / 6442450944 radians, where k is the whole part of 98361 / (4 range); 7.5 degrees below 50 mm
-/// and for no return.
+/// By how many degrees a point at `range_mm` lies behind the head, with the steps that the vendor's decoder has: 8
+/// degrees less k / 1024 less k^3 / 6442450944 radians, where k is the whole part of 98361 / (4 range); 7.5 degrees
+/// below 50 mm and for no return.
 pub(crate) fn shift_deg(range_mm: Option<f64>) -> f64 {
     match range_mm {
         Some(range_mm) if range_mm >= 50.0 => {

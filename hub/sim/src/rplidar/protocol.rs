@@ -1,8 +1,8 @@
 //! The wire format of an RPLIDAR: decodes requests, and encodes responses and packets of points.
 //!
-//! A request is `A5 command`. If the top bit of the command is set, a length, a payload of this length and the XOR of all
-//! bytes follow. A response is a descriptor and its data. Angles and ranges are rounded here to the resolution of the format.
-//! The driver has its own description of the protocol, so that an error in one of them is noticed.
+//! A request is `A5 command`. If the top bit of the command is set, a length, a payload of this length and the XOR of
+//! all bytes follow. A response is a descriptor and its data. Angles and ranges are rounded here to the resolution of
+//! the format. The driver has its own description of the protocol, so that an error in one of them is noticed.
 
 use super::models::{Mode, Model};
 
@@ -41,8 +41,8 @@ pub(crate) struct Decoder {
 }
 
 impl Decoder {
-    /// Adds a byte, and returns the request that it completes. Requests with a wrong checksum, a wrong length or an unknown
-    /// command are dropped.
+    /// Adds a byte, and returns the request that it completes. Requests with a wrong checksum, a wrong length or an
+    /// unknown command are dropped.
     pub(crate) fn hear(&mut self, byte: u8) -> Option<Request> {
         if self.bytes.is_empty() && byte != START {
             return None;
@@ -97,7 +97,8 @@ const START: u8 = 0xA5;
 /// The bit of a command that has a payload.
 const PAYLOAD: u8 = 0x80;
 
-/// Encodes a descriptor: `A5 5A`, the length of a response in 30 bits, 2 bits that announce further responses, and the type.
+/// Encodes a descriptor: `A5 5A`, the length of a response in 30 bits, 2 bits that announce further responses, and the
+/// type.
 fn descriptor(len: usize, follows: bool, answer: u8) -> Vec<u8> {
     let word = len as u32 | u32::from(follows) << 30;
     [&[0xA5, 0x5A][..], &word.to_le_bytes(), &[answer]].concat()
@@ -196,8 +197,8 @@ pub(crate) struct Reading {
     pub(crate) begins_turn: bool,
 }
 
-/// Encodes a packet of type 0x81: quality and the flag of a new revolution with its inverse, the angle in 1/64 degree with a
-/// bit that is always 1, and the range in 1/4 millimeter.
+/// Encodes a packet of type 0x81: quality and the flag of a new revolution with its inverse, the angle in 1/64 degree
+/// with a bit that is always 1, and the range in 1/4 millimeter.
 pub(crate) fn standard(reading: &Reading) -> Vec<u8> {
     let flags = if reading.begins_turn { 0b01 } else { 0b10 };
     let angle = sixty_fourths(reading.clockwise_deg) << 1 | 1;
@@ -224,9 +225,9 @@ pub(crate) fn express(is_first: bool, readings: &[Reading]) -> Vec<u8> {
     sealed(body)
 }
 
-/// Encodes a packet of type 0x84: 32 words. Each word has one range of 12 bits, on a scale whose steps grow with the range.
-/// Two differences of 10 bits follow, in steps of that scale: one from this range, and one from the range of the next word. A
-/// range that no difference reaches becomes no return. `next` is the first range of the next packet.
+/// Encodes a packet of type 0x84: 32 words. Each word has one range of 12 bits, on a scale whose steps grow with the
+/// range. Two differences of 10 bits follow, in steps of that scale: one from this range, and one from the range of the
+/// next word. A range that no difference reaches becomes no return. `next` is the first range of the next packet.
 pub(crate) fn ultra(is_first: bool, readings: &[Reading], next: &Reading) -> Vec<u8> {
     let mut body = head(is_first, readings);
     let majors: Vec<u16> =
@@ -249,8 +250,8 @@ pub(crate) fn dense(is_first: bool, readings: &[Reading]) -> Vec<u8> {
     sealed(body)
 }
 
-/// Encodes a packet of type 0x86: the scanner's clock and state, and 32 pairs of 20 bits. Each point has a scale of 2 to
-/// 5 mm, a range on this scale, and the upper bits of the quality.
+/// Encodes a packet of type 0x86: the scanner's clock and state, and 32 pairs of 20 bits. Each point has a scale of 2
+/// to 5 mm, a range on this scale, and the upper bits of the quality.
 pub(crate) fn ultra_dense(is_first: bool, clock: u32, readings: &[Reading]) -> Vec<u8> {
     let mut body = clock.to_le_bytes().to_vec();
     // The state of the scanner. The vendor's headers name it, without its values.

@@ -1,5 +1,5 @@
-//! Asks a person at a terminal whether to carry out a plan. The only place that creates consent: nothing is written into a
-//! sensor unless a person has typed `yes`.
+//! Asks a person at a terminal whether to carry out a plan. The only place that creates consent: nothing is written
+//! into a sensor unless a person has typed `yes`.
 
 use std::io::{IsTerminal, Write, stderr, stdin};
 use std::sync::atomic::{AtomicBool, Ordering};

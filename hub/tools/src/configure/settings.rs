@@ -1,5 +1,5 @@
-//! The settings of the command line, `KEY=VALUE`: their keys, their valid values, and what each changes in a configuration.
-//! A setting that the type of the scanner does not support is refused with the reason.
+//! The settings of the command line, `KEY=VALUE`: their keys, their valid values, and what each changes in a
+//! configuration. A setting that the type of the scanner does not support is refused with the reason.
 
 use lms_configure::{OwnedConfiguration, Plan, eeprom::PowerOn};
 use scanhub_drivers::lms::family::Family;
@@ -28,8 +28,8 @@ impl SettingsRequest {
     ///
     /// # Errors
     ///
-    /// Returns [`Kind::Configuration`] with key, value and the valid values if a setting is invalid, and [`Kind::Usage`] if
-    /// there is none.
+    /// Returns [`Kind::Configuration`] with key, value and the valid values if a setting is invalid, and
+    /// [`Kind::Usage`] if there is none.
     pub(crate) fn parse(settings: &[String]) -> Result<SettingsRequest, Failure> {
         if settings.is_empty() {
             let keys: Vec<String> = KEYS.iter().map(|(key, values, _)| format!("{key}={values}")).collect();

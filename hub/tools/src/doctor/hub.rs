@@ -1,4 +1,5 @@
-//! The links of a running hub, as it reports them. No other process can send a request to a scanner whose port the hub holds.
+//! The links of a running hub, as it reports them. No other process can send a request to a scanner whose port the hub
+//! holds.
 
 use std::time::Duration;
 

@@ -1,5 +1,5 @@
-//! Checks one port from the outside in: existence, holders, permissions and rates. Then follow the scanner at its other end,
-//! and the bytes that the line has damaged or lost.
+//! Checks one port from the outside in: existence, holders, permissions and rates. Then follow the scanner at its other
+//! end, and the bytes that the line has damaged or lost.
 
 use std::path::Path;
 use std::sync::atomic::AtomicBool;
@@ -134,7 +134,8 @@ fn server(
     }
 }
 
-/// Rate at which a rotating scanner was found, and the findings about the scanner. Otherwise the reason why none replied.
+/// Rate at which a rotating scanner was found, and the findings about the scanner. Otherwise the reason why none
+/// replied.
 type Examined = Result<(Option<u32>, Vec<Finding>), Finding>;
 
 /// Checks the scanner at `port`, which is open at `first`.
@@ -259,8 +260,8 @@ fn latency(path: &Path, ms: Option<u8>) -> Finding {
     )
 }
 
-/// Checks whether the port supports the rate of the stream: the rate of the rotating scanner that was `found`, or that of
-/// the link.
+/// Checks whether the port supports the rate of the stream: the rate of the rotating scanner that was `found`, or that
+/// of the link.
 fn rate(subject: &Subject, port: &Port, first: Baud, found: Option<u32>) -> Finding {
     const NAME: &str = "rate";
     let link_rate = subject.link.as_ref().map_or(Baud::B500000.rate(), config::Link::rate);

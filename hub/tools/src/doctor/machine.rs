@@ -1,6 +1,6 @@
-//! Checks what a hub needs from the machine, whatever its sensors are: shared memory, its own domain, descriptors and file
-//! sizes, and the network interface of a gateway. Most checks judge [`Facts`] that were gathered before, so that tests can
-//! provide any facts.
+//! Checks what a hub needs from the machine, whatever its sensors are: shared memory, its own domain, descriptors and
+//! file sizes, and the network interface of a gateway. Most checks judge [`Facts`] that were gathered before, so that
+//! tests can provide any facts.
 
 use std::fs;
 use std::os::unix::fs::MetadataExt;
@@ -236,8 +236,8 @@ pub(crate) fn domain(facts: &Facts) -> Finding {
     Finding::ok(NAME, format!("{root}: free, yours, mode {:04o}", place.mode))
 }
 
-/// Checks whether there is only one hub of this name for clients that name no location. `name_of` returns the name of the
-/// owner of another location.
+/// Checks whether there is only one hub of this name for clients that name no location. `name_of` returns the name of
+/// the owner of another location.
 pub(crate) fn hubs(facts: &Facts, name_of: impl Fn(u32) -> String) -> Finding {
     const NAME: &str = "hubs";
     let others: Vec<String> =
@@ -300,7 +300,8 @@ pub(crate) fn descriptors(facts: &Facts) -> Finding {
     if consumers >= MIN_SUBSCRIBERS { Finding::ok(NAME, text) } else { Finding::warning(NAME, text, remedy) }
 }
 
-/// Checks whether a hub may create files as long as the longest segment. A signal ends a process that exceeds the limit.
+/// Checks whether a hub may create files as long as the longest segment. A signal ends a process that exceeds the
+/// limit.
 pub(crate) fn file_size(facts: &Facts) -> Finding {
     const NAME: &str = "file-size";
     let Some(limit) = facts.file_size else { return Finding::ok(NAME, "no limit") };

@@ -1,5 +1,5 @@
-//! Checks whether the scanner at a port has the configured settings, and is healthy. An LMS comes first, then a link of the
-//! hub, and last a rotating scanner. `probe` sends the requests.
+//! Checks whether the scanner at a port has the configured settings, and is healthy. An LMS comes first, then a link of
+//! the hub, and last a rotating scanner. `probe` sends the requests.
 
 use config::{Link, Scanner};
 use scanhub_drivers::line::family::Condition as ReportedHealth;
@@ -38,8 +38,8 @@ pub(crate) fn as_the_hub_says(link: Option<(&str, &Status)>, why_unknown: &str) 
     }
 }
 
-/// Checks whether the measuring mode has bits for reflectors. Returns `None` if the mode is unknown, or if a scanner without
-/// these bits needs no remedy.
+/// Checks whether the measuring mode has bits for reflectors. Returns `None` if the mode is unknown, or if a scanner
+/// without these bits needs no remedy.
 fn marks(status: &Status, when: &str) -> Option<Finding> {
     const NAME: &str = "marks";
     let Some(remedy) = status.reflector_remedy() else {

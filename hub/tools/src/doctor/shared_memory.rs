@@ -1,9 +1,9 @@
-//! Checks the files of a domain in shared memory, and removes those that dead processes left. The next hub does that, too,
-//! for files that are certainly its own. If no hub starts at this location again, only this module removes them.
+//! Checks the files of a domain in shared memory, and removes those that dead processes left. The next hub does that,
+//! too, for files that are certainly its own. If no hub starts at this location again, only this module removes them.
 //!
-//! The names of the files contain only the name of the domain, which a hub at another location may have, too. Files that a
-//! process still holds are therefore never counted as left. Files of other users under these names are never opened, but
-//! they can prevent the start of the hub.
+//! The names of the files contain only the name of the domain, which a hub at another location may have, too. Files
+//! that a process still holds are therefore never counted as left. Files of other users under these names are never
+//! opened, but they can prevent the start of the hub.
 
 use std::fs;
 use std::os::unix::fs::MetadataExt;
@@ -61,8 +61,8 @@ pub(crate) fn leftovers(facts: &Facts) -> Finding {
     }
 }
 
-/// Removes everything that dead processes of `user` left in this domain, at all its `places`, and reports it. Has no effect
-/// while a hub or a listener runs at one of them.
+/// Removes everything that dead processes of `user` left in this domain, at all its `places`, and reports it. Has no
+/// effect while a hub or a listener runs at one of them.
 pub(crate) fn clean(places: &[&Domain], user: u32) -> Finding {
     const NAME: &str = "clean";
     let Some(prefix) = places.first().map(|place| place.prefix()) else {
@@ -145,9 +145,9 @@ fn files(prefix: &str, user: u32) -> Vec<SharedFile> {
     files
 }
 
-/// Returns those of the [`files`] that no process has open or mapped. No process keeps the library's lock open. The lock
-/// counts as held if a process holds another file whose name begins in the same way, because a domain of this name at
-/// another location uses it.
+/// Returns those of the [`files`] that no process has open or mapped. No process keeps the library's lock open. The
+/// lock counts as held if a process holds another file whose name begins in the same way, because a domain of this name
+/// at another location uses it.
 fn unheld(prefix: &str, user: u32) -> Vec<SharedFile> {
     let files = files(prefix, user);
     let (free, held): (Vec<_>, Vec<_>) = files.into_iter().partition(|file| is_unheld(&file.path));
@@ -166,8 +166,8 @@ pub(crate) fn abandoned(prefix: &str, user: u32) -> Vec<SharedFile> {
     files
 }
 
-/// Returns the library's lock if it is the only file. No process keeps it open, so next to other files it may belong to a
-/// hub that runs.
+/// Returns the library's lock if it is the only file. No process keeps it open, so next to other files it may belong to
+/// a hub that runs.
 pub(crate) fn lock(prefix: &str, user: u32) -> Option<PathBuf> {
     let files = files(prefix, user);
     let is_alone = files.iter().all(|file| file.bytes <= ALWAYS_LEFT);
@@ -257,7 +257,8 @@ mod tests {
         );
     }
 
-    /// Waits until no process has `path` open. A child that another test starts has a copy of all descriptors for a moment.
+    /// Waits until no process has `path` open. A child that another test starts has a copy of all descriptors for a
+    /// moment.
     fn await_unheld(prefix: &str, user: u32, path: &Path) {
         let give_up_at = Instant::now() + Duration::from_secs(60);
         while !unheld(prefix, user).iter().any(|file| file.path == path) {

@@ -1,5 +1,5 @@
-//! The machine's own files, below a directory that need not be the root of this machine, so that tests can provide files of
-//! an administrator.
+//! The machine's own files, below a directory that need not be the root of this machine, so that tests can provide
+//! files of an administrator.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -47,8 +47,8 @@ impl System {
         paths.into_iter().find(|path| path.symlink_metadata().is_ok())
     }
 
-    /// Returns the files of `directories` whose names end with `.conf`, in the order of their names. If several files have the
-    /// same name, only that of the first directory counts (as systemd reads drop-in files).
+    /// Returns the files of `directories` whose names end with `.conf`, in the order of their names. If several files
+    /// have the same name, only that of the first directory counts (as systemd reads drop-in files).
     pub(crate) fn drop_ins(&self, directories: &[String]) -> Vec<PathBuf> {
         let mut found: Vec<PathBuf> = Vec::new();
         for directory in directories {

@@ -1,6 +1,6 @@
 //! Checks the files that systemd, udev and logind read: the service with its program and the udev rule, which
-//! `hub/dist/install.sh` installs, and what logind does to shared memory at logout. Reads only files. A hub that is started by
-//! hand needs neither service nor rule.
+//! `hub/dist/install.sh` installs, and what logind does to shared memory at logout. Reads only files. A hub that is
+//! started by hand needs neither service nor rule.
 
 use std::fs;
 use std::io::ErrorKind;
@@ -12,8 +12,8 @@ use schema::regular;
 use super::version::{Build, VERSION, compare};
 use super::{Finding, System};
 
-/// Checks whether the service is installed, starts this version, and runs if it is enabled. `hub` is the process of the hub,
-/// if one runs.
+/// Checks whether the service is installed, starts this version, and runs if it is enabled. `hub` is the process of the
+/// hub, if one runs.
 pub(crate) fn service(system: &System, hub: Option<u32>) -> Finding {
     const NAME: &str = "service";
     let Some(unit) = system.first(&UNITS, UNIT) else {
@@ -153,8 +153,9 @@ const RULES: [&str; 5] = [
 ];
 const INSTALL: &str = "sudo hub/dist/install.sh puts this version in place";
 
-/// Checks whether the shared memory of the hub of `user` remains when this user logs out. At the end of the last session of
-/// an ordinary user, logind removes their files in /dev/shm, even while a hub uses them (logind.conf(5), `RemoveIPC=`).
+/// Checks whether the shared memory of the hub of `user` remains when this user logs out. At the end of the last
+/// session of an ordinary user, logind removes their files in /dev/shm, even while a hub uses them (logind.conf(5),
+/// `RemoveIPC=`).
 pub(crate) fn logout(system: &System, user: u32) -> Finding {
     const NAME: &str = "logout";
     let name = system.name_of(user);

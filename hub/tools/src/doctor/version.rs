@@ -80,8 +80,8 @@ fn running(pid: u32) -> Option<Running> {
     Some(Running { build, is_replaced: link.to_string_lossy().ends_with(" (deleted)") })
 }
 
-/// Compares `program` with this one. Starts it to query its version only if it is `trusted`, and if only this user and root
-/// can write it.
+/// Compares `program` with this one. Starts it to query its version only if it is `trusted`, and if only this user and
+/// root can write it.
 ///
 /// # Errors
 ///

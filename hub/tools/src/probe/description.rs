@@ -1,5 +1,5 @@
-//! Descriptions of a scanner that was found, as text and as JSON of class `probe`: [`Description`] of an LMS, and [`Turning`]
-//! of a rotating scanner.
+//! Descriptions of a scanner that was found, as text and as JSON of class `probe`: [`Description`] of an LMS, and
+//! [`Turning`] of a rotating scanner.
 
 use std::fmt;
 

@@ -1,4 +1,5 @@
-//! The link that a configuration needs for a scanner that was found: as a command for the shell, and as a section of a file.
+//! The link that a configuration needs for a scanner that was found: as a command for the shell, and as a section of a
+//! file.
 
 use std::path::{Path, PathBuf};
 

@@ -1,5 +1,5 @@
-//! The bytes to decode, from raw bytes, hexadecimal text or a recording. Text is detected by its first bytes, because raw
-//! bytes are hardly ever all printable characters.
+//! The bytes to decode, from raw bytes, hexadecimal text or a recording. Text is detected by its first bytes, because
+//! raw bytes are hardly ever all printable characters.
 
 use std::collections::VecDeque;
 use std::fs::File;
@@ -81,8 +81,8 @@ impl Input {
     }
 }
 
-/// Parses pairs of hexadecimal digits, with the usual separators and prefixes. Text between double quotes stands for its
-/// own bytes.
+/// Parses pairs of hexadecimal digits, with the usual separators and prefixes. Text between double quotes stands for
+/// its own bytes.
 pub(super) fn parse(text: &str) -> Result<Vec<u8>, String> {
     let mut bytes = Vec::new();
     for (line, text) in text.lines().enumerate() {
@@ -121,8 +121,8 @@ pub(super) fn is_framed(path: &Path) -> bool {
             .is_ok_and(|len| Recording::is_framed(&head[..len]))
 }
 
-/// Returns the telegrams of `sensor` in the recording at `path`, as the bytes of a line. A recording of one sensor needs no
-/// name.
+/// Returns the telegrams of `sensor` in the recording at `path`, as the bytes of a line. A recording of one sensor
+/// needs no name.
 ///
 /// # Errors
 ///
