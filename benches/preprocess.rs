@@ -1,5 +1,5 @@
-//! What do the hub's processors cost for one scan of 361 beams, with a person who walks through the room of the paper's
-//! Fig. 8? Targets: zones, marks and background together 1 us with the method `paper`, 3 us with `multi`; 5 us with
+//! CPU time of the hub's processors for one scan of 361 beams, with a person who walks through the room of the paper's
+//! Fig. 8. Targets: zones, marks and background together 1 us with the method `paper`, 3 us with `multi`; 5 us with
 //! segments.
 
 #![allow(missing_docs)] // criterion's macros make public functions

@@ -1,6 +1,5 @@
-//! Who publishes in a domain: at most one hub, one listener that publishes topics of other machines, and any number of
-//! programs beside them, each under a name of its own. Each holds a lock that ends with its process. Consumers ask who
-//! holds the locks and never hold one themselves. Refuses to know what is published.
+//! Locks of the publishers in a domain: at most one hub, at most one listener for remote sensors, and any number of programs
+//! that publish under their own name. A lock ends with its process. Subscribers query the locks but never take one.
 
 use std::fs::File;
 use std::io;

@@ -2,7 +2,7 @@
 //! scans of telegrams and revolutions.
 //!
 //! Sans-I/O: the caller passes bytes and the time, and gets bytes, events and deadlines back. No driver opens a port, reads a
-//! clock or starts a thread. Bytes that are no telegram are counted; they are never an error.
+//! clock or starts a thread. Bytes outside telegrams are counted and are never an error.
 #![forbid(unsafe_code)]
 
 pub mod ld;

@@ -1,5 +1,5 @@
 //! What makes a measured range different from the true one, layer by layer, each with its own switch. Two layers have
-//! no switch: ranges are sent in whole units, and a range beyond the greatest value is sent as a code. Knows no shapes.
+//! no switch: ranges are sent in whole units, and a range beyond the greatest value is sent as a code.
 
 use scanhub_drivers::lms;
 use schema::Nanos;

@@ -1,5 +1,5 @@
-//! What one beam measures from the rays that its spot covers: an echo from one surface, or from two, of which it
-//! reports one, the other or a value between. Knows neither units nor codes.
+//! The echo of one beam, computed from the rays that its spot covers. If they hit two surfaces, the scanner reports one of
+//! them, or a value between them.
 
 use crate::labeled_scan::Met;
 use crate::layers::BeamRng;

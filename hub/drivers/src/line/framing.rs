@@ -2,7 +2,7 @@
 //!
 //! An 8-bit checksum is right by chance in 1 of 256 cases, and a packet that lost bytes includes the beginning of the next one.
 //! A packet that contains another header is therefore accepted only if a header follows it, or if the bytes from the inner
-//! header on are no packet.
+//! header on are not a packet.
 
 /// Format of packets that have a fixed length and begin with a header of two bytes.
 pub trait Format {

@@ -1,5 +1,4 @@
-//! What a head sees point by point: where a point is that its laser meets, which of them come back, and how strong.
-//! Knows neither packets nor requests.
+//! Optics of the head: for each point, the position that the laser hits, and whether and how strongly it is reflected.
 //!
 //! The laser of a scanner that triangulates sits beside its lens. So the angle of a point lies behind the head's by a
 //! shift that depends on its range, and points at the edge of something near come out of angular order. The vendor's
