@@ -59,7 +59,7 @@ fn it_shows_what_comes_and_says_why_nothing_does() {
     page.open(&url);
     page.await_true("window.scanhub?.connected && /no hub/.test(window.scanhub.reason)");
     assert_eq!(page.ask("scanhub.verdict"), "unknown");
-    assert_eq!(page.ask("/scanhub run/.test(scanhub.reason)"), true, "and what to do");
+    page.await_true("/scanhub run/.test(scanhub.reason)");
     let red = page.ask(COLOUR);
 
     // One that does not answer yet says where it is looked for, and what looks into that.
@@ -148,7 +148,7 @@ fn keys_and_the_mouse_change_the_picture() {
     page.press("Escape");
     page.await_true("!document.querySelector('#help').open");
     // Nothing is wider than the screen, and every key can be hit by a finger.
-    assert_eq!(page.ask("document.documentElement.scrollWidth <= 390"), true);
+    page.await_true("document.documentElement.scrollWidth <= 390");
     // One that is hidden has no height.
     let small = "[...document.querySelectorAll('nav button:not([hidden])')].filter((one) => one.offsetHeight < 40).length";
     assert_eq!(page.ask(small), 0);

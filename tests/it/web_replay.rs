@@ -36,10 +36,7 @@ fn the_keys_of_a_player_are_on_the_page() {
     page.await_true("window.scanhub?.beams === 181 && scanhub.player && !scanhub.player.paused");
     let own = format!("sh_web-{}_", server.pid());
     assert!(!shared_memory(&own).is_empty(), "a hub of its own");
-    assert_eq!(
-        page.ask("document.querySelector('#line').max > 119 && document.querySelector('#line').value > 0"),
-        true
-    );
+    page.await_true("document.querySelector('#line').max > 119 && document.querySelector('#line').value > 0");
 
     // Paused by a key: the picture stands, longer than a scan is what is there.
     page.press("p");
@@ -69,12 +66,9 @@ fn the_keys_of_a_player_are_on_the_page() {
     }
     page.press("p");
     page.await_true("scanhub.player.over && /at its end/.test(document.querySelector('#played').innerText)");
-    assert_eq!(
-        page.ask(&format!(
-            "document.querySelector('[data-order=step]').disabled && scanhub.player.telegrams === {SCANS}"
-        )),
-        true
-    );
+    page.await_true(&format!(
+        "document.querySelector('[data-order=step]').disabled && scanhub.player.telegrams === {SCANS}"
+    ));
     assert_eq!(page.ask("scanhub.beams"), 181, "what was seen last stands");
     assert!(page.complaints.is_empty(), "{:?}", page.complaints);
     let outcome = server.end(INT);
@@ -89,7 +83,7 @@ fn a_recording_starts_again_and_what_is_none_is_refused() {
     let (server, url) = show(&env, &log(&env, 8), &["--loop"]);
     page.open(&url);
     page.await_true("window.scanhub?.player?.lap >= 1 && scanhub.beams === 181");
-    assert_eq!(page.ask("document.documentElement.scrollWidth <= 390"), true);
+    page.await_true("document.documentElement.scrollWidth <= 390");
     assert_eq!(server.end(INT).code, Some(0));
     let outcome = env.run(&["web", "--json", "--replay", &env.word("none.log")]);
     assert_eq!(

@@ -145,23 +145,23 @@ fn a_hall_is_seen_from_the_side_while_somebody_looks() {
     // Where nobody makes sweeps the page is as ever.
     page.press("h");
     let is_plain = format!("{SIDE}.hidden && !scanhub.aside && {SWEPT} === ''");
-    assert_eq!(page.ask(&is_plain), true);
+    page.await_true(&is_plain);
 
     let tilt = hall.tilt(&["--as=hall", NEAR]);
     page.await_true(&format!("!{SIDE}.hidden && /^hall: /.test({SWEPT})"));
     page.await_true("scanhub.obstacles > 0 && scanhub.beams > 100");
-    assert_eq!(page.ask(&format!("{SIDE}.offsetHeight >= 40")), true);
+    page.await_true(&format!("{SIDE}.offsetHeight >= 40"));
     assert_eq!(hall.env.subscribers("hall/cloud"), 0, "points are not seen from above");
     page.press("h");
     page.await_true(&format!("scanhub.aside && {SIDE}.ariaPressed === 'true'"));
     page.await_true("scanhub.swept > 1000 && scanhub.obstacles > 0 && scanhub.reason === null");
     assert_eq!(hall.env.subscribers("hall/cloud"), 1);
     page.await_true(&format!("/^hall: [1-9][0-9]* obstacles?, nearest 1\\.[3-5] m/.test({SWEPT})"));
-    assert_eq!(page.ask("document.querySelector('#map').ariaLabel.includes('from the side')"), true);
+    page.await_true("document.querySelector('#map').ariaLabel.includes('from the side')");
     // To the right is ahead, and up is up.
     let place = "scanhub.screen(1, -2).map(Math.round).join() !== scanhub.screen(0, 0).map(Math.round).join() && \
                  scanhub.screen(1, -2)[0] > scanhub.screen(0, 0)[0] && scanhub.screen(1, -2)[1] < scanhub.screen(0, 0)[1]";
-    assert_eq!(page.ask(place), true);
+    page.await_true(place);
     page.mouse("mouseMoved", (500.0, 400.0), false);
     page.await_true("/above the floor/.test(document.querySelector('#readout').innerText)");
 
@@ -201,7 +201,7 @@ fn a_hall_is_seen_from_the_side_while_somebody_looks() {
     // What makes the sweeps is gone: they are not there any more, and that is said.
     assert_eq!(tilt.end(INT).code, Some(0));
     page.await_true("scanhub.swept === 0 && /hall: no sweep any more/.test(scanhub.reason)");
-    assert_eq!(page.ask("/scanhub tilt/.test(scanhub.reason)"), true, "and where to look");
+    page.await_true("/scanhub tilt/.test(scanhub.reason)");
     page.press("h");
     page.await_true("!scanhub.aside && scanhub.beams > 100 && scanhub.reason === null");
     assert!(page.complaints.is_empty(), "{:?}", page.complaints);
