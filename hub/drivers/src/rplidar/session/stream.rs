@@ -36,6 +36,8 @@ pub(super) struct Measure {
     last: Nanos,
     /// Whether something is missing before it.
     lacks: bool,
+    /// Nanoseconds by which the last packet came later than in a steady stream. It falls while packets catch up.
+    behind: f64,
     passed: Nanos,
     points: u64,
     /// What has to pass until it is believed.
@@ -209,14 +211,23 @@ impl Session {
         let Some(measure) = &mut self.measure else {
             let told = self.offers.sample_us(kind, self.settings.mode);
             self.point_ns = told.map(|us| f64::from(us) * 1e3);
-            self.measure = Some(Measure { last: at, lacks: false, passed: 0, points: 0, span: SOON });
+            self.measure =
+                Some(Measure { last: at, lacks: false, behind: 0.0, passed: 0, points: 0, span: SOON });
             return;
         };
         let apart = at.saturating_sub(core::mem::replace(&mut measure.last, at));
         let points = (span.packets * kind.points()) as f64;
-        let is_late = self.point_ns.is_some_and(|ns| apart as f64 > 1.5 * points * ns + LATE);
+        let steady = self.point_ns.map(|ns| points * ns);
+        let ahead = steady.map_or(0.0, |steady| steady - apart as f64);
+        let is_late = steady.is_some_and(|steady| apart as f64 > 1.5 * steady + LATE);
+        measure.behind = match steady {
+            Some(_) if is_late => -ahead,
+            // Packets that waited with the late one arrive fast until they have caught up.
+            Some(steady) if ahead > steady / 2.0 => (measure.behind - ahead).max(0.0),
+            _ => 0.0,
+        };
         // What comes at the same time came with it.
-        measure.lacks = span.reasons != 0 || is_late || (measure.lacks && apart == 0);
+        measure.lacks = span.reasons != 0 || is_late || measure.behind > 0.0 || (measure.lacks && apart == 0);
         if measure.lacks {
             return;
         }
@@ -226,7 +237,8 @@ impl Session {
             return;
         }
         let measured = measure.passed as f64 / measure.points as f64;
-        *measure = Measure { last: at, lacks: false, passed: 0, points: 0, span: 2 * measure.span };
+        *measure =
+            Measure { last: at, lacks: false, behind: 0.0, passed: 0, points: 0, span: 2 * measure.span };
         let told = self.offers.nearest_us(kind, (measured / 1e3) as f32);
         let point_ns = told.map_or(measured, |us| f64::from(us) * 1e3);
         let off = self.point_ns.map_or(0.0, |before| (before / point_ns - 1.0).abs());

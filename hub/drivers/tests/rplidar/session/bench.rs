@@ -25,6 +25,7 @@ pub(crate) struct Told {
 }
 
 /// What a recorder keeps of what was handed out.
+#[derive(Clone)]
 pub(crate) struct Kept {
     pub(crate) first: Nanos,
     pub(crate) last: Nanos,

@@ -136,6 +136,30 @@ fn one_that_begins_in_the_midst_of_a_line_that_damages_bytes_is_dated_right() {
     }
 }
 
+/// While a busy machine stands still, packets wait in its driver. Then their stamps are late and close together, and have little to
+/// do with the time that a point takes.
+#[test]
+fn packets_that_waited_do_not_change_the_time_per_point() {
+    for (model, mode) in MODES {
+        let settings = Settings { mode: Some(mode), ..of(model) };
+        let live = recorded(model, mode, 12);
+        let from = live.log.heard.iter().position(|kept| kept.first > 2 * SECOND).expect("some");
+        let steady = &live.log.heard[from..];
+        let mut stalled = steady.to_vec();
+        let mut free = 0;
+        for kept in &mut stalled {
+            let into = kept.last % (300 * MILLIS);
+            // The hub takes a tenth of a millisecond for each of those that waited.
+            let at = if into < 40 * MILLIS { kept.last - into + 40 * MILLIS } else { kept.last };
+            free = at.max(free + MILLIS / 10);
+            kept.last = free;
+        }
+        let points = |heard: &[Kept]| replay(settings, heard).1.iter().map(|seen| seen.points).collect();
+        let [expected, found]: [Vec<usize>; 2] = [points(steady), points(&stalled)];
+        assert!(expected.len() > 50 && found == expected, "{model:?} {mode:?}: {expected:?} {found:?}");
+    }
+}
+
 /// Ranges of the one kind are nonsense as those of the other one.
 #[test]
 fn packets_that_may_be_of_two_kinds_are_refused_in_words() {
