@@ -6,6 +6,7 @@ use std::time::{Duration, Instant};
 
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::fs::{Mode, OFlags, open};
+use rustix::io::Errno;
 use rustix::termios::{OptionalActions, tcgetattr, tcsetattr};
 use scanhub_drivers::lms;
 use scanhub_drivers::lms::command::Request;
@@ -21,18 +22,26 @@ pub(crate) struct Host {
 
 impl Host {
     pub(crate) fn open(path: &Path, rate: u32) -> Host {
+        Host::try_open(path, rate).unwrap()
+    }
+
+    /// Opens a port that may be unplugged at any time.
+    pub(crate) fn try_open(path: &Path, rate: u32) -> Result<Host, Errno> {
         let flags = OFlags::RDWR | OFlags::NOCTTY | OFlags::NONBLOCK | OFlags::CLOEXEC;
-        let port = open(path, flags, Mode::empty()).unwrap();
-        let host = Host { port, framer: Framer::default() };
-        host.set_rate(rate);
-        host
+        let host = Host { port: open(path, flags, Mode::empty())?, framer: Framer::default() };
+        host.try_set_rate(rate)?;
+        Ok(host)
     }
 
     pub(crate) fn set_rate(&self, rate: u32) {
-        let mut termios = tcgetattr(&self.port).unwrap();
+        self.try_set_rate(rate).unwrap();
+    }
+
+    fn try_set_rate(&self, rate: u32) -> Result<(), Errno> {
+        let mut termios = tcgetattr(&self.port)?;
         termios.make_raw();
-        termios.set_speed(rate).unwrap();
-        tcsetattr(&self.port, OptionalActions::Now, &termios).unwrap();
+        termios.set_speed(rate)?;
+        tcsetattr(&self.port, OptionalActions::Now, &termios)
     }
 
     /// Writes `request` as most drivers do: at once, for the UART to space.
@@ -41,7 +50,7 @@ impl Host {
         assert_eq!(rustix::io::write(&self.port, encoded.bytes()), Ok(encoded.bytes().len()));
     }
 
-    /// The next telegram that comes within `patience`.
+    /// Returns the next telegram that arrives within `patience`; `None` if the port is unplugged before.
     pub(crate) fn telegram(&mut self, patience: Duration) -> Option<Vec<u8>> {
         let end = Instant::now() + patience;
         loop {
@@ -61,8 +70,12 @@ impl Host {
                 }
                 return None;
             }
-            let count = rustix::io::read(&self.port, self.framer.spare()).unwrap_or(0);
-            self.framer.commit(count);
+            match rustix::io::read(&self.port, self.framer.spare()) {
+                Ok(0) => return None,
+                Ok(count) => self.framer.commit(count),
+                Err(Errno::AGAIN | Errno::INTR) => {}
+                Err(_) => return None,
+            }
         }
     }
 
