@@ -4,10 +4,12 @@
 pub mod framer;
 mod model;
 pub mod packet;
+mod probe;
 mod restarts;
 mod sequence;
 mod session;
 
 pub use crate::line::{Heard, Packets, Tally, Turn, TurnCounts};
 pub use model::Model;
+pub use probe::Probe;
 pub use session::{Session, Settings, Trouble};

@@ -10,3 +10,4 @@ pub mod line;
 pub mod lms;
 pub mod rplidar;
 pub mod scanner;
+pub mod search;

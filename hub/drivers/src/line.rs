@@ -5,6 +5,7 @@ mod arrival;
 pub mod family;
 pub mod framing;
 pub mod grid;
+pub mod probe;
 mod reads;
 mod sensor_clock;
 mod session;

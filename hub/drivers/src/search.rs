@@ -1,0 +1,795 @@
+//! Finds the scanner on a line whose family is not configured, and the rate of the line.
+//!
+//! A search consists of rounds, and a round of steps. Each step sets a rate, and then listens or sends a request:
+//!
+//! 1. Listen for a stream that needs no request.
+//! 2. If bytes have arrived, listen at further rates for streams of scanners that should get no request while they stream.
+//! 3. Send the requests of each family at its rates.
+//!
+//! In every second round, slow scanners have more time. Rounds without a byte are followed by pauses, which get longer.
+//!
+//! An unknown scanner gets only requests that no scanner of another family accepts, at any rate, and that change nothing: each
+//! family declares them in its [`Approach`]. Resets, motor requests, changes of settings and of the line DTR belong to the
+//! sessions. In the first 150 ms after the open, no byte is sent.
+//!
+//! The search is driven like a [`Session`](crate::line::Session). It ends with [`Output::Found`]; then the bytes of its
+//! last step are available from [`Search::reads`], so that the family's session handles each of them.
+
+use core::fmt;
+
+use schema::{Family, MILLIS, Nanos, line_time};
+
+use crate::line::probe::{Approach, Asks, Evidence, Probe};
+use crate::line::{Account, State};
+use crate::{ld, lms, rplidar};
+
+/// Creates a recognizer for each family. Steps that listen, and steps that ask, are in this order.
+fn probes() -> [Box<dyn Probe>; 3] {
+    [Box::<ld::Probe>::default(), Box::<lms::Probe>::default(), Box::<rplidar::Probe>::default()]
+}
+
+/// What the search wants next.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Output {
+    /// Set the port to this rate, in bits per second, and discard what it has received. Then continue to drain. If the port
+    /// cannot have this rate, call [`Search::reject_rate`] before.
+    SetRate(u32),
+    /// Write this byte, not before the given time, and then call [`Search::transmitted`]. Do nothing else meanwhile.
+    Transmit {
+        /// The byte.
+        byte: u8,
+        /// Earliest time to write it.
+        not_before: Nanos,
+    },
+    /// Read when the port has bytes. If a read at the deadline finds none, call [`Search::handle_timeout`].
+    Wait {
+        /// The deadline; [`Nanos::MAX`] means none.
+        until: Nanos,
+    },
+    /// The scanner is found, and the search has ended.
+    Found(Found),
+}
+
+/// Result of a search.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Found {
+    /// Family of the scanner.
+    pub family: Family,
+    /// Name of the model, if the scanner has reported it.
+    pub model: Option<&'static str>,
+    /// Rate of the line, in bits per second. `None` if the port has no rate that can be set.
+    pub rate: Option<u32>,
+}
+
+/// Kind of a port.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Port {
+    /// A serial line, whose rate the search sets.
+    Serial,
+    /// A serial server on the network, whose rate is set there.
+    Server,
+    /// A recording, which receives nothing. Families whose streams prove nothing are found only by recorded replies.
+    Recording,
+}
+
+/// Scanner that was found on the same port before.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Memory {
+    /// Its family.
+    pub family: Family,
+    /// Rate of its stream, in bits per second.
+    pub stream_rate: u32,
+    /// Rate at which it replied when it did not stream: that of [`Found`].
+    pub reply_rate: u32,
+}
+
+/// Reason why no scanner is found.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Trouble {
+    /// No byte arrives.
+    Silent {
+        /// Duration of the search in seconds, rounded down to 3, 10, 30, 60, ..
+        seconds: u32,
+    },
+    /// Bytes arrive, but no family recognizes them.
+    Unrecognized {
+        /// Bytes per second in the last step that listened, rounded to three digits.
+        bytes_per_second: u32,
+    },
+}
+
+/// A search on an open port. After every call that changes it, drain [`Search::poll_output`] until it returns
+/// [`Output::Wait`] or [`Output::Found`].
+#[derive(Debug)]
+pub struct Search {
+    port: Port,
+    memory: Option<Memory>,
+    probes: [Box<dyn Probe>; 3],
+    phase: Phase,
+    /// Number of the round, from 0.
+    round: usize,
+    /// Steps of the round, and the number of those that were entered.
+    steps: Vec<Step>,
+    entered: usize,
+    /// Whether the remembered scanner was asked in this round.
+    is_memory_asked: bool,
+    rate: Option<u32>,
+    change_rate: bool,
+    /// Rates that the port cannot have.
+    rejected: Vec<u32>,
+    capture: Capture,
+    /// Number of the first captured byte that may belong to a reply.
+    asked_at: usize,
+    opened_at: Nanos,
+    now: Nanos,
+    last_byte: Nanos,
+    /// Bytes that were read: at all, when the round began, and when the step began.
+    read: u64,
+    round_read: u64,
+    step_read: u64,
+    step_began: Nanos,
+    round_began: Nanos,
+    /// Bytes per second of the last step that listened and received any in this round.
+    listened: Option<u32>,
+    /// The same for the last complete round. `None` if no byte arrived in it.
+    bytes_per_second: Option<u32>,
+    found: Option<Found>,
+}
+
+#[derive(Clone, Copy, Debug)]
+struct Step {
+    condition: Condition,
+    /// `None` if the port has no rate that can be set.
+    rate: Option<u32>,
+    action: Action,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Condition {
+    Always,
+    /// Bytes have arrived in this round, or the search has not listened in it because the port cannot have the rates.
+    Bytes,
+    /// The line looks like that of the remembered scanner, or is silent.
+    Familiar,
+    /// The remembered scanner was not asked in this round.
+    NotAsked,
+}
+
+#[derive(Clone, Copy, Debug)]
+enum Action {
+    /// Listens for this time, and longer by the second time if a transmission has begun.
+    Listen(Nanos, Nanos),
+    /// Sends the request of the probe with this number.
+    Ask(usize),
+}
+
+#[derive(Clone, Copy, Debug)]
+enum Phase {
+    /// Waits for bytes until `until`, or for the end of a transmission that has begun until `at_most`.
+    Listening { until: Nanos, at_most: Nanos },
+    /// Waits until the request of `ask` may be sent.
+    Settling { ask: Ask, until: Nanos },
+    /// The bytes of the request leave.
+    Sending { ask: Ask, outgoing: Outgoing },
+    /// Waits for the end of the stream that the request has stopped.
+    Draining { ask: Ask, until: Nanos, at_most: Nanos },
+    /// Waits for the reply, as [`Phase::Listening`].
+    Awaiting { ask: Ask, until: Nanos, at_most: Nanos },
+    /// Waits between two rounds. A byte ends the pause.
+    Pausing { until: Nanos },
+}
+
+/// Requests of one step.
+#[derive(Clone, Copy, Debug)]
+struct Ask {
+    probe: usize,
+    asks: &'static Asks,
+    /// Number of times that the request is to be sent again, and the same if its reply may have been damaged.
+    repeats: u8,
+    retries: u8,
+    /// Whether the request that leaves stops a stream.
+    is_stop: bool,
+}
+
+/// A request that is sent byte by byte.
+#[derive(Clone, Copy, Debug)]
+struct Outgoing {
+    request: &'static [u8],
+    sent: usize,
+    not_before: Nanos,
+    /// Time of the last byte.
+    left_at: Nanos,
+    restarts: u8,
+}
+
+impl Search {
+    /// Returns the rate at which the port has to be open, in bits per second.
+    pub fn opening_rate(memory: Option<Memory>) -> u32 {
+        let first = probes().iter().find_map(|probe| probe.approach().listens.first().map(|step| step.rate));
+        memory.map(|memory| memory.stream_rate).or(first).unwrap_or(BOOT_RATE)
+    }
+
+    /// Creates a search on a port that was opened at `now`, with the [`opening_rate`](Self::opening_rate).
+    pub fn new(port: Port, memory: Option<Memory>, now: Nanos) -> Search {
+        let mut search = Search {
+            port,
+            memory,
+            probes: probes(),
+            phase: Phase::Pausing { until: now },
+            round: 0,
+            steps: Vec::new(),
+            entered: 0,
+            is_memory_asked: false,
+            rate: (port == Port::Serial).then(|| Search::opening_rate(memory)),
+            change_rate: false,
+            rejected: Vec::new(),
+            capture: Capture::default(),
+            asked_at: 0,
+            opened_at: now,
+            now,
+            last_byte: now,
+            read: 0,
+            round_read: 0,
+            step_read: 0,
+            step_began: now,
+            round_began: now,
+            listened: None,
+            bytes_per_second: None,
+            found: None,
+        };
+        search.begin_round();
+        search
+    }
+
+    /// Returns the buffer for the next read; never empty once the outputs are drained.
+    pub fn spare(&mut self) -> &mut [u8] {
+        self.capture.spare()
+    }
+
+    /// Handles a read that returned at `now` with `len` bytes in [`spare`](Self::spare).
+    pub fn commit(&mut self, now: Nanos, len: usize) {
+        self.now = now;
+        if len == 0 || self.found.is_some() {
+            return;
+        }
+        let removed = self.capture.commit(now, len);
+        self.asked_at = self.asked_at.saturating_sub(removed);
+        (self.last_byte, self.read) = (now, self.read + len as u64);
+        match &mut self.phase {
+            Phase::Pausing { until } => *until = (*until).min(now + END_OF_PAUSE),
+            Phase::Draining { ask, until, .. } => *until = now + ask.asks.stop.map_or(0, |stop| stop.quiet),
+            _ => {}
+        }
+        for probe in &mut self.probes {
+            if listens_at(probe.approach(), self.rate) {
+                probe.receive(self.capture.last(len));
+            }
+        }
+        self.conclude();
+    }
+
+    /// Handles a deadline at which a read found nothing.
+    pub fn handle_timeout(&mut self, now: Nanos) {
+        self.now = now;
+        let idle = now.saturating_sub(self.last_byte);
+        self.probes.iter_mut().for_each(|probe| probe.release(idle));
+        self.conclude();
+    }
+
+    /// The port cannot have the rate of the last [`Output::SetRate`], or, before the first output, its opening rate. The search
+    /// never uses this rate again.
+    pub fn reject_rate(&mut self, now: Nanos) {
+        self.now = now;
+        self.rejected.extend(self.rate.replace(UNKNOWN_RATE));
+        if !matches!(self.phase, Phase::Pausing { .. }) {
+            self.advance();
+        }
+    }
+
+    /// The byte of [`Output::Transmit`] was written at `now`.
+    pub fn transmitted(&mut self, now: Nanos) {
+        self.now = now;
+        // The rate of a server is unknown, so its bytes are sent at the slowest pace.
+        let byte_time = line_time(1, self.rate.unwrap_or(BOOT_RATE));
+        let Phase::Sending { ask, outgoing } = &mut self.phase else { return };
+        outgoing.transmitted(now, byte_time, ask.asks.gap);
+        if outgoing.sent < outgoing.request.len() {
+            return;
+        }
+        let (ask, stop) = (*ask, ask.asks.stop.filter(|_| ask.is_stop));
+        self.phase = match stop {
+            Some(stop) => Phase::Draining { ask, until: now + stop.quiet, at_most: now + stop.at_most },
+            None => {
+                let until = now + self.reply_time(ask.asks);
+                Phase::Awaiting { ask, until, at_most: until + ask.asks.extension }
+            }
+        };
+    }
+
+    /// Returns what the search wants next.
+    pub fn poll_output(&mut self) -> Output {
+        if let Some(found) = self.found {
+            return Output::Found(found);
+        }
+        loop {
+            if core::mem::take(&mut self.change_rate)
+                && let Some(rate) = self.rate
+            {
+                return Output::SetRate(rate);
+            }
+            let until = match &self.phase {
+                Phase::Sending { outgoing, .. } if outgoing.not_before <= self.now + TRANSMIT_AHEAD => {
+                    let Outgoing { request, sent, not_before, .. } = *outgoing;
+                    return Output::Transmit { byte: request[sent], not_before };
+                }
+                Phase::Sending { outgoing, .. } => outgoing.not_before,
+                Phase::Draining { until, at_most, .. } => *until.min(at_most),
+                Phase::Listening { until, .. }
+                | Phase::Settling { until, .. }
+                | Phase::Awaiting { until, .. }
+                | Phase::Pausing { until } => *until,
+            };
+            if until > self.now {
+                let holds = self.probes.iter().filter_map(|probe| probe.hold());
+                let held_until = holds.map(|hold| self.last_byte + hold).filter(|&at| at > self.now).min();
+                return Output::Wait { until: until.min(held_until.unwrap_or(Nanos::MAX)) };
+            }
+            self.expire();
+        }
+    }
+
+    /// Returns the reads of the step in which the scanner was found: the time of each, and its bytes. Pass them to the session
+    /// of the family, before all later reads.
+    pub fn reads(&self) -> impl Iterator<Item = (Nanos, &[u8])> {
+        self.capture.reads()
+    }
+
+    /// Returns the state that is shown.
+    pub fn state(&self) -> State {
+        State::Probing
+    }
+
+    /// Returns the rate of the port, in bits per second. `None` if it has none that can be set.
+    pub fn rate(&self) -> Option<u32> {
+        self.rate
+    }
+
+    /// Returns the counters of the bytes that the search has read, except those in [`reads`](Self::reads).
+    pub fn account(&self) -> Account {
+        let discarded = self.read - self.capture.len() as u64;
+        Account { read: discarded, discarded, ..Account::default() }
+    }
+
+    /// Returns why no scanner is found yet. `None` in the first two rounds.
+    pub fn trouble(&self) -> Option<Trouble> {
+        if self.round < 2 || self.found.is_some() {
+            return None;
+        }
+        if let Some(bytes_per_second) = self.bytes_per_second {
+            return Some(Trouble::Unrecognized { bytes_per_second });
+        }
+        let seconds = (self.now.saturating_sub(self.opened_at) / (1_000 * MILLIS)) as u32;
+        let seconds = SECONDS.into_iter().rev().find(|&step| step <= seconds)?;
+        Some(Trouble::Silent { seconds })
+    }
+
+    /// Ends the search if a family recognizes its scanner.
+    fn conclude(&mut self) {
+        for probe in &self.probes {
+            let approach = probe.approach();
+            let Evidence::Found(model) = probe.evidence() else { continue };
+            self.found = Some(Found { family: approach.family, model, rate: self.rate });
+            if approach.asks.is_some_and(|asks| asks.stop.is_some()) && self.port != Port::Recording {
+                self.capture.discard(self.asked_at);
+            }
+            return;
+        }
+    }
+
+    /// Handles the deadline of the phase.
+    fn expire(&mut self) {
+        let phase = self.phase;
+        match phase {
+            Phase::Listening { until, at_most } if self.extend(until, at_most) => {}
+            Phase::Awaiting { until, at_most, .. } if self.extend(until, at_most) => {}
+            Phase::Settling { ask, .. } => self.send(ask),
+            Phase::Draining { ask, .. } => self.send(Ask { is_stop: false, ..ask }),
+            Phase::Awaiting { ask, .. } if ask.retries > 0 && self.is_damaged(ask.probe) => {
+                self.send(Ask { retries: ask.retries - 1, is_stop: ask.asks.stop.is_some(), ..ask });
+            }
+            Phase::Awaiting { ask, .. } if ask.repeats > 0 => {
+                self.send(Ask { repeats: ask.repeats - 1, is_stop: ask.asks.stop.is_some(), ..ask });
+            }
+            Phase::Sending { .. } => {}
+            Phase::Listening { .. } => {
+                self.note_listened();
+                self.advance();
+            }
+            Phase::Awaiting { .. } => self.advance(),
+            Phase::Pausing { .. } => {
+                self.note_listened();
+                self.begin_round();
+            }
+        }
+    }
+
+    /// Whether a reply to the request of this probe may have been damaged. The end of one that has begun is missing.
+    fn is_damaged(&self, probe: usize) -> bool {
+        matches!(self.probes[probe].evidence(), Evidence::Damaged | Evidence::Begun)
+    }
+
+    /// Waits a little longer, but no longer than `at_most`, if a transmission has begun. Returns whether it has.
+    fn extend(&mut self, until: Nanos, at_most: Nanos) -> bool {
+        let mut probes = self.probes.iter().filter(|probe| listens_at(probe.approach(), self.rate));
+        if self.now >= at_most || !probes.any(|probe| probe.evidence() == Evidence::Begun) {
+            return false;
+        }
+        let later = (until.max(self.now) + EXTENSION).min(at_most);
+        if let Phase::Listening { until, .. } | Phase::Awaiting { until, .. } = &mut self.phase {
+            *until = later;
+        }
+        true
+    }
+
+    /// Stores the bytes per second of a step that listened.
+    fn note_listened(&mut self) {
+        let bytes = self.read - self.step_read;
+        if bytes > 0 {
+            self.listened = Some(per_second(bytes, self.now.saturating_sub(self.step_began)));
+        }
+    }
+
+    /// Starts the next step, or ends the round.
+    fn advance(&mut self) {
+        while let Some(&step) = self.steps.get(self.entered) {
+            self.entered += 1;
+            if self.applies(step) {
+                return self.enter(step);
+            }
+        }
+        self.end_round();
+    }
+
+    fn applies(&self, step: Step) -> bool {
+        let has_bytes = self.read > self.round_read;
+        let is_stream = || self.probes.iter().any(|probe| probe.evidence() == Evidence::Stream);
+        let is_possible = step.rate.is_none_or(|rate| !self.rejected.contains(&rate));
+        is_possible
+            && match step.condition {
+                Condition::Always => true,
+                Condition::Bytes => has_bytes || self.now == self.round_began,
+                Condition::Familiar => self.is_memory_asked || !has_bytes || is_stream(),
+                Condition::NotAsked => !self.is_memory_asked,
+            }
+    }
+
+    fn enter(&mut self, step: Step) {
+        self.set_rate(step.rate);
+        self.begin_step();
+        match step.action {
+            Action::Listen(span, extension) => {
+                let until = self.now.saturating_add(span);
+                self.phase = Phase::Listening { until, at_most: until.saturating_add(extension) };
+            }
+            Action::Ask(probe) => {
+                let Some(asks) = self.probes[probe].approach().asks.as_ref() else { return };
+                self.is_memory_asked |= step.condition == Condition::Familiar;
+                let repeats = if self.is_patient() { asks.repeats.saturating_sub(1) } else { 0 };
+                let ask = Ask { probe, asks, repeats, retries: MAX_RETRIES, is_stop: asks.stop.is_some() };
+                let settled = if self.change_rate { self.now + asks.settle } else { self.now };
+                self.phase = Phase::Settling { ask, until: settled.max(self.opened_at + SILENT_AFTER_OPEN) };
+            }
+        }
+    }
+
+    /// Starts to send the request of `ask`.
+    fn send(&mut self, ask: Ask) {
+        let requests = ask.asks.requests;
+        let question = requests[self.round % requests.len()];
+        let request = ask.asks.stop.filter(|_| ask.is_stop).map_or(question, |stop| stop.request);
+        if !ask.is_stop {
+            self.probes[ask.probe].expect_reply(true);
+            self.asked_at = self.capture.len();
+        }
+        let outgoing =
+            Outgoing { request, sent: 0, not_before: self.now, left_at: self.now, restarts: MAX_RESTARTS };
+        self.phase = Phase::Sending { ask, outgoing };
+    }
+
+    fn begin_step(&mut self) {
+        (self.step_began, self.step_read) = (self.now, self.read);
+        self.probes.iter_mut().for_each(|probe| probe.expect_reply(false));
+    }
+
+    fn set_rate(&mut self, rate: Option<u32>) {
+        if self.rate == rate {
+            return;
+        }
+        (self.rate, self.change_rate) = (rate, true);
+        self.capture.discard(self.capture.len());
+        self.asked_at = 0;
+        self.probes.iter_mut().for_each(|probe| probe.clear());
+    }
+
+    fn begin_round(&mut self) {
+        self.plan_round();
+        (self.entered, self.is_memory_asked, self.listened) = (0, false, None);
+        (self.round_began, self.round_read) = (self.now, self.read);
+        self.advance();
+    }
+
+    /// Pauses if no byte has arrived in the round, except after the first one.
+    fn end_round(&mut self) {
+        let bytes = self.read - self.round_read;
+        let mean = per_second(bytes, self.now.saturating_sub(self.round_began));
+        self.bytes_per_second = (bytes > 0).then_some(self.listened.unwrap_or(mean));
+        let pause = if bytes == 0 { PAUSES[self.round.min(PAUSES.len() - 1)] } else { 0 };
+        self.round += 1;
+        let boot_rate = self.probes.iter().find_map(|probe| probe.approach().boot_rate);
+        if let Some(rate) = boot_rate.filter(|rate| !self.rejected.contains(rate))
+            && pause > 0
+            && self.port == Port::Serial
+        {
+            self.set_rate(Some(rate));
+        }
+        self.begin_step();
+        self.phase = Phase::Pausing { until: self.now + pause };
+    }
+
+    /// Whether slow scanners have more time in this round.
+    fn is_patient(&self) -> bool {
+        self.round % 2 == 1
+    }
+
+    fn reply_time(&self, asks: &Asks) -> Nanos {
+        match self.port {
+            Port::Serial if self.is_patient() => asks.reply + asks.patience,
+            Port::Serial => asks.reply,
+            Port::Server | Port::Recording => SERVER_STEP,
+        }
+    }
+
+    fn plan_round(&mut self) {
+        let mut steps = Vec::new();
+        let mut push = |condition, rate, action| steps.push(Step { condition, rate, action });
+        match self.port {
+            Port::Recording => push(Condition::Always, None, Action::Listen(Nanos::MAX, 0)),
+            Port::Server => {
+                push(Condition::Always, None, Action::Listen(SERVER_STEP, SERVER_STEP));
+                let is_other =
+                    |number: &usize| Some(self.family(*number)) != self.memory.map(|memory| memory.family);
+                let mut numbers: Vec<usize> = (0..self.probes.len()).collect();
+                numbers.sort_by_key(is_other);
+                for number in
+                    numbers.into_iter().filter(|&number| self.probes[number].approach().asks.is_some())
+                {
+                    push(Condition::Always, None, Action::Ask(number));
+                }
+            }
+            Port::Serial => {
+                let memory = self.memory.filter(|_| self.round == 0);
+                let mut remembered = Vec::new();
+                if let Some(Memory { family, stream_rate, reply_rate }) = memory
+                    && let Some(number) = (0..self.probes.len()).find(|&number| self.family(number) == family)
+                {
+                    let approach = self.probes[number].approach();
+                    let telegrams = 2 * line_time(approach.max_transmission, stream_rate);
+                    push(Condition::Always, Some(stream_rate), Action::Listen(SILENT_AFTER_OPEN, telegrams));
+                    if approach.asks.is_some() {
+                        remembered.push((number, reply_rate));
+                        remembered.extend((stream_rate != reply_rate).then_some((number, stream_rate)));
+                    }
+                }
+                for &(number, rate) in &remembered {
+                    push(Condition::Familiar, Some(rate), Action::Ask(number));
+                }
+                for needs_bytes in [false, true] {
+                    let condition = if needs_bytes { Condition::Bytes } else { Condition::Always };
+                    let listens = self.probes.iter().flat_map(|probe| probe.approach().listens);
+                    for listen in listens.filter(|listen| listen.needs_bytes == needs_bytes) {
+                        if memory.is_none_or(|memory| memory.stream_rate != listen.rate) {
+                            push(condition, Some(listen.rate), Action::Listen(listen.span, listen.span));
+                        }
+                    }
+                }
+                for &(number, rate) in &remembered {
+                    push(Condition::NotAsked, Some(rate), Action::Ask(number));
+                }
+                for number in 0..self.probes.len() {
+                    for rate in self.rates(number) {
+                        if !remembered.contains(&(number, rate)) {
+                            push(Condition::Always, Some(rate), Action::Ask(number));
+                        }
+                    }
+                }
+            }
+        }
+        self.steps = steps;
+    }
+
+    fn family(&self, number: usize) -> Family {
+        self.probes[number].approach().family
+    }
+
+    /// Returns the rates at which a family is asked, the remembered ones first.
+    fn rates(&self, number: usize) -> Vec<u32> {
+        let approach = self.probes[number].approach();
+        let mut rates = approach.asks.map_or_else(Vec::new, |asks| asks.rates.to_vec());
+        if let Some(memory) = self.memory.filter(|memory| memory.family == approach.family) {
+            let order = [memory.reply_rate, memory.stream_rate];
+            rates.sort_by_key(|rate| order.iter().position(|first| first == rate).unwrap_or(order.len()));
+        }
+        rates
+    }
+}
+
+impl Outgoing {
+    /// The next byte was written at `now`. If it was too late, the scanner has dropped the request, which then starts over.
+    fn transmitted(&mut self, now: Nanos, byte_time: Nanos, gap: Option<(Nanos, Nanos)>) {
+        let (min_gap, max_gap) = gap.unwrap_or((0, Nanos::MAX - byte_time));
+        let is_late = self.sent > 0 && now.saturating_sub(self.left_at) > byte_time + max_gap;
+        self.left_at = now;
+        if is_late && self.restarts > 0 {
+            (self.sent, self.restarts) = (0, self.restarts - 1);
+            self.not_before = now + byte_time + 2 * max_gap;
+        } else {
+            self.sent += 1;
+            self.not_before = if gap.is_some() { now + byte_time + min_gap } else { now };
+        }
+    }
+}
+
+/// Bytes of the present step, with the times of their reads.
+#[derive(Clone, Debug, Default)]
+struct Capture {
+    bytes: Vec<u8>,
+    /// Number of bytes that are stored.
+    len: usize,
+    /// End of each read, and its time.
+    reads: Vec<(usize, Nanos)>,
+}
+
+impl Capture {
+    fn spare(&mut self) -> &mut [u8] {
+        self.bytes.resize(CAPTURE + READ, 0);
+        &mut self.bytes[self.len..self.len + READ]
+    }
+
+    /// Adds a read of `len` bytes, and returns how many old ones were removed to make room for the next read.
+    fn commit(&mut self, now: Nanos, len: usize) -> usize {
+        self.len += len;
+        self.reads.push((self.len, now));
+        let surplus = if self.len > CAPTURE { self.len - CAPTURE / 2 } else { 0 };
+        self.discard(surplus);
+        surplus
+    }
+
+    /// Removes the first `len` bytes.
+    fn discard(&mut self, len: usize) {
+        self.bytes.copy_within(len..self.len, 0);
+        self.len -= len;
+        self.reads.retain_mut(|(end, _)| {
+            *end = end.saturating_sub(len);
+            *end > 0
+        });
+    }
+
+    fn len(&self) -> usize {
+        self.len
+    }
+
+    /// Returns the last `len` bytes.
+    fn last(&self, len: usize) -> &[u8] {
+        &self.bytes[self.len - len..self.len]
+    }
+
+    fn reads(&self) -> impl Iterator<Item = (Nanos, &[u8])> {
+        let begins = core::iter::once(0).chain(self.reads.iter().map(|(end, _)| *end));
+        begins.zip(&self.reads).map(|(begin, &(end, now))| (now, &self.bytes[begin..end]))
+    }
+}
+
+impl Trouble {
+    /// Returns the message for the user of `port`.
+    pub fn message(self, port: &str) -> String {
+        match self {
+            Trouble::Silent { .. } => self.to_string(),
+            Trouble::Unrecognized { .. } => format!("{self}: scanhub probe {port}"),
+        }
+    }
+}
+
+impl fmt::Display for Trouble {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Trouble::Silent { seconds } => {
+                f.write_str("no scanner replies (looked for ")?;
+                for (number, family) in Family::ALL.into_iter().enumerate() {
+                    write!(f, "{}{}", if number > 0 { ", " } else { "" }, family.name())?;
+                }
+                write!(f, " for {seconds} s): power, cable?")
+            }
+            Trouble::Unrecognized { bytes_per_second } => {
+                match (bytes_per_second / 1_000, bytes_per_second % 1_000) {
+                    (0, ones) => write!(f, "{ones}")?,
+                    (thousands, ones) => write!(f, "{thousands},{ones:03}")?,
+                }
+                f.write_str(" bytes/s arrive, but scanhub does not recognize the scanner")
+            }
+        }
+    }
+}
+
+/// Returns whether scanners of a family may use `rate`. All may at a port whose rate is unknown.
+fn listens_at(approach: &Approach, rate: Option<u32>) -> bool {
+    let asks = approach.asks.map_or(&[][..], |asks| asks.rates);
+    let mut rates = approach.listens.iter().map(|listen| listen.rate).chain(asks.iter().copied());
+    rate.is_none_or(|rate| rates.any(|known| known == rate))
+}
+
+/// Returns the number of bytes per second, rounded to three digits.
+fn per_second(bytes: u64, span: Nanos) -> u32 {
+    let exact = bytes * 1_000 * MILLIS / span.max(MILLIS);
+    let unit = 10u64.pow(exact.checked_ilog10().unwrap_or(0).saturating_sub(2));
+    ((exact + unit / 2) / unit * unit) as u32
+}
+
+/// Time after the open in which no byte is sent, so that a scanner that streams can be recognized first.
+const SILENT_AFTER_OPEN: Nanos = 150 * MILLIS;
+/// Duration of each step on a serial server.
+const SERVER_STEP: Nanos = 500 * MILLIS;
+/// Pauses after rounds without a byte, by the number of the round.
+const PAUSES: [Nanos; 4] = [0, 500 * MILLIS, 1_000 * MILLIS, 1_500 * MILLIS];
+/// Time from the first byte in a pause to the end of the pause: that of a boot message.
+const END_OF_PAUSE: Nanos = 60 * MILLIS;
+/// Interval at which the search checks whether a transmission that has begun is complete.
+const EXTENSION: Nanos = 20 * MILLIS;
+/// A byte that may leave within this time is passed to the driver at once.
+const TRANSMIT_AHEAD: Nanos = 5 * MILLIS;
+/// Number of times that a request is sent again because its reply may have been damaged.
+const MAX_RETRIES: u8 = 2;
+/// Number of times that a request starts over because a byte was late.
+const MAX_RESTARTS: u8 = 3;
+/// Slowest rate, in bits per second. It sets the pace of requests where the rate is unknown.
+const BOOT_RATE: u32 = 9_600;
+/// Stands for the rate of a port that has rejected a rate.
+const UNKNOWN_RATE: u32 = 0;
+/// Bytes of one step that are kept. The longest telegram has 814.
+const CAPTURE: usize = 16 * 1_024;
+/// Bytes of one read: as many as a tty returns at once.
+const READ: usize = 4_096;
+/// Durations that messages contain, so that a message does not change every second.
+const SECONDS: [u32; 9] = [3, 10, 30, 60, 300, 600, 1_800, 3_600, 36_000];
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_request_whose_next_byte_is_late_starts_over() {
+        const BYTE: Nanos = 1_000_000;
+        let gap = Some((MILLIS / 10, 5 * MILLIS));
+        let request = &[1, 2, 3];
+        let mut outgoing = Outgoing { request, sent: 0, not_before: 0, left_at: 0, restarts: 1 };
+        outgoing.transmitted(0, BYTE, gap);
+        outgoing.transmitted(BYTE + 5 * MILLIS, BYTE, gap);
+        assert_eq!(outgoing.sent, 2, "in time");
+        let late = 2 * (BYTE + 5 * MILLIS) + 1;
+        outgoing.transmitted(late, BYTE, gap);
+        assert_eq!((outgoing.sent, outgoing.not_before), (0, late + BYTE + 10 * MILLIS));
+        // Without end, the request would never be complete on a slow machine.
+        outgoing.transmitted(late + 20 * MILLIS, BYTE, gap);
+        outgoing.transmitted(late + 60 * MILLIS, BYTE, gap);
+        assert_eq!(outgoing.sent, 2);
+    }
+
+    #[test]
+    fn messages_name_the_pace_and_the_port() {
+        let messages = [999, 1_000, 12_400]
+            .map(|bytes_per_second| Trouble::Unrecognized { bytes_per_second }.message("/dev/ttyUSB0"));
+        let rest = "bytes/s arrive, but scanhub does not recognize the scanner: scanhub probe /dev/ttyUSB0";
+        assert_eq!(messages, ["999", "1,000", "12,400"].map(|pace| format!("{pace} {rest}")));
+        assert_eq!([per_second(12_449, 1_000 * MILLIS), per_second(7, 1_000 * MILLIS)], [12_400, 7]);
+        assert_eq!(per_second(0, 0), 0);
+    }
+}

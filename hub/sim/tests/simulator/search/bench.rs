@@ -1,0 +1,407 @@
+//! A search and a simulated scanner at the two ends of a line, in virtual time. If port and scanner have different rates, bytes
+//! are garbled in both directions.
+
+use std::collections::VecDeque;
+
+use scanhub_drivers::ld;
+use scanhub_drivers::line;
+use scanhub_drivers::lms::variant::Baud;
+use scanhub_drivers::search::{Found, Memory, Output, Port, Search};
+use schema::{MICROS, MILLIS, Nanos, line_time};
+use sim::Arrival;
+use sim::device::Device;
+use sim::fault::Faults;
+use sim::ld::{Head, HeadSettings, Packets};
+use sim::machine::{self, Machine, Start};
+use sim::noise::Mistuned;
+use sim::operating::Operating;
+use sim::room::Room;
+use sim::rplidar::{Model, Unit, UnitSettings, UnitStart};
+use sim::wire::Wire;
+
+/// Host's end of the line: a search, or a session to compare it with.
+pub(crate) trait Host {
+    type Result;
+    fn spare(&mut self) -> &mut [u8];
+    fn commit(&mut self, now: Nanos, len: usize);
+    fn handle_timeout(&mut self, now: Nanos);
+    fn transmitted(&mut self, now: Nanos);
+    fn reject_rate(&mut self, now: Nanos);
+    fn poll(&mut self) -> Event<Self::Result>;
+}
+
+/// What a host wants next.
+pub(crate) enum Event<R> {
+    SetRate(u32),
+    Transmit(u8, Nanos),
+    Wait(Nanos),
+    Done(R),
+}
+
+impl Host for Search {
+    type Result = Found;
+
+    fn spare(&mut self) -> &mut [u8] {
+        self.spare()
+    }
+
+    fn commit(&mut self, now: Nanos, len: usize) {
+        self.commit(now, len);
+    }
+
+    fn handle_timeout(&mut self, now: Nanos) {
+        self.handle_timeout(now);
+    }
+
+    fn transmitted(&mut self, now: Nanos) {
+        self.transmitted(now);
+    }
+
+    fn reject_rate(&mut self, now: Nanos) {
+        self.reject_rate(now);
+    }
+
+    fn poll(&mut self) -> Event<Found> {
+        match self.poll_output() {
+            Output::SetRate(rate) => Event::SetRate(rate),
+            Output::Transmit { byte, not_before } => Event::Transmit(byte, not_before),
+            Output::Wait { until } => Event::Wait(until),
+            Output::Found(found) => Event::Done(found),
+        }
+    }
+}
+
+/// A session of a named family, until something of the scanner arrives.
+pub(crate) struct Named<S>(pub(crate) S);
+
+impl<S: line::Session> Host for Named<S> {
+    type Result = ();
+
+    fn spare(&mut self) -> &mut [u8] {
+        self.0.spare()
+    }
+
+    fn commit(&mut self, now: Nanos, len: usize) {
+        self.0.commit(now, len);
+    }
+
+    fn handle_timeout(&mut self, now: Nanos) {
+        self.0.handle_timeout(now);
+    }
+
+    fn transmitted(&mut self, now: Nanos) {
+        self.0.transmitted(now);
+    }
+
+    fn reject_rate(&mut self, _: Nanos) {}
+
+    fn poll(&mut self) -> Event<()> {
+        loop {
+            return match self.0.poll_output() {
+                line::Output::SetRate(rate) => Event::SetRate(rate),
+                line::Output::SetDtr(_) => continue,
+                line::Output::Transmit { byte, not_before } => Event::Transmit(byte, not_before),
+                line::Output::Wait { until } | line::Output::Rest(until) => Event::Wait(until),
+                line::Output::Heard(_) => Event::Done(()),
+            };
+        }
+    }
+}
+
+/// Both ends, the line, and what the host did.
+pub(crate) struct Bench<H = Search> {
+    pub(crate) host: H,
+    /// `None` if no scanner is connected.
+    pub(crate) device: Option<Box<dyn Device>>,
+    wire: Wire,
+    /// Time at which the scanner gets power.
+    power_at: Nanos,
+    is_powered: bool,
+    pub(crate) opened_at: Nanos,
+    pub(crate) now: Nanos,
+    port: Port,
+    rate: u32,
+    /// Rates that the port cannot have.
+    pub(crate) impossible: Vec<u32>,
+    to_host: Mistuned,
+    to_device: Mistuned,
+    /// Time at which the last byte of the host has left, and whether the line was idle since then.
+    left_at: Nanos,
+    is_flushed: bool,
+    inbox: VecDeque<u8>,
+    /// Random bytes that arrive in addition: the time of the next one, and the mean time between them.
+    noise: Option<(Nanos, Nanos)>,
+    random: fastrand::Rng,
+    /// Bytes that the search has sent, with their times and rates.
+    pub(crate) written: Vec<(Nanos, u32, u8)>,
+    /// Bytes that the host has read at the present rate, with their times.
+    pub(crate) read: Vec<(Nanos, Vec<u8>)>,
+    /// Rates that the search has set, with their times.
+    pub(crate) rates: Vec<(Nanos, u32)>,
+}
+
+pub(crate) fn room(seed: u64) -> Room {
+    Room::new(&"random".parse().expect("a world"), seed)
+}
+
+/// An LMS at `baud` that streams or not.
+pub(crate) fn lms(baud: Baud, streams: bool, seed: u64) -> Box<dyn Device> {
+    let operating = if streams { Operating::All } else { Operating::OnRequest };
+    let settings =
+        machine::Settings { baud, start: Start::In(operating), seed, ..machine::Settings::default() };
+    Box::new(Machine::new(settings, sim::source::Source::Room(room(seed))))
+}
+
+pub(crate) fn ld(model: ld::Model, seed: u64) -> Box<dyn Device> {
+    let settings = HeadSettings { seed, ..HeadSettings::of(model) };
+    Box::new(Head::new(settings, Packets::Room(Box::new(room(seed)))))
+}
+
+/// An RPLIDAR that streams or not, and reports this health.
+pub(crate) fn rplidar(model: Model, streams: bool, health: u8, seed: u64) -> Box<dyn Device> {
+    let start = if streams { UnitStart::Streaming } else { UnitStart::Idle };
+    let settings = UnitSettings { start, health: (health, 1), seed, ..UnitSettings::of(model) };
+    Box::new(Unit::new(settings, room(seed)))
+}
+
+impl Bench {
+    /// Opens a port with a scanner that has run for some time, which `seed` selects.
+    pub(crate) fn new(
+        device: Option<Box<dyn Device>>,
+        port: Port,
+        memory: Option<Memory>,
+        seed: u64,
+    ) -> Bench {
+        Bench::with_faults(device, port, memory, "", seed)
+    }
+
+    pub(crate) fn with_faults(
+        device: Option<Box<dyn Device>>,
+        port: Port,
+        memory: Option<Memory>,
+        faults: &str,
+        seed: u64,
+    ) -> Bench {
+        let rate = match port {
+            Port::Serial => Search::opening_rate(memory),
+            Port::Server | Port::Recording => device.as_ref().map_or(9_600, |device| device.rate()),
+        };
+        let faults = faults.parse().expect("faults");
+        Bench::hosting(|now| Search::new(port, memory, now), device, port, rate, &faults, seed)
+    }
+}
+
+impl<S: line::Session> Bench<Named<S>> {
+    /// Opens a serial port for a session of a named family, which `begin` creates. Returns the time until something of the
+    /// scanner arrives.
+    pub(crate) fn named(begin: impl FnOnce(Nanos) -> S, device: Box<dyn Device>, seed: u64) -> Nanos {
+        let mut rate = 0;
+        let begin = |now| {
+            let session = begin(now);
+            rate = session.rate();
+            Named(session)
+        };
+        let mut bench = Bench::hosting(begin, Some(device), Port::Serial, 0, &Faults::default(), seed);
+        bench.rate = rate;
+        bench.run(bench.now + 20_000 * MILLIS).expect("something arrives");
+        bench.now - bench.opened_at
+    }
+}
+
+impl<H: Host> Bench<H> {
+    fn hosting(
+        begin: impl FnOnce(Nanos) -> H,
+        mut device: Option<Box<dyn Device>>,
+        port: Port,
+        rate: u32,
+        faults: &Faults,
+        seed: u64,
+    ) -> Bench<H> {
+        let mut random = fastrand::Rng::with_seed(seed);
+        let now = 100 * MILLIS + random.u64(..1_000 * MILLIS);
+        while device.as_mut().is_some_and(|device| device.poll_transmit(now).is_some()) {}
+        Bench {
+            host: begin(now),
+            device,
+            wire: Wire::new(faults, seed),
+            power_at: 0,
+            is_powered: true,
+            opened_at: now,
+            now,
+            port,
+            rate,
+            impossible: Vec::new(),
+            to_host: Mistuned::default(),
+            to_device: Mistuned::default(),
+            left_at: 0,
+            is_flushed: true,
+            inbox: VecDeque::new(),
+            noise: None,
+            random,
+            written: Vec::new(),
+            read: Vec::new(),
+            rates: Vec::new(),
+        }
+    }
+
+    /// The scanner gets power `after` this time from the open.
+    pub(crate) fn powered_after(mut self, after: Nanos) -> Self {
+        (self.power_at, self.is_powered) = (self.now + after, false);
+        self
+    }
+
+    /// Random bytes arrive, with this mean time between them.
+    pub(crate) fn with_noise(mut self, mean: Nanos) -> Self {
+        self.noise = Some((self.now, mean));
+        self
+    }
+
+    /// Runs until the scanner is found, or for `span`. Returns the result and the time since the open.
+    pub(crate) fn find(&mut self, span: Nanos) -> Option<(H::Result, Nanos)> {
+        let end = self.now + span;
+        let found = self.run(end).map(|found| (found, self.now - self.opened_at));
+        self.check_requests();
+        found
+    }
+
+    /// Runs until `end`.
+    pub(crate) fn run(&mut self, end: Nanos) -> Option<H::Result> {
+        while self.now < end {
+            let until = match self.drain() {
+                Ok(until) => until,
+                Err(found) => return Some(found),
+            };
+            while self.inbox.is_empty()
+                && let Some(at) = self.next_event().filter(|&at| at <= until.min(end))
+            {
+                self.advance(at);
+            }
+            let woken = if self.inbox.is_empty() { until.min(end) } else { self.now };
+            let latency = self.random.u64(20 * MICROS..3 * MILLIS);
+            self.advance(woken.max(self.now) + latency);
+            let spare = self.host.spare();
+            assert!(!spare.is_empty());
+            let len = spare.len().min(self.inbox.len());
+            for (place, byte) in spare.iter_mut().zip(self.inbox.drain(..len)) {
+                *place = byte;
+            }
+            self.read.push((self.now, spare[..len].to_vec()));
+            self.host.commit(self.now, len);
+            if len == 0 && self.now >= until {
+                self.host.handle_timeout(self.now);
+            }
+        }
+        None
+    }
+
+    fn drain(&mut self) -> Result<Nanos, H::Result> {
+        loop {
+            match self.host.poll() {
+                Event::SetRate(rate) if self.impossible.contains(&rate) => self.host.reject_rate(self.now),
+                Event::SetRate(rate) => {
+                    assert_eq!(self.port, Port::Serial);
+                    self.flush();
+                    self.rate = rate;
+                    self.inbox.clear();
+                    self.read.clear();
+                    self.rates.push((self.now, rate));
+                }
+                Event::Transmit(byte, not_before) => self.transmit(byte, not_before),
+                Event::Wait(until) => {
+                    self.flush();
+                    return Ok(until);
+                }
+                Event::Done(result) => return Err(result),
+            }
+        }
+    }
+
+    fn transmit(&mut self, byte: u8, not_before: Nanos) {
+        self.advance(not_before);
+        self.written.push((self.now, self.rate, byte));
+        self.host.transmitted(self.now);
+        if self.now > self.left_at {
+            self.flush();
+        }
+        self.left_at = self.now.max(self.left_at) + line_time(1, self.rate);
+        self.is_flushed = false;
+        self.deliver(&[byte], false);
+    }
+
+    /// The line to the scanner is idle.
+    fn flush(&mut self) {
+        if !std::mem::replace(&mut self.is_flushed, true) {
+            self.deliver(&[], true);
+        }
+    }
+
+    /// Bytes of the host arrive at the scanner, garbled if the rates differ.
+    fn deliver(&mut self, bytes: &[u8], is_idle: bool) {
+        let Some(device) = self.device.as_mut().filter(|_| self.is_powered) else { return };
+        let bytes = match device.rate() {
+            rate if rate == self.rate => bytes.to_vec(),
+            rate => self.to_device.receive((self.rate, rate), bytes, is_idle),
+        };
+        for byte in bytes {
+            self.wire.receive(&mut **device, byte, Arrival::at(self.left_at));
+        }
+    }
+
+    fn next_event(&self) -> Option<Nanos> {
+        let noise = self.noise.map(|(at, _)| at);
+        let device = self.device.as_ref().map(|device| match self.is_powered {
+            true => self.wire.poll_timeout(&**device, self.now),
+            false => Some(self.power_at),
+        });
+        noise.into_iter().chain(device.flatten()).min().map(|at| at.max(self.now))
+    }
+
+    fn advance(&mut self, to: Nanos) {
+        while let Some(at) = self.next_event().filter(|&at| at <= to) {
+            self.now = self.now.max(at);
+            if let Some((at, mean)) = self.noise.filter(|(at, _)| *at <= self.now) {
+                self.inbox.push_back(self.random.u8(..));
+                self.noise = Some((at + self.random.u64(1..=2 * mean), mean));
+            }
+            let Some(device) = &mut self.device else { continue };
+            if !self.is_powered {
+                if self.now >= self.power_at {
+                    self.is_powered = true;
+                    device.power_cycle(self.now);
+                }
+                continue;
+            }
+            while let Some(carried) = self.wire.poll_transmit(&mut **device, self.now) {
+                let bytes = match carried.rate {
+                    rate if rate == self.rate => carried.bytes,
+                    rate => self.to_host.receive((rate, self.rate), &carried.bytes, carried.idle_after),
+                };
+                self.inbox.extend(bytes);
+            }
+        }
+        self.now = self.now.max(to);
+    }
+
+    /// The search sent nothing but the requests that an unknown scanner may get, and nothing just after the open.
+    fn check_requests(&self) {
+        const ALLOWED: [(&[u8], &[u32]); 4] = [
+            (&[0x02, 0x00, 0x01, 0x00, 0x3A, 0x1E, 0x12], &[9_600, 19_200, 38_400, 500_000]),
+            (&[0x02, 0x00, 0x01, 0x00, 0x31, 0x15, 0x12], &[9_600, 19_200, 38_400, 500_000]),
+            (&[0xA5, 0x25], &[115_200, 256_000, 460_800, 1_000_000]),
+            (&[0xA5, 0x50], &[115_200, 256_000, 460_800, 1_000_000]),
+        ];
+        assert!(self.written.iter().all(|(at, ..)| *at >= self.opened_at + 150 * MILLIS));
+        let mut rest = &self.written[..];
+        while let Some(&(_, rate, _)) = rest.first() {
+            let sent: Vec<u8> = rest.iter().map(|(.., byte)| *byte).collect();
+            let is_one = |(request, rates): &&(&[u8], &[u32])| {
+                let is_at_rate = self.port != Port::Serial || rates.contains(&rate);
+                is_at_rate && (sent.starts_with(request) || request.starts_with(&sent))
+            };
+            let request = ALLOWED.iter().find(is_one);
+            let (request, _) = request.unwrap_or_else(|| panic!("{sent:02X?} at {rate}"));
+            rest = &rest[request.len().min(rest.len())..];
+        }
+        assert_eq!(self.device.as_ref().map_or(0, |device| device.eeprom_writes()), 0);
+    }
+}
