@@ -126,6 +126,7 @@ pub fn session(data: &[u8]) {
         baud: Baud::ALL[usize::from(*baud) % Baud::ALL.len()],
         listen_only: variant & 0xC0 == 0xC0,
         fixed_rate: variant & 0x20 != 0,
+        keep_baud: variant & 0x10 != 0,
     };
     let mut now: Nanos = 1_000 * MILLIS;
     let mut session = Session::new(settings, now);

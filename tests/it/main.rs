@@ -76,6 +76,7 @@ mod restart;
 mod robot;
 mod ros;
 mod rplidar;
+mod rs232;
 mod serial_server;
 mod service;
 mod sharing;

@@ -145,7 +145,9 @@ impl Draft {
                 return Err(refuse(&place, what, &remedy_of_lms(key, &scanner)));
             }
         }
-        let (unit, baud) = (unit.map(|said| said.value), baud.map_or(Baud::B500000, |said| said.value));
+        let unit = unit.map(|said| said.value);
+        let is_baud_set = baud.is_some();
+        let baud = baud.map_or(Baud::B500000, |said| said.value);
         if let Some(mode) = mode.as_ref().filter(|_| !matches!(port, Source::File { .. })) {
             let what = format!("the mode of {} is read from the sensor", port.name());
             return Err(refuse(
@@ -189,7 +191,8 @@ impl Draft {
         let start =
             said.iter().rev().find_map(|(origin, sections)| Some(origin.place(Some(sections.start()?))));
         let mode = mode.map(|said| said.value);
-        let mut link = Link { name, port, scanner, family, variant, unit, mode, baud, processing };
+        let mut link =
+            Link { name, port, scanner, family, variant, unit, mode, baud, is_baud_set, processing };
         ZoneCoverage { link: &link, place: &place, said }.check()?;
         own.iter().try_for_each(|(origin, sections)| sections.check_family(origin, link.family()))?;
         let mut background = std::mem::take(&mut link.processing.background);

@@ -45,6 +45,8 @@ pub struct Link {
     pub mode: Option<Mode>,
     /// Rate to stream at.
     pub baud: Baud,
+    /// Whether the rate is set. Otherwise, the hub may use a lower one on a line that cannot carry it.
+    pub is_baud_set: bool,
     /// How its scans are processed.
     pub processing: Processing,
 }

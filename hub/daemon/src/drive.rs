@@ -23,6 +23,7 @@ use crate::backlog::Backlog;
 use crate::control::Flow;
 use crate::driver::{Driver, Heard};
 use crate::identity_cache::IdentityCache;
+use crate::learned::KnownRate;
 use crate::link::LinkCore;
 use crate::settings_check::SettingsCheck;
 use crate::surroundings::{Learned, Line, On, Surroundings, Woken};
@@ -39,7 +40,7 @@ pub(crate) struct Drive<'a, S: Surroundings> {
     /// When the next scan has to be here to follow the last one without a silence, by the stamps of scans.
     follows_by: Nanos,
     /// Where the sensor was found the last time that it had to be sought.
-    found: Option<u32>,
+    found: Option<KnownRate>,
     /// In how many pieces a telegram is read, as of the last scan: as many as who follows early warnings wants.
     pieces: u8,
 }
@@ -105,7 +106,7 @@ impl<'a, S: Surroundings> Drive<'a, S> {
     }
 
     /// The rate to begin with where the sensor of `core` has to be sought.
-    pub(crate) fn last_rate(&self, core: &LinkCore<'a, S>) -> Option<u32> {
+    pub(crate) fn last_rate(&self, core: &LinkCore<'a, S>) -> Option<KnownRate> {
         let kept = || rates(core)?.rate(&core.link.port.name());
         self.found.or_else(kept).filter(|_| is_tty(core))
     }
@@ -277,7 +278,7 @@ impl<'a, S: Surroundings> Drive<'a, S> {
         }
         self.identity.keep_first(session);
         let (state, is_new) = core.diagnosis.examine(session, now);
-        if is_new && let Some(found) = session.found_at() {
+        if is_new && let Some(found) = session.known_rate() {
             self.found = Some(found);
             rates(core).iter().for_each(|rates| rates.keep_rate(&core.link.port.name(), found));
         }

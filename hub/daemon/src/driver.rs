@@ -14,6 +14,7 @@ use scanhub_drivers::{line, lms, scanner};
 use schema::Nanos;
 
 use crate::early::Begun;
+use crate::learned::KnownRate;
 
 /// A session of one of the families.
 #[expect(clippy::large_enum_variant, reason = "there is one per open port")]
@@ -69,8 +70,13 @@ impl Driver {
             }
         }
         let fixed_rate = matches!(link.port, Source::Tcp { .. });
-        let settings =
-            Settings { variant: link.variant, baud: link.baud, listen_only: is_recording, fixed_rate };
+        let settings = Settings {
+            variant: link.variant,
+            baud: link.baud,
+            listen_only: is_recording,
+            fixed_rate,
+            keep_baud: link.is_baud_set,
+        };
         Driver::Lms(lms::Session::new(settings, now))
     }
 
@@ -124,18 +130,21 @@ impl Driver {
         }
     }
 
-    /// The rate that is asked first where the scanner has to be sought. To be said before anything is read.
-    pub(crate) fn seek_first(&mut self, rate: u32) {
+    /// Restores the rate at which an earlier session found the scanner. Call it before the first read.
+    pub(crate) fn recall_rate(&mut self, known: KnownRate) {
         if let Driver::Lms(session) = self
-            && let Some(baud) = Baud::ALL.into_iter().find(|baud| baud.rate() == rate)
+            && let Some(baud) = Baud::of_rate(known.baud)
         {
             session.seek_first(baud);
+            session.recall_silent_switches(known.silent_switches);
         }
     }
 
-    /// The rate at which a scanner that was sought answered; nothing if none had to be sought.
-    pub(crate) fn found_at(&self) -> Option<u32> {
-        self.lms()?.found_at().map(Baud::rate)
+    /// Returns the rate at which the session found the scanner, for the next search. `None` if there was no search.
+    pub(crate) fn known_rate(&self) -> Option<KnownRate> {
+        let session = self.lms()?;
+        let baud = session.found_at()?.rate();
+        Some(KnownRate { baud, silent_switches: session.silent_switches() })
     }
 
     /// What the next session would have to ask if this one ended now; nothing if that is not known.

@@ -18,6 +18,7 @@ use schema::{Age, Background, Failure, MILLIS, Nanos, Pose, StateDirectory};
 use crate::event_fd::EventFd;
 use crate::surroundings::Learned;
 use file::KeptBackground;
+pub use rate::KnownRate;
 pub(crate) use writer::Writer;
 
 /// Where texts are kept under names between two hubs.
@@ -87,7 +88,7 @@ struct Slot {
     /// 0 if none is kept.
     kept_wall_ns: AtomicU64,
     /// Rate and port, and whether that is to be written.
-    rate: Mutex<(Option<(u32, String)>, bool)>,
+    rate: Mutex<(Option<(KnownRate, String)>, bool)>,
 }
 
 /// The slot of one link.
@@ -180,12 +181,12 @@ impl Learned for Handle<'_> {
         Some(self.slot.kept_wall_ns.load(Ordering::Relaxed)).filter(|&wall_ns| wall_ns != 0)
     }
 
-    fn rate(&self, port: &str) -> Option<u32> {
+    fn rate(&self, port: &str) -> Option<KnownRate> {
         let (known, _) = &*held(&self.slot.rate);
         known.as_ref().filter(|(_, of)| of == port).map(|(rate, _)| *rate)
     }
 
-    fn keep_rate(&self, port: &str, rate: u32) {
+    fn keep_rate(&self, port: &str, rate: KnownRate) {
         let news = (Some((rate, port.to_owned())), true);
         let mut known = held(&self.slot.rate);
         if known.0 != news.0 {
@@ -267,7 +268,7 @@ fn recall(link: &mut Link, files: &impl Files, now_wall_ns: u64) -> u64 {
 }
 
 /// The rate that is known of the sensor of `link`, and its port. On a line whose rate cannot be changed none is sought.
-fn known_rate(link: &Link, files: &impl Files) -> Option<(u32, String)> {
+fn known_rate(link: &Link, files: &impl Files) -> Option<(KnownRate, String)> {
     let Source::Tty(_) = link.port else { return None };
     let text = files.read(&rate_of(&link.name), rate::LONGEST).unwrap_or_else(|failure| {
         tracing::warn!("{}: {}; {}", link.name, failure.message, failure.hint);
@@ -314,7 +315,8 @@ mod tests {
             keeper.slots().of(name).and_then(|slot| slot.rate(port))
         };
         assert_eq!(known("front", port), None, "the first one");
-        for rate in [9_600, 500_000] {
+        for (baud, silent_switches) in [(9_600, 0), (38_400, 2), (500_000, 0)] {
+            let rate = KnownRate { baud, silent_switches };
             let mut keeper = begin(&format!("front={port}"));
             let slots = keeper.slots();
             slots.of("front").expect("a slot").keep_rate(port, rate);

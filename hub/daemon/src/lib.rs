@@ -33,7 +33,7 @@ mod system;
 mod topics;
 
 pub use control::{ControlQueue, Orders, Outcome};
-pub use learned::{Files, Handle, Keeper, Slots};
+pub use learned::{Files, Handle, Keeper, KnownRate, Slots};
 pub use player::{Pace, Play, Player, Progress};
 pub use reconnect::LiveLink;
 pub use reload::{Read, Reload};

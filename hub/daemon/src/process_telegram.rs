@@ -85,7 +85,7 @@ impl<'a, S: Surroundings> LinkOutput<'a, S> {
             measured.zip(mode).is_some_and(|(measured, mode)| scanner::is_forbidden(&measured, mode));
         let reasons = received.reasons | if forbidden { line::suspect::FORBIDDEN_BITS } else { 0 };
         let variant = measured.and_then(|measured| Variant::of_beams(measured.count()));
-        let nominal = || scanner::period_us(variant, self.link.baud.rate());
+        let nominal = || scanner::period_us(variant, received.message.baud.rate());
         let period_us = recorded.period_us.unwrap_or_else(nominal).max(recorded.gap_us);
         let period_us = recorded.stretched(period_us);
         self.recall(recorded);
@@ -120,7 +120,7 @@ impl<'a, S: Surroundings> LinkOutput<'a, S> {
             let (first, last, reasons, period_us) = match begun {
                 Begun::Telegram(telegram) => {
                     let variant = Variant::of_beams(telegram.values.count());
-                    let period_us = scanner::period_us(variant, self.link.baud.rate());
+                    let period_us = scanner::period_us(variant, telegram.baud.rate());
                     (telegram.first, telegram.last, telegram.reasons, period_us)
                 }
                 Begun::Turn(turn) => (turn.first, turn.last, turn.reasons, micros(turn.period)),

@@ -175,10 +175,11 @@ impl<'a, S: Surroundings> LiveLink<'a, S> {
         }
         if let Some(rate) = self.drive.last_rate(core) {
             tracing::debug!(
-                "{}: the search begins at {rate} baud, where the scanner was found",
-                core.link.name
+                "{}: the search begins at {} baud, where the scanner was found",
+                core.link.name,
+                rate.baud
             );
-            session.seek_first(rate);
+            session.recall_rate(rate);
         }
         if core.control.is_paused() {
             session.control(Control::Pause, now);

@@ -137,7 +137,7 @@ impl Differences {
             ("unit", old.unit != new.unit),
             ("mode", old.mode != new.mode || was.mode != will.mode),
             ("idle", was.stop_when_idle != will.stop_when_idle),
-            ("baud", old.baud != new.baud),
+            ("baud", (old.baud, old.is_baud_set) != (new.baud, new.is_baud_set)),
             ("background.start", is_begun && begin(old) != begin(new)),
         ]);
         if !sections.is_empty() {

@@ -10,6 +10,7 @@ use schema::ipc::{Medium, Payload};
 use schema::{Background, Failure, Nanos, Pose, Ring, Wake};
 
 use crate::control::ControlQueue;
+use crate::learned::KnownRate;
 
 /// What one link has around it.
 pub trait Surroundings {
@@ -83,11 +84,11 @@ pub trait Learned {
     /// Returns when the background was written that the next hub would begin with, in ns since 1970; nothing if there is none.
     fn kept_wall_ns(&self) -> Option<u64>;
 
-    /// Returns the rate at which the sensor at `port` was found the last time that it had to be sought.
-    fn rate(&self, port: &str) -> Option<u32>;
+    /// Returns the rate at which the scanner at `port` was found the last time that it had to be searched for.
+    fn rate(&self, port: &str) -> Option<KnownRate>;
 
-    /// The sensor at `port` was found at `rate`.
-    fn keep_rate(&self, port: &str, rate: u32);
+    /// Saves the `rate` at which the scanner at `port` was found.
+    fn keep_rate(&self, port: &str, rate: KnownRate);
 }
 
 /// An open line; nothing here waits.

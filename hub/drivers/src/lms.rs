@@ -14,6 +14,7 @@ pub mod errors;
 pub mod exchange;
 pub mod explain;
 pub mod family;
+mod fast_switch;
 pub mod framer;
 pub mod header;
 mod identity;

@@ -162,6 +162,7 @@ faults! {
     answer, 0.0 to 10.0, 0.0, "seconds from each ACK to its reply; 0: by chance 0.055 to 0.145";
     refuse, 0.0 to 255.0, 0.0, "command that it refuses, such as 0x3B";
     mute, 0.0 to 1.0, 0.0, "1: it does not answer";
+    rs232, 0.0 to 1.0, 0.0, "1: the line is RS-232, which carries nothing at 500000 baud or more";
 }
 
 impl Faults {

@@ -38,6 +38,8 @@ pub struct Wire {
     unplug: Window,
     power: Schedule,
     brownouts: Schedule,
+    /// Whether nothing gets through at [`RS422_RATE`] or more.
+    is_rs232: bool,
     /// Whether the adapter is in its socket.
     plugged: bool,
     /// Bytes of the telegram on the line that were sent, the last of them, and why they did not arrive as they were.
@@ -66,6 +68,7 @@ impl Wire {
             unplug: Window::unplugs(faults, seed),
             power: Schedule::power_cycles(faults, seed),
             brownouts: Schedule::brownouts(faults, seed),
+            is_rs232: faults.rs232 > 0.0,
             plugged: true,
             position: 0,
             last: 0,
@@ -103,7 +106,7 @@ impl Wire {
 
     /// A byte of the host, if it gets through. Call it after [`Wire::poll_transmit`] answered `None`.
     pub fn receive(&mut self, machine: &mut dyn Device, byte: u8, arrival: Arrival) {
-        if self.plugged {
+        if self.plugged && self.carries(machine.rate()) {
             machine.receive(byte, arrival);
         }
     }
@@ -133,7 +136,7 @@ impl Wire {
                         return None;
                     }
                     let bytes = Some(self.garbage(now, false)?.0);
-                    let bytes = bytes.filter(|_| !self.silence.holds(now)).unwrap_or_default();
+                    let bytes = bytes.filter(|_| !self.is_silent(machine.rate(), now)).unwrap_or_default();
                     let rate = machine.rate();
                     self.push(now, Carried { bytes, rate, idle_after: true, part: None, fault: None });
                 }
@@ -155,7 +158,7 @@ impl Wire {
     /// Puts what becomes of a chunk that is through on its way to the host.
     fn carry(&mut self, machine: &mut dyn Device, chunk: Chunk, now: Nanos) {
         let Chunk { bytes, rate, idle_after, part } = chunk;
-        let is_silent = self.silence.holds(now);
+        let is_silent = self.is_silent(rate, now);
         self.telegram_len = machine.telegram_len();
         let (arrived, mut fault) = match &part {
             Part::Acknowledge => (self.carry_acknowledge(&bytes), None),
@@ -176,6 +179,16 @@ impl Wire {
             let bytes = sent.telegram.clone();
             self.push(now, Carried { bytes, rate, idle_after, part: Some(Part::End(sent)), fault: None });
         }
+    }
+
+    /// Returns whether the line carries bytes at `rate`, in bits per second.
+    fn carries(&self, rate: u32) -> bool {
+        !self.is_rs232 || rate < RS422_RATE
+    }
+
+    /// Returns whether nothing sent at `rate` arrives at `now`.
+    fn is_silent(&mut self, rate: u32, now: Nanos) -> bool {
+        self.silence.holds(now) || !self.carries(rate)
     }
 
     fn carry_acknowledge(&mut self, bytes: &[u8]) -> Vec<u8> {
@@ -276,5 +289,7 @@ fn foreign(mut bytes: Vec<u8>, between: Option<(u8, u8)>) -> Vec<u8> {
     bytes
 }
 
+/// Lowest rate that RS-232 does not carry, in bits per second.
+const RS422_RATE: u32 = 500_000;
 /// Bytes of a stream's header: STX to count word.
 const HEADER: usize = 7;

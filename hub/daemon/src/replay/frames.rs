@@ -186,7 +186,7 @@ impl Lap<'_> {
                 let at = self.last_stamp;
                 let received = Received {
                     bytes: telegram.bytes(),
-                    message: Message { telegram, reply, mode, offset: 0 },
+                    message: Message { telegram, reply, mode, baud: replay.link.link.baud, offset: 0 },
                     first: at.saturating_sub(when.last - when.first),
                     last: at,
                     estimated: header.is_some_and(|header| header.flags & Flags::STAMP_ESTIMATED != 0),

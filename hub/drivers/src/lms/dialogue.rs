@@ -4,6 +4,7 @@
 
 use crate::line::State;
 use crate::lms::command::{MODE, Request};
+use crate::lms::fast_switch::FastSwitches;
 use crate::lms::header::{Expect, StreamHeader, is_data};
 use crate::lms::identity::Identity;
 use crate::lms::measured::Measured;
@@ -35,8 +36,11 @@ pub(crate) struct Dialogue {
     pub(crate) first: Baud,
     /// The rate at which the search had its last answer.
     pub(crate) found_at: Option<Baud>,
+    /// Rate to stream at, unless the line cannot carry it.
+    wanted: Baud,
     /// What is in the way now; [`Dialogue::trouble`] is what is shown.
     pub(crate) trouble: Option<Trouble>,
+    pub(crate) fast_switches: FastSwitches,
     /// A user paused the sensor.
     pub(crate) is_paused: bool,
     /// The sensor keeps another variant than the wanted one.
@@ -68,7 +72,9 @@ impl Dialogue {
             rest_at: POWER_ON_BAUD,
             first: POWER_ON_BAUD,
             found_at: None,
+            wanted: settings.baud,
             trouble: None,
+            fast_switches: FastSwitches::default(),
             is_paused: false,
             variant_refused: false,
             resyncs: 0,
@@ -104,7 +110,13 @@ impl Dialogue {
         let has_other_angles = self.sensor.has_other_angles().then_some(Trouble::AnglesUnknown);
         let no_ranges = self.sensor.mode.filter(|mode| !mode.has_ranges()).map(Trouble::NoRanges);
         let variant_refused = self.variant_refused.then_some(Trouble::VariantRefused);
-        self.trouble.or(has_other_angles).or(no_ranges).or(variant_refused)
+        let instead = self.rate_in_place_of_fast();
+        let is_concerned = self.wanted == FAST && self.fast_switches.have_failed();
+        let needs_rs422 = is_concerned.then_some(Trouble::NeedsRs422 { instead });
+        // While the scanner is lost, it explains every other finding.
+        let is_lost = self.fast_switches.have_lost();
+        let first = needs_rs422.filter(|_| is_lost).or(self.trouble);
+        first.or(has_other_angles).or(no_ranges).or(needs_rs422).or(variant_refused)
     }
 
     /// The rate to set on the port now.
@@ -204,6 +216,13 @@ impl Dialogue {
         now: Nanos,
     ) {
         self.quiet_since = now;
+        // A telegram that was read before a change of the rate arrived at the previous rate.
+        let is_fast = self.baud == FAST && self.change_baud.is_none();
+        if self.fast_switches.receive(is_fast) {
+            self.settings.baud = self.wanted;
+            // Report a rate even without a search, so that the reset count is saved with it.
+            self.found_at = self.found_at.or(Some(self.rest_at));
+        }
         self.sensor.learn(reply.as_ref(), telegram);
         if telegram.command() == POWER_ON {
             self.restarts += u64::from(core::mem::take(&mut self.is_in_contact));
@@ -414,6 +433,22 @@ impl Dialogue {
         self.open = Some(Outgoing::new(request, address, not_before, tries));
     }
 
+    /// Uses 38,400 baud in place of 500,000 baud from now on if the line cannot carry that rate. Returns whether it does so.
+    pub(crate) fn limit_rate(&mut self) -> bool {
+        let Settings { baud, keep_baud, listen_only, fixed_rate, .. } = self.settings;
+        let is_limited =
+            self.fast_switches.have_failed() && baud == FAST && !(keep_baud || listen_only || fixed_rate);
+        if is_limited {
+            self.settings.baud = RS232;
+        }
+        is_limited
+    }
+
+    /// Returns the rate that is used in place of 500,000 baud, if the line cannot carry that rate.
+    pub(crate) fn rate_in_place_of_fast(&self) -> Option<Baud> {
+        Some(self.settings.baud).filter(|&baud| baud != self.wanted)
+    }
+
     pub(crate) fn change_baud(&mut self, baud: Baud) {
         if self.baud != baud && !self.settings.fixed_rate {
             self.baud = baud;
@@ -422,5 +457,9 @@ impl Dialogue {
     }
 }
 
+/// The rate that needs RS-422.
+pub(crate) const FAST: Baud = Baud::B500000;
+/// The highest rate of RS-232.
+const RS232: Baud = Baud::B38400;
 /// Command byte of the reply to every change of mode or rate.
 const MODE_REPLY: u8 = MODE | REPLY;

@@ -19,6 +19,9 @@ pub struct Settings {
     pub listen_only: bool,
     /// Whether the port has the wanted rate and no other: a serial server on the network.
     pub fixed_rate: bool,
+    /// Whether to keep to `baud` even if the line cannot carry it. Otherwise, the session streams at 38,400 baud after two
+    /// switches to 500,000 baud that the scanner acknowledged and that were followed by silence.
+    pub keep_baud: bool,
 }
 
 #[derive(Clone, Copy, Debug)]

@@ -79,7 +79,7 @@ impl Dialogue {
         }
         let baud = self.settings.fixed_rate.then_some(self.baud);
         let seconds = coarse(now.saturating_sub(self.quiet_since) / (1_000 * MILLIS));
-        if !self.is_paused && seconds > 0 {
+        if !self.is_paused && seconds > 0 && !self.fast_switches.have_lost() {
             self.trouble = Some(Trouble::NoAnswer { baud, seconds });
         }
         let pause = PAUSES[(round - 1).min(PAUSES.len() - 1)];

@@ -31,6 +31,11 @@ pub enum Trouble {
     VariantRefused,
     /// One second without measured data.
     Silence,
+    /// The line cannot carry 500,000 baud: it was silent after two switches to that rate.
+    NeedsRs422 {
+        /// Rate that the session uses instead; `None` if it has to keep to 500,000 baud.
+        instead: Option<Baud>,
+    },
     /// A pause is wanted, but bytes come, and no answer says that they will end.
     NotStopped,
     /// The sensor calls itself a version S14, which scans 90 degrees with as many values as others 180.
@@ -65,6 +70,16 @@ impl fmt::Display for Trouble {
             }
             Trouble::NotStopped => f.write_str("paused, but the sensor does not stop: cable to the sensor?"),
             Trouble::Silence => f.write_str("no measured data for one second"),
+            Trouble::NeedsRs422 { instead: Some(baud) } => write!(
+                f,
+                "500000 baud needs RS-422: the scanner was lost in two switches to it, so the hub uses {} baud. If no \
+                 scans arrive, cycle the scanner's power",
+                baud.rate()
+            ),
+            Trouble::NeedsRs422 { instead: None } => f.write_str(
+                "500000 baud needs RS-422: the scanner was lost in two switches to it. On RS-232, set baud = 38400 and \
+                 cycle the scanner's power",
+            ),
         }
     }
 }

@@ -27,6 +27,8 @@ pub struct Message<'a> {
     /// Mode, which defines how a value is split into range and intensity. `None` while the scanner has not reported it, if the angles of
     /// the values are unknown, or if the telegram arrived at another rate than that of the settings.
     pub mode: Option<Mode>,
+    /// Rate at which the session streams.
+    pub baud: Baud,
     /// Number of the first byte among all bytes of the session, from 0.
     pub offset: u64,
 }
@@ -41,6 +43,8 @@ pub struct Begun<'a> {
     pub values: FirstValues<'a>,
     /// Mode, which defines how a value is split into range and intensity.
     pub mode: Mode,
+    /// Rate at which the session streams.
+    pub baud: Baud,
     /// Number of the first byte of the telegram among all bytes of the session, from 0.
     pub offset: u64,
     /// Bytes that have arrived.
@@ -112,9 +116,25 @@ impl Session {
         self.dialogue.first = baud;
     }
 
-    /// Returns the rate at which the search found the scanner. `None` if there was no search.
+    /// Returns the rate to try first the next time: the one at which the search found the scanner, or the one in use if the
+    /// line cannot carry 500,000 baud. `None` if there was no search.
     pub fn found_at(&self) -> Option<Baud> {
-        self.dialogue.found_at
+        self.dialogue.rate_in_place_of_fast().or(self.dialogue.found_at)
+    }
+
+    /// Restores the [number of silent switches](Self::silent_switches) that the previous session counted. After two of
+    /// them, the session streams at 38,400 baud, unless its settings keep it at 500,000. Call it before the first read.
+    pub fn recall_silent_switches(&mut self, count: u8) {
+        self.dialogue.fast_switches.restore(count);
+        if self.dialogue.limit_rate() {
+            self.dialogue.begin(self.now);
+        }
+    }
+
+    /// Returns the number of switches to 500,000 baud in a row that the scanner acknowledged and that were followed by
+    /// silence, at most 2. It outlives restarts of the scanner.
+    pub fn silent_switches(&self) -> u8 {
+        self.dialogue.fast_switches.silent()
     }
 
     /// Returns the identity for the next session. `None` if the scanner does not stream, or has not reported all of it.
@@ -161,6 +181,7 @@ impl Session {
         Some(Begun {
             values,
             mode,
+            baud: self.dialogue.settings.baud,
             offset: begun.offset,
             bytes,
             first: first.at.max(self.last_stamp),
@@ -226,7 +247,13 @@ impl Session {
         let mode = self.dialogue.sensor.mode_of_scans().filter(|_| is_at_rate);
         Received {
             bytes: telegram.bytes(),
-            message: Message { telegram, reply, mode, offset: span.offset },
+            message: Message {
+                telegram,
+                reply,
+                mode,
+                baud: self.dialogue.settings.baud,
+                offset: span.offset,
+            },
             first: first.at,
             last,
             estimated,

@@ -3,7 +3,7 @@
 
 use crate::line::State;
 use crate::lms::command::Request;
-use crate::lms::dialogue::Dialogue;
+use crate::lms::dialogue::{Dialogue, FAST};
 use crate::lms::phase::{MORE_TRIES, Phase, Progress, SETTLE, STOPS, Step, TRIES};
 use crate::lms::reply::Reply;
 use crate::lms::sensor::Trouble;
@@ -80,6 +80,9 @@ impl Dialogue {
             Step::Check => self.proceed(progress, now),
             Step::Baud => {
                 self.change_baud(self.settings.baud);
+                if self.settings.baud == FAST {
+                    self.fast_switches.acknowledge();
+                }
                 self.enter(Step::Check, progress, now + SETTLE);
             }
             Step::Variant => {
@@ -116,7 +119,12 @@ impl Dialogue {
             }
             Step::Stop | Step::Stream if heard => self.doubt(progress, at),
             Step::Stop | Step::Check | Step::Baud | Step::Stream => {
-                self.trouble = Some(Trouble::Unanswered(request));
+                if self.baud == FAST {
+                    self.fast_switches.give_up();
+                    self.limit_rate();
+                }
+                let is_lost = self.fast_switches.have_lost();
+                self.trouble = (!is_lost).then_some(Trouble::Unanswered(request));
                 self.probe(at, 0);
             }
         }

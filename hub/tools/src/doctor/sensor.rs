@@ -452,6 +452,7 @@ mod tests {
             unit: Some(Unit::Cm),
             mode: None,
             baud: Baud::B500000,
+            is_baud_set: false,
             processing: Default::default(),
         };
         let judged = |link| settings("/dev/ttyUSB0", &report(healthy(), 0x10, &[]), link);

@@ -100,8 +100,13 @@ pub(crate) struct Received {
 }
 
 /// What the session is asked for in all tests here.
-pub(crate) const WANTED: Settings =
-    Settings { variant: Variant::HALF, baud: Baud::B500000, listen_only: false, fixed_rate: false };
+pub(crate) const WANTED: Settings = Settings {
+    variant: Variant::HALF,
+    baud: Baud::B500000,
+    listen_only: false,
+    fixed_rate: false,
+    keep_baud: false,
+};
 
 /// A sensor in a room, at this rate.
 pub(crate) fn sensor(baud: Baud) -> Machine {

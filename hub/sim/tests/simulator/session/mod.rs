@@ -14,6 +14,7 @@ mod notices;
 mod power;
 mod property;
 mod rest;
+mod rs232;
 mod start;
 mod stopped;
 mod trouble;
