@@ -83,7 +83,13 @@ fn of_another_family_or_of_all() {
 fn a_sensor_on_a_mount_sees_in_three_dimensions() {
     let outcome = demo(&["--world", "tilt", "--headless", "--json"], |mut program| {
         let ready = program.await_line("ready", testkit::is_class("ready"));
-        let mut echo = beside(ready["domain"].as_str().expect("a name"), &["echo", "hall/obstacles"]);
+        let domain = ready["domain"].as_str().expect("a name");
+        // The demo is ready before `tilt` has started.
+        until("hall is published", || {
+            let list = beside(domain, &["list"]).wait();
+            list.lines().iter().any(|line| line["sensor"] == "hall")
+        });
+        let mut echo = beside(domain, &["echo", "hall/obstacles"]);
         echo.await_lines(3, "a sweep", testkit::is_class("obstacles"));
         assert_eq!(echo.end(INT).code, Some(0));
         program.end(INT)

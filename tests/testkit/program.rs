@@ -238,6 +238,21 @@ impl Program {
     }
 }
 
+impl Drop for Program {
+    /// Ends it. If the test has failed, prints how the program was and what it reported, because that may be the reason.
+    fn drop(&mut self) {
+        let Some(errors) = self.errors.take().filter(|_| thread::panicking()) else { return };
+        let status = self.process.try_wait().ok().flatten();
+        let state = status.map_or_else(|| "still running".to_owned(), |status| status.to_string());
+        self.process.end();
+        self.out.extend(self.pieces.try_iter().flatten());
+        let out = String::from_utf8_lossy(&self.out);
+        let tail: Vec<_> = out.lines().rev().take(5).collect();
+        let errors = errors.join().unwrap_or_default();
+        eprintln!("scanhub {}: {state}; it reported last: {tail:#?}\n{errors}", self.name);
+    }
+}
+
 impl Outcome {
     /// Parses its stdout as lines of JSON.
     pub(crate) fn lines(&self) -> Vec<Value> {
