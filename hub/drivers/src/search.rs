@@ -28,7 +28,7 @@ fn probes() -> [Box<dyn Probe>; 3] {
     [Box::<ld::Probe>::default(), Box::<lms::Probe>::default(), Box::<rplidar::Probe>::default()]
 }
 
-/// What the search wants next.
+/// Next action of the driver.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Output {
     /// Set the port to this rate, in bits per second, and discard what it has received. Then continue to drain. If the port
@@ -75,7 +75,7 @@ pub enum Port {
 /// Scanner that was found on the same port before.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Memory {
-    /// Its family.
+    /// Family of the scanner.
     pub family: Family,
     /// Rate of its stream, in bits per second.
     pub stream_rate: u32,
@@ -111,7 +111,7 @@ pub struct Search {
     /// Steps of the round, and the number of those that were entered.
     steps: Vec<Step>,
     entered: usize,
-    /// Whether the remembered scanner was asked in this round.
+    /// Whether a request to the remembered scanner was sent in this round.
     is_memory_asked: bool,
     rate: Option<u32>,
     change_rate: bool,
@@ -131,7 +131,7 @@ pub struct Search {
     round_began: Nanos,
     /// Bytes per second of the last step that listened and received any in this round.
     listened: Option<u32>,
-    /// The same for the last complete round. `None` if no byte arrived in it.
+    /// Bytes per second of the last complete round. `None` if no byte arrived in it.
     bytes_per_second: Option<u32>,
     found: Option<Found>,
 }
@@ -151,7 +151,7 @@ enum Condition {
     Bytes,
     /// The line looks like that of the remembered scanner, or is silent.
     Familiar,
-    /// The remembered scanner was not asked in this round.
+    /// No request to the remembered scanner was sent in this round.
     NotAsked,
 }
 
@@ -184,8 +184,9 @@ enum Phase {
 struct Ask {
     probe: usize,
     asks: &'static Asks,
-    /// Number of times that the request is to be sent again, and the same if its reply may have been damaged.
+    /// Number of repetitions of the request that are left.
     repeats: u8,
+    /// Number of repetitions that are left for damaged replies.
     retries: u8,
     /// Whether the request that leaves stops a stream.
     is_stop: bool,
@@ -276,8 +277,8 @@ impl Search {
         self.conclude();
     }
 
-    /// The port cannot have the rate of the last [`Output::SetRate`], or, before the first output, its opening rate. The search
-    /// never uses this rate again.
+    /// Leaves out the rate of the last [`Output::SetRate`], or, before the first output, the opening rate, because the port
+    /// cannot have it.
     pub fn reject_rate(&mut self, now: Nanos) {
         self.now = now;
         self.rejected.extend(self.rate.replace(UNKNOWN_RATE));
@@ -286,7 +287,7 @@ impl Search {
         }
     }
 
-    /// The byte of [`Output::Transmit`] was written at `now`.
+    /// Continues after the byte of [`Output::Transmit`] was written at `now`.
     pub fn transmitted(&mut self, now: Nanos) {
         self.now = now;
         // The rate of a server is unknown, so its bytes are sent at the slowest pace.
@@ -611,7 +612,7 @@ impl Search {
         self.probes[number].approach().family
     }
 
-    /// Returns the rates at which a family is asked, the remembered ones first.
+    /// Returns the rates at which the search sends requests of a family, the remembered ones first.
     fn rates(&self, number: usize) -> Vec<u32> {
         let approach = self.probes[number].approach();
         let mut rates = approach.asks.map_or_else(Vec::new, |asks| asks.rates.to_vec());
@@ -624,7 +625,7 @@ impl Search {
 }
 
 impl Outgoing {
-    /// The next byte was written at `now`. If it was too late, the scanner has dropped the request, which then starts over.
+    /// Continues after the next byte was written at `now`. If it was too late, the scanner has dropped the request, which then starts over.
     fn transmitted(&mut self, now: Nanos, byte_time: Nanos, gap: Option<(Nanos, Nanos)>) {
         let (min_gap, max_gap) = gap.unwrap_or((0, Nanos::MAX - byte_time));
         let is_late = self.sent > 0 && now.saturating_sub(self.left_at) > byte_time + max_gap;

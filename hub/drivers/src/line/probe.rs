@@ -36,7 +36,7 @@ pub trait Probe: fmt::Debug + Send {
     fn evidence(&self) -> Evidence;
 }
 
-/// What bytes prove about the scanner that sent them.
+/// Evidence about the scanner that has sent some bytes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Evidence {
     /// Nothing.
@@ -51,7 +51,7 @@ pub enum Evidence {
     Found(Option<&'static str>),
 }
 
-/// What the search may do to find a family.
+/// Rates and requests by which the search may find a family.
 #[derive(Clone, Copy, Debug)]
 pub struct Approach {
     /// The family.

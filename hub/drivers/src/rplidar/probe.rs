@@ -1,5 +1,5 @@
 //! Recognizes an RPLIDAR by its reply to `A5 50`, sent after `A5 25`, which stops a stream: a scanner that measures does not
-//! reply. Packets alone are no proof, because most rates and bytes that look like them belong to something else.
+//! reply. Packets alone do not prove a scanner, because those of one point have no checksum.
 
 use schema::{Family, MILLIS};
 

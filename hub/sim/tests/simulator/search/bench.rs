@@ -30,7 +30,7 @@ pub(crate) trait Host {
     fn poll(&mut self) -> Event<Self::Result>;
 }
 
-/// What a host wants next.
+/// Next action of a host.
 pub(crate) enum Event<R> {
     SetRate(u32),
     Transmit(u8, Nanos),
@@ -144,7 +144,7 @@ pub(crate) fn room(seed: u64) -> Room {
     Room::new(&"random".parse().expect("a world"), seed)
 }
 
-/// An LMS at `baud` that streams or not.
+/// Creates an LMS at `baud` that streams or not.
 pub(crate) fn lms(baud: Baud, streams: bool, seed: u64) -> Box<dyn Device> {
     let operating = if streams { Operating::All } else { Operating::OnRequest };
     let settings =
@@ -157,7 +157,7 @@ pub(crate) fn ld(model: ld::Model, seed: u64) -> Box<dyn Device> {
     Box::new(Head::new(settings, Packets::Room(Box::new(room(seed)))))
 }
 
-/// An RPLIDAR that streams or not, and reports this health.
+/// Creates an RPLIDAR that streams or not, and reports this health.
 pub(crate) fn rplidar(model: Model, streams: bool, health: u8, seed: u64) -> Box<dyn Device> {
     let start = if streams { UnitStart::Streaming } else { UnitStart::Idle };
     let settings = UnitSettings { start, health: (health, 1), seed, ..UnitSettings::of(model) };
@@ -244,13 +244,13 @@ impl<H: Host> Bench<H> {
         }
     }
 
-    /// The scanner gets power `after` this time from the open.
+    /// Switches the scanner on `after` this time from the open.
     pub(crate) fn powered_after(mut self, after: Nanos) -> Self {
         (self.power_at, self.is_powered) = (self.now + after, false);
         self
     }
 
-    /// Random bytes arrive, with this mean time between them.
+    /// Adds random bytes, with this mean time between them.
     pub(crate) fn with_noise(mut self, mean: Nanos) -> Self {
         self.noise = Some((self.now, mean));
         self

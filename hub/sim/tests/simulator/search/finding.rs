@@ -12,7 +12,7 @@ use super::bench::{self, Bench};
 /// Creates a scanner with a seed.
 type Create = Box<dyn Fn(u64) -> Box<dyn Device>>;
 
-/// All models and states: the name, what is to be found, and the scanner.
+/// Returns all models and states: the name, the expected result, and a function that creates the scanner.
 pub(super) fn scanners() -> Vec<(String, Found, Create)> {
     let mut all: Vec<(String, Found, Create)> = Vec::new();
     for baud in Baud::ALL {
@@ -128,7 +128,7 @@ fn hands_over_every_read_of_the_last_step() {
                 let read: Vec<_> =
                     bench.read.iter().filter(|(_, bytes)| !bytes.is_empty()).cloned().collect();
                 if found.family == Family::Rplidar {
-                    // From the reply on; nothing before it is worth a session's time.
+                    // Only the reply is handed over.
                     assert!(
                         reads[0].1.starts_with(&[0xA5, 0x5A, 0x14, 0, 0, 0, 0x04]),
                         "{name}: {reads:02X?}"

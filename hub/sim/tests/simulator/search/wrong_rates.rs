@@ -13,7 +13,7 @@ use super::bench;
 const LMS: [&[u8]; 2] = [&[0x02, 0, 1, 0, 0x3A, 0x1E, 0x12], &[0x02, 0, 1, 0, 0x31, 0x15, 0x12]];
 const RPLIDAR: [&[u8]; 3] = [&[0xA5, 0x25], &[0xA5, 0x50], &[0xA5, 0x25, 0xA5, 0x50]];
 
-/// Requests of the search with their rates, and the time between two bytes.
+/// Returns the requests of the search with their rates, and the time between two bytes.
 fn requests() -> Vec<(&'static [u8], u32, Nanos)> {
     let lms = Baud::ALL.into_iter().flat_map(|baud| LMS.map(|request| (request, baud.rate(), 120_000)));
     let rates = [115_200, 256_000, 460_800, 1_000_000];
@@ -21,7 +21,7 @@ fn requests() -> Vec<(&'static [u8], u32, Nanos)> {
     lms.chain(rplidar).collect()
 }
 
-/// Scanners by name, each idle and streaming; whether it belongs to the LMS.
+/// Returns scanners by name, each idle and streaming. The flag is set for an LMS.
 fn receivers() -> Vec<(String, bool, Box<dyn Device>)> {
     let mut all: Vec<(String, bool, Box<dyn Device>)> = Vec::new();
     for streams in [false, true] {
