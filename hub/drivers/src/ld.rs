@@ -4,6 +4,7 @@
 pub mod framer;
 mod model;
 pub mod packet;
+mod point_count;
 mod probe;
 mod restarts;
 mod sequence;

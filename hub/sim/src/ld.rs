@@ -25,8 +25,12 @@ pub struct HeadSettings {
     pub model: Model,
     /// Turns in a second, on the mean; by default the model's.
     pub turns_per_second: f64,
+    /// Points per second; by default those of the model.
+    pub points_per_second: f64,
     /// By which share of that the speed goes up and down; real ones hold it within 1 %.
     pub wander: f64,
+    /// Time constant of the spin-up after power-on, in seconds; 0 means full speed at once.
+    pub spin_up_s: f64,
     /// From power-on to the first packet.
     pub boot_ns: Nanos,
     /// How many bytes the host's hardware hands over at once.
@@ -41,7 +45,9 @@ impl HeadSettings {
         HeadSettings {
             model,
             turns_per_second: f64::from(model.turns_per_second()),
+            points_per_second: f64::from(model.points_per_second()),
             wander: 0.005,
+            spin_up_s: 0.0,
             boot_ns: 2_000 * MILLIS,
             chunk: ChunkSize::Uart,
             seed: 0,
@@ -133,16 +139,16 @@ impl Head {
 
     /// When point number `point` is measured, in seconds since the head turns.
     fn seconds(&self, point: u64) -> f64 {
-        point as f64 / f64::from(self.settings.model.points_per_second())
+        point as f64 / self.settings.points_per_second
     }
 
     /// Restarts the scanner at `now`; packets follow after `boot_ns`. Returns whether a packet was broken off.
-    fn restart(&mut self, now: Nanos, boot_ns: Nanos) -> bool {
+    fn restart(&mut self, now: Nanos, boot_ns: Nanos, spin_up_s: f64) -> bool {
         let broken = self.tx_queue.break_off(now);
         self.power_ns = now;
         self.turns_ns = now + boot_ns;
         let HeadSettings { turns_per_second, wander, seed, .. } = self.settings;
-        (self.rotation, self.sent) = (Rotation::new(turns_per_second, wander, 0.0, seed), 0);
+        (self.rotation, self.sent) = (Rotation::new(turns_per_second, wander, spin_up_s, seed), 0);
         if let Source::Recorded { passed_ms, .. } = &mut self.source {
             *passed_ms = 0;
         }
@@ -214,12 +220,12 @@ impl Device for Head {
     fn receive(&mut self, _: u8, _: Arrival) {}
 
     fn power_cycle(&mut self, now: Nanos) -> bool {
-        self.restart(now, self.settings.boot_ns)
+        self.restart(now, self.settings.boot_ns, self.settings.spin_up_s)
     }
 
     /// Restarts the scanner: the clock begins again, while the inertia of the head keeps it turning.
     fn brown_out(&mut self, now: Nanos) -> bool {
-        self.restart(now, RESTART_NS)
+        self.restart(now, RESTART_NS, 0.0)
     }
 
     fn break_off(&mut self, now: Nanos) {

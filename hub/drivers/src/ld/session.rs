@@ -9,6 +9,7 @@ use schema::{MILLIS, Nanos, line_time};
 use crate::ld::framer::{Framer, Span};
 use crate::ld::model::Model;
 use crate::ld::packet::{LEN, POINTS, Packet};
+use crate::ld::point_count::{Counted, PointCount};
 use crate::ld::restarts::Restarts;
 use crate::ld::sequence::{Place, Sequence};
 use crate::line::family::{self, Features, Turning, Wanted};
@@ -55,6 +56,14 @@ pub struct Session {
     phase: Phase,
     baud: u32,
     change_baud: bool,
+    point_count: PointCount,
+    /// Model and number of beams by the points that the scanner measures, once they are known. A power cycle does not change
+    /// them.
+    measured: Option<(Model, usize)>,
+    /// Another number of beams, which the points have required since this time of the scanner's clock.
+    other_beams: Option<(usize, Nanos)>,
+    /// The last change of the number of beams, and until when it is reported.
+    change: Option<(Trouble, Nanos)>,
     /// Number of beams, once it is known.
     beams: Option<usize>,
     /// Whether the points per second of this stream are known.
@@ -108,6 +117,10 @@ impl Session {
             sequence: Sequence::new(),
             turns: Turns::new(),
             pace: None,
+            point_count: PointCount::default(),
+            measured: None,
+            other_beams: None,
+            change: None,
             phase: Phase::Listening { shown: State::Probing, next_at: now + LISTEN },
             baud: settings.baud(),
             change_baud: false,
@@ -126,9 +139,49 @@ impl Session {
         }
     }
 
+    /// Restores the model and the number of beams that an earlier session on the same port has measured. Call it before the
+    /// first read.
+    pub fn recall(&mut self, model: Model, beams: usize) {
+        self.measured = Some((model, beams));
+    }
+
     /// Returns the model, once it is known. Of models that cannot be distinguished, it is one.
     pub fn model(&self) -> Option<Model> {
-        self.settings.model.or_else(|| self.heard_model())
+        self.settings.model.or(self.measured.map(|(model, _)| model))
+    }
+
+    /// Returns the number of beams for scans: that of the settings, of the model in the settings, or the measured one.
+    fn known_beams(&self) -> Option<usize> {
+        let of_model = || self.settings.model.map(Model::beams);
+        let measured = || self.measured.map(|(_, beams)| beams);
+        let beams = self.settings.beams.or_else(of_model).or_else(measured)?;
+        Some(beams.min(self.settings.most_beams.unwrap_or(usize::MAX)))
+    }
+
+    /// Handles the points of a revolution of a scanner without a configured model. The first reliable number of points decides.
+    /// Later, it must be different for a long time.
+    fn count(&mut self, counted: Counted) {
+        let Some((_, beams)) = self.measured else {
+            self.measured = counted.is_final().then(|| (counted.model(), counted.beams()));
+            return;
+        };
+        if !counted.is_final() || !counted.differs_from(beams) {
+            self.other_beams = None;
+            return;
+        }
+        // The clock of a scanner that has restarted begins again.
+        let is_same = |&(other, since): &(usize, Nanos)| !counted.differs_from(other) && since <= counted.at;
+        let known = self.other_beams.filter(is_same);
+        let (other, since) = *self.other_beams.insert(known.unwrap_or((counted.beams(), counted.at)));
+        if counted.at.saturating_sub(since) < CHANGE {
+            return;
+        }
+        (self.measured, self.other_beams) = (Some((counted.model(), other)), None);
+        if self.settings.beams.is_none() {
+            self.is_learned = false;
+            let trouble = Trouble::BeamsChanged { from: beams, to: other };
+            self.change = Some((trouble, self.now + SHOW_CHANGE));
+        }
     }
 
     /// Returns the model of the scanner if it is not the one of the settings. Models with the same number of points per second
@@ -230,10 +283,12 @@ impl Session {
         let mut places = [Place::Odd; MOST];
         self.clock_before = None;
         let flow = Flow { byte_ns: self.sequence.packet_ns() / LEN as f64, packet_len: LEN, pace };
+        let mut counted = None;
         let (bytes, _) = self.framer.bytes(span).as_chunks::<LEN>();
         for (number, bytes) in bytes.iter().enumerate() {
             let Ok(packet) = Packet::check(bytes) else { continue };
             let place = self.sequence.place(&packet);
+            counted = self.point_count.note(&packet, place).or(counted);
             let end = span.offset + ((number + 1) * LEN - 1) as u64;
             if matches!(place, Place::First { .. }) {
                 let arrivals = self.reads.arrivals();
@@ -252,6 +307,9 @@ impl Session {
                 self.restarts.note_next(packet.millis(), measured + packet_time);
             }
             places[number] = place;
+        }
+        if let Some(counted) = counted.filter(|_| self.settings.model.is_none()) {
+            self.count(counted);
         }
         self.scanner_time = places[..span.packets].iter().rev().find_map(|place| place.time());
         let stamp = |number: usize| places[number].time().and_then(|time| self.clock_of(number).time(time));
@@ -301,10 +359,9 @@ impl Session {
         }
         self.damaged.1 = discarded;
         if !self.is_learned
-            && let Some(model) = self.model().filter(|_| self.sequence.points_per_second().is_some())
+            && self.sequence.points_per_second().is_some()
+            && let Some(beams) = self.known_beams()
         {
-            let most = self.settings.most_beams.unwrap_or(usize::MAX);
-            let beams = self.settings.beams.unwrap_or(model.beams()).min(most);
             (self.beams, self.is_learned) = (Some(beams), true);
             self.turns.begin(beams);
         }
@@ -462,7 +519,8 @@ impl line::Session for Session {
     }
 
     fn trouble(&self) -> Option<Trouble> {
-        self.trouble.filter(|_| !matches!(self.phase, Phase::Paused))
+        let change = self.change.filter(|&(_, until)| self.now < until).map(|(trouble, _)| trouble);
+        self.trouble.or(change).filter(|_| !matches!(self.phase, Phase::Paused))
     }
 
     fn missing(&self) -> Option<&'static str> {
@@ -548,6 +606,13 @@ pub enum Trouble {
     Silence,
     /// Packets arrive, but the head does not rotate.
     StandsStill,
+    /// The scanner measures another number of points per revolution, so its scans have another number of beams.
+    BeamsChanged {
+        /// Number of beams before.
+        from: usize,
+        /// Number of beams now.
+        to: usize,
+    },
 }
 
 impl fmt::Display for Trouble {
@@ -563,6 +628,9 @@ impl fmt::Display for Trouble {
             }
             Trouble::Silence => f.write_str("no packet for one second"),
             Trouble::StandsStill => f.write_str("packets come, but the head does not turn: is it blocked?"),
+            Trouble::BeamsChanged { from, to } => {
+                write!(f, "scans have {to} beams instead of {from}, as many as the scanner measures points")
+            }
         }
     }
 }
@@ -614,5 +682,9 @@ const LISTEN: Nanos = 300 * MILLIS;
 const SILENCE: Nanos = 1_000 * MILLIS;
 /// After this time without a revolution, the head is blocked. The slowest head rotates twice per second.
 const STILL: Nanos = 2_000 * MILLIS;
+/// After this time with another number of points per revolution, the number of beams changes.
+const CHANGE: Nanos = 10_000 * MILLIS;
+/// Duration for which a change of the number of beams is reported.
+const SHOW_CHANGE: Nanos = 60_000 * MILLIS;
 /// Maximum number of packets that are returned together: those of an STL27L in 10 ms, one every 0.56 ms.
 const MOST: usize = 17;

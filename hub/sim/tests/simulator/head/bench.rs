@@ -26,6 +26,7 @@ pub(crate) struct Turn {
     pub(crate) points: Vec<Point>,
     pub(crate) first: Nanos,
     pub(crate) incomplete: bool,
+    pub(crate) beams: usize,
 }
 
 pub(crate) struct Bench {
@@ -106,7 +107,10 @@ impl Bench {
     fn carry(&mut self) {
         while let Some(carried) = self.wire.poll_transmit(&mut self.head, self.now) {
             self.intact &= carried.fault.is_none();
-            self.inbox.extend(carried.bytes);
+            // Bytes at another rate are of no use.
+            if carried.rate == self.session.rate() {
+                self.inbox.extend(carried.bytes);
+            }
             if let Some(Part::End(sent)) = carried.part {
                 let intact = std::mem::replace(&mut self.intact, true);
                 self.sent.push(Sent { bytes: sent.telegram, intact, at: self.now });
@@ -127,7 +131,9 @@ impl Bench {
                     points: turn.points.to_vec(),
                     first: turn.first,
                     incomplete: turn.incomplete,
+                    beams: turn.beams,
                 }),
+                Output::SetRate(_) => self.inbox.clear(),
                 Output::Rest(until) => return (until, false),
                 Output::Wait { until, .. } => return (until, true),
                 output => panic!("{output:?}"),

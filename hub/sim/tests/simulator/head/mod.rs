@@ -1,5 +1,6 @@
 //! Scanners of LDROBOT in simulated rooms: what a session tells of them is what they measured.
 
+mod beams;
 mod bench;
 
 use bench::{Bench, still};
