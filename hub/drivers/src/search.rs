@@ -31,8 +31,8 @@ fn probes() -> [Box<dyn Probe>; 3] {
 /// Next action of the driver.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Output {
-    /// Set the port to this rate, in bits per second, and discard what it has received. Then continue to drain. If the port
-    /// cannot have this rate, call [`Search::reject_rate`] before.
+    /// Set the port to this rate, in bits per second, and discard the bytes that it has received. If the port cannot have
+    /// this rate, call [`Search::reject_rate`]. Then continue to drain.
     SetRate(u32),
     /// Write this byte, not before the given time, and then call [`Search::transmitted`]. Do nothing else meanwhile.
     Transmit {
@@ -63,7 +63,7 @@ pub struct Found {
 
 /// Kind of a port.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Port {
+pub enum PortKind {
     /// A serial line, whose rate the search sets.
     Serial,
     /// A serial server on the network, whose rate is set there.
@@ -88,7 +88,7 @@ pub struct Memory {
 pub enum Trouble {
     /// No byte arrives.
     Silent {
-        /// Duration of the search in seconds, rounded down to 3, 10, 30, 60, ..
+        /// Duration of the search in seconds, rounded down to 10, 100, 300, 600, ..
         seconds: u32,
     },
     /// Bytes arrive, but no family recognizes them.
@@ -102,7 +102,7 @@ pub enum Trouble {
 /// [`Output::Wait`] or [`Output::Found`].
 #[derive(Debug)]
 pub struct Search {
-    port: Port,
+    port: PortKind,
     memory: Option<Memory>,
     probes: [Box<dyn Probe>; 3],
     phase: Phase,
@@ -206,22 +206,25 @@ struct Outgoing {
 impl Search {
     /// Returns the rate at which the port has to be open, in bits per second.
     pub fn opening_rate(memory: Option<Memory>) -> u32 {
-        let first = probes().iter().find_map(|probe| probe.approach().listens.first().map(|step| step.rate));
+        let probes = probes();
+        let first = probes.iter().find_map(|probe| probe.approach().listens.first().map(|step| step.rate));
+        let memory = memory.and_then(|memory| memory.checked(&probes));
         memory.map(|memory| memory.stream_rate).or(first).unwrap_or(BOOT_RATE)
     }
 
     /// Creates a search on a port that was opened at `now`, with the [`opening_rate`](Self::opening_rate).
-    pub fn new(port: Port, memory: Option<Memory>, now: Nanos) -> Search {
+    pub fn new(port: PortKind, memory: Option<Memory>, now: Nanos) -> Search {
+        let probes = probes();
         let mut search = Search {
             port,
-            memory,
-            probes: probes(),
+            memory: memory.and_then(|memory| memory.checked(&probes)),
+            probes,
             phase: Phase::Pausing { until: now },
             round: 0,
             steps: Vec::new(),
             entered: 0,
             is_memory_asked: false,
-            rate: (port == Port::Serial).then(|| Search::opening_rate(memory)),
+            rate: (port == PortKind::Serial).then(|| Search::opening_rate(memory)),
             change_rate: false,
             rejected: Vec::new(),
             capture: Capture::default(),
@@ -380,7 +383,7 @@ impl Search {
             let approach = probe.approach();
             let Evidence::Found(model) = probe.evidence() else { continue };
             self.found = Some(Found { family: approach.family, model, rate: self.rate });
-            if approach.asks.is_some_and(|asks| asks.stop.is_some()) && self.port != Port::Recording {
+            if approach.asks.is_some_and(|asks| asks.stop.is_some()) && self.port != PortKind::Recording {
                 self.capture.discard(self.asked_at);
             }
             return;
@@ -523,13 +526,16 @@ impl Search {
     fn end_round(&mut self) {
         let bytes = self.read - self.round_read;
         let mean = per_second(bytes, self.now.saturating_sub(self.round_began));
-        self.bytes_per_second = (bytes > 0).then_some(self.listened.unwrap_or(mean));
+        let new = (bytes > 0).then_some(self.listened.unwrap_or(mean));
+        // A number that is about the same stays, so that its message does.
+        let is_same = |old: &u32| new.is_some_and(|new| new / 3 <= old / 2 && old / 3 <= new / 2);
+        self.bytes_per_second = self.bytes_per_second.filter(is_same).or(new);
         let pause = if bytes == 0 { PAUSES[self.round.min(PAUSES.len() - 1)] } else { 0 };
         self.round += 1;
         let boot_rate = self.probes.iter().find_map(|probe| probe.approach().boot_rate);
         if let Some(rate) = boot_rate.filter(|rate| !self.rejected.contains(rate))
             && pause > 0
-            && self.port == Port::Serial
+            && self.port == PortKind::Serial
         {
             self.set_rate(Some(rate));
         }
@@ -544,9 +550,9 @@ impl Search {
 
     fn reply_time(&self, asks: &Asks) -> Nanos {
         match self.port {
-            Port::Serial if self.is_patient() => asks.reply + asks.patience,
-            Port::Serial => asks.reply,
-            Port::Server | Port::Recording => SERVER_STEP,
+            PortKind::Serial if self.is_patient() => asks.reply + asks.patience,
+            PortKind::Serial => asks.reply,
+            PortKind::Server | PortKind::Recording => SERVER_STEP,
         }
     }
 
@@ -554,8 +560,8 @@ impl Search {
         let mut steps = Vec::new();
         let mut push = |condition, rate, action| steps.push(Step { condition, rate, action });
         match self.port {
-            Port::Recording => push(Condition::Always, None, Action::Listen(Nanos::MAX, 0)),
-            Port::Server => {
+            PortKind::Recording => push(Condition::Always, None, Action::Listen(Nanos::MAX, 0)),
+            PortKind::Server => {
                 push(Condition::Always, None, Action::Listen(SERVER_STEP, SERVER_STEP));
                 let is_other =
                     |number: &usize| Some(self.family(*number)) != self.memory.map(|memory| memory.family);
@@ -567,7 +573,7 @@ impl Search {
                     push(Condition::Always, None, Action::Ask(number));
                 }
             }
-            Port::Serial => {
+            PortKind::Serial => {
                 let memory = self.memory.filter(|_| self.round == 0);
                 let mut remembered = Vec::new();
                 if let Some(Memory { family, stream_rate, reply_rate }) = memory
@@ -624,8 +630,21 @@ impl Search {
     }
 }
 
+impl Memory {
+    /// Returns the memory with rates of its family, at which the search may send its requests. `None` if the rate of the stream
+    /// is not one.
+    fn checked(self, probes: &[Box<dyn Probe>]) -> Option<Memory> {
+        let approach =
+            probes.iter().map(|probe| probe.approach()).find(|approach| approach.family == self.family)?;
+        let is_known = |rate| listens_at(approach, Some(rate));
+        let reply_rate = if is_known(self.reply_rate) { self.reply_rate } else { self.stream_rate };
+        is_known(self.stream_rate).then_some(Memory { reply_rate, ..self })
+    }
+}
+
 impl Outgoing {
-    /// Continues after the next byte was written at `now`. If it was too late, the scanner has dropped the request, which then starts over.
+    /// Continues after the next byte was written at `now`. If it was too late, the scanner has dropped the request, which then
+    /// starts over.
     fn transmitted(&mut self, now: Nanos, byte_time: Nanos, gap: Option<(Nanos, Nanos)>) {
         let (min_gap, max_gap) = gap.unwrap_or((0, Nanos::MAX - byte_time));
         let is_late = self.sent > 0 && now.saturating_sub(self.left_at) > byte_time + max_gap;
@@ -759,8 +778,8 @@ const UNKNOWN_RATE: u32 = 0;
 const CAPTURE: usize = 16 * 1_024;
 /// Bytes of one read: as many as a tty returns at once.
 const READ: usize = 4_096;
-/// Durations that messages contain, so that a message does not change every second.
-const SECONDS: [u32; 9] = [3, 10, 30, 60, 300, 600, 1_800, 3_600, 36_000];
+/// Durations in messages. They are more than a minute apart, because each new message is logged.
+const SECONDS: [u32; 7] = [10, 100, 300, 600, 1_800, 3_600, 36_000];
 
 #[cfg(test)]
 mod tests {
@@ -782,6 +801,21 @@ mod tests {
         outgoing.transmitted(late + 20 * MILLIS, BYTE, gap);
         outgoing.transmitted(late + 60 * MILLIS, BYTE, gap);
         assert_eq!(outgoing.sent, 2);
+    }
+
+    #[test]
+    fn a_memory_never_leads_to_a_request_at_a_rate_of_another_family() {
+        for (family, stream_rate, reply_rate, expected) in [
+            (Family::Lms, 500_000, 9_600, Some((500_000, 9_600))),
+            (Family::Lms, 500_000, 115_200, Some((500_000, 500_000))),
+            (Family::Rplidar, 500_000, 115_200, None),
+            (Family::Ld, 9_600, 230_400, None),
+        ] {
+            let memory = Some(Memory { family, stream_rate, reply_rate });
+            let search = Search::new(PortKind::Serial, memory, 0);
+            assert_eq!(search.memory.map(|memory| (memory.stream_rate, memory.reply_rate)), expected);
+            assert_eq!(search.rate(), Some(Search::opening_rate(memory)));
+        }
     }
 
     #[test]

@@ -6,7 +6,7 @@ use std::collections::VecDeque;
 use scanhub_drivers::ld;
 use scanhub_drivers::line;
 use scanhub_drivers::lms::variant::Baud;
-use scanhub_drivers::search::{Found, Memory, Output, Port, Search};
+use scanhub_drivers::search::{Found, Memory, Output, PortKind, Search};
 use schema::{MICROS, MILLIS, Nanos, line_time};
 use sim::Arrival;
 use sim::device::Device;
@@ -119,7 +119,7 @@ pub(crate) struct Bench<H = Search> {
     is_powered: bool,
     pub(crate) opened_at: Nanos,
     pub(crate) now: Nanos,
-    port: Port,
+    port: PortKind,
     rate: u32,
     /// Rates that the port cannot have.
     pub(crate) impossible: Vec<u32>,
@@ -168,7 +168,7 @@ impl Bench {
     /// Opens a port with a scanner that has run for some time, which `seed` selects.
     pub(crate) fn new(
         device: Option<Box<dyn Device>>,
-        port: Port,
+        port: PortKind,
         memory: Option<Memory>,
         seed: u64,
     ) -> Bench {
@@ -177,14 +177,14 @@ impl Bench {
 
     pub(crate) fn with_faults(
         device: Option<Box<dyn Device>>,
-        port: Port,
+        port: PortKind,
         memory: Option<Memory>,
         faults: &str,
         seed: u64,
     ) -> Bench {
         let rate = match port {
-            Port::Serial => Search::opening_rate(memory),
-            Port::Server | Port::Recording => device.as_ref().map_or(9_600, |device| device.rate()),
+            PortKind::Serial => Search::opening_rate(memory),
+            PortKind::Server | PortKind::Recording => device.as_ref().map_or(9_600, |device| device.rate()),
         };
         let faults = faults.parse().expect("faults");
         Bench::hosting(|now| Search::new(port, memory, now), device, port, rate, &faults, seed)
@@ -201,7 +201,7 @@ impl<S: line::Session> Bench<Named<S>> {
             rate = session.rate();
             Named(session)
         };
-        let mut bench = Bench::hosting(begin, Some(device), Port::Serial, 0, &Faults::default(), seed);
+        let mut bench = Bench::hosting(begin, Some(device), PortKind::Serial, 0, &Faults::default(), seed);
         bench.rate = rate;
         bench.run(bench.now + 20_000 * MILLIS).expect("something arrives");
         bench.now - bench.opened_at
@@ -212,7 +212,7 @@ impl<H: Host> Bench<H> {
     fn hosting(
         begin: impl FnOnce(Nanos) -> H,
         mut device: Option<Box<dyn Device>>,
-        port: Port,
+        port: PortKind,
         rate: u32,
         faults: &Faults,
         seed: u64,
@@ -299,7 +299,7 @@ impl<H: Host> Bench<H> {
             match self.host.poll() {
                 Event::SetRate(rate) if self.impossible.contains(&rate) => self.host.reject_rate(self.now),
                 Event::SetRate(rate) => {
-                    assert_eq!(self.port, Port::Serial);
+                    assert_eq!(self.port, PortKind::Serial);
                     self.flush();
                     self.rate = rate;
                     self.inbox.clear();
@@ -395,7 +395,7 @@ impl<H: Host> Bench<H> {
         while let Some(&(_, rate, _)) = rest.first() {
             let sent: Vec<u8> = rest.iter().map(|(.., byte)| *byte).collect();
             let is_one = |(request, rates): &&(&[u8], &[u32])| {
-                let is_at_rate = self.port != Port::Serial || rates.contains(&rate);
+                let is_at_rate = self.port != PortKind::Serial || rates.contains(&rate);
                 is_at_rate && (sent.starts_with(request) || request.starts_with(&sent))
             };
             let request = ALLOWED.iter().find(is_one);

@@ -2,7 +2,7 @@
 
 use scanhub_drivers::ld;
 use scanhub_drivers::lms::variant::Baud;
-use scanhub_drivers::search::{Found, Port};
+use scanhub_drivers::search::{Found, PortKind};
 use schema::{Family, MILLIS, Nanos};
 use sim::device::Device;
 use sim::rplidar::Model;
@@ -38,10 +38,10 @@ pub(super) fn scanners() -> Vec<(String, Found, Create)> {
 }
 
 /// Finds each scanner with 20 seeds, and returns the times.
-fn find_all(faults: &str, port: Port) -> Vec<Nanos> {
+fn find_all(faults: &str, port: PortKind) -> Vec<Nanos> {
     let mut times = Vec::new();
     for (name, expected, create) in scanners() {
-        let expected = Found { rate: expected.rate.filter(|_| port == Port::Serial), ..expected };
+        let expected = Found { rate: expected.rate.filter(|_| port == PortKind::Serial), ..expected };
         let mut of_model = Vec::new();
         for seed in 0..20 {
             let mut bench = Bench::with_faults(Some(create(seed)), port, None, faults, seed);
@@ -63,19 +63,19 @@ fn find_all(faults: &str, port: Port) -> Vec<Nanos> {
 
 #[test]
 fn finds_every_scanner_in_every_state() {
-    let times = find_all("", Port::Serial);
+    let times = find_all("", PortKind::Serial);
     assert!(times[times.len() / 2] <= 2_000 * MILLIS && times[times.len() - 1] <= 6_000 * MILLIS);
 }
 
 #[test]
 fn finds_every_scanner_on_a_bad_line() {
-    let times = find_all("loss=0.002,flip=0.002,insert=0.002", Port::Serial);
+    let times = find_all("loss=0.002,flip=0.002,insert=0.002", PortKind::Serial);
     assert!(times[times.len() / 2] <= 2_000 * MILLIS && times[times.len() - 1] <= 6_000 * MILLIS);
 }
 
 #[test]
 fn finds_every_scanner_behind_a_server() {
-    let times = find_all("", Port::Server);
+    let times = find_all("", PortKind::Server);
     assert!(times[times.len() - 1] <= 6_000 * MILLIS);
 }
 
@@ -87,7 +87,7 @@ fn rounds(bench: &Bench) -> Vec<Nanos> {
 
 #[test]
 fn rounds_take_their_time_on_a_silent_line() {
-    let mut bench = Bench::new(None, Port::Serial, None, 1);
+    let mut bench = Bench::new(None, PortKind::Serial, None, 1);
     assert!(bench.find(12_000 * MILLIS).is_none());
     let begins = rounds(&bench);
     println!("silent: rounds begin at {:?} ms", begins.iter().map(|at| at / MILLIS).collect::<Vec<_>>());
@@ -101,7 +101,7 @@ fn rounds_take_their_time_on_a_silent_line() {
 
 #[test]
 fn rounds_take_their_time_on_a_noisy_line() {
-    let mut bench = Bench::new(None, Port::Serial, None, 1).with_noise(MILLIS);
+    let mut bench = Bench::new(None, PortKind::Serial, None, 1).with_noise(MILLIS);
     assert!(bench.find(30_000 * MILLIS).is_none());
     let begins = rounds(&bench);
     println!("noisy: rounds begin at {:?} ms", begins.iter().map(|at| at / MILLIS).collect::<Vec<_>>());
@@ -118,7 +118,7 @@ fn rounds_take_their_time_on_a_noisy_line() {
 
 #[test]
 fn hands_over_every_read_of_the_last_step() {
-    for port in [Port::Serial, Port::Server] {
+    for port in [PortKind::Serial, PortKind::Server] {
         for (name, _, create) in scanners() {
             for seed in 0..5 {
                 let mut bench = Bench::new(Some(create(seed)), port, None, seed);
@@ -151,7 +151,7 @@ fn leaves_out_rates_that_the_port_cannot_have() {
         let rate = expected.rate.expect("a serial line");
         let impossible = [230_400, 500_000, 921_600, 1_000_000, 9_600];
         let impossible = impossible.into_iter().filter(|&other| other != rate).collect();
-        let mut bench = Bench::new(Some(create(1)), Port::Serial, None, 1);
+        let mut bench = Bench::new(Some(create(1)), PortKind::Serial, None, 1);
         bench.impossible = impossible;
         if rate != 230_400 {
             bench.host.reject_rate(bench.now);

@@ -1,11 +1,11 @@
 //! Bytes that no scanner has sent never end a search.
 
-use scanhub_drivers::search::{Output, Port, Search};
+use scanhub_drivers::search::{Output, PortKind, Search};
 use schema::{MILLIS, Nanos};
 
 /// Passes `bytes` to a search on `port`, in reads of at most `most` bytes, until `seconds` have passed.
 fn feed(
-    port: Port,
+    port: PortKind,
     seed: u64,
     most: usize,
     seconds: u64,
@@ -41,7 +41,7 @@ fn feed(
 #[test]
 fn garbage_is_not_a_scanner() {
     let mut count = 0;
-    for port in [Port::Serial, Port::Server, Port::Recording] {
+    for port in [PortKind::Serial, PortKind::Server, PortKind::Recording] {
         for seed in 0..6 {
             count += feed(port, seed, 200, 20, |random| random.u8(..));
             // Bytes that begin telegrams and packets of the families, among others.

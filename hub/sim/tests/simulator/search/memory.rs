@@ -1,7 +1,7 @@
 //! A remembered scanner is found nearly as soon as by a session of its family, and another one is still found.
 
 use scanhub_drivers::lms::variant::{Baud, Variant};
-use scanhub_drivers::search::{Memory, Port};
+use scanhub_drivers::search::{Memory, PortKind};
 use scanhub_drivers::{ld, lms, rplidar};
 use schema::{Family, MILLIS, Nanos};
 use sim::device::Device;
@@ -19,7 +19,7 @@ fn slower(
 ) -> Nanos {
     let mut worst = (0, 0, 0);
     for seed in 0..20 {
-        let mut bench = Bench::new(Some(create(seed)), Port::Serial, Some(memory), seed);
+        let mut bench = Bench::new(Some(create(seed)), PortKind::Serial, Some(memory), seed);
         let (found, time) = bench.find(20_000 * MILLIS).unwrap_or_else(|| panic!("{name}, seed {seed}"));
         assert_eq!(found.family, memory.family);
         let of_named = named(create(seed), seed);
@@ -115,7 +115,7 @@ fn finds_another_scanner_than_the_remembered_one() {
         let memory = Memory { family, stream_rate, reply_rate };
         for (name, expected, create) in scanners() {
             for seed in 0..3 {
-                let mut bench = Bench::new(Some(create(seed)), Port::Serial, Some(memory), seed);
+                let mut bench = Bench::new(Some(create(seed)), PortKind::Serial, Some(memory), seed);
                 let (found, time) =
                     bench.find(20_000 * MILLIS).unwrap_or_else(|| panic!("{name}, {memory:?}"));
                 assert_eq!(found, expected, "{name}, {memory:?}");

@@ -2,7 +2,7 @@
 
 use scanhub_drivers::ld;
 use scanhub_drivers::lms::variant::Baud;
-use scanhub_drivers::search::Port;
+use scanhub_drivers::search::PortKind;
 use schema::{MILLIS, Nanos};
 use sim::device::Device;
 use sim::ld::{Head, HeadSettings, Packets};
@@ -19,7 +19,7 @@ const SECOND: Nanos = 1_000 * MILLIS;
 fn worst(name: &str, after: Nanos, boot: Nanos, create: impl Fn(u64) -> Box<dyn Device>) -> Nanos {
     let times = (0..10).map(|seed| {
         let after = after + seed * 317 * MILLIS;
-        let mut bench = Bench::new(Some(create(seed)), Port::Serial, None, seed).powered_after(after);
+        let mut bench = Bench::new(Some(create(seed)), PortKind::Serial, None, seed).powered_after(after);
         let (_, time) =
             bench.find(after + boot + 20 * SECOND).unwrap_or_else(|| panic!("{name}, seed {seed}"));
         time.saturating_sub(after + boot)
