@@ -14,8 +14,9 @@ pub(crate) struct PointCount {
     packets: u32,
     revolution: Option<Revolution>,
     steady: Option<Steady>,
-    /// Time of the last packet.
+    /// Time of the last packet, and degrees of its first point over all revolutions.
     time: Nanos,
+    angle: f64,
 }
 
 /// A revolution that is being measured.
@@ -59,6 +60,7 @@ impl PointCount {
             Place::Next { time, angle, missing, .. } if missing <= MAX_MISSING => {
                 self.packets += 1;
                 let started_at = core::mem::replace(&mut self.time, time);
+                self.angle = angle;
                 let Some(revolution) = &mut self.revolution else {
                     self.revolution = Some(Revolution::begin(packet, angle));
                     return None;
@@ -73,17 +75,25 @@ impl PointCount {
             }
             Place::First { time, angle } | Place::Next { time, angle, .. } => {
                 let revolution = Some(Revolution::begin(packet, angle));
-                *self = PointCount { packets: 1, revolution, steady: None, time };
+                *self = PointCount { packets: 1, revolution, steady: None, time, angle };
                 None
             }
         }
     }
 
+    /// Returns the model and its beams if a part of a revolution is exactly as the model is sold. A recording loses no scan
+    /// until a complete revolution has arrived.
+    pub(crate) fn typical(&self) -> Option<(Model, usize)> {
+        let revolution = self.revolution.filter(|revolution| revolution.packets >= MIN_TYPICAL)?;
+        let counted = revolution.counted(self.angle);
+        let model = counted.model();
+        let is_typical = revolution.is_steady() && counted.is_usual() && counted.beams() == model.beams();
+        is_typical.then_some((model, model.beams()))
+    }
+
     fn complete(&mut self, revolution: Revolution, angle: f64, at: Nanos) -> Counted {
-        let Revolution { packets, speeds: (sum, count), slowest, fastest, .. } = revolution;
-        let turns_per_second = sum / f64::from(count) / 360.0;
-        let points_per_turn = f64::from(packets) * POINTS as f64 * 360.0 / (angle - revolution.angle);
-        let is_steady = f64::from(fastest) <= f64::from(slowest) * (1.0 + STEADY);
+        let counted = revolution.counted(angle);
+        let turns_per_second = counted.turns_per_second;
         let began_at = at.saturating_sub((1e9 / turns_per_second.max(0.1)) as Nanos);
         let alone = Steady { since: began_at, slowest: turns_per_second, fastest: turns_per_second };
         let before = self.steady.unwrap_or(alone);
@@ -91,9 +101,9 @@ impl PointCount {
         let fastest = before.fastest.max(turns_per_second);
         let is_continued = fastest <= slowest * (1.0 + STEADY);
         let steady = if is_continued { Steady { slowest, fastest, ..before } } else { alone };
-        self.steady = is_steady.then_some(steady);
+        self.steady = revolution.is_steady().then_some(steady);
         let steady_for = self.steady.map_or(0, |steady| at.saturating_sub(steady.since));
-        Counted { packets: self.packets, points_per_turn, turns_per_second, steady_for, at }
+        Counted { packets: self.packets, steady_for, at, ..counted }
     }
 }
 
@@ -104,7 +114,20 @@ impl Revolution {
         Revolution { angle, packets: 0, speeds: (f64::from(speed), 1), slowest: speed, fastest: speed }
     }
 
-    /// Adds a packet that follows after `missing` others. Its speed belongs to the revolution, its points to what follows.
+    /// Returns the points up to a packet at `angle`.
+    fn counted(&self, angle: f64) -> Counted {
+        let (sum, count) = self.speeds;
+        let points_per_turn =
+            f64::from(self.packets) * POINTS as f64 * 360.0 / (angle - self.angle).max(0.01);
+        let turns_per_second = sum / f64::from(count) / 360.0;
+        Counted { packets: self.packets, points_per_turn, turns_per_second, steady_for: 0, at: 0 }
+    }
+
+    fn is_steady(&self) -> bool {
+        f64::from(self.fastest) <= f64::from(self.slowest) * (1.0 + STEADY)
+    }
+
+    /// Adds a packet that follows after `missing` others. Its points belong to the next packet's interval.
     fn add(&mut self, packet: &Packet<'_>, missing: u32) {
         let speed = packet.speed();
         self.packets += 1 + missing;
@@ -114,7 +137,7 @@ impl Revolution {
 }
 
 impl Counted {
-    /// Returns the model, by the points per second. Of models that cannot be distinguished, it is one.
+    /// Returns the model by the points per second, or one of the models that cannot be distinguished.
     pub(crate) fn model(&self) -> Model {
         Model::of_point_rate((self.points_per_turn * self.turns_per_second) as f32)
     }
@@ -129,12 +152,16 @@ impl Counted {
     /// Returns whether the number of points is reliable. At another speed than that of its model, a head may still spin up,
     /// slowly.
     pub(crate) fn is_final(&self) -> bool {
-        let usual = f64::from(self.model().turns_per_second());
-        let is_usual = (self.turns_per_second / usual - 1.0).abs() <= USUAL;
-        self.packets >= MIN_PACKETS && self.steady_for >= if is_usual { 1 } else { SLOW_SPIN_UP }
+        self.packets >= MIN_PACKETS && self.steady_for >= if self.is_usual() { 1 } else { SLOW_SPIN_UP }
     }
 
-    /// Returns whether there are so many points more or fewer that `beams` no longer fits.
+    /// Returns whether the head rotates at the speed at which its model is sold.
+    fn is_usual(&self) -> bool {
+        let usual = f64::from(self.model().turns_per_second());
+        (self.turns_per_second / usual - 1.0).abs() <= USUAL
+    }
+
+    /// Returns whether `beams` no longer fits the number of points.
     pub(crate) fn differs_from(&self, beams: usize) -> bool {
         (self.points_per_turn / beams as f64 - 1.0).abs() > CLOSE
     }
@@ -142,6 +169,8 @@ impl Counted {
 
 /// Packets in sequence before a number of points is reliable.
 const MIN_PACKETS: u32 = 64;
+/// Packets of a typical revolution that are enough for a recording.
+const MIN_TYPICAL: u32 = 16;
 /// More missing packets than these end a sequence: their number is uncertain.
 const MAX_MISSING: u32 = 8;
 /// Share by which a constant speed may vary. The speed of real heads varies by 1 %.

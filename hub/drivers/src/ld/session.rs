@@ -30,6 +30,8 @@ pub struct Settings {
     /// Whether the port has one fixed rate and bytes do not arrive at the pace of a line, as with a serial server on the
     /// network or a recording.
     pub fixed_rate: bool,
+    /// Whether the bytes are from a recording.
+    pub listen_only: bool,
 }
 
 impl Settings {
@@ -289,6 +291,9 @@ impl Session {
             let Ok(packet) = Packet::check(bytes) else { continue };
             let place = self.sequence.place(&packet);
             counted = self.point_count.note(&packet, place).or(counted);
+            if self.settings.listen_only && self.measured.is_none() {
+                self.measured = self.point_count.typical();
+            }
             let end = span.offset + ((number + 1) * LEN - 1) as u64;
             if matches!(place, Place::First { .. }) {
                 let arrivals = self.reads.arrivals();
@@ -563,8 +568,9 @@ impl Turning for Session {
     };
 
     fn begin(wanted: Wanted, now: Nanos) -> Self {
-        let Wanted { model, beams, most_beams, fixed_rate, .. } = wanted;
-        Session::new(Settings { model: model.and_then(Model::named), beams, most_beams, fixed_rate }, now)
+        let Wanted { model, beams, most_beams, fixed_rate, listen_only, .. } = wanted;
+        let model = model.and_then(Model::named);
+        Session::new(Settings { model, beams, most_beams, fixed_rate, listen_only }, now)
     }
 
     fn model(&self) -> Option<family::Model> {

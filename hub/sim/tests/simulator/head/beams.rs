@@ -97,3 +97,19 @@ fn another_speed_changes_the_beams_after_ten_seconds_and_says_so() {
     assert_eq!(trouble, Trouble::BeamsChanged { from: 450, to: numbers[1] });
     assert!(trouble.to_string().contains("instead of 450"));
 }
+
+#[test]
+fn a_recording_loses_no_scan_to_the_measurement() {
+    for model in Model::ALL {
+        let mut bench = bench(HeadSettings::of(model), 1);
+        let settings = Settings { listen_only: true, fixed_rate: true, ..Settings::default() };
+        // A recording has no rate.
+        bench.session = match model {
+            Model::Stl27l => Session::new(Settings { model: Some(model), ..settings }, 0),
+            _ => Session::new(settings, 0),
+        };
+        bench.run(SECOND);
+        assert_eq!(numbers_of_beams(&bench), [model.beams()]);
+        assert!(bench.turns[0].first < 2 * SECOND / model.turns_per_second() as Nanos, "{model:?}");
+    }
+}
