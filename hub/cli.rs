@@ -33,7 +33,7 @@ use std::time::Duration;
 use ::config::Sources;
 use clap::builder::{PossibleValuesParser, TypedValueParser};
 use clap::{Args, Command, CommandFactory, FromArgMatches, Parser, Subcommand};
-use schema::{DEFAULT_DOMAIN, Domain, Environment, Failure};
+use schema::{DEFAULT_DOMAIN, Domain, Environment, Failure, Family};
 use verbs::{Bounds, duration};
 
 use crate::demo::{Families, World};
@@ -299,6 +299,11 @@ impl Limits {
     pub(crate) fn bounds(&self) -> Bounds {
         Bounds { count: self.count, run_for: self.run_for, timeout: self.timeout }
     }
+}
+
+/// Parses the name of a family.
+fn family(text: &str) -> Result<Family, String> {
+    Family::parse(&text.to_lowercase()).ok_or_else(|| format!("lms, ld or rplidar, not {text:?}"))
 }
 
 #[derive(Args, Debug)]

@@ -26,6 +26,7 @@ pub(crate) fn replay(replay: &Replay, everywhere: &Everywhere) -> Result<(), Fai
     let options = daemon::Replay {
         file: &replay.file,
         sensor: replay.sensor.as_deref(),
+        family: replay.family,
         sources: &replay.configured.sources(),
         play: replay.play()?,
         holds: replay.hold,

@@ -7,8 +7,8 @@ use std::sync::atomic::AtomicBool;
 use clap::Args;
 use recording::convert::{self, ConvertOptions, Converted};
 use recording::{Damage, Form, Unread};
-use schema::Failure;
 use schema::file::Compression;
+use schema::{Failure, Family};
 use serde::Serialize;
 use sim::options;
 
@@ -26,6 +26,9 @@ pub(crate) struct Convert {
     /// Convert only this sensor; for a stream or a log, the name that it gets [default: front]
     #[arg(long, value_name = "NAME")]
     sensor: Option<String>,
+    /// Family of a telegram stream: lms, ld or rplidar [default: recognized by its bytes]
+    #[arg(long, value_name = "NAME", value_parser = super::family)]
+    family: Option<Family>,
     /// Write an MCAP file of ROS 2 messages only: scans as sensor_msgs/msg/LaserScan, and /tf_static from the poses
     #[arg(long)]
     ros2: bool,
@@ -56,6 +59,7 @@ impl Convert {
             input: self.input.clone(),
             output: self.output.clone(),
             sensor: self.sensor.clone(),
+            family: self.family,
             force: self.force,
             ros2: self.ros2,
             compression: self.compression,
@@ -161,7 +165,7 @@ impl<'a> Line<'a> {
     fn of(convert: &'a Convert, converted: &'a Converted) -> Self {
         let Unread { poses, odometry, remissions, lines } = converted.unread;
         let is_log = converted.forms.0 == Form::Carmen;
-        let Damage { telegrams, bytes, chunks, is_cut, is_harmed } = converted.damage;
+        let Damage { telegrams, bytes, chunks, repeats, is_cut, is_harmed } = converted.damage;
         Line {
             class: "converted",
             input: &convert.input,
@@ -176,7 +180,7 @@ impl<'a> Line<'a> {
             missing: Missing {
                 telegrams,
                 bytes,
-                chunks,
+                chunks: chunks + repeats,
                 stamps: 0,
                 begin: false,
                 end: is_cut,

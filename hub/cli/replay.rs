@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use clap::Args;
 use daemon::{Pace, Play};
-use schema::{Failure, Kind};
+use schema::{Failure, Family, Kind};
 use verbs::duration;
 
 use super::Configured;
@@ -35,6 +35,9 @@ pub(crate) struct Replay {
     /// Play only this sensor; for a stream or a log, the name that it gets [default: front]
     #[arg(long, value_name = "NAME")]
     pub(crate) sensor: Option<String>,
+    /// Family of a telegram stream: lms, ld or rplidar [default: recognized by its bytes]
+    #[arg(long, value_name = "NAME", value_parser = super::family)]
+    pub(crate) family: Option<Family>,
     #[command(flatten)]
     pub(crate) configured: Configured,
 }

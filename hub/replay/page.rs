@@ -30,6 +30,7 @@ pub(crate) fn show(
     let replay = daemon::Replay {
         file,
         sensor: None,
+        family: None,
         sources: &sources,
         play: Play { is_looped: web.is_looped, ..Play::default() },
         // What was seen last stands until whoever looks has seen enough.

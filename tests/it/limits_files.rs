@@ -5,6 +5,7 @@
 use std::io::Write;
 use std::process::Command;
 
+use crate::testkit;
 use crate::testkit::{Outcome, Program, TestEnv};
 use flate2::Compression;
 use flate2::write::GzEncoder;
@@ -117,7 +118,10 @@ fn what_unpacks_to_far_more_than_it_is_is_refused() {
     };
     let bomb = packed(&env, "bomb.mcap.gz", &mcap(&[long(100 << 20)]));
     let zeros = packed(&env, "zeros.bin.gz", &vec![0; 100 << 20]);
-    for file in [&bomb, &zeros] {
+    refused(&env, &["convert", &zeros, &env.word("x.mcap")], 66, "there is no telegram in it");
+    let telegrams: Vec<u8> = (0..100).flat_map(testkit::scan).collect();
+    let stream = packed(&env, "stream.bin.gz", &[&telegrams[..], &vec![0; 100 << 20]].concat());
+    for file in [&bomb, &stream] {
         refused(
             &env,
             &["convert", file, &env.word("x.mcap")],

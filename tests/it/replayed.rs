@@ -37,6 +37,7 @@ fn replay(env: &TestEnv, file: &Path, play: Play, set: &[&str]) -> Vec<Vec<Publi
     let replay = Replay {
         file,
         sensor: None,
+        family: None,
         sources: &sources,
         play: Play { is_paused: true, ..play },
         holds: false,

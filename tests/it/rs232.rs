@@ -2,39 +2,102 @@
 //! 38,400 baud, and remembers it.
 
 use std::fs;
+use std::os::unix::net::UnixStream;
+use std::sync::Mutex;
+use std::sync::mpsc::{Sender, channel};
+use std::thread::{self, JoinHandle};
+use std::time::Duration;
 
-use crate::testkit::{KILL, Outcome, TERM, TestEnv, is_class};
+use schema::Failure;
+use serde_json::Value;
+use sim::fault::Faults;
+use sim::options::SimulateOptions;
+use sim::truth::Summary;
+use sim::{Event, simulate_with};
+
+use crate::testkit::{PATIENCE, TERM, TestEnv, is_class};
 
 const NEEDS: &str = "500000 baud needs RS-422";
 
-/// Waits for a stream at 38,400 baud, and returns how the hub ended.
-fn streams_slowly(env: &TestEnv) -> Outcome {
-    let hub = env.hub(&[env.link("front")]);
-    let mut echo = env.echo(&["front/scan", "front/status"]);
-    let streaming =
-        echo.await_line("streaming at 38400", |line| line["state"] == "streaming" && line["baud"] == 38_400);
-    assert!(streaming["last_error"].as_str().is_some_and(|error| error.starts_with(NEEDS)), "{streaming}");
-    let scan = echo.await_line("a scan", is_class("scan"));
-    // 732 bytes take 191 ms at this rate.
-    assert!(scan["period_us"].as_u64().is_some_and(|period| period > 180_000), "{scan}");
-    hub.end(TERM)
+/// A simulated scanner whose power the test can cycle.
+struct Scanner {
+    events: Sender<Event>,
+    stop: UnixStream,
+    thread: JoinHandle<Result<Vec<Summary>, Failure>>,
+}
+
+impl Scanner {
+    fn start(env: &TestEnv) -> Scanner {
+        let options = SimulateOptions {
+            ports: vec![env.path("front")],
+            boot: Duration::from_millis(300),
+            faults: Faults { rs232: 1.0, ..Faults::default() },
+            ..SimulateOptions::default()
+        };
+        let (stop, stopped) = UnixStream::pair().expect("a pair of sockets");
+        let (events, next) = channel();
+        let (say_ready, is_ready) = channel();
+        let thread = thread::spawn(move || {
+            let next = Mutex::new(next);
+            simulate_with(
+                &options,
+                &stopped,
+                |_| say_ready.send(()).expect("the test waits"),
+                |_| {},
+                |_| next.lock().expect("whole").try_recv().ok(),
+                |_, _| {},
+            )
+        });
+        is_ready.recv_timeout(PATIENCE).expect("the port can be opened");
+        Scanner { events, stop, thread }
+    }
+
+    fn cycle_power(&self) {
+        self.events.send(Event::PowerCycle).expect("the scanner is simulated");
+    }
+
+    fn end(self) {
+        drop(self.stop);
+        let [summary] = &self.thread.join().expect("no panic").expect("ends well")[..] else {
+            panic!("one port")
+        };
+        assert_eq!(summary.eeprom_writes, 0);
+    }
+}
+
+fn names_rs422(status: &Value) -> bool {
+    status["last_error"].as_str().is_some_and(|error| error.starts_with(NEEDS))
+}
+
+fn streams_slowly(status: &Value) -> bool {
+    status["state"] == "streaming" && status["baud"] == 38_400 && names_rs422(status)
 }
 
 #[test]
 fn falls_back_to_38400_baud_and_the_next_hub_starts_there() {
     let env = TestEnv::new();
-    let simulator =
-        env.simulator_on_real_lines(&["front"], &["--boot=0.3", "--fault=rs232=1,power_at=5,power_every=6"]);
-    let log = streams_slowly(&env).errors;
+    let scanner = Scanner::start(&env);
+    let hub = env.hub(&[env.link("front")]);
+    let mut echo = env.echo(&["front/scan", "front/status"]);
+    echo.await_line("lost", |line| line["last_error"].as_str().is_some_and(|error| error.contains("Status")));
+    scanner.cycle_power();
+    echo.await_line("lost again", |line| line["state"] == "probing" && names_rs422(line));
+    scanner.cycle_power();
+    echo.await_line("streaming at 38400", streams_slowly);
+    echo.await_lines(3, "a scan", is_class("scan"));
+    let log = hub.end(TERM).errors;
     assert_eq!(log.matches(NEEDS).count(), 1, "{log}");
     let saved = env.path("state/scanhub").join(env.place().name()).join("front.rate");
     let text = fs::read_to_string(&saved).unwrap_or_else(|error| panic!("{}: {error}", saved.display()));
     assert!(text.starts_with("38400,silent=2 "), "{text}");
-    env.kill_simulator(simulator, "front");
+    scanner.end();
 
     // After a power cycle, the scanner is at 9,600 baud. A single switch to 500,000 baud would lose it for good.
-    let simulator = env.simulator_on_real_lines(&["front"], &["--fault=rs232=1"]);
-    let log = streams_slowly(&env).errors;
+    let scanner = Scanner::start(&env);
+    let hub = env.hub(&[env.link("front")]);
+    let mut echo = env.echo(&["front/status"]);
+    echo.await_line("streaming at 38400", streams_slowly);
+    let log = hub.end(TERM).errors;
     assert_eq!(log.matches(NEEDS).count(), 1, "{log}");
-    assert_eq!(simulator.end(KILL).code, None);
+    scanner.end();
 }

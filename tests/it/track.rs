@@ -149,7 +149,8 @@ type Published = Vec<(u64, Vec<u8>)>;
 fn tracked(env: &TestEnv, site: &str, file: &str) -> [Published; 2] {
     let sources = Sources { set: vec!["background.scans=100".to_owned()], ..Sources::default() };
     let play = Play { is_paused: true, ..Play::default() };
-    let replay = Replay { file: Path::new(file), sensor: None, sources: &sources, play, holds: true };
+    let replay =
+        Replay { file: Path::new(file), sensor: None, family: None, sources: &sources, play, holds: true };
     let domain = env.place();
     let (tell, ready) = channel();
     thread::scope(|scope| {

@@ -21,6 +21,8 @@ pub struct Replay<'a> {
     pub file: &'a Path,
     /// Of one with several sensors the only one to play; of one that names none the name that it gets.
     pub sensor: Option<&'a str>,
+    /// Family of a stream file, unless it is to be recognized by its bytes.
+    pub family: Option<Family>,
     /// Where its sensors are configured.
     pub sources: &'a Sources,
     /// What is asked of the player.
@@ -42,7 +44,7 @@ pub fn replay(
     on_ready: impl FnOnce(&Ready, &Arc<Player>),
 ) -> Result<Progress, Failure> {
     let Replay { file, sources, .. } = *replay;
-    let recording = Recording::open(file)?;
+    let recording = Recording::open_as(file, replay.family)?;
     tell_of_damage(&recording);
     let sensors = sensors(&recording, replay.sensor)?;
     let read = || configuration(sources, &sensors, file);

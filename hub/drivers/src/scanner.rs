@@ -3,6 +3,7 @@
 //! consumers read.
 
 mod families;
+pub mod recognize;
 mod turning;
 
 use crate::line::suspect;
@@ -12,6 +13,7 @@ use crate::lms::variant::{Mode, Variant};
 use schema::{Contents, Reasons, Scan, ScanArrays, ScanHead};
 
 pub use families::{Introduction, Session, Trouble, features};
+pub use recognize::family_of;
 pub use turning::Turning;
 
 /// Bytes of the scan that `measured` makes.

@@ -148,6 +148,8 @@ pub struct Damage {
     pub bytes: u64,
     /// Chunks that were skipped because they are damaged.
     pub chunks: u64,
+    /// Chunks that were skipped because the file has them twice.
+    pub repeats: u64,
     /// Whether the file ends without its index, as after a kill.
     pub is_cut: bool,
     /// Whether the file was changed after it was written: a checksum or a length is wrong.
@@ -172,7 +174,8 @@ impl fmt::Display for Damage {
         let parts = [
             counted(self.telegrams, "telegram", "telegrams"),
             counted(self.chunks, "chunk", "chunks"),
-            counted(self.bytes, "byte outside any telegram", "bytes outside any telegram"),
+            counted(self.repeats, "chunk that the file has twice", "chunks that the file has twice"),
+            counted(self.bytes, "byte that could not be used", "bytes that could not be used"),
             self.is_cut.then(|| "the end of the file, with its index".to_owned()),
         ];
         let parts: Vec<_> = parts.into_iter().flatten().collect();

@@ -14,7 +14,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use scanhub_drivers::lms::variant::{Baud, Mode, Unit};
 use schema::csv::{MarkColumns, ScanColumns};
 use schema::file::{Compression, Writer};
-use schema::{Failure, Flags, Header, Kind, Topic, check_followed};
+use schema::{Failure, Family, Flags, Header, Kind, Topic, check_followed};
 
 use crate::{Damage, Encoding, Form, Frame, Recording, Unread, carmen};
 use output::{Packing, Place, unwritable};
@@ -26,6 +26,8 @@ use views::{Csv, Ros2, View, write_marks};
 pub struct ConvertOptions {
     /// The recording, of any form.
     pub input: PathBuf,
+    /// Family of a stream file, unless it is to be recognized by its bytes.
+    pub family: Option<Family>,
     /// What it becomes: the form is that of the ending; `-` is a telegram stream on stdout.
     pub output: PathBuf,
     /// Which sensor of the recording; of a stream or a log the name that it gets in an MCAP file.
@@ -111,7 +113,7 @@ pub fn convert(
     mut progress: impl FnMut(u64, u64),
 ) -> Result<Converted, Failure> {
     let (target, chosen) = target_of(options)?;
-    let whole = Recording::open(&options.input)?;
+    let whole = Recording::open_as(&options.input, options.family)?;
     let place = Place::check(&options.output, &options.input, options.force)?;
     let recording = match chosen {
         Some(sensor) if whole.contents().form == Form::Mcap => whole.of(sensor)?,

@@ -15,8 +15,8 @@ use schema::{Family, Header, Pace, Scan, Status, Topic};
 
 use crate::{Contents, Damage, Form, Frame};
 pub(crate) use catalog::Catalog;
-pub(crate) use records::Record;
 use records::Records;
+pub(crate) use records::{Record, has_border};
 
 /// A part of a file.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -55,12 +55,31 @@ impl<R: Read> Reader<R> {
     ///
     /// Returns the errors of [`Records::next`] and [`Catalog::note`].
     pub(crate) fn next(&mut self) -> io::Result<Option<Item>> {
-        let Some(record) = self.records.next()? else { return Ok(None) };
-        self.catalog.note(&record)?;
-        Ok(Some(match self.telegram(&record) {
-            Some(sample) => Item::Telegram(sample),
-            None => Item::Record(record),
-        }))
+        loop {
+            let Some(record) = self.records.next()? else { return Ok(None) };
+            self.catalog.note(&record)?;
+            let sample = self.telegram(&record);
+            if !record.is_in_chunk && self.is_damaged(&record, sample.as_ref()) {
+                self.records.reject(&record);
+                continue;
+            }
+            return Ok(Some(match sample {
+                Some(sample) => Item::Telegram(sample),
+                None => Item::Record(record),
+            }));
+        }
+    }
+
+    /// Returns whether a record that no checksum of a chunk covers contradicts itself: a message of the hub whose header does
+    /// not fit to it, or a telegram of an LMS with a wrong CRC.
+    fn is_damaged(&self, record: &Record, sample: Option<&Sample>) -> bool {
+        if let Some(Sample { header, telegram, .. }) = sample {
+            return header.family == Family::Lms as u8 && Telegram::check(telegram).is_none();
+        }
+        record.message().is_some_and(|(message, data)| {
+            let is_ours = matches!(self.catalog.place(message.channel_id), Some(Some(_)));
+            is_ours && catalog::sample(&message, data).is_none()
+        })
     }
 
     fn telegram(&mut self, record: &Record) -> Option<Sample> {

@@ -8,6 +8,7 @@ use std::path::{Path, PathBuf};
 use scanhub_drivers::line::family::{Model, Wanted};
 use scanhub_drivers::lms::variant::{Mode, Unit};
 use scanhub_drivers::scanner;
+use scanhub_drivers::scanner::recognize::{EXAMINED, bytes_by_family, family_of, framing_mode};
 use schema::{Failure, Family, Kind, regular};
 
 use crate::carmen::{self, Log};
@@ -46,22 +47,43 @@ pub struct Recording {
 }
 
 impl Recording {
-    /// Opens and reads through the file at `path`.
+    /// Opens the file at `path`, and reads it to its end. The family of a stream file is recognized by its bytes. A damaged
+    /// file is opened: see [`Contents::damage`].
     ///
-    /// [`Kind::Input`] if it is no recording: anything without a telegram but an MCAP file. One that is damaged is opened: see [`Contents::damage`].
+    /// # Errors
+    ///
+    /// Returns [`Kind::Input`] if the file is not a recording: neither an MCAP file nor a CARMEN log, and without a telegram.
+    /// Returns [`Kind::Configuration`] if no family takes at least half of the [first bytes](recognize::EXAMINED) of a stream
+    /// file.
     pub fn open(path: impl Into<PathBuf>) -> Result<Recording, Failure> {
-        let recording = Recording::open_line(path)?;
+        Recording::open_as(path, None)
+    }
+
+    /// Opens a file like [`open`](Self::open). If it is a stream file, its bytes belong to `family`, if that is given.
+    ///
+    /// # Errors
+    ///
+    /// Returns the errors of [`open`](Self::open).
+    pub fn open_as(path: impl Into<PathBuf>, family: Option<Family>) -> Result<Recording, Failure> {
+        let path = path.into();
+        let recording = Recording::open_line(&path, family).map_err(|failure| {
+            let is_recording = failure.kind != Kind::Configuration
+                || head(&path).is_ok_and(|head| bytes_by_family(&head)[0].1 > 0);
+            if is_recording { failure } else { without_telegram(&path) }
+        })?;
         if recording.contents.form == Form::Telegrams && recording.contents.telegrams == 0 {
-            let what = "is neither an MCAP file nor a CARMEN log, and there is no telegram in it";
-            return Err(refused(&recording.path, what));
+            return Err(without_telegram(&path));
         }
         Ok(recording)
     }
 
-    /// The same, but also for bytes without a telegram: a line with only noise.
+    /// Opens a file like [`open_as`](Self::open_as). A stream file of a named `family` may have no telegram: a line with only
+    /// noise.
     ///
-    /// [`Kind::Input`] as of [`open`](Self::open).
-    pub fn open_line(path: impl Into<PathBuf>) -> Result<Recording, Failure> {
+    /// # Errors
+    ///
+    /// Returns the errors of [`open`](Self::open).
+    pub fn open_line(path: impl Into<PathBuf>, family: Option<Family>) -> Result<Recording, Failure> {
         let path = path.into();
         let mut reader = reader(&path)?;
         let head = reader.fill_buf().map_err(|error| unreadable(&path, &error))?;
@@ -72,16 +94,18 @@ impl Recording {
             return Recording::open_mcap(path);
         }
         let form = if carmen::is_log(head) { Form::Carmen } else { Form::Telegrams };
-        if ends_as_mcap(&path).map_err(|error| unreadable(&path, &error))? {
-            let what = "is the end of an MCAP file, without its beginning";
-            return Err(refused(&path, what));
+        if let Some(piece) = piece_of_mcap(&path).map_err(|error| unreadable(&path, &error))? {
+            let message =
+                format!("recording {} is {piece} of an MCAP file, without its beginning", path.display());
+            return Err(Failure::new(
+                Kind::Input,
+                message,
+                "an MCAP file is read from its first byte: give the whole file",
+            ));
         }
         let contents = match form {
             Form::Carmen => carmen::survey(&path, reader)?,
-            _ => match survey_telegrams(&path, reader)? {
-                contents if contents.telegrams == 0 => survey_packets(&path)?.unwrap_or(contents),
-                contents => contents,
-            },
+            _ => survey_stream(&path, family)?,
         };
         if form == Form::Carmen && contents.telegrams == 0 {
             return Err(refused(&path, "is a CARMEN log without a scan"));
@@ -236,16 +260,29 @@ impl Recording {
                 let (mut log, own) = (Log::new(reader), self.encoding().unwrap_or(encoding));
                 Box::new(std::iter::from_fn(move || Some(log.following()?.frame(own, encoding))))
             }
-            Form::Telegrams => match self.family().and_then(|family| Packets::of(family, reader)) {
-                Some(mut packets) => Box::new(std::iter::from_fn(move || packets.next().ok()?)),
-                None => {
-                    let mut telegrams = Telegrams::new(self::reader(&self.path)?);
-                    Box::new(std::iter::from_fn(move || {
-                        Some(Frame { telegram: telegrams.next().ok()??, ..Frame::default() })
-                    }))
-                }
-            },
+            Form::Telegrams => self.telegrams_of_stream(reader)?,
             Form::Mcap => self.telegrams_of_sensor(reader)?,
+        })
+    }
+
+    fn telegrams_of_stream(
+        &self,
+        reader: Box<dyn BufRead + Send>,
+    ) -> Result<Box<dyn Iterator<Item = Frame> + Send>, Failure> {
+        let family = self.family().unwrap_or(Family::Lms);
+        let mode = if family == Family::Lms {
+            None
+        } else {
+            framing_mode(family, &head(&self.path).map_err(|error| unreadable(&self.path, &error))?)
+        };
+        Ok(match Packets::of(family, mode, reader) {
+            Some(mut packets) => Box::new(std::iter::from_fn(move || packets.next().ok()?)),
+            None => {
+                let mut telegrams = Telegrams::new(self::reader(&self.path)?);
+                Box::new(std::iter::from_fn(move || {
+                    Some(Frame { telegram: telegrams.next().ok()??, ..Frame::default() })
+                }))
+            }
         })
     }
 
@@ -310,6 +347,57 @@ impl Recording {
     }
 }
 
+/// Reads the stream file at `path`, whose bytes belong to `named`. If that is not given, or if the file has no telegram of that
+/// family, the family is recognized by the bytes.
+///
+/// # Errors
+///
+/// Returns [`Kind::Input`] if it cannot be read, and [`Kind::Configuration`] if its family is neither named nor recognized.
+fn survey_stream(path: &Path, named: Option<Family>) -> Result<Contents, Failure> {
+    let head = head(path).map_err(|error| unreadable(path, &error))?;
+    let survey = |family| match family {
+        Family::Lms => survey_telegrams(path),
+        _ => survey_packets(path, family, framing_mode(family, &head)),
+    };
+    let of_named = named.map(survey).transpose()?;
+    if let Some(contents) = of_named.as_ref().filter(|contents| contents.telegrams > 0) {
+        return Ok(contents.clone());
+    }
+    match (family_of(&head), of_named) {
+        (Some(family), _) => survey(family),
+        (None, Some(contents)) => Ok(contents),
+        (None, None) => Err(unrecognized(path, &head)),
+    }
+}
+
+/// Returns the first bytes of the file at `path`, unpacked.
+fn head(path: &Path) -> io::Result<Vec<u8>> {
+    let mut head = Vec::new();
+    match open(path)?.take(EXAMINED as u64).read_to_end(&mut head) {
+        Err(error) if !is_end(&error) => Err(error),
+        _ => Ok(head),
+    }
+}
+
+/// Returns the failure of a stream file that starts with `head`, in which no family has enough bytes.
+fn unrecognized(path: &Path, head: &[u8]) -> Failure {
+    let percent = |len: usize| 100 * len / head.len().max(1);
+    let counts = bytes_by_family(head).map(|(family, len)| format!("{} {} %", family.name(), percent(len)));
+    let message = format!(
+        "the family of recording {} is not known: none takes half of its first {} bytes ({})",
+        path.display(),
+        head.len(),
+        counts.join(", ")
+    );
+    let hint = "say which scanner sent it: family=lms, family=ld or family=rplidar of a link, or --family of the command";
+    Failure::new(Kind::Configuration, message, hint)
+}
+
+/// Returns the failure of a file that is not a recording.
+fn without_telegram(path: &Path) -> Failure {
+    refused(path, "is neither an MCAP file nor a CARMEN log, and there is no telegram in it")
+}
+
 /// Whether a reader that fails so has no more to give, and the disk is not to blame: a packed file is cut or harmed.
 pub(crate) fn is_end(error: &io::Error) -> bool {
     use io::ErrorKind::{InvalidData, InvalidInput, UnexpectedEof};
@@ -328,14 +416,28 @@ fn open(path: &Path) -> io::Result<Box<dyn BufRead + Send>> {
     Ok(Box::new(file))
 }
 
-/// Returns whether the file ends with the magic bytes of MCAP. Telegrams in it would otherwise look like a stream.
-fn ends_as_mcap(path: &Path) -> io::Result<bool> {
+/// Returns which piece of an MCAP file the file at `path` is, if it is one. Its telegrams would otherwise look like a stream.
+fn piece_of_mcap(path: &Path) -> io::Result<Option<&'static str>> {
     let mut file = regular::open(path)?;
     let end = file.metadata()?.len().saturating_sub(MCAP.len() as u64);
     file.seek(SeekFrom::Start(end))?;
     let mut tail = Vec::new();
     file.read_to_end(&mut tail)?;
-    Ok(tail == MCAP)
+    if tail == MCAP {
+        return Ok(Some("the end"));
+    }
+    #[cfg(feature = "mcap")]
+    {
+        let mut head = Vec::new();
+        match open(path)?.take(SEARCHED).read_to_end(&mut head) {
+            Err(error) if !is_end(&error) => return Err(error),
+            _ => {}
+        }
+        if crate::mcap::has_border(&head) {
+            return Ok(Some("a piece"));
+        }
+    }
+    Ok(None)
 }
 
 pub(crate) fn unreadable(path: &Path, error: &io::Error) -> Failure {
@@ -364,6 +466,9 @@ const FORMS: &str = "a recording is an MCAP file, a stream of telegrams or a CAR
 const GZIP: &[u8] = &[0x1F, 0x8B];
 /// First bytes of an MCAP file.
 const MCAP: &[u8] = b"\x89MCAP0\r\n";
+/// Bytes at the beginning of a file in which records of MCAP are searched for: several samples of any topic.
+#[cfg(feature = "mcap")]
+const SEARCHED: u64 = 256 * 1024;
 /// Enough for the head of a log to show a line that tells it.
 const BUFFER: usize = 64 * 1024;
 /// Frames within which a model is known.

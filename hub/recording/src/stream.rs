@@ -70,9 +70,9 @@ pub(crate) struct Packets<R> {
 }
 
 impl<R: Read> Packets<R> {
-    /// Reads packets of `family`; `None` if that family sends no packets.
-    pub(crate) fn of(family: Family, reader: R) -> Option<Packets<R>> {
-        let wanted = Wanted { fixed_rate: true, listen_only: true, ..Wanted::default() };
+    /// Reads packets of `family`, which are split as those of `mode`, if that is given. `None` if the family sends no packets.
+    pub(crate) fn of(family: Family, mode: Option<&'static str>, reader: R) -> Option<Packets<R>> {
+        let wanted = Wanted { mode, fixed_rate: true, listen_only: true, ..Wanted::default() };
         let session = scanner::Session::begin(family, wanted, 0)?;
         Some(Packets { reader, session, family, last: None, passed: 0, ended: false })
     }
@@ -141,59 +141,56 @@ impl<R: Read> Packets<R> {
 /// # Errors
 ///
 /// Returns [`Kind::Input`](schema::Kind::Input) if it cannot be read.
-pub(crate) fn survey_telegrams(path: &Path, reader: impl Read) -> Result<Contents, Failure> {
-    let mut contents = Contents::new(Form::Telegrams);
-    let mut telegrams = Telegrams::new(reader);
-    loop {
-        match telegrams.next() {
-            Ok(Some(bytes)) => contents.note(Family::Lms as u8, &bytes, None),
-            Ok(None) => break,
-            Err(error) if is_end(&error) && contents.telegrams > 0 => {
-                contents.damage.is_cut = true;
-                break;
-            }
-            Err(error) => return Err(unreadable(path, &error)),
-        }
-    }
+pub(crate) fn survey_telegrams(path: &Path) -> Result<Contents, Failure> {
+    let mut telegrams = Telegrams::new(reader(path)?);
+    let mut contents = survey(path, Family::Lms, || {
+        Ok(telegrams.next()?.map(|telegram| Frame { telegram, ..Frame::default() }))
+    })?;
     contents.damage.bytes = telegrams.discarded();
     Ok(contents)
 }
 
-/// Reads the stream at `path` for packets of each family, and returns those of the family that most bytes belong to; `None` if
-/// there are none.
+/// Reads the stream at `path` for packets of `family`, which is not that of an LMS. They are split as those of `mode`, if that is
+/// given.
 ///
 /// # Errors
 ///
 /// Returns [`Kind::Input`](schema::Kind::Input) if it cannot be read.
-pub(crate) fn survey_packets(path: &Path) -> Result<Option<Contents>, Failure> {
-    let mut best: Option<(u64, Contents)> = None;
-    for family in Family::ALL {
-        let Some(mut packets) = Packets::of(family, reader(path)?) else { continue };
-        let (mut contents, mut bytes) = (Contents::new(Form::Telegrams), 0);
-        loop {
-            match packets.next() {
-                Ok(Some(frame)) => {
-                    contents.note(frame.family, &frame.telegram, None);
-                    contents.scanner_ns = frame.scanner_ns;
-                    bytes += frame.telegram.len() as u64;
-                }
-                Ok(None) => break,
-                Err(error) if is_end(&error) && contents.telegrams > 0 => {
-                    contents.damage.is_cut = true;
-                    break;
-                }
-                Err(error) => return Err(unreadable(path, &error)),
+pub(crate) fn survey_packets(
+    path: &Path,
+    family: Family,
+    mode: Option<&'static str>,
+) -> Result<Contents, Failure> {
+    let Some(mut packets) = Packets::of(family, mode, reader(path)?) else {
+        return Ok(Contents::new(Form::Telegrams));
+    };
+    let mut contents = survey(path, family, || packets.next())?;
+    contents.damage.bytes = packets.discarded();
+    Ok(contents)
+}
+
+/// Returns the contents of the telegrams or packets that `next` reads from the stream at `path`.
+fn survey(
+    path: &Path,
+    family: Family,
+    mut next: impl FnMut() -> io::Result<Option<Frame>>,
+) -> Result<Contents, Failure> {
+    let mut contents = Contents { family: family as u8, ..Contents::new(Form::Telegrams) };
+    loop {
+        match next() {
+            Ok(Some(frame)) => {
+                contents.note(frame.family, &frame.telegram, None);
+                contents.scanner_ns = frame.scanner_ns;
             }
-        }
-        contents.damage.bytes = packets.discarded();
-        if bytes > best.as_ref().map_or(BY_CHANCE, |(bytes, _)| *bytes) {
-            best = Some((bytes, contents));
+            Ok(None) => return Ok(contents),
+            Err(error) if is_end(&error) && contents.telegrams > 0 => {
+                contents.damage.is_cut = true;
+                return Ok(contents);
+            }
+            Err(error) => return Err(unreadable(path, &error)),
         }
     }
-    Ok(best.map(|(_, contents)| contents))
 }
 
 /// Time after which a session no longer holds packets back.
 const IDLE: Nanos = 100 * MILLIS;
-/// Number of bytes up to which packets may be noise that passed a short checksum.
-const BY_CHANCE: u64 = 100;

@@ -260,7 +260,7 @@ impl Device for Head {
 /// [`Kind::Input`] if it cannot be read, or there are none; [`Kind::NoTopic`] and [`Kind::Usage`] as of
 /// [`Recording::of`].
 pub fn recorded(path: &Path, sensor: Option<&str>) -> Result<Vec<[u8; LEN]>, Failure> {
-    let whole = Recording::open_line(path)?;
+    let whole = Recording::open_line(path, Some(Family::Ld))?;
     let recording = sensor.map_or(Ok(whole.clone()), |sensor| whole.of(sensor))?;
     // Packets are sent as they were: nothing of them is encoded.
     let frames = recording.telegrams(Encoding { unit: Unit::Mm, mode: Mode(1) })?;

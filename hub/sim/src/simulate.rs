@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use recording::{Encoding, Frame, Recording};
 use rustix::event::{EventfdFlags, eventfd};
 use scanhub_drivers::lms::variant::{Baud, Mode, Variant};
-use schema::{Failure, Kind, Nanos};
+use schema::{Failure, Family, Kind, Nanos};
 
 use crate::device::Device;
 use crate::ld::{Head, HeadSettings, Packets, recorded};
@@ -57,7 +57,8 @@ pub fn simulate_with(
 ) -> Result<Vec<Summary>, Failure> {
     check(options)?;
     let recording = options.replay.as_ref().filter(|_| options.scanner.is_none());
-    let recording = recording.map(Recording::open).transpose()?;
+    // The ports are LMS, so the bytes of a stream file are theirs.
+    let recording = recording.map(|path| Recording::open_as(path, Some(Family::Lms))).transpose()?;
     let truth = options.truth.as_deref().map(Truth::create).transpose()?;
     let tell = |record: &Record| {
         tell(record);

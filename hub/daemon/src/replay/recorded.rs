@@ -55,7 +55,7 @@ impl Recorded {
     /// [`Kind::Input`] if it cannot be read, [`Kind::Configuration`] if it has other sensors. A file without a telegram is a line
     /// that only brings noise.
     pub(crate) fn open(path: &Path, link: &Link) -> Result<Recorded, Failure> {
-        let recording = Recording::open_line(path)?;
+        let recording = Recording::open_line(path, Some(link.family()))?;
         tell_of_damage(&recording);
         if recording.contents().sensors.len() > 1 {
             // Its name is configured, and not a word of somebody who asks.

@@ -216,6 +216,8 @@ impl Dialogue {
         now: Nanos,
     ) {
         self.quiet_since = now;
+        // The power cycle that brings back a lost scanner is no sign of a weak supply.
+        let is_expected_restart = self.fast_switches.have_lost();
         // A telegram that was read before a change of the rate arrived at the previous rate.
         let is_fast = self.baud == FAST && self.change_baud.is_none();
         if self.fast_switches.receive(is_fast) {
@@ -225,7 +227,8 @@ impl Dialogue {
         }
         self.sensor.learn(reply.as_ref(), telegram);
         if telegram.command() == POWER_ON {
-            self.restarts += u64::from(core::mem::take(&mut self.is_in_contact));
+            let is_restart = core::mem::take(&mut self.is_in_contact) && !is_expected_restart;
+            self.restarts += u64::from(is_restart);
             self.streamed_at = None;
             return self.on_power_on(now);
         }

@@ -2,15 +2,19 @@
 //!
 //! A damaged file is read as far as its structure can be trusted:
 //!
-//! - A chunk is used whole or not at all, because one CRC-32 covers all of its records. A chunk with a wrong checksum is
-//!   skipped, and so is a record whose fields do not fit into it.
-//! - At a length that is impossible, reading ends: nothing after it is known to be the start of a record.
+//! - A chunk is used whole or not at all, because one CRC-32 covers all of its records. A chunk with a wrong checksum or
+//!   opcode is skipped, and so is a record whose fields do not fit into it.
+//! - A chunk that the file contains twice is read once.
+//! - After a record whose length or opcode is impossible, reading continues at the next chunk whose lengths agree. In a file
+//!   with messages outside chunks, it continues at the next message of the hub.
 //! - A file that was cut anywhere is read to its last whole record.
 //!
 //! [`Damage`] counts all bytes that were not used. The format is described at <https://mcap.dev/spec>.
 
 use std::borrow::Cow;
-use std::io::{self, Read};
+use std::collections::HashSet;
+use std::hash::{DefaultHasher, Hasher};
+use std::io::{self, Cursor, Read};
 use std::ops::RangeInclusive;
 
 use flate2::Crc;
@@ -18,6 +22,7 @@ use mcap::records::{MessageHeader, Record as Parsed, op};
 use mcap::sans_io::{LinearReadEvent, LinearReader, LinearReaderOptions};
 use mcap::{MAGIC, McapError, parse_record};
 
+use super::catalog;
 use crate::Damage;
 use crate::open::is_end;
 
@@ -26,6 +31,8 @@ use crate::open::is_end;
 pub(crate) struct Record {
     pub(crate) opcode: u8,
     pub(crate) body: Vec<u8>,
+    /// Whether the checksum of a chunk covers it.
+    pub(crate) is_in_chunk: bool,
 }
 
 impl Record {
@@ -55,6 +62,14 @@ pub(crate) struct Records<R> {
     input: R,
     /// The open chunk, whose records are returned next.
     chunk: Chunk,
+    /// Hashes of the first [`MOST_CHUNKS`] chunks with messages.
+    chunks: HashSet<u64>,
+    /// Bytes to read again before those of `input`.
+    unread: Cursor<Vec<u8>>,
+    /// Number of places at which the structure was lost.
+    resyncs: u32,
+    /// Whether a message was read outside chunks.
+    has_messages: bool,
     /// Checksum of the section that is being read: the data section, then the summary.
     section: Crc,
     /// The last bytes that were read, at most as many as the magic bytes.
@@ -69,6 +84,10 @@ impl<R: Read> Records<R> {
         Records {
             input,
             chunk: Chunk::default(),
+            chunks: HashSet::new(),
+            unread: Cursor::default(),
+            resyncs: 0,
+            has_messages: false,
             section: Crc::new(),
             tail: Vec::new(),
             damage: Damage::default(),
@@ -86,8 +105,8 @@ impl<R: Read> Records<R> {
     ///
     /// # Errors
     ///
-    /// Returns the error of the input. Returns `FileTooLarge` at a chunk that is longer than [`LONGEST`], and `Unsupported`
-    /// at a chunk whose compression this build lacks.
+    /// Returns the error of the input. Returns `FileTooLarge` at an intact chunk that is longer than [`LONGEST`], compressed
+    /// or not, and `Unsupported` at a chunk whose compression this build lacks.
     pub(crate) fn next(&mut self) -> io::Result<Option<Record>> {
         loop {
             if let Some(record) = self.chunk.next() {
@@ -120,21 +139,26 @@ impl<R: Read> Records<R> {
             self.end_in_record(head.len() as u64);
             return Ok(None);
         };
-        if opcode == 0 {
-            return self.end_here(HEAD).map(|()| None);
+        if opcode == 0 || length > longest_possible(opcode) {
+            return self.resynchronize(head);
         }
-        if length > longest(opcode) {
-            return self.skip_long(&head, opcode, length).map(|()| None);
+        if opcode == op::CHUNK {
+            return self.read_chunk(head, length);
+        }
+        if length > LONGEST {
+            return self.skip_long(&head, length).map(|()| None);
         }
         let body = self.read(length as usize)?;
         let len = HEAD as u64 + body.len() as u64;
         if (body.len() as u64) < length {
-            self.end_in_record(len);
-            return Ok(None);
+            return self.end_or_resynchronize(head, body);
         }
-        // The opcode of another record became that of a footer, or one that the format reserves.
+        // The opcode of another record became that of a footer or data end, or one that the format reserves.
         let is_no_footer = opcode == op::FOOTER && length != FOOTER_LEN;
-        if is_no_footer || RESERVED.contains(&opcode) {
+        let is_no_end = opcode == op::DATA_END && length != DATA_END_LEN;
+        let is_chunk = is_chunk(&body, length);
+        if is_chunk || is_no_footer || is_no_end || RESERVED.contains(&opcode) {
+            self.damage.chunks += u64::from(is_chunk);
             self.skip(len);
             return Ok(None);
         }
@@ -154,42 +178,76 @@ impl<R: Read> Records<R> {
                 self.section.update(&body);
             }
         }
-        if opcode == op::CHUNK {
-            if chunk_length(&body) != Some(length) {
-                return self.end_here(len as usize).map(|()| None);
-            }
-            match Chunk::open(body) {
-                Ok(chunk) => self.chunk = chunk,
-                Err(McapError::UnsupportedCompression(name)) if matches!(&name[..], "lz4" | "zstd") => {
-                    let what = format!("its chunks are packed by {name}");
-                    return Err(io::Error::new(io::ErrorKind::Unsupported, what));
-                }
-                Err(_) => {
-                    self.damage.chunks += 1;
-                    self.skip(len);
-                }
-            }
+        if length > longest(opcode) {
+            self.damage.bytes += len;
             return Ok(None);
         }
-        let record = Record { opcode, body };
+        let record = Record { opcode, body, is_in_chunk: false };
         if is_interpreted(opcode) && record.parse().is_none() {
             self.skip(len);
             return Ok(None);
         }
+        self.has_messages |= opcode == op::MESSAGE;
         Ok(Some(record))
     }
 
-    /// Passes over a record that is too long to be held in memory.
-    fn skip_long(&mut self, head: &[u8], opcode: u8, length: u64) -> io::Result<()> {
-        if opcode == op::CHUNK {
-            let begin = self.read(HEAD_OF_CHUNK)?;
-            if chunk_length(&begin) == Some(length) {
-                let (megabytes, most) = (length >> 20, LONGEST >> 20);
-                let what = format!("it has a chunk of {megabytes} MB; at most {most} MB are read at a time");
-                return Err(io::Error::new(io::ErrorKind::FileTooLarge, what));
-            }
-            return self.end_here(HEAD + begin.len());
+    /// Reads the body of a chunk, and opens the chunk if it can be used.
+    fn read_chunk(&mut self, head: Vec<u8>, length: u64) -> io::Result<Option<Record>> {
+        let mut body = self.read(HEAD_OF_CHUNK.min(length as usize))?;
+        if !is_chunk(&body, length) {
+            let is_end = (body.len() as u64) < length && body.len() < HEAD_OF_CHUNK;
+            return if is_end {
+                self.end_or_resynchronize(head, body)
+            } else {
+                self.resynchronize([head, body].concat())
+            };
         }
+        if length > LONGEST {
+            return Err(too_long(length));
+        }
+        body.append(&mut self.read(length as usize - body.len())?);
+        let len = HEAD as u64 + body.len() as u64;
+        if (body.len() as u64) < length {
+            return self.end_or_resynchronize(head, body);
+        }
+        self.section.update(&head);
+        self.section.update(&body);
+        // The time of the first message; 0 if there is none. Messages without times may be equal.
+        let is_dated = body.iter().take(8).any(|byte| *byte != 0);
+        let mut hasher = DefaultHasher::new();
+        hasher.write(&body);
+        match Chunk::open(body) {
+            Ok(_) if is_dated && !self.is_new(hasher.finish()) => {
+                self.damage.repeats += 1;
+                self.damage.is_harmed = true;
+            }
+            Ok(chunk) => self.chunk = chunk,
+            Err(McapError::UnsupportedCompression(name)) if matches!(&name[..], "lz4" | "zstd") => {
+                let what = format!("its chunks are packed by {name}");
+                return Err(io::Error::new(io::ErrorKind::Unsupported, what));
+            }
+            Err(McapError::ChunkTooLarge(len)) => return Err(too_long(len)),
+            Err(_) => {
+                self.damage.chunks += 1;
+                self.skip(len);
+            }
+        }
+        Ok(None)
+    }
+
+    /// Returns whether no chunk with this hash was read before. Two chunks of a recorder are never equal, because the times and
+    /// numbers of their messages differ.
+    fn is_new(&mut self, hash: u64) -> bool {
+        if self.chunks.len() < MOST_CHUNKS { self.chunks.insert(hash) } else { !self.chunks.contains(&hash) }
+    }
+
+    /// Counts `record`, which was read outside chunks, as damaged.
+    pub(crate) fn reject(&mut self, record: &Record) {
+        self.skip((HEAD + record.body.len()) as u64);
+    }
+
+    /// Passes over a record that is too long to be held in memory.
+    fn skip_long(&mut self, head: &[u8], length: u64) -> io::Result<()> {
         self.damage.bytes += head.len() as u64;
         self.section.update(head);
         let mut left = length;
@@ -204,6 +262,47 @@ impl<R: Read> Records<R> {
             left -= piece.len() as u64;
         }
         Ok(())
+    }
+
+    /// Continues at the next chunk after the start of a record that cannot be right, or at the next message of the hub if the
+    /// file has messages outside chunks. `window` has the bytes from that start on that have been read. Always returns `None`.
+    fn resynchronize(&mut self, mut window: Vec<u8>) -> io::Result<Option<Record>> {
+        self.resyncs += 1;
+        let mut from = 1;
+        while self.resyncs <= MOST_RESYNCS {
+            let missing = (from + PIECE as usize).saturating_sub(window.len());
+            let is_end = missing > 0 && {
+                let more = self.read(missing)?;
+                window.extend_from_slice(&more);
+                more.len() < missing
+            };
+            let end = if is_end { window.len() } else { window.len() - HEAD - HEAD_OF_CHUNK };
+            if let Some(at) = (from..end).find(|&at| is_border(&window[at..], self.has_messages)) {
+                self.skip(at as u64);
+                window.drain(..at);
+                self.unread.read_to_end(&mut window)?;
+                self.unread = Cursor::new(window);
+                return Ok(None);
+            }
+            if is_end {
+                break;
+            }
+            self.skip(end as u64);
+            window.drain(..end);
+            from = 0;
+        }
+        self.end_here(window.len())?;
+        Ok(None)
+    }
+
+    /// Handles a record whose end is missing: the file was cut there, or its length is wrong.
+    fn end_or_resynchronize(&mut self, head: Vec<u8>, body: Vec<u8>) -> io::Result<Option<Record>> {
+        // A file that was cut does not end with the magic bytes.
+        if self.tail == MAGIC {
+            return self.resynchronize([head, body].concat());
+        }
+        self.end_in_record((head.len() + body.len()) as u64);
+        Ok(None)
     }
 
     /// Reads the magic bytes at the end of the file, after which nothing may follow.
@@ -268,11 +367,12 @@ impl<R: Read> Records<R> {
     fn read(&mut self, len: usize) -> io::Result<Vec<u8>> {
         // A length may be wrong: memory is allocated for bytes that exist.
         let mut bytes = Vec::with_capacity(len.min(PIECE as usize));
-        match self.input.by_ref().take(len as u64).read_to_end(&mut bytes) {
+        let begin = self.unread.by_ref().take(len as u64).read_to_end(&mut bytes)?;
+        match self.input.by_ref().take((len - begin) as u64).read_to_end(&mut bytes) {
             Err(error) if !is_end(&error) => return Err(error),
             _ => {}
         }
-        self.tail.extend_from_slice(&bytes[bytes.len().saturating_sub(MAGIC.len())..]);
+        self.tail.extend_from_slice(&bytes[begin.max(bytes.len().saturating_sub(MAGIC.len()))..]);
         self.tail.drain(..self.tail.len().saturating_sub(MAGIC.len()));
         Ok(bytes)
     }
@@ -291,13 +391,19 @@ impl Chunk {
     ///
     /// # Errors
     ///
-    /// Returns an error if the checksum is wrong, if its records do not fill it, or if it cannot be unpacked.
+    /// Returns an error if the checksum is wrong, if its records do not fill it, or if it cannot be unpacked. Returns
+    /// [`McapError::ChunkTooLarge`] if it is intact, but unpacks to more than [`LONGEST`].
     fn open(body: Vec<u8>) -> Result<Chunk, McapError> {
         let Parsed::Chunk { header, data } = parse_record(op::CHUNK, &body)? else {
             return Err(McapError::UnexpectedEoc);
         };
         if header.uncompressed_size > LONGEST {
-            return Err(McapError::ChunkTooLarge(header.uncompressed_size));
+            // Its length may be damaged. Only an intact chunk shows that the file has longer chunks than can be read.
+            return Err(match unpacked_length(&body, header.uncompressed_size) {
+                Ok(len) if len == header.uncompressed_size => McapError::ChunkTooLarge(len),
+                Ok(_) => McapError::UnexpectedEoc,
+                Err(error) => error,
+            });
         }
         let chunk = if header.compression.is_empty() {
             let mut crc = Crc::new();
@@ -330,20 +436,50 @@ impl Iterator for Chunk {
             return None;
         };
         self.at += record.len();
-        Some(Record { opcode: record[0], body: record[HEAD..].to_vec() })
+        Some(Record { opcode: record[0], body: record[HEAD..].to_vec(), is_in_chunk: true })
     }
 }
 
 /// Returns the records of a compressed chunk, with their opcodes and lengths.
 fn unpack(body: &[u8]) -> Result<Vec<u8>, McapError> {
-    let options = LinearReaderOptions::default()
+    let mut records = Vec::new();
+    for_each_record(
+        body,
+        LinearReaderOptions::default().with_prevalidate_chunk_crcs(true),
+        |opcode, data| {
+            records.push(opcode);
+            records.extend((data.len() as u64).to_le_bytes());
+            records.extend(data);
+            true
+        },
+    )?;
+    Ok(records)
+}
+
+/// Returns the length of the records of a compressed chunk that may be too long to be held in memory. Stops when it is
+/// longer than `most`, or than any chunk that a recorder writes.
+fn unpacked_length(body: &[u8], most: u64) -> Result<u64, McapError> {
+    let (mut len, most) = (0, most.min(LONGEST_WRITTEN));
+    for_each_record(body, LinearReaderOptions::default().with_validate_chunk_crcs(true), |_, data| {
+        len += (HEAD + data.len()) as u64;
+        len <= most
+    })?;
+    Ok(len)
+}
+
+/// Calls `take` with opcode and body of each record of a compressed chunk, until it returns false.
+fn for_each_record(
+    body: &[u8],
+    options: LinearReaderOptions,
+    mut take: impl FnMut(u8, &[u8]) -> bool,
+) -> Result<(), McapError> {
+    let options = options
         .with_skip_start_magic(true)
         .with_skip_end_magic(true)
-        .with_prevalidate_chunk_crcs(true)
         .with_record_length_limit(LONGEST as usize);
     let mut reader = LinearReader::new_with_options(options);
     let chunk = [&[op::CHUNK][..], &(body.len() as u64).to_le_bytes(), body].concat();
-    let (mut input, mut records) = (&chunk[..], Vec::new());
+    let mut input = &chunk[..];
     while let Some(event) = reader.next_event() {
         match event? {
             LinearReadEvent::ReadRequest(wanted) => {
@@ -353,13 +489,75 @@ fn unpack(body: &[u8]) -> Result<Vec<u8>, McapError> {
                 input = rest;
             }
             LinearReadEvent::Record { opcode, data } => {
-                records.push(opcode);
-                records.extend((data.len() as u64).to_le_bytes());
-                records.extend(data);
+                if !take(opcode, data) {
+                    return Ok(());
+                }
             }
         }
     }
-    Ok(records)
+    Ok(())
+}
+
+/// Returns the error of a chunk of `len` bytes, which is too long.
+fn too_long(len: u64) -> io::Error {
+    let (megabytes, most) = (len >> 20, LONGEST >> 20);
+    let what = format!("it has a chunk of {megabytes} MB; at most {most} MB are read at a time");
+    io::Error::new(io::ErrorKind::FileTooLarge, what)
+}
+
+/// Returns whether `bytes` start with a chunk whose lengths agree, or with a message of the hub, if `messages` count. Neither
+/// occurs by chance: both have lengths or times twice.
+fn is_border(bytes: &[u8], messages: bool) -> bool {
+    let Some((opcode, length)) = split_head(bytes) else { return false };
+    match opcode {
+        _ if length > LONGEST => false,
+        op::CHUNK => is_chunk(&bytes[HEAD..], length),
+        op::MESSAGE => messages && is_message_of_hub(bytes),
+        _ => false,
+    }
+}
+
+/// Returns whether a chunk or a message of the hub starts anywhere in `bytes`.
+pub(crate) fn has_border(bytes: &[u8]) -> bool {
+    (0..bytes.len()).any(|at| is_border(&bytes[at..], true))
+}
+
+/// Returns whether `bytes` start with a message of the hub, whole or not.
+fn is_message_of_hub(bytes: &[u8]) -> bool {
+    let Some((op::MESSAGE, length)) = split_head(bytes) else { return false };
+    let end = bytes.len().min(HEAD.saturating_add(length as usize)).min(HEAD + HEAD_OF_MESSAGE);
+    match parse_record(op::MESSAGE, &bytes[HEAD..end]) {
+        Ok(Parsed::Message { header, data }) => {
+            header.log_time != 0 && catalog::sample(&header, &data).is_some()
+        }
+        _ => false,
+    }
+}
+
+/// Returns whether the body of a record of this `length` starts with the fields of a chunk.
+fn is_chunk(body: &[u8], length: u64) -> bool {
+    let is_known = |name: &[u8]| matches!(name, b"" | b"lz4" | b"zstd");
+    let compression = || {
+        let (len, rest) = body.get(COMPRESSION..)?.split_first_chunk()?;
+        rest.get(..u32::from_le_bytes(*len) as usize)
+    };
+    chunk_length(body) == Some(length) && compression().is_some_and(is_known)
+}
+
+/// Returns the maximum length that a record with this opcode can have. A greater length is damaged.
+fn longest_possible(opcode: u8) -> u64 {
+    match opcode {
+        op::HEADER
+        | op::FOOTER
+        | op::MESSAGE_INDEX
+        | op::CHUNK_INDEX
+        | op::ATTACHMENT_INDEX
+        | op::STATISTICS
+        | op::METADATA_INDEX
+        | op::SUMMARY_OFFSET
+        | op::DATA_END => LONGEST,
+        _ => LONGEST_FILE,
+    }
 }
 
 /// Returns opcode and length of the body of the record that starts with `bytes`.
@@ -376,11 +574,10 @@ fn split_record(bytes: &[u8]) -> Option<(&[u8], &[u8])> {
 
 /// Returns the length that a chunk must have according to the fields at the beginning of its `body`.
 fn chunk_length(body: &[u8]) -> Option<u64> {
-    // Times of the first and the last message, uncompressed size, CRC.
-    let (compression, rest) = body.get(8 + 8 + 8 + 4..)?.split_first_chunk()?;
+    let (compression, rest) = body.get(COMPRESSION..)?.split_first_chunk()?;
     let compression = u32::from_le_bytes(*compression);
     let records = rest.get(compression as usize..)?.first_chunk()?;
-    let head = 8 + 8 + 8 + 4 + 4 + u64::from(compression) + 8;
+    let head = COMPRESSION as u64 + 4 + u64::from(compression) + 8;
     u64::from_le_bytes(*records).checked_add(head)
 }
 
@@ -416,6 +613,13 @@ fn longest(opcode: u8) -> u64 {
 const HEAD: usize = 1 + 8;
 /// Bytes of a chunk that include the length of its records, whatever the name of its compression.
 const HEAD_OF_CHUNK: usize = 1024;
+/// Position of the name of a chunk's compression: after the times of the first and the last message, the uncompressed size,
+/// and the CRC.
+const COMPRESSION: usize = 8 + 8 + 8 + 4;
+/// Bytes of a message that include the header of a sample of the hub.
+const HEAD_OF_MESSAGE: usize = 2 + 4 + 8 + 8 + size_of::<schema::Header>();
+/// Length of a data end.
+const DATA_END_LEN: u64 = 4;
 /// Position of the checksum in the footer.
 const FOOTER_CRC: usize = 8 + 8;
 /// Length of a footer.
@@ -424,5 +628,13 @@ const FOOTER_LEN: u64 = FOOTER_CRC as u64 + 4;
 const RESERVED: RangeInclusive<u8> = 0x10..=0x7F;
 /// Maximum length of all other records. A few times this is held in memory; recorders write chunks of less than half of it.
 const LONGEST: u64 = 8 << 20;
+/// No file is longer.
+const LONGEST_FILE: u64 = 1 << 40;
+/// Longest chunk that is unpacked to find out whether it is intact.
+const LONGEST_WRITTEN: u64 = 1 << 30;
+/// Maximum number of chunks that are compared with later ones: 14 hours of a recording of the hub.
+const MOST_CHUNKS: usize = 1 << 19;
+/// Maximum number of places at which the structure of a file is found again. Each one may read the longest record twice.
+const MOST_RESYNCS: u32 = 256;
 /// Bytes that are read at a time.
 const PIECE: u64 = 64 * 1024;

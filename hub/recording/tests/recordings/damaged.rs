@@ -1,6 +1,7 @@
 //! Damaged MCAP files: of a file that was cut or changed anywhere, the intact chunks are read, and nothing that was never in
 //! the file.
 
+use std::io::Write as _;
 use std::ops::Range;
 
 use fastrand::Rng;
@@ -142,25 +143,166 @@ fn chunk_with_another_opcode_costs_one_chunk() {
 }
 
 #[test]
-fn reading_ends_at_an_impossible_length() {
+fn reading_continues_at_next_chunk_after_an_impossible_length() {
     let folder = TempDir::new().unwrap();
-    let whole = Whole::new(20, Compression::None);
-    let (length, last) = (whole.bytes.len(), 1 + 7);
-    for (number, chunk) in whole.chunks.iter().enumerate() {
-        // The length of the chunk contradicts its fields; the length of the next record leads beyond the end of the file;
-        // no record has opcode 0.
-        for (start, at, left) in [
-            (chunk.start, chunk.start + 1, number),
-            (chunk.start, chunk.start + last, number),
-            (chunk.end, chunk.end + last, number + 1),
-            (chunk.start, chunk.start, number),
-        ] {
+    for compression in [Compression::None, Compression::Zstd] {
+        let whole = Whole::new(20, compression);
+        let last = 1 + 7;
+        for (number, chunk) in whole.chunks.iter().enumerate() {
+            let next = whole.chunks.get(number + 1).map_or(whole.bytes.len(), |next| next.start);
+            // The length of the chunk contradicts its fields; the length of the next record leads beyond the end of the file;
+            // no record has opcode 0.
+            for (start, at, is_chunk) in [
+                (chunk.start, chunk.start + 1, true),
+                (chunk.start, chunk.start + last, true),
+                (chunk.end, chunk.end + last, false),
+                (chunk.end, chunk.end + 3, false),
+                (chunk.start, chunk.start, true),
+                (chunk.end, chunk.end, false),
+            ] {
+                let mut bytes = whole.bytes.clone();
+                bytes[at] = if at == start { 0 } else { bytes[at] ^ 0x40 };
+                let (telegrams, damage) = read(&folder, &bytes);
+                let left = |other| !is_chunk || other != number;
+                assert!(telegrams == whole.telegrams(left), "{compression:?}, byte {at}: {damage}");
+                assert_eq!((damage.bytes, damage.is_harmed), ((next - start) as u64, true), "byte {at}");
+            }
+        }
+    }
+}
+
+#[test]
+fn any_flipped_bit_of_an_opcode_costs_at_most_one_chunk() {
+    let folder = TempDir::new().unwrap();
+    let whole = Whole::new(20, Compression::Lz4);
+    // The last end is that of the footer.
+    for (index, start) in whole.ends.iter().enumerate().take(whole.ends.len() - 1) {
+        for bit in 0..8 {
             let mut bytes = whole.bytes.clone();
-            bytes[at] = if at == start { 0 } else { bytes[at] ^ 0x40 };
+            bytes[*start] ^= 1 << bit;
             let (telegrams, damage) = read(&folder, &bytes);
-            assert!(telegrams == whole.telegrams(|other| other < left), "byte {at}: {damage}");
-            let expected = Damage { bytes: (length - start) as u64, is_harmed: true, ..Damage::default() };
-            assert_eq!(damage, expected, "byte {at}");
+            let name = format!("bit {bit} of record {index}, opcode {}: {damage}", whole.bytes[*start]);
+            let hit = whole.chunks.iter().position(|chunk| chunk.start == *start);
+            assert!(telegrams == whole.telegrams(|number| Some(number) != hit), "{name}");
+            assert!(damage.is_harmed, "{name}");
+            assert!(hit.is_none() || damage.bytes > 0, "{name}");
+        }
+    }
+}
+
+#[test]
+fn chunk_that_the_file_has_twice_is_read_once() {
+    let folder = TempDir::new().unwrap();
+    for compression in [Compression::None, Compression::Zstd] {
+        let whole = Whole::new(20, compression);
+        // One chunk again at another place, and a block of three chunks with all records between them.
+        let (first, block) = (whole.chunks[0].clone(), whole.chunks[1].start..whole.chunks[3].end);
+        for (copied, at, repeats) in [(first, whole.chunks[2].end, 1), (block, whole.chunks[3].end, 3)] {
+            let mut bytes = whole.bytes.clone();
+            let again = bytes[copied].to_vec();
+            bytes.splice(at..at, again);
+            let (telegrams, damage) = read(&folder, &bytes);
+            assert!(telegrams == whole.telegrams(|_| true), "{compression:?}: {damage}");
+            assert_eq!(damage, Damage { repeats, is_harmed: true, ..Damage::default() });
+            let words = if repeats == 1 {
+                "1 chunk that the file has twice"
+            } else {
+                "3 chunks that the file has twice"
+            };
+            assert_eq!(damage.to_string(), words);
+        }
+    }
+}
+
+#[test]
+fn telegram_outside_chunks_is_checked_by_its_own_checksum() {
+    let folder = TempDir::new().unwrap();
+    let whole = Whole::new(8, Compression::None);
+    let telegrams = whole.telegrams(|_| true);
+    // The records of the chunks, without the chunks, and checksums of sections that were not computed.
+    let (mut bytes, mut at) = (whole.bytes[..MAGIC].to_vec(), MAGIC);
+    let mut messages = Vec::new();
+    for end in &whole.ends[1..] {
+        let record = at..*end;
+        at = *end;
+        match whole.bytes[record.start] {
+            mcap::records::op::CHUNK => {
+                let mut from = record.start + HEAD + 8 + 8 + 8 + 4 + 4 + 8;
+                while from < record.end {
+                    let len = u64::from_le_bytes(*whole.bytes[from + 1..].first_chunk().unwrap()) as usize;
+                    let next = from + HEAD + len;
+                    if whole.bytes[from] == mcap::records::op::MESSAGE {
+                        messages.push(bytes.len()..bytes.len() + next - from);
+                    }
+                    bytes.extend_from_slice(&whole.bytes[from..next]);
+                    from = next;
+                }
+            }
+            mcap::records::op::DATA_END | mcap::records::op::FOOTER => {
+                bytes.extend_from_slice(&whole.bytes[record]);
+                let len = bytes.len();
+                bytes[len - 4..].fill(0);
+            }
+            _ => bytes.extend_from_slice(&whole.bytes[record]),
+        }
+    }
+    bytes.extend_from_slice(&whole.bytes[at..]);
+    assert_eq!(read(&folder, &bytes), (telegrams.clone(), Damage::default()));
+    for known in &telegrams {
+        let is_in = |range: &&Range<usize>| bytes[(*range).clone()].ends_with(&known.telegram);
+        let hits: Vec<_> = messages.iter().filter(is_in).cloned().collect();
+        // A reply is sent again and again. Only the header tells which one it is.
+        for hit in &hits {
+            for at in [hit.end - 1, hit.end - known.telegram.len() / 2, hit.end - known.telegram.len()] {
+                let mut changed = bytes.clone();
+                changed[at] ^= 0x04;
+                let (read, damage) = read(&folder, &changed);
+                assert_eq!(read.len() + 1, telegrams.len(), "byte {at}: {damage}");
+                assert!(read.iter().all(|read| telegrams.contains(read)), "byte {at}: {damage}");
+                assert!(damage.bytes == hit.len() as u64 && damage.is_harmed, "byte {at}: {damage}");
+            }
+        }
+        assert!(!hits.is_empty());
+    }
+    // After a length that is impossible, the next message of the hub is found.
+    let hit = messages[telegrams.len()].clone();
+    bytes[hit.start + 1 + 7] ^= 0x40;
+    let (read, damage) = read(&folder, &bytes);
+    assert!(read.len() + 1 >= telegrams.len() && damage.is_harmed, "{} telegrams, {damage}", read.len());
+}
+
+#[test]
+fn intact_chunk_that_unpacks_to_too_much_is_refused_and_a_wrong_length_is_not() {
+    let folder = TempDir::new().unwrap();
+    // Zeros, so that the chunk is short until it is unpacked.
+    let mut writer =
+        schema::file::Writer::packed(Vec::new(), "", Compression::Zstd, Default::default()).unwrap();
+    let channel = schema::file::Foreign {
+        topic: "/map",
+        encoding: "raw",
+        schema: ("map", "bytes", "text"),
+        metadata: &[],
+    };
+    let map = writer.channel(&channel).unwrap();
+    for round in 0..9 {
+        writer.message(map, round, u64::from(round), &vec![0; 1 << 20]).unwrap();
+    }
+    writer.close_chunk().unwrap();
+    let failure = Recording::open(file(&folder, "long.mcap", &writer.finish().unwrap())).unwrap_err();
+    assert!(
+        failure.message.ends_with("it has a chunk of 9 MB; at most 8 MB are read at a time"),
+        "{failure}"
+    );
+    assert!(failure.hint.contains("mcap filter"), "{failure}");
+
+    let whole = Whole::new(20, Compression::Zstd);
+    for (number, chunk) in whole.chunks.iter().enumerate() {
+        for at in [2, 3, 5, 7] {
+            let mut bytes = whole.bytes.clone();
+            bytes[chunk.start + HEAD + 8 + 8 + at] ^= 0x80;
+            let (telegrams, damage) = read(&folder, &bytes);
+            assert!(telegrams == whole.telegrams(|other| other != number), "{at}: {damage}");
+            assert_eq!(damage.chunks, 1, "{at}: {damage}");
         }
     }
 }
@@ -232,6 +374,20 @@ fn file_without_its_beginning_is_refused() {
         assert!(failure.message.ends_with("is the end of an MCAP file, without its beginning"), "{failure}");
         assert_eq!(failure.kind.exit_code(), 66);
     }
+    // Neither the beginning nor the end: messages, or a chunk of which nothing can be read.
+    let packed = Whole::new(20, Compression::Zstd);
+    let middle = |whole: &Whole| whole.bytes[whole.chunks[1].start + 40..whole.chunks[3].end].to_vec();
+    for bytes in [middle(&Whole::new(20, Compression::None)), middle(&packed), gzip(&middle(&packed))] {
+        let failure = Recording::open(file(&folder, "middle.bin", &bytes)).unwrap_err();
+        assert!(failure.message.ends_with("is a piece of an MCAP file, without its beginning"), "{failure}");
+        assert!(failure.hint.contains("whole file"), "{failure}");
+    }
+}
+
+fn gzip(bytes: &[u8]) -> Vec<u8> {
+    let mut encoder = flate2::write::GzEncoder::new(Vec::new(), flate2::Compression::default());
+    encoder.write_all(bytes).unwrap();
+    encoder.finish().unwrap()
 }
 
 /// Telegrams in a chunk: four of each sensor.

@@ -12,6 +12,7 @@ use scanhub_drivers::lms::measured::{self, Measured};
 use scanhub_drivers::lms::reply;
 use scanhub_drivers::lms::telegram::Telegram;
 use scanhub_drivers::lms::variant::{Mode, Unit, Variant};
+use schema::Family;
 use tempfile::NamedTempFile;
 
 const MM: Encoding = Encoding { unit: Unit::Mm, mode: Mode(1) };
@@ -107,9 +108,31 @@ fn what_is_no_recording_is_refused_with_place_value_and_remedy() {
         let file = temporary(name, &bytes);
         let failure = Recording::open(file.path()).unwrap_err();
         assert!(failure.message.contains(says), "{failure}");
-        // A line may bring nothing but noise.
-        let line = Recording::open_line(file.path()).ok();
-        assert_eq!(line.map(|line| line.contents().telegrams), (says == "no telegram in it").then_some(0));
+        // A line may bring nothing but noise, if it is known whose it is.
+        let line = |family| Recording::open_line(file.path(), family);
+        let is_noise = says == "no telegram in it";
+        let known = line(Some(Family::Lms)).ok();
+        assert_eq!(known.map(|line| line.contents().telegrams), is_noise.then_some(0));
+        let unknown = line(None).unwrap_err();
+        assert!(!is_noise || unknown.kind.exit_code() == 78 && unknown.hint.contains("family="), "{unknown}");
+    }
+}
+
+#[test]
+fn stream_of_which_no_family_takes_half_needs_the_family() {
+    let telegrams: Vec<u8> = (0..8).flat_map(scan).collect();
+    let noise = vec![0x42; telegrams.len() + 1];
+    let few = temporary("few.bin", &[&telegrams[..], &noise].concat());
+    let failure = Recording::open(few.path()).unwrap_err();
+    assert_eq!(failure.kind.exit_code(), 78);
+    assert!(failure.message.contains("(lms 49 %, ") && failure.hint.contains("family="), "{failure}");
+    let named = Recording::open_as(few.path(), Some(Family::Lms)).unwrap();
+    assert_eq!((named.contents().telegrams, named.contents().damage.bytes), (8, noise.len() as u64));
+    // A wrong name does not hide whose it is.
+    let enough = temporary("enough.bin", &[&telegrams[..], &noise[1..]].concat());
+    for family in [None, Some(Family::Lms), Some(Family::Ld)] {
+        let recording = Recording::open_as(enough.path(), family).unwrap();
+        assert_eq!((recording.family(), recording.contents().telegrams), (Some(Family::Lms), 8));
     }
 }
 

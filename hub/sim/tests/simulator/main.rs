@@ -5,6 +5,7 @@ mod faults;
 mod head;
 mod inquiry;
 mod machine;
+mod recognize;
 mod search;
 mod session;
 mod unit;

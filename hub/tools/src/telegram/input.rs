@@ -129,7 +129,7 @@ pub(super) fn is_framed(path: &Path) -> bool {
 /// Returns [`Kind::Input`] if the file cannot be read or has no telegrams, [`Kind::NoTopic`] if it does not have this
 /// sensor, and [`Kind::Usage`] if a name is missing, or is given although the file has none.
 pub(super) fn open_recording(path: &Path, sensor: Option<&str>) -> Result<Unpacked, Failure> {
-    let mut recording = Recording::open(path)?;
+    let mut recording = Recording::open_as(path, Some(Family::Lms))?;
     if let Some(sensor) = sensor {
         recording = recording.of(sensor)?;
     }

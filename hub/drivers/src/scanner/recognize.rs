@@ -1,0 +1,163 @@
+//! Recognizes the family of raw bytes, such as those of a stream file, by the bytes that the framer of each family accepts.
+
+use schema::{Family, MILLIS, Nanos};
+
+use super::{Session, features};
+use crate::line::family::Wanted;
+use crate::line::{Heard, Output, Session as _};
+use crate::lms::framer::{Framer, VETO_HOLD};
+
+/// Number of bytes at the beginning of a stream that are examined.
+pub const EXAMINED: usize = 64 * 1024;
+
+/// Returns the family whose telegrams or packets take most of the first [`EXAMINED`] bytes of `bytes`, and at least half of
+/// them. `None` if no family does.
+pub fn family_of(bytes: &[u8]) -> Option<Family> {
+    let examined = bytes.len().min(EXAMINED);
+    let [(first, most), ..] = bytes_by_family(bytes);
+    (most > 0 && 2 * most >= examined).then_some(first)
+}
+
+/// Returns each family with the number of bytes in its telegrams or packets, among the first [`EXAMINED`] bytes of `bytes`.
+/// The family with the most bytes is first.
+pub fn bytes_by_family(bytes: &[u8]) -> [(Family, usize); Family::ALL.len()] {
+    let bytes = &bytes[..bytes.len().min(EXAMINED)];
+    let mut counts = Family::ALL.map(|family| (family, accepted(family, bytes)));
+    counts.sort_by_key(|(_, accepted)| std::cmp::Reverse(*accepted));
+    counts
+}
+
+/// Returns the name of a scan mode that tells how to split `bytes` into packets of `family`. `None` if the bytes tell that
+/// themselves. Packets of some modes look alike, so another mode may be the right one to decode them.
+pub fn framing_mode(family: Family, bytes: &[u8]) -> Option<&'static str> {
+    packets(family, &bytes[..bytes.len().min(EXAMINED)])?.1
+}
+
+/// Returns the number of bytes in telegrams or packets of `family`.
+fn accepted(family: Family, bytes: &[u8]) -> usize {
+    match packets(family, bytes) {
+        None => in_telegrams(bytes),
+        Some((len, _)) if len > BY_CHANCE => len,
+        Some(_) => 0,
+    }
+}
+
+/// Returns the number of bytes in packets of `family`, and the [mode](framing_mode) in which they are packets. `None` if the
+/// family does not send packets.
+fn packets(family: Family, bytes: &[u8]) -> Option<(usize, Option<&'static str>)> {
+    let in_mode = |mode| {
+        let wanted = Wanted { mode, fixed_rate: true, listen_only: true, ..Wanted::default() };
+        Session::begin(family, wanted, 0).map(|session| in_packets(session, bytes))
+    };
+    let (len, is_ambiguous) = in_mode(None)?;
+    if !is_ambiguous {
+        return Some((len, None));
+    }
+    let modes = features(family)?.modes.iter().copied();
+    let lengths = modes.filter_map(|mode| Some((in_mode(Some(mode))?.0, Some(mode))));
+    lengths.max_by_key(|(len, _)| *len).filter(|(best, _)| *best > len).or(Some((len, None)))
+}
+
+fn in_telegrams(mut bytes: &[u8]) -> usize {
+    let mut framer = Framer::default();
+    loop {
+        while framer.poll().is_some() {}
+        if bytes.is_empty() {
+            break;
+        }
+        let len = fill(framer.spare(), &mut bytes);
+        framer.commit(len);
+    }
+    // No more bytes can refute a telegram that is held back.
+    framer.release(VETO_HOLD);
+    while framer.poll().is_some() {}
+    framer.tally().in_telegrams as usize
+}
+
+/// Returns the number of bytes in packets, and whether the session cannot tell their kind.
+fn in_packets(mut session: Session, mut bytes: &[u8]) -> (usize, bool) {
+    let mut accepted = 0;
+    let mut is_ended = false;
+    loop {
+        loop {
+            match session.poll_output() {
+                Output::Heard(Heard::Packets(received)) => accepted += received.bytes.len(),
+                Output::Transmit { .. } => session.transmitted(0),
+                Output::Heard(Heard::Turn(_)) | Output::SetRate(_) | Output::SetDtr(_) => {}
+                Output::Rest(_) | Output::Wait { .. } => break,
+            }
+        }
+        if is_ended {
+            return (accepted, session.lacks().is_some());
+        }
+        let len = fill(session.spare(), &mut bytes);
+        session.commit(0, len);
+        if len == 0 {
+            is_ended = true;
+            // No more bytes can refute packets that are held back.
+            session.handle_timeout(IDLE);
+        }
+    }
+}
+
+/// Moves the first of `bytes` into `spare`, and returns their number.
+fn fill(spare: &mut [u8], bytes: &mut &[u8]) -> usize {
+    let len = spare.len().min(bytes.len());
+    let (now, later) = bytes.split_at(len);
+    spare[..len].copy_from_slice(now);
+    *bytes = later;
+    len
+}
+
+/// Time after which a session no longer holds packets back.
+const IDLE: Nanos = 100 * MILLIS;
+/// Number of bytes up to which packets may be noise that passed a short checksum.
+const BY_CHANCE: usize = 100;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::lms::measured;
+    use crate::lms::variant::Unit;
+
+    fn telegrams(count: u16) -> Vec<u8> {
+        let scan = |i: u16| measured::encode(0, Unit::Mm, &[700 + i % 50; 181], 0x10).bytes().to_vec();
+        (0..count).flat_map(scan).collect()
+    }
+
+    #[test]
+    fn at_least_half_of_the_bytes_belong_to_the_family() {
+        let telegrams = telegrams(10);
+        let mut random = fastrand::Rng::with_seed(1);
+        let mut with_noise = |len: usize| {
+            let noise: Vec<u8> = (0..len).map(|_| random.u8(3..=0x7F)).collect();
+            family_of(&[&telegrams[..], &noise].concat())
+        };
+        assert_eq!(with_noise(0), Some(Family::Lms));
+        assert_eq!(with_noise(telegrams.len()), Some(Family::Lms));
+        assert_eq!(with_noise(telegrams.len() + 2), None);
+        assert_eq!(bytes_by_family(&telegrams)[0], (Family::Lms, telegrams.len()));
+    }
+
+    #[test]
+    fn only_the_first_bytes_count() {
+        let (telegrams, noise) = (telegrams(400), vec![0x42; EXAMINED]);
+        assert!(telegrams.len() > EXAMINED);
+        assert_eq!(family_of(&[&telegrams[..], &noise, &noise, &noise].concat()), Some(Family::Lms));
+        assert_eq!(family_of(&[&noise[..], &telegrams].concat()), None);
+    }
+
+    #[test]
+    fn noise_and_nothing_have_no_family() {
+        assert_eq!(family_of(&[]), None);
+        for seed in 0..40 {
+            let mut random = fastrand::Rng::with_seed(seed);
+            let len = random.usize(1..4_000);
+            let noise: Vec<u8> = (0..len).map(|_| random.u8(..)).collect();
+            assert_eq!(family_of(&noise), None, "seed {seed}");
+        }
+        for byte in [0x00, 0x02, 0x42, 0x54, 0xAA, 0xFF] {
+            assert_eq!(family_of(&[byte; 2_000]), None, "{byte:02x}");
+        }
+    }
+}

@@ -1,0 +1,80 @@
+//! The family of raw bytes is recognized by the bytes alone: of every simulated scanner, in every mode, from any byte on, and
+//! on a line that loses bytes.
+
+use scanhub_drivers::lms::variant::{Baud, Variant};
+use scanhub_drivers::scanner::recognize::{EXAMINED, family_of};
+use schema::{Family, MILLIS, Nanos};
+use sim::device::Device;
+use sim::fault::Faults;
+use sim::ld::{Head, HeadSettings, Packets};
+use sim::machine::{Machine, Settings, Start};
+use sim::operating::Operating;
+use sim::room::Room;
+use sim::rplidar::{self, Unit, UnitSettings, UnitStart};
+use sim::source::Source;
+use sim::wire::Wire;
+
+/// Returns at most the first `len` bytes that arrive from `device` within 30 s.
+fn bytes_of(device: &mut dyn Device, faults: &str, len: usize) -> Vec<u8> {
+    let mut wire = Wire::new(&faults.parse::<Faults>().expect("faults"), 3);
+    let (mut now, mut bytes): (Nanos, _) = (0, Vec::new());
+    while now < 30_000 * MILLIS && bytes.len() < len {
+        while let Some(carried) = wire.poll_transmit(device, now) {
+            bytes.extend(carried.bytes);
+        }
+        let Some(next) = wire.poll_timeout(device, now) else { break };
+        now = now.max(next);
+    }
+    bytes.truncate(len);
+    bytes
+}
+
+fn room() -> Room {
+    Room::new(&"room".parse().expect("a world"), 1)
+}
+
+/// Every scanner that streams, with its family and a name.
+fn scanners() -> Vec<(Family, String, Box<dyn Device>)> {
+    let mut scanners: Vec<(Family, String, Box<dyn Device>)> = Vec::new();
+    let modes = [Operating::All, Operating::Partial, Operating::Means(10), Operating::Range(31, 91)];
+    for (number, operating) in modes.into_iter().enumerate() {
+        for variant in Variant::ALL {
+            let start = Start::In(operating.clone());
+            let settings = Settings { baud: Baud::B500000, variant, start, ..Settings::default() };
+            let name = format!("lms, mode {number}, {variant:?}");
+            scanners.push((Family::Lms, name, Box::new(Machine::new(settings, Source::Room(room())))));
+        }
+    }
+    for model in scanhub_drivers::ld::Model::ALL {
+        let head = Head::new(HeadSettings::of(model), Packets::Room(Box::new(room())));
+        scanners.push((Family::Ld, model.name().to_owned(), Box::new(head)));
+    }
+    for model in rplidar::Model::ALL {
+        for typical in 0..model.modes().len() {
+            let settings = UnitSettings { start: UnitStart::Streaming, typical, ..UnitSettings::of(model) };
+            let name = format!("{}, mode {typical}", model.name());
+            scanners.push((Family::Rplidar, name, Box::new(Unit::new(settings, room()))));
+        }
+    }
+    scanners
+}
+
+#[test]
+fn family_of_every_scanner_in_every_mode() {
+    for (family, name, mut scanner) in scanners() {
+        let bytes = bytes_of(&mut *scanner, "", EXAMINED + 1_000);
+        assert!(bytes.len() > 5_000, "{name}: {} bytes", bytes.len());
+        for begin in [0, 1, 20, 977] {
+            assert_eq!(family_of(&bytes[begin..]), Some(family), "{name} from byte {begin}");
+        }
+        assert_eq!(family_of(&bytes[..5_000]), Some(family), "{name}, few bytes");
+    }
+}
+
+#[test]
+fn family_on_a_line_that_loses_bytes() {
+    for (family, name, mut scanner) in scanners() {
+        let bytes = bytes_of(&mut *scanner, "loss=0.00135,burst=1.89", EXAMINED);
+        assert_eq!(family_of(&bytes), Some(family), "{name}");
+    }
+}
