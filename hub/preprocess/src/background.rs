@@ -1,68 +1,181 @@
-//! Decides which beams of a scan hit the permanent surroundings, and which hit something in front of them. The model
-//! of the surroundings is learned from the scans, beam by beam, by one of two methods, or in a map
-//! that a moving sensor is laid into. It refuses to know what objects there are.
+//! Decides which beams of a scan hit the permanent surroundings, and which hit something in front of them.
+//!
+//! A [`Model`] of the surroundings is learned from the scans: beam by beam by one of two methods (`fixed`), or as a map
+//! around a sensor that moves (`moving`).
 
+mod fixed;
 mod moving;
-mod multi;
-mod paper;
-mod runs;
-mod settings;
 
+use std::f64::consts::TAU;
 use std::fmt;
 
 use schema::{
     Background, BackgroundHead, Foreground, ForegroundArrays, ForegroundHead, Motion, Pose, Scan, ScanHead,
 };
 
+use fixed::{Multi, Paper};
 use moving::Moving;
-use multi::Multi;
-use paper::Paper;
-use settings::Limits;
-pub use settings::{Candidate, Method, Settings, Start};
 
-/// What one beam of a scan is, beside its background.
+/// Settings of a background.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Settings {
+    /// Method of learning.
+    pub method: Method,
+    /// Maximum difference in mm of readings of one surface, at least one unit of the sensor. `None`: 30, in cm mode 60,
+    /// in dm mode 100.
+    pub threshold_mm: Option<u16>,
+    /// The same for a reading and its candidate (`paper`).
+    pub candidate_mm: Option<u16>,
+    /// Number of scans until a surface is background. `None`: 375 at half degrees, 750 at 1, 188 at a quarter, which
+    /// are 10 s at the full rate. `multi` knows a surface well enough after 5/8 of this number. At most 8191, which is
+    /// 3.6 minutes at half degrees; a greater number counts as that.
+    pub scans: Option<u32>,
+    /// Reading that a candidate is compared with (`paper`).
+    pub candidate: Candidate,
+    /// Contents of the model at the start.
+    pub start: Start,
+    /// Whether a beam without a return has a far background. Otherwise, it is not a reading. `None`: true for `multi`,
+    /// which then detects people in front of glass, at no cost elsewhere; false for `paper`, whose runs each such beam
+    /// ends.
+    pub no_return_is_far: Option<bool>,
+}
+
+/// Method of learning a background.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Method {
+    /// One background per beam, replaced by a range that was read often enough in a row.
+    Paper,
+    /// Several surfaces per beam, and neighbors that must agree before something is in the foreground.
+    #[default]
+    Multi,
+    /// A map of the surroundings of a robot that moves. Beams that end in space that was seen free are in the
+    /// foreground. Each scan needs the robot's position, see [`Model::follow`].
+    Moving,
+}
+
+/// Reading that the readings of a run are compared with.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Candidate {
+    /// The first one. A person who walks straight at the sensor never becomes background.
+    #[default]
+    First,
+    /// The previous one. It drifts along with anything that moves slowly.
+    Latest,
+}
+
+/// Contents of the model at the start and after each reset.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Start {
+    /// Nothing.
+    #[default]
+    Empty,
+    /// The first scan, as soon as it is complete. Beams without a reading in it start empty.
+    FirstScan,
+}
+
+/// The settings in the units of the scans.
+#[derive(Clone, Copy, Debug)]
+struct Limits {
+    /// In device units. Low enough that no range is near [`schema::Background::FAR`].
+    threshold: u16,
+    /// In device units.
+    candidate: u16,
+    /// 1 to [`MOST_SCANS`].
+    scans: u16,
+    latest: bool,
+    no_return_is_far: bool,
+    /// Angle between two beams in 1/1000 degree, in either direction.
+    step_mdeg: u32,
+    /// Micrometers per device unit, at least 1.
+    unit_um: u32,
+}
+
+/// Default of both thresholds: six standard deviations of a range (the paper names no value).
+const THRESHOLD_MM: u16 = 30;
+/// The same in cm mode, where quantization adds to it.
+const THRESHOLD_CM_MODE_MM: u16 = 60;
+/// The same in dm mode, where surfaces 30 mm apart are read as at most one unit apart.
+const THRESHOLD_DM_MODE_MM: u16 = 100;
+/// 750 mirror revolutions of an LMS: this number of scans at 1 degree, half of them at half degrees.
+const TEN_SECONDS_NS: f64 = 9.99e9;
+/// Maximum that the weights of `multi` have room for: eight per scan in 16 bits.
+const MOST_SCANS: u32 = 8191;
+/// Maximum difference of two ranges. [`schema::Background::FAR`] differs by more from all of them.
+const FARTHEST: u32 = 0x7FFF;
+/// Maximum rounding error of a quotient: a whole number stays that number.
+const ROUNDING: f64 = 1e-6;
+
+impl Limits {
+    fn of(settings: &Settings, scan: &ScanHead) -> Limits {
+        let unit_um = scan.unit_um.max(1);
+        let default_mm = match unit_um {
+            ..10_000 => THRESHOLD_MM,
+            10_000..100_000 => THRESHOLD_CM_MODE_MM,
+            100_000.. => THRESHOLD_DM_MODE_MM,
+        };
+        // With less than a unit, a reading between two of them would belong to no surface.
+        let units = |mm: Option<u16>| {
+            (1000 * u32::from(mm.unwrap_or(default_mm)) / unit_um).clamp(1, FARTHEST) as u16
+        };
+        let turn_ns = f64::from(scan.beam_time_ns) * TAU / scan.step.abs();
+        // Without revolutions, there is no number of scans for 10 s.
+        let ten_seconds =
+            (TEN_SECONDS_NS / (turn_ns * f64::from(scan.turns.max(1))) - ROUNDING).ceil() as u32;
+        Limits {
+            threshold: units(settings.threshold_mm),
+            candidate: units(settings.candidate_mm),
+            scans: settings.scans.unwrap_or(ten_seconds).clamp(1, MOST_SCANS) as u16,
+            latest: settings.candidate == Candidate::Latest,
+            no_return_is_far: settings.no_return_is_far.unwrap_or(settings.method == Method::Multi),
+            step_mdeg: (scan.step.abs().to_degrees() * 1000.0).round() as u32,
+            unit_um,
+        }
+    }
+}
+
+/// Class of a beam, compared with its background.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(u8)]
 pub enum Class {
     /// It has no reading.
     Invalid,
-    /// Its background is not known; or (`multi`) something is nearer, but on too few beams to be believed.
+    /// Its background is unknown; or (`multi`) something is nearer, but on too few beams.
     Unknown,
     /// It ends where it always does.
     Background,
     /// It ends nearer than its background.
     Foreground,
-    /// It ends farther away than its background: something has gone.
+    /// It ends farther away than its background: an object was removed.
     Behind,
 }
 
 /// The background of one sensor.
 ///
-/// A scan of another shape than the one before (number of beams, unit, angles) resets it. A reading of 0 is one like
-/// any other, but as a background it cannot be told from one that is not known.
+/// A scan with another shape than the previous one (number of beams, unit, angles) resets it. A reading of 0 is like
+/// any other, but as a background it cannot be distinguished from an unknown one.
 #[derive(Clone)]
 pub struct Model {
     settings: Settings,
     limits: Limits,
     learner: Learner,
-    /// The most beams of a scan; those beyond are passed over.
+    /// Maximum number of beams of a scan. More are ignored.
     most: usize,
-    /// Beams and unit in micrometres of the model: of the last scan or of what was loaded; (0, 0) before both.
+    /// Number of beams and unit in micrometers of the last scan or of the loaded model; (0, 0) before both.
     shape: (u16, u32),
-    /// First angle and step: of the last scan or of what was loaded; 0 before both.
+    /// First angle and step of the last scan or of the loaded model; 0 before both.
     angles: (f64, f64),
-    /// There was a scan, by which the settings are those of its units.
+    /// Whether a scan has arrived, so that the limits are in its units.
     is_fitted: bool,
     generation: u32,
     frozen: bool,
-    /// Nothing has been learned or loaded since the last reset.
+    /// Whether nothing has been learned or loaded since the last reset.
     fresh: bool,
     classes: Box<[Class]>,
-    /// What the beams tell, while a scan is looked at.
+    /// Readings of the beams, while a scan is processed.
     readings: Box<[u16]>,
 }
 
-/// What is learned, by method.
+/// State of the method.
 #[derive(Clone)]
 enum Learner {
     Paper(Paper),
@@ -70,11 +183,11 @@ enum Learner {
     Moving(Moving),
 }
 
-/// A reading that tells nothing. It lies between the ranges and [`Background::FAR`].
+/// Value of a beam without a reading. It lies between the ranges and [`Background::FAR`].
 const INVALID: u16 = Background::FAR - 1;
 
 impl Model {
-    /// A model that knows nothing, for scans of at most `beams` beams: all the memory that it ever needs.
+    /// Creates an empty model for scans of at most `beams` beams. It allocates all the memory that it ever needs.
     pub fn new(settings: Settings, beams: usize) -> Model {
         Model {
             settings,
@@ -92,12 +205,12 @@ impl Model {
         }
     }
 
-    /// Compares `scan` with the model as it is, writes what stands before it to `out`, then learns from it. Writes
-    /// every byte of `out` but those of the segments.
+    /// Compares `scan` with the model, writes what is in front of it to `out`, and then learns from it. Writes every
+    /// byte of `out` except those of the segments.
     ///
     /// # Panics
     ///
-    /// If `out` has no memory for as many beams.
+    /// Panics if `out` has no memory for as many beams.
     pub fn update(&mut self, scan: &Scan, out: &mut Foreground) {
         self.fit(scan);
         let count = scan.beams().min(self.most);
@@ -118,8 +231,8 @@ impl Model {
         write(scan, self.generation, &self.classes[..count], out);
     }
 
-    /// The next scan is from where `motion` says that the robot is, of a sensor at `pose`: for
-    /// [`Method::Moving`]. Where the motion begins anew or is refused, all is forgotten.
+    /// Sets the robot's position at the next scan, as in `motion`, of a sensor at `pose`, for [`Method::Moving`]. If
+    /// the motion restarts or is refused, the model forgets everything.
     pub fn follow(&mut self, pose: &Pose, motion: &Motion) {
         if let Learner::Moving(moving) = &mut self.learner
             && !moving.follow(pose, motion)
@@ -129,12 +242,12 @@ impl Model {
         }
     }
 
-    /// What the beams of the last scan are; empty before the first one.
+    /// Returns the classes of the beams of the last scan; empty before the first one.
     pub fn classes(&self) -> &[Class] {
         if self.is_fitted { &self.classes[..usize::from(self.shape.0)] } else { &[] }
     }
 
-    /// Returns the number of beams of the model: those of the last scan or of what was loaded.
+    /// Returns the number of beams of the last scan or of the loaded model.
     pub fn beams(&self) -> usize {
         self.shape.0.into()
     }
@@ -143,7 +256,7 @@ impl Model {
     ///
     /// # Panics
     ///
-    /// If `out` has no memory for as many beams.
+    /// Panics if `out` has no memory for as many beams.
     pub fn show(&self, out: &mut Background) {
         let ranges = out.begin(BackgroundHead {
             first_angle: self.angles.0,
@@ -162,27 +275,28 @@ impl Model {
         out.taught = taught;
     }
 
-    /// By which method it is learned.
+    /// Returns the method of learning.
     pub fn method(&self) -> Method {
         self.settings.method
     }
 
-    /// Counts the models: one more after a reset, a load, and a change of the scan's shape.
+    /// Returns the number of the model. It increases by 1 with a reset, a load, and a change of the scan's shape.
     pub fn generation(&self) -> u32 {
         self.generation
     }
 
-    /// In so many scans something has to be met until it is background, as set or as follows from the last scan.
+    /// Returns the number of scans in which something must be met until it is background, as set or as computed from
+    /// the last scan.
     pub fn scans(&self) -> u16 {
         self.limits.scans
     }
 
-    /// Nothing is learned until it is thawed.
+    /// Returns whether learning is stopped.
     pub fn is_frozen(&self) -> bool {
         self.frozen
     }
 
-    /// Forgets everything. A frozen model stays frozen and then knows nothing until it is thawed.
+    /// Forgets everything. A frozen model stays frozen, and is empty until it is thawed.
     pub fn reset(&mut self) {
         match &mut self.learner {
             Learner::Paper(paper) if self.settings.method == Method::Paper => paper.forget(),
@@ -199,16 +313,16 @@ impl Model {
         self.frozen = true;
     }
 
-    /// Learns again.
+    /// Resumes learning.
     pub fn thaw(&mut self) {
         self.frozen = false;
     }
 
-    /// Takes the ranges of `model` for the background; what was about to be learned is forgotten, its generation and
-    /// its flags are left to this model's own.
+    /// Uses the ranges of `model` as the background. Candidates are forgotten. Generation and flags of `model` are
+    /// ignored.
     ///
-    /// Before the first scan nothing is known to compare it with: it is taken, and a first scan of another number of
-    /// beams or unit resets it as any change does.
+    /// Before the first scan, its shape is unknown, so any model is accepted. A first scan with another number of beams
+    /// or unit resets it, like any change.
     pub fn load(&mut self, model: &Background) -> Result<(), Mismatch> {
         let ranges = model.ranges();
         let shape = (ranges.len() as u16, model.unit_um);
@@ -225,10 +339,10 @@ impl Model {
         Ok(())
     }
 
-    /// Learns by `settings` from the next scan on. What is background stays background, as well known as can be; what was
-    /// about to be learned is forgotten, and the generation is the next one, as after [`load`](Self::load).
+    /// Learns by `settings` from the next scan on. The background stays, as well known as possible. Candidates are
+    /// forgotten, and the generation increases, as after [`load`](Self::load).
     pub fn change(&mut self, settings: Settings) {
-        // Between two scans there are no readings.
+        // Between two scans, there are no readings.
         let beams = self.beams();
         for (i, range) in self.readings[..beams].iter_mut().enumerate() {
             *range = self.learner.background(i, &self.limits);
@@ -238,11 +352,11 @@ impl Model {
         self.reset();
         self.learner.adopt(&self.readings[..beams]);
         self.fresh = was_fresh;
-        // The next scan tells what the settings mean in its units.
+        // The next scan defines the units of the settings.
         self.is_fitted = false;
     }
 
-    /// Makes the model one for scans such as `scan`.
+    /// Adapts the model to scans such as `scan`.
     fn fit(&mut self, scan: &Scan) {
         let shape = (scan.beams().min(self.most) as u16, scan.unit_um);
         let angles = (scan.first_angle, scan.step);
@@ -268,21 +382,21 @@ impl Learner {
         }
     }
 
-    /// Takes `ranges` for the background, but those that tell nothing.
+    /// Uses `ranges` as the background, except those without a reading.
     fn adopt(&mut self, ranges: &[u16]) {
         for (i, &range) in ranges.iter().enumerate() {
             if range != INVALID && range != Background::UNTAUGHT {
                 match self {
                     Learner::Paper(paper) => paper.adopt(i, range),
                     Learner::Multi(multi) => multi.adopt(i, range),
-                    // Ranges from one place are no map.
+                    // Ranges from one position are not a map.
                     Learner::Moving(_) => {}
                 }
             }
         }
     }
 
-    /// The background of beam `i` in device units, [`Background::UNTAUGHT`] or [`Background::FAR`].
+    /// Returns the background of beam `i` in device units, [`Background::UNTAUGHT`] or [`Background::FAR`].
     fn background(&self, i: usize, limits: &Limits) -> u16 {
         match self {
             Learner::Paper(paper) => paper.background(i),
@@ -292,8 +406,8 @@ impl Learner {
     }
 }
 
-/// The readings of `scan` in device units, [`Background::FAR`] or [`INVALID`]. The values
-/// themselves are compared: they are many.
+/// Writes the readings of `scan` in device units, [`Background::FAR`] or [`INVALID`]. The values themselves are
+/// compared, because there are many.
 fn measure(scan: &Scan, no_return_is_far: bool, readings: &mut [u16]) {
     let ScanHead { valid_to, no_return, beyond, .. } = **scan;
     let valid_to = valid_to.min(INVALID - 1);
@@ -305,7 +419,7 @@ fn measure(scan: &Scan, no_return_is_far: bool, readings: &mut [u16]) {
     }
 }
 
-/// Writes everything but the segments.
+/// Writes everything except the segments.
 fn write(scan: &Scan, generation: u32, classes: &[Class], out: &mut Foreground) {
     let head = ForegroundHead {
         generation,
@@ -332,12 +446,12 @@ fn write(scan: &Scan, generation: u32, classes: &[Class], out: &mut Foreground) 
     out.beams = beams as u16;
 }
 
-/// A model that does not fit the sensor.
+/// Error: a model that does not fit the sensor.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Mismatch {
-    /// Beams and micrometres per device unit of the model.
+    /// Number of beams and micrometers per device unit of the model.
     pub model: (u16, u32),
-    /// Those of the sensor's scans.
+    /// The same of the sensor's scans.
     pub sensor: (u16, u32),
 }
 
@@ -354,6 +468,91 @@ impl fmt::Display for Mismatch {
 }
 
 impl std::error::Error for Mismatch {}
+
+/// Decides how many neighboring beams, in how many scans, count as an object. Noise and mixed readings at edges are
+/// single beams. People cover several, unless they are far away.
+#[derive(Clone)]
+struct Runs {
+    /// Readings of beams of the last scan that were nearer than their background; [`INVALID`] for the others.
+    seen: Box<[u16]>,
+    /// Those of them that counted as an object.
+    told: Box<[u16]>,
+    /// The same for the current scan.
+    next: [Box<[u16]>; 2],
+}
+
+impl Runs {
+    /// Creates the state for at most `beams` beams.
+    fn new(beams: usize) -> Runs {
+        let none = || vec![INVALID; beams].into_boxed_slice();
+        Runs { seen: none(), told: none(), next: [none(), none()] }
+    }
+
+    /// Restores the initial state.
+    fn forget(&mut self) {
+        self.seen.fill(INVALID);
+        self.told.fill(INVALID);
+    }
+
+    /// Keeps runs of foreground beams in `classes` that count as objects. Beams of other runs become unknown. Beams
+    /// without a reading neither end a run nor count.
+    ///
+    /// A run of three beams counts at once. A shorter one counts if the last scan had a foreground beam of an object
+    /// there. It also counts if it is as long as a leg is wide at its range, and the last scan had any foreground beam
+    /// there. There means among or next to its own beams, within 200 mm of its nearest range.
+    fn keep(&mut self, readings: &[u16], limits: &Limits, classes: &mut [Class]) {
+        let most = self.seen.len();
+        let [seen, told] = &mut self.next;
+        seen.fill(INVALID);
+        told.fill(INVALID);
+        let mut begin = 0;
+        while let Some(ahead) = classes[begin..].iter().position(|&class| class == Class::Foreground) {
+            let first = begin + ahead;
+            let (mut behind, mut beams, mut nearest) = (first, 0, INVALID);
+            for (i, class) in classes.iter().enumerate().skip(first) {
+                match class {
+                    Class::Foreground => {
+                        (behind, beams, nearest) = (i + 1, beams + 1, nearest.min(readings[i]));
+                        seen[i] = readings[i];
+                    }
+                    Class::Invalid => {}
+                    _ => break,
+                }
+            }
+            let around = first.saturating_sub(1)..(behind + 1).min(most);
+            let reach = (1000 * REACH_MM / limits.unit_um).min(u16::MAX.into()) as u16;
+            let there = |before: &[u16]| {
+                let mut before = before[around.clone()].iter();
+                before.any(|&range| range != INVALID && range.abs_diff(nearest) <= reach)
+            };
+            let run = &mut classes[first..behind];
+            if beams >= ENOUGH || there(&self.told) || beams >= leg(nearest, limits) && there(&self.seen) {
+                told[first..behind].copy_from_slice(&seen[first..behind]);
+            } else {
+                run.iter_mut().filter(|class| **class == Class::Foreground).for_each(|c| *c = Class::Unknown);
+            }
+            begin = behind;
+        }
+        std::mem::swap(&mut self.seen, seen);
+        std::mem::swap(&mut self.told, told);
+    }
+}
+
+/// Returns the number of beams that a leg covers at `range`, at least one and at most [`ENOUGH`].
+fn leg(range: u16, limits: &Limits) -> u64 {
+    let apart_um = u64::from(range) * u64::from(limits.unit_um);
+    let apart = apart_um.saturating_mul(limits.step_mdeg.into());
+    (1000 * LEG_MM * MDEG_PER_RADIAN).checked_div(apart).map_or(ENOUGH, |beams| beams.clamp(1, ENOUGH))
+}
+
+/// Number of beams that are never noise. More are not required, however near an object is.
+const ENOUGH: u64 = 3;
+/// Width of a leg with its trousers and of a beam. Among 120, 135 and 150 mm, it has the best recall that costs no
+/// precision in the room of Fig. 8.
+const LEG_MM: u64 = 135;
+const MDEG_PER_RADIAN: u64 = 57_296;
+/// Maximum movement of an object between two scans, and its depth: 5 m/s at 37.5 Hz is 133 mm.
+const REACH_MM: u32 = 200;
 
 #[cfg(test)]
 mod tests {
@@ -384,5 +583,39 @@ mod tests {
                 }
             }
         }
+    }
+
+    #[test]
+    fn defaults_go_by_unit_and_resolution() {
+        let limits = |settings, unit_mm: u32, turns| {
+            let step_deg = 1.0 / f64::from(turns);
+            let head = ScanHead {
+                unit_um: 1000 * unit_mm,
+                step: step_deg.to_radians(),
+                beam_time_ns: (37_000.0 * step_deg) as u32,
+                turns,
+                ..ScanHead::default()
+            };
+            let limits = Limits::of(&settings, &head);
+            (limits.threshold, limits.candidate, limits.scans)
+        };
+        let paper = Settings { method: Method::Paper, ..Settings::default() };
+        assert_eq!(limits(paper, 1, 2), (30, 30, 375));
+        assert_eq!(limits(paper, 10, 1), (6, 6, 750));
+        assert_eq!(limits(paper, 1, 4), (30, 30, 188));
+        assert_eq!(limits(paper, 100, 2), (1, 1, 375));
+        let own = Settings { threshold_mm: Some(45), candidate_mm: Some(u16::MAX), scans: Some(0), ..paper };
+        assert_eq!(limits(own, 10, 2), (4, 6553, 1));
+        assert_eq!(limits(own, 0, 2), (32_767, 32_767, 1));
+        let turning = ScanHead {
+            unit_um: 1000,
+            step: -0.8_f64.to_radians(),
+            beam_time_ns: 222_222,
+            ..ScanHead::default()
+        };
+        assert_eq!(Limits::of(&paper, &turning).scans, 100, "10 Hz");
+        assert_eq!(Limits::of(&paper, &ScanHead::default()).scans, 1);
+        assert_eq!(limits(own, 100, 2), (1, 655, 1), "less than a unit is one");
+        assert_eq!(limits(Settings { scans: Some(u32::MAX), ..paper }, 1, 2).2, 8191);
     }
 }

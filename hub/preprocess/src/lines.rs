@@ -12,9 +12,6 @@
 mod cut;
 mod fit;
 mod join;
-mod least;
-mod piece;
-mod refine;
 
 use std::f32::consts::{PI, TAU};
 
@@ -22,7 +19,7 @@ use schema::{BEAMS, Corner, LINES, Line, Lines, Pose, Scan};
 
 use cut::{Bounds, Cutter};
 use fit::{Information, Ray};
-use piece::Piece;
+use join::Piece;
 
 /// Which lines are looked for.
 #[derive(Clone, Copy, Debug, PartialEq)]

@@ -1,33 +1,34 @@
-//! How a robot moved from scan to scan. Corners and lines of both scans are matched first, then all beams: each ends on a
-//! surface of the scan that it is compared with. Refuses to know how lines are found, and what time it is.
+//! Estimates how a robot moved from scan to scan. Corners and lines of both scans are matched first, and then all
+//! beams: each ends on a surface of the scan that it is compared with.
 //!
-//! The method is point-to-line matching as in Censi: "An ICP variant using a point-to-line metric" (ICRA 2008), with the
-//! covariance of Censi: "An accurate closed-form estimate of ICP's covariance" (ICRA 2007). Surfaces are the lines of the
-//! scan where there are such, else those of a few neighbours.
+//! The method is point-to-line matching as in Censi: "An ICP variant using a point-to-line metric" (ICRA 2008), with
+//! the covariance of Censi: "An accurate closed-form estimate of ICP's covariance" (ICRA 2007). Surfaces are the lines
+//! of the scan, and otherwise those of a few neighbors.
 //!
-//! Scans are compared with a scan that is kept until the robot is away from it: a robot that stands does not drift.
+//! Scans are compared with a scan that is kept until the robot has left its position, so a robot that stands does not
+//! drift.
 
 mod matching;
 mod rigid;
-mod solve;
-mod start;
 mod view;
 
-use schema::{BEAMS, Lines, Motion, MotionMethod, Pose, Scan};
+use std::f64::consts::{FRAC_PI_2, PI};
+
+use schema::{BEAMS, Corner, Line, Lines, Motion, MotionMethod, Pose, Scan};
 
 use matching::{Match, Matcher};
 pub use rigid::Rigid;
-use solve::Square;
+use rigid::Square;
 use view::View;
 
-/// Which steps are believed.
+/// Limits of the steps that are accepted.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Settings {
-    /// A robot does not move farther from one scan to the next, in metres.
+    /// Maximum distance from one scan to the next, in meters.
     pub max_step_m: f64,
-    /// It does not turn more, in degrees; less than 90.
+    /// Maximum turn from one scan to the next, in degrees; less than 90.
     pub max_turn_deg: f64,
-    /// Share of a scan's readings that must lie on surfaces of the scan that it is compared with.
+    /// Minimum share of a scan's readings that lie on surfaces of the scan that it is compared with.
     pub min_overlap: f64,
 }
 
@@ -37,34 +38,34 @@ impl Default for Settings {
     }
 }
 
-/// Follows the motion of one sensor.
+/// Estimates the motion of one sensor.
 pub struct MotionEstimator {
     pose: Pose,
     settings: Settings,
-    /// The scan that others are compared with, and the one that is looked at.
+    /// The scan that others are compared with, and the current one.
     kept: View,
     now: View,
     matcher: Matcher,
-    /// Nothing before the first scan.
+    /// `None` before the first scan.
     track: Option<Track>,
 }
 
-/// Where the robot was, and how it came there.
+/// Position of the robot, and its last step.
 #[derive(Clone, Copy)]
 struct Track {
-    /// Where it was at the kept scan, since the start.
+    /// Position at the kept scan, since the start.
     origin: Rigid,
-    /// Where it was at the last scan, as seen from there.
+    /// Position at the last scan, in the frame of the kept one.
     last: Rigid,
-    /// How unsure that is by the last scan's own noise; none if that is the kept one.
+    /// Covariance of that position by the last scan's own noise; `None` if that is the kept one.
     unsure: Option<Square>,
-    /// Its last step.
+    /// The last step.
     step: Rigid,
     breaks: u16,
 }
 
 impl MotionEstimator {
-    /// For a sensor that sits at `pose` and has at most `beams` beams.
+    /// Creates an estimator for a sensor at `pose` with at most `beams` beams.
     pub fn new(pose: Pose, settings: Settings, beams: usize) -> MotionEstimator {
         let beams = beams.min(BEAMS);
         MotionEstimator {
@@ -77,7 +78,7 @@ impl MotionEstimator {
         }
     }
 
-    /// Goes on for a sensor at `pose` as `settings` say. One that sits elsewhere begins again.
+    /// Continues with these `settings` for a sensor at `pose`. If the pose has changed, the estimator restarts.
     pub fn change(&mut self, pose: Pose, settings: Settings) {
         if self.pose != pose {
             self.forget();
@@ -85,12 +86,12 @@ impl MotionEstimator {
         (self.pose, self.settings) = (pose, settings);
     }
 
-    /// The next scan is the first: what was summed up is forgotten.
+    /// Forgets the motion so far. The next scan is the first one.
     pub fn forget(&mut self) {
         self.track = None;
     }
 
-    /// Writes how the robot moved since the last scan into `out`, every byte of it. `lines` are those of `scan`.
+    /// Writes the motion since the last scan into `out`, every byte of it. `lines` are those of `scan`.
     pub fn update(&mut self, scan: &Scan, lines: &Lines, out: &mut Motion) {
         *out = Motion::default();
         self.now.take(&self.pose, scan, lines);
@@ -120,18 +121,18 @@ impl MotionEstimator {
         }
     }
 
-    /// Where the robot is and its step, if there is one that can be believed.
+    /// Returns the robot's position and its step, if they are within the limits.
     fn find(&mut self, track: &Track) -> Option<(Match, Rigid)> {
         let Settings { max_step_m, max_turn_deg, min_overlap } = self.settings;
         let limits = Limits { step_m: max_step_m, turn_rad: max_turn_deg.to_radians() };
-        let begin = start::place(&self.kept, &self.now, track, &limits);
+        let begin = initial_guess(&self.kept, &self.now, track, &limits);
         let found = self.matcher.find(&self.kept, &self.now, begin, max_step_m)?;
         let step = track.last.inverse().then(&found.place);
         let is_near = step.x.hypot(step.y) <= limits.step_m && step.yaw.abs() <= limits.turn_rad;
         (is_near && found.overlap >= min_overlap).then_some((found, step))
     }
 
-    /// From now on scans are compared with the one that was looked at.
+    /// Keeps the current scan, with which later ones are compared.
     fn keep(&mut self, track: Track) {
         self.now.doubt(self.matcher.doubts());
         std::mem::swap(&mut self.kept, &mut self.now);
@@ -140,7 +141,7 @@ impl MotionEstimator {
     }
 }
 
-/// How far a robot moves at most from one scan to the next.
+/// Maximum motion of a robot from one scan to the next.
 struct Limits {
     step_m: f64,
     turn_rad: f64,
@@ -149,12 +150,12 @@ struct Limits {
 /// Writes `step`, which leads to `found`.
 fn write(track: &Track, found: &Match, step: &Rigid, out: &mut Motion) {
     (out.dx_m, out.dy_m, out.dyaw_rad) = (step.x as f32, step.y as f32, step.yaw as f32);
-    // Both scans are unsure by their own noise; that of the kept one moves both places alike.
+    // Both scans have their own noise. That of the kept one moves both positions alike.
     let before = track.unsure.unwrap_or(found.of_kept);
-    let mut covariance = solve::of_step(&found.own, &before, &track.last, step);
-    // Readings that lie on nothing speak against this step: by them the robot went on as before.
+    let mut covariance = rigid::of_step(&found.own, &before, &track.last, step);
+    // Readings on no surface contradict this step: according to them, the robot moved as before.
     let other = [step.x - track.step.x, step.y - track.step.y, step.yaw - track.step.yaw];
-    solve::add_outer(&mut covariance, &other, 1.0 - found.overlap);
+    rigid::add_outer(&mut covariance, &other, 1.0 - found.overlap);
     for (place, number) in out.covariance.iter_mut().zip(covariance.as_flattened()) {
         *place = *number as f32;
     }
@@ -171,8 +172,132 @@ fn write(track: &Track, found: &Match, step: &Rigid, out: &mut Motion) {
     out.breaks = track.breaks;
 }
 
-/// So far from the kept scan another one is kept: its surfaces are still seen from about the same side.
+/// Distance from the kept scan at which another one is kept. Its surfaces are still seen from about the same side.
 const AWAY_M: f64 = 0.15;
 const AWAY_RAD: f64 = 0.15;
-/// If fewer readings lie on surfaces of the kept scan, another one is kept.
+/// Minimum share of readings on surfaces of the kept scan. With less, another scan is kept.
 const ENOUGH: f64 = 0.5;
+
+/// Returns the position in `kept`, at which the matching of `now` starts: the one that most beams agree with. Corners and lines
+/// of the two scans that may be the same propose positions, and a few beams choose among them.
+fn initial_guess(kept: &View, now: &View, track: &Track, limits: &Limits) -> Rigid {
+    let mut best =
+        Guess { kept, now, track, limits, place: track.last.then(&track.step), score: 0, tries: 0 };
+    best.score = best.score(&best.place);
+    best.try_place(track.last);
+    best.try_corners();
+    if best.score < best.beams() * 4 / 5 {
+        best.try_lines();
+    }
+    best.place
+}
+
+struct Guess<'a> {
+    kept: &'a View,
+    now: &'a View,
+    track: &'a Track,
+    limits: &'a Limits,
+    place: Rigid,
+    score: usize,
+    tries: usize,
+}
+
+impl Guess<'_> {
+    /// Returns the number of beams that are sampled.
+    fn beams(&self) -> usize {
+        self.now.points().len().div_ceil(self.stride())
+    }
+
+    fn stride(&self) -> usize {
+        self.now.points().len().div_ceil(ASKED).max(1)
+    }
+
+    /// Returns the number of sampled beams that end on a surface.
+    fn score(&self, place: &Rigid) -> usize {
+        let width = WIDTH * self.kept.noise.hypot(self.now.noise) + WIDTH_M;
+        let fits = |point: &&(f64, f64)| {
+            let point = place.point(**point);
+            let on = self.kept.nearest(point, width + SPACING_M);
+            let surface = on.and_then(|nearest| self.kept.readings()[nearest].surface);
+            surface.is_some_and(|surface| surface.off(point).abs() <= width)
+        };
+        self.now.points().iter().step_by(self.stride()).filter(fits).count()
+    }
+
+    /// Uses `place` if the robot can be there and more beams agree with it.
+    fn try_place(&mut self, place: Rigid) {
+        let step = self.track.last.inverse().then(&place);
+        let is_near = step.x.hypot(step.y) <= self.limits.step_m && step.yaw.abs() <= self.limits.turn_rad;
+        if !is_near || self.tries >= TRIES {
+            return;
+        }
+        self.tries += 1;
+        let score = self.score(&place);
+        if score > self.score {
+            (self.place, self.score) = (place, score);
+        }
+    }
+
+    /// Tries the positions at which corners coincide. Corners that open alike may be the same.
+    fn try_corners(&mut self) {
+        let (kept, now) = (self.kept, self.now);
+        let opening = |view: &View, corner: &Corner| {
+            let line = |number: u16| view.lines.lines().get(usize::from(number));
+            let (one, two) = (line(corner.first_line)?, line(corner.second_line)?);
+            Some((f64::from(one.alpha_rad), f64::from(two.alpha_rad)))
+        };
+        for corner in now.lines.corners() {
+            let Some((first, second)) = opening(now, corner) else { continue };
+            for other in kept.lines.corners() {
+                let Some((of_first, of_second)) = opening(kept, other) else { continue };
+                let (one, two) = (turned(first, of_first), turned(second, of_second));
+                if (one - two).abs() > ALIKE_RAD {
+                    continue;
+                }
+                let yaw = (one + two) / 2.0;
+                let turn = Rigid::new(0.0, 0.0, yaw);
+                let (x, y) = turn.point((corner.x_m.into(), corner.y_m.into()));
+                self.try_place(Rigid::new(f64::from(other.x_m) - x, f64::from(other.y_m) - y, yaw));
+            }
+        }
+    }
+
+    /// Tries the positions at which lines coincide. A line defines how far the robot turned, and how far it moved
+    /// across the line.
+    fn try_lines(&mut self) {
+        let (kept, now) = (self.kept, self.now);
+        let expected = self.track.last.then(&self.track.step);
+        let is_long = |line: &&Line| line.points >= LONG;
+        for line in now.lines.lines().iter().filter(is_long) {
+            for other in kept.lines.lines().iter().filter(is_long) {
+                let (alpha, of_other) = (f64::from(line.alpha_rad), f64::from(other.alpha_rad));
+                let yaw = turned(alpha, of_other);
+                let (sin, cos) = of_other.sin_cos();
+                // If the line is behind the robot's center, its normal points the other way.
+                let is_same_side = (alpha + yaw - of_other).cos() > 0.0;
+                let r = f64::from(if is_same_side { line.r_m } else { -line.r_m });
+                let across = f64::from(other.r_m) - r - (cos * expected.x + sin * expected.y);
+                self.try_place(Rigid::new(expected.x + cos * across, expected.y + sin * across, yaw));
+            }
+        }
+    }
+}
+
+/// Returns the turn from one direction of a line to another, less than a quarter turn either way.
+fn turned(from: f64, to: f64) -> f64 {
+    (to - from + FRAC_PI_2).rem_euclid(PI) - FRAC_PI_2
+}
+
+/// Number of beams that are sampled.
+const ASKED: usize = 48;
+/// Maximum number of positions that are tried.
+const TRIES: usize = 64;
+/// Maximum distance of a beam's end from a surface, in standard deviations, and in addition to that in meters.
+const WIDTH: f64 = 3.0;
+const WIDTH_M: f64 = 0.01;
+/// As in `matching`.
+const SPACING_M: f64 = 0.2;
+/// Maximum difference of the opening of equal corners: 5 degrees.
+const ALIKE_RAD: f64 = 0.09;
+/// Minimum number of beams of a line whose direction is reliable.
+const LONG: u16 = 10;

@@ -1,51 +1,51 @@
-//! Checks whether something is near the robot: the paper's minimal distance check, with circles around the robot's
-//! centre. Refuses to know where beams cross circles: the table has that in device units, so a scan costs only
-//! comparisons of integers.
+//! Checks whether something is near the robot: the minimal distance check of the paper, with circles around the robot's
+//! center.
+//!
+//! A [`Check`] counts violations over scans. Its table has, for each beam, the ranges that lie inside each circle. It
+//! is computed once per layout of the scans, in floating point and millimeters. A scan then costs only comparisons of
+//! integers in device units.
 
-mod nearest;
-mod spans;
-mod table;
+use std::f64::consts::TAU;
 
-use schema::{Pose, Scan, Verdict, ZONES, Zone, Zones};
-use table::{Layout, Met, Table};
+use schema::{Pose, Scan, ScanHead, Verdict, ZONES, Zone, Zones, in_sector_mdeg};
 
-/// A part of the sensor's view in which something of the robot itself stands.
+/// Sector of the sensor's view in which parts of the robot itself are visible.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Sector {
     /// First sensor angle in 1/1000 degree, as in the scan: 0 ahead, counter-clockwise.
     pub from_mdeg: i32,
-    /// Last sensor angle in 1/1000 degree; it belongs to the sector.
+    /// Last sensor angle in 1/1000 degree, inclusive.
     pub to_mdeg: i32,
-    /// Readings nearer than this are the robot's own body and are ignored.
+    /// Minimum range. Nearer readings are the robot's own body and are ignored.
     pub range_mm: u16,
 }
 
-/// The most sectors of a sensor; those beyond are left out.
+/// Maximum number of sectors of a sensor. More are ignored.
 pub const SECTORS: usize = 64;
 
-/// What a check is made from.
+/// Settings of a check.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Settings<'a> {
-    /// Radii of the circles, the largest first, at most [`ZONES`]; those beyond are left out.
+    /// Radii of the circles, the largest first, at most [`ZONES`]. More are ignored.
     pub radii_mm: &'a [u16],
-    /// The robot's own body; where sectors overlap, the farthest range holds.
+    /// The robot's own body. Where sectors overlap, the largest range counts.
     pub self_min: &'a [Sector],
-    /// Added to a circle along every beam that meets it.
+    /// Distance that is added to a circle along every beam that meets it.
     pub margin_mm: u16,
-    /// A zone is violated by so many beams of a scan; 0 is 1.
+    /// Number of beams of a scan that violate a zone; 0 counts as 1.
     pub min_beams: u16,
-    /// And by so many scans, one after the other; 0 is 1.
+    /// Number of consecutive scans that violate a zone; 0 counts as 1.
     pub min_scans: u16,
-    /// The verdict is unknown if a greater share of the beams through the largest circle is invalid.
+    /// Maximum share of invalid beams among those through the largest circle. With more, the verdict is unknown.
     pub max_invalid: f64,
-    /// What stands before the circle, between a sensor outside and the circle's near side, is not inside.
+    /// Whether objects between a sensor outside a circle and the circle's near side count as outside.
     pub exact: bool,
-    /// A beam of which nothing came back has met nothing; otherwise it is invalid.
+    /// Whether a beam without a return has met nothing. Otherwise, it is invalid.
     pub no_return_is_far: bool,
 }
 
 impl Default for Settings<'static> {
-    /// 1 m and 0.6 m (paper III.B.1), one beam, one scan; a tenth of the beams may be invalid.
+    /// Returns 1 m and 0.6 m (paper III.B.1), one beam, one scan. A tenth of the beams may be invalid.
     fn default() -> Self {
         Settings {
             radii_mm: &[1000, 600],
@@ -60,40 +60,41 @@ impl Default for Settings<'static> {
     }
 }
 
-/// What a part of a scan tells: never that the robot's surroundings are clear.
+/// Result of checking an incomplete scan. It never reports that the robot's surroundings are clear.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Warning {
     /// [`Verdict::Slow`] or [`Verdict::Stop`].
     pub verdict: Verdict,
-    /// The beam of the nearest point so far.
+    /// Beam of the nearest point so far.
     pub beam: u16,
-    /// Its distance from the robot's centre in mm, rounded down.
+    /// Its distance from the robot's center in mm, rounded down.
     pub distance_mm: u32,
 }
 
 /// Compares scans of one sensor with its circles.
 ///
 /// Where the design leaves something open:
-/// - until `min_scans` scans were seen since the start, a silence or a change of the sensor's layout, no zone can be
-///   violated; the verdict is unknown then, because clear would be a guess;
-/// - a beam can tell something if there is a reading of it, in the scan's units and below its codes, that lies inside
-///   the largest circle and not in the robot's own body; all others count neither as invalid nor among all;
-/// - where fewer beams can tell something than a violation takes, nothing would ever be violated: unknown. So it is with
-///   an empty scan, no circle at all, a pose that is not finite, and a sensor that looks past the largest circle.
+/// - Until `min_scans` scans have been seen since the start, a silence or a change of the sensor's layout, no zone can
+///   be violated. The verdict is unknown then, because clear would be a guess.
+/// - A beam is relevant if one of its readings, in the scan's units and below its codes, can lie inside the largest
+///   circle and outside the robot's own body. All other beams count neither as invalid nor in the total.
+/// - If fewer beams are relevant than a violation takes, no zone can ever be violated, so the verdict is unknown. This
+///   includes an empty scan, no circle at all, a pose that is not finite, and a sensor that looks past the largest
+///   circle.
 pub struct Check {
     min_beams: u16,
     min_scans: u16,
     table: Table,
-    /// Scans since the start, a silence or another layout.
+    /// Number of scans since the start, a silence or a change of the layout.
     seen: u16,
-    /// Scans one after the other in which enough beams met something, by circle.
+    /// Number of consecutive scans in which enough beams met something, by circle.
     streaks: [u16; ZONES],
-    /// Scans may be older than they seem.
+    /// Whether scans may be older than they seem.
     is_late: bool,
 }
 
 impl Check {
-    /// A check for the sensor that sits at `pose` and has at most `beams` beams; those beyond are passed over.
+    /// Creates a check for a sensor at `pose` with at most `beams` beams. More are ignored.
     pub fn new(pose: Pose, settings: &Settings<'_>, beams: usize) -> Check {
         Check {
             min_beams: settings.min_beams.max(1),
@@ -105,7 +106,8 @@ impl Check {
         }
     }
 
-    /// Writes what `scan` tells into `out`, every byte of it. The first scan of a layout costs a table; no other does.
+    /// Writes the result for `scan` into `out`, every byte of it. Only the first scan of a layout costs the computation
+    /// of a table.
     pub fn update(&mut self, scan: &Scan, out: &mut Zones) {
         let layout = Layout::of(scan, self.table.most());
         if self.table.layout() != layout {
@@ -128,10 +130,10 @@ impl Check {
         self.write_circles(&inside, out);
     }
 
-    /// What the `ranges` of a scan tell that is not complete, of so many beams `count` and `unit_um` as the last one: the zone
-    /// that it violates if nothing else comes, if any. These are the first ones; or all, with their exact `angles`, of a scan
-    /// that has such: then a nearer point may still take the place of one. A scan whose first one has yet to be seen tells
-    /// nothing.
+    /// Checks an incomplete scan with as many beams, `count`, and the same unit, `unit_um`, as the last one. `ranges`
+    /// are its first ranges. For a scan with exact `angles`, they are all of its ranges, and a nearer point may still
+    /// replace one of them. Returns the zone that the scan violates if no more points arrive, or `None`. Before the
+    /// first complete scan, the result is `None`.
     pub fn early(&mut self, count: usize, unit_um: u32, ranges: &[u16], angles: &[f32]) -> Option<Warning> {
         if !self.table.layout().is_of(count, unit_um) || self.is_blind() {
             return None;
@@ -148,26 +150,26 @@ impl Check {
         Some(Warning { verdict, beam, distance_mm })
     }
 
-    /// Writes into `out` what to say when scans stay out: nothing is known but the circles. Scans have to follow each
-    /// other anew.
+    /// Writes the result of missing scans into `out`: only the circles are known. Scans have to be consecutive again
+    /// afterwards.
     pub fn stale(&mut self, out: &mut Zones) {
         self.forget();
         *out = Zones { count: self.table.circles() as u8, ..Zones::unknown() };
         self.write_circles(&[0; ZONES], out);
     }
 
-    /// The scans from now on may be older than they seem, or are not any more. What such a scan sees in the smallest circle
-    /// counts; else the verdict is unknown.
+    /// Sets whether scans may be older than they seem from now on. Points of such a scan in the smallest circle count.
+    /// Otherwise, the verdict is unknown.
     pub fn doubt(&mut self, is_late: bool) {
         self.is_late = is_late;
     }
 
-    /// Beams of the last scan's layout that can tell something of the largest circle; none before the first scan.
+    /// Returns the number of relevant beams of the last scan's layout; 0 before the first scan.
     pub fn telling(&self) -> u16 {
         self.table.telling()
     }
 
-    /// Fewer beams can tell something than a violation takes: the verdict is always unknown.
+    /// Returns whether fewer beams are relevant than a violation takes. The verdict is then always unknown.
     pub fn is_blind(&self) -> bool {
         self.telling() < self.min_beams
     }
@@ -181,7 +183,7 @@ impl Check {
         self.streaks[zone] >= self.min_scans
     }
 
-    /// What is seen inside the smallest circle outweighs what is not known.
+    /// Returns the verdict. Points inside the smallest circle take precedence over invalid beams.
     fn verdict(&self, is_known: bool) -> Verdict {
         match self.table.circles().checked_sub(1) {
             None => Verdict::Unknown,
@@ -203,5 +205,459 @@ impl Check {
                 reserved: [0; 3],
             };
         }
+    }
+}
+
+/// Properties of a scan on which the table depends.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+struct Layout {
+    count: usize,
+    unit_um: u32,
+    valid_to: u16,
+    no_return: u16,
+    beyond: u16,
+    first_angle: f64,
+    step: f64,
+}
+
+impl Layout {
+    /// Returns the layout of `scan`, of which at most `most` beams are used.
+    fn of(scan: &Scan, most: usize) -> Layout {
+        let ScanHead { unit_um, valid_to, no_return, beyond, first_angle, step, .. } = **scan;
+        let count = scan.beams().min(most);
+        Layout { count, unit_um, valid_to, no_return, beyond, first_angle, step }
+    }
+
+    /// Returns whether scans with this number of beams and this unit have the layout.
+    fn is_of(&self, count: usize, unit_um: u32) -> bool {
+        (self.count, self.unit_um) == (count, unit_um)
+    }
+
+    /// Returns the millimeters per device unit. No sensor has a unit of 0.
+    fn unit_mm(&self) -> f64 {
+        f64::from(self.unit_um.max(1)) / 1000.0
+    }
+}
+
+/// The circles of a sensor, computed for the layout of its last scan.
+struct Table {
+    pose: Pose,
+    circles: usize,
+    radii_mm: [u16; ZONES],
+    /// The robot's own body: the sectors, and their number.
+    sectors: ([Sector; SECTORS], usize),
+    margin_mm: u16,
+    exact: bool,
+    no_return_is_far: bool,
+    max_invalid: f64,
+
+    layout: Layout,
+    /// Valid readings inside each circle, beyond the robot's own body.
+    inside: [Spans; ZONES],
+    nearest: Nearest,
+    /// 1 for relevant beams: a reading of them may lie inside the largest circle.
+    tells: Box<[u16]>,
+    /// Number of relevant beams.
+    telling: u16,
+    most_invalid: u16,
+}
+
+/// Points of a scan inside the circles.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+struct Met {
+    /// Number of beams that met something inside each circle.
+    inside: [u16; ZONES],
+    /// Beam whose point is nearest to the robot's center, and its distance in mm, rounded down. The first one of
+    /// several.
+    nearest: Option<(u16, u32)>,
+}
+
+impl Table {
+    /// Creates a table for a sensor with at most `beams` beams.
+    fn new(pose: Pose, settings: &Settings<'_>, beams: usize) -> Table {
+        let circles = settings.radii_mm.len().min(ZONES);
+        let mut radii_mm = [0; ZONES];
+        radii_mm[..circles].copy_from_slice(&settings.radii_mm[..circles]);
+        let mut sectors = [Sector { from_mdeg: 0, to_mdeg: -1, range_mm: 0 }; SECTORS];
+        let count = settings.self_min.len().min(SECTORS);
+        sectors[..count].copy_from_slice(&settings.self_min[..count]);
+        let mut table = Table {
+            pose,
+            circles,
+            radii_mm,
+            sectors: (sectors, count),
+            margin_mm: settings.margin_mm,
+            exact: settings.exact,
+            no_return_is_far: settings.no_return_is_far,
+            max_invalid: settings.max_invalid,
+            layout: Layout::default(),
+            inside: std::array::from_fn(|zone| Spans::none(if zone < circles { beams } else { 0 })),
+            nearest: Nearest::none(beams),
+            tells: vec![0; beams].into(),
+            telling: 0,
+            most_invalid: 0,
+        };
+        table.make(Layout::default());
+        table
+    }
+
+    /// Returns the number of circles, at most [`ZONES`].
+    fn circles(&self) -> usize {
+        self.circles
+    }
+
+    /// Returns the radius of circle `zone`; 0 for unused ones.
+    fn radius_mm(&self, zone: usize) -> u16 {
+        self.radii_mm[zone]
+    }
+
+    /// Returns the maximum number of beams of a scan.
+    fn most(&self) -> usize {
+        self.tells.len()
+    }
+
+    /// Returns the layout of the table.
+    fn layout(&self) -> Layout {
+        self.layout
+    }
+
+    /// Computes the table for `layout`.
+    fn make(&mut self, layout: Layout) {
+        self.layout = layout;
+        self.inside.iter_mut().for_each(Spans::clear);
+        self.nearest.seen.clear();
+        self.nearest.twice_q.fill(0.0);
+        self.tells.fill(0);
+        for i in 0..layout.count {
+            self.make_beam(i, layout.first_angle + i as f64 * layout.step);
+        }
+        self.nearest.finish();
+        self.telling = self.tells.iter().sum();
+        self.most_invalid = floor(self.max_invalid * f64::from(self.telling)) as u16;
+    }
+
+    fn make_beam(&mut self, i: usize, angle: f64) {
+        let beam = self.beam(angle);
+        let beyond_ranges = self.layout.valid_to.saturating_add(1);
+        self.nearest.seen.set(i, beam.own, beyond_ranges);
+        self.nearest.twice_q[i] = 2.0 * beam.q / self.layout.unit_mm();
+        for zone in 0..self.circles {
+            let (from, below) = self.span(&beam, zone);
+            self.inside[zone].set(i, from, below.min(u64::from(beyond_ranges)) as u16);
+            if zone == 0 {
+                self.tells[i] = u16::from(self.inside[zone].has_any(i));
+            }
+        }
+    }
+
+    /// Returns the beam at a sensor angle.
+    fn beam(&self, angle: f64) -> Beam {
+        let own = in_units(self.self_min_mm(angle) as f64, self.layout.unit_mm());
+        let (sx, sy) = self.sensor_mm();
+        if (sx, sy) == (0.0, 0.0) && self.pose.yaw_rad.is_finite() {
+            // From the robot's center, all beams are alike, and exact ones are many.
+            return Beam { q: 0.0, own };
+        }
+        let (ux, uy) = self.pose.direction(angle);
+        Beam { q: sx * ux + sy * uy, own }
+    }
+
+    /// Returns the readings of `beam` inside circle `zone`: the first one, and the one after the last.
+    fn span(&self, beam: &Beam, zone: usize) -> (u64, u64) {
+        let unit_mm = self.layout.unit_mm();
+        let (sx, sy) = self.sensor_mm();
+        let (lo_mm, hi_mm) = self.chord_mm(beam.q, sx * sx + sy * sy, f64::from(self.radii_mm[zone]));
+        let from = if self.exact && lo_mm > 0 { floor(lo_mm as f64 / unit_mm) as u64 + 1 } else { 0 };
+        (from.max(beam.own), in_units(hi_mm as f64, unit_mm))
+    }
+
+    /// Returns the number of relevant beams.
+    fn telling(&self) -> u16 {
+        self.telling
+    }
+
+    /// Returns the maximum number of invalid beams with which the verdict does not become unknown.
+    fn most_invalid(&self) -> u16 {
+        self.most_invalid
+    }
+
+    /// Returns the number of relevant beams without a reading. A beam that was not measured counts if nothing was
+    /// measured over more than two spacings of the sensor's own points, which are `spacing` radians.
+    fn invalid(&self, ranges: &[u16], spacing: f32) -> u16 {
+        let Layout { valid_to, no_return, beyond, .. } = self.layout;
+        let is_invalid = |value: u16| {
+            let is_no_return = self.no_return_is_far & (value == no_return);
+            let is_beyond = (value == beyond) & (beyond != no_return);
+            (value > valid_to) & !is_beyond & !is_no_return
+        };
+        let beams = ranges.iter().zip(&self.tells);
+        let invalid: u16 = beams.map(|(&value, &tells)| u16::from(is_invalid(value)) & tells).sum();
+        if invalid == 0 { 0 } else { invalid - self.looked_past(ranges, spacing) }
+    }
+
+    /// Returns the number of relevant beams that were not measured, but have measured ones near enough on both sides.
+    fn looked_past(&self, ranges: &[u16], spacing: f32) -> u16 {
+        let is_measured = |value: &u16| *value != Scan::NOT_MEASURED;
+        let (Some(first), Some(last)) =
+            (ranges.iter().position(is_measured), ranges.iter().rposition(is_measured))
+        else {
+            return 0;
+        };
+        let step = self.layout.step.abs();
+        let most = (2.0 * f64::from(spacing) / step * (1.0 + ROUNDING)) as usize;
+        // In a full revolution, the first beam follows the last one.
+        let is_whole_turn = (ranges.len() as f64 * step - TAU).abs() < step / 2.0;
+        let across = if is_whole_turn { first + ranges.len() - 1 - last } else { usize::MAX - 1 };
+        let told = |run: &[u16], tells: &[u16]| -> u16 { tells[..run.len()].iter().sum() };
+        let mut past = 0;
+        if across < most {
+            past += told(&ranges[..first], &self.tells) + told(&ranges[last + 1..], &self.tells[last + 1..]);
+        }
+        let mut begin = first;
+        while begin < last {
+            let behind = begin + 1 + ranges[begin + 1..].iter().position(is_measured).unwrap_or(0);
+            if behind - begin - 1 < most {
+                past += told(&ranges[begin + 1..behind], &self.tells[begin + 1..]);
+            }
+            begin = behind;
+        }
+        past
+    }
+
+    /// Returns the points inside the circles for these `ranges`, the first ones of a scan of the table's layout. If
+    /// there are `angles`, the exact points count.
+    fn met(&mut self, ranges: &[u16], angles: &[f32]) -> Met {
+        if !angles.is_empty() {
+            return self.met_exactly(ranges, angles);
+        }
+        let nearest = self.nearest.find(ranges).map(|(beam, square)| self.at_distance(beam, square));
+        Met { inside: std::array::from_fn(|zone| self.inside[zone].count(ranges)), nearest }
+    }
+
+    /// Returns the points inside the circles of a scan with exact angles. Only points that are near enough to be inside
+    /// a circle, or the nearest one, are computed.
+    fn met_exactly(&self, ranges: &[u16], angles: &[f32]) -> Met {
+        let unit_mm = self.layout.unit_mm();
+        let (sx, sy) = self.sensor_mm();
+        let away = (sx * sx + sy * sy).sqrt();
+        let radius_mm = self.radii_mm[..self.circles].iter().max().map_or(0.0, |&radius| f64::from(radius));
+        let reach = (away + radius_mm + f64::from(self.margin_mm) + 1.0) / unit_mm;
+        let (mut met, mut best) = (Met::default(), (f64::INFINITY, None));
+        for (i, (&range, &angle)) in ranges.iter().zip(angles).enumerate() {
+            let value = f64::from(range);
+            let may_be_nearest = value * unit_mm - away <= best.0;
+            if range > self.layout.valid_to || !(may_be_nearest || value <= reach) {
+                continue;
+            }
+            let beam = self.beam(f64::from(angle));
+            if u64::from(range) < beam.own {
+                continue;
+            }
+            let square = value * (value + 2.0 * beam.q / unit_mm);
+            let distance_mm = (square * unit_mm * unit_mm + away * away).max(0.0).sqrt();
+            if distance_mm < best.0 {
+                best = (distance_mm, Some((i, square)));
+            }
+            for (zone, inside) in met.inside.iter_mut().enumerate().take(self.circles) {
+                let (from, below) = self.span(&beam, zone);
+                *inside += u16::from((from..below).contains(&u64::from(range)));
+            }
+        }
+        met.nearest = best.1.map(|(beam, square)| self.at_distance(beam, square));
+        met
+    }
+
+    /// Returns beam and distance in mm of a point. `square` is the square of its distance without that of the sensor,
+    /// in device units.
+    fn at_distance(&self, beam: usize, square: f64) -> (u16, u32) {
+        let unit_mm = self.layout.unit_mm();
+        let (sx, sy) = self.sensor_mm();
+        let distance_mm = (square * unit_mm * unit_mm + sx * sx + sy * sy).max(0.0).sqrt();
+        (beam as u16, floor(distance_mm) as u32)
+    }
+
+    /// Returns the sensor's position in the robot's frame.
+    fn sensor_mm(&self) -> (f64, f64) {
+        (1000.0 * self.pose.x_m, 1000.0 * self.pose.y_m)
+    }
+
+    /// Returns the range at which the robot's own body ends along a beam.
+    fn self_min_mm(&self, angle: f64) -> u64 {
+        let sectors = &self.sectors.0[..self.sectors.1];
+        if sectors.is_empty() {
+            return 0;
+        }
+        let angle_mdeg = in_sector_mdeg(angle);
+        let here = |sector: &&Sector| (sector.from_mdeg..=sector.to_mdeg).contains(&angle_mdeg);
+        sectors.iter().filter(here).map(|sector| u64::from(sector.range_mm)).max().unwrap_or(0)
+    }
+
+    /// Returns the ranges in mm between which a beam is inside a circle; 0 and 0 if it never is. `q` is s.u and
+    /// `square` is |s|^2, with the sensor's position s and the beam's direction u (a line through a circle; paper
+    /// III.B.1).
+    fn chord_mm(&self, q: f64, square: f64, radius_mm: f64) -> (u64, u64) {
+        let outside = square - radius_mm * radius_mm;
+        let disc = q * q - outside;
+        let (lo, hi) = if outside < 0.0 {
+            (0.0, -q + disc.sqrt())
+        } else if disc > 0.0 && q < 0.0 {
+            (-q - disc.sqrt(), -q + disc.sqrt())
+        } else {
+            return (0, 0);
+        };
+        let margin = f64::from(self.margin_mm);
+        // Negative ranges become 0.
+        (floor(lo - margin) as u64, ceil(hi + margin) as u64)
+    }
+}
+
+/// A beam: s.u, with the sensor's position s and the beam's direction u, in mm, and the range at which the robot's own
+/// body ends, in device units.
+struct Beam {
+    q: f64,
+    own: u64,
+}
+
+/// Returns the minimum number of device units that is not less than `mm`.
+fn in_units(mm: f64, unit_mm: f64) -> u64 {
+    ceil(mm / unit_mm) as u64
+}
+
+/// Maximum rounding error of a quotient.
+const ROUNDING: f64 = 1e-6;
+
+/// Values within this number of mm of a whole number count as that number. Rounding is never towards clear, but an
+/// object exactly on a circle is outside, whatever sine and cosine lose.
+const WHOLE_MM: f64 = 1e-6;
+
+fn floor(value: f64) -> f64 {
+    if (value - value.round()).abs() <= WHOLE_MM { value.round() } else { value.floor() }
+}
+
+fn ceil(value: f64) -> f64 {
+    if (value - value.round()).abs() <= WHOLE_MM { value.round() } else { value.ceil() }
+}
+
+/// Finds the reading that is nearest to the robot's center, exact to the millimeter (rounded down), while only a few
+/// beams are computed one by one.
+struct Nearest {
+    /// Readings that count: valid ones beyond the robot's own body.
+    seen: Spans,
+    /// Twice s.u for each beam, in device units, with the sensor's position s and the beam's direction u.
+    twice_q: Box<[f64]>,
+    /// For each block of beams: the minimum of `twice_q`, and the lower bound of its readings in the current scan.
+    least_twice_q: Box<[f64]>,
+    bounds: Box<[f64]>,
+}
+
+impl Nearest {
+    /// Creates the search for at most `beams` beams. There are none yet.
+    fn none(beams: usize) -> Nearest {
+        let blocks = vec![0.0; beams.div_ceil(BLOCK)].into_boxed_slice();
+        Nearest {
+            seen: Spans::none(beams),
+            twice_q: vec![0.0; beams].into(),
+            least_twice_q: blocks.clone(),
+            bounds: blocks,
+        }
+    }
+
+    /// Completes the blocks. Call it when all beams are set.
+    fn finish(&mut self) {
+        for (block, least) in self.twice_q.chunks(BLOCK).zip(&mut self.least_twice_q) {
+            *least = block.iter().copied().fold(f64::INFINITY, f64::min);
+        }
+    }
+
+    /// Returns the beam whose point is nearest to the center, the first one of several, and the square of its distance
+    /// without that of the sensor: r^2 + 2qr, in device units.
+    fn find(&mut self, ranges: &[u16]) -> Option<(usize, f64)> {
+        self.bound(ranges);
+        let bounds = &self.bounds[..ranges.len().div_ceil(BLOCK)];
+        let best =
+            (1..bounds.len()).fold(0, |best, block| if bounds[block] < bounds[best] { block } else { best });
+        let mut nearest = self.nearer(best, ranges, (f64::INFINITY, usize::MAX));
+        for (block, &bound) in bounds.iter().enumerate() {
+            if bound <= nearest.0 {
+                nearest = self.nearer(block, ranges, nearest);
+            }
+        }
+        let (square, beam) = nearest;
+        (beam != usize::MAX).then_some((beam, square))
+    }
+
+    /// Computes the lower bound of each block: its shortest reading that counts, along its most favorable beam.
+    fn bound(&mut self, ranges: &[u16]) {
+        let blocks = ranges.chunks(BLOCK).zip(self.seen.from.chunks(BLOCK));
+        for ((bound, (ranges, from)), &twice_q) in self.bounds.iter_mut().zip(blocks).zip(&self.least_twice_q)
+        {
+            // A code is greater than any range, so it does no harm here.
+            let shortest =
+                ranges.iter().zip(from).map(|(&range, &from)| range.max(from)).fold(u16::MAX, u16::min);
+            let (shortest, turn) = (f64::from(shortest), -0.5 * twice_q);
+            let value = if shortest > turn { shortest } else { turn };
+            *bound = value * (value + twice_q);
+        }
+    }
+
+    /// Returns `nearest`, or a reading of the block that is nearer.
+    fn nearer(&self, block: usize, ranges: &[u16], nearest: (f64, usize)) -> (f64, usize) {
+        let mut nearest = nearest;
+        for (i, &range) in ranges.iter().enumerate().skip(block * BLOCK).take(BLOCK) {
+            let value = f64::from(range);
+            let square = value * (value + self.twice_q[i]);
+            let is_nearer = square < nearest.0 || (square == nearest.0 && i < nearest.1);
+            if is_nearer && self.seen.has(i, range) {
+                nearest = (square, i);
+            }
+        }
+        nearest
+    }
+}
+
+/// Number of beams of a block. Their directions differ little, and there are few blocks.
+const BLOCK: usize = 32;
+
+/// The values `from..from + len` of each beam, tested by one comparison of integers in device units.
+#[derive(Clone)]
+struct Spans {
+    /// Minimum value; the maximum of the type for beams that do not exist.
+    from: Box<[u16]>,
+    len: Box<[u16]>,
+}
+
+impl Spans {
+    /// Creates empty spans of `beams` beams.
+    fn none(beams: usize) -> Spans {
+        Spans { from: vec![u16::MAX; beams].into(), len: vec![0; beams].into() }
+    }
+
+    /// Makes all spans empty.
+    fn clear(&mut self) {
+        self.from.fill(u16::MAX);
+        self.len.fill(0);
+    }
+
+    /// Sets the values of beam `i` that count: from `from`, below `below`.
+    fn set(&mut self, i: usize, from: u64, below: u16) {
+        self.from[i] = from.min(u64::from(u16::MAX)) as u16;
+        self.len[i] = below.saturating_sub(self.from[i]);
+    }
+
+    /// Returns whether the value counts.
+    #[inline]
+    fn has(&self, i: usize, value: u16) -> bool {
+        value.wrapping_sub(self.from[i]) < self.len[i]
+    }
+
+    /// Returns whether a value of beam `i` can count.
+    fn has_any(&self, i: usize) -> bool {
+        self.len[i] > 0
+    }
+
+    /// Returns the number of beams whose value counts.
+    fn count(&self, ranges: &[u16]) -> u16 {
+        let spans = self.from.iter().zip(&self.len);
+        spans.zip(ranges).map(|((&from, &len), &value)| u16::from(value.wrapping_sub(from) < len)).sum()
     }
 }

@@ -99,7 +99,7 @@ fn no_processor_uses_another() {
         let planted = |path: &str, code: &str| tree.with(path, &format!("//! So.\n{code}\n"));
         vec![
             planted("hub/preprocess/src/zones.rs", "use crate::marks::MarkDetector;"),
-            planted("hub/preprocess/src/zones/table.rs", "use crate::{background, Reading};"),
+            planted("hub/preprocess/src/background/fixed.rs", "use crate::{zones, Reading};"),
             planted("hub/preprocess/src/segments.rs", "let class = super::background::Class::Unknown;"),
         ]
     });

@@ -1,79 +1,84 @@
-//! A telegram for people: every byte of it belongs to a field, and every field has a name, a value and, where there are
-//! any, words. Without a heap, so the fields are shown to a visitor one after the other. Refuses to know how they are
-//! printed.
+//! Explains a telegram: every byte belongs to a field, and every field has a name, a value and, if it needs them, words.
+//!
+//! [`explain`] shows the fields one after the other to a visitor, so nothing is allocated. [`Headline`] is the telegram in one
+//! line. The layouts are those of the Telegram listing, chapter 7. Requests that write the EEPROM are explained here, but never
+//! made.
 
-mod headline;
-mod names;
-mod replies;
-mod requests;
-mod walk;
+use core::fmt::{self, Display};
 
-pub use headline::Headline;
-pub use names::name;
-pub use walk::{Field, Value};
-
+use crate::lms::command::{
+    CARTESIAN, EEPROM_WRITES, MEANS, MODE, RANGE, RANGE_FIELDS, RANGE_MEANS, REFLECTIVITIES, REFLECTIVITY,
+    Request, VALUES, VARIANT,
+};
 use crate::lms::condition::Condition;
+use crate::lms::configuration::{self, availability_words};
+use crate::lms::errors::Fault;
+use crate::lms::measured::{COUNT, MEASURED, Measured, PARTIAL};
+use crate::lms::operating;
+use crate::lms::reply::{POWER_ON, REFUSED, RESET, Reply};
+use crate::lms::status_report::{self, Kind};
 use crate::lms::telegram::{REPLY, Telegram};
-use crate::lms::variant::{Mode, Unit};
-use core::fmt;
-use walk::{Walk, said};
+use crate::lms::variant::{Baud, Mode, Unit, Variant};
 
-/// Shows the fields of `telegram` to `visit`, from STX to the checksum, without a gap.
-///
-/// `mode` is how the sensor splits its values, which a telegram of values does not tell; without it their lower 13 bits
-/// are taken for the range.
-pub fn explain(telegram: Telegram<'_>, mode: Option<Mode>, visit: &mut dyn FnMut(&Field<'_>)) {
-    let mut walk = Walk::new(telegram.bytes(), visit);
-    // A telegram that is shorter than its layout ends early; the rest is shown as bytes.
-    let _ = fields(&mut walk, telegram, mode);
-    walk.leave(2 + usize::from(telegram.status().is_some()));
-    if telegram.status().is_some() {
-        walk.byte_as("status", Condition);
-    }
-    walk.word("checksum");
+/// A field of a telegram.
+pub struct Field<'a> {
+    /// Index of its first byte, counted from STX.
+    pub offset: usize,
+    /// Its bytes.
+    pub bytes: &'a [u8],
+    /// Its name.
+    pub name: &'static str,
+    /// Its value.
+    pub value: Value<'a>,
+    /// The meaning of the value as text; `None` if it needs none.
+    pub words: Option<&'a dyn Display>,
 }
 
-fn fields(walk: &mut Walk<'_, '_>, telegram: Telegram<'_>, mode: Option<Mode>) -> Option<()> {
-    walk.open(5);
-    walk.byte("STX")?;
-    walk.byte_as("address", |byte| {
-        said(move |f| match byte {
-            0 => f.write_str("to all sensors"),
-            1..REPLY => write!(f, "to sensor {byte}"),
-            _ => write!(f, "from sensor {}", byte & !REPLY),
-        })
-    })?;
-    walk.word_as("length", |length| said(move |f| write!(f, "{length} bytes from command to checksum")))?;
-    walk.byte_as("command", |command| name(command, telegram.is_reply()).unwrap_or("unknown"))?;
-    walk.open(5 + telegram.data().len());
-    if telegram.is_reply() { replies::fields(walk, telegram, mode) } else { requests::fields(walk, telegram) }
+/// Value of a field.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Value<'a> {
+    /// A number, low byte first.
+    Number(u32),
+    /// Characters.
+    Text(&'a [u8]),
+    /// Bytes without a layout.
+    Bytes(&'a [u8]),
+    /// Rows of words, a word for each column.
+    Rows {
+        /// All rows.
+        bytes: &'a [u8],
+        /// Names of the words of a row.
+        columns: &'static [&'static str],
+    },
+    /// Measured values.
+    Ranges(Ranges<'a>),
 }
 
 /// Measured values with what is needed to read them.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Ranges<'a> {
     bytes: &'a [u8],
-    /// How they are split.
+    /// Mode, which defines how a value is split.
     pub mode: Mode,
-    /// Whether that is known, or taken for granted.
+    /// Whether the mode is known. Otherwise, it is assumed.
     pub mode_known: bool,
     /// Unit of the ranges.
     pub unit: Unit,
 }
 
 impl<'a> Ranges<'a> {
-    /// The value words as they are.
+    /// Returns the value words unchanged.
     pub fn raw(&self) -> impl ExactSizeIterator<Item = u16> + 'a {
         self.bytes.chunks_exact(2).map(|pair| u16::from_le_bytes([pair[0], pair[1]]))
     }
 
-    /// The range of each value in millimetres, or why there is none.
+    /// Returns the range of each value in millimeters, or the code that says why it has none.
     pub fn millimetres(&self) -> impl ExactSizeIterator<Item = Result<u32, crate::lms::value::Code>> + 'a {
         let (mode, mm) = (self.mode, u32::from(self.unit.mm()));
         self.raw().map(move |word| mode.split(word).range.map(|range| u32::from(range) * mm))
     }
 
-    /// The bits above the range.
+    /// Returns the bits above the range of each value.
     pub fn upper(&self) -> impl ExactSizeIterator<Item = u8> + 'a {
         let mode = self.mode;
         self.raw().map(move |word| mode.split(word).upper)
@@ -104,7 +109,449 @@ impl fmt::Display for Ranges<'_> {
     }
 }
 
-/// Hundredths of a degree as people write them: 0.25, 0.5, 1.
+/// A telegram in one line: its direction, its command, and the most important of its contents.
+#[derive(Clone, Copy, Debug)]
+pub struct Headline<'a>(pub Telegram<'a>);
+
+impl fmt::Display for Headline<'_> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let telegram = self.0;
+        let (command, is_reply) = (telegram.command(), telegram.is_reply());
+        write!(f, "{command:02X}h {}", name(command, is_reply).unwrap_or("unknown command"))?;
+        match (is_reply, telegram.address() & !REPLY) {
+            (true, address) => write!(f, ", from sensor {address}")?,
+            (false, 0) => f.write_str(", to all sensors")?,
+            (false, address) => write!(f, ", to sensor {address}")?,
+        }
+        if is_reply {
+            write_reply(f, telegram)?;
+        } else {
+            write_request(f, telegram)?;
+        }
+        match telegram.status() {
+            Some(status) => write!(f, "; {}", Condition(status)),
+            None => Ok(()),
+        }
+    }
+}
+
+fn write_request(f: &mut fmt::Formatter<'_>, telegram: Telegram<'_>) -> fmt::Result {
+    match Request::decode(telegram) {
+        Some(Request::Variant(Variant { angle_deg, resolution_cdeg })) => {
+            write!(f, ": {angle_deg} degrees at {}", Degrees(resolution_cdeg))
+        }
+        Some(Request::Stream | Request::Stop | Request::Baud(_) | Request::Operate(_)) => {
+            write!(f, ": {}", operating::name(telegram.data()[0]))
+        }
+        Some(_) => Ok(()),
+        None if EEPROM_WRITES.contains(&telegram.command()) => f.write_str(" (EEPROM)"),
+        None => f.write_str(", not as it should be"),
+    }
+}
+
+fn write_reply(f: &mut fmt::Formatter<'_>, telegram: Telegram<'_>) -> fmt::Result {
+    match Reply::decode(telegram) {
+        Some(Reply::PowerOn(name) | Reply::Type(name)) => write!(f, ": {}", name.escape_ascii()),
+        Some(Reply::Mode { done }) => f.write_str(if done { ": done" } else { ": not done" }),
+        Some(Reply::Measured(values)) => write_measured(f, values),
+        Some(
+            Reply::Means { values, .. } | Reply::Range { values, .. } | Reply::RangeMeans { values, .. },
+        ) => {
+            write!(f, ": {} in {}", values.count(), unit_name(values.unit()))
+        }
+        Some(Reply::Status(report)) => {
+            write!(
+                f,
+                ": {}, {}",
+                report.software().escape_ascii(),
+                operating::name(report.operating_mode())
+            )?;
+            f.write_str(if report.is_defective() { ", DEFECTIVE" } else { "" })
+        }
+        Some(Reply::Errors(errors)) => match errors.iter().len() {
+            0 => f.write_str(": none"),
+            count => {
+                let past = errors.iter().filter(|fault| fault.is_past()).count();
+                write!(f, ": {} present, {past} past", count - past)
+            }
+        },
+        Some(Reply::Variant { done, angle_deg, resolution_cdeg }) => {
+            let degrees = Degrees(resolution_cdeg);
+            let outcome = if done { "done" } else { "not done" };
+            write!(f, ": {outcome}, {angle_deg} degrees at {degrees} in force")
+        }
+        Some(Reply::Configuration(configuration)) => write!(f, ": {}", configuration.mode().name()),
+        Some(Reply::ConfigurationWritten { done, .. } | Reply::Configuration2Written { done, .. }) => {
+            f.write_str(if done { ": done" } else { ": not done" })
+        }
+        Some(_) => Ok(()),
+        None => f.write_str(", not as it should be"),
+    }
+}
+
+fn write_measured(f: &mut fmt::Formatter<'_>, values: Measured<'_>) -> fmt::Result {
+    write!(f, ": {} in {}", values.count(), unit_name(values.unit()))?;
+    match (values.partial(), Variant::of_beams(values.count())) {
+        (Some(quarter), _) => write!(f, ", partial scan from {}", Degrees(25 * u16::from(quarter))),
+        (None, Some(Variant { angle_deg, resolution_cdeg })) => {
+            write!(f, ", {angle_deg} degrees at {}", Degrees(resolution_cdeg))
+        }
+        (None, None) => Ok(()),
+    }
+}
+
+/// Shows the fields of `telegram` to `visit`, from STX to the checksum, without a gap.
+///
+/// `mode` defines how the scanner splits its values, which a telegram of values does not state. Without it, the lower 13 bits
+/// count as the range.
+pub fn explain(telegram: Telegram<'_>, mode: Option<Mode>, visit: &mut dyn FnMut(&Field<'_>)) {
+    let mut walk = Walk::new(telegram.bytes(), visit);
+    // A telegram that is shorter than its layout ends early. The rest is shown as bytes.
+    let _ = fields(&mut walk, telegram, mode);
+    walk.leave(2 + usize::from(telegram.status().is_some()));
+    if telegram.status().is_some() {
+        walk.byte_as("status", Condition);
+    }
+    walk.word("checksum");
+}
+
+fn fields(walk: &mut Walk<'_, '_>, telegram: Telegram<'_>, mode: Option<Mode>) -> Option<()> {
+    walk.open(5);
+    walk.byte("STX")?;
+    walk.byte_as("address", |byte| {
+        said(move |f| match byte {
+            0 => f.write_str("to all sensors"),
+            1..REPLY => write!(f, "to sensor {byte}"),
+            _ => write!(f, "from sensor {}", byte & !REPLY),
+        })
+    })?;
+    walk.word_as("length", |length| said(move |f| write!(f, "{length} bytes from command to checksum")))?;
+    walk.byte_as("command", |command| name(command, telegram.is_reply()).unwrap_or("unknown"))?;
+    walk.open(5 + telegram.data().len());
+    if telegram.is_reply() { reply_fields(walk, telegram, mode) } else { request_fields(walk, telegram) }
+}
+
+/// Returns the name of `command` (Telegram listing, table 7-1), for a reply that of the request. `None` if it is unknown.
+pub fn name(command: u8, is_reply: bool) -> Option<&'static str> {
+    if !is_reply {
+        return request_name(command);
+    }
+    match command {
+        0x90 => Some("power on"),
+        0x91 => Some("reset begins"),
+        0x92 => Some("command refused"),
+        0xB0 => Some("measured values"),
+        _ => request_name(command.checked_sub(REPLY)?),
+    }
+}
+
+fn request_name(command: u8) -> Option<&'static str> {
+    Some(match command {
+        0x10 => "reset",
+        0x20 => "change of operating mode",
+        0x30 => "measured values, once",
+        0x31 => "status",
+        0x32 => "errors",
+        0x35 => "operating data counters",
+        0x36 => "mean values",
+        0x37 => "values of a sub-range",
+        0x3A => "type and firmware",
+        0x3B => "switch of angle and resolution",
+        0x3E => "values of a sub-range with field values",
+        0x3F => "mean values of a sub-range",
+        0x40 => "write of a field",
+        0x41 => "switch of the field set",
+        0x42 => "change of the password",
+        0x44 => "ranges and reflectivity (S14)",
+        0x45 => "field",
+        0x46 => "teaching of a field",
+        0x4A => "state of the field outputs",
+        0x66 => "write of the rate after power-on",
+        0x69 => "positioning aid",
+        0x74 => "configuration, part 1",
+        0x75 => "ranges and reflectivities",
+        0x76 => "Cartesian coordinates",
+        0x77 => "write of the configuration, part 1",
+        0x7B => "configuration, part 2",
+        0x7C => "write of the configuration, part 2",
+        0x0B
+        | 0x0C
+        | 0x33
+        | 0x34
+        | 0x38
+        | 0x39
+        | 0x3C
+        | 0x3D
+        | 0x48
+        | 0x4B..=0x52
+        | 0x67
+        | 0x68
+        | 0x70
+        | 0x72
+        | 0x78..=0x7A => "reserved",
+        _ => return None,
+    })
+}
+
+/// Shows the parameters of a request. Those without a layout here are left for the caller.
+fn request_fields(walk: &mut Walk<'_, '_>, telegram: Telegram<'_>) -> Option<()> {
+    match telegram.command() {
+        MODE => mode_fields(walk),
+        VALUES => walk.byte_as("selection", selection).map(drop),
+        MEANS => shots(walk),
+        RANGE => {
+            walk.word_as("first value", |first| {
+                said(move |f| match first & DIRECT {
+                    0 => Ok(()),
+                    _ => write!(f, "{}, direct output of a partial scan", first & !DIRECT),
+                })
+            })?;
+            walk.word("last value").map(drop)
+        }
+        RANGE_FIELDS | REFLECTIVITY | CARTESIAN => span(walk),
+        RANGE_MEANS => shots(walk).and_then(|()| span(walk)),
+        REFLECTIVITIES => spans(walk),
+        VARIANT => {
+            walk.word_as("angle", |angle| said(move |f| write!(f, "{angle} degrees")))?;
+            walk.word_as("resolution", |step| said(move |f| write!(f, "{} degrees", Degrees(step)))).map(drop)
+        }
+        WRITE_CONFIGURATION => configuration_fields(walk),
+        POWER_ON_RATE => walk.byte_as("rate after power-on", power_on).map(drop),
+        _ => walk.rest("parameters"),
+    }
+}
+
+fn mode_fields(walk: &mut Walk<'_, '_>) -> Option<()> {
+    match walk.byte_as("operating mode", operating::name)? {
+        operating::INSTALLATION | 0x30 => walk.text("password", 8),
+        0x26 => shots(walk),
+        0x27 | 0x29 | 0x50 => span(walk),
+        0x28 => shots(walk).and_then(|()| span(walk)),
+        0x2B => spans(walk),
+        _ => walk.rest("parameters"),
+    }
+}
+
+fn shots(walk: &mut Walk<'_, '_>) -> Option<()> {
+    walk.byte_as("scans", |shots| said(move |f| write!(f, "mean of {shots}"))).map(drop)
+}
+
+fn span(walk: &mut Walk<'_, '_>) -> Option<()> {
+    walk.word("first value")?;
+    walk.word("last value").map(drop)
+}
+
+fn spans(walk: &mut Walk<'_, '_>) -> Option<()> {
+    for _ in 0..walk.word("sub-ranges")? {
+        span(walk)?;
+    }
+    Some(())
+}
+
+/// Returns the meaning of the parameter of 66h.
+fn power_on(byte: u8) -> &'static str {
+    match byte {
+        0 => "9600",
+        1 => "the present rate is kept",
+        2 => "the type is kept",
+        _ => "unknown",
+    }
+}
+
+fn selection(byte: u8) -> &'static str {
+    match byte {
+        1 => "all values",
+        2 => "least vertical distance",
+        3 => "taught values",
+        6 => "every 2nd value",
+        7 => "every 20th value",
+        8 => "the current partial scan",
+        _ => "unknown",
+    }
+}
+
+/// Request that writes the EEPROM. It is explained here, and encoded only in `lms_configure`.
+const POWER_ON_RATE: u8 = 0x66;
+/// See [`POWER_ON_RATE`].
+const WRITE_CONFIGURATION: u8 = 0x77;
+/// Bit of the first value of a sub-range: direct output of a partial scan.
+const DIRECT: u16 = 1 << 15;
+
+/// Shows the data of a reply. Data without a layout here is left for the caller.
+fn reply_fields(walk: &mut Walk<'_, '_>, telegram: Telegram<'_>, mode: Option<Mode>) -> Option<()> {
+    match telegram.command() {
+        RESET | REFUSED => Some(()),
+        POWER_ON | 0xBA => walk.text("type, number, firmware", walk.left()),
+        0xA0 => walk.byte_as("outcome", done_if_zero).map(drop),
+        MEASURED => values(walk, mode),
+        0xB1 => status_fields(walk),
+        0xB2 => error_fields(walk),
+        0xB5 => {
+            walk.word_as("hours", |hours| said(move |f| write!(f, "{} h", 2 * u32::from(hours))))?;
+            walk.word("power-ons").map(drop)
+        }
+        0xB6 => walk.byte("scans").and_then(|_| values(walk, mode)),
+        0xB7 => span(walk).and_then(|()| values(walk, mode)),
+        0xBB => {
+            walk.byte_as("outcome", done_if_one)?;
+            walk.word_as("angle", |angle| said(move |f| write!(f, "{angle} degrees")))?;
+            walk.word_as("resolution", |step| said(move |f| write!(f, "{} degrees", Degrees(step)))).map(drop)
+        }
+        0xBE => {
+            span(walk)?;
+            let count = count_word(walk)?;
+            walk.rows("values", count, &["value", "field A", "field B", "field C"])?;
+            indices(walk)
+        }
+        0xBF => {
+            walk.byte("scans")?;
+            span(walk).and_then(|()| values(walk, mode))
+        }
+        0xC4 => {
+            let (count, unit) = counted(walk)?;
+            ranges(walk, count, unit, mode)?;
+            let levels = usize::from(walk.word("reflectivities")? & COUNT);
+            span(walk)?;
+            walk.raw("reflectivity", levels)?;
+            indices(walk)
+        }
+        0xE6 => {
+            walk.byte("outcome")?;
+            walk.byte_as("rate after power-on", power_on).map(drop)
+        }
+        0xF4 => configuration_fields(walk),
+        0xF5 => {
+            for _ in 0..walk.word("sub-ranges")? {
+                span(walk)?;
+                let count = count_word(walk)?;
+                walk.rows("values", count, &["distance", "reflectivity"])?;
+            }
+            indices(walk)
+        }
+        0xF7 => walk.byte_as("outcome", done_if_one).and_then(|_| configuration_fields(walk)),
+        0xFC => walk.byte_as("outcome", done_if_one).and_then(|_| walk.rest("parameters")),
+        _ => walk.rest("data"),
+    }
+}
+
+/// Shows count word, values, and the two indices if they are present.
+fn values(walk: &mut Walk<'_, '_>, mode: Option<Mode>) -> Option<()> {
+    let (count, unit) = counted(walk)?;
+    ranges(walk, count, unit, mode)?;
+    indices(walk)
+}
+
+fn ranges(walk: &mut Walk<'_, '_>, count: usize, unit: Unit, mode: Option<Mode>) -> Option<()> {
+    walk.ranges("values", count, |bytes| Ranges {
+        bytes,
+        mode: mode.unwrap_or(Mode(0)),
+        mode_known: mode.is_some(),
+        unit,
+    })
+}
+
+fn counted(walk: &mut Walk<'_, '_>) -> Option<(usize, Unit)> {
+    let word = walk.word_as("count and unit", |word| {
+        said(move |f| {
+            write!(f, "{} values in {}", word & COUNT, unit_words((word >> 14) as u8))?;
+            match word & PARTIAL {
+                0 => Ok(()),
+                _ => write!(f, ", partial scan from x.{:02}", 25 * (word >> 11 & 3)),
+            }
+        })
+    })?;
+    Some((usize::from(word & COUNT), Unit::of_code((word >> 14) as u8).unwrap_or(Unit::Mm)))
+}
+
+fn count_word(walk: &mut Walk<'_, '_>) -> Option<usize> {
+    counted(walk).map(|(count, _)| count)
+}
+
+fn indices(walk: &mut Walk<'_, '_>) -> Option<()> {
+    if walk.left() == 2 {
+        walk.byte("scan index")?;
+        walk.byte("telegram index")?;
+    }
+    Some(())
+}
+
+fn error_fields(walk: &mut Walk<'_, '_>) -> Option<()> {
+    while walk.left() >= 2 {
+        // Both bytes are one error.
+        walk.word_as("error", |word| {
+            let [kind, number] = word.to_le_bytes();
+            Fault { kind, number }
+        })?;
+    }
+    Some(())
+}
+
+fn status_fields(walk: &mut Walk<'_, '_>) -> Option<()> {
+    for item in status_report::ITEMS {
+        match item.kind {
+            Kind::Text => walk.text(item.name, item.len)?,
+            Kind::Words => walk.rows(item.name, item.len / 2, &["channel"])?,
+            Kind::Bytes => walk.raw(item.name, item.len)?,
+            Kind::Number => {
+                let name = item.name;
+                let words = move |value: u32| {
+                    said(move |f| match name {
+                        "operating mode" => f.write_str(operating::name(value as u8)),
+                        "measuring mode" => f.write_str(Mode(value as u8).name()),
+                        "unit" => f.write_str(unit_words(value as u8)),
+                        "defective" => f.write_str(if value == 0 { "no" } else { "yes" }),
+                        "laser" => f.write_str(if value == 0 { "off" } else { "on" }),
+                        "motor" => write!(f, "{} us a turn", 90 * value),
+                        "laser power" => write!(f, "{value} %"),
+                        "scan angle" => write!(f, "{value} degrees"),
+                        "resolution" => write!(f, "{} degrees", Degrees(value as u16)),
+                        "permanent rate" => f.write_str(if value == 0 { "9600" } else { "another" }),
+                        "rate of the line" => match status_report::baud_of_divisor(value as u16) {
+                            Some(baud) => write!(f, "{} baud", Baud::rate(baud)),
+                            None => f.write_str("unknown"),
+                        },
+                        "calibration interval" => write!(f, "{value} ns"),
+                        _ => Ok(()),
+                    })
+                };
+                walk.number(item.name, item.len, Some(words)).map(drop)?;
+            }
+        }
+    }
+    Some(())
+}
+
+/// Shows the configuration, as far as the telegram contains it.
+fn configuration_fields(walk: &mut Walk<'_, '_>) -> Option<()> {
+    for item in configuration::ITEMS {
+        if walk.left() < item.len {
+            break;
+        }
+        let name = item.name;
+        let words = move |value: u32| {
+            said(move |f| match name {
+                "blanking" => write!(f, "{value} cm"),
+                "stop threshold" => write!(f, "{value} mV"),
+                "availability" => f.write_str(availability_words(value as u8)),
+                "measuring mode" => f.write_str(Mode(value as u8).name()),
+                "unit" => f.write_str(Unit::of_code(value as u8).map_or("unknown", unit_name)),
+                _ => Ok(()),
+            })
+        };
+        walk.number(item.name, item.len, Some(words)).map(drop)?;
+    }
+    Some(())
+}
+
+fn done_if_zero(outcome: u8) -> &'static str {
+    if outcome == 0 { "done" } else { "not done: wrong password, or a fault" }
+}
+
+fn done_if_one(outcome: u8) -> &'static str {
+    if outcome == 1 { "done" } else { "not done: what is in force follows" }
+}
+
+/// Hundredths of a degree, shown without trailing zeros: 0.25, 0.5, 1.
 struct Degrees(u16);
 
 impl fmt::Display for Degrees {
@@ -127,6 +574,132 @@ fn unit_name(unit: Unit) -> &'static str {
 
 fn unit_words(code: u8) -> &'static str {
     Unit::of_code(code).map_or("unknown", unit_name)
+}
+
+/// A walk through the bytes of a telegram. It never steps over the end of the layout, and never leaves a byte out.
+struct Walk<'t, 'v> {
+    bytes: &'t [u8],
+    at: usize,
+    end: usize,
+    visit: &'v mut dyn FnMut(&Field<'_>),
+}
+
+impl<'t, 'v> Walk<'t, 'v> {
+    fn new(bytes: &'t [u8], visit: &'v mut dyn FnMut(&Field<'_>)) -> Self {
+        Walk { bytes, at: 0, end: 0, visit }
+    }
+
+    /// Sets the end of the fields that follow.
+    fn open(&mut self, end: usize) {
+        self.end = end;
+    }
+
+    /// Shows the bytes that have no field yet, up to the last `len` bytes of the telegram, which follow.
+    fn leave(&mut self, len: usize) {
+        self.end = self.bytes.len() - len;
+        self.rest("data");
+        self.end = self.bytes.len();
+    }
+
+    /// Returns the number of bytes before the end of the layout.
+    fn left(&self) -> usize {
+        self.end - self.at
+    }
+
+    fn byte(&mut self, name: &'static str) -> Option<u8> {
+        self.number(name, 1, None::<fn(u32) -> &'static str>).map(|value| value as u8)
+    }
+
+    fn byte_as<D: Display>(&mut self, name: &'static str, words: impl FnOnce(u8) -> D) -> Option<u8> {
+        self.number(name, 1, Some(|value| words(value as u8))).map(|value| value as u8)
+    }
+
+    fn word(&mut self, name: &'static str) -> Option<u16> {
+        self.number(name, 2, None::<fn(u32) -> &'static str>).map(|value| value as u16)
+    }
+
+    fn word_as<D: Display>(&mut self, name: &'static str, words: impl FnOnce(u16) -> D) -> Option<u16> {
+        self.number(name, 2, Some(|value| words(value as u16))).map(|value| value as u16)
+    }
+
+    /// Shows a number of one to four bytes, the low byte first.
+    fn number<D: Display>(
+        &mut self,
+        name: &'static str,
+        len: usize,
+        words: Option<impl FnOnce(u32) -> D>,
+    ) -> Option<u32> {
+        let (offset, bytes) = self.take(len)?;
+        let value = bytes.iter().rev().fold(0, |value, &byte| value << 8 | u32::from(byte));
+        let words = words.map(|words| words(value));
+        let words = words.as_ref().map(|words| words as &dyn Display);
+        self.show(&Field { offset, bytes, name, value: Value::Number(value), words });
+        Some(value)
+    }
+
+    fn text(&mut self, name: &'static str, len: usize) -> Option<()> {
+        let (offset, bytes) = self.take(len)?;
+        self.show(&Field { offset, bytes, name, value: Value::Text(bytes), words: None });
+        Some(())
+    }
+
+    fn raw(&mut self, name: &'static str, len: usize) -> Option<()> {
+        let (offset, bytes) = self.take(len)?;
+        self.show(&Field { offset, bytes, name, value: Value::Bytes(bytes), words: None });
+        Some(())
+    }
+
+    /// Shows all bytes before the end of the layout.
+    fn rest(&mut self, name: &'static str) -> Option<()> {
+        self.raw(name, self.left())
+    }
+
+    fn rows(&mut self, name: &'static str, rows: usize, columns: &'static [&'static str]) -> Option<()> {
+        let (offset, bytes) = self.take(rows * 2 * columns.len())?;
+        self.show(&Field { offset, bytes, name, value: Value::Rows { bytes, columns }, words: None });
+        Some(())
+    }
+
+    /// Shows `count` measured values. `make` adds what is needed to read their bytes.
+    fn ranges(
+        &mut self,
+        name: &'static str,
+        count: usize,
+        make: impl FnOnce(&'t [u8]) -> Ranges<'t>,
+    ) -> Option<()> {
+        let (offset, bytes) = self.take(2 * count)?;
+        let ranges = make(bytes);
+        self.show(&Field { offset, bytes, name, value: Value::Ranges(ranges), words: Some(&ranges) });
+        Some(())
+    }
+
+    /// Shows a field, unless it has no bytes.
+    fn show(&mut self, field: &Field<'_>) {
+        if !field.bytes.is_empty() {
+            (self.visit)(field);
+        }
+    }
+
+    fn take(&mut self, len: usize) -> Option<(usize, &'t [u8])> {
+        let bytes = self.bytes.get(self.at..self.at + len).filter(|_| self.at + len <= self.end)?;
+        let offset = self.at;
+        self.at += len;
+        Some((offset, bytes))
+    }
+}
+
+/// Text that is written when it is displayed.
+struct Said<F>(F);
+
+/// Returns text that `write` writes.
+fn said<F: Fn(&mut fmt::Formatter<'_>) -> fmt::Result>(write: F) -> Said<F> {
+    Said(write)
+}
+
+impl<F: Fn(&mut fmt::Formatter<'_>) -> fmt::Result> Display for Said<F> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        (self.0)(f)
+    }
 }
 
 #[cfg(test)]

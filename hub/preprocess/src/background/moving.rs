@@ -4,9 +4,7 @@
 
 use schema::{Background, Motion, Pose, Scan};
 
-use super::runs::Runs;
-use super::settings::Limits;
-use super::{Class, INVALID};
+use super::{Class, INVALID, Limits, Runs};
 
 /// State of the method that follows the robot.
 #[derive(Clone)]

@@ -1,41 +1,40 @@
-//! Cuts the rays of a scan into pieces that end on one line each: beginning with pairs, neighbours are joined
-//! ([`join`](super::join)), then the cuts between them are moved ([`refine`](super::refine)). Refuses to know angles,
-//! payloads and where a scan comes from.
+//! Cuts the rays of a scan into pieces that end on one line each.
+//!
+//! Starting with pairs of rays, neighbors are joined (`join`). Then the cuts between the pieces are moved to where they cost
+//! least, a cut is taken from where it helps least to where it helps most, and rays at ends that fit worst are dropped.
 
-use super::fit::Ray;
-use super::join::Joiner;
-use super::piece::Piece;
-use super::refine::{exchange, settle, trim};
+use super::fit::{Ray, Sums};
+use super::join::{Joiner, Piece};
 
-/// When cutting ends.
+/// Limits of cutting.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Bounds {
-    /// So many pieces at most.
+    /// Maximum number of pieces.
     pub(super) max: usize,
-    /// Joining goes on below `max` while it costs less than this, in m2.
+    /// Below `max`, pieces are joined while that costs less than this, in m2.
     pub(super) penalty: f64,
-    /// The variance of a range in m2. Two pieces that are worse than this by themselves are joined for more.
+    /// Variance of a range in m2. Two pieces whose own variance is greater are joined at a higher cost.
     pub(super) variance: f64,
-    /// A ray that belongs to no piece costs this, in m2, where there are too many.
+    /// Cost of a ray that belongs to no piece, in m2, if there are too many pieces.
     pub(super) loss: f64,
-    /// Pieces of fewer rays are left out.
+    /// Minimum number of rays of a piece. Smaller ones are dropped.
     pub(super) min_points: usize,
-    /// So often cuts are moved.
+    /// Maximum number of rounds in which cuts are moved.
     pub(super) rounds: usize,
-    /// Whether cuts are taken elsewhere too.
+    /// Whether cuts are also moved to other pieces.
     pub(super) exchange: bool,
-    /// So many rays at ends of pieces, those that fit worst, may be left out.
+    /// Maximum number of rays at ends of pieces that may be dropped: those that fit worst.
     pub(super) trimmed: usize,
 }
 
-/// The pieces that a scan was cut into.
+/// Pieces of a scan.
 pub(super) struct Pieces<'a> {
     pub(super) list: &'a [Piece],
-    /// There are more than allowed; they were joined or left out.
+    /// Whether there were more than allowed. The others were joined or dropped.
     pub(super) is_full: bool,
 }
 
-/// The memory for it.
+/// Memory for cutting.
 pub(super) struct Cutter {
     pieces: Box<[Piece]>,
     count: usize,
@@ -43,13 +42,13 @@ pub(super) struct Cutter {
 }
 
 impl Cutter {
-    /// For at most so many `beams`.
+    /// Creates the memory for at most `beams` beams.
     pub(super) fn new(beams: usize) -> Cutter {
         let pieces = vec![Piece::default(); beams].into();
         Cutter { pieces, count: 0, joiner: Joiner::new(beams) }
     }
 
-    /// Returns the pieces of `rays`, of which each group ends where `ends` says: behind its last ray.
+    /// Returns the pieces of `rays`. `ends` has the index after the last ray of each group.
     pub(super) fn cut(&mut self, rays: &[Ray], ends: &[u16], bounds: &Bounds) -> Pieces<'_> {
         self.begin(rays, ends, bounds.min_points);
         let (count, is_full) = self.joiner.join(&mut self.pieces[..self.count], bounds);
@@ -63,7 +62,8 @@ impl Cutter {
         Pieces { list: &self.pieces[..self.count], is_full }
     }
 
-    /// Pairs; the last of an odd group has three. Groups that are too small are left out.
+    /// Creates a piece of each pair of rays. The last one of an odd group has three. Groups that are too small are
+    /// dropped.
     fn begin(&mut self, rays: &[Ray], ends: &[u16], min_points: usize) {
         self.count = 0;
         let mut first = 0;
@@ -81,7 +81,7 @@ impl Cutter {
         }
     }
 
-    /// Leaves out pieces that are too small; their neighbours get of their rays what fits.
+    /// Drops pieces that are too small. Their neighbors get the rays that fit.
     fn leave_out(&mut self, rays: &[Ray], bounds: &Bounds) {
         let mut kept: usize = 0;
         let mut is_apart = true;
@@ -102,4 +102,144 @@ impl Cutter {
         }
         self.count = kept;
     }
+}
+
+/// Moves each cut to where it costs least. Returns whether any moved.
+fn slide(pieces: &mut [Piece], rays: &[Ray]) -> bool {
+    let mut moved = false;
+    for i in 1..pieces.len() {
+        let (left, right) = (pieces[i - 1], pieces[i]);
+        if left.is_last {
+            continue;
+        }
+        if let Some((cut, sums)) = best_cut(rays, &left, &right) {
+            pieces[i - 1] = Piece { end: cut, sums: sums.0, error: sums.0.error(), ..left };
+            pieces[i] = Piece { first: cut, sums: sums.1, error: sums.1.error(), ..right };
+            moved = true;
+        }
+    }
+    moved
+}
+
+/// Moves cuts until none moves, at most `rounds` times.
+fn settle(pieces: &mut [Piece], rays: &[Ray], rounds: usize) {
+    for _ in 0..rounds {
+        if !slide(pieces, rays) {
+            break;
+        }
+    }
+}
+
+/// Moves a cut from where it helps least to where it helps most, while that helps, at most once per piece.
+fn exchange(pieces: &mut [Piece], rays: &[Ray], bounds: &Bounds) {
+    let least = bounds.min_points.max(2);
+    for _ in 0..pieces.len() {
+        // Piece whose cut in two helps most.
+        let mut best = (0.0, 0, 0, (Sums::default(), Sums::default()));
+        for (i, piece) in pieces.iter().enumerate() {
+            if piece.len() < 2 * least || piece.error <= best.0 {
+                continue;
+            }
+            let (cut, sums, error) = halves(rays, piece, least);
+            if piece.error - error > best.0 {
+                best = (piece.error - error, i, cut, sums);
+            }
+        }
+        let (gain, split, cut, sums) = best;
+        // Neighbors that cost least to join, neither of which is the one to be cut.
+        let mut cheapest = (f64::INFINITY, 0);
+        for i in 1..pieces.len() {
+            let price = pieces[i - 1].price(&pieces[i], bounds.variance);
+            if price < cheapest.0 && i - 1 != split && i != split {
+                cheapest = (price, i - 1);
+            }
+        }
+        let (price, join) = cheapest;
+        if gain <= price * 1.000_001 {
+            break;
+        }
+        let piece = pieces[split];
+        let left = Piece { end: cut, sums: sums.0, error: sums.0.error(), is_last: false, ..piece };
+        let right = Piece { first: cut, sums: sums.1, error: sums.1.error(), ..piece };
+        pieces[join] = pieces[join].joined(&pieces[join + 1]);
+        // The slot that joining has freed moves to where the second half belongs.
+        let at = if join < split {
+            pieces[join + 1..split].rotate_left(1);
+            split - 1
+        } else {
+            pieces[split + 1..join + 2].rotate_right(1);
+            split
+        };
+        (pieces[at], pieces[at + 1]) = (left, right);
+        settle(pieces, rays, SETTLED);
+    }
+}
+
+/// More rounds than cuts need to settle.
+const SETTLED: usize = 8;
+
+/// Drops rays at the ends of pieces, the most expensive one first, if it costs more than three rays on average.
+fn trim(pieces: &mut [Piece], rays: &[Ray], bounds: &Bounds) {
+    let count: usize = pieces.iter().map(Piece::len).sum();
+    let mut error: f64 = pieces.iter().map(|piece| piece.error).sum();
+    for left in 0..bounds.trimmed {
+        let mut best = (3.0 * error / (count - left).max(1) as f64, None);
+        for (i, piece) in pieces.iter().enumerate() {
+            if piece.len() <= bounds.min_points.max(2) || piece.error <= best.0 {
+                continue;
+            }
+            for at in [piece.first, piece.end - 1] {
+                let sums = piece.sums - Sums::one(&rays[at]);
+                let gain = piece.error - sums.error();
+                if gain > best.0 {
+                    best = (gain, Some((i, at, sums)));
+                }
+            }
+        }
+        let (gain, Some((i, at, sums))) = best else { break };
+        error -= gain;
+        let piece = &mut pieces[i];
+        (piece.sums, piece.error) = (sums, sums.error());
+        if at == piece.first { piece.first += 1 } else { piece.end -= 1 }
+    }
+}
+
+/// Returns where to cut a piece in two, with at least `least` rays each, so that it costs least.
+fn halves(rays: &[Ray], piece: &Piece, least: usize) -> (usize, (Sums, Sums), f64) {
+    let mut best = (piece.first, (Sums::default(), Sums::default()), f64::INFINITY);
+    let mut left = Sums::of(&rays[piece.first..piece.first + least - 1]);
+    for cut in piece.first + least..=piece.end - least {
+        left = left + Sums::one(&rays[cut - 1]);
+        let right = piece.sums - left;
+        let error = left.error() + right.error();
+        if error < best.2 {
+            best = (cut, (left, right), error);
+        }
+    }
+    best
+}
+
+/// Returns where the cut between two pieces costs less than at its present position.
+fn best_cut(rays: &[Ray], left: &Piece, right: &Piece) -> Option<(usize, (Sums, Sums))> {
+    let here = left.error + right.error;
+    let mut best = (here * 0.999_999 - 1e-12, None);
+    let (mut l, mut r) = (left.sums, right.sums);
+    for cut in (left.first + 2..left.end).rev() {
+        let one = Sums::one(&rays[cut]);
+        (l, r) = (l - one, r + one);
+        let error = l.error() + r.error();
+        if error < best.0 {
+            best = (error, Some((cut, (l, r))));
+        }
+    }
+    (l, r) = (left.sums, right.sums);
+    for cut in right.first + 1..right.end - 1 {
+        let one = Sums::one(&rays[cut - 1]);
+        (l, r) = (l + one, r - one);
+        let error = l.error() + r.error();
+        if error < best.0 {
+            best = (error, Some((cut, (l, r))));
+        }
+    }
+    best.1
 }

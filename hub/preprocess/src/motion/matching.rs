@@ -3,8 +3,7 @@
 
 use schema::{Corner, Line};
 
-use super::rigid::Rigid;
-use super::solve::{Square, add_outer, around, eigen};
+use super::rigid::{Rigid, Square, add_outer, around, eigen};
 use super::view::{Surface, View};
 
 /// How one scan lies on another.

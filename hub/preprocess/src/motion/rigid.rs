@@ -1,8 +1,9 @@
-//! Where something is and where it looks, in the plane.
+//! Geometry of the plane for motion: rigid transforms, and symmetric 3 x 3 matrices such as their covariances.
 
 use std::f64::consts::{PI, TAU};
 
-/// A place and a direction in some frame: metres, and radians counter-clockwise from -pi to pi.
+/// A position and a direction in some frame: meters, and radians counterclockwise from -pi to pi. Also the transform from the
+/// frame of a robot there into that frame.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Rigid {
     /// Ahead.
@@ -22,38 +23,127 @@ impl Default for Rigid {
 }
 
 impl Rigid {
-    /// The place `x`, `y` and the direction `yaw`.
+    /// Creates the transform of position `x`, `y` and direction `yaw`.
     pub fn new(x: f64, y: f64, yaw: f64) -> Rigid {
         let (sin, cos) = yaw.sin_cos();
         Rigid { x, y, yaw: (yaw + PI).rem_euclid(TAU) - PI, cos, sin }
     }
 
-    /// Returns what is `next` in the frame of this one, in the frame that this one is in.
+    /// Returns this transform followed by `next`, which is given in the frame of this one.
     pub fn then(&self, next: &Rigid) -> Rigid {
         let (x, y) = self.point((next.x, next.y));
         Rigid::new(x, y, self.yaw + next.yaw)
     }
 
-    /// Returns the frame that this one is in, as seen from this one.
+    /// Returns the inverse transform.
     pub fn inverse(&self) -> Rigid {
         let (x, y) = self.turned_back((-self.x, -self.y));
         Rigid::new(x, y, -self.yaw)
     }
 
-    /// Returns a point of this frame in the frame that this one is in.
+    /// Transforms a point out of this frame.
     #[inline]
     pub fn point(&self, (x, y): (f64, f64)) -> (f64, f64) {
         (self.x + self.cos * x - self.sin * y, self.y + self.sin * x + self.cos * y)
     }
 
-    /// Returns a direction of this frame in the frame that this one is in.
+    /// Transforms a direction out of this frame.
     #[inline]
     pub(super) fn turned(&self, (x, y): (f64, f64)) -> (f64, f64) {
         (self.cos * x - self.sin * y, self.sin * x + self.cos * y)
     }
 
-    /// Returns a direction of the frame that this one is in, in this frame.
+    /// Transforms a direction into this frame.
     pub(super) fn turned_back(&self, (x, y): (f64, f64)) -> (f64, f64) {
         (self.cos * x + self.sin * y, self.cos * y - self.sin * x)
+    }
+}
+
+/// Three rows.
+pub(super) type Square = [[f64; 3]; 3];
+
+/// `m` + factor v v'.
+#[inline]
+pub(super) fn add_outer(m: &mut Square, v: &[f64; 3], factor: f64) {
+    for i in 0..3 {
+        for j in 0..3 {
+            m[i][j] += factor * v[i] * v[j];
+        }
+    }
+}
+
+/// a b.
+pub(super) fn product(a: &Square, b: &Square) -> Square {
+    std::array::from_fn(|i| std::array::from_fn(|j| (0..3).map(|k| a[i][k] * b[k][j]).sum()))
+}
+
+/// a b a'.
+pub(super) fn around(a: &Square, b: &Square) -> Square {
+    let transposed: Square = std::array::from_fn(|i| std::array::from_fn(|j| a[j][i]));
+    product(&product(a, b), &transposed)
+}
+
+/// The eigenvalues of a symmetric matrix, and for each its unit vector: by Jacobi's rotations.
+pub(super) fn eigen(mut m: Square) -> ([f64; 3], [[f64; 3]; 3]) {
+    let mut vectors = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]];
+    for _ in 0..SWEEPS {
+        for (p, q) in [(0, 1), (0, 2), (1, 2)] {
+            if m[p][q].abs() <= f64::MIN_POSITIVE {
+                continue;
+            }
+            let theta = (m[q][q] - m[p][p]) / (2.0 * m[p][q]);
+            let t = theta.signum() / (theta.abs() + (theta * theta + 1.0).sqrt());
+            let cos = 1.0 / (t * t + 1.0).sqrt();
+            let sin = t * cos;
+            for row in &mut m {
+                (row[p], row[q]) = (cos * row[p] - sin * row[q], sin * row[p] + cos * row[q]);
+            }
+            for k in 0..3 {
+                (m[p][k], m[q][k]) = (cos * m[p][k] - sin * m[q][k], sin * m[p][k] + cos * m[q][k]);
+                (vectors[p][k], vectors[q][k]) =
+                    (cos * vectors[p][k] - sin * vectors[q][k], sin * vectors[p][k] + cos * vectors[q][k]);
+            }
+        }
+    }
+    ([m[0][0], m[1][1], m[2][2]], vectors)
+}
+
+/// The covariance of `step` between two places in one frame, `before` and the next, of which each is unsure for itself: `own`
+/// of the next one, `of_before`.
+pub(super) fn of_step(own: &Square, of_before: &Square, before: &Rigid, step: &Rigid) -> Square {
+    let (x, y) = (before.turned_back((1.0, 0.0)), before.turned_back((0.0, 1.0)));
+    let back = [[x.0, y.0, 0.0], [x.1, y.1, 0.0], [0.0, 0.0, 1.0]];
+    // How the step changes with the place before.
+    let by_before = [[-x.0, -y.0, step.y], [-x.1, -y.1, -step.x], [0.0, 0.0, -1.0]];
+    let (own, other) = (around(&back, own), around(&by_before, of_before));
+    std::array::from_fn(|i| std::array::from_fn(|j| own[i][j] + other[i][j]))
+}
+
+/// Enough for all digits of three numbers.
+const SWEEPS: usize = 6;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn eigenvectors_are_those_of_the_matrix() {
+        let mut random = fastrand::Rng::with_seed(3);
+        for _ in 0..500 {
+            let mut m = [[0.0; 3]; 3];
+            for _ in 0..random.usize(1..5) {
+                let vector = std::array::from_fn(|_| random.f64() - 0.5);
+                add_outer(&mut m, &vector, 10.0_f64.powi(random.i32(-4..4)));
+            }
+            let size: f64 = m.as_flattened().iter().map(|value| value.abs()).sum();
+            let (values, vectors) = eigen(m);
+            for (value, vector) in values.iter().zip(&vectors) {
+                for i in 0..3 {
+                    let product: f64 = (0..3).map(|j| m[i][j] * vector[j]).sum();
+                    assert!((product - value * vector[i]).abs() <= 1e-12 * size, "{m:?} {value} {vector:?}");
+                }
+                assert!((vector.iter().map(|x| x * x).sum::<f64>() - 1.0).abs() < 1e-12);
+            }
+        }
     }
 }

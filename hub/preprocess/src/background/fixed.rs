@@ -1,22 +1,92 @@
-//! A background with several surfaces a beam: at edges a beam flips between two of them, and both are learned. Refuses
-//! to know how many neighbouring beams make an object: `runs` decides that.
+//! The two methods that learn a background beam by beam, for a sensor that does not move: that of the paper with one range per
+//! beam ([`Paper`]), and one with several surfaces per beam ([`Multi`]).
 //!
-//! All beams take the same steps, whatever they hit, so that the compiler can vectorise them. The constants were found
-//! on seeds 0 to 9 of the simulated scenes, by `benches/perception`.
+//! All beams take the same steps, whatever they hit, so that the compiler can vectorize them. The constants of [`Multi`] were
+//! found on seeds 0 to 9 of the simulated scenes, by `benches/perception`.
 
-use super::runs::Runs;
-use super::settings::Limits;
-use super::{Class, INVALID};
+use super::{Class, INVALID, Limits, Runs};
 use schema::Background;
 
-/// State of the method with several surfaces.
+/// State of the paper's method: one range per beam, which is replaced by a new range once that was read a number of times in a
+/// row. A beam that flips between two surfaces never learns either of them.
+#[derive(Clone)]
+pub(super) struct Paper {
+    /// Ranges in device units, [`Background::UNTAUGHT`] or [`Background::FAR`].
+    background: Box<[u16]>,
+    /// Candidates for the background, where `run` is not 0.
+    candidate: Box<[u16]>,
+    /// Number of consecutive readings of the candidate.
+    run: Box<[u16]>,
+}
+
+impl Paper {
+    /// Creates the state for at most `beams` beams.
+    pub(super) fn new(beams: usize) -> Paper {
+        let none = || vec![0; beams].into_boxed_slice();
+        Paper { background: vec![Background::UNTAUGHT; beams].into(), candidate: none(), run: none() }
+    }
+
+    /// Restores the initial state.
+    pub(super) fn forget(&mut self) {
+        self.background.fill(Background::UNTAUGHT);
+        self.run.fill(0);
+    }
+
+    /// Compares and learns (paper III.B.3). Readings without a range neither count nor end a run. Farther ones count,
+    /// but are never foreground. The scan that completes a run is compared with the old background.
+    pub(super) fn update(&mut self, readings: &[u16], limits: &Limits, learn: bool, classes: &mut [Class]) {
+        for ((&reading, &background), class) in readings.iter().zip(&self.background).zip(classes) {
+            let aside = if reading < background { Class::Foreground } else { Class::Behind };
+            let ends = reading.abs_diff(background) <= limits.threshold;
+            let known = if ends { Class::Background } else { aside };
+            let valid = if background == Background::UNTAUGHT { Class::Unknown } else { known };
+            *class = if reading == INVALID { Class::Invalid } else { valid };
+        }
+        if learn {
+            self.learn(readings, limits);
+        }
+    }
+
+    fn learn(&mut self, readings: &[u16], limits: &Limits) {
+        let beams = readings.len();
+        let background = &mut self.background[..beams];
+        let candidate = &mut self.candidate[..beams];
+        let run = &mut self.run[..beams];
+        for (i, &reading) in readings.iter().enumerate() {
+            let valid = reading != INVALID;
+            let known = background[i] != Background::UNTAUGHT;
+            let ends = known & (reading.abs_diff(background[i]) <= limits.threshold);
+            let goes_on = (run[i] > 0) & (reading.abs_diff(candidate[i]) <= limits.candidate);
+            let longer = if goes_on { run[i] + 1 } else { 1 };
+            let adopted = valid & !ends & (longer >= limits.scans);
+            let anew = valid & !ends & (!goes_on | limits.latest);
+            let new_run = if ends | adopted { 0 } else { longer };
+            background[i] = if adopted { reading } else { background[i] };
+            candidate[i] = if anew { reading } else { candidate[i] };
+            run[i] = if valid { new_run } else { run[i] };
+        }
+    }
+
+    /// Uses `range` as the background of beam `i`.
+    pub(super) fn adopt(&mut self, i: usize, range: u16) {
+        self.background[i] = range;
+        self.run[i] = 0;
+    }
+
+    pub(super) fn background(&self, i: usize) -> u16 {
+        self.background[i]
+    }
+}
+
+/// State of the method with several surfaces per beam. At edges, a beam flips between two surfaces, and both are learned.
+/// [`Runs`] decides how many neighboring beams make an object.
 #[derive(Clone)]
 pub(super) struct Multi {
     slots: [Slots; SLOTS],
-    /// What a surface weighs that the beam meets next: more where nothing came back from it before.
+    /// Weight that the next surface of the beam gains: more if previous scans had no return.
     gain: Box<[u16]>,
     runs: Runs,
-    /// The nearest background of each beam, and what the surface that it meets gains, while a scan is looked at.
+    /// The nearest background of each beam, and the weight that its surface gains, while a scan is processed.
     nearest: Box<[u16]>,
     gains: Box<[u16]>,
 }
@@ -26,11 +96,12 @@ pub(super) struct Multi {
 struct Slots {
     /// In device units.
     range: Box<[u16]>,
-    /// How well it is known: grows with each scan in which it was met, and leaks in others. 0: there is none.
+    /// How well the surface is known. It grows with each scan in which the beam met it, and decreases in others. 0:
+    /// there is no surface.
     weight: Box<[u16]>,
 }
 
-/// What the steps are about, in units of ranges and of weights.
+/// Limits of the steps, in units of ranges and of weights.
 #[derive(Clone, Copy)]
 struct Bounds {
     threshold: u16,
@@ -79,10 +150,11 @@ impl Multi {
         }
     }
 
-    /// What each beam is beside its own background, and the nearest one of these; [`INVALID`] if there is none.
+    /// Classifies each beam by its own background, and finds the nearest background of each beam; [`INVALID`] if there is
+    /// none.
     fn compare(&mut self, readings: &[u16], bounds: Bounds, classes: &mut [Class]) {
         let n = readings.len();
-        // Of one length, so that the loop needs no look at it.
+        // All slices have one length, so the loop needs no bounds checks.
         let slots = self.slots.each_ref().map(|slots| (&slots.range[..n], &slots.weight[..n]));
         let (classes, nearest) = (&mut classes[..n], &mut self.nearest[..n]);
         for (i, ((&reading, class), nearest)) in readings.iter().zip(classes).zip(nearest).enumerate() {
@@ -101,8 +173,8 @@ impl Multi {
         }
     }
 
-    /// Beam `i`, whose own background is not known, is nearer than what its neighbours to both sides end on, and meets
-    /// nothing that it has met for a while.
+    /// Returns whether beam `i`, whose own background is unknown, ends nearer than its neighbors on both sides, and
+    /// meets nothing that it has met for a while.
     fn is_before_its_neighbours(&self, i: usize, reading: u16, nearest: &[u16], bounds: Bounds) -> bool {
         let known = |range: &&u16| **range != INVALID;
         let right = nearest[i.saturating_sub(ASIDE)..i].iter().rev().find(known);
@@ -114,9 +186,9 @@ impl Multi {
         reading < right.min(left).saturating_sub(bounds.threshold) && !self.slots.iter().any(met)
     }
 
-    /// The surface nearest to a reading, within the threshold, was met; the others leak, those through which the beam
-    /// went more than those that may be hidden. What is none of them takes the place of the least known one, unless all
-    /// are known too well.
+    /// Updates the surfaces. The one nearest to a reading, within the threshold, was met. The others lose weight: those
+    /// that the beam passed through more than those that may be hidden. A reading of no surface replaces the least
+    /// known one, unless all are known too well.
     fn learn(&mut self, readings: &[u16], bounds: Bounds) {
         self.gain(readings, bounds);
         let n = readings.len();
@@ -134,8 +206,8 @@ impl Multi {
         }
     }
 
-    /// What the surface that each beam meets gains in this scan. By themselves: the processor does not do so many things at
-    /// once in the loop over the surfaces.
+    /// Computes the weights that the surfaces gain in this scan. A separate loop, because the processor does not do all
+    /// of this at once in the loop over the surfaces.
     fn gain(&mut self, readings: &[u16], bounds: Bounds) {
         for ((gain, next), &reading) in self.gains.iter_mut().zip(&mut self.gain).zip(readings) {
             let is_far = reading == Background::FAR;
@@ -146,15 +218,15 @@ impl Multi {
         }
     }
 
-    /// Takes `range` for the only background of beam `i`, as well known as can be.
+    /// Uses `range` as the only background of beam `i`, as well known as possible.
     pub(super) fn adopt(&mut self, i: usize, range: u16) {
         self.slots.iter_mut().for_each(|slots| slots.weight[i] = 0);
         self.slots[0].range[i] = range;
         self.slots[0].weight[i] = u16::MAX;
     }
 
-    /// The best known background of beam `i`, of equals the nearer one; a surface before nothing, however often
-    /// nothing comes back from it: a model that starts with that range alone would report the surface as foreground.
+    /// Returns the best known background of beam `i`, and of equal ones the nearer one. A surface takes precedence over
+    /// no return, however frequent: a model that starts with that range alone would report the surface as foreground.
     pub(super) fn background(&self, i: usize, limits: &Limits) -> u16 {
         let known = |slots: &&Slots| slots.weight[i] >= Bounds::of(limits).known;
         let rank = |s: &&Slots| (s.range[i] != Background::FAR, s.weight[i], u16::MAX - s.range[i]);
@@ -163,7 +235,7 @@ impl Multi {
     }
 }
 
-/// The surfaces of one beam after `reading`; the one that was met gains so much.
+/// Returns the surfaces of one beam after `reading`. The one that was met gains this weight.
 #[inline]
 fn learned(
     range: [u16; SLOTS],
@@ -217,29 +289,30 @@ impl Bounds {
     }
 }
 
-/// Surfaces a beam remembers: two at an edge, and one that may take the place of either.
+/// Number of surfaces per beam: two at an edge, and one that may replace either.
 const SLOTS: usize = 3;
-/// A surface's range moves by this part of its distance to the reading, in whole units: too slowly to follow somebody
-/// who walks.
+/// Divisor of the distance between a surface and a reading by which the surface moves, in whole units. Too slow to
+/// follow a person who walks.
 const DRAWN: i16 = 16;
 
-/// Weight of a scan in which the surface was met; it is fully known after as many scans as are set.
+/// Weight of a scan in which the surface was met. It is fully known after the configured number of scans.
 const MET: u16 = 8;
-/// A surface counts as met also in the scans just before from which nothing came back, at most so many with the one in
-/// which it was met, and at most one for so many that are set. So a wall from which 15 % of the beams come back is
-/// background after 5/4 of the scans that are set, and somebody who stands there no sooner for a beam that is lost.
+/// A surface also counts as met in the scans just before that had no return: at most this number, including the one in
+/// which it was met, and at most one per this number of configured scans. So a wall that returns 15 % of the beams is
+/// background after 5/4 of the configured scans, and a person who stands there no sooner because of a lost beam.
 const RETURNED: u16 = 16;
 const RETURNED_OF: u16 = 16;
-/// Weight lost in a scan that saw what is behind the surface: what was taken away is no background any more after 3/4
-/// of the scans that are set, and what is met in more than a third of the scans becomes one in the end.
+/// Weight lost in a scan that saw something behind the surface. An object that was removed is no longer background
+/// after 3/4 of the configured scans, and a surface that is met in more than a third of the scans finally becomes
+/// background.
 const PASSED: u16 = 4;
-/// Weight lost in a scan that saw something before the surface, which may still be there. Not 0: else all slots could
-/// be taken by a surface that stays hidden.
+/// Weight lost in a scan that saw something in front of the surface, which may still exist. Not 0, because otherwise
+/// all slots could be taken by hidden surfaces.
 const HIDDEN: u16 = 1;
-/// Weight per scan that is set, from which on a surface is background: 5/8 of the full weight, so that readings may be
+/// Weight per configured scan from which on a surface is background: 5/8 of the full weight, so that readings may be
 /// missing.
 const KNOWN: u16 = 5;
-/// Weight per scan that is set, below which a surface can be replaced.
+/// Weight per configured scan below which a surface can be replaced.
 const REPLACED: u16 = 2;
-/// Beams to either side among which one has to be known, to stand in for a beam that is not.
+/// Number of beams on either side among which one must be known, to replace an unknown one.
 const ASIDE: usize = 8;
