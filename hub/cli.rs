@@ -303,7 +303,8 @@ impl Limits {
 
 /// Parses the name of a family.
 fn family(text: &str) -> Result<Family, String> {
-    Family::parse(&text.to_lowercase()).ok_or_else(|| format!("lms, ld or rplidar, not {text:?}"))
+    let names = || Family::ALL.map(Family::name).join(", ");
+    Family::parse(&text.to_lowercase()).ok_or_else(|| format!("one of {}, not {text:?}", names()))
 }
 
 #[derive(Args, Debug)]

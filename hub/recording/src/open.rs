@@ -389,7 +389,10 @@ fn unrecognized(path: &Path, head: &[u8]) -> Failure {
         head.len(),
         counts.join(", ")
     );
-    let hint = "say which scanner sent it: family=lms, family=ld or family=rplidar of a link, or --family of the command";
+    let names = Family::ALL.map(Family::name).join(", ");
+    let hint = format!(
+        "name the family of the scanner, one of {names}: family=NAME of a link, or --family NAME of the command"
+    );
     Failure::new(Kind::Configuration, message, hint)
 }
 

@@ -33,14 +33,14 @@ impl FastSwitches {
         self.is_lost = false;
         if is_fast {
             self.is_pending = false;
-            return std::mem::take(&mut self.silent) > 0;
+            return core::mem::take(&mut self.silent) > 0;
         }
         false
     }
 
     /// Handles a request that got no reply in all its tries.
     pub(crate) fn give_up(&mut self) {
-        if std::mem::take(&mut self.is_pending) {
+        if core::mem::take(&mut self.is_pending) {
             self.silent = self.silent.saturating_add(1).min(MOST_SILENT);
             self.is_lost = true;
         }

@@ -23,7 +23,7 @@ pub fn family_of(bytes: &[u8]) -> Option<Family> {
 pub fn bytes_by_family(bytes: &[u8]) -> [(Family, usize); Family::ALL.len()] {
     let bytes = &bytes[..bytes.len().min(EXAMINED)];
     let mut counts = Family::ALL.map(|family| (family, accepted(family, bytes)));
-    counts.sort_by_key(|(_, accepted)| std::cmp::Reverse(*accepted));
+    counts.sort_by_key(|(_, accepted)| core::cmp::Reverse(*accepted));
     counts
 }
 
