@@ -68,16 +68,19 @@ pub(crate) fn demo(options: &DemoOptions, out: &mut dyn Write, stop: &AtomicBool
                 say_ready(out, &stage, options.json);
             }
         };
-        play(options, &stage, &mut show, &|| stop.load(Ordering::Relaxed))
+        play(options, &stage, &mut show, &|| stop.swap(false, Ordering::Relaxed))
     };
     drop(web);
     stage.tell_errors();
-    let (account, stopped) = played?;
+    let (account, end) = played?;
     account.summary(out, options.json);
+    if end == End::Hurried {
+        return Err(Failure::new(Kind::Interrupted, "interrupted before all telegrams had arrived", ""));
+    }
     if let Some(loss) = account.loss() {
         return Err(Failure::new(Kind::Check, loss, "is the machine too busy to run all processes?"));
     }
-    if stopped && options.run_for.is_some() {
+    if end == End::Stopped && options.run_for.is_some() {
         return Err(Failure::new(Kind::Interrupted, "interrupted before the time was over", ""));
     }
     Ok(())
@@ -90,7 +93,7 @@ fn play_with_picture(
     url: Option<&str>,
     out: &mut dyn Write,
     stop: &AtomicBool,
-) -> Result<(Account, bool), Failure> {
+) -> Result<(Account, End), Failure> {
     let picture = WatchOptions {
         sensors: Vec::new(),
         colours: colours(),
@@ -102,8 +105,8 @@ fn play_with_picture(
     thread::scope(|scope| {
         let play = scope.spawn(|| {
             let _over = Raise(&over);
-            let is_stopped = || stop.load(Ordering::Relaxed) || closed.load(Ordering::Relaxed);
-            play(options, stage, &mut |_, _| {}, &is_stopped)
+            let is_asked = || stop.swap(false, Ordering::Relaxed) | closed.swap(false, Ordering::Relaxed);
+            play(options, stage, &mut |_, _| {}, &is_asked)
         });
         let closing = Raise(&closed);
         let shown = verbs::watch(&picture, out, &over);
@@ -152,13 +155,26 @@ struct Ready<'a> {
     pid: u32,
 }
 
-/// Starts everybody and keeps account until the time is over or `is_stopped`, which is the second answer.
+/// How a demonstration ended.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum End {
+    /// The time was over.
+    TimeOver,
+    /// The user stopped it.
+    Stopped,
+    /// The user stopped it, and then did not wait for the telegrams that were on their way.
+    Hurried,
+}
+
+/// Starts all processes, and compares what is sent with what arrives until the time is over or the user stops the demonstration.
+/// `is_asked` returns whether the user has asked for the end since the last call. After that, the telegrams on their way still
+/// arrive, unless the user asks again.
 fn play(
     options: &DemoOptions,
     stage: &Stage,
     show: &mut dyn FnMut(&Account, Duration),
-    is_stopped: &dyn Fn() -> bool,
-) -> Result<(Account, bool), Failure> {
+    is_asked: &dyn Fn() -> bool,
+) -> Result<(Account, End), Failure> {
     let (lines, received) = mpsc::channel();
     let hub = stage.start_hub(lines.clone())?;
     let consumers = stage.start_consumers(&lines)?;
@@ -171,8 +187,8 @@ fn play(
     let mut first_sample: Option<Instant> = None;
     let begun = Instant::now();
     let mut next_look = begun;
-    let mut is_cut = false;
-    loop {
+    let mut end = None;
+    let end = loop {
         match received.recv_timeout(next_look.saturating_duration_since(Instant::now()).min(PATIENCE)) {
             Ok(Line::Said { of: TRACKER, text }) => account.take_news(text),
             Ok(Line::Said { of, text }) => {
@@ -207,22 +223,24 @@ fn play(
             ));
         }
         let over = options.run_for.zip(first_sample).is_some_and(|(limit, first)| first.elapsed() >= limit);
-        if !is_cut && (over || is_stopped()) {
-            // Telegrams that were sent by now arrive before any process is stopped.
-            account.cut();
-            is_cut = true;
+        match (end, is_asked()) {
+            (Some(_), true) => break End::Hurried,
+            (Some(end), false) if account.is_complete(LATE) => break end,
+            (None, is_asked) if is_asked || over => {
+                // Telegrams that were sent by now arrive before any process is stopped.
+                account.cut();
+                end = Some(if is_asked { End::Stopped } else { End::TimeOver });
+            }
+            _ => {}
         }
-        if is_cut && account.is_complete(LATE) {
-            break;
-        }
-    }
+    };
     drop(tilted);
     drop(tracker);
     drop(consumers);
     drop(hub);
     drop(simulators);
     account.read_truth();
-    Ok((account, is_stopped()))
+    Ok((account, end))
 }
 
 fn ended(of: usize) -> Failure {

@@ -54,9 +54,9 @@ pub(crate) struct Sensor {
     pub(crate) first_ns: u64,
     pub(crate) last_ns: u64,
     eeprom_writes: u64,
-    /// What the line took away, as the hub says, since its start.
-    pub(crate) damaged: Option<f64>,
-    pub(crate) lost_on_line: Option<u64>,
+    /// Counters of the line in the last status, and those before the first telegram.
+    line: Option<LineCounts>,
+    line_before: LineCounts,
     /// Samples of its telegrams that were published and that this program's subscriber did not receive.
     pub(crate) missed: u64,
     /// Hash of each telegram that was sent after the cut.
@@ -66,6 +66,15 @@ pub(crate) struct Sensor {
     is_past_cut: bool,
     /// Time at which the last telegram arrived.
     arrived_at: Option<Instant>,
+}
+
+/// Counters of a sensor's line since the start of the hub.
+#[derive(Clone, Copy, Default)]
+struct LineCounts {
+    read: u64,
+    damaged: u64,
+    /// `None` while the period of the scans is unknown.
+    lost: Option<u64>,
 }
 
 /// A moment in the hub's life: when, and how much processor time it had used.
@@ -129,9 +138,12 @@ impl Account {
             Some("status") => {
                 sensor.state = line["state"].as_str().unwrap_or_default().to_owned();
                 let count = |name: &str| line["counters"][name].as_u64().unwrap_or_default();
-                let (damaged, read) = (count("bytes_damaged"), count("bytes_read"));
-                sensor.damaged = (read > 0).then(|| damaged as f64 / read as f64);
-                sensor.lost_on_line = line["lost_on_line"].as_u64();
+                let (read, damaged) = (count("bytes_read"), count("bytes_damaged"));
+                let counts = LineCounts { read, damaged, lost: line["lost_on_line"].as_u64() };
+                sensor.line = Some(counts);
+                if sensor.arrived_at.is_none() {
+                    sensor.line_before = counts;
+                }
                 sensor.baud = line["baud"].as_u64().unwrap_or_default();
             }
             _ => {}
@@ -217,21 +229,17 @@ impl Account {
         let count = |of: fn(&Sensor) -> u64| lossy().map(of).sum::<u64>();
         let lost = Some(count(Sensor::lost)).filter(|&lost| lost > 0)?;
         let causes = [
-            (
-                count(|sensor| sensor.missed),
-                "samples that the hub published were missed by this program's subscribers",
-            ),
-            (count(|sensor| sensor.lost_on_line.unwrap_or_default()), "telegrams were lost on the line"),
-            (
-                count(|sensor| u64::from(!sensor.is_past_cut)),
-                "of the sensors sent no later telegram that arrived",
-            ),
+            (count(|sensor| sensor.missed), "published by the hub, but missed by this program's subscribers"),
+            (count(|sensor| sensor.lost_on_line().unwrap_or_default()), "lost on the line"),
         ];
         let causes =
             causes.iter().filter(|(count, _)| *count > 0).map(|(count, what)| format!("{count} {what}"));
-        let causes: Vec<String> = causes.collect();
+        let silent = Some(count(|sensor| u64::from(!sensor.is_past_cut))).filter(|&silent| silent > 0);
+        let silent = silent.map(|count| format!("no later telegram of {} arrived", counted(count, "sensor")));
+        let causes: Vec<String> = causes.chain(silent).collect();
         let causes = if causes.is_empty() { "for an unknown reason".into() } else { causes.join(", ") };
-        Some(format!("{lost} telegrams were sent and not received: {causes}"))
+        let (what, were) = (counted(lost, "telegram"), if lost == 1 { "was" } else { "were" });
+        Some(format!("{what} {were} sent and not received: {causes}"))
     }
 
     /// Prints a line per sensor.
@@ -250,21 +258,22 @@ impl Account {
                 nearest_mm: sensor.nearest_mm,
                 hub_cpu_percent: self.hub_cpu_percent,
                 eeprom_writes: sensor.eeprom_writes,
-                damaged: sensor.damaged,
-                lost_on_line: sensor.lost_on_line,
+                damaged: sensor.damaged(),
+                lost_on_line: sensor.lost_on_line(),
                 missed: sensor.missed,
             };
             let line = if json {
                 serde_json::to_string(&summary).unwrap_or_default()
             } else {
                 format!(
-                    "{:6} {}: {sent} telegrams sent, {} received, {lost} lost in {:.1} s, {} on the line, {} missed, {} Hz, \
+                    "{:6} {}: {} sent, {} received, {lost} lost in {:.1} s, {} on the line, {} missed, {} Hz, \
                      nearest {}, hub {:.1} % of a processor, {} EEPROM writes",
                     summary.sensor,
                     summary.state,
+                    counted(sent, "telegram"),
                     summary.received,
                     summary.seconds,
-                    sensor.lost_on_line.map_or("unknown".into(), |lost| lost.to_string()),
+                    summary.lost_on_line.map_or("unknown".into(), |lost| lost.to_string()),
                     summary.missed,
                     summary.hz.map_or("unknown".into(), |hz| format!("{hz:.2}")),
                     sensor.nearest_mm.map_or("nothing".into(), |mm| format!("{mm} mm")),
@@ -289,6 +298,20 @@ impl Sensor {
     /// Telegrams sent and not arrived, or not yet.
     pub(crate) fn lost(&self) -> u64 {
         self.missing.values().sum()
+    }
+
+    /// Returns the number of scans that the line lost since the first telegram, as the hub counts them. `None` while the hub
+    /// cannot tell.
+    pub(crate) fn lost_on_line(&self) -> Option<u64> {
+        let lost = self.line?.lost?;
+        Some(lost.saturating_sub(self.line_before.lost.unwrap_or_default()))
+    }
+
+    /// Returns the share of damaged bytes since the first telegram; `None` if none has been read.
+    fn damaged(&self) -> Option<f64> {
+        let (counts, before) = (self.line?, self.line_before);
+        let read = counts.read.saturating_sub(before.read);
+        (read > 0).then(|| counts.damaged.saturating_sub(before.damaged) as f64 / read as f64)
     }
 
     fn take_sent(&mut self, hash: &str) {
@@ -400,6 +423,11 @@ fn processor_time_ns(pid: u32) -> u64 {
 /// Command of a measured-value telegram.
 const MEASURED: u64 = 0xB0;
 
+/// Returns `count` with `what`, in the plural unless it is 1.
+pub(super) fn counted(count: u64, what: &str) -> String {
+    format!("{count} {what}{}", if count == 1 { "" } else { "s" })
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -454,15 +482,14 @@ mod tests {
         account.cut();
         account.read_truth();
         assert!(!account.is_complete(Duration::MAX) && account.is_complete(Duration::ZERO));
-        let silent =
-            "1 telegrams were sent and not received: 1 of the sensors sent no later telegram that arrived";
+        let silent = "1 telegram was sent and not received: no later telegram of 1 sensor arrived";
         assert_eq!(account.loss().as_deref(), Some(silent));
         let notice =
             serde_json::json!({ "class": "notice", "kind": "missed", "topic": "telegram", "missed": 1 });
         account.take(0, &notice);
         account.take(0, &telegram("63"));
         assert!(account.is_complete(Duration::MAX));
-        let missed = "1 samples that the hub published were missed by this program's subscribers";
+        let missed = "1 published by the hub, but missed by this program's subscribers";
         assert!(account.loss().is_some_and(|loss| loss.ends_with(missed)));
         account.take(0, &telegram("62"));
         assert_eq!(account.loss(), None);
@@ -475,5 +502,23 @@ mod tests {
         let turn = serde_json::json!({ "unit_um": 1000, "first_angle_deg": 0.0, "step_deg": -90.0, "ranges": [1, 2, 3, 4] });
         sensor.take_scan(&turn);
         assert_eq!(sensor.ranges, [2, 1, 4, 3].map(Some));
+    }
+
+    #[test]
+    fn losses_on_the_line_count_from_the_first_telegram_on() {
+        let mut account = Account::new(&[], Vec::new());
+        account.sensors.push(Sensor { name: "front".into(), ..Sensor::default() });
+        let status = |read: u64, damaged: u64, lost: Option<u64>| {
+            let counters = serde_json::json!({ "bytes_read": read, "bytes_damaged": damaged });
+            serde_json::json!({ "class": "status", "counters": counters, "lost_on_line": lost })
+        };
+        let mut told = |line: &Value| {
+            account.take(0, line);
+            (account.sensors[0].lost_on_line(), account.sensors[0].damaged())
+        };
+        assert_eq!(told(&status(1_000, 500, Some(7))), (Some(0), None));
+        told(&serde_json::json!({ "class": "telegram", "command": 0xB0, "data": "61" }));
+        assert_eq!(told(&status(2_000, 750, Some(9))), (Some(2), Some(0.25)));
+        assert_eq!(told(&status(3_000, 750, None)), (None, Some(0.125)));
     }
 }

@@ -3,6 +3,8 @@
 use serde::Serialize;
 use serde_json::Value;
 
+use super::account::counted;
+
 /// The sweeps so far: the last line, keys in the order of their contract.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
 pub(super) struct Tilted {
@@ -34,6 +36,7 @@ impl Tilted {
             return serde_json::to_string(self).unwrap_or_default();
         }
         let nearest = self.nearest_m.map_or(String::new(), |m| format!(", the nearest at {m:.2} m"));
-        format!("{:6} {} sweeps, {} obstacles in the last{nearest}", self.sensor, self.sweeps, self.obstacles)
+        let (sweeps, obstacles) = (counted(self.sweeps, "sweep"), counted(self.obstacles as u64, "obstacle"));
+        format!("{:6} {sweeps}, {obstacles} in the last{nearest}", self.sensor)
     }
 }

@@ -3,7 +3,7 @@
 use std::io::Write;
 use std::time::Duration;
 
-use super::account::{Account, Sensor};
+use super::account::{Account, Sensor, counted};
 
 /// What was said last.
 pub(crate) struct View {
@@ -61,14 +61,14 @@ fn sensor_lines(sensor: &Sensor) -> [String; 3] {
     };
     [
         format!(
-            "{:6} {:9} {:6} Bd  {:>5} Hz   {} telegrams   {} lost, {} on the line",
+            "{:6} {:9} {:6} Bd  {:>5} Hz   {}   {} lost, {} on the line",
             sensor.name,
             sensor.state,
             sensor.baud,
             sensor.hz().map_or("-".into(), |hz| format!("{hz:.2}")),
-            sensor.received_count,
+            counted(sensor.received_count, "telegram"),
             lost,
-            sensor.lost_on_line.unwrap_or_default(),
+            sensor.lost_on_line().unwrap_or_default(),
         ),
         format!("  left  {}  right", profile(sensor)),
         format!("        {:<COLUMNS$}", format!("(the taller, the nearer)   {nearest}")),

@@ -57,8 +57,13 @@ fn ends_as_counted(outcome: &Outcome, lost: u64) {
     assert_eq!(outcome.code, Some(if lost == 0 { 0 } else { 5 }), "{outcome}");
     if lost > 0 {
         let message = outcome.of_class("error")[0]["message"].to_string();
-        let begin = format!("\"{lost} telegrams were sent and not received: ");
-        assert!(message.starts_with(&begin) && message.contains("missed"), "{outcome}");
+        let telegrams =
+            if lost == 1 { "1 telegram was".to_owned() } else { format!("{lost} telegrams were") };
+        assert!(
+            message.starts_with(&format!("\"{telegrams} sent and not received: "))
+                && message.contains("missed"),
+            "{outcome}"
+        );
     }
 }
 
@@ -185,6 +190,41 @@ fn interrupted() {
     });
     let lost = outcome.of_class("summary").iter().map(|line| number(line, "lost")).sum();
     ends_as_counted(&outcome, lost);
+}
+
+#[test]
+fn second_interrupt_ends_at_once() {
+    let outcome = demo(&["--headless", "--json"], |mut program| {
+        let ready = program.await_line("ready", testkit::is_class("ready"));
+        let domain = ready["domain"].as_str().expect("a name");
+        let mut echo = beside(domain, &["echo", "front/scan"]);
+        echo.await_lines(2, "a scan", testkit::is_class("scan"));
+        assert_eq!(echo.end(INT).code, Some(0));
+        // Telegrams on their way from a simulator that does not run never arrive, so the demonstration waits for them.
+        let simulator = process_of(domain, "simulate");
+        rustix::process::kill_process(simulator, rustix::process::Signal::STOP).expect("it runs");
+        program.signal(INT);
+        until("it ends", || {
+            program.signal(INT);
+            program.is_over()
+        });
+        program.wait()
+    });
+    assert_eq!(outcome.code, Some(130), "{outcome}");
+    assert_eq!(outcome.of_class("error")[0]["message"], "interrupted before all telegrams had arrived");
+    assert_eq!(outcome.of_class("summary").len(), 2, "{outcome}");
+}
+
+/// Returns the process of a demonstration in `domain` that runs `verb`.
+fn process_of(domain: &str, verb: &str) -> rustix::process::Pid {
+    let entries = fs::read_dir("/proc").expect("procfs").flatten();
+    let is_meant = |path: &Path| {
+        let line = fs::read_to_string(path.join("cmdline")).unwrap_or_default();
+        line.split('\0').nth(1) == Some(verb) && line.split('\0').any(|word| word == domain)
+    };
+    let found = entries.map(|entry| entry.path()).find(|path| is_meant(path)).expect("it runs");
+    let pid = found.file_name().and_then(|name| name.to_str()).and_then(|name| name.parse().ok());
+    rustix::process::Pid::from_raw(pid.expect("a number")).expect("a process")
 }
 
 #[test]
