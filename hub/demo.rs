@@ -155,10 +155,10 @@ struct Ready<'a> {
     pid: u32,
 }
 
-/// How a demonstration ended.
+/// Reason for the end of a demonstration.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum End {
-    /// The time was over.
+    /// The configured time has elapsed.
     TimeOver,
     /// The user stopped it.
     Stopped,
@@ -166,9 +166,9 @@ enum End {
     Hurried,
 }
 
-/// Starts all processes, and compares what is sent with what arrives until the time is over or the user stops the demonstration.
-/// `is_asked` returns whether the user has asked for the end since the last call. After that, the telegrams on their way still
-/// arrive, unless the user asks again.
+/// Starts all processes, and compares sent telegrams with received ones until the configured time has elapsed or the user stops the
+/// demonstration. `is_asked` returns whether the user has requested the end since the last call. Telegrams on their way still
+/// arrive after that, unless there is another request.
 fn play(
     options: &DemoOptions,
     stage: &Stage,

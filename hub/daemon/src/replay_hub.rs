@@ -21,7 +21,7 @@ pub struct Replay<'a> {
     pub file: &'a Path,
     /// Of one with several sensors the only one to play; of one that names none the name that it gets.
     pub sensor: Option<&'a str>,
-    /// Family of a stream file, unless it is to be recognized by its bytes.
+    /// Family of a stream file; `None` if it is recognized by the bytes.
     pub family: Option<Family>,
     /// Where its sensors are configured.
     pub sources: &'a Sources,

@@ -221,7 +221,7 @@ struct Layout {
 }
 
 impl Layout {
-    /// Returns the layout of `scan`, of which at most `most` beams are used.
+    /// Returns the layout of `scan`. At most `most` beams are used.
     fn of(scan: &Scan, most: usize) -> Layout {
         let ScanHead { unit_um, valid_to, no_return, beyond, first_angle, step, .. } = **scan;
         let count = scan.beams().min(most);

@@ -26,7 +26,7 @@ use views::{Csv, Ros2, View, write_marks};
 pub struct ConvertOptions {
     /// The recording, of any form.
     pub input: PathBuf,
-    /// Family of a stream file, unless it is to be recognized by its bytes.
+    /// Family of a stream file; `None` if it is recognized by the bytes.
     pub family: Option<Family>,
     /// What it becomes: the form is that of the ending; `-` is a telegram stream on stdout.
     pub output: PathBuf,

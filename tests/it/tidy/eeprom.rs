@@ -38,10 +38,7 @@ fn nobody_writes_the_eeprom() {
                 "hub/drivers/src/lms/planted.rs",
                 "//! Writes.\nlet telegram = Writer::new(address, 0x66);\n",
             ),
-            tree.with(
-                "hub/drivers/src/lms/explain.rs",
-                "//! Writes.\nlet telegram = Writer::new(0, SET);\n",
-            ),
+            tree.with("hub/drivers/src/lms/explain.rs", "//! Writes.\nlet telegram = Writer::new(0, SET);\n"),
             tree.with("hub/drivers/src/lms/dialogue.rs", "//! Talks.\nuse crate::eeprom::Write;\n"),
             tree.with("hub/drivers/src/lms/session.rs", "//! Talks.\nuse crate::{Nanos, eeprom};\n"),
             tree.with(

@@ -216,7 +216,7 @@ impl Dialogue {
         now: Nanos,
     ) {
         self.quiet_since = now;
-        // The power cycle that brings back a lost scanner is no sign of a weak supply.
+        // A lost scanner needs a power cycle, so that restart does not count as a sign of a weak supply.
         let is_expected_restart = self.fast_switches.have_lost();
         // A telegram that was read before a change of the rate arrived at the previous rate.
         let is_fast = self.baud == FAST && self.change_baud.is_none();

@@ -11,7 +11,7 @@ use crate::lms::framer::{Framer, VETO_HOLD};
 pub const EXAMINED: usize = 64 * 1024;
 
 /// Returns the family whose telegrams or packets take most of the first [`EXAMINED`] bytes of `bytes`, and at least half of
-/// them. `None` if no family does.
+/// them. `None` if there is no such family.
 pub fn family_of(bytes: &[u8]) -> Option<Family> {
     let examined = bytes.len().min(EXAMINED);
     let [(first, most), ..] = bytes_by_family(bytes);
@@ -27,7 +27,7 @@ pub fn bytes_by_family(bytes: &[u8]) -> [(Family, usize); Family::ALL.len()] {
     counts
 }
 
-/// Returns the name of a scan mode that tells how to split `bytes` into packets of `family`. `None` if the bytes tell that
+/// Returns the name of a scan mode that defines how to split `bytes` into packets of `family`. `None` if the bytes define it
 /// themselves. Packets of some modes look alike, so another mode may be the right one to decode them.
 pub fn framing_mode(family: Family, bytes: &[u8]) -> Option<&'static str> {
     packets(family, &bytes[..bytes.len().min(EXAMINED)])?.1

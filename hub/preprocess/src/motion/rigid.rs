@@ -62,7 +62,7 @@ impl Rigid {
 /// Three rows.
 pub(super) type Square = [[f64; 3]; 3];
 
-/// `m` + factor v v'.
+/// Adds factor v v' to `m`.
 #[inline]
 pub(super) fn add_outer(m: &mut Square, v: &[f64; 3], factor: f64) {
     for i in 0..3 {
@@ -72,12 +72,12 @@ pub(super) fn add_outer(m: &mut Square, v: &[f64; 3], factor: f64) {
     }
 }
 
-/// a b.
+/// Returns a b.
 pub(super) fn product(a: &Square, b: &Square) -> Square {
     std::array::from_fn(|i| std::array::from_fn(|j| (0..3).map(|k| a[i][k] * b[k][j]).sum()))
 }
 
-/// a b a'.
+/// Returns a b a'.
 pub(super) fn around(a: &Square, b: &Square) -> Square {
     let transposed: Square = std::array::from_fn(|i| std::array::from_fn(|j| a[j][i]));
     product(&product(a, b), &transposed)
