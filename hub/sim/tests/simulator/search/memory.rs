@@ -41,6 +41,7 @@ fn finds_a_remembered_lms_soon() {
                 baud: Baud::B500000,
                 listen_only: false,
                 fixed_rate: false,
+                keep_baud: false,
             };
             let begin = |now| {
                 let mut session = lms::Session::new(settings, now);
