@@ -150,7 +150,8 @@ impl Bench {
     }
 }
 
-const AUTO: Settings = Settings { model: None, beams: None, most_beams: None, fixed_rate: false, listen_only: false };
+const AUTO: Settings =
+    Settings { model: None, beams: None, most_beams: None, fixed_rate: false, listen_only: false };
 
 fn of(model: Model) -> Settings {
     Settings { model: Some(model), ..AUTO }
