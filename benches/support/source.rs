@@ -29,12 +29,14 @@ impl Source {
         let limits = TopicLimits { consumers: 200, ..TopicLimits::default() };
         let waker = Waker::new(&node, SENSOR)?;
         let service = Scan::create(&node, SENSOR, &limits)?;
+        let status = Status::create(&node, SENSOR, &limits)?;
+        lock.report_ready()?;
         Ok(Source {
             publisher: Scan::publisher(&service, &limits)?,
             waker,
             next: 0,
             _service: service,
-            _status: Status::create(&node, SENSOR, &limits)?,
+            _status: status,
             _node: node,
             _lock: lock,
         })

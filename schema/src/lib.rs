@@ -75,7 +75,7 @@ pub use zones::{Early, Verdict, ZONES, Zone, Zones};
 #[cfg(feature = "ipc")]
 pub use directory::Directory;
 #[cfg(feature = "ipc")]
-pub use lock::{HubLock, ListenLock, NameLock, holder, publisher};
+pub use lock::{HubLock, ListenLock, NameLock, holder, is_starting, publisher};
 #[cfg(feature = "ipc")]
 pub use running::{RunningHub, shell_word};
 #[cfg(feature = "json")]

@@ -18,7 +18,7 @@ use crate::{Directory, Failure, Kind, ipc, shortage};
 /// node.
 #[derive(Debug)]
 pub struct HubLock {
-    _publishing: Publishing,
+    publishing: Publishing,
 }
 
 impl HubLock {
@@ -29,7 +29,18 @@ impl HubLock {
     /// [`Kind::DomainHeld`] if another hub has it (the message names its pid), [`Kind::Failed`] if the directory is
     /// another user's or cannot be created.
     pub fn acquire(root: &Path) -> Result<HubLock, Failure> {
-        Ok(HubLock { _publishing: Publishing::acquire(root, HUB, "hub")? })
+        Ok(HubLock { publishing: Publishing::acquire(root, HUB, "hub")? })
+    }
+
+    /// Reports to clients that all topics exist. Until then, [`is_starting`] is true.
+    ///
+    /// # Errors
+    ///
+    /// [`Kind::Failed`] if the lock's file cannot be written.
+    pub fn report_ready(&self) -> Result<(), Failure> {
+        let Publishing { root, held, .. } = &self.publishing;
+        let content = format!("{}\n{READY}\n", std::process::id());
+        held.file.write_all_at(content.as_bytes(), 0).map_err(|error| unusable(root, &error))
     }
 }
 
@@ -86,13 +97,13 @@ impl Drop for NameLock {
 struct Publishing {
     root: PathBuf,
     name: &'static str,
-    _held: Held,
+    held: Held,
 }
 
 impl Publishing {
     fn acquire(root: &Path, name: &'static str, who: &str) -> Result<Publishing, Failure> {
         Ok(Publishing {
-            _held: Held::acquire(root, name, |pid| held(root, who, pid))?,
+            held: Held::acquire(root, name, |pid| held(root, who, pid))?,
             root: root.to_owned(),
             name,
         })
@@ -180,6 +191,19 @@ pub fn holder(root: &Path) -> Result<Option<u32>, Failure> {
     holder_of(root, HUB)
 }
 
+/// Returns whether a hub lives in `root` that does not have all its topics yet.
+///
+/// # Errors
+///
+/// As [`holder`].
+pub fn is_starting(root: &Path) -> Result<bool, Failure> {
+    if holder(root)?.is_none() {
+        return Ok(false);
+    }
+    let file = Directory::open(root)?.map(|directory| directory.file(HUB)).transpose()?.flatten();
+    Ok(file.is_some_and(|file| content(&file).lines().nth(1) != Some(READY)))
+}
+
 /// Returns the process that publishes in `root`: the hub, or else a listener; failures and 0 as with [`holder`].
 ///
 /// # Errors
@@ -208,6 +232,8 @@ fn holder_of(root: &Path, name: &str) -> Result<Option<u32>, Failure> {
 const HUB: &str = "hub.lock";
 const LISTENER: &str = "listen.lock";
 const MAKING: &str = "making.lock";
+/// Second line of the file of a hub's lock once all topics exist.
+const READY: &str = "ready";
 
 /// A lock of the whole file, however long; `l_pid` has to be 0 for open file descriptions.
 fn whole_file(kind: libc::c_int) -> flock {
@@ -222,9 +248,13 @@ fn whole_file(kind: libc::c_int) -> flock {
 
 /// The lock itself tells no pid (the kernel answers -1), the file's content does.
 fn pid_in(file: &File) -> u32 {
-    let mut bytes = [0; 16];
+    content(file).lines().next().and_then(|pid| pid.parse().ok()).unwrap_or_default()
+}
+
+fn content(file: &File) -> String {
+    let mut bytes = [0; 32];
     let length = file.read_at(&mut bytes, 0).unwrap_or_default();
-    str::from_utf8(&bytes[..length]).ok().and_then(|text| text.trim_end().parse().ok()).unwrap_or_default()
+    String::from_utf8_lossy(&bytes[..length]).into_owned()
 }
 
 fn held(root: &Path, who: &str, pid: u32) -> Failure {

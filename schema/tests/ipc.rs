@@ -10,7 +10,7 @@ use schema::ipc::{self, Payload, PortFactory, SharedMemory, Waker};
 use schema::limits::TopicLimits;
 use schema::{
     Contents, Failure, Header, HubLock, Kind, ListenLock, Request, Response, Scan, ScanHead, Status,
-    Telegram, Topic, Verb, Wake, holder, limits, publisher,
+    Telegram, Topic, Verb, Wake, holder, is_starting, limits, publisher,
 };
 
 #[test]
@@ -208,16 +208,19 @@ fn one_hub_holds_a_domain() {
     let root = place.domain.root();
     assert_eq!(holder(root), Ok(None));
     let lock = HubLock::acquire(root).unwrap();
-    assert_eq!(holder(root), Ok(Some(std::process::id())));
+    assert_eq!((holder(root), is_starting(root)), (Ok(Some(std::process::id())), Ok(true)));
+    lock.report_ready().unwrap();
+    assert_eq!((holder(root), is_starting(root)), (Ok(Some(std::process::id())), Ok(false)));
     let second = HubLock::acquire(root).unwrap_err();
     assert_eq!(second.kind, Kind::DomainHeld);
     assert!(second.message.contains(&format!("pid {}", std::process::id())), "{second}");
     drop(lock);
-    assert_eq!(holder(root), Ok(None));
+    assert_eq!((holder(root), is_starting(root)), (Ok(None), Ok(false)));
     let listener = ListenLock::acquire(root).unwrap();
     assert_eq!((holder(root), publisher(root)), (Ok(None), Ok(Some(std::process::id()))));
     assert!(ListenLock::acquire(root).unwrap_err().message.starts_with("another listener holds "));
     let _again = HubLock::acquire(root).unwrap();
+    assert_eq!(is_starting(root), Ok(true), "nothing is left of the previous hub");
     drop(listener);
     assert_eq!(publisher(root), Ok(Some(std::process::id())));
 }

@@ -5,7 +5,7 @@ use std::os::fd::{AsFd, BorrowedFd};
 use std::time::{Duration, Instant};
 
 use schema::ipc::{self, Node, Payload, Subscriber};
-use schema::{Domain, Failure, Kind, Topic, holder};
+use schema::{Domain, Failure, Kind, Topic, holder, is_starting};
 
 use crate::presence::{Change, Presence, Who};
 use crate::readiness::Readiness;
@@ -111,6 +111,11 @@ impl Session {
     /// Returns whether there is a hub, and not only a listener that stands for those of other machines.
     pub fn hub_lives(&self) -> bool {
         self.domain().is_some_and(|domain| matches!(holder(domain.root()), Ok(Some(_))))
+    }
+
+    /// Returns whether there is a hub that does not have all its topics yet.
+    pub fn hub_is_starting(&self) -> bool {
+        self.domain().is_some_and(|domain| is_starting(domain.root()) == Ok(true))
     }
 
     /// Returns what to tell who cannot wait for a hub.

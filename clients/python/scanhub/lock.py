@@ -104,8 +104,8 @@ def _acquire(domain: Domain, name: str) -> int:
 
 def _written(file: int) -> int:
     """The lock itself tells no process, the file's content does."""
-    text = os.pread(file, 16, 0).strip()
-    return int(text) if text.isdigit() else 0
+    lines = os.pread(file, 32, 0).split()
+    return int(lines[0]) if lines and lines[0].isdigit() else 0
 
 
 def _whole_file(kind: int) -> bytes:

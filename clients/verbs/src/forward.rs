@@ -155,7 +155,7 @@ impl Forwarder {
                 }
             }
         }
-        if !self.is_checked && called.age >= GRACE {
+        if !self.is_checked && called.age >= GRACE && !self.session.hub_is_starting() {
             let is_there = |name: &&str| called.sensors.iter().any(|it| it == name);
             let demanded = self.demanded.iter().map(String::as_str);
             if let Some(name) =

@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 
 use scanhub_client::clock;
 use scanhub_client::streams::{Follower, GRACE, Session, find};
-use schema::{Counter, Domain, Failure, Family, Kind, Pose, Status, check_followed, ipc};
+use schema::{Counter, Domain, Failure, Family, Kind, Pose, Status, check_followed, ipc, is_starting};
 
 use crate::json;
 use crate::names::{as_word, no_sensor};
@@ -56,7 +56,9 @@ fn wanted(sensor: Option<&str>, domain: &Domain) -> Result<Vec<String>, Failure>
         match sensor {
             None => return Ok(sensors),
             Some(sensor) if sensors.iter().any(|it| it == sensor) => return Ok(vec![sensor.to_owned()]),
-            Some(sensor) if Instant::now() >= give_up_at => return Err(no_sensor(sensor, &sensors)),
+            Some(sensor) if Instant::now() >= give_up_at && !is_starting(domain.root())? => {
+                return Err(no_sensor(sensor, &sensors));
+            }
             Some(_) => std::thread::sleep(ASK_AGAIN),
         }
     }

@@ -102,7 +102,7 @@ pub(crate) fn serve(
     let service = Service::of_process();
     preflight::raise_descriptor_limit();
     let signals = Signals::of_process()?;
-    let _lock = HubLock::acquire(domain.root())?;
+    let lock = HubLock::acquire(domain.root())?;
     // What is known of sensors is no recording's.
     let state = StateDirectory::of_domain(domain.name()).filter(|_| set.is_none());
     preflight::check_descriptors(config.links.len())?;
@@ -177,6 +177,9 @@ pub(crate) fn serve(
         ready.waiting.sort_by_key(|name| ready.sensors.iter().position(|sensor| sensor == name));
         if outcome.is_ok() {
             outcome = shortage::allocate(domain);
+        }
+        if outcome.is_ok() {
+            outcome = lock.report_ready();
         }
         if outcome.is_ok() {
             on_ready(&ready);

@@ -192,7 +192,9 @@ impl FakeHub {
             begun_ns: 1_000_000_000,
             period_us: 26_640,
         };
-        FakeHub { sensors: sensors.iter().map(sensor).collect(), _node: node, _lock: lock }
+        let sensors = sensors.iter().map(sensor).collect();
+        lock.report_ready().unwrap();
+        FakeHub { sensors, _node: node, _lock: lock }
     }
 
     pub(crate) fn front(&mut self) -> &mut FakeSensor {

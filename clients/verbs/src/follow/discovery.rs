@@ -47,6 +47,10 @@ impl Run<'_> {
             return Ok(());
         }
         self.asked_at = Some(Instant::now());
+        // On a busy machine, a hub may take seconds to create its topics.
+        if self.session.hub_is_starting() {
+            return Ok(());
+        }
         // A hub that came to a listener has to make its topics first.
         let lives = self.session.hub_lives();
         self.hub_lives_since = if lives { self.hub_lives_since.or(Some(Instant::now())) } else { None };

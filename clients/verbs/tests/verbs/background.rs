@@ -26,8 +26,8 @@ impl Keeper {
         let flag = stop.clone();
         let (ready, is_ready) = std::sync::mpsc::channel();
         let thread = std::thread::spawn(move || {
-            let _lock = lock;
             let server = ControlServer::create(&ipc::hub_node(&domain).unwrap()).unwrap();
+            lock.report_ready().unwrap();
             ready.send(()).unwrap();
             while !flag.load(Ordering::Relaxed) {
                 while let Some(asked) = server.receive().unwrap() {
