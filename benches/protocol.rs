@@ -4,7 +4,6 @@
 #![allow(missing_docs)] // criterion's macros make public functions
 
 use criterion::{Criterion, criterion_group, criterion_main};
-use daemon::scanner;
 use fastrand::Rng;
 use scanhub_drivers::lms::crc::crc;
 use scanhub_drivers::lms::framer::{Found, Framer};
@@ -73,7 +72,7 @@ fn decoding(c: &mut Criterion) {
     c.bench_function("decode of 361 beams", |b| {
         b.iter(|| {
             let measured = Measured::decode(black_box(telegram)).expect("a scan");
-            scanner::decode(&measured, black_box(Mode(1)), &mut scan);
+            measured.scan(black_box(Mode(1))).write(&mut scan);
             black_box(&mut scan);
         });
     });

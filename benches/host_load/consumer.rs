@@ -6,7 +6,6 @@ use std::hint::black_box;
 use std::path::Path;
 use std::thread;
 
-use daemon::scanner;
 use preprocess::{background, marks, segments, zones};
 use rustix::fs::{OFlags, fcntl_setfl};
 use scanhub_drivers::lms;
@@ -161,7 +160,7 @@ impl Processors {
     /// Processes `telegram`, and returns whether it was a scan.
     fn take(&mut self, telegram: Telegram<'_>) -> bool {
         let Some(measured) = Measured::decode(telegram) else { return false };
-        scanner::decode(&measured, MODE, &mut self.scan);
+        measured.scan(MODE).write(&mut self.scan);
         self.zones.update(&self.scan, &mut self.near);
         self.marks.update(&self.scan, &mut self.found);
         self.model.update(&self.scan, &mut self.foreground);

@@ -9,7 +9,7 @@ mod surroundings;
 
 use lms_configure::eeprom::Write;
 use scanhub_drivers::line::Control;
-use scanhub_drivers::line::{Output, Session as _};
+use scanhub_drivers::line::{Event, Output, Protocol as _, Session as _};
 use scanhub_drivers::lms;
 use scanhub_drivers::lms::Session;
 use scanhub_drivers::lms::Settings;
@@ -127,6 +127,7 @@ pub fn session(data: &[u8]) {
         listen_only: variant & 0xC0 == 0xC0,
         fixed_rate: variant & 0x20 != 0,
         keep_baud: variant & 0x10 != 0,
+        mode: None,
     };
     let mut now: Nanos = 1_000 * MILLIS;
     let mut session = Session::new(settings, now);
@@ -138,16 +139,17 @@ pub fn session(data: &[u8]) {
         let mut until = Nanos::MAX;
         loop {
             match session.poll_output() {
-                Output::Transmit { byte, not_before } if what & 0x80 == 0 => {
+                Output::Transmit { bytes, not_before } if what & 0x80 == 0 => {
                     now = now.max(not_before);
-                    said.push(byte);
+                    said.extend(bytes);
                     session.transmitted(now);
                 }
                 Output::Transmit { .. } => break,
                 Output::SetDtr(_) => panic!("such a scanner has nothing at this line"),
                 Output::SetRate(baud) => assert!(baud == settings.baud.rate() || !settings.fixed_rate),
-                Output::Heard(received) => {
-                    assert!(Telegram::check(received.message.telegram.bytes()).is_some());
+                Output::Event(Event::Scan(_)) => panic!("a telegram is a scan"),
+                Output::Event(Event::Telegram(received)) => {
+                    assert!(Telegram::check(received.bytes).is_some());
                     assert!(received.first <= received.last && received.last <= now);
                 }
                 Output::Rest(at) | Output::Wait { until: at, .. } => {

@@ -1,6 +1,5 @@
 //! Scans as the hub publishes them, from the values that a simulated LMS sends: the hub's own decoder splits them.
 
-use daemon::scanner;
 use scanhub_drivers::lms::measured::{self, Measured};
 use scanhub_drivers::lms::variant::{Mode, Unit};
 use schema::Scan;
@@ -12,7 +11,8 @@ pub(crate) const MODE: Mode = Mode(1);
 pub(crate) fn scan(words: &[u16], unit: Unit) -> Box<Scan> {
     let telegram = measured::encode(0, unit, words, 0x10);
     let measured = Measured::decode(telegram.telegram()).expect("as many words as a variant has");
-    let mut scan = Scan::zeroed(scanner::len(&measured));
-    scanner::decode(&measured, MODE, &mut scan);
+    let raw = measured.scan(MODE);
+    let mut scan = Scan::zeroed(raw.len());
+    raw.write(&mut scan);
     scan
 }

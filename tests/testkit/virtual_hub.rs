@@ -171,7 +171,7 @@ impl Line for Bytes {
         Ok(len)
     }
 
-    fn write(&self, _: u8) -> io::Result<()> {
+    fn write(&self, _: &[u8]) -> io::Result<()> {
         Ok(())
     }
 

@@ -6,6 +6,7 @@ use std::fmt;
 
 use preprocess::background::{Candidate, Method, Start};
 use preprocess::{lines, marks, motion, zones};
+use scanhub_drivers::Settings;
 use schema::limits::TopicLimits;
 use schema::{Failure, Pose};
 use serde::Serialize;
@@ -15,7 +16,6 @@ use toml::de::{DeTable, DeValue};
 use crate::gateway::Gateway;
 use crate::link::{Config, Link};
 use crate::processing::{Background, Zones};
-use crate::scanner::Scanner;
 use crate::sources::{Origin, Sources};
 
 /// One value in effect.
@@ -57,23 +57,23 @@ impl List {
         let of = |key: &'static str| (name.as_str(), key);
         self.put(of("port"), json!(port.name()), DEFAULT);
         // A family that no source sets follows from the model.
-        let by_model = match scanner {
-            Scanner::Turning(turning) => format!("default of {}", turning.model.name),
-            Scanner::Lms => DEFAULT.to_owned(),
-        };
+        let features = scanner.features();
+        let reports_model = features.models.is_empty();
+        let by_model =
+            if reports_model { DEFAULT.to_owned() } else { format!("default of {}", scanner.model().name) };
         self.put(of("family"), json!(link.family().name()), &by_model);
-        match scanner {
-            Scanner::Lms => self.lms(link),
-            Scanner::Turning(turning) => {
-                self.put(of("model"), json!(turning.model.name), DEFAULT);
-                self.put(of("beams"), json!(turning.beams), DEFAULT);
-                if !turning.features.modes.is_empty() {
-                    self.put(of("mode"), json!(turning.mode.unwrap_or("auto")), DEFAULT);
-                }
-                if turning.features.can_rest {
-                    let idle = if turning.stop_when_idle { "stop" } else { "run" };
-                    self.put(of("idle"), json!(idle), DEFAULT);
-                }
+        let settings = &scanner.settings;
+        if reports_model {
+            self.reported(link);
+        } else {
+            self.put(of("model"), json!(scanner.model().name), DEFAULT);
+            self.put(of("beams"), json!(settings.beams), DEFAULT);
+            if !features.modes.is_empty() {
+                self.put(of("mode"), json!(settings.mode.unwrap_or("auto")), DEFAULT);
+            }
+            if features.can_rest {
+                let idle = if settings.stop_when_idle { "stop" } else { "run" };
+                self.put(of("idle"), json!(idle), DEFAULT);
             }
         }
         let Pose { x_m, y_m, yaw_rad, upside_down, .. } = processing.pose;
@@ -98,25 +98,27 @@ impl List {
         self.put(of("motion.max_step"), json!(max_step_m), DEFAULT);
         self.put(of("motion.max_turn"), json!(max_turn_deg), DEFAULT);
         self.put(of("motion.min_overlap"), json!(min_overlap), DEFAULT);
-        if let Scanner::Lms = link.scanner {
+        if features.has_whole_telegrams {
             self.put(of("early.pieces"), json!(processing.early.pieces), DEFAULT);
         }
         self.background(name, &processing.background);
     }
 
-    fn lms(&mut self, link: &Link) {
-        let Link { name, family, variant, unit, mode, baud, .. } = link;
+    /// Adds the settings of a scanner that reports its model.
+    fn reported(&mut self, Link { name, scanner, .. }: &Link) {
         let of = |key: &'static str| (name.as_str(), key);
-        let by_type = match family {
-            Some(family) => format!("default of {}", family.name()),
+        let by_type = match scanner.expected_type {
+            Some(name) => format!("default of {name}"),
             None => DEFAULT.to_owned(),
         };
-        self.put(of("type"), json!(family.map(|family| family.name())), DEFAULT);
-        self.put(of("angle"), json!(variant.angle_deg), &by_type);
-        self.put(of("resolution"), json!(f64::from(variant.resolution_cdeg) / 100.0), &by_type);
-        self.put(of("unit"), json!(unit.map(|unit| if unit.mm() == 1 { "mm" } else { "cm" })), DEFAULT);
-        self.put(of("mode"), json!(mode.map(|mode| mode.0)), DEFAULT);
-        self.put(of("baud"), json!(baud.rate()), DEFAULT);
+        let Settings { view, unit_mm, mode_number, .. } = scanner.settings;
+        let (angle_deg, resolution_cdeg) = view.unzip();
+        self.put(of("type"), json!(scanner.expected_type), DEFAULT);
+        self.put(of("angle"), json!(angle_deg), &by_type);
+        self.put(of("resolution"), json!(resolution_cdeg.map(|cdeg| f64::from(cdeg) / 100.0)), &by_type);
+        self.put(of("unit"), json!(unit_mm.map(|mm| if mm == 1 { "mm" } else { "cm" })), DEFAULT);
+        self.put(of("mode"), json!(mode_number), DEFAULT);
+        self.put(of("baud"), json!(scanner.rate()), DEFAULT);
     }
 
     fn zones(&mut self, link: &str, zones: &Zones) {

@@ -4,6 +4,7 @@
 use std::rc::Rc;
 
 use port::Source;
+use scanhub_drivers::Settings;
 use scanhub_drivers::lms::family::Family;
 use scanhub_drivers::lms::variant::{Baud, Mode, Unit, Variant};
 use schema::limits::TopicLimits;
@@ -17,7 +18,7 @@ use crate::processing::{
     BackgroundLayer, EarlyLayer, LinesLayer, MarksLayer, MotionLayer, PoseLayer, Processing, Sections,
     ZonesLayer,
 };
-use crate::scanner::{Scanner, ScannerDraft, ScannerLayer, remedy_of_lms};
+use crate::scanner::{ScannerDraft, ScannerLayer, remedy_of_lms};
 use crate::sources::Origin;
 use crate::zone_coverage::ZoneCoverage;
 
@@ -129,8 +130,8 @@ impl Draft {
             Failure::new(Kind::Configuration, format!("{place}: link {name}: {what}"), remedy)
         };
         let port = port.ok_or_else(|| refuse(&place, "no port".into(), "add port = \"/dev/ttyUSB0\""))?;
-        let scanner = scanner.finish(refuse)?;
-        if scanner != Scanner::Lms {
+        let mut scanner = scanner.finish(refuse)?;
+        if !scanner.features().models.is_empty() {
             let said = |place: Option<&String>, key| place.map(|place| (place.clone(), key));
             let of_lms = [
                 said(family.as_ref().map(|said| &said.place), "type"),
@@ -145,9 +146,6 @@ impl Draft {
                 return Err(refuse(&place, what, &remedy_of_lms(key, &scanner)));
             }
         }
-        let unit = unit.map(|said| said.value);
-        let is_baud_set = baud.is_some();
-        let baud = baud.map_or(Baud::B500000, |said| said.value);
         if let Some(mode) = mode.as_ref().filter(|_| !matches!(port, Source::File { .. })) {
             let what = format!("the mode of {} is read from the sensor", port.name());
             return Err(refuse(
@@ -183,6 +181,16 @@ impl Draft {
             let what = format!("an {} does not scan {angle_deg} degrees: {why}", family.name());
             return Err(refuse(angle_place, what, "angle = 100"));
         }
+        if scanner.features().models.is_empty() {
+            scanner.expected_type = family.map(Family::name);
+            scanner.settings = Settings {
+                view: Some((variant.angle_deg, variant.resolution_cdeg)),
+                baud: baud.map(|said| said.value.rate()),
+                unit_mm: unit.map(|said| said.value.mm()),
+                mode_number: mode.map(|said| said.value.0),
+                ..scanner.settings
+            };
+        }
         let mut processing = Processing::default();
         let said: Vec<_> = general.iter().chain(&own).collect();
         for (origin, sections) in &said {
@@ -190,9 +198,7 @@ impl Draft {
         }
         let start =
             said.iter().rev().find_map(|(origin, sections)| Some(origin.place(Some(sections.start()?))));
-        let mode = mode.map(|said| said.value);
-        let mut link =
-            Link { name, port, scanner, family, variant, unit, mode, baud, is_baud_set, processing };
+        let mut link = Link { name, port, scanner, processing };
         ZoneCoverage { link: &link, place: &place, said }.check()?;
         own.iter().try_for_each(|(origin, sections)| sections.check_family(origin, link.family()))?;
         let mut background = std::mem::take(&mut link.processing.background);

@@ -16,7 +16,7 @@ pub use effective::{Value, values};
 pub use gateway::Gateway;
 pub use link::{Config, Link};
 pub use processing::{Background, Processing, Zones};
-pub use scanner::{Scanner, Turning};
+pub use scanner::Scanner;
 pub use sources::Sources;
 
 /// Configuration file to start from, with the default values.

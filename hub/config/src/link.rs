@@ -1,11 +1,9 @@
-//! The links of a hub, each with its port and the settings of its sensor: values in effect. Refuses to know where they
-//! were set.
+//! The links of a hub, each with its port and the settings of its sensor: values in effect.
 
 use port::Source;
-use scanhub_drivers::lms::family::Family;
-use scanhub_drivers::lms::variant::{Baud, MAX_BEAMS, Mode, Unit, Variant};
+use scanhub_drivers::{Features, Settings, scan_heads};
 use schema::limits::TopicLimits;
-use schema::{Background, Contents};
+use schema::{Background, Family};
 
 use crate::processing::Processing;
 use crate::scanner::Scanner;
@@ -33,20 +31,8 @@ pub struct Link {
     pub name: String,
     /// The source of its bytes.
     pub port: Source,
-    /// Of which family its scanner is.
+    /// Family and settings of its scanner.
     pub scanner: Scanner,
-    /// The expected type of the sensor, if it is set: settings that the type does not support are refused.
-    pub family: Option<Family>,
-    /// Angle and resolution.
-    pub variant: Variant,
-    /// The expected unit of the sensor, if it is set; it is compared, never written.
-    pub unit: Option<Unit>,
-    /// Measuring mode of a recording that does not contain it; a sensor is asked.
-    pub mode: Option<Mode>,
-    /// Rate to stream at.
-    pub baud: Baud,
-    /// Whether the rate is set. Otherwise, the hub may use a lower one on a line that cannot carry it.
-    pub is_baud_set: bool,
     /// How its scans are processed.
     pub processing: Processing,
 }
@@ -54,65 +40,53 @@ pub struct Link {
 impl Link {
     /// Returns the rate at which its port is opened, in bits per second.
     pub fn rate(&self) -> u32 {
-        match self.scanner {
-            Scanner::Lms => self.baud.rate(),
-            Scanner::Turning(turning) => turning.model.baud,
-        }
+        self.scanner.rate()
     }
 
-    /// Returns the highest rate of what may be behind its port, which a serial server has whatever is configured here.
-    pub fn most_rate(&self) -> u32 {
-        match self.scanner {
-            Scanner::Turning(turning) if !matches!(self.port, Source::Tty(_)) => turning.most_rate(),
-            _ => self.rate(),
-        }
+    /// Returns the highest rate that the scanner can have at its port.
+    pub fn max_rate(&self) -> u32 {
+        self.scanner.max_rate_at(&self.port)
     }
 
-    /// Returns the most beams of a scan of its sensor.
-    pub fn beams(&self) -> usize {
-        match self.scanner {
-            Scanner::Lms => MAX_BEAMS,
-            Scanner::Turning(turning) => turning.most_beams(),
-        }
+    /// Returns the maximum number of beams of a scan.
+    pub fn max_beams(&self) -> usize {
+        self.scanner.max_beams()
     }
 
-    /// Returns what its topics are made for, where those of all links are made as `all` says.
+    /// Returns the limits of its topics. `all` are those of all links.
     pub fn limits(&self, all: &TopicLimits) -> TopicLimits {
-        match self.scanner {
-            Scanner::Lms => *all,
-            Scanner::Turning(_) => TopicLimits { beams: self.beams(), contents: Contents::TURNING, ..*all },
-        }
+        let &Features { contents, max_telegram, .. } = self.scanner.features();
+        TopicLimits { beams: self.max_beams(), contents, telegram: max_telegram, ..*all }
     }
 
     /// Returns the family of its scanner.
-    pub fn family(&self) -> schema::Family {
-        match self.scanner {
-            Scanner::Lms => schema::Family::Lms,
-            Scanner::Turning(turning) => turning.family,
-        }
+    pub fn family(&self) -> Family {
+        self.scanner.family
     }
 
-    /// Whether `model` may be of its sensor, as far as that is known.
+    /// Returns the settings of a session at its port. Nothing can be sent to a recording.
+    pub fn settings(&self) -> Settings {
+        self.scanner.settings_at(&self.port, matches!(self.port, Source::File { .. }))
+    }
+
+    /// Checks whether `model` may belong to its sensor, as far as that is known.
     ///
     /// # Errors
     ///
-    /// The beams and the unit that such a model has, in words.
+    /// Returns the beams and the unit that such a model has, as text.
     pub fn fits(&self, model: &Background) -> Result<(), String> {
-        let (fits, beams, unit_mm) = match self.scanner {
-            Scanner::Lms => {
-                let (beams, unit) = (self.variant.beams(), self.unit.map(|unit| u32::from(unit.mm())));
-                let unit_mm = unit.unwrap_or(model.unit_um / 1000);
-                (usize::from(model.count) == beams, beams.to_string(), unit_mm)
-            }
-            Scanner::Turning(turning) if turning.is_auto() => {
-                (usize::from(model.count) <= self.beams(), format!("at most {}", self.beams()), 1)
-            }
-            Scanner::Turning(_) => (usize::from(model.count) == self.beams(), self.beams().to_string(), 1),
+        let heads = scan_heads(self.family(), &self.settings());
+        let count = heads[0].count;
+        let (fits, beams) = match self.scanner.is_auto() {
+            true => (model.count <= count, format!("at most {count}")),
+            false => (model.count == count, count.to_string()),
         };
-        if fits && model.unit_um == 1000 * unit_mm {
+        // A unit that is not configured may be any.
+        let unit_um = if heads.len() > 1 { model.unit_um } else { heads[0].unit_um };
+        if fits && model.unit_um == unit_um {
             return Ok(());
         }
-        Err(format!("{beams} beams in units of {unit_mm} mm"))
+        Err(format!("{beams} beams in units of {} mm", unit_um / 1000))
     }
 }
 

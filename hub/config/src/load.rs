@@ -88,8 +88,6 @@ impl Gateway {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use scanhub_drivers::lms::family::Family;
-    use scanhub_drivers::lms::variant::{Baud, Mode, Unit, Variant};
 
     fn sources(set: &[&str], links: &[&str]) -> Sources {
         let owned = |flags: &[&str]| flags.iter().map(|flag| (*flag).to_owned()).collect();
@@ -116,7 +114,8 @@ mod tests {
         let config = Config::load(&sources(&[], &[])).unwrap();
         let names: Vec<_> = config.links.iter().map(|link| (link.name.as_str(), link.port.name())).collect();
         assert_eq!(names, [("front", "/dev/ttyUSB0".to_owned()), ("rear", "/dev/ttyUSB1".to_owned())]);
-        assert_eq!((config.links[0].variant, config.links[0].baud), (Variant::HALF, Baud::B500000));
+        let link = &config.links[0];
+        assert_eq!((link.scanner.settings.view, link.rate()), (Some((180, 50)), 500_000));
     }
 
     #[test]
@@ -126,8 +125,9 @@ mod tests {
             &["a=/dev/x", "b=file:/tmp/a b.bin?rate=max"],
         ))
         .unwrap();
-        assert_eq!(config.links[0].variant, Variant { angle_deg: 100, resolution_cdeg: 25 });
-        assert_eq!((config.links[0].unit, config.links[1].baud), (Some(Unit::Cm), Baud::B38400));
+        let settings = &config.links[0].scanner.settings;
+        assert_eq!((settings.view, settings.unit_mm), (Some((100, 25)), Some(10)));
+        assert_eq!(config.links[1].rate(), 38_400);
         assert_eq!(config.links[1].port, Source::File { path: "/tmp/a b.bin".into(), paced: false });
     }
 
@@ -168,7 +168,7 @@ mod tests {
     #[test]
     fn only_a_recording_is_told_its_mode() {
         let config = Config::load(&sources(&["link.a.mode=0x01"], &["a=file:x"])).unwrap();
-        assert_eq!(config.links[0].mode, Some(Mode(1)));
+        assert_eq!(config.links[0].scanner.settings.mode_number, Some(1));
         let live = refusal(&["link.front.mode=0x01"], &["front=/dev/x"]);
         assert!(
             live.contains(
@@ -185,10 +185,10 @@ mod tests {
     #[test]
     fn what_a_type_cannot_do_is_refused() {
         let of = |set: &[&str]| Config::load(&sources(set, &[])).map(|config| config.links[0].clone());
-        let link = of(&["link.front.type=lms211"]).unwrap();
-        assert_eq!((link.family, link.variant), (Some(Family::Lms211), Variant::new(100, 50).unwrap()));
+        let scanner = of(&["link.front.type=lms211"]).unwrap().scanner;
+        assert_eq!((scanner.expected_type, scanner.settings.view), (Some("lms211"), Some((100, 50))));
         let fine = of(&["link.front.type=lms211", "link.front.resolution=0.25"]).unwrap();
-        assert_eq!(fine.variant.beams(), 401);
+        assert_eq!(fine.scanner.settings.view, Some((100, 25)));
         let wide = refusal(&["link.front.angle=180", "link.front.type=lms211"], &[]);
         assert!(
             wide.starts_with("--set link.front.angle=180: link front: an lms211 does not scan 180"),

@@ -1,74 +1,67 @@
-//! The scanner of a link: its family and the settings of a rotating scanner, as values in effect and as keys of the
-//! sources. The settings of an LMS are in [`Link`](crate::Link).
+//! The scanner of a link: its family and settings, as values in effect and as keys of the sources.
 
-use scanhub_drivers::line;
-use scanhub_drivers::line::family::{Features, Model, Wanted};
-use scanhub_drivers::scanner::features;
+use port::Source;
+use scanhub_drivers::{Features, Model, Settings, features, line};
 use schema::{Failure, Family};
 use toml::Spanned;
 
 use crate::sources::Origin;
 
-/// Family of a scanner, with its settings. The settings of an LMS are in its [`Link`](crate::Link).
+/// Family of a scanner, with its settings.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Scanner {
-    /// SICK LMS 2xx.
-    Lms,
-    /// A rotating scanner.
-    Turning(Turning),
-}
-
-/// Settings of a rotating scanner.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Turning {
+pub struct Scanner {
     /// Family of the scanner.
     pub family: Family,
-    /// Models and modes of the family.
-    pub features: &'static Features,
-    /// Model, or the features' `auto` if the session must detect it.
-    pub model: Model,
-    /// Measuring mode; `None` if the scanner chooses it.
-    pub mode: Option<&'static str>,
-    /// Number of beams of a scan; `None` for that of the model.
-    pub beams: Option<usize>,
-    /// Whether the motor stops while there are no subscribers.
-    pub stop_when_idle: bool,
+    /// Name of the expected type, for a family that reports it.
+    pub expected_type: Option<&'static str>,
+    /// Values that are set for the session. Those of the port follow from the link.
+    pub settings: Settings,
 }
 
-impl Turning {
-    /// Creates the settings of a scanner of `family`, with nothing set.
-    pub(crate) fn new(family: Family, features: &'static Features) -> Turning {
-        Turning { family, features, model: features.auto, mode: None, beams: None, stop_when_idle: false }
+impl Scanner {
+    /// Returns the models and settings of the family.
+    pub fn features(&self) -> &'static Features {
+        features(self.family)
+    }
+
+    /// Returns the model, or the values for an unknown one if the session must detect it.
+    pub fn model(&self) -> Model {
+        let features = self.features();
+        let named = features.models.iter().find(|model| Some(model.name) == self.settings.model);
+        named.copied().unwrap_or(features.auto)
     }
 
     /// Returns whether the session must detect the model, and with it the number of beams.
     pub fn is_auto(&self) -> bool {
-        self.model == self.features.auto && self.beams.is_none()
+        let Settings { model, beams, .. } = self.settings;
+        !self.features().models.is_empty() && model.is_none() && beams.is_none()
     }
 
-    /// Returns the number of beams of a scan, or its maximum if the model must be detected.
-    pub fn most_beams(&self) -> usize {
-        self.beams.unwrap_or(self.model.beams)
+    /// Returns the number of beams of a scan, or its maximum if it is not known before.
+    pub fn max_beams(&self) -> usize {
+        self.settings.beams.unwrap_or(self.model().beams)
+    }
+
+    /// Returns the rate at which a tty is opened, in bits per second.
+    pub fn rate(&self) -> u32 {
+        self.settings.baud.unwrap_or(self.model().baud)
     }
 
     /// Returns the highest rate that the scanner can have.
-    pub fn most_rate(&self) -> u32 {
-        let all = self.features.models.iter().map(|model| model.baud);
-        if self.is_auto() { all.max().unwrap_or(self.model.baud) } else { self.model.baud }
+    fn max_rate(&self) -> u32 {
+        let all = self.features().models.iter().map(|model| model.baud);
+        if self.is_auto() { all.max().unwrap_or(self.rate()) } else { self.rate() }
     }
 
-    /// Returns the settings of its session. `fixed_rate` is whether the port's rate cannot be changed, `listen_only`
-    /// whether nothing may be sent.
-    pub fn wanted(&self, fixed_rate: bool, listen_only: bool) -> Wanted {
-        Wanted {
-            model: (self.model != self.features.auto).then_some(self.model.name),
-            mode: self.mode,
-            beams: self.beams,
-            most_beams: Some(self.most_beams()),
-            fixed_rate,
-            listen_only,
-            stop_when_idle: self.stop_when_idle,
-        }
+    /// Returns the highest rate that the scanner can have at `port`. A serial server has its own rate, whatever is configured here.
+    pub fn max_rate_at(&self, port: &Source) -> u32 {
+        if matches!(port, Source::Tty(_)) { self.rate() } else { self.max_rate() }
+    }
+
+    /// Returns the settings of a session at `port`. `listen_only` is whether nothing may be sent.
+    pub fn settings_at(&self, port: &Source, listen_only: bool) -> Settings {
+        let fixed_rate = !matches!(port, Source::Tty(_));
+        Settings { max_beams: Some(self.max_beams()), fixed_rate, listen_only, ..self.settings }
     }
 }
 
@@ -142,7 +135,7 @@ impl ScannerDraft {
             return Err(refuse(place, what, &format!("leave `family` out, or set family = \"{implied}\"")));
         }
         if let (Some((model, place)), None, None) = (&model, set, implied) {
-            let known = Family::ALL.into_iter().filter_map(features).flat_map(|features| features.models);
+            let known = Family::ALL.into_iter().map(features).flat_map(|features| features.models);
             let names = auto_or(known.map(|model| model.name));
             let remedy = format!(
                 "{names}; leave it out for an LMS, which reports its model; `type` is the expected one"
@@ -153,12 +146,13 @@ impl ScannerDraft {
         let name = family.name();
         let mode = mode.filter(|(mode, _)| mode != AUTO);
         let rest = stop_when_idle.filter(|(stops, _)| *stops);
-        let known = features(family);
-        if let Some((_, place)) = rest.as_ref().filter(|_| known.is_none_or(|known| !known.can_rest)) {
+        let features = features(family);
+        if let Some((_, place)) = rest.as_ref().filter(|_| !features.can_rest) {
             let what = format!("idle = \"stop\", and an {name} cannot be told to rest");
             return Err(refuse(place, what, "leave it out"));
         }
-        let Some(features) = known else {
+        let mut settings = Settings { stop_when_idle: rest.is_some(), ..Settings::default() };
+        if features.models.is_empty() {
             let own = [
                 model.map(|(model, place)| {
                     let what =
@@ -173,34 +167,30 @@ impl ScannerDraft {
             ];
             return match own.into_iter().flatten().next() {
                 Some((place, what, remedy)) => Err(refuse(&place, what, remedy)),
-                None => Ok(Scanner::Lms),
+                None => Ok(Scanner { family, expected_type: None, settings }),
             };
-        };
-        let mut turning = Turning::new(family, features);
+        }
         if let Some((model, place)) = model {
             let known = features.models.iter().find(|known| known.name.eq_ignore_ascii_case(&model));
-            turning.model = *known.ok_or_else(|| {
+            let known = known.ok_or_else(|| {
                 let names = features.models.iter().map(|model| model.name);
                 refuse(&place, format!("model = \"{model}\""), &auto_or(names))
             })?;
+            settings.model = Some(known.name);
         }
         if let Some((mode, place)) = mode {
-            turning.mode =
+            settings.mode =
                 Some(mode_of(features, name, &mode).map_err(|(what, remedy)| refuse(&place, what, &remedy))?);
         }
-        turning.beams = beams.map(|(beams, _)| beams);
-        turning.stop_when_idle = rest.is_some();
-        Ok(Scanner::Turning(turning))
+        settings.beams = beams.map(|(beams, _)| beams);
+        Ok(Scanner { family, expected_type: None, settings })
     }
 }
 
 /// Returns the family of the model called `model`. Each name belongs to one family.
 fn family_of(model: &str) -> Option<Family> {
-    let has = |family: &Family| {
-        features(*family).is_some_and(|features| {
-            features.models.iter().any(|known| known.name.eq_ignore_ascii_case(model))
-        })
-    };
+    let has =
+        |family: &Family| features(*family).models.iter().any(|known| known.name.eq_ignore_ascii_case(model));
     Family::ALL.into_iter().find(has)
 }
 
@@ -218,8 +208,8 @@ fn mode_of(features: &Features, name: &str, mode: &str) -> Result<&'static str, 
 pub(crate) fn remedy_of_lms(key: &str, scanner: &Scanner) -> String {
     match (key, scanner) {
         ("baud", _) => "leave it out: the rate is the model's".to_owned(),
-        ("mode", Scanner::Turning(turning)) if !turning.features.modes.is_empty() => {
-            format!("name one of: {}", turning.features.modes.join(", "))
+        ("mode", scanner) if !scanner.features().modes.is_empty() => {
+            format!("name one of: {}", scanner.features().modes.join(", "))
         }
         _ => "leave it out, or set family = \"lms\"".to_owned(),
     }

@@ -4,12 +4,11 @@
 use std::rc::Rc;
 
 use preprocess::zones::{Check, Settings};
-use scanhub_drivers::lms::variant::Unit;
+use scanhub_drivers::scan_heads;
 use schema::{Failure, Kind, Scan, ScanHead, Zones};
 
 use crate::link::Link;
 use crate::processing::{Processing, Sections};
-use crate::scanner::Scanner;
 use crate::sources::Origin;
 
 /// A link with the sections that its settings come from.
@@ -69,21 +68,9 @@ impl ZoneCoverage<'_> {
         self.heads().iter().map(of_head).max().unwrap_or_default()
     }
 
-    /// Returns the possible heads of its scans. The measuring mode of an LMS is unknown here, and so is its unit if
-    /// none is configured.
+    /// Returns the possible heads of its scans.
     fn heads(&self) -> Vec<ScanHead> {
-        let &Link { scanner, variant, unit, .. } = self.link;
-        match scanner {
-            Scanner::Lms => {
-                let units = [Unit::Mm, Unit::Cm].into_iter().filter(|of| unit.is_none_or(|is| is == *of));
-                let step_mdeg = u32::from(variant.resolution_cdeg) * 10;
-                let (beams, first) = (variant.beams(), variant.first_angle_mdeg());
-                units
-                    .map(|unit| ScanHead::lms(beams, first, step_mdeg, unit.mm().into(), MAX_RANGE_BITS))
-                    .collect()
-            }
-            Scanner::Turning(turning) => vec![ScanHead::turning(turning.family, turning.most_beams())],
-        }
+        scan_heads(self.link.family(), &self.link.settings())
     }
 
     /// Returns the failure at the last place where `place` is set, or at the start of the link if it is not set.
@@ -96,6 +83,3 @@ impl ZoneCoverage<'_> {
 }
 
 type Place = fn(&Sections) -> Option<std::ops::Range<usize>>;
-
-/// Highest value of all measuring modes (Telegram listing, 77h block D).
-const MAX_RANGE_BITS: u8 = 15;

@@ -1,10 +1,10 @@
 //! What is made of the scans, as it is configured: who wins over whom, what cannot be, and that each refusal names place,
 //! value and remedy.
 
-use scanhub_drivers::scanner;
+use scanhub_drivers::features;
 use std::fs;
 
-use config::{Config, Gateway, Processing, Scanner, Sources};
+use config::{Config, Gateway, Processing, Sources};
 use preprocess::background::{Candidate, Method, Start};
 use preprocess::zones::Sector;
 use schema::{Background, BackgroundHead, Family, Kind, as_json};
@@ -51,11 +51,11 @@ fn the_page_holds() {
     assert_eq!((front.processing.pose.x_m, rear.processing.pose.upside_down), (0.3, 1));
     assert_eq!(front.processing.zones.self_min.len(), 1);
     assert_eq!(front.processing.zones.margin_mm, 50);
-    let Scanner::Turning(side) = side.scanner else { panic!("{side:?}") };
-    assert_eq!((side.family, side.model.name, side.beams), (Family::Ld, "ld19", Some(450)));
-    let Scanner::Turning(top) = top.scanner else { panic!("{top:?}") };
+    let set = &side.scanner.settings;
+    assert_eq!((side.family(), set.model, set.beams), (Family::Ld, Some("ld19"), Some(450)));
+    let set = &top.scanner.settings;
     assert_eq!(
-        (top.family, top.is_auto(), top.mode, top.stop_when_idle),
+        (top.family(), top.scanner.is_auto(), set.mode, set.stop_when_idle),
         (Family::Rplidar, true, None, false)
     );
     // What the page shows as the values without a word are those: the front's are changed in these sections.
@@ -78,7 +78,7 @@ fn the_default_has_a_section_for_each_family() {
     let config = load(&[&file], &[]).unwrap_or_else(|refusal| panic!("{refusal}"));
     let families: Vec<Family> = config.links.iter().map(config::Link::family).collect();
     assert_eq!(families, Family::ALL);
-    for features in Family::ALL.into_iter().filter_map(scanner::features) {
+    for features in Family::ALL.into_iter().map(features) {
         let names = features.models.iter().map(|model| model.name).chain(features.modes.iter().copied());
         for name in names {
             assert!(config::DEFAULT.contains(name), "{name} is missing");

@@ -177,7 +177,8 @@ fn default_file_sets_the_defaults_and_shows_every_family() {
     let all = Config::load(&sources(&[&all], &[], &[])).unwrap();
     let families: Vec<_> = all.links.iter().map(|link| link.family()).collect();
     assert_eq!(families, schema::Family::ALL);
-    assert!(all.links[0].family.is_some() && all.links[0].unit.is_some());
+    let scanner = &all.links[0].scanner;
+    assert!(scanner.expected_type.is_some() && scanner.settings.unit_mm.is_some());
 }
 
 #[test]

@@ -1,8 +1,8 @@
 //! Which scanner a link has, wherever that is said, and that what its family does not have is refused with place, value and remedy.
 
-use config::{Config, Link, Scanner, Sources};
-use scanhub_drivers::scanner;
-use schema::Kind;
+use config::{Config, Link, Sources};
+use scanhub_drivers::{Settings, features};
+use schema::{Family, Kind};
 
 fn load(set: &[&str]) -> Result<Config, String> {
     let sources = Sources {
@@ -18,16 +18,15 @@ fn load(set: &[&str]) -> Result<Config, String> {
 
 /// Family, model and beams of a scanner whose head turns.
 fn set_of(link: &Link) -> Option<(&'static str, &'static str, Option<usize>)> {
-    match link.scanner {
-        Scanner::Lms => None,
-        Scanner::Turning(turning) => Some((turning.family.name(), turning.model.name, turning.beams)),
-    }
+    let scanner = &link.scanner;
+    (scanner.family != Family::Lms)
+        .then(|| (scanner.family.name(), scanner.model().name, scanner.settings.beams))
 }
 
 #[test]
 fn a_link_has_a_family_and_what_its_family_needs() {
     let front = |set: &[&str]| load(set).map(|mut config| config.links.swap_remove(0));
-    let known = |link: &Link| (set_of(link), link.rate(), link.beams());
+    let known = |link: &Link| (set_of(link), link.rate(), link.max_beams());
     let family = "link.front.family=ld";
     let set = |model, beams| Some(("ld", model, beams));
     for (setting, scanner, rate, beams) in [
@@ -61,7 +60,7 @@ fn a_link_has_a_family_and_what_its_family_needs() {
     let marks = |link: &Link| (link.processing.marks.i_min, link.processing.marks.level);
     assert_eq!((marks(&config.links[0]), marks(&config.links[1])), ((2, Some(250)), (2, Some(240))));
     // The other link is what it was.
-    assert_eq!(load(&[family]).unwrap().links[1].scanner, Scanner::Lms);
+    assert_eq!(load(&[family]).unwrap().links[1].family(), Family::Lms);
 
     let lms = "is of family lms; a scanner of another family has no such setting\n  leave it out, or set family = \"lms\"";
     for (others, setting, words) in [
@@ -143,7 +142,7 @@ fn a_link_has_a_family_and_what_its_family_needs() {
 
 #[test]
 fn every_model_belongs_to_one_family() {
-    let features = schema::Family::ALL.into_iter().filter_map(scanner::features);
+    let features = Family::ALL.into_iter().map(features);
     let mut names: Vec<_> = features.flat_map(|features| features.models).map(|model| model.name).collect();
     let count = names.len();
     names.sort_unstable();
@@ -155,9 +154,10 @@ fn every_model_belongs_to_one_family() {
 fn a_mode_and_rest_are_for_those_that_have_them() {
     let family = "link.front.family=rplidar";
     let front = |set: &[&str]| load(&[&[family], set].concat()).map(|mut config| config.links.swap_remove(0));
-    let set = |set: &[&str]| match front(set).unwrap().scanner {
-        Scanner::Lms => panic!("{set:?}"),
-        Scanner::Turning(turning) => (turning.model.name, turning.mode, turning.stop_when_idle),
+    let set = |set: &[&str]| {
+        let scanner = front(set).unwrap().scanner;
+        let Settings { mode, stop_when_idle, .. } = scanner.settings;
+        (scanner.model().name, mode, stop_when_idle)
     };
     assert_eq!(set(&[]), ("auto", None, false));
     let said = ["link.front.model=s2", "link.front.mode=denseboost", "link.front.idle=stop"];
@@ -166,7 +166,7 @@ fn a_mode_and_rest_are_for_those_that_have_them() {
     assert_eq!(set(&shouted), set(&said));
     assert_eq!(set(&["link.front.model=Auto"]).0, "auto");
     let link = front(&said).unwrap();
-    assert_eq!((link.rate(), link.beams()), (1_000_000, 3200));
+    assert_eq!((link.rate(), link.max_beams()), (1_000_000, 3200));
     // The later source wins, also over the number of an LMS.
     assert_eq!(set(&["link.front.mode=1", "link.front.mode=express"]), ("auto", Some("express"), false));
     for (setting, words) in [
@@ -193,7 +193,7 @@ fn keys_of_a_link_may_follow_its_port() {
     let link = load("side=/dev/ttyUSB2,family=ld,model=ld19,beams=300").unwrap();
     assert_eq!((link.name.as_str(), link.port.name().as_str()), ("side", "/dev/ttyUSB2"));
     assert_eq!(set_of(&link), Some(("ld", "ld19", Some(300))));
-    assert_eq!(load("a=tcp:10.0.0.7:4001,angle=100,unit=cm").unwrap().variant.angle_deg, 100);
+    assert_eq!(load("a=tcp:10.0.0.7:4001,angle=100,unit=cm").unwrap().scanner.settings.view, Some((100, 50)));
     // A comma may be in the name of a port.
     assert_eq!(load("a=file:/tmp/a,b.bin").unwrap().port.name(), "file:/tmp/a,b.bin");
     for (link, words) in [

@@ -4,16 +4,13 @@
 
 use std::path::Path;
 
-use config::{Link, Scanner};
+use config::Link;
 use port::{Alteration, Source};
-use scanhub_drivers::line::Session as _;
-use scanhub_drivers::lms::Notice;
-use scanhub_drivers::lms::variant::Unit;
-use scanhub_drivers::{line, lms};
+use scanhub_drivers::line::{Notice, Session as _};
+use scanhub_drivers::{Session, Trouble, line};
 use schema::{MILLIS, Nanos, State, Status};
 
 use crate::byte_rate::{ByteRate, with_commas};
-use crate::driver::{Driver, Trouble};
 use crate::recent::LineHealth;
 
 /// What is known to be wrong with one link.
@@ -61,7 +58,7 @@ struct Facts {
     /// Rate of the bytes that arrive while the session is [missing](line::Session::missing) something.
     bytes_per_second: Option<u64>,
     other_model: Option<&'static str>,
-    unit: Option<Unit>,
+    unit_mm: Option<u8>,
     notice: Option<Notice>,
 }
 
@@ -85,45 +82,44 @@ impl<'a> Diagnosis<'a> {
         }
     }
 
-    /// Looks at `driver`, at `now`. The state of the link, and whether anything is new since the last look.
-    pub(crate) fn examine(&mut self, driver: &Driver, now: Nanos) -> (State, bool) {
+    /// Looks at `session`, at `now`. The state of the link, and whether anything is new since the last look.
+    pub(crate) fn examine(&mut self, session: &Session, now: Nanos) -> (State, bool) {
         if self.altered.take_if(|altered| now >= altered.until).is_some() {
             self.facts = None;
         }
-        let bytes_per_second = self.measure(driver, now);
-        let state = if self.is_doubtful(driver) { State::Absent } else { state_of(driver) };
-        let sensor = driver.lms().map(lms::Session::sensor);
+        let bytes_per_second = self.measure(session, now);
+        let state = if self.is_doubtful(session) { State::Absent } else { state_of(session) };
         let facts = Facts {
             state,
-            trouble: driver.trouble(),
+            trouble: session.trouble(),
             bytes_per_second,
-            other_model: driver.other_model().map(|model| model.name),
-            unit: sensor.and_then(|sensor| sensor.unit),
-            notice: sensor.and_then(|sensor| sensor.notices().next()),
+            other_model: session.other_model().map(|model| model.name),
+            unit_mm: session.unit_mm(),
+            notice: session.notice(),
         };
         let is_new = self.facts != Some(facts);
         if is_new {
             // What is good to know is no error.
-            if let Some(notice) = facts.notice.filter(|notice| !notice.is_fault())
+            if let Some(notice) = facts.notice.filter(|notice| !notice.is_fault)
                 && self.facts.is_none_or(|before| before.notice != Some(notice))
             {
-                tracing::info!("{}: {notice}", self.link.name);
+                tracing::info!("{}: {}", self.link.name, notice.text);
             }
             self.facts = Some(facts);
-            self.words = self.trouble(driver);
+            self.words = self.trouble(session);
         }
         (state, is_new)
     }
 
     /// Measures the rate of the bytes that arrive at `now`. Returns it while the session is missing something.
-    fn measure(&mut self, driver: &Driver, now: Nanos) -> Option<u64> {
-        if driver.state() == line::State::Streaming {
+    fn measure(&mut self, session: &Session, now: Nanos) -> Option<u64> {
+        if session.state() == line::State::Streaming {
             self.byte_rate = ByteRate::default();
             return None;
         }
-        let read = driver.account().read;
+        let read = session.account().read;
         self.byte_rate.note(now, read);
-        driver.missing().and_then(|_| self.byte_rate.shown(now, read))
+        session.missing().and_then(|_| self.byte_rate.shown(now, read))
     }
 
     /// Handles that the port has been opened, as `device` if that is known.
@@ -226,20 +222,20 @@ impl<'a> Diagnosis<'a> {
 
     /// Whether the port may go away again before it brings anything, as it did the last time: a serial server that
     /// serves somebody else takes each connection and closes it.
-    fn is_doubtful(&self, driver: &Driver) -> bool {
-        let is_silent = driver.account().read == 0 && driver.trouble().is_none();
-        !self.doubt.is_empty() && is_silent && driver.state() == line::State::Probing
+    fn is_doubtful(&self, session: &Session) -> bool {
+        let is_silent = session.account().read == 0 && session.trouble().is_none();
+        !self.doubt.is_empty() && is_silent && session.state() == line::State::Probing
     }
 
-    fn trouble(&self, driver: &Driver) -> String {
-        if self.is_doubtful(driver) {
+    fn trouble(&self, session: &Session) -> String {
+        if self.is_doubtful(session) {
             return self.doubt.clone();
         }
         if self.is_flooded {
             return format!(
                 "the server sends more than a line of {} baud carries; the hub reads at most twice that; the serial \
                  server must be in raw mode at that rate",
-                self.link.most_rate()
+                self.link.max_rate()
             );
         }
         if let Some(altered) = &self.altered {
@@ -259,25 +255,17 @@ impl<'a> Diagnosis<'a> {
             }
         }
         let rate = self.facts.and_then(|facts| facts.bytes_per_second);
-        if let Some((missing, rate)) = driver.missing().zip(rate) {
+        if let Some((missing, rate)) = session.missing().zip(rate) {
             return self.other_bytes(missing, rate);
         }
-        let is_server = matches!(self.link.port, Source::Tcp { .. });
-        match driver.trouble() {
-            Some(Trouble::Lms(lms::Trouble::NoAnswer { .. })) if is_server => self.with_probe(&format!(
-                "no answer at {} baud, the rate set in the serial server: power, cable, rate?",
-                self.link.baud.rate()
-            )),
+        match session.trouble() {
             // Another family's scanner may be connected, or one at a rate that this family does not have.
-            Some(trouble) if driver.missing().is_some() => self.with_probe(&trouble.to_string()),
+            Some(trouble) if session.missing().is_some() => self.with_probe(&trouble.to_string()),
             Some(trouble) => trouble.to_string(),
-            None => self.mismatch(driver).unwrap_or_else(|| match driver.lms() {
+            None => self.mismatch(session).unwrap_or_else(|| match session.notice() {
                 _ if self.unserved_for >= UNSERVED_LIMIT => self.unserved(),
-                Some(session) => {
-                    let fault = session.sensor().notices().find(|notice| notice.is_fault());
-                    fault.map_or_else(String::new, |notice| notice.to_string())
-                }
-                None => String::new(),
+                Some(notice) if notice.is_fault => notice.text.to_owned(),
+                _ => String::new(),
             }),
         }
     }
@@ -309,32 +297,30 @@ impl<'a> Diagnosis<'a> {
         whole.unwrap_or_else(|| words.to_owned())
     }
 
-    /// What the configuration says otherwise than the scanner.
-    fn mismatch(&self, driver: &Driver) -> Option<String> {
-        let unit = driver.lms().and_then(|session| session.sensor().unit);
-        if let Some((is, expected)) = unit.zip(self.link.unit).filter(|(is, expected)| is != expected) {
+    /// Returns how the configuration differs from what the scanner reports.
+    fn mismatch(&self, session: &Session) -> Option<String> {
+        let Link { name, scanner, .. } = self.link;
+        let units = session.unit_mm().zip(scanner.settings.unit_mm);
+        if let Some((is, expected)) = units.filter(|(is, expected)| is != expected) {
             return Some(format!(
-                "the sensor measures in units of {} mm, the configuration says {} mm; the unit is stored in its EEPROM, \
-                 which the hub never writes",
-                is.mm(),
-                expected.mm()
+                "the sensor measures in units of {is} mm, the configuration says {expected} mm; the unit is stored in its \
+                 EEPROM, which the hub never writes"
             ));
         }
-        let name = &self.link.name;
-        if let Some((is, Scanner::Turning(turning))) = driver.other_model().zip(Some(self.link.scanner)) {
+        if let Some(is) = session.other_model() {
             return Some(format!(
                 "model {} is configured, but the scanner is a {} or compatible with it: set link.{name}.model",
-                turning.model.name, is.name
+                scanner.model().name,
+                is.name
             ));
         }
-        let (model, beams) = driver.model()?;
-        let Scanner::Turning(turning) = self.link.scanner else { return None };
-        (beams < model.beams && beams == self.link.beams() && turning.is_auto()).then(|| {
+        let (model, beams) = session.model().zip(session.beams())?;
+        let room = self.link.max_beams();
+        (beams < model.beams && beams == room && scanner.is_auto()).then(|| {
             format!(
-                "the scanner measures {} points per revolution, but topics have room for {}: set link.{name}.model or \
+                "the scanner measures {} points per revolution, but topics have room for {room}: set link.{name}.model or \
                  link.{name}.beams",
-                model.beams,
-                self.link.beams()
+                model.beams
             )
         })
     }
@@ -348,7 +334,7 @@ impl<'a> Diagnosis<'a> {
 }
 
 /// The word for how far `session` is.
-fn state_of(session: &Driver) -> State {
+fn state_of(session: &Session) -> State {
     match session.state() {
         line::State::Probing => State::Probing,
         line::State::Switching => State::Switching,

@@ -14,17 +14,16 @@
 use std::io;
 
 use port::{Allowance, LineErrors, Source};
-use scanhub_drivers::line;
-use scanhub_drivers::line::{Output, Session as _, suspect};
-use scanhub_drivers::lms::Identity;
+use scanhub_drivers::Session;
+use scanhub_drivers::line::{Event, Identity, Output, Protocol as _, Session as _, suspect};
 use schema::{Nanos, State};
 
 use crate::backlog::Backlog;
 use crate::control::Flow;
-use crate::driver::{Driver, Heard};
 use crate::identity_cache::IdentityCache;
 use crate::learned::KnownRate;
 use crate::link::LinkCore;
+use crate::process_telegram::RecordedContext;
 use crate::settings_check::SettingsCheck;
 use crate::surroundings::{Learned, Line, On, Surroundings, Woken};
 
@@ -48,7 +47,7 @@ pub(crate) struct Drive<'a, S: Surroundings> {
 /// A session on an open line, and what it waits for.
 pub(crate) struct Open<L> {
     pub(crate) line: L,
-    pub(crate) session: Driver,
+    pub(crate) session: Session,
     /// What may be read; nothing where all may.
     allowance: Option<Allowance>,
     /// What waited in the port when it was opened, until all of it was read.
@@ -65,7 +64,7 @@ pub(crate) struct Open<L> {
 
 impl<L: Line> Open<L> {
     /// `session` on `line`, which was opened at `now`; at its nominal `baud` it brings no more than twice that.
-    pub(crate) fn new(line: L, session: Driver, baud: u32, now: Nanos) -> Open<L> {
+    pub(crate) fn new(line: L, session: Session, baud: u32, now: Nanos) -> Open<L> {
         let allowance = line.allowance(baud);
         let backlog = Backlog::new(line.waiting().unwrap_or(0), now);
         let settings_check = SettingsCheck::default();
@@ -135,13 +134,13 @@ impl<'a, S: Surroundings> Drive<'a, S> {
         loop {
             match session.poll_output() {
                 Output::SetDtr(on) => line.set_dtr(on)?,
-                Output::Transmit { byte, not_before } => {
+                Output::Transmit { bytes, not_before } => {
                     core.around.pause(not_before);
-                    line.write(byte)?;
+                    line.write(bytes)?;
                     session.transmitted(core.around.now());
                 }
-                // What is heard now is for nobody.
-                Output::SetRate(_) | Output::Heard(_) => {}
+                // Nothing is published any more.
+                Output::SetRate(_) | Output::Event(_) => {}
                 Output::Rest(_) | Output::Wait { .. } => return Ok(()),
             }
         }
@@ -150,14 +149,14 @@ impl<'a, S: Surroundings> Drive<'a, S> {
     fn read(&mut self, core: &mut LinkCore<'a, S>, open: &mut Open<S::Line>) -> io::Result<()> {
         let Open { line, session, allowance, backlog, settings_check, watch, until, .. } = open;
         let around = core.around;
-        if !*watch && matches!(session, Driver::Lms(_)) {
-            // The telegram's end is near: what can be done before it is not done after it. Packets end all the time.
+        if !*watch && session.features().has_whole_telegrams {
+            // The end of the telegram is near, so do now what can be done before it. Packets end all the time.
             core.output.prepare();
         }
         if *watch
-            && session.may_leave()
+            && session.can_defer_read()
             && let Some(waiting) = line.waiting()
-            && session.leave(around.now(), waiting)
+            && session.defer_read(around.now(), waiting)
         {
             return Ok(());
         }
@@ -195,7 +194,7 @@ impl<'a, S: Surroundings> Drive<'a, S> {
     fn drain(&mut self, core: &mut LinkCore<'a, S>, open: &mut Open<S::Line>) -> io::Result<()> {
         let Open { line, session, .. } = open;
         let around = core.around;
-        let recorded = core.recorded();
+        let recorded = RecordedContext::default();
         let (mut published, mut is_scan) = (false, !core.stats.is_streaming());
         (open.watch, open.until) = loop {
             match session.poll_output() {
@@ -208,46 +207,34 @@ impl<'a, S: Surroundings> Drive<'a, S> {
                     open.settings_check.pass();
                 }
                 Output::SetDtr(on) => line.set_dtr(on)?,
-                Output::Transmit { byte, not_before } => {
+                Output::Transmit { bytes, not_before } => {
                     around.pause(not_before);
-                    line.write(byte)?;
+                    line.write(bytes)?;
                     session.transmitted(around.now());
                 }
-                Output::Heard(Heard::Lms(mut received)) => {
+                Output::Event(Event::Telegram(mut received)) => {
                     let counted = line.line_errors();
                     core.stats.line_errors += counted;
                     let is_hit = self.line_errors.note(counted);
                     let is_behind = self.behind_at.is_some_and(|at| received.last <= at);
                     received.estimated |= is_behind;
                     received.reasons |= if is_hit { suspect::LINE_ERROR } else { 0 };
-                    // A hub that did not run did not hear the silence between what waited for it and what came later.
-                    if !is_behind && received.last > self.follows_by {
-                        core.output.learn_silence();
+                    if received.whole.is_some() {
+                        self.note_silence(core, received.last, is_behind);
+                        is_scan = true;
                     }
                     if let Some(limit) = core.publish(&received, &recorded, is_behind) {
-                        // How long before the next one what waited was measured is not known; a network says it by its stamps.
+                        // The age of a backlog is unknown, so the next scan may follow after any time. The stamps of a network show it.
                         let is_of_backlog = is_behind && open.allowance.is_none();
                         self.follows_by = if is_of_backlog { 0 } else { received.last.saturating_add(limit) };
                     }
-                    (published, is_scan) = (true, true);
-                }
-                Output::Heard(Heard::Turning(line::Heard::Packets(mut received))) => {
-                    let counted = line.line_errors();
-                    core.stats.line_errors += counted;
-                    let is_hit = self.line_errors.note(counted);
-                    received.estimated |= self.behind_at.is_some_and(|at| received.last <= at);
-                    received.reasons |= if is_hit { suspect::LINE_ERROR } else { 0 };
-                    core.publish_packets(&received, &recorded);
                     published = true;
                 }
-                Output::Heard(Heard::Turning(line::Heard::Turn(turn))) => {
-                    let is_behind = self.behind_at.is_some_and(|at| turn.last <= at);
-                    if !is_behind && turn.last > self.follows_by {
-                        core.output.learn_silence();
-                    }
-                    if let Some(limit) = core.publish_turn(&turn, &recorded, is_behind) {
-                        self.follows_by = if is_behind { 0 } else { turn.last.saturating_add(limit) };
-                    }
+                Output::Event(Event::Scan(scan)) => {
+                    let is_behind = self.behind_at.is_some_and(|at| scan.last <= at);
+                    self.note_silence(core, scan.last, is_behind);
+                    let limit = core.publish_scan(&scan, &recorded, is_behind);
+                    self.follows_by = if is_behind { 0 } else { scan.last.saturating_add(limit) };
                     (published, is_scan) = (true, true);
                 }
                 Output::Rest(until) => break (false, until),
@@ -266,14 +253,14 @@ impl<'a, S: Surroundings> Drive<'a, S> {
         if is_scan {
             self.pieces = core.output.pieces();
         }
-        session.look_in(self.pieces);
+        session.set_partial_reads(self.pieces);
         if self.pieces > 1 || core.output.has_warned() {
-            match session.begun() {
-                // What waited in the port warns of nothing that is still to come.
-                Some(begun) if self.behind_at.is_some_and(|at| begun.first() <= at) => {
-                    core.output.withdraw(Some(begun.number()));
+            match session.partial_scan() {
+                // A backlog warns of nothing that is still to come.
+                Some(partial) if self.behind_at.is_some_and(|at| partial.first <= at) => {
+                    core.output.withdraw(Some(partial.number));
                 }
-                begun => core.output.foresee(begun.as_ref()),
+                partial => core.output.foresee(partial.as_ref()),
             }
         }
         self.identity.keep_first(session);
@@ -285,7 +272,7 @@ impl<'a, S: Surroundings> Drive<'a, S> {
         if (is_new || core.is_due(now)) && core.show_session(session, state) {
             self.identity.keep(session, around.now());
             if core.stops_when_idle() {
-                session.followed(around.now(), core.output.topics.is_followed());
+                session.set_has_subscribers(around.now(), core.output.topics.is_followed());
                 // What follows from it is done at once, after an empty look at the line.
                 open.until = around.now();
             }
@@ -297,7 +284,15 @@ impl<'a, S: Surroundings> Drive<'a, S> {
         Ok(())
     }
 
-    /// The sensor is looked for at those rates that the port can have; of another one it is said once that it cannot.
+    /// Handles a scan or reply whose last byte arrived at `last`. A hub that was stopped could not report the silence before it, so
+    /// detect it by the stamps.
+    fn note_silence(&self, core: &mut LinkCore<'a, S>, last: Nanos, is_behind: bool) {
+        if !is_behind && last > self.follows_by {
+            core.output.learn_silence();
+        }
+    }
+
+    /// Sets the rate. Logs once that the port cannot have it; the search then leaves that rate out.
     fn set_baud(&mut self, core: &LinkCore<'a, S>, line: &S::Line, baud: u32) -> io::Result<()> {
         if let Some(error) = line.set_baud(baud)?
             && !self.refused.contains(&baud)

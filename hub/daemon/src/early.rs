@@ -4,44 +4,13 @@
 //! to know topics, and whether anybody listens.
 
 use preprocess::zones::{Check, Warning};
-use scanhub_drivers::line::Turn;
-use scanhub_drivers::scanner::Turning;
-use scanhub_drivers::{lms, scanner};
-use schema::{Early, Family, Nanos, Scan, Verdict};
-
-/// A scan that is arriving.
-pub(crate) enum Begun<'a> {
-    /// A telegram of an LMS.
-    Telegram(lms::session::Begun<'a>),
-    /// A turn of a head, with its points so far.
-    Turn(Turn<'a>),
-}
-
-impl Begun<'_> {
-    /// Which one, of those of its session.
-    pub(crate) fn number(&self) -> u64 {
-        match self {
-            Begun::Telegram(telegram) => telegram.offset,
-            Begun::Turn(turn) => turn.number,
-        }
-    }
-
-    /// When it began.
-    pub(crate) fn first(&self) -> Nanos {
-        match self {
-            Begun::Telegram(telegram) => telegram.first,
-            Begun::Turn(turn) => turn.first,
-        }
-    }
-}
+use scanhub_drivers::line::RawScan;
+use schema::{Contents, Early, Scan, Verdict};
 
 /// What was said of the scan that is arriving.
 pub(crate) struct EarlyWarner {
-    family: Family,
-    /// The ranges of a telegram so far.
-    ranges: Box<[u16]>,
-    /// A turn as its points so far have it.
-    turn: Box<Scan>,
+    /// The scan so far.
+    scan: Box<Scan>,
     said: Option<Said>,
 }
 
@@ -61,47 +30,40 @@ pub(crate) struct Word {
 }
 
 impl EarlyWarner {
-    /// For scans of at most `beams` beams of a scanner of `family`.
-    pub(crate) fn new(family: Family, beams: usize) -> EarlyWarner {
-        let turn = Scan::zeroed(Turning::len(beams));
-        EarlyWarner { family, ranges: vec![0; beams].into(), turn, said: None }
+    /// For scans of at most `beams` beams.
+    pub(crate) fn new(beams: usize) -> EarlyWarner {
+        EarlyWarner { scan: Scan::zeroed(Scan::len(beams, Contents::TURNING)), said: None }
     }
 
-    /// What has to be said now that `check` knows as much of a scan as has `begun`: what was said of it is taken back if it does
+    /// What has to be said now that `check` knows as much of a scan as has `partial`: what was said of it is taken back if it does
     /// not hold any more, and a warning is said if it is worse than what was. `next_seq` is the number of the next telegram.
-    pub(crate) fn look(&mut self, begun: &Begun<'_>, check: &mut Check, next_seq: u64) -> [Option<Word>; 2] {
-        let early = self.judge(begun, check);
+    pub(crate) fn look(
+        &mut self,
+        partial: &RawScan<'_>,
+        check: &mut Check,
+        next_seq: u64,
+    ) -> [Option<Word>; 2] {
+        let early = self.judge(partial, check);
         let told = early.map_or(Verdict::Clear as u8, |early| early.verdict);
         // Packets of the turn that came since may have the numbers of its zones, so what is said anew keeps its number.
         let seq = self.said.map_or(next_seq, |said| said.word.seq);
         let withdrawn = if self.verdict() > told { self.withdraw(None) } else { None };
         let worse = early.filter(|_| told > self.verdict()).map(|early| {
             let word = Word { seq, early };
-            self.said = Some(Said { number: begun.number(), word });
+            self.said = Some(Said { number: partial.number, word });
             word
         });
         [withdrawn, worse]
     }
 
     /// What `check` makes of the part of a scan that is there, if it is a warning.
-    fn judge(&mut self, begun: &Begun<'_>, check: &mut Check) -> Option<Early> {
-        let (warning, bytes_seen, beams_seen) = match begun {
-            Begun::Telegram(telegram) => {
-                let values = &telegram.values;
-                let seen = scanner::decode_first(values, telegram.mode, &mut self.ranges);
-                let (unit_um, ranges) = (scanner::unit_um(values), &self.ranges[..seen]);
-                (check.early(values.count(), unit_um, ranges, &[])?, telegram.bytes, seen)
-            }
-            Begun::Turn(turn) => {
-                let scan = &mut self.turn;
-                Turning::of(turn, self.family).decode(turn.beams, scan);
-                let warning = check.early(scan.beams(), scan.unit_um, scan.ranges(), scan.exact_angles())?;
-                let seen = scan.ranges().iter().filter(|range| **range != Scan::NOT_MEASURED).count();
-                (warning, 0, seen)
-            }
-        };
+    fn judge(&mut self, partial: &RawScan<'_>, check: &mut Check) -> Option<Early> {
+        let scan = &mut self.scan;
+        partial.write(scan);
+        let warning = check.early(scan.beams(), scan.unit_um, scan.ranges(), scan.exact_angles())?;
+        let beams_seen = scan.ranges().iter().filter(|range| **range != Scan::NOT_MEASURED).count();
         let Warning { verdict, beam, distance_mm } = warning;
-        let (bytes_seen, beams_seen) = (bytes_seen as u16, beams_seen as u16);
+        let (bytes_seen, beams_seen) = (partial.bytes as u16, beams_seen as u16);
         Some(Early { verdict: verdict as u8, flags: 0, beam, distance_mm, bytes_seen, beams_seen })
     }
 

@@ -3,10 +3,10 @@
 //! once a second while the sensor streams. Refuses to know what of a sensor is worth to be known, where the record lies, and
 //! whether the line was its own all the while.
 
-use scanhub_drivers::lms::Identity;
+use scanhub_drivers::Session;
+use scanhub_drivers::line::{Identity, Session as _};
 use schema::{MILLIS, Nanos};
 
-use crate::driver::Driver;
 use crate::surroundings::Surroundings;
 
 /// The identity of the sensor of one link.
@@ -30,20 +30,20 @@ impl<'a, S: Surroundings> IdentityCache<'a, S> {
     /// What the hub before this one knew, if that was just now and of this port.
     pub(crate) fn recall(&self, now: Nanos) -> Option<Identity> {
         // One byte more than there should be would be another port.
-        let mut record = vec![0; STAMP + Identity::LEN + self.port.len() + 1];
+        let mut record = vec![0; STAMP + size_of::<Identity>() + self.port.len() + 1];
         let len = self.around.recall(self.link, &mut record)?;
         read(record.get(..len)?, &self.port, now)
     }
 
     /// Keeps what `session` knows `now`, if that is worth it.
-    pub(crate) fn keep(&mut self, session: &Driver, now: Nanos) {
+    pub(crate) fn keep(&mut self, session: &Session, now: Nanos) {
         if let Some(identity) = session.identity() {
             self.write(identity, now);
         }
     }
 
     /// As soon as anything is known; then [`keep`](Self::keep) keeps it new.
-    pub(crate) fn keep_first(&mut self, session: &Driver) {
+    pub(crate) fn keep_first(&mut self, session: &Session) {
         if self.identity.is_none() {
             self.keep(session, self.around.now());
         }
@@ -63,7 +63,7 @@ impl<'a, S: Surroundings> IdentityCache<'a, S> {
 fn write(record: &mut Vec<u8>, identity: Identity, port: &str) {
     record.clear();
     record.extend([0; STAMP]);
-    record.extend(identity.to_bytes());
+    record.extend(identity);
     record.extend(port.as_bytes());
 }
 
@@ -72,7 +72,7 @@ fn read(record: &[u8], port: &str, now: Nanos) -> Option<Identity> {
     let (stamp, rest) = record.split_first_chunk()?;
     let (identity, of) = rest.split_first_chunk()?;
     let is_new = now.checked_sub(Nanos::from_le_bytes(*stamp)).is_some_and(|age| age < FRESH);
-    (is_new && of == port.as_bytes()).then(|| Identity::from_bytes(*identity))
+    (is_new && of == port.as_bytes()).then_some(*identity)
 }
 
 /// Bytes of a stamp.
@@ -87,7 +87,7 @@ mod tests {
     #[test]
     fn what_was_known_just_now_of_this_port_is_known() {
         let (now, port) = (9_000 * MILLIS, "/dev/ttyUSB0");
-        let identity = Identity::from_bytes([2; Identity::LEN]);
+        let identity: Identity = [2; size_of::<Identity>()];
         let mut record = vec![7; 300];
         write(&mut record, identity, port);
         record[..STAMP].copy_from_slice(&now.to_le_bytes());

@@ -1,18 +1,15 @@
 //! What a link has, whatever its other end is: where its results go, what it reports of itself, what users ask of it, and
 //! when it has to do something although nothing came. Refuses to know where bytes come from, and how a wait is done.
 
-use config::{Link, Processing, Scanner};
-use port::Source;
-use scanhub_drivers::line;
-use scanhub_drivers::line::Control;
-use scanhub_drivers::lms::session::Received;
+use config::{Link, Processing};
+use scanhub_drivers::Session;
+use scanhub_drivers::line::{Control, RawScan, Received};
 use schema::{Failure, MILLIS, Nanos, Shown, State, Verb, Wake};
 
 use crate::control::{ControlQueue, Flow};
 use crate::diagnosis::Diagnosis;
-use crate::driver::Driver;
 use crate::link_stats::LinkStats;
-use crate::process_telegram::{LinkOutput, RecordedContext};
+use crate::process_telegram::{LinkOutput, Processed, RecordedContext};
 use crate::surroundings::{Learned, Surroundings, Woken};
 use crate::topics::Topics;
 
@@ -70,64 +67,52 @@ impl<'a, S: Surroundings> LinkCore<'a, S> {
     }
 
     /// The `session` on the port is over.
-    pub(crate) fn close(&mut self, session: &Driver) {
+    pub(crate) fn close(&mut self, session: &Session) {
         self.diagnosis.end_flood();
         self.output.foresee(None);
         self.stats.close(session);
     }
 
-    /// Whether the other end is a recording, to which nobody talks.
-    pub(crate) fn is_recording(&self) -> bool {
-        matches!(self.link.port, Source::File { .. })
-    }
-
     /// Whether its motor rests while nobody follows.
     pub(crate) fn stops_when_idle(&self) -> bool {
-        matches!(self.link.scanner, Scanner::Turning(turning) if turning.stop_when_idle)
+        self.link.scanner.settings.stop_when_idle
     }
 
-    /// What is known beside the sensor: nothing of one that can be asked.
-    pub(crate) fn recorded(&self) -> RecordedContext {
-        let mode = self.link.mode.filter(|_| self.is_recording());
-        RecordedContext { mode, ..RecordedContext::default() }
-    }
-
-    /// Publishes `received` and what is made of it, and wakes the consumers. For how long the verdict on its scan stands,
-    /// where it has one.
+    /// Publishes a telegram, with the scan that it may contain, or packets, and wakes the subscribers. Returns how long the verdict
+    /// on the scan stays valid.
     pub(crate) fn publish(
         &mut self,
         received: &Received<'_>,
         recorded: &RecordedContext,
         is_behind: bool,
     ) -> Option<Nanos> {
-        let processed = self.output.process(received, recorded, is_behind);
-        self.output.topics.wake(Wake::Telegram);
+        let processed = match &received.whole {
+            Some(whole) => {
+                let processed = self.output.process_telegram(received, whole, recorded, is_behind);
+                self.output.topics.wake(Wake::Telegram);
+                processed
+            }
+            None => {
+                let processed = self.output.process_packets(received, recorded);
+                self.output.topics.wake_for_packets();
+                processed
+            }
+        };
         self.stats.note(processed);
         processed.stands_for
     }
 
-    /// Publishes packets of a scanner whose head turns, and wakes the consumers.
-    pub(crate) fn publish_packets<M>(
+    /// Publishes a scan whose packets were published, and wakes the subscribers. Returns how long the verdict on it stays valid.
+    pub(crate) fn publish_scan(
         &mut self,
-        received: &line::Received<'_, M>,
-        recorded: &RecordedContext,
-    ) {
-        let processed = self.output.process_packets(received, recorded);
-        self.output.topics.wake_for_packets();
-        self.stats.note(processed);
-    }
-
-    /// Publishes what is made of `turn`, and wakes the consumers. For how long the verdict on it stands.
-    pub(crate) fn publish_turn(
-        &mut self,
-        turn: &line::Turn<'_>,
+        scan: &RawScan<'_>,
         recorded: &RecordedContext,
         is_behind: bool,
-    ) -> Option<Nanos> {
-        let processed = self.output.process_turn(turn, recorded, is_behind);
+    ) -> Nanos {
+        let stands_for = self.output.process_revolution(scan, recorded, is_behind);
         self.output.topics.wake(Wake::Telegram);
-        self.stats.note(processed);
-        processed.stands_for
+        self.stats.note(Processed { is_suspect: scan.reasons != 0, stands_for: Some(stands_for) });
+        stands_for
     }
 
     /// When a status goes out without news.
@@ -142,20 +127,20 @@ impl<'a, S: Surroundings> LinkCore<'a, S> {
 
     /// Publishes the status if it changed or is due, and greets late joiners; `error` is what is wrong, in words. Whether a
     /// status went out.
-    pub(crate) fn show(&mut self, session: Option<&Driver>, state: State, error: &str) -> bool {
+    pub(crate) fn show(&mut self, session: Option<&Session>, state: State, error: &str) -> bool {
         let now = self.around.now();
         let changed = update(&mut self.stats, self.link, state, error, now);
         self.publish_status(session, state, changed, now)
     }
 
     /// As [`show`](Self::show), of a `session` that was examined: what is wrong is for [`Diagnosis`] to say.
-    pub(crate) fn show_session(&mut self, session: &Driver, state: State) -> bool {
+    pub(crate) fn show_session(&mut self, session: &Session, state: State) -> bool {
         let now = self.around.now();
         let changed = update(&mut self.stats, self.link, state, self.diagnosis.explanation(), now);
         self.publish_status(Some(session), state, changed, now)
     }
 
-    fn publish_status(&mut self, session: Option<&Driver>, state: State, changed: bool, now: Nanos) -> bool {
+    fn publish_status(&mut self, session: Option<&Session>, state: State, changed: bool, now: Nanos) -> bool {
         let is_due = changed || now >= self.next_status;
         if is_due {
             self.next_status = now + STATUS_PERIOD;

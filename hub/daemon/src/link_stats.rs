@@ -1,23 +1,18 @@
 //! What a link reports of itself: the state of a session and the hub's own counts as the payload of topic `status`.
 
 use config::Link;
+use scanhub_drivers::Session;
 use scanhub_drivers::line::Session as _;
-use scanhub_drivers::lms;
-use scanhub_drivers::lms::header::Reject;
-use scanhub_drivers::lms::reply::Reply;
-use scanhub_drivers::lms::telegram::Telegram;
-use scanhub_drivers::lms::variant::{Mode, Variant};
 use schema::{Counter, Counters, MIN_RATE_SPAN, Nanos, Pose, State, Status};
 
-use crate::driver::Driver;
 use crate::process_telegram::Processed;
 use crate::recent::{LineHealth, Recent};
 
 /// The link's statistics, across all sessions on its port.
 pub(crate) struct LinkStats {
     status: Status,
-    /// The measuring mode while no reply has told it, as configured.
-    mode: Option<Mode>,
+    /// Configured measuring mode, which is reported while no reply has reported it.
+    mode: Option<u8>,
     /// Counters of the sessions that ended.
     past: Counters,
     /// What the line took away lately.
@@ -44,7 +39,7 @@ impl LinkStats {
         status.set_port(&link.port.name());
         LinkStats {
             status,
-            mode: link.mode,
+            mode: link.scanner.settings.mode_number,
             past: Counters::default(),
             recent: Recent::new(),
             health: LineHealth::default(),
@@ -71,11 +66,11 @@ impl LinkStats {
     }
 
     /// The status with everything that `session`, if there is one, knows.
-    pub(crate) fn status(&mut self, session: Option<&Driver>, loan_failed: u64, now: Nanos) -> &Status {
+    pub(crate) fn status(&mut self, session: Option<&Session>, loan_failed: u64, now: Nanos) -> &Status {
         let mut counters = self.past;
         match session {
             Some(session) => {
-                add(&mut counters, session);
+                session.add_counters(&mut counters);
                 self.describe(session);
             }
             None => self.status.baud = 0,
@@ -103,25 +98,16 @@ impl LinkStats {
         self.scans += u64::from(processed.stands_for.is_some());
     }
 
-    /// A whole telegram of a recording was taken, which says `reply`; `mode` is the one by which its values are split, if
-    /// it has any.
-    pub(crate) fn recall(&mut self, telegram: Telegram<'_>, reply: Option<&Reply<'_>>, mode: Option<Mode>) {
-        let len = telegram.bytes().len() as u64;
-        self.past[Counter::BytesRead] += len;
-        self.past[Counter::BytesInTelegrams] += len;
+    /// Returns the status, for what a telegram of a recording reports.
+    pub(crate) fn status_mut(&mut self) -> &mut Status {
+        &mut self.status
+    }
+
+    /// Counts a whole telegram of a recording, of `len` bytes.
+    pub(crate) fn note_recorded(&mut self, len: usize) {
+        self.past[Counter::BytesRead] += len as u64;
+        self.past[Counter::BytesInTelegrams] += len as u64;
         self.past[Counter::Telegrams] += 1;
-        self.status.mode = mode.map_or(Status::MODE_UNKNOWN, |mode| mode.0);
-        match reply {
-            Some(Reply::Measured(measured)) => {
-                self.status.unit_mm = measured.unit().mm();
-                if let Some(variant) = Variant::of_beams(measured.count()) {
-                    self.status.angle_deg = variant.angle_deg;
-                    self.status.resolution_cdeg = variant.resolution_cdeg;
-                }
-            }
-            Some(Reply::Type(name)) => self.status.set_sensor_type(&String::from_utf8_lossy(name)),
-            _ => {}
-        }
     }
 
     /// The sensor sits elsewhere, or so it is said now.
@@ -145,67 +131,22 @@ impl LinkStats {
     }
 
     /// The session is over: its counters stay.
-    pub(crate) fn close(&mut self, session: &Driver) {
+    pub(crate) fn close(&mut self, session: &Session) {
         self.describe(session);
-        add(&mut self.past, session);
+        session.add_counters(&mut self.past);
         self.past[Counter::BytesDiscarded] += session.account().buffered;
         self.past[Counter::BytesBuffered] = 0;
     }
 
-    fn describe(&mut self, driver: &Driver) {
+    fn describe(&mut self, session: &Session) {
         let known_rate = matches!(self.status.state(), Some(State::Streaming | State::Starting));
-        self.status.baud = if known_rate { driver.rate() } else { 0 };
-        if let Some(kind) = driver.kind() {
-            self.status.set_sensor_type(&kind);
+        self.status.baud = if known_rate { session.rate() } else { 0 };
+        session.describe(&mut self.status);
+        if self.status.mode == Status::MODE_UNKNOWN {
+            self.status.mode = self.mode.unwrap_or(Status::MODE_UNKNOWN);
         }
-        if let Some((_, beams)) = driver.model() {
-            self.status.unit_mm = 1;
-            self.status.angle_deg = 360;
-            self.status.resolution_cdeg = (36_000.0 / beams as f64).round() as u16;
-        }
-        let Some(sensor) = driver.lms().map(lms::Session::sensor) else { return };
-        self.status.mode = sensor.mode.or(self.mode).map_or(Status::MODE_UNKNOWN, |mode| mode.0);
-        self.status.unit_mm = sensor.unit.map_or(0, |unit| unit.mm());
-        let Variant { angle_deg, resolution_cdeg } =
-            sensor.variant.unwrap_or(Variant { angle_deg: 0, resolution_cdeg: 0 });
-        self.status.angle_deg = angle_deg;
-        self.status.resolution_cdeg = resolution_cdeg;
-        self.status.set_sensor_type(&String::from_utf8_lossy(sensor.kind()));
     }
 }
-
-fn add(counters: &mut Counters, driver: &Driver) {
-    let account = driver.account();
-    counters[Counter::BytesRead] += account.read;
-    counters[Counter::BytesInTelegrams] += account.in_telegrams;
-    counters[Counter::BytesAcknowledge] += account.acknowledge;
-    counters[Counter::BytesDiscarded] += account.discarded;
-    counters[Counter::BytesBuffered] = account.buffered;
-    counters[Counter::Telegrams] += account.telegrams;
-    counters[Counter::Resyncs] += account.resyncs;
-    counters[Counter::ScannerRestarts] += account.restarts;
-    counters[Counter::BytesDamaged] += account.damaged;
-    counters[Counter::DueOnLine] += account.due;
-    counters[Counter::LostOnLine] += account.lost;
-    counters[Counter::LostInRestart] += u64::from(account.began_with_a_cut);
-    counters[Counter::RejectedCrc] += account.rejected_checksum;
-    let Some(session) = driver.lms() else { return };
-    let tally = session.tally();
-    counters[Counter::Aborted] += tally.aborted;
-    for (reject, counter) in REJECTS {
-        counters[counter] += tally.rejected[reject as usize];
-    }
-}
-
-/// But for the checksum, which every family has.
-const REJECTS: [(Reject, Counter); Reject::COUNT - 1] = [
-    (Reject::Address, Counter::RejectedAddress),
-    (Reject::Length, Counter::RejectedLength),
-    (Reject::Command, Counter::RejectedCommand),
-    (Reject::Count, Counter::RejectedCount),
-    (Reject::Vetoed, Counter::RejectedVetoed),
-    (Reject::Superseded, Counter::RejectedSuperseded),
-];
 
 /// The rate is that of the last seconds.
 const RATE_WINDOW: Nanos = 5_000_000_000;

@@ -1,24 +1,17 @@
-//! What a link makes of a telegram: the telegram itself, its scan, and what follows from that, into the link's topics.
-//! Refuses to know whether it came down a line or was recorded, and when the next one comes.
+//! Publishes what a session has received: telegrams and packets as they are, scans, and what the processors compute from them.
 
 use config::{Link, Processing};
-use scanhub_drivers::lms::reply::Reply;
-use scanhub_drivers::lms::session::Received;
-use scanhub_drivers::lms::variant::{Mode, Variant};
-use scanhub_drivers::{line, scanner};
-use schema::{Background, Failure, Family, Flags, Nanos, Pose, Scan, Verb, Wake, Zones};
+use scanhub_drivers::line::{RawScan, Received, Whole};
+use schema::{Background, Failure, Flags, Nanos, Pose, Verb, Wake, Zones};
 
-use crate::early::{Begun, EarlyWarner, Word};
+use crate::early::{EarlyWarner, Word};
 use crate::pipeline::Pipeline;
-use crate::process_turn::micros;
 use crate::surroundings::Surroundings;
 use crate::topics::Topics;
 
 /// What a recording knows of a telegram and nobody could ask a line for; by default nothing.
 #[derive(Clone, Copy, Debug, Default)]
 pub(crate) struct RecordedContext {
-    /// The mode of a sensor that cannot be asked.
-    pub(crate) mode: Option<Mode>,
     /// Wall clock of its first byte.
     pub(crate) wall_ns: Option<u64>,
     /// Nominal time to the next scan, if it is not that of the link's rate.
@@ -63,69 +56,80 @@ pub(crate) struct LinkOutput<'a, S: Surroundings> {
 impl<'a, S: Surroundings> LinkOutput<'a, S> {
     /// The output of `link` into `topics`; nothing is published yet.
     pub(crate) fn new(link: &'a Link, around: &'a S, topics: Topics<'a, S>) -> Self {
-        let pipeline = Pipeline::new(&link.processing, link.beams());
-        let early = EarlyWarner::new(link.family(), link.beams());
+        let pipeline = Pipeline::new(&link.processing, link.max_beams());
+        let early = EarlyWarner::new(link.max_beams());
         LinkOutput { link, around, topics, pipeline, early, stale_at: Nanos::MAX, is_blind: false }
     }
 
-    /// Publishes a telegram and, if it is measured data that can be read, its scan and what is made of it. What `recorded`
-    /// knows goes before what the link knows. A telegram that `is_behind` waited in the port for an unknown time.
-    pub(crate) fn process(
+    /// Publishes a telegram and the scan that it contains, if that can be read. Values in `recorded` replace those of the session. A
+    /// telegram that `is_behind` was buffered for an unknown time.
+    pub(crate) fn process_telegram(
         &mut self,
         received: &Received<'_>,
+        whole: &Whole<'_>,
         recorded: &RecordedContext,
         is_behind: bool,
     ) -> Processed {
-        let measured = match received.message.reply {
-            Some(Reply::Measured(measured)) => Some(measured),
-            _ => None,
-        };
-        let mode = received.message.mode.or(recorded.mode).filter(|mode| mode.has_ranges());
-        let forbidden =
-            measured.zip(mode).is_some_and(|(measured, mode)| scanner::is_forbidden(&measured, mode));
-        let reasons = received.reasons | if forbidden { line::suspect::FORBIDDEN_BITS } else { 0 };
-        let variant = measured.and_then(|measured| Variant::of_beams(measured.count()));
-        let nominal = || scanner::period_us(variant, received.message.baud.rate());
+        let nominal = || micros(whole.period);
         let period_us = recorded.period_us.unwrap_or_else(nominal).max(recorded.gap_us);
         let period_us = recorded.stretched(period_us);
         self.recall(recorded);
-        // The number of what is taken back is the one that this telegram gets.
-        self.withdraw(Some(received.message.offset));
-        self.topics.telegram(received, reasons, period_us);
-        let is_suspect = reasons != 0;
-        // Better no range than a wrong one.
-        let Some((measured, mode)) = measured.zip(mode) else {
-            return Processed { is_suspect, stands_for: None };
-        };
-        let decode = |scan: &mut Scan| scanner::decode(&measured, mode, scan);
+        // A withdrawal has the sequence number that this telegram gets.
+        self.withdraw(Some(whole.number));
+        self.topics.telegram(received, period_us);
+        let is_suspect = received.reasons != 0;
+        let Some(scan) = &whole.scan else { return Processed { is_suspect, stands_for: None } };
         let stands_for = limit(period_us);
-        self.publish_scan(measured.count(), scanner::len(&measured), decode, stands_for, is_behind);
-        self.early.confirm(received.message.offset);
+        self.publish_scan(scan, stands_for, is_behind);
         Processed { is_suspect, stands_for: Some(stands_for) }
     }
 
-    /// In how many pieces a telegram of an LMS is read: 1, unless somebody wants to be warned early.
+    /// Publishes packets that arrived together.
+    pub(crate) fn process_packets(
+        &mut self,
+        received: &Received<'_>,
+        recorded: &RecordedContext,
+    ) -> Processed {
+        self.recall(recorded);
+        self.topics.packets(received);
+        Processed { is_suspect: received.reasons != 0, stands_for: None }
+    }
+
+    /// Publishes a scan whose packets were published. One that `is_behind` was buffered for an unknown time. Returns how long the
+    /// verdict on it stays valid.
+    pub(crate) fn process_revolution(
+        &mut self,
+        scan: &RawScan<'_>,
+        recorded: &RecordedContext,
+        is_behind: bool,
+    ) -> Nanos {
+        self.recall(recorded);
+        let period_us = recorded.stretched(micros(scan.period));
+        if self.has_warned() {
+            // The last points may show that what seemed near is the robot's own body.
+            self.foresee(Some(scan));
+        }
+        self.topics.begin_scan(scan.first, scan.last, scan.reasons, period_us);
+        let stands_for = limit(period_us);
+        self.publish_scan(scan, stands_for, is_behind);
+        stands_for
+    }
+
+    /// Returns the number of reads per telegram: 1, unless early warnings have a subscriber.
     pub(crate) fn pieces(&self) -> u8 {
         if self.topics.wants_early() { self.pipeline.pieces() } else { 1 }
     }
 
-    /// Publishes what the scan that is arriving tells already, `begun`, if that is a warning and somebody wants it; and takes
-    /// back what was said of one that is gone, or of this one where it is not true any more.
-    pub(crate) fn foresee(&mut self, begun: Option<&Begun<'_>>) {
-        self.withdraw(begun.map(Begun::number));
-        let Some(begun) = begun.filter(|_| self.topics.wants_early()) else { return };
-        let [withdrawn, worse] = self.early.look(begun, &mut self.pipeline.zones, self.topics.next_seq());
+    /// Publishes a warning if the `partial` scan gives one and a subscriber wants it. Withdraws a warning of another scan, and one that
+    /// no longer holds.
+    pub(crate) fn foresee(&mut self, partial: Option<&RawScan<'_>>) {
+        self.withdraw(partial.map(|partial| partial.number));
+        let Some(partial) = partial.filter(|_| self.topics.wants_early()) else { return };
+        let [withdrawn, worse] = self.early.look(partial, &mut self.pipeline.zones, self.topics.next_seq());
         self.take_back(withdrawn);
         if let Some(word) = worse {
-            let (first, last, reasons, period_us) = match begun {
-                Begun::Telegram(telegram) => {
-                    let variant = Variant::of_beams(telegram.values.count());
-                    let period_us = scanner::period_us(variant, telegram.baud.rate());
-                    (telegram.first, telegram.last, telegram.reasons, period_us)
-                }
-                Begun::Turn(turn) => (turn.first, turn.last, turn.reasons, micros(turn.period)),
-            };
-            self.topics.early(&word, first, last, reasons, period_us);
+            let &RawScan { first, last, reasons, period, .. } = partial;
+            self.topics.early(&word, first, last, reasons, micros(period));
         }
     }
 
@@ -154,19 +158,12 @@ impl<'a, S: Surroundings> LinkOutput<'a, S> {
         }
     }
 
-    /// Publishes the scan of `beams` beams and `len` bytes that `decode` writes, and what is made of it. The verdict on it
-    /// stands for `stands_for`; of one that `is_behind`, it is not known.
-    pub(crate) fn publish_scan(
-        &mut self,
-        beams: usize,
-        len: usize,
-        decode: impl FnOnce(&mut Scan),
-        stands_for: Nanos,
-        is_behind: bool,
-    ) {
+    /// Publishes `scan` and what the processors compute from it. The verdict stays valid for `stands_for`; that on a scan that
+    /// `is_behind` is not known.
+    fn publish_scan(&mut self, scan: &RawScan<'_>, stands_for: Nanos, is_behind: bool) {
         // What waited in the port does not tell how it looks around the robot now.
         self.pipeline.zones.doubt(is_behind);
-        if let Some(reason) = self.topics.scan(beams, len, decode, &mut self.pipeline) {
+        if let Some(reason) = self.topics.scan(scan, &mut self.pipeline) {
             tracing::warn!("{}: the background is learned again: {reason}", self.link.name);
         }
         let is_blind = self.pipeline.zones.is_blind();
@@ -175,11 +172,7 @@ impl<'a, S: Surroundings> LinkOutput<'a, S> {
         }
         // Telegrams that had to wait for the hub are late, but scans do not stay out.
         self.stale_at = self.around.now().saturating_add(stands_for);
-    }
-
-    /// The family of the link's scanner.
-    pub(crate) fn family(&self) -> Family {
-        self.link.family()
+        self.early.confirm(scan.number);
     }
 
     /// Takes loans for a telegram that will be complete in a moment, so that it need not wait for them.
@@ -187,18 +180,9 @@ impl<'a, S: Surroundings> LinkOutput<'a, S> {
         self.topics.prepare(&self.pipeline);
     }
 
-    /// Lets all that has a memory learn from a telegram that says `reply` and is not published.
-    pub(crate) fn learn(&mut self, reply: Option<&Reply<'_>>, mode: Option<Mode>) {
-        let Some(mode) = mode.filter(|mode| mode.has_ranges()) else { return };
-        if let Some(Reply::Measured(measured)) = reply {
-            let decode = |scan: &mut Scan| scanner::decode(measured, mode, scan);
-            self.learn_scan(scanner::len(measured), decode);
-        }
-    }
-
-    /// As [`learn`](Self::learn), from a scan of `len` bytes that `decode` writes.
-    pub(crate) fn learn_scan(&mut self, len: usize, decode: impl FnOnce(&mut Scan)) {
-        self.topics.learn(len, decode, &mut self.pipeline);
+    /// Updates what is learned from a scan that is not published.
+    pub(crate) fn learn(&mut self, scan: &RawScan<'_>) {
+        self.topics.learn(scan, &mut self.pipeline);
     }
 
     /// As [`learn`](Self::learn), of a time without scans.
@@ -287,6 +271,11 @@ impl<'a, S: Surroundings> LinkOutput<'a, S> {
     pub(crate) fn hand_on(&mut self, last: bool) -> Option<(Pose, Box<Background>)> {
         self.pipeline.hand_on(last)
     }
+}
+
+/// Returns a period in microseconds.
+pub(crate) fn micros(period: Nanos) -> u32 {
+    u32::try_from(period / schema::MICROS).unwrap_or(u32::MAX)
 }
 
 /// For how long after a scan the verdict on it stands, if scans come every `period_us`.

@@ -4,13 +4,12 @@
 use std::io;
 
 use port::{PortError, Source};
-use scanhub_drivers::line::{Control, Session as _};
-use scanhub_drivers::lms::Identity;
+use scanhub_drivers::Session;
+use scanhub_drivers::line::{Control, Identity, Session as _};
 use schema::{Failure, Flags, MILLIS, Nanos, State};
 
 use crate::control::{ControlQueue, Flow};
 use crate::drive::{Drive, Open};
-use crate::driver::Driver;
 use crate::link::LinkCore;
 use crate::surroundings::{Line, On, Surroundings, Wait, Woken};
 
@@ -169,9 +168,9 @@ impl<'a, S: Surroundings> LiveLink<'a, S> {
         core.around.keep(&core.link.name, &line);
         core.diagnosis.open(line.device());
         core.output.topics.set_flags(if line.is_simulated() { Flags::SIMULATED } else { 0 });
-        let mut session = Driver::new(core.link, core.is_recording(), now);
+        let mut session = Session::begin(core.link.family(), &core.link.settings(), now);
         if let Some(known) = known {
-            session.recall(known);
+            session.restore_identity(known);
         }
         if let Some(rate) = self.drive.last_rate(core) {
             tracing::debug!(
@@ -179,12 +178,12 @@ impl<'a, S: Surroundings> LiveLink<'a, S> {
                 core.link.name,
                 rate.baud
             );
-            session.recall_rate(rate);
+            session.hint_rate(rate);
         }
         if core.control.is_paused() {
             session.control(Control::Pause, now);
         }
-        self.phase = Phase::Open(Box::new(Open::new(line, session, core.link.most_rate(), now)));
+        self.phase = Phase::Open(Box::new(Open::new(line, session, core.link.max_rate(), now)));
     }
 
     /// A session begins, if there is a line.

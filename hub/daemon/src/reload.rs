@@ -1,8 +1,7 @@
 //! The configuration read again while the hub runs: what is made of scans changes with the next scan, and nothing of the
 //! stream is lost for it; what belongs to a line waits for the next start, which is said. One that cannot be changes nothing.
 
-use config::{Background, Config, Link, Processing, Scanner};
-use scanhub_drivers::line::family::Wanted;
+use config::{Background, Config, Link, Processing};
 use schema::{Failure, Nanos};
 
 use crate::control::Orders;
@@ -120,24 +119,22 @@ impl Differences {
             let background = &link.processing.background;
             (background.learning.start, background.file.clone())
         };
-        let wanted = |link: &Link| match link.scanner {
-            Scanner::Lms => Wanted::default(),
-            Scanner::Turning(turning) => turning.wanted(false, false),
-        };
-        let (was, will) = (wanted(old), wanted(new));
+        let (was, will) = (old.scanner.settings, new.scanner.settings);
+        // Another family has another default.
+        let views = was.view.zip(will.view);
         let is_begun = before.background.is_kept && new.processing.background.is_kept;
         let waiting = of_others([
             ("port", old.port != new.port),
             ("family", old.family() != new.family()),
             ("model", was.model != will.model),
             ("beams", was.beams != will.beams),
-            ("type", old.family != new.family),
-            ("angle", old.variant.angle_deg != new.variant.angle_deg),
-            ("resolution", old.variant.resolution_cdeg != new.variant.resolution_cdeg),
-            ("unit", old.unit != new.unit),
-            ("mode", old.mode != new.mode || was.mode != will.mode),
+            ("type", old.scanner.expected_type != new.scanner.expected_type),
+            ("angle", views.is_some_and(|((was, _), (will, _))| was != will)),
+            ("resolution", views.is_some_and(|((_, was), (_, will))| was != will)),
+            ("unit", was.unit_mm != will.unit_mm),
+            ("mode", was.mode_number != will.mode_number || was.mode != will.mode),
             ("idle", was.stop_when_idle != will.stop_when_idle),
-            ("baud", (old.baud, old.is_baud_set) != (new.baud, new.is_baud_set)),
+            ("baud", was.baud != will.baud),
             ("background.start", is_begun && begin(old) != begin(new)),
         ]);
         if !sections.is_empty() {

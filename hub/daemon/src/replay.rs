@@ -9,13 +9,10 @@ use std::os::fd::AsFd;
 use std::path::Path;
 
 use port::clock;
-use scanhub_drivers::lms::reply::Reply;
-use scanhub_drivers::lms::variant::Variant;
-use scanhub_drivers::{lms, scanner};
+use scanhub_drivers::Session;
 use schema::{Failure, Flags, MILLIS, Nanos, State};
 
 use crate::control::Flow;
-use crate::driver::Driver;
 use crate::link::LinkCore;
 use crate::player::{Due, Pace, Play, Player, PlayerHandle, Turn};
 use crate::surroundings::Woken;
@@ -137,7 +134,7 @@ impl<'a, 'p> ReplayLink<'a, 'p> {
     }
 
     /// Waits for the turn of what is of `media`; meanwhile the link's state is `state`. Nothing if the hub shall end.
-    fn wait_turn(&mut self, session: Option<&Driver>, media: Nanos, state: State) -> Option<Due> {
+    fn wait_turn(&mut self, session: Option<&Session>, media: Nanos, state: State) -> Option<Due> {
         loop {
             let now = clock::now();
             if self.handle.flows() && now < self.look_at {
@@ -180,20 +177,6 @@ impl<'a, 'p> ReplayLink<'a, 'p> {
         }
         Woken::Timeout
     }
-}
-
-/// The variant of the scan that `reply` is, if it is one.
-fn variant_of(reply: Option<&Reply<'_>>) -> Option<Variant> {
-    match reply {
-        Some(Reply::Measured(measured)) => Variant::of_beams(measured.count()),
-        _ => None,
-    }
-}
-
-/// From one scan to the next, as streams without stamps are played.
-fn period(variant: Option<Variant>) -> Nanos {
-    let rate = lms::variant::Baud::B500000.rate();
-    Nanos::from(scanner::period_us(variant.or(Some(Variant::HALF)), rate)) * 1000
 }
 
 /// A verdict stands until the recording says otherwise, also while the player waits.

@@ -4,10 +4,10 @@
 use std::path::Path;
 use std::sync::Arc;
 
-use config::{Config, Scanner, Sources};
+use config::{Config, Sources};
 use port::Source;
 use recording::Recording;
-use scanhub_drivers::line::family::Model;
+use scanhub_drivers::Model;
 use schema::{Domain, Failure, Family, Kind, Nanos, check_sensor};
 
 use crate::player::{Play, Player, Progress};
@@ -156,14 +156,13 @@ fn configuration(sources: &Sources, sensors: &[Sensor], file: &Path) -> Result<C
         link.port = Source::File { path: file.to_owned(), paced: true };
         let of = sensors.iter().find(|sensor| sensor.link == link.name);
         // What is not configured is as it was recorded.
-        if let Scanner::Turning(turning) = &mut link.scanner
-            && let Some(Sensor { model, beams, way, .. }) = of.filter(|_| turning.is_auto())
-        {
-            if turning.mode.is_none() {
-                turning.model = model.clone()?.unwrap_or(turning.model);
+        if let Some(Sensor { model, beams, way, .. }) = of.filter(|_| link.scanner.is_auto()) {
+            let settings = &mut link.scanner.settings;
+            if settings.mode.is_none() {
+                settings.model = model.clone()?.map(|model| model.name);
             }
-            turning.mode = turning.mode.or(*way);
-            turning.beams = *beams;
+            settings.mode = settings.mode.or(*way);
+            settings.beams = *beams;
         }
     }
     Ok(config)
@@ -215,8 +214,8 @@ mod tests {
         let file = Path::new("/tmp/a?b=c.mcap");
         let config = configuration(&sources, &[sensor("front"), sensor("left")], file).unwrap();
         let named: Vec<_> =
-            config.links.iter().map(|link| (link.name.as_str(), link.variant.angle_deg)).collect();
-        assert_eq!(named, [("front", 100), ("left", 180)]);
+            config.links.iter().map(|link| (link.name.as_str(), link.scanner.settings.view)).collect();
+        assert_eq!(named, [("front", Some((100, 50))), ("left", Some((180, 50)))]);
         assert_eq!(config.links[1].port, Source::File { path: file.to_owned(), paced: true });
         let place = tempfile::NamedTempFile::new().unwrap().into_temp_path();
         std::fs::write(&place, "[[link]]\nname = \"rear\"\nport = \"/dev/x\"\nbaud = 38400\n[[link]]\nname = \"up\"\nport = \"y\"\n").unwrap();
@@ -224,7 +223,7 @@ mod tests {
         let config = configuration(&sources, &[sensor("rear")], file).unwrap();
         let left_out = left_out(&sources, &[sensor("rear")], &config).unwrap();
         assert_eq!(
-            (config.links.len(), config.links[0].baud.rate(), left_out),
+            (config.links.len(), config.links[0].rate(), left_out),
             (1, 38_400, vec!["up".to_owned()])
         );
     }

@@ -100,12 +100,12 @@ pub trait Line {
     /// The line is gone.
     fn read(&self, buffer: &mut [u8]) -> io::Result<usize>;
 
-    /// Writes one byte; a full line drops it, as a cable would.
+    /// Writes `bytes`. A full line drops what it has no room for, as a cable would.
     ///
     /// # Errors
     ///
     /// The line is gone.
-    fn write(&self, byte: u8) -> io::Result<()>;
+    fn write(&self, bytes: &[u8]) -> io::Result<()>;
 
     /// Changes the rate, and discards what arrived at the old one. Returns why this rate is not possible.
     ///

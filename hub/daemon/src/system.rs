@@ -268,8 +268,8 @@ impl Line for Port {
         self.read(buffer)
     }
 
-    fn write(&self, byte: u8) -> io::Result<()> {
-        self.write(byte)
+    fn write(&self, bytes: &[u8]) -> io::Result<()> {
+        self.write(bytes)
     }
 
     fn set_baud(&self, baud: u32) -> io::Result<Option<io::Error>> {

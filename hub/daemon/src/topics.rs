@@ -4,7 +4,7 @@
 mod moment;
 mod prepared_publisher;
 
-use scanhub_drivers::line::Received;
+use scanhub_drivers::line::{RawScan, Received};
 use schema::ipc::DueRings;
 use schema::{
     Background, Early, Failure, Family, Flags, Foreground, Header, Lines, MILLIS, Marks, Motion, Nanos,
@@ -106,17 +106,16 @@ impl<'a, S: Surroundings> Topics<'a, S> {
     }
 
     /// Publishes the telegram and takes its number and stamps for all that follows from it.
-    /// `reasons` are why it is suspect.
-    pub(crate) fn telegram<M>(&mut self, received: &Received<'_, M>, reasons: u8, period_us: u32) {
-        self.begin_telegram(received, reasons, period_us);
+    pub(crate) fn telegram(&mut self, received: &Received<'_>, period_us: u32) {
+        self.begin_telegram(received, period_us);
         self.telegram.send_bytes(received.bytes, &self.header, &mut self.due);
     }
 
     /// As [`telegram`](Self::telegram), of packets, of which there are many and which most do not follow: whether anybody does is
     /// asked now and then.
-    pub(crate) fn packets<M>(&mut self, received: &Received<'_, M>, reasons: u8) {
-        // Packets are no scans: how long one takes, their turn says.
-        self.begin_telegram(received, reasons, 0);
+    pub(crate) fn packets(&mut self, received: &Received<'_>) {
+        // The period belongs to the scan.
+        self.begin_telegram(received, 0);
         if received.last >= self.asked_at + UNASKED {
             self.asked_at = received.last;
             self.has_followers = self.telegram.is_heard();
@@ -128,10 +127,10 @@ impl<'a, S: Surroundings> Topics<'a, S> {
         }
     }
 
-    fn begin_telegram<M>(&mut self, received: &Received<'_, M>, reasons: u8, period_us: u32) {
+    fn begin_telegram(&mut self, received: &Received<'_>, period_us: u32) {
         self.header.seq = self.next_seq;
         self.next_seq += 1;
-        self.begin_scan(received.first, received.last, reasons, period_us);
+        self.begin_scan(received.first, received.last, received.reasons, period_us);
         self.header.flags |= if received.estimated { Flags::STAMP_ESTIMATED } else { 0 };
     }
 
@@ -151,19 +150,14 @@ impl<'a, S: Surroundings> Topics<'a, S> {
         self.header.flags &= !Flags::STAMP_ESTIMATED;
     }
 
-    /// Publishes a scan of the last telegram, of `beams` beams and `len` bytes, which `fill` writes, and its zones, and wakes
+    /// Publishes a scan of the last telegram and its zones, and wakes
     /// those who wait for these; then whatever else `pipeline` makes of it. Marks, lines, motion and foreground that nobody wants are
     /// not made. A background that does not fit the scan starts again; then it is told why.
-    pub(crate) fn scan(
-        &mut self,
-        beams: usize,
-        len: usize,
-        fill: impl FnOnce(&mut Scan),
-        pipeline: &mut Pipeline,
-    ) -> Option<Relearned> {
+    pub(crate) fn scan(&mut self, raw: &RawScan<'_>, pipeline: &mut Pipeline) -> Option<Relearned> {
+        let len = raw.len();
         let (mut scan, mut zones) = (self.scan.loan(len), self.zones.loan(0));
         let decoded = with_room(&mut self.decoded, len);
-        fill(decoded);
+        raw.write(decoded);
         if let Some(sample) = Publisher::<Scan, S>::payload_mut(&mut scan) {
             sample.copy_from(decoded.bytes());
         }
@@ -176,7 +170,7 @@ impl<'a, S: Surroundings> Topics<'a, S> {
         let (mut marks, mut lines) = (self.marks.loan(0), self.lines.loan(0));
         let mut motion = self.motion.loan(0);
         let mut foreground =
-            pipeline.keeps_background().then(|| self.foreground.loan(Foreground::len(beams)));
+            pipeline.keeps_background().then(|| self.foreground.loan(Foreground::len(raw.beams())));
         let relearned = pipeline.examine(
             &self.decoded,
             Outputs {
@@ -236,10 +230,10 @@ impl<'a, S: Surroundings> Topics<'a, S> {
         }
     }
 
-    /// Lets `pipeline` learn from a scan of `len` bytes that is not published, and that `fill` writes.
-    pub(crate) fn learn(&mut self, len: usize, fill: impl FnOnce(&mut Scan), pipeline: &mut Pipeline) {
-        let scan = with_room(&mut self.decoded, len);
-        fill(scan);
+    /// Updates `pipeline` from a scan that is not published.
+    pub(crate) fn learn(&mut self, raw: &RawScan<'_>, pipeline: &mut Pipeline) {
+        let scan = with_room(&mut self.decoded, raw.len());
+        raw.write(scan);
         pipeline.watch(scan, None);
         pipeline.examine(scan, Outputs::default());
     }

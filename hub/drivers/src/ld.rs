@@ -10,7 +10,8 @@ mod restarts;
 mod sequence;
 mod session;
 
-pub use crate::line::{Heard, Packets, Tally, Turn, TurnCounts};
+pub use crate::line::{Tally, TurnCounts};
 pub use model::Model;
 pub use probe::Probe;
-pub use session::{Session, Settings, Trouble};
+pub(crate) use session::scan_heads;
+pub use session::{FEATURES, Session, Settings, Trouble};

@@ -1,13 +1,16 @@
-//! The drivers: what each family of laser scanners sends and receives, the session with a scanner, and the decoder that makes
-//! scans of telegrams and revolutions.
+//! The drivers: the protocol of each family of laser scanners, the session with a scanner, and the scans that it yields.
 //!
 //! Sans-I/O: the caller passes bytes and the time, and gets bytes, events and deadlines back. No driver opens a port, reads a
 //! clock or starts a thread. Bytes outside telegrams are counted and are never an error.
 #![forbid(unsafe_code)]
 
+mod families;
 pub mod ld;
 pub mod line;
 pub mod lms;
+pub mod recognize;
 pub mod rplidar;
-pub mod scanner;
 pub mod search;
+
+pub use families::{Session, Trouble, features, scan_heads};
+pub use line::family::{Features, Model, Settings};

@@ -7,19 +7,23 @@ pub mod framing;
 pub mod grid;
 pub mod probe;
 mod reads;
+mod scan;
 mod sensor_clock;
 mod session;
 mod turns;
 
 pub use arrival::{Arrivals, Flow};
-pub use family::{Heard, Packets, Turn, TurnCounts};
 pub use framing::{Buffer, Tally};
 pub use reads::Reads;
+pub use scan::{RawScan, Values, revolution_head};
 pub use sensor_clock::SensorClock;
-pub use session::{Account, Control, Output, Received, Session, State};
-pub use turns::{Closed, Pace, Turns};
+pub use session::{
+    Account, Condition, Control, Event, Identity, Introduction, KnownRate, Notice, Output, Protocol,
+    Received, Session, State, Whole,
+};
+pub use turns::{Closed, Pace, TurnCounts, Turns};
 
-/// Why a telegram or packet is suspect: bits of `reasons`. A family sets those that it can detect.
+/// Reasons why a telegram or packet is suspect: bits of `reasons`. A family sets those that it can detect.
 pub mod suspect {
     /// The error counters of the line have increased.
     pub const LINE_ERROR: u8 = 1;

@@ -38,10 +38,10 @@ pub mod telegram;
 pub mod value;
 pub mod variant;
 
-pub use identity::Identity;
 pub use inquiry::Inquiry;
 pub use notice::Notice;
 pub use phase::{SILENCE, Settings};
 pub use probe::Probe;
 pub use sensor::{Sensor, Trouble};
-pub use session::Session;
+pub(crate) use session::scan_heads;
+pub use session::{FEATURES, Session};

@@ -11,8 +11,9 @@ mod request;
 mod sequence;
 mod session;
 
-pub use crate::line::{Heard, Packets, Tally, Turn, TurnCounts};
+pub use crate::line::{Tally, TurnCounts};
 pub use device_info::{Health, Info};
 pub use model::{Mode, Model};
 pub use probe::Probe;
-pub use session::{Session, Settings, Trouble};
+pub(crate) use session::scan_heads;
+pub use session::{FEATURES, Session, Settings, Trouble};

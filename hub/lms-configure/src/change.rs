@@ -5,10 +5,9 @@
 //! The only code that sends a request of [`crate::eeprom`], and it needs [`Consent`]. A write that was not
 //! acknowledged is not simply repeated: first the configuration is read, to see whether it was done.
 
+use scanhub_drivers::line::{Output, Protocol};
 use scanhub_drivers::lms::command::{self, Request};
-use scanhub_drivers::lms::exchange::{
-    Conversation, Exchange, Heard, MODE_TIMEOUT, MORE_TRIES, Output, Say, TRIES,
-};
+use scanhub_drivers::lms::exchange::{Exchange, Heard, MODE_TIMEOUT, MORE_TRIES, Say, TRIES};
 use scanhub_drivers::lms::framer::TelegramSpan;
 use scanhub_drivers::lms::operating::{ON_REQUEST, Operating, PARTIAL, STREAM};
 use scanhub_drivers::lms::reply::Reply;
@@ -161,7 +160,7 @@ impl Change {
         self.step
     }
 
-    /// What became of it; all of it after [`Output::Done`].
+    /// What became of it; all of it when the change [is done](Protocol::is_done).
     pub fn outcome(&self) -> &Outcome {
         &self.outcome
     }
@@ -308,7 +307,7 @@ impl Change {
     }
 }
 
-impl Conversation for Change {
+impl Protocol for Change {
     fn spare(&mut self) -> &mut [u8] {
         self.exchange.spare()
     }
@@ -331,7 +330,11 @@ impl Conversation for Change {
         self.exchange.transmitted(now);
     }
 
-    fn poll_output(&mut self) -> Output {
+    fn is_done(&self) -> bool {
+        self.step == Step::Done
+    }
+
+    fn poll_output(&mut self) -> Output<'_> {
         while let Some(heard) = self.exchange.advance() {
             match heard {
                 Heard::Telegram(span) => self.on_telegram(span),
@@ -344,7 +347,10 @@ impl Conversation for Change {
                 }
             }
         }
-        if self.step == Step::Done { Output::Done } else { self.exchange.output(Nanos::MAX) }
+        match self.step {
+            Step::Done => Output::Wait { until: Nanos::MAX },
+            _ => self.exchange.output(Nanos::MAX),
+        }
     }
 }
 

@@ -210,11 +210,11 @@ impl Port {
         }
     }
 
-    /// Writes one byte. A full line drops it, as a cable would, and the session repeats the request.
-    pub fn write(&self, byte: u8) -> io::Result<()> {
+    /// Writes `bytes`. A full line drops what it has no room for, as a cable would, and the session repeats the request.
+    pub fn write(&self, bytes: &[u8]) -> io::Result<()> {
         match self {
-            Port::Tty(tty) => tty.write(byte),
-            Port::Tcp(tcp) => tcp.write(byte),
+            Port::Tty(tty) => tty.write(bytes),
+            Port::Tcp(tcp) => tcp.write(bytes),
         }
     }
 

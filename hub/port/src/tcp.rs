@@ -62,8 +62,8 @@ impl Tcp {
         Ok(())
     }
 
-    pub(crate) fn write(&self, byte: u8) -> io::Result<()> {
-        match rustix::io::write(&self.stream, &[byte]) {
+    pub(crate) fn write(&self, bytes: &[u8]) -> io::Result<()> {
+        match rustix::io::write(&self.stream, bytes) {
             Ok(_) | Err(Errno::AGAIN | Errno::INTR) => Ok(()),
             Err(error) => Err(error.into()),
         }

@@ -195,8 +195,8 @@ impl Tty {
         }
     }
 
-    pub(crate) fn write(&self, byte: u8) -> io::Result<()> {
-        match rustix::io::write(&self.line, &[byte]) {
+    pub(crate) fn write(&self, bytes: &[u8]) -> io::Result<()> {
+        match rustix::io::write(&self.line, bytes) {
             Err(Errno::IO) => Err(hung_up()),
             Ok(_) | Err(Errno::AGAIN | Errno::INTR) => Ok(()),
             Err(error) => Err(error.into()),

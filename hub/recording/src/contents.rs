@@ -2,11 +2,11 @@
 
 use std::fmt;
 
-use scanhub_drivers::lms::measured::Measured;
+use scanhub_drivers::lms::measured::{Measured, nominal_period};
 use scanhub_drivers::lms::reply::Reply;
 use scanhub_drivers::lms::telegram::Telegram;
-use scanhub_drivers::lms::variant::{Mode, Unit, Variant};
-use schema::Family;
+use scanhub_drivers::lms::variant::{Baud, Mode, Unit, Variant};
+use schema::{Family, Nanos};
 
 use crate::{Unfit, Unread};
 
@@ -69,6 +69,13 @@ impl Contents {
     pub fn readable(&self) -> Option<Mode> {
         let plain = Mode(0x00);
         self.mode.or((self.bits <= plain.max_value()).then_some(plain))
+    }
+
+    /// Returns the time from a scan of `beams` to the next one, for a recording without stamps. Another number of beams than those of
+    /// the listing has the period of the other scans.
+    pub fn period(&self, beams: usize) -> Nanos {
+        let variant = Variant::of_beams(beams).or(self.variant).unwrap_or(Variant::HALF);
+        nominal_period(variant.beams(), Baud::B500000.rate())
     }
 
     /// Nothing yet.

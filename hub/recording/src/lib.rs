@@ -21,6 +21,8 @@ pub use open::{Encoding, Recording};
 pub use virtual_time::VirtualTime;
 
 use scanhub_drivers::lms::measured::MEASURED;
+use scanhub_drivers::lms::reply::Reply;
+use scanhub_drivers::lms::telegram::Telegram;
 use schema::Family;
 
 /// One telegram of a recording, or the packets that arrived together.
@@ -45,6 +47,12 @@ impl Frame {
     /// Whether it is a telegram of measured values (B0h), which is what an LMS streams.
     pub fn is_scan(&self) -> bool {
         is_scan(self.family, &self.telegram)
+    }
+
+    /// Returns whether it reports the measuring mode, or that the mode is no longer known.
+    pub fn tells_mode(&self) -> bool {
+        let reply = Telegram::check(&self.telegram).and_then(Reply::decode);
+        reply.is_some_and(|reply| reply.mode().is_some())
     }
 }
 

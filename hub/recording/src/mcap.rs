@@ -7,9 +7,9 @@ use std::collections::{BTreeMap, HashSet};
 use std::io::{self, Read};
 use std::sync::Arc;
 
+use scanhub_drivers::features;
 use scanhub_drivers::lms::telegram::Telegram;
 use scanhub_drivers::lms::variant::Mode;
-use scanhub_drivers::scanner;
 use schema::datagram::Packed;
 use schema::{Family, Header, Pace, Scan, Status, Topic};
 
@@ -262,7 +262,7 @@ impl Survey {
 
 /// Returns the model and the scan mode that `status` names, if the scanner is a rotating one.
 fn rotating(status: &Status) -> Option<(&'static str, Option<&'static str>)> {
-    let features = scanner::features(Family::of_number(status.family)?)?;
+    let features = features(Family::of_number(status.family)?);
     let name = status.model()?;
     let model = features.models.iter().map(|model| model.name).find(|known| *known == name)?;
     let way = features.modes.iter().copied().find(|known| status.way() == Some(known));

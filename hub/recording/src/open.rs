@@ -5,10 +5,10 @@ use std::fmt;
 use std::io::{self, BufRead, BufReader, Read, Seek, SeekFrom};
 use std::path::{Path, PathBuf};
 
-use scanhub_drivers::line::family::{Model, Wanted};
+use scanhub_drivers::line::Session as _;
 use scanhub_drivers::lms::variant::{Mode, Unit};
-use scanhub_drivers::scanner;
-use scanhub_drivers::scanner::recognize::{EXAMINED, bytes_by_family, family_of, framing_mode};
+use scanhub_drivers::recognize::{EXAMINED, bytes_by_family, family_of, framing_mode};
+use scanhub_drivers::{Model, Session, Settings, features};
 use schema::{Failure, Family, Kind, regular};
 
 use crate::carmen::{self, Log};
@@ -183,18 +183,15 @@ impl Recording {
     ///
     /// As [`telegrams`](Self::telegrams); [`Kind::Input`] if nothing in it tells how its packets are to be read.
     pub fn model(&self) -> Result<Option<Model>, Failure> {
-        let models = || self.family().and_then(scanner::features).map(|features| features.models.iter());
-        if let Some(told) =
-            models().and_then(|mut models| models.find(|it| Some(it.name) == self.contents.model))
-        {
-            return Ok(Some(*told));
-        }
-        let wanted = Wanted { fixed_rate: true, listen_only: true, ..Wanted::default() };
-        let Some(session) = self.family().and_then(|family| scanner::Session::begin(family, wanted, 0))
-        else {
+        let Some(family) = self.family().filter(|family| !features(*family).models.is_empty()) else {
             return Ok(None);
         };
-        let mut session = VirtualTime::new(session, 0);
+        let mut models = features(family).models.iter();
+        if let Some(told) = models.find(|it| Some(it.name) == self.contents.model) {
+            return Ok(Some(*told));
+        }
+        let settings = Settings { fixed_rate: true, listen_only: true, ..Settings::default() };
+        let mut session = VirtualTime::new(Session::begin(family, &settings, 0), 0);
         // Nothing of it is encoded here.
         let mut frames = self.telegrams(Encoding { unit: Unit::Mm, mode: Mode(0) })?;
         let mut told = None;
@@ -205,13 +202,12 @@ impl Recording {
                 break;
             }
         }
-        if let Some(lacks) =
-            session.session().lacks().filter(|_| told.is_none() && self.contents.way.is_none())
-        {
+        let missing = session.session().missing_setting();
+        if let Some(missing) = missing.filter(|_| told.is_none() && self.contents.way.is_none()) {
             return Err(Failure::new(
                 Kind::Input,
                 format!("recording {} does not tell of which kind its packets are", self.path.display()),
-                format!("`scanhub replay` plays it where link.NAME.{lacks} is set"),
+                format!("`scanhub replay` plays it where link.NAME.{missing} is set"),
             ));
         }
         Ok(told)
@@ -222,7 +218,7 @@ impl Recording {
     pub fn beams(&self) -> Option<usize> {
         let scans = self.contents.beams.map(usize::from);
         scans.or_else(|| {
-            let (step, features) = (self.contents.step_cdeg?, scanner::features(self.family()?)?);
+            let (step, features) = (self.contents.step_cdeg?, features(self.family()?));
             let model = features.models.iter().find(|model| Some(model.name) == self.contents.model);
             let is_told = |beams: &usize| (36_000.0 / *beams as f64).round() == f64::from(step);
             [model.map(|model| model.beams), Some(features.auto.beams)].into_iter().flatten().find(is_told)

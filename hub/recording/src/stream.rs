@@ -5,10 +5,9 @@
 use std::io::{self, Read};
 use std::path::Path;
 
-use scanhub_drivers::line::family::Wanted;
-use scanhub_drivers::line::{Heard, Output, Session as _};
+use scanhub_drivers::line::{Event, Output, Protocol as _, Session as _};
 use scanhub_drivers::lms::framer::{Found, Framer, VETO_HOLD};
-use scanhub_drivers::scanner;
+use scanhub_drivers::{Session, Settings, features};
 use schema::{Failure, Family, MILLIS, Nanos, line_time};
 
 use crate::open::{is_end, reader, unreadable};
@@ -60,7 +59,7 @@ impl<R: Read> Telegrams<R> {
 /// Reads packets of a rotating scanner; ends with the stream.
 pub(crate) struct Packets<R> {
     reader: R,
-    session: scanner::Session,
+    session: Session,
     family: Family,
     /// The scanner's clock at the last packets.
     last: Option<Nanos>,
@@ -72,8 +71,11 @@ pub(crate) struct Packets<R> {
 impl<R: Read> Packets<R> {
     /// Reads packets of `family`, which are split as those of `mode`, if that is given. `None` if the family sends no packets.
     pub(crate) fn of(family: Family, mode: Option<&'static str>, reader: R) -> Option<Packets<R>> {
-        let wanted = Wanted { mode, fixed_rate: true, listen_only: true, ..Wanted::default() };
-        let session = scanner::Session::begin(family, wanted, 0)?;
+        if features(family).has_whole_telegrams {
+            return None;
+        }
+        let settings = Settings { mode, fixed_rate: true, listen_only: true, ..Settings::default() };
+        let session = Session::begin(family, &settings, 0);
         Some(Packets { reader, session, family, last: None, passed: 0, ended: false })
     }
 
@@ -109,9 +111,11 @@ impl<R: Read> Packets<R> {
     fn heard(&mut self) -> Option<Frame> {
         let (telegram, reasons) = loop {
             match self.session.poll_output() {
-                Output::Heard(Heard::Packets(received)) => break (received.bytes.to_vec(), received.reasons),
+                Output::Event(Event::Telegram(received)) => {
+                    break (received.bytes.to_vec(), received.reasons);
+                }
                 Output::Transmit { .. } => self.session.transmitted(0),
-                Output::Heard(Heard::Turn(_)) | Output::SetRate(_) | Output::SetDtr(_) => {}
+                Output::Event(Event::Scan(_)) | Output::SetRate(_) | Output::SetDtr(_) => {}
                 Output::Rest(_) | Output::Wait { .. } => return None,
             }
         };

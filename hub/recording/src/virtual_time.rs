@@ -2,7 +2,7 @@
 //! what it waits for in between comes when it is due. So it makes of the packets what was made of them then. Refuses to know
 //! where they are from, and what becomes of that.
 
-use scanhub_drivers::line::{Output, Session};
+use scanhub_drivers::line::{Event, Output, Protocol};
 use schema::Nanos;
 
 /// `S` in a time that its owner tells.
@@ -13,7 +13,7 @@ pub struct VirtualTime<S> {
     until: Nanos,
 }
 
-impl<S: Session> VirtualTime<S> {
+impl<S: Protocol> VirtualTime<S> {
     /// Begins with `session`, which was made at `now`.
     pub fn new(session: S, now: Nanos) -> VirtualTime<S> {
         VirtualTime { session, now, until: now }
@@ -29,16 +29,16 @@ impl<S: Session> VirtualTime<S> {
         &mut self.session
     }
 
-    /// Lets the time pass until `now`, at which `bytes` are there; `heard` gets what the session hands out meanwhile. Time
+    /// Lets the time pass until `now`, at which `bytes` are there; `handle` gets the events meanwhile. Time
     /// does not go back: an earlier `now` is the last one.
-    pub fn take(&mut self, now: Nanos, bytes: &[u8], mut heard: impl FnMut(S::Heard<'_>)) {
+    pub fn take(&mut self, now: Nanos, bytes: &[u8], mut handle: impl FnMut(Event<'_>)) {
         let now = now.max(self.now);
         while self.until < now {
             self.now = self.until.max(self.now);
             self.session.spare();
             self.session.commit(self.now, 0);
             self.session.handle_timeout(self.now);
-            self.drain(&mut heard);
+            self.drain(&mut handle);
             // What it waits for did not come, and cannot be waited for again in the same moment.
             self.until = self.until.max(self.now + 1);
         }
@@ -49,17 +49,17 @@ impl<S: Session> VirtualTime<S> {
             let (taken, rest) = bytes.split_at(bytes.len().min(room.len()));
             room[..taken.len()].copy_from_slice(taken);
             self.session.commit(now, taken.len());
-            self.drain(&mut heard);
+            self.drain(&mut handle);
             bytes = rest;
         }
     }
 
-    fn drain(&mut self, heard: &mut impl FnMut(S::Heard<'_>)) {
+    fn drain(&mut self, handle: &mut impl FnMut(Event<'_>)) {
         self.until = loop {
             let is_sent = match self.session.poll_output() {
                 Output::Transmit { .. } => true,
-                Output::Heard(said) => {
-                    heard(said);
+                Output::Event(event) => {
+                    handle(event);
                     false
                 }
                 Output::SetRate(_) | Output::SetDtr(_) => false,

@@ -2,9 +2,8 @@
 //! and what share of the bins stays empty, against the number of bins; and how long a turn takes to be put there. The
 //! tables of docs/scanners.md: `cargo run --release -p scanhub-sim --example beams`.
 
-use scanhub_drivers::line::family::Turning;
 use scanhub_drivers::line::grid::{Grid, Point};
-use scanhub_drivers::line::{Heard, Output, Session};
+use scanhub_drivers::line::{Event, Output, Session};
 use scanhub_drivers::{ld, rplidar};
 use schema::{MILLIS, Nanos, line_time};
 use sim::Arrival;
@@ -24,7 +23,7 @@ fn room() -> Room {
 /// The whole turns that `session` makes of what `device` sends in `seconds`, and the beams that it has by itself.
 fn turns<S>(mut session: S, mut device: impl Device, seconds: u64) -> (Vec<Vec<Point>>, usize)
 where
-    S: for<'a> Session<Heard<'a> = Heard<'a>> + Turning,
+    S: Session,
 {
     let (mut now, mut turns): (Nanos, Vec<Vec<Point>>) = (0, Vec::new());
     while now < seconds * 1_000 * MILLIS {
@@ -42,16 +41,20 @@ where
         }
         loop {
             match session.poll_output() {
-                Output::Heard(Heard::Turn(turn)) if !turn.incomplete => turns.push(turn.points.to_vec()),
-                Output::Transmit { byte, .. } => {
-                    now += line_time(1, device.rate());
-                    while device.poll_transmit(now).is_some() {}
-                    if session.rate() == device.rate() {
-                        device.receive(byte, Arrival::at(now));
+                Output::Event(Event::Scan(turn)) if !turn.is_incomplete() => {
+                    turns.push(turn.points().to_vec())
+                }
+                Output::Transmit { bytes, .. } => {
+                    for byte in bytes.to_vec() {
+                        now += line_time(1, device.rate());
+                        while device.poll_transmit(now).is_some() {}
+                        if session.rate() == device.rate() {
+                            device.receive(byte, Arrival::at(now));
+                        }
                     }
                     session.transmitted(now);
                 }
-                Output::Heard(_) | Output::SetRate(_) | Output::SetDtr(_) => {}
+                Output::Event(_) | Output::SetRate(_) | Output::SetDtr(_) => {}
                 Output::Rest(_) | Output::Wait { .. } => break,
             }
         }

@@ -18,7 +18,7 @@ use scanhub_drivers::lms::variant::{Mode, Unit};
 use schema::{Failure, Kind};
 use serde::Serialize;
 
-use crate::driver::drive;
+use crate::driver::{Procedure, drive};
 use crate::probe::{hex, measuring, open, request_report};
 use settings::{AVAILABILITY, MODE, SENSITIVITIES, SENSITIVITY, SettingsRequest, UNIT};
 
@@ -94,12 +94,13 @@ pub fn configure(order: &Order, stop: &AtomicBool, tell: &mut dyn FnMut(News<'_>
     let mut shown = None;
     // An interrupt would leave the change incomplete. It takes seconds, and ends in any case.
     let never_stop = AtomicBool::new(false);
-    let result = drive(&port, &mut change, &never_stop, |change| {
+    let mut procedure = Procedure::new(|change: &Change| {
         if shown != Some(change.step()) {
             shown = Some(change.step());
             tell(News::Doing(describe_step(change.step())));
         }
     });
+    let result = drive(&port, &mut change, &mut procedure, &never_stop);
     result.map_err(|failure| lost_while_writing(&name, &change, &failure))?;
     let configured = Configured::of(&name, &plan, was_permanent, change.outcome())?;
     tell(News::Configured(&configured));

@@ -1,17 +1,17 @@
-//! Runs protocol state machines on an open port, for a user at a terminal: [`detect`] searches for a rotating scanner,
-//! and [`drive`] runs a conversation with an LMS. A thread of the hub does the same for a link, without an end.
+//! Runs protocol state machines on an open port, for a user at a terminal: [`drive`] runs any of them, and [`detect`] searches
+//! for a rotating scanner with it. A thread of the hub does the same for a link, without an end.
 
 use std::fmt;
+use std::io;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
 use port::{Port, clock};
 use rustix::event::{PollFd, PollFlags, poll};
-use scanhub_drivers::line::Session as _;
-use scanhub_drivers::line::family::{Condition, Features, Model, Wanted};
-use scanhub_drivers::line::{Account, Heard, Output};
-use scanhub_drivers::lms::exchange::{self, Conversation};
-use scanhub_drivers::scanner::{Introduction, Session, features};
+use scanhub_drivers::line::{
+    Account, Condition, Event, Introduction, Output, Protocol, Session as _, Values,
+};
+use scanhub_drivers::{Features, Model, Session, Settings, features};
 use schema::{Failure, Family, Kind, MILLIS, Nanos};
 
 /// A rotating scanner that was detected, and what was received from it.
@@ -69,8 +69,8 @@ impl fmt::Display for DetectedScanner {
 
 /// Returns the families of rotating scanners. Families that stream without a request come first.
 pub(crate) fn turning() -> Vec<(Family, &'static Features)> {
-    let known = Family::ALL.into_iter().filter_map(|family| Some((family, features(family)?)));
-    let mut known: Vec<_> = known.collect();
+    let all = Family::ALL.into_iter().map(|family| (family, features(family)));
+    let mut known: Vec<_> = all.filter(|(_, features)| !features.models.is_empty()).collect();
     known.sort_by_key(|(_, features)| !features.speaks_unasked);
     known
 }
@@ -89,68 +89,52 @@ pub(crate) fn detect(
     port: &Port,
     (family, features): (Family, &Features),
     stop: &AtomicBool,
-    mut look: impl FnMut(u32),
+    look: impl FnMut(u32),
 ) -> Result<Result<DetectedScanner, u64>, Failure> {
     let fixed_rate = port.baud().is_none();
-    let wanted = Wanted { fixed_rate, listen_only: features.speaks_unasked, ..Wanted::default() };
+    let settings = Settings { fixed_rate, listen_only: features.speaks_unasked, ..Settings::default() };
     let begun = clock::now();
-    let Some(mut session) = Session::begin(family, wanted, begun) else { return Ok(Err(0)) };
+    let mut session = Session::begin(family, &settings, begun);
     port.try_baud(session.rate()).map_err(|error| port_lost(port, &error))?;
-    let mut heard = Received::default();
-    let (first_rate, mut rate, mut rates) = (session.rate(), 0, 0);
-    // A scanner may miss a request or respond late, and the line may damage the response.
-    let mut rounds = if features.speaks_unasked { 1 } else { 3 };
-    loop {
-        if !fixed_rate && rate != session.rate() {
-            (rate, rates) = (session.rate(), rates + 1);
-            if rates > 1 && rate == first_rate && heard.said.is_none() {
-                rounds -= 1;
-            }
-            if rounds == 0 {
-                break;
-            }
-            look(rate);
-        }
-        let until = heard.drain(port, &mut session).map_err(|error| port_lost(port, &error))?;
-        if stop.load(Ordering::Relaxed) {
-            let _ = heard.end(port, &mut session);
-            return Err(Failure::new(Kind::Interrupted, "interrupted", ""));
-        }
-        let now = clock::now();
-        let is_detected = heard.packets >= MIN_PACKETS;
-        let limit = match (&heard.said, heard.measures_since) {
-            (Some(said), _) if said.condition == Condition::Error => now,
-            (Some(_), Some(since)) => since + MEASURING_TIME,
-            (Some(_), None) => heard.said_at + SPIN_UP_TIMEOUT,
-            (None, Some(since)) if is_detected && heard.turns >= MIN_REVOLUTIONS => since + MEASURING_TIME,
-            (None, _) if is_detected => begun + REVOLUTIONS_TIMEOUT,
-            (None, _) if features.speaks_unasked => begun + PACKETS_TIMEOUT,
-            (None, _) => begun + REPLY_TIMEOUT,
-        };
-        if now >= limit {
-            break;
-        }
-        let until = until.min(limit);
-        let mut fds = [PollFd::new(port, PollFlags::IN)];
-        // An interrupted wait only ends early.
-        let _ = poll(&mut fds, Some(&clock::span(now, until.min(now + STOP_CHECK_INTERVAL))));
-        let len = port.read(session.spare()).map_err(|error| port_lost(port, &error))?;
-        let now = clock::now();
-        session.commit(now, len);
-        if len == 0 && now >= until {
-            session.handle_timeout(now);
-        }
-    }
+    let mut detection = Detection {
+        speaks_unasked: features.speaks_unasked,
+        fixed_rate,
+        begun,
+        first_rate: session.rate(),
+        rate: 0,
+        rates: 0,
+        // A scanner may miss a request or respond late, and the line may damage the response.
+        rounds: if features.speaks_unasked { 1 } else { 3 },
+        look,
+        packets: 0,
+        measures_since: None,
+        turns: 0,
+        period: 0,
+        points_per_second: 0.0,
+        said: None,
+        said_at: 0,
+        dtr: None,
+    };
+    let driven = drive(port, &mut session, &mut detection, stop);
     let mut trouble = session.trouble().map(|trouble| trouble.to_string());
-    if heard.packets == 0 && heard.said.as_ref().is_some_and(|said| said.condition != Condition::Error) {
+    let Detection { packets, period, points_per_second, said, .. } = detection;
+    let is_error = |said: &Introduction| said.condition == Condition::Error;
+    if packets == 0 && said.as_ref().is_some_and(|said| !is_error(said)) {
         trouble.get_or_insert_with(|| "it answers, but does not begin to measure".to_owned());
     }
     let (account, model) = (session.account(), session.model());
-    heard.end(port, &mut session).map_err(|error| port_lost(port, &error))?;
-    if heard.packets < MIN_PACKETS && heard.said.is_none() {
+    // Stops a scanner that measures on request, and its motor, as a hub does when it exits.
+    let measures = said.as_ref().is_some_and(|said| !is_error(said));
+    let ended = match &driven {
+        Err(failure) if failure.kind != Kind::Interrupted => Ok(0),
+        _ if measures && session.end(clock::now()) => drain(port, &mut session, &mut End),
+        _ => Ok(0),
+    };
+    driven?;
+    ended.map_err(|error| port_lost(port, &error))?;
+    if packets < MIN_PACKETS && said.is_none() {
         return Ok(Err(account.read));
     }
-    let Received { packets, period, points_per_second, said, .. } = heard;
     Ok(Ok(DetectedScanner {
         family,
         model,
@@ -186,9 +170,18 @@ pub(crate) fn not_detected(name: &str, family: Family, features: &Features, byte
     Failure::new(Kind::Timeout, what, remedy)
 }
 
-/// Statistics of the outputs of a session.
-#[derive(Default)]
-struct Received {
+/// Detection of a rotating scanner: decides when enough was received.
+struct Detection<F> {
+    speaks_unasked: bool,
+    fixed_rate: bool,
+    begun: Nanos,
+    first_rate: u32,
+    /// Rate at which the session searches, and the number of rates so far.
+    rate: u32,
+    rates: u32,
+    /// Remaining searches at all rates.
+    rounds: u32,
+    look: F,
     packets: u64,
     /// Time of the first packet.
     measures_since: Option<Nanos>,
@@ -202,71 +195,102 @@ struct Received {
     dtr: Option<bool>,
 }
 
-impl Received {
-    /// Carries out the actions of `session` until it waits. Returns the end of the wait.
-    fn drain(&mut self, port: &Port, session: &mut Session) -> std::io::Result<Nanos> {
-        loop {
-            match session.poll_output() {
-                Output::SetRate(rate) => {
-                    port.try_baud(rate)?;
+impl<F: FnMut(u32)> Task<Session> for Detection<F> {
+    /// Takes over what the scanner has reported of itself. From then on its motor is controlled. If it reports an error, the session
+    /// would restart it next.
+    fn may_continue(&mut self, port: &Port, session: &Session) -> io::Result<bool> {
+        if self.said.is_some() {
+            return Ok(true);
+        }
+        self.said = session.introduction();
+        self.said_at = clock::now();
+        match (&self.said, self.dtr) {
+            (Some(said), _) if said.condition == Condition::Error => Ok(false),
+            (Some(_), Some(on)) => port.set_dtr(on).map(|()| true),
+            _ => Ok(true),
+        }
+    }
+
+    /// Before the scanner has replied, its motor stays as it is.
+    fn set_dtr(&mut self, port: &Port, on: bool) -> io::Result<()> {
+        self.dtr = Some(on);
+        if self.said.is_some() { port.set_dtr(on) } else { Ok(()) }
+    }
+
+    fn on_event(&mut self, event: Event<'_>) {
+        match event {
+            Event::Telegram(received) if !received.is_reply => {
+                self.measures_since.get_or_insert_with(clock::now);
+                self.packets += received.count as u64;
+            }
+            Event::Telegram(_) => {}
+            Event::Scan(scan) => {
+                self.turns += 1;
+                self.period = scan.period;
+                if let Values::Points { per_second, .. } = scan.values {
+                    self.points_per_second = per_second;
                 }
-                // Before the scanner has replied, its motor stays as it is.
-                Output::SetDtr(on) => {
-                    self.dtr = Some(on);
-                    if self.said.is_some() {
-                        port.set_dtr(on)?;
-                    }
-                }
-                Output::Transmit { byte, .. } => {
-                    if self.said.is_none() {
-                        self.said = session.introduction();
-                        self.said_at = clock::now();
-                        match &self.said {
-                            // The session would reset it next.
-                            Some(said) if said.condition == Condition::Error => return Ok(self.said_at),
-                            Some(_) => self.dtr.map_or(Ok(()), |on| port.set_dtr(on))?,
-                            None => {}
-                        }
-                    }
-                    port.write(byte)?;
-                    session.transmitted(clock::now());
-                }
-                Output::Heard(Heard::Packets(received)) => {
-                    if !received.message.is_reply {
-                        self.measures_since.get_or_insert_with(clock::now);
-                        self.packets += received.message.count as u64;
-                    }
-                }
-                Output::Heard(Heard::Turn(turn)) => {
-                    self.turns += 1;
-                    self.period = turn.period;
-                    self.points_per_second = turn.points_per_second;
-                }
-                Output::Rest(until) => {
-                    std::thread::sleep(Duration::from_nanos(until.saturating_sub(clock::now())));
-                    return Ok(until);
-                }
-                Output::Wait { until, .. } => return Ok(until),
             }
         }
     }
 
-    /// Stops a scanner that measures on request, and its motor, as a hub does when it exits.
-    fn end(&self, port: &Port, session: &mut Session) -> std::io::Result<()> {
-        let measures = self.said.as_ref().is_some_and(|said| said.condition != Condition::Error);
-        if !measures || !session.end(clock::now()) {
-            return Ok(());
-        }
-        loop {
-            match session.poll_output() {
-                Output::SetDtr(on) => port.set_dtr(on)?,
-                Output::Transmit { byte, .. } => {
-                    port.write(byte)?;
-                    session.transmitted(clock::now());
-                }
-                Output::SetRate(_) | Output::Heard(_) => {}
-                Output::Rest(_) | Output::Wait { .. } => return Ok(()),
+    fn limit(&mut self, session: &Session, now: Nanos) -> Option<Nanos> {
+        if !self.fixed_rate && self.rate != session.rate() {
+            (self.rate, self.rates) = (session.rate(), self.rates + 1);
+            if self.rates > 1 && self.rate == self.first_rate && self.said.is_none() {
+                self.rounds -= 1;
             }
+            if self.rounds == 0 {
+                return None;
+            }
+            (self.look)(self.rate);
+        }
+        let is_detected = self.packets >= MIN_PACKETS;
+        let limit = match (&self.said, self.measures_since) {
+            (Some(said), _) if said.condition == Condition::Error => now,
+            (Some(_), Some(since)) => since + MEASURING_TIME,
+            (Some(_), None) => self.said_at + SPIN_UP_TIMEOUT,
+            (None, Some(since)) if is_detected && self.turns >= MIN_REVOLUTIONS => since + MEASURING_TIME,
+            (None, _) if is_detected => self.begun + REVOLUTIONS_TIMEOUT,
+            (None, _) if self.speaks_unasked => self.begun + PACKETS_TIMEOUT,
+            (None, _) => self.begun + REPLY_TIMEOUT,
+        };
+        (now < limit).then_some(limit)
+    }
+}
+
+/// End of a session: what arrives no longer matters.
+struct End;
+
+impl Task<Session> for End {}
+
+/// A procedure with an end, such as requests to an LMS. Calls `progress` before each wait. Logs each rate once that the port cannot
+/// have; the procedure skips it.
+pub(crate) struct Procedure<F> {
+    progress: F,
+    refused: Vec<u32>,
+}
+
+impl<F> Procedure<F> {
+    pub(crate) fn new(progress: F) -> Procedure<F> {
+        Procedure { progress, refused: Vec::new() }
+    }
+}
+
+impl<P, F: FnMut(&P)> Task<P> for Procedure<F> {
+    fn limit(&mut self, protocol: &P, _: Nanos) -> Option<Nanos> {
+        (self.progress)(protocol);
+        Some(Nanos::MAX)
+    }
+
+    fn on_refused(&mut self, port: &Port, rate: u32, error: &io::Error) {
+        if self.refused.contains(&rate) {
+            return;
+        }
+        self.refused.push(rate);
+        match port {
+            Port::Tty(tty) => tracing::warn!("{}: {error}", tty.device().display()),
+            Port::Tcp(_) => tracing::warn!("{error}"),
         }
     }
 }
@@ -294,75 +318,101 @@ const PACKETS_TIMEOUT: Nanos = 650 * MILLIS;
 /// Timeout for [`MIN_REVOLUTIONS`]. It is long enough for a head that makes two revolutions per second.
 const REVOLUTIONS_TIMEOUT: Nanos = 4_000 * MILLIS;
 
-/// Runs `conversation` with an LMS on `port` until it ends. Calls `progress` before each wait. Skips rates that the
-/// port cannot have.
+/// What a program does with a protocol, besides the I/O of [`drive`].
+pub(crate) trait Task<P> {
+    /// Called before each action. Returns whether to carry it out; if not, the driver waits.
+    fn may_continue(&mut self, port: &Port, protocol: &P) -> io::Result<bool> {
+        let _ = (port, protocol);
+        Ok(true)
+    }
+
+    /// Sets the line DTR, as the protocol requests.
+    fn set_dtr(&mut self, port: &Port, on: bool) -> io::Result<()> {
+        port.set_dtr(on)
+    }
+
+    /// Handles an event.
+    fn on_event(&mut self, event: Event<'_>) {
+        let _ = event;
+    }
+
+    /// Handles that the port cannot have `rate`.
+    fn on_refused(&mut self, port: &Port, rate: u32, error: &io::Error) {
+        let _ = (port, rate, error);
+    }
+
+    /// Called before each wait. Returns its latest end, or `None` to end.
+    fn limit(&mut self, protocol: &P, now: Nanos) -> Option<Nanos> {
+        let _ = (protocol, now);
+        None
+    }
+}
+
+/// Runs `protocol` on `port` until it is done, or until `task` ends it.
 ///
 /// # Errors
 ///
 /// Returns [`Kind::PortMissing`] if the port disappears, and [`Kind::Interrupted`] if `stop` is set.
-pub(crate) fn drive<C: Conversation>(
+pub(crate) fn drive<P: Protocol>(
     port: &Port,
-    conversation: &mut C,
+    protocol: &mut P,
+    task: &mut impl Task<P>,
     stop: &AtomicBool,
-    mut progress: impl FnMut(&C),
 ) -> Result<(), Failure> {
-    let mut refused = Vec::new();
-    while let Some(until) =
-        carry_out(port, conversation, &mut refused).map_err(|error| port_lost(port, &error))?
-    {
-        progress(conversation);
+    loop {
+        let until = drain(port, protocol, task).map_err(|error| port_lost(port, &error))?;
+        if protocol.is_done() {
+            return Ok(());
+        }
+        let Some(limit) = task.limit(protocol, clock::now()) else { return Ok(()) };
         if stop.load(Ordering::Relaxed) {
             return Err(Failure::new(Kind::Interrupted, "interrupted", ""));
         }
-        let now = clock::now();
+        let (now, until) = (clock::now(), until.min(limit));
         let mut fds = [PollFd::new(port, PollFlags::IN)];
         // An interrupted wait only ends early.
         let _ = poll(&mut fds, Some(&clock::span(now, until.min(now + STOP_CHECK_INTERVAL))));
-        let len = port.read(conversation.spare()).map_err(|error| port_lost(port, &error))?;
+        let len = port.read(protocol.spare()).map_err(|error| port_lost(port, &error))?;
         let now = clock::now();
-        conversation.commit(now, len);
+        protocol.commit(now, len);
         if len == 0 && now >= until {
-            conversation.handle_timeout(now);
+            protocol.handle_timeout(now);
         }
     }
-    Ok(())
 }
 
-/// Carries out the actions of `conversation` until it waits or ends. Returns the end of the wait. Logs a rate that the
-/// port refuses, unless it is in `refused`, and adds it there.
-fn carry_out<C: Conversation>(
-    port: &Port,
-    conversation: &mut C,
-    refused: &mut Vec<u32>,
-) -> std::io::Result<Option<Nanos>> {
-    loop {
-        match conversation.poll_output() {
-            exchange::Output::SetBaud(baud) => {
-                if let Some(error) = port.try_baud(baud.rate())?
-                    && !refused.contains(&baud.rate())
+/// Carries out the actions of `protocol` until it waits. Returns the end of the wait.
+fn drain<P: Protocol>(port: &Port, protocol: &mut P, task: &mut impl Task<P>) -> io::Result<Nanos> {
+    while task.may_continue(port, protocol)? {
+        match protocol.poll_output() {
+            Output::SetRate(rate) => {
+                if let Some(error) = port.try_baud(rate)? {
+                    task.on_refused(port, rate, &error);
+                }
+            }
+            Output::SetDtr(on) => task.set_dtr(port, on)?,
+            Output::Transmit { not_before, .. } => {
+                sleep_until(not_before);
+                if !protocol.restart_if_late(clock::now())
+                    && let Output::Transmit { bytes, .. } = protocol.poll_output()
                 {
-                    refused.push(baud.rate());
-                    match port {
-                        Port::Tty(tty) => tracing::warn!("{}: {error}", tty.device().display()),
-                        Port::Tcp(_) => tracing::warn!("{error}"),
-                    }
+                    port.write(bytes)?;
+                    protocol.transmitted(clock::now());
                 }
             }
-            exchange::Output::Transmit { byte, not_before } => {
-                let now = clock::now();
-                if not_before > now {
-                    std::thread::sleep(Duration::from_nanos(not_before - now));
-                }
-                if conversation.restart_if_late(clock::now()) {
-                    continue;
-                }
-                port.write(byte)?;
-                conversation.transmitted(clock::now());
+            Output::Event(event) => task.on_event(event),
+            Output::Rest(until) => {
+                sleep_until(until);
+                return Ok(until);
             }
-            exchange::Output::Wait { until } => return Ok(Some(until)),
-            exchange::Output::Done => return Ok(None),
+            Output::Wait { until } => return Ok(until),
         }
     }
+    Ok(clock::now())
+}
+
+fn sleep_until(at: Nanos) {
+    std::thread::sleep(Duration::from_nanos(at.saturating_sub(clock::now())));
 }
 
 /// Returns the failure for a `port` that can no longer be used. A serial server that already has a client closes the

@@ -14,8 +14,7 @@ use scanhub_drivers::lms::variant::Baud;
 use schema::{Failure, Family, Kind};
 use serde::Serialize;
 
-use crate::driver::drive;
-use crate::driver::{DetectedScanner, detect, not_detected, turning};
+use crate::driver::{DetectedScanner, Procedure, detect, drive, not_detected, turning};
 pub use description::{Description, Found, Turning};
 pub(crate) use description::{hex, measuring};
 pub use suggestion::SuggestedLink;
@@ -203,12 +202,13 @@ pub(crate) fn request_report(
     let now = clock::now();
     let mut inquiry = if is_server { Inquiry::at(Baud::B9600, now) } else { Inquiry::new(first, now) };
     let mut shown = None;
-    drive(port, &mut inquiry, stop, |inquiry| {
+    let mut procedure = Procedure::new(|inquiry: &Inquiry| {
         if shown != Some(inquiry.baud()) && !is_server {
             shown = Some(inquiry.baud());
             look(inquiry.baud().rate());
         }
-    })?;
+    });
+    drive(port, &mut inquiry, &mut procedure, stop)?;
     let mut report = inquiry.report().clone();
     if is_server {
         report.baud = report.status().and_then(|status| status.baud()).or(report.baud);

@@ -50,7 +50,7 @@ fn no_family_names_another() {
             planted("hub/drivers/src/rplidar.rs", "let session: ld::Session;"),
             planted("hub/drivers/src/lms/session.rs", "use crate::{line, rplidar};"),
             planted("hub/drivers/src/line/session.rs", "use crate::lms::SILENCE;"),
-            planted("hub/drivers/src/ld/planted.rs", "use crate::scanner::Session;"),
+            planted("hub/drivers/src/ld/planted.rs", "use crate::Session;"),
         ]
     });
 }

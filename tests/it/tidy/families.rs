@@ -9,7 +9,7 @@ const MAY: [&str; 11] = [
     // The modules of the drivers.
     "hub/drivers/src/lib.rs",
     // The list of the families.
-    "hub/drivers/src/scanner/families.rs",
+    "hub/drivers/src/families.rs",
     // The search for a scanner of any of them.
     "hub/drivers/src/search.rs",
     // The configuration that users start from, with a section for each.

@@ -89,15 +89,16 @@ impl Line for OpenLine {
         Ok(if len > 1 && planted.strikes(Defect::LostByte, 100) { len - 1 } else { len })
     }
 
-    fn write(&self, byte: u8) -> io::Result<()> {
+    fn write(&self, bytes: &[u8]) -> io::Result<()> {
         let Handle { shared, port, device } = &*self.handle;
         let (mut tty, now) = (shared.ports[*port].borrow_mut(), self.clock.now());
         tty.advance(now, &shared.log);
         let is_deaf = shared.planted.is(Defect::DeafScanner) && tty.sensor.streams();
         // Half a request is none.
-        let is_cut = shared.planted.is(Defect::UnturnedHead) && matches!(byte, 0xF0 | 0xA8);
-        if self.check(tty.is_there(*device))? && !is_deaf && !is_cut {
-            tty.write(byte, now);
+        let cuts = shared.planted.is(Defect::UnturnedHead);
+        let is_cut = |byte: &&u8| cuts && matches!(byte, 0xF0 | 0xA8);
+        if self.check(tty.is_there(*device))? && !is_deaf {
+            bytes.iter().filter(|byte| !is_cut(byte)).for_each(|byte| tty.write(*byte, now));
         }
         Ok(())
     }

@@ -4,7 +4,8 @@
 use fastrand::Rng;
 use preprocess::zones::{Sector, Settings};
 use scanhub_drivers::line::grid::{NO_RETURN, Point};
-use schema::{Pose, Zones};
+use scanhub_drivers::line::{Values, revolution_head};
+use schema::{Family, Pose, Zones};
 
 use super::*;
 
@@ -29,25 +30,25 @@ fn points(random: &mut Rng, late: usize) -> Vec<Point> {
     points.into_iter().map(|(_, point)| point).collect()
 }
 
-fn turn(number: u64, points: &[Point]) -> Turn<'_> {
-    Turn {
+fn turn(number: u64, points: &[Point]) -> RawScan<'_> {
+    // It is not the same for any two.
+    let (period, per_second) = (100_000_000 + 1_000 * number, 900.0);
+    RawScan {
         number,
-        points,
         first: 0,
         last: 0,
-        // It is not the same for any two.
-        period: 100_000_000 + 1_000 * number,
-        beams: BEAMS,
-        points_per_second: 900.0,
-        incomplete: false,
+        period,
         reasons: 0,
+        bytes: 0,
+        head: revolution_head(Family::Ld, BEAMS, period, per_second, false),
+        values: Values::Points { points, per_second },
     }
 }
 
 /// The zones of the whole turn.
-fn zones(check: &mut Check, turn: &Turn<'_>) -> Zones {
-    let mut scan = Scan::zeroed(Turning::len(BEAMS));
-    Turning::of(turn, Family::Ld).decode(BEAMS, &mut scan);
+fn zones(check: &mut Check, turn: &RawScan<'_>) -> Zones {
+    let mut scan = Scan::zeroed(turn.len());
+    turn.write(&mut scan);
     let mut zones = Zones::unknown();
     check.update(&scan, &mut zones);
     zones
@@ -101,7 +102,7 @@ fn a_warning_that_is_not_withdrawn_is_confirmed_by_its_turn() {
         let upside_down = random.bool().into();
         let pose = Pose { x_m, y_m, yaw_rad: 6.0 * random.f64(), upside_down, ..Pose::default() };
         let mut check = Check::new(pose, &settings, BEAMS);
-        let mut warner = EarlyWarner::new(Family::Ld, BEAMS);
+        let mut warner = EarlyWarner::new(BEAMS);
         let late = if random.bool() { 0 } else { 20 };
         let again = points(&mut random, late);
         for number in 1..9 {
@@ -113,7 +114,7 @@ fn a_warning_that_is_not_withdrawn_is_confirmed_by_its_turn() {
             while seen < end {
                 (seen, packets) = ((seen + random.usize(1..24)).min(end), packets + 1);
                 warner.withdraw(Some(number)).into_iter().for_each(|word| heard.hear(word));
-                let begun = Begun::Turn(turn(number, &points[..seen]));
+                let begun = turn(number, &points[..seen]);
                 let words = warner.look(&begun, &mut check, packets);
                 words.into_iter().flatten().for_each(|word| heard.hear(word));
             }
@@ -121,7 +122,7 @@ fn a_warning_that_is_not_withdrawn_is_confirmed_by_its_turn() {
                 // The packet that ends the turn has some of its points.
                 packets += 1;
                 if warner.has_said() {
-                    let begun = Begun::Turn(turn(number, &points));
+                    let begun = turn(number, &points);
                     let words = warner.look(&begun, &mut check, packets);
                     words.into_iter().flatten().for_each(|word| heard.hear(word));
                 }
@@ -148,13 +149,13 @@ fn what_is_the_robots_own_body_is_taken_back() {
     let own = [Sector { from_mdeg: -95_000, to_mdeg: -85_000, range_mm: 300 }];
     let settings = Settings { self_min: &own, ..Settings::default() };
     let mut check = Check::new(Pose::default(), &settings, BEAMS);
-    let mut warner = EarlyWarner::new(Family::Ld, BEAMS);
+    let mut warner = EarlyWarner::new(BEAMS);
     zones(&mut check, &turn(1, &[at(10.0, 5000)]));
     // Beam 22 is 88 degrees to the right, and its nearest point counts.
     let mut turned: Vec<Point> = (0..BEAMS).map(|beam| at(4.0 * beam as f32, 5000)).collect();
     turned.splice(22..23, [at(87.5, 500), at(88.5, 200)]);
     turned[60].range = 800;
-    let mut look = |seen: usize| warner.look(&Begun::Turn(turn(2, &turned[..seen])), &mut check, 7);
+    let mut look = |seen: usize| warner.look(&turn(2, &turned[..seen]), &mut check, 7);
     assert_eq!(look(22), [None, None]);
     let [None, Some(stop)] = look(23) else { panic!("no warning") };
     let Early { verdict, beam, distance_mm, bytes_seen, beams_seen, flags } = stop.early;

@@ -3,15 +3,7 @@
 //! After power-on, a scanner has the same rate each time, so a search that starts there saves the timeouts of the other
 //! rates. A wrong rate costs only that time.
 
-/// Rate at which a scanner was found, for the next search.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct KnownRate {
-    /// The rate in bits per second.
-    pub baud: u32,
-    /// Number of the last switches to 500,000 baud that were followed by silence. After two of them, the line counts as one
-    /// that cannot carry that rate.
-    pub silent_switches: u8,
-}
+pub use scanhub_drivers::line::KnownRate;
 
 /// Returns the line for a scanner that was found at `port` at `rate`.
 pub(super) fn text(rate: KnownRate, port: &str) -> String {

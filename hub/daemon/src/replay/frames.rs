@@ -1,24 +1,18 @@
 //! Plays a recording frame by frame: each telegram, or group of packets, once, in order and bit for bit, with the header that
 //! was recorded. Silences are those of the recording, however fast it is played.
 //!
-//! A telegram of an LMS is a scan by itself. The packets of a rotating scanner pass through a session that runs in the time of
+//! A whole telegram is a scan or a reply by itself. The packets of a rotating scanner pass through a session that runs in the time of
 //! the recording. It builds the same scans as the hub that recorded them, with the same times between them.
 
 use recording::{Frame, VirtualTime};
-use scanhub_drivers::line::{Heard, Received, Turn, suspect};
-use scanhub_drivers::lms::SILENCE;
-use scanhub_drivers::lms::reply::Reply;
-use scanhub_drivers::lms::session::Message;
-use scanhub_drivers::lms::telegram::Telegram;
-use scanhub_drivers::lms::variant::Mode;
-use schema::{Flags, Header, Nanos, State};
+use scanhub_drivers::line::{Event, RawScan, Received, Session as _, suspect};
+use scanhub_drivers::{Session, Settings};
+use schema::{Flags, Header, MILLIS, Nanos, State};
 
-use super::recorded::{Frames, told};
-use super::{LONGEST_GAP, ReplayLink, STANDS, period, variant_of};
-use crate::driver::{self, Driver};
+use super::recorded::Frames;
+use super::{LONGEST_GAP, ReplayLink, STANDS};
 use crate::player::Due;
-use crate::process_telegram::{RecordedContext, limit};
-use crate::process_turn::micros;
+use crate::process_telegram::{RecordedContext, limit, micros};
 
 /// Plays `frames` into the topics of `replay`. Returns how long the last verdict stays valid at the end; `None` if the hub
 /// must end.
@@ -37,13 +31,12 @@ pub(super) fn play(replay: &mut ReplayLink<'_, '_>, frames: &Frames) -> Option<O
         start_ns: play.start_ns,
         run: None,
         has_begun: false,
-        mode: frames.first_mode(),
         understood_from: 0,
         session: None,
         last_stamp: 0,
         verdict: None,
         limit: None,
-        state: if frames.is_lms { State::Streaming } else { State::Starting },
+        state: if frames.is_whole { State::Streaming } else { State::Starting },
     };
     while let Some(frame) = read.next() {
         let media = timeline.media(&frame);
@@ -53,18 +46,17 @@ pub(super) fn play(replay: &mut ReplayLink<'_, '_>, frames: &Frames) -> Option<O
         let when = When::of(&frame, media, media < play.start_ns);
         lap.note_silence(replay, when)?;
         lap.note_run(replay, &frame, when);
-        if !frames.is_lms {
+        if !frames.is_whole {
             lap.play_packets(replay, &frame, when)?;
-        } else if let Some(telegram) = Telegram::check(&frame.telegram) {
-            let reply = Reply::decode(telegram);
-            lap.play_telegram(replay, (&frame, read.peek()), (telegram, reply), when)?;
-            if !frames.has_stamps() && frame.is_scan() {
-                timeline.pass(period(variant_of(reply.as_ref())));
-            }
+            continue;
+        }
+        let beams = lap.play_telegram(replay, &frame, read.peek(), when)?;
+        if !frames.has_stamps() && frame.is_scan() {
+            timeline.pass(frames.period(beams));
         }
     }
-    if let Some(session) = lap.session {
-        replay.link.stats.close(session.session());
+    if let Some(session) = lap.shown_session() {
+        replay.link.stats.close(session);
     }
     Some(lap.limit)
 }
@@ -77,12 +69,10 @@ struct Lap<'f> {
     /// Run of the hub that recorded the last frame.
     run: Option<u64>,
     has_begun: bool,
-    /// For an LMS: the measuring mode.
-    mode: Option<Mode>,
-    /// For an LMS: number of the first telegram whose mode the hub knew in this run.
+    /// Number of the first whole telegram whose values the hub could read in this run.
     understood_from: u64,
-    /// For a rotating scanner: the session of this run.
-    session: Option<VirtualTime<Driver>>,
+    /// The session that reads all whole telegrams, or the packets of this run.
+    session: Option<VirtualTime<Session>>,
     /// Stamp of the last published frame; stamps never go back.
     last_stamp: Nanos,
     verdict: Option<Verdict>,
@@ -128,7 +118,7 @@ impl Lap<'_> {
             return Some(());
         }
         let at = silence.until.clamp(self.start_ns, when.media);
-        let due = replay.wait_turn(self.session.as_ref().map(VirtualTime::session), at, self.state)?;
+        let due = replay.wait_turn(self.shown_session(), at, self.state)?;
         replay.link.output.publish_stale(due.at);
         // A scan that was lost on the line makes the verdict stale, and the sensor not silent.
         if when.media.saturating_sub(silence.of) >= SILENCE.max(silence.until - silence.of) {
@@ -145,17 +135,24 @@ impl Lap<'_> {
                 self.verdict = None;
                 if when.is_skipped { replay.link.output.forget() } else { replay.restart() }
             }
-            if let Some(session) = self.session.take() {
-                replay.link.stats.close(session.session());
-                self.state = State::Starting;
+            if let Some(session) = self.shown_session() {
+                replay.link.stats.close(session);
+                (self.session, self.state) = (None, State::Starting);
             }
             self.run = run;
             self.understood_from = frame.header.map_or(0, |header| self.frames.understood_from(&header));
         }
-        if !self.frames.is_lms && self.session.is_none() {
-            let driver = Driver::new(replay.link.link, true, when.first);
-            self.session = Some(VirtualTime::new(driver, when.first));
-        }
+        self.session.get_or_insert_with(|| {
+            let link = replay.link.link;
+            let mode_number = self.frames.first_mode().map(|mode| mode.0);
+            let settings = Settings { mode_number, ..link.settings() };
+            VirtualTime::new(Session::begin(link.family(), &settings, when.first), when.first)
+        });
+    }
+
+    /// Returns the session that the status describes. A session that reads whole telegrams only decodes them.
+    fn shown_session(&self) -> Option<&Session> {
+        self.session.as_ref().filter(|_| !self.frames.is_whole).map(VirtualTime::session)
     }
 
     /// Waits until the frame at `when` is due: `Some(None)` if it is skipped, `None` if the hub must end.
@@ -163,39 +160,43 @@ impl Lap<'_> {
         if when.is_skipped {
             return replay.pass().then_some(None);
         }
-        let session = self.session.as_ref().map(VirtualTime::session);
-        let due = replay.wait_turn(session, when.media, self.state)?;
+        let due = replay.wait_turn(self.shown_session(), when.media, self.state)?;
         self.last_stamp = due.at.max(self.last_stamp);
         Some(Some(due))
     }
 
-    /// Plays a telegram of an LMS; the frame after it is known, too. Returns `None` if the hub must end.
+    /// Plays a whole telegram; the frame after it is known, too. Returns the number of beams of its measured data, or `None` if the
+    /// hub must end.
     fn play_telegram(
         &mut self,
         replay: &mut ReplayLink<'_, '_>,
-        (frame, next): (&Frame, Option<&Frame>),
-        (telegram, reply): (Telegram<'_>, Option<Reply<'_>>),
+        frame: &Frame,
+        next: Option<&Frame>,
         when: When,
-    ) -> Option<()> {
+    ) -> Option<usize> {
+        let due = self.wait(replay, when)?;
         let header = frame.header;
-        self.mode = reply.as_ref().and_then(told).unwrap_or(self.mode);
-        let mode = self.mode.filter(|_| header.is_none_or(|header| header.seq >= self.understood_from));
-        match self.wait(replay, when)? {
-            None => replay.link.output.learn(reply.as_ref(), mode),
+        let is_readable = header.is_none_or(|header| header.seq >= self.understood_from);
+        let status = due.map(|_| replay.link.stats.status_mut());
+        let session = self.session.as_mut()?.session_mut();
+        let Some(received) = session.read_recorded(&frame.telegram, is_readable, status) else {
+            return Some(0);
+        };
+        let whole = received.whole?;
+        match due {
+            None => whole.scan.iter().for_each(|scan| replay.link.output.learn(scan)),
             Some(due) => {
                 let at = self.last_stamp;
                 let received = Received {
-                    bytes: telegram.bytes(),
-                    message: Message { telegram, reply, mode, baud: replay.link.link.baud, offset: 0 },
                     first: at.saturating_sub(when.last - when.first),
                     last: at,
                     estimated: header.is_some_and(|header| header.flags & Flags::STAMP_ESTIMATED != 0),
-                    reasons: frame.reasons,
+                    reasons: received.reasons | frame.reasons,
+                    ..received
                 };
-                replay.link.stats.recall(telegram, reply.as_ref(), mode);
+                replay.link.stats.note_recorded(received.bytes.len());
                 let gap = next.and_then(|next| gap(frame, next));
                 let recorded = RecordedContext {
-                    mode,
                     period_us: header.map(|header| header.period_us),
                     gap_us: gap.map_or(0, |gap| (gap / 1000) as u32),
                     stretch: due.stretch,
@@ -209,10 +210,10 @@ impl Lap<'_> {
             }
         }
         // A scan whose values could not be read had no verdict.
-        if frame.is_scan() && mode.is_some_and(Mode::has_ranges) {
+        if whole.scan.is_some() {
             self.verdict = header.map(|header| Verdict::of(&header, when.begin)).or(self.verdict);
         }
-        Some(())
+        Some(whole.beams)
     }
 
     /// Plays packets of a rotating scanner, and the revolutions that end with them. Returns `None` if the hub must end.
@@ -224,30 +225,32 @@ impl Lap<'_> {
         if let Some((at, recorded)) = &at {
             let received = Received {
                 bytes: &frame.telegram,
-                message: (),
                 first: at.saturating_sub(when.last - when.first),
                 last: *at,
                 estimated: frame.header.is_none_or(|header| header.flags & Flags::STAMP_ESTIMATED != 0),
                 reasons: frame.reasons,
+                count: 0,
+                is_checked: false,
+                is_reply: false,
+                whole: None,
             };
-            replay.link.publish_packets(&received, recorded);
+            replay.link.publish(&received, recorded, false);
             replay.handle.played(when.begin);
         }
         let Lap { session, verdict, limit: last_limit, state, .. } = self;
         let session = session.as_mut()?;
         // As on a line, an error of the line concerns the packets alone, not the revolution.
-        session.session_mut().doubt(frame.reasons & !suspect::LINE_ERROR);
-        session.take(when.last, &frame.telegram, |heard| {
-            let driver::Heard::Turning(Heard::Turn(turn)) = heard else { return };
-            let Some((at, recorded)) = at else { return replay.link.output.learn_turn(&turn) };
+        session.session_mut().mark_suspect(frame.reasons & !suspect::LINE_ERROR);
+        session.take(when.last, &frame.telegram, |event| {
+            let Event::Scan(scan) = event else { return };
+            let Some((at, recorded)) = at else { return replay.link.output.learn(&scan) };
             let here = |stamp: Nanos| at.saturating_sub(when.last.saturating_sub(stamp));
-            let wall_ns = recorded.wall_ns.map(|ns| ns.saturating_add(turn.first).saturating_sub(when.first));
-            let (first, last) = (here(turn.first), here(turn.last));
+            let wall_ns = recorded.wall_ns.map(|ns| ns.saturating_add(scan.first).saturating_sub(when.first));
+            let (first, last) = (here(scan.first), here(scan.last));
             let recorded = RecordedContext { wall_ns, ..recorded };
-            let published = replay.link.publish_turn(&Turn { first, last, ..turn }, &recorded, false);
-            *last_limit = published.or(*last_limit);
+            *last_limit = Some(replay.link.publish_scan(&RawScan { first, last, ..scan }, &recorded, false));
             replay.link.output.stand_until(STANDS);
-            let valid = limit(micros(turn.period));
+            let valid = limit(micros(scan.period));
             let (until_ns, until) = (when.last.saturating_add(valid), when.media.saturating_add(valid));
             *verdict = Some(Verdict { of: when.media, until_ns, until });
             *state = State::Streaming;
@@ -299,5 +302,7 @@ fn gap(frame: &Frame, next: &Frame) -> Option<Nanos> {
     Some(to.saturating_sub(from).min(LONGEST_GAP))
 }
 
+/// A scanner is silent after this time without a scan.
+const SILENCE: Nanos = 1_000 * MILLIS;
 /// Time at which the clock of a frame without stamps starts: that of a machine that has run for a while.
 const BEGIN: Nanos = 10_000_000_000;

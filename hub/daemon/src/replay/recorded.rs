@@ -6,12 +6,10 @@ use std::path::Path;
 
 use config::Link;
 use recording::{Encoding, Form, Frame, Recording};
-use scanhub_drivers::lms::reply::Reply;
-use scanhub_drivers::lms::telegram::Telegram;
-use scanhub_drivers::lms::variant::{Mode, Unit, Variant};
-use schema::{Failure, Family, Header, Kind, Nanos};
+use scanhub_drivers::lms::variant::{Mode, Unit};
+use schema::{Failure, Header, Kind, Nanos};
 
-use super::{LONGEST_GAP, period};
+use super::LONGEST_GAP;
 
 /// A recording of one sensor.
 pub(crate) enum Recorded {
@@ -30,8 +28,8 @@ pub(crate) struct Stream {
 /// Complete telegrams or packets, with their stamps.
 pub(crate) struct Frames {
     recording: Recording,
-    /// Whether they are telegrams of an LMS.
-    pub(super) is_lms: bool,
+    /// Whether they are telegrams that are a scan or a reply by themselves, and no packets.
+    pub(super) is_whole: bool,
     /// Of a log the metres, of others nothing.
     encoding: Encoding,
     mode: Option<Mode>,
@@ -72,32 +70,34 @@ impl Recorded {
     /// link's.
     pub(crate) fn new(recording: Recording, link: &Link) -> Result<Recorded, Failure> {
         check_family(&recording, link)?;
-        if link.family() != Family::Lms {
+        if !link.scanner.features().has_whole_telegrams {
             let encoding = Encoding { unit: Unit::Mm, mode: Mode(0) };
-            let mut frames =
-                Frames { recording, is_lms: false, encoding, mode: None, origin: None, is_told_later: false };
+            let mut frames = Frames {
+                recording,
+                is_whole: false,
+                encoding,
+                mode: None,
+                origin: None,
+                is_told_later: false,
+            };
             frames.origin = frames.read()?.next().as_ref().and_then(Origin::of);
             return Ok(Recorded::Frames(frames));
         }
         tell_of_log(&recording, &link.name);
         let contents = recording.contents();
-        let mode = contents.mode.or(link.mode).or(contents.readable());
+        let mode = contents.mode.or(configured_mode(link)).or(contents.readable());
         tell_of_mode(&recording, link);
         if recording.contents().form == Form::Telegrams {
             return Ok(Recorded::Stream(Stream { recording, mode }));
         }
         let encoding = Encoding { unit: contents.unit.unwrap_or(Unit::Mm), mode: mode.unwrap_or(Mode(0)) };
         let mut frames =
-            Frames { recording, is_lms: true, encoding, mode, origin: None, is_told_later: false };
+            Frames { recording, is_whole: true, encoding, mode, origin: None, is_told_later: false };
         let mut first = frames.read()?.take(ASKED_WITHIN).peekable();
         frames.origin = first.peek().and_then(Origin::of);
         let begin = first.peek().and_then(|frame| frame.header).filter(is_first);
         let is_open = begin.is_some_and(|header| frames.recording.understood(header.boot).is_none());
-        let tells = |frame: Frame| {
-            let reply = Telegram::check(&frame.telegram).and_then(Reply::decode);
-            reply.is_some_and(|reply| told(&reply).is_some())
-        };
-        frames.is_told_later = is_open && first.any(tells);
+        frames.is_told_later = is_open && first.any(|frame| frame.tells_mode());
         Ok(Recorded::Frames(frames))
     }
 
@@ -141,7 +141,7 @@ impl Recorded {
         match (contents.span, self.begin_ns()) {
             (Some((_, last_ns)), Some(begin_ns)) => Some(last_ns.saturating_sub(begin_ns)),
             _ if contents.scanner_ns.is_some() => contents.scanner_ns,
-            _ => Some(contents.scans.saturating_sub(1) * period(contents.variant)),
+            _ => Some(contents.scans.saturating_sub(1) * contents.period(0)),
         }
     }
 
@@ -168,8 +168,9 @@ impl Stream {
         self.recording.bytes()
     }
 
-    pub(super) fn period(&self, variant: Option<Variant>) -> Nanos {
-        period(variant.or(self.recording.contents().variant))
+    /// Returns the time from a scan of `beams` to the next one.
+    pub(super) fn period(&self, beams: usize) -> Nanos {
+        self.recording.contents().period(beams)
     }
 }
 
@@ -212,6 +213,11 @@ impl Frames {
             life: life.map(|(boot, stamp_ns)| (boot, i128::from(stamp_ns))),
             last: 0,
         }
+    }
+
+    /// Returns the time from a scan of `beams` to the next one, where there are no stamps.
+    pub(super) fn period(&self, beams: usize) -> Nanos {
+        self.recording.contents().period(beams)
     }
 
     /// Whether it has stamps at all.
@@ -306,7 +312,10 @@ fn check_family(recording: &Recording, link: &Link) -> Result<(), Failure> {
 /// That the values are read in a way which neither the recording nor the configuration tells.
 fn tell_of_mode(recording: &Recording, link: &Link) {
     let contents = recording.contents();
-    if contents.mode.or(link.mode).is_none() && contents.scans > 0 && contents.readable().is_some() {
+    if contents.mode.or(configured_mode(link)).is_none()
+        && contents.scans > 0
+        && contents.readable().is_some()
+    {
         let name = &link.name;
         tracing::info!(
             "{name}: the recording does not contain a measuring mode, and no value has more than 13 bits: read as ranges of 13"
@@ -337,14 +346,9 @@ fn is_first(header: &Header) -> bool {
     header.seq == 0 && header.hub_pid != 0
 }
 
-/// What `reply` tells of how values are split: of a sensor that gets its power, that this is not known any more.
-pub(super) fn told(reply: &Reply<'_>) -> Option<Option<Mode>> {
-    match reply {
-        Reply::Configuration(configuration) => Some(Some(configuration.mode())),
-        Reply::Status(report) => Some(Some(report.mode())),
-        Reply::PowerOn(_) => Some(None),
-        _ => None,
-    }
+/// Returns the configured measuring mode.
+fn configured_mode(link: &Link) -> Option<Mode> {
+    link.scanner.settings.mode_number.map(Mode)
 }
 
 /// A hub that found a sensor streaming has asked it within so many telegrams.

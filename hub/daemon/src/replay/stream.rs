@@ -2,14 +2,12 @@
 //! damaged in them is found out as on a line.
 
 use port::clock;
-use scanhub_drivers::line::{Output, Session as _};
-use scanhub_drivers::lms;
-use scanhub_drivers::lms::measured::MEASURED;
-use schema::{Nanos, State};
+use scanhub_drivers::line::{Event, Output, Protocol as _};
+use scanhub_drivers::{Session, Settings};
+use schema::{MILLIS, Nanos, State};
 
 use super::recorded::{Stream, read};
-use super::{ReplayLink, STANDS, variant_of};
-use crate::driver::{Driver, Heard};
+use super::{ReplayLink, STANDS};
 use crate::process_telegram::RecordedContext;
 
 /// Plays `stream` into the topics of `replay`. At the end, for how long the last verdict stands; nothing if the hub shall
@@ -23,8 +21,10 @@ pub(super) fn play(replay: &mut ReplayLink<'_, '_>, stream: &Stream) -> Option<O
             return Some(None);
         }
     };
-    let mut session = Driver::new(replay.link.link, true, clock::now());
-    let mut recorded = RecordedContext { mode: stream.mode, ..RecordedContext::default() };
+    let link = replay.link.link;
+    let settings = Settings { mode_number: stream.mode.map(|mode| mode.0), ..link.settings() };
+    let mut session = Session::begin(link.family(), &settings, clock::now());
+    let mut recorded = RecordedContext::default();
     let (mut media, mut limit) = (0, None);
     let state = if stream.has_telegrams() { State::Streaming } else { State::Probing };
     loop {
@@ -45,26 +45,19 @@ pub(super) fn play(replay: &mut ReplayLink<'_, '_>, stream: &Stream) -> Option<O
         let now = clock::now();
         session.commit(now, len);
         if len == 0 {
-            // Nothing will come that could refute a telegram held back.
-            session.handle_timeout(now + lms::framer::VETO_HOLD);
+            // No more bytes can refute a telegram that is held back.
+            session.handle_timeout(now + IDLE);
         }
-        while let Output::Heard(Heard::Lms(received)) = session.poll_output() {
-            let (is_scan, variant) = (
-                received.message.telegram.command() == MEASURED,
-                variant_of(received.message.reply.as_ref()),
-            );
-            if is_skipped {
-                replay
-                    .link
-                    .output
-                    .learn(received.message.reply.as_ref(), received.message.mode.or(recorded.mode));
-            } else {
+        while let Output::Event(Event::Telegram(received)) = session.poll_output() {
+            if !is_skipped {
                 limit = replay.link.publish(&received, &recorded, false).or(limit);
                 replay.link.output.stand_until(STANDS);
                 replay.handle.played(media);
+            } else if let Some(scan) = received.whole.and_then(|whole| whole.scan) {
+                replay.link.output.learn(&scan);
             }
-            if is_scan {
-                media += stream.period(variant);
+            if !received.is_reply {
+                media += stream.period(received.whole.map_or(0, |whole| whole.beams));
             }
         }
         if !is_skipped {
@@ -80,3 +73,5 @@ pub(super) fn play(replay: &mut ReplayLink<'_, '_>, stream: &Stream) -> Option<O
 
 /// Bytes given to the session at a time: less than a telegram, so that stamps stay near.
 const PIECE: usize = 128;
+/// Time without a byte after which a session no longer holds a telegram back.
+const IDLE: Nanos = 100 * MILLIS;

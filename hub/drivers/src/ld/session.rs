@@ -4,7 +4,7 @@
 
 use core::fmt;
 
-use schema::{MILLIS, Nanos, line_time};
+use schema::{Contents, Family, MILLIS, Nanos, ScanHead, line_time};
 
 use crate::ld::framer::{Framer, Span};
 use crate::ld::model::Model;
@@ -12,10 +12,10 @@ use crate::ld::packet::{LEN, POINTS, Packet};
 use crate::ld::point_count::{Counted, PointCount};
 use crate::ld::restarts::Restarts;
 use crate::ld::sequence::{Place, Sequence};
-use crate::line::family::{self, Features, Turning, Wanted};
+use crate::line::family::{self, Features};
 use crate::line::{
-    self, Account, Closed, Control, Flow, Heard, Output, Pace, Packets, Reads, Received, SensorClock, State,
-    Tally, Turn, TurnCounts, Turns,
+    self, Account, Closed, Control, Event, Flow, Output, Pace, RawScan, Reads, Received, SensorClock, State,
+    Tally, TurnCounts, Turns, Values, revolution_head,
 };
 
 /// Settings of a session.
@@ -23,10 +23,10 @@ use crate::line::{
 pub struct Settings {
     /// The model. `None`: the session finds it out.
     pub model: Option<Model>,
-    /// Number of beams of the grid. `None`: the model's number, at most [`most_beams`](Self::most_beams).
+    /// Number of beams of the grid. `None`: the model's number, at most [`max_beams`](Self::max_beams).
     pub beams: Option<usize>,
     /// Maximum number of beams. `None`: the maximum of a grid.
-    pub most_beams: Option<usize>,
+    pub max_beams: Option<usize>,
     /// Whether the port has one fixed rate and bytes do not arrive at the pace of a line, as with a serial server on the
     /// network or a recording.
     pub fixed_rate: bool,
@@ -147,6 +147,13 @@ impl Session {
         self.measured = Some((model, beams));
     }
 
+    /// Creates a session from the settings that all families share.
+    pub(crate) fn configured(settings: &family::Settings, now: Nanos) -> Session {
+        let &family::Settings { model, beams, max_beams, fixed_rate, listen_only, .. } = settings;
+        let model = model.and_then(Model::named);
+        Session::new(Settings { model, beams, max_beams, fixed_rate, listen_only }, now)
+    }
+
     /// Returns the model, once it is known. Of models that cannot be distinguished, it is one.
     pub fn model(&self) -> Option<Model> {
         self.settings.model.or(self.measured.map(|(model, _)| model))
@@ -157,7 +164,7 @@ impl Session {
         let of_model = || self.settings.model.map(Model::beams);
         let measured = || self.measured.map(|(_, beams)| beams);
         let beams = self.settings.beams.or_else(of_model).or_else(measured)?;
-        Some(beams.min(self.settings.most_beams.unwrap_or(usize::MAX)))
+        Some(beams.min(self.settings.max_beams.unwrap_or(usize::MAX)))
     }
 
     /// Handles the points of a revolution of a scanner without a configured model. The first reliable number of points decides.
@@ -277,7 +284,7 @@ impl Session {
     }
 
     /// Stamps the packets of `span`, and keeps them for revolutions.
-    fn receive(&mut self, span: Span) -> Received<'_, Packets> {
+    fn receive(&mut self, span: Span) -> Received<'_> {
         let mut span = span;
         span.reasons |= self.reads.take_doubt(span.offset + (span.packets * LEN) as u64);
         let pace = (!self.settings.fixed_rate).then_some(self.baud);
@@ -330,11 +337,14 @@ impl Session {
         self.hear();
         Received {
             bytes: self.framer.bytes(span),
-            message: Packets { count: span.packets, is_checked: true, is_reply: false },
             first: at,
             last,
             estimated: first.is_none(),
             reasons: span.reasons,
+            count: span.packets,
+            is_checked: true,
+            is_reply: false,
+            whole: None,
         }
     }
 
@@ -413,7 +423,7 @@ impl Session {
     }
 
     /// Returns a complete revolution, and updates the state of the session.
-    fn show(&mut self, closed: Closed) -> Turn<'_> {
+    fn show(&mut self, closed: Closed) -> RawScan<'_> {
         let first = self.dated(closed).first;
         self.reads.end_turn(first);
         self.trouble = None;
@@ -424,34 +434,27 @@ impl Session {
         self.dated(closed)
     }
 
-    /// Returns the revolution that is being measured, with the points that have arrived.
-    fn begun_turn(&self) -> Option<Turn<'_>> {
-        self.turns.begun(self.pace?).map(|begun| self.dated(begun))
-    }
-
     /// Converts a revolution to the hub's clock.
-    fn dated(&self, closed: Closed) -> Turn<'_> {
+    fn dated(&self, closed: Closed) -> RawScan<'_> {
         let packet = self.current.map_or(usize::MAX, |current| current.packet);
         let stamp = |at: Nanos| self.clock_of(packet).time(at).unwrap_or(self.now);
         let (first, last) = self.reads.turn_dates(stamp(closed.first), stamp(closed.last));
-        Turn {
+        let (beams, per_second) =
+            (self.beams.unwrap_or_default(), self.points_per_second().unwrap_or_default());
+        RawScan {
             number: closed.number,
-            points: self.turns.points(&closed),
             first,
             last,
             period: closed.period,
-            beams: self.beams.unwrap_or_default(),
-            points_per_second: self.sequence.points_per_second().unwrap_or_default(),
-            incomplete: closed.incomplete,
             reasons: closed.reasons,
+            bytes: 0,
+            head: revolution_head(Family::Ld, beams, closed.period, per_second, closed.incomplete),
+            values: Values::Points { points: self.turns.points(&closed), per_second },
         }
     }
 }
 
-impl line::Session for Session {
-    type Heard<'a> = Heard<'a>;
-    type Trouble = Trouble;
-
+impl line::Protocol for Session {
     fn spare(&mut self) -> &mut [u8] {
         let spare = self.framer.spare();
         self.reads.offer(spare.len());
@@ -460,7 +463,7 @@ impl line::Session for Session {
 
     fn commit(&mut self, now: Nanos, len: usize) {
         self.now = now;
-        self.reads.note(now, len, self.state() == State::Streaming);
+        self.reads.note(now, len, line::Session::state(self) == State::Streaming);
         if len > 0 {
             self.framer.commit(len);
         }
@@ -470,6 +473,36 @@ impl line::Session for Session {
         self.now = now;
         self.framer.release(now.saturating_sub(self.reads.last_byte()));
     }
+
+    fn transmitted(&mut self, now: Nanos) {
+        self.now = now;
+    }
+
+    fn poll_output(&mut self) -> Output<'_> {
+        if let Some(closed) = self.advance_turns() {
+            return Output::Event(Event::Scan(self.show(closed)));
+        }
+        while let Some(span) = self.framer.advance(most_together(self.baud)) {
+            if !matches!(self.phase, Phase::Paused) {
+                return Output::Event(Event::Telegram(self.receive(span)));
+            }
+        }
+        self.expire();
+        if core::mem::take(&mut self.change_baud) {
+            self.framer.clear();
+            return Output::SetRate(self.baud);
+        }
+        let until = match self.phase {
+            Phase::Listening { next_at, .. } => next_at,
+            Phase::Hearing { silent_at, .. } => silent_at,
+            Phase::Paused => Nanos::MAX,
+        };
+        self.reads.wait(self.now, until, self.framer.hold())
+    }
+}
+
+impl line::Session for Session {
+    type Trouble = Trouble;
 
     fn control(&mut self, control: Control, now: Nanos) {
         self.now = now;
@@ -486,32 +519,6 @@ impl line::Session for Session {
                 self.listen(State::Probing);
             }
         }
-    }
-
-    fn transmitted(&mut self, now: Nanos) {
-        self.now = now;
-    }
-
-    fn poll_output(&mut self) -> Output<Heard<'_>> {
-        if let Some(closed) = self.advance_turns() {
-            return Output::Heard(Heard::Turn(self.show(closed)));
-        }
-        while let Some(span) = self.framer.advance(most_together(self.baud)) {
-            if !matches!(self.phase, Phase::Paused) {
-                return Output::Heard(Heard::Packets(self.receive(span)));
-            }
-        }
-        self.expire();
-        if core::mem::take(&mut self.change_baud) {
-            self.framer.clear();
-            return Output::SetRate(self.baud);
-        }
-        let until = match self.phase {
-            Phase::Listening { next_at, .. } => next_at,
-            Phase::Hearing { silent_at, .. } => silent_at,
-            Phase::Paused => Nanos::MAX,
-        };
-        self.reads.wait(self.now, until, self.framer.hold())
     }
 
     fn state(&self) -> State {
@@ -555,34 +562,17 @@ impl line::Session for Session {
             began_with_a_cut: self.cut,
         }
     }
-}
-
-impl Turning for Session {
-    const FEATURES: Features = Features {
-        models: &ALL,
-        // Enough for all models but the STL27L.
-        auto: family::Model { name: "auto", baud: Model::Ld19.baud(), beams: 720 },
-        modes: &[],
-        can_rest: false,
-        speaks_unasked: true,
-    };
-
-    fn begin(wanted: Wanted, now: Nanos) -> Self {
-        let Wanted { model, beams, most_beams, fixed_rate, listen_only, .. } = wanted;
-        let model = model.and_then(Model::named);
-        Session::new(Settings { model, beams, most_beams, fixed_rate, listen_only }, now)
-    }
 
     fn model(&self) -> Option<family::Model> {
         self.model().map(described)
     }
 
     fn beams(&self) -> Option<usize> {
-        self.beams()
+        self.beams
     }
 
-    fn begun(&self) -> Option<Turn<'_>> {
-        self.begun_turn()
+    fn partial_scan(&self) -> Option<RawScan<'_>> {
+        self.turns.begun(self.pace?).map(|begun| self.dated(begun))
     }
 
     fn other_model(&self) -> Option<family::Model> {
@@ -593,9 +583,28 @@ impl Turning for Session {
         self.scanner_time
     }
 
-    fn doubt(&mut self, reasons: u8) {
+    fn mark_suspect(&mut self, reasons: u8) {
         self.reads.doubt(reasons);
     }
+}
+
+/// Models and settings of the family.
+pub const FEATURES: Features = Features {
+    models: &ALL,
+    // Enough for all models but the STL27L.
+    auto: family::Model { name: "auto", baud: Model::Ld19.baud(), beams: 720 },
+    modes: &[],
+    can_rest: false,
+    speaks_unasked: true,
+    has_whole_telegrams: false,
+    contents: Contents::TURNING,
+    max_telegram: MOST * LEN,
+};
+
+/// Returns the head of a scan on a grid of as many beams as there is space for.
+pub(crate) fn scan_heads(settings: &family::Settings) -> Vec<ScanHead> {
+    let beams = settings.beams.or(settings.max_beams).unwrap_or(FEATURES.auto.beams);
+    vec![ScanHead::turning(Family::Ld, beams)]
 }
 
 /// Reason why a session does not stream.

@@ -79,7 +79,7 @@ impl Reads {
 
     /// Returns what to wait for at `now`: the end of a rest, or bytes until the deadline `until`. If the framer holds a packet
     /// back until the line was idle for `hold`, the deadline is the end of that time, if it comes first.
-    pub fn wait<H>(&self, now: Nanos, until: Nanos, hold: Option<Nanos>) -> Output<H> {
+    pub fn wait<'a>(&self, now: Nanos, until: Nanos, hold: Option<Nanos>) -> Output<'a> {
         if self.rest_until > now {
             return Output::Rest(self.rest_until);
         }

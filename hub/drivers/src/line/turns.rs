@@ -3,7 +3,6 @@
 //! turn is over only when the head is past its end by more than a point can be late, and until then there are two. Knows
 //! no bytes and no hub's clock.
 
-use crate::line::TurnCounts;
 use crate::line::grid::{NO_RETURN, Point};
 use schema::Nanos;
 
@@ -52,6 +51,19 @@ pub struct Closed {
     pub incomplete: bool,
     /// Why its points are suspect, bits of [`crate::line::suspect`].
     pub reasons: u8,
+}
+
+/// Numbers of revolutions by kind. They only increase.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct TurnCounts {
+    /// Returned revolutions, including incomplete ones.
+    pub turns: u64,
+    /// Returned revolutions that are incomplete.
+    pub incomplete: u64,
+    /// Revolutions that were not returned, because less than half of the points arrived.
+    pub short: u64,
+    /// Revolutions without a packet.
+    pub missed: u64,
 }
 
 /// How fast the head turns past points.

@@ -164,7 +164,7 @@ impl Dialogue {
             _ => Nanos::MAX,
         };
         let Some(request) = &self.open else { return phase_ends_at };
-        let next_byte_at = request.byte().map_or(Nanos::MAX, |(_, not_before)| not_before);
+        let next_byte_at = request.next_at().unwrap_or(Nanos::MAX);
         phase_ends_at.min(request.give_up_at()).min(next_byte_at)
     }
 

@@ -1,6 +1,7 @@
 //! One request after the other, and what comes back: what [`crate::lms::inquiry`] and a change of the configuration have in common. Knows
 //! pace, tries and bytes; refuses to know what is asked, and why.
 
+use crate::line::Output;
 use crate::lms::framer::{Advance, Framer, Tally, TelegramSpan};
 pub use crate::lms::outgoing::{MODE_TIMEOUT, Say};
 use crate::lms::outgoing::{NAK_PAUSE, Outgoing, SOON};
@@ -9,52 +10,6 @@ use crate::lms::reply::REFUSED;
 use crate::lms::telegram::{REPLY, Telegram};
 use crate::lms::variant::Baud;
 use schema::Nanos;
-
-/// What a conversation wants, in the order in which it wants it.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Output {
-    /// Set the port to this rate and forget what it had received, then go on draining.
-    SetBaud(Baud),
-    /// Write this byte, not before the time given, then say so by [`Conversation::transmitted`]. Do nothing else
-    /// meanwhile: the sensor drops a request whose bytes are more than 6 ms apart.
-    Transmit {
-        /// The byte.
-        byte: u8,
-        /// Earliest time to write it.
-        not_before: Nanos,
-    },
-    /// Read when the port has bytes; at the deadline, if a read finds none, call [`Conversation::handle_timeout`].
-    Wait {
-        /// The deadline.
-        until: Nanos,
-    },
-    /// It is over.
-    Done,
-}
-
-/// A conversation with a sensor that comes to an end, driven from outside as a [`crate::lms::Session`] is: bytes and times
-/// go in, and after every call that changes it [`Conversation::poll_output`] is drained until it wants to wait.
-pub trait Conversation {
-    /// Room for the next read; never empty once the outputs are drained.
-    fn spare(&mut self) -> &mut [u8];
-
-    /// A read returned at `now` and brought `len` bytes into [`Conversation::spare`].
-    fn commit(&mut self, now: Nanos, len: usize);
-
-    /// The deadline passed, and a read found nothing.
-    fn handle_timeout(&mut self, now: Nanos);
-
-    /// Call it at `now`, immediately before the byte of [`Output::Transmit`] is written. Returns whether it is too late for
-    /// this byte, as on a machine that did not run the program for a few milliseconds. Then do not write it, and continue
-    /// draining: the request starts over.
-    fn restart_if_late(&mut self, now: Nanos) -> bool;
-
-    /// The byte of [`Output::Transmit`] was written at `now`.
-    fn transmitted(&mut self, now: Nanos);
-
-    /// What it wants next.
-    fn poll_output(&mut self) -> Output;
-}
 
 /// A line with at most one open request.
 #[derive(Clone, Debug)]
@@ -88,12 +43,12 @@ impl<R: Say> Exchange<R> {
         }
     }
 
-    /// As [`Conversation::spare`].
+    /// As [`Protocol::spare`](crate::line::Protocol::spare).
     pub fn spare(&mut self) -> &mut [u8] {
         self.framer.spare()
     }
 
-    /// As [`Conversation::commit`].
+    /// As [`Protocol::commit`](crate::line::Protocol::commit).
     pub fn commit(&mut self, now: Nanos, len: usize) {
         self.now = now;
         if len > 0 {
@@ -111,13 +66,13 @@ impl<R: Say> Exchange<R> {
         self.open.as_ref().is_some_and(|open| now >= open.give_up_at())
     }
 
-    /// As [`Conversation::restart_if_late`]. Behind a server, the gaps on the line are not known.
+    /// As [`Protocol::restart_if_late`](crate::line::Protocol::restart_if_late). Behind a server, the gaps on the line are not known.
     pub fn restart_if_late(&mut self, now: Nanos) -> bool {
         self.now = now;
         !self.behind_server && self.open.as_mut().is_some_and(|open| open.restart_if_late(now, self.baud))
     }
 
-    /// As [`Conversation::transmitted`].
+    /// As [`Protocol::transmitted`](crate::line::Protocol::transmitted).
     pub fn transmitted(&mut self, now: Nanos) {
         self.now = now;
         if let Some(open) = &mut self.open {
@@ -184,19 +139,19 @@ impl<R: Say> Exchange<R> {
     }
 
     /// What it wants, with a deadline of its user's own.
-    pub fn output(&mut self, own: Nanos) -> Output {
+    pub fn output(&mut self, own: Nanos) -> Output<'_> {
         if core::mem::take(&mut self.change_baud) {
             self.framer.clear();
-            return Output::SetBaud(self.baud);
+            return Output::SetRate(self.baud.rate());
         }
         self.framer.await_acknowledge(self.open.is_some());
         let mut until = own;
         if let Some(open) = &self.open {
-            match open.byte() {
-                Some((byte, not_before)) if not_before <= self.now + SOON => {
-                    return Output::Transmit { byte, not_before };
+            match open.next_at() {
+                Some(not_before) if not_before <= self.now + SOON => {
+                    return Output::Transmit { bytes: open.next_byte(), not_before };
                 }
-                Some((_, not_before)) => until = until.min(not_before),
+                Some(not_before) => until = until.min(not_before),
                 None => until = until.min(open.give_up_at()),
             }
         }
@@ -255,7 +210,8 @@ mod tests {
             let (mut written, mut now, mut restarts) = (0, 0, 0);
             while written < request.bytes().len() {
                 match exchange.output(Nanos::MAX) {
-                    Output::Transmit { byte, not_before } => {
+                    Output::Transmit { bytes, not_before } => {
+                        let &[byte] = bytes else { panic!("no gaps between {bytes:?}") };
                         // The fourth byte is late, once.
                         let late = if written == 3 && restarts == 0 { byte_ns + gap } else { 0 };
                         now = (now + late).max(not_before);

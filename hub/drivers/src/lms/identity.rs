@@ -2,13 +2,14 @@
 //! the same stream, and can say what the values mean before it has asked. Refuses to know where it is kept, and for how
 //! long it is worth anything.
 
+use crate::line;
 use crate::lms::header::StreamHeader;
 use crate::lms::sensor::KIND_LEN;
 use crate::lms::variant::Mode;
 
 /// Who streams, and how its values are split.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Identity {
+pub(crate) struct Identity {
     /// How each of its scans begins.
     pub(crate) header: StreamHeader,
     pub(crate) mode: Mode,
@@ -17,12 +18,9 @@ pub struct Identity {
 }
 
 impl Identity {
-    /// Bytes of one.
-    pub const LEN: usize = size_of::<StreamHeader>() + 1 + KIND_LEN;
-
     /// As bytes: header, mode, type.
-    pub fn to_bytes(self) -> [u8; Identity::LEN] {
-        let mut bytes = [0; Identity::LEN];
+    pub(crate) fn to_bytes(self) -> line::Identity {
+        let mut bytes = line::Identity::default();
         let (header, rest) = bytes.split_at_mut(self.header.len());
         header.copy_from_slice(&self.header);
         rest[0] = self.mode.0;
@@ -31,7 +29,7 @@ impl Identity {
     }
 
     /// What [`to_bytes`](Self::to_bytes) made bytes of.
-    pub fn from_bytes(bytes: [u8; Identity::LEN]) -> Identity {
+    pub(crate) fn from_bytes(bytes: line::Identity) -> Identity {
         let mut identity = Identity { header: Default::default(), mode: Mode(0), kind: [0; KIND_LEN] };
         let (header, rest) = bytes.split_at(identity.header.len());
         identity.header.copy_from_slice(header);
@@ -40,6 +38,8 @@ impl Identity {
         identity
     }
 }
+
+const _: () = assert!(size_of::<StreamHeader>() + 1 + KIND_LEN == size_of::<line::Identity>());
 
 #[cfg(test)]
 mod tests {

@@ -6,8 +6,9 @@
 
 mod report;
 
+use crate::line::{Output, Protocol};
 use crate::lms::command::Request;
-use crate::lms::exchange::{Conversation, Exchange, Heard, Output};
+use crate::lms::exchange::{Exchange, Heard};
 use crate::lms::family::Family;
 use crate::lms::framer::{Tally, TelegramSpan};
 use crate::lms::header::is_data;
@@ -83,7 +84,7 @@ impl Inquiry {
         }
     }
 
-    /// What is known; all there is to know after [`Output::Done`].
+    /// What is known; all there is to know when it [is done](Protocol::is_done).
     pub fn report(&self) -> &Report {
         &self.report
     }
@@ -196,7 +197,7 @@ impl Inquiry {
     }
 }
 
-impl Conversation for Inquiry {
+impl Protocol for Inquiry {
     fn spare(&mut self) -> &mut [u8] {
         self.exchange.spare()
     }
@@ -224,7 +225,11 @@ impl Conversation for Inquiry {
         self.exchange.transmitted(now);
     }
 
-    fn poll_output(&mut self) -> Output {
+    fn is_done(&self) -> bool {
+        matches!(self.phase, Phase::Done)
+    }
+
+    fn poll_output(&mut self) -> Output<'_> {
         while let Some(heard) = self.exchange.advance() {
             match heard {
                 Heard::Telegram(span) => self.on_telegram(span),
@@ -242,7 +247,7 @@ impl Conversation for Inquiry {
                 self.exchange.output(give_up_at)
             }
             Phase::Seeking { .. } | Phase::Asking { .. } => self.exchange.output(Nanos::MAX),
-            Phase::Done => Output::Done,
+            Phase::Done => Output::Wait { until: Nanos::MAX },
         }
     }
 }

@@ -2,8 +2,10 @@
 //! where the sensor is set to send them. What the words mean in millimetres depends on the measuring mode, which no
 //! telegram of values carries.
 
+use crate::line::{RawScan, Values};
 use crate::lms::telegram::{Encoded, REPLY, Telegram, Writer};
-use crate::lms::variant::{MAX_BEAMS, Unit};
+use crate::lms::variant::{MAX_BEAMS, Mode, Unit, Variant};
+use schema::{Nanos, ScanHead};
 
 /// Command byte of a measured-value telegram.
 pub const MEASURED: u8 = 0xB0;
@@ -74,6 +76,16 @@ impl<'a> Measured<'a> {
         self.indices
     }
 
+    /// Returns whether a value has bits set that `mode` never sets.
+    pub(crate) fn is_forbidden(&self, mode: Mode) -> bool {
+        mode.forbidden() != 0 && self.words().any(|word| word & mode.forbidden() != 0)
+    }
+
+    /// Returns the scan, with its values split as `mode` says. Its stamps are 0.
+    pub fn scan(&self, mode: Mode) -> RawScan<'a> {
+        raw(self.values, head(self.count(), self.unit(), self.partial(), mode), mode)
+    }
+
     /// The values as sent: range in the low bits, reflector level or field bits above (see [`crate::lms::variant::Mode`]).
     pub fn words(&self) -> impl ExactSizeIterator<Item = u16> + use<'a> {
         words(self.values)
@@ -104,20 +116,39 @@ impl<'a> FirstValues<'a> {
         is_whole.then_some(FirstValues { count, unit, values })
     }
 
-    /// Number of beams of the whole scan: 1 to 401.
-    pub fn count(&self) -> usize {
-        self.count
+    /// Returns the scan so far, with its values split as `mode` says. Its stamps are 0.
+    pub(crate) fn scan(&self, mode: Mode) -> RawScan<'a> {
+        raw(self.values, head(self.count, self.unit, None, mode), mode)
     }
+}
 
-    /// Unit of the ranges.
-    pub fn unit(&self) -> Unit {
-        self.unit
-    }
+fn raw(bytes: &[u8], head: ScanHead, mode: Mode) -> RawScan<'_> {
+    let values = Values::Words { bytes, range_bits: mode.range_bits() };
+    RawScan { number: 0, first: 0, last: 0, period: 0, reasons: 0, bytes: 0, head, values }
+}
 
-    /// The values so far, as sent; see [`Measured::words`].
-    pub fn words(&self) -> impl ExactSizeIterator<Item = u16> + use<'a> {
-        words(self.values)
+/// Returns the head of a scan of `count` values. Beams are in the order in which the sensor sends them: counterclockwise as seen
+/// from above, the first one on the right. Their angles are counted from ahead (REP 103).
+fn head(count: usize, unit: Unit, partial: Option<u8>, mode: Mode) -> ScanHead {
+    let variant = Variant::of_beams(count);
+    // A partial scan has 180 or 181 beams, a degree apart.
+    let step_mdeg = variant.map_or(1000, |variant| variant.resolution_cdeg * 10);
+    let first_angle_mdeg = match (variant, partial) {
+        (None, Some(quarters)) => i32::from(quarters) * 250 - 90_000,
+        (variant, _) => variant.map_or(-90_000, Variant::first_angle_mdeg),
+    };
+    ScanHead {
+        intensity_bits: mode.intensity_bits(),
+        ..ScanHead::lms(count, first_angle_mdeg, step_mdeg.into(), unit.mm().into(), mode.range_bits())
     }
+}
+
+/// Returns the nominal time between two scans of `beams` values at `baud`, rounded down to microseconds; 0 if there is no variant
+/// with this number of values.
+pub fn nominal_period(beams: usize, baud: u32) -> Nanos {
+    // STX to count word, status and checksum: 10 bytes beside the values.
+    let period = |variant: Variant| variant.period(2 * variant.beams() + 10, baud);
+    Variant::of_beams(beams).map_or(0, |variant| period(variant) / 1000 * 1000)
 }
 
 /// A measured-value telegram of a whole scan from the sensor at `address` (0 to 127): at most 401 `words` as they
@@ -159,6 +190,39 @@ pub(crate) const PARTIAL: u16 = 1 << 13;
 #[cfg(test)]
 mod tests {
     use super::*;
+    use schema::Scan;
+
+    #[test]
+    fn words_are_split_as_the_mode_says() {
+        let words: Vec<u16> = (0..181).map(|i| (i % 8) << 13 | (1000 + i)).collect();
+        let encoded = encode(0, Unit::Cm, &words, 0x10);
+        let measured = Measured::decode(encoded.telegram()).unwrap();
+        let mut scan = Scan::zeroed(measured.scan(Mode(1)).len());
+        measured.scan(Mode(1)).write(&mut scan);
+        assert_eq!(
+            (scan.beams(), scan.unit_um, scan.valid_to, scan.intensity_bits),
+            (181, 10_000, 0x1FF6, 3)
+        );
+        assert_eq!((scan.angle_deg(0), scan.angle_deg(90), scan.angle_deg(180)), (-90.0, 0.0, 90.0));
+        assert_eq!((scan.ranges()[5], scan.intensities().get(5)), (1005, Some(5)));
+        measured.scan(Mode(4)).write(&mut scan);
+        assert_eq!((scan.no_return, scan.intensity_bits), (0x3FFF, 0));
+        assert_eq!((scan.ranges()[3], scan.upper()[3]), ((3 << 13 | 1003) & 0x3FFF, 1));
+        assert!(measured.is_forbidden(Mode(0x0F)) && !measured.is_forbidden(Mode(4)));
+    }
+
+    #[test]
+    fn a_status_knows_the_modes_with_reflector_bits() {
+        for mode in 0..schema::Status::MODE_UNKNOWN {
+            let status = schema::Status { mode, ..schema::Status::default() };
+            assert_eq!(status.has_reflector_bits(), Some(Mode(mode).intensity_bits() > 0), "{mode}");
+        }
+    }
+
+    #[test]
+    fn periods() {
+        assert_eq!((nominal_period(361, 500_000), nominal_period(180, 500_000)), (26_640_000, 0));
+    }
 
     #[test]
     fn the_synthetic_scan_of_the_reference() {

@@ -1,7 +1,5 @@
 //! What a sensor's owner should know although scans come: plain words for what the sensor says of itself.
 
-use core::fmt;
-
 /// Something that the sensor said of itself; see [`crate::lms::Sensor::notices`].
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Notice {
@@ -22,18 +20,19 @@ impl Notice {
     pub fn is_fault(self) -> bool {
         self != Notice::PermanentBaud
     }
-}
 
-impl fmt::Display for Notice {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(match self {
-            Notice::Defective => "the sensor reports that it is defective; it streams, but its scans may be wrong",
+    /// Returns the message.
+    pub(crate) fn text(self) -> &'static str {
+        match self {
+            Notice::Defective => {
+                "the sensor reports that it is defective; it streams, but its scans may be wrong"
+            }
             Notice::Fatal => "the sensor reports a fatal error; it streams, but its scans may be wrong",
             Notice::Error => "the sensor reports an error; it streams, but its scans may be wrong",
             Notice::Dirty => "the sensor's window is dirty: clean it",
             Notice::PermanentBaud => {
                 "the rate after power-on in the sensor's EEPROM is not the factory's; the hub works with it as it is"
             }
-        })
+        }
     }
 }

@@ -92,9 +92,14 @@ impl<R: Say> Outgoing<R> {
         self.patience = patience;
     }
 
-    /// The next byte, and when it may leave at the earliest.
-    pub(crate) fn byte(&self) -> Option<(u8, Nanos)> {
-        self.encoded.bytes().get(self.sent).map(|&byte| (byte, self.not_before))
+    /// Returns the next byte. Empty if all of them left.
+    pub(crate) fn next_byte(&self) -> &[u8] {
+        self.encoded.bytes().get(self.sent..=self.sent).unwrap_or_default()
+    }
+
+    /// Returns when the next byte may leave at the earliest.
+    pub(crate) fn next_at(&self) -> Option<Nanos> {
+        (!self.is_out()).then_some(self.not_before)
     }
 
     /// The byte left at `now`.
@@ -178,7 +183,7 @@ impl<R: Say> Outgoing<R> {
 
     /// Whether all of it left.
     pub(crate) fn is_out(&self) -> bool {
-        self.byte().is_none()
+        self.sent >= self.encoded.bytes().len()
     }
 }
 
@@ -217,7 +222,7 @@ mod tests {
         let mut outgoing = Outgoing::new(Request::Status, 0, 5, 2);
         let mut now = 5;
         for &expected in Request::Status.encode(0).bytes() {
-            let (byte, not_before) = outgoing.byte().unwrap();
+            let (byte, not_before) = (outgoing.next_byte()[0], outgoing.next_at().unwrap());
             assert_eq!(byte, expected);
             assert!(not_before >= now);
             now = not_before + 7;

@@ -5,7 +5,7 @@ use crate::line::State;
 use crate::lms::command::Request;
 use crate::lms::header::StreamHeader;
 use crate::lms::reply::Reply;
-use crate::lms::variant::{Baud, Variant};
+use crate::lms::variant::{Baud, Mode, Variant};
 use schema::{MILLIS, Nanos};
 
 /// What a session shall do.
@@ -22,6 +22,8 @@ pub struct Settings {
     /// Whether to keep to `baud` even if the line cannot carry it. Otherwise, the session streams at 38,400 baud after two
     /// switches to 500,000 baud that the scanner acknowledged and that were followed by silence.
     pub keep_baud: bool,
+    /// Measuring mode of a recording that does not contain it.
+    pub mode: Option<Mode>,
 }
 
 #[derive(Clone, Copy, Debug)]

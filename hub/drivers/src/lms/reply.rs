@@ -115,6 +115,16 @@ pub enum Reply<'a> {
 }
 
 impl<'a> Reply<'a> {
+    /// Returns the measuring mode that it reports: `Some(None)` after power-on, when the mode of earlier replies is no longer valid.
+    pub fn mode(&self) -> Option<Option<Mode>> {
+        match self {
+            Reply::Configuration(configuration) => Some(Some(configuration.mode())),
+            Reply::Status(report) => Some(Some(report.mode())),
+            Reply::PowerOn(_) => Some(None),
+            _ => None,
+        }
+    }
+
     /// What `telegram` says; `None` if it is no reply of this list or its data are not as its kind needs them.
     pub fn decode(telegram: Telegram<'a>) -> Option<Reply<'a>> {
         if !telegram.is_reply() || telegram.status().is_none() {

@@ -53,9 +53,9 @@ impl fmt::Display for Trouble {
                 f,
                 "no answer at 9600, 19200, 38400 or 500000 baud for {seconds} s: power, cable, RS-422 jumper?"
             ),
-            Trouble::NoAnswer { baud: Some(baud), seconds } => write!(
+            Trouble::NoAnswer { baud: Some(baud), .. } => write!(
                 f,
-                "no answer at {} baud, the only rate of this port, for {seconds} s: power, cable, another rate?",
+                "no answer at {} baud, the rate set in the serial server: power, cable, rate?",
                 baud.rate()
             ),
             Trouble::Unanswered(request) => write!(f, "no reply to {request:?} in several tries"),
@@ -150,7 +150,7 @@ impl Sensor {
         self.software.trim_ascii()
     }
 
-    /// What its owner should know, worst first.
+    /// Returns what its owner should know, the worst first. All faults come before what is only good to know.
     pub fn notices(&self) -> impl Iterator<Item = Notice> {
         let severity = self.condition.and_then(Condition::severity);
         let dirty = self.condition.is_some_and(Condition::is_polluted);

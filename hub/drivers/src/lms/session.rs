@@ -1,6 +1,9 @@
 //! The session with an LMS: bytes and the time go in; telegrams, bytes to send and the next deadline come out.
 
-use crate::line::{self, Account, Control, Output, State, suspect};
+use crate::line::family;
+use crate::line::{
+    self, Account, Control, Event, KnownRate, Output, RawScan, Received, State, Whole, suspect,
+};
 use crate::lms::arrival::{Arrivals, Rhythm, Stamp};
 use crate::lms::cadence::Cadence;
 use crate::lms::damage::Damage;
@@ -8,54 +11,14 @@ use crate::lms::dialogue::Dialogue;
 use crate::lms::framer::{Advance, Framer, Tally, TelegramSpan};
 use crate::lms::header::Reject;
 use crate::lms::identity::Identity;
-use crate::lms::measured::{FirstValues, MEASURED};
-use crate::lms::outgoing::SOON;
+use crate::lms::measured::{FirstValues, MEASURED, nominal_period};
+use crate::lms::outgoing::{Outgoing, SOON};
 use crate::lms::phase::{Phase, Settings};
 use crate::lms::reply::Reply;
 use crate::lms::sensor::{Sensor, Trouble};
-use crate::lms::telegram::Telegram;
-use crate::lms::variant::{BYTES_PER_TURN, Baud, Mode, Variant};
-use schema::Nanos;
-
-/// A decoded telegram.
-#[derive(Clone, Copy, Debug)]
-pub struct Message<'a> {
-    /// The telegram, in the session's buffer.
-    pub telegram: Telegram<'a>,
-    /// The reply that it contains. `None` if it cannot be decoded.
-    pub reply: Option<Reply<'a>>,
-    /// Mode, which defines how a value is split into range and intensity. `None` while the scanner has not reported it, if the angles of
-    /// the values are unknown, or if the telegram arrived at another rate than that of the settings.
-    pub mode: Option<Mode>,
-    /// Rate at which the session streams.
-    pub baud: Baud,
-    /// Number of the first byte among all bytes of the session, from 0.
-    pub offset: u64,
-}
-
-/// A telegram with its stamps.
-pub type Received<'a> = line::Received<'a, Message<'a>>;
-
-/// Measured values of a telegram that is not complete yet. It may turn out to be damaged.
-#[derive(Clone, Copy, Debug)]
-pub struct Begun<'a> {
-    /// The values that have arrived.
-    pub values: FirstValues<'a>,
-    /// Mode, which defines how a value is split into range and intensity.
-    pub mode: Mode,
-    /// Rate at which the session streams.
-    pub baud: Baud,
-    /// Number of the first byte of the telegram among all bytes of the session, from 0.
-    pub offset: u64,
-    /// Bytes that have arrived.
-    pub bytes: usize,
-    /// Time at which the first byte arrived.
-    pub first: Nanos,
-    /// Time at which the last of these bytes arrived.
-    pub last: Nanos,
-    /// Reasons for suspicion so far: bits of [`crate::line::suspect`].
-    pub reasons: u8,
-}
+use crate::lms::telegram::{MAX_TELEGRAM, Telegram};
+use crate::lms::variant::{BYTES_PER_TURN, Baud, MAX_BEAMS, Mode, Unit, Variant};
+use schema::{Contents, Counter, Counters, Nanos, ScanHead, Status};
 
 /// The session with one scanner. If the scanner is replaced within a second by one that streams already, with the same number
 /// of values and the same address, the session does not notice.
@@ -80,6 +43,8 @@ pub struct Session {
     has_more: bool,
     /// Time until which waiting bytes are not read.
     left_until: Option<Nanos>,
+    /// Mode that the last telegrams of a recording reported.
+    recorded_mode: Option<Mode>,
 }
 
 impl Session {
@@ -100,26 +65,8 @@ impl Session {
             room: 0,
             has_more: false,
             left_until: None,
+            recorded_mode: settings.mode,
         }
-    }
-
-    /// Restores the identity that the previous session saved a moment ago. Scans are available at once if the scanner still
-    /// streams as it did then. The session still requests the status. Call it before the first read.
-    pub fn recall(&mut self, known: Identity) {
-        self.dialogue.recalled = Some(known);
-    }
-
-    /// Sets the rate that is tried first, in place of 9,600, if no stream arrives: the rate at which the scanner was
-    /// [found](Self::found_at) the last time. Call it before the first read.
-    pub fn seek_first(&mut self, baud: Baud) {
-        self.dialogue.rest_at = baud;
-        self.dialogue.first = baud;
-    }
-
-    /// Returns the rate to try first the next time: the one at which the search found the scanner, or the one in use if the
-    /// line cannot carry 500,000 baud. `None` if there was no search.
-    pub fn found_at(&self) -> Option<Baud> {
-        self.dialogue.rate_in_place_of_fast().or(self.dialogue.found_at)
     }
 
     /// Restores the [number of silent switches](Self::silent_switches) that the previous session counted. After two of
@@ -137,12 +84,9 @@ impl Session {
         self.dialogue.fast_switches.silent()
     }
 
-    /// Returns the identity for the next session. `None` if the scanner does not stream, or has not reported all of it.
-    pub fn identity(&self) -> Option<Identity> {
-        match self.dialogue.phase {
-            Phase::Streaming { header, .. } => self.sensor().identity(header),
-            _ => None,
-        }
+    /// Creates a session from the settings that all families share.
+    pub(crate) fn configured(settings: &family::Settings, now: Nanos) -> Session {
+        Session::new(typed(settings), now)
     }
 
     /// Returns the rate of the line.
@@ -158,36 +102,6 @@ impl Session {
     /// Returns why the session does not stream.
     pub fn trouble(&self) -> Option<Trouble> {
         self.dialogue.trouble()
-    }
-
-    /// Sets the number of reads per telegram to `pieces`, so that [`begun`](Self::begun) returns more values each time. With 0
-    /// and 1, a telegram is read when it is complete.
-    pub fn look_in(&mut self, pieces: u8) {
-        self.rhythm.look_in(pieces);
-    }
-
-    /// Returns the values of the scan that is arriving. Call it when [`poll_output`](line::Session::poll_output) has returned a wait.
-    /// `None` between scans, and while the mode of the scanner is not known.
-    pub fn begun(&self) -> Option<Begun<'_>> {
-        if !self.is_live() || !self.is_at_rate() {
-            return None;
-        }
-        let begun = self.framer.begun()?;
-        let values = FirstValues::of(begun.bytes)?;
-        let mode = self.dialogue.sensor.mode_of_scans()?;
-        let (baud, bytes) = (self.dialogue.baud.rate(), begun.bytes.len());
-        let first = self.arrivals.stamp(begun.offset, baud);
-        let last = self.arrivals.stamp(begun.offset + bytes as u64 - 1, baud);
-        Some(Begun {
-            values,
-            mode,
-            baud: self.dialogue.settings.baud,
-            offset: begun.offset,
-            bytes,
-            first: first.at.max(self.last_stamp),
-            last: last.at.max(first.at).max(self.last_stamp),
-            reasons: begun.reasons,
-        })
     }
 
     /// Returns the counters of the framer.
@@ -244,21 +158,11 @@ impl Session {
         self.dialogue.sensor.doubt(self.damage.is_recent(self.now));
         let is_at_rate = self.is_at_rate();
         self.dialogue.on_telegram(telegram, reply, first.at, self.now);
-        let mode = self.dialogue.sensor.mode_of_scans().filter(|_| is_at_rate);
-        Received {
-            bytes: telegram.bytes(),
-            message: Message {
-                telegram,
-                reply,
-                mode,
-                baud: self.dialogue.settings.baud,
-                offset: span.offset,
-            },
-            first: first.at,
-            last,
-            estimated,
-            reasons: framed.reasons | if slow { suspect::SLOW } else { 0 },
-        }
+        let settings = &self.dialogue.settings;
+        let mode = self.dialogue.sensor.mode_of_scans().filter(|_| is_at_rate).or(settings.mode);
+        let received = received(telegram, reply.as_ref(), mode, settings.baud, span.offset);
+        let reasons = received.reasons | framed.reasons | if slow { suspect::SLOW } else { 0 };
+        Received { first: first.at, last, estimated, reasons, ..received }
     }
 
     /// Returns when the first byte arrived that is in no telegram yet.
@@ -299,10 +203,7 @@ impl Session {
     }
 }
 
-impl line::Session for Session {
-    type Heard<'a> = Received<'a>;
-    type Trouble = Trouble;
-
+impl line::Protocol for Session {
     fn spare(&mut self) -> &mut [u8] {
         let spare = self.framer.spare();
         self.room = spare.len();
@@ -327,25 +228,6 @@ impl line::Session for Session {
         }
     }
 
-    fn may_leave(&self) -> bool {
-        let begins = self.framer.buffered() == 0 && !self.has_more && self.left_until.is_none();
-        // A reply takes less time than a scan.
-        let is_silent = self.dialogue.open.is_none();
-        begins && is_silent && self.rhythm.duration().is_some() && self.has_pace() && self.is_live()
-    }
-
-    fn leave(&mut self, now: Nanos, waiting: usize) -> bool {
-        self.now = now;
-        // If the bytes of more than a revolution wait, the host did not run. Then the read has to find out since when they wait.
-        if (1..=BYTES_PER_TURN).contains(&waiting) && self.may_leave() {
-            self.arrivals.sense(now, waiting);
-            let begun = self.next_began();
-            self.rhythm.begin(begun);
-            self.left_until = self.rhythm.rest(now);
-        }
-        self.left_until.is_some()
-    }
-
     fn handle_timeout(&mut self, now: Nanos) {
         self.now = now;
         self.framer.release(now.saturating_sub(self.last_byte));
@@ -354,12 +236,6 @@ impl line::Session for Session {
             self.damage.note(self.framer.tally(), now);
         }
         self.dialogue.handle_timeout(now);
-    }
-
-    fn control(&mut self, control: Control, now: Nanos) {
-        self.now = now;
-        self.left_until = None;
-        self.dialogue.control(control, now);
     }
 
     fn transmitted(&mut self, now: Nanos) {
@@ -374,10 +250,10 @@ impl line::Session for Session {
         }
     }
 
-    fn poll_output(&mut self) -> Output<Received<'_>> {
+    fn poll_output(&mut self) -> Output<'_> {
         while let Some(found) = self.framer.advance() {
             match found {
-                Advance::Telegram(span) => return Output::Heard(self.receive(span)),
+                Advance::Telegram(span) => return Output::Event(Event::Telegram(self.receive(span))),
                 Advance::Ack => self.dialogue.on_acknowledge(self.now),
                 Advance::Nak => self.dialogue.on_nak(self.now),
             }
@@ -389,11 +265,12 @@ impl line::Session for Session {
         }
         self.framer.expect(self.dialogue.expect());
         self.framer.await_acknowledge(self.dialogue.awaits_acknowledge());
-        let next_byte = self.dialogue.outgoing().and_then(|outgoing| outgoing.byte());
-        if let Some((byte, not_before)) = next_byte.filter(|&(_, at)| at <= self.now + SOON) {
+        let next_at = self.dialogue.outgoing().and_then(|outgoing| outgoing.next_at());
+        if let Some(not_before) = next_at.filter(|&at| at <= self.now + SOON) {
             // The sensor skips scans while it answers.
             self.cadence.rest();
-            return Output::Transmit { byte, not_before };
+            let bytes = self.dialogue.open.as_ref().map_or(&[][..], Outgoing::next_byte);
+            return Output::Transmit { bytes, not_before };
         }
         if let Some(until) = self.left_until {
             return Output::Rest(until);
@@ -410,6 +287,35 @@ impl line::Session for Session {
         // A telegram may be held back until the line was idle for a while.
         let held_until = self.framer.hold().map_or(Nanos::MAX, |hold| self.last_byte + hold);
         Output::Wait { until: self.dialogue.deadline().min(held_until) }
+    }
+}
+
+impl line::Session for Session {
+    type Trouble = Trouble;
+
+    fn can_defer_read(&self) -> bool {
+        let begins = self.framer.buffered() == 0 && !self.has_more && self.left_until.is_none();
+        // A reply takes less time than a scan.
+        let is_silent = self.dialogue.open.is_none();
+        begins && is_silent && self.rhythm.duration().is_some() && self.has_pace() && self.is_live()
+    }
+
+    fn defer_read(&mut self, now: Nanos, waiting: usize) -> bool {
+        self.now = now;
+        // If the bytes of more than a revolution wait, the host did not run. Then the read has to find out since when they wait.
+        if (1..=BYTES_PER_TURN).contains(&waiting) && self.can_defer_read() {
+            self.arrivals.sense(now, waiting);
+            let begun = self.next_began();
+            self.rhythm.begin(begun);
+            self.left_until = self.rhythm.rest(now);
+        }
+        self.left_until.is_some()
+    }
+
+    fn control(&mut self, control: Control, now: Nanos) {
+        self.now = now;
+        self.left_until = None;
+        self.dialogue.control(control, now);
     }
 
     fn state(&self) -> State {
@@ -451,4 +357,191 @@ impl line::Session for Session {
             began_with_a_cut: self.cut,
         }
     }
+
+    fn restore_identity(&mut self, identity: line::Identity) {
+        self.dialogue.recalled = Some(Identity::from_bytes(identity));
+    }
+
+    fn identity(&self) -> Option<line::Identity> {
+        match self.dialogue.phase {
+            Phase::Streaming { header, .. } => self.sensor().identity(header).map(Identity::to_bytes),
+            _ => None,
+        }
+    }
+
+    /// It is tried in place of 9,600, if no stream arrives.
+    fn hint_rate(&mut self, known: KnownRate) {
+        if let Some(baud) = Baud::of_rate(known.baud) {
+            self.dialogue.rest_at = baud;
+            self.dialogue.first = baud;
+            self.recall_silent_switches(known.silent_switches);
+        }
+    }
+
+    /// Of a line that cannot carry 500,000 baud, it is the rate in use.
+    fn known_rate(&self) -> Option<KnownRate> {
+        let baud = self.dialogue.rate_in_place_of_fast().or(self.dialogue.found_at)?;
+        Some(KnownRate { baud: baud.rate(), silent_switches: self.silent_switches() })
+    }
+
+    fn set_partial_reads(&mut self, count: u8) {
+        self.rhythm.look_in(count);
+    }
+
+    fn partial_scan(&self) -> Option<RawScan<'_>> {
+        if !self.is_live() || !self.is_at_rate() {
+            return None;
+        }
+        let begun = self.framer.begun()?;
+        let values = FirstValues::of(begun.bytes)?;
+        let scan = values.scan(self.dialogue.sensor.mode_of_scans()?);
+        let (baud, bytes) = (self.dialogue.baud.rate(), begun.bytes.len());
+        let first = self.arrivals.stamp(begun.offset, baud);
+        let last = self.arrivals.stamp(begun.offset + bytes as u64 - 1, baud);
+        Some(RawScan {
+            number: begun.offset,
+            first: first.at.max(self.last_stamp),
+            last: last.at.max(first.at).max(self.last_stamp),
+            period: nominal_period(scan.beams(), self.dialogue.settings.baud.rate()),
+            reasons: begun.reasons,
+            bytes,
+            ..scan
+        })
+    }
+
+    fn unit_mm(&self) -> Option<u8> {
+        self.sensor().unit.map(Unit::mm)
+    }
+
+    fn notice(&self) -> Option<line::Notice> {
+        let notice = self.sensor().notices().next()?;
+        Some(line::Notice { text: notice.text(), is_fault: notice.is_fault() })
+    }
+
+    fn read_recorded<'a>(
+        &mut self,
+        telegram: &'a [u8],
+        is_readable: bool,
+        status: Option<&mut Status>,
+    ) -> Option<Received<'a>> {
+        let telegram = Telegram::check(telegram)?;
+        let reply = Reply::decode(telegram);
+        let reported = reply.as_ref().and_then(Reply::mode);
+        self.recorded_mode = reported.unwrap_or(self.recorded_mode);
+        let mode = self.recorded_mode.filter(|_| is_readable);
+        if let Some(status) = status {
+            status.mode = mode.map_or(Status::MODE_UNKNOWN, |mode| mode.0);
+            match reply {
+                Some(Reply::Measured(measured)) => {
+                    status.unit_mm = measured.unit().mm();
+                    if let Some(variant) = Variant::of_beams(measured.count()) {
+                        status.angle_deg = variant.angle_deg;
+                        status.resolution_cdeg = variant.resolution_cdeg;
+                    }
+                }
+                Some(Reply::Type(name)) => status.set_sensor_type(&String::from_utf8_lossy(name)),
+                _ => {}
+            }
+        }
+        Some(received(telegram, reply.as_ref(), mode, self.dialogue.settings.baud, 0))
+    }
+
+    fn describe(&self, status: &mut Status) {
+        let sensor = self.sensor();
+        status.mode = sensor.mode.map_or(Status::MODE_UNKNOWN, |mode| mode.0);
+        status.unit_mm = sensor.unit.map_or(0, |unit| unit.mm());
+        let Variant { angle_deg, resolution_cdeg } =
+            sensor.variant.unwrap_or(Variant { angle_deg: 0, resolution_cdeg: 0 });
+        status.angle_deg = angle_deg;
+        status.resolution_cdeg = resolution_cdeg;
+        status.set_sensor_type(&String::from_utf8_lossy(sensor.kind()));
+    }
+
+    fn add_counters(&self, counters: &mut Counters) {
+        self.account().add_to(counters);
+        let tally = self.framer.tally();
+        counters[Counter::Aborted] += tally.aborted;
+        for (reject, counter) in REJECTS {
+            counters[counter] += tally.rejected[reject as usize];
+        }
+    }
 }
+
+/// Returns `telegram`, which decodes to `reply`, with stamps of 0. Its scan, if it has one, is split as `mode` says.
+fn received<'a>(
+    telegram: Telegram<'a>,
+    reply: Option<&Reply<'a>>,
+    mode: Option<Mode>,
+    baud: Baud,
+    number: u64,
+) -> Received<'a> {
+    let measured = match reply {
+        Some(Reply::Measured(measured)) => Some(*measured),
+        _ => None,
+    };
+    let beams = measured.map_or(0, |measured| measured.count());
+    let period = nominal_period(beams, baud.rate());
+    // No range is better than a wrong one.
+    let split = measured.zip(mode.filter(|mode| mode.has_ranges()));
+    let is_forbidden = split.is_some_and(|(measured, mode)| measured.is_forbidden(mode));
+    let scan = split.map(|(measured, mode)| RawScan { number, period, ..measured.scan(mode) });
+    Received {
+        bytes: telegram.bytes(),
+        first: 0,
+        last: 0,
+        estimated: false,
+        reasons: if is_forbidden { suspect::FORBIDDEN_BITS } else { 0 },
+        count: 1,
+        is_checked: true,
+        is_reply: telegram.command() != MEASURED,
+        whole: Some(Whole { number, beams, period, scan }),
+    }
+}
+
+/// Models and settings of the family.
+pub const FEATURES: family::Features = family::Features {
+    models: &[],
+    auto: family::Model { name: "auto", baud: 500_000, beams: MAX_BEAMS },
+    modes: &[],
+    can_rest: false,
+    speaks_unasked: false,
+    has_whole_telegrams: true,
+    contents: Contents::UPPER,
+    max_telegram: MAX_TELEGRAM,
+};
+
+/// Returns the heads of scans with the view of `settings`. The measuring mode is unknown, and so is the unit if none is set.
+pub(crate) fn scan_heads(settings: &family::Settings) -> Vec<ScanHead> {
+    let variant = typed(settings).variant;
+    let units = settings.unit_mm.map_or(vec![Unit::Mm.mm(), Unit::Cm.mm()], |mm| vec![mm]);
+    let step_mdeg = u32::from(variant.resolution_cdeg) * 10;
+    let (beams, first) = (variant.beams(), variant.first_angle_mdeg());
+    let head = |mm: u8| ScanHead::lms(beams, first, step_mdeg, mm.into(), MAX_RANGE_BITS);
+    units.into_iter().map(head).collect()
+}
+
+/// Converts the settings that all families share.
+fn typed(settings: &family::Settings) -> Settings {
+    let &family::Settings { view, baud, mode_number, listen_only, fixed_rate, .. } = settings;
+    Settings {
+        variant: view.and_then(|(angle, step)| Variant::new(angle, step)).unwrap_or(Variant::HALF),
+        baud: baud.and_then(Baud::of_rate).unwrap_or(Baud::B500000),
+        listen_only,
+        fixed_rate,
+        keep_baud: baud.is_some(),
+        mode: mode_number.map(Mode),
+    }
+}
+
+/// Range bits of the mode with the most of them (Telegram listing, 77h block D).
+const MAX_RANGE_BITS: u8 = 15;
+
+/// Counters of rejected telegrams, except for a wrong checksum, which every family has.
+const REJECTS: [(Reject, Counter); Reject::COUNT - 1] = [
+    (Reject::Address, Counter::RejectedAddress),
+    (Reject::Length, Counter::RejectedLength),
+    (Reject::Command, Counter::RejectedCommand),
+    (Reject::Count, Counter::RejectedCount),
+    (Reject::Vetoed, Counter::RejectedVetoed),
+    (Reject::Superseded, Counter::RejectedSuperseded),
+];

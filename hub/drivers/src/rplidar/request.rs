@@ -92,9 +92,9 @@ impl RequestQueue {
         }
     }
 
-    /// Returns the byte to send next.
-    pub(crate) fn next(&self) -> Option<u8> {
-        self.bytes[self.sent..self.len].first().copied()
+    /// Returns the next byte to send. Empty if there is none.
+    pub(crate) fn next(&self) -> &[u8] {
+        &self.bytes[self.sent..self.len.min(self.sent + 1)]
     }
 
     /// Removes the byte that was sent. Returns whether the queue is empty now.

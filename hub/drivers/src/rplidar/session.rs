@@ -9,12 +9,12 @@ mod stream;
 
 use core::fmt;
 
-use schema::{MILLIS, Nanos};
+use schema::{Contents, Family, MILLIS, Nanos, ScanHead};
 
-use crate::line::family::{self, Condition, Features, Turning, Wanted};
+use crate::line::family::{self, Features};
 use crate::line::{
-    self, Account, Control, Heard, Output, Packets, Reads, Received, SensorClock, State, Tally, Turn,
-    TurnCounts, Turns,
+    self, Account, Condition, Control, Event, Introduction, Output, RawScan, Reads, Received, SensorClock,
+    State, Tally, TurnCounts, Turns,
 };
 
 use crate::rplidar::device_info::{Health, Info};
@@ -35,10 +35,10 @@ pub struct Settings {
     pub model: Option<Model>,
     /// The scan mode. `None`: the fastest one that the line can carry.
     pub mode: Option<Mode>,
-    /// Number of beams of the grid. `None`: the model's number, at most [`most_beams`](Self::most_beams).
+    /// Number of beams of the grid. `None`: the model's number, at most [`max_beams`](Self::max_beams).
     pub beams: Option<usize>,
     /// Maximum number of beams. `None`: the maximum of a grid.
-    pub most_beams: Option<usize>,
+    pub max_beams: Option<usize>,
     /// Whether the port has one fixed rate and bytes do not arrive at the pace of a line, as with a serial server on the
     /// network or a recording.
     pub fixed_rate: bool,
@@ -234,6 +234,16 @@ impl Session {
         self.point_ns.map(|ns| (1e9 / ns) as f32)
     }
 
+    /// Creates a session from the settings that all families share.
+    pub(crate) fn configured(settings: &family::Settings, now: Nanos) -> Session {
+        let &family::Settings {
+            model, mode, beams, max_beams, fixed_rate, listen_only, stop_when_idle, ..
+        } = settings;
+        let (model, mode) = (model.and_then(Model::named), mode.and_then(Mode::named));
+        let settings = Settings { model, mode, beams, max_beams, fixed_rate, listen_only, stop_when_idle };
+        Session::new(settings, now)
+    }
+
     /// Returns the counters of the framer.
     pub fn tally(&self) -> &Tally {
         self.framer.tally()
@@ -310,22 +320,22 @@ impl Session {
     }
 
     /// Returns the packets of a response for the caller.
-    fn reply(&self, span: Span) -> Received<'_, Packets> {
+    fn reply(&self, span: Span) -> Received<'_> {
         Received {
             bytes: self.framer.bytes(span),
-            message: Packets { count: span.packets, is_checked: false, is_reply: true },
             first: self.reads.last_byte(),
             last: self.reads.last_byte(),
             estimated: true,
             reasons: 0,
+            count: span.packets,
+            is_checked: false,
+            is_reply: true,
+            whole: None,
         }
     }
 }
 
-impl line::Session for Session {
-    type Heard<'a> = Heard<'a>;
-    type Trouble = Trouble;
-
+impl line::Protocol for Session {
     fn spare(&mut self) -> &mut [u8] {
         let spare = self.framer.spare();
         self.reads.offer(spare.len());
@@ -334,7 +344,7 @@ impl line::Session for Session {
 
     fn commit(&mut self, now: Nanos, len: usize) {
         self.now = now;
-        self.reads.note(now, len, self.state() == State::Streaming);
+        self.reads.note(now, len, line::Session::state(self) == State::Streaming);
         if len > 0 {
             self.framer.commit(len);
             if let Phase::Draining { until, .. } = &mut self.phase {
@@ -347,6 +357,57 @@ impl line::Session for Session {
         self.now = now;
         self.framer.release(now.saturating_sub(self.reads.last_byte()));
     }
+
+    fn transmitted(&mut self, now: Nanos) {
+        self.now = now;
+        if self.outgoing.advance() {
+            self.sent();
+        }
+    }
+
+    fn poll_output(&mut self) -> Output<'_> {
+        loop {
+            if let Some(on) = self.change_dtr.take() {
+                return Output::SetDtr(on);
+            }
+            if core::mem::take(&mut self.change_baud) {
+                self.framer.clear();
+                return Output::SetRate(self.baud);
+            }
+            if !self.outgoing.next().is_empty() {
+                return Output::Transmit { bytes: self.outgoing.next(), not_before: 0 };
+            }
+            if let Some(closed) = self.advance_turns() {
+                return Output::Event(Event::Scan(self.show(closed)));
+            }
+            let most = self.framer.kind().map_or(1, |kind| self.most_together(kind));
+            let Some(found) = self.framer.advance(most) else { break };
+            match found {
+                Found::Reply(answer, span) => {
+                    let data = Reply::new(&self.framer.bytes(span)[Head::LEN..]);
+                    self.answered(answer, data);
+                    return Output::Event(Event::Telegram(self.reply(span)));
+                }
+                Found::Stream(span) => {
+                    self.stream_begins();
+                    return Output::Event(Event::Telegram(self.reply(span)));
+                }
+                Found::Packets(kind, span) => {
+                    return Output::Event(Event::Telegram(self.receive(kind, span)));
+                }
+                Found::Greeting { is_named } => self.booted(is_named),
+            }
+        }
+        self.expire();
+        if self.change_dtr.is_some() || self.change_baud || !self.outgoing.next().is_empty() {
+            return self.poll_output();
+        }
+        self.reads.wait(self.now, self.deadline(), self.framer.hold())
+    }
+}
+
+impl line::Session for Session {
+    type Trouble = Trouble;
 
     fn control(&mut self, control: Control, now: Nanos) {
         self.now = now;
@@ -362,9 +423,9 @@ impl line::Session for Session {
         }
     }
 
-    fn followed(&mut self, now: Nanos, is_followed: bool) {
+    fn set_has_subscribers(&mut self, now: Nanos, has_subscribers: bool) {
         self.now = now;
-        if !is_followed {
+        if !has_subscribers {
             self.idle_since.get_or_insert(now);
             return;
         }
@@ -381,53 +442,6 @@ impl line::Session for Session {
             self.rest(false);
         }
         is_at_work
-    }
-
-    fn transmitted(&mut self, now: Nanos) {
-        self.now = now;
-        if self.outgoing.advance() {
-            self.sent();
-        }
-    }
-
-    fn poll_output(&mut self) -> Output<Heard<'_>> {
-        loop {
-            if let Some(on) = self.change_dtr.take() {
-                return Output::SetDtr(on);
-            }
-            if core::mem::take(&mut self.change_baud) {
-                self.framer.clear();
-                return Output::SetRate(self.baud);
-            }
-            if let Some(byte) = self.outgoing.next() {
-                return Output::Transmit { byte, not_before: 0 };
-            }
-            if let Some(closed) = self.advance_turns() {
-                return Output::Heard(Heard::Turn(self.show(closed)));
-            }
-            let most = self.framer.kind().map_or(1, |kind| self.most_together(kind));
-            let Some(found) = self.framer.advance(most) else { break };
-            match found {
-                Found::Reply(answer, span) => {
-                    let data = Reply::new(&self.framer.bytes(span)[Head::LEN..]);
-                    self.answered(answer, data);
-                    return Output::Heard(Heard::Packets(self.reply(span)));
-                }
-                Found::Stream(span) => {
-                    self.stream_begins();
-                    return Output::Heard(Heard::Packets(self.reply(span)));
-                }
-                Found::Packets(kind, span) => {
-                    return Output::Heard(Heard::Packets(self.receive(kind, span)));
-                }
-                Found::Greeting { is_named } => self.booted(is_named),
-            }
-        }
-        self.expire();
-        if self.change_dtr.is_some() || self.change_baud || self.outgoing.next().is_some() {
-            return self.poll_output();
-        }
-        self.reads.wait(self.now, self.deadline(), self.framer.hold())
     }
 
     fn state(&self) -> State {
@@ -472,24 +486,6 @@ impl line::Session for Session {
             rejected_checksum: tally.rejected_checksum,
         }
     }
-}
-
-impl Turning for Session {
-    const FEATURES: Features = Features {
-        models: &MODELS,
-        // Enough for all models but the S2 and the S3.
-        auto: family::Model { name: "auto", baud: Model::A1.baud(), beams: 2_048 },
-        modes: &MODES,
-        can_rest: true,
-        speaks_unasked: false,
-    };
-
-    fn begin(wanted: Wanted, now: Nanos) -> Self {
-        let Wanted { model, mode, beams, most_beams, fixed_rate, listen_only, stop_when_idle } = wanted;
-        let (model, mode) = (model.and_then(Model::named), mode.and_then(Mode::named));
-        let settings = Settings { model, mode, beams, most_beams, fixed_rate, listen_only, stop_when_idle };
-        Session::new(settings, now)
-    }
 
     fn model(&self) -> Option<family::Model> {
         self.model().map(described)
@@ -499,7 +495,7 @@ impl Turning for Session {
         self.beams()
     }
 
-    fn begun(&self) -> Option<Turn<'_>> {
+    fn partial_scan(&self) -> Option<RawScan<'_>> {
         self.begun_turn()
     }
 
@@ -507,11 +503,11 @@ impl Turning for Session {
         self.info().and_then(|info| info.model()).filter(|model| self.is_unexpected(*model)).map(described)
     }
 
-    fn lacks(&self) -> Option<&'static str> {
+    fn missing_setting(&self) -> Option<&'static str> {
         (line::Session::trouble(self) == Some(Trouble::Alike)).then_some("model or mode")
     }
 
-    fn specify(&self, text: &mut dyn fmt::Write) {
+    fn write_details(&self, text: &mut dyn fmt::Write) {
         let _ = self.mode().map_or(Ok(()), |mode| write!(text, " {}", mode.name()));
         if let Some(Info { firmware: (major, minor), .. }) = self.info() {
             let _ = write!(text, " {major}.{minor:02}");
@@ -522,23 +518,45 @@ impl Turning for Session {
         self.scanner_time
     }
 
-    fn doubt(&mut self, reasons: u8) {
+    fn mark_suspect(&mut self, reasons: u8) {
         self.reads.doubt(reasons);
     }
 
-    fn introduction(&self, identity: &mut dyn fmt::Write, health: &mut dyn fmt::Write) -> Option<Condition> {
+    fn introduction(&self) -> Option<Introduction> {
         let info = self.info().filter(|_| self.is_introduced())?;
         let (major, minor) = info.firmware;
-        let _ = write!(identity, "firmware {major}.{minor:02}, hardware {}, number ", info.hardware);
-        let _ = info.serial.iter().try_for_each(|byte| write!(identity, "{byte:02X}"));
-        let Some(said) = self.health() else { return Some(Condition::Unknown) };
-        let _ = write!(health, "{said}");
-        Some(match said {
-            Health::Good => Condition::Good,
-            Health::Warning(_) => Condition::Warning,
-            Health::Error(_) => Condition::Error,
+        let serial: String = info.serial.iter().map(|byte| format!("{byte:02X}")).collect();
+        let identity = format!("firmware {major}.{minor:02}, hardware {}, number {serial}", info.hardware);
+        Some(Introduction {
+            identity,
+            health: self.health().map_or_else(String::new, |health| health.to_string()),
+            condition: match self.health() {
+                None => Condition::Unknown,
+                Some(Health::Good) => Condition::Good,
+                Some(Health::Warning(_)) => Condition::Warning,
+                Some(Health::Error(_)) => Condition::Error,
+            },
         })
     }
+}
+
+/// Models and settings of the family.
+pub const FEATURES: Features = Features {
+    models: &MODELS,
+    // Enough for all models but the S2 and the S3.
+    auto: family::Model { name: "auto", baud: Model::A1.baud(), beams: 2_048 },
+    modes: &MODES,
+    can_rest: true,
+    speaks_unasked: false,
+    has_whole_telegrams: false,
+    contents: Contents::TURNING,
+    max_telegram: stream::LONGEST,
+};
+
+/// Returns the head of a scan on a grid of as many beams as there is space for.
+pub(crate) fn scan_heads(settings: &family::Settings) -> Vec<ScanHead> {
+    let beams = settings.beams.or(settings.max_beams).unwrap_or(FEATURES.auto.beams);
+    vec![ScanHead::turning(Family::Rplidar, beams)]
 }
 
 /// Reason why a session does not stream as it should.

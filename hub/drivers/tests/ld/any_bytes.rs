@@ -1,8 +1,8 @@
 //! Whatever comes down the line: every byte is counted once, and nothing panics.
 
 use scanhub_drivers::ld::packet::{Contents, HEADER, LEN, POINTS};
-use scanhub_drivers::ld::{Heard, Session, Settings};
-use scanhub_drivers::line::{Output, Session as _};
+use scanhub_drivers::ld::{Session, Settings};
+use scanhub_drivers::line::{Event, Output, Protocol as _, Session as _};
 use schema::MILLIS;
 
 /// A packet with a right checksum that says anything.
@@ -37,11 +37,11 @@ fn every_byte_is_counted_once() {
             session.commit(now, bytes.len());
             loop {
                 match session.poll_output() {
-                    Output::Heard(Heard::Packets(received)) => {
+                    Output::Event(Event::Telegram(received)) => {
                         told += received.bytes.len() as u64;
                         assert!(received.bytes.len() % LEN == 0 && received.first <= received.last);
                     }
-                    Output::Heard(Heard::Turn(turn)) => assert!(turn.points.len() >= POINTS),
+                    Output::Event(Event::Scan(turn)) => assert!(turn.points().len() >= POINTS),
                     Output::SetRate(_) => {}
                     Output::Transmit { .. } | Output::SetDtr(_) => panic!("nothing is sent"),
                     Output::Rest(_) | Output::Wait { .. } => break,

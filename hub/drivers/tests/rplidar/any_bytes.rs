@@ -1,7 +1,7 @@
 //! Whatever comes down the line: every byte is counted once, and nothing panics.
 
 use scanhub_drivers::line;
-use scanhub_drivers::line::{Control, Heard, Output, Session as _};
+use scanhub_drivers::line::{Control, Event, Output, Protocol as _, Session as _};
 use scanhub_drivers::rplidar::packet::Kind;
 use scanhub_drivers::rplidar::{Mode, Model, Session, Settings};
 use schema::MILLIS;
@@ -77,7 +77,7 @@ fn every_byte_is_counted_once() {
                 0 => session.control(Control::Pause, now),
                 1 => session.control(Control::Resume, now),
                 2 => session.control(Control::Resync, now),
-                3 => session.followed(now, random.bool()),
+                3 => session.set_has_subscribers(now, random.bool()),
                 4 => session.handle_timeout(now),
                 _ => {}
             }
@@ -91,13 +91,13 @@ fn every_byte_is_counted_once() {
             session.commit(now, len);
             loop {
                 match session.poll_output() {
-                    Output::Heard(Heard::Packets(received)) => {
+                    Output::Event(Event::Telegram(received)) => {
                         told += received.bytes.len() as u64;
                         assert!(received.first <= received.last && received.last <= now);
-                        assert_eq!(received.bytes.len() % received.message.count, 0);
+                        assert_eq!(received.bytes.len() % received.count, 0);
                     }
-                    Output::Heard(Heard::Turn(turn)) => {
-                        assert!(turn.first <= turn.last && line::grid::BEAMS.contains(&turn.beams));
+                    Output::Event(Event::Scan(turn)) => {
+                        assert!(turn.first <= turn.last && line::grid::BEAMS.contains(&turn.beams()));
                         turns += 1;
                     }
                     Output::SetRate(_) => assert!(!settings.fixed_rate && !settings.listen_only),

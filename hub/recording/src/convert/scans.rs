@@ -6,14 +6,12 @@
 
 use std::collections::BTreeMap;
 
-use scanhub_drivers::line::Heard;
-use scanhub_drivers::line::family::Wanted;
+use scanhub_drivers::line::{Event, RawScan, Session as _, suspect};
 use scanhub_drivers::lms::measured::Measured;
 use scanhub_drivers::lms::reply::Reply;
 use scanhub_drivers::lms::telegram::Telegram;
 use scanhub_drivers::lms::variant::{Baud, Mode, Variant};
-use scanhub_drivers::scanner::Turning;
-use scanhub_drivers::{line, scanner};
+use scanhub_drivers::{Session, Settings, features};
 use schema::datagram::Packed;
 use schema::{Failure, Family, Flags, Header, Kind, Nanos, Pose, Quality, Scan, Status, Topic};
 
@@ -161,8 +159,9 @@ impl Sensor {
         }
         match (Measured::decode(telegram), self.mode) {
             (Some(measured), Some(mode)) => {
-                Scan::grow(scan, scanner::len(&measured));
-                scanner::decode(&measured, mode, scan);
+                let raw = measured.scan(mode);
+                Scan::grow(scan, raw.len());
+                raw.write(scan);
             }
             _ => return false,
         }
@@ -173,22 +172,23 @@ impl Sensor {
 /// Turns the packets of a rotating scanner into scans, as the hub does.
 pub(super) struct Turns {
     family: Family,
-    wanted: Wanted,
+    settings: Settings,
     /// The session, and the run of the hub that it belongs to.
-    session: Option<(u64, VirtualTime<scanner::Session>)>,
+    session: Option<(u64, VirtualTime<Session>)>,
     scan: Box<Scan>,
 }
 
 impl Turns {
     /// Starts with the only sensor of `recording`; `None` if it is not a rotating scanner.
     pub(super) fn of(recording: &Recording) -> Result<Option<Turns>, Failure> {
-        let Some(family) = recording.family().filter(|family| *family != Family::Lms) else {
+        let Some(family) = recording.family().filter(|family| !features(*family).has_whole_telegrams) else {
             return Ok(None);
         };
         let model = recording.model()?.map(|model| model.name);
         let (beams, mode) = (recording.beams(), recording.contents().way);
-        let wanted = Wanted { model, mode, beams, fixed_rate: true, listen_only: true, ..Wanted::default() };
-        Ok(Some(Turns { family, wanted, session: None, scan: Box::default() }))
+        let settings =
+            Settings { model, mode, beams, fixed_rate: true, listen_only: true, ..Settings::default() };
+        Ok(Some(Turns { family, settings, session: None, scan: Box::default() }))
     }
 
     /// Takes the packets of a sample with this `header`, and calls `tell` for each scan that they complete, with its header.
@@ -198,35 +198,29 @@ impl Turns {
         packets: &[u8],
         mut tell: impl FnMut(Header, &Scan) -> Result<(), Failure>,
     ) -> Result<(), Failure> {
-        let Turns { family, wanted, session, scan } = self;
+        let Turns { family, settings, session, scan } = self;
         // Another run of the hub has another clock.
         if session.as_ref().is_none_or(|(boot, _)| *boot != header.boot) {
-            let begin = scanner::Session::begin(*family, *wanted, header.stamp_first_ns);
-            *session = begin.map(|begin| (header.boot, VirtualTime::new(begin, header.stamp_first_ns)));
+            let begun = Session::begin(*family, settings, header.stamp_first_ns);
+            *session = Some((header.boot, VirtualTime::new(begun, header.stamp_first_ns)));
         }
         let Some((_, session)) = session else { return Ok(()) };
-        session.session_mut().doubt(header.reasons & !line::suspect::LINE_ERROR);
+        session.session_mut().mark_suspect(header.reasons & !suspect::LINE_ERROR);
         let mut told = Ok(());
-        session.take(header.stamp_last_ns, packets, |heard| {
-            let Heard::Turn(turn) = heard else { return };
-            let turning = Turning {
-                family: *family,
-                points: turn.points,
-                period_ns: turn.period,
-                points_per_second: turn.points_per_second,
-                incomplete: turn.incomplete,
-            };
-            Scan::grow(scan, Turning::len(turn.beams));
-            turning.decode(turn.beams, scan);
-            let quality = if turn.reasons == 0 { Quality::Clean } else { Quality::Suspect };
+        session.take(header.stamp_last_ns, packets, |event| {
+            let Event::Scan(raw) = event else { return };
+            Scan::grow(scan, raw.len());
+            raw.write(scan);
+            let RawScan { first, last, period, reasons, .. } = raw;
+            let quality = if reasons == 0 { Quality::Clean } else { Quality::Suspect };
             let wall_ns = |stamp: Nanos| (header.wall_ns + stamp).saturating_sub(header.stamp_first_ns);
             let header = Header {
-                stamp_first_ns: turn.first,
-                stamp_last_ns: turn.last,
-                wall_ns: wall_ns(turn.first),
-                period_us: u32::try_from(turn.period / schema::MICROS).unwrap_or(u32::MAX),
+                stamp_first_ns: first,
+                stamp_last_ns: last,
+                wall_ns: wall_ns(first),
+                period_us: u32::try_from(period / schema::MICROS).unwrap_or(u32::MAX),
                 quality: quality as u8,
-                reasons: turn.reasons,
+                reasons,
                 hub_time: [0; 3],
                 ..*header
             };

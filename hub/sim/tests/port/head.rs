@@ -4,8 +4,8 @@ use std::time::{Duration, Instant};
 
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use scanhub_drivers::ld::packet::LEN;
-use scanhub_drivers::ld::{Heard, Model, Session, Settings};
-use scanhub_drivers::line::{Output, Session as _, State};
+use scanhub_drivers::ld::{Model, Session, Settings};
+use scanhub_drivers::line::{Event, Output, Protocol as _, Session as _, State};
 use scanhub_drivers::lms;
 use schema::{Failure, Nanos};
 use sim::fault::Faults;
@@ -26,10 +26,10 @@ fn hear(session: &mut Session, host: &Host, turns: usize) -> Vec<[u8; LEN]> {
         let (until, flags) = loop {
             match session.poll_output() {
                 Output::SetRate(rate) => host.set_rate(rate),
-                Output::Heard(Heard::Packets(received)) => {
+                Output::Event(Event::Telegram(received)) => {
                     packets.extend(received.bytes.as_chunks::<LEN>().0)
                 }
-                Output::Heard(Heard::Turn(turn)) => {
+                Output::Event(Event::Scan(turn)) => {
                     told += 1;
                     assert!(turn.first < turn.last && turn.last < now_ns());
                 }

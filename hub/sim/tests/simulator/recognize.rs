@@ -2,7 +2,7 @@
 //! on a line that loses bytes.
 
 use scanhub_drivers::lms::variant::{Baud, Variant};
-use scanhub_drivers::scanner::recognize::{EXAMINED, family_of};
+use scanhub_drivers::recognize::{EXAMINED, family_of};
 use schema::{Family, MILLIS, Nanos};
 use sim::device::Device;
 use sim::fault::Faults;

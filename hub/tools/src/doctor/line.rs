@@ -277,7 +277,7 @@ fn rate(subject: &Subject, port: &Port, first: Baud, found: Option<u32>) -> Find
             let state = if found.is_some() { "in use" } else { "possible" };
             Finding::ok(NAME, format!("{wanted} Bd is {state}{near}"))
         }
-        (Err(error), Some(link)) if link.scanner != config::Scanner::Lms => Finding::failed(
+        (Err(error), Some(link)) if !link.scanner.features().models.is_empty() => Finding::failed(
             NAME,
             error.to_string(),
             "use an adapter that can set it: with a CP2102N, FT232R or newer",

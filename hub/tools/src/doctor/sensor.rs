@@ -1,14 +1,13 @@
 //! Checks whether the scanner at a port has the configured settings, and is healthy. An LMS comes first, then a link of
 //! the hub, and last a rotating scanner. `probe` sends the requests.
 
-use config::{Link, Scanner};
-use scanhub_drivers::line::family::Condition as ReportedHealth;
+use config::Link;
+use scanhub_drivers::line::{Condition as ReportedHealth, Introduction};
 use scanhub_drivers::lms::condition::{Condition, Severity};
 use scanhub_drivers::lms::errors::Fault;
 use scanhub_drivers::lms::family::Family;
 use scanhub_drivers::lms::inquiry::Report;
-use scanhub_drivers::lms::variant::{Unit, Variant};
-use scanhub_drivers::scanner::Introduction;
+use scanhub_drivers::lms::variant::Variant;
 use schema::{State, Status};
 
 use super::Finding;
@@ -103,22 +102,26 @@ fn settings(port: &str, report: &Report, link: Option<&Link>) -> Vec<Finding> {
     );
     let mut wrong = Vec::new();
     let family = report.kind().and_then(Family::of_type);
-    if let Some((expected, is)) = link.and_then(|link| link.family).zip(family)
-        && expected != is
+    let scanner = link.map(|link| &link.scanner);
+    if let Some((expected, is)) = scanner.and_then(|scanner| scanner.expected_type).zip(family)
+        && expected != is.name()
     {
         wrong.push(Finding::warning(
             NAME,
-            format!("the configuration says type {}, it is a {}", expected.name(), is.name()),
+            format!("the configuration says type {expected}, it is a {}", is.name()),
             "correct the type in the configuration, or plug in the other sensor",
         ));
     }
-    if let Some((expected, is)) = link.and_then(|link| link.unit).zip(status.unit())
-        && expected != is
+    if let Some((expected, is)) = scanner.and_then(|scanner| scanner.settings.unit_mm).zip(status.unit())
+        && expected != is.mm()
     {
         wrong.push(Finding::warning(
             NAME,
-            format!("{text}; the configuration says unit {} mm", expected.mm()),
-            format!("scanhub configure {port} unit={}, or correct the configuration", word(expected)),
+            format!("{text}; the configuration says unit {expected} mm"),
+            format!(
+                "scanhub configure {port} unit={}, or correct the configuration",
+                if expected == 1 { "mm" } else { "cm" }
+            ),
         ));
     }
     if wrong.is_empty() {
@@ -194,14 +197,6 @@ fn in_words(variant: Variant) -> String {
     format!("{angle_deg} degrees at {}", f64::from(resolution_cdeg) / 100.0)
 }
 
-fn word(unit: Unit) -> &'static str {
-    match unit {
-        Unit::Cm => "cm",
-        Unit::Mm => "mm",
-        Unit::Dm => "dm",
-    }
-}
-
 /// Operating mode in which the EEPROM can be written.
 const INSTALLATION: u8 = 0x00;
 
@@ -253,9 +248,9 @@ fn model(heard: &DetectedScanner, link: Option<&Link>) -> Finding {
         (Some(_), None) => "a model that is not known here".to_owned(),
     };
     let Some((model, link)) = heard.model.zip(link) else { return Finding::ok(NAME, text) };
-    let Scanner::Turning(turning) = link.scanner else { return Finding::ok(NAME, text) };
-    let (set, name) = (turning.model, &link.name);
-    if set != turning.features.auto && (set.baud, set.beams) != (model.baud, model.beams) {
+    let (set, name) = (link.scanner.model(), &link.name);
+    let is_named = link.scanner.settings.model.is_some();
+    if is_named && (set.baud, set.beams) != (model.baud, model.beams) {
         return Finding::warning(
             NAME,
             format!(
@@ -265,10 +260,10 @@ fn model(heard: &DetectedScanner, link: Option<&Link>) -> Finding {
             format!("--set link.{name}.model={}, or plug in the other scanner", model.name),
         );
     }
-    if turning.is_auto() && link.beams() < model.beams {
+    if link.scanner.is_auto() && link.max_beams() < model.beams {
         return Finding::warning(
             NAME,
-            format!("{text}, and there is room for {} beams", link.beams()),
+            format!("{text}, and there is room for {} beams", link.max_beams()),
             format!("--set link.{name}.model={}, or link.{name}.beams", model.name),
         );
     }
@@ -317,11 +312,11 @@ const MAX_LOSS: u64 = 100;
 
 #[cfg(test)]
 mod tests {
-    use scanhub_drivers::line::Account;
-    use scanhub_drivers::lms::exchange::{Conversation, Output};
+    use scanhub_drivers::Settings;
+    use scanhub_drivers::line::{Account, Output, Protocol as _};
     use scanhub_drivers::lms::status_report::Health;
     use scanhub_drivers::lms::telegram::{Telegram, Writer};
-    use scanhub_drivers::lms::variant::{Baud, Mode};
+    use scanhub_drivers::lms::variant::{Baud, Mode, Unit};
     use scanhub_drivers::lms::{Inquiry, configuration};
 
     use super::*;
@@ -333,11 +328,9 @@ mod tests {
         let (mut now, mut request, mut reply) = (0, Vec::new(), Vec::new());
         loop {
             match inquiry.poll_output() {
-                Output::Done => return inquiry.report().clone(),
-                Output::SetBaud(baud) => panic!("{baud:?}"),
-                Output::Transmit { byte, not_before } => {
+                Output::Transmit { bytes, not_before } => {
                     now = not_before.max(now);
-                    request.push(byte);
+                    request.extend(bytes);
                     inquiry.transmitted(now);
                     if let Some(received) = Telegram::check(&request) {
                         let data: Vec<u8> = match received.command() {
@@ -353,6 +346,9 @@ mod tests {
                     }
                 }
                 Output::Wait { until } => {
+                    if inquiry.is_done() {
+                        return inquiry.report().clone();
+                    }
                     now = until;
                     let bytes = std::mem::take(&mut reply);
                     inquiry.spare()[..bytes.len()].copy_from_slice(&bytes);
@@ -361,6 +357,7 @@ mod tests {
                         inquiry.handle_timeout(now);
                     }
                 }
+                output => panic!("{output:?}"),
             }
         }
     }
@@ -446,13 +443,11 @@ mod tests {
         let link = Link {
             name: "front".into(),
             port: port::Source::Tty("/dev/ttyUSB0".into()),
-            scanner: config::Scanner::Lms,
-            family: Some(Family::Lms291),
-            variant: Variant::HALF,
-            unit: Some(Unit::Cm),
-            mode: None,
-            baud: Baud::B500000,
-            is_baud_set: false,
+            scanner: config::Scanner {
+                family: schema::Family::Lms,
+                expected_type: Some("lms291"),
+                settings: Settings { unit_mm: Some(10), ..Settings::default() },
+            },
             processing: Default::default(),
         };
         let judged = |link| settings("/dev/ttyUSB0", &report(healthy(), 0x10, &[]), link);

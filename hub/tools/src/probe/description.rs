@@ -3,7 +3,6 @@
 
 use std::fmt;
 
-use scanhub_drivers::line::family::Model;
 use scanhub_drivers::lms::command::Request;
 use scanhub_drivers::lms::condition::Condition;
 use scanhub_drivers::lms::configuration::availability_words;
@@ -11,7 +10,7 @@ use scanhub_drivers::lms::inquiry::Report;
 use scanhub_drivers::lms::operating;
 use scanhub_drivers::lms::reply::Reply;
 use scanhub_drivers::lms::variant::Mode;
-use scanhub_drivers::{lms, scanner};
+use scanhub_drivers::{Model, features, lms};
 use schema::Family;
 use serde::Serialize;
 
@@ -247,7 +246,7 @@ impl Turning {
 
     /// Returns the models that a scanner cannot be distinguished from, unless it has identified itself.
     fn alike(&self) -> String {
-        let features = Family::parse(self.family).and_then(scanner::features);
+        let features = Family::parse(self.family).map(features);
         let models = features.map_or(&[][..], |features| features.models);
         let found = models.iter().find(|model| Some(model.name) == self.model);
         let Some(found) = found.filter(|_| self.identity.is_none()) else { return String::new() };

@@ -115,9 +115,9 @@ const NAME: &str = "front";
 #[cfg(test)]
 mod tests {
     use super::*;
-    use config::{Config, Link, Scanner, Sources};
+    use config::{Config, Link, Sources};
+    use scanhub_drivers::features;
     use scanhub_drivers::lms::inquiry::Inquiry;
-    use scanhub_drivers::scanner::features;
 
     fn link(port: &str, settings: &[(&'static str, &str)]) -> SuggestedLink {
         let settings = settings.iter().map(|(key, value)| (*key, (*value).to_owned())).collect();
@@ -141,11 +141,10 @@ mod tests {
     #[test]
     fn every_suggestion_is_a_valid_link() {
         for family in Family::ALL {
-            let models = features(family).map(|features| features.models).unwrap_or_default();
+            let models = features(family).models;
             for model in models {
                 let link = loaded(&link("/dev/x", &[("family", family.name()), ("model", model.name)]));
-                let Scanner::Turning(turning) = link.scanner else { panic!("{link:?}") };
-                assert_eq!((turning.family, turning.model.name), (family, model.name));
+                assert_eq!((link.family(), link.scanner.model().name), (family, model.name));
             }
             assert_eq!(loaded(&link("/dev/x", &[("family", family.name())])).family(), family);
         }
@@ -154,8 +153,8 @@ mod tests {
                 link("tcp:[::1]:4001", &[("family", "lms"), ("type", kind.name()), ("baud", "38400")]);
             let link = loaded(&suggested);
             assert_eq!(
-                (link.family, link.baud, link.port.name()),
-                (Some(kind), Baud::B38400, suggested.port)
+                (link.scanner.expected_type, link.rate(), link.port.name()),
+                (Some(kind.name()), 38_400, suggested.port)
             );
         }
         for port in ["/dev/serial/by-id/usb-a_b\\x20c#1,2-if00", "/dev/it's \"one\"", "/dev/a,b c"] {

@@ -2,8 +2,10 @@
 //! are known once the next one came, and only if nothing was between.
 
 use crate::line;
-use crate::line::{Closed, Flow, Pace, Packets, Received, SensorClock, State, Turn, Turns};
-use schema::{MILLIS, Nanos, line_time};
+use crate::line::{
+    Closed, Flow, Pace, RawScan, Received, SensorClock, State, Turns, Values, revolution_head,
+};
+use schema::{Family, MILLIS, Nanos, line_time};
 
 use super::dialogue::Ask;
 use super::{MOST_POINTS, Phase, SILENCE, Session};
@@ -86,7 +88,7 @@ impl Session {
     }
 
     /// Packets came: dates them, and remembers them for turns. Those behind a gap come once more, by themselves.
-    pub(super) fn receive(&mut self, kind: Kind, mut span: Span) -> Received<'_, Packets> {
+    pub(super) fn receive(&mut self, kind: Kind, mut span: Span) -> Received<'_> {
         self.hear();
         span.reasons |= self.reads.take_doubt(span.offset + span.len as u64);
         if self.settings.listen_only || self.point_ns.is_none() || self.measure.is_some() {
@@ -176,11 +178,14 @@ impl Session {
         let last = self.reads.date_packet((last + packet_time).clamp(first, self.now.max(first)));
         Received {
             bytes: self.framer.bytes(span),
-            message: Packets { count: span.packets, is_checked: kind.is_checked(), is_reply: false },
             first,
             last,
             estimated: stamps.is_none(),
             reasons: span.reasons,
+            count: span.packets,
+            is_checked: kind.is_checked(),
+            is_reply: false,
+            whole: None,
         }
     }
 
@@ -262,7 +267,7 @@ impl Session {
             (Some(model), Some(_)) => model.beams_of((1e9 / point_ns) as f32),
             (None, _) => (points_per_turn + 0.5) as usize,
         };
-        let most = self.settings.most_beams.unwrap_or(*line::grid::BEAMS.end());
+        let most = self.settings.max_beams.unwrap_or(*line::grid::BEAMS.end());
         let beams =
             self.settings.beams.or(self.beams).unwrap_or(own.max(*line::grid::BEAMS.start())).min(most);
         (self.beams, self.is_learned) = (Some(beams), true);
@@ -327,7 +332,7 @@ impl Session {
         Some(Pace { step: advance / kind.points() as f64, point_ns })
     }
 
-    pub(super) fn show(&mut self, closed: Closed) -> Turn<'_> {
+    pub(super) fn show(&mut self, closed: Closed) -> RawScan<'_> {
         let first = self.dated(closed).first;
         self.reads.end_turn(first);
         self.trouble = None;
@@ -339,25 +344,26 @@ impl Session {
     }
 
     /// The turn that is being measured, as if it ended with the points that are known.
-    pub(crate) fn begun_turn(&self) -> Option<Turn<'_>> {
+    pub(crate) fn begun_turn(&self) -> Option<RawScan<'_>> {
         let pace = self.framer.kind().and_then(|kind| self.pace(kind))?;
         self.turns.begun(pace).map(|begun| self.dated(begun))
     }
 
     /// A turn that is over, or that is being measured, by the hub's clock.
-    fn dated(&self, closed: Closed) -> Turn<'_> {
+    fn dated(&self, closed: Closed) -> RawScan<'_> {
         let stamp = |at: Nanos| self.clock.time(at).unwrap_or(self.now);
         let (first, last) = self.reads.turn_dates(stamp(closed.first), stamp(closed.last));
-        Turn {
+        let (beams, per_second) =
+            (self.beams.unwrap_or_default(), self.points_per_second().unwrap_or_default());
+        RawScan {
             number: closed.number,
-            points: self.turns.points(&closed),
             first,
             last,
             period: closed.period,
-            beams: self.beams.unwrap_or_default(),
-            points_per_second: self.points_per_second().unwrap_or_default(),
-            incomplete: closed.incomplete,
             reasons: closed.reasons,
+            bytes: 0,
+            head: revolution_head(Family::Rplidar, beams, closed.period, per_second, closed.incomplete),
+            values: Values::Points { points: self.turns.points(&closed), per_second },
         }
     }
 }
@@ -383,4 +389,4 @@ const LATE: f64 = 15e6;
 const SPIN_UP: Nanos = 3_000 * MILLIS;
 /// Packets of one sample at the most, and its bytes.
 pub(super) const MOST: usize = 128;
-const LONGEST: usize = 800;
+pub(super) const LONGEST: usize = 800;

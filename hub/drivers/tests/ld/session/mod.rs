@@ -4,9 +4,9 @@ mod head;
 
 use head::{Damage, Head};
 use scanhub_drivers::ld::packet::LEN;
-use scanhub_drivers::ld::{Heard, Model, Session, Settings, Trouble};
+use scanhub_drivers::ld::{Model, Session, Settings, Trouble};
 use scanhub_drivers::line::grid::Grid;
-use scanhub_drivers::line::{Control, Output, Session as _, State};
+use scanhub_drivers::line::{Control, Event, Output, Protocol as _, Session as _, State};
 use schema::{MILLIS, Nanos};
 
 /// A turn as it was handed out.
@@ -89,7 +89,7 @@ impl Bench {
                     return (Some(until), until);
                 }
                 Output::Wait { until, .. } => return (None, until),
-                Output::Heard(Heard::Packets(received)) => {
+                Output::Event(Event::Telegram(received)) => {
                     assert!(received.first <= received.last && received.last <= self.now);
                     assert!(received.last - received.first <= 10 * MILLIS);
                     let (packets, rest) = received.bytes.as_chunks::<LEN>();
@@ -97,20 +97,20 @@ impl Bench {
                     self.log.most = self.log.most.max(packets.len());
                     self.log.packets.extend(packets);
                 }
-                Output::Heard(Heard::Turn(turn)) => {
+                Output::Event(Event::Scan(turn)) => {
                     let head = &self.head;
                     let rate = u64::from(head.model.points_per_second());
                     let about = turn.first.saturating_sub(head.zero) * rate / 1_000_000_000;
                     let points: Vec<u64> =
-                        turn.points.iter().map(|point| Head::point_of(point.range, about)).collect();
-                    let wrong = turn.points.iter().zip(&points).filter(|(told, point)| {
+                        turn.points().iter().map(|point| Head::point_of(point.range, about)).collect();
+                    let wrong = turn.points().iter().zip(&points).filter(|(told, point)| {
                         let right = head.angle(**point) % 36_000.0;
                         let off = (-f64::from(told.angle).to_degrees() * 100.0 - right).rem_euclid(36_000.0);
                         // The packet's own angles are cut off to a hundredth.
                         off.min(36_000.0 - off) > 2.0
                     });
                     let wrong = wrong.count();
-                    let (first, period, incomplete) = (turn.first, turn.period, turn.incomplete);
+                    let (first, period, incomplete) = (turn.first, turn.period, turn.is_incomplete());
                     self.log.turns.push(Told { points, wrong, first, period, incomplete });
                 }
             }
@@ -151,7 +151,7 @@ impl Bench {
 }
 
 const AUTO: Settings =
-    Settings { model: None, beams: None, most_beams: None, fixed_rate: false, listen_only: false };
+    Settings { model: None, beams: None, max_beams: None, fixed_rate: false, listen_only: false };
 
 fn of(model: Model) -> Settings {
     Settings { model: Some(model), ..AUTO }
@@ -368,7 +368,7 @@ fn a_turn_goes_on_a_grid_of_constant_beams() {
     let grid = Grid::new(bench.session.beams().expect("known"));
     loop {
         let output = bench.session.poll_output();
-        let Output::Heard(Heard::Turn(turn)) = output else {
+        let Output::Event(Event::Scan(turn)) = output else {
             let is_wait = matches!(output, Output::Wait { .. } | Output::Rest(_));
             if is_wait {
                 bench.now += MILLIS;
@@ -378,7 +378,7 @@ fn a_turn_goes_on_a_grid_of_constant_beams() {
         };
         let beams = grid.beams();
         let (mut ranges, mut intensities, mut angles) = (vec![0; beams], vec![0; beams], vec![0.0; beams]);
-        let placed = grid.fill(turn.points, &mut ranges, &mut intensities, &mut angles);
+        let placed = grid.fill(turn.points(), &mut ranges, &mut intensities, &mut angles);
         assert!(placed.not_measured < 3 && placed.collapsed < 3, "{placed:?}");
         for (beam, angle) in angles.iter().enumerate().filter(|(_, angle)| !angle.is_nan()) {
             let off = (f64::from(*angle) - beam as f64 * grid.step()).rem_euclid(std::f64::consts::TAU);

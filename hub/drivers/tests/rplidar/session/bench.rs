@@ -1,7 +1,7 @@
 //! A session and a head with the line between them, in virtual time, and what is to hold whatever happens.
 
 use scanhub_drivers::line;
-use scanhub_drivers::line::{Heard, Output, Session as _};
+use scanhub_drivers::line::{Event, Output, Protocol as _, Session as _};
 use scanhub_drivers::rplidar::packet::Kind;
 use scanhub_drivers::rplidar::{Session, Settings};
 use schema::{MILLIS, Nanos};
@@ -107,9 +107,11 @@ impl Bench {
                     self.head.dtr = on;
                     self.log.dtr.push(on);
                 }
-                Output::Transmit { byte, not_before } => {
+                Output::Transmit { bytes, not_before } => {
                     self.now = self.now.max(not_before);
-                    self.head.write(byte, self.session.rate(), self.now);
+                    let bytes = bytes.to_vec();
+                    let rate = self.session.rate();
+                    bytes.into_iter().for_each(|byte| self.head.write(byte, rate, self.now));
                     self.session.transmitted(self.now);
                 }
                 Output::Rest(until) => {
@@ -117,7 +119,7 @@ impl Bench {
                     return (until, false);
                 }
                 Output::Wait { until, .. } => return (until, true),
-                Output::Heard(Heard::Packets(received)) => {
+                Output::Event(Event::Telegram(received)) => {
                     assert!(received.first <= received.last && received.last <= self.now, "{received:?}");
                     self.log.heard.push(Kept {
                         first: received.first,
@@ -125,25 +127,25 @@ impl Bench {
                         bytes: received.bytes.to_vec(),
                         reasons: received.reasons,
                     });
-                    if received.message.is_reply {
+                    if received.is_reply {
                         self.log.replies += 1;
                         continue;
                     }
                     assert!(received.last - received.first <= 12 * MILLIS, "{received:?}");
-                    let len = received.bytes.len() / received.message.count;
-                    assert_eq!(received.message.is_checked, len > 5);
+                    let len = received.bytes.len() / received.count;
+                    assert_eq!(received.is_checked, len > 5);
                     self.log.packets.extend(received.bytes.chunks_exact(len).map(<[u8]>::to_vec));
                 }
-                Output::Heard(Heard::Turn(turn)) => {
-                    let points = turn.points.iter();
+                Output::Event(Event::Scan(turn)) => {
+                    let points = turn.points().iter();
                     self.log.turns.push(Told {
                         points: points
                             .map(|point| (-f64::from(point.angle).to_degrees(), point.range))
                             .collect(),
                         first: turn.first,
-                        incomplete: turn.incomplete,
+                        incomplete: turn.is_incomplete(),
                         reasons: turn.reasons,
-                        beams: turn.beams,
+                        beams: turn.beams(),
                     });
                 }
             }

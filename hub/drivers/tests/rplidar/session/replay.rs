@@ -1,7 +1,6 @@
 //! A session of a recording, at whose other end nobody is: it hears what another session handed out.
 
-use scanhub_drivers::line::family::Turning as _;
-use scanhub_drivers::line::{Heard, Output, Session as _, Turn};
+use scanhub_drivers::line::{Event, Output, Protocol as _, RawScan, Session as _};
 use scanhub_drivers::rplidar::{Mode, Model, Session, Settings, Trouble};
 use schema::{MILLIS, Nanos};
 
@@ -25,13 +24,13 @@ fn replay(settings: Settings, heard: &[Kept]) -> (Session, Vec<Seen>) {
     let mut session = Session::new(settings, heard[0].first);
     let mut turns = Vec::new();
     for Kept { last, bytes, reasons, .. } in heard {
-        session.doubt(*reasons);
+        session.mark_suspect(*reasons);
         session.spare()[..bytes.len()].copy_from_slice(bytes);
         session.commit(*last, bytes.len());
         loop {
             match session.poll_output() {
-                Output::Heard(Heard::Turn(turn)) => turns.push(seen(&turn)),
-                Output::Heard(Heard::Packets(_)) => {}
+                Output::Event(Event::Scan(turn)) => turns.push(seen(&turn)),
+                Output::Event(Event::Telegram(_)) => {}
                 Output::Rest(_) | Output::Wait { .. } => break,
                 output => panic!("{output:?}"),
             }
@@ -40,8 +39,13 @@ fn replay(settings: Settings, heard: &[Kept]) -> (Session, Vec<Seen>) {
     (session, turns)
 }
 
-fn seen(turn: &Turn<'_>) -> Seen {
-    Seen { first: turn.first, points: turn.points.len(), beams: turn.beams, incomplete: turn.incomplete }
+fn seen(turn: &RawScan<'_>) -> Seen {
+    Seen {
+        first: turn.first,
+        points: turn.points().len(),
+        beams: turn.beams(),
+        incomplete: turn.is_incomplete(),
+    }
 }
 
 const MODES: [(Model, Mode); 7] = [

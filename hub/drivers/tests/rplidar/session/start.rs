@@ -1,7 +1,6 @@
 //! How a session finds its scanner and gets it to measure, from whatever it was doing.
 
-use scanhub_drivers::line::family::Turning as _;
-use scanhub_drivers::line::{Control, Heard, Output, Session as _, State};
+use scanhub_drivers::line::{Control, Event, Output, Protocol as _, Session as _, State};
 use scanhub_drivers::rplidar::packet::Kind;
 use scanhub_drivers::rplidar::{Health, Mode, Model, Session, Settings, Trouble};
 use schema::MILLIS;
@@ -185,7 +184,7 @@ fn what_it_is_is_told_also_where_something_else_was_expected() {
         let mut bench = Bench::new(settings, Head::new(model, 1));
         bench.until(3 * SECOND, is_streaming);
         let mut kind = String::new();
-        bench.session.specify(&mut kind);
+        bench.session.write_details(&mut kind);
         (kind, bench.session.other_model().map(|model| model.name))
     };
     assert_eq!(told(Settings::default(), Model::A1), (" boost 1.29".to_owned(), None));
@@ -232,7 +231,7 @@ fn the_motor_rests_while_nobody_follows_if_it_shall() {
         let settings = Settings { stop_when_idle, ..of(Model::A1) };
         let mut bench = Bench::new(settings, Head::new(Model::A1, 1));
         bench.until(3 * SECOND, is_streaming);
-        bench.session.followed(bench.now, false);
+        bench.session.set_has_subscribers(bench.now, false);
         bench.run(bench.now + 2 * SECOND);
         assert_eq!(bench.session.state(), State::Streaming, "not at once");
         bench.run(bench.now + 5 * SECOND);
@@ -240,7 +239,7 @@ fn the_motor_rests_while_nobody_follows_if_it_shall() {
         assert_eq!(bench.head.dtr, stop_when_idle);
         bench.session.control(Control::Resume, bench.now);
         assert_eq!(bench.head.is_measuring(), !stop_when_idle);
-        bench.session.followed(bench.now, true);
+        bench.session.set_has_subscribers(bench.now, true);
         bench.until(2 * SECOND, is_streaming);
         assert!(!bench.head.dtr);
     }
@@ -400,8 +399,8 @@ fn a_recording_is_read_and_nothing_is_said() {
                 rest = &rest[len..];
                 loop {
                     match session.poll_output() {
-                        Output::Heard(Heard::Turn(_)) => turns += 1,
-                        Output::Heard(_) => {}
+                        Output::Event(Event::Scan(_)) => turns += 1,
+                        Output::Event(_) => {}
                         Output::Rest(_) | Output::Wait { .. } => break,
                         output => panic!("{output:?}"),
                     }

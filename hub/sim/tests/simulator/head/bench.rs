@@ -2,10 +2,10 @@
 //! measured.
 
 use scanhub_drivers::ld::packet::LEN;
-use scanhub_drivers::ld::{Heard, Session, Settings};
+use scanhub_drivers::ld::{Session, Settings};
 use scanhub_drivers::line;
 use scanhub_drivers::line::grid::Point;
-use scanhub_drivers::line::{Output, Session as _};
+use scanhub_drivers::line::{Event, Output, Protocol as _, Session as _};
 use schema::{MILLIS, Nanos};
 use sim::device::{Device as _, Part};
 use sim::fault::Faults;
@@ -122,16 +122,16 @@ impl Bench {
     fn drain(&mut self) -> (Nanos, bool) {
         loop {
             match self.session.poll_output() {
-                Output::Heard(Heard::Packets(received)) => {
+                Output::Event(Event::Telegram(received)) => {
                     assert!(received.last <= self.now);
                     self.packets.extend(received.bytes.as_chunks().0);
                     self.stamps.push(received.first);
                 }
-                Output::Heard(Heard::Turn(turn)) => self.turns.push(Turn {
-                    points: turn.points.to_vec(),
+                Output::Event(Event::Scan(turn)) => self.turns.push(Turn {
+                    points: turn.points().to_vec(),
                     first: turn.first,
-                    incomplete: turn.incomplete,
-                    beams: turn.beams,
+                    incomplete: turn.is_incomplete(),
+                    beams: turn.beams(),
                 }),
                 Output::SetRate(_) => self.inbox.clear(),
                 Output::Rest(until) => return (until, false),

@@ -2,9 +2,9 @@
 //! not to be.
 
 use lms_configure::{Change, Consent, OwnedConfiguration, Plan};
+use scanhub_drivers::line::{Output, Protocol};
 use scanhub_drivers::lms::Inquiry;
 use scanhub_drivers::lms::configuration::factory;
-use scanhub_drivers::lms::exchange::{Conversation, Output};
 use scanhub_drivers::lms::framer::Tally;
 use scanhub_drivers::lms::parameters::Password;
 use scanhub_drivers::lms::telegram::{FRAME, Telegram, Writer};
@@ -12,14 +12,14 @@ use scanhub_drivers::lms::variant::{Baud, Mode, Unit};
 use schema::{MILLIS, Nanos};
 
 /// Drives `talk` until it is over, by what comes to mind; returns the telegrams that it said.
-fn drive<C: Conversation>(talk: &mut C, seed: u64) -> Vec<Vec<u8>> {
+fn drive<C: Protocol>(talk: &mut C, seed: u64) -> Vec<Vec<u8>> {
     let mut random = fastrand::Rng::with_seed(seed);
     let (mut now, mut said, mut request): (Nanos, Vec<Vec<u8>>, Vec<u8>) = (0, Vec::new(), Vec::new());
     for _ in 0..200_000 {
         match talk.poll_output() {
-            Output::Done => return said,
-            Output::SetBaud(_) => request.clear(),
-            Output::Transmit { byte, not_before } => {
+            Output::SetRate(_) => request.clear(),
+            Output::Transmit { bytes, not_before } => {
+                let &[byte] = bytes else { panic!("no gaps between {bytes:?}") };
                 now = now.max(not_before) + if random.u8(..100) == 0 { 20 * MILLIS } else { 0 };
                 if talk.restart_if_late(now) {
                     request.clear();
@@ -34,6 +34,9 @@ fn drive<C: Conversation>(talk: &mut C, seed: u64) -> Vec<Vec<u8>> {
                 talk.transmitted(now);
             }
             Output::Wait { until } => {
+                if talk.is_done() {
+                    return said;
+                }
                 let asked = said.last().map(|telegram| telegram[4]);
                 let bytes = anything(asked, &mut random);
                 let is_early = random.u8(..3) == 0;
@@ -50,6 +53,7 @@ fn drive<C: Conversation>(talk: &mut C, seed: u64) -> Vec<Vec<u8>> {
                     talk.handle_timeout(now);
                 }
             }
+            output => panic!("{output:?}"),
         }
     }
     panic!("no end, seed {seed}");

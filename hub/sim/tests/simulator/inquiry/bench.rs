@@ -3,8 +3,8 @@
 
 use std::collections::VecDeque;
 
+use scanhub_drivers::line::{Output, Protocol};
 use scanhub_drivers::lms::command::Request;
-use scanhub_drivers::lms::exchange::{Conversation, Output};
 use scanhub_drivers::lms::telegram::{Encoded, FRAME};
 use scanhub_drivers::lms::variant::Baud;
 use schema::{MICROS, MILLIS, Nanos, line_time};
@@ -65,7 +65,7 @@ pub(crate) fn make_stream(machine: &mut Machine) -> Nanos {
     say(machine, &Request::Stream.encode(0))
 }
 
-impl<C: Conversation> Bench<C> {
+impl<C: Protocol> Bench<C> {
     /// The conversation begins at `now` of the machine's time, at a port with the rate `port`.
     pub(crate) fn new(talk: C, port: Baud, machine: Machine, now: Nanos) -> Self {
         Bench {
@@ -122,13 +122,16 @@ impl<C: Conversation> Bench<C> {
     fn drain(&mut self) -> Option<Nanos> {
         loop {
             match self.talk.poll_output() {
-                Output::SetBaud(baud) => {
-                    self.port = baud;
+                Output::SetRate(rate) => {
+                    self.port = Baud::of_rate(rate).expect("a rate of an LMS");
                     self.inbox.clear();
                 }
-                Output::Transmit { byte, not_before } => self.transmit(byte, not_before),
-                Output::Wait { until } => return Some(until),
-                Output::Done => return None,
+                Output::Transmit { bytes, not_before } => {
+                    let &[byte] = bytes else { panic!("no gaps between {bytes:?}") };
+                    self.transmit(byte, not_before);
+                }
+                Output::Wait { until } => return (!self.talk.is_done()).then_some(until),
+                output => panic!("{output:?}"),
             }
         }
     }

@@ -100,9 +100,12 @@ impl<S: line::Session> Host for Named<S> {
             return match self.0.poll_output() {
                 line::Output::SetRate(rate) => Event::SetRate(rate),
                 line::Output::SetDtr(_) => continue,
-                line::Output::Transmit { byte, not_before } => Event::Transmit(byte, not_before),
+                line::Output::Transmit { bytes, not_before } => {
+                    let &[byte] = bytes else { panic!("more than a byte: {bytes:?}") };
+                    Event::Transmit(byte, not_before)
+                }
                 line::Output::Wait { until } | line::Output::Rest(until) => Event::Wait(until),
-                line::Output::Heard(_) => Event::Done(()),
+                line::Output::Event(_) => Event::Done(()),
             };
         }
     }

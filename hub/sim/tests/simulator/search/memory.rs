@@ -1,5 +1,6 @@
 //! A remembered scanner is found nearly as soon as by a session of its family, and another one is still found.
 
+use scanhub_drivers::line::{KnownRate, Session as _};
 use scanhub_drivers::lms::variant::{Baud, Variant};
 use scanhub_drivers::search::{Memory, PortKind};
 use scanhub_drivers::{ld, lms, rplidar};
@@ -42,10 +43,11 @@ fn finds_a_remembered_lms_soon() {
                 listen_only: false,
                 fixed_rate: false,
                 keep_baud: false,
+                mode: None,
             };
             let begin = |now| {
                 let mut session = lms::Session::new(settings, now);
-                session.seek_first(first);
+                session.hint_rate(KnownRate { baud: first.rate(), silent_switches: 0 });
                 session
             };
             Bench::named(begin, device, seed)

@@ -56,7 +56,7 @@ fn what_comes_at_another_rate_gives_no_scans() {
     let mut machine = sensor(Baud::B9600);
     let begun = make_stream(&mut machine);
     let mut bench = Bench::new(machine, begun);
-    bench.session.seek_first(WANTED.baud);
+    bench.seek_first(WANTED.baud);
     // It is asked at the wanted rate and at its own, tells its status, and is deaf from then on: it cannot be stopped.
     let asked = 2 * Request::Status.encode(0).bytes().len();
     bench.to_sensor = Box::new(move |number, byte| (number < asked).then_some(byte));
@@ -66,12 +66,12 @@ fn what_comes_at_another_rate_gives_no_scans() {
         bench.stop(1_700 * MILLIS);
     }
     assert!(bench.session.sensor().mode.is_some() && bench.received_scans(begun).len() > 20, "{bench}");
-    assert!(bench.received.iter().all(|received| received.mode.is_none()), "{bench}");
+    assert!(bench.received.iter().all(|received| received.range_bits.is_none()), "{bench}");
     assert!(!bench.states.contains(&State::Streaming), "{bench}");
     bench.to_sensor = Box::new(|_, byte| Some(byte));
     bench.until("streaming", 10_000 * MILLIS, Bench::is_streaming);
     bench.until("scans", 1_000 * MILLIS, |bench| {
-        bench.received.last().is_some_and(|last| last.mode.is_some())
+        bench.received.last().is_some_and(|last| last.range_bits.is_some())
     });
 }
 
@@ -99,10 +99,10 @@ fn what_the_last_session_knew_is_not_waited_for() {
         let known = last.session.identity().expect("it streams");
         let begun = last.now;
         let mut bench = Bench::new(last.machine, begun);
-        bench.session.recall(known);
+        bench.session.restore_identity(known);
         bench.until("a scan", 60 * MILLIS, |bench| !bench.received_scans(0).is_empty());
         bench.run(2_000 * MILLIS);
-        assert!(bench.received.iter().all(|got| got.mode == Some(Mode(1))), "{bench}");
+        assert!(bench.scans(0).all(|got| got.range_bits == Some(13)), "{bench}");
         assert_eq!(bench.states, [State::Probing, State::Streaming], "{bench}");
         assert_eq!(bench.session.sensor().kind(), b"LMS200;301063;V02.30");
         assert_eq!((bench.session.sensor().defective, bench.session.identity()), (Some(false), Some(known)));
@@ -127,20 +127,20 @@ fn what_the_last_session_knew_of_another_one_is_not_believed() {
     let mut other = sensor_with(centimetres);
     let begun = make_stream(&mut other);
     let mut bench = Bench::new(other, begun);
-    bench.session.recall(known);
+    bench.session.restore_identity(known);
     bench.until("its mode", 2_000 * MILLIS, |bench| bench.session.sensor().mode.is_some());
     bench.run(200 * MILLIS);
-    assert!(bench.received.iter().filter_map(|got| got.mode).all(|mode| mode == Mode(4)), "{bench}");
+    assert!(bench.received.iter().filter_map(|got| got.range_bits).all(|bits| bits == 14), "{bench}");
     // They begin in the same way, and mean something else: its status tells.
     let mut other =
         sensor_with(machine::Settings { baud: Baud::B500000, mode: Mode(4), ..machine::Settings::default() });
     let begun = make_stream(&mut other);
     let mut bench = Bench::new(other, begun);
-    bench.session.recall(known);
+    bench.session.restore_identity(known);
     bench.until("its mode", 600 * MILLIS, |bench| bench.session.sensor().mode == Some(Mode(4)));
     // Nobody streams: what was known is not known any more once somebody answers.
     let mut bench = Bench::new(sensor(Baud::B500000), 0);
-    bench.session.recall(known);
+    bench.session.restore_identity(known);
     bench.until("an answer", 4_000 * MILLIS, |bench| !bench.received.is_empty());
     assert_eq!(bench.session.sensor().kind(), b"");
 }
@@ -176,7 +176,7 @@ fn another_one_is_not_taken_for_the_first() {
         let known = bench.session.sensor();
         assert_eq!((known.mode, known.kind()), (Some(Mode(4)), &b"LMS291;S05063;V02.30"[..]), "{bench}");
         let told = bench.received.iter().filter(|got| got.at > since);
-        assert!(told.filter_map(|got| got.mode).all(|mode| mode == Mode(4)), "{bench}");
+        assert!(told.filter_map(|got| got.range_bits).all(|bits| bits == 14), "{bench}");
         assert!(!bench.states.contains(&State::Starting), "it was adopted: {bench}");
     }
 }

@@ -3,13 +3,13 @@
 
 use std::collections::VecDeque;
 
-use scanhub_drivers::line::State;
-use scanhub_drivers::line::{Output, Session as _};
+use scanhub_drivers::line;
+use scanhub_drivers::line::{Event, KnownRate, Output, Protocol as _, Session as _, State, Values};
 use scanhub_drivers::lms;
 use scanhub_drivers::lms::Session;
 use scanhub_drivers::lms::Settings;
 use scanhub_drivers::lms::command::Request;
-use scanhub_drivers::lms::variant::{Baud, Mode, Variant};
+use scanhub_drivers::lms::variant::{Baud, Variant};
 use schema::{MICROS, MILLIS, Nanos, line_time};
 use sim::Arrival;
 use sim::device::{Device as _, Part};
@@ -85,8 +85,8 @@ pub(crate) struct Sent {
 pub(crate) struct Received {
     pub(crate) at: Nanos,
     pub(crate) telegram: Vec<u8>,
-    /// How its values are split, if that was known when it was delivered.
-    pub(crate) mode: Option<Mode>,
+    /// Range bits of its values, if it is a scan whose mode was known when it was delivered.
+    pub(crate) range_bits: Option<u8>,
     /// Why it is suspect; 0 is clean.
     #[allow(dead_code, reason = "for the tests of faults")]
     pub(crate) reasons: u8,
@@ -106,6 +106,7 @@ pub(crate) const WANTED: Settings = Settings {
     listen_only: false,
     fixed_rate: false,
     keep_baud: false,
+    mode: None,
 };
 
 /// A sensor in a room, at this rate.
@@ -168,6 +169,17 @@ impl Bench {
         }
     }
 
+    /// Has the session try `baud` first, as a hub does that has found the sensor there before.
+    pub(crate) fn seek_first(&mut self, baud: Baud) {
+        let silent_switches = self.session.silent_switches();
+        self.session.hint_rate(KnownRate { baud: baud.rate(), silent_switches });
+    }
+
+    /// Returns the rate at which the session has found the sensor.
+    pub(crate) fn found_at(&self) -> Option<Baud> {
+        self.session.known_rate().and_then(|known| Baud::of_rate(known.baud))
+    }
+
     /// A session with a past, none of whose requests is half said, gets this machine.
     pub(crate) fn adopting(session: Session, machine: Machine, now: Nanos) -> Bench {
         let (port, read) = (session.baud(), session.tally().read);
@@ -204,8 +216,13 @@ impl Bench {
 
     /// Scans that were delivered after `since`.
     pub(crate) fn received_scans(&self, since: Nanos) -> Vec<&[u8]> {
-        let is_scan = |got: &&Received| got.at > since && got.telegram[4] == lms::measured::MEASURED;
-        self.received.iter().filter(is_scan).map(|got| &got.telegram[..]).collect()
+        self.scans(since).map(|got| &got.telegram[..]).collect()
+    }
+
+    /// The same, with what the session says of them.
+    pub(crate) fn scans(&self, since: Nanos) -> impl Iterator<Item = &Received> {
+        let is_scan = move |got: &&Received| got.at > since && got.telegram[4] == lms::measured::MEASURED;
+        self.received.iter().filter(is_scan)
     }
 
     /// The host does not run for `span`.
@@ -222,7 +239,7 @@ impl Bench {
             return;
         }
         self.looks += 1;
-        if watch && self.session.may_leave() && self.session.leave(self.now, self.inbox.len()) {
+        if watch && self.session.can_defer_read() && self.session.defer_read(self.now, self.inbox.len()) {
             return;
         }
         let spare = self.session.spare();
@@ -247,14 +264,29 @@ impl Bench {
                     self.damaged |= !self.inbox.is_empty();
                     self.inbox.clear();
                 }
-                Output::Transmit { byte, not_before } => self.transmit(byte, not_before),
-                Output::Heard(received) => {
-                    let telegram = received.message.telegram.bytes().to_vec();
+                Output::Transmit { bytes, not_before } => {
+                    let &[byte] = bytes else { panic!("no gaps between {bytes:?}") };
+                    self.transmit(byte, not_before);
+                }
+                Output::Event(Event::Scan(_)) => panic!("a telegram is a scan"),
+                Output::Event(Event::Telegram(received)) => {
+                    let line::Received { bytes, whole, reasons, first, estimated, .. } = received;
+                    let telegram = bytes.to_vec();
                     let looks = std::mem::take(&mut self.looks);
-                    let lms::session::Received { message, reasons, first, estimated, .. } = received;
-                    let mode = message.mode;
+                    let range_bits = whole.and_then(|whole| match whole.scan?.values {
+                        Values::Words { range_bits, .. } => Some(range_bits),
+                        Values::Points { .. } => None,
+                    });
                     let at = self.now;
-                    self.received.push(Received { at, telegram, mode, reasons, first, estimated, looks });
+                    self.received.push(Received {
+                        at,
+                        telegram,
+                        range_bits,
+                        reasons,
+                        first,
+                        estimated,
+                        looks,
+                    });
                 }
                 Output::Rest(until) => break (false, until),
                 Output::Wait { until, .. } => break (true, until),

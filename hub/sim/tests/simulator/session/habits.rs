@@ -97,7 +97,7 @@ fn a_version_s14_streams_but_nobody_knows_its_angles() {
         bench.run(1_000 * MILLIS);
         assert!(bench.is_streaming() && bench.received_scans(0).len() > 60, "{bench}");
         let mut scans = bench.received.iter().filter(|got| got.telegram[4] == lms::measured::MEASURED);
-        assert!(scans.all(|got| got.mode.is_none()), "{bench}");
+        assert!(scans.all(|got| got.range_bits.is_none()), "{bench}");
         assert_eq!(bench.session.trouble(), Some(Trouble::AnglesUnknown));
     }
 }
@@ -111,7 +111,7 @@ fn a_mode_without_ranges_gives_no_scans() {
         bench.run(1_000 * MILLIS);
         assert!(bench.is_streaming() && bench.received_scans(0).len() > 30, "{bench}");
         let mut scans = bench.received.iter().filter(|got| got.telegram[4] == lms::measured::MEASURED);
-        assert!(scans.all(|got| got.mode.is_none()), "{bench}");
+        assert!(scans.all(|got| got.range_bits.is_none()), "{bench}");
         assert_eq!(bench.session.trouble(), Some(Trouble::NoRanges(Mode(0x3F))));
     }
 }

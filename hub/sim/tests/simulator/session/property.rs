@@ -3,7 +3,7 @@
 
 use lms_configure::eeprom::Write;
 use scanhub_drivers::line::{Control, State};
-use scanhub_drivers::line::{Output, Session as _};
+use scanhub_drivers::line::{Event, Output, Protocol as _, Session as _};
 use scanhub_drivers::lms;
 use scanhub_drivers::lms::Session;
 use scanhub_drivers::lms::Settings;
@@ -74,7 +74,7 @@ impl Chaos {
             bytes = &bytes[len..];
             self.now += self.random.u64(..line_time(len, 9_600));
             if self.random.bool() {
-                self.session.leave(self.now, len);
+                self.session.defer_read(self.now, len);
                 self.drain(false);
             }
             self.read += len as u64;
@@ -87,18 +87,19 @@ impl Chaos {
     fn drain(&mut self, lazy: bool) {
         loop {
             match self.session.poll_output() {
-                Output::Transmit { byte, not_before } => {
+                Output::Transmit { bytes, not_before } => {
                     if lazy && self.random.bool() {
                         break;
                     }
-                    self.said.push(byte);
+                    self.said.extend(bytes);
                     self.now = self.now.max(not_before);
                     self.session.transmitted(self.now);
                 }
                 Output::SetRate(_) => {}
                 Output::SetDtr(_) => panic!("there is nothing at this line"),
-                Output::Heard(received) => {
-                    assert!(Telegram::check(received.message.telegram.bytes()).is_some());
+                Output::Event(Event::Scan(_)) => panic!("a telegram is a scan"),
+                Output::Event(Event::Telegram(received)) => {
+                    assert!(Telegram::check(received.bytes).is_some());
                     self.telegrams += 1;
                 }
                 Output::Rest(_) | Output::Wait { .. } => break,

@@ -65,7 +65,7 @@ fn streams_at_38400_after_exactly_two_switches() {
             bench.run(boot * MILLIS);
             lose(&mut bench);
             assert_eq!((bench.session.silent_switches(), bench.session.trouble()), (2, FALLS_BACK));
-            assert_eq!(bench.session.found_at(), Some(Baud::B38400), "remembered before the scanner is back");
+            assert_eq!(bench.found_at(), Some(Baud::B38400), "remembered before the scanner is back");
             bench.run(20_000 * MILLIS);
             assert_eq!(bench.session.trouble(), FALLS_BACK, "the search reports nothing else");
             cycle_power(&mut bench, 0);
@@ -74,7 +74,7 @@ fn streams_at_38400_after_exactly_two_switches() {
             bench.run(2_000 * MILLIS);
             assert!(bench.is_streaming() && bench.received_scans(0).len() >= 8, "{bench}");
             assert_eq!((bench.session.baud(), bench.machine.baud()), (Baud::B38400, Baud::B38400));
-            assert_eq!((bench.session.trouble(), bench.session.found_at()), (FALLS_BACK, Some(Baud::B38400)));
+            assert_eq!((bench.session.trouble(), bench.found_at()), (FALLS_BACK, Some(Baud::B38400)));
             assert_eq!(count(&bench, Request::Baud(Baud::B500000)), 2, "{bench}");
         }
     }
@@ -86,10 +86,10 @@ fn count_outlives_session_and_next_session_uses_38400_first() {
     lose(&mut bench);
     let counted = bench.session.silent_switches();
     let mut bench = on_rs232(WANTED, Settings::default());
-    bench.session.seek_first(Baud::B9600);
+    bench.seek_first(Baud::B9600);
     bench.session.recall_silent_switches(counted);
     lose(&mut bench);
-    let (rate, counted) = (bench.session.found_at(), bench.session.silent_switches());
+    let (rate, counted) = (bench.found_at(), bench.session.silent_switches());
     assert_eq!((rate, counted), (Some(Baud::B38400), 2));
     // The scanner still streams for the previous hub, is idle at that rate, or has had a power cycle.
     let streaming = || {
@@ -102,13 +102,13 @@ fn count_outlives_session_and_next_session_uses_38400_first() {
     {
         let mut bench = Bench::new(machine, now);
         bench.wire = Wire::new(&Faults { rs232: 1.0, ..Faults::default() }, 0);
-        bench.session.seek_first(Baud::B38400);
+        bench.seek_first(Baud::B38400);
         bench.session.recall_silent_switches(counted);
         bench.until("streaming", within * MILLIS, Bench::is_streaming);
         bench.run(1_000 * MILLIS);
         assert_eq!((bench.session.baud(), bench.session.trouble()), (Baud::B38400, FALLS_BACK), "{bench}");
         assert_eq!(count(&bench, Request::Baud(Baud::B500000)), 0, "{bench}");
-        assert_eq!((bench.session.found_at(), bench.session.silent_switches()), (Some(Baud::B38400), 2));
+        assert_eq!((bench.found_at(), bench.session.silent_switches()), (Some(Baud::B38400), 2));
     }
 }
 
@@ -119,7 +119,7 @@ fn configured_rate_is_kept_and_message_names_rs422() {
     for _ in 0..3 {
         cycle_power(&mut bench, 500 * MILLIS);
         lose(&mut bench);
-        assert_eq!((bench.session.trouble(), bench.session.found_at()), (KEEPS, Some(Baud::B9600)));
+        assert_eq!((bench.session.trouble(), bench.found_at()), (KEEPS, Some(Baud::B9600)));
     }
     // The line was rewired.
     bench.wire = Wire::new(&Faults::default(), 0);
@@ -139,16 +139,16 @@ fn telegram_at_500000_resets_count_and_limit() {
     let mut machine = sensor(Baud::B500000);
     let now = make_stream(&mut machine);
     let mut bench = Bench::new(machine, now);
-    bench.session.seek_first(Baud::B9600);
+    bench.seek_first(Baud::B9600);
     bench.session.recall_silent_switches(1);
     bench.until("streaming", LIMIT, Bench::is_streaming);
-    assert_eq!((bench.session.silent_switches(), bench.session.found_at()), (0, Some(Baud::B9600)));
+    assert_eq!((bench.session.silent_switches(), bench.found_at()), (0, Some(Baud::B9600)));
     // A scanner that answers at 500,000 baud proves that the line was rewired.
     for streams in [false, true] {
         let mut machine = sensor(Baud::B500000);
         let now = if streams { make_stream(&mut machine) } else { 0 };
         let mut bench = Bench::new(machine, now);
-        bench.session.seek_first(Baud::B38400);
+        bench.seek_first(Baud::B38400);
         bench.session.recall_silent_switches(2);
         bench.until("streaming", LIMIT, Bench::is_streaming);
         bench.run(500 * MILLIS);

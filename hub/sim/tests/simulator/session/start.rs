@@ -77,10 +77,10 @@ fn a_sensor_that_just_got_its_power_streams_soon() {
     {
         let settings = Settings { seed, ..prompt(Baud::B9600, Start::In(Operating::OnRequest)) };
         let mut bench = Bench::new(sensor_with(settings), 0);
-        first.into_iter().for_each(|baud| bench.session.seek_first(baud));
+        first.into_iter().for_each(|baud| bench.seek_first(baud));
         let took = bench.until("a scan", within * MILLIS, |bench| !bench.received_scans(0).is_empty());
-        assert_eq!(bench.session.found_at(), Some(Baud::B9600));
-        assert!(bench.received.last().is_some_and(|got| got.mode == Some(Mode(1))), "{took}: {bench}");
+        assert_eq!(bench.found_at(), Some(Baud::B9600));
+        assert!(bench.received.last().is_some_and(|got| got.range_bits == Some(13)), "{took}: {bench}");
         let known = bench.session.sensor();
         assert_eq!((known.kind(), known.unit), (&b"LMS200;301063;V02.30"[..], Some(Unit::Mm)));
         // At 9600 nothing long is said: a type and a change of rate.
@@ -112,18 +112,18 @@ fn where_it_was_the_last_time_is_asked_and_not_believed() {
     for first in Baud::ALL {
         for baud in Baud::ALL {
             let mut bench = Bench::new(sensor_with(prompt(baud, Start::In(Operating::OnRequest))), 0);
-            bench.session.seek_first(first);
+            bench.seek_first(first);
             let took = bench.until("streaming", 1_500 * MILLIS, Bench::is_streaming);
             assert!(first != baud || took < 500 * MILLIS, "{first:?}: {took}");
-            assert_eq!((bench.session.found_at(), bench.session.trouble()), (Some(baud), None));
+            assert_eq!((bench.found_at(), bench.session.trouble()), (Some(baud), None));
             let mut machine = sensor(baud);
             let now = make_stream(&mut machine);
             let mut bench = Bench::new(machine, now);
-            bench.session.seek_first(first);
+            bench.seek_first(first);
             // A stream at the wanted rate is heard before anything is asked.
             let within = if baud == Baud::B500000 { 60 } else { 4_000 };
             bench.until("streaming", within * MILLIS, Bench::is_streaming);
-            assert_eq!(bench.session.found_at().is_none(), baud == Baud::B500000);
+            assert_eq!(bench.found_at().is_none(), baud == Baud::B500000);
         }
     }
 }

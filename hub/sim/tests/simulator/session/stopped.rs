@@ -97,7 +97,7 @@ fn what_waited_while_a_host_between_two_telegrams_was_stopped_is_no_newer_than_i
     let (mut bench, _) = streaming(Baud::B500000, Variant::HALF);
     for _ in 0..20 {
         bench.run(100 * MILLIS);
-        while !bench.session.may_leave() {
+        while !bench.session.can_defer_read() {
             bench.run(MILLIS);
         }
         let stopped = bench.now;

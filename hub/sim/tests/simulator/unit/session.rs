@@ -1,7 +1,7 @@
 //! The hub's session with a scanner of Slamtec: what it makes of the bytes beside what the scanner measured.
 
 use scanhub_drivers::line::grid::NO_RETURN;
-use scanhub_drivers::line::{Heard, Output, Session as _, State};
+use scanhub_drivers::line::{Event, Output, Protocol as _, Session as _, State};
 use scanhub_drivers::rplidar::{Mode, Model as Known, Session, Settings, Trouble};
 use schema::{MILLIS, Nanos, line_time};
 use sim::device::Device as _;
@@ -43,25 +43,27 @@ impl Talk {
                 match self.session.poll_output() {
                     Output::SetRate(_) => self.read = self.bench.line.len(),
                     Output::SetDtr(_) => {}
-                    Output::Transmit { byte, .. } => {
-                        self.bench.pass(line_time(1, self.bench.unit.rate()));
-                        if self.session.rate() == self.bench.unit.rate() {
-                            self.bench.say(byte);
+                    Output::Transmit { bytes, .. } => {
+                        for byte in bytes.to_vec() {
+                            self.bench.pass(line_time(1, self.bench.unit.rate()));
+                            if self.session.rate() == self.bench.unit.rate() {
+                                self.bench.say(byte);
+                            }
                         }
                         self.session.transmitted(self.bench.now);
                     }
-                    Output::Heard(Heard::Turn(turn)) => {
+                    Output::Event(Event::Scan(turn)) => {
                         let degrees = |angle: f32| -f64::from(angle).to_degrees();
                         let range = |range| if range == NO_RETURN { 0 } else { range };
-                        let points = turn.points.iter();
+                        let points = turn.points().iter();
                         self.turns.push(Told {
                             first: turn.first,
                             period: turn.period,
-                            is_marked: turn.incomplete || turn.reasons != 0,
+                            is_marked: turn.is_incomplete() || turn.reasons != 0,
                             points: points.map(|point| (degrees(point.angle), range(point.range))).collect(),
                         });
                     }
-                    Output::Heard(Heard::Packets(_)) => {}
+                    Output::Event(Event::Telegram(_)) => {}
                     Output::Rest(at) => {
                         wakes_at = at;
                         break;

@@ -2,10 +2,9 @@
 
 use schema::{Family, MILLIS, Nanos};
 
-use super::{Session, features};
-use crate::line::family::Wanted;
-use crate::line::{Heard, Output, Session as _};
+use crate::line::{Event, Output, Protocol as _, Session as _};
 use crate::lms::framer::{Framer, VETO_HOLD};
+use crate::{Session, Settings, features};
 
 /// Number of bytes at the beginning of a stream that are examined.
 pub const EXAMINED: usize = 64 * 1024;
@@ -46,15 +45,18 @@ fn accepted(family: Family, bytes: &[u8]) -> usize {
 /// family does not send packets.
 fn packets(family: Family, bytes: &[u8]) -> Option<(usize, Option<&'static str>)> {
     let in_mode = |mode| {
-        let wanted = Wanted { mode, fixed_rate: true, listen_only: true, ..Wanted::default() };
-        Session::begin(family, wanted, 0).map(|session| in_packets(session, bytes))
+        let settings = Settings { mode, fixed_rate: true, listen_only: true, ..Settings::default() };
+        in_packets(Session::begin(family, &settings, 0), bytes)
     };
-    let (len, is_ambiguous) = in_mode(None)?;
+    if features(family).has_whole_telegrams {
+        return None;
+    }
+    let (len, is_ambiguous) = in_mode(None);
     if !is_ambiguous {
         return Some((len, None));
     }
-    let modes = features(family)?.modes.iter().copied();
-    let lengths = modes.filter_map(|mode| Some((in_mode(Some(mode))?.0, Some(mode))));
+    let modes = features(family).modes.iter().copied();
+    let lengths = modes.map(|mode| (in_mode(Some(mode)).0, Some(mode)));
     lengths.max_by_key(|(len, _)| *len).filter(|(best, _)| *best > len).or(Some((len, None)))
 }
 
@@ -81,14 +83,14 @@ fn in_packets(mut session: Session, mut bytes: &[u8]) -> (usize, bool) {
     loop {
         loop {
             match session.poll_output() {
-                Output::Heard(Heard::Packets(received)) => accepted += received.bytes.len(),
+                Output::Event(Event::Telegram(received)) => accepted += received.bytes.len(),
                 Output::Transmit { .. } => session.transmitted(0),
-                Output::Heard(Heard::Turn(_)) | Output::SetRate(_) | Output::SetDtr(_) => {}
+                Output::Event(Event::Scan(_)) | Output::SetRate(_) | Output::SetDtr(_) => {}
                 Output::Rest(_) | Output::Wait { .. } => break,
             }
         }
         if is_ended {
-            return (accepted, session.lacks().is_some());
+            return (accepted, session.missing_setting().is_some());
         }
         let len = fill(session.spare(), &mut bytes);
         session.commit(0, len);

@@ -1,0 +1,165 @@
+//! The list of the families: one [`Session`] for all of them. A caller that supports every family needs nothing else.
+
+use std::fmt;
+
+use crate::line::family::{Features, Model, Settings};
+use crate::line::{
+    self, Account, Control, Identity, Introduction, KnownRate, Notice, Output, RawScan, Received, State,
+};
+use crate::{ld, lms, rplidar};
+use schema::{Counters, Family, Nanos, ScanHead, Status};
+
+/// Declares the families. A line has the name and the module of one.
+macro_rules! families {
+    ($($Family:ident $family:ident,)*) => {
+        /// A session with a scanner of one of the families.
+        #[expect(clippy::large_enum_variant, reason = "there is one per open port")]
+        #[derive(Clone, Debug)]
+        pub enum Session {
+            $(#[doc = concat!("Of family ", stringify!($family), ".")] $Family($family::Session),)*
+        }
+
+        /// Reason why a session does not stream as it should. Its text is the family's.
+        #[derive(Clone, Copy, Debug, PartialEq)]
+        pub enum Trouble {
+            $(#[doc = concat!("Of family ", stringify!($family), ".")] $Family($family::Trouble),)*
+        }
+
+        /// Returns the models and settings of `family`.
+        pub const fn features(family: Family) -> &'static Features {
+            match family { $(Family::$Family => &$family::FEATURES,)* }
+        }
+
+        /// Returns the possible heads of scans of a scanner of `family`, as far as `settings` and the family determine them. They have
+        /// the same number of beams, at most the maximum.
+        pub fn scan_heads(family: Family, settings: &Settings) -> Vec<ScanHead> {
+            match family { $(Family::$Family => $family::scan_heads(settings),)* }
+        }
+
+        impl Session {
+            /// Creates a session with a scanner of `family`, on a port that is open at the rate of `settings`, or else of the model.
+            pub fn begin(family: Family, settings: &Settings, now: Nanos) -> Session {
+                match family { $(Family::$Family => Session::$Family($family::Session::configured(settings, now)),)* }
+            }
+
+            /// Returns the family.
+            pub fn family(&self) -> Family {
+                match self { $(Session::$Family(_) => Family::$Family,)* }
+            }
+        }
+
+        /// Returns the trouble of a session of any family.
+        fn trouble(session: &Session) -> Option<Trouble> {
+            match session { $(Session::$Family(session) => line::Session::trouble(session).map(Trouble::$Family),)* }
+        }
+
+        impl fmt::Display for Trouble {
+            fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+                match self { $(Trouble::$Family(trouble) => trouble.fmt(f),)* }
+            }
+        }
+
+        /// Evaluates an expression with the session of whatever family.
+        macro_rules! each {
+            ($of:expr, $session:ident => $value:expr) => {
+                match $of { $(Session::$Family($session) => $value,)* }
+            };
+        }
+    };
+}
+
+families! {
+    Lms lms,
+    Ld ld,
+    Rplidar rplidar,
+}
+
+impl Session {
+    /// Returns the models and settings of its family.
+    pub fn features(&self) -> &'static Features {
+        features(self.family())
+    }
+}
+
+/// Writes methods that call those of the session inside.
+macro_rules! delegate {
+    ($Trait:ident & $(fn $name:ident($($arg:ident: $Arg:ty),*) $(-> $Ret:ty)?;)*) => {
+        $(fn $name(&self $(, $arg: $Arg)*) $(-> $Ret)? {
+            each!(self, session => line::$Trait::$name(session $(, $arg)*))
+        })*
+    };
+    ($Trait:ident &mut $(fn $name:ident($($arg:ident: $Arg:ty),*) $(-> $Ret:ty)?;)*) => {
+        $(fn $name(&mut self $(, $arg: $Arg)*) $(-> $Ret)? {
+            each!(self, session => line::$Trait::$name(session $(, $arg)*))
+        })*
+    };
+}
+
+impl line::Protocol for Session {
+    delegate! { Protocol &mut
+        fn spare() -> &mut [u8];
+        fn commit(now: Nanos, len: usize);
+        fn handle_timeout(now: Nanos);
+        fn transmitted(now: Nanos);
+        fn poll_output() -> Output<'_>;
+    }
+}
+
+impl line::Session for Session {
+    type Trouble = Trouble;
+
+    fn trouble(&self) -> Option<Trouble> {
+        trouble(self)
+    }
+
+    fn read_recorded<'a>(
+        &mut self,
+        telegram: &'a [u8],
+        is_readable: bool,
+        status: Option<&mut Status>,
+    ) -> Option<Received<'a>> {
+        each!(self, session => line::Session::read_recorded(session, telegram, is_readable, status))
+    }
+
+    delegate! { Session &mut
+        fn control(control: Control, now: Nanos);
+        fn defer_read(now: Nanos, waiting: usize) -> bool;
+        fn set_has_subscribers(now: Nanos, has_subscribers: bool);
+        fn end(now: Nanos) -> bool;
+        fn restore_identity(identity: Identity);
+        fn hint_rate(known: KnownRate);
+        fn set_partial_reads(count: u8);
+        fn mark_suspect(reasons: u8);
+    }
+
+    delegate! { Session &
+        fn state() -> State;
+        fn missing() -> Option<&'static str>;
+        fn rate() -> u32;
+        fn account() -> Account;
+        fn can_defer_read() -> bool;
+        fn identity() -> Option<Identity>;
+        fn known_rate() -> Option<KnownRate>;
+        fn partial_scan() -> Option<RawScan<'_>>;
+        fn model() -> Option<Model>;
+        fn beams() -> Option<usize>;
+        fn other_model() -> Option<Model>;
+        fn unit_mm() -> Option<u8>;
+        fn notice() -> Option<Notice>;
+        fn missing_setting() -> Option<&'static str>;
+        fn write_details(text: &mut dyn fmt::Write);
+        fn introduction() -> Option<Introduction>;
+        fn scanner_time() -> Option<Nanos>;
+        fn describe(status: &mut Status);
+        fn add_counters(counters: &mut Counters);
+    }
+}
+
+const _: () = assert!(lms::telegram::MAX_TELEGRAM == schema::Telegram::MAX);
+const _: () = assert!(
+    line::suspect::LINE_ERROR == schema::Reasons::LINE_ERROR
+        && line::suspect::NEIGHBOUR == schema::Reasons::NEIGHBOUR
+        && line::suspect::SLOW == schema::Reasons::SLOW
+        && line::suspect::FORBIDDEN_BITS == schema::Reasons::FORBIDDEN_BITS
+        && line::suspect::HEADER_INSIDE == schema::Reasons::HEADER_INSIDE
+);
