@@ -12,7 +12,7 @@ pub(crate) fn scan(words: &[u16], unit: Unit) -> Box<Scan> {
     let telegram = measured::encode(0, unit, words, 0x10);
     let measured = Measured::decode(telegram.telegram()).expect("as many words as a variant has");
     let raw = measured.scan(MODE);
-    let mut scan = Scan::zeroed(raw.len());
+    let mut scan = Scan::zeroed(raw.payload_len());
     raw.write(&mut scan);
     scan
 }

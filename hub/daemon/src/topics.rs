@@ -154,7 +154,7 @@ impl<'a, S: Surroundings> Topics<'a, S> {
     /// those who wait for these; then whatever else `pipeline` makes of it. Marks, lines, motion and foreground that nobody wants are
     /// not made. A background that does not fit the scan starts again; then it is told why.
     pub(crate) fn scan(&mut self, raw: &RawScan<'_>, pipeline: &mut Pipeline) -> Option<Relearned> {
-        let len = raw.len();
+        let len = raw.payload_len();
         let (mut scan, mut zones) = (self.scan.loan(len), self.zones.loan(0));
         let decoded = with_room(&mut self.decoded, len);
         raw.write(decoded);
@@ -232,7 +232,7 @@ impl<'a, S: Surroundings> Topics<'a, S> {
 
     /// Updates `pipeline` from a scan that is not published.
     pub(crate) fn learn(&mut self, raw: &RawScan<'_>, pipeline: &mut Pipeline) {
-        let scan = with_room(&mut self.decoded, raw.len());
+        let scan = with_room(&mut self.decoded, raw.payload_len());
         raw.write(scan);
         pipeline.watch(scan, None);
         pipeline.examine(scan, Outputs::default());

@@ -45,7 +45,8 @@ where
                     turns.push(turn.points().to_vec())
                 }
                 Output::Transmit { bytes, .. } => {
-                    for byte in bytes.to_vec() {
+                    let bytes = bytes.to_vec();
+                    for byte in bytes {
                         now += line_time(1, device.rate());
                         while device.poll_transmit(now).is_some() {}
                         if session.rate() == device.rate() {

@@ -47,7 +47,7 @@ fn turn(number: u64, points: &[Point]) -> RawScan<'_> {
 
 /// The zones of the whole turn.
 fn zones(check: &mut Check, turn: &RawScan<'_>) -> Zones {
-    let mut scan = Scan::zeroed(turn.len());
+    let mut scan = Scan::zeroed(turn.payload_len());
     turn.write(&mut scan);
     let mut zones = Zones::unknown();
     check.update(&scan, &mut zones);

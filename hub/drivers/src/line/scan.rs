@@ -64,7 +64,7 @@ impl<'a> RawScan<'a> {
     }
 
     /// Returns the length of its payload in bytes.
-    pub fn len(&self) -> usize {
+    pub fn payload_len(&self) -> usize {
         Scan::len(self.beams(), self.head.contents)
     }
 
@@ -72,7 +72,7 @@ impl<'a> RawScan<'a> {
     ///
     /// # Panics
     ///
-    /// Panics if `scan` has less memory than [`len`](Self::len) bytes.
+    /// Panics if `scan` has less memory than [`payload_len`](Self::payload_len) bytes.
     pub fn write(&self, scan: &mut Scan) {
         let ScanArrays { angles, ranges, upper, .. } = scan.begin(self.head);
         match self.values {
@@ -140,9 +140,9 @@ mod tests {
             head: revolution_head(Family::Ld, 8, 100_000_000, 40.0, true),
             values: Values::Points { points: &points, per_second: 40.0 },
         };
-        let mut scan = Scan::zeroed(raw.len());
+        let mut scan = Scan::zeroed(raw.payload_len());
         raw.write(&mut scan);
-        assert_eq!(raw.len(), Scan::len(8, Contents::TURNING));
+        assert_eq!(raw.payload_len(), Scan::len(8, Contents::TURNING));
         assert_eq!((scan.beams(), scan.collapsed, scan.is_incomplete()), (8, 1, true));
         assert_eq!(
             (scan.distance_mm(0), scan.distance_mm(2), scan.intensities().get(2)),
@@ -166,7 +166,7 @@ mod tests {
             head: ScanHead::lms(3, -90_000, 500, 1, 13),
             values: Values::Words { bytes, range_bits: 13 },
         };
-        let mut scan = Scan::zeroed(raw(&[]).len());
+        let mut scan = Scan::zeroed(raw(&[]).payload_len());
         let bytes = [0x0A, 0x20, 0x0B, 0x40, 0x0C, 0x60];
         raw(&bytes).write(&mut scan);
         assert_eq!((scan.ranges(), scan.upper()), (&[10, 11, 12][..], &[1, 2, 3][..]));

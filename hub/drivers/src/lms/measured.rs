@@ -197,7 +197,7 @@ mod tests {
         let words: Vec<u16> = (0..181).map(|i| (i % 8) << 13 | (1000 + i)).collect();
         let encoded = encode(0, Unit::Cm, &words, 0x10);
         let measured = Measured::decode(encoded.telegram()).unwrap();
-        let mut scan = Scan::zeroed(measured.scan(Mode(1)).len());
+        let mut scan = Scan::zeroed(measured.scan(Mode(1)).payload_len());
         measured.scan(Mode(1)).write(&mut scan);
         assert_eq!(
             (scan.beams(), scan.unit_um, scan.valid_to, scan.intensity_bits),

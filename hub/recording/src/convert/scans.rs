@@ -160,7 +160,7 @@ impl Sensor {
         match (Measured::decode(telegram), self.mode) {
             (Some(measured), Some(mode)) => {
                 let raw = measured.scan(mode);
-                Scan::grow(scan, raw.len());
+                Scan::grow(scan, raw.payload_len());
                 raw.write(scan);
             }
             _ => return false,
@@ -209,7 +209,7 @@ impl Turns {
         let mut told = Ok(());
         session.take(header.stamp_last_ns, packets, |event| {
             let Event::Scan(raw) = event else { return };
-            Scan::grow(scan, raw.len());
+            Scan::grow(scan, raw.payload_len());
             raw.write(scan);
             let RawScan { first, last, period, reasons, .. } = raw;
             let quality = if reasons == 0 { Quality::Clean } else { Quality::Suspect };

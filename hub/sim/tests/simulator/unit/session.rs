@@ -44,7 +44,8 @@ impl Talk {
                     Output::SetRate(_) => self.read = self.bench.line.len(),
                     Output::SetDtr(_) => {}
                     Output::Transmit { bytes, .. } => {
-                        for byte in bytes.to_vec() {
+                        let bytes = bytes.to_vec();
+                        for byte in bytes {
                             self.bench.pass(line_time(1, self.bench.unit.rate()));
                             if self.session.rate() == self.bench.unit.rate() {
                                 self.bench.say(byte);
