@@ -81,8 +81,8 @@ impl PointCount {
         }
     }
 
-    /// Returns the model and its beams if a part of a revolution is exactly as the model is sold. A recording loses no scan
-    /// until a complete revolution has arrived.
+    /// Returns the model and its beams if a part of a revolution already is exactly as the model is sold: at the usual speed,
+    /// with the usual number of points.
     pub(crate) fn typical(&self) -> Option<(Model, usize)> {
         let revolution = self.revolution.filter(|revolution| revolution.packets >= MIN_TYPICAL)?;
         let counted = revolution.counted(self.angle);
@@ -169,7 +169,7 @@ impl Counted {
 
 /// Packets in sequence before a number of points is reliable.
 const MIN_PACKETS: u32 = 64;
-/// Packets of a typical revolution that are enough for a recording.
+/// Packets of a revolution that are enough if it is typical.
 const MIN_TYPICAL: u32 = 16;
 /// More missing packets than these end a sequence: their number is uncertain.
 const MAX_MISSING: u32 = 8;

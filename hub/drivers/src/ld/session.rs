@@ -30,8 +30,6 @@ pub struct Settings {
     /// Whether the port has one fixed rate and bytes do not arrive at the pace of a line, as with a serial server on the
     /// network or a recording.
     pub fixed_rate: bool,
-    /// Whether the bytes are from a recording.
-    pub listen_only: bool,
 }
 
 impl Settings {
@@ -149,9 +147,9 @@ impl Session {
 
     /// Creates a session from the settings that all families share.
     pub(crate) fn configured(settings: &family::Settings, now: Nanos) -> Session {
-        let &family::Settings { model, beams, max_beams, fixed_rate, listen_only, .. } = settings;
+        let &family::Settings { model, beams, max_beams, fixed_rate, .. } = settings;
         let model = model.and_then(Model::named);
-        Session::new(Settings { model, beams, max_beams, fixed_rate, listen_only }, now)
+        Session::new(Settings { model, beams, max_beams, fixed_rate }, now)
     }
 
     /// Returns the model, once it is known. Of models that cannot be distinguished, it is one.
@@ -298,9 +296,7 @@ impl Session {
             let Ok(packet) = Packet::check(bytes) else { continue };
             let place = self.sequence.place(&packet);
             counted = self.point_count.note(&packet, place).or(counted);
-            if self.settings.listen_only && self.measured.is_none() {
-                self.measured = self.point_count.typical();
-            }
+            self.measured = self.measured.or_else(|| self.point_count.typical());
             let end = span.offset + ((number + 1) * LEN - 1) as u64;
             if matches!(place, Place::First { .. }) {
                 let arrivals = self.reads.arrivals();

@@ -150,8 +150,7 @@ impl Bench {
     }
 }
 
-const AUTO: Settings =
-    Settings { model: None, beams: None, max_beams: None, fixed_rate: false, listen_only: false };
+const AUTO: Settings = Settings { model: None, beams: None, max_beams: None, fixed_rate: false };
 
 fn of(model: Model) -> Settings {
     Settings { model: Some(model), ..AUTO }
