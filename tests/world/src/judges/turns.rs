@@ -47,9 +47,8 @@ struct OfSensor {
     /// whether it was sent; and the number of the last telegram that was.
     foreign_at: Option<Nanos>,
     seen: Option<u64>,
-    /// Of the scans of this life of the topic.
-    beams: Option<(u64, usize)>,
-    is_other: bool,
+    /// Run of the hub, number of beams, and time of the first scan with this number since the port was opened.
+    beams: Option<(u64, usize, Nanos)>,
     /// Place behind the last packet that came without delay, and when it did.
     prompt: Option<(u64, Nanos)>,
     /// How many were read without delay since the session began, and when the last one of the first few was.
@@ -79,7 +78,6 @@ impl Turns {
             foreign_at: None,
             seen: None,
             beams: None,
-            is_other: false,
             prompt: None,
             prompts: 0,
             settled_at: None,
@@ -116,11 +114,11 @@ impl Judge for Turns {
             Event::Retuned { sensor } => self.sensors[sensor].begin(),
             Event::Opened { sensor, .. } => {
                 self.sensors[sensor].begin();
-                self.sensors[sensor].forget_beams(false);
+                self.sensors[sensor].beams = None;
             }
             Event::Exchanged { sensor } => {
                 self.sensors[sensor].begin();
-                self.sensors[sensor].forget_beams(true);
+                self.sensors[sensor].beams = None;
             }
             Event::HubBegins { .. } => {
                 self.stalled_until = 0;
@@ -157,14 +155,6 @@ impl OfSensor {
         if self.prompts >= FEW {
             self.settled_at.get_or_insert(at);
         }
-    }
-
-    /// Another model may have other beams, at once or when the port is opened again.
-    fn forget_beams(&mut self, is_other: bool) {
-        if is_other || std::mem::take(&mut self.is_other) {
-            self.beams = None;
-        }
-        self.is_other |= is_other;
     }
 
     fn measure(&mut self, points: &[TruePoint]) {
@@ -232,9 +222,14 @@ impl OfSensor {
                     return Err("what is no scan".to_owned());
                 }
                 let (boot, beams) = (sample.header.boot, scan.beams());
-                let before = self.beams.replace((boot, beams)).filter(|(of, _)| *of == boot);
-                if let Some((_, before)) = before.filter(|(_, before)| *before != beams) {
-                    return Err(format!("{beams} beams after {before}"));
+                let before = self.beams.filter(|(of, ..)| *of == boot);
+                match before {
+                    Some((_, before, _)) if before == beams => {}
+                    // While the port stays open, only after a scanner's points per revolution were others for so long.
+                    Some((_, before, since)) if at < since + OTHER_BEAMS => {
+                        return Err(format!("{beams} beams after {before}"));
+                    }
+                    _ => self.beams = Some((boot, beams, at)),
                 }
                 if self.seen.is_some_and(|seen| sample.header.seq > seen) {
                     self.foreign_at = Some(at);
@@ -332,6 +327,8 @@ impl OfSensor {
 
 /// A point may lie so far before one that was measured before it.
 const BACK_DEG: f64 = 40.0;
+/// Minimum time with the same number of beams while the port stays open.
+const OTHER_BEAMS: Nanos = 10_000 * MILLIS;
 /// The first point of a packet was measured no longer before the last one.
 const LONGEST: Nanos = 60 * MILLIS;
 /// A stamp is off by no more; a later point by a tenth of the time since it more, while the head changes its speed.
