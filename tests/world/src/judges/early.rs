@@ -39,6 +39,8 @@ struct OfSensor {
     is_unknown: bool,
     /// A warning was withdrawn although nothing had gone wrong.
     is_needless: bool,
+    /// The same of a scan whose zones were published.
+    needs_reason: bool,
     /// Scans since the hub found the scanner, and beams of the last one.
     scans: usize,
     beams: usize,
@@ -57,8 +59,11 @@ impl Judge for Early {
                 let is_well = self.healed_at.is_some_and(|healed_at| at > healed_at + RECOVERED);
                 let wrong = match sample.topic {
                     Topic::Scan => {
-                        (of.scans, of.beams) = (of.scans + 1, Scan::of_bytes(&sample.bytes).beams());
-                        None
+                        let before = std::mem::replace(&mut of.beams, Scan::of_bytes(&sample.bytes).beams());
+                        of.scans += 1;
+                        // With another number of beams, the warning was of a scan that is not completed.
+                        let is_wrong = std::mem::take(&mut of.needs_reason) && before == of.beams;
+                        is_wrong.then(|| "a warning was withdrawn although nothing went wrong".to_owned())
                     }
                     Topic::Early => of.warn(seq, &pod_read_unaligned(&sample.bytes), is_well),
                     Topic::Zones => of.tell(seq, &pod_read_unaligned(&sample.bytes), is_well),
@@ -114,9 +119,7 @@ impl OfSensor {
     fn tell(&mut self, seq: u64, zones: &Zones, is_well: bool) -> Option<String> {
         self.zones = Some(seq);
         // A hub that ends withdraws its warning, and sends no zones after that.
-        if std::mem::take(&mut self.is_needless) {
-            return Some("a warning was withdrawn although nothing went wrong".to_owned());
-        }
+        self.needs_reason = std::mem::take(&mut self.is_needless);
         let verdict = zones.verdict();
         let said = self.stands.take_if(|said| seq >= said.seq);
         let is_soon = zones.nearest().is_some_and(|(beam, _)| 5 * usize::from(beam) < 3 * self.beams);
