@@ -111,14 +111,14 @@ impl List {
             Some(name) => format!("default of {name}"),
             None => DEFAULT.to_owned(),
         };
-        let Settings { view, unit_mm, mode_number, .. } = scanner.settings;
+        let Settings { view, unit_mm, mode_number, baud, .. } = scanner.settings;
         let (angle_deg, resolution_cdeg) = view.unzip();
         self.put(of("type"), json!(scanner.expected_type), DEFAULT);
         self.put(of("angle"), json!(angle_deg), &by_type);
         self.put(of("resolution"), json!(resolution_cdeg.map(|cdeg| f64::from(cdeg) / 100.0)), &by_type);
         self.put(of("unit"), json!(unit_mm.map(|mm| if mm == 1 { "mm" } else { "cm" })), DEFAULT);
         self.put(of("mode"), json!(mode_number), DEFAULT);
-        self.put(of("baud"), json!(scanner.rate()), DEFAULT);
+        self.put(of("baud"), json!(baud), DEFAULT);
     }
 
     fn zones(&mut self, link: &str, zones: &Zones) {
