@@ -53,7 +53,7 @@ impl Recording {
     /// # Errors
     ///
     /// Returns [`Kind::Input`] if the file is not a recording: neither an MCAP file nor a CARMEN log, and without a telegram.
-    /// Returns [`Kind::Configuration`] if no family takes at least half of the [first bytes](recognize::EXAMINED) of a stream
+    /// Returns [`Kind::Configuration`] if no family takes at least half of the [first bytes](scanhub_drivers::recognize::EXAMINED) of a stream
     /// file.
     pub fn open(path: impl Into<PathBuf>) -> Result<Recording, Failure> {
         Recording::open_as(path, None)
