@@ -6,7 +6,7 @@ use crate::line::family::{Features, Model, Settings};
 use crate::line::{
     self, Account, Control, Identity, Introduction, KnownRate, Notice, Output, RawScan, Received, State,
 };
-use crate::{ld, lms, rplidar};
+use crate::{ld, lms, rplidar, search};
 use schema::{Counters, Family, Nanos, ScanHead, Status};
 
 /// Declares the families. A line has the name and the module of one.
@@ -23,6 +23,8 @@ macro_rules! families {
         #[derive(Clone, Copy, Debug, PartialEq)]
         pub enum Trouble {
             $(#[doc = concat!("Of family ", stringify!($family), ".")] $Family($family::Trouble),)*
+            /// Of the search for a scanner of any family.
+            Search(search::Trouble),
         }
 
         /// Returns the models and settings of `family`.
@@ -55,7 +57,10 @@ macro_rules! families {
 
         impl fmt::Display for Trouble {
             fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-                match self { $(Trouble::$Family(trouble) => trouble.fmt(f),)* }
+                match self {
+                    $(Trouble::$Family(trouble) => trouble.fmt(f),)*
+                    Trouble::Search(trouble) => trouble.fmt(f),
+                }
             }
         }
 
@@ -128,6 +133,8 @@ impl line::Session for Session {
         fn end(now: Nanos) -> bool;
         fn restore_identity(identity: Identity);
         fn hint_rate(known: KnownRate);
+        fn begin_at(rate: u32, now: Nanos);
+        fn restore_beams(model: Model, beams: usize);
         fn set_partial_reads(count: u8);
         fn mark_suspect(reasons: u8);
     }

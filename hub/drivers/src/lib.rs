@@ -8,9 +8,11 @@ mod families;
 pub mod ld;
 pub mod line;
 pub mod lms;
+mod port_session;
 pub mod recognize;
 pub mod rplidar;
 pub mod search;
 
 pub use families::{Session, Trouble, features, scan_heads};
 pub use line::family::{Features, Model, Settings};
+pub use port_session::PortSession;

@@ -342,6 +342,11 @@ impl Search {
         }
     }
 
+    /// Returns the scanner, once it is found.
+    pub fn found(&self) -> Option<Found> {
+        self.found
+    }
+
     /// Returns the reads of the step in which the scanner was found: the time of each, and its bytes. Pass them to the session
     /// of the family, before all later reads.
     pub fn reads(&self) -> impl Iterator<Item = (Nanos, &[u8])> {

@@ -559,6 +559,16 @@ impl line::Session for Session {
         }
     }
 
+    fn begin_at(&mut self, rate: u32, _: Nanos) {
+        self.baud = rate;
+    }
+
+    fn restore_beams(&mut self, model: family::Model, beams: usize) {
+        if let Some(model) = Model::named(model.name) {
+            self.recall(model, beams);
+        }
+    }
+
     fn model(&self) -> Option<family::Model> {
         self.model().map(described)
     }

@@ -108,6 +108,18 @@ pub trait Session: Protocol {
         let _ = known;
     }
 
+    /// Handles that a search has found the scanner at `rate`, in bits per second, at which the port is open. Call it before the
+    /// first read, and after [`hint_rate`](Self::hint_rate).
+    fn begin_at(&mut self, rate: u32, now: Nanos) {
+        let _ = (rate, now);
+    }
+
+    /// Restores the model and the number of beams that an earlier session on the same open port has measured. Call it before the
+    /// first read.
+    fn restore_beams(&mut self, model: Model, beams: usize) {
+        let _ = (model, beams);
+    }
+
     /// Returns the rate at which the search found the scanner, for the next search. `None` if there was no search.
     fn known_rate(&self) -> Option<KnownRate> {
         None

@@ -26,6 +26,13 @@ impl Dialogue {
         self.listen(now, State::Probing);
     }
 
+    /// Starts at `baud`, at which a search has found the scanner and the port is open.
+    pub(crate) fn begin_at(&mut self, baud: Baud, now: Nanos) {
+        (self.rest_at, self.first) = (baud, baud);
+        (self.baud, self.change_baud) = (baud, None);
+        self.listen(now, State::Probing);
+    }
+
     /// Listens for a stream at this rate.
     pub(crate) fn listen(&mut self, now: Nanos, shown: State) {
         self.open = None;

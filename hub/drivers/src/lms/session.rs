@@ -378,6 +378,12 @@ impl line::Session for Session {
         }
     }
 
+    fn begin_at(&mut self, rate: u32, now: Nanos) {
+        if let Some(baud) = Baud::of_rate(rate) {
+            self.dialogue.begin_at(baud, now);
+        }
+    }
+
     /// Of a line that cannot carry 500,000 baud, it is the rate in use.
     fn known_rate(&self) -> Option<KnownRate> {
         let baud = self.dialogue.rate_in_place_of_fast().or(self.dialogue.found_at)?;

@@ -522,6 +522,10 @@ impl line::Session for Session {
         self.reads.doubt(reasons);
     }
 
+    fn begin_at(&mut self, rate: u32, _: Nanos) {
+        self.baud = rate;
+    }
+
     fn introduction(&self) -> Option<Introduction> {
         let info = self.info().filter(|_| self.is_introduced())?;
         let (major, minor) = info.firmware;

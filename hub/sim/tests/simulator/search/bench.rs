@@ -212,6 +212,17 @@ impl<S: line::Session> Bench<Named<S>> {
 }
 
 impl<H: Host> Bench<H> {
+    /// Opens a serial port for a session that searches for the scanner.
+    pub(crate) fn auto(
+        begin: impl FnOnce(Nanos) -> H,
+        device: Option<Box<dyn Device>>,
+        memory: Option<Memory>,
+        seed: u64,
+    ) -> Bench<H> {
+        let rate = Search::opening_rate(memory);
+        Bench::hosting(begin, device, PortKind::Serial, rate, &Faults::default(), seed)
+    }
+
     fn hosting(
         begin: impl FnOnce(Nanos) -> H,
         mut device: Option<Box<dyn Device>>,

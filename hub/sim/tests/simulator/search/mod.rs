@@ -4,5 +4,6 @@ mod bench;
 mod finding;
 mod garbage;
 mod memory;
+mod port;
 mod power;
 mod wrong_rates;

@@ -1,0 +1,211 @@
+//! A session on a port without a configured family: scans arrive soon, no byte is lost on the way from the search to the session,
+//! and the search begins again when the scanner is gone.
+
+use scanhub_drivers::line::{self, Account, Protocol as _, Session as _, State};
+use scanhub_drivers::lms::variant::Baud;
+use scanhub_drivers::search::Memory;
+use scanhub_drivers::{PortSession, Settings, ld};
+use schema::{Counter, Counters, Family, MILLIS, Nanos, Status};
+use sim::device::Device;
+use sim::rplidar::Model;
+
+use super::bench::{self, Bench, Event, Host};
+
+/// A host whose result is the first scan.
+pub(crate) struct Auto {
+    pub(crate) session: PortSession,
+    scans: u64,
+    /// Wanted number of scans.
+    wanted: u64,
+    bytes: u64,
+}
+
+impl Host for Auto {
+    type Result = u64;
+
+    fn spare(&mut self) -> &mut [u8] {
+        self.session.spare()
+    }
+
+    fn commit(&mut self, now: Nanos, len: usize) {
+        self.bytes += len as u64;
+        self.session.commit(now, len);
+        self.check();
+    }
+
+    fn handle_timeout(&mut self, now: Nanos) {
+        self.session.handle_timeout(now);
+    }
+
+    fn transmitted(&mut self, now: Nanos) {
+        self.session.transmitted(now);
+    }
+
+    fn reject_rate(&mut self, now: Nanos) {
+        self.session.reject_rate(now);
+    }
+
+    fn poll(&mut self) -> Event<u64> {
+        loop {
+            if self.scans >= self.wanted {
+                return Event::Done(self.scans);
+            }
+            match self.session.poll_output() {
+                line::Output::SetRate(rate) => return Event::SetRate(rate),
+                line::Output::SetDtr(_) => {}
+                line::Output::Transmit { bytes, not_before } => {
+                    let &[byte] = bytes else { panic!("more than a byte: {bytes:?}") };
+                    return Event::Transmit(byte, not_before);
+                }
+                line::Output::Event(line::Event::Telegram(received)) => {
+                    self.scans += u64::from(received.whole.is_some_and(|whole| whole.scan.is_some()));
+                }
+                line::Output::Event(line::Event::Scan(_)) => self.scans += 1,
+                line::Output::Rest(until) => return Event::Wait(until),
+                line::Output::Wait { until } => {
+                    if !self.session.advance() {
+                        return Event::Wait(until);
+                    }
+                    self.check();
+                }
+            }
+        }
+    }
+}
+
+impl Auto {
+    /// Every byte that was read is in the counters, in those of the status too.
+    fn check(&self) {
+        let account = self.session.account();
+        let Account { read, in_telegrams, acknowledge, discarded, buffered, .. } = account;
+        assert_eq!(read, self.bytes);
+        assert_eq!(read, in_telegrams + acknowledge + discarded + buffered, "{account:?}");
+        let mut counters = Counters::default();
+        self.session.add_counters(&mut counters);
+        assert_eq!([counters[Counter::BytesRead], counters[Counter::BytesBuffered]], [read, buffered]);
+        assert_eq!(counters[Counter::BytesDiscarded], discarded);
+    }
+}
+
+fn host(memory: Option<Memory>, now: Nanos) -> Auto {
+    let settings = Settings { max_beams: Some(3_240), ..Settings::default() };
+    let session = PortSession::begin(None, &settings, memory, now);
+    Auto { session, scans: 0, wanted: 1, bytes: 0 }
+}
+
+fn open(device: Option<Box<dyn Device>>, memory: Option<Memory>, seed: u64) -> Bench<Auto> {
+    Bench::auto(|now| host(memory, now), device, memory, seed)
+}
+
+/// Runs until the next scan. Returns the time that it took.
+fn next_scan(bench: &mut Bench<Auto>, what: &str) -> Nanos {
+    let begin = bench.now;
+    bench.host.wanted = bench.host.scans + 1;
+    bench.run(begin + 60_000 * MILLIS).unwrap_or_else(|| {
+        let session = &bench.host.session;
+        panic!("{what}: {:?}, {:?}, at {}", session.state(), session.trouble(), session.rate())
+    });
+    bench.now - begin
+}
+
+/// Creates a scanner from a seed.
+type Create = Box<dyn Fn(u64) -> Box<dyn Device>>;
+
+fn scanners() -> Vec<(&'static str, Family, Create)> {
+    vec![
+        ("lms idle at 9600", Family::Lms, Box::new(|seed| bench::lms(Baud::B9600, false, seed))),
+        ("lms idle at 38400", Family::Lms, Box::new(|seed| bench::lms(Baud::B38400, false, seed))),
+        ("lms streams at 500000", Family::Lms, Box::new(|seed| bench::lms(Baud::B500000, true, seed))),
+        ("lms streams at 38400", Family::Lms, Box::new(|seed| bench::lms(Baud::B38400, true, seed))),
+        ("ld19", Family::Ld, Box::new(|seed| bench::ld(ld::Model::Ld19, seed))),
+        ("stl27l", Family::Ld, Box::new(|seed| bench::ld(ld::Model::Stl27l, seed))),
+        ("a1 idle", Family::Rplidar, Box::new(|seed| bench::rplidar(Model::A1, false, 0, seed))),
+        ("s2 streams", Family::Rplidar, Box::new(|seed| bench::rplidar(Model::S2, true, 0, seed))),
+        ("c1 idle", Family::Rplidar, Box::new(|seed| bench::rplidar(Model::C1, false, 0, seed))),
+    ]
+}
+
+#[test]
+fn scans_of_every_family_arrive_and_the_scanner_is_remembered() {
+    for (name, family, create) in scanners() {
+        let (mut times, mut remembered) = (Vec::new(), Vec::new());
+        for seed in 0..8 {
+            let mut bench = open(Some(create(seed)), None, seed);
+            assert_eq!((bench.host.session.family(), bench.host.session.state()), (None, State::Probing));
+            times.push(next_scan(&mut bench, name) / MILLIS);
+            let session = &bench.host.session;
+            assert_eq!(session.family(), Some(family), "{name}");
+            bench.run(bench.now + 100 * MILLIS);
+            let memory = bench.host.session.memory().expect("it streams");
+            assert_eq!(memory.family, family);
+            assert_eq!(bench.device.as_ref().map_or(0, |device| device.eeprom_writes()), 0);
+            let mut again = open(Some(create(seed)), Some(memory), seed);
+            remembered.push(next_scan(&mut again, name) / MILLIS);
+        }
+        times.sort_unstable();
+        remembered.sort_unstable();
+        println!("{name:22} first scan {times:?} ms, remembered {remembered:?} ms");
+        assert!(times[7] <= 9_000, "{name}: {times:?}");
+    }
+}
+
+#[test]
+fn the_telegrams_of_the_search_reach_the_session() {
+    for seed in 0..20 {
+        // Each is found by its stream, so it gets no byte before the session begins.
+        for (name, device, most_lost) in [
+            ("lms", bench::lms(Baud::B500000, true, seed), 814),
+            ("ld", bench::ld(ld::Model::Ld19, seed), 2 * 47),
+        ] {
+            let mut bench = open(Some(device), None, seed);
+            next_scan(&mut bench, name);
+            let at_rate: u64 = bench.read.iter().map(|(_, bytes)| bytes.len() as u64).sum();
+            let account = bench.host.session.account();
+            // What was read at the last rate is in telegrams, except a fragment of the first one.
+            let lost = at_rate - account.in_telegrams - account.buffered;
+            assert!(lost < most_lost, "{name}, seed {seed}: {lost} of {at_rate}");
+            assert_eq!(bench.written.is_empty(), name == "ld", "{name}, seed {seed}");
+        }
+    }
+}
+
+#[test]
+fn another_scanner_is_found_ten_seconds_after_the_first_one_is_gone() {
+    let mut bench = open(Some(bench::ld(ld::Model::Ld19, 1)), None, 1);
+    next_scan(&mut bench, "ld19");
+    bench.device = None;
+    let gone = bench.now;
+    bench.host.wanted = u64::MAX;
+    bench.run(gone + 9_900 * MILLIS);
+    assert_eq!(bench.host.session.family(), Some(Family::Ld), "its session handles silence");
+    bench.run(gone + 10_200 * MILLIS);
+    assert_eq!(bench.host.session.family(), None);
+    assert!(bench.host.session.trouble().is_some(), "the trouble of the session is shown");
+    let mut status = Status::default();
+    status.set_sensor_type("LD19");
+    bench.host.session.describe(&mut status);
+    assert_eq!(status.sensor_type(), "");
+    bench.device = Some(bench::rplidar(Model::A1, false, 0, 1));
+    next_scan(&mut bench, "a1");
+    assert_eq!(bench.host.session.family(), Some(Family::Rplidar));
+    assert_eq!(bench.host.session.memory().map(|memory| memory.family), Some(Family::Rplidar));
+}
+
+#[test]
+fn a_paused_search_sends_nothing() {
+    let mut bench = open(Some(bench::lms(Baud::B9600, false, 3)), None, 3);
+    bench.host.session.control(line::Control::Pause, bench.now);
+    bench.run(bench.now + 5_000 * MILLIS);
+    assert_eq!((bench.host.session.state(), bench.written.len()), (State::Paused, 0));
+    bench.host.session.control(line::Control::Resume, bench.now);
+    next_scan(&mut bench, "after the pause");
+}
+
+#[test]
+fn a_silent_line_has_a_message() {
+    let mut bench = open(None, None, 4);
+    bench.run(bench.now + 13_000 * MILLIS);
+    let trouble = bench.host.session.trouble().map(|trouble| trouble.to_string());
+    let expected = "no scanner replies (looked for lms, ld, rplidar for 10 s): power, cable?";
+    assert_eq!(trouble.as_deref(), Some(expected));
+}
