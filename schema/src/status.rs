@@ -112,7 +112,7 @@ impl Status {
         self.port().starts_with("file:")
     }
 
-    /// Returns the family of the scanner, as configured; nothing if a newer hub has one that this program does not know.
+    /// Returns the family of the scanner; `None` while the hub searches for it, or if this program does not know the family.
     pub fn family(&self) -> Option<Family> {
         Family::of_number(self.family)
     }

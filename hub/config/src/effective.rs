@@ -8,7 +8,7 @@ use preprocess::background::{Candidate, Method, Start};
 use preprocess::{lines, marks, motion, zones};
 use scanhub_drivers::Settings;
 use schema::limits::TopicLimits;
-use schema::{Failure, Pose};
+use schema::{Failure, Family, Pose};
 use serde::Serialize;
 use serde_json::{Value as Json, json};
 use toml::de::{DeTable, DeValue};
@@ -16,6 +16,7 @@ use toml::de::{DeTable, DeValue};
 use crate::gateway::Gateway;
 use crate::link::{Config, Link};
 use crate::processing::{Background, Zones};
+use crate::scanner::AUTO;
 use crate::sources::{Origin, Sources};
 
 /// One value in effect.
@@ -61,9 +62,12 @@ impl List {
         let reports_model = features.models.is_empty();
         let by_model =
             if reports_model { DEFAULT.to_owned() } else { format!("default of {}", scanner.model().name) };
-        self.put(of("family"), json!(link.family().name()), &by_model);
+        let family = link.family();
+        self.put(of("family"), json!(family.map_or(AUTO, Family::name)), &by_model);
         let settings = &scanner.settings;
-        if reports_model {
+        if family.is_none() {
+            self.put(of("beams"), json!(settings.beams), DEFAULT);
+        } else if reports_model {
             self.reported(link);
         } else {
             self.put(of("model"), json!(scanner.model().name), DEFAULT);
@@ -83,9 +87,10 @@ impl List {
         self.put(of("pose.upside_down"), json!(upside_down != 0), DEFAULT);
         self.zones(name, &processing.zones);
         let marks::Settings { i_min, level, max_range_step_mm, max_gap } = processing.marks;
-        if link.family().has_reflector_levels() {
+        if family.is_none_or(Family::has_reflector_levels) {
             self.put(of("marks.i_min"), json!(i_min), DEFAULT);
-        } else {
+        }
+        if family.is_none_or(|family| !family.has_reflector_levels()) {
             self.put(of("marks.level"), json!(level), DEFAULT);
         }
         self.put(of("marks.max_range_step"), json!(metres(max_range_step_mm)), DEFAULT);

@@ -130,21 +130,22 @@ impl Draft {
             Failure::new(Kind::Configuration, format!("{place}: link {name}: {what}"), remedy)
         };
         let port = port.ok_or_else(|| refuse(&place, "no port".into(), "add port = \"/dev/ttyUSB0\""))?;
-        let mut scanner = scanner.finish(refuse)?;
-        if !scanner.features().models.is_empty() {
-            let said = |place: Option<&String>, key| place.map(|place| (place.clone(), key));
-            let of_lms = [
-                said(family.as_ref().map(|said| &said.place), "type"),
-                said(angle_deg.as_ref().map(|said| &said.place), "angle"),
-                said(resolution_cdeg.as_ref().map(|said| &said.place), "resolution"),
-                said(unit.as_ref().map(|said| &said.place), "unit"),
-                said(mode.as_ref().map(|said| &said.place), "mode"),
-                said(baud.as_ref().map(|said| &said.place), "baud"),
-            ];
-            if let Some((place, key)) = of_lms.into_iter().flatten().next() {
-                let what = format!("{key} is of family lms; a scanner of another family has no such setting");
-                return Err(refuse(&place, what, &remedy_of_lms(key, &scanner)));
-            }
+        let said = |place: Option<&String>, key| place.map(|place| (place.clone(), key));
+        let of_lms = [
+            said(family.as_ref().map(|said| &said.place), "type"),
+            said(angle_deg.as_ref().map(|said| &said.place), "angle"),
+            said(resolution_cdeg.as_ref().map(|said| &said.place), "resolution"),
+            said(unit.as_ref().map(|said| &said.place), "unit"),
+            said(mode.as_ref().map(|said| &said.place), "mode"),
+            said(baud.as_ref().map(|said| &said.place), "baud"),
+        ];
+        let of_lms: Vec<_> = of_lms.into_iter().flatten().collect();
+        let mut scanner = scanner.finish(&of_lms, refuse)?;
+        if !scanner.features().models.is_empty()
+            && let Some((place, key)) = of_lms.first()
+        {
+            let what = format!("{key} is of family lms; a scanner of another family has no such setting");
+            return Err(refuse(place, what, &remedy_of_lms(key, &scanner)));
         }
         if let Some(mode) = mode.as_ref().filter(|_| !matches!(port, Source::File { .. })) {
             let what = format!("the mode of {} is read from the sensor", port.name());
@@ -181,7 +182,7 @@ impl Draft {
             let what = format!("an {} does not scan {angle_deg} degrees: {why}", family.name());
             return Err(refuse(angle_place, what, "angle = 100"));
         }
-        if scanner.features().models.is_empty() {
+        if scanner.family.is_some() && scanner.features().models.is_empty() {
             scanner.expected_type = family.map(Family::name);
             scanner.settings = Settings {
                 view: Some((variant.angle_deg, variant.resolution_cdeg)),
@@ -200,7 +201,9 @@ impl Draft {
             said.iter().rev().find_map(|(origin, sections)| Some(origin.place(Some(sections.start()?))));
         let mut link = Link { name, port, scanner, processing };
         ZoneCoverage { link: &link, place: &place, said }.check()?;
-        own.iter().try_for_each(|(origin, sections)| sections.check_family(origin, link.family()))?;
+        if let Some(family) = link.family() {
+            own.iter().try_for_each(|(origin, sections)| sections.check_family(origin, family))?;
+        }
         let mut background = std::mem::take(&mut link.processing.background);
         background.read(&link).map_err(|failure| {
             let place = start.unwrap_or_default();

@@ -3,7 +3,7 @@
 use port::Source;
 use scanhub_drivers::{Features, Settings, scan_heads};
 use schema::limits::TopicLimits;
-use schema::{Background, Family};
+use schema::{Background, Family, ScanHead};
 
 use crate::processing::Processing;
 use crate::scanner::Scanner;
@@ -59,9 +59,19 @@ impl Link {
         TopicLimits { beams: self.max_beams(), contents, telegram: max_telegram, ..*all }
     }
 
-    /// Returns the family of its scanner.
-    pub fn family(&self) -> Family {
+    /// Returns the family of its scanner. `None`: it is searched for.
+    pub fn family(&self) -> Option<Family> {
         self.scanner.family
+    }
+
+    /// Returns the possible heads of its scans, as far as they are known; those with the most beams first.
+    pub fn scan_heads(&self) -> Vec<ScanHead> {
+        let families = self.family().map_or(Family::ALL.to_vec(), |family| vec![family]);
+        let settings = self.settings();
+        let mut heads: Vec<_> =
+            families.into_iter().flat_map(|family| scan_heads(family, &settings)).collect();
+        heads.sort_by_key(|head| std::cmp::Reverse(head.count));
+        heads
     }
 
     /// Returns the settings of a session at its port. Nothing can be sent to a recording.
@@ -75,7 +85,7 @@ impl Link {
     ///
     /// Returns the beams and the unit that such a model has, as text.
     pub fn fits(&self, model: &Background) -> Result<(), String> {
-        let heads = scan_heads(self.family(), &self.settings());
+        let heads = self.scan_heads();
         let count = heads[0].count;
         let (fits, beams) = match self.scanner.is_auto() {
             true => (model.count <= count, format!("at most {count}")),

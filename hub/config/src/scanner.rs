@@ -1,7 +1,7 @@
 //! The scanner of a link: its family and settings, as values in effect and as keys of the sources.
 
 use port::Source;
-use scanhub_drivers::{Features, Model, Settings, features, line};
+use scanhub_drivers::{ANY, Features, Model, Settings, features, line};
 use schema::{Failure, Family};
 use toml::Spanned;
 
@@ -10,8 +10,8 @@ use crate::sources::Origin;
 /// Family of a scanner, with its settings.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Scanner {
-    /// Family of the scanner.
-    pub family: Family,
+    /// Family of the scanner. `None`: the hub searches for it.
+    pub family: Option<Family>,
     /// Name of the expected type, for a family that reports it.
     pub expected_type: Option<&'static str>,
     /// Values that are set for the session. Those of the port follow from the link.
@@ -19,9 +19,9 @@ pub struct Scanner {
 }
 
 impl Scanner {
-    /// Returns the models and settings of the family.
+    /// Returns the models and settings of the family, or of all families if it is searched for.
     pub fn features(&self) -> &'static Features {
-        features(self.family)
+        self.family.map_or(&ANY, features)
     }
 
     /// Returns the model, or the values for an unknown one if the session must detect it.
@@ -34,12 +34,19 @@ impl Scanner {
     /// Returns whether the session must detect the model, and with it the number of beams.
     pub fn is_auto(&self) -> bool {
         let Settings { model, beams, .. } = self.settings;
-        !self.features().models.is_empty() && model.is_none() && beams.is_none()
+        let has_models = self.family.is_none_or(|family| !features(family).models.is_empty());
+        has_models && model.is_none() && beams.is_none()
     }
 
     /// Returns the number of beams of a scan, or its maximum if it is not known before.
     pub fn max_beams(&self) -> usize {
-        self.settings.beams.unwrap_or(self.model().beams)
+        let Some(beams) = self.settings.beams else { return self.model().beams };
+        if self.family.is_some() {
+            return beams;
+        }
+        // A scanner that reports its model has its own number of beams.
+        let own = Family::ALL.into_iter().map(features).filter(|features| features.models.is_empty());
+        own.map(|features| features.auto.beams).max().unwrap_or(beams).max(beams)
     }
 
     /// Returns the rate at which a tty is opened, in bits per second.
@@ -49,7 +56,10 @@ impl Scanner {
 
     /// Returns the highest rate that the scanner can have.
     fn max_rate(&self) -> u32 {
-        let all = self.features().models.iter().map(|model| model.baud);
+        let families =
+            self.family.map_or(Family::ALL.to_vec(), |family| vec![family]).into_iter().map(features);
+        let all = families.flat_map(|features| features.models.iter().chain([&features.auto]));
+        let all = all.map(|model| model.baud);
         if self.is_auto() { all.max().unwrap_or(self.rate()) } else { self.rate() }
     }
 
@@ -76,7 +86,8 @@ pub(crate) struct ScannerLayer {
 /// Values of all sources with their places.
 #[derive(Default)]
 pub(crate) struct ScannerDraft {
-    family: Option<(Family, String)>,
+    /// The family, or that it is searched for.
+    family: Option<(Option<Family>, String)>,
     model: Option<(String, String)>,
     beams: Option<(usize, String)>,
     /// Name of a mode. A number is a mode of an LMS.
@@ -84,15 +95,25 @@ pub(crate) struct ScannerDraft {
     stop_when_idle: Option<(bool, String)>,
 }
 
+/// A key that names the family of its link.
+struct Naming {
+    family: Family,
+    /// Key and value, as text.
+    what: String,
+    place: String,
+}
+
 impl ScannerDraft {
     /// Applies the keys that are set in `layer`.
     pub(crate) fn apply(&mut self, layer: ScannerLayer, origin: &Origin) -> Result<(), Failure> {
         let ScannerLayer { family, model, beams, idle } = layer;
         if let Some(family) = family {
-            let known = Family::parse(family.get_ref()).ok_or_else(|| {
+            let known = Family::parse(family.get_ref());
+            if known.is_none() && !family.get_ref().eq_ignore_ascii_case(AUTO) {
                 let what = format!("family = \"{}\"", family.get_ref());
-                origin.refuse(Some(family.span()), what, one_of(Family::ALL.map(Family::name)))
-            })?;
+                let names = auto_or(Family::ALL.into_iter().map(Family::name));
+                return Err(origin.refuse(Some(family.span()), what, names));
+            }
             self.family = Some((known, origin.place(Some(family.span()))));
         }
         if let Some(model) = model {
@@ -119,11 +140,22 @@ impl ScannerDraft {
         Ok(())
     }
 
-    /// Returns the scanner. `refuse` creates the failure for a place, a problem and a remedy.
-    pub(crate) fn finish(self, refuse: impl Fn(&str, String, &str) -> Failure) -> Result<Scanner, Failure> {
+    /// Returns the scanner. `lms_keys` are the keys that only an LMS has, each with its place. `refuse` creates the failure for a
+    /// place, a problem and a remedy.
+    pub(crate) fn finish(
+        self,
+        lms_keys: &[(String, &str)],
+        refuse: impl Fn(&str, String, &str) -> Failure,
+    ) -> Result<Scanner, Failure> {
+        let named = match &self.family {
+            Some((None, _)) => self.named_family(lms_keys, &refuse)?,
+            _ => None,
+        };
         let ScannerDraft { family, model, beams, mode, stop_when_idle } = self;
         let model = model.filter(|(model, _)| !model.eq_ignore_ascii_case(AUTO));
         let implied = model.as_ref().and_then(|(model, _)| family_of(model));
+        let is_searched = family.as_ref().is_some_and(|(family, _)| family.is_none()) && named.is_none();
+        let family = family.and_then(|(family, place)| Some((family.or(named)?, place)));
         let set = family.as_ref().map(|(family, _)| *family);
         if let (Some((model, place)), Some((family, family_place)), Some(implied)) =
             (&model, &family, implied)
@@ -142,9 +174,13 @@ impl ScannerDraft {
             );
             return Err(refuse(place, format!("model = \"{model}\""), &remedy));
         }
+        if is_searched {
+            let settings = Settings { beams: beams.map(|(beams, _)| beams), ..Settings::default() };
+            return Ok(Scanner { family: None, expected_type: None, settings });
+        }
         let family = set.or(implied).unwrap_or(Family::Lms);
         let name = family.name();
-        let mode = mode.filter(|(mode, _)| mode != AUTO);
+        let mode = mode.filter(|(mode, _)| !mode.eq_ignore_ascii_case(AUTO));
         let rest = stop_when_idle.filter(|(stops, _)| *stops);
         let features = features(family);
         if let Some((_, place)) = rest.as_ref().filter(|_| !features.can_rest) {
@@ -167,7 +203,7 @@ impl ScannerDraft {
             ];
             return match own.into_iter().flatten().next() {
                 Some((place, what, remedy)) => Err(refuse(&place, what, remedy)),
-                None => Ok(Scanner { family, expected_type: None, settings }),
+                None => Ok(Scanner { family: Some(family), expected_type: None, settings }),
             };
         }
         if let Some((model, place)) = model {
@@ -183,7 +219,47 @@ impl ScannerDraft {
                 Some(mode_of(features, name, &mode).map_err(|(what, remedy)| refuse(&place, what, &remedy))?);
         }
         settings.beams = beams.map(|(beams, _)| beams);
-        Ok(Scanner { family, expected_type: None, settings })
+        Ok(Scanner { family: Some(family), expected_type: None, settings })
+    }
+
+    /// Returns the family that the keys name which only one family has. `None` if there are none.
+    fn named_family(
+        &self,
+        lms_keys: &[(String, &str)],
+        refuse: impl Fn(&str, String, &str) -> Failure,
+    ) -> Result<Option<Family>, Failure> {
+        let of_lms = lms_keys.iter().map(|(place, key)| Naming {
+            family: Family::Lms,
+            what: (*key).to_owned(),
+            place: place.clone(),
+        });
+        let model = self.model.as_ref().and_then(|(model, place)| {
+            let what = format!("model = \"{model}\"");
+            Some(Naming { family: family_of(model)?, what, place: place.clone() })
+        });
+        let mode = self.mode.as_ref().filter(|(mode, _)| !mode.eq_ignore_ascii_case(AUTO));
+        let mode = mode.and_then(|(mode, place)| {
+            let family = family_with(|features| !features.modes.is_empty())?;
+            Some(Naming { family, what: format!("mode = \"{mode}\""), place: place.clone() })
+        });
+        let idle = self.stop_when_idle.as_ref().and_then(|(_, place)| {
+            let family = family_with(|features| features.can_rest)?;
+            Some(Naming { family, what: "idle".to_owned(), place: place.clone() })
+        });
+        let mut all = of_lms.chain(model).chain(mode).chain(idle);
+        let Some(first) = all.next() else { return Ok(None) };
+        if let Some(other) = all.find(|other| other.family != first.family) {
+            let what = format!(
+                "{} is of family {}, but {} at {} is of family {}",
+                other.what,
+                other.family.name(),
+                first.what,
+                first.place,
+                first.family.name()
+            );
+            return Err(refuse(&other.place, what, "set only keys of the family that the scanner has"));
+        }
+        Ok(Some(first.family))
     }
 }
 
@@ -192,6 +268,11 @@ fn family_of(model: &str) -> Option<Family> {
     let has =
         |family: &Family| features(*family).models.iter().any(|known| known.name.eq_ignore_ascii_case(model));
     Family::ALL.into_iter().find(has)
+}
+
+/// Returns the first family whose features meet `condition`.
+fn family_with(condition: impl Fn(&Features) -> bool) -> Option<Family> {
+    Family::ALL.into_iter().find(|family| condition(features(*family)))
 }
 
 /// Returns the mode called `mode` of the family `name`, or the problem and the remedy.
@@ -223,7 +304,7 @@ fn one_of<const N: usize>(names: [&str; N]) -> String {
     format!("one of: {}", names.join(", "))
 }
 
-/// The session detects or chooses the value.
-const AUTO: &str = "auto";
+/// The hub or the session detects or chooses the value.
+pub(crate) const AUTO: &str = "auto";
 /// Values of `idle`, and whether the motor then stops while there are no subscribers.
 const IDLE: [(&str, bool); 2] = [("run", false), ("stop", true)];

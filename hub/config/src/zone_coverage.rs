@@ -4,7 +4,6 @@
 use std::rc::Rc;
 
 use preprocess::zones::{Check, Settings};
-use scanhub_drivers::scan_heads;
 use schema::{Failure, Kind, Scan, ScanHead, Zones};
 
 use crate::link::Link;
@@ -26,7 +25,7 @@ impl ZoneCoverage<'_> {
     pub(crate) fn check(&self) -> Result<(), Failure> {
         let processing = &self.link.processing;
         let settings = processing.zones.settings();
-        let (beams, min_beams) = (self.heads()[0].count.into(), settings.min_beams);
+        let (beams, min_beams) = (self.link.scan_heads()[0].count.into(), settings.min_beams);
         if usize::from(min_beams) > beams {
             let what = format!("min_beams = {min_beams}, and a scan has {beams} beams");
             return Err(self.refuse(Sections::min_beams, what, "the default is one beam"));
@@ -65,12 +64,7 @@ impl ZoneCoverage<'_> {
             check.update(&Scan::of(*head, &vec![0; beams]), &mut Zones::unknown());
             check.telling()
         };
-        self.heads().iter().map(of_head).max().unwrap_or_default()
-    }
-
-    /// Returns the possible heads of its scans.
-    fn heads(&self) -> Vec<ScanHead> {
-        scan_heads(self.link.family(), &self.link.settings())
+        self.link.scan_heads().iter().map(of_head).max().unwrap_or_default()
     }
 
     /// Returns the failure at the last place where `place` is set, or at the start of the link if it is not set.

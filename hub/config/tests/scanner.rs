@@ -19,8 +19,8 @@ fn load(set: &[&str]) -> Result<Config, String> {
 /// Family, model and beams of a scanner whose head turns.
 fn set_of(link: &Link) -> Option<(&'static str, &'static str, Option<usize>)> {
     let scanner = &link.scanner;
-    (scanner.family != Family::Lms)
-        .then(|| (scanner.family.name(), scanner.model().name, scanner.settings.beams))
+    let family = scanner.family.filter(|family| *family != Family::Lms)?;
+    Some((family.name(), scanner.model().name, scanner.settings.beams))
 }
 
 #[test]
@@ -60,11 +60,11 @@ fn a_link_has_a_family_and_what_its_family_needs() {
     let marks = |link: &Link| (link.processing.marks.i_min, link.processing.marks.level);
     assert_eq!((marks(&config.links[0]), marks(&config.links[1])), ((2, Some(250)), (2, Some(240))));
     // The other link is what it was.
-    assert_eq!(load(&[family]).unwrap().links[1].family(), Family::Lms);
+    assert_eq!(load(&[family]).unwrap().links[1].family(), Some(Family::Lms));
 
     let lms = "is of family lms; a scanner of another family has no such setting\n  leave it out, or set family = \"lms\"";
     for (others, setting, words) in [
-        (&[][..], "family=sick", "family = \"sick\"\n  one of: lms, ld, rplidar"),
+        (&[][..], "family=sick", "family = \"sick\"\n  auto, or one of: lms, ld, rplidar"),
         (&[], "famly=ld", "unknown key `famly`\n  did you mean `family`?"),
         (
             &[],
@@ -204,4 +204,68 @@ fn keys_of_a_link_may_follow_its_port() {
         assert!(refusal.contains(words), "{refusal}");
     }
     assert_eq!(load("a=family=ld").unwrap().port.name(), "family=ld", "a port has to be there");
+}
+
+#[test]
+fn a_family_may_be_searched_for() {
+    let front = |set: &[&str]| {
+        load(&[&["link.front.family=auto"], set].concat()).map(|mut config| config.links.swap_remove(0))
+    };
+    let link = front(&[]).unwrap();
+    assert_eq!((link.family(), link.max_beams(), link.rate()), (None, 3_240, 230_400));
+    assert!(link.scanner.is_auto());
+    let limits = link.limits(&schema::limits::TopicLimits::default());
+    for family in Family::ALL.into_iter().map(features) {
+        assert!(family.models.iter().all(|model| model.beams <= limits.beams));
+        assert!(
+            family.max_telegram <= limits.telegram && limits.contents & family.contents == family.contents
+        );
+    }
+    // No family is named by what every link may have, and by what is automatic anyway.
+    for set in [&["link.front.model=auto", "link.front.mode=Auto"][..], &["link.front.marks.level=200"]] {
+        assert_eq!(front(set).unwrap().family(), None, "{set:?}");
+    }
+    // An LMS has its own number of beams.
+    let beams = front(&["link.front.beams=300"]).unwrap();
+    assert_eq!((beams.scanner.settings.beams, beams.max_beams()), (Some(300), 401));
+    for (set, family) in [
+        ("type=LMS291", Family::Lms),
+        ("angle=100", Family::Lms),
+        ("resolution=1", Family::Lms),
+        ("unit=mm", Family::Lms),
+        ("baud=38400", Family::Lms),
+        ("mode=express", Family::Rplidar),
+        ("idle=run", Family::Rplidar),
+        ("model=LD19", Family::Ld),
+        ("model=s2", Family::Rplidar),
+        ("family=LD", Family::Ld),
+    ] {
+        let set = format!("link.front.{set}");
+        assert_eq!(front(&[&set]).unwrap().family(), Some(family), "{set}");
+    }
+    assert_eq!(front(&["link.front.family=AUTO"]).unwrap().family(), None);
+    for (first, second, words) in [
+        (
+            "angle=180",
+            "model=ld19",
+            "model = \"ld19\" is of family ld, but angle at --set link.front.angle=180 is of family lms",
+        ),
+        (
+            "model=ld19",
+            "idle=stop",
+            "idle is of family rplidar, but model = \"ld19\" at --set link.front.model=ld19",
+        ),
+        (
+            "baud=38400",
+            "mode=boost",
+            "mode = \"boost\" is of family rplidar, but baud at --set link.front.baud=38400",
+        ),
+    ] {
+        let [first, second] = [first, second].map(|set| format!("link.front.{set}"));
+        let refusal = front(&[&first, &second]).unwrap_err();
+        assert!(refusal.starts_with(&format!("--set {second}: link front: ")), "{refusal}");
+        assert!(refusal.contains(words), "{refusal}");
+    }
+    let refusal = front(&["link.front.model=ld18"]).unwrap_err();
+    assert!(refusal.contains("model = \"ld18\"\n  auto, or one of: ld06"), "{refusal}");
 }

@@ -79,6 +79,31 @@ families! {
     Rplidar rplidar,
 }
 
+/// What a link needs whose family is searched for: space for every scanner.
+pub const ANY: Features = {
+    let mut any = Features {
+        models: &[],
+        // Enough for every model.
+        auto: Model { name: "auto", baud: FIRST_RATE, beams: 3_240 },
+        modes: &[],
+        can_rest: false,
+        speaks_unasked: false,
+        has_whole_telegrams: true,
+        contents: 0,
+        max_telegram: 0,
+    };
+    let mut at = 0;
+    while at < Family::ALL.len() {
+        let features = features(Family::ALL[at]);
+        any.contents |= features.contents;
+        if features.max_telegram > any.max_telegram {
+            any.max_telegram = features.max_telegram;
+        }
+        at += 1;
+    }
+    any
+};
+
 impl Session {
     /// Returns the models and settings of its family.
     pub fn features(&self) -> &'static Features {
@@ -162,6 +187,8 @@ impl line::Session for Session {
     }
 }
 
+/// Rate at which a search begins that remembers no scanner, in bits per second.
+const FIRST_RATE: u32 = 230_400;
 const _: () = assert!(lms::telegram::MAX_TELEGRAM == schema::Telegram::MAX);
 const _: () = assert!(
     line::suspect::LINE_ERROR == schema::Reasons::LINE_ERROR

@@ -13,6 +13,6 @@ pub mod recognize;
 pub mod rplidar;
 pub mod search;
 
-pub use families::{Session, Trouble, features, scan_heads};
+pub use families::{ANY, Session, Trouble, features, scan_heads};
 pub use line::family::{Features, Model, Settings};
 pub use port_session::PortSession;

@@ -32,6 +32,9 @@ impl Family {
     /// All families.
     pub const ALL: [Family; 3] = [Family::Lms, Family::Ld, Family::Rplidar];
 
+    /// Number in place of a family while the hub searches for the scanner.
+    pub const UNKNOWN: u8 = 255;
+
     /// Returns the family's name in configurations and in all output.
     pub fn name(self) -> &'static str {
         match self {
@@ -41,9 +44,9 @@ impl Family {
         }
     }
 
-    /// Returns the family called `name`.
+    /// Returns the family called `name`, in upper or lower case.
     pub fn parse(name: &str) -> Option<Family> {
-        Family::ALL.into_iter().find(|family| family.name() == name)
+        Family::ALL.into_iter().find(|family| family.name().eq_ignore_ascii_case(name))
     }
 
     /// Returns whether the family's intensities are levels of reflectors, with 0 for any other surface. Otherwise they

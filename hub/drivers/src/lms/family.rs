@@ -40,7 +40,7 @@ impl Family {
 
     /// The one that is called so in configurations.
     pub fn of_name(name: &str) -> Option<Family> {
-        Family::ALL.into_iter().find(|family| family.name() == name)
+        Family::ALL.into_iter().find(|family| family.name().eq_ignore_ascii_case(name))
     }
 
     /// The one that a sensor is by its type reply, such as `LMS200;S18063;V02.19`; `None` if it is none of these.
