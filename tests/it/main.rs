@@ -5,6 +5,7 @@
 mod testkit;
 
 mod altered_port;
+mod auto;
 mod background;
 mod browser;
 mod children;

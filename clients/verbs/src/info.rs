@@ -159,6 +159,7 @@ fn pose(pose: &Pose) -> String {
 
 fn marks(sensor: &str, status: &Status) -> String {
     match (status.has_reflector_bits(), status.reflector_remedy()) {
+        (None, _) if status.family().is_none() => "unknown".into(),
         (None, _) if status.family() != Some(Family::Lms) => {
             format!("off, unless link.{sensor}.marks.level is set")
         }

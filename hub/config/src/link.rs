@@ -3,7 +3,7 @@
 use port::Source;
 use scanhub_drivers::{Features, Settings, scan_heads};
 use schema::limits::TopicLimits;
-use schema::{Background, Family, ScanHead};
+use schema::{Background, Failure, Family, ScanHead};
 
 use crate::processing::Processing;
 use crate::scanner::Scanner;
@@ -21,6 +21,24 @@ impl Config {
     /// Returns what the topics of each link are made for.
     pub fn topic_limits(&self) -> Vec<TopicLimits> {
         self.links.iter().map(|link| link.limits(&self.limits)).collect()
+    }
+
+    /// Adds to a failure because of too little shared memory that a link needs less once its family is set, if there is one whose
+    /// family is searched for.
+    pub fn with_remedy(&self, failure: Failure) -> Failure {
+        match self.memory_remedy() {
+            Some(remedy) => Failure { hint: format!("{}; {remedy}", failure.hint), ..failure },
+            None => failure,
+        }
+    }
+
+    /// Returns how links need less shared memory. `None` if the families of all are set.
+    pub fn memory_remedy(&self) -> Option<String> {
+        let link = self.links.iter().find(|link| link.family().is_none())?;
+        Some(format!(
+            "a named family needs less than auto: --set link.{}.family=lms, ld or rplidar",
+            link.name
+        ))
     }
 }
 

@@ -7,7 +7,7 @@ use std::path::Path;
 use config::Link;
 use port::{Alteration, Source};
 use scanhub_drivers::line::{Notice, Session as _};
-use scanhub_drivers::{Session, Trouble, line};
+use scanhub_drivers::{PortSession, Trouble, line, search};
 use schema::{MILLIS, Nanos, State, Status};
 
 use crate::byte_rate::{ByteRate, with_commas};
@@ -83,7 +83,7 @@ impl<'a> Diagnosis<'a> {
     }
 
     /// Looks at `session`, at `now`. The state of the link, and whether anything is new since the last look.
-    pub(crate) fn examine(&mut self, session: &Session, now: Nanos) -> (State, bool) {
+    pub(crate) fn examine(&mut self, session: &PortSession, now: Nanos) -> (State, bool) {
         if self.altered.take_if(|altered| now >= altered.until).is_some() {
             self.facts = None;
         }
@@ -112,7 +112,7 @@ impl<'a> Diagnosis<'a> {
     }
 
     /// Measures the rate of the bytes that arrive at `now`. Returns it while the session is missing something.
-    fn measure(&mut self, session: &Session, now: Nanos) -> Option<u64> {
+    fn measure(&mut self, session: &PortSession, now: Nanos) -> Option<u64> {
         if session.state() == line::State::Streaming {
             self.byte_rate = ByteRate::default();
             return None;
@@ -222,12 +222,12 @@ impl<'a> Diagnosis<'a> {
 
     /// Whether the port may go away again before it brings anything, as it did the last time: a serial server that
     /// serves somebody else takes each connection and closes it.
-    fn is_doubtful(&self, session: &Session) -> bool {
+    fn is_doubtful(&self, session: &PortSession) -> bool {
         let is_silent = session.account().read == 0 && session.trouble().is_none();
         !self.doubt.is_empty() && is_silent && session.state() == line::State::Probing
     }
 
-    fn trouble(&self, session: &Session) -> String {
+    fn trouble(&self, session: &PortSession) -> String {
         if self.is_doubtful(session) {
             return self.doubt.clone();
         }
@@ -260,6 +260,7 @@ impl<'a> Diagnosis<'a> {
         }
         match session.trouble() {
             // Another family's scanner may be connected, or one at a rate that this family does not have.
+            Some(Trouble::Search(trouble)) => self.search_trouble(trouble),
             Some(trouble) if session.missing().is_some() => self.with_probe(&trouble.to_string()),
             Some(trouble) => trouble.to_string(),
             None => self.mismatch(session).unwrap_or_else(|| match session.notice() {
@@ -287,18 +288,28 @@ impl<'a> Diagnosis<'a> {
     /// Returns `words` with a question and the command that probes the port, if it can be probed and the whole command fits
     /// into a status.
     fn try_probe(&self, words: &str, question: &str) -> String {
+        let message = |port: &str| format!("{words}{question} Try: scanhub probe {port}");
+        self.with_port(message).unwrap_or_else(|| words.to_owned())
+    }
+
+    /// Returns why the search finds no scanner, with the port if the message then fits into a status.
+    fn search_trouble(&self, trouble: search::Trouble) -> String {
+        self.with_port(|port| trouble.message(port)).unwrap_or_else(|| trouble.to_string())
+    }
+
+    /// Returns the message for the name of the port, or else for its device. `None` if the port cannot be probed, or no message
+    /// fits into a status.
+    fn with_port(&self, message: impl Fn(&str) -> String) -> Option<String> {
         let ports = match self.link.port {
             Source::Tty(_) | Source::Tcp { .. } => vec![Some(self.link.port.name()), self.device.clone()],
             _ => Vec::new(),
         };
-        let message = |port: String| format!("{words}{question} Try: scanhub probe {port}");
-        let mut messages = ports.into_iter().flatten().map(message);
-        let whole = messages.find(|message| message.len() <= Status::MAX_ERROR_LEN);
-        whole.unwrap_or_else(|| words.to_owned())
+        let mut messages = ports.into_iter().flatten().map(|port| message(&port));
+        messages.find(|message| message.len() <= Status::MAX_ERROR_LEN)
     }
 
     /// Returns how the configuration differs from what the scanner reports.
-    fn mismatch(&self, session: &Session) -> Option<String> {
+    fn mismatch(&self, session: &PortSession) -> Option<String> {
         let Link { name, scanner, .. } = self.link;
         let units = session.unit_mm().zip(scanner.settings.unit_mm);
         if let Some((is, expected)) = units.filter(|(is, expected)| is != expected) {
@@ -334,7 +345,7 @@ impl<'a> Diagnosis<'a> {
 }
 
 /// The word for how far `session` is.
-fn state_of(session: &Session) -> State {
+fn state_of(session: &PortSession) -> State {
     match session.state() {
         line::State::Probing => State::Probing,
         line::State::Switching => State::Switching,

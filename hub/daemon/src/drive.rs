@@ -11,17 +11,19 @@
 //!
 //! Nothing on this way allocates, locks or logs. Refuses to know how the port came to be open.
 
+use std::fmt;
 use std::io;
 
 use port::{Allowance, LineErrors, Source};
-use scanhub_drivers::Session;
+use scanhub_drivers::PortSession;
 use scanhub_drivers::line::{Event, Identity, Output, Protocol as _, Session as _, suspect};
-use schema::{Nanos, State};
+use scanhub_drivers::search::{Memory, Search};
+use schema::{MILLIS, Nanos, State};
 
 use crate::backlog::Backlog;
 use crate::control::Flow;
 use crate::identity_cache::IdentityCache;
-use crate::learned::KnownRate;
+use crate::learned::{KnownRate, KnownScanner};
 use crate::link::LinkCore;
 use crate::process_telegram::RecordedContext;
 use crate::settings_check::SettingsCheck;
@@ -40,6 +42,10 @@ pub(crate) struct Drive<'a, S: Surroundings> {
     follows_by: Nanos,
     /// Where the sensor was found the last time that it had to be sought.
     found: Option<KnownRate>,
+    /// The scanner that the search found last, in this run of the hub or an earlier one.
+    scanner: Option<KnownScanner>,
+    /// Whether the log names that scanner.
+    is_named: bool,
     /// In how many pieces a telegram is read, as of the last scan: as many as who follows early warnings wants.
     pieces: u8,
 }
@@ -47,7 +53,7 @@ pub(crate) struct Drive<'a, S: Surroundings> {
 /// A session on an open line, and what it waits for.
 pub(crate) struct Open<L> {
     pub(crate) line: L,
-    pub(crate) session: Session,
+    pub(crate) session: PortSession,
     /// What may be read; nothing where all may.
     allowance: Option<Allowance>,
     /// What waited in the port when it was opened, until all of it was read.
@@ -64,7 +70,7 @@ pub(crate) struct Open<L> {
 
 impl<L: Line> Open<L> {
     /// `session` on `line`, which was opened at `now`; at its nominal `baud` it brings no more than twice that.
-    pub(crate) fn new(line: L, session: Session, baud: u32, now: Nanos) -> Open<L> {
+    pub(crate) fn new(line: L, session: PortSession, baud: u32, now: Nanos) -> Open<L> {
         let allowance = line.allowance(baud);
         let backlog = Backlog::new(line.waiting().unwrap_or(0), now);
         let settings_check = SettingsCheck::default();
@@ -89,6 +95,8 @@ impl<'a, S: Surroundings> Drive<'a, S> {
             behind_at: None,
             follows_by: Nanos::MAX,
             found: None,
+            scanner: known_scanner(core),
+            is_named: false,
             pieces: 1,
         }
     }
@@ -108,6 +116,24 @@ impl<'a, S: Surroundings> Drive<'a, S> {
     pub(crate) fn last_rate(&self, core: &LinkCore<'a, S>) -> Option<KnownRate> {
         let kept = || rates(core)?.rate(&core.link.port.name());
         self.found.or_else(kept).filter(|_| is_tty(core))
+    }
+
+    /// Returns the scanner with which a search begins.
+    pub(crate) fn memory(&self, core: &LinkCore<'a, S>) -> Option<Memory> {
+        self.scanner.as_ref().filter(|_| core.link.family().is_none()).map(|scanner| scanner.memory)
+    }
+
+    /// Returns the rate at which to open the port of `core`.
+    pub(crate) fn opening_rate(&self, core: &LinkCore<'a, S>) -> u32 {
+        match core.link.family() {
+            Some(_) => core.link.rate(),
+            None => Search::opening_rate(self.memory(core)),
+        }
+    }
+
+    /// Returns whether the port cannot have this rate.
+    pub(crate) fn is_refused(&self, baud: u32) -> bool {
+        self.refused.contains(&baud)
     }
 
     /// Goes on after a wait that ended as `woken` says; an error says that the line is gone.
@@ -149,7 +175,7 @@ impl<'a, S: Surroundings> Drive<'a, S> {
     fn read(&mut self, core: &mut LinkCore<'a, S>, open: &mut Open<S::Line>) -> io::Result<()> {
         let Open { line, session, allowance, backlog, settings_check, watch, until, .. } = open;
         let around = core.around;
-        if !*watch && session.features().has_whole_telegrams {
+        if !*watch && session.features().is_some_and(|features| features.has_whole_telegrams) {
             // The end of the telegram is near, so do now what can be done before it. Packets end all the time.
             core.output.prepare();
         }
@@ -201,7 +227,9 @@ impl<'a, S: Surroundings> Drive<'a, S> {
                 Output::SetRate(baud) => {
                     // Setting the rate hides what another process has changed.
                     restore(core, line, baud)?;
-                    self.set_baud(core, line, baud)?;
+                    if !self.set_baud(core, line, baud)? {
+                        session.reject_rate(around.now());
+                    }
                     // What waited is discarded.
                     open.backlog = None;
                     open.settings_check.pass();
@@ -238,7 +266,12 @@ impl<'a, S: Surroundings> Drive<'a, S> {
                     (published, is_scan) = (true, true);
                 }
                 Output::Rest(until) => break (false, until),
-                Output::Wait { until, .. } => break (true, until),
+                Output::Wait { until, .. } => {
+                    if !session.advance() {
+                        break (true, until);
+                    }
+                    core.output.topics.set_family(session.family());
+                }
             }
         };
         if published {
@@ -271,6 +304,7 @@ impl<'a, S: Surroundings> Drive<'a, S> {
         }
         if (is_new || core.is_due(now)) && core.show_session(session, state) {
             self.identity.keep(session, around.now());
+            self.note_scanner(core, session, now);
             if core.stops_when_idle() {
                 session.set_has_subscribers(around.now(), core.output.topics.is_followed());
                 // What follows from it is done at once, after an empty look at the line.
@@ -292,16 +326,71 @@ impl<'a, S: Surroundings> Drive<'a, S> {
         }
     }
 
-    /// Sets the rate. Logs once that the port cannot have it; the search then leaves that rate out.
-    fn set_baud(&mut self, core: &LinkCore<'a, S>, line: &S::Line, baud: u32) -> io::Result<()> {
-        if let Some(error) = line.set_baud(baud)?
-            && !self.refused.contains(&baud)
-        {
+    /// Sets the rate. Returns whether the port can have it; the search leaves out a rate that it cannot have.
+    fn set_baud(&mut self, core: &LinkCore<'a, S>, line: &S::Line, baud: u32) -> io::Result<bool> {
+        let error = line.set_baud(baud)?;
+        error.iter().for_each(|error| self.refuse(core, baud, error));
+        Ok(error.is_none())
+    }
+
+    /// Logs once why the port cannot have this rate.
+    pub(crate) fn refuse(&mut self, core: &LinkCore<'a, S>, baud: u32, error: &dyn fmt::Display) {
+        if !self.refused.contains(&baud) {
             self.refused.push(baud);
             tracing::warn!("{}: {error}", core.link.name);
         }
-        Ok(())
     }
+
+    /// Saves the scanner that a search has found and that streams, and logs it once its model is known.
+    fn note_scanner(&mut self, core: &LinkCore<'a, S>, session: &PortSession, now: Nanos) {
+        let Some(memory) = session.memory() else { return };
+        let (link, status) = (core.link, core.stats.last());
+        let before = self.scanner.as_ref();
+        let is_same_family = before.is_some_and(|before| before.memory.family == memory.family);
+        let known_model = before.filter(|_| is_same_family).and_then(|before| before.model.clone());
+        let reported = status.model();
+        let is_reported = reported.is_some() || now >= status.since_ns + UNNAMED;
+        let scanner = KnownScanner { memory, model: reported.or_else(|| known_model.clone()) };
+        let is_other =
+            before.is_some() && (!is_same_family || known_model.is_some() && known_model != scanner.model);
+        if is_reported && (is_other || !self.is_named) {
+            self.is_named = true;
+            let name = name_of(&scanner);
+            match before.filter(|_| is_other) {
+                Some(before) => tracing::info!("{}: was {}, is now {name}", link.name, name_of(before)),
+                None if is_tty(core) => {
+                    tracing::info!("{}: found {name} at {} baud", link.name, session.rate());
+                }
+                None => tracing::info!("{}: found {name}", link.name),
+            }
+            if session.model().is_none() && link.scanner.settings.beams.is_some() {
+                tracing::info!(
+                    "{}: {name} has its own number of beams: link.{}.beams is not used",
+                    link.name,
+                    link.name
+                );
+            }
+        } else if !is_reported && is_other {
+            // The log names both scanners once the model of this one is known.
+            return;
+        }
+        if self.scanner.as_ref() != Some(&scanner) {
+            if let Some(learned) = core.around.learned() {
+                learned.keep_scanner(&link.port.name(), scanner.clone());
+            }
+            self.scanner = Some(scanner);
+        }
+    }
+}
+
+/// Returns the model, or else the family.
+fn name_of(scanner: &KnownScanner) -> &str {
+    scanner.model.as_deref().unwrap_or(scanner.memory.family.name())
+}
+
+/// Returns the scanner that an earlier run of the hub has found at the port of `core`.
+fn known_scanner<S: Surroundings>(core: &LinkCore<'_, S>) -> Option<KnownScanner> {
+    core.around.learned().and_then(|learned| learned.scanner(&core.link.port.name()))
 }
 
 /// Makes the hub's settings of `line` again, at `baud`, if another process has changed them; returns whether it has.
@@ -317,6 +406,9 @@ fn restore<S: Surroundings>(core: &mut LinkCore<'_, S>, line: &S::Line, baud: u3
 fn rates<'a, S: Surroundings>(core: &LinkCore<'a, S>) -> Option<&'a dyn Learned> {
     core.around.learned().filter(|_| is_tty(core))
 }
+
+/// Time for which the log waits for the model of a scanner that streams.
+const UNNAMED: Nanos = 10_000 * MILLIS;
 
 /// Whether the rate of the line can be changed.
 fn is_tty<S: Surroundings>(core: &LinkCore<'_, S>) -> bool {

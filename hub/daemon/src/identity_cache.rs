@@ -3,7 +3,7 @@
 //! once a second while the sensor streams. Refuses to know what of a sensor is worth to be known, where the record lies, and
 //! whether the line was its own all the while.
 
-use scanhub_drivers::Session;
+use scanhub_drivers::PortSession;
 use scanhub_drivers::line::{Identity, Session as _};
 use schema::{MILLIS, Nanos};
 
@@ -36,14 +36,14 @@ impl<'a, S: Surroundings> IdentityCache<'a, S> {
     }
 
     /// Keeps what `session` knows `now`, if that is worth it.
-    pub(crate) fn keep(&mut self, session: &Session, now: Nanos) {
+    pub(crate) fn keep(&mut self, session: &PortSession, now: Nanos) {
         if let Some(identity) = session.identity() {
             self.write(identity, now);
         }
     }
 
     /// As soon as anything is known; then [`keep`](Self::keep) keeps it new.
-    pub(crate) fn keep_first(&mut self, session: &Session) {
+    pub(crate) fn keep_first(&mut self, session: &PortSession) {
         if self.identity.is_none() {
             self.keep(session, self.around.now());
         }

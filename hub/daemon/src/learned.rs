@@ -1,10 +1,11 @@
 //! What a hub has learned of its sensors, kept for the next one: their backgrounds, without which whoever stands there while
-//! that one starts is background, and for seconds nobody is foreground; and the rates at which they were found. Links hand it
+//! that one starts is background, and for seconds nobody is foreground; the rates at which they were found, and which scanners. Links hand it
 //! on between two scans; it is written when it is worth it. Time is an argument. Refuses to know how a background is learned,
 //! and how long a disk takes.
 
 mod file;
 mod rate;
+mod scanner;
 mod writer;
 
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -19,6 +20,7 @@ use crate::event_fd::EventFd;
 use crate::surroundings::Learned;
 use file::KeptBackground;
 pub use rate::KnownRate;
+pub use scanner::KnownScanner;
 pub(crate) use writer::Writer;
 
 /// Where texts are kept under names between two hubs.
@@ -89,6 +91,8 @@ struct Slot {
     kept_wall_ns: AtomicU64,
     /// Rate and port, and whether that is to be written.
     rate: Mutex<(Option<(KnownRate, String)>, bool)>,
+    /// Scanner and port, and whether they are to be written.
+    scanner: Mutex<(Option<(KnownScanner, String)>, bool)>,
 }
 
 /// The slot of one link.
@@ -124,6 +128,7 @@ impl<F: Files> Keeper<F> {
             model: Mutex::default(),
             kept_wall_ns: AtomicU64::new(recall(link, &files, wall_ns)),
             rate: Mutex::new((known_rate(link, &files), false)),
+            scanner: Mutex::new((known_scanner(link, &files), false)),
         };
         let slots: Vec<_> = config.links.iter_mut().filter(is_live).map(slot).collect();
         if slots.is_empty() {
@@ -145,6 +150,7 @@ impl<F: Files> Keeper<F> {
         let mut until = Nanos::MAX;
         for (slot, file) in self.slots.slots.iter().zip(&mut self.written) {
             slot.write_rate(&self.files);
+            slot.write_scanner(&self.files);
             file.waiting = held(&slot.model).take().or(file.waiting.take());
             let Some((pose, model)) = &file.waiting else { continue };
             if !is_last && file.generation == Some(model.generation) && now < file.due {
@@ -184,6 +190,20 @@ impl Learned for Handle<'_> {
     fn rate(&self, port: &str) -> Option<KnownRate> {
         let (known, _) = &*held(&self.slot.rate);
         known.as_ref().filter(|(_, of)| of == port).map(|(rate, _)| *rate)
+    }
+
+    fn scanner(&self, port: &str) -> Option<KnownScanner> {
+        let (known, _) = &*held(&self.slot.scanner);
+        known.as_ref().filter(|(_, of)| of == port).map(|(scanner, _)| scanner.clone())
+    }
+
+    fn keep_scanner(&self, port: &str, scanner: KnownScanner) {
+        let news = (Some((scanner, port.to_owned())), true);
+        let mut known = held(&self.slot.scanner);
+        if known.0 != news.0 {
+            *known = news;
+            self.slots.event.signal();
+        }
     }
 
     fn keep_rate(&self, port: &str, rate: KnownRate) {
@@ -231,6 +251,32 @@ impl Slot {
             tracing::warn!("{}: {}; {}", self.sensor, failure.message, failure.hint);
         }
     }
+
+    /// Writes the scanner, if it is new. The slot is free while the disk is written.
+    fn write_scanner(&self, files: &impl Files) {
+        let text = {
+            let mut known = held(&self.scanner);
+            let is_news = std::mem::take(&mut known.1);
+            known.0.as_ref().filter(|_| is_news).map(|(scanner, port)| scanner::text(scanner, port))
+        };
+        if let Some(text) = text
+            && let Err(failure) = files.write(&scanner_of(&self.sensor), &text)
+        {
+            tracing::warn!("{}: {}; {}", self.sensor, failure.message, failure.hint);
+        }
+    }
+}
+
+/// Returns the scanner that the search of `link` found last, and its port.
+fn known_scanner(link: &Link, files: &impl Files) -> Option<(KnownScanner, String)> {
+    if link.family().is_some() {
+        return None;
+    }
+    let text = files.read(&scanner_of(&link.name), rate::LONGEST).unwrap_or_else(|failure| {
+        tracing::warn!("{}: {}; {}", link.name, failure.message, failure.hint);
+        None
+    })?;
+    scanner::read(&text).map(|(scanner, port)| (scanner, port.to_owned()))
 }
 
 /// Lets `link` begin with what is kept for it, if it fits and nothing else was said; when that was written, else 0.
@@ -286,6 +332,10 @@ fn background_of(sensor: &str) -> String {
     format!("{sensor}.background.json")
 }
 
+fn scanner_of(sensor: &str) -> String {
+    format!("{sensor}.scanner")
+}
+
 fn rate_of(sensor: &str) -> String {
     format!("{sensor}.rate")
 }
@@ -327,6 +377,36 @@ mod tests {
         // What cannot be believed is as good as nothing.
         state.write("front.rate", &"9".repeat(10_000)).unwrap();
         assert_eq!(known("front", port), None);
+    }
+
+    #[test]
+    fn a_scanner_is_known_of_this_link_at_this_port() {
+        let root = tempfile::tempdir().unwrap();
+        let state = StateDirectory::at(root.path().join("state"));
+        let begin = |link: &str| {
+            let sources = Sources { links: vec![link.to_owned()], ..Sources::default() };
+            let config = Config::load(&sources).expect("a configuration");
+            Keeper::begin(config, state.clone(), 0).expect("descriptors").1.expect("a live link")
+        };
+        let memory = scanhub_drivers::search::Memory {
+            family: schema::Family::Ld,
+            stream_rate: 921_600,
+            reply_rate: 921_600,
+        };
+        let scanner = KnownScanner { memory, model: Some("stl27l".to_owned()) };
+        let mut keeper = begin("front=/dev/x,family=auto");
+        keeper.slots().of("front").expect("a slot").keep_scanner("/dev/x", scanner.clone());
+        keeper.turn(1, 1, true);
+        for (link, port, expected) in [
+            ("front=/dev/x,family=auto", "/dev/x", Some(&scanner)),
+            ("front=/dev/y,family=auto", "/dev/y", None),
+            ("rear=/dev/x,family=auto", "/dev/x", None),
+            ("front=/dev/x,family=ld", "/dev/x", None),
+        ] {
+            let name = &link[..link.find('=').expect("a link")];
+            let known = begin(link).slots().of(name).and_then(|slot| slot.scanner(port));
+            assert_eq!(known.as_ref(), expected, "{link}");
+        }
     }
 
     #[test]

@@ -31,7 +31,7 @@ mod system;
 mod topics;
 
 pub use control::{ControlQueue, Orders, Outcome};
-pub use learned::{Files, Handle, Keeper, KnownRate, Slots};
+pub use learned::{Files, Handle, Keeper, KnownRate, KnownScanner, Slots};
 pub use player::{Pace, Play, Player, Progress};
 pub use reconnect::LiveLink;
 pub use reload::{Read, Reload};

@@ -2,7 +2,7 @@
 //! when it has to do something although nothing came. Refuses to know where bytes come from, and how a wait is done.
 
 use config::{Link, Processing};
-use scanhub_drivers::Session;
+use scanhub_drivers::PortSession;
 use scanhub_drivers::line::{Control, RawScan, Received};
 use schema::{Failure, MILLIS, Nanos, Shown, State, Verb, Wake};
 
@@ -67,7 +67,7 @@ impl<'a, S: Surroundings> LinkCore<'a, S> {
     }
 
     /// The `session` on the port is over.
-    pub(crate) fn close(&mut self, session: &Session) {
+    pub(crate) fn close(&mut self, session: &PortSession) {
         self.diagnosis.end_flood();
         self.output.foresee(None);
         self.stats.close(session);
@@ -127,20 +127,31 @@ impl<'a, S: Surroundings> LinkCore<'a, S> {
 
     /// Publishes the status if it changed or is due, and greets late joiners; `error` is what is wrong, in words. Whether a
     /// status went out.
-    pub(crate) fn show(&mut self, session: Option<&Session>, state: State, error: &str) -> bool {
+    pub(crate) fn show(&mut self, session: Option<&PortSession>, state: State, error: &str) -> bool {
         let now = self.around.now();
         let changed = update(&mut self.stats, self.link, state, error, now);
         self.publish_status(session, state, changed, now)
     }
 
     /// As [`show`](Self::show), of a `session` that was examined: what is wrong is for [`Diagnosis`] to say.
-    pub(crate) fn show_session(&mut self, session: &Session, state: State) -> bool {
+    pub(crate) fn show_session(&mut self, session: &PortSession, state: State) -> bool {
         let now = self.around.now();
-        let changed = update(&mut self.stats, self.link, state, self.diagnosis.explanation(), now);
+        let error = self.diagnosis.explanation();
+        let changed = if session.family().is_some() {
+            update(&mut self.stats, self.link, state, error, now)
+        } else {
+            update_search(&mut self.stats, self.link, state, error, now)
+        };
         self.publish_status(Some(session), state, changed, now)
     }
 
-    fn publish_status(&mut self, session: Option<&Session>, state: State, changed: bool, now: Nanos) -> bool {
+    fn publish_status(
+        &mut self,
+        session: Option<&PortSession>,
+        state: State,
+        changed: bool,
+        now: Nanos,
+    ) -> bool {
         let is_due = changed || now >= self.next_status;
         if is_due {
             self.next_status = now + STATUS_PERIOD;
@@ -246,6 +257,21 @@ fn update(stats: &mut LinkStats, link: &Link, state: State, error: &str, now: Na
     changed
 }
 
+/// As [`update`], while the scanner is searched for. The number of bytes per second in an error may change often, so errors are
+/// logged at most once a minute.
+fn update_search(stats: &mut LinkStats, link: &Link, state: State, error: &str, now: Nanos) -> bool {
+    if error.is_empty() || now >= stats.next_search_log {
+        let changed = update(stats, link, state, error, now);
+        if changed && !error.is_empty() {
+            stats.next_search_log = now + SEARCH_LOG_PERIOD;
+        }
+        return changed;
+    }
+    stats.update(state, error, now)
+}
+
+/// Minimum time between two log lines about a search.
+const SEARCH_LOG_PERIOD: Nanos = 60_000 * MILLIS;
 /// A port that is left alone is looked at so often whether it is still there; at the highest rate no rest is as long.
 const LONGEST_REST: Nanos = 40 * MILLIS;
 /// A status goes out at least so often.

@@ -1,9 +1,9 @@
 //! What a link reports of itself: the state of a session and the hub's own counts as the payload of topic `status`.
 
 use config::Link;
-use scanhub_drivers::Session;
+use scanhub_drivers::PortSession;
 use scanhub_drivers::line::Session as _;
-use schema::{Counter, Counters, MIN_RATE_SPAN, Nanos, Pose, State, Status};
+use schema::{Counter, Counters, Family, MIN_RATE_SPAN, Nanos, Pose, State, Status};
 
 use crate::process_telegram::Processed;
 use crate::recent::{LineHealth, Recent};
@@ -30,12 +30,14 @@ pub(crate) struct LinkStats {
     pub(crate) reconnects: u64,
     /// Errors that the line's driver counted.
     pub(crate) line_errors: u64,
+    /// Earliest time of the next log line about a search.
+    pub(crate) next_search_log: Nanos,
 }
 
 impl LinkStats {
     pub(crate) fn new(link: &Link, now: Nanos) -> Self {
         let mut status = Status { since_ns: now, pose: link.processing.pose, ..Status::default() };
-        status.family = link.family() as u8;
+        status.family = number_of(link.family());
         status.set_port(&link.port.name());
         LinkStats {
             status,
@@ -49,6 +51,7 @@ impl LinkStats {
             suspect: 0,
             reconnects: 0,
             line_errors: 0,
+            next_search_log: 0,
         }
     }
 
@@ -66,7 +69,7 @@ impl LinkStats {
     }
 
     /// The status with everything that `session`, if there is one, knows.
-    pub(crate) fn status(&mut self, session: Option<&Session>, loan_failed: u64, now: Nanos) -> &Status {
+    pub(crate) fn status(&mut self, session: Option<&PortSession>, loan_failed: u64, now: Nanos) -> &Status {
         let mut counters = self.past;
         match session {
             Some(session) => {
@@ -110,6 +113,11 @@ impl LinkStats {
         self.past[Counter::Telegrams] += 1;
     }
 
+    /// Sets the family of a recording.
+    pub(crate) fn set_family(&mut self, family: Family) {
+        self.status.family = family as u8;
+    }
+
     /// The sensor sits elsewhere, or so it is said now.
     pub(crate) fn set_pose(&mut self, pose: Pose) {
         self.status.pose = pose;
@@ -131,14 +139,15 @@ impl LinkStats {
     }
 
     /// The session is over: its counters stay.
-    pub(crate) fn close(&mut self, session: &Session) {
+    pub(crate) fn close(&mut self, session: &PortSession) {
         self.describe(session);
         session.add_counters(&mut self.past);
         self.past[Counter::BytesDiscarded] += session.account().buffered;
         self.past[Counter::BytesBuffered] = 0;
     }
 
-    fn describe(&mut self, session: &Session) {
+    fn describe(&mut self, session: &PortSession) {
+        self.status.family = number_of(session.family());
         let known_rate = matches!(self.status.state(), Some(State::Streaming | State::Starting));
         self.status.baud = if known_rate { session.rate() } else { 0 };
         session.describe(&mut self.status);
@@ -146,6 +155,11 @@ impl LinkStats {
             self.status.mode = self.mode.unwrap_or(Status::MODE_UNKNOWN);
         }
     }
+}
+
+/// Returns the number of `family` in a status.
+fn number_of(family: Option<Family>) -> u8 {
+    family.map_or(Family::UNKNOWN, |family| family as u8)
 }
 
 /// The rate is that of the last seconds.

@@ -4,7 +4,7 @@
 use std::io;
 
 use port::{PortError, Source};
-use scanhub_drivers::Session;
+use scanhub_drivers::PortSession;
 use scanhub_drivers::line::{Control, Identity, Session as _};
 use schema::{Failure, Flags, MILLIS, Nanos, State};
 
@@ -127,9 +127,9 @@ impl<'a, S: Surroundings> LiveLink<'a, S> {
 
     /// The line at the hub's start, and whether it is the one that a killed hub had and somebody kept, with what lies in it;
     /// nothing if a connection has to be made.
-    fn first_line(&self) -> Result<Option<(S::Line, bool)>, PortError> {
+    fn first_line(&mut self) -> Result<Option<(S::Line, bool)>, PortError> {
         let (link, around) = (self.core.link, self.core.around);
-        let (name, source, baud) = (&link.name, &link.port, link.rate());
+        let (name, source, baud) = (&link.name, &link.port, self.drive.opening_rate(&self.core));
         if let Source::Tcp { .. } = source {
             return Ok(None);
         }
@@ -137,10 +137,22 @@ impl<'a, S: Surroundings> LiveLink<'a, S> {
             tracing::info!("{name}: continues with {}, which the service manager kept open", source.name());
             return Ok(Some((line, true)));
         }
-        match around.open(source, baud) {
+        match self.open_line(baud) {
             Some(Ok(line)) => Ok(Some((line, false))),
             Some(Err(error)) => Err(error),
             None => Ok(None),
+        }
+    }
+
+    /// Opens the port at `baud`. A search leaves out a rate that the port cannot have, so then it gets a port at another rate.
+    fn open_line(&mut self, baud: u32) -> Option<Result<S::Line, PortError>> {
+        let LinkCore { link, around, .. } = self.core;
+        match around.open(&link.port, baud) {
+            Some(Err(error @ PortError::Rate { .. })) if link.family().is_none() => {
+                self.drive.refuse(&self.core, baud, &error);
+                around.open(&link.port, SLOWEST)
+            }
+            opened => opened,
         }
     }
 
@@ -148,7 +160,7 @@ impl<'a, S: Surroundings> LiveLink<'a, S> {
     fn reach(&mut self) {
         let (link, around) = (self.core.link, self.core.around);
         let mut away = self.phase.take_away();
-        match around.open(&link.port, link.rate()) {
+        match self.open_line(self.drive.opening_rate(&self.core)) {
             Some(Ok(line)) => {
                 self.open(line, None);
                 self.begin();
@@ -168,7 +180,12 @@ impl<'a, S: Surroundings> LiveLink<'a, S> {
         core.around.keep(&core.link.name, &line);
         core.diagnosis.open(line.device());
         core.output.topics.set_flags(if line.is_simulated() { Flags::SIMULATED } else { 0 });
-        let mut session = Session::begin(core.link.family(), &core.link.settings(), now);
+        let (family, memory) = (core.link.family(), self.drive.memory(core));
+        let mut session = PortSession::begin(family, &core.link.settings(), memory, now);
+        core.output.topics.set_family(family);
+        if family.is_none() && self.drive.is_refused(self.drive.opening_rate(core)) {
+            session.reject_rate(now);
+        }
         if let Some(known) = known {
             session.restore_identity(known);
         }
@@ -304,6 +321,8 @@ fn said(failure: Failure) -> String {
     format!("{}; {}", failure.message, failure.hint)
 }
 
+/// Every port can have this rate, in bits per second.
+const SLOWEST: u32 = 9_600;
 /// Between two looks for a port that is away.
 const LOOK: Nanos = 100 * MILLIS;
 /// Times that the pause between two looks doubles.

@@ -9,7 +9,7 @@ use std::os::fd::AsFd;
 use std::path::Path;
 
 use port::clock;
-use scanhub_drivers::Session;
+use scanhub_drivers::PortSession;
 use schema::{Failure, Flags, MILLIS, Nanos, State};
 
 use crate::control::Flow;
@@ -77,7 +77,9 @@ struct ReplayLink<'a, 'p> {
 }
 
 impl<'a, 'p> ReplayLink<'a, 'p> {
-    fn new(link: LinkCore<'a, System<'a>>, recorded: &Recorded, handle: PlayerHandle<'p>) -> Self {
+    fn new(mut link: LinkCore<'a, System<'a>>, recorded: &Recorded, handle: PlayerHandle<'p>) -> Self {
+        link.output.topics.set_family(Some(recorded.family()));
+        link.stats.set_family(recorded.family());
         let trouble = recorded.trouble(&link.link.name);
         ReplayLink { link, handle, trouble, look_at: 0 }
     }
@@ -134,7 +136,7 @@ impl<'a, 'p> ReplayLink<'a, 'p> {
     }
 
     /// Waits for the turn of what is of `media`; meanwhile the link's state is `state`. Nothing if the hub shall end.
-    fn wait_turn(&mut self, session: Option<&Session>, media: Nanos, state: State) -> Option<Due> {
+    fn wait_turn(&mut self, session: Option<&PortSession>, media: Nanos, state: State) -> Option<Due> {
         loop {
             let now = clock::now();
             if self.handle.flows() && now < self.look_at {

@@ -106,7 +106,7 @@ pub(crate) fn serve(
     // What is known of sensors is no recording's.
     let state = StateDirectory::of_domain(domain.name()).filter(|_| set.is_none());
     preflight::check_descriptors(config.links.len())?;
-    preflight::check_memory(&config.topic_limits())?;
+    preflight::check_memory(&config.topic_limits()).map_err(|failure| config.with_remedy(failure))?;
     // Ends after the links: it writes what they had learned last.
     let (config, keeper) = begin(config, state)?;
     let writer = keeper.map(Writer::start).transpose()?;

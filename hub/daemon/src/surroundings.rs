@@ -10,7 +10,7 @@ use schema::ipc::{Medium, Payload};
 use schema::{Background, Failure, Nanos, Pose, Ring, Wake};
 
 use crate::control::ControlQueue;
-use crate::learned::KnownRate;
+use crate::learned::{KnownRate, KnownScanner};
 
 /// What one link has around it.
 pub trait Surroundings {
@@ -86,6 +86,12 @@ pub trait Learned {
 
     /// Returns the rate at which the scanner at `port` was found the last time that it had to be searched for.
     fn rate(&self, port: &str) -> Option<KnownRate>;
+
+    /// Returns the scanner that a search found at `port` the last time.
+    fn scanner(&self, port: &str) -> Option<KnownScanner>;
+
+    /// Saves the `scanner` that a search found at `port`.
+    fn keep_scanner(&self, port: &str, scanner: KnownScanner);
 
     /// Saves the `rate` at which the scanner at `port` was found.
     fn keep_rate(&self, port: &str, rate: KnownRate);

@@ -78,9 +78,9 @@ impl<'a, S: Surroundings> Topics<'a, S> {
         self.header.flags = flags;
     }
 
-    /// Of which family the sensor is.
-    pub(crate) fn set_family(&mut self, family: Family) {
-        self.header.family = family as u8;
+    /// Sets the family of the scanner. `None`: it is searched for.
+    pub(crate) fn set_family(&mut self, family: Option<Family>) {
+        self.header.family = family.map_or(Family::UNKNOWN, |family| family as u8);
     }
 
     /// What is published from now on, until the next call, was recorded at `wall_ns`, and has these [`Flags`].

@@ -221,7 +221,8 @@ pub fn examine(
         _ => vec![TopicLimits::default(); ports.len().max(1)],
     };
     let facts = Facts::gather(domain, &subjects.places, limits, hub.as_ref());
-    tell(machine::memory(&facts));
+    let config = subjects.config.as_ref().and_then(|config| config.as_ref().ok());
+    tell(machine::memory(&facts, config.and_then(config::Config::memory_remedy)));
     tell(machine::domain(&facts));
     tell(machine::hubs(&facts, |user| system.name_of(user)));
     tell(shared_memory::strangers(&ipc::strangers(domain.root()), |user| system.name_of(user)));

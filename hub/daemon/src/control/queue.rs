@@ -6,7 +6,7 @@ use std::sync::mpsc::{Receiver, Sender};
 use std::sync::{Arc, PoisonError};
 
 use config::Processing;
-use scanhub_drivers::Session;
+use scanhub_drivers::PortSession;
 use scanhub_drivers::line::{Control, Session as _};
 use schema::{Failure, Kind, Nanos};
 
@@ -28,7 +28,7 @@ pub struct ControlQueue {
 /// Who can be told to pause, to resume, to resync.
 pub(crate) enum Flow<'a> {
     /// A session with a sensor.
-    Session(&'a mut Session),
+    Session(&'a mut PortSession),
     /// Nobody, for now.
     Away,
     /// The player of a recording.

@@ -6,7 +6,7 @@
 
 use recording::{Frame, VirtualTime};
 use scanhub_drivers::line::{Event, RawScan, Received, Session as _, suspect};
-use scanhub_drivers::{Session, Settings};
+use scanhub_drivers::{PortSession, Settings};
 use schema::{Flags, Header, MILLIS, Nanos, State};
 
 use super::recorded::Frames;
@@ -72,7 +72,7 @@ struct Lap<'f> {
     /// Number of the first whole telegram whose values the hub could read in this run.
     understood_from: u64,
     /// The session that reads all whole telegrams, or the packets of this run.
-    session: Option<VirtualTime<Session>>,
+    session: Option<VirtualTime<PortSession>>,
     /// Stamp of the last published frame; stamps never go back.
     last_stamp: Nanos,
     verdict: Option<Verdict>,
@@ -146,12 +146,13 @@ impl Lap<'_> {
             let link = replay.link.link;
             let mode_number = self.frames.first_mode().map(|mode| mode.0);
             let settings = Settings { mode_number, ..link.settings() };
-            VirtualTime::new(Session::begin(link.family(), &settings, when.first), when.first)
+            let session = PortSession::begin(Some(self.frames.family), &settings, None, when.first);
+            VirtualTime::new(session, when.first)
         });
     }
 
     /// Returns the session that the status describes. A session that reads whole telegrams only decodes them.
-    fn shown_session(&self) -> Option<&Session> {
+    fn shown_session(&self) -> Option<&PortSession> {
         self.session.as_ref().filter(|_| !self.frames.is_whole).map(VirtualTime::session)
     }
 

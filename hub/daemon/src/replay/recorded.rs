@@ -6,8 +6,9 @@ use std::path::Path;
 
 use config::Link;
 use recording::{Encoding, Form, Frame, Recording};
+use scanhub_drivers::features;
 use scanhub_drivers::lms::variant::{Mode, Unit};
-use schema::{Failure, Header, Kind, Nanos};
+use schema::{Failure, Family, Header, Kind, Nanos};
 
 use super::LONGEST_GAP;
 
@@ -22,12 +23,14 @@ pub(crate) enum Recorded {
 /// A stream of telegrams, with whatever came between them.
 pub(crate) struct Stream {
     recording: Recording,
+    pub(super) family: Family,
     pub(super) mode: Option<Mode>,
 }
 
 /// Complete telegrams or packets, with their stamps.
 pub(crate) struct Frames {
     recording: Recording,
+    pub(super) family: Family,
     /// Whether they are telegrams that are a scan or a reply by themselves, and no packets.
     pub(super) is_whole: bool,
     /// Of a log the metres, of others nothing.
@@ -53,7 +56,7 @@ impl Recorded {
     /// [`Kind::Input`] if it cannot be read, [`Kind::Configuration`] if it has other sensors. A file without a telegram is a line
     /// that only brings noise.
     pub(crate) fn open(path: &Path, link: &Link) -> Result<Recorded, Failure> {
-        let recording = Recording::open_line(path, Some(link.family()))?;
+        let recording = Recording::open_line(path, link.family())?;
         tell_of_damage(&recording);
         if recording.contents().sensors.len() > 1 {
             // Its name is configured, and not a word of somebody who asks.
@@ -69,11 +72,12 @@ impl Recorded {
     /// [`Kind::Input`] if it is of a family that this version does not know, [`Kind::Configuration`] if it is not of the
     /// link's.
     pub(crate) fn new(recording: Recording, link: &Link) -> Result<Recorded, Failure> {
-        check_family(&recording, link)?;
-        if !link.scanner.features().has_whole_telegrams {
+        let family = check_family(&recording, link)?;
+        if !features(family).has_whole_telegrams {
             let encoding = Encoding { unit: Unit::Mm, mode: Mode(0) };
             let mut frames = Frames {
                 recording,
+                family,
                 is_whole: false,
                 encoding,
                 mode: None,
@@ -88,17 +92,25 @@ impl Recorded {
         let mode = contents.mode.or(configured_mode(link)).or(contents.readable());
         tell_of_mode(&recording, link);
         if recording.contents().form == Form::Telegrams {
-            return Ok(Recorded::Stream(Stream { recording, mode }));
+            return Ok(Recorded::Stream(Stream { recording, family, mode }));
         }
         let encoding = Encoding { unit: contents.unit.unwrap_or(Unit::Mm), mode: mode.unwrap_or(Mode(0)) };
         let mut frames =
-            Frames { recording, is_whole: true, encoding, mode, origin: None, is_told_later: false };
+            Frames { recording, family, is_whole: true, encoding, mode, origin: None, is_told_later: false };
         let mut first = frames.read()?.take(ASKED_WITHIN).peekable();
         frames.origin = first.peek().and_then(Origin::of);
         let begin = first.peek().and_then(|frame| frame.header).filter(is_first);
         let is_open = begin.is_some_and(|header| frames.recording.understood(header.boot).is_none());
         frames.is_told_later = is_open && first.any(|frame| frame.tells_mode());
         Ok(Recorded::Frames(frames))
+    }
+
+    /// Returns the family of the scanner.
+    pub(super) fn family(&self) -> Family {
+        match self {
+            Recorded::Stream(stream) => stream.family,
+            Recorded::Frames(frames) => frames.family,
+        }
     }
 
     /// Where its media time begins, of what has stamps.
@@ -123,8 +135,8 @@ impl Recorded {
 
     /// Why no scan can be read, in words; empty if they can.
     pub(super) fn trouble(&self, name: &str) -> String {
-        let (Recorded::Stream(Stream { mode, recording }) | Recorded::Frames(Frames { mode, recording, .. })) =
-            self;
+        let (Recorded::Stream(Stream { mode, recording, .. })
+        | Recorded::Frames(Frames { mode, recording, .. })) = self;
         if recording.contents().telegrams == 0 {
             return "there is no telegram in the recording".to_owned();
         }
@@ -288,10 +300,13 @@ impl Origin {
     }
 }
 
-/// Whether `recording` is of a scanner that `link` can be of.
-fn check_family(recording: &Recording, link: &Link) -> Result<(), Failure> {
-    if recording.contents().telegrams == 0 || recording.family() == Some(link.family()) {
-        return Ok(());
+/// Returns the family of the scanner: that of `link`, or that of `recording` if the link has none. They must be the same.
+fn check_family(recording: &Recording, link: &Link) -> Result<Family, Failure> {
+    let (set, recorded) = (link.family(), recording.family());
+    if let Some(family) = set.or(recorded)
+        && (recording.contents().telegrams == 0 || recorded == Some(family))
+    {
+        return Ok(family);
     }
     let (place, number) = (recording.path().display(), recording.contents().family);
     let Some(family) = recording.family() else {
@@ -303,7 +318,7 @@ fn check_family(recording: &Recording, link: &Link) -> Result<(), Failure> {
         "recording {place} is of a scanner of family {}, and link {} is of family {}",
         family.name(),
         link.name,
-        link.family().name()
+        set.map_or("auto", Family::name)
     );
     let hint = format!("set link.{}.family = \"{}\"", link.name, family.name());
     Err(Failure::new(Kind::Configuration, message, hint))

@@ -3,7 +3,7 @@
 
 use port::clock;
 use scanhub_drivers::line::{Event, Output, Protocol as _};
-use scanhub_drivers::{Session, Settings};
+use scanhub_drivers::{PortSession, Settings};
 use schema::{MILLIS, Nanos, State};
 
 use super::recorded::{Stream, read};
@@ -23,7 +23,7 @@ pub(super) fn play(replay: &mut ReplayLink<'_, '_>, stream: &Stream) -> Option<O
     };
     let link = replay.link.link;
     let settings = Settings { mode_number: stream.mode.map(|mode| mode.0), ..link.settings() };
-    let mut session = Session::begin(link.family(), &settings, clock::now());
+    let mut session = PortSession::begin(Some(stream.family), &settings, None, clock::now());
     let mut recorded = RecordedContext::default();
     let (mut media, mut limit) = (0, None);
     let state = if stream.has_telegrams() { State::Streaming } else { State::Probing };

@@ -141,7 +141,7 @@ type Examined = Result<(Option<u32>, Vec<Finding>), Finding>;
 /// Checks the scanner at `port`, which is open at `first`.
 fn ask(subject: &Subject, port: &Port, first: Baud, stop: &AtomicBool) -> Result<Examined, Failure> {
     let (source, link) = (&subject.source, subject.link.as_ref());
-    match probe::find(port, first, source, link.map(config::Link::family), stop, |_| {}) {
+    match probe::find(port, first, source, link.and_then(config::Link::family), stop, |_| {}) {
         Ok(Answer::Asked(report)) => Ok(Ok((None, sensor::check_lms(&source.name(), &report, link)))),
         Ok(Answer::Detected(heard)) => Ok(Ok((Some(heard.rate), sensor::check_rotating(&heard, link)))),
         Err(failure) if failure.kind == Kind::Interrupted => Err(failure),
@@ -264,13 +264,15 @@ fn latency(path: &Path, ms: Option<u8>) -> Finding {
 /// of the link.
 fn rate(subject: &Subject, port: &Port, first: Baud, found: Option<u32>) -> Finding {
     const NAME: &str = "rate";
-    let link_rate = subject.link.as_ref().map_or(Baud::B500000.rate(), config::Link::rate);
+    // The search for a scanner leaves out a rate that the port cannot have.
+    let link = subject.link.as_ref().filter(|link| link.family().is_some());
+    let link_rate = link.map_or(Baud::B500000.rate(), config::Link::rate);
     let wanted = found.unwrap_or(link_rate);
     let outcome = port.set_baud(wanted);
     let given = port.baud().filter(|&given| given != wanted);
     // The requests start at the rate at which the port was opened.
     let _ = port.set_baud(first.rate());
-    match (outcome, &subject.link) {
+    match (outcome, link) {
         (Ok(()), _) => {
             let near =
                 given.map_or(String::new(), |given| format!(": the driver sets {given} Bd, close enough"));

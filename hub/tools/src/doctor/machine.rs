@@ -163,8 +163,8 @@ impl Place {
     }
 }
 
-/// Checks whether shared memory has room for the links.
-pub(crate) fn memory(facts: &Facts) -> Finding {
+/// Checks whether shared memory has room for the links. `less` is how they need less, if they can.
+pub(crate) fn memory(facts: &Facts, less: Option<String>) -> Finding {
     const NAME: &str = "memory";
     let Some(Memory { size, free, free_files, is_read_only }) = facts.memory else {
         let remedy = format!("mount a tmpfs there: sudo mount -t tmpfs -o size=64M tmpfs {SHARED_MEMORY}");
@@ -198,6 +198,7 @@ pub(crate) fn memory(facts: &Facts) -> Finding {
             "make it larger: sudo mount -o remount,size=64M {SHARED_MEMORY}; of a container by --shm-size=64m"
         )
     };
+    let remedy = less.map_or(remedy.clone(), |less| format!("{remedy}; {less}"));
     Finding::failed(NAME, text, remedy)
 }
 
@@ -412,20 +413,22 @@ pub(super) mod tests {
 
     #[test]
     fn compares_memory_with_need_of_links() {
-        says(&memory(&facts()), State::Ok, &["61440 kB of them free", "2 links"]);
+        says(&memory(&facts(), None), State::Ok, &["61440 kB of them free", "2 links"]);
         let with = |memory: Memory| Facts { memory: Some(memory), ..facts() };
         let full = with(Memory { free: 1 << 10, ..ROOMY });
-        says(&memory(&full), State::Failed, &["1 kB of them free", "free some"]);
+        says(&memory(&full, None), State::Failed, &["1 kB of them free", "free some"]);
         let small = with(Memory { size: 1 << 20, free: 1 << 20, ..ROOMY });
-        says(&memory(&small), State::Failed, &["1024 kB", "remount", "--shm-size"]);
-        says(&memory(&Facts { hub: Ok(Some(5)), ..full }), State::Ok, &["the hub has"]);
-        says(&memory(&with(Memory { size: 0, free: 0, ..ROOMY })), State::Ok, &["no limit"]);
-        says(&memory(&Facts { memory: None, ..facts() }), State::Failed, &["mount -t tmpfs"]);
+        let less = Some("a named family needs less".to_owned());
+        says(&memory(&small, less), State::Failed, &["--shm-size=64m; a named family needs less"]);
+        says(&memory(&small, None), State::Failed, &["1024 kB", "remount", "--shm-size"]);
+        says(&memory(&Facts { hub: Ok(Some(5)), ..full }, None), State::Ok, &["the hub has"]);
+        says(&memory(&with(Memory { size: 0, free: 0, ..ROOMY }), None), State::Ok, &["no limit"]);
+        says(&memory(&Facts { memory: None, ..facts() }, None), State::Failed, &["mount -t tmpfs"]);
         let crowded = with(Memory { free_files: Some(9), ..ROOMY });
-        says(&memory(&crowded), State::Failed, &["room for 9 files", "nr_inodes"]);
-        says(&memory(&with(Memory { free_files: Some(900), ..ROOMY })), State::Ok, &["free"]);
+        says(&memory(&crowded, None), State::Failed, &["room for 9 files", "nr_inodes"]);
+        says(&memory(&with(Memory { free_files: Some(900), ..ROOMY }), None), State::Ok, &["free"]);
         let closed = with(Memory { is_read_only: true, ..ROOMY });
-        says(&memory(&closed), State::Failed, &["cannot be written", "remount,rw"]);
+        says(&memory(&closed, None), State::Failed, &["cannot be written", "remount,rw"]);
     }
 
     #[test]

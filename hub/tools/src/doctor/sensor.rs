@@ -444,7 +444,7 @@ mod tests {
             name: "front".into(),
             port: port::Source::Tty("/dev/ttyUSB0".into()),
             scanner: config::Scanner {
-                family: schema::Family::Lms,
+                family: Some(schema::Family::Lms),
                 expected_type: Some("lms291"),
                 settings: Settings { unit_mm: Some(10), ..Settings::default() },
             },

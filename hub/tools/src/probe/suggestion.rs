@@ -144,9 +144,9 @@ mod tests {
             let models = features(family).models;
             for model in models {
                 let link = loaded(&link("/dev/x", &[("family", family.name()), ("model", model.name)]));
-                assert_eq!((link.family(), link.scanner.model().name), (family, model.name));
+                assert_eq!((link.family(), link.scanner.model().name), (Some(family), model.name));
             }
-            assert_eq!(loaded(&link("/dev/x", &[("family", family.name())])).family(), family);
+            assert_eq!(loaded(&link("/dev/x", &[("family", family.name())])).family(), Some(family));
         }
         for kind in Type::ALL.into_iter().filter(|kind| kind.factory_variant().is_some()) {
             let suggested =

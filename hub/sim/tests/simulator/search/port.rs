@@ -5,7 +5,7 @@ use scanhub_drivers::line::{self, Account, Protocol as _, Session as _, State};
 use scanhub_drivers::lms::variant::Baud;
 use scanhub_drivers::search::Memory;
 use scanhub_drivers::{PortSession, Settings, ld};
-use schema::{Counter, Counters, Family, MILLIS, Nanos, Status};
+use schema::{Counter, Counters, Family, MICROS, MILLIS, Nanos, Status};
 use sim::device::Device;
 use sim::rplidar::Model;
 
@@ -208,4 +208,13 @@ fn a_silent_line_has_a_message() {
     let trouble = bench.host.session.trouble().map(|trouble| trouble.to_string());
     let expected = "no scanner replies (looked for lms, ld, rplidar for 10 s): power, cable?";
     assert_eq!(trouble.as_deref(), Some(expected));
+}
+
+#[test]
+fn bytes_of_no_scanner_have_a_message() {
+    let mut bench = open(None, None, 5).with_noise(200 * MICROS);
+    bench.run(bench.now + 13_000 * MILLIS);
+    let trouble = bench.host.session.trouble().map(|trouble| trouble.to_string()).unwrap_or_default();
+    assert!(trouble.ends_with(" bytes/s arrive, but scanhub does not recognize the scanner"), "{trouble}");
+    assert_eq!(bench.host.session.family(), None);
 }

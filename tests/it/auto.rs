@@ -1,0 +1,111 @@
+//! A hub whose link has `family = "auto"`: it finds the scanner, reports it, remembers it, and says so if there is none.
+
+use std::fs;
+
+use serde_json::Value;
+
+use crate::testkit::{INT, Program, TERM, TestEnv, is_class, sequence};
+
+const LMS: &[&str] = &["--seed=17", "--world=room"];
+const LD19: &[&str] = &["--family=ld", "--model=ld19", "--world=room", "--seed=17"];
+const A1: &[&str] = &["--family=rplidar", "--model=a1", "--world=room", "--seed=17"];
+
+fn hub(env: &TestEnv) -> Program {
+    env.hub(&[format!("{},family=auto", env.link("front"))])
+}
+
+fn text<'a>(line: &'a Value, key: &str) -> &'a str {
+    line[key].as_str().unwrap_or_default()
+}
+
+/// Text of the file that remembers the scanner.
+fn memory(env: &TestEnv) -> String {
+    let file = env.path("state/scanhub").join(env.place().name()).join("front.scanner");
+    fs::read_to_string(file).unwrap_or_default()
+}
+
+#[test]
+fn scanners_of_every_family_are_found_and_remembered() {
+    for (simulated, family, model, beams, rate) in [
+        (LMS, "lms", "lms200", 361, "500000"),
+        (LD19, "ld", "ld19", 450, "230400"),
+        (A1, "rplidar", "a1", 1079, "115200"),
+    ] {
+        let env = TestEnv::new();
+        let simulator = env.simulator(&["front"], simulated);
+        let first = hub(&env);
+        let mut scans = env.echo(&["front/scan"]);
+        let scan = scans.await_line("a scan", is_class("scan"));
+        assert_eq!((text(&scan, "family"), &scan["count"]), (family, &beams.into()));
+        let info = env.await_info("front", |info| info["state"] == "streaming" && info["model"] == model);
+        assert_eq!((text(&info, "family"), text(&info, "last_error")), (family, ""), "{info}");
+        assert_eq!(info["baud"].to_string(), rate, "{info}");
+        sequence(&scans.end(INT).of_class("scan"), "topic_seq");
+        crate::testkit::until("the scanner is remembered", || memory(&env).contains(model));
+        assert!(memory(&env).starts_with(&format!("{family} {model} {rate} ")), "{}", memory(&env));
+        let log = first.end(TERM).errors;
+        assert!(log.contains(&format!("front: found {model} at {rate} baud")), "{log}");
+
+        let second = hub(&env);
+        env.echo(&["front/scan"]).await_line("a scan", is_class("scan"));
+        env.await_info("front", |info| info["family"] == family && info["model"] == model);
+        let outcome = second.end(TERM);
+        assert_eq!((outcome.code, outcome.errors.contains("is now")), (Some(0), false), "{outcome}");
+        assert_eq!(simulator.end(TERM).code, Some(0));
+        if family != "ld" {
+            assert_eq!(env.simulated("front").1, 0, "EEPROM");
+        }
+    }
+}
+
+#[test]
+fn another_scanner_at_the_port_is_named_and_sequence_numbers_continue() {
+    let env = TestEnv::new();
+    let first = env.simulator(&["front"], LD19);
+    let hub = hub(&env);
+    let mut consumer = env.echo(&["front/scan", "front/status"]);
+    consumer.await_line("a scan of the first one", |line| is_class("scan")(line) && line["family"] == "ld");
+    env.await_info("front", |info| info["model"] == "ld19");
+    env.kill_simulator(first, "front");
+    consumer.await_line("absent", |line| line["state"] == "absent");
+    let _second = env.simulator(&["front"], A1);
+    consumer.await_line("a search", |line| is_class("status")(line) && line["family"].is_null());
+    consumer.await_line("a scan", |line| is_class("scan")(line) && line["family"] == "rplidar");
+    env.await_info("front", |info| info["family"] == "rplidar" && info["model"] == "a1");
+    crate::testkit::until("the scanner is remembered", || memory(&env).starts_with("rplidar a1 "));
+    sequence(&consumer.end(INT).of_class("scan"), "topic_seq");
+    let outcome = hub.end(TERM);
+    assert!(outcome.errors.contains("front: was ld19, is now a1"), "{}", outcome.errors);
+}
+
+#[test]
+fn a_silent_line_is_reported_and_clients_show_that_the_family_is_unknown() {
+    let env = TestEnv::new();
+    let _simulator = env.simulator(&["front"], &["--fault=mute=1"]);
+    let hub = hub(&env);
+    let expected = "no scanner replies (looked for lms, ld, rplidar for 10 s): power, cable?";
+    let info = env.await_info("front", |info| text(info, "last_error") == expected);
+    assert_eq!((&info["family"], text(&info, "state")), (&Value::Null, "probing"), "{info}");
+    assert_eq!((&info["model"], &info["baud"]), (&Value::Null, &Value::Null), "{info}");
+    let shown = String::from_utf8_lossy(&env.run(&["info", "front"]).out).into_owned();
+    assert!(shown.lines().any(|line| line.split_whitespace().eq(["family", "unknown"])), "{shown}");
+    let listed = String::from_utf8_lossy(&env.run(&["list"]).out).into_owned();
+    assert!(listed.contains(&format!("front: probing: {expected}")), "{listed}");
+    let log = hub.end(TERM).errors;
+    assert_eq!(log.matches(expected).count(), 1, "{log}");
+}
+
+#[test]
+fn bytes_of_no_known_scanner_are_reported_with_the_command_that_examines_them() {
+    let env = TestEnv::new();
+    // Every telegram is damaged.
+    let damage = ["--baud=500000", "--state=streaming", "--fault=flip=0.5,flip_bits=64,overlook=1"];
+    let _simulator = env.simulator(&["front"], &damage);
+    let _hub = hub(&env);
+    let end = format!(
+        " bytes/s arrive, but scanhub does not recognize the scanner: scanhub probe {}",
+        env.word("front")
+    );
+    let info = env.await_info("front", |info| text(info, "last_error").ends_with(&end));
+    assert_eq!(info["family"], Value::Null, "{info}");
+}
