@@ -1,4 +1,4 @@
-//! A hub whose link has `family = "auto"`: it finds the scanner, reports it, remembers it, and says so if there is none.
+//! A hub whose link has `family = "auto"`: it finds the scanner, reports it and remembers it, and reports if there is none.
 
 use std::fs;
 

@@ -23,8 +23,7 @@ impl Config {
         self.links.iter().map(|link| link.limits(&self.limits)).collect()
     }
 
-    /// Adds to a failure because of too little shared memory that a link needs less once its family is set, if there is one whose
-    /// family is searched for.
+    /// Adds the [remedy](Self::memory_remedy) to a failure that reports too little shared memory.
     pub fn with_remedy(&self, failure: Failure) -> Failure {
         match self.memory_remedy() {
             Some(remedy) => Failure { hint: format!("{}; {remedy}", failure.hint), ..failure },
@@ -32,13 +31,11 @@ impl Config {
         }
     }
 
-    /// Returns how links need less shared memory. `None` if the families of all are set.
+    /// Returns the remedy for too little shared memory: to set the family of a link. `None` if all links have one.
     pub fn memory_remedy(&self) -> Option<String> {
         let link = self.links.iter().find(|link| link.family().is_none())?;
-        Some(format!(
-            "a named family needs less than auto: --set link.{}.family=lms, ld or rplidar",
-            link.name
-        ))
+        let families = Family::ALL.map(Family::name).join(", ");
+        Some(format!("family = \"auto\" needs the most: set link.{}.family to one of {families}", link.name))
     }
 }
 

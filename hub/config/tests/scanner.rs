@@ -221,10 +221,15 @@ fn a_family_may_be_searched_for() {
             family.max_telegram <= limits.telegram && limits.contents & family.contents == family.contents
         );
     }
-    // No family is named by what every link may have, and by what is automatic anyway.
+    // Keys of every link, and automatic values, name no family.
     for set in [&["link.front.model=auto", "link.front.mode=Auto"][..], &["link.front.marks.level=200"]] {
         assert_eq!(front(set).unwrap().family(), None, "{set:?}");
     }
+    let remedy = "family = \"auto\" needs the most: set link.front.family to one of lms, ld, rplidar";
+    let short = || schema::Failure::new(Kind::Short, "shared memory is short", "free some of it");
+    let config = load(&["link.front.family=auto"]).unwrap();
+    assert_eq!(config.with_remedy(short()).hint, format!("free some of it; {remedy}"));
+    assert_eq!(load(&[]).unwrap().with_remedy(short()), short());
     // An LMS has its own number of beams.
     let beams = front(&["link.front.beams=300"]).unwrap();
     assert_eq!((beams.scanner.settings.beams, beams.max_beams()), (Some(300), 401));

@@ -91,7 +91,7 @@ struct Slot {
     kept_wall_ns: AtomicU64,
     /// Rate and port, and whether that is to be written.
     rate: Mutex<(Option<(KnownRate, String)>, bool)>,
-    /// Scanner and port, and whether they are to be written.
+    /// Scanner and port, and whether they must be written.
     scanner: Mutex<(Option<(KnownScanner, String)>, bool)>,
 }
 

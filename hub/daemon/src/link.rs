@@ -257,8 +257,8 @@ fn update(stats: &mut LinkStats, link: &Link, state: State, error: &str, now: Na
     changed
 }
 
-/// As [`update`], while the scanner is searched for. The number of bytes per second in an error may change often, so errors are
-/// logged at most once a minute.
+/// Does the same as [`update`] during a search. Its errors may change often, because of the bytes per second in them, so they
+/// are logged at most once a minute.
 fn update_search(stats: &mut LinkStats, link: &Link, state: State, error: &str, now: Nanos) -> bool {
     if error.is_empty() || now >= stats.next_search_log {
         let changed = update(stats, link, state, error, now);

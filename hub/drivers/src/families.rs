@@ -23,7 +23,7 @@ macro_rules! families {
         #[derive(Clone, Copy, Debug, PartialEq)]
         pub enum Trouble {
             $(#[doc = concat!("Of family ", stringify!($family), ".")] $Family($family::Trouble),)*
-            /// Of the search for a scanner of any family.
+            /// The search has found no scanner.
             Search(search::Trouble),
         }
 
@@ -79,7 +79,7 @@ families! {
     Rplidar rplidar,
 }
 
-/// What a link needs whose family is searched for: space for every scanner.
+/// Features of a link whose family is searched for: space for every scanner.
 pub const ANY: Features = {
     let mut any = Features {
         models: &[],

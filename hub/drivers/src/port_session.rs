@@ -4,7 +4,6 @@
 //! that family first. The driver handles both like any session, and calls [`PortSession::advance`] at each wait.
 
 use core::fmt;
-use std::collections::VecDeque;
 
 use schema::{Counter, Counters, Family, MILLIS, Nanos, Status};
 
@@ -23,8 +22,8 @@ pub struct PortSession {
     /// Whether the family is searched for.
     is_auto: bool,
     stage: Stage,
-    /// Reads of the search that the session of the found scanner has not handled yet.
-    captured: VecDeque<(Nanos, Vec<u8>)>,
+    /// Reads of the search that the session of the found scanner has not handled yet, the oldest at the end.
+    captured: Vec<(Nanos, Vec<u8>)>,
     memory: Option<Memory>,
     /// Rate at which the scanner was found.
     found_rate: Option<u32>,
@@ -79,7 +78,7 @@ impl PortSession {
             settings: *settings,
             is_auto: family.is_none(),
             stage,
-            captured: VecDeque::new(),
+            captured: Vec::new(),
             memory,
             found_rate: None,
             identity: None,
@@ -149,14 +148,14 @@ impl PortSession {
                 })
             }
             Stage::Found(session) => {
-                if let Some((at, bytes)) = self.captured.pop_front() {
+                if let Some((at, bytes)) = self.captured.pop() {
                     let spare = session.spare();
                     let len = bytes.len().min(spare.len());
                     spare[..len].copy_from_slice(&bytes[..len]);
                     self.session_now = self.session_now.max(at);
                     session.commit(self.session_now, len);
                     if len < bytes.len() {
-                        self.captured.push_front((at, bytes[len..].to_vec()));
+                        self.captured.push((at, bytes[len..].to_vec()));
                     }
                     return true;
                 }
@@ -178,8 +177,9 @@ impl PortSession {
         let Stage::Searching(search) = &self.stage else { return };
         let Found { family, rate, model: _ } = found;
         self.captured = search.reads().map(|(at, bytes)| (at, bytes.to_vec())).collect();
+        self.captured.reverse();
         self.searched += search.account().read;
-        let begins = self.captured.front().map_or(self.now, |(at, _)| *at);
+        let begins = self.captured.last().map_or(self.now, |(at, _)| *at);
         let mut session = Session::begin(family, &self.settings, begins);
         if let Some(known) = self.known_rate {
             session.hint_rate(known);
@@ -201,7 +201,7 @@ impl PortSession {
         self.stage = Stage::Found(session);
     }
 
-    /// Ends the session with a scanner of which nothing arrives any more, and searches again.
+    /// Ends the session, because nothing of its scanner arrives any more, and searches again.
     fn lose(&mut self) {
         let Stage::Found(session) = &self.stage else { return };
         let account = session.account();

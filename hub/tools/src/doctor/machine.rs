@@ -163,7 +163,7 @@ impl Place {
     }
 }
 
-/// Checks whether shared memory has room for the links. `less` is how they need less, if they can.
+/// Checks whether shared memory has room for the links. `less` is a remedy that reduces their need.
 pub(crate) fn memory(facts: &Facts, less: Option<String>) -> Finding {
     const NAME: &str = "memory";
     let Some(Memory { size, free, free_files, is_read_only }) = facts.memory else {

@@ -1,5 +1,5 @@
 //! A session on a port without a configured family: scans arrive soon, no byte is lost on the way from the search to the session,
-//! and the search begins again when the scanner is gone.
+//! and the search begins again after the scanner was unplugged.
 
 use scanhub_drivers::line::{self, Account, Protocol as _, Session as _, State};
 use scanhub_drivers::lms::variant::Baud;
@@ -161,7 +161,7 @@ fn the_telegrams_of_the_search_reach_the_session() {
             next_scan(&mut bench, name);
             let at_rate: u64 = bench.read.iter().map(|(_, bytes)| bytes.len() as u64).sum();
             let account = bench.host.session.account();
-            // What was read at the last rate is in telegrams, except a fragment of the first one.
+            // All bytes of the last rate are in telegrams, except a fragment of the first one.
             let lost = at_rate - account.in_telegrams - account.buffered;
             assert!(lost < most_lost, "{name}, seed {seed}: {lost} of {at_rate}");
             assert_eq!(bench.written.is_empty(), name == "ld", "{name}, seed {seed}");
