@@ -109,3 +109,27 @@ fn bytes_of_no_known_scanner_are_reported_with_the_command_that_examines_them() 
     let info = env.await_info("front", |info| text(info, "last_error").ends_with(&end));
     assert_eq!(info["family"], Value::Null, "{info}");
 }
+
+#[test]
+fn a_recording_has_the_family_of_its_scanner() {
+    let env = TestEnv::new();
+    let simulator = env.simulator(&["front"], LD19);
+    let live = hub(&env);
+    let recorder = crate::replay_packets::recorder(&env, "front.mcap", &["--all"]);
+    env.echo(&["front/scan"]).await_lines(20, "a scan", is_class("scan"));
+    assert_eq!(recorder.end(INT).code, Some(0));
+    assert_eq!((live.end(TERM).code, simulator.end(TERM).code), (Some(0), Some(0)));
+    let (recording, bytes) = (env.word("front.mcap"), env.word("front.bin"));
+    assert_eq!(env.run(&["convert", &recording, &bytes]).code, Some(0));
+    for file in [recording, bytes] {
+        let replayed = env.hub(&[format!("--link=front=file:{file},family=auto")]);
+        let scan = env.echo(&["front/scan"]).await_line("a scan", is_class("scan"));
+        assert_eq!((text(&scan, "family"), &scan["count"]), ("ld", &450.into()), "{file}");
+        env.await_info("front", |info| info["family"] == "ld");
+        assert_eq!(replayed.end(TERM).code, Some(0));
+    }
+    let noise = env.file("noise.bin", [0; 4_096]);
+    let refused = env.run(&["run", &format!("--link=front=file:{noise},family=auto")]);
+    assert_eq!(refused.code, Some(78), "{refused}");
+    assert!(refused.errors.contains("family"), "{refused}");
+}
