@@ -1,15 +1,16 @@
-//! Drives a session with a sensor on an open port, until that is gone. The way of a scan, from the line
-//! to whoever sleeps for it, is here:
+//! Drives a session with a sensor on an open port, until the port is gone. The path of a scan, from the line to the
+//! subscribers, is here:
 //!
 //! - **read**: [`Drive::turn`] reads into the session's buffer once the port is ready;
-//! - **frame**: [`Drive::drain`] asks the session what the bytes are, and gets a telegram in that buffer, decoded once;
-//! - **loan**, **decode**, **process**, **send**: [`LinkOutput::process`](crate::process_telegram::LinkOutput::process)
-//!   sends the telegram, then takes loans of shared memory, writes the scan and what the processors make of it in place, and
-//!   sends them (`topics.rs`, `pipeline.rs`);
-//! - **ring**: [`LinkCore::publish`] wakes the consumers, once a telegram: those of telegram, scan and zones before marks and
-//!   foreground are made.
+//! - **frame**: [`Drive::drain`] polls the session, which returns a telegram in that buffer, or a revolution;
+//! - **loan**, **decode**, **process**, **send**:
+//!   [`LinkOutput::process_telegram`](crate::process_telegram::LinkOutput::process_telegram) and
+//!   [`process_revolution`](crate::process_telegram::LinkOutput::process_revolution) send the telegram, then take loans of
+//!   shared memory, write the scan and the results of the processors in place, and send them (`topics.rs`, `pipeline.rs`);
+//! - **ring**: [`LinkCore::publish`] wakes the subscribers, once per telegram: those of telegram, scan and zones before marks
+//!   and foreground are computed.
 //!
-//! Nothing on this way allocates, locks or logs. Refuses to know how the port came to be open.
+//! Nothing on this path allocates, locks or logs.
 
 use std::fmt;
 use std::io;
