@@ -6,6 +6,7 @@ use std::io;
 use std::os::fd::AsRawFd;
 use std::os::unix::fs::{FileExt, MetadataExt};
 use std::path::{Path, PathBuf};
+use std::time::Duration;
 
 use nix::errno::Errno;
 use nix::fcntl::{FcntlArg, fcntl};
@@ -191,7 +192,7 @@ pub fn holder(root: &Path) -> Result<Option<u32>, Failure> {
     holder_of(root, HUB)
 }
 
-/// Returns whether a hub lives in `root` that does not have all its topics yet.
+/// Returns whether there is a hub in `root` that does not have all its topics yet, and that started at most a minute ago.
 ///
 /// # Errors
 ///
@@ -201,7 +202,7 @@ pub fn is_starting(root: &Path) -> Result<bool, Failure> {
         return Ok(false);
     }
     let file = Directory::open(root)?.map(|directory| directory.file(HUB)).transpose()?.flatten();
-    Ok(file.is_some_and(|file| content(&file).lines().nth(1) != Some(READY)))
+    Ok(file.is_some_and(|file| content(&file).lines().nth(1) != Some(READY) && is_recent(&file)))
 }
 
 /// Returns the process that publishes in `root`: the hub, or else a listener; failures and 0 as with [`holder`].
@@ -232,6 +233,8 @@ fn holder_of(root: &Path, name: &str) -> Result<Option<u32>, Failure> {
 const HUB: &str = "hub.lock";
 const LISTENER: &str = "listen.lock";
 const MAKING: &str = "making.lock";
+/// Maximum duration of a hub's start for clients. After it, a hub of a version that never reports that it is ready is up.
+const MAX_START: Duration = Duration::from_secs(60);
 /// Second line of the file of a hub's lock once all topics exist.
 const READY: &str = "ready";
 
@@ -249,6 +252,12 @@ fn whole_file(kind: libc::c_int) -> flock {
 /// The lock itself tells no pid (the kernel answers -1), the file's content does.
 fn pid_in(file: &File) -> u32 {
     content(file).lines().next().and_then(|pid| pid.parse().ok()).unwrap_or_default()
+}
+
+/// Returns whether the file was written in the last minute. A clock that was set back does not count.
+fn is_recent(file: &File) -> bool {
+    let written = file.metadata().and_then(|metadata| metadata.modified());
+    written.is_ok_and(|written| written.elapsed().is_ok_and(|age| age < MAX_START))
 }
 
 fn content(file: &File) -> String {

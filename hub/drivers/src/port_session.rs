@@ -258,7 +258,11 @@ impl line::Protocol for PortSession {
     fn transmitted(&mut self, now: Nanos) {
         (self.now, self.session_now) = (now, now);
         match &mut self.stage {
-            Stage::Searching(search) => search.transmitted(now),
+            Stage::Searching(search) => {
+                // A scanner that replies may be another one.
+                self.identity = None;
+                search.transmitted(now);
+            }
             Stage::Found(session) => session.transmitted(now),
         }
     }

@@ -60,6 +60,8 @@ pub struct Session {
     /// Model and number of beams by the points that the scanner measures, once they are known. A power cycle does not change
     /// them.
     measured: Option<(Model, usize)>,
+    /// Time since which packets have arrived without a decision about the number of beams.
+    undecided_since: Nanos,
     /// Another number of beams, which the points have required since this time of the scanner's clock.
     other_beams: Option<(usize, Nanos)>,
     /// The last change of the number of beams, and until when it is reported.
@@ -119,6 +121,7 @@ impl Session {
             pace: None,
             point_count: PointCount::default(),
             measured: None,
+            undecided_since: now,
             other_beams: None,
             change: None,
             phase: Phase::Listening { shown: State::Probing, next_at: now + LISTEN },
@@ -318,6 +321,11 @@ impl Session {
         }
         if let Some(counted) = counted.filter(|_| self.settings.model.is_none()) {
             self.count(counted);
+            if !self.is_learned
+                && let Phase::Hearing { turned_at, .. } = &mut self.phase
+            {
+                *turned_at = self.now;
+            }
         }
         self.scanner_time = places[..span.packets].iter().rev().find_map(|place| place.time());
         let stamp = |number: usize| places[number].time().and_then(|time| self.clock_of(number).time(time));
@@ -360,9 +368,17 @@ impl Session {
             Phase::Hearing { silent_at: at, .. } => {
                 *at = silent_at;
                 self.damaged.0 += discarded - self.damaged.1;
+                if self.measured.is_none()
+                    && self.now >= self.undecided_since + UNDECIDED
+                    && let Some(rate) = self.sequence.points_per_second()
+                {
+                    let model = Model::of_point_rate(rate);
+                    self.measured = Some((model, model.beams()));
+                }
             }
             Phase::Listening { .. } => {
                 self.trouble = None;
+                self.undecided_since = self.now;
                 self.phase = Phase::Hearing { turned_at: self.now, has_turned: false, silent_at };
                 self.await_turn();
             }
@@ -703,6 +719,9 @@ const LISTEN: Nanos = 300 * MILLIS;
 const SILENCE: Nanos = 1_000 * MILLIS;
 /// After this time without a revolution, the head is blocked. The slowest head rotates twice per second.
 const STILL: Nanos = 2_000 * MILLIS;
+/// Time after which a scanner whose speed is never constant, or whose sequence has a gap in every revolution, has the beams of
+/// its model.
+const UNDECIDED: Nanos = 10_000 * MILLIS;
 /// After this time with another number of points per revolution, the number of beams changes.
 const CHANGE: Nanos = 10_000 * MILLIS;
 /// Duration for which a change of the number of beams is reported.

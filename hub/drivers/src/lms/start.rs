@@ -121,6 +121,8 @@ impl Dialogue {
             Step::Stop | Step::Check | Step::Baud | Step::Stream => {
                 if self.baud == FAST {
                     self.fast_switches.give_up();
+                    // Report a rate even if the scanner was found by its boot message, so that the count is saved with it.
+                    self.found_at = self.found_at.or(Some(self.rest_at));
                     self.limit_rate();
                 }
                 let is_lost = self.fast_switches.have_lost();

@@ -31,6 +31,8 @@ pub(crate) struct Head {
     pub(crate) points: f64,
     /// By how much its clock is slow.
     pub(crate) drift: f64,
+    /// Share by which the speed in every other packet differs from the true one.
+    pub(crate) jitter: f64,
     damage: Damage,
     random: fastrand::Rng,
     burst: bool,
@@ -48,6 +50,7 @@ impl Head {
             model,
             points,
             drift: 0.0,
+            jitter: 0.0,
             damage,
             random: fastrand::Rng::with_seed(seed),
             burst: false,
@@ -110,7 +113,7 @@ impl Head {
             let hz = f64::from(self.model.points_per_second()) / self.points;
             let word = |angle: f64| (angle % f64::from(TURN)) as u16;
             let packet = Contents {
-                speed: (360.0 * hz).round() as u16,
+                speed: (360.0 * hz * (1.0 + self.jitter * (self.packets % 2) as f64)).round() as u16,
                 start: word(self.angle(first)),
                 points: std::array::from_fn(|i| (Head::range(first + i as u64), (i * 7) as u8)),
                 end: word(self.angle(last)),

@@ -163,6 +163,19 @@ fn points(model: Model) -> f64 {
 const SECOND: Nanos = 1_000 * MILLIS;
 
 #[test]
+fn scanner_with_uneven_speed_has_the_beams_of_its_model() {
+    let model = Model::Ld19;
+    let mut head = Head::new(model, points(model), 1, Damage::default());
+    head.jitter = 0.05;
+    let mut bench = Bench::new(AUTO, head);
+    bench.run(9 * SECOND);
+    assert_eq!((bench.log.turns.len(), bench.session.trouble()), (0, None), "the head rotates");
+    bench.run(15 * SECOND);
+    assert!(bench.log.turns.len() > 25, "{}", bench.log.turns.len());
+    assert_eq!((bench.session.beams(), bench.session.trouble()), (Some(model.beams()), None));
+}
+
+#[test]
 fn every_model_is_heard_and_every_turn_of_it() {
     for model in Model::ALL {
         // A speed at which no two turns have their points at the same places.

@@ -60,6 +60,7 @@ fn streams_at_38400_after_exactly_two_switches() {
             bench.run(boot * MILLIS);
             lose(&mut bench);
             assert_eq!(bench.session.silent_switches(), 1);
+            assert!(bench.found_at().is_some(), "the count is saved with the rate");
             assert!(!matches!(bench.session.trouble(), FALLS_BACK | KEEPS), "{bench}");
             cycle_power(&mut bench, 700 * MILLIS);
             bench.run(boot * MILLIS);
