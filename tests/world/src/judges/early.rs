@@ -60,7 +60,8 @@ impl Judge for Early {
                 let wrong = match sample.topic {
                     Topic::Scan => {
                         let before = std::mem::replace(&mut of.beams, Scan::of_bytes(&sample.bytes).beams());
-                        of.scans += 1;
+                        // The session begins its revolutions again with another number of beams.
+                        of.scans = if before == of.beams { of.scans + 1 } else { 0 };
                         // With another number of beams, the warning was of a scan that is not completed.
                         let is_wrong = std::mem::take(&mut of.needs_reason) && before == of.beams;
                         is_wrong.then(|| "a warning was withdrawn although nothing went wrong".to_owned())
