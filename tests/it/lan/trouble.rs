@@ -68,7 +68,8 @@ fn a_cable_is_pulled_and_an_address_taken() {
         let (sent, failed) = sent(&outcome, "eth0");
         let (received, lost) = account(&receiver.finish());
         assert_eq!(received + lost, sent + failed, "every number is accounted for");
-        assert!(lost >= 300 && lost <= failed, "{lost} lost, {failed} counted");
+        // The kernel may accept a few datagrams and drop them when the link goes: nobody can count these at the gateway.
+        assert!(failed >= 300 && lost >= failed, "{lost} lost, {failed} counted");
     });
 }
 
