@@ -39,8 +39,6 @@ struct OfSensor {
     is_unknown: bool,
     /// A warning was withdrawn although nothing had gone wrong.
     is_needless: bool,
-    /// The same of a scan whose zones were published.
-    needs_reason: bool,
     /// Scans since the hub found the scanner, and beams of the last one.
     scans: usize,
     beams: usize,
@@ -62,9 +60,7 @@ impl Judge for Early {
                         let before = std::mem::replace(&mut of.beams, Scan::of_bytes(&sample.bytes).beams());
                         // The session begins its revolutions again with another number of beams.
                         of.scans = if before == of.beams { of.scans + 1 } else { 0 };
-                        // With another number of beams, the warning was of a scan that is not completed.
-                        let is_wrong = std::mem::take(&mut of.needs_reason) && before == of.beams;
-                        is_wrong.then(|| "a warning was withdrawn although nothing went wrong".to_owned())
+                        None
                     }
                     Topic::Early => of.warn(seq, &pod_read_unaligned(&sample.bytes), is_well),
                     Topic::Zones => of.tell(seq, &pod_read_unaligned(&sample.bytes), is_well),
@@ -120,7 +116,10 @@ impl OfSensor {
     fn tell(&mut self, seq: u64, zones: &Zones, is_well: bool) -> Option<String> {
         self.zones = Some(seq);
         // A hub that ends withdraws its warning, and sends no zones after that.
-        self.needs_reason = std::mem::take(&mut self.is_needless);
+        // A scan is published before its zones. With another number of beams, the one that was announced is not completed.
+        if std::mem::take(&mut self.is_needless) && self.scans > 0 {
+            return Some("a warning was withdrawn although nothing went wrong".to_owned());
+        }
         let verdict = zones.verdict();
         let said = self.stands.take_if(|said| seq >= said.seq);
         let is_soon = zones.nearest().is_some_and(|(beam, _)| 5 * usize::from(beam) < 3 * self.beams);
