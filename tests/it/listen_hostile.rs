@@ -140,7 +140,7 @@ fn sealed_nonsense_neither_ends_it_nor_fills_memory() {
         assert!(lines.len() <= 1024, "{} lines", lines.len());
         let own = lines.iter().find(|it| it["hub"] == "000000000000abcd" && it["topic"] == "zones");
         let own = own.unwrap_or_else(|| panic!("its sender is forgotten: {lines:?}"));
-        // Of what the flood pushed out behind the last one that came, the listener cannot know.
+        // The listener cannot know of datagrams that the flood displaced after the last one that it received.
         let known = number(own, "received") + number(own, "lost");
         assert!((1..=counted).contains(&known), "{known} of {counted}");
         let sensors = &outcome.of_class("lan_published")[0]["sensors"];

@@ -178,7 +178,7 @@ fn shared_memory_of_strangers() {
         let hub = env.hub(&[env.link("front")]);
         let mut consumer = env.echo(&["front/scan"]);
         let mut allowed = Vec::new();
-        // With its next scans, the hub removes what belonged to a subscriber that has left, perhaps in the midst of the attacks.
+        // With its next scans, the hub removes segments of a subscriber that has left, perhaps during the attacks.
         until("the attacks change nothing", || {
             let own = segments(&env);
             consumer.await_lines(10, "a scan", is_class("scan"));

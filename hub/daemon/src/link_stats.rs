@@ -101,7 +101,7 @@ impl LinkStats {
         self.scans += u64::from(processed.stands_for.is_some());
     }
 
-    /// Returns the status, for what a telegram of a recording reports.
+    /// Returns the status, so that a telegram of a recording can update it.
     pub(crate) fn status_mut(&mut self) -> &mut Status {
         &mut self.status
     }

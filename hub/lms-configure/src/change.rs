@@ -155,12 +155,12 @@ impl Change {
         self
     }
 
-    /// How far it is.
+    /// Returns the current step.
     pub fn step(&self) -> Step {
         self.step
     }
 
-    /// What became of it; all of it when the change [is done](Protocol::is_done).
+    /// Returns the outcome. It is complete when the change [is done](Protocol::is_done).
     pub fn outcome(&self) -> &Outcome {
         &self.outcome
     }

@@ -24,7 +24,7 @@ pub struct Settings {
     /// Maximum difference in mm of readings of one surface, at least one unit of the sensor. `None`: 30, in cm mode 60,
     /// in dm mode 100.
     pub threshold_mm: Option<u16>,
-    /// The same for a reading and its candidate (`paper`).
+    /// Maximum difference in mm of a reading and its candidate (`paper`).
     pub candidate_mm: Option<u16>,
     /// Number of scans until a surface is background. `None`: 375 at half degrees, 750 at 1, 188 at a quarter, which
     /// are 10 s at the full rate. `multi` knows a surface well enough after 5/8 of this number. At most 8191, which is
@@ -451,7 +451,7 @@ fn write(scan: &Scan, generation: u32, classes: &[Class], out: &mut Foreground) 
 pub struct Mismatch {
     /// Number of beams and micrometers per device unit of the model.
     pub model: (u16, u32),
-    /// The same of the sensor's scans.
+    /// Number of beams and micrometers per device unit of the sensor's scans.
     pub sensor: (u16, u32),
 }
 

@@ -29,8 +29,8 @@ impl<S: Protocol> VirtualTime<S> {
         &mut self.session
     }
 
-    /// Lets the time pass until `now`, at which `bytes` are there; `handle` gets the events meanwhile. Time
-    /// does not go back: an earlier `now` is the last one.
+    /// Advances the time to `now`, and then passes `bytes` to the session. `handle` receives the events. Time never goes
+    /// back: an earlier `now` counts as the last one.
     pub fn take(&mut self, now: Nanos, bytes: &[u8], mut handle: impl FnMut(Event<'_>)) {
         let now = now.max(self.now);
         while self.until < now {

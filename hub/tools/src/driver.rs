@@ -259,7 +259,7 @@ impl<F: FnMut(u32)> Task<Session> for Detection<F> {
     }
 }
 
-/// End of a session: what arrives no longer matters.
+/// Task at the end of a session. It ignores all events.
 struct End;
 
 impl Task<Session> for End {}
@@ -318,7 +318,7 @@ const PACKETS_TIMEOUT: Nanos = 650 * MILLIS;
 /// Timeout for [`MIN_REVOLUTIONS`]. It is long enough for a head that makes two revolutions per second.
 const REVOLUTIONS_TIMEOUT: Nanos = 4_000 * MILLIS;
 
-/// What a program does with a protocol, besides the I/O of [`drive`].
+/// Reactions of a program to a protocol that [`drive`] does the I/O for.
 pub(crate) trait Task<P> {
     /// Called before each action. Returns whether to carry it out; if not, the driver waits.
     fn may_continue(&mut self, port: &Port, protocol: &P) -> io::Result<bool> {

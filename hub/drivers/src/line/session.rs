@@ -248,7 +248,7 @@ pub enum Output<'a> {
     },
 }
 
-/// What a session has received.
+/// Event of a session: received bytes, or a scan made from them.
 #[derive(Clone, Copy, Debug)]
 pub enum Event<'a> {
     /// A telegram, or packets that arrived together, at most 10 ms of them, without other bytes between them. Each packet is in one of

@@ -43,12 +43,12 @@ impl<R: Say> Exchange<R> {
         }
     }
 
-    /// As [`Protocol::spare`](crate::line::Protocol::spare).
+    /// Returns the buffer of the next read, like [`Protocol::spare`](crate::line::Protocol::spare).
     pub fn spare(&mut self) -> &mut [u8] {
         self.framer.spare()
     }
 
-    /// As [`Protocol::commit`](crate::line::Protocol::commit).
+    /// Handles a read of `len` bytes, like [`Protocol::commit`](crate::line::Protocol::commit).
     pub fn commit(&mut self, now: Nanos, len: usize) {
         self.now = now;
         if len > 0 {

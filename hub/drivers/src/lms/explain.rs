@@ -24,11 +24,11 @@ use crate::lms::variant::{Baud, Mode, Unit, Variant};
 pub struct Field<'a> {
     /// Index of its first byte, counted from STX.
     pub offset: usize,
-    /// Its bytes.
+    /// Bytes of the field.
     pub bytes: &'a [u8],
-    /// Its name.
+    /// Name of the field.
     pub name: &'static str,
-    /// Its value.
+    /// Decoded value.
     pub value: Value<'a>,
     /// The meaning of the value as text; `None` if it needs none.
     pub words: Option<&'a dyn Display>,

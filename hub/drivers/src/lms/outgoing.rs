@@ -154,7 +154,7 @@ impl<R: Say> Outgoing<R> {
 
     /// Starts over with the first byte if `now` is too late for the next one, and returns whether it is. The sensor has
     /// dropped the request, and it cannot have received its last byte. This does not count as a try. After [`MAX_RESTARTS`] the
-    /// request is sent to its end all the same, so that the wait for its reply ends.
+    /// request is sent to its end anyway, so that the wait for its reply ends.
     pub(crate) fn restart_if_late(&mut self, now: Nanos, baud: Baud) -> bool {
         let is_gap = self.is_partly_out() && now > self.left_at + line_time(1, baud.rate()) + MOST_GAP;
         self.left_at = now;

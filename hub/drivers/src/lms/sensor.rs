@@ -150,7 +150,7 @@ impl Sensor {
         self.software.trim_ascii()
     }
 
-    /// Returns what its owner should know, the worst first. All faults come before what is only good to know.
+    /// Returns the notices for the owner, the worst first. Faults come before all others.
     pub fn notices(&self) -> impl Iterator<Item = Notice> {
         let severity = self.condition.and_then(Condition::severity);
         let dirty = self.condition.is_some_and(Condition::is_polluted);

@@ -219,7 +219,7 @@ impl Bench {
         self.scans(since).map(|got| &got.telegram[..]).collect()
     }
 
-    /// The same, with what the session says of them.
+    /// Returns scans that were delivered after `since`, with their stamps and reasons.
     pub(crate) fn scans(&self, since: Nanos) -> impl Iterator<Item = &Received> {
         let is_scan = move |got: &&Received| got.at > since && got.telegram[4] == lms::measured::MEASURED;
         self.received.iter().filter(is_scan)
