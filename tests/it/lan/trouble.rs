@@ -68,8 +68,9 @@ fn a_cable_is_pulled_and_an_address_taken() {
         let (sent, failed) = sent(&outcome, "eth0");
         let (received, lost) = account(&receiver.finish());
         assert_eq!(received + lost, sent + failed, "every number is accounted for");
-        // The kernel may accept a few datagrams and drop them when the link goes: nobody can count these at the gateway.
-        assert!(failed >= 300 && lost >= failed, "{lost} lost, {failed} counted");
+        // Either may be more than the other. The kernel accepts a few datagrams and drops them when the link goes. When it is
+        // back, the gateway counts what it sends as failed until it looks at the link again, up to a second later.
+        assert!(failed >= 300 && lost >= 300, "{lost} lost, {failed} counted");
     });
 }
 
