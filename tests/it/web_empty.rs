@@ -4,7 +4,7 @@ use serde_json::Value;
 
 use crate::browser::{Browser, Look};
 use crate::strangers::{STRANGER, beside_a_stranger, scanhub, stranger};
-use crate::testkit::{INT, KILL, Program, TestEnv, in_a_network, is_class};
+use crate::testkit::{INT, Program, TestEnv, in_a_network, is_class};
 use crate::web::web;
 use crate::web_page::browse;
 
@@ -38,8 +38,7 @@ fn a_sensor_that_is_silent_and_one_whose_port_is_gone() {
     await_reason(&mut page, "front: ", "plug its adapter in, or name the right port");
     let sensor = env.simulator(&["front"], &["--seed=5", "--baud=500000"]);
     page.await_true("scanhub.reason === null && scanhub.beams > 100");
-    assert_eq!(sensor.end(KILL).code, None);
-    std::fs::remove_file(env.path("front")).expect("the name is left");
+    env.kill_simulator(sensor, "front");
     await_reason(&mut page, "front: ", "plug its adapter in, or name the right port");
     assert!(page.complaints.is_empty(), "{:?}", page.complaints);
 }

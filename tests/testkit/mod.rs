@@ -199,11 +199,11 @@ impl TestEnv {
         self.start(&words).ready()
     }
 
-    /// Kills the simulator of one port, and takes away the name that it leaves: a hub that goes on would soon find
-    /// another test's terminal by it.
+    /// Kills the simulator of one port. Its name is removed first: otherwise, the hub could open the name again after
+    /// another test's simulator has been given the same terminal.
     pub(crate) fn kill_simulator(&self, simulator: Program, port: &str) {
-        assert_eq!(simulator.end(KILL).code, None);
         fs::remove_file(self.path(port)).unwrap_or_else(|error| panic!("{port}: {error}"));
+        assert_eq!(simulator.end(KILL).code, None);
     }
 
     /// `echo --json` of these topics, attached to all of them, as soon as there are all of them: those of a remote sensor

@@ -122,8 +122,7 @@ impl Desk {
         shell.env("SCANHUB_END_WITH_PARENT", "1").env("SCANHUB_LOG", "error").env_remove("SCANHUB_CONFIG");
         let program = Program::start(shell);
         let group = Pid::from_raw(program.pid() as i32).expect("a process");
-        // These look at everything and then end, however long that takes.
-        let ends = ["scanhub doctor", "scanhub probe"].iter().any(|verb| line.starts_with(verb));
+        let ends = ENDING.iter().any(|verb| line.starts_with(verb));
         // Any other may last. It is ended when it can be, and has had time for something to go wrong.
         until(line, || program.is_over() || !ends && catches_interrupts(group));
         let begun = Instant::now();
@@ -142,6 +141,10 @@ impl Desk {
         (!is_right).then(|| format!("{line}: {outcome}"))
     }
 }
+
+/// Commands that end by themselves, however long that takes on this machine.
+const ENDING: [&str; 6] =
+    ["scanhub doctor", "scanhub probe", "scanhub list", "scanhub info", "scanhub convert", "scanhub key"];
 
 /// Time in which a command that lasts may fail. A longer or shorter time does not let a right one fail.
 const TIME_TO_FAIL: Duration = Duration::from_millis(1200);
