@@ -198,11 +198,8 @@ pub fn holder(root: &Path) -> Result<Option<u32>, Failure> {
 ///
 /// As [`holder`].
 pub fn is_starting(root: &Path) -> Result<bool, Failure> {
-    if holder(root)?.is_none() {
-        return Ok(false);
-    }
-    let file = Directory::open(root)?.map(|directory| directory.file(HUB)).transpose()?.flatten();
-    Ok(file.is_some_and(|file| content(&file).lines().nth(1) != Some(READY) && is_recent(&file)))
+    let held = held_file(root, HUB)?;
+    Ok(held.is_some_and(|(_, file)| content(&file).lines().nth(1) != Some(READY) && is_recent(&file)))
 }
 
 /// Returns the process that publishes in `root`: the hub, or else a listener; failures and 0 as with [`holder`].
@@ -218,16 +215,19 @@ pub fn publisher(root: &Path) -> Result<Option<u32>, Failure> {
 }
 
 fn holder_of(root: &Path, name: &str) -> Result<Option<u32>, Failure> {
+    let Some((directory, file)) = held_file(root, name)? else { return Ok(None) };
+    // A process that just starts or ends has the lock, and the file may have the ID of an earlier process.
+    Ok(Some(if read_prefix(&directory, root)?.is_some() { pid_in(&file) } else { 0 }))
+}
+
+/// Returns the file of the lock `name` and its directory if a process holds the lock.
+fn held_file(root: &Path, name: &str) -> Result<Option<(Directory, File)>, Failure> {
     let Some(directory) = Directory::open(root)? else { return Ok(None) };
     let Some(file) = directory.file(name)? else { return Ok(None) };
     let mut lock = whole_file(libc::F_RDLCK);
     fcntl(file.as_raw_fd(), FcntlArg::F_OFD_GETLK(&mut lock))
         .map_err(|error| unusable(root, &error.into()))?;
-    if lock.l_type == libc::F_UNLCK as libc::c_short {
-        return Ok(None);
-    }
-    // Whoever is just starting or ending has the lock, and an earlier one's process id may stand in it.
-    Ok(Some(if read_prefix(&directory, root)?.is_some() { pid_in(&file) } else { 0 }))
+    Ok((lock.l_type != libc::F_UNLCK as libc::c_short).then_some((directory, file)))
 }
 
 const HUB: &str = "hub.lock";

@@ -117,10 +117,15 @@ impl Status {
         Family::of_number(self.family)
     }
 
-    /// Returns the scanner's model in lower case, the first word of what the sensor calls itself; nothing if unknown.
+    /// Returns the scanner's model in lower case. `None` if it is unknown.
     pub fn model(&self) -> Option<String> {
-        let word = self.sensor_type().split(|c: char| c == ';' || c.is_whitespace()).next()?;
-        (!word.is_empty()).then(|| word.to_lowercase())
+        self.reported_model().map(str::to_lowercase)
+    }
+
+    /// Returns the scanner's model as the scanner writes it: the first word of its type. `None` if it is unknown.
+    pub fn reported_model(&self) -> Option<&str> {
+        let word = self.sensor_type().split(|c: char| c == ';' || c.is_whitespace()).next();
+        word.filter(|word| !word.is_empty())
     }
 
     /// Returns how a scanner measures whose modes have names, the second word of what the sensor calls itself; nothing if

@@ -34,7 +34,7 @@ use crate::surroundings::{Learned, Line, On, Surroundings, Woken};
 pub(crate) struct Drive<'a, S: Surroundings> {
     /// What the next hub would like to know.
     identity: IdentityCache<'a, S>,
-    /// Rates that the port cannot have, as was said.
+    /// Rates that the port could not have, as the log has reported.
     refused: Vec<u32>,
     line_errors: LineErrors,
     /// When something was read last that had waited in the port for an unknown time.
@@ -130,11 +130,6 @@ impl<'a, S: Surroundings> Drive<'a, S> {
             Some(_) => core.link.rate(),
             None => Search::opening_rate(self.memory(core)),
         }
-    }
-
-    /// Returns whether the port cannot have this rate.
-    pub(crate) fn is_refused(&self, baud: u32) -> bool {
-        self.refused.contains(&baud)
     }
 
     /// Goes on after a wait that ended as `woken` says; an error says that the line is gone.
@@ -347,6 +342,14 @@ impl<'a, S: Surroundings> Drive<'a, S> {
         let Some(memory) = session.memory() else { return };
         let (link, status) = (core.link, core.stats.last());
         let before = self.scanner.as_ref();
+        let is_known = |known: &KnownScanner| {
+            let model = known.model.as_deref();
+            let is_it = |reported: &str| model.is_some_and(|model| model.eq_ignore_ascii_case(reported));
+            known.memory == memory && status.reported_model().is_none_or(is_it)
+        };
+        if self.is_named && before.is_some_and(is_known) {
+            return;
+        }
         let is_same_family = before.is_some_and(|before| before.memory.family == memory.family);
         let known_model = before.filter(|_| is_same_family).and_then(|before| before.model.clone());
         let reported = status.model();

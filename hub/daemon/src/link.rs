@@ -2,8 +2,8 @@
 //! when it has to do something although nothing came. Refuses to know where bytes come from, and how a wait is done.
 
 use config::{Link, Processing};
-use scanhub_drivers::PortSession;
-use scanhub_drivers::line::{Control, RawScan, Received};
+use scanhub_drivers::line::{Control, RawScan, Received, Session as _};
+use scanhub_drivers::{PortSession, Trouble};
 use schema::{Failure, MILLIS, Nanos, Shown, State, Verb, Wake};
 
 use crate::control::{ControlQueue, Flow};
@@ -137,10 +137,13 @@ impl<'a, S: Surroundings> LinkCore<'a, S> {
     pub(crate) fn show_session(&mut self, session: &PortSession, state: State) -> bool {
         let now = self.around.now();
         let error = self.diagnosis.explanation();
-        let changed = if session.family().is_some() {
-            update(&mut self.stats, self.link, state, error, now)
-        } else {
+        if session.family().is_some() {
+            self.stats.next_search_log = 0;
+        }
+        let changed = if matches!(session.trouble(), Some(Trouble::Search(_))) {
             update_search(&mut self.stats, self.link, state, error, now)
+        } else {
+            update(&mut self.stats, self.link, state, error, now)
         };
         self.publish_status(Some(session), state, changed, now)
     }

@@ -23,6 +23,13 @@ pub struct LiveLink<'a, S: Surroundings> {
     has_begun: bool,
 }
 
+/// A line that was just opened.
+struct OpenLine<L> {
+    line: L,
+    /// Whether it has the rate that the session wants first.
+    has_rate: bool,
+}
+
 /// Where the port is.
 enum Phase<L> {
     /// There.
@@ -127,7 +134,7 @@ impl<'a, S: Surroundings> LiveLink<'a, S> {
 
     /// The line at the hub's start, and whether it is the one that a killed hub had and somebody kept, with what lies in it;
     /// nothing if a connection has to be made.
-    fn first_line(&mut self) -> Result<Option<(S::Line, bool)>, PortError> {
+    fn first_line(&mut self) -> Result<Option<(OpenLine<S::Line>, bool)>, PortError> {
         let (link, around) = (self.core.link, self.core.around);
         let (name, source, baud) = (&link.name, &link.port, self.drive.opening_rate(&self.core));
         if let Source::Tcp { .. } = source {
@@ -135,7 +142,7 @@ impl<'a, S: Surroundings> LiveLink<'a, S> {
         }
         if let Some(line) = around.take_kept(name, source, baud) {
             tracing::info!("{name}: continues with {}, which the service manager kept open", source.name());
-            return Ok(Some((line, true)));
+            return Ok(Some((OpenLine { line, has_rate: true }, true)));
         }
         match self.open_line(baud) {
             Some(Ok(line)) => Ok(Some((line, false))),
@@ -144,16 +151,17 @@ impl<'a, S: Surroundings> LiveLink<'a, S> {
         }
     }
 
-    /// Opens the port at `baud`. A search leaves out a rate that the port cannot have, so then it gets a port at another rate.
-    fn open_line(&mut self, baud: u32) -> Option<Result<S::Line, PortError>> {
+    /// Opens the port at `baud`. A search leaves out a rate that the port cannot have, so it then gets a port at another rate.
+    fn open_line(&mut self, baud: u32) -> Option<Result<OpenLine<S::Line>, PortError>> {
         let LinkCore { link, around, .. } = self.core;
-        match around.open(&link.port, baud) {
+        let (opened, has_rate) = match around.open(&link.port, baud) {
             Some(Err(error @ PortError::Rate { .. })) if link.family().is_none() => {
                 self.drive.refuse(&self.core, baud, &error);
-                around.open(&link.port, SLOWEST)
+                (around.open(&link.port, SLOWEST), false)
             }
-            opened => opened,
-        }
+            opened => (opened, true),
+        };
+        opened.map(|opened| opened.map(|line| OpenLine { line, has_rate }))
     }
 
     /// Tries to open the port; what becomes of it is known at once, or when the wait for it is over.
@@ -173,8 +181,8 @@ impl<'a, S: Surroundings> LiveLink<'a, S> {
         }
     }
 
-    /// There is a `line`; a session on it may go on with a stream of a sensor of which something is `known`.
-    fn open(&mut self, line: S::Line, known: Option<Identity>) {
+    /// Starts a session on an open line. It may continue with the stream of a scanner whose identity is `known`.
+    fn open(&mut self, OpenLine { line, has_rate }: OpenLine<S::Line>, known: Option<Identity>) {
         let core = &mut self.core;
         let now = core.around.now();
         core.around.keep(&core.link.name, &line);
@@ -183,7 +191,7 @@ impl<'a, S: Surroundings> LiveLink<'a, S> {
         let (family, memory) = (core.link.family(), self.drive.memory(core));
         let mut session = PortSession::begin(family, &core.link.settings(), memory, now);
         core.output.topics.set_family(family);
-        if family.is_none() && self.drive.is_refused(self.drive.opening_rate(core)) {
+        if !has_rate {
             session.reject_rate(now);
         }
         if let Some(known) = known {
