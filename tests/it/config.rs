@@ -86,7 +86,7 @@ fn values_stand_below_each_other_with_their_places() {
     assert!(row("link.a.zones.radii").contains("  [2.0, 1.0]  "), "{shown}");
     assert!(row("link.a.zones.radii").ends_with(&format!("  {file}:5:9")), "{shown}");
     assert!(row("link.a.pose.x").ends_with("  --set link.a.pose.x=0.3"), "{shown}");
-    assert!(row("link.a.mode").ends_with("  default"), "{shown}");
+    assert!(row("link.a.family").ends_with("  default"), "{shown}");
     let columns = [file.as_str(), "default", "--set"];
     let begins: Vec<_> =
         shown.lines().map(|line| columns.iter().find_map(|word| line.find(&format!("  {word}")))).collect();

@@ -62,7 +62,7 @@ fn bytes_between_telegrams_are_counted_by_whoever_reads_them() {
     let summary = outcome.of_class("summary").pop().unwrap_or_else(|| panic!("{outcome}"));
     assert_eq!((&summary["telegrams"], &summary["bytes_discarded"]), (&json!(8), &json!(31_002)));
     assert!(env.run(&["telegram", "decode", &stream]).to_string().contains("31002 bytes in nothing"));
-    let hub = env.hub(&[format!("--link=a=file:{stream}?rate=max")]);
+    let hub = env.hub(&[format!("--link=a=file:{stream}?rate=max,family=lms")]);
     let info = env.await_info("a", |info| info["state"] == "silent");
     let counters = &info["counters"];
     assert_eq!((&counters["telegrams"], &counters["bytes_discarded"]), (&json!(8), &json!(31_002)));

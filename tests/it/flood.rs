@@ -53,7 +53,7 @@ fn receive(consumer: &mut Program, sent: &[Vec<u8>]) -> u64 {
 fn telegrams_in_a_flood_of_garbage() {
     let env = TestEnv::new();
     let line = Line::at(&env.path("front"));
-    let hub = env.hub(&[env.link("front")]);
+    let hub = env.hub(&[env.lms_link("front")]);
     let mut consumer = env.echo(&["front/telegram"]);
     line.await_open();
     let mut random = Rng::with_seed(4);
@@ -100,7 +100,7 @@ fn worked(pid: u32) -> Duration {
 fn a_serial_server_that_sends_garbage_at_full_speed() {
     let env = TestEnv::new();
     let listener = TcpListener::bind("127.0.0.1:0").expect("a port of the loopback");
-    let link = format!("--link=front=tcp:{}", listener.local_addr().expect("it has an address"));
+    let link = format!("--link=front=tcp:{},family=lms", listener.local_addr().expect("it has an address"));
     let hub = env.hub(&[link]);
     let mut consumer = env.echo(&["front/telegram"]);
     let (mut server, _) = listener.accept().expect("the hub comes");

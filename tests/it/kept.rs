@@ -9,7 +9,7 @@ use crate::testkit::{Line, Outcome, Program, TERM, TestEnv, until};
 fn where_a_sensor_was_found_is_asked_first_by_the_next_hub() {
     let env = TestEnv::new();
     let simulator = env.simulator(&["front"], &["--permanent-baud=19200"]);
-    let hub = env.hub(&[env.link("front")]);
+    let hub = env.hub(&[env.lms_link("front")]);
     let directory = env.path("state/scanhub").join(env.place().name());
     let kept = directory.join("front.rate");
     let said = format!("19200 {}\n", env.word("front"));
@@ -22,16 +22,16 @@ fn where_a_sensor_was_found_is_asked_first_by_the_next_hub() {
 
     // Nobody streams: the next one asks there, for what is told in few bytes.
     let line = Line::at(&env.path("front"));
-    let outcome = search(&env, &line, env.link("front"));
+    let outcome = search(&env, &line, env.lms_link("front"));
     assert!(outcome.errors.contains("the search begins at 19200 baud"), "{outcome}");
 
     // A link with the same name at another port, and a file that anybody may have written.
     let other = Line::at(&env.path("other"));
-    let outcome = search(&env, &other, format!("--link=front={}", env.word("other")));
+    let outcome = search(&env, &other, format!("--link=front={},family=lms", env.word("other")));
     assert!(!outcome.errors.contains("the search begins at"), "{outcome}");
     fs::set_permissions(&kept, fs::Permissions::from_mode(0o666)).expect("it is ours");
     let line = Line::at(&env.path("again"));
-    let outcome = search(&env, &line, format!("--link=front={}", env.word("again")));
+    let outcome = search(&env, &line, format!("--link=front={},family=lms", env.word("again")));
     assert!(!outcome.errors.contains("the search begins at"), "{outcome}");
     assert!(outcome.errors.contains("others can write it"), "{outcome}");
     assert!(outcome.errors.contains("delete it; its content is learned again"), "{outcome}");

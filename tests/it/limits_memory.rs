@@ -80,7 +80,7 @@ fn done_or_short(outcome: &Outcome) {
 fn a_hub_starts_or_says_what_it_needs() {
     in_a_namespace("limits_memory::a_hub_starts_or_says_what_it_needs", || {
         let env = TestEnv::new();
-        let run = ["run".to_owned(), "--json".to_owned(), env.link("front")];
+        let run = ["run".to_owned(), "--json".to_owned(), env.lms_link("front")];
         let short = |bytes: u64| {
             mount(bytes);
             let outcome = env.run(&run);
@@ -102,7 +102,7 @@ fn a_hub_starts_or_says_what_it_needs() {
         }
         for bytes in [needed.next_multiple_of(4096), 8 << 20, 16 << 20] {
             mount(bytes);
-            let hub = env.hub(&[env.link("front")]);
+            let hub = env.hub(&[env.lms_link("front")]);
             assert_eq!(env.info("front")["state"], "absent");
             assert_eq!(hub.end(TERM).code, Some(0));
             assert!(env.left_behind().is_empty(), "{:?}", env.left_behind());
@@ -117,7 +117,7 @@ fn memory_that_is_full_stops_nobody_who_is_there() {
         mount(8 << 20);
         let env = TestEnv::new();
         let _simulator = env.simulator(&["front"], &["--seed=41", "--baud=500000"]);
-        let hub = env.hub(&[env.link("front")]);
+        let hub = env.hub(&[env.lms_link("front")]);
         let mut scans = env.echo(&["front/scan"]);
         scans.await_lines(10, "a scan", is_class("scan"));
         for _ in 0..2 {
@@ -156,7 +156,7 @@ fn consumers_that_come_together_where_little_is_left_end_in_order() {
     in_a_namespace("limits_memory::consumers_that_come_together_where_little_is_left_end_in_order", || {
         mount(8 << 20);
         let env = TestEnv::new();
-        let hub = env.hub(&[env.link("front")]);
+        let hub = env.hub(&[env.lms_link("front")]);
         let mut short = 0;
         for pages in [0, 1, 15, 16, 17, 18, 20, 24, 32] {
             fill(pages * 4096);
@@ -180,7 +180,7 @@ fn consumers_that_come_together_where_little_is_left_end_in_order() {
 fn a_bus_error_has_a_last_line() {
     let env = TestEnv::new();
     let _simulator = env.simulator(&["front"], &["--seed=42", "--baud=500000"]);
-    let hub = env.hub(&[env.link("front")]);
+    let hub = env.hub(&[env.lms_link("front")]);
     let mut consumer = env.start(&["echo", "--json", "front/scan"]);
     consumer.await_lines(3, "a scan", is_class("scan"));
     for (program, on_stdout) in [(hub, false), (consumer, true)] {
@@ -194,6 +194,6 @@ fn a_bus_error_has_a_last_line() {
         assert_eq!((outcome.code, &error["kind"]), (Some(75), &"short".into()), "{outcome}");
         assert!(error["message"].as_str().is_some_and(|message| message.contains("full")), "{outcome}");
     }
-    let outcome = env.hub(&[env.link("front")]).end(Signal::BUS);
+    let outcome = env.hub(&[env.lms_link("front")]).end(Signal::BUS);
     assert_eq!(outcome.code, Some(75), "{outcome}");
 }

@@ -268,13 +268,13 @@ fn the_scans_of_a_slow_recording_follow_each_other() {
 fn a_pose_and_circles_that_cannot_be_end_the_hub_with_their_place() {
     let env = TestEnv::new();
     for (text, words) in [
-        ("[link.pose]\nx = nan\n", ":5:5: x = NaN"),
-        ("[link.pose]\nx = 1.0\n", ":5:5: link front: no beam sees into the circle of 1 m"),
-        ("[link.zones]\nradii = [0.6, 1.0]\n", ":5:9: radii = [0.6, 1.0]"),
-        ("[link.zones]\nmargn = 0.1\n", ":5:1: unknown key `margn`"),
+        ("[link.pose]\nx = nan\n", ":6:5: x = NaN"),
+        ("[link.pose]\nx = 1.0\n", ":6:5: link front: no beam sees into the circle of 1 m"),
+        ("[link.zones]\nradii = [0.6, 1.0]\n", ":6:9: radii = [0.6, 1.0]"),
+        ("[link.zones]\nmargn = 0.1\n", ":6:1: unknown key `margn`"),
         ("[link.background]\nstart = \"/no/such/model\"\n", "/no/such/model"),
     ] {
-        let link = "[[link]]\nname = \"front\"\nport = \"/dev/null\"\n";
+        let link = "[[link]]\nname = \"front\"\nport = \"/dev/null\"\nangle = 180\n";
         let file = env.file("hub.toml", [link, text].concat());
         let outcome = env.run(&["run", "--config", &file, "--json"]);
         assert_eq!((outcome.code, outcome.out.is_empty()), (Some(78), true), "{outcome}");

@@ -11,7 +11,7 @@ use serde_json::Value;
 fn a_sensor_that_goes_and_comes_back() {
     let env = TestEnv::new();
     let simulator = env.simulator(&["front"], &["--seed=22", REAL_ANSWERS]);
-    let hub = env.hub(&[env.link("front")]);
+    let hub = env.hub(&[env.lms_link("front")]);
     let mut consumer = env.echo(&["front/scan", "front/status"]);
     consumer.await_lines(10, "a scan", is_class("scan"));
     assert_eq!(simulator.end(INT).code, Some(0));
@@ -43,7 +43,7 @@ fn stream(line: &Line, consumer: &mut Program, seed: u16) {
 fn a_port_is_taken_back_under_its_name_whatever_device_it_is() {
     let env = TestEnv::new();
     let port = env.path("front");
-    let hub = env.hub(&[env.link("front")]);
+    let hub = env.hub(&[env.lms_link("front")]);
     let mut consumer = env.echo(&["front/telegram", "front/status"]);
     // Another pty each time: the one before is still there when the next one is made.
     let mut line = Line::at(&port);
@@ -71,7 +71,7 @@ fn a_name_that_moves_while_its_old_device_lives() {
     let env = TestEnv::new();
     let port = env.path("front");
     let old = Line::at(&port);
-    let _hub = env.hub(&[env.link("front")]);
+    let _hub = env.hub(&[env.lms_link("front")]);
     let mut consumer = env.echo(&["front/telegram", "front/status"]);
     stream(&old, &mut consumer, 1);
     std::fs::remove_file(&port).expect("the name is there");
@@ -87,7 +87,7 @@ fn a_name_that_moves_while_its_old_device_lives() {
 fn a_port_that_comes_back_in_other_hands() {
     let env = TestEnv::new();
     let port = env.path("front");
-    let hub = env.hub(&[env.link("front")]);
+    let hub = env.hub(&[env.lms_link("front")]);
     env.await_info("front", |info| info["state"] == "absent");
     // This test holds it before it has its name.
     let line = Line::at(&env.path("elsewhere"));

@@ -127,7 +127,7 @@ fn who_is_started_with_the_hub_gets_a_recording_from_its_beginning() {
 #[test]
 fn a_file_without_a_telegram_does_not_stream() {
     let env = TestEnv::new();
-    let hub = env.hub(&[&format!("--link=a=file:{}", env.file("noise", vec![0x42; 4000]))]);
+    let hub = env.hub(&[&format!("--link=a=file:{},family=lms", env.file("noise", vec![0x42; 4000]))]);
     let info = at_the_end(&env);
     assert_eq!(info["counters"]["bytes_discarded"], 4000);
     let outcome = hub.end(INT);
@@ -222,7 +222,7 @@ fn data() -> Option<PathBuf> {
 fn counters_of(data: &std::path::Path, name: &str) -> Value {
     let env = TestEnv::new();
     let path = data.join(name);
-    let link = format!("--link=a=file:{}?rate=max", path.display());
+    let link = format!("--link=a=file:{}?rate=max,family=lms", path.display());
     let _hub: Program = env.hub(&[link]);
     at_the_end(&env)["counters"].clone()
 }

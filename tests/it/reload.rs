@@ -119,7 +119,7 @@ fn what_cannot_be_changed_is_said_and_what_cannot_be_changes_nothing() {
     for words in [
         format!("the configuration is refused, the old one stays: {place}; the largest first"),
         "front: pose, zones changed as configured".to_owned(),
-        "front: baud changed; restart the hub to apply it".to_owned(),
+        "front: family and baud changed; restart the hub to apply them".to_owned(),
         "side: link added; restart the hub to apply it".to_owned(),
     ] {
         assert!(ended.errors.contains(&words), "{words}: {ended}");

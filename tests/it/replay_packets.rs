@@ -219,7 +219,11 @@ fn what_cannot_be_played_is_refused_in_words() {
         78,
         "of family ld, and link front is of family lms",
     );
-    refused(&["run", &format!("--link=front=file:{recording}")], 78, "set link.front.family = \"ld\"");
+    refused(
+        &["run", &format!("--link=front=file:{recording},family=lms")],
+        78,
+        "set link.front.family = \"ld\"",
+    );
     let outcome = env.run(&["convert", &recording, &env.word("x.log")]);
     assert_eq!((outcome.code, outcome.errors.contains("no place")), (Some(66), true), "{outcome}");
     let outcome = env.run(&["telegram", "decode", &recording]);

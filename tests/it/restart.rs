@@ -11,7 +11,7 @@ fn consumers_outlive_several_hubs() {
     // A hub that gets no time is stale, as it should be, and not gone.
     let env = TestEnv::new();
     let simulator = env.simulator(&["front"], &["--seed=21"]);
-    let link = [env.link("front")];
+    let link = [env.lms_link("front")];
     let mut hub = env.hub(&link);
     let mut telegrams = env.echo(&["front/telegram"]);
     let mut scans = env.echo(&["front/scan", "front/status"]);

@@ -12,7 +12,7 @@ use serde_json::Value;
 fn a_hub_that_was_stopped() {
     let env = TestEnv::new();
     let simulator = env.simulator_on_real_lines(&["front"], &["--seed=31", "--baud=500000"]);
-    let hub = env.hub(&[env.link("front")]);
+    let hub = env.hub(&[env.lms_link("front")]);
     let mut consumer = env.echo(&["front/telegram", "front/scan", "front/zones", "front/status"]);
     consumer.await_lines(20, "a telegram", is_class("telegram"));
     let stopped = now();

@@ -118,6 +118,11 @@ impl TestEnv {
         format!("--link={name}={}", self.word(name))
     }
 
+    /// As [`link`](Self::link), with an LMS. A hub that searches for the scanner would also send requests of the search.
+    pub(crate) fn lms_link(&self, name: &str) -> String {
+        format!("{},family=lms", self.link(name))
+    }
+
     /// The program with `arguments`, in this domain.
     pub(crate) fn command<S: AsRef<str>>(&self, arguments: &[S]) -> Command {
         self.command_at(self.directory.path(), arguments)

@@ -57,17 +57,18 @@ impl List {
         let Link { name, port, scanner, processing, .. } = link;
         let of = |key: &'static str| (name.as_str(), key);
         self.put(of("port"), json!(port.name()), DEFAULT);
-        // A family that no source sets follows from the model.
         let features = scanner.features();
-        let reports_model = features.models.is_empty();
-        let by_model =
-            if reports_model { DEFAULT.to_owned() } else { format!("default of {}", scanner.model().name) };
         let family = link.family();
-        self.put(of("family"), json!(family.map_or(AUTO, Family::name)), &by_model);
+        let origin = match (family, scanner.settings.model) {
+            (None, _) => DEFAULT.to_owned(),
+            (_, Some(model)) => format!("default of {model}"),
+            _ => "follows from other keys".to_owned(),
+        };
+        self.put(of("family"), json!(family.map_or(AUTO, Family::name)), &origin);
         let settings = &scanner.settings;
         if family.is_none() {
             self.put(of("beams"), json!(settings.beams), DEFAULT);
-        } else if reports_model {
+        } else if features.models.is_empty() {
             self.reported(link);
         } else {
             self.put(of("model"), json!(scanner.model().name), DEFAULT);

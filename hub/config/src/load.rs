@@ -115,7 +115,7 @@ mod tests {
         let names: Vec<_> = config.links.iter().map(|link| (link.name.as_str(), link.port.name())).collect();
         assert_eq!(names, [("front", "/dev/ttyUSB0".to_owned()), ("rear", "/dev/ttyUSB1".to_owned())]);
         let link = &config.links[0];
-        assert_eq!((link.scanner.settings.view, link.rate()), (Some((180, 50)), 500_000));
+        assert_eq!((link.family(), link.scanner.settings.view, link.rate()), (None, None, 230_400));
     }
 
     #[test]

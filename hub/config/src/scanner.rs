@@ -148,17 +148,14 @@ impl ScannerDraft {
         refuse: impl Fn(&str, String, &str) -> Failure,
     ) -> Result<Scanner, Failure> {
         let named = match &self.family {
-            Some((None, _)) => self.named_family(lms_keys, &refuse)?,
-            _ => None,
+            Some((Some(_), _)) => None,
+            _ => self.named_family(lms_keys, &refuse)?,
         };
         let ScannerDraft { family, model, beams, mode, stop_when_idle } = self;
         let model = model.filter(|(model, _)| !model.eq_ignore_ascii_case(AUTO));
         let implied = model.as_ref().and_then(|(model, _)| family_of(model));
-        let is_searched = family.as_ref().is_some_and(|(family, _)| family.is_none()) && named.is_none();
-        let family = family.and_then(|(family, place)| Some((family.or(named)?, place)));
-        let set = family.as_ref().map(|(family, _)| *family);
-        if let (Some((model, place)), Some((family, family_place)), Some(implied)) =
-            (&model, &family, implied)
+        let set = family.and_then(|(family, place)| Some((family?, place)));
+        if let (Some((model, place)), Some((family, family_place)), Some(implied)) = (&model, &set, implied)
             && implied != *family
         {
             let [implied, family] = [implied.name(), family.name()];
@@ -166,7 +163,7 @@ impl ScannerDraft {
                 format!("model = \"{model}\" is of family {implied}, but {family_place} says {family}");
             return Err(refuse(place, what, &format!("leave `family` out, or set family = \"{implied}\"")));
         }
-        if let (Some((model, place)), None, None) = (&model, set, implied) {
+        if let (Some((model, place)), None, None) = (&model, &set, implied) {
             let known = Family::ALL.into_iter().map(features).flat_map(|features| features.models);
             let names = auto_or(known.map(|model| model.name));
             let remedy = format!(
@@ -174,11 +171,10 @@ impl ScannerDraft {
             );
             return Err(refuse(place, format!("model = \"{model}\""), &remedy));
         }
-        if is_searched {
+        let Some(family) = set.map(|(family, _)| family).or(named) else {
             let settings = Settings { beams: beams.map(|(beams, _)| beams), ..Settings::default() };
             return Ok(Scanner { family: None, expected_type: None, settings });
-        }
-        let family = set.or(implied).unwrap_or(Family::Lms);
+        };
         let name = family.name();
         let mode = mode.filter(|(mode, _)| !mode.eq_ignore_ascii_case(AUTO));
         let rest = stop_when_idle.filter(|(stops, _)| *stops);

@@ -22,7 +22,7 @@ impl Scratch {
 }
 
 /// Where no file says which there are.
-const LINKS: [&str; 2] = ["front=/dev/ttyUSB0", "rear=/dev/ttyUSB1"];
+const LINKS: [&str; 2] = ["front=/dev/ttyUSB0,family=lms", "rear=/dev/ttyUSB1,family=lms"];
 
 fn load(files: &[&Scratch], set: &[&str]) -> Result<Config, String> {
     let sources = Sources {
@@ -274,10 +274,12 @@ fn a_circle_that_the_sensor_cannot_see_is_refused() {
         &[&body("1.0")],
         "link rear: self_min covers every beam up to the circle of 1 m\n  shorten self_min",
     );
-    let file =
-        Scratch::new("away.toml", "[[link]]\nname = \"a\"\nport = \"x\"\n[link.pose]\nyaw = 0.1\nx = 2\n");
+    let file = Scratch::new(
+        "away.toml",
+        "[[link]]\nname = \"a\"\nport = \"x\"\nangle = 180\n[link.pose]\nyaw = 0.1\nx = 2\n",
+    );
     let refusal = load(&[&file], &[]).unwrap_err();
-    assert!(refusal.contains("away.toml:6:5: link a: no beam sees into the circle of 1 m"), "{refusal}");
+    assert!(refusal.contains("away.toml:7:5: link a: no beam sees into the circle of 1 m"), "{refusal}");
 }
 
 #[test]

@@ -96,14 +96,17 @@ fn a_link_shows_the_keys_of_its_own_family() {
     let said = ["link.front.family=ld", "link.front.model=ld19", "link.front.beams=300"];
     let values = |set: &[&str]| values(&sources(&[], &LINKS, set)).unwrap();
     let (all, auto) = (values(&said), values(&said[..1]));
+    let (lms, model) = (values(&["link.rear.angle=180"]), values(&["link.rear.model=ld19"]));
     for (values, key, value, origin) in [
         (&all, "link.front.family", json!("ld"), "--set link.front.family=ld"),
         (&all, "link.front.model", json!("ld19"), "--set link.front.model=ld19"),
         (&all, "link.front.beams", json!(300), "--set link.front.beams=300"),
         (&auto, "link.front.model", json!("auto"), "default"),
         (&auto, "link.front.beams", Json::Null, "default"),
-        (&all, "link.rear.family", json!("lms"), "default"),
-        (&all, "link.rear.baud", Json::Null, "default"),
+        (&all, "link.rear.family", json!("auto"), "default"),
+        (&lms, "link.rear.family", json!("lms"), "follows from other keys"),
+        (&lms, "link.rear.baud", Json::Null, "default"),
+        (&model, "link.rear.family", json!("ld"), "default of ld19"),
     ] {
         assert_eq!(shown(values, key), (&value, origin), "{key}");
     }
@@ -111,9 +114,9 @@ fn a_link_shows_the_keys_of_its_own_family() {
     assert_eq!(shown(&top, "link.front.mode").0, &json!("express"));
     assert_eq!(shown(&top, "link.front.idle").0, &json!("stop"));
     assert!(all.iter().all(|value| value.key != "link.front.mode" && value.key != "link.front.idle"));
-    let lms = ["type", "angle", "resolution", "unit", "mode", "baud"].map(|key| format!("link.front.{key}"));
-    let ld = ["model", "beams"].map(|key| format!("link.rear.{key}"));
-    assert!(all.iter().all(|value| !lms.contains(&value.key) && !ld.contains(&value.key)));
+    let lms_keys =
+        ["type", "angle", "resolution", "unit", "mode", "baud"].map(|key| format!("link.front.{key}"));
+    assert!(all.iter().all(|value| !lms_keys.contains(&value.key) && value.key != "link.rear.model"));
     let set: Vec<String> = all
         .iter()
         .filter(|value| !value.value.is_null())
@@ -177,7 +180,7 @@ fn default_file_sets_the_defaults_and_shows_every_family() {
     let all = Config::load(&sources(&[&all], &[], &[])).unwrap();
     let families: Vec<_> = all.links.iter().filter_map(|link| link.family()).collect();
     assert_eq!(families, schema::Family::ALL);
-    let scanner = &all.links[0].scanner;
+    let scanner = &all.links[1].scanner;
     assert!(scanner.expected_type.is_some() && scanner.settings.unit_mm.is_some());
 }
 

@@ -6,7 +6,7 @@ use config::{Config, Link, Sources, values};
 fn sources(set: &[&str]) -> Sources {
     let owned = |flags: &[&str]| flags.iter().map(|flag| (*flag).to_owned()).collect();
     let set = [&["link.side.family=ld"], set].concat();
-    Sources { files: Vec::new(), links: owned(&["front=/dev/x", "side=/dev/y"]), set: owned(&set) }
+    Sources { files: Vec::new(), links: owned(&["front=/dev/x,family=lms", "side=/dev/y"]), set: owned(&set) }
 }
 
 #[test]

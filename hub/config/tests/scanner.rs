@@ -30,7 +30,7 @@ fn a_link_has_a_family_and_what_its_family_needs() {
     let family = "link.front.family=ld";
     let set = |model, beams| Some(("ld", model, beams));
     for (setting, scanner, rate, beams) in [
-        (&[][..], None, 500_000, 401),
+        (&["link.front.family=lms"][..], None, 500_000, 401),
         (&["link.front.family=lms", "link.front.model=auto"], None, 500_000, 401),
         (&[family, "link.front.model=ld19"], set("ld19", None), 230_400, 450),
         (&[family, "link.front.model=stl27l"], set("stl27l", None), 921_600, 2160),
@@ -50,7 +50,7 @@ fn a_link_has_a_family_and_what_its_family_needs() {
         (&[family, "link.front.mode=auto", "link.front.idle=run"], set("auto", None), 230_400, 720),
         // The later one counts, of whichever family it is.
         (&[family, "link.front.mode=1", "link.front.mode=auto"], set("auto", None), 230_400, 720),
-        (&["link.front.mode=auto", "link.front.idle=run"], None, 500_000, 401),
+        (&["link.front.family=lms", "link.front.mode=auto", "link.front.idle=run"], None, 500_000, 401),
     ] {
         let link = front(setting).unwrap();
         assert_eq!(known(&link), (scanner, rate, beams), "{setting:?}");
@@ -60,7 +60,7 @@ fn a_link_has_a_family_and_what_its_family_needs() {
     let marks = |link: &Link| (link.processing.marks.i_min, link.processing.marks.level);
     assert_eq!((marks(&config.links[0]), marks(&config.links[1])), ((2, Some(250)), (2, Some(240))));
     // The other link is what it was.
-    assert_eq!(load(&[family]).unwrap().links[1].family(), Some(Family::Lms));
+    assert_eq!(load(&[family]).unwrap().links[1].family(), None);
 
     let lms = "is of family lms; a scanner of another family has no such setting\n  leave it out, or set family = \"lms\"";
     for (others, setting, words) in [
@@ -90,7 +90,7 @@ fn a_link_has_a_family_and_what_its_family_needs() {
              out, or set family = \"rplidar\"",
         ),
         (
-            &[],
+            &["link.front.family=lms"],
             "beams=450",
             "link front: beams = 450, and an lms has its own\n  leave it out; `angle` and `resolution`",
         ),
@@ -112,14 +112,22 @@ fn a_link_has_a_family_and_what_its_family_needs() {
             "mode=express",
             "link front: mode = \"express\", and an ld measures in one way only\n  leave it out",
         ),
-        (&[], "mode=express", "link front: mode = \"express\"\n  0x00 to 0x06, or 0x0F"),
+        (
+            &["link.front.family=lms"],
+            "mode=express",
+            "link front: mode = \"express\"\n  0x00 to 0x06, or 0x0F",
+        ),
         (&[], "mode=1.5", "mode = 1.5\n  0x00 to 0x06, or 0x0F"),
         (
             &[family],
             "idle=stop",
             "link front: idle = \"stop\", and an ld cannot be told to rest\n  leave it out",
         ),
-        (&[], "idle=stop", "link front: idle = \"stop\", and an lms cannot be told to rest"),
+        (
+            &["link.front.family=lms"],
+            "idle=stop",
+            "link front: idle = \"stop\", and an lms cannot be told to rest",
+        ),
         (&[family], "idle=rest", "idle = \"rest\"\n  one of: run, stop"),
         (
             &[family],
@@ -208,10 +216,9 @@ fn keys_of_a_link_may_follow_its_port() {
 
 #[test]
 fn a_family_may_be_searched_for() {
-    let front = |set: &[&str]| {
-        load(&[&["link.front.family=auto"], set].concat()).map(|mut config| config.links.swap_remove(0))
-    };
+    let front = |set: &[&str]| load(set).map(|mut config| config.links.swap_remove(0));
     let link = front(&[]).unwrap();
+    assert_eq!(front(&["link.front.family=auto"]).unwrap(), link, "it is the default");
     assert_eq!((link.family(), link.max_beams(), link.rate()), (None, 3_240, 230_400));
     assert!(link.scanner.is_auto());
     let limits = link.limits(&schema::limits::TopicLimits::default());
@@ -227,9 +234,9 @@ fn a_family_may_be_searched_for() {
     }
     let remedy = "family = \"auto\" needs the most: set link.front.family to one of lms, ld, rplidar";
     let short = || schema::Failure::new(Kind::Short, "shared memory is short", "free some of it");
-    let config = load(&["link.front.family=auto"]).unwrap();
-    assert_eq!(config.with_remedy(short()).hint, format!("free some of it; {remedy}"));
-    assert_eq!(load(&[]).unwrap().with_remedy(short()), short());
+    assert_eq!(load(&[]).unwrap().with_remedy(short()).hint, format!("free some of it; {remedy}"));
+    let named = load(&["link.front.family=ld", "link.rear.family=lms"]).unwrap();
+    assert_eq!(named.with_remedy(short()), short());
     // An LMS has its own number of beams.
     let beams = front(&["link.front.beams=300"]).unwrap();
     assert_eq!((beams.scanner.settings.beams, beams.max_beams()), (Some(300), 401));

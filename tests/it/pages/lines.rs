@@ -122,7 +122,8 @@ impl Desk {
         shell.env("SCANHUB_END_WITH_PARENT", "1").env("SCANHUB_LOG", "error").env_remove("SCANHUB_CONFIG");
         let program = Program::start(shell);
         let group = Pid::from_raw(program.pid() as i32).expect("a process");
-        let ends = ENDING.iter().any(|verb| line.starts_with(verb));
+        let mut words = line.split_whitespace();
+        let ends = words.next() == Some("scanhub") && words.next().is_some_and(|verb| ENDING.contains(&verb));
         // Any other may last. It is ended when it can be, and has had time for something to go wrong.
         until(line, || program.is_over() || !ends && catches_interrupts(group));
         let begun = Instant::now();
@@ -143,8 +144,7 @@ impl Desk {
 }
 
 /// Commands that end by themselves, however long that takes on this machine.
-const ENDING: [&str; 6] =
-    ["scanhub doctor", "scanhub probe", "scanhub list", "scanhub info", "scanhub convert", "scanhub key"];
+const ENDING: [&str; 6] = ["doctor", "probe", "list", "info", "convert", "key"];
 
 /// Time in which a command that lasts may fail. A longer or shorter time does not let a right one fail.
 const TIME_TO_FAIL: Duration = Duration::from_millis(1200);
