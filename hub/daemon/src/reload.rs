@@ -191,11 +191,11 @@ mod tests {
 
     #[test]
     fn what_is_made_of_scans_changes_now_and_lines_at_the_next_start() {
-        let old = config(&["a=/dev/x", "b=/dev/y", "c=/dev/z"], &[]);
+        let old = config(&["a=/dev/x", "b=/dev/y,family=lms", "c=/dev/z"], &[]);
         let same = Differences::between(&old, &old);
         assert_eq!(same, Differences::default());
         let new = config(
-            &["d=/dev/w", "b=/dev/other", "a=/dev/x"],
+            &["d=/dev/w", "b=/dev/other,family=lms", "a=/dev/x"],
             &[
                 "zones.radii=[2.0]",
                 "link.a.pose.x=0.3",

@@ -150,7 +150,7 @@ fn link_name(sensor: &str) -> String {
 
 /// What is configured, with the sensors of the recording for links.
 fn configuration(sources: &Sources, sensors: &[Sensor], file: &Path) -> Result<Config, Failure> {
-    let mut config = Config::load(&with_links(sources, sensors))?;
+    let mut config = Config::load(&with_links(sources, sensors)?)?;
     config.links.retain(|link| sensors.iter().any(|sensor| sensor.link == link.name));
     for link in &mut config.links {
         link.port = Source::File { path: file.to_owned(), paced: true };
@@ -168,15 +168,18 @@ fn configuration(sources: &Sources, sensors: &[Sensor], file: &Path) -> Result<C
     Ok(config)
 }
 
-/// `sources`, and a link for each of the sensors, of its family unless another one is set for it.
-fn with_links(sources: &Sources, sensors: &[Sensor]) -> Sources {
+/// Returns `sources` with a link for each of `sensors`. A link without a configured family has that of its sensor.
+fn with_links(sources: &Sources, sensors: &[Sensor]) -> Result<Sources, Failure> {
     let mut sources = sources.clone();
     // Not the path itself, which may have signs that have a meaning in a port's name.
     sources.links.extend(sensors.iter().map(|sensor| format!("{}=file:recording", sensor.link)));
-    let turning = sensors.iter().filter(|sensor| sensor.family != Family::Lms);
-    let families = turning.map(|sensor| format!("link.{}.family={}", sensor.link, sensor.family.name()));
-    sources.set.splice(..0, families);
-    sources
+    let links = Config::load(&sources)?.links;
+    let is_searched =
+        |sensor: &&Sensor| links.iter().any(|link| link.name == sensor.link && link.family().is_none());
+    let families = sensors.iter().filter(is_searched);
+    let families = families.map(|sensor| format!("link.{}.family={}", sensor.link, sensor.family.name()));
+    sources.set.extend(families);
+    Ok(sources)
 }
 
 /// Links that are configured and not in `config`.
@@ -184,7 +187,7 @@ fn left_out(sources: &Sources, sensors: &[Sensor], config: &Config) -> Result<Ve
     if sources.files.is_empty() {
         return Ok(Vec::new());
     }
-    let all = Config::load(&with_links(sources, sensors))?.links.into_iter().map(|link| link.name);
+    let all = Config::load(&with_links(sources, sensors)?)?.links.into_iter().map(|link| link.name);
     Ok(all.filter(|name| config.links.iter().all(|link| link.name != *name)).collect())
 }
 
