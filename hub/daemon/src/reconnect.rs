@@ -5,7 +5,7 @@ use std::io;
 
 use port::{PortError, Source};
 use scanhub_drivers::PortSession;
-use scanhub_drivers::line::{Control, Identity, Session as _};
+use scanhub_drivers::line::{Control, Identity, Protocol as _, Session as _};
 use schema::{Failure, Flags, MILLIS, Nanos, State};
 
 use crate::control::{ControlQueue, Flow};

@@ -13,7 +13,7 @@ use crate::line::{
     self, Account, Control, Identity, Introduction, KnownRate, Notice, Output, Protocol as _, RawScan,
     Received, Session as _, State,
 };
-use crate::search::{self, Found, Memory, PortKind, Search};
+use crate::search::{Found, Memory, PortKind, Search};
 
 /// A session on an open port.
 #[derive(Debug)]
@@ -36,10 +36,6 @@ pub struct PortSession {
     trouble: Option<Trouble>,
     /// Whether a user has paused the search.
     is_paused: bool,
-    /// Rate that the port has to get before the search begins.
-    set_rate: Option<u32>,
-    /// The byte that the search sends.
-    byte: [u8; 1],
     now: Nanos,
     /// Last time that was passed to the session. Captured reads are older than `now`.
     session_now: Nanos,
@@ -86,8 +82,6 @@ impl PortSession {
             last: None,
             trouble: None,
             is_paused: false,
-            set_rate: None,
-            byte: [0],
             now,
             session_now: now,
             received_at: now,
@@ -123,14 +117,6 @@ impl PortSession {
         let before = self.memory.filter(|memory| memory.family == family && found_rate == stream_rate);
         let reply_rate = before.map_or(found_rate, |memory| memory.reply_rate);
         Some(Memory { family, stream_rate, reply_rate })
-    }
-
-    /// Handles that the port cannot have the rate of the last [`Output::SetRate`], or the one at which it should be open.
-    pub fn reject_rate(&mut self, now: Nanos) {
-        self.now = now;
-        if let Stage::Searching(search) = &mut self.stage {
-            search.reject_rate(now);
-        }
     }
 
     /// Continues when [`poll_output`](line::Protocol::poll_output) has returned a wait. Returns whether there is more to drain:
@@ -178,7 +164,7 @@ impl PortSession {
         let Found { family, rate, model: _ } = found;
         self.captured = search.reads().map(|(at, bytes)| (at, bytes.to_vec())).collect();
         self.captured.reverse();
-        self.searched += search.account().read;
+        self.searched += search.account().discarded;
         let begins = self.captured.last().map_or(self.now, |(at, _)| *at);
         let mut session = Session::begin(family, &self.settings, begins);
         if let Some(known) = self.known_rate {
@@ -220,12 +206,11 @@ impl PortSession {
     /// Starts a search on a port that is open at any rate.
     fn search(&mut self) {
         if let Stage::Searching(search) = &self.stage {
-            self.searched += bytes_read(search);
+            self.searched += search.account().read;
         }
-        let port = port_kind(&self.settings);
-        self.set_rate = (port == PortKind::Serial).then(|| Search::opening_rate(self.memory));
         self.captured.clear();
-        self.stage = Stage::Searching(Box::new(Search::new(port, self.memory, self.now)));
+        let search = Search::new(port_kind(&self.settings), self.memory, self.now);
+        self.stage = Stage::Searching(Box::new(search.at_another_rate()));
     }
 }
 
@@ -267,23 +252,17 @@ impl line::Protocol for PortSession {
         }
     }
 
+    fn reject_rate(&mut self, now: Nanos) {
+        self.now = now;
+        if let Stage::Searching(search) = &mut self.stage {
+            search.reject_rate(now);
+        }
+    }
+
     fn poll_output(&mut self) -> Output<'_> {
         match &mut self.stage {
             Stage::Searching(_) if self.is_paused => Output::Wait { until: Nanos::MAX },
-            Stage::Searching(search) => {
-                if let Some(rate) = self.set_rate.take() {
-                    return Output::SetRate(rate);
-                }
-                match search.poll_output() {
-                    search::Output::SetRate(rate) => Output::SetRate(rate),
-                    search::Output::Transmit { byte, not_before } => {
-                        self.byte = [byte];
-                        Output::Transmit { bytes: &self.byte, not_before }
-                    }
-                    search::Output::Wait { until } => Output::Wait { until },
-                    search::Output::Found(_) => Output::Wait { until: self.now },
-                }
-            }
+            Stage::Searching(search) => search.poll_output(),
             Stage::Found(session) => {
                 let may_search = self.is_auto && session.state() != State::Paused;
                 let lost_at = if may_search { self.received_at + LOST_AFTER } else { Nanos::MAX };
@@ -335,7 +314,7 @@ impl line::Session for PortSession {
     fn state(&self) -> State {
         match &self.stage {
             Stage::Searching(_) if self.is_paused => State::Paused,
-            Stage::Searching(search) => search.state(),
+            Stage::Searching(_) => State::Probing,
             Stage::Found(session) => session.state(),
         }
     }
@@ -350,18 +329,14 @@ impl line::Session for PortSession {
 
     fn rate(&self) -> u32 {
         match &self.stage {
-            // A port that cannot have the rate of the search has an unknown one.
-            Stage::Searching(search) => search.rate().filter(|&rate| rate > 0).unwrap_or(SLOWEST),
+            Stage::Searching(search) => search.rate().unwrap_or(SLOWEST),
             Stage::Found(session) => session.rate(),
         }
     }
 
     fn account(&self) -> Account {
         let now = match &self.stage {
-            Stage::Searching(search) => {
-                let (read, discarded) = (bytes_read(search), search.account().discarded);
-                Account { read, discarded, buffered: read - discarded, ..Account::default() }
-            }
+            Stage::Searching(search) => search.account(),
             Stage::Found(session) => {
                 let account = session.account();
                 let captured = self.captured.iter().map(|(_, bytes)| bytes.len() as u64).sum::<u64>();
@@ -470,11 +445,7 @@ impl line::Session for PortSession {
         counters[Counter::BytesRead] += self.searched;
         counters[Counter::BytesDiscarded] += self.searched;
         match &self.stage {
-            Stage::Searching(search) => {
-                let (read, discarded) = (bytes_read(search), search.account().discarded);
-                Account { read, discarded, buffered: read - discarded, ..Account::default() }
-                    .add_to(counters);
-            }
+            Stage::Searching(search) => search.account().add_to(counters),
             Stage::Found(session) => {
                 session.add_counters(counters);
                 let captured = self.captured.iter().map(|(_, bytes)| bytes.len() as u64).sum::<u64>();
@@ -483,11 +454,6 @@ impl line::Session for PortSession {
             }
         }
     }
-}
-
-/// Returns the number of bytes that `search` has read, with those that it keeps for the session.
-fn bytes_read(search: &Search) -> u64 {
-    search.account().read + search.reads().map(|(_, bytes)| bytes.len() as u64).sum::<u64>()
 }
 
 /// Returns the kind of the port of a session with these settings.

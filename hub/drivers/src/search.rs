@@ -12,42 +12,20 @@
 //! family declares them in its [`Approach`]. Resets, motor requests, changes of settings and of the line DTR belong to the
 //! sessions. In the first 150 ms after the open, no byte is sent.
 //!
-//! The search is driven like a [`Session`](crate::line::Session). It ends with [`Output::Found`]; then the bytes of its
-//! last step are available from [`Search::reads`], so that the family's session handles each of them.
+//! The search is a [`Protocol`]. It is done when it has [found](Search::found) the scanner. Then the bytes of its last step are
+//! available from [`Search::reads`], so that the family's session handles each of them.
 
 use core::fmt;
 
 use schema::{Family, MILLIS, Nanos, line_time};
 
 use crate::line::probe::{Approach, Asks, Evidence, Probe};
-use crate::line::{Account, State};
+use crate::line::{Account, Output, Protocol};
 use crate::{ld, lms, rplidar};
 
 /// Creates a recognizer for each family. Steps that listen, and steps that ask, are in this order.
 fn probes() -> [Box<dyn Probe>; 3] {
     [Box::<ld::Probe>::default(), Box::<lms::Probe>::default(), Box::<rplidar::Probe>::default()]
-}
-
-/// Next action of the driver.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Output {
-    /// Set the port to this rate, in bits per second, and discard the bytes that it has received. If the port cannot have
-    /// this rate, call [`Search::reject_rate`]. Then continue to drain.
-    SetRate(u32),
-    /// Write this byte, not before the given time, and then call [`Search::transmitted`]. Do nothing else meanwhile.
-    Transmit {
-        /// The byte.
-        byte: u8,
-        /// Earliest time to write it.
-        not_before: Nanos,
-    },
-    /// Read when the port has bytes. If a read at the deadline finds none, call [`Search::handle_timeout`].
-    Wait {
-        /// The deadline; [`Nanos::MAX`] means none.
-        until: Nanos,
-    },
-    /// The scanner is found, and the search has ended.
-    Found(Found),
 }
 
 /// Result of a search.
@@ -98,8 +76,7 @@ pub enum Trouble {
     },
 }
 
-/// A search on an open port. After every call that changes it, drain [`Search::poll_output`] until it returns
-/// [`Output::Wait`] or [`Output::Found`].
+/// A search on an open port. It returns no events.
 #[derive(Debug)]
 pub struct Search {
     port: PortKind,
@@ -245,101 +222,10 @@ impl Search {
         search
     }
 
-    /// Returns the buffer for the next read; never empty once the outputs are drained.
-    pub fn spare(&mut self) -> &mut [u8] {
-        self.capture.spare()
-    }
-
-    /// Handles a read that returned at `now` with `len` bytes in [`spare`](Self::spare).
-    pub fn commit(&mut self, now: Nanos, len: usize) {
-        self.now = now;
-        if len == 0 || self.found.is_some() {
-            return;
-        }
-        let removed = self.capture.commit(now, len);
-        self.asked_at = self.asked_at.saturating_sub(removed);
-        (self.last_byte, self.read) = (now, self.read + len as u64);
-        match &mut self.phase {
-            Phase::Pausing { until } => *until = (*until).min(now + END_OF_PAUSE),
-            Phase::Draining { ask, until, .. } => *until = now + ask.asks.stop.map_or(0, |stop| stop.quiet),
-            _ => {}
-        }
-        for probe in &mut self.probes {
-            if listens_at(probe.approach(), self.rate) {
-                probe.receive(self.capture.last(len));
-            }
-        }
-        self.conclude();
-    }
-
-    /// Handles a deadline at which a read found nothing.
-    pub fn handle_timeout(&mut self, now: Nanos) {
-        self.now = now;
-        let idle = now.saturating_sub(self.last_byte);
-        self.probes.iter_mut().for_each(|probe| probe.release(idle));
-        self.conclude();
-    }
-
-    /// Leaves out the rate of the last [`Output::SetRate`], or, before the first output, the opening rate, because the port
-    /// cannot have it.
-    pub fn reject_rate(&mut self, now: Nanos) {
-        self.now = now;
-        self.rejected.extend(self.rate.replace(UNKNOWN_RATE));
-        if !matches!(self.phase, Phase::Pausing { .. }) {
-            self.advance();
-        }
-    }
-
-    /// Continues after the byte of [`Output::Transmit`] was written at `now`.
-    pub fn transmitted(&mut self, now: Nanos) {
-        self.now = now;
-        // The rate of a server is unknown, so its bytes are sent at the slowest pace.
-        let byte_time = line_time(1, self.rate.unwrap_or(BOOT_RATE));
-        let Phase::Sending { ask, outgoing } = &mut self.phase else { return };
-        outgoing.transmitted(now, byte_time, ask.asks.gap);
-        if outgoing.sent < outgoing.request.len() {
-            return;
-        }
-        let (ask, stop) = (*ask, ask.asks.stop.filter(|_| ask.is_stop));
-        self.phase = match stop {
-            Some(stop) => Phase::Draining { ask, until: now + stop.quiet, at_most: now + stop.at_most },
-            None => {
-                let until = now + self.reply_time(ask.asks);
-                Phase::Awaiting { ask, until, at_most: until + ask.asks.extension }
-            }
-        };
-    }
-
-    /// Returns what the search wants next.
-    pub fn poll_output(&mut self) -> Output {
-        if let Some(found) = self.found {
-            return Output::Found(found);
-        }
-        loop {
-            if core::mem::take(&mut self.change_rate)
-                && let Some(rate) = self.rate
-            {
-                return Output::SetRate(rate);
-            }
-            let until = match &self.phase {
-                Phase::Sending { outgoing, .. } if outgoing.not_before <= self.now + TRANSMIT_AHEAD => {
-                    let Outgoing { request, sent, not_before, .. } = *outgoing;
-                    return Output::Transmit { byte: request[sent], not_before };
-                }
-                Phase::Sending { outgoing, .. } => outgoing.not_before,
-                Phase::Draining { until, at_most, .. } => *until.min(at_most),
-                Phase::Listening { until, .. }
-                | Phase::Settling { until, .. }
-                | Phase::Awaiting { until, .. }
-                | Phase::Pausing { until } => *until,
-            };
-            if until > self.now {
-                let holds = self.probes.iter().filter_map(|probe| probe.hold());
-                let held_until = holds.map(|hold| self.last_byte + hold).filter(|&at| at > self.now).min();
-                return Output::Wait { until: until.min(held_until.unwrap_or(Nanos::MAX)) };
-            }
-            self.expire();
-        }
+    /// Requests the [`opening_rate`](Self::opening_rate) first, because the port is open at another rate.
+    pub fn at_another_rate(mut self) -> Search {
+        self.change_rate = self.rate.is_some();
+        self
     }
 
     /// Returns the scanner, once it is found.
@@ -353,20 +239,20 @@ impl Search {
         self.capture.reads()
     }
 
-    /// Returns the state that is shown.
-    pub fn state(&self) -> State {
-        State::Probing
-    }
-
-    /// Returns the rate of the port, in bits per second. `None` if it has none that can be set.
+    /// Returns the rate of the port, in bits per second. `None` if it is unknown.
     pub fn rate(&self) -> Option<u32> {
-        self.rate
+        self.rate.filter(|&rate| rate != UNKNOWN_RATE)
     }
 
-    /// Returns the counters of the bytes that the search has read, except those in [`reads`](Self::reads).
+    /// Returns the number of complete rounds.
+    pub fn rounds(&self) -> usize {
+        self.round
+    }
+
+    /// Returns the counters. The bytes in [`reads`](Self::reads) count as buffered.
     pub fn account(&self) -> Account {
-        let discarded = self.read - self.capture.len() as u64;
-        Account { read: discarded, discarded, ..Account::default() }
+        let buffered = self.capture.len() as u64;
+        Account { read: self.read, discarded: self.read - buffered, buffered, ..Account::default() }
     }
 
     /// Returns why no scanner is found yet. `None` in the first two rounds.
@@ -632,6 +518,102 @@ impl Search {
             rates.sort_by_key(|rate| order.iter().position(|first| first == rate).unwrap_or(order.len()));
         }
         rates
+    }
+}
+
+impl Protocol for Search {
+    fn spare(&mut self) -> &mut [u8] {
+        self.capture.spare()
+    }
+
+    fn commit(&mut self, now: Nanos, len: usize) {
+        self.now = now;
+        if len == 0 || self.found.is_some() {
+            return;
+        }
+        let removed = self.capture.commit(now, len);
+        self.asked_at = self.asked_at.saturating_sub(removed);
+        (self.last_byte, self.read) = (now, self.read + len as u64);
+        match &mut self.phase {
+            Phase::Pausing { until } => *until = (*until).min(now + END_OF_PAUSE),
+            Phase::Draining { ask, until, .. } => *until = now + ask.asks.stop.map_or(0, |stop| stop.quiet),
+            _ => {}
+        }
+        for probe in &mut self.probes {
+            if listens_at(probe.approach(), self.rate) {
+                probe.receive(self.capture.last(len));
+            }
+        }
+        self.conclude();
+    }
+
+    fn handle_timeout(&mut self, now: Nanos) {
+        self.now = now;
+        let idle = now.saturating_sub(self.last_byte);
+        self.probes.iter_mut().for_each(|probe| probe.release(idle));
+        self.conclude();
+    }
+
+    fn reject_rate(&mut self, now: Nanos) {
+        self.now = now;
+        self.rejected.extend(self.rate.replace(UNKNOWN_RATE));
+        if !matches!(self.phase, Phase::Pausing { .. }) {
+            self.advance();
+        }
+    }
+
+    fn transmitted(&mut self, now: Nanos) {
+        self.now = now;
+        // The rate of a server is unknown, so its bytes are sent at the slowest pace.
+        let byte_time = line_time(1, self.rate.unwrap_or(BOOT_RATE));
+        let Phase::Sending { ask, outgoing } = &mut self.phase else { return };
+        outgoing.transmitted(now, byte_time, ask.asks.gap);
+        if outgoing.sent < outgoing.request.len() {
+            return;
+        }
+        let (ask, stop) = (*ask, ask.asks.stop.filter(|_| ask.is_stop));
+        self.phase = match stop {
+            Some(stop) => Phase::Draining { ask, until: now + stop.quiet, at_most: now + stop.at_most },
+            None => {
+                let until = now + self.reply_time(ask.asks);
+                Phase::Awaiting { ask, until, at_most: until + ask.asks.extension }
+            }
+        };
+    }
+
+    fn is_done(&self) -> bool {
+        self.found.is_some()
+    }
+
+    fn poll_output(&mut self) -> Output<'_> {
+        if self.is_done() {
+            return Output::Wait { until: self.now };
+        }
+        loop {
+            if core::mem::take(&mut self.change_rate)
+                && let Some(rate) = self.rate
+            {
+                return Output::SetRate(rate);
+            }
+            let until = match &self.phase {
+                Phase::Sending { outgoing, .. } if outgoing.not_before <= self.now + TRANSMIT_AHEAD => {
+                    let Outgoing { request, sent, not_before, .. } = *outgoing;
+                    return Output::Transmit { bytes: &request[sent..=sent], not_before };
+                }
+                Phase::Sending { outgoing, .. } => outgoing.not_before,
+                Phase::Draining { until, at_most, .. } => *until.min(at_most),
+                Phase::Listening { until, .. }
+                | Phase::Settling { until, .. }
+                | Phase::Awaiting { until, .. }
+                | Phase::Pausing { until } => *until,
+            };
+            if until > self.now {
+                let holds = self.probes.iter().filter_map(|probe| probe.hold());
+                let held_until = holds.map(|hold| self.last_byte + hold).filter(|&at| at > self.now).min();
+                return Output::Wait { until: until.min(held_until.unwrap_or(Nanos::MAX)) };
+            }
+            self.expire();
+        }
     }
 }
 

@@ -4,9 +4,9 @@
 use std::collections::VecDeque;
 
 use scanhub_drivers::ld;
-use scanhub_drivers::line;
+use scanhub_drivers::line::{self, Output, Protocol};
 use scanhub_drivers::lms::variant::Baud;
-use scanhub_drivers::search::{Found, Memory, Output, PortKind, Search};
+use scanhub_drivers::search::{Found, Memory, PortKind, Search};
 use schema::{MICROS, MILLIS, Nanos, line_time};
 use sim::Arrival;
 use sim::device::Device;
@@ -22,12 +22,14 @@ use sim::wire::Wire;
 /// Host's end of the line: a search, or a session to compare it with.
 pub(crate) trait Host {
     type Result;
-    fn spare(&mut self) -> &mut [u8];
-    fn commit(&mut self, now: Nanos, len: usize);
-    fn handle_timeout(&mut self, now: Nanos);
-    fn transmitted(&mut self, now: Nanos);
-    fn reject_rate(&mut self, now: Nanos);
+
+    fn protocol(&mut self) -> &mut impl Protocol;
+
     fn poll(&mut self) -> Event<Self::Result>;
+
+    fn commit(&mut self, now: Nanos, len: usize) {
+        self.protocol().commit(now, len);
+    }
 }
 
 /// Next action of a host.
@@ -35,39 +37,45 @@ pub(crate) enum Event<R> {
     SetRate(u32),
     Transmit(u8, Nanos),
     Wait(Nanos),
+    Rest(Nanos),
     Done(R),
+}
+
+impl<R> Event<R> {
+    /// Returns the next action that `protocol` requests. `event` handles its events, and returns a result to end with.
+    pub(crate) fn of(
+        protocol: &mut impl Protocol,
+        mut event: impl FnMut(line::Event<'_>) -> Option<R>,
+    ) -> Event<R> {
+        loop {
+            return match protocol.poll_output() {
+                Output::SetRate(rate) => Event::SetRate(rate),
+                Output::SetDtr(_) => continue,
+                Output::Transmit { bytes, not_before } => {
+                    let &[byte] = bytes else { panic!("more than a byte: {bytes:?}") };
+                    Event::Transmit(byte, not_before)
+                }
+                Output::Wait { until } => Event::Wait(until),
+                Output::Rest(until) => Event::Rest(until),
+                Output::Event(received) => match event(received) {
+                    Some(result) => Event::Done(result),
+                    None => continue,
+                },
+            };
+        }
+    }
 }
 
 impl Host for Search {
     type Result = Found;
 
-    fn spare(&mut self) -> &mut [u8] {
-        self.spare()
-    }
-
-    fn commit(&mut self, now: Nanos, len: usize) {
-        self.commit(now, len);
-    }
-
-    fn handle_timeout(&mut self, now: Nanos) {
-        self.handle_timeout(now);
-    }
-
-    fn transmitted(&mut self, now: Nanos) {
-        self.transmitted(now);
-    }
-
-    fn reject_rate(&mut self, now: Nanos) {
-        self.reject_rate(now);
+    fn protocol(&mut self) -> &mut impl Protocol {
+        self
     }
 
     fn poll(&mut self) -> Event<Found> {
-        match self.poll_output() {
-            Output::SetRate(rate) => Event::SetRate(rate),
-            Output::Transmit { byte, not_before } => Event::Transmit(byte, not_before),
-            Output::Wait { until } => Event::Wait(until),
-            Output::Found(found) => Event::Done(found),
-        }
+        let event = Event::of(self, |event| panic!("{event:?}"));
+        self.found().map_or(event, Event::Done)
     }
 }
 
@@ -77,37 +85,12 @@ pub(crate) struct Named<S>(pub(crate) S);
 impl<S: line::Session> Host for Named<S> {
     type Result = ();
 
-    fn spare(&mut self) -> &mut [u8] {
-        self.0.spare()
+    fn protocol(&mut self) -> &mut impl Protocol {
+        &mut self.0
     }
-
-    fn commit(&mut self, now: Nanos, len: usize) {
-        self.0.commit(now, len);
-    }
-
-    fn handle_timeout(&mut self, now: Nanos) {
-        self.0.handle_timeout(now);
-    }
-
-    fn transmitted(&mut self, now: Nanos) {
-        self.0.transmitted(now);
-    }
-
-    fn reject_rate(&mut self, _: Nanos) {}
 
     fn poll(&mut self) -> Event<()> {
-        loop {
-            return match self.0.poll_output() {
-                line::Output::SetRate(rate) => Event::SetRate(rate),
-                line::Output::SetDtr(_) => continue,
-                line::Output::Transmit { bytes, not_before } => {
-                    let &[byte] = bytes else { panic!("more than a byte: {bytes:?}") };
-                    Event::Transmit(byte, not_before)
-                }
-                line::Output::Wait { until } | line::Output::Rest(until) => Event::Wait(until),
-                line::Output::Event(_) => Event::Done(()),
-            };
-        }
+        Event::of(&mut self.0, |_| Some(()))
     }
 }
 
@@ -293,7 +276,7 @@ impl<H: Host> Bench<H> {
             let woken = if self.inbox.is_empty() { until.min(end) } else { self.now };
             let latency = self.random.u64(20 * MICROS..3 * MILLIS);
             self.advance(woken.max(self.now) + latency);
-            let spare = self.host.spare();
+            let spare = self.host.protocol().spare();
             assert!(!spare.is_empty());
             let len = spare.len().min(self.inbox.len());
             for (place, byte) in spare.iter_mut().zip(self.inbox.drain(..len)) {
@@ -302,7 +285,7 @@ impl<H: Host> Bench<H> {
             self.read.push((self.now, spare[..len].to_vec()));
             self.host.commit(self.now, len);
             if len == 0 && self.now >= until {
-                self.host.handle_timeout(self.now);
+                self.host.protocol().handle_timeout(self.now);
             }
         }
         None
@@ -311,7 +294,9 @@ impl<H: Host> Bench<H> {
     fn drain(&mut self) -> Result<Nanos, H::Result> {
         loop {
             match self.host.poll() {
-                Event::SetRate(rate) if self.impossible.contains(&rate) => self.host.reject_rate(self.now),
+                Event::SetRate(rate) if self.impossible.contains(&rate) => {
+                    self.host.protocol().reject_rate(self.now);
+                }
                 Event::SetRate(rate) => {
                     assert_eq!(self.port, PortKind::Serial);
                     self.flush();
@@ -321,7 +306,7 @@ impl<H: Host> Bench<H> {
                     self.rates.push((self.now, rate));
                 }
                 Event::Transmit(byte, not_before) => self.transmit(byte, not_before),
-                Event::Wait(until) => {
+                Event::Wait(until) | Event::Rest(until) => {
                     self.flush();
                     return Ok(until);
                 }
@@ -333,7 +318,7 @@ impl<H: Host> Bench<H> {
     fn transmit(&mut self, byte: u8, not_before: Nanos) {
         self.advance(not_before);
         self.written.push((self.now, self.rate, byte));
-        self.host.transmitted(self.now);
+        self.host.protocol().transmitted(self.now);
         if self.now > self.left_at {
             self.flush();
         }

@@ -1,6 +1,7 @@
 //! Bytes that no scanner has sent never end a search.
 
-use scanhub_drivers::search::{Output, PortKind, Search};
+use scanhub_drivers::line::{Output, Protocol as _};
+use scanhub_drivers::search::{PortKind, Search};
 use schema::{MILLIS, Nanos};
 
 /// Passes `bytes` to a search on `port`, in reads of at most `most` bytes, until `seconds` have passed.
@@ -23,9 +24,10 @@ fn feed(
                     search.transmitted(now);
                 }
                 Output::Wait { until } => break until,
-                Output::Found(found) => panic!("{found:?} in garbage, seed {seed}"),
+                output => panic!("{output:?}"),
             }
         };
+        assert_eq!(search.found(), None, "in garbage, seed {seed}");
         now = (now + random.u64(..5 * MILLIS)).min(until);
         let len = random.usize(..=most).min(search.spare().len());
         search.spare()[..len].fill_with(|| bytes(&mut random));

@@ -1,7 +1,7 @@
 //! A session on a port without a configured family: scans arrive soon, no byte is lost on the way from the search to the session,
 //! and the search begins again after the scanner was unplugged.
 
-use scanhub_drivers::line::{self, Account, Protocol as _, Session as _, State};
+use scanhub_drivers::line::{self, Account, Protocol, Session as _, State};
 use scanhub_drivers::lms::variant::Baud;
 use scanhub_drivers::search::Memory;
 use scanhub_drivers::{PortSession, Settings, ld};
@@ -23,8 +23,8 @@ pub(crate) struct Auto {
 impl Host for Auto {
     type Result = u64;
 
-    fn spare(&mut self) -> &mut [u8] {
-        self.session.spare()
+    fn protocol(&mut self) -> &mut impl Protocol {
+        &mut self.session
     }
 
     fn commit(&mut self, now: Nanos, len: usize) {
@@ -33,42 +33,27 @@ impl Host for Auto {
         self.check();
     }
 
-    fn handle_timeout(&mut self, now: Nanos) {
-        self.session.handle_timeout(now);
-    }
-
-    fn transmitted(&mut self, now: Nanos) {
-        self.session.transmitted(now);
-    }
-
-    fn reject_rate(&mut self, now: Nanos) {
-        self.session.reject_rate(now);
-    }
-
     fn poll(&mut self) -> Event<u64> {
         loop {
             if self.scans >= self.wanted {
                 return Event::Done(self.scans);
             }
-            match self.session.poll_output() {
-                line::Output::SetRate(rate) => return Event::SetRate(rate),
-                line::Output::SetDtr(_) => {}
-                line::Output::Transmit { bytes, not_before } => {
-                    let &[byte] = bytes else { panic!("more than a byte: {bytes:?}") };
-                    return Event::Transmit(byte, not_before);
-                }
-                line::Output::Event(line::Event::Telegram(received)) => {
-                    self.scans += u64::from(received.whole.is_some_and(|whole| whole.scan.is_some()));
-                }
-                line::Output::Event(line::Event::Scan(_)) => self.scans += 1,
-                line::Output::Rest(until) => return Event::Wait(until),
-                line::Output::Wait { until } => {
-                    if !self.session.advance() {
-                        return Event::Wait(until);
+            let (scans, wanted) = (&mut self.scans, self.wanted);
+            let count = |event: line::Event<'_>| {
+                *scans += match event {
+                    line::Event::Telegram(received) => {
+                        u64::from(received.whole.is_some_and(|whole| whole.scan.is_some()))
                     }
-                    self.check();
-                }
+                    line::Event::Scan(_) => 1,
+                };
+                (*scans >= wanted).then_some(*scans)
+            };
+            let event = Event::of(&mut self.session, count);
+            if matches!(event, Event::Wait(_)) && self.session.advance() {
+                self.check();
+                continue;
             }
+            return event;
         }
     }
 }
