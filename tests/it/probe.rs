@@ -1,7 +1,9 @@
 //! `scanhub probe`, as somebody runs it: it tells what is there, and leaves it as it was.
 
+use std::io::Read;
+
 use crate::testkit;
-use crate::testkit::{INT, REAL_ANSWERS, TERM, TestEnv, number};
+use crate::testkit::{INT, Line, REAL_ANSWERS, TERM, TestEnv, number, open_line};
 use serde_json::Value;
 
 #[test]
@@ -130,6 +132,75 @@ fn nobody_there() {
     }
     let outcome = env.run(&["probe", "file:/etc/hostname", "--json"]);
     assert_eq!((outcome.code, &outcome.of_class("error")[0]["kind"]), (Some(78), &"configuration".into()));
+}
+
+/// Probe and doctor search in the same way. The code is that of a silent line.
+const SEARCHES: [(&[&str], i32); 2] = [(&["probe"], 3), (&["doctor", "--no-system-config"], 5)];
+
+/// Checks that `sent` has only requests of the search. Returns the number of each.
+fn count_requests(mut sent: &[u8]) -> [usize; 4] {
+    const REQUESTS: [&[u8]; 4] = [
+        &[0x02, 0x00, 0x01, 0x00, 0x3A, 0x1E, 0x12],
+        &[0x02, 0x00, 0x01, 0x00, 0x31, 0x15, 0x12],
+        &[0xA5, 0x25],
+        &[0xA5, 0x50],
+    ];
+    let mut counts = [0; 4];
+    while !sent.is_empty() {
+        // A request whose next byte would be late starts over.
+        let len_of = |request: &[u8]| request.iter().zip(sent).take_while(|(a, b)| a == b).count();
+        let (len, number) = (0..4).map(|number| (len_of(REQUESTS[number]), number)).max().expect("four");
+        assert!(len > 0, "{sent:02X?}");
+        counts[number] += usize::from(len == REQUESTS[number].len());
+        sent = &sent[len..];
+    }
+    counts
+}
+
+#[test]
+fn an_unknown_scanner_gets_only_requests_of_the_search() {
+    for (verb, code) in SEARCHES {
+        let env = TestEnv::new();
+        let line = Line::at(&env.path("front"));
+        let program = env.start(&[verb, &[&env.word("front"), "--json"]].concat());
+        let mut sent = Vec::new();
+        testkit::until("it ends", || {
+            sent.extend(line.received());
+            program.is_over()
+        });
+        let outcome = program.wait();
+        sent.extend(line.received());
+        assert_eq!(outcome.code, Some(code), "{outcome}");
+        assert!(outcome.to_string().contains("no sensor of family ld, rplidar either"), "{outcome}");
+        // Each family has four rates, and there are two rounds.
+        let counts = count_requests(&sent);
+        assert!(counts[0] >= 4 && counts[1] >= 4 && counts[2] >= 8 && counts[3] >= 8, "{counts:?}");
+    }
+}
+
+/// In virtual time, it gets no byte at all. On a busy machine, its packets may have a gap in which the search continues.
+#[test]
+fn a_scanner_that_streams_unasked_gets_no_other_request() {
+    let env = TestEnv::new();
+    let _simulator = env.simulator(&["scanner"], &["--family=ld", "--model=ld19", "--world=room"]);
+    let line = Line::at(&env.path("front"));
+    let mut scanner = open_line(&env.path("scanner"), 230_400);
+    for (verb, _) in SEARCHES {
+        let program = env.start(&[verb, &[&env.word("front"), "--json"]].concat());
+        let (mut sent, mut packets) = (Vec::new(), [0; 4096]);
+        testkit::until("it ends", || {
+            if let Ok(len) = scanner.read(&mut packets) {
+                line.offer(&packets[..len]);
+            }
+            sent.extend(line.received());
+            program.is_over()
+        });
+        let outcome = program.wait();
+        sent.extend(line.received());
+        println!("{:?}", count_requests(&sent));
+        assert_eq!(outcome.code, Some(0), "{outcome}");
+        assert!(outcome.to_string().to_lowercase().contains("ld19"), "{outcome}");
+    }
 }
 
 #[test]

@@ -61,6 +61,20 @@ impl Line {
         said[COMMAND]
     }
 
+    /// Returns the bytes that the other end has sent since the last call.
+    pub(crate) fn received(&self) -> Vec<u8> {
+        let (mut received, mut bytes) = (Vec::new(), [0; 256]);
+        while let Ok(len @ 1..) = read(&self.0, &mut bytes) {
+            received.extend(&bytes[..len]);
+        }
+        received
+    }
+
+    /// Sends the beginning of `bytes` that the line has room for.
+    pub(crate) fn offer(&self, bytes: &[u8]) {
+        let _ = write(&self.0, bytes);
+    }
+
     /// Sends all of `bytes`, in the pace of whoever reads them; what the other end says meanwhile is not heard.
     pub(crate) fn send(&self, mut bytes: &[u8]) {
         let give_up_at = Instant::now() + PATIENCE;

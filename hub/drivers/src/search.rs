@@ -24,8 +24,8 @@ use crate::line::{Account, Output, Protocol};
 use crate::{ld, lms, rplidar};
 
 /// Creates a recognizer for each family. Steps that listen, and steps that ask, are in this order.
-fn probes() -> [Box<dyn Probe>; 3] {
-    [Box::<ld::Probe>::default(), Box::<lms::Probe>::default(), Box::<rplidar::Probe>::default()]
+fn probes() -> Vec<Box<dyn Probe>> {
+    vec![Box::<ld::Probe>::default(), Box::<lms::Probe>::default(), Box::<rplidar::Probe>::default()]
 }
 
 /// Result of a search.
@@ -81,7 +81,7 @@ pub enum Trouble {
 pub struct Search {
     port: PortKind,
     memory: Option<Memory>,
-    probes: [Box<dyn Probe>; 3],
+    probes: Vec<Box<dyn Probe>>,
     phase: Phase,
     /// Number of the round, from 0.
     round: usize,
@@ -225,6 +225,13 @@ impl Search {
     /// Requests the [`opening_rate`](Self::opening_rate) first, because the port is open at another rate.
     pub fn at_another_rate(mut self) -> Search {
         self.change_rate = self.rate.is_some();
+        self
+    }
+
+    /// Restricts a new search to scanners of `family`.
+    pub fn only(mut self, family: Family) -> Search {
+        self.probes.retain(|probe| probe.approach().family == family);
+        self.begin_round();
         self
     }
 

@@ -63,7 +63,7 @@ pub fn configure(order: &Order, stop: &AtomicBool, tell: &mut dyn FnMut(News<'_>
     let requested = SettingsRequest::parse(&order.settings)?;
     let password = password(&order.password)?;
     let (port, first) = open(&order.source, stop)?;
-    let report = request_report(&port, first, &order.source, stop, |rate| tell(News::Looking(rate)))?;
+    let report = request_report(&port, first, first, &order.source, stop, |rate| tell(News::Looking(rate)))?;
     let name = order.source.name();
     let Some(mut plan) = Plan::of(&report) else {
         return Err(Failure::new(
@@ -99,6 +99,7 @@ pub fn configure(order: &Order, stop: &AtomicBool, tell: &mut dyn FnMut(News<'_>
             shown = Some(change.step());
             tell(News::Doing(describe_step(change.step())));
         }
+        true
     });
     let result = drive(&port, &mut change, &mut procedure, &never_stop);
     result.map_err(|failure| lost_while_writing(&name, &change, &failure))?;

@@ -1,5 +1,5 @@
-//! Runs protocol state machines on an open port, for a user at a terminal: [`drive`] runs any of them, and [`detect`] searches
-//! for a rotating scanner with it. A thread of the hub does the same for a link, without an end.
+//! Runs protocol state machines on an open port, for a user at a terminal: [`drive`] runs any of them. With it, [`search`] finds
+//! the scanner, and [`detect`] identifies one that rotates. A thread of the hub does the same for a link, without an end.
 
 use std::fmt;
 use std::io;
@@ -11,7 +11,8 @@ use rustix::event::{PollFd, PollFlags, poll};
 use scanhub_drivers::line::{
     Account, Condition, Event, Introduction, Output, Protocol, Session as _, Values,
 };
-use scanhub_drivers::{Features, Model, Session, Settings, features};
+use scanhub_drivers::search::{Found, PortKind, Search};
+use scanhub_drivers::{Model, Session, Settings, features};
 use schema::{Failure, Family, Kind, MILLIS, Nanos};
 
 /// A rotating scanner that was detected, and what was received from it.
@@ -67,17 +68,39 @@ impl fmt::Display for DetectedScanner {
     }
 }
 
-/// Returns the families of rotating scanners. Families that stream without a request come first.
-pub(crate) fn turning() -> Vec<(Family, &'static Features)> {
-    let all = Family::ALL.into_iter().map(|family| (family, features(family)));
-    let mut known: Vec<_> = all.filter(|(_, features)| !features.models.is_empty()).collect();
-    known.sort_by_key(|(_, features)| !features.speaks_unasked);
-    known
+/// Searches `port` for a scanner of any family, or of `only` one, as the hub does. Calls `look` with each rate. Returns the
+/// scanner; otherwise the number of bytes received.
+///
+/// # Errors
+///
+/// Returns [`Kind::PortMissing`] if the port disappears, and [`Kind::Interrupted`] if `stop` is set.
+pub(crate) fn search(
+    port: &Port,
+    only: Option<Family>,
+    stop: &AtomicBool,
+    mut look: impl FnMut(u32),
+) -> Result<Result<Found, u64>, Failure> {
+    let kind = if port.baud().is_none() { PortKind::Server } else { PortKind::Serial };
+    let begun = clock::now();
+    let mut search = Search::new(kind, None, begun).at_another_rate();
+    if let Some(family) = only {
+        search = search.only(family);
+    }
+    let mut shown = None;
+    let mut procedure = Procedure::new(|search: &Search| {
+        if shown != search.rate() {
+            shown = search.rate();
+            shown.into_iter().for_each(&mut look);
+        }
+        let rounds = if search.account().read == 0 { SILENT_ROUNDS } else { ROUNDS };
+        search.rounds() < rounds || clock::now() < begun + MIN_SEARCH_TIME
+    });
+    drive(port, &mut search, &mut procedure, stop)?;
+    Ok(search.found().ok_or(search.account().read))
 }
 
-/// Searches `port` for a scanner of `family`, at all rates of the family unless the port has a fixed rate. Calls `look`
-/// with each rate. Returns the scanner, if more packets arrived than could match by chance; otherwise the number of
-/// bytes received.
+/// Identifies the rotating scanner that a search has found at `port`. Returns it, if more packets arrived than could match by
+/// chance; otherwise the number of bytes received.
 ///
 /// Sends nothing to a scanner that streams without a request. From other scanners it requests identity and health, lets
 /// them measure for a second, and stops them as a hub does.
@@ -87,25 +110,18 @@ pub(crate) fn turning() -> Vec<(Family, &'static Features)> {
 /// Returns [`Kind::PortMissing`] if the port disappears, and [`Kind::Interrupted`] if `stop` is set.
 pub(crate) fn detect(
     port: &Port,
-    (family, features): (Family, &Features),
+    found: Found,
     stop: &AtomicBool,
-    look: impl FnMut(u32),
 ) -> Result<Result<DetectedScanner, u64>, Failure> {
-    let fixed_rate = port.baud().is_none();
-    let settings = Settings { fixed_rate, listen_only: features.speaks_unasked, ..Settings::default() };
+    let listen_only = features(found.family).speaks_unasked;
+    let settings = Settings { fixed_rate: found.rate.is_none(), listen_only, ..Settings::default() };
     let begun = clock::now();
-    let mut session = Session::begin(family, &settings, begun);
-    port.try_baud(session.rate()).map_err(|error| port_lost(port, &error))?;
+    let mut session = Session::begin(found.family, &settings, begun);
+    if let Some(rate) = found.rate {
+        session.begin_at(rate, begun);
+    }
     let mut detection = Detection {
-        speaks_unasked: features.speaks_unasked,
-        fixed_rate,
         begun,
-        first_rate: session.rate(),
-        rate: 0,
-        rates: 0,
-        // A scanner may miss a request or respond late, and the line may damage the response.
-        rounds: if features.speaks_unasked { 1 } else { 3 },
-        look,
         packets: 0,
         measures_since: None,
         turns: 0,
@@ -136,7 +152,7 @@ pub(crate) fn detect(
         return Ok(Err(account.read));
     }
     Ok(Ok(DetectedScanner {
-        family,
+        family: found.family,
         model,
         rate: session.rate(),
         account,
@@ -148,9 +164,10 @@ pub(crate) fn detect(
     }))
 }
 
-/// Returns the failure for a port called `name` at which no scanner of `family` was detected, after `bytes` bytes
+/// Returns the failure for a port called `name` at which no rotating scanner of `family` was detected, after `bytes` bytes
 /// arrived.
-pub(crate) fn not_detected(name: &str, family: Family, features: &Features, bytes: u64) -> Failure {
+pub(crate) fn not_detected(name: &str, family: Family, bytes: u64) -> Failure {
+    let features = features(family);
     let mut rates: Vec<u32> = features.models.iter().map(|model| model.baud).collect();
     rates.sort_unstable();
     rates.dedup();
@@ -171,17 +188,8 @@ pub(crate) fn not_detected(name: &str, family: Family, features: &Features, byte
 }
 
 /// Detection of a rotating scanner: decides when enough was received.
-struct Detection<F> {
-    speaks_unasked: bool,
-    fixed_rate: bool,
+struct Detection {
     begun: Nanos,
-    first_rate: u32,
-    /// Rate at which the session searches, and the number of rates so far.
-    rate: u32,
-    rates: u32,
-    /// Remaining searches at all rates.
-    rounds: u32,
-    look: F,
     packets: u64,
     /// Time of the first packet.
     measures_since: Option<Nanos>,
@@ -195,7 +203,7 @@ struct Detection<F> {
     dtr: Option<bool>,
 }
 
-impl<F: FnMut(u32)> Task<Session> for Detection<F> {
+impl Task<Session> for Detection {
     /// Takes over what the scanner has reported of itself. From then on its motor is controlled. If it reports an error, the session
     /// would restart it next.
     fn may_continue(&mut self, port: &Port, session: &Session) -> io::Result<bool> {
@@ -234,17 +242,7 @@ impl<F: FnMut(u32)> Task<Session> for Detection<F> {
         }
     }
 
-    fn limit(&mut self, session: &Session, now: Nanos) -> Option<Nanos> {
-        if !self.fixed_rate && self.rate != session.rate() {
-            (self.rate, self.rates) = (session.rate(), self.rates + 1);
-            if self.rates > 1 && self.rate == self.first_rate && self.said.is_none() {
-                self.rounds -= 1;
-            }
-            if self.rounds == 0 {
-                return None;
-            }
-            (self.look)(self.rate);
-        }
+    fn limit(&mut self, _: &Session, now: Nanos) -> Option<Nanos> {
         let is_detected = self.packets >= MIN_PACKETS;
         let limit = match (&self.said, self.measures_since) {
             (Some(said), _) if said.condition == Condition::Error => now,
@@ -252,8 +250,7 @@ impl<F: FnMut(u32)> Task<Session> for Detection<F> {
             (Some(_), None) => self.said_at + SPIN_UP_TIMEOUT,
             (None, Some(since)) if is_detected && self.turns >= MIN_REVOLUTIONS => since + MEASURING_TIME,
             (None, _) if is_detected => self.begun + REVOLUTIONS_TIMEOUT,
-            (None, _) if self.speaks_unasked => self.begun + PACKETS_TIMEOUT,
-            (None, _) => self.begun + REPLY_TIMEOUT,
+            (None, _) => self.begun + FIRST_TIMEOUT,
         };
         (now < limit).then_some(limit)
     }
@@ -264,8 +261,8 @@ struct End;
 
 impl Task<Session> for End {}
 
-/// A procedure with an end, such as requests to an LMS. Calls `progress` before each wait. Logs each rate once that the port cannot
-/// have; the procedure skips it.
+/// A procedure with an end, such as requests to an LMS. Calls `progress` before each wait, and ends early if it returns false.
+/// Logs each rate once that the port cannot have; the procedure skips it.
 pub(crate) struct Procedure<F> {
     progress: F,
     refused: Vec<u32>,
@@ -277,10 +274,9 @@ impl<F> Procedure<F> {
     }
 }
 
-impl<P, F: FnMut(&P)> Task<P> for Procedure<F> {
+impl<P, F: FnMut(&P) -> bool> Task<P> for Procedure<F> {
     fn limit(&mut self, protocol: &P, _: Nanos) -> Option<Nanos> {
-        (self.progress)(protocol);
-        Some(Nanos::MAX)
+        (self.progress)(protocol).then_some(Nanos::MAX)
     }
 
     fn on_refused(&mut self, port: &Port, rate: u32, error: &io::Error) {
@@ -303,18 +299,22 @@ const MAX_DAMAGED: f64 = 0.01;
 /// Share of damaged bytes that makes conclusions from the others unreliable.
 pub(crate) const MOST_DAMAGED: f64 = 0.5;
 
+/// Number of rounds of a search on a silent line.
+const SILENT_ROUNDS: usize = 2;
+/// Number of rounds of a search if bytes have arrived. A scanner may miss a request, and the line may damage the reply.
+const ROUNDS: usize = 4;
+/// Minimum time of a search. Rounds are short if the family is known.
+const MIN_SEARCH_TIME: Nanos = 1_000 * MILLIS;
 /// Minimum number of packets of a scanner. Other bytes pass a checksum of 8 bits now and then, but not that often.
 const MIN_PACKETS: u64 = 20;
 /// Minimum number of complete revolutions for a measurement of the head's speed.
 const MIN_REVOLUTIONS: u32 = 5;
-/// Timeout for a reply at all rates of a family, or at one rate over a network.
-const REPLY_TIMEOUT: Nanos = 2_000 * MILLIS;
+/// Timeout for the first packets or the first reply of a scanner that was found. Replies may be damaged.
+const FIRST_TIMEOUT: Nanos = 2_000 * MILLIS;
 /// Minimum time for which measured data are received.
 const MEASURING_TIME: Nanos = 1_000 * MILLIS;
 /// Timeout for the first packet of a scanner whose motor has to spin up. It allows for many damaged replies.
 const SPIN_UP_TIMEOUT: Nanos = 7_000 * MILLIS;
-/// Timeout for the first packets of a scanner that streams without a request, at two rates.
-const PACKETS_TIMEOUT: Nanos = 650 * MILLIS;
 /// Timeout for [`MIN_REVOLUTIONS`]. It is long enough for a head that makes two revolutions per second.
 const REVOLUTIONS_TIMEOUT: Nanos = 4_000 * MILLIS;
 
@@ -388,6 +388,7 @@ fn drain<P: Protocol>(port: &Port, protocol: &mut P, task: &mut impl Task<P>) ->
             Output::SetRate(rate) => {
                 if let Some(error) = port.try_baud(rate)? {
                     task.on_refused(port, rate, &error);
+                    protocol.reject_rate(clock::now());
                 }
             }
             Output::SetDtr(on) => task.set_dtr(port, on)?,

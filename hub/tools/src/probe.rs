@@ -1,5 +1,5 @@
-//! `scanhub probe`: finds the scanner at a port, whatever its family. Opens the port, listens for scanners that stream
-//! without a request, and then sends requests. Changes no settings.
+//! `scanhub probe`: finds the scanner at a port, whatever its family, by the search of the hub, and then requests what it
+//! reports of itself. Changes no settings.
 
 mod description;
 mod suggestion;
@@ -11,10 +11,11 @@ use std::sync::atomic::AtomicBool;
 use port::{Candidate, Port, PortlessAdapter, Source, candidates, clock, found_in};
 use scanhub_drivers::lms::inquiry::{Inquiry, Report};
 use scanhub_drivers::lms::variant::Baud;
+use scanhub_drivers::search;
 use schema::{Failure, Family, Kind};
 use serde::Serialize;
 
-use crate::driver::{DetectedScanner, Procedure, detect, drive, not_detected, turning};
+use crate::driver::{self, DetectedScanner, Procedure, detect, drive, not_detected};
 pub use description::{Description, Found, Turning};
 pub(crate) use description::{hex, measuring};
 pub use suggestion::SuggestedLink;
@@ -84,8 +85,8 @@ impl Ports {
     }
 }
 
-/// Finds the scanner at `source`. Listens for scanners that stream without a request before it sends one. Calls `look`
-/// with each rate at which it searches.
+/// Finds the scanner at `source`. Until its family is known, it gets only the requests of the search. Calls `look` with
+/// each rate at which it searches.
 ///
 /// # Errors
 ///
@@ -121,8 +122,7 @@ pub(crate) enum Answer {
     Detected(Box<DetectedScanner>),
 }
 
-/// Finds the scanner at `port`, which is open at `first`. The scanner may be of any family, or of `only` one. Listens
-/// for scanners that stream without a request before it sends one.
+/// Finds the scanner at `port`, whose highest possible rate is `first`. The scanner may be of any family, or of `only` one.
 ///
 /// # Errors
 ///
@@ -135,27 +135,32 @@ pub(crate) fn find(
     stop: &AtomicBool,
     mut look: impl FnMut(u32),
 ) -> Result<Answer, Failure> {
-    let mut missed = Vec::new();
-    for (family, features) in
-        turning().into_iter().filter(|(family, _)| only.is_none_or(|only| only == *family))
-    {
-        match detect(port, (family, features), stop, &mut look)? {
-            Ok(heard) => return Ok(Answer::Detected(Box::new(heard))),
-            Err(bytes) if only.is_some() => {
-                return Err(not_detected(&source.name(), family, features, bytes));
-            }
-            Err(_) => missed.push(family.name()),
-        }
+    let found = match only {
+        // Its requests find the rate, too.
+        Some(family @ Family::Lms) => search::Found { family, model: None, rate: None },
+        _ => driver::search(port, only, stop, &mut look)?
+            .map_err(|bytes| not_found(source, first, only, bytes))?,
+    };
+    if found.family == Family::Lms {
+        let rate = found.rate.and_then(Baud::of_rate).unwrap_or(first);
+        let report = request_report(port, first, rate, source, stop, look)?;
+        return Ok(Answer::Asked(Box::new(report)));
     }
-    let _ = port.set_baud(first.rate());
-    match request_report(port, first, source, stop, look) {
-        Ok(report) => Ok(Answer::Asked(Box::new(report))),
-        Err(failure) if failure.kind == Kind::Timeout && !missed.is_empty() => {
-            let message = format!("{}; no sensor of family {} either", failure.message, missed.join(", "));
-            Err(Failure { message, ..failure })
-        }
-        Err(failure) => Err(failure),
+    let detected = detect(port, found, stop)?;
+    let heard = detected.map_err(|bytes| not_detected(&source.name(), found.family, bytes))?;
+    Ok(Answer::Detected(Box::new(heard)))
+}
+
+/// Returns the failure for a port at which the search has found no scanner, after `bytes` bytes arrived.
+fn not_found(source: &Source, first: Baud, only: Option<Family>, bytes: u64) -> Failure {
+    if let Some(family) = only {
+        return not_detected(&source.name(), family, bytes);
     }
+    let failure = silence(source, first, None, bytes);
+    let others = Family::ALL.into_iter().filter(|&family| family != Family::Lms);
+    let others: Vec<_> = others.map(Family::name).collect();
+    let message = format!("{}; no sensor of family {} either", failure.message, others.join(", "));
+    Failure { message, ..failure }
 }
 
 /// Parses the name of a port: a tty, or `tcp:HOST:PORT`.
@@ -185,7 +190,8 @@ pub(crate) fn open(source: &Source, stop: &AtomicBool) -> Result<(Port, Baud), F
     Ok((port, baud))
 }
 
-/// Requests identity, settings and state of the LMS at `port`, which is open at `first`.
+/// Requests identity, settings and state of the LMS at `port`, which is open at `rate`. The highest rate of the port is
+/// `first`.
 ///
 /// # Errors
 ///
@@ -193,6 +199,7 @@ pub(crate) fn open(source: &Source, stop: &AtomicBool) -> Result<(Port, Baud), F
 pub(crate) fn request_report(
     port: &Port,
     first: Baud,
+    rate: Baud,
     source: &Source,
     stop: &AtomicBool,
     mut look: impl FnMut(u32),
@@ -200,27 +207,28 @@ pub(crate) fn request_report(
     let is_server = matches!(source, Source::Tcp { .. });
     // The scanner reports the rate of a serial server later. The slowest rate waits long enough for any.
     let now = clock::now();
-    let mut inquiry = if is_server { Inquiry::at(Baud::B9600, now) } else { Inquiry::new(first, now) };
+    let mut inquiry = if is_server { Inquiry::at(Baud::B9600, now) } else { Inquiry::new(rate, now) };
     let mut shown = None;
     let mut procedure = Procedure::new(|inquiry: &Inquiry| {
         if shown != Some(inquiry.baud()) && !is_server {
             shown = Some(inquiry.baud());
             look(inquiry.baud().rate());
         }
+        true
     });
     drive(port, &mut inquiry, &mut procedure, stop)?;
     let mut report = inquiry.report().clone();
     if is_server {
         report.baud = report.status().and_then(|status| status.baud()).or(report.baud);
     }
-    if report.answers() { Ok(report) } else { Err(silence(source, first, &report)) }
+    if report.answers() { Ok(report) } else { Err(silence(source, first, report.baud, report.bytes)) }
 }
 
-/// Returns the failure for a scanner that did not reply, with possible reasons. The highest rate of the port is
-/// `first`.
-fn silence(source: &Source, first: Baud, report: &Report) -> Failure {
+/// Returns the failure for an LMS that did not reply, with possible reasons, after `bytes` bytes arrived. It may stream at
+/// `streams_at`. The highest rate of the port is `first`.
+fn silence(source: &Source, first: Baud, streams_at: Option<Baud>, bytes: u64) -> Failure {
     let name = source.name();
-    let came = match report.bytes {
+    let came = match bytes {
         0 => "no byte arrived".to_owned(),
         bytes => format!("{bytes} bytes arrived, without a telegram"),
     };
@@ -228,7 +236,7 @@ fn silence(source: &Source, first: Baud, report: &Report) -> Failure {
         Baud::B500000 => "9600, 19200, 38400 or 500000 Bd",
         _ => "9600, 19200 or 38400 Bd",
     };
-    let (what, remedy) = match (report.baud, source) {
+    let (what, remedy) = match (streams_at, source) {
         (Some(_), Source::Tcp { .. }) => (
             format!("{name}: a sensor streams but does not answer"),
             "it does not receive from the serial server: check the wire to its receiver",
@@ -242,7 +250,7 @@ fn silence(source: &Source, first: Baud, report: &Report) -> Failure {
             "set the serial server to the sensor's rate, 8 bits, no parity; check power and cable; a server that has another \
              client already may let this one wait: end that program first",
         ),
-        (None, _) if report.bytes == 0 => (
+        (None, _) if bytes == 0 => (
             format!("{name}: no answer at {rates}; {came}"),
             "check power, cable, jumper 7-8 for RS-422; after power-on a sensor takes up to a minute",
         ),
@@ -260,8 +268,7 @@ mod tests {
 
     #[test]
     fn names_only_rates_that_the_port_has() {
-        let report = Inquiry::new(Baud::B38400, 0).report().clone();
-        let message = |first| silence(&Source::Tty("/dev/ttyS0".into()), first, &report).message;
+        let message = |first| silence(&Source::Tty("/dev/ttyS0".into()), first, None, 0).message;
         assert!(message(Baud::B500000).contains("38400 or 500000 Bd; no byte"));
         assert!(message(Baud::B38400).contains("no answer at 9600, 19200 or 38400 Bd; no byte"));
     }

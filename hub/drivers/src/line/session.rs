@@ -33,8 +33,8 @@ pub trait Protocol {
         false
     }
 
-    /// Handles at `now` that the port cannot have the rate of the last [`Output::SetRate`], or, before the first output, the rate at
-    /// which it should be open. A protocol that can try other rates leaves this one out.
+    /// Handles at `now` that the port cannot have the rate of the last [`Output::SetRate`], or, before the first output,
+    /// the rate at which it should be open. A protocol that can try other rates leaves this one out.
     fn reject_rate(&mut self, now: Nanos) {
         let _ = now;
     }
@@ -231,8 +231,8 @@ pub trait Session: Protocol {
 /// Action that a protocol requests, in the order in which it is to be carried out.
 #[derive(Debug)]
 pub enum Output<'a> {
-    /// Set the port to this rate, in bits per second, and discard what it had received. If the port cannot have this rate, call
-    /// [`Protocol::reject_rate`]. Then continue draining.
+    /// Set the port to this rate, in bits per second, and discard what it had received. If the port cannot have this rate,
+    /// call [`Protocol::reject_rate`]. Then continue draining.
     SetRate(u32),
     /// Assert the line DTR of a serial port, or clear it; other ports have none. Then continue draining.
     SetDtr(bool),

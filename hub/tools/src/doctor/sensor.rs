@@ -312,12 +312,12 @@ const MAX_LOSS: u64 = 100;
 
 #[cfg(test)]
 mod tests {
-    use scanhub_drivers::Settings;
     use scanhub_drivers::line::{Account, Output, Protocol as _};
     use scanhub_drivers::lms::status_report::Health;
     use scanhub_drivers::lms::telegram::{Telegram, Writer};
     use scanhub_drivers::lms::variant::{Baud, Mode, Unit};
     use scanhub_drivers::lms::{Inquiry, configuration};
+    use scanhub_drivers::{Settings, features};
 
     use super::*;
     use crate::doctor::State as Verdict;
@@ -476,11 +476,17 @@ mod tests {
         assert_eq!(as_the_hub_says(None, "it is unknown")[0].state, Verdict::Skipped);
     }
 
+    /// Returns the family that streams without a request.
+    fn streaming() -> schema::Family {
+        let is_streaming = |family: &schema::Family| features(*family).speaks_unasked;
+        schema::Family::ALL.into_iter().find(is_streaming).expect("there is one")
+    }
+
     fn heard() -> DetectedScanner {
-        let (family, features) = crate::driver::turning()[0];
+        let family = streaming();
         DetectedScanner {
             family,
-            model: Some(features.models[1]),
+            model: Some(features(family).models[1]),
             rate: 230_400,
             account: Account { in_telegrams: 9_400, due: 200, ..Account::default() },
             said: None,
@@ -553,7 +559,7 @@ mod tests {
         let judged = |heard: &DetectedScanner, set: &[&str]| {
             model(heard, Some(&link(&[&[family.as_str()], set].concat())))
         };
-        let models = crate::driver::turning()[0].1.models;
+        let models = features(streaming()).models;
         // A model with the same protocol counts as the same.
         let (like, other) = (format!("model={}", models[0].name), format!("model={}", models[3].name));
         assert_eq!(judged(&heard(), &[&like]).state, Verdict::Ok);

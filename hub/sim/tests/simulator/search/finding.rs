@@ -3,7 +3,7 @@
 use scanhub_drivers::ld;
 use scanhub_drivers::line::Protocol as _;
 use scanhub_drivers::lms::variant::Baud;
-use scanhub_drivers::search::{Found, PortKind};
+use scanhub_drivers::search::{Found, PortKind, Search};
 use schema::{Family, MILLIS, Nanos};
 use sim::device::Device;
 use sim::rplidar::Model;
@@ -159,5 +159,31 @@ fn leaves_out_rates_that_the_port_cannot_have() {
         }
         let (found, time) = bench.find(20_000 * MILLIS).unwrap_or_else(|| panic!("{name}"));
         assert!(found == expected && time < 6_000 * MILLIS, "{name}: {found:?}");
+    }
+}
+
+#[test]
+fn a_restricted_search_sends_only_requests_of_its_family() {
+    let open = |family, device, seed| {
+        let search = |now| Search::new(PortKind::Serial, None, now).at_another_rate().only(family);
+        Bench::auto(search, device, None, seed)
+    };
+    for (family, first, rates) in [
+        (Family::Ld, 230_400, &[][..]),
+        (Family::Lms, 500_000, &[9_600, 19_200, 38_400, 500_000]),
+        (Family::Rplidar, 115_200, &[115_200, 256_000, 460_800, 1_000_000]),
+    ] {
+        let mut bench = open(family, None, 1);
+        assert_eq!(bench.find(10_000 * MILLIS), None);
+        assert_eq!(bench.rates[0].1, first, "the port is open at another rate");
+        let mut sent_at: Vec<u32> = bench.written.iter().map(|(_, rate, _)| *rate).collect();
+        sent_at.sort_unstable();
+        sent_at.dedup();
+        assert_eq!(sent_at, rates, "{family:?}");
+    }
+    for (name, expected, create) in scanners() {
+        let mut bench = open(expected.family, Some(create(2)), 2);
+        let (found, _) = bench.find(20_000 * MILLIS).unwrap_or_else(|| panic!("{name}"));
+        assert_eq!(found, expected, "{name}");
     }
 }
