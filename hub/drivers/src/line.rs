@@ -10,6 +10,7 @@ mod reads;
 mod scan;
 mod sensor_clock;
 mod session;
+mod stream;
 mod turns;
 
 pub use arrival::{Arrivals, Flow};
@@ -21,6 +22,7 @@ pub use session::{
     Account, Condition, Control, Event, Identity, Introduction, KnownRate, Notice, Output, Protocol,
     Received, Session, State, Whole,
 };
+pub use stream::{StreamCounters, Watchdog};
 pub use turns::{Closed, Pace, TurnCounts, Turns};
 
 /// Reasons why a telegram or packet is suspect: bits of `reasons`. A family sets those that it can detect.

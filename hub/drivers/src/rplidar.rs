@@ -3,13 +3,15 @@
 
 mod device_info;
 mod framer;
+mod handshake;
 mod model;
-mod offers;
 pub mod packet;
 mod probe;
+mod rate_search;
 mod request;
 mod sequence;
 mod session;
+mod stream;
 
 pub use crate::line::{Tally, TurnCounts};
 pub use device_info::{Health, Info};

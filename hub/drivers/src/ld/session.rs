@@ -12,10 +12,10 @@ use crate::ld::packet::{LEN, POINTS, Packet};
 use crate::ld::point_count::{Counted, PointCount};
 use crate::ld::restarts::Restarts;
 use crate::ld::sequence::{Place, Sequence};
-use crate::line::family::{self, Features};
+use crate::line::family::{self, Features, table};
 use crate::line::{
     self, Account, Closed, Control, Event, Flow, Output, Pace, RawScan, Reads, Received, SensorClock, State,
-    Tally, TurnCounts, Turns, Values, revolution_head,
+    StreamCounters, Tally, TurnCounts, Turns, Values, Watchdog, revolution_head,
 };
 
 /// Settings of a session.
@@ -77,21 +77,16 @@ pub struct Session {
     trouble: Option<Trouble>,
     /// Time since which no packet has arrived.
     quiet_since: Nanos,
-    /// Discarded bytes of streams, and all discarded bytes when the first number was updated.
-    damaged: (u64, u64),
-    resyncs: u64,
+    counters: StreamCounters,
     restarts: Restarts,
-    /// Discarded bytes of streams, and bytes of packets, when the last revolution ended.
-    turned_with: (u64, u64),
-    cut: bool,
 }
 
 #[derive(Clone, Copy, Debug)]
 enum Phase {
     /// No packets yet. At `next_at` the session tries another rate.
     Listening { shown: State, next_at: Nanos },
-    /// Packets arrive, the next one by `silent_at`. The last revolution ended at `turned_at`, or packets began to arrive then.
-    Hearing { turned_at: Nanos, has_turned: bool, silent_at: Nanos },
+    /// Packets arrive.
+    Streaming(Watchdog),
     /// A user paused the session.
     Paused,
 }
@@ -134,11 +129,8 @@ impl Session {
             now,
             trouble: None,
             quiet_since: now,
-            damaged: (0, 0),
-            resyncs: 0,
+            counters: StreamCounters::default(),
             restarts: Restarts::default(),
-            turned_with: (0, 0),
-            cut: false,
         }
     }
 
@@ -264,24 +256,17 @@ impl Session {
     fn expire(&mut self) {
         match self.phase {
             Phase::Listening { shown, next_at } if self.now >= next_at => self.listen_on(shown),
-            Phase::Hearing { silent_at, .. } if self.now >= silent_at => {
-                self.resyncs += 1;
+            Phase::Streaming(watchdog) if watchdog.is_silent(self.now) => {
+                self.counters.note_resync();
                 self.trouble = Some(Trouble::Silence);
                 self.listen(State::Silent);
             }
-            Phase::Hearing { turned_at, .. } if self.now >= turned_at + STILL => {
-                // A revolution may also be missing because most bytes are damaged.
-                let (damaged, in_packets) = self.turned_with;
-                let is_damaged = self.damaged.0 - damaged > self.framer.tally().in_packets - in_packets;
+            Phase::Streaming(watchdog) if watchdog.is_revolution_overdue(self.now) => {
+                let is_damaged = self.counters.is_mostly_damaged(self.framer.tally());
                 self.trouble = (!is_damaged).then_some(Trouble::StandsStill);
             }
             _ => {}
         }
-    }
-
-    /// Starts to wait for the end of the next revolution.
-    fn await_turn(&mut self) {
-        self.turned_with = (self.damaged.0, self.framer.tally().in_packets);
     }
 
     /// Stamps the packets of `span`, and keeps them for revolutions.
@@ -322,9 +307,9 @@ impl Session {
         if let Some(counted) = counted.filter(|_| self.settings.model.is_none()) {
             self.count(counted);
             if !self.is_learned
-                && let Phase::Hearing { turned_at, .. } = &mut self.phase
+                && let Phase::Streaming(watchdog) = &mut self.phase
             {
-                *turned_at = self.now;
+                watchdog.await_revolution(self.now);
             }
         }
         self.scanner_time = places[..span.packets].iter().rev().find_map(|place| place.time());
@@ -337,8 +322,8 @@ impl Session {
         // A packet that arrived twice is stamped by its arrival, and the next one by the scanner's clock.
         let last = self.reads.date_packet(last.max(at));
         self.current = Some(Current { span, places, packet: 0, is_put: false });
-        self.cut |= self.framer.tally().packets == span.packets as u64 && self.framer.tally().discarded > 0;
-        self.hear();
+        self.counters.note_packets(self.framer.tally(), span.packets);
+        self.continue_stream();
         Received {
             bytes: self.framer.bytes(span),
             first: at,
@@ -361,13 +346,11 @@ impl Session {
     }
 
     /// Starts or extends the stream after packets have arrived.
-    fn hear(&mut self) {
-        let silent_at = self.now + SILENCE;
-        let discarded = self.framer.tally().discarded;
+    fn continue_stream(&mut self) {
         match &mut self.phase {
-            Phase::Hearing { silent_at: at, .. } => {
-                *at = silent_at;
-                self.damaged.0 += discarded - self.damaged.1;
+            Phase::Streaming(watchdog) => {
+                watchdog.note_packets(self.now);
+                self.counters.continue_stream(self.framer.tally());
                 if self.measured.is_none()
                     && self.now >= self.undecided_since + UNDECIDED
                     && let Some(rate) = self.sequence.points_per_second()
@@ -379,12 +362,11 @@ impl Session {
             Phase::Listening { .. } => {
                 self.trouble = None;
                 self.undecided_since = self.now;
-                self.phase = Phase::Hearing { turned_at: self.now, has_turned: false, silent_at };
-                self.await_turn();
+                self.phase = Phase::Streaming(Watchdog::new(self.now));
+                self.counters.begin_stream(self.framer.tally());
             }
             Phase::Paused => {}
         }
-        self.damaged.1 = discarded;
         if !self.is_learned
             && self.sequence.points_per_second().is_some()
             && let Some(beams) = self.known_beams()
@@ -439,10 +421,10 @@ impl Session {
         let first = self.dated(closed).first;
         self.reads.end_turn(first);
         self.trouble = None;
-        if let Phase::Hearing { turned_at, has_turned, .. } = &mut self.phase {
-            (*turned_at, *has_turned) = (self.now, true);
+        if let Phase::Streaming(watchdog) = &mut self.phase {
+            watchdog.note_revolution(self.now);
         }
-        self.await_turn();
+        self.counters.await_revolution(self.framer.tally());
         self.dated(closed)
     }
 
@@ -506,7 +488,7 @@ impl line::Protocol for Session {
         }
         let until = match self.phase {
             Phase::Listening { next_at, .. } => next_at,
-            Phase::Hearing { silent_at, .. } => silent_at,
+            Phase::Streaming(watchdog) => watchdog.silent_at(),
             Phase::Paused => Nanos::MAX,
         };
         self.reads.wait(self.now, until, self.framer.hold())
@@ -526,7 +508,7 @@ impl line::Session for Session {
             (Control::Resume, Phase::Paused) => self.listen(State::Probing),
             (Control::Resume, _) => {}
             (Control::Resync, _) => {
-                self.resyncs += 1;
+                self.counters.note_resync();
                 self.trouble = None;
                 self.listen(State::Probing);
             }
@@ -536,8 +518,7 @@ impl line::Session for Session {
     fn state(&self) -> State {
         match self.phase {
             Phase::Listening { shown, .. } => shown,
-            Phase::Hearing { has_turned: false, .. } => State::Starting,
-            Phase::Hearing { .. } => State::Streaming,
+            Phase::Streaming(watchdog) => watchdog.state(),
             Phase::Paused => State::Paused,
         }
     }
@@ -556,23 +537,9 @@ impl line::Session for Session {
     }
 
     fn account(&self) -> Account {
-        let tally = self.framer.tally();
-        let (came, lost) = self.sequence.came_and_lost();
-        Account {
-            read: tally.read,
-            in_telegrams: tally.in_packets,
-            acknowledge: 0,
-            discarded: tally.discarded,
-            buffered: self.framer.buffered() as u64,
-            telegrams: tally.packets,
-            due: came + lost,
-            lost,
-            damaged: self.damaged.0,
-            rejected_checksum: tally.rejected_checksum,
-            resyncs: self.resyncs,
-            restarts: self.restarts.count(),
-            began_with_a_cut: self.cut,
-        }
+        let (tally, buffered) = (self.framer.tally(), self.framer.buffered());
+        let account = self.counters.account(tally, buffered, self.sequence.came_and_lost());
+        Account { restarts: self.restarts.count(), ..account }
     }
 
     fn begin_at(&mut self, rate: u32, _: Nanos) {
@@ -612,7 +579,7 @@ impl line::Session for Session {
 
 /// Models and settings of the family.
 pub const FEATURES: Features = Features {
-    models: &ALL,
+    models: &MODELS,
     // Enough for all models but the STL27L.
     auto: family::Model { name: "auto", baud: Model::Ld19.baud(), beams: 720 },
     modes: &[],
@@ -696,15 +663,7 @@ const fn described(model: Model) -> family::Model {
 }
 
 /// All models, described for the configuration.
-const ALL: [family::Model; Model::ALL.len()] = {
-    let mut all = [described(Model::Ld19); Model::ALL.len()];
-    let mut at = 0;
-    while at < all.len() {
-        all[at] = described(Model::ALL[at]);
-        at += 1;
-    }
-    all
-};
+const MODELS: [family::Model; Model::ALL.len()] = table!(Model::ALL, described);
 
 /// Returns how many packets are returned together: as many as arrive in 10 ms.
 const fn most_together(baud: u32) -> usize {
@@ -715,10 +674,6 @@ const fn most_together(baud: u32) -> usize {
 const MOST_POINTS: usize = 4_400;
 /// How long the session listens at one rate. A stream has a packet every 3 ms.
 const LISTEN: Nanos = 300 * MILLIS;
-/// After this time without a packet, the session begins again.
-const SILENCE: Nanos = 1_000 * MILLIS;
-/// After this time without a revolution, the head is blocked. The slowest head rotates twice per second.
-const STILL: Nanos = 2_000 * MILLIS;
 /// Time after which a scanner whose speed is never constant, or whose sequence has a gap in every revolution, has the beams of
 /// its model.
 const UNDECIDED: Nanos = 10_000 * MILLIS;

@@ -59,3 +59,17 @@ pub struct Settings {
     /// Whether the motor stops while there are no subscribers, if it [can](Features::can_rest).
     pub stop_when_idle: bool,
 }
+
+/// Maps a constant array with a constant function.
+macro_rules! table {
+    ($from:expr, $map:path) => {{
+        let mut to = [$map($from[0]); $from.len()];
+        let mut at = 1;
+        while at < to.len() {
+            to[at] = $map($from[at]);
+            at += 1;
+        }
+        to
+    }};
+}
+pub(crate) use table;

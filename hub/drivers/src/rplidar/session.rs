@@ -4,29 +4,23 @@
 //! A stream that another program left running is stopped, never continued: express and dense packets look alike, and a
 //! scanner that measures answers no request.
 
-mod dialogue;
-mod stream;
-
 use core::fmt;
 
-use schema::{Contents, Family, MILLIS, Nanos, ScanHead};
+use schema::{Contents, Family, MILLIS, Nanos, ScanHead, line_time};
 
-use crate::line::family::{self, Features};
+use crate::line::family::{self, Features, table};
 use crate::line::{
-    self, Account, Condition, Control, Event, Introduction, Output, RawScan, Reads, Received, SensorClock,
-    State, Tally, TurnCounts, Turns,
+    self, Account, Closed, Condition, Control, Event, Introduction, Output, RawScan, Reads, Received, State,
+    StreamCounters, Tally, TurnCounts, Watchdog,
 };
-
 use crate::rplidar::device_info::{Health, Info};
 use crate::rplidar::framer::{Expect, Found, Framer, Span};
+use crate::rplidar::handshake::{Handshake, Next, Query};
 use crate::rplidar::model::{Mode, Model};
-use crate::rplidar::offers::Offers;
 use crate::rplidar::packet::Kind;
-use crate::rplidar::request::{Head, RequestQueue};
-use crate::rplidar::sequence::{Place, Sequence, Step};
-
-use self::dialogue::{Ask, Reply};
-use self::stream::{Current, Held, MOST, Measure};
+use crate::rplidar::rate_search::RateSearch;
+use crate::rplidar::request::{Answer, Head, Request, RequestQueue};
+use crate::rplidar::stream::{Line, MAX_SAMPLE_LEN, Stream};
 
 /// Settings of a session.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -59,78 +53,38 @@ impl Settings {
 #[derive(Clone, Debug)]
 pub struct Session {
     settings: Settings,
+    now: Nanos,
+    phase: Phase,
+    /// State that is shown until measured data arrive.
+    shown: State,
+    trouble: Option<Trouble>,
     framer: Framer,
     reads: Reads,
-    clock: SensorClock,
-    sequence: Sequence,
-    turns: Turns<MOST_POINTS>,
-    phase: Phase,
-    /// The state that is shown until measured data arrive.
-    shown: State,
-    baud: u32,
-    change_baud: bool,
+    rate: RateSearch,
+    requests: RequestQueue,
     /// Level that the DTR line has to get.
     change_dtr: Option<bool>,
-    outgoing: RequestQueue,
-    info: Option<Info>,
-    health: Option<Health>,
-    offers: Offers,
-    /// Whether a scanner that reported an error was already restarted.
-    was_reset: bool,
-    /// Whether an accessory board controls the motor, by its duty cycle.
-    has_board: bool,
-    /// The mode in use, if scanhub knows it.
-    mode: Option<Mode>,
-    /// The mode of the settings, if the scanner cannot use it.
-    no_mode: Option<Mode>,
-    /// Nanoseconds per point, once they are known.
-    point_ns: Option<f64>,
-    /// Measurement of the time per point.
-    measure: Option<Measure>,
-    /// In a recording: the last mode in a request of the recorded program, and the key of that request.
-    overheard: (u8, u8),
-    /// Number of beams, once it is known.
-    beams: Option<usize>,
-    /// Whether the packets of this stream are identified.
-    is_learned: bool,
-    /// Packets that were returned and whose points are not in revolutions yet.
-    current: Option<Current>,
-    /// Positions of the packets of the last span.
-    places: [Place; MOST],
-    held: Option<Held>,
+    handshake: Handshake,
+    stream: Stream,
+    counters: StreamCounters,
     /// Time since which there are no subscribers.
     idle_since: Option<Nanos>,
-    now: Nanos,
-    scanner_time: Option<Nanos>,
-    trouble: Option<Trouble>,
-    /// Time since which no response has arrived, and the number of bytes read by then.
-    quiet_since: Option<(Nanos, u64)>,
-    /// Discarded bytes of streams, and all discarded bytes when the first number was updated.
-    damaged: (u64, u64),
-    resyncs: u64,
-    /// Restarts of the scanner that were not requested.
-    restarts: u64,
-    /// Rate of the last stream, until a greeting is received.
-    streamed_at: Option<u32>,
-    /// Discarded bytes of streams, and bytes of packets, when the last revolution ended.
-    turned_with: (u64, u64),
-    cut: bool,
 }
 
 #[derive(Clone, Copy, Debug)]
 enum Phase {
     /// A recording. No packets have been read yet.
     Listening { since: Nanos },
-    /// The stop request was sent. The session sends the first request at `until`, or at `at_most` if bytes still arrive.
+    /// The stop request was sent. The session sends the first query at `until`, or at `at_most` if bytes still arrive.
     Draining { attempts: u8, until: Nanos, at_most: Nanos },
-    /// A response is expected by `until`.
-    Asking { ask: Ask, attempts: u8, until: Nanos },
-    /// The restart request was sent.
+    /// The response to `query` is expected by `until`.
+    Querying { query: Query, attempts: u8, until: Nanos },
+    /// The scanner restarts.
     Booting { until: Nanos },
     /// The scanner reports an error. The session requests the health again at `until`.
     Unwell { until: Nanos },
-    /// Packets arrive, the next one by `silent_at`. The last revolution ended at `turned_at`, or the stream began then.
-    Hearing { turned_at: Nanos, has_turned: bool, silent_at: Nanos },
+    /// Packets arrive.
+    Streaming(Watchdog),
     /// A user paused the session, or, if `is_resting`, there are no subscribers.
     Paused { is_resting: bool },
 }
@@ -140,98 +94,22 @@ impl Session {
     pub fn new(settings: Settings, now: Nanos) -> Self {
         let mut session = Session {
             settings,
-            framer: Framer::new(Expect::Nothing),
-            reads: Reads::new(now),
-            clock: SensorClock::new(),
-            sequence: Sequence::new(),
-            turns: Turns::new(),
+            now,
             phase: Phase::Listening { since: now },
             shown: State::Probing,
-            baud: settings.baud(),
-            change_baud: false,
-            change_dtr: None,
-            outgoing: RequestQueue::default(),
-            info: None,
-            health: None,
-            offers: Offers::default(),
-            was_reset: false,
-            has_board: false,
-            mode: settings.mode.filter(|_| settings.listen_only),
-            no_mode: None,
-            point_ns: None,
-            measure: None,
-            overheard: (0, 0),
-            beams: None,
-            is_learned: false,
-            current: None,
-            places: [Place { step: Step::Odd, angle: 0.0, time: 0.0 }; MOST],
-            held: None,
-            idle_since: None,
-            now,
-            scanner_time: None,
             trouble: None,
-            quiet_since: None,
-            damaged: (0, 0),
-            resyncs: 0,
-            restarts: 0,
-            streamed_at: None,
-            turned_with: (0, 0),
-            cut: false,
+            framer: Framer::new(Expect::Nothing),
+            reads: Reads::new(now),
+            rate: RateSearch::new(&settings),
+            requests: RequestQueue::default(),
+            change_dtr: None,
+            handshake: Handshake::new(settings),
+            stream: Stream::new(settings),
+            counters: StreamCounters::default(),
+            idle_since: None,
         };
         session.begin(State::Probing);
         session
-    }
-
-    /// Returns the model, once it is known.
-    pub fn model(&self) -> Option<Model> {
-        self.info.and_then(|info| info.model()).or(self.settings.model)
-    }
-
-    /// Returns the scan mode, once the scanner measures, if scanhub knows it.
-    fn mode(&self) -> Option<Mode> {
-        self.mode
-    }
-
-    /// Returns whether `model` is not the one of the settings.
-    fn is_unexpected(&self, model: Model) -> bool {
-        self.settings.model.is_some_and(|wanted| wanted != model)
-    }
-
-    /// Returns the kind of packets that look like both express and dense ones if no response has named it: the fastest kind of
-    /// the model.
-    fn alike(&self) -> Option<Kind> {
-        match (self.settings.mode, self.model()) {
-            (Some(Mode::DenseBoost), _) => Some(Kind::Dense),
-            (Some(_), _) => Some(Kind::Express),
-            (None, Some(Model::A1 | Model::A2m8 | Model::A2m12 | Model::A3)) => Some(Kind::Express),
-            (None, model) => model.map(|_| Kind::Dense),
-        }
-    }
-
-    /// Returns the identity that the scanner reported.
-    pub fn info(&self) -> Option<Info> {
-        self.info
-    }
-
-    /// Returns the health that the scanner reported.
-    pub fn health(&self) -> Option<Health> {
-        self.health
-    }
-
-    /// Returns whether the scanner has reported its identity, and its health unless it does not respond to that request.
-    fn is_introduced(&self) -> bool {
-        let is_asked = matches!(self.phase, Phase::Asking { ask: Ask::Info | Ask::Health, .. });
-        self.info.is_some() && !is_asked && !matches!(self.phase, Phase::Draining { .. })
-    }
-
-    /// Returns the number of beams of a scan, once the model is known.
-    pub fn beams(&self) -> Option<usize> {
-        self.beams
-    }
-
-    /// Returns the points that the scanner measures per second, once they are known.
-    pub fn points_per_second(&self) -> Option<f32> {
-        self.point_ns.map(|ns| (1e9 / ns) as f32)
     }
 
     /// Creates a session from the settings that all families share.
@@ -244,6 +122,31 @@ impl Session {
         Session::new(settings, now)
     }
 
+    /// Returns the model, once it is known.
+    pub fn model(&self) -> Option<Model> {
+        self.handshake.model()
+    }
+
+    /// Returns the identity that the scanner reported.
+    pub fn info(&self) -> Option<Info> {
+        self.handshake.info()
+    }
+
+    /// Returns the health that the scanner reported.
+    pub fn health(&self) -> Option<Health> {
+        self.handshake.health()
+    }
+
+    /// Returns the number of beams of a scan, once the model is known.
+    pub fn beams(&self) -> Option<usize> {
+        self.stream.beams()
+    }
+
+    /// Returns the points that the scanner measures per second, once they are known.
+    pub fn points_per_second(&self) -> Option<f32> {
+        self.stream.points_per_second()
+    }
+
     /// Returns the counters of the framer.
     pub fn tally(&self) -> &Tally {
         self.framer.tally()
@@ -251,71 +154,260 @@ impl Session {
 
     /// Returns the numbers of revolutions by kind.
     pub fn turn_counts(&self) -> TurnCounts {
-        self.turns.counts()
+        self.stream.turn_counts()
     }
 
-    /// Handles deadlines after all bytes were framed. Bytes that belong to nothing do not extend a deadline.
-    fn expire(&mut self) {
-        let now = self.now;
-        let is_idle =
-            self.settings.stop_when_idle && self.idle_since.is_some_and(|since| now >= since + IDLE);
-        if is_idle && !self.settings.listen_only && !matches!(self.phase, Phase::Paused { .. }) {
-            return self.rest(true);
+    /// Begins again at the current rate. The session shows the state `shown` until measured data arrive.
+    fn begin(&mut self, shown: State) {
+        self.end_stream();
+        self.shown = shown;
+        if self.settings.listen_only {
+            self.phase = Phase::Listening { since: self.now };
+            return self.framer.expect(Expect::Anything(self.handshake.alike()));
         }
-        match self.phase {
-            Phase::Listening { .. } if self.framer.is_alike() => self.trouble = Some(Trouble::Alike),
-            Phase::Listening { since } => self.complain(since),
-            Phase::Draining { until, at_most, .. }
-                if until > at_most && now >= at_most && self.seeks_quickly() =>
-            {
-                self.seek_on();
-            }
-            Phase::Draining { attempts, until, at_most } if now >= until.min(at_most) => {
-                self.ask(Ask::Info, attempts);
-            }
-            Phase::Asking { ask, attempts, until } if now >= until => self.unanswered(ask, attempts),
-            Phase::Booting { until } | Phase::Unwell { until } if now >= until => self.begin(self.shown),
-            Phase::Hearing { silent_at, .. } if now >= silent_at => {
-                self.resyncs += 1;
-                self.trouble = Some(Trouble::Silence);
-                self.begin(State::Silent);
-            }
-            Phase::Hearing { turned_at, .. } if now >= turned_at + STILL => {
-                // A revolution may also be missing because most bytes are damaged.
-                let (damaged, in_packets) = self.turned_with;
-                let is_damaged = self.damaged.0 - damaged > self.framer.tally().in_packets - in_packets;
-                self.trouble = (!is_damaged).then_some(Trouble::StandsStill);
-            }
+        // Opening a port asserts it, which keeps the motor of an A1 off.
+        self.change_dtr = Some(false);
+        self.stop(0);
+    }
+
+    /// Sends the stop request. The first query follows; `attempts` of it were not answered.
+    fn stop(&mut self, attempts: u8) {
+        self.framer.expect(Expect::Answers);
+        self.requests = RequestQueue::default();
+        self.requests.push(&Request::STOP);
+        let (until, at_most) = (self.now + QUIET, self.now + DRAIN);
+        self.phase = Phase::Draining { attempts, until, at_most };
+    }
+
+    /// Stops the stream and the motor, and expects nothing.
+    fn rest(&mut self, is_resting: bool) {
+        self.end_stream();
+        self.framer.expect(Expect::Nothing);
+        if !self.settings.listen_only {
+            self.requests = RequestQueue::default();
+            self.requests.push(&Request::STOP);
+            self.set_motor(false);
+        }
+        self.phase = Phase::Paused { is_resting };
+    }
+
+    /// Starts the motor, or stops it.
+    fn set_motor(&mut self, is_on: bool) {
+        match self.handshake.motor_request(is_on) {
+            _ if self.settings.listen_only => {}
+            Some(request) => self.requests.push(&request),
+            // A session begins with DTR cleared.
+            None if is_on => {}
+            None => self.change_dtr = Some(true),
+        }
+    }
+
+    /// Sends `query`. There were `attempts` before. In a recording, the recorded program sends queries.
+    fn query(&mut self, query: Query, attempts: u8) {
+        if self.settings.listen_only {
+            return;
+        }
+        // A leftover fragment would swallow the start of the next response.
+        self.framer.clear();
+        self.requests.push(&query.request());
+        self.phase = Phase::Querying { query, attempts, until: self.now + self.response_timeout() };
+    }
+
+    /// Restarts the timeout after a request was sent completely.
+    fn requests_sent(&mut self) {
+        let (now, timeout) = (self.now, self.response_timeout());
+        match &mut self.phase {
+            Phase::Querying { until, .. } => *until = now + timeout,
+            Phase::Draining { until, at_most, .. } => (*until, *at_most) = (now + QUIET, now + DRAIN),
             _ => {}
         }
     }
 
-    /// Starts to wait for the end of the next revolution.
-    fn await_turn(&mut self) {
-        self.turned_with = (self.damaged.0, self.framer.tally().in_packets);
+    fn response_timeout(&self) -> Nanos {
+        if self.settings.fixed_rate { NETWORK_TIMEOUT } else { RESPONSE_TIMEOUT }
     }
 
-    /// Returns whether the search for the rate is young. During this time, a scanner that streams on after the stop request is
-    /// not asked at this rate, because at the right rate it would have stopped. Later a request is sent, because the line may never
-    /// be quiet.
-    fn seeks_quickly(&self) -> bool {
-        let is_young = self.quiet_since.is_none_or(|(since, _)| self.now < since + ROUNDS);
-        is_young && self.next_rate().is_some()
+    /// Handles a response with its descriptor in `span`.
+    fn answered(&mut self, answer: Answer, span: Span) {
+        let query = if let Phase::Querying { query, .. } = self.phase { Some(query) } else { None };
+        let data = &self.framer.bytes(span)[Head::LEN..];
+        let next = self.handshake.answered(query, answer, data, self.rate.baud());
+        self.proceed(next);
     }
 
-    /// Returns when the session has to act without a byte.
-    fn deadline(&self) -> Nanos {
-        match self.phase {
-            Phase::Listening { since } => {
-                let seconds = self.now.saturating_sub(since) / SILENCE;
-                since + (seconds + 1) * SILENCE
+    /// Handles that no response to `query` arrived.
+    fn unanswered(&mut self, query: Query, attempts: u8) {
+        // Bytes arrived, but no valid response. The response may have been damaged, so do not conclude that the request is
+        // unsupported.
+        let is_damaged =
+            self.reads.last_byte() + self.response_timeout() > self.now && attempts < MAX_ATTEMPTS;
+        match query {
+            Query::Info if attempts == 0 && is_damaged => self.stop(1),
+            Query::Info => self.search_on(),
+            _ if attempts == 0 || is_damaged => self.query(query, attempts + 1),
+            _ => {
+                let next = self.handshake.unanswered(query, self.rate.baud());
+                self.proceed(next);
             }
-            Phase::Paused { .. } => Nanos::MAX,
-            Phase::Draining { until, at_most, .. } => until.min(at_most),
-            Phase::Asking { until, .. } => until,
-            Phase::Booting { until } => until,
-            Phase::Unwell { until } => until,
-            Phase::Hearing { silent_at, .. } => silent_at,
+        }
+    }
+
+    /// Carries out the next step of the handshake.
+    fn proceed(&mut self, next: Next) {
+        match next {
+            Next::Nothing => {}
+            Next::Found(query) => {
+                self.rate.end();
+                if self.shown == State::Probing {
+                    self.shown = State::Starting;
+                }
+                self.query(query, 0);
+            }
+            Next::Query(query) => self.query(query, 0),
+            Next::Reset => {
+                self.rate.forget_stream();
+                self.requests.push(&Request::RESET);
+                self.phase = Phase::Booting { until: self.now + BOOT };
+            }
+            Next::Unwell(health) => {
+                self.trouble = Some(Trouble::Unwell(health));
+                self.phase = Phase::Unwell { until: self.now + HEALTH_RETRY_INTERVAL };
+            }
+            Next::StartMotor(query) => {
+                self.set_motor(true);
+                self.query(query, 0);
+            }
+            Next::Scan(mode) => {
+                self.stream.set_sample_us(mode.sample_us);
+                self.query(mode.query(), 0);
+            }
+            Next::Restart => self.begin(self.shown),
+            Next::Refused => {
+                self.trouble = Some(Trouble::Refused);
+                self.stop(0);
+            }
+        }
+    }
+
+    /// Tries the next rate, and updates the time in the trouble.
+    fn search_on(&mut self) {
+        let since = self.rate.advance(self.now, self.framer.tally().read);
+        self.complain(since);
+        self.stop(0);
+    }
+
+    /// Reports that no response has arrived since `since`.
+    fn complain(&mut self, since: Nanos) {
+        if self.trouble != Some(Trouble::Alike) {
+            self.trouble = self.rate.no_answer(since, self.now).or(self.trouble);
+        }
+    }
+
+    /// Handles the boot message of a scanner, which has lost its settings. `is_named` as of [`Found::Greeting`].
+    fn booted(&mut self, is_named: bool) {
+        match self.phase {
+            Phase::Paused { .. } | Phase::Listening { .. } => {}
+            // The first query follows anyway. A stream at another rate may look like text again and again.
+            Phase::Draining { .. } | Phase::Querying { query: Query::Info, .. } => {
+                if is_named && self.rate.take_stream() {
+                    self.counters.note_restart();
+                }
+            }
+            Phase::Booting { .. } => self.phase = Phase::Booting { until: self.now + SETTLE },
+            // The rest of a packet may be text too, but a scanner that boots pauses before its boot message. A name proves it even
+            // after other bytes, which a scanner sends while its supply drops.
+            Phase::Streaming(watchdog)
+                if !is_named
+                    && (watchdog.silent_at().abs_diff(self.now + Watchdog::SILENCE) < BOOT_SILENCE
+                        || self.framer.skipped() > Kind::LONGEST as u32 + BOOT_MESSAGE_LEN) => {}
+            // A stream whose beginning was damaged looks like text here and there.
+            Phase::Querying { .. } if !is_named => {}
+            phase => {
+                if matches!(phase, Phase::Streaming(_)) {
+                    self.counters.note_resync();
+                }
+                self.counters.note_restart();
+                self.rate.forget_stream();
+                self.begin(State::Starting);
+                self.requests = RequestQueue::default();
+                self.phase = Phase::Booting { until: self.now + SETTLE };
+            }
+        }
+    }
+
+    /// Handles the descriptor of a stream.
+    fn stream_begins(&mut self) {
+        match self.phase {
+            // Another program has started another stream, in an unknown mode.
+            Phase::Streaming(_) if self.stream.is_begun() && !self.settings.listen_only => {
+                self.counters.note_resync();
+                self.begin(State::Starting);
+            }
+            Phase::Querying { query, .. } if !query.is_scan() => self.framer.expect(Expect::Answers),
+            Phase::Querying { .. } | Phase::Listening { .. } | Phase::Streaming(_) => {
+                self.end_stream();
+                let mut watchdog = self.continue_stream();
+                watchdog.await_spin_up(self.now + SPIN_UP);
+                self.phase = Phase::Streaming(watchdog);
+                self.counters.await_revolution(self.framer.tally());
+            }
+            Phase::Paused { .. } => self.framer.expect(Expect::Nothing),
+            Phase::Draining { .. } | Phase::Booting { .. } | Phase::Unwell { .. } => {
+                self.framer.expect(Expect::Answers);
+            }
+        }
+    }
+
+    /// Starts or extends the stream after packets have arrived. Returns its deadlines.
+    fn continue_stream(&mut self) -> Watchdog {
+        let mut watchdog = Watchdog::new(self.now);
+        if let Phase::Streaming(known) = self.phase {
+            watchdog = known;
+            watchdog.note_packets(self.now);
+            self.counters.continue_stream(self.framer.tally());
+        } else {
+            self.trouble = None;
+            self.counters.begin_stream(self.framer.tally());
+        }
+        self.phase = Phase::Streaming(watchdog);
+        self.rate.note_stream();
+        watchdog
+    }
+
+    /// Ends the stream: the next packet belongs to another one.
+    fn end_stream(&mut self) {
+        self.stream.end();
+        self.reads.end_rest();
+    }
+
+    /// Stamps the packets of `span`, and keeps them for revolutions.
+    fn receive(&mut self, kind: Kind, mut span: Span) -> Received<'_> {
+        self.continue_stream();
+        span.reasons |= self.reads.take_doubt(span.offset + span.len as u64);
+        let (baud, model) = (self.rate.baud(), self.model());
+        let pace = (!self.settings.fixed_rate).then_some(baud);
+        let line = Line { arrivals: self.reads.arrivals(), baud, pace };
+        let mut stamps = None;
+        if self.stream.measure(kind, span, line, self.handshake.modes()) {
+            stamps = self.stream.place(kind, &mut span, &mut self.framer, line, model);
+            self.counters.note_packets(self.framer.tally(), span.packets);
+        }
+        let packet_time = line_time(kind.bytes(), baud);
+        let latest = line.arrivals.latest(span.offset + span.len as u64 - 1, pace);
+        let latest = latest.saturating_sub(packet_time);
+        let (first, last) = stamps.unwrap_or((latest, latest));
+        let first = first.min(self.now);
+        let last = self.reads.date_packet((last + packet_time).clamp(first, self.now.max(first)));
+        Received {
+            bytes: self.framer.bytes(span),
+            first,
+            last,
+            estimated: stamps.is_none(),
+            reasons: span.reasons,
+            count: span.packets,
+            is_checked: kind.is_checked(),
+            is_reply: false,
+            whole: None,
         }
     }
 
@@ -333,6 +425,67 @@ impl Session {
             whole: None,
         }
     }
+
+    /// Returns a complete revolution, and updates the state of the session.
+    fn show(&mut self, closed: Closed) -> RawScan<'_> {
+        let first = self.stream.scan(closed, &self.reads, self.now).first;
+        self.reads.end_turn(first);
+        self.trouble = None;
+        if let Phase::Streaming(watchdog) = &mut self.phase {
+            watchdog.note_revolution(self.now);
+        }
+        self.counters.await_revolution(self.framer.tally());
+        self.stream.scan(closed, &self.reads, self.now)
+    }
+
+    /// Handles deadlines after all bytes were framed. Bytes that belong to nothing do not extend a deadline.
+    fn expire(&mut self) {
+        let now = self.now;
+        let is_idle =
+            self.settings.stop_when_idle && self.idle_since.is_some_and(|since| now >= since + IDLE);
+        if is_idle && !self.settings.listen_only && !matches!(self.phase, Phase::Paused { .. }) {
+            return self.rest(true);
+        }
+        match self.phase {
+            Phase::Listening { .. } if self.framer.is_alike() => self.trouble = Some(Trouble::Alike),
+            Phase::Listening { since } => self.complain(since),
+            Phase::Draining { until, at_most, .. }
+                if until > at_most && now >= at_most && self.rate.is_quick(now) =>
+            {
+                self.search_on();
+            }
+            Phase::Draining { attempts, until, at_most } if now >= until.min(at_most) => {
+                self.query(Query::Info, attempts);
+            }
+            Phase::Querying { query, attempts, until } if now >= until => self.unanswered(query, attempts),
+            Phase::Booting { until } | Phase::Unwell { until } if now >= until => self.begin(self.shown),
+            Phase::Streaming(watchdog) if watchdog.is_silent(now) => {
+                self.counters.note_resync();
+                self.trouble = Some(Trouble::Silence);
+                self.begin(State::Silent);
+            }
+            Phase::Streaming(watchdog) if watchdog.is_revolution_overdue(now) => {
+                let is_damaged = self.counters.is_mostly_damaged(self.framer.tally());
+                self.trouble = (!is_damaged).then_some(Trouble::StandsStill);
+            }
+            _ => {}
+        }
+    }
+
+    /// Returns when the session has to act without a byte.
+    fn deadline(&self) -> Nanos {
+        match self.phase {
+            Phase::Listening { since } => {
+                // The next full second, for the time in the trouble.
+                let seconds = self.now.saturating_sub(since) / SECOND;
+                since + (seconds + 1) * SECOND
+            }
+            Phase::Paused { .. } => Nanos::MAX,
+            Phase::Draining { until, at_most, .. } => until.min(at_most),
+            Phase::Querying { until, .. } | Phase::Booting { until } | Phase::Unwell { until } => until,
+            Phase::Streaming(watchdog) => watchdog.silent_at(),
+        }
+    }
 }
 
 impl line::Protocol for Session {
@@ -348,7 +501,7 @@ impl line::Protocol for Session {
         if len > 0 {
             self.framer.commit(len);
             if let Phase::Draining { until, .. } = &mut self.phase {
-                *until = now + dialogue::QUIET;
+                *until = now + QUIET;
             }
         }
     }
@@ -360,8 +513,8 @@ impl line::Protocol for Session {
 
     fn transmitted(&mut self, now: Nanos) {
         self.now = now;
-        if self.outgoing.advance() {
-            self.sent();
+        if self.requests.advance() {
+            self.requests_sent();
         }
     }
 
@@ -370,22 +523,21 @@ impl line::Protocol for Session {
             if let Some(on) = self.change_dtr.take() {
                 return Output::SetDtr(on);
             }
-            if core::mem::take(&mut self.change_baud) {
+            if let Some(baud) = self.rate.take_change() {
                 self.framer.clear();
-                return Output::SetRate(self.baud);
+                return Output::SetRate(baud);
             }
-            if !self.outgoing.next().is_empty() {
-                return Output::Transmit { bytes: self.outgoing.next(), not_before: 0 };
+            if !self.requests.next().is_empty() {
+                return Output::Transmit { bytes: self.requests.next(), not_before: 0 };
             }
-            if let Some(closed) = self.advance_turns() {
+            if let Some(closed) = self.stream.advance(&self.framer) {
                 return Output::Event(Event::Scan(self.show(closed)));
             }
-            let most = self.framer.kind().map_or(1, |kind| self.most_together(kind));
+            let most = self.framer.kind().map_or(1, |kind| self.stream.max_packets_per_sample(kind));
             let Some(found) = self.framer.advance(most) else { break };
             match found {
                 Found::Reply(answer, span) => {
-                    let data = Reply::new(&self.framer.bytes(span)[Head::LEN..]);
-                    self.answered(answer, data);
+                    self.answered(answer, span);
                     return Output::Event(Event::Telegram(self.reply(span)));
                 }
                 Found::Stream(span) => {
@@ -399,7 +551,7 @@ impl line::Protocol for Session {
             }
         }
         self.expire();
-        if self.change_dtr.is_some() || self.change_baud || !self.outgoing.next().is_empty() {
+        if self.change_dtr.is_some() || self.rate.is_changed() || !self.requests.next().is_empty() {
             return self.poll_output();
         }
         self.reads.wait(self.now, self.deadline(), self.framer.hold())
@@ -416,7 +568,7 @@ impl line::Session for Session {
             (Control::Resume, Phase::Paused { is_resting: false }) => self.begin(State::Probing),
             (Control::Resume, _) => {}
             (Control::Resync, _) => {
-                self.resyncs += 1;
+                self.counters.note_resync();
                 self.trouble = None;
                 self.begin(State::Probing);
             }
@@ -446,8 +598,7 @@ impl line::Session for Session {
 
     fn state(&self) -> State {
         match self.phase {
-            Phase::Hearing { has_turned: false, .. } => State::Starting,
-            Phase::Hearing { .. } => State::Streaming,
+            Phase::Streaming(watchdog) => watchdog.state(),
             Phase::Paused { .. } => State::Paused,
             _ => self.shown,
         }
@@ -455,8 +606,10 @@ impl line::Session for Session {
 
     fn trouble(&self) -> Option<Trouble> {
         let is_paused = matches!(self.phase, Phase::Paused { .. });
-        let warning = self.health.filter(|health| matches!(health, Health::Warning(_))).map(Trouble::Unwell);
-        self.trouble.or(self.no_mode.map(Trouble::NoMode)).or(warning).filter(|_| !is_paused)
+        let no_mode = self.handshake.unavailable_mode().map(Trouble::NoMode);
+        let warning =
+            self.health().filter(|health| matches!(health, Health::Warning(_))).map(Trouble::Unwell);
+        self.trouble.or(no_mode).or(warning).filter(|_| !is_paused)
     }
 
     fn missing(&self) -> Option<&'static str> {
@@ -464,27 +617,12 @@ impl line::Session for Session {
     }
 
     fn rate(&self) -> u32 {
-        self.baud
+        self.rate.baud()
     }
 
     fn account(&self) -> Account {
-        let tally = self.framer.tally();
-        let (came, lost) = self.sequence.came_and_lost();
-        Account {
-            read: tally.read,
-            in_telegrams: tally.in_packets,
-            acknowledge: 0,
-            discarded: tally.discarded,
-            buffered: self.framer.buffered() as u64,
-            telegrams: tally.packets,
-            due: came + lost,
-            lost,
-            damaged: self.damaged.0,
-            resyncs: self.resyncs,
-            restarts: self.restarts,
-            began_with_a_cut: self.cut,
-            rejected_checksum: tally.rejected_checksum,
-        }
+        let (tally, buffered) = (self.framer.tally(), self.framer.buffered());
+        self.counters.account(tally, buffered, self.stream.came_and_lost())
     }
 
     fn model(&self) -> Option<family::Model> {
@@ -496,11 +634,13 @@ impl line::Session for Session {
     }
 
     fn partial_scan(&self) -> Option<RawScan<'_>> {
-        self.begun_turn()
+        let closed = self.framer.kind().and_then(|kind| self.stream.partial_revolution(kind))?;
+        Some(self.stream.scan(closed, &self.reads, self.now))
     }
 
     fn other_model(&self) -> Option<family::Model> {
-        self.info().and_then(|info| info.model()).filter(|model| self.is_unexpected(*model)).map(described)
+        let reported = self.info().and_then(|info| info.model())?;
+        self.settings.model.filter(|wanted| *wanted != reported).map(|_| described(reported))
     }
 
     fn missing_setting(&self) -> Option<&'static str> {
@@ -508,14 +648,14 @@ impl line::Session for Session {
     }
 
     fn write_details(&self, text: &mut dyn fmt::Write) {
-        let _ = self.mode().map_or(Ok(()), |mode| write!(text, " {}", mode.name()));
+        let _ = self.handshake.mode().map_or(Ok(()), |mode| write!(text, " {}", mode.name()));
         if let Some(Info { firmware: (major, minor), .. }) = self.info() {
             let _ = write!(text, " {major}.{minor:02}");
         }
     }
 
     fn scanner_time(&self) -> Option<Nanos> {
-        self.scanner_time
+        self.stream.scanner_time()
     }
 
     fn mark_suspect(&mut self, reasons: u8) {
@@ -523,11 +663,16 @@ impl line::Session for Session {
     }
 
     fn begin_at(&mut self, rate: u32, _: Nanos) {
-        self.baud = rate;
+        self.rate.begin_at(rate);
     }
 
     fn introduction(&self) -> Option<Introduction> {
-        let info = self.info().filter(|_| self.is_introduced())?;
+        // The health is known, unless the scanner does not respond to that request.
+        let is_asked = matches!(
+            self.phase,
+            Phase::Draining { .. } | Phase::Querying { query: Query::Info | Query::Health, .. }
+        );
+        let info = self.info().filter(|_| !is_asked)?;
         let (major, minor) = info.firmware;
         let serial: String = info.serial.iter().map(|byte| format!("{byte:02X}")).collect();
         let identity = format!("firmware {major}.{minor:02}, hardware {}, number {serial}", info.hardware);
@@ -554,7 +699,7 @@ pub const FEATURES: Features = Features {
     speaks_unasked: false,
     has_whole_telegrams: false,
     contents: Contents::TURNING,
-    max_telegram: stream::LONGEST,
+    max_telegram: MAX_SAMPLE_LEN,
 };
 
 /// Returns the head of a scan on a grid of as many beams as there is space for.
@@ -622,34 +767,33 @@ const fn described(model: Model) -> family::Model {
 }
 
 /// All models, described for the configuration.
-const MODELS: [family::Model; Model::ALL.len()] = {
-    let mut all = [described(Model::A1); Model::ALL.len()];
-    let mut at = 0;
-    while at < all.len() {
-        all[at] = described(Model::ALL[at]);
-        at += 1;
-    }
-    all
-};
+const MODELS: [family::Model; Model::ALL.len()] = table!(Model::ALL, described);
 
 /// Names of all modes.
-const MODES: [&str; Mode::ALL.len()] = {
-    let mut all = [""; Mode::ALL.len()];
-    let mut at = 0;
-    while at < all.len() {
-        all[at] = Mode::ALL[at].name();
-        at += 1;
-    }
-    all
-};
+const MODES: [&str; Mode::ALL.len()] = table!(Mode::ALL, Mode::name);
 
-/// Maximum number of points in a revolution: those of an S2 at four revolutions per second.
-const MOST_POINTS: usize = 8_192;
-/// After this time without a packet, the session begins again.
-const SILENCE: Nanos = 1_000 * MILLIS;
-/// After this time without a revolution, the head is blocked. The slowest head needs less for one.
-const STILL: Nanos = 2_000 * MILLIS;
+/// A line without a byte for this time after the stop request is quiet.
+const QUIET: Nanos = 15 * MILLIS;
+/// Maximum time to wait for a quiet line before the first query.
+pub(crate) const DRAIN: Nanos = 60 * MILLIS;
+/// A response takes some milliseconds. An adapter that collects bytes takes 16 ms more, twice.
+const RESPONSE_TIMEOUT: Nanos = 70 * MILLIS;
+/// Maximum time for a response over a network.
+const NETWORK_TIMEOUT: Nanos = 500 * MILLIS;
+/// Maximum number of attempts with a query whose responses are damaged.
+const MAX_ATTEMPTS: u8 = 8;
+/// Maximum time from a restart request to the boot message. A real A1 has booted after 0.67 s.
+const BOOT: Nanos = 1_500 * MILLIS;
+/// Minimum silence before the boot message.
+const BOOT_SILENCE: Nanos = 200 * MILLIS;
+/// Maximum length of a boot message, in bytes.
+const BOOT_MESSAGE_LEN: u32 = 64;
+/// Time from the boot message to the first query. A scanner responds after 4 ms.
+const SETTLE: Nanos = 10 * MILLIS;
+/// Interval between requests for the health of a scanner that reports an error.
+const HEALTH_RETRY_INTERVAL: Nanos = 2_000 * MILLIS;
+/// Some heads have to reach their speed before they measure.
+const SPIN_UP: Nanos = 3_000 * MILLIS;
 /// The motor stops after this time without subscribers. A program that restarts subscribes again in less.
 const IDLE: Nanos = 5_000 * MILLIS;
-/// All rates are tried twice in this time if bytes arrive at each of them, because a stop request can be lost.
-const ROUNDS: Nanos = 8 * dialogue::DRAIN;
+const SECOND: Nanos = 1_000 * MILLIS;

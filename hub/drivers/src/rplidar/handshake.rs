@@ -1,0 +1,526 @@
+//! The handshake with a scanner: the queries in their order, what the scanner has reported, and the scan mode that follows from
+//! it. [`Handshake`] decides which step comes next; the session carries it out, and waits for responses.
+
+use crate::rplidar::device_info::{Health, Info};
+use crate::rplidar::model::{Mode, Model, Motor};
+use crate::rplidar::packet::Kind;
+use crate::rplidar::request::{Answer, Request, key};
+use crate::rplidar::session::Settings;
+
+/// A request whose response the session waits for, in the order of the handshake. Those about a mode contain its place in the
+/// list of modes.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Query {
+    Info,
+    Health,
+    Board,
+    ModeCount,
+    TypicalMode,
+    SampleTime(u8),
+    Kind(u8),
+    Name(u8),
+    /// The times per point of a scanner that does not list its modes.
+    SampleTimes,
+    /// The time per point of the chosen mode once more, because responses have no checksum and all stamps depend on it.
+    Confirm(u8),
+    /// Start the standard scan.
+    StandardScan,
+    /// Start a scan mode whose packets contain several points.
+    ExpressScan(u8),
+}
+
+impl Query {
+    /// Returns the request.
+    pub(crate) fn request(self) -> Request {
+        match self {
+            Query::Info => Request::INFO,
+            Query::Health => Request::HEALTH,
+            Query::Board => Request::board(),
+            Query::ModeCount => Request::configuration(key::COUNT, None),
+            Query::TypicalMode => Request::configuration(key::TYPICAL, None),
+            Query::SampleTime(mode) | Query::Confirm(mode) => {
+                Request::configuration(key::SAMPLE_TIME, Some(mode))
+            }
+            Query::Kind(mode) => Request::configuration(key::ANSWER, Some(mode)),
+            Query::Name(mode) => Request::configuration(key::NAME, Some(mode)),
+            Query::SampleTimes => Request::SAMPLE_TIMES,
+            Query::StandardScan => Request::SCAN,
+            Query::ExpressScan(mode) => Request::express(mode),
+        }
+    }
+
+    /// Returns whether the response is a stream.
+    pub(crate) fn is_scan(self) -> bool {
+        matches!(self, Query::StandardScan | Query::ExpressScan(_))
+    }
+}
+
+/// Step that follows from a response, or from its absence.
+#[derive(Clone, Copy, Debug)]
+pub(crate) enum Next {
+    /// Nothing. For example, it was not the expected response.
+    Nothing,
+    /// The scanner has responded to the first query: send this one.
+    Found(Query),
+    /// Send this query.
+    Query(Query),
+    /// Restart the scanner, which reports an error.
+    Reset,
+    /// Wait: the scanner reports an error even after a restart.
+    Unwell(Health),
+    /// Start the motor, and send this query.
+    StartMotor(Query),
+    /// Start this mode.
+    Scan(ScanMode),
+    /// Begin again, because a response was damaged.
+    Restart,
+    /// The scanner does not begin to measure.
+    Refused,
+}
+
+/// Properties that the scanner has reported, and the scan mode that follows from it.
+#[derive(Clone, Debug)]
+pub(crate) struct Handshake {
+    settings: Settings,
+    info: Option<Info>,
+    health: Option<Health>,
+    /// Whether a scanner that reported an error was already restarted.
+    was_reset: bool,
+    /// Whether an accessory board controls the motor, by its duty cycle.
+    has_board: bool,
+    modes: ScanModes,
+    /// The mode in use, if scanhub knows it.
+    mode: Option<Mode>,
+    /// The mode of the settings, if the scanner cannot use it.
+    unavailable_mode: Option<Mode>,
+    /// In a recording: place of the last mode in a response to the recorded program, and the key of that response.
+    recorded: (u8, u8),
+}
+
+impl Handshake {
+    pub(crate) fn new(settings: Settings) -> Handshake {
+        Handshake {
+            settings,
+            info: None,
+            health: None,
+            was_reset: false,
+            has_board: false,
+            modes: ScanModes::default(),
+            mode: settings.mode.filter(|_| settings.listen_only),
+            unavailable_mode: None,
+            recorded: (0, 0),
+        }
+    }
+
+    /// Returns the identity that the scanner reported.
+    pub(crate) fn info(&self) -> Option<Info> {
+        self.info
+    }
+
+    /// Returns the health that the scanner reported.
+    pub(crate) fn health(&self) -> Option<Health> {
+        self.health
+    }
+
+    /// Returns the model, once it is known.
+    pub(crate) fn model(&self) -> Option<Model> {
+        self.info.and_then(|info| info.model()).or(self.settings.model)
+    }
+
+    /// Returns the scan modes that the scanner reported.
+    pub(crate) fn modes(&self) -> &ScanModes {
+        &self.modes
+    }
+
+    /// Returns the scan mode in use, if scanhub knows it.
+    pub(crate) fn mode(&self) -> Option<Mode> {
+        self.mode
+    }
+
+    /// Returns the mode of the settings, if the scanner cannot use it.
+    pub(crate) fn unavailable_mode(&self) -> Option<Mode> {
+        self.unavailable_mode
+    }
+
+    /// Returns the kind of packets that look like both express and dense ones if no response has named it: the fastest kind of
+    /// the model.
+    pub(crate) fn alike(&self) -> Option<Kind> {
+        match (self.settings.mode, self.model()) {
+            (Some(Mode::DenseBoost), _) => Some(Kind::Dense),
+            (Some(_), _) => Some(Kind::Express),
+            (None, Some(Model::A1 | Model::A2m8 | Model::A2m12 | Model::A3)) => Some(Kind::Express),
+            (None, model) => model.map(|_| Kind::Dense),
+        }
+    }
+
+    /// Returns the request that starts the motor, or stops it. `None` if the line DTR controls it.
+    pub(crate) fn motor_request(&self, is_on: bool) -> Option<Request> {
+        match self.motor() {
+            Motor::Speed => Some(Request::speed(if is_on { SPEED } else { 0 })),
+            Motor::Board if self.has_board => Some(Request::duty(if is_on { DUTY } else { 0 })),
+            Motor::Board | Motor::Dtr => None,
+        }
+    }
+
+    fn motor(&self) -> Motor {
+        self.info.map_or(Motor::Dtr, |info| info.motor())
+    }
+
+    /// Handles a response with the contents `data`, while the response to `query` is expected, on a line of `baud` bits per
+    /// second. It may belong to an earlier query.
+    pub(crate) fn answered(&mut self, query: Option<Query>, answer: Answer, data: &[u8], baud: u32) -> Next {
+        if answer == Answer::Info {
+            self.info = Info::parse(data);
+        }
+        let query = match query {
+            Some(query) => query,
+            None if self.settings.listen_only => self.infer_query(answer, data),
+            None => return Next::Nothing,
+        };
+        // A response about a key begins with that key.
+        let of_key = |key: u8| data.strip_prefix(&[key, 0, 0, 0]).filter(|_| answer == Answer::Configuration);
+        match query {
+            Query::Info if answer == Answer::Info => return Next::Found(Query::Health),
+            Query::Health if answer == Answer::Health => return self.examine(Health::parse(data)),
+            Query::Board if answer == Answer::Board => {
+                self.has_board = number(data) & 1 == 1;
+                return Next::StartMotor(Query::ModeCount);
+            }
+            Query::ModeCount => {
+                let Some(data) = of_key(key::COUNT) else { return Next::Nothing };
+                self.modes.begin(number(data) as usize);
+                return Next::Query(Query::TypicalMode);
+            }
+            Query::TypicalMode => {
+                let Some(data) = of_key(key::TYPICAL) else { return Next::Nothing };
+                self.modes.recommend(number(data) as u8);
+            }
+            Query::SampleTime(mode) => {
+                let Some(data) = of_key(key::SAMPLE_TIME) else { return Next::Nothing };
+                self.modes.set(mode, |mode| mode.sample_us = Some(sample_us(data)).filter(|us| *us > 0.0));
+            }
+            Query::Confirm(mode) => {
+                let Some(data) = of_key(key::SAMPLE_TIME) else { return Next::Nothing };
+                let is_same = self.modes.nth(mode).and_then(|mode| mode.sample_us) == Some(sample_us(data));
+                return if is_same { self.start(baud) } else { Next::Restart };
+            }
+            Query::Kind(mode) => {
+                let Some(data) = of_key(key::ANSWER) else { return Next::Nothing };
+                self.modes.set(mode, |mode| mode.kind = Kind::of(number(data) as u8));
+            }
+            Query::Name(mode) => {
+                let Some(data) = of_key(key::NAME) else { return Next::Nothing };
+                self.modes.set(mode, |mode| mode.named = Mode::said(data));
+            }
+            Query::SampleTimes if answer == Answer::SampleTimes => {
+                let us = number(data);
+                self.modes = ScanModes::of_old(us as u16, (us >> 16) as u16);
+                return self.start(baud);
+            }
+            _ => return Next::Nothing,
+        }
+        self.after(query, baud)
+    }
+
+    /// Continues without the response to `query`, other than [`Query::Info`].
+    pub(crate) fn unanswered(&mut self, query: Query, baud: u32) -> Next {
+        match query {
+            Query::Board => Next::StartMotor(Query::ModeCount),
+            // The scanner responds, but not to everything. Its health counts as good.
+            Query::Health => self.after_health(),
+            Query::ModeCount => Next::Query(Query::SampleTimes),
+            Query::SampleTimes => {
+                self.modes = ScanModes::of_old(0, 0);
+                self.start(baud)
+            }
+            Query::Confirm(_) => self.start(baud),
+            Query::StandardScan | Query::ExpressScan(_) => Next::Refused,
+            query => self.after(query, baud),
+        }
+    }
+
+    /// Returns the step after `query`, which is about the list of modes.
+    fn after(&mut self, query: Query, baud: u32) -> Next {
+        let next = match query {
+            Query::SampleTime(mode) => Query::Kind(mode),
+            Query::Kind(mode) => Query::Name(mode),
+            Query::Name(mode) => Query::SampleTime(mode + 1),
+            _ => Query::SampleTime(0),
+        };
+        match next {
+            Query::SampleTime(mode) if usize::from(mode) >= self.modes.count => self.confirm(baud),
+            next => Next::Query(next),
+        }
+    }
+
+    /// Handles the reported health.
+    fn examine(&mut self, health: Option<Health>) -> Next {
+        self.health = health;
+        match health {
+            _ if self.settings.listen_only => Next::Nothing,
+            Some(Health::Error(_)) if !self.was_reset => {
+                self.was_reset = true;
+                Next::Reset
+            }
+            Some(health @ Health::Error(_)) => Next::Unwell(health),
+            _ => {
+                self.was_reset = false;
+                self.after_health()
+            }
+        }
+    }
+
+    fn after_health(&self) -> Next {
+        if self.motor() == Motor::Board {
+            Next::Query(Query::Board)
+        } else {
+            Next::StartMotor(Query::ModeCount)
+        }
+    }
+
+    /// Confirms the time per point of the chosen scan mode, and then starts the mode.
+    fn confirm(&mut self, baud: u32) -> Next {
+        if self.settings.listen_only {
+            return Next::Nothing;
+        }
+        let mode = self.choose(baud);
+        if mode.sample_us.is_some() { Next::Query(Query::Confirm(mode.id)) } else { self.start(baud) }
+    }
+
+    /// Starts the chosen scan mode.
+    fn start(&mut self, baud: u32) -> Next {
+        if self.settings.listen_only {
+            return Next::Nothing;
+        }
+        let mode = self.choose(baud);
+        self.mode = mode.named;
+        Next::Scan(mode)
+    }
+
+    /// Returns the mode of the settings, or the fastest one if the scanner or the line cannot use it.
+    fn choose(&mut self, baud: u32) -> ScanMode {
+        let baud = (!self.settings.fixed_rate).then_some(baud);
+        let wanted = self.settings.mode.and_then(|mode| self.modes.wanted(mode, baud));
+        self.unavailable_mode = self.settings.mode.filter(|_| wanted.is_none());
+        let fastest = || self.modes.fastest(baud).or_else(|| self.modes.fastest(None));
+        wanted.or_else(fastest).unwrap_or_default()
+    }
+
+    /// Infers the query from a response in a recording: a program lists the modes in their order, and the keys of each mode
+    /// in ascending order.
+    fn infer_query(&mut self, answer: Answer, data: &[u8]) -> Query {
+        let key = match answer {
+            Answer::Info => return Query::Info,
+            Answer::Health => return Query::Health,
+            Answer::Board => return Query::Board,
+            Answer::SampleTimes => return Query::SampleTimes,
+            Answer::Configuration => data.first().copied().unwrap_or(key::COUNT),
+        };
+        let (mode, before) = self.recorded;
+        let mode = if key > before { mode } else { mode + 1 };
+        match key {
+            key::COUNT => self.recorded = (0, 0),
+            key::SAMPLE_TIME | key::ANSWER | key::NAME => self.recorded = (mode, key),
+            _ => {}
+        }
+        match key {
+            key::SAMPLE_TIME => Query::SampleTime(mode),
+            key::ANSWER => Query::Kind(mode),
+            key::NAME => Query::Name(mode),
+            key::TYPICAL => Query::TypicalMode,
+            _ => Query::ModeCount,
+        }
+    }
+}
+
+/// A scan mode as the scanner describes it.
+#[derive(Clone, Copy, Debug, Default)]
+pub(crate) struct ScanMode {
+    /// Number in the request that starts it.
+    id: u8,
+    /// Microseconds from one point to the next.
+    pub(crate) sample_us: Option<f32>,
+    kind: Option<Kind>,
+    named: Option<Mode>,
+}
+
+impl ScanMode {
+    /// Returns the query that starts the mode.
+    pub(crate) fn query(&self) -> Query {
+        if self.kind.is_none_or(|kind| kind == Kind::Standard) {
+            Query::StandardScan
+        } else {
+            Query::ExpressScan(self.id)
+        }
+    }
+}
+
+/// The scan modes of a scanner.
+#[derive(Clone, Copy, Debug, Default)]
+pub(crate) struct ScanModes {
+    all: [ScanMode; ScanModes::MOST],
+    count: usize,
+    typical: Option<u8>,
+}
+
+impl ScanModes {
+    const MOST: usize = 12;
+
+    /// Begins a list of `count` modes.
+    fn begin(&mut self, count: usize) {
+        *self = ScanModes { count: count.min(ScanModes::MOST), ..ScanModes::default() };
+        (0..).zip(&mut self.all).for_each(|(id, mode)| mode.id = id);
+    }
+
+    fn nth(&self, place: u8) -> Option<&ScanMode> {
+        self.all[..self.count].get(usize::from(place))
+    }
+
+    /// Changes the mode at `place` of the list.
+    fn set(&mut self, place: u8, set: impl Fn(&mut ScanMode)) {
+        self.all[..self.count].get_mut(usize::from(place)).into_iter().for_each(set);
+    }
+
+    /// Marks the mode with number `id` as the one that the manufacturer recommends.
+    fn recommend(&mut self, id: u8) {
+        self.typical = Some(id);
+    }
+
+    /// Returns the two modes that every scanner has, for one that does not list its modes. The times per point are in
+    /// microseconds; 0 if unknown.
+    fn of_old(standard_us: u16, express_us: u16) -> ScanModes {
+        let old = |us: u16, kind, mode| ScanMode {
+            id: 0,
+            sample_us: (us > 0).then_some(f32::from(us)),
+            kind: Some(kind),
+            named: Some(mode),
+        };
+        let mut modes = ScanModes::default();
+        modes.all[0] = old(standard_us, Kind::Standard, Mode::Standard);
+        modes.all[1] = old(express_us, Kind::Express, Mode::Express);
+        modes.count = if express_us > 0 { 2 } else { 1 };
+        modes
+    }
+
+    /// Returns the offered mode that is `mode`, if a line of `baud` bits per second can carry it. `None` for `baud`: the line
+    /// has no rate.
+    fn wanted(&self, mode: Mode, baud: Option<u32>) -> Option<ScanMode> {
+        let kind = match mode {
+            Mode::Standard => Some(Kind::Standard),
+            Mode::Express => Some(Kind::Express),
+            Mode::DenseBoost => Some(Kind::Dense),
+            Mode::UltraDense => Some(Kind::UltraDense),
+            Mode::Boost | Mode::Sensitivity | Mode::Stability => None,
+        };
+        let named = self.possible(baud).find(|offered| offered.named == Some(mode));
+        named.or_else(|| self.possible(baud).find(|offered| kind.is_some() && offered.kind == kind))
+    }
+
+    /// Returns the fastest mode that the line can carry. Among equally fast ones, it prefers those with a checksum, then the
+    /// recommended one.
+    fn fastest(&self, baud: Option<u32>) -> Option<ScanMode> {
+        self.possible(baud).min_by(|a, b| {
+            let of = |mode: &ScanMode| mode.sample_us.unwrap_or(f32::MAX);
+            let rank = |mode: &ScanMode| {
+                let is_checked = mode.kind.is_some_and(Kind::is_checked);
+                (!is_checked, self.typical != Some(mode.id))
+            };
+            of(a).total_cmp(&of(b)).then(rank(a).cmp(&rank(b)))
+        })
+    }
+
+    /// Returns the microseconds from one point to the next for packets of `kind`: in `mode` if it has such packets, otherwise
+    /// in the fastest mode that has.
+    pub(crate) fn sample_us(&self, kind: Kind, mode: Option<Mode>) -> Option<f32> {
+        let of_kind = || self.of_kind(kind);
+        let named = of_kind().filter(|(named, _)| mode.is_some() && *named == mode).map(|(_, us)| us);
+        named.reduce(f32::min).or_else(|| of_kind().map(|(_, us)| us).reduce(f32::min))
+    }
+
+    /// Returns the reported microseconds per point that are nearest to `us`, among the modes with packets of `kind`.
+    pub(crate) fn nearest_us(&self, kind: Kind, us: f32) -> Option<f32> {
+        self.of_kind(kind)
+            .map(|(_, reported)| reported)
+            .min_by(|a, b| (a - us).abs().total_cmp(&(b - us).abs()))
+    }
+
+    fn of_kind(&self, kind: Kind) -> impl Iterator<Item = (Option<Mode>, f32)> {
+        let all = self.all[..self.count].iter().filter(move |mode| mode.kind == Some(kind));
+        all.filter_map(|mode| Some((mode.named, mode.sample_us?)))
+    }
+
+    /// Returns the modes whose packets scanhub can decode and the line can carry.
+    fn possible(&self, baud: Option<u32>) -> impl Iterator<Item = ScanMode> {
+        self.all[..self.count].iter().copied().filter(move |mode| {
+            let Some((kind, baud)) = mode.kind.zip(baud) else { return mode.kind.is_some() };
+            let packets_per_second = 1e6 / (mode.sample_us.unwrap_or(1e6) * kind.points() as f32);
+            packets_per_second * kind.bytes() as f32 * 10.0 <= baud as f32
+        })
+    }
+}
+
+/// Decodes a little-endian number of one to four bytes.
+fn number(data: &[u8]) -> u32 {
+    data.iter().take(4).rev().fold(0, |number, byte| number << 8 | u32::from(*byte))
+}
+
+/// Decodes a time per point, in microseconds.
+fn sample_us(data: &[u8]) -> f32 {
+    number(data) as f32 / 256.0
+}
+
+/// Requested speed, in revolutions per minute: of an S1, the manufacturer's choice.
+const SPEED: u16 = 600;
+/// Requested duty cycle of the motor, of 1,023: of an A2, the manufacturer's choice.
+const DUTY: u16 = 660;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// The modes of a real A1M8.
+    fn a1() -> ScanModes {
+        let mut listed = ScanModes::default();
+        listed.begin(5);
+        let modes = [
+            (Mode::Standard, 508.0, Kind::Standard),
+            (Mode::Express, 254.0, Kind::Express),
+            (Mode::Boost, 127.0, Kind::Ultra),
+            (Mode::Sensitivity, 127.0, Kind::Ultra),
+            (Mode::Stability, 201.0, Kind::Ultra),
+        ];
+        for (place, (mode, us, kind)) in (0..).zip(modes) {
+            listed.set(place, |listed| {
+                (listed.named, listed.sample_us, listed.kind) = (Some(mode), Some(us), Some(kind));
+            });
+        }
+        listed.recommend(3);
+        listed
+    }
+
+    #[test]
+    fn prefers_fastest_mode_that_the_line_carries() {
+        assert_eq!(a1().fastest(Some(115_200)).map(|mode| mode.id), Some(3));
+        assert_eq!(a1().fastest(Some(100_000)).map(|mode| mode.id), Some(4), "6,840 bytes a second");
+        assert_eq!(a1().fastest(Some(57_600)).map(|mode| mode.id), None);
+        assert_eq!(a1().fastest(None).map(|mode| mode.id), Some(3));
+        assert_eq!(
+            ScanModes::of_old(500, 250).fastest(Some(115_200)).and_then(|mode| mode.kind),
+            Some(Kind::Express)
+        );
+        assert_eq!(
+            ScanModes::of_old(500, 0).fastest(Some(115_200)).and_then(|mode| mode.kind),
+            Some(Kind::Standard)
+        );
+    }
+
+    #[test]
+    fn finds_mode_by_name_or_kind() {
+        assert_eq!(a1().wanted(Mode::Boost, None).map(|mode| mode.id), Some(2));
+        assert_eq!(a1().wanted(Mode::DenseBoost, None).map(|mode| mode.id), None);
+        let mut nameless = a1();
+        (0..5).for_each(|n| nameless.set(n, |mode| mode.named = None));
+        assert_eq!(nameless.wanted(Mode::Express, None).map(|mode| mode.id), Some(1));
+        assert_eq!(nameless.wanted(Mode::Boost, None).map(|mode| mode.id), None);
+    }
+}
