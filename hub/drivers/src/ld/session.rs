@@ -15,7 +15,7 @@ use crate::ld::sequence::{Place, Sequence};
 use crate::line::family::{self, Features, table};
 use crate::line::{
     self, Account, Closed, Control, Event, Flow, Output, Pace, RawScan, Reads, Received, SensorClock, State,
-    StreamCounters, Tally, TurnCounts, Turns, Values, Watchdog, revolution_head,
+    StreamCounters, Tally, TurnCounts, Turns, Watchdog,
 };
 
 /// Settings of a session.
@@ -432,19 +432,9 @@ impl Session {
     fn dated(&self, closed: Closed) -> RawScan<'_> {
         let packet = self.current.map_or(usize::MAX, |current| current.packet);
         let stamp = |at: Nanos| self.clock_of(packet).time(at).unwrap_or(self.now);
-        let (first, last) = self.reads.turn_dates(stamp(closed.first), stamp(closed.last));
-        let (beams, per_second) =
-            (self.beams.unwrap_or_default(), self.points_per_second().unwrap_or_default());
-        RawScan {
-            number: closed.number,
-            first,
-            last,
-            period: closed.period,
-            reasons: closed.reasons,
-            bytes: 0,
-            head: revolution_head(Family::Ld, beams, closed.period, per_second, closed.incomplete),
-            values: Values::Points { points: self.turns.points(&closed), per_second },
-        }
+        let stamps = self.reads.turn_dates(stamp(closed.first), stamp(closed.last));
+        let resolution = (self.beams.unwrap_or_default(), self.points_per_second().unwrap_or_default());
+        RawScan::revolution(Family::Ld, &closed, stamps, resolution, self.turns.points(&closed))
     }
 }
 

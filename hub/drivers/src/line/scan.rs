@@ -3,8 +3,8 @@
 
 use std::f64::consts::TAU;
 
-use crate::line;
 use crate::line::grid::{Grid, Point};
+use crate::line::{self, Closed};
 use schema::{Code, Family, Nanos, Scan, ScanArrays, ScanHead};
 
 /// A scan as it was received.
@@ -48,6 +48,21 @@ pub enum Values<'a> {
 }
 
 impl<'a> RawScan<'a> {
+    /// Returns the scan of the revolution `closed` with its `points`, on a grid of `beams`. `stamps` are those of beam 0 and of the
+    /// last point. `per_second` is the number of points per second; 0 if unknown.
+    pub fn revolution(
+        family: Family,
+        closed: &Closed,
+        (first, last): (Nanos, Nanos),
+        (beams, per_second): (usize, f32),
+        points: &'a [Point],
+    ) -> RawScan<'a> {
+        let &Closed { number, period, reasons, incomplete, .. } = closed;
+        let head = revolution_head(family, beams, period, per_second, incomplete);
+        let values = Values::Points { points, per_second };
+        RawScan { number, first, last, period, reasons, bytes: 0, head, values }
+    }
+
     /// Returns the number of beams.
     pub fn beams(&self) -> usize {
         self.head.count.into()

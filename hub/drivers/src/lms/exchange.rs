@@ -1,11 +1,9 @@
-//! One request after the other, and what comes back: what [`crate::lms::inquiry`] and a change of the configuration have in common. Knows
-//! pace, tries and bytes; refuses to know what is asked, and why.
+//! Sends one request after another, and returns the replies. [`crate::lms::inquiry`] and a change of the configuration use it.
 
 use crate::line::Output;
 use crate::lms::framer::{Advance, Framer, Tally, TelegramSpan};
-pub use crate::lms::outgoing::{MODE_TIMEOUT, Say};
+pub use crate::lms::outgoing::{MODE_TIMEOUT, MORE_TRIES, Say, TRIES};
 use crate::lms::outgoing::{NAK_PAUSE, Outgoing, SOON};
-pub use crate::lms::phase::{MORE_TRIES, TRIES};
 use crate::lms::reply::REFUSED;
 use crate::lms::telegram::{REPLY, Telegram};
 use crate::lms::variant::Baud;
@@ -17,19 +15,19 @@ pub struct Exchange<R> {
     framer: Framer,
     open: Option<Outgoing<R>>,
     change_baud: bool,
-    /// The rate that the port is to have.
+    /// Rate of the port.
     pub baud: Baud,
-    /// When it was last told something.
+    /// Time of the last call.
     pub now: Nanos,
     last_byte: Nanos,
-    /// The sensor's own address, once it has said it; 0 is for all.
+    /// Address of the scanner, once it is known; 0 is for all.
     pub address: u8,
-    /// Behind a server, whose first sign of a reply may be all of it.
+    /// Whether the port is a serial server on the network, whose first bytes of a reply may be all of it.
     pub behind_server: bool,
 }
 
 impl<R: Say> Exchange<R> {
-    /// On a port that is open at `baud`.
+    /// Creates it on a port that is open at `baud`.
     pub fn new(baud: Baud, now: Nanos) -> Self {
         Exchange {
             framer: Framer::default(),
@@ -59,20 +57,21 @@ impl<R: Say> Exchange<R> {
         }
     }
 
-    /// A read found nothing; returns whether the open request has waited long enough.
+    /// Handles a read that found nothing. Returns whether the wait for the reply has ended.
     pub fn handle_timeout(&mut self, now: Nanos) -> bool {
         self.now = now;
         self.framer.release(now.saturating_sub(self.last_byte));
         self.open.as_ref().is_some_and(|open| now >= open.give_up_at())
     }
 
-    /// As [`Protocol::restart_if_late`](crate::line::Protocol::restart_if_late). Behind a server, the gaps on the line are not known.
+    /// Handles that a byte is about to be written, like [`Protocol::restart_if_late`](crate::line::Protocol::restart_if_late). For a
+    /// serial server, the gaps on the line are not known.
     pub fn restart_if_late(&mut self, now: Nanos) -> bool {
         self.now = now;
         !self.behind_server && self.open.as_mut().is_some_and(|open| open.restart_if_late(now, self.baud))
     }
 
-    /// As [`Protocol::transmitted`](crate::line::Protocol::transmitted).
+    /// Handles that a byte was written, like [`Protocol::transmitted`](crate::line::Protocol::transmitted).
     pub fn transmitted(&mut self, now: Nanos) {
         self.now = now;
         if let Some(open) = &mut self.open {
@@ -83,18 +82,18 @@ impl<R: Say> Exchange<R> {
         }
     }
 
-    /// Changes the rate, if it is another one.
+    /// Changes the rate.
     pub fn set_baud(&mut self, baud: Baud) {
         self.change_baud |= self.baud != baud;
         self.baud = baud;
     }
 
-    /// Says `request` from `not_before` on, at most `tries` times.
+    /// Sends `request` from `not_before` on, at most `tries` times.
     pub fn ask(&mut self, request: R, not_before: Nanos, tries: u8) {
         self.open = Some(Outgoing::new(request, self.address, not_before, tries));
     }
 
-    /// Says the open request once more from `at` on; `false` if its tries are used up or there is none.
+    /// Sends the open request once more, from `at` on. Returns whether there is one, and it had a try left.
     pub fn again(&mut self, at: Nanos) -> bool {
         let more = self.open.as_mut().is_some_and(|open| open.again(at));
         if !more {
@@ -103,12 +102,12 @@ impl<R: Say> Exchange<R> {
         more
     }
 
-    /// A NAK came that is to be believed; returns whether there was a request, and whether it will be said again.
+    /// Handles a NAK that counts. Returns whether the request will be sent again. `None` if there was none.
     pub fn refused_checksum(&mut self) -> Option<bool> {
         self.open.as_ref().is_some_and(Outgoing::is_out).then(|| self.again(self.now + NAK_PAUSE))
     }
 
-    /// Takes the open request if `telegram` answers it, or refuses it.
+    /// Removes the open request if a telegram with this `command` is its reply, or a refusal.
     pub fn answered(&mut self, command: u8) -> Option<R> {
         let answers = |open: &mut Outgoing<R>| {
             open.is_out() && (command == REFUSED || command == open.request.command() | REPLY)
@@ -116,9 +115,9 @@ impl<R: Say> Exchange<R> {
         self.open.take_if(answers).map(|open| open.request)
     }
 
-    /// The next thing found in the bytes; an acknowledgement is taken note of.
+    /// Returns the next telegram or NAK in the received bytes, and handles acknowledgments.
     pub fn advance(&mut self) -> Option<Heard> {
-        // Another rate is about to be set: what came at the old one is not looked at.
+        // Bytes that arrived before a change of the rate are not checked.
         while !self.change_baud {
             match self.framer.advance()? {
                 Advance::Telegram(span) => return Some(Heard::Telegram(span)),
@@ -133,12 +132,12 @@ impl<R: Say> Exchange<R> {
         None
     }
 
-    /// The telegram that was found last.
+    /// Returns the telegram that was found last.
     pub fn view(&self, span: TelegramSpan) -> Telegram<'_> {
         self.framer.view(span).telegram
     }
 
-    /// What it wants, with a deadline of its user's own.
+    /// Returns the next action. `own` is an additional deadline of the caller.
     pub fn output(&mut self, own: Nanos) -> Output<'_> {
         if core::mem::take(&mut self.change_baud) {
             self.framer.clear();
@@ -161,16 +160,16 @@ impl<R: Say> Exchange<R> {
         Output::Wait { until }
     }
 
-    /// What became of the bytes, and how many are open.
+    /// Returns the counters of bytes, and the number of bytes that are not assigned yet.
     pub fn tally(&self) -> (&Tally, usize) {
         (self.framer.tally(), self.framer.buffered())
     }
 }
 
-/// What came.
+/// A received telegram or NAK.
 #[derive(Clone, Copy, Debug)]
 pub enum Heard {
-    /// A telegram, to be seen by [`Exchange::view`].
+    /// A telegram. [`Exchange::view`] returns it.
     Telegram(TelegramSpan),
     /// A NAK.
     Nak,
@@ -183,7 +182,7 @@ mod tests {
     use schema::{MILLIS, line_time};
 
     #[test]
-    fn a_server_that_packs_the_longest_reply_is_waited_for() {
+    fn waits_for_a_server_that_packs_the_longest_reply() {
         let until = |behind_server: bool| {
             let mut exchange = Exchange::new(Baud::B9600, 0);
             exchange.behind_server = behind_server;

@@ -1,37 +1,39 @@
-//! Who is there? Finds the rate at which a sensor talks and asks it what it is, without changing anything in it: no
-//! mode, no rate, no setting. A sensor that streams goes on streaming; each question costs it a scan.
+//! Finds the rate of a scanner, and requests what it is, without changing its mode, its rate or a setting. A scanner that streams
+//! continues; each reply costs a scan.
 //!
-//! It listens first, because a stream at the port's rate tells itself. Then it asks for the status at each rate, and
-//! once more round: a sensor may overlook a request. A rate at which telegrams were heard is not left so easily.
-
-mod report;
+//! The inquiry listens first, because a stream at the port's rate needs no request. Then it requests the status at each rate, in
+//! two rounds, because a scanner may overlook a request. A rate at which telegrams arrived is tried more often.
 
 use crate::line::{Output, Protocol};
 use crate::lms::command::Request;
+use crate::lms::condition::Condition;
+use crate::lms::configuration::Configuration;
+use crate::lms::dialogue::LISTEN;
+use crate::lms::errors::Errors;
 use crate::lms::exchange::{Exchange, Heard};
 use crate::lms::family::Family;
 use crate::lms::framer::{Tally, TelegramSpan};
 use crate::lms::header::is_data;
-use crate::lms::phase::{LISTEN, SETTLE, TRIES};
+use crate::lms::outgoing::TRIES;
+use crate::lms::rate::SETTLE;
 use crate::lms::reply::Reply;
+use crate::lms::status_report::{DIRTY, StatusReport};
 use crate::lms::telegram::{Encoded, MAX_TELEGRAM, REPLY};
 use crate::lms::variant::Baud;
-pub use report::Report;
-use report::{QUESTIONS, place_of};
 use schema::{Nanos, line_time};
 
-/// The questions, and how far it is with them.
+/// Progress of an inquiry.
 #[derive(Clone, Debug)]
 pub struct Inquiry {
     exchange: Exchange<Request>,
     phase: Phase,
-    /// The rates to try, in their order.
+    /// The rates in the order of the search.
     rates: [Baud; Baud::ALL.len()],
-    /// How many of them are tried.
+    /// Number of rates that are tried.
     count: usize,
-    /// Telegrams heard unasked at each of them.
-    heard: [u32; Baud::ALL.len()],
-    /// How often more it asks at a rate at which it heard telegrams.
+    /// Number of telegrams that arrived without a request at each of them.
+    unasked: [u32; Baud::ALL.len()],
+    /// Number of further requests at a rate at which telegrams arrived.
     patience: u8,
     report: Report,
 }
@@ -47,8 +49,8 @@ enum Phase {
     Asking {
         question: usize,
     },
-    /// Bytes came and nobody answered: whether there is a stream that can be read.
-    Overhearing {
+    /// Bytes arrived, but no reply. The inquiry checks whether they are a stream.
+    ListeningAgain {
         attempt: usize,
         give_up_at: Nanos,
     },
@@ -56,7 +58,7 @@ enum Phase {
 }
 
 impl Inquiry {
-    /// On a port that is open at `first`: all rates, that one first.
+    /// Creates an inquiry on a port that is open at `first`. It tries all rates, that one first.
     pub fn new(first: Baud, now: Nanos) -> Self {
         let mut rates = Baud::ALL;
         if let Some(at) = rates.iter().position(|&baud| baud == first) {
@@ -65,7 +67,7 @@ impl Inquiry {
         Inquiry::with(rates, rates.len(), now)
     }
 
-    /// On the line of a serial server, whose rate cannot be changed from here.
+    /// Creates an inquiry on the line of a serial server, whose rate is fixed.
     pub fn at(baud: Baud, now: Nanos) -> Self {
         let mut inquiry = Inquiry::with([baud; Baud::ALL.len()], 1, now);
         inquiry.exchange.behind_server = true;
@@ -78,23 +80,23 @@ impl Inquiry {
             phase: Phase::Listening { give_up_at: now + LISTEN },
             rates,
             count,
-            heard: [0; Baud::ALL.len()],
+            unasked: [0; Baud::ALL.len()],
             patience: PATIENCE,
             report: Report::default(),
         }
     }
 
-    /// What is known; all there is to know when it [is done](Protocol::is_done).
+    /// Returns the report, which is complete when the inquiry [is done](Protocol::is_done).
     pub fn report(&self) -> &Report {
         &self.report
     }
 
-    /// The rate at which it looks.
+    /// Returns the rate that the inquiry tries now.
     pub fn baud(&self) -> Baud {
         self.exchange.baud
     }
 
-    /// What became of the bytes, and how many are not yet decided.
+    /// Returns the counters of bytes, and the number of bytes that are not assigned yet.
     pub fn tally(&self) -> (&Tally, usize) {
         self.exchange.tally()
     }
@@ -104,7 +106,7 @@ impl Inquiry {
         let (command, address, status) = (telegram.command(), telegram.address() & !REPLY, telegram.status());
         let is_status = matches!(Reply::decode(telegram), Some(Reply::Status(_)));
         let reply = Encoded::of(telegram);
-        // The checksum is weak, and noise of another rate may pass it: there only a whole status proves the rate.
+        // The checksum is weak, and bytes of another rate may pass it. There, only a complete status proves the rate.
         let may_answer = is_status || matches!(self.phase, Phase::Asking { .. });
         let Some(request) = may_answer.then(|| self.exchange.answered(command)).flatten() else {
             return self.on_unasked(command);
@@ -120,16 +122,16 @@ impl Inquiry {
     fn on_unasked(&mut self, command: u8) {
         self.report.streams |= is_data(command);
         if let Some(at) = self.rates.iter().position(|&baud| baud == self.exchange.baud) {
-            self.heard[at] += 1;
+            self.unasked[at] += 1;
         }
         match self.phase {
             Phase::Listening { .. } => self.seek(0, self.exchange.now),
-            Phase::Overhearing { .. } => self.give_up(),
+            Phase::ListeningAgain { .. } => self.give_up(),
             Phase::Seeking { .. } | Phase::Asking { .. } | Phase::Done => {}
         }
     }
 
-    /// Asks what comes after `request`.
+    /// Sends the request after `request`.
     fn ask_after(&mut self, request: Request) {
         let question = place_of(request).map_or(QUESTIONS.len(), |at| at + 1);
         match QUESTIONS.get(question) {
@@ -142,42 +144,42 @@ impl Inquiry {
         }
     }
 
-    /// What is of no known type would refuse them itself.
+    /// Returns whether the scanner may have counters. A scanner of an unknown type refuses the request itself.
     fn has_counters(&self) -> bool {
         let family = self.report.kind().and_then(Family::of_type);
         family.is_none_or(|family| family.refuses(Request::Counters).is_none())
     }
 
-    /// The status at the next rate.
+    /// Requests the status at the rate of `attempt`.
     fn seek(&mut self, attempt: usize, not_before: Nanos) {
         if attempt >= self.count * ROUNDS {
-            return self.overhear(0);
+            return self.listen_again(0);
         }
         self.phase = Phase::Seeking { attempt };
         self.exchange.set_baud(self.rates[attempt % self.count]);
-        // The second time round it is asked twice.
+        // In the second round, the request is sent twice.
         let tries = 1 + (attempt / self.count) as u8;
         self.exchange.ask(Request::Status, not_before, tries);
     }
 
-    /// Waits for any telegram at one rate after the other, each as long as two of the longest take: unless the line is
-    /// silent, or something was heard before.
-    fn overhear(&mut self, attempt: usize) {
+    /// Waits for any telegram at one rate after the other, each for the time of the two longest ones. Not if the line is silent, or
+    /// telegrams have arrived before.
+    fn listen_again(&mut self, attempt: usize) {
         let is_silent = self.exchange.tally().0.read == 0;
-        if is_silent || attempt >= self.count || self.heard.iter().any(|&heard| heard > 0) {
+        if is_silent || attempt >= self.count || self.unasked.iter().any(|&count| count > 0) {
             return self.give_up();
         }
         let baud = self.rates[attempt];
         self.exchange.set_baud(baud);
         let give_up_at = self.exchange.now + LISTEN + 2 * line_time(MAX_TELEGRAM, baud.rate());
-        self.phase = Phase::Overhearing { attempt, give_up_at };
+        self.phase = Phase::ListeningAgain { attempt, give_up_at };
     }
 
-    /// Nobody answers; what streams all the same tells its rate.
+    /// Ends without a reply. A stream reveals its rate.
     fn give_up(&mut self) {
         self.phase = Phase::Done;
-        let loudest = self.heard.iter().zip(self.rates).max_by_key(|(heard, _)| **heard);
-        self.report.baud = loudest.filter(|(heard, _)| **heard > 0).map(|(_, baud)| baud);
+        let loudest = self.unasked.iter().zip(self.rates).max_by_key(|(count, _)| **count);
+        self.report.baud = loudest.filter(|(count, _)| **count > 0).map(|(_, baud)| baud);
     }
 
     fn on_silence(&mut self) {
@@ -186,13 +188,13 @@ impl Inquiry {
             return;
         }
         match self.phase {
-            Phase::Seeking { attempt } if self.heard[attempt % self.count] > 0 && self.patience > 0 => {
+            Phase::Seeking { attempt } if self.unasked[attempt % self.count] > 0 && self.patience > 0 => {
                 self.patience -= 1;
                 self.exchange.ask(Request::Status, now, 1);
             }
             Phase::Seeking { attempt } => self.seek(attempt + 1, now + SETTLE),
             Phase::Asking { question } => self.ask_after(QUESTIONS[question]),
-            Phase::Listening { .. } | Phase::Overhearing { .. } | Phase::Done => {}
+            Phase::Listening { .. } | Phase::ListeningAgain { .. } | Phase::Done => {}
         }
     }
 }
@@ -211,7 +213,9 @@ impl Protocol for Inquiry {
         let unanswered = self.exchange.handle_timeout(now);
         match self.phase {
             Phase::Listening { give_up_at } if now >= give_up_at => self.seek(0, now),
-            Phase::Overhearing { attempt, give_up_at } if now >= give_up_at => self.overhear(attempt + 1),
+            Phase::ListeningAgain { attempt, give_up_at } if now >= give_up_at => {
+                self.listen_again(attempt + 1)
+            }
             _ if unanswered => self.on_silence(),
             _ => {}
         }
@@ -233,7 +237,7 @@ impl Protocol for Inquiry {
         while let Some(heard) = self.exchange.advance() {
             match heard {
                 Heard::Telegram(span) => self.on_telegram(span),
-                // While the rate is sought, noise has such bytes too.
+                // During the search for the rate, noise contains such bytes too.
                 Heard::Nak if matches!(self.phase, Phase::Asking { .. }) => {
                     if self.exchange.refused_checksum() == Some(false) {
                         self.on_silence();
@@ -243,7 +247,7 @@ impl Protocol for Inquiry {
             }
         }
         match self.phase {
-            Phase::Listening { give_up_at } | Phase::Overhearing { give_up_at, .. } => {
+            Phase::Listening { give_up_at } | Phase::ListeningAgain { give_up_at, .. } => {
                 self.exchange.output(give_up_at)
             }
             Phase::Seeking { .. } | Phase::Asking { .. } => self.exchange.output(Nanos::MAX),
@@ -252,7 +256,91 @@ impl Protocol for Inquiry {
     }
 }
 
-/// How often all rates are tried.
+/// Replies of a scanner.
+#[derive(Clone, Debug, Default)]
+pub struct Report {
+    /// Rate of the scanner. `None` if no telegram arrived at any.
+    pub baud: Option<Baud>,
+    /// Address of the scanner, 0 to 127.
+    pub address: Option<u8>,
+    /// Whether telegrams arrived without a request.
+    pub streams: bool,
+    /// The last status byte.
+    pub status_byte: Option<u8>,
+    /// Number of received bytes.
+    pub bytes: u64,
+    replies: [Option<Encoded>; QUESTIONS.len()],
+}
+
+impl Report {
+    /// Returns whether the scanner has replied. One that streams and does not reply does not receive requests.
+    pub fn answers(&self) -> bool {
+        self.replies.iter().any(Option::is_some)
+    }
+
+    /// Returns the reply to `request`, which may be a refusal.
+    pub fn reply(&self, request: Request) -> Option<Reply<'_>> {
+        Reply::decode(self.replies[place_of(request)?].as_ref()?.telegram())
+    }
+
+    /// Returns the status.
+    pub fn status(&self) -> Option<StatusReport<'_>> {
+        match self.reply(Request::Status)? {
+            Reply::Status(status) => Some(status),
+            _ => None,
+        }
+    }
+
+    /// Returns type, number and firmware, such as `LMS200;S18063;V02.19`, usually in ASCII.
+    pub fn kind(&self) -> Option<&[u8]> {
+        match self.reply(Request::Type)? {
+            Reply::Type(kind) => Some(kind),
+            _ => None,
+        }
+    }
+
+    /// Returns the first part of the configuration.
+    pub fn configuration(&self) -> Option<Configuration<'_>> {
+        match self.reply(Request::Configuration)? {
+            Reply::Configuration(configuration) => Some(configuration),
+            _ => None,
+        }
+    }
+
+    /// Returns present and past errors.
+    pub fn errors(&self) -> Option<Errors<'_>> {
+        match self.reply(Request::Errors)? {
+            Reply::Errors(errors) => Some(errors),
+            _ => None,
+        }
+    }
+
+    /// Returns whether the window is dirty, by the status byte or by the measured value in the status. `None` if neither was
+    /// reported.
+    pub fn is_polluted(&self) -> Option<bool> {
+        let reported = self.status_byte.map(|byte| Condition(byte).is_polluted());
+        let measured =
+            self.status().and_then(|status| status.window_percent()).map(|percent| percent < DIRTY);
+        reported.max(measured)
+    }
+
+    /// Stores the `reply` to one of the questions.
+    fn keep(&mut self, request: Request, reply: Encoded) {
+        if let Some(place) = place_of(request).and_then(|at| self.replies.get_mut(at)) {
+            *place = Some(reply);
+        }
+    }
+}
+
+/// Returns the index of `request` among the questions.
+fn place_of(request: Request) -> Option<usize> {
+    QUESTIONS.iter().position(|&question| question == request)
+}
+
+/// The requests in their order. The first one finds the rate.
+const QUESTIONS: [Request; 5] =
+    [Request::Status, Request::Type, Request::Configuration, Request::Errors, Request::Counters];
+/// Number of rounds through all rates.
 const ROUNDS: usize = 2;
-/// More tries at a rate at which telegrams were heard.
+/// Number of further requests at a rate at which telegrams arrived.
 const PATIENCE: u8 = 5;

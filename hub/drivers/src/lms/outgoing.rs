@@ -1,21 +1,21 @@
-//! One request on its way: paced byte by byte, acknowledged or not, tried again or given up. The sensor wants at
-//! least 55 us and at most 6 ms between bytes and may overlook a request while its mirror turns (Telegram listing
-//! 4.3), so a request is never just written.
+//! A request that is being sent, or whose reply is expected: its pace, its timeouts and its tries. The scanner requires at
+//! least 55 us and at most 6 ms between bytes, and may overlook a request while its mirror rotates (Telegram listing 4.3). So
+//! a request is sent byte by byte.
 
 use crate::lms::command::Request;
 use crate::lms::telegram::{Encoded, REPLY};
 use crate::lms::variant::Baud;
 use schema::{MICROS, MILLIS, Nanos, line_time};
 
-/// What can be said: a telegram that has a reply, which takes its time.
+/// A telegram that has a reply.
 pub trait Say {
-    /// The telegram that says it to the sensor at `address`.
+    /// Encodes it for the scanner at `address`.
     fn encode(&self, address: u8) -> Encoded;
-    /// Its command byte.
+    /// Returns its command byte.
     fn command(&self) -> u8;
-    /// How long the sensor may work between acknowledgement and reply.
+    /// Returns the maximum time from the acknowledgment to the reply.
     fn work(&self) -> Nanos;
-    /// How long the first sign of an answer may take.
+    /// Returns the maximum time to the acknowledgment, or to the first byte of a reply without one.
     fn sign(&self) -> Nanos {
         ACKNOWLEDGE_TIMEOUT
     }
@@ -51,23 +51,23 @@ pub(crate) struct Outgoing<R = Request> {
     not_before: Nanos,
     /// Earliest time at which the byte before the next one can have left, see [`Outgoing::restart_if_late`].
     left_at: Nanos,
-    /// How often the request was started over because a byte was late.
+    /// Number of times that the request was started over because a byte was late.
     restarts: u8,
     tries: u8,
     tries_left: u8,
-    /// Added to every wait for the acknowledgement.
+    /// Additional time for each wait for the acknowledgment.
     patience: Nanos,
     acknowledged: bool,
-    /// Whether a byte came since it was out.
+    /// Whether a byte has arrived since the last one was sent.
     is_heard: bool,
-    /// When its last byte left.
+    /// Time at which the last byte was sent.
     out_at: Option<Nanos>,
-    /// When its reply is given up; counts from the last byte.
+    /// End of the wait for the reply, which begins with the last byte.
     give_up_at: Nanos,
 }
 
 impl<R: Say> Outgoing<R> {
-    /// `request` to the sensor at `address`, from `not_before` on, at most `tries` times.
+    /// Creates `request` for the scanner at `address`, to be sent from `not_before` on, at most `tries` times.
     pub(crate) fn new(request: R, address: u8, not_before: Nanos, tries: u8) -> Self {
         let encoded = request.encode(address);
         Outgoing {
@@ -87,43 +87,43 @@ impl<R: Say> Outgoing<R> {
         }
     }
 
-    /// The sensor has so much more time to begin its answer.
+    /// Extends the wait for the acknowledgment by `patience`.
     pub(crate) fn be_patient(&mut self, patience: Nanos) {
         self.patience = patience;
     }
 
-    /// Returns the next byte. Empty if all of them left.
+    /// Returns the next byte. Empty if all of them were sent.
     pub(crate) fn next_byte(&self) -> &[u8] {
         self.encoded.bytes().get(self.sent..=self.sent).unwrap_or_default()
     }
 
-    /// Returns when the next byte may leave at the earliest.
+    /// Returns the earliest time of the next byte.
     pub(crate) fn next_at(&self) -> Option<Nanos> {
         (!self.is_out()).then_some(self.not_before)
     }
 
-    /// The byte left at `now`.
+    /// Handles that the next byte was sent at `now`.
     pub(crate) fn transmitted(&mut self, now: Nanos, baud: Baud) {
         self.sent += 1;
         self.not_before = now + line_time(1, baud.rate()) + GAP;
         if self.sent == self.encoded.bytes().len() {
             self.out_at = Some(now);
-            // A sensor that is slower than it should be needs a longer wait, not more tries: each breaks off the last.
+            // A slow scanner needs a longer wait, not more tries, because each try interrupts the last one.
             let tried = Nanos::from(self.tries - self.tries_left - 1);
             self.give_up_at = now + self.request.sign() + tried * ACKNOWLEDGE_TIMEOUT + self.patience;
         }
     }
 
-    /// A byte came. Behind the head of a scan that the request broke off, the acknowledgement is not seen: the reply is,
-    /// which may have begun now.
+    /// Handles that bytes arrived. After the beginning of a scan that the request interrupted, the acknowledgment is not detected,
+    /// only the reply, which may have begun now.
     pub(crate) fn hear(&mut self, baud: Baud) {
         if self.is_out() && !core::mem::replace(&mut self.is_heard, true) {
             self.give_up_at += line_time(1 + LONGEST_REPLY, baud.rate());
         }
     }
 
-    /// The sensor acknowledged: its reply may take longer. It does so once; a stream at another rate looks like
-    /// acknowledgements without end, which must not put the deadline off again and again.
+    /// Handles an acknowledgment, after which the reply may take longer. Only the first one counts: a stream at another rate looks
+    /// like endless acknowledgments, which must not extend the deadline again and again.
     pub(crate) fn acknowledged(&mut self, now: Nanos, baud: Baud) {
         if core::mem::replace(&mut self.acknowledged, true) {
             return;
@@ -131,7 +131,7 @@ impl<R: Say> Outgoing<R> {
         self.give_up_at = now + self.request.work() + line_time(LONGEST_REPLY, baud.rate());
     }
 
-    /// Begins again not before `at`; `false` if all tries are used up.
+    /// Begins again, not before `at`. Returns whether there was a try left.
     pub(crate) fn again(&mut self, at: Nanos) -> bool {
         self.sent = 0;
         self.not_before = at;
@@ -142,12 +142,12 @@ impl<R: Say> Outgoing<R> {
         self.tries_left.checked_sub(1).map(|left| self.tries_left = left).is_some()
     }
 
-    /// When to call [`Outgoing::again`], if no reply came; never while it still leaves.
+    /// Returns when to call [`Outgoing::again`] if no reply has arrived. Never while the request is being sent.
     pub(crate) fn give_up_at(&self) -> Nanos {
         self.give_up_at
     }
 
-    /// Whether the sensor heard it.
+    /// Returns whether the scanner has acknowledged it.
     pub(crate) fn is_acknowledged(&self) -> bool {
         self.acknowledged
     }
@@ -166,51 +166,54 @@ impl<R: Say> Outgoing<R> {
         is_late
     }
 
-    /// When its last byte left; `None` while there are more.
+    /// Returns when the last byte was sent. `None` while there are more.
     pub(crate) fn out_at(&self) -> Option<Nanos> {
         self.out_at
     }
 
-    /// Command byte of its reply.
+    /// Returns the command byte of its reply.
     pub(crate) fn reply(&self) -> u8 {
         self.request.command() | REPLY
     }
 
-    /// Whether it began to leave and has not ended.
+    /// Returns whether some of its bytes were sent, but not all.
     pub(crate) fn is_partly_out(&self) -> bool {
         self.sent > 0 && !self.is_out()
     }
 
-    /// Whether all of it left.
+    /// Returns whether all of it was sent.
     pub(crate) fn is_out(&self) -> bool {
         self.sent >= self.encoded.bytes().len()
     }
 }
 
-/// A request that stops in the middle is dropped by the sensor after 6 ms (Telegram listing 4.3).
+/// Number of tries. A scanner may overlook a request while its mirror rotates. All drivers give it three tries.
+pub const TRIES: u8 = 3;
+/// Number of tries of requests without which there is no stream.
+pub const MORE_TRIES: u8 = 5;
+/// The scanner drops a partial request after 6 ms (Telegram listing 4.3).
 pub(crate) const FORGOTTEN: Nanos = 10 * MILLIS;
-/// Between the end of a byte and the next: more than 55 us, far less than 6 ms (Telegram listing 4.3).
+/// Time from the end of a byte to the next one: more than 55 us, far less than 6 ms (Telegram listing 4.3).
 const GAP: Nanos = 120 * MICROS;
-/// So often a request is started over because a byte was late. A machine that is late more often cannot send it.
+/// Maximum number of times that a request starts over because a byte was late. A machine that is late more often cannot send it.
 const MAX_RESTARTS: u8 = 50;
 /// Longest time between the end of a byte and the next one: 6 ms (Telegram listing 4.3), less the time of the write.
 const MOST_GAP: Nanos = 5 * MILLIS;
-/// A byte that may leave within so long is asked for at once; a later one is waited for as for anything else.
+/// A byte that may be sent within this time is requested at once. A later one has a deadline like everything else.
 pub(crate) const SOON: Nanos = 5 * MILLIS;
-/// ACK or NAK comes within 60 ms (Telegram listing 4.3), and a reply was captured to begin within 100 ms; the rest is
-/// for adapters.
+/// ACK or NAK arrives within 60 ms (Telegram listing 4.3), and captured replies begin within 100 ms. The rest is for adapters.
 const ACKNOWLEDGE_TIMEOUT: Nanos = 150 * MILLIS;
-/// The reply to a stop was captured to take 94 ms, and its acknowledgement is hidden where it is needed. Waiting is
-/// cheap: a sensor that overlooked the stop continues to stream.
+/// A captured reply to a stop takes 94 ms, and its acknowledgment is hidden in the stream. Waiting is cheap: a scanner that
+/// overlooked the stop continues to stream.
 const STOP_TIMEOUT: Nanos = 300 * MILLIS;
-/// Type, status and configuration were captured to take up to 158 ms.
+/// Captured replies with type, status and configuration take up to 158 ms.
 pub(crate) const REPLY_TIMEOUT: Nanos = 500 * MILLIS;
-/// A change of mode takes up to 3 s (Telegram listing 7.3), but mostly a tenth of one. Who asks what became of it before
-/// it is over finds the mode that was, and undoes the change.
+/// A change of mode takes up to 3 s (Telegram listing 7.3), but mostly 0.1 s. A request for the mode before its end returns the
+/// previous mode, and undoes the change.
 pub const MODE_TIMEOUT: Nanos = 3_200 * MILLIS;
-/// Bytes of the status reply.
+/// Length of the status reply, in bytes.
 const LONGEST_REPLY: usize = 160;
-/// After a NAK the sensor wants 30 ms of peace (Telegram listing 4.3).
+/// The scanner requires a pause of 30 ms after a NAK (Telegram listing 4.3).
 pub(crate) const NAK_PAUSE: Nanos = 30 * MILLIS;
 
 #[cfg(test)]
@@ -218,7 +221,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn bytes_leave_with_their_gap() {
+    fn bytes_are_sent_with_gaps() {
         let mut outgoing = Outgoing::new(Request::Status, 0, 5, 2);
         let mut now = 5;
         for &expected in Request::Status.encode(0).bytes() {
@@ -230,7 +233,7 @@ mod tests {
         }
         assert!(outgoing.is_out());
         assert_eq!(outgoing.give_up_at(), now + ACKNOWLEDGE_TIMEOUT);
-        // What came may be the begin of the longest reply; it begins once.
+        // The bytes may be the start of the longest reply, which starts once.
         for _ in 0..2 {
             outgoing.hear(Baud::B500000);
             assert_eq!(outgoing.give_up_at(), now + ACKNOWLEDGE_TIMEOUT + line_time(161, 500_000));

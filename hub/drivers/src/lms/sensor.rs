@@ -1,48 +1,47 @@
-//! What a session knows of its sensor, in plain values: learned from its replies, and forgotten where it may be another
-//! sensor that speaks next.
+//! State of a scanner as far as it has reported it, for messages and for the next session. It is discarded when the next
+//! telegram may come from another scanner.
 
+use crate::line;
 use crate::lms::command::Request;
 use crate::lms::condition::{Condition, Severity};
 use crate::lms::family::Family;
 use crate::lms::header::StreamHeader;
-use crate::lms::identity::Identity;
-use crate::lms::notice::Notice;
 use crate::lms::reply::{POWER_ON, Reply};
 use crate::lms::status_report::{DIRTY, StatusReport};
 use crate::lms::telegram::Telegram;
 use crate::lms::variant::{Baud, Mode, Unit, Variant};
 use core::fmt;
 
-/// Why a session is not where it should be.
+/// Reason why a session does not stream as it should.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Trouble {
-    /// No rate got an answer.
+    /// No reply at any rate.
     NoAnswer {
-        /// The only rate at which was asked; `None`: at all of them.
+        /// The only rate that the session tried. `None`: it tried all.
         baud: Option<Baud>,
-        /// For how long already, in steps that grow.
+        /// Seconds without a reply, rounded down to steps that grow.
         seconds: u32,
     },
-    /// A request was not answered in all its tries.
+    /// A request had no reply in all its tries.
     Unanswered(Request),
-    /// The sensor said no.
+    /// The scanner refused a request.
     Refused(Request),
-    /// The sensor keeps another angle or resolution than asked for, and streams that.
+    /// The scanner keeps another angle or resolution than the requested one, and streams that.
     VariantRefused,
-    /// One second without measured data.
+    /// No measured data arrived for one second.
     Silence,
     /// The line cannot carry 500,000 baud: it was silent after two switches to that rate.
     NeedsRs422 {
         /// Rate that the session uses instead; `None` if it has to keep to 500,000 baud.
         instead: Option<Baud>,
     },
-    /// A pause is wanted, but bytes come, and no answer says that they will end.
+    /// The session is paused, but bytes arrive, and the scanner has not confirmed that it stops.
     NotStopped,
-    /// The sensor calls itself a version S14, which scans 90 degrees with as many values as others 180.
+    /// The scanner reports that it is a version S14, which scans 90 degrees with as many values as others 180.
     AnglesUnknown,
-    /// The sensor is set to a measuring mode whose values are not ranges, or whose layout is not documented.
+    /// The scanner is set to a measuring mode whose values are not ranges, or whose layout is not documented.
     NoRanges(Mode),
-    /// The sensor does not report its measuring mode, so it is not known how many of the 16 bits are the range.
+    /// The scanner does not report its measuring mode, so it is not known how many of the 16 bits are the range.
     ModeUnknown,
 }
 
@@ -84,68 +83,68 @@ impl fmt::Display for Trouble {
     }
 }
 
-/// What the sensor said of itself.
+/// State of a scanner as far as it has reported it.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Sensor {
-    /// The address byte of its telegrams: its own address + 80h.
+    /// Address byte of its telegrams: its own address + 80h.
     pub address: Option<u8>,
-    /// How its values are split.
+    /// Measuring mode, which defines how values are split.
     pub mode: Option<Mode>,
     /// Unit of its ranges.
     pub unit: Option<Unit>,
     /// Angle and resolution.
     pub variant: Option<Variant>,
-    /// Whether it does something unasked: sends scans, or is in a mode in which it does not measure.
+    /// Whether it sends scans without a request, or is in a mode in which it does not measure.
     pub streams: bool,
-    /// The status byte of its telegrams. A worse one counts at once, a better one after some hundred telegrams: it may
+    /// Status byte of its telegrams. A worse one counts at once, a better one after some hundred telegrams, because it may
     /// change with each scan.
     pub condition: Option<Condition>,
-    /// Whether it calls itself defective.
+    /// Whether it reports that it is defective.
     pub defective: Option<bool>,
-    /// Whether its EEPROM holds a rate for power-on that is not the factory's 9600.
+    /// Whether its EEPROM contains a rate for power-on that is not the factory's 9,600 baud.
     pub permanent_baud: Option<bool>,
-    /// Laser power in percent of what it should be; real ones tell 156 to 161.
+    /// Laser power in percent of the nominal one. Real scanners report 156 to 161.
     pub laser_power_percent: Option<u16>,
-    /// What the dirtiest channel of the window lets through, in percent of when it was clean (a warning comes below 75, an
-    /// error below 30).
+    /// Transmission of the dirtiest channel of the window, in percent of a clean one. The scanner warns below 75, and reports an
+    /// error below 30.
     pub window_percent: Option<u16>,
     software: [u8; SOFTWARE_LEN],
     kind: [u8; KIND_LEN],
     kind_len: usize,
-    /// Telegrams in a row whose condition was better.
+    /// Number of telegrams in a row whose condition was better.
     calm: u16,
-    /// The line damages what it carries, so that one telegram alone proves nothing bad.
-    is_doubted: bool,
-    /// How often a worse condition was told on such a line, and telegrams since the first time.
+    /// Whether the line damages telegrams, so that a single one does not prove a worse condition.
+    is_line_damaged: bool,
+    /// Number of reports of a worse condition on such a line, and telegrams since the first one.
     sightings: u8,
     sighted_since: u16,
-    /// How often a fatal one was.
+    /// Number of reports of a fatal condition.
     fatal_sightings: u8,
-    /// The last status report complained, and whether the one before it did so likewise.
+    /// Complaint of the last status report, and whether the one before had the same.
     complaint: Option<Complaint>,
     is_confirmed: bool,
 }
 
-/// What a status report says of the sensor's health: that it is defective, that its window is dirty.
+/// Whether a status report says that the scanner is defective, and that its window is dirty.
 type Complaint = (bool, bool);
 
 impl Sensor {
-    /// Type, number and firmware as ASCII, such as `LMS200;S18063;V02.19`; empty if it was not asked yet.
+    /// Returns type, number and firmware as ASCII, such as `LMS200;S18063;V02.19`. Empty if not reported yet.
     pub fn kind(&self) -> &[u8] {
         &self.kind[..self.kind_len]
     }
 
-    /// Whether its scans have none of the angles of [`Variant`], although they look so.
+    /// Returns whether its scans have none of the angles of [`Variant`], although they look so.
     pub fn has_other_angles(&self) -> bool {
         Family::of_type(self.kind()) == Some(Family::Fast)
     }
 
-    /// How its values are split, if they are ranges at angles that are known: else there are no scans.
+    /// Returns the measuring mode if values are ranges at known angles. `None`: there are no scans.
     pub(crate) fn mode_of_scans(&self) -> Option<Mode> {
         self.mode.filter(|mode| mode.has_ranges() && !self.has_other_angles())
     }
 
-    /// Firmware as ASCII, such as `V02.19`; empty if it was not asked yet.
+    /// Returns the firmware as ASCII, such as `V02.19`. Empty if not reported yet.
     pub fn software(&self) -> &[u8] {
         self.software.trim_ascii()
     }
@@ -166,8 +165,8 @@ impl Sensor {
         .filter_map(|(is_so, notice)| is_so.then_some(notice))
     }
 
-    /// The next sensor at this port may be another one, or the same with another configuration: its identity and the
-    /// layout of its values are unknown again. What each scan repeats may stay.
+    /// Discards the identity and the layout of values: the next telegram may come from another scanner, or from the same one with
+    /// another configuration. State that each scan repeats may stay.
     pub(crate) fn forget(&mut self) {
         self.mode = None;
         self.kind_len = 0;
@@ -176,42 +175,42 @@ impl Sensor {
         self.is_confirmed = false;
     }
 
-    /// Whether the line that it speaks on damages telegrams now: some of them pass their weak checksum all the same.
-    pub(crate) fn doubt(&mut self, is_doubted: bool) {
-        self.is_doubted = is_doubted;
-        if !is_doubted {
+    /// Stores whether the line damages telegrams now. Some of them pass their weak checksum.
+    pub(crate) fn set_line_damaged(&mut self, is_line_damaged: bool) {
+        self.is_line_damaged = is_line_damaged;
+        if !is_line_damaged {
             (self.sightings, self.fatal_sightings) = (0, 0);
         }
     }
 
-    /// Whether its health has to be asked again: one report that complains may be a damaged one.
+    /// Returns whether the health must be requested again, because a single report with a complaint may be damaged.
     pub(crate) fn is_complaint_open(&self) -> bool {
         self.complaint.is_some() && !self.is_confirmed
     }
 
-    /// No second report is to be had: the one that there is counts.
-    pub(crate) fn believe(&mut self) {
+    /// Accepts the last report, because there will not be a second one.
+    pub(crate) fn accept_unconfirmed(&mut self) {
         self.is_confirmed = true;
     }
 
-    /// What a session that goes on with its stream, whose scans begin with `header`, would have to ask; nothing if that is not
-    /// known.
+    /// Returns the identity, for a session that continues with the stream whose scans begin with `header`. `None` if not all of
+    /// it is known.
     pub(crate) fn identity(&self, header: StreamHeader) -> Option<Identity> {
         let mode = self.mode.filter(|_| self.kind_len > 0)?;
         Some(Identity { header, mode, kind: self.kind })
     }
 
-    /// It streams as it did when this was known of it.
-    pub(crate) fn recall(&mut self, known: Identity) {
+    /// Restores an identity of a scanner that still streams as it did then.
+    pub(crate) fn restore_identity(&mut self, known: Identity) {
         self.mode = Some(known.mode);
         self.kind = known.kind;
         self.kind_len = known.kind.iter().position(|&byte| byte == 0).unwrap_or(KIND_LEN);
     }
 
-    /// Takes over what `telegram` tells, which is `reply`, if it can be read.
+    /// Stores what `telegram` reports, which decodes to `reply`.
     pub(crate) fn learn(&mut self, reply: Option<&Reply<'_>>, telegram: Telegram<'_>) {
         self.address = Some(telegram.address());
-        self.feel(telegram.status().map(Condition));
+        self.note_condition(telegram.status().map(Condition));
         if telegram.command() == POWER_ON {
             self.forget();
             self.streams = false;
@@ -256,9 +255,9 @@ impl Sensor {
         self.software = *report.bytes().first_chunk().unwrap_or(&[0; SOFTWARE_LEN]);
     }
 
-    /// A worse condition was told once more on a line that damages telegrams; whether that is often enough. A sensor that
-    /// calls itself fatal may do so now and then only: two of its scans tell, however far apart.
-    fn is_sighted(&mut self, is_fatal: bool) -> bool {
+    /// Counts a worse condition on a line that damages telegrams. Returns whether there were enough of them. A scanner may report a
+    /// fatal condition only now and then, so two scans are enough, however far apart.
+    fn is_confirmed_now(&mut self, is_fatal: bool) -> bool {
         if is_fatal {
             self.fatal_sightings += 1;
             return self.fatal_sightings == FATAL_SIGHTINGS;
@@ -270,10 +269,13 @@ impl Sensor {
         self.sightings == SIGHTINGS
     }
 
-    fn feel(&mut self, condition: Option<Condition>) {
+    fn note_condition(&mut self, condition: Option<Condition>) {
         self.sighted_since = self.sighted_since.saturating_add(1);
         let is_fatal = condition.and_then(Condition::severity) == Some(Severity::Fatal);
-        if self.is_doubted && badness(condition) > badness(self.condition) && !self.is_sighted(is_fatal) {
+        if self.is_line_damaged
+            && badness(condition) > badness(self.condition)
+            && !self.is_confirmed_now(is_fatal)
+        {
             return;
         }
         self.fatal_sightings = if is_fatal { 0 } else { self.fatal_sightings };
@@ -287,23 +289,95 @@ impl Sensor {
     }
 }
 
-/// An order of conditions by what is told of them.
+/// Identity of a scanner that streams, which its scans do not contain. With it, a session that continues with the same stream has
+/// the meaning of values before it sends a request.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) struct Identity {
+    /// Beginning of each of its scans.
+    pub(crate) header: StreamHeader,
+    mode: Mode,
+    /// Type, padded with 0.
+    kind: [u8; KIND_LEN],
+}
+
+impl Identity {
+    /// Encodes it: header, mode, type.
+    pub(crate) fn to_bytes(self) -> line::Identity {
+        let mut bytes = line::Identity::default();
+        let (header, rest) = bytes.split_at_mut(self.header.len());
+        header.copy_from_slice(&self.header);
+        rest[0] = self.mode.0;
+        rest[1..].copy_from_slice(&self.kind);
+        bytes
+    }
+
+    /// Decodes the result of [`to_bytes`](Self::to_bytes).
+    pub(crate) fn from_bytes(bytes: line::Identity) -> Identity {
+        let mut identity = Identity { header: Default::default(), mode: Mode(0), kind: [0; KIND_LEN] };
+        let (header, rest) = bytes.split_at(identity.header.len());
+        identity.header.copy_from_slice(header);
+        identity.mode = Mode(rest[0]);
+        identity.kind.copy_from_slice(&rest[1..]);
+        identity
+    }
+}
+
+const _: () = assert!(size_of::<StreamHeader>() + 1 + KIND_LEN == size_of::<line::Identity>());
+
+/// A fact that the owner of the scanner should know although scans arrive.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Notice {
+    /// The status report says that the scanner is defective.
+    Defective,
+    /// The status byte reports a fatal error.
+    Fatal,
+    /// The status byte reports an error.
+    Error,
+    /// The window is dirty.
+    Dirty,
+    /// After power-on, the scanner does not begin at 9,600 baud.
+    PermanentBaud,
+}
+
+impl Notice {
+    /// Returns whether scans may be wrong because of it.
+    pub fn is_fault(self) -> bool {
+        self != Notice::PermanentBaud
+    }
+
+    /// Returns the message.
+    pub(crate) fn text(self) -> &'static str {
+        match self {
+            Notice::Defective => {
+                "the sensor reports that it is defective; it streams, but its scans may be wrong"
+            }
+            Notice::Fatal => "the sensor reports a fatal error; it streams, but its scans may be wrong",
+            Notice::Error => "the sensor reports an error; it streams, but its scans may be wrong",
+            Notice::Dirty => "the sensor's window is dirty: clean it",
+            Notice::PermanentBaud => {
+                "the rate after power-on in the sensor's EEPROM is not the factory's; the hub works with it as it is"
+            }
+        }
+    }
+}
+
+/// Returns how bad a condition is, as far as notices report it.
 fn badness(condition: Option<Condition>) -> u8 {
     let severity = condition.and_then(Condition::severity).unwrap_or(Severity::Ok);
     let polluted = condition.is_some_and(Condition::is_polluted);
     if severity >= Severity::Error { 2 * severity.code() + u8::from(polluted) } else { u8::from(polluted) }
 }
 
-/// Better telegrams in a row before a bad one is forgotten: some seconds of scans.
+/// Number of better telegrams in a row before a bad one is discarded: some seconds of scans.
 const CALM: u16 = 200;
-/// Telegrams among so many that tell a worse condition before it is believed, on a line that damages some of them.
+/// Number of telegrams, among [`CALM`], that must report a worse condition on a line that damages some of them.
 const SIGHTINGS: u8 = 3;
-/// The same for a fatal one, among however many.
+/// Number of telegrams, among any number, that must report a fatal condition on such a line.
 const FATAL_SIGHTINGS: u8 = 2;
-/// Bytes of the firmware's name.
+/// Length of the firmware's name, in bytes.
 const SOFTWARE_LEN: usize = 7;
-/// A type reply has 20 or 21 characters.
-pub(crate) const KIND_LEN: usize = 24;
+/// Maximum length of a type. Replies have 20 or 21 characters.
+const KIND_LEN: usize = 24;
 /// Operating mode: values on request.
 const ON_REQUEST: u8 = 0x25;
 
@@ -315,34 +389,34 @@ mod tests {
     use crate::lms::telegram::{REPLY, Writer};
 
     #[test]
-    fn a_doubted_line_is_believed_what_a_sensor_repeats() {
+    fn repeated_conditions_count_on_a_damaged_line() {
         // Severity in the lowest bits: 0 ok, 4 fatal; the highest one is a dirty window.
         let (ok, fatal, dirty) = (Condition(0x10), Condition(0x14), Condition(0x90));
-        let tell = |sensor: &mut Sensor, condition: Condition, calm: u32| {
-            sensor.feel(Some(condition));
+        let report = |sensor: &mut Sensor, condition: Condition, calm: u32| {
+            sensor.note_condition(Some(condition));
             let notice = sensor.notices().next();
-            (0..calm).for_each(|_| sensor.feel(Some(ok)));
+            (0..calm).for_each(|_| sensor.note_condition(Some(ok)));
             notice
         };
         let mut sensor = Sensor::default();
-        tell(&mut sensor, ok, 1);
-        sensor.doubt(true);
-        assert_eq!(tell(&mut sensor, fatal, 5_000), None, "one telegram proves nothing");
-        assert_eq!(tell(&mut sensor, fatal, 5_000), Some(Notice::Fatal));
+        report(&mut sensor, ok, 1);
+        sensor.set_line_damaged(true);
+        assert_eq!(report(&mut sensor, fatal, 5_000), None, "one telegram proves nothing");
+        assert_eq!(report(&mut sensor, fatal, 5_000), Some(Notice::Fatal));
         for _ in 0..5 {
-            assert_eq!(tell(&mut sensor, dirty, 150), None, "fewer than three of 200");
+            assert_eq!(report(&mut sensor, dirty, 150), None, "fewer than three of 200");
         }
         for _ in 0..2 {
-            assert_eq!(tell(&mut sensor, fatal, 10), None);
-            sensor.doubt(false);
-            sensor.feel(Some(ok));
-            sensor.doubt(true);
+            assert_eq!(report(&mut sensor, fatal, 10), None);
+            sensor.set_line_damaged(false);
+            sensor.note_condition(Some(ok));
+            sensor.set_line_damaged(true);
         }
-        assert_eq!([(); 3].map(|()| tell(&mut sensor, dirty, 10)), [None, None, Some(Notice::Dirty)]);
+        assert_eq!([(); 3].map(|()| report(&mut sensor, dirty, 10)), [None, None, Some(Notice::Dirty)]);
     }
 
     #[test]
-    fn a_report_that_complains_counts_once_another_one_does() {
+    fn complaint_counts_once_confirmed() {
         let healthy = Health {
             software: *b"V02.30 ",
             operating_mode: ON_REQUEST,
@@ -355,21 +429,29 @@ mod tests {
         let mut defective = healthy;
         defective[8] = 1;
         let mut sensor = Sensor::default();
-        let mut told = |report: &[u8]| {
+        let mut reports = |report: &[u8]| {
             let telegram = Writer::new(REPLY, STATUS | REPLY).slice(report).byte(0x10).finish();
             let reply = Reply::decode(telegram.telegram());
             assert!(matches!(reply, Some(Reply::Status(_))));
             sensor.learn(reply.as_ref(), telegram.telegram());
             (sensor.notices().next(), sensor.is_complaint_open())
         };
-        assert_eq!(told(&healthy), (None, false));
-        assert_eq!(told(&defective), (None, true));
-        assert_eq!(told(&healthy), (None, false));
-        assert_eq!(told(&defective), (None, true));
-        assert_eq!(told(&defective), (Some(Notice::Defective), false));
-        assert_eq!(told(&healthy), (None, false));
-        told(&defective);
-        sensor.believe();
-        assert_eq!(sensor.notices().next(), Some(Notice::Defective), "no other one is to be had");
+        assert_eq!(reports(&healthy), (None, false));
+        assert_eq!(reports(&defective), (None, true));
+        assert_eq!(reports(&healthy), (None, false));
+        assert_eq!(reports(&defective), (None, true));
+        assert_eq!(reports(&defective), (Some(Notice::Defective), false));
+        assert_eq!(reports(&healthy), (None, false));
+        reports(&defective);
+        sensor.accept_unconfirmed();
+        assert_eq!(sensor.notices().next(), Some(Notice::Defective), "there will not be another one");
+    }
+
+    #[test]
+    fn identity_round_trips() {
+        let kind = *b"LMS200;301063;V02.30\0\0\0\0";
+        let identity = Identity { header: [2, 0x80, 0xd6, 2, 0xb0, 0x69, 0x41], mode: Mode(4), kind };
+        assert_eq!(Identity::from_bytes(identity.to_bytes()), identity);
+        assert_eq!(identity.to_bytes()[6..9], [0x41, 4, b'L']);
     }
 }

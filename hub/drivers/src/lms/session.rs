@@ -10,20 +10,37 @@ use crate::lms::damage::Damage;
 use crate::lms::dialogue::Dialogue;
 use crate::lms::framer::{Advance, Framer, Tally, TelegramSpan};
 use crate::lms::header::Reject;
-use crate::lms::identity::Identity;
 use crate::lms::measured::{FirstValues, MEASURED, nominal_period};
 use crate::lms::outgoing::{Outgoing, SOON};
-use crate::lms::phase::{Phase, Settings};
 use crate::lms::reply::Reply;
 use crate::lms::sensor::{Sensor, Trouble};
 use crate::lms::telegram::{MAX_TELEGRAM, Telegram};
 use crate::lms::variant::{BYTES_PER_TURN, Baud, MAX_BEAMS, Mode, Unit, Variant};
 use schema::{Contents, Counter, Counters, Nanos, ScanHead, Status};
 
+/// Settings of a session.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Settings {
+    /// Requested angle and resolution. A scanner that refuses them streams what it has.
+    pub variant: Variant,
+    /// Rate to stream at.
+    pub baud: Baud,
+    /// Whether nothing can be sent, because the bytes are from a recording.
+    pub listen_only: bool,
+    /// Whether the port has the rate [`baud`](Self::baud) and no other, as with a serial server on the network.
+    pub fixed_rate: bool,
+    /// Whether to keep to [`baud`](Self::baud) even if the line cannot carry it. Otherwise, the session streams at 38,400 baud after
+    /// two switches to 500,000 baud that the scanner acknowledged and that were followed by silence.
+    pub keep_baud: bool,
+    /// Measuring mode of a recording that does not contain it.
+    pub mode: Option<Mode>,
+}
+
 /// The session with one scanner. If the scanner is replaced within a second by one that streams already, with the same number
 /// of values and the same address, the session does not notice.
 #[derive(Clone, Debug)]
 pub struct Session {
+    settings: Settings,
     framer: Framer,
     dialogue: Dialogue,
     arrivals: Arrivals,
@@ -51,6 +68,7 @@ impl Session {
     /// Creates a session on a port that is open at the rate of `settings`.
     pub fn new(settings: Settings, now: Nanos) -> Self {
         Session {
+            settings,
             framer: Framer::default(),
             dialogue: Dialogue::new(settings, now),
             arrivals: Arrivals::new(now),
@@ -72,16 +90,13 @@ impl Session {
     /// Restores the [number of silent switches](Self::silent_switches) that the previous session counted. After two of
     /// them, the session streams at 38,400 baud, unless its settings keep it at 500,000. Call it before the first read.
     pub fn recall_silent_switches(&mut self, count: u8) {
-        self.dialogue.fast_switches.restore(count);
-        if self.dialogue.limit_rate() {
-            self.dialogue.begin(self.now);
-        }
+        self.dialogue.restore_silent_switches(count, self.now);
     }
 
     /// Returns the number of switches to 500,000 baud in a row that the scanner acknowledged and that were followed by
     /// silence, at most 2. It outlives restarts of the scanner.
     pub fn silent_switches(&self) -> u8 {
-        self.dialogue.fast_switches.silent()
+        self.dialogue.rate().silent_switches()
     }
 
     /// Creates a session from the settings that all families share.
@@ -91,12 +106,12 @@ impl Session {
 
     /// Returns the rate of the line.
     pub fn baud(&self) -> Baud {
-        self.dialogue.baud
+        self.dialogue.rate().baud()
     }
 
     /// Returns what the scanner has reported.
     pub fn sensor(&self) -> &Sensor {
-        &self.dialogue.sensor
+        self.dialogue.sensor()
     }
 
     /// Returns why the session does not stream.
@@ -111,7 +126,7 @@ impl Session {
 
     /// Stamps a telegram, and passes it to the dialogue.
     fn receive(&mut self, span: TelegramSpan) -> Received<'_> {
-        let baud = self.dialogue.baud.rate();
+        let baud = self.baud().rate();
         let framed = self.framer.view(span);
         let telegram = framed.telegram;
         let reply = Reply::decode(telegram);
@@ -155,12 +170,10 @@ impl Session {
             let begun = self.next_began();
             self.rhythm.begin(begun);
         }
-        self.dialogue.sensor.doubt(self.damage.is_recent(self.now));
-        let is_at_rate = self.is_at_rate();
-        self.dialogue.on_telegram(telegram, reply, first.at, self.now);
-        let settings = &self.dialogue.settings;
-        let mode = self.dialogue.sensor.mode_of_scans().filter(|_| is_at_rate).or(settings.mode);
-        let received = received(telegram, reply.as_ref(), mode, settings.baud, span.offset);
+        let (is_at_rate, is_line_damaged) = (self.is_at_rate(), self.damage.is_recent(self.now));
+        self.dialogue.on_telegram(telegram, reply, is_line_damaged, first.at, self.now);
+        let mode = self.sensor().mode_of_scans().filter(|_| is_at_rate).or(self.settings.mode);
+        let received = received(telegram, reply.as_ref(), mode, self.dialogue.rate().target(), span.offset);
         let reasons = received.reasons | framed.reasons | if slow { suspect::SLOW } else { 0 };
         Received { first: first.at, last, estimated, reasons, ..received }
     }
@@ -168,14 +181,14 @@ impl Session {
     /// Returns when the first byte arrived that is in no telegram yet.
     fn next_began(&self) -> Nanos {
         let open = self.tally().read - self.framer.buffered() as u64;
-        self.arrivals.stamp(open, self.dialogue.baud.rate()).at
+        self.arrivals.stamp(open, self.baud().rate()).at
     }
 
     /// Returns the time between two scans like `telegram`, which decodes to `reply`, if it is part of a stream with a known period.
     fn period(&self, telegram: Telegram<'_>, reply: Option<&Reply<'_>>) -> Option<Nanos> {
         let Some(Reply::Measured(measured)) = reply.filter(|_| self.is_live()) else { return None };
         let variant = Variant::of_beams(measured.count()).filter(|_| measured.partial().is_none())?;
-        Some(variant.period(telegram.bytes().len(), self.dialogue.baud.rate()))
+        Some(variant.period(telegram.bytes().len(), self.baud().rate()))
     }
 
     /// Returns when the scan of `len` bytes at `offset` began, if it is part of a backlog of a host that did not run. The time follows
@@ -188,18 +201,18 @@ impl Session {
 
     /// Returns whether a scanner streams, and not a recording.
     fn is_live(&self) -> bool {
-        self.dialogue.state() == State::Streaming && !self.dialogue.settings.listen_only
+        self.dialogue.state() == State::Streaming && !self.settings.listen_only
     }
 
     /// Returns whether the line has the rate of the settings, so that periods and durations are those of that rate.
     fn is_at_rate(&self) -> bool {
-        // Bytes that were read before a change of the rate arrived at the previous rate.
-        self.dialogue.change_baud.is_none() && self.dialogue.baud == self.dialogue.settings.baud
+        let rate = self.dialogue.rate();
+        !rate.is_changed() && rate.baud() == rate.target()
     }
 
     /// Returns whether bytes arrive at the pace of a line, unlike those of a recording or a network.
     fn has_pace(&self) -> bool {
-        !(self.dialogue.settings.listen_only || self.dialogue.settings.fixed_rate)
+        !(self.settings.listen_only || self.settings.fixed_rate)
     }
 }
 
@@ -214,14 +227,14 @@ impl line::Protocol for Session {
         self.now = now;
         self.has_more = len > 0 && len == self.room;
         self.left_until = None;
-        self.arrivals.note(now, len, self.has_pace().then_some(self.dialogue.baud.rate()));
+        self.arrivals.note(now, len, self.has_pace().then_some(self.baud().rate()));
         if len == 0 {
             return;
         }
         let was_empty = self.framer.buffered() == 0;
         self.framer.commit(len);
         self.last_byte = now;
-        self.dialogue.hear();
+        self.dialogue.on_bytes();
         if was_empty {
             let begun = self.next_began();
             self.rhythm.begin(begun);
@@ -240,14 +253,7 @@ impl line::Protocol for Session {
 
     fn transmitted(&mut self, now: Nanos) {
         self.now = now;
-        let (baud, is_fixed) = (self.dialogue.baud, self.dialogue.settings.fixed_rate);
-        if let Some(outgoing) = self.dialogue.outgoing() {
-            outgoing.transmitted(now, baud);
-            if is_fixed {
-                // On a network, the first bytes of a reply may be all of it.
-                outgoing.hear(baud);
-            }
-        }
+        self.dialogue.transmitted(now);
     }
 
     fn poll_output(&mut self) -> Output<'_> {
@@ -258,18 +264,18 @@ impl line::Protocol for Session {
                 Advance::Nak => self.dialogue.on_nak(self.now),
             }
         }
-        if let Some(baud) = self.dialogue.take_change_baud() {
+        if let Some(baud) = self.dialogue.take_rate_change() {
             self.framer.clear();
             self.rhythm.lose();
             return Output::SetRate(baud.rate());
         }
         self.framer.expect(self.dialogue.expect());
-        self.framer.await_acknowledge(self.dialogue.awaits_acknowledge());
-        let next_at = self.dialogue.outgoing().and_then(|outgoing| outgoing.next_at());
+        self.framer.await_acknowledge(self.dialogue.open().is_some());
+        let next_at = self.dialogue.open().and_then(Outgoing::next_at);
         if let Some(not_before) = next_at.filter(|&at| at <= self.now + SOON) {
             // The sensor skips scans while it answers.
             self.cadence.rest();
-            let bytes = self.dialogue.open.as_ref().map_or(&[][..], Outgoing::next_byte);
+            let bytes = self.dialogue.open().map_or(&[][..], Outgoing::next_byte);
             return Output::Transmit { bytes, not_before };
         }
         if let Some(until) = self.left_until {
@@ -278,7 +284,7 @@ impl line::Protocol for Session {
         if self.framer.buffered() == 0 {
             self.rhythm.lose();
         } else if self.is_live()
-            && self.dialogue.open.is_none()
+            && self.dialogue.open().is_none()
             && !self.has_more
             && let Some(until) = self.rhythm.rest(self.now)
         {
@@ -296,7 +302,7 @@ impl line::Session for Session {
     fn can_defer_read(&self) -> bool {
         let begins = self.framer.buffered() == 0 && !self.has_more && self.left_until.is_none();
         // A reply takes less time than a scan.
-        let is_silent = self.dialogue.open.is_none();
+        let is_silent = self.dialogue.open().is_none();
         begins && is_silent && self.rhythm.duration().is_some() && self.has_pace() && self.is_live()
     }
 
@@ -331,7 +337,7 @@ impl line::Session for Session {
     }
 
     fn rate(&self) -> u32 {
-        self.dialogue.baud.rate()
+        self.baud().rate()
     }
 
     /// The number of scans that the scanner must have sent follows from their period, after the first scan of each stream. A stream
@@ -352,28 +358,24 @@ impl line::Session for Session {
             lost: self.cadence.lost(),
             damaged: self.damage.damaged(tally),
             rejected_checksum: tally.rejected[Reject::Crc as usize],
-            resyncs: self.dialogue.resyncs,
-            restarts: self.dialogue.restarts,
+            resyncs: self.dialogue.resyncs(),
+            restarts: self.dialogue.restarts(),
             began_with_a_cut: self.cut,
         }
     }
 
     fn restore_identity(&mut self, identity: line::Identity) {
-        self.dialogue.recalled = Some(Identity::from_bytes(identity));
+        self.dialogue.restore_identity(identity);
     }
 
     fn identity(&self) -> Option<line::Identity> {
-        match self.dialogue.phase {
-            Phase::Streaming { header, .. } => self.sensor().identity(header).map(Identity::to_bytes),
-            _ => None,
-        }
+        self.dialogue.identity()
     }
 
-    /// It is tried in place of 9,600, if no stream arrives.
+    /// The search tries it in place of 9,600 baud if no stream arrives.
     fn hint_rate(&mut self, known: KnownRate) {
         if let Some(baud) = Baud::of_rate(known.baud) {
-            self.dialogue.rest_at = baud;
-            self.dialogue.first = baud;
+            self.dialogue.restore_rate(baud);
             self.recall_silent_switches(known.silent_switches);
         }
     }
@@ -384,10 +386,9 @@ impl line::Session for Session {
         }
     }
 
-    /// Of a line that cannot carry 500,000 baud, it is the rate in use.
+    /// For a line that cannot carry 500,000 baud, it is the rate in use.
     fn known_rate(&self) -> Option<KnownRate> {
-        let baud = self.dialogue.rate_in_place_of_fast().or(self.dialogue.found_at)?;
-        Some(KnownRate { baud: baud.rate(), silent_switches: self.silent_switches() })
+        self.dialogue.rate().known()
     }
 
     fn set_partial_reads(&mut self, count: u8) {
@@ -400,15 +401,15 @@ impl line::Session for Session {
         }
         let begun = self.framer.begun()?;
         let values = FirstValues::of(begun.bytes)?;
-        let scan = values.scan(self.dialogue.sensor.mode_of_scans()?);
-        let (baud, bytes) = (self.dialogue.baud.rate(), begun.bytes.len());
+        let scan = values.scan(self.sensor().mode_of_scans()?);
+        let (baud, bytes) = (self.baud().rate(), begun.bytes.len());
         let first = self.arrivals.stamp(begun.offset, baud);
         let last = self.arrivals.stamp(begun.offset + bytes as u64 - 1, baud);
         Some(RawScan {
             number: begun.offset,
             first: first.at.max(self.last_stamp),
             last: last.at.max(first.at).max(self.last_stamp),
-            period: nominal_period(scan.beams(), self.dialogue.settings.baud.rate()),
+            period: nominal_period(scan.beams(), self.dialogue.rate().target().rate()),
             reasons: begun.reasons,
             bytes,
             ..scan
@@ -449,7 +450,7 @@ impl line::Session for Session {
                 _ => {}
             }
         }
-        Some(received(telegram, reply.as_ref(), mode, self.dialogue.settings.baud, 0))
+        Some(received(telegram, reply.as_ref(), mode, self.dialogue.rate().target(), 0))
     }
 
     fn describe(&self, status: &mut Status) {

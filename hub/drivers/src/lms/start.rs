@@ -1,140 +1,188 @@
-//! From a sensor that hears us, whatever it does, to the stream that is wanted: it is brought to rest, to the wanted
-//! rate, to its settings. What some sensors do not have, or do not answer right after a reset, is done without.
+//! Sequences of requests: the steps that bring a scanner to the requested stream, and the questions to a scanner that streams
+//! already. Settings that a scanner does not have, or does not report right after a reset, are left out.
 
-use crate::line::State;
+use schema::{MILLIS, Nanos};
+
 use crate::lms::command::Request;
-use crate::lms::dialogue::{Dialogue, FAST};
-use crate::lms::phase::{MORE_TRIES, Phase, Progress, SETTLE, STOPS, Step, TRIES};
+use crate::lms::outgoing::{MORE_TRIES, TRIES};
 use crate::lms::reply::Reply;
-use crate::lms::sensor::Trouble;
-use schema::Nanos;
+use crate::lms::sensor::Sensor;
+use crate::lms::variant::{Baud, Variant};
 
-impl Dialogue {
-    /// What the sensor does now is known: goes on from there.
-    pub(crate) fn proceed(&mut self, progress: Progress, now: Nanos) {
-        match progress.stops_left.checked_sub(1) {
-            Some(stops_left) if self.sensor.streams => {
-                self.enter(Step::Stop, Progress { stops_left, ..progress }, now);
-            }
-            _ if self.baud != self.settings.baud => self.enter(Step::Baud, progress, now),
-            _ => self.settle(progress, now),
-        }
+/// Step of a [`Start`], each a request. Between two changes of mode or rate, whose replies look alike, there is always another
+/// one. So a reply that is late, or arrives twice, is not taken for the next one's.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Step {
+    /// Ends a stream, or the installation mode.
+    Stop,
+    /// Requests what the scanner does now, which also shows whether it receives at this rate.
+    Check,
+    Baud,
+    Variant,
+    Type,
+    Configuration,
+    Stream,
+}
+
+/// Progress of a start: the scanner receives requests, and is brought to rest, to the rate to stream at, to its settings, and to a
+/// stream.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Start {
+    step: Step,
+    /// Number of stops that may still be sent.
+    stops_left: u8,
+    /// Steps once the scanner is at rest, at the rate to stream at.
+    settings: &'static [Step],
+    /// Whether the scanner has reported its status, which contains what it does and how its values are split.
+    has_status: bool,
+    /// Whether the scanner has replied to a request for its type.
+    has_type: bool,
+}
+
+impl Start {
+    /// A start that begins with a check.
+    pub(crate) const CHECK: Start = Start {
+        step: Step::Check,
+        stops_left: STOPS + 1,
+        settings: &[Step::Variant, Step::Type, Step::Configuration, Step::Stream],
+        has_status: false,
+        has_type: false,
+    };
+
+    /// Returns the step whose reply is expected.
+    pub(crate) fn step(&self) -> Step {
+        self.step
     }
 
-    /// The next of the settings that is not as it should be.
-    fn settle(&mut self, mut progress: Progress, now: Nanos) {
-        while let Some((&step, rest)) = progress.settings.split_first() {
-            progress.settings = rest;
-            let is_known = match step {
-                Step::Variant => self.sensor.variant == Some(self.settings.variant),
-                Step::Type => progress.has_type,
-                Step::Configuration => progress.has_status,
-                _ => false,
-            };
-            if !is_known {
-                return self.enter(step, progress, now);
-            }
-        }
-        // The stream was asked for, and what came of it is not known.
-        self.enter(Step::Stream, progress, now);
-    }
-
-    /// Says what belongs to `step`.
-    pub(crate) fn enter(&mut self, step: Step, progress: Progress, now: Nanos) {
-        let (request, tries) = match step {
+    /// Returns the request of the step, and its number of tries.
+    pub(crate) fn request(&self, baud: Baud, variant: Variant) -> (Request, u8) {
+        match self.step {
             Step::Stop => (Request::Stop, MORE_TRIES),
             Step::Check => (Request::Status, MORE_TRIES),
-            Step::Baud => (Request::Baud(self.settings.baud), MORE_TRIES),
-            Step::Variant => (Request::Variant(self.settings.variant), TRIES),
+            Step::Baud => (Request::Baud(baud), MORE_TRIES),
+            Step::Variant => (Request::Variant(variant), TRIES),
             Step::Type => (Request::Type, TRIES),
             Step::Configuration => (Request::Configuration, TRIES),
             Step::Stream => (Request::Stream, MORE_TRIES),
-        };
-        self.streamed_at = None;
-        self.phase = Phase::Starting { step, progress };
-        self.ask(request, now, tries);
-    }
-
-    /// The sensor answered.
-    pub(crate) fn on_step(
-        &mut self,
-        step: Step,
-        progress: Progress,
-        request: Request,
-        reply: Option<Reply<'_>>,
-        now: Nanos,
-    ) {
-        let failed = matches!(reply, Some(Reply::Refused | Reply::Mode { done: false }));
-        let was_told = progress.has_status;
-        let progress = progress.after(request, reply.as_ref());
-        match step {
-            // Not in the mode in which it is, which was not asked yet.
-            Step::Baud if failed && !was_told && progress.stops_left > STOPS => {
-                self.enter(Step::Check, progress, now);
-            }
-            Step::Stop | Step::Baud | Step::Stream if failed => self.refused(request, now),
-            Step::Stop => {
-                self.sensor.streams = false;
-                self.enter(Step::Check, progress, now);
-            }
-            Step::Check => self.proceed(progress, now),
-            Step::Baud => {
-                self.change_baud(self.settings.baud);
-                if self.settings.baud == FAST {
-                    self.fast_switches.acknowledge();
-                }
-                self.enter(Step::Check, progress, now + SETTLE);
-            }
-            Step::Variant => {
-                self.variant_refused = !matches!(reply, Some(Reply::Variant { done: true, .. }));
-                self.settle(progress, now);
-            }
-            Step::Type | Step::Configuration => self.settle(progress, now),
-            // The stream is there when its first telegram is, which is due like one that went missing.
-            Step::Stream => {
-                let until = self.silent_at(now);
-                self.phase = Phase::Listening {
-                    give_up_at: until,
-                    quiet_at: until,
-                    shown: State::Starting,
-                    attempt: 0,
-                };
-            }
         }
     }
 
-    /// The sensor did not answer in all its tries, or `heard` the request and did not say what it did.
-    pub(crate) fn on_no_reply(
-        &mut self,
-        step: Step,
-        progress: Progress,
-        request: Request,
-        heard: bool,
-        at: Nanos,
-    ) {
-        match step {
-            Step::Variant | Step::Type | Step::Configuration => {
-                self.variant_refused |= step == Step::Variant;
-                self.doubt(progress, at);
-            }
-            Step::Stop | Step::Stream if heard => self.doubt(progress, at),
-            Step::Stop | Step::Check | Step::Baud | Step::Stream => {
-                if self.baud == FAST {
-                    self.fast_switches.give_up();
-                    // Report a rate even if the scanner was found by its boot message, so that the count is saved with it.
-                    self.found_at = self.found_at.or(Some(self.rest_at));
-                    self.limit_rate();
-                }
-                let is_lost = self.fast_switches.have_lost();
-                self.trouble = (!is_lost).then_some(Trouble::Unanswered(request));
-                self.probe(at, 0);
-            }
+    /// Returns the start after the `reply` to `request`. A scanner that refuses to report its type is not asked again.
+    pub(crate) fn after(self, request: Request, reply: Option<&Reply<'_>>) -> Start {
+        Start {
+            has_status: self.has_status || matches!(reply, Some(Reply::Status(_))),
+            has_type: self.has_type || request == Request::Type,
+            ..self
         }
     }
 
-    /// The sensor may have gone: asks whether it is there, but not for long.
-    fn doubt(&mut self, progress: Progress, at: Nanos) {
-        self.phase = Phase::Starting { step: Step::Check, progress };
-        self.ask(Request::Status, at, TRIES);
+    /// Returns the start with a check as its step.
+    pub(crate) fn check(self) -> Start {
+        Start { step: Step::Check, ..self }
+    }
+
+    /// Returns whether a scanner that refused to change its rate may be in a mode that does not allow it, because its status is
+    /// not known and it was not stopped.
+    pub(crate) fn may_be_in_other_mode(&self) -> bool {
+        !self.has_status && self.stops_left > STOPS
+    }
+
+    /// Returns the next step, now that it is known what the scanner does.
+    pub(crate) fn proceed(self, sensor: &Sensor, is_at_rate: bool, variant: Variant) -> Start {
+        match self.stops_left.checked_sub(1) {
+            Some(stops_left) if sensor.streams => Start { step: Step::Stop, stops_left, ..self },
+            _ if !is_at_rate => Start { step: Step::Baud, ..self },
+            _ => self.settle(sensor, variant),
+        }
+    }
+
+    /// Returns the step for the next setting that is not known to be right.
+    pub(crate) fn settle(mut self, sensor: &Sensor, variant: Variant) -> Start {
+        // Without any left, the stream was requested, and it is not known what came of it.
+        self.step = Step::Stream;
+        while let Some((&step, rest)) = self.settings.split_first() {
+            self.settings = rest;
+            let is_known = match step {
+                Step::Variant => sensor.variant == Some(variant),
+                Step::Type => self.has_type,
+                Step::Configuration => self.has_status,
+                _ => false,
+            };
+            if !is_known {
+                return Start { step, ..self };
+            }
+        }
+        self
     }
 }
+
+/// Questions to a scanner that streams: who it is, which may say at which angles it measures, and how its values are split,
+/// which two replies report. A reply costs the scan that it interrupts. After some rounds, only how values are split is
+/// requested, and rarely: without it there are no scans.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Questions {
+    /// The rest of this round.
+    left: &'static [Request],
+    /// Number of complete rounds.
+    rounds: u8,
+    /// Earliest time of the next question.
+    ask_at: Nanos,
+}
+
+/// Action that follows from the questions.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum NextQuestion {
+    /// Send this request.
+    Ask(Request),
+    /// Nothing now: the next round follows.
+    Later,
+    /// All is known, or as much as the scanner reports.
+    Done,
+    /// The scanner does not report how its values are split.
+    ModeUnknown,
+}
+
+impl Questions {
+    /// Returns the questions from the time `ask_at` on.
+    pub(crate) fn new(ask_at: Nanos) -> Questions {
+        Questions { left: QUESTIONS, rounds: 0, ask_at }
+    }
+
+    /// Returns what follows at `now`, right after a scan, while no request is open.
+    pub(crate) fn next(&mut self, sensor: &Sensor, now: Nanos) -> NextQuestion {
+        if now < self.ask_at {
+            return NextQuestion::Later;
+        }
+        let is_open = |question: Request| match question {
+            Request::Type => sensor.kind().is_empty(),
+            Request::Status => sensor.defective.is_none() || sensor.is_complaint_open(),
+            _ => sensor.mode.is_none(),
+        };
+        while let Some((&question, rest)) = self.left.split_first() {
+            self.left = rest;
+            if is_open(question) {
+                return NextQuestion::Ask(question);
+            }
+        }
+        if QUESTIONS.iter().any(|&question| is_open(question)) && self.rounds < ROUNDS - 1 {
+            self.rounds += 1;
+            self.left = QUESTIONS;
+            NextQuestion::Later
+        } else if sensor.mode.is_some() {
+            self.ask_at = Nanos::MAX;
+            NextQuestion::Done
+        } else {
+            self.ask_at = now + ROUND_PAUSE;
+            self.left = QUESTIONS;
+            NextQuestion::ModeUnknown
+        }
+    }
+}
+
+/// Number of stops after the first one. A scanner that continues after them does not receive them.
+pub(crate) const STOPS: u8 = 2;
+const QUESTIONS: &[Request] = &[Request::Type, Request::Status, Request::Configuration];
+/// Number of rounds of questions without a pause.
+const ROUNDS: u8 = 5;
+/// Pause between later rounds.
+const ROUND_PAUSE: Nanos = 10_000 * MILLIS;

@@ -49,6 +49,25 @@ impl Query {
         }
     }
 
+    /// Returns the contents of a response if `answer` and its `data` belong to this query. A response about a key begins with
+    /// that key.
+    fn contents(self, answer: Answer, data: &[u8]) -> Option<&[u8]> {
+        let (expected, key) = match self {
+            Query::Info => (Answer::Info, None),
+            Query::Health => (Answer::Health, None),
+            Query::Board => (Answer::Board, None),
+            Query::ModeCount => (Answer::Configuration, Some(key::COUNT)),
+            Query::TypicalMode => (Answer::Configuration, Some(key::TYPICAL)),
+            Query::SampleTime(_) | Query::Confirm(_) => (Answer::Configuration, Some(key::SAMPLE_TIME)),
+            Query::Kind(_) => (Answer::Configuration, Some(key::ANSWER)),
+            Query::Name(_) => (Answer::Configuration, Some(key::NAME)),
+            Query::SampleTimes => (Answer::SampleTimes, None),
+            Query::StandardScan | Query::ExpressScan(_) => return None,
+        };
+        let data = key.map_or(Some(data), |key| data.strip_prefix(&[key, 0, 0, 0]))?;
+        (answer == expected).then_some(data)
+    }
+
     /// Returns whether the response is a stream.
     pub(crate) fn is_scan(self) -> bool {
         matches!(self, Query::StandardScan | Query::ExpressScan(_))
@@ -177,47 +196,34 @@ impl Handshake {
             None if self.settings.listen_only => self.infer_query(answer, data),
             None => return Next::Nothing,
         };
-        // A response about a key begins with that key.
-        let of_key = |key: u8| data.strip_prefix(&[key, 0, 0, 0]).filter(|_| answer == Answer::Configuration);
+        let Some(data) = query.contents(answer, data) else { return Next::Nothing };
         match query {
-            Query::Info if answer == Answer::Info => return Next::Found(Query::Health),
-            Query::Health if answer == Answer::Health => return self.examine(Health::parse(data)),
-            Query::Board if answer == Answer::Board => {
+            Query::Info => return Next::Found(Query::Health),
+            Query::Health => return self.examine(Health::parse(data)),
+            Query::Board => {
                 self.has_board = number(data) & 1 == 1;
                 return Next::StartMotor(Query::ModeCount);
             }
             Query::ModeCount => {
-                let Some(data) = of_key(key::COUNT) else { return Next::Nothing };
                 self.modes.begin(number(data) as usize);
                 return Next::Query(Query::TypicalMode);
             }
-            Query::TypicalMode => {
-                let Some(data) = of_key(key::TYPICAL) else { return Next::Nothing };
-                self.modes.recommend(number(data) as u8);
-            }
+            Query::TypicalMode => self.modes.recommend(number(data) as u8),
             Query::SampleTime(mode) => {
-                let Some(data) = of_key(key::SAMPLE_TIME) else { return Next::Nothing };
                 self.modes.set(mode, |mode| mode.sample_us = Some(sample_us(data)).filter(|us| *us > 0.0));
             }
+            Query::Kind(mode) => self.modes.set(mode, |mode| mode.kind = Kind::of(number(data) as u8)),
+            Query::Name(mode) => self.modes.set(mode, |mode| mode.named = Mode::said(data)),
             Query::Confirm(mode) => {
-                let Some(data) = of_key(key::SAMPLE_TIME) else { return Next::Nothing };
                 let is_same = self.modes.nth(mode).and_then(|mode| mode.sample_us) == Some(sample_us(data));
                 return if is_same { self.start(baud) } else { Next::Restart };
             }
-            Query::Kind(mode) => {
-                let Some(data) = of_key(key::ANSWER) else { return Next::Nothing };
-                self.modes.set(mode, |mode| mode.kind = Kind::of(number(data) as u8));
-            }
-            Query::Name(mode) => {
-                let Some(data) = of_key(key::NAME) else { return Next::Nothing };
-                self.modes.set(mode, |mode| mode.named = Mode::said(data));
-            }
-            Query::SampleTimes if answer == Answer::SampleTimes => {
+            Query::SampleTimes => {
                 let us = number(data);
                 self.modes = ScanModes::of_old(us as u16, (us >> 16) as u16);
                 return self.start(baud);
             }
-            _ => return Next::Nothing,
+            Query::StandardScan | Query::ExpressScan(_) => return Next::Nothing,
         }
         self.after(query, baud)
     }

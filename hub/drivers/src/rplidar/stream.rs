@@ -1,10 +1,7 @@
 //! Packets of a stream: gives them stamps, and assembles their points into revolutions. The points of a packet with several
 //! points are known once the next packet has arrived, and only if nothing is missing between the two.
 
-use crate::line;
-use crate::line::{
-    Arrivals, Closed, Flow, Pace, RawScan, Reads, SensorClock, TurnCounts, Turns, Values, revolution_head,
-};
+use crate::line::{self, Arrivals, Closed, Flow, Pace, RawScan, Reads, SensorClock, TurnCounts, Turns};
 use schema::{Family, MILLIS, Nanos, line_time};
 
 use crate::rplidar::framer::{Framer, Span};
@@ -240,19 +237,10 @@ impl Stream {
     /// Converts a revolution, complete or partial, to the hub's clock.
     pub(crate) fn scan(&self, closed: Closed, reads: &Reads, now: Nanos) -> RawScan<'_> {
         let stamp = |at: Nanos| self.clock.time(at).unwrap_or(now);
-        let (first, last) = reads.turn_dates(stamp(closed.first), stamp(closed.last));
-        let (beams, per_second) =
-            (self.beams.unwrap_or_default(), self.points_per_second().unwrap_or_default());
-        RawScan {
-            number: closed.number,
-            first,
-            last,
-            period: closed.period,
-            reasons: closed.reasons,
-            bytes: 0,
-            head: revolution_head(Family::Rplidar, beams, closed.period, per_second, closed.incomplete),
-            values: Values::Points { points: self.revolutions.turns.points(&closed), per_second },
-        }
+        let stamps = reads.turn_dates(stamp(closed.first), stamp(closed.last));
+        let resolution = (self.beams.unwrap_or_default(), self.points_per_second().unwrap_or_default());
+        let points = self.revolutions.turns.points(&closed);
+        RawScan::revolution(Family::Rplidar, &closed, stamps, resolution, points)
     }
 }
 
