@@ -1,8 +1,8 @@
-//! When a byte arrived, at the latest: the port only tells when a read returned and how many bytes it brought.
+//! Latest and earliest possible arrival of a byte. A port only reports when a read returned and how many bytes it had.
 
 use schema::{Nanos, line_time};
 
-/// Reads, newest last, by the number of the byte after their last one.
+/// The last reads, newest last, by the number of the byte after their last one.
 #[derive(Clone, Debug, Default)]
 pub struct Arrivals {
     reads: [(u64, Nanos); Arrivals::CAPACITY],
@@ -10,23 +10,23 @@ pub struct Arrivals {
     total: u64,
 }
 
-/// How a scanner sends: bytes `byte_ns` nanoseconds apart on the whole, but those of a packet of `packet_len` maybe at once, or as
-/// fast as a line of `pace` bits per second lets them.
+/// Timing of a stream: on average, bytes are `byte_ns` nanoseconds apart. Those of a packet of `packet_len` may arrive at once, or at the
+/// speed of a line with `pace` bits per second.
 #[derive(Clone, Copy, Debug)]
 pub struct Flow {
-    /// Nanoseconds from one byte to the next in the mean.
+    /// Mean nanoseconds from one byte to the next.
     pub byte_ns: f64,
-    /// Bytes of a packet.
+    /// Length of a packet in bytes.
     pub packet_len: usize,
-    /// Bits per second of the line, if it is one.
+    /// Bits per second, if bytes arrive at the pace of a line.
     pub pace: Option<u32>,
 }
 
 impl Arrivals {
-    /// A packet in pieces of 16 bytes, and the one that begins inside it.
+    /// A packet in pieces of 16 bytes, and another one that begins inside it.
     const CAPACITY: usize = 8;
 
-    /// A read at `now` brought `len` bytes.
+    /// Handles a read of `len` bytes at `now`.
     pub fn note(&mut self, now: Nanos, len: usize) {
         if len > 0 {
             self.total += len as u64;
@@ -35,13 +35,13 @@ impl Arrivals {
         }
     }
 
-    /// How many bytes came.
+    /// Returns the number of bytes read.
     pub fn total(&self) -> u64 {
         self.total
     }
 
-    /// When byte number `offset` was there for sure: what came behind it took its time on a line of `pace` bits per second,
-    /// if it was one, but none of it was there when it was read before.
+    /// Returns the latest possible arrival of byte number `offset`. Bytes after it took their time on a line of `pace` bits per second, if
+    /// it was one, but none of them had arrived at the previous read.
     pub fn latest(&self, offset: u64, pace: Option<u32>) -> Nanos {
         let oldest = self.next.saturating_sub(Arrivals::CAPACITY);
         let mut latest = Nanos::MAX;
@@ -57,10 +57,10 @@ impl Arrivals {
         latest
     }
 
-    /// When byte number `offset` of a stream was there at the earliest; nothing where that is not known: more came at once than
-    /// was sent since the read before, so it had waited.
+    /// Returns the earliest possible arrival of byte number `offset` of a stream. `None` if it is not known, because more bytes arrived
+    /// at once than were sent since the previous read, so it was in a backlog.
     pub fn earliest(&self, offset: u64, flow: Flow) -> Option<Nanos> {
-        // Of what waited in a tty that was full the last piece is shorter, and some more may come a moment later.
+        // The last piece of a backlog in a full tty is shorter, and some more bytes may arrive a moment later.
         let is_rest = |n: usize| {
             n > self.oldest() + 2
                 && self.read(n - 2).0 - self.read(n - 3).0 >= TTY as u64
@@ -70,13 +70,12 @@ impl Arrivals {
         self.came(n, offset, flow)
     }
 
-    /// As [`earliest`](Self::earliest), of a byte before which others are missing, so that it is no rest of what waited. Of what
-    /// had waited in a tty that was full it is known where nearly nothing waited behind it: it came when there was room again, or
-    /// shortly before.
+    /// Returns the [`earliest`](Self::earliest) possible arrival of a byte after missing ones, which is not the rest of a backlog. In a
+    /// backlog of a full tty, it is known if almost no bytes follow: the byte arrived when there was space again, or shortly before.
     pub fn earliest_behind_gap(&self, offset: u64, flow: Flow) -> Option<Nanos> {
         let n = self.read_of(offset)?;
         self.came(n, offset, flow).or_else(|| {
-            // Since the first of those that brought more than was sent since the one before, one behind the other.
+            // The first of the consecutive reads that had more bytes than were sent since the one before.
             let first = (self.oldest() + 1..=n).rev().take_while(|&n| self.brought_more(n, flow)).last()?;
             let ((begin, since), (end, now)) = (self.read(first - 1), self.read(n));
             let behind = end.saturating_sub(offset + ROOM) as f64 * flow.byte_ns;
@@ -85,41 +84,41 @@ impl Arrivals {
         })
     }
 
-    /// The oldest read that is known.
+    /// Returns the number of the oldest stored read.
     fn oldest(&self) -> usize {
         self.next.saturating_sub(Arrivals::CAPACITY)
     }
 
-    /// The number of the byte after the last one of read `n`, and when it was.
+    /// Returns the number of the byte after the last one of read `n`, and the time of the read.
     fn read(&self, n: usize) -> (u64, Nanos) {
         self.reads[n % Arrivals::CAPACITY]
     }
 
-    /// The read that brought byte number `offset`, or the newest one before.
+    /// Returns the read with byte number `offset`, or the newest one before.
     fn read_of(&self, offset: u64) -> Option<usize> {
         (self.oldest() + 1..self.next).rev().find(|&n| self.read(n - 1).0 <= offset)
     }
 
-    /// Whether read `n` brought more than was sent since the one before.
+    /// Returns whether read `n` had more bytes than were sent since the one before.
     fn brought_more(&self, n: usize, flow: Flow) -> bool {
         let ((begin, before), (end, now)) = (self.read(n - 1), self.read(n));
         (end - begin) as f64 * flow.byte_ns > 1.25 * now.saturating_sub(before) as f64
     }
 
-    /// When byte number `offset` of read `n` was there at the earliest, if all that waited before was read.
+    /// Returns the earliest possible arrival of byte number `offset` of read `n`, if the whole backlog was read before.
     fn came(&self, n: usize, offset: u64, flow: Flow) -> Option<Nanos> {
         let ((begin, before), (end, now)) = (self.read(n - 1), self.read(n));
         let is_rest = n > self.oldest() + 1 && begin - self.read(n - 2).0 >= TTY as u64;
         let sent = (end - begin).saturating_sub(flow.packet_len as u64) as f64 * flow.byte_ns;
-        // Behind what a tty hands out at once it may hand out some more a moment later, which says nothing.
+        // After a full read, a tty may return some more bytes a moment later, which prove nothing.
         if offset >= end || is_rest || sent > 1.25 * now.saturating_sub(before) as f64 {
             return None;
         }
         let line_time = |bytes: u64| flow.pace.map_or(0, |baud| line_time(bytes as usize, baud));
         let packet = flow.packet_len as u64;
-        // The packet took its time on the line, as far as it is of this read.
+        // The part of the packet in this read took its time on the line.
         let before = (before + line_time((offset + 1 - begin).min(packet))).min(now);
-        // So few find room anywhere: if they were dropped that came then, these would have been too.
+        // Every adapter has space for this few bytes: if others had been dropped, these would have been, too.
         let idle = (packet as f64 * flow.byte_ns) as Nanos;
         let behind = ((end - offset) as f64 * flow.byte_ns) as Nanos + idle.saturating_sub(line_time(packet));
         let came = if end - begin <= ROOM { now.saturating_sub(behind) } else { 0 };
@@ -127,9 +126,9 @@ impl Arrivals {
     }
 }
 
-/// Bytes that every adapter keeps for a host that is late.
+/// Number of bytes that every adapter buffers for a late host.
 const ROOM: u64 = 256;
-/// Bytes that a tty hands out at once, whatever waits behind them.
+/// Maximum number of bytes that a tty returns at once.
 pub(crate) const TTY: usize = 4_095;
 
 #[cfg(test)]
@@ -138,7 +137,7 @@ mod tests {
     use schema::MILLIS;
 
     #[test]
-    fn what_came_behind_it_took_its_time() {
+    fn later_bytes_took_their_time() {
         let mut arrivals = Arrivals::default();
         arrivals.note(1_000_000, 100);
         arrivals.note(1_500_000, 0);
@@ -148,7 +147,7 @@ mod tests {
         assert_eq!(arrivals.latest(90, Some(1_000_000)), 1_000_000 - 9 * byte);
         assert_eq!(arrivals.latest(109, Some(1_000_000)), 2_000_000);
         assert_eq!(arrivals.latest(90, None), 1_000_000);
-        // Two reads of what had been waiting.
+        // Two reads of buffered bytes.
         arrivals.note(2_000_001, 30);
         assert_eq!(arrivals.latest(109, Some(1_000_000)), 2_000_000, "not before it was read");
         arrivals.note(3_000_000, 200);
@@ -156,13 +155,13 @@ mod tests {
         assert_eq!(arrivals.latest(300, Some(1_000_000)), 3_000_000 - 39 * byte);
     }
 
-    /// Bytes that come one by one, `byte_ns` apart.
+    /// Returns the timing of bytes that arrive one by one, `byte_ns` apart.
     fn evenly(byte_ns: f64) -> Flow {
         Flow { byte_ns, packet_len: 0, pace: None }
     }
 
     #[test]
-    fn what_had_waited_may_have_been_there_long_before() {
+    fn backlogged_bytes_may_be_old() {
         let (mut arrivals, flow) = (Arrivals::default(), evenly(100_000.0));
         let at = |millis: Nanos| millis * MILLIS;
         arrivals.note(at(1_000), 50);
@@ -172,35 +171,31 @@ mod tests {
         arrivals.note(at(2_005), 100);
         assert_eq!(arrivals.earliest(100, flow), Some(at(1_995)), "nothing was sent before");
         arrivals.note(at(3_005), 4_000);
-        assert_eq!(
-            arrivals.earliest(4_100, flow),
-            Some(at(2_005)),
-            "behind it others may have found no room"
-        );
+        assert_eq!(arrivals.earliest(4_100, flow), Some(at(2_005)), "others after it may have been dropped");
         arrivals.note(at(3_010), 700);
-        assert_eq!(arrivals.earliest(4_300, flow), None, "all of it waited");
+        assert_eq!(arrivals.earliest(4_300, flow), None, "all bytes were buffered");
         arrivals.note(at(3_015), 50);
         assert_eq!(arrivals.earliest(4_910, flow), Some(at(3_011)));
     }
 
     #[test]
-    fn packets_come_in_one_piece() {
+    fn packets_arrive_in_one_piece() {
         let (mut arrivals, flow) = (Arrivals::default(), evenly(100_000.0));
         let packets = Flow { packet_len: 84, ..flow };
         let on_a_line = Flow { pace: Some(400_000), ..packets };
         let at = |millis: Nanos| millis * MILLIS;
         arrivals.note(at(1_000), 84);
-        // Nothing was sent for a while, then a packet as fast as the line goes.
+        // A pause, and then a packet at the speed of the line.
         arrivals.note(at(1_500), 16);
         arrivals.note(at(1_505), 68);
         assert_eq!(arrivals.earliest(167, flow), None);
         assert_eq!(arrivals.earliest(167, packets), Some(at(1_500)), "at once, and nothing since");
         assert_eq!(arrivals.earliest(167, on_a_line), Some(at(1_500) + line_time(68, 400_000)));
-        // What a read leaves had waited, however little it is.
+        // The rest after a full read was buffered, however short it is.
         arrivals.note(at(2_500), 4_095);
         arrivals.note(at(2_501), 60);
         assert_eq!(arrivals.earliest(4_300, packets), None);
-        // Also behind the last piece of what waited, which is shorter.
+        // That includes the rest after the last piece of a backlog, which is shorter.
         arrivals.note(at(3_500), 4_095);
         arrivals.note(at(3_501), 4_056);
         arrivals.note(at(3_507), 70);
@@ -210,18 +205,18 @@ mod tests {
     }
 
     #[test]
-    fn what_comes_to_a_full_tty_finds_room_once_it_is_read() {
+    fn full_tty_has_space_once_it_is_read() {
         let mut arrivals = Arrivals::default();
         let packets = Flow { packet_len: 84, ..evenly(15_000.0) };
         let at = |millis: Nanos| millis * MILLIS;
         arrivals.note(at(1_000), 420);
-        // A tty may take its time to hand out more.
+        // A tty may need some time to return more.
         let reads = [(1_500, 4_095), (1_501, 4_095), (1_502, 900), (1_507, 4_095)];
         reads.iter().for_each(|&(ms, len)| arrivals.note(at(ms), len));
         let end = 420 + 3 * 4_095 + 900;
         assert_eq!(arrivals.earliest_behind_gap(end - 100, packets), Some(at(1_500)));
         let early = arrivals.earliest_behind_gap(end - 4_000, packets);
-        assert_eq!(early, None, "it waited, or what is behind it did");
+        assert_eq!(early, None, "it was buffered, or the bytes after it were");
         arrivals.note(at(1_508), 2_000);
         assert_eq!(arrivals.earliest_behind_gap(end + 1_700, packets), Some(at(1_500)));
         assert_eq!(arrivals.earliest_behind_gap(end + 500, packets), None);

@@ -1,5 +1,4 @@
-//! What a session of packets keeps of its reads: when bytes came, for how long the line may be left alone, and the stamps
-//! before which no later ones go. Refuses to know what a packet is.
+//! Reads of a session with packets: the arrival of bytes, the time of the next read, and stamps that never decrease.
 
 use crate::line::arrival::TTY;
 use crate::line::{Arrivals, Output};
@@ -10,18 +9,18 @@ use schema::{MILLIS, Nanos};
 pub struct Reads {
     arrivals: Arrivals,
     last_byte: Nanos,
-    /// Bytes that the next read has room for.
+    /// Size of the buffer of the next read.
     room: usize,
-    /// Until when nothing has to be read.
+    /// Time of the next read.
     rest_until: Nanos,
     last_packet: Nanos,
     last_turn: Nanos,
-    /// From which byte on the next packet is suspect, and why.
+    /// Number of the byte from which on the next packet is suspect, and the reasons.
     doubt: (u64, u8),
 }
 
 impl Reads {
-    /// Of a session that begins at `now`.
+    /// Creates the reads of a session that begins at `now`.
     pub fn new(now: Nanos) -> Reads {
         Reads {
             arrivals: Arrivals::default(),
@@ -34,13 +33,13 @@ impl Reads {
         }
     }
 
-    /// The next read has room for so many bytes.
+    /// Sets the size of the buffer of the next read.
     pub fn offer(&mut self, room: usize) {
         self.room = room;
     }
 
-    /// A read at `now` brought `len` bytes. While a scanner streams, packets are read some at once. What waited is read without
-    /// a rest: as long as a tty is full, what comes finds no room.
+    /// Handles a read of `len` bytes at `now`. While a scanner streams, some packets are read at once. A backlog is read without
+    /// pauses: while a tty is full, it drops bytes that arrive.
     pub fn note(&mut self, now: Nanos, len: usize, is_streaming: bool) {
         self.arrivals.note(now, len);
         let is_all = (1..self.room.min(TTY)).contains(&len);
@@ -48,22 +47,22 @@ impl Reads {
         self.last_byte = if len > 0 { now } else { self.last_byte };
     }
 
-    /// The line is to be looked at again at once.
+    /// Cancels the wait for the next read.
     pub fn end_rest(&mut self) {
         self.rest_until = 0;
     }
 
-    /// When which byte was there.
+    /// Returns the arrival times of bytes.
     pub fn arrivals(&self) -> &Arrivals {
         &self.arrivals
     }
 
-    /// When the last byte came, or the session began.
+    /// Returns when the last byte arrived, or the session began.
     pub fn last_byte(&self) -> Nanos {
         self.last_byte
     }
 
-    /// The packet that comes next is suspect for these `reasons`, bits of [`crate::line::suspect`].
+    /// Marks the next packet as suspect for these `reasons`, bits of [`crate::line::suspect`].
     pub fn doubt(&mut self, reasons: u8) {
         if reasons != 0 {
             let from = if self.doubt.1 == 0 { self.arrivals.total() } else { self.doubt.0 };
@@ -71,8 +70,8 @@ impl Reads {
         }
     }
 
-    /// Why packets are suspect of which the last one ends before byte number `end`, beside what is in them: packets may be
-    /// held back until the next bytes come.
+    /// Returns the marked reasons for packets that end before byte number `end`. The mark may belong to later ones, because the framer
+    /// may hold packets back.
     pub fn take_doubt(&mut self, end: u64) -> u8 {
         if end > self.doubt.0 { core::mem::take(&mut self.doubt.1) } else { 0 }
     }
@@ -87,23 +86,23 @@ impl Reads {
         Output::Wait { until: until.min(held_until) }
     }
 
-    /// When a packet was over that seems to be over at `last`: not before the one before it.
+    /// Returns the stamp of the end of a packet: `last`, but not before that of the previous packet.
     pub fn date_packet(&mut self, last: Nanos) -> Nanos {
         self.last_packet = last.max(self.last_packet);
         self.last_packet
     }
 
-    /// From when to when a turn is that seems to be from `first` to `last`: it does not begin before the one before it.
+    /// Returns the stamps of a revolution: `first` and `last`, but not before the beginning of the previous revolution.
     pub fn turn_dates(&self, first: Nanos, last: Nanos) -> (Nanos, Nanos) {
         let first = first.max(self.last_turn);
         (first, last.max(first))
     }
 
-    /// A turn was over that began at `first`.
+    /// Stores the beginning of a complete revolution.
     pub fn end_turn(&mut self, first: Nanos) {
         self.last_turn = first;
     }
 }
 
-/// A stream is read so late after bytes of it were: some packets at once, and a tenth of what a tty keeps.
+/// Interval between reads of a stream: for some packets at once, and a tenth of the bytes that a tty keeps.
 const REST: Nanos = 5 * MILLIS;

@@ -1,27 +1,27 @@
-//! The scanner's clock tied to the hub's. A packet can be late for many reasons and early for none: so the least delay of
-//! the last seconds is the truth about all packets of these seconds, also about those that waited while the host did not
-//! run. Both clocks drift against each other; by how much is learned. Knows no bytes.
+//! Maps the scanner's clock to the hub's clock. A packet can be late for many reasons but never early. The smallest delay of the last
+//! few seconds therefore holds for every packet in them, even for packets that waited while the host was stopped. The drift
+//! between the clocks is estimated too.
 
 use schema::{MILLIS, Nanos};
 
-/// The least delays of the last seconds.
+/// The minimum delays of the last seconds.
 #[derive(Clone, Debug)]
 pub struct SensorClock {
-    /// The least delay of each span, oldest first from `next` on.
+    /// Minimum delay of each span, oldest first from `next` on.
     least: [Option<Delay>; SensorClock::SPANS],
     next: usize,
-    /// When the newest span began, and how long one is: drift is to be known soon, and later well.
+    /// Beginning of the newest span, and duration of a span, which grows: first the drift is known soon, later exactly.
     since: Nanos,
     span: Nanos,
-    /// Of all spans the one that says most.
+    /// Minimum delay of all spans.
     best: Option<Delay>,
     /// Nanoseconds by which the hub's clock gets ahead in each nanosecond of the scanner's.
     drift: f64,
-    /// Times from the first one on may be off, beside those before, by the second one: until a span says more.
+    /// Times from the first value on may be off by the second one against earlier ones, until the spans decide it.
     doubt: Option<(Nanos, Nanos)>,
 }
 
-/// From a time of the scanner's clock to the hub's.
+/// Offset from a time of the scanner's clock to the hub's clock.
 #[derive(Clone, Copy, Debug)]
 struct Delay {
     at: Nanos,
@@ -29,7 +29,7 @@ struct Delay {
 }
 
 impl Delay {
-    /// What it says of the offset at `at`, where the clocks drift.
+    /// Returns the offset at another time `at`, for clocks with this drift.
     fn seen_from(self, at: Nanos, drift: f64) -> i64 {
         self.offset + (drift * (at as i64 - self.at as i64) as f64) as i64
     }
@@ -38,8 +38,8 @@ impl Delay {
 impl SensorClock {
     const SPANS: usize = 16;
 
-    /// Nothing is known of it yet.
-    #[expect(clippy::new_without_default, reason = "a clock of which nothing is known is no default")]
+    /// Creates a clock before its first time.
+    #[expect(clippy::new_without_default, reason = "the start of a stream is not a default value")]
     pub fn new() -> Self {
         SensorClock {
             least: [None; Self::SPANS],
@@ -52,8 +52,8 @@ impl SensorClock {
         }
     }
 
-    /// From `at` of the scanner's clock on, its times may be off by `most` beside those before: what took the time between them
-    /// was counted, not measured. Delays from before count until those of a span since are known as well.
+    /// Records that times from `at` of the scanner's clock on may be off by `most` against earlier ones, because the time between
+    /// them was counted, not measured. Earlier delays count until those of a later span are known as well.
     pub fn doubt(&mut self, at: Nanos, most: Nanos) {
         if self.best.is_some() {
             self.doubt = Some((at, most));
@@ -61,7 +61,7 @@ impl SensorClock {
         }
     }
 
-    /// What happened at `at` of the scanner's clock was known at `latest` of the hub's.
+    /// Records that an event at `at` of the scanner's clock had arrived at `latest` of the hub's clock.
     pub fn note(&mut self, at: Nanos, latest: Nanos) {
         let delay = Delay { at, offset: latest as i64 - at as i64 };
         if self.best.is_none() || at.saturating_sub(self.since) >= self.span {
@@ -85,7 +85,7 @@ impl SensorClock {
         }
     }
 
-    /// The hub's time at which it was `at` by the scanner's clock; nothing before anything was noted.
+    /// Converts `at` of the scanner's clock to the hub's clock. `None` before the first event.
     pub fn time(&self, at: Nanos) -> Option<Nanos> {
         let best = self.best?;
         Some(at.saturating_add_signed(best.seen_from(at, self.drift)))
@@ -97,7 +97,7 @@ impl SensorClock {
         self.since = at;
     }
 
-    /// A span is over, at `at`. Where it says as much as those before a doubt did, these were of other times.
+    /// Ends a span at `at`. If it agrees with the spans before the [uncertain](Self::doubt) time, those are not needed any more.
     fn settle(&mut self, at: Nanos) {
         let Some((from, most)) = self.doubt else { return };
         let seen = |known: Delay| known.seen_from(at, self.drift);
@@ -113,7 +113,7 @@ impl SensorClock {
         }
     }
 
-    /// Two spans become one, twice as long.
+    /// Joins pairs of spans, so that spans become twice as long.
     fn join_pairs(&mut self) {
         let mut joined = [None; Self::SPANS];
         for (n, delay) in self.known().enumerate() {
@@ -132,7 +132,7 @@ impl SensorClock {
         older.iter().chain(newer).copied().flatten()
     }
 
-    /// The median of what pairs of an older and a newer span say, of those in which the host ran.
+    /// Estimates the drift: the median over pairs of an older and a newer span, of those in which the host ran.
     fn learn_drift(&mut self) {
         if self.doubt.is_some() {
             return;
@@ -161,22 +161,22 @@ impl SensorClock {
     }
 }
 
-/// Spans get as long as this, and begin shorter.
+/// Maximum duration of a span, and that of the first ones.
 const SPAN: Nanos = 500 * MILLIS;
 const FIRST_SPAN: Nanos = SPAN / 8;
-/// Spans that tell a drift.
+/// Minimum number of spans for an estimate of the drift.
 const ENOUGH: usize = 6;
-/// No oscillator is off by more, not even one without a crystal.
+/// Maximum drift. No oscillator is off by more, not even one without a crystal.
 const MOST_DRIFT: f64 = 0.02;
-/// What a host that runs is late by, in nanoseconds.
+/// Maximum delay of a host that runs, in nanoseconds.
 const JITTER: f64 = 4e6;
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
-    /// The worst error in microseconds from `from` seconds on, for a scanner whose clock runs `drift` slow, a packet each
-    /// 2 ms with a delay of at least 100 us, and a host that stops for `stall` seconds each `every` seconds.
+    /// Returns the maximum error in microseconds from `from` seconds on. The scanner's clock is slow by `drift`, and it sends a packet
+    /// every 2 ms with a delay of at least 100 us. The host stops for `stall` seconds every `every` seconds.
     fn worst_us(drift: f64, stall: f64, every: f64, from: f64) -> f64 {
         let mut clock = SensorClock::new();
         let mut random = fastrand::Rng::with_seed(7);
@@ -189,9 +189,9 @@ mod tests {
             let stopped = if hub_s > 1.0 && phase < stall { stall - phase } else { 0.0 };
             let nanos = |s: f64| ((s + 1_000.0) * 1e9) as Nanos;
             clock.note(nanos(sensor_s), nanos(hub_s + late_s.max(stopped)));
-            let told = clock.time(nanos(sensor_s)).expect("tied");
+            let mapped = clock.time(nanos(sensor_s)).expect("tied");
             if hub_s > from {
-                worst = worst.max((told as f64 - nanos(hub_s) as f64).abs() / 1e3);
+                worst = worst.max((mapped as f64 - nanos(hub_s) as f64).abs() / 1e3);
             }
         }
         worst
@@ -205,12 +205,12 @@ mod tests {
     }
 
     #[test]
-    fn what_was_counted_wrong_is_known_soon_and_is_no_drift() {
+    fn miscounted_times_are_corrected_and_are_not_drift() {
         let mut clock = SensorClock::new();
         let (mut counted, mut wrong) = (0, 0);
         for n in 0..40_000u64 {
             let hub = 1_000_000_000_000 + n * MILLIS;
-            // Half a second of each two nothing arrives in time, then something is missing that was counted one too few.
+            // In half a second of every two, nothing arrives in time. Then packets are missing, and the count of them is one too low.
             let phase = n % 2_000;
             if n > 4_000 && phase == 1_250 {
                 counted += MILLIS;
@@ -226,7 +226,7 @@ mod tests {
     }
 
     #[test]
-    fn clocks_that_drift_are_followed() {
+    fn drift_is_followed() {
         for drift in [-0.01, -0.000_5, 0.000_5, 0.01] {
             let worst = worst_us(drift, 0.0, 1.0, 4.0);
             assert!(worst < 1_000.0, "{drift}: {worst}");

@@ -1,25 +1,27 @@
-//! Points to turns. A turn begins half a step of the grid before the scanner's zero, so that the beam ahead is measured in
-//! one piece, and each point belongs to the turn that its own angle says: it may come after points that lie behind it. So a
-//! turn is over only when the head is past its end by more than a point can be late, and until then there are two. Knows
-//! no bytes and no hub's clock.
+//! Assembles points into revolutions.
+//!
+//! A revolution begins half a step of the grid before the scanner's zero, so that the beam ahead is measured in one piece. A point
+//! belongs to the revolution of its angle, and may arrive after points with larger angles. So a revolution is complete only
+//! when the head is past its end by more than a point can be late, and until then there are two. Times are those of the scanner's
+//! clock.
 
 use crate::line::grid::{NO_RETURN, Point};
 use schema::Nanos;
 
-/// The turn that is being measured, and the next one, of `N` points at the most.
+/// The revolution that is being measured, and the next one, with at most `N` points each.
 #[derive(Clone, Debug)]
 pub struct Turns<const N: usize> {
     points: [[Point; N]; 2],
-    /// Which of both holds the points of the first one.
+    /// Index of the buffer with the points of the first one.
     at: usize,
     open: [Open; 2],
-    /// The number of the first one since the sequence began; nothing before that is known.
+    /// Number of the first one since the sequence began, once it is known.
     number: Option<i64>,
-    /// The same among all turns; the second one has the next.
+    /// Number of the first one among all revolutions. The second one has the next number.
     serial: u64,
-    /// The last turn of which it is known that points are missing.
+    /// The last revolution with missing points.
     lacking: i64,
-    /// Degrees from the edge of a turn to the zero.
+    /// Degrees from the edge of a revolution to the zero.
     edge: f64,
     counts: TurnCounts,
 }
@@ -27,29 +29,29 @@ pub struct Turns<const N: usize> {
 #[derive(Clone, Copy, Debug, Default)]
 struct Open {
     len: usize,
-    /// By the scanner's clock, in nanoseconds, at its edge and of its last point.
+    /// Times at its edge and of its last point, in nanoseconds.
     first: Option<f64>,
     last: f64,
     incomplete: bool,
     reasons: u8,
 }
 
-/// A turn that is over, with times of the scanner's clock; its points stay until the next point comes.
+/// A complete revolution, in time of the scanner's clock. Its points stay valid until the next point is added.
 #[derive(Clone, Copy, Debug)]
 pub struct Closed {
-    /// Which one: no other has this number, not even one that came to no end.
+    /// Number that no other revolution has, not even one that was given up.
     pub number: u64,
     points: usize,
     len: usize,
-    /// When it began: at its edge.
+    /// Time at its edge, where it begins.
     pub first: Nanos,
-    /// When its last point was measured.
+    /// Time of its last point.
     pub last: Nanos,
-    /// How long it took.
+    /// Duration.
     pub period: Nanos,
-    /// Whether points of it are missing.
+    /// Whether points are missing.
     pub incomplete: bool,
-    /// Why its points are suspect, bits of [`crate::line::suspect`].
+    /// Reasons for suspicion: bits of [`crate::line::suspect`]; 0 is clean.
     pub reasons: u8,
 }
 
@@ -66,7 +68,7 @@ pub struct TurnCounts {
     pub missed: u64,
 }
 
-/// How fast the head turns past points.
+/// Speed of the head, from point to point.
 #[derive(Clone, Copy, Debug)]
 pub struct Pace {
     /// Degrees from one point to the next.
@@ -76,20 +78,20 @@ pub struct Pace {
 }
 
 impl Pace {
-    /// Points of a whole turn.
+    /// Returns the number of points of a revolution.
     fn due(&self) -> f64 {
         360.0 / self.step.max(1e-3)
     }
 
-    /// How long one takes, in nanoseconds.
+    /// Returns the duration of a revolution, in nanoseconds.
     fn turn_ns(&self) -> f64 {
         self.due() * self.point_ns
     }
 }
 
 impl<const N: usize> Turns<N> {
-    /// Nothing is known yet.
-    #[expect(clippy::new_without_default, reason = "turns of which nothing is known are no default")]
+    /// Creates it before any point.
+    #[expect(clippy::new_without_default, reason = "the start of a stream is not a default value")]
     pub fn new() -> Self {
         const NONE: Point = Point { angle: 0.0, range: NO_RETURN, intensity: 0 };
         Turns {
@@ -104,29 +106,29 @@ impl<const N: usize> Turns<N> {
         }
     }
 
-    /// From now on turns are for a grid of so many beams; the open ones are given up.
+    /// Begins revolutions for a grid of `beams` beams, and gives up the open ones.
     pub fn begin(&mut self, beams: usize) {
         self.edge = 180.0 / beams as f64;
         self.give_up();
     }
 
-    /// How many there were of which kind.
+    /// Returns the numbers of revolutions by kind.
     pub fn counts(&self) -> TurnCounts {
         self.counts
     }
 
-    /// The first of the turns that are being measured, as if it ended here.
+    /// Returns the first of the open revolutions, as if it ended here.
     pub fn begun(&self, pace: Pace) -> Option<Closed> {
         let open = &self.open[0];
         Some(self.end(open, open.first?, pace.turn_ns()))
     }
 
-    /// The points of a turn that was closed just now, or that is being measured.
+    /// Returns the points of the revolution that was completed last, or that is being measured.
     pub fn points(&self, closed: &Closed) -> &[Point] {
         &self.points[closed.points][..closed.len]
     }
 
-    /// The open turns come to no end, and no angle that is known goes on.
+    /// Gives up the open revolutions. The next point begins a new sequence of angles.
     pub fn give_up(&mut self) {
         self.counts.short += u64::from(self.open[0].len > 0);
         self.open = [Open::default(); 2];
@@ -134,13 +136,13 @@ impl<const N: usize> Turns<N> {
         (self.number, self.lacking) = (None, i64::MIN);
     }
 
-    /// A point at `angle`, in degrees clockwise over all turns, measured at `time`.
+    /// Adds a point at `angle`, in degrees clockwise over all revolutions, measured at `time`.
     pub fn put(&mut self, angle: f64, time: f64, range: u16, intensity: u8, reasons: u8, pace: Pace) {
         let turn = self.turn_of(angle);
-        // Turns are measured from their edge on.
+        // Only the next revolution is measured from its edge on.
         let number = *self.number.get_or_insert(turn + 1);
         let Some(which) = usize::try_from(turn - number).ok().filter(|which| *which < 2) else {
-            // Whoever did not reach it before its points come loses them.
+            // The caller has not called `reach` for it before its points.
             self.lacking = self.lacking.max(turn);
             return;
         };
@@ -155,12 +157,12 @@ impl<const N: usize> Turns<N> {
         open.len += 1;
         open.last = open.last.max(time);
         open.reasons |= reasons;
-        // Where the first points are missing, the edge is dated as if they were there.
+        // If the first points are missing, the time at the edge is extrapolated.
         let points = if pace.step > 0.0 { (within + self.edge) / pace.step } else { 0.0 };
         open.first.get_or_insert((time - points * pace.point_ns).max(0.0));
     }
 
-    /// Between these angles points are missing.
+    /// Records that points are missing between two angles.
     pub fn lacks(&mut self, from: f64, to: f64) {
         let Some(number) = self.number else { return };
         let (from, to) = (self.turn_of(from), self.turn_of(to));
@@ -170,13 +172,13 @@ impl<const N: usize> Turns<N> {
         self.lacking = self.lacking.max(to);
     }
 
-    /// Of the turn that is being measured something may be missing, nobody knows where.
+    /// Records that points may be missing somewhere in the revolution that is being measured.
     pub fn doubt(&mut self) {
         self.open[0].incomplete |= self.number.is_some();
     }
 
-    /// All points before `angle` were put. The turn that is over with it, if there is one; then this is to be called
-    /// once more.
+    /// Handles that all points before `angle` were added. Returns a revolution that is complete now. Then call it again, until it
+    /// returns `None`.
     pub fn reach(&mut self, angle: f64, pace: Pace) -> Option<Closed> {
         let turn = self.turn_of(angle);
         while let Some(number) = self.number.filter(|number| turn > *number) {
@@ -188,7 +190,7 @@ impl<const N: usize> Turns<N> {
                 self.open = [self.fresh(turn), self.fresh(turn + 1)];
                 return None;
             }
-            // A head may change its speed: from edge to edge is what this turn took.
+            // The duration is that from edge to edge, because a head may change its speed.
             let usual = pace.turn_ns();
             let took = open.first.zip(self.open[1].first).map(|(first, next)| next - first);
             let took = took.filter(|took| (0.5 * usual..2.0 * usual).contains(took));
@@ -211,7 +213,7 @@ impl<const N: usize> Turns<N> {
         None
     }
 
-    /// The first of the open turns, which began at `first` and takes so many nanoseconds.
+    /// Returns the first of the open revolutions, which began at `first` and takes `period` nanoseconds.
     fn end(&self, open: &Open, first: f64, period: f64) -> Closed {
         Closed {
             number: self.serial,
@@ -231,7 +233,7 @@ impl<const N: usize> Turns<N> {
 
     fn turn_of(&self, angle: f64) -> i64 {
         let turns = (angle + self.edge) / 360.0;
-        // Towards less, also below zero.
+        // Round down, even below zero.
         let whole = turns as i64;
         if (whole as f64) > turns { whole - 1 } else { whole }
     }
@@ -242,10 +244,10 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_turn_takes_the_time_from_its_edge_to_the_next_one() {
+    fn revolution_lasts_from_edge_to_edge() {
         let mut turns = Turns::<400>::new();
         turns.begin(360);
-        // Points of a degree each; the head is faster as soon as the turn is over.
+        // Points of one degree each. The head is faster after the first revolutions.
         for n in 0..735 {
             let angle = f64::from(n);
             let time = 1e6 * angle.min(722.0) + 0.9e6 * (angle - 722.0).max(0.0);
@@ -257,7 +259,7 @@ mod tests {
     }
 
     #[test]
-    fn a_turn_of_which_points_came_before_it_was_reached_lacks_them() {
+    fn lacks_points_that_arrived_before_it_was_reached() {
         let mut turns = Turns::<400>::new();
         turns.begin(360);
         let pace = Pace { step: 1.0, point_ns: 1e6 };
@@ -268,14 +270,14 @@ mod tests {
         // A gap over an edge, and points on both sides of the next one.
         turns.lacks(601.0, 1_074.0);
         put(&mut turns, 1_075, 1_086);
-        let (mut told, mut count) = ([(0, false); 2], 0);
+        let (mut closed_turns, mut count) = ([(0, false); 2], 0);
         for at in 1_086..1_450 {
             while let Some(closed) = turns.reach(f64::from(at), pace) {
-                told[count] = (closed.len, closed.incomplete);
+                closed_turns[count] = (closed.len, closed.incomplete);
                 count += 1;
             }
             put(&mut turns, at, at + 1);
         }
-        assert_eq!(told, [(240, true), (354, true)]);
+        assert_eq!(closed_turns, [(240, true), (354, true)]);
     }
 }

@@ -1,19 +1,19 @@
-//! When a byte arrived, and when to look at the line again. The port only tells when a read returned and how many
-//! bytes it brought; this file turns that into a stamp for any byte, and learns how long a telegram takes, so that
-//! the host can sleep through it.
+//! Arrival times of bytes, and the time of the next read. A port only reports when a read returned and how many bytes it had. From
+//! that, [`Arrivals`] computes a stamp for any byte, and [`Rhythm`] measures how long a telegram takes, so that the host can sleep
+//! meanwhile.
 
 use crate::lms::variant::BYTES_PER_TURN;
 use schema::{MICROS, MILLIS, Nanos, line_time};
 
-/// Reads, newest last, by the number of the byte after their last one.
+/// The last reads, newest last, by the number of the byte after their last one.
 #[derive(Clone, Debug)]
 pub(crate) struct Arrivals {
     reads: [Read; Arrivals::CAPACITY],
     next: usize,
     total: u64,
-    /// When the line was last seen to bring something: one that holds its bytes back looks empty.
+    /// Time at which the line last had bytes. A line that holds its bytes back looks empty.
     last_look: Nanos,
-    /// What waited while the host did not look.
+    /// Bytes that were buffered while the host did not read.
     backlog: Option<Backlog>,
 }
 
@@ -24,40 +24,39 @@ struct Read {
     backlog: Option<Backlog>,
 }
 
-/// Bytes that came while the host did not run, or that the line held back. Their age is not known; but the line's buffer keeps the oldest ones, so
-/// they arrived at the speed of the line, starting at the last read.
+/// Bytes that arrived while the host did not run, or that the line held back. Their age is not known. But the line's buffer keeps the
+/// oldest ones, so they arrived at the speed of the line, starting at the last read.
 #[derive(Clone, Copy, Debug)]
 struct Backlog {
     /// Number of its first byte.
     begin: u64,
-    /// The last look before it that found something.
+    /// Time at which the line had bytes before.
     since: Nanos,
-    /// The last read that brought more than can have come since the one before it, and the bytes read after it.
+    /// Time of the last read that had more bytes than can have arrived since the read before, and number of bytes after it.
     hurried: Nanos,
     read_since: usize,
 }
 
-/// A stamp, and whether more than the pace of a UART stands between it and the truth.
+/// A stamp, and whether its error may be more than the pace of a UART.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct Stamp {
     pub(crate) at: Nanos,
     pub(crate) estimated: bool,
-    /// Where the byte waited while the host did not run: when it must have been there at the latest. Then `at` is the
-    /// earliest time that is possible.
+    /// For a byte in a backlog: its latest possible arrival. Then `at` is the earliest possible one.
     pub(crate) latest: Option<Nanos>,
 }
 
 impl Arrivals {
-    /// A telegram in pieces of 16 bytes, twice.
+    /// Two telegrams in pieces of 16 bytes.
     const CAPACITY: usize = 128;
 
-    /// Nothing that arrives is older than `now`.
+    /// Creates it at `now`. No byte is older.
     pub(crate) fn new(now: Nanos) -> Self {
         let reads = [Read::default(); Arrivals::CAPACITY];
         Arrivals { reads, next: 0, total: 0, last_look: now, backlog: None }
     }
 
-    /// A read at `now` brought `len` bytes, of a line of `pace` bits per second if it was one.
+    /// Handles a read of `len` bytes at `now`, from a line of `pace` bits per second. `None`: bytes do not arrive at the pace of a line.
     pub(crate) fn note(&mut self, now: Nanos, len: usize, pace: Option<u32>) {
         let since = self.last_look;
         if len > 0 {
@@ -82,7 +81,7 @@ impl Arrivals {
         }
     }
 
-    /// At `now` there were `len` bytes that will come with the next read.
+    /// Handles that at `now`, the line had `len` bytes for the next read.
     pub(crate) fn sense(&mut self, now: Nanos, len: usize) {
         self.last_look = now;
         let read = Read { end: self.total + len as u64, now, backlog: self.backlog };
@@ -90,7 +89,7 @@ impl Arrivals {
         self.next += 1;
     }
 
-    /// What was read since the last hurried read came when it was read.
+    /// Ends the backlog: bytes that were read after the last hurried read are not part of it.
     fn catch_up(&mut self) {
         if let Some(backlog) = self.backlog.take() {
             for read in self.reads.iter_mut().filter(|read| read.now > backlog.hurried) {
@@ -99,9 +98,9 @@ impl Arrivals {
         }
     }
 
-    /// When byte number `offset` arrived at the latest: whatever came behind it, in the same read or in one right
-    /// after it, took its time on the line. Of a backlog it is the earliest time that is possible: old values must not
-    /// look new. Where the beat of the stream is known, [`crate::lms::cadence`] knows better.
+    /// Returns the latest possible arrival of byte number `offset`: bytes after it, in the same read or soon after, took their time on
+    /// the line. For a byte in a backlog, it is the earliest possible arrival, because old values must not look new. If the
+    /// period of the stream is known, [`crate::lms::cadence`] is more exact.
     pub(crate) fn stamp(&self, offset: u64, baud: u32) -> Stamp {
         let oldest = self.next.saturating_sub(Arrivals::CAPACITY);
         let (mut at, mut own, mut own_behind) = (Nanos::MAX, Nanos::MAX, ESTIMATED + 1);
@@ -120,23 +119,22 @@ impl Arrivals {
                 waited = true;
             }
         }
-        // A host that wakes up a little later for one read than for another is no estimate.
+        // Small differences between the delays of reads do not make it an estimate.
         let moved = own - at > line_time(ESTIMATED, baud);
         Stamp { at, estimated: own_behind > ESTIMATED || moved, latest: waited.then_some(latest) }
     }
 }
 
-/// How long a telegram of the stream takes, learned from those that came. A busy host only ever sees them take
-/// longer, so the least of several is the truth.
+/// Duration of a telegram of the stream, as measured. A busy host can only measure too much, so the minimum of several counts.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Rhythm {
     duration: Option<Nanos>,
-    /// The shortest of the `counted` telegrams since it was learned.
+    /// Minimum duration of the last `counted` telegrams.
     least: Nanos,
     counted: u32,
-    /// First byte of the telegram that is coming.
+    /// Arrival of the first byte of the telegram that is arriving.
     first: Option<Nanos>,
-    /// A telegram is read in so many pieces, at least.
+    /// Minimum number of reads per telegram.
     pieces: u8,
 }
 
@@ -145,22 +143,22 @@ impl Rhythm {
         Rhythm { duration: None, least: Nanos::MAX, counted: 0, first: None, pieces: 1 }
     }
 
-    /// From now on the host looks at a telegram `pieces` times in all, in equal parts of it; 0 is 1.
+    /// Sets the number of reads per telegram, at equal distances; 0 is 1.
     pub(crate) fn look_in(&mut self, pieces: u8) {
         self.pieces = pieces.max(1);
     }
 
-    /// The first byte of a telegram arrived.
+    /// Handles the arrival of the first byte of a telegram.
     pub(crate) fn begin(&mut self, first: Nanos) {
         self.first = Some(first);
     }
 
-    /// How long a telegram takes, if that is known.
+    /// Returns the duration of a telegram, if it is known.
     pub(crate) fn duration(&self) -> Option<Nanos> {
         self.duration
     }
 
-    /// Until when nothing can be complete that is waited for: the next piece, or the telegram; answered once for each.
+    /// Returns the time until which the host can sleep: to the next piece, or to the end of the telegram. Only once for each.
     pub(crate) fn rest(&mut self, now: Nanos) -> Option<Nanos> {
         let (first, duration) = (self.first?, self.duration?);
         let end = first + duration.checked_sub(LEAD)?;
@@ -173,7 +171,7 @@ impl Rhythm {
         (until > soon).then_some(until)
     }
 
-    /// A telegram is complete that took so long from its first to its last byte.
+    /// Handles a complete telegram with the given duration from its first to its last byte.
     pub(crate) fn complete(&mut self, took: Nanos) {
         self.first = None;
         self.least = self.least.min(took);
@@ -185,77 +183,77 @@ impl Rhythm {
         }
     }
 
-    /// What was coming is not known any more.
+    /// Discards the arrival of the first byte.
     pub(crate) fn lose(&mut self) {
         self.first = None;
     }
 
-    /// Whether `took` is longer than usual by more than noise.
+    /// Returns whether the duration `took` is unusually long.
     pub(crate) fn is_slow(&self, took: Nanos) -> bool {
         self.duration.is_some_and(|duration| took > duration + SLOW)
     }
 }
 
-/// More bytes than so behind a stamped one in the same read make the stamp an estimate: an adapter's chunk of 62.
+/// With more bytes than this after a byte in the same read, its stamp is an estimate. An adapter's chunk has 62.
 const ESTIMATED: usize = 64;
-/// A host that found nothing for so long, beyond any rest at the highest rate, was stopped or starved, or the line was.
+/// After this time without bytes, longer than any sleep at the highest rate, the host was stopped or starved, or the line was.
 const LATE: Nanos = 50 * MILLIS;
-/// A line that brings no more than it can for so long has no backlog any more: less than a telegram takes, more than the
-/// kernel needs to move what it kept from one buffer to the next.
+/// After this time with no more bytes than the line can carry, the backlog ends. It is shorter than a telegram, and longer than the
+/// kernel needs to move bytes from one buffer to the next.
 const CALM: Nanos = 12 * MILLIS;
-/// The host looks again so long before the expected end: a chunk or two of 16 bytes.
+/// The host reads this time before the expected end: one or two chunks of 16 bytes.
 const LEAD: Nanos = 600 * MICROS;
-/// A shorter rest is not worth a system call.
+/// Minimum sleep. A shorter one is not worth the system call.
 const MIN_REST: Nanos = 500 * MICROS;
-/// Telegrams that are read as they come before the first rest.
+/// Number of telegrams before the first sleep.
 const LESSONS: u32 = 3;
-/// Telegrams of which the shortest counts, from then on. One that was slept through to its end took the rest at most,
-/// so too long a rest shortens itself.
+/// Number of telegrams whose minimum counts from then on. A telegram during which the host slept too long measures at most the
+/// sleep, so the sleep becomes shorter.
 const WINDOW: u32 = 16;
-/// A telegram that takes so much longer than usual is suspect (framing: quality, reason 4).
+/// A telegram that takes longer than usual by more than this is suspect (framing: quality, reason 4).
 const SLOW: Nanos = 8 * MILLIS;
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
-    /// When a byte arrived, and whether that is an estimate.
+    /// Returns the stamp of a byte, and whether it is an estimate.
     fn seen(arrivals: &Arrivals, offset: u64) -> (Nanos, bool) {
         let Stamp { at, estimated, .. } = arrivals.stamp(offset, 500_000);
         (at, estimated)
     }
 
     #[test]
-    fn a_stamp_knows_what_came_behind_it() {
+    fn later_bytes_make_a_stamp_earlier() {
         let mut arrivals = Arrivals::new(0);
         arrivals.note(1_000_000, 16, Some(500_000));
         arrivals.note(11_000_000, 484, Some(500_000));
         assert_eq!(seen(&arrivals, 0), (1_000_000 - 15 * 20_000, false));
         assert_eq!(seen(&arrivals, 499), (11_000_000, false));
         assert_eq!(seen(&arrivals, 16), (11_000_000 - 483 * 20_000, true));
-        // Two reads of what had been waiting: the line was not faster because of that.
+        // Two reads of buffered bytes. The line was not faster.
         arrivals.note(11_010_000, 500, Some(500_000));
         assert_eq!(seen(&arrivals, 499), (11_010_000 - 500 * 20_000, true));
-        // Reads with a jitter of some microseconds are what they are.
+        // A jitter of some microseconds changes nothing.
         arrivals.note(31_000_000, 16, Some(500_000));
         arrivals.note(31_300_000, 16, Some(500_000));
         assert_eq!(seen(&arrivals, 1_015), (30_980_000, false));
         for _ in 0..200 {
             arrivals.note(40_000_000, 1, Some(500_000));
         }
-        // Older than what is remembered: the oldest remembered read.
+        // The byte is older than the stored reads.
         assert!(arrivals.stamp(0, 500_000).estimated);
     }
 
     #[test]
-    fn what_waited_while_the_host_did_not_run_is_not_new() {
+    fn backlogged_bytes_are_not_stamped_as_new() {
         let mut arrivals = Arrivals::new(0);
         arrivals.note(1_000 * MILLIS, 16, Some(500_000));
-        // Two seconds later, as fast as they can be read; then as they come.
+        // Two seconds later, as fast as they can be read, and then as they arrive.
         for read in 0..4 {
             arrivals.note(3_000 * MILLIS + read * 100_000, 1_600, Some(500_000));
         }
-        // The kernel moves the rest a little later; then comes what is new.
+        // The kernel moves the rest a little later. Then new bytes arrive.
         arrivals.note(3_002 * MILLIS, 50, Some(500_000));
         arrivals.note(3_002 * MILLIS + 50_000, 1_550, Some(500_000));
         arrivals.note(3_010 * MILLIS, 16, Some(500_000));
@@ -266,7 +264,7 @@ mod tests {
             assert_eq!(seen(&arrivals, 16 + byte), (at, true));
         }
         assert_eq!(seen(&arrivals, 8_031), (3_010 * MILLIS, false));
-        // A line that was silent is looked at in time; a slow one that was slept through has kept its pace.
+        // A silent line is read in time. A slow one has kept its pace while the host slept.
         arrivals.note(5_000 * MILLIS, 62, Some(500_000));
         assert_eq!(seen(&arrivals, 8_109), (5_000 * MILLIS, false));
         arrivals.note(5_762 * MILLIS, 730, Some(9600));
@@ -275,7 +273,7 @@ mod tests {
     }
 
     #[test]
-    fn what_a_line_held_back_is_not_new_though_the_host_looked() {
+    fn bytes_that_a_line_held_back_are_not_new() {
         let mut arrivals = Arrivals::new(0);
         arrivals.note(1_000 * MILLIS, 16, Some(500_000));
         arrivals.note(1_500 * MILLIS, 0, Some(500_000));
@@ -284,7 +282,7 @@ mod tests {
     }
 
     #[test]
-    fn what_comes_with_the_first_look_is_no_older_than_the_session() {
+    fn first_bytes_are_not_older_than_the_session() {
         let mut arrivals = Arrivals::new(9_000 * MILLIS);
         arrivals.note(9_010 * MILLIS, 400, Some(500_000));
         let at = 9_010 * MILLIS - 399 * 20_000;
@@ -292,7 +290,7 @@ mod tests {
     }
 
     #[test]
-    fn what_was_seen_before_it_was_read_is_as_old_as_that() {
+    fn unread_bytes_are_stamped_when_they_were_counted() {
         let mut arrivals = Arrivals::new(0);
         arrivals.sense(1_000_000, 16);
         arrivals.note(18_000_000, 700, Some(500_000));
@@ -304,7 +302,7 @@ mod tests {
     }
 
     #[test]
-    fn after_three_lessons_the_host_may_rest() {
+    fn host_sleeps_after_three_telegrams() {
         let mut rhythm = Rhythm::new();
         for took in [18_300_000, 18_000_000, 90_000_000] {
             rhythm.begin(0);
@@ -315,7 +313,7 @@ mod tests {
         assert_eq!(rhythm.rest(100_000_000), Some(117_400_000));
         assert_eq!(rhythm.rest(117_400_000), None, "once per telegram");
         assert!(rhythm.is_slow(26_000_001) && !rhythm.is_slow(26_000_000));
-        // All of them were there before the host looked: it looks earlier from then on.
+        // All of them were complete before the host read, so it reads earlier from then on.
         for _ in 0..16 {
             rhythm.complete(17_500_000);
         }
@@ -324,7 +322,7 @@ mod tests {
     }
 
     #[test]
-    fn in_pieces_the_host_looks_once_for_each() {
+    fn host_reads_once_for_each_piece() {
         let mut rhythm = Rhythm::new();
         (0..3).for_each(|_| rhythm.complete(18_000_000));
         rhythm.look_in(3);
@@ -334,12 +332,8 @@ mod tests {
         assert_eq!(rhythm.rest(12_050_000), Some(17_400_000), "the end, a little before it");
         assert_eq!(rhythm.rest(17_450_000), None);
         rhythm.begin(100_000_000);
-        assert_eq!(
-            rhythm.rest(113_000_000),
-            Some(117_400_000),
-            "a host that is late passes over what is over"
-        );
-        // So many pieces that the last one would be where the end is.
+        assert_eq!(rhythm.rest(113_000_000), Some(117_400_000), "a late host skips pieces that have arrived");
+        // With 200 pieces, the last one would be at the end.
         rhythm.look_in(200);
         rhythm.begin(0);
         let looks = core::iter::successors(rhythm.rest(0), |&at| rhythm.rest(at)).count();

@@ -1,33 +1,33 @@
-//! When the scans of a stream are due. A sensor sends them one period apart, whatever becomes of them on the way: so
-//! those that never came can be counted, and one that waited while the host did not run can be dated. Knows no bytes.
-//! If a sensor is silent for longer than the session waits, that is not counted as loss on the line: the stream starts
-//! again.
+//! Due times of the scans of a stream.
+//!
+//! A scanner sends scans one period apart, even if they do not arrive. So lost ones can be counted, and one that was in a backlog can
+//! be stamped. If a scanner is silent for longer than the session waits, that is not a loss on the line: the stream starts again.
 
 use schema::{MILLIS, Nanos};
 
-/// The beat of one stream, and the account of all streams of a session.
+/// Due times of one stream, and counters of all streams of a session.
 #[derive(Clone, Debug)]
 pub(crate) struct Cadence {
-    /// The period that the beat began with, by the sensor's settings.
+    /// Period by the scanner's settings.
     nominal: Nanos,
-    /// The period as it was measured since: a sensor's motor and a host's clock are never quite equal.
+    /// Measured period. It differs, because the scanner's motor and the host's clock are never exact.
     period: Nanos,
-    /// When the last scan was due; `None`: the next one begins a beat.
+    /// Due time of the last scan. `None`: the next one begins a cadence.
     last: Option<Nanos>,
-    /// Two scans came one period apart: the sensor does send that often.
+    /// Whether two scans have arrived one period apart, so that the scanner does send that often.
     is_steady: bool,
     lesson: Lesson,
-    /// Scans that were due after the first one of each beat, and those of them that came.
+    /// Number of scans that were due after the first one of each cadence, and of those that arrived.
     due: u64,
     came: u64,
-    /// Those that did not come, for sure.
+    /// Number of scans that certainly did not arrive.
     lost: u64,
-    /// The fewest that were missing since then: what is only late is missing for a moment.
+    /// Minimum number of missing scans since `settled_at`. A late one is missing only for a moment.
     least: u64,
     settled_at: Nanos,
 }
 
-/// From which scan on the period is measured, and over how many.
+/// Measurement of the period.
 #[derive(Clone, Copy, Debug)]
 struct Lesson {
     begin: Nanos,
@@ -51,22 +51,22 @@ impl Cadence {
         }
     }
 
-    /// Scans that the sensor must have sent since the first one of each stream; 0 also where that is not known.
+    /// Returns the number of scans that the scanner must have sent since the first one of each stream. Not counted if unknown.
     pub(crate) fn due(&self) -> u64 {
         self.due
     }
 
-    /// Those of them that did not arrive. One that is missing counts after a second: it might only be late.
+    /// Returns the number of those that did not arrive. A missing one counts after a second, because it may only be late.
     pub(crate) fn lost(&self) -> u64 {
         self.lost
     }
 
-    /// When the scan is due that comes so many periods after the last one; nothing before there was one.
+    /// Returns the due time `slots` periods after the last scan. `None` before the scanner is known to be steady.
     pub(crate) fn after(&self, slots: u64) -> Option<Nanos> {
         self.last.filter(|_| self.is_steady).map(|last| last + slots * self.period)
     }
 
-    /// The stream ended, or a request was sent, for which the sensor skips scans: the next scan starts a new cadence.
+    /// Ends the cadence, because the stream ended, or a request was sent, for which the scanner skips scans.
     pub(crate) fn rest(&mut self) {
         if self.last.take().is_some() {
             self.lost = self.lost.max(self.due.saturating_sub(self.came));
@@ -74,7 +74,7 @@ impl Cadence {
         }
     }
 
-    /// A scan began at `at`, which may be an estimate, of a sensor that sends one each `nominal`.
+    /// Handles a scan that began at `at`, of a scanner with the period `nominal`.
     pub(crate) fn note(&mut self, at: Nanos, estimated: bool, nominal: Nanos) {
         if nominal != self.nominal {
             self.rest();
@@ -89,7 +89,7 @@ impl Cadence {
         let (since, period) = (at as i64 - last as i64, self.period as i64);
         let slots = (since + period / 2).div_euclid(period).max(0);
         let off = since - slots * period;
-        // What a busy host adds to one stamp shall not move the beat by as much.
+        // The delay that a busy host adds to one stamp must not move the due times by as much.
         let due = last.saturating_add_signed(slots * period + off / if estimated { 8 } else { 2 });
         self.last = Some(due);
         let slots = slots as u64;
@@ -105,7 +105,7 @@ impl Cadence {
         }
     }
 
-    /// Takes the mean of the lesson for the period, if it can be one.
+    /// Uses the mean of the measurement as the period, if it is plausible.
     fn learn(&mut self, due: Nanos) {
         let Lesson { begin, slots, length } = self.lesson;
         let mean = due.saturating_sub(begin) / slots;
@@ -115,7 +115,7 @@ impl Cadence {
         self.lesson = Lesson { begin: due, slots: 0, length: (2 * length).min(LONGEST_LESSON) };
     }
 
-    /// What was missing for a whole second is lost.
+    /// Counts scans as lost that were missing for a whole second.
     fn settle(&mut self, at: Nanos) {
         let missing = self.due.saturating_sub(self.came);
         self.least = self.least.min(missing);
@@ -127,12 +127,12 @@ impl Cadence {
     }
 }
 
-/// Scans by which the period is measured at first, and at most.
+/// Number of scans of the first measurement, and of the longest one.
 const FIRST_LESSON: u64 = 64;
 const LONGEST_LESSON: u64 = 256;
-/// A mean that is off by this part of the nominal period is none: something was miscounted.
+/// A mean that differs by this part of the nominal period is not plausible: scans were miscounted.
 const TOLERANCE: u64 = 6;
-/// What comes later than so much is lost: a network may hold back for some tenths of a second.
+/// A scan that is later than this is lost. A network may delay scans for some tenths of a second.
 const LATEST: Nanos = 1_000 * MILLIS;
 
 #[cfg(test)]
@@ -141,8 +141,8 @@ mod tests {
 
     const PERIOD: Nanos = 26_640_000;
 
-    /// The account after scans at these times, in periods.
-    fn heard(scans: impl IntoIterator<Item = f64>) -> Cadence {
+    /// Returns the cadence after scans at these times, in periods.
+    fn after_scans(scans: impl IntoIterator<Item = f64>) -> Cadence {
         let mut cadence = Cadence::new();
         for at in scans {
             cadence.note(((100.0 + at) * PERIOD as f64) as Nanos, false, PERIOD);
@@ -152,7 +152,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_missing_is_counted_once_it_cannot_come_any_more() {
+    fn counts_missing_scans_when_they_are_too_late() {
         let mut cadence = Cadence::new();
         for n in (0..100).filter(|n| ![20, 40, 41, 42].contains(n)) {
             cadence.note(n * PERIOD, false, PERIOD);
@@ -165,10 +165,10 @@ mod tests {
     }
 
     #[test]
-    fn a_host_or_network_that_is_late_loses_nothing() {
+    fn delays_are_not_losses() {
         let jittery = (0..4000).map(|n| f64::from(n) + f64::from(n * 7 % 10) * 0.04);
-        assert_eq!(heard(jittery).lost(), 0);
-        // A network that holds back for 200 ms, now and then, and then brings all at once.
+        assert_eq!(after_scans(jittery).lost(), 0);
+        // A network that sometimes delays scans for 200 ms, and then delivers all at once.
         let held = (0..4000).map(|n| f64::from(if n % 100 < 8 { n - n % 100 + 8 } else { n }));
         let mut cadence = Cadence::new();
         for at in held {
@@ -178,24 +178,24 @@ mod tests {
     }
 
     #[test]
-    fn a_period_that_is_not_quite_the_nominal_one_is_learned() {
+    fn measures_a_period_near_the_nominal_one() {
         for drift in [0.97, 0.999, 1.001, 1.03, 1.12] {
             let kept = |n: &u32| !n.is_multiple_of(3) || n.is_multiple_of(5);
             let scans = (0..3000).filter(kept).map(|n| f64::from(n) * drift);
             let lost = (0..3000).filter(|n| !kept(n)).count() as u64;
-            let counted = heard(scans).lost();
+            let counted = after_scans(scans).lost();
             assert!(counted.abs_diff(lost) <= 2, "{drift}: {counted} of {lost}");
         }
         let mut cadence = Cadence::new();
         (0..400).for_each(|n| cadence.note(n * (PERIOD + 30_000), false, PERIOD));
-        let due = cadence.after(80).expect("a beat");
+        let due = cadence.after(80).expect("steady");
         assert!(due.abs_diff((399 + 80) * (PERIOD + 30_000)) < 100_000, "{due}");
     }
 
     #[test]
-    fn what_may_be_anything_is_not_counted() {
-        // A sensor that sends every other scan all the while.
-        let slow = heard((0..100).map(|n| f64::from(2 * n)));
+    fn ambiguous_gaps_are_not_counted() {
+        // A scanner that always sends every other scan.
+        let slow = after_scans((0..100).map(|n| f64::from(2 * n)));
         assert_eq!((slow.due(), slow.lost()), (0, 0));
         // A pause.
         let mut cadence = Cadence::new();

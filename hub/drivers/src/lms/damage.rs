@@ -1,23 +1,22 @@
-//! How much of a stream the line damages: bytes that are in no telegram although neither side broke off a
-//! transmission. Bytes of another rate, or of a stream that is being stopped, do not count: they say nothing about the
-//! line.
+//! Damage on the line: bytes of a stream that are in no telegram although neither side aborted a transmission. Bytes of another
+//! rate, or of a stream that is being stopped, do not count, because they do not indicate the quality of the line.
 
 use crate::lms::framer::Tally;
 use schema::{MILLIS, Nanos};
 
-/// The account of all streams of a session.
+/// Damage of all streams of a session.
 #[derive(Clone, Copy, Debug, Default)]
 pub(crate) struct Damage {
-    /// Bytes damaged, up to `seen`.
+    /// Number of damaged bytes, up to `seen`.
     damaged: u64,
-    /// The account of bytes as it was when the stream was last looked at; nothing while there is none.
+    /// Number of bytes in no telegram when the stream was last checked. `None` without a stream.
     seen: Option<u64>,
-    /// When bytes were last found damaged.
+    /// Time at which bytes were last found damaged.
     last: Option<Nanos>,
 }
 
 impl Damage {
-    /// The stream goes on, or begins, with this account of its bytes.
+    /// Handles the counters of a stream that begins or continues.
     pub(crate) fn note(&mut self, tally: &Tally, now: Nanos) {
         let in_nothing = in_nothing(tally);
         if let Some(seen) = self.seen.replace(in_nothing)
@@ -28,17 +27,17 @@ impl Damage {
         }
     }
 
-    /// There is no stream.
+    /// Ends the stream.
     pub(crate) fn end(&mut self) {
         self.seen = None;
     }
 
-    /// Bytes of streams that were damaged, with those since the last look.
+    /// Returns the number of damaged bytes, including those since the last check.
     pub(crate) fn damaged(&self, tally: &Tally) -> u64 {
         self.damaged + self.seen.map_or(0, |seen| in_nothing(tally) - seen)
     }
 
-    /// Whether what comes at `now` may be damaged where its checksum did not notice.
+    /// Returns whether a telegram that arrives at `now` may be damaged although its checksum is right.
     pub(crate) fn is_recent(&self, now: Nanos) -> bool {
         self.last.is_some_and(|last| now.saturating_sub(last) < RECENT)
     }
@@ -48,7 +47,7 @@ fn in_nothing(tally: &Tally) -> u64 {
     tally.discarded - tally.broken_off
 }
 
-/// A line that damaged something a while ago is well now.
+/// Time for which a line counts as damaging after the last damage.
 const RECENT: Nanos = 10_000 * MILLIS;
 
 #[cfg(test)]
@@ -56,7 +55,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn only_what_a_stream_loses_counts() {
+    fn counts_only_bytes_of_streams() {
         let tally = |discarded, broken_off| Tally { discarded, broken_off, ..Tally::default() };
         let mut damage = Damage::default();
         damage.note(&tally(500, 0), 1);

@@ -1,7 +1,7 @@
-//! Finds answers and packets in a stream of bytes of which some are missing, and the greeting of a scanner that booted.
+//! Finds responses and packets in a stream that may lack bytes, and the boot message of a scanner.
 //!
-//! A packet of one point has no checksum, and of wrong places 1 in 70 looks like one. So such packets are believed after a
-//! run of them with angles near each other, and each only if another one follows it. Knows no clock.
+//! A packet of one point has no checksum, and 1 in 70 wrong positions looks like one. So such packets are accepted after a run
+//! of them with angles near each other, and each only if another one follows it.
 
 use crate::line::framing::{Format, Verdict, judge};
 use crate::line::{Buffer, Tally, suspect};
@@ -10,45 +10,45 @@ use schema::{MILLIS, Nanos};
 use crate::rplidar::packet::Kind;
 use crate::rplidar::request::{Answer, Head};
 
-/// What the bytes may be.
+/// Expected contents of the bytes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Expect {
-    /// Nothing that is wanted.
+    /// Nothing: all bytes are discarded.
     Nothing,
-    /// Answers, among what is left of a stream.
+    /// Responses, among the rest of a stream.
     Answers,
     /// Packets of this kind.
     Packets(Kind),
-    /// Packets of any kind; express and dense ones look alike, these are taken for the given one, if there is one.
+    /// Packets of any kind. Express and dense ones look alike, and count as the given kind; `None` if unknown.
     Anything(Option<Kind>),
 }
 
-/// What was found.
+/// Contents that were found.
 #[derive(Clone, Copy, Debug)]
 pub(crate) enum Found {
-    /// An answer, its head and what follows it.
+    /// A response with its descriptor.
     Reply(Answer, Span),
-    /// The head of packets.
+    /// The descriptor of packets.
     Stream(Span),
-    /// Packets without anything between them.
+    /// Packets without other bytes between them.
     Packets(Kind, Span),
-    /// The text that a scanner sends when it booted. Other bytes may be text too, but hardly ever contain the word `LIDAR`.
+    /// The boot message, which is text. Other bytes may be text too, but hardly ever contain the word `LIDAR`.
     Greeting {
         /// Whether the text contains that word.
         is_named: bool,
     },
 }
 
-/// Bytes in the framer's buffer, until the next ones come.
+/// Bytes in the framer's buffer, until the next ones are committed.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Span {
     at: usize,
     pub(crate) len: usize,
-    /// How many packets they are.
+    /// Number of packets.
     pub(crate) packets: usize,
     /// Number of the first byte among all bytes committed, from 0.
     pub(crate) offset: u64,
-    /// Bytes between it and the packet before it.
+    /// Number of bytes between it and the packet before.
     pub(crate) skipped: u32,
     /// Bits of [`suspect`]; 0 is clean.
     pub(crate) reasons: u8,
@@ -59,17 +59,17 @@ pub(crate) struct Span {
 pub(crate) struct Framer {
     buffer: Buffer<CAPACITY>,
     expect: Expect,
-    /// The next packet has to begin where the last one ended.
+    /// Whether the next packet must begin at the end of the last one.
     is_locked: bool,
     is_held: bool,
     is_released: bool,
-    /// Bytes discarded since the last packet.
+    /// Number of bytes discarded since the last packet.
     skipped: u32,
-    /// Printable ones among them, in a row, the last of them, and whether they contain [`NAME`].
+    /// Number of printable ones in a row, the last of them, and whether they contain [`NAME`].
     text: usize,
     last_text: [u8; NAME.len()],
     is_named: bool,
-    /// There were packets that look alike, and it was not said what they are.
+    /// Whether packets that look alike have arrived, and their kind is unknown.
     is_alike: bool,
 }
 
@@ -89,7 +89,7 @@ impl Format for Kind {
     }
 }
 
-/// What to do about the first open bytes.
+/// Action for the first open bytes.
 enum Step {
     Take(usize),
     Discard,
@@ -112,24 +112,24 @@ impl Framer {
         }
     }
 
-    /// From now on the bytes are this.
+    /// Sets the expected contents of the open bytes and those that follow.
     pub(crate) fn expect(&mut self, expect: Expect) {
         self.expect = expect;
         (self.is_locked, self.skipped) = (false, 0);
     }
 
-    /// Room for the next bytes, never empty after [`Framer::advance`] answered `None`.
+    /// Returns the space for the next bytes. Never empty after [`Framer::advance`] returned `None`.
     pub(crate) fn spare(&mut self) -> &mut [u8] {
         self.buffer.spare()
     }
 
-    /// The first `len` bytes of [`Framer::spare`] are valid now.
+    /// Adds the first `len` bytes of [`Framer::spare`].
     pub(crate) fn commit(&mut self, len: usize) {
         self.buffer.commit(len);
         self.is_released &= len == 0;
     }
 
-    /// What is next, of packets `most` at most; `None` until more bytes come.
+    /// Returns what is next, at most `most` packets. `None` until more bytes arrive.
     pub(crate) fn advance(&mut self, most: usize) -> Option<Found> {
         self.is_held = false;
         loop {
@@ -137,7 +137,7 @@ impl Framer {
             if open.is_empty() {
                 return None;
             }
-            // What begins where the last packet ended is the next one, though it may look like an answer.
+            // Bytes at the end of the last packet are the next one, even if they look like a response.
             if !self.is_locked && self.expect != Expect::Nothing && Head::begins(open) {
                 match Head::parse(open) {
                     Some(Head::Reply(_, len)) if open.len() < Head::LEN + len => return None,
@@ -170,40 +170,40 @@ impl Framer {
         }
     }
 
-    /// The bytes at a span that [`Framer::advance`] answered last.
+    /// Returns the bytes of the span that [`Framer::advance`] returned last.
     pub(crate) fn bytes(&self, span: Span) -> &[u8] {
         self.buffer.taken(span.at, span.len)
     }
 
-    /// Of `span`, which [`Framer::advance`] answered last, the packets from number `packets` on are to come once more.
+    /// Shortens `span`, which [`Framer::advance`] returned last, to the first `packets` packets. The others will be returned once more.
     pub(crate) fn cut(&mut self, span: &mut Span, packets: usize) {
         let len = span.len / span.packets;
         self.buffer.give_back((span.packets - packets) * len, span.packets - packets);
         (span.len, span.packets) = (packets * len, packets);
     }
 
-    /// How long the line must be idle until [`Framer::release`] may let pass what waits; `None` if nothing does.
+    /// Returns how long the line must be idle until [`Framer::release`] releases a packet that is held back. `None` if there is none.
     pub(crate) fn hold(&self) -> Option<Nanos> {
         self.is_held.then_some(HOLD)
     }
 
-    /// A read found nothing, and no byte came for `idle`.
+    /// Handles a read that found nothing. No byte has arrived for `idle`.
     pub(crate) fn release(&mut self, idle: Nanos) {
         self.is_released |= self.is_held && idle >= HOLD;
     }
 
-    /// Gives up all bytes that are still open.
+    /// Discards all open bytes.
     pub(crate) fn clear(&mut self) {
         self.buffer.clear();
         (self.is_held, self.is_released, self.text) = (false, false, 0);
     }
 
-    /// The kind of packets that are expected.
+    /// Returns the kind of the expected packets.
     pub(crate) fn kind(&self) -> Option<Kind> {
         if let Expect::Packets(kind) = self.expect { Some(kind) } else { None }
     }
 
-    /// Whether there were packets of which it was not said what they are.
+    /// Returns whether packets of an unknown kind have arrived.
     pub(crate) fn is_alike(&self) -> bool {
         self.is_alike
     }
@@ -250,7 +250,7 @@ impl Framer {
         }
     }
 
-    /// Packets of one point, `most` at most, as far as they are believed.
+    /// Checks for packets of one point, at most `most`.
     fn nodes(&self, most: usize) -> Step {
         let open = self.buffer.open();
         let (run, is_open) = run(open, most.max(RUN) + 1);
@@ -269,7 +269,7 @@ impl Framer {
         }
     }
 
-    /// Looks for two packets of any kind, one behind the other.
+    /// Searches for two consecutive packets of any kind.
     fn seek(&mut self, alike: Option<Kind>) -> Step {
         let open = self.buffer.open();
         let mut is_open = false;
@@ -310,7 +310,7 @@ impl Framer {
         Span { at: self.buffer.take(len, packets), len, packets, offset, skipped, reasons }
     }
 
-    /// Gives up the first open byte. Returns whether a greeting is found with it.
+    /// Discards the first open byte. Returns whether a boot message is found with it.
     fn discard(&mut self) -> bool {
         let byte = self.buffer.open().first().copied().unwrap_or_default();
         let is_text = matches!(byte, b' '..=b'~' | b'\r' | b'\n');
@@ -323,12 +323,12 @@ impl Framer {
         self.text = if is_text { self.text + 1 } else { 0 };
         let is_name = self.last_text == *NAME && !self.is_named;
         self.is_named |= is_name;
-        // Text may precede the greeting, so that its name comes late.
+        // Text may precede the boot message, so that its name arrives late.
         self.text == GREETING || is_name && self.text > GREETING
     }
 }
 
-/// How many packets of one point are here in a row, of `most`, and whether more bytes could make it longer.
+/// Returns the number of consecutive packets of one point, at most `most`, and whether more bytes could extend the run.
 fn run(open: &[u8], most: usize) -> (usize, bool) {
     let mut before = None;
     let (nodes, rest) = open.as_chunks::<5>();
@@ -344,15 +344,15 @@ fn run(open: &[u8], most: usize) -> (usize, bool) {
     (nodes.len().min(most), is_open)
 }
 
-/// What a tty keeps for a reader who is late, and two packets.
+/// Capacity of a tty for a late reader, and two packets.
 const CAPACITY: usize = 4_096 + 2 * Kind::LONGEST;
-/// After so long without a byte nothing is under way: an adapter hands bytes on by the packet, in the slowest stream each 6 ms.
+/// After this time without a byte, no more bytes are in flight: in the slowest stream, an adapter passes on a packet every 6 ms.
 const HOLD: Nanos = 10 * MILLIS;
-/// Packets of one point that are believed together: wrong places give as many once in millions.
+/// Minimum number of packets of one point in a run. A wrong position has as many once in millions.
 const RUN: usize = 6;
-/// Degrees between two points of one head, one after the other, even if some are missing between them.
+/// Maximum angle between two consecutive points in degrees, even if some are missing between them.
 const NEAR: f32 = 30.0;
-/// A scanner that booted sends 64 bytes of text, of which some may be missing.
+/// Minimum length of a boot message. It has 64 bytes of text, and some may be missing.
 const GREETING: usize = 40;
 /// Part of that text, near its beginning.
 const NAME: &[u8; 5] = b"LIDAR";

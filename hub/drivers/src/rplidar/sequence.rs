@@ -1,21 +1,22 @@
-//! What a packet is to the one before it: the next one, one after a gap, or something that does not belong there. Packets have
-//! no counter. But a head turns evenly, so the angle from packet to packet is known, and how many are missing in a gap is
-//! that angle's share of it; how many turns are missing besides, only the time tells. Knows no bytes.
+//! Position of a packet in its stream: the next one, one after a gap, or an outlier.
+//!
+//! Packets have no counter. But a head rotates evenly, so the angle from packet to packet is known. The number of missing packets
+//! follows from the angle of the gap, and the number of missing revolutions from the time.
 
 /// The packets of one stream: of several points each, or of one.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Sequence {
     last: Option<Seen>,
-    /// One that did not belong there: the next one may tell that it did.
+    /// Angle of the last outlier. The next packet may show that it was none.
     odd: Option<f32>,
     odds: u32,
-    /// Degrees from one packet to the next, and packets that it was learned from.
+    /// Degrees from one packet to the next, and number of packets that it was measured with.
     advance: f64,
     lessons: u32,
-    /// Of packets of one point: where a full turn is counted from, and how many came since.
+    /// For packets of one point: angle at which a full revolution began, and number of packets since.
     counted: (f64, u32),
     is_whole: bool,
-    /// As many points as bytes between them may have been that came since.
+    /// Number of points that the bytes between packets since then may have been.
     doubtful: u32,
     came: u64,
     lost: u64,
@@ -31,38 +32,38 @@ struct Seen {
 /// The place of a packet in its stream.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Place {
-    /// How it follows.
+    /// Relation to the last packet.
     pub(crate) step: Step,
-    /// Degrees of its first point, clockwise over all turns.
+    /// Degrees of its first point, clockwise over all revolutions.
     pub(crate) angle: f64,
-    /// When its first point was measured, by the scanner's clock in nanoseconds.
+    /// Time of its first point, by the scanner's clock in nanoseconds.
     pub(crate) time: f64,
 }
 
-/// How a packet follows the last one.
+/// Relation of a packet to the last one.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) enum Step {
-    /// A new sequence begins with it, and with it a new clock.
+    /// The packet begins a new sequence, and with it a new clock.
     First,
-    /// It is the next one.
+    /// The packet is the next one.
     Next,
-    /// Others are missing between, or may be: the last one was at `from`.
+    /// Packets are missing between the two, or may be. The last one was at `from`.
     Gap {
         /// Degrees, as in [`Place::angle`].
         from: f64,
-        /// So long it took, in nanoseconds, by the packets that were counted.
+        /// Duration in nanoseconds, by the counted packets.
         ns: f64,
     },
-    /// It does not belong here.
+    /// The packet is an outlier.
     Odd,
 }
 
-/// A packet that came.
+/// A received packet.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Came {
     /// Degrees of its first point, clockwise.
     pub(crate) start: f32,
-    /// Bytes between it and the last one that are in nothing.
+    /// Number of discarded bytes between it and the last one.
     pub(crate) skipped: u32,
     /// Nanoseconds from one packet to the next.
     pub(crate) packet_ns: f64,
@@ -90,28 +91,28 @@ impl Sequence {
         }
     }
 
-    /// The stream ended: the next packet is the first one of another.
+    /// Ends the sequence: the next packet is the first one of another.
     pub(crate) fn end(&mut self) {
         (self.last, self.odd, self.odds, self.lessons) = (None, None, 0, 0);
     }
 
-    /// Whether a packet came since the stream began.
+    /// Returns whether a packet has arrived since the sequence began.
     pub(crate) fn is_begun(&self) -> bool {
         self.last.is_some()
     }
 
-    /// Packets that came, and those that did not although the ones before and after them did.
+    /// Returns the numbers of received packets, and of lost ones between them.
     pub(crate) fn came_and_lost(&self) -> (u64, u64) {
         (self.came, self.lost)
     }
 
-    /// Degrees from one packet to the next; nothing before that is known, or if the head stands still.
+    /// Returns the degrees from one packet to the next. `None` until they are known, and if the head stands still.
     pub(crate) fn advance(&self) -> Option<f64> {
         (self.lessons >= LESSONS && self.advance > STILL).then_some(self.advance)
     }
 
-    /// A packet of several points came; `late` says by how many nanoseconds more than usual, if its first point was
-    /// measured at that time, and whether it is behind a gap.
+    /// Places a packet of several points. `late` returns the nanoseconds by which it arrived later than usual if its first point was
+    /// measured at the given time. Its second argument is whether there is a gap before.
     pub(crate) fn place(&mut self, came: Came, late: impl Fn(f64, bool) -> f64) -> Place {
         self.came += 1;
         let Some(last) = self.last else { return self.first(came.start) };
@@ -136,7 +137,7 @@ impl Sequence {
         let late = |time: f64| late(time, true);
         let angle = angle + 360.0 * turn.missing(late(last.time + turn.time(angle)));
         let packets = f64::from((angle / advance + 0.5) as u32);
-        // In a long gap a head may have changed its speed: then the time tells better how many there were.
+        // In a long gap, a head may have changed its speed. Then the time indicates the number of packets better.
         let most = f64::from((0.1 * packets) as u32);
         let late_by = late(last.time + packets * came.packet_ns) / came.packet_ns;
         let off = (late_by + 0.5f64.copysign(late_by)).clamp(-most, most) as i32;
@@ -153,14 +154,14 @@ impl Sequence {
         self.next(last, came, angle, packets, Step::Gap { from: last.angle, ns })
     }
 
-    /// A packet of one point came: such points may lie before ones that came before them.
+    /// Places a packet of one point, whose angle may be smaller than that of an earlier one.
     pub(crate) fn place_point(&mut self, came: Came, late: impl Fn(f64, bool) -> f64) -> Place {
         self.came += 1;
         let Some(last) = self.last else { return self.first(came.start) };
         let angle = clockwise(last.start, came.start);
         let angle = if angle > 360.0 - BACK { angle - 360.0 } else { angle };
         self.is_whole &= came.adjoins();
-        // What is left of points that lost bytes, or had one too many; what took less time than points do was none.
+        // The skipped bytes may be points that lost bytes or had additional ones, but not if they took less time than points.
         let points = f64::from(1 + (came.skipped + 3) / POINT);
         let early = if came.adjoins() { 0.0 } else { -late(last.time + points * came.packet_ns, false) };
         let points = f64::from((points - early.max(0.0) / came.packet_ns).max(1.0) as u32);
@@ -204,7 +205,7 @@ impl Sequence {
         Place { step: Step::First, angle, time }
     }
 
-    /// It came `packets` packets and `angle` degrees after `last`.
+    /// Places a packet `packets` packets and `angle` degrees after `last`.
     fn next(&mut self, last: Seen, came: Came, angle: f64, packets: f64, step: Step) -> Place {
         let is_steady = self.lessons >= STEADY;
         let missing = if is_steady { (packets - 1.0).max(0.0) as u64 } else { 0 };
@@ -220,7 +221,7 @@ impl Sequence {
         self.counted.1 += packets as u32;
         let (from, count) = self.counted;
         let passed = place.angle - from;
-        // A turn in which the head stood still is none.
+        // A revolution in which the head stood still does not count.
         if self.advance().is_some_and(|advance| f64::from(count) > (passed + 90.0) / advance) {
             return self.first(came.start);
         }
@@ -230,7 +231,7 @@ impl Sequence {
         (self.counted, self.doubtful) = ((place.angle, 0), 0);
         let whole = core::mem::replace(&mut self.is_whole, true);
         match self.advance() {
-            // What is missing without a jump of the angle.
+            // Points are missing without a jump of the angle.
             Some(advance) if !whole => {
                 let missing = passed / advance - f64::from(count);
                 if missing >= 2.0 {
@@ -248,7 +249,7 @@ impl Sequence {
         place
     }
 
-    /// It does not belong here, unless it goes on from the last one that did not.
+    /// Handles an outlier, unless enough of them follow each other.
     fn odd(&mut self, came: Came) -> Place {
         let follows = self.odd.is_some_and(|odd| clockwise(odd, came.start) < WIDEST);
         if follows && came.adjoins() && self.odds + 1 >= LESSONS {
@@ -260,71 +261,69 @@ impl Sequence {
     }
 }
 
-/// Degrees from one angle to another, 0 to 360.
+/// Returns the degrees from one angle to another, 0 to 360.
 fn clockwise(from: f32, to: f32) -> f64 {
     let angle = f64::from(to) - f64::from(from);
     if angle < 0.0 { angle + 360.0 } else { angle }
 }
 
-/// How fast a head turns.
+/// Speed of a head.
 #[derive(Clone, Copy)]
 struct Turn {
-    /// Degrees from one packet to the next, and nanoseconds.
+    /// Degrees and nanoseconds from one packet to the next.
     advance: f64,
     packet_ns: f64,
 }
 
 impl Turn {
-    /// Nanoseconds that `angle` degrees take.
+    /// Returns the nanoseconds for `angle` degrees.
     fn time(self, angle: f64) -> f64 {
         angle / self.advance * self.packet_ns
     }
 
-    /// How many turns are missing where a packet comes later than usual by `late`.
+    /// Returns the number of missing revolutions before a packet that is `late` nanoseconds later than usual.
     fn missing(self, late: f64) -> f64 {
         f64::from((late.max(0.0) / self.time(360.0) + 0.5) as u32)
     }
 
-    /// Whether a packet that is `angle` degrees behind the last one comes before it was measured: clocks differ by little.
+    /// Returns whether a packet `angle` degrees after the last one arrived before it was measured. The clocks differ by little.
     fn is_early(self, late: f64, angle: f64) -> bool {
         late < -(EARLY + MOST_DRIFT * self.time(angle))
     }
 
-    /// Whether a packet comes so much later than its angle says that the scanner did not send for a while.
+    /// Returns whether the scanner did not send for a while, because a packet is much later than its angle indicates.
     fn is_apart(self, late: f64) -> bool {
         late > 0.15 * self.time(360.0)
     }
 }
 
-/// Packets that agree before it is believed how far they are apart; and those in a row that may be wrong.
+/// Number of packets in agreement until the angle between them counts, and of outliers in a row until they do.
 const LESSONS: u32 = 3;
-/// Packets that agree before it is believed that what does not come is missing: a head gets up to its speed.
+/// Number of packets in agreement until missing ones count as lost. Before, the head may not have its speed yet.
 const STEADY: u32 = 12;
-/// Degrees of the widest packet: a head that turns so fast measures less than four of them in a turn.
+/// Maximum degrees of a packet. A faster head measures less than four of them in a revolution.
 const WIDEST: f64 = 100.0;
-/// Degrees of a packet of a head that stands still.
+/// Maximum degrees of a packet of a head that stands still.
 const STILL: f64 = 0.02;
-/// The scanner's clock begins so late that nothing is before it, in nanoseconds.
+/// Beginning of the scanner's clock in nanoseconds, so late that no time is negative.
 const BEGIN: f64 = 1e10;
-/// Degrees by which a point may lie before one that came before it, and behind it without a gap.
+/// Degrees by which a point may be before the previous one, and after it without a gap.
 const BACK: f64 = 25.0;
 const AHEAD: f64 = 25.0;
-/// Nanoseconds by which nothing comes before its time, and the share of the time since the last packet by which two clocks
-/// may differ.
+/// Nanoseconds by which a packet may be early, and share of the time since the last packet by which two clocks may differ.
 const EARLY: f64 = 3e6;
 const MOST_DRIFT: f64 = 0.02;
-/// Bytes of a packet of one point.
+/// Length of a packet of one point, in bytes.
 const POINT: u32 = 5;
-/// So many points of a stream of single ones may be missing without a word.
+/// Number of single points that may be missing without a gap.
 const GAP: u32 = 30;
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
-    /// Packets of a head that gets up to its speed within 200 of them, and goes on.
     #[test]
-    fn nothing_is_lost_while_a_head_gets_up_to_its_speed() {
+    fn counts_no_loss_during_spin_up() {
         for steps in [20.0, 60.0, 200.0] {
             let (mut sequence, mut start, mut begun) = (Sequence::new(), 0.0f64, 0.0);
             for n in 0..400 {
@@ -341,9 +340,8 @@ mod tests {
         }
     }
 
-    /// Packets are counted by the time where the angle leaves it open, to the nearest.
     #[test]
-    fn over_a_long_gap_the_time_tells_how_many_packets_there_were() {
+    fn counts_packets_of_a_long_gap_by_time() {
         let (mut sequence, packet_ns, advance) = (Sequence::new(), 12e6, 32.57);
         let mut place = |n: f64, angle: f64| {
             let came = Came { start: (angle % 360.0) as f32, skipped: 0, packet_ns };
@@ -352,14 +350,14 @@ mod tests {
         (0..40).map(f64::from).for_each(|n| {
             place(n, n * advance);
         });
-        // The head turned by 0.2 % slower.
+        // The head was slower by 0.2 %.
         let behind = place(39.0 + 256.8, (39.0 + 256.4) * advance);
         assert!(matches!(behind.step, Step::Gap { .. }), "{behind:?}");
         assert_eq!(((behind.time - BEGIN) / packet_ns).round(), 39.0 + 257.0);
     }
 
     #[test]
-    fn what_a_line_puts_between_points_are_no_points() {
+    fn inserted_bytes_are_not_counted_as_points() {
         let (mut sequence, packet_ns, advance) = (Sequence::new(), 217e3, 0.78);
         let mut place = |n: u32, skipped: u32| {
             let start = (f64::from(n) * advance % 360.0) as f32;
@@ -369,9 +367,9 @@ mod tests {
         (0..3_000).for_each(|n| {
             place(n, 0);
         });
-        // 12 bytes after each point, then 4,693 at once, and a piece of ten points that are gone.
+        // 12 bytes after each point, then 4,693 at once, and a fragment of ten lost points.
         let steps: [Step; 49] = core::array::from_fn(|i| place(3_001 + i as u32, 12).step);
-        assert!(matches!(steps, [Step::Next, .., Step::Gap { .. }]), "so many may have been points");
+        assert!(matches!(steps, [Step::Next, .., Step::Gap { .. }]), "that many bytes may have been points");
         place(3_051, 4_693);
         let last = place(3_060, 43);
         assert!(((last.time - BEGIN) / packet_ns - 3_060.0).abs() < 1.5, "{last:?}");

@@ -384,12 +384,12 @@ impl Session {
     fn receive(&mut self, kind: Kind, mut span: Span) -> Received<'_> {
         self.continue_stream();
         span.reasons |= self.reads.take_doubt(span.offset + span.len as u64);
-        let (baud, model) = (self.rate.baud(), self.model());
+        let baud = self.rate.baud();
         let pace = (!self.settings.fixed_rate).then_some(baud);
         let line = Line { arrivals: self.reads.arrivals(), baud, pace };
         let mut stamps = None;
         if self.stream.measure(kind, span, line, self.handshake.modes()) {
-            stamps = self.stream.place(kind, &mut span, &mut self.framer, line, model);
+            stamps = self.stream.place(kind, &mut span, &mut self.framer, line, &self.handshake);
             self.counters.note_packets(self.framer.tally(), span.packets);
         }
         let packet_time = line_time(kind.bytes(), baud);

@@ -5,8 +5,7 @@ use crate::line::{self, Arrivals, Closed, Flow, Pace, RawScan, Reads, SensorCloc
 use schema::{Family, MILLIS, Nanos, line_time};
 
 use crate::rplidar::framer::{Framer, Span};
-use crate::rplidar::handshake::ScanModes;
-use crate::rplidar::model::Model;
+use crate::rplidar::handshake::{Handshake, ScanModes};
 use crate::rplidar::packet::Kind;
 use crate::rplidar::sequence::{Came, Place, Sequence, Step};
 use crate::rplidar::session::Settings;
@@ -126,7 +125,7 @@ impl Stream {
         span: &mut Span,
         framer: &mut Framer,
         line: Line<'_>,
-        model: Option<Model>,
+        handshake: &Handshake,
     ) -> Option<(Nanos, Nanos)> {
         let Line { arrivals, baud, pace } = line;
         let point_ns = self.point_time.ns?;
@@ -193,19 +192,19 @@ impl Stream {
         let stamps = stamp(places.first()).zip(stamp(places.last()));
         self.scanner_time = places.iter().rev().find(is_placed).map(|place| place.time as Nanos);
         self.revolutions.current = Some(Current { kind, span: *span, packet: 0, is_put: false });
-        self.choose_beams(kind, model);
+        self.choose_beams(kind, handshake);
         stamps
     }
 
     /// Chooses the number of beams as soon as the speed of the head is known, once per stream.
-    fn choose_beams(&mut self, kind: Kind, model: Option<Model>) {
+    fn choose_beams(&mut self, kind: Kind, handshake: &Handshake) {
         let Settings { mode, beams, max_beams, .. } = self.settings;
         let Some(points_per_second) = self.points_per_second().filter(|_| !self.revolutions.is_begun) else {
             return;
         };
         let Some(advance) = self.sequence.advance() else { return };
         let points_per_turn = 360.0 / advance * kind.points() as f64;
-        let own = match (model, mode) {
+        let own = match (handshake.model(), mode) {
             (Some(model), None) => model.beams(),
             (Some(model), Some(_)) => model.beams_of(points_per_second),
             (None, _) => (points_per_turn + 0.5) as usize,
