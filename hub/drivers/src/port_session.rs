@@ -166,7 +166,8 @@ impl PortSession {
         self.captured.reverse();
         self.searched += search.account().discarded;
         let begins = self.captured.last().map_or(self.now, |(at, _)| *at);
-        let mut session = Session::begin(family, &self.settings, begins);
+        let settings = Settings { is_found: true, ..self.settings };
+        let mut session = Session::begin(family, &settings, begins);
         if let Some(known) = self.known_rate {
             session.hint_rate(known);
         }

@@ -58,6 +58,8 @@ pub struct Settings {
     pub listen_only: bool,
     /// Whether the motor stops while there are no subscribers, if it [can](Features::can_rest).
     pub stop_when_idle: bool,
+    /// Whether a search has found the scanner. Its number of beams then follows what it reports.
+    pub is_found: bool,
 }
 
 /// Maps a constant array with a constant function.

@@ -40,6 +40,9 @@ pub struct Settings {
     pub listen_only: bool,
     /// Whether the motor stops while there are no subscribers.
     pub stop_when_idle: bool,
+    /// Whether a scanner whose model is not configured has as many beams as it reports points per revolution. Otherwise, it has
+    /// those of its model.
+    pub reported_beams: bool,
 }
 
 impl Settings {
@@ -115,10 +118,28 @@ impl Session {
     /// Creates a session from the settings that all families share.
     pub(crate) fn configured(settings: &family::Settings, now: Nanos) -> Session {
         let &family::Settings {
-            model, mode, beams, max_beams, fixed_rate, listen_only, stop_when_idle, ..
+            model,
+            mode,
+            beams,
+            max_beams,
+            fixed_rate,
+            listen_only,
+            stop_when_idle,
+            is_found,
+            ..
         } = settings;
         let (model, mode) = (model.and_then(Model::named), mode.and_then(Mode::named));
-        let settings = Settings { model, mode, beams, max_beams, fixed_rate, listen_only, stop_when_idle };
+        let reported_beams = is_found;
+        let settings = Settings {
+            model,
+            mode,
+            beams,
+            max_beams,
+            fixed_rate,
+            listen_only,
+            stop_when_idle,
+            reported_beams,
+        };
         Session::new(settings, now)
     }
 

@@ -6,6 +6,7 @@ use schema::{Family, MILLIS, Nanos, line_time};
 
 use crate::rplidar::framer::{Framer, Span};
 use crate::rplidar::handshake::{Handshake, ScanModes};
+use crate::rplidar::model::Model;
 use crate::rplidar::packet::Kind;
 use crate::rplidar::sequence::{Came, Place, Sequence, Step};
 use crate::rplidar::session::Settings;
@@ -205,7 +206,7 @@ impl Stream {
         let Some(advance) = self.sequence.advance() else { return };
         let points_per_turn = 360.0 / advance * kind.points() as f64;
         let own = match (handshake.model(), mode) {
-            (Some(model), None) => model.beams(),
+            (Some(model), None) => self.reported_beams(model, kind, handshake).unwrap_or(model.beams()),
             (Some(model), Some(_)) => model.beams_of(points_per_second),
             (None, _) => (points_per_turn + 0.5) as usize,
         };
@@ -213,6 +214,17 @@ impl Stream {
         let beams = beams.or(self.beams).unwrap_or(own.max(*line::grid::BEAMS.start())).min(most);
         self.beams = Some(beams);
         self.revolutions.begin(beams);
+    }
+
+    /// Returns the number of beams for the points per second that the scanner has reported, if the beams follow it: that of the
+    /// `model`, if it is close. An A1 with an old firmware measures half as many points as the others.
+    fn reported_beams(&self, model: Model, kind: Kind, handshake: &Handshake) -> Option<usize> {
+        let follows = self.settings.reported_beams && self.settings.model.is_none();
+        let point_us = self.point_time.ns.filter(|_| follows)? / 1e3;
+        let reported_us = handshake.modes().nearest_us(kind, point_us as f32)?;
+        let beams = model.beams_of(1e6 / reported_us);
+        let is_close = (beams as f64 / model.beams() as f64 - 1.0).abs() <= CLOSE;
+        Some(if is_close { model.beams() } else { beams })
     }
 
     /// Returns the speed of the head. `None` before the revolutions have begun.
@@ -436,6 +448,8 @@ const FIRST_MEASUREMENT: Nanos = 250 * MILLIS;
 const UNSTEADY: f64 = 0.005;
 /// Nanoseconds by which packets that arrive together may be late.
 const LATE: f64 = 15e6;
+/// Share by which the reported number of points may differ from that of the model.
+const CLOSE: f64 = 0.03;
 /// Maximum number of points in a revolution: those of an S2 at four revolutions per second.
 const MAX_POINTS: usize = 8_192;
 /// Maximum number of packets of one sample.

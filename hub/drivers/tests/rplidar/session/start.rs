@@ -273,6 +273,31 @@ fn old_firmware_has_two_modes() {
 }
 
 #[test]
+fn a_scanner_that_a_search_has_found_has_the_beams_that_it_reports() {
+    let found = Settings { max_beams: Some(3_240), reported_beams: true, ..Settings::default() };
+    let family = Settings { max_beams: Some(2_048), ..Settings::default() };
+    let beams = |model, is_old, settings| {
+        let mut head = Head::new(model, 1);
+        head.is_old = is_old;
+        let mut bench = Bench::new(settings, head);
+        bench.until(3 * SECOND, is_streaming);
+        bench.head.boot(bench.now);
+        bench.run(bench.now + 3 * SECOND);
+        let beams = bench.session.beams().expect("known");
+        assert!(bench.log.turns.len() > 5 && bench.log.turns.iter().all(|turn| turn.beams == beams));
+        beams
+    };
+    for model in Model::ALL {
+        assert_eq!(beams(model, false, found), model.beams(), "{model:?}");
+        assert_eq!(beams(model, false, family), model.beams().min(2_048), "{model:?}");
+    }
+    assert_eq!(beams(Model::A1, true, found), 539, "one point in 254 us, 7.3 revolutions per second");
+    assert_eq!(beams(Model::A1, true, Settings { model: Some(Model::A1), ..found }), 1_079);
+    assert_eq!(beams(Model::A1, true, Settings { beams: Some(360), ..found }), 360);
+    assert_eq!(beams(Model::A1, true, family), 1_079);
+}
+
+#[test]
 fn a_second_without_data_begins_again() {
     let mut bench = Bench::new(of(Model::A1), Head::new(Model::A1, 1));
     bench.run(3 * SECOND);
