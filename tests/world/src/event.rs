@@ -35,6 +35,8 @@ pub(crate) enum Event<'a> {
     Retuned { sensor: usize },
     /// Another process has set the port to another rate.
     Altered { sensor: usize },
+    /// The hub has written bytes to the port.
+    Written { sensor: usize },
     /// The hub has read so many bytes, up to this one.
     Read { sensor: usize, len: usize, to: u64 },
     /// A sample went to whoever is attached.
@@ -191,6 +193,10 @@ impl std::fmt::Display for Violation {
 impl Event<'_> {
     /// Takes it into the hash of everything.
     pub(crate) fn hash(&self, at: Nanos, history: &mut History) {
+        // What the scanner makes of them is hashed.
+        if matches!(self, Event::Written { .. }) {
+            return;
+        }
         history.number(at);
         let mut numbers = |numbers: &[u64]| numbers.iter().for_each(|&number| history.number(number));
         match *self {
@@ -215,7 +221,7 @@ impl Event<'_> {
                 history.bytes(&sample.bytes);
             }
             // What it tells of them is hashed.
-            Event::Measured { .. } => {}
+            Event::Measured { .. } | Event::Written { .. } => {}
             Event::Rung { sensor, ring } => numbers(&[29, sensor as u64, ring as u64]),
             Event::Lacking { sensor, topic } => numbers(&[11, sensor as u64, topic as u64]),
             Event::Attached { consumer, sensor, topic, .. } => {
@@ -300,7 +306,7 @@ impl Event<'_> {
                 }
             }
             Event::Taken { .. } | Event::Read { .. } | Event::Dropped { .. } | Event::Lacking { .. } => None,
-            Event::Rung { .. } | Event::Measured { .. } => None,
+            Event::Rung { .. } | Event::Measured { .. } | Event::Written { .. } => None,
             Event::Transmitted { .. } | Event::Republished { .. } | Event::Counted { .. } => None,
             Event::Accounted { .. } => None,
             Event::Forged { forgery, .. } => Some(format!("forged: {forgery:?}")),

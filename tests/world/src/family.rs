@@ -25,6 +25,12 @@ pub(crate) trait Family {
     /// The keys of its link, as `KEY=VALUE`.
     fn keys(&self) -> Vec<String>;
 
+    /// The same scanner at a link without a family, which has none of the keys that only one family has.
+    fn auto(&self) -> Rc<dyn Family>;
+
+    /// Its family.
+    fn family(&self) -> schema::Family;
+
     /// The longest time between two scans, and from when something is measured until the scan that tells it has left.
     fn times(&self) -> (Nanos, Nanos);
 

@@ -9,6 +9,7 @@ use daemon::surroundings::Line;
 use port::{Allowance, Alteration};
 use schema::Nanos;
 
+use crate::event::Event;
 use crate::planted::{Defect, eeprom_request};
 use crate::shared::Shared;
 
@@ -99,6 +100,7 @@ impl Line for OpenLine {
         let is_cut = |byte: &&u8| cuts && matches!(byte, 0xF0 | 0xA8);
         if self.check(tty.is_there(*device))? && !is_deaf {
             bytes.iter().filter(|byte| !is_cut(byte)).for_each(|byte| tty.write(*byte, now));
+            shared.log.tell(now, &Event::Written { sensor: *port });
         }
         Ok(())
     }

@@ -28,6 +28,9 @@ struct Arguments {
     /// So many of the first worlds are run twice, and must be equal.
     #[arg(long, default_value_t = 0)]
     twice: usize,
+    /// Half of the links have no family: the hub searches for their scanners.
+    #[arg(long)]
+    auto: bool,
     /// Worlds at a time.
     #[arg(long, default_value_t = 2)]
     threads: usize,
@@ -98,7 +101,7 @@ fn main() -> ExitCode {
 }
 
 fn plans(arguments: &Arguments) -> Result<Vec<Plan>, String> {
-    let of_seed = |seed| Plan::of_seed(seed, arguments.virtual_seconds);
+    let of_seed = |seed| Plan { is_auto: arguments.auto, ..Plan::of_seed(seed, arguments.virtual_seconds) };
     if let Some(path) = &arguments.plan {
         let text = std::fs::read_to_string(path).map_err(|error| format!("{}: {error}", path.display()))?;
         return Ok(vec![text.parse()?]);
@@ -114,7 +117,7 @@ fn plans(arguments: &Arguments) -> Result<Vec<Plan>, String> {
 
 /// Says what failed, and the shortest plan that still does.
 fn report(plan: &Plan, outcome: &Outcome, is_same: bool, is_long: bool) {
-    println!("SEED={} COMMIT={}", plan.seed, commit());
+    println!("SEED={}{} COMMIT={}", plan.seed, if plan.is_auto { " --auto" } else { "" }, commit());
     if !is_same {
         println!("the second run was another one than the first");
     }

@@ -19,6 +19,8 @@ pub struct Plan {
     pub seconds: u64,
     /// The only sensor, by its model, of some its mode and what it does at first; else the seed draws one or two.
     pub model: Option<String>,
+    /// Whether half of the links have no family, and the hub searches for their scanners. The link of the only sensor has none.
+    pub is_auto: bool,
     /// In the order of time.
     pub actions: Vec<Action>,
 }
@@ -53,7 +55,12 @@ impl Plan {
             }
         }
         actions.sort_by_key(|action| action.at_ms);
-        Plan { seed, seconds, model: None, actions }
+        Plan { seed, seconds, model: None, is_auto: false, actions }
+    }
+
+    /// Returns the plan of [`of_seed`](Plan::of_seed) for a world in which half of the links have no family.
+    pub fn auto_of_seed(seed: u64, seconds: u64) -> Plan {
+        Plan { is_auto: true, ..Plan::of_seed(seed, seconds) }
     }
 
     /// When everything is made well again: what is to be seen then has eight seconds.
@@ -125,6 +132,7 @@ impl fmt::Display for Plan {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(f, "seed {} seconds {}", self.seed, self.seconds)?;
         self.model.iter().try_for_each(|model| write!(f, " {model}"))?;
+        f.write_str(if self.is_auto { " auto" } else { "" })?;
         writeln!(f)?;
         self.actions.iter().try_for_each(|action| writeln!(f, "{action}"))
     }
@@ -137,10 +145,14 @@ impl FromStr for Plan {
         let mut lines = text.lines().map(str::trim).filter(|line| !line.is_empty());
         let head = lines.next().unwrap_or_default();
         let words: Vec<&str> = head.split_whitespace().collect();
-        let ["seed", seed, "seconds", seconds, ref model @ ..] = words[..] else {
+        let ["seed", seed, "seconds", seconds, ref rest @ ..] = words[..] else {
             return Err(format!("{head:?} is not the first line of a plan"));
         };
-        let model = match *model {
+        let (is_auto, rest) = match rest {
+            [model @ .., "auto"] => (true, model),
+            model => (false, model),
+        };
+        let model = match *rest {
             [] => None,
             [model] if family::named(model, &mut fastrand::Rng::with_seed(0)).is_some() => {
                 Some(model.to_owned())
@@ -149,7 +161,7 @@ impl FromStr for Plan {
         };
         let number = |word: &str| word.parse().map_err(|_| format!("{word:?} is no number"));
         let (seed, seconds) = (number(seed)?, number(seconds)?);
-        Ok(Plan { seed, seconds, model, actions: lines.map(str::parse).collect::<Result<_, _>>()? })
+        Ok(Plan { seed, seconds, model, is_auto, actions: lines.map(str::parse).collect::<Result<_, _>>()? })
     }
 }
 
@@ -166,6 +178,9 @@ mod tests {
             assert_eq!(plan, Plan::of_seed(seed, 60));
             assert!(plan.actions.iter().all(|action| action.at_ms * MILLIS < plan.heals_at()));
             met.extend(plan.actions.iter().map(Action::name));
+            let model = Some("a1:boost".to_owned()).filter(|_| seed % 2 == 0);
+            let auto = Plan { model, ..Plan::auto_of_seed(seed, 60) };
+            assert_eq!(auto.to_string().parse(), Ok(auto));
         }
         assert_eq!(met.len(), KINDS.len(), "{met:?}");
         for wrong in ["", "seed x seconds 1", "seed 1 seconds 2\nfoo", "seed 1 seconds 2\n5 fly sensor=1"] {

@@ -38,7 +38,9 @@ impl Setup {
             let every_ms = random.u64(5..400);
             cast.push((sensor, Topic::Scan, Habit::Slow { every_ms }, random.usize(0..=4)));
         }
-        Setup { sensors, keeps_ports: random.bool(), min_scans: random.u64(1..=2), cast }
+        let (keeps_ports, min_scans) = (random.bool(), random.u64(1..=2));
+        let sensors = if plan.is_auto { half_auto(sensors, plan) } else { sensors };
+        Setup { sensors, keeps_ports, min_scans, cast }
     }
 
     /// The sensors' names in topics.
@@ -68,4 +70,12 @@ impl Setup {
         let sensor = |(number, of): (usize, &Rc<dyn Family>)| Sensor::new(of.found(changes(number)));
         self.sensors.iter().enumerate().map(sensor).collect()
     }
+}
+
+/// Removes the family from the link of the only sensor of `plan`, or from half of the links.
+fn half_auto(sensors: Vec<Rc<dyn Family>>, plan: &Plan) -> Vec<Rc<dyn Family>> {
+    // Its own random numbers: everything else is as in the world in which all links have a family.
+    let mut random = fastrand::Rng::with_seed(plan.seed ^ 0xA070_0000_0000_0000);
+    let mut is_auto = || plan.model.is_some() || random.bool();
+    sensors.into_iter().map(|sensor| if is_auto() { sensor.auto() } else { sensor }).collect()
 }

@@ -1,6 +1,8 @@
 //! LDROBOT: a head that turns and tells of what it measures in packets, unasked. What it measures has no noise, so that each
 //! point that is told can be found among those that are true.
 
+use std::rc::Rc;
+
 use scanhub_drivers::ld::Model;
 use scanhub_drivers::ld::packet::{LEN, POINTS, Packet};
 use schema::{MILLIS, Nanos, Scan};
@@ -14,8 +16,11 @@ use super::{Begin, Family, INERTIA, SLOWEST, Scanner, still_rooms};
 use crate::plan::Action;
 
 /// One of them, and what its link asks for.
+#[derive(Clone)]
 pub(super) struct Ld {
     settings: HeadSettings,
+    /// Name of the family in the link.
+    family: &'static str,
     /// The link says which model it is.
     is_said: bool,
     beams: Option<usize>,
@@ -37,7 +42,7 @@ impl Ld {
             seed: random.u64(..),
             ..HeadSettings::of(model)
         };
-        Ld { settings, is_said: random.bool(), beams: None }
+        Ld { settings, family: "ld", is_said: random.bool(), beams: None }
     }
 }
 
@@ -45,7 +50,15 @@ impl Family for Ld {
     fn keys(&self) -> Vec<String> {
         let model = self.is_said.then(|| format!("model={}", self.settings.model.name()));
         let beams = self.beams.map(|beams| format!("beams={beams}"));
-        ["family=ld".to_owned()].into_iter().chain(model).chain(beams).collect()
+        [format!("family={}", self.family)].into_iter().chain(model).chain(beams).collect()
+    }
+
+    fn auto(&self) -> Rc<dyn Family> {
+        Rc::new(Ld { family: "auto", is_said: false, ..self.clone() })
+    }
+
+    fn family(&self) -> schema::Family {
+        schema::Family::Ld
     }
 
     /// What appears where the head has just been is measured a turn later, and told when that turn is over.

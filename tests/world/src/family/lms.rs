@@ -1,5 +1,6 @@
 //! SICK LMS 2xx: found at any rate and in any state, asked for any variant. Its scans were measured once for all worlds.
 
+use std::rc::Rc;
 use std::sync::{Arc, LazyLock, Mutex, PoisonError};
 
 use scanhub_drivers::lms;
@@ -19,8 +20,11 @@ use super::{Family, Scanner, habits, rooms};
 use crate::plan::Action;
 
 /// One of them, and what its link asks for.
+#[derive(Clone)]
 pub(super) struct Lms {
     settings: Settings,
+    /// Whether the link has no family.
+    is_auto: bool,
     variant: Variant,
     baud: Baud,
 }
@@ -46,12 +50,15 @@ impl Lms {
             seed: random.u64(..),
             ..Settings::default()
         };
-        Lms { settings, variant, baud }
+        Lms { settings, is_auto: false, variant, baud }
     }
 }
 
 impl Family for Lms {
     fn keys(&self) -> Vec<String> {
+        if self.is_auto {
+            return vec!["family=auto".to_owned()];
+        }
         let Variant { angle_deg, resolution_cdeg } = self.variant;
         let resolution = f64::from(resolution_cdeg) / 100.0;
         vec![
@@ -59,6 +66,15 @@ impl Family for Lms {
             format!("angle={angle_deg}"),
             format!("resolution={resolution}"),
         ]
+    }
+
+    /// It streams as an LMS does without keys.
+    fn auto(&self) -> Rc<dyn Family> {
+        Rc::new(Lms { is_auto: true, variant: Variant::HALF, baud: Baud::B500000, ..self.clone() })
+    }
+
+    fn family(&self) -> schema::Family {
+        schema::Family::Lms
     }
 
     /// At the rate that the link asks for.

@@ -2,6 +2,8 @@
 //! measures has no noise, so that each point that is told can be found among those that are true. It has no EEPROM; what it
 //! would keep is changed by one request only, and each of these counts as a write.
 
+use std::rc::Rc;
+
 use scanhub_drivers::rplidar::packet::Kind;
 use schema::{MILLIS, Nanos, Scan};
 use sim::device::Device;
@@ -16,8 +18,11 @@ use super::{Ailment, Begin, Exactness, Family, Scanner, habits, still_rooms};
 use crate::plan::Action;
 
 /// One of them, and what its link asks for.
+#[derive(Clone)]
 pub(super) struct Rplidar {
     settings: UnitSettings,
+    /// Name of the family in the link.
+    family: &'static str,
     /// Nobody told its motor to turn.
     is_off: bool,
     /// The link says which model it is, and in which of its modes it shall measure.
@@ -49,7 +54,8 @@ impl Rplidar {
             seed: random.u64(..),
             ..UnitSettings::of(model)
         };
-        Rplidar { settings, is_off: false, is_said: random.bool(), mode: None, beams: None }
+        let is_said = random.bool();
+        Rplidar { settings, family: "rplidar", is_off: false, is_said, mode: None, beams: None }
     }
 
     /// The one that is written `MODEL`, `MODEL:MODE` or `MODEL:MODE:STATE`; without a mode it is the fastest, and without a
@@ -90,7 +96,15 @@ impl Family for Rplidar {
         let said = self.is_said.then(|| format!("model={}", model.name()));
         let mode = self.mode.map(|mode| format!("mode={}", key(model.modes()[mode].name)));
         let beams = self.beams.map(|beams| format!("beams={beams}"));
-        ["family=rplidar".to_owned()].into_iter().chain(said).chain(mode).chain(beams).collect()
+        [format!("family={}", self.family)].into_iter().chain(said).chain(mode).chain(beams).collect()
+    }
+
+    fn auto(&self) -> Rc<dyn Family> {
+        Rc::new(Rplidar { family: "auto", is_said: false, mode: None, ..self.clone() })
+    }
+
+    fn family(&self) -> schema::Family {
+        schema::Family::Rplidar
     }
 
     /// As of any head that turns; whether a turn is over is seen only when the head is well behind its end.

@@ -5,6 +5,7 @@ mod accounts;
 mod bytes;
 mod early;
 mod eeprom;
+mod family;
 mod liveness;
 mod lost_on_line;
 mod nothing_invented;
@@ -83,6 +84,7 @@ pub(crate) fn all(setup: &Setup, plan: &Plan) -> Vec<Box<dyn Judge>> {
         Box::new(settings::Settings::new(sensors.len())),
         Box::new(resources::Resources),
         Box::new(eeprom::Eeprom),
+        Box::new(family::OfSensors::new(sensors)),
         Box::new(remote_nothing_invented::RemoteNothingInvented::new(&terms)),
         Box::new(remote_accounts::RemoteAccounts::default()),
         Box::new(remote_bridge::RemoteBridge::new(&terms)),

@@ -1,0 +1,106 @@
+//! A sample has the family of the scanner. At a link without a family, what is published before the scanner is found has none:
+//! never a telegram or a scan, and a status only while the hub searches or has no port. No byte is sent to an LDROBOT that
+//! streams undisturbed.
+
+use std::rc::Rc;
+
+use schema::{Family as FamilyName, MILLIS, Nanos, State, Status, Topic};
+
+use super::{Judge, Say};
+use crate::event::{Event, Telegram};
+use crate::family::Family;
+use crate::topics::Sample;
+
+/// The families of all sensors, and since when their scanners have been streaming.
+pub(crate) struct OfSensors(Vec<OfSensor>);
+
+struct OfSensor {
+    family: FamilyName,
+    is_auto: bool,
+    opened_at: Nanos,
+    /// Time since which packets have been arriving without damage and without gaps, and of the last one.
+    clean_since: Option<Nanos>,
+    last_at: Nanos,
+    /// Place after the last packet.
+    end: u64,
+}
+
+impl OfSensors {
+    pub(crate) fn new(sensors: &[Rc<dyn Family>]) -> OfSensors {
+        let sensor = |family: &Rc<dyn Family>| OfSensor {
+            family: family.family(),
+            is_auto: family.keys().iter().any(|key| key == "family=auto"),
+            opened_at: 0,
+            clean_since: None,
+            last_at: 0,
+            end: 0,
+        };
+        OfSensors(sensors.iter().map(sensor).collect())
+    }
+}
+
+impl Judge for OfSensors {
+    fn name(&self) -> &'static str {
+        "family"
+    }
+
+    fn note(&mut self, at: Nanos, event: &Event<'_>, say: &mut Say<'_>) {
+        match *event {
+            Event::Opened { sensor, .. } => self.0[sensor].opened_at = at,
+            Event::Sent { sensor, telegram } => self.0[sensor].send(at, telegram),
+            Event::Exchanged { sensor } | Event::Altered { sensor } => self.0[sensor].clean_since = None,
+            Event::Written { sensor } => {
+                let of = &self.0[sensor];
+                let is_undisturbed = |since: Nanos| since <= of.opened_at || since + SEARCH < at;
+                if of.family == FamilyName::Ld && of.clean_since.is_some_and(is_undisturbed) {
+                    say.broken(format!("sensor {sensor}: an LDROBOT that streams gets a byte"));
+                }
+            }
+            Event::Published { sensor, sample } => {
+                if let Err(words) = self.0[sensor].check(sample) {
+                    say.broken(format!("sensor {sensor}: {words}"));
+                }
+            }
+            _ => {}
+        }
+    }
+}
+
+impl OfSensor {
+    fn send(&mut self, at: Nanos, telegram: &Telegram<'_>) {
+        let begin = std::mem::replace(&mut self.end, telegram.span.1);
+        // The line is not to blame for these.
+        let is_harmless = |damage: &str| matches!(damage, "baud" | "unread" | "flushed");
+        let is_clean = telegram.damage.is_none_or(is_harmless) && telegram.span.0 <= begin;
+        let is_next = at < std::mem::replace(&mut self.last_at, at) + GAP;
+        self.clean_since = self.clean_since.filter(|_| is_next).or(Some(at)).filter(|_| is_clean);
+    }
+
+    /// Returns what is wrong with the family of a sample.
+    fn check(&self, Sample { topic, header, bytes, .. }: &Sample) -> Result<(), String> {
+        let family = header.family();
+        let may_be_unknown = match topic {
+            Topic::Status => {
+                let status: Status = bytemuck::pod_read_unaligned(bytes);
+                if status.family() != family {
+                    return Err(format!("a status of {:?} with a header of {family:?}", status.family()));
+                }
+                let searches = matches!(status.state(), Some(State::Probing | State::Paused | State::Absent));
+                searches
+            }
+            Topic::Telegram | Topic::Scan | Topic::Early => false,
+            // The zones are unknown, and the background is the saved one.
+            _ => true,
+        };
+        let is_unknown = self.is_auto && may_be_unknown && family.is_none();
+        if is_unknown || family == Some(self.family) {
+            return Ok(());
+        }
+        Err(format!("{topic:?} of {family:?}, and the scanner is of {:?}", self.family))
+    }
+}
+
+/// Time between two packets of a scanner that streams.
+const GAP: Nanos = 50 * MILLIS;
+/// Duration of a round of the search, after which it notices that a scanner has begun to stream.
+const SEARCH: Nanos = 4_000 * MILLIS;
