@@ -4,7 +4,7 @@ use std::fs;
 
 use serde_json::Value;
 
-use crate::testkit::{INT, Program, TERM, TestEnv, is_class, sequence};
+use crate::testkit::{INT, KILL, Program, TERM, TestEnv, is_class, sequence};
 
 const LMS: &[&str] = &["--seed=17", "--world=room"];
 const LD19: &[&str] = &["--family=ld", "--model=ld19", "--world=room", "--seed=17"];
@@ -132,4 +132,38 @@ fn a_recording_has_the_family_of_its_scanner() {
     let refused = env.run(&["run", &format!("--link=front=file:{noise},family=auto")]);
     assert_eq!(refused.code, Some(78), "{refused}");
     assert!(refused.errors.contains("family"), "{refused}");
+}
+
+#[test]
+fn a_number_of_beams_outlives_a_restart_of_the_hub() {
+    let env = TestEnv::new();
+    let ld14p = env.simulator(&["front"], &["--family=ld", "--model=ld14p", "--world=room", "--seed=17"]);
+    let counts = |outcome: &crate::testkit::Outcome| -> Vec<Value> {
+        outcome.of_class("scan").iter().map(|scan| scan["count"].clone()).collect()
+    };
+    for how in [TERM, KILL, TERM] {
+        let hub = hub(&env);
+        let mut scans = env.echo(&["front/scan"]);
+        scans.await_lines(10, "a scan", is_class("scan"));
+        crate::testkit::until("the beams are remembered", || memory(&env).contains(" 666 "));
+        let counts = counts(&scans.end(INT));
+        assert!(counts.iter().all(|count| *count == 666), "{counts:?}");
+        hub.end(how);
+    }
+    // Another model at the same rate: its first scans have the number that is remembered for the port. It changes once the other
+    // number is certain.
+    env.kill_simulator(ld14p, "front");
+    let _ld19 = env.simulator(&["front"], LD19);
+    let hub = hub(&env);
+    let mut scans = env.echo(&["front/scan"]);
+    scans.await_line("a scan with the other number", |line| is_class("scan")(line) && line["count"] == 450);
+    let message = "scans have 450 beams instead of 666, as many as the scanner measures points";
+    env.await_info("front", |info| text(info, "last_error") == message);
+    let counts = counts(&scans.end(INT));
+    let change = counts.iter().position(|count| *count == 450).expect("awaited");
+    assert!(change >= 20 && counts[..change].iter().all(|count| *count == 666), "{counts:?}");
+    assert!(counts[change..].iter().all(|count| *count == 450), "{counts:?}");
+    crate::testkit::until("the other number is remembered", || memory(&env).contains(" 450 "));
+    let log = hub.end(TERM).errors;
+    assert_eq!(log.matches(message).count(), 1, "{log}");
 }

@@ -16,9 +16,9 @@ use std::fmt;
 use std::io;
 
 use port::{Allowance, LineErrors, Source};
-use scanhub_drivers::PortSession;
 use scanhub_drivers::line::{Event, Identity, Output, Protocol as _, Session as _, suspect};
 use scanhub_drivers::search::{Memory, Search};
+use scanhub_drivers::{Model, PortSession};
 use schema::{MILLIS, Nanos, State};
 
 use crate::backlog::Backlog;
@@ -47,6 +47,8 @@ pub(crate) struct Drive<'a, S: Surroundings> {
     scanner: Option<KnownScanner>,
     /// Whether the log names that scanner.
     is_named: bool,
+    /// Model and number of beams that an earlier run of the hub has saved, until the port is opened.
+    beams: Option<(Model, usize)>,
     /// In how many pieces a telegram is read, as of the last scan: as many as who follows early warnings wants.
     pieces: u8,
 }
@@ -89,6 +91,8 @@ impl<L: Line> Open<L> {
 impl<'a, S: Surroundings> Drive<'a, S> {
     /// For the port of `core`.
     pub(crate) fn new(core: &LinkCore<'a, S>) -> Drive<'a, S> {
+        let scanner = known_scanner(core);
+        let beams = scanner.as_ref().and_then(KnownScanner::beams_of_model);
         Drive {
             identity: IdentityCache::new(core.around, &core.link.name, core.link.port.name()),
             refused: Vec::new(),
@@ -96,8 +100,9 @@ impl<'a, S: Surroundings> Drive<'a, S> {
             behind_at: None,
             follows_by: Nanos::MAX,
             found: None,
-            scanner: known_scanner(core),
+            scanner,
             is_named: false,
+            beams,
             pieces: 1,
         }
     }
@@ -122,6 +127,12 @@ impl<'a, S: Surroundings> Drive<'a, S> {
     /// Returns the scanner with which a search begins.
     pub(crate) fn memory(&self, core: &LinkCore<'a, S>) -> Option<Memory> {
         self.scanner.as_ref().filter(|_| core.link.family().is_none()).map(|scanner| scanner.memory)
+    }
+
+    /// Returns the model and the number of beams that an earlier run of the hub has saved, for the first session on the port. Later
+    /// sessions follow a loss of the port, and a different scanner may be connected.
+    pub(crate) fn take_beams(&mut self) -> Option<(Model, usize)> {
+        self.beams.take()
     }
 
     /// Returns the rate at which to open the port of `core`.
@@ -342,10 +353,11 @@ impl<'a, S: Surroundings> Drive<'a, S> {
         let Some(memory) = session.memory() else { return };
         let (link, status) = (core.link, core.stats.last());
         let before = self.scanner.as_ref();
+        let beams = session.beams().filter(|_| link.scanner.settings.beams.is_none());
         let is_known = |known: &KnownScanner| {
             let model = known.model.as_deref();
             let is_it = |reported: &str| model.is_some_and(|model| model.eq_ignore_ascii_case(reported));
-            known.memory == memory && status.reported_model().is_none_or(is_it)
+            (known.memory, known.beams) == (memory, beams) && status.reported_model().is_none_or(is_it)
         };
         if self.is_named && before.is_some_and(is_known) {
             return;
@@ -354,7 +366,7 @@ impl<'a, S: Surroundings> Drive<'a, S> {
         let known_model = before.filter(|_| is_same_family).and_then(|before| before.model.clone());
         let reported = status.model();
         let is_reported = reported.is_some() || now >= status.since_ns + UNNAMED;
-        let scanner = KnownScanner { memory, model: reported.or_else(|| known_model.clone()) };
+        let scanner = KnownScanner { memory, model: reported.or_else(|| known_model.clone()), beams };
         let is_other =
             before.is_some() && (!is_same_family || known_model.is_some() && known_model != scanner.model);
         if is_reported && (is_other || !self.is_named) {

@@ -393,7 +393,7 @@ mod tests {
             stream_rate: 921_600,
             reply_rate: 921_600,
         };
-        let scanner = KnownScanner { memory, model: Some("stl27l".to_owned()) };
+        let scanner = KnownScanner { memory, model: Some("stl27l".to_owned()), beams: Some(2_160) };
         let mut keeper = begin("front=/dev/x,family=auto");
         keeper.slots().of("front").expect("a slot").keep_scanner("/dev/x", scanner.clone());
         keeper.turn(1, 1, true);

@@ -197,6 +197,9 @@ impl<'a, S: Surroundings> LiveLink<'a, S> {
         if let Some(known) = known {
             session.restore_identity(known);
         }
+        if let Some((model, beams)) = self.drive.take_beams() {
+            session.restore_beams(model, beams);
+        }
         if let Some(rate) = self.drive.last_rate(core) {
             tracing::debug!(
                 "{}: the search begins at {} baud, where the scanner was found",

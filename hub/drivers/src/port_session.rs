@@ -176,11 +176,11 @@ impl PortSession {
         {
             session.restore_identity(identity);
         }
-        if let Some((_, model, beams)) = self.last.filter(|(last, ..)| *last == family) {
-            session.restore_beams(model, beams);
-        }
         if let Some(rate) = rate {
             session.begin_at(rate, begins);
+        }
+        if let Some((_, model, beams)) = self.last.filter(|(last, ..)| *last == family) {
+            session.restore_beams(model, beams);
         }
         session.set_partial_reads(self.partial_reads);
         (self.session_now, self.received_at) = (begins, self.now);
@@ -382,6 +382,13 @@ impl line::Session for PortSession {
         match &mut self.stage {
             Stage::Searching(_) => self.known_rate = Some(known),
             Stage::Found(session) => session.hint_rate(known),
+        }
+    }
+
+    fn restore_beams(&mut self, model: Model, beams: usize) {
+        match &mut self.stage {
+            Stage::Searching(_) => self.last = self.memory.map(|memory| (memory.family, model, beams)),
+            Stage::Found(session) => session.restore_beams(model, beams),
         }
     }
 

@@ -537,7 +537,8 @@ impl line::Session for Session {
     }
 
     fn restore_beams(&mut self, model: family::Model, beams: usize) {
-        if let Some(model) = Model::named(model.name) {
+        let model = Model::named(model.name);
+        if let Some(model) = model.filter(|model| self.settings.fixed_rate || model.baud() == self.baud) {
             self.recall(model, beams);
         }
     }

@@ -120,8 +120,8 @@ pub trait Session: Protocol {
         let _ = (rate, now);
     }
 
-    /// Restores the model and the number of beams that an earlier session on the same open port has measured. Call it before the
-    /// first read.
+    /// Restores the model and the number of beams that an earlier session on the same port has measured. They are
+    /// ignored if the scanner streams at a rate that this model does not have. Call it before the first read, and after [`begin_at`](Self::begin_at).
     fn restore_beams(&mut self, model: Model, beams: usize) {
         let _ = (model, beams);
     }

@@ -177,6 +177,49 @@ fn another_scanner_is_found_ten_seconds_after_the_first_one_is_gone() {
 }
 
 #[test]
+fn scans_arrive_at_a_port_that_rejects_rates() {
+    for (name, family, create) in scanners() {
+        for impossible in [[230_400, 19_200], [921_600, 460_800], [500_000, 256_000], [1_000_000, 38_400]] {
+            let device = create(1);
+            let (is_own, needs) = (impossible.contains(&device.rate()), family == Family::Lms);
+            // An LMS is sent to 500,000 baud.
+            if is_own || needs && impossible.contains(&500_000) {
+                continue;
+            }
+            let mut bench = open(Some(device), None, 1);
+            bench.impossible = impossible.to_vec();
+            if impossible.contains(&230_400) {
+                bench.host.session.reject_rate(bench.now);
+            }
+            next_scan(&mut bench, name);
+            assert_eq!(bench.host.session.family(), Some(family), "{name}");
+        }
+    }
+}
+
+#[test]
+fn beams_that_are_restored_stay_unless_the_rate_is_that_of_another_model() {
+    for (scanner, restored, expected) in [
+        (ld::Model::Ld19, ld::Model::Ld14p, 666),
+        (ld::Model::Ld14p, ld::Model::Ld19, 450),
+        (ld::Model::Stl27l, ld::Model::Ld19, 2_160),
+        (ld::Model::Ld19, ld::Model::Stl27l, 450),
+    ] {
+        let memory = Memory { family: Family::Ld, stream_rate: restored.baud(), reply_rate: restored.baud() };
+        let begin = |now| {
+            let mut host = host(Some(memory), now);
+            let features = scanhub_drivers::features(Family::Ld);
+            let model = features.models.iter().find(|model| model.name == restored.name());
+            host.session.restore_beams(*model.expect("a model"), restored.beams());
+            host
+        };
+        let mut bench = Bench::auto(begin, Some(bench::ld(scanner, 1)), Some(memory), 1);
+        next_scan(&mut bench, scanner.name());
+        assert_eq!(bench.host.session.beams(), Some(expected), "{scanner:?} after {restored:?}");
+    }
+}
+
+#[test]
 fn a_paused_search_sends_nothing() {
     let mut bench = open(Some(bench::lms(Baud::B9600, false, 3)), None, 3);
     bench.host.session.control(line::Control::Pause, bench.now);
