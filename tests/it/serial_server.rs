@@ -106,6 +106,38 @@ fn a_sensor_behind_a_serial_server() {
     assert_eq!(hub.end(TERM).code, Some(0));
 }
 
+#[test]
+fn a_scanner_of_an_unknown_family_behind_a_serial_server_is_found() {
+    for (simulated, rate, family, model) in [
+        (&["--baud=38400", "--seed=5"][..], 38_400, "lms", "lms200"),
+        (&["--family=ld", "--model=ld19", "--seed=5"], 230_400, "ld", "ld19"),
+        (&["--family=rplidar", "--model=a1", "--seed=5"], 115_200, "rplidar", "a1"),
+    ] {
+        let env = TestEnv::new();
+        let simulator = env.simulator(&["line"], simulated);
+        let server = Server::new(&env, "line", rate);
+        let hub = env.hub(&[format!("{},family=auto", server.link())]);
+        let mut consumer = env.echo(&["front/scan", "front/status"]);
+        consumer.await_line("a scan", |line| is_class("scan")(line) && line["family"] == family);
+        let info = env.await_info("front", |info| info["state"] == "streaming" && info["model"] == model);
+        assert_eq!((&info["family"], &info["last_error"]), (&family.into(), &"".into()), "{info}");
+        // The search begins again with the connection, and with this scanner.
+        server.hang_up.store(true, Ordering::Relaxed);
+        consumer.await_line("absent", |line| line["state"] == "absent");
+        consumer.await_line("a search", |line| line["state"] == "probing" && line["family"].is_null());
+        consumer.await_line("a scan", |line| is_class("scan")(line) && line["family"] == family);
+        sequence(&consumer.end(INT).of_class("scan"), "topic_seq");
+        let outcome = hub.end(TERM);
+        assert_eq!((outcome.code, outcome.errors.contains("is now")), (Some(0), false), "{outcome}");
+        assert!(outcome.errors.contains(&format!("front: found {model}")), "{outcome}");
+        drop(server);
+        assert_eq!(simulator.end(TERM).code, Some(0));
+        if family == "lms" {
+            assert_eq!(env.simulated("line").1, 0, "EEPROM");
+        }
+    }
+}
+
 /// Scans that are sent while the hub is stopped.
 const WAITING: usize = 20;
 

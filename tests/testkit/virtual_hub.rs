@@ -67,6 +67,12 @@ impl VirtualLink<'_> {
         self.around.telegrams.get()
     }
 
+    /// Makes the port reject these `rates`.
+    #[allow(dead_code, reason = "not every program that includes this module has such a port")]
+    pub(crate) fn reject(&mut self, rates: &[u32]) {
+        *self.around.line.1.borrow_mut() = rates.to_vec();
+    }
+
     fn turn(&mut self, woken: Woken) {
         let Wait { until, .. } = self.link.turn(woken);
         self.until = until;
@@ -85,9 +91,9 @@ struct Around<'a> {
     telegrams: Cell<usize>,
 }
 
-/// Bytes that have arrived and were not read.
+/// Bytes that have arrived and were not read, and rates that the port rejects.
 #[derive(Clone, Default)]
-struct Bytes(Rc<RefCell<VecDeque<u8>>>);
+struct Bytes(Rc<RefCell<VecDeque<u8>>>, Rc<RefCell<Vec<u32>>>);
 
 impl<'a> Around<'a> {
     fn new(node: &'a Node, sensor: &str) -> Result<Self, Failure> {
@@ -175,8 +181,9 @@ impl Line for Bytes {
         Ok(())
     }
 
-    fn set_baud(&self, _: u32) -> io::Result<Option<io::Error>> {
-        Ok(None)
+    fn set_baud(&self, baud: u32) -> io::Result<Option<io::Error>> {
+        let is_rejected = self.1.borrow().contains(&baud);
+        Ok(is_rejected.then(|| io::Error::other(format!("the port cannot have {baud} baud"))))
     }
 
     fn altered(&self) -> io::Result<Option<Alteration>> {

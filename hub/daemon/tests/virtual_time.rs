@@ -4,13 +4,18 @@
 #[path = "../../../tests/testkit/virtual_hub.rs"]
 mod virtual_hub;
 
+use std::fmt;
 use std::fs;
+use std::sync::{Arc, Mutex};
 
 use config::{Config, Sources};
 use scanhub_drivers::lms;
 use scanhub_drivers::lms::variant::Unit;
 use schema::ipc::{self, Payload};
-use schema::{Domain, Marks, Scan, State, Status};
+use schema::{Domain, Family, Marks, Scan, State, Status};
+use tracing::field::{Field, Visit};
+use tracing::span;
+use tracing::{Event, Metadata, Subscriber};
 use virtual_hub::virtual_hub;
 
 /// A domain that goes with the test, however it ends.
@@ -98,4 +103,76 @@ fn what_nobody_follows_is_not_made_and_a_status_tells_that_it_streams() {
         assert_eq!(status.state(), Some(State::Streaming));
     });
     assert_eq!(outcome, Ok(()));
+}
+
+/// Collects the messages of the log.
+#[derive(Clone, Default)]
+struct Log(Arc<Mutex<Vec<String>>>);
+
+impl Subscriber for Log {
+    fn enabled(&self, _: &Metadata<'_>) -> bool {
+        true
+    }
+
+    fn new_span(&self, _: &span::Attributes<'_>) -> span::Id {
+        span::Id::from_u64(1)
+    }
+
+    fn record(&self, _: &span::Id, _: &span::Record<'_>) {}
+
+    fn record_follows_from(&self, _: &span::Id, _: &span::Id) {}
+
+    fn event(&self, event: &Event<'_>) {
+        struct Message(String);
+        impl Visit for Message {
+            fn record_debug(&mut self, field: &Field, value: &dyn fmt::Debug) {
+                if field.name() == "message" {
+                    self.0 = format!("{value:?}");
+                }
+            }
+        }
+        let mut message = Message(String::new());
+        event.record(&mut message);
+        self.0.lock().expect("not poisoned").push(message.0);
+    }
+
+    fn enter(&self, _: &span::Id) {}
+
+    fn exit(&self, _: &span::Id) {}
+}
+
+#[test]
+fn a_rate_that_the_port_rejects_is_logged_once_and_the_scanner_is_found() {
+    let place = Place::new('r');
+    let sources = Sources { links: vec!["a=/dev/none,family=auto".to_owned()], ..Sources::default() };
+    let config = Config::load(&sources).expect("a configuration");
+    let log = Log::default();
+    let outcome = tracing::subscriber::with_default(log.clone(), || {
+        virtual_hub(&config, &place.0, |links| {
+            let node = ipc::client_node(&place.0).expect("a node");
+            let status = Status::open(&node, "a").expect("a topic").expect("is there");
+            let status = Status::subscriber(&status).expect("a subscriber");
+            links[0].reject(&[500_000, 921_600, 256_000]);
+            // Bytes of no scanner, for several rounds of the search.
+            for read in 1..=200 {
+                links[0].read(read * 50_000_000, &[0x55; 5]);
+            }
+            let telegram = lms::measured::encode(0, Unit::Mm, &[500; 361], 0x10);
+            let found = (201..=400).find(|read| {
+                links[0].read(read * 50_000_000, telegram.bytes());
+                let mut family = None;
+                while let Ok(Some(status)) = Status::receive(&status) {
+                    family = status.family();
+                }
+                family == Some(Family::Lms)
+            });
+            found.expect("the scanner is found");
+        })
+    });
+    assert_eq!(outcome, Ok(()));
+    let lines = log.0.lock().expect("not poisoned");
+    for rate in [500_000, 921_600, 256_000] {
+        let message = format!("a: the port cannot have {rate} baud");
+        assert_eq!(lines.iter().filter(|line| **line == message).count(), 1, "{lines:?}");
+    }
 }
