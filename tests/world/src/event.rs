@@ -193,7 +193,7 @@ impl std::fmt::Display for Violation {
 impl Event<'_> {
     /// Takes it into the hash of everything.
     pub(crate) fn hash(&self, at: Nanos, history: &mut History) {
-        // What the scanner makes of them is hashed.
+        // The hash contains the replies of the scanner.
         if matches!(self, Event::Written { .. }) {
             return;
         }

@@ -1,6 +1,7 @@
 //! The families of scanners in a world, a file each: how one of them is found, what its link's configuration says, what its
 //! bytes mean to the judges. All else in a world knows none of them.
 
+mod either;
 mod ld;
 mod lms;
 mod rplidar;
@@ -25,11 +26,14 @@ pub(crate) trait Family {
     /// The keys of its link, as `KEY=VALUE`.
     fn keys(&self) -> Vec<String>;
 
-    /// The same scanner at a link without a family, which has none of the keys that only one family has.
+    /// Returns this scanner with a link that has no family, and no key that names one.
     fn auto(&self) -> Rc<dyn Family>;
 
-    /// Its family.
-    fn family(&self) -> schema::Family;
+    /// Returns the family, or both families of a scanner that is exchanged for a scanner of another family.
+    fn families(&self) -> Vec<schema::Family>;
+
+    /// Returns the rates that the line may have, in bits per second.
+    fn rates(&self) -> Vec<u32>;
 
     /// The longest time between two scans, and from when something is measured until the scan that tells it has left.
     fn times(&self) -> (Nanos, Nanos);
@@ -169,6 +173,23 @@ pub(crate) fn draw(random: &mut fastrand::Rng) -> Vec<Rc<dyn Family>> {
         }
     };
     (0..count).map(|_| one(random)).collect()
+}
+
+/// Returns `first` together with a rotating scanner of another family, for which it is exchanged. Returns `first` alone if it does
+/// not rotate.
+pub(crate) fn either(first: Rc<dyn Family>, random: &mut fastrand::Rng) -> Rc<dyn Family> {
+    let second: Rc<dyn Family> = match first.families()[..] {
+        [schema::Family::Ld] => Rc::new(rplidar::Rplidar::draw(random)),
+        [schema::Family::Rplidar] => Rc::new(ld::Ld::draw(random)),
+        _ => return first,
+    };
+    let second = second.auto();
+    Rc::new(either::Either { first, second })
+}
+
+/// Returns whether these bytes look like a packet of an LDROBOT.
+pub(crate) fn is_ld_packet(bytes: &[u8]) -> bool {
+    bytes.len() == scanhub_drivers::ld::packet::LEN && bytes.starts_with(&[0x54, 0x2C])
 }
 
 /// The scanner that a plan calls so, otherwise as `random` draws it; nothing if there is none: `ld19`, `a1`, `a1:boost`,

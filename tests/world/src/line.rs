@@ -87,6 +87,10 @@ impl Line for OpenLine {
         if planted.strikes(Defect::EepromWrite, 500) {
             eeprom_request().into_iter().for_each(|byte| tty.write(byte, now));
         }
+        if planted.strikes(Defect::NeedlessByte, 100) {
+            tty.write(0, now);
+            shared.log.tell(now, &Event::Written { sensor: *port });
+        }
         Ok(if len > 1 && planted.strikes(Defect::LostByte, 100) { len - 1 } else { len })
     }
 
@@ -109,9 +113,13 @@ impl Line for OpenLine {
         let Handle { shared, port, device } = &*self.handle;
         let (mut tty, now) = (shared.ports[*port].borrow_mut(), self.clock.now());
         tty.advance(now, &shared.log);
-        if self.check(tty.is_there(*device))? {
-            tty.set_rate(baud, &shared.log, now);
+        if !self.check(tty.is_there(*device))? {
+            return Ok(None);
         }
+        if !tty.can_have(baud) {
+            return Ok(Some(io::Error::other(format!("{baud} Bd is not possible here"))));
+        }
+        tty.set_rate(baud, &shared.log, now);
         Ok(None)
     }
 

@@ -4,7 +4,7 @@
 use std::cell::Cell;
 
 use scanhub_drivers::lms::telegram::Writer;
-use schema::{Counter, Flags, Header, Scan, ScanHead, Status, Topic};
+use schema::{Counter, Family, Flags, Header, Scan, ScanHead, Status, Topic};
 
 /// A defect.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -85,11 +85,15 @@ pub enum Defect {
     NeedlessEstimate,
     /// No early warning is sent.
     UnsentWarning,
+    /// Now and then a scan has another family than its scanner.
+    WrongFamily,
+    /// Now and then the hub sends a needless byte to a scanner that streams.
+    NeedlessByte,
 }
 
 impl Defect {
     /// All of them.
-    pub const ALL: [Defect; 38] = [
+    pub const ALL: [Defect; 40] = [
         Defect::LostWake,
         Defect::OneRing,
         Defect::LostByte,
@@ -128,6 +132,8 @@ impl Defect {
         Defect::UnmarkedEstimate,
         Defect::NeedlessEstimate,
         Defect::UnsentWarning,
+        Defect::WrongFamily,
+        Defect::NeedlessByte,
     ];
 }
 
@@ -194,6 +200,9 @@ impl Spoiler {
         if topic != Topic::Scan {
             return;
         }
+        if planted.strikes(Defect::WrongFamily, 20) {
+            header.family = (header.family + 1) % Family::ALL.len() as u8;
+        }
         if planted.is(Defect::StampedOnArrival) {
             let late = now.saturating_sub(header.stamp_last_ns + STALE_NS);
             (header.stamp_first_ns, header.stamp_last_ns) =
@@ -237,6 +246,7 @@ impl Spoiler {
             Defect::WrongPlaces,
             Defect::UnmarkedEstimate,
             Defect::NeedlessEstimate,
+            Defect::WrongFamily,
         ];
         mine.into_iter().any(|defect| planted.is(defect))
     }

@@ -16,6 +16,8 @@ use crate::sensor::Sensor;
 pub(crate) struct Setup {
     /// The sensors, and what their links ask for.
     pub(crate) sensors: Vec<Rc<dyn Family>>,
+    /// Rates that the port of each sensor cannot have.
+    pub(crate) impossible: Vec<Vec<u32>>,
     /// A service manager keeps the ports of a killed hub.
     pub(crate) keeps_ports: bool,
     /// Scans in a row that violate a circle.
@@ -39,8 +41,9 @@ impl Setup {
             cast.push((sensor, Topic::Scan, Habit::Slow { every_ms }, random.usize(0..=4)));
         }
         let (keeps_ports, min_scans) = (random.bool(), random.u64(1..=2));
-        let sensors = if plan.is_auto { half_auto(sensors, plan) } else { sensors };
-        Setup { sensors, keeps_ports, min_scans, cast }
+        let all_named = || (sensors.clone(), vec![Vec::new(); sensors.len()]);
+        let (sensors, impossible) = if plan.is_auto { half_auto(&sensors, plan) } else { all_named() };
+        Setup { sensors, impossible, keeps_ports, min_scans, cast }
     }
 
     /// The sensors' names in topics.
@@ -72,10 +75,27 @@ impl Setup {
     }
 }
 
-/// Removes the family from the link of the only sensor of `plan`, or from half of the links.
-fn half_auto(sensors: Vec<Rc<dyn Family>>, plan: &Plan) -> Vec<Rc<dyn Family>> {
+/// Removes the family from the link of the only sensor of `plan`, or from half of the links. At some of these links, an exchange
+/// connects a scanner of another family, and some of their ports cannot have all rates of the search. Returns the sensors,
+/// and the rates that each port cannot have.
+fn half_auto(sensors: &[Rc<dyn Family>], plan: &Plan) -> (Vec<Rc<dyn Family>>, Vec<Vec<u32>>) {
     // Its own random numbers: everything else is as in the world in which all links have a family.
     let mut random = fastrand::Rng::with_seed(plan.seed ^ 0xA070_0000_0000_0000);
-    let mut is_auto = || plan.model.is_some() || random.bool();
-    sensors.into_iter().map(|sensor| if is_auto() { sensor.auto() } else { sensor }).collect()
+    let of = |sensor: &Rc<dyn Family>| {
+        let mut random = random.fork();
+        if plan.model.is_none() && random.bool() {
+            return (sensor.clone(), Vec::new());
+        }
+        let sensor = sensor.auto();
+        let sensor = if random.u8(..3) == 0 { family::either(sensor, &mut random) } else { sensor };
+        let needed = sensor.rates();
+        let lacks_rates = random.u8(..3) == 0;
+        let is_impossible = |rate: &u32| lacks_rates && !needed.contains(rate) && random.bool();
+        let impossible = SEARCHED.into_iter().filter(is_impossible).collect();
+        (sensor, impossible)
+    };
+    sensors.iter().map(of).unzip()
 }
+
+/// Rates of the search, in bits per second, except the slowest, which every port can have.
+const SEARCHED: [u32; 9] = [19_200, 38_400, 115_200, 230_400, 256_000, 460_800, 500_000, 921_600, 1_000_000];

@@ -23,6 +23,8 @@ pub(crate) struct Tty {
     devices: u64,
     /// The device has another name than the one that is configured.
     is_elsewhere: bool,
+    /// Rates that it cannot have.
+    impossible: Vec<u32>,
     /// Why it cannot be opened although it is there.
     pub(crate) refuses: Option<PortError>,
     is_open: bool,
@@ -52,13 +54,15 @@ const ROOM: usize = 17_024;
 const LINE_DISCIPLINE: usize = 4_095;
 
 impl Tty {
-    pub(crate) fn new(number: usize, sensor: Sensor) -> Tty {
+    /// Creates the port of a sensor. It cannot have the rates in `impossible`.
+    pub(crate) fn new(number: usize, sensor: Sensor, impossible: Vec<u32>) -> Tty {
         Tty {
             number,
             sensor,
             device: Some(0),
             devices: 1,
             is_elsewhere: false,
+            impossible,
             refuses: None,
             is_open: false,
             rate: 9_600,
@@ -126,6 +130,9 @@ impl Tty {
         if self.is_open {
             return Err(PortError::Busy);
         }
+        if !self.can_have(rate) {
+            return Err(PortError::Rate { wanted: rate, given: 9_600 });
+        }
         self.is_open = true;
         (self.rate, self.own_rate) = (rate, rate);
         log.tell(now, &Event::Opened { sensor: self.number, offset: self.taken() });
@@ -135,7 +142,7 @@ impl Tty {
     /// Another hub goes on with it, at `rate`; whether it is still the same.
     pub(crate) fn adopt(&mut self, device: u64, rate: u32, log: &Log, now: Nanos) -> bool {
         self.advance(now, log);
-        if !self.is_there(device) || self.is_elsewhere {
+        if !self.is_there(device) || self.is_elsewhere || !self.can_have(rate) {
             return false;
         }
         (self.rate, self.own_rate) = (rate, rate);
@@ -177,6 +184,11 @@ impl Tty {
 
     pub(crate) fn write(&mut self, byte: u8, now: Nanos) {
         self.sensor.write(now, byte, self.rate);
+    }
+
+    /// Returns whether the port can have this rate.
+    pub(crate) fn can_have(&self, rate: u32) -> bool {
+        !self.impossible.contains(&rate)
     }
 
     /// Changes the rate, and discards what arrived.

@@ -100,12 +100,12 @@ impl World {
     fn new(plan: &Plan, detail: Detail, defect: Option<Defect>, sought: &'static [&'static str]) -> World {
         let setup = Rc::new(Setup::of_plan(plan));
         let sensors = setup.sensors(|sensor| object::changes(plan, sensor, setup.sensors.len()));
-        let ports =
-            sensors.into_iter().enumerate().map(|(number, sensor)| RefCell::new(Tty::new(number, sensor)));
+        let sensors = sensors.into_iter().zip(setup.impossible.iter().cloned()).enumerate();
+        let ports = sensors.map(|(number, (sensor, impossible))| Tty::new(number, sensor, impossible));
         let shared = Rc::new(Shared {
             clock: Cell::new(0),
             wall_ahead: Cell::new(WALL_NS),
-            ports: ports.collect(),
+            ports: ports.map(RefCell::new).collect(),
             board: RefCell::new(Board::new(setup.sensors.len())),
             log: Log::new(judges::all(&setup, plan), detail, sought),
             planted: Planted::new(defect),

@@ -37,6 +37,7 @@ fn judge(defect: Defect) -> &'static [&'static str] {
         Defect::HiddenRate => &["settings"],
         Defect::UnmarkedEstimate | Defect::NeedlessEstimate => &["stamps"],
         Defect::UnsentWarning => &["early"],
+        Defect::WrongFamily | Defect::NeedlessByte => &["family"],
     }
 }
 
@@ -58,7 +59,7 @@ const OF_HEADS: [(Defect, &str); 12] = [
 
 /// First seeds by which a defect was found when this was written, where that is not 0. Seeds that find nothing are not played
 /// again; if one of these finds nothing either, all are.
-const FOUND_BY: [(Defect, &str, u64); 16] = [
+const FOUND_BY: [(Defect, &str, u64); 17] = [
     (Defect::MergedTurn, "", 1),
     (Defect::OtherBeams, "", 1),
     (Defect::StampedOnArrival, "", 22),
@@ -71,6 +72,7 @@ const FOUND_BY: [(Defect, &str, u64); 16] = [
     (Defect::WrongPlaces, "", 1),
     (Defect::UnmarkedEstimate, "", 2),
     (Defect::UnsentWarning, "", 51),
+    (Defect::NeedlessByte, "", 1),
     (Defect::UnmarkedTurn, "s1", 3),
     (Defect::StampedOnArrival, "a1", 45),
     (Defect::UncountedLoss, "c1", 3),

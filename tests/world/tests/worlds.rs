@@ -35,6 +35,12 @@ fn worlds_are_well() {
     are_well((0..20).map(|seed| Plan::of_seed(seed, 60)).collect());
 }
 
+/// The first of those in which the hub searches for scanners.
+#[test]
+fn worlds_with_links_without_a_family_are_well() {
+    are_well((0..10).map(|seed| Plan::auto_of_seed(seed, 60)).collect());
+}
+
 /// Checks that no judge finds a violation in these worlds.
 fn are_well(plans: Vec<Plan>) {
     let count = plans.len();

@@ -57,8 +57,12 @@ impl Family for Ld {
         Rc::new(Ld { family: "auto", is_said: false, ..self.clone() })
     }
 
-    fn family(&self) -> schema::Family {
-        schema::Family::Ld
+    fn families(&self) -> Vec<schema::Family> {
+        vec![schema::Family::Ld]
+    }
+
+    fn rates(&self) -> Vec<u32> {
+        vec![self.settings.model.baud()]
     }
 
     /// What appears where the head has just been is measured a turn later, and told when that turn is over.

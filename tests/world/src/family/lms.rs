@@ -68,13 +68,17 @@ impl Family for Lms {
         ]
     }
 
-    /// It streams as an LMS does without keys.
+    /// An LMS whose link has no keys streams in the usual variant, at 500,000 baud.
     fn auto(&self) -> Rc<dyn Family> {
         Rc::new(Lms { is_auto: true, variant: Variant::HALF, baud: Baud::B500000, ..self.clone() })
     }
 
-    fn family(&self) -> schema::Family {
-        schema::Family::Lms
+    fn families(&self) -> Vec<schema::Family> {
+        vec![schema::Family::Lms]
+    }
+
+    fn rates(&self) -> Vec<u32> {
+        Baud::ALL.map(Baud::rate).to_vec()
     }
 
     /// At the rate that the link asks for.

@@ -103,8 +103,12 @@ impl Family for Rplidar {
         Rc::new(Rplidar { family: "auto", is_said: false, mode: None, ..self.clone() })
     }
 
-    fn family(&self) -> schema::Family {
-        schema::Family::Rplidar
+    fn families(&self) -> Vec<schema::Family> {
+        vec![schema::Family::Rplidar]
+    }
+
+    fn rates(&self) -> Vec<u32> {
+        alike(self.settings.model).iter().map(|model| model.baud()).collect()
     }
 
     /// As of any head that turns; whether a turn is over is seen only when the head is well behind its end.

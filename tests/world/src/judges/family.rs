@@ -8,16 +8,19 @@ use schema::{Family as FamilyName, MILLIS, Nanos, State, Status, Topic};
 
 use super::{Judge, Say};
 use crate::event::{Event, Telegram};
-use crate::family::Family;
+use crate::family::{Family, is_ld_packet};
 use crate::topics::Sample;
 
 /// The families of all sensors, and since when their scanners have been streaming.
 pub(crate) struct OfSensors(Vec<OfSensor>);
 
 struct OfSensor {
-    family: FamilyName,
+    /// The family, or both families of a scanner that is exchanged for a scanner of another family.
+    families: Vec<FamilyName>,
     is_auto: bool,
     opened_at: Nanos,
+    /// Time from which a scanner that was exchanged for one of another family must be found like any other.
+    lost_at: Nanos,
     /// Time since which packets have been arriving without damage and without gaps, and of the last one.
     clean_since: Option<Nanos>,
     last_at: Nanos,
@@ -28,9 +31,10 @@ struct OfSensor {
 impl OfSensors {
     pub(crate) fn new(sensors: &[Rc<dyn Family>]) -> OfSensors {
         let sensor = |family: &Rc<dyn Family>| OfSensor {
-            family: family.family(),
+            families: family.families(),
             is_auto: family.keys().iter().any(|key| key == "family=auto"),
             opened_at: 0,
+            lost_at: 0,
             clean_since: None,
             last_at: 0,
             end: 0,
@@ -48,13 +52,15 @@ impl Judge for OfSensors {
         match *event {
             Event::Opened { sensor, .. } => self.0[sensor].opened_at = at,
             Event::Sent { sensor, telegram } => self.0[sensor].send(at, telegram),
-            Event::Exchanged { sensor } | Event::Altered { sensor } => self.0[sensor].clean_since = None,
-            Event::Written { sensor } => {
-                let of = &self.0[sensor];
-                let is_undisturbed = |since: Nanos| since <= of.opened_at || since + SEARCH < at;
-                if of.family == FamilyName::Ld && of.clean_since.is_some_and(is_undisturbed) {
-                    say.broken(format!("sensor {sensor}: an LDROBOT that streams gets a byte"));
-                }
+            Event::Exchanged { sensor } => {
+                let of = &mut self.0[sensor];
+                of.clean_since = None;
+                // The session of the other family handles the silence of its scanner first.
+                of.lost_at = if of.families.len() > 1 { at + LOST_AFTER } else { at };
+            }
+            Event::Altered { sensor } => self.0[sensor].clean_since = None,
+            Event::Written { sensor } if self.0[sensor].is_undisturbed(at) => {
+                say.broken(format!("sensor {sensor}: an LDROBOT that streams gets a byte"));
             }
             Event::Published { sensor, sample } => {
                 if let Err(words) = self.0[sensor].check(sample) {
@@ -67,11 +73,22 @@ impl Judge for OfSensors {
 }
 
 impl OfSensor {
+    /// Returns whether an LDROBOT has been streaming since the port was opened, or for longer than a search needs to notice.
+    fn is_undisturbed(&self, at: Nanos) -> bool {
+        // A scanner of another family may be remembered, whose rates are tried first.
+        let is_known = self.families == [FamilyName::Ld];
+        let is_old =
+            |since: Nanos| is_known && since <= self.opened_at || since.max(self.lost_at) + SEARCH < at;
+        at < self.last_at + GAP && self.clean_since.is_some_and(is_old)
+    }
+
     fn send(&mut self, at: Nanos, telegram: &Telegram<'_>) {
         let begin = std::mem::replace(&mut self.end, telegram.span.1);
-        // The line is not to blame for these.
+        // The scanner and the line are intact: the port has another rate, or the hub does not read.
         let is_harmless = |damage: &str| matches!(damage, "baud" | "unread" | "flushed");
-        let is_clean = telegram.damage.is_none_or(is_harmless) && telegram.span.0 <= begin;
+        let is_clean = is_ld_packet(telegram.bytes)
+            && telegram.damage.is_none_or(is_harmless)
+            && telegram.span.0 <= begin;
         let is_next = at < std::mem::replace(&mut self.last_at, at) + GAP;
         self.clean_since = self.clean_since.filter(|_| is_next).or(Some(at)).filter(|_| is_clean);
     }
@@ -93,10 +110,10 @@ impl OfSensor {
             _ => true,
         };
         let is_unknown = self.is_auto && may_be_unknown && family.is_none();
-        if is_unknown || family == Some(self.family) {
+        if is_unknown || family.is_some_and(|family| self.families.contains(&family)) {
             return Ok(());
         }
-        Err(format!("{topic:?} of {family:?}, and the scanner is of {:?}", self.family))
+        Err(format!("{topic:?} of {family:?}, and the scanner is of {:?}", self.families))
     }
 }
 
@@ -104,3 +121,5 @@ impl OfSensor {
 const GAP: Nanos = 50 * MILLIS;
 /// Duration of a round of the search, after which it notices that a scanner has begun to stream.
 const SEARCH: Nanos = 4_000 * MILLIS;
+/// Time after which the search begins again because nothing of the scanner arrives.
+const LOST_AFTER: Nanos = 10_000 * MILLIS;

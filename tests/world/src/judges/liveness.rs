@@ -1,5 +1,6 @@
 //! When nothing goes wrong any more, everything comes back soon: each link says that it streams, and publishes measured values;
-//! and scans, as soon as the sensor has told how its values are split. One that did not tell is asked again now and then.
+//! and scans, as soon as the sensor has told how its values are split. One that did not tell is asked again now and then. The
+//! search for a scanner of another family begins after ten seconds without data.
 
 use std::rc::Rc;
 
@@ -18,6 +19,8 @@ pub(crate) struct Liveness {
 struct OfSensor {
     family: Rc<dyn Family>,
     says_so: bool,
+    /// Time at which the search for a scanner of another family begins.
+    searched_at: Nanos,
     /// Telegrams of measured values came, and scans.
     came: [bool; 2],
     /// When the first one of each came, without the time that the scanner waited for its motor.
@@ -32,6 +35,7 @@ impl Liveness {
         let sensor = |family: &Rc<dyn Family>| OfSensor {
             family: family.clone(),
             says_so: false,
+            searched_at: 0,
             came: [false; 2],
             first: [None; 2],
             answered_at: 0,
@@ -56,6 +60,9 @@ impl Judge for Liveness {
             Event::Healed => {
                 self.healed = Some(at);
                 self.sensors.iter_mut().for_each(|of| of.came = [false; 2]);
+            }
+            Event::Exchanged { sensor } if self.sensors[sensor].family.families().len() > 1 => {
+                self.sensors[sensor].searched_at = at + LOST_AFTER;
             }
             Event::Sent { sensor, telegram }
                 if telegram.is_reply && self.sensors[sensor].first[0].is_none() =>
@@ -86,7 +93,7 @@ impl Judge for Liveness {
                 }
                 let is_back = of.says_so && !of.came[which];
                 of.came[which] |= of.says_so;
-                if let Some(healed) = self.healed
+                if let Some(healed) = self.healed.map(|healed| healed.max(of.searched_at))
                     && is_back
                     && at > healed + SOON[which]
                 {
@@ -96,7 +103,9 @@ impl Judge for Liveness {
             }
             Event::Over { .. } => {
                 let sensors = self.sensors.iter().enumerate();
-                for (sensor, _) in sensors.filter(|(_, of)| !(of.says_so && of.came == [true; 2])) {
+                let is_due = |of: &OfSensor| of.searched_at == 0 || at > of.searched_at + SOON[1];
+                let is_back = |of: &OfSensor| of.says_so && of.came == [true; 2];
+                for (sensor, _) in sensors.filter(|(_, of)| is_due(of) && !is_back(of)) {
                     say.broken(format!("sensor {sensor} does not stream at the end"));
                 }
             }
@@ -109,3 +118,5 @@ impl Judge for Liveness {
 /// whose last word was damaged, just before everything was well, is asked again for up to 3 s first. One that streams and
 /// does not tell how is asked every ten seconds.
 const SOON: [Nanos; 2] = [5_500 * MILLIS, 11_000 * MILLIS];
+/// Time after which the search begins again because nothing of the scanner arrives.
+const LOST_AFTER: Nanos = 10_000 * MILLIS;
