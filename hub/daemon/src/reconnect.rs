@@ -28,6 +28,8 @@ struct OpenLine<L> {
     line: L,
     /// Whether it has the rate that the session wants first.
     has_rate: bool,
+    /// Whether a service manager kept the line of a killed hub open, with the bytes that it has received.
+    is_kept: bool,
 }
 
 /// Where the port is.
@@ -63,9 +65,10 @@ impl<'a, S: Surroundings> LiveLink<'a, S> {
         let mut live =
             LiveLink { core, drive, phase: Phase::away(Away::default(), 0), futile: 0, has_begun: false };
         match live.first_line() {
-            Ok(Some((line, is_kept))) => {
+            Ok(Some(line)) => {
                 // On a line that was closed meanwhile it may be another sensor, or the same in another mode.
-                live.open(line, known.filter(|_| is_kept));
+                let known = known.filter(|_| line.is_kept);
+                live.open(line, known);
                 Ok(live)
             }
             Ok(None) => {
@@ -132,9 +135,8 @@ impl<'a, S: Surroundings> LiveLink<'a, S> {
         self.core.end();
     }
 
-    /// The line at the hub's start, and whether it is the one that a killed hub had and somebody kept, with what lies in it;
-    /// nothing if a connection has to be made.
-    fn first_line(&mut self) -> Result<Option<(OpenLine<S::Line>, bool)>, PortError> {
+    /// Returns the line at the start of the hub. `None` if a connection has to be made.
+    fn first_line(&mut self) -> Result<Option<OpenLine<S::Line>>, PortError> {
         let (link, around) = (self.core.link, self.core.around);
         let (name, source, baud) = (&link.name, &link.port, self.drive.opening_rate(&self.core));
         if let Source::Tcp { .. } = source {
@@ -142,13 +144,9 @@ impl<'a, S: Surroundings> LiveLink<'a, S> {
         }
         if let Some(line) = around.take_kept(name, source, baud) {
             tracing::info!("{name}: continues with {}, which the service manager kept open", source.name());
-            return Ok(Some((OpenLine { line, has_rate: true }, true)));
+            return Ok(Some(OpenLine { line, has_rate: true, is_kept: true }));
         }
-        match self.open_line(baud) {
-            Some(Ok(line)) => Ok(Some((line, false))),
-            Some(Err(error)) => Err(error),
-            None => Ok(None),
-        }
+        self.open_line(baud).transpose()
     }
 
     /// Opens the port at `baud`. A search leaves out a rate that the port cannot have, so it then gets a port at another rate.
@@ -161,7 +159,7 @@ impl<'a, S: Surroundings> LiveLink<'a, S> {
             }
             opened => (opened, true),
         };
-        opened.map(|opened| opened.map(|line| OpenLine { line, has_rate }))
+        opened.map(|opened| opened.map(|line| OpenLine { line, has_rate, is_kept: false }))
     }
 
     /// Tries to open the port; what becomes of it is known at once, or when the wait for it is over.
@@ -182,7 +180,7 @@ impl<'a, S: Surroundings> LiveLink<'a, S> {
     }
 
     /// Starts a session on an open line. It may continue with the stream of a scanner whose identity is `known`.
-    fn open(&mut self, OpenLine { line, has_rate }: OpenLine<S::Line>, known: Option<Identity>) {
+    fn open(&mut self, OpenLine { line, has_rate, .. }: OpenLine<S::Line>, known: Option<Identity>) {
         let core = &mut self.core;
         let now = core.around.now();
         core.around.keep(&core.link.name, &line);
