@@ -74,8 +74,8 @@ pub struct Warning {
 /// Compares scans of one sensor with its circles.
 ///
 /// Where the design leaves something open:
-/// - Until `min_scans` scans have been seen since the start, a silence or a change of the sensor's layout, no zone can
-///   be violated. The verdict is unknown then, because clear would be a guess.
+/// - Until `min_scans` scans have been seen since the start, a silence, a scan with too many invalid beams or a change of the
+///   sensor's layout, the absence of a violation proves nothing. The verdict is unknown then, because clear would be a guess.
 /// - A beam is relevant if one of its readings, in the scan's units and below its codes, can lie inside the largest
 ///   circle and outside the robot's own body. All other beams count neither as invalid nor in the total.
 /// - If fewer beams are relevant than a violation takes, no zone can ever be violated, so the verdict is unknown. This
@@ -85,7 +85,7 @@ pub struct Check {
     min_beams: u16,
     min_scans: u16,
     table: Table,
-    /// Number of scans since the start, a silence or a change of the layout.
+    /// Number of scans since the start, a silence, a scan with too many invalid beams or a change of the layout.
     seen: u16,
     /// Number of consecutive scans in which enough beams met something, by circle.
     streaks: [u16; ZONES],
@@ -119,7 +119,8 @@ impl Check {
         let invalid = self.table.invalid(ranges, scan.spacing);
         let Met { inside, nearest } = self.table.met(ranges, scan.exact_angles());
         let is_enough = self.seen >= self.min_scans && !self.is_blind();
-        let is_known = is_enough && !self.is_late && invalid <= self.table.most_invalid();
+        let is_valid = invalid <= self.table.most_invalid();
+        let is_known = is_enough && !self.is_late && is_valid;
         for (streak, &beams) in self.streaks.iter_mut().zip(&inside).take(self.table.circles()) {
             *streak = if beams >= self.min_beams { streak.saturating_add(1) } else { 0 };
         }
@@ -128,6 +129,10 @@ impl Check {
         (out.nearest_beam, out.nearest_mm) = nearest.unwrap_or((Zones::NO_BEAM, Zones::NO_DISTANCE));
         out.invalid_beams = invalid;
         self.write_circles(&inside, out);
+        if !is_valid {
+            // The scan may have ended the streak of a zone whose object is still there.
+            self.seen = 0;
+        }
     }
 
     /// Checks an incomplete scan with as many beams, `count`, and the same unit, `unit_um`, as the last one. `ranges`

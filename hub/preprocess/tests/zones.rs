@@ -181,7 +181,8 @@ fn compare(case: &Case, scan: &Scan, out: &Zones) -> Tally {
     }
     assert_eq!(out.invalid_beams, invalid);
     tally.blind = telling < case.settings.min_beams;
-    tally.unknown = tally.blind || f64::from(invalid) > case.settings.max_invalid * f64::from(telling) + 1e-9;
+    tally.invalid = f64::from(invalid) > case.settings.max_invalid * f64::from(telling) + 1e-9;
+    tally.unknown = tally.blind || tally.invalid;
     match (nearest, out.nearest()) {
         (None, None) => {}
         (Some((distance, i)), Some((beam, said))) => {
@@ -203,6 +204,8 @@ struct Tally {
     sure: u32,
     close: u32,
     unknown: bool,
+    /// Too many beams are invalid.
+    invalid: bool,
     /// A violation takes more beams than can tell something.
     blind: bool,
 }
@@ -220,7 +223,9 @@ fn zones_are_those_of_the_formula_and_of_geometry() {
         for unit_mm in [1, 10, 100] {
             let mut scan = scans::layout(&mut random, unit_mm);
             let mut streaks = vec![0; case.radii.len()];
-            for seen in 1..=SCANS {
+            let mut seen = 0;
+            for _ in 0..SCANS {
+                seen += 1;
                 case.fill(&mut random, &mut scan);
                 check.update(&scan, &mut out);
                 let tally = compare(&case, &scan, &out);
@@ -242,6 +247,9 @@ fn zones_are_those_of_the_formula_and_of_geometry() {
                 assert_eq!(out.flags & Zones::PROVISIONAL != 0, is_new);
                 assert!(violated.is_sorted_by(|outer, inner| outer >= inner), "nested");
                 verdicts[expected as usize] += 1;
+                if tally.invalid {
+                    seen = 0;
+                }
             }
         }
     }
@@ -250,6 +258,25 @@ fn zones_are_those_of_the_formula_and_of_geometry() {
     );
     assert!(verdicts.iter().all(|&verdicts| verdicts > CASES / 10), "{verdicts:?}");
     assert!(close > 1000 && sure > 10_000 && blind > 100, "{close} {sure} {blind}");
+}
+
+/// An object stays inside the circle, and one scan in between cannot show it.
+#[test]
+fn after_an_invalid_scan_the_verdict_is_not_clear_before_it_is_proven() {
+    let settings = Settings { radii_mm: &[1000, 600], min_scans: 2, ..Settings::default() };
+    let mut check = Check::new(Pose::default(), &settings, 181);
+    let head = ScanHead::lms(181, -90_000, 1000, 1, 13);
+    let scan = |range: u16| Scan::of(head, &[range; 181]);
+    let (near, far, invalid) = (scan(300), scan(4000), scan(head.no_return - 1));
+    let mut verdict = |scan: &Box<Scan>| {
+        let mut out = dirty();
+        check.update(scan, &mut out);
+        out.verdict()
+    };
+    let verdicts =
+        [&near, &near, &invalid, &near, &near, &far, &invalid, &far, &far].map(|scan| verdict(scan));
+    let [unknown, stop, clear] = [Verdict::Unknown, Verdict::Stop, Verdict::Clear];
+    assert_eq!(verdicts, [unknown, stop, unknown, unknown, stop, clear, unknown, unknown, clear]);
 }
 
 #[test]
