@@ -117,7 +117,8 @@ impl Stage {
         // The state of the hub is removed with the stage.
         command.env("XDG_STATE_HOME", &self.directory).env_remove("STATE_DIRECTORY");
         sensors.iter().for_each(|sensor| {
-            command.args(["--link", &format!("{sensor}={}", self.port(sensor))]);
+            // Without the time and the shared memory of a search.
+            command.args(["--link", &format!("{sensor}={},family=lms", self.port(sensor))]);
         });
         command
     }

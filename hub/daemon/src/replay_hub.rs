@@ -150,10 +150,12 @@ fn link_name(sensor: &str) -> String {
 
 /// What is configured, with the sensors of the recording for links.
 fn configuration(sources: &Sources, sensors: &[Sensor], file: &Path) -> Result<Config, Failure> {
-    let mut config = Config::load(&with_links(sources, sensors)?)?;
+    let (sources, searched) = with_links(sources, sensors)?;
+    let mut config = Config::load(&sources)?;
     config.links.retain(|link| sensors.iter().any(|sensor| sensor.link == link.name));
     for link in &mut config.links {
         link.port = Source::File { path: file.to_owned(), paced: true };
+        link.scanner.settings.is_found = searched.contains(&link.name);
         let of = sensors.iter().find(|sensor| sensor.link == link.name);
         // What is not configured is as it was recorded.
         if let Some(Sensor { model, beams, way, .. }) = of.filter(|_| link.scanner.is_auto()) {
@@ -168,18 +170,19 @@ fn configuration(sources: &Sources, sensors: &[Sensor], file: &Path) -> Result<C
     Ok(config)
 }
 
-/// Returns `sources` with a link for each of `sensors`. A link without a configured family has that of its sensor.
-fn with_links(sources: &Sources, sensors: &[Sensor]) -> Result<Sources, Failure> {
+/// Returns `sources` with a link for each of `sensors`, and the names of the links without a configured family. They have that of
+/// their sensor.
+fn with_links(sources: &Sources, sensors: &[Sensor]) -> Result<(Sources, Vec<String>), Failure> {
     let mut sources = sources.clone();
     // Not the path itself, which may have signs that have a meaning in a port's name.
     sources.links.extend(sensors.iter().map(|sensor| format!("{}=file:recording", sensor.link)));
     let links = Config::load(&sources)?.links;
     let is_searched =
         |sensor: &&Sensor| links.iter().any(|link| link.name == sensor.link && link.family().is_none());
-    let families = sensors.iter().filter(is_searched);
-    let families = families.map(|sensor| format!("link.{}.family={}", sensor.link, sensor.family.name()));
-    sources.set.extend(families);
-    Ok(sources)
+    let searched: Vec<&Sensor> = sensors.iter().filter(is_searched).collect();
+    let family = |sensor: &&Sensor| format!("link.{}.family={}", sensor.link, sensor.family.name());
+    sources.set.extend(searched.iter().map(family));
+    Ok((sources, searched.iter().map(|sensor| sensor.link.clone()).collect()))
 }
 
 /// Links that are configured and not in `config`.
@@ -187,7 +190,7 @@ fn left_out(sources: &Sources, sensors: &[Sensor], config: &Config) -> Result<Ve
     if sources.files.is_empty() {
         return Ok(Vec::new());
     }
-    let all = Config::load(&with_links(sources, sensors)?)?.links.into_iter().map(|link| link.name);
+    let all = Config::load(&with_links(sources, sensors)?.0)?.links.into_iter().map(|link| link.name);
     Ok(all.filter(|name| config.links.iter().all(|link| link.name != *name)).collect())
 }
 

@@ -131,6 +131,7 @@ impl line::Protocol for Session {
         fn commit(now: Nanos, len: usize);
         fn handle_timeout(now: Nanos);
         fn transmitted(now: Nanos);
+        fn reject_rate(now: Nanos);
         fn poll_output() -> Output<'_>;
     }
 }

@@ -255,8 +255,9 @@ impl line::Protocol for PortSession {
 
     fn reject_rate(&mut self, now: Nanos) {
         self.now = now;
-        if let Stage::Searching(search) = &mut self.stage {
-            search.reject_rate(now);
+        match &mut self.stage {
+            Stage::Searching(search) => search.reject_rate(now),
+            Stage::Found(session) => session.reject_rate(now),
         }
     }
 

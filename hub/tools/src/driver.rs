@@ -262,7 +262,7 @@ struct End;
 impl Task<Session> for End {}
 
 /// A procedure with an end, such as requests to an LMS. Calls `progress` before each wait, and ends early if it returns false.
-/// Logs each rate once that the port cannot have; the procedure skips it.
+/// Logs each rate once that the port cannot have; a search leaves it out.
 pub(crate) struct Procedure<F> {
     progress: F,
     refused: Vec<u32>,

@@ -64,7 +64,7 @@ impl Machine<'_> {
     pub(crate) fn robot(&self) -> [Running; 2] {
         let port = |name: &str| self.root.join(format!("tty-{name}")).display().to_string();
         let ports = SENSORS.map(|name| format!("--port={}", port(name)));
-        let links = SENSORS.map(|name| format!("--link={name}={}", port(name)));
+        let links = SENSORS.map(|name| format!("--link={name}={},family=lms", port(name)));
         let scanhub = &self.stage.scanhub;
         let simulator = self.start(scanhub, &["simulate", &ports[0], &ports[1], "--baud=500000"]);
         [simulator, self.start(scanhub, &["run", &links[0], &links[1]])]

@@ -145,7 +145,8 @@ impl Lap<'_> {
         self.session.get_or_insert_with(|| {
             let link = replay.link.link;
             let mode_number = self.frames.first_mode().map(|mode| mode.0);
-            let settings = Settings { mode_number, ..link.settings() };
+            let is_found = link.family().is_none() || link.settings().is_found;
+            let settings = Settings { mode_number, is_found, ..link.settings() };
             let session = PortSession::begin(Some(self.frames.family), &settings, None, when.first);
             VirtualTime::new(session, when.first)
         });

@@ -104,6 +104,11 @@ impl Dialogue {
         &self.rate
     }
 
+    /// Handles that the port cannot have the rate to which it was to be set.
+    pub(crate) fn reject_rate(&mut self) {
+        self.rate.reject();
+    }
+
     /// Returns the rate if the port has to be set to it now.
     pub(crate) fn take_rate_change(&mut self) -> Option<Baud> {
         self.rate.take_change()

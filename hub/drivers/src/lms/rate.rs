@@ -4,6 +4,9 @@
 //! communicate before its power is cycled. After [`MOST_SILENT`] such switches in a row, a session with an automatic rate
 //! streams at 38,400 baud, the highest rate of RS-232. The count outlives boot messages, sessions and runs of the hub: the
 //! power of a scanner is often cycled together with that of its host.
+//!
+//! The port may not be able to have 500,000 baud either. A named LMS is refused there when the port is opened. If a search has
+//! found the scanner at another rate, the port is set to 500,000 baud for a moment before the scanner is switched to it.
 
 use schema::{MILLIS, Nanos};
 
@@ -33,6 +36,19 @@ pub(crate) struct LineRate {
     /// The rate at which the search had its last reply.
     found_at: Option<Baud>,
     fast_switches: FastSwitches,
+    trial: Trial,
+}
+
+/// Trial whether the port can have the rate to stream at.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Trial {
+    /// The port is open at that rate, or it was tried.
+    Done,
+    Due,
+    /// The port was set to that rate.
+    Running,
+    /// The port cannot have that rate.
+    Failed,
 }
 
 impl LineRate {
@@ -50,6 +66,7 @@ impl LineRate {
             first: POWER_ON_BAUD,
             found_at: None,
             fast_switches: FastSwitches::default(),
+            trial: Trial::Done,
         }
     }
 
@@ -70,7 +87,25 @@ impl LineRate {
 
     /// Returns the rate if the port has to be set to it.
     pub(crate) fn take_change(&mut self) -> Option<Baud> {
+        match self.trial {
+            Trial::Due => {
+                self.trial = Trial::Running;
+                return Some(self.target);
+            }
+            Trial::Running => {
+                self.trial = Trial::Done;
+                self.is_changed = true;
+            }
+            Trial::Failed | Trial::Done => {}
+        }
         core::mem::take(&mut self.is_changed).then_some(self.baud)
+    }
+
+    /// Handles that the port cannot have the rate to which it was to be set.
+    pub(crate) fn reject(&mut self) {
+        if self.trial == Trial::Running {
+            (self.trial, self.target, self.is_changed) = (Trial::Failed, RS232, true);
+        }
     }
 
     /// Changes the rate, unless the port has only one.
@@ -84,6 +119,9 @@ impl LineRate {
     pub(crate) fn begin_at(&mut self, baud: Baud) {
         (self.rest_at, self.first) = (baud, baud);
         (self.baud, self.is_changed) = (baud, false);
+        if baud != self.target && !self.is_kept {
+            self.trial = Trial::Due;
+        }
     }
 
     /// Begins at the rate to stream at. If there is no stream, the search tries that rate first if the scanner was stopped there
@@ -166,8 +204,11 @@ impl LineRate {
         self.fast_switches.have_lost()
     }
 
-    /// Returns the message that the line cannot carry the wanted rate, if so.
+    /// Returns the message that the port or the line cannot have the wanted rate, if so.
     pub(crate) fn trouble(&self) -> Option<Trouble> {
+        if self.trial == Trial::Failed {
+            return Some(Trouble::PortLacksRate { instead: self.target });
+        }
         let has_failed = self.wanted == FAST && self.fast_switches.have_failed();
         has_failed.then(|| Trouble::NeedsRs422 { instead: self.instead_of_wanted() })
     }

@@ -35,6 +35,11 @@ pub enum Trouble {
         /// Rate that the session uses instead; `None` if it has to keep to 500,000 baud.
         instead: Option<Baud>,
     },
+    /// The port cannot have 500,000 baud.
+    PortLacksRate {
+        /// Rate that the session uses instead.
+        instead: Baud,
+    },
     /// The session is paused, but bytes arrive, and the scanner has not confirmed that it stops.
     NotStopped,
     /// The scanner reports that it is a version S14, which scans 90 degrees with as many values as others 180.
@@ -74,6 +79,12 @@ impl fmt::Display for Trouble {
                 "500000 baud needs RS-422: the scanner was lost in two switches to it, so the hub uses {} baud. If no \
                  scans arrive, cycle the scanner's power",
                 baud.rate()
+            ),
+            Trouble::PortLacksRate { instead } => write!(
+                f,
+                "the port cannot have 500000 baud, so the hub uses {} baud, with a tenth of the scans. An adapter with \
+                 an FTDI chip can have it",
+                instead.rate()
             ),
             Trouble::NeedsRs422 { instead: None } => f.write_str(
                 "500000 baud needs RS-422: the scanner was lost in two switches to it. On RS-232, set baud = 38400 and \

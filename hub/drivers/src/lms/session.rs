@@ -217,6 +217,11 @@ impl Session {
 }
 
 impl line::Protocol for Session {
+    fn reject_rate(&mut self, now: Nanos) {
+        self.now = now;
+        self.dialogue.reject_rate();
+    }
+
     fn spare(&mut self) -> &mut [u8] {
         let spare = self.framer.spare();
         self.room = spare.len();
