@@ -1,5 +1,6 @@
-//! Locks of the publishers in a domain: at most one hub, at most one listener for remote sensors, and any number of programs
-//! that publish under their own name. A lock ends with its process. Subscribers query the locks but never take one.
+//! Locks of the publishers in a domain: at most one hub, at most one listener for remote sensors, and any number of
+//! programs that publish under their own name. A lock ends with its process. Subscribers query the locks but never take
+//! one.
 
 use std::fs::File;
 use std::io;
@@ -15,8 +16,8 @@ use nix::libc::{self, flock};
 use crate::ipc::isolation::{ensure_prefix, read_prefix};
 use crate::{Directory, Failure, Kind, ipc, shortage};
 
-/// The lock of a hub on its domain; it ends with the value or with the process, however that ends. Drop it after the hub's
-/// node.
+/// The lock of a hub on its domain; it ends with the value or with the process, however that ends. Drop it after the
+/// hub's node.
 #[derive(Debug)]
 pub struct HubLock {
     publishing: Publishing,
@@ -122,8 +123,8 @@ impl Drop for Publishing {
     }
 }
 
-/// Held while services are made in a domain or what is left of unfinished ones is swept away, by hub, listener and programs
-/// under a name of their own in turn.
+/// Held while services are made in a domain or what is left of unfinished ones is swept away, by hub, listener and
+/// programs under a name of their own in turn.
 pub(crate) struct MakingLock {
     _held: Held,
 }
@@ -233,7 +234,8 @@ fn held_file(root: &Path, name: &str) -> Result<Option<(Directory, File)>, Failu
 const HUB: &str = "hub.lock";
 const LISTENER: &str = "listen.lock";
 const MAKING: &str = "making.lock";
-/// Maximum duration of a hub's start for clients. After it, a hub of a version that never reports that it is ready is up.
+/// Maximum duration of a hub's start for clients. After it, a hub of a version that never reports that it is ready is
+/// up.
 const MAX_START: Duration = Duration::from_secs(60);
 /// Second line of the file of a hub's lock once all topics exist.
 const READY: &str = "ready";

@@ -62,14 +62,14 @@ impl Status {
         State::ALL.get(usize::from(self.state)).copied()
     }
 
-    /// Returns whether the measuring mode has reflector bits, without which there are no marks (Telegram listing, 77h block D);
-    /// nothing as long as the mode is not known.
+    /// Returns whether the measuring mode has reflector bits, without which there are no marks (Telegram listing, 77h
+    /// block D); nothing as long as the mode is not known.
     pub fn has_reflector_bits(&self) -> Option<bool> {
         (self.mode != Status::MODE_UNKNOWN).then_some(matches!(self.mode, 0x01 | 0x03 | 0x05))
     }
 
-    /// Returns the command that gives the sensor reflector bits, if it has none and is no recording: they live in its EEPROM,
-    /// which only a person changes.
+    /// Returns the command that gives the sensor reflector bits, if it has none and is no recording: they live in its
+    /// EEPROM, which only a person changes.
     pub fn reflector_remedy(&self) -> Option<String> {
         let is_wanted = self.has_reflector_bits() == Some(false) && !self.is_replayed();
         is_wanted.then(|| format!("scanhub configure {} mode=0x01", self.port()))
@@ -81,13 +81,14 @@ impl Status {
         is_measured.then(|| f64::from(self.rate_mhz) / 1000.0)
     }
 
-    /// Returns the share of the line's bytes that were in nothing over the last 10 s, 0 to 1: those of a stream, without
-    /// scans that the sensor broke off to answer.
+    /// Returns the share of the line's bytes that were in nothing over the last 10 s, 0 to 1: those of a stream,
+    /// without scans that the sensor broke off to answer.
     pub fn damaged(&self) -> f64 {
         self.counters[Counter::DamagedPpm] as f64 / 1e6
     }
 
-    /// Scans, or of a scanner whose head turns packets, that must have been sent and did not arrive; nothing if that is not known.
+    /// Scans, or of a scanner whose head turns packets, that must have been sent and did not arrive; nothing if that is
+    /// not known.
     pub fn lost_on_line(&self) -> Option<u64> {
         (self.counters[Counter::DueOnLine] > 0).then_some(self.counters[Counter::LostOnLine])
     }
@@ -97,8 +98,8 @@ impl Status {
         self.lost_on_line().map(|_| self.counters[Counter::LostPpm] as f64 / 1e6)
     }
 
-    /// Returns what the line takes away, in words such as `41 % lost on the line`, if that is more than a thousandth in the
-    /// last 10 s.
+    /// Returns what the line takes away, in words such as `41 % lost on the line`, if that is more than a thousandth in
+    /// the last 10 s.
     pub fn line_loss(&self) -> Option<String> {
         let lost = self.lost_share().filter(|&share| share > WELL);
         let damaged = Some(self.damaged()).filter(|&share| share > WELL);
@@ -112,7 +113,8 @@ impl Status {
         self.port().starts_with("file:")
     }
 
-    /// Returns the family of the scanner; `None` while the hub searches for it, or if this program does not know the family.
+    /// Returns the family of the scanner; `None` while the hub searches for it, or if this program does not know the
+    /// family.
     pub fn family(&self) -> Option<Family> {
         Family::of_number(self.family)
     }
@@ -128,8 +130,8 @@ impl Status {
         word.filter(|word| !word.is_empty())
     }
 
-    /// Returns how a scanner measures whose modes have names, the second word of what the sensor calls itself; nothing if
-    /// unknown.
+    /// Returns how a scanner measures whose modes have names, the second word of what the sensor calls itself; nothing
+    /// if unknown.
     pub fn way(&self) -> Option<&str> {
         let is_named = self.family().is_some_and(|family| family != Family::Lms);
         let word = self.sensor_type().split_whitespace().nth(1).filter(|_| is_named)?;

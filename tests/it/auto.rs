@@ -1,4 +1,5 @@
-//! A hub whose link has `family = "auto"`: it finds the scanner, reports it and remembers it, and reports if there is none.
+//! A hub whose link has `family = "auto"`: it finds the scanner, reports it and remembers it, and reports if there is
+//! none.
 
 use std::fs;
 
@@ -150,8 +151,8 @@ fn a_number_of_beams_outlives_a_restart_of_the_hub() {
         assert!(counts.iter().all(|count| *count == 666), "{counts:?}");
         hub.end(how);
     }
-    // Another model at the same rate: its first scans have the number that is remembered for the port. It changes once the other
-    // number is certain.
+    // Another model at the same rate: its first scans have the number that is remembered for the port. It changes once
+    // the other number is certain.
     env.kill_simulator(ld14p, "front");
     let _ld19 = env.simulator(&["front"], LD19);
     let hub = hub(&env);

@@ -1,5 +1,5 @@
-//! `scanhub config`: what it prints loads, what it checks a hub would take, and what it shows names every place. And what
-//! follows from the command line's own definition: examples, the nearest name, completions, manual pages.
+//! `scanhub config`: what it prints loads, what it checks a hub would take, and what it shows names every place. And
+//! what follows from the command line's own definition: examples, the nearest name, completions, manual pages.
 
 use std::fs;
 use std::path::{Path, PathBuf};

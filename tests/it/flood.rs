@@ -1,5 +1,5 @@
-//! Ten megabytes of garbage as fast as the hub reads, with a telegram now and then: each is delivered, and nothing grows.
-//! From a serial server no more is read than twice what the line brings, and what it costs is little.
+//! Ten megabytes of garbage as fast as the hub reads, with a telegram now and then: each is delivered, and nothing
+//! grows. From a serial server no more is read than twice what the line brings, and what it costs is little.
 
 use std::io::Write;
 use std::net::TcpListener;

@@ -178,7 +178,8 @@ fn an_unknown_scanner_gets_only_requests_of_the_search() {
     }
 }
 
-/// In virtual time, it gets no byte at all. On a busy machine, its packets may have a gap in which the search continues.
+/// In virtual time, it gets no byte at all. On a busy machine, its packets may have a gap in which the search
+/// continues.
 #[test]
 fn a_scanner_that_streams_unasked_gets_no_other_request() {
     let env = TestEnv::new();

@@ -1,5 +1,5 @@
-//! What the hub makes of scans, from a line to consumers: marks, zones, foreground and background with each scan, the one
-//! `unknown` when scans stay out, and what users may ask of the background.
+//! What the hub makes of scans, from a line to consumers: marks, zones, foreground and background with each scan, the
+//! one `unknown` when scans stay out, and what users may ask of the background.
 
 use crate::testkit;
 use crate::testkit::{INT, Outcome, TERM, TestEnv, accounted, is_class, number, until};
@@ -56,7 +56,8 @@ fn each_scan_has_its_marks_zones_and_foreground() {
         });
         assert!(of_scans.count() > 0, "{name}: {lines:?}");
     }
-    // The room has reflectors, the simulated sensor tells of them, and nothing is known yet of what always stands there.
+    // The room has reflectors, the simulated sensor tells of them, and nothing is known yet of what always stands
+    // there.
     assert!(marks.iter().all(|line| line["available"] == true));
     assert!(marks.iter().any(|line| line["marks"].as_array().is_some_and(|marks| !marks.is_empty())));
     assert!(zones.iter().all(|line| number(line, "nearest_mm") > 0 && line["verdict"] != "unknown"));
@@ -125,8 +126,8 @@ fn a_background_is_asked_held_begun_anew_and_brought_back() {
     let env = TestEnv::new();
     let _hub = env.hub(&[env.link("front"), "--set=background.scans=20".into()]);
     let mut generations = env.echo(&["front/background"]);
-    // A wall without people, learned in a second. A subscriber that a busy machine runs too late misses the sample in which
-    // nothing is learned yet; the second generation is frozen in that state.
+    // A wall without people, learned in a second. A subscriber that a busy machine runs too late misses the sample in
+    // which nothing is learned yet; the second generation is frozen in that state.
     let _simulator = env.simulator(&["front"], &["--seed=52", "--baud=500000", "--world=bare"]);
     let first = generations.await_line("the first generation", is_class("background"));
     assert_eq!((number(&first, "generation"), number(&first, "count")), (0, 361), "{first}");

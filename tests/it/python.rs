@@ -1,5 +1,5 @@
-//! The Python package beside a hub: its scripts check themselves what only Python can see, and what they follow is compared
-//! with what `echo` says. Skips, saying so, where there is no Python with iceoryx2 and numpy.
+//! The Python package beside a hub: its scripts check themselves what only Python can see, and what they follow is
+//! compared with what `echo` says. Skips, saying so, where there is no Python with iceoryx2 and numpy.
 
 use std::collections::BTreeMap;
 use std::io::Write;

@@ -1,5 +1,6 @@
-//! A configuration that changes while the hub runs: zones, marks, background and pose with the next scan, without a gap in
-//! the stream; lines at the next start; and one that cannot be changes nothing. A hangup of its terminal still ends a hub.
+//! A configuration that changes while the hub runs: zones, marks, background and pose with the next scan, without a gap
+//! in the stream; lines at the next start; and one that cannot be changes nothing. A hangup of its terminal still ends
+//! a hub.
 
 use std::process::Command;
 

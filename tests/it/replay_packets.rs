@@ -1,5 +1,5 @@
-//! Recordings of scanners whose heads turn: their packets are played as those of an LMS are, and the scans that come of them
-//! are those that were published when they were recorded.
+//! Recordings of scanners whose heads turn: their packets are played as those of an LMS are, and the scans that come of
+//! them are those that were published when they were recorded.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -20,7 +20,8 @@ pub(crate) fn recorder(env: &TestEnv, name: &str, flags: &[&str]) -> Program {
     recorder
 }
 
-/// Records two files, one with telegrams alone, until so many scans came: of a scanner of `model`, on a line with faults.
+/// Records two files, one with telegrams alone, until so many scans came: of a scanner of `model`, on a line with
+/// faults.
 fn record(env: &TestEnv, model: &str, settings: &[&str], scans: usize) {
     let set = ["family=ld"].iter().chain(settings).map(|set| format!("--set=link.front.{set}"));
     let hub = env.hub(&[vec![env.link("front")], set.collect()].concat());
@@ -64,8 +65,8 @@ pub(crate) fn scan(payload: &[u8]) -> Box<Scan> {
     scan
 }
 
-/// Checks that scans which were recorded are replayed as they were. Their stamps are not compared, because they depend on when the
-/// hub got a processor. Stamps of a live stream are checked in virtual time (`tests/world`, judge `turns`).
+/// Checks that scans which were recorded are replayed as they were. Their stamps are not compared, because they depend
+/// on when the hub got a processor. Stamps of a live stream are checked in virtual time (`tests/world`, judge `turns`).
 fn check_scans(recorded: &[(Header, Vec<u8>)], replayed: &[(Header, Vec<u8>)]) {
     let by_seq: BTreeMap<u64, _> =
         replayed.iter().map(|(header, payload)| (header.seq, (header, payload))).collect();

@@ -275,7 +275,8 @@ fn probe_and_doctor_ask_there_too() {
     assert_eq!(outcome.code, Some(4), "{outcome}");
 }
 
-/// What a person sees who runs the program with `arguments` at a terminal and answers its question by yes; its exit code.
+/// What a person sees who runs the program with `arguments` at a terminal and answers its question by yes; its exit
+/// code.
 fn confirmed(env: &TestEnv, arguments: &[&str]) -> (String, Option<i32>) {
     let (mut keys, screen) = terminal();
     let mut command = env.command(arguments);

@@ -1,6 +1,6 @@
 //! A hub that does not run for a while, as on a machine that is suspended: what its line's buffer had room for is
-//! delivered, what it had no room for is lost and counted, and then it goes on as if nothing had been. And a listener: what
-//! waited for it is not new.
+//! delivered, what it had no room for is lost and counted, and then it goes on as if nothing had been. And a listener:
+//! what waited for it is not new.
 
 use crate::testkit::{INT, Sender, TERM, TestEnv, bytes_of, hash, in_a_network, is_class, number, until};
 use rustix::process::Signal;
@@ -47,8 +47,8 @@ fn a_hub_that_was_stopped() {
 
     let stamps: Vec<u64> = lines.iter().map(|line| number(line, "stamp_ns")).collect();
     assert!(stamps.is_sorted(), "stamps run backwards: {stamps:?}");
-    // Nothing that waited looks newer than it is, or it says that its stamp is an estimate: where the kernel's own threads wait
-    // for a processor, the line falls silent before all that waited was read.
+    // Nothing that waited looks newer than it is, or it says that its stamp is an estimate: where the kernel's own
+    // threads wait for a processor, the line falls silent before all that waited was read.
     let sent = places.iter().map(|&place| truth[place].sent_ns);
     let is_estimate = |line: &Value| line["flags"].to_string().contains("stamp_estimated");
     let waited = sent.zip(&stamps).zip(lines.iter().map(is_estimate));
@@ -59,8 +59,8 @@ fn a_hub_that_was_stopped() {
     let is_old = |((sent, stamp), _): &((u64, &u64), bool)| *stamp < sent;
     assert!(waited.iter().take(READ_AT_ONCE).all(is_old), "{waited:?}");
 
-    // Each scan has a verdict; what the zones' numbers are ahead of the scans' by was said because scans stayed out. That
-    // is not said again between those that waited.
+    // Each scan has a verdict; what the zones' numbers are ahead of the scans' by was said because scans stayed out.
+    // That is not said again between those that waited.
     let scans = outcome.of_class("scan");
     let ahead = outcome.of_class("zones").into_iter().filter_map(|line| {
         let scan = scans.iter().find(|scan| scan["seq"] == line["seq"])?;

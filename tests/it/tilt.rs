@@ -1,4 +1,5 @@
-//! `scanhub tilt`, from telegrams and angles to points and an obstacle: as its page walks through it, and with angles that stop.
+//! `scanhub tilt`, from telegrams and angles to points and an obstacle: as its page walks through it, and with angles
+//! that stop.
 
 use std::cell::Cell;
 
@@ -10,7 +11,8 @@ use crate::pages::{commands_on, programs_on};
 use crate::publishers::{Mount, languages};
 use crate::testkit::{INT, Outcome, Program, TestEnv, is_class, number};
 
-/// A hall with a post ahead of a sensor that swings slowly: how late the hub stamps scans on a busy machine moves points little.
+/// A hall with a post ahead of a sensor that swings slowly: how late the hub stamps scans on a busy machine moves
+/// points little.
 const WORLD: &str = "
 [[sensor]]
 pose = [0, 0, 90]

@@ -118,7 +118,8 @@ impl TestEnv {
         format!("--link={name}={}", self.word(name))
     }
 
-    /// As [`link`](Self::link), with an LMS. A hub that searches for the scanner would also send requests of the search.
+    /// As [`link`](Self::link), with an LMS. A hub that searches for the scanner would also send requests of the
+    /// search.
     pub(crate) fn lms_link(&self, name: &str) -> String {
         format!("{},family=lms", self.link(name))
     }
@@ -187,9 +188,9 @@ impl TestEnv {
         self.start(&with(&["gateway", "--json", "--no-system-config"], flags))
     }
 
-    /// A simulator with a port of each of these names that is up; its truth is in the file `truth`. Its sensors answer soon
-    /// unless `flags` have faults or [`REAL_ANSWERS`]: few tests are about that wait, and all would wait. A hub that does not
-    /// get a processor loses nothing: the sensors wait for it.
+    /// A simulator with a port of each of these names that is up; its truth is in the file `truth`. Its sensors answer
+    /// soon unless `flags` have faults or [`REAL_ANSWERS`]: few tests are about that wait, and all would wait. A hub
+    /// that does not get a processor loses nothing: the sensors wait for it.
     pub(crate) fn simulator<S: AsRef<str>>(&self, ports: &[&str], flags: &[S]) -> Program {
         self.simulator_on_real_lines(ports, &with(flags, &["--lossless"]))
     }
@@ -211,8 +212,8 @@ impl TestEnv {
         assert_eq!(simulator.end(KILL).code, None);
     }
 
-    /// `echo --json` of these topics, attached to all of them, as soon as there are all of them: those of a remote sensor
-    /// come one by one, each with what is first heard of it.
+    /// `echo --json` of these topics, attached to all of them, as soon as there are all of them: those of a remote
+    /// sensor come one by one, each with what is first heard of it.
     pub(crate) fn echo(&self, topics: &[&str]) -> Program {
         let mut before = Vec::new();
         until("all topics are there", || {
@@ -346,8 +347,8 @@ pub(crate) fn until(what: &str, mut is_so: impl FnMut() -> bool) {
     }
 }
 
-/// Waits until at least `span` has passed, for a program that must notice this by its own clock. No test fails if it takes
-/// longer.
+/// Waits until at least `span` has passed, for a program that must notice this by its own clock. No test fails if it
+/// takes longer.
 pub(crate) fn let_pass(span: Duration) {
     thread::sleep(span);
 }

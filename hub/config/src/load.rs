@@ -13,7 +13,8 @@ use crate::sources::Sources;
 impl Config {
     /// Reads all sources.
     ///
-    /// [`schema::Kind::Configuration`] with place, value and remedy; also without any link: only named ports are opened.
+    /// [`schema::Kind::Configuration`] with place, value and remedy; also without any link: only named ports are
+    /// opened.
     pub fn load(sources: &Sources) -> Result<Config, Failure> {
         let mut drafts = Drafts::default();
         for layer in sources.files().chain(sources.links()) {

@@ -63,7 +63,8 @@ impl Scanner {
         if self.is_auto() { all.max().unwrap_or(self.rate()) } else { self.rate() }
     }
 
-    /// Returns the highest rate that the scanner can have at `port`. A serial server has its own rate, whatever is configured here.
+    /// Returns the highest rate that the scanner can have at `port`. A serial server has its own rate, whatever is
+    /// configured here.
     pub fn max_rate_at(&self, port: &Source) -> u32 {
         if matches!(port, Source::Tty(_)) { self.rate() } else { self.max_rate() }
     }
@@ -140,8 +141,8 @@ impl ScannerDraft {
         Ok(())
     }
 
-    /// Returns the scanner. `lms_keys` are the keys that only an LMS has, each with its place. `refuse` creates the failure for a
-    /// place, a problem and a remedy.
+    /// Returns the scanner. `lms_keys` are the keys that only an LMS has, each with its place. `refuse` creates the
+    /// failure for a place, a problem and a remedy.
     pub(crate) fn finish(
         self,
         lms_keys: &[(String, &str)],

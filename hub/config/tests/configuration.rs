@@ -1,5 +1,5 @@
-//! What is made of the scans, as it is configured: who wins over whom, what cannot be, and that each refusal names place,
-//! value and remedy.
+//! What is made of the scans, as it is configured: who wins over whom, what cannot be, and that each refusal names
+//! place, value and remedy.
 
 use scanhub_drivers::features;
 use std::fs;

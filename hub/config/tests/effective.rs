@@ -1,5 +1,5 @@
-//! What is in effect, and where it is said: each value of each link has a place, whichever source it is from, and what is
-//! shown is what the hub works with.
+//! What is in effect, and where it is said: each value of each link has a place, whichever source it is from, and what
+//! is shown is what the hub works with.
 
 use std::fs;
 

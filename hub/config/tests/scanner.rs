@@ -1,4 +1,5 @@
-//! Which scanner a link has, wherever that is said, and that what its family does not have is refused with place, value and remedy.
+//! Which scanner a link has, wherever that is said, and that what its family does not have is refused with place, value
+//! and remedy.
 
 use config::{Config, Link, Sources};
 use scanhub_drivers::{Settings, features};

@@ -5,10 +5,11 @@
 //! - **frame**: [`Drive::drain`] polls the session, which returns a telegram in that buffer, or a revolution;
 //! - **loan**, **decode**, **process**, **send**:
 //!   [`LinkOutput::process_telegram`](crate::process_telegram::LinkOutput::process_telegram) and
-//!   [`process_revolution`](crate::process_telegram::LinkOutput::process_revolution) send the telegram, then take loans of
-//!   shared memory, write the scan and the results of the processors in place, and send them (`topics.rs`, `pipeline.rs`);
-//! - **ring**: [`LinkCore::publish`] wakes the subscribers, once per telegram: those of telegram, scan and zones before marks
-//!   and foreground are computed.
+//!   [`process_revolution`](crate::process_telegram::LinkOutput::process_revolution) send the telegram, then take loans
+//!   of shared memory, write the scan and the results of the processors in place, and send them (`topics.rs`,
+//!   `pipeline.rs`);
+//! - **ring**: [`LinkCore::publish`] wakes the subscribers, once per telegram: those of telegram, scan and zones before
+//!   marks and foreground are computed.
 //!
 //! Nothing on this path allocates, locks or logs.
 
@@ -129,8 +130,8 @@ impl<'a, S: Surroundings> Drive<'a, S> {
         self.scanner.as_ref().filter(|_| core.link.family().is_none()).map(|scanner| scanner.memory)
     }
 
-    /// Returns the model and the number of beams that an earlier run of the hub has saved, for the first session on the port. Later
-    /// sessions follow a loss of the port, and a different scanner may be connected.
+    /// Returns the model and the number of beams that an earlier run of the hub has saved, for the first session on the
+    /// port. Later sessions follow a loss of the port, and a different scanner may be connected.
     pub(crate) fn take_beams(&mut self) -> Option<(Model, usize)> {
         self.beams.take()
     }
@@ -259,7 +260,8 @@ impl<'a, S: Surroundings> Drive<'a, S> {
                         is_scan = true;
                     }
                     if let Some(limit) = core.publish(&received, &recorded, is_behind) {
-                        // The age of a backlog is unknown, so the next scan may follow after any time. The stamps of a network show it.
+                        // The age of a backlog is unknown, so the next scan may follow after any time. The stamps of a
+                        // network show it.
                         let is_of_backlog = is_behind && open.allowance.is_none();
                         self.follows_by = if is_of_backlog { 0 } else { received.last.saturating_add(limit) };
                     }
@@ -325,8 +327,8 @@ impl<'a, S: Surroundings> Drive<'a, S> {
         Ok(())
     }
 
-    /// Handles a scan or reply whose last byte arrived at `last`. A hub that was stopped could not report the silence before it, so
-    /// detect it by the stamps.
+    /// Handles a scan or reply whose last byte arrived at `last`. A hub that was stopped could not report the silence
+    /// before it, so detect it by the stamps.
     fn note_silence(&self, core: &mut LinkCore<'a, S>, last: Nanos, is_behind: bool) {
         if !is_behind && last > self.follows_by {
             core.output.learn_silence();

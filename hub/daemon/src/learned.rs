@@ -1,7 +1,7 @@
-//! What a hub has learned of its sensors, kept for the next one: their backgrounds, without which whoever stands there while
-//! that one starts is background, and for seconds nobody is foreground; the rates at which they were found, and which scanners. Links hand it
-//! on between two scans; it is written when it is worth it. Time is an argument. Refuses to know how a background is learned,
-//! and how long a disk takes.
+//! What a hub has learned of its sensors, kept for the next one: their backgrounds, without which whoever stands there
+//! while that one starts is background, and for seconds nobody is foreground; the rates at which they were found, and
+//! which scanners. Links hand it on between two scans; it is written when it is worth it. Time is an argument. Refuses
+//! to know how a background is learned, and how long a disk takes.
 
 mod file;
 mod rate;

@@ -1,5 +1,6 @@
-//! What a link has, whatever its other end is: where its results go, what it reports of itself, what users ask of it, and
-//! when it has to do something although nothing came. Refuses to know where bytes come from, and how a wait is done.
+//! What a link has, whatever its other end is: where its results go, what it reports of itself, what users ask of it,
+//! and when it has to do something although nothing came. Refuses to know where bytes come from, and how a wait is
+//! done.
 
 use config::{Link, Processing};
 use scanhub_drivers::line::{Control, RawScan, Received, Session as _};
@@ -78,8 +79,8 @@ impl<'a, S: Surroundings> LinkCore<'a, S> {
         self.link.scanner.settings.stop_when_idle
     }
 
-    /// Publishes a telegram, with the scan that it may contain, or packets, and wakes the subscribers. Returns how long the verdict
-    /// on the scan stays valid.
+    /// Publishes a telegram, with the scan that it may contain, or packets, and wakes the subscribers. Returns how long
+    /// the verdict on the scan stays valid.
     pub(crate) fn publish(
         &mut self,
         received: &Received<'_>,
@@ -102,7 +103,8 @@ impl<'a, S: Surroundings> LinkCore<'a, S> {
         processed.stands_for
     }
 
-    /// Publishes a scan whose packets were published, and wakes the subscribers. Returns how long the verdict on it stays valid.
+    /// Publishes a scan whose packets were published, and wakes the subscribers. Returns how long the verdict on it
+    /// stays valid.
     pub(crate) fn publish_scan(
         &mut self,
         scan: &RawScan<'_>,
@@ -125,8 +127,8 @@ impl<'a, S: Surroundings> LinkCore<'a, S> {
         now >= self.next_status.min(self.next_greeting)
     }
 
-    /// Publishes the status if it changed or is due, and greets late joiners; `error` is what is wrong, in words. Whether a
-    /// status went out.
+    /// Publishes the status if it changed or is due, and greets late joiners; `error` is what is wrong, in words.
+    /// Whether a status went out.
     pub(crate) fn show(&mut self, session: Option<&PortSession>, state: State, error: &str) -> bool {
         let now = self.around.now();
         let changed = update(&mut self.stats, self.link, state, error, now);
@@ -188,8 +190,9 @@ impl<'a, S: Surroundings> LinkCore<'a, S> {
         }
     }
 
-    /// Publishes what is due before a wait `until`; until when to wait instead, because something of the link's own is due
-    /// earlier. Some drivers wake nobody who waits for no bytes: a line whose bytes are `left_alone` is looked at now and then.
+    /// Publishes what is due before a wait `until`; until when to wait instead, because something of the link's own is
+    /// due earlier. Some drivers wake nobody who waits for no bytes: a line whose bytes are `left_alone` is looked at
+    /// now and then.
     pub(crate) fn bound(&mut self, until: Nanos, left_alone: bool) -> Nanos {
         let now = self.around.now();
         // What was due before comes first: it may be a scan.
@@ -246,8 +249,8 @@ impl<'a, S: Surroundings> LinkCore<'a, S> {
     }
 }
 
-/// Takes over `state` and `error`, and logs them if they are new. Returns whether they are. An error that stays through several
-/// states is logged once.
+/// Takes over `state` and `error`, and logs them if they are new. Returns whether they are. An error that stays through
+/// several states is logged once.
 fn update(stats: &mut LinkStats, link: &Link, state: State, error: &str, now: Nanos) -> bool {
     let told = stats.last().last_error_text;
     let (changed, name) = (stats.update(state, error, now), &link.name);
@@ -260,8 +263,8 @@ fn update(stats: &mut LinkStats, link: &Link, state: State, error: &str, now: Na
     changed
 }
 
-/// Does the same as [`update`] during a search. Its errors may change often, because of the bytes per second in them, so they
-/// are logged at most once a minute.
+/// Does the same as [`update`] during a search. Its errors may change often, because of the bytes per second in them,
+/// so they are logged at most once a minute.
 fn update_search(stats: &mut LinkStats, link: &Link, state: State, error: &str, now: Nanos) -> bool {
     if error.is_empty() || now >= stats.next_search_log {
         let changed = update(stats, link, state, error, now);

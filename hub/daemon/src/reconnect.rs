@@ -1,5 +1,6 @@
 //! The life of a port: streamed from while it is there, looked for while it is away, taken back when it returns under
-//! its name, whatever device that is then. Looking costs next to nothing; why it is away is said once, not at each look.
+//! its name, whatever device that is then. Looking costs next to nothing; why it is away is said once, not at each
+//! look.
 
 use std::io;
 
@@ -149,7 +150,8 @@ impl<'a, S: Surroundings> LiveLink<'a, S> {
         self.open_line(baud).transpose()
     }
 
-    /// Opens the port at `baud`. A search leaves out a rate that the port cannot have, so it then gets a port at another rate.
+    /// Opens the port at `baud`. A search leaves out a rate that the port cannot have, so it then gets a port at
+    /// another rate.
     fn open_line(&mut self, baud: u32) -> Option<Result<OpenLine<S::Line>, PortError>> {
         let LinkCore { link, around, .. } = self.core;
         let (opened, has_rate) = match around.open(&link.port, baud) {

@@ -1,5 +1,6 @@
-//! The configuration read again while the hub runs: what is made of scans changes with the next scan, and nothing of the
-//! stream is lost for it; what belongs to a line waits for the next start, which is said. One that cannot be changes nothing.
+//! The configuration read again while the hub runs: what is made of scans changes with the next scan, and nothing of
+//! the stream is lost for it; what belongs to a line waits for the next start, which is said. One that cannot be
+//! changes nothing.
 
 use config::{Background, Config, Link, Processing};
 use schema::{Failure, Nanos};

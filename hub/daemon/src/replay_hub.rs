@@ -35,8 +35,8 @@ pub struct Replay<'a> {
 /// it, or SIGINT or SIGTERM; `on_ready` is called once, when all topics exist, before the first telegram. How far it
 /// came.
 ///
-/// [`Kind::Input`] if the recording cannot be read, [`Kind::NoTopic`] if it has no such sensor, [`Kind::Usage`] if it ends
-/// before it shall start, [`Kind::Configuration`] if it and the configuration do not go together, and whatever
+/// [`Kind::Input`] if the recording cannot be read, [`Kind::NoTopic`] if it has no such sensor, [`Kind::Usage`] if it
+/// ends before it shall start, [`Kind::Configuration`] if it and the configuration do not go together, and whatever
 /// [`run`](crate::run) fails with.
 pub fn replay(
     replay: &Replay<'_>,
@@ -170,8 +170,8 @@ fn configuration(sources: &Sources, sensors: &[Sensor], file: &Path) -> Result<C
     Ok(config)
 }
 
-/// Returns `sources` with a link for each of `sensors`, and the names of the links without a configured family. They have that of
-/// their sensor.
+/// Returns `sources` with a link for each of `sensors`, and the names of the links without a configured family. They
+/// have that of their sensor.
 fn with_links(sources: &Sources, sensors: &[Sensor]) -> Result<(Sources, Vec<String>), Failure> {
     let mut sources = sources.clone();
     // Not the path itself, which may have signs that have a meaning in a port's name.

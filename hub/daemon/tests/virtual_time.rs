@@ -1,5 +1,5 @@
-//! Links that are driven in made-up time publish what those of lines do: every telegram, its scan, the moments that were
-//! told. Nobody sleeps here.
+//! Links that are driven in made-up time publish what those of lines do: every telegram, its scan, the moments that
+//! were told. Nobody sleeps here.
 
 #[path = "../../../tests/testkit/virtual_hub.rs"]
 mod virtual_hub;

@@ -32,14 +32,15 @@ macro_rules! families {
             match family { $(Family::$Family => &$family::FEATURES,)* }
         }
 
-        /// Returns the possible heads of scans of a scanner of `family`, as far as `settings` and the family determine them. They have
-        /// the same number of beams, at most the maximum.
+        /// Returns the possible heads of scans of a scanner of `family`, as far as `settings` and the family determine
+        /// them. They have the same number of beams, at most the maximum.
         pub fn scan_heads(family: Family, settings: &Settings) -> Vec<ScanHead> {
             match family { $(Family::$Family => $family::scan_heads(settings),)* }
         }
 
         impl Session {
-            /// Creates a session with a scanner of `family`, on a port that is open at the rate of `settings`, or else of the model.
+            /// Creates a session with a scanner of `family`, on a port that is open at the rate of `settings`, or else
+            /// of the model.
             pub fn begin(family: Family, settings: &Settings, now: Nanos) -> Session {
                 match family { $(Family::$Family => Session::$Family($family::Session::configured(settings, now)),)* }
             }

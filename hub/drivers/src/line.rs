@@ -1,5 +1,6 @@
-//! What all families share: the session as its driver sees it, what arrived and when, and why it is suspect. For scanners
-//! with a rotating head also packets, revolutions, and the grid that a revolution is put on. This module names no family.
+//! What all families share: the session as its driver sees it, what arrived and when, and why it is suspect. For
+//! scanners with a rotating head also packets, revolutions, and the grid that a revolution is put on. This module names
+//! no family.
 
 mod arrival;
 pub mod family;

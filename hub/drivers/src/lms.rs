@@ -1,5 +1,5 @@
-//! SICK LMS 2xx: the framer, telegrams in both directions, and the session with a scanner. The simulator is the second user of
-//! the protocol, so requests are decoded and replies are encoded here, too.
+//! SICK LMS 2xx: the framer, telegrams in both directions, and the session with a scanner. The simulator is the second
+//! user of the protocol, so requests are decoded and replies are encoded here, too.
 
 mod arrival;
 mod cadence;

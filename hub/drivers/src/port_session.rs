@@ -1,7 +1,7 @@
 //! The session on a port: with a scanner of a configured family, or with the scanner that a [`Search`] finds.
 //!
-//! A found scanner gets a session of its family. If nothing of the scanner arrives for 10 s, the search begins again, with
-//! that family first. The driver handles both like any session, and calls [`PortSession::advance`] at each wait.
+//! A found scanner gets a session of its family. If nothing of the scanner arrives for 10 s, the search begins again,
+//! with that family first. The driver handles both like any session, and calls [`PortSession::advance`] at each wait.
 
 use core::fmt;
 
@@ -57,9 +57,9 @@ enum Stage {
 }
 
 impl PortSession {
-    /// Creates a session on a port that was opened at `now`. With a `family`, the port is open at the rate of `settings`, or else
-    /// of the model. Without one, it is open at the [rate of the search](Search::opening_rate), which begins with the scanner in
-    /// `memory`.
+    /// Creates a session on a port that was opened at `now`. With a `family`, the port is open at the rate of
+    /// `settings`, or else of the model. Without one, it is open at the [rate of the search](Search::opening_rate),
+    /// which begins with the scanner in `memory`.
     pub fn begin(
         family: Option<Family>,
         settings: &Settings,
@@ -119,8 +119,8 @@ impl PortSession {
         Some(Memory { family, stream_rate, reply_rate })
     }
 
-    /// Continues when [`poll_output`](line::Protocol::poll_output) has returned a wait. Returns whether there is more to drain:
-    /// the search has found a scanner, or it begins again.
+    /// Continues when [`poll_output`](line::Protocol::poll_output) has returned a wait. Returns whether there is more
+    /// to drain: the search has found a scanner, or it begins again.
     pub fn advance(&mut self) -> bool {
         if !self.is_auto {
             return false;
@@ -492,8 +492,8 @@ fn sum(a: Account, b: Account) -> Account {
     }
 }
 
-/// After this time without anything of a found scanner, the search begins again. Until then, the session of the family handles
-/// silence and power cycles.
+/// After this time without anything of a found scanner, the search begins again. Until then, the session of the family
+/// handles silence and power cycles.
 const LOST_AFTER: Nanos = 10_000 * MILLIS;
 /// Stands for an unknown rate of the port, in bits per second.
 const SLOWEST: u32 = 9_600;

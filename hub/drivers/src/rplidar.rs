@@ -1,5 +1,5 @@
-//! Slamtec RPLIDAR A1, A2, A3, S1, S2, S3 and C1: requests and responses, the framer, packets, revolutions, and the session with
-//! a scanner. No request changes a setting that the scanner keeps without power.
+//! Slamtec RPLIDAR A1, A2, A3, S1, S2, S3 and C1: requests and responses, the framer, packets, revolutions, and the
+//! session with a scanner. No request changes a setting that the scanner keeps without power.
 
 mod device_info;
 mod framer;

@@ -3,17 +3,18 @@
 //! A search consists of rounds, and a round of steps. Each step sets a rate, and then listens or sends a request:
 //!
 //! 1. Listen for a stream that needs no request.
-//! 2. If bytes have arrived, listen at further rates for streams of scanners that should get no request while they stream.
+//! 2. If bytes have arrived, listen at further rates for streams of scanners that should get no request while they
+//!    stream.
 //! 3. Send the requests of each family at its rates.
 //!
 //! In every second round, slow scanners have more time. Rounds without a byte are followed by pauses, which get longer.
 //!
-//! An unknown scanner gets only requests that no scanner of another family accepts, at any rate, and that change nothing: each
-//! family declares them in its [`Approach`]. Resets, motor requests, changes of settings and of the line DTR belong to the
-//! sessions. In the first 150 ms after the open, no byte is sent.
+//! An unknown scanner gets only requests that no scanner of another family accepts, at any rate, and that change
+//! nothing: each family declares them in its [`Approach`]. Resets, motor requests, changes of settings and of the line
+//! DTR belong to the sessions. In the first 150 ms after the open, no byte is sent.
 //!
-//! The search is a [`Protocol`]. It is done when it has [found](Search::found) the scanner. Then the bytes of its last step are
-//! available from [`Search::reads`], so that the family's session handles each of them.
+//! The search is a [`Protocol`]. It is done when it has [found](Search::found) the scanner. Then the bytes of its last
+//! step are available from [`Search::reads`], so that the family's session handles each of them.
 
 use core::fmt;
 
@@ -240,8 +241,8 @@ impl Search {
         self.found
     }
 
-    /// Returns the reads of the step in which the scanner was found: the time of each, and its bytes. Pass them to the session
-    /// of the family, before all later reads.
+    /// Returns the reads of the step in which the scanner was found: the time of each, and its bytes. Pass them to the
+    /// session of the family, before all later reads.
     pub fn reads(&self) -> impl Iterator<Item = (Nanos, &[u8])> {
         self.capture.reads()
     }
@@ -625,8 +626,8 @@ impl Protocol for Search {
 }
 
 impl Memory {
-    /// Returns the memory with rates of its family, at which the search may send its requests. `None` if the rate of the stream
-    /// is not one.
+    /// Returns the memory with rates of its family, at which the search may send its requests. `None` if the rate of
+    /// the stream is not one.
     fn checked(self, probes: &[Box<dyn Probe>]) -> Option<Memory> {
         let approach =
             probes.iter().map(|probe| probe.approach()).find(|approach| approach.family == self.family)?;
@@ -637,8 +638,8 @@ impl Memory {
 }
 
 impl Outgoing {
-    /// Continues after the next byte was written at `now`. If it was too late, the scanner has dropped the request, which then
-    /// starts over.
+    /// Continues after the next byte was written at `now`. If it was too late, the scanner has dropped the request,
+    /// which then starts over.
     fn transmitted(&mut self, now: Nanos, byte_time: Nanos, gap: Option<(Nanos, Nanos)>) {
         let (min_gap, max_gap) = gap.unwrap_or((0, Nanos::MAX - byte_time));
         let is_late = self.sent > 0 && now.saturating_sub(self.left_at) > byte_time + max_gap;

@@ -74,8 +74,9 @@ pub struct Warning {
 /// Compares scans of one sensor with its circles.
 ///
 /// Where the design leaves something open:
-/// - Until `min_scans` scans have been seen since the start, a silence, a scan with too many invalid beams or a change of the
-///   sensor's layout, the absence of a violation proves nothing. The verdict is unknown then, because clear would be a guess.
+/// - Until `min_scans` scans have been seen since the start, a silence, a scan with too many invalid beams or a change
+///   of the sensor's layout, the absence of a violation proves nothing. The verdict is unknown then, because clear
+///   would be a guess.
 /// - A beam is relevant if one of its readings, in the scan's units and below its codes, can lie inside the largest
 ///   circle and outside the robot's own body. All other beams count neither as invalid nor in the total.
 /// - If fewer beams are relevant than a violation takes, no zone can ever be violated, so the verdict is unknown. This

@@ -78,8 +78,8 @@ impl Case {
         range >= own && range < hi && (!self.settings.exact || lo == 0.0 || range > lo)
     }
 
-    /// There is a reading of the scan's kind that would be inside the largest circle: the shortest one beyond the robot's
-    /// own body and the circle's near side, if any.
+    /// There is a reading of the scan's kind that would be inside the largest circle: the shortest one beyond the
+    /// robot's own body and the circle's near side, if any.
     fn tells(&self, scan: &Scan, u: [f64; 2], own: f64) -> bool {
         let (unit, radius) = (scans::unit_mm(scan), f64::from(self.radii[0]));
         let shortest = (own.max(self.chord(u, radius).0) / unit).floor();

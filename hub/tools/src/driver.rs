@@ -1,5 +1,6 @@
-//! Runs protocol state machines on an open port, for a user at a terminal: [`drive`] runs any of them. With it, [`search`] finds
-//! the scanner, and [`detect`] identifies one that rotates. A thread of the hub does the same for a link, without an end.
+//! Runs protocol state machines on an open port, for a user at a terminal: [`drive`] runs any of them. With it,
+//! [`search`] finds the scanner, and [`detect`] identifies one that rotates. A thread of the hub does the same for a
+//! link, without an end.
 
 use std::fmt;
 use std::io;
@@ -164,8 +165,8 @@ pub(crate) fn detect(
     }))
 }
 
-/// Returns the failure for a port called `name` at which no rotating scanner of `family` was detected, after `bytes` bytes
-/// arrived.
+/// Returns the failure for a port called `name` at which no rotating scanner of `family` was detected, after `bytes`
+/// bytes arrived.
 pub(crate) fn not_detected(name: &str, family: Family, bytes: u64) -> Failure {
     let features = features(family);
     let mut rates: Vec<u32> = features.models.iter().map(|model| model.baud).collect();
@@ -204,8 +205,8 @@ struct Detection {
 }
 
 impl Task<Session> for Detection {
-    /// Takes over what the scanner has reported of itself. From then on its motor is controlled. If it reports an error, the session
-    /// would restart it next.
+    /// Takes over what the scanner has reported of itself. From then on its motor is controlled. If it reports an
+    /// error, the session would restart it next.
     fn may_continue(&mut self, port: &Port, session: &Session) -> io::Result<bool> {
         if self.said.is_some() {
             return Ok(true);
@@ -261,8 +262,8 @@ struct End;
 
 impl Task<Session> for End {}
 
-/// A procedure with an end, such as requests to an LMS. Calls `progress` before each wait, and ends early if it returns false.
-/// Logs each rate once that the port cannot have; a search leaves it out.
+/// A procedure with an end, such as requests to an LMS. Calls `progress` before each wait, and ends early if it returns
+/// false. Logs each rate once that the port cannot have; a search leaves it out.
 pub(crate) struct Procedure<F> {
     progress: F,
     refused: Vec<u32>,

@@ -1,5 +1,5 @@
-//! `scanhub probe`: finds the scanner at a port, whatever its family, by the search of the hub, and then requests what it
-//! reports of itself. Changes no settings.
+//! `scanhub probe`: finds the scanner at a port, whatever its family, by the search of the hub, and then requests what
+//! it reports of itself. Changes no settings.
 
 mod description;
 mod suggestion;
@@ -224,8 +224,8 @@ pub(crate) fn request_report(
     if report.answers() { Ok(report) } else { Err(silence(source, first, report.baud, report.bytes)) }
 }
 
-/// Returns the failure for an LMS that did not reply, with possible reasons, after `bytes` bytes arrived. It may stream at
-/// `streams_at`. The highest rate of the port is `first`.
+/// Returns the failure for an LMS that did not reply, with possible reasons, after `bytes` bytes arrived. It may stream
+/// at `streams_at`. The highest rate of the port is `first`.
 fn silence(source: &Source, first: Baud, streams_at: Option<Baud>, bytes: u64) -> Failure {
     let name = source.name();
     let came = match bytes {

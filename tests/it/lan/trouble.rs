@@ -1,5 +1,5 @@
-//! What happens to networks and programs, as heard at the other end of the cable: the gateway outlives it, what it could
-//! not send is counted, and it sends again.
+//! What happens to networks and programs, as heard at the other end of the cable: the gateway outlives it, what it
+//! could not send is counted, and it sends again.
 
 use crate::testkit::{
     INT, KILL, Machine, Outcome, Program, Receiver, Relay, Robot, TERM, TestEnv, in_a_network, ip, is_class,
@@ -68,8 +68,9 @@ fn a_cable_is_pulled_and_an_address_taken() {
         let (sent, failed) = sent(&outcome, "eth0");
         let (received, lost) = account(&receiver.finish());
         assert_eq!(received + lost, sent + failed, "every number is accounted for");
-        // Either may be more than the other. The kernel accepts a few datagrams and drops them when the link goes. When it is
-        // back, the gateway counts what it sends as failed until it looks at the link again, up to a second later.
+        // Either may be more than the other. The kernel accepts a few datagrams and drops them when the link goes. When
+        // it is back, the gateway counts what it sends as failed until it looks at the link again, up to a second
+        // later.
         assert!(failed >= 300 && lost >= 300, "{lost} lost, {failed} counted");
     });
 }

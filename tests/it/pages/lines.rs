@@ -1,5 +1,5 @@
-//! The lines for a shell on the pages, run by a shell: with a hub and a sensor `front`, recordings under the names that the
-//! pages use, and a spare sensor at every port that they name. What cannot be run is named here, with the reason.
+//! The lines for a shell on the pages, run by a shell: with a hub and a sensor `front`, recordings under the names that
+//! the pages use, and a spare sensor at every port that they name. What cannot be run is named here, with the reason.
 
 use std::fs;
 use std::process::Command;
@@ -13,8 +13,8 @@ use super::shell::{commands, lines};
 use crate::testkit::{Program, Sender, TestEnv, in_a_network, is_class, side_by_side, until, write_program};
 use schema::Topic;
 
-/// Commands that are not run, by how their line begins or what is in it, and what makes sure of them. Those of the program
-/// are read by `hub/cli/examples.rs`.
+/// Commands that are not run, by how their line begins or what is in it, and what makes sure of them. Those of the
+/// program are read by `hub/cli/examples.rs`.
 const NOT_RUN: [(&str, &str); 17] = [
     ("sudo ", "changes the machine; tests/it/dist.rs and tests/it/client_c.rs install elsewhere"),
     ("sudoedit ", "an editor"),
@@ -149,7 +149,8 @@ const ENDING: [&str; 6] = ["doctor", "probe", "list", "info", "convert", "key"];
 /// Time in which a command that lasts may fail. A longer or shorter time does not let a right one fail.
 const TIME_TO_FAIL: Duration = Duration::from_millis(1200);
 
-/// Whether there are programs of this project in `group`, and all of them have a handler for SIGINT (proc(5), `SigCgt`).
+/// Whether there are programs of this project in `group`, and all of them have a handler for SIGINT (proc(5),
+/// `SigCgt`).
 fn catches_interrupts(group: Pid) -> bool {
     let processes = fs::read_dir("/proc").into_iter().flatten().flatten().map(|entry| entry.path());
     let ours = processes.filter_map(|process| {
@@ -169,8 +170,8 @@ fn catches_interrupts(group: Pid) -> bool {
 /// What is wrong with those of `lines` that can be run.
 fn wrong_with(desk: &Desk, lines: &[(String, String)]) -> Vec<String> {
     let wrong = |(place, line): &(String, String)| Some(format!("{place}: {}", desk.run(line)?));
-    // There is one spare sensor, one domain for another hub, one place for a listener, and one sensor to be told what to do;
-    // the rest mostly waits.
+    // There is one spare sensor, one domain for another hub, one place for a listener, and one sensor to be told what
+    // to do; the rest mostly waits.
     const IN_TURN: [&str; 6] = [
         "scanhub run",
         "scanhub replay",

@@ -150,7 +150,8 @@ pub struct Figures {
     pub wrong: u64,
     /// Packets that a hub counted as lost on the line.
     pub lost: u64,
-    /// When a hub had the first packet of measured values, and the first scan; what a scanner waited for its motor not counted.
+    /// When a hub had the first packet of measured values, and the first scan; what a scanner waited for its motor not
+    /// counted.
     pub data_ns: Nanos,
     /// See above.
     pub scan_ns: Nanos,

@@ -1,5 +1,5 @@
-//! The families of scanners in a world, a file each: how one of them is found, what its link's configuration says, what its
-//! bytes mean to the judges. All else in a world knows none of them.
+//! The families of scanners in a world, a file each: how one of them is found, what its link's configuration says, what
+//! its bytes mean to the judges. All else in a world knows none of them.
 
 mod either;
 mod ld;
@@ -53,8 +53,8 @@ pub(crate) trait Family {
     /// Whether `scan` has the values of the last `sample` of telegrams, where a sample has those of a scan.
     fn is_scan_of(&self, scan: &Scan, sample: &[u8]) -> bool;
 
-    /// Whether a line may have made `got` of one of the units that it `damaged` lately, so that nobody can know: a checksum
-    /// is right once in a while.
+    /// Whether a line may have made `got` of one of the units that it `damaged` lately, so that nobody can know: a
+    /// checksum is right once in a while.
     fn is_collision(&self, got: &[u8], damaged: &mut dyn Iterator<Item = &[u8]>) -> bool;
 
     /// Whether its head turns all around, and its scans are turns of points whose truth is known.
@@ -94,11 +94,11 @@ pub(crate) struct Exactness {
     pub(crate) nothing_deg: f64,
     /// Points of a turn.
     pub(crate) points: usize,
-    /// Packets before and behind damaged bytes that may be lost with them: of what has a checksum only the one before them,
-    /// and only that which follows could tell how its points are.
+    /// Packets before and behind damaged bytes that may be lost with them: of what has a checksum only the one before
+    /// them, and only that which follows could tell how its points are.
     pub(crate) neighbours: usize,
-    /// Whether packets have a time of their own. Without one it takes a while until it is known how the scanner's clock goes, and
-    /// over a long gap nobody can know how many packets there were.
+    /// Whether packets have a time of their own. Without one it takes a while until it is known how the scanner's clock
+    /// goes, and over a long gap nobody can know how many packets there were.
     pub(crate) has_clock: bool,
 }
 
@@ -175,8 +175,8 @@ pub(crate) fn draw(random: &mut fastrand::Rng) -> Vec<Rc<dyn Family>> {
     (0..count).map(|_| one(random)).collect()
 }
 
-/// Returns `first` together with a rotating scanner of another family, for which it is exchanged. Returns `first` alone if it does
-/// not rotate.
+/// Returns `first` together with a rotating scanner of another family, for which it is exchanged. Returns `first` alone
+/// if it does not rotate.
 pub(crate) fn either(first: Rc<dyn Family>, random: &mut fastrand::Rng) -> Rc<dyn Family> {
     let second: Rc<dyn Family> = match first.families()[..] {
         [schema::Family::Ld] => Rc::new(rplidar::Rplidar::draw(random)),
@@ -192,8 +192,8 @@ pub(crate) fn is_ld_packet(bytes: &[u8]) -> bool {
     bytes.len() == scanhub_drivers::ld::packet::LEN && bytes.starts_with(&[0x54, 0x2C])
 }
 
-/// The scanner that a plan calls so, otherwise as `random` draws it; nothing if there is none: `ld19`, `a1`, `a1:boost`,
-/// `a1:boost:streaming`.
+/// The scanner that a plan calls so, otherwise as `random` draws it; nothing if there is none: `ld19`, `a1`,
+/// `a1:boost`, `a1:boost:streaming`.
 pub(crate) fn named(text: &str, random: &mut fastrand::Rng) -> Option<Rc<dyn Family>> {
     match scanhub_drivers::ld::Model::named(text) {
         Some(model) => Some(Rc::new(ld::Ld::of(model, random))),
@@ -228,7 +228,8 @@ const SLOWEST: f64 = 0.6;
 /// The most by which a head gets faster or slower in a second, as a share of its usual speed.
 const INERTIA: f64 = 0.4;
 
-/// What scanners see in all worlds: a room without anything near, the same with a post 0.8 m ahead, and with one 0.4 m ahead.
+/// What scanners see in all worlds: a room without anything near, the same with a post 0.8 m ahead, and with one 0.4 m
+/// ahead.
 fn rooms(layers: impl Fn(Scene) -> Scene) -> Vec<Room> {
     let rooms = [None, Some(800), Some(400)].map(|ahead_mm: Option<u32>| {
         let post =

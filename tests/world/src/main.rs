@@ -1,5 +1,5 @@
-//! Runs worlds: `cargo run --release -p scanhub-world -- --seeds 0..200`. A violation is printed with its seed and with the
-//! shortest list of actions that still shows it.
+//! Runs worlds: `cargo run --release -p scanhub-world -- --seeds 0..200`. A violation is printed with its seed and with
+//! the shortest list of actions that still shows it.
 
 use std::io::{IsTerminal, Write};
 use std::process::{Command, ExitCode};

@@ -1,5 +1,6 @@
-//! What shall happen in a world, as data: a seed, a time, and a list of timed actions. A list can be drawn by the seed, printed,
-//! parsed and cut, so that a failure can be played again with fewer actions. Refuses to know what an action does.
+//! What shall happen in a world, as data: a seed, a time, and a list of timed actions. A list can be drawn by the seed,
+//! printed, parsed and cut, so that a failure can be played again with fewer actions. Refuses to know what an action
+//! does.
 
 use std::fmt;
 use std::str::FromStr;
@@ -19,7 +20,8 @@ pub struct Plan {
     pub seconds: u64,
     /// The only sensor, by its model, of some its mode and what it does at first; else the seed draws one or two.
     pub model: Option<String>,
-    /// Whether half of the links have no family, and the hub searches for their scanners. The link of the only sensor has none.
+    /// Whether half of the links have no family, and the hub searches for their scanners. The link of the only sensor
+    /// has none.
     pub is_auto: bool,
     /// In the order of time.
     pub actions: Vec<Action>,
@@ -36,8 +38,8 @@ pub struct Action {
 }
 
 impl Plan {
-    /// What `seed` draws for `seconds`: of the kinds of action about half (swarm testing: many faults hide each other), each
-    /// of the others some times, and nothing in the last eight seconds.
+    /// What `seed` draws for `seconds`: of the kinds of action about half (swarm testing: many faults hide each other),
+    /// each of the others some times, and nothing in the last eight seconds.
     pub fn of_seed(seed: u64, seconds: u64) -> Plan {
         let mut random = fastrand::Rng::with_seed(seed ^ 0x5EED_0F1A_C710_0000);
         let end_ms = (seconds * 1_000).saturating_sub(REST / MILLIS);

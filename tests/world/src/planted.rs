@@ -1,5 +1,5 @@
-//! Defects that are built into the models around the hub and its network on purpose, to see that the judges find them. None is in the hub's
-//! own code, so that nothing has to be built twice. Refuses to know who notices.
+//! Defects that are built into the models around the hub and its network on purpose, to see that the judges find them.
+//! None is in the hub's own code, so that nothing has to be built twice. Refuses to know who notices.
 
 use std::cell::Cell;
 

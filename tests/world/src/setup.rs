@@ -1,5 +1,5 @@
-//! What a world begins with, as its seed has it: the sensors and the state in which they are found, the hub's configuration,
-//! whether a service manager keeps ports, the consumers. Refuses to know what happens later.
+//! What a world begins with, as its seed has it: the sensors and the state in which they are found, the hub's
+//! configuration, whether a service manager keeps ports, the consumers. Refuses to know what happens later.
 
 use std::rc::Rc;
 
@@ -75,9 +75,9 @@ impl Setup {
     }
 }
 
-/// Removes the family from the link of the only sensor of `plan`, or from half of the links. At some of these links, an exchange
-/// connects a scanner of another family, and some of their ports cannot have all rates of the search. Returns the sensors,
-/// and the rates that each port cannot have.
+/// Removes the family from the link of the only sensor of `plan`, or from half of the links. At some of these links, an
+/// exchange connects a scanner of another family, and some of their ports cannot have all rates of the search. Returns
+/// the sensors, and the rates that each port cannot have.
 fn half_auto(sensors: &[Rc<dyn Family>], plan: &Plan) -> (Vec<Rc<dyn Family>>, Vec<Vec<u32>>) {
     // Its own random numbers: everything else is as in the world in which all links have a family.
     let mut random = fastrand::Rng::with_seed(plan.seed ^ 0xA070_0000_0000_0000);

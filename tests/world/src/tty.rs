@@ -1,5 +1,5 @@
-//! A serial port as the kernel has it: a buffer of 4,095 bytes, a rate, one owner; it can be pulled out and come back as
-//! another device. Says everything that happens to bytes. Refuses to know who reads them.
+//! A serial port as the kernel has it: a buffer of 4,095 bytes, a rate, one owner; it can be pulled out and come back
+//! as another device. Says everything that happens to bytes. Refuses to know who reads them.
 
 use std::collections::VecDeque;
 

@@ -1,5 +1,5 @@
-//! A world from its beginning to its end: one clock that jumps from one thing that is due to the next. Refuses to know what a
-//! hub does with its links, and what actions mean.
+//! A world from its beginning to its end: one clock that jumps from one thing that is due to the next. Refuses to know
+//! what a hub does with its links, and what actions mean.
 
 use std::cell::{Cell, RefCell};
 use std::collections::{BTreeMap, VecDeque};
@@ -43,8 +43,8 @@ pub fn run(plan: &Plan, detail: Detail) -> Outcome {
     World::new(plan, detail, None, &[]).live()
 }
 
-/// Returns whether one of `judges` finds a violation while `plan` is played with `defect` around the hub. The world ends
-/// with the first violation.
+/// Returns whether one of `judges` finds a violation while `plan` is played with `defect` around the hub. The world
+/// ends with the first violation.
 pub fn is_found(plan: &Plan, defect: Option<Defect>, judges: &'static [&'static str]) -> bool {
     let outcome = World::new(plan, Detail::Nothing, defect, judges).live();
     outcome.violations.iter().any(|violation| judges.contains(&violation.judge))

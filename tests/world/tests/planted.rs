@@ -1,5 +1,5 @@
-//! The judges are shown to bite: each of some defects that are built into the models around the hub is found within 200 seeds,
-//! by the judge whose business it is.
+//! The judges are shown to bite: each of some defects that are built into the models around the hub is found within 200
+//! seeds, by the judge whose business it is.
 
 use std::sync::Mutex;
 use std::sync::atomic::{AtomicUsize, Ordering};
@@ -57,8 +57,8 @@ const OF_HEADS: [(Defect, &str); 12] = [
     (Defect::UnsentWarning, "ld19"),
 ];
 
-/// First seeds by which a defect was found when this was written, where that is not 0. Seeds that find nothing are not played
-/// again; if one of these finds nothing either, all are.
+/// First seeds by which a defect was found when this was written, where that is not 0. Seeds that find nothing are not
+/// played again; if one of these finds nothing either, all are.
 const FOUND_BY: [(Defect, &str, u64); 17] = [
     (Defect::MergedTurn, "", 1),
     (Defect::OtherBeams, "", 1),

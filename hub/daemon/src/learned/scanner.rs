@@ -1,5 +1,5 @@
-//! The scanner that a search found at a link's port, as a line of text. The next search begins with it. A wrong scanner costs
-//! only time.
+//! The scanner that a search found at a link's port, as a line of text. The next search begins with it. A wrong scanner
+//! costs only time.
 
 use scanhub_drivers::line::grid::BEAMS;
 use scanhub_drivers::search::Memory;

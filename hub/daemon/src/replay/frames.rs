@@ -1,8 +1,9 @@
-//! Plays a recording frame by frame: each telegram, or group of packets, once, in order and bit for bit, with the header that
-//! was recorded. Silences are those of the recording, however fast it is played.
+//! Plays a recording frame by frame: each telegram, or group of packets, once, in order and bit for bit, with the
+//! header that was recorded. Silences are those of the recording, however fast it is played.
 //!
-//! A whole telegram is a scan or a reply by itself. The packets of a rotating scanner pass through a session that runs in the time of
-//! the recording. It builds the same scans as the hub that recorded them, with the same times between them.
+//! A whole telegram is a scan or a reply by itself. The packets of a rotating scanner pass through a session that runs
+//! in the time of the recording. It builds the same scans as the hub that recorded them, with the same times between
+//! them.
 
 use recording::{Frame, VirtualTime};
 use scanhub_drivers::line::{Event, RawScan, Received, Session as _, suspect};
@@ -14,8 +15,8 @@ use super::{LONGEST_GAP, ReplayLink, STANDS};
 use crate::player::Due;
 use crate::process_telegram::{RecordedContext, limit, micros};
 
-/// Plays `frames` into the topics of `replay`. Returns how long the last verdict stays valid at the end; `None` if the hub
-/// must end.
+/// Plays `frames` into the topics of `replay`. Returns how long the last verdict stays valid at the end; `None` if the
+/// hub must end.
 pub(super) fn play(replay: &mut ReplayLink<'_, '_>, frames: &Frames) -> Option<Option<Nanos>> {
     let play = replay.handle.play();
     let mut read = match frames.read() {
@@ -107,8 +108,8 @@ struct When {
 }
 
 impl Lap<'_> {
-    /// Publishes that the last verdict is stale, if its validity ended before the frame at `when`. Returns `None` if the hub
-    /// must end.
+    /// Publishes that the last verdict is stale, if its validity ended before the frame at `when`. Returns `None` if
+    /// the hub must end.
     fn note_silence(&mut self, replay: &mut ReplayLink<'_, '_>, when: When) -> Option<()> {
         let Some(silence) = self.verdict.take_if(|verdict| when.last > verdict.until_ns) else {
             return Some(());
@@ -167,8 +168,8 @@ impl Lap<'_> {
         Some(Some(due))
     }
 
-    /// Plays a whole telegram; the frame after it is known, too. Returns the number of beams of its measured data, or `None` if the
-    /// hub must end.
+    /// Plays a whole telegram; the frame after it is known, too. Returns the number of beams of its measured data, or
+    /// `None` if the hub must end.
     fn play_telegram(
         &mut self,
         replay: &mut ReplayLink<'_, '_>,
@@ -275,7 +276,8 @@ impl Verdict {
 }
 
 impl When {
-    /// Returns the times of `frame`, which begins at `begin`. A frame without stamps has a clock that starts at [`BEGIN`].
+    /// Returns the times of `frame`, which begins at `begin`. A frame without stamps has a clock that starts at
+    /// [`BEGIN`].
     fn of(frame: &Frame, begin: Nanos, is_skipped: bool) -> When {
         let begun = BEGIN.saturating_add(begin);
         let (first, last) =

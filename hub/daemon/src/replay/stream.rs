@@ -10,8 +10,8 @@ use super::recorded::{Stream, read};
 use super::{ReplayLink, STANDS};
 use crate::process_telegram::RecordedContext;
 
-/// Plays `stream` into the topics of `replay`. At the end, for how long the last verdict stands; nothing if the hub shall
-/// end.
+/// Plays `stream` into the topics of `replay`. At the end, for how long the last verdict stands; nothing if the hub
+/// shall end.
 pub(super) fn play(replay: &mut ReplayLink<'_, '_>, stream: &Stream) -> Option<Option<Nanos>> {
     let play = replay.handle.play();
     let mut bytes = match stream.bytes() {

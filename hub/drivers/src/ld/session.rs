@@ -1,6 +1,6 @@
-//! The session with an LDROBOT scanner, which streams without a request. The session only receives: at the model's rate, or at
-//! both rates in turn until packets arrive. It learns how many points the scanner measures per second, and returns packets
-//! as they arrive, and revolutions.
+//! The session with an LDROBOT scanner, which streams without a request. The session only receives: at the model's
+//! rate, or at both rates in turn until packets arrive. It learns how many points the scanner measures per second, and
+//! returns packets as they arrive, and revolutions.
 
 use core::fmt;
 
@@ -27,8 +27,8 @@ pub struct Settings {
     pub beams: Option<usize>,
     /// Maximum number of beams. `None`: the maximum of a grid.
     pub max_beams: Option<usize>,
-    /// Whether the port has one fixed rate and bytes do not arrive at the pace of a line, as with a serial server on the
-    /// network or a recording.
+    /// Whether the port has one fixed rate and bytes do not arrive at the pace of a line, as with a serial server on
+    /// the network or a recording.
     pub fixed_rate: bool,
 }
 
@@ -46,8 +46,8 @@ pub struct Session {
     framer: Framer,
     reads: Reads,
     clock: SensorClock,
-    /// If a new sequence began within the packets that were returned last: the number of its first packet among them, and
-    /// the clock of the packets before.
+    /// If a new sequence began within the packets that were returned last: the number of its first packet among them,
+    /// and the clock of the packets before.
     clock_before: Option<(usize, SensorClock)>,
     sequence: Sequence,
     turns: Turns<MOST_POINTS>,
@@ -57,8 +57,8 @@ pub struct Session {
     baud: u32,
     change_baud: bool,
     point_count: PointCount,
-    /// Model and number of beams by the points that the scanner measures, once they are known. A power cycle does not change
-    /// them.
+    /// Model and number of beams by the points that the scanner measures, once they are known. A power cycle does not
+    /// change them.
     measured: Option<(Model, usize)>,
     /// Time since which packets have arrived without a decision about the number of beams.
     undecided_since: Nanos,
@@ -134,8 +134,8 @@ impl Session {
         }
     }
 
-    /// Restores the model and the number of beams that an earlier session on the same port has measured. Call it before the
-    /// first read.
+    /// Restores the model and the number of beams that an earlier session on the same port has measured. Call it before
+    /// the first read.
     pub fn recall(&mut self, model: Model, beams: usize) {
         self.measured = Some((model, beams));
     }
@@ -160,8 +160,8 @@ impl Session {
         Some(beams.min(self.settings.max_beams.unwrap_or(usize::MAX)))
     }
 
-    /// Handles the points of a revolution of a scanner without a configured model. The first reliable number of points decides.
-    /// Later, it must be different for a long time.
+    /// Handles the points of a revolution of a scanner without a configured model. The first reliable number of points
+    /// decides. Later, it must be different for a long time.
     fn count(&mut self, counted: Counted) {
         let Some((_, beams)) = self.measured else {
             self.measured = counted.is_final().then(|| (counted.model(), counted.beams()));
@@ -186,8 +186,8 @@ impl Session {
         }
     }
 
-    /// Returns the model of the scanner if it is not the one of the settings. Models with the same number of points per second
-    /// cannot be distinguished.
+    /// Returns the model of the scanner if it is not the one of the settings. Models with the same number of points per
+    /// second cannot be distinguished.
     fn heard_other_model(&self) -> Option<Model> {
         let wanted = self.settings.model?;
         self.heard_model().filter(|heard| heard.points_per_second() != wanted.points_per_second())
@@ -665,8 +665,8 @@ const fn most_together(baud: u32) -> usize {
 const MOST_POINTS: usize = 4_400;
 /// How long the session listens at one rate. A stream has a packet every 3 ms.
 const LISTEN: Nanos = 300 * MILLIS;
-/// Time after which a scanner whose speed is never constant, or whose sequence has a gap in every revolution, has the beams of
-/// its model.
+/// Time after which a scanner whose speed is never constant, or whose sequence has a gap in every revolution, has the
+/// beams of its model.
 const UNDECIDED: Nanos = 10_000 * MILLIS;
 /// After this time with another number of points per revolution, the number of beams changes.
 const CHANGE: Nanos = 10_000 * MILLIS;

@@ -10,8 +10,8 @@ pub struct Arrivals {
     total: u64,
 }
 
-/// Timing of a stream: on average, bytes are `byte_ns` nanoseconds apart. Those of a packet of `packet_len` may arrive at once, or at the
-/// speed of a line with `pace` bits per second.
+/// Timing of a stream: on average, bytes are `byte_ns` nanoseconds apart. Those of a packet of `packet_len` may arrive
+/// at once, or at the speed of a line with `pace` bits per second.
 #[derive(Clone, Copy, Debug)]
 pub struct Flow {
     /// Mean nanoseconds from one byte to the next.
@@ -40,8 +40,8 @@ impl Arrivals {
         self.total
     }
 
-    /// Returns the latest possible arrival of byte number `offset`. Bytes after it took their time on a line of `pace` bits per second, if
-    /// it was one, but none of them had arrived at the previous read.
+    /// Returns the latest possible arrival of byte number `offset`. Bytes after it took their time on a line of `pace`
+    /// bits per second, if it was one, but none of them had arrived at the previous read.
     pub fn latest(&self, offset: u64, pace: Option<u32>) -> Nanos {
         let oldest = self.next.saturating_sub(Arrivals::CAPACITY);
         let mut latest = Nanos::MAX;
@@ -57,8 +57,8 @@ impl Arrivals {
         latest
     }
 
-    /// Returns the earliest possible arrival of byte number `offset` of a stream. `None` if it is not known, because more bytes arrived
-    /// at once than were sent since the previous read, so it was in a backlog.
+    /// Returns the earliest possible arrival of byte number `offset` of a stream. `None` if it is not known, because
+    /// more bytes arrived at once than were sent since the previous read, so it was in a backlog.
     pub fn earliest(&self, offset: u64, flow: Flow) -> Option<Nanos> {
         // The last piece of a backlog in a full tty is shorter, and some more bytes may arrive a moment later.
         let is_rest = |n: usize| {
@@ -70,8 +70,9 @@ impl Arrivals {
         self.came(n, offset, flow)
     }
 
-    /// Returns the [`earliest`](Self::earliest) possible arrival of a byte after missing ones, which is not the rest of a backlog. In a
-    /// backlog of a full tty, it is known if almost no bytes follow: the byte arrived when there was space again, or shortly before.
+    /// Returns the [`earliest`](Self::earliest) possible arrival of a byte after missing ones, which is not the rest of
+    /// a backlog. In a backlog of a full tty, it is known if almost no bytes follow: the byte arrived when there was
+    /// space again, or shortly before.
     pub fn earliest_behind_gap(&self, offset: u64, flow: Flow) -> Option<Nanos> {
         let n = self.read_of(offset)?;
         self.came(n, offset, flow).or_else(|| {

@@ -13,7 +13,8 @@ pub struct Features {
     pub can_rest: bool,
     /// Whether the scanner streams as soon as it has power, without a request.
     pub speaks_unasked: bool,
-    /// Whether each telegram is a scan or a reply by itself. Otherwise the family sends packets, which are parts of a scan.
+    /// Whether each telegram is a scan or a reply by itself. Otherwise the family sends packets, which are parts of a
+    /// scan.
     pub has_whole_telegrams: bool,
     /// Arrays of a scan: bits of [`schema::Contents`].
     pub contents: u8,
@@ -51,8 +52,8 @@ pub struct Settings {
     pub unit_mm: Option<u8>,
     /// Number of the mode that defines the meaning of values, for a recording that does not contain it.
     pub mode_number: Option<u8>,
-    /// Whether the port has one fixed rate and bytes do not arrive at the pace of a line, as with a serial server on the
-    /// network or a recording.
+    /// Whether the port has one fixed rate and bytes do not arrive at the pace of a line, as with a serial server on
+    /// the network or a recording.
     pub fixed_rate: bool,
     /// Whether nothing can be sent, because the bytes are from a recording.
     pub listen_only: bool,

@@ -38,8 +38,8 @@ impl Reads {
         self.room = room;
     }
 
-    /// Handles a read of `len` bytes at `now`. While a scanner streams, some packets are read at once. A backlog is read without
-    /// pauses: while a tty is full, it drops bytes that arrive.
+    /// Handles a read of `len` bytes at `now`. While a scanner streams, some packets are read at once. A backlog is
+    /// read without pauses: while a tty is full, it drops bytes that arrive.
     pub fn note(&mut self, now: Nanos, len: usize, is_streaming: bool) {
         self.arrivals.note(now, len);
         let is_all = (1..self.room.min(TTY)).contains(&len);
@@ -70,14 +70,14 @@ impl Reads {
         }
     }
 
-    /// Returns the marked reasons for packets that end before byte number `end`. The mark may belong to later ones, because the framer
-    /// may hold packets back.
+    /// Returns the marked reasons for packets that end before byte number `end`. The mark may belong to later ones,
+    /// because the framer may hold packets back.
     pub fn take_doubt(&mut self, end: u64) -> u8 {
         if end > self.doubt.0 { core::mem::take(&mut self.doubt.1) } else { 0 }
     }
 
-    /// Returns what to wait for at `now`: the end of a rest, or bytes until the deadline `until`. If the framer holds a packet
-    /// back until the line was idle for `hold`, the deadline is the end of that time, if it comes first.
+    /// Returns what to wait for at `now`: the end of a rest, or bytes until the deadline `until`. If the framer holds a
+    /// packet back until the line was idle for `hold`, the deadline is the end of that time, if it comes first.
     pub fn wait<'a>(&self, now: Nanos, until: Nanos, hold: Option<Nanos>) -> Output<'a> {
         if self.rest_until > now {
             return Output::Rest(self.rest_until);

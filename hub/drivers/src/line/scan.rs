@@ -1,5 +1,5 @@
-//! A scan in the buffer of a session, complete or still arriving. It writes itself into a payload: here raw values become
-//! ranges, directly in the shared memory that subscribers read.
+//! A scan in the buffer of a session, complete or still arriving. It writes itself into a payload: here raw values
+//! become ranges, directly in the shared memory that subscribers read.
 
 use std::f64::consts::TAU;
 
@@ -48,8 +48,8 @@ pub enum Values<'a> {
 }
 
 impl<'a> RawScan<'a> {
-    /// Returns the scan of the revolution `closed` with its `points`, on a grid of `beams`. `stamps` are those of beam 0 and of the
-    /// last point. `per_second` is the number of points per second; 0 if unknown.
+    /// Returns the scan of the revolution `closed` with its `points`, on a grid of `beams`. `stamps` are those of beam
+    /// 0 and of the last point. `per_second` is the number of points per second; 0 if unknown.
     pub fn revolution(
         family: Family,
         closed: &Closed,
@@ -110,8 +110,8 @@ impl<'a> RawScan<'a> {
     }
 }
 
-/// Returns the head of the scan of a revolution that takes `period`, on a grid of `beams`. `points_per_second` is 0 if it is not
-/// known.
+/// Returns the head of the scan of a revolution that takes `period`, on a grid of `beams`. `points_per_second` is 0 if
+/// it is not known.
 pub fn revolution_head(
     family: Family,
     beams: usize,

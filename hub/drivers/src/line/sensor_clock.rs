@@ -1,6 +1,6 @@
-//! Maps the scanner's clock to the hub's clock. A packet can be late for many reasons but never early. The smallest delay of the last
-//! few seconds therefore holds for every packet in them, even for packets that waited while the host was stopped. The drift
-//! between the clocks is estimated too.
+//! Maps the scanner's clock to the hub's clock. A packet can be late for many reasons but never early. The smallest
+//! delay of the last few seconds therefore holds for every packet in them, even for packets that waited while the host
+//! was stopped. The drift between the clocks is estimated too.
 
 use schema::{MILLIS, Nanos};
 
@@ -52,8 +52,8 @@ impl SensorClock {
         }
     }
 
-    /// Records that times from `at` of the scanner's clock on may be off by `most` against earlier ones, because the time between
-    /// them was counted, not measured. Earlier delays count until those of a later span are known as well.
+    /// Records that times from `at` of the scanner's clock on may be off by `most` against earlier ones, because the
+    /// time between them was counted, not measured. Earlier delays count until those of a later span are known as well.
     pub fn doubt(&mut self, at: Nanos, most: Nanos) {
         if self.best.is_some() {
             self.doubt = Some((at, most));
@@ -97,7 +97,8 @@ impl SensorClock {
         self.since = at;
     }
 
-    /// Ends a span at `at`. If it agrees with the spans before the [uncertain](Self::doubt) time, those are not needed any more.
+    /// Ends a span at `at`. If it agrees with the spans before the [uncertain](Self::doubt) time, those are not needed
+    /// any more.
     fn settle(&mut self, at: Nanos) {
         let Some((from, most)) = self.doubt else { return };
         let seen = |known: Delay| known.seen_from(at, self.drift);
@@ -175,8 +176,9 @@ const JITTER: f64 = 4e6;
 mod tests {
     use super::*;
 
-    /// Returns the maximum error in microseconds from `from` seconds on. The scanner's clock is slow by `drift`, and it sends a packet
-    /// every 2 ms with a delay of at least 100 us. The host stops for `stall` seconds every `every` seconds.
+    /// Returns the maximum error in microseconds from `from` seconds on. The scanner's clock is slow by `drift`, and it
+    /// sends a packet every 2 ms with a delay of at least 100 us. The host stops for `stall` seconds every `every`
+    /// seconds.
     fn worst_us(drift: f64, stall: f64, every: f64, from: f64) -> f64 {
         let mut clock = SensorClock::new();
         let mut random = fastrand::Rng::with_seed(7);
@@ -210,7 +212,8 @@ mod tests {
         let (mut counted, mut wrong) = (0, 0);
         for n in 0..40_000u64 {
             let hub = 1_000_000_000_000 + n * MILLIS;
-            // In half a second of every two, nothing arrives in time. Then packets are missing, and the count of them is one too low.
+            // In half a second of every two, nothing arrives in time. Then packets are missing, and the count of them
+            // is one too low.
             let phase = n % 2_000;
             if n > 4_000 && phase == 1_250 {
                 counted += MILLIS;

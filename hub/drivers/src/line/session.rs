@@ -1,5 +1,5 @@
-//! The session with one scanner as its driver sees it: bytes and the time go in; bytes to send, events and the next deadline
-//! come out. A session never waits, reads or writes itself.
+//! The session with one scanner as its driver sees it: bytes and the time go in; bytes to send, events and the next
+//! deadline come out. A session never waits, reads or writes itself.
 
 use core::fmt;
 
@@ -7,8 +7,8 @@ use crate::line::RawScan;
 use crate::line::family::Model;
 use schema::{Counter, Counters, Nanos, Status};
 
-/// A protocol state machine on an open port. After every call that changes it, drain [`Protocol::poll_output`] until it returns
-/// [`Output::Wait`] or [`Output::Rest`].
+/// A protocol state machine on an open port. After every call that changes it, drain [`Protocol::poll_output`] until it
+/// returns [`Output::Wait`] or [`Output::Rest`].
 pub trait Protocol {
     /// Returns the buffer of the next read. It is never empty after the outputs were drained.
     fn spare(&mut self) -> &mut [u8];
@@ -25,16 +25,16 @@ pub trait Protocol {
     /// Returns the next action that the protocol requests.
     fn poll_output(&mut self) -> Output<'_>;
 
-    /// Call it at `now`, immediately before the bytes of [`Output::Transmit`] are written. Returns whether it is too late for them, as
-    /// on a machine that did not run the program for a few milliseconds. Then do not write them, and continue draining: the
-    /// request starts over.
+    /// Call it at `now`, immediately before the bytes of [`Output::Transmit`] are written. Returns whether it is too
+    /// late for them, as on a machine that did not run the program for a few milliseconds. Then do not write them, and
+    /// continue draining: the request starts over.
     fn restart_if_late(&mut self, now: Nanos) -> bool {
         let _ = now;
         false
     }
 
-    /// Handles at `now` that the port cannot have the rate of the last [`Output::SetRate`], or, before the first output,
-    /// the rate at which it should be open. A protocol that can try other rates leaves this one out.
+    /// Handles at `now` that the port cannot have the rate of the last [`Output::SetRate`], or, before the first
+    /// output, the rate at which it should be open. A protocol that can try other rates leaves this one out.
     fn reject_rate(&mut self, now: Nanos) {
         let _ = now;
     }
@@ -52,8 +52,8 @@ pub trait Session: Protocol {
     /// Reason why a session does not stream as it should, as text when displayed.
     type Trouble: Copy + PartialEq + fmt::Display;
 
-    /// Handles a request of a user. A repeated request changes nothing, but each [`Control::Resync`] counts. A recording
-    /// cannot be controlled.
+    /// Handles a request of a user. A repeated request changes nothing, but each [`Control::Resync`] counts. A
+    /// recording cannot be controlled.
     fn control(&mut self, control: Control, now: Nanos);
 
     /// Returns the state.
@@ -72,13 +72,14 @@ pub trait Session: Protocol {
     /// Returns the counters.
     fn account(&self) -> Account;
 
-    /// Returns whether [`defer_read`](Self::defer_read) may postpone the next read, so that counting the waiting bytes pays off.
+    /// Returns whether [`defer_read`](Self::defer_read) may postpone the next read, so that counting the waiting bytes
+    /// pays off.
     fn can_defer_read(&self) -> bool {
         false
     }
 
-    /// Handles that the line has `waiting` unread bytes at `now`. Returns whether they may stay there for a while: if the host
-    /// is killed, unread bytes are not lost.
+    /// Handles that the line has `waiting` unread bytes at `now`. Returns whether they may stay there for a while: if
+    /// the host is killed, unread bytes are not lost.
     fn defer_read(&mut self, now: Nanos, waiting: usize) -> bool {
         let _ = (now, waiting);
         false
@@ -89,39 +90,40 @@ pub trait Session: Protocol {
         let _ = (now, has_subscribers);
     }
 
-    /// Handles that the line is closed in a moment, without a successor. Returns whether there are bytes to send before; then
-    /// drain the session once more.
+    /// Handles that the line is closed in a moment, without a successor. Returns whether there are bytes to send
+    /// before; then drain the session once more.
     fn end(&mut self, now: Nanos) -> bool {
         let _ = now;
         false
     }
 
-    /// Restores the identity that the previous session saved a moment ago. Scans are available at once if the scanner still
-    /// streams as it did then. Call it before the first read.
+    /// Restores the identity that the previous session saved a moment ago. Scans are available at once if the scanner
+    /// still streams as it did then. Call it before the first read.
     fn restore_identity(&mut self, identity: Identity) {
         let _ = identity;
     }
 
-    /// Returns the identity for the next session. `None` if the scanner does not stream, has not reported all of it, or reports it in
-    /// every packet.
+    /// Returns the identity for the next session. `None` if the scanner does not stream, has not reported all of it, or
+    /// reports it in every packet.
     fn identity(&self) -> Option<Identity> {
         None
     }
 
-    /// Sets the rate that the search for the scanner tries first: the one at which it was [found](Self::known_rate) the last time.
-    /// Call it before the first read.
+    /// Sets the rate that the search for the scanner tries first: the one at which it was [found](Self::known_rate) the
+    /// last time. Call it before the first read.
     fn hint_rate(&mut self, known: KnownRate) {
         let _ = known;
     }
 
-    /// Handles that a search has found the scanner at `rate`, in bits per second, at which the port is open. Call it before the
-    /// first read, and after [`hint_rate`](Self::hint_rate).
+    /// Handles that a search has found the scanner at `rate`, in bits per second, at which the port is open. Call it
+    /// before the first read, and after [`hint_rate`](Self::hint_rate).
     fn begin_at(&mut self, rate: u32, now: Nanos) {
         let _ = (rate, now);
     }
 
     /// Restores the model and the number of beams that an earlier session on the same port has measured. They are
-    /// ignored if the scanner streams at a rate that this model does not have. Call it before the first read, and after [`begin_at`](Self::begin_at).
+    /// ignored if the scanner streams at a rate that this model does not have. Call it before the first read, and after
+    /// [`begin_at`](Self::begin_at).
     fn restore_beams(&mut self, model: Model, beams: usize) {
         let _ = (model, beams);
     }
@@ -131,17 +133,18 @@ pub trait Session: Protocol {
         None
     }
 
-    /// Sets the number of reads per telegram, so that [`partial_scan`](Self::partial_scan) returns more values each time. With 0 and
-    /// 1, a telegram is read when it is complete.
+    /// Sets the number of reads per telegram, so that [`partial_scan`](Self::partial_scan) returns more values each
+    /// time. With 0 and 1, a telegram is read when it is complete.
     fn set_partial_reads(&mut self, count: u8) {
         let _ = count;
     }
 
-    /// Returns the scan that is arriving, with the values so far. Call it when [`poll_output`](Protocol::poll_output) has returned a wait.
-    /// `None` between scans, and while the meaning of values is not known.
+    /// Returns the scan that is arriving, with the values so far. Call it when [`poll_output`](Protocol::poll_output)
+    /// has returned a wait. `None` between scans, and while the meaning of values is not known.
     fn partial_scan(&self) -> Option<RawScan<'_>>;
 
-    /// Returns the model, once it is known. Of models that cannot be distinguished, it is one. `None` for a family without models.
+    /// Returns the model, once it is known. Of models that cannot be distinguished, it is one. `None` for a family
+    /// without models.
     fn model(&self) -> Option<Model> {
         None
     }
@@ -176,28 +179,29 @@ pub trait Session: Protocol {
         let _ = text;
     }
 
-    /// Returns the identity and the health that the scanner reported. `None` before it has reported both, and always for a family
-    /// without such requests.
+    /// Returns the identity and the health that the scanner reported. `None` before it has reported both, and always
+    /// for a family without such requests.
     fn introduction(&self) -> Option<Introduction> {
         None
     }
 
-    /// Returns the time at which the last returned packet was measured, by the scanner's own clock, if it has one. Its zero is
-    /// arbitrary. The clock restarts with the scanner.
+    /// Returns the time at which the last returned packet was measured, by the scanner's own clock, if it has one. Its
+    /// zero is arbitrary. The clock restarts with the scanner.
     fn scanner_time(&self) -> Option<Nanos> {
         None
     }
 
-    /// Adds `reasons`, bits of [`crate::line::suspect`], to the packets that are returned next. Used for a recording, which does not
-    /// contain the damaged bytes beside a packet.
+    /// Adds `reasons`, bits of [`crate::line::suspect`], to the packets that are returned next. Used for a recording,
+    /// which does not contain the damaged bytes beside a packet.
     fn mark_suspect(&mut self, reasons: u8) {
         let _ = reasons;
     }
 
-    /// Reads a whole telegram of a recording, for a family whose telegrams need no bytes before or after them. Its stamps are 0. Returns
-    /// `None` for other families, and if it is not a telegram.
+    /// Reads a whole telegram of a recording, for a family whose telegrams need no bytes before or after them. Its
+    /// stamps are 0. Returns `None` for other families, and if it is not a telegram.
     ///
-    /// `is_readable` is whether the recording hub knew the meaning of its values. Writes what the telegram reports into `status`.
+    /// `is_readable` is whether the recording hub knew the meaning of its values. Writes what the telegram reports into
+    /// `status`.
     fn read_recorded<'a>(
         &mut self,
         telegram: &'a [u8],
@@ -231,13 +235,14 @@ pub trait Session: Protocol {
 /// Action that a protocol requests, in the order in which it is to be carried out.
 #[derive(Debug)]
 pub enum Output<'a> {
-    /// Set the port to this rate, in bits per second, and discard what it had received. If the port cannot have this rate,
-    /// call [`Protocol::reject_rate`]. Then continue draining.
+    /// Set the port to this rate, in bits per second, and discard what it had received. If the port cannot have this
+    /// rate, call [`Protocol::reject_rate`]. Then continue draining.
     SetRate(u32),
     /// Assert the line DTR of a serial port, or clear it; other ports have none. Then continue draining.
     SetDtr(bool),
-    /// Write these bytes, not before the time given, then call [`Protocol::transmitted`]. Do nothing else meanwhile, because a
-    /// request may have to arrive without pauses. It is one byte at a time where the scanner requires gaps between bytes.
+    /// Write these bytes, not before the time given, then call [`Protocol::transmitted`]. Do nothing else meanwhile,
+    /// because a request may have to arrive without pauses. It is one byte at a time where the scanner requires gaps
+    /// between bytes.
     Transmit {
         /// The bytes.
         bytes: &'a [u8],
@@ -258,8 +263,8 @@ pub enum Output<'a> {
 /// Event of a session: received bytes, or a scan made from them.
 #[derive(Clone, Copy, Debug)]
 pub enum Event<'a> {
-    /// A telegram, or packets that arrived together, at most 10 ms of them, without other bytes between them. Each packet is in one of
-    /// these events, in the order of arrival.
+    /// A telegram, or packets that arrived together, at most 10 ms of them, without other bytes between them. Each
+    /// packet is in one of these events, in the order of arrival.
     Telegram(Received<'a>),
     /// A complete revolution of a rotating scanner, after its packets.
     Scan(RawScan<'a>),
@@ -306,8 +311,8 @@ pub struct Whole<'a> {
 pub struct KnownRate {
     /// The rate in bits per second.
     pub baud: u32,
-    /// Number of the last switches to 500,000 baud that were followed by silence. After two of them, the line counts as one
-    /// that cannot carry that rate.
+    /// Number of the last switches to 500,000 baud that were followed by silence. After two of them, the line counts as
+    /// one that cannot carry that rate.
     pub silent_switches: u8,
 }
 

@@ -1,5 +1,5 @@
-//! Supervision of a stream of packets: the deadlines after which a stream is silent or its head is blocked, and the counters
-//! of its session.
+//! Supervision of a stream of packets: the deadlines after which a stream is silent or its head is blocked, and the
+//! counters of its session.
 
 use schema::{MILLIS, Nanos};
 
@@ -104,7 +104,8 @@ impl StreamCounters {
         self.at_revolution = (self.damaged, tally.in_packets);
     }
 
-    /// Returns whether most bytes since the last revolution were damaged, so that the next one may be missing because of that.
+    /// Returns whether most bytes since the last revolution were damaged, so that the next one may be missing because
+    /// of that.
     pub fn is_mostly_damaged(&self, tally: &Tally) -> bool {
         let (damaged, in_packets) = self.at_revolution;
         self.damaged - damaged > tally.in_packets - in_packets

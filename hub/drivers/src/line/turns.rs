@@ -1,9 +1,9 @@
 //! Assembles points into revolutions.
 //!
-//! A revolution begins half a step of the grid before the scanner's zero, so that the beam ahead is measured in one piece. A point
-//! belongs to the revolution of its angle, and may arrive after points with larger angles. So a revolution is complete only
-//! when the head is past its end by more than a point can be late, and until then there are two. Times are those of the scanner's
-//! clock.
+//! A revolution begins half a step of the grid before the scanner's zero, so that the beam ahead is measured in one
+//! piece. A point belongs to the revolution of its angle, and may arrive after points with larger angles. So a
+//! revolution is complete only when the head is past its end by more than a point can be late, and until then there are
+//! two. Times are those of the scanner's clock.
 
 use crate::line::grid::{NO_RETURN, Point};
 use schema::Nanos;
@@ -177,8 +177,8 @@ impl<const N: usize> Turns<N> {
         self.open[0].incomplete |= self.number.is_some();
     }
 
-    /// Handles that all points before `angle` were added. Returns a revolution that is complete now. Then call it again, until it
-    /// returns `None`.
+    /// Handles that all points before `angle` were added. Returns a revolution that is complete now. Then call it
+    /// again, until it returns `None`.
     pub fn reach(&mut self, angle: f64, pace: Pace) -> Option<Closed> {
         let turn = self.turn_of(angle);
         while let Some(number) = self.number.filter(|number| turn > *number) {

@@ -1,6 +1,6 @@
-//! Arrival times of bytes, and the time of the next read. A port only reports when a read returned and how many bytes it had. From
-//! that, [`Arrivals`] computes a stamp for any byte, and [`Rhythm`] measures how long a telegram takes, so that the host can sleep
-//! meanwhile.
+//! Arrival times of bytes, and the time of the next read. A port only reports when a read returned and how many bytes
+//! it had. From that, [`Arrivals`] computes a stamp for any byte, and [`Rhythm`] measures how long a telegram takes, so
+//! that the host can sleep meanwhile.
 
 use crate::lms::variant::BYTES_PER_TURN;
 use schema::{MICROS, MILLIS, Nanos, line_time};
@@ -24,15 +24,16 @@ struct Read {
     backlog: Option<Backlog>,
 }
 
-/// Bytes that arrived while the host did not run, or that the line held back. Their age is not known. But the line's buffer keeps the
-/// oldest ones, so they arrived at the speed of the line, starting at the last read.
+/// Bytes that arrived while the host did not run, or that the line held back. Their age is not known. But the line's
+/// buffer keeps the oldest ones, so they arrived at the speed of the line, starting at the last read.
 #[derive(Clone, Copy, Debug)]
 struct Backlog {
     /// Number of its first byte.
     begin: u64,
     /// Time at which the line had bytes before.
     since: Nanos,
-    /// Time of the last read that had more bytes than can have arrived since the read before, and number of bytes after it.
+    /// Time of the last read that had more bytes than can have arrived since the read before, and number of bytes after
+    /// it.
     hurried: Nanos,
     read_since: usize,
 }
@@ -56,7 +57,8 @@ impl Arrivals {
         Arrivals { reads, next: 0, total: 0, last_look: now, backlog: None }
     }
 
-    /// Handles a read of `len` bytes at `now`, from a line of `pace` bits per second. `None`: bytes do not arrive at the pace of a line.
+    /// Handles a read of `len` bytes at `now`, from a line of `pace` bits per second. `None`: bytes do not arrive at
+    /// the pace of a line.
     pub(crate) fn note(&mut self, now: Nanos, len: usize, pace: Option<u32>) {
         let since = self.last_look;
         if len > 0 {
@@ -98,9 +100,9 @@ impl Arrivals {
         }
     }
 
-    /// Returns the latest possible arrival of byte number `offset`: bytes after it, in the same read or soon after, took their time on
-    /// the line. For a byte in a backlog, it is the earliest possible arrival, because old values must not look new. If the
-    /// period of the stream is known, [`crate::lms::cadence`] is more exact.
+    /// Returns the latest possible arrival of byte number `offset`: bytes after it, in the same read or soon after,
+    /// took their time on the line. For a byte in a backlog, it is the earliest possible arrival, because old values
+    /// must not look new. If the period of the stream is known, [`crate::lms::cadence`] is more exact.
     pub(crate) fn stamp(&self, offset: u64, baud: u32) -> Stamp {
         let oldest = self.next.saturating_sub(Arrivals::CAPACITY);
         let (mut at, mut own, mut own_behind) = (Nanos::MAX, Nanos::MAX, ESTIMATED + 1);
@@ -125,7 +127,8 @@ impl Arrivals {
     }
 }
 
-/// Duration of a telegram of the stream, as measured. A busy host can only measure too much, so the minimum of several counts.
+/// Duration of a telegram of the stream, as measured. A busy host can only measure too much, so the minimum of several
+/// counts.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Rhythm {
     duration: Option<Nanos>,
@@ -158,7 +161,8 @@ impl Rhythm {
         self.duration
     }
 
-    /// Returns the time until which the host can sleep: to the next piece, or to the end of the telegram. Only once for each.
+    /// Returns the time until which the host can sleep: to the next piece, or to the end of the telegram. Only once for
+    /// each.
     pub(crate) fn rest(&mut self, now: Nanos) -> Option<Nanos> {
         let (first, duration) = (self.first?, self.duration?);
         let end = first + duration.checked_sub(LEAD)?;
@@ -196,10 +200,11 @@ impl Rhythm {
 
 /// With more bytes than this after a byte in the same read, its stamp is an estimate. An adapter's chunk has 62.
 const ESTIMATED: usize = 64;
-/// After this time without bytes, longer than any sleep at the highest rate, the host was stopped or starved, or the line was.
+/// After this time without bytes, longer than any sleep at the highest rate, the host was stopped or starved, or the
+/// line was.
 const LATE: Nanos = 50 * MILLIS;
-/// After this time with no more bytes than the line can carry, the backlog ends. It is shorter than a telegram, and longer than the
-/// kernel needs to move bytes from one buffer to the next.
+/// After this time with no more bytes than the line can carry, the backlog ends. It is shorter than a telegram, and
+/// longer than the kernel needs to move bytes from one buffer to the next.
 const CALM: Nanos = 12 * MILLIS;
 /// The host reads this time before the expected end: one or two chunks of 16 bytes.
 const LEAD: Nanos = 600 * MICROS;
@@ -207,8 +212,8 @@ const LEAD: Nanos = 600 * MICROS;
 const MIN_REST: Nanos = 500 * MICROS;
 /// Number of telegrams before the first sleep.
 const LESSONS: u32 = 3;
-/// Number of telegrams whose minimum counts from then on. A telegram during which the host slept too long measures at most the
-/// sleep, so the sleep becomes shorter.
+/// Number of telegrams whose minimum counts from then on. A telegram during which the host slept too long measures at
+/// most the sleep, so the sleep becomes shorter.
 const WINDOW: u32 = 16;
 /// A telegram that takes longer than usual by more than this is suspect (framing: quality, reason 4).
 const SLOW: Nanos = 8 * MILLIS;

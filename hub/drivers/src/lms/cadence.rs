@@ -1,7 +1,8 @@
 //! Due times of the scans of a stream.
 //!
-//! A scanner sends scans one period apart, even if they do not arrive. So lost ones can be counted, and one that was in a backlog can
-//! be stamped. If a scanner is silent for longer than the session waits, that is not a loss on the line: the stream starts again.
+//! A scanner sends scans one period apart, even if they do not arrive. So lost ones can be counted, and one that was in
+//! a backlog can be stamped. If a scanner is silent for longer than the session waits, that is not a loss on the line:
+//! the stream starts again.
 
 use schema::{MILLIS, Nanos};
 
@@ -51,12 +52,14 @@ impl Cadence {
         }
     }
 
-    /// Returns the number of scans that the scanner must have sent since the first one of each stream. Not counted if unknown.
+    /// Returns the number of scans that the scanner must have sent since the first one of each stream. Not counted if
+    /// unknown.
     pub(crate) fn due(&self) -> u64 {
         self.due
     }
 
-    /// Returns the number of those that did not arrive. A missing one counts after a second, because it may only be late.
+    /// Returns the number of those that did not arrive. A missing one counts after a second, because it may only be
+    /// late.
     pub(crate) fn lost(&self) -> u64 {
         self.lost
     }

@@ -1,5 +1,5 @@
-//! Positions in the framer's buffer at which a telegram may begin, and where each would end. Their number is bounded by the headers
-//! that fit into the buffer, so they need no heap.
+//! Positions in the framer's buffer at which a telegram may begin, and where each would end. Their number is bounded by
+//! the headers that fit into the buffer, so they need no heap.
 
 use crate::lms::framer::CAPACITY;
 use crate::lms::header::HEADER_DISTANCE;
@@ -38,8 +38,8 @@ impl Candidates {
         self.as_slice().first().copied()
     }
 
-    /// Returns the candidate that is complete first, with bytes up to `end`. If two have the same end, it is the inner one, which may
-    /// refute the outer one.
+    /// Returns the candidate that is complete first, with bytes up to `end`. If two have the same end, it is the inner
+    /// one, which may refute the outer one.
     pub(crate) fn first_complete(&self, end: usize) -> Option<Candidate> {
         let complete = self.as_slice().iter().filter(|candidate| usize::from(candidate.end) <= end);
         complete.copied().min_by_key(|candidate| (candidate.end, core::cmp::Reverse(candidate.at)))

@@ -1,5 +1,6 @@
-//! Damage on the line: bytes of a stream that are in no telegram although neither side aborted a transmission. Bytes of another
-//! rate, or of a stream that is being stopped, do not count, because they do not indicate the quality of the line.
+//! Damage on the line: bytes of a stream that are in no telegram although neither side aborted a transmission. Bytes of
+//! another rate, or of a stream that is being stopped, do not count, because they do not indicate the quality of the
+//! line.
 
 use crate::lms::framer::Tally;
 use schema::{MILLIS, Nanos};

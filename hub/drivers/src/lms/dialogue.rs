@@ -1,6 +1,7 @@
 //! The protocol state of a session: how the scanner is found, brought to a stream, supervised, and stopped.
 //!
-//! It handles telegrams and deadlines; the session handles bytes. No request changes a setting that outlives a power cycle.
+//! It handles telegrams and deadlines; the session handles bytes. No request changes a setting that outlives a power
+//! cycle.
 
 use schema::{MILLIS, Nanos};
 
@@ -34,7 +35,8 @@ pub(crate) struct Dialogue {
     is_paused: bool,
     /// Whether the scanner keeps another variant than the requested one.
     variant_refused: bool,
-    /// Whether bytes have arrived since the session began to listen, to stop the scanner, or to search for another round.
+    /// Whether bytes have arrived since the session began to listen, to stop the scanner, or to search for another
+    /// round.
     has_received: bool,
     /// Time since which no telegram has arrived.
     quiet_since: Nanos,
@@ -44,8 +46,8 @@ pub(crate) struct Dialogue {
 
 #[derive(Clone, Copy, Debug)]
 enum Phase {
-    /// Waiting for a stream without sending. The state is `shown` meanwhile. The session then sends request number `attempt` of
-    /// the search: at `quiet_at` if no byte has arrived, otherwise at `give_up_at`.
+    /// Waiting for a stream without sending. The state is `shown` meanwhile. The session then sends request number
+    /// `attempt` of the search: at `quiet_at` if no byte has arrived, otherwise at `give_up_at`.
     Listening { give_up_at: Nanos, quiet_at: Nanos, shown: State, attempt: usize },
     /// Sending a request at one rate after the other.
     Probing { attempt: usize },
@@ -188,8 +190,8 @@ impl Dialogue {
         }
     }
 
-    /// Returns when the dialogue has to act without a byte: the end of its phase or of the wait for a reply, or the time at
-    /// which the next byte of a request may leave.
+    /// Returns when the dialogue has to act without a byte: the end of its phase or of the wait for a reply, or the
+    /// time at which the next byte of a request may leave.
     pub(crate) fn deadline(&self) -> Nanos {
         let phase_ends_at = match self.phase {
             Phase::Listening { give_up_at, .. } if self.has_received => give_up_at,
@@ -240,8 +242,8 @@ impl Dialogue {
         }
     }
 
-    /// Handles a NAK. It proves nothing during a search or while a stream is stopped, because the rest of a scan, or a stream at
-    /// another rate, contains such bytes. Then only the timeout counts.
+    /// Handles a NAK. It proves nothing during a search or while a stream is stopped, because the rest of a scan, or a
+    /// stream at another rate, contains such bytes. Then only the timeout counts.
     pub(crate) fn on_nak(&mut self, now: Nanos) {
         let credible = !matches!(self.phase, Phase::Probing { .. }) && !self.sensor.streams;
         if credible && self.open.as_ref().is_some_and(Outgoing::is_out) {
@@ -249,8 +251,8 @@ impl Dialogue {
         }
     }
 
-    /// Handles a telegram whose first byte arrived at `first`. It counts as a reply even if it cannot be decoded to a `reply`.
-    /// `is_line_damaged` is whether the line has damaged telegrams recently.
+    /// Handles a telegram whose first byte arrived at `first`. It counts as a reply even if it cannot be decoded to a
+    /// `reply`. `is_line_damaged` is whether the line has damaged telegrams recently.
     pub(crate) fn on_telegram(
         &mut self,
         telegram: Telegram<'_>,
@@ -329,7 +331,8 @@ impl Dialogue {
         }
     }
 
-    /// Handles the boot message: the scanner lost power or was reset. Its settings are lost, and it receives at this rate.
+    /// Handles the boot message: the scanner lost power or was reset. Its settings are lost, and it receives at this
+    /// rate.
     fn on_power_on(&mut self, now: Nanos) {
         match self.phase {
             Phase::Following => {}
@@ -436,9 +439,10 @@ impl Dialogue {
         self.phase = Phase::Listening { give_up_at, quiet_at, shown, attempt: 0 };
     }
 
-    /// Sends request number `attempt` of the search, for the status. On a silent line, at another rate than the one to stream at,
-    /// it is for the type: at 9,600 baud, the 160 bytes of a status take 0.17 s. The status follows after the change of the rate. In
-    /// every other round it is always for the status, because some scanners do not report their type.
+    /// Sends request number `attempt` of the search, for the status. On a silent line, at another rate than the one to
+    /// stream at, it is for the type: at 9,600 baud, the 160 bytes of a status take 0.17 s. The status follows after
+    /// the change of the rate. In every other round it is always for the status, because some scanners do not report
+    /// their type.
     fn probe(&mut self, now: Nanos, attempt: usize) {
         self.phase = Phase::Probing { attempt };
         // The next reply may come from another scanner. Address 0 is for all.
@@ -456,8 +460,8 @@ impl Dialogue {
         }
     }
 
-    /// Continues the search after `attempt` had no reply. After a round without a single byte, it pauses at the rate at which a
-    /// scanner sends its boot message, up to a minute after power-on (Telegram listing 7.1).
+    /// Continues the search after `attempt` had no reply. After a round without a single byte, it pauses at the rate at
+    /// which a scanner sends its boot message, up to a minute after power-on (Telegram listing 7.1).
     fn search_on(&mut self, attempt: usize, now: Nanos) {
         let next = attempt + 1;
         if !next.is_multiple_of(SEARCH_ORDER.len()) {
@@ -596,8 +600,8 @@ impl Dialogue {
         self.question(now);
     }
 
-    /// Sends the next question right after a scan. A reply costs the scan that it interrupts, so the next question waits for the
-    /// next scan.
+    /// Sends the next question right after a scan. A reply costs the scan that it interrupts, so the next question
+    /// waits for the next scan.
     fn question(&mut self, now: Nanos) {
         let Phase::Streaming { questions, .. } = &mut self.phase else { return };
         if self.open.is_some() {
@@ -614,8 +618,8 @@ impl Dialogue {
         }
     }
 
-    /// Handles a request of a user. A pause stops the scanner, after a search for it if necessary. It ends with the report that the
-    /// scanner has stopped, or that this is not known.
+    /// Handles a request of a user. A pause stops the scanner, after a search for it if necessary. It ends with the
+    /// report that the scanner has stopped, or that this is not known.
     pub(crate) fn control(&mut self, control: Control, now: Nanos) {
         match (control, self.phase) {
             (_, Phase::Following) => {}
@@ -666,8 +670,8 @@ impl Dialogue {
 #[derive(Clone, Copy, Debug, Default)]
 struct Restarts {
     count: u64,
-    /// Whether a telegram has arrived since the session began or the last boot message. Without it, a boot message is first
-    /// contact, or a copy of the last one.
+    /// Whether a telegram has arrived since the session began or the last boot message. Without it, a boot message is
+    /// first contact, or a copy of the last one.
     is_in_contact: bool,
     /// Rate of the last stream, until a request stops it or the scanner is found again.
     streamed_at: Option<Baud>,
@@ -681,8 +685,8 @@ impl Restarts {
         self.streamed_at = None;
     }
 
-    /// Handles that the scanner was found at `baud`. It has restarted, and its boot message was lost, if it streamed and no
-    /// request stopped it, but now it `is_idle` or has another rate.
+    /// Handles that the scanner was found at `baud`. It has restarted, and its boot message was lost, if it streamed
+    /// and no request stopped it, but now it `is_idle` or has another rate.
     fn note_found(&mut self, baud: Baud, is_idle: bool) {
         let has_restarted = self.streamed_at.take().is_some_and(|before| before != baud || is_idle);
         self.count += u64::from(has_restarted);
@@ -699,17 +703,18 @@ fn coarse(seconds: u64) -> u32 {
 
 /// Command byte of the reply to every change of mode or rate.
 const MODE_REPLY: u8 = MODE | REPLY;
-/// Time to listen for a stream: more than two scans of the slowest variant. It is longer where the line is slower than the scans.
+/// Time to listen for a stream: more than two scans of the slowest variant. It is longer where the line is slower than
+/// the scans.
 pub(crate) const LISTEN: Nanos = 120 * MILLIS;
-/// A line that is silent for this time carries no stream of whole scans: the slowest variant begins one every 53 ms, and has
-/// bytes on the line for at least a third of that. Two telegram times of the usual variant.
+/// A line that is silent for this time carries no stream of whole scans: the slowest variant begins one every 53 ms,
+/// and has bytes on the line for at least a third of that. Two telegram times of the usual variant.
 const QUIET: Nanos = 55 * MILLIS;
 /// After this time without measured data, the session begins again (paper: resynchronize after one second).
 pub const SILENCE: Nanos = 1_000 * MILLIS;
 /// Pause after a refusal, before the search begins.
 const REFUSAL_PAUSE: Nanos = 500 * MILLIS;
-/// A whole scan that began this long after a request shows that the scanner overlooked the request, which would have interrupted the
-/// stream. The time is for bytes that an adapter keeps.
+/// A whole scan that began this long after a request shows that the scanner overlooked the request, which would have
+/// interrupted the stream. The time is for bytes that an adapter keeps.
 const OVERLOOKED: Nanos = 25 * MILLIS;
 /// Pauses before the next round of the search, by the number of rounds without a byte.
 const PAUSES: [Nanos; 4] = [0, 500 * MILLIS, 1_000 * MILLIS, 1_500 * MILLIS];

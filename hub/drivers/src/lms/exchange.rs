@@ -1,4 +1,5 @@
-//! Sends one request after another, and returns the replies. [`crate::lms::inquiry`] and a change of the configuration use it.
+//! Sends one request after another, and returns the replies. [`crate::lms::inquiry`] and a change of the configuration
+//! use it.
 
 use crate::line::Output;
 use crate::lms::framer::{Advance, Framer, Tally, TelegramSpan};
@@ -64,8 +65,9 @@ impl<R: Say> Exchange<R> {
         self.open.as_ref().is_some_and(|open| now >= open.give_up_at())
     }
 
-    /// Handles that a byte is about to be written, like [`Protocol::restart_if_late`](crate::line::Protocol::restart_if_late). For a
-    /// serial server, the gaps on the line are not known.
+    /// Handles that a byte is about to be written, like
+    /// [`Protocol::restart_if_late`](crate::line::Protocol::restart_if_late). For a serial server, the gaps on the line
+    /// are not known.
     pub fn restart_if_late(&mut self, now: Nanos) -> bool {
         self.now = now;
         !self.behind_server && self.open.as_mut().is_some_and(|open| open.restart_if_late(now, self.baud))

@@ -1,8 +1,9 @@
-//! Finds the rate of a scanner, and requests what it is, without changing its mode, its rate or a setting. A scanner that streams
-//! continues; each reply costs a scan.
+//! Finds the rate of a scanner, and requests what it is, without changing its mode, its rate or a setting. A scanner
+//! that streams continues; each reply costs a scan.
 //!
-//! The inquiry listens first, because a stream at the port's rate needs no request. Then it requests the status at each rate, in
-//! two rounds, because a scanner may overlook a request. A rate at which telegrams arrived is tried more often.
+//! The inquiry listens first, because a stream at the port's rate needs no request. Then it requests the status at each
+//! rate, in two rounds, because a scanner may overlook a request. A rate at which telegrams arrived is tried more
+//! often.
 
 use crate::line::{Output, Protocol};
 use crate::lms::command::Request;
@@ -162,8 +163,8 @@ impl Inquiry {
         self.exchange.ask(Request::Status, not_before, tries);
     }
 
-    /// Waits for any telegram at one rate after the other, each for the time of the two longest ones. Not if the line is silent, or
-    /// telegrams have arrived before.
+    /// Waits for any telegram at one rate after the other, each for the time of the two longest ones. Not if the line
+    /// is silent, or telegrams have arrived before.
     fn listen_again(&mut self, attempt: usize) {
         let is_silent = self.exchange.tally().0.read == 0;
         if is_silent || attempt >= self.count || self.unasked.iter().any(|&count| count > 0) {
@@ -315,8 +316,8 @@ impl Report {
         }
     }
 
-    /// Returns whether the window is dirty, by the status byte or by the measured value in the status. `None` if neither was
-    /// reported.
+    /// Returns whether the window is dirty, by the status byte or by the measured value in the status. `None` if
+    /// neither was reported.
     pub fn is_polluted(&self) -> Option<bool> {
         let reported = self.status_byte.map(|byte| Condition(byte).is_polluted());
         let measured =

@@ -1,6 +1,6 @@
-//! A request that is being sent, or whose reply is expected: its pace, its timeouts and its tries. The scanner requires at
-//! least 55 us and at most 6 ms between bytes, and may overlook a request while its mirror rotates (Telegram listing 4.3). So
-//! a request is sent byte by byte.
+//! A request that is being sent, or whose reply is expected: its pace, its timeouts and its tries. The scanner requires
+//! at least 55 us and at most 6 ms between bytes, and may overlook a request while its mirror rotates (Telegram listing
+//! 4.3). So a request is sent byte by byte.
 
 use crate::lms::command::Request;
 use crate::lms::telegram::{Encoded, REPLY};
@@ -114,16 +114,16 @@ impl<R: Say> Outgoing<R> {
         }
     }
 
-    /// Handles that bytes arrived. After the beginning of a scan that the request interrupted, the acknowledgment is not detected,
-    /// only the reply, which may have begun now.
+    /// Handles that bytes arrived. After the beginning of a scan that the request interrupted, the acknowledgment is
+    /// not detected, only the reply, which may have begun now.
     pub(crate) fn hear(&mut self, baud: Baud) {
         if self.is_out() && !core::mem::replace(&mut self.is_heard, true) {
             self.give_up_at += line_time(1 + LONGEST_REPLY, baud.rate());
         }
     }
 
-    /// Handles an acknowledgment, after which the reply may take longer. Only the first one counts: a stream at another rate looks
-    /// like endless acknowledgments, which must not extend the deadline again and again.
+    /// Handles an acknowledgment, after which the reply may take longer. Only the first one counts: a stream at another
+    /// rate looks like endless acknowledgments, which must not extend the deadline again and again.
     pub(crate) fn acknowledged(&mut self, now: Nanos, baud: Baud) {
         if core::mem::replace(&mut self.acknowledged, true) {
             return;
@@ -153,8 +153,8 @@ impl<R: Say> Outgoing<R> {
     }
 
     /// Starts over with the first byte if `now` is too late for the next one, and returns whether it is. The sensor has
-    /// dropped the request, and it cannot have received its last byte. This does not count as a try. After [`MAX_RESTARTS`] the
-    /// request is sent to its end anyway, so that the wait for its reply ends.
+    /// dropped the request, and it cannot have received its last byte. This does not count as a try. After
+    /// [`MAX_RESTARTS`] the request is sent to its end anyway, so that the wait for its reply ends.
     pub(crate) fn restart_if_late(&mut self, now: Nanos, baud: Baud) -> bool {
         let is_gap = self.is_partly_out() && now > self.left_at + line_time(1, baud.rate()) + MOST_GAP;
         self.left_at = now;
@@ -195,21 +195,23 @@ pub const MORE_TRIES: u8 = 5;
 pub(crate) const FORGOTTEN: Nanos = 10 * MILLIS;
 /// Time from the end of a byte to the next one: more than 55 us, far less than 6 ms (Telegram listing 4.3).
 const GAP: Nanos = 120 * MICROS;
-/// Maximum number of times that a request starts over because a byte was late. A machine that is late more often cannot send it.
+/// Maximum number of times that a request starts over because a byte was late. A machine that is late more often cannot
+/// send it.
 const MAX_RESTARTS: u8 = 50;
 /// Longest time between the end of a byte and the next one: 6 ms (Telegram listing 4.3), less the time of the write.
 const MOST_GAP: Nanos = 5 * MILLIS;
 /// A byte that may be sent within this time is requested at once. A later one has a deadline like everything else.
 pub(crate) const SOON: Nanos = 5 * MILLIS;
-/// ACK or NAK arrives within 60 ms (Telegram listing 4.3), and captured replies begin within 100 ms. The rest is for adapters.
+/// ACK or NAK arrives within 60 ms (Telegram listing 4.3), and captured replies begin within 100 ms. The rest is for
+/// adapters.
 const ACKNOWLEDGE_TIMEOUT: Nanos = 150 * MILLIS;
-/// A captured reply to a stop takes 94 ms, and its acknowledgment is hidden in the stream. Waiting is cheap: a scanner that
-/// overlooked the stop continues to stream.
+/// A captured reply to a stop takes 94 ms, and its acknowledgment is hidden in the stream. Waiting is cheap: a scanner
+/// that overlooked the stop continues to stream.
 const STOP_TIMEOUT: Nanos = 300 * MILLIS;
 /// Captured replies with type, status and configuration take up to 158 ms.
 pub(crate) const REPLY_TIMEOUT: Nanos = 500 * MILLIS;
-/// A change of mode takes up to 3 s (Telegram listing 7.3), but mostly 0.1 s. A request for the mode before its end returns the
-/// previous mode, and undoes the change.
+/// A change of mode takes up to 3 s (Telegram listing 7.3), but mostly 0.1 s. A request for the mode before its end
+/// returns the previous mode, and undoes the change.
 pub const MODE_TIMEOUT: Nanos = 3_200 * MILLIS;
 /// Length of the status reply, in bytes.
 const LONGEST_REPLY: usize = 160;

@@ -1,12 +1,13 @@
 //! The rate of the line: the one to stream at, and the order in which the search for a scanner tries the others.
 //!
-//! A line may not be able to carry 500,000 baud, such as RS-232. There, the scanner acknowledges the switch, and then does not
-//! communicate before its power is cycled. After [`MOST_SILENT`] such switches in a row, a session with an automatic rate
-//! streams at 38,400 baud, the highest rate of RS-232. The count outlives boot messages, sessions and runs of the hub: the
-//! power of a scanner is often cycled together with that of its host.
+//! A line may not be able to carry 500,000 baud, such as RS-232. There, the scanner acknowledges the switch, and then
+//! does not communicate before its power is cycled. After [`MOST_SILENT`] such switches in a row, a session with an
+//! automatic rate streams at 38,400 baud, the highest rate of RS-232. The count outlives boot messages, sessions and
+//! runs of the hub: the power of a scanner is often cycled together with that of its host.
 //!
-//! The port may not be able to have 500,000 baud either. A named LMS is refused there when the port is opened. If a search has
-//! found the scanner at another rate, the port is set to 500,000 baud for a moment before the scanner is switched to it.
+//! The port may not be able to have 500,000 baud either. A named LMS is refused there when the port is opened. If a
+//! search has found the scanner at another rate, the port is set to 500,000 baud for a moment before the scanner is
+//! switched to it.
 
 use schema::{MILLIS, Nanos};
 
@@ -80,7 +81,8 @@ impl LineRate {
         self.target
     }
 
-    /// Returns whether the port has to be set to another rate. Bytes that were read before arrived at the previous rate.
+    /// Returns whether the port has to be set to another rate. Bytes that were read before arrived at the previous
+    /// rate.
     pub(crate) fn is_changed(&self) -> bool {
         self.is_changed
     }
@@ -124,8 +126,8 @@ impl LineRate {
         }
     }
 
-    /// Begins at the rate to stream at. If there is no stream, the search tries that rate first if the scanner was stopped there
-    /// (`is_stopped`), otherwise the most likely one.
+    /// Begins at the rate to stream at. If there is no stream, the search tries that rate first if the scanner was
+    /// stopped there (`is_stopped`), otherwise the most likely one.
     pub(crate) fn begin(&mut self, is_stopped: bool) {
         self.first = if is_stopped { self.target } else { self.rest_at };
         self.set(self.target);
@@ -180,8 +182,8 @@ impl LineRate {
         (self.rest_at, self.first) = (baud, baud);
     }
 
-    /// Restores the [number of silent switches](Self::silent_switches). Returns whether the rate to stream at has changed
-    /// because of them.
+    /// Restores the [number of silent switches](Self::silent_switches). Returns whether the rate to stream at has
+    /// changed because of them.
     pub(crate) fn restore_silent_switches(&mut self, count: u8) -> bool {
         self.fast_switches.silent = count;
         self.limit()
@@ -192,8 +194,8 @@ impl LineRate {
         self.fast_switches.silent
     }
 
-    /// Returns what the next search should know. For a line that cannot carry 500,000 baud, it is the rate in use. `None` if
-    /// there was no search.
+    /// Returns what the next search should know. For a line that cannot carry 500,000 baud, it is the rate in use.
+    /// `None` if there was no search.
     pub(crate) fn known(&self) -> Option<KnownRate> {
         let baud = self.instead_of_wanted().or(self.found_at)?;
         Some(KnownRate { baud: baud.rate(), silent_switches: self.silent_switches() })
@@ -218,13 +220,14 @@ impl LineRate {
         Some(self.target).filter(|&baud| baud != self.wanted)
     }
 
-    /// Has [`known`](Self::known) return a rate even without a search, so that the number of silent switches is saved with it.
+    /// Has [`known`](Self::known) return a rate even without a search, so that the number of silent switches is saved
+    /// with it.
     fn save_count(&mut self) {
         self.found_at = self.found_at.or(Some(self.rest_at));
     }
 
-    /// Streams at 38,400 baud in place of 500,000 baud from now on if the line cannot carry that rate. Returns whether it is a
-    /// change.
+    /// Streams at 38,400 baud in place of 500,000 baud from now on if the line cannot carry that rate. Returns whether
+    /// it is a change.
     fn limit(&mut self) -> bool {
         let is_limited = self.fast_switches.have_failed() && self.target == FAST && !self.is_kept;
         if is_limited {
@@ -241,7 +244,8 @@ struct FastSwitches {
     silent: u8,
     /// Whether a switch was acknowledged, and no telegram has arrived at the new rate yet.
     is_pending: bool,
-    /// Whether the last switch was silent, and no telegram has arrived at any rate since. The scanner may need a power cycle.
+    /// Whether the last switch was silent, and no telegram has arrived at any rate since. The scanner may need a power
+    /// cycle.
     is_lost: bool,
 }
 
@@ -251,8 +255,8 @@ impl FastSwitches {
         self.is_pending = true;
     }
 
-    /// Handles a telegram. If it arrived at 500,000 baud (`is_fast`), the line can carry that rate. Returns whether that is
-    /// news.
+    /// Handles a telegram. If it arrived at 500,000 baud (`is_fast`), the line can carry that rate. Returns whether
+    /// that is news.
     fn receive(&mut self, is_fast: bool) -> bool {
         self.is_lost = false;
         if is_fast {
@@ -275,8 +279,8 @@ impl FastSwitches {
         self.silent >= MOST_SILENT
     }
 
-    /// Returns whether the scanner was lost in the switch that made the line count as one that cannot carry 500,000 baud,
-    /// or in a later one.
+    /// Returns whether the scanner was lost in the switch that made the line count as one that cannot carry 500,000
+    /// baud, or in a later one.
     fn have_lost(self) -> bool {
         self.have_failed() && self.is_lost
     }

@@ -1,5 +1,5 @@
-//! State of a scanner as far as it has reported it, for messages and for the next session. It is discarded when the next
-//! telegram may come from another scanner.
+//! State of a scanner as far as it has reported it, for messages and for the next session. It is discarded when the
+//! next telegram may come from another scanner.
 
 use crate::line;
 use crate::lms::command::Request;
@@ -107,8 +107,8 @@ pub struct Sensor {
     pub variant: Option<Variant>,
     /// Whether it sends scans without a request, or is in a mode in which it does not measure.
     pub streams: bool,
-    /// Status byte of its telegrams. A worse one counts at once, a better one after some hundred telegrams, because it may
-    /// change with each scan.
+    /// Status byte of its telegrams. A worse one counts at once, a better one after some hundred telegrams, because it
+    /// may change with each scan.
     pub condition: Option<Condition>,
     /// Whether it reports that it is defective.
     pub defective: Option<bool>,
@@ -116,8 +116,8 @@ pub struct Sensor {
     pub permanent_baud: Option<bool>,
     /// Laser power in percent of the nominal one. Real scanners report 156 to 161.
     pub laser_power_percent: Option<u16>,
-    /// Transmission of the dirtiest channel of the window, in percent of a clean one. The scanner warns below 75, and reports an
-    /// error below 30.
+    /// Transmission of the dirtiest channel of the window, in percent of a clean one. The scanner warns below 75, and
+    /// reports an error below 30.
     pub window_percent: Option<u16>,
     software: [u8; SOFTWARE_LEN],
     kind: [u8; KIND_LEN],
@@ -176,8 +176,8 @@ impl Sensor {
         .filter_map(|(is_so, notice)| is_so.then_some(notice))
     }
 
-    /// Discards the identity and the layout of values: the next telegram may come from another scanner, or from the same one with
-    /// another configuration. State that each scan repeats may stay.
+    /// Discards the identity and the layout of values: the next telegram may come from another scanner, or from the
+    /// same one with another configuration. State that each scan repeats may stay.
     pub(crate) fn forget(&mut self) {
         self.mode = None;
         self.kind_len = 0;
@@ -204,8 +204,8 @@ impl Sensor {
         self.is_confirmed = true;
     }
 
-    /// Returns the identity, for a session that continues with the stream whose scans begin with `header`. `None` if not all of
-    /// it is known.
+    /// Returns the identity, for a session that continues with the stream whose scans begin with `header`. `None` if
+    /// not all of it is known.
     pub(crate) fn identity(&self, header: StreamHeader) -> Option<Identity> {
         let mode = self.mode.filter(|_| self.kind_len > 0)?;
         Some(Identity { header, mode, kind: self.kind })
@@ -266,8 +266,8 @@ impl Sensor {
         self.software = *report.bytes().first_chunk().unwrap_or(&[0; SOFTWARE_LEN]);
     }
 
-    /// Counts a worse condition on a line that damages telegrams. Returns whether there were enough of them. A scanner may report a
-    /// fatal condition only now and then, so two scans are enough, however far apart.
+    /// Counts a worse condition on a line that damages telegrams. Returns whether there were enough of them. A scanner
+    /// may report a fatal condition only now and then, so two scans are enough, however far apart.
     fn is_confirmed_now(&mut self, is_fatal: bool) -> bool {
         if is_fatal {
             self.fatal_sightings += 1;
@@ -300,8 +300,8 @@ impl Sensor {
     }
 }
 
-/// Identity of a scanner that streams, which its scans do not contain. With it, a session that continues with the same stream has
-/// the meaning of values before it sends a request.
+/// Identity of a scanner that streams, which its scans do not contain. With it, a session that continues with the same
+/// stream has the meaning of values before it sends a request.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct Identity {
     /// Beginning of each of its scans.

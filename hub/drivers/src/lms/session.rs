@@ -29,15 +29,15 @@ pub struct Settings {
     pub listen_only: bool,
     /// Whether the port has the rate [`baud`](Self::baud) and no other, as with a serial server on the network.
     pub fixed_rate: bool,
-    /// Whether to keep to [`baud`](Self::baud) even if the line cannot carry it. Otherwise, the session streams at 38,400 baud after
-    /// two switches to 500,000 baud that the scanner acknowledged and that were followed by silence.
+    /// Whether to keep to [`baud`](Self::baud) even if the line cannot carry it. Otherwise, the session streams at
+    /// 38,400 baud after two switches to 500,000 baud that the scanner acknowledged and that were followed by silence.
     pub keep_baud: bool,
     /// Measuring mode of a recording that does not contain it.
     pub mode: Option<Mode>,
 }
 
-/// The session with one scanner. If the scanner is replaced within a second by one that streams already, with the same number
-/// of values and the same address, the session does not notice.
+/// The session with one scanner. If the scanner is replaced within a second by one that streams already, with the same
+/// number of values and the same address, the session does not notice.
 #[derive(Clone, Debug)]
 pub struct Session {
     settings: Settings,
@@ -137,8 +137,8 @@ impl Session {
         // A line may have held back only the end of a telegram.
         let estimated = first.estimated || last.estimated;
         let due = period.and(self.due(&first, span.offset, len));
-        // A later read may show that bytes were older than their stamps. Those before them were older still, but their stamps
-        // are published.
+        // A later read may show that bytes were older than their stamps. Those before them were older still, but their
+        // stamps are published.
         first.at = due.unwrap_or(first.at).max(self.last_stamp);
         let last = match due.and(self.rhythm.duration()) {
             Some(usual) => (first.at + usual).min(last.latest.unwrap_or(last.at)),
@@ -184,15 +184,16 @@ impl Session {
         self.arrivals.stamp(open, self.baud().rate()).at
     }
 
-    /// Returns the time between two scans like `telegram`, which decodes to `reply`, if it is part of a stream with a known period.
+    /// Returns the time between two scans like `telegram`, which decodes to `reply`, if it is part of a stream with a
+    /// known period.
     fn period(&self, telegram: Telegram<'_>, reply: Option<&Reply<'_>>) -> Option<Nanos> {
         let Some(Reply::Measured(measured)) = reply.filter(|_| self.is_live()) else { return None };
         let variant = Variant::of_beams(measured.count()).filter(|_| measured.partial().is_none())?;
         Some(variant.period(telegram.bytes().len(), self.baud().rate()))
     }
 
-    /// Returns when the scan of `len` bytes at `offset` began, if it is part of a backlog of a host that did not run. The time follows
-    /// from its position in the backlog, limited by the time of the read.
+    /// Returns when the scan of `len` bytes at `offset` began, if it is part of a backlog of a host that did not run.
+    /// The time follows from its position in the backlog, limited by the time of the read.
     fn due(&self, first: &Stamp, offset: u64, len: u64) -> Option<Nanos> {
         let latest = first.latest?;
         let slots = (offset - self.last_scan + len / 2) / len;
@@ -313,7 +314,8 @@ impl line::Session for Session {
 
     fn defer_read(&mut self, now: Nanos, waiting: usize) -> bool {
         self.now = now;
-        // If the bytes of more than a revolution wait, the host did not run. Then the read has to find out since when they wait.
+        // If the bytes of more than a revolution wait, the host did not run. Then the read has to find out since when
+        // they wait.
         if (1..=BYTES_PER_TURN).contains(&waiting) && self.can_defer_read() {
             self.arrivals.sense(now, waiting);
             let begun = self.next_began();
@@ -345,11 +347,11 @@ impl line::Session for Session {
         self.baud().rate()
     }
 
-    /// The number of scans that the scanner must have sent follows from their period, after the first scan of each stream. A stream
-    /// ends when no scan arrives for a second, and when a request is sent. Nothing is due of a stream without a known period, of
-    /// partial scans, and of a recording. A loss is counted a second later. A scan that the scanner aborts to reply is not damage.
-    /// The session resynchronizes when no measured data arrive for a second, when the scanner reports power-on, and when a user
-    /// requests it.
+    /// The number of scans that the scanner must have sent follows from their period, after the first scan of each
+    /// stream. A stream ends when no scan arrives for a second, and when a request is sent. Nothing is due of a stream
+    /// without a known period, of partial scans, and of a recording. A loss is counted a second later. A scan that the
+    /// scanner aborts to reply is not damage. The session resynchronizes when no measured data arrive for a second,
+    /// when the scanner reports power-on, and when a user requests it.
     fn account(&self) -> Account {
         let tally = self.framer.tally();
         Account {
@@ -522,7 +524,8 @@ pub const FEATURES: family::Features = family::Features {
     max_telegram: MAX_TELEGRAM,
 };
 
-/// Returns the heads of scans with the view of `settings`. The measuring mode is unknown, and so is the unit if none is set.
+/// Returns the heads of scans with the view of `settings`. The measuring mode is unknown, and so is the unit if none is
+/// set.
 pub(crate) fn scan_heads(settings: &family::Settings) -> Vec<ScanHead> {
     let variant = typed(settings).variant;
     let units = settings.unit_mm.map_or(vec![Unit::Mm.mm(), Unit::Cm.mm()], |mm| vec![mm]);

@@ -1,5 +1,5 @@
-//! Sequences of requests: the steps that bring a scanner to the requested stream, and the questions to a scanner that streams
-//! already. Settings that a scanner does not have, or does not report right after a reset, are left out.
+//! Sequences of requests: the steps that bring a scanner to the requested stream, and the questions to a scanner that
+//! streams already. Settings that a scanner does not have, or does not report right after a reset, are left out.
 
 use schema::{MILLIS, Nanos};
 
@@ -9,8 +9,8 @@ use crate::lms::reply::Reply;
 use crate::lms::sensor::Sensor;
 use crate::lms::variant::{Baud, Variant};
 
-/// Step of a [`Start`], each a request. Between two changes of mode or rate, whose replies look alike, there is always another
-/// one. So a reply that is late, or arrives twice, is not taken for the next one's.
+/// Step of a [`Start`], each a request. Between two changes of mode or rate, whose replies look alike, there is always
+/// another one. So a reply that is late, or arrives twice, is not taken for the next one's.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Step {
     /// Ends a stream, or the installation mode.
@@ -24,8 +24,8 @@ pub(crate) enum Step {
     Stream,
 }
 
-/// Progress of a start: the scanner receives requests, and is brought to rest, to the rate to stream at, to its settings, and to a
-/// stream.
+/// Progress of a start: the scanner receives requests, and is brought to rest, to the rate to stream at, to its
+/// settings, and to a stream.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Start {
     step: Step,
@@ -81,8 +81,8 @@ impl Start {
         Start { step: Step::Check, ..self }
     }
 
-    /// Returns whether a scanner that refused to change its rate may be in a mode that does not allow it, because its status is
-    /// not known and it was not stopped.
+    /// Returns whether a scanner that refused to change its rate may be in a mode that does not allow it, because its
+    /// status is not known and it was not stopped.
     pub(crate) fn may_be_in_other_mode(&self) -> bool {
         !self.has_status && self.stops_left > STOPS
     }
@@ -116,9 +116,9 @@ impl Start {
     }
 }
 
-/// Questions to a scanner that streams: who it is, which may say at which angles it measures, and how its values are split,
-/// which two replies report. A reply costs the scan that it interrupts. After some rounds, only how values are split is
-/// requested, and rarely: without it there are no scans.
+/// Questions to a scanner that streams: who it is, which may say at which angles it measures, and how its values are
+/// split, which two replies report. A reply costs the scan that it interrupts. After some rounds, only how values are
+/// split is requested, and rarely: without it there are no scans.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Questions {
     /// The rest of this round.

@@ -1,7 +1,7 @@
 //! Finds responses and packets in a stream that may lack bytes, and the boot message of a scanner.
 //!
-//! A packet of one point has no checksum, and 1 in 70 wrong positions looks like one. So such packets are accepted after a run
-//! of them with angles near each other, and each only if another one follows it.
+//! A packet of one point has no checksum, and 1 in 70 wrong positions looks like one. So such packets are accepted
+//! after a run of them with angles near each other, and each only if another one follows it.
 
 use crate::line::framing::{Format, Verdict, judge};
 use crate::line::{Buffer, Tally, suspect};
@@ -175,14 +175,16 @@ impl Framer {
         self.buffer.taken(span.at, span.len)
     }
 
-    /// Shortens `span`, which [`Framer::advance`] returned last, to the first `packets` packets. The others will be returned once more.
+    /// Shortens `span`, which [`Framer::advance`] returned last, to the first `packets` packets. The others will be
+    /// returned once more.
     pub(crate) fn cut(&mut self, span: &mut Span, packets: usize) {
         let len = span.len / span.packets;
         self.buffer.give_back((span.packets - packets) * len, span.packets - packets);
         (span.len, span.packets) = (packets * len, packets);
     }
 
-    /// Returns how long the line must be idle until [`Framer::release`] releases a packet that is held back. `None` if there is none.
+    /// Returns how long the line must be idle until [`Framer::release`] releases a packet that is held back. `None` if
+    /// there is none.
     pub(crate) fn hold(&self) -> Option<Nanos> {
         self.is_held.then_some(HOLD)
     }
@@ -346,7 +348,8 @@ fn run(open: &[u8], most: usize) -> (usize, bool) {
 
 /// Capacity of a tty for a late reader, and two packets.
 const CAPACITY: usize = 4_096 + 2 * Kind::LONGEST;
-/// After this time without a byte, no more bytes are in flight: in the slowest stream, an adapter passes on a packet every 6 ms.
+/// After this time without a byte, no more bytes are in flight: in the slowest stream, an adapter passes on a packet
+/// every 6 ms.
 const HOLD: Nanos = 10 * MILLIS;
 /// Minimum number of packets of one point in a run. A wrong position has as many once in millions.
 const RUN: usize = 6;

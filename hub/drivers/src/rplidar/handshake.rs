@@ -1,5 +1,5 @@
-//! The handshake with a scanner: the queries in their order, what the scanner has reported, and the scan mode that follows from
-//! it. [`Handshake`] decides which step comes next; the session carries it out, and waits for responses.
+//! The handshake with a scanner: the queries in their order, what the scanner has reported, and the scan mode that
+//! follows from it. [`Handshake`] decides which step comes next; the session carries it out, and waits for responses.
 
 use crate::rplidar::device_info::{Health, Info};
 use crate::rplidar::model::{Mode, Model, Motor};
@@ -7,8 +7,8 @@ use crate::rplidar::packet::Kind;
 use crate::rplidar::request::{Answer, Request, key};
 use crate::rplidar::session::Settings;
 
-/// A request whose response the session waits for, in the order of the handshake. Those about a mode contain its place in the
-/// list of modes.
+/// A request whose response the session waits for, in the order of the handshake. Those about a mode contain its place
+/// in the list of modes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Query {
     Info,
@@ -49,8 +49,8 @@ impl Query {
         }
     }
 
-    /// Returns the contents of a response if `answer` and its `data` belong to this query. A response about a key begins with
-    /// that key.
+    /// Returns the contents of a response if `answer` and its `data` belong to this query. A response about a key
+    /// begins with that key.
     fn contents(self, answer: Answer, data: &[u8]) -> Option<&[u8]> {
         let (expected, key) = match self {
             Query::Info => (Answer::Info, None),
@@ -161,8 +161,8 @@ impl Handshake {
         self.unavailable_mode
     }
 
-    /// Returns the kind of packets that look like both express and dense ones if no response has named it: the fastest kind of
-    /// the model.
+    /// Returns the kind of packets that look like both express and dense ones if no response has named it: the fastest
+    /// kind of the model.
     pub(crate) fn alike(&self) -> Option<Kind> {
         match (self.settings.mode, self.model()) {
             (Some(Mode::DenseBoost), _) => Some(Kind::Dense),
@@ -185,8 +185,8 @@ impl Handshake {
         self.info.map_or(Motor::Dtr, |info| info.motor())
     }
 
-    /// Handles a response with the contents `data`, while the response to `query` is expected, on a line of `baud` bits per
-    /// second. It may belong to an earlier query.
+    /// Handles a response with the contents `data`, while the response to `query` is expected, on a line of `baud` bits
+    /// per second. It may belong to an earlier query.
     pub(crate) fn answered(&mut self, query: Option<Query>, answer: Answer, data: &[u8], baud: u32) -> Next {
         if answer == Answer::Info {
             self.info = Info::parse(data);
@@ -312,8 +312,8 @@ impl Handshake {
         wanted.or_else(fastest).unwrap_or_default()
     }
 
-    /// Infers the query from a response in a recording: a program lists the modes in their order, and the keys of each mode
-    /// in ascending order.
+    /// Infers the query from a response in a recording: a program lists the modes in their order, and the keys of each
+    /// mode in ascending order.
     fn infer_query(&mut self, answer: Answer, data: &[u8]) -> Query {
         let key = match answer {
             Answer::Info => return Query::Info,
@@ -408,8 +408,8 @@ impl ScanModes {
         modes
     }
 
-    /// Returns the offered mode that is `mode`, if a line of `baud` bits per second can carry it. `None` for `baud`: the line
-    /// has no rate.
+    /// Returns the offered mode that is `mode`, if a line of `baud` bits per second can carry it. `None` for `baud`:
+    /// the line has no rate.
     fn wanted(&self, mode: Mode, baud: Option<u32>) -> Option<ScanMode> {
         let kind = match mode {
             Mode::Standard => Some(Kind::Standard),
@@ -422,8 +422,8 @@ impl ScanModes {
         named.or_else(|| self.possible(baud).find(|offered| kind.is_some() && offered.kind == kind))
     }
 
-    /// Returns the fastest mode that the line can carry. Among equally fast ones, it prefers those with a checksum, then the
-    /// recommended one.
+    /// Returns the fastest mode that the line can carry. Among equally fast ones, it prefers those with a checksum,
+    /// then the recommended one.
     fn fastest(&self, baud: Option<u32>) -> Option<ScanMode> {
         self.possible(baud).min_by(|a, b| {
             let of = |mode: &ScanMode| mode.sample_us.unwrap_or(f32::MAX);
@@ -435,8 +435,8 @@ impl ScanModes {
         })
     }
 
-    /// Returns the microseconds from one point to the next for packets of `kind`: in `mode` if it has such packets, otherwise
-    /// in the fastest mode that has.
+    /// Returns the microseconds from one point to the next for packets of `kind`: in `mode` if it has such packets,
+    /// otherwise in the fastest mode that has.
     pub(crate) fn sample_us(&self, kind: Kind, mode: Option<Mode>) -> Option<f32> {
         let of_kind = || self.of_kind(kind);
         let named = of_kind().filter(|(named, _)| mode.is_some() && *named == mode).map(|(_, us)| us);

@@ -1,7 +1,7 @@
 //! The rate of the line, and the search for it: one rate after the other, until the scanner responds.
 //!
-//! A scanner that lost its power is soon back at the rate of its last stream, and sends a boot message there. So that rate is
-//! remembered.
+//! A scanner that lost its power is soon back at the rate of its last stream, and sends a boot message there. So that
+//! rate is remembered.
 
 use schema::{MILLIS, Nanos};
 
@@ -58,8 +58,8 @@ impl RateSearch {
         self.quiet_since = None;
     }
 
-    /// Tries the next rate, because no response arrived. `read` is the number of bytes read so far. Returns since when no
-    /// response has arrived.
+    /// Tries the next rate, because no response arrived. `read` is the number of bytes read so far. Returns since when
+    /// no response has arrived.
     pub(crate) fn advance(&mut self, now: Nanos, read: u64) -> Nanos {
         let (since, read_before) = *self.quiet_since.get_or_insert((now, read));
         // Stay at the rate of the last stream for a while, so that the boot message is received.
@@ -71,8 +71,9 @@ impl RateSearch {
         since
     }
 
-    /// Returns whether the search is young. During this time, a scanner that streams on after the stop request is not asked at
-    /// this rate, because at the right rate it would have stopped. Later a request is sent, because the line may never be quiet.
+    /// Returns whether the search is young. During this time, a scanner that streams on after the stop request is not
+    /// asked at this rate, because at the right rate it would have stopped. Later a request is sent, because the line
+    /// may never be quiet.
     pub(crate) fn is_quick(&self, now: Nanos) -> bool {
         self.quiet_since.is_none_or(|(since, _)| now < since + ROUNDS) && self.next().is_some()
     }

@@ -1,7 +1,7 @@
 //! Position of a packet in its stream: the next one, one after a gap, or an outlier.
 //!
-//! Packets have no counter. But a head rotates evenly, so the angle from packet to packet is known. The number of missing packets
-//! follows from the angle of the gap, and the number of missing revolutions from the time.
+//! Packets have no counter. But a head rotates evenly, so the angle from packet to packet is known. The number of
+//! missing packets follows from the angle of the gap, and the number of missing revolutions from the time.
 
 /// The packets of one stream: of several points each, or of one.
 #[derive(Clone, Copy, Debug)]
@@ -111,8 +111,8 @@ impl Sequence {
         (self.lessons >= LESSONS && self.advance > STILL).then_some(self.advance)
     }
 
-    /// Places a packet of several points. `late` returns the nanoseconds by which it arrived later than usual if its first point was
-    /// measured at the given time. Its second argument is whether there is a gap before.
+    /// Places a packet of several points. `late` returns the nanoseconds by which it arrived later than usual if its
+    /// first point was measured at the given time. Its second argument is whether there is a gap before.
     pub(crate) fn place(&mut self, came: Came, late: impl Fn(f64, bool) -> f64) -> Place {
         self.came += 1;
         let Some(last) = self.last else { return self.first(came.start) };
@@ -161,7 +161,8 @@ impl Sequence {
         let angle = clockwise(last.start, came.start);
         let angle = if angle > 360.0 - BACK { angle - 360.0 } else { angle };
         self.is_whole &= came.adjoins();
-        // The skipped bytes may be points that lost bytes or had additional ones, but not if they took less time than points.
+        // The skipped bytes may be points that lost bytes or had additional ones, but not if they took less time than
+        // points.
         let points = f64::from(1 + (came.skipped + 3) / POINT);
         let early = if came.adjoins() { 0.0 } else { -late(last.time + points * came.packet_ns, false) };
         let points = f64::from((points - early.max(0.0) / came.packet_ns).max(1.0) as u32);
@@ -286,7 +287,8 @@ impl Turn {
         f64::from((late.max(0.0) / self.time(360.0) + 0.5) as u32)
     }
 
-    /// Returns whether a packet `angle` degrees after the last one arrived before it was measured. The clocks differ by little.
+    /// Returns whether a packet `angle` degrees after the last one arrived before it was measured. The clocks differ by
+    /// little.
     fn is_early(self, late: f64, angle: f64) -> bool {
         late < -(EARLY + MOST_DRIFT * self.time(angle))
     }
@@ -310,7 +312,8 @@ const BEGIN: f64 = 1e10;
 /// Degrees by which a point may be before the previous one, and after it without a gap.
 const BACK: f64 = 25.0;
 const AHEAD: f64 = 25.0;
-/// Nanoseconds by which a packet may be early, and share of the time since the last packet by which two clocks may differ.
+/// Nanoseconds by which a packet may be early, and share of the time since the last packet by which two clocks may
+/// differ.
 const EARLY: f64 = 3e6;
 const MOST_DRIFT: f64 = 0.02;
 /// Length of a packet of one point, in bytes.

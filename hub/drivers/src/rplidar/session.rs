@@ -1,5 +1,5 @@
-//! The session with an RPLIDAR: it requests the identity of the scanner, starts a scan mode, and returns packets as they arrive,
-//! and revolutions.
+//! The session with an RPLIDAR: it requests the identity of the scanner, starts a scan mode, and returns packets as
+//! they arrive, and revolutions.
 //!
 //! A stream that another program left running is stopped, never continued: express and dense packets look alike, and a
 //! scanner that measures answers no request.
@@ -33,15 +33,15 @@ pub struct Settings {
     pub beams: Option<usize>,
     /// Maximum number of beams. `None`: the maximum of a grid.
     pub max_beams: Option<usize>,
-    /// Whether the port has one fixed rate and bytes do not arrive at the pace of a line, as with a serial server on the
-    /// network or a recording.
+    /// Whether the port has one fixed rate and bytes do not arrive at the pace of a line, as with a serial server on
+    /// the network or a recording.
     pub fixed_rate: bool,
     /// Whether nothing can be sent, because the bytes are from a recording.
     pub listen_only: bool,
     /// Whether the motor stops while there are no subscribers.
     pub stop_when_idle: bool,
-    /// Whether a scanner whose model is not configured has as many beams as it reports points per revolution. Otherwise, it has
-    /// those of its model.
+    /// Whether a scanner whose model is not configured has as many beams as it reports points per revolution.
+    /// Otherwise, it has those of its model.
     pub reported_beams: bool,
 }
 
@@ -258,8 +258,8 @@ impl Session {
 
     /// Handles that no response to `query` arrived.
     fn unanswered(&mut self, query: Query, attempts: u8) {
-        // Bytes arrived, but no valid response. The response may have been damaged, so do not conclude that the request is
-        // unsupported.
+        // Bytes arrived, but no valid response. The response may have been damaged, so do not conclude that the request
+        // is unsupported.
         let is_damaged =
             self.reads.last_byte() + self.response_timeout() > self.now && attempts < MAX_ATTEMPTS;
         match query {
@@ -335,8 +335,8 @@ impl Session {
                 }
             }
             Phase::Booting { .. } => self.phase = Phase::Booting { until: self.now + SETTLE },
-            // The rest of a packet may be text too, but a scanner that boots pauses before its boot message. A name proves it even
-            // after other bytes, which a scanner sends while its supply drops.
+            // The rest of a packet may be text too, but a scanner that boots pauses before its boot message. A name
+            // proves it even after other bytes, which a scanner sends while its supply drops.
             Phase::Streaming(watchdog)
                 if !is_named
                     && (watchdog.silent_at().abs_diff(self.now + Watchdog::SILENCE) < BOOT_SILENCE

@@ -1,5 +1,5 @@
-//! Packets of a stream: gives them stamps, and assembles their points into revolutions. The points of a packet with several
-//! points are known once the next packet has arrived, and only if nothing is missing between the two.
+//! Packets of a stream: gives them stamps, and assembles their points into revolutions. The points of a packet with
+//! several points are known once the next packet has arrived, and only if nothing is missing between the two.
 
 use crate::line::{self, Arrivals, Closed, Flow, Pace, RawScan, Reads, SensorClock, TurnCounts, Turns};
 use schema::{Family, MILLIS, Nanos, line_time};
@@ -100,7 +100,8 @@ impl Stream {
         ((1e7 / packet_ns) as usize).clamp(1, (MAX_SAMPLE_LEN / kind.bytes()).min(MAX_PACKETS))
     }
 
-    /// Measures the time per point with the packets of `span`, if the scanner has not reported it. Returns whether it is known.
+    /// Measures the time per point with the packets of `span`, if the scanner has not reported it. Returns whether it
+    /// is known.
     pub(crate) fn measure(&mut self, kind: Kind, span: Span, line: Line<'_>, modes: &ScanModes) -> bool {
         let time = &mut self.point_time;
         if self.settings.listen_only || time.ns.is_none() || time.measurement.is_some() {
@@ -117,9 +118,9 @@ impl Stream {
         self.point_time.ns.is_some()
     }
 
-    /// Places the packets of `span` in the sequence, and keeps them for [`advance`](Self::advance). Packets after a gap are given
-    /// back to the framer, so that they arrive once more by themselves. Returns the stamps of the first point of the first packet
-    /// and of the last point of the last packet, if they are known.
+    /// Places the packets of `span` in the sequence, and keeps them for [`advance`](Self::advance). Packets after a gap
+    /// are given back to the framer, so that they arrive once more by themselves. Returns the stamps of the first point
+    /// of the first packet and of the last point of the last packet, if they are known.
     pub(crate) fn place(
         &mut self,
         kind: Kind,
@@ -216,8 +217,8 @@ impl Stream {
         self.revolutions.begin(beams);
     }
 
-    /// Returns the number of beams for the points per second that the scanner has reported, if the beams follow it: that of the
-    /// `model`, if it is close. An A1 with an old firmware measures half as many points as the others.
+    /// Returns the number of beams for the points per second that the scanner has reported, if the beams follow it:
+    /// that of the `model`, if it is close. An A1 with an old firmware measures half as many points as the others.
     fn reported_beams(&self, model: Model, kind: Kind, handshake: &Handshake) -> Option<usize> {
         let follows = self.settings.reported_beams && self.settings.model.is_none();
         let point_us = self.point_time.ns.filter(|_| follows)? / 1e3;
@@ -284,9 +285,9 @@ impl Measurement {
 }
 
 impl PointTime {
-    /// Measures with the packets of `span`, whose last one arrived at `at`. Among the reported times of modes with packets of
-    /// `kind`, the nearest one counts. Without any, the measured time counts, and is measured again over longer and longer
-    /// durations. Returns the relative change of a time that was known.
+    /// Measures with the packets of `span`, whose last one arrived at `at`. Among the reported times of modes with
+    /// packets of `kind`, the nearest one counts. Without any, the measured time counts, and is measured again over
+    /// longer and longer durations. Returns the relative change of a time that was known.
     fn measure(&mut self, kind: Kind, span: Span, at: Nanos, modes: &ScanModes, settings: Settings) -> f64 {
         let Some(measurement) = &mut self.measurement else {
             self.ns = modes.sample_us(kind, settings.mode).map(|us| f64::from(us) * 1e3);
@@ -381,7 +382,8 @@ impl Revolutions {
         (self.current, self.pending) = (None, None);
     }
 
-    /// Adds the points of the current packets, of a head with the speed `pace`. Returns the first revolution that is complete.
+    /// Adds the points of the current packets, of a head with the speed `pace`. Returns the first revolution that is
+    /// complete.
     fn advance(&mut self, framer: &Framer, pace: Option<Pace>) -> Option<Closed> {
         while let Some(Current { kind, span, packet, is_put }) = self.current {
             let place = self.places.get(packet).copied().filter(|_| packet < span.packets);

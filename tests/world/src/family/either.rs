@@ -1,5 +1,5 @@
-//! Two rotating scanners of different families that take turns at one port: an exchange connects the other scanner. Packets of an
-//! LDROBOT are recognized by their header; all other bytes belong to the other family.
+//! Two rotating scanners of different families that take turns at one port: an exchange connects the other scanner.
+//! Packets of an LDROBOT are recognized by their header; all other bytes belong to the other family.
 
 use std::rc::Rc;
 

@@ -1,5 +1,5 @@
-//! LDROBOT: a head that turns and tells of what it measures in packets, unasked. What it measures has no noise, so that each
-//! point that is told can be found among those that are true.
+//! LDROBOT: a head that turns and tells of what it measures in packets, unasked. What it measures has no noise, so that
+//! each point that is told can be found among those that are true.
 
 use std::rc::Rc;
 
@@ -139,9 +139,9 @@ impl Scanner for AtLine {
         &mut self.head
     }
 
-    /// Does nothing. Its clock begins again, and where that shows the time that a clock which continued would show, no session
-    /// can distinguish a restart from a stall: stamps are then off until the next revolutions. The session's own tests cover
-    /// restarts.
+    /// Does nothing. Its clock begins again, and where that shows the time that a clock which continued would show, no
+    /// session can distinguish a restart from a stall: stamps are then off until the next revolutions. The session's
+    /// own tests cover restarts.
     fn brown_out(&mut self, _: Nanos) {}
 
     /// It gets its power then.

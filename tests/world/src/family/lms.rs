@@ -1,4 +1,5 @@
-//! SICK LMS 2xx: found at any rate and in any state, asked for any variant. Its scans were measured once for all worlds.
+//! SICK LMS 2xx: found at any rate and in any state, asked for any variant. Its scans were measured once for all
+//! worlds.
 
 use std::rc::Rc;
 use std::sync::{Arc, LazyLock, Mutex, PoisonError};

@@ -1,6 +1,6 @@
 //! Slamtec RPLIDAR: a scanner that is asked and told to measure, in one of several modes whose packets differ. What it
-//! measures has no noise, so that each point that is told can be found among those that are true. It has no EEPROM; what it
-//! would keep is changed by one request only, and each of these counts as a write.
+//! measures has no noise, so that each point that is told can be found among those that are true. It has no EEPROM;
+//! what it would keep is changed by one request only, and each of these counts as a write.
 
 use std::rc::Rc;
 
@@ -58,8 +58,8 @@ impl Rplidar {
         Rplidar { settings, family: "rplidar", is_off: false, is_said, mode: None, beams: None }
     }
 
-    /// The one that is written `MODEL`, `MODEL:MODE` or `MODEL:MODE:STATE`; without a mode it is the fastest, and without a
-    /// state it is idle.
+    /// The one that is written `MODEL`, `MODEL:MODE` or `MODEL:MODE:STATE`; without a mode it is the fastest, and
+    /// without a state it is idle.
     pub(super) fn named(text: &str, random: &mut fastrand::Rng) -> Option<Rplidar> {
         let mut words = text.split(':');
         let (model, mode, state) = (words.next()?, words.next(), words.next());
@@ -348,5 +348,6 @@ const DRAWN: [Model; 13] = [
     Model::S2,
     Model::S3,
 ];
-/// A head is ten degrees and two packets behind the end of a turn before it is over, and the last packet is on the line.
+/// A head is ten degrees and two packets behind the end of a turn before it is over, and the last packet is on the
+/// line.
 const BEHIND: Nanos = 90 * MILLIS;

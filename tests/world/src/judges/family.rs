@@ -1,6 +1,6 @@
-//! A sample has the family of the scanner. At a link without a family, what is published before the scanner is found has none:
-//! never a telegram or a scan, and a status only while the hub searches or has no port. No byte is sent to an LDROBOT that
-//! streams undisturbed.
+//! A sample has the family of the scanner. At a link without a family, what is published before the scanner is found
+//! has none: never a telegram or a scan, and a status only while the hub searches or has no port. No byte is sent to an
+//! LDROBOT that streams undisturbed.
 
 use std::rc::Rc;
 
@@ -73,7 +73,8 @@ impl Judge for OfSensors {
 }
 
 impl OfSensor {
-    /// Returns whether an LDROBOT has been streaming since the port was opened, or for longer than a search needs to notice.
+    /// Returns whether an LDROBOT has been streaming since the port was opened, or for longer than a search needs to
+    /// notice.
     fn is_undisturbed(&self, at: Nanos) -> bool {
         // A scanner of another family may be remembered, whose rates are tried first.
         let is_known = self.families == [FamilyName::Ld];

@@ -1,6 +1,6 @@
-//! When nothing goes wrong any more, everything comes back soon: each link says that it streams, and publishes measured values;
-//! and scans, as soon as the sensor has told how its values are split. One that did not tell is asked again now and then. The
-//! search for a scanner of another family begins after ten seconds without data.
+//! When nothing goes wrong any more, everything comes back soon: each link says that it streams, and publishes measured
+//! values; and scans, as soon as the sensor has told how its values are split. One that did not tell is asked again now
+//! and then. The search for a scanner of another family begins after ten seconds without data.
 
 use std::rc::Rc;
 
@@ -114,9 +114,9 @@ impl Judge for Liveness {
     }
 }
 
-/// So soon: after a second of silence a sensor is sought that may be at another rate, for some 2.4 s (`docs/measured.md`); one
-/// whose last word was damaged, just before everything was well, is asked again for up to 3 s first. One that streams and
-/// does not tell how is asked every ten seconds.
+/// So soon: after a second of silence a sensor is sought that may be at another rate, for some 2.4 s
+/// (`docs/measured.md`); one whose last word was damaged, just before everything was well, is asked again for up to 3 s
+/// first. One that streams and does not tell how is asked every ten seconds.
 const SOON: [Nanos; 2] = [5_500 * MILLIS, 11_000 * MILLIS];
 /// Time after which the search begins again because nothing of the scanner arrives.
 const LOST_AFTER: Nanos = 10_000 * MILLIS;

@@ -1,5 +1,5 @@
-//! The judges: each watches everything that happens for one promise, and says when it is broken. None knows another, nor what a
-//! plan wants.
+//! The judges: each watches everything that happens for one promise, and says when it is broken. None knows another,
+//! nor what a plan wants.
 
 mod accounts;
 mod bytes;

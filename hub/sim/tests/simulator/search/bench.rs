@@ -1,5 +1,5 @@
-//! A search and a simulated scanner at the two ends of a line, in virtual time. If port and scanner have different rates, bytes
-//! are garbled in both directions.
+//! A search and a simulated scanner at the two ends of a line, in virtual time. If port and scanner have different
+//! rates, bytes are garbled in both directions.
 
 use std::collections::VecDeque;
 
@@ -178,8 +178,8 @@ impl Bench {
 }
 
 impl<S: line::Session> Bench<Named<S>> {
-    /// Opens a serial port for a session of a named family, which `begin` creates. Returns the time until something of the
-    /// scanner arrives.
+    /// Opens a serial port for a session of a named family, which `begin` creates. Returns the time until something of
+    /// the scanner arrives.
     pub(crate) fn named(begin: impl FnOnce(Nanos) -> S, device: Box<dyn Device>, seed: u64) -> Nanos {
         let mut rate = 0;
         let begin = |now| {

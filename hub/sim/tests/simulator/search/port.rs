@@ -1,5 +1,5 @@
-//! A session on a port without a configured family: scans arrive soon, no byte is lost on the way from the search to the session,
-//! and the search begins again after the scanner was unplugged.
+//! A session on a port without a configured family: scans arrive soon, no byte is lost on the way from the search to
+//! the session, and the search begins again after the scanner was unplugged.
 
 use scanhub_drivers::line::{self, Account, Protocol, Session as _, State};
 use scanhub_drivers::lms::variant::Baud;
