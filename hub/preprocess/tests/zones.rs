@@ -267,14 +267,14 @@ fn after_an_invalid_scan_the_verdict_is_not_clear_before_it_is_proven() {
     let mut check = Check::new(Pose::default(), &settings, 181);
     let head = ScanHead::lms(181, -90_000, 1000, 1, 13);
     let scan = |range: u16| Scan::of(head, &[range; 181]);
-    let (near, far, invalid) = (scan(300), scan(4000), scan(head.no_return - 1));
-    let mut verdict = |scan: &Box<Scan>| {
+    let scans = [scan(300), scan(4000), scan(head.no_return - 1)];
+    let [near, far, invalid]: [&Scan; 3] = scans.each_ref().map(|scan| &**scan);
+    let mut verdict = |scan: &Scan| {
         let mut out = dirty();
         check.update(scan, &mut out);
         out.verdict()
     };
-    let verdicts =
-        [&near, &near, &invalid, &near, &near, &far, &invalid, &far, &far].map(|scan| verdict(scan));
+    let verdicts = [near, near, invalid, near, near, far, invalid, far, far].map(&mut verdict);
     let [unknown, stop, clear] = [Verdict::Unknown, Verdict::Stop, Verdict::Clear];
     assert_eq!(verdicts, [unknown, stop, unknown, unknown, stop, clear, unknown, unknown, clear]);
 }
