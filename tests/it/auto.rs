@@ -5,6 +5,7 @@ use std::fs;
 
 use serde_json::Value;
 
+use crate::replay_packets::recorder;
 use crate::testkit::{INT, KILL, Program, TERM, TestEnv, is_class, sequence};
 
 const LMS: &[&str] = &["--seed=17", "--world=room"];
@@ -77,6 +78,28 @@ fn another_scanner_at_the_port_is_named_and_sequence_numbers_continue() {
     sequence(&consumer.end(INT).of_class("scan"), "topic_seq");
     let outcome = hub.end(TERM);
     assert!(outcome.errors.contains("front: was ld19, is now a1"), "{}", outcome.errors);
+}
+
+#[test]
+fn a_recording_is_played_with_the_beams_that_were_recorded_and_telegrams_of_another_family_are_counted() {
+    let env = TestEnv::new();
+    let first = env.simulator(&["front"], A1);
+    let live = hub(&env);
+    let recorder = recorder(&env, "swap.mcap", &["front/telegram", "front/scan", "front/status"]);
+    let mut scans = env.echo(&["front/scan"]);
+    let of = |family: &'static str| move |line: &Value| is_class("scan")(line) && line["family"] == family;
+    scans.await_lines(5, "a scan of the first one", of("rplidar"));
+    env.kill_simulator(first, "front");
+    let _second = env.simulator(&["front"], LD19);
+    scans.await_lines(5, "a scan of the second one", of("ld"));
+    assert_eq!([recorder.end(INT).code, scans.end(INT).code, live.end(TERM).code], [Some(0); 3]);
+
+    let played = env.hub(&[format!("--link=front=file:{}", env.word("swap.mcap"))]);
+    let scan = env.echo(&["front/scan"]).await_line("a scan", is_class("scan"));
+    assert_eq!((text(&scan, "family"), &scan["count"]), ("rplidar", &1079.into()));
+    env.await_info("front", |info| info["state"] == "silent");
+    let log = played.end(TERM).errors;
+    assert!(log.contains("telegrams are of a scanner of another family"), "{log}");
 }
 
 #[test]

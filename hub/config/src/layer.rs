@@ -65,6 +65,20 @@ struct LinkLayer {
     early: Option<EarlyLayer>,
 }
 
+impl Layer {
+    /// Refuses a link of a flag that an earlier flag has defined, and adds the names of the others to `names`.
+    pub(crate) fn check_names(&self, origin: &Origin, names: &mut Vec<String>) -> Result<(), Failure> {
+        for LinkLayer { name, .. } in &self.link {
+            if names.contains(name.get_ref()) {
+                let what = format!("a second link {}", name.get_ref());
+                return Err(origin.refuse(Some(name.span()), what, "give each link its own name"));
+            }
+            names.push(name.get_ref().clone());
+        }
+        Ok(())
+    }
+}
+
 /// All links while sources are merged.
 #[derive(Default)]
 pub(crate) struct Drafts {

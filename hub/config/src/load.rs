@@ -17,8 +17,14 @@ impl Config {
     /// opened.
     pub fn load(sources: &Sources) -> Result<Config, Failure> {
         let mut drafts = Drafts::default();
-        for layer in sources.files().chain(sources.links()) {
+        for layer in sources.files() {
             let (origin, layer) = layer?;
+            drafts.merge(layer, origin, true)?;
+        }
+        let mut names = Vec::new();
+        for layer in sources.links() {
+            let (origin, layer) = layer?;
+            layer.check_names(&origin, &mut names)?;
             drafts.merge(layer, origin, true)?;
         }
         let settings = sources.settings().collect::<Result<Vec<_>, _>>()?;
@@ -115,6 +121,9 @@ mod tests {
         let config = Config::load(&sources(&[], &[])).unwrap();
         let names: Vec<_> = config.links.iter().map(|link| (link.name.as_str(), link.port.name())).collect();
         assert_eq!(names, [("front", "/dev/ttyUSB0".to_owned()), ("rear", "/dev/ttyUSB1".to_owned())]);
+        let second = ["front=/dev/x", "rear=/dev/y", "front=/dev/z,model=ld19"];
+        let second = refusal(&[], &second);
+        assert!(second.starts_with("--link front=/dev/z,model=ld19: a second link front"), "{second}");
         let link = &config.links[0];
         assert_eq!((link.family(), link.scanner.settings.view, link.rate()), (None, None, 230_400));
     }

@@ -175,7 +175,12 @@ fn configuration(sources: &Sources, sensors: &[Sensor], file: &Path) -> Result<C
 fn with_links(sources: &Sources, sensors: &[Sensor]) -> Result<(Sources, Vec<String>), Failure> {
     let mut sources = sources.clone();
     // Not the path itself, which may have signs that have a meaning in a port's name.
-    sources.links.extend(sensors.iter().map(|sensor| format!("{}=file:recording", sensor.link)));
+    for sensor in sensors {
+        let name = format!("{}=", sensor.link);
+        if !sources.links.iter().any(|link| link.starts_with(&name)) {
+            sources.links.push(format!("{name}file:recording"));
+        }
+    }
     let links = Config::load(&sources)?.links;
     let is_searched =
         |sensor: &&Sensor| links.iter().any(|link| link.name == sensor.link && link.family().is_none());

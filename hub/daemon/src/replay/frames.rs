@@ -6,8 +6,8 @@
 //! them.
 
 use recording::{Frame, VirtualTime};
+use scanhub_drivers::PortSession;
 use scanhub_drivers::line::{Event, RawScan, Received, Session as _, suspect};
-use scanhub_drivers::{PortSession, Settings};
 use schema::{Flags, Header, MILLIS, Nanos, State};
 
 use super::recorded::Frames;
@@ -39,7 +39,12 @@ pub(super) fn play(replay: &mut ReplayLink<'_, '_>, frames: &Frames) -> Option<O
         limit: None,
         state: if frames.is_whole { State::Streaming } else { State::Starting },
     };
+    let mut foreign = 0_u64;
     while let Some(frame) = read.next() {
+        if frame.header.is_some_and(|header| header.family != frames.family as u8) {
+            foreign += 1;
+            continue;
+        }
         let media = timeline.media(&frame);
         if play.end_ns.is_some_and(|end_ns| media >= end_ns) {
             break;
@@ -55,6 +60,13 @@ pub(super) fn play(replay: &mut ReplayLink<'_, '_>, frames: &Frames) -> Option<O
         if !frames.has_stamps() && frame.is_scan() {
             timeline.pass(frames.period(beams));
         }
+    }
+    if foreign > 0 {
+        tracing::warn!(
+            "{}: {foreign} telegrams are of a scanner of another family, and are not played: only those of family {} are",
+            replay.link.link.name,
+            frames.family.name()
+        );
     }
     if let Some(session) = lap.shown_session() {
         replay.link.stats.close(session);
@@ -145,9 +157,7 @@ impl Lap<'_> {
         }
         self.session.get_or_insert_with(|| {
             let link = replay.link.link;
-            let mode_number = self.frames.first_mode().map(|mode| mode.0);
-            let is_found = link.family().is_none() || link.settings().is_found;
-            let settings = Settings { mode_number, is_found, ..link.settings() };
+            let settings = self.frames.settings(link);
             let session = PortSession::begin(Some(self.frames.family), &settings, None, when.first);
             VirtualTime::new(session, when.first)
         });

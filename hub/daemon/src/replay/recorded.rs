@@ -6,8 +6,8 @@ use std::path::Path;
 
 use config::Link;
 use recording::{Encoding, Form, Frame, Recording};
-use scanhub_drivers::features;
 use scanhub_drivers::lms::variant::{Mode, Unit};
+use scanhub_drivers::{Settings, features};
 use schema::{Failure, Family, Header, Kind, Nanos};
 
 use super::LONGEST_GAP;
@@ -206,9 +206,18 @@ impl Frames {
         self.recording.telegrams(self.encoding)
     }
 
-    /// How values are split, as it is known at the beginning.
-    pub(super) fn first_mode(&self) -> Option<Mode> {
-        self.mode.filter(|_| !self.is_told_later)
+    /// Returns the settings of a session that reads it for `link`. What is not configured is as it was recorded.
+    pub(super) fn settings(&self, link: &Link) -> Settings {
+        let mode_number = self.mode.filter(|_| !self.is_told_later).map(|mode| mode.0);
+        let is_found = link.family().is_none() || link.settings().is_found;
+        let mut settings = Settings { mode_number, is_found, ..link.settings() };
+        if !self.is_whole && link.scanner.is_auto() {
+            let model = self.recording.model().ok().flatten();
+            settings.model = settings.model.or(model.map(|model| model.name));
+            settings.mode = settings.mode.or(self.recording.contents().way);
+            settings.beams = settings.beams.or(self.recording.beams());
+        }
+        settings
     }
 
     /// Number of the first telegram whose values the hub could read, in the life that begins with that of `header`.
