@@ -118,8 +118,8 @@ impl TestEnv {
         format!("--link={name}={}", self.word(name))
     }
 
-    /// As [`link`](Self::link), with an LMS. A hub that searches for the scanner would also send requests of the
-    /// search.
+    /// Returns the flag for a link with `family = "lms"`. A hub that searches for the scanner would also send requests
+    /// of the search.
     pub(crate) fn lms_link(&self, name: &str) -> String {
         format!("{},family=lms", self.link(name))
     }

@@ -13,8 +13,10 @@ use crate::sources::Sources;
 impl Config {
     /// Reads all sources.
     ///
-    /// [`schema::Kind::Configuration`] with place, value and remedy; also without any link: only named ports are
-    /// opened.
+    /// # Errors
+    ///
+    /// Returns [`schema::Kind::Configuration`] with place, value and remedy if a value is not valid, or if there is no
+    /// link.
     pub fn load(sources: &Sources) -> Result<Config, Failure> {
         let mut drafts = Drafts::default();
         for layer in sources.files() {

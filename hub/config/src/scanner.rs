@@ -72,7 +72,8 @@ impl Scanner {
     /// Returns the settings of a session at `port`. `listen_only` is whether nothing may be sent.
     pub fn settings_at(&self, port: &Source, listen_only: bool) -> Settings {
         let fixed_rate = !matches!(port, Source::Tty(_));
-        Settings { max_beams: Some(self.max_beams()), fixed_rate, listen_only, ..self.settings }
+        let is_found = self.family.is_none() || self.settings.is_found;
+        Settings { max_beams: Some(self.max_beams()), fixed_rate, listen_only, is_found, ..self.settings }
     }
 }
 

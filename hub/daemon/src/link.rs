@@ -1,6 +1,5 @@
-//! What a link has, whatever its other end is: where its results go, what it reports of itself, what users ask of it,
-//! and when it has to do something although nothing came. Refuses to know where bytes come from, and how a wait is
-//! done.
+//! The parts of a link that do not depend on where its bytes come from: its topics, status, diagnosis and requests of
+//! users, and the times at which it has to publish although no bytes have arrived.
 
 use config::{Link, Processing};
 use scanhub_drivers::line::{Control, RawScan, Received, Session as _};
@@ -127,8 +126,8 @@ impl<'a, S: Surroundings> LinkCore<'a, S> {
         now >= self.next_status.min(self.next_greeting)
     }
 
-    /// Publishes the status if it changed or is due, and greets late joiners; `error` is what is wrong, in words.
-    /// Whether a status went out.
+    /// Publishes the status if it has changed or is due, and sends late joiners what they missed. `error` is the message
+    /// of the status. Returns whether a status was published.
     pub(crate) fn show(&mut self, session: Option<&PortSession>, state: State, error: &str) -> bool {
         let now = self.around.now();
         let changed = update(&mut self.stats, self.link, state, error, now);
@@ -190,9 +189,9 @@ impl<'a, S: Surroundings> LinkCore<'a, S> {
         }
     }
 
-    /// Publishes what is due before a wait `until`; until when to wait instead, because something of the link's own is
-    /// due earlier. Some drivers wake nobody who waits for no bytes: a line whose bytes are `left_alone` is looked at
-    /// now and then.
+    /// Publishes what is due, and returns when the wait must end: at `until`, or earlier if the link itself has
+    /// something to do. Some drivers report the loss of a port only to a thread that waits for bytes, so a line whose
+    /// bytes are `left_alone` is polled every 40 ms.
     pub(crate) fn bound(&mut self, until: Nanos, left_alone: bool) -> Nanos {
         let now = self.around.now();
         // What was due before comes first: it may be a scan.

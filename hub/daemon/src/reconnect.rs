@@ -1,6 +1,5 @@
-//! The life of a port: streamed from while it is there, looked for while it is away, taken back when it returns under
-//! its name, whatever device that is then. Looking costs next to nothing; why it is away is said once, not at each
-//! look.
+//! Keeps a link connected to its port. It streams while the port exists, polls for it while it is missing, and opens it
+//! again under the same name, whatever device it is then. The log has each reason for a missing port once.
 
 use std::io;
 

@@ -209,8 +209,7 @@ impl Frames {
     /// Returns the settings of a session that reads it for `link`. What is not configured is as it was recorded.
     pub(super) fn settings(&self, link: &Link) -> Settings {
         let mode_number = self.mode.filter(|_| !self.is_told_later).map(|mode| mode.0);
-        let is_found = link.family().is_none() || link.settings().is_found;
-        let mut settings = Settings { mode_number, is_found, ..link.settings() };
+        let mut settings = Settings { mode_number, ..link.settings() };
         if !self.is_whole && link.scanner.is_auto() {
             let model = self.recording.model().ok().flatten();
             settings.model = settings.model.or(model.map(|model| model.name));

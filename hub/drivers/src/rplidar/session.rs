@@ -129,7 +129,6 @@ impl Session {
             ..
         } = settings;
         let (model, mode) = (model.and_then(Model::named), mode.and_then(Mode::named));
-        let reported_beams = is_found;
         let settings = Settings {
             model,
             mode,
@@ -138,7 +137,7 @@ impl Session {
             fixed_rate,
             listen_only,
             stop_when_idle,
-            reported_beams,
+            reported_beams: is_found,
         };
         Session::new(settings, now)
     }
