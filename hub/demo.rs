@@ -1,12 +1,10 @@
-//! The whole thing in one terminal: simulated sensors of one family or of all, the hub, one consumer per sensor, and where there are
-//! people to follow the tracker, each a process as in real life. This process only starts them, reads what they print, compares what was sent with what arrived, and shows
-//! the picture that `watch` makes of it.
+//! `scanhub demo`: simulators, a hub, a subscriber for each sensor, and a people tracker, all in one terminal. Each of
+//! them is a separate process, as in real use. This process starts them, reads their output, compares sent with
+//! received telegrams, and shows the picture of `watch`.
 
 mod account;
 mod cast;
-mod process;
 mod stage;
-mod tilted;
 mod view;
 
 use std::io::Write;
@@ -24,28 +22,29 @@ use verbs::{Bounds, WatchOptions};
 use crate::cli::watch::{can_show_pictures, colours};
 use account::Account;
 pub(crate) use cast::{Families, World};
-use process::Line;
-use stage::Stage;
+use stage::{Line, Stage};
 use view::View;
 
-/// What the demonstration is asked for.
+/// Options of a demonstration.
 #[derive(Clone, Debug)]
 pub(crate) struct DemoOptions {
-    /// No live view.
+    /// Whether there is no live view.
     pub(crate) headless: bool,
-    /// How long from the first sample on; until `stop` if nothing.
+    /// Duration from the first sample on. `None`: until the user stops it.
     pub(crate) run_for: Option<Duration>,
-    /// Where it takes place.
+    /// The simulated world.
     pub(crate) world: World,
     /// Seed of the rooms.
     pub(crate) seed: u64,
-    /// Of which families the sensors are.
+    /// Families of the sensors.
     pub(crate) family: Families,
     /// Whether the summary is JSON.
     pub(crate) json: bool,
 }
 
-/// Runs until `run_for` is over, the picture is closed or `stop` is set, then prints a summary per sensor.
+/// Runs until `run_for` has elapsed, the picture is closed, or `stop` is set. Then prints a summary for each sensor.
+///
+/// # Errors
 ///
 /// [`Kind::Check`] if a telegram that a sensor sent did not arrive, [`Kind::Interrupted`] if a bounded run was stopped,
 /// [`Kind::Timeout`] if a sensor does not stream within 30 seconds, [`Kind::Failed`] if a process ends early.
@@ -54,7 +53,7 @@ pub(crate) fn demo(options: &DemoOptions, out: &mut dyn Write, stop: &AtomicBool
     let has_picture = shows && can_show_pictures();
     let sensors = options.world.sensors(options.family)?;
     let stage = Stage::new(has_picture, options.world, sensors)?;
-    // Where no port is free the demonstration goes on without a browser.
+    // If no port is free, the demonstration runs without the page.
     let web = if shows { stage.start_web().ok() } else { None };
     let url = web.as_ref().map(|(_, url)| url.as_str());
     let played = if has_picture {
@@ -71,7 +70,7 @@ pub(crate) fn demo(options: &DemoOptions, out: &mut dyn Write, stop: &AtomicBool
         play(options, &stage, &mut show, &|| stop.swap(false, Ordering::Relaxed))
     };
     drop(web);
-    stage.tell_errors();
+    stage.print_errors();
     let (account, end) = played?;
     account.summary(out, options.json);
     if end == End::Hurried {
@@ -86,7 +85,7 @@ pub(crate) fn demo(options: &DemoOptions, out: &mut dyn Write, stop: &AtomicBool
     Ok(())
 }
 
-/// As [`play`], while the terminal shows the picture; whoever closes it ends the demonstration.
+/// Does the same as [`play`] while the terminal shows the picture. Closing the picture ends the demonstration.
 fn play_with_picture(
     options: &DemoOptions,
     stage: &Stage,
@@ -116,7 +115,7 @@ fn play_with_picture(
     })
 }
 
-/// Sets a flag when dropped, in a panic too: the other thread ends then.
+/// Sets a flag when it is dropped, even by a panic, so that the other thread ends.
 struct Raise<'a>(&'a AtomicBool);
 
 impl Drop for Raise<'_> {
@@ -125,17 +124,17 @@ impl Drop for Raise<'_> {
     }
 }
 
-/// What somebody types in another terminal to look at it.
+/// Returns the command that shows a topic of the demonstration in another terminal.
 fn attach(stage: &Stage) -> String {
     format!("other terminal: scanhub echo {} --domain {}", stage.world.topic(), stage.domain.name())
 }
 
-/// As much of it as stands beside the keys on 80 columns.
+/// Returns the address of the page, short enough for 80 columns together with the keys.
 fn short(url: &str, domain: &Domain) -> String {
     format!("browser: {url}  domain: {}", domain.name())
 }
 
-/// Says where it takes place.
+/// Prints the domain of the demonstration.
 fn say_ready(out: &mut dyn Write, stage: &Stage, json: bool) {
     let domain = &stage.domain;
     let ready = Ready { class: "ready", domain: domain.name(), root: domain.root(), pid: std::process::id() };
@@ -146,7 +145,7 @@ fn say_ready(out: &mut dyn Write, stage: &Stage, json: bool) {
     let _ = out.write_all(format!("{line}\n").as_bytes());
 }
 
-/// Class `ready`; keys in the order of their contract.
+/// Class `ready`. The order of keys is part of the contract.
 #[derive(Serialize)]
 struct Ready<'a> {
     class: &'static str,
@@ -166,9 +165,9 @@ enum End {
     Hurried,
 }
 
-/// Starts all processes, and compares sent telegrams with received ones until the configured time has elapsed or the user stops the
-/// demonstration. `is_asked` returns whether the user has requested the end since the last call. Telegrams on their way still
-/// arrive after that, unless there is another request.
+/// Starts all processes, and compares sent telegrams with received ones until the configured time has elapsed or the
+/// user stops the demonstration. `is_asked` returns whether the user has requested the end since the last call.
+/// Telegrams on their way still arrive after that, unless there is another request.
 fn play(
     options: &DemoOptions,
     stage: &Stage,
@@ -180,7 +179,7 @@ fn play(
     let consumers = stage.start_consumers(&lines)?;
     let tracker = stage.start_tracker(&lines)?;
     let mut account = Account::new(&stage.sensors, stage.open_truths()?);
-    // The sensors come last: whoever listens from the beginning can tell whether something was lost.
+    // Start the simulators last, so that the subscribers receive everything from the beginning.
     let mut simulators = Vec::new();
     let mut tilted = None;
     let mut ready = 0;
@@ -255,17 +254,17 @@ fn ended(of: usize) -> Failure {
     Failure::new(Kind::Failed, format!("{who} ended early"), "its output is above")
 }
 
-/// Number of the hub among the processes; consumers have their sensor's.
+/// Numbers of the processes. A subscriber has the number of its sensor.
 const HUB: usize = 100;
 const SIMULATOR: usize = 101;
 const WEB: usize = 102;
 const TILTED: usize = 103;
 const TRACKER: usize = 104;
-/// Between two pictures.
+/// Interval between updates of the view.
 const REFRESH: Duration = Duration::from_millis(250);
-/// Longest wait for a line before the clock is looked at.
+/// Maximum wait for a line before the time is checked.
 const PATIENCE: Duration = Duration::from_millis(50);
-/// Processes start and a rate is found in far less, unless the machine is busy.
+/// Limit for all sensors to stream. It takes far less unless the machine is busy.
 const START_LIMIT: Duration = Duration::from_secs(30);
 /// A sensor without a telegram for this time has stopped streaming.
 const LATE: Duration = Duration::from_secs(10);

@@ -1,9 +1,8 @@
-//! The player of `scanhub replay`: starts the hub whose sensors are a recording, and gives whoever sits at a terminal its
-//! keys and a line that says how far it is.
+//! `scanhub replay`: runs a hub that plays a recording. A terminal shows a progress line, and its keys control the
+//! player.
 
 pub(crate) mod line;
 pub(crate) mod page;
-mod terminal;
 
 use std::io::{IsTerminal, Read, stderr, stdin};
 use std::os::fd::AsFd;
@@ -13,14 +12,17 @@ use std::thread::{self, JoinHandle};
 
 use daemon::{Player, Progress};
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
+use rustix::process::getpgrp;
+use rustix::termios::{
+    LocalModes, OptionalActions, SpecialCodeIndex, Termios, tcgetattr, tcgetpgrp, tcsetattr,
+};
 use schema::Failure;
 use serde::Serialize;
 
 use crate::cli::{Everywhere, Replay};
 use line::Line;
-use terminal::Keys;
 
-/// Runs until everything was played, or somebody ends it; then says how far it came.
+/// Runs until the recording has been played or the user ends it. Then prints a summary.
 pub(crate) fn replay(replay: &Replay, everywhere: &Everywhere) -> Result<(), Failure> {
     let domain = everywhere.hub_domain()?;
     let options = daemon::Replay {
@@ -44,23 +46,23 @@ pub(crate) fn replay(replay: &Replay, everywhere: &Everywhere) -> Result<(), Fai
     Ok(())
 }
 
-/// A person at a terminal, as long as the hub runs.
+/// The thread that handles keys and draws the progress line. Dropping it ends the thread.
 struct Console {
-    /// Closed, it tells the thread to end.
+    /// Closing this end makes the thread end.
     open: Option<UnixStream>,
     thread: Option<JoinHandle<()>>,
 }
 
 impl Console {
-    /// Nothing if there is neither somebody to press keys nor somebody to read.
+    /// Starts the thread. Returns `None` if neither standard input nor standard error is a terminal.
     fn open(player: &Arc<Player>) -> Option<Console> {
         if !stdin().is_terminal() && !stderr().is_terminal() {
             return None;
         }
         let (open, closed) = UnixStream::pair().ok()?;
         let player = player.clone();
-        let attend = move || attend(&player, &closed);
-        let thread = thread::Builder::new().name("keys".into()).spawn(attend).ok()?;
+        let run = move || run_console(&player, &closed);
+        let thread = thread::Builder::new().name("keys".into()).spawn(run).ok()?;
         Some(Console { open: Some(open), thread: Some(thread) })
     }
 }
@@ -68,13 +70,13 @@ impl Console {
 impl Drop for Console {
     fn drop(&mut self) {
         self.open = None;
-        // It has nothing to say, also if it panicked.
+        // The thread returns nothing, and the log has the message of a panic.
         let _ = self.thread.take().map(JoinHandle::join);
     }
 }
 
-/// Takes keys and draws the line until `closed` is.
-fn attend(player: &Player, closed: &UnixStream) {
+/// Handles keys and draws the progress line until the other end of `closed` is closed.
+fn run_console(player: &Player, closed: &UnixStream) {
     let mut keys = Keys::take_over();
     let mut line = stderr().is_terminal().then(Line::default);
     let mut drawn_at = None;
@@ -96,8 +98,8 @@ fn attend(player: &Player, closed: &UnixStream) {
         if fds.get(1).is_some_and(|fd| !fd.revents().is_empty()) {
             let mut pressed = [0; 64];
             match input.lock().read(&mut pressed) {
-                Ok(len @ 1..) => obey(player, &pressed[..len]),
-                // The terminal is gone, and with it whoever could end a player that goes on for ever.
+                Ok(len @ 1..) => handle_keys(player, &pressed[..len]),
+                // The terminal was closed, so no key could end a player that runs in a loop.
                 _ => {
                     keys = None;
                     player.end();
@@ -107,7 +109,8 @@ fn attend(player: &Player, closed: &UnixStream) {
     }
 }
 
-fn obey(player: &Player, mut pressed: &[u8]) {
+/// Handles pressed keys.
+fn handle_keys(player: &Player, mut pressed: &[u8]) {
     while let [key, rest @ ..] = pressed {
         pressed = rest;
         match key {
@@ -117,7 +120,7 @@ fn obey(player: &Player, mut pressed: &[u8]) {
             b'-' => player.slow_down(),
             b'q' => player.end(),
             b'\x1b' => {
-                // Keys that are no letters come as several bytes (ECMA-48); with the last of them they end.
+                // Special keys are sequences of several bytes (ECMA-48).
                 if let [b'[' | b'O', b'C', ..] = rest {
                     player.step();
                 }
@@ -128,6 +131,39 @@ fn obey(player: &Player, mut pressed: &[u8]) {
             }
             _ => {}
         }
+    }
+}
+
+/// The terminal without echo and line buffering, for single keys. Dropping it restores the terminal.
+struct Keys {
+    before: Termios,
+}
+
+impl Keys {
+    /// Changes the mode of the terminal. Returns `None` if standard input is not a terminal, or if this process runs in
+    /// the background.
+    fn take_over() -> Option<Keys> {
+        let keyboard = stdin();
+        if !keyboard.is_terminal() || tcgetpgrp(&keyboard).ok()? != getpgrp() {
+            return None;
+        }
+        let before = tcgetattr(&keyboard).ok()?;
+        let mut ours = before.clone();
+        // Ctrl-C stays a signal. Ctrl-Z and Ctrl-\ would leave the terminal in this mode.
+        ours.local_modes -= LocalModes::ICANON | LocalModes::ECHO;
+        ours.special_codes[SpecialCodeIndex::VSUSP] = DISABLED;
+        ours.special_codes[SpecialCodeIndex::VQUIT] = DISABLED;
+        ours.special_codes[SpecialCodeIndex::VMIN] = 1;
+        ours.special_codes[SpecialCodeIndex::VTIME] = 0;
+        tcsetattr(&keyboard, OptionalActions::Now, &ours).ok()?;
+        Some(Keys { before })
+    }
+}
+
+impl Drop for Keys {
+    fn drop(&mut self) {
+        // Fails if the terminal was closed. Then there is nothing to restore.
+        let _ = tcsetattr(stdin(), OptionalActions::Now, &self.before);
     }
 }
 
@@ -150,6 +186,8 @@ impl Replayed {
     }
 }
 
-/// The line is drawn five times a second at the most.
+/// Minimum interval between two progress lines.
 const REDRAW_NS: u64 = 200_000_000;
 const REDRAW: Timespec = Timespec { tv_sec: 0, tv_nsec: REDRAW_NS as i64 };
+/// Value of a special character that no key produces (`_POSIX_VDISABLE`).
+const DISABLED: u8 = 0;

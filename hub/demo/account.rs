@@ -1,5 +1,5 @@
-//! What was sent and what arrived: the simulator's truth on one side, the consumers' telegrams on the other, told
-//! apart by their hash, so that a damaged telegram is a lost one.
+//! Compares the telegrams that the simulators sent with those that the subscribers received. Telegrams are identified
+//! by their hash, so a damaged telegram counts as lost.
 
 use std::collections::{HashMap, HashSet};
 use std::fs::File;
@@ -11,43 +11,41 @@ use serde::Serialize;
 use serde_json::Value;
 use sha2::{Digest, Sha256};
 
-use super::tilted::Tilted;
-
-/// The account of all sensors.
+/// Counts of all sensors.
 pub(crate) struct Account {
     pub(crate) sensors: Vec<Sensor>,
-    /// What each simulator says, line by line, and the beginning of a line; reading never waits.
+    /// The pipe of each simulator, and the beginning of an unfinished line. Reading never blocks.
     truths: Vec<(File, Vec<u8>)>,
-    /// Telegrams whose last byte left after this moment do not count.
+    /// Telegrams whose last byte was sent after this time do not count, in nanoseconds of the monotonic clock.
     cut_ns: u64,
     cut_at: Option<Instant>,
-    /// What was seen in three dimensions, if anything was.
+    /// Results of three-dimensional perception, if a sensor is on a mount.
     tilted: Option<Tilted>,
     hub: Option<Work>,
-    /// What happened to people last.
+    /// Last line of the people tracker.
     pub(crate) news: Option<String>,
-    /// Processor time of the hub in percent of one processor, over the last look and over all.
+    /// CPU time of the hub since all sensors stream, in percent of one processor.
     pub(crate) hub_cpu_percent: f64,
 }
 
-/// One sensor's account.
+/// Counts of one sensor.
 #[derive(Default)]
 pub(crate) struct Sensor {
     pub(crate) name: String,
     pub(crate) state: String,
     pub(crate) baud: u64,
-    /// Its head turns: what it sends are packets, and before anybody listens they do not count.
+    /// Whether the scanner rotates and sends packets. Packets before the first subscriber do not count.
     turns: bool,
-    /// Packets that were sent before the first one that arrived, as far as that is known.
+    /// Hashes of packets that were sent before the first one arrived.
     before: Vec<String>,
     /// Telegrams of measured data that were sent whole before the cut.
     pub(crate) sent: u64,
-    /// Hash of each that was sent and has not arrived.
+    /// Hash of each telegram that was sent and has not arrived.
     missing: HashMap<String, u64>,
-    /// Hash of each that arrived before the simulator said that it was sent.
+    /// Hash of each telegram that arrived before the simulator reported it.
     early: HashMap<String, u64>,
     pub(crate) received_count: u64,
-    /// Ranges of the last scan from right to left, in mm; none where there is no reading.
+    /// Ranges of the last scan from right to left, in millimeters. `None`: no reading.
     pub(crate) ranges: Vec<Option<u64>>,
     pub(crate) nearest_mm: Option<u64>,
     pub(crate) nearest_deg: f64,
@@ -61,8 +59,8 @@ pub(crate) struct Sensor {
     pub(crate) missed: u64,
     /// Hash of each telegram that was sent after the cut.
     after_cut: HashSet<String>,
-    /// Whether one of them has arrived. Telegrams arrive in their order, so all that were sent before the cut have arrived, or
-    /// never will.
+    /// Whether one of them has arrived. Telegrams arrive in their order, so all that were sent before the cut have
+    /// arrived, or never will.
     is_past_cut: bool,
     /// Time at which the last telegram arrived.
     arrived_at: Option<Instant>,
@@ -77,14 +75,14 @@ struct LineCounts {
     lost: Option<u64>,
 }
 
-/// A moment in the hub's life: when, and how much processor time it had used.
+/// CPU time that the hub had used at a time.
 #[derive(Clone, Copy)]
 struct Work {
     since: Instant,
     used_ns: u64,
 }
 
-/// The last line per sensor, keys in the order of their contract.
+/// The line of a sensor in the summary. The order of keys is part of the contract.
 #[derive(Serialize)]
 struct Summary<'a> {
     class: &'static str,
@@ -123,7 +121,7 @@ impl Account {
         }
     }
 
-    /// Takes a line that the consumer of sensor number `of` printed.
+    /// Handles a line that the subscriber of sensor number `of` printed.
     pub(crate) fn take(&mut self, of: usize, line: &Value) {
         if line["class"] == "obstacles" {
             self.tilted.get_or_insert_default().take(line);
@@ -150,18 +148,18 @@ impl Account {
         }
     }
 
-    /// Takes a line that the tracker of people printed.
+    /// Handles a line of the people tracker.
     pub(crate) fn take_news(&mut self, line: String) {
         self.news = Some(line);
     }
 
-    /// Whether every sensor has sent a scan.
+    /// Returns whether a scan of every sensor has arrived.
     pub(crate) fn all_stream(&self) -> bool {
         self.sensors.iter().all(|sensor| !sensor.ranges.is_empty())
     }
 
-    /// Returns whether no more telegrams from before the cut will arrive: a later one of each sensor has arrived, or none of any
-    /// kind for `limit`, or six times as long has passed since the cut.
+    /// Returns whether no more telegrams from before the cut will arrive: a later one of each sensor has arrived, or
+    /// none of any kind for `limit`, or six times as long has passed since the cut.
     pub(crate) fn is_complete(&self, limit: Duration) -> bool {
         let Some(cut_at) = self.cut_at else { return false };
         // A sensor that has sent nothing by the cut has lost nothing.
@@ -173,10 +171,10 @@ impl Account {
         all_arrived || cut_at.elapsed() > limit.saturating_mul(6)
     }
 
-    /// Reads what the simulators wrote since the last time.
+    /// Reads what the simulators have written since the last call.
     pub(crate) fn read_truth(&mut self) {
         for (truth, unfinished) in &mut self.truths {
-            // Ends with an error where there is nothing more to read now; what was read before it is kept.
+            // Returns an error when the pipe is empty, and keeps the bytes that were read before.
             let _ = truth.read_to_end(unfinished);
             let whole = unfinished.iter().rposition(|&byte| byte == b'\n').map_or(0, |end| end + 1);
             let rest = unfinished.split_off(whole);
@@ -202,17 +200,17 @@ impl Account {
         }
     }
 
-    /// What leaves a sensor from now on does not count any more.
+    /// Ends the count: telegrams that are sent from now on do not count.
     pub(crate) fn cut(&mut self) {
         let now = rustix::time::clock_gettime(rustix::time::ClockId::Monotonic);
         self.cut_ns = now.tv_sec as u64 * 1_000_000_000 + now.tv_nsec as u64;
         self.cut_at = Some(Instant::now());
     }
 
-    /// Looks at the processor time of the hub, process `pid`.
+    /// Updates the CPU time of the hub, process `pid`.
     pub(crate) fn look_at_hub(&mut self, pid: u32) {
-        let now = Work { since: Instant::now(), used_ns: processor_time_ns(pid) };
-        // From the first scan on: finding the sensors is another matter.
+        let now = Work { since: Instant::now(), used_ns: cpu_time_ns(pid) };
+        // The search for the scanners does not count.
         if self.sensors.iter().any(|sensor| sensor.ranges.is_empty()) {
             self.hub = Some(now);
             return;
@@ -242,7 +240,7 @@ impl Account {
         Some(format!("{what} {were} sent and not received: {causes}"))
     }
 
-    /// Prints a line per sensor.
+    /// Prints the summary, one line for each sensor.
     pub(crate) fn summary(&self, out: &mut dyn Write, json: bool) {
         for sensor in &self.sensors {
             let (sent, lost) = (sensor.sent, sensor.lost());
@@ -288,20 +286,20 @@ impl Account {
         }
     }
 
-    /// What was seen in three dimensions, for people.
+    /// Returns the results of three-dimensional perception as text.
     pub(crate) fn tilted_words(&self) -> Option<String> {
         self.tilted.as_ref().map(|tilted| tilted.line(false))
     }
 }
 
 impl Sensor {
-    /// Telegrams sent and not arrived, or not yet.
+    /// Returns the number of telegrams that were sent and have not arrived yet.
     pub(crate) fn lost(&self) -> u64 {
         self.missing.values().sum()
     }
 
-    /// Returns the number of scans that the line lost since the first telegram, as the hub counts them. `None` while the hub
-    /// cannot tell.
+    /// Returns the number of scans that the line lost since the first telegram, as the hub counts them. `None` while
+    /// the hub cannot tell.
     pub(crate) fn lost_on_line(&self) -> Option<u64> {
         let lost = self.line?.lost?;
         Some(lost.saturating_sub(self.line_before.lost.unwrap_or_default()))
@@ -337,8 +335,8 @@ impl Sensor {
         }
     }
 
-    /// Returns the telegrams per second from the first to the last, or revolutions of a rotating scanner. `None` while they
-    /// span less than [`schema::MIN_RATE_SPAN`].
+    /// Returns the telegrams per second from the first to the last, or revolutions of a rotating scanner. `None` while
+    /// they span less than [`schema::MIN_RATE_SPAN`].
     pub(crate) fn hz(&self) -> Option<f64> {
         let span = Duration::from_nanos(self.last_ns.saturating_sub(self.first_ns));
         schema::rate_hz(self.received_count.saturating_sub(1), span)
@@ -358,12 +356,12 @@ impl Sensor {
         let packets = line["packets"].as_u64().unwrap_or(1).max(1) as usize;
         bytes.chunks((bytes.len() / packets).max(1)).for_each(|packet| self.take_arrived(packet));
         if !self.turns {
-            self.note(line);
+            self.count(line);
         }
     }
 
-    /// A telegram came, or a turn.
-    fn note(&mut self, line: &Value) {
+    /// Counts a telegram, or a revolution of a rotating scanner.
+    fn count(&mut self, line: &Value) {
         self.received_count += 1;
         self.last_ns = line["stamp_ns"].as_u64().unwrap_or_default();
         if self.first_ns == 0 {
@@ -373,12 +371,12 @@ impl Sensor {
 
     fn take_scan(&mut self, line: &Value) {
         if self.turns {
-            self.note(line);
+            self.count(line);
         }
         let unit = line["unit_um"].as_u64().unwrap_or(1000) / 1000;
         let ranges = line["ranges"].as_array().map(Vec::as_slice).unwrap_or_default();
         self.ranges = ranges.iter().map(|range| range.as_u64().map(|range| range * unit)).collect();
-        // What is there is seen by two beams side by side; a single one may be noise. Of both the farther one counts.
+        // A single beam may be noise, so two neighboring beams must see an object. The farther of the two counts.
         let both = |pair: &[Option<u64>]| Some(pair[0]?.max(pair[1]?));
         let pairs = self.ranges.windows(2).enumerate();
         let nearest = pairs.filter_map(|(i, pair)| Some((both(pair)?, i))).min();
@@ -387,7 +385,7 @@ impl Sensor {
         self.nearest_deg =
             nearest.map_or(0.0, |(_, i)| angle("first_angle_deg") + i as f64 * angle("step_deg"));
         if angle("step_deg") < 0.0 {
-            // Of a whole turn, what is behind is at both ends, and the right comes first as of others.
+            // A revolution starts ahead and runs clockwise. Put the rear at both ends, and the right first.
             let half = self.ranges.len() / 2;
             self.ranges.rotate_left(half);
             self.ranges.reverse();
@@ -395,12 +393,48 @@ impl Sensor {
     }
 }
 
-/// Takes one of `hash` out of `pile`, if it is there.
-fn take(pile: &mut HashMap<String, u64>, hash: &str) -> bool {
-    let Some(count) = pile.get_mut(hash) else { return false };
+/// Results of three-dimensional perception, the last line of the summary. The order of keys is part of the contract.
+#[derive(Clone, Debug, Default, PartialEq, Serialize)]
+struct Tilted {
+    class: &'static str,
+    sensor: String,
+    sweeps: u64,
+    /// Number in the last sweep.
+    obstacles: usize,
+    /// Distance of the nearest obstacle from the center of the robot, in meters.
+    nearest_m: Option<f64>,
+}
+
+impl Tilted {
+    /// Updates the counts from a line of class `obstacles`.
+    fn take(&mut self, line: &Value) {
+        let obstacles = line["obstacles"].as_array().map(Vec::as_slice).unwrap_or_default();
+        *self = Tilted {
+            class: "summary",
+            sensor: line["sensor"].as_str().unwrap_or_default().to_owned(),
+            sweeps: self.sweeps + 1,
+            obstacles: obstacles.len(),
+            nearest_m: obstacles.first().and_then(|one| one["distance_m"].as_f64()),
+        };
+    }
+
+    /// Returns the line, as JSON or as text.
+    fn line(&self, json: bool) -> String {
+        if json {
+            return serde_json::to_string(self).unwrap_or_default();
+        }
+        let nearest = self.nearest_m.map_or(String::new(), |m| format!(", the nearest at {m:.2} m"));
+        let (sweeps, obstacles) = (counted(self.sweeps, "sweep"), counted(self.obstacles as u64, "obstacle"));
+        format!("{:6} {sweeps}, {obstacles} in the last{nearest}", self.sensor)
+    }
+}
+
+/// Removes one of `hash` from `counts`, and returns whether there was one.
+fn take(counts: &mut HashMap<String, u64>, hash: &str) -> bool {
+    let Some(count) = counts.get_mut(hash) else { return false };
     *count -= 1;
     if *count == 0 {
-        pile.remove(hash);
+        counts.remove(hash);
     }
     true
 }
@@ -410,8 +444,8 @@ fn from_hex(text: &str) -> Vec<u8> {
     (0..text.len()).step_by(2).map_while(digits).collect()
 }
 
-/// Processor time of all threads of `pid`, user and system.
-fn processor_time_ns(pid: u32) -> u64 {
+/// Returns the CPU time of all threads of `pid`, in nanoseconds.
+fn cpu_time_ns(pid: u32) -> u64 {
     let tasks = std::fs::read_dir(format!("/proc/{pid}/task")).into_iter().flatten().flatten();
     let spent = tasks.filter_map(|task| {
         let text = std::fs::read_to_string(task.path().join("schedstat")).ok()?;
@@ -448,7 +482,7 @@ mod tests {
         let hash =
             |bytes: &[u8]| Sha256::digest(bytes).iter().map(|byte| format!("{byte:02x}")).collect::<String>();
         let mut sensor = Sensor { turns: true, ..Sensor::default() };
-        // Two before anybody listened, and one after another of which the middle one is lost; the truth comes before or after.
+        // Two packets are sent before the first one arrives. Three follow, and the middle one is lost.
         [b"a", b"b", b"c"].iter().for_each(|sent| sensor.take_sent(&hash(*sent)));
         assert_eq!((sensor.sent, sensor.lost()), (0, 0));
         sensor.take_telegram(&telegram("6365", 2));
@@ -496,7 +530,7 @@ mod tests {
     }
 
     #[test]
-    fn a_turn_is_shown_from_right_to_left() {
+    fn a_revolution_is_shown_from_right_to_left() {
         let mut sensor = Sensor { turns: true, ..Sensor::default() };
         // Ahead, right, behind, left.
         let turn = serde_json::json!({ "unit_um": 1000, "first_angle_deg": 0.0, "step_deg": -90.0, "ranges": [1, 2, 3, 4] });

@@ -1,36 +1,39 @@
-//! Where a demonstration takes place, and who takes part: a hub, consumers, a tracker of people and simulated sensors, in a domain and a
-//! directory that are gone afterwards. Refuses to know what they say.
+//! The processes of a demonstration: a hub, subscribers, a people tracker and simulators. They run in a temporary
+//! domain and directory.
 
 use std::fs::{File, OpenOptions};
-use std::io::{self, Write};
+use std::io::{self, BufRead, BufReader, Write};
 use std::os::unix::fs::OpenOptionsExt;
-use std::path::PathBuf;
-use std::process::Stdio;
-use std::sync::mpsc;
+use std::os::unix::process::CommandExt;
+use std::path::{Path, PathBuf};
+use std::process::{Child as Process, ChildStdout, Command, Stdio};
+use std::sync::mpsc::{self, Sender};
+use std::thread;
+use std::time::{Duration, Instant};
 
 use rustix::fs::{CWD, FileType, Mode, OFlags, mknodat};
-use schema::{Failure, Family, Kind};
+use rustix::process::{Pid, Signal, kill_process};
+use schema::{Domain, Failure, Family, Kind};
 use serde_json::Value;
 use tempfile::TempDir;
 
-use super::process::{Child, Line};
-use crate::own_domain::OwnDomain;
-
 use super::cast::{Sensor, World};
 use super::{HUB, SIMULATOR, TILTED, TRACKER, WEB};
+use crate::own_domain::OwnDomain;
 
-/// A domain and a directory of its own.
+/// The domain, the directory and the settings of all processes.
 pub(super) struct Stage {
     pub(super) domain: OwnDomain,
     pub(super) world: World,
     pub(super) sensors: Vec<Sensor>,
     directory: TempDir,
-    /// There is a picture on the terminal, into which nobody may write.
+    /// Whether the processes write errors to a file, because the terminal shows a picture.
     quiet: bool,
 }
 
 impl Stage {
-    /// `quiet`: what the processes have to say of errors is kept until [`tell_errors`](Self::tell_errors).
+    /// Creates the domain and the directory. With `quiet`, errors of the processes are kept until
+    /// [`print_errors`](Self::print_errors).
     pub(super) fn new(quiet: bool, world: World, sensors: Vec<Sensor>) -> Result<Stage, Failure> {
         let domain = OwnDomain::new("demo")?;
         let name = domain.name().to_owned();
@@ -42,8 +45,8 @@ impl Stage {
         Ok(Stage { domain, world, sensors, directory, quiet })
     }
 
-    /// Says on stderr what was kept.
-    pub(super) fn tell_errors(&self) {
+    /// Prints the kept errors.
+    pub(super) fn print_errors(&self) {
         let kept = std::fs::read(self.log()).unwrap_or_default();
         let _ = io::stderr().lock().write_all(&kept);
     }
@@ -52,13 +55,13 @@ impl Stage {
         self.directory.path().join("log")
     }
 
-    /// Where a process says what goes wrong.
+    /// Returns the standard error of a process.
     fn errors(&self) -> Stdio {
         let log = OpenOptions::new().append(true).create(true).open(self.log());
         log.ok().filter(|_| self.quiet).map_or_else(Stdio::inherit, Stdio::from)
     }
 
-    /// The families of the sensors: each has a simulator of its own.
+    /// Returns the families of the sensors. Each family has one simulator.
     fn families(&self) -> impl Iterator<Item = Family> {
         Family::ALL.into_iter().filter(|family| self.sensors.iter().any(|sensor| sensor.family == *family))
     }
@@ -67,7 +70,8 @@ impl Stage {
         self.directory.path().join(format!("truth-{}", family.name()))
     }
 
-    /// The reading ends of what the simulators will tell: pipes, because a demonstration may run for days.
+    /// Opens what the simulators write about sent telegrams: pipes instead of files, because a demonstration may run
+    /// for days.
     pub(super) fn open_truths(&self) -> Result<Vec<File>, Failure> {
         let open = |path: &PathBuf| -> io::Result<File> {
             mknodat(CWD, path, FileType::Fifo, Mode::RUSR | Mode::WUSR, 0)?;
@@ -87,7 +91,7 @@ impl Stage {
         self.directory.path().join(sensor).display().to_string()
     }
 
-    pub(super) fn start_hub(&self, lines: mpsc::Sender<Line>) -> Result<Child, Failure> {
+    pub(super) fn start_hub(&self, lines: Sender<Line>) -> Result<Child, Failure> {
         let links = self.sensors.iter().flat_map(|Sensor { name, family, pose: [x, y, yaw] }| {
             let set = |setting: &str| format!("--set=link.{name}.{setting}");
             [
@@ -112,7 +116,7 @@ impl Stage {
         Ok(hub.await_ready(HUB, lines)?.0)
     }
 
-    pub(super) fn start_consumers(&self, lines: &mpsc::Sender<Line>) -> Result<Vec<Child>, Failure> {
+    pub(super) fn start_consumers(&self, lines: &Sender<Line>) -> Result<Vec<Child>, Failure> {
         let start = |(of, Sensor { name: sensor, .. }): (usize, &Sensor)| {
             let topics = ["telegram", "scan", "status"].map(|topic| format!("{sensor}/{topic}"));
             let arguments = [&["echo".into(), "--json".into()], &topics[..]].concat();
@@ -127,8 +131,8 @@ impl Stage {
         self.sensors.iter().enumerate().map(start).collect()
     }
 
-    /// What follows people, where there is a site to follow them in.
-    pub(super) fn start_tracker(&self, lines: &mpsc::Sender<Line>) -> Result<Option<Child>, Failure> {
+    /// Starts the people tracker, if the world has a site.
+    pub(super) fn start_tracker(&self, lines: &Sender<Line>) -> Result<Option<Child>, Failure> {
         let Some(site) = self.world.site() else { return Ok(None) };
         let path = self.directory.path().join("site.toml");
         std::fs::write(&path, site).map_err(|error| {
@@ -141,20 +145,11 @@ impl Stage {
         Child::start(&arguments, &self.domain, self.directory.path(), listener, self.errors()).map(Some)
     }
 
-    pub(super) fn start_simulators(
-        &self,
-        seed: u64,
-        lines: &mpsc::Sender<Line>,
-    ) -> Result<Vec<Child>, Failure> {
+    pub(super) fn start_simulators(&self, seed: u64, lines: &Sender<Line>) -> Result<Vec<Child>, Failure> {
         self.families().map(|family| self.start_simulator(family, seed, lines.clone())).collect()
     }
 
-    fn start_simulator(
-        &self,
-        family: Family,
-        seed: u64,
-        lines: mpsc::Sender<Line>,
-    ) -> Result<Child, Failure> {
+    fn start_simulator(&self, family: Family, seed: u64, lines: Sender<Line>) -> Result<Child, Failure> {
         let sensors = self.sensors.iter().filter(|sensor| sensor.family == family);
         let ports: Vec<_> = sensors.flat_map(|sensor| ["--port".into(), self.port(&sensor.name)]).collect();
         let truth = self.truth(family).display().to_string();
@@ -170,8 +165,8 @@ impl Stage {
         Ok(simulator.await_ready(SIMULATOR, lines)?.0)
     }
 
-    /// What sees in three dimensions, if a sensor is tilted: once the angles of its mount are there.
-    pub(super) fn start_tilted(&self, lines: &mpsc::Sender<Line>) -> Result<Option<Child>, Failure> {
+    /// Starts the verb that sees in three dimensions, if the sensor is on a mount. The angles of the mount must exist.
+    pub(super) fn start_tilted(&self, lines: &Sender<Line>) -> Result<Option<Child>, Failure> {
         if self.world != World::Tilt {
             return Ok(None);
         }
@@ -180,11 +175,11 @@ impl Stage {
         Child::start(&arguments, &self.domain, self.directory.path(), listener, self.errors()).map(Some)
     }
 
-    /// The picture for a browser, and its address.
+    /// Starts the page for browsers, and returns its address too.
     pub(super) fn start_web(&self) -> Result<(Child, String), Failure> {
         let arguments = ["web".into(), "--json".into()];
         let web = Child::start(&arguments, &self.domain, self.directory.path(), None, self.errors())?;
-        // Who comes and goes is not told here.
+        // Lines about viewers are not shown.
         let (web, ready) = web.await_ready(WEB, mpsc::channel().0)?;
         let ready: Value = serde_json::from_str(&ready).unwrap_or_default();
         match ready["url"].as_str() {
@@ -194,9 +189,105 @@ impl Stage {
     }
 }
 
-/// Who says how the mount stands.
+/// An event of a child process. `of` is the number of the child.
+#[derive(Debug)]
+pub(super) enum Line {
+    /// The child printed a line.
+    Said { of: usize, text: String },
+    /// The child closed its standard output.
+    Ended { of: usize },
+}
+
+/// A child process that runs a verb of this program. Dropping it ends the process.
+#[derive(Debug)]
+pub(super) struct Child {
+    process: Process,
+}
+
+impl Child {
+    /// Starts this program with `arguments` in `domain`. `state` is its state directory, and `errors` its standard
+    /// error. With a `listener`, the lines of the child are sent there with its number.
+    pub(super) fn start(
+        arguments: &[String],
+        domain: &Domain,
+        state: &Path,
+        listener: Option<(usize, Sender<Line>)>,
+        errors: Stdio,
+    ) -> Result<Child, Failure> {
+        let failed = |error: std::io::Error| {
+            Failure::new(Kind::Failed, format!("cannot start scanhub {}: {error}", arguments.join(" ")), "")
+        };
+        let program = std::env::current_exe().map_err(failed)?;
+        let mut process = Command::new(program)
+            .args(arguments)
+            .args(["--domain", domain.name(), "--root"])
+            .arg(domain.root().parent().unwrap_or(domain.root()))
+            .env("SCANHUB_LOG", std::env::var("SCANHUB_LOG").unwrap_or("error".into()))
+            .env(crate::END_WITH_PARENT, "1")
+            .env("STATE_DIRECTORY", state)
+            // Ctrl-C must reach only the demonstration, which ends its children in the right order.
+            .process_group(0)
+            .stdin(Stdio::null())
+            .stdout(Stdio::piped())
+            .stderr(errors)
+            .spawn()
+            .map_err(failed)?;
+        if let Some((of, lines)) = listener
+            && let Some(stdout) = process.stdout.take()
+        {
+            forward(BufReader::new(stdout), of, lines);
+        }
+        Ok(Child { process })
+    }
+
+    /// Waits for the first line, which says that the child is ready, and returns it. Later lines are sent to `lines`.
+    pub(super) fn await_ready(mut self, of: usize, lines: Sender<Line>) -> Result<(Child, String), Failure> {
+        let mut first = String::new();
+        if let Some(stdout) = self.process.stdout.take() {
+            let mut stdout = BufReader::new(stdout);
+            let _ = stdout.read_line(&mut first);
+            forward(stdout, of, lines);
+        }
+        if first.is_empty() { Err(super::ended(of)) } else { Ok((self, first)) }
+    }
+
+    /// Returns the process id.
+    pub(super) fn pid(&self) -> u32 {
+        self.process.id()
+    }
+}
+
+impl Drop for Child {
+    fn drop(&mut self) {
+        if let Some(pid) = Pid::from_raw(self.process.id() as i32) {
+            let _ = kill_process(pid, Signal::TERM);
+        }
+        let give_up_at = Instant::now() + Duration::from_secs(2);
+        while let Ok(None) = self.process.try_wait() {
+            if Instant::now() > give_up_at {
+                let _ = self.process.kill();
+                let _ = self.process.wait();
+                return;
+            }
+            thread::sleep(Duration::from_millis(5));
+        }
+    }
+}
+
+fn forward(stdout: BufReader<ChildStdout>, of: usize, lines: Sender<Line>) {
+    thread::spawn(move || {
+        for text in stdout.lines().map_while(Result::ok) {
+            if lines.send(Line::Said { of, text }).is_err() {
+                return;
+            }
+        }
+        let _ = lines.send(Line::Ended { of });
+    });
+}
+
+/// Name under which the simulator publishes the angles of the mount.
 const MOUNT: &str = "mount";
-/// Of the mount of world `tilt` (`tests/worlds/tilt.toml`).
+/// Arguments with the geometry of the mount in world `tilt` (`tests/worlds/tilt.toml`).
 const TILTED_VERB: [&str; 11] = [
     "tilt",
     "front",
@@ -210,7 +301,8 @@ const TILTED_VERB: [&str; 11] = [
     "--as",
     "hall",
 ];
-/// How long the tracker waits for the scan of a sensor: a machine on which somebody tries things is busy.
+/// Maximum time that the tracker waits for the scan of a sensor. Longer than the default, because the machine may be
+/// busy.
 const DELAY: &str = "200ms";
-/// What a demonstration learns is gone with it.
+/// Setting by which the hub saves no background: its directory is removed with the demonstration.
 const FORGETS: &str = "--set=background.keep=false";

@@ -1,5 +1,5 @@
-//! `scanhub configure`, as a person runs it at a terminal, and as no person does: a sensor's EEPROM is written once, after
-//! a `yes`, and otherwise never.
+//! `scanhub configure`, as a person runs it at a terminal, and as no person does: a sensor's EEPROM is written once,
+//! after a `yes`, and otherwise never.
 
 use std::fs::File;
 use std::io::{Read, Write};

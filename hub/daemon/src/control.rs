@@ -1,29 +1,28 @@
-//! Requests from outside on their way to the links: each is handed to its link's thread by a bounded queue and answered
-//! when the link has taken it. Never waits for a link; what a request does to a sensor is the session's business.
-
-mod queue;
+//! Requests of users to the links of a hub. The supervising thread receives each request and puts it into the bounded
+//! queue of its link's thread. It replies when the link has handled the request, and never blocks on a link in between.
 
 use std::os::fd::{AsFd, BorrowedFd};
-use std::sync::mpsc::{Receiver, SyncSender, TrySendError, channel, sync_channel};
+use std::sync::mpsc::{Receiver, Sender, SyncSender, TrySendError, channel, sync_channel};
 use std::sync::{Arc, Mutex, PoisonError};
 
 use config::Processing;
+use scanhub_drivers::PortSession;
+use scanhub_drivers::line::{Control, Session as _};
 use schema::ipc::{self, Asked, Node};
-use schema::{Background, Failure, Kind, Response, Shown, Verb, shortage};
+use schema::{Background, Failure, Kind, Nanos, Response, Shown, Verb, shortage};
 
 use crate::event_fd::EventFd;
-pub use queue::ControlQueue;
-pub(crate) use queue::Flow;
+use crate::player::Player;
 
-/// Where requests come in; stays in the supervising thread.
+/// The server of control requests. It belongs to the supervising thread.
 pub(crate) struct ControlServer {
     server: ipc::ControlServer,
     pub(crate) orders: Orders,
-    /// Requests that a link has not taken yet, by their numbers.
+    /// Requests whose link has not reported an outcome yet, with their numbers.
     open: Vec<(u64, Asked)>,
 }
 
-/// What users want of links, on its way to them and back.
+/// Queues to the threads of all links, and the outcomes that these threads report.
 pub struct Orders {
     links: Vec<LinkQueue>,
     outcomes: Receiver<(u64, Outcome)>,
@@ -31,7 +30,7 @@ pub struct Orders {
     next: u64,
 }
 
-/// The way to a link's thread.
+/// The supervisor's end of the queue to one link's thread.
 struct LinkQueue {
     sensor: String,
     queue: SyncSender<QueuedRequest>,
@@ -39,27 +38,27 @@ struct LinkQueue {
     event: Arc<EventFd>,
 }
 
-/// What a link shall make of its scans from now on, until it has taken it.
+/// New settings of the processors of a link, until the link takes them.
 type Changed = Arc<Mutex<Option<Box<Processing>>>>;
 
-/// What came of a request: done, with the model that was asked for, or why not.
+/// Outcome of a request: the background model if the request asked for it, or the reason of a failure.
 pub type Outcome = Result<Option<Box<Shown>>, Failure>;
 
-/// A request on its way to a link.
+/// A request in the queue of a link.
 pub(crate) struct QueuedRequest {
-    /// By which it is answered.
+    /// Identifies the request in its [`Outcome`].
     pub(crate) number: u64,
     pub(crate) verb: Verb,
-    /// What a request to load brings.
+    /// The model of [`Verb::Load`]; empty for the other verbs.
     pub(crate) model: Box<Background>,
 }
 
 impl Orders {
-    /// For a link of each of `sensors`; what comes for them arrives at the second value.
+    /// Creates a queue for the link of each sensor in `sensors`. The second value has the links' ends, in the same order.
     ///
     /// # Errors
     ///
-    /// [`Kind::Short`] if descriptors are.
+    /// [`Kind::Short`] if no descriptors are left.
     pub fn new<'a>(sensors: impl Iterator<Item = &'a str>) -> Result<(Orders, Vec<ControlQueue>), Failure> {
         let event = Arc::new(EventFd::new()?);
         let (told, outcomes) = channel();
@@ -86,7 +85,8 @@ impl Orders {
         Ok((Orders { links, outcomes, event, next: 0 }, ends))
     }
 
-    /// Lets the link of `sensor` make of its scans what `processing` says, as soon as it looks; the last word holds.
+    /// Gives the link of `sensor` new settings for its processors. They replace settings that the link has not taken
+    /// yet.
     pub fn change(&self, sensor: &str, processing: &Processing) {
         if let Some(link) = self.links.iter().find(|link| link.sensor == sensor) {
             let mut changed = link.changed.lock().unwrap_or_else(PoisonError::into_inner);
@@ -95,8 +95,8 @@ impl Orders {
         }
     }
 
-    /// Puts `verb`, with the `model` of a request to load, into the queue of the link of `sensor`. The number by which its
-    /// [`outcome`](Self::outcome) will be told.
+    /// Queues a request for the link of `sensor`, and returns its number in [`outcome`](Self::outcome). `model` is the model
+    /// of [`Verb::Load`].
     ///
     /// # Errors
     ///
@@ -123,16 +123,18 @@ impl Orders {
         Ok(self.next - 1)
     }
 
-    /// What came of a request that a link has taken, and its number.
+    /// Returns the number and the outcome of the next request that a link has handled.
     pub fn outcome(&self) -> Option<(u64, Outcome)> {
         self.outcomes.try_recv().ok()
     }
 }
 
 impl ControlServer {
-    /// Opens the control service, for a link of each of `sensors`; what comes for them arrives at the second value.
+    /// Opens the control service for the link of each sensor in `sensors`. The second value has the links' queues.
     ///
-    /// [`Kind::Short`] if memory or descriptors are.
+    /// # Errors
+    ///
+    /// [`Kind::Short`] if no memory or descriptors are left.
     pub(crate) fn open<'a>(
         node: &Node,
         sensors: impl Iterator<Item = &'a str>,
@@ -142,12 +144,12 @@ impl ControlServer {
         Ok((ControlServer { server, orders, open: Vec::new() }, queues))
     }
 
-    /// What becomes readable when there is something to [`serve`](Self::serve).
+    /// Descriptors that become readable when [`serve`](Self::serve) has something to do.
     pub(crate) fn descriptors(&self) -> [BorrowedFd<'_>; 2] {
         [ipc::descriptor(self.server.requests()), self.orders.event.as_fd()]
     }
 
-    /// Answers what the links have taken, and hands on what came in.
+    /// Replies to the requests that links have handled, and queues new ones.
     pub(crate) fn serve(&mut self) {
         self.orders.event.clear();
         while let Some((number, outcome)) = self.orders.outcome() {
@@ -157,19 +159,19 @@ impl ControlServer {
             }
         }
         self.open.retain(|(_, asked)| asked.is_waited_for());
-        let mut unheard = ipc::take_wakeups(&[self.server.requests()]).is_ok_and(|rang| rang);
+        let mut was_signaled = ipc::take_wakeups(&[self.server.requests()]).is_ok_and(|rang| rang);
         loop {
             match self.server.receive() {
                 Ok(Some(asked)) => {
-                    unheard = false;
+                    was_signaled = false;
                     self.hand_on(asked);
                 }
                 Ok(None) => break,
                 Err(failure) => return tracing::warn!(%failure, "a request was not received"),
             }
         }
-        // The library leaves out a client that it has no descriptors for.
-        if unheard && let Err(failure) = shortage::check_descriptors(CLIENT_DESCRIPTORS) {
+        // iceoryx2 skips a client for whose connection no descriptors are left.
+        if was_signaled && let Err(failure) = shortage::check_descriptors(CLIENT_DESCRIPTORS) {
             tracing::warn!("a request was not received: {}; {}", failure.message, failure.hint);
         }
     }
@@ -181,7 +183,7 @@ impl ControlServer {
         }
     }
 
-    /// Puts what `asked` wants into the link's queue; the number by which its outcome will be told.
+    /// Puts `asked` into the queue of its link, and returns its number.
     fn queue(&mut self, asked: &Asked) -> Result<u64, Failure> {
         let request =
             asked.request().and_then(|request| Some((request.sensor, request.verb?, request.model)));
@@ -200,7 +202,96 @@ impl ControlServer {
     }
 }
 
-/// Descriptors of the connection to a client: both directions, and the memory of its requests.
+/// The link's end of its queue.
+pub struct ControlQueue {
+    sensor: String,
+    /// Whether a user has paused the sensor.
+    paused: bool,
+    queue: Receiver<QueuedRequest>,
+    changed: Changed,
+    event: Arc<EventFd>,
+    outcomes: Sender<(u64, Outcome)>,
+    server: Arc<EventFd>,
+}
+
+/// The source of a link's data. A user can pause, resume or restart it.
+pub(crate) enum Flow<'a> {
+    /// A session with a sensor.
+    Session(&'a mut PortSession),
+    /// The port is missing.
+    Away,
+    /// The player of a recording.
+    Recording(&'a Player),
+}
+
+impl ControlQueue {
+    /// Returns whether a user has paused the sensor. A pause continues while the port is missing.
+    pub(crate) fn is_paused(&self) -> bool {
+        self.paused
+    }
+
+    /// Applies `control` to `flow` at `now`.
+    ///
+    /// # Errors
+    ///
+    /// [`Kind::Failed`] if a session has to be restarted and there is none.
+    pub(crate) fn control(
+        &mut self,
+        control: Control,
+        flow: &mut Flow<'_>,
+        now: Nanos,
+    ) -> Result<(), Failure> {
+        match flow {
+            Flow::Recording(player) => {
+                match control {
+                    Control::Pause => player.pause(),
+                    Control::Resume => player.resume(),
+                    Control::Resync => return Err(self.refusal("a recording has no session to restart")),
+                }
+                return Ok(());
+            }
+            Flow::Away if control == Control::Resync => return Err(self.refusal("the port is away")),
+            Flow::Away => {}
+            Flow::Session(session) => session.control(control, now),
+        }
+        self.paused = control == Control::Pause;
+        Ok(())
+    }
+
+    /// Takes the new settings of the processors, if they were changed since the last call.
+    pub(crate) fn changed(&self) -> Option<Box<Processing>> {
+        self.event.clear();
+        self.changed.lock().unwrap_or_else(PoisonError::into_inner).take()
+    }
+
+    /// Takes the next request from the queue.
+    pub(crate) fn take(&self) -> Option<QueuedRequest> {
+        self.event.clear();
+        self.queue.try_recv().ok()
+    }
+
+    /// Reports the outcome of request `number` to the server.
+    pub(crate) fn answer(&self, number: u64, outcome: Outcome) {
+        // Without a server, no client waits.
+        if self.outcomes.send((number, outcome)).is_ok() {
+            self.server.signal();
+        }
+    }
+
+    fn refusal(&self, why: &str) -> Failure {
+        let hint = format!("`scanhub info {}` shows its state", self.sensor);
+        Failure::new(Kind::Failed, format!("{}: {why}", self.sensor), hint)
+    }
+}
+
+impl AsFd for ControlQueue {
+    /// Readable while a request or new settings wait.
+    fn as_fd(&self) -> BorrowedFd<'_> {
+        self.event.as_fd()
+    }
+}
+
+/// Descriptors of a connection to a client: both directions, and the memory of its requests.
 const CLIENT_DESCRIPTORS: u64 = 4;
-/// Requests that wait for a link; whoever asks faster is told to come back.
+/// Maximum number of waiting requests for each link. Further requests are refused.
 const QUEUE: usize = 4;

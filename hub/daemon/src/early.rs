@@ -1,63 +1,64 @@
-//! Warnings by the part of a scan that is there, while the rest of it is on the line or not even measured: a telegram of 361
-//! values takes 14.6 ms at 500 kBd, a turn of a head 100 ms, and what is near stands in it long before its end. Says slow or
-//! stop, never clear; what it said of a scan that is not published, or that looks better as it goes on, it takes back. Refuses
-//! to know topics, and whether anybody listens.
+//! Early warnings from an incomplete scan, while its rest is still on the line or not measured yet. A telegram of 361
+//! values takes 14.6 ms at 500 kBd and a revolution 100 ms, and a near object is often seen long before the end. A
+//! warning is slow or stop, never clear. It is withdrawn if its scan is not published, or if a later part of the scan
+//! refutes it.
 
 use preprocess::zones::{Check, Warning};
 use scanhub_drivers::line::RawScan;
 use schema::{Contents, Early, Scan, Verdict};
 
-/// What was said of the scan that is arriving.
+/// Warns of objects in the scan that is arriving.
 pub(crate) struct EarlyWarner {
-    /// The scan so far.
+    /// The measured part of the scan.
     scan: Box<Scan>,
-    said: Option<Said>,
+    /// The warning that was published for this scan, and that its zones have not confirmed yet.
+    warning: Option<PublishedWarning>,
 }
 
-/// A warning that nothing has confirmed.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-struct Said {
-    /// Of which scan of its session.
-    number: u64,
-    word: Word,
+struct PublishedWarning {
+    /// Number of the scan in its session.
+    scan: u64,
+    message: EarlyMessage,
 }
 
-/// A warning, or what takes it back, and its number in the topics: the zones of its scan have no lesser one.
+/// A warning or its withdrawal, with its sequence number. The number is not greater than that of the zones of its scan.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) struct Word {
+pub(crate) struct EarlyMessage {
     pub(crate) seq: u64,
     pub(crate) early: Early,
 }
 
 impl EarlyWarner {
-    /// For scans of at most `beams` beams.
+    /// Creates a warner for scans of at most `beams` beams.
     pub(crate) fn new(beams: usize) -> EarlyWarner {
-        EarlyWarner { scan: Scan::zeroed(Scan::len(beams, Contents::TURNING)), said: None }
+        EarlyWarner { scan: Scan::zeroed(Scan::len(beams, Contents::TURNING)), warning: None }
     }
 
-    /// What has to be said now that `check` knows as much of a scan as has `partial`: what was said of it is taken back if it does
-    /// not hold any more, and a warning is said if it is worse than what was. `next_seq` is the number of the next telegram.
-    pub(crate) fn look(
+    /// Checks an incomplete scan. Returns the withdrawal of an earlier warning that no longer holds, and a new warning
+    /// if it is worse than the earlier one. `next_seq` is the number of the next telegram.
+    pub(crate) fn update(
         &mut self,
         partial: &RawScan<'_>,
         check: &mut Check,
         next_seq: u64,
-    ) -> [Option<Word>; 2] {
-        let early = self.judge(partial, check);
-        let told = early.map_or(Verdict::Clear as u8, |early| early.verdict);
-        // Packets of the turn that came since may have the numbers of its zones, so what is said anew keeps its number.
-        let seq = self.said.map_or(next_seq, |said| said.word.seq);
-        let withdrawn = if self.verdict() > told { self.withdraw(None) } else { None };
-        let worse = early.filter(|_| told > self.verdict()).map(|early| {
-            let word = Word { seq, early };
-            self.said = Some(Said { number: partial.number, word });
-            word
+    ) -> [Option<EarlyMessage>; 2] {
+        let early = self.warning(partial, check);
+        let verdict = early.map_or(Verdict::Clear as u8, |early| early.verdict);
+        // A further warning keeps the number of the first: `next_seq` may be greater than the number of the zones by
+        // now.
+        let seq = self.warning.map_or(next_seq, |warning| warning.message.seq);
+        let withdrawn = if self.verdict() > verdict { self.withdraw(None) } else { None };
+        let worse = early.filter(|_| verdict > self.verdict()).map(|early| {
+            let message = EarlyMessage { seq, early };
+            self.warning = Some(PublishedWarning { scan: partial.number, message });
+            message
         });
         [withdrawn, worse]
     }
 
-    /// What `check` makes of the part of a scan that is there, if it is a warning.
-    fn judge(&mut self, partial: &RawScan<'_>, check: &mut Check) -> Option<Early> {
+    /// Returns the warning that an incomplete scan gives rise to.
+    fn warning(&mut self, partial: &RawScan<'_>, check: &mut Check) -> Option<Early> {
         let scan = &mut self.scan;
         partial.write(scan);
         let warning = check.early(scan.beams(), scan.unit_um, scan.ranges(), scan.exact_angles())?;
@@ -67,30 +68,212 @@ impl EarlyWarner {
         Some(Early { verdict: verdict as u8, flags: 0, beam, distance_mm, bytes_seen, beams_seen })
     }
 
-    /// Whether there is a warning that nothing has confirmed.
-    pub(crate) fn has_said(&self) -> bool {
-        self.said.is_some()
+    /// Returns whether a published warning is not confirmed yet.
+    pub(crate) fn has_warned(&self) -> bool {
+        self.warning.is_some()
     }
 
-    /// The scan `number` was published, and what was said of it holds.
+    /// Confirms the warning of scan `number`, whose zones were published.
     pub(crate) fn confirm(&mut self, number: u64) {
-        self.said = self.said.filter(|said| said.number != number);
+        self.warning = self.warning.filter(|warning| warning.scan != number);
     }
 
-    /// What has to be taken back now that the scan that is arriving is `number`, if one is.
-    pub(crate) fn withdraw(&mut self, number: Option<u64>) -> Option<Word> {
-        let Word { seq, early } = self.said.take_if(|said| Some(said.number) != number)?.word;
-        Some(Word { seq, early: Early { flags: Early::WITHDRAWN, ..early } })
+    /// Returns the withdrawal of an unconfirmed warning of any scan but `number`, the one that is arriving.
+    pub(crate) fn withdraw(&mut self, number: Option<u64>) -> Option<EarlyMessage> {
+        let warning = self.warning.take_if(|warning| Some(warning.scan) != number)?;
+        let EarlyMessage { seq, early } = warning.message;
+        Some(EarlyMessage { seq, early: Early { flags: Early::WITHDRAWN, ..early } })
     }
 
     fn verdict(&self) -> u8 {
-        self.said.map_or(Verdict::Clear as u8, |said| said.word.early.verdict)
+        self.warning.map_or(Verdict::Clear as u8, |warning| warning.message.early.verdict)
     }
 }
 
-// A worse verdict is a greater number.
+// A worse verdict has a greater number.
 const _: () = assert!((Verdict::Clear as u8) < Verdict::Slow as u8);
 const _: () = assert!((Verdict::Slow as u8) < Verdict::Stop as u8);
 
 #[cfg(test)]
-mod tests;
+mod tests {
+    use fastrand::Rng;
+    use preprocess::zones::{Sector, Settings};
+    use scanhub_drivers::line::grid::{NO_RETURN, Point};
+    use scanhub_drivers::line::{Values, revolution_head};
+    use schema::{Family, Pose, Zones};
+
+    use super::*;
+
+    const BEAMS: usize = 90;
+
+    /// Points of a revolution with near objects, in an order in which each comes at most `late` places late.
+    fn points(random: &mut Rng, late: usize) -> Vec<Point> {
+        let count = random.usize(40..200);
+        let near: Vec<(f32, f32, u16)> = (0..random.usize(..4))
+            .map(|_| (6.2 * random.f32(), 0.3 * random.f32(), random.u16(..1300)))
+            .collect();
+        let mut points: Vec<(usize, Point)> = (0..count)
+            .map(|i| {
+                let clockwise = i as f32 / count as f32 * std::f32::consts::TAU - 0.03;
+                let is_at = |place: &&(f32, f32, u16)| (clockwise - place.0).abs() < place.1;
+                let found = near.iter().find(is_at).map_or(5000, |place| place.2 + random.u16(..30));
+                let range = if random.u8(..20) == 0 { NO_RETURN } else { found };
+                (i + random.usize(..=late), Point { angle: -clockwise, range, intensity: 9 })
+            })
+            .collect();
+        points.sort_by_key(|(place, _)| *place);
+        points.into_iter().map(|(_, point)| point).collect()
+    }
+
+    fn turn(number: u64, points: &[Point]) -> RawScan<'_> {
+        // Each revolution has another period.
+        let (period, per_second) = (100_000_000 + 1_000 * number, 900.0);
+        RawScan {
+            number,
+            first: 0,
+            last: 0,
+            period,
+            reasons: 0,
+            bytes: 0,
+            head: revolution_head(Family::Ld, BEAMS, period, per_second, false),
+            values: Values::Points { points, per_second },
+        }
+    }
+
+    /// The zones of a whole revolution.
+    fn zones(check: &mut Check, turn: &RawScan<'_>) -> Zones {
+        let mut scan = Scan::zeroed(turn.payload_len());
+        turn.write(&mut scan);
+        let mut zones = Zones::unknown();
+        check.update(&scan, &mut zones);
+        zones
+    }
+
+    /// The state of a subscriber, which checks every message.
+    #[derive(Default)]
+    struct Subscriber {
+        /// The warning in force.
+        warning: Option<EarlyMessage>,
+        warned: usize,
+        withdrawn: usize,
+    }
+
+    impl Subscriber {
+        fn receive(&mut self, message: EarlyMessage) {
+            if message.early.is_withdrawn() {
+                let before = self.warning.take().expect("nothing to withdraw");
+                assert_eq!((before.seq, before.early.verdict), (message.seq, message.early.verdict));
+                self.withdrawn += 1;
+                return;
+            }
+            assert!(matches!(message.early.verdict(), Verdict::Slow | Verdict::Stop));
+            if let Some(before) = self.warning.replace(message) {
+                assert!(
+                    before.seq == message.seq && before.early.verdict < message.early.verdict,
+                    "{message:?}"
+                );
+            }
+            self.warned += 1;
+        }
+    }
+
+    #[test]
+    fn a_warning_that_is_not_withdrawn_is_confirmed_by_its_scan() {
+        let mut random = Rng::with_seed(28);
+        let (mut subscriber, mut confirmed, mut packets) = (Subscriber::default(), 0, 0);
+        for _ in 0..400 {
+            let own: Vec<Sector> = (0..random.usize(..3))
+                .map(|_| {
+                    let from_mdeg = random.i32(-180_000..180_000);
+                    Sector {
+                        from_mdeg,
+                        to_mdeg: from_mdeg + random.i32(..90_000),
+                        range_mm: random.u16(..900),
+                    }
+                })
+                .collect();
+            let settings = Settings {
+                self_min: &own,
+                margin_mm: random.u16(..50),
+                min_beams: random.u16(1..4),
+                min_scans: random.u16(1..4),
+                exact: random.bool(),
+                ..Settings::default()
+            };
+            let (x_m, y_m) = (2.0 * random.f64() - 1.0, 2.0 * random.f64() - 1.0);
+            let upside_down = random.bool().into();
+            let pose = Pose { x_m, y_m, yaw_rad: 6.0 * random.f64(), upside_down, ..Pose::default() };
+            let mut check = Check::new(pose, &settings, BEAMS);
+            let mut warner = EarlyWarner::new(BEAMS);
+            let late = if random.bool() { 0 } else { 20 };
+            let again = points(&mut random, late);
+            for number in 1..9 {
+                // Most revolutions see the same objects as the one before.
+                let points = if random.u8(..3) == 0 { points(&mut random, late) } else { again.clone() };
+                let is_over = random.u8(..4) > 0;
+                let end = if is_over { points.len() - 1 } else { random.usize(..points.len()) };
+                let mut seen = 0;
+                while seen < end {
+                    (seen, packets) = ((seen + random.usize(1..24)).min(end), packets + 1);
+                    warner.withdraw(Some(number)).into_iter().for_each(|message| subscriber.receive(message));
+                    let begun = turn(number, &points[..seen]);
+                    let messages = warner.update(&begun, &mut check, packets);
+                    messages.into_iter().flatten().for_each(|message| subscriber.receive(message));
+                }
+                if is_over {
+                    // The packet that ends the revolution has some of its points.
+                    packets += 1;
+                    if warner.has_warned() {
+                        let begun = turn(number, &points);
+                        let messages = warner.update(&begun, &mut check, packets);
+                        messages.into_iter().flatten().for_each(|message| subscriber.receive(message));
+                    }
+                    let zones = zones(&mut check, &turn(number, &points));
+                    warner.confirm(number);
+                    let warning = subscriber.warning.take();
+                    assert!(
+                        warning.as_ref().is_none_or(|warning| warning.seq < packets),
+                        "{warning:?} of {packets}"
+                    );
+                    let holds = |warning: &EarlyMessage| {
+                        zones.verdict().worse(warning.early.verdict()) == zones.verdict()
+                    };
+                    assert!(warning.as_ref().is_none_or(holds), "{warning:?} and {:?}", zones.verdict());
+                    confirmed += usize::from(warning.is_some());
+                } else {
+                    warner.withdraw(None).into_iter().for_each(|message| subscriber.receive(message));
+                    assert_eq!(subscriber.warning, None);
+                }
+            }
+        }
+        let Subscriber { warned, withdrawn, .. } = subscriber;
+        assert!(confirmed > 300 && withdrawn > 100, "{confirmed} confirmed, {withdrawn} withdrawn");
+        assert!(warned >= confirmed + withdrawn);
+    }
+
+    #[test]
+    fn a_warning_of_the_robots_own_body_is_withdrawn() {
+        let at = |degrees: f32, range| Point { angle: -degrees.to_radians(), range, intensity: 9 };
+        let own = [Sector { from_mdeg: -95_000, to_mdeg: -85_000, range_mm: 300 }];
+        let settings = Settings { self_min: &own, ..Settings::default() };
+        let mut check = Check::new(Pose::default(), &settings, BEAMS);
+        let mut warner = EarlyWarner::new(BEAMS);
+        zones(&mut check, &turn(1, &[at(10.0, 5000)]));
+        // Beam 22 points 88 degrees to the right. Its nearest point counts, and that is on the robot.
+        let mut turned: Vec<Point> = (0..BEAMS).map(|beam| at(4.0 * beam as f32, 5000)).collect();
+        turned.splice(22..23, [at(87.5, 500), at(88.5, 200)]);
+        turned[60].range = 800;
+        let mut update = |seen: usize| warner.update(&turn(2, &turned[..seen]), &mut check, 7);
+        assert_eq!(update(22), [None, None]);
+        let [None, Some(stop)] = update(23) else { panic!("no warning") };
+        let Early { verdict, beam, distance_mm, bytes_seen, beams_seen, flags } = stop.early;
+        assert_eq!((stop.seq, verdict, flags), (7, Verdict::Stop as u8, 0));
+        assert_eq!((beam, distance_mm, bytes_seen, beams_seen), (22, 500, 0, 23));
+        assert_eq!(update(23), [None, None], "each warning is published once");
+        let withdrawn = EarlyMessage { early: Early { flags: Early::WITHDRAWN, ..stop.early }, ..stop };
+        assert_eq!(update(24), [Some(withdrawn), None]);
+        let [None, Some(slow)] = update(BEAMS) else { panic!("no warning") };
+        assert_eq!(slow.early.verdict(), Verdict::Slow);
+        assert_eq!(zones(&mut check, &turn(2, &turned)).verdict(), Verdict::Slow);
+    }
+}

@@ -126,8 +126,8 @@ impl<'a, S: Surroundings> LinkCore<'a, S> {
         now >= self.next_status.min(self.next_greeting)
     }
 
-    /// Publishes the status if it has changed or is due, and sends late joiners what they missed. `error` is the message
-    /// of the status. Returns whether a status was published.
+    /// Publishes the status if it has changed or is due, and sends late joiners what they missed. `error` is the
+    /// message of the status. Returns whether a status was published.
     pub(crate) fn show(&mut self, session: Option<&PortSession>, state: State, error: &str) -> bool {
         let now = self.around.now();
         let changed = update(&mut self.stats, self.link, state, error, now);

@@ -1,5 +1,5 @@
-//! What the hub makes of each scan of a link: marks, lines, motion, zones, foreground. One after the other on the scan where it was
-//! decoded, each into the payload that is given. Refuses to know topics, and who listens.
+//! The processors of a link: they compute zones, marks, lines, motion and foreground from each scan. They run one after
+//! the other on the decoded scan, and write into the payloads of the caller.
 
 use std::fmt;
 
@@ -12,34 +12,34 @@ use preprocess::segments::Segmenter;
 use preprocess::zones::Check;
 use schema::{Background, Failure, Foreground, Kind, Lines, Marks, Motion, Pose, Scan, Verb, Zones};
 
-/// The processors of one link. Suspect scans take the same way as clean ones: an obstacle counts also where it is only
-/// suspected, and a background needs hundreds of scans in agreement, which the one bad one among them does not spoil.
+/// The processors of one link. They process suspect scans like clean ones: a suspected obstacle counts, and a
+/// background needs hundreds of scans in agreement, so that a bad one among them does no harm.
 pub(crate) struct Pipeline {
     pub(crate) zones: Check,
     marks: MarkDetector,
     lines: LineFinder,
     motion: MotionEstimator,
     background: Option<BackgroundStage>,
-    /// By which they are made.
+    /// Settings of the processors.
     processing: Processing,
-    /// The most beams of a scan.
+    /// Maximum number of beams of a scan.
     beams: usize,
-    /// Where a payload is written that nobody wants, or for which there is no memory.
+    /// Buffers for results that have no subscriber or no memory.
     spare: Spare,
 }
 
-/// A background, and what is known of it outside.
+/// The background model, and which of its states were published and saved.
 struct BackgroundStage {
     model: Model,
     cutter: Segmenter,
     every_scan: bool,
-    /// The generation that was published last.
+    /// Generation that was published last.
     published: Option<u32>,
-    /// Scans that it has learned from since.
+    /// Scans that the model has learned from since then.
     learned: u32,
-    /// The generation that was handed on last, and scans that it has learned from since.
+    /// Generation that was saved last, and the scans that the model has learned from since then.
     handed_on: (u32, u32),
-    /// Beams and unit in micrometres of the model, as far as something was learned or loaded.
+    /// Number of beams and unit in micrometers of the model, if anything was learned or loaded.
     shape: Option<(u16, u32)>,
 }
 
@@ -50,12 +50,12 @@ struct Spare {
     foreground: Box<Foreground>,
 }
 
-/// Why a background is learned again from a scan on.
+/// Reason to learn the background again.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Relearned {
-    /// The model was one of other beams or another unit.
+    /// The model has another number of beams or another unit.
     Shape(Mismatch),
-    /// Its beams look elsewhere.
+    /// The beams have other angles.
     Angles,
 }
 
@@ -68,7 +68,7 @@ impl fmt::Display for Relearned {
     }
 }
 
-/// Where to write what a scan tells beside its zones; nothing where nobody wants it or there is no memory.
+/// Payloads for the results of a scan other than zones. `None`: the topic has no subscriber, or there is no memory.
 #[derive(Default)]
 pub(crate) struct Outputs<'a> {
     pub(crate) marks: Option<&'a mut Marks>,
@@ -78,7 +78,7 @@ pub(crate) struct Outputs<'a> {
 }
 
 impl Pipeline {
-    /// The processors as configured, with the model to begin with, for scans of at most `beams` beams.
+    /// Creates the processors with the configured model, for scans of at most `beams` beams.
     pub(crate) fn new(processing: &Processing, beams: usize) -> Pipeline {
         let Processing { pose, zones, marks, lines, motion, background, early: _ } = processing;
         Pipeline {
@@ -98,13 +98,13 @@ impl Pipeline {
         }
     }
 
-    /// Forgets all that was learned, as at the start.
+    /// Returns to the state at the start.
     pub(crate) fn reset(&mut self) {
         *self = Pipeline::new(&self.processing, self.beams);
     }
 
-    /// Goes on as `processing` says, what it says of a begin aside. A check of other circles knows nothing until it has
-    /// seen its scans; a background stays, as far as it is known.
+    /// Applies other settings, except for the initial model. If circles change, the zones are unknown until enough
+    /// scans were checked. The background is kept.
     pub(crate) fn change(&mut self, processing: &Processing) {
         let before = std::mem::replace(&mut self.processing, processing.clone());
         let Processing { pose, zones, marks, lines, motion, background, early: _ } = &self.processing;
@@ -126,12 +126,13 @@ impl Pipeline {
         }
     }
 
-    /// Reads `scan` for its zones, which are wanted first. What has a memory learns from it, whoever wants to know.
+    /// Computes the zones of `scan`, which subscribers need first. The state of the zones is updated even without
+    /// `out`.
     pub(crate) fn watch(&mut self, scan: &Scan, out: Option<&mut Zones>) {
         self.zones.update(scan, out.unwrap_or(&mut self.spare.zones));
     }
 
-    /// Reads `scan` for all else. A model that does not fit it starts again; then the reason is returned.
+    /// Computes all other results of `scan`. Returns a reason if the background does not fit the scan and starts again.
     pub(crate) fn examine(&mut self, scan: &Scan, out: Outputs<'_>) -> Option<Relearned> {
         if let Some(marks) = out.marks {
             self.marks.update(scan, marks);
@@ -147,7 +148,7 @@ impl Pipeline {
                 self.lines.update(scan, lines);
                 self.motion.forget();
             }
-            // The one is found by the other.
+            // Motion is computed from lines.
             (lines, Some(motion)) => {
                 let lines = lines.unwrap_or(&mut self.spare.lines);
                 self.lines.update(scan, lines);
@@ -160,28 +161,28 @@ impl Pipeline {
         self.background.as_mut()?.update(scan, out.foreground, &mut self.spare.foreground)
     }
 
-    /// In how many pieces a telegram is read for who wants to be warned early.
+    /// Returns the number of reads per telegram while early warnings have a subscriber.
     pub(crate) fn pieces(&self) -> u8 {
         self.processing.early.pieces
     }
 
-    /// What to say of the zones when scans stay out.
+    /// Writes the zones for a time without scans: unknown.
     pub(crate) fn stale(&mut self, out: &mut Zones) {
         self.zones.stale(out);
     }
 
-    /// Whether there are foreground and background at all.
+    /// Returns whether there is a background model.
     pub(crate) fn keeps_background(&self) -> bool {
         self.background.is_some()
     }
 
-    /// Whether the model is published with every scan.
+    /// Returns whether the model is published with every scan.
     pub(crate) fn shows_every_scan(&self) -> bool {
         self.background.as_ref().is_some_and(|kept| kept.every_scan)
     }
 
-    /// Whether there is a model, of a generation that was not published, or that has had the time since to learn what
-    /// stands there.
+    /// Returns whether the model is worth publishing: its generation was not published yet, or it has learned since
+    /// then from as many scans as it needs for a new object.
     pub(crate) fn is_news(&self) -> bool {
         let is_new = |kept: &BackgroundStage| kept.published != Some(kept.model.generation());
         let has_learned = |kept: &BackgroundStage| kept.learned >= u32::from(kept.model.scans());
@@ -190,12 +191,12 @@ impl Pipeline {
             .is_some_and(|kept| kept.shape.is_some() && (is_new(kept) || has_learned(kept)))
     }
 
-    /// Returns the bytes of the model, if one is kept.
+    /// Returns the size of the model in bytes, 0 without one.
     pub(crate) fn model_len(&self) -> usize {
         self.background.as_ref().map_or(0, |kept| Background::len(kept.model.beams()))
     }
 
-    /// Writes the model, which is to be published, into `out`, if one is kept.
+    /// Writes the model into `out`, and counts it as published.
     pub(crate) fn show(&mut self, out: &mut Background) {
         if let Some(kept) = &mut self.background {
             kept.model.show(out);
@@ -204,8 +205,9 @@ impl Pipeline {
         }
     }
 
-    /// The model for the next hub, if that shall have it, and where the sensor sits: of a generation that was not handed on,
-    /// or that has learned since for as long as it takes; or, if it is `last` time, for however long.
+    /// Returns the model and the sensor's pose for the next hub if they are worth saving. They are if the generation
+    /// was not saved yet, or if the model has learned from as many scans as it needs. At the end of the hub (`last`),
+    /// one scan is enough.
     pub(crate) fn hand_on(&mut self, last: bool) -> Option<(Pose, Box<Background>)> {
         let Processing { pose, background, .. } = &self.processing;
         let kept = self.background.as_mut().filter(|kept| background.is_handed_on && !kept.is_moving())?;
@@ -218,10 +220,12 @@ impl Pipeline {
         Some((*pose, kept.shown()))
     }
 
-    /// Does what a user asks of the background of `sensor`; the model, for [`Verb::Show`]. `model` is that of a request
-    /// to load.
+    /// Handles a user's request for the background of `sensor`. Returns the model for [`Verb::Show`]. `model` is the model of
+    /// [`Verb::Load`].
     ///
-    /// [`Kind::Configuration`] if none is kept, or if `model` is another sensor's.
+    /// # Errors
+    ///
+    /// [`Kind::Configuration`] if there is no background, or if `model` does not fit the sensor.
     pub(crate) fn handle(
         &mut self,
         sensor: &str,
@@ -248,7 +252,7 @@ impl Pipeline {
                     "a model fits scans of its own resolution and unit: save one of this sensor as it is now";
                 Failure::new(Kind::Configuration, format!("{sensor}: {mismatch}"), hint)
             })?,
-            // The session's business.
+            // Handled by the session.
             Verb::Pause | Verb::Resume | Verb::Resync => {}
         }
         Ok(None)
@@ -268,14 +272,14 @@ impl BackgroundStage {
             shape: None,
         };
         if let Some(model) = background.model.as_ref().filter(|_| !kept.is_moving()) {
-            // Before the first scan every model is taken.
+            // Before the first scan, every model fits.
             let _ = kept.load(model);
             kept.handed_on.0 = kept.model.generation();
         }
         kept
     }
 
-    /// It is a map that the robot moves in.
+    /// Returns whether the model is a map that the robot moves in.
     fn is_moving(&self) -> bool {
         self.model.method() == Method::Moving
     }
@@ -286,7 +290,7 @@ impl BackgroundStage {
         Ok(())
     }
 
-    /// A copy of the model.
+    /// Returns a copy of the model.
     fn shown(&self) -> Box<Background> {
         let mut shown = Background::zeroed(Background::len(self.model.beams()));
         self.model.show(&mut shown);
@@ -305,7 +309,7 @@ impl BackgroundStage {
                 self.model.update(scan, out);
                 self.cutter.update(scan, out);
             }
-            // The segments of the next scan are supported by the points of this one.
+            // Segments of the next scan need the points of this one.
             None => {
                 self.model.update(scan, spare);
                 self.cutter.pass(scan, spare);
@@ -322,4 +326,150 @@ impl BackgroundStage {
 }
 
 #[cfg(test)]
-mod tests;
+mod tests {
+    use super::*;
+    use schema::{BackgroundHead, ScanHead, Verdict};
+
+    fn processing(change: impl FnOnce(&mut Processing)) -> Processing {
+        let mut processing = Processing::default();
+        processing.background.learning.scans = Some(4);
+        change(&mut processing);
+        processing
+    }
+
+    /// A wall at `range` all around.
+    fn wall(count: usize, unit_mm: u32, range: u16) -> Box<Scan> {
+        Scan::of(ScanHead::lms(count, -90_000, 500, unit_mm, 13), &vec![range; count])
+    }
+
+    fn pipeline(processing: &Processing) -> Pipeline {
+        Pipeline::new(processing, 401)
+    }
+
+    fn shown(pipeline: &mut Pipeline) -> Box<Background> {
+        let mut model = Background::zeroed(Background::len(401));
+        pipeline.show(&mut model);
+        model
+    }
+
+    #[test]
+    fn the_background_learns_and_zones_warn_without_subscribers() {
+        let mut pipeline = pipeline(&processing(|_| {}));
+        let mut zones = Zones::default();
+        for _ in 0..20 {
+            assert_eq!(pipeline.examine(&wall(361, 1, 3000), Outputs::default()), None);
+        }
+        let mut foreground = Foreground::of(361);
+        let near = wall(361, 1, 500);
+        let out = Outputs { foreground: Some(&mut foreground), ..Outputs::default() };
+        pipeline.watch(&near, Some(&mut zones));
+        assert_eq!(pipeline.examine(&near, out), None);
+        assert_eq!((zones.verdict(), foreground.beams), (Verdict::Stop, 361));
+        assert_eq!(foreground.segments().len(), 1, "segments are those of this scan");
+        let mut stale = Zones::default();
+        pipeline.stale(&mut stale);
+        assert_eq!((stale.verdict(), stale.count), (Verdict::Unknown, 2));
+    }
+
+    #[test]
+    fn a_generation_is_new_until_it_is_published() {
+        let mut pipeline = pipeline(&processing(|_| {}));
+        assert!(!pipeline.is_news(), "nothing was learned yet");
+        pipeline.examine(&wall(361, 1, 3000), Outputs::default());
+        assert!(pipeline.is_news());
+        assert_eq!((shown(&mut pipeline).generation, pipeline.is_news()), (0, false));
+        for (verb, is_news) in [(Verb::Freeze, false), (Verb::Thaw, false), (Verb::Reset, true)] {
+            assert_eq!(pipeline.handle("a", verb, &Box::<Background>::default()), Ok(None));
+            assert_eq!(pipeline.is_news(), is_news, "{verb:?}");
+        }
+        assert_eq!(shown(&mut pipeline).generation, 1);
+        let asked = pipeline
+            .handle("a", Verb::Show, &Box::<Background>::default())
+            .expect("is kept")
+            .expect("a model");
+        assert_eq!((asked.generation, asked.count), (1, 361));
+    }
+
+    #[test]
+    fn a_model_that_has_learned_enough_is_published_again() {
+        let mut pipeline = pipeline(&processing(|_| {}));
+        pipeline.examine(&wall(361, 1, 3000), Outputs::default());
+        assert_eq!(shown(&mut pipeline).taught, 0);
+        for _ in 0..3 {
+            pipeline.examine(&wall(361, 1, 3000), Outputs::default());
+            assert!(!pipeline.is_news());
+        }
+        pipeline.examine(&wall(361, 1, 3000), Outputs::default());
+        assert!(pipeline.is_news());
+        assert_eq!((shown(&mut pipeline).taught, pipeline.is_news()), (361, false));
+        pipeline.handle("a", Verb::Freeze, &Box::<Background>::default()).expect("is kept");
+        for _ in 0..9 {
+            pipeline.examine(&wall(361, 1, 3000), Outputs::default());
+        }
+        assert!(!pipeline.is_news(), "a frozen model stays as it is");
+    }
+
+    #[test]
+    fn a_model_that_does_not_fit_is_refused_or_starts_again() {
+        let head = BackgroundHead { unit_um: 10_000, ..BackgroundHead::default() };
+        let model = Background::of(head, &[300; 181]);
+        let kept = model.clone();
+        let mut pipeline = pipeline(&processing(|processing| processing.background.model = Some(kept)));
+        let (first, is_news) = (shown(&mut pipeline), pipeline.is_news());
+        assert_eq!((first.generation, first.taught, first.ranges()[180], is_news), (1, 181, 300, false));
+        let reason = pipeline.examine(&wall(361, 10, 300), Outputs::default());
+        assert_eq!(reason, Some(Relearned::Shape(Mismatch { model: (181, 10_000), sensor: (361, 10_000) })));
+        assert!(pipeline.is_news());
+        let refusal = pipeline.handle("a", Verb::Load, &model).expect_err("another resolution");
+        assert_eq!(refusal.kind, Kind::Configuration);
+        let words = "a: the model has 181 beams in units of 10 mm, the sensor's scans have 361 beams in units of 10 mm";
+        assert_eq!(refusal.message, words);
+        assert!(pipeline.examine(&wall(361, 1, 3000), Outputs::default()).is_some(), "another unit");
+        let mut turned = wall(361, 1, 3000);
+        turned.first_angle = -1.0;
+        shown(&mut pipeline);
+        assert_eq!(pipeline.examine(&turned, Outputs::default()), Some(Relearned::Angles));
+        assert_eq!((pipeline.is_news(), pipeline.examine(&turned, Outputs::default())), (true, None));
+    }
+
+    #[test]
+    fn other_settings_keep_the_background() {
+        let mut pipeline = pipeline(&processing(|_| {}));
+        for _ in 0..20 {
+            pipeline.examine(&wall(361, 1, 3000), Outputs::default());
+        }
+        let told = |pipeline: &mut Pipeline, range| {
+            let (mut zones, mut foreground) = (Zones::default(), Foreground::of(361));
+            let out = Outputs { foreground: Some(&mut foreground), ..Outputs::default() };
+            pipeline.watch(&wall(361, 1, range), Some(&mut zones));
+            assert_eq!(pipeline.examine(&wall(361, 1, range), out), None);
+            (zones.verdict(), foreground.beams)
+        };
+        let known = shown(&mut pipeline);
+        assert_eq!((told(&mut pipeline, 2000), known.taught), ((Verdict::Clear, 361), 361));
+        pipeline.change(&processing(|processing| processing.zones.radii_mm = vec![2500]));
+        assert!(!pipeline.is_news(), "the background is not concerned");
+        assert_eq!(told(&mut pipeline, 2000), (Verdict::Stop, 361));
+        pipeline.change(&processing(|processing| {
+            processing.background.learning.method = preprocess::background::Method::Paper;
+            processing.background.learning.threshold_mm = Some(1500);
+        }));
+        let changed = shown(&mut pipeline);
+        assert_eq!((changed.generation, changed.ranges()), (known.generation + 1, known.ranges()));
+        assert_eq!(told(&mut pipeline, 2000), (Verdict::Clear, 0), "the threshold is another one");
+        pipeline.change(&processing(|processing| processing.background.is_kept = false));
+        assert!(!pipeline.keeps_background());
+        pipeline.change(&processing(|_| {}));
+        assert_eq!((pipeline.keeps_background(), shown(&mut pipeline).taught), (true, 0));
+    }
+
+    #[test]
+    fn a_request_without_a_background_names_the_key() {
+        let mut pipeline = pipeline(&processing(|processing| processing.background.is_kept = false));
+        pipeline.examine(&wall(361, 1, 3000), Outputs::default());
+        assert!(!pipeline.keeps_background() && !pipeline.is_news() && !pipeline.shows_every_scan());
+        let refusal =
+            pipeline.handle("side", Verb::Show, &Box::<Background>::default()).expect_err("none is kept");
+        assert!(refusal.hint.contains("link.side.background.method=multi"), "{refusal}");
+    }
+}

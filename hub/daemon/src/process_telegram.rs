@@ -1,10 +1,11 @@
-//! Publishes what a session has received: telegrams and packets as they are, scans, and what the processors compute from them.
+//! Publishes what a session has received: telegrams and packets as they are, scans, and what the processors compute
+//! from them.
 
 use config::{Link, Processing};
 use scanhub_drivers::line::{RawScan, Received, Whole};
 use schema::{Background, Failure, Flags, Nanos, Pose, Verb, Wake, Zones};
 
-use crate::early::{EarlyWarner, Word};
+use crate::early::{EarlyMessage, EarlyWarner};
 use crate::pipeline::Pipeline;
 use crate::surroundings::Surroundings;
 use crate::topics::Topics;
@@ -61,8 +62,8 @@ impl<'a, S: Surroundings> LinkOutput<'a, S> {
         LinkOutput { link, around, topics, pipeline, early, stale_at: Nanos::MAX, is_blind: false }
     }
 
-    /// Publishes a telegram and the scan that it contains, if that can be read. Values in `recorded` replace those of the session. A
-    /// telegram that `is_behind` was buffered for an unknown time.
+    /// Publishes a telegram and the scan that it contains, if that can be read. Values in `recorded` replace those of
+    /// the session. A telegram that `is_behind` was buffered for an unknown time.
     pub(crate) fn process_telegram(
         &mut self,
         received: &Received<'_>,
@@ -95,8 +96,8 @@ impl<'a, S: Surroundings> LinkOutput<'a, S> {
         Processed { is_suspect: received.reasons != 0, stands_for: None }
     }
 
-    /// Publishes a scan whose packets were published. One that `is_behind` was buffered for an unknown time. Returns how long the
-    /// verdict on it stays valid.
+    /// Publishes a scan whose packets were published. One that `is_behind` was buffered for an unknown time. Returns
+    /// how long the verdict on it stays valid.
     pub(crate) fn process_revolution(
         &mut self,
         scan: &RawScan<'_>,
@@ -120,34 +121,34 @@ impl<'a, S: Surroundings> LinkOutput<'a, S> {
         if self.topics.wants_early() { self.pipeline.pieces() } else { 1 }
     }
 
-    /// Publishes a warning if the `partial` scan gives one and a subscriber wants it. Withdraws a warning of another scan, and one that
-    /// no longer holds.
+    /// Publishes a warning if the `partial` scan gives one and a subscriber wants it. Withdraws a warning of another
+    /// scan, and one that no longer holds.
     pub(crate) fn foresee(&mut self, partial: Option<&RawScan<'_>>) {
         self.withdraw(partial.map(|partial| partial.number));
         let Some(partial) = partial.filter(|_| self.topics.wants_early()) else { return };
-        let [withdrawn, worse] = self.early.look(partial, &mut self.pipeline.zones, self.topics.next_seq());
-        self.take_back(withdrawn);
-        if let Some(word) = worse {
+        let [withdrawn, worse] = self.early.update(partial, &mut self.pipeline.zones, self.topics.next_seq());
+        self.publish_withdrawal(withdrawn);
+        if let Some(warning) = worse {
             let &RawScan { first, last, reasons, period, .. } = partial;
-            self.topics.early(&word, first, last, reasons, micros(period));
+            self.topics.early(&warning, first, last, reasons, micros(period));
         }
     }
 
-    /// Whether something was said of a scan that is not complete.
+    /// Returns whether a warning was published for a scan that is not complete yet.
     pub(crate) fn has_warned(&self) -> bool {
-        self.early.has_said()
+        self.early.has_warned()
     }
 
-    /// Takes back what was said of another scan than `number`.
+    /// Withdraws the warning of any scan but `number`.
     pub(crate) fn withdraw(&mut self, number: Option<u64>) {
         let withdrawn = self.early.withdraw(number);
-        self.take_back(withdrawn);
+        self.publish_withdrawal(withdrawn);
     }
 
-    fn take_back(&mut self, withdrawn: Option<Word>) {
-        if let Some(word) = withdrawn {
+    fn publish_withdrawal(&mut self, withdrawn: Option<EarlyMessage>) {
+        if let Some(message) = withdrawn {
             let now = self.around.now();
-            self.topics.early(&word, now, now, 0, 0);
+            self.topics.early(&message, now, now, 0, 0);
         }
     }
 
@@ -158,8 +159,8 @@ impl<'a, S: Surroundings> LinkOutput<'a, S> {
         }
     }
 
-    /// Publishes `scan` and what the processors compute from it. The verdict stays valid for `stands_for`; that on a scan that
-    /// `is_behind` is not known.
+    /// Publishes `scan` and what the processors compute from it. The verdict stays valid for `stands_for`; that on a
+    /// scan that `is_behind` is not known.
     fn publish_scan(&mut self, scan: &RawScan<'_>, stands_for: Nanos, is_behind: bool) {
         // What waited in the port does not tell how it looks around the robot now.
         self.pipeline.zones.doubt(is_behind);

@@ -1,5 +1,5 @@
-//! A link whose other end is a recording. Telegrams are played in their order, with the times between them that were recorded, or
-//! as fast as they can be read. The hub sends no requests, because nothing could answer them.
+//! A link whose other end is a recording. Telegrams are played in their order, with the times between them that were
+//! recorded, or as fast as they can be read. The hub sends no requests, because nothing could answer them.
 
 mod frames;
 mod recorded;
@@ -84,14 +84,14 @@ impl<'a, 'p> ReplayLink<'a, 'p> {
         ReplayLink { link, handle, trouble, look_at: 0 }
     }
 
-    /// Waits a moment until somebody is attached: who starts a hub and a consumer together wants the recording from its
-    /// beginning.
+    /// Waits for a short time until a subscriber is attached: a user who starts a hub and a subscriber together wants
+    /// the recording from its beginning.
     fn await_consumer(&mut self) -> Woken {
-        let (mut until, mut is_heard) = (clock::now() + FIRST_CONSUMER, false);
+        let (mut until, mut has_subscribers) = (clock::now() + FIRST_CONSUMER, false);
         while clock::now() < until {
-            if !is_heard && self.link.output.topics.is_heard() {
-                is_heard = true;
-                // One consumer follows several topics, and others are started with it.
+            if !has_subscribers && self.link.output.topics.has_subscribers() {
+                has_subscribers = true;
+                // A program subscribes to several topics, and others may start with it.
                 until = until.min(clock::now() + OTHER_TOPICS);
             }
             self.link.show(None, State::Starting, "");

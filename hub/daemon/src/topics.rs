@@ -1,26 +1,22 @@
-//! The topics of one link: numbers every sample, fills it in place, sends it, wakes the consumers. A sample for which
-//! there is no memory is counted and its number used up, so that consumers see the gap; nothing ever waits for one.
-
-mod moment;
-mod prepared_publisher;
+//! The topics of one link: numbers the samples, fills them in place, sends them, and wakes the subscribers. Nothing
+//! waits for memory. A sample without memory is counted and its number is skipped, so that subscribers notice the gap.
 
 use scanhub_drivers::line::{RawScan, Received};
-use schema::ipc::DueRings;
+use schema::ipc::{DueRings, Medium, Payload, TopicPublisher};
+use schema::limits::history;
 use schema::{
     Background, Early, Failure, Family, Flags, Foreground, Header, Lines, MILLIS, Marks, Motion, Nanos,
     Quality, Ring, Scan, Status, Wake, Zones,
 };
 
-use crate::early::Word;
+use crate::early::EarlyMessage;
 use crate::pipeline::{Outputs, Pipeline, Relearned};
 use crate::surroundings::Surroundings;
-use moment::{of_moment, wall};
-use prepared_publisher::PreparedPublisher;
 
-/// A topic in the surroundings of a link.
+/// A topic of a link.
 type Publisher<P, S> = PreparedPublisher<P, <S as Surroundings>::Medium<P>>;
 
-/// The publishing end of one sensor; stays in its link's thread.
+/// Publishers of all topics of one sensor. They belong to the thread of its link.
 pub(crate) struct Topics<'a, S: Surroundings> {
     around: &'a S,
     telegram: Publisher<[u8], S>,
@@ -33,22 +29,26 @@ pub(crate) struct Topics<'a, S: Surroundings> {
     foreground: Publisher<Foreground, S>,
     background: Publisher<Background, S>,
     status: Publisher<Status, S>,
-    /// The last scan, which is read while others have its sample already.
+    /// The last scan. Processors read it after its sample was sent.
     decoded: Box<Scan>,
-    /// What was sent and not rung for.
+    /// Samples that were sent, but whose subscribers were not woken yet.
     due: DueRings,
-    /// What the next sample's header begins with.
+    /// Template for the header of the next sample.
     header: Header,
-    /// Its wall clock is that of a recording.
+    /// Whether `header.wall_ns` comes from a recording.
     is_recalled: bool,
     next_seq: u64,
-    /// Whether anybody follows packets, and when that was asked.
+    /// Whether packets have a subscriber, as of `checked_at`.
     has_followers: bool,
-    asked_at: Nanos,
+    checked_at: Nanos,
 }
 
 impl<'a, S: Surroundings> Topics<'a, S> {
-    /// Makes the topics of `sensor`, number `number` in the configuration, for the hub's life `boot`.
+    /// Creates the topics of `sensor`, which is number `number` in the configuration. `boot` identifies the run of the hub.
+    ///
+    /// # Errors
+    ///
+    /// [`Kind::Short`](schema::Kind::Short) if no memory or descriptors are left.
     pub(crate) fn new(around: &'a S, sensor: &str, number: u8, boot: u64) -> Result<Self, Failure> {
         let header = Header { sensor: number, boot, hub_pid: std::process::id(), ..Header::default() };
         Ok(Topics {
@@ -69,11 +69,11 @@ impl<'a, S: Surroundings> Topics<'a, S> {
             is_recalled: false,
             next_seq: 0,
             has_followers: false,
-            asked_at: 0,
+            checked_at: 0,
         })
     }
 
-    /// What all samples from now on have in common: bits of [`Flags`].
+    /// Sets the [`Flags`] of all further samples.
     pub(crate) fn set_flags(&mut self, flags: u8) {
         self.header.flags = flags;
     }
@@ -83,13 +83,13 @@ impl<'a, S: Surroundings> Topics<'a, S> {
         self.header.family = family.map_or(Family::UNKNOWN, |family| family as u8);
     }
 
-    /// What is published from now on, until the next call, was recorded at `wall_ns`, and has these [`Flags`].
+    /// Sets the wall clock and the [`Flags`] of samples from a recording, until the next call.
     pub(crate) fn recall(&mut self, wall_ns: u64, flags: u8) {
         (self.header.wall_ns, self.header.flags, self.is_recalled) = (wall_ns, flags, true);
     }
 
-    /// Takes loans for a telegram as long as the last one and for what `pipeline` makes of its scan, which will be there
-    /// in a moment.
+    /// Takes loans for a telegram that is about to arrive, if it is as long as the last one, and for the results of
+    /// `pipeline`.
     pub(crate) fn prepare(&mut self, pipeline: &Pipeline) {
         self.telegram.prepare();
         self.scan.prepare();
@@ -105,20 +105,20 @@ impl<'a, S: Surroundings> Topics<'a, S> {
         }
     }
 
-    /// Publishes the telegram and takes its number and stamps for all that follows from it.
+    /// Publishes a telegram. Later samples have its number and its stamps, until the next telegram.
     pub(crate) fn telegram(&mut self, received: &Received<'_>, period_us: u32) {
         self.begin_telegram(received, period_us);
         self.telegram.send_bytes(received.bytes, &self.header, &mut self.due);
     }
 
-    /// As [`telegram`](Self::telegram), of packets, of which there are many and which most do not follow: whether anybody does is
-    /// asked now and then.
+    /// Does the same as [`telegram`](Self::telegram) for packets. There are many, and few programs subscribe to them,
+    /// so the hub checks for subscribers only every 20 ms.
     pub(crate) fn packets(&mut self, received: &Received<'_>) {
-        // The period belongs to the scan.
+        // A packet has no period, only its scan has.
         self.begin_telegram(received, 0);
-        if received.last >= self.asked_at + UNASKED {
-            self.asked_at = received.last;
-            self.has_followers = self.telegram.is_heard();
+        if received.last >= self.checked_at + CHECK_INTERVAL {
+            self.checked_at = received.last;
+            self.has_followers = self.telegram.has_subscribers();
         }
         if self.has_followers {
             self.telegram.send_bytes(received.bytes, &self.header, &mut self.due);
@@ -134,13 +134,13 @@ impl<'a, S: Surroundings> Topics<'a, S> {
         self.header.flags |= if received.estimated { Flags::STAMP_ESTIMATED } else { 0 };
     }
 
-    /// Takes over when a scan that the last telegram completed was measured, from its first beam to its last, and why it is
-    /// suspect, for all that follows from it.
+    /// Sets the stamps, the period, and the [`Reasons`](schema::Reasons) for a scan that the last telegram completed.
+    /// `first` and `last` are the times of its first and last beam.
     pub(crate) fn begin_scan(&mut self, first: Nanos, last: Nanos, reasons: u8, period_us: u32) {
         let now = self.around.now();
         (self.header.stamp_first_ns, self.header.stamp_last_ns) = (first, last);
         if !self.is_recalled {
-            self.header.wall_ns = wall(self.around, first, now);
+            self.header.wall_ns = wall_clock(self.around, first, now);
         }
         self.header.set_sent_at(now);
         self.header.period_us = period_us;
@@ -150,9 +150,9 @@ impl<'a, S: Surroundings> Topics<'a, S> {
         self.header.flags &= !Flags::STAMP_ESTIMATED;
     }
 
-    /// Publishes a scan of the last telegram and its zones, and wakes
-    /// those who wait for these; then whatever else `pipeline` makes of it. Marks, lines, motion and foreground that nobody wants are
-    /// not made. A background that does not fit the scan starts again; then it is told why.
+    /// Publishes a scan of the last telegram with its zones, and wakes their subscribers. Then publishes the other
+    /// results of `pipeline`. Marks, lines, motion and foreground without a subscriber are not computed. Returns a
+    /// reason if the background starts again, because it does not fit the scan.
     pub(crate) fn scan(&mut self, raw: &RawScan<'_>, pipeline: &mut Pipeline) -> Option<Relearned> {
         let len = raw.payload_len();
         let (mut scan, mut zones) = (self.scan.loan(len), self.zones.loan(0));
@@ -192,26 +192,33 @@ impl<'a, S: Surroundings> Topics<'a, S> {
         relearned
     }
 
-    /// The number of the next telegram.
+    /// Returns the number of the next telegram.
     pub(crate) fn next_seq(&self) -> u64 {
         self.next_seq
     }
 
-    /// Whether anybody wants to be warned before a scan is complete.
+    /// Returns whether `early` has a subscriber.
     pub(crate) fn wants_early(&self) -> bool {
-        self.early.is_heard()
+        self.early.has_subscribers()
     }
 
-    /// Publishes `word`, which a part of a scan from `first` to `last` tells, and wakes those who wait for that alone. `reasons`
-    /// are why it is suspect already.
-    pub(crate) fn early(&mut self, word: &Word, first: Nanos, last: Nanos, reasons: u8, period_us: u32) {
+    /// Publishes an early warning and wakes its subscribers. `first` and `last` are the times of the measured part of
+    /// the scan. `reasons` are the [`Reasons`](schema::Reasons) so far.
+    pub(crate) fn early(
+        &mut self,
+        message: &EarlyMessage,
+        first: Nanos,
+        last: Nanos,
+        reasons: u8,
+        period_us: u32,
+    ) {
         let now = self.around.now();
         let quality = if reasons == 0 { Quality::Clean } else { Quality::Suspect };
         let mut header = Header {
-            seq: word.seq,
+            seq: message.seq,
             stamp_first_ns: first,
             stamp_last_ns: last,
-            wall_ns: wall(self.around, first, now),
+            wall_ns: wall_clock(self.around, first, now),
             quality: quality as u8,
             reasons,
             period_us,
@@ -221,7 +228,7 @@ impl<'a, S: Surroundings> Topics<'a, S> {
         header.set_sent_at(now);
         let mut loan = self.early.loan(0);
         if let Some(payload) = Publisher::<Early, S>::payload_mut(&mut loan) {
-            *payload = word.early;
+            *payload = message.early;
         }
         self.early.send(loan, &header, &mut self.due);
         if self.due.take(Ring::Early) {
@@ -238,19 +245,19 @@ impl<'a, S: Surroundings> Topics<'a, S> {
         pipeline.examine(scan, Outputs::default());
     }
 
-    /// Publishes that nothing is known of the zones as of `now`, for scans stay out.
+    /// Publishes that the zones are unknown as of `now`, because no scans arrive.
     pub(crate) fn stale(&mut self, pipeline: &mut Pipeline, now: u64) {
         let mut loan = self.zones.loan(0);
         pipeline.stale(Publisher::<Zones, S>::payload_mut(&mut loan).unwrap_or(&mut Zones::default()));
-        let header = self.of_moment(now);
+        let header = self.header_at(now);
         self.zones.send(loan, &header, &mut self.due);
     }
 
-    /// Publishes the background as of `now`, if it is one that was not published; whether it was.
+    /// Publishes the background as of `now` if it is new. Returns whether it was published.
     pub(crate) fn background(&mut self, pipeline: &mut Pipeline, now: u64) -> bool {
         let is_news = pipeline.is_news();
         if is_news {
-            self.show(pipeline, &self.of_moment(now));
+            self.show(pipeline, &self.header_at(now));
         }
         is_news
     }
@@ -261,46 +268,50 @@ impl<'a, S: Surroundings> Topics<'a, S> {
         if let Some(payload) = Publisher::<Status, S>::payload_mut(&mut loan) {
             *payload = *status;
         }
-        let header = self.of_moment(now);
+        let header = self.header_at(now);
         self.status.send(loan, &header, &mut self.due);
     }
 
-    /// Wakes whoever sleeps and was not woken since a sample came for him; once per telegram, after its last sample.
+    /// Wakes the subscribers that have received samples since they were last woken. Called once per telegram, after its
+    /// last sample.
     pub(crate) fn wake(&mut self, why: Wake) {
         Ring::ALL.into_iter().for_each(|ring| self.ring(ring));
         self.around.tell(why);
     }
 
-    /// Wakes whoever got the packets that were published just now: who follows scans alone sleeps on.
+    /// Wakes the subscribers of the packets that were just published. Subscribers of scans alone are not woken.
     pub(crate) fn wake_for_packets(&mut self) {
         if self.telegram.has_reached() {
             self.wake(Wake::Telegram);
         }
     }
 
-    /// Wakes who sleeps at the bell, if that is due: a call of the system that nobody needs is not made.
+    /// Rings the doorbell `ring` if samples were sent since the last time, to save the system call otherwise.
     fn ring(&mut self, ring: Ring) {
         if self.due.take(ring) {
             self.around.ring(ring);
         }
     }
 
-    /// Gives late joiners what they would else get with the next sample.
+    /// Gives new subscribers the history that they would otherwise get with the next sample.
     pub(crate) fn greet(&self) {
         self.status.connect();
         self.zones.connect();
         self.background.connect();
     }
 
-    /// Whether anybody is attached to anything.
-    pub(crate) fn is_heard(&self) -> bool {
-        let of_telegrams = self.telegram.is_heard() || self.scan.is_heard() || self.zones.is_heard();
-        let of_wanted = self.marks.is_heard() || self.foreground.is_heard() || self.background.is_heard();
-        let of_moved = self.lines.is_heard() || self.motion.is_heard();
-        of_telegrams || of_wanted || of_moved || self.early.is_heard() || self.status.is_heard()
+    /// Returns whether any topic has a subscriber.
+    pub(crate) fn has_subscribers(&self) -> bool {
+        let of_telegrams =
+            self.telegram.has_subscribers() || self.scan.has_subscribers() || self.zones.has_subscribers();
+        let of_wanted = self.marks.has_subscribers()
+            || self.foreground.has_subscribers()
+            || self.background.has_subscribers();
+        let of_moved = self.lines.has_subscribers() || self.motion.has_subscribers();
+        of_telegrams || of_wanted || of_moved || self.early.has_subscribers() || self.status.has_subscribers()
     }
 
-    /// Samples without memory.
+    /// Returns the number of samples that were dropped because there was no memory.
     pub(crate) fn loan_failed(&self) -> u64 {
         let of_scans = self.scan.failed() + self.zones.failed() + self.marks.failed() + self.lines.failed();
         let of_moved = self.motion.failed();
@@ -308,9 +319,9 @@ impl<'a, S: Surroundings> Topics<'a, S> {
         self.telegram.failed() + of_scans + of_moved + of_models + self.early.failed() + self.status.failed()
     }
 
-    /// Consumers that got nothing although they are attached: their descriptors or ours ran out, and sending says Ok
-    /// all the same. Of a topic nothing is known while nothing is sent: of those of telegrams unless they come
-    /// (`streaming`), of the background ever.
+    /// Returns the number of subscribers that are attached but did not get the last sample, because their descriptors
+    /// or those of the hub ran out. (Sending succeeds nevertheless.) The topics of telegrams count only while telegrams
+    /// arrive (`streaming`). The background never counts, because it is seldom sent.
     pub(crate) fn unreached(&self, streaming: bool) -> usize {
         if !streaming {
             return self.status.missed_out();
@@ -323,22 +334,27 @@ impl<'a, S: Surroundings> Topics<'a, S> {
         of_telegrams.max(of_wanted).max(of_moved).max(self.status.missed_out())
     }
 
-    /// Whether anybody follows what the sensor measures: of the status alone nobody needs a scanner that measures.
+    /// Returns whether any topic other than `status` has a subscriber. Otherwise the scanner may stop.
     pub(crate) fn is_followed(&self) -> bool {
-        let of_scans = self.scan.is_heard() || self.zones.is_heard() || self.marks.is_heard();
+        let of_scans =
+            self.scan.has_subscribers() || self.zones.has_subscribers() || self.marks.has_subscribers();
         of_scans
-            || self.lines.is_heard()
-            || self.motion.is_heard()
-            || self.early.is_heard()
-            || self.telegram.is_heard()
-            || self.foreground.is_heard()
-            || self.background.is_heard()
+            || self.lines.has_subscribers()
+            || self.motion.has_subscribers()
+            || self.early.has_subscribers()
+            || self.telegram.has_subscribers()
+            || self.foreground.has_subscribers()
+            || self.background.has_subscribers()
     }
 
-    fn of_moment(&self, now: u64) -> Header {
-        let wall_ns =
-            if self.is_recalled { self.header.wall_ns } else { wall(self.around, now, self.around.now()) };
-        of_moment(&self.header, now, wall_ns)
+    /// Returns the header of a sample that is published at `now` without a telegram.
+    fn header_at(&self, now: u64) -> Header {
+        let wall_ns = if self.is_recalled {
+            self.header.wall_ns
+        } else {
+            wall_clock(self.around, now, self.around.now())
+        };
+        header_without_telegram(&self.header, now, wall_ns)
     }
 
     fn show(&mut self, pipeline: &mut Pipeline, header: &Header) {
@@ -352,11 +368,183 @@ impl<'a, S: Surroundings> Topics<'a, S> {
     }
 }
 
-/// Memory for a scan of `len` bytes, which is made longer once where it is too short.
+/// Publisher of one topic, which takes a loan before the sample arrives.
+///
+/// A topic without a history is not sent while it has no subscriber, and its number is skipped. Sending visits the
+/// slots of all possible subscribers, and after a pause none of them is in the processor's cache.
+struct PreparedPublisher<P: Payload + ?Sized, M: Medium<P>> {
+    topic: TopicPublisher<P, M>,
+    /// Subscribers that got the last sample.
+    reached: usize,
+    /// Loan for the next sample, with the length of the last one.
+    prepared: Option<M::Loan>,
+    last_len: usize,
+}
+
+impl<P: Payload + ?Sized, M: Medium<P>> PreparedPublisher<P, M> {
+    /// Opens the topic of `sensor`.
+    fn new(around: &impl Surroundings<Medium<P> = M>, sensor: &str) -> Result<Self, Failure> {
+        let topic = TopicPublisher::over(around.medium::<P>(sensor)?);
+        Ok(PreparedPublisher { topic, reached: 0, prepared: None, last_len: 0 })
+    }
+
+    /// Takes a loan for the sample that is about to arrive, and connects new subscribers.
+    fn prepare(&mut self) {
+        if self.prepared.is_none() && self.is_wanted() {
+            self.prepared = self.topic.loan(self.last_len).ok();
+        }
+        // Connects now instead of while the telegram waits. It also brings the slots into the cache.
+        self.connect();
+    }
+
+    /// Takes a loan for the next sample. `len` is its size in bytes if the payload has no fixed size.
+    fn loan(&mut self, len: usize) -> Loan<M::Loan> {
+        if !self.is_wanted() {
+            return Loan::Unwanted;
+        }
+        if self.last_len != len {
+            self.last_len = len;
+            self.prepared = None;
+        }
+        self.prepared.take().or_else(|| self.topic.loan(len).ok()).map_or(Loan::Lacking, Loan::Taken)
+    }
+
+    /// Returns the payload of `loan`, if there is memory for it.
+    fn payload_mut(loan: &mut Loan<M::Loan>) -> Option<&mut P> {
+        match loan {
+            Loan::Taken(loan) => Some(M::payload_mut(loan)),
+            Loan::Lacking | Loan::Unwanted => None,
+        }
+    }
+
+    /// Sends a sample from [`loan`](Self::loan), and notes in `due` which doorbell has to ring.
+    fn send(&mut self, loan: Loan<M::Loan>, header: &Header, due: &mut DueRings) {
+        match loan {
+            Loan::Taken(loan) => {
+                // The topic counts a failure.
+                if let Ok(reached) = self.topic.send_loan(loan, header) {
+                    self.reached = reached;
+                    due.note(P::TOPIC, reached);
+                }
+            }
+            Loan::Lacking => self.topic.fail(),
+            Loan::Unwanted => self.skip(),
+        }
+    }
+
+    /// Skips the number of a sample that is not sent, because the topic has no subscriber.
+    fn skip(&mut self) {
+        self.topic.skip(1);
+        self.reached = 0;
+    }
+
+    /// Returns the number of samples that were dropped because there was no memory.
+    fn failed(&self) -> u64 {
+        self.topic.failed()
+    }
+
+    /// Returns whether samples are sent: the topic has a subscriber, or a history for later ones.
+    fn is_wanted(&self) -> bool {
+        history(P::TOPIC) > 0 || self.has_subscribers()
+    }
+
+    /// Returns whether the topic has a subscriber.
+    fn has_subscribers(&self) -> bool {
+        self.topic.subscribers() > 0
+    }
+
+    /// Returns whether a subscriber got the last sample.
+    fn has_reached(&self) -> bool {
+        self.reached > 0
+    }
+
+    /// Returns the number of attached subscribers that did not get the last sample.
+    fn missed_out(&self) -> usize {
+        let has_begun = self.topic.next_number() > 0;
+        if has_begun { self.topic.subscribers().saturating_sub(self.reached) } else { 0 }
+    }
+
+    /// Connects new subscribers, and gives them the history of the topic.
+    fn connect(&self) {
+        if let Err(error) = self.topic.connect() {
+            tracing::debug!(?error, "a subscriber could not be connected");
+        }
+    }
+}
+
+impl<M: Medium<[u8]>> PreparedPublisher<[u8], M> {
+    /// Publishes `bytes` if the topic has a subscriber.
+    fn send_bytes(&mut self, bytes: &[u8], header: &Header, due: &mut DueRings) {
+        let mut loan = self.loan(bytes.len());
+        if let Some(payload) = Self::payload_mut(&mut loan) {
+            payload.copy_from_slice(bytes);
+        }
+        self.send(loan, header, due);
+    }
+}
+
+/// Loan of a sample.
+enum Loan<L> {
+    /// Memory that the sample is written into.
+    Taken(L),
+    /// There is no memory for the sample.
+    Lacking,
+    /// The topic has no subscriber.
+    Unwanted,
+}
+
+/// Converts `stamp` to nanoseconds since 1970. `now` is the current time of the clock of `around`.
+fn wall_clock(around: &impl Surroundings, stamp: Nanos, now: Nanos) -> u64 {
+    around.wall_ns().saturating_sub(now.saturating_sub(stamp))
+}
+
+/// Returns the header of a sample that is published at `now` without a telegram. It has the number of the last
+/// telegram.
+fn header_without_telegram(last: &Header, now: u64, wall_ns: u64) -> Header {
+    Header {
+        stamp_first_ns: now,
+        stamp_last_ns: now,
+        wall_ns,
+        quality: Quality::Clean as u8,
+        reasons: 0,
+        flags: last.flags & !Flags::STAMP_ESTIMATED,
+        hub_time: [0; 3],
+        ..*last
+    }
+}
+
+/// Returns `scan` with room for `len` bytes. It is reallocated once if it is too short.
 fn with_room(scan: &mut Box<Scan>, len: usize) -> &mut Scan {
     Scan::grow(scan, len);
     scan
 }
 
-/// Whoever begins to follow packets gets them after so long.
-const UNASKED: Nanos = 20 * MILLIS;
+/// Interval between checks for subscribers of packets. A new subscriber gets its first packet after this time at the
+/// latest.
+const CHECK_INTERVAL: Nanos = 20 * MILLIS;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_sample_without_a_telegram_does_not_inherit_its_doubts() {
+        let flags = Flags::SIMULATED | Flags::STAMP_ESTIMATED;
+        let last = Header {
+            seq: 7,
+            period_us: 26_640,
+            quality: 1,
+            reasons: 4,
+            flags,
+            hub_time: [9; 3],
+            ..Header::default()
+        };
+        let header = header_without_telegram(&last, 5, 6);
+        assert_eq!((header.quality, header.reasons, header.flags), (0, 0, Flags::SIMULATED));
+        assert_eq!(header.hub_time_ns(), None);
+        assert_eq!(
+            (header.seq, header.period_us, header.stamp_first_ns, header.stamp_last_ns, header.wall_ns),
+            (7, 26_640, 5, 5, 6)
+        );
+    }
+}

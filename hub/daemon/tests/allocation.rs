@@ -1,6 +1,6 @@
 //! The hub's memory is fixed once a sensor streams, however many scans come. Its link takes nothing from the heap for a
-//! scan and what is made of it but what the shared-memory library takes for each loan of a sample: one small piece, given
-//! back when it is sent. For telegrams, marks and foreground that nobody follows there is no loan.
+//! scan and what is made of it but what the shared-memory library takes for each loan of a sample: one small piece,
+//! given back when it is sent. For telegrams, marks and foreground that nobody follows there is no loan.
 
 mod counting;
 
@@ -26,8 +26,8 @@ use scanhub_drivers::lms::variant::{Baud, Mode, Unit, Variant};
 use schema::ipc::{self, Payload, Subscriber};
 use schema::{Domain, Foreground, Marks, Scan};
 
-/// A scanner at the other end of a pty. Like a real one, it neither sends nor receives anything while the hub's port has
-/// another rate, and it streams until it is told to stop.
+/// A scanner at the other end of a pty. Like a real one, it neither sends nor receives anything while the hub's port
+/// has another rate, and it streams until it is told to stop.
 struct Sensor {
     line: OwnedFd,
     heard: Vec<u8>,

@@ -53,8 +53,8 @@ pub(crate) struct Origin {
 impl Recorded {
     /// Opens the recording at `path`: of several sensors the one that has the name of `link`.
     ///
-    /// [`Kind::Input`] if it cannot be read, [`Kind::Configuration`] if it has other sensors. A file without a telegram is a line
-    /// that only brings noise.
+    /// [`Kind::Input`] if it cannot be read, [`Kind::Configuration`] if it has other sensors. A file without a telegram
+    /// is a line that only brings noise.
     pub(crate) fn open(path: &Path, link: &Link) -> Result<Recorded, Failure> {
         let recording = Recording::open_line(path, link.family())?;
         tell_of_damage(&recording);
@@ -69,8 +69,8 @@ impl Recorded {
 
     /// `recording`, which is of one sensor, as the link of `link`; says how the ranges of a log are read.
     ///
-    /// [`Kind::Input`] if it is of a family that this version does not know, [`Kind::Configuration`] if it is not of the
-    /// link's.
+    /// [`Kind::Input`] if it is of a family that this version does not know, [`Kind::Configuration`] if it is not of
+    /// the link's.
     pub(crate) fn new(recording: Recording, link: &Link) -> Result<Recorded, Failure> {
         let family = check_family(&recording, link)?;
         if !features(family).has_whole_telegrams {
@@ -308,7 +308,8 @@ impl Origin {
     }
 }
 
-/// Returns the family of the scanner: that of `link`, or that of `recording` if the link has none. They must be the same.
+/// Returns the family of the scanner: that of `link`, or that of `recording` if the link has none. They must be the
+/// same.
 fn check_family(recording: &Recording, link: &Link) -> Result<Family, Failure> {
     let (set, recorded) = (link.family(), recording.family());
     if let Some(family) = set.or(recorded)
