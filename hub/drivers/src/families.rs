@@ -3,13 +3,14 @@
 use std::fmt;
 
 use crate::line::family::{Features, Model, Settings};
+use crate::line::probe::Probe;
 use crate::line::{
     self, Account, Control, Identity, Introduction, KnownRate, Notice, Output, RawScan, Received, State,
 };
 use crate::{ld, lms, rplidar, search};
 use schema::{Counters, Family, Nanos, ScanHead, Status};
 
-/// Declares the families. A line has the name and the module of one.
+/// Declares the families, each with its name and its module, in the order in which the search looks for them.
 macro_rules! families {
     ($($Family:ident $family:ident,)*) => {
         /// A session with a scanner of one of the families.
@@ -36,6 +37,11 @@ macro_rules! families {
         /// them. They have the same number of beams, at most the maximum.
         pub fn scan_heads(family: Family, settings: &Settings) -> Vec<ScanHead> {
             match family { $(Family::$Family => $family::scan_heads(settings),)* }
+        }
+
+        /// Creates a recognizer for each family. The search listens for the families, and asks them, in this order.
+        pub(crate) fn probes() -> Vec<Box<dyn Probe>> {
+            vec![$(Box::<$family::Probe>::default()),*]
         }
 
         impl Session {
@@ -75,8 +81,8 @@ macro_rules! families {
 }
 
 families! {
-    Lms lms,
     Ld ld,
+    Lms lms,
     Rplidar rplidar,
 }
 

@@ -20,14 +20,9 @@ use core::fmt;
 
 use schema::{Family, MILLIS, Nanos, line_time};
 
+use crate::families::probes;
 use crate::line::probe::{Approach, Asks, Evidence, Probe};
 use crate::line::{Account, Output, Protocol};
-use crate::{ld, lms, rplidar};
-
-/// Creates a recognizer for each family. Steps that listen, and steps that ask, are in this order.
-fn probes() -> Vec<Box<dyn Probe>> {
-    vec![Box::<ld::Probe>::default(), Box::<lms::Probe>::default(), Box::<rplidar::Probe>::default()]
-}
 
 /// Result of a search.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
