@@ -277,9 +277,8 @@ impl Drop for Child {
 fn forward(stdout: BufReader<ChildStdout>, of: usize, lines: Sender<Line>) {
     thread::spawn(move || {
         for text in stdout.lines().map_while(Result::ok) {
-            if lines.send(Line::Said { of, text }).is_err() {
-                return;
-            }
+            // Read on without a receiver: a closed pipe would end the child with its next line.
+            let _ = lines.send(Line::Said { of, text });
         }
         let _ = lines.send(Line::Ended { of });
     });

@@ -7,6 +7,7 @@ use std::process::Command;
 
 use crate::testkit;
 use crate::testkit::{INT, Outcome, Program, is_there, number, output, shared_memory, until};
+use crate::web::{channels, view};
 
 /// Runs the demonstration in an empty environment; `end` may wait for something and hasten its end.
 fn demo(arguments: &[&str], end: impl FnOnce(Program) -> Outcome) -> Outcome {
@@ -225,6 +226,34 @@ fn process_of(domain: &str, verb: &str) -> rustix::process::Pid {
     let found = entries.map(|entry| entry.path()).find(|path| is_meant(path)).expect("it runs");
     let pid = found.file_name().and_then(|name| name.to_str()).and_then(|name| name.parse().ok());
     rustix::process::Pid::from_raw(pid.expect("a number")).expect("a process")
+}
+
+#[test]
+fn the_page_outlives_its_viewers() {
+    let outcome = demo(&[], |mut program| {
+        let url = loop {
+            if let Some(url) = program.next_text().strip_prefix("browser: http://") {
+                break url.to_owned();
+            }
+        };
+        let host = url.trim_end_matches('/');
+        let connect = || {
+            let mut viewer = view(host, "/", None).expect("the page is open");
+            channels(&mut viewer, ["/front/scan"]);
+            viewer
+        };
+        let mut first = connect();
+        // Two reloads, then a second viewer.
+        for _ in 0..2 {
+            drop(first);
+            first = connect();
+        }
+        let second = connect();
+        drop((first, second));
+        connect();
+        program.end(INT)
+    });
+    assert!([Some(0), Some(5)].contains(&outcome.code), "{outcome}");
 }
 
 #[test]
