@@ -1,6 +1,10 @@
-//! What there is to see: channels, and of each the newest message alone. Who is slower than the sensors gets the newest when
-//! he is ready, and however many viewers there are, this is all that is kept. Refuses to know sockets and what messages mean.
+//! The channels that viewers can subscribe to, each with a short queue of its last messages. All viewers share the queues, so
+//! memory does not depend on their number.
+//!
+//! A queue covers 250 ms: a server that was late for less still sends every message. A viewer that falls behind further skips
+//! to the newest message, so that it never shows old data.
 
+use std::collections::VecDeque;
 use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -8,20 +12,21 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use rustix::event::{EventfdFlags, eventfd};
 use schema::{Failure, Kind};
 
-/// What a channel carries.
+/// Description of a channel.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Channel {
-    /// Its name, as `/front/scan`.
+    /// Name of the channel, such as `/front/scan`.
     pub topic: String,
-    /// How its messages are encoded: `cdr` or `json`.
+    /// Encoding of the messages: `cdr` or `json`.
     pub encoding: &'static str,
-    /// The type of its messages.
+    /// Type of the messages.
     pub schema_name: &'static str,
-    /// The language in which `schema` says what they are.
+    /// Language of `schema`.
     pub schema_encoding: &'static str,
-    /// That text.
+    /// Definition of the type.
     pub schema: &'static str,
-    /// The newest message says how things are, until the next one does: whoever comes later gets it, too.
+    /// Whether a message is the state until the next one: a later subscriber gets the last message, and older ones
+    /// are never sent.
     pub is_kept: bool,
 }
 
@@ -29,21 +34,23 @@ pub struct Channel {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub struct ChannelId(pub(crate) usize);
 
-/// A message and its number in its channel, from 1 on.
+/// A message in the queue of a channel.
 #[derive(Clone, Debug)]
-pub(crate) struct Newest {
+pub(crate) struct Queued {
+    /// Number in the channel, from 1 on.
     pub(crate) number: u64,
+    /// Time of the message, in nanoseconds since 1970.
     pub(crate) wall_ns: u64,
     pub(crate) payload: Arc<[u8]>,
     /// See [`Channel::is_kept`].
     pub(crate) is_kept: bool,
 }
 
-/// The channels, shared by who fills them and who sends them.
+/// All channels, shared by the thread that fills them and the thread that serves the viewers.
 #[derive(Debug)]
 pub struct Board {
     posts: Mutex<Vec<Post>>,
-    /// Something was put up that who sends was not told of.
+    /// Whether there are messages for which the server was not woken yet.
     is_new: AtomicBool,
     bell: OwnedFd,
 }
@@ -51,17 +58,19 @@ pub struct Board {
 #[derive(Debug)]
 struct Post {
     channel: Arc<Channel>,
-    newest: Option<Newest>,
+    /// The last messages, oldest first.
+    queue: VecDeque<Queued>,
+    /// Number of the last message.
     number: u64,
     subscribers: u32,
 }
 
 impl Board {
-    /// Makes one without channels.
+    /// Creates a board without channels.
     ///
     /// # Errors
     ///
-    /// [`Kind::Short`] if descriptors are short.
+    /// [`Kind::Short`] if no descriptors are left.
     pub fn new() -> Result<Board, Failure> {
         let bell = eventfd(0, EventfdFlags::CLOEXEC | EventfdFlags::NONBLOCK);
         let bell = bell.map_err(|error| {
@@ -70,11 +79,12 @@ impl Board {
         Ok(Board { posts: Mutex::default(), is_new: AtomicBool::new(false), bell })
     }
 
-    /// Returns the channel with this topic; it is made if there is none.
+    /// Returns the channel with this topic, and creates it if there is none.
     pub fn channel(&self, channel: Channel) -> ChannelId {
         let mut posts = self.posts();
         let at = posts.iter().position(|post| post.channel.topic == channel.topic).unwrap_or_else(|| {
-            posts.push(Post { channel: Arc::new(channel), newest: None, number: 0, subscribers: 0 });
+            let (channel, queue) = (Arc::new(channel), VecDeque::with_capacity(MOST));
+            posts.push(Post { channel, queue, number: 0, subscribers: 0 });
             posts.len() - 1
         });
         drop(posts);
@@ -82,45 +92,52 @@ impl Board {
         ChannelId(at)
     }
 
-    /// Returns whether anybody would get a message now, or later.
+    /// Returns whether a present or a later subscriber would get a message.
     pub fn is_wanted(&self, id: ChannelId) -> bool {
         let posts = self.posts();
         posts.get(id.0).is_some_and(|post| post.channel.is_kept || post.subscribers > 0)
     }
 
-    /// Returns whether anybody would get a message now.
+    /// Returns whether the channel has a subscriber.
     pub fn is_watched(&self, id: ChannelId) -> bool {
         self.posts().get(id.0).is_some_and(|post| post.subscribers > 0)
     }
 
-    /// Puts up a message of a moment in ns since 1970, in place of the one before. Who sends hears of it by
-    /// [`tell`](Self::tell), once for all that came together.
+    /// Queues a message of the time `wall_ns`, in nanoseconds since 1970. [`tell`](Self::tell) wakes the server once for all
+    /// messages that were queued together.
     pub fn put(&self, id: ChannelId, wall_ns: u64, payload: &[u8]) {
         if let Some(post) = self.posts().get_mut(id.0) {
             post.number += 1;
             let (number, is_kept) = (post.number, post.channel.is_kept);
-            post.newest = Some(Newest { number, wall_ns, payload: payload.into(), is_kept });
+            post.queue.push_back(Queued { number, wall_ns, payload: payload.into(), is_kept });
+            let is_old = |queue: &VecDeque<Queued>| {
+                let span = queue.front().map_or(0, |oldest| wall_ns.saturating_sub(oldest.wall_ns));
+                is_kept || queue.len() > MOST || (queue.len() > LEAST && span > SPAN_NS)
+            };
+            while post.queue.len() > 1 && is_old(&post.queue) {
+                post.queue.pop_front();
+            }
             self.is_new.store(true, Ordering::Relaxed);
         }
     }
 
-    /// Takes down what is there: it is not true any more.
+    /// Removes the messages of a channel that are no longer true.
     pub fn clear(&self, id: ChannelId) {
         if let Some(post) = self.posts().get_mut(id.0) {
-            post.newest = None;
+            post.queue.clear();
         }
     }
 
-    /// Wakes who sends, if something was put up since the last time.
+    /// Wakes the server if messages were queued since the last call.
     pub fn tell(&self) {
         if self.is_new.swap(false, Ordering::Relaxed) {
             self.ring();
         }
     }
 
-    /// Wakes who sends.
+    /// Wakes the server.
     pub fn ring(&self) {
-        // A full counter is readable, too.
+        // Fails if the counter is full, and then it is readable anyway.
         let _ = rustix::io::write(&self.bell, &1_u64.to_ne_bytes());
     }
 
@@ -132,18 +149,18 @@ impl Board {
         let _ = rustix::io::read(&self.bell, &mut [0; 8]);
     }
 
-    /// The channels from number `from` on.
+    /// Returns the channels from number `from` on.
     pub(crate) fn channels_from(&self, from: usize) -> Vec<(usize, Arc<Channel>)> {
         self.posts().iter().enumerate().skip(from).map(|(at, post)| (at, post.channel.clone())).collect()
     }
 
-    /// Takes note of a subscriber; the number of the last message that he does not get, if there is such a channel.
+    /// Adds a subscriber. Returns the number of the last message that it does not get, or `None` if there is no such channel.
     pub(crate) fn subscribe(&self, id: usize) -> Option<u64> {
         let mut posts = self.posts();
         let post = posts.get_mut(id)?;
         post.subscribers += 1;
-        let kept = post.newest.as_ref().filter(|newest| newest.is_kept);
-        Some(kept.map_or(post.number, |newest| newest.number - 1))
+        let kept = post.queue.back().filter(|last| last.is_kept);
+        Some(kept.map_or(post.number, |last| last.number - 1))
     }
 
     pub(crate) fn unsubscribe(&self, id: usize) {
@@ -152,15 +169,25 @@ impl Board {
         }
     }
 
-    /// The newest message of a channel, if it is newer than message `number`.
-    pub(crate) fn newer(&self, id: usize, number: u64) -> Option<Newest> {
-        self.posts().get(id)?.newest.clone().filter(|newest| newest.number > number)
+    /// Returns the message after message `number`, or the newest one if that is no longer queued. `None` if there is none.
+    pub(crate) fn next(&self, id: usize, number: u64) -> Option<Queued> {
+        let posts = self.posts();
+        let queue = &posts.get(id)?.queue;
+        let following = queue.iter().find(|queued| queued.number == number + 1);
+        following.or(queue.back()).filter(|queued| queued.number > number).cloned()
     }
 
     fn posts(&self) -> MutexGuard<'_, Vec<Post>> {
         self.posts.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
+
+/// Minimum length of a queue.
+const LEAST: usize = 2;
+/// Maximum length of a queue.
+const MOST: usize = 16;
+/// Time that a queue covers between these lengths.
+const SPAN_NS: u64 = 250_000_000;
 
 #[cfg(test)]
 mod tests {
@@ -179,7 +206,7 @@ mod tests {
     }
 
     #[test]
-    fn the_newest_alone_is_kept_and_late_comers_get_what_still_holds() {
+    fn late_subscribers_get_the_last_message_that_is_a_state() {
         let board = Board::new().unwrap();
         let (scan, status) =
             (board.channel(channel("/scan", false)), board.channel(channel("/status", true)));
@@ -190,25 +217,41 @@ mod tests {
             board.put(status, n, &[n as u8]);
         }
         let (of_scan, of_status) = (board.subscribe(scan.0).unwrap(), board.subscribe(status.0).unwrap());
-        assert!(board.newer(scan.0, of_scan).is_none(), "that was before");
-        assert_eq!(board.newer(status.0, of_status).unwrap().payload[..], [3]);
+        assert!(board.next(scan.0, of_scan).is_none(), "earlier messages are not sent");
+        assert_eq!(board.next(status.0, of_status).unwrap().payload[..], [3]);
         board.put(scan, 4, &[4]);
         board.put(scan, 5, &[5]);
-        let newest = board.newer(scan.0, of_scan).unwrap();
-        assert_eq!((newest.number, newest.payload[0]), (5, 5), "one was skipped");
+        assert_eq!(board.next(scan.0, of_scan).unwrap().number, of_scan + 1, "every scan is sent");
         board.clear(scan);
-        assert!(board.newer(scan.0, of_scan).is_none());
+        assert!(board.next(scan.0, of_scan).is_none());
         board.clear(status);
         let late = board.subscribe(status.0).unwrap();
         board.put(status, 4, &[4]);
-        assert_eq!(
-            board.newer(status.0, late).unwrap().number,
-            late + 1,
-            "what was taken down was not missed"
-        );
+        assert_eq!(board.next(status.0, late).unwrap().number, late + 1, "a removed message counts as sent");
         assert!(board.is_wanted(scan) && board.is_watched(status));
         board.unsubscribe(scan.0);
         assert!(!board.is_wanted(scan));
         assert_eq!(board.subscribe(7), None);
+    }
+
+    #[test]
+    fn a_queue_covers_a_quarter_of_a_second() {
+        let board = Board::new().unwrap();
+        // Interval of the messages in milliseconds, and how many of them are queued.
+        for (interval, queued) in [(1000, 2), (100, 3), (27, 10), (5, 16), (0, 16)] {
+            let scan = board.channel(channel(&format!("/scan{interval}"), false));
+            let before = board.subscribe(scan.0).unwrap();
+            let put = |n: u64| board.put(scan, n * interval * 1_000_000, &[]);
+            (0..queued).for_each(put);
+            assert_eq!(board.next(scan.0, before).unwrap().number, before + 1, "{interval} ms");
+            put(queued);
+            let newest = board.next(scan.0, before).unwrap();
+            assert_eq!(
+                newest.number,
+                before + queued + 1,
+                "{interval} ms: the newest one replaces the others"
+            );
+            assert_eq!(board.next(scan.0, before + 1).unwrap().number, before + 2, "{interval} ms");
+        }
     }
 }

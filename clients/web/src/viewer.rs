@@ -1,5 +1,5 @@
-//! One viewer at his WebSocket: what he subscribed to, and what he gets next. Few messages of his are on their way, so that
-//! his memory is bounded and he gets the newest when he is ready. Refuses to know where messages come from.
+//! One viewer at its WebSocket: its subscriptions, and the message that it gets next. Few bytes are in flight, so memory is
+//! bounded, and a viewer that was slow continues with the newest messages.
 
 use std::io;
 use std::net::TcpStream;
@@ -8,54 +8,66 @@ use std::time::{Duration, Instant};
 use tungstenite::protocol::{Role, WebSocketConfig};
 use tungstenite::{Bytes, Error, Message, WebSocket};
 
-use crate::board::{Board, Newest};
+use crate::board::{Board, Queued};
 use crate::foxglove::{self, Wish};
 use crate::playback::Playback;
 
-/// The most subscriptions of one viewer.
+/// Maximum number of subscriptions of a viewer.
 const SUBSCRIPTIONS: usize = 256;
-/// The longest message of a viewer: room for subscribing to everything.
+/// Maximum length of a message from a viewer, in bytes: enough to subscribe to everything.
 const LONGEST: usize = 64 << 10;
-/// What one viewer says at a time, in messages: the others' turn comes, too.
+/// Maximum number of messages from a viewer that are handled in one call, so that a flood does not starve other viewers.
 const HEARD: usize = 32;
-/// What is sent at a time, in bytes: few system calls for many small messages, and little that grows old on its way.
+/// Number of bytes that are written at once: few system calls for many small messages, and little data in flight.
 const PIECE: usize = 16 << 10;
-/// So long a message may be on its way before the viewer is given up.
+/// Send timeout. A viewer that does not accept a message in this time is disconnected.
 const PATIENCE: Duration = Duration::from_secs(30);
-/// Between two words about what was skipped.
-const TELL_EVERY: Duration = Duration::from_secs(1);
+/// Minimum interval between two reports of skipped messages.
+const REPORT_INTERVAL: Duration = Duration::from_secs(1);
 
+/// A connected viewer.
 pub(crate) struct Viewer {
     socket: WebSocket<TcpStream>,
     subscriptions: Vec<Subscription>,
-    /// Channels that he was told of.
-    told: usize,
-    /// Whose turn it is.
+    /// Number of channels that were advertised.
+    advertised: usize,
+    /// Subscription that is served next.
     next: usize,
-    /// Since when a message is on its way.
+    /// Time since when the socket does not accept all bytes.
     pending: Option<Instant>,
-    skipped: u64,
-    told_skipped: u64,
-    tell_at: Instant,
-    /// The last channel that he asked for in vain.
+    /// Whether the socket was full since this viewer last had all messages.
+    was_full: bool,
+    skipped: Skipped,
+    reported: Skipped,
+    report_at: Instant,
+    /// The last subscription to an unknown channel, which was not refused yet.
     unknown: Option<usize>,
-    /// He may have said more than was heard, though nothing new comes.
+    /// Whether unread messages may be left, even if the socket receives nothing new.
     hears_more: bool,
 }
 
 struct Subscription {
     id: u32,
     channel: usize,
-    /// The last message that he got, or that was there before him.
+    /// Number of the last message that was sent, or that was older than the subscription.
     number: u64,
 }
 
-/// The viewer is gone, or is to go.
+/// Messages that were replaced by newer ones before they were sent.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+struct Skipped {
+    /// Messages that the viewer, or the network to it, was too slow for.
+    by_viewer: u64,
+    /// Messages that this process was too late for.
+    by_server: u64,
+}
+
+/// The viewer has disconnected, or has to be disconnected.
 #[derive(Debug)]
 pub(crate) struct Gone;
 
 impl Viewer {
-    /// A viewer whose handshake was answered; `early` is what he said behind it.
+    /// Creates a viewer after its handshake. `early` are the bytes that it sent after the handshake.
     pub(crate) fn new(
         stream: TcpStream,
         early: Vec<u8>,
@@ -70,12 +82,13 @@ impl Viewer {
         let mut viewer = Viewer {
             socket: WebSocket::from_partially_read(stream, early, Role::Server, Some(config)),
             subscriptions: Vec::new(),
-            told: 0,
+            advertised: 0,
             next: 0,
             pending: None,
-            skipped: 0,
-            told_skipped: 0,
-            tell_at: now,
+            was_full: false,
+            skipped: Skipped::default(),
+            reported: Skipped::default(),
+            report_at: now,
             unknown: None,
             hears_more: true,
         };
@@ -88,30 +101,30 @@ impl Viewer {
         self.socket.get_ref()
     }
 
-    /// A message is on its way: what can be written next is waited for.
+    /// Returns whether the socket does not accept all bytes.
     pub(crate) fn is_pending(&self) -> bool {
         self.pending.is_some()
     }
 
-    /// Messages that were replaced by newer ones before he was ready; how things are is told as often as he can hear it.
+    /// Returns the number of messages that newer ones replaced before they were sent. Messages that are a state do not count.
     pub(crate) fn skipped(&self) -> u64 {
-        self.skipped
+        self.skipped.by_viewer + self.skipped.by_server
     }
 
-    /// He may have said more than [`hear`](Self::hear) took.
+    /// Returns whether [`hear`](Self::hear) may have left messages unread.
     pub(crate) fn hears_more(&self) -> bool {
         self.hears_more
     }
 
-    /// When something is to be done though nothing happens.
+    /// Returns when the viewer next needs service even without input, such as for a timeout.
     pub(crate) fn wake_at(&self) -> Option<Instant> {
         let gives_up = self.pending.map(|since| since + PATIENCE);
-        let tells = (self.skipped > self.told_skipped).then_some(self.tell_at);
+        let reports = (self.skipped != self.reported).then_some(self.report_at);
         let hears = self.hears_more.then(Instant::now);
-        gives_up.into_iter().chain(tells).chain(hears).min()
+        gives_up.into_iter().chain(reports).chain(hears).min()
     }
 
-    /// Takes what he says, but not all of who does not stop.
+    /// Handles messages from the viewer, up to [`HEARD`].
     pub(crate) fn hear(&mut self, board: &Board, player: Option<&dyn Playback>) -> Result<(), Gone> {
         self.hears_more = false;
         for _ in 0..HEARD {
@@ -157,7 +170,7 @@ impl Viewer {
         Ok(())
     }
 
-    /// Sends what there is for him, until some of it has to wait: what came together in one piece.
+    /// Sends what the viewer has to get until the socket is full.
     pub(crate) fn serve(&mut self, board: &Board, now: Instant) -> Result<(), Gone> {
         self.flush(now)?;
         while !self.is_pending() {
@@ -169,28 +182,26 @@ impl Viewer {
         Ok(())
     }
 
-    /// Writes down what there is for him, in a piece that is not much longer than [`PIECE`]; whether there is any.
+    /// Buffers about [`PIECE`] bytes for the viewer. Returns whether there are any.
     fn gather(&mut self, board: &Board, now: Instant) -> Result<bool, Gone> {
         let mut length = 0;
         while length < PIECE {
-            let channels = board.channels_from(self.told);
+            let channels = board.channels_from(self.advertised);
             if !channels.is_empty() {
-                self.told += channels.len();
+                self.advertised += channels.len();
                 length += PIECE;
                 let told = foxglove::advertise(channels.iter().map(|(at, channel)| (*at, &**channel)));
                 self.send(Message::text(told), now)?;
             } else if let Some(channel) = self.unknown.take() {
                 length += PIECE;
                 self.send(Message::text(foxglove::unknown_channel(channel)), now)?;
-            } else if self.skipped > self.told_skipped && now >= self.tell_at {
-                self.told_skipped = self.skipped;
-                self.tell_at = now + TELL_EVERY;
-                let words =
-                    format!("{} messages skipped: newer ones came before they could be sent", self.skipped);
+            } else if self.skipped != self.reported && now >= self.report_at {
+                self.reported = self.skipped;
+                self.report_at = now + REPORT_INTERVAL;
                 length += PIECE;
-                self.send(Message::text(foxglove::warning("skipped", &words)), now)?;
-            } else if let Some((id, newest)) = self.choose(board) {
-                let frame = foxglove::message(id, newest.wall_ns, &newest.payload);
+                self.send(Message::text(foxglove::warning("skipped", &self.skipped.text())), now)?;
+            } else if let Some((id, queued)) = self.choose(board) {
+                let frame = foxglove::message(id, queued.wall_ns, &queued.payload);
                 length += frame.len();
                 self.send(Message::Binary(Bytes::from(frame)), now)?;
             } else {
@@ -200,24 +211,27 @@ impl Viewer {
         Ok(length > 0)
     }
 
-    /// The next subscription for which there is something new, each in its turn.
-    fn choose(&mut self, board: &Board) -> Option<(u32, Newest)> {
+    /// Returns the next message and its subscription. Subscriptions take turns.
+    fn choose(&mut self, board: &Board) -> Option<(u32, Queued)> {
         let count = self.subscriptions.len();
         for step in 0..count {
             let at = (self.next + step) % count;
             let subscription = &mut self.subscriptions[at];
-            let Some(newest) = board.newer(subscription.channel, subscription.number) else { continue };
-            if !newest.is_kept {
-                self.skipped += newest.number - subscription.number - 1;
+            let Some(queued) = board.next(subscription.channel, subscription.number) else { continue };
+            if !queued.is_kept {
+                let skipped = queued.number - subscription.number - 1;
+                let Skipped { by_viewer, by_server } = &mut self.skipped;
+                *(if self.was_full { by_viewer } else { by_server }) += skipped;
             }
-            subscription.number = newest.number;
+            subscription.number = queued.number;
             self.next = at + 1;
-            return Some((subscription.id, newest));
+            return Some((subscription.id, queued));
         }
+        self.was_full = false;
         None
     }
 
-    /// Writes `message` down; some of it may be sent already.
+    /// Buffers `message`, and may send some of the buffer.
     fn send(&mut self, message: Message, now: Instant) -> Result<(), Gone> {
         match self.socket.write(message) {
             Err(Error::Io(error)) if error.kind() != io::ErrorKind::WouldBlock => return Err(Gone),
@@ -232,15 +246,30 @@ impl Viewer {
         let Some(since) = self.pending else { return Ok(()) };
         match self.socket.flush() {
             Ok(()) => self.pending = None,
-            Err(Error::Io(error)) if error.kind() == io::ErrorKind::WouldBlock => {}
+            Err(Error::Io(error)) if error.kind() == io::ErrorKind::WouldBlock => self.was_full = true,
             Err(_) => return Err(Gone),
         }
         if self.is_pending() && now - since >= PATIENCE { Err(Gone) } else { Ok(()) }
     }
 
-    /// He is gone.
+    /// Ends the subscriptions.
     pub(crate) fn leave(&mut self, board: &Board) {
         self.subscriptions.drain(..).for_each(|one| board.unsubscribe(one.channel));
+    }
+}
+
+impl Skipped {
+    /// Returns the report for the viewer.
+    fn text(self) -> String {
+        let Skipped { by_viewer, by_server } = self;
+        let viewer = format!("{by_viewer} messages skipped: this viewer or its network is too slow");
+        let server =
+            format!("{by_server} messages skipped: the server was too late, its machine may be busy");
+        match (by_viewer, by_server) {
+            (_, 0) => viewer,
+            (0, _) => server,
+            _ => format!("{viewer}; {server}"),
+        }
     }
 }
 
@@ -250,7 +279,7 @@ mod tests {
     use crate::board::Channel;
     use std::net::TcpListener;
 
-    /// Both ends of a viewer.
+    /// Returns both ends of a viewer's connection.
     fn pair(now: Instant) -> (Viewer, WebSocket<TcpStream>) {
         let listener = TcpListener::bind("127.0.0.1:0").unwrap();
         let client = TcpStream::connect(listener.local_addr().unwrap()).unwrap();
@@ -262,7 +291,7 @@ mod tests {
     }
 
     #[test]
-    fn who_does_not_read_gets_the_newest_then_and_hears_what_that_replaced() {
+    fn a_slow_viewer_gets_the_newest_message_and_a_report_of_the_skipped_ones() {
         let (board, now) = (Board::new().unwrap(), Instant::now());
         let scans = board.channel(Channel {
             topic: "/front/scan".into(),
@@ -278,40 +307,54 @@ mod tests {
         while !board.is_wanted(scans) {
             viewer.hear(&board, None).unwrap();
         }
-        // Until the buffers of the system are full.
-        let mut sent = 0_u32;
-        let mut put = |viewer: &mut Viewer| {
-            sent += 1;
-            board.put(scans, 1, &[&sent.to_le_bytes()[..], &[0; 100_000]].concat());
-            viewer.serve(&board, now).unwrap();
-            sent
+        let put = |number: u32| {
+            board.put(scans, 1, &[&number.to_le_bytes()[..], &[0; 100_000]].concat());
         };
+        let mut receive = || match client.read().unwrap() {
+            Message::Binary(frame) => Ok(u32::from_le_bytes(frame[13..17].try_into().unwrap())),
+            Message::Text(text) => Err(text.to_string()),
+            other => panic!("{other:?}"),
+        };
+        // The server is late, and the queue is too short.
+        (1..=40).for_each(put);
+        viewer.serve(&board, now).unwrap();
+        let (newest, report) = loop {
+            match receive() {
+                Ok(number) => break (number, receive().unwrap_err()),
+                Err(other) => assert!(!other.contains("skipped"), "{other}"),
+            }
+        };
+        assert_eq!((newest, viewer.skipped()), (40, 39));
+        assert!(report.contains("39 messages skipped: the server was too late"), "{report}");
+        // The viewer does not read, so the buffers of the sockets fill.
+        let (mut last, now) = (40, now + REPORT_INTERVAL);
         while !viewer.is_pending() {
-            put(&mut viewer);
-        }
-        let full = put(&mut viewer);
-        let last = (0..9).map(|_| put(&mut viewer)).last().unwrap();
-        assert_eq!(last, full + 9);
-        let (mut numbers, mut words) = (Vec::new(), String::new());
-        while words.is_empty() || numbers.last() != Some(&last) {
+            last += 1;
+            put(last);
             viewer.serve(&board, now).unwrap();
-            match client.read().unwrap() {
-                Message::Binary(frame) => numbers.push(u32::from_le_bytes(frame[13..17].try_into().unwrap())),
-                Message::Text(text) if text.contains("skipped") => words = text.to_string(),
-                _ => {}
+        }
+        for _ in 0..40 {
+            last += 1;
+            put(last);
+            viewer.serve(&board, now).unwrap();
+        }
+        let (mut numbers, mut report) = (vec![newest], String::new());
+        while report.is_empty() || numbers.last() != Some(&last) {
+            viewer.serve(&board, now).unwrap();
+            match receive() {
+                Ok(number) => numbers.push(number),
+                Err(text) => report = text,
             }
         }
-        assert!(
-            numbers.is_sorted() && numbers.len() as u64 + viewer.skipped() == u64::from(last),
-            "{numbers:?}"
-        );
-        assert!(
-            viewer.skipped() >= 9 && words.contains(&format!("{} messages", viewer.skipped())),
-            "{words}"
-        );
-        // Who never reads is given up.
+        let received = numbers.len() as u64;
+        assert!(numbers.is_sorted() && received + viewer.skipped() == u64::from(last), "{numbers:?}");
+        let skipped = format!("{} messages skipped: this viewer", viewer.skipped() - 39);
+        assert!(viewer.skipped() > 39 && report.contains(&skipped), "{report}");
+        // A viewer that never reads is disconnected.
         while !viewer.is_pending() {
-            put(&mut viewer);
+            last += 1;
+            put(last);
+            viewer.serve(&board, now).unwrap();
         }
         assert!(viewer.serve(&board, now + PATIENCE).is_err());
     }
