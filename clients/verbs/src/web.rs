@@ -6,8 +6,9 @@ mod sensor;
 mod tilted;
 mod told;
 
+use std::fmt;
 use std::io::Write;
-use std::net::SocketAddr;
+use std::net::{IpAddr, SocketAddr};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc;
 use std::thread;
@@ -16,6 +17,7 @@ use ::web::{Board, Door, Playback, Server};
 use schema::{Domain, Failure, Kind, Maker, check_followed};
 
 use crate::follow::{Bounds, follow};
+use crate::interface::reachable_addresses;
 use crate::names::as_word;
 use crate::output::{Output, quiet};
 use crate::picture;
@@ -74,8 +76,8 @@ pub fn web(
     let board = Board::new()?;
     let (tell, events) = mpsc::channel();
     let mut output = Output::new(out);
-    let url = url(server.address(), &options.names, options.token.as_deref());
-    if let Err(end) = told::ready(&mut output, &url, options) {
+    let urls = urls(server.address(), &reachable_addresses(), &options.names, options.token.as_deref());
+    if let Err(end) = told::ready(&mut output, &urls, options) {
         return quiet(Err(end));
     }
     let wanted = [&picture::TOPICS[..], Maker::Mount.topics(), Maker::Tilted.topics()].concat();
@@ -108,13 +110,21 @@ fn is_word(token: &str) -> bool {
     !token.is_empty() && token.bytes().all(|byte| byte.is_ascii_alphanumeric() || b"._~-".contains(&byte))
 }
 
-/// What a browser opens; by the machine's name where every address of it does.
-fn url(address: SocketAddr, names: &[String], token: Option<&str>) -> String {
+/// Returns the URLs of the page. If the server listens on all addresses, they have the name of this machine, if it is known,
+/// and then each address in `reachable` of the same version of IP.
+fn urls(address: SocketAddr, reachable: &[IpAddr], names: &[String], token: Option<&str>) -> Vec<String> {
     let token = token.map(|token| format!("?token={token}")).unwrap_or_default();
-    match names.first().filter(|_| address.ip().is_unspecified()) {
-        Some(name) => format!("http://{name}:{}/{token}", address.port()),
-        None => format!("http://{address}/{token}"),
+    let of = |host: &dyn fmt::Display| format!("http://{host}/{token}");
+    if !address.ip().is_unspecified() {
+        return vec![of(&address)];
     }
+    let port = address.port();
+    let name = names.first().map(|name| of(&format!("{name}:{port}")));
+    // A socket for all IPv6 addresses accepts IPv4 too.
+    let accepted = reachable.iter().filter(|one| address.is_ipv6() || one.is_ipv4());
+    let urls: Vec<String> =
+        name.into_iter().chain(accepted.map(|one| of(&SocketAddr::new(*one, port)))).collect();
+    if urls.is_empty() { vec![of(&address)] } else { urls }
 }
 
 /// Ends the thread that serves, however this one ends.
@@ -180,8 +190,12 @@ mod tests {
         let [ready, others] = &local.lines().collect::<Vec<_>>()[..] else { panic!("{local}") };
         assert!(ready.starts_with("ready http://127.0.0.1:"), "{local}");
         assert_eq!(*others, "for other machines: --listen 0.0.0.0:0 --token WORD");
+        let token = Some("carrot".to_owned());
+        let all = text(&WebOptions { token, names: vec!["robot".to_owned()], ..options("0.0.0.0:0") });
+        assert!(all.starts_with("ready http://robot:") && !all.contains("anyone"), "{all}");
         let open = text(&WebOptions { open: true, ..options("0.0.0.0:0") });
-        assert_eq!(open.lines().count(), 1, "{open}");
+        let warning = "anyone who can reach this address can watch; to restrict that: --token WORD";
+        assert_eq!(open.lines().last(), Some(warning), "{open}");
         let json = text(&WebOptions { json: true, ..options("127.0.0.1:0") });
         assert_eq!(json.lines().count(), 1, "{json}");
     }
@@ -246,14 +260,17 @@ mod tests {
     }
 
     #[test]
-    fn the_address_has_the_word() {
-        let address = "127.0.0.1:8080".parse().unwrap();
+    fn urls_have_the_token_and_every_address() {
         let names = ["robot".to_owned()];
-        assert_eq!(url(address, &names, None), "http://127.0.0.1:8080/");
-        assert_eq!(url(address, &names, Some("carrot")), "http://127.0.0.1:8080/?token=carrot");
-        let all = "0.0.0.0:8080".parse().unwrap();
-        assert_eq!(url(all, &names, None), "http://robot:8080/");
-        assert_eq!(url(all, &[], None), "http://0.0.0.0:8080/");
+        let reachable = ["192.168.1.7", "2001:db8::7"].map(|address| address.parse().unwrap());
+        let of =
+            |listen: &str, names: &[String], token| urls(listen.parse().unwrap(), &reachable, names, token);
+        assert_eq!(of("127.0.0.1:8080", &names, None), ["http://127.0.0.1:8080/"]);
+        assert_eq!(of("127.0.0.1:8080", &names, Some("carrot")), ["http://127.0.0.1:8080/?token=carrot"]);
+        assert_eq!(of("0.0.0.0:8080", &names, None), ["http://robot:8080/", "http://192.168.1.7:8080/"]);
+        let all = ["http://192.168.1.7:8080/?token=x", "http://[2001:db8::7]:8080/?token=x"];
+        assert_eq!(of("[::]:8080", &[], Some("x")), all);
+        assert_eq!(urls("0.0.0.0:8080".parse().unwrap(), &[], &[], None), ["http://0.0.0.0:8080/"]);
     }
 
     #[test]

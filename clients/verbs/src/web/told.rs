@@ -9,20 +9,32 @@ use serde::Serialize;
 use super::{WEB_PORT, WebOptions};
 use crate::output::{End, Output};
 
-/// Prints the address; as text also the flags for access from other machines, if `options` name a local address.
-pub(crate) fn ready(output: &mut Output<'_>, url: &str, options: &WebOptions) -> Result<(), End> {
+/// Prints the URLs of the page. As text, prints also what a user should know about access: with a local address the flags for
+/// other machines, and with `--open` a warning.
+pub(crate) fn ready(output: &mut Output<'_>, urls: &[String], options: &WebOptions) -> Result<(), End> {
     #[derive(Serialize)]
     struct Ready<'a> {
         class: &'static str,
         url: &'a str,
+        urls: &'a [String],
         pid: u32,
     }
+    let url = urls.first().map_or("", String::as_str);
     if options.json {
-        return output.json(&Ready { class: "ready", url, pid: std::process::id() });
+        return output.json(&Ready { class: "ready", url, urls, pid: std::process::id() });
     }
     output.line(|line| write!(line, "ready {url}"))?;
+    if let [_, others @ ..] = urls
+        && !others.is_empty()
+    {
+        output.line(|line| write!(line, "or {}", others.join(" ")))?;
+    }
     if !options.listen.ip().is_loopback() {
-        return Ok(());
+        if !options.open {
+            return Ok(());
+        }
+        let warning = "anyone who can reach this address can watch; to restrict that: --token WORD";
+        return output.line(|line| write!(line, "{warning}"));
     }
     let port = match options.listen.port() {
         WEB_PORT => String::new(),
