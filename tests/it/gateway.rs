@@ -309,8 +309,8 @@ fn what_is_longer_than_a_datagram_comes_in_parts_and_is_shown_whole() {
         let gateway =
             env.gateway(&[&["--interface=lo", "--to=127.0.0.1:30000", "--mtu=576"], &topics[..]].concat());
         listener.await_lines(20, "a scan", is_class("scan"));
-        let last = listener.await_line("a scan", is_class("scan"))["seq"].clone();
-        echo.await_line("the last of them", |line| number(line, "seq") >= last.as_u64().unwrap_or_default());
+        let last = number(&listener.await_line("a scan", is_class("scan")), "seq");
+        echo.await_line("the last of them", |line| line["class"] == "scan" && number(line, "seq") >= last);
         let (remote, own) = (listener.end(INT), echo.end(INT));
         assert_eq!(gateway.end(TERM).code, Some(0));
         let own: BTreeMap<_, _> = own

@@ -43,10 +43,12 @@ fn ages_of_a_stream_are_split_and_judged() {
         assert_eq!((number(&line, "received"), number(&line, "ahead")), (20, 0), "{line}");
         assert_eq!(line["flags"][0], "simulated");
         assert_eq!(count(&line, "age") + number(&line, "before"), 20, "{line}");
-        assert_eq!((count(&line, "hub"), count(&line, "wake")), (count(&line, "age"), count(&line, "age")));
+        // On a busy machine, a header cannot hold the time that a sample took in the hub.
+        let in_hub = count(&line, "hub");
+        assert!(in_hub == count(&line, "wake") && in_hub <= count(&line, "age"), "{line}");
         // Of a telegram whose stamps were computed, on a busy machine, nothing is known of the line.
         assert!(count(&line, "line") <= 20 && count(&line, "line") == count(&line, "total"), "{line}");
-        for part in ["hub", "wake"] {
+        for part in ["hub", "wake"].into_iter().filter(|_| in_hub > 0) {
             assert!(number(&line[part], "max_ns") <= number(&line["age"], "max_ns"), "{line}");
         }
         assert_eq!(line["network"], Value::Null);

@@ -18,6 +18,9 @@ fn simulator(env: &TestEnv, world: &str) -> Program {
     env.simulator(&["front"], &["--seed=51", "--baud=500000", world])
 }
 
+/// Time in which 50 scans arrive even on a busy machine.
+const LONG: &str = "20s";
+
 /// Waits until scans come and the verdict is `verdict`.
 fn await_verdict(env: &TestEnv, verdict: &str) {
     env.echo(&["front/zones"]).await_line(verdict, |line| line["verdict"] == verdict);
@@ -36,7 +39,7 @@ fn a_robot_that_knows_its_own_post_goes_on() {
     let _simulator = simulator(&env, &world(&env, POST));
     let hub = env.hub(&[env.link("front")]);
     await_verdict(&env, "stop");
-    let outcome = env.run(&["zones", "front", "mask", "--for", "3s"]);
+    let outcome = env.run(&["zones", "front", "mask", "--for", LONG]);
     assert_eq!(outcome.code, Some(0), "{outcome}");
     assert!(!DOUBTS.iter().any(|doubt| outcome.errors.contains(doubt)), "{outcome}");
     assert_eq!(hub.end(TERM).code, Some(0));
@@ -61,7 +64,7 @@ fn a_robot_that_knows_its_own_post_goes_on() {
         lines.iter().filter(|line| line["verdict"] == "stop" || line["verdict"] == "slow").collect();
     assert!(seen.is_empty(), "{seen:#?}");
     // A mask that is in force does not hinder the next one: scans are as the sensor sends them.
-    let again = env.run(&["zones", "front", "mask", "--for", "4s", "--json"]);
+    let again = env.run(&["zones", "front", "mask", "--for", LONG, "--json"]);
     assert_eq!(again.code, Some(0), "{again}");
     let mask = &again.of_class("mask")[0];
     assert_eq!(
@@ -78,7 +81,7 @@ fn nothing_there_is_an_empty_mask_that_a_hub_takes_too() {
     let _simulator = simulator(&env, &world(&env, ""));
     let hub = env.hub(&[env.link("front")]);
     await_verdict(&env, "clear");
-    let outcome = env.run(&["zones", "front", "mask", "--for", "3s"]);
+    let outcome = env.run(&["zones", "front", "mask", "--for", LONG]);
     assert_eq!(outcome.code, Some(0), "{outcome}");
     let doubt = "nothing of the robot is seen within 1.0 m of its centre: no mask is needed";
     assert!(outcome.errors.contains(doubt), "{outcome}");
@@ -89,7 +92,7 @@ fn nothing_there_is_an_empty_mask_that_a_hub_takes_too() {
     await_verdict(&env, "clear");
 
     // The walls are no body, but in a circle that is as large as the room they are: that is told.
-    let outcome = env.run(&["zones", "front", "mask", "--for", "4s", "--within", "6"]);
+    let outcome = env.run(&["zones", "front", "mask", "--for", LONG, "--within", "6"]);
     assert_eq!(outcome.code, Some(0), "{outcome}");
     assert!(outcome.errors.contains("the hub will be blind there"), "{outcome}");
 }
@@ -100,11 +103,11 @@ fn a_body_beyond_the_circle_that_violates_it_is_no_reason_to_do_without_a_mask()
     let _simulator = simulator(&env, &world(&env, "[[thing]]\nradius_mm = 40\npose = [0, 1200]\n"));
     let _hub = env.hub(&[&env.link("front"), "--set=zones.margin=0.5"]);
     await_verdict(&env, "slow");
-    let outcome = env.run(&["zones", "front", "mask", "--for", "3s"]);
+    let outcome = env.run(&["zones", "front", "mask", "--for", LONG]);
     assert_eq!(outcome.code, Some(0), "{outcome}");
     assert!(outcome.errors.contains("the largest circle is violated") && outcome.errors.contains("--within"));
     assert!(!outcome.errors.contains("no mask is needed"), "{outcome}");
-    let outcome = env.run(&["zones", "front", "mask", "--for", "3s", "--within", "1.5"]);
+    let outcome = env.run(&["zones", "front", "mask", "--for", LONG, "--within", "1.5"]);
     assert_eq!(outcome.code, Some(0), "{outcome}");
     assert!(!DOUBTS.iter().any(|doubt| outcome.errors.contains(doubt)), "{outcome}");
     assert!(!outcome.out.ends_with(b"self_min = []\n"), "{outcome}");

@@ -87,8 +87,9 @@ fn two_rooms_are_watched_from_a_third_machine() {
         assert!(ages.code == Some(0) && received("room0.front") > 0 && received("room1.front") > 0, "{ages}");
         let (mut near, mut far) = (rooms[1].echo(&["front/scan"]), watcher.echo(&["room1.front/scan"]));
         let scan = near.await_lines(10, "a scan", is_class("scan")).pop().expect("ten");
-        let same =
-            far.await_line("the same or a newer scan", |line| number(line, "seq") >= number(&scan, "seq"));
+        let is_it =
+            |line: &serde_json::Value| line["class"] == "scan" && number(line, "seq") >= number(&scan, "seq");
+        let same = far.await_line("the same or a newer scan", is_it);
         assert!(same["seq"] != scan["seq"] || same["ranges"] == scan["ranges"], "{same}");
         if can_sit() {
             let watch = Sitting::start(&watcher.command(&["watch"]), (100, 30));
