@@ -5,13 +5,11 @@ use super::holds;
 use super::tree::{Tree, code};
 
 /// What names a family, but for its driver, its simulator, tests, benches and pages; each says why.
-const MAY: [&str; 11] = [
+const MAY: [&str; 10] = [
     // The modules of the drivers.
     "hub/drivers/src/lib.rs",
     // The list of the families.
     "hub/drivers/src/families.rs",
-    // The search for a scanner of any of them.
-    "hub/drivers/src/search.rs",
     // The configuration that users start from, with a section for each.
     "hub/config/src/default.toml",
     // Number and name, in each language that reads scans, and what can be said of its packets.
