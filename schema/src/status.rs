@@ -43,7 +43,8 @@ pub struct Status {
     pub last_error_text: [u8; Status::MAX_ERROR_LEN],
     /// See [`Counter`].
     pub counters: Counters,
-    /// The pose of the sensor, as configured.
+    /// The pose of the sensor, as configured. The first of its reserved bytes belongs to the status, see
+    /// [`Status::has_mark_level`].
     pub pose: Pose,
 }
 
@@ -73,6 +74,39 @@ impl Status {
     pub fn reflector_remedy(&self) -> Option<String> {
         let is_wanted = self.has_reflector_bits() == Some(false) && !self.is_replayed();
         is_wanted.then(|| format!("scanhub configure {} mode=0x01", self.port()))
+    }
+
+    /// Returns whether a threshold for reflectors (`marks.level`) is configured. Only scanners without
+    /// [reflector levels](Family::has_reflector_levels) need one.
+    pub fn has_mark_level(&self) -> bool {
+        self.pose.reserved[0] & MARK_LEVEL != 0
+    }
+
+    /// Sets the sensor's pose, and whether a threshold for reflectors is configured.
+    pub fn set_processing(&mut self, pose: Pose, has_mark_level: bool) {
+        self.pose = pose;
+        self.pose.reserved[0] = if has_mark_level { MARK_LEVEL } else { 0 };
+    }
+
+    /// Returns whether topic `marks` is available: with the reflector bits of an LMS, and with the threshold for
+    /// reflectors of every other scanner. `None` while the family or the measuring mode is unknown.
+    pub fn has_marks(&self) -> Option<bool> {
+        if self.family()?.has_reflector_levels() {
+            self.has_reflector_bits()
+        } else {
+            Some(self.has_mark_level())
+        }
+    }
+
+    /// Returns the command, or the setting of link `sensor`, that makes topic `marks` available. `None` if it is available,
+    /// or if that is unknown or impossible.
+    pub fn marks_remedy(&self, sensor: &str) -> Option<String> {
+        // The name on the machine of the sensor.
+        let name = sensor.rsplit('.').next().unwrap_or(sensor);
+        match self.family()?.has_reflector_levels() {
+            true => self.reflector_remedy(),
+            false => (!self.has_mark_level()).then(|| format!("set link.{name}.marks.level")),
+        }
     }
 
     /// Returns the scans per second. `None` while a stream that just started has not been measured.
@@ -179,6 +213,9 @@ impl Status {
 
 /// A line that takes away more than this share has something that is to be looked for.
 const WELL: f64 = 0.001;
+
+/// Flag in the first reserved byte of the pose: a threshold for reflectors is configured.
+const MARK_LEVEL: u8 = 1;
 
 /// What the link is doing.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -330,6 +367,34 @@ mod tests {
         status.mode = 0;
         assert_eq!((status.has_reflector_bits(), status.reflector_remedy()), (Some(false), None));
         assert_eq!(Status::default().has_reflector_bits(), None);
+    }
+
+    #[test]
+    fn marks_need_reflector_bits_or_a_threshold() {
+        let of = |family: u8, mode, has_mark_level| {
+            let mut status = Status { family, mode, ..Status::default() };
+            status.set_port("/dev/ttyUSB0");
+            status.set_processing(Pose { x_m: 1.0, ..Pose::default() }, has_mark_level);
+            assert_eq!(status.pose.x_m, 1.0);
+            (status.has_marks(), status.marks_remedy("robot1.front"))
+        };
+        let configure = Some("scanhub configure /dev/ttyUSB0 mode=0x01".to_owned());
+        for (number, family) in Family::ALL.into_iter().enumerate() {
+            let number = number as u8;
+            let [without, with] = [false, true].map(|has_level| of(number, Status::MODE_UNKNOWN, has_level));
+            match family {
+                Family::Lms => {
+                    assert_eq!((&without, &with), (&(None, None), &(None, None)));
+                    assert_eq!(of(number, 0, true), (Some(false), configure.clone()));
+                    assert_eq!(of(number, 1, false), (Some(true), None));
+                }
+                _ => {
+                    assert_eq!(without, (Some(false), Some("set link.front.marks.level".to_owned())));
+                    assert_eq!(with, (Some(true), None));
+                }
+            }
+        }
+        assert_eq!(of(Family::UNKNOWN, Status::MODE_UNKNOWN, true), (None, None), "while the hub searches");
     }
 
     #[test]

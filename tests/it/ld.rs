@@ -139,6 +139,12 @@ fn marks_need_a_level() {
     assert_eq!((&marks["available"], &marks["marks"]), (&false.into(), &Value::Array(Vec::new())), "{marks}");
     let said = env.run(&["echo", "front/marks", "-n", "1"]);
     assert!(String::from_utf8_lossy(&said.out).contains("set link.NAME.marks.level"), "{said}");
+    let offer = |env: &TestEnv| env.info("front")["marks"].clone();
+    let remedy = "set link.front.marks.level";
+    assert_eq!(offer(&env), serde_json::json!({ "available": false, "remedy": remedy }));
+    let shown = |env: &TestEnv| String::from_utf8_lossy(&env.run(&["info", "front"]).out).into_owned();
+    let info = shown(&env);
+    assert!(info.contains(&format!("unavailable: {remedy}")), "{info}");
     assert_eq!(without.end(TERM).code, Some(0));
     // Reflectors of the room have 255 of 255.
     let _hub = hub(&env, &["model=ld19", "marks.level=250"]);
@@ -146,6 +152,13 @@ fn marks_need_a_level() {
     let marks = env.echo(&["front/marks"]).await_line("marks", is_found);
     assert_eq!(marks["available"], true, "{marks}");
     assert!(marks["marks"][0]["peak"].as_u64().is_some_and(|peak| peak >= 250), "{marks}");
+    assert_eq!(offer(&env), serde_json::json!({ "available": true, "remedy": null }));
+    let info = shown(&env);
+    let is_available = |line: &str| line.split_whitespace().eq(["marks", "available"]);
+    assert!(info.lines().any(is_available), "{info}");
+    let checked = env.run(&["doctor", "front", "--json", "--no-system-config"]).of_class("check");
+    let found = checked.iter().find(|line| line["name"] == "marks").expect("a check");
+    assert_eq!((&found["state"], &found["finding"]), (&"ok".into(), &"marks.level is set".into()));
 }
 
 #[test]

@@ -158,18 +158,16 @@ fn pose(pose: &Pose) -> String {
 }
 
 fn marks(sensor: &str, status: &Status) -> String {
-    match (status.has_reflector_bits(), status.reflector_remedy()) {
-        (None, _) if status.family().is_none() => "unknown".into(),
-        (None, _) if status.family() != Some(Family::Lms) => {
-            format!("off, unless link.{sensor}.marks.level is set")
-        }
-        (None, _) if status.is_replayed() => {
+    let is_lms = status.family() == Some(Family::Lms);
+    match (status.has_marks(), status.marks_remedy(sensor)) {
+        (None, _) if is_lms && status.is_replayed() => {
             format!("unavailable: the recording does not contain its measuring mode; set link.{sensor}.mode")
         }
         (None, _) => "unknown".into(),
         (Some(true), _) => "available".into(),
         (Some(false), None) => "unavailable: the recording has no reflector bits".into(),
-        (Some(false), Some(remedy)) => format!("unavailable: no reflector bits; `{remedy}`"),
+        (Some(false), Some(remedy)) if is_lms => format!("unavailable: no reflector bits; `{remedy}`"),
+        (Some(false), Some(remedy)) => format!("unavailable: {remedy}"),
     }
 }
 

@@ -169,7 +169,7 @@ struct Place {
     upside_down: bool,
 }
 
-/// Whether there are marks, in a status, and the command that changes it.
+/// Whether topic `marks` is available, in a status, and the command or setting that makes it so.
 #[derive(Serialize)]
 struct MarksOffer {
     available: Option<bool>,
@@ -226,7 +226,7 @@ pub(crate) fn status<'a>(sensor: &'a str, status: &'a Status) -> impl Serialize 
             yaw_rad: status.pose.yaw_rad,
             upside_down: status.pose.upside_down != 0,
         },
-        marks: MarksOffer { available: status.has_reflector_bits(), remedy: status.reflector_remedy() },
+        marks: MarksOffer { available: status.has_marks(), remedy: status.marks_remedy(sensor) },
         damaged: status.damaged(),
         lost_on_line: status.lost_on_line(),
     }

@@ -243,7 +243,7 @@ impl<'a, S: Surroundings> LinkCore<'a, S> {
     fn change(&mut self, processing: &Processing) {
         let now = self.around.now();
         self.output.change(processing, now);
-        self.stats.set_pose(processing.pose);
+        self.stats.set_processing(processing);
         self.next_status = now;
     }
 }

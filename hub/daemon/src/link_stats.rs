@@ -1,9 +1,9 @@
 //! What a link reports of itself: the state of a session and the hub's own counts as the payload of topic `status`.
 
-use config::Link;
+use config::{Link, Processing};
 use scanhub_drivers::PortSession;
 use scanhub_drivers::line::Session as _;
-use schema::{Counter, Counters, Family, MIN_RATE_SPAN, Nanos, Pose, State, Status};
+use schema::{Counter, Counters, Family, MIN_RATE_SPAN, Nanos, State, Status};
 
 use crate::process_telegram::Processed;
 use crate::recent::{LineHealth, Recent};
@@ -36,10 +36,10 @@ pub(crate) struct LinkStats {
 
 impl LinkStats {
     pub(crate) fn new(link: &Link, now: Nanos) -> Self {
-        let mut status = Status { since_ns: now, pose: link.processing.pose, ..Status::default() };
+        let mut status = Status { since_ns: now, ..Status::default() };
         status.family = number_of(link.family());
         status.set_port(&link.port.name());
-        LinkStats {
+        let mut stats = LinkStats {
             status,
             mode: link.scanner.settings.mode_number,
             past: Counters::default(),
@@ -52,7 +52,9 @@ impl LinkStats {
             reconnects: 0,
             line_errors: 0,
             next_search_log: 0,
-        }
+        };
+        stats.set_processing(&link.processing);
+        stats
     }
 
     /// Takes over the state and the trouble of the moment; returns whether either is new.
@@ -118,9 +120,9 @@ impl LinkStats {
         self.status.family = family as u8;
     }
 
-    /// The sensor sits elsewhere, or so it is said now.
-    pub(crate) fn set_pose(&mut self, pose: Pose) {
-        self.status.pose = pose;
+    /// Takes over the configured pose, and whether a threshold for reflectors is configured.
+    pub(crate) fn set_processing(&mut self, processing: &Processing) {
+        self.status.set_processing(processing.pose, processing.marks.level.is_some());
     }
 
     /// The status as it was last.

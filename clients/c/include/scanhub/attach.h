@@ -412,7 +412,7 @@ struct scanhub_pose_v2 {
     double y_m; /* to the left of it */
     double yaw_rad;
     uint8_t upside_down;
-    uint8_t reserved[7];
+    uint8_t reserved[7]; /* of a status, the first one is 1 if marks.level is set */
 };
 
 /* States. */

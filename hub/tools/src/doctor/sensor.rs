@@ -37,14 +37,14 @@ pub(crate) fn as_the_hub_says(link: Option<(&str, &Status)>, why_unknown: &str) 
     }
 }
 
-/// Checks whether the measuring mode has bits for reflectors. Returns `None` if the mode is unknown, or if a scanner
-/// without these bits needs no remedy.
+/// Checks whether the measuring mode of an LMS has bits for reflectors. Returns `None` if the mode is unknown, or if a
+/// scanner without these bits needs no remedy, like one of another family without a configured threshold.
 fn marks(status: &Status, when: &str) -> Option<Finding> {
     const NAME: &str = "marks";
     let Some(remedy) = status.reflector_remedy() else {
-        return status
-            .has_reflector_bits()?
-            .then(|| Finding::ok(NAME, "the measuring mode has reflector bits"));
+        let is_lms = status.family() == Some(schema::Family::Lms);
+        let why = if is_lms { "the measuring mode has reflector bits" } else { "marks.level is set" };
+        return status.has_marks()?.then(|| Finding::ok(NAME, why));
     };
     let what = format!(
         "the measuring mode, {:02x}h, has no reflector bits: topic marks is unavailable",
