@@ -85,8 +85,8 @@ fn dispatch(cli: &Cli) -> Result<(), Failure> {
         Verb::Telegram(telegram) => match &telegram.way {
             Way::Decode(decode) => tools::telegram::decode(&decode.options(everywhere.json), &mut out),
         },
-        Verb::Probe(probe) => probe.run(everywhere.json, &*interrupt()?),
-        Verb::Configure(configure) => configure.run(everywhere.json, &*interrupt_by(&ENDS)?),
+        Verb::Probe(probe) => probe.run(everywhere, &*interrupt()?),
+        Verb::Configure(configure) => configure.run(everywhere, &*interrupt_by(&ENDS)?),
         Verb::Convert(convert) => convert.run(everywhere.json, &*interrupt()?),
         Verb::Completions(completions) => completions.run(),
         Verb::Complete(complete) => {

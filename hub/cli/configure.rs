@@ -8,6 +8,7 @@ use schema::Failure;
 use tools::configure::{News, Order, configure};
 use tools::probe::source;
 
+use super::Everywhere;
 use super::probe::Progress;
 
 #[derive(Args, Debug)]
@@ -29,12 +30,14 @@ pub(crate) const CONSENT: &str = "A person must confirm. If stdin or stderr is n
                                   shown, nothing is written, and the exit code is 2";
 
 impl Configure {
-    pub(crate) fn run(&self, json: bool, stop: &AtomicBool) -> Result<(), Failure> {
+    pub(crate) fn run(&self, everywhere: &Everywhere, stop: &AtomicBool) -> Result<(), Failure> {
         let order = Order {
             source: source(&self.port)?,
+            places: everywhere.places()?,
             settings: self.settings.clone(),
             password: self.password.clone(),
         };
+        let json = everywhere.json;
         let mut progress = Progress::new();
         let outcome = configure(&order, stop, &mut |news| match news {
             News::Looking(rate) => progress.show(&format!("looking at {rate} Bd")),

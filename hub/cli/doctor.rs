@@ -14,7 +14,7 @@ use super::{Everywhere, Run};
 #[derive(Args, Debug)]
 pub(crate) struct Doctor {
     /// Ports to check: a tty or tcp:HOST:PORT, or the name of a link of the running hub; without one, the ports of the
-    /// configuration, else all ports
+    /// configuration, or all ports if there are none, and the links of the running hub
     #[arg(value_name = "PORT")]
     ports: Vec<String>,
     /// First remove what dead processes left in this domain; removes nothing while a hub runs there

@@ -9,6 +9,8 @@ use schema::Failure;
 use serde::Serialize;
 use tools::probe::{Ports, probe, source};
 
+use super::Everywhere;
+
 #[derive(Args, Debug)]
 pub(crate) struct Probe {
     /// Port to look at: a tty or tcp:HOST:PORT; without one, the ports of this machine are listed
@@ -20,7 +22,8 @@ pub(crate) struct Probe {
 }
 
 impl Probe {
-    pub(crate) fn run(&self, json: bool, stop: &AtomicBool) -> Result<(), Failure> {
+    pub(crate) fn run(&self, everywhere: &Everywhere, stop: &AtomicBool) -> Result<(), Failure> {
+        let json = everywhere.json;
         let Some(port) = &self.port else {
             let ports = Ports::of_machine();
             for candidate in &ports.candidates {
@@ -32,7 +35,9 @@ impl Probe {
             return ports.check();
         };
         let mut progress = Progress::new();
-        let found = probe(&source(port)?, stop, |rate| progress.show(&format!("looking at {rate} Bd")));
+        let places = everywhere.places()?;
+        let found =
+            probe(&source(port)?, &places, stop, |rate| progress.show(&format!("looking at {rate} Bd")));
         if found.is_err() {
             progress.leave();
         }

@@ -127,7 +127,7 @@ fn bytes_of_no_known_scanner_are_reported_with_the_command_that_examines_them() 
     let _simulator = env.simulator(&["front"], &damage);
     let _hub = hub(&env);
     let end = format!(
-        " bytes/s arrive, but scanhub does not recognize the scanner: scanhub probe {}",
+        " bytes/s arrive, but scanhub does not recognize the scanner: stop the hub, then: scanhub probe {}",
         env.word("front")
     );
     let info = env.await_info("front", |info| text(info, "last_error").ends_with(&end));
@@ -190,4 +190,28 @@ fn a_number_of_beams_outlives_a_restart_of_the_hub() {
     crate::testkit::until("the other number is remembered", || memory(&env).contains(" 450 "));
     let log = hub.end(TERM).errors;
     assert_eq!(log.matches(message).count(), 1, "{log}");
+}
+
+/// A recording that begins during a stream has no reply with the scanner's type, but a status with it.
+#[test]
+fn a_recording_has_the_model_of_its_scanner() {
+    for (simulated, model) in [(LMS, "lms200"), (LD19, "ld19"), (A1, "a1")] {
+        let env = TestEnv::new();
+        let simulator = env.simulator(&["front"], simulated);
+        let live = hub(&env);
+        let shown = env.await_info("front", |info| info["state"] == "streaming" && info["model"] == model);
+        let recorder = recorder(&env, "front.mcap", &["front/telegram", "front/status"]);
+        let mut echo = env.echo(&["front/scan", "front/status"]);
+        echo.await_lines(10, "a scan", is_class("scan"));
+        echo.await_line("a status", is_class("status"));
+        assert_eq!([recorder.end(INT).code, echo.end(INT).code, live.end(TERM).code], [Some(0); 3]);
+        assert_eq!(simulator.end(TERM).code, Some(0));
+
+        let replayed = env.hub(&[format!("--link=front=file:{}", env.word("front.mcap"))]);
+        for state in ["streaming", "silent"] {
+            let info = env.await_info("front", |info| info["state"] == state || info["state"] == "silent");
+            assert_eq!((text(&info, "model"), &info["family"]), (model, &shown["family"]), "{info}");
+        }
+        assert_eq!(replayed.end(TERM).code, Some(0));
+    }
 }

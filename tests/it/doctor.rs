@@ -121,7 +121,7 @@ fn a_port_without_a_sensor_is_asked_for_a_bounded_time() {
     let _simulator = env.simulator(&["front"], &["--fault=mute=1"]);
     let (findings, _) = doctor(&env, &[&env.word("front")], 5);
     let (found, text) = state(&findings, "sensor", Some(&env.word("front")));
-    assert!(found == "failed" && text.contains("no answer at 9600"), "{text}");
+    assert!(found == "failed" && text.contains("looked for lms at 9600"), "{text}");
 }
 
 #[test]

@@ -1,8 +1,25 @@
 //! A hub at a scanner of another family than its link has: bytes arrive, and none of them make sense.
 
-use serde_json::Value;
+use std::fs::File;
 
-use crate::testkit::{TERM, TestEnv};
+use config::{Config, Sources};
+use scanhub_drivers::ld;
+use scanhub_drivers::lms::variant::Baud;
+use schema::ipc::{self, Payload};
+use schema::{Family, MILLIS, Nanos, Status};
+use serde_json::Value;
+use sim::Arrival;
+use sim::device::Device;
+use sim::ld::{Head, HeadSettings, Packets};
+use sim::machine::{self, Machine, Start};
+use sim::operating::Operating;
+use sim::room::Room;
+use sim::rplidar::{Model, Unit, UnitSettings, UnitStart};
+
+use crate::replayed::recorded_rooms::virtual_hub::{VirtualLink, virtual_hub};
+use crate::testkit::{INT, TERM, TestEnv};
+
+const REMEDY: &str = "Remove family from link front and restart the hub: it finds the scanner";
 
 #[test]
 fn bytes_of_another_scanner_are_reported_with_their_rate() {
@@ -14,10 +31,7 @@ fn bytes_of_another_scanner_are_reported_with_their_rate() {
         let env = TestEnv::new();
         let _simulator = env.simulator(&["front"], &[&["--seed=43"], simulated].concat());
         let hub = env.hub(&[format!("{},family={family}", env.link("front"))]);
-        let says = format!(
-            " bytes/s arrive, but no {missing}; is it another scanner? Try: scanhub probe {}",
-            env.word("front")
-        );
+        let says = format!(" bytes/s arrive, but no {missing}; is it another scanner? {REMEDY}");
         let error = |info: &Value| info["last_error"].as_str().unwrap_or_default().to_owned();
         let info = env.await_info("front", |info| error(info).contains(" bytes/s arrive"));
         let error = error(&info);
@@ -44,7 +58,225 @@ fn a_silent_line_may_have_another_scanner() {
         let _hub = env.hub(&[format!("{},family={family}", env.link("front"))]);
         let error = |info: &Value| info["last_error"].as_str().unwrap_or_default().to_owned();
         let info = env.await_info("front", |info| error(info).starts_with(says));
-        let remedy = format!(" Another scanner? Try: scanhub probe {}", env.word("front"));
-        assert!(error(&info).ends_with(&remedy), "{info}");
+        let remedy = error(&info).split_once(" Another scanner? ").map(|(_, remedy)| remedy.to_owned());
+        assert!(remedy.is_some_and(|remedy| remedy.starts_with("Remove family from link front")), "{info}");
     }
+}
+
+/// The remedy that the hub names leads to the scanner, and so does `probe`, which cannot search a port of the hub.
+#[test]
+fn a_port_of_the_hub_is_refused_with_what_the_hub_reports_and_the_next_command() {
+    let (env, other) = (TestEnv::new(), TestEnv::new());
+    let _simulator = env.simulator(&["front"], &["--family=ld", "--model=ld19", "--world=room"]);
+    let (port, name) = (env.word("front"), env.place().name().to_owned());
+    let hub = env.hub(&[format!("{},family=lms", env.link("front"))]);
+    let error = |info: &Value| info["last_error"].as_str().unwrap_or_default().to_owned();
+    let info = env.await_info("front", |info| error(info).ends_with(REMEDY));
+    let stop = format!("stop the hub: kill {}", hub.pid());
+    let refused = |env: &TestEnv, verb: &[&str]| {
+        let outcome = env.run(&[verb, &["--json"]].concat());
+        let failure = &outcome.of_class("error")[0];
+        assert_eq!((outcome.code, &failure["kind"]), (Some(4), &"port_busy".into()), "{outcome}");
+        ["message", "hint"].map(|key| failure[key].as_str().expect("a text").to_owned())
+    };
+    for verb in [&["probe", &port][..], &["configure", &port, "unit=mm"]] {
+        let [message, hint] = refused(&env, verb);
+        let begin = format!("{port}: in use by the hub, process {}; its link front is ", hub.pid());
+        let remedy = "is it another scanner? Remove family from link front";
+        assert!(message.starts_with(&begin) && message.contains(remedy), "{message}");
+        assert_eq!(hint, format!("scanhub info front; before another program may use the port, {stop}"));
+    }
+    // From another domain, the command names the domain of the hub.
+    let [message, hint] = refused(&other, &["probe", &port]);
+    assert!(
+        message.contains("in use by the hub, process ") && message.contains("its link front"),
+        "{message}"
+    );
+    assert!(hint.contains(&format!(" info --domain {name} ")) && hint.ends_with(&stop), "{hint}");
+
+    let doctor = |env: &TestEnv, port: &str| {
+        let outcome = env.run(&["doctor", port, "--json", "--no-system-config"]);
+        assert_eq!(outcome.code, Some(5), "{outcome}");
+        let findings = outcome.of_class("check");
+        let of = |name: &str| {
+            let found = findings.iter().find(|line| line["name"] == name && !line["port"].is_null());
+            found.unwrap_or_else(|| panic!("no {name}: {outcome}")).clone()
+        };
+        [of("holder"), of("sensor")]
+    };
+    for (env, port) in [(&env, &port), (&env, &"front".to_owned()), (&other, &port)] {
+        let [holder, sensor] = doctor(env, port);
+        let text = |line: &Value, key: &str| line[key].as_str().unwrap_or_default().to_owned();
+        assert!(text(&holder, "finding").contains(&format!("process {}", hub.pid())), "{holder}");
+        assert!(text(&sensor, "finding").contains("is it another scanner? Remove family"), "{sensor}");
+        let next = format!("or stop the hub (kill {}), then search the port: scanhub probe ", hub.pid());
+        assert!(sensor["state"] == "failed" && text(&sensor, "remedy").contains(&next), "{sensor}");
+        assert!(text(&sensor, "remedy").contains(" info "), "{sensor}");
+    }
+
+    // A third process takes bytes away from the hub.
+    let reader = File::options().read(true).open(env.path("front")).expect("the port");
+    let [message, hint] = refused(&env, &["probe", &port]);
+    let process = format!("process {} (", std::process::id());
+    assert!(message.contains(&format!(", and read by {process}")), "{message}");
+    assert!(hint.starts_with(&format!("end {process}")) && hint.ends_with(&stop), "{hint}");
+    drop(reader);
+
+    assert_eq!(hub.end(TERM).code, Some(0), "{info}");
+    // Each of the two remedies leads to the scanner.
+    assert_eq!(env.run(&["probe", &port, "--json"]).lines()[0]["model"], "ld19");
+    let _hub = env.hub(&[env.link("front")]);
+    env.await_info("front", |info| info["state"] == "streaming" && info["model"] == "ld19");
+}
+
+/// Scanners that stream, with the name that the message has for each.
+fn scanners() -> [(&'static str, Box<dyn Device>); 3] {
+    let room = || Room::new(&"room".parse().expect("a world"), 7);
+    let head = HeadSettings { seed: 7, ..HeadSettings::of(ld::Model::Ld19) };
+    let machine = machine::Settings {
+        baud: Baud::B500000,
+        start: Start::In(Operating::All),
+        seed: 7,
+        ..machine::Settings::default()
+    };
+    let unit = UnitSettings { start: UnitStart::Streaming, seed: 7, ..UnitSettings::of(Model::A1) };
+    [
+        ("ld19", Box::new(Head::new(head, Packets::Room(Box::new(room()))))),
+        ("lms", Box::new(Machine::new(machine, sim::source::Source::Room(room())))),
+        ("a1", Box::new(Unit::new(unit, room()))),
+    ]
+}
+
+/// Connects `device` to a link of the hub from `begin` to `end`. The rate of the line garbles no bytes. Calls `note` with the time
+/// of each step.
+fn connect(
+    device: &mut dyn Device,
+    link: &mut VirtualLink<'_>,
+    (begin, end): (Nanos, Nanos),
+    mut note: impl FnMut(Nanos),
+) {
+    for now in (begin..end).step_by(10 * MILLIS as usize) {
+        let mut bytes = Vec::new();
+        while let Some(chunk) = device.poll_transmit(now) {
+            bytes.extend(chunk.bytes);
+        }
+        // It was not connected before.
+        link.read(now, if now == begin { &[] } else { &bytes });
+        for (number, byte) in link.take_written().into_iter().enumerate() {
+            device.receive(byte, Arrival::at(now + number as Nanos * MILLIS / 4));
+        }
+        note(now);
+    }
+}
+
+const SECOND: Nanos = 1_000 * MILLIS;
+/// Time at which the scanner is exchanged.
+const EXCHANGED_AT: Nanos = 10 * SECOND;
+
+/// Time, family and last error of a status.
+type Reported = (Nanos, Option<Family>, String);
+
+/// Runs a hub in virtual time until `end`: the scanner with this number streams, and is then replaced by the next one on the same
+/// line. `keys` belong to the link. Returns the name of the first scanner, and what the hub has reported.
+fn exchange(keys: &str, number: usize, end: Nanos) -> (&'static str, Vec<Reported>) {
+    let env = TestEnv::new();
+    let (name, mut first) = scanners().into_iter().nth(number).expect("three");
+    let (_, mut second) = scanners().into_iter().nth((number + 1) % 3).expect("three");
+    let sources = Sources { links: vec![format!("a=/dev/none{keys}")], ..Sources::default() };
+    let config = Config::load(&sources).expect("a configuration");
+    let domain = env.place();
+    let driven = virtual_hub(&config, &domain, |links| {
+        let node = ipc::client_node(&domain).expect("a node");
+        let topic = Status::open(&node, "a").expect("a topic").expect("is there");
+        let statuses = Status::subscriber(&topic).expect("a subscriber");
+        let mut reported = Vec::new();
+        let mut note = |now: Nanos| {
+            while let Ok(Some(sample)) = Status::receive(&statuses) {
+                let status = Status::read(&sample);
+                reported.push((now, status.family(), status.last_error().to_owned()));
+            }
+        };
+        connect(&mut *first, &mut links[0], (0, EXCHANGED_AT), &mut note);
+        connect(&mut *second, &mut links[0], (EXCHANGED_AT, end), &mut note);
+        reported
+    });
+    (name, driven.expect("the domain is free"))
+}
+
+/// Checks that a hub reports the exchange of a scanner called `name` within 4 s, with `remedy`, and no damage of the line.
+fn check_exchange(name: &str, remedy: &str, reported: &[Reported]) {
+    let says = format!(" bytes/s of another kind arrive: was the {name} exchanged? {remedy}");
+    let is_soon = |(now, ..): &&Reported| (EXCHANGED_AT..EXCHANGED_AT + 4 * SECOND).contains(now);
+    let mut soon = reported.iter().filter(is_soon);
+    assert!(soon.any(|(.., error)| error.ends_with(&says)), "{says}: {reported:#?}");
+    let is_damaged = reported.iter().any(|(.., error)| error.contains("damaged on the line"));
+    assert!(!is_damaged, "{name}: {reported:#?}");
+}
+
+#[test]
+fn an_exchanged_scanner_is_not_reported_as_a_damaged_line() {
+    for number in 0..3 {
+        let (name, reported) = exchange("", number, 35 * SECOND);
+        check_exchange(name, "The search begins after 10 s without it", &reported);
+        let before = reported.iter().rfind(|(now, ..)| *now < EXCHANGED_AT).and_then(|(_, family, _)| *family);
+        let (_, family, error) = reported.last().expect("statuses");
+        assert!(before.is_some() && family.is_some() && before != *family, "{name}: {reported:#?}");
+        assert_eq!(error, "", "{name}: {reported:#?}");
+    }
+    let (name, reported) = exchange(",family=ld", 0, 16 * SECOND);
+    let remedy = "Remove family from link a and restart the hub: it finds the scanner";
+    check_exchange(name, remedy, &reported);
+}
+
+/// The links of a running hub need no name on the command line.
+#[test]
+fn doctor_reports_each_link_of_the_running_hub() {
+    let env = TestEnv::new();
+    let _simulator = env.simulator(&["front"], &["--family=ld", "--model=ld19", "--world=room"]);
+    let server = std::net::TcpListener::bind("127.0.0.1:0").and_then(|socket| socket.local_addr());
+    let server = format!("tcp:{}", server.expect("a port that was free a moment ago"));
+    let scan = format!("FLASER 181{} 0 0 0 0 0 0 1.5 host 1.5\n", " 1.5".repeat(181));
+    let log = env.file("walk.log", scan);
+    let links = [
+        env.link("front"),
+        env.link("absent"),
+        format!("--link=side={server}"),
+        format!("--link=walk=file:{log}"),
+    ];
+    let hub = env.hub(&links);
+    env.await_info("front", |info| info["state"] == "streaming");
+    env.await_info("walk", |info| info["state"] == "silent");
+    env.await_info("side", |info| info["last_error"].as_str().is_some_and(|error| error.contains("refused")));
+    let outcome = env.run(&["doctor", "--json", "--no-system-config"]);
+    assert_eq!(outcome.code, Some(5), "{outcome}");
+    let findings = outcome.of_class("check");
+    for (link, port, state, says) in [
+        ("front", env.word("front"), "ok", "link front of the hub: streaming, family ld, LD19"),
+        ("absent", env.word("absent"), "failed", "link absent of the hub: absent"),
+        ("side", server.clone(), "failed", "connection refused; nothing listens there"),
+        ("walk", format!("file:{log}"), "ok", "link walk of the hub: silent"),
+    ] {
+        let found = findings.iter().find(|line| line["name"] == "sensor" && line["link"] == link);
+        let found = found.unwrap_or_else(|| panic!("no {link}: {outcome}"));
+        let text = |key: &str| found[key].as_str().unwrap_or_default();
+        assert_eq!((text("state"), text("port")), (state, &port[..]), "{found}");
+        assert!(text("finding").contains(says), "{found}");
+        assert!(text("state") == "ok" || text("remedy").contains(&format!("scanhub info {link}")), "{found}");
+    }
+    let text = env.run(&["doctor", "--no-system-config"]).to_string();
+    assert!(text.contains(&format!("{server} (link side)")), "{text}");
+    // A configuration of other links adds its own.
+    let named = env.run(&["doctor", "--json", "--no-system-config", &env.link("front"), &env.link("rear")]);
+    let findings = named.of_class("check");
+    let links = ["front", "rear", "absent", "side"];
+    let count = |link: &&str| {
+        findings
+            .iter()
+            .filter(|line| {
+                line["link"] == **link && ["port", "holder"].contains(&line["name"].as_str().unwrap_or(""))
+            })
+            .count()
+    };
+    assert!(links.iter().all(|link| count(link) > 0), "{named}");
+    assert_eq!(hub.end(INT).code, Some(0));
 }

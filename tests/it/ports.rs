@@ -1,10 +1,11 @@
 //! The ways in which a port cannot be used: each has its message and its remedy. A hub ends only at a port that is not a
 //! serial line, and waits for all others.
 
+use std::net::{TcpListener, TcpStream};
 use std::os::unix::fs::{PermissionsExt, chown, symlink};
 use std::os::unix::process::CommandExt;
 
-use crate::testkit::{Line, Program, TERM, TestEnv, is_class, skip, succeeds};
+use crate::testkit::{self, Line, Program, TERM, TestEnv, is_class, skip, succeeds};
 use rustix::process::geteuid;
 use serde_json::Value;
 
@@ -139,8 +140,33 @@ fn what_another_process_has() {
 #[test]
 fn ready_without_json_names_what_the_hub_waits_for() {
     let env = TestEnv::new();
-    let mut hub = env.start(&["run", &env.link("front"), &env.link("rear")]);
+    // Nothing listens at the one, and the other one accepts no connection.
+    let free = TcpListener::bind("127.0.0.1:0").and_then(|socket| socket.local_addr()).expect("a port");
+    let mute = TcpListener::bind("127.0.0.1:0").expect("a port");
+    rustix::net::listen(&mute, 0).expect("a socket");
+    let _waiting = mute.local_addr().and_then(TcpStream::connect).expect("room for one");
+    let servers = [("refused", free), ("mute", mute.local_addr().expect("an address"))];
+    let servers = servers.map(|(name, address)| format!("--link={name}=tcp:{address}"));
+    let links = [&[env.link("front"), env.link("rear")], &servers[..]].concat();
+    let mut hub = env.start(&[&["run".to_owned()], &links[..]].concat());
     let ready = hub.next_text();
-    assert!(ready.ends_with(", sensors: front, rear; waiting for the port of front, rear"), "{ready}");
+    let names = "front, rear, refused, mute";
+    assert!(ready.ends_with(&format!(", sensors: {names}; waiting for the port of {names}")), "{ready}");
     assert_eq!(hub.end(TERM).code, Some(0));
+}
+
+/// A server that accepts the connection at once is not waited for.
+#[test]
+fn ready_names_no_serial_server_that_is_connected() {
+    let env = TestEnv::new();
+    let server = TcpListener::bind("127.0.0.1:0").expect("a port");
+    let link = format!("--link=front=tcp:{}", server.local_addr().expect("an address"));
+    let is_connected = || {
+        let mut hub = env.start(&["run", "--json", &link]);
+        let ready = hub.await_line("ready", is_class("ready"));
+        assert_eq!((ready["sensors"].as_array().map(Vec::len), hub.end(TERM).code), (Some(1), Some(0)));
+        ready["waiting"] == serde_json::json!([])
+    };
+    // On a busy machine, the hub may run too late to connect in time.
+    testkit::until("the hub is connected when it is ready", is_connected);
 }

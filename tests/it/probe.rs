@@ -171,7 +171,15 @@ fn an_unknown_scanner_gets_only_requests_of_the_search() {
         let outcome = program.wait();
         sent.extend(line.received());
         assert_eq!(outcome.code, Some(code), "{outcome}");
-        assert!(outcome.to_string().contains("no sensor of family ld, rplidar either"), "{outcome}");
+        let text = outcome.to_string();
+        for says in [
+            "no byte arrived; looked for lms at 9600, 19200, 38400 or 500000 Bd, ld at ",
+            "; lms: ",
+            "; ld: ",
+            "; rplidar: ",
+        ] {
+            assert!(text.contains(says), "{says}: {outcome}");
+        }
         // Each family has four rates, and there are two rounds.
         let counts = count_requests(&sent);
         assert!(counts[0] >= 4 && counts[1] >= 4 && counts[2] >= 8 && counts[3] >= 8, "{counts:?}");
@@ -202,6 +210,25 @@ fn a_scanner_that_streams_unasked_gets_no_other_request() {
         assert_eq!(outcome.code, Some(0), "{outcome}");
         assert!(outcome.to_string().to_lowercase().contains("ld19"), "{outcome}");
     }
+}
+
+/// `probe` would get only a part of the bytes, and report the line as damaged.
+#[test]
+fn another_process_that_reads_the_port_is_named() {
+    let env = TestEnv::new();
+    let _simulator = env.simulator(&["front"], &["--family=ld", "--model=ld19", "--world=room"]);
+    let port = env.word("front");
+    let reader = std::fs::File::open(env.path("front")).expect("the port");
+    for verb in [&["probe", &port][..], &["configure", &port, "unit=mm"]] {
+        let outcome = env.run(&[verb, &["--json"]].concat());
+        let error = &outcome.of_class("error")[0];
+        assert_eq!((outcome.code, &error["kind"]), (Some(4), &"port_busy".into()), "{outcome}");
+        let holder = format!("{port}: in use by process {} (", std::process::id());
+        assert!(error["message"].as_str().is_some_and(|message| message.starts_with(&holder)), "{error}");
+        assert_eq!(error["hint"], "stop it first");
+    }
+    drop(reader);
+    assert_eq!(env.run(&["probe", &port, "--json"]).lines()[0]["model"], "ld19");
 }
 
 #[test]
@@ -246,13 +273,21 @@ fn a_serial_server_that_has_another_client_is_told_with_a_remedy() {
     let mut simulator = env.start(&[&["simulate", "--json", "--tcp=127.0.0.1:0"], &flags[..]].concat());
     let ready = simulator.await_line("ready", |line| line["class"] == "ready");
     let port = ready["ports"][0]["port"].as_str().expect("its address");
-    let hub = env.hub(&[&format!("--link=front={port}"), "--set=link.front.family=ld"]);
-    env.await_info("front", |info| info["state"] == "streaming");
-    let busy = env.run(&["probe", port, "--json"]);
-    let error = &busy.of_class("error")[0];
-    assert_eq!((busy.code, &error["kind"]), (Some(4), &"port_busy".into()), "{busy}");
-    assert!(error["hint"].as_str().is_some_and(|hint| hint.contains("end the other program")), "{busy}");
-    assert_eq!(env.info("front")["state"], "streaming", "the hub does not notice");
+    let other = TestEnv::new();
+    let hub = other.hub(&[&format!("--link=front={port}"), "--set=link.front.family=ld"]);
+    other.await_info("front", |info| info["state"] == "streaming");
+    let busy = |env: &TestEnv| {
+        let busy = env.run(&["probe", port, "--json"]);
+        let error = &busy.of_class("error")[0];
+        assert_eq!((busy.code, &error["kind"]), (Some(4), &"port_busy".into()), "{busy}");
+        ["message", "hint"].map(|key| error[key].as_str().unwrap_or_default().to_owned())
+    };
+    let [_, hint] = busy(&env);
+    assert!(hint.contains("end the other program"), "{hint}");
+    let [message, hint] = busy(&other);
+    let begin = format!("{port}: in use by the hub, process {}; its link front is streaming", hub.pid());
+    assert!(message.starts_with(&begin) && hint.starts_with("scanhub info front; "), "{message} {hint}");
+    assert_eq!(other.info("front")["state"], "streaming", "the hub does not notice");
     assert_eq!(hub.end(TERM).code, Some(0));
     testkit::until("the server has no client", || env.run(&["probe", port]).code == Some(0));
     assert_eq!(simulator.end(TERM).code, Some(0));

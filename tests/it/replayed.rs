@@ -3,7 +3,7 @@
 //! replayed telegram by telegram.
 
 #[path = "../testkit/recorded_rooms.rs"]
-mod recorded_rooms;
+pub(crate) mod recorded_rooms;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::mpsc::channel;

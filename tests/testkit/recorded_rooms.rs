@@ -2,7 +2,7 @@
 //! file.
 
 #[path = "virtual_hub.rs"]
-mod virtual_hub;
+pub(crate) mod virtual_hub;
 
 use std::collections::BTreeMap;
 use std::fs::File;

@@ -1,6 +1,6 @@
 //! The hub's links in virtual time: bytes are passed in with the time at which they arrived, and the topics are
 //! published in shared memory by the same code as those of a line. Many sensors can be driven faster than in real time.
-//! What a session sends to a sensor is discarded.
+//! What a session sends to a sensor is kept until it is taken.
 
 use std::cell::{Cell, RefCell};
 use std::collections::VecDeque;
@@ -73,6 +73,12 @@ impl VirtualLink<'_> {
         *self.around.line.1.borrow_mut() = rates.to_vec();
     }
 
+    /// Returns the bytes that the session has sent since the last call.
+    #[allow(dead_code, reason = "not every program that includes this module has a sensor that receives")]
+    pub(crate) fn take_written(&mut self) -> Vec<u8> {
+        std::mem::take(&mut self.around.line.2.borrow_mut())
+    }
+
     fn turn(&mut self, woken: Woken) {
         let Wait { until, .. } = self.link.turn(woken);
         self.until = until;
@@ -91,9 +97,9 @@ struct Around<'a> {
     telegrams: Cell<usize>,
 }
 
-/// Bytes that have arrived and were not read, and rates that the port rejects.
+/// Bytes that have arrived and were not read, rates that the port rejects, and bytes that were written.
 #[derive(Clone, Default)]
-struct Bytes(Rc<RefCell<VecDeque<u8>>>, Rc<RefCell<Vec<u32>>>);
+struct Bytes(Rc<RefCell<VecDeque<u8>>>, Rc<RefCell<Vec<u32>>>, Rc<RefCell<Vec<u8>>>);
 
 impl<'a> Around<'a> {
     fn new(node: &'a Node, sensor: &str) -> Result<Self, Failure> {
@@ -177,7 +183,8 @@ impl Line for Bytes {
         Ok(len)
     }
 
-    fn write(&self, _: &[u8]) -> io::Result<()> {
+    fn write(&self, bytes: &[u8]) -> io::Result<()> {
+        self.2.borrow_mut().extend(bytes);
         Ok(())
     }
 

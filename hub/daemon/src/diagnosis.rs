@@ -8,7 +8,7 @@ use config::Link;
 use port::{Alteration, Source};
 use scanhub_drivers::line::{Notice, Session as _};
 use scanhub_drivers::{PortSession, Trouble, line, search};
-use schema::{MILLIS, Nanos, State, Status};
+use schema::{Family, MILLIS, Nanos, State, Status};
 
 use crate::byte_rate::{ByteRate, with_commas};
 use crate::recent::LineHealth;
@@ -26,6 +26,15 @@ pub(crate) struct Diagnosis<'a> {
     device: Option<String>,
     /// Rate of the bytes that arrive while nothing is streaming.
     byte_rate: ByteRate,
+    /// Family of the scanner. `None` while the session searches for it.
+    family: Option<Family>,
+    /// Number of telegrams of the session, and the time of the scanner's last one. `None` before the first one.
+    telegrams: u64,
+    last_telegram: Option<Nanos>,
+    /// Message that the scanner was exchanged, until the next one is found; else empty.
+    exchange: String,
+    /// Time of the last look.
+    now: Nanos,
     /// Settings that another process changed.
     altered: Option<Altered>,
     /// The port brings more than its line can.
@@ -55,8 +64,11 @@ struct Altered {
 struct Facts {
     state: State,
     trouble: Option<Trouble>,
-    /// Rate of the bytes that arrive while the session is [missing](line::Session::missing) something.
+    /// Rate of the bytes that arrive while the session is [missing](line::Session::missing) something, or was
+    /// interrupted.
     bytes_per_second: Option<u64>,
+    /// Whether bytes arrive that are not of the scanner that has streamed.
+    is_exchanged: bool,
     other_model: Option<&'static str>,
     unit_mm: Option<u8>,
     notice: Option<Notice>,
@@ -72,6 +84,11 @@ impl<'a> Diagnosis<'a> {
             doubt: String::new(),
             device: None,
             byte_rate: ByteRate::default(),
+            family: None,
+            telegrams: 0,
+            last_telegram: None,
+            exchange: String::new(),
+            now: 0,
             altered: None,
             is_flooded: false,
             damaged_percent: None,
@@ -87,12 +104,14 @@ impl<'a> Diagnosis<'a> {
         if self.altered.take_if(|altered| now >= altered.until).is_some() {
             self.facts = None;
         }
+        self.now = now;
         let bytes_per_second = self.measure(session, now);
         let state = if self.is_doubtful(session) { State::Absent } else { state_of(session) };
         let facts = Facts {
             state,
             trouble: session.trouble(),
             bytes_per_second,
+            is_exchanged: self.is_exchanged(session, bytes_per_second),
             other_model: session.other_model().map(|model| model.name),
             unit_mm: session.unit_mm(),
             notice: session.notice(),
@@ -107,25 +126,54 @@ impl<'a> Diagnosis<'a> {
             }
             self.facts = Some(facts);
             self.words = self.trouble(session);
+            if facts.is_exchanged {
+                self.exchange.clone_from(&self.words);
+            } else if self.family.is_some() {
+                self.exchange.clear();
+            }
         }
         (state, is_new)
     }
 
-    /// Measures the rate of the bytes that arrive at `now`. Returns it while the session is missing something.
+    /// Measures the rate of the bytes that arrive at `now`. Returns it while the session is missing something, or was
+    /// interrupted.
     fn measure(&mut self, session: &PortSession, now: Nanos) -> Option<u64> {
+        let account = session.account();
+        if session.family() != self.family {
+            (self.family, self.last_telegram) = (session.family(), None);
+        }
+        if account.telegrams != self.telegrams {
+            (self.telegrams, self.last_telegram) = (account.telegrams, Some(now));
+        }
         if session.state() == line::State::Streaming {
             self.byte_rate = ByteRate::default();
             return None;
         }
-        let read = session.account().read;
-        self.byte_rate.note(now, read);
-        session.missing().and_then(|_| self.byte_rate.shown(now, read))
+        self.byte_rate.note(now, account.read);
+        let is_shown = self.is_silent_for(SILENCE) || session.missing().is_some();
+        if is_shown { self.byte_rate.shown(now, account.read) } else { None }
+    }
+
+    /// Returns whether telegrams have arrived, and then none for at least `span`.
+    fn is_silent_for(&self, span: Nanos) -> bool {
+        self.last_telegram.is_some_and(|at| self.now >= at + span)
+    }
+
+    /// Returns whether another scanner must have been connected: a stream of bytes arrives, but no telegram of the scanner that
+    /// has streamed. If the line has damaged most bytes before, it may damage all of them now.
+    fn is_exchanged(&self, session: &PortSession, bytes_per_second: Option<u64>) -> bool {
+        session.state() != line::State::Paused
+            && self.is_silent_for(EXCHANGED_AFTER)
+            && self.damaged_percent.is_none()
+            && bytes_per_second.is_some_and(|rate| rate >= STREAM_BYTES)
     }
 
     /// Handles that the port has been opened, as `device` if that is known.
     pub(crate) fn open(&mut self, device: Option<&Path>) {
         self.device = device.map(|device| device.display().to_string());
         self.byte_rate = ByteRate::default();
+        (self.telegrams, self.last_telegram) = (0, None);
+        self.exchange.clear();
         // This describes the previous connection.
         self.damaged_percent = None;
     }
@@ -184,6 +232,8 @@ impl<'a> Diagnosis<'a> {
         let share = if is_received { line.damaged.max(line.discarded) } else { line.damaged };
         let percent = (100.0 * share).round() as u32;
         let damaged_percent = match self.damaged_percent {
+            // Another scanner may have sent bytes without any telegram among them.
+            None if self.family.is_none() || self.is_silent_for(SILENCE) => None,
             None => Some(percent).filter(|&percent| percent >= MOST_DAMAGED),
             // A number that changes every second would be logged every second.
             Some(before) if before.abs_diff(percent) < COARSE => Some(before),
@@ -255,13 +305,20 @@ impl<'a> Diagnosis<'a> {
             }
         }
         let rate = self.facts.and_then(|facts| facts.bytes_per_second);
+        if let Some(rate) = rate.filter(|_| self.facts.is_some_and(|facts| facts.is_exchanged)) {
+            return self.bytes_of_another_kind(session, rate);
+        }
         if let Some((missing, rate)) = session.missing().zip(rate) {
             return self.other_bytes(missing, rate);
         }
         match session.trouble() {
             // Another family's scanner may be connected, or one at a rate that this family does not have.
             Some(Trouble::Search(trouble)) => self.search_trouble(trouble),
-            Some(trouble) if session.missing().is_some() => self.with_probe(&trouble.to_string()),
+            // The search has just begun.
+            Some(_) if self.family.is_none() && !self.exchange.is_empty() => self.exchange.clone(),
+            Some(trouble) if session.missing().is_some() => {
+                self.with_remedy(&trouble.to_string(), " Another scanner?")
+            }
             Some(trouble) => trouble.to_string(),
             None => self.mismatch(session).unwrap_or_else(|| match session.notice() {
                 _ if self.unserved_for >= UNSERVED_LIMIT => self.unserved(),
@@ -277,19 +334,38 @@ impl<'a> Diagnosis<'a> {
         let other_rate = if is_server { ", or does the server use another rate" } else { "" };
         let bytes = with_commas(rate);
         let words = format!("{bytes} bytes/s arrive, but no {missing}; is it another scanner{other_rate}?");
-        self.try_probe(&words, "")
+        self.with_remedy(&words, "")
     }
 
-    /// Returns `words` about a scanner that does not reply, with the command that searches for all scanners.
-    fn with_probe(&self, words: &str) -> String {
-        self.try_probe(words, " Another scanner?")
+    /// Returns the message that `rate` bytes per second arrive that are not of the scanner of `session`, which has streamed
+    /// before.
+    fn bytes_of_another_kind(&self, session: &PortSession, rate: u64) -> String {
+        let family = session.family().map_or("", |family| family.name());
+        let name = session.model().map_or(family, |model| model.name);
+        let words =
+            format!("{} bytes/s of another kind arrive: was the {name} exchanged?", with_commas(rate));
+        if self.link.family().is_none() {
+            return format!("{words} The search begins after 10 s without it");
+        }
+        self.with_remedy(&words, "")
     }
 
-    /// Returns `words` with a question and the command that probes the port, if it can be probed and the whole command fits
-    /// into a status.
-    fn try_probe(&self, words: &str, question: &str) -> String {
-        let message = |port: &str| format!("{words}{question} Try: scanhub probe {port}");
-        self.with_port(message).unwrap_or_else(|| words.to_owned())
+    /// Returns `words`, a question and the remedy, if the family is configured and they fit into a status: the scanner may
+    /// belong to another family. `scanhub probe` cannot search the port while the hub has it.
+    fn with_remedy(&self, words: &str, question: &str) -> String {
+        let Link { name, scanner, .. } = self.link;
+        let names_model = scanner.settings.model.is_some();
+        // The name of a model implies its family.
+        let keys = if names_model { "family and model" } else { "family" };
+        let remedies = [
+            format!("Remove {keys} from link {name} and restart the hub: it finds the scanner"),
+            format!("Remove {keys} from link {name}, restart the hub"),
+            format!("Remove {keys} from the link"),
+        ];
+        let has_family = self.link.family().is_some() && !matches!(self.link.port, Source::File { .. });
+        let messages = remedies.into_iter().map(|remedy| format!("{words}{question} {remedy}"));
+        let mut messages = messages.filter(|message| has_family && message.len() <= Status::MAX_ERROR_LEN);
+        messages.next().unwrap_or_else(|| words.to_owned())
     }
 
     /// Returns why the search finds no scanner, with the port if the message then fits into a status.
@@ -360,6 +436,12 @@ fn state_of(session: &PortSession) -> State {
 const MOST_DAMAGED: u32 = 50;
 /// Steps in which that share is reported.
 const COARSE: u32 = 10;
+/// Minimum silence of a scanner after which damage is not concluded from bytes alone.
+const SILENCE: Nanos = 1_000 * MILLIS;
+/// Minimum silence of a scanner after which other bytes are reported as those of another scanner.
+const EXCHANGED_AFTER: Nanos = 2_000 * MILLIS;
+/// Minimum number of bytes per second of a stream: an LMS at 9,600 baud sends twice that. A boot message is shorter.
+const STREAM_BYTES: u64 = 500;
 /// Fewer telegrams in 10 s may be chance matches in the bytes of another scanner.
 const FEW_TELEGRAMS: u64 = 3;
 /// Time for which a status reports that another process changed the port's settings.

@@ -73,6 +73,7 @@ impl LinkStats {
     /// The status with everything that `session`, if there is one, knows.
     pub(crate) fn status(&mut self, session: Option<&PortSession>, loan_failed: u64, now: Nanos) -> &Status {
         let mut counters = self.past;
+        let was_searched = self.status.family == Family::UNKNOWN;
         match session {
             Some(session) => {
                 session.add_counters(&mut counters);
@@ -85,6 +86,9 @@ impl LinkStats {
         counters[Counter::Wakeups] = self.wakeups;
         counters[Counter::LoanFailed] = loan_failed;
         counters[Counter::LineErrors] = self.line_errors;
+        if was_searched && self.status.family != Family::UNKNOWN {
+            self.recent.restart(now, &counters);
+        }
         self.health = self.recent.gauge(now, &mut counters);
         self.status.counters = counters;
         let (since, scans) = *self.measured_at.get_or_insert((now, self.scans));

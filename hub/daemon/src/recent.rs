@@ -29,6 +29,12 @@ impl Recent {
         Recent { looks: VecDeque::with_capacity(LOOKS) }
     }
 
+    /// Restarts at `now`, with the `counters` of that time. Earlier bytes do not belong to the scanner.
+    pub(crate) fn restart(&mut self, now: Nanos, counters: &Counters) {
+        self.looks.clear();
+        self.looks.push_back((now, *counters));
+    }
+
     /// Sets the gauges of `counters`, which are those of `now`, and returns the state of the line.
     pub(crate) fn gauge(&mut self, now: Nanos, counters: &mut Counters) -> LineHealth {
         while self.looks.get(1).is_some_and(|(at, _)| now.saturating_sub(*at) >= WINDOW) {
@@ -64,6 +70,19 @@ const LOOKS: usize = (WINDOW / STEP) as usize + 2;
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn bytes_of_a_search_are_not_those_of_the_scanner_that_it_finds() {
+        let mut recent = Recent::new();
+        let mut counters = Counters::default();
+        (counters[Counter::BytesRead], counters[Counter::BytesDiscarded]) = (90_000, 90_000);
+        assert_eq!(recent.gauge(0, &mut counters).discarded, 1.0);
+        recent.restart(MILLIS, &counters);
+        assert_eq!(recent.gauge(MILLIS, &mut counters), LineHealth::default());
+        counters[Counter::BytesRead] += 1_000;
+        counters[Counter::BytesDiscarded] += 100;
+        assert_eq!(recent.gauge(2 * MILLIS, &mut counters).discarded, 0.1);
+    }
 
     #[test]
     fn shares_are_those_of_the_last_ten_seconds() {

@@ -92,9 +92,17 @@ impl<'a, S: Surroundings> LiveLink<'a, S> {
         }
     }
 
-    /// Returns whether the link waits for its port, which could not be opened.
+    /// Returns whether the link waits for its port: it could not be opened, or the connection is not made yet.
     pub fn is_waiting(&self) -> bool {
-        matches!(&self.phase, Phase::Away { away, .. } if away.error.is_some())
+        !matches!(self.phase, Phase::Open(_))
+    }
+
+    /// Returns whether the link has tried to open its port, with any result.
+    pub fn has_tried(&self) -> bool {
+        match &self.phase {
+            Phase::Open(_) => true,
+            Phase::Away { away, .. } | Phase::Opening { away, .. } => away.error.is_some(),
+        }
     }
 
     /// Does what there is to do after a wait that ended as `woken` says, and returns what to wait for next.

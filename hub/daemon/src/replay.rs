@@ -80,6 +80,7 @@ impl<'a, 'p> ReplayLink<'a, 'p> {
     fn new(mut link: LinkCore<'a, System<'a>>, recorded: &Recorded, handle: PlayerHandle<'p>) -> Self {
         link.output.topics.set_family(Some(recorded.family()));
         link.stats.set_family(recorded.family());
+        link.stats.status_mut().set_sensor_type(recorded.sensor_type().unwrap_or_default());
         let trouble = recorded.trouble(&link.link.name);
         ReplayLink { link, handle, trouble, look_at: 0 }
     }

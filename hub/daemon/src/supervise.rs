@@ -47,9 +47,9 @@ pub(crate) struct ReplaySet<'a> {
 
 /// Outcome of the start of a link.
 enum Start {
-    /// With an open port, or with a recording; a serial server may still be dialed.
+    /// With an open port, or with a recording.
     Open,
-    /// Without its port, which cannot be opened yet.
+    /// Without its port, which cannot be opened yet, or to which no connection is made yet.
     Waiting,
 }
 
@@ -230,8 +230,9 @@ fn run_link(
         },
         Source::Tty(_) | Source::Tcp { .. } => match LiveLink::new(link, number, boot, system, queue) {
             Ok(live) => {
-                report(Ok(if live.is_waiting() { Start::Waiting } else { Start::Open }));
-                system.drive(live);
+                system.drive(live, |is_waiting| {
+                    report(Ok(if is_waiting { Start::Waiting } else { Start::Open }));
+                });
             }
             Err(failure) => report(Err(failure)),
         },

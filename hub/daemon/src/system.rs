@@ -69,11 +69,17 @@ impl<'a> System<'a> {
         Ok(System { hub, waker, worked, learned, dial, looked_at, record })
     }
 
-    /// Drives `link` until the hub shall end.
-    pub(crate) fn drive(&self, mut link: LiveLink<'_, Self>) {
+    /// Drives `link` until the hub ends. Calls `on_start` once, with whether the link waits for its port: as soon as
+    /// the link has tried to open it, but not later than [`START`].
+    pub(crate) fn drive(&self, mut link: LiveLink<'_, Self>, on_start: impl FnOnce(bool)) {
         let mut woken = Woken::Timeout;
+        let (mut on_start, start_by) = (Some(on_start), clock::now() + START);
         while woken != Woken::Stop {
+            if let Some(on_start) = on_start.take_if(|_| link.has_tried() || clock::now() >= start_by) {
+                on_start(link.is_waiting());
+            }
             let Wait { requests, on, until } = link.turn(woken);
+            let until = if on_start.is_some() { until.min(start_by) } else { until };
             let dial = self.dial.borrow();
             let port = match on {
                 On::Nothing => None,
@@ -316,3 +322,5 @@ fn is_ready(fd: &PollFd<'_>) -> bool {
 /// A rest that is not longer is slept through, if requests, the hub's end and the loss of a line do not wait for longer than that.
 const SHORT: Nanos = 20 * MILLIS;
 const UNSEEN: Nanos = 50 * MILLIS;
+/// Time that the start of the hub waits for the connection to a serial server.
+const START: Nanos = 250 * MILLIS;

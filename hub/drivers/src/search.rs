@@ -64,12 +64,27 @@ pub enum Trouble {
     Silent {
         /// Duration of the search in seconds, rounded down to 10, 100, 300, 600, ..
         seconds: u32,
+        /// Whether the port has a rate of the family's scanners, for each family in the order of [`Family::ALL`].
+        is_possible: [bool; Family::ALL.len()],
     },
     /// Bytes arrive, but no family recognizes them.
     Unrecognized {
         /// Bytes per second in the last step that listened, rounded to three digits.
         bytes_per_second: u32,
     },
+}
+
+/// Rates at which a search looks for the scanners of one family.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Coverage {
+    /// The family.
+    pub family: Family,
+    /// Rates of the family, in bits per second, without those that the port cannot have.
+    pub rates: Vec<u32>,
+    /// Rates of the family that the port cannot have.
+    pub rejected: Vec<u32>,
+    /// Properties of the scanner that the user should check if it is not found, as part of a message.
+    pub advice: &'static str,
 }
 
 /// A search on an open port. It returns no events.
@@ -252,6 +267,18 @@ impl Search {
         self.round
     }
 
+    /// Returns the rates at which it searches for each family, in the order of [`Family::ALL`].
+    pub fn coverage(&self) -> Vec<Coverage> {
+        let of = |family| self.probes.iter().map(|probe| probe.approach()).find(|it| it.family == family);
+        let approaches = Family::ALL.into_iter().filter_map(of);
+        let coverage = approaches.map(|approach| {
+            let (rejected, rates) =
+                approach.rates().into_iter().partition(|rate| self.rejected.contains(rate));
+            Coverage { family: approach.family, rates, rejected, advice: approach.advice }
+        });
+        coverage.collect()
+    }
+
     /// Returns the counters. The bytes in [`reads`](Self::reads) count as buffered.
     pub fn account(&self) -> Account {
         let buffered = self.capture.len() as u64;
@@ -268,7 +295,9 @@ impl Search {
         }
         let seconds = (self.now.saturating_sub(self.opened_at) / (1_000 * MILLIS)) as u32;
         let seconds = SECONDS.into_iter().rev().find(|&step| step <= seconds)?;
-        Some(Trouble::Silent { seconds })
+        let coverage = self.coverage();
+        let has_rates = |family| coverage.iter().any(|it| it.family == family && !it.rates.is_empty());
+        Some(Trouble::Silent { seconds, is_possible: Family::ALL.map(has_rates) })
     }
 
     /// Ends the search if a family recognizes its scanner.
@@ -704,7 +733,7 @@ impl Trouble {
     pub fn message(self, port: &str) -> String {
         match self {
             Trouble::Silent { .. } => self.to_string(),
-            Trouble::Unrecognized { .. } => format!("{self}: scanhub probe {port}"),
+            Trouble::Unrecognized { .. } => format!("{self}: stop the hub, then: scanhub probe {port}"),
         }
     }
 }
@@ -712,12 +741,17 @@ impl Trouble {
 impl fmt::Display for Trouble {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
-            Trouble::Silent { seconds } => {
-                f.write_str("no scanner replies (looked for ")?;
-                for (number, family) in Family::ALL.into_iter().enumerate() {
-                    write!(f, "{}{}", if number > 0 { ", " } else { "" }, family.name())?;
+            Trouble::Silent { seconds, is_possible } => {
+                let names = |wanted: bool| {
+                    let families = Family::ALL.into_iter().zip(*is_possible);
+                    let names = families.filter(|(_, is_possible)| *is_possible == wanted);
+                    names.map(|(family, _)| family.name()).collect::<Vec<_>>().join(", ")
+                };
+                write!(f, "no scanner replies (looked for {} for {seconds} s", names(true))?;
+                if is_possible.contains(&false) {
+                    write!(f, "; the port cannot have the rates of {}", names(false))?;
                 }
-                write!(f, " for {seconds} s): power, cable?")
+                f.write_str("): power, cable?")
             }
             Trouble::Unrecognized { bytes_per_second } => {
                 match (bytes_per_second / 1_000, bytes_per_second % 1_000) {
@@ -809,10 +843,31 @@ mod tests {
     }
 
     #[test]
+    fn families_whose_rates_the_port_rejects_are_not_looked_for() {
+        let mut search = Search::new(PortKind::Serial, None, 0);
+        let (ld, lms) = (ld::Probe::default(), lms::Probe::default());
+        let rates = |probe: &dyn Probe| probe.approach().rates();
+        search.rejected = [rates(&ld), vec![500_000]].concat();
+        let coverage = search.coverage();
+        let of = |family| coverage.iter().find(|it| it.family == family).expect("all families");
+        assert_eq!((&of(Family::Ld).rates, &of(Family::Ld).rejected), (&vec![], &rates(&ld)));
+        assert_eq!(of(Family::Lms).rates, [9_600, 19_200, 38_400]);
+        assert_eq!((&of(Family::Lms).rejected[..], rates(&lms).len()), (&[500_000][..], 4));
+        (search.round, search.now) = (2, 10_000 * MILLIS);
+        let message = search.trouble().expect("it is silent").to_string();
+        let expected = "no scanner replies (looked for lms, rplidar for 10 s; the port cannot have the rates of ld): \
+                        power, cable?";
+        assert_eq!(message, expected);
+        let only = Search::new(PortKind::Serial, None, 0).only(Family::Rplidar).coverage();
+        assert_eq!(only.iter().map(|it| it.family).collect::<Vec<_>>(), [Family::Rplidar]);
+    }
+
+    #[test]
     fn messages_name_the_pace_and_the_port() {
         let messages = [999, 1_000, 12_400]
             .map(|bytes_per_second| Trouble::Unrecognized { bytes_per_second }.message("/dev/ttyUSB0"));
-        let rest = "bytes/s arrive, but scanhub does not recognize the scanner: scanhub probe /dev/ttyUSB0";
+        let rest = "bytes/s arrive, but scanhub does not recognize the scanner: stop the hub, then: scanhub probe \
+                    /dev/ttyUSB0";
         assert_eq!(messages, ["999", "1,000", "12,400"].map(|pace| format!("{pace} {rest}")));
         assert_eq!([per_second(12_449, 1_000 * MILLIS), per_second(7, 1_000 * MILLIS)], [12_400, 7]);
         assert_eq!(per_second(0, 0), 0);

@@ -44,6 +44,8 @@ pub struct Contents {
     pub model: Option<&'static str>,
     /// Name of the way in which that one measures, if a status says it.
     pub way: Option<&'static str>,
+    /// Number of the sensor's family, and its type, as in the first status that has a type.
+    pub sensor_type: Option<(u8, String)>,
     /// Angle between two beams in 1/100 degree, of such a one, as a status says it.
     pub step_cdeg: Option<u16>,
     /// Variant of the first scan.
@@ -91,6 +93,7 @@ impl Contents {
             beams: None,
             model: None,
             way: None,
+            sensor_type: None,
             step_cdeg: None,
             variant: None,
             unit: None,

@@ -248,8 +248,12 @@ impl Survey {
         if place.topic == Topic::Status && status.unpack(payload) {
             let mode = (status.mode != Status::MODE_UNKNOWN).then_some(Mode(status.mode));
             let rotating = if place.is_old { None } else { rotating(&status) };
+            let name = Some(status.sensor_type()).filter(|name| !name.is_empty());
             for contents in [&mut self.whole, of_sensor(&mut self.sensors, &place.sensor)] {
                 contents.mode = contents.mode.or(mode);
+                if contents.sensor_type.is_none() {
+                    contents.sensor_type = name.map(|name| (status.family, name.to_owned()));
+                }
                 if let Some((model, way)) = rotating {
                     contents.model = contents.model.or(Some(model));
                     contents.way = contents.way.or(way);

@@ -15,11 +15,11 @@ use scanhub_drivers::lms::family::Family;
 use scanhub_drivers::lms::operating;
 use scanhub_drivers::lms::parameters::Password;
 use scanhub_drivers::lms::variant::{Mode, Unit};
-use schema::{Failure, Kind};
+use schema::{Domain, Failure, Kind};
 use serde::Serialize;
 
 use crate::driver::{Procedure, drive};
-use crate::probe::{hex, measuring, open, request_report};
+use crate::probe::{check_unused, hex, measuring, open, request_report};
 use settings::{AVAILABILITY, MODE, SENSITIVITIES, SENSITIVITY, SettingsRequest, UNIT};
 
 /// The settings to change, and the port of the scanner.
@@ -27,6 +27,8 @@ use settings::{AVAILABILITY, MODE, SENSITIVITIES, SENSITIVITY, SettingsRequest, 
 pub struct Order {
     /// The port.
     pub source: Source,
+    /// The locations in which a client would search for the domain of a hub, which may use the port.
+    pub places: Vec<Domain>,
     /// `KEY=VALUE`, as given.
     pub settings: Vec<String>,
     /// Password of the installation mode: 8 ASCII characters.
@@ -62,6 +64,7 @@ pub enum News<'a> {
 pub fn configure(order: &Order, stop: &AtomicBool, tell: &mut dyn FnMut(News<'_>)) -> Result<(), Failure> {
     let requested = SettingsRequest::parse(&order.settings)?;
     let password = password(&order.password)?;
+    check_unused(&order.source, &order.places)?;
     let (port, first) = open(&order.source, stop)?;
     let report = request_report(&port, first, first, &order.source, stop, |rate| tell(News::Looking(rate)))?;
     let name = order.source.name();

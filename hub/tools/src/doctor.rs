@@ -18,7 +18,7 @@ use std::sync::atomic::AtomicBool;
 
 pub use crate::bridge_program::Bridge;
 use config::{Config, Gateway, Link};
-use hub::Hub;
+pub(crate) use hub::Hub;
 use machine::Facts;
 use port::{Candidate, PortlessAdapter, Source, candidates};
 use schema::limits::TopicLimits;
@@ -29,7 +29,8 @@ pub use system::System;
 /// The ports, the configuration and the machine to check.
 #[derive(Clone, Debug)]
 pub struct Subjects {
-    /// Ports as the user named them, or names of links of the running hub. If it is empty, those of the configuration.
+    /// Ports as the user named them, or names of links of the running hub. If it is empty, those of the configuration and of
+    /// the running hub.
     pub ports: Vec<Source>,
     /// The configuration, or the reason why it is invalid; `None` if there is none.
     pub config: Option<Result<Config, Failure>>,
@@ -116,7 +117,7 @@ pub struct Finding {
     pub remedy: String,
     /// The port that the finding describes; `None` if it describes the machine.
     pub port: Option<String>,
-    /// The link of the configuration that has this port.
+    /// The link of the configuration, or else of the running hub, that has this port.
     pub link: Option<String>,
 }
 
@@ -233,7 +234,9 @@ pub fn examine(
     tell(machine::multicast(system, subjects.gateway.interface.as_deref()));
     subjects.bridge.check().into_iter().for_each(&mut tell);
     for subject in &ports {
-        let (port, link) = (subject.source.name(), subject.link.as_ref().map(|link| link.name.as_str()));
+        let link = subject.link.as_ref().map(|link| link.name.as_str());
+        let of_hub = || hub.as_ref().and_then(|hub| hub.link(&subject.source)).map(|(name, _)| name);
+        let (port, link) = (subject.source.name(), link.or_else(of_hub));
         line::examine(subject, &there, hub.as_ref(), stop, &mut |finding| tell(finding.at(&port, link)))?;
     }
     match failed {
@@ -247,7 +250,8 @@ pub fn examine(
     }
 }
 
-/// Returns the ports that the user named. If there are none, those of the configuration, or all ports of the machine.
+/// Returns the ports that the user named. If there are none, those of the configuration, or all ports of the machine, with
+/// the ports of the running hub.
 fn choose(
     subjects: &Subjects,
     there: &[Candidate],
@@ -276,21 +280,40 @@ fn choose(
             .map(|source| Subject { link: of_link(&source), source, named: true })
             .collect();
     }
+    // The hub may have other links than this configuration, and ports that are not lines of this machine. A port that it
+    // waits for stays unopened.
+    let add_links_of_hub = |mut ports: Vec<Subject>| {
+        for source in hub.map(Hub::ports).unwrap_or_default() {
+            if !ports.iter().any(|subject| is_same_port(&subject.source, &source)) {
+                ports.push(Subject { source, link: None, named: false });
+            }
+        }
+        ports
+    };
     if !links.is_empty() {
         let ports = links.iter();
-        return ports
-            .map(|link| Subject { source: link.port.clone(), link: Some(link.clone()), named: true })
-            .collect();
+        let ports =
+            ports.map(|link| Subject { source: link.port.clone(), link: Some(link.clone()), named: true });
+        return add_links_of_hub(ports.collect());
     }
-    if there.is_empty() && portless.is_empty() {
+    if there.is_empty() && portless.is_empty() && hub.is_none_or(|hub| hub.ports().is_empty()) {
         tell(Finding::failed(
             "ports",
             "no serial line on this machine",
             "plug an adapter in, or name a port",
         ));
     }
-    there
-        .iter()
-        .map(|port| Subject { source: Source::Tty(port.name.clone()), link: None, named: false })
-        .collect()
+    let ports = there.iter();
+    let ports =
+        ports.map(|port| Subject { source: Source::Tty(port.name.clone()), link: None, named: false });
+    add_links_of_hub(ports.collect())
+}
+
+/// Returns whether two names belong to the same port.
+pub(crate) fn is_same_port(a: &Source, b: &Source) -> bool {
+    let device = |source: &Source| match source {
+        Source::Tty(path) => path.canonicalize().ok(),
+        Source::Tcp { .. } | Source::File { .. } => None,
+    };
+    a == b || device(a).is_some_and(|a| Some(a) == device(b))
 }

@@ -12,7 +12,7 @@ use rustix::event::{PollFd, PollFlags, poll};
 use scanhub_drivers::line::{
     Account, Condition, Event, Introduction, Output, Protocol, Session as _, Values,
 };
-use scanhub_drivers::search::{Found, PortKind, Search};
+use scanhub_drivers::search::{Coverage, Found, PortKind, Search};
 use scanhub_drivers::{Model, Session, Settings, features};
 use schema::{Failure, Family, Kind, MILLIS, Nanos};
 
@@ -69,8 +69,16 @@ impl fmt::Display for DetectedScanner {
     }
 }
 
-/// Searches `port` for a scanner of any family, or of `only` one, as the hub does. Calls `look` with each rate. Returns the
-/// scanner; otherwise the number of bytes received.
+/// Result of a search that has found no scanner.
+#[derive(Clone, Debug)]
+pub(crate) struct NotFound {
+    /// Number of bytes received.
+    pub(crate) bytes: u64,
+    /// Families and rates that it has looked for.
+    pub(crate) coverage: Vec<Coverage>,
+}
+
+/// Searches `port` for a scanner of any family, or of `only` one, as the hub does. Calls `look` with each rate.
 ///
 /// # Errors
 ///
@@ -80,7 +88,7 @@ pub(crate) fn search(
     only: Option<Family>,
     stop: &AtomicBool,
     mut look: impl FnMut(u32),
-) -> Result<Result<Found, u64>, Failure> {
+) -> Result<Result<Found, NotFound>, Failure> {
     let kind = if port.baud().is_none() { PortKind::Server } else { PortKind::Serial };
     let begun = clock::now();
     let mut search = Search::new(kind, None, begun).at_another_rate();
@@ -97,7 +105,8 @@ pub(crate) fn search(
         search.rounds() < rounds || clock::now() < begun + MIN_SEARCH_TIME
     });
     drive(port, &mut search, &mut procedure, stop)?;
-    Ok(search.found().ok_or(search.account().read))
+    let not_found = || NotFound { bytes: search.account().read, coverage: search.coverage() };
+    Ok(search.found().ok_or_else(not_found))
 }
 
 /// Identifies the rotating scanner that a search has found at `port`. Returns it, if more packets arrived than could match by
@@ -165,27 +174,16 @@ pub(crate) fn detect(
     }))
 }
 
-/// Returns the failure for a port called `name` at which no rotating scanner of `family` was detected, after `bytes`
-/// bytes arrived.
-pub(crate) fn not_detected(name: &str, family: Family, bytes: u64) -> Failure {
-    let features = features(family);
-    let mut rates: Vec<u32> = features.models.iter().map(|model| model.baud).collect();
-    rates.sort_unstable();
-    rates.dedup();
-    let rates: Vec<String> = rates.iter().map(u32::to_string).collect();
-    let (came, remedy) = match bytes {
-        0 => {
-            ("no byte arrived".to_owned(), "check power and cable, each transmitter to the other's receiver")
-        }
-        bytes => (
-            format!("{bytes} bytes arrived that are none"),
-            "another device, or another rate? A serial server must be set to the scanner's rate",
-        ),
-    };
-    let sought = if features.speaks_unasked { "packets" } else { "answer" };
-    let what =
-        format!("{name}: no {sought} of family {} at {} Bd; {came}", family.name(), rates.join(" or "));
-    Failure::new(Kind::Timeout, what, remedy)
+/// Returns the failure for a port called `name` at which a search has found a scanner, but which then sent only `bytes`
+/// bytes and too few packets.
+pub(crate) fn not_detected(name: &str, found: Found, bytes: u64) -> Failure {
+    let Found { family, rate, .. } = found;
+    let rate = rate.map_or(String::new(), |rate| format!(" at {rate} Bd"));
+    let what = format!(
+        "{name}: a scanner of family {}{rate} was found, but then {bytes} bytes without its packets arrived",
+        family.name()
+    );
+    Failure::new(Kind::Timeout, what, "check its power and the cable, and try again")
 }
 
 /// Detection of a rotating scanner: decides when enough was received.

@@ -8,14 +8,17 @@ use std::fmt;
 use std::path::Path;
 use std::sync::atomic::AtomicBool;
 
-use port::{Candidate, Port, PortlessAdapter, Source, candidates, clock, found_in};
+use port::{
+    Candidate, Port, PortError, PortlessAdapter, Source, all_holders, candidates, check_tty, clock, found_in,
+};
 use scanhub_drivers::lms::inquiry::{Inquiry, Report};
 use scanhub_drivers::lms::variant::Baud;
-use scanhub_drivers::search;
-use schema::{Failure, Family, Kind};
+use scanhub_drivers::search::{self, Coverage};
+use schema::{Domain, Failure, Family, Kind};
 use serde::Serialize;
 
-use crate::driver::{self, DetectedScanner, Procedure, detect, drive, not_detected};
+use crate::doctor::Hub;
+use crate::driver::{self, DetectedScanner, NotFound, Procedure, detect, drive, not_detected};
 pub use description::{Description, Found, Turning};
 pub(crate) use description::{hex, measuring};
 pub use suggestion::SuggestedLink;
@@ -86,13 +89,19 @@ impl Ports {
 }
 
 /// Finds the scanner at `source`. Until its family is known, it gets only the requests of the search. Calls `look` with
-/// each rate at which it searches.
+/// each rate at which it searches. `places` are the locations in which a client would search for the domain of a hub.
 ///
 /// # Errors
 ///
-/// Returns the kinds of a port that cannot be used, [`Kind::Timeout`] if no scanner replies, and [`Kind::Interrupted`]
-/// if `stop` is set.
-pub fn probe(source: &Source, stop: &AtomicBool, look: impl FnMut(u32)) -> Result<Probed, Failure> {
+/// Returns the kinds of a port that cannot be used, including [`Kind::PortBusy`] if another process has it open. Returns
+/// [`Kind::Timeout`] if no scanner replies, and [`Kind::Interrupted`] if `stop` is set.
+pub fn probe(
+    source: &Source,
+    places: &[Domain],
+    stop: &AtomicBool,
+    look: impl FnMut(u32),
+) -> Result<Probed, Failure> {
+    check_unused(source, places)?;
     let (port, first) = open(source, stop)?;
     let there = found_in(Path::new("/"));
     let caution = candidate_of(source, &there).and_then(|port| port.caution(Path::new(&source.name())));
@@ -139,7 +148,7 @@ pub(crate) fn find(
         // Its requests find the rate, too.
         Some(family @ Family::Lms) => search::Found { family, model: None, rate: None },
         _ => driver::search(port, only, stop, &mut look)?
-            .map_err(|bytes| not_found(source, first, only, bytes))?,
+            .map_err(|not_found| nothing_found(source, &not_found))?,
     };
     if found.family == Family::Lms {
         let rate = found.rate.and_then(Baud::of_rate).unwrap_or(first);
@@ -147,20 +156,49 @@ pub(crate) fn find(
         return Ok(Answer::Asked(Box::new(report)));
     }
     let detected = detect(port, found, stop)?;
-    let heard = detected.map_err(|bytes| not_detected(&source.name(), found.family, bytes))?;
+    let heard = detected.map_err(|bytes| not_detected(&source.name(), found, bytes))?;
     Ok(Answer::Detected(Box::new(heard)))
 }
 
-/// Returns the failure for a port at which the search has found no scanner, after `bytes` bytes arrived.
-fn not_found(source: &Source, first: Baud, only: Option<Family>, bytes: u64) -> Failure {
-    if let Some(family) = only {
-        return not_detected(&source.name(), family, bytes);
+/// Returns the failure for a port at which a search has found no scanner. The message lists the families and rates of the
+/// search, and the hint what to check at a scanner of each family.
+fn nothing_found(source: &Source, NotFound { bytes, coverage }: &NotFound) -> Failure {
+    let (possible, impossible): (Vec<_>, Vec<_>) = coverage.iter().partition(|it| !it.rates.is_empty());
+    let at_rates = |it: &&Coverage| format!("{} at {} Bd", it.family.name(), listed(&it.rates));
+    let looked_for: Vec<String> = possible.iter().map(at_rates).collect();
+    let arrived = match bytes {
+        0 => "no byte arrived".to_owned(),
+        bytes => format!("{bytes} bytes arrived that scanhub does not recognize"),
+    };
+    let mut message = format!("{}: no scanner replies; {arrived}", source.name());
+    if !looked_for.is_empty() {
+        message += &format!("; looked for {}", looked_for.join(", "));
     }
-    let failure = silence(source, first, None, bytes);
-    let others = Family::ALL.into_iter().filter(|&family| family != Family::Lms);
-    let others: Vec<_> = others.map(Family::name).collect();
-    let message = format!("{}; no sensor of family {} either", failure.message, others.join(", "));
-    Failure { message, ..failure }
+    let mut remedies = vec![match (source, bytes) {
+        (Source::Tcp { .. }, _) => {
+            "set the serial server to the scanner's rate, 8 bits, no parity; a server that has another client already may \
+             let this one wait: end that program first; check power and cable"
+        }
+        (_, 0) => "check power and cable, each transmitter to the other's receiver",
+        _ => "another device, a line that damages the bytes (ground, RS-232 instead of RS-422), or a missing wire?",
+    }
+    .to_owned()];
+    remedies.extend(possible.iter().map(|it| format!("{}: {}", it.family.name(), it.advice)));
+    for it in impossible {
+        let (family, rates) = (it.family.name(), listed(&it.rejected));
+        message += &format!(
+            "; this port cannot have {rates} Bd, so scanners of family {family} cannot be found here"
+        );
+        remedies.push(format!("{family}: use an adapter with a CP2102N, FT232R or newer"));
+    }
+    Failure::new(Kind::Timeout, message, remedies.join("; "))
+}
+
+/// Lists `rates`, as in "9600, 19200 or 38400".
+fn listed(rates: &[u32]) -> String {
+    let mut words: Vec<String> = rates.iter().map(u32::to_string).collect();
+    let last = words.pop().unwrap_or_default();
+    if words.is_empty() { last } else { format!("{} or {last}", words.join(", ")) }
 }
 
 /// Parses the name of a port: a tty, or `tcp:HOST:PORT`.
@@ -176,6 +214,27 @@ pub fn source(text: &str) -> Result<Source, Failure> {
             "name a tty (scanhub probe lists them), or tcp:HOST:PORT",
         )
     })
+}
+
+/// Checks that no other process has `source` open, whether or not it has locked it: each of the two would get only a
+/// part of the bytes. `places` are the locations in which a client would search for the domain of a hub.
+///
+/// # Errors
+///
+/// Returns [`Kind::PortBusy`] with the process. If it is a hub, the failure states what the hub reports about its link.
+pub(crate) fn check_unused(source: &Source, places: &[Domain]) -> Result<(), Failure> {
+    let holders = match source {
+        // Many processes have a device such as /dev/null open. The failure to open it is the reason.
+        Source::Tty(path) if check_tty(path).is_err() => return Ok(()),
+        Source::Tty(path) => all_holders(path),
+        // Another process may be connected to the server from anywhere. Only a hub of this machine reports it.
+        Source::Tcp { .. } | Source::File { .. } => Vec::new(),
+    };
+    match Hub::at(source, &holders, places) {
+        Some(hub) => Err(hub.refuse(source, &holders)),
+        None if holders.is_empty() => Ok(()),
+        None => Err(PortError::Busy.explain(source)),
+    }
 }
 
 /// Opens `source` at the highest rate that it supports, unless `stop` is set before it is open.
@@ -265,6 +324,45 @@ fn silence(source: &Source, first: Baud, streams_at: Option<Baud>, bytes: u64) -
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_search_without_result_states_what_it_looked_for_and_what_to_check() {
+        let coverage = |rejected: &[u32]| {
+            let port = search::PortKind::Serial;
+            let mut coverage = search::Search::new(port, None, 0).coverage();
+            for it in &mut coverage {
+                (it.rejected, it.rates) = it.rates.iter().partition(|rate| rejected.contains(rate));
+            }
+            coverage
+        };
+        let failure = |source: &str, bytes, rejected: &[u32]| {
+            let not_found = NotFound { bytes, coverage: coverage(rejected) };
+            nothing_found(&Source::parse(source).expect("a port"), &not_found)
+        };
+        let silent = failure("/dev/ttyUSB0", 0, &[]);
+        let looked_for = "/dev/ttyUSB0: no scanner replies; no byte arrived; looked for lms at 9600, 19200, 38400 or 500000 \
+                          Bd, ld at 230400 or 921600 Bd, rplidar at 115200, 256000, 460800 or 1000000 Bd";
+        assert_eq!(silent.message, looked_for);
+        for family in Family::ALL {
+            assert!(silent.hint.contains(&format!("{}: ", family.name())), "{silent}");
+        }
+        assert!(silent.hint.contains("power and cable") && silent.hint.contains("jumper 7-8"), "{silent}");
+        let noisy = failure("/dev/ttyUSB0", 7, &[]);
+        assert!(noisy.message.contains("7 bytes arrived that scanhub does not recognize"), "{noisy}");
+        let server = failure("tcp:box:4001", 0, &[]);
+        assert!(server.hint.starts_with("set the serial server to the scanner's rate"), "{server}");
+        // A port that has no rate of one family, and lacks one rate of another.
+        let slow = failure("/dev/ttyS0", 0, &[230_400, 921_600, 500_000]);
+        let cannot =
+            "; this port cannot have 230400 or 921600 Bd, so scanners of family ld cannot be found here";
+        assert!(slow.message.ends_with(cannot) && !slow.message.contains("500000"), "{slow}");
+        assert!(slow.hint.ends_with("; ld: use an adapter with a CP2102N, FT232R or newer"), "{slow}");
+        // A link that names its family.
+        let mut only = coverage(&[230_400, 921_600]);
+        only.retain(|it| it.family == Family::Ld);
+        let only = nothing_found(&Source::Tty("/dev/ttyS0".into()), &NotFound { bytes: 0, coverage: only });
+        assert_eq!(only.message, format!("/dev/ttyS0: no scanner replies; no byte arrived{cannot}"));
+    }
 
     #[test]
     fn names_only_rates_that_the_port_has() {

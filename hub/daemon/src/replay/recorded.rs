@@ -113,6 +113,15 @@ impl Recorded {
         }
     }
 
+    /// Returns the sensor's type, if a status of the recording has it. The recording may also contain a scanner of another
+    /// family, which is not played.
+    pub(super) fn sensor_type(&self) -> Option<&str> {
+        let (Recorded::Stream(Stream { recording, family, .. })
+        | Recorded::Frames(Frames { recording, family, .. })) = self;
+        let (number, name) = recording.contents().sensor_type.as_ref()?;
+        (*number == *family as u8).then_some(name.as_str())
+    }
+
     /// Where its media time begins, of what has stamps.
     pub(crate) fn origin(&self) -> Option<Origin> {
         match self {

@@ -84,6 +84,7 @@ const APPROACH: Approach = Approach {
     asks: None,
     boot_rate: None,
     max_transmission: LEN,
+    advice: "it streams by itself once it has 5 V and its head rotates",
 };
 /// Packets in sequence that prove an LDROBOT. Each has a header and a checksum of 24 bits, and its angles and its clock have
 /// to continue those of the packet before.

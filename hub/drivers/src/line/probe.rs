@@ -64,6 +64,20 @@ pub struct Approach {
     pub boot_rate: Option<u32>,
     /// Maximum number of bytes of a transmission.
     pub max_transmission: usize,
+    /// Properties of the scanner that the user should check if it is not found, as part of a message.
+    pub advice: &'static str,
+}
+
+impl Approach {
+    /// Returns the rates at which the search looks for the family, in bits per second, in increasing order.
+    pub fn rates(&self) -> Vec<u32> {
+        let asks = self.asks.map_or(&[][..], |asks| asks.rates);
+        let mut rates: Vec<u32> = self.listens.iter().map(|listen| listen.rate).collect();
+        rates.extend(asks);
+        rates.sort_unstable();
+        rates.dedup();
+        rates
+    }
 }
 
 /// Step that only listens.

@@ -106,6 +106,7 @@ const APPROACH: Approach = Approach {
     // Without another setting in its EEPROM, the scanner starts at this rate (Telegram listing 7.1).
     boot_rate: Some(9_600),
     max_transmission: MAX_TELEGRAM,
+    advice: "RS-422 needs jumper 7-8, and after power-on it takes up to a minute",
 };
 
 const _: () = assert!(Baud::ALL.len() == 4);

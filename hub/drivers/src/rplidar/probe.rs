@@ -88,6 +88,7 @@ const APPROACH: Approach = Approach {
     }),
     boot_rate: None,
     max_transmission: Kind::LONGEST,
+    advice: "it needs 5 V for the scanner and its motor",
 };
 
 #[cfg(test)]

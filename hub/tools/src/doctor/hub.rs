@@ -1,15 +1,20 @@
 //! The links of a running hub, as it reports them. No other process can send a request to a scanner whose port the hub
 //! holds.
 
+use std::path::Path;
 use std::time::Duration;
 
-use port::Source;
+use port::{Holder, Source};
 use schema::ipc::{self, Payload};
-use schema::{Domain, Failure, Status, is_remote};
+use schema::{Domain, Environment, Failure, Kind, RunningHub, State, Status, is_remote};
+
+use super::is_same_port;
 
 /// A running hub.
 pub(crate) struct Hub {
     pub(crate) pid: u32,
+    /// Command that shows a link of this hub, without the link's name.
+    info: String,
     statuses: Vec<LinkStatus>,
 }
 
@@ -17,12 +22,43 @@ impl Hub {
     /// Returns the hub in `domain`, if there is one.
     pub(crate) fn find(domain: &Domain) -> Option<Hub> {
         let pid = schema::holder(domain.root()).ok().flatten()?;
-        Some(Hub { pid, statuses: statuses(domain).unwrap_or_default() })
+        Some(Hub { pid, info: "scanhub info".to_owned(), statuses: statuses(domain).unwrap_or_default() })
+    }
+
+    /// Returns the hub that uses the port `source`: one of its `holders`, in `places` or in another domain of this machine, or
+    /// one in `places` that is connected to this serial server.
+    pub(crate) fn at(source: &Source, holders: &[Holder], places: &[Domain]) -> Option<Hub> {
+        if let Source::Tcp { .. } = source {
+            let hub = places.iter().find_map(Hub::find)?;
+            let is_connected = |(_, status): (&str, &Status)| status.state() != Some(State::Absent);
+            let is_used = hub.link(source).is_some_and(is_connected);
+            return is_used.then_some(hub);
+        }
+        let is_holder = |pid| holders.iter().any(|holder| holder.pid == pid);
+        if holders.is_empty() {
+            return None;
+        }
+        let runs_hub =
+            |place: &&Domain| matches!(schema::holder(place.root()), Ok(Some(pid)) if is_holder(pid));
+        if let Some(place) = places.iter().find(runs_hub) {
+            return Hub::find(place);
+        }
+        let running = RunningHub::all(Path::new("/")).into_iter().find(|hub| is_holder(hub.pid))?;
+        let domain = Domain::at(running.domain.as_ref()?, running.base.as_ref()?).ok()?;
+        let asked = places.first().map_or(schema::DEFAULT_DOMAIN, Domain::name);
+        let info = running.command("info", asked, &Environment::of_process());
+        Hub::find(&domain).filter(|hub| hub.pid == running.pid).map(|hub| Hub { info, ..hub })
     }
 
     /// Returns the port of a link, if `source` is the link's name and not the path of a file.
     pub(crate) fn port_of(&self, source: &Source) -> Option<Source> {
         Source::parse(self.named(source)?.1.as_ref()?.port()).ok()
+    }
+
+    /// Returns the ports of all links that report theirs.
+    pub(crate) fn ports(&self) -> Vec<Source> {
+        let statuses = self.statuses.iter().filter_map(|(_, status)| status.as_ref());
+        statuses.filter_map(|status| Source::parse(status.port()).ok()).collect()
     }
 
     /// Returns whether `source` names a link whose port is unknown because its status did not arrive.
@@ -35,11 +71,15 @@ impl Hub {
         self.statuses.iter().filter(|(_, status)| status.is_none()).map(|(name, _)| name.clone()).collect()
     }
 
-    /// Returns name and status of the link whose port is configured as `port`.
-    pub(crate) fn link(&self, port: &str) -> Option<(&str, &Status)> {
-        let mut links =
-            self.statuses.iter().filter_map(|(name, status)| Some((name.as_str(), status.as_ref()?)));
-        links.find(|(_, status)| status.port() == port)
+    /// Returns name and status of the link with this port, even if its configuration has another name for it.
+    pub(crate) fn link(&self, port: &Source) -> Option<(&str, &Status)> {
+        let links =
+            || self.statuses.iter().filter_map(|(name, status)| Some((name.as_str(), status.as_ref()?)));
+        let is_of_port = |(_, status): &(&str, &Status)| {
+            Source::parse(status.port()).is_ok_and(|source| is_same_port(&source, port))
+        };
+        let name = port.name();
+        links().find(|(_, status)| status.port() == name).or_else(|| links().find(is_of_port))
     }
 
     /// Returns the reason why a port that the hub has open belongs to none of its reported links.
@@ -50,11 +90,70 @@ impl Hub {
         }
     }
 
+    /// Returns the next commands for a link of this hub that has a problem. `holders` have its port open.
+    pub(crate) fn remedy(&self, name: &str, status: &Status, holders: &[Holder]) -> String {
+        let info = format!("{} {name}", self.info);
+        match status.state() {
+            // The error of the link has the remedy for the port, or for the scanner that streams.
+            Some(State::Absent | State::Streaming | State::Paused) => info,
+            _ if status.is_replayed() => info,
+            _ => {
+                let (stop, port) = (self.stop(holders), schema::shell_word(status.port()));
+                format!("{info}; or stop the hub ({stop}), then search the port: scanhub probe {port}")
+            }
+        }
+    }
+
+    /// Returns the failure for a program that needs the port `source` of this hub, which has `holders`.
+    pub(crate) fn refuse(&self, source: &Source, holders: &[Holder]) -> Failure {
+        let (name, pid, stop) = (source.name(), self.pid, self.stop(holders));
+        let mut message = format!("{name}: in use by the hub, process {pid}");
+        let mut remedies = Vec::new();
+        if let Some(other) = other_reader(holders, pid) {
+            message += &format!(", and read by {other}");
+            remedies.push(format!("end {other}: the hub loses every byte that it reads"));
+        }
+        match self.link(source) {
+            Some((link, status)) => {
+                let state = status.state().map_or("unknown", State::name);
+                message += &format!("; its link {link} is {state}");
+                if !status.last_error().is_empty() {
+                    message += &format!(": {}", status.last_error());
+                }
+                remedies.push(format!("{} {link}", self.info));
+            }
+            None => remedies.push(self.info.clone()),
+        }
+        remedies.push(format!("before another program may use the port, stop the hub: {stop}"));
+        Failure::new(Kind::PortBusy, message, remedies.join("; "))
+    }
+
+    /// Returns the command that stops the hub. The service manager holds ports only for a service.
+    fn stop(&self, holders: &[Holder]) -> String {
+        if holders.iter().any(|holder| holder.pid == SERVICE_MANAGER) {
+            "sudo systemctl stop scanhub".to_owned()
+        } else {
+            format!("kill {}", self.pid)
+        }
+    }
+
+    /// Creates a hub without links.
+    #[cfg(test)]
+    pub(crate) fn without_links(pid: u32) -> Hub {
+        Hub { pid, info: "scanhub info".to_owned(), statuses: Vec::new() }
+    }
+
     fn named(&self, source: &Source) -> Option<&LinkStatus> {
         let Source::Tty(path) = source else { return None };
         let name = path.to_str().filter(|_| !path.exists())?;
         self.statuses.iter().find(|(sensor, _)| sensor == name)
     }
+}
+
+/// Returns the process among the `holders` of a port that takes bytes away from `hub`. The service manager only keeps the
+/// port for the next hub.
+pub(crate) fn other_reader(holders: &[Holder], hub: u32) -> Option<&Holder> {
+    holders.iter().find(|holder| holder.pid != hub && holder.pid != SERVICE_MANAGER)
 }
 
 /// Name of a link, and its last status if one arrived.
@@ -84,6 +183,62 @@ fn statuses(domain: &Domain) -> Result<Vec<LinkStatus>, Failure> {
     Ok(found)
 }
 
+/// Process ID of the service manager, which holds ports only for a service.
+const SERVICE_MANAGER: u32 = 1;
 /// Number of polls: a second and a half in total.
 const POLLS: u32 = 75;
 const POLL_INTERVAL: Duration = Duration::from_millis(20);
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn hub(state: State, port: &str, error: &str) -> Hub {
+        let mut status = Status { state: state as u8, ..Status::default() };
+        status.set_port(port);
+        status.set_last_error(error);
+        Hub { statuses: vec![("front".to_owned(), Some(status))], ..Hub::without_links(7) }
+    }
+
+    fn holder(pid: u32, program: &str) -> Holder {
+        Holder { pid, program: program.to_owned() }
+    }
+
+    #[test]
+    fn a_port_of_the_hub_is_refused_with_what_the_hub_reports() {
+        let error = "1,200 bytes/s arrive, but no LMS replies; is it another scanner?";
+        let hub = hub(State::Probing, "/dev/x", error);
+        let source = Source::Tty("/dev/x".into());
+        let refused = hub.refuse(&source, &[holder(7, "scanhub")]);
+        assert_eq!(refused.kind, Kind::PortBusy);
+        let message = format!("/dev/x: in use by the hub, process 7; its link front is probing: {error}");
+        assert_eq!(refused.message, message);
+        let stop = "before another program may use the port, stop the hub: kill 7";
+        assert_eq!(refused.hint, format!("scanhub info front; {stop}"));
+        let read = hub.refuse(&source, &[holder(7, "scanhub"), holder(9, "cat")]);
+        assert!(read.message.contains(", and read by process 9 (cat); its link"), "{read}");
+        assert!(read.hint.starts_with("end process 9 (cat): the hub loses"), "{read}");
+        // The service manager keeps the port for the next hub.
+        let service = hub.refuse(&source, &[holder(1, "systemd"), holder(7, "scanhub")]);
+        assert!(
+            service.hint.ends_with("sudo systemctl stop scanhub") && !service.message.contains("read by")
+        );
+    }
+
+    #[test]
+    fn a_link_is_found_by_any_name_of_its_port() {
+        let directory = tempfile::tempdir().expect("a directory");
+        let name = directory.path().join("lidar");
+        std::os::unix::fs::symlink("/dev/null", &name).expect("a link");
+        let hub = hub(State::Streaming, &name.display().to_string(), "");
+        for port in [name.as_path(), Path::new("/dev/null")] {
+            assert_eq!(
+                hub.link(&Source::Tty(port.to_owned())).map(|(name, _)| name),
+                Some("front"),
+                "{port:?}"
+            );
+        }
+        assert!(hub.link(&Source::Tty("/dev/zero".into())).is_none());
+        assert_eq!(hub.ports(), [Source::Tty(name)]);
+    }
+}

@@ -11,7 +11,7 @@ use port::{
 use scanhub_drivers::lms::variant::Baud;
 use schema::{Counter, Failure, Kind, Status};
 
-use super::hub::Hub;
+use super::hub::{Hub, other_reader};
 use super::{Finding, Subject, sensor};
 use crate::driver::MOST_DAMAGED;
 use crate::probe::{self, Answer};
@@ -28,10 +28,13 @@ pub(crate) fn examine(
     stop: &AtomicBool,
     tell: &mut dyn FnMut(Finding),
 ) -> Result<(), Failure> {
+    // A hub that waits for the port reports the reason.
+    let reported = hub.and_then(|hub| Some(sensor::of_hub(hub, hub.link(&subject.source)?, &[])));
     let path = match &subject.source {
         Source::Tty(path) => path,
         Source::File { path, .. } => {
             tell(recording(path));
+            reported.into_iter().flatten().for_each(tell);
             return Ok(());
         }
         Source::Tcp { .. } => return server(subject, hub, stop, tell),
@@ -43,32 +46,40 @@ pub(crate) fn examine(
     }
     if let Err(error @ (PortError::NotTty | PortError::Dead | PortError::Other(_))) = check_tty(path) {
         tell(refused(error.explain(&subject.source)));
+        reported.into_iter().flatten().for_each(tell);
         return Ok(());
     }
     tell(presence(&subject.source, path, candidate));
     if !path.exists() {
+        reported.into_iter().flatten().for_each(tell);
         return Ok(());
     }
     let holders = all_holders(path);
     if !holders.is_empty() {
         // Opening the port would change its settings under the process that has it.
-        match hub.filter(|hub| holders.iter().any(|holder| holder.pid == hub.pid)) {
+        let own = hub.filter(|hub| holders.iter().any(|holder| holder.pid == hub.pid));
+        let of_other_domain = if own.is_none() { Hub::at(&subject.source, &holders, &[]) } else { None };
+        match own.or(of_other_domain.as_ref()) {
             Some(hub) => {
-                let link = hub.link(&subject.source.name());
-                let why = hub.why_unknown();
                 tell(latency(path, latency_ms(path)));
                 tell(held(&holders, hub.pid));
-                match link {
-                    Some((_, status)) => {
-                        [as_the_hub_counts(status), line_loss(status)].into_iter().for_each(&mut *tell)
+                let why = hub.why_unknown();
+                match hub.link(&subject.source) {
+                    Some(link) => {
+                        [as_the_hub_counts(link.1), line_loss(link.1)].into_iter().for_each(&mut *tell);
+                        sensor::of_hub(hub, link, &holders).into_iter().for_each(tell);
                     }
-                    None => tell(Finding::skipped("line-errors", why)),
+                    None => {
+                        ["line-errors", "sensor"]
+                            .into_iter()
+                            .for_each(|name| tell(Finding::skipped(name, why)));
+                    }
                 }
-                sensor::as_the_hub_says(link, why).into_iter().for_each(tell);
             }
             None => {
                 tell(refused(PortError::Busy.explain(&subject.source)));
-                tell(Finding::skipped("sensor", "its port is in use"));
+                let skipped = || vec![Finding::skipped("sensor", "its port is in use")];
+                reported.unwrap_or_else(skipped).into_iter().for_each(tell);
             }
         }
         return Ok(());
@@ -83,7 +94,8 @@ pub(crate) fn examine(
         });
         let name = subject.source.name();
         let why = format!("not opened, because the port was not named; scanhub doctor {name} checks it");
-        tell(Finding::skipped("sensor", why));
+        let skipped = || vec![Finding::skipped("sensor", why)];
+        reported.unwrap_or_else(skipped).into_iter().for_each(tell);
         return Ok(());
     }
     let (port, first) = match probe::open(&subject.source, stop) {
@@ -114,10 +126,10 @@ fn server(
     tell: &mut dyn FnMut(Finding),
 ) -> Result<(), Failure> {
     // Most servers accept one client at a time, so do not connect to the server of a link.
-    if let Some(link) = hub.and_then(|hub| hub.link(&subject.source.name())) {
-        tell(Finding::ok("holder", "it is a link of the hub"));
+    if let Some((hub, link)) = hub.and_then(|hub| Some((hub, hub.link(&subject.source)?))) {
+        tell(Finding::ok("holder", format!("it is a link of the hub, process {}", hub.pid)));
         tell(line_loss(link.1));
-        sensor::as_the_hub_says(Some(link), "").into_iter().for_each(tell);
+        sensor::of_hub(hub, link, &[]).into_iter().for_each(tell);
         return Ok(());
     }
     match probe::open(&subject.source, stop) {
@@ -158,8 +170,7 @@ fn report(examined: Examined) -> Vec<Finding> {
 fn held(holders: &[Holder], hub: u32) -> Finding {
     const NAME: &str = "holder";
     let words: Vec<String> = holders.iter().map(ToString::to_string).collect();
-    let other = holders.iter().find(|holder| holder.pid != hub && holder.pid != SERVICE_MANAGER);
-    match other {
+    match other_reader(holders, hub) {
         None => Finding::ok(NAME, format!("the hub has it, {}", words.join(", "))),
         Some(other) => Finding::warning(
             NAME,
@@ -300,9 +311,6 @@ fn rate(subject: &Subject, port: &Port, first: Baud, found: Option<u32>) -> Find
         ),
     }
 }
-
-/// Process ID of the service manager, which holds ports only for a service.
-const SERVICE_MANAGER: u32 = 1;
 
 /// Name of the check of bytes that arrived damaged, or were lost before they could be read.
 const LINE_ERRORS: &str = "line-errors";

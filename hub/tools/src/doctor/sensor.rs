@@ -2,6 +2,7 @@
 //! the hub, and last a rotating scanner. `probe` sends the requests.
 
 use config::Link;
+use port::Holder;
 use scanhub_drivers::line::{Condition as ReportedHealth, Introduction};
 use scanhub_drivers::lms::condition::{Condition, Severity};
 use scanhub_drivers::lms::errors::Fault;
@@ -10,8 +11,8 @@ use scanhub_drivers::lms::inquiry::Report;
 use scanhub_drivers::lms::variant::Variant;
 use schema::{State, Status};
 
-use super::Finding;
 use super::line::{LOSS_REMEDY, is_mostly_damaged};
+use super::{Finding, Hub};
 use crate::driver::{DetectedScanner, LINE_REMEDY};
 
 /// Checks the LMS at `port` by its `report`.
@@ -26,15 +27,13 @@ pub(crate) fn check_lms(port: &str, report: &Report, link: Option<&Link>) -> Vec
     findings
 }
 
-/// Checks a link of the hub by its status. Returns `why_unknown` if the hub has no link of the port.
-pub(crate) fn as_the_hub_says(link: Option<(&str, &Status)>, why_unknown: &str) -> Vec<Finding> {
-    match link {
-        None => vec![Finding::skipped("sensor", why_unknown)],
-        Some((name, status)) => {
-            let marks = marks(status, "stop the hub first: ");
-            std::iter::once(link_of_the_hub(name, status)).chain(marks).collect()
-        }
-    }
+/// Checks a link of `hub` by its status. `holders` have its port open.
+pub(crate) fn of_hub(hub: &Hub, (name, status): (&str, &Status), holders: &[Holder]) -> Vec<Finding> {
+    // `info` shows no more of a damaged line than this check.
+    let remedy =
+        if is_mostly_damaged(status) { LOSS_REMEDY.to_owned() } else { hub.remedy(name, status, holders) };
+    let marks = marks(status, "stop the hub first: ");
+    std::iter::once(link_of_the_hub(name, status, remedy)).chain(marks).collect()
 }
 
 /// Checks whether the measuring mode of an LMS has bits for reflectors. Returns `None` if the mode is unknown, or if a
@@ -53,7 +52,7 @@ fn marks(status: &Status, when: &str) -> Option<Finding> {
     Some(Finding::warning(NAME, what, format!("{when}{remedy}")))
 }
 
-fn link_of_the_hub(name: &str, status: &Status) -> Finding {
+fn link_of_the_hub(name: &str, status: &Status, remedy: String) -> Finding {
     const NAME: &str = "sensor";
     let text = format!(
         "link {name} of the hub: {}, family {}, {}",
@@ -64,16 +63,20 @@ fn link_of_the_hub(name: &str, status: &Status) -> Finding {
             kind => kind,
         }
     );
-    // `info` shows no more of a damaged line than this check.
-    let remedy =
-        if is_mostly_damaged(status) { LOSS_REMEDY.to_owned() } else { format!("scanhub info {name}") };
     match (status.state(), status.last_error()) {
-        (Some(State::Streaming | State::Paused), "") => {
+        (Some(State::Streaming | State::Paused), "") if !status.is_replayed() => {
             Finding::ok(NAME, format!("{text}, {} Bd", status.baud))
         }
+        (_, "") if status.is_replayed() => Finding::ok(NAME, text),
+        // At its end, a recording is silent.
+        (Some(State::Silent), error) if status.is_replayed() => Finding::ok(NAME, format!("{text}: {error}")),
         (Some(State::Streaming | State::Paused), error) => {
             Finding::warning(NAME, format!("{text}: {error}"), remedy)
         }
+        (_, error) if status.is_replayed() => Finding::warning(NAME, format!("{text}: {error}"), remedy),
+        // It has just begun: a search reports its problem after some seconds.
+        (Some(State::Absent) | None, "") => Finding::failed(NAME, text, remedy),
+        (_, "") => Finding::warning(NAME, format!("{text}; the hub has not found a problem yet"), remedy),
         (_, error) => Finding::failed(NAME, format!("{text}: {error}"), remedy),
     }
 }
@@ -461,7 +464,8 @@ mod tests {
     #[test]
     fn passes_on_status_of_hub() {
         let mut status = Status { state: State::Streaming as u8, baud: 500_000, ..Status::default() };
-        let findings = |status: &Status| as_the_hub_says(Some(("front", status)), "");
+        let hub = Hub::without_links(7);
+        let findings = |status: &Status| of_hub(&hub, ("front", status), &[]);
         assert_eq!(findings(&status).iter().map(|finding| finding.state).collect::<Vec<_>>(), [Verdict::Ok]);
         status.mode = 0;
         status.set_port("/dev/ttyUSB0");
@@ -471,9 +475,19 @@ mod tests {
         status.set_last_error("the window is dirty");
         let dirty = &findings(&status)[0];
         assert!(dirty.state == Verdict::Warning && dirty.finding.contains("window"), "{dirty}");
+        assert_eq!(dirty.remedy, "scanhub info front");
         status.state = State::Silent as u8;
-        assert_eq!(findings(&status)[0].state, Verdict::Failed);
-        assert_eq!(as_the_hub_says(None, "it is unknown")[0].state, Verdict::Skipped);
+        let silent = &findings(&status)[0];
+        assert_eq!(silent.state, Verdict::Failed);
+        let remedy =
+            "scanhub info front; or stop the hub (kill 7), then search the port: scanhub probe /dev/ttyUSB0";
+        assert_eq!(silent.remedy, remedy);
+        status.set_last_error("");
+        assert_eq!(findings(&status)[0].state, Verdict::Warning, "it has just begun");
+        // A recording is silent at its end.
+        status.set_port("file:/tmp/walk.mcap");
+        status.set_last_error("the recording is at its end");
+        assert_eq!(findings(&status)[0].state, Verdict::Ok);
     }
 
     /// Returns the family that streams without a request.
