@@ -258,7 +258,7 @@ pub(crate) struct Demo {
     #[arg(long, default_value_t = 1)]
     pub(crate) seed: u64,
     /// Of which family the sensors are; mixed: one of each family
-    #[arg(long, default_value = "lms", value_name = "FAMILY", value_parser = families())]
+    #[arg(long, default_value = Family::ALL[0].name(), value_name = "FAMILY", value_parser = families())]
     pub(crate) family: Families,
 }
 

@@ -66,15 +66,15 @@ pub(crate) struct Simulate {
     #[arg(long, value_name = "FILE")]
     truth: Option<PathBuf>,
     /// Family of the sensors: lms (SICK LMS 2xx), ld (LDROBOT) or rplidar (Slamtec)
-    #[arg(long, default_value = "lms", value_name = "FAMILY")]
+    #[arg(long, default_value = options::DEFAULT_FAMILY, value_name = "FAMILY")]
     family: String,
     /// Model, of family ld: ld06, ld19, stl19p, stl27l or ld14p [default: ld19]; of family rplidar: a1, a2m8, a2m12, a3, s1,
     /// s2, s3 or c1 [default: a1]
     #[arg(long, value_name = "NAME")]
     model: Option<String>,
     /// Type of the sensors of family lms, which also limits what they support: lms200, lms211, lms221 or lms291
-    #[arg(long = "type", default_value = "lms200", value_name = "TYPE")]
-    lms_type: String,
+    #[arg(long = "type", default_value = options::DEFAULT_TYPE, value_name = "TYPE")]
+    scanner_type: String,
     /// Angle and resolution [default: the recording's, else 180/0.5, or 100/0.5 of an lms211]
     #[arg(long, value_name = "DEGREES/STEP")]
     variant: Option<String>,
@@ -128,7 +128,7 @@ impl Simulate {
             seed: self.seed,
             faults: self.fault.parse()?,
             truth: self.truth.clone(),
-            family: options::parse_type(&self.lms_type)?,
+            family: options::parse_type(&self.scanner_type)?,
             variant: self.variant.as_deref().map(options::parse_variant).transpose()?,
             unit: self.unit.as_deref().map(options::parse_unit).transpose()?,
             mode: mode.filter(|_| scanner.is_none()).map(options::parse_mode).transpose()?,

@@ -6,7 +6,7 @@ use std::fs::File;
 use std::io::{Read, Write};
 use std::time::{Duration, Instant};
 
-use schema::Family;
+use scanhub_drivers::features;
 use serde::Serialize;
 use serde_json::Value;
 use sha2::{Digest, Sha256};
@@ -106,7 +106,7 @@ impl Account {
         let sensors = sensors.iter().map(|sensor| Sensor {
             name: sensor.name.clone(),
             state: "absent".into(),
-            turns: sensor.family != Family::Lms,
+            turns: !features(sensor.family).has_whole_telegrams,
             ..Sensor::default()
         });
         Account {

@@ -97,8 +97,8 @@ struct Sensor {
     recorded: Option<String>,
     /// Its link's.
     link: String,
-    /// What it is.
-    family: Family,
+    /// What it is, if this version knows it.
+    family: Option<Family>,
     /// Where its head turns: the model, and the beams that were recorded, as far as they are known.
     model: Result<Option<Model>, Failure>,
     beams: Option<usize>,
@@ -109,9 +109,8 @@ struct Sensor {
 impl Sensor {
     /// The sensor of `recording`, which has no other one, for `link`.
     fn new(recorded: Option<String>, link: String, recording: &Recording) -> Sensor {
-        let family = recording.family().unwrap_or(Family::Lms);
         let (model, beams, way) = (recording.model(), recording.beams(), recording.contents().way);
-        Sensor { recorded, link, family, model, beams, way }
+        Sensor { recorded, link, family: recording.family(), model, beams, way }
     }
 }
 
@@ -185,8 +184,8 @@ fn with_links(sources: &Sources, sensors: &[Sensor]) -> Result<(Sources, Vec<Str
     let is_searched =
         |sensor: &&Sensor| links.iter().any(|link| link.name == sensor.link && link.family().is_none());
     let searched: Vec<&Sensor> = sensors.iter().filter(is_searched).collect();
-    let family = |sensor: &&Sensor| format!("link.{}.family={}", sensor.link, sensor.family.name());
-    sources.set.extend(searched.iter().map(family));
+    let family = |sensor: &&Sensor| Some(format!("link.{}.family={}", sensor.link, sensor.family?.name()));
+    sources.set.extend(searched.iter().filter_map(family));
     Ok((sources, searched.iter().map(|sensor| sensor.link.clone()).collect()))
 }
 
@@ -212,7 +211,7 @@ mod tests {
         Sensor {
             recorded: None,
             link: name.to_owned(),
-            family: Family::Lms,
+            family: Some(Family::Lms),
             model: Ok(None),
             beams: None,
             way: None,

@@ -7,6 +7,7 @@ use crate::line::probe::Probe;
 use crate::line::{
     self, Account, Control, Identity, Introduction, KnownRate, Notice, Output, RawScan, Received, State,
 };
+use crate::lms::Inquiry;
 use crate::{ld, lms, rplidar, search};
 use schema::{Counters, Family, Nanos, ScanHead, Status};
 
@@ -86,6 +87,15 @@ families! {
     Rplidar rplidar,
 }
 
+/// Creates the inquiry of a scanner of `family`, on a port that is open at `rate`, in bits per second. Without a rate, the
+/// port is a serial server, whose rate is set there. Returns `None` for a family that [has none](Features::has_inquiry).
+pub fn inquiry(family: Family, rate: Option<u32>, now: Nanos) -> Option<Inquiry> {
+    match family {
+        Family::Lms => Some(Inquiry::begin(rate, now)),
+        Family::Ld | Family::Rplidar => None,
+    }
+}
+
 /// Features of a link whose family is searched for: space for every scanner.
 pub const ANY: Features = {
     let mut any = Features {
@@ -96,6 +106,7 @@ pub const ANY: Features = {
         can_rest: false,
         speaks_unasked: false,
         has_whole_telegrams: true,
+        has_inquiry: false,
         contents: 0,
         max_telegram: 0,
     };

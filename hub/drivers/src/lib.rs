@@ -13,6 +13,7 @@ pub mod recognize;
 pub mod rplidar;
 pub mod search;
 
-pub use families::{ANY, Session, Trouble, features, scan_heads};
+pub use families::{ANY, Session, Trouble, features, inquiry, scan_heads};
 pub use line::family::{Features, Model, Settings};
+pub use lms::inquiry::{Inquiry, Report};
 pub use port_session::PortSession;

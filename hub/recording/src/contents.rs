@@ -8,7 +8,7 @@ use scanhub_drivers::lms::telegram::Telegram;
 use scanhub_drivers::lms::variant::{Baud, Mode, Unit, Variant};
 use schema::{Family, Nanos};
 
-use crate::{Unfit, Unread};
+use crate::{Encoding, Unfit, Unread};
 
 /// What kind of recording it is.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -71,6 +71,18 @@ impl Contents {
     pub fn readable(&self) -> Option<Mode> {
         let plain = Mode(0x00);
         self.mode.or((self.bits <= plain.max_value()).then_some(plain))
+    }
+
+    /// Returns the number of the measuring mode for reading the values: the one in the recording, or else `configured`, or
+    /// else the one that is [readable](Self::readable).
+    pub fn mode_or(&self, configured: Option<u8>) -> Option<u8> {
+        self.mode.map(|mode| mode.0).or(configured).or(self.readable().map(|mode| mode.0))
+    }
+
+    /// Returns the encoding of values in the measuring mode with the number `mode`.
+    pub fn encoding(&self, mode: Option<u8>) -> Encoding {
+        let default = Encoding::default();
+        Encoding { unit: self.unit.unwrap_or(default.unit), mode: mode.map_or(default.mode, Mode) }
     }
 
     /// Returns the time from a scan of `beams` to the next one, for a recording without stamps. Another number of beams than those of

@@ -27,6 +27,13 @@ pub struct Encoding {
     pub mode: Mode,
 }
 
+/// Ranges in mm, in as many bits as a value has for them.
+impl Default for Encoding {
+    fn default() -> Encoding {
+        Encoding { unit: Unit::Mm, mode: Mode(0) }
+    }
+}
+
 /// In words.
 impl fmt::Display for Encoding {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
@@ -193,7 +200,7 @@ impl Recording {
         let settings = Settings { fixed_rate: true, listen_only: true, ..Settings::default() };
         let mut session = VirtualTime::new(Session::begin(family, &settings, 0), 0);
         // Nothing of it is encoded here.
-        let mut frames = self.telegrams(Encoding { unit: Unit::Mm, mode: Mode(0) })?;
+        let mut frames = self.telegrams(Encoding::default())?;
         let mut told = None;
         for frame in frames.by_ref().take(TELLING) {
             session.take(0, &frame.telegram, |_| {});

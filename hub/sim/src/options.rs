@@ -16,6 +16,11 @@ use crate::rplidar;
 use crate::transmission::ChunkSize;
 use crate::world::World;
 
+/// Family of the sensors, unless an option names another one.
+pub const DEFAULT_FAMILY: &str = "lms";
+/// Type of the sensors of this family, unless an option names another one.
+pub const DEFAULT_TYPE: &str = "lms200";
+
 /// The options of the verb.
 #[derive(Clone, Debug)]
 pub struct SimulateOptions {

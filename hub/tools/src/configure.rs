@@ -10,6 +10,7 @@ use std::sync::atomic::AtomicBool;
 use lms_configure::eeprom::PowerOn;
 use lms_configure::{Change, Failing, Outcome, OwnedConfiguration, Plan, Step};
 use port::{Source, clock};
+use scanhub_drivers::Inquiry;
 use scanhub_drivers::lms::configuration::{Item, availability_words};
 use scanhub_drivers::lms::family::Family;
 use scanhub_drivers::lms::operating;
@@ -66,7 +67,10 @@ pub fn configure(order: &Order, stop: &AtomicBool, tell: &mut dyn FnMut(News<'_>
     let password = password(&order.password)?;
     check_unused(&order.source, &order.places)?;
     let (port, first) = open(&order.source, stop)?;
-    let report = request_report(&port, first, first, &order.source, stop, |rate| tell(News::Looking(rate)))?;
+    let rate = if let Source::Tcp { .. } = order.source { None } else { Some(first) };
+    let inquiry = Inquiry::begin(rate, clock::now());
+    let report =
+        request_report(&port, first, inquiry, &order.source, stop, |rate| tell(News::Looking(rate)))?;
     let name = order.source.name();
     let Some(mut plan) = Plan::of(&report) else {
         return Err(Failure::new(

@@ -11,14 +11,14 @@ use std::sync::atomic::AtomicBool;
 use port::{
     Candidate, Port, PortError, PortlessAdapter, Source, all_holders, candidates, check_tty, clock, found_in,
 };
-use scanhub_drivers::lms::inquiry::{Inquiry, Report};
-use scanhub_drivers::lms::variant::Baud;
-use scanhub_drivers::search::{self, Coverage};
+use scanhub_drivers::search::Coverage;
+use scanhub_drivers::{Inquiry, Report, features, inquiry, search};
 use schema::{Domain, Failure, Family, Kind};
 use serde::Serialize;
 
 use crate::doctor::Hub;
 use crate::driver::{self, DetectedScanner, NotFound, Procedure, detect, drive, not_detected};
+use description::link_settings;
 pub use description::{Description, Found, Turning};
 pub(crate) use description::{hex, measuring};
 pub use suggestion::SuggestedLink;
@@ -113,46 +113,54 @@ pub fn probe(
     })?;
     Ok(match answer {
         Answer::Asked(report) => {
-            let found = Found::Lms(Box::new(Description::new(source.name(), &report)));
-            Probed::new(found, SuggestedLink::for_lms(source, &there, &report, first), caution)
+            // The rate of a serial server is set there.
+            let rate = if is_server(source) { report.baud.map(|baud| baud.rate()) } else { None };
+            let settings = link_settings(&report, rate.unwrap_or(first));
+            let found = Found::Asked(Box::new(Description::new(source.name(), &report)));
+            Probed::new(found, SuggestedLink::new(source, &there, settings), caution)
         }
         Answer::Detected(heard) => {
             let found = Found::Turning(Box::new(Turning::new(source.name(), &heard)));
-            Probed::new(found, SuggestedLink::for_turning(source, &there, &heard), caution)
+            let family = ("family", heard.family.name().to_owned());
+            let model = heard.model.map(|model| ("model", model.name.to_owned()));
+            let settings = std::iter::once(family).chain(model).collect();
+            Probed::new(found, SuggestedLink::new(source, &there, settings), caution)
         }
     })
 }
 
 /// The scanner that was found.
 pub(crate) enum Answer {
-    /// An LMS, with its replies to the requests.
+    /// A scanner that reports its settings on request, with its replies.
     Asked(Box<Report>),
     /// A rotating scanner.
     Detected(Box<DetectedScanner>),
 }
 
-/// Finds the scanner at `port`, whose highest possible rate is `first`. The scanner may be of any family, or of `only` one.
+/// Finds the scanner at `port`, whose highest possible rate is `first`, in bits per second. The scanner may be of any
+/// family, or of `only` one.
 ///
 /// # Errors
 ///
 /// Returns [`Kind::Timeout`] if no scanner replies; the other kinds are those of [`probe`].
 pub(crate) fn find(
     port: &Port,
-    first: Baud,
+    first: u32,
     source: &Source,
     only: Option<Family>,
     stop: &AtomicBool,
     mut look: impl FnMut(u32),
 ) -> Result<Answer, Failure> {
-    let found = match only {
-        // Its requests find the rate, too.
-        Some(family @ Family::Lms) => search::Found { family, model: None, rate: None },
-        _ => driver::search(port, only, stop, &mut look)?
+    // An inquiry finds the rate, too.
+    let known = only.filter(|&family| features(family).has_inquiry);
+    let found = match known {
+        Some(family) => search::Found { family, model: None, rate: None },
+        None => driver::search(port, only, stop, &mut look)?
             .map_err(|not_found| nothing_found(source, &not_found))?,
     };
-    if found.family == Family::Lms {
-        let rate = found.rate.and_then(Baud::of_rate).unwrap_or(first);
-        let report = request_report(port, first, rate, source, stop, look)?;
+    let rate = (!is_server(source)).then_some(found.rate.unwrap_or(first));
+    if let Some(inquiry) = inquiry(found.family, rate, clock::now()) {
+        let report = request_report(port, first, inquiry, source, stop, look)?;
         return Ok(Answer::Asked(Box::new(report)));
     }
     let detected = detect(port, found, stop)?;
@@ -237,71 +245,72 @@ pub(crate) fn check_unused(source: &Source, places: &[Domain]) -> Result<(), Fai
     }
 }
 
-/// Opens `source` at the highest rate that it supports, unless `stop` is set before it is open.
-pub(crate) fn open(source: &Source, stop: &AtomicBool) -> Result<(Port, Baud), Failure> {
-    let open = |baud: Baud| Port::open(source, baud.rate(), stop).map(|port| (port, baud));
-    let (port, baud) = open(Baud::B500000).or_else(|failure| match failure.kind {
-        Kind::PortRate => open(Baud::B38400),
+/// Opens `source` at the highest rate of an inquiry that it supports, in bits per second, unless `stop` is set before it is open.
+pub(crate) fn open(source: &Source, stop: &AtomicBool) -> Result<(Port, u32), Failure> {
+    let open = |rate: u32| Port::open(source, rate, stop).map(|port| (port, rate));
+    let (port, rate) = open(HIGHEST_RATE).or_else(|failure| match failure.kind {
+        Kind::PortRate => open(RATE_OF_EVERY_PORT),
         _ => Err(failure),
     })?;
     // Bytes in the input buffer may be older than the scanner's last power-on. Setting the rate discards them.
-    let _ = port.set_baud(baud.rate());
-    Ok((port, baud))
+    let _ = port.set_baud(rate);
+    Ok((port, rate))
 }
 
-/// Requests identity, settings and state of the LMS at `port`, which is open at `rate`. The highest rate of the port is
-/// `first`.
+/// Requests identity, settings and state of the scanner at `port` by `inquiry`. The highest rate of the port is `first`, in
+/// bits per second.
 ///
 /// # Errors
 ///
 /// Returns [`Kind::Timeout`] if no scanner replies; the other kinds are those of [`probe`].
 pub(crate) fn request_report(
     port: &Port,
-    first: Baud,
-    rate: Baud,
+    first: u32,
+    mut inquiry: Inquiry,
     source: &Source,
     stop: &AtomicBool,
     mut look: impl FnMut(u32),
 ) -> Result<Report, Failure> {
-    let is_server = matches!(source, Source::Tcp { .. });
-    // The scanner reports the rate of a serial server later. The slowest rate waits long enough for any.
-    let now = clock::now();
-    let mut inquiry = if is_server { Inquiry::at(Baud::B9600, now) } else { Inquiry::new(rate, now) };
     let mut shown = None;
     let mut procedure = Procedure::new(|inquiry: &Inquiry| {
-        if shown != Some(inquiry.baud()) && !is_server {
+        if shown != Some(inquiry.baud()) && !is_server(source) {
             shown = Some(inquiry.baud());
             look(inquiry.baud().rate());
         }
         true
     });
     drive(port, &mut inquiry, &mut procedure, stop)?;
-    let mut report = inquiry.report().clone();
-    if is_server {
-        report.baud = report.status().and_then(|status| status.baud()).or(report.baud);
-    }
-    if report.answers() { Ok(report) } else { Err(silence(source, first, report.baud, report.bytes)) }
+    let report = inquiry.report().clone();
+    let streams_at = report.baud.map(|baud| baud.rate());
+    if report.answers() { Ok(report) } else { Err(silence(source, first, streams_at, report.bytes)) }
 }
 
-/// Returns the failure for an LMS that did not reply, with possible reasons, after `bytes` bytes arrived. It may stream
-/// at `streams_at`. The highest rate of the port is `first`.
-fn silence(source: &Source, first: Baud, streams_at: Option<Baud>, bytes: u64) -> Failure {
+fn is_server(source: &Source) -> bool {
+    matches!(source, Source::Tcp { .. })
+}
+
+/// Highest rate of an inquiry, in bits per second.
+pub(crate) const HIGHEST_RATE: u32 = Inquiry::RATES[Inquiry::RATES.len() - 1];
+/// Highest rate of an inquiry that every serial port supports, in bits per second.
+const RATE_OF_EVERY_PORT: u32 = Inquiry::RATES[Inquiry::RATES.len() - 2];
+
+/// Returns the failure for a scanner that did not reply to an inquiry, with possible reasons, after `bytes` bytes arrived.
+/// It may stream at `streams_at`. The highest rate of the port is `first`. Rates are in bits per second.
+fn silence(source: &Source, first: u32, streams_at: Option<u32>, bytes: u64) -> Failure {
     let name = source.name();
     let came = match bytes {
         0 => "no byte arrived".to_owned(),
         bytes => format!("{bytes} bytes arrived, without a telegram"),
     };
-    let rates = match first {
-        Baud::B500000 => "9600, 19200, 38400 or 500000 Bd",
-        _ => "9600, 19200 or 38400 Bd",
-    };
+    let lower: Vec<_> = Inquiry::RATES.iter().filter(|&&rate| rate < first).map(u32::to_string).collect();
+    let rates = format!("{} or {first} Bd", lower.join(", "));
     let (what, remedy) = match (streams_at, source) {
         (Some(_), Source::Tcp { .. }) => (
             format!("{name}: a sensor streams but does not answer"),
             "it does not receive from the serial server: check the wire to its receiver",
         ),
-        (Some(baud), _) => (
-            format!("{name}: a sensor streams at {} Bd but does not answer", baud.rate()),
+        (Some(rate), _) => (
+            format!("{name}: a sensor streams at {rate} Bd but does not answer"),
             "it does not receive from this port: check the wire to its receiver",
         ),
         (None, Source::Tcp { .. }) => (
@@ -367,7 +376,7 @@ mod tests {
     #[test]
     fn names_only_rates_that_the_port_has() {
         let message = |first| silence(&Source::Tty("/dev/ttyS0".into()), first, None, 0).message;
-        assert!(message(Baud::B500000).contains("38400 or 500000 Bd; no byte"));
-        assert!(message(Baud::B38400).contains("no answer at 9600, 19200 or 38400 Bd; no byte"));
+        assert!(message(HIGHEST_RATE).contains("38400 or 500000 Bd; no byte"));
+        assert!(message(RATE_OF_EVERY_PORT).contains("no answer at 9600, 19200 or 38400 Bd; no byte"));
     }
 }

@@ -28,6 +28,40 @@ const FAMILIES: [(&str, &[&str]); 2] = [
     ("rplidar", &["slamtec", "a1m8", "a2m8", "a2m12"]),
 ];
 
+/// Sources of the hub, its tools and the program, which name no family, not even the LMS. Recordings and clients name the
+/// LMS, because its telegrams are a format of files and topics.
+const HUB: [&str; 5] = ["hub/daemon/", "hub/tools/", "hub/cli", "hub/demo", "hub/main.rs"];
+
+/// Sources among those of [`HUB`] that name the LMS; each says why.
+const MAY_NAME_LMS: [&str; 5] = [
+    // Changes settings in the EEPROM, which only an LMS has.
+    "hub/cli/configure.rs",
+    "hub/tools/src/configure",
+    // Explains telegrams byte by byte, which only an LMS sends.
+    "hub/tools/src/telegram",
+    // Describes and checks the settings that only an LMS reports on request.
+    "hub/tools/src/probe/description.rs",
+    "hub/tools/src/doctor/sensor.rs",
+];
+
+/// Sources of the hub that name the LMS and may not.
+fn hub_names_no_lms(tree: &Tree) -> Vec<String> {
+    let others =
+        hub_sources_with_lms(tree).filter(|path| !MAY_NAME_LMS.iter().any(|may| path.starts_with(may)));
+    others.map(|path| format!("{path} names the LMS: call what the drivers have for every family")).collect()
+}
+
+/// Sources of the hub that name the LMS.
+fn hub_sources_with_lms(tree: &Tree) -> impl Iterator<Item = &str> {
+    let is_hub = |path: &str| HUB.iter().any(|hub| path.starts_with(hub)) && !path.contains("tests");
+    let names_it = |line: &str| {
+        let line = line.to_lowercase();
+        line.split(|c: char| !c.is_alphanumeric()).any(|word| word.starts_with("lms"))
+    };
+    let sources = tree.files(".rs").filter(move |(path, _)| is_hub(path));
+    sources.filter(move |(_, text)| code(text).any(|(_, line)| names_it(line))).map(|(path, _)| path)
+}
+
 /// Files that name a family and may not.
 fn few_files_name_a_family(tree: &Tree) -> Vec<String> {
     let named = FAMILIES.iter().flat_map(|(name, words)| named(tree, name, words));
@@ -55,6 +89,24 @@ fn named<'a>(tree: &'a Tree, name: &str, words: &[&str]) -> Vec<&'a str> {
             false => text.lines().any(names_it),
         });
     named.map(|(path, _)| path).collect()
+}
+
+#[test]
+fn the_hub_names_no_lms() {
+    holds(hub_names_no_lms, |tree| {
+        vec![
+            tree.with("hub/daemon/src/drive.rs", "//! Drives.\nif matches!(session, Session::Lms(_)) {\n"),
+            tree.with("hub/daemon/src/drive.rs", "//! Drives.\nif family == Family::Lms {\n"),
+            tree.with("hub/tools/src/driver.rs", "//! Drives.\nuse scanhub_drivers::lms::variant::Baud;\n"),
+            tree.with("hub/tools/src/probe.rs", "//! Probes.\nif kind == \"LMS291\" {\n"),
+            tree.with("hub/cli/planted.rs", "//! Options.\nlms_type: String,\n"),
+        ]
+    });
+    let tree = Tree::load();
+    for may in MAY_NAME_LMS {
+        let is_used = hub_sources_with_lms(&tree).any(|path| path.starts_with(may));
+        assert!(is_used, "{may} does not name the LMS: it need not be in the list");
+    }
 }
 
 #[test]

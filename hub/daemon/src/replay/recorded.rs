@@ -6,7 +6,6 @@ use std::path::Path;
 
 use config::Link;
 use recording::{Encoding, Form, Frame, Recording};
-use scanhub_drivers::lms::variant::{Mode, Unit};
 use scanhub_drivers::{Settings, features};
 use schema::{Failure, Family, Header, Kind, Nanos};
 
@@ -24,7 +23,8 @@ pub(crate) enum Recorded {
 pub(crate) struct Stream {
     recording: Recording,
     pub(super) family: Family,
-    pub(super) mode: Option<Mode>,
+    /// Number of the measuring mode.
+    pub(super) mode: Option<u8>,
 }
 
 /// Complete telegrams or packets, with their stamps.
@@ -35,7 +35,8 @@ pub(crate) struct Frames {
     pub(super) is_whole: bool,
     /// Of a log the metres, of others nothing.
     encoding: Encoding,
-    mode: Option<Mode>,
+    /// Number of the measuring mode.
+    mode: Option<u8>,
     origin: Option<Origin>,
     /// At its beginning it is not known how values are split: the hub that recorded it learned that from a telegram.
     is_told_later: bool,
@@ -74,12 +75,11 @@ impl Recorded {
     pub(crate) fn new(recording: Recording, link: &Link) -> Result<Recorded, Failure> {
         let family = check_family(&recording, link)?;
         if !features(family).has_whole_telegrams {
-            let encoding = Encoding { unit: Unit::Mm, mode: Mode(0) };
             let mut frames = Frames {
                 recording,
                 family,
                 is_whole: false,
-                encoding,
+                encoding: Encoding::default(),
                 mode: None,
                 origin: None,
                 is_told_later: false,
@@ -88,13 +88,12 @@ impl Recorded {
             return Ok(Recorded::Frames(frames));
         }
         tell_of_log(&recording, &link.name);
-        let contents = recording.contents();
-        let mode = contents.mode.or(configured_mode(link)).or(contents.readable());
+        let mode = recording.contents().mode_or(configured_mode(link));
         tell_of_mode(&recording, link);
         if recording.contents().form == Form::Telegrams {
             return Ok(Recorded::Stream(Stream { recording, family, mode }));
         }
-        let encoding = Encoding { unit: contents.unit.unwrap_or(Unit::Mm), mode: mode.unwrap_or(Mode(0)) };
+        let encoding = recording.contents().encoding(mode);
         let mut frames =
             Frames { recording, family, is_whole: true, encoding, mode, origin: None, is_told_later: false };
         let mut first = frames.read()?.take(ASKED_WITHIN).peekable();
@@ -217,7 +216,7 @@ impl Frames {
 
     /// Returns the settings of a session that reads it for `link`. What is not configured is as it was recorded.
     pub(super) fn settings(&self, link: &Link) -> Settings {
-        let mode_number = self.mode.filter(|_| !self.is_told_later).map(|mode| mode.0);
+        let mode_number = self.mode.filter(|_| !self.is_told_later);
         let mut settings = Settings { mode_number, ..link.settings() };
         if !self.is_whole && link.scanner.is_auto() {
             let model = self.recording.model().ok().flatten();
@@ -345,7 +344,8 @@ fn check_family(recording: &Recording, link: &Link) -> Result<Family, Failure> {
 /// That the values are read in a way which neither the recording nor the configuration tells.
 fn tell_of_mode(recording: &Recording, link: &Link) {
     let contents = recording.contents();
-    if contents.mode.or(configured_mode(link)).is_none()
+    if contents.mode.is_none()
+        && configured_mode(link).is_none()
         && contents.scans > 0
         && contents.readable().is_some()
     {
@@ -379,9 +379,9 @@ fn is_first(header: &Header) -> bool {
     header.seq == 0 && header.hub_pid != 0
 }
 
-/// Returns the configured measuring mode.
-fn configured_mode(link: &Link) -> Option<Mode> {
-    link.scanner.settings.mode_number.map(Mode)
+/// Returns the number of the configured measuring mode.
+fn configured_mode(link: &Link) -> Option<u8> {
+    link.scanner.settings.mode_number
 }
 
 /// A hub that found a sensor streaming has asked it within so many telegrams.

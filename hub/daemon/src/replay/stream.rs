@@ -22,7 +22,7 @@ pub(super) fn play(replay: &mut ReplayLink<'_, '_>, stream: &Stream) -> Option<O
         }
     };
     let link = replay.link.link;
-    let settings = Settings { mode_number: stream.mode.map(|mode| mode.0), ..link.settings() };
+    let settings = Settings { mode_number: stream.mode, ..link.settings() };
     let mut session = PortSession::begin(Some(stream.family), &settings, None, clock::now());
     let mut recorded = RecordedContext::default();
     let (mut media, mut limit) = (0, None);

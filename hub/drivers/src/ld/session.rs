@@ -577,6 +577,7 @@ pub const FEATURES: Features = Features {
     can_rest: false,
     speaks_unasked: true,
     has_whole_telegrams: false,
+    has_inquiry: false,
     contents: Contents::TURNING,
     max_telegram: MOST * LEN,
 };

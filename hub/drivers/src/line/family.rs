@@ -16,6 +16,8 @@ pub struct Features {
     /// Whether each telegram is a scan or a reply by itself. Otherwise the family sends packets, which are parts of a
     /// scan.
     pub has_whole_telegrams: bool,
+    /// Whether the scanner reports its settings on request, outside a session: to an [inquiry](crate::inquiry).
+    pub has_inquiry: bool,
     /// Arrays of a scan: bits of [`schema::Contents`].
     pub contents: u8,
     /// Maximum number of bytes of a telegram, or of packets that arrived together.

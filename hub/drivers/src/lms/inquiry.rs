@@ -5,6 +5,7 @@
 //! rate, in two rounds, because a scanner may overlook a request. A rate at which telegrams arrived is tried more
 //! often.
 
+use crate::line::family::table;
 use crate::line::{Output, Protocol};
 use crate::lms::command::Request;
 use crate::lms::condition::Condition;
@@ -59,6 +60,19 @@ enum Phase {
 }
 
 impl Inquiry {
+    /// All rates of a scanner, in bits per second.
+    pub const RATES: [u32; Baud::ALL.len()] = table!(Baud::ALL, Baud::rate);
+
+    /// Creates an inquiry on a port that is open at `rate`, in bits per second. Without a rate, the port is a serial
+    /// server, whose rate is set there.
+    pub fn begin(rate: Option<u32>, now: Nanos) -> Self {
+        match rate {
+            Some(rate) => Inquiry::new(Baud::of_rate(rate).unwrap_or(Baud::B500000), now),
+            // The scanner reports the rate later. The slowest rate waits long enough for any.
+            None => Inquiry::at(Baud::B9600, now),
+        }
+    }
+
     /// Creates an inquiry on a port that is open at `first`. It tries all rates, that one first.
     pub fn new(first: Baud, now: Nanos) -> Self {
         let mut rates = Baud::ALL;
@@ -114,6 +128,9 @@ impl Inquiry {
         };
         self.report.keep(request, reply);
         self.report.baud = Some(self.exchange.baud);
+        if self.exchange.behind_server {
+            self.report.baud = self.report.status().and_then(|status| status.baud()).or(self.report.baud);
+        }
         self.report.address = Some(address);
         self.report.status_byte = status;
         self.exchange.address = address;

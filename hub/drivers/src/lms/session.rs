@@ -520,6 +520,7 @@ pub const FEATURES: family::Features = family::Features {
     can_rest: false,
     speaks_unasked: false,
     has_whole_telegrams: true,
+    has_inquiry: true,
     contents: Contents::UPPER,
     max_telegram: MAX_TELEGRAM,
 };

@@ -160,7 +160,7 @@ impl Baud {
     pub const ALL: [Baud; 4] = [Baud::B9600, Baud::B19200, Baud::B38400, Baud::B500000];
 
     /// Bits per second.
-    pub fn rate(self) -> u32 {
+    pub const fn rate(self) -> u32 {
         match self {
             Baud::B9600 => 9_600,
             Baud::B19200 => 19_200,

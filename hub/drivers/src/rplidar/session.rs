@@ -718,6 +718,7 @@ pub const FEATURES: Features = Features {
     can_rest: true,
     speaks_unasked: false,
     has_whole_telegrams: false,
+    has_inquiry: false,
     contents: Contents::TURNING,
     max_telegram: MAX_SAMPLE_LEN,
 };

@@ -8,7 +8,6 @@ use port::{
     Candidate, Counts, Holder, PROMPT_MS, Port, PortError, PortlessAdapter, Rights, Source, all_holders,
     check_tty, latency_ms,
 };
-use scanhub_drivers::lms::variant::Baud;
 use schema::{Counter, Failure, Kind, Status};
 
 use super::hub::{Hub, other_reader};
@@ -150,11 +149,11 @@ fn server(
 /// replied.
 type Examined = Result<(Option<u32>, Vec<Finding>), Finding>;
 
-/// Checks the scanner at `port`, which is open at `first`.
-fn ask(subject: &Subject, port: &Port, first: Baud, stop: &AtomicBool) -> Result<Examined, Failure> {
+/// Checks the scanner at `port`, which is open at `first`, in bits per second.
+fn ask(subject: &Subject, port: &Port, first: u32, stop: &AtomicBool) -> Result<Examined, Failure> {
     let (source, link) = (&subject.source, subject.link.as_ref());
     match probe::find(port, first, source, link.and_then(config::Link::family), stop, |_| {}) {
-        Ok(Answer::Asked(report)) => Ok(Ok((None, sensor::check_lms(&source.name(), &report, link)))),
+        Ok(Answer::Asked(report)) => Ok(Ok((None, sensor::check_report(&source.name(), &report, link)))),
         Ok(Answer::Detected(heard)) => Ok(Ok((Some(heard.rate), sensor::check_rotating(&heard, link)))),
         Err(failure) if failure.kind == Kind::Interrupted => Err(failure),
         Err(failure) => Ok(Err(Finding::failed("sensor", failure.message, failure.hint))),
@@ -273,16 +272,16 @@ fn latency(path: &Path, ms: Option<u8>) -> Finding {
 
 /// Checks whether the port supports the rate of the stream: the rate of the rotating scanner that was `found`, or that
 /// of the link.
-fn rate(subject: &Subject, port: &Port, first: Baud, found: Option<u32>) -> Finding {
+fn rate(subject: &Subject, port: &Port, first: u32, found: Option<u32>) -> Finding {
     const NAME: &str = "rate";
     // The search for a scanner leaves out a rate that the port cannot have.
     let link = subject.link.as_ref().filter(|link| link.family().is_some());
-    let link_rate = link.map_or(Baud::B500000.rate(), config::Link::rate);
+    let link_rate = link.map_or(probe::HIGHEST_RATE, config::Link::rate);
     let wanted = found.unwrap_or(link_rate);
     let outcome = port.set_baud(wanted);
     let given = port.baud().filter(|&given| given != wanted);
     // The requests start at the rate at which the port was opened.
-    let _ = port.set_baud(first.rate());
+    let _ = port.set_baud(first);
     match (outcome, link) {
         (Ok(()), _) => {
             let near =

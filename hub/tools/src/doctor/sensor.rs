@@ -16,7 +16,7 @@ use super::{Finding, Hub};
 use crate::driver::{DetectedScanner, LINE_REMEDY};
 
 /// Checks the LMS at `port` by its `report`.
-pub(crate) fn check_lms(port: &str, report: &Report, link: Option<&Link>) -> Vec<Finding> {
+pub(crate) fn check_report(port: &str, report: &Report, link: Option<&Link>) -> Vec<Finding> {
     let mut status =
         Status { mode: report.status().map_or(Status::MODE_UNKNOWN, |it| it.mode().0), ..Status::default() };
     status.set_port(port);
@@ -385,7 +385,7 @@ mod tests {
     fn verdict(name: &str, at: usize, byte: u8, condition: u8, errors: &[u8]) -> (Verdict, String) {
         let mut status = healthy();
         status[at] = byte;
-        let findings = check_lms("/dev/ttyUSB0", &report(status, condition, errors), None);
+        let findings = check_report("/dev/ttyUSB0", &report(status, condition, errors), None);
         let found = findings.iter().find(|finding| finding.name == name).expect("it is checked");
         (found.state, found.to_string())
     }
@@ -432,7 +432,9 @@ mod tests {
     #[test]
     fn reports_mode_without_reflector_bits() {
         let found = |mode: u8| {
-            check_lms("/dev/ttyUSB0", &report(with_mode(mode), 0x10, &[]), None).pop().expect("it is checked")
+            check_report("/dev/ttyUSB0", &report(with_mode(mode), 0x10, &[]), None)
+                .pop()
+                .expect("it is checked")
         };
         assert_eq!((found(1).name, found(1).state), ("marks", Verdict::Ok));
         assert_eq!(

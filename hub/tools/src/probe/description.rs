@@ -6,11 +6,11 @@ use std::fmt;
 use scanhub_drivers::lms::command::Request;
 use scanhub_drivers::lms::condition::Condition;
 use scanhub_drivers::lms::configuration::availability_words;
-use scanhub_drivers::lms::inquiry::Report;
+use scanhub_drivers::lms::family::Family as Type;
 use scanhub_drivers::lms::operating;
 use scanhub_drivers::lms::reply::Reply;
 use scanhub_drivers::lms::variant::Mode;
-use scanhub_drivers::{Model, features, lms};
+use scanhub_drivers::{Model, Report, features, lms};
 use schema::Family;
 use serde::Serialize;
 
@@ -20,8 +20,8 @@ use crate::driver::DetectedScanner;
 #[derive(Clone, Debug, Serialize)]
 #[serde(untagged)]
 pub enum Found {
-    /// An LMS, which replied to requests.
-    Lms(Box<Description>),
+    /// A scanner that reports its settings on request.
+    Asked(Box<Description>),
     /// A rotating scanner.
     Turning(Box<Turning>),
 }
@@ -29,10 +29,21 @@ pub enum Found {
 impl fmt::Display for Found {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
-            Found::Lms(description) => description.fmt(f),
+            Found::Asked(description) => description.fmt(f),
             Found::Turning(turning) => turning.fmt(f),
         }
     }
+}
+
+/// Returns the settings of a link for the LMS that sent `report`, at a line of `rate` bits per second.
+pub(crate) fn link_settings(report: &Report, rate: u32) -> Vec<(&'static str, String)> {
+    let kind = report.kind().and_then(Type::of_type);
+    // No link can be configured for a type that has no variant, but the hub streams what such a sensor sends.
+    let kind = kind.filter(|kind| kind.factory_variant().is_some());
+    let mut settings = vec![("family", Family::Lms.name().to_owned())];
+    settings.extend(kind.map(|kind| ("type", kind.name().to_owned())));
+    settings.extend((rate != features(Family::Lms).auto.baud).then(|| ("baud", rate.to_string())));
+    settings
 }
 
 /// Description of an LMS. A value that it did not report is null.
@@ -103,7 +114,7 @@ impl Description {
         Description {
             class: "probe",
             port,
-            family: schema::Family::Lms.name(),
+            family: Family::Lms.name(),
             model: kind.as_deref().map(str::to_lowercase),
             baud: report.baud.map(|baud| baud.rate()),
             kind,
@@ -279,5 +290,26 @@ impl fmt::Display for Turning {
         row("points", self.points_per_second.map(|points| format!("{points:.0} a second")))?;
         row("turns", self.turns_per_second.map(|turns| format!("{turns:.2} a second")))?;
         row("trouble", self.trouble.clone())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use scanhub_drivers::inquiry;
+
+    #[test]
+    fn a_link_names_only_a_rate_below_the_highest() {
+        let report = inquiry(Family::Lms, None, 0).unwrap().report().clone();
+        let family = ("family", "lms".to_owned());
+        assert_eq!(link_settings(&report, 500_000), [family.clone()]);
+        assert_eq!(link_settings(&report, 38_400), [family, ("baud", "38400".to_owned())]);
+    }
+
+    #[test]
+    fn a_family_has_an_inquiry_if_it_says_so() {
+        for family in Family::ALL {
+            assert_eq!(inquiry(family, None, 0).is_some(), features(family).has_inquiry, "{family:?}");
+        }
     }
 }

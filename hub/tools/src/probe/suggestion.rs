@@ -4,13 +4,6 @@
 use std::path::{Path, PathBuf};
 
 use port::{Candidate, Source};
-use scanhub_drivers::lms::family::Family as Type;
-use scanhub_drivers::lms::inquiry::Report;
-use scanhub_drivers::lms::variant::Baud;
-use schema::Family;
-
-use crate::driver::DetectedScanner;
-
 /// A link for the scanner at a port.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct SuggestedLink {
@@ -21,32 +14,12 @@ pub struct SuggestedLink {
 }
 
 impl SuggestedLink {
-    /// Returns the link for an LMS that sent `report`, at a port whose highest possible rate is `most`.
-    pub(crate) fn for_lms(
+    /// Creates the link for a scanner at `source`, with keys and values besides name and port.
+    pub(crate) fn new(
         source: &Source,
         there: &[Candidate],
-        report: &Report,
-        most: Baud,
+        settings: Vec<(&'static str, String)>,
     ) -> SuggestedLink {
-        let kind = report.kind().and_then(Type::of_type);
-        // No link can be configured for a type that has no variant, but the hub streams what such a sensor sends.
-        let kind = kind.filter(|kind| kind.factory_variant().is_some());
-        // The rate of a serial server is set there.
-        let rate = if let Source::Tcp { .. } = source { report.baud.unwrap_or(most) } else { most };
-        let mut settings = vec![("family", Family::Lms.name().to_owned())];
-        settings.extend(kind.map(|kind| ("type", kind.name().to_owned())));
-        settings.extend((rate != Baud::B500000).then(|| ("baud", rate.rate().to_string())));
-        SuggestedLink { port: permanent_name(source, there), settings }
-    }
-
-    /// Returns the link for a rotating scanner.
-    pub(crate) fn for_turning(
-        source: &Source,
-        there: &[Candidate],
-        heard: &DetectedScanner,
-    ) -> SuggestedLink {
-        let mut settings = vec![("family", heard.family.name().to_owned())];
-        settings.extend(heard.model.map(|model| ("model", model.name.to_owned())));
         SuggestedLink { port: permanent_name(source, there), settings }
     }
 
@@ -117,7 +90,8 @@ mod tests {
     use super::*;
     use config::{Config, Link, Sources};
     use scanhub_drivers::features;
-    use scanhub_drivers::lms::inquiry::Inquiry;
+    use scanhub_drivers::lms::family::Family as Type;
+    use schema::Family;
 
     fn link(port: &str, settings: &[(&'static str, &str)]) -> SuggestedLink {
         let settings = settings.iter().map(|(key, value)| (*key, (*value).to_owned())).collect();
@@ -161,21 +135,6 @@ mod tests {
             let suggested = link(port, &[("family", "ld")]);
             assert_eq!(loaded(&suggested).port.name(), port);
         }
-    }
-
-    #[test]
-    fn an_lms_gets_the_rate_of_its_port() {
-        let report = Inquiry::new(Baud::B38400, 0).report().clone();
-        let of = |source: &str, most| {
-            SuggestedLink::for_lms(&Source::parse(source).unwrap(), &[], &report, most).flag()
-        };
-        assert_eq!(of("/dev/ttyS9", Baud::B500000), "front=/dev/ttyS9,family=lms");
-        assert_eq!(of("/dev/ttyS9", Baud::B38400), "front=/dev/ttyS9,family=lms,baud=38400");
-        let mut server = report.clone();
-        server.baud = Some(Baud::B38400);
-        let source = Source::parse("tcp:box:4001").unwrap();
-        let suggested = SuggestedLink::for_lms(&source, &[], &server, Baud::B500000);
-        assert_eq!(suggested.flag(), "front=tcp:box:4001,family=lms,baud=38400");
     }
 
     #[test]
