@@ -6,7 +6,7 @@ use std::fmt;
 
 use preprocess::background::{Candidate, Method, Start};
 use preprocess::{lines, marks, motion, zones};
-use scanhub_drivers::Settings;
+use scanhub_drivers::{AUTO, Settings};
 use schema::limits::TopicLimits;
 use schema::{Failure, Family, Pose};
 use serde::Serialize;
@@ -16,7 +16,6 @@ use toml::de::{DeTable, DeValue};
 use crate::gateway::Gateway;
 use crate::link::{Config, Link};
 use crate::processing::{Background, Zones};
-use crate::scanner::AUTO;
 use crate::sources::{Origin, Sources};
 
 /// One value in effect.
@@ -113,13 +112,13 @@ impl List {
     /// Adds the settings of a scanner that reports its model.
     fn reported(&mut self, Link { name, scanner, .. }: &Link) {
         let of = |key: &'static str| (name.as_str(), key);
-        let by_type = match scanner.expected_type {
+        let by_type = match scanner.settings.expected_type {
             Some(name) => format!("default of {name}"),
             None => DEFAULT.to_owned(),
         };
         let Settings { view, unit_mm, mode_number, baud, .. } = scanner.settings;
         let (angle_deg, resolution_cdeg) = view.unzip();
-        self.put(of("type"), json!(scanner.expected_type), DEFAULT);
+        self.put(of("type"), json!(scanner.settings.expected_type), DEFAULT);
         self.put(of("angle"), json!(angle_deg), &by_type);
         self.put(of("resolution"), json!(resolution_cdeg.map(|cdeg| f64::from(cdeg) / 100.0)), &by_type);
         self.put(of("unit"), json!(unit_mm.map(|mm| if mm == 1 { "mm" } else { "cm" })), DEFAULT);

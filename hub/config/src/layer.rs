@@ -4,9 +4,6 @@
 use std::rc::Rc;
 
 use port::Source;
-use scanhub_drivers::Settings;
-use scanhub_drivers::lms::family::Family;
-use scanhub_drivers::lms::variant::{Baud, Mode, Unit, Variant};
 use schema::limits::TopicLimits;
 use schema::{Failure, Kind, check_sensor};
 use serde::Deserialize;
@@ -18,7 +15,7 @@ use crate::processing::{
     BackgroundLayer, EarlyLayer, LinesLayer, MarksLayer, MotionLayer, PoseLayer, Processing, Sections,
     ZonesLayer,
 };
-use crate::scanner::{ScannerDraft, ScannerLayer, remedy_of_lms};
+use crate::scanner::{ScannerDraft, ScannerLayer};
 use crate::sources::Origin;
 use crate::zone_coverage::ZoneCoverage;
 
@@ -45,7 +42,7 @@ struct LinkLayer {
     name: Spanned<String>,
     port: Option<Spanned<String>>,
     #[serde(rename = "type")]
-    lms_type: Option<Spanned<String>>,
+    expected_type: Option<Spanned<String>>,
     family: Option<Spanned<String>>,
     model: Option<Spanned<String>>,
     beams: Option<Spanned<i64>>,
@@ -94,20 +91,8 @@ struct Draft {
     place: String,
     port: Option<Source>,
     scanner: ScannerDraft,
-    family: Option<Sourced<Family>>,
-    angle_deg: Option<Sourced<u16>>,
-    resolution_cdeg: Option<Sourced<u16>>,
-    unit: Option<Sourced<Unit>>,
-    mode: Option<Sourced<Mode>>,
-    baud: Option<Sourced<Baud>>,
     /// Sections for this link, in the order of the sources.
     own: Vec<(Rc<Origin>, Sections)>,
-}
-
-/// A value, and the last place where it was set.
-struct Sourced<T> {
-    value: T,
-    place: String,
 }
 
 impl Drafts {
@@ -138,73 +123,23 @@ impl Drafts {
 impl Draft {
     /// Returns the link. Values for the link take precedence over values for all links, regardless of their order.
     fn finish(self, general: &[(Rc<Origin>, Sections)]) -> Result<Link, Failure> {
-        let Draft { name, place, port, scanner, family, angle_deg, resolution_cdeg, unit, mode, baud, own } =
-            self;
+        let Draft { name, place, port, scanner: requested, own } = self;
         let refuse = |place: &str, what: String, remedy: &str| {
             Failure::new(Kind::Configuration, format!("{place}: link {name}: {what}"), remedy)
         };
         let port = port.ok_or_else(|| refuse(&place, "no port".into(), "add port = \"/dev/ttyUSB0\""))?;
-        let said = |place: Option<&String>, key| place.map(|place| (place.clone(), key));
-        let of_lms = [
-            said(family.as_ref().map(|said| &said.place), "type"),
-            said(angle_deg.as_ref().map(|said| &said.place), "angle"),
-            said(resolution_cdeg.as_ref().map(|said| &said.place), "resolution"),
-            said(unit.as_ref().map(|said| &said.place), "unit"),
-            said(mode.as_ref().map(|said| &said.place), "mode"),
-            said(baud.as_ref().map(|said| &said.place), "baud"),
-        ];
-        let of_lms: Vec<_> = of_lms.into_iter().flatten().collect();
-        let mut scanner = scanner.finish(&of_lms, refuse)?;
-        if !scanner.features().models.is_empty()
-            && let Some((place, key)) = of_lms.first()
+        let scanner_refused =
+            |at: Option<&str>, what, remedy: &str| refuse(at.unwrap_or(&place), what, remedy);
+        let scanner = requested.finish(scanner_refused)?;
+        if let Some(mode_place) =
+            requested.mode_number_place().filter(|_| !matches!(port, Source::File { .. }))
         {
-            let what = format!("{key} is of family lms; a scanner of another family has no such setting");
-            return Err(refuse(place, what, &remedy_of_lms(key, &scanner)));
-        }
-        if let Some(mode) = mode.as_ref().filter(|_| !matches!(port, Source::File { .. })) {
             let what = format!("the mode of {} is read from the sensor", port.name());
             return Err(refuse(
-                &mode.place,
+                mode_place,
                 what,
                 "mode is only for recordings, port = \"file:PATH\"; leave it out",
             ));
-        }
-        // Place of the value that conflicts, or of the value that implies it.
-        let type_place = family.as_ref().map_or(&place, |said| &said.place);
-        let angle_place = angle_deg.as_ref().map_or(type_place, |said| &said.place);
-        let step_place = resolution_cdeg.as_ref().map_or(angle_place, |said| &said.place);
-        let family = family.as_ref().map(|said| said.value);
-        let factory = family.and_then(Family::factory_variant).unwrap_or(Variant::HALF);
-        let angle_deg = angle_deg.as_ref().map_or(factory.angle_deg, |said| said.value);
-        let resolution_cdeg = resolution_cdeg.as_ref().map_or(factory.resolution_cdeg, |said| said.value);
-        if family == Some(Family::Fast) {
-            // A scan with 181 values looks like one of 180 degrees with a resolution of 1 degree.
-            let what =
-                "the beams of version S14 have other angles: 90 degrees at 0.5, which no telegram reports";
-            return Err(refuse(
-                type_place,
-                what.into(),
-                "a hub can stream lms200, lms211, lms221 and lms291",
-            ));
-        }
-        let variant = Variant::new(angle_deg, resolution_cdeg).ok_or_else(|| {
-            let step = f64::from(resolution_cdeg) / 100.0;
-            let remedy = "180 degrees at 0.5 or 1, 100 degrees at 0.25, 0.5 or 1";
-            refuse(step_place, format!("no sensor scans {angle_deg} degrees at {step}"), remedy)
-        })?;
-        if let Some((family, why)) = family.and_then(|f| Some((f, f.refuses_variant(variant)?))) {
-            let what = format!("an {} does not scan {angle_deg} degrees: {why}", family.name());
-            return Err(refuse(angle_place, what, "angle = 100"));
-        }
-        if scanner.family.is_some() && scanner.features().models.is_empty() {
-            scanner.expected_type = family.map(Family::name);
-            scanner.settings = Settings {
-                view: Some((variant.angle_deg, variant.resolution_cdeg)),
-                baud: baud.map(|said| said.value.rate()),
-                unit_mm: unit.map(|said| said.value.mm()),
-                mode_number: mode.map(|said| said.value.0),
-                ..scanner.settings
-            };
         }
         let mut processing = Processing::default();
         let said: Vec<_> = general.iter().chain(&own).collect();
@@ -265,12 +200,6 @@ fn merge(
                     place: origin.place(span),
                     port: None,
                     scanner: ScannerDraft::default(),
-                    family: None,
-                    angle_deg: None,
-                    resolution_cdeg: None,
-                    unit: None,
-                    mode: None,
-                    baud: None,
                     own: Vec::new(),
                 });
                 links.len() - 1
@@ -293,80 +222,17 @@ fn merge(
                 )
             })?);
         }
-        let LinkLayer { family, model, beams, idle, .. } = link;
-        draft.scanner.apply(ScannerLayer { family, model, beams, idle }, origin)?;
-        if let Some(family) = link.lms_type {
-            let value = Family::of_name(family.get_ref()).ok_or_else(|| {
-                let what = format!("type = \"{}\"", family.get_ref());
-                origin.refuse(Some(family.span()), what, "lms200, lms211, lms221 or lms291")
-            })?;
-            draft.family = Some(Sourced { value, place: origin.place(Some(family.span())) });
-        }
-        if let Some(angle) = link.angle {
-            let value = scaled(origin, &angle, 1.0, "angle", "100 or 180")?;
-            draft.angle_deg = Some(Sourced { value, place: origin.place(Some(angle.span())) });
-        }
-        if let Some(step) = link.resolution {
-            let value = scaled(origin, &step, 100.0, "resolution", "0.25, 0.5 or 1")?;
-            draft.resolution_cdeg = Some(Sourced { value, place: origin.place(Some(step.span())) });
-        }
-        if let Some(unit) = link.unit {
-            let value = match unit.get_ref().as_str() {
-                "mm" => Unit::Mm,
-                "cm" => Unit::Cm,
-                other => {
-                    let what = format!("unit = \"{other}\"");
-                    return Err(origin.refuse(Some(unit.span()), what, "\"mm\" or \"cm\""));
-                }
-            };
-            draft.unit = Some(Sourced { value, place: origin.place(Some(unit.span())) });
-        }
-        if let Some(mode) = link.mode {
-            let place = origin.place(Some(mode.span()));
-            // The last one applies, whatever its family is.
-            (draft.mode, draft.scanner.mode) = match mode.get_ref() {
-                toml::Value::String(name) => (None, Some((name.clone(), place))),
-                value => {
-                    let number = value.as_integer().and_then(|number| u8::try_from(number).ok());
-                    let known = number.map(Mode).filter(|mode| mode.has_ranges());
-                    let refuse = || origin.refuse(Some(mode.span()), format!("mode = {value}"), MODES);
-                    (Some(Sourced { value: known.ok_or_else(refuse)?, place }), None)
-                }
-            };
-        }
-        if let Some(baud) = link.baud {
-            let value = Baud::of_rate(*baud.get_ref()).ok_or_else(|| {
-                let what = format!("baud = {}", baud.get_ref());
-                origin.refuse(
-                    Some(baud.span()),
-                    what,
-                    "500000, 38400, 19200 or 9600; it is of an LMS, and the rate of others is the model's",
-                )
-            })?;
-            draft.baud = Some(Sourced { value, place: origin.place(Some(baud.span())) });
-        }
+        let LinkLayer {
+            family, expected_type, model, beams, angle, resolution, unit, mode, idle, baud, ..
+        } = link;
+        let layer =
+            ScannerLayer { family, expected_type, model, beams, angle, resolution, unit, mode, idle, baud };
+        draft.scanner.apply(layer, origin)?;
         let LinkLayer { pose, zones, marks, lines, motion, background, early, .. } = link;
         draft.own.push((origin.clone(), Sections { pose, zones, marks, lines, motion, background, early }));
     }
     Ok(())
 }
-
-/// Returns `value * scale` if a variant has this number. `allowed` lists the valid values in the failure.
-fn scaled(
-    origin: &Origin,
-    value: &Spanned<f64>,
-    scale: f64,
-    key: &str,
-    allowed: &str,
-) -> Result<u16, Failure> {
-    let scaled = value.get_ref() * scale;
-    let known = |v: &Variant| if scale == 1.0 { v.angle_deg } else { v.resolution_cdeg };
-    let found = Variant::ALL.iter().map(known).find(|&number| f64::from(number) == scaled);
-    found.ok_or_else(|| origin.refuse(Some(value.span()), format!("{key} = {}", value.get_ref()), allowed))
-}
-
-/// Modes whose values are ranges (Telegram listing, 77h block D).
-pub(crate) const MODES: &str = "0x00 to 0x06, or 0x0F: 0x01 has 3 reflector bits, 0x03 has 2, 0x05 has 1";
 
 /// Keys of section `limits`.
 #[derive(Deserialize)]

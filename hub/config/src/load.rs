@@ -198,7 +198,10 @@ mod tests {
     fn what_a_type_cannot_do_is_refused() {
         let of = |set: &[&str]| Config::load(&sources(set, &[])).map(|config| config.links[0].clone());
         let scanner = of(&["link.front.type=lms211"]).unwrap().scanner;
-        assert_eq!((scanner.expected_type, scanner.settings.view), (Some("lms211"), Some((100, 50))));
+        assert_eq!(
+            (scanner.settings.expected_type, scanner.settings.view),
+            (Some("lms211"), Some((100, 50)))
+        );
         let fine = of(&["link.front.type=lms211", "link.front.resolution=0.25"]).unwrap();
         assert_eq!(fine.scanner.settings.view, Some((100, 25)));
         let wide = refusal(&["link.front.angle=180", "link.front.type=lms211"], &[]);

@@ -9,6 +9,7 @@ use std::path::PathBuf;
 use preprocess::background::{Candidate, Method, Settings as Learning, Start};
 use preprocess::zones::{SECTORS, Sector};
 use preprocess::{lines, marks, motion, zones};
+use scanhub_drivers::features;
 use schema::{BEAMS, Failure, Family, Kind, LINES, Pose, SavedModel, ZONES, regular};
 use serde::Deserialize;
 use toml::Spanned;
@@ -602,10 +603,9 @@ impl EarlyLayer {
         put(&mut early.pieces, self.pieces, |value| whole(origin, "pieces", value, 2..=8))
     }
 
-    /// Returns [`Kind::Configuration`] if it is set for a `family` other than the LMS.
-    /// Their packets are short already.
+    /// Returns [`Kind::Configuration`] if it is set for a `family` that sends packets, which are short already.
     pub(crate) fn check_family(&self, origin: &Origin, family: Family) -> Result<(), Failure> {
-        let foreign = self.pieces.as_ref().filter(|_| family != Family::Lms);
+        let foreign = self.pieces.as_ref().filter(|_| !features(family).has_whole_telegrams);
         foreign.map_or(Ok(()), |pieces| {
             let what = format!("pieces, and an {} sends packets, which are short", family.name());
             Err(origin.refuse(Some(pieces.span()), what, "it warns by each packet anyway"))

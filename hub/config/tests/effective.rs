@@ -181,7 +181,7 @@ fn default_file_sets_the_defaults_and_shows_every_family() {
     let families: Vec<_> = all.links.iter().filter_map(|link| link.family()).collect();
     assert_eq!(families, schema::Family::ALL);
     let scanner = &all.links[1].scanner;
-    assert!(scanner.expected_type.is_some() && scanner.settings.unit_mm.is_some());
+    assert!(scanner.settings.expected_type.is_some() && scanner.settings.unit_mm.is_some());
 }
 
 #[test]

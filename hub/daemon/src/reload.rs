@@ -129,7 +129,7 @@ impl Differences {
             ("family", old.family() != new.family()),
             ("model", was.model != will.model),
             ("beams", was.beams != will.beams),
-            ("type", old.scanner.expected_type != new.scanner.expected_type),
+            ("type", was.expected_type != will.expected_type),
             ("angle", views.is_some_and(|((was, _), (will, _))| was != will)),
             ("resolution", views.is_some_and(|((_, was), (_, will))| was != will)),
             ("unit", was.unit_mm != will.unit_mm),

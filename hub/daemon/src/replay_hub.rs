@@ -97,7 +97,7 @@ struct Sensor {
     recorded: Option<String>,
     /// Its link's.
     link: String,
-    /// What it is, if this version knows it.
+    /// Family of its scanner; `None` if this version does not have it.
     family: Option<Family>,
     /// Where its head turns: the model, and the beams that were recorded, as far as they are known.
     model: Result<Option<Model>, Failure>,

@@ -4,6 +4,7 @@ use std::fmt;
 
 use crate::line::family::{Features, Model, Settings};
 use crate::line::probe::Probe;
+use crate::line::settings::{Refusal, SettingsRequest};
 use crate::line::{
     self, Account, Control, Identity, Introduction, KnownRate, Notice, Output, RawScan, Received, State,
 };
@@ -45,11 +46,16 @@ macro_rules! families {
             vec![$(Box::<$family::Probe>::default()),*]
         }
 
+        /// Returns the settings that `request` has for a scanner of `family`.
+        pub(crate) fn check(family: Family, request: &SettingsRequest) -> Result<Settings, Refusal> {
+            match family { $(Family::$Family => $family::check(request),)* }
+        }
+
         impl Session {
             /// Creates a session with a scanner of `family`, on a port that is open at the rate of `settings`, or else
             /// of the model.
             pub fn begin(family: Family, settings: &Settings, now: Nanos) -> Session {
-                match family { $(Family::$Family => Session::$Family($family::Session::configured(settings, now)),)* }
+                match family { $(Family::$Family => Session::$Family($family::Session::new((*settings).into(), now)),)* }
             }
 
             /// Returns the family.
@@ -103,6 +109,7 @@ pub const ANY: Features = {
         // Enough for every model.
         auto: Model { name: "auto", baud: FIRST_RATE, beams: 3_240 },
         modes: &[],
+        keys: &[],
         can_rest: false,
         speaks_unasked: false,
         has_whole_telegrams: true,

@@ -13,5 +13,5 @@ mod session;
 pub use crate::line::{Tally, TurnCounts};
 pub use model::Model;
 pub use probe::Probe;
-pub(crate) use session::scan_heads;
-pub use session::{FEATURES, Session, Settings, Trouble};
+pub use session::{FEATURES, Session, Trouble};
+pub(crate) use session::{check, scan_heads};

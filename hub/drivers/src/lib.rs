@@ -12,8 +12,11 @@ mod port_session;
 pub mod recognize;
 pub mod rplidar;
 pub mod search;
+mod settings;
 
 pub use families::{ANY, Session, Trouble, features, inquiry, scan_heads};
 pub use line::family::{Features, Model, Settings};
+pub use line::settings::{AUTO, Key, Refusal, SettingsRequest, Value, auto_or};
 pub use lms::inquiry::{Inquiry, Report};
 pub use port_session::PortSession;
+pub use settings::family_of;

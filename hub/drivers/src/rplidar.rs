@@ -17,5 +17,5 @@ pub use crate::line::{Tally, TurnCounts};
 pub use device_info::{Health, Info};
 pub use model::{Mode, Model};
 pub use probe::Probe;
-pub(crate) use session::scan_heads;
-pub use session::{FEATURES, Session, Settings, Trouble};
+pub use session::{FEATURES, Session, Trouble};
+pub(crate) use session::{check, scan_heads};

@@ -4,7 +4,7 @@
 
 use scanhub_drivers::line::grid::{Grid, Point};
 use scanhub_drivers::line::{Event, Output, Session};
-use scanhub_drivers::{ld, rplidar};
+use scanhub_drivers::{Settings, ld, rplidar};
 use schema::{MILLIS, Nanos, line_time};
 use sim::Arrival;
 use sim::device::Device;
@@ -104,7 +104,7 @@ fn rows(name: &str, a_turn: usize, turns: &[Vec<Point>], percents: &[usize]) {
 fn main() {
     println!("| model | beams | of points collapsed | of beams not measured |\n|---|---|---|---|");
     for model in [ld::Model::Ld19, ld::Model::Stl27l, ld::Model::Ld14p] {
-        let session = ld::Session::new(ld::Settings { model: Some(model), ..ld::Settings::default() }, 0);
+        let session = ld::Session::new(Settings { model: Some(model.name()), ..Settings::default() }, 0);
         let head = Head::new(HeadSettings::of(model), Packets::Room(Box::new(room())));
         let a_turn = model.points_per_second() / model.turns_per_second();
         let percents = [67, 80, 90, 95, 99, 100, 101, 105, 110, 120, 133];
@@ -112,10 +112,10 @@ fn main() {
     }
     for simulated in sim::rplidar::Model::ALL {
         for mode in simulated.modes() {
-            let settings = rplidar::Settings {
-                model: rplidar::Model::named(simulated.name()),
-                mode: rplidar::Mode::named(mode.name),
-                ..rplidar::Settings::default()
+            let settings = Settings {
+                model: Some(simulated.name()),
+                mode: rplidar::Mode::named(mode.name).map(rplidar::Mode::name),
+                ..Settings::default()
             };
             let unit = Unit::new(UnitSettings::of(simulated), room());
             let (turns, beams) = turns(rplidar::Session::new(settings, 0), unit, 30);

@@ -28,11 +28,11 @@ const FAMILIES: [(&str, &[&str]); 2] = [
     ("rplidar", &["slamtec", "a1m8", "a2m8", "a2m12"]),
 ];
 
-/// Sources of the hub, its tools and the program, which name no family, not even the LMS. Recordings and clients name the
-/// LMS, because its telegrams are a format of files and topics.
-const HUB: [&str; 5] = ["hub/daemon/", "hub/tools/", "hub/cli", "hub/demo", "hub/main.rs"];
+/// Sources of the hub, its configuration, its tools and the program, beside those right in `hub/`. They name no family, not
+/// even the LMS. Recordings and clients name the LMS, because its telegrams are a format of files and topics.
+const HUB: [&str; 5] = ["hub/config/", "hub/daemon/", "hub/tools/", "hub/cli/", "hub/demo/"];
 
-/// Sources among those of [`HUB`] that name the LMS; each says why.
+/// Sources of the hub that name the LMS, each with the reason.
 const MAY_NAME_LMS: [&str; 5] = [
     // Changes settings in the EEPROM, which only an LMS has.
     "hub/cli/configure.rs",
@@ -53,7 +53,10 @@ fn hub_names_no_lms(tree: &Tree) -> Vec<String> {
 
 /// Sources of the hub that name the LMS.
 fn hub_sources_with_lms(tree: &Tree) -> impl Iterator<Item = &str> {
-    let is_hub = |path: &str| HUB.iter().any(|hub| path.starts_with(hub)) && !path.contains("tests");
+    let is_program = |path: &str| path.strip_prefix("hub/").is_some_and(|file| !file.contains('/'));
+    let is_hub = move |path: &str| {
+        !path.contains("tests") && (is_program(path) || HUB.iter().any(|hub| path.starts_with(hub)))
+    };
     let names_it = |line: &str| {
         let line = line.to_lowercase();
         line.split(|c: char| !c.is_alphanumeric()).any(|word| word.starts_with("lms"))
@@ -99,6 +102,7 @@ fn the_hub_names_no_lms() {
             tree.with("hub/daemon/src/drive.rs", "//! Drives.\nif family == Family::Lms {\n"),
             tree.with("hub/tools/src/driver.rs", "//! Drives.\nuse scanhub_drivers::lms::variant::Baud;\n"),
             tree.with("hub/tools/src/probe.rs", "//! Probes.\nif kind == \"LMS291\" {\n"),
+            tree.with("hub/config/src/planted.rs", "//! Settings.\nif family != Family::Lms {\n"),
             tree.with("hub/cli/planted.rs", "//! Options.\nlms_type: String,\n"),
         ]
     });

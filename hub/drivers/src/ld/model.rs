@@ -1,5 +1,7 @@
 //! The models of the family, as far as they differ. Where the figures come from: the makers' data sheets.
 
+use crate::line::family::Settings;
+
 /// A scanner of the family.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Model {
@@ -33,6 +35,11 @@ impl Model {
     /// The model of this name.
     pub fn named(name: &str) -> Option<Model> {
         Model::ALL.into_iter().find(|model| model.name() == name)
+    }
+
+    /// Returns the model of `settings`.
+    pub(crate) fn of(settings: &Settings) -> Option<Model> {
+        settings.model.and_then(Model::named)
     }
 
     /// The rate at which it speaks, in bits per second.

@@ -12,32 +12,12 @@ use crate::ld::packet::{LEN, POINTS, Packet};
 use crate::ld::point_count::{Counted, PointCount};
 use crate::ld::restarts::Restarts;
 use crate::ld::sequence::{Place, Sequence};
-use crate::line::family::{self, Features, table};
+use crate::line::family::{self, Features, Settings, table};
+use crate::line::settings::{Refusal, SettingsRequest};
 use crate::line::{
     self, Account, Closed, Control, Event, Flow, Output, Pace, RawScan, Reads, Received, SensorClock, State,
     StreamCounters, Tally, TurnCounts, Turns, Watchdog,
 };
-
-/// Settings of a session.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub struct Settings {
-    /// The model. `None`: the session finds it out.
-    pub model: Option<Model>,
-    /// Number of beams of the grid. `None`: the model's number, at most [`max_beams`](Self::max_beams).
-    pub beams: Option<usize>,
-    /// Maximum number of beams. `None`: the maximum of a grid.
-    pub max_beams: Option<usize>,
-    /// Whether the port has one fixed rate and bytes do not arrive at the pace of a line, as with a serial server on
-    /// the network or a recording.
-    pub fixed_rate: bool,
-}
-
-impl Settings {
-    /// Returns the rate at which the port is opened, in bits per second.
-    pub fn baud(&self) -> u32 {
-        self.model.unwrap_or(Model::Ld19).baud()
-    }
-}
 
 /// The session with one scanner.
 #[derive(Clone, Debug)]
@@ -120,7 +100,7 @@ impl Session {
             other_beams: None,
             change: None,
             phase: Phase::Listening { shown: State::Probing, next_at: now + LISTEN },
-            baud: settings.baud(),
+            baud: Model::of(&settings).map_or(FEATURES.auto.baud, Model::baud),
             change_baud: false,
             beams: None,
             is_learned: false,
@@ -140,21 +120,14 @@ impl Session {
         self.measured = Some((model, beams));
     }
 
-    /// Creates a session from the settings that all families share.
-    pub(crate) fn configured(settings: &family::Settings, now: Nanos) -> Session {
-        let &family::Settings { model, beams, max_beams, fixed_rate, .. } = settings;
-        let model = model.and_then(Model::named);
-        Session::new(Settings { model, beams, max_beams, fixed_rate }, now)
-    }
-
     /// Returns the model, once it is known. Of models that cannot be distinguished, it is one.
     pub fn model(&self) -> Option<Model> {
-        self.settings.model.or(self.measured.map(|(model, _)| model))
+        Model::of(&self.settings).or(self.measured.map(|(model, _)| model))
     }
 
     /// Returns the number of beams for scans: that of the settings, of the model in the settings, or the measured one.
     fn known_beams(&self) -> Option<usize> {
-        let of_model = || self.settings.model.map(Model::beams);
+        let of_model = || Model::of(&self.settings).map(Model::beams);
         let measured = || self.measured.map(|(_, beams)| beams);
         let beams = self.settings.beams.or_else(of_model).or_else(measured)?;
         Some(beams.min(self.settings.max_beams.unwrap_or(usize::MAX)))
@@ -189,7 +162,7 @@ impl Session {
     /// Returns the model of the scanner if it is not the one of the settings. Models with the same number of points per
     /// second cannot be distinguished.
     fn heard_other_model(&self) -> Option<Model> {
-        let wanted = self.settings.model?;
+        let wanted = Model::of(&self.settings)?;
         self.heard_model().filter(|heard| heard.points_per_second() != wanted.points_per_second())
     }
 
@@ -574,6 +547,7 @@ pub const FEATURES: Features = Features {
     // Enough for all models but the STL27L.
     auto: family::Model { name: "auto", baud: Model::Ld19.baud(), beams: 720 },
     modes: &[],
+    keys: &[],
     can_rest: false,
     speaks_unasked: true,
     has_whole_telegrams: false,
@@ -582,8 +556,13 @@ pub const FEATURES: Features = Features {
     max_telegram: MOST * LEN,
 };
 
+/// Returns the settings that `request` has for an LDROBOT.
+pub(crate) fn check(request: &SettingsRequest) -> Result<Settings, Refusal> {
+    request.check_models(Family::Ld, &FEATURES)
+}
+
 /// Returns the head of a scan on a grid of as many beams as there is space for.
-pub(crate) fn scan_heads(settings: &family::Settings) -> Vec<ScanHead> {
+pub(crate) fn scan_heads(settings: &Settings) -> Vec<ScanHead> {
     let beams = settings.beams.or(settings.max_beams).unwrap_or(FEATURES.auto.beams);
     vec![ScanHead::turning(Family::Ld, beams)]
 }

@@ -1,5 +1,7 @@
 //! What a configuration can name: the models and settings of a family.
 
+use crate::line::settings::Key;
+
 /// Models and settings of a family.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Features {
@@ -9,6 +11,8 @@ pub struct Features {
     pub auto: Model,
     /// Names of the scan modes. Empty if there is no choice.
     pub modes: &'static [&'static str],
+    /// Keys of settings that only this family has.
+    pub keys: &'static [Key],
     /// Whether the motor can be stopped.
     pub can_rest: bool,
     /// Whether the scanner streams as soon as it has power, without a request.
@@ -50,6 +54,8 @@ pub struct Settings {
     pub view: Option<(u16, u16)>,
     /// Rate to stream at, in bits per second. `None`: that of the model or family.
     pub baud: Option<u32>,
+    /// Name of the expected type. It is compared, never written.
+    pub expected_type: Option<&'static str>,
     /// Expected unit of ranges in mm. It is compared, never written.
     pub unit_mm: Option<u8>,
     /// Number of the mode that defines the meaning of values, for a recording that does not contain it.

@@ -1,6 +1,7 @@
 //! The session with an LMS: bytes and the time go in; telegrams, bytes to send and the next deadline come out.
 
 use crate::line::family;
+use crate::line::settings::Key;
 use crate::line::{
     self, Account, Control, Event, KnownRate, Output, RawScan, Received, State, Whole, suspect,
 };
@@ -97,11 +98,6 @@ impl Session {
     /// silence, at most 2. It outlives restarts of the scanner.
     pub fn silent_switches(&self) -> u8 {
         self.dialogue.rate().silent_switches()
-    }
-
-    /// Creates a session from the settings that all families share.
-    pub(crate) fn configured(settings: &family::Settings, now: Nanos) -> Session {
-        Session::new(typed(settings), now)
     }
 
     /// Returns the rate of the line.
@@ -517,6 +513,7 @@ pub const FEATURES: family::Features = family::Features {
     models: &[],
     auto: family::Model { name: "auto", baud: 500_000, beams: MAX_BEAMS },
     modes: &[],
+    keys: &[Key::Type, Key::Angle, Key::Resolution, Key::Unit, Key::ModeNumber, Key::Baud],
     can_rest: false,
     speaks_unasked: false,
     has_whole_telegrams: true,
@@ -528,7 +525,7 @@ pub const FEATURES: family::Features = family::Features {
 /// Returns the heads of scans with the view of `settings`. The measuring mode is unknown, and so is the unit if none is
 /// set.
 pub(crate) fn scan_heads(settings: &family::Settings) -> Vec<ScanHead> {
-    let variant = typed(settings).variant;
+    let variant = Settings::from(*settings).variant;
     let units = settings.unit_mm.map_or(vec![Unit::Mm.mm(), Unit::Cm.mm()], |mm| vec![mm]);
     let step_mdeg = u32::from(variant.resolution_cdeg) * 10;
     let (beams, first) = (variant.beams(), variant.first_angle_mdeg());
@@ -536,16 +533,17 @@ pub(crate) fn scan_heads(settings: &family::Settings) -> Vec<ScanHead> {
     units.into_iter().map(head).collect()
 }
 
-/// Converts the settings that all families share.
-fn typed(settings: &family::Settings) -> Settings {
-    let &family::Settings { view, baud, mode_number, listen_only, fixed_rate, .. } = settings;
-    Settings {
-        variant: view.and_then(|(angle, step)| Variant::new(angle, step)).unwrap_or(Variant::HALF),
-        baud: baud.and_then(Baud::of_rate).unwrap_or(Baud::B500000),
-        listen_only,
-        fixed_rate,
-        keep_baud: baud.is_some(),
-        mode: mode_number.map(Mode),
+impl From<family::Settings> for Settings {
+    fn from(settings: family::Settings) -> Settings {
+        let family::Settings { view, baud, mode_number, listen_only, fixed_rate, .. } = settings;
+        Settings {
+            variant: view.and_then(|(angle, step)| Variant::new(angle, step)).unwrap_or(Variant::HALF),
+            baud: baud.and_then(Baud::of_rate).unwrap_or(Baud::B500000),
+            listen_only,
+            fixed_rate,
+            keep_baud: baud.is_some(),
+            mode: mode_number.map(Mode),
+        }
     }
 }
 

@@ -1,11 +1,11 @@
 //! The handshake with a scanner: the queries in their order, what the scanner has reported, and the scan mode that
 //! follows from it. [`Handshake`] decides which step comes next; the session carries it out, and waits for responses.
 
+use crate::line::family::Settings;
 use crate::rplidar::device_info::{Health, Info};
 use crate::rplidar::model::{Mode, Model, Motor};
 use crate::rplidar::packet::Kind;
 use crate::rplidar::request::{Answer, Request, key};
-use crate::rplidar::session::Settings;
 
 /// A request whose response the session waits for, in the order of the handshake. Those about a mode contain its place
 /// in the list of modes.
@@ -125,7 +125,7 @@ impl Handshake {
             was_reset: false,
             has_board: false,
             modes: ScanModes::default(),
-            mode: settings.mode.filter(|_| settings.listen_only),
+            mode: Mode::of(&settings).filter(|_| settings.listen_only),
             unavailable_mode: None,
             recorded: (0, 0),
         }
@@ -143,7 +143,7 @@ impl Handshake {
 
     /// Returns the model, once it is known.
     pub(crate) fn model(&self) -> Option<Model> {
-        self.info.and_then(|info| info.model()).or(self.settings.model)
+        self.info.and_then(|info| info.model()).or(Model::of(&self.settings))
     }
 
     /// Returns the scan modes that the scanner reported.
@@ -164,7 +164,7 @@ impl Handshake {
     /// Returns the kind of packets that look like both express and dense ones if no response has named it: the fastest
     /// kind of the model.
     pub(crate) fn alike(&self) -> Option<Kind> {
-        match (self.settings.mode, self.model()) {
+        match (Mode::of(&self.settings), self.model()) {
             (Some(Mode::DenseBoost), _) => Some(Kind::Dense),
             (Some(_), _) => Some(Kind::Express),
             (None, Some(Model::A1 | Model::A2m8 | Model::A2m12 | Model::A3)) => Some(Kind::Express),
@@ -306,8 +306,9 @@ impl Handshake {
     /// Returns the mode of the settings, or the fastest one if the scanner or the line cannot use it.
     fn choose(&mut self, baud: u32) -> ScanMode {
         let baud = (!self.settings.fixed_rate).then_some(baud);
-        let wanted = self.settings.mode.and_then(|mode| self.modes.wanted(mode, baud));
-        self.unavailable_mode = self.settings.mode.filter(|_| wanted.is_none());
+        let requested = Mode::of(&self.settings);
+        let wanted = requested.and_then(|mode| self.modes.wanted(mode, baud));
+        self.unavailable_mode = requested.filter(|_| wanted.is_none());
         let fastest = || self.modes.fastest(baud).or_else(|| self.modes.fastest(None));
         wanted.or_else(fastest).unwrap_or_default()
     }

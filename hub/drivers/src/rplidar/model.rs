@@ -1,6 +1,8 @@
 //! The models of the family and their modes, as far as they differ. Where the figures come from: the maker's data sheets; of
 //! an A1, measurements of a real one.
 
+use crate::line::family::Settings;
+
 /// A scanner of the family.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Model {
@@ -55,6 +57,11 @@ impl Model {
     /// The model of this name.
     pub fn named(name: &str) -> Option<Model> {
         Model::ALL.into_iter().find(|model| model.name() == name)
+    }
+
+    /// Returns the model of `settings`.
+    pub(crate) fn of(settings: &Settings) -> Option<Model> {
+        settings.model.and_then(Model::named)
     }
 
     /// The model that says `id` of itself: its series in the upper half.
@@ -160,6 +167,11 @@ impl Mode {
     /// The mode of this name.
     pub fn named(name: &str) -> Option<Mode> {
         Mode::said(name.as_bytes())
+    }
+
+    /// Returns the mode of `settings`.
+    pub(crate) fn of(settings: &Settings) -> Option<Mode> {
+        settings.mode.and_then(Mode::named)
     }
 
     /// The mode that a scanner calls `name`: in capitals, with spaces, ended by a zero, as it likes.

@@ -5,7 +5,9 @@
 
 use schema::{MILLIS, Nanos};
 
-use crate::rplidar::session::{DRAIN, Settings, Trouble};
+use crate::line::family::Settings;
+use crate::rplidar::model::Model;
+use crate::rplidar::session::{DRAIN, FEATURES, Trouble};
 
 /// The rate of the line, and the state of the search for it.
 #[derive(Clone, Copy, Debug)]
@@ -25,7 +27,7 @@ impl RateSearch {
     /// Creates a search on a port that is open at the rate of `settings`.
     pub(crate) fn new(settings: &Settings) -> RateSearch {
         RateSearch {
-            baud: settings.baud(),
+            baud: Model::of(settings).map_or(FEATURES.auto.baud, Model::baud),
             is_fixed: settings.fixed_rate || settings.listen_only,
             is_changed: false,
             quiet_since: None,

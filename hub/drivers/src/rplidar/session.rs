@@ -8,7 +8,8 @@ use core::fmt;
 
 use schema::{Contents, Family, MILLIS, Nanos, ScanHead, line_time};
 
-use crate::line::family::{self, Features, table};
+use crate::line::family::{self, Features, Settings, table};
+use crate::line::settings::{Key, Refusal, SettingsRequest};
 use crate::line::{
     self, Account, Closed, Condition, Control, Event, Introduction, Output, RawScan, Reads, Received, State,
     StreamCounters, Tally, TurnCounts, Watchdog,
@@ -21,36 +22,6 @@ use crate::rplidar::packet::Kind;
 use crate::rplidar::rate_search::RateSearch;
 use crate::rplidar::request::{Answer, Head, Request, RequestQueue};
 use crate::rplidar::stream::{Line, MAX_SAMPLE_LEN, Stream};
-
-/// Settings of a session.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub struct Settings {
-    /// The model. `None`: the session requests it, at the rates of all models.
-    pub model: Option<Model>,
-    /// The scan mode. `None`: the fastest one that the line can carry.
-    pub mode: Option<Mode>,
-    /// Number of beams of the grid. `None`: the model's number, at most [`max_beams`](Self::max_beams).
-    pub beams: Option<usize>,
-    /// Maximum number of beams. `None`: the maximum of a grid.
-    pub max_beams: Option<usize>,
-    /// Whether the port has one fixed rate and bytes do not arrive at the pace of a line, as with a serial server on
-    /// the network or a recording.
-    pub fixed_rate: bool,
-    /// Whether nothing can be sent, because the bytes are from a recording.
-    pub listen_only: bool,
-    /// Whether the motor stops while there are no subscribers.
-    pub stop_when_idle: bool,
-    /// Whether a scanner whose model is not configured has as many beams as it reports points per revolution.
-    /// Otherwise, it has those of its model.
-    pub reported_beams: bool,
-}
-
-impl Settings {
-    /// Returns the rate at which the port is opened, in bits per second.
-    pub fn baud(&self) -> u32 {
-        self.model.unwrap_or(Model::A1).baud()
-    }
-}
 
 /// The session with one scanner.
 #[derive(Clone, Debug)]
@@ -113,33 +84,6 @@ impl Session {
         };
         session.begin(State::Probing);
         session
-    }
-
-    /// Creates a session from the settings that all families share.
-    pub(crate) fn configured(settings: &family::Settings, now: Nanos) -> Session {
-        let &family::Settings {
-            model,
-            mode,
-            beams,
-            max_beams,
-            fixed_rate,
-            listen_only,
-            stop_when_idle,
-            is_found,
-            ..
-        } = settings;
-        let (model, mode) = (model.and_then(Model::named), mode.and_then(Mode::named));
-        let settings = Settings {
-            model,
-            mode,
-            beams,
-            max_beams,
-            fixed_rate,
-            listen_only,
-            stop_when_idle,
-            reported_beams: is_found,
-        };
-        Session::new(settings, now)
     }
 
     /// Returns the model, once it is known.
@@ -660,7 +604,7 @@ impl line::Session for Session {
 
     fn other_model(&self) -> Option<family::Model> {
         let reported = self.info().and_then(|info| info.model())?;
-        self.settings.model.filter(|wanted| *wanted != reported).map(|_| described(reported))
+        Model::of(&self.settings).filter(|wanted| *wanted != reported).map(|_| described(reported))
     }
 
     fn missing_setting(&self) -> Option<&'static str> {
@@ -715,6 +659,7 @@ pub const FEATURES: Features = Features {
     // Enough for all models but the S2 and the S3.
     auto: family::Model { name: "auto", baud: Model::A1.baud(), beams: 2_048 },
     modes: &MODES,
+    keys: &[Key::ModeName, Key::Idle],
     can_rest: true,
     speaks_unasked: false,
     has_whole_telegrams: false,
@@ -723,8 +668,13 @@ pub const FEATURES: Features = Features {
     max_telegram: MAX_SAMPLE_LEN,
 };
 
+/// Returns the settings that `request` has for an RPLIDAR.
+pub(crate) fn check(request: &SettingsRequest) -> Result<Settings, Refusal> {
+    request.check_models(Family::Rplidar, &FEATURES)
+}
+
 /// Returns the head of a scan on a grid of as many beams as there is space for.
-pub(crate) fn scan_heads(settings: &family::Settings) -> Vec<ScanHead> {
+pub(crate) fn scan_heads(settings: &Settings) -> Vec<ScanHead> {
     let beams = settings.beams.or(settings.max_beams).unwrap_or(FEATURES.auto.beams);
     vec![ScanHead::turning(Family::Rplidar, beams)]
 }

@@ -1,15 +1,15 @@
 //! Packets of a stream: gives them stamps, and assembles their points into revolutions. The points of a packet with
 //! several points are known once the next packet has arrived, and only if nothing is missing between the two.
 
+use crate::line::family::Settings;
 use crate::line::{self, Arrivals, Closed, Flow, Pace, RawScan, Reads, SensorClock, TurnCounts, Turns};
 use schema::{Family, MILLIS, Nanos, line_time};
 
 use crate::rplidar::framer::{Framer, Span};
 use crate::rplidar::handshake::{Handshake, ScanModes};
-use crate::rplidar::model::Model;
+use crate::rplidar::model::{Mode, Model};
 use crate::rplidar::packet::Kind;
 use crate::rplidar::sequence::{Came, Place, Sequence, Step};
-use crate::rplidar::session::Settings;
 
 /// The line that packets arrive on.
 #[derive(Clone, Copy, Debug)]
@@ -220,7 +220,7 @@ impl Stream {
     /// Returns the number of beams for the points per second that the scanner has reported, if the beams follow it:
     /// that of the `model`, if it is close. An A1 with an old firmware measures half as many points as the others.
     fn reported_beams(&self, model: Model, kind: Kind, handshake: &Handshake) -> Option<usize> {
-        let follows = self.settings.reported_beams && self.settings.model.is_none();
+        let follows = self.settings.is_found && self.settings.model.is_none();
         let point_us = self.point_time.ns.filter(|_| follows)? / 1e3;
         let reported_us = handshake.modes().nearest_us(kind, point_us as f32)?;
         let beams = model.beams_of(1e6 / reported_us);
@@ -290,7 +290,7 @@ impl PointTime {
     /// longer and longer durations. Returns the relative change of a time that was known.
     fn measure(&mut self, kind: Kind, span: Span, at: Nanos, modes: &ScanModes, settings: Settings) -> f64 {
         let Some(measurement) = &mut self.measurement else {
-            self.ns = modes.sample_us(kind, settings.mode).map(|us| f64::from(us) * 1e3);
+            self.ns = modes.sample_us(kind, Mode::of(&settings)).map(|us| f64::from(us) * 1e3);
             self.measurement = Some(Measurement::new(at, FIRST_MEASUREMENT));
             return 0.0;
         };

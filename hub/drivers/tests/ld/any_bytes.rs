@@ -1,7 +1,8 @@
 //! Whatever comes down the line: every byte is counted once, and nothing panics.
 
+use scanhub_drivers::Settings;
+use scanhub_drivers::ld::Session;
 use scanhub_drivers::ld::packet::{Contents, HEADER, LEN, POINTS};
-use scanhub_drivers::ld::{Session, Settings};
 use scanhub_drivers::line::{Event, Output, Protocol as _, Session as _};
 use schema::MILLIS;
 

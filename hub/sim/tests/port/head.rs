@@ -4,10 +4,11 @@ use std::time::{Duration, Instant};
 
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use scanhub_drivers::ld::packet::LEN;
-use scanhub_drivers::ld::{Model, Session, Settings};
+use scanhub_drivers::ld::{Model, Session};
 use scanhub_drivers::line::{Event, Output, Protocol as _, Session as _, State};
 use scanhub_drivers::lms;
-use schema::{Failure, Nanos};
+use scanhub_drivers::{Settings, features};
+use schema::{Failure, Family, Nanos};
 use sim::fault::Faults;
 use sim::options::{Scanner, SimulateOptions};
 use sim::pty::now_ns;
@@ -62,7 +63,7 @@ fn every_model_is_heard_bit_for_bit_as_the_truth_says() {
             ..SimulateOptions::default()
         });
         let settings = Settings::default();
-        let host = Host::open(&port, settings.baud());
+        let host = Host::open(&port, features(Family::Ld).auto.baud);
         let mut session = Session::new(settings, now_ns());
         let packets = hear(&mut session, &host, 20);
         assert_eq!((session.state(), session.model()), (State::Streaming, Some(model)));

@@ -106,7 +106,7 @@ fn settings(port: &str, report: &Report, link: Option<&Link>) -> Vec<Finding> {
     let mut wrong = Vec::new();
     let family = report.kind().and_then(Family::of_type);
     let scanner = link.map(|link| &link.scanner);
-    if let Some((expected, is)) = scanner.and_then(|scanner| scanner.expected_type).zip(family)
+    if let Some((expected, is)) = scanner.and_then(|scanner| scanner.settings.expected_type).zip(family)
         && expected != is.name()
     {
         wrong.push(Finding::warning(
@@ -450,8 +450,11 @@ mod tests {
             port: port::Source::Tty("/dev/ttyUSB0".into()),
             scanner: config::Scanner {
                 family: Some(schema::Family::Lms),
-                expected_type: Some("lms291"),
-                settings: Settings { unit_mm: Some(10), ..Settings::default() },
+                settings: Settings {
+                    expected_type: Some("lms291"),
+                    unit_mm: Some(10),
+                    ..Settings::default()
+                },
             },
             processing: Default::default(),
         };

@@ -127,7 +127,7 @@ mod tests {
                 link("tcp:[::1]:4001", &[("family", "lms"), ("type", kind.name()), ("baud", "38400")]);
             let link = loaded(&suggested);
             assert_eq!(
-                (link.scanner.expected_type, link.rate(), link.port.name()),
+                (link.scanner.settings.expected_type, link.rate(), link.port.name()),
                 (Some(kind.name()), 38_400, suggested.port)
             );
         }

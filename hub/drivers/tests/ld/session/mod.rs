@@ -3,8 +3,9 @@
 mod head;
 
 use head::{Damage, Head};
+use scanhub_drivers::Settings;
 use scanhub_drivers::ld::packet::LEN;
-use scanhub_drivers::ld::{Model, Session, Settings, Trouble};
+use scanhub_drivers::ld::{Model, Session, Trouble};
 use scanhub_drivers::line::grid::Grid;
 use scanhub_drivers::line::{Control, Event, Output, Protocol as _, Session as _, State};
 use schema::{MILLIS, Nanos};
@@ -150,10 +151,8 @@ impl Bench {
     }
 }
 
-const AUTO: Settings = Settings { model: None, beams: None, max_beams: None, fixed_rate: false };
-
 fn of(model: Model) -> Settings {
-    Settings { model: Some(model), ..AUTO }
+    Settings { model: Some(model.name()), ..Settings::default() }
 }
 
 fn points(model: Model) -> f64 {
@@ -167,7 +166,7 @@ fn scanner_with_uneven_speed_has_the_beams_of_its_model() {
     let model = Model::Ld19;
     let mut head = Head::new(model, points(model), 1, Damage::default());
     head.jitter = 0.05;
-    let mut bench = Bench::new(AUTO, head);
+    let mut bench = Bench::new(Settings::default(), head);
     bench.run(9 * SECOND);
     assert_eq!((bench.log.turns.len(), bench.session.trouble()), (0, None), "the head rotates");
     bench.run(15 * SECOND);
@@ -208,7 +207,8 @@ fn a_model_that_is_not_told_is_found_by_its_rate_and_its_points() {
     for (model, found) in
         [(Model::Ld06, Model::Ld19), (Model::Stl27l, Model::Stl27l), (Model::Ld14p, Model::Ld14p)]
     {
-        let mut bench = Bench::new(AUTO, Head::new(model, points(model), 1, Damage::default()));
+        let mut bench =
+            Bench::new(Settings::default(), Head::new(model, points(model), 1, Damage::default()));
         bench.run(4 * SECOND);
         assert_eq!(bench.session.model(), Some(found));
         assert_eq!(bench.session.state(), State::Streaming, "{model:?}: {:?}", bench.log.bauds);
@@ -333,7 +333,7 @@ fn a_second_without_a_packet_begins_again() {
 
 #[test]
 fn where_nobody_speaks_it_says_so_in_steps() {
-    let mut session = Session::new(AUTO, 0);
+    let mut session = Session::new(Settings::default(), 0);
     let (mut now, mut troubles, mut bauds) = (0, Vec::new(), Vec::new());
     while now < 20 * SECOND {
         match session.poll_output() {

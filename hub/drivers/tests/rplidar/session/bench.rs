@@ -1,9 +1,10 @@
 //! A session and a head with the line between them, in virtual time, and what is to hold whatever happens.
 
+use scanhub_drivers::Settings;
 use scanhub_drivers::line;
 use scanhub_drivers::line::{Event, Output, Protocol as _, Session as _};
+use scanhub_drivers::rplidar::Session;
 use scanhub_drivers::rplidar::packet::Kind;
-use scanhub_drivers::rplidar::{Session, Settings};
 use schema::{MILLIS, Nanos};
 
 use crate::session::encode::Sample;

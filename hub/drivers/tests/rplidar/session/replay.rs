@@ -1,7 +1,8 @@
 //! A session of a recording, at whose other end nobody is: it hears what another session handed out.
 
+use scanhub_drivers::Settings;
 use scanhub_drivers::line::{Event, Output, Protocol as _, RawScan, Session as _};
-use scanhub_drivers::rplidar::{Mode, Model, Session, Settings, Trouble};
+use scanhub_drivers::rplidar::{Mode, Model, Session, Trouble};
 use schema::{MILLIS, Nanos};
 
 use crate::session::bench::{Bench, Kept, SECOND};
@@ -59,7 +60,7 @@ const MODES: [(Model, Mode); 7] = [
 ];
 
 fn recorded(model: Model, mode: Mode, seconds: u64) -> Bench {
-    let mut live = Bench::new(Settings { mode: Some(mode), ..of(model) }, Head::new(model, 1));
+    let mut live = Bench::new(Settings { mode: Some(mode.name()), ..of(model) }, Head::new(model, 1));
     live.run(seconds * SECOND);
     live
 }
@@ -69,7 +70,7 @@ fn recorded(model: Model, mode: Mode, seconds: u64) -> Bench {
 fn a_recording_from_the_beginning_has_the_turns_that_were_handed_out() {
     for (model, mode) in MODES {
         let live = recorded(model, mode, 6);
-        for settings in [Settings::default(), Settings { mode: Some(mode), ..of(model) }] {
+        for settings in [Settings::default(), Settings { mode: Some(mode.name()), ..of(model) }] {
             let (session, turns) = replay(settings, &live.log.heard);
             let per_second = session.points_per_second().expect("told");
             assert_eq!(Some(per_second), live.session.points_per_second(), "{model:?} {mode:?}");
@@ -99,7 +100,8 @@ fn one_that_begins_in_the_midst_has_turns_soon() {
     for (model, mode) in MODES {
         let live = recorded(model, mode, 8);
         let from = live.log.heard.iter().position(|kept| kept.first > 3 * SECOND).expect("some");
-        let (session, turns) = replay(Settings { mode: Some(mode), ..of(model) }, &live.log.heard[from..]);
+        let (session, turns) =
+            replay(Settings { mode: Some(mode.name()), ..of(model) }, &live.log.heard[from..]);
         let first = turns.first().expect("some").first;
         assert!(first < 3 * SECOND + SECOND * 6 / 10, "{model:?} {mode:?}: {first}");
         let is =
@@ -122,7 +124,7 @@ fn off(live: &Bench, turns: &[Seen]) -> Vec<Nanos> {
 #[test]
 fn one_that_begins_in_the_midst_of_a_line_that_damages_bytes_is_dated_right() {
     for (model, mode) in MODES {
-        let settings = Settings { mode: Some(mode), ..of(model) };
+        let settings = Settings { mode: Some(mode.name()), ..of(model) };
         let mut all = Vec::new();
         for seed in 0..20 {
             let mut live = Bench::new(settings, Head::new(model, seed));
@@ -145,7 +147,7 @@ fn one_that_begins_in_the_midst_of_a_line_that_damages_bytes_is_dated_right() {
 #[test]
 fn packets_that_waited_do_not_change_the_time_per_point() {
     for (model, mode) in MODES {
-        let settings = Settings { mode: Some(mode), ..of(model) };
+        let settings = Settings { mode: Some(mode.name()), ..of(model) };
         let live = recorded(model, mode, 12);
         let from = live.log.heard.iter().position(|kept| kept.first > 2 * SECOND).expect("some");
         let steady = &live.log.heard[from..];

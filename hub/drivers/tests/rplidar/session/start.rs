@@ -1,15 +1,16 @@
 //! How a session finds its scanner and gets it to measure, from whatever it was doing.
 
+use scanhub_drivers::Settings;
 use scanhub_drivers::line::{Control, Event, Output, Protocol as _, Session as _, State};
 use scanhub_drivers::rplidar::packet::Kind;
-use scanhub_drivers::rplidar::{Health, Mode, Model, Session, Settings, Trouble};
+use scanhub_drivers::rplidar::{Health, Mode, Model, Session, Trouble};
 use schema::MILLIS;
 
 use crate::session::bench::{Bench, SECOND};
 use crate::session::head::Head;
 
 pub(crate) fn of(model: Model) -> Settings {
-    Settings { model: Some(model), ..Settings::default() }
+    Settings { model: Some(model.name()), ..Settings::default() }
 }
 
 fn is_streaming(bench: &Bench) -> bool {
@@ -188,7 +189,7 @@ fn what_it_is_is_told_also_where_something_else_was_expected() {
         (kind, bench.session.other_model().map(|model| model.name))
     };
     assert_eq!(told(Settings::default(), Model::A1), (" boost 1.29".to_owned(), None));
-    let standard = Settings { mode: Some(Mode::Standard), ..of(Model::A2m8) };
+    let standard = Settings { mode: Some(Mode::Standard.name()), ..of(Model::A2m8) };
     assert_eq!(told(standard, Model::A2m8), (" standard 1.29".to_owned(), None));
     assert_eq!(told(of(Model::A1), Model::A2m8).1, Some("a2m8"));
     // As long as a status has room for it.
@@ -247,8 +248,8 @@ fn the_motor_rests_while_nobody_follows_if_it_shall() {
 
 #[test]
 fn the_fastest_mode_or_the_wanted_one() {
-    let run = |model, mode| {
-        let mut bench = Bench::new(Settings { mode, ..of(model) }, Head::new(model, 1));
+    let run = |model, mode: Option<Mode>| {
+        let mut bench = Bench::new(Settings { mode: mode.map(Mode::name), ..of(model) }, Head::new(model, 1));
         bench.until(3 * SECOND, is_streaming);
         let us = 1e6 / bench.session.points_per_second().expect("known");
         (bench.head.kind().expect("measuring"), us.round(), bench.session.trouble(), bench.session.beams())
@@ -266,7 +267,7 @@ fn old_firmware_has_two_modes() {
     for (mode, kind) in [(None, Kind::Express), (Some(Mode::Standard), Kind::Standard)] {
         let mut head = Head::new(Model::A1, 1);
         head.is_old = true;
-        let mut bench = Bench::new(Settings { mode, ..of(Model::A1) }, head);
+        let mut bench = Bench::new(Settings { mode: mode.map(Mode::name), ..of(Model::A1) }, head);
         bench.until(3 * SECOND, is_streaming);
         assert_eq!(bench.head.kind(), Some(kind));
     }
@@ -274,7 +275,7 @@ fn old_firmware_has_two_modes() {
 
 #[test]
 fn a_scanner_that_a_search_has_found_has_the_beams_that_it_reports() {
-    let found = Settings { max_beams: Some(3_240), reported_beams: true, ..Settings::default() };
+    let found = Settings { max_beams: Some(3_240), is_found: true, ..Settings::default() };
     let family = Settings { max_beams: Some(2_048), ..Settings::default() };
     let beams = |model, is_old, settings| {
         let mut head = Head::new(model, 1);
@@ -292,7 +293,7 @@ fn a_scanner_that_a_search_has_found_has_the_beams_that_it_reports() {
         assert_eq!(beams(model, false, family), model.beams().min(2_048), "{model:?}");
     }
     assert_eq!(beams(Model::A1, true, found), 539, "one point in 254 us, 7.3 revolutions per second");
-    assert_eq!(beams(Model::A1, true, Settings { model: Some(Model::A1), ..found }), 1_079);
+    assert_eq!(beams(Model::A1, true, Settings { model: Some("a1"), ..found }), 1_079);
     assert_eq!(beams(Model::A1, true, Settings { beams: Some(360), ..found }), 360);
     assert_eq!(beams(Model::A1, true, family), 1_079);
 }
@@ -341,7 +342,8 @@ fn a_cable_that_is_plugged_in_again_is_not_a_restart() {
 fn a_greeting_in_the_midst_of_a_stream_begins_again_at_once() {
     for model in [Model::A1, Model::A3, Model::S2, Model::S3] {
         for mode in [None, Some(Mode::Standard)] {
-            let mut bench = Bench::new(Settings { mode, ..of(model) }, Head::new(model, 1));
+            let mut bench =
+                Bench::new(Settings { mode: mode.map(Mode::name), ..of(model) }, Head::new(model, 1));
             bench.run(3 * SECOND);
             bench.head.boot(bench.now);
             let took = bench.until(1_500 * MILLIS, |bench| bench.session.account().resyncs > 0);
@@ -374,7 +376,8 @@ fn a_greeting_after_other_bytes_is_a_restart() {
 fn ranges_that_are_text_are_no_greeting() {
     // A single point is believed if another one follows it.
     for (mode, lost) in [(Mode::Standard, 65), (Mode::DenseBoost, 60)] {
-        let mut bench = Bench::new(Settings { mode: Some(mode), ..of(Model::S2) }, Head::new(Model::S2, 1));
+        let mut bench =
+            Bench::new(Settings { mode: Some(mode.name()), ..of(Model::S2) }, Head::new(Model::S2, 1));
         bench.run(3 * SECOND);
         for _ in 0..20 {
             bench.head.leave_text(bench.now);
@@ -407,10 +410,10 @@ fn a_recording_is_read_and_nothing_is_said() {
     for (model, mode) in
         [(Model::A1, Mode::Express), (Model::S2, Mode::DenseBoost), (Model::A1, Mode::Standard)]
     {
-        let mut live = Bench::new(Settings { mode: Some(mode), ..of(model) }, Head::new(model, 1));
+        let mut live = Bench::new(Settings { mode: Some(mode.name()), ..of(model) }, Head::new(model, 1));
         live.run(4 * SECOND);
         let bytes = live.log.packets.concat();
-        let settings = Settings { mode: Some(mode), fixed_rate: true, listen_only: true, ..of(model) };
+        let settings = Settings { mode: Some(mode.name()), fixed_rate: true, listen_only: true, ..of(model) };
         let mut session = Session::new(settings, 0);
         let per_second = bytes.len() / 3;
         let (mut now, mut turns) = (0, 0);

@@ -1,7 +1,8 @@
 //! What becomes of packets: turns, stamps, damage.
 
+use scanhub_drivers::Settings;
 use scanhub_drivers::line::Session as _;
-use scanhub_drivers::rplidar::{Mode, Model, Settings};
+use scanhub_drivers::rplidar::{Mode, Model};
 use schema::MILLIS;
 
 use crate::session::bench::{Bench, SECOND};
@@ -17,7 +18,7 @@ fn every_mode_of_every_model_is_heard_and_every_turn_of_it() {
             if !head.has(mode) {
                 continue;
             }
-            let mut bench = Bench::new(Settings { mode: Some(mode), ..of(model) }, head);
+            let mut bench = Bench::new(Settings { mode: Some(mode.name()), ..of(model) }, head);
             bench.run(2 * SECOND);
             let before = bench.log.turns.len();
             bench.run(12 * SECOND);
@@ -47,7 +48,7 @@ const KINDS: [(Model, Mode); 6] = [
 ];
 
 fn in_mode((model, mode): (Model, Mode), seed: u64) -> Bench {
-    Bench::new(Settings { mode: Some(mode), ..of(model) }, Head::new(model, seed))
+    Bench::new(Settings { mode: Some(mode.name()), ..of(model) }, Head::new(model, seed))
 }
 
 #[test]

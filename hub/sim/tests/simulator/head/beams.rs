@@ -1,7 +1,8 @@
 //! The number of beams of a scanner whose model is not configured: as many as it measures points per revolution, whatever
 //! happens to its power.
 
-use scanhub_drivers::ld::{Model, Session, Settings, Trouble};
+use scanhub_drivers::Settings;
+use scanhub_drivers::ld::{Model, Session, Trouble};
 use scanhub_drivers::line::Session as _;
 use schema::{MILLIS, Nanos};
 use sim::ld::HeadSettings;

@@ -1,8 +1,9 @@
 //! A head, its line with faults and a session, in virtual time; what the session tells is judged by what the head really
 //! measured.
 
+use scanhub_drivers::Settings;
+use scanhub_drivers::ld::Session;
 use scanhub_drivers::ld::packet::LEN;
-use scanhub_drivers::ld::{Session, Settings};
 use scanhub_drivers::line;
 use scanhub_drivers::line::grid::Point;
 use scanhub_drivers::line::{Event, Output, Protocol as _, Session as _};
@@ -58,7 +59,7 @@ impl Bench {
 
     pub(crate) fn of(settings: HeadSettings, packets: Packets, faults: &str, seed: u64) -> Bench {
         let faults: Faults = faults.parse().expect("faults");
-        let session = Session::new(Settings { model: Some(settings.model), ..Settings::default() }, 0);
+        let session = Session::new(Settings { model: Some(settings.model.name()), ..Settings::default() }, 0);
         Bench {
             session,
             head: Head::new(settings, packets),

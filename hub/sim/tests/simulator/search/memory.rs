@@ -3,7 +3,7 @@
 use scanhub_drivers::line::{KnownRate, Session as _};
 use scanhub_drivers::lms::variant::{Baud, Variant};
 use scanhub_drivers::search::{Memory, PortKind};
-use scanhub_drivers::{ld, lms, rplidar};
+use scanhub_drivers::{Settings, ld, lms, rplidar};
 use schema::{Family, MILLIS, Nanos};
 use sim::device::Device;
 use sim::rplidar::Model;
@@ -81,7 +81,7 @@ fn finds_a_remembered_rotating_scanner_soon() {
             memory,
             |seed| bench::ld(model, seed),
             |device, seed| {
-                let settings = ld::Settings { model: Some(model), ..ld::Settings::default() };
+                let settings = Settings { model: Some(model.name()), ..Settings::default() };
                 Bench::named(|now| ld::Session::new(settings, now), device, seed)
             },
         );
@@ -97,7 +97,7 @@ fn finds_a_remembered_rotating_scanner_soon() {
                 memory,
                 |seed| bench::rplidar(model, streams, health, seed),
                 |device, seed| {
-                    let settings = rplidar::Settings { model: Some(named), ..rplidar::Settings::default() };
+                    let settings = Settings { model: Some(named.name()), ..Settings::default() };
                     Bench::named(|now| rplidar::Session::new(settings, now), device, seed)
                 },
             );

@@ -1,8 +1,9 @@
 //! The hub's session with a scanner of Slamtec: what it makes of the bytes beside what the scanner measured.
 
+use scanhub_drivers::Settings;
 use scanhub_drivers::line::grid::NO_RETURN;
 use scanhub_drivers::line::{Event, Output, Protocol as _, Session as _, State};
-use scanhub_drivers::rplidar::{Mode, Model as Known, Session, Settings, Trouble};
+use scanhub_drivers::rplidar::{Mode, Model as Known, Session, Trouble};
 use schema::{MILLIS, Nanos, line_time};
 use sim::device::Device as _;
 use sim::layers::Layers;
@@ -137,7 +138,8 @@ fn every_mode_of_every_model_is_understood() {
     for model in Model::ALL {
         for mode in modes(model) {
             let known = Known::named(model.name()).expect("known");
-            let settings = Settings { model: Some(known), mode, ..Settings::default() };
+            let settings =
+                Settings { model: Some(known.name()), mode: mode.map(Mode::name), ..Settings::default() };
             let mut talk = Talk::new(settings, UnitSettings::of(model), "");
             talk.run(8 * SECOND);
             assert_eq!((talk.session.state(), talk.session.trouble()), (State::Streaming, None));
@@ -173,7 +175,7 @@ fn one_that_somebody_left_streaming_or_unwell_streams_in_three_seconds() {
 #[test]
 fn every_brown_out_is_a_restart_and_so_is_a_power_cycle() {
     for model in Model::ALL {
-        let settings = Settings { model: Known::named(model.name()), ..Settings::default() };
+        let settings = Settings { model: Some(model.name()), ..Settings::default() };
         let mut talk = Talk::new(settings, UnitSettings::of(model), "brownout_at=4,brownout_every=5");
         talk.run(30 * SECOND);
         let banners = talk.bench.sent.iter().filter(|sent| sent.bytes.starts_with(b"RP LIDAR"));
@@ -206,7 +208,7 @@ fn what_only_looks_like_a_restart_is_none() {
             "stall=1.5,stall_every=4",
             "loss=0.002",
         ] {
-            let settings = Settings { model: Known::named(model.name()), ..Settings::default() };
+            let settings = Settings { model: Some(model.name()), ..Settings::default() };
             let mut talk = Talk::new(settings, UnitSettings::of(model), faults);
             talk.run(30 * SECOND);
             assert_eq!(talk.session.account().restarts, 0, "{model:?} {faults}");
@@ -232,7 +234,7 @@ fn no_point_of_an_unmarked_turn_is_wrong_on_a_line_that_loses_bytes() {
     for (model, mode) in kinds {
         for seed in 0..3 {
             let settings =
-                Settings { model: Known::named(model.name()), mode: Some(mode), ..Settings::default() };
+                Settings { model: Some(model.name()), mode: Some(mode.name()), ..Settings::default() };
             let unit = UnitSettings { seed, ..UnitSettings::of(model) };
             let mut talk = Talk::new(settings, unit, "loss=0.0002,burst=4");
             talk.run(12 * SECOND);
