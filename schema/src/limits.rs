@@ -3,7 +3,7 @@
 
 use std::ops::RangeInclusive;
 
-use crate::{Contents, Failure, Kind, Telegram, Topic};
+use crate::{Contents, Failure, Family, Kind, Topic};
 
 /// Publishers of a topic: the hub's link.
 pub const PUBLISHERS: usize = 1;
@@ -44,7 +44,12 @@ impl TopicLimits {
 impl Default for TopicLimits {
     /// For an LMS: 100 degrees in quarters.
     fn default() -> Self {
-        TopicLimits { consumers: 32, beams: 401, contents: Contents::UPPER, telegram: Telegram::MAX }
+        TopicLimits {
+            consumers: 32,
+            beams: 401,
+            contents: Contents::UPPER,
+            telegram: Family::Lms.max_telegram(),
+        }
     }
 }
 

@@ -14,12 +14,20 @@ pub struct Telegram<'a> {
 }
 
 impl<'a> Telegram<'a> {
-    /// The longest sample there is, in bytes: an LMS's telegram, STX to CRC (Telegram listing: 812 and its two bytes of CRC).
-    pub const MAX: usize = 814;
+    /// Maximum length of a telegram of any family, in bytes.
+    pub const MAX: usize = {
+        let (mut max, mut at) = (0, 0);
+        while at < Family::ALL.len() {
+            let len = Family::ALL[at].max_telegram();
+            max = if len > max { len } else { max };
+            at += 1;
+        }
+        max
+    };
 
     /// Returns the telegram with which a payload of `family`'s begins: of an LMS its length field says how long it is, and what
     /// follows is a later revision's; of another family it is all of the payload. Nothing if there is none, or if it is longer
-    /// than [`MAX`](Self::MAX).
+    /// than a telegram of its [family](Family::max_telegram) can be, or of [any](Self::MAX) if this version does not know it.
     pub fn of(family: u8, payload: &'a [u8]) -> Option<Telegram<'a>> {
         let family = Family::of_number(family);
         let len = match (family, payload) {
@@ -29,7 +37,8 @@ impl<'a> Telegram<'a> {
             (Some(Family::Lms), _) | (_, []) => return None,
             _ => payload.len(),
         };
-        let bytes = payload.get(..len).filter(|bytes| bytes.len() <= Telegram::MAX)?;
+        let max = family.map_or(Telegram::MAX, Family::max_telegram);
+        let bytes = payload.get(..len).filter(|bytes| bytes.len() <= max)?;
         Some(Telegram { family, bytes })
     }
 
@@ -100,7 +109,12 @@ mod tests {
         assert_eq!((of_tomorrow.bytes, of_tomorrow.packets()), (&bytes[..], None));
         for family in Family::ALL.into_iter().filter(|family| *family != Family::Lms) {
             assert_eq!(Telegram::of(family as u8, &[]), None);
-            assert_eq!(Telegram::of(family as u8, &[1; Telegram::MAX + 1]), None);
+            let longest = vec![1; family.max_telegram()];
+            assert_eq!(
+                Telegram::of(family as u8, &longest).map(|telegram| telegram.bytes),
+                Some(&longest[..])
+            );
+            assert_eq!(Telegram::of(family as u8, &[&longest[..], &[1]].concat()), None);
         }
     }
 }

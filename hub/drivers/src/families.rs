@@ -215,7 +215,13 @@ impl line::Session for Session {
 
 /// Rate at which a search begins that remembers no scanner, in bits per second.
 const FIRST_RATE: u32 = 230_400;
-const _: () = assert!(lms::telegram::MAX_TELEGRAM == schema::Telegram::MAX);
+const _: () = {
+    let mut at = 0;
+    while at < Family::ALL.len() {
+        assert!(features(Family::ALL[at]).max_telegram == Family::ALL[at].max_telegram());
+        at += 1;
+    }
+};
 const _: () = assert!(
     line::suspect::LINE_ERROR == schema::Reasons::LINE_ERROR
         && line::suspect::NEIGHBOUR == schema::Reasons::NEIGHBOUR

@@ -84,6 +84,10 @@ impl Packed for [u8] {
         (1..=Telegram::MAX).contains(&payload.len()).then_some(payload.len())
     }
 
+    fn widen(limits: &mut TopicLimits, payload: &[u8]) {
+        limits.telegram = limits.telegram.max(payload.len());
+    }
+
     fn unpack(&mut self, payload: &[u8]) -> bool {
         let Some(len) = <[u8]>::room(payload) else { return false };
         self.get_mut(..len).map(|memory| memory.copy_from_slice(payload)).is_some()

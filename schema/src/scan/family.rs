@@ -49,6 +49,17 @@ impl Family {
         Family::ALL.into_iter().find(|family| family.name().eq_ignore_ascii_case(name))
     }
 
+    /// Returns the maximum number of bytes of a telegram, or of packets that are published together.
+    pub const fn max_telegram(self) -> usize {
+        match self {
+            // Telegram listing: 812 bytes, and two of the checksum.
+            Family::Lms => 814,
+            // 10 ms of packets, of an STL27L the most.
+            Family::Ld => 17 * LD_PACKET,
+            Family::Rplidar => 800,
+        }
+    }
+
     /// Returns whether the family's intensities are levels of reflectors, with 0 for any other surface. Otherwise they
     /// are measured from every surface, and the user must configure the threshold for reflectors.
     pub fn has_reflector_levels(self) -> bool {

@@ -6,7 +6,7 @@ use lan::republish::{Republisher, SensorTopics, TopicStore};
 use scanhub_client::{PublishSession, SensorPublisher, clock};
 use schema::limits::TopicLimits;
 use schema::shortage::{check_memory, raise_descriptor_limit, sensor_bytes};
-use schema::{BEAMS, Contents, Domain, Failure, Header, Topic, Wake};
+use schema::{BEAMS, Contents, Domain, Failure, Header, Telegram, Topic, Wake};
 
 use any_publisher::AnyPublisher;
 
@@ -83,10 +83,11 @@ impl SharedTopics {
         let known = TopicLimits {
             beams: limits.beams.max(self.limits.beams),
             contents: limits.contents | self.limits.contents,
+            telegram: limits.telegram.max(self.limits.telegram),
             ..limits
         };
         let limits = if known != self.limits && self.widened >= WIDENED_EXACTLY {
-            TopicLimits { beams: BEAMS, contents: Contents::ALL, ..known }
+            TopicLimits { beams: BEAMS, contents: Contents::ALL, telegram: Telegram::MAX, ..known }
         } else {
             known
         };
