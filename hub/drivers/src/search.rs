@@ -180,7 +180,7 @@ struct Ask {
     is_stop: bool,
 }
 
-/// A request that is sent byte by byte.
+/// A request, and the number of its bytes that were sent. They are sent one by one if the scanner requires gaps.
 #[derive(Clone, Copy, Debug)]
 struct Outgoing {
     request: &'static [u8],
@@ -628,9 +628,9 @@ impl Protocol for Search {
                 return Output::SetRate(rate);
             }
             let until = match &self.phase {
-                Phase::Sending { outgoing, .. } if outgoing.not_before <= self.now + TRANSMIT_AHEAD => {
-                    let Outgoing { request, sent, not_before, .. } = *outgoing;
-                    return Output::Transmit { bytes: &request[sent..=sent], not_before };
+                Phase::Sending { ask, outgoing } if outgoing.not_before <= self.now + TRANSMIT_AHEAD => {
+                    let bytes = outgoing.next(ask.asks.gap);
+                    return Output::Transmit { bytes, not_before: outgoing.not_before };
                 }
                 Phase::Sending { outgoing, .. } => outgoing.not_before,
                 Phase::Draining { until, at_most, .. } => *until.min(at_most),
@@ -662,10 +662,19 @@ impl Memory {
 }
 
 impl Outgoing {
-    /// Continues after the next byte was written at `now`. If it was too late, the scanner has dropped the request,
+    /// Returns the bytes to write next.
+    fn next(&self, gap: Option<(Nanos, Nanos)>) -> &'static [u8] {
+        let end = if gap.is_some() { self.sent + 1 } else { self.request.len() };
+        &self.request[self.sent..end]
+    }
+
+    /// Continues after the next bytes were written at `now`. If it was too late, the scanner has dropped the request,
     /// which then starts over.
     fn transmitted(&mut self, now: Nanos, byte_time: Nanos, gap: Option<(Nanos, Nanos)>) {
-        let (min_gap, max_gap) = gap.unwrap_or((0, Nanos::MAX - byte_time));
+        let Some((min_gap, max_gap)) = gap else {
+            self.sent = self.request.len();
+            return;
+        };
         let is_late = self.sent > 0 && now.saturating_sub(self.left_at) > byte_time + max_gap;
         self.left_at = now;
         if is_late && self.restarts > 0 {
@@ -673,7 +682,7 @@ impl Outgoing {
             self.not_before = now + byte_time + 2 * max_gap;
         } else {
             self.sent += 1;
-            self.not_before = if gap.is_some() { now + byte_time + min_gap } else { now };
+            self.not_before = now + byte_time + min_gap;
         }
     }
 }

@@ -15,6 +15,7 @@ use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
 
+use rustix::io::Errno;
 use schema::Failure;
 
 pub use access::{Holder, Ownership, Rights, all_holders, altering_program, holder};
@@ -210,7 +211,7 @@ impl Port {
         }
     }
 
-    /// Writes `bytes`. A full line drops what it has no room for, as a cable would, and the session repeats the request.
+    /// Writes `bytes`. A line that is full drops the rest, as a cable would, and the session repeats the request.
     pub fn write(&self, bytes: &[u8]) -> io::Result<()> {
         match self {
             Port::Tty(tty) => tty.write(bytes),
@@ -287,10 +288,38 @@ impl AsFd for Port {
     }
 }
 
+/// Writes `bytes` to `fd`, which does not block. Drops the bytes for which it has no room.
+fn write_all(fd: impl AsFd, mut bytes: &[u8]) -> Result<(), Errno> {
+    while !bytes.is_empty() {
+        match rustix::io::write(&fd, bytes) {
+            Ok(0) | Err(Errno::AGAIN) => break,
+            Ok(len) => bytes = &bytes[len..],
+            Err(Errno::INTR) => {}
+            Err(error) => return Err(error),
+        }
+    }
+    Ok(())
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
     use schema::Kind;
+    use std::io::Read as _;
+    use std::os::unix::net::UnixStream;
+
+    #[test]
+    fn a_full_line_gets_the_beginning_of_what_is_written() {
+        let (line, mut end) = UnixStream::pair().unwrap();
+        line.set_nonblocking(true).unwrap();
+        let bytes: Vec<u8> = (0..10_000_000_u32).map(|i| (i % 251) as u8).collect();
+        write_all(&line, &bytes).unwrap();
+        drop(line);
+        let mut received = Vec::new();
+        end.read_to_end(&mut received).unwrap();
+        assert!(!received.is_empty() && received.len() < bytes.len(), "{}", received.len());
+        assert!(bytes.starts_with(&received));
+    }
 
     static NEVER: AtomicBool = AtomicBool::new(false);
 

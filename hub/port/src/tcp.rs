@@ -21,7 +21,7 @@ use rustix::net::sockopt::{
 };
 use schema::{MILLIS, Nanos, line_time, shortage};
 
-use crate::{Port, PortError};
+use crate::{Port, PortError, write_all};
 
 /// A connection to a serial server. Reads and writes never block.
 pub struct Tcp {
@@ -63,10 +63,7 @@ impl Tcp {
     }
 
     pub(crate) fn write(&self, bytes: &[u8]) -> io::Result<()> {
-        match rustix::io::write(&self.stream, bytes) {
-            Ok(_) | Err(Errno::AGAIN | Errno::INTR) => Ok(()),
-            Err(error) => Err(error.into()),
-        }
+        Ok(write_all(&self.stream, bytes)?)
     }
 
     fn new(stream: TcpStream) -> Result<Tcp, Errno> {

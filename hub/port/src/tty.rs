@@ -21,9 +21,9 @@ use rustix::termios::{
 };
 use serialport::{ClearBuffer, DataBits, FlowControl, SerialPort, StopBits, TTYPort};
 
-use super::PortError;
 use super::candidates::{PROMPT_MS, check_tty, is_tty, latency_ms};
 use super::uart::{Counts, set_low_latency};
+use super::{PortError, write_all};
 
 /// An open serial line, exclusive and raw. Reads and writes never block.
 pub struct Tty {
@@ -196,11 +196,8 @@ impl Tty {
     }
 
     pub(crate) fn write(&self, bytes: &[u8]) -> io::Result<()> {
-        match rustix::io::write(&self.line, bytes) {
-            Err(Errno::IO) => Err(hung_up()),
-            Ok(_) | Err(Errno::AGAIN | Errno::INTR) => Ok(()),
-            Err(error) => Err(error.into()),
-        }
+        let written = write_all(&self.line, bytes);
+        written.map_err(|error| if error == Errno::IO { hung_up() } else { error.into() })
     }
 
     /// Checks the result of changing settings by the rate that the driver has set instead of `wanted`. A lost line

@@ -102,7 +102,8 @@ pub struct Asks {
     pub stop: Option<Stop>,
     /// Requests for a reply. Every round uses the next one.
     pub requests: &'static [&'static [u8]],
-    /// Minimum and maximum time between the end of a byte and the next one. `None` if the scanner accepts any time.
+    /// Minimum and maximum time between the end of a byte and the next one. `None` if the scanner accepts any time: then
+    /// a request is one write.
     pub gap: Option<(Nanos, Nanos)>,
     /// Time for the reply to begin, from the last byte of the request.
     pub reply: Nanos,

@@ -73,12 +73,11 @@ impl Request {
     }
 }
 
-/// Requests that are sent byte by byte.
+/// Requests that are sent together.
 #[derive(Clone, Copy, Debug, Default)]
 pub(crate) struct RequestQueue {
     bytes: [u8; 32],
     len: usize,
-    sent: usize,
 }
 
 impl RequestQueue {
@@ -92,19 +91,9 @@ impl RequestQueue {
         }
     }
 
-    /// Returns the next byte to send. Empty if there is none.
-    pub(crate) fn next(&self) -> &[u8] {
-        &self.bytes[self.sent..self.len.min(self.sent + 1)]
-    }
-
-    /// Removes the byte that was sent. Returns whether the queue is empty now.
-    pub(crate) fn advance(&mut self) -> bool {
-        self.sent += 1;
-        let is_done = self.sent >= self.len;
-        if is_done {
-            *self = RequestQueue::default();
-        }
-        is_done
+    /// Returns the bytes to send. A scanner needs no gaps between them.
+    pub(crate) fn bytes(&self) -> &[u8] {
+        &self.bytes[..self.len]
     }
 }
 

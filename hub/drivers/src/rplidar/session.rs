@@ -477,9 +477,8 @@ impl line::Protocol for Session {
 
     fn transmitted(&mut self, now: Nanos) {
         self.now = now;
-        if self.requests.advance() {
-            self.requests_sent();
-        }
+        self.requests = RequestQueue::default();
+        self.requests_sent();
     }
 
     fn poll_output(&mut self) -> Output<'_> {
@@ -491,8 +490,8 @@ impl line::Protocol for Session {
                 self.framer.clear();
                 return Output::SetRate(baud);
             }
-            if !self.requests.next().is_empty() {
-                return Output::Transmit { bytes: self.requests.next(), not_before: 0 };
+            if !self.requests.bytes().is_empty() {
+                return Output::Transmit { bytes: self.requests.bytes(), not_before: 0 };
             }
             if let Some(closed) = self.stream.advance(&self.framer) {
                 return Output::Event(Event::Scan(self.show(closed)));
@@ -515,7 +514,7 @@ impl line::Protocol for Session {
             }
         }
         self.expire();
-        if self.change_dtr.is_some() || self.rate.is_changed() || !self.requests.next().is_empty() {
+        if self.change_dtr.is_some() || self.rate.is_changed() || !self.requests.bytes().is_empty() {
             return self.poll_output();
         }
         self.reads.wait(self.now, self.deadline(), self.framer.hold())

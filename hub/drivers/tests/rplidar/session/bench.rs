@@ -110,6 +110,7 @@ impl Bench {
                 }
                 Output::Transmit { bytes, not_before } => {
                     self.now = self.now.max(not_before);
+                    assert!(bytes.len() > 1, "a request is one write: {bytes:?}");
                     let bytes = bytes.to_vec();
                     let rate = self.session.rate();
                     bytes.into_iter().for_each(|byte| self.head.write(byte, rate, self.now));

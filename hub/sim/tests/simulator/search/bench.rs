@@ -35,7 +35,7 @@ pub(crate) trait Host {
 /// Next action of a host.
 pub(crate) enum Event<R> {
     SetRate(u32),
-    Transmit(u8, Nanos),
+    Transmit(Vec<u8>, Nanos),
     Wait(Nanos),
     Rest(Nanos),
     Done(R),
@@ -51,10 +51,7 @@ impl<R> Event<R> {
             return match protocol.poll_output() {
                 Output::SetRate(rate) => Event::SetRate(rate),
                 Output::SetDtr(_) => continue,
-                Output::Transmit { bytes, not_before } => {
-                    let &[byte] = bytes else { panic!("more than a byte: {bytes:?}") };
-                    Event::Transmit(byte, not_before)
-                }
+                Output::Transmit { bytes, not_before } => Event::Transmit(bytes.to_vec(), not_before),
                 Output::Wait { until } => Event::Wait(until),
                 Output::Rest(until) => Event::Rest(until),
                 Output::Event(received) => match event(received) {
@@ -305,7 +302,7 @@ impl<H: Host> Bench<H> {
                     self.read.clear();
                     self.rates.push((self.now, rate));
                 }
-                Event::Transmit(byte, not_before) => self.transmit(byte, not_before),
+                Event::Transmit(bytes, not_before) => self.transmit(&bytes, not_before),
                 Event::Wait(until) | Event::Rest(until) => {
                     self.flush();
                     return Ok(until);
@@ -315,16 +312,18 @@ impl<H: Host> Bench<H> {
         }
     }
 
-    fn transmit(&mut self, byte: u8, not_before: Nanos) {
+    fn transmit(&mut self, bytes: &[u8], not_before: Nanos) {
         self.advance(not_before);
-        self.written.push((self.now, self.rate, byte));
         self.host.protocol().transmitted(self.now);
-        if self.now > self.left_at {
-            self.flush();
+        for &byte in bytes {
+            self.written.push((self.now, self.rate, byte));
+            if self.now > self.left_at {
+                self.flush();
+            }
+            self.left_at = self.now.max(self.left_at) + line_time(1, self.rate);
+            self.is_flushed = false;
+            self.deliver(&[byte], false);
         }
-        self.left_at = self.now.max(self.left_at) + line_time(1, self.rate);
-        self.is_flushed = false;
-        self.deliver(&[byte], false);
     }
 
     /// The line to the scanner is idle.
