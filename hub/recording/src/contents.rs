@@ -28,6 +28,8 @@ pub struct Contents {
     pub form: Form,
     /// Of which family its first sensor is, a number of [`Family`]; a log is of an LMS.
     pub family: u8,
+    /// Number of another family that telegrams belong to. `None` if all have the same.
+    pub other_family: Option<u8>,
     /// Names of the sensors in it, in order of appearance; a stream and a log name none.
     pub sensors: Vec<String>,
     /// Number of whole telegrams; of a log, of scans.
@@ -97,6 +99,7 @@ impl Contents {
         Contents {
             form,
             family: Family::Lms as u8,
+            other_family: None,
             sensors: Vec::new(),
             telegrams: 0,
             scans: 0,
@@ -126,6 +129,8 @@ impl Contents {
     pub(crate) fn note(&mut self, family: u8, telegram: &[u8], wall_ns: Option<u64>) {
         if self.telegrams == 0 {
             self.family = family;
+        } else if family != self.family {
+            self.other_family.get_or_insert(family);
         }
         self.telegrams += 1;
         self.note_time(wall_ns);

@@ -347,6 +347,22 @@ fn encoding(recording: &Recording, target: Target) -> Result<Encoding, Failure> 
         let hint = "round its ranges first; `scanhub replay` plays it rounded";
         return Err(Failure::new(Kind::Input, message, hint));
     }
+    if target == Target::Recording(Form::Telegrams)
+        && contents.sensors.len() <= 1
+        && let Some(other) = contents.other_family
+    {
+        let [one, other] = [contents.family, other].map(|number| {
+            Family::of_number(number)
+                .map_or_else(|| format!("number {number}"), |family| family.name().to_owned())
+        });
+        let message = format!(
+            "{} has telegrams of families {one} and {other}, because the scanner was replaced; raw bytes of both cannot be \
+             told apart",
+            recording.path().display()
+        );
+        let hint = "name OUT.mcap, which keeps the family of each telegram, or OUT.csv for the scans";
+        return Err(Failure::new(Kind::Input, message, hint));
+    }
     if !contents.is_lms() && target == Target::Recording(Form::Carmen) {
         let message = format!(
             "{} is of a scanner that looks all around, which a CARMEN log has no place for",

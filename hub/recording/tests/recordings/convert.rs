@@ -16,7 +16,7 @@ use scanhub_drivers::lms::reply;
 use scanhub_drivers::lms::variant::{Mode, Unit};
 use schema::datagram::Packed;
 use schema::file::Writer;
-use schema::{Flags, Header, Mark, Marks, Topic};
+use schema::{Family, Flags, Header, Mark, Marks, Topic};
 
 const CM: Encoding = Encoding { unit: Unit::Cm, mode: Mode(0) };
 
@@ -174,6 +174,31 @@ fn rows_have_intensities_and_meters_on_request() {
         failure.message.contains("has intensities") && !folder.path().join("b.csv").exists(),
         "{failure}"
     );
+}
+
+#[test]
+fn raw_bytes_of_two_families_are_refused() {
+    let folder = TempDir::new().unwrap();
+    let recorded = |families: &[Family]| {
+        let mut writer = Writer::begin(Vec::new(), "", Default::default()).unwrap();
+        for (number, family) in (0..).zip(families) {
+            let header =
+                Header { seq: number, topic_seq: number, family: *family as u8, ..Header::default() };
+            writer.sample("front", Topic::Telegram, &header, &[0x54; 47]).unwrap();
+        }
+        file(&folder, "front.mcap", &writer.finish().unwrap())
+    };
+    let (bytes, copy) = (folder.path().join("out.bin"), folder.path().join("out.mcap"));
+    let one = recorded(&[Family::Ld, Family::Ld]);
+    assert_eq!(converted(&one, &bytes, None).unwrap().telegrams, 2);
+    fs::remove_file(&bytes).unwrap();
+    // The scanner was replaced while the hub searched for any.
+    let two = recorded(&[Family::Ld, Family::Rplidar, Family::Ld]);
+    let failure = converted(&two, &bytes, Some("front")).unwrap_err();
+    assert_eq!(failure.kind.exit_code(), 66);
+    assert!(failure.message.contains("of families ld and rplidar"), "{failure}");
+    assert!(failure.hint.contains("OUT.mcap") && !bytes.exists(), "{failure}");
+    assert_eq!(converted(&two, &copy, None).unwrap().telegrams, 3);
 }
 
 #[test]
