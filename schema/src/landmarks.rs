@@ -27,7 +27,7 @@ pub struct Marks {
 #[cfg_attr(feature = "ipc", derive(ZeroCopySend), type_name("scanhub.Mark.v2"))]
 #[repr(C)]
 pub struct Mark {
-    /// Sensor angle in 1/1000 degree, as in the scan: 0 is ahead, counterclockwise is positive.
+    /// Sensor angle in 1/1000 degree, from -180,000 to below 180,000: 0 is ahead, counterclockwise is positive.
     pub angle_mdeg: i32,
     /// Range in 1/10 mm.
     pub range_dmm: u32,

@@ -174,7 +174,7 @@ impl Open {
         let angle = 2 * (of_beams + i128::from(self.off_udeg)) + weight;
         let last = scan.beams() - 1;
         Mark {
-            angle_mdeg: angle.div_euclid(2 * weight) as i32,
+            angle_mdeg: in_range_mdeg(angle.div_euclid(2 * weight)),
             range_dmm: half_up(u128::from(scan.unit_um) * u128::from(self.ranges), 100 * self.weight) as u32,
             weight: u16::try_from(self.weight).unwrap_or(u16::MAX),
             peak: u8::try_from(self.peak).unwrap_or(u8::MAX),
@@ -183,6 +183,11 @@ impl Open {
             last_beam: self.last_beam as u16,
         }
     }
+}
+
+/// Returns an angle in 1/1000 degree, counted from any revolution, from -180,000 to below 180,000.
+fn in_range_mdeg(mdeg: i128) -> i32 {
+    ((mdeg + 180_000).rem_euclid(360_000) - 180_000) as i32
 }
 
 /// How far the exact angle of beam `i` is from that of the beam, in millionths of a degree: 0 where there is none. Either may
