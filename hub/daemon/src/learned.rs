@@ -4,7 +4,6 @@
 //! to know how a background is learned, and how long a disk takes.
 
 mod file;
-mod rate;
 mod scanner;
 mod writer;
 
@@ -19,7 +18,8 @@ use schema::{Age, Background, Failure, MILLIS, Nanos, Pose, StateDirectory};
 use crate::event_fd::EventFd;
 use crate::surroundings::Learned;
 use file::KeptBackground;
-pub use rate::KnownRate;
+pub use scanhub_drivers::line::KnownRate;
+use scanner::Kept;
 pub use scanner::KnownScanner;
 pub(crate) use writer::Writer;
 
@@ -89,10 +89,10 @@ struct Slot {
     model: Mutex<Option<(Pose, Box<Background>)>>,
     /// 0 if none is kept.
     kept_wall_ns: AtomicU64,
-    /// Rate and port, and whether that is to be written.
-    rate: Mutex<(Option<(KnownRate, String)>, bool)>,
-    /// Scanner and port, and whether they must be written.
-    scanner: Mutex<(Option<(KnownScanner, String)>, bool)>,
+    /// Rate at which the scanner was found last.
+    rate: Kept<KnownRate>,
+    /// Scanner that the search found last.
+    scanner: Kept<KnownScanner>,
 }
 
 /// The slot of one link.
@@ -127,8 +127,9 @@ impl<F: Files> Keeper<F> {
             sensor: link.name.clone(),
             model: Mutex::default(),
             kept_wall_ns: AtomicU64::new(recall(link, &files, wall_ns)),
-            rate: Mutex::new((known_rate(link, &files), false)),
-            scanner: Mutex::new((known_scanner(link, &files), false)),
+            // Only the rate of a tty can be changed.
+            rate: Kept::load(&link.name, &files, matches!(link.port, Source::Tty(_))),
+            scanner: Kept::load(&link.name, &files, link.family().is_none()),
         };
         let slots: Vec<_> = config.links.iter_mut().filter(is_live).map(slot).collect();
         if slots.is_empty() {
@@ -149,8 +150,8 @@ impl<F: Files> Keeper<F> {
     pub fn turn(&mut self, now: Nanos, wall_ns: u64, is_last: bool) -> Nanos {
         let mut until = Nanos::MAX;
         for (slot, file) in self.slots.slots.iter().zip(&mut self.written) {
-            slot.write_rate(&self.files);
-            slot.write_scanner(&self.files);
+            slot.rate.write(&slot.sensor, &self.files);
+            slot.scanner.write(&slot.sensor, &self.files);
             file.waiting = held(&slot.model).take().or(file.waiting.take());
             let Some((pose, model)) = &file.waiting else { continue };
             if !is_last && file.generation == Some(model.generation) && now < file.due {
@@ -188,29 +189,21 @@ impl Learned for Handle<'_> {
     }
 
     fn rate(&self, port: &str) -> Option<KnownRate> {
-        let (known, _) = &*held(&self.slot.rate);
-        known.as_ref().filter(|(_, of)| of == port).map(|(rate, _)| *rate)
+        self.slot.rate.of(port)
     }
 
     fn scanner(&self, port: &str) -> Option<KnownScanner> {
-        let (known, _) = &*held(&self.slot.scanner);
-        known.as_ref().filter(|(_, of)| of == port).map(|(scanner, _)| scanner.clone())
+        self.slot.scanner.of(port)
     }
 
     fn keep_scanner(&self, port: &str, scanner: KnownScanner) {
-        let news = (Some((scanner, port.to_owned())), true);
-        let mut known = held(&self.slot.scanner);
-        if known.0 != news.0 {
-            *known = news;
+        if self.slot.scanner.keep(port, scanner) {
             self.slots.event.signal();
         }
     }
 
     fn keep_rate(&self, port: &str, rate: KnownRate) {
-        let news = (Some((rate, port.to_owned())), true);
-        let mut known = held(&self.slot.rate);
-        if known.0 != news.0 {
-            *known = news;
+        if self.slot.rate.keep(port, rate) {
             self.slots.event.signal();
         }
     }
@@ -237,46 +230,6 @@ impl Slot {
         self.kept_wall_ns.store(wall_ns, Ordering::Relaxed);
         Ok(())
     }
-
-    /// Writes the rate, if that is news; the disk is waited for while nobody holds the slot.
-    fn write_rate(&self, files: &impl Files) {
-        let text = {
-            let mut known = held(&self.rate);
-            let is_news = std::mem::take(&mut known.1);
-            known.0.as_ref().filter(|_| is_news).map(|(rate, port)| rate::text(*rate, port))
-        };
-        if let Some(text) = text
-            && let Err(failure) = files.write(&rate_of(&self.sensor), &text)
-        {
-            tracing::warn!("{}: {}; {}", self.sensor, failure.message, failure.hint);
-        }
-    }
-
-    /// Writes the scanner, if it is new. The slot is free while the disk is written.
-    fn write_scanner(&self, files: &impl Files) {
-        let text = {
-            let mut known = held(&self.scanner);
-            let is_news = std::mem::take(&mut known.1);
-            known.0.as_ref().filter(|_| is_news).map(|(scanner, port)| scanner::text(scanner, port))
-        };
-        if let Some(text) = text
-            && let Err(failure) = files.write(&scanner_of(&self.sensor), &text)
-        {
-            tracing::warn!("{}: {}; {}", self.sensor, failure.message, failure.hint);
-        }
-    }
-}
-
-/// Returns the scanner that the search of `link` found last, and its port.
-fn known_scanner(link: &Link, files: &impl Files) -> Option<(KnownScanner, String)> {
-    if link.family().is_some() {
-        return None;
-    }
-    let text = files.read(&scanner_of(&link.name), rate::LONGEST).unwrap_or_else(|failure| {
-        tracing::warn!("{}: {}; {}", link.name, failure.message, failure.hint);
-        None
-    })?;
-    scanner::read(&text).map(|(scanner, port)| (scanner, port.to_owned()))
 }
 
 /// Lets `link` begin with what is kept for it, if it fits and nothing else was said; when that was written, else 0.
@@ -313,16 +266,6 @@ fn recall(link: &mut Link, files: &impl Files, now_wall_ns: u64) -> u64 {
     }
 }
 
-/// The rate that is known of the sensor of `link`, and its port. On a line whose rate cannot be changed none is sought.
-fn known_rate(link: &Link, files: &impl Files) -> Option<(KnownRate, String)> {
-    let Source::Tty(_) = link.port else { return None };
-    let text = files.read(&rate_of(&link.name), rate::LONGEST).unwrap_or_else(|failure| {
-        tracing::warn!("{}: {}; {}", link.name, failure.message, failure.hint);
-        None
-    })?;
-    rate::read(&text).map(|(rate, port)| (rate, port.to_owned()))
-}
-
 /// What a thread that panicked held is whole: each is replaced at once.
 fn held<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
@@ -330,14 +273,6 @@ fn held<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
 
 fn background_of(sensor: &str) -> String {
     format!("{sensor}.background.json")
-}
-
-fn scanner_of(sensor: &str) -> String {
-    format!("{sensor}.scanner")
-}
-
-fn rate_of(sensor: &str) -> String {
-    format!("{sensor}.rate")
 }
 
 /// Between two writes of a generation: what a hub that is killed had learned since is learned again.
