@@ -1,12 +1,12 @@
-//! The page: its markup, its style and its script in one answer, and the policy by which a browser runs this script and no
-//! other.
+//! The page: markup, style and script in one response, and the policy that lets a browser run only this script. Style and script
+//! are sent without comments and indentation.
 
 use data_encoding::BASE64;
 use sha2::{Digest, Sha256};
 
 const MARKUP: &str = include_str!("../page/page.html");
 const STYLE: &str = include_str!("../page/page.css");
-/// One script, in the order in which it is read: a file for each of its concerns.
+/// The files of the script, in the order in which the browser reads them.
 const SCRIPT: &str = concat!(
     include_str!("../page/known.js"),
     include_str!("../page/wire.js"),
@@ -29,8 +29,9 @@ pub(crate) struct Page {
 impl Page {
     pub(crate) fn new() -> Page {
         let hash = |text: &str| BASE64.encode(&Sha256::digest(text));
-        let body = MARKUP.replace("/* page.css */", STYLE).replace("/* page.js */", SCRIPT);
-        Page { body, hashes: [hash(SCRIPT), hash(STYLE)] }
+        let (script, style) = (compact(SCRIPT), compact(STYLE));
+        let body = MARKUP.replace("/* page.css */", &style).replace("/* page.js */", &script);
+        Page { body, hashes: [hash(&script), hash(&style)] }
     }
 
     /// The policy of the page as `host`: an address of a WebSocket is not every browser's 'self'.
@@ -43,18 +44,38 @@ impl Page {
     }
 }
 
+/// Returns `text` without indentation, empty lines, and comments that start a line.
+fn compact(text: &str) -> String {
+    let (mut compact, mut is_comment) = (String::with_capacity(text.len()), false);
+    for line in text.lines().map(str::trim_start) {
+        is_comment |= line.starts_with("/*");
+        if !is_comment && !line.is_empty() && !line.starts_with("//") {
+            compact.push_str(line);
+            compact.push('\n');
+        }
+        is_comment &= !line.ends_with("*/");
+    }
+    compact
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
 
     #[test]
-    fn the_page_is_one_small_answer_without_anybody_elses_parts() {
+    fn page_is_one_small_response_without_external_parts() {
         let page = Page::new();
         assert!(page.body.len() < 60_000, "{} bytes", page.body.len());
-        assert!(page.body.contains(STYLE) && page.body.contains(SCRIPT));
+        assert!(page.body.contains(&compact(STYLE)) && page.body.contains(&compact(SCRIPT)));
         assert!(!page.body.contains("https://") && !page.body.contains("src="), "nothing is loaded");
         assert!(!SCRIPT.contains("</script") && !STYLE.contains("</style"));
         assert!(!SCRIPT.contains("innerHTML"), "names from elsewhere stay text");
+    }
+
+    #[test]
+    fn comments_and_indentation_are_not_sent() {
+        let text = "/** Two\n * lines. */\nif (a) {\n  // No.\n\n  b(\"//c\"); // Yes.\n}\n/* One. */\nd\n";
+        assert_eq!(compact(text), "if (a) {\nb(\"//c\"); // Yes.\n}\nd\n");
     }
 
     /// The colour `name` of the light and of the dark page, as 8-bit red, green and blue.
