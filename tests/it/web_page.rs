@@ -193,3 +193,20 @@ fn the_picture_of_the_documents() {
         assert!(page.complaints.is_empty(), "{:?}", page.complaints);
     }
 }
+/// Returns a script that counts the pixels with the color `name` in the first sensor's curve of damage.
+fn curve(name: &str) -> String {
+    format!(
+        "(() => {{
+            const probe = document.body.appendChild(document.createElement('i'));
+            probe.style.color = 'var(--{name})';
+            const wanted = getComputedStyle(probe).color.match(/\\d+/g).map(Number);
+            probe.remove();
+            const canvas = document.querySelectorAll('#sensors canvas')[2];
+            const {{ data }} = canvas.getContext('2d').getImageData(0, 0, canvas.width, canvas.height);
+            let count = 0;
+            for (let i = 0; i < data.length; i += 4) count += data[i + 3] > 100 && wanted.every((one, n) => Math.abs(one - data[i + n]) < 30);
+            return count;
+        }})()"
+    )
+}
+

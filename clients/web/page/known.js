@@ -7,7 +7,8 @@ const map = $("map");
 let pen = map.getContext("2d");
 
 const sensors = new Map(); // by namespace, as "/front"
-let robot = {}; // what was said of it last
+let robot = {}; // the last message about it
+let session = null; // ID of the server's run
 let circles = [];
 let beams = []; // that violate a circle
 let marks = [];
@@ -27,11 +28,11 @@ const TRAIL_MS = 1600;
 const TRAIL_STEP_MS = 90;
 const HISTORY_MS = 120_000;
 
-/** The one of `all` that a topic is of; `made` where there was none. */
+/** Returns the entry of `all` that a topic belongs to, and creates it with `made`. It belongs to this run of the server. */
 function owner(all, topic, made) {
   const space = topic.slice(0, topic.lastIndexOf("/"));
   if (!all.has(space)) all.set(space, { space, name: space.slice(1).replaceAll("/", "."), ...made() });
-  return all.get(space);
+  return Object.assign(all.get(space), { session });
 }
 
 /** Of a sensor, and of who makes sweeps, that sees nothing. */
@@ -56,4 +57,27 @@ function forget() {
   for (const one of sweeps.values()) Object.assign(one, empty());
   [circles, beams, marks, walls, corners] = [[], [], [], [], []];
   people.clear();
+}
+
+/** Removes the entries of other runs of the server. A frozen picture keeps them until its release. */
+function dropOthers() {
+  if (kept) return;
+  for (const all of [sensors, sweeps]) {
+    for (const [space, one] of all) {
+      if (one.session === session) continue;
+      one.card?.card.remove();
+      all.delete(space);
+      if (only === space) only = null;
+    }
+  }
+}
+
+/** Starts with the run `id` of the server. Nothing of another run is valid. */
+function enter(id) {
+  if (session !== null && id !== session) {
+    forget();
+    [robot, heard, player] = [{}, -Infinity, null];
+  }
+  session = id;
+  dropOthers();
 }

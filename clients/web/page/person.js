@@ -69,6 +69,7 @@ const actions = {
     const waiting = kept;
     kept = waiting ? null : new Map();
     if (waiting && isHeldGone) forget();
+    dropOthers();
     for (const [topic, [buffer, offset]] of waiting ?? []) show(topic, buffer, offset);
     press(buttonOf("hold"), Boolean(kept));
     tell();

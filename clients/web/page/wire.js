@@ -232,7 +232,8 @@ function connect() {
       return;
     }
     const said = JSON.parse(data);
-    if (said.op === "advertise") {
+    if (said.op === "serverInfo") enter(said.sessionId);
+    else if (said.op === "advertise") {
       for (const { id, topic } of said.channels) {
         topics.set(id, topic);
         if (lastWord(topic) === "cloud") sweepAt(topic);

@@ -161,7 +161,7 @@ function tellSensors() {
     if (!status) return;
     if (!sensor.card) makeCard(sensor);
     const { card, title, state, kind, trouble, fields } = sensor.card;
-    const isHere = isHeard() && robot.hub;
+    const isHere = isHeard() && robot.hub && sensor.session === session;
     const word = isHere ? status.state : "unheard";
     const isLossy = status.loss > WELL;
     card.className = [word, isLossy ? "lossy" : "", shown().includes(sensor) ? "" : "off"].join(" ");
