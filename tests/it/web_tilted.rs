@@ -153,6 +153,19 @@ fn a_hall_is_seen_from_the_side_while_somebody_looks() {
     page.await_true(&format!("{SIDE}.offsetHeight >= 40"));
     assert_eq!(hall.env.subscribers("hall/cloud"), 0, "points are not seen from above");
     page.press("h");
+    // The floor is in front of a background in two dimensions, whose beams had another angle.
+    page.await_true("scanhub.sweeps[0].sweep !== undefined && scanhub.foreground === 0");
+    let most = "new Promise((done) => {
+        const until = scanhub.scans.front + 40;
+        let most = 0;
+        const look = () => {
+            most = Math.max(most, scanhub.foreground);
+            if (scanhub.scans.front < until) requestAnimationFrame(look); else done(most);
+        };
+        look();
+    })";
+    assert_eq!(page.ask(most), 0);
+    assert_eq!(page.ask("scanhub.axes"), 2);
     page.await_true(&format!("scanhub.aside && {SIDE}.ariaPressed === 'true'"));
     page.await_true("scanhub.swept > 1000 && scanhub.obstacles > 0 && scanhub.reason === null");
     assert_eq!(hall.env.subscribers("hall/cloud"), 1);

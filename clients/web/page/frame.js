@@ -2,18 +2,20 @@
 
 function drawFromAbove(now) {
   const seen = shown();
+  // Background and foreground in two dimensions have no meaning for a scanner on a mount: they change with its angle.
+  const level = seen.filter((sensor) => sensor !== tiltedSensor());
   if (layers.field) seen.forEach(drawField);
   if (layers.grid) drawGrid();
   if (layers.background) {
     pen.fillStyle = colours.old;
-    for (const sensor of seen) dots(sensor.background, 2.5, poseOf(sensor));
+    for (const sensor of level) dots(sensor.background, 2.5, poseOf(sensor));
   }
-  if (layers.trails) for (const sensor of seen) drawTrail(sensor, now);
+  if (layers.trails) for (const sensor of level) drawTrail(sensor, now);
   if (layers.zones) drawn.zones = drawZones();
   if (layers.scan) for (const sensor of seen) drawn.beams += drawScan(sensor);
   if (layers.foreground) {
     pen.fillStyle = colours.new;
-    for (const sensor of seen) drawn.foreground += dots(sensor.foreground, 5, poseOf(sensor));
+    for (const sensor of level) drawn.foreground += dots(sensor.foreground, 5, poseOf(sensor));
   }
   if (layers.lines) drawn.lines = drawLines();
   if (layers.marks) drawn.marks = drawMarks();

@@ -73,6 +73,12 @@ function fit() {
   const seen = allPoints();
   // Where a picture ends some hundred points tell as well as thousands.
   const stride = 2 * ceil(seen.reduce((sum, { points }) => sum + points.length, 0) / 1000);
+/** Returns the scanner on a mount if it is known which one that is, because this machine has only one. */
+function tiltedSensor() {
+  const own = everySensor().filter(({ status }) => status && !status.remote);
+  return everySweep().some(({ sweep }) => sweep) && own.length === 1 ? own[0] : null;
+}
+
   const [xs, ys] = [[], []];
   for (const { points, pose } of seen) {
     const [a, b, c, d, e, f] = onScreen(pose);

@@ -45,17 +45,21 @@ function put(element, text) {
   if (element.textContent !== text) element.textContent = text;
 }
 
-/** The verdict in words; with each frame, so that words and circles are of one moment. */
+/** Writes the verdict. Called for each frame, so that text and zones describe the same moment. */
 function tellVerdict() {
+  // Zones are around the robot, whose position in the map of a site is unknown.
+  const isMap = isHeard() && robot.hub && robot.map;
   const word = verdict();
   const box = $("verdict");
-  box.className = word;
+  box.className = isMap ? "map" : word;
+  box.hidden = isMap && !kept;
+  box.firstElementChild.hidden = isMap;
   put(box.firstElementChild, word.toUpperCase());
   const { sensor, nearest_m, hub_words: hub } = isHeard() ? robot : {};
-  const nearest = nearest_m?.toFixed(2);
-  put(box.lastElementChild, [sensor, nearest && `nearest ${nearest} m`].filter(Boolean).join(", ") + (kept ? "  ·  picture held" : ""));
+  const nearest = isMap ? "" : [sensor, nearest_m && `nearest ${nearest_m.toFixed(2)} m`].filter(Boolean).join(", ");
+  put(box.lastElementChild, [nearest, kept && "picture held"].filter(Boolean).join("  ·  "));
   put($("hub"), hub ?? "");
-  put($("title"), `${word.toUpperCase()} – scanhub`);
+  put($("title"), isMap ? "scanhub" : `${word.toUpperCase()} – scanhub`);
 }
 
 function lose(one, left) {
