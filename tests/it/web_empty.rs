@@ -84,7 +84,8 @@ fn a_sensor_that_loses_on_its_line_is_amber_and_says_how_much() {
     page.open(&format!("http://{host}/"));
     let card = "document.querySelector('#sensors article.streaming.lossy')";
     page.await_true(&format!(
-        "/^[1-9][0-9.]* % of its line is damaged or lost/.test({card}?.querySelector('.trouble').innerText)"
+        "/^[1-9][0-9.]* % of its simulated line is damaged or lost: simulated faults/\
+         .test({card}?.querySelector('.trouble').innerText)"
     ));
     let amber = colour(&mut page, "slow");
     assert_eq!(page.ask(&format!("getComputedStyle({card}.querySelector('.trouble')).color")), amber);

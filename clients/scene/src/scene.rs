@@ -1,8 +1,8 @@
 //! What is known of the robot and its surroundings: the last sample of each topic of each sensor. Time is an argument.
 
 use schema::{
-    Background, Counter, Foreground, Header, Lines, Mark, Marks, Scan, State, Status, Tracks, Verdict, Zones,
-    is_remote,
+    Background, Counter, Flags, Foreground, Header, Lines, Mark, Marks, Scan, State, Status, Tracks, Verdict,
+    Zones, is_remote,
 };
 
 use crate::meter::Meter;
@@ -61,6 +61,8 @@ pub struct Sensor {
     foreground_of: u64,
     /// When the scan is too old to be shown as what is there, in ns of CLOCK_MONOTONIC.
     old_at_ns: u64,
+    /// Flags of the header of the last scan.
+    flags: u8,
 }
 
 impl Scene {
@@ -171,7 +173,18 @@ impl Sensor {
             scan_of: 0,
             foreground_of: 0,
             old_at_ns: 0,
+            flags: 0,
         }
+    }
+
+    /// Returns whether the last scan came from a simulator.
+    pub fn is_simulated(&self) -> bool {
+        self.flags & Flags::SIMULATED != 0
+    }
+
+    /// Returns whether the last scan came from a recording.
+    pub fn is_replayed(&self) -> bool {
+        self.flags & Flags::REPLAYED != 0
     }
 
     /// Takes a scan that arrived at `now_ns`.
@@ -183,6 +196,7 @@ impl Sensor {
         let brightest = scan.intensities().iter().max().map_or(1.0, f64::from);
         self.brightest = brightest.max(FADING * self.brightest).max(1.0);
         self.scan_of = header.seq;
+        self.flags = header.flags;
         self.leave_trail(now_ns);
     }
 

@@ -174,9 +174,8 @@ function tellSensors() {
     put(state, word + (status.frozen ? ", frozen" : ""));
     put(kind, [status.family, status.model, status.port].filter(Boolean).join(" · "));
     const told = isHere && status.trouble;
-    const lossWords = isLossy && isHere && `${percent(status.loss)} of its line is damaged or lost: check cable, ground and rate`;
-    put(trouble, told ? [told.what, told.remedy].filter(Boolean).join(": ") : lossWords || "");
-    for (const { field, number, line, series, text } of fields) {
+    put(trouble, told ? [told.what, told.remedy].filter(Boolean).join(": ") : isLossy && isHere ? lossWords(status) : "");
+    for (const { field, number, line, scale, series, text } of fields) {
       put(number, isHere ? text(status) : "–");
       field.className = series === "loss" && isLossy ? "amber" : "";
       if (line) sparkline(line, sensor.history, series);
@@ -184,7 +183,23 @@ function tellSensors() {
   });
 }
 
-/** The last two minutes; the middle of a bare line is no trouble, so it begins at 0. */
+/** Returns the reason of the losses on a line, or the remedy. */
+function lossWords({ loss, simulated, replayed }) {
+  const line = simulated ? "simulated line" : replayed ? "recorded line" : "line";
+  const remedy = replayed ? "" : simulated ? ": simulated faults, or this machine is too busy" : ": check cable, ground and rate";
+  return `${percent(loss)} of its ${line} is damaged or lost${remedy}`;
+}
+
+/** Text of a sparkline's scale, which ends at `top`. */
+const SCALES = { hz: (top) => `0–${top} Hz`, age: (top) => `p99, 0–${top} ms`, loss: (top) => `0–${fixed(100 * top, 0)} %` };
+
+/** Returns the next round value above `value`. */
+function roundUp(value) {
+  const power = 10 ** floor(Math.log10(value));
+  return power * [1, 2, 5, 10].find((step) => step * power >= value || step === 10);
+}
+
+/** Draws the last two minutes, from 0 on, because the middle of an empty curve does not mean trouble. Returns the scale as text. */
 function sparkline(canvas, history, series) {
   const { clientWidth: width, clientHeight: height } = canvas;
   const now = performance.now();

@@ -119,7 +119,8 @@ fn hub_words(scene: &Scene, domain: &str) -> String {
     format!("domain {domain}{pid}{load}")
 }
 
-/// State, rate, ages and losses of `sensor`, and where it sits as far as that was told.
+/// Encodes state, rate, ages and losses of `sensor`, its pose if that is known, and whether its scans come from a simulator
+/// or a recording.
 pub fn status(sensor: &Sensor) -> Vec<u8> {
     #[derive(Serialize)]
     struct Told<'a> {
@@ -139,6 +140,8 @@ pub fn status(sensor: &Sensor) -> Vec<u8> {
         age_p50_ms: Option<f64>,
         age_p99_ms: Option<f64>,
         frozen: bool,
+        simulated: bool,
+        replayed: bool,
         taught: Option<u32>,
         objects: Option<usize>,
         marks: Option<usize>,
@@ -179,6 +182,8 @@ pub fn status(sensor: &Sensor) -> Vec<u8> {
         age_p50_ms: ages.map(|(half, _)| half),
         age_p99_ms: ages.map(|(_, most)| most),
         frozen: sensor.is_frozen(),
+        simulated: sensor.is_simulated(),
+        replayed: sensor.is_replayed(),
         taught: sensor.background.as_ref().map(|model| u32::from(model.taught)),
         objects: sensor.foreground.as_ref().map(|foreground| foreground.segments().len()),
         marks: sensor.marks.map(|marks| marks.marks().len()),
