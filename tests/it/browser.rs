@@ -73,18 +73,23 @@ impl Browser {
         for domain in ["Page", "Runtime", "Log"] {
             browser.call(&format!("{domain}.enable"), json!({}));
         }
+        browser.set_look(look);
+        Some(browser)
+    }
+
+    /// Changes the size of the window, the color scheme and the kind of device.
+    pub(crate) fn set_look(&mut self, look: Look) {
         let Look { width, height, scheme, is_phone } = look;
         let ratio = if is_phone { 2 } else { 1 };
         let screen =
             json!({ "width": width, "height": height, "deviceScaleFactor": ratio, "mobile": is_phone });
-        browser.call("Emulation.setDeviceMetricsOverride", screen);
-        // Without movement the picture is where it is to be with the next frame, however long a frame takes here.
+        self.call("Emulation.setDeviceMetricsOverride", screen);
+        // Without motion, the view is in its final place with the next frame, however long a frame takes.
         let features = json!([
             { "name": "prefers-color-scheme", "value": scheme },
             { "name": "prefers-reduced-motion", "value": "reduce" },
         ]);
-        browser.call("Emulation.setEmulatedMedia", json!({ "features": features }));
-        Some(browser)
+        self.call("Emulation.setEmulatedMedia", json!({ "features": features }));
     }
 
     pub(crate) fn open(&mut self, url: &str) {

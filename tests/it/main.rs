@@ -103,6 +103,7 @@ mod web_channels;
 mod web_crowd;
 mod web_empty;
 mod web_families;
+mod web_layout;
 mod web_page;
 mod web_replay;
 mod web_tilted;

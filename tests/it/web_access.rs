@@ -81,6 +81,10 @@ fn the_keyboard_alone_is_enough() {
     page.await_true(&pressed("[data-do=fit]"));
     page.press("l");
     page.await_true("document.querySelector('#layers').classList.contains('open')");
+    let keys = "[...document.querySelectorAll('#layers kbd')].map((one) => one.innerText).join(' ')";
+    assert_eq!(page.ask(keys), "s i f t b z m e o v g");
+    page.await_true("document.querySelector('#scale').innerText.startsWith('0') && !document.querySelector('#scale').hidden");
+    page.await_true("[...document.querySelectorAll('#layers button')].every((one) => one.ariaLabel && one.offsetHeight > 0)");
     // A dialogue takes the keyboard, and gives it back.
     page.ask("document.querySelector('[data-do=layers]').focus()");
     page.press("?");

@@ -100,6 +100,47 @@ fn it_shows_what_comes_and_says_why_nothing_does() {
 }
 
 #[test]
+fn page_drops_sensors_of_previous_server() {
+    let (first, second) = (TestEnv::new(), TestEnv::new());
+    let Some(mut page) = browse(&first, Look::LAPTOP) else { return };
+    let simulators = [
+        first.simulator(&["front", "rear"], &["--seed=71", "--baud=500000"]),
+        second.simulator(&["rear"], &["--seed=72", "--baud=500000"]),
+    ];
+    let hubs = [first.hub(&[first.link("front"), first.link("rear")]), second.hub(&[second.link("rear")])];
+    let (server, url) = web(&first, "127.0.0.1:0");
+    page.open(&url);
+    let titles = "[...document.querySelectorAll('#sensors h2 button')].map((one) => one.textContent).join()";
+    page.await_true(&format!("window.scanhub?.beams > 600 && {titles} === '1  front,2  rear'"));
+    page.press("1");
+    page.await_true("scanhub.beams > 0 && scanhub.beams <= 361");
+
+    // A frozen picture keeps what it shows, but its sensors are no longer reported as streaming.
+    hold(&mut page, "scanhub.beams > 100");
+    let address = url.trim_start_matches("http://").trim_end_matches('/').to_owned();
+    assert_eq!(server.end(INT).code, Some(0));
+    page.await_true("/No connection/.test(scanhub.reason)");
+    let (server, _) = web(&second, &address);
+    let states = "[...document.querySelectorAll('#sensors article')].map((one) => one.classList[0]).join()";
+    page.await_true(&format!("{titles} === '1  front,2  rear' && {states} === 'unheard,streaming'"));
+    assert!(page.ask("scanhub.beams").as_u64() > Some(100));
+    page.press(" ");
+    page.await_true(&format!("{titles} === '1  rear' && {states} === 'streaming' && scanhub.beams > 100"));
+
+    // Without a frozen picture, the sensors are dropped as soon as the page has connected.
+    assert_eq!(server.end(INT).code, Some(0));
+    page.await_true("/No connection/.test(scanhub.reason)");
+    let (server, _) = web(&first, &address);
+    page.await_true(&format!("{titles} === '1  front,2  rear' && scanhub.beams > 600"));
+    assert_eq!(server.end(INT).code, Some(0));
+    page.await_true("/No connection/.test(scanhub.reason)");
+    let (_server, _) = web(&second, &address);
+    page.await_true(&format!("{titles} === '1  rear' && {states} === 'streaming' && scanhub.beams > 100"));
+    assert!(page.complaints.is_empty(), "{:?}", page.complaints);
+    drop((simulators, hubs));
+}
+
+#[test]
 fn keys_and_the_mouse_change_the_picture() {
     let env = TestEnv::new();
     let Some(mut page) = browse(&env, Look::PHONE) else { return };
@@ -155,6 +196,23 @@ fn keys_and_the_mouse_change_the_picture() {
     assert!(page.complaints.is_empty(), "{:?}", page.complaints);
 }
 
+/// Returns a script that counts the pixels with the color `name` in the first sensor's curve of damage.
+fn curve(name: &str) -> String {
+    format!(
+        "(() => {{
+            const probe = document.body.appendChild(document.createElement('i'));
+            probe.style.color = 'var(--{name})';
+            const wanted = getComputedStyle(probe).color.match(/\\d+/g).map(Number);
+            probe.remove();
+            const canvas = document.querySelectorAll('#sensors canvas')[2];
+            const {{ data }} = canvas.getContext('2d').getImageData(0, 0, canvas.width, canvas.height);
+            let count = 0;
+            for (let i = 0; i < data.length; i += 4) count += data[i + 3] > 100 && wanted.every((one, n) => Math.abs(one - data[i + n]) < 30);
+            return count;
+        }})()"
+    )
+}
+
 /// As in the documents: `SCANHUB_PICTURES=docs cargo test --test it the_picture_of_the_documents` makes those anew, each when a
 /// minute is over. They are of a recording, because a simulator that has to wait for a busy machine loses bytes.
 #[test]
@@ -176,6 +234,12 @@ fn the_picture_of_the_documents() {
         page.await_true(seen);
         page.await_true("scanhub.zones === 2 && scanhub.marks >= 2 && scanhub.sensors.length === 2");
         page.await_true("document.querySelectorAll('#sensors article.streaming').length === 2");
+        // The recording has no damage, so the curve of the damage is gray.
+        page.await_true(&format!("{} > 0 && {} === 0", curve("soft"), curve("slow")));
+        page.await_true(
+            "/^0–50 Hz, 2 min; p99, 0–[125]0* ms, 2 min; 0–1 %, 2 min$/.test(\
+             [...document.querySelectorAll('#sensors article:first-child small')].map((one) => one.innerText).join('; '))",
+        );
         if let Some(directory) = &directory {
             for _ in 0..6 {
                 page.ask("new Promise((done) => setTimeout(done, 10_000))");
@@ -193,20 +257,3 @@ fn the_picture_of_the_documents() {
         assert!(page.complaints.is_empty(), "{:?}", page.complaints);
     }
 }
-/// Returns a script that counts the pixels with the color `name` in the first sensor's curve of damage.
-fn curve(name: &str) -> String {
-    format!(
-        "(() => {{
-            const probe = document.body.appendChild(document.createElement('i'));
-            probe.style.color = 'var(--{name})';
-            const wanted = getComputedStyle(probe).color.match(/\\d+/g).map(Number);
-            probe.remove();
-            const canvas = document.querySelectorAll('#sensors canvas')[2];
-            const {{ data }} = canvas.getContext('2d').getImageData(0, 0, canvas.width, canvas.height);
-            let count = 0;
-            for (let i = 0; i < data.length; i += 4) count += data[i + 3] > 100 && wanted.every((one, n) => Math.abs(one - data[i + n]) < 30);
-            return count;
-        }})()"
-    )
-}
-

@@ -146,13 +146,13 @@ fn a_hall_is_seen_from_the_side_while_somebody_looks() {
     page.press("h");
     let is_plain = format!("{SIDE}.hidden && !scanhub.aside && {SWEPT} === ''");
     page.await_true(&is_plain);
+    page.await_true("scanhub.foreground > 0");
 
     let tilt = hall.tilt(&["--as=hall", NEAR]);
     page.await_true(&format!("!{SIDE}.hidden && /^hall: /.test({SWEPT})"));
     page.await_true("scanhub.obstacles > 0 && scanhub.beams > 100");
     page.await_true(&format!("{SIDE}.offsetHeight >= 40"));
     assert_eq!(hall.env.subscribers("hall/cloud"), 0, "points are not seen from above");
-    page.press("h");
     // The floor is in front of a background in two dimensions, whose beams had another angle.
     page.await_true("scanhub.sweeps[0].sweep !== undefined && scanhub.foreground === 0");
     let most = "new Promise((done) => {
@@ -166,11 +166,16 @@ fn a_hall_is_seen_from_the_side_while_somebody_looks() {
     })";
     assert_eq!(page.ask(most), 0);
     assert_eq!(page.ask("scanhub.axes"), 2);
+    page.press("h");
     page.await_true(&format!("scanhub.aside && {SIDE}.ariaPressed === 'true'"));
     page.await_true("scanhub.swept > 1000 && scanhub.obstacles > 0 && scanhub.reason === null");
     assert_eq!(hall.env.subscribers("hall/cloud"), 1);
     page.await_true(&format!("/^hall: [1-9][0-9]* obstacles?, nearest 1\\.[3-5] m/.test({SWEPT})"));
     page.await_true("document.querySelector('#map').ariaLabel.includes('from the side')");
+    // The axes have names, and the floor is at the bottom of the free part of the picture.
+    page.await_true("scanhub.axes === 2");
+    let floor = "document.querySelector('nav').getBoundingClientRect().top - scanhub.screen(0, 0)[1]";
+    page.await_true(&format!("{floor} > 20 && {floor} < 120"));
     // To the right is ahead, and up is up.
     let place = "scanhub.screen(1, -2).map(Math.round).join() !== scanhub.screen(0, 0).map(Math.round).join() && \
                  scanhub.screen(1, -2)[0] > scanhub.screen(0, 0)[0] && scanhub.screen(1, -2)[1] < scanhub.screen(0, 0)[1]";

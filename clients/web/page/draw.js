@@ -77,30 +77,61 @@ function label(text, x, y) {
   pen.fillText(text, x, y);
 }
 
-function drawGrid() {
-  const step = STEPS.find((length) => length * view.scale >= 64) ?? 100;
-  const reach = hypot(size.width, size.height) / view.scale / 2 + step;
-  const digits = step < 0.1 ? 2 : step < 1 ? 1 : 0;
-  // Where a circle crosses the axis stands what that is.
-  const isBare = (n) => n !== 0 && !(layers.zones && !isAside() && circles.some(({ radius }) => abs(abs(n * step) - radius) * view.scale < 26));
-  const ways = [
-    { centre: view.x, at: (n, other) => toScreen(n * step, other), other: view.y, right: 13 * cos, down: 13 * sin, sign: 1 },
-    { centre: view.y, at: (n, other) => toScreen(other, n * step), other: view.x, right: -11 * sin, down: 11 * cos, sign: isAside() ? -1 : 1 },
+/** Returns both axes, upright first: where index `n` of a grid line is, and the side on which the axis has its numbers. */
+function axes() {
+  return [
+    { centre: view.x, at: (n, other) => toScreen(n, other), other: view.y, right: cos, down: sin, sign: 1,
+      name: isAside() ? "height, m" : "x ahead, m" },
+    { centre: view.y, at: (n, other) => toScreen(other, n), other: view.x, right: -sin, down: cos, sign: isAside() ? -1 : 1,
+      name: isAside() ? `${toTheSide()} along the floor, m` : "y left, m" },
   ];
+}
+
+/** Distance of grid lines in meters. */
+const gridStep = () => STEPS.find((length) => length * view.scale >= 64) ?? 100;
+const gridReach = () => hypot(size.width, size.height) / view.scale / 2 + gridStep();
+
+/** Returns whether a text of this width at a place of the screen is not covered. */
+const isFree = ([x, y], width) => x > width / 2 + 8 && x < middle.width - width / 2 - 8 && abs(y - middle.y) < middle.height / 2 - 8;
+
+function drawGrid() {
+  const [step, reach] = [gridStep(), gridReach()];
+  const digits = step < 0.1 ? 2 : step < 1 ? 1 : 0;
+  // The label of a zone takes the place of a number.
+  const isBare = (n) => n !== 0 && !(layers.zones && !isAside() && circles.some(({ radius }) => abs(abs(n * step) - radius) * view.scale < 26));
   const each = (act) => {
-    for (const way of ways) for (let n = ceil((way.centre - reach) / step); n * step <= way.centre + reach; n++) act(n, way);
+    for (const axis of axes()) for (let n = ceil((axis.centre - reach) / step); n * step <= axis.centre + reach; n++) act(n, axis);
   };
   for (const isAxis of [false, true]) {
     ink(isAxis ? colours.axis : colours.grid, 1);
-    each((n, { at, other }) => { if ((n === 0) === isAxis) stroke(at(n, other - reach), at(n, other + reach)); });
+    each((n, { at, other }) => { if ((n === 0) === isAxis) stroke(at(n * step, other - reach), at(n * step, other + reach)); });
   }
   ink(colours.soft, 1);
   font(11, "middle");
   each((n, { at, right, down, sign }) => {
-    const [x, y] = at(n, 0);
-    const isFree = x > 20 && x < middle.x + middle.width / 2 - 20 && y > 64 && y < middle.y + middle.height / 2 - 8;
-    if (isBare(n) && isFree) label((sign * n * step).toFixed(digits), x + right, y + down);
+    const [x, y] = at(n * step, 0);
+    if (isBare(n) && isFree([x, y], 24)) label((sign * n * step).toFixed(digits), x + 13 * right, y + 11 * down);
   });
+}
+
+/** Writes the name of each axis near its positive end, between two numbers. Called last, so that points do not hide it. */
+function drawAxisNames() {
+  const [step, reach] = [gridStep(), gridReach()];
+  ink(colours.soft, 1);
+  font(11, "middle");
+  for (const { at, right, down, sign, name, centre } of axes()) {
+    const { width } = pen.measureText(name);
+    const apart = abs(right) * (width / 2 + 7) + abs(down) * 25;
+    const last = sign * floor((sign * centre + reach) / step);
+    for (let back = 0.5; back * step < 2 * reach; back++) {
+      const [x, y] = at((last - sign * back) * step, 0);
+      const place = [x + right * apart, y + down * apart];
+      if (!isFree(place, width)) continue;
+      drawn.axes += 1;
+      label(name, ...place);
+      break;
+    }
+  }
 }
 
 function drawRobot() {

@@ -20,10 +20,11 @@ function drawFromAbove(now) {
   if (layers.lines) drawn.lines = drawLines();
   if (layers.marks) drawn.marks = drawMarks();
   drawn.tracks = drawPeople();
-  // Where the robot is in a map of a site nobody knows.
+  // The robot's position in the map of a site is unknown.
   if (!robot.map) drawRobot();
   if (layers.obstacles && !robot.map) drawn.obstacles = drawObstacles();
   drawSensors();
+  if (layers.grid) drawAxisNames();
 }
 
 function draw(now) {
@@ -70,6 +71,8 @@ function resize() {
   for (const one of views) one.isFitted = false;
   isFitDue = true;
   size = { width: innerWidth, height: innerHeight, ratio: min(devicePixelRatio || 1, 3) };
+  covered = { top: 0, right: 0, bottom: 0 };
+  measure();
   map.width = Math.round(size.width * size.ratio);
   map.height = Math.round(size.height * size.ratio);
   wake();

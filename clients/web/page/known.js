@@ -20,7 +20,7 @@ let player = null; // of the recording that this server plays, if it does
 let heard = -Infinity; // when the verdict came last
 let frames = 0;
 const ages = []; // moment of a scan, and of the end of the frame that shows it, in ms since 1970, by one machine's clock
-const drawn = { beams: 0, foreground: 0, zones: 0, marks: 0, lines: 0, tracks: 0, obstacles: 0, swept: 0 };
+const drawn = { beams: 0, foreground: 0, zones: 0, marks: 0, lines: 0, tracks: 0, obstacles: 0, swept: 0, axes: 0 };
 
 const SILENT_MS = 500; // after which the verdict is not known
 const OLD_MS = 1000; // after which a scan is not what is there

@@ -91,7 +91,11 @@ for (const button of document.querySelectorAll("nav button")) button.onclick = (
 for (const [layer, [key, name]] of Object.entries(LAYERS)) {
   const button = make("button", $("layers"));
   button.dataset.key = key;
-  button.textContent = name;
+  button.ariaLabel = name;
+  button.setAttribute("aria-keyshortcuts", key);
+  make("i", button, layer);
+  make("span", button).textContent = name;
+  make("kbd", button).textContent = key;
   const mark = () => press(button, layers[layer]);
   button.onclick = () => {
     layers[layer] = !layers[layer];
@@ -104,6 +108,23 @@ for (const [layer, [key, name]] of Object.entries(LAYERS)) {
     wake();
   };
   mark();
+}
+
+const scaleBox = make("div");
+scaleBox.id = "scale";
+make("canvas", scaleBox).setAttribute("aria-hidden", "true");
+const scaleTexts = make("small", scaleBox);
+for (let n = 0; n < 3; n++) make("span", scaleTexts);
+document.querySelector("[data-key=i]").after(scaleBox);
+
+// Colors of things that are not in the list of layers, and the view in which they are.
+const LEGEND = [["above", "people", "Person. Numbers count all tracks since the tracker started"],
+  ["aside", "unknown", "Background not known yet"], ["aside", "behind", "Behind the background"]];
+for (const [view, kind, words] of LEGEND) {
+  const line = make("p", $("layers"));
+  line.dataset.view = view;
+  make("i", line, kind);
+  make("span", line).textContent = words;
 }
 
 for (const button of document.querySelectorAll("#player button")) {

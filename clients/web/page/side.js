@@ -22,6 +22,9 @@ function takeObstacles(update, topic) {
     obstacles: boxes.map((one) => ({ ...told(one), ...one.cubes[0] })) });
 }
 
+/** Direction of the horizontal axis of the side view. */
+const toTheSide = () => (view.turn ? "to the right" : "ahead");
+
 const toTheRight = (x, y) => x * Math.cos(view.turn) - y * Math.sin(view.turn);
 
 /** A list of right and up for each class of each sweep; computed once for a sweep and a turn. */
@@ -83,11 +86,10 @@ function drawFromTheSide() {
   const [, floor] = toScreen(0, 0);
   ink(colours.soft, 2);
   stroke([0, floor], [size.width, floor]);
-  font(11, "bottom");
-  label("floor", middle.x + middle.width / 2 - 30, floor - 3);
   drawn.swept = drawPoints();
   drawRobot();
   if (layers.obstacles) drawn.obstacles = drawObstacles();
+  if (layers.grid) drawAxisNames();
 }
 
 const sweepWords = ({ name, sweep, until }) => `${name}: ${sweep?.words ?? (until ? "no sweep any more" : "no sweep yet")}`;

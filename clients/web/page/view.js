@@ -20,14 +20,28 @@ let tape = null; // { from, to } in metres
 let isTape = false;
 let size = { width: 1, height: 1, ratio: 1 };
 
-/** The part of the window that nothing covers. */
-function open() {
+/** Widths of the margins that boxes cover, in pixels. */
+let covered = { top: 0, right: 0, bottom: 0 };
+
+/** Measures the margins. They do not shrink while the window keeps its size: text that changes must not move the picture. */
+function measure() {
+  const box = (name) => document.querySelector(name).getBoundingClientRect();
   const isNarrow = size.width <= 720;
-  const right = isNarrow ? 0 : 320;
-  const bottom = isNarrow ? 60 + ($("sensors").offsetHeight || 0) : player ? 116 : 60;
-  const top = 56;
-  return { x: (size.width - right) / 2, y: top + (size.height - top - bottom) / 2, width: size.width - right,
-    height: size.height - top - bottom };
+  const lower = [isNarrow ? "aside" : "#player", "nav"].map(box).find(({ height }) => height);
+  const now = { top: box("header").bottom + 8, right: isNarrow ? 0 : size.width - box("aside").left, bottom: size.height - lower.top + 8 };
+  const before = covered;
+  covered = Object.fromEntries(Object.entries(now).map(([side, width]) => [side, max(width, before[side])]));
+  if (Object.keys(now).some((side) => covered[side] !== before[side])) {
+    isFitDue = true;
+    wake();
+  }
+}
+
+/** Returns the part of the window that no box covers. */
+function open() {
+  const { top, right, bottom } = covered;
+  const [width, height] = [size.width - right, max(1, size.height - top - bottom)];
+  return { x: width / 2, y: top + height / 2, width, height };
 }
 
 function toScreen(x, y) {
@@ -59,6 +73,12 @@ function place() {
   [cos, sin] = isAside() ? [1, 0] : [Math.cos(view.turn), Math.sin(view.turn)];
 }
 
+/** Returns the scanner on a mount if it is known which one that is, because this machine has only one. */
+function tiltedSensor() {
+  const own = everySensor().filter(({ status }) => status && !status.remote);
+  return everySweep().some(({ sweep }) => sweep) && own.length === 1 ? own[0] : null;
+}
+
 const shown = () => everySensor().filter((sensor) => (only === null ? !sensor.status?.remote || !hasOwn() : sensor.space === only));
 const hasOwn = () => everySensor().some((sensor) => sensor.status && !sensor.status.remote);
 
@@ -73,12 +93,6 @@ function fit() {
   const seen = allPoints();
   // Where a picture ends some hundred points tell as well as thousands.
   const stride = 2 * ceil(seen.reduce((sum, { points }) => sum + points.length, 0) / 1000);
-/** Returns the scanner on a mount if it is known which one that is, because this machine has only one. */
-function tiltedSensor() {
-  const own = everySensor().filter(({ status }) => status && !status.remote);
-  return everySweep().some(({ sweep }) => sweep) && own.length === 1 ? own[0] : null;
-}
-
   const [xs, ys] = [[], []];
   for (const { points, pose } of seen) {
     const [a, b, c, d, e, f] = onScreen(pose);
@@ -92,13 +106,18 @@ function tiltedSensor() {
   if (!xs.length) return;
   const reach = max(0.5, ...(isAside() ? [] : circles.map(({ radius }) => radius))) * 1.08 * view.scale;
   const robotAt = toScreen(0, 0);
+  // The side view shows nothing below the floor, except for points.
+  const below = isAside() ? 0 : reach;
   const [[left, right], [top, bottom]] = [xs, ys].map((unsorted, n) => {
     const values = Float32Array.from(unsorted).sort();
     const out = floor(values.length / 50);
-    return [min(values[out], robotAt[n] - reach), max(values[values.length - 1 - out], robotAt[n] + reach)];
+    return [min(values[out], robotAt[n] - reach), max(values[values.length - 1 - out], robotAt[n] + (n ? below : reach))];
   });
   const scale = (view.scale * min(middle.width / (right - left), middle.height / (bottom - top))) / MARGIN;
-  const [x, y] = toRobot((left + right) / 2, (top + bottom) / 2);
+  // In the side view, the floor is at the bottom, with space for the numbers and the name of its axis.
+  const bottomSpace = min(44, middle.height / 8);
+  const centerY = isAside() ? bottom + ((bottomSpace - middle.height / 2) * view.scale) / scale : (top + bottom) / 2;
+  const [x, y] = toRobot((left + right) / 2, centerY);
   const goal = { scale, x, y };
   const now = view.goal ?? view;
   const moved = hypot(goal.x - now.x, goal.y - now.y) * scale;

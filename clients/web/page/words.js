@@ -26,7 +26,7 @@ function readOut() {
   const [x, y] = toRobot(...(best.screen ?? pointer));
   const bold = make("b");
   bold.textContent = isAside() ? `${fixed(x, 2)} m above the floor` : `${fixed(hypot(x, y), 2)} m from the ${robot.map ? "map's origin" : "robot"}`;
-  const place = isAside() ? `${fixed(-y, 2)} m ${view.turn ? "to the right" : "ahead"}` : `x ${fixed(x, 2)}  y ${fixed(y, 2)} m`;
+  const place = isAside() ? `${fixed(-y, 2)} m ${toTheSide()}` : `x ${fixed(x, 2)}  y ${fixed(y, 2)} m`;
   box.replaceChildren(bold, `\n${place}`, best.words?.(best.beam) ?? "");
   if (!best.screen) return;
   ink(colours.accent, 2);
@@ -85,11 +85,42 @@ function tell() {
     wake();
   }
   if (!kept && !stands()) age(now);
-  put($("people"), (isHeard() && robot.people) || "");
+  put($("people"), peopleWords());
   put($("swept"), everySweep().map(sweepWords).join("; "));
   buttonOf("side").hidden = !sweeps.size;
   tellPlayer();
   explain();
+  tellLegend();
+  measure();
+}
+
+/** Returns who is in which room, and for numbers that are greater than their count, the reason. */
+function peopleWords() {
+  if (!isHeard() || !robot.people) return "";
+  const all = persons();
+  const latest = max(0, ...all.map(({ id }) => Number(id)));
+  return latest > all.length ? `${robot.people}  ·  tracks so far: ${latest}` : robot.people;
+}
+
+/** Writes the scale of the intensities, and the colors of the things that are not in the list of layers. */
+function tellLegend() {
+  const limits = shown().filter(({ scan }) => scan?.byShade.length).map(({ brightest }) => Math.round(brightest));
+  const [limit, ...others] = new Set(limits);
+  $("scale").hidden = limit === undefined || isAside();
+  // Shades follow the root of an intensity.
+  const numbers = others.length ? [0, "", "highest of each sensor"] : [0, limit < 4 ? "" : Math.round(limit / 4), limit];
+  const [canvas, texts] = $("scale").children;
+  [...texts.children].forEach((text, n) => put(text, String(numbers[n])));
+  const { clientWidth: width, clientHeight: height } = canvas;
+  if (width) {
+    drawOn(canvas, () => shadeColours.forEach((shade, n) => {
+      ink(shade, 1);
+      pen.fillRect((n * width) / SHADES, 0, width / SHADES + 1, height);
+    }), width, height);
+  }
+  for (const one of document.querySelectorAll("#layers [data-view]")) {
+    one.hidden = one.dataset.view === "aside" ? !isAside() : !persons().length;
+  }
 }
 
 function tellPlayer() {
@@ -153,8 +184,9 @@ function makeCard(sensor) {
     const value = make("dd", field);
     const number = make("span", value);
     const line = series && make("canvas", value);
-    if (line) line.setAttribute("aria-hidden", "true");
-    sensor.card.fields.push({ field, number, line, series, text });
+    const scale = line && make("small", value);
+    for (const one of [line, scale]) one?.setAttribute("aria-hidden", "true");
+    sensor.card.fields.push({ field, number, line, scale, series, text });
   }
   sensor.card.title.onclick = () => choose(sensor.space);
 }
@@ -178,7 +210,7 @@ function tellSensors() {
     for (const { field, number, line, scale, series, text } of fields) {
       put(number, isHere ? text(status) : "–");
       field.className = series === "loss" && isLossy ? "amber" : "";
-      if (line) sparkline(line, sensor.history, series);
+      if (line) put(scale, sparkline(line, sensor.history, series));
     }
   });
 }
@@ -203,12 +235,14 @@ function roundUp(value) {
 function sparkline(canvas, history, series) {
   const { clientWidth: width, clientHeight: height } = canvas;
   const now = performance.now();
-  const most = max(series === "loss" ? 0.01 : 1, ...history.map((one) => one[series]));
+  const top = roundUp(max(series === "loss" ? 0.01 : 1, ...history.map((one) => one[series])));
+  const isWell = series === "loss" && history.every(({ loss }) => loss <= WELL);
   drawOn(canvas, () => {
     ink(colours.edge, 1);
     stroke([0, height - 0.5], [width, height - 0.5]);
-    ink(series === "loss" ? colours.slow : colours.accent, 1.5);
+    ink(isWell ? colours.soft : series === "loss" ? colours.slow : colours.accent, 1.5);
     pen.lineJoin = "round";
-    stroke(...history.map((one) => [width - ((now - one.at) / HISTORY_MS) * width, height - 1 - (one[series] / (most * 1.15)) * (height - 3)]));
+    stroke(...history.map((one) => [width - ((now - one.at) / HISTORY_MS) * width, height - 1 - (one[series] / top) * (height - 3)]));
   }, width, height);
+  return `${SCALES[series](top)}, ${HISTORY_MS / 60_000} min`;
 }
