@@ -218,7 +218,8 @@ fn an_exchanged_scanner_is_not_reported_as_a_damaged_line() {
     for number in 0..3 {
         let (name, reported) = exchange("", number, 35 * SECOND);
         check_exchange(name, "The search begins after 10 s without it", &reported);
-        let before = reported.iter().rfind(|(now, ..)| *now < EXCHANGED_AT).and_then(|(_, family, _)| *family);
+        let before =
+            reported.iter().rfind(|(now, ..)| *now < EXCHANGED_AT).and_then(|(_, family, _)| *family);
         let (_, family, error) = reported.last().expect("statuses");
         assert!(before.is_some() && family.is_some() && before != *family, "{name}: {reported:#?}");
         assert_eq!(error, "", "{name}: {reported:#?}");

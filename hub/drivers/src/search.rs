@@ -854,7 +854,7 @@ mod tests {
     #[test]
     fn families_whose_rates_the_port_rejects_are_not_looked_for() {
         let mut search = Search::new(PortKind::Serial, None, 0);
-        let (ld, lms) = (ld::Probe::default(), lms::Probe::default());
+        let (ld, lms) = (crate::ld::Probe::default(), crate::lms::Probe::default());
         let rates = |probe: &dyn Probe| probe.approach().rates();
         search.rejected = [rates(&ld), vec![500_000]].concat();
         let coverage = search.coverage();
