@@ -302,8 +302,8 @@ mod tests {
     fn a_link_names_only_a_rate_below_the_highest() {
         let report = inquiry(Family::Lms, None, 0).unwrap().report().clone();
         let family = ("family", "lms".to_owned());
-        assert_eq!(link_settings(&report, 500_000), [family.clone()]);
-        assert_eq!(link_settings(&report, 38_400), [family, ("baud", "38400".to_owned())]);
+        assert_eq!(link_settings(&report, 38_400), [family.clone(), ("baud", "38400".to_owned())]);
+        assert_eq!(link_settings(&report, 500_000), [family]);
     }
 
     #[test]
