@@ -113,16 +113,17 @@ function fit() {
     const out = floor(values.length / 50);
     return [min(values[out], robotAt[n] - reach), max(values[values.length - 1 - out], robotAt[n] + (n ? below : reach))];
   });
-  const scale = (view.scale * min(middle.width / (right - left), middle.height / (bottom - top))) / MARGIN;
   // In the side view, the floor is at the bottom, with space for the numbers and the name of its axis.
-  const bottomSpace = min(44, middle.height / 8);
+  const bottomSpace = isAside() ? min(44, middle.height / 4) : 0;
+  const scale = (view.scale * min(middle.width / (right - left), (middle.height - bottomSpace) / (bottom - top))) / MARGIN;
   const centerY = isAside() ? bottom + ((bottomSpace - middle.height / 2) * view.scale) / scale : (top + bottom) / 2;
   const [x, y] = toRobot((left + right) / 2, centerY);
   const goal = { scale, x, y };
   const now = view.goal ?? view;
   const moved = hypot(goal.x - now.x, goal.y - now.y) * scale;
   // A moving view is hard to read: keep it while it fits.
-  const isOut = scale * MARGIN < now.scale * 0.99 || moved > 0.12 * min(middle.width, middle.height);
+  const isOffFloor = isAside() && abs(goal.x - now.x) * scale > 12;
+  const isOut = scale * MARGIN < now.scale * 0.99 || moved > 0.12 * min(middle.width, middle.height) || isOffFloor;
   if (isOut || now.scale < 0.6 * scale || !view.isFitted) Object.assign(view, { goal, isFitted: true });
 }
 
