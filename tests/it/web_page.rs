@@ -196,6 +196,14 @@ fn keys_and_the_mouse_change_the_picture() {
     assert!(page.complaints.is_empty(), "{:?}", page.complaints);
 }
 
+/// Writes the page to a PNG file, without the read-out of the position under the mouse.
+pub(crate) fn photograph(page: &mut Browser, look: Look, path: &Path) {
+    // The edge of the buttons' box, between its border and the first button.
+    page.mouse("mouseMoved", (14.0, f64::from(look.height) - 30.0), false);
+    page.await_true("document.querySelector('#readout').innerText === ''");
+    page.photograph(path);
+}
+
 /// Returns a script that counts the pixels with the color `name` in the first sensor's curve of damage.
 fn curve(name: &str) -> String {
     format!(
@@ -252,7 +260,7 @@ fn the_picture_of_the_documents() {
                     look();
                 }})"
             ));
-            page.photograph(&Path::new(directory).join(format!("{name}.png")));
+            photograph(&mut page, look, &Path::new(directory).join(format!("{name}.png")));
         }
         assert!(page.complaints.is_empty(), "{:?}", page.complaints);
     }

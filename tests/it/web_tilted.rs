@@ -16,7 +16,7 @@ use crate::tilt::{Hall, NEAR, ends_well, numbers};
 use crate::tilted::{CLASSES, Made, TOPICS, hub, round};
 use crate::web::{channels, subscribe, view, view_as, web};
 use crate::web_channels::conforms;
-use crate::web_page::{browse, hold};
+use crate::web_page::{browse, hold, photograph};
 
 /// The messages of a round: an angle, a sweep, and what that has found.
 fn say(made: &mut Made, viewer: &mut WebSocket<TcpStream>) -> [Vec<u8>; 3] {
@@ -267,10 +267,10 @@ fn the_picture_of_the_documents_from_the_side() {
     page.open(&format!("http://{host}/"));
     page.await_true(&format!("{SIDE}?.hidden === false"));
     page.press("h");
-    page.await_true("scanhub.aside && scanhub.swept > 1000");
+    page.await_true("scanhub.aside && scanhub.swept > 1000 && scanhub.axes === 2");
     if let Some(directory) = &directory {
         // A pole and a box, and whoever walks.
-        let seen = "scanhub.swept > 10_000 && scanhub.sweeps[0].complete === 'true' \
+        let seen = "scanhub.swept > 10_000 && scanhub.axes === 2 && scanhub.sweeps[0].complete === 'true' \
                     && scanhub.sweeps[0].obstacles.filter((one) => one.near === 'true').length >= 2 \
                     && document.querySelector('#sensors article.streaming:not(.lossy)') !== null \
                     && document.querySelector('#news').innerText === ''";
@@ -279,7 +279,7 @@ fn the_picture_of_the_documents_from_the_side() {
         page.await_true(&format!(
             "{seen} && {is_told} && scanhub.obstacles === scanhub.sweeps[0].obstacles.length"
         ));
-        page.photograph(&Path::new(directory).join("web-side.png"));
+        photograph(&mut page, look, &Path::new(directory).join("web-side.png"));
     }
     assert!(page.complaints.is_empty(), "{:?}", page.complaints);
     let outcome = tilt.end(INT);
