@@ -259,12 +259,6 @@ struct scanhub_telegram {
     uint8_t family;
     uint16_t packets; /* their number; 0 of an LMS, and where it is not known here */
 };
-/* Maximum length of a telegram of a family; 814 of one that is not known here. */
-static inline size_t scanhub_max_telegram(uint8_t family)
-{
-    static const uint16_t lengths[] = {814, 799, 800};
-    return family < sizeof lengths / sizeof *lengths ? lengths[family] : 814u;
-}
 static inline enum scanhub_result scanhub_read_telegram(const struct scanhub_datagram *datagram,
                                                         struct scanhub_telegram *out)
 {
@@ -279,7 +273,7 @@ static inline enum scanhub_result scanhub_read_telegram(const struct scanhub_dat
             return SCANHUB_BAD_PAYLOAD;
         len = scanhub_u16(at + 2) + (size_t)6;
     }
-    if (len > scanhub_max_telegram(datagram->family) || len > datagram->payload_len)
+    if (len > 814 || len > datagram->payload_len)
         return SCANHUB_BAD_PAYLOAD;
     out->bytes = at;
     out->len = (uint16_t)len;

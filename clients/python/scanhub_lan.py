@@ -731,18 +731,16 @@ _OF_NAMES = b"abcdefghijklmnopqrstuvwxyz0123456789_-"
 def _telegram(payload: bytes, number: int) -> Telegram:
     family = FAMILIES[number] if number < len(FAMILIES) else None
     if family != "lms":
-        _limit(1 <= len(payload) <= _MAX_TELEGRAM.get(family, 814))
+        _limit(1 <= len(payload) <= 814)
         return Telegram(payload, family, len(payload) // _PACKET[family] if family in _PACKET else None)
     _limit(payload[:1] == b"\x02")
     (length,) = struct.unpack_from("<2xH", payload)
-    _limit(length + 6 <= min(len(payload), _MAX_TELEGRAM[family]))
+    _limit(length + 6 <= min(len(payload), 814))
     return Telegram(payload[: length + 6], family, None)
 
 
 # Bytes of a packet.
 _PACKET = {"ld": 47}
-# Maximum length of a telegram; 814 of a family that is not known here.
-_MAX_TELEGRAM = {"lms": 814, "ld": 799, "rplidar": 800}
 
 
 def _scan(payload: bytes) -> Scan:

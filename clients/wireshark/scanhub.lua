@@ -25,8 +25,6 @@ local POINT_CLASSES = { [0] = "unknown", "background", "foreground", "behind" }
 local FAMILIES = { [0] = "lms", "ld", "rplidar" }
 -- Of families that send packets: how many bytes one has.
 local PACKET = { 47 }
--- Maximum length of a telegram; 814 of a family that is not known here.
-local MAX_TELEGRAM = { [0] = 814, 799, 800 }
 local CODES = { [0] = "not_measured", "no_return", "beyond", "too_near", "too_bright", "weak", "overflow", "error" }
 -- From the greatest value of an LMS's measuring mode down.
 local OF_LMS = { [0] = "no_return", [1] = "too_bright", [4] = "weak", [5] = "error", [8] = "beyond" }
@@ -498,7 +496,7 @@ unpack_payload[1] = function(payload, tree, _, _, family)
         if len < 4 or payload(0, 1):uint() ~= 2 then return nil end
         len = payload(2, 2):le_uint() + 6
     end
-    if len == 0 or len > payload:len() or len > (MAX_TELEGRAM[family] or 814) then return nil end
+    if len == 0 or len > payload:len() or len > 814 then return nil end
     local item = tree:add(f["telegram"], payload(0, len))
     local packet = PACKET[family]
     if packet then

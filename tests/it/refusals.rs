@@ -372,7 +372,7 @@ fn ports_that_cannot_be_used() {
     let hub = env.hub(&[env.link("front")]);
     env.await_info("front", |info| info["state"] == "streaming");
     let (port, pid) = (env.word("front"), format!("process {}", hub.pid()));
-    refused(&TestEnv::new(), &["probe", &port], 4, "port_busy", &[&port, &pid, "stop it"]);
+    refused(&TestEnv::new(), &["probe", &port], 4, "port_busy", &[&port, &pid, "stop the hub: kill"]);
     assert_eq!(env.info("front")["state"], "streaming", "was disturbed");
 }
 
