@@ -241,7 +241,7 @@ fn what_cannot_be_is_refused_before_anything_is_written() {
     env.await_info("front", |info| info["state"] == "streaming");
     let outcome = env.run(&["configure", &port, "unit=cm"]);
     assert_eq!(outcome.code, Some(4), "{outcome}");
-    assert!(outcome.errors.contains(&format!("process {} (scanhub)", hub.pid())), "{outcome}");
+    assert!(outcome.errors.contains(&format!("in use by the hub, process {};", hub.pid())), "{outcome}");
     assert_eq!(env.info("front")["state"], "streaming");
     drop(hub);
     assert_eq!(simulator.end(TERM).code, Some(0));
