@@ -14,12 +14,14 @@ use toml::Spanned;
 use crate::sources::Origin;
 
 /// Family of a scanner, with its settings.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Scanner {
     /// Family of the scanner. `None`: the hub searches for it.
     pub family: Option<Family>,
     /// Values that are set for the session. Those of the port follow from the link.
     pub settings: Settings,
+    /// Keys that name the family: `family`, and those that only one family has.
+    pub named_by: Vec<&'static str>,
 }
 
 impl Scanner {
@@ -194,7 +196,10 @@ impl ScannerDraft {
             Some(family) => self.request.check(family).map_err(refused)?,
             None => Settings { beams: self.request.beams, ..Settings::default() },
         };
-        Ok(Scanner { family, settings })
+        let keys = self.request.naming().map(|(key, ..)| key.name());
+        let mut named_by: Vec<_> = set.map(|_| "family").into_iter().chain(keys).collect();
+        named_by.dedup();
+        Ok(Scanner { family, settings, named_by })
     }
 
     /// Returns the family that the keys name which only one family has. `None` if there are none.

@@ -253,9 +253,13 @@ fn a_family_may_be_searched_for() {
         ("model=s2", Family::Rplidar),
         ("family=LD", Family::Ld),
     ] {
+        let key = set.split('=').next().unwrap();
         let set = format!("link.front.{set}");
-        assert_eq!(front(&[&set]).unwrap().family(), Some(family), "{set}");
+        let link = front(&[&set]).unwrap();
+        assert_eq!((link.family(), &link.scanner.named_by[..]), (Some(family), &[key][..]), "{set}");
     }
+    let link = front(&["link.front.family=lms", "link.front.type=lms291", "link.front.baud=38400"]).unwrap();
+    assert_eq!(link.scanner.named_by, ["family", "type", "baud"]);
     assert_eq!(front(&["link.front.family=AUTO"]).unwrap().family(), None);
     for (first, second, words) in [
         (

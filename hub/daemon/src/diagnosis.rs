@@ -126,8 +126,8 @@ impl<'a> Diagnosis<'a> {
             }
             self.facts = Some(facts);
             self.words = self.trouble(session);
-            if facts.is_exchanged {
-                self.exchange.clone_from(&self.words);
+            if let Some(rate) = facts.bytes_per_second.filter(|_| facts.is_exchanged) {
+                self.exchange = self.bytes_of_another_kind(session, rate);
             } else if self.family.is_some() {
                 self.exchange.clear();
             }
@@ -342,8 +342,11 @@ impl<'a> Diagnosis<'a> {
     fn bytes_of_another_kind(&self, session: &PortSession, rate: u64) -> String {
         let family = session.family().map_or("", |family| family.name());
         let name = session.model().map_or(family, |model| model.name);
-        let words =
-            format!("{} bytes/s of another kind arrive: was the {name} exchanged?", with_commas(rate));
+        let is_server = matches!(self.link.port, Source::Tcp { .. });
+        // Bytes do not tell which of the two it is.
+        let other = if is_server { "another rate of the server" } else { "a damaged line" };
+        let bytes = with_commas(rate);
+        let words = format!("{bytes} bytes/s arrive, but none of the {name}: another scanner, or {other}?");
         if self.link.family().is_none() {
             return format!("{words} The search begins after 10 s without it");
         }
@@ -354,15 +357,16 @@ impl<'a> Diagnosis<'a> {
     /// belong to another family. `scanhub probe` cannot search the port while the hub has it.
     fn with_remedy(&self, words: &str, question: &str) -> String {
         let Link { name, scanner, .. } = self.link;
-        let names_model = scanner.settings.model.is_some();
-        // The name of a model implies its family.
-        let keys = if names_model { "family and model" } else { "family" };
+        let keys = match &scanner.named_by[..] {
+            [keys @ .., last] if !keys.is_empty() => format!("{} and {last}", keys.join(", ")),
+            keys => keys.concat(),
+        };
         let remedies = [
             format!("Remove {keys} from link {name} and restart the hub: it finds the scanner"),
             format!("Remove {keys} from link {name}, restart the hub"),
             format!("Remove {keys} from the link"),
         ];
-        let has_family = self.link.family().is_some() && !matches!(self.link.port, Source::File { .. });
+        let has_family = !keys.is_empty() && !matches!(self.link.port, Source::File { .. });
         let messages = remedies.into_iter().map(|remedy| format!("{words}{question} {remedy}"));
         let mut messages = messages.filter(|message| has_family && message.len() <= Status::MAX_ERROR_LEN);
         messages.next().unwrap_or_else(|| words.to_owned())

@@ -29,10 +29,9 @@ impl Hub {
     /// one in `places` that is connected to this serial server.
     pub(crate) fn at(source: &Source, holders: &[Holder], places: &[Domain]) -> Option<Hub> {
         if let Source::Tcp { .. } = source {
-            let hub = places.iter().find_map(Hub::find)?;
             let is_connected = |(_, status): (&str, &Status)| status.state() != Some(State::Absent);
-            let is_used = hub.link(source).is_some_and(is_connected);
-            return is_used.then_some(hub);
+            let uses_it = |hub: &Hub| hub.link(source).is_some_and(is_connected);
+            return places.iter().filter_map(Hub::find).find(uses_it);
         }
         let is_holder = |pid| holders.iter().any(|holder| holder.pid == pid);
         if holders.is_empty() {

@@ -455,6 +455,7 @@ mod tests {
                     unit_mm: Some(10),
                     ..Settings::default()
                 },
+                named_by: vec!["family"],
             },
             processing: Default::default(),
         };
