@@ -73,7 +73,7 @@ fn signal(pid: u32, signal: Signal) {
 }
 
 fn probe(env: &TestEnv, port: &str) -> Value {
-    let outcome = env.run(&["probe", &env.word(port), "--json"]);
+    let outcome = env.search(&["probe", &env.word(port), "--json"]);
     assert_eq!(outcome.code, Some(0), "{outcome}");
     outcome.lines()[0].clone()
 }

@@ -168,7 +168,7 @@ fn probe_hears_what_it_is_and_leaves_no_trace() {
     for (name, model, rate, points) in models {
         let model_of = format!("--model={model}");
         let simulator = env.simulator(&[name], &["--family=ld", &model_of, "--world=room", "--seed=7"]);
-        let outcome = env.run(&["probe", &env.word(name), "--json"]);
+        let outcome = env.search(&["probe", &env.word(name), "--json"]);
         let [found] = &outcome.lines()[..] else { panic!("{outcome}") };
         assert_eq!(
             (outcome.code, &found["class"], &found["family"]),
@@ -180,7 +180,7 @@ fn probe_hears_what_it_is_and_leaves_no_trace() {
         assert!((of("turns_per_second") / 10.0 - 1.0).abs() < 0.05 && of("damaged") == 0.0, "{found}");
         assert!(number(found, "packets") > 20 && found["trouble"].is_null(), "{found}");
         assert_eq!(outcome.errors, "", "no progress without a terminal");
-        let text = env.run(&["probe", &env.word(name)]).to_string();
+        let text = env.search(&["probe", &env.word(name)]).to_string();
         for word in ["family", "ld", model, "Bd", "turns"] {
             assert!(text.contains(word), "{word}: {text}");
         }

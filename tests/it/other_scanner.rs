@@ -124,7 +124,7 @@ fn a_port_of_the_hub_is_refused_with_what_the_hub_reports_and_the_next_command()
 
     assert_eq!(hub.end(TERM).code, Some(0), "{info}");
     // Each of the two remedies leads to the scanner.
-    assert_eq!(env.run(&["probe", &port, "--json"]).lines()[0]["model"], "ld19");
+    assert_eq!(env.search(&["probe", &port, "--json"]).lines()[0]["model"], "ld19");
     let _hub = env.hub(&[env.link("front")]);
     env.await_info("front", |info| info["state"] == "streaming" && info["model"] == "ld19");
 }

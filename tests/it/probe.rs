@@ -12,7 +12,7 @@ fn a_sensor_tells_of_itself_and_is_left_as_it_was() {
     let simulator = env.simulator(&["front"], &["--baud=19200", "--type=lms291", "--unit=cm", REAL_ANSWERS]);
     let port = env.word("front");
     for _ in 0..2 {
-        let outcome = env.run(&["probe", &port, "--json"]);
+        let outcome = env.search(&["probe", &port, "--json"]);
         assert_eq!(outcome.code, Some(0), "{outcome}");
         let [found] = &outcome.lines()[..] else { panic!("{outcome}") };
         let text = String::from_utf8_lossy(&outcome.out);
@@ -29,7 +29,7 @@ fn a_sensor_tells_of_itself_and_is_left_as_it_was() {
         assert_eq!(found["configuration"].as_str().map(str::len), Some(68), "{found}");
         assert_eq!(outcome.errors, "", "no progress without a terminal");
     }
-    let outcome = env.run(&["probe", &port]);
+    let outcome = env.search(&["probe", &port]);
     let text = String::from_utf8_lossy(&outcome.out);
     for word in ["LMS291", "19200 Bd", "values on request", "10 mm", "180 degrees", "errors"] {
         assert!(text.contains(word), "{word}: {outcome}");
@@ -50,14 +50,14 @@ fn what_is_found_can_be_run_at_once() {
         let env = TestEnv::new();
         let simulator = env.simulator(&["front"], flags);
         let port = env.word("front");
-        let probed = env.run(&["probe", &port]);
+        let probed = env.search(&["probe", &port]);
         let text = String::from_utf8_lossy(&probed.out).into_owned();
         let next = text.lines().last().and_then(|line| line.strip_prefix("next: scanhub run --link "));
         let link = next.unwrap_or_else(|| panic!("{probed}"));
         assert_eq!(link, format!("front={port},{keys}"), "{probed}");
-        let json = env.run(&["probe", &port, "--json"]);
+        let json = env.search(&["probe", &port, "--json"]);
         assert_eq!(json.lines()[0]["link"], link, "{json}");
-        let toml = env.run(&["probe", &port, "--toml"]);
+        let toml = env.search(&["probe", &port, "--toml"]);
         assert_eq!((toml.code, toml.errors.as_str()), (Some(0), ""), "{toml}");
         let section = String::from_utf8_lossy(&toml.out).into_owned();
         assert!(section.starts_with("[[link]]\nname = \"front\"\nport = "), "{section}");
@@ -91,9 +91,9 @@ fn a_dirty_window_is_told_whatever_the_status_byte_says() {
     let env = TestEnv::new();
     let _simulator = env.simulator(&["front"], &["--type=lms291", "--pollution=20"]);
     let port = env.word("front");
-    let found = env.run(&["probe", &port, "--json"]);
+    let found = env.search(&["probe", &port, "--json"]);
     assert_eq!(found.lines()[0]["polluted"], true, "{found}");
-    let outcome = env.run(&["probe", &port]);
+    let outcome = env.search(&["probe", &port]);
     let text = String::from_utf8_lossy(&outcome.out);
     assert!(text.contains("ok, window polluted"), "{outcome}");
     assert!(text.contains("20 % clear: clean it"), "{outcome}");
@@ -107,7 +107,7 @@ fn a_stream_goes_on() {
     let hub = env.hub(&[env.link("front")]);
     env.await_info("front", |info| info["state"] == "streaming");
     hub.end(testkit::KILL);
-    let found = env.run(&["probe", &env.word("front"), "--json"]);
+    let found = env.search(&["probe", &env.word("front"), "--json"]);
     assert_eq!((found.code, number(&found.lines()[0], "operating_mode")), (Some(0), 0x24), "{found}");
     let sent = env.truth("front").len();
     testkit::until("it streams on", || env.truth("front").len() > sent + 20);
@@ -228,7 +228,7 @@ fn another_process_that_reads_the_port_is_named() {
         assert_eq!(error["hint"], "stop it first");
     }
     drop(reader);
-    assert_eq!(env.run(&["probe", &port, "--json"]).lines()[0]["model"], "ld19");
+    assert_eq!(env.search(&["probe", &port, "--json"]).lines()[0]["model"], "ld19");
 }
 
 #[test]

@@ -100,7 +100,7 @@ fn probe_asks_what_it_is_and_listens_to_its_line() {
     let env = TestEnv::new();
     for (model, rate) in [("a1", 115_200), ("s2", 1_000_000)] {
         let simulator = simulator(&env, model, &[]);
-        let outcome = env.run(&["probe", &env.word("front"), "--json"]);
+        let outcome = env.search(&["probe", &env.word("front"), "--json"]);
         let [found] = &outcome.lines()[..] else { panic!("{outcome}") };
         assert_eq!(
             (outcome.code, text(found, "family"), text(found, "model")),
@@ -123,7 +123,7 @@ fn a_line_that_damages_most_bytes_is_told_before_anything_else() {
     let env = TestEnv::new();
     let port = env.word("front");
     let _simulator = simulator(&env, "s2", &["--fault=loss=0.01,burst=1"]);
-    let probed = env.run(&["probe", &port, "--json"]);
+    let probed = env.search(&["probe", &port, "--json"]);
     let [found] = &probed.lines()[..] else { panic!("{probed}") };
     assert!(found["damaged"].as_f64().is_some_and(|share| share > 0.4), "{found}");
     assert!(text(found, "trouble").contains("of the bytes are damaged on the line"), "{found}");

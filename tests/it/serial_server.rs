@@ -260,7 +260,7 @@ fn probe_and_doctor_ask_there_too() {
     let _simulator = env.simulator(&["sensor"], &["--baud=38400"]);
     let server = Server::new(&env, "sensor", 38_400);
     let port = format!("tcp:{}", server.address);
-    let outcome = env.run(&["probe", &port, "--json"]);
+    let outcome = env.search(&["probe", &port, "--json"]);
     assert_eq!(outcome.code, Some(0), "{outcome}");
     let found = &outcome.lines()[0];
     // The server has the rate; the sensor tells which it is.
@@ -271,7 +271,7 @@ fn probe_and_doctor_ask_there_too() {
     let sensor = findings.iter().find(|line| line["name"] == "sensor").expect("it is asked");
     assert!(sensor["finding"].as_str().is_some_and(|text| text.contains("38400 Bd")), "{sensor}");
     drop(server);
-    let outcome = env.run(&["probe", &port, "--json"]);
+    let outcome = env.search(&["probe", &port, "--json"]);
     assert_eq!(outcome.code, Some(4), "{outcome}");
 }
 
@@ -303,7 +303,7 @@ fn a_sensor_there_can_be_configured() {
     let port = format!("tcp:{}", server.address);
     let (seen, code) = confirmed(&env, &["configure", &port, "unit=cm"]);
     assert_eq!(code, Some(0), "{seen}");
-    assert_eq!(number(&env.run(&["probe", &port, "--json"]).lines()[0], "unit_mm"), 10);
+    assert_eq!(number(&env.search(&["probe", &port, "--json"]).lines()[0], "unit_mm"), 10);
     drop(server);
     assert_eq!(simulator.end(TERM).code, Some(0));
     assert_eq!(env.simulated("front").1, 1);

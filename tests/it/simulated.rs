@@ -20,7 +20,7 @@ fn a_sensor_with_a_past_tells_it_when_it_is_asked() {
         "--short-configuration",
     ];
     let simulator = env.simulator(&["front"], &flags);
-    let outcome = env.run(&["probe", &env.word("front"), "--json"]);
+    let outcome = env.search(&["probe", &env.word("front"), "--json"]);
     assert_eq!(outcome.code, Some(0), "{outcome}");
     let [found] = &outcome.lines()[..] else { panic!("{outcome}") };
     assert_eq!((number(found, "baud"), number(found, "operating_mode")), (38_400, 0), "{found}");

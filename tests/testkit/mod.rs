@@ -249,6 +249,21 @@ impl TestEnv {
         topics.iter().map(subscribers).collect()
     }
 
+    /// Runs a verb that searches for a scanner, again while it finds none: on a busy machine, the simulated scanner may reply
+    /// too late.
+    pub(crate) fn search(&self, arguments: &[&str]) -> Outcome {
+        const NOT_FOUND: i32 = 3;
+        let mut outcome = self.run(arguments);
+        until("a scanner is found", || {
+            let is_found = outcome.code != Some(NOT_FOUND);
+            if !is_found {
+                outcome = self.run(arguments);
+            }
+            is_found
+        });
+        outcome
+    }
+
     /// What `info` says of `sensor`.
     pub(crate) fn info(&self, sensor: &str) -> Value {
         let outcome = self.run(&["info", sensor, "--json"]);
