@@ -8,18 +8,26 @@ use crate::testkit::{
 };
 use rustix::process::{Pid, Resource, Rlimit, getrlimit, prlimit};
 
-/// Starts the program with at most so many descriptors.
+/// Starts the program with at most so many descriptors of its own.
 fn limited<S: AsRef<str>>(env: &TestEnv, limit: u64, arguments: &[S]) -> Program {
     let inner = env.command(arguments);
     let mut command = Command::new("sh");
-    // Whoever runs the tests may have left some open.
+    // The process that runs the tests may have left some open. A shell can close only those with one digit.
     let closed = "exec 3<&- 4<&- 5<&- 6<&- 7<&- 8<&- 9<&-";
+    let limit = limit + inherited();
     let script = format!("{closed} && ulimit -n \"$0\" && exec \"$@\"");
     command.args(["-c", &script, &limit.to_string()]);
     command.arg(inner.get_program()).args(inner.get_args());
     command.envs(inner.get_envs().filter_map(|(key, value)| Some((key, value?))));
     command.env_remove("SCANHUB_CONFIG");
     Program::start(command)
+}
+
+/// Returns the number of descriptors from 10 on that a child of this process inherits.
+fn inherited() -> u64 {
+    let listed = Command::new("sh").args(["-c", "for fd in /proc/$$/fd/*; do echo ${fd##*/}; done"]).output();
+    let listed = String::from_utf8(listed.expect("a shell").stdout).expect("numbers");
+    listed.lines().filter(|fd| fd.parse::<u32>().is_ok_and(|fd| fd > 9)).count() as u64
 }
 
 fn is_short(outcome: &Outcome) {
