@@ -4,7 +4,8 @@
 use std::process::Command;
 
 use crate::testkit::{
-    INT, Outcome, Program, TERM, TestEnv, in_a_network, is_class, number, sequence, side_by_side, until,
+    INT, Outcome, Program, TERM, TestEnv, in_a_network, is_class, number, output, sequence, side_by_side,
+    until,
 };
 use rustix::process::{Pid, Resource, Rlimit, getrlimit, prlimit};
 
@@ -25,8 +26,9 @@ fn limited<S: AsRef<str>>(env: &TestEnv, limit: u64, arguments: &[S]) -> Program
 
 /// Returns the number of descriptors from 10 on that a child of this process inherits.
 fn inherited() -> u64 {
-    let listed = Command::new("sh").args(["-c", "for fd in /proc/$$/fd/*; do echo ${fd##*/}; done"]).output();
-    let listed = String::from_utf8(listed.expect("a shell").stdout).expect("numbers");
+    let mut shell = Command::new("sh");
+    shell.args(["-c", "for fd in /proc/$$/fd/*; do echo ${fd##*/}; done"]);
+    let listed = String::from_utf8(output(shell).expect("a shell").stdout).expect("numbers");
     listed.lines().filter(|fd| fd.parse::<u32>().is_ok_and(|fd| fd > 9)).count() as u64
 }
 

@@ -14,7 +14,7 @@ use toml::Spanned;
 use crate::sources::Origin;
 
 /// Family of a scanner, with its settings.
-#[derive(Clone, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug)]
 pub struct Scanner {
     /// Family of the scanner. `None`: the hub searches for it.
     pub family: Option<Family>,
@@ -23,6 +23,15 @@ pub struct Scanner {
     /// Keys that name the family: `family`, and those that only one family has.
     pub named_by: Vec<&'static str>,
 }
+
+impl PartialEq for Scanner {
+    /// Compares what the link does. The keys that name the family are only for messages.
+    fn eq(&self, other: &Scanner) -> bool {
+        (self.family, &self.settings) == (other.family, &other.settings)
+    }
+}
+
+impl Eq for Scanner {}
 
 impl Scanner {
     /// Returns the models and settings of the family, or of all families if it is searched for.
