@@ -9,7 +9,7 @@ use crate::testkit::{
 };
 use rustix::process::{Pid, Resource, Rlimit, getrlimit, prlimit};
 
-/// Starts the program with at most so many descriptors of its own.
+/// Starts the program with room for `limit` descriptors, besides those that it inherits.
 fn limited<S: AsRef<str>>(env: &TestEnv, limit: u64, arguments: &[S]) -> Program {
     let inner = env.command(arguments);
     let mut command = Command::new("sh");

@@ -1,6 +1,6 @@
 //! The hub's links in virtual time: bytes are passed in with the time at which they arrived, and the topics are
 //! published in shared memory by the same code as those of a line. Many sensors can be driven faster than in real time.
-//! What a session sends to a sensor is kept until it is taken.
+//! Bytes that a session sends are kept until a test takes them.
 
 use std::cell::{Cell, RefCell};
 use std::collections::VecDeque;

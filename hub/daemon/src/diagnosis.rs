@@ -31,9 +31,9 @@ pub(crate) struct Diagnosis<'a> {
     /// Number of telegrams of the session, and the time of the scanner's last one. `None` before the first one.
     telegrams: u64,
     last_telegram: Option<Nanos>,
-    /// Message that the scanner was exchanged, until the next one is found; else empty.
+    /// Message that the scanner was exchanged, until the next one is found. Otherwise empty.
     exchange: String,
-    /// Time of the last look.
+    /// Time of the last update.
     now: Nanos,
     /// Settings that another process changed.
     altered: Option<Altered>,
@@ -343,7 +343,7 @@ impl<'a> Diagnosis<'a> {
         let family = session.family().map_or("", |family| family.name());
         let name = session.model().map_or(family, |model| model.name);
         let is_server = matches!(self.link.port, Source::Tcp { .. });
-        // Bytes do not tell which of the two it is.
+        // The bytes are the same in both cases.
         let other = if is_server { "another rate of the server" } else { "a damaged line" };
         let bytes = with_commas(rate);
         let words = format!("{bytes} bytes/s arrive, but none of the {name}: another scanner, or {other}?");
@@ -361,15 +361,17 @@ impl<'a> Diagnosis<'a> {
             [keys @ .., last] if !keys.is_empty() => format!("{} and {last}", keys.join(", ")),
             keys => keys.concat(),
         };
+        if keys.is_empty() || matches!(self.link.port, Source::File { .. }) {
+            return words.to_owned();
+        }
         let remedies = [
             format!("Remove {keys} from link {name} and restart the hub: it finds the scanner"),
             format!("Remove {keys} from link {name}, restart the hub"),
             format!("Remove {keys} from the link"),
         ];
-        let has_family = !keys.is_empty() && !matches!(self.link.port, Source::File { .. });
-        let messages = remedies.into_iter().map(|remedy| format!("{words}{question} {remedy}"));
-        let mut messages = messages.filter(|message| has_family && message.len() <= Status::MAX_ERROR_LEN);
-        messages.next().unwrap_or_else(|| words.to_owned())
+        let mut messages = remedies.into_iter().map(|remedy| format!("{words}{question} {remedy}"));
+        let message = messages.find(|message| message.len() <= Status::MAX_ERROR_LEN);
+        message.unwrap_or_else(|| words.to_owned())
     }
 
     /// Returns why the search finds no scanner, with the port if the message then fits into a status.

@@ -1,5 +1,5 @@
-//! The parts of a link that do not depend on where its bytes come from: its topics, status, diagnosis and requests of
-//! users, and the times at which it has to publish although no bytes have arrived.
+//! The parts of a link that do not depend on the source of its bytes: topics, status, diagnosis, requests of users, and the
+//! times at which it publishes without new bytes.
 
 use config::{Link, Processing};
 use scanhub_drivers::line::{Control, RawScan, Received, Session as _};

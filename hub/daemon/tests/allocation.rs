@@ -1,6 +1,6 @@
-//! The hub's memory is fixed once a sensor streams, however many scans come. Its link takes nothing from the heap for a
-//! scan and what is made of it but what the shared-memory library takes for each loan of a sample: one small piece,
-//! given back when it is sent. For telegrams, marks and foreground that nobody follows there is no loan.
+//! The hub's memory is fixed once a scanner streams. For a scan and its results, a link allocates only what iceoryx2 needs for
+//! each loan: one small piece, which is freed when the sample is sent. Telegrams, marks and foreground without a subscriber
+//! need no loan.
 
 mod counting;
 
@@ -27,7 +27,7 @@ use schema::ipc::{self, Payload, Subscriber};
 use schema::{Domain, Foreground, Marks, Scan};
 
 /// A scanner at the other end of a pty. Like a real one, it neither sends nor receives anything while the hub's port
-/// has another rate, and it streams until it is told to stop.
+/// has another rate, and it streams until it gets a request to stop.
 struct Sensor {
     line: OwnedFd,
     heard: Vec<u8>,
@@ -196,7 +196,7 @@ fn thread_named(name: &str) -> i32 {
     found.expect("the link has a thread")
 }
 
-/// What the link took for a window of scans.
+/// Allocations of the link during a window of scans.
 struct Window {
     scans: u64,
     seconds: u64,
@@ -274,8 +274,8 @@ fn a_scan_takes_nothing_from_the_heap() {
         ('b', true, &["background.publish=every-scan"][..], 5),
     ] {
         for Window { scans, seconds, taken, held } in windows(letter, follow_all, set) {
-            // A loan for each; those of a silence, and of a status each second and when the state changes. Of the
-            // scans that the sensor sent twice, the first may not have been one.
+            // Each topic takes a loan for a scan. There are more for a silence, and for a status each second and when the
+            // state changes. If the scanner has sent a scan twice, the hub may have missed the first one.
             let loans = topics * (scans - UNHEARD)..=topics * scans + OTHERS + 4 * seconds;
             assert!(loans.contains(&taken), "{taken} pieces of memory for {scans} scans and {topics} topics");
             assert_eq!(held, 0, "bytes kept of {scans} scans and {topics} topics");

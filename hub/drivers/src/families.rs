@@ -41,7 +41,7 @@ macro_rules! families {
             match family { $(Family::$Family => $family::scan_heads(settings),)* }
         }
 
-        /// Creates a recognizer for each family. The search listens for the families, and asks them, in this order.
+        /// Creates a recognizer for each family. The search listens, and sends its requests, in this order.
         pub(crate) fn probes() -> Vec<Box<dyn Probe>> {
             vec![$(Box::<$family::Probe>::default()),*]
         }

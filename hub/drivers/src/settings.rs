@@ -51,11 +51,11 @@ impl SettingsRequest {
         })
     }
 
-    /// Checks whether the model, if there is one, can belong to a scanner whose family is unknown.
+    /// Checks that some family has the model, if one is set.
     ///
     /// # Errors
     ///
-    /// Returns a refusal if no family has the model.
+    /// Returns a refusal if no family has it.
     pub fn check_model(&self) -> Result<(), Refusal> {
         let Some(model) = self.model.as_ref().filter(|model| family_of(model).is_none()) else {
             return Ok(());

@@ -93,7 +93,7 @@ impl Desk {
         (Desk { env, count: AtomicUsize::new(0) }, [simulator, hub])
     }
 
-    /// Runs `line`, and returns what is wrong with it. A search for a scanner runs again while it finds none: on a busy machine,
+    /// Runs `line`, and returns the problem, if there is one. A search for a scanner runs again while it finds none: on a busy machine,
     /// the simulated scanner may reply too late.
     fn run(&self, line: &str) -> Option<String> {
         let mut wrong = self.run_once(line);
@@ -109,7 +109,7 @@ impl Desk {
         wrong
     }
 
-    /// Runs `line` in a directory of its own, as long as it wants, or ends it by Ctrl-C. Returns what is wrong with it.
+    /// Runs `line` in a new directory until it ends, or ends it with Ctrl-C. Returns the problem, if there is one.
     fn run_once(&self, line: &str) -> Option<String> {
         let here = self.env.path(&format!("line{}", self.count.fetch_add(1, Ordering::Relaxed)));
         fs::create_dir(&here).expect("a directory");

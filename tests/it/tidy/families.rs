@@ -28,7 +28,7 @@ const FAMILIES: [(&str, &[&str]); 2] = [
     ("rplidar", &["slamtec", "a1m8", "a2m8", "a2m12"]),
 ];
 
-/// Sources of the hub, its configuration, its tools and the program, beside those right in `hub/`. They name no family, not
+/// Sources of the hub, its configuration, its tools and the program. Files directly in `hub/` count, too. They name no family, not
 /// even the LMS. Recordings and clients name the LMS, because its telegrams are a format of files and topics.
 const HUB: [&str; 5] = ["hub/config/", "hub/daemon/", "hub/tools/", "hub/cli/", "hub/demo/"];
 

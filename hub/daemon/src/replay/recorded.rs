@@ -214,7 +214,7 @@ impl Frames {
         self.recording.telegrams(self.encoding)
     }
 
-    /// Returns the settings of a session that reads it for `link`. What is not configured is as it was recorded.
+    /// Returns the settings of a session that reads it for `link`. Settings that are not configured come from the recording.
     pub(super) fn settings(&self, link: &Link) -> Settings {
         let mode_number = self.mode.filter(|_| !self.is_told_later);
         let mut settings = Settings { mode_number, ..link.settings() };
