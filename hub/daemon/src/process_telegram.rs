@@ -110,7 +110,7 @@ impl<'a, S: Surroundings> LinkOutput<'a, S> {
             // The last points may show that what seemed near is the robot's own body.
             self.foresee(Some(scan));
         }
-        self.topics.begin_scan(scan.first, scan.last, scan.reasons, period_us);
+        self.topics.begin_revolution(scan.first, scan.last, scan.reasons, period_us);
         let stands_for = limit(period_us);
         self.publish_scan(scan, stands_for, is_behind);
         stands_for

@@ -37,6 +37,8 @@ pub(crate) struct Topics<'a, S: Surroundings> {
     header: Header,
     /// Whether `header.wall_ns` comes from a recording.
     is_recalled: bool,
+    last_telegram: LastStamps,
+    last_revolution: LastStamps,
     next_seq: u64,
     /// Whether packets have a subscriber, as of `checked_at`.
     has_followers: bool,
@@ -67,6 +69,8 @@ impl<'a, S: Surroundings> Topics<'a, S> {
             due: DueRings::default(),
             header,
             is_recalled: false,
+            last_telegram: LastStamps::default(),
+            last_revolution: LastStamps::default(),
             next_seq: 0,
             has_followers: false,
             checked_at: 0,
@@ -130,13 +134,20 @@ impl<'a, S: Surroundings> Topics<'a, S> {
     fn begin_telegram(&mut self, received: &Received<'_>, period_us: u32) {
         self.header.seq = self.next_seq;
         self.next_seq += 1;
-        self.begin_scan(received.first, received.last, received.reasons, period_us);
-        self.header.flags |= if received.estimated { Flags::STAMP_ESTIMATED } else { 0 };
+        self.begin(received.first, received.last, received.reasons, period_us);
+        let is_moved = self.last_telegram.order(&mut self.header, self.is_recalled);
+        self.header.flags |= if received.estimated || is_moved { Flags::STAMP_ESTIMATED } else { 0 };
     }
 
-    /// Sets the stamps, the period, and the [`Reasons`](schema::Reasons) for a scan that the last telegram completed.
+    /// Sets the stamps, the period, and the [`Reasons`](schema::Reasons) for a revolution that the last packet completed.
     /// `first` and `last` are the times of its first and last beam.
-    pub(crate) fn begin_scan(&mut self, first: Nanos, last: Nanos, reasons: u8, period_us: u32) {
+    pub(crate) fn begin_revolution(&mut self, first: Nanos, last: Nanos, reasons: u8, period_us: u32) {
+        self.begin(first, last, reasons, period_us);
+        let is_moved = self.last_revolution.order(&mut self.header, self.is_recalled);
+        self.header.flags |= if is_moved { Flags::STAMP_ESTIMATED } else { 0 };
+    }
+
+    fn begin(&mut self, first: Nanos, last: Nanos, reasons: u8, period_us: u32) {
         let now = self.around.now();
         (self.header.stamp_first_ns, self.header.stamp_last_ns) = (first, last);
         if !self.is_recalled {
@@ -493,6 +504,38 @@ enum Loan<L> {
     Unwanted,
 }
 
+/// The stamps of the last telegram or revolution. On a busy machine, several telegrams may be read at once, so that their
+/// computed stamps are equal, but a stamp identifies a scan in ROS.
+#[derive(Default)]
+struct LastStamps {
+    first_ns: u64,
+    wall_ns: u64,
+}
+
+impl LastStamps {
+    /// Moves the stamps of `header` if they are not later than the last ones: to the last one plus 1 ns. A wall clock that
+    /// `is_recalled` from a recording is not changed. Returns whether a stamp was moved.
+    fn order(&mut self, header: &mut Header, is_recalled: bool) -> bool {
+        let (first_ns, wall_ns) = (header.stamp_first_ns, header.wall_ns);
+        header.stamp_first_ns = later(first_ns, self.first_ns);
+        header.stamp_last_ns = header.stamp_last_ns.max(header.stamp_first_ns);
+        if !is_recalled {
+            header.wall_ns = later(wall_ns, self.wall_ns);
+        }
+        (self.first_ns, self.wall_ns) = (header.stamp_first_ns, header.wall_ns);
+        (self.first_ns, self.wall_ns) != (first_ns, wall_ns)
+    }
+}
+
+/// Returns `stamp`, or `last` plus 1 ns if that is later. A clock that was set back by more than [`MAX_REVERSAL`] is
+/// accepted.
+fn later(stamp: u64, last: u64) -> u64 {
+    if last.saturating_sub(stamp) > MAX_REVERSAL { stamp } else { stamp.max(last + 1) }
+}
+
+/// How far back a stamp may lie before the last one and still count as its successor.
+const MAX_REVERSAL: Nanos = 100 * MILLIS;
+
 /// Converts `stamp` to nanoseconds since 1970. `now` is the current time of the clock of `around`.
 fn wall_clock(around: &impl Surroundings, stamp: Nanos, now: Nanos) -> u64 {
     around.wall_ns().saturating_sub(now.saturating_sub(stamp))
@@ -526,6 +569,29 @@ const CHECK_INTERVAL: Nanos = 20 * MILLIS;
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn stamps_ascend_unless_the_clock_was_set() {
+        let mut last = LastStamps::default();
+        let mut order = |first: u64, wall: u64| {
+            let mut header =
+                Header { stamp_first_ns: first, stamp_last_ns: first, wall_ns: wall, ..Header::default() };
+            let is_moved = last.order(&mut header, false);
+            (header.stamp_first_ns, header.stamp_last_ns, header.wall_ns, is_moved)
+        };
+        let wall = 1_000 * MILLIS;
+        assert_eq!(order(50, wall), (50, 50, wall, false));
+        assert_eq!(order(50, wall), (51, 51, wall + 1, true));
+        assert_eq!(order(50, wall), (52, 52, wall + 2, true), "a burst of three");
+        assert_eq!(
+            order(90, wall - 5),
+            (90, 90, wall + 3, true),
+            "the two clocks were read at different times"
+        );
+        assert_eq!(order(91, wall + 40), (91, 91, wall + 40, false));
+        let set_back = wall - MAX_REVERSAL;
+        assert_eq!(order(92, set_back), (92, 92, set_back, false), "the wall clock was set");
+    }
 
     #[test]
     fn a_sample_without_a_telegram_does_not_inherit_its_doubts() {
