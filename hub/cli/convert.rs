@@ -32,6 +32,9 @@ pub(crate) struct Convert {
     /// Write an MCAP file of ROS 2 messages only: scans as sensor_msgs/msg/LaserScan, and /tf_static from the poses
     #[arg(long)]
     ros2: bool,
+    /// With --ros2: each scan also as sensor_msgs/msg/PointCloud2, for viewers that show no LaserScan (rerun)
+    #[arg(long)]
+    points: bool,
     /// With --ros2 or .csv: measuring mode of a recording that does not contain it, such as 0x01
     #[arg(long)]
     mode: Option<String>,
@@ -62,6 +65,7 @@ impl Convert {
             family: self.family,
             force: self.force,
             ros2: self.ros2,
+            points: self.points,
             compression: self.compression,
             mode: self.mode.as_deref().map(options::parse_mode).transpose()?,
             topic: self.topic.clone(),

@@ -121,6 +121,7 @@ const EXAMPLES: &[(&str, &[&str])] = &[
             "scanhub convert robot.mcap front.log.gz --sensor front",
             "scanhub convert room.log.gz room.mcap",
             "scanhub convert walk.mcap ros.mcap --ros2",
+            "scanhub convert walk.mcap points.mcap --ros2 --points",
             "scanhub convert robot.mcap front.csv --sensor front --meters",
             "scanhub convert robot.mcap marks.csv --topic front/marks",
         ],

@@ -25,9 +25,8 @@ fn link(env: &TestEnv, name: &str, pose: &Pose) -> Vec<String> {
 
 type Published = (Header, Box<Scan>);
 
-/// The scans of a recording as the hub published them, by topic of ROS and wall clock. Scans that waited in the port may
-/// have the same time.
-fn published(recording: &Recording) -> BTreeMap<(String, u64), Vec<Published>> {
+/// The scans of a recording as the hub published them, by topic of ROS and wall clock, which no two scans of a sensor share.
+fn published(recording: &Recording) -> BTreeMap<(String, u64), Published> {
     let of = |sensor: &str| {
         let kept = recording.of(&format!("{sensor}/scan"));
         let scans = kept.into_iter().map(|kept| {
@@ -38,9 +37,10 @@ fn published(recording: &Recording) -> BTreeMap<(String, u64), Vec<Published>> {
         });
         scans.collect::<Vec<_>>()
     };
-    let mut by_time: BTreeMap<_, Vec<_>> = BTreeMap::new();
+    let mut by_time = BTreeMap::new();
     for (key, scan) in [of("front"), of("rear")].concat() {
-        by_time.entry(key).or_default().push(scan);
+        let other = by_time.insert(key.clone(), scan);
+        assert!(other.is_none(), "two scans have the stamp {key:?}");
     }
     by_time
 }
@@ -173,9 +173,8 @@ fn others_read_every_message_made_live_and_later() {
             for line in said.iter().filter(|line| line["topic"] != "/tf_static") {
                 let topic = line["topic"].as_str().unwrap_or_default().to_owned();
                 let key = (topic, number(line, "log_time"));
-                match published.get(&key).map(Vec::as_slice) {
-                    Some([scan]) => check_scan(line, scan),
-                    Some(_) => continue,
+                match published.get(&key) {
+                    Some(scan) => check_scan(line, scan),
                     // A telegram was recorded, and its scan was not: the recorder attaches to topics one by one.
                     None => assert!(is_at_an_end(&key), "{verb} of {name}: nobody published {key:?}"),
                 }
@@ -191,6 +190,42 @@ fn others_read_every_message_made_live_and_later() {
             }
         }
     }
+}
+
+#[test]
+fn a_scan_is_also_written_as_points() {
+    let env = TestEnv::new();
+    let words: [u16; 361] =
+        std::array::from_fn(|beam| if beam % 3 == 0 { 0x1FFF } else { 500 + beam as u16 });
+    let stream = env.file("a.bin", lms::measured::encode(0, Unit::Mm, &words, 0x10).bytes().repeat(20));
+    let file = env.word("points.mcap");
+    let outcome = env.run(&["convert", &stream, &file, "--mode=0", "--ros2", "--points"]);
+    assert_eq!(outcome.code, Some(0), "{outcome}");
+    let topics = |topic: &str| Recording::whole(&env.path("points.mcap")).of(topic).len();
+    assert_eq!((topics("/front/scan"), topics("/front/points")), (20, 20));
+    for (verb, modules) in [("mcap_ros2", "mcap_ros2, mcap"), ("rosbags", "rosbags, mcap")] {
+        let Some(python) = python(modules) else { continue };
+        let messages = said(python, verb, &file);
+        let of = |topic: &str| messages.iter().filter(|line| line["topic"] == topic).collect::<Vec<_>>();
+        let (scans, clouds) = (of("/front/scan"), of("/front/points"));
+        assert_eq!((scans.len(), clouds.len()), (20, 20), "{verb}");
+        for (scan, cloud) in scans.iter().zip(&clouds) {
+            assert_eq!((&cloud["stamp_ns"], &cloud["frame"]), (&scan["stamp_ns"], &scan["frame"]));
+            assert_eq!(cloud["fields"], Value::from(vec!["x", "y", "z", "intensity"]));
+            let ranges = scan["ranges"].as_array().expect("ranges").iter().enumerate();
+            let readings: Vec<_> = ranges.filter_map(|(i, range)| Some((i, range.as_f64()?))).collect();
+            let points = cloud["points"].as_array().expect("points");
+            assert!(readings.len() == points.len() && points.len() > 200, "{verb}: {}", points.len());
+            for ((beam, range), point) in readings.iter().zip(points) {
+                let angle = real(scan, "angle_min") + *beam as f64 * real(scan, "angle_increment");
+                let [x, y] = [0, 1].map(|axis| point[axis].as_f64().expect("a number"));
+                let apart = (x - range * angle.cos()).hypot(y - range * angle.sin());
+                assert!(apart < 1e-4, "{verb}: beam {beam} is {apart} m from its reading");
+            }
+        }
+    }
+    let outcome = env.run(&["convert", &stream, "b.mcap", "--points"]);
+    assert!(outcome.code == Some(2) && outcome.errors.contains("--ros2 --points"), "{outcome}");
 }
 
 #[test]

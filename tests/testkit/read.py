@@ -2,6 +2,7 @@
 
 import json
 import math
+import struct
 import sys
 
 from mcap.exceptions import EndOfFile
@@ -44,6 +45,12 @@ def told(topic, log_time, message):
             | {"q" + key: getattr(found.transform.rotation, key) for key in "xyzw"}
             for found in message.transforms
         ]
+        return line
+    if topic.endswith("/points"):
+        line |= header(message.header)
+        line["fields"] = [field.name for field in message.fields]
+        values = struct.unpack(f"<{4 * message.width}f", bytes(message.data))
+        line["points"] = [list(values[at : at + 4]) for at in range(0, len(values), 4)]
         return line
     keys = "angle_min angle_max angle_increment time_increment scan_time range_min range_max"
     line |= header(message.header) | {key: number(getattr(message, key)) for key in keys.split()}

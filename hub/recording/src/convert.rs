@@ -36,6 +36,8 @@ pub struct ConvertOptions {
     pub force: bool,
     /// An MCAP file with only messages of ROS 2.
     pub ros2: bool,
+    /// For ROS 2: each scan also as a PointCloud2.
+    pub points: bool,
     /// For scans: the measuring mode of a recording that does not contain it.
     pub mode: Option<Mode>,
     /// For CSV: `SENSOR/scan` or `SENSOR/marks`.
@@ -184,7 +186,8 @@ pub fn convert(
             write_mcap(&recording, sensor, encoding, file, &mut count, &failed)
         }
         Target::Ros2 => {
-            Ros2::begin(&mut file, compression, form_name(contents.form)).map_err(&failed).and_then(|view| {
+            let view = Ros2::begin(&mut file, compression, form_name(contents.form), options.points);
+            view.map_err(&failed).and_then(|view| {
                 write_view(&recording, sensor, encoding, options.mode, view, &mut count, &failed)
             })
         }
@@ -459,6 +462,9 @@ fn usage<T>(message: &str, hint: &str) -> Result<T, Failure> {
 /// Returns the format that the file's name and `--ros2` select.
 fn format_of(options: &ConvertOptions) -> Result<Target, Failure> {
     let target = ending(&options.output)?;
+    if options.points && !options.ros2 {
+        return usage("--points is for ROS 2", "scanhub convert IN OUT.mcap --ros2 --points");
+    }
     match (target, options.ros2) {
         (Target::Recording(Form::Mcap), true) => Ok(Target::Ros2),
         (Target::Csv | Target::Recording(Form::Telegrams | Form::Carmen), _)

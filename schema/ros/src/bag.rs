@@ -1,21 +1,24 @@
-//! Messages of ROS 2 in an MCAP file, as rosbag2 keeps them: profile `ros2`, each channel with its type's text and the
-//! quality of service that its publisher offers. Refuses to know where samples come from.
+//! Messages of ROS 2 in an MCAP file, as rosbag2 stores them: profile `ros2`, each channel with the text of its type and the
+//! quality of service that its publisher offers.
 
 use std::io::{self, Write};
 
 use schema::file::{Foreign, Writer};
 use schema::{Header, Pose, Scan};
 
-use crate::{LASER_SCAN, TF_MESSAGE, TF_STATIC, Type, frame, laser_scan, scan_topic, static_transforms};
+use crate::{
+    LASER_SCAN, POINT_CLOUD, TF_MESSAGE, TF_STATIC, Type, frame, laser_scan, points_topic, scan_cloud,
+    scan_topic, static_transforms,
+};
 
 /// The profile of a file that has only messages of ROS 2.
 pub const PROFILE: &str = "ros2";
 
-/// What is in a file, as far as the next message depends on it.
+/// Channels and transforms of a file.
 #[derive(Debug, Default)]
 pub struct Bag {
-    /// Channels of the sensors' scans; few enough to be looked through.
-    scans: Vec<(String, u16)>,
+    /// Channels of scans and of points, by topic.
+    channels: Vec<(String, u16)>,
     transforms: Option<Transforms>,
     /// By frame.
     poses: Vec<(String, Pose)>,
@@ -32,7 +35,11 @@ struct Transforms {
 }
 
 impl Bag {
-    /// Writes a scan of `sensor`, whose log time is the wall clock of its telegram.
+    /// Writes a scan of `sensor` as a LaserScan. The log time is the wall clock of its telegram.
+    ///
+    /// # Errors
+    ///
+    /// If the file cannot be written.
     pub fn scan<W: Write>(
         &mut self,
         writer: &mut Writer<W>,
@@ -40,17 +47,37 @@ impl Bag {
         header: &Header,
         scan: &Scan,
     ) -> io::Result<()> {
-        let channel = match self.scans.iter().find(|(of, _)| of == sensor) {
-            Some(&(_, channel)) => channel,
-            None => {
-                let channel = channel(writer, &scan_topic(sensor), &LASER_SCAN, EVERY_SCAN)?;
-                self.scans.push((sensor.to_owned(), channel));
-                channel
-            }
-        };
+        let channel = self.channel(writer, scan_topic(sensor), &LASER_SCAN)?;
         self.message.clear();
         laser_scan(&mut self.message, frame(sensor), header, scan);
         writer.message(channel, header.topic_seq as u32, header.wall_ns, &self.message)
+    }
+
+    /// Writes a scan of `sensor` as a PointCloud2, with the log time of its LaserScan.
+    ///
+    /// # Errors
+    ///
+    /// If the file cannot be written.
+    pub fn points<W: Write>(
+        &mut self,
+        writer: &mut Writer<W>,
+        sensor: &str,
+        header: &Header,
+        scan: &Scan,
+    ) -> io::Result<()> {
+        let channel = self.channel(writer, points_topic(sensor), &POINT_CLOUD)?;
+        self.message.clear();
+        scan_cloud(&mut self.message, frame(sensor), header, scan);
+        writer.message(channel, header.topic_seq as u32, header.wall_ns, &self.message)
+    }
+
+    fn channel<W: Write>(&mut self, writer: &mut Writer<W>, topic: String, of: &Type) -> io::Result<u16> {
+        if let Some(&(_, channel)) = self.channels.iter().find(|(known, _)| *known == topic) {
+            return Ok(channel);
+        }
+        let channel = channel(writer, &topic, of, EVERY_SCAN)?;
+        self.channels.push((topic, channel));
+        Ok(channel)
     }
 
     /// Writes the poses of all known sensors if `pose` of `sensor` is new; log time and stamp are `wall_ns` (since 1970), or

@@ -19,6 +19,11 @@ pub fn scan_topic(sensor: &str) -> String {
     Names::default().topic(sensor, "scan")
 }
 
+/// The topic of `sensor`'s scans as points, where nothing else is said.
+pub fn points_topic(sensor: &str) -> String {
+    Names::default().topic(sensor, "points")
+}
+
 /// How topics and frames are called.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Names {

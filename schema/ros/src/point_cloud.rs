@@ -1,5 +1,4 @@
-//! Points as `sensor_msgs/msg/PointCloud2`: the foreground of a scan, and a sweep in three dimensions. Refuses to know the
-//! background.
+//! Points as `sensor_msgs/msg/PointCloud2`: a scan, its foreground, and a sweep in three dimensions.
 
 use std::mem::offset_of;
 
@@ -8,6 +7,24 @@ use schema::{CloudPoint, Foreground, Header, Scan};
 use crate::BASE_FRAME;
 use crate::cdr::Cdr;
 use crate::laser_scan::stamp_ns;
+
+/// Appends the readings of `scan` in frame `frame` to `message`: a point x, y, z and intensity (meters, and what the scanner
+/// reports, 32-bit floats; z is 0, and so is the intensity of a scan without intensities) for each beam with a reading, in the order of the
+/// beams, with the stamp of the LaserScan.
+pub fn scan_cloud(message: &mut Vec<u8>, frame: &str, header: &Header, scan: &Scan) {
+    let points = || (0..scan.beams()).filter_map(|i| Some((i, scan.distance_m(i)?)));
+    let width = points().count();
+    let intensities = scan.intensities();
+    let point = OF_SCANS.len() as u32 * 4;
+    let mut cdr = begin(message, stamp_ns(header, scan), frame, &OF_SCANS, (point, width));
+    for (i, meters) in points() {
+        let (sin, cos) = scan.angle(i).sin_cos();
+        let intensity = intensities.get(i).map_or(0.0, f64::from);
+        let values = [meters * cos, meters * sin, 0.0, intensity];
+        cdr.bytes(values.map(|value| value as f32).map(f32::to_le_bytes).as_flattened());
+    }
+    cdr.bool(true);
+}
 
 /// Writes `foreground` of `scan`, of the frame `frame`, to the end of `message`: a point x, y, z (metres, 32-bit floats; z
 /// is 0) for each of its beams that has a distance, in the order of the beams, stamped as the scan is.
@@ -78,6 +95,7 @@ fn begin<'a>(
 }
 
 const AXES: [(&str, u32, u8); 3] = [("x", 0, FLOAT32), ("y", 4, FLOAT32), ("z", 8, FLOAT32)];
+const OF_SCANS: [(&str, u32, u8); 4] = [AXES[0], AXES[1], AXES[2], ("intensity", 12, FLOAT32)];
 /// Bytes of a point of a foreground.
 const POINT: u32 = 12;
 const OF_SWEEPS: [(&str, u32, u8); 5] = [
@@ -136,6 +154,28 @@ mod tests {
         let nanoseconds =
             1e9 * told.number("header.stamp.sec").unwrap() + told.number("header.stamp.nanosec").unwrap();
         assert_eq!(nanoseconds, (7_000_000_000 + scan.beam_ns(0)) as f64);
+    }
+
+    #[test]
+    fn a_scan_has_a_point_for_each_reading() {
+        let mut ranges = [500; 181];
+        (ranges[0], ranges[1], ranges[90]) = (0x1FFF, 0x1FFF, 200);
+        let scan = Scan::of(ScanHead::lms(181, -90_000, 1000, 10, 13), &ranges);
+        let header = Header { wall_ns: 7_000_000_000, ..Header::default() };
+        let mut message = Vec::new();
+        scan_cloud(&mut message, "front", &header, &scan);
+        let message = read(&POINT_CLOUD, &message).unwrap();
+        assert_eq!((message.number("width"), message.number("point_step")), (Some(179.0), Some(16.0)));
+        assert_eq!(message.text("fields.3.name"), Some("intensity"));
+        let float = |at: usize| {
+            f32::from_le_bytes(std::array::from_fn(|i| {
+                message.number(&format!("data.{}", at + i)).unwrap() as u8
+            }))
+        };
+        // Beam 90 looks ahead, and is the 89th with a reading.
+        let ahead = [0, 4, 8, 12].map(|offset| float(88 * 16 + offset));
+        assert!((ahead[0] - 2.0).abs() < 1e-6 && ahead[1].abs() < 1e-6, "{ahead:?}");
+        assert_eq!(ahead[2..], [0.0, 0.0]);
     }
 
     #[test]

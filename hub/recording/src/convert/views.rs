@@ -32,17 +32,20 @@ pub(super) trait View {
 pub(super) struct Ros2<W: Write> {
     writer: Writer<W>,
     bag: Bag,
-    /// Beams in the open chunk.
-    beams: usize,
+    /// Whether each scan is also written as points.
+    has_points: bool,
+    /// Bytes of scans in the open chunk, approximately.
+    chunk_len: usize,
 }
 
 impl<W: Write> Ros2<W> {
-    pub(super) fn begin(file: W, compression: Compression, from: &str) -> io::Result<Self> {
+    pub(super) fn begin(file: W, compression: Compression, from: &str, has_points: bool) -> io::Result<Self> {
         let facts = [("converted from".to_owned(), from.to_owned())];
         Ok(Ros2 {
             writer: Writer::packed(file, bag::PROFILE, compression, facts.into())?,
             bag: Bag::default(),
-            beams: 0,
+            has_points,
+            chunk_len: 0,
         })
     }
 }
@@ -52,10 +55,14 @@ impl<W: Write> View for Ros2<W> {
         match sight {
             Sight::Scan(sensor, header, scan) => {
                 self.bag.scan(&mut self.writer, sensor, header, scan)?;
-                self.beams += scan.beams();
-                if self.beams * size_of::<f32>() >= CHUNK {
+                self.chunk_len += scan.beams() * size_of::<f32>();
+                if self.has_points {
+                    self.bag.points(&mut self.writer, sensor, header, scan)?;
+                    self.chunk_len += scan.beams() * size_of::<[f32; 4]>();
+                }
+                if self.chunk_len >= CHUNK {
                     self.writer.close_chunk()?;
-                    self.beams = 0;
+                    self.chunk_len = 0;
                 }
                 Ok(Some(Written::Scan))
             }
