@@ -21,8 +21,8 @@ function drawFromAbove(now) {
   if (layers.marks) drawn.marks = drawMarks();
   drawn.tracks = drawPeople();
   // The robot's position in the map of a site is unknown.
-  if (!robot.map) drawRobot();
-  if (layers.obstacles && !robot.map) drawn.obstacles = drawObstacles();
+  if (!isMap()) drawRobot();
+  if (layers.obstacles && !isMap()) drawn.obstacles = drawObstacles();
   drawSensors();
   if (layers.grid) drawAxisNames();
 }

@@ -45,6 +45,9 @@ const everySensor = () => [...sensors.values()];
 const everySweep = () => [...sweeps.values()];
 const sweepAt = (topic) => owner(sweeps, topic, empty);
 
+/** Returns whether the picture is the map of a site, where the robot's position is unknown. */
+const isMap = () => (kept ? isHeldMap : Boolean(robot.map));
+
 /** Clears all but the background, because the hub has exited. A frozen picture stays until its release. */
 function forget() {
   if (kept) {

@@ -67,6 +67,7 @@ const actions = {
   },
   hold: () => {
     const waiting = kept;
+    isHeldMap = Boolean(robot.map);
     kept = waiting ? null : new Map();
     if (waiting && isHeldGone) forget();
     dropOthers();

@@ -174,6 +174,7 @@ const ofJson = { robot: takeRobot, status: takeStatus, zones: takeZones, lines: 
 /** What makes the words beside the picture, and not the picture. */
 const BESIDE = ["robot", "status", "replay"];
 let kept = null; // what came for the picture while it is held, the newest of each topic
+let isHeldMap = false; // whether the frozen picture is the map of a site
 let isHeldGone = false; // clear the frozen picture at its release
 
 const lastWord = (topic) => topic.slice(topic.lastIndexOf("/") + 1);

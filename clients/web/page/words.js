@@ -25,7 +25,7 @@ function readOut() {
   }
   const [x, y] = toRobot(...(best.screen ?? pointer));
   const bold = make("b");
-  bold.textContent = isAside() ? `${fixed(x, 2)} m above the floor` : `${fixed(hypot(x, y), 2)} m from the ${robot.map ? "map's origin" : "robot"}`;
+  bold.textContent = isAside() ? `${fixed(x, 2)} m above the floor` : `${fixed(hypot(x, y), 2)} m from the ${isMap() ? "map's origin" : "robot"}`;
   const place = isAside() ? `${fixed(-y, 2)} m ${toTheSide()}` : `x ${fixed(x, 2)}  y ${fixed(y, 2)} m`;
   box.replaceChildren(bold, `\n${place}`, best.words?.(best.beam) ?? "");
   if (!best.screen) return;
@@ -48,18 +48,18 @@ function put(element, text) {
 /** Writes the verdict. Called for each frame, so that text and zones describe the same moment. */
 function tellVerdict() {
   // Zones are around the robot, whose position in the map of a site is unknown.
-  const isMap = isHeard() && robot.hub && robot.map;
+  const hasNoVerdict = isHeard() && robot.hub && robot.map;
   const word = verdict();
   const box = $("verdict");
-  box.className = isMap ? "map" : word;
-  box.hidden = isMap && !kept;
-  box.firstElementChild.hidden = isMap;
+  box.className = hasNoVerdict ? "map" : word;
+  box.hidden = hasNoVerdict && !kept;
+  box.firstElementChild.hidden = hasNoVerdict;
   put(box.firstElementChild, word.toUpperCase());
   const { sensor, nearest_m, hub_words: hub } = isHeard() ? robot : {};
-  const nearest = isMap ? "" : [sensor, nearest_m && `nearest ${nearest_m.toFixed(2)} m`].filter(Boolean).join(", ");
+  const nearest = hasNoVerdict ? "" : [sensor, nearest_m && `nearest ${nearest_m.toFixed(2)} m`].filter(Boolean).join(", ");
   put(box.lastElementChild, [nearest, kept && "picture held"].filter(Boolean).join("  ·  "));
   put($("hub"), hub ?? "");
-  put($("title"), isMap ? "scanhub" : `${word.toUpperCase()} – scanhub`);
+  put($("title"), hasNoVerdict ? "scanhub" : `${word.toUpperCase()} – scanhub`);
 }
 
 function lose(one, left) {
