@@ -4,12 +4,14 @@
 //!   publisher
 //! - `killed`: a router that is killed again and again
 //! - `slow`: a link that is too slow
+//! - `stalls`: the same link, on which nothing moves for 2 s of every 20 s
 //! - `loss`: all topics of two sensors for minutes
+//! - `plain`: the same behind a router with Zenoh's own configuration, to a plain Zenoh subscriber
 //!
 //! The bench does not measure a real network.
 //!
-//! `cargo bench -p scanhub-bridge --bench bridge [-- MINUTES] [hop|killed|slow|loss ..]` (default: 10, all), after
-//! `cargo build --release`.
+//! `cargo bench -p scanhub-bridge --bench bridge [-- MINUTES] [hop|killed|slow|stalls|loss|plain ..]` (default: 10,
+//! all), after `cargo build --release`.
 
 mod stage;
 
@@ -28,6 +30,7 @@ use socket2::{Domain, Protocol, Socket, Type};
 use zenoh::Wait;
 
 use stage::{SENSORS, Stage, Times, free_port, listened, percentile, session};
+use zenoh::sample::Sample;
 
 /// One row of the table.
 struct Row {
@@ -46,9 +49,14 @@ fn main() {
     let minutes = words.iter().find_map(|word| word.parse().ok()).unwrap_or(10.0);
     let is_selected = |part: &str| words.iter().all(|word| word.parse::<f64>().is_ok() || word == part);
     type Part<'a> = (&'static str, &'a dyn Fn(&Stage) -> Vec<Row>);
-    let in_minutes = |stage: &Stage| loss(stage, minutes);
-    let parts: [Part<'_>; 4] =
-        [("hop", &latency), ("killed", &killed_router), ("slow", &slow_link), ("loss", &in_minutes)];
+    let parts: [Part<'_>; 6] = [
+        ("hop", &latency),
+        ("killed", &killed_router),
+        ("slow", &|stage| slow_link(stage, None)),
+        ("stalls", &|stage| slow_link(stage, Some(Stalls { every: STALL_EVERY, length: STALL }))),
+        ("loss", &|stage| loss(stage, minutes)),
+        ("plain", &|stage| plain_router(stage, minutes)),
+    ];
     for (name, part) in parts {
         if is_selected(name) || words.iter().any(|word| word == name) {
             let Some(stage) = Stage::new(name) else { return };
@@ -287,18 +295,57 @@ fn loss(stage: &Stage, minutes: f64) -> Vec<Row> {
     ]
 }
 
+/// All topics of two sensors for minutes, through a router with Zenoh's own configuration: what does a plain subscriber
+/// to `scanhub/**` lose?
+fn plain_router(stage: &Stage, minutes: f64) -> Vec<Row> {
+    let robot = stage.machine("robot");
+    let at = free_port();
+    let _router = stage::plain_router(at);
+    listened(at);
+    let received: Arc<Mutex<HashMap<(u8, u8), u64>>> = Arc::default();
+    let (counts, listener) = (received.clone(), session(at));
+    let _subscriber = listener
+        .declare_subscriber("scanhub/**")
+        .callback(move |sample: Sample| {
+            let bytes = sample.payload().to_bytes();
+            let head = Datagram::read(&bytes).expect("a datagram").head;
+            *counts.lock().expect("no panic").entry((head.sensor, head.topic)).or_default() += 1;
+        })
+        .wait()
+        .expect("a subscriber");
+    let there = robot.bridge(&[&format!("--connect=tcp/{at}"), "--topic=*/*"]);
+    there.tells(|line| line["class"] == "bridge_link" && line["state"] == "up");
+    let _hub = robot.robot();
+    thread::sleep(Duration::from_secs_f64(60.0 * minutes));
+    let sent = there.end();
+    thread::sleep(Duration::from_secs(1));
+    let of_all = last(&sent, "sent").into_values().filter_map(|row| row["sent"].as_u64()).sum::<u64>();
+    let received = received.lock().expect("no panic").values().sum::<u64>();
+    vec![row(
+        &format!(
+            "all topics of two sensors through a plain router for {minutes} minutes: samples and announcements lost"
+        ),
+        format!("{} of {of_all}", of_all as i64 - received as i64),
+        Some(("0", received == of_all)),
+    )]
+}
+
 const SLOW_RUN: Duration = Duration::from_secs(40);
+const STALLS_RUN: Duration = Duration::from_secs(80);
+const STALL_EVERY: Duration = Duration::from_secs(20);
+const STALL: Duration = Duration::from_secs(2);
 const BYTES_A_SECOND: f64 = 500_000.0 / 8.0;
 const DELAY: Duration = Duration::from_millis(100);
 
 /// A link of 0.5 Mbit/s and 100 ms each way, with all topics of two sensors: how old are scans when they arrive, and do
 /// both ends know what did not arrive?
-fn slow_link(stage: &Stage) -> Vec<Row> {
+fn slow_link(stage: &Stage, stalls: Option<Stalls>) -> Vec<Row> {
     let [robot, desk] = ["robot", "desk"].map(|name| stage.machine(name));
     let at = free_port();
     let there = robot.bridge(&[&format!("--listen=tcp/{at}"), "--topic=*/*"]);
     listened(at);
-    let here = desk.bridge(&[&format!("--connect=tcp/{}", relay(at, BYTES_A_SECOND, DELAY)), "--publish"]);
+    let here =
+        desk.bridge(&[&format!("--connect=tcp/{}", relay(at, BYTES_A_SECOND, DELAY, stalls)), "--publish"]);
     here.tells(|line| line["class"] == "bridge_link" && line["state"] == "up");
     let _hub = robot.robot();
     let published =
@@ -310,7 +357,8 @@ fn slow_link(stage: &Stage) -> Vec<Row> {
     let (mut ages, mut missed, mut heard) = (Vec::new(), 0, 0);
     let mut is_first = true;
     let begun = Instant::now();
-    while begun.elapsed() < SLOW_RUN {
+    let run = if stalls.is_some() { STALLS_RUN } else { SLOW_RUN };
+    while begun.elapsed() < run {
         memory.look().expect("a domain");
         for source in &mut sources {
             while let Some(sample) = source.receive(&mut memory).expect("a sample") {
@@ -334,9 +382,12 @@ fn slow_link(stage: &Stage) -> Vec<Row> {
     thread::sleep(Duration::from_secs(2));
     let totals = compare(&sent, &here.end());
     let [p50, p99] = [0.5, 0.99].map(|share| percentile(&mut ages, share) / 1e3);
+    let way = if stalls.is_some() { ", stalls of 2 s" } else { "" };
     vec![
         row(
-            "0.5 Mbit/s, 100 ms each way, all topics of two sensors: age of a scan, median and p99",
+            &format!(
+                "0.5 Mbit/s, 100 ms each way{way}, all topics of two sensors: age of a scan, median and p99"
+            ),
             format!("{p50:.0} ms, {p99:.0} ms, {} scans", ages.len()),
             Some(("p99 at most 600 ms", p99 <= 600.0)),
         ),
@@ -360,14 +411,15 @@ const SOCKET: usize = 4096;
 const PACKET: usize = 1448;
 
 /// A long, slow connection between `to` and programs that connect to the returned address: a number of bytes per
-/// second, each after the same delay, in both directions, and no more in transit than that needs. (Kernels with netem
-/// and tbf do the same to a network namespace.)
-fn relay(to: SocketAddr, bytes_a_second: f64, delay: Duration) -> SocketAddr {
+/// second, each after the same delay, in both directions, and no more in transit than that needs. During `stalls`,
+/// nothing moves. (Kernels with netem and tbf do the same to a network namespace.)
+fn relay(to: SocketAddr, bytes_a_second: f64, delay: Duration, stalls: Option<Stalls>) -> SocketAddr {
     let listener = socket();
     listener.bind(&SocketAddr::from(([127, 0, 0, 1], 0)).into()).expect("a port");
     listener.listen(8).expect("it is bound");
     let listener = TcpListener::from(listener);
     let at = listener.local_addr().expect("it is bound");
+    let begun = Instant::now();
     // The thread ends with the bench.
     thread::spawn(move || {
         for near in listener.incoming().map_while(Result::ok) {
@@ -380,7 +432,7 @@ fn relay(to: SocketAddr, bytes_a_second: f64, delay: Duration) -> SocketAddr {
             near.set_nodelay(true).expect("TCP");
             for (from, to) in [(&near, &far), (&far, &near)] {
                 let both = [from, to].map(|stream| stream.try_clone().expect("a descriptor"));
-                thread::spawn(move || pass(both, bytes_a_second, delay));
+                thread::spawn(move || pass(both, bytes_a_second, delay, begun, stalls));
             }
         }
     });
@@ -397,11 +449,34 @@ fn socket() -> Socket {
     socket
 }
 
-fn pass([mut from, mut to]: [TcpStream; 2], bytes_a_second: f64, delay: Duration) {
+/// The end of each period, in which a link stalls.
+#[derive(Clone, Copy)]
+struct Stalls {
+    every: Duration,
+    length: Duration,
+}
+
+impl Stalls {
+    /// Returns how long the link still stalls.
+    fn left(self, since: Instant) -> Duration {
+        let phase = since.elapsed().as_nanos() % self.every.as_nanos();
+        let left = self.every.saturating_sub(Duration::from_nanos(phase as u64));
+        if left > self.length { Duration::ZERO } else { left }
+    }
+}
+
+fn pass(
+    [mut from, mut to]: [TcpStream; 2],
+    bytes_a_second: f64,
+    delay: Duration,
+    begun: Instant,
+    stalls: Option<Stalls>,
+) {
     let mut in_transit: VecDeque<(Instant, Vec<u8>)> = VecDeque::new();
     let mut room_at = Instant::now();
     let mut packet = [0; PACKET];
     loop {
+        thread::sleep(stalls.map_or(Duration::ZERO, |stalls| stalls.left(begun)));
         let now = Instant::now();
         while in_transit.front().is_some_and(|(at, _)| *at <= now)
             && let Some((_, bytes)) = in_transit.pop_front()

@@ -16,7 +16,7 @@ use serde::Serialize;
 use verbs::network::{now, quiet};
 
 use crate::diagnosis::{Diagnosis, UNREACHED};
-use crate::engine::{Connection, Engine, News, Prepared};
+use crate::session::{CheckedConfig, Connection, LinkEvent, ZenohSession};
 use crate::{BridgeOptions, now_s};
 
 /// One line of what was found.
@@ -68,7 +68,7 @@ pub fn check(options: &BridgeOptions, stop: &AtomicBool, out: &mut dyn Write) ->
 }
 
 fn find(options: &BridgeOptions, stop: &AtomicBool) -> Result<Vec<Finding>, Failure> {
-    let opened = Prepared::read(options, now_s()).and_then(Connection::open);
+    let opened = CheckedConfig::read(options, now_s()).and_then(Connection::open);
     let connection = match opened {
         Ok(connection) => connection,
         Err(failure) => return Ok(vec![Finding::failed(failure.message, failure.hint)]),
@@ -83,15 +83,15 @@ fn find(options: &BridgeOptions, stop: &AtomicBool) -> Result<Vec<Finding>, Fail
             return Err(Failure::new(Kind::Interrupted, "interrupted", ""));
         }
         thread::sleep(LOOK_EVERY);
-        let news = |news| {
-            match news {
-                News::Up => is_linked = true,
-                News::Down => is_linked = false,
-                News::Failing(why) => reasons.push(why),
+        let event = |event| {
+            match event {
+                LinkEvent::Up => is_linked = true,
+                LinkEvent::Down => is_linked = false,
+                LinkEvent::Failing(why) => reasons.push(why),
             }
             Ok::<_, Infallible>(())
         };
-        let Ok(()) = connection.news(news);
+        let Ok(()) = connection.events(event);
         // Who is refused by one router may still be taken by another, but not by waiting for long.
         if Diagnosis::of(&reasons.join("; ")).is_some_and(|known| known != UNREACHED) {
             end_at = end_at.min(Instant::now() + REFUSED_WITHIN);
@@ -100,8 +100,8 @@ fn find(options: &BridgeOptions, stop: &AtomicBool) -> Result<Vec<Finding>, Fail
     if let Some(failure) = connection.failure() {
         return Ok(vec![Finding::failed(failure.message, failure.hint)]);
     }
-    let findings = match connection.engine(&AtomicBool::new(true)) {
-        Some(engine) if is_linked => hubs(engine)?,
+    let findings = match connection.session(&AtomicBool::new(true)) {
+        Some(session) if is_linked => hubs(session)?,
         _ if !options.listen.is_empty() => {
             vec![Finding::ok("it can listen; nobody is connected yet".to_owned())]
         }
@@ -123,11 +123,11 @@ fn unreachable(reasons: &[String]) -> Finding {
 type Hubs = BTreeMap<u64, Result<i64, DatagramError>>;
 
 /// Somebody is connected: asks all sensors for their announcements.
-fn hubs(engine: &Engine) -> Result<Vec<Finding>, Failure> {
+fn hubs(session: &ZenohSession) -> Result<Vec<Finding>, Failure> {
     let live_sensors: Arc<Mutex<Vec<String>>> = Arc::default();
     let heard: Arc<Mutex<Hubs>> = Arc::default();
     let (tokens, begin) = (live_sensors.clone(), Instant::now());
-    let _ear = engine.watch(&format!("{PREFIX}/*/*/{LIVE}"), move |key| {
+    let _tokens = session.watch(&format!("{PREFIX}/*/*/{LIVE}"), move |key| {
         let mut tokens = tokens.lock().unwrap_or_else(PoisonError::into_inner);
         if let Some((hub, sensor)) = live(key).filter(|_| tokens.len() < SENSORS) {
             tokens.push(Address { hub, sensor, topic: None }.to_string());
@@ -140,7 +140,7 @@ fn hubs(engine: &Engine) -> Result<Vec<Finding>, Failure> {
         asked += news.len();
         for key in news {
             let heard = heard.clone();
-            engine.ask(&key, usize::from(u16::MAX), move |key, payload| {
+            session.query(&key, usize::from(u16::MAX), move |key, payload| {
                 let Some(Address { hub, .. }) = Address::parse(key) else { return };
                 let ahead_ns = match Datagram::read(&payload.unwrap_or_default()) {
                     Ok(datagram) => Ok(now().wall_ns.wrapping_sub(datagram.head.stamp_ns) as i64),
@@ -208,9 +208,12 @@ mod tests {
 
     #[test]
     fn why_nobody_is_connected_has_a_remedy() {
-        let said = unreachable(&["invalid peer certificate: Expired".into()]);
+        let said = unreachable(&["Unable to connect to tls/r:1! invalid peer certificate: Expired".into()]);
         assert!(said.state == "failed" && said.remedy.contains("renew"), "{said:?}");
-        assert_eq!(said.finding, "a certificate has expired: invalid peer certificate: Expired");
+        assert_eq!(
+            said.finding,
+            "a certificate has expired: Unable to connect to tls/r:1! invalid peer certificate: Expired"
+        );
         assert_eq!(unreachable(&[]).finding, "no router is reached");
     }
 

@@ -1,7 +1,7 @@
-//! What Zenoh's words about a connection that did not come about mean, and what to do. Its words are those of 1.10, whose
-//! version is pinned. Refuses to know whom they are told.
+//! What Zenoh's messages about failed connections mean, and what to do. The texts are those of Zenoh 1.10, whose version is
+//! pinned.
 
-/// What is wrong, and what to do.
+/// A cause and its remedy.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct Diagnosis {
     pub(crate) finding: &'static str,
@@ -9,22 +9,25 @@ pub(crate) struct Diagnosis {
 }
 
 impl Diagnosis {
-    /// What `words` mean; nothing if that is not known.
+    /// Returns what `words` mean, if that is known.
     pub(crate) fn of(words: &str) -> Option<Diagnosis> {
         let words = words.to_lowercase();
-        let is_in = |(signs, _): &&(&[&str], Diagnosis)| signs.iter().any(|sign| words.contains(sign));
-        KNOWN.iter().find(is_in).map(|(_, diagnosis)| *diagnosis)
+        let has_any = |signs: &[&str]| signs.iter().any(|sign| words.contains(sign));
+        let (_, diagnosis) = KNOWN.iter().find(|(signs, _)| has_any(signs))?;
+        // Only the end that connects writes this.
+        let connects = has_any(UNABLE);
+        Some(if !connects && has_any(CERTIFICATES) { PEER_REFUSED } else { *diagnosis })
     }
 }
 
-/// Nobody answers, or nobody that speaks so.
+/// Nobody answers, or not in Zenoh's protocol.
 pub(crate) const UNREACHED: Diagnosis = Diagnosis {
     finding: "no router is reached",
     remedy: "start a router there (`scanhub bridge --listen ..` or zenohd), and check the firewall",
 };
 
-/// Parts of what is said, in lower case, and what they mean. The first that fits does: what is said of users and certificates says
-/// also that nobody is connected.
+/// Parts of Zenoh's messages in lower case, and what they mean. The first match counts: messages about users and certificates
+/// also say that nobody is connected.
 const KNOWN: &[(&[&str], Diagnosis)] = &[
     (
         &["recv opensyn. invalid", "recv initsyn. expected"],
@@ -48,6 +51,13 @@ const KNOWN: &[(&[&str], Diagnosis)] = &[
         },
     ),
     (
+        &["too many open files"],
+        Diagnosis {
+            finding: "a connection was not accepted: no file descriptor is left",
+            remedy: "allow more: `ulimit -n 4096` in the shell, or LimitNOFILE=4096 in the unit of a service",
+        },
+    ),
+    (
         &["expired"],
         Diagnosis {
             finding: "a certificate has expired",
@@ -65,12 +75,25 @@ const KNOWN: &[(&[&str], Diagnosis)] = &[
         &["certificate", "unknownissuer", "unknownca", "tls"],
         Diagnosis {
             finding: "the certificates do not fit",
-            remedy: "root_ca_certificate must be of who signed the router's certificate, whose name must be in --connect; a router \
-                     that wants one of this machine is shown connect_certificate",
+            remedy: "root_ca_certificate must be the authority that signed the router's certificate, and --connect must name the \
+                     router as its certificate does; a router with enable_mtls needs a connect_certificate",
         },
     ),
-    (&["unable to connect"], UNREACHED),
+    (UNABLE, UNREACHED),
 ];
+
+const UNABLE: &[&str] = &["unable to connect"];
+
+/// What is wrong with certificates, at either end.
+const CERTIFICATES: &[&str] =
+    &["expired", "notvalidyet", "not valid yet", "certificate", "unknownissuer", "unknownca", "tls"];
+
+/// At the end that listens.
+const PEER_REFUSED: Diagnosis = Diagnosis {
+    finding: "somebody was refused: the certificates do not fit",
+    remedy: "a machine that connects must trust the authority of listen_certificate here; with enable_mtls, it must \
+             also show a connect_certificate of the authority in root_ca_certificate here, which has not expired",
+};
 
 #[cfg(test)]
 mod tests {
@@ -79,9 +102,9 @@ mod tests {
     #[test]
     fn words_of_zenoh_have_a_remedy() {
         for (words, finding, remedy) in [
-            ("invalid peer certificate: certificate expired: verification time 7", "has expired", "renew"),
-            ("invalid peer certificate: Expected NotValidYet", "not valid yet", "clock"),
-            ("invalid peer certificate: UnknownIssuer", "do not fit", "root_ca_certificate"),
+            ("Unable to connect to tls/r:1! invalid peer certificate: Expired", "has expired", "renew"),
+            ("Unable to connect to tls/r:1! invalid peer certificate: NotValidYet", "not valid yet", "clock"),
+            ("Unable to connect to tls/r:1! received fatal alert: UnknownCA", "do not fit", "--connect"),
             (
                 "Received a close message (reason GENERIC) in response to an OpenSyn on: TransportLinkUnicast",
                 "the user or the password is refused",
@@ -93,6 +116,9 @@ mod tests {
                 "usrpwd/user",
             ),
             ("UsrPwd extension - Recv OpenSyn. Invalid password.", "somebody was refused", "dictionary_file"),
+            ("invalid peer certificate: Expired.", "somebody was refused", "connect_certificate"),
+            ("received fatal alert: UnknownCA.", "somebody was refused", "listen_certificate"),
+            ("Too many open files (os error 24)", "no file descriptor", "ulimit"),
             ("Unable to connect to tcp/r:1! Connection refused (os error 111)", "no router", "firewall"),
         ] {
             let known = Diagnosis::of(words).unwrap_or_else(|| panic!("{words}"));

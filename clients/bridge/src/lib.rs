@@ -1,14 +1,16 @@
-//! Topics of a hub over Zenoh, to other machines and from them: what `gateway` and `listen` are for a LAN. Which sample
-//! goes out, who may speak and what was lost is decided by `scanhub_lan`, without a network; Zenoh stands in one module.
+//! Sends the topics of a hub to other machines over Zenoh, and publishes those of other machines: what `gateway` and
+//! `listen` do in a LAN. Which samples are sent, which are accepted and what was lost is decided in `scanhub_lan`, without a
+//! network. Zenoh is used in one module only, `session`.
 #![forbid(unsafe_code)]
 
 mod check;
 mod diagnosis;
-mod engine;
+mod queue;
 mod receiving;
 mod report;
 mod ros2;
 mod sending;
+mod session;
 
 use std::io::{self, stderr, stdout};
 use std::path::PathBuf;
@@ -22,10 +24,10 @@ use schema::{Domain, Failure, Kind, Topic};
 use verbs::network::{End, LossyWriter, Output, now, quiet};
 
 pub use check::check;
-use engine::{Connection, Prepared};
 use report::Report;
 pub use ros2::Ros2Options;
-use sending::Sending;
+use sending::{DatagramSender, Sending};
+use session::{CheckedConfig, Connection};
 
 /// What a bridge is asked for.
 #[derive(Clone, Debug)]
@@ -80,22 +82,24 @@ pub struct PublishOptions {
 /// [`Kind::Input`] if the file of its configuration cannot be read; [`Kind::Usage`] if there is no such topic;
 /// [`Kind::DomainHeld`] if another listener publishes in the domain; [`Kind::NoTopic`] if the first hub has no such sensor.
 pub fn bridge(options: &BridgeOptions, tell: &AtomicBool, stop: &AtomicBool) -> Result<(), Failure> {
-    let prepared = Prepared::read(options, now_s())?;
+    let config = CheckedConfig::read(options, now_s())?;
     let mut out = stdout();
     let mut notes = stderr();
     let (mut out, mut notes) = (LossyWriter::around(&mut out, stop), LossyWriter::around(&mut notes, stop));
     let mut report = Report::new(options.json, Output::new(&mut out), Output::new(&mut notes));
     let sending = options.send.as_ref().map(Sending::open).transpose()?;
-    let connection = Connection::open(prepared)?;
+    let connection = Connection::open(config)?;
     quiet(run(options, &connection, sending, &mut report, tell, stop))
 }
 
-/// Between two announcements, and two accounts.
+/// Interval between two announcements, and between two reports of the statistics.
 const TICK: Duration = ANNOUNCE_EVERY;
-/// So long it waits for a router before it says so.
-const PATIENCE: Duration = Duration::from_secs(1);
-/// So long it sleeps at most where nothing wakes it.
-const NAP: Duration = Duration::from_millis(50);
+/// How long the bridge waits for a router before it reports that.
+const REPORT_WAITING_AFTER: Duration = Duration::from_secs(1);
+/// The longest wait for the hub.
+const MAX_WAIT: Duration = Duration::from_millis(50);
+/// Interval between two checks for threads that end.
+const JOIN_INTERVAL: Duration = Duration::from_millis(5);
 
 fn run(
     options: &BridgeOptions,
@@ -114,15 +118,17 @@ fn run(
                 let work = move || receiving::run(publish, options.json, connection, tell_in, is_over);
                 begin("receiving").spawn_scoped(scope, work)
             });
-            let handing = sending.as_ref().map(|sending| {
-                let handing = sending.handing();
-                begin("handing").spawn_scoped(scope, move || handing.run(connection, is_over))
+            let datagrams = sending.as_ref().map(|sending| {
+                let queue = sending.queue().clone();
+                let open = move |session| DatagramSender::open(session, &queue);
+                let queue = sending.queue().clone();
+                begin("sending").spawn_scoped(scope, move || queue::send(&queue, connection, is_over, open))
             });
             let ros2 = options.ros2.as_ref().map(|ros2| {
                 let work = move || ros2::run(ros2, options.json, connection, tell_ros2, is_over);
                 begin("ros2").spawn_scoped(scope, work)
             });
-            Ok((receiving.transpose()?, handing.transpose()?, ros2.transpose()?))
+            Ok((receiving.transpose()?, datagrams.transpose()?, ros2.transpose()?))
         })()
         .map_err(|error: io::Error| no_thread(&error));
         let end = match &threads {
@@ -134,17 +140,44 @@ fn run(
             Err(failure) => Err(failure.clone().into()),
         };
         is_over.store(true, Ordering::Relaxed);
-        let (receiving, handing, ros2) = threads?;
-        let handed = handing.map_or(Ok(()), |thread| thread.join().unwrap_or_else(|_| Err(died())));
+        let (receiving, datagrams, ros2) = threads?;
+        // A thread that still waits for room on a link ends as soon as the session is closed.
+        let over_at = Instant::now() + queue::FLUSH_TIME + MAX_WAIT;
+        let is_sending = || {
+            datagrams.as_ref().is_some_and(|thread| !thread.is_finished())
+                || ros2.as_ref().is_some_and(|thread| !thread.is_finished())
+        };
+        while is_sending() && Instant::now() < over_at {
+            thread::sleep(JOIN_INTERVAL);
+        }
+        if is_sending() {
+            connection.close();
+        }
+        let sent = datagrams.map_or(Ok(()), |thread| thread.join().unwrap_or_else(|_| Err(died())));
         let received =
             receiving.map_or(Ok(()), |thread| thread.join().unwrap_or_else(|_| Err(died().into())));
         let graph = ros2.map_or(Ok(()), |thread| thread.join().unwrap_or_else(|_| Err(died().into())));
         connection.close();
-        if let Some(sending) = &sending {
-            report.account(sending)?;
-        }
-        received.and(graph).and(end).and(Ok(handed?))
+        report_counts(options, connection, sending.as_ref(), report)?;
+        received.and(graph).and(end).and(Ok(sent?))
     })
+}
+
+/// Reports the statistics of what is sent, and the refused connections. Where topics are published, the refused connections
+/// are reported with them.
+fn report_counts(
+    options: &BridgeOptions,
+    connection: &Connection,
+    sending: Option<&Sending>,
+    report: &mut Report<'_>,
+) -> Result<(), End> {
+    if let Some(sending) = sending {
+        report.account(sending)?;
+    }
+    match options.publish {
+        None => report.refused(connection.refused()),
+        Some(_) => Ok(()),
+    }
 }
 
 /// The work of the main thread until it is done.
@@ -158,7 +191,7 @@ fn carry(
     is_done: &impl Fn() -> bool,
 ) -> Result<(), End> {
     let mut tick_at = Instant::now();
-    let (mut wait_until, mut is_ready) = (Some(tick_at + PATIENCE), false);
+    let (mut wait_until, mut is_ready) = (Some(tick_at + REPORT_WAITING_AFTER), false);
     while !is_done() {
         let more = match sending {
             Some(sending) => sending.forward(report)?,
@@ -169,7 +202,7 @@ fn carry(
             report.begin(options, sending.as_ref())?;
             connection.begin();
         }
-        connection.news(|news| report.link(&news))?;
+        connection.events(|event| report.link(&event))?;
         let mut is_late = || wait_until.take_if(|until| Instant::now() >= *until).is_some();
         if !is_ready && !connection.listens() && is_late() {
             report.waiting(options)?;
@@ -187,12 +220,10 @@ fn carry(
         }
         if tell.swap(false, Ordering::Relaxed) || is_due && report.is_periodic() {
             tell_others.into_iter().for_each(|tell| tell.store(true, Ordering::Relaxed));
-            if let Some(sending) = sending {
-                report.account(sending)?;
-            }
+            report_counts(options, connection, sending.as_ref(), report)?;
         }
         if !more {
-            let left = tick_at.saturating_duration_since(now).min(NAP);
+            let left = tick_at.saturating_duration_since(now).min(MAX_WAIT);
             match sending {
                 Some(sending) => sending.wait(left)?,
                 None => thread::sleep(left),

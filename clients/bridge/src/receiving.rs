@@ -15,7 +15,7 @@ use schema::{Failure, Topic};
 use verbs::network::{End, Origin, Output, Reception, Wanted, Words, now};
 
 use crate::PublishOptions;
-use crate::engine::{Connection, Ear, Engine};
+use crate::session::{Connection, Subscriber, ZenohSession};
 use asking::Asking;
 
 /// What was heard.
@@ -26,7 +26,7 @@ enum Heard {
     Live(Box<str>),
 }
 
-/// What comes in, between the threads of the engine and the one that takes it.
+/// What comes in, between the threads of Zenoh and the one that takes it.
 #[derive(Clone)]
 struct Inlet {
     to: SyncSender<Heard>,
@@ -75,14 +75,14 @@ pub(crate) fn run(
     };
     let reception =
         Reception::open(wanted, json, Words::BRIDGE, Output::new(&mut out), Output::new(&mut notes))?;
-    let Some(engine) = connection.engine(is_over) else { return Ok(()) };
+    let Some(session) = connection.session(is_over) else { return Ok(()) };
     let (to, inbox) = sync_channel(WAITING);
     let inlet = Inlet { to, counts: Arc::default() };
-    let ears = inlet.listen(engine, &options.topics)?;
+    let subscribers = inlet.listen(session, &options.topics)?;
     let asks = inlet.clone();
     let ask = |address: &Address<'_>| {
         let asks = asks.clone();
-        engine.ask(&address.to_string(), LONGEST, move |key, payload| asks.take(key, payload))
+        session.query(&address.to_string(), LONGEST, move |key, payload| asks.take(key, payload))
     };
     let refused = || connection.refused();
     let asking = Asking::new(Instant::now());
@@ -96,30 +96,30 @@ pub(crate) fn run(
         ask: Box::new(ask),
         refused: Box::new(refused),
     };
-    receiving.run(&inbox, tell, is_over, move || drop(ears))
+    receiving.run(&inbox, tell, is_over, move || drop(subscribers))
 }
 
 impl Inlet {
     /// Hears announcements, samples of `topics`, and who comes.
-    fn listen(&self, engine: &Engine, topics: &[Topic]) -> Result<Vec<Ear>, Failure> {
+    fn listen(&self, session: &ZenohSession, topics: &[Topic]) -> Result<Vec<Subscriber>, Failure> {
         // All in one word: who has rights to all needs no more.
         let words = match topics.len() == Topic::ALL.len() {
             true => vec!["*"],
             false => std::iter::once(ANNOUNCE).chain(topics.iter().map(|topic| topic.name())).collect(),
         };
-        let mut ears = Vec::new();
+        let mut subscribers = Vec::new();
         for word in words {
             let samples = self.clone();
             let hear = move |key: &str, payload| samples.take(key, payload);
-            ears.push(engine.subscribe(&format!("{PREFIX}/*/*/{word}"), LONGEST, hear)?);
+            subscribers.push(session.subscribe(&format!("{PREFIX}/*/*/{word}"), LONGEST, hear)?);
         }
         let tokens = self.clone();
-        ears.push(engine.watch(&format!("{PREFIX}/*/*/{LIVE}"), move |key| {
+        subscribers.push(session.watch(&format!("{PREFIX}/*/*/{LIVE}"), move |key| {
             if key.len() <= LONGEST_NAME {
                 tokens.put(Heard::Live(key.into()));
             }
         })?);
-        Ok(ears)
+        Ok(subscribers)
     }
 
     fn take(&self, key: &str, payload: Option<Vec<u8>>) {

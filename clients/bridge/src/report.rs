@@ -1,37 +1,36 @@
-//! What a bridge tells of itself, of its links, and of what goes out. What comes in is told where it is counted. Refuses to
-//! know why.
+//! What a bridge reports of itself, of its links, and of what it sends. What it receives is reported where it is counted.
 
 use std::io::Write;
 
 use serde::Serialize;
-use verbs::network::{End, Notice, Output, account, tell};
+use verbs::network::{End, Notice, Output, tell};
 
 use crate::BridgeOptions;
 use crate::diagnosis::Diagnosis;
-use crate::engine::News;
 use crate::sending::Sending;
+use crate::session::LinkEvent;
 
-/// Where it is told.
+/// Writes the reports.
 pub(crate) struct Report<'a> {
     json: bool,
-    /// What was told to be wrong since somebody was connected: the remedy is told once.
-    told: Vec<Diagnosis>,
+    /// What was reported since somebody was connected last: a remedy is reported once.
+    reported: Vec<Diagnosis>,
     out: Output<'a>,
     notes: Output<'a>,
 }
 
 impl<'a> Report<'a> {
-    /// Accounts to `out`, and what is no account to `notes` if `out` is not JSON.
+    /// Writes statistics to `out`, and everything else to `notes` unless `out` is JSON.
     pub(crate) fn new(json: bool, out: Output<'a>, notes: Output<'a>) -> Report<'a> {
-        Report { json, told: Vec::new(), out, notes }
+        Report { json, reported: Vec::new(), out, notes }
     }
 
-    /// Whether it accounts by itself, now and then.
+    /// Returns whether statistics are written periodically.
     pub(crate) fn is_periodic(&self) -> bool {
         self.json
     }
 
-    /// It is ready: who it is, and what it does.
+    /// Reports that the bridge is ready, its number, and what it does.
     pub(crate) fn begin(&mut self, options: &BridgeOptions, sending: Option<&Sending>) -> Result<(), End> {
         let life = sending.map(|sending| &sending.life);
         let publish = options.publish.as_ref().map(|publish| publish.domain.name());
@@ -58,12 +57,12 @@ impl<'a> Report<'a> {
         })
     }
 
-    /// News of the hub.
+    /// Reports an event of the hub.
     pub(crate) fn hub(&mut self, notice: Notice) -> Result<(), End> {
         tell(notice, self.json, &mut self.out, &mut self.notes)
     }
 
-    /// Nobody is connected yet, and it goes on trying.
+    /// Reports that nobody is connected yet. The bridge keeps trying.
     pub(crate) fn waiting(&mut self, options: &BridgeOptions) -> Result<(), End> {
         let message = match &options.connect[..] {
             [] => "waits for the routers that --config names".to_owned(),
@@ -75,12 +74,12 @@ impl<'a> Report<'a> {
         self.notes.line(|line| write!(line, "{message}"))
     }
 
-    /// News of the links.
-    pub(crate) fn link(&mut self, news: &News) -> Result<(), End> {
-        let News::Failing(words) = news else {
-            let is_up = *news == News::Up;
+    /// Reports an event of the links.
+    pub(crate) fn link(&mut self, event: &LinkEvent) -> Result<(), End> {
+        let LinkEvent::Failing(words) = event else {
+            let is_up = *event == LinkEvent::Up;
             if is_up {
-                self.told.clear();
+                self.reported.clear();
             }
             if self.json {
                 return self.out.json(&Link::of(if is_up { "up" } else { "down" }));
@@ -93,8 +92,8 @@ impl<'a> Report<'a> {
             let (finding, remedy) = (known.map(|known| known.finding), known.map(|known| known.remedy));
             return self.out.json(&Link { message: Some(words), finding, remedy, ..Link::of("failing") });
         }
-        let new = known.filter(|known| !self.told.contains(known));
-        self.told.extend(new);
+        let new = known.filter(|known| !self.reported.contains(known));
+        self.reported.extend(new);
         let Some(Diagnosis { finding, remedy }) = new else {
             return self.notes.line(|line| write!(line, "{words}"));
         };
@@ -102,9 +101,20 @@ impl<'a> Report<'a> {
         self.notes.line(|line| write!(line, "  {remedy}"))
     }
 
-    /// The account of what goes out.
+    /// Reports the statistics of what is sent.
     pub(crate) fn account(&mut self, sending: &Sending) -> Result<(), End> {
-        account(&sending.outgoing(), &sending.life, "bridge", self.json, &mut self.out)
+        sending.account(self.json, &mut self.out)
+    }
+
+    /// Reports how many connections failed or were refused.
+    pub(crate) fn refused(&mut self, connection: u64) -> Result<(), End> {
+        if self.json {
+            return self.out.json(&Refused { class: "bridge_refused", connection });
+        }
+        match connection {
+            0 => Ok(()),
+            _ => self.out.line(|line| write!(line, "refused: connection {connection}")),
+        }
     }
 }
 
@@ -121,6 +131,13 @@ struct Begin<'a> {
     pid: u32,
 }
 
+/// Class `bridge_refused` of a bridge that receives nothing.
+#[derive(Serialize)]
+struct Refused {
+    class: &'static str,
+    connection: u64,
+}
+
 /// Class `bridge_link`.
 #[derive(Serialize)]
 struct Link<'a> {
@@ -134,7 +151,7 @@ struct Link<'a> {
 }
 
 impl Link<'_> {
-    /// As long as nothing else is said.
+    /// A line with nothing but the state.
     fn of(state: &'static str) -> Self {
         Link { class: "bridge_link", state, message: None, finding: None, remedy: None }
     }

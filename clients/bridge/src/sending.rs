@@ -1,225 +1,234 @@
-//! The way out: what the hub publishes waits, of each topic the newest, until the engine takes it. Two threads, so that a
-//! slow network makes nobody wait but the one that hands over. Refuses to know what carries it.
+//! Topics of a hub under Zenoh's own keys: `scanhub/HUB/SENSOR/TOPIC`, with the datagrams of a gateway as payload. Of each
+//! topic, the newest sample waits until the links have room for it.
 
 use std::collections::HashMap;
 use std::collections::hash_map::Entry;
 use std::num::NonZeroU64;
-use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
-use std::thread;
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
+use lan::Stamp;
 use lan::address::{Address, LIVE, PREFIX};
 use lan::outgoing::{Outgoing, Sample, Transmit};
 use schema::{Domain, Failure, Topic};
-use verbs::network::{Carrier, End, Forwarder, Life, Selection, begin_life, now};
+use verbs::network::{Carrier, End, Life, Output, Selection, account, begin_life, now};
 
 use crate::SendOptions;
-use crate::engine::{Connection, Engine, Publisher, Token};
+use crate::queue::{Follower, Queue, Sender, Shared};
 use crate::report::Report;
+use crate::session::{Publisher, Queryable, Reply, Token, ZenohSession};
 
-/// The hub, and what waits of it.
+/// What a bridge sends of its hub.
 pub(crate) struct Sending {
     pub(crate) life: Life,
-    forwarder: Forwarder,
-    waiting: Waiting,
+    follower: Follower<Datagrams>,
 }
 
-/// What waits, and who is to hear of it.
-#[derive(Clone)]
-struct Waiting(Arc<Shared>);
-
-struct Shared {
+/// The datagrams that wait, and their statistics.
+pub(crate) struct Datagrams {
     hub: u64,
-    outgoing: Mutex<Outgoing>,
-    /// Something waits.
-    bell: Condvar,
-    /// The hub is there.
-    hub_lives: AtomicBool,
+    outgoing: Outgoing,
+    hub_is_available: bool,
 }
 
-/// In the place of an interface, in the name of the file that keeps a bridge's number.
-const WAY: &str = "bridge";
+/// Stands for the interface in the name of the file that keeps the bridge's number.
+const INTERFACE: &str = "bridge";
 
 impl Sending {
-    /// Begins a life of the bridge of the domain.
+    /// Starts a run of the domain's bridge.
     pub(crate) fn open(options: &SendOptions) -> Result<Sending, Failure> {
         let selection = Selection::parse(&options.topics, false)?;
         let domain = options.places.first().map(Domain::name).unwrap_or_default();
-        let life = begin_life(domain, WAY)?;
-        let mut waiting = Waiting(Arc::new(Shared {
-            hub: life.hub,
-            outgoing: Mutex::new(Outgoing::waiting(life.hub, life.epoch)),
-            bell: Condvar::new(),
-            hub_lives: AtomicBool::new(false),
-        }));
-        let forwarder = Forwarder::new(selection, &options.places, &mut waiting);
-        Ok(Sending { life, forwarder, waiting })
+        let life = begin_life(domain, INTERFACE)?;
+        let outgoing = Outgoing::waiting(life.hub, life.epoch);
+        let datagrams = Datagrams { hub: life.hub, outgoing, hub_is_available: false };
+        Ok(Sending { life, follower: Follower::new(selection, &options.places, datagrams) })
     }
 
-    /// Takes what the hub published, and looks after it; whether there may be more.
+    /// Queues what the hub published, and polls the hub. Returns whether there may be more.
     pub(crate) fn forward(&mut self, report: &mut Report<'_>) -> Result<bool, End> {
-        let Sending { forwarder, waiting, .. } = self;
-        let more = forwarder.forward(waiting)?;
-        waiting.ring();
-        forwarder.look(Instant::now(), waiting, &mut |notice| report.hub(notice))?;
-        waiting.0.hub_lives.store(forwarder.is_there(), Ordering::Relaxed);
-        Ok(more)
+        self.follower.forward(&mut |notice| report.hub(notice))
     }
 
-    /// Waits for the hub, and no longer than `at_most`.
+    /// Waits for the hub, for at most `at_most`.
     pub(crate) fn wait(&mut self, at_most: Duration) -> Result<(), Failure> {
-        self.forwarder.wait(at_most)
+        self.follower.wait(at_most)
     }
 
     /// Announces all sensors.
     pub(crate) fn announce(&mut self) {
-        self.waiting.outgoing().announce(now(), &mut Nowhere);
-        self.waiting.ring();
+        self.queue().lock().announce();
+        self.queue().ring();
     }
 
-    /// What waits, as it stands.
-    pub(crate) fn outgoing(&self) -> MutexGuard<'_, Outgoing> {
-        self.waiting.outgoing()
+    /// Writes the statistics of each topic.
+    pub(crate) fn account(&self, json: bool, out: &mut Output<'_>) -> Result<(), End> {
+        account(&self.queue().lock().outgoing, &self.life, "bridge", json, out)
     }
 
-    /// The other end, for a thread of its own.
-    pub(crate) fn handing(&self) -> Handing {
-        Handing { waiting: self.waiting.clone(), publishers: HashMap::new(), tokens: HashMap::new() }
-    }
-}
-
-impl Waiting {
-    fn outgoing(&self) -> MutexGuard<'_, Outgoing> {
-        // Nobody panics while he has it; if one did, the samples are none the worse for it.
-        self.0.outgoing.lock().unwrap_or_else(PoisonError::into_inner)
-    }
-
-    fn ring(&self) {
-        self.0.bell.notify_one();
+    /// Returns the queue, for the thread that sends.
+    pub(crate) fn queue(&self) -> &Shared<Datagrams> {
+        self.follower.queue()
     }
 }
 
-impl Carrier for Waiting {
+impl Datagrams {
+    fn announce(&mut self) {
+        self.outgoing.announce(now(), &mut NullTransmit);
+    }
+
+    /// Returns the last announcements, statuses and backgrounds whose key is part of a query.
+    fn answers(&mut self, is_queried: &dyn Fn(&str) -> bool) -> Vec<Reply> {
+        let Datagrams { hub, outgoing, .. } = self;
+        let kept = outgoing.kept().map(|(sensor, topic)| (sensor.to_owned(), topic));
+        let kept: Vec<(String, Option<Topic>)> = kept.collect();
+        let mut answers = Vec::new();
+        for (sensor, topic) in kept {
+            let key = Address { hub: *hub, sensor: &sensor, topic }.to_string();
+            if is_queried(&key)
+                && let Some(payload) = outgoing.again(&sensor, topic, now())
+            {
+                answers.push(Reply { key, payload: payload.to_vec(), attachment: None });
+            }
+        }
+        answers
+    }
+}
+
+impl Queue for Datagrams {
+    fn is_waiting(&self) -> bool {
+        self.outgoing.is_waiting()
+    }
+
+    fn look(&mut self, hub_is_available: bool, _: Stamp) {
+        self.hub_is_available = hub_is_available;
+    }
+}
+
+impl Carrier for Datagrams {
     fn follow(&mut self, name: &str, every: &dyn Fn(Topic) -> Option<NonZeroU64>) -> usize {
-        self.outgoing().follow(name, every)
+        self.outgoing.follow(name, every)
     }
 
     fn wants(&self, sensor: usize, topic: Topic) -> bool {
-        self.outgoing().wants(sensor, topic)
+        self.outgoing.wants(sensor, topic)
     }
 
     fn sample(&mut self, sensor: usize, sample: &Sample<'_>) {
-        self.outgoing().sample(sensor, sample, now(), &mut Nowhere);
+        self.outgoing.sample(sensor, sample, now(), &mut NullTransmit);
     }
 }
 
-/// Where samples wait, none is transmitted.
-struct Nowhere;
+/// Where samples wait, nothing is transmitted at once.
+struct NullTransmit;
 
-impl Transmit for Nowhere {
+impl Transmit for NullTransmit {
     fn transmit(&mut self, _: &[u8], _: u8, _: u8) -> bool {
         false
     }
 }
 
-/// What hands over to the engine.
-pub(crate) struct Handing {
-    waiting: Waiting,
-    /// By sensor and topic.
-    publishers: HashMap<(u8, Option<Topic>), (String, Publisher)>,
-    /// What says that the hub and its sensors are there, by its name.
+/// Sends datagrams under their keys, and answers queries for the last ones.
+pub(crate) struct DatagramSender<'a> {
+    session: &'a ZenohSession,
+    hub: u64,
+    topics: Vec<SentTopic>,
+    /// The tokens of the hub and its sensors, by key. Empty while the hub is unavailable.
     tokens: HashMap<String, Token>,
+    is_finished: bool,
+    _queryable: Queryable,
 }
 
-/// Between two looks at the link and at the hub where nothing waits.
-const LOOK_EVERY: Duration = Duration::from_millis(50);
-/// The same while there is no link.
-const LINK_EVERY: Duration = Duration::from_millis(5);
-/// So long it goes on at the end for what still waits.
-const LAST: Duration = Duration::from_secs(1);
+/// A topic of a sensor. A sensor's number belongs to another one when the hub restarts with other links.
+struct SentTopic {
+    number: u8,
+    sensor: String,
+    topic: Option<Topic>,
+    publisher: Option<Publisher>,
+}
 
-impl Handing {
-    /// Hands over until it `is_over`, and then what still waits.
-    pub(crate) fn run(mut self, connection: &Connection, is_over: &AtomicBool) -> Result<(), Failure> {
-        let Some(engine) = connection.engine(is_over) else { return Ok(()) };
-        let shared = self.waiting.clone();
-        let _answers = engine.answer(&format!("{PREFIX}/{:016x}/*/*", shared.0.hub), move |key| {
-            let address = Address::parse(key).filter(|address| address.hub == shared.0.hub)?;
-            shared.outgoing().again(address.sensor, address.topic, now()).map(<[u8]>::to_vec)
-        })?;
-        let mut bytes = Vec::new();
-        let (mut end_at, mut is_announced) = (None, false);
-        loop {
-            if is_over.load(Ordering::Relaxed) {
-                let end_at = *end_at.get_or_insert_with(|| Instant::now() + LAST);
-                let is_done = !self.waiting.outgoing().is_waiting();
-                if is_done && is_announced || Instant::now() >= end_at {
-                    return Ok(());
-                }
-                // How many were sent is the last word, behind all that was.
-                if is_done {
-                    self.waiting.outgoing().announce(now(), &mut Nowhere);
-                    is_announced = true;
-                }
-            }
-            self.look(engine)?;
-            if !engine.is_linked() {
-                thread::sleep(LINK_EVERY);
-                continue;
-            }
-            self.hand(engine, &mut bytes)?;
-        }
+impl<'a> DatagramSender<'a> {
+    /// Opens a sender for `queue`.
+    pub(crate) fn open(
+        session: &'a ZenohSession,
+        queue: &Shared<Datagrams>,
+    ) -> Result<DatagramSender<'a>, Failure> {
+        let hub = queue.lock().hub;
+        let queue = queue.clone();
+        let answer = move |is_queried: &dyn Fn(&str) -> bool| queue.lock().answers(is_queried);
+        let _queryable = session.answer(&format!("{PREFIX}/{hub:016x}/*/*"), answer)?;
+        Ok(DatagramSender {
+            session,
+            hub,
+            topics: Vec::new(),
+            tokens: HashMap::new(),
+            is_finished: false,
+            _queryable,
+        })
     }
 
-    /// Hands over the sample that has waited for longest; waits for one if there is none.
-    fn hand(&mut self, engine: &Engine, bytes: &mut Vec<u8>) -> Result<(), Failure> {
-        let Shared { hub, bell, .. } = &*self.waiting.0;
-        let mut outgoing = self.waiting.outgoing();
-        if !outgoing.is_waiting() {
-            let woken = bell.wait_timeout(outgoing, LOOK_EVERY).unwrap_or_else(PoisonError::into_inner);
-            outgoing = woken.0;
-        }
-        let Some(handed) = outgoing.hand(now()) else { return Ok(()) };
-        let (number, topic) = (handed.sensor.0, handed.topic);
-        bytes.clear();
-        bytes.extend_from_slice(handed.datagram);
-        let known = self.publishers.get(&(number, topic)).is_some_and(|(name, _)| name == handed.sensor.1);
-        if !known {
-            let sensor = handed.sensor.1.to_owned();
-            drop(outgoing);
-            let address = Address { hub: *hub, sensor: &sensor, topic }.to_string();
-            let publisher = engine.publisher(&address)?;
-            let live = format!("{PREFIX}/{hub:016x}/{sensor}/{LIVE}");
-            if let Entry::Vacant(place) = self.tokens.entry(live) {
-                let token = engine.token(place.key())?;
-                place.insert(token);
-            }
-            self.publishers.insert((number, topic), (sensor, publisher));
-        } else {
-            drop(outgoing);
-        }
-        let is_taken = self.publishers.get(&(number, topic)).is_some_and(|(_, to)| to.put(bytes));
-        if !is_taken {
-            self.waiting.outgoing().not_taken(number, topic, bytes.len());
+    /// Announces that `key` exists, once.
+    fn announce(&mut self, key: String) -> Result<(), Failure> {
+        if let Entry::Vacant(place) = self.tokens.entry(key) {
+            let token = self.session.token(place.key())?;
+            place.insert(token);
         }
         Ok(())
     }
+}
 
-    /// Says that the hub is there, or that it and its sensors are not.
-    fn look(&mut self, engine: &Engine) -> Result<(), Failure> {
-        let is_there = self.waiting.0.hub_lives.load(Ordering::Relaxed);
-        if is_there != self.tokens.is_empty() {
+impl Sender for DatagramSender<'_> {
+    type Queue = Datagrams;
+
+    fn declare(&mut self, queue: &Shared<Datagrams>) -> Result<(), Failure> {
+        let hub_is_available = queue.lock().hub_is_available;
+        if hub_is_available != self.tokens.is_empty() {
             return Ok(());
         }
-        if !is_there {
+        if !hub_is_available {
             self.tokens.clear();
-            self.publishers.clear();
+            self.topics.clear();
             return Ok(());
         }
-        let live = format!("{PREFIX}/{:016x}/{LIVE}", self.waiting.0.hub);
-        let token = engine.token(&live)?;
-        self.tokens.insert(live, token);
-        Ok(())
+        self.announce(format!("{PREFIX}/{:016x}/{LIVE}", self.hub))
+    }
+
+    fn take(&mut self, queue: &mut Datagrams, now: Stamp, message: &mut Vec<u8>) -> Option<usize> {
+        let handed = queue.outgoing.hand(now)?;
+        message.clear();
+        message.extend_from_slice(handed.datagram);
+        let ((number, sensor), topic) = (handed.sensor, handed.topic);
+        let is_same = |it: &SentTopic| (it.number, &*it.sensor, it.topic) == (number, sensor, topic);
+        Some(self.topics.iter().position(is_same).unwrap_or_else(|| {
+            self.topics.push(SentTopic { number, sensor: sensor.to_owned(), topic, publisher: None });
+            self.topics.len() - 1
+        }))
+    }
+
+    fn send(&mut self, topic: usize, message: &[u8]) -> Result<bool, Failure> {
+        if self.topics[topic].publisher.is_none() {
+            let SentTopic { ref sensor, topic: of, .. } = self.topics[topic];
+            let hub = self.hub;
+            let key = Address { hub, sensor, topic: of }.to_string();
+            let live = format!("{PREFIX}/{hub:016x}/{sensor}/{LIVE}");
+            self.topics[topic].publisher = Some(self.session.publisher(&key)?);
+            self.announce(live)?;
+        }
+        let publisher = self.topics[topic].publisher.as_ref();
+        Ok(publisher.is_some_and(|publisher| self.session.put(publisher, message, None)))
+    }
+
+    fn not_sent(&self, queue: &mut Datagrams, topic: usize, message: &[u8]) {
+        let SentTopic { number, topic, .. } = self.topics[topic];
+        queue.outgoing.not_taken(number, topic, message.len());
+    }
+
+    /// The last announcement counts everything that was sent.
+    fn finish(&mut self, queue: &mut Datagrams) -> bool {
+        if self.is_finished {
+            return false;
+        }
+        self.is_finished = true;
+        queue.announce();
+        true
     }
 }

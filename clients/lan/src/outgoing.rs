@@ -96,6 +96,12 @@ impl Outgoing {
         self.numbering.again(name, topic, now)
     }
 
+    /// Returns the sensors and topics (`None`: announcements) of which [`again`](Outgoing::again) has a sample. The
+    /// announcement of a sensor comes before its samples.
+    pub fn kept(&self) -> impl Iterator<Item = (&str, Option<Topic>)> {
+        self.numbering.kept()
+    }
+
     /// Returns whether samples wait, so that newer ones may replace them: then announcements say how many were.
     pub fn tells_replaced(&self) -> bool {
         self.numbering.tells_replaced()

@@ -167,10 +167,19 @@ pub(crate) fn listened(at: SocketAddr) {
 
 /// Opens a plain Zenoh session at a router.
 pub(crate) fn session(router: SocketAddr) -> zenoh::Session {
+    open("client", "connect/endpoints", router)
+}
+
+/// Opens a Zenoh router with Zenoh's own configuration, as `zenohd` is one.
+pub(crate) fn plain_router(at: SocketAddr) -> zenoh::Session {
+    open("router", "listen/endpoints", at)
+}
+
+fn open(mode: &str, endpoints: &str, at: SocketAddr) -> zenoh::Session {
     let mut config = Config::default();
     for (key, value) in [
-        ("mode", "\"client\"".to_owned()),
-        ("connect/endpoints", format!("[\"tcp/{router}\"]")),
+        ("mode", format!("{mode:?}")),
+        (endpoints, format!("[\"tcp/{at}\"]")),
         ("scouting/multicast/enabled", "false".to_owned()),
     ] {
         config.insert_json5(key, &value).expect("a key of Zenoh");

@@ -3,7 +3,7 @@
 use std::process::Command;
 
 use crate::testkit::{INT, Program, TestEnv, output};
-use crate::{address, bridge, lonely};
+use crate::{address, bridge, lonely, refused};
 
 /// Runs `openssl` in the directory of this test.
 fn openssl(env: &TestEnv, words: &str) {
@@ -92,6 +92,18 @@ fn who_has_a_certificate_of_the_authority_is_connected_and_nobody_else() {
         reason(&mut thief, "the certificates do not fit");
         assert_eq!(thief.end(INT).of_class("bridge_published").len(), 0);
     }
+    // The robot only sends. It says what its peers need, and counts them.
+    let line = robot.await_line("the refusal", |line| {
+        line["class"] == "bridge_link"
+            && line["finding"] == "somebody was refused: the certificates do not fit"
+    });
+    let remedy = line["remedy"].as_str().unwrap_or_default();
+    assert!(remedy.contains("connect_certificate") && !remedy.contains("--connect"), "{line}");
+    robot.await_line("its count", |line| {
+        line["class"] == "bridge_refused" && line["connection"].as_u64() > Some(0)
+    });
+    let outcome = robot.end(INT);
+    assert!(refused(&outcome, "connection") > 0, "{outcome}");
     let outcome = other.run(&[
         "bridge",
         "--json",

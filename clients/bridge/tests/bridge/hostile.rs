@@ -2,32 +2,13 @@
 
 use schema::datagram::{HEAD, Head};
 use schema::{State, Status, Topic, Verdict, Zones};
-use zenoh::{Config, Session, Wait};
+use zenoh::{Session, Wait};
 
 use crate::testkit::{INT, Program, Sender, TestEnv, number, until};
-use crate::{address, bridge, linked, refused};
+use crate::{address, bridge, linked, peer, refused};
 
 const HUB: u64 = 0x5f3a_12bc_00d1_e2f3;
 const FRONT: &str = "scanhub/5f3a12bc00d1e2f3/front";
-
-/// A peer that is connected to the router at this address.
-fn peer(at: &str) -> Session {
-    let mut config = Config::default();
-    for (key, value) in [
-        ("mode", "\"client\""),
-        ("connect/endpoints", &format!("[{at:?}]")),
-        ("scouting/multicast/enabled", "false"),
-    ] {
-        config.insert_json5(key, value).expect("a key of Zenoh");
-    }
-    // It said that it has begun before it listens.
-    let mut session = None;
-    until("the router is there", || {
-        session = zenoh::open(config.clone()).wait().ok();
-        session.is_some()
-    });
-    session.expect("it was waited for")
-}
 
 fn put(session: &Session, key: &str, bytes: &[u8]) {
     use zenoh::qos::CongestionControl;

@@ -3,10 +3,12 @@
 use std::cell::Cell;
 use std::process::Command;
 
+use schema::datagram::Datagram;
 use serde_json::Value;
+use zenoh::Wait;
 
 use crate::testkit::{INT, TestEnv, number, output, succeeds, until, write_program};
-use crate::{NO_FLAGS, account, address, agree, bridge, linked, lonely, refused};
+use crate::{NO_FLAGS, account, address, agree, bridge, linked, lonely, peer, refused};
 
 /// By the number of the scan, what `name` saw.
 fn scans(env: &TestEnv, name: &str, count: &str) -> Vec<(u64, Value)> {
@@ -70,6 +72,57 @@ fn what_a_hub_publishes_is_on_the_other_machine_and_nothing_is_lost() {
     for reason in ["crc", "payload", "key", "long", "overrun", "twin"] {
         assert_eq!((refused(&received, reason), refused(&latest, reason)), (0, 0), "{reason}: {received}");
     }
+}
+
+/// The keys of all answers to a query of a plain Zenoh client.
+fn answers(session: &zenoh::Session, query: &str) -> Vec<String> {
+    let replies = session.get(query).wait().expect("a query");
+    let mut keys = Vec::new();
+    while let Ok(reply) = replies.recv() {
+        let sample = reply.into_result().unwrap_or_else(|error| panic!("{query}: {error:?}"));
+        let payload = sample.payload().to_bytes();
+        Datagram::read(&payload).unwrap_or_else(|error| panic!("{query}: {error:?}"));
+        keys.push(sample.key_expr().as_str().to_owned());
+    }
+    keys.sort();
+    keys
+}
+
+#[test]
+fn queries_with_wildcards_get_every_answer_that_fits() {
+    let robot = TestEnv::new();
+    let _sensors = robot.simulator(&["front", "rear"], NO_FLAGS);
+    let at = address("tcp");
+    let (mut there, id) = bridge(&robot, &["--listen", &at]);
+    let client = peer(&at);
+    linked(&mut there);
+    let _hub = robot.hub(&[robot.link("front"), robot.link("rear")]);
+    let keys = |names: &[&str]| names.iter().map(|name| format!("scanhub/{id}/{name}")).collect::<Vec<_>>();
+    let all = keys(&[
+        "front/announce",
+        "front/background",
+        "front/status",
+        "rear/announce",
+        "rear/background",
+        "rear/status",
+    ]);
+    until("all answers exist", || answers(&client, "scanhub/**") == all);
+    assert_eq!(answers(&client, "**"), all);
+    assert_eq!(answers(&client, "scanhub/*/*/announce"), keys(&["front/announce", "rear/announce"]));
+    assert_eq!(answers(&client, &format!("scanhub/{id}/rear/*")), all[3..]);
+    assert_eq!(answers(&client, &all[1]), all[1..2]);
+    assert_eq!(answers(&client, "scanhub/*/*/scan"), all[..0], "no scan is kept");
+}
+
+#[test]
+fn a_frame_of_an_unknown_sensor_is_refused_without_a_router() {
+    let robot = TestEnv::new();
+    let _sensor = robot.simulator(&["front"], NO_FLAGS);
+    let _hub = robot.hub(&[robot.link("front")]);
+    robot.await_info("front", |info| info["state"] == "streaming");
+    let outcome = robot.run(&["bridge", "--connect=tcp/127.0.0.1:1", "--ros2", "--frame=nothere=x"]);
+    assert_eq!(outcome.code, Some(3), "{outcome}");
+    assert!(outcome.errors.contains("nothere") && outcome.errors.contains("front"), "{outcome}");
 }
 
 #[test]

@@ -16,7 +16,8 @@ use std::collections::BTreeMap;
 use std::net::TcpListener;
 
 use serde_json::Value;
-use testkit::{Outcome, Program, TestEnv, number};
+use testkit::{Outcome, Program, TestEnv, number, until};
+use zenoh::{Config, Session, Wait};
 
 /// A simulator whose sensors are as usual.
 const NO_FLAGS: &[&str] = &[];
@@ -51,6 +52,25 @@ fn router(env: &TestEnv, listen: &str, connect: &[&str]) -> Program {
     let connect: Vec<_> = connect.iter().map(|address| format!("--connect={address}")).collect();
     let flags: Vec<_> = std::iter::once(listen.as_str()).chain(connect.iter().map(String::as_str)).collect();
     bridge(env, &flags).0
+}
+
+/// Returns a plain Zenoh client of the router at this address.
+fn peer(at: &str) -> Session {
+    let mut config = Config::default();
+    for (key, value) in [
+        ("mode", "\"client\""),
+        ("connect/endpoints", &format!("[{at:?}]")),
+        ("scouting/multicast/enabled", "false"),
+    ] {
+        config.insert_json5(key, value).expect("a key of Zenoh");
+    }
+    // A bridge reports that it is ready before it listens.
+    let mut session = None;
+    until("the router accepts connections", || {
+        session = zenoh::open(config.clone()).wait().ok();
+        session.is_some()
+    });
+    session.expect("a session")
 }
 
 /// By sensor and topic, the value of each of these keys in the last account of a bridge: in one before it, a sensor that is

@@ -3,9 +3,10 @@
 
 use std::process::Command;
 
+use rustix::process::Signal;
 use serde_json::Value;
 
-use crate::testkit::{INT, TERM, TestEnv, in_a_network, skip, succeeds, until};
+use crate::testkit::{INT, Outcome, Program, TERM, TestEnv, in_a_network, skip, succeeds, until};
 use crate::{Account, NO_FLAGS, account, account_so_far, address, agree, bridge, linked};
 
 /// Lets no more than 0.5 Mbit/s through the loopback, whose packets are those of a network.
@@ -13,6 +14,29 @@ fn slow_down() -> bool {
     let run = |program: &str, words: &str| succeeds(Command::new(program).args(words.split(' ')));
     run("ip", "link set lo mtu 1500")
         && run("tc", "qdisc add dev lo root tbf rate 500kbit burst 5000 latency 200ms")
+}
+
+/// Ends the bridges `there`, which sends, and `here`, which receives, after everything has arrived. The hub has ended
+/// before, so that the link gets empty: what is still on it when a bridge ends is cut off. Returns what the sender printed,
+/// and the number of lost samples.
+fn end_when_all_arrived(mut there: Program, mut here: Program) -> (Outcome, u64) {
+    let mut received = || account_so_far(&mut here, &["received", "lost"]);
+    until("all samples have arrived", || {
+        let samples = |account: Account| -> Vec<(String, u64)> {
+            let rows = account.into_iter().filter(|(name, _)| !name.ends_with("/announce"));
+            rows.map(|(name, row)| (name, row.iter().sum())).collect()
+        };
+        let sent = samples(account_so_far(&mut there, &["sent"]));
+        sent.len() > 4 && sent == samples(received())
+    });
+    let sent = there.end(INT);
+    let counts = account(&sent, &["sent"]);
+    until("the last announcements have arrived", || {
+        let received = received();
+        counts.iter().all(|(name, row)| received.get(name).is_some_and(|it| it[0] + it[1] == row[0]))
+    });
+    let lost = agree(&sent, &here.end(INT));
+    (sent, lost)
 }
 
 #[test]
@@ -36,26 +60,54 @@ fn on_a_slow_link_the_newest_comes_first() {
         local.await_line("a scan", |line| line["class"] == "scan");
         let local = local.end(INT);
         assert_eq!(local.of_class("summary")[0]["lost"], 0, "{local}");
-        // What waits on the link when a bridge ends is cut off: nothing new comes, and it gets empty.
         assert_eq!(hub.end(TERM).code, Some(0));
-        let mut received = || account_so_far(&mut here, &["received", "lost"]);
-        until("all samples have arrived", || {
-            let samples = |account: Account| -> Vec<(String, u64)> {
-                let rows = account.into_iter().filter(|(name, _)| !name.ends_with("/announce"));
-                rows.map(|(name, row)| (name, row.iter().sum())).collect()
-            };
-            let sent = samples(account_so_far(&mut there, &["sent"]));
-            sent.len() > 4 && sent == samples(received())
-        });
-        let sent = there.end(INT);
-        let counts = account(&sent, &["sent"]);
-        until("the last announcements have arrived", || {
-            let received = received();
-            counts.iter().all(|(name, row)| received.get(name).is_some_and(|it| it[0] + it[1] == row[0]))
-        });
-        let received = here.end(INT);
-        agree(&sent, &received);
+        let (sent, _) = end_when_all_arrived(there, here);
         let replaced: u64 = account(&sent, &["sent", "replaced"]).values().map(|row| row[1]).sum();
         assert!(replaced > 100, "it was not slow: {sent}");
     });
+}
+
+/// How many samples newer ones must replace before the stalled link moves again: more than 1 s of zones.
+const REPLACED: u64 = 60;
+
+/// Stops the program that receives until newer samples have replaced many others, with this bridge as the router.
+fn stall(robot_listens: bool) {
+    let (robot, desk) = (TestEnv::new(), TestEnv::new());
+    let _sensor = robot.simulator(&["front"], NO_FLAGS);
+    let at = address("tcp");
+    let (robot_flag, desk_flag) = match robot_listens {
+        true => ("--listen", "--connect"),
+        false => ("--connect", "--listen"),
+    };
+    let send = || bridge(&robot, &[robot_flag, &at, "--topic=*/*"]).0;
+    let receive = || bridge(&desk, &[desk_flag, &at, "--publish"]).0;
+    // The one that listens must be first.
+    let (mut there, mut here);
+    if robot_listens {
+        (there, here) = (send(), receive());
+    } else {
+        here = receive();
+        there = send();
+    }
+    linked(&mut there);
+    linked(&mut here);
+    let hub = robot.hub(&[robot.link("front")]);
+    here.await_line("a sensor", |line| line["kind"] == "published");
+    let replaced = |there: &mut Program| {
+        account_so_far(there, &["sent", "replaced"]).get("front/zones").map_or(0, |row| row[1])
+    };
+    here.signal(Signal::STOP);
+    until("many samples are replaced", || replaced(&mut there) > REPLACED);
+    here.signal(Signal::CONT);
+    assert_eq!(hub.end(TERM).code, Some(0));
+    let (sent, lost) = end_when_all_arrived(there, here);
+    // A receiver that is stopped for longer than 5 s loses the link, and what was on it.
+    let is_broken = sent.of_class("bridge_link").iter().any(|line| line["state"] == "down");
+    assert!(lost == 0 || is_broken, "{lost} samples were not sent: {sent}");
+}
+
+#[test]
+fn what_a_stalled_link_has_no_room_for_is_not_counted_as_sent() {
+    stall(true);
+    stall(false);
 }

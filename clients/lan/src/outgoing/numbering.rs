@@ -210,6 +210,14 @@ impl Numbering {
         head.seal(&mut self.buffer, len)
     }
 
+    /// The sensors and topics of which a sample is kept, in the order in which they were sent first.
+    pub(super) fn kept(&self) -> impl Iterator<Item = (&str, Option<Topic>)> {
+        self.waiting
+            .iter()
+            .flat_map(|waiting| &waiting.last)
+            .map(|(head, _)| (&*self.sensors[usize::from(head.sensor)].name, Topic::of_number(head.topic)))
+    }
+
     /// What was handed on as this sensor's and topic's last sample, of so many bytes, was not taken.
     pub(super) fn not_taken(&mut self, number: u8, topic: Option<Topic>, bytes: usize) {
         if let Some(row) = self.row(number, topic.map_or(Announce::NUMBER, Topic::number)) {

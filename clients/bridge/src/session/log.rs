@@ -1,5 +1,5 @@
-//! What Zenoh says of connections that fail: it has no other way to tell why. The newest lines wait here, each once, until
-//! they are told; everything else that it logs is passed over. Refuses to know what they mean.
+//! What Zenoh logs about connections that fail: there is no other way to learn why. The newest lines wait here until they are
+//! reported, each once. Everything else in Zenoh's log is ignored.
 
 use std::collections::VecDeque;
 use std::fmt::{Debug, Write};
@@ -26,9 +26,9 @@ const MOST: usize = 16;
 /// The longest line, in bytes.
 const LONGEST: usize = 500;
 
-/// What is followed by what is another one at each attempt (how soon the next one is, the port on this side), and how much of
-/// it is kept.
-const OF_AN_ATTEMPT: [(&str, usize); 2] = [(" Retry in ", 0), ("Syn on: ", 3)];
+/// Text after which a line differs in each attempt (the time until the next one, the local port), or has advice for the
+/// wrong system, and how much of that text is kept.
+const CUT: [(&str, usize); 3] = [(" Retry in ", 0), ("Syn on: ", 3), (" Hint: increase the system", 0)];
 /// What Zenoh writes behind addresses, because this program told it so (`config.rs`).
 const OUR_LIMIT: &str = "#so_sndbuf=8192";
 
@@ -65,7 +65,7 @@ impl Log {
     }
 
     fn add(&self, line: &str) {
-        let end = OF_AN_ATTEMPT.iter().filter_map(|(sign, len)| Some(line.find(sign)? + len)).min();
+        let end = CUT.iter().filter_map(|(sign, len)| Some(line.find(sign)? + len)).min();
         let mut line = without_places(&line[..end.unwrap_or(line.len())]).replace(OUR_LIMIT, "");
         let end = line.char_indices().map(|(at, _)| at).find(|at| *at + 4 > LONGEST);
         line.truncate(end.unwrap_or(line.len()));
@@ -168,6 +168,8 @@ mod tests {
         log.add("no route");
         log.add("no route");
         assert_eq!((log.take(), log.take(), log.count()), (vec!["no route".to_owned()], vec![], 2));
+        log.add("Too many open files (os error 24). Hint: increase the system open file limit.");
+        assert_eq!(log.take(), ["Too many open files (os error 24)."]);
         log.add("no tcp/r:1#so_sndbuf=8192: refused. Retry in 100ms.");
         log.add("no tcp/r:1#so_sndbuf=8192: refused. Retry in 200ms.");
         assert_eq!(log.take(), ["no tcp/r:1: refused."]);

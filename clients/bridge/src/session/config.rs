@@ -1,5 +1,5 @@
-//! What Zenoh is told: the routers and places that the user named, in what its own configuration file says, and limits where
-//! that says nothing. Nothing listens, nothing is looked for, unless somebody said so. Refuses to know when it is opened.
+//! Zenoh's configuration: its own configuration file, the addresses that the user named, and limits for what the file does
+//! not set. A session listens and searches only if the user or the file says so.
 
 use std::path::Path;
 
@@ -12,17 +12,17 @@ use super::certificate::{Unusable, check_key, check_own, check_trusted};
 use super::log::without_places;
 use crate::BridgeOptions;
 
-/// A configuration that was checked.
+/// A valid configuration.
 #[derive(Debug)]
-pub(crate) struct Prepared {
+pub(crate) struct CheckedConfig {
     config: Config,
     listens: bool,
 }
 
-/// What is told where the file says nothing: keys of Zenoh's configuration, and their values as JSON.
+/// Keys of Zenoh's configuration, and the JSON values that they get if the file does not set them.
 ///
-/// Its own values are made for throughput: what stands in long queues is old on a slow link. A message that finds no room
-/// is waited for here (and only here: a router on the way has values of its own), and the sender keeps the newest meanwhile.
+/// Zenoh's own values are made for throughput: samples in long queues are old on a slow link. A message that finds no room
+/// waits in this session, while newer samples replace those behind it. A router on the way has values of its own.
 const LIMITS: &[(&str, &str)] = &[
     ("scouting/multicast/enabled", "false"),
     ("scouting/gossip/enabled", "false"),
@@ -33,11 +33,22 @@ const LIMITS: &[(&str, &str)] = &[
     ("transport/unicast/max_sessions", "64"),
     ("transport/link/tx/batch_size", "8192"),
     ("transport/link/tx/queue/size/data", "1"),
-    ("transport/link/tx/queue/congestion_control/drop/wait_before_drop", "1000000"),
-    ("transport/link/tx/queue/congestion_control/drop/max_wait_before_drop_fragments", "2000000"),
     ("transport/link/rx/max_message_size", "1048576"),
     ("transport/link/tcp/so_sndbuf", "8192"),
     ("transport/link/tls/so_sndbuf", "8192"),
+];
+
+/// How long a message waits for room before Zenoh drops it, and every later one until there is room, in microseconds. In
+/// fragments, it may wait for the second time.
+///
+/// A session that only connects has one link, and waits longer than a link without data lives (10 s). So it drops nothing,
+/// but the link breaks. A session that listens may have many links, and one that is stopped must not delay the others.
+const WAIT: [(&str, [&str; 2]); 2] = [
+    ("transport/link/tx/queue/congestion_control/drop/wait_before_drop", ["60000000", "1000000"]),
+    (
+        "transport/link/tx/queue/congestion_control/drop/max_wait_before_drop_fragments",
+        ["60000000", "2000000"],
+    ),
 ];
 
 /// Files that Zenoh opens when it connects, and not before.
@@ -62,12 +73,14 @@ enum Content {
     Users,
 }
 
-impl Prepared {
-    /// Reads what `options` say, `now_s` seconds after 1970.
+impl CheckedConfig {
+    /// Makes the configuration for these `options`. `now_s` is the time in seconds since 1970.
     ///
-    /// [`Kind::Input`] if the file is missing or unreadable, [`Kind::Configuration`] if it or an address cannot be, if neither
-    /// a router nor a place to listen is named, or if a certificate has expired.
-    pub(crate) fn read(options: &BridgeOptions, now_s: i64) -> Result<Prepared, Failure> {
+    /// # Errors
+    ///
+    /// [`Kind::Input`] if the file cannot be read. [`Kind::Configuration`] if the file or an address is invalid, if there is
+    /// neither a router nor an address to listen on, or if a certificate has expired.
+    pub(crate) fn read(options: &BridgeOptions, now_s: i64) -> Result<CheckedConfig, Failure> {
         let mut config = options.config.as_deref().map_or_else(|| Ok(Config::default()), read)?;
         let unsaid = Config::default();
         let is_said = |config: &Config, key: &str| config.get_json(key).ok() != unsaid.get_json(key).ok();
@@ -79,11 +92,6 @@ impl Prepared {
             None => WhatAmI::Client,
         };
         set(&mut config, "mode", &format!("{:?}", mode.to_str()));
-        for (key, value) in LIMITS {
-            if !is_said(&config, key) {
-                set(&mut config, key, value);
-            }
-        }
         let mut listen = if listens_by_itself { Vec::new() } else { endpoints(&config, "listen", mode) };
         listen.extend(checked("--listen", &options.listen)?);
         let mut connect = endpoints(&config, "connect", mode);
@@ -95,6 +103,12 @@ impl Prepared {
             return Err(Failure::new(Kind::Configuration, "no router", hint));
         }
         let listens = !listen.is_empty();
+        let waits = WAIT.iter().map(|(key, values)| (*key, values[usize::from(listens)]));
+        for (key, value) in LIMITS.iter().copied().chain(waits) {
+            if !is_said(&config, key) {
+                set(&mut config, key, value);
+            }
+        }
         for (key, endpoints) in [("listen/endpoints", &listen), ("connect/endpoints", &connect)] {
             let list: Vec<_> = endpoints.iter().map(|endpoint| format!("{endpoint:?}")).collect();
             set(&mut config, key, &format!("[{}]", list.join(",")));
@@ -113,15 +127,15 @@ impl Prepared {
         for &(key, content) in FILES {
             check_file(&config, key, content, now_s)?;
         }
-        Ok(Prepared { config, listens })
+        Ok(CheckedConfig { config, listens })
     }
 
-    /// What Zenoh is told.
-    pub(super) fn config(&self) -> Config {
+    /// Returns the configuration for Zenoh.
+    pub(super) fn zenoh(&self) -> Config {
         self.config.clone()
     }
 
-    /// It listens.
+    /// Returns whether the session listens.
     pub(super) fn listens(&self) -> bool {
         self.listens
     }
@@ -207,31 +221,34 @@ mod tests {
         }
     }
 
-    fn said(prepared: &Prepared, key: &str) -> String {
+    fn said(prepared: &CheckedConfig, key: &str) -> String {
         prepared.config.get_json(key).unwrap()
     }
 
     /// What becomes of a file with this `text`.
-    fn of_file(name: &str, text: &str, connect: &[&str]) -> Result<Prepared, Failure> {
+    fn of_file(name: &str, text: &str, connect: &[&str]) -> Result<CheckedConfig, Failure> {
         let file = tempfile::Builder::new().suffix(name).tempfile().unwrap();
         std::fs::write(&file, text).unwrap();
-        Prepared::read(&options(connect, &[], Some(file.path())), NOW_S)
+        CheckedConfig::read(&options(connect, &[], Some(file.path())), NOW_S)
     }
 
     #[test]
     fn nothing_listens_or_is_looked_for_unless_it_was_said() {
-        let client = Prepared::read(&options(&["tcp/127.0.0.1:7447"], &[], None), NOW_S).unwrap();
+        let client = CheckedConfig::read(&options(&["tcp/127.0.0.1:7447"], &[], None), NOW_S).unwrap();
         assert_eq!(said(&client, "mode"), r#""client""#);
         assert_eq!(said(&client, "listen/endpoints"), "[]");
         assert_eq!(said(&client, "connect/endpoints"), r#"["tcp/127.0.0.1:7447"]"#);
-        let router = Prepared::read(&options(&[], &["tcp/127.0.0.1:0"], None), NOW_S).unwrap();
+        let router = CheckedConfig::read(&options(&[], &["tcp/127.0.0.1:0"], None), NOW_S).unwrap();
         assert_eq!((said(&router, "mode"), router.listens()), (r#""router""#.into(), true));
-        for prepared in [&client, &router] {
+        for (prepared, wait) in [(&client, 0), (&router, 1)] {
             for (key, value) in LIMITS.iter().filter(|(key, _)| *key != "connect/retry") {
                 assert_eq!(said(prepared, key), *value, "{key}");
             }
+            for (key, values) in WAIT {
+                assert_eq!(said(prepared, key), values[wait], "{key}");
+            }
         }
-        let nobody = Prepared::read(&options(&[], &[], None), NOW_S).unwrap_err();
+        let nobody = CheckedConfig::read(&options(&[], &[], None), NOW_S).unwrap_err();
         assert!(nobody.kind == Kind::Configuration && nobody.hint.contains("--listen"), "{nobody}");
     }
 
@@ -252,8 +269,8 @@ mod tests {
 
     #[test]
     fn what_cannot_be_is_refused_by_its_place() {
-        let kind = |read: Result<Prepared, Failure>| read.map(drop).map_err(|failure| failure.kind);
-        let missing = Prepared::read(&options(&[], &[], Some(Path::new("/nowhere/zenoh.json5"))), NOW_S);
+        let kind = |read: Result<CheckedConfig, Failure>| read.map(drop).map_err(|failure| failure.kind);
+        let missing = CheckedConfig::read(&options(&[], &[], Some(Path::new("/nowhere/zenoh.json5"))), NOW_S);
         assert_eq!(kind(missing), Err(Kind::Input));
         for text in ["{ mode: 'king' }", "{ mode: ", "{ no_such_key: 1 }"] {
             let failure = of_file("wrong", text, &["tcp/10.0.0.1:1"]).unwrap_err();
@@ -262,11 +279,11 @@ mod tests {
                 "{text}: {failure}"
             );
         }
-        let bare = Prepared::read(&options(&[], &["tls/127.0.0.1:0"], None), NOW_S).unwrap_err();
+        let bare = CheckedConfig::read(&options(&[], &["tls/127.0.0.1:0"], None), NOW_S).unwrap_err();
         assert!(bare.kind == Kind::Configuration && bare.hint.contains("listen_certificate"), "{bare}");
         for address in ["nonsense", "udp/10.0.0.1:1", "quic/10.0.0.1:1", ""] {
             assert_eq!(
-                kind(Prepared::read(&options(&[address], &[], None), NOW_S)),
+                kind(CheckedConfig::read(&options(&[address], &[], None), NOW_S)),
                 Err(Kind::Configuration),
                 "{address}"
             );

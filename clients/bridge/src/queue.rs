@@ -1,0 +1,170 @@
+//! Messages on their way from the hub to Zenoh. One thread follows the hub and fills a queue. Another one hands the messages
+//! to Zenoh, so that a slow network delays only that one. Zenoh's own topics (`sending.rs`) and those of ROS 2 (`ros2.rs`) are
+//! the two queues.
+
+use std::num::NonZeroU64;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
+use std::thread;
+use std::time::{Duration, Instant};
+
+use lan::Stamp;
+use lan::outgoing::Sample;
+use schema::{Domain, Failure, Topic};
+use verbs::network::{Carrier, End, Forwarder, Notice, Selection, now};
+
+use crate::session::{Connection, ZenohSession};
+
+/// Messages that wait until they are sent. Newer ones of a topic replace older ones.
+pub(crate) trait Queue: Carrier {
+    /// Returns whether a message waits.
+    fn is_waiting(&self) -> bool;
+
+    /// Updates what depends on whether the hub is available. The follower calls it after each poll.
+    fn look(&mut self, hub_is_available: bool, now: Stamp);
+}
+
+/// A queue that two threads share.
+pub(crate) struct Shared<Q>(Arc<(Mutex<Q>, Condvar)>);
+
+/// Fills a queue with what a hub publishes.
+pub(crate) struct Follower<Q> {
+    forwarder: Forwarder,
+    queue: Shared<Q>,
+}
+
+/// Sends the messages of a queue through a session. A message belongs to a topic, which has a number here.
+pub(crate) trait Sender {
+    /// Where the messages come from.
+    type Queue: Queue;
+
+    /// Declares what exists now: tokens, and publishers of new topics.
+    fn declare(&mut self, queue: &Shared<Self::Queue>) -> Result<(), Failure>;
+
+    /// Writes the message that has waited longest to `message`, counts it as sent, and returns its topic.
+    fn take(&mut self, queue: &mut Self::Queue, now: Stamp, message: &mut Vec<u8>) -> Option<usize>;
+
+    /// Sends `message`. Returns whether the links had room for it.
+    fn send(&mut self, topic: usize, message: &[u8]) -> Result<bool, Failure>;
+
+    /// Counts the `message` that [`take`](Sender::take) returned last as not sent.
+    fn not_sent(&self, queue: &mut Self::Queue, topic: usize, message: &[u8]);
+
+    /// Adds what must be sent last, after everything else has been sent. Returns whether it added something.
+    fn finish(&mut self, queue: &mut Self::Queue) -> bool;
+}
+
+/// Interval between two checks of the hub's tokens while no message waits.
+const CHECK_INTERVAL: Duration = Duration::from_millis(50);
+/// Interval between two checks of the links while nobody is connected.
+const LINK_INTERVAL: Duration = Duration::from_millis(5);
+/// How long messages that still wait at the end are sent.
+pub(crate) const FLUSH_TIME: Duration = Duration::from_secs(1);
+
+impl<Q: Queue> Follower<Q> {
+    /// Follows what is selected of the hub in the first live one of `places`.
+    pub(crate) fn new(selection: Selection, places: &[Domain], queue: Q) -> Follower<Q> {
+        let mut queue = Shared(Arc::new((Mutex::new(queue), Condvar::new())));
+        let forwarder = Forwarder::new(selection, places, &mut queue);
+        Follower { forwarder, queue }
+    }
+
+    /// Requires that the hub has `sensor`, whether or not anything is sent of it.
+    pub(crate) fn demand(&mut self, sensor: &str) {
+        self.forwarder.demand(sensor);
+    }
+
+    /// Queues what the hub published, and polls the hub. Returns whether there may be more.
+    pub(crate) fn forward(
+        &mut self,
+        report: &mut impl FnMut(Notice) -> Result<(), End>,
+    ) -> Result<bool, End> {
+        let more = self.forwarder.forward(&mut self.queue)?;
+        self.queue.ring();
+        self.forwarder.look(Instant::now(), &mut self.queue, report)?;
+        self.queue.lock().look(self.forwarder.is_there(), now());
+        self.queue.ring();
+        Ok(more)
+    }
+
+    /// Waits for the hub, for at most `at_most`.
+    pub(crate) fn wait(&mut self, at_most: Duration) -> Result<(), Failure> {
+        self.forwarder.wait(at_most)
+    }
+
+    /// Returns the queue.
+    pub(crate) fn queue(&self) -> &Shared<Q> {
+        &self.queue
+    }
+}
+
+impl<Q> Shared<Q> {
+    /// Locks the queue.
+    pub(crate) fn lock(&self) -> MutexGuard<'_, Q> {
+        // No code panics while it holds the lock; if one did, the messages would still be valid.
+        self.0.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Wakes the thread that sends.
+    pub(crate) fn ring(&self) {
+        self.0.1.notify_one();
+    }
+}
+
+impl<Q> Clone for Shared<Q> {
+    fn clone(&self) -> Self {
+        Shared(self.0.clone())
+    }
+}
+
+impl<Q: Queue> Carrier for Shared<Q> {
+    fn follow(&mut self, name: &str, every: &dyn Fn(Topic) -> Option<NonZeroU64>) -> usize {
+        self.lock().follow(name, every)
+    }
+
+    fn wants(&self, sensor: usize, topic: Topic) -> bool {
+        self.lock().wants(sensor, topic)
+    }
+
+    fn sample(&mut self, sensor: usize, sample: &Sample<'_>) {
+        self.lock().sample(sensor, sample);
+    }
+}
+
+/// Sends the messages of `queue` until `is_over` is set, and then for at most [`FLUSH_TIME`] what still waits. `open` makes
+/// the sender as soon as there is a session.
+pub(crate) fn send<'a, S: Sender>(
+    queue: &Shared<S::Queue>,
+    connection: &'a Connection,
+    is_over: &AtomicBool,
+    open: impl FnOnce(&'a ZenohSession) -> Result<S, Failure>,
+) -> Result<(), Failure> {
+    let Some(session) = connection.session(is_over) else { return Ok(()) };
+    let mut sender = open(session)?;
+    let (mut message, mut end_at) = (Vec::new(), None);
+    loop {
+        if is_over.load(Ordering::Relaxed) {
+            let end_at = *end_at.get_or_insert_with(|| Instant::now() + FLUSH_TIME);
+            let mut queue = queue.lock();
+            if Instant::now() >= end_at || !queue.is_waiting() && !sender.finish(&mut queue) {
+                return Ok(());
+            }
+        }
+        sender.declare(queue)?;
+        // Without a link the newest messages wait for the next one.
+        if !session.is_linked() {
+            thread::sleep(LINK_INTERVAL);
+            continue;
+        }
+        let mut waiting = queue.lock();
+        if !waiting.is_waiting() {
+            let woken = queue.0.1.wait_timeout(waiting, CHECK_INTERVAL);
+            waiting = woken.unwrap_or_else(PoisonError::into_inner).0;
+        }
+        let Some(topic) = sender.take(&mut waiting, now(), &mut message) else { continue };
+        drop(waiting);
+        if !sender.send(topic, &message)? {
+            sender.not_sent(&mut queue.lock(), topic, &message);
+        }
+    }
+}

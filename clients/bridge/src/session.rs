@@ -1,0 +1,345 @@
+//! A Zenoh session, and nothing of scanhub: a background thread opens it, publishers, tokens, subscribers and queryables
+//! belong to it, and it reports the events of its links. What a payload means is not known here.
+
+mod certificate;
+mod config;
+mod log;
+
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex, OnceLock, PoisonError};
+use std::thread;
+use std::time::{Duration, Instant};
+
+use schema::{Failure, Kind};
+use zenoh::config::WhatAmI;
+use zenoh::key_expr::KeyExpr;
+use zenoh::liveliness::LivelinessToken;
+use zenoh::qos::CongestionControl;
+use zenoh::query::{Query, QueryConsolidation, QueryTarget};
+use zenoh::sample::{Locality, Sample, SampleKind};
+use zenoh::{Session, Wait};
+
+pub(crate) use config::CheckedConfig;
+use log::{Log, without_places};
+
+/// A session that opens in the background.
+pub(crate) struct Connection {
+    state: Arc<State>,
+    log: Log,
+    /// A session that listens opens soon, or never.
+    listens: bool,
+    /// Set once the user knows about the session. Nothing that arrives over it is reported earlier.
+    has_begun: AtomicBool,
+    was_linked: Mutex<Option<bool>>,
+}
+
+#[derive(Default)]
+struct State {
+    session: OnceLock<ZenohSession>,
+    failure: Mutex<Option<Failure>>,
+}
+
+/// An event of the links.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(crate) enum LinkEvent {
+    /// Somebody is connected.
+    Up,
+    /// Nobody is connected any more.
+    Down,
+    /// A connection failed, in Zenoh's words.
+    Failing(String),
+}
+
+/// Interval between two attempts to open a session.
+const RETRY_INTERVAL: Duration = Duration::from_millis(300);
+/// Interval between two checks for the session.
+const POLL_INTERVAL: Duration = Duration::from_millis(5);
+
+impl Connection {
+    /// Starts to open a session with this configuration, and retries until it succeeds.
+    pub(crate) fn open(config: CheckedConfig) -> Result<Connection, Failure> {
+        let log = Log::install();
+        let (state, listens) = (Arc::new(State::default()), config.listens());
+        let shared = state.clone();
+        // The thread ends with the process: nothing can end an attempt.
+        let opening = thread::Builder::new().name("opening".into()).spawn(move || {
+            loop {
+                match zenoh::open(config.zenoh()).wait() {
+                    Ok(session) => {
+                        let _ = shared.session.set(ZenohSession { session, links: Mutex::default() });
+                        return;
+                    }
+                    // A session that listens waits for nobody, so another attempt fails too.
+                    Err(error) if listens => {
+                        let what = format!("Zenoh does not start: {}", without_places(&error.to_string()));
+                        let failure = Failure::new(Kind::Configuration, what, "see --listen and --config");
+                        *shared.failure.lock().unwrap_or_else(PoisonError::into_inner) = Some(failure);
+                        return;
+                    }
+                    Err(_) => thread::sleep(RETRY_INTERVAL),
+                }
+            }
+        });
+        opening.map_err(|error| Failure::new(Kind::Short, format!("cannot start a thread: {error}"), ""))?;
+        Ok(Connection {
+            state,
+            log,
+            listens,
+            has_begun: AtomicBool::new(false),
+            was_linked: Mutex::new(None),
+        })
+    }
+
+    /// Lets [`session`](Connection::session) return the session: the user knows about it.
+    pub(crate) fn begin(&self) {
+        self.has_begun.store(true, Ordering::Relaxed);
+    }
+
+    /// Waits for the session and for [`begin`](Connection::begin). Returns `None` if `is_over` is set first.
+    pub(crate) fn session(&self, is_over: &AtomicBool) -> Option<&ZenohSession> {
+        loop {
+            if let Some(session) = self.begun() {
+                return Some(session);
+            }
+            if is_over.load(Ordering::Relaxed) {
+                return None;
+            }
+            thread::sleep(POLL_INTERVAL);
+        }
+    }
+
+    fn begun(&self) -> Option<&ZenohSession> {
+        self.state.session.get().filter(|_| self.has_begun.load(Ordering::Relaxed))
+    }
+
+    /// Returns whether the session is open: it listens, or it is connected to a router.
+    pub(crate) fn is_open(&self) -> bool {
+        self.state.session.get().is_some()
+    }
+
+    /// Returns whether others connect to this session, so that it waits for no router.
+    pub(crate) fn listens(&self) -> bool {
+        self.listens
+    }
+
+    /// Returns why there will never be a session, if that is known.
+    pub(crate) fn failure(&self) -> Option<Failure> {
+        self.state.failure.lock().unwrap_or_else(PoisonError::into_inner).clone()
+    }
+
+    /// Passes the events since the last call to `report`. Why there will never be a session is not among them: see
+    /// [`failure`](Connection::failure).
+    pub(crate) fn events<E>(&self, mut report: impl FnMut(LinkEvent) -> Result<(), E>) -> Result<(), E> {
+        if self.listens && !self.is_open() {
+            return Ok(());
+        }
+        self.log.take().into_iter().try_for_each(|line| report(LinkEvent::Failing(line)))?;
+        let mut was_linked = self.was_linked.lock().unwrap_or_else(PoisonError::into_inner);
+        let Some(session) = self.begun() else { return Ok(()) };
+        let is_linked = session.is_linked();
+        if was_linked.is_none_or(|before| before != is_linked) && (is_linked || was_linked.is_some()) {
+            report(if is_linked { LinkEvent::Up } else { LinkEvent::Down })?;
+        }
+        *was_linked = Some(is_linked);
+        Ok(())
+    }
+
+    /// Returns how many connections failed or were refused.
+    pub(crate) fn refused(&self) -> u64 {
+        self.log.count()
+    }
+
+    /// Closes the session, also while a thread waits in [`put`](ZenohSession::put).
+    pub(crate) fn close(&self) {
+        if let Some(session) = self.state.session.get() {
+            // Peers that do not receive this notice the silence.
+            let _ = session.session.close().wait();
+        }
+    }
+}
+
+/// An open session.
+pub(crate) struct ZenohSession {
+    session: Session,
+    links: Mutex<Links>,
+}
+
+/// Who was connected at the last check.
+#[derive(Clone, Copy, Default)]
+struct Links {
+    checked: Option<Instant>,
+    count: usize,
+    /// Only one program is connected, and it passes nothing on.
+    is_lone_client: bool,
+}
+
+/// A check of the links is valid for this long while somebody is connected.
+const LINKS_VALID: Duration = Duration::from_millis(10);
+
+/// A key to send under. It is not a publisher of Zenoh: such a publisher loses its first sample while it finds out who
+/// subscribed.
+pub(crate) struct Publisher {
+    key_expr: KeyExpr<'static>,
+}
+
+/// Announces that something exists, until it is dropped.
+pub(crate) struct Token {
+    _token: LivelinessToken,
+}
+
+/// A subscription, until it is dropped.
+pub(crate) struct Subscriber {
+    _subscriber: zenoh::pubsub::Subscriber<()>,
+}
+
+/// Answers queries, until it is dropped.
+pub(crate) struct Queryable {
+    _queryable: zenoh::query::Queryable<()>,
+}
+
+/// An answer to a query.
+pub(crate) struct Reply {
+    pub(crate) key: String,
+    pub(crate) payload: Vec<u8>,
+    pub(crate) attachment: Option<Vec<u8>>,
+}
+
+impl ZenohSession {
+    /// Returns whether anybody is connected: a router, or a program that connected to this one.
+    pub(crate) fn is_linked(&self) -> bool {
+        self.links().count > 0
+    }
+
+    fn links(&self) -> Links {
+        let mut links = self.links.lock().unwrap_or_else(PoisonError::into_inner);
+        let now = Instant::now();
+        let is_valid = |checked| now.saturating_duration_since(checked) < LINKS_VALID;
+        if links.count == 0 || !links.checked.is_some_and(is_valid) {
+            let mut transports = self.session.info().transports().wait();
+            let first = transports.next();
+            let is_lone = transports.next().is_none();
+            *links = Links {
+                checked: Some(now),
+                count: usize::from(first.is_some()) + usize::from(!is_lone),
+                is_lone_client: is_lone && first.is_some_and(|peer| peer.whatami() == WhatAmI::Client),
+            };
+        }
+        *links
+    }
+
+    /// Returns the session's ID, in hexadecimal digits as Zenoh writes it.
+    pub(crate) fn id(&self) -> String {
+        self.session.zid().to_string()
+    }
+
+    /// Declares `key`, so that [`put`](ZenohSession::put) can send under it.
+    pub(crate) fn publisher(&self, key: &str) -> Result<Publisher, Failure> {
+        let key_expr = self.session.declare_keyexpr(key.to_owned()).wait();
+        Ok(Publisher { key_expr: key_expr.map_err(|error| failed(key, &error))? })
+    }
+
+    /// Sends `payload`, and waits until the links have room for it. Returns false if the session was closed before that.
+    ///
+    /// A link that breaks ends the wait, and so does a peer that reads nothing for as long as the configuration says. The
+    /// payload is then lost.
+    pub(crate) fn put(&self, to: &Publisher, payload: &[u8], attachment: Option<&[u8]>) -> bool {
+        // A router would pass `Block` on, and one slow subscriber behind it would delay all others.
+        let congestion_control = match self.links().is_lone_client {
+            true => CongestionControl::Block,
+            false => CongestionControl::Drop,
+        };
+        let put = self.session.put(&to.key_expr, payload).attachment(attachment);
+        let put = put.congestion_control(congestion_control).allowed_destination(Locality::Remote).wait();
+        put.is_ok() && !self.session.is_closed()
+    }
+
+    /// Announces that `key` exists.
+    pub(crate) fn token(&self, key: &str) -> Result<Token, Failure> {
+        let token = self.session.liveliness().declare_token(key.to_owned()).wait();
+        token.map(|_token| Token { _token }).map_err(|error| failed(key, &error))
+    }
+
+    /// Passes key and payload of what others send under `keys` to `receive`; the payload is `None` if it has more than
+    /// `max_len` bytes.
+    pub(crate) fn subscribe(
+        &self,
+        keys: &str,
+        max_len: usize,
+        receive: impl Fn(&str, Option<Vec<u8>>) + Send + Sync + 'static,
+    ) -> Result<Subscriber, Failure> {
+        let subscriber = self.session.declare_subscriber(keys.to_owned()).allowed_origin(Locality::Remote);
+        let subscriber = subscriber.callback(move |sample: Sample| pass(&sample, max_len, &receive)).wait();
+        subscriber.map(|_subscriber| Subscriber { _subscriber }).map_err(|error| failed(keys, &error))
+    }
+
+    /// Passes the key of each token of `keys` that exists or appears to `receive`.
+    pub(crate) fn watch(
+        &self,
+        keys: &str,
+        receive: impl Fn(&str) + Send + Sync + 'static,
+    ) -> Result<Subscriber, Failure> {
+        let subscriber = self.session.liveliness().declare_subscriber(keys.to_owned()).history(true);
+        let subscriber = subscriber.callback(move |sample: Sample| {
+            if sample.kind() == SampleKind::Put {
+                receive(sample.key_expr().as_str());
+            }
+        });
+        let subscriber = subscriber.wait();
+        subscriber.map(|_subscriber| Subscriber { _subscriber }).map_err(|error| failed(keys, &error))
+    }
+
+    /// Answers queries that intersect `keys` with what `answer` returns. `answer` gets a function that returns whether a
+    /// key is part of the query, which may have wildcards.
+    pub(crate) fn answer(
+        &self,
+        keys: &str,
+        answer: impl Fn(&dyn Fn(&str) -> bool) -> Vec<Reply> + Send + Sync + 'static,
+    ) -> Result<Queryable, Failure> {
+        let queryable = self.session.declare_queryable(keys.to_owned()).callback(move |query: Query| {
+            let is_queried =
+                |key: &str| KeyExpr::try_from(key).is_ok_and(|key| query.key_expr().intersects(&key));
+            for Reply { key, payload, attachment } in answer(&is_queried) {
+                // The client may have gone, or it accepts only answers under the key of its query.
+                let _ = query.reply(key, payload).attachment(attachment).wait();
+            }
+        });
+        let queryable = queryable.wait();
+        queryable.map(|_queryable| Queryable { _queryable }).map_err(|error| failed(keys, &error))
+    }
+
+    /// Queries `key`. The answers go to `receive` as those of [`subscribe`](ZenohSession::subscribe).
+    pub(crate) fn query(
+        &self,
+        key: &str,
+        max_len: usize,
+        receive: impl Fn(&str, Option<Vec<u8>>) + Send + Sync + 'static,
+    ) -> Result<(), Failure> {
+        let key_expr = KeyExpr::try_from(key.to_owned()).map_err(|error| failed(key, &error))?;
+        let query = self
+            .session
+            .get(key_expr)
+            .target(QueryTarget::All)
+            .consolidation(QueryConsolidation::DEFAULT)
+            .allowed_destination(Locality::Remote)
+            .timeout(QUERY_TIMEOUT)
+            .callback(move |reply| {
+                if let Ok(sample) = reply.result() {
+                    pass(sample, max_len, &receive);
+                }
+            })
+            .wait();
+        query.map_err(|error| failed(key, &error))
+    }
+}
+
+/// How long an answer to a query may take.
+const QUERY_TIMEOUT: Duration = Duration::from_secs(2);
+
+fn pass(sample: &Sample, max_len: usize, receive: &impl Fn(&str, Option<Vec<u8>>)) {
+    let is_put = sample.kind() == SampleKind::Put && sample.payload().len() <= max_len;
+    receive(sample.key_expr().as_str(), is_put.then(|| sample.payload().to_bytes().into_owned()));
+}
+
+fn failed(key: &str, error: &dyn std::fmt::Display) -> Failure {
+    Failure::new(Kind::Failed, format!("Zenoh refuses {key}: {}", without_places(&error.to_string())), "")
+}
