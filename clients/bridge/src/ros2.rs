@@ -128,13 +128,16 @@ struct RosSender<'a> {
     _token: Token,
 }
 
+/// Payload and attachment of the last message of a latched topic, for late joiners.
+type LastMessage = Arc<Mutex<Option<(Vec<u8>, Vec<u8>)>>>;
+
 /// A publisher of the node. Its token, and the queryable of a latched topic, exist as long as it does.
 struct RosPublisher {
     publisher: Publisher,
     gid: [u8; 16],
     sequence: i64,
-    /// Payload and attachment of the last message, for late joiners of a latched topic.
-    last: Option<Arc<Mutex<Option<(Vec<u8>, Vec<u8>)>>>>,
+    /// `None` if the topic is not latched.
+    last: Option<LastMessage>,
     _history: Option<Queryable>,
     _tokens: Vec<Token>,
 }
@@ -205,7 +208,7 @@ impl RosPublisher {
         let mut tokens = vec![session.token(&node.publisher_token(of))?];
         let (mut last, mut history) = (None, None);
         if of.qos == Qos::Latched {
-            let kept = Arc::<Mutex<Option<(Vec<u8>, Vec<u8>)>>>::default();
+            let kept = LastMessage::default();
             let history_key = node.history_key(of);
             let answers = kept.clone();
             // Subscribers query the history, and expect the topic's own key in the answer.
