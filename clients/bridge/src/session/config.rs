@@ -33,6 +33,9 @@ const LIMITS: &[(&str, &str)] = &[
     ("transport/unicast/max_sessions", "64"),
     ("transport/link/tx/batch_size", "8192"),
     ("transport/link/tx/queue/size/data", "1"),
+    // A sample leaves at once, as with Zenoh's `express`. That one would also hold for routers on the way, which have room for
+    // two batches, and drop the third.
+    ("transport/link/tx/queue/batching/enabled", "false"),
     ("transport/link/rx/max_message_size", "1048576"),
     ("transport/link/tcp/so_sndbuf", "8192"),
     ("transport/link/tls/so_sndbuf", "8192"),
