@@ -51,6 +51,13 @@ const KNOWN: &[(&[&str], Diagnosis)] = &[
         },
     ),
     (
+        &["unable to push non droppable"],
+        Diagnosis {
+            finding: "a program that is connected read nothing for 5 s, so its link was closed",
+            remedy: "check whether it is stopped, or its network is too slow; it connects again by itself",
+        },
+    ),
+    (
         &["too many open files"],
         Diagnosis {
             finding: "a connection was not accepted: no file descriptor is left",
@@ -118,6 +125,11 @@ mod tests {
             ("UsrPwd extension - Recv OpenSyn. Invalid password.", "somebody was refused", "dictionary_file"),
             ("invalid peer certificate: Expired.", "somebody was refused", "connect_certificate"),
             ("received fatal alert: UnknownCA.", "somebody was refused", "listen_certificate"),
+            (
+                "Unable to push non droppable network message to 1a2b. Closing transport!",
+                "read nothing for 5 s",
+                "connects again",
+            ),
             ("Too many open files (os error 24)", "no file descriptor", "ulimit"),
             ("Unable to connect to tcp/r:1! Connection refused (os error 111)", "no router", "firewall"),
         ] {

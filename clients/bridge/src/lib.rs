@@ -14,8 +14,9 @@ mod session;
 
 use std::io::{self, stderr, stdout};
 use std::path::PathBuf;
+use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::thread;
+use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant};
 
 use lan::outgoing::ANNOUNCE_EVERY;
@@ -88,83 +89,74 @@ pub fn bridge(options: &BridgeOptions, tell: &AtomicBool, stop: &AtomicBool) -> 
     let (mut out, mut notes) = (LossyWriter::around(&mut out, stop), LossyWriter::around(&mut notes, stop));
     let mut report = Report::new(options.json, Output::new(&mut out), Output::new(&mut notes));
     let sending = options.send.as_ref().map(Sending::open).transpose()?;
-    let connection = Connection::open(config)?;
+    let connection = Arc::new(Connection::open(config)?);
     quiet(run(options, &connection, sending, &mut report, tell, stop))
 }
 
-/// Interval between two announcements, and between two reports of the statistics.
+/// Interval between announcements, and between reports of the statistics.
 const TICK: Duration = ANNOUNCE_EVERY;
 /// How long the bridge waits for a router before it reports that.
 const REPORT_WAITING_AFTER: Duration = Duration::from_secs(1);
 /// The longest wait for the hub.
 const MAX_WAIT: Duration = Duration::from_millis(50);
-/// Interval between two checks for threads that end.
-const JOIN_INTERVAL: Duration = Duration::from_millis(5);
 
 fn run(
     options: &BridgeOptions,
-    connection: &Connection,
+    connection: &Arc<Connection>,
     mut sending: Option<Sending>,
     report: &mut Report<'_>,
     tell: &AtomicBool,
     stop: &AtomicBool,
 ) -> Result<(), End> {
-    let (tell_in, is_over) = ([AtomicBool::new(false), AtomicBool::new(false)], AtomicBool::new(false));
-    thread::scope(|scope| {
-        let begin = |name: &str| thread::Builder::new().name(name.into());
-        let ([tell_in, tell_ros2], is_over) = (&tell_in, &is_over);
-        let threads = (|| {
-            let receiving = options.publish.as_ref().map(|publish| {
-                let work = move || receiving::run(publish, options.json, connection, tell_in, is_over);
-                begin("receiving").spawn_scoped(scope, work)
-            });
-            let datagrams = sending.as_ref().map(|sending| {
-                let queue = sending.queue().clone();
-                let open = move |session| DatagramSender::open(session, &queue);
-                let queue = sending.queue().clone();
-                begin("sending").spawn_scoped(scope, move || queue::send(&queue, connection, is_over, open))
-            });
-            let ros2 = options.ros2.as_ref().map(|ros2| {
-                let work = move || ros2::run(ros2, options.json, connection, tell_ros2, is_over);
-                begin("ros2").spawn_scoped(scope, work)
-            });
-            Ok((receiving.transpose()?, datagrams.transpose()?, ros2.transpose()?))
-        })()
-        .map_err(|error: io::Error| no_thread(&error));
-        let end = match &threads {
-            Ok((receiving, _, ros2)) => {
-                let has_ended = || [receiving, ros2].into_iter().flatten().any(|thread| thread.is_finished());
-                let is_done = || stop.load(Ordering::Relaxed) || has_ended();
-                carry(options, connection, &mut sending, report, tell, [tell_in, tell_ros2], &is_done)
-            }
-            Err(failure) => Err(failure.clone().into()),
-        };
-        is_over.store(true, Ordering::Relaxed);
-        let (receiving, datagrams, ros2) = threads?;
-        // A thread that still waits for room on a link ends as soon as the session is closed.
-        let over_at = Instant::now() + queue::FLUSH_TIME + MAX_WAIT;
-        let is_sending = || {
-            datagrams.as_ref().is_some_and(|thread| !thread.is_finished())
-                || ros2.as_ref().is_some_and(|thread| !thread.is_finished())
-        };
-        while is_sending() && Instant::now() < over_at {
-            thread::sleep(JOIN_INTERVAL);
+    let [tell_in, tell_ros2, is_over] = [(); 3].map(|()| Arc::new(AtomicBool::new(false)));
+    let json = options.json;
+    let receiving = options.publish.clone().map(|publish| {
+        let (connection, tell, is_over) = (connection.clone(), tell_in.clone(), is_over.clone());
+        spawn("receiving", move || receiving::run(&publish, json, &connection, &tell, &is_over))
+    });
+    let datagrams = sending.as_ref().map(|sending| {
+        let (queue, connection, is_over) = (sending.queue().clone(), connection.clone(), is_over.clone());
+        spawn("sending", move || {
+            queue::send(&queue, &connection, &is_over, |session| DatagramSender::open(session, &queue))
+        })
+    });
+    let ros2 = options.ros2.clone().map(|ros2| {
+        let (connection, tell, is_over) = (connection.clone(), tell_ros2.clone(), is_over.clone());
+        spawn("ros2", move || ros2::run(&ros2, json, &connection, &tell, &is_over))
+    });
+    let threads =
+        (|| Ok::<_, Failure>((receiving.transpose()?, datagrams.transpose()?, ros2.transpose()?)))();
+    let end = match &threads {
+        Ok((receiving, _, ros2)) => {
+            let has_ended = || [receiving, ros2].into_iter().flatten().any(|thread| thread.is_finished());
+            let is_done = || stop.load(Ordering::Relaxed) || has_ended();
+            carry(options, connection, &mut sending, report, tell, [&tell_in, &tell_ros2], &is_done)
         }
-        if is_sending() {
-            connection.close();
-        }
-        let sent = datagrams.map_or(Ok(()), |thread| thread.join().unwrap_or_else(|_| Err(died())));
-        let received =
-            receiving.map_or(Ok(()), |thread| thread.join().unwrap_or_else(|_| Err(died().into())));
-        let graph = ros2.map_or(Ok(()), |thread| thread.join().unwrap_or_else(|_| Err(died().into())));
-        connection.close();
-        report_counts(options, connection, sending.as_ref(), report)?;
-        received.and(graph).and(end).and(Ok(sent?))
-    })
+        Err(failure) => Err(failure.clone().into()),
+    };
+    is_over.store(true, Ordering::Relaxed);
+    let (receiving, datagrams, ros2) = threads?;
+    let join = |thread: JoinHandle<Result<(), End>>| thread.join().unwrap_or_else(|_| Err(died().into()));
+    let sent = match (datagrams, &sending) {
+        (Some(thread), Some(sending)) => queue::join(thread, sending.queue()),
+        _ => Ok(()),
+    };
+    let received = receiving.map_or(Ok(()), join);
+    let graph = ros2.map_or(Ok(()), join);
+    connection.close();
+    report_counts(options, connection, sending.as_ref(), report)?;
+    received.and(graph).and(end).and(Ok(sent?))
 }
 
-/// Reports the statistics of what is sent, and the refused connections. Where topics are published, the refused connections
-/// are reported with them.
+fn spawn<T: Send + 'static>(
+    name: &str,
+    work: impl FnOnce() -> T + Send + 'static,
+) -> Result<JoinHandle<T>, Failure> {
+    thread::Builder::new().name(name.into()).spawn(work).map_err(|error| no_thread(&error))
+}
+
+/// Reports the statistics of sent samples, and the refused connections. Once topics are published, the refused connections are
+/// reported with them.
 fn report_counts(
     options: &BridgeOptions,
     connection: &Connection,
@@ -175,8 +167,8 @@ fn report_counts(
         report.account(sending)?;
     }
     match options.publish {
-        None => report.refused(connection.refused()),
-        Some(_) => Ok(()),
+        Some(_) if connection.is_open() => Ok(()),
+        _ => report.refused(connection.refused()),
     }
 }
 
@@ -187,7 +179,7 @@ fn carry(
     sending: &mut Option<Sending>,
     report: &mut Report<'_>,
     tell: &AtomicBool,
-    tell_others: [&AtomicBool; 2],
+    tell_others: [&Arc<AtomicBool>; 2],
     is_done: &impl Fn() -> bool,
 ) -> Result<(), End> {
     let mut tick_at = Instant::now();

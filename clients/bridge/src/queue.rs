@@ -5,7 +5,7 @@
 use std::num::NonZeroU64;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
-use std::thread;
+use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant};
 
 use lan::Stamp;
@@ -22,6 +22,9 @@ pub(crate) trait Queue: Carrier {
 
     /// Updates what depends on whether the hub is available. The follower calls it after each poll.
     fn look(&mut self, hub_is_available: bool, now: Stamp);
+
+    /// Settles the message that was taken last: it was sent, or else it counts as not sent.
+    fn settle(&mut self, is_sent: bool);
 }
 
 /// A queue that two threads share.
@@ -41,25 +44,23 @@ pub(crate) trait Sender {
     /// Declares what exists now: tokens, and publishers of new topics.
     fn declare(&mut self, queue: &Shared<Self::Queue>) -> Result<(), Failure>;
 
-    /// Writes the message that has waited longest to `message`, counts it as sent, and returns its topic.
+    /// Writes the message that has waited longest to `message`, counts it as sent until it is
+    /// [settled](Queue::settle), and returns its topic.
     fn take(&mut self, queue: &mut Self::Queue, now: Stamp, message: &mut Vec<u8>) -> Option<usize>;
 
     /// Sends `message`. Returns whether the links had room for it.
     fn send(&mut self, topic: usize, message: &[u8]) -> Result<bool, Failure>;
 
-    /// Counts the `message` that [`take`](Sender::take) returned last as not sent.
-    fn not_sent(&self, queue: &mut Self::Queue, topic: usize, message: &[u8]);
-
     /// Adds what must be sent last, after everything else has been sent. Returns whether it added something.
     fn finish(&mut self, queue: &mut Self::Queue) -> bool;
 }
 
-/// Interval between two checks of the hub's tokens while no message waits.
+/// Interval between checks of the hub's tokens while no message waits.
 const CHECK_INTERVAL: Duration = Duration::from_millis(50);
-/// Interval between two checks of the links while nobody is connected.
+/// Interval between checks of the links while there is no connection.
 const LINK_INTERVAL: Duration = Duration::from_millis(5);
-/// How long messages that still wait at the end are sent.
-pub(crate) const FLUSH_TIME: Duration = Duration::from_secs(1);
+/// Time in which messages that still wait at the end are sent.
+const FLUSH_TIME: Duration = Duration::from_secs(1);
 
 impl<Q: Queue> Follower<Q> {
     /// Follows what is selected of the hub in the first live one of `places`.
@@ -131,6 +132,27 @@ impl<Q: Queue> Carrier for Shared<Q> {
     }
 }
 
+/// Waits for the end of a thread that [sends](send) the messages of `queue`. A thread that still waits for room on a link after
+/// [`FLUSH_TIME`] is left to the end of the process, and its message counts as not sent.
+///
+/// # Errors
+///
+/// The error of the thread, or that it panicked.
+pub(crate) fn join<Q: Queue>(
+    thread: JoinHandle<Result<(), Failure>>,
+    queue: &Shared<Q>,
+) -> Result<(), Failure> {
+    let end_at = Instant::now() + FLUSH_TIME + CHECK_INTERVAL;
+    while !thread.is_finished() {
+        if Instant::now() >= end_at {
+            queue.lock().settle(false);
+            return Ok(());
+        }
+        thread::sleep(LINK_INTERVAL);
+    }
+    thread.join().unwrap_or_else(|_| Err(crate::died()))
+}
+
 /// Sends the messages of `queue` until `is_over` is set, and then for at most [`FLUSH_TIME`] what still waits. `open` makes
 /// the sender as soon as there is a session.
 pub(crate) fn send<'a, S: Sender>(
@@ -163,8 +185,7 @@ pub(crate) fn send<'a, S: Sender>(
         }
         let Some(topic) = sender.take(&mut waiting, now(), &mut message) else { continue };
         drop(waiting);
-        if !sender.send(topic, &message)? {
-            sender.not_sent(&mut queue.lock(), topic, &message);
-        }
+        let is_sent = sender.send(topic, &message)?;
+        queue.lock().settle(is_sent);
     }
 }

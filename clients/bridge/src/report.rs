@@ -1,4 +1,5 @@
-//! What a bridge reports of itself, of its links, and of what it sends. What it receives is reported where it is counted.
+//! Reports of a bridge: about itself, its links, and the samples that it sends. Samples that it receives are reported where
+//! they are counted.
 
 use std::io::Write;
 
@@ -13,7 +14,7 @@ use crate::session::LinkEvent;
 /// Writes the reports.
 pub(crate) struct Report<'a> {
     json: bool,
-    /// What was reported since somebody was connected last: a remedy is reported once.
+    /// Causes that were reported since the last connection. Each remedy is reported once.
     reported: Vec<Diagnosis>,
     out: Output<'a>,
     notes: Output<'a>,
@@ -62,7 +63,7 @@ impl<'a> Report<'a> {
         tell(notice, self.json, &mut self.out, &mut self.notes)
     }
 
-    /// Reports that nobody is connected yet. The bridge keeps trying.
+    /// Reports that there is no connection yet. The bridge keeps trying.
     pub(crate) fn waiting(&mut self, options: &BridgeOptions) -> Result<(), End> {
         let message = match &options.connect[..] {
             [] => "waits for the routers that --config names".to_owned(),
@@ -101,7 +102,7 @@ impl<'a> Report<'a> {
         self.notes.line(|line| write!(line, "  {remedy}"))
     }
 
-    /// Reports the statistics of what is sent.
+    /// Reports the statistics of sent samples.
     pub(crate) fn account(&mut self, sending: &Sending) -> Result<(), End> {
         sending.account(self.json, &mut self.out)
     }

@@ -22,12 +22,12 @@ use crate::queue::{self, Follower, Queue, Sender, Shared};
 use crate::session::{Connection, Publisher, Queryable, Reply, Token, ZenohSession};
 use graph::{Graph, Published};
 
-/// What is published in a graph of ROS 2.
+/// Options of the node of ROS 2.
 #[derive(Clone, Debug)]
 pub struct Ros2Options {
     /// `SENSOR/TOPIC`, `*/TOPIC` or `SENSOR/*`, with `:every=N` to thin it. Empty: all topics that ROS has messages for.
     pub topics: Vec<String>,
-    /// Where the hub's domain may be.
+    /// Possible locations of the hub's domain.
     pub places: Vec<Domain>,
     /// `ROS_DOMAIN_ID`.
     pub domain_id: u32,
@@ -52,7 +52,7 @@ const MAX_WAIT: Duration = Duration::from_millis(50);
 pub(crate) fn run(
     options: &Ros2Options,
     json: bool,
-    connection: &Connection,
+    connection: &Arc<Connection>,
     tell_account: &AtomicBool,
     is_over: &AtomicBool,
 ) -> Result<(), End> {
@@ -66,33 +66,35 @@ pub(crate) fn run(
     options.names.framed().for_each(|sensor| follower.demand(sensor));
     let queue = follower.queue().clone();
     // Set at any end, so that the other thread does not wait for a router any more.
-    let is_done = AtomicBool::new(false);
-    thread::scope(|scope| {
-        let work = || queue::send(&queue, connection, &is_done, |session| RosSender::open(session, options));
-        let sending = thread::Builder::new().name("ros2 sending".into()).spawn_scoped(scope, work);
-        let sending = sending.map_err(|error| crate::no_thread(&error))?;
-        let mut follow = || {
-            while !is_over.load(Ordering::Relaxed) && !sending.is_finished() {
-                let more = follower.forward(&mut |notice| match options.tells_of_hub {
-                    true => tell(notice, json, &mut out, &mut notes),
-                    false => Ok(()),
-                })?;
-                if tell_account.swap(false, Ordering::Relaxed) {
-                    account(&queue.lock(), json, &mut out)?;
-                }
-                if !more {
-                    follower.wait(MAX_WAIT)?;
-                }
+    let is_done = Arc::new(AtomicBool::new(false));
+    let work = {
+        let (queue, connection, is_done) = (queue.clone(), connection.clone(), is_done.clone());
+        let options = options.clone();
+        move || queue::send(&queue, &connection, &is_done, |session| RosSender::open(session, &options))
+    };
+    let sending = thread::Builder::new().name("ros2 sending".into()).spawn(work);
+    let sending = sending.map_err(|error| crate::no_thread(&error))?;
+    let mut follow = || {
+        while !is_over.load(Ordering::Relaxed) && !sending.is_finished() {
+            let more = follower.forward(&mut |notice| match options.tells_of_hub {
+                true => tell(notice, json, &mut out, &mut notes),
+                false => Ok(()),
+            })?;
+            if tell_account.swap(false, Ordering::Relaxed) {
+                account(&queue.lock(), json, &mut out)?;
             }
-            Ok::<_, End>(())
-        };
-        let end = follow();
-        is_done.store(true, Ordering::Relaxed);
-        queue.ring();
-        let sent = sending.join().unwrap_or_else(|_| Err(crate::died()));
-        account(&queue.lock(), json, &mut out)?;
-        end.and(Ok(sent?))
-    })
+            if !more {
+                follower.wait(MAX_WAIT)?;
+            }
+        }
+        Ok::<_, End>(())
+    };
+    let end = follow();
+    is_done.store(true, Ordering::Relaxed);
+    queue.ring();
+    let sent = queue::join(sending, &queue);
+    account(&queue.lock(), json, &mut out)?;
+    end.and(Ok(sent?))
 }
 
 impl Queue for Graph {
@@ -102,6 +104,10 @@ impl Queue for Graph {
 
     fn look(&mut self, hub_is_available: bool, now: Stamp) {
         Graph::look(self, hub_is_available, now);
+    }
+
+    fn settle(&mut self, is_sent: bool) {
+        Graph::settle(self, is_sent);
     }
 }
 
@@ -186,10 +192,6 @@ impl Sender for RosSender<'_> {
 
     fn send(&mut self, topic: usize, message: &[u8]) -> Result<bool, Failure> {
         Ok(self.publishers[topic].send(self.session, message))
-    }
-
-    fn not_sent(&self, graph: &mut Graph, topic: usize, _: &[u8]) {
-        graph.not_taken(topic);
     }
 
     fn finish(&mut self, _: &mut Graph) -> bool {

@@ -1,5 +1,5 @@
-//! Topics of a hub under Zenoh's own keys: `scanhub/HUB/SENSOR/TOPIC`, with the datagrams of a gateway as payload. Of each
-//! topic, the newest sample waits until the links have room for it.
+//! Topics of a hub under Zenoh's own keys: `scanhub/HUB/SENSOR/TOPIC`, with the datagrams of a gateway as payload. The newest
+//! sample of each topic waits until the links have room for it.
 
 use std::collections::HashMap;
 use std::collections::hash_map::Entry;
@@ -17,7 +17,7 @@ use crate::queue::{Follower, Queue, Sender, Shared};
 use crate::report::Report;
 use crate::session::{Publisher, Queryable, Reply, Token, ZenohSession};
 
-/// What a bridge sends of its hub.
+/// The sending side of a bridge.
 pub(crate) struct Sending {
     pub(crate) life: Life,
     follower: Follower<Datagrams>,
@@ -28,6 +28,10 @@ pub(crate) struct Datagrams {
     hub: u64,
     outgoing: Outgoing,
     hub_is_available: bool,
+    /// How often the hub became available.
+    hub_runs: u64,
+    /// The message that was taken last and is not settled: number of the sensor, topic and length.
+    in_flight: Option<(u8, Option<Topic>, usize)>,
 }
 
 /// Stands for the interface in the name of the file that keeps the bridge's number.
@@ -40,7 +44,8 @@ impl Sending {
         let domain = options.places.first().map(Domain::name).unwrap_or_default();
         let life = begin_life(domain, INTERFACE)?;
         let outgoing = Outgoing::waiting(life.hub, life.epoch);
-        let datagrams = Datagrams { hub: life.hub, outgoing, hub_is_available: false };
+        let datagrams =
+            Datagrams { hub: life.hub, outgoing, hub_is_available: false, hub_runs: 0, in_flight: None };
         Ok(Sending { life, follower: Follower::new(selection, &options.places, datagrams) })
     }
 
@@ -78,7 +83,7 @@ impl Datagrams {
 
     /// Returns the last announcements, statuses and backgrounds whose key is part of a query.
     fn answers(&mut self, is_queried: &dyn Fn(&str) -> bool) -> Vec<Reply> {
-        let Datagrams { hub, outgoing, .. } = self;
+        let Datagrams { hub, outgoing, hub_is_available: true, .. } = self else { return Vec::new() };
         let kept = outgoing.kept().map(|(sensor, topic)| (sensor.to_owned(), topic));
         let kept: Vec<(String, Option<Topic>)> = kept.collect();
         let mut answers = Vec::new();
@@ -100,7 +105,18 @@ impl Queue for Datagrams {
     }
 
     fn look(&mut self, hub_is_available: bool, _: Stamp) {
+        if hub_is_available && !self.hub_is_available {
+            self.hub_runs += 1;
+            // Sensors of the last run may not exist any more.
+            self.outgoing.forget_kept();
+        }
         self.hub_is_available = hub_is_available;
+    }
+
+    fn settle(&mut self, is_sent: bool) {
+        if let Some((sensor, topic, len)) = self.in_flight.take().filter(|_| !is_sent) {
+            self.outgoing.not_taken(sensor, topic, len);
+        }
     }
 }
 
@@ -118,7 +134,7 @@ impl Carrier for Datagrams {
     }
 }
 
-/// Where samples wait, nothing is transmitted at once.
+/// Transmits nothing at once: all samples wait.
 struct NullTransmit;
 
 impl Transmit for NullTransmit {
@@ -134,6 +150,8 @@ pub(crate) struct DatagramSender<'a> {
     topics: Vec<SentTopic>,
     /// The tokens of the hub and its sensors, by key. Empty while the hub is unavailable.
     tokens: HashMap<String, Token>,
+    /// The run of the hub that the tokens announce.
+    hub_runs: u64,
     is_finished: bool,
     _queryable: Queryable,
 }
@@ -161,6 +179,7 @@ impl<'a> DatagramSender<'a> {
             hub,
             topics: Vec::new(),
             tokens: HashMap::new(),
+            hub_runs: 0,
             is_finished: false,
             _queryable,
         })
@@ -180,16 +199,16 @@ impl Sender for DatagramSender<'_> {
     type Queue = Datagrams;
 
     fn declare(&mut self, queue: &Shared<Datagrams>) -> Result<(), Failure> {
-        let hub_is_available = queue.lock().hub_is_available;
-        if hub_is_available != self.tokens.is_empty() {
-            return Ok(());
-        }
-        if !hub_is_available {
+        let Datagrams { hub_is_available, hub_runs, .. } = *queue.lock();
+        if !self.tokens.is_empty() && (!hub_is_available || hub_runs != self.hub_runs) {
             self.tokens.clear();
             self.topics.clear();
-            return Ok(());
         }
-        self.announce(format!("{PREFIX}/{:016x}/{LIVE}", self.hub))
+        if hub_is_available && self.tokens.is_empty() {
+            self.hub_runs = hub_runs;
+            self.announce(format!("{PREFIX}/{:016x}/{LIVE}", self.hub))?;
+        }
+        Ok(())
     }
 
     fn take(&mut self, queue: &mut Datagrams, now: Stamp, message: &mut Vec<u8>) -> Option<usize> {
@@ -197,6 +216,7 @@ impl Sender for DatagramSender<'_> {
         message.clear();
         message.extend_from_slice(handed.datagram);
         let ((number, sensor), topic) = (handed.sensor, handed.topic);
+        queue.in_flight = Some((number, topic, message.len()));
         let is_same = |it: &SentTopic| (it.number, &*it.sensor, it.topic) == (number, sensor, topic);
         Some(self.topics.iter().position(is_same).unwrap_or_else(|| {
             self.topics.push(SentTopic { number, sensor: sensor.to_owned(), topic, publisher: None });
@@ -215,11 +235,6 @@ impl Sender for DatagramSender<'_> {
         }
         let publisher = self.topics[topic].publisher.as_ref();
         Ok(publisher.is_some_and(|publisher| self.session.put(publisher, message, None)))
-    }
-
-    fn not_sent(&self, queue: &mut Datagrams, topic: usize, message: &[u8]) {
-        let SentTopic { number, topic, .. } = self.topics[topic];
-        queue.outgoing.not_taken(number, topic, message.len());
     }
 
     /// The last announcement counts everything that was sent.

@@ -1,5 +1,5 @@
 //! A Zenoh session, and nothing of scanhub: a background thread opens it, publishers, tokens, subscribers and queryables
-//! belong to it, and it reports the events of its links. What a payload means is not known here.
+//! belong to it, and it reports the events of its links. Payloads are bytes here.
 
 mod certificate;
 mod config;
@@ -42,17 +42,19 @@ struct State {
 /// An event of the links.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(crate) enum LinkEvent {
-    /// Somebody is connected.
+    /// There is a connection.
     Up,
-    /// Nobody is connected any more.
+    /// The last connection has ended.
     Down,
     /// A connection failed, in Zenoh's words.
     Failing(String),
 }
 
-/// Interval between two attempts to open a session.
+/// Interval between attempts to open a session.
 const RETRY_INTERVAL: Duration = Duration::from_millis(300);
-/// Interval between two checks for the session.
+/// Longest time to close a session.
+const CLOSE_TIME: Duration = Duration::from_secs(1);
+/// Interval between checks for the session.
 const POLL_INTERVAL: Duration = Duration::from_millis(5);
 
 impl Connection {
@@ -69,7 +71,7 @@ impl Connection {
                         let _ = shared.session.set(ZenohSession { session, links: Mutex::default() });
                         return;
                     }
-                    // A session that listens waits for nobody, so another attempt fails too.
+                    // A session that listens needs no peer, so another attempt fails too.
                     Err(error) if listens => {
                         let what = format!("Zenoh does not start: {}", without_places(&error.to_string()));
                         let failure = Failure::new(Kind::Configuration, what, "see --listen and --config");
@@ -149,11 +151,16 @@ impl Connection {
         self.log.count()
     }
 
-    /// Closes the session, also while a thread waits in [`put`](ZenohSession::put).
+    /// Closes the session. A stalled link may delay that for ten seconds: then it is left to the end of the process, which
+    /// the peers notice too.
     pub(crate) fn close(&self) {
-        if let Some(session) = self.state.session.get() {
-            // Peers that do not receive this notice the silence.
-            let _ = session.session.close().wait();
+        let Some(session) = self.state.session.get().map(|opened| opened.session.clone()) else { return };
+        let closing = thread::Builder::new().name("closing".into()).spawn(move || {
+            let _ = session.close().wait();
+        });
+        let end_at = Instant::now() + CLOSE_TIME;
+        while closing.as_ref().is_ok_and(|closing| !closing.is_finished()) && Instant::now() < end_at {
+            thread::sleep(POLL_INTERVAL);
         }
     }
 }
@@ -164,7 +171,7 @@ pub(crate) struct ZenohSession {
     links: Mutex<Links>,
 }
 
-/// Who was connected at the last check.
+/// The connections at the last check.
 #[derive(Clone, Copy, Default)]
 struct Links {
     checked: Option<Instant>,
@@ -173,7 +180,7 @@ struct Links {
     is_lone_client: bool,
 }
 
-/// A check of the links is valid for this long while somebody is connected.
+/// Time for which a check is valid while there is a connection.
 const LINKS_VALID: Duration = Duration::from_millis(10);
 
 /// A key to send under. It is not a publisher of Zenoh: such a publisher loses its first sample while it finds out who
@@ -205,7 +212,7 @@ pub(crate) struct Reply {
 }
 
 impl ZenohSession {
-    /// Returns whether anybody is connected: a router, or a program that connected to this one.
+    /// Returns whether there is a connection: to a router, or from another program.
     pub(crate) fn is_linked(&self) -> bool {
         self.links().count > 0
     }
@@ -238,12 +245,12 @@ impl ZenohSession {
         Ok(Publisher { key_expr: key_expr.map_err(|error| failed(key, &error))? })
     }
 
-    /// Sends `payload`, and waits until the links have room for it. Returns false if the session was closed before that.
+    /// Sends `payload`, and waits until the links have room for it. Returns false if the session was closed.
     ///
-    /// A link that breaks ends the wait, and so does a peer that reads nothing for as long as the configuration says. The
-    /// payload is then lost.
+    /// The wait ends when the link breaks, or after 5 s (one client), 10 s (a router, from a client) or 1 s (several links),
+    /// unless Zenoh's configuration file says otherwise. The payload is then lost on that link.
     pub(crate) fn put(&self, to: &Publisher, payload: &[u8], attachment: Option<&[u8]>) -> bool {
-        // A router would pass `Block` on, and one slow subscriber behind it would delay all others.
+        // A router would pass `Block` on, and then one slow subscriber of the router would delay all others.
         let congestion_control = match self.links().is_lone_client {
             true => CongestionControl::Block,
             false => CongestionControl::Drop,
@@ -259,8 +266,8 @@ impl ZenohSession {
         token.map(|_token| Token { _token }).map_err(|error| failed(key, &error))
     }
 
-    /// Passes key and payload of what others send under `keys` to `receive`; the payload is `None` if it has more than
-    /// `max_len` bytes.
+    /// Passes key and payload of each sample that others send under `keys` to `receive`. The payload is `None` if it has
+    /// more than `max_len` bytes.
     pub(crate) fn subscribe(
         &self,
         keys: &str,
@@ -288,8 +295,8 @@ impl ZenohSession {
         subscriber.map(|_subscriber| Subscriber { _subscriber }).map_err(|error| failed(keys, &error))
     }
 
-    /// Answers queries that intersect `keys` with what `answer` returns. `answer` gets a function that returns whether a
-    /// key is part of the query, which may have wildcards.
+    /// Answers queries that intersect `keys` with the replies that `answer` returns. `answer` gets a function that checks
+    /// whether a key matches the query, which may have wildcards.
     pub(crate) fn answer(
         &self,
         keys: &str,
@@ -332,7 +339,7 @@ impl ZenohSession {
     }
 }
 
-/// How long an answer to a query may take.
+/// Time within which a query is answered.
 const QUERY_TIMEOUT: Duration = Duration::from_secs(2);
 
 fn pass(sample: &Sample, max_len: usize, receive: &impl Fn(&str, Option<Vec<u8>>)) {

@@ -96,10 +96,15 @@ impl Outgoing {
         self.numbering.again(name, topic, now)
     }
 
-    /// Returns the sensors and topics (`None`: announcements) of which [`again`](Outgoing::again) has a sample. The
+    /// Returns the sensors and topics (`None`: announcements) for which [`again`](Outgoing::again) has a sample. The
     /// announcement of a sensor comes before its samples.
     pub fn kept(&self) -> impl Iterator<Item = (&str, Option<Topic>)> {
         self.numbering.kept()
+    }
+
+    /// Makes [`again`](Outgoing::again) return nothing until newer samples are handed on.
+    pub fn forget_kept(&mut self) {
+        self.numbering.forget_kept();
     }
 
     /// Returns whether samples wait, so that newer ones may replace them: then announcements say how many were.

@@ -6,24 +6,36 @@ const $ = (id) => document.getElementById(id);
 const map = $("map");
 let pen = map.getContext("2d");
 
-const sensors = new Map(); // by namespace, as "/front"
-let robot = {}; // the last message about it
-let session = null; // ID of the server's run
+// By namespace, as "/front".
+const sensors = new Map();
+// The last message about it.
+let robot = {};
+// ID of the server's run.
+let session = null;
 let circles = [];
-let beams = []; // that violate a circle
+// That violate a circle.
+let beams = [];
 let marks = [];
-let walls = []; // straight surfaces, as pairs of ends
+// Straight surfaces, as pairs of ends.
+let walls = [];
 let corners = [];
-const people = new Map(); // by topic of their tracker: when they came, and who is where
-const sweeps = new Map(); // by namespace of who makes them of a tilted scanner
-let player = null; // of the recording that this server plays, if it does
-let heard = -Infinity; // when the verdict came last
+// By topic of their tracker: when they came, and who is where.
+const people = new Map();
+// By namespace of who makes them of a tilted scanner.
+const sweeps = new Map();
+// Of the recording that this server plays, if it does.
+let player = null;
+// When the verdict came last.
+let heard = -Infinity;
 let frames = 0;
-const ages = []; // moment of a scan, and of the end of the frame that shows it, in ms since 1970, by one machine's clock
+// Moment of a scan, and of the end of the frame that shows it, in ms since 1970, by one machine's clock.
+const ages = [];
 const drawn = { beams: 0, foreground: 0, zones: 0, marks: 0, lines: 0, tracks: 0, obstacles: 0, swept: 0, axes: 0 };
 
-const SILENT_MS = 500; // after which the verdict is not known
-const OLD_MS = 1000; // after which a scan is not what is there
+// After which the verdict is not known.
+const SILENT_MS = 500;
+// After which a scan is not what is there.
+const OLD_MS = 1000;
 const TRAIL_MS = 1600;
 const TRAIL_STEP_MS = 90;
 const HISTORY_MS = 120_000;

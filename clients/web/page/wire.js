@@ -173,9 +173,12 @@ const ofJson = { robot: takeRobot, status: takeStatus, zones: takeZones, lines: 
 
 /** What makes the words beside the picture, and not the picture. */
 const BESIDE = ["robot", "status", "replay"];
-let kept = null; // what came for the picture while it is held, the newest of each topic
-let isHeldMap = false; // whether the frozen picture is the map of a site
-let isHeldGone = false; // clear the frozen picture at its release
+// What came for the picture while it is held, the newest of each topic.
+let kept = null;
+// Whether the frozen picture is the map of a site.
+let isHeldMap = false;
+// Clear the frozen picture at its release.
+let isHeldGone = false;
 
 const lastWord = (topic) => topic.slice(topic.lastIndexOf("/") + 1);
 
@@ -200,7 +203,8 @@ function show(topic, buffer, offset) {
 let socket = null;
 let isOpen = false;
 let retry = 250;
-const topics = new Map(); // by channel, which is the number of its subscription, too
+// By channel, which is the number of its subscription, too.
+const topics = new Map();
 
 /** Whoever asks for lines and points costs others something: that is done while they are looked at. */
 function isWanted(topic) {

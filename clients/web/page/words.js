@@ -48,18 +48,18 @@ function put(element, text) {
 /** Writes the verdict. Called for each frame, so that text and zones describe the same moment. */
 function tellVerdict() {
   // Zones are around the robot, whose position in the map of a site is unknown.
-  const hasNoVerdict = isHeard() && robot.hub && robot.map;
+  const isSite = isHeard() && robot.hub && robot.map;
   const word = verdict();
   const box = $("verdict");
-  box.className = hasNoVerdict ? "map" : word;
-  box.hidden = hasNoVerdict && !kept;
-  box.firstElementChild.hidden = hasNoVerdict;
+  box.className = isSite ? "map" : word;
+  box.hidden = isSite && !kept;
+  box.firstElementChild.hidden = isSite;
   put(box.firstElementChild, word.toUpperCase());
   const { sensor, nearest_m, hub_words: hub } = isHeard() ? robot : {};
-  const nearest = hasNoVerdict ? "" : [sensor, nearest_m && `nearest ${nearest_m.toFixed(2)} m`].filter(Boolean).join(", ");
+  const nearest = isSite ? "" : [sensor, nearest_m && `nearest ${nearest_m.toFixed(2)} m`].filter(Boolean).join(", ");
   put(box.lastElementChild, [nearest, kept && "picture held"].filter(Boolean).join("  ·  "));
   put($("hub"), hub ?? "");
-  put($("title"), hasNoVerdict ? "scanhub" : `${word.toUpperCase()} – scanhub`);
+  put($("title"), isSite ? "scanhub" : `${word.toUpperCase()} – scanhub`);
 }
 
 function lose(one, left) {

@@ -135,7 +135,7 @@ impl<'a, S: Surroundings> Topics<'a, S> {
         self.header.seq = self.next_seq;
         self.next_seq += 1;
         self.begin(received.first, received.last, received.reasons, period_us);
-        let is_moved = self.last_telegram.order(&mut self.header, self.is_recalled);
+        let is_moved = self.last_telegram.order(&mut self.header);
         self.header.flags |= if received.estimated || is_moved { Flags::STAMP_ESTIMATED } else { 0 };
     }
 
@@ -143,7 +143,7 @@ impl<'a, S: Surroundings> Topics<'a, S> {
     /// `first` and `last` are the times of its first and last beam.
     pub(crate) fn begin_revolution(&mut self, first: Nanos, last: Nanos, reasons: u8, period_us: u32) {
         self.begin(first, last, reasons, period_us);
-        let is_moved = self.last_revolution.order(&mut self.header, self.is_recalled);
+        let is_moved = self.last_revolution.order(&mut self.header);
         self.header.flags |= if is_moved { Flags::STAMP_ESTIMATED } else { 0 };
     }
 
@@ -513,15 +513,16 @@ struct LastStamps {
 }
 
 impl LastStamps {
-    /// Moves the stamps of `header` if they are not later than the last ones: to the last one plus 1 ns. A wall clock that
-    /// `is_recalled` from a recording is not changed. Returns whether a stamp was moved.
-    fn order(&mut self, header: &mut Header, is_recalled: bool) -> bool {
+    /// Moves the stamps of `header` if they are not later than the last ones: to the last one plus 1 ns. Stamps of a
+    /// replay are not changed. Returns whether a stamp was moved.
+    fn order(&mut self, header: &mut Header) -> bool {
+        if header.flags & Flags::REPLAYED != 0 {
+            return false;
+        }
         let (first_ns, wall_ns) = (header.stamp_first_ns, header.wall_ns);
         header.stamp_first_ns = later(first_ns, self.first_ns);
         header.stamp_last_ns = header.stamp_last_ns.max(header.stamp_first_ns);
-        if !is_recalled {
-            header.wall_ns = later(wall_ns, self.wall_ns);
-        }
+        header.wall_ns = later(wall_ns, self.wall_ns);
         (self.first_ns, self.wall_ns) = (header.stamp_first_ns, header.wall_ns);
         (self.first_ns, self.wall_ns) != (first_ns, wall_ns)
     }
@@ -533,7 +534,7 @@ fn later(stamp: u64, last: u64) -> u64 {
     if last.saturating_sub(stamp) > MAX_REVERSAL { stamp } else { stamp.max(last + 1) }
 }
 
-/// How far back a stamp may lie before the last one and still count as its successor.
+/// Largest time by which a stamp may be earlier than the last one and still count as its successor.
 const MAX_REVERSAL: Nanos = 100 * MILLIS;
 
 /// Converts `stamp` to nanoseconds since 1970. `now` is the current time of the clock of `around`.
@@ -576,7 +577,7 @@ mod tests {
         let mut order = |first: u64, wall: u64| {
             let mut header =
                 Header { stamp_first_ns: first, stamp_last_ns: first, wall_ns: wall, ..Header::default() };
-            let is_moved = last.order(&mut header, false);
+            let is_moved = last.order(&mut header);
             (header.stamp_first_ns, header.stamp_last_ns, header.wall_ns, is_moved)
         };
         let wall = 1_000 * MILLIS;

@@ -19,7 +19,7 @@ pub fn scan_topic(sensor: &str) -> String {
     Names::default().topic(sensor, "scan")
 }
 
-/// The topic of `sensor`'s scans as points, where nothing else is said.
+/// Returns the topic of `sensor`'s scans as points, with the default [`Names`].
 pub fn points_topic(sensor: &str) -> String {
     Names::default().topic(sensor, "points")
 }

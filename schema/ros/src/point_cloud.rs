@@ -8,9 +8,9 @@ use crate::BASE_FRAME;
 use crate::cdr::Cdr;
 use crate::laser_scan::stamp_ns;
 
-/// Appends the readings of `scan` in frame `frame` to `message`: a point x, y, z and intensity (meters, and what the scanner
-/// reports, 32-bit floats; z is 0, and so is the intensity of a scan without intensities) for each beam with a reading, in the order of the
-/// beams, with the stamp of the LaserScan.
+/// Appends the readings of `scan` in frame `frame` to `message`: a point for each beam with a reading, in the order of the
+/// beams, with the stamp of the LaserScan. A point is x, y, z in meters (z is 0) and the intensity that the scanner reports
+/// (0 if it reports none), as 32-bit floats.
 pub fn scan_cloud(message: &mut Vec<u8>, frame: &str, header: &Header, scan: &Scan) {
     let points = || (0..scan.beams()).filter_map(|i| Some((i, scan.distance_m(i)?)));
     let width = points().count();

@@ -24,6 +24,8 @@ pub(super) struct Graph {
     /// What was handed last, and memory for others.
     handed: Vec<u8>,
     spare: Vec<Vec<u8>>,
+    /// The topic of the message that was handed on last, until it is settled.
+    in_flight: Option<usize>,
     /// By frame.
     poses: Vec<(String, Pose)>,
     poses_slot: Option<usize>,
@@ -123,6 +125,7 @@ impl Graph {
             waiting: VecDeque::new(),
             handed: Vec::new(),
             spare: Vec::new(),
+            in_flight: None,
             poses: Vec::new(),
             poses_slot: None,
         };
@@ -265,16 +268,19 @@ impl Graph {
             self.spare.push(std::mem::replace(&mut self.handed, message));
             if is_fresh {
                 self.topics[topic].sent += 1;
+                self.in_flight = Some(topic);
                 return Some(Handed { topic, message: &self.handed });
             }
             self.topics[topic].replaced += 1;
         }
     }
 
-    /// Counts that a message of this topic was handed on and not taken.
-    pub(super) fn not_taken(&mut self, topic: usize) {
-        let topic = &mut self.topics[topic];
-        (topic.sent, topic.failed) = (topic.sent - 1, topic.failed + 1);
+    /// Settles the message that was handed on last: it was sent, or else it failed.
+    pub(super) fn settle(&mut self, is_sent: bool) {
+        if let Some(topic) = self.in_flight.take().filter(|_| !is_sent) {
+            let topic = &mut self.topics[topic];
+            (topic.sent, topic.failed) = (topic.sent - 1, topic.failed + 1);
+        }
     }
 
     fn status(&mut self, sensor: usize, header: &Header, status: &Status, now: Stamp) {

@@ -1,5 +1,5 @@
 //! Zenoh's configuration: its own configuration file, the addresses that the user named, and limits for what the file does
-//! not set. A session listens and searches only if the user or the file says so.
+//! not set. A session listens and searches only if the user or the file enables that.
 
 use std::path::Path;
 
@@ -22,7 +22,7 @@ pub(crate) struct CheckedConfig {
 /// Keys of Zenoh's configuration, and the JSON values that they get if the file does not set them.
 ///
 /// Zenoh's own values are made for throughput: samples in long queues are old on a slow link. A message that finds no room
-/// waits in this session, while newer samples replace those behind it. A router on the way has values of its own.
+/// waits in this session, while newer samples replace the samples in the queue. A router on the way has values of its own.
 const LIMITS: &[(&str, &str)] = &[
     ("scouting/multicast/enabled", "false"),
     ("scouting/gossip/enabled", "false"),
@@ -41,17 +41,15 @@ const LIMITS: &[(&str, &str)] = &[
     ("transport/link/tls/so_sndbuf", "8192"),
 ];
 
-/// How long a message waits for room before Zenoh drops it, and every later one until there is room, in microseconds. In
-/// fragments, it may wait for the second time.
+/// Time for which a message waits for room before Zenoh drops it, and every later one until there is room, in microseconds:
+/// of a client, and of a router or peer. The second key is the time that a message in fragments waits beyond that.
 ///
-/// A session that only connects has one link, and waits longer than a link without data lives (10 s). So it drops nothing,
-/// but the link breaks. A session that listens may have many links, and one that is stopped must not delay the others.
+/// A client has one link. It waits as long as a link without data lives (10 s), so that it drops nothing unless the link
+/// breaks. A longer wait would delay the end of a dead link, because the wait holds a lock of Zenoh. A router may have many
+/// links, and one that stalls must not delay the others.
 const WAIT: [(&str, [&str; 2]); 2] = [
-    ("transport/link/tx/queue/congestion_control/drop/wait_before_drop", ["60000000", "1000000"]),
-    (
-        "transport/link/tx/queue/congestion_control/drop/max_wait_before_drop_fragments",
-        ["60000000", "2000000"],
-    ),
+    ("transport/link/tx/queue/congestion_control/drop/wait_before_drop", ["10000000", "1000000"]),
+    ("transport/link/tx/queue/congestion_control/drop/max_wait_before_drop_fragments", ["0", "2000000"]),
 ];
 
 /// Files that Zenoh opens when it connects, and not before.
@@ -106,7 +104,7 @@ impl CheckedConfig {
             return Err(Failure::new(Kind::Configuration, "no router", hint));
         }
         let listens = !listen.is_empty();
-        let waits = WAIT.iter().map(|(key, values)| (*key, values[usize::from(listens)]));
+        let waits = WAIT.iter().map(|(key, values)| (*key, values[usize::from(mode != WhatAmI::Client)]));
         for (key, value) in LIMITS.iter().copied().chain(waits) {
             if !is_said(&config, key) {
                 set(&mut config, key, value);

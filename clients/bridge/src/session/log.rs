@@ -1,5 +1,5 @@
-//! What Zenoh logs about connections that fail: there is no other way to learn why. The newest lines wait here until they are
-//! reported, each once. Everything else in Zenoh's log is ignored.
+//! Zenoh's log lines about connections that fail, which is the only way to learn why. The newest lines wait here until they
+//! are reported, each once. Everything else in the log is ignored.
 
 use std::collections::VecDeque;
 use std::fmt::{Debug, Write};
@@ -39,6 +39,8 @@ const QUIET: [(&str, &str); 3] = [
     ("zenoh_link_tls::unicast", "Can not accept"),
     ("zenoh_transport::unicast::establishment::accept", ""),
 ];
+/// How Zenoh reports that it closes a link which has no room. That connection was not refused.
+const CLOSED: &str = "Unable to push";
 /// How it tells of one that it did not refuse.
 const ACCEPTED: &str = "New transport";
 
@@ -70,7 +72,7 @@ impl Log {
         let end = line.char_indices().map(|(at, _)| at).find(|at| *at + 4 > LONGEST);
         line.truncate(end.unwrap_or(line.len()));
         let mut lines = self.lines();
-        lines.count += 1;
+        lines.count += u64::from(!line.starts_with(CLOSED));
         if lines.known.contains(&line) {
             return;
         }
@@ -170,6 +172,9 @@ mod tests {
         assert_eq!((log.take(), log.take(), log.count()), (vec!["no route".to_owned()], vec![], 2));
         log.add("Too many open files (os error 24). Hint: increase the system open file limit.");
         assert_eq!(log.take(), ["Too many open files (os error 24)."]);
+        let refused = log.count();
+        log.add("Unable to push non droppable network message to 1a2b. Closing transport!");
+        assert_eq!((log.take().len(), log.count()), (1, refused), "a closed link was not refused");
         log.add("no tcp/r:1#so_sndbuf=8192: refused. Retry in 100ms.");
         log.add("no tcp/r:1#so_sndbuf=8192: refused. Retry in 200ms.");
         assert_eq!(log.take(), ["no tcp/r:1: refused."]);

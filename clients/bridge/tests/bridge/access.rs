@@ -92,7 +92,7 @@ fn who_has_a_certificate_of_the_authority_is_connected_and_nobody_else() {
         reason(&mut thief, "the certificates do not fit");
         assert_eq!(thief.end(INT).of_class("bridge_published").len(), 0);
     }
-    // The robot only sends. It says what its peers need, and counts them.
+    // The robot only sends. It reports what its peers need, and counts them.
     let line = robot.await_line("the refusal", |line| {
         line["class"] == "bridge_link"
             && line["finding"] == "somebody was refused: the certificates do not fit"

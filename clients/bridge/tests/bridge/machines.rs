@@ -89,7 +89,7 @@ fn answers(session: &zenoh::Session, query: &str) -> Vec<String> {
 }
 
 #[test]
-fn queries_with_wildcards_get_every_answer_that_fits() {
+fn a_plain_client_gets_samples_and_every_answer_that_fits_its_query() {
     let robot = TestEnv::new();
     let _sensors = robot.simulator(&["front", "rear"], NO_FLAGS);
     let at = address("tcp");
@@ -106,6 +106,11 @@ fn queries_with_wildcards_get_every_answer_that_fits() {
         "rear/background",
         "rear/status",
     ]);
+    // A router has room for two samples that are sent as `express`.
+    let samples = client.declare_subscriber("scanhub/*/*/scan").wait().expect("a subscriber");
+    for _ in 0..5 {
+        assert!(!samples.recv().expect("a scan").express());
+    }
     until("all answers exist", || answers(&client, "scanhub/**") == all);
     assert_eq!(answers(&client, "**"), all);
     assert_eq!(answers(&client, "scanhub/*/*/announce"), keys(&["front/announce", "rear/announce"]));

@@ -1,5 +1,6 @@
 //! Routers between the machines: two in a row, and one that is killed and comes back.
 
+use rustix::process::Signal;
 use serde_json::Value;
 
 use crate::testkit::{INT, KILL, TestEnv, number, wall_ns};
@@ -55,6 +56,27 @@ fn a_router_that_is_killed_and_back_loses_nothing_that_is_not_told() {
                 .is_some_and(|(received, lost)| received + lost >= announced)
     });
     agree(&sent, &here.end(INT));
+}
+
+/// The link of a router that is stopped ends with Zenoh's lease, although a sample waits for room on it.
+#[test]
+fn a_router_that_is_stopped_loses_its_link_and_gets_it_back() {
+    let (robot, desk) = (TestEnv::new(), TestEnv::new());
+    let _sensor = robot.simulator(&["front"], NO_FLAGS);
+    let at = address("tcp");
+    let (mut here, _) = bridge(&desk, &["--listen", &at, "--publish"]);
+    let (mut there, _) = bridge(&robot, &["--connect", &at, "--topic=*/*"]);
+    linked(&mut there);
+    let _hub = robot.hub(&[robot.link("front")]);
+    let sensor = here.await_line("a sensor", |line| line["kind"] == "published")["sensor"].clone();
+    here.signal(Signal::STOP);
+    there.await_line("the end of the link", |line| is_link(line, "down"));
+    here.signal(Signal::CONT);
+    there.await_line("the link", |line| is_link(line, "up"));
+    let mut zones = desk.echo(&[&format!("{}/zones", sensor.as_str().unwrap_or_default())]);
+    let begun = wall_ns();
+    zones.await_line("zones after that", |line| line["class"] == "zones" && number(line, "wall_ns") >= begun);
+    assert_eq!(there.end(INT).code, Some(0));
 }
 
 /// How many announcements were sent.

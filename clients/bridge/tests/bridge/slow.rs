@@ -17,7 +17,7 @@ fn slow_down() -> bool {
 }
 
 /// Ends the bridges `there`, which sends, and `here`, which receives, after everything has arrived. The hub has ended
-/// before, so that the link gets empty: what is still on it when a bridge ends is cut off. Returns what the sender printed,
+/// before, so that the link gets empty: a bridge that ends cuts off the samples on its link. Returns what the sender printed,
 /// and the number of lost samples.
 fn end_when_all_arrived(mut there: Program, mut here: Program) -> (Outcome, u64) {
     let mut received = || account_so_far(&mut here, &["received", "lost"]);
@@ -67,7 +67,7 @@ fn on_a_slow_link_the_newest_comes_first() {
     });
 }
 
-/// How many samples newer ones must replace before the stalled link moves again: more than 1 s of zones.
+/// Number of zones that newer ones must replace before the stalled link moves again: those of more than 1 s.
 const REPLACED: u64 = 60;
 
 /// Stops the program that receives until newer samples have replaced many others, with this bridge as the router.

@@ -201,21 +201,28 @@ impl Numbering {
     /// What was handed on last of a topic that is kept, sent again `now` under the number that it has.
     pub(super) fn again(&mut self, name: &str, topic: Option<Topic>, now: Stamp) -> Option<&[u8]> {
         let number = topic.map_or(Announce::NUMBER, Topic::number);
-        let sensor = self.sensors.iter().position(|rows| rows.name == name)?;
         let last = &self.waiting.as_ref()?.last;
-        let is_it = |head: &Head| usize::from(head.sensor) == sensor && head.topic == number;
-        let (head, payload) = last.iter().find(|(head, _)| is_it(head))?;
+        let is_it = |head: &Head| self.sensors[usize::from(head.sensor)].name == name && head.topic == number;
+        // After a restart of the hub, a sensor may have two numbers: the later one counts.
+        let (head, payload) = last.iter().rev().find(|(head, _)| is_it(head))?;
         let head = Head { stamp_ns: stamp_ns(head, now), ..*head };
-        let len = self.sensors[sensor].write(&head, payload, &mut self.buffer[HEAD..])?;
+        let len = self.sensors[usize::from(head.sensor)].write(&head, payload, &mut self.buffer[HEAD..])?;
         head.seal(&mut self.buffer, len)
     }
 
-    /// The sensors and topics of which a sample is kept, in the order in which they were sent first.
+    /// Returns the sensors and topics with a kept sample, in the order in which they were sent first.
     pub(super) fn kept(&self) -> impl Iterator<Item = (&str, Option<Topic>)> {
         self.waiting
             .iter()
             .flat_map(|waiting| &waiting.last)
             .map(|(head, _)| (&*self.sensors[usize::from(head.sensor)].name, Topic::of_number(head.topic)))
+    }
+
+    /// Forgets all kept samples.
+    pub(super) fn forget_kept(&mut self) {
+        if let Some(waiting) = &mut self.waiting {
+            waiting.last.clear();
+        }
     }
 
     /// What was handed on as this sensor's and topic's last sample, of so many bytes, was not taken.

@@ -124,7 +124,7 @@ fn as_many_wait_as_are_kept_and_old_ones_give_way() {
     };
     take(&mut graph, 0);
     assert_eq!(ranges(handed(&mut graph)), [3, 4, 5, 6, 7]);
-    graph.not_taken(0);
+    graph.settle(false);
     assert_eq!(counts(&graph), (4, 2, 1));
     // Of those that came 60 to 140 ms after the start, two are old at 190 ms; later on the newest is not, as the only one.
     take(&mut graph, 0);
