@@ -8,33 +8,33 @@ let pen = map.getContext("2d");
 
 // By namespace, as "/front".
 const sensors = new Map();
-// The last message about it.
+// The last message of topic `robot`.
 let robot = {};
 // ID of the server's run.
 let session = null;
 let circles = [];
-// That violate a circle.
+// Beams that violate a zone.
 let beams = [];
 let marks = [];
 // Straight surfaces, as pairs of ends.
 let walls = [];
 let corners = [];
-// By topic of their tracker: when they came, and who is where.
+// Tracks, and the time of their arrival, by topic of the tracker.
 const people = new Map();
-// By namespace of who makes them of a tilted scanner.
+// Sweeps of tilted scanners, by namespace.
 const sweeps = new Map();
-// Of the recording that this server plays, if it does.
+// State of the replay, if this server plays a recording.
 let player = null;
-// When the verdict came last.
+// Time of the last verdict.
 let heard = -Infinity;
 let frames = 0;
-// Moment of a scan, and of the end of the frame that shows it, in ms since 1970, by one machine's clock.
+// Time of a scan, and end of the frame that shows it, in ms since 1970, by one machine's clock.
 const ages = [];
 const drawn = { beams: 0, foreground: 0, zones: 0, marks: 0, lines: 0, tracks: 0, obstacles: 0, swept: 0, axes: 0 };
 
-// After which the verdict is not known.
+// The verdict is unknown after this silence.
 const SILENT_MS = 500;
-// After which a scan is not what is there.
+// A scan is stale after this time.
 const OLD_MS = 1000;
 const TRAIL_MS = 1600;
 const TRAIL_STEP_MS = 90;

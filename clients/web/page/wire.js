@@ -173,7 +173,7 @@ const ofJson = { robot: takeRobot, status: takeStatus, zones: takeZones, lines: 
 
 /** What makes the words beside the picture, and not the picture. */
 const BESIDE = ["robot", "status", "replay"];
-// What came for the picture while it is held, the newest of each topic.
+// The newest message of each topic, while the picture is frozen.
 let kept = null;
 // Whether the frozen picture is the map of a site.
 let isHeldMap = false;
