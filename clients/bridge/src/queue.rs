@@ -83,8 +83,14 @@ impl<Q: Queue> Follower<Q> {
         let more = self.forwarder.forward(&mut self.queue)?;
         self.queue.ring();
         self.forwarder.look(Instant::now(), &mut self.queue, report)?;
-        self.queue.lock().look(self.forwarder.is_there(), now());
-        self.queue.ring();
+        let is_waiting = {
+            let mut queue = self.queue.lock();
+            queue.look(self.forwarder.is_there(), now());
+            queue.is_waiting()
+        };
+        if is_waiting {
+            self.queue.ring();
+        }
         Ok(more)
     }
 
