@@ -175,8 +175,8 @@ fn tracked(env: &TestEnv, site: &str, file: &str) -> [Published; 2] {
                 }
                 take::<Tracks>(&tracks, |wall_ns, payload| published[0].push((wall_ns, packed(payload))));
                 take::<Event>(&events, |wall_ns, payload| published[1].push((wall_ns, packed(payload))));
-                let shown_ns = published[0].last().map_or(BEGIN_NS + 1_000_000_000, |(wall_ns, _)| *wall_ns);
-                played_ns < shown_ns + DELAY_NS + LEAD_NS
+                let shown_ns = published[0].last().map(|(wall_ns, _)| wall_ns + LEAD_NS);
+                played_ns < shown_ns.unwrap_or(BEGIN_NS + 1_000_000_000 + FIRST_LEAD_NS) + DELAY_NS
             });
         }
         let outcome = track.end(INT);
@@ -189,12 +189,14 @@ fn tracked(env: &TestEnv, site: &str, file: &str) -> [Published; 2] {
     })
 }
 
-/// Time that the tracker waits for scans of other sensors. Before its first samples, nothing shows what it has received, so
-/// this and the lead together are less than the 16 foregrounds that wait for it (426 ms).
-const DELAY_NS: u64 = 200_000_000;
+/// Time that the tracker waits for scans of other sensors.
+const DELAY_NS: u64 = 300_000_000;
 /// Time of scans that the tracker may be behind: less than it waits for other sensors, and more than is between two of its
 /// samples (40 ms).
-const LEAD_NS: u64 = 120_000_000;
+const LEAD_NS: u64 = 160_000_000;
+/// The lead before its first sample, when nothing shows yet what it has received. With the delay, it is less than the 16
+/// foregrounds that wait for it (426 ms), and enough for that sample.
+const FIRST_LEAD_NS: u64 = 100_000_000;
 /// End of the compared span, from the start of the world.
 const END_NS: u64 = 20_000_000_000;
 
