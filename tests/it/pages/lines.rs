@@ -15,10 +15,11 @@ use schema::Topic;
 
 /// Commands that are not run, by how their line begins or what is in it, and what makes sure of them. Those of the
 /// program are read by `hub/cli/examples.rs`.
-const NOT_RUN: [(&str, &str); 17] = [
+const NOT_RUN: [(&str, &str); 18] = [
     ("sudo ", "changes the machine; tests/it/dist.rs and tests/it/client_c.rs install elsewhere"),
     ("sudoedit ", "an editor"),
     ("curl ", "installs Rust, which built this test"),
+    (". \"$HOME/.cargo/env\"", "the shell that started this test finds cargo"),
     ("systemctl ", "asks the machine's service manager; tests/it/service.rs has one of its own"),
     ("cargo build", "builds for minutes; this test was built so"),
     ("cargo test", "this is it"),
