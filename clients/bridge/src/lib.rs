@@ -168,6 +168,7 @@ fn report_counts(
     }
     match options.publish {
         Some(_) if connection.is_open() => Ok(()),
+        _ if !connection.is_open() && connection.refused() == 0 => Ok(()),
         _ => report.refused(connection.refused()),
     }
 }

@@ -231,7 +231,10 @@ impl Sender for DatagramSender<'_> {
             let key = Address { hub, sensor, topic: of }.to_string();
             let live = format!("{PREFIX}/{hub:016x}/{sensor}/{LIVE}");
             self.topics[topic].publisher = Some(self.session.publisher(&key)?);
-            self.announce(live)?;
+            // Announcements are sent without a hub too.
+            if !self.tokens.is_empty() {
+                self.announce(live)?;
+            }
         }
         let publisher = self.topics[topic].publisher.as_ref();
         Ok(publisher.is_some_and(|publisher| self.session.put(publisher, message, None)))

@@ -96,7 +96,7 @@ fn a_plain_client_gets_samples_and_every_answer_that_fits_its_query() {
     let (mut there, id) = bridge(&robot, &["--listen", &at]);
     let client = peer(&at);
     linked(&mut there);
-    let _hub = robot.hub(&[robot.link("front"), robot.link("rear")]);
+    let hub = robot.hub(&[robot.link("front"), robot.link("rear")]);
     let keys = |names: &[&str]| names.iter().map(|name| format!("scanhub/{id}/{name}")).collect::<Vec<_>>();
     let all = keys(&[
         "front/announce",
@@ -117,6 +117,20 @@ fn a_plain_client_gets_samples_and_every_answer_that_fits_its_query() {
     assert_eq!(answers(&client, &format!("scanhub/{id}/rear/*")), all[3..]);
     assert_eq!(answers(&client, &all[1]), all[1..2]);
     assert_eq!(answers(&client, "scanhub/*/*/scan"), all[..0], "no scan is kept");
+
+    // Without a hub, announcements go on, but neither the hub nor its sensors have a token.
+    assert_eq!(hub.end(INT).code, Some(0));
+    let tokens = || {
+        let replies = client.liveliness().get("scanhub/*/*/@live").wait().expect("a query");
+        std::iter::from_fn(|| replies.recv().ok()).count()
+    };
+    until("the tokens are gone", || tokens() == 0);
+    let changes = client.liveliness().declare_subscriber("scanhub/*/*/@live").wait().expect("a subscriber");
+    let announcements = client.declare_subscriber("scanhub/*/*/announce").wait().expect("a subscriber");
+    for _ in 0..4 {
+        announcements.recv().expect("an announcement");
+    }
+    assert!(matches!(changes.try_recv(), Ok(None)), "a token of a hub that has ended");
 }
 
 #[test]
