@@ -1,4 +1,4 @@
-//! What Zenoh's messages about failed connections mean, and what to do. The texts are those of Zenoh 1.10, whose version is
+//! Causes and remedies for Zenoh's messages about failed connections. The texts are those of Zenoh 1.10, whose version is
 //! pinned.
 
 /// A cause and its remedy.
@@ -13,22 +13,24 @@ impl Diagnosis {
     pub(crate) fn of(words: &str) -> Option<Diagnosis> {
         let words = words.to_lowercase();
         let has_any = |signs: &[&str]| signs.iter().any(|sign| words.contains(sign));
-        let (_, diagnosis) = KNOWN.iter().find(|(signs, _)| has_any(signs))?;
+        let find = |known: &[Row]| known.iter().find(|(signs, _)| has_any(signs)).map(|row| row.1);
         // Only the end that connects writes this.
-        let connects = has_any(UNABLE);
-        Some(if !connects && has_any(CERTIFICATES) { PEER_REFUSED } else { *diagnosis })
+        let connects = words.contains("unable to connect");
+        let of_certificate = || find(CERTIFICATES).map(|known| if connects { known } else { PEER_REFUSED });
+        find(KNOWN).or_else(of_certificate).or(connects.then_some(UNREACHED))
     }
 }
 
-/// Nobody answers, or not in Zenoh's protocol.
+/// No program answers, or not in Zenoh's protocol.
 pub(crate) const UNREACHED: Diagnosis = Diagnosis {
     finding: "no router is reached",
     remedy: "start a router there (`scanhub bridge --listen ..` or zenohd), and check the firewall",
 };
 
-/// Parts of Zenoh's messages in lower case, and what they mean. The first match counts: messages about users and certificates
-/// also say that nobody is connected.
-const KNOWN: &[(&[&str], Diagnosis)] = &[
+/// Parts of Zenoh's messages in lower case, and their cause. The first match counts.
+type Row = (&'static [&'static str], Diagnosis);
+
+const KNOWN: &[Row] = &[
     (
         &["recv opensyn. invalid", "recv initsyn. expected"],
         Diagnosis {
@@ -64,6 +66,10 @@ const KNOWN: &[(&[&str], Diagnosis)] = &[
             remedy: "allow more: `ulimit -n 4096` in the shell, or LimitNOFILE=4096 in the unit of a service",
         },
     ),
+];
+
+/// Bad certificates, as the end that connects reports them.
+const CERTIFICATES: &[Row] = &[
     (
         &["expired"],
         Diagnosis {
@@ -86,16 +92,9 @@ const KNOWN: &[(&[&str], Diagnosis)] = &[
                      router as its certificate does; a router with enable_mtls needs a connect_certificate",
         },
     ),
-    (UNABLE, UNREACHED),
 ];
 
-const UNABLE: &[&str] = &["unable to connect"];
-
-/// What is wrong with certificates, at either end.
-const CERTIFICATES: &[&str] =
-    &["expired", "notvalidyet", "not valid yet", "certificate", "unknownissuer", "unknownca", "tls"];
-
-/// At the end that listens.
+/// A bad certificate, at the end that listens.
 const PEER_REFUSED: Diagnosis = Diagnosis {
     finding: "somebody was refused: the certificates do not fit",
     remedy: "a machine that connects must trust the authority of listen_certificate here; with enable_mtls, it must \

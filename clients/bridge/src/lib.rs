@@ -1,6 +1,6 @@
-//! Sends the topics of a hub to other machines over Zenoh, and publishes those of other machines: what `gateway` and
-//! `listen` do in a LAN. Which samples are sent, which are accepted and what was lost is decided in `scanhub_lan`, without a
-//! network. Zenoh is used in one module only, `session`.
+//! Sends the topics of a hub to other machines over Zenoh, and publishes those of other machines, as `gateway` and `listen` do
+//! in a LAN. `scanhub_lan` decides which samples are sent and accepted, and counts the lost ones, without a network. Only
+//! module `session` uses Zenoh.
 #![forbid(unsafe_code)]
 
 mod check;
@@ -95,7 +95,7 @@ pub fn bridge(options: &BridgeOptions, tell: &AtomicBool, stop: &AtomicBool) -> 
 
 /// Interval between announcements, and between reports of the statistics.
 const TICK: Duration = ANNOUNCE_EVERY;
-/// How long the bridge waits for a router before it reports that.
+/// Time without a router after which the bridge reports that it waits.
 const REPORT_WAITING_AFTER: Duration = Duration::from_secs(1);
 /// The longest wait for the hub.
 const MAX_WAIT: Duration = Duration::from_millis(50);

@@ -30,7 +30,7 @@ pub(crate) trait Queue: Carrier {
 /// A queue that two threads share.
 pub(crate) struct Shared<Q>(Arc<(Mutex<Q>, Condvar)>);
 
-/// Fills a queue with what a hub publishes.
+/// Fills a queue with the samples of a hub.
 pub(crate) struct Follower<Q> {
     forwarder: Forwarder,
     queue: Shared<Q>,
@@ -38,7 +38,7 @@ pub(crate) struct Follower<Q> {
 
 /// Sends the messages of a queue through a session. A message belongs to a topic, which has a number here.
 pub(crate) trait Sender {
-    /// Where the messages come from.
+    /// The queue with the messages.
     type Queue: Queue;
 
     /// Declares what exists now: tokens, and publishers of new topics.

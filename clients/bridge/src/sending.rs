@@ -28,7 +28,7 @@ pub(crate) struct Datagrams {
     hub: u64,
     outgoing: Outgoing,
     hub_is_available: bool,
-    /// How often the hub became available.
+    /// Number of runs of the hub so far.
     hub_runs: u64,
     /// The message that was taken last and is not settled: number of the sensor, topic and length.
     in_flight: Option<(u8, Option<Topic>, usize)>,

@@ -175,7 +175,7 @@ pub(crate) struct ZenohSession {
 #[derive(Clone, Copy, Default)]
 struct Links {
     checked: Option<Instant>,
-    count: usize,
+    is_linked: bool,
     /// Only one program is connected, and it passes nothing on.
     is_lone_client: bool,
 }
@@ -214,20 +214,20 @@ pub(crate) struct Reply {
 impl ZenohSession {
     /// Returns whether there is a connection: to a router, or from another program.
     pub(crate) fn is_linked(&self) -> bool {
-        self.links().count > 0
+        self.links().is_linked
     }
 
     fn links(&self) -> Links {
         let mut links = self.links.lock().unwrap_or_else(PoisonError::into_inner);
         let now = Instant::now();
         let is_valid = |checked| now.saturating_duration_since(checked) < LINKS_VALID;
-        if links.count == 0 || !links.checked.is_some_and(is_valid) {
+        if !links.is_linked || !links.checked.is_some_and(is_valid) {
             let mut transports = self.session.info().transports().wait();
             let first = transports.next();
             let is_lone = transports.next().is_none();
             *links = Links {
                 checked: Some(now),
-                count: usize::from(first.is_some()) + usize::from(!is_lone),
+                is_linked: first.is_some(),
                 is_lone_client: is_lone && first.is_some_and(|peer| peer.whatami() == WhatAmI::Client),
             };
         }

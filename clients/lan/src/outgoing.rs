@@ -102,7 +102,7 @@ impl Outgoing {
         self.numbering.kept()
     }
 
-    /// Makes [`again`](Outgoing::again) return nothing until newer samples are handed on.
+    /// Drops the samples that [`again`](Outgoing::again) returns.
     pub fn forget_kept(&mut self) {
         self.numbering.forget_kept();
     }

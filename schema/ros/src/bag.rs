@@ -47,10 +47,8 @@ impl Bag {
         header: &Header,
         scan: &Scan,
     ) -> io::Result<()> {
-        let channel = self.channel(writer, scan_topic(sensor), &LASER_SCAN)?;
-        self.message.clear();
-        laser_scan(&mut self.message, frame(sensor), header, scan);
-        writer.message(channel, header.topic_seq as u32, header.wall_ns, &self.message)
+        let write = |message: &mut Vec<u8>| laser_scan(message, frame(sensor), header, scan);
+        self.write(writer, scan_topic(sensor), &LASER_SCAN, header, write)
     }
 
     /// Writes a scan of `sensor` as a PointCloud2, with the log time of its LaserScan.
@@ -65,19 +63,29 @@ impl Bag {
         header: &Header,
         scan: &Scan,
     ) -> io::Result<()> {
-        let channel = self.channel(writer, points_topic(sensor), &POINT_CLOUD)?;
-        self.message.clear();
-        scan_cloud(&mut self.message, frame(sensor), header, scan);
-        writer.message(channel, header.topic_seq as u32, header.wall_ns, &self.message)
+        let write = |message: &mut Vec<u8>| scan_cloud(message, frame(sensor), header, scan);
+        self.write(writer, points_topic(sensor), &POINT_CLOUD, header, write)
     }
 
-    fn channel<W: Write>(&mut self, writer: &mut Writer<W>, topic: String, of: &Type) -> io::Result<u16> {
-        if let Some(&(_, channel)) = self.channels.iter().find(|(known, _)| *known == topic) {
-            return Ok(channel);
-        }
-        let channel = channel(writer, &topic, of, EVERY_SCAN)?;
-        self.channels.push((topic, channel));
-        Ok(channel)
+    fn write<W: Write>(
+        &mut self,
+        writer: &mut Writer<W>,
+        topic: String,
+        of: &Type,
+        header: &Header,
+        write: impl FnOnce(&mut Vec<u8>),
+    ) -> io::Result<()> {
+        let channel = match self.channels.iter().find(|(known, _)| *known == topic) {
+            Some(&(_, channel)) => channel,
+            None => {
+                let channel = channel(writer, &topic, of, EVERY_SCAN)?;
+                self.channels.push((topic, channel));
+                channel
+            }
+        };
+        self.message.clear();
+        write(&mut self.message);
+        writer.message(channel, header.topic_seq as u32, header.wall_ns, &self.message)
     }
 
     /// Writes the poses of all known sensors if `pose` of `sensor` is new; log time and stamp are `wall_ns` (since 1970), or

@@ -24,7 +24,7 @@ pub(super) struct Graph {
     /// What was handed last, and memory for others.
     handed: Vec<u8>,
     spare: Vec<Vec<u8>>,
-    /// The topic of the message that was handed on last, until it is settled.
+    /// The topic of the last message from [`hand`](Graph::hand), until it is settled.
     in_flight: Option<usize>,
     /// By frame.
     poses: Vec<(String, Pose)>,
@@ -275,7 +275,7 @@ impl Graph {
         }
     }
 
-    /// Settles the message that was handed on last: it was sent, or else it failed.
+    /// Settles the last message from [`hand`](Graph::hand): it was sent, or else it failed.
     pub(super) fn settle(&mut self, is_sent: bool) {
         if let Some(topic) = self.in_flight.take().filter(|_| !is_sent) {
             let topic = &mut self.topics[topic];

@@ -39,7 +39,7 @@ const QUIET: [(&str, &str); 3] = [
     ("zenoh_link_tls::unicast", "Can not accept"),
     ("zenoh_transport::unicast::establishment::accept", ""),
 ];
-/// How Zenoh reports that it closes a link which has no room. That connection was not refused.
+/// Begin of Zenoh's line about a link that it closes because it has no room. Such a connection was not refused.
 const CLOSED: &str = "Unable to push";
 /// How it tells of one that it did not refuse.
 const ACCEPTED: &str = "New transport";

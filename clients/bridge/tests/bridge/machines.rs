@@ -118,7 +118,7 @@ fn a_plain_client_gets_samples_and_every_answer_that_fits_its_query() {
     assert_eq!(answers(&client, &all[1]), all[1..2]);
     assert_eq!(answers(&client, "scanhub/*/*/scan"), all[..0], "no scan is kept");
 
-    // Without a hub, announcements go on, but neither the hub nor its sensors have a token.
+    // Without a hub, the bridge still announces its sensors, but neither the hub nor they have a token.
     assert_eq!(hub.end(INT).code, Some(0));
     let tokens = || {
         let replies = client.liveliness().get("scanhub/*/*/@live").wait().expect("a query");
