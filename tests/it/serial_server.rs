@@ -154,16 +154,12 @@ fn scans_that_waited_for_a_hub_at_a_standstill_say_nothing_of_now() {
     let before = sent();
     until("scans wait", || sent() > before + WAITING);
     hub.signal(Signal::CONT);
-    let first = consumer.await_line("a verdict", |line| line["verdict"] == "unknown");
-    let first = consumer.await_line("an old scan", |line| line["seq"].as_u64() > first["seq"].as_u64());
     let is_estimated = |line: &Value| line["flags"].to_string().contains("stamp_estimated");
-    let is_of_now = |line: &Value| line["verdict"] == "clear" && !is_estimated(line);
-    let last = consumer.await_line("a new scan", is_of_now);
-    assert!(is_estimated(&first), "{first}");
-    let waited = number(&last, "seq") - number(&first, "seq");
-    eprintln!("{waited} scans were too old to tell of now");
     // The server sends five per second, so those of the last second may be recent.
-    assert!(waited >= WAITING as u64 - 6, "{waited}: {first} {last}");
+    for _ in 0..WAITING - 6 {
+        consumer.await_line("an old scan", |line| line["verdict"] == "unknown" && is_estimated(line));
+    }
+    consumer.await_line("a new scan", |line| line["verdict"] == "clear" && !is_estimated(line));
     consumer.end(INT);
     assert_eq!(hub.end(TERM).code, Some(0));
 }
