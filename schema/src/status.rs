@@ -142,6 +142,14 @@ impl Status {
         Some(format!("{percent:.digits$} % {word} on the line"))
     }
 
+    /// Returns whether telegrams have arrived, but most bytes since the hub's start were in none, and the hub looks for the
+    /// scanner again. Only then is the share of these bytes a finding: before, they may be those of another scanner.
+    pub fn is_mostly_discarded(&self) -> bool {
+        let (read, discarded) = (self.counters[Counter::BytesRead], self.counters[Counter::BytesDiscarded]);
+        let has_replied = self.counters[Counter::Telegrams] > 0;
+        self.state() == Some(State::Probing) && has_replied && discarded > read / 2
+    }
+
     /// Returns whether the sensor is a recording, of which nothing can be asked.
     pub fn is_replayed(&self) -> bool {
         self.port().starts_with("file:")

@@ -1,6 +1,6 @@
 //! A line that loses bytes: hub and clients say how much of the stream that costs, as the simulator has it.
 
-use crate::testkit::{INT, TERM, TestEnv, is_class, number};
+use crate::testkit::{INT, TERM, TestEnv, is_class, number, sequence, until};
 
 /// What the paper found on a line of theirs.
 const BURSTS: &str = "--fault=loss=0.00135,burst=1.89";
@@ -78,4 +78,28 @@ fn a_line_that_is_well_says_so_from_the_first_second() {
     assert_eq!(info["damaged"], 0.0, "{info}");
     assert_eq!(hub.end(TERM).code, Some(0));
     assert_eq!(simulator.end(INT).code, Some(0));
+}
+
+/// Replies arrive now and then, but hardly ever a scan.
+#[test]
+fn a_line_that_damages_all_scans_is_reported_before_another_scanner() {
+    let env = TestEnv::new();
+    let _simulator = env.simulator(&["front"], &["--seed=5", "--fault=loss=0.02,burst=1"]);
+    let hub = env.hub(&[format!("{},family=lms", env.link("front"))]);
+    let error = |info: &serde_json::Value| info["last_error"].as_str().unwrap_or_default().to_owned();
+    let info = env.await_info("front", |info| error(info).contains("few telegrams of the "));
+    assert!(
+        error(&info).ends_with("are intact: check the cable, its ground and termination, and the adapter"),
+        "{info}"
+    );
+    let is_found = || {
+        let outcome = env.run(&["doctor", &env.word("front"), "--json"]);
+        let checks = outcome.of_class("check");
+        let check = checks.iter().find(|check| check["name"] == "line-loss").expect("it is looked at");
+        check["state"] == "failed" && check["finding"].to_string().contains("were in no intact telegram")
+    };
+    until("doctor finds it, while the hub looks for the scanner", is_found);
+    let is_told = || env.run(&["info", "front"]).to_string().contains("bytes were in no intact telegram");
+    until("info says it, while the hub looks for the scanner", is_told);
+    assert_eq!(hub.end(TERM).code, Some(0));
 }

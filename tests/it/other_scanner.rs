@@ -142,7 +142,7 @@ fn scanners() -> [(&'static str, Box<dyn Device>); 3] {
     let unit = UnitSettings { start: UnitStart::Streaming, seed: 7, ..UnitSettings::of(Model::A1) };
     [
         ("ld19", Box::new(Head::new(head, Packets::Room(Box::new(room()))))),
-        ("lms", Box::new(Machine::new(machine, sim::source::Source::Room(room())))),
+        ("lms scanner", Box::new(Machine::new(machine, sim::source::Source::Room(room())))),
         ("a1", Box::new(Unit::new(unit, room()))),
     ]
 }
@@ -206,7 +206,7 @@ fn exchange(keys: &str, number: usize, end: Nanos) -> (&'static str, Vec<Reporte
 /// Checks that a hub reports the exchange of a scanner called `name` within 4 s, with `remedy`, and no damage of the line.
 fn check_exchange(name: &str, remedy: &str, reported: &[Reported]) {
     let says =
-        format!(" bytes/s arrive, but none of the {name}: another scanner, or a damaged line? {remedy}");
+        format!(" bytes/s arrive, but nothing from the {name}: another scanner, or a damaged line? {remedy}");
     let is_soon = |(now, ..): &&Reported| (EXCHANGED_AT..EXCHANGED_AT + 4 * SECOND).contains(now);
     let mut soon = reported.iter().filter(is_soon);
     assert!(soon.any(|(.., error)| error.ends_with(&says)), "{says}: {reported:#?}");

@@ -140,6 +140,11 @@ fn mode(status: &Status) -> Option<String> {
 
 /// What the line takes away: lately, and since the hub's start.
 fn line(status: &Status) -> String {
+    if status.is_mostly_discarded() {
+        let (read, discarded) =
+            (status.counters[Counter::BytesRead], status.counters[Counter::BytesDiscarded]);
+        return format!("{discarded} of {read} bytes were in no intact telegram, and no scans arrive");
+    }
     let percent = |share: f64| format!("{:.2} %", 100.0 * share);
     let lost = match (status.lost_on_line(), status.lost_share()) {
         (Some(lost), Some(share)) => {

@@ -19,7 +19,12 @@ pub(crate) struct ByteRate {
 impl ByteRate {
     /// Notes that the session had read `read` bytes at `now`.
     pub(crate) fn note(&mut self, now: Nanos, read: u64) {
-        let (since, _) = *self.window.get_or_insert((now, read));
+        let (since, before) = *self.window.get_or_insert((now, read));
+        if !self.is_complete && read == before {
+            // The first window begins with the first byte.
+            self.window = Some((now, read));
+            return;
+        }
         if now >= since + WINDOW {
             let rate = self.of_window(now, read);
             self.quiet = if rate.is_some() { 0 } else { self.quiet + 1 };
@@ -32,8 +37,8 @@ impl ByteRate {
         }
     }
 
-    /// Returns the rate in bytes per second, rounded for a message; `None` if almost nothing arrives. The session has read
-    /// `read` bytes at `now`. A rate that varies a little is returned unchanged, because a new message is a new log line.
+    /// Returns the rate in bytes per second, rounded for a message; `None` if almost nothing arrives, or while the
+    /// rate [settles](Self::is_settling). The session has read `read` bytes at `now`. A rate that varies a little is returned unchanged, because a new message is a new log line.
     pub(crate) fn shown(&mut self, now: Nanos, read: u64) -> Option<u64> {
         let rate = if self.is_complete { self.last } else { self.of_window(now, read) }?;
         if !(self.shown / 2..=self.shown * 2).contains(&rate) {
@@ -42,10 +47,16 @@ impl ByteRate {
         Some(self.shown)
     }
 
+    /// Returns whether bytes have begun to arrive, but not long enough for a rate.
+    pub(crate) fn is_settling(&self, now: Nanos, read: u64) -> bool {
+        let is_begun = |(since, before)| read > before + NOISE && now < since + FIRST;
+        !self.is_complete && self.window.is_some_and(is_begun)
+    }
+
     fn of_window(&self, now: Nanos, read: u64) -> Option<u64> {
         let (since, before) = self.window?;
         let bytes = read.saturating_sub(before);
-        (bytes > NOISE && now > since).then(|| (bytes * 1_000 * MILLIS).div_ceil(now - since))
+        (bytes > NOISE && now >= since + FIRST).then(|| (bytes * 1_000 * MILLIS).div_ceil(now - since))
     }
 }
 
@@ -70,6 +81,9 @@ pub(crate) fn with_commas(number: u64) -> String {
 
 /// Longer than a search at all rates, so that the rate of the host's port does not change the result.
 const WINDOW: Nanos = 5_000 * MILLIS;
+/// Time before the first rate. A scanner that returns is found within this time, and the rate of a shorter time changes
+/// quickly: each change is a log line.
+const FIRST: Nanos = 2_000 * MILLIS;
 /// Windows without bytes after which there is no rate any more.
 const QUIET_WINDOWS: u32 = 3;
 /// Number of bytes that an adapter may deliver when a cable is plugged in.

@@ -26,11 +26,14 @@ pub(crate) struct Diagnosis<'a> {
     device: Option<String>,
     /// Rate of the bytes that arrive while nothing is streaming.
     byte_rate: ByteRate,
+    is_settling: bool,
     /// Family of the scanner. `None` while the session searches for it.
     family: Option<Family>,
     /// Number of telegrams of the session, and the time of the scanner's last one. `None` before the first one.
     telegrams: u64,
     last_telegram: Option<Nanos>,
+    /// Whether the scanner has streamed since the port was opened.
+    has_streamed: bool,
     /// Message that the scanner was exchanged, until the next one is found. Otherwise empty.
     exchange: String,
     /// Time of the last update.
@@ -84,9 +87,11 @@ impl<'a> Diagnosis<'a> {
             doubt: String::new(),
             device: None,
             byte_rate: ByteRate::default(),
+            is_settling: false,
             family: None,
             telegrams: 0,
             last_telegram: None,
+            has_streamed: false,
             exchange: String::new(),
             now: 0,
             altered: None,
@@ -140,16 +145,18 @@ impl<'a> Diagnosis<'a> {
     fn measure(&mut self, session: &PortSession, now: Nanos) -> Option<u64> {
         let account = session.account();
         if session.family() != self.family {
-            (self.family, self.last_telegram) = (session.family(), None);
+            (self.family, self.last_telegram, self.has_streamed) = (session.family(), None, false);
         }
         if account.telegrams != self.telegrams {
             (self.telegrams, self.last_telegram) = (account.telegrams, Some(now));
         }
         if session.state() == line::State::Streaming {
-            self.byte_rate = ByteRate::default();
+            self.has_streamed = true;
+            (self.byte_rate, self.is_settling) = (ByteRate::default(), false);
             return None;
         }
         self.byte_rate.note(now, account.read);
+        self.is_settling = self.byte_rate.is_settling(now, account.read);
         let is_shown = self.is_silent_for(SILENCE) || session.missing().is_some();
         if is_shown { self.byte_rate.shown(now, account.read) } else { None }
     }
@@ -163,6 +170,7 @@ impl<'a> Diagnosis<'a> {
     /// has streamed. If the line has damaged most bytes before, it may damage all of them now.
     fn is_exchanged(&self, session: &PortSession, bytes_per_second: Option<u64>) -> bool {
         session.state() != line::State::Paused
+            && self.has_streamed
             && self.is_silent_for(EXCHANGED_AFTER)
             && self.damaged_percent.is_none()
             && bytes_per_second.is_some_and(|rate| rate >= STREAM_BYTES)
@@ -172,7 +180,7 @@ impl<'a> Diagnosis<'a> {
     pub(crate) fn open(&mut self, device: Option<&Path>) {
         self.device = device.map(|device| device.display().to_string());
         self.byte_rate = ByteRate::default();
-        (self.telegrams, self.last_telegram) = (0, None);
+        (self.telegrams, self.last_telegram, self.has_streamed) = (0, None, false);
         self.exchange.clear();
         // This describes the previous connection.
         self.damaged_percent = None;
@@ -308,8 +316,20 @@ impl<'a> Diagnosis<'a> {
         if let Some(rate) = rate.filter(|_| self.facts.is_some_and(|facts| facts.is_exchanged)) {
             return self.bytes_of_another_kind(session, rate);
         }
+        if let Some(rate) = rate.filter(|_| self.last_telegram.is_some() && !self.has_streamed) {
+            return format!(
+                "{} bytes/s arrive, but few telegrams of the {} are intact: check the cable, its ground and termination, \
+                 and the adapter",
+                with_commas(rate),
+                scanner_of(session)
+            );
+        }
         if let Some((missing, rate)) = session.missing().zip(rate) {
             return self.other_bytes(missing, rate);
+        }
+        // Soon the rate of the bytes gives a better message than "no answer".
+        if self.is_settling && session.missing().is_some() {
+            return self.words.clone();
         }
         match session.trouble() {
             // Another family's scanner may be connected, or one at a rate that this family does not have.
@@ -340,13 +360,13 @@ impl<'a> Diagnosis<'a> {
     /// Returns the message that `rate` bytes per second arrive that are not of the scanner of `session`, which has streamed
     /// before.
     fn bytes_of_another_kind(&self, session: &PortSession, rate: u64) -> String {
-        let family = session.family().map_or("", |family| family.name());
-        let name = session.model().map_or(family, |model| model.name);
+        let name = scanner_of(session);
         let is_server = matches!(self.link.port, Source::Tcp { .. });
         // The bytes are the same in both cases.
         let other = if is_server { "another rate of the server" } else { "a damaged line" };
         let bytes = with_commas(rate);
-        let words = format!("{bytes} bytes/s arrive, but none of the {name}: another scanner, or {other}?");
+        let words =
+            format!("{bytes} bytes/s arrive, but nothing from the {name}: another scanner, or {other}?");
         if self.link.family().is_none() {
             return format!("{words} The search begins after 10 s without it");
         }
@@ -424,6 +444,12 @@ impl<'a> Diagnosis<'a> {
             "{count} consumers are attached but get nothing: raise the limit of open descriptors (ulimit -n)"
         )
     }
+}
+
+/// Returns the name of the scanner of `session`: its model's, or else its family's.
+fn scanner_of(session: &PortSession) -> String {
+    let family = session.family().map_or("", |family| family.name());
+    session.model().map_or_else(|| format!("{family} scanner"), |model| model.name.to_owned())
 }
 
 /// The word for how far `session` is.

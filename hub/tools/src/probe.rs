@@ -324,7 +324,7 @@ fn silence(source: &Source, first: u32, streams_at: Option<u32>, bytes: u64) -> 
         ),
         (None, _) => (
             format!("{name}: no answer at {rates}; {came}"),
-            "another device, RS-232 instead of RS-422, or a missing wire?",
+            "another device, a line that damages the bytes (ground, RS-232 instead of RS-422), or a missing wire?",
         ),
     };
     Failure::new(Kind::Timeout, what, remedy)
