@@ -1,6 +1,6 @@
 //! A line that loses bytes: hub and clients say how much of the stream that costs, as the simulator has it.
 
-use crate::testkit::{INT, TERM, TestEnv, is_class, number, sequence, until};
+use crate::testkit::{INT, TERM, TestEnv, is_class, number, until};
 
 /// What the paper found on a line of theirs.
 const BURSTS: &str = "--fault=loss=0.00135,burst=1.89";
