@@ -316,7 +316,9 @@ impl<'a> Diagnosis<'a> {
         if let Some(rate) = rate.filter(|_| self.facts.is_some_and(|facts| facts.is_exchanged)) {
             return self.bytes_of_another_kind(session, rate);
         }
-        if let Some(rate) = rate.filter(|_| self.last_telegram.is_some() && !self.has_streamed) {
+        let account = session.account();
+        let is_damaged = self.last_telegram.is_some() && account.discarded > account.read / 2;
+        if let Some(rate) = rate.filter(|_| is_damaged && !self.has_streamed) {
             return format!(
                 "{} bytes/s arrive, but few telegrams of the {} are intact: check the cable, its ground and termination, \
                  and the adapter",
