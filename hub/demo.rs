@@ -126,7 +126,7 @@ impl Drop for Raise<'_> {
 
 /// Returns the command that shows a topic of the demonstration in another terminal.
 fn attach(stage: &Stage) -> String {
-    format!("other terminal: scanhub echo {} --domain {}", stage.world.topic(), stage.domain.name())
+    format!("other terminal: scanhub echo {} {}", stage.world.topic(), stage.domain.flags())
 }
 
 /// Returns the address of the page, short enough for 80 columns together with the keys.
@@ -178,7 +178,7 @@ fn play(
     let hub = stage.start_hub(lines.clone())?;
     let consumers = stage.start_consumers(&lines)?;
     let tracker = stage.start_tracker(&lines)?;
-    let mut account = Account::new(&stage.sensors, stage.open_truths()?);
+    let mut account = Account::new(&stage.sensors);
     // Start the simulators last, so that the subscribers receive everything from the beginning.
     let mut simulators = Vec::new();
     let mut tilted = None;
@@ -190,6 +190,9 @@ fn play(
     let end = loop {
         match received.recv_timeout(next_look.saturating_duration_since(Instant::now()).min(PATIENCE)) {
             Ok(Line::Said { of: TRACKER, text }) => account.take_news(text),
+            Ok(Line::Said { of: SIMULATOR, text }) => {
+                account.take_sent(&serde_json::from_str(&text).unwrap_or_default());
+            }
             Ok(Line::Said { of, text }) => {
                 let value: Value = serde_json::from_str(&text).unwrap_or_default();
                 if value["class"] == "status" && simulators.is_empty() {
@@ -210,7 +213,6 @@ fn play(
         let now = Instant::now();
         if now >= next_look {
             next_look = now + REFRESH;
-            account.read_truth();
             account.look_at_hub(hub.pid());
             show(&account, begun.elapsed());
         }
@@ -237,8 +239,20 @@ fn play(
     drop(tracker);
     drop(consumers);
     drop(hub);
+    let mut open = simulators.len();
     drop(simulators);
-    account.read_truth();
+    // Their last lines are their summaries.
+    while open > 0
+        && let Ok(line) = received.recv_timeout(END_LIMIT)
+    {
+        match line {
+            Line::Said { of: SIMULATOR, text } => {
+                account.take_sent(&serde_json::from_str(&text).unwrap_or_default());
+            }
+            Line::Ended { of: SIMULATOR } => open -= 1,
+            _ => {}
+        }
+    }
     Ok((account, end))
 }
 
@@ -266,5 +280,7 @@ const REFRESH: Duration = Duration::from_millis(250);
 const PATIENCE: Duration = Duration::from_millis(50);
 /// Limit for all sensors to stream. It takes far less unless the machine is busy.
 const START_LIMIT: Duration = Duration::from_secs(30);
+/// Maximum wait for the last lines of a simulator that has ended.
+const END_LIMIT: Duration = Duration::from_secs(2);
 /// A sensor without a telegram for this time has stopped streaming.
 const LATE: Duration = Duration::from_secs(10);

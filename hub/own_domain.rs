@@ -1,21 +1,50 @@
-//! A domain of this process alone, gone with it. Refuses to know what hub runs in it.
+//! A domain of this process alone, which is removed when it ends.
 
 use std::ops::Deref;
 
-use schema::{Domain, Environment, Failure};
+use schema::{Directory, Domain, Environment, Failure, Kind};
+use tempfile::TempDir;
 
-/// The domain; its directory and its shared memory are removed when this is dropped.
-pub(crate) struct OwnDomain(Domain);
+/// The domain. Its directory and its shared memory are removed when this is dropped.
+pub(crate) struct OwnDomain {
+    domain: Domain,
+    /// Directory that has the domain, if another user has occupied the usual one.
+    base: Option<TempDir>,
+}
 
 impl OwnDomain {
-    /// One whose name begins with `word`, and has our process id.
+    /// Creates a domain whose name begins with `word`, and has our process id.
+    ///
+    /// # Errors
+    ///
+    /// [`Kind::Failed`] if neither the usual directory nor one for temporary files can be used.
     pub(crate) fn new(word: &str) -> Result<OwnDomain, Failure> {
         let name = format!("{word}-{}", std::process::id());
         let environment = Environment::of_process();
-        // Where the user's own place is too long a name for a domain, that of who has none is not.
+        // The user's directory may have too long a name for a domain. The one for users without a directory does not.
         let fallback = Environment { uid: environment.uid, ..Environment::default() };
-        let domain = Domain::of_hub(&name, None, &environment);
-        domain.or_else(|_| Domain::of_hub(&name, None, &fallback)).map(OwnDomain)
+        for environment in [environment, fallback] {
+            if let Ok(domain) = Domain::of_hub(&name, None, &environment)
+                && Directory::make(domain.root()).is_ok()
+            {
+                return Ok(OwnDomain { domain, base: None });
+            }
+        }
+        let base = tempfile::Builder::new().prefix("scanhub-").tempdir().map_err(|error| {
+            let message = format!("cannot create a temporary directory: {error}");
+            Failure::new(Kind::Failed, message, "set TMPDIR to a directory that this user may write")
+        })?;
+        let domain = Domain::of_hub(&name, Some(base.path()), &Environment::default())?;
+        Ok(OwnDomain { domain, base: Some(base) })
+    }
+
+    /// Returns the flags by which another program finds the domain.
+    pub(crate) fn flags(&self) -> String {
+        let name = self.domain.name();
+        match &self.base {
+            Some(base) => format!("--domain {name} --root {}", base.path().display()),
+            None => format!("--domain {name}"),
+        }
     }
 }
 
@@ -23,13 +52,13 @@ impl Deref for OwnDomain {
     type Target = Domain;
 
     fn deref(&self) -> &Domain {
-        &self.0
+        &self.domain
     }
 }
 
 impl Drop for OwnDomain {
     fn drop(&mut self) {
-        // All of it is ours alone: the name has our process id.
+        // The name has our process id, so nothing in it belongs to another process.
         let _ = std::fs::remove_dir_all(self.root());
         let prefix = self.prefix();
         let entries = std::fs::read_dir("/dev/shm").into_iter().flatten().flatten();

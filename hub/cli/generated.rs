@@ -1,11 +1,10 @@
 //! What is generated from the definition of the command line: completions for shells, and manual pages. It knows no verb.
 
-use std::io;
 use std::path::{Path, PathBuf};
 
 use clap::{Args, ValueEnum};
 use clap_complete::shells;
-use schema::{Failure, Kind};
+use schema::{Failure, Kind, output};
 
 use super::{command, complete};
 use crate::print_own;
@@ -72,12 +71,24 @@ impl Man {
 }
 
 fn write_pages(directory: &Path) -> Result<(), Failure> {
-    let written =
-        std::fs::create_dir_all(directory).and_then(|()| clap_mangen::generate_to(command(), directory));
-    written.map_err(|error: io::Error| {
+    std::fs::create_dir_all(directory).map_err(|error| {
         let message = format!("{}: {error}", directory.display());
         Failure::new(Kind::Output, message, "name a directory that can be written to")
-    })
+    })?;
+    let mut command = command().disable_help_subcommand(true);
+    command.build();
+    write_page(command, directory)
+}
+
+/// Writes the page of `command` and those of its subcommands. Pages of an earlier version are replaced.
+fn write_page(command: clap::Command, directory: &Path) -> Result<(), Failure> {
+    for command in command.get_subcommands().filter(|command| !command.is_hide_set()) {
+        write_page(command.clone(), directory)?;
+    }
+    let man = clap_mangen::Man::new(command);
+    let (path, mut page) = (directory.join(man.get_filename()), Vec::new());
+    man.render(&mut page).map_err(|error| output::unwritable(&path, &error))?;
+    output::write(&path, &page, true)
 }
 
 const NAME: &str = env!("CARGO_PKG_NAME");

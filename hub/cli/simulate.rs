@@ -62,9 +62,12 @@ pub(crate) struct Simulate {
     /// Faults to inject, for example loss=0.00135,burst=1.89; see below
     #[arg(long, default_value = "", hide_default_value = true, value_name = "KEY=VALUE,..")]
     fault: String,
-    /// Write one JSON line per telegram to this file: what was sent, with its hash
+    /// Write one JSON line per telegram to this file: what was sent, with its hash. `-` is stdout
     #[arg(long, value_name = "FILE")]
     truth: Option<PathBuf>,
+    /// Replace an existing file of --truth
+    #[arg(long, requires = "truth")]
+    force: bool,
     /// Family of the sensors: lms (SICK LMS 2xx), ld (LDROBOT) or rplidar (Slamtec)
     #[arg(long, default_value = options::DEFAULT_FAMILY, value_name = "FAMILY")]
     family: String,
@@ -128,6 +131,7 @@ impl Simulate {
             seed: self.seed,
             faults: self.fault.parse()?,
             truth: self.truth.clone(),
+            force: self.force,
             family: options::parse_type(&self.scanner_type)?,
             variant: self.variant.as_deref().map(options::parse_variant).transpose()?,
             unit: self.unit.as_deref().map(options::parse_unit).transpose()?,

@@ -1,11 +1,9 @@
 //! `scanhub site` on the command line: the plan that `track` follows people in.
 
-use std::fs::File;
-use std::io::Write;
 use std::path::PathBuf;
 
 use clap::{Args, Subcommand};
-use schema::{Failure, Kind};
+use schema::{Failure, output};
 use serde::Serialize;
 
 use crate::{line, print};
@@ -22,9 +20,12 @@ enum Order {
     Check {
         /// The site file: sensors, rooms and doors
         file: PathBuf,
-        /// Draw the plan into this file, which must not exist
+        /// Draw the plan into this file
         #[arg(long, value_name = "OUT")]
         svg: Option<PathBuf>,
+        /// Replace an existing file of --svg
+        #[arg(long, requires = "svg")]
+        force: bool,
     },
 }
 
@@ -41,14 +42,10 @@ struct Checked {
 
 impl Site {
     pub(crate) fn run(&self, json: bool) -> Result<(), Failure> {
-        let Order::Check { file, svg } = &self.order;
+        let Order::Check { file, svg, force } = &self.order;
         let site = track::Site::read(file)?;
         if let Some(out) = svg {
-            let written = File::create_new(out).and_then(|mut file| file.write_all(site.svg().as_bytes()));
-            written.map_err(|error| {
-                let message = format!("{}: {error}", out.display());
-                Failure::new(Kind::Output, message, "name a new file in a folder that you may write to")
-            })?;
+            output::write(out, site.svg().as_bytes(), *force)?;
         }
         let watched = site.watched();
         let rooms: Vec<String> = site.rooms.iter().map(|room| room.name.clone()).collect();

@@ -1,10 +1,10 @@
 //! `scanhub web` on the command line.
 
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use clap::Args;
-use schema::Failure;
+use schema::{Failure, Kind, regular};
 use verbs::WebOptions;
 
 use super::{Everywhere, Limits};
@@ -18,11 +18,15 @@ pub(crate) struct Web {
     /// port is in use, the next free one
     #[arg(long, default_value = "127.0.0.1:8080", value_name = "ADDRESS:PORT", value_parser = listen_address)]
     listen: SocketAddr,
-    /// Word that page and viewers must know: it goes into the address, as ?token=WORD. It travels unencrypted
+    /// Word that page and viewers must know: it goes into the address, as ?token=WORD. It travels unencrypted, and other users
+    /// of this machine see it in the list of processes, unless it comes from the environment or --token-file
     #[arg(long, value_name = "WORD", env = "SCANHUB_WEB_TOKEN", hide_env_values = true, value_parser = word)]
     token: Option<String>,
+    /// File with the word of --token as its only line
+    #[arg(long, value_name = "FILE", conflicts_with = "token")]
+    token_file: Option<PathBuf>,
     /// Serve everyone who can reach the address, without a token
-    #[arg(long, conflicts_with = "token")]
+    #[arg(long, conflicts_with_all = ["token", "token_file"])]
     open: bool,
     /// Accept viewers that are served from this URL. Can be repeated
     #[arg(long = "allow-origin", value_name = "URL")]
@@ -70,13 +74,36 @@ fn word(text: &str) -> Result<String, String> {
     }
 }
 
+/// Returns the token in `file`.
+///
+/// # Errors
+///
+/// [`Kind::Input`] if it cannot be read, [`Kind::Configuration`] if it contains no token.
+fn read_token(file: &Path) -> Result<String, Failure> {
+    let place = file.display();
+    let text = regular::read_text(file, MAX_TOKEN_FILE).map_err(|error| {
+        let hint = "it must exist and be readable for this user";
+        Failure::new(Kind::Input, format!("cannot read {place}: {error}"), hint)
+    })?;
+    word(text.trim_end()).map_err(|expected| {
+        let hint = format!("one line with one word: {expected}");
+        Failure::new(Kind::Configuration, format!("{place} contains no token"), hint)
+    })
+}
+
+/// Maximum size of a file with a token, in bytes.
+const MAX_TOKEN_FILE: u64 = 4096;
+
 impl Web {
     pub(crate) fn options(&self, everywhere: &Everywhere) -> Result<WebOptions, Failure> {
         let name = rustix::system::uname().nodename().to_string_lossy().into_owned();
         Ok(WebOptions {
             sensors: self.sensors.clone(),
             listen: self.listen,
-            token: self.token.clone(),
+            token: self
+                .token_file
+                .as_deref()
+                .map_or(Ok(self.token.clone()), |file| read_token(file).map(Some))?,
             open: self.open,
             origins: self.origins.clone(),
             names: vec![name],

@@ -2,8 +2,7 @@
 //! by their hash, so a damaged telegram counts as lost.
 
 use std::collections::{HashMap, HashSet};
-use std::fs::File;
-use std::io::{Read, Write};
+use std::io::Write;
 use std::time::{Duration, Instant};
 
 use scanhub_drivers::features;
@@ -14,8 +13,6 @@ use sha2::{Digest, Sha256};
 /// Counts of all sensors.
 pub(crate) struct Account {
     pub(crate) sensors: Vec<Sensor>,
-    /// The pipe of each simulator, and the beginning of an unfinished line. Reading never blocks.
-    truths: Vec<(File, Vec<u8>)>,
     /// Telegrams whose last byte was sent after this time do not count, in nanoseconds of the monotonic clock.
     cut_ns: u64,
     cut_at: Option<Instant>,
@@ -102,7 +99,7 @@ struct Summary<'a> {
 }
 
 impl Account {
-    pub(crate) fn new(sensors: &[super::cast::Sensor], truths: Vec<File>) -> Self {
+    pub(crate) fn new(sensors: &[super::cast::Sensor]) -> Self {
         let sensors = sensors.iter().map(|sensor| Sensor {
             name: sensor.name.clone(),
             state: "absent".into(),
@@ -111,7 +108,6 @@ impl Account {
         });
         Account {
             sensors: sensors.collect(),
-            truths: truths.into_iter().map(|truth| (truth, Vec::new())).collect(),
             cut_ns: u64::MAX,
             cut_at: None,
             tilted: None,
@@ -171,31 +167,21 @@ impl Account {
         all_arrived || cut_at.elapsed() > limit.saturating_mul(6)
     }
 
-    /// Reads what the simulators have written since the last call.
-    pub(crate) fn read_truth(&mut self) {
-        for (truth, unfinished) in &mut self.truths {
-            // Returns an error when the pipe is empty, and keeps the bytes that were read before.
-            let _ = truth.read_to_end(unfinished);
-            let whole = unfinished.iter().rposition(|&byte| byte == b'\n').map_or(0, |end| end + 1);
-            let rest = unfinished.split_off(whole);
-            let lines = std::mem::replace(unfinished, rest);
-            for line in lines.split(|&byte| byte == b'\n').filter(|line| !line.is_empty()) {
-                let value: Value = serde_json::from_slice(line).unwrap_or_default();
-                let name = value["port"].as_str().and_then(|port| port.rsplit('/').next());
-                let of = self.sensors.iter_mut().find(|sensor| name == Some(sensor.name.as_str()));
-                let Some(sensor) = of else { continue };
-                if value["class"] == "simulated" {
-                    sensor.eeprom_writes = value["eeprom_writes"].as_u64().unwrap_or(u64::MAX);
-                } else if value["kind"] == "data" && value["fault"].is_null() {
-                    let sent_ns = value["sent_ns"].as_u64().unwrap_or_default();
-                    let hash = value["sha256"].as_str().unwrap_or_default();
-                    if sent_ns <= self.cut_ns {
-                        sensor.take_sent(hash);
-                    } else {
-                        sensor.is_past_cut |= sensor.early.contains_key(hash);
-                        sensor.after_cut.insert(hash.to_owned());
-                    }
-                }
+    /// Handles a line of a simulator: a telegram that it sent, or its summary.
+    pub(crate) fn take_sent(&mut self, line: &Value) {
+        let name = line["port"].as_str().and_then(|port| port.rsplit('/').next());
+        let of = self.sensors.iter_mut().find(|sensor| name == Some(sensor.name.as_str()));
+        let Some(sensor) = of else { return };
+        if line["class"] == "simulated" {
+            sensor.eeprom_writes = line["eeprom_writes"].as_u64().unwrap_or(u64::MAX);
+        } else if line["kind"] == "data" && line["fault"].is_null() {
+            let sent_ns = line["sent_ns"].as_u64().unwrap_or_default();
+            let hash = line["sha256"].as_str().unwrap_or_default();
+            if sent_ns <= self.cut_ns {
+                sensor.take_sent(hash);
+            } else {
+                sensor.is_past_cut |= sensor.early.contains_key(hash);
+                sensor.after_cut.insert(hash.to_owned());
             }
         }
     }
@@ -499,22 +485,19 @@ mod tests {
     fn a_loss_has_a_cause_and_a_later_telegram_ends_the_wait() {
         let hash =
             |bytes: &[u8]| Sha256::digest(bytes).iter().map(|byte| format!("{byte:02x}")).collect::<String>();
-        let path = std::env::temp_dir().join(format!("scanhub-account-{}", std::process::id()));
-        let line = |bytes: &[u8], sent_ns: u64| {
+        let sent = |bytes: &[u8], sent_ns: u64| {
             let port = "/x/front";
             serde_json::json!({ "port": port, "kind": "data", "fault": null, "sent_ns": sent_ns, "sha256": hash(bytes) })
-                .to_string()
-                + "\n"
         };
-        std::fs::write(&path, [line(b"a", 1), line(b"b", 2), line(b"c", u64::MAX)].concat()).unwrap();
         let sensor = Sensor { name: "front".into(), ..Sensor::default() };
-        let mut account = Account::new(&[], vec![File::open(&path).unwrap()]);
-        std::fs::remove_file(&path).unwrap();
+        let mut account = Account::new(&[]);
         account.sensors.push(sensor);
         let telegram = |data: &str| serde_json::json!({ "class": "telegram", "command": 0xB0, "data": data });
         account.take(0, &telegram("61"));
         account.cut();
-        account.read_truth();
+        for line in [sent(b"a", 1), sent(b"b", 2), sent(b"c", u64::MAX)] {
+            account.take_sent(&line);
+        }
         assert!(!account.is_complete(Duration::MAX) && account.is_complete(Duration::ZERO));
         let silent = "1 telegram was sent and not received: no later telegram of 1 sensor arrived";
         assert_eq!(account.loss().as_deref(), Some(silent));
@@ -540,7 +523,7 @@ mod tests {
 
     #[test]
     fn losses_on_the_line_count_from_the_first_telegram_on() {
-        let mut account = Account::new(&[], Vec::new());
+        let mut account = Account::new(&[]);
         account.sensors.push(Sensor { name: "front".into(), ..Sensor::default() });
         let status = |read: u64, damaged: u64, lost: Option<u64>| {
             let counters = serde_json::json!({ "bytes_read": read, "bytes_damaged": damaged });

@@ -1,9 +1,8 @@
 //! The processes of a demonstration: a hub, subscribers, a people tracker and simulators. They run in a temporary
 //! domain and directory.
 
-use std::fs::{File, OpenOptions};
+use std::fs::OpenOptions;
 use std::io::{self, BufRead, BufReader, Write};
-use std::os::unix::fs::OpenOptionsExt;
 use std::os::unix::process::CommandExt;
 use std::path::{Path, PathBuf};
 use std::process::{Child as Process, ChildStdout, Command, Stdio};
@@ -11,7 +10,6 @@ use std::sync::mpsc::{self, Sender};
 use std::thread;
 use std::time::{Duration, Instant};
 
-use rustix::fs::{CWD, FileType, Mode, OFlags, mknodat};
 use rustix::process::{Pid, Signal, kill_process};
 use schema::{Domain, Failure, Family, Kind};
 use serde_json::Value;
@@ -64,27 +62,6 @@ impl Stage {
     /// Returns the families of the sensors. Each family has one simulator.
     fn families(&self) -> impl Iterator<Item = Family> {
         Family::ALL.into_iter().filter(|family| self.sensors.iter().any(|sensor| sensor.family == *family))
-    }
-
-    fn truth(&self, family: Family) -> PathBuf {
-        self.directory.path().join(format!("truth-{}", family.name()))
-    }
-
-    /// Opens what the simulators write about sent telegrams: pipes instead of files, because a demonstration may run
-    /// for days.
-    pub(super) fn open_truths(&self) -> Result<Vec<File>, Failure> {
-        let open = |path: &PathBuf| -> io::Result<File> {
-            mknodat(CWD, path, FileType::Fifo, Mode::RUSR | Mode::WUSR, 0)?;
-            OpenOptions::new().read(true).custom_flags(OFlags::NONBLOCK.bits() as i32).open(path)
-        };
-        let pipes = self.families().map(|family| self.truth(family));
-        pipes
-            .map(|path| {
-                open(&path).map_err(|error| {
-                    Failure::new(Kind::Failed, format!("cannot make a pipe {}: {error}", path.display()), "")
-                })
-            })
-            .collect()
     }
 
     fn port(&self, sensor: &str) -> String {
@@ -152,8 +129,7 @@ impl Stage {
     fn start_simulator(&self, family: Family, seed: u64, lines: Sender<Line>) -> Result<Child, Failure> {
         let sensors = self.sensors.iter().filter(|sensor| sensor.family == family);
         let ports: Vec<_> = sensors.flat_map(|sensor| ["--port".into(), self.port(&sensor.name)]).collect();
-        let truth = self.truth(family).display().to_string();
-        let rest = ["--truth".into(), truth, "--seed".into(), seed.to_string(), "--json".into()];
+        let rest = ["--truth".into(), "-".into(), "--seed".into(), seed.to_string(), "--json".into()];
         let world = ["--world".into(), self.world.name().into(), "--family".into(), family.name().into()];
         let angles = if self.world == World::Tilt {
             vec!["--angles".to_owned(), MOUNT.to_owned()]

@@ -32,6 +32,10 @@ pub mod ipc;
 pub mod limits;
 #[cfg(feature = "ipc")]
 mod lock;
+#[cfg(feature = "output")]
+pub mod output;
+#[cfg(any(feature = "ipc", feature = "output"))]
+mod path_walk;
 #[cfg(feature = "files")]
 pub mod regular;
 #[cfg(feature = "ipc")]

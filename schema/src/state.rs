@@ -1,17 +1,15 @@
-//! What a domain keeps across restarts: small text files that are replaced as a whole, only for this user. A crash leaves
-//! the old file or the new one. The reader checks the content: it may come from another version, or be missing. Refuses to
-//! know what the files contain; losing them only costs time.
+//! Small text files that a domain keeps across restarts, only for this user. Each is replaced as a whole: a crash leaves the
+//! old file or the new one. The reader checks the content, which may come from another version or be missing. Losing a
+//! file only costs time.
 
-use std::ffi::OsString;
-use std::fs::{self, DirBuilder, File, OpenOptions};
-use std::io::{self, ErrorKind, Read, Write};
-use std::os::unix::fs::{DirBuilderExt, MetadataExt, OpenOptionsExt};
-use std::path::{Path, PathBuf};
-
-use rustix::fs::OFlags;
+use std::ffi::{OsStr, OsString};
+use std::fs::File;
+use std::io::{self, Read};
+use std::os::unix::fs::MetadataExt;
+use std::path::PathBuf;
 
 use crate::domain::first_path;
-use crate::{Failure, Kind};
+use crate::{Directory, Failure, Kind};
 
 /// The directory of a domain's files: `$STATE_DIRECTORY/DOMAIN`, else `$XDG_STATE_HOME/scanhub/DOMAIN`, else
 /// `~/.local/state/scanhub/DOMAIN`.
@@ -42,23 +40,29 @@ impl StateDirectory {
         self.path.join(name)
     }
 
+    /// Checks that the directory can be used, if it exists.
+    ///
+    /// # Errors
+    ///
+    /// [`Kind::Failed`] with owner and remedy. It, or the directory above it, belongs to another user or can be written to by
+    /// others. Or it is reached by a link that another user could have made.
+    pub fn check(&self) -> Result<(), Failure> {
+        self.open().map(drop)
+    }
+
     /// Returns what file `name` holds; `None` if there is none.
     ///
     /// # Errors
     ///
-    /// [`Kind::Failed`] if it cannot be read, is not a plain file of this user that nobody else can write, has more than
-    /// `most` bytes, or is not UTF-8.
+    /// Those of [`check`](Self::check), and [`Kind::Failed`] if the file cannot be read, is not a regular file of this user that
+    /// no other user can write, has more than `most` bytes, or is not UTF-8.
     pub fn read(&self, name: &str, most: u64) -> Result<Option<String>, Failure> {
-        let path = self.path(name);
-        match read(&path, most) {
-            Ok(text) => Ok(Some(text)),
-            Err(error) if matches!(error.kind(), ErrorKind::NotFound | ErrorKind::NotADirectory) => Ok(None),
-            Err(error) => Err(Failure::new(
-                Kind::Failed,
-                format!("cannot use {}: {error}", path.display()),
-                "delete it; its content is learned again",
-            )),
-        }
+        let Some(directory) = self.open()? else { return Ok(None) };
+        let Some(file) = directory.file(name)? else { return Ok(None) };
+        read(&file, most).map(Some).map_err(|error| {
+            let what = format!("cannot use {}: {error}", self.path(name).display());
+            Failure::new(Kind::Failed, what, "delete it; its content is learned again")
+        })
     }
 
     /// Replaces the content of file `name`, mode 0600, by `text`; creates the directory, mode 0700, if it does not exist.
@@ -66,71 +70,55 @@ impl StateDirectory {
     ///
     /// # Errors
     ///
-    /// [`Kind::Failed`] if that is not possible; then what the file held is still there.
+    /// Those of [`check`](Self::check), and [`Kind::Failed`] if it cannot be written; then what the file held is still there.
     pub fn write(&self, name: &str, text: &str) -> Result<(), Failure> {
-        self.replace(name, text).map_err(|error| self.unusable(name, &error))
+        self.make()?.replace(name, text.as_bytes()).map_err(unkept)
     }
 
     /// Waits until no other process is between reading and writing file `name`; they wait for us until what is returned is
-    /// dropped. Creates the directory as [`write`](Self::write) does, and beside the file one that is locked.
+    /// dropped. Creates the directory as [`write`](Self::write) does, and the file that is locked.
     ///
     /// # Errors
     ///
-    /// [`Kind::Failed`] if that is not possible.
+    /// Those of [`write`](Self::write).
     pub fn lock(&self, name: &str) -> Result<File, Failure> {
-        let lock = || {
-            self.make()?;
-            let mut options = OpenOptions::new();
-            let options = options.write(true).create(true).truncate(false).mode(0o600);
-            let file = options
-                .custom_flags((OFlags::NOFOLLOW | OFlags::NONBLOCK).bits() as i32)
-                .open(self.path(&format!("{name}.lock")))?;
-            file.lock().map(|()| file)
-        };
-        lock().map_err(|error| self.unusable(name, &error))
+        let name = format!("{name}.lock");
+        let file = self.make()?.file_or_new(&name).map_err(unkept)?;
+        let locked = file.lock().map(|()| file);
+        locked.map_err(|error| {
+            let what = format!("cannot lock {}: {error}", self.path(&name).display());
+            Failure::new(Kind::Failed, what, "the file system must have locks")
+        })
     }
 
     /// Removes file `name`, if it is there.
     ///
     /// # Errors
     ///
-    /// [`Kind::Failed`] if it stays.
+    /// Those of [`check`](Self::check), and [`Kind::Failed`] if it stays.
     pub fn remove(&self, name: &str) -> Result<(), Failure> {
-        let path = self.path(name);
-        match fs::remove_file(&path) {
-            Err(error) if !matches!(error.kind(), ErrorKind::NotFound | ErrorKind::NotADirectory) => {
-                let message = format!("{}: an old file stays: {error}", path.display());
-                Err(Failure::new(Kind::Failed, message, "remove the file"))
-            }
-            _ => Ok(()),
-        }
+        let Some(directory) = self.open()? else { return Ok(()) };
+        directory.try_remove(OsStr::new(name)).map_err(|error| {
+            let message = format!("{}: an old file stays: {error}", self.path(name).display());
+            Failure::new(Kind::Failed, message, "remove the file")
+        })
     }
 
-    fn make(&self) -> io::Result<()> {
-        DirBuilder::new().recursive(true).mode(0o700).create(&self.path)
+    fn open(&self) -> Result<Option<Directory>, Failure> {
+        Directory::open_state(&self.path, OWN)
     }
 
-    fn unusable(&self, name: &str, error: &io::Error) -> Failure {
-        let what = format!("cannot keep {}: {error}", self.path(name).display());
-        Failure::new(Kind::Failed, what, "set STATE_DIRECTORY or XDG_STATE_HOME to a directory of this user")
+    fn make(&self) -> Result<Directory, Failure> {
+        Directory::make_state(&self.path, OWN).map_err(unkept)
     }
+}
 
-    fn replace(&self, name: &str, text: &str) -> io::Result<()> {
-        self.make()?;
-        let beside = self.path(&format!("{name}.new"));
-        // One that a crash left may have another mode, or lead elsewhere.
-        match fs::remove_file(&beside) {
-            Err(error) if error.kind() != ErrorKind::NotFound => return Err(error),
-            _ => {}
-        }
-        let mut file = OpenOptions::new().write(true).create_new(true).mode(0o600).open(&beside)?;
-        let written = file.write_all(text.as_bytes()).and_then(|()| file.sync_data());
-        let renamed = written.and_then(|()| fs::rename(&beside, self.path(name)));
-        if renamed.is_err() {
-            let _ = fs::remove_file(&beside);
-        }
-        renamed
-    }
+/// The directory of the domain, and the one of all domains above it.
+const OWN: usize = 2;
+
+/// Says that something cannot be kept.
+fn unkept(failure: Failure) -> Failure {
+    Failure { message: format!("cannot keep {}", failure.message), ..failure }
 }
 
 fn base_in(variable: impl Fn(&str) -> Option<OsString>) -> Option<PathBuf> {
@@ -139,11 +127,8 @@ fn base_in(variable: impl Fn(&str) -> Option<OsString>) -> Option<PathBuf> {
     path("STATE_DIRECTORY").or_else(|| Some(user()?.join("scanhub")))
 }
 
-fn read(path: &Path, most: u64) -> io::Result<String> {
-    // A FIFO would be waited for.
-    let flags = (OFlags::NOFOLLOW | OFlags::NONBLOCK).bits() as i32;
-    let file = OpenOptions::new().read(true).custom_flags(flags).open(path)?;
-    check(&file)?;
+fn read(file: &File, most: u64) -> io::Result<String> {
+    check(file)?;
     let mut text = String::new();
     let len = file.take(most + 1).read_to_string(&mut text)?;
     if len as u64 > most { Err(refused(format!("it has more than {most} bytes"))) } else { Ok(text) }
@@ -152,25 +137,25 @@ fn read(path: &Path, most: u64) -> io::Result<String> {
 fn check(file: &File) -> io::Result<()> {
     let metadata = file.metadata()?;
     let (owner, mode) = (metadata.uid(), metadata.mode() & 0o7777);
-    if !metadata.is_file() {
-        return Err(refused("it is no file".into()));
-    }
-    if owner != rustix::process::geteuid().as_raw() || mode & 0o022 != 0 {
+    if mode & 0o022 != 0 {
         return Err(refused(format!("others can write it: owner {owner}, mode {mode:04o}")));
     }
     Ok(())
 }
 
 fn refused(what: String) -> io::Error {
-    io::Error::new(ErrorKind::InvalidData, what)
+    io::Error::new(io::ErrorKind::InvalidData, what)
 }
 
 #[cfg(test)]
 mod tests {
+    use std::fs;
+    use std::os::unix::fs::{PermissionsExt, symlink};
+    use std::path::Path;
+
     use tempfile::TempDir;
 
     use super::*;
-    use std::os::unix::fs::{PermissionsExt, symlink};
 
     /// Path of a directory that does not exist yet, below a temporary one.
     struct Place(PathBuf, #[expect(dead_code, reason = "it is removed when it is dropped")] TempDir);
@@ -233,16 +218,16 @@ mod tests {
         let refused = |state: &StateDirectory, name, says: &str| {
             let failure = state.read(name, 5).unwrap_err();
             assert!(failure.message.contains(says) && failure.message.contains("/a/"), "{failure}");
-            assert!(failure.hint.contains("delete it"), "{failure}");
+            assert!(failure.hint.contains("delete it") || failure.hint.contains("remove it"), "{failure}");
         };
         fs::write(state.path("long"), "123456").unwrap();
         refused(&state, "long", "more than 5 bytes");
         fs::write(state.path("binary"), [0xff]).unwrap();
         refused(&state, "binary", "UTF-8");
         symlink(state.path("f"), state.path("link")).unwrap();
-        refused(&state, "link", "");
+        refused(&state, "link", "is a link");
         fs::create_dir(state.path("directory")).unwrap();
-        refused(&state, "directory", "no file");
+        refused(&state, "directory", "no regular file");
         fs::set_permissions(state.path("f"), fs::Permissions::from_mode(0o620)).unwrap();
         refused(&state, "f", "mode 0620");
         drop(place);
@@ -251,9 +236,9 @@ mod tests {
     #[test]
     fn where_nothing_can_be_written_the_remedy_is_told() {
         let state = StateDirectory::at("/dev/null/x");
-        assert_eq!(state.read("f", 9), Ok(None));
-        let failure = state.write("f", "text").unwrap_err();
-        assert!(failure.message.contains("/dev/null/x/f"), "{failure}");
+        let failures = [state.read("f", 9).map(drop).unwrap_err(), state.write("f", "text").unwrap_err()];
+        let [_, failure] = failures;
+        assert!(failure.message.contains("cannot keep /dev/null"), "{failure}");
         assert!(failure.hint.contains("STATE_DIRECTORY"), "{failure}");
     }
 

@@ -257,7 +257,7 @@ fn what_cannot_be_is_refused() {
             command.env("XDG_STATE_HOME", "/dev/null").env_remove("STATE_DIRECTORY");
             Program::start(command).wait()
         };
-        assert_eq!(unwritable.code, Some(78), "{unwritable}");
+        assert_eq!(unwritable.code, Some(73), "{unwritable}");
         // What the configuration says counts, and a flag wins over it.
         let said = config("[gateway]\ninterface = \"eth8\"\ntopics = [\"front/status\"]\nmtu = 1400\n");
         let mut gateway = env.gateway_at(&["--interface=lo", &said]);

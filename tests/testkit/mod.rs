@@ -201,7 +201,7 @@ impl TestEnv {
         let truth = format!("--truth={}", self.word("truth"));
         let has_faults = flags.iter().any(|flag| flag.as_ref().starts_with("--fault"));
         let soon: &[&str] = if has_faults { &[] } else { &[QUICK_ANSWERS] };
-        let words = with(&with(&["simulate", "--json", &truth], soon), &with(&ports, flags));
+        let words = with(&with(&["simulate", "--json", &truth, "--force"], soon), &with(&ports, flags));
         self.start(&words).ready()
     }
 

@@ -1,22 +1,23 @@
 //! `scanhub background`: shows, resets, freezes, thaws, saves and loads the background model of a sensor. Files are
 //! handled here; the hub gets models only.
 
-use std::io::{Read, Write};
+use std::io::{self, Read, Write};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
 use std::time::{Duration, SystemTime};
 
 use scanhub_client::request;
+use schema::output::{self, Target};
 use schema::{
     Age, Background, BackgroundHead, Domain, Failure, Kind, Request, SavedModel, Shown, Verb, as_json,
-    check_sensor,
+    check_sensor, regular,
 };
 use serde::Serialize;
 
 use crate::control::done;
 use crate::names::as_word;
 use crate::output::{Output, quiet};
-use crate::{file, json, text};
+use crate::{json, text};
 
 /// What `background` is asked for.
 #[derive(Clone, Debug)]
@@ -107,19 +108,13 @@ pub fn background(
             })
         }
         ModelOrder::Save { file, force } => {
-            check(file, *force)?;
+            if file != Path::new(STANDARD) {
+                Target::open(file)?.check(*force)?;
+            }
             let Shown { model, .. } = shown(sensor, ask(Verb::Show)?)?;
-            save(file, sensor, &model, *json, &mut output)
+            save(file, *force, sensor, &model, *json, &mut output)
         }
     }
-}
-
-/// Whether there may be a file made at `path`; what is there may be replaced if `force`.
-fn check(path: &Path, force: bool) -> Result<(), Failure> {
-    if force || path == Path::new(STANDARD) || !path.is_file() {
-        return Ok(());
-    }
-    Err(Failure::new(Kind::Output, format!("{} exists", path.display()), "--force replaces it"))
 }
 
 /// What is shown: a model, and when it was kept for the next hub.
@@ -143,13 +138,15 @@ fn shown(sensor: &str, shown: Option<Shown>) -> Result<Shown, Failure> {
     })
 }
 
-/// Writes `model` to `file`, and to `output` that it was; to `output` alone if that is the file.
+/// Writes `model` to `file`, which may replace an existing file if `force`, and reports it to `printed`. Standard output as
+/// `file` is `printed` itself.
 fn save(
     file: &Path,
+    force: bool,
     sensor: &str,
     model: &Background,
     json: bool,
-    output: &mut Output<'_>,
+    printed: &mut Output<'_>,
 ) -> Result<(), Failure> {
     if model.count == 0 {
         let hint = format!("a scan must arrive first: `scanhub info {sensor}` shows its state");
@@ -167,17 +164,17 @@ fn save(
     }
     let object = as_json(sensor, model);
     if file == Path::new(STANDARD) {
-        return quiet(output.json(&object));
+        return quiet(printed.json(&object));
     }
     let mut content = serde_json::to_vec(&object)
         .map_err(|error| Failure::new(Kind::Failed, format!("the model is no JSON: {error}"), ""))?;
     content.push(b'\n');
-    file::replace(file, &content)?;
+    output::write(file, &content, force)?;
     let (BackgroundHead { taught, count, generation, .. }, place) = (**model, file.display());
     quiet(if json {
-        output.json(&Saved { class: "saved", sensor, file: place.to_string(), generation, taught, count })
+        printed.json(&Saved { class: "saved", sensor, file: place.to_string(), generation, taught, count })
     } else {
-        output.line(|line| write!(line, "{sensor}: {taught} of {count} beams saved to {place}"))
+        printed.line(|line| write!(line, "{sensor}: {taught} of {count} beams saved to {place}"))
     })
 }
 
@@ -203,9 +200,10 @@ pub fn saved_model(
     input: &mut dyn Read,
 ) -> Result<Box<Background>, Failure> {
     let (text, place) = if file == Path::new(STANDARD) {
-        (file::read_all(input, "stdin", LONGEST)?, "stdin".to_owned())
+        (regular::read_all(input, LONGEST).map_err(|error| unreadable("stdin", &error))?, "stdin".to_owned())
     } else {
-        (file::read(file, LONGEST)?, file.display().to_string())
+        let place = file.display().to_string();
+        (regular::read(file, LONGEST).map_err(|error| unreadable(&place, &error))?, place)
     };
     let saved = SavedModel::parse(&text, &place)?;
     if saved.sensor == sensor || any_sensor {
@@ -213,6 +211,11 @@ pub fn saved_model(
     }
     let message = format!("{place} is the background of {}, not of {sensor}", saved.sensor);
     Err(Failure::new(Kind::Configuration, message, "--any-sensor accepts it anyway"))
+}
+
+fn unreadable(place: &str, error: &io::Error) -> Failure {
+    let hint = "it must exist and be readable for this user";
+    Failure::new(Kind::Input, format!("cannot read {place}: {error}"), hint)
 }
 
 /// The file that is stdin or stdout.

@@ -1,21 +1,23 @@
-//! The file with the key that gateways and listeners share: made here, and read only if nobody else can read it. Refuses to
-//! know what the key is for.
+//! The file with the key that gateways and listeners share. It is created here, and read only if no other user can read it.
 
-use std::fs::{File, OpenOptions};
-use std::io::{ErrorKind, Read, Write};
-use std::os::unix::fs::{MetadataExt, OpenOptionsExt};
+use std::fs::File;
+use std::io::Write;
+use std::os::unix::fs::MetadataExt;
 use std::path::Path;
 
 use lan::Key;
 use rustix::rand::{GetRandomFlags, getrandom};
+use schema::output::{PRIVATE, Target, unwritable};
 use schema::{Failure, Kind, regular};
 use serde_json::json;
 
 use crate::output::{Output, quiet};
 
-/// Makes the file at `path` with a new random key, for this user only, and tells its name to `out`.
+/// Creates the file at `path` with a new random key, for this user only, and prints the key's name to `out`.
 ///
-/// [`Kind::Output`] if there is a file already, or none can be made.
+/// # Errors
+///
+/// [`Kind::Output`] if there is a file already, or if it cannot be written.
 pub fn new_key(path: &Path, json: bool, out: &mut dyn Write) -> Result<(), Failure> {
     let mut bytes = [0; Key::LEN];
     let filled = getrandom(&mut bytes, GetRandomFlags::empty());
@@ -23,20 +25,12 @@ pub fn new_key(path: &Path, json: bool, out: &mut dyn Write) -> Result<(), Failu
         return Err(Failure::new(Kind::Failed, "the system gives no random bytes", "try again"));
     }
     let text: String = bytes.iter().map(|byte| format!("{byte:02x}")).chain(["\n".into()]).collect();
-    let write = || {
-        let mut file = OpenOptions::new().write(true).create_new(true).mode(0o600).open(path)?;
-        file.write_all(text.as_bytes())?;
-        file.sync_all()
-    };
-    write().map_err(|error: std::io::Error| {
-        let hint = match error.kind() {
-            ErrorKind::AlreadyExists => {
-                "give another name, or remove the file if nobody uses its key any more"
-            }
-            _ => "the directory must exist and be writable",
-        };
-        Failure::new(Kind::Output, format!("cannot make {}: {error}", path.display()), hint)
-    })?;
+    let target = Target::open(path)?;
+    // No option replaces a key: other machines may have it.
+    target.check(false).map_err(|failure| Failure { hint: KEY_EXISTS.to_owned(), ..failure })?;
+    let mut file = target.create_new(false, PRIVATE)?;
+    let written = file.write_all(text.as_bytes()).and_then(|()| file.sync_all());
+    written.map_err(|error| unwritable(path, &error))?;
     let (path, name) = (path.display().to_string(), Key::new(&bytes).name());
     let mut out = Output::new(out);
     quiet(match json {
@@ -50,15 +44,19 @@ pub fn new_key(path: &Path, json: bool, out: &mut dyn Write) -> Result<(), Failu
     })
 }
 
-/// The key in the file at `path`: 32 bytes, or 64 hex digits.
+/// Returns the key in the file at `path`: 32 bytes, or 64 hex digits.
 ///
-/// [`Kind::Configuration`] if it cannot be read, is another user's, can be read or written by anybody else, or holds no key.
+/// # Errors
+///
+/// [`Kind::Input`] if it cannot be read or is not a regular file, [`Kind::Configuration`] if it belongs to another user, can
+/// be read or written by others, or contains no key.
 pub(crate) fn read(path: &Path) -> Result<Key, Failure> {
     let refuse = |what: String, hint: &str| {
         Failure::new(Kind::Configuration, format!("key file {}: {what}", path.display()), hint)
     };
     let unreadable = |error: std::io::Error| {
-        refuse(error.to_string(), "`scanhub key new FILE` makes one; this user must be able to read it")
+        let hint = "`scanhub key new FILE` makes one; this user must be able to read it";
+        Failure::new(Kind::Input, format!("key file {}: {error}", path.display()), hint)
     };
     let mut file: File = regular::open(path).map_err(unreadable)?;
     let about = file.metadata().map_err(unreadable)?;
@@ -71,8 +69,7 @@ pub(crate) fn read(path: &Path) -> Result<Key, Failure> {
         let what = format!("its mode is {mode:04o}, so others can use the key");
         return Err(refuse(what, "`chmod 600` it; if others may have read it, make a new one"));
     }
-    let mut bytes = Vec::new();
-    (&mut file).take(LONGEST).read_to_end(&mut bytes).map_err(unreadable)?;
+    let bytes = regular::read_all(&mut file, LONGEST).map_err(unreadable)?;
     let key = parse(&bytes).ok_or_else(|| {
         refuse(
             format!("its {} bytes are no key", about.len()),
@@ -92,6 +89,8 @@ fn parse(bytes: &[u8]) -> Option<[u8; Key::LEN]> {
     pairs.iter().map(byte).collect::<Option<Vec<u8>>>().filter(|_| is_hex)?.try_into().ok()
 }
 
+/// Remedy for a file that is not replaced.
+const KEY_EXISTS: &str = "name another file, or remove this one if no gateway uses its key any more";
 /// More than any form of a key has.
 const LONGEST: u64 = 256;
 

@@ -9,7 +9,6 @@ mod control;
 mod discovery;
 pub mod duration;
 mod echo;
-mod file;
 mod follow;
 mod forward;
 mod gateway;

@@ -25,6 +25,7 @@ use std::time::{Duration, Instant};
 use scanhub_client::clock;
 use scanhub_client::streams::Sample;
 use schema::file::Compression;
+use schema::output::Target;
 use schema::{Domain, Failure, Header, Kind};
 
 use crate::follow::{Bounds, Notice, Sink, follow};
@@ -156,7 +157,11 @@ fn begin(options: &RecordOptions, queue: &Arc<Queue>) -> Result<Disk, End> {
         }
         true => Err(File::from(io::stdout().as_fd().try_clone_to_owned().map_err(failed)?)),
         false => {
-            output_error::check(path, options.force)?;
+            let target = Target::open(path)?;
+            // The files of a split run have names of their own.
+            if options.split.is_none() {
+                target.check(options.force)?;
+            }
             let run = wall_ns.to_string();
             Ok(Files::new(path, options.split.is_some(), options.force, options.keep, &run))
         }

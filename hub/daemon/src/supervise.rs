@@ -103,8 +103,14 @@ pub(crate) fn serve(
     preflight::raise_descriptor_limit();
     let signals = Signals::of_process()?;
     let lock = HubLock::acquire(domain.root())?;
-    // What is known of sensors is no recording's.
-    let state = StateDirectory::of_domain(domain.name()).filter(|_| set.is_none());
+    // A replay does not use the saved state of sensors.
+    let state = StateDirectory::of_domain(domain.name()).filter(|_| set.is_none()).filter(|state| {
+        let checked = state.check();
+        if let Err(Failure { message, hint, .. }) = &checked {
+            tracing::warn!("nothing is kept across restarts: {message}; {hint}");
+        }
+        checked.is_ok()
+    });
     preflight::check_descriptors(config.links.len())?;
     preflight::check_memory(&config.topic_limits()).map_err(|failure| config.with_remedy(failure))?;
     // Ends after the links: it writes what they had learned last.

@@ -7,17 +7,18 @@ mod scans;
 mod views;
 
 use std::cell::Cell;
-use std::io::{self, Write};
+use std::io::{self, BufWriter, Write};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use scanhub_drivers::lms::variant::{Baud, Mode, Unit};
 use schema::csv::{MarkColumns, ScanColumns};
 use schema::file::{Compression, Writer};
+use schema::output::unwritable;
 use schema::{Failure, Family, Flags, Header, Kind, Topic, check_followed};
 
 use crate::{Damage, Encoding, Form, Frame, Recording, Unread, carmen};
-use output::{Packing, Place, unwritable};
+use output::{Output, Packing};
 use scans::{Sight, Times};
 use views::{Csv, Ros2, View, write_marks};
 
@@ -116,7 +117,7 @@ pub fn convert(
 ) -> Result<Converted, Failure> {
     let (target, chosen) = target_of(options)?;
     let whole = Recording::open_as(&options.input, options.family)?;
-    let place = Place::check(&options.output, &options.input, options.force)?;
+    let output = Output::create(&options.output, &options.input, options.force)?;
     let recording = match chosen {
         Some(sensor) if whole.contents().form == Form::Mcap => whole.of(sensor)?,
         Some(sensor) => {
@@ -149,10 +150,10 @@ pub fn convert(
         // Fails before anything is written if the file has several sensors and none was chosen.
         drop(recording.telegrams(encoding)?);
     }
-    let mut file = place.create()?;
+    let mut file = BufWriter::with_capacity(BUFFER, output);
     let is_closed = Cell::new(false);
     let failed = |error: io::Error| {
-        is_closed.set(place.is_closed(&error));
+        is_closed.set(Output::is_closed(&options.output, &error));
         unwritable(&options.output, &error)
     };
     let mut first_ns = None;
@@ -207,12 +208,16 @@ pub fn convert(
             write_bytes(&recording, form, encoding, out, &mut count, &failed)
         }
     };
-    match written {
+    let flushed = written.and_then(|()| file.flush().map_err(&failed));
+    match flushed.and_then(|()| file.into_inner().map_err(|error| failed(error.into_error()))) {
         Err(_) if is_closed.get() => Ok(Converted { is_closed: true, ..converted }),
         Err(failure) => Err(failure),
-        Ok(()) => place.put(file).map(|is_whole| Converted { is_closed: !is_whole, ..converted }),
+        Ok(output) => output.commit().map(|()| converted),
     }
 }
+
+/// Size of the buffer before the output, in bytes.
+const BUFFER: usize = 1 << 20;
 
 /// What became of a telegram.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

@@ -63,6 +63,8 @@ pub struct SimulateOptions {
     pub faults: Faults,
     /// File for the truth.
     pub truth: Option<PathBuf>,
+    /// Whether an existing file for the truth is replaced.
+    pub force: bool,
     /// What the sensor calls itself, which decides what it cannot do.
     pub family: Family,
     /// Angle and resolution; `None`: those of the recording, else the type's.
@@ -127,6 +129,7 @@ impl Default for SimulateOptions {
             seed: 0,
             faults: Faults::default(),
             truth: None,
+            force: false,
             family: Family::Lms200,
             variant: None,
             unit: None,

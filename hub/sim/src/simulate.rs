@@ -59,7 +59,7 @@ pub fn simulate_with(
     let recording = options.replay.as_ref().filter(|_| options.scanner.is_none());
     // The ports are LMS, so the bytes of a stream file are theirs.
     let recording = recording.map(|path| Recording::open_as(path, Some(Family::Lms))).transpose()?;
-    let truth = options.truth.as_deref().map(Truth::create).transpose()?;
+    let truth = options.truth.as_deref().map(|path| Truth::create(path, options.force)).transpose()?;
     let tell = |record: &Record| {
         tell(record);
         truth.as_ref().map_or(Ok(()), |truth| truth.write(&record.line()))

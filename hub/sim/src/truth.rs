@@ -1,11 +1,12 @@
-//! What was really sent: one record per telegram and one per port at the end, as lines for a file. Knows neither the
-//! sensor nor the port; the hub never sees any of it.
+//! What was really sent: one record per telegram and one per port at the end, as lines in a file or on stdout. The hub never
+//! sees any of it.
 
 use std::fs::File;
-use std::io::Write;
+use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 use std::sync::Mutex;
 
+use schema::output::{self, Target};
 use schema::{Failure, Kind};
 use serde_json::json;
 use sha2::{Digest, Sha256};
@@ -70,35 +71,51 @@ impl Summary {
     }
 }
 
-/// A file of lines that several ports write to, one write per line.
+/// Lines that several ports write, one write per line.
 #[derive(Debug)]
 pub struct Truth {
     path: PathBuf,
-    file: Mutex<File>,
+    /// `None` for stdout.
+    file: Option<Mutex<File>>,
 }
 
 impl Truth {
-    /// Makes or empties the file at `path`; [`Kind::Output`] if that cannot be.
-    pub fn create(path: &Path) -> Result<Self, Failure> {
-        let file = File::create(path).map_err(|error| failure(Kind::Output, path, &error))?;
-        Ok(Truth { path: path.to_owned(), file: Mutex::new(file) })
+    /// Creates the file at `path`, which replaces an existing one if `force`. `-` is stdout.
+    ///
+    /// # Errors
+    ///
+    /// As [`Target::create_new`].
+    pub fn create(path: &Path, force: bool) -> Result<Self, Failure> {
+        let is_stdout = path == Path::new("-");
+        let file =
+            if is_stdout { None } else { Some(Target::open(path)?.create_new(force, output::PUBLIC)?) };
+        Ok(Truth { path: path.to_owned(), file: file.map(Mutex::new) })
     }
 
     /// Appends `line`.
+    ///
+    /// # Errors
+    ///
+    /// [`Kind::Failed`] if it cannot be written.
     pub fn write(&self, line: &str) -> Result<(), Failure> {
-        // A thread that panicked with the lock wrote its line or not: either way the next one begins a new line.
-        let mut file = self.file.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
-        file.write_all(format!("{line}\n").as_bytes())
-            .map_err(|error| failure(Kind::Failed, &self.path, &error))
+        let line = format!("{line}\n");
+        let written = match &self.file {
+            // A thread that panicked with the lock wrote its line or not: either way the next one begins a new line.
+            Some(file) => {
+                file.lock().unwrap_or_else(std::sync::PoisonError::into_inner).write_all(line.as_bytes())
+            }
+            None => {
+                let mut stdout = io::stdout().lock();
+                stdout.write_all(line.as_bytes()).and_then(|()| stdout.flush())
+            }
+        };
+        written.map_err(|error| failure(&self.path, &error))
     }
 }
 
-fn failure(kind: Kind, path: &Path, error: &std::io::Error) -> Failure {
-    Failure::new(
-        kind,
-        format!("cannot write the truth to {}: {error}", path.display()),
-        "give a path in a directory that exists and is writable",
-    )
+fn failure(path: &Path, error: &io::Error) -> Failure {
+    let what = format!("cannot write the truth to {}: {error}", path.display());
+    Failure::new(Kind::Failed, what, "the disk must have space, and the reader of stdout must stay")
 }
 
 #[cfg(test)]

@@ -4,12 +4,11 @@ mod find;
 mod input;
 mod show;
 
-use std::fs::File;
 use std::io::{self, ErrorKind, Read, Write};
 use std::path::{Path, PathBuf};
 
 use scanhub_drivers::lms::variant::Mode;
-use schema::{Failure, Kind};
+use schema::{Failure, Kind, regular};
 
 use find::Finder;
 use input::{Input, is_framed, open_recording};
@@ -43,7 +42,7 @@ pub fn decode(options: &DecodeOptions, out: &mut dyn Write) -> Result<(), Failur
         (Some(path), sensor) if sensor.is_some() || is_framed(path) => {
             open_recording(path, sensor.as_deref())?
         }
-        (Some(path), _) => (Box::new(File::open(path).map_err(|error| unreadable(&name, &error))?), None),
+        (Some(path), _) => (Box::new(regular::open(path).map_err(|error| unreadable(&name, &error))?), None),
         (None, None) => (Box::new(io::stdin()), None),
         (None, Some(_)) => {
             let hint = "for example `scanhub telegram decode walk.mcap --sensor front`";

@@ -19,8 +19,8 @@ use std::sync::atomic::{AtomicU32, Ordering};
 use rustix::fs::{CWD, RenameFlags, renameat_with};
 use rustix::io::Errno;
 
-use crate::directory::named;
 use crate::lock::MakingLock;
+use crate::path_walk::named;
 use crate::shortage::{SHARED_MEMORY, memory};
 use crate::{Directory, Failure, Kind, shortage};
 

@@ -2,6 +2,8 @@
 
 use std::fmt::Write;
 
+use schema::Printable;
+
 use super::{Room, Site};
 use crate::geometry::{Point, middle};
 
@@ -28,7 +30,9 @@ impl Site {
         );
         let text = |svg: &mut String, point: Point, down: f64, colour: &str, words: &str| {
             let (x, y) = at(point);
-            let words = words.replace('&', "&amp;").replace('<', "&lt;");
+            // XML has no control characters, not even escaped ones.
+            let words = Printable(words).to_string().replace(['\n', '\u{FFFE}', '\u{FFFF}'], "?");
+            let words = words.replace('&', "&amp;").replace('<', "&lt;").replace('>', "&gt;");
             let _ = writeln!(
                 svg,
                 "<text x=\"{x:.1}\" y=\"{:.1}\" text-anchor=\"middle\" fill=\"{colour}\">{words}</text>",

@@ -1,13 +1,13 @@
 //! Who a gateway is: a random number that it keeps from one start to the next, and the number of this life, greater than
 //! those before. Two gateways at once are two, also those of one hub. Refuses to know what is sent under them.
 
-use std::fs::{DirBuilder, File};
+use std::fs::{File, Permissions};
 use std::hash::{BuildHasher, RandomState};
 use std::io;
-use std::os::unix::fs::{DirBuilderExt, FileExt};
+use std::os::unix::fs::{FileExt, PermissionsExt};
 use std::path::{Path, PathBuf};
 
-use schema::{Failure, Kind, StateDirectory};
+use schema::{Directory, Failure, Kind, StateDirectory};
 
 /// One life of a gateway. Nobody else has its number as long as this value is there.
 #[derive(Debug)]
@@ -27,7 +27,10 @@ impl Life {
     /// there is one already: kept in a file in `directory`, which is made if it is not there. `now_s` is seconds since 1970.
     /// What was kept on another `machine` than this one is another gateway's; where that is not known, it is not asked.
     ///
-    /// [`Kind::Configuration`] if the file cannot be written: then listeners could not tell this life from the last one.
+    /// # Errors
+    ///
+    /// [`Kind::Output`] if the file cannot be written: then listeners could not distinguish this life from the last one.
+    /// [`Kind::Configuration`] if there are too many.
     pub(super) fn begin(
         directory: &Path,
         domain: &str,
@@ -35,23 +38,22 @@ impl Life {
         now_s: u64,
         machine: Option<u64>,
     ) -> Result<Life, Failure> {
-        let unusable = |path: &Path, error: &io::Error| {
-            let what = format!("cannot keep the gateway's number in {}: {error}", path.display());
-            Failure::new(Kind::Configuration, what, "set XDG_STATE_HOME to a directory that can be written")
+        let unkept = |failure: Failure| {
+            let message = format!("cannot keep the gateway's number: {}", failure.message);
+            Failure { kind: Kind::Output, message, ..failure }
         };
-        DirBuilder::new()
-            .recursive(true)
-            .mode(0o700)
-            .create(directory)
-            .map_err(|error| unusable(directory, &error))?;
+        let place = Directory::make_state(directory, 1).map_err(unkept)?;
         for number in 1..=MOST {
-            let path = directory.join(format!("gateway-{domain}-{interface}-{number}"));
-            let file = File::options().read(true).write(true).create(true).truncate(false).open(&path);
-            let file = file.map_err(|error| unusable(&path, &error))?;
+            let name = format!("gateway-{domain}-{interface}-{number}");
+            let file = place.file_or_new(&name).map_err(unkept)?;
+            let unusable = |error: io::Error| {
+                let what = format!("{}: {error}", directory.join(&name).display());
+                unkept(Failure::new(Kind::Output, what, "the file system must have locks and free space"))
+            };
             match file.try_lock() {
-                Ok(()) => return Life::of(file, now_s, machine).map_err(|error| unusable(&path, &error)),
+                Ok(()) => return Life::of(file, now_s, machine).map_err(unusable),
                 Err(std::fs::TryLockError::WouldBlock) => {}
-                Err(std::fs::TryLockError::Error(error)) => return Err(unusable(&path, &error)),
+                Err(std::fs::TryLockError::Error(error)) => return Err(unusable(error)),
             }
         }
         let what = format!("{MOST} gateways of domain {domain} are on {interface} already");
@@ -72,6 +74,8 @@ impl Life {
         let kept =
             last.unwrap_or_else(|| Kept { hub: RandomState::new().hash_one(now_s), epoch: now, machine });
         let line = kept.line();
+        // Earlier versions let others read it.
+        file.set_permissions(Permissions::from_mode(0o600))?;
         file.write_all_at(line.as_bytes(), 0)?;
         file.set_len(line.len() as u64)?;
         file.sync_data()?;
@@ -195,7 +199,7 @@ mod tests {
     #[test]
     fn a_place_that_cannot_be_written_is_refused() {
         let refused = Life::begin(Path::new("/dev/null/x"), "d", "eth0", 1, None).unwrap_err();
-        assert_eq!(refused.kind, Kind::Configuration);
-        assert!(refused.message.contains("/dev/null/x"), "{refused}");
+        assert_eq!(refused.kind, Kind::Output);
+        assert!(refused.message.contains("number: /dev/null: "), "{refused}");
     }
 }

@@ -11,6 +11,7 @@ use std::time::Duration;
 
 use rustix::fs::OFlags;
 use schema::file::MAGIC;
+use schema::output::Target;
 
 use super::lock;
 use crate::duration;
@@ -239,26 +240,17 @@ fn head(path: &Path) -> io::Result<(File, Vec<u8>, Option<bool>)> {
     Ok((file, head, is_taken))
 }
 
-/// Opens a file that no other run writes, empty.
+/// Opens the file at `path`, which no other run writes, and empties it.
 fn open(path: &Path, overwrites: bool) -> io::Result<File> {
-    let mut options = File::options();
-    options.write(true);
-    match overwrites {
-        // Emptied when it is known that nobody writes it.
-        true => options.create(true).truncate(false),
-        false => options.create_new(true),
-    };
-    let mut file = options.open(path)?;
-    if !file.metadata()?.is_file() {
-        return Ok(file);
-    }
+    let target = Target::open(path).map_err(|failure| io::Error::other(failure.message))?;
+    let mut file = target.create(overwrites)?;
     lock::take(&file)?;
     // Another run may remove it as an old file between the open and the lock.
     for _ in 0..TRIES {
         if is_at(&file, path) {
             break;
         }
-        file = options.open(path)?;
+        file = target.create(overwrites)?;
         lock::take(&file)?;
     }
     file.set_len(0)?;

@@ -1,32 +1,9 @@
-//! Why a path cannot hold a recording, and what helps. Refuses to open anything.
+//! Why a recording cannot be written, and what helps.
 
-use std::fs;
 use std::io::{self, ErrorKind};
-use std::os::unix::fs::FileTypeExt;
 use std::path::Path;
 
 use schema::{Failure, Kind};
-
-/// The file at `path` cannot hold a recording, whatever its permissions; `force` accepts a device all the same.
-///
-/// [`Kind::Output`] with what would be one.
-pub(super) fn check(path: &Path, force: bool) -> Result<(), Failure> {
-    let Ok(place) = fs::metadata(path).map(|place| place.file_type()) else { return Ok(()) };
-    let shown = path.display();
-    let (what, hint) = if place.is_dir() {
-        ("directory", format!("name a file in it: -o {}", path.join("walk.mcap").display()))
-    } else if place.is_fifo() {
-        // Opening one waits for its reader, and nobody could end that.
-        ("pipe", format!("the shell opens it: scanhub record -o - > {shown}"))
-    } else if place.is_socket() {
-        ("socket", "-o FILE names a file".to_owned())
-    } else if (place.is_char_device() || place.is_block_device()) && !force {
-        ("device", "-o FILE names a file; --force overwrites the content of the device".to_owned())
-    } else {
-        return Ok(());
-    };
-    Err(Failure::new(Kind::Output, format!("cannot record into {shown}: it is a {what}"), hint))
-}
 
 /// What kind of failure it is that `error` comes of a write: of a disk that is full, or may not be filled any further,
 /// there may be more later.

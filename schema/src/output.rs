@@ -1,0 +1,408 @@
+//! Files that a user names as output. Other users of the machine may write to the same directory, so every verb creates its
+//! files here.
+//!
+//! A file that is written at once is complete or absent: [`OutputFile`] has a random name until it is complete. A file that
+//! grows has its own name from the start, see [`Target::create`], so that a kill loses nothing.
+//!
+//! - The last component of a path is never a link, and never a device, a pipe or a socket.
+//! - A link on the way is followed, unless it belongs to another user and lies in a sticky directory, such as /tmp.
+//! - An existing file is replaced only by force.
+
+use std::ffi::OsString;
+use std::fs::{self, File, Permissions};
+use std::io::{self, ErrorKind, Write};
+use std::os::fd::{AsRawFd, OwnedFd};
+use std::os::unix::ffi::OsStringExt;
+use std::os::unix::fs::{MetadataExt, PermissionsExt, fchown};
+use std::path::{Path, PathBuf};
+
+use rustix::fs::{AtFlags, FileType, Mode, OFlags, Stat, openat, readlinkat, statat, unlinkat};
+use rustix::io::Errno;
+use tempfile::NamedTempFile;
+
+use crate::path_walk::{LinkPolicy, PathWalk, WalkError, components_of, named, user};
+use crate::{Failure, Kind};
+
+/// Writes all of `content` to the file at `path`; replaces an existing one if `force`.
+///
+/// # Errors
+///
+/// Those of [`OutputFile::create`] and [`OutputFile::commit`].
+pub fn write(path: &Path, content: &[u8], force: bool) -> Result<(), Failure> {
+    let mut file = OutputFile::create(path, force)?;
+    file.write_all(content).map_err(|error| unwritable(path, &error))?;
+    file.commit()
+}
+
+/// A file that is written at once. It has a random name beside its target, and mode 0600, until [`commit`](Self::commit).
+/// Without that, it is removed when it is dropped.
+#[derive(Debug)]
+pub struct OutputFile {
+    // Dropped before the directory, in which it is removed then.
+    file: NamedTempFile,
+    target: Target,
+    force: bool,
+}
+
+impl OutputFile {
+    /// Creates the file for `path`. With `force`, it may replace a regular file.
+    ///
+    /// # Errors
+    ///
+    /// Those of [`Target::open`] and [`Target::check`], and [`Kind::Output`] if the directory takes no file.
+    pub fn create(path: &Path, force: bool) -> Result<OutputFile, Failure> {
+        let target = Target::open(path)?;
+        target.check(force)?;
+        let mut prefix = OsString::from(".");
+        prefix.push(&target.name);
+        prefix.push(".");
+        let file = tempfile::Builder::new().prefix(&prefix).tempfile_in(target.directory_path());
+        let file = file.map_err(|error| unwritable(path, &error))?;
+        Ok(OutputFile { target, file, force })
+    }
+
+    /// Gives the complete file its name. A new file has the permissions that the umask leaves, and one that replaces another
+    /// has owner and permissions of that.
+    ///
+    /// # Errors
+    ///
+    /// [`Kind::Output`] if it cannot be written, or if something has the name by now.
+    pub fn commit(self) -> Result<(), Failure> {
+        let OutputFile { target, file, force } = self;
+        let old = target.check(force)?;
+        let put = || {
+            let permissions = match old {
+                Some(old) => {
+                    // Only root may give a file away. This clears some permissions, so they are set afterwards.
+                    let _ = fchown(file.as_file(), Some(old.st_uid), Some(old.st_gid));
+                    old.st_mode & 0o7777
+                }
+                None => PUBLIC & !umask(),
+            };
+            file.as_file().set_permissions(Permissions::from_mode(permissions))?;
+            file.as_file().sync_all()?;
+            let path = target.directory_path().join(&target.name);
+            let persisted = if force { file.persist(path) } else { file.persist_noclobber(path) };
+            persisted.map(drop).map_err(|failed| failed.error)
+        };
+        put().map_err(|error| match error.kind() {
+            ErrorKind::AlreadyExists => exists(&target.path),
+            _ => unwritable(&target.path, &error),
+        })
+    }
+}
+
+impl Write for OutputFile {
+    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        self.file.write(bytes)
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        self.file.flush()
+    }
+}
+
+/// Name of an output file in its open directory.
+#[derive(Debug)]
+pub struct Target {
+    directory: OwnedFd,
+    name: OsString,
+    /// As the user named it.
+    path: PathBuf,
+}
+
+impl Target {
+    /// Opens the directory of `path`.
+    ///
+    /// # Errors
+    ///
+    /// [`Kind::Output`] if it does not exist, cannot be opened, or is reached by a link that another user has put into a
+    /// sticky directory, and if `path` names no file.
+    pub fn open(path: &Path) -> Result<Target, Failure> {
+        let Some(name) = path.file_name() else {
+            // It ends with the root or with "..".
+            let message = format!("cannot write {}: it is a directory", path.display());
+            return Err(Failure::new(Kind::Output, message, "name a file in it"));
+        };
+        let parent = path.parent().unwrap_or(Path::new(""));
+        let reached = PathWalk::begin(path, LinkPolicy::NotPlanted, user()).and_then(|mut walk| {
+            let exists = walk.enter(components_of(parent), false)?;
+            if exists { Ok(walk) } else { Err(WalkError::System(parent.to_owned(), Errno::NOENT)) }
+        });
+        match reached {
+            Ok(walk) => {
+                Ok(Target { directory: walk.into_parts().0, name: name.to_owned(), path: path.to_owned() })
+            }
+            Err(WalkError::System(at, error)) => {
+                let error = io::Error::from(error);
+                // The usual case needs no second path.
+                let error =
+                    if at == parent { error } else { io::Error::other(format!("{}: {error}", at.display())) };
+                Err(unwritable(path, &error))
+            }
+            Err(WalkError::Foreign(at, owner, mode)) => {
+                let mode = mode & 0o7777;
+                let what = format!("{} belongs to user {} with mode {mode:04o}", at.display(), named(owner));
+                Err(unwritable(path, &io::Error::other(what)))
+            }
+            // Only directories of this user's own are checked for that.
+            Err(WalkError::Writable(at, _)) => Err(unwritable(&at, &Errno::PERM.into())),
+            Err(WalkError::Planted(at, what)) => {
+                let message = format!("cannot write {}: {} {what}", path.display(), at.display());
+                Err(Failure::new(Kind::Output, message, "name the file without that link, or another one"))
+            }
+        }
+    }
+
+    /// Returns the metadata of an existing file that may be replaced, or `None` if there is no file.
+    ///
+    /// # Errors
+    ///
+    /// [`Kind::Output`] if it exists and `force` is not set, and in any case if it is not a regular file.
+    pub fn check(&self, force: bool) -> Result<Option<Stat>, Failure> {
+        let stat = match statat(&self.directory, &self.name, AtFlags::SYMLINK_NOFOLLOW) {
+            Ok(stat) => stat,
+            Err(Errno::NOENT) => return Ok(None),
+            Err(error) => return Err(unwritable(&self.path, &error.into())),
+        };
+        let (what, hint) = match FileType::from_raw_mode(stat.st_mode) {
+            FileType::RegularFile if force => return Ok(Some(stat)),
+            FileType::RegularFile => return Err(exists(&self.path)),
+            FileType::Symlink => {
+                let target = readlinkat(&self.directory, &self.name, Vec::new()).unwrap_or_default();
+                let target = PathBuf::from(OsString::from_vec(target.into_bytes()));
+                (
+                    format!("a link to {}", target.display()),
+                    "name that file itself, or remove the link".to_owned(),
+                )
+            }
+            FileType::Directory => ("a directory".to_owned(), "name a file in it".to_owned()),
+            kind => {
+                let what = match kind {
+                    FileType::Fifo => "a pipe",
+                    FileType::Socket => "a socket",
+                    _ => "a device",
+                };
+                // The shell opens a pipe or a device without any of these checks.
+                (
+                    what.to_owned(),
+                    format!("name a file; or stdout, if this verb has it: - > {}", self.path.display()),
+                )
+            }
+        };
+        let message = format!("cannot write {}: it is {what}", self.path.display());
+        Err(Failure::new(Kind::Output, message, hint))
+    }
+
+    /// Creates the empty file, with the permissions that the umask leaves. If there is one, it is opened and keeps its
+    /// content with `reuse`, and otherwise this is an error.
+    ///
+    /// # Errors
+    ///
+    /// The system's error: [`ErrorKind::AlreadyExists`] if there is a file and `reuse` is not set, and always for a link.
+    pub fn create(&self, reuse: bool) -> io::Result<File> {
+        self.open_file(reuse, PUBLIC)
+    }
+
+    fn open_file(&self, reuse: bool, mode: u32) -> io::Result<File> {
+        let how = if reuse { OFlags::empty() } else { OFlags::EXCL };
+        // Without NONBLOCK, opening a pipe would wait for its reader.
+        let flags =
+            OFlags::WRONLY | OFlags::CREATE | OFlags::NOFOLLOW | OFlags::NONBLOCK | OFlags::CLOEXEC | how;
+        let file = File::from(openat(&self.directory, &self.name, flags, Mode::from_raw_mode(mode))?);
+        let metadata = file.metadata()?;
+        if !metadata.is_file() {
+            return Err(io::Error::new(ErrorKind::InvalidInput, "it is not a regular file"));
+        }
+        if metadata.nlink() > 1 {
+            let what =
+                format!("it has {} names (hard links), and would change under all of them", metadata.nlink());
+            return Err(io::Error::new(ErrorKind::InvalidInput, what));
+        }
+        Ok(file)
+    }
+
+    /// Creates the empty file, which replaces an existing regular file if `force`. It has the permissions `mode`, without
+    /// those that the umask takes away.
+    ///
+    /// # Errors
+    ///
+    /// Those of [`check`](Self::check), and [`Kind::Output`] if it cannot be created.
+    pub fn create_new(&self, force: bool, mode: u32) -> Result<File, Failure> {
+        if self.check(force)?.is_some() {
+            let removed = unlinkat(&self.directory, &self.name, AtFlags::empty());
+            removed.map_err(|error| unwritable(&self.path, &error.into()))?;
+        }
+        self.open_file(false, mode).map_err(|error| match error.kind() {
+            ErrorKind::AlreadyExists => exists(&self.path),
+            _ => unwritable(&self.path, &error),
+        })
+    }
+
+    /// Returns a path of the open directory that stays valid even if the directory is moved.
+    fn directory_path(&self) -> PathBuf {
+        format!("/proc/self/fd/{}", self.directory.as_raw_fd()).into()
+    }
+}
+
+/// Permissions of a new file, before the umask takes some away.
+pub const PUBLIC: u32 = 0o666;
+/// Permissions of a new file that only this user may read.
+pub const PRIVATE: u32 = 0o600;
+
+/// Returns the failure of a write to the file at `path`.
+pub fn unwritable(path: &Path, error: &io::Error) -> Failure {
+    let hint = "the directory must exist, be writable and have free space";
+    Failure::new(Kind::Output, format!("cannot write {}: {error}", path.display()), hint)
+}
+
+fn exists(path: &Path) -> Failure {
+    Failure::new(
+        Kind::Output,
+        format!("{} exists", path.display()),
+        "--force replaces it; or name another file",
+    )
+}
+
+/// Returns the permissions that new files of this process do not get. If the kernel does not report them (before Linux 4.7),
+/// those of group and others.
+fn umask() -> u32 {
+    let status = fs::read_to_string("/proc/self/status").unwrap_or_default();
+    let umask = status.lines().find_map(|line| line.strip_prefix("Umask:"));
+    umask.and_then(|umask| u32::from_str_radix(umask.trim(), 8).ok()).unwrap_or(0o077)
+}
+
+#[cfg(test)]
+mod tests {
+    use std::os::unix::fs::symlink;
+
+    use rustix::fs::{CWD, mknodat};
+    use tempfile::TempDir;
+
+    use super::*;
+
+    fn names(directory: &Path) -> Vec<String> {
+        let entries = fs::read_dir(directory).unwrap();
+        let mut names: Vec<_> = entries.map(|it| it.unwrap().file_name().into_string().unwrap()).collect();
+        names.sort();
+        names
+    }
+
+    #[test]
+    fn a_file_is_complete_or_absent() {
+        let directory = TempDir::new().unwrap();
+        let path = directory.path().join("a.json");
+        let mut file = OutputFile::create(&path, false).unwrap();
+        file.write_all(b"half").unwrap();
+        assert_eq!(names(directory.path()).len(), 1);
+        assert!(!path.exists());
+        let temporary = fs::metadata(directory.path().join(&names(directory.path())[0])).unwrap();
+        assert_eq!(temporary.mode() & 0o7777, 0o600);
+        drop(file);
+        assert_eq!(names(directory.path()), [""; 0]);
+        write(&path, b"whole", false).unwrap();
+        assert_eq!(
+            (names(directory.path()), fs::read(&path).unwrap()),
+            (vec!["a.json".into()], b"whole".into())
+        );
+        assert_eq!(fs::metadata(&path).unwrap().mode() & 0o7777, 0o666 & !umask());
+    }
+
+    #[test]
+    fn an_existing_file_is_replaced_by_force_alone_and_keeps_its_permissions() {
+        let directory = TempDir::new().unwrap();
+        let path = directory.path().join("a");
+        let file = OutputFile::create(&path, false).unwrap();
+        fs::write(&path, "old").unwrap();
+        fs::set_permissions(&path, Permissions::from_mode(0o640)).unwrap();
+        // It appeared after the check.
+        let failure = file.commit().unwrap_err();
+        assert_eq!((failure.kind, failure.message.ends_with("/a exists")), (Kind::Output, true), "{failure}");
+        assert!(failure.hint.contains("--force"), "{failure}");
+        assert_eq!(write(&path, b"new", false).unwrap_err().message, failure.message);
+        assert_eq!(fs::read(&path).unwrap(), b"old");
+        write(&path, b"new", true).unwrap();
+        assert_eq!(fs::read(&path).unwrap(), b"new");
+        assert_eq!(fs::metadata(&path).unwrap().mode() & 0o7777, 0o640);
+        assert_eq!(names(directory.path()), ["a"]);
+    }
+
+    #[test]
+    fn links_and_special_files_are_refused_even_by_force() {
+        let directory = TempDir::new().unwrap();
+        let at = |name: &str| directory.path().join(name);
+        fs::write(at("victim"), "whole").unwrap();
+        symlink("victim", at("link")).unwrap();
+        symlink("absent", at("dangling")).unwrap();
+        mknodat(CWD, at("pipe"), FileType::Fifo, Mode::RUSR | Mode::WUSR, 0).unwrap();
+        fs::create_dir(at("directory")).unwrap();
+        for (path, what) in [
+            (at("link"), "it is a link to victim"),
+            (at("dangling"), "it is a link to absent"),
+            (at("pipe"), "it is a pipe"),
+            (at("directory"), "it is a directory"),
+            ("/dev/null".into(), "it is a device"),
+        ] {
+            for force in [false, true] {
+                let create = |target: Target| target.create_new(force, PUBLIC);
+                let growing = Target::open(&path).and_then(create).unwrap_err();
+                let failure = write(&path, b"new", force).unwrap_err();
+                assert!(failure.message.ends_with(what) && !failure.hint.is_empty(), "{failure}");
+                assert_eq!((failure.kind, &failure.message), (Kind::Output, &growing.message));
+            }
+        }
+        for name in ["link", "dangling", "pipe"] {
+            let target = Target::open(&at(name)).unwrap();
+            assert!(target.create(true).is_err() && target.create(false).is_err(), "{name}");
+        }
+        assert_eq!(fs::read(at("victim")).unwrap(), b"whole");
+        assert!(!at("absent").exists());
+    }
+
+    #[test]
+    fn a_file_with_another_name_is_not_emptied() {
+        let directory = TempDir::new().unwrap();
+        let [path, backup] = ["a", "backup"].map(|name| directory.path().join(name));
+        fs::write(&path, "old").unwrap();
+        fs::hard_link(&path, &backup).unwrap();
+        let target = Target::open(&path).unwrap();
+        assert!(target.create(true).unwrap_err().to_string().contains("2 names"));
+        target.create_new(true, PUBLIC).unwrap().write_all(b"new").unwrap();
+        assert_eq!((fs::read(&path).unwrap(), fs::read(&backup).unwrap()), (b"new".into(), b"old".into()));
+    }
+
+    #[test]
+    fn links_on_the_way_are_followed_but_not_those_of_others_in_a_sticky_directory() {
+        let directory = TempDir::new().unwrap();
+        let at = |name: &str| directory.path().join(name);
+        fs::create_dir_all(at("real/below")).unwrap();
+        fs::create_dir(at("shared")).unwrap();
+        symlink(at("real"), at("shared/link")).unwrap();
+        symlink("real/below", at("relative")).unwrap();
+        for mode in [0o700, 0o777, 0o1777] {
+            fs::set_permissions(at("shared"), Permissions::from_mode(mode)).unwrap();
+            write(&at("shared/link/below/../a"), b"x", true).unwrap();
+            assert_eq!(names(&at("real")), ["a", "below"]);
+            write(&at("relative/a"), b"x", true).unwrap();
+            assert_eq!(names(&at("real/below")), ["a"]);
+        }
+        if user() == 0 {
+            std::os::unix::fs::lchown(at("shared/link"), Some(12_345), None).unwrap();
+            let failure = write(&at("shared/link/b"), b"x", true).unwrap_err();
+            assert!(failure.message.contains("link is a link of user 12345"), "{failure}");
+            fs::set_permissions(at("shared"), Permissions::from_mode(0o777)).unwrap();
+            write(&at("shared/link/b"), b"x", true).unwrap();
+        }
+        for absent in ["absent/a", "real/a/b"] {
+            let failure = write(&at(absent), b"x", true).unwrap_err();
+            assert!(
+                failure.kind == Kind::Output && failure.hint.contains("directory must exist"),
+                "{failure}"
+            );
+        }
+        assert_eq!(
+            write(Path::new("/"), b"x", true).unwrap_err().message,
+            "cannot write /: it is a directory"
+        );
+    }
+}

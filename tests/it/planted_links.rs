@@ -1,0 +1,169 @@
+//! Links that another user has planted where root writes files: root's files stay as they are.
+
+use std::fs::{self, Permissions};
+use std::os::unix::fs::{MetadataExt, PermissionsExt};
+use std::process::Command;
+
+use crate::strangers::{beside_a_stranger, scanhub, stranger};
+use crate::testkit::{INT, Outcome, Program, TERM, is_class, until};
+
+const VICTIM: &str = "/mnt/victim";
+const CONTENT: &str = "a file of root";
+
+/// Creates root's file and an input for each verb, where the stranger can write nothing.
+fn prepare() {
+    fs::write(VICTIM, CONTENT).expect("a file");
+    let scan = format!("FLASER 181{} 0 0 0 0 0 0 1.5 host 1.5\n", " 1.5".repeat(181));
+    fs::write("/mnt/walk.log", scan).expect("a file");
+    let site = "[[sensor]]\nname = \"front\"\npose = { x = 0, y = 0, yaw = 0 }\n[[room]]\nname = \"a\"\npolygon = [[0, 0], [4, 0], [4, 3]]\n";
+    fs::write("/mnt/site.toml", site).expect("a file");
+}
+
+fn run(words: &[&str]) -> Outcome {
+    Program::start(scanhub(0, words)).wait()
+}
+
+/// Command lines of root that write to `file`.
+fn outputs(file: &str) -> [Vec<&str>; 10] {
+    [
+        vec!["convert", "/mnt/walk.log", file],
+        vec!["convert", "/mnt/walk.log", file, "--force"],
+        vec!["record", "-o", file],
+        vec!["record", "-o", file, "--force"],
+        vec!["simulate", "--port=/mnt/port", "--truth", file],
+        vec!["simulate", "--port=/mnt/port", "--truth", file, "--force"],
+        vec!["site", "check", "/mnt/site.toml", "--svg", file],
+        vec!["site", "check", "/mnt/site.toml", "--svg", file, "--force"],
+        vec!["key", "new", file],
+        vec!["background", "front", "save", file, "--force"],
+    ]
+}
+
+#[test]
+fn links_at_the_name_of_an_output_are_refused() {
+    beside_a_stranger("planted_links::links_at_the_name_of_an_output_are_refused", || {
+        prepare();
+        stranger(
+            "ln -s /mnt/victim /tmp/out.mcap && ln -s /mnt /tmp/way && ln -s /mnt/new /tmp/dangling.mcap",
+        );
+        for (file, says) in [
+            ("/tmp/out.mcap", "it is a link to /mnt/victim"),
+            ("/tmp/dangling.mcap", "it is a link to /mnt/new"),
+            ("/tmp/way/victim", "/tmp/way is a link of user 65533"),
+            ("/tmp/way/new.mcap", "/tmp/way is a link of user 65533"),
+        ] {
+            for words in outputs(file) {
+                let outcome = run(&words);
+                let is_format = words[0] == "convert" && file.ends_with("victim");
+                assert!(
+                    outcome.code == Some(73) || is_format && outcome.code == Some(2),
+                    "{words:?}: {outcome}"
+                );
+                assert!(outcome.errors.contains(says) || is_format, "{words:?}: {outcome}");
+            }
+        }
+        assert_eq!(fs::read_to_string(VICTIM).expect("it is there"), CONTENT);
+        assert!(!fs::exists("/mnt/new").unwrap() && !fs::exists("/mnt/new.mcap").unwrap());
+    });
+}
+
+/// A name that contains the process id can be planted before the process starts.
+#[test]
+fn names_of_temporary_files_cannot_be_guessed() {
+    beside_a_stranger("planted_links::names_of_temporary_files_cannot_be_guessed", || {
+        prepare();
+        let pid = std::process::id();
+        for name in ["out.mcap", "plan.svg"] {
+            stranger(&format!(
+                "for n in $(seq {pid} {}); do ln -s /mnt/victim /tmp/.{name}.$n; done",
+                pid + 2_000
+            ));
+        }
+        assert_eq!(run(&["convert", "/mnt/walk.log", "/tmp/out.mcap"]).code, Some(0));
+        assert_eq!(run(&["site", "check", "/mnt/site.toml", "--svg", "/tmp/plan.svg"]).code, Some(0));
+        assert_eq!(fs::read_to_string(VICTIM).expect("it is there"), CONTENT);
+        for file in ["/tmp/out.mcap", "/tmp/plan.svg"] {
+            let file = fs::symlink_metadata(file).expect("it is there");
+            assert!(file.is_file() && file.uid() == 0);
+        }
+    });
+}
+
+/// As after `sudo -E`: the environment of another user names the directory.
+#[test]
+fn a_state_directory_of_another_user_is_not_used() {
+    beside_a_stranger("planted_links::a_state_directory_of_another_user_is_not_used", || {
+        prepare();
+        fs::create_dir("/mnt/prey").expect("a directory");
+        // Links at each of the levels that a program would open.
+        let plant = [
+            "mkdir -p /tmp/state/scanhub && ln -s /mnt/victim /tmp/state/scanhub/gateway-scanhub-lo-1",
+            "rm -r /tmp/state/scanhub && ln -s /mnt/prey /tmp/state/scanhub",
+            "rm /tmp/state/scanhub && mkdir /tmp/state/scanhub && ln -s /mnt/prey /tmp/state/scanhub/scanhub",
+            "rm -r /tmp/state && ln -s /mnt/prey /tmp/state",
+        ];
+        for script in plant {
+            stranger(script);
+            let with_state = |words: &[&str]| -> Command {
+                let mut command = scanhub(0, words);
+                command.env("XDG_STATE_HOME", "/tmp/state");
+                command
+            };
+            let gateway =
+                Program::start(with_state(&["gateway", "--no-system-config", "--interface=lo"])).wait();
+            assert_eq!(gateway.code, Some(73), "{script}: {gateway}");
+            assert!(gateway.errors.contains("65533"), "the owner is named: {script}: {gateway}");
+            let run = ["run", "--json", "--no-system-config", "--link=front=/mnt/no-port", "--root=/mnt/hub"];
+            let hub = Program::start(with_state(&run)).ready();
+            let hub = hub.end(TERM);
+            assert!(hub.errors.contains("nothing is kept across restarts: "), "{script}: {hub}");
+            assert!(hub.errors.contains("65533") && hub.errors.contains("XDG_STATE_HOME"), "{script}: {hub}");
+        }
+        assert_eq!(fs::read_to_string(VICTIM).expect("it is there"), CONTENT);
+        assert_eq!(fs::read_dir("/mnt/prey").expect("it is ours").count(), 0);
+    });
+}
+
+#[test]
+fn files_of_a_gateway_are_private() {
+    beside_a_stranger("planted_links::files_of_a_gateway_are_private", || {
+        fs::create_dir_all("/mnt/state/scanhub").expect("a directory");
+        let file = "/mnt/state/scanhub/gateway-scanhub-lo-1";
+        // As an earlier version left it.
+        fs::write(file, "").expect("a file");
+        fs::set_permissions(file, Permissions::from_mode(0o666)).expect("it is ours");
+        let mut command = scanhub(0, &["gateway", "--json", "--no-system-config", "--interface=lo"]);
+        command.env("XDG_STATE_HOME", "/mnt/state");
+        let mut gateway = Program::start(command);
+        gateway.await_line("its begin", is_class("gateway"));
+        assert_eq!(fs::metadata(file).expect("it is there").mode() & 0o777, 0o600);
+        gateway.end(INT);
+    });
+}
+
+/// Another user cannot occupy the directories of a demonstration.
+#[test]
+fn a_demonstration_runs_where_its_usual_directory_is_occupied() {
+    beside_a_stranger("planted_links::a_demonstration_runs_where_its_usual_directory_is_occupied", || {
+        stranger("mkdir -m 777 /tmp/scanhub-0");
+        let mut demo = scanhub(0, &["demo", "--headless", "--json"]);
+        demo.env("PATH", std::env::var_os("PATH").unwrap_or_default());
+        // Where /run belongs to root, that is the usual directory.
+        demo.env_remove("XDG_RUNTIME_DIR");
+        let mut demo = Program::start(demo);
+        let ready = demo.await_line("ready", is_class("ready"));
+        let root = ready["root"].as_str().expect("a directory").to_owned();
+        let list = || {
+            run(&[
+                "list",
+                "--domain",
+                ready["domain"].as_str().unwrap(),
+                "--root",
+                root.rsplit_once('/').unwrap().0,
+            ])
+        };
+        until("its sensors stream", || String::from_utf8_lossy(&list().out).contains("front/scan"));
+        demo.end(INT);
+        assert!(!fs::exists(&root).unwrap());
+    });
+}
