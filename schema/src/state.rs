@@ -116,9 +116,9 @@ impl StateDirectory {
 /// The directory of the domain, and the one of all domains above it.
 const OWN: usize = 2;
 
-/// Says that something cannot be kept.
+/// Adds that nothing can be kept to the message.
 fn unkept(failure: Failure) -> Failure {
-    Failure { message: format!("cannot keep {}", failure.message), ..failure }
+    Failure { message: format!("nothing can be kept: {}", failure.message), ..failure }
 }
 
 fn base_in(variable: impl Fn(&str) -> Option<OsString>) -> Option<PathBuf> {
@@ -238,7 +238,7 @@ mod tests {
         let state = StateDirectory::at("/dev/null/x");
         let failures = [state.read("f", 9).map(drop).unwrap_err(), state.write("f", "text").unwrap_err()];
         let [_, failure] = failures;
-        assert!(failure.message.contains("cannot keep /dev/null"), "{failure}");
+        assert!(failure.message.contains("nothing can be kept: /dev/null"), "{failure}");
         assert!(failure.hint.contains("STATE_DIRECTORY"), "{failure}");
     }
 

@@ -66,7 +66,7 @@ mod tests {
     #[test]
     fn listeners_that_keep_at_once_forget_nothing() {
         let root = tempfile::tempdir().unwrap();
-        let epochs = || Epochs::of(&Key::new(&[1; 32]), Some(StateDirectory::at(root.path())));
+        let epochs = || Epochs::of(&Key::new(&[1; 32]), Some(StateDirectory::at(root.path().join("d"))));
         std::thread::scope(|scope| {
             for listener in 0..8u64 {
                 let epochs = epochs();
@@ -82,7 +82,7 @@ mod tests {
     #[test]
     fn no_more_are_kept_than_a_listener_knows() {
         let root = tempfile::tempdir().unwrap();
-        let epochs = Epochs::of(&Key::new(&[1; 32]), Some(StateDirectory::at(root.path())));
+        let epochs = Epochs::of(&Key::new(&[1; 32]), Some(StateDirectory::at(root.path().join("d"))));
         let many = |from: u64, count: u64| (from..from + count).map(|hub| (hub, hub as u32 + 1)).collect();
         epochs.keep(&many(0, GATEWAYS as u64)).unwrap();
         epochs.keep(&many(50_000, 10)).unwrap();
@@ -95,13 +95,13 @@ mod tests {
     #[test]
     fn the_greatest_of_all_listeners_is_kept() {
         let root = tempfile::tempdir().unwrap();
-        let epochs = |key| Epochs::of(&Key::new(&[key; 32]), Some(StateDirectory::at(root.path())));
+        let epochs = |key| Epochs::of(&Key::new(&[key; 32]), Some(StateDirectory::at(root.path().join("d"))));
         assert_eq!(epochs(1).read().unwrap(), HashMap::new());
         epochs(1).keep(&HashMap::from([(5, 7), (6, 1)])).unwrap();
         epochs(1).keep(&HashMap::from([(5, 6), (7, u32::MAX)])).unwrap();
         assert_eq!(epochs(1).read().unwrap(), HashMap::from([(5, 7), (6, 1), (7, u32::MAX)]));
         assert_eq!(epochs(2).read().unwrap(), HashMap::new(), "another key");
-        std::fs::write(StateDirectory::at(root.path()).path(&epochs(1).name), "torn\n5 9 \nffff 3\n")
+        std::fs::write(StateDirectory::at(root.path().join("d")).path(&epochs(1).name), "torn\n5 9 \nffff 3\n")
             .unwrap();
         assert_eq!(epochs(1).read().unwrap(), HashMap::from([(0xffff, 3)]));
         assert_eq!(Epochs::of(&Key::new(&[1; 32]), None).keep(&HashMap::from([(5, 7)])), Ok(()));
