@@ -205,6 +205,8 @@ impl line::Session for Session {
         fn unit_mm() -> Option<u8>;
         fn notice() -> Option<Notice>;
         fn missing_setting() -> Option<&'static str>;
+        fn model_text() -> Option<String>;
+        fn stream_head(reported: &str, beams: Option<usize>) -> Vec<u8>;
         fn write_details(text: &mut dyn fmt::Write);
         fn introduction() -> Option<Introduction>;
         fn scanner_time() -> Option<Nanos>;

@@ -12,6 +12,7 @@ mod request;
 mod sequence;
 mod session;
 mod stream;
+mod stream_head;
 
 pub use crate::line::{Tally, TurnCounts};
 pub use device_info::{Health, Info};

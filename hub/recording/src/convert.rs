@@ -4,6 +4,7 @@
 mod copy;
 mod output;
 mod scans;
+mod stream_head;
 mod views;
 
 use std::cell::Cell;
@@ -20,6 +21,7 @@ use schema::{Failure, Family, Flags, Header, Kind, Topic, check_followed};
 use crate::{Damage, Encoding, Form, Frame, Recording, Unread, carmen};
 use output::{Output, Packing};
 use scans::{Sight, Times};
+use stream_head::stream_heads;
 use views::{Csv, Ros2, View, write_marks};
 
 /// What to convert.
@@ -226,7 +228,7 @@ enum Written {
     Other,
     /// The marks of a scan.
     Marks,
-    /// A reply with the encoding of a log's values, which the log itself does not contain.
+    /// A reply that the recording itself does not contain, such as one with the encoding of a log's values.
     Added,
     LeftOut,
 }
@@ -253,7 +255,11 @@ fn write_bytes(
 ) -> Result<(), Failure> {
     let mut times = Times::of(recording);
     if form == Form::Telegrams {
+        let mut heads = stream_heads(recording)?.into_iter().peekable();
         for (number, frame) in frames(recording, encoding)?.enumerate() {
+            if let Some((_, head)) = heads.next_if(|(before, _)| *before == number) {
+                out.write_all(&head).map_err(failed)?;
+            }
             out.write_all(&frame.telegram).map_err(failed)?;
             count(Written::of_frame(recording.contents().form, number, &frame), frame.wall_ns)?;
         }

@@ -11,10 +11,11 @@ use scanhub_drivers::features;
 use scanhub_drivers::lms::telegram::Telegram;
 use scanhub_drivers::lms::variant::Mode;
 use schema::datagram::Packed;
-use schema::{Family, Header, Pace, Scan, Status, Topic};
+use schema::{Family, Foreground, Header, Pace, Scan, Status, Topic};
 
 use crate::{Contents, Damage, Form, Frame};
 pub(crate) use catalog::Catalog;
+use catalog::Place;
 use records::Records;
 pub(crate) use records::{Record, has_border};
 
@@ -236,11 +237,10 @@ impl Survey {
                 None => {}
             }
         }
-        if place.has_scans() && header.family != Family::Lms as u8 {
+        if header.family != Family::Lms as u8 {
             let of_sensor = of_sensor(&mut self.sensors, &place.sensor);
-            let mut scan = Box::<Scan>::default();
-            if of_sensor.beams.is_none() && Scan::unpack_into(&mut scan, payload) {
-                of_sensor.beams = Some(scan.beams() as u16);
+            if of_sensor.beams.is_none() {
+                of_sensor.beams = beams_of(place, payload);
                 self.whole.beams = self.whole.beams.or(of_sensor.beams);
             }
         }
@@ -255,7 +255,7 @@ impl Survey {
                     contents.sensor_type = name.map(|name| (status.family, name.to_owned()));
                 }
                 if let Some((model, way)) = rotating {
-                    contents.model = contents.model.or(Some(model));
+                    contents.model = contents.model.or(model);
                     contents.way = contents.way.or(way);
                     contents.step_cdeg = contents.step_cdeg.or(Some(status.resolution_cdeg));
                 }
@@ -264,11 +264,30 @@ impl Survey {
     }
 }
 
-/// Returns the model and the scan mode that `status` names, if the scanner is a rotating one.
-fn rotating(status: &Status) -> Option<(&'static str, Option<&'static str>)> {
+/// Returns the number of beams of the scan that `payload` is, or that it was computed from. `None` for another topic.
+fn beams_of(place: &Place, payload: &[u8]) -> Option<u16> {
+    match place.topic {
+        _ if place.is_old => None,
+        Topic::Scan => {
+            let mut scan = Box::<Scan>::default();
+            Scan::unpack_into(&mut scan, payload).then(|| scan.beams() as u16)
+        }
+        // The default topics of a recording contain no scans.
+        Topic::Foreground => {
+            let mut foreground = Box::<Foreground>::default();
+            Foreground::unpack_into(&mut foreground, payload).then_some(foreground.count)
+        }
+        _ => None,
+    }
+    .filter(|beams| *beams > 0)
+}
+
+/// Returns the model and the scan mode that `status` names, if the scanner is a rotating one. Each is `None` if this version
+/// does not know it.
+fn rotating(status: &Status) -> Option<(Option<&'static str>, Option<&'static str>)> {
     let features = features(Family::of_number(status.family)?);
-    let name = status.model()?;
-    let model = features.models.iter().map(|model| model.name).find(|known| *known == name)?;
+    let name = status.model().filter(|_| !features.has_whole_telegrams)?;
+    let model = features.models.iter().map(|model| model.name).find(|known| *known == name);
     let way = features.modes.iter().copied().find(|known| status.way() == Some(known));
     Some((model, way))
 }

@@ -232,6 +232,17 @@ impl Recording {
         })
     }
 
+    /// Returns the settings of a session that reads its packets: model, mode and number of beams, as far as they are known.
+    ///
+    /// # Errors
+    ///
+    /// Returns the errors of [`model`](Self::model).
+    pub fn session_settings(&self) -> Result<Settings, Failure> {
+        let model = self.model()?.map(|model| model.name);
+        let (mode, beams) = (self.contents.way, self.beams());
+        Ok(Settings { model, mode, beams, fixed_rate: true, listen_only: true, ..Settings::default() })
+    }
+
     /// Where it is.
     pub fn path(&self) -> &Path {
         &self.path

@@ -150,6 +150,7 @@ faults! {
     hold_every, 0.0 to 86400.0, 0.0, "as silence_every";
     health, 0.0 to 2.0, 0.0, "of an RPLIDAR: status that it reports until a RESET: 1 warning, 2 error";
     stubborn, 0.0 to 1.0, 0.0, "1: a RESET does not change that status";
+    id, 0.0 to 255.0, 0.0, "of an RPLIDAR: number that it reports as its model, such as 0x95; 0: that of the model";
     overlook, 0.0 to 1.0, 0.0, "share of the requests that the sensor ignores";
     nak, 0.0 to 1.0, 0.0, "share of the requests that it answers with NAK";
     twice, 0.0 to 1.0, 0.0, "share of the replies that it sends twice";

@@ -29,6 +29,8 @@ pub use models::{Form, Mode, Model};
 pub struct UnitSettings {
     /// The model.
     pub model: Model,
+    /// Number that the scanner reports as its model; by default that of the model.
+    pub id: u8,
     /// Number of the mode that the scanner recommends; by default that of the model.
     pub typical: usize,
     /// Mean revolutions per second; by default those of the model.
@@ -69,6 +71,7 @@ impl UnitSettings {
     pub fn of(model: Model) -> UnitSettings {
         UnitSettings {
             model,
+            id: model.id(),
             typical: model.typical(),
             turns_per_second: model.turns_per_second(),
             wander: 0.005,
@@ -241,7 +244,7 @@ impl Unit {
     fn advance(&mut self, now: Nanos) {
         if self.boots_ns.is_some_and(|at| at <= now) {
             let at_ns = self.boots_ns.take().unwrap_or(now);
-            self.tx_queue.send(protocol::boot_message(self.settings.model), at_ns, true);
+            self.tx_queue.send(protocol::boot_message(self.settings.model, self.settings.id), at_ns, true);
             self.hears_ns = self.tx_queue.free_ns() + HEARS_NS;
         }
         match (self.stalls.holds(now), self.held) {
@@ -295,7 +298,7 @@ impl Unit {
                 self.begin(first.unwrap_or(1), false, now);
             }
             Request::Express(number) => self.begin(usize::from(number), false, now),
-            Request::Info => self.reply(protocol::info(model, self.settings.seed), now),
+            Request::Info => self.reply(protocol::info(model, self.settings.id, self.settings.seed), now),
             Request::Health => {
                 let (status, code) = if self.held.is_some() { (ERROR, HELD) } else { self.health };
                 self.reply(protocol::health(status, code), now);

@@ -157,6 +157,7 @@ fn device(
         Some(Scanner::Rplidar { model, mode }) => {
             let faults = options.faults;
             let settings = UnitSettings {
+                id: if faults.id > 0.0 { faults.id as u8 } else { model.id() },
                 typical: mode,
                 start: match &options.state {
                     Start::PowerOn => UnitStart::PowerOn,

@@ -174,6 +174,21 @@ pub trait Session: Protocol {
         None
     }
 
+    /// Returns the name of the model as a status shows it, or its number if scanhub does not know the model. `None` if the
+    /// scanner has reported neither.
+    fn model_text(&self) -> Option<String> {
+        self.model().map(|model| model.name.to_uppercase())
+    }
+
+    /// Returns the responses that a stream file needs before the packets of this session, because the packets do not contain
+    /// the model, the kind of packets, or the time per point. Empty if the session has received them with the packets, or if
+    /// the family does not need them. Used for a recording. `reported` is the type of the scanner in a status of the
+    /// recording, and `beams` the number of beams of its scans, if the recording has them.
+    fn stream_head(&self, reported: &str, beams: Option<usize>) -> Vec<u8> {
+        let _ = (reported, beams);
+        Vec::new()
+    }
+
     /// Writes the scan mode and the firmware version of the scanner, in short form.
     fn write_details(&self, text: &mut dyn fmt::Write) {
         let _ = text;
@@ -214,8 +229,7 @@ pub trait Session: Protocol {
 
     /// Writes what is known of the scanner into `status`.
     fn describe(&self, status: &mut Status) {
-        if let Some(model) = self.model() {
-            let mut text = model.name.to_uppercase();
+        if let Some(mut text) = self.model_text() {
             self.write_details(&mut text);
             status.set_sensor_type(&text);
             if let Some(beams) = self.beams() {

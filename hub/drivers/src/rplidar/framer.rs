@@ -137,8 +137,7 @@ impl Framer {
             if open.is_empty() {
                 return None;
             }
-            // Bytes at the end of the last packet are the next one, even if they look like a response.
-            if !self.is_locked && self.expect != Expect::Nothing && Head::begins(open) {
+            if self.expect != Expect::Nothing && Head::begins(open) && !self.is_at_packet() {
                 match Head::parse(open) {
                     Some(Head::Reply(_, len)) if open.len() < Head::LEN + len => return None,
                     Some(Head::Reply(answer, len)) => {
@@ -221,6 +220,15 @@ impl Framer {
 
     pub(crate) fn buffered(&self) -> usize {
         self.buffer.open().len()
+    }
+
+    /// Returns whether the open bytes follow a packet and may be the next one. Then they are, even if they look like a response.
+    fn is_at_packet(&self) -> bool {
+        let may_be = |kind: Kind| match self.buffer.open().get(..kind.bytes()) {
+            Some(packet) => kind.is_right(packet),
+            None => kind.begins(self.buffer.open()),
+        };
+        self.is_locked && self.kind().is_some_and(may_be)
     }
 
     fn step(&mut self, most: usize) -> Step {

@@ -156,6 +156,14 @@ impl Handshake {
         self.mode
     }
 
+    /// Handles the descriptor of a stream with packets of `kind`. In a recording, the mode is the only reported one with such
+    /// packets, if there is only one.
+    pub(crate) fn stream_begins(&mut self, kind: Kind) {
+        if self.settings.listen_only && self.settings.mode.is_none() {
+            self.mode = self.modes.only_of(kind);
+        }
+    }
+
     /// Returns the mode of the settings, if the scanner cannot use it.
     pub(crate) fn unavailable_mode(&self) -> Option<Mode> {
         self.unavailable_mode
@@ -449,6 +457,26 @@ impl ScanModes {
         self.of_kind(kind)
             .map(|(_, reported)| reported)
             .min_by(|a, b| (a - us).abs().total_cmp(&(b - us).abs()))
+    }
+
+    /// Returns the mode with packets of `kind`, if there is only one and scanhub knows it.
+    fn only_of(&self, kind: Kind) -> Option<Mode> {
+        let mut modes = self.all[..self.count].iter().filter(|mode| mode.kind == Some(kind));
+        let only = modes.next().filter(|_| modes.next().is_none());
+        only.and_then(|mode| mode.named)
+    }
+
+    /// Returns whether all reported modes with packets of `kind` have the same time per point, so that the packets define it.
+    pub(crate) fn is_unambiguous(&self, kind: Kind) -> bool {
+        let mut times = self.of_kind(kind).map(|(_, us)| us);
+        let first = times.next();
+        times.all(|us| Some(us) == first)
+    }
+
+    /// Returns whether a reported mode with packets of `kind` and this time per point is `mode`.
+    pub(crate) fn has(&self, mode: Mode, kind: Kind, us: f32) -> bool {
+        let nearest = self.nearest_us(kind, us);
+        self.of_kind(kind).any(|(named, us)| named == Some(mode) && Some(us) == nearest)
     }
 
     fn of_kind(&self, kind: Kind) -> impl Iterator<Item = (Option<Mode>, f32)> {

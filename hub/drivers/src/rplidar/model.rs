@@ -79,6 +79,20 @@ impl Model {
         }
     }
 
+    /// Returns the number that the usual hardware of this model reports, for [`Model::of_id`].
+    pub(crate) fn id(self) -> u8 {
+        match self {
+            Model::A1 => 0x18,
+            Model::A2m8 => 0x28,
+            Model::A2m12 => 0x2C,
+            Model::A3 => 0x31,
+            Model::C1 => 0x41,
+            Model::S1 => 0x61,
+            Model::S2 => 0x71,
+            Model::S3 => 0x81,
+        }
+    }
+
     /// The rate at which it speaks, in bits per second.
     pub const fn baud(self) -> u32 {
         match self {
@@ -115,10 +129,21 @@ impl Model {
     }
 
     /// Beams of a turn where so many points are measured in a second.
-    pub(crate) const fn beams_of(self, points_per_second: f32) -> usize {
+    const fn beams_of(self, points_per_second: f32) -> usize {
         (points_per_second / self.turns_per_second() + 0.5) as usize
     }
+
+    /// Returns the number of beams for a mode in which the scanner measures `points_per_second`: that of the model's fastest
+    /// mode, if it is close.
+    pub(crate) fn beams_in_mode(self, points_per_second: f32) -> usize {
+        let (beams, fastest) = (self.beams_of(points_per_second), self.beams());
+        let is_close = (beams as f64 / fastest as f64 - 1.0).abs() <= CLOSE;
+        if is_close { fastest } else { beams }
+    }
 }
+
+/// Share by which a number of beams may differ from that of the model's fastest mode, and still counts as the same.
+const CLOSE: f64 = 0.03;
 
 /// A way of measuring that a model may offer.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -180,5 +205,25 @@ impl Mode {
             let letters = name.iter().filter(|byte| byte.is_ascii_alphanumeric());
             letters.map(u8::to_ascii_lowercase).eq(mode.name().bytes())
         })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn id_belongs_to_the_model() {
+        assert!(Model::ALL.into_iter().all(|model| Model::of_id(model.id()) == Some(model)));
+        assert_eq!([0x00, 0x58, 0x77, 0x91].map(Model::of_id), [None, None, Some(Model::S2), None]);
+    }
+
+    #[test]
+    fn a_mode_has_the_beams_of_the_fastest_one_if_they_are_close() {
+        // The scanner reports 127 us per point, and its data sheet 8,000 points per second.
+        assert_eq!(Model::A2m8.beams_in_mode(1e6 / 127.0), 800);
+        assert_eq!(Model::A2m12.beams_in_mode(1e6 / 63.0), 1_600);
+        assert_eq!(Model::A2m8.beams_in_mode(1e6 / 201.0), 498);
+        assert_eq!(Model::A1.beams_in_mode(1e6 / 254.0), 539);
     }
 }

@@ -40,7 +40,8 @@ impl Kind {
         Kind::ALL.into_iter().find(|kind| kind.answer() == answer)
     }
 
-    const fn answer(self) -> u8 {
+    /// Returns the type of this kind in a descriptor.
+    pub(crate) const fn answer(self) -> u8 {
         match self {
             Kind::Standard => 0x81,
             Kind::Express => 0x82,

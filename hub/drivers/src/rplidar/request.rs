@@ -135,6 +135,19 @@ pub(crate) enum Answer {
     Board,
 }
 
+impl Answer {
+    /// Returns the type in the descriptor.
+    const fn number(self) -> u8 {
+        match self {
+            Answer::Info => 0x04,
+            Answer::Health => 0x06,
+            Answer::SampleTimes => 0x15,
+            Answer::Configuration => 0x20,
+            Answer::Board => 0xFF,
+        }
+    }
+}
+
 impl Head {
     /// Length of a descriptor, in bytes.
     pub(crate) const LEN: usize = 7;
@@ -153,6 +166,16 @@ impl Head {
             (1, answer, len) => Kind::of(answer).filter(|kind| kind.bytes() == len).map(Head::Stream),
             _ => None,
         }
+    }
+
+    /// Encodes the descriptor, in the form in which a scanner sends it.
+    pub(crate) fn encode(self) -> [u8; Head::LEN] {
+        let (len, times, kind) = match self {
+            Head::Reply(answer, len) => (len, 0, answer.number()),
+            Head::Stream(kind) => (kind.bytes(), 1, kind.answer()),
+        };
+        let [a, b, c, d] = (len as u32 | times << 30).to_le_bytes();
+        [START, 0x5A, a, b, c, d, kind]
     }
 
     /// Returns whether `bytes` may be the beginning of a descriptor.
@@ -189,6 +212,9 @@ mod tests {
         assert_eq!(Head::parse(&info), Some(Head::Reply(Answer::Info, 20)));
         let express = [0xA5, 0x5A, 0x54, 0, 0, 0x40, 0x82];
         assert_eq!(Head::parse(&express), Some(Head::Stream(Kind::Express)));
+        for bytes in [info, express] {
+            assert_eq!(Head::parse(&bytes).map(Head::encode), Some(bytes));
+        }
         for (at, wrong) in [(0, 0xA4), (1, 0x5B), (2, 0x13), (5, 0x40), (6, 0x05)] {
             let mut bytes = info;
             bytes[at] = wrong;

@@ -22,6 +22,7 @@ use crate::rplidar::packet::Kind;
 use crate::rplidar::rate_search::RateSearch;
 use crate::rplidar::request::{Answer, Head, Request, RequestQueue};
 use crate::rplidar::stream::{Line, MAX_SAMPLE_LEN, Stream};
+use crate::rplidar::stream_head::StreamHead;
 
 /// The session with one scanner.
 #[derive(Clone, Debug)]
@@ -40,6 +41,8 @@ pub struct Session {
     change_dtr: Option<bool>,
     handshake: Handshake,
     stream: Stream,
+    /// Whether the descriptor of the stream has arrived.
+    is_announced: bool,
     counters: StreamCounters,
     /// Time since which there are no subscribers.
     idle_since: Option<Nanos>,
@@ -79,6 +82,7 @@ impl Session {
             change_dtr: None,
             handshake: Handshake::new(settings),
             stream: Stream::new(settings),
+            is_announced: false,
             counters: StreamCounters::default(),
             idle_since: None,
         };
@@ -124,6 +128,7 @@ impl Session {
     /// Begins again at the current rate. The session shows the state `shown` until measured data arrive.
     fn begin(&mut self, shown: State) {
         self.end_stream();
+        self.is_announced = false;
         self.shown = shown;
         if self.settings.listen_only {
             self.phase = Phase::Listening { since: self.now };
@@ -310,6 +315,8 @@ impl Session {
             Phase::Querying { query, .. } if !query.is_scan() => self.framer.expect(Expect::Answers),
             Phase::Querying { .. } | Phase::Listening { .. } | Phase::Streaming(_) => {
                 self.end_stream();
+                self.is_announced = true;
+                self.framer.kind().into_iter().for_each(|kind| self.handshake.stream_begins(kind));
                 let mut watchdog = self.continue_stream();
                 watchdog.await_spin_up(self.now + SPIN_UP);
                 self.phase = Phase::Streaming(watchdog);
@@ -610,6 +617,29 @@ impl line::Session for Session {
         (line::Session::trouble(self) == Some(Trouble::Alike)).then_some("model or mode")
     }
 
+    fn model_text(&self) -> Option<String> {
+        let number = || self.info().map(|info| format!("0x{:02x}", info.id));
+        self.model().map(|model| model.name().to_uppercase()).or_else(number)
+    }
+
+    fn stream_head(&self, reported: &str, beams: Option<usize>) -> Vec<u8> {
+        let Some(kind) = self.framer.kind() else { return Vec::new() };
+        let (model, modes) = (self.model(), self.handshake.modes());
+        if self.is_announced && self.info().is_some() && modes.is_unambiguous(kind) {
+            return Vec::new();
+        }
+        let sample_us = self.stream.reported_us(model, beams);
+        let of_status = reported.split_whitespace().nth(1).and_then(Mode::named);
+        let is_it = |mode: &Mode| sample_us.is_some_and(|us| modes.has(*mode, kind, us as f32));
+        let head = StreamHead {
+            info: self.info().or_else(|| Info::of_status(model, reported)),
+            mode: self.handshake.mode().or(of_status.filter(is_it)),
+            sample_us,
+            kind,
+        };
+        head.encode()
+    }
+
     fn write_details(&self, text: &mut dyn fmt::Write) {
         let _ = self.handshake.mode().map_or(Ok(()), |mode| write!(text, " {}", mode.name()));
         if let Some(Info { firmware: (major, minor), .. }) = self.info() {
@@ -638,7 +668,12 @@ impl line::Session for Session {
         let info = self.info().filter(|_| !is_asked)?;
         let (major, minor) = info.firmware;
         let serial: String = info.serial.iter().map(|byte| format!("{byte:02X}")).collect();
-        let identity = format!("firmware {major}.{minor:02}, hardware {}, number {serial}", info.hardware);
+        let model = match info.model() {
+            Some(_) => String::new(),
+            None => format!("model 0x{:02x} (unknown), ", info.id),
+        };
+        let hardware = info.hardware;
+        let identity = format!("{model}firmware {major}.{minor:02}, hardware {hardware}, number {serial}");
         Some(Introduction {
             identity,
             health: self.health().map_or_else(String::new, |health| health.to_string()),

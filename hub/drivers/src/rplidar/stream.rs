@@ -200,16 +200,13 @@ impl Stream {
 
     /// Chooses the number of beams as soon as the speed of the head is known, once per stream.
     fn choose_beams(&mut self, kind: Kind, handshake: &Handshake) {
-        let Settings { mode, beams, max_beams, .. } = self.settings;
-        let Some(points_per_second) = self.points_per_second().filter(|_| !self.revolutions.is_begun) else {
-            return;
-        };
+        let Settings { beams, max_beams, .. } = self.settings;
+        let Some(point_ns) = self.point_time.ns.filter(|_| !self.revolutions.is_begun) else { return };
         let Some(advance) = self.sequence.advance() else { return };
         let points_per_turn = 360.0 / advance * kind.points() as f64;
-        let own = match (handshake.model(), mode) {
-            (Some(model), None) => self.reported_beams(model, kind, handshake).unwrap_or(model.beams()),
-            (Some(model), Some(_)) => model.beams_of(points_per_second),
-            (None, _) => (points_per_turn + 0.5) as usize,
+        let own = match handshake.model() {
+            Some(model) => self.beams_of(model, kind, point_ns, handshake),
+            None => (points_per_turn + 0.5) as usize,
         };
         let most = max_beams.unwrap_or(*line::grid::BEAMS.end());
         let beams = beams.or(self.beams).unwrap_or(own.max(*line::grid::BEAMS.start())).min(most);
@@ -217,15 +214,30 @@ impl Stream {
         self.revolutions.begin(beams);
     }
 
-    /// Returns the number of beams for the points per second that the scanner has reported, if the beams follow it:
-    /// that of the `model`, if it is close. An A1 with an old firmware measures half as many points as the others.
-    fn reported_beams(&self, model: Model, kind: Kind, handshake: &Handshake) -> Option<usize> {
-        let follows = self.settings.is_found && self.settings.model.is_none();
-        let point_us = self.point_time.ns.filter(|_| follows)? / 1e3;
-        let reported_us = handshake.modes().nearest_us(kind, point_us as f32)?;
-        let beams = model.beams_of(1e6 / reported_us);
-        let is_close = (beams as f64 / model.beams() as f64 - 1.0).abs() <= CLOSE;
-        Some(if is_close { model.beams() } else { beams })
+    /// Returns the number of beams of a `model` that takes `point_ns` per point: that of the mode in the settings, or that of
+    /// the mode that the scanner has reported, if the beams follow it. Otherwise that of the fastest mode. An A1 with an old
+    /// firmware measures half as many points as the others.
+    fn beams_of(&self, model: Model, kind: Kind, point_ns: f64, handshake: &Handshake) -> usize {
+        let Settings { model: named, mode, is_found, listen_only, .. } = self.settings;
+        let point_us = (point_ns / 1e3) as f32;
+        let follows = listen_only || is_found && named.is_none();
+        let mode_us = match mode {
+            Some(_) => Some(point_us),
+            None => handshake.modes().nearest_us(kind, point_us).filter(|_| follows),
+        };
+        mode_us.map_or(model.beams(), |us| model.beams_in_mode(1e6 / us))
+    }
+
+    /// Returns the microseconds per point that a scanner of this `model` must have reported: the measured ones, unless the
+    /// number of `beams` of its scans shows that it reported another value. A real A1 takes 0.7 % longer than it reports.
+    pub(crate) fn reported_us(&self, model: Option<Model>, beams: Option<usize>) -> Option<f64> {
+        let measured = self.point_time.ns? / 1e3;
+        let of_scans = model.zip(beams).and_then(|(model, beams)| {
+            let reported = 1e6 / (beams as f64 * f64::from(model.turns_per_second()));
+            let is_other = model.beams_in_mode((1e6 / measured) as f32) != beams;
+            (is_other && (reported / measured - 1.0).abs() <= OFF).then_some(reported)
+        });
+        of_scans.or(Some(measured))
     }
 
     /// Returns the speed of the head. `None` before the revolutions have begun.
@@ -450,8 +462,8 @@ const FIRST_MEASUREMENT: Nanos = 250 * MILLIS;
 const UNSTEADY: f64 = 0.005;
 /// Nanoseconds by which packets that arrive together may be late.
 const LATE: f64 = 15e6;
-/// Share by which the reported number of points may differ from that of the model.
-const CLOSE: f64 = 0.03;
+/// Maximum share by which the time per point may differ from the reported one.
+const OFF: f64 = 0.02;
 /// Maximum number of points in a revolution: those of an S2 at four revolutions per second.
 const MAX_POINTS: usize = 8_192;
 /// Maximum number of packets of one sample.

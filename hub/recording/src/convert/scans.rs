@@ -184,10 +184,7 @@ impl Turns {
         let Some(family) = recording.family().filter(|family| !features(*family).has_whole_telegrams) else {
             return Ok(None);
         };
-        let model = recording.model()?.map(|model| model.name);
-        let (beams, mode) = (recording.beams(), recording.contents().way);
-        let settings =
-            Settings { model, mode, beams, fixed_rate: true, listen_only: true, ..Settings::default() };
+        let settings = recording.session_settings()?;
         Ok(Some(Turns { family, settings, session: None, scan: Box::default() }))
     }
 

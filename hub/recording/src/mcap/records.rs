@@ -517,9 +517,14 @@ fn is_border(bytes: &[u8], messages: bool) -> bool {
     }
 }
 
-/// Returns whether a chunk or a message of the hub starts anywhere in `bytes`.
+/// Returns whether a chunk with messages or a message of the hub starts anywhere in `bytes`. Packets of a scanner that sees
+/// nothing are zeros, and with the range before them they may look like an empty chunk.
 pub(crate) fn has_border(bytes: &[u8]) -> bool {
-    (0..bytes.len()).any(|at| is_border(&bytes[at..], true))
+    let is_dated = |bytes: &[u8]| match split_head(bytes) {
+        Some((op::CHUNK, _)) => bytes[HEAD..].iter().take(8).any(|byte| *byte != 0),
+        _ => true,
+    };
+    (0..bytes.len()).any(|at| is_border(&bytes[at..], true) && is_dated(&bytes[at..]))
 }
 
 /// Returns whether `bytes` start with a message of the hub, whole or not.

@@ -113,12 +113,12 @@ pub(crate) fn stream_descriptor(mode: &Mode) -> Vec<u8> {
     descriptor(mode.form.packet_len(), true, mode.form.answer())
 }
 
-/// Encodes model, firmware, hardware, and a serial number that `seed` selects.
-pub(crate) fn info(model: Model, seed: u64) -> Vec<u8> {
+/// Encodes the number `id` of the model, firmware, hardware, and a serial number that `seed` selects.
+pub(crate) fn info(model: Model, id: u8, seed: u64) -> Vec<u8> {
     let ([major, minor], hardware) = model.versions();
     let mut random = fastrand::Rng::with_seed(seed ^ u64::from(model.id()) << 32);
     let serial: [u8; 16] = std::array::from_fn(|_| random.u8(..));
-    answer(&[&[model.id(), minor, major, hardware][..], &serial].concat(), 0x04)
+    answer(&[&[id, minor, major, hardware][..], &serial].concat(), 0x04)
 }
 
 /// Encodes a health status (0 good, 1 warning, 2 error) and a code.
@@ -164,13 +164,11 @@ pub(crate) fn board(steers: bool) -> Vec<u8> {
     answer(&[u8::from(steers), 0, 0, 0], 0xFF)
 }
 
-/// Encodes the boot message: 64 bytes of ASCII.
-pub(crate) fn boot_message(model: Model) -> Vec<u8> {
+/// Encodes the boot message of a scanner that reports `id` as its model: 64 bytes of ASCII.
+pub(crate) fn boot_message(model: Model, id: u8) -> Vec<u8> {
     let ([major, minor], hardware) = model.versions();
-    let text = format!(
-        "RP LIDAR System.\r\nFirmware Ver {major}.{minor}, HW Ver {hardware}\r\nModel: {:02x}",
-        model.id()
-    );
+    let text =
+        format!("RP LIDAR System.\r\nFirmware Ver {major}.{minor}, HW Ver {hardware}\r\nModel: {id:02x}");
     let mut bytes = text.into_bytes();
     bytes.resize(BOOT_MESSAGE_LEN - 2, b' ');
     bytes.extend(b"\r\n");

@@ -8,5 +8,6 @@ mod machine;
 mod recognize;
 mod search;
 mod session;
+mod stream_files;
 mod unit;
 mod worlds;

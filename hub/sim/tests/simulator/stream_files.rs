@@ -1,0 +1,291 @@
+//! A recording becomes a stream file (`.bin`) and is read again: every model of the rotating scanners, in every mode, has the same
+//! scans, wherever the recording begins. A stream file has no stamps, so stamps are not compared.
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+use std::sync::atomic::AtomicBool;
+
+use recording::convert::{ConvertOptions, Converted, convert};
+use recording::{Encoding, Form, Recording, VirtualTime};
+use scanhub_drivers::line::{Event, Output, Protocol as _, Session as _};
+use scanhub_drivers::{Session, Settings, ld};
+use schema::datagram::Packed;
+use schema::file::Writer;
+use schema::{Family, Foreground, Header, MILLIS, Nanos, Scan, Status, Topic};
+use sim::Arrival;
+use sim::device::Device;
+use sim::fault::Faults;
+use sim::ld::{Head, HeadSettings, Packets};
+use sim::room::Room;
+use sim::rplidar::{Model, Unit, UnitSettings};
+use sim::wire::Wire;
+use tempfile::TempDir;
+
+const SECOND: Nanos = 1_000 * MILLIS;
+/// Length of a recording. The motor of an RPLIDAR takes 1.6 s to get up to speed.
+const LENGTH: Nanos = 9 * SECOND;
+/// Time at which a recording begins that lacks the beginning of the stream.
+const JOINED: Nanos = 4 * SECOND;
+/// Time at which the clock of a read file begins.
+const BEGIN: Nanos = 10 * SECOND;
+/// Length of a packet of one point, in bytes.
+const POINT: u64 = 5;
+const WALL: u64 = 1_700_000_000_000_000_000;
+
+/// Telegrams, scans and status that a hub published of a scanner.
+struct Live {
+    family: Family,
+    telegrams: Vec<(Header, Vec<u8>)>,
+    scans: Vec<(Nanos, Box<Scan>)>,
+    status: Status,
+}
+
+impl Live {
+    /// Runs a session with `settings` on `device` for [`LENGTH`].
+    fn of(device: &mut dyn Device, family: Family, settings: &Settings) -> Live {
+        let mut wire = Wire::new(&Faults::default(), 3);
+        let mut session = Session::begin(family, settings, 0);
+        let mut live = Live { family, telegrams: Vec::new(), scans: Vec::new(), status: Status::default() };
+        for now in (0..LENGTH).step_by(MILLIS as usize) {
+            let mut bytes = Vec::new();
+            while let Some(carried) = wire.poll_transmit(device, now) {
+                bytes.extend(carried.bytes);
+            }
+            let spare = session.spare();
+            let len = bytes.len();
+            spare[..len].copy_from_slice(&bytes);
+            session.commit(now, len);
+            if len == 0 {
+                session.handle_timeout(now);
+            }
+            loop {
+                match session.poll_output() {
+                    Output::Event(Event::Telegram(received)) => {
+                        let header = Header {
+                            seq: live.telegrams.len() as u64,
+                            topic_seq: live.telegrams.len() as u64,
+                            stamp_first_ns: received.first,
+                            stamp_last_ns: received.last,
+                            wall_ns: WALL + received.first,
+                            boot: 77,
+                            hub_pid: 1,
+                            family: family as u8,
+                            reasons: received.reasons,
+                            ..Header::default()
+                        };
+                        live.telegrams.push((header, received.bytes.to_vec()));
+                    }
+                    Output::Event(Event::Scan(raw)) => {
+                        let mut scan = Scan::zeroed(raw.payload_len());
+                        raw.write(&mut scan);
+                        live.scans.push((raw.first, scan));
+                    }
+                    Output::Transmit { bytes, .. } => {
+                        let bytes = bytes.to_vec();
+                        let is_heard = session.rate() == device.rate();
+                        for byte in bytes.iter().filter(|_| is_heard) {
+                            wire.receive(device, *byte, Arrival::at(now));
+                        }
+                        session.transmitted(now);
+                    }
+                    Output::SetRate(_) | Output::SetDtr(_) => {}
+                    Output::Rest(_) | Output::Wait { .. } => break,
+                }
+            }
+        }
+        live.status.family = family as u8;
+        session.describe(&mut live.status);
+        live
+    }
+
+    /// Writes the default topics of a recorder that is attached at `from`.
+    fn record(&self, folder: &TempDir, from: Nanos) -> PathBuf {
+        let mut writer = Writer::begin(Vec::new(), "", BTreeMap::new()).unwrap();
+        let mut room = vec![0; 32_768];
+        let first = self.telegrams.iter().position(|(header, _)| header.stamp_first_ns >= from).unwrap();
+        let (header, _) = self.telegrams[first];
+        let mut write = |topic, header: &Header, payload: &[u8]| {
+            writer.sample("front", topic, header, payload).unwrap();
+        };
+        let len = self.status.pack(&mut room).unwrap();
+        write(Topic::Status, &header, &room[..len]);
+        for (header, telegram) in &self.telegrams[first..] {
+            write(Topic::Telegram, header, telegram);
+        }
+        let (header, _) = self.telegrams[self.telegrams.len() - 1];
+        let len = Foreground::of(self.scans[0].1.beams()).pack(&mut room).unwrap();
+        write(Topic::Foreground, &header, &room[..len]);
+        let path = folder.path().join(format!("from-{from}.mcap"));
+        std::fs::write(&path, writer.finish().unwrap()).unwrap();
+        path
+    }
+}
+
+fn converted(input: &Path, output: &str) -> (PathBuf, Converted) {
+    let output = input.with_file_name(output);
+    let options = ConvertOptions {
+        input: input.to_owned(),
+        output: output.clone(),
+        force: true,
+        ..ConvertOptions::default()
+    };
+    let converted = convert(&options, &AtomicBool::new(false), |_, _| {}).unwrap();
+    (output, converted)
+}
+
+/// Reads the scans of a recording, as a replay does.
+fn scans_of(path: &Path) -> Vec<Box<Scan>> {
+    let recording = Recording::open(path).unwrap();
+    let family = recording.family().expect("known");
+    let settings = recording.session_settings().unwrap();
+    let mut session: Option<VirtualTime<Session>> = None;
+    let mut scans = Vec::new();
+    for frame in recording.telegrams(Encoding::default()).unwrap() {
+        let at = frame.header.map_or(BEGIN + frame.scanner_ns.unwrap_or(0), |header| header.stamp_last_ns);
+        let session =
+            session.get_or_insert_with(|| VirtualTime::new(Session::begin(family, &settings, at), at));
+        session.take(at, &frame.telegram, |event| {
+            if let Event::Scan(raw) = event {
+                let mut scan = Scan::zeroed(raw.payload_len());
+                raw.write(&mut scan);
+                scans.push(scan);
+            }
+        });
+    }
+    scans
+}
+
+fn is_same(a: &Scan, b: &Scan) -> bool {
+    let angles = |scan: &Scan| (0..scan.beams()).map(|beam| scan.angle(beam)).collect::<Vec<f64>>();
+    let is_near = |(a, b): (&f64, &f64)| (a - b).abs() < 1e-5 || a.is_nan() && b.is_nan();
+    (a.beams(), a.flags, a.family, a.collapsed) == (b.beams(), b.flags, b.family, b.collapsed)
+        && a.ranges() == b.ranges()
+        && a.intensities() == b.intensities()
+        && angles(a).iter().zip(&angles(b)).all(is_near)
+}
+
+/// Checks that `path` has the scans of `live` that began after `from`, except the first `learning` ones.
+fn check(name: &str, live: &Live, from: Nanos, path: &Path, learning: usize) {
+    let expected: Vec<_> = live.scans.iter().filter(|(first, _)| *first >= from).collect();
+    let read = scans_of(path);
+    // A file that has the time per point may have an earlier scan, before which the live session was measuring that time.
+    let earlier = (0..read.len().min(3)).find(|&number| is_same(&expected[0].1, &read[number])).unwrap_or(0);
+    let read = &read[earlier..];
+    let first = read.first().unwrap_or_else(|| panic!("{name}: no scan"));
+    let begin = expected.iter().position(|(_, scan)| is_same(scan, first));
+    let beams = (first.beams(), expected[0].1.beams());
+    let begin = begin.unwrap_or_else(|| panic!("{name}: another scan, {beams:?} beams"));
+    assert!(begin <= learning, "{name}: the first {begin} scans are missing");
+    for (number, (read, (_, live))) in read.iter().zip(&expected[begin..]).enumerate() {
+        assert!(is_same(read, live), "{name}: scan {number} is another one");
+    }
+    assert_eq!(begin + read.len(), expected.len(), "{name}: {begin} and {}", read.len());
+    assert!(read.len() > 20, "{name}: {}", read.len());
+}
+
+/// Checks that the scans of `live` come back from a stream file, whenever the recording began.
+fn check_stream_files(name: &str, live: &Live, learning: usize) {
+    let folder = TempDir::new().unwrap();
+    for from in [0, JOINED] {
+        let name = format!("{name} from {} s", from / SECOND);
+        let recorded = live.record(&folder, from);
+        let recording = Recording::open(&recorded).unwrap();
+        let (stream, account) = converted(&recorded, "a.bin");
+        assert_eq!(account.telegrams, recording.contents().telegrams, "{name}");
+        let read = Recording::open(&stream).unwrap();
+        assert_eq!((read.contents().form, read.family()), (Form::Telegrams, Some(live.family)), "{name}");
+        // A point without a checksum counts only if another one follows.
+        assert!(read.contents().damage.bytes <= POINT, "{name}: {}", read.contents().damage);
+        // Models of LDROBOT may be alike.
+        let model = |recording: &Recording| recording.model().unwrap().map(|model| (model.baud, model.beams));
+        assert_eq!(model(&read), model(&recording), "{name}");
+        let took = read.contents().scanner_ns.expect("a clock of the scanner");
+        let expected = LENGTH
+            - live
+                .telegrams
+                .iter()
+                .map(|(header, _)| header.stamp_first_ns)
+                .find(|first| *first >= from.max(live.scans[0].0))
+                .unwrap();
+        assert!(took.abs_diff(expected) < SECOND, "{name}: {took} {expected}");
+        check(&name, live, from, &stream, learning);
+        // A file of packets and their stamps again, and a stream file of that.
+        let (again, _) = converted(&stream, "b.mcap");
+        check(&format!("{name}, in MCAP"), live, from, &again, learning);
+        let (twice, _) = converted(&again, "c.bin");
+        let [bytes, twice] = [stream, twice].map(|path| std::fs::read(path).unwrap());
+        let missing = bytes.len() - twice.len();
+        assert!(bytes.starts_with(&twice) && missing as u64 <= POINT, "{name}: {missing} bytes are missing");
+    }
+}
+
+fn room() -> Room {
+    Room::new(&"room".parse().expect("a world"), 1)
+}
+
+#[test]
+fn every_rplidar_in_every_mode_has_the_same_scans() {
+    for model in Model::ALL {
+        let fastest = Settings { is_found: true, ..Settings::default() };
+        let modes = model.modes().iter().map(|mode| {
+            let mode = scanhub_drivers::rplidar::Mode::named(mode.name).expect("known").name();
+            (mode, Settings { model: Some(model.name()), mode: Some(mode), ..Settings::default() })
+        });
+        for (mode, settings) in modes.chain([("the fastest mode", fastest)]) {
+            let mut unit = Unit::new(UnitSettings::of(model), room());
+            let live = Live::of(&mut unit, Family::Rplidar, &settings);
+            check_stream_files(&format!("{} {mode}", model.name()), &live, 3);
+        }
+    }
+}
+
+#[test]
+fn every_ldrobot_has_the_same_scans() {
+    for model in ld::Model::ALL {
+        for settings in [Settings::default(), Settings { model: Some(model.name()), ..Settings::default() }] {
+            let mut head = Head::new(HeadSettings::of(model), Packets::Room(Box::new(room())));
+            let live = Live::of(&mut head, Family::Ld, &settings);
+            check_stream_files(model.name(), &live, 8);
+        }
+    }
+}
+
+/// A stream that was captured without the responses of the scanner is read as before: its packets are found, and scans need the
+/// model or the mode if the packets may be of two kinds.
+#[test]
+fn stream_without_responses_needs_model_or_mode_if_its_packets_look_alike() {
+    let folder = TempDir::new().unwrap();
+    let settings = Settings { model: Some("s1"), ..Settings::default() };
+    let live = Live::of(&mut Unit::new(UnitSettings::of(Model::S1), room()), Family::Rplidar, &settings);
+    let packets = live.telegrams.iter().filter(|(header, _)| header.stamp_first_ns >= JOINED);
+    let bytes: Vec<u8> = packets.flat_map(|(_, bytes)| bytes.clone()).collect();
+    let path = folder.path().join("old.bin");
+    std::fs::write(&path, &bytes).unwrap();
+    let recording = Recording::open(&path).unwrap();
+    assert_eq!((recording.contents().telegrams > 100, recording.contents().damage.bytes), (true, 0));
+    let failure = recording.session_settings().unwrap_err();
+    assert!(failure.hint.contains("link.NAME.model or mode is set"), "{failure}");
+    let frames: Vec<_> = recording.telegrams(Encoding::default()).unwrap().collect();
+    assert!(frames.iter().flat_map(|frame| &frame.telegram).eq(&bytes));
+    let in_mode = |settings: Settings| {
+        let settings = Settings { fixed_rate: true, listen_only: true, ..settings };
+        let mut session = VirtualTime::new(Session::begin(Family::Rplidar, &settings, BEGIN), BEGIN);
+        let mut beams = Vec::new();
+        for frame in &frames {
+            session.take(BEGIN + frame.scanner_ns.unwrap_or(0), &frame.telegram, |event| {
+                if let Event::Scan(scan) = event {
+                    beams.push(scan.beams());
+                }
+            });
+        }
+        beams
+    };
+    assert!(in_mode(Settings::default()).is_empty());
+    for named in [settings, Settings { mode: Some("denseboost"), ..Settings::default() }] {
+        let beams = in_mode(named);
+        assert!(beams.len() > 20 && beams.iter().all(|beams| beams.abs_diff(920) < 20), "{beams:?}");
+    }
+    // It stays as it is.
+    let (copy, _) = converted(&path, "copy.bin");
+    assert!(std::fs::read(copy).unwrap() == bytes);
+}
