@@ -3,6 +3,7 @@
 
 use serde_json::Value;
 
+use crate::replay_packets::{recorder, replay, samples, scan};
 use crate::testkit::{INT, Program, TERM, TestEnv, is_class, number, sequence};
 
 /// A scanner of this model.
@@ -116,6 +117,69 @@ fn probe_asks_what_it_is_and_listens_to_its_line() {
         let sent = env.truth("front");
         assert!(sent[..2].iter().all(|sent| sent.is_reply), "first what it is, and how");
     }
+}
+
+/// A model that is newer than this version.
+#[test]
+fn a_model_that_is_not_known_is_shown_with_its_number() {
+    let env = TestEnv::new();
+    let _simulator = simulator(&env, "s2", &["--fault=id=0x95"]);
+    let probed = env.search(&["probe", &env.word("front"), "--json"]);
+    let [found] = &probed.lines()[..] else { panic!("{probed}") };
+    assert_eq!((text(found, "family"), &found["model"]), ("rplidar", &Value::Null), "{found}");
+    assert!(text(found, "identity").starts_with("model 0x95 (unknown), firmware 1.02"), "{found}");
+
+    let hub = env.hub(&[env.link("front")]);
+    let info = env.await_info("front", |info| info["state"] == "streaming");
+    assert_eq!((text(&info, "model"), text(&info, "type")), ("0x95", "0x95 denseboost 1.02"), "{info}");
+    assert_eq!((number(&info, "angle_deg"), text(&info, "last_error")), (360, ""), "{info}");
+    let mut scans = env.echo(&["front/scan"]);
+    for scan in scans.await_lines(5, "a scan", is_class("scan")) {
+        assert!(number(&scan, "count").abs_diff(3_200) < 100, "as many as it measures: {scan}");
+    }
+    let info = env.run(&["info", "front"]).to_string();
+    assert!(info.contains("0x95 (unknown)") && info.contains("denseboost 1.02"), "{info}");
+    let outcome = hub.end(TERM);
+    assert!(
+        outcome.errors.contains("front: found rplidar model 0x95 (unknown) at 1000000 baud"),
+        "{outcome}"
+    );
+}
+
+/// A recorder that is attached to a stream misses what the scanner has reported before. The stream file has it.
+#[test]
+fn a_stream_file_has_the_scans_that_were_recorded() {
+    let env = TestEnv::new();
+    let hub = env.hub(&[env.link("front")]);
+    let mut echo = env.echo(&["front/scan"]);
+    let simulator = simulator(&env, "s1", &[]);
+    echo.await_lines(2, "a scan", is_class("scan"));
+    let recorders = [recorder(&env, "all.mcap", &["--all"]), recorder(&env, "default.mcap", &[])];
+    echo.await_lines(40, "a scan", is_class("scan"));
+    for recorder in recorders {
+        assert_eq!(recorder.end(INT).code, Some(0));
+    }
+    assert_eq!((echo.end(INT).code, hub.end(TERM).code), (Some(0), Some(0)));
+    assert_eq!(simulator.end(TERM).code, Some(0));
+    let (recording, stream) = (env.word("default.mcap"), env.word("default.bin"));
+    let outcome = env.run(&["convert", &recording, &stream]);
+    assert_eq!(outcome.code, Some(0), "{outcome}");
+    replay(&env, "default.bin", &[]);
+    let ranges = |name: &str| -> Vec<Vec<u16>> {
+        let scans = samples(&env.path(name), "front/scan").into_iter();
+        scans.map(|(_, payload)| scan(&payload).ranges().to_vec()).collect()
+    };
+    let (recorded, replayed) = (ranges("all.mcap"), ranges("replayed.mcap"));
+    // The recorder of the default topics began later, and ended later.
+    let begin = recorded.iter().position(|scan| *scan == replayed[0]).expect("the first one was recorded");
+    let both = (recorded.len() - begin).min(replayed.len());
+    assert!(both > 25 && recorded[begin..][..both] == replayed[..both], "{begin} {both}");
+
+    let words = ["replay", "--json", "--no-system-config", "--hold", "--rate=max", &stream];
+    let player = env.start(&words).ready();
+    let info = env.await_info("front", |info| info["last_error"] == "the recording is at its end");
+    assert_eq!((text(&info, "model"), text(&info, "type")), ("s1", "S1 denseboost 1.02"), "{info}");
+    assert_eq!(player.end(TERM).code, Some(0));
 }
 
 #[test]

@@ -381,7 +381,8 @@ impl<'a, S: Surroundings> Drive<'a, S> {
                 }
                 None => tracing::info!("{}: found {name}", link.name),
             }
-            if session.model().is_none() && link.scanner.settings.beams.is_some() {
+            let has_own_beams = session.features().is_some_and(|features| features.models.is_empty());
+            if has_own_beams && link.scanner.settings.beams.is_some() {
                 tracing::info!(
                     "{}: {name} has its own number of beams: link.{}.beams is not used",
                     link.name,
@@ -401,9 +402,14 @@ impl<'a, S: Surroundings> Drive<'a, S> {
     }
 }
 
-/// Returns the model, or else the family.
-fn name_of(scanner: &KnownScanner) -> &str {
-    scanner.model.as_deref().unwrap_or(scanner.memory.family.name())
+/// Returns the model, or else the family. A model that scanhub does not know has only a number.
+fn name_of(scanner: &KnownScanner) -> String {
+    let family = scanner.memory.family.name();
+    match &scanner.model {
+        Some(number) if number.starts_with("0x") => format!("{family} model {number} (unknown)"),
+        Some(model) => model.clone(),
+        None => family.to_owned(),
+    }
 }
 
 /// Returns the scanner that an earlier run of the hub has found at the port of `core`.
