@@ -112,7 +112,7 @@ struct scanhub_scan_v2 {
     uint16_t valid_to;      /* the greatest value that is a range; all above are codes */
     uint16_t no_return;     /* the code of a beam that nothing returned to */
     uint16_t beyond;        /* the code of an echo from beyond the range limit */
-    uint16_t collapsed;     /* points that found their beam taken by a nearer one */
+    uint16_t collapsed;     /* points dropped because another has the same beam */
     uint8_t family;         /* SCANHUB_FAMILY_.. */
     uint8_t flags;          /* 1: packets of the turn are missing */
     uint8_t contents;       /* SCANHUB_SCAN_.. */
@@ -650,7 +650,7 @@ static inline int32_t scanhub_intensity(const struct scanhub_sample *scan, unsig
     return -1;
 }
 
-/* Points that found their beam taken by a nearer one. */
+/* Points that were dropped because another point has the same beam. Points without a return count, too. */
 static inline unsigned scanhub_collapsed(const struct scanhub_sample *scan)
 {
     const struct scanhub_scan_v2 *head = scanhub_scan_head(scan);
