@@ -113,6 +113,48 @@ fn what_is_wrong_is_told_with_its_remedy() {
     assert!(found == "failed" && text.contains("100 or 180"), "{text}");
 }
 
+/// A port has many names, and a hub may have been started in another directory.
+#[test]
+fn a_port_of_the_hub_is_found_by_any_of_its_names() {
+    let env = TestEnv::new();
+    let _simulator = env.simulator(&["front"], &[] as &[&str]);
+    let (front, again, directory) = (env.word("front"), env.word("again"), env.path(""));
+    std::os::unix::fs::symlink(&front, &again).expect("a link");
+    let device = env.path("front").canonicalize().expect("a pty").display().to_string();
+    // Without a hub, the link of the configuration is found.
+    let arguments = [&again, &env.link("front"), "--set", "link.front.unit=cm"];
+    let (findings, _) = doctor_of(&again, &env, &arguments, 0);
+    let (found, text) = state(&findings, "settings", Some(&again));
+    assert!(found == "warning" && text.contains("unit=cm"), "{text}");
+
+    let in_directory = |words: &[&str]| {
+        let mut command = env.command(words);
+        command.current_dir(&directory);
+        Program::start(command)
+    };
+    let hub = in_directory(&["run", "--json", "--link=front=./front"]).ready();
+    env.await_info("front", |info| info["state"] == "streaming");
+    for name in [&front[..], &again, &device, "./front", "again"] {
+        let outcome = in_directory(&["doctor", name, "--json", "--no-system-config"]).wait();
+        let (findings, _) = checks(outcome, 0);
+        for check in ["holder", "sensor", "line-errors", "line-loss"] {
+            let found = findings.iter().find(|line| line["name"] == check && line["port"] == name);
+            let found = found.unwrap_or_else(|| panic!("no {check} of {name}: {findings:#?}"));
+            assert_eq!((&found["state"], &found["link"]), (&"ok".into(), &"front".into()), "{found}");
+        }
+        for verb in [&["probe", name][..], &["configure", name, "unit=mm"]] {
+            let outcome = in_directory(&[verb, &["--json"]].concat()).wait();
+            let message = outcome.of_class("error")[0]["message"].to_string();
+            assert!(outcome.code == Some(4) && message.contains("its link front is streaming"), "{outcome}");
+        }
+    }
+    // The links of the hub, from another directory, with a name that leads to the port.
+    let (findings, _) = doctor(&env, &[], 0);
+    let (found, text) = state(&findings, "sensor", Some(&env.path("./front").display().to_string()));
+    assert!(found == "ok" && text.contains("link front of the hub: streaming"), "{text}");
+    assert_eq!(hub.end(TERM).code, Some(0));
+}
+
 #[test]
 fn a_sensor_that_is_not_well_is_no_good_set_up() {
     let env = TestEnv::new();

@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use port::Source;
+use port::{Source, is_same_line};
 use schema::{Failure, Kind};
 
 use crate::gateway::Gateway;
@@ -48,9 +48,8 @@ impl Config {
 fn check_ports(links: &[Link]) -> Result<(), Failure> {
     let is_same = |a: &Source, b: &Source| match (a, b) {
         (Source::File { .. }, _) => false,
-        (Source::Tty(a), Source::Tty(b)) => {
-            a == b || a.canonicalize().is_ok_and(|a| b.canonicalize().is_ok_and(|b| a == b))
-        }
+        (Source::Tty(a), Source::Tty(b)) => is_same_line(a, b),
+        // No name of a server is resolved to read a configuration.
         _ => a == b,
     };
     for (at, link) in links.iter().enumerate() {

@@ -163,6 +163,16 @@ fn check_tty_in(path: &Path, known: &Path) -> Result<(), PortError> {
     }
 }
 
+/// Returns whether two paths name the same line: the same device number, whatever the names are.
+pub fn is_same_line(a: &Path, b: &Path) -> bool {
+    let number = |path: &Path| {
+        let metadata = fs::metadata(path).ok().filter(|metadata| metadata.file_type().is_char_device())?;
+        Some(metadata.rdev())
+    };
+    let is_same_file = || a.canonicalize().is_ok_and(|a| b.canonicalize().is_ok_and(|b| a == b));
+    a == b || number(a).is_some_and(|a| Some(a) == number(b)) || is_same_file()
+}
+
 /// How long the adapter at `path` collects bytes before it hands them over, in milliseconds, if it reports that.
 pub fn latency_ms(path: &Path) -> Option<u8> {
     let device = path.canonicalize().ok()?;

@@ -11,6 +11,7 @@ mod uart;
 mod usb_adapter;
 
 use std::io;
+use std::net::{SocketAddr, ToSocketAddrs as _};
 use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
@@ -19,7 +20,9 @@ use rustix::io::Errno;
 use schema::Failure;
 
 pub use access::{Holder, Ownership, Rights, all_holders, altering_program, holder};
-pub use candidates::{Candidate, PROMPT_MS, candidates, check_tty, found_in, is_tty, latency_ms};
+pub use candidates::{
+    Candidate, PROMPT_MS, candidates, check_tty, found_in, is_same_line, is_tty, latency_ms,
+};
 pub use port_error::PortError;
 pub use tcp::{Allowance, Dial, Tcp};
 pub use tty::{Alteration, Tty};
@@ -56,6 +59,25 @@ impl Source {
             Source::Tcp { host, port } => format!("tcp:{host}:{port}"),
             Source::File { path, paced: true } => format!("file:{}", path.display()),
             Source::File { path, paced: false } => format!("file:{}?rate=max", path.display()),
+        }
+    }
+
+    /// Returns whether `other` names the same port: the same serial line, or the same address of a serial server. Two names of
+    /// a server with the same port number are resolved, which may take some seconds.
+    pub fn is_same_port(&self, other: &Source) -> bool {
+        match (self, other) {
+            (Source::Tty(a), Source::Tty(b)) => is_same_line(a, b),
+            (Source::Tcp { host: a, port: a_port }, Source::Tcp { host: b, port: b_port }) => {
+                let addresses = |host: &str| -> Vec<SocketAddr> {
+                    (host, *a_port).to_socket_addrs().map_or_else(|_| Vec::new(), Iterator::collect)
+                };
+                let is_same_host = || {
+                    let a = addresses(a);
+                    addresses(b).iter().any(|address| a.contains(address))
+                };
+                a_port == b_port && (a == b || is_same_host())
+            }
+            _ => self == other,
         }
     }
 
@@ -319,6 +341,27 @@ mod tests {
         end.read_to_end(&mut received).unwrap();
         assert!(!received.is_empty() && received.len() < bytes.len(), "{}", received.len());
         assert!(bytes.starts_with(&received));
+    }
+
+    #[test]
+    fn a_port_is_the_same_under_another_name() {
+        let directory = tempfile::tempdir().unwrap();
+        let link = directory.path().join("lidar");
+        std::os::unix::fs::symlink("/dev/null", &link).unwrap();
+        let is_same = |a: &str, b: &str| {
+            let [a, b] = [a, b].map(|text| Source::parse(text).unwrap());
+            assert_eq!(a.is_same_port(&b), b.is_same_port(&a));
+            a.is_same_port(&b)
+        };
+        let link = link.to_str().unwrap();
+        assert!(is_same(link, "/dev/null") && is_same("/dev/../dev/null", link));
+        assert!(!is_same(link, "/dev/zero") && !is_same("/dev/no-such-port", "/dev/another"));
+        assert!(is_same("/dev/no-such-port", "/dev/no-such-port"));
+        assert!(is_same("tcp:127.0.0.1:4001", "tcp:127.1:4001"), "two forms of one address");
+        assert!(is_same("tcp:localhost:4001", "tcp:localhost:4001"));
+        assert!(!is_same("tcp:127.0.0.1:4001", "tcp:127.0.0.1:4002"));
+        assert!(!is_same("tcp:127.0.0.1:4001", "tcp:127.0.0.2:4001"));
+        assert!(!is_same("/dev/null", "file:/dev/null"));
     }
 
     static NEVER: AtomicBool = AtomicBool::new(false);

@@ -272,7 +272,7 @@ fn choose(
         }
         None => &[],
     };
-    let of_link = |source: &Source| links.iter().find(|link| link.port == *source).cloned();
+    let of_link = |source: &Source| links.iter().find(|link| link.port.is_same_port(source)).cloned();
     if !subjects.ports.is_empty() {
         let named = subjects.ports.iter();
         return named
@@ -284,7 +284,7 @@ fn choose(
     // waits for stays unopened.
     let add_links_of_hub = |mut ports: Vec<Subject>| {
         for source in hub.map(Hub::ports).unwrap_or_default() {
-            if !ports.iter().any(|subject| is_same_port(&subject.source, &source)) {
+            if !ports.iter().any(|subject| subject.source.is_same_port(&source)) {
                 ports.push(Subject { source, link: None, named: false });
             }
         }
@@ -307,13 +307,4 @@ fn choose(
     let ports =
         ports.map(|port| Subject { source: Source::Tty(port.name.clone()), link: None, named: false });
     add_links_of_hub(ports.collect())
-}
-
-/// Returns whether two names belong to the same port.
-pub(crate) fn is_same_port(a: &Source, b: &Source) -> bool {
-    let device = |source: &Source| match source {
-        Source::Tty(path) => path.canonicalize().ok(),
-        Source::Tcp { .. } | Source::File { .. } => None,
-    };
-    a == b || device(a).is_some_and(|a| Some(a) == device(b))
 }

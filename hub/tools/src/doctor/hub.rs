@@ -8,8 +8,6 @@ use port::{Holder, Source};
 use schema::ipc::{self, Payload};
 use schema::{Domain, Environment, Failure, Kind, RunningHub, State, Status, is_remote};
 
-use super::is_same_port;
-
 /// A running hub.
 pub(crate) struct Hub {
     pub(crate) pid: u32,
@@ -51,13 +49,24 @@ impl Hub {
 
     /// Returns the port of a link, if `source` is the link's name and not the path of a file.
     pub(crate) fn port_of(&self, source: &Source) -> Option<Source> {
-        Source::parse(self.named(source)?.1.as_ref()?.port()).ok()
+        self.source_of(self.named(source)?.1.as_ref()?)
+    }
+
+    /// Returns the port of the link with this `status`. The hub may have been started in another directory.
+    fn source_of(&self, status: &Status) -> Option<Source> {
+        let source = Source::parse(status.port()).ok()?;
+        let Source::Tty(path) = &source else { return Some(source) };
+        let directory = || std::fs::read_link(format!("/proc/{}/cwd", self.pid)).ok();
+        match directory().filter(|_| path.is_relative()) {
+            Some(directory) => Some(Source::Tty(directory.join(path))),
+            None => Some(source),
+        }
     }
 
     /// Returns the ports of all links that report theirs.
     pub(crate) fn ports(&self) -> Vec<Source> {
         let statuses = self.statuses.iter().filter_map(|(_, status)| status.as_ref());
-        statuses.filter_map(|status| Source::parse(status.port()).ok()).collect()
+        statuses.filter_map(|status| self.source_of(status)).collect()
     }
 
     /// Returns whether `source` names a link whose port is unknown because its status did not arrive.
@@ -74,11 +83,11 @@ impl Hub {
     pub(crate) fn link(&self, port: &Source) -> Option<(&str, &Status)> {
         let links =
             || self.statuses.iter().filter_map(|(name, status)| Some((name.as_str(), status.as_ref()?)));
-        let is_of_port = |(_, status): &(&str, &Status)| {
-            Source::parse(status.port()).is_ok_and(|source| is_same_port(&source, port))
+        let is_named = |(_, status): &(&str, &Status)| self.source_of(status).as_ref() == Some(port);
+        let is_same = |(_, status): &(&str, &Status)| {
+            self.source_of(status).is_some_and(|source| source.is_same_port(port))
         };
-        let name = port.name();
-        links().find(|(_, status)| status.port() == name).or_else(|| links().find(is_of_port))
+        links().find(is_named).or_else(|| links().find(is_same))
     }
 
     /// Returns the reason why a port that the hub has open belongs to none of its reported links.
@@ -97,7 +106,9 @@ impl Hub {
             Some(State::Absent | State::Streaming | State::Paused) => info,
             _ if status.is_replayed() => info,
             _ => {
-                let (stop, port) = (self.stop(holders), schema::shell_word(status.port()));
+                let port =
+                    self.source_of(status).map_or_else(|| status.port().to_owned(), |source| source.name());
+                let (stop, port) = (self.stop(holders), schema::shell_word(&port));
                 format!("{info}; or stop the hub ({stop}), then search the port: scanhub probe {port}")
             }
         }
