@@ -21,13 +21,35 @@ use crate::testkit::{INT, TERM, TestEnv};
 
 const REMEDY: &str = "Remove family from link front and restart the hub: it finds the scanner";
 
+/// A scanner that streams, and one that waits for requests, with the families that they do not belong to. An LDROBOT never waits.
+const STREAMING: [(&[&str], [&str; 2]); 3] = [
+    (&["--family=ld", "--model=ld19"], ["lms", "rplidar"]),
+    (&["--baud=500000", "--state=streaming"], ["ld", "rplidar"]),
+    (&["--family=rplidar", "--model=a1", "--state=streaming"], ["lms", "ld"]),
+];
+const IDLE: [(&[&str], [&str; 2]); 2] =
+    [(&[], ["ld", "rplidar"]), (&["--family=rplidar", "--model=a1"], ["lms", "ld"])];
+
+/// Calls `check` with each scanner and each family that it does not belong to, at the same time.
+fn each_wrong(scanners: &[(&[&str], [&str; 2])], check: impl Fn(&[&str], &str) + Sync) {
+    std::thread::scope(|scope| {
+        let cases =
+            scanners.iter().flat_map(|(simulated, families)| families.map(|family| (*simulated, family)));
+        for (simulated, family) in cases {
+            let check = &check;
+            scope.spawn(move || check(simulated, family));
+        }
+    });
+}
+
 #[test]
 fn bytes_of_another_scanner_are_reported_with_their_rate() {
-    const LD19: &[&str] = &["--family=ld", "--model=ld19"];
-    const LMS: &[&str] = &["--baud=500000", "--state=streaming"];
-    for (simulated, family, missing) in
-        [(LD19, "lms", "LMS replies"), (LD19, "rplidar", "RPLIDAR replies"), (LMS, "ld", "LDROBOT packets")]
-    {
+    each_wrong(&STREAMING, |simulated, family| {
+        let missing = match family {
+            "lms" => "LMS replies",
+            "ld" => "LDROBOT packets",
+            _ => "RPLIDAR replies",
+        };
         let env = TestEnv::new();
         let _simulator = env.simulator(&["front"], &[&["--seed=43"], simulated].concat());
         let hub = env.hub(&[format!("{},family={family}", env.link("front"))]);
@@ -43,24 +65,52 @@ fn bytes_of_another_scanner_are_reported_with_their_rate() {
         for wrong in ["no answer", "power, cable"] {
             assert!(!outcome.errors.contains(wrong), "{outcome}");
         }
-    }
+    });
 }
 
 #[test]
 fn a_silent_line_may_have_another_scanner() {
-    for (family, says) in [
-        ("lms", "no answer at 9600, 19200, 38400 or 500000 baud"),
-        ("rplidar", "no answer at 115200, 256000, 460800 and 1000000 baud"),
-        ("ld", "no packets at 230400 and 921600 baud"),
-    ] {
+    each_wrong(&IDLE, |simulated, family| {
+        let says = match family {
+            "lms" => "no answer at 9600, 19200, 38400 or 500000 baud",
+            "ld" => "no packets at 230400 and 921600 baud",
+            _ => "no answer at 115200, 256000, 460800 and 1000000 baud",
+        };
         let env = TestEnv::new();
-        let _simulator = env.simulator(&["front"], &["--fault=mute=1"]);
+        let _simulator = env.simulator(&["front"], simulated);
         let _hub = env.hub(&[format!("{},family={family}", env.link("front"))]);
         let error = |info: &Value| info["last_error"].as_str().unwrap_or_default().to_owned();
         let info = env.await_info("front", |info| error(info).starts_with(says));
         let remedy = error(&info).split_once(" Another scanner? ").map(|(_, remedy)| remedy.to_owned());
         assert!(remedy.is_some_and(|remedy| remedy.starts_with("Remove family from link front")), "{info}");
-    }
+    });
+}
+
+/// `doctor` searches only for the family that a link names. `configure` writes only to an LMS.
+#[test]
+fn doctor_and_configure_name_the_search_for_any_scanner() {
+    let try_this = |port: &str| format!("is it another scanner? Try: scanhub probe {port}; ");
+    let check = |simulated: &[&str], family: &str| {
+        let env = TestEnv::new();
+        let _simulator = env.simulator(&["front"], &[&["--seed=43"], simulated].concat());
+        let (port, link) = (env.word("front"), format!("{},family={family}", env.link("front")));
+        let outcome = env.run(&["doctor", &port, &link, "--json", "--no-system-config"]);
+        assert_eq!(outcome.code, Some(5), "{outcome}");
+        let findings = outcome.of_class("check");
+        let sensor = findings.iter().find(|line| line["name"] == "sensor").expect("is checked");
+        let remedy = sensor["remedy"].as_str().expect("a text");
+        assert!(sensor["state"] == "failed" && remedy.starts_with(&try_this(&port)), "{sensor}");
+        if family == "lms" {
+            let outcome = env.run(&["configure", &port, "unit=mm", "--json"]);
+            let failure = &outcome.of_class("error")[0];
+            let hint = failure["hint"].as_str().expect("a text");
+            assert!(outcome.code == Some(3) && hint.starts_with(&try_this(&port)), "{outcome}");
+        }
+        // This leads to the scanner.
+        assert_eq!(env.search(&["probe", &port, "--json"]).code, Some(0));
+    };
+    each_wrong(&STREAMING, &check);
+    each_wrong(&IDLE, &check);
 }
 
 /// The remedy that the hub names leads to the scanner, and so does `probe`, which cannot search a port of the hub.

@@ -70,7 +70,7 @@ pub fn configure(order: &Order, stop: &AtomicBool, tell: &mut dyn FnMut(News<'_>
     let rate = if let Source::Tcp { .. } = order.source { None } else { Some(first) };
     let inquiry = Inquiry::begin(rate, clock::now());
     let report =
-        request_report(&port, first, inquiry, &order.source, stop, |rate| tell(News::Looking(rate)))?;
+        request_report(&port, first, inquiry, (&order.source, true), stop, |rate| tell(News::Looking(rate)))?;
     let name = order.source.name();
     let Some(mut plan) = Plan::of(&report) else {
         return Err(Failure::new(

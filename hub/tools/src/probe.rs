@@ -156,11 +156,11 @@ pub(crate) fn find(
     let found = match known {
         Some(family) => search::Found { family, model: None, rate: None },
         None => driver::search(port, only, stop, &mut look)?
-            .map_err(|not_found| nothing_found(source, &not_found))?,
+            .map_err(|not_found| nothing_found(source, only.is_some(), &not_found))?,
     };
     let rate = (!is_server(source)).then_some(found.rate.unwrap_or(first));
     if let Some(inquiry) = inquiry(found.family, rate, clock::now()) {
-        let report = request_report(port, first, inquiry, source, stop, look)?;
+        let report = request_report(port, first, inquiry, (source, only.is_some()), stop, look)?;
         return Ok(Answer::Asked(Box::new(report)));
     }
     let detected = detect(port, found, stop)?;
@@ -169,8 +169,8 @@ pub(crate) fn find(
 }
 
 /// Returns the failure for a port at which a search has found no scanner. The message lists the families and rates of the
-/// search, and the hint what to check at a scanner of each family.
-fn nothing_found(source: &Source, NotFound { bytes, coverage }: &NotFound) -> Failure {
+/// search, and the hint what to check at a scanner of each family. If a family was named, the scanner may belong to another one.
+fn nothing_found(source: &Source, is_named: bool, NotFound { bytes, coverage }: &NotFound) -> Failure {
     let (possible, impossible): (Vec<_>, Vec<_>) = coverage.iter().partition(|it| !it.rates.is_empty());
     let at_rates = |it: &&Coverage| format!("{} at {} Bd", it.family.name(), listed(&it.rates));
     let looked_for: Vec<String> = possible.iter().map(at_rates).collect();
@@ -191,6 +191,9 @@ fn nothing_found(source: &Source, NotFound { bytes, coverage }: &NotFound) -> Fa
         _ => "another device, a line that damages the bytes (ground, RS-232 instead of RS-422), or a missing wire?",
     }
     .to_owned()];
+    if is_named {
+        remedies.insert(0, other_scanner(source));
+    }
     remedies.extend(possible.iter().map(|it| format!("{}: {}", it.family.name(), it.advice)));
     for it in impossible {
         let (family, rates) = (it.family.name(), listed(&it.rejected));
@@ -200,6 +203,11 @@ fn nothing_found(source: &Source, NotFound { bytes, coverage }: &NotFound) -> Fa
         remedies.push(format!("{family}: use an adapter with a CP2102N, FT232R or newer"));
     }
     Failure::new(Kind::Timeout, message, remedies.join("; "))
+}
+
+/// Returns the remedy for a port at which no scanner of the named family replies.
+fn other_scanner(source: &Source) -> String {
+    format!("is it another scanner? Try: scanhub probe {}", schema::shell_word(&source.name()))
 }
 
 /// Lists `rates`, as in "9600, 19200 or 38400".
@@ -258,7 +266,7 @@ pub(crate) fn open(source: &Source, stop: &AtomicBool) -> Result<(Port, u32), Fa
 }
 
 /// Requests identity, settings and state of the scanner at `port` by `inquiry`. The highest rate of the port is `first`, in
-/// bits per second.
+/// bits per second. If the family was named, the scanner may belong to another one.
 ///
 /// # Errors
 ///
@@ -267,7 +275,7 @@ pub(crate) fn request_report(
     port: &Port,
     first: u32,
     mut inquiry: Inquiry,
-    source: &Source,
+    (source, is_named): (&Source, bool),
     stop: &AtomicBool,
     mut look: impl FnMut(u32),
 ) -> Result<Report, Failure> {
@@ -282,7 +290,14 @@ pub(crate) fn request_report(
     drive(port, &mut inquiry, &mut procedure, stop)?;
     let report = inquiry.report().clone();
     let streams_at = report.baud.map(|baud| baud.rate());
-    if report.answers() { Ok(report) } else { Err(silence(source, first, streams_at, report.bytes)) }
+    if report.answers() {
+        return Ok(report);
+    }
+    let failure = silence(source, first, streams_at, report.bytes);
+    let may_be_other = is_named && streams_at.is_none();
+    let hint =
+        if may_be_other { format!("{}; {}", other_scanner(source), failure.hint) } else { failure.hint };
+    Err(Failure { hint, ..failure })
 }
 
 fn is_server(source: &Source) -> bool {
@@ -346,7 +361,7 @@ mod tests {
         };
         let failure = |source: &str, bytes, rejected: &[u32]| {
             let not_found = NotFound { bytes, coverage: coverage(rejected) };
-            nothing_found(&Source::parse(source).expect("a port"), &not_found)
+            nothing_found(&Source::parse(source).expect("a port"), false, &not_found)
         };
         let silent = failure("/dev/ttyUSB0", 0, &[]);
         let looked_for = "/dev/ttyUSB0: no scanner replies; no byte arrived; looked for lms at 9600, 19200, 38400 or 500000 \
@@ -369,7 +384,9 @@ mod tests {
         // A link that names its family.
         let mut only = coverage(&[230_400, 921_600]);
         only.retain(|it| it.family == Family::Ld);
-        let only = nothing_found(&Source::Tty("/dev/ttyS0".into()), &NotFound { bytes: 0, coverage: only });
+        let not_found = NotFound { bytes: 0, coverage: only };
+        let only = nothing_found(&Source::Tty("/dev/ttyS0".into()), true, &not_found);
+        assert!(only.hint.starts_with("is it another scanner? Try: scanhub probe /dev/ttyS0; "), "{only}");
         assert_eq!(only.message, format!("/dev/ttyS0: no scanner replies; no byte arrived{cannot}"));
     }
 
