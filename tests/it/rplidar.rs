@@ -155,7 +155,7 @@ fn a_stream_file_has_the_scans_that_were_recorded() {
     let simulator = simulator(&env, "s1", &[]);
     echo.await_lines(2, "a scan", is_class("scan"));
     let recorders = [recorder(&env, "all.mcap", &["--all"]), recorder(&env, "default.mcap", &[])];
-    echo.await_lines(40, "a scan", is_class("scan"));
+    env.echo(&["front/scan"]).await_lines(40, "a scan with both recorders", is_class("scan"));
     for recorder in recorders {
         assert_eq!(recorder.end(INT).code, Some(0));
     }
