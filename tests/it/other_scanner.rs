@@ -109,8 +109,8 @@ fn doctor_and_configure_name_the_search_for_any_scanner() {
         // This leads to the scanner.
         assert_eq!(env.search(&["probe", &port, "--json"]).code, Some(0));
     };
-    each_wrong(&STREAMING, &check);
-    each_wrong(&IDLE, &check);
+    each_wrong(&STREAMING, check);
+    each_wrong(&IDLE, check);
 }
 
 /// The remedy that the hub names leads to the scanner, and so does `probe`, which cannot search a port of the hub.
