@@ -105,6 +105,11 @@ impl Everywhere {
         Domain::of_hub(&self.domain, self.root.as_deref(), &Environment::of_process())
     }
 
+    /// Returns the domain in which a program publishes: the running one, otherwise that of a hub that starts now.
+    pub(crate) fn publisher_domain(&self) -> Result<Domain, Failure> {
+        schema::publisher_domain(&self.domain, self.root.as_deref(), &Environment::of_process())
+    }
+
     /// The directories that may hold domains.
     pub(crate) fn bases(&self) -> Vec<PathBuf> {
         self.root.clone().map_or_else(|| Environment::of_process().bases(), |root| vec![root])

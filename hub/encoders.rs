@@ -1,58 +1,83 @@
-//! The angles of simulated mounts as topics, which a program of the encoder publishes for a real mount. Refuses to know what is
-//! mounted.
+//! Publishes the angles of simulated mounts as topics, as the program of an encoder does for a real mount.
 
 use std::sync::mpsc::{self, Receiver, Sender};
-use std::thread;
+use std::thread::{self, JoinHandle};
 
 use scanhub_client::{Publication, PublishSession, SensorPublisher, Wake};
 use schema::limits::TopicLimits;
-use schema::{Domain, Failure, Flags, Header, Kind, Maker, Tilt, publisher};
+use schema::{Domain, Failure, Flags, Header, Kind, Maker, Tilt};
 use sim::mount::Report;
 use sim::options::SimulateOptions;
 
-/// What publishes the angles of a mount, and wakes who follows them.
-type Topic = (Publication<Tilt>, SensorPublisher);
-/// A report of the encoder at the port with this number.
-type Said = (usize, Report);
+/// Publishing end of all mounts. Dropping it removes the topics.
+pub(crate) struct Encoders {
+    /// `None` once no more reports follow.
+    reports: Option<Sender<NumberedReport>>,
+    /// Owns the topics, because publishers stay in one thread.
+    thread: Option<JoinHandle<()>>,
+}
 
-/// Publishes each report that comes under the name of its port, until nobody reports any more. `places` are those of the
-/// domain.
-///
-/// [`Kind::Usage`] if a port has no mount, those of publishing.
-pub(crate) fn publish(
-    names: &[String],
-    options: &SimulateOptions,
-    places: &[Domain],
-) -> Result<Sender<Said>, Failure> {
-    for (number, name) in names.iter().enumerate() {
-        let has_mount = options.world.mount(number % options.world.sensors()).is_some();
-        if number >= options.ports.len() || !has_mount {
-            let what = format!("--angles {name}: no sensor with a mount is at port number {}", number + 1);
-            return Err(Failure::new(Kind::Usage, what, "--world tilt has one, see docs/worlds.md"));
+/// The topic of a mount, and its subscribers' wake-up.
+type MountTopic = (Publication<Tilt>, SensorPublisher);
+/// A report of the encoder at the port with this number.
+type NumberedReport = (usize, Report);
+
+impl Encoders {
+    /// Publishes the mount at port `i` as `names[i]` in `domain`.
+    ///
+    /// # Errors
+    ///
+    /// Returns [`Kind::Usage`] if a port has no mount. Otherwise the errors of [`PublishSession::beside`].
+    pub(crate) fn start(
+        names: &[String],
+        options: &SimulateOptions,
+        domain: &Domain,
+    ) -> Result<Encoders, Failure> {
+        for (number, name) in names.iter().enumerate() {
+            let has_mount = options.world.mount(number % options.world.sensors()).is_some();
+            if number >= options.ports.len() || !has_mount {
+                let what =
+                    format!("--angles {name}: no sensor with a mount is at port number {}", number + 1);
+                return Err(Failure::new(Kind::Usage, what, "--world tilt has one, see docs/worlds.md"));
+            }
+        }
+        let (reports, receiver) = mpsc::channel();
+        let (on_start, start) = mpsc::channel();
+        let (names, domain) = (names.to_vec(), domain.clone());
+        let thread = thread::spawn(move || match open(&names, &domain) {
+            Ok(topics) => {
+                let _ = on_start.send(Ok(()));
+                publish(&receiver, topics);
+            }
+            Err(failure) => {
+                let _ = on_start.send(Err(failure));
+            }
+        });
+        let encoders = Encoders { reports: Some(reports), thread: Some(thread) };
+        match start.recv() {
+            Ok(outcome) => outcome.map(|()| encoders),
+            Err(_) => Err(Failure::new(Kind::Failed, "the thread that publishes angles has ended", "")),
         }
     }
-    let (said, reports) = mpsc::channel();
-    let (is_up, up) = mpsc::channel();
-    let (names, places) = (names.to_vec(), places.to_vec());
-    // What publishes stays in one thread.
-    thread::spawn(move || match open(&names, &places) {
-        Ok(topics) => {
-            let _ = is_up.send(Ok(()));
-            pass_on(&reports, topics);
+
+    /// Publishes `report` of the encoder at port `number`, if it has a name.
+    pub(crate) fn report(&self, number: usize, report: Report) {
+        if let Some(reports) = &self.reports {
+            let _ = reports.send((number, report));
         }
-        Err(failure) => {
-            let _ = is_up.send(Err(failure));
-        }
-    });
-    match up.recv() {
-        Ok(outcome) => outcome.map(|()| said),
-        Err(_) => Err(Failure::new(Kind::Failed, "what publishes angles has ended", "")),
     }
 }
 
-fn open(names: &[String], places: &[Domain]) -> Result<Vec<Topic>, Failure> {
-    let lives = |domain: &&Domain| matches!(publisher(domain.root()), Ok(Some(_)));
-    let Some(domain) = places.iter().find(lives).or(places.first()) else { return Ok(Vec::new()) };
+impl Drop for Encoders {
+    fn drop(&mut self) {
+        self.reports = None;
+        if let Some(thread) = self.thread.take() {
+            let _ = thread.join();
+        }
+    }
+}
+
+fn open(names: &[String], domain: &Domain) -> Result<Vec<MountTopic>, Failure> {
     let open = |name: &String| {
         let sensor = PublishSession::beside(domain, name, Maker::Mount.topics(), TopicLimits::default())?;
         Ok((sensor.topic()?, sensor))
@@ -60,13 +85,14 @@ fn open(names: &[String], places: &[Domain]) -> Result<Vec<Topic>, Failure> {
     names.iter().map(open).collect()
 }
 
-fn pass_on(reports: &Receiver<Said>, mut topics: Vec<Topic>) {
+/// Publishes all reports until their sender is dropped.
+fn publish(reports: &Receiver<NumberedReport>, mut topics: Vec<MountTopic>) {
     for (number, report) in reports {
         let Some((topic, sensor)) = topics.get_mut(number) else { continue };
         let header = Header { flags: Flags::SIMULATED, ..topic.header_at(report.stamp_ns) };
-        let said = Tilt { angle_rad: report.angle_rad, rate_rad_s: report.rate_rad_s };
-        // A sample without memory is a number that is missing, and who cannot be woken looks ten times a second.
-        let _ = topic.send_with(&header, |sample| *sample = said);
+        let tilt = Tilt { angle_rad: report.angle_rad, rate_rad_s: report.rate_rad_s };
+        // Without memory, the sample's number is skipped. A subscriber that is not woken polls ten times a second.
+        let _ = topic.send_with(&header, |sample| *sample = tilt);
         let _ = sensor.wake(Wake::Telegram);
     }
 }

@@ -29,6 +29,7 @@ use verbs::{EchoOptions, Format, HzOptions, InfoOptions, ListOptions};
 
 use cli::{Cli, Everywhere, Verb, Way};
 use demo::DemoOptions;
+use encoders::Encoders;
 
 /// In the environment of a process that shall not outlive the one that started it.
 const END_WITH_PARENT: &str = "SCANHUB_END_WITH_PARENT";
@@ -208,11 +209,14 @@ fn say_ready(ready: &daemon::Ready, domain: &Domain, json: bool) {
         })
     } else {
         let place = domain.root().display();
-        let waiting = match &ready.waiting[..] {
+        let without_port: Vec<_> =
+            ready.waiting.iter().filter(|name| !ready.taken.contains(name)).cloned().collect();
+        let waiting = |what: &str, names: &[String]| match names {
             [] => String::new(),
-            waiting => format!("; waiting for the port of {}", waiting.join(", ")),
+            names => format!("; waiting for the {what} of {}", names.join(", ")),
         };
-        format!("ready {} in {place}, sensors: {}{waiting}", domain.name(), ready.sensors.join(", "))
+        let (ports, names) = (waiting("port", &without_port), waiting("name", &ready.taken));
+        format!("ready {} in {place}, sensors: {}{ports}{names}", domain.name(), ready.sensors.join(", "))
     });
 }
 
@@ -233,12 +237,9 @@ fn run_simulator(simulate: &cli::simulate::Simulate, everywhere: &Everywhere) ->
             say(&format!("ready {}", ports.join(" ")));
         }
     };
-    let said = encoders::publish(&simulate.angles, &options, &everywhere.places()?)?;
-    let say = |number, report| {
-        // Who publishes them lives as long as this.
-        let _ = said.send((number, report));
-    };
-    sim::simulate_with(&options, &stop, announce, |_| {}, |_| None, say).map(drop)
+    let encoders = Encoders::start(&simulate.angles, &options, &everywhere.publisher_domain()?)?;
+    let report = |number, report| encoders.report(number, report);
+    sim::simulate_with(&options, &stop, announce, |_| {}, |_| None, report).map(drop)
 }
 
 /// The line that says that the hub is up; keys in the order of their contract.

@@ -52,7 +52,7 @@ impl Listen {
             key_file: self.key_file.clone(),
             state: StateDirectory::of_domain(&everywhere.domain),
             stats: self.stats,
-            publish: if self.publish { Some(everywhere.hub_domain()?) } else { None },
+            publish: if self.publish { Some(everywhere.publisher_domain()?) } else { None },
             limits: TopicLimits { consumers: self.consumers.into(), ..TopicLimits::default() },
             json: everywhere.json,
             terminal: stdout().is_terminal(),

@@ -13,6 +13,8 @@ pub enum Kind {
     Failed,
     /// Another hub holds the domain: exit 1.
     DomainHeld,
+    /// Another process publishes under the name: exit 75.
+    NameHeld,
     /// Syntax of the command line, a topic that there is not, or a form that the verb does not take: exit 2.
     Usage,
     /// No hub lives in the domain: exit 3.
@@ -51,6 +53,7 @@ impl Kind {
         match self {
             Kind::Failed => "failed",
             Kind::DomainHeld => "domain_held",
+            Kind::NameHeld => "name_held",
             Kind::Usage => "usage",
             Kind::NoHub => "no_hub",
             Kind::NoTopic => "no_topic",
@@ -81,7 +84,7 @@ impl Kind {
             Kind::Check => 5,
             Kind::Input => 66,
             Kind::Output => 73,
-            Kind::Short => 75,
+            Kind::Short | Kind::NameHeld => 75,
             Kind::Configuration => 78,
             Kind::Interrupted => 130,
         }

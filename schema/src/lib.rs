@@ -79,7 +79,7 @@ pub use zones::{Early, Verdict, ZONES, Zone, Zones};
 #[cfg(feature = "ipc")]
 pub use directory::Directory;
 #[cfg(feature = "ipc")]
-pub use lock::{HubLock, ListenLock, NameLock, holder, is_starting, publisher};
+pub use lock::{HubLock, ListenLock, NameLock, holder, is_starting, name_held, publisher, publisher_domain};
 #[cfg(feature = "ipc")]
 pub use running::{RunningHub, shell_word};
 #[cfg(feature = "json")]

@@ -1,8 +1,8 @@
-//! Locks of the publishers in a domain: at most one hub, at most one listener for remote sensors, and any number of
-//! programs that publish under their own name. A lock ends with its process. Subscribers query the locks but never take
+//! Locks of the publishers in a domain: at most one hub, at most one listener for remote sensors, and one process for
+//! each name of a sensor, tracker or mount. A lock ends with its process. Subscribers query the locks but never take
 //! one.
 
-use std::fs::File;
+use std::fs::{self, File};
 use std::io;
 use std::os::fd::AsRawFd;
 use std::os::unix::fs::{FileExt, MetadataExt};
@@ -14,7 +14,7 @@ use nix::fcntl::{FcntlArg, fcntl};
 use nix::libc::{self, flock};
 
 use crate::ipc::isolation::{ensure_prefix, read_prefix};
-use crate::{Directory, Failure, Kind, ipc, shortage};
+use crate::{Directory, Domain, Environment, Failure, Kind, ipc, shortage};
 
 /// The lock of a hub on its domain; it ends with the value or with the process, however that ends. Drop it after the
 /// hub's node.
@@ -63,7 +63,8 @@ impl ListenLock {
     }
 }
 
-/// The lock of a program that publishes under a name of its own, such as a tracker or a mount. There need not be a hub.
+/// The lock of the process that publishes under a name: a program with a tracker or a mount, or the hub with a link. The
+/// doorbell and the services of the name belong to this process alone. There need not be a hub.
 #[derive(Debug)]
 pub struct NameLock {
     root: PathBuf,
@@ -75,14 +76,23 @@ impl NameLock {
     ///
     /// # Errors
     ///
-    /// As [`HubLock::acquire`], with another program that publishes under `name`.
+    /// Returns [`Kind::NameHeld`] if another process publishes under `name`; the message names it. Otherwise the errors of
+    /// [`HubLock::acquire`].
     pub fn acquire(root: &Path, name: &str) -> Result<NameLock, Failure> {
-        let held = Held::acquire(root, &format!("name.{name}.lock"), |pid| {
-            let what = format!("another program publishes as {name} in {}: pid {pid}", root.display());
-            Failure::new(Kind::DomainHeld, what, "end it, or choose another name")
-        });
+        let held = Held::acquire(root, &format!("name.{name}.lock"), |pid| name_held(name, pid));
         Ok(NameLock { _held: held?, root: root.to_owned() })
     }
+}
+
+/// Returns the failure if process `pid` publishes under `name`.
+pub fn name_held(name: &str, pid: u32) -> Failure {
+    let process = match fs::read_to_string(format!("/proc/{pid}/comm")) {
+        _ if pid == 0 => "another process".to_owned(),
+        Ok(program) => format!("process {pid} ({})", program.trim_end()),
+        Err(_) => format!("process {pid}"),
+    };
+    let what = format!("the name {name} is published by {process}");
+    Failure::new(Kind::NameHeld, what, "end it, or choose another name")
 }
 
 impl Drop for NameLock {
@@ -124,7 +134,7 @@ impl Drop for Publishing {
 }
 
 /// Held while services are made in a domain or what is left of unfinished ones is swept away, by hub, listener and
-/// programs under a name of their own in turn.
+/// other publishing programs in turn.
 pub(crate) struct MakingLock {
     _held: Held,
 }
@@ -212,6 +222,25 @@ pub fn publisher(root: &Path) -> Result<Option<u32>, Failure> {
     match holder_of(root, HUB)? {
         None => holder_of(root, LISTENER),
         hub => Ok(hub),
+    }
+}
+
+/// Returns the domain in which a program publishes: at the first place, in the order in which clients search, where a hub
+/// or a listener is running. If none is, at the place that a hub in this `environment` would take, so that the hub that
+/// starts next is in the same domain. Only below `base` if it is given.
+///
+/// # Errors
+///
+/// Returns the errors of [`Domain::at`].
+pub fn publisher_domain(
+    name: &str,
+    base: Option<&Path>,
+    environment: &Environment,
+) -> Result<Domain, Failure> {
+    let is_live = |domain: &Domain| matches!(publisher(domain.root()), Ok(Some(_)));
+    match Domain::candidates(name, base, environment)?.into_iter().find(is_live) {
+        Some(live) => Ok(live),
+        None => Domain::of_hub(name, base, environment),
     }
 }
 

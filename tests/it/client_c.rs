@@ -307,7 +307,8 @@ fn the_examples_build_and_run() {
             lines.iter().all(|line| (0.0..28.7).contains(&line["angle_deg"].as_f64().expect("a number")))
         );
         let again = program(&env, path, &["swing"]).wait();
-        assert!(again.code == Some(1) && again.errors.contains("publishes as swing"), "{again}");
+        let held = format!("the name swing is published by process {} (", mount.pid());
+        assert!(again.code == Some(1) && again.errors.contains(&held), "{again}");
         assert_eq!(mount.end(INT).errors, "");
     }
     let Some(stop) = installed.compile_cpp(&env, &examples.join("stop.cpp")) else { return };

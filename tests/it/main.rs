@@ -89,6 +89,7 @@ mod strangers;
 mod streaming;
 mod suspended;
 mod telegram;
+mod taken_names;
 mod terminal_text;
 mod three_machines;
 mod tidy;

@@ -127,14 +127,16 @@ fn angles_arrive_with_their_stamps_and_wake_who_sleeps() {
 #[test]
 fn a_name_has_one_publisher_in_all_languages() {
     let env = TestEnv::new();
-    let _hub = env.hub(&[&env.link("front"), &env.link("rear")]);
+    let hub = env.hub(&[&env.link("front"), &env.link("rear")]);
     let starts = languages(&env);
     let beside =
         || PublishSession::beside(&env.place(), "mount", Maker::Mount.topics(), TopicLimits::default());
-    let refused = |pid: u32| {
-        let root = env.place().root().display().to_string();
-        format!("another program publishes as mount in {root}: pid {pid}\n  end it, or choose another name")
+    let held = |name: &str, pid: u32| {
+        let program = std::fs::read_to_string(format!("/proc/{pid}/comm")).expect("it runs");
+        let process = format!("process {pid} ({})", program.trim_end());
+        format!("the name {name} is published by {process}\n  end it, or choose another name")
     };
+    let refused = |pid: u32| held("mount", pid);
     for start in &starts {
         let mount = Mount::publishing(start("mount"));
         for other in &starts {
@@ -145,7 +147,7 @@ fn a_name_has_one_publisher_in_all_languages() {
             );
         }
         let failure = beside().map(drop).expect_err("it is taken");
-        assert_eq!((failure.kind, failure.to_string()), (Kind::DomainHeld, refused(mount.program.pid())));
+        assert_eq!((failure.kind, failure.to_string()), (Kind::NameHeld, refused(mount.program.pid())));
         assert_eq!(mount.end().code, Some(0));
         // It is free at once.
         let in_rust = beside().expect("the name is free");
@@ -158,8 +160,8 @@ fn a_name_has_one_publisher_in_all_languages() {
         }
         drop(in_rust);
         let outcome = Mount::start(start("front")).program.wait();
-        let words = "\"front\" is no name to publish under: it is a sensor of the hub\n  any other name";
-        assert!(outcome.code == Some(1) && outcome.errors.contains(words), "{outcome}");
+        let words = held("front", hub.pid());
+        assert!(outcome.code == Some(1) && outcome.errors.contains(&words), "{outcome}");
     }
 }
 

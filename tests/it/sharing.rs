@@ -249,3 +249,46 @@ fn the_page_s_configuration_is_one() {
     let is_it = |line: &Value| line["key"] == "gateway.interface" && line["value"] == "lo";
     assert!(shown.lines().iter().any(is_it), "{shown}");
 }
+
+/// The three terminals of docs/tilt.md, in the order of the page: the mount publishes before there is a hub.
+#[test]
+fn mount_and_hub_find_each_other_in_whatever_order_they_start() {
+    among_users("sharing::mount_and_hub_find_each_other_in_whatever_order_they_start", || {
+        fs::create_dir("/run/user").expect("an empty /run");
+        for user in [0, OTHER] {
+            own(user, &format!("/run/user/{user}"));
+            own(user, &format!("/tmp/{user}"));
+        }
+        for (user, has_session) in [(0, true), (0, false), (OTHER, true), (OTHER, false)] {
+            let start: fn(u32, &[&str]) -> Program = if has_session { start } else { by_sudo };
+            let port = format!("/tmp/{user}/lms");
+            let port_flag = format!("--port={port}");
+            let simulate =
+                ["simulate", "--json", &port_flag, "--world=tilt", "--angles=mount", "--baud=500000"];
+            let simulator = start(user, &simulate).ready();
+            let run = ["run", "--json", "--no-system-config", &format!("--link=front={port}")];
+            let hub = start(user, &run).ready();
+            let mut tilt = start(
+                user,
+                &[
+                    "tilt",
+                    "front",
+                    "--angles=mount",
+                    "--axis-at=0,0,0.9",
+                    "--sensor-at=0.06,0,0.94",
+                    "--json",
+                ],
+            );
+            tilt.await_line("a sweep", is_class("obstacles"));
+            assert!(!fs::exists("/run/scanhub").expect("/run can be read"), "a service's place is not ours");
+            assert_eq!((tilt.end(INT).code, hub.end(INT).code), (Some(0), Some(0)));
+            // Alone again, it is where the next hub looks for it, too.
+            let hub = start(user, &run).ready();
+            let mut echo = start(user, &["echo", "mount/tilt", "--json"]);
+            echo.await_line("an angle", is_class("tilt"));
+            assert_eq!((echo.end(INT).code, hub.end(INT).code), (Some(0), Some(0)));
+            assert_eq!(simulator.end(INT).code, Some(0));
+            assert_eq!(testkit::shared_memory("sh_scanhub_"), Vec::<std::path::PathBuf>::new());
+        }
+    });
+}

@@ -120,9 +120,10 @@ fn points_are_where_things_are_and_the_post_is_an_obstacle() {
     assert!(off[off.len() * 9 / 10] < 0.08, "{:?}", [off[off.len() / 2], off[off.len() * 9 / 10]]);
     // Beside the others: a mount, a tracker's place, and what is made of both; a name has one publisher.
     let again = hall.tilt(&["--as=hall"]).wait();
-    assert!(again.code == Some(1) && is_told(&again, "publishes as hall"), "{again}");
+    let held = |name: &str, pid: u32| format!("the name {name} is published by process {pid} (scanhub)");
+    assert!(again.code == Some(75) && is_told(&again, &held("hall", tilt.pid())), "{again}");
     let taken = hall.tilt(&["--as=front"]).wait();
-    assert!(taken.code == Some(78) && is_told(&taken, "sensor of the hub"), "{taken}");
+    assert!(taken.code == Some(75) && is_told(&taken, &held("front", hall.hub.pid())), "{taken}");
     let outcome = tilt.end(INT);
     assert_eq!(outcome.code, Some(0), "{outcome}");
     let sum = &outcome.of_class("summary")[0];

@@ -129,6 +129,10 @@ impl Surroundings for Around<'_> {
 
     fn pause(&self, _: Nanos) {}
 
+    fn take_name(&self) -> Result<(), Failure> {
+        Ok(())
+    }
+
     fn open(&self, _: &Source, _: u32) -> Option<Result<Bytes, PortError>> {
         Some(Ok(self.line.clone()))
     }

@@ -13,7 +13,7 @@ use clap::Parser;
 use ros::Names;
 use ros::zenoh_wire::Distro;
 use schema::limits::TopicLimits;
-use schema::{DEFAULT_DOMAIN, Domain, Environment, Failure, Kind, Printable};
+use schema::{DEFAULT_DOMAIN, Domain, Environment, Failure, Kind, Printable, publisher_domain};
 use verbs::network::received_topics;
 
 /// Carry topics to other machines and back over Zenoh, through a router or as one: other rooms, Wi-Fi, the internet
@@ -100,7 +100,7 @@ impl Cli {
             Ok(SendOptions { topics: self.topics.clone(), places })
         });
         let publish = self.publish.then(|| {
-            let domain = Domain::of_hub(&self.domain, self.root.as_deref(), &environment)?;
+            let domain = publisher_domain(&self.domain, self.root.as_deref(), &environment)?;
             let limits = TopicLimits { consumers: self.consumers.into(), ..TopicLimits::default() };
             let topics = received_topics(&self.topics)?;
             Ok(PublishOptions { domain, topics, names: self.names, hubs: self.hubs, limits })

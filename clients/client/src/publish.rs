@@ -13,10 +13,8 @@ use schema::limits::TopicLimits;
 use schema::shortage::{allocate, check_descriptors, check_memory, longest_segment, sensor_bytes};
 use schema::{
     DEFAULT_DOMAIN, Domain, Environment, Failure, Kind, ListenLock, Maker, NameLock, Ring, Topic, Wake,
-    check_followed, check_sensor, is_remote, publisher,
+    check_followed, check_sensor, holder, is_remote, name_held, publisher_domain,
 };
-
-use crate::subscribe::places;
 
 pub use publication::Publication;
 
@@ -59,13 +57,9 @@ pub fn publish<P: Payload + ?Sized>(name: &str) -> Result<Publication<P>, Failur
 ///
 /// [`Kind::Configuration`](schema::Kind) if the name is not possible.
 pub fn home(domain: Option<&str>) -> Result<Domain, Failure> {
-    let lives = |domain: &Domain| matches!(publisher(domain.root()), Ok(Some(_)));
-    if let Some(live) = places(domain)?.into_iter().find(lives) {
-        return Ok(live);
-    }
     let of_process = std::env::var("SCANHUB_DOMAIN");
     let name = domain.unwrap_or(of_process.as_deref().unwrap_or(DEFAULT_DOMAIN));
-    Domain::of_hub(name, None, &Environment::of_process())
+    publisher_domain(name, None, &Environment::of_process())
 }
 
 /// A process's stay in a domain as one that publishes. It ends when the session and all that was made of it are dropped.
@@ -122,9 +116,10 @@ impl PublishSession {
     ///
     /// # Errors
     ///
-    /// [`Kind::DomainHeld`](schema::Kind) if another program publishes as `name`: the message has its number;
-    /// [`Kind::Configuration`](schema::Kind) if the name is not possible or a sensor's; else as [`open`](Self::open) and
-    /// [`sensor`](Self::sensor).
+    /// Returns [`Kind::NameHeld`](schema::Kind) if another process publishes as `name`: a program, or the hub whose sensor
+    /// it is. The message names the process. Returns [`Kind::Configuration`](schema::Kind) if the name is invalid, or if
+    /// subscribers still wait for a sensor of this name after its hub has ended. Otherwise the errors of
+    /// [`open`](Self::open) and [`sensor`](Self::sensor).
     pub fn beside(
         domain: &Domain,
         name: &str,
@@ -137,6 +132,10 @@ impl PublishSession {
         check_topics(topics, &limits)?;
         let of_hub = |(sensor, topic): &(String, Topic)| sensor == name && topic.maker() == Maker::Link;
         if ipc::published(domain)?.iter().any(of_hub) {
+            // A hub that is starting, or that has waited for this name, takes it now.
+            if let Some(pid) = holder(domain.root())? {
+                return Err(name_held(name, pid));
+            }
             let what = format!("{name:?} is no name to publish under: it is a sensor of the hub");
             return Err(Failure::new(Kind::Configuration, what, "any other name, for example house"));
         }
@@ -148,6 +147,11 @@ impl PublishSession {
         let boot = RandomState::new().hash_one(std::process::id());
         let (domain, sensors) = (domain.clone(), RefCell::default());
         PublishSession(Rc::new(Membership { domain, limits, boot, sensors, node, lock }))
+    }
+
+    /// Returns what the topics of the session are made for.
+    pub fn limits(&self) -> &TopicLimits {
+        &self.0.limits
     }
 
     /// Checks that there is memory for `topics` of one sensor, and descriptors for their first consumers.
@@ -209,8 +213,9 @@ impl SensorPublisher {
     ///
     /// # Errors
     ///
-    /// [`Kind::DomainHeld`](schema::Kind) if this process publishes it already; [`Kind::Short`](schema::Kind) if memory or
-    /// descriptors are short; [`Kind::Failed`](schema::Kind) if the topic is there with another layout.
+    /// [`Kind::DomainHeld`](schema::Kind) if this process publishes it already; [`Kind::Configuration`](schema::Kind) if only
+    /// sensors have the topic, and the name has no dot; [`Kind::Short`](schema::Kind) if memory or descriptors are short;
+    /// [`Kind::Failed`](schema::Kind) if the topic is there with another layout.
     pub fn topic<P: Payload + ?Sized>(&self) -> Result<Publication<P>, Failure> {
         self.topic_for(self.limits())
     }
@@ -222,6 +227,15 @@ impl SensorPublisher {
     /// As [`topic`](Self::topic).
     pub fn topic_for<P: Payload + ?Sized>(&self, limits: &TopicLimits) -> Result<Publication<P>, Failure> {
         let Membership { domain, node, .. } = &*self.0.membership;
+        if P::TOPIC.maker() == Maker::Link && !is_remote(&self.0.name) {
+            let what =
+                format!("only sensors have the topic {}, and {} is not one", P::TOPIC.name(), self.0.name);
+            return Err(Failure::new(
+                Kind::Configuration,
+                what,
+                "publish it as OWNER.NAME, for example tracker.near",
+            ));
+        }
         check_topics(&[P::TOPIC], limits)?;
         check_descriptors(SERVICE_DESCRIPTORS)?;
         let topic = TopicPublisher::new(node, &self.0.name, limits)?;

@@ -167,11 +167,17 @@ fn programs_with_names_of_their_own_publish_at_once_with_a_hub_and_without() {
     let mut yard = beside("yard").unwrap().topic::<Event>().unwrap();
     assert_eq!(publisher(place.domain.root()), Ok(None), "nobody holds the domain");
     let again = beside("house").map(drop).unwrap_err();
-    assert_eq!(again.kind, Kind::DomainHeld);
-    assert!(again.message.contains("publishes as house"), "{again}");
+    assert_eq!(again.kind, Kind::NameHeld);
+    let held = |name: &str| format!("the name {name} is published by process {} (", std::process::id());
+    assert!(again.message.starts_with(&held("house")), "{again}");
     let _listener = PublishSession::open(&place.domain, &[Topic::Marks], TopicLimits::default()).unwrap();
     let mut hub = FakeHub::new(&place.domain, &["front"], 1);
-    for impossible in ["front", "", "robot", "tracker.near"] {
+    let of_hub = beside("front").map(drop).unwrap_err();
+    assert_eq!(of_hub.kind, Kind::NameHeld);
+    assert!(of_hub.message.starts_with(&held("front")), "{of_hub}");
+    let scans = house.topic::<Scan>().map(drop).unwrap_err();
+    assert_eq!(scans.kind, Kind::Configuration, "only sensors have scans: {scans}");
+    for impossible in ["", "robot", "tracker.near"] {
         assert_eq!(beside(impossible).map(drop).unwrap_err().kind, Kind::Configuration, "{impossible}");
     }
     let mut seen = Subscription::<Tracks>::in_domain(place.places(), "house").unwrap();

@@ -128,8 +128,8 @@ def publish(
     """Publishes the angles of a mount as `topic`, `NAME/tilt` as in `mount/tilt`, in the first live place of `domain`, or
     where a hub would be: there need not be one. The name has no dot, and no sensor of the hub has it.
 
-    Raises Taken if another program publishes as NAME, Impossible if the name is not possible or a sensor's, or the topic
-    another one; Denied, Short, Mismatch, Failure as they say.
+    Raises Taken if another process publishes as NAME, a program or the hub; Impossible if the name or the topic is
+    invalid; Denied, Short, Mismatch, Failure as they say.
     """
     name = parse(topic)
     if name.topic != Tilt.topic:

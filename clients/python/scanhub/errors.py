@@ -44,7 +44,7 @@ class Held(Failure):
 
 
 class Taken(Failure):
-    """Another program publishes under the name."""
+    """Another process publishes under the name: a program, or the hub whose sensor it is."""
 
 
 class Impossible(Failure, ValueError):

@@ -1,5 +1,5 @@
-"""Who publishes in a domain: each name has one publisher, whose lock ends with its process. The same files as the hub's
-(schema/src/lock.rs). Refuses to know what is published."""
+"""Locks of the publishers in a domain: one process publishes under each name, and its lock ends with it. The files are
+those of the hub (schema/src/lock.rs)."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from .names import Domain
 
 
 class NameLock:
-    """The lock of a program that publishes under a name of its own. There need not be a hub. Taken, Denied, OSError."""
+    """The lock of the process that publishes under a name. There need not be a hub. Taken, Denied, OSError."""
 
     def __init__(self, domain: Domain, name: str) -> None:
         self._file = _acquire(domain, name)
@@ -94,12 +94,19 @@ def _acquire(domain: Domain, name: str) -> int:
             os.close(file)
             if error.errno not in (errno.EAGAIN, errno.EACCES):
                 raise
-            what = f"another program publishes as {name} in {domain.root}: pid {pid}"
-            raise Taken(what, "end it, or choose another name") from None
+            raise name_held(name, pid) from None
         # Whoever held it until now may have taken the domain away, and the next one would lock another file.
         if os.fstat(file).st_nlink > 0:
             return file
         os.close(file)
+
+
+def name_held(name: str, pid: int) -> Taken:
+    """Returns the error if process `pid` publishes under `name`."""
+    process = f"process {pid}" if pid else "another process"
+    with contextlib.suppress(OSError), open(f"/proc/{pid}/comm", encoding="utf-8", errors="replace") as program:
+        process += f" ({program.read().strip()})"
+    return Taken(f"the name {name} is published by {process}", "end it, or choose another name")
 
 
 def _written(file: int) -> int:

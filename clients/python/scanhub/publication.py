@@ -12,7 +12,7 @@ import weakref
 
 from . import layout, memory, prefix, trouble
 from .errors import Failure, Impossible
-from .lock import NameLock, is_held, making
+from .lock import NameLock, holder, is_held, making, name_held
 from .names import LINKS, Domain, TopicName
 from .outlet import Outlet
 from .tilted import Tilt
@@ -79,6 +79,10 @@ class _Place:
         self._lock = NameLock(domain, name.sensor)
         try:
             if any(other.sensor == name.sensor and other.topic in LINKS for other in memory.topics(domain)):
+                # A hub that is starting, or that has waited for this name, takes it now.
+                hub = holder(domain, "hub.lock")
+                if hub is not None:
+                    raise name_held(name.sensor, hub)
                 what = f'"{name.sensor}" is no name to publish under: it is a sensor of the hub'
                 raise Impossible(what, "any other name, for example house")
             # In one step: a name without a process is forgotten by the next one that ends.

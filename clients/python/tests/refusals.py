@@ -118,8 +118,8 @@ def other_layouts() -> None:
     assert "u8 of 1 bytes under ()" in said.message and "scanhub.Zones.v2 of 76 bytes" in said.message, said
     said = refusal(scanhub.Mismatch, lambda: publish("old"))
     assert "u8 of 1 bytes under ()" in said.message and "scanhub.Tilt.v2 of 16 bytes" in said.message, said
-    said = refusal(scanhub.Impossible, lambda: publish("front"))
-    assert "sensor of the hub" in said.message, said
+    said = refusal(scanhub.Taken, lambda: publish("front"))
+    assert "the name front is published by" in said.message, said
     said = refusal(scanhub.Silent, lambda: follow("front/marks", "rear/scan", timeout=0.3))
     assert "front/marks, rear/scan" in said.message and "front/scan" in said.remedy, said
     said = refusal(scanhub.NoHub, lambda: scanhub.background("front", domain=domain, root=root))

@@ -21,7 +21,8 @@ pub fn descriptors(links: usize) -> u64 {
 
 /// Descriptors of what belongs to no link, beside those open from the start: 16 are left open, making them takes more.
 const BASE_DESCRIPTORS: u64 = 24;
-/// Descriptors of a link: four for each of its services, which are a topic or the event, its port, and a first consumer.
-const LINK_DESCRIPTORS: u64 = 4 * (Topic::OF_LINKS.len() as u64 + 1) + 6;
+/// Descriptors of a link: four for each of its services, which are a topic or the event, its port, the lock of its name, and a
+/// first subscriber.
+const LINK_DESCRIPTORS: u64 = 4 * (Topic::OF_LINKS.len() as u64 + 1) + 7;
 /// The control service, what belongs to no link, and the first consumers.
 const REST: u64 = 512 * 1024;

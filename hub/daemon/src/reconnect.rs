@@ -1,12 +1,13 @@
 //! Keeps a link connected to its port. It streams while the port exists, polls for it while it is missing, and opens it
-//! again under the same name, whatever device it is then. The log has each reason for a missing port once.
+//! again under the same name, whatever device it is then. While another process publishes under the sensor's name, the
+//! link leaves the port alone and waits for the name. The log has each reason once.
 
 use std::io;
 
 use port::{PortError, Source};
 use scanhub_drivers::PortSession;
 use scanhub_drivers::line::{Control, Identity, Protocol as _, Session as _};
-use schema::{Failure, Flags, MILLIS, Nanos, State};
+use schema::{Failure, Flags, Kind, MILLIS, Nanos, State};
 
 use crate::control::{ControlQueue, Flow};
 use crate::drive::{Drive, Open};
@@ -21,6 +22,8 @@ pub struct LiveLink<'a, S: Surroundings> {
     /// Times in a row that the port was there and went without a byte.
     futile: u32,
     has_begun: bool,
+    /// Whether another process has had the sensor's name since the link exists.
+    lacks_name: bool,
 }
 
 /// A line that was just opened.
@@ -43,14 +46,15 @@ enum Phase<L> {
 }
 
 impl<'a, S: Surroundings> LiveLink<'a, S> {
-    /// Makes the topics of `link`, number `number` in the configuration, for the hub's life `boot`, publishes how it is
-    /// before anything can come, and looks for the port. Then [`turn`](Self::turn) is to be called with a timeout.
+    /// Takes the name of `link`, number `number` in the configuration, and creates its topics for the run `boot` of the hub.
+    /// Publishes the first status, and looks for the port. Then [`turn`](Self::turn) is to be called with a timeout.
     ///
     /// # Errors
     ///
     /// Returns an error of kind [`PortNotTty`](schema::Kind::PortNotTty) if the port is not a serial line at all, an error
     /// of kind [`Short`](schema::Kind::Short) if descriptors or memory run out, and those of [`Surroundings::medium`]. The
-    /// link waits for a port that is missing, in use or forbidden, or that cannot have the rate.
+    /// link waits for a port that is missing, in use or forbidden, or that cannot have the rate, and for a name that
+    /// another process has.
     pub fn new(
         link: &'a config::Link,
         number: u8,
@@ -58,12 +62,23 @@ impl<'a, S: Surroundings> LiveLink<'a, S> {
         around: &'a S,
         control: ControlQueue,
     ) -> Result<Self, Failure> {
+        // Before the topics: a subscriber that finds a topic sleeps at the doorbell.
+        let taken = match around.take_name() {
+            Ok(()) => None,
+            Err(failure) if failure.kind == Kind::NameHeld => Some(failure),
+            Err(failure) => return Err(failure),
+        };
         let mut core = LinkCore::new(link, number, boot, around, control)?;
         core.begin();
         let drive = Drive::new(&core);
         let known = drive.recall(around.now());
-        let mut live =
-            LiveLink { core, drive, phase: Phase::away(Away::default(), 0), futile: 0, has_begun: false };
+        let phase = Phase::away(Away::default(), 0);
+        let lacks_name = taken.is_some();
+        let mut live = LiveLink { core, drive, phase, futile: 0, has_begun: false, lacks_name };
+        if let Some(failure) = taken {
+            live.leave(Away::for_lack_of_the_name(failure));
+            return Ok(live);
+        }
         match live.first_line() {
             Ok(Some(line)) => {
                 // On a line that was closed meanwhile it may be another sensor, or the same in another mode.
@@ -97,11 +112,16 @@ impl<'a, S: Surroundings> LiveLink<'a, S> {
         !matches!(self.phase, Phase::Open(_))
     }
 
-    /// Returns whether the link has tried to open its port, with any result.
+    /// Returns whether the link waits for its name, because another process publishes under it.
+    pub fn lacks_name(&self) -> bool {
+        self.lacks_name
+    }
+
+    /// Returns whether the link has tried to open its port, with any result, or must not because it lacks its name.
     pub fn has_tried(&self) -> bool {
         match &self.phase {
             Phase::Open(_) => true,
-            Phase::Away { away, .. } | Phase::Opening { away, .. } => away.error.is_some(),
+            Phase::Away { away, .. } | Phase::Opening { away, .. } => self.lacks_name || away.error.is_some(),
         }
     }
 
@@ -145,16 +165,23 @@ impl<'a, S: Surroundings> LiveLink<'a, S> {
 
     /// Returns the line at the start of the hub. `None` if a connection has to be made.
     fn first_line(&mut self) -> Result<Option<OpenLine<S::Line>>, PortError> {
-        let (link, around) = (self.core.link, self.core.around);
-        let (name, source, baud) = (&link.name, &link.port, self.drive.opening_rate(&self.core));
+        let (source, baud) = (&self.core.link.port, self.drive.opening_rate(&self.core));
         if let Source::Tcp { .. } = source {
             return Ok(None);
         }
-        if let Some(line) = around.take_kept(name, source, baud) {
-            tracing::info!("{name}: continues with {}, which the service manager kept open", source.name());
-            return Ok(Some(OpenLine { line, has_rate: true, is_kept: true }));
+        match self.kept_line(baud) {
+            Some(line) => Ok(Some(line)),
+            None => self.open_line(baud).transpose(),
         }
-        self.open_line(baud).transpose()
+    }
+
+    /// Returns the line that the service manager kept open while the previous hub was killed.
+    fn kept_line(&self, baud: u32) -> Option<OpenLine<S::Line>> {
+        let LinkCore { link, around, .. } = self.core;
+        let (name, source) = (&link.name, &link.port);
+        let line = around.take_kept(name, source, baud)?;
+        tracing::info!("{name}: continues with {}, which the service manager kept open", source.name());
+        Some(OpenLine { line, has_rate: true, is_kept: true })
     }
 
     /// Opens the port at `baud`. A search leaves out a rate that the port cannot have, so it then gets a port at
@@ -175,7 +202,15 @@ impl<'a, S: Surroundings> LiveLink<'a, S> {
     fn reach(&mut self) {
         let (link, around) = (self.core.link, self.core.around);
         let mut away = self.phase.take_away();
-        match self.open_line(self.drive.opening_rate(&self.core)) {
+        if self.lacks_name
+            && let Err(failure) = around.take_name()
+        {
+            return self.leave(Away::for_lack_of_the_name(failure));
+        }
+        let baud = self.drive.opening_rate(&self.core);
+        // While the link had no name, it has not taken the line that was kept for it.
+        let kept = if std::mem::take(&mut self.lacks_name) { self.kept_line(baud) } else { None };
+        match kept.map(Ok).or_else(|| self.open_line(baud)) {
             Some(Ok(line)) => {
                 self.open(line, None);
                 self.begin();
@@ -312,6 +347,11 @@ impl Away {
     /// There is no port, which `words` say: that the next look finds none is no news.
     fn for_lack_of_a_port(words: String) -> Away {
         Away { error: Some(PortError::Missing), words, ..Away::default() }
+    }
+
+    /// The link must not open its port, because another process has its name, as `failure` says.
+    fn for_lack_of_the_name(failure: Failure) -> Away {
+        Away { words: said(failure), ..Away::default() }
     }
 
     /// The port cannot be opened because of `error`, which `explain` says in words.

@@ -22,6 +22,7 @@ use crate::reload::{Read, Reload};
 use crate::replay::{Recorded, ReplayPart};
 use crate::service::{Service, Watchdog};
 use crate::signals::{Signals, Wanted};
+use crate::surroundings::Surroundings as _;
 use crate::system::{Hub, System};
 use crate::{preflight, replay};
 
@@ -32,8 +33,11 @@ pub struct Ready {
     pub boot: u64,
     /// The sensors' names.
     pub sensors: Vec<String>,
-    /// Names of the sensors whose port cannot be opened yet.
+    /// Names of the sensors that do not stream yet: their port cannot be opened, or another process publishes under
+    /// their name.
     pub waiting: Vec<String>,
+    /// The sensors in `waiting` whose name another process has.
+    pub taken: Vec<String>,
 }
 
 /// The links of a hub that plays a recording.
@@ -51,6 +55,8 @@ enum Start {
     Open,
     /// Without its port, which cannot be opened yet, or to which no connection is made yet.
     Waiting,
+    /// Without its port, because another process publishes under the sensor's name.
+    Taken,
 }
 
 /// The end of a hub that plays a recording.
@@ -79,9 +85,11 @@ impl EndOfPlayback<'_> {
 ///
 /// # Errors
 ///
-/// Returns the error of `read` at the start, [`Kind::DomainHeld`] if another hub has the domain, [`Kind::Short`] if memory
-/// or descriptors are, [`Kind::PortNotTty`] if a port is not a serial line, and [`Kind::Failed`] if shared memory
-/// refuses. The hub waits for a port that cannot be opened for another reason.
+/// Returns the error of `read` at the start. Returns [`Kind::DomainHeld`] if another hub has the domain, and
+/// [`Kind::NameHeld`] if another process publishes under the name of a link that plays a recording. Returns [`Kind::Short`]
+/// if memory or descriptors are short, [`Kind::PortNotTty`] if a port is not a serial line, and [`Kind::Failed`] if shared
+/// memory refuses. The hub waits for a port that cannot be opened for another reason, and for a name that another process
+/// has.
 pub fn run(
     read: &dyn Fn() -> Result<Config, Failure>,
     domain: &Domain,
@@ -120,7 +128,7 @@ pub(crate) fn serve(
     let node = ipc::hub_node(domain)?;
     node.try_cleanup_dead_nodes();
     let sensors = config.links.iter().map(|link| link.name.clone()).collect();
-    let mut ready = Ready { boot: random(), sensors, waiting: Vec::new() };
+    let mut ready = Ready { boot: random(), sensors, waiting: Vec::new(), taken: Vec::new() };
     let boot = ready.boot;
     // By the port, not by the name: a line that somebody keeps cannot be opened by anybody.
     service.assign(|line| {
@@ -154,10 +162,8 @@ pub(crate) fn serve(
                 .map(|(player, recorded)| ReplayPart { recorded, handle: PlayerHandle { player, number } });
             let body = move || {
                 let report = |outcome| drop(report.send((number, outcome)));
-                match System::new(hub, &link.name, worked, learned) {
-                    Ok(system) => run_link(link, number as u8, boot, &system, queue, part, report),
-                    Err(failure) => report(Err(failure)),
-                }
+                let system = System::new(hub, &link.name, worked, learned);
+                run_link(link, number as u8, boot, &system, queue, part, report);
             };
             let thread = thread::Builder::new().name(link.name.clone()).spawn_scoped(scope, body);
             match thread {
@@ -171,16 +177,23 @@ pub(crate) fn serve(
         drop(report);
         let mut outcome = Ok(());
         for (number, start) in reports.iter().take(config.links.len()) {
+            let name = &config.links[number].name;
             match start {
                 Ok(Start::Open) => {}
-                Ok(Start::Waiting) => ready.waiting.push(config.links[number].name.clone()),
+                Ok(Start::Waiting) => ready.waiting.push(name.clone()),
+                Ok(Start::Taken) => {
+                    ready.waiting.push(name.clone());
+                    ready.taken.push(name.clone());
+                }
                 Err(failure) => {
                     outcome = Err(failure);
                     break;
                 }
             }
         }
-        ready.waiting.sort_by_key(|name| ready.sensors.iter().position(|sensor| sensor == name));
+        for names in [&mut ready.waiting, &mut ready.taken] {
+            names.sort_by_key(|name| ready.sensors.iter().position(|sensor| sensor == name));
+        }
         if outcome.is_ok() {
             outcome = shortage::allocate(domain);
         }
@@ -228,16 +241,25 @@ fn run_link(
     report: impl FnOnce(Result<Start, Failure>),
 ) {
     match &link.port {
-        Source::File { path, paced } => match LinkCore::new(link, number, boot, system, queue) {
-            Ok(core) => {
-                replay::run(core, part, path, *paced, |outcome| report(outcome.map(|()| Start::Open)));
+        // A recording does not wait for its name: the other links of the hub may play with it.
+        Source::File { path, paced } => {
+            match system.take_name().and_then(|()| LinkCore::new(link, number, boot, system, queue)) {
+                Ok(core) => {
+                    replay::run(core, part, path, *paced, |outcome| report(outcome.map(|()| Start::Open)));
+                }
+                Err(failure) => report(Err(failure)),
             }
-            Err(failure) => report(Err(failure)),
-        },
+        }
         Source::Tty(_) | Source::Tcp { .. } => match LiveLink::new(link, number, boot, system, queue) {
             Ok(live) => {
-                system.drive(live, |is_waiting| {
-                    report(Ok(if is_waiting { Start::Waiting } else { Start::Open }));
+                system.drive(live, |live| {
+                    report(Ok(if live.lacks_name() {
+                        Start::Taken
+                    } else if live.is_waiting() {
+                        Start::Waiting
+                    } else {
+                        Start::Open
+                    }));
                 });
             }
             Err(failure) => report(Err(failure)),

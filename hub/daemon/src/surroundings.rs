@@ -28,6 +28,14 @@ pub trait Surroundings {
     /// Sleeps until `until`, too short a time to watch anything meanwhile.
     fn pause(&self, until: Nanos);
 
+    /// Takes the name of the sensor, and creates its doorbell and its event, unless the link has the name already.
+    ///
+    /// # Errors
+    ///
+    /// Returns [`Kind::NameHeld`](schema::Kind) if another process publishes under it. The link then publishes without
+    /// waking its subscribers, which poll ten times a second.
+    fn take_name(&self) -> Result<(), Failure>;
+
     /// Opens the line at `source` at `baud`; nothing while that takes time: then to be asked again once
     /// [`On::Opening`] is ready.
     ///

@@ -13,7 +13,7 @@ use port::{Allowance, Alteration, Dial, Port, PortError, Source, clock};
 use rustix::event::{PollFd, PollFlags, poll};
 use schema::ipc::{Node, Payload, SharedMemory, Waker};
 use schema::limits::TopicLimits;
-use schema::{Directory, Failure, MILLIS, Nanos, Ring, Wake};
+use schema::{Directory, Failure, MILLIS, NameLock, Nanos, Ring, Wake};
 
 use crate::control::ControlQueue;
 use crate::learned::Handle;
@@ -25,7 +25,9 @@ use crate::surroundings::{Learned, Line, On, Surroundings, Wait, Woken};
 /// What the machine has for one link; stays in the link's thread.
 pub(crate) struct System<'a> {
     hub: Hub<'a>,
-    waker: Waker,
+    sensor: &'a str,
+    /// Empty while another process has the sensor's name.
+    name: OnceCell<HeldName>,
     /// Set whenever the link finished something.
     worked: &'a AtomicBool,
     learned: Option<Handle<'a>>,
@@ -35,6 +37,13 @@ pub(crate) struct System<'a> {
     looked_at: Cell<Nanos>,
     /// What outlives a killed hub; nothing where it cannot be written: then the sensor is asked.
     record: OnceCell<Option<File>>,
+}
+
+/// The name of the sensor, which only this hub publishes under.
+struct HeldName {
+    waker: Waker,
+    // Dropped last: the next process with this name creates its own doorbell.
+    _lock: NameLock,
 }
 
 /// What a hub has for a link.
@@ -54,29 +63,24 @@ pub(crate) struct Hub<'a> {
 impl<'a> System<'a> {
     /// What `hub` has for the link of `sensor`, which sets `worked` whenever it finished something; `learned` is where it hands
     /// on what it learned.
-    ///
-    /// # Errors
-    ///
-    /// As [`Waker::new`].
     pub(crate) fn new(
         hub: Hub<'a>,
-        sensor: &str,
+        sensor: &'a str,
         worked: &'a AtomicBool,
         learned: Option<Handle<'a>>,
-    ) -> Result<System<'a>, Failure> {
-        let waker = Waker::new(hub.node, sensor)?;
+    ) -> System<'a> {
         let (dial, looked_at, record) = (RefCell::default(), Cell::default(), OnceCell::new());
-        Ok(System { hub, waker, worked, learned, dial, looked_at, record })
+        System { hub, sensor, name: OnceCell::new(), worked, learned, dial, looked_at, record }
     }
 
-    /// Drives `link` until the hub ends. Calls `on_start` once, with whether the link waits for its port: as soon as
-    /// the link has tried to open it, but not later than [`START`].
-    pub(crate) fn drive(&self, mut link: LiveLink<'_, Self>, on_start: impl FnOnce(bool)) {
+    /// Drives `link` until the hub ends. Calls `on_start` once with the link: as soon as it has tried to open its port,
+    /// but not later than [`START`].
+    pub(crate) fn drive(&self, mut link: LiveLink<'_, Self>, on_start: impl FnOnce(&LiveLink<'_, Self>)) {
         let mut woken = Woken::Timeout;
         let (mut on_start, start_by) = (Some(on_start), clock::now() + START);
         while woken != Woken::Stop {
             if let Some(on_start) = on_start.take_if(|_| link.has_tried() || clock::now() >= start_by) {
-                on_start(link.is_waiting());
+                on_start(&link);
             }
             let Wait { requests, on, until } = link.turn(woken);
             let until = if on_start.is_some() { until.min(start_by) } else { until };
@@ -184,6 +188,15 @@ impl Surroundings for System<'_> {
         }
     }
 
+    fn take_name(&self) -> Result<(), Failure> {
+        if self.name.get().is_none() {
+            let lock = NameLock::acquire(self.hub.root, self.sensor)?;
+            let waker = Waker::new(self.hub.node, self.sensor)?;
+            let _ = self.name.set(HeldName { waker, _lock: lock });
+        }
+        Ok(())
+    }
+
     fn open(&self, source: &Source, baud: u32) -> Option<Result<Port, PortError>> {
         if let Some(dial) = self.dial.take() {
             return Some(dial.finish());
@@ -245,11 +258,13 @@ impl Surroundings for System<'_> {
     }
 
     fn ring(&self, ring: Ring) {
-        self.waker.ring(ring);
+        if let Some(name) = self.name.get() {
+            name.waker.ring(ring);
+        }
     }
 
     fn tell(&self, why: Wake) {
-        if let Err(failure) = self.waker.tell(why) {
+        if let Some(Err(failure)) = self.name.get().map(|name| name.waker.tell(why)) {
             tracing::debug!(%failure, "some consumers were not woken");
         }
     }

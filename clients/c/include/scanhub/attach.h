@@ -528,9 +528,9 @@ int scanhub_hub_lives(struct scanhub_attachment *handle);
 
 /*
  * Publishes the angles of a mount as the topic tilt of `name` ("mount") in `domain` (NULL: the one that SCANHUB_DOMAIN names),
- * for scanhub tilt and for everybody who follows it: docs/tilt.md. There need not be a hub. The name has no dot and is no
- * sensor's of the hub: else SCANHUB_REFUSED_CONFIGURATION. It has one publisher: a name that another program has is
- * SCANHUB_REFUSED_FAILED, and scanhub_error says which one. Returns 0; *publication is NULL after a refusal.
+ * for scanhub tilt and for everybody who follows it: docs/tilt.md. There need not be a hub. The name has no dot: else
+ * SCANHUB_REFUSED_CONFIGURATION. One process publishes under it: if another one has it, a program or the hub whose sensor it
+ * is, SCANHUB_REFUSED_FAILED, and scanhub_error names that process. Returns 0; *publication is NULL after a refusal.
  */
 int scanhub_publish_tilt(struct scanhub_publication **publication, const char *domain, const char *name);
 

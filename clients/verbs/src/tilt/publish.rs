@@ -47,7 +47,7 @@ impl Samples {
     /// Makes the topics of `name` in the domain where a hub or listener lives, for clouds of so many `beams`.
     ///
     /// [`Kind::NoHub`](schema::Kind) if none does, [`Kind::Configuration`](schema::Kind) if the name is not possible,
-    /// [`Kind::DomainHeld`](schema::Kind) if another program has it, [`Kind::Short`](schema::Kind) if memory or descriptors are
+    /// [`Kind::NameHeld`](schema::Kind) if another process has it, [`Kind::Short`](schema::Kind) if memory or descriptors are
     /// short.
     pub(super) fn publish(&mut self, name: &str, beams: usize, places: &[Domain]) -> Result<(), Failure> {
         let limits = TopicLimits { beams, ..TopicLimits::default() };

@@ -47,8 +47,8 @@ impl Samples {
 
     /// Makes the topics of `name` in the domain where a hub or listener lives.
     ///
-    /// [`Kind::NoHub`](schema::Kind) if none does, [`Kind::Configuration`](schema::Kind) if the name is not possible, [`Kind::DomainHeld`](schema::Kind) if another tracker
-    /// has it, [`Kind::Short`](schema::Kind) if memory or descriptors are short.
+    /// [`Kind::NoHub`](schema::Kind) if none does, [`Kind::Configuration`](schema::Kind) if the name is not possible,
+    /// [`Kind::NameHeld`](schema::Kind) if another process has it, [`Kind::Short`](schema::Kind) if memory or descriptors are short.
     pub(super) fn publish(&mut self, name: &str, places: &[Domain]) -> Result<(), Failure> {
         let (topics, limits) = (Maker::Tracker.topics(), TopicLimits::default());
         let sensor = PublishSession::beside(&find(places)?, name, topics, limits)?;
