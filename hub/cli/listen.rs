@@ -38,6 +38,9 @@ pub(crate) struct Listen {
     /// Places for consumers of each published topic, 1 to 250
     #[arg(long, value_name = "N", requires = "publish", default_value_t = 32, value_parser = clap::value_parser!(u16).range(1..=250))]
     consumers: u16,
+    /// Shared memory that all published topics may take together, in MB (2^20 bytes). A sensor that does not fit is refused
+    #[arg(long, value_name = "MB", requires = "publish", default_value_t = 64, value_parser = clap::value_parser!(u32).range(1..))]
+    memory: u32,
     #[command(flatten)]
     limits: Limits,
 }
@@ -54,6 +57,7 @@ impl Listen {
             stats: self.stats,
             publish: if self.publish { Some(everywhere.publisher_domain()?) } else { None },
             limits: TopicLimits { consumers: self.consumers.into(), ..TopicLimits::default() },
+            memory: u64::from(self.memory) << 20,
             json: everywhere.json,
             terminal: stdout().is_terminal(),
             bounds: self.limits.bounds(),

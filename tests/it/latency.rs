@@ -96,8 +96,7 @@ fn of_a_remote_sensor_the_way_on_this_machine_is_known() {
         let mut sender = Sender::new(0x5f3a_12bc_00d1_e2f3, 7, 3, "front");
         let publisher = ["listen", "--json", "--publish", "--name=robot1=5f3a12bc00d1e2f3"];
         let mut listener = env.start(&publisher).ready();
-        sender.announce(&[Topic::Zones]);
-        listener.await_line("a sensor", |line| line["kind"] == "published");
+        sender.await_published(&mut listener, &[Topic::Zones]);
         let mut latency = env.start(&["latency", "--json", "robot1.front/zones"]);
         until("it is attached", || env.subscribers("robot1.front/zones") == 1);
         let zones = Zones { verdict: Verdict::Clear as u8, ..Zones::unknown() };

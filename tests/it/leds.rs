@@ -218,8 +218,7 @@ fn a_worse_verdict_is_shown_at_once_and_a_better_one_only_when_it_has_stood() {
         let mut front = Sender::new(1, 7, 0, "front");
         let mut listener =
             env.start(&["listen", "--json", "--publish", "--name=robot1=0000000000000001"]).ready();
-        front.announce(&[Topic::Zones]);
-        listener.await_line("a sensor", |line| line["kind"] == "published");
+        front.await_published(&mut listener, &[Topic::Zones]);
         let mut say = |verdict: Verdict| {
             front.send(Topic::Zones, &Zones { verdict: verdict as u8, ..Zones::unknown() });
         };

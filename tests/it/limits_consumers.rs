@@ -108,8 +108,7 @@ fn a_consumer_without_a_place_is_told_the_flag() {
         let mut sender = Sender::new(0x5f3a_12bc_00d1_e2f3, 7, 3, "front");
         let flags = ["listen", "--json", "--publish", "--consumers=2", "--name=robot1=5f3a12bc00d1e2f3"];
         let mut program = env.start(&flags).ready();
-        sender.announce(&[Topic::Zones, Topic::Status]);
-        program.await_line("a sensor", |line| line["kind"] == "published");
+        sender.await_published(&mut program, &[Topic::Zones, Topic::Status]);
         let node = ipc::client_node(&env.place()).expect("joins");
         let topic = Zones::open(&node, "robot1.front").expect("works").expect("is there");
         let subscribers = [(); 2].map(|()| Zones::subscriber(&topic).expect("a place"));

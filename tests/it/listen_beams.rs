@@ -109,8 +109,7 @@ fn a_sender_who_asks_for_more_with_each_scan_gets_all_of_it_at_once() {
         let mut listener = env.start(&words).ready();
         let mut sender = Sender::new(0x5f3a_12bc_00d1_e2f3, 7, 3, "front");
         sender.family = Family::Ld;
-        sender.announce(&[Topic::Scan]);
-        listener.await_line("a sensor", |line| line["kind"] == "published");
+        sender.await_published(&mut listener, &[Topic::Scan]);
         let mut echo = env.echo(&["robot1.front/scan"]);
         let turn = |beams: usize| {
             let head = ScanHead { contents: Contents::ALL, ..ScanHead::turning(Family::Ld, beams) };

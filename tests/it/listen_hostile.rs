@@ -91,8 +91,7 @@ fn sealed_nonsense_neither_ends_it_nor_fills_memory() {
         let words = ["listen", "--json", "--publish", "--timeout=20s"];
         let mut program = env.start(&words).ready();
         let mut sender = Sender::new(0xabcd, 7, 0, "front");
-        sender.announce(&[Topic::Zones]);
-        program.await_line("a name", |line| line["kind"] == "published");
+        sender.await_published(&mut program, &[Topic::Zones]);
         let mut random = fastrand::Rng::with_seed(7);
         let mut kb = 0;
         let mut counted = 0;

@@ -55,8 +55,7 @@ fn hubs_that_are_not_named_are_not_published() {
         let words = ["listen", "--json", "--publish", "--hub=5f3a12bc00d1e2f3"];
         let mut program = env.start(&words).ready();
         crowd();
-        Sender::new(HUB, 7, 0, "front").announce(&[Topic::Zones]);
-        let line = program.await_line("a sensor", |line| line["kind"] == "published");
+        let line = Sender::new(HUB, 7, 0, "front").await_published(&mut program, &[Topic::Zones]);
         assert_eq!((&line["sensor"], &line["here"]), (&json!("5f3a12bc00d1e2f3.front"), &json!(true)));
         let outcome = program.end(INT);
         assert_eq!(outcome.of_class("notice").len(), 1, "{outcome}");

@@ -21,9 +21,8 @@ fn publisher(env: &TestEnv) -> Program {
 /// A listener that publishes what a sender has announced.
 fn published(env: &TestEnv, sender: &mut Sender) -> Program {
     let mut program = publisher(env);
-    sender.announce(&[Topic::Zones, Topic::Scan, Topic::Status, Topic::Telegram]);
-    let line = program.await_line("a sensor", |line| line["kind"] == "published");
-    assert_eq!(line["sensor"], FRONT);
+    let topics = [Topic::Zones, Topic::Scan, Topic::Status, Topic::Telegram];
+    assert_eq!(sender.await_published(&mut program, &topics)["sensor"], FRONT);
     // Whoever lists sensors waits for one.
     sender.send(Topic::Status, &Status { state: State::Starting as u8, ..Status::default() });
     program
@@ -159,7 +158,8 @@ fn gateways_and_hubs_that_start_again_are_followed() {
         let outcome = echo.end(INT);
         assert_eq!(outcome.of_class("summary")[0]["lost"], 3, "{outcome}");
         let outcome = program.end(INT);
-        assert_eq!(outcome.of_class("lan_published")[0]["unnamed"], 2, "{outcome}");
+        let unnamed = number(&outcome.of_class("lan_published")[0], "unnamed");
+        assert_eq!(unnamed, 2 + u64::from(sender.proofs), "{outcome}");
         assert_eq!(outcome.of_class("notice").iter().filter(|line| line["kind"] == "published").count(), 1);
     });
 }
@@ -171,7 +171,7 @@ fn a_hub_and_two_remote_ones_live_in_one_domain() {
         let _simulator = env.simulator(&["front"], &["--seed=61", "--baud=500000"]);
         let mut one = Sender::new(HUB, 7, 0, "front");
         let mut other = Sender::new(0xab, 7, 0, "front");
-        let listener = published(&env, &mut one);
+        let mut listener = published(&env, &mut one);
         // Somebody who follows the hub's sensor waits for the hub, whoever else is in the domain.
         let mut early = env.start(&["echo", "--json", "front/scan"]);
         let absent = env.run(&["echo", "--json", "front/scan", "-n", "1"]);
@@ -183,14 +183,10 @@ fn a_hub_and_two_remote_ones_live_in_one_domain() {
         let hub = env.hub(&[env.link("front")]);
         early.await_line("a scan", |line| line["class"] == "scan");
         assert_eq!(early.end(INT).code, Some(0));
-        other.announce(&[Topic::Zones, Topic::Status]);
-        other.send(Topic::Status, &Status::default());
         let second = publisher_refused(&env);
         assert!(second.contains(&format!("pid {}", listener.pid())), "{second}");
-        until("the second one is published", || {
-            let topics = env.run(&["list", "--json"]).lines();
-            topics.iter().any(|line| line["sensor"] == "00000000000000ab.front" && line["topic"] == "zones")
-        });
+        other.await_published(&mut listener, &[Topic::Zones, Topic::Status]);
+        other.send(Topic::Status, &Status::default());
         let mut echo = env.echo(&["front/scan", "robot1.front/zones", "00000000000000ab.front/zones"]);
         one.send(Topic::Zones, &zones(Verdict::Stop));
         other.send(Topic::Zones, &zones(Verdict::Slow));
@@ -343,8 +339,7 @@ fn what_has_no_room_is_counted_as_such() {
         let env = TestEnv::new();
         let mut front = Sender::new(HUB, 7, 3, "front");
         let mut program = publisher(&env);
-        front.announce(&[Topic::Zones]);
-        program.await_line("a sensor", |line| line["kind"] == "published");
+        front.await_published(&mut program, &[Topic::Zones]);
         let mut echo = env.echo(&["robot1.front/zones"]);
         let pid = program.pid();
         let used = std::fs::read_dir(format!("/proc/{pid}/fd")).expect("it runs").count() as u64;
@@ -364,7 +359,7 @@ fn what_has_no_room_is_counted_as_such() {
         let outcome = program.end(INT);
         let line = &outcome.of_class("lan_published")[0];
         assert_eq!((&line["sensors"], &line["shortage"]), (&json!([FRONT]), &json!(2)), "{outcome}");
-        assert_eq!((&line["unannounced"], &line["unnamed"]), (&json!(1), &json!(0)), "{outcome}");
+        assert_eq!((&line["unannounced"], &line["unnamed"]), (&json!(1), &json!(front.proofs)), "{outcome}");
     });
 }
 
@@ -375,8 +370,8 @@ fn there_is_room_for_sixteen_sensors() {
         let mut program = publisher(&env);
         let mut senders: Vec<_> =
             (0..17).map(|number| Sender::new(0xab, 7, number, &format!("s{number}"))).collect();
-        // All but the last one deliver for a second.
-        for (count, wait_ms) in [(16, 1100), (17, 0)] {
+        // All but the last one are published when their gateway has delivered for a second, and deliver for another one.
+        for (count, wait_ms) in [(16, 1100), (16, 1100), (17, 0)] {
             for sender in &mut senders[..count] {
                 sender.announce(&[Topic::Zones]);
                 sender.send(Topic::Zones, &zones(Verdict::Clear));

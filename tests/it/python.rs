@@ -256,9 +256,8 @@ fn without_a_hub_the_robot_is_of_the_sensors_of_other_machines() {
         let mut listener =
             env.start(&["listen", "--json", "--publish", "--name=robot1=0000000000000001"]).ready();
         let mut front = Sender::new(1, 7, 0, "front");
-        front.announce(&[Topic::Zones]);
-        Sender::new(1, 7, 1, "mapper").announce(&[Topic::Scan]);
-        listener.await_lines(2, "its sensors", |line| line["kind"] == "published");
+        front.await_published(&mut listener, &[Topic::Zones]);
+        Sender::new(1, 7, 1, "mapper").await_published(&mut listener, &[Topic::Scan]);
         let mut robot = Program::start(command);
         let are = |verdict: &'static str, sensor: &'static str| {
             move |line: &Value| line["verdict"] == verdict && line["sensors"] == json!({ sensor: verdict })

@@ -131,6 +131,8 @@ fn no_topic_is_called_so_whoever_is_asked() {
         (&["listen", "--topic=scam"], &["scam", "scan"]),
         (&["listen", "--publish", "--consumers=251"], &["251", "1..=250"]),
         (&["listen", "--consumers=3"], &["--publish"]),
+        (&["listen", "--memory=3"], &["--publish"]),
+        (&["listen", "--publish", "--memory=0"], &["0", "1.."]),
         (&["echo", "*/scam"], &["*/scam", "*/scan"]),
         (&["echo", "*"], &["topics are"]),
         (&["record", "*/scam"], &["*/scam", "*/scan"]),

@@ -93,10 +93,9 @@ fn without_a_hub_the_robot_is_of_the_sensors_of_other_machines() {
         assert!(error["hint"].as_str().is_some_and(|hint| hint.contains("scanhub listen")), "{error}");
 
         let mut front = Sender::new(1, 7, 0, "front");
-        front.announce(&[Topic::Zones]);
+        front.await_published(&mut listener, &[Topic::Zones]);
         // Who publishes no zones is no part of the robot.
-        Sender::new(1, 7, 1, "mapper").announce(&[Topic::Scan]);
-        listener.await_lines(2, "its sensors", |line| line["kind"] == "published");
+        Sender::new(1, 7, 1, "mapper").await_published(&mut listener, &[Topic::Scan]);
         let mut echo = env.start(&["echo", "--json", "robot/zones"]);
         let mut leds = env.start(&["leds", "--json", "robot", "--hold=0s"]);
         let own = |line: &Value, verdict: &str, sensor: &str| {

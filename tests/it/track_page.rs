@@ -52,10 +52,15 @@ fn somebody_goes_from_the_hall_to_the_kitchen_as_the_page_says() {
         let world = World::of_toml("world.toml", WORLD).expect("a world");
         let file = recorded_world(&robot, &world, &["front", "rear"], 30);
         let _played = [play(&robot, &file, "front"), play(&kitchen, &file, "rear")];
-        let mut gateway = kitchen.gateway_at(&["--interface=lo", "--topic=*/scan", "--topic=*/foreground"]);
+        // With a key, a sensor is published before it sends anything: the recordings are still paused.
+        let made = robot.run(&["key", "new", &robot.word("key")]);
+        assert_eq!(made.code, Some(0), "{made}");
+        let key = format!("--key-file={}", robot.word("key"));
+        let mut gateway =
+            kitchen.gateway_at(&["--interface=lo", "--topic=*/scan", "--topic=*/foreground", &key]);
         let hub = gateway.await_line("its begin", is_class("gateway"))["hub"].clone();
         let name = format!("--name=kitchen={}", hub.as_str().expect("the number of a hub"));
-        let mut listen = robot.start(&["listen", "--publish", "--json", &name]).ready();
+        let mut listen = robot.start(&["listen", "--publish", "--json", &name, &key]).ready();
         listen.await_line("the sensor in the kitchen", |line| line["sensor"] == "kitchen.rear");
 
         // Twice as the page has them; both wait longer than it says, for a machine that is busy.

@@ -93,8 +93,7 @@ fn sensors_of_other_machines_stand_in_the_list_and_not_on_this_robot() {
         let words = ["listen", "--json", "--publish", "--name=robot1=5f3a12bc00d1e2f3"];
         let mut listener = env.start(&words).ready();
         let said = [Topic::Zones, Topic::Scan, Topic::Status];
-        sender.announce(&said);
-        listener.await_line("a sensor", |line| line["kind"] == "published");
+        sender.await_published(&mut listener, &said);
         // Nothing in this hall comes near.
         let world = format!("--world={}", env.file("world", HALL));
         let _lms = env.simulator(&["rear"], &["--seed=7", "--baud=500000", &world]);

@@ -6,7 +6,10 @@ use rustix::net::sockopt::set_ip_multicast_if;
 use schema::datagram::{
     Announce, Announced, GROUPS, HEAD, Head, LanFlags, MTU_ETHERNET, PART_LONGEST, PORT, Packed, group,
 };
-use schema::{Family, Topic};
+use schema::{Family, Status, Topic};
+use serde_json::Value;
+
+use super::{Program, until};
 
 /// One sensor of one gateway.
 pub(crate) struct Sender {
@@ -24,7 +27,12 @@ pub(crate) struct Sender {
     pub(crate) counter: u32,
     /// Of what is sent, ns since 1970.
     pub(crate) stamp_ns: u64,
+    /// Samples by [`prove`](Sender::prove) so far. A listener counts them as `unnamed`.
+    pub(crate) proofs: u32,
 }
+
+/// Number of a sensor that is never announced.
+const NAMELESS: u8 = 255;
 
 impl Sender {
     pub(crate) fn new(hub: u64, epoch: u32, sensor: u8, name: &str) -> Sender {
@@ -32,7 +40,7 @@ impl Sender {
         set_ip_multicast_if(&socket, &Ipv4Addr::LOCALHOST).expect("the loopback has an address");
         let (boot, next, counter, stamp_ns) = (0xb007, [0; 256], 0, wall_ns());
         let (name, family) = (name.to_owned(), Family::Lms);
-        Sender { socket, hub, epoch, sensor, family, name, boot, next, counter, stamp_ns }
+        Sender { socket, hub, epoch, sensor, family, name, boot, next, counter, stamp_ns, proofs: 0 }
     }
 
     /// The next datagram of `topic`.
@@ -87,6 +95,33 @@ impl Sender {
         let datagram = self.seal(Announce::NUMBER, &mut buffer, len);
         self.stamp_ns = stamp_ns;
         datagram
+    }
+
+    /// Sends a sample of another sensor of the same gateway. Such samples for a second prove that the gateway delivers, and
+    /// this sensor has sent nothing.
+    pub(crate) fn prove(&mut self) {
+        let status = usize::from(Topic::Status.number());
+        let sensor = std::mem::replace(&mut self.sensor, NAMELESS);
+        let next = std::mem::replace(&mut self.next[status], self.proofs);
+        self.send(Topic::Status, &Status::default());
+        self.proofs = std::mem::replace(&mut self.next[status], next);
+        self.sensor = sensor;
+    }
+
+    /// Announces `topics` until `listener`, which needs no key, publishes the sensor. Returns its notice.
+    pub(crate) fn await_published(&mut self, listener: &mut Program, topics: &[Topic]) -> Value {
+        let (hub, name) = (format!("{:016x}", self.hub), format!(".{}", self.name));
+        let is_it = |line: &Value| {
+            let is_named = line["sensor"].as_str().is_some_and(|sensor| sensor.ends_with(&name));
+            line["kind"] == "published" && line["hub"] == hub.as_str() && is_named
+        };
+        let mut notice = Value::Null;
+        until("the sensor is published", || {
+            self.announce(topics);
+            self.prove();
+            listener.printed(is_it).map(|line| notice = line).is_some()
+        });
+        notice
     }
 
     /// Sends an empty payload of the topic with this number.

@@ -72,6 +72,8 @@ pub struct PublishOptions {
     pub hubs: Vec<String>,
     /// What the topics are made for.
     pub limits: TopicLimits,
+    /// Bytes of shared memory that all topics may take together.
+    pub memory: u64,
 }
 
 /// Carries samples until `stop` is set, whatever becomes of the hub and of the network. The account goes to stdout at the

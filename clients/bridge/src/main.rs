@@ -49,6 +49,9 @@ struct Cli {
     /// Places for consumers of each published topic, 1 to 250
     #[arg(long, value_name = "N", requires = "publish", default_value_t = 32, value_parser = clap::value_parser!(u16).range(1..=250))]
     consumers: u16,
+    /// Shared memory that all published topics may take together, in MB (2^20 bytes). A sensor that does not fit is refused
+    #[arg(long, value_name = "MB", requires = "publish", default_value_t = 64, value_parser = clap::value_parser!(u32).range(1..))]
+    memory: u32,
     /// Connect, print what would keep a bridge from working and what to do, and end; nothing is sent or published
     #[arg(long, conflicts_with = "publish")]
     check: bool,
@@ -103,7 +106,8 @@ impl Cli {
             let domain = publisher_domain(&self.domain, self.root.as_deref(), &environment)?;
             let limits = TopicLimits { consumers: self.consumers.into(), ..TopicLimits::default() };
             let topics = received_topics(&self.topics)?;
-            Ok(PublishOptions { domain, topics, names: self.names, hubs: self.hubs, limits })
+            let memory = u64::from(self.memory) << 20;
+            Ok(PublishOptions { domain, topics, names: self.names, hubs: self.hubs, limits, memory })
         });
         Ok(BridgeOptions {
             connect: self.connect,

@@ -71,6 +71,9 @@ pub(crate) fn run(
         state: None,
         publish: Some(&options.domain),
         limits: options.limits,
+        memory: options.memory,
+        // Zenoh's configuration controls access.
+        only_proven: false,
         stats: true,
     };
     let reception =

@@ -69,6 +69,8 @@ pub struct Announcement {
     pub is_named: bool,
     /// How much the gateway's clock is behind this one's, in ns, if they differ; said once of each gateway.
     pub behind_ns: Option<i64>,
+    /// Whether its gateway had the key, or samples that it has sent cover a second or more.
+    pub is_proven: bool,
 }
 
 /// A sample, and what is known of who sent it.
@@ -81,6 +83,8 @@ pub struct RemoteSample<'a> {
     pub begins: bool,
     /// Samples of its topic that were sent before it and did not come, or not yet; 0 if it is late.
     pub missed: u32,
+    /// Whether its gateway had the key, or samples that it has sent cover a second or more.
+    pub is_proven: bool,
 }
 
 impl Arrived<'_> {
@@ -205,8 +209,13 @@ impl Incoming {
             Datagram { payload: telegram.map_or(datagram.payload, |telegram| telegram.bytes), ..datagram };
         let boot = announced.map_or(0, |announced| announced.boot);
         let (arrival_ns, authenticated) = (arrival.monotonic_ns, self.guard.is_some());
+        let is_proven = self.is_proven(&head);
         let remote = Remote { topic, datagram, boot, arrival_ns, age_ns, late, authenticated };
-        Arrived::Sample(RemoteSample { remote, announced, begins, missed })
+        Arrived::Sample(RemoteSample { remote, announced, begins, missed, is_proven })
+    }
+
+    fn is_proven(&self, head: &Head) -> bool {
+        self.guard.is_some() || self.stats.is_proven(head.hub, head.epoch)
     }
 
     fn announced<'a>(&mut self, datagram: &Datagram<'a>, begins: bool, arrival: Stamp) -> Arrived<'a> {
@@ -221,6 +230,7 @@ impl Incoming {
             begins,
             is_named,
             behind_ns,
+            is_proven: self.is_proven(&head),
         })
     }
 

@@ -225,7 +225,7 @@ fn play(run: &Run) -> Judged {
         receiving.step(at, NAME, |seen| judged.see(seen, &sending.sent, run));
     }
     judge_account(&judged, &sending.sent, &receiving);
-    let LeftOut { unnamed, unannounced, late, capacity, shortage } = receiving.republisher.left_out;
+    let LeftOut { unnamed, unannounced, late, capacity, shortage, .. } = receiving.republisher.left_out;
     judged.left_out = [unnamed, unannounced, late, capacity, shortage];
     let zones = |(key, _): &(&Key, _)| key.2 == Topic::Zones.number();
     judged.sent = sending.sent.datagrams.iter().filter(zones).map(|(_, numbers)| numbers.len() as u64).sum();

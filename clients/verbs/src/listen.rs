@@ -44,6 +44,8 @@ pub struct ListenOptions {
     pub publish: Option<Domain>,
     /// What the topics are made for that are published.
     pub limits: TopicLimits,
+    /// Bytes of shared memory that all published topics may take together.
+    pub memory: u64,
     /// Objects instead of text.
     pub json: bool,
     /// `out` is a terminal: the account is shown each second.
@@ -83,6 +85,8 @@ pub fn listen(
         state: options.state.clone(),
         publish: options.publish.as_ref(),
         limits: options.limits,
+        memory: options.memory,
+        only_proven: options.key_file.is_none(),
         stats: options.stats,
     };
     let reception = Reception::open(wanted, options.json, Words::LAN, Output::new(out), Output::new(notes))?;

@@ -50,6 +50,10 @@ pub struct Wanted<'a> {
     pub publish: Option<&'a Domain>,
     /// What the topics are made for that are published.
     pub limits: TopicLimits,
+    /// Bytes of shared memory that all published topics may take together.
+    pub memory: u64,
+    /// Whether only sensors of gateways are published that have delivered for a second.
+    pub only_proven: bool,
     /// Only the account, no samples.
     pub stats: bool,
 }
@@ -96,6 +100,10 @@ const OTHER_VERSION: &str = "somebody sends datagrams of another version, which 
 /// What is wrong where a datagram is of a topic that is not known here.
 const NEWER_TOPIC: &str = "somebody sends topics that this version does not know, which are left out: install the same \
                            version of scanhub on both machines";
+/// Message if a sensor does not fit into the memory that remote sensors may use.
+const NO_ROOM: &str = "samples of remote sensors were not published, because these need more shared memory than --memory \
+                       allows: use a greater --memory; if someone invents sensors, use --key-file, or --hub to receive only \
+                       those that it names";
 /// The most things that are told to be wrong: it may be the network that makes them.
 const TOLD: usize = 16;
 
@@ -105,8 +113,9 @@ impl<'a> Reception<'a> {
     ///
     /// # Errors
     ///
-    /// [`Kind::Configuration`](schema::Kind) if a name or hub is not possible, [`Kind::DomainHeld`](schema::Kind) if another
-    /// listener publishes in the domain, [`Kind::Short`](schema::Kind) if memory for that is.
+    /// [`Kind::Configuration`](schema::Kind) if a name or hub is not possible, or too little memory is allowed for a sensor;
+    /// [`Kind::DomainHeld`](schema::Kind) if another listener publishes in the domain, [`Kind::Short`](schema::Kind) if memory
+    /// for that is.
     pub fn open(
         wanted: Wanted<'_>,
         json: bool,
@@ -116,7 +125,11 @@ impl<'a> Reception<'a> {
     ) -> Result<Reception<'a>, Failure> {
         let names = Names::parse(wanted.names)?;
         let hubs = Hubs::parse(wanted.hubs, &names)?;
-        let publication = wanted.publish.map(|domain| publish::open(domain, wanted.limits)).transpose()?;
+        let open = |domain| {
+            let publication = publish::open(domain, wanted.limits, wanted.memory)?;
+            Ok(if wanted.only_proven { publication.only_proven() } else { publication })
+        };
+        let publication = wanted.publish.map(open).transpose()?;
         let key_name = wanted.key.as_ref().map(Key::name);
         let epochs = wanted.key.as_ref().map(|key| Epochs::of(key, wanted.state.clone()));
         let (known, unreadable) = match epochs.as_ref().map_or(Ok(HashMap::new()), Epochs::read) {
@@ -274,6 +287,9 @@ impl<'a> Reception<'a> {
         self.last_sample = Instant::now();
         if let Some(publication) = &mut self.publication {
             let made = publication.sample(sample, || self.report.names.of(head.hub), stamp::now());
+            if publication.left_out.no_room > 0 {
+                self.trouble(NO_ROOM)?;
+            }
             return self.made(head, made, origin);
         }
         if self.is_quiet {

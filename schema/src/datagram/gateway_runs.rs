@@ -223,7 +223,8 @@ impl Standing {
         }
     }
 
-    fn is_proven(&self) -> bool {
+    /// Returns whether the run is known to deliver: a second or more passed between its first and its last sample.
+    pub fn is_proven(&self) -> bool {
         self.delivered_ns.is_some_and(|(first_ns, last_ns)| last_ns.saturating_sub(first_ns) >= PROVEN_NS)
     }
 }

@@ -195,6 +195,14 @@ impl StreamStats {
         self.runs.since_ns((hub, epoch))
     }
 
+    /// Returns whether this run of `hub` is known to deliver: its accepted samples cover a second or more.
+    pub fn is_proven(&self, hub: u64, epoch: u32) -> bool {
+        match self.runs.find((hub, epoch)) {
+            RunLookup::At(slot) => self.runs.record(slot).standing.is_proven(),
+            RunLookup::Over | RunLookup::New => false,
+        }
+    }
+
     /// Returns whether two gateways are known to send under this number and epoch. All datagrams of one of them are
     /// refused as [`DatagramError::Twin`].
     pub fn is_shared(&self, hub: u64, epoch: u32) -> bool {

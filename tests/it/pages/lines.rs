@@ -10,7 +10,7 @@ use rustix::process::{Pid, Signal, kill_process_group};
 
 use super::blocks::blocks;
 use super::shell::{commands, lines};
-use crate::testkit::{Program, Sender, TestEnv, in_a_network, is_class, side_by_side, until, write_program};
+use crate::testkit::{Program, Sender, TestEnv, in_a_network, side_by_side, until, write_program};
 use schema::Topic;
 
 /// Commands that are not run, by how their line begins or what is in it, and what makes sure of them. Those of the
@@ -228,8 +228,7 @@ fn every_line_about_a_network_runs() {
         let name = "--name=robot1=5f3a12bc00d1e2f3";
         let mut listener = desk.env.start(&["listen", "--json", "--publish", name, "--interface=lo"]).ready();
         let mut sender = Sender::new(0x5f3a_12bc_00d1_e2f3, 7, 0, "front");
-        sender.announce(&[Topic::Scan, Topic::Zones]);
-        listener.await_line("a sensor", |line| is_class("notice")(line) && line["kind"] == "published");
+        sender.await_published(&mut listener, &[Topic::Scan, Topic::Zones]);
         wrong.extend(wrong_with(&desk, &follows));
         assert!(wrong.is_empty(), "{}", wrong.join("\n"));
     });

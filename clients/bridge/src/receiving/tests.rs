@@ -22,6 +22,8 @@ fn run(heard: Vec<Heard>, is_over: bool, ask: impl Fn(&str) -> Result<(), Failur
         state: None,
         publish: None,
         limits: TopicLimits::default(),
+        memory: 0,
+        only_proven: false,
         stats: true,
     };
     let (to_out, to_notes) = (Output::new(&mut out), Output::new(&mut notes));

@@ -36,6 +36,17 @@ pub(super) struct RemoteSensor<T: SensorTopics> {
     topics: T,
 }
 
+/// Outcome of a sample.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Outcome {
+    /// The sample was published.
+    Published,
+    /// The sensor has no such topic.
+    NoTopic,
+    /// The memory that remote sensors may use has no room for so long a sample.
+    NoRoom,
+}
+
 /// So long nothing comes before the sensor counts as silent: three announcements.
 const SILENT_AFTER_NS: u64 = 3_000_000_000;
 
@@ -111,13 +122,16 @@ impl<T: SensorTopics> RemoteSensor<T> {
         self.source.is_some_and(|source| (source.0, source.1) == (hub, epoch))
     }
 
-    /// Publishes `remote`; `false` if it has no such topic. A payload cannot fail to be read: the account has
-    /// checked it.
-    pub(super) fn publish(&mut self, remote: &Remote<'_>) -> bool {
+    /// Publishes `remote` if the sensor has the topic and room for the sample. The payload was checked before.
+    pub(super) fn publish(&mut self, remote: &Remote<'_>) -> Outcome {
         self.heard_ns = Some(remote.arrival_ns);
         self.standing.take(Arrival { delivers: true, now_ns: remote.arrival_ns });
         let topic = remote.topic;
-        let Some(stream) = &mut self.streams[topic as usize] else { return false };
+        let Some(stream) = &mut self.streams[topic as usize] else { return Outcome::NoTopic };
+        // Its number is left out before the next sample that fits.
+        if !self.topics.fits(topic, remote.datagram.payload) {
+            return Outcome::NoRoom;
+        }
         let Placed { left_out, header } = stream.place(remote, self.pid);
         self.topics.skip(topic, left_out);
         if topic != Topic::Status {
@@ -133,7 +147,7 @@ impl<T: SensorTopics> RemoteSensor<T> {
             Some(Wake::Telegram) => Some(Wake::Telegram),
             _ => Some(why),
         };
-        true
+        Outcome::Published
     }
 
     /// Wakes the consumers, if something was published since the last call.
@@ -253,10 +267,10 @@ mod tests {
             authenticated: false,
         };
         let read = |ms| Stamp { monotonic_ns: ms * MS, wall_ns: ms * MS };
-        assert!(sensor.publish(&came(1_000)));
+        assert_eq!(sensor.publish(&came(1_000)), Outcome::Published);
         // The listener is behind: what came at 4.6 s is the next that it will read.
         [3_999, 4_500, 4_550].into_iter().for_each(|ms| sensor.look(read(ms)));
-        assert!(sensor.publish(&came(4_600)));
+        assert_eq!(sensor.publish(&came(4_600)), Outcome::Published);
         sensor.look(read(5_000));
         let (streams, silent) = (Some(State::Streaming), Some(State::Silent));
         assert_eq!(

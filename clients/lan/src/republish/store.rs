@@ -14,6 +14,12 @@ pub trait TopicStore {
     /// [`Kind::Short`](schema::Kind) if there is not.
     fn check_room(&self, topics: &[Topic]) -> Result<(), Failure>;
 
+    /// Returns whether the memory that remote sensors may use has room for `topics` of one more sensor.
+    fn fits(&self, topics: &[Topic]) -> bool {
+        let _ = topics;
+        true
+    }
+
     /// Makes a sensor without topics.
     ///
     /// # Errors
@@ -36,6 +42,13 @@ pub trait SensorTopics {
 
     /// Takes `topic` away.
     fn remove(&mut self, topic: Topic);
+
+    /// Returns whether the memory that remote sensors may use has room for `topic` with samples as long as `payload`, which
+    /// is as in a datagram, and was checked.
+    fn fits(&self, topic: Topic, payload: &[u8]) -> bool {
+        let _ = (topic, payload);
+        true
+    }
 
     /// Uses up `count` numbers of `topic` without a sample.
     fn skip(&mut self, topic: Topic, count: u64);

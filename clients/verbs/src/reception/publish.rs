@@ -1,20 +1,27 @@
 //! Where remote sensors are published: the shared memory of a domain. Refuses to know which of them, and when.
 
 mod any_publisher;
+mod budget;
+
+use std::rc::Rc;
 
 use lan::republish::{Republisher, SensorTopics, TopicStore};
 use scanhub_client::{PublishSession, SensorPublisher, clock};
 use schema::limits::TopicLimits;
 use schema::shortage::{check_memory, raise_descriptor_limit, sensor_bytes};
-use schema::{BEAMS, Contents, Domain, Failure, Header, Telegram, Topic, Wake};
+use schema::{BEAMS, Contents, Domain, Failure, Header, Kind, Telegram, Topic, Wake};
 
 use any_publisher::AnyPublisher;
+use budget::{Budget, Share};
 
 /// The publishing end of all remote sensors of a domain.
 pub(super) type Publication = Republisher<SharedMemory>;
 
-/// The shared memory of a domain.
-pub(super) struct SharedMemory(PublishSession);
+/// The shared memory of a domain. Remote sensors may use a part of it.
+pub(super) struct SharedMemory {
+    session: PublishSession,
+    budget: Rc<Budget>,
+}
 
 /// The topics of one sensor in shared memory. How long its samples are is not announced: topics are made for an LMS, and
 /// made anew where a sample comes that is longer. Their consumers stay.
@@ -31,54 +38,82 @@ pub(super) struct SharedTopics {
     failed: u64,
     // Behind the topics: it wakes their consumers.
     sensor: SensorPublisher,
+    budget: Rc<Budget>,
+    /// Memory of the doorbell and the event.
+    _share: Share,
 }
 
 /// A topic, and what it was made for.
 struct Made {
     publisher: AnyPublisher,
     limits: TopicLimits,
+    // Behind the publisher, whose memory it counts.
+    share: Share,
 }
 
 /// So often topics are made anew for exactly what came, then for the longest samples that there can be: whoever can send
 /// could ask for a beam more with each sample.
 const WIDENED_EXACTLY: u32 = 4;
 
-/// Takes the domain's place for a listener, beside its hub if there is one. All topics are made as `limits` say.
+/// Takes the lock of the domain's listener. All topics are created with `limits`, and take at most `memory` bytes together.
 ///
-/// [`Kind::DomainHeld`](schema::Kind) if another listener has it, [`Kind::Short`](schema::Kind) if there is no memory
-/// for even one sensor, [`Kind::Failed`](schema::Kind) if shared memory refuses.
-pub(super) fn open(domain: &Domain, limits: TopicLimits) -> Result<Publication, Failure> {
+/// Returns [`Kind::Configuration`] if `memory` is too small for a sensor, and [`Kind::DomainHeld`] if another listener has
+/// the lock. Returns [`Kind::Short`] if there is no memory for even one sensor, and [`Kind::Failed`] if shared memory
+/// refuses.
+pub(super) fn open(domain: &Domain, limits: TopicLimits, memory: u64) -> Result<Publication, Failure> {
     // With fewer, fewer consumers can attach.
     let _ = raise_descriptor_limit();
+    let needed = sensor_bytes(&Topic::ALL, &limits);
+    if memory < needed {
+        let (have, need) = (memory.div_ceil(MEGABYTE), needed.div_ceil(MEGABYTE));
+        let what = format!("--memory {have} has no room for a sensor with {} subscribers", limits.consumers);
+        return Err(Failure::new(Kind::Configuration, what, format!("at least {need}")));
+    }
     let session = PublishSession::open(domain, &Topic::ALL, limits)?;
-    Ok(Republisher::new(SharedMemory(session), std::process::id(), clock::now_ns()))
+    let store = SharedMemory { session, budget: Rc::new(Budget::new(memory)) };
+    Ok(Republisher::new(store, std::process::id(), clock::now_ns()))
 }
+
+/// Unit of `--memory`.
+const MEGABYTE: u64 = 1 << 20;
 
 impl TopicStore for SharedMemory {
     type Sensor = SharedTopics;
 
     fn check_room(&self, topics: &[Topic]) -> Result<(), Failure> {
-        self.0.check_room(topics)
+        self.session.check_room(topics)
+    }
+
+    fn fits(&self, topics: &[Topic]) -> bool {
+        self.budget.has(sensor_bytes(topics, self.session.limits()))
     }
 
     fn sensor(&self, name: &str) -> Result<SharedTopics, Failure> {
         let (topics, gone) = ([const { None }; Topic::ALL.len()], [None; Topic::ALL.len()]);
-        let sensor = self.0.sensor(name)?;
-        Ok(SharedTopics { topics, gone, limits: *sensor.limits(), widened: 0, failed: 0, sensor })
+        let limits = *self.session.limits();
+        Ok(SharedTopics {
+            topics,
+            gone,
+            limits,
+            widened: 0,
+            failed: 0,
+            sensor: self.session.sensor(name)?,
+            budget: self.budget.clone(),
+            _share: self.budget.take(sensor_bytes(&[], &limits)),
+        })
     }
 
     fn clean_up(&self) {
-        self.0.clean_up();
+        self.session.clean_up();
     }
 }
 
 impl SharedTopics {
-    /// Makes `topic` anew if it has no room for `payload`. What is too long all the same is counted when it is published.
-    fn make_room(&mut self, topic: Topic, payload: &[u8]) {
-        let Some(made) = &self.topics[topic as usize] else { return };
-        let mut limits = made.limits;
+    /// Returns the limits with which `topic` has room for `payload`. `None` if it has room.
+    fn wider(&self, topic: Topic, payload: &[u8]) -> Option<TopicLimits> {
+        let mut limits = self.topics[topic as usize].as_ref()?.limits;
         if !AnyPublisher::widen(topic, &mut limits, payload) {
-            return;
+            return None;
         }
         let known = TopicLimits {
             beams: limits.beams.max(self.limits.beams),
@@ -86,20 +121,27 @@ impl SharedTopics {
             telegram: limits.telegram.max(self.limits.telegram),
             ..limits
         };
-        let limits = if known != self.limits && self.widened >= WIDENED_EXACTLY {
+        Some(if known != self.limits && self.widened >= WIDENED_EXACTLY {
             TopicLimits { beams: BEAMS, contents: Contents::ALL, telegram: Telegram::MAX, ..known }
         } else {
             known
-        };
+        })
+    }
+
+    /// Creates `topic` again if it has no room for `payload`. A sample that is still too long is counted when it is published.
+    fn make_room(&mut self, topic: Topic, payload: &[u8]) {
+        let Some(limits) = self.wider(topic, payload) else { return };
         if !has_memory(topic, &limits) {
             return;
         }
         self.widened += u32::from(limits != self.limits);
         self.limits = limits;
-        let Some(Made { publisher, limits: before }) = self.topics[topic as usize].take() else { return };
+        let Some(Made { publisher, limits: before, share }) = self.topics[topic as usize].take() else {
+            return;
+        };
         let (next, failed) = (publisher.next_number(), publisher.failed());
         // One at a time publishes a topic.
-        drop(publisher);
+        drop((publisher, share));
         self.failed += failed;
         self.topics[topic as usize] =
             [limits, before].into_iter().find_map(|limits| self.made(topic, limits).ok());
@@ -110,7 +152,8 @@ impl SharedTopics {
     /// Makes `topic` again that is gone, as soon as there is memory.
     fn make_again(&mut self, topic: Topic) {
         let Some(next) = self.gone[topic as usize] else { return };
-        if has_memory(topic, &self.limits)
+        if self.budget.has(topic_bytes(topic, &self.limits))
+            && has_memory(topic, &self.limits)
             && let Ok(made) = self.made(topic, self.limits)
         {
             self.topics[topic as usize] = Some(made);
@@ -120,14 +163,23 @@ impl SharedTopics {
     }
 
     fn made(&self, topic: Topic, limits: TopicLimits) -> Result<Made, Failure> {
-        Ok(Made { publisher: AnyPublisher::new(topic, &self.sensor, &limits)?, limits })
+        let publisher = AnyPublisher::new(topic, &self.sensor, &limits)?;
+        Ok(Made { publisher, limits, share: self.budget.take(topic_bytes(topic, &limits)) })
     }
 }
 
 impl SensorTopics for SharedTopics {
     fn add(&mut self, topic: Topic) -> Result<(), Failure> {
-        self.topics[topic as usize] = Some(self.made(topic, self.limits)?);
+        let is_wide = self.budget.has(topic_bytes(topic, &self.limits));
+        let limits = if is_wide { self.limits } else { *self.sensor.limits() };
+        self.topics[topic as usize] = Some(self.made(topic, limits)?);
         Ok(())
+    }
+
+    fn fits(&self, topic: Topic, payload: &[u8]) -> bool {
+        let Some(limits) = self.wider(topic, payload) else { return true };
+        let before = self.topics[topic as usize].as_ref().map_or(0, |made| made.share.bytes());
+        self.budget.has(topic_bytes(topic, &limits).saturating_sub(before))
     }
 
     fn remove(&mut self, topic: Topic) {
@@ -168,6 +220,11 @@ impl SensorTopics for SharedTopics {
     fn failed(&self) -> u64 {
         self.failed + self.topics.iter().flatten().map(|made| made.publisher.failed()).sum::<u64>()
     }
+}
+
+/// Returns the memory of a `topic` that is made as `limits` say, without that of its sensor's event.
+fn topic_bytes(topic: Topic, limits: &TopicLimits) -> u64 {
+    sensor_bytes(&[topic], limits) - sensor_bytes(&[], limits)
 }
 
 /// Whether there is memory for one more `topic` that is made as `limits` say.

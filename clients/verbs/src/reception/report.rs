@@ -15,7 +15,7 @@ use super::names::Names;
 use super::publish::Publication;
 use super::remote::{self, id};
 use crate::output::{End, Output, table};
-use classes::{Notice, Published, Ready, Sums};
+use classes::{NoRoom, Notice, Published, Ready, Sums};
 
 /// The classes of an account, by the network that it is of.
 #[derive(Clone, Copy, Debug)]
@@ -24,6 +24,7 @@ pub struct Words {
     refused: &'static str,
     given_up: &'static str,
     published: &'static str,
+    no_room: &'static str,
     /// Whether it is told how many samples senders replaced by newer ones.
     tells_replaced: bool,
 }
@@ -35,6 +36,7 @@ impl Words {
         refused: "lan_refused",
         given_up: "lan_given_up",
         published: "lan_published",
+        no_room: "lan_no_room",
         tells_replaced: false,
     };
     /// What comes over a bridge.
@@ -43,6 +45,7 @@ impl Words {
         refused: "bridge_refused",
         given_up: "bridge_given_up",
         published: "bridge_published",
+        no_room: "bridge_no_room",
         tells_replaced: true,
     };
 }
@@ -152,7 +155,20 @@ impl<'a> Report<'a> {
     /// What became of all that came, in shared memory.
     pub(super) fn publication(&mut self, publication: &Publication) -> Result<(), End> {
         let line = Published::new(publication, self.words.published);
-        if self.json { self.out.json(&line) } else { self.out.line(|out| line.text(out)) }
+        if self.json {
+            self.out.json(&line)?
+        } else {
+            self.out.line(|out| line.text(out))?
+        }
+        for &(hub, no_room) in publication.no_room() {
+            if self.json {
+                self.out.json(&NoRoom { class: self.words.no_room, hub, no_room })?;
+            } else {
+                let hub = self.names.of(hub);
+                self.out.line(|line| write!(line, "of {hub}: {no_room} beyond --memory"))?;
+            }
+        }
+        Ok(())
     }
 
     /// Something is wrong here.

@@ -94,7 +94,18 @@ pub(super) struct Published<'a> {
     late: u64,
     capacity: u64,
     shortage: u64,
+    unproven: u64,
+    no_room: u64,
     loan_failed: u64,
+}
+
+/// Class `lan_no_room` or `bridge_no_room`, of a gateway.
+#[derive(Serialize)]
+pub(super) struct NoRoom {
+    pub(super) class: &'static str,
+    #[serde(serialize_with = "id")]
+    pub(super) hub: u64,
+    pub(super) no_room: u64,
 }
 
 impl<'a> Published<'a> {
@@ -108,16 +119,20 @@ impl<'a> Published<'a> {
             late: left_out.late,
             capacity: left_out.capacity,
             shortage: left_out.shortage,
+            unproven: left_out.unproven,
+            no_room: left_out.no_room,
             loan_failed: publication.failed(),
         }
     }
 
     /// The same for people.
     pub(super) fn text(&self, line: &mut Vec<u8>) -> io::Result<()> {
-        let Published { unnamed, unannounced, late, capacity, shortage, loan_failed, .. } = self;
+        let Published { unnamed, unannounced, late, capacity, shortage, .. } = self;
+        let Published { unproven, no_room, loan_failed, .. } = self;
         write!(line, "published: {}; left out: {unnamed} unnamed, ", self.sensors.join(", "))?;
+        write!(line, "{unproven} in a gateway's first second, ")?;
         write!(line, "{unannounced} unannounced, {late} late, {capacity} beyond capacity, ")?;
-        write!(line, "{shortage} for lack of room, {loan_failed} without memory")
+        write!(line, "{no_room} beyond --memory, {shortage} for lack of room, {loan_failed} without memory")
     }
 }
 
