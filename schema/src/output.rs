@@ -257,11 +257,7 @@ pub fn unwritable(path: &Path, error: &io::Error) -> Failure {
 }
 
 fn exists(path: &Path) -> Failure {
-    Failure::new(
-        Kind::Output,
-        format!("{} exists", path.display()),
-        "--force replaces it; or name another file",
-    )
+    Failure::new(Kind::Output, format!("{} exists", path.display()), "--force replaces it")
 }
 
 /// Returns the permissions that new files of this process do not get. If the kernel does not report them (before Linux 4.7),

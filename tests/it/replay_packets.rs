@@ -72,7 +72,15 @@ fn check_scans(recorded: &[(Header, Vec<u8>)], replayed: &[(Header, Vec<u8>)]) {
         replayed.iter().map(|(header, payload)| (header.seq, (header, payload))).collect();
     let (mut compared, mut incomplete, mut suspect) = (0, 0, 0);
     for (header, payload) in recorded {
-        let (played, bytes) = by_seq.get(&header.seq).unwrap_or_else(|| panic!("no scan of {}", header.seq));
+        let (played, bytes) = by_seq.get(&header.seq).unwrap_or_else(|| {
+            let near = |samples: &[(Header, Vec<u8>)]| -> Vec<_> {
+                let is_near = |(other, _): &&(Header, Vec<u8>)| other.seq.abs_diff(header.seq) < 100;
+                let facts =
+                    |(of, _): &(Header, Vec<u8>)| (of.seq, of.topic_seq, of.stamp_first_ns, of.reasons);
+                samples.iter().filter(is_near).map(facts).collect()
+            };
+            panic!("no scan of {}: {:?} became {:?}", header.seq, near(recorded), near(replayed))
+        });
         let (then, now) = (scan(payload), scan(bytes));
         assert_eq!(then.ranges(), now.ranges(), "{}", header.seq);
         let exact =

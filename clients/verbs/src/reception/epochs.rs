@@ -101,8 +101,11 @@ mod tests {
         epochs(1).keep(&HashMap::from([(5, 6), (7, u32::MAX)])).unwrap();
         assert_eq!(epochs(1).read().unwrap(), HashMap::from([(5, 7), (6, 1), (7, u32::MAX)]));
         assert_eq!(epochs(2).read().unwrap(), HashMap::new(), "another key");
-        std::fs::write(StateDirectory::at(root.path().join("d")).path(&epochs(1).name), "torn\n5 9 \nffff 3\n")
-            .unwrap();
+        std::fs::write(
+            StateDirectory::at(root.path().join("d")).path(&epochs(1).name),
+            "torn\n5 9 \nffff 3\n",
+        )
+        .unwrap();
         assert_eq!(epochs(1).read().unwrap(), HashMap::from([(0xffff, 3)]));
         assert_eq!(Epochs::of(&Key::new(&[1; 32]), None).keep(&HashMap::from([(5, 7)])), Ok(()));
     }

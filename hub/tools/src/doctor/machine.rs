@@ -482,7 +482,7 @@ pub(super) mod tests {
         says(&descriptors(&facts()), State::Ok, &["4096", "990 consumers"]);
         says(&descriptors(&Facts { descriptors: None, ..facts() }), State::Ok, &["no limit"]);
         says(&descriptors(&Facts { descriptors: Some(152), ..facts() }), State::Warning, &["4 consumers"]);
-        says(&descriptors(&Facts { descriptors: Some(131), ..facts() }), State::Failed, &["needs 134"]);
+        says(&descriptors(&Facts { descriptors: Some(131), ..facts() }), State::Failed, &["needs 136"]);
     }
 
     #[test]
