@@ -62,7 +62,7 @@ pub(crate) struct Simulate {
     /// Faults to inject, for example loss=0.00135,burst=1.89; see below
     #[arg(long, default_value = "", hide_default_value = true, value_name = "KEY=VALUE,..")]
     fault: String,
-    /// Write one JSON line per telegram to this file: what was sent, with its hash. `-` is stdout
+    /// Write one JSON line with its hash to this file for each telegram that was sent. `-` is stdout
     #[arg(long, value_name = "FILE")]
     truth: Option<PathBuf>,
     /// Replace an existing file of --truth

@@ -1,9 +1,9 @@
-//! A private directory, such as that of a domain, opened so that no other user can put another one in its place: component
-//! by component from the root of the file system, and then every file relative to the open directory.
+//! A private directory, such as that of a domain. It is opened component by component from the root of the file system, and
+//! every file in it relative to the open directory. No other user can put another directory in its place.
 //!
-//! The last components (base and domain) must belong to this user and be writable by nobody else, and a link is never
-//! followed there. Above them, a link is followed if root or this user made it where nobody else can make one: `/home` or
-//! `/var/run` may be links. The owners of the directories above the base are not checked.
+//! The last components (base and domain) must belong to this user and be writable by no other user, and a link is never
+//! followed there. Above them, a link is followed if root or this user made it in a directory that no other user can write to:
+//! `/home` or `/var/run` may be links. The owners of the directories above the base are not checked.
 
 use std::ffi::{OsStr, OsString};
 use std::fs::File;
@@ -27,12 +27,12 @@ pub struct Directory {
     purpose: Purpose,
 }
 
-/// What a directory is for: the remedies differ.
+/// Purpose of a directory, which decides about remedies.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Purpose {
     /// The files of a domain.
     Domain,
-    /// What programs keep across restarts.
+    /// Files that programs keep across restarts.
     State,
 }
 
@@ -62,16 +62,16 @@ impl Directory {
     ///
     /// # Errors
     ///
-    /// As [`open`](Self::open).
+    /// Those of [`open`](Self::open).
     pub fn open_state(path: &Path, own: usize) -> Result<Option<Directory>, Failure> {
         Directory::walk(path, own, Purpose::State, user(), false)
     }
 
-    /// Opens it as [`open_state`](Self::open_state) does; what is missing is made for this user alone.
+    /// Opens it as [`open_state`](Self::open_state) does. Missing directories are created for this user alone.
     ///
     /// # Errors
     ///
-    /// As [`make`](Self::make).
+    /// Those of [`make`](Self::make).
     pub fn make_state(path: &Path, own: usize) -> Result<Directory, Failure> {
         let made = Directory::walk(path, own, Purpose::State, user(), true)?;
         made.ok_or_else(|| Purpose::State.unusable(path, Errno::NOENT))
@@ -195,7 +195,7 @@ impl Directory {
         Ok(File::from(fd))
     }
 
-    /// Opens `path`, of which `user` must own the last `own` components.
+    /// Opens `path`. `user` must own its last `own` components.
     fn walk(
         path: &Path,
         own: usize,

@@ -34,7 +34,7 @@ pub fn write(path: &Path, content: &[u8], force: bool) -> Result<(), Failure> {
     file.commit()
 }
 
-/// A file that is written at once. It has a random name beside its target, and mode 0600, until [`commit`](Self::commit).
+/// A file that is written at once. It has a random name in the directory of its target, and mode 0600, until [`commit`](Self::commit).
 /// Without that, it is removed when it is dropped.
 #[derive(Debug)]
 pub struct OutputFile {

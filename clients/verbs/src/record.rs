@@ -158,7 +158,7 @@ fn begin(options: &RecordOptions, queue: &Arc<Queue>) -> Result<Disk, End> {
         true => Err(File::from(io::stdout().as_fd().try_clone_to_owned().map_err(failed)?)),
         false => {
             let target = Target::open(path)?;
-            // The files of a split run have names of their own.
+            // A split run adds numbers to the name.
             if options.split.is_none() {
                 target.check(options.force)?;
             }

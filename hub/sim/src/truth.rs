@@ -1,5 +1,5 @@
-//! What was really sent: one record per telegram and one per port at the end, as lines in a file or on stdout. The hub never
-//! sees any of it.
+//! Record of what the simulator has sent: one line per telegram, and one per port at the end, in a file or on stdout. The hub
+//! never reads it.
 
 use std::fs::File;
 use std::io::{self, Write};
@@ -84,7 +84,7 @@ impl Truth {
     ///
     /// # Errors
     ///
-    /// As [`Target::create_new`].
+    /// Those of [`Target::create_new`].
     pub fn create(path: &Path, force: bool) -> Result<Self, Failure> {
         let is_stdout = path == Path::new("-");
         let file =

@@ -29,7 +29,7 @@ impl Life {
     ///
     /// # Errors
     ///
-    /// [`Kind::Output`] if the file cannot be written: then listeners could not distinguish this life from the last one.
+    /// [`Kind::Output`] if the file cannot be written: then listeners could not distinguish this run from the last one.
     /// [`Kind::Configuration`] if there are too many.
     pub(super) fn begin(
         directory: &Path,

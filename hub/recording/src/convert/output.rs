@@ -8,7 +8,7 @@ use flate2::write::GzEncoder;
 use schema::output::OutputFile;
 use schema::{Failure, Kind};
 
-/// Where a conversion writes.
+/// Output of a conversion.
 pub(super) enum Output {
     Stdout(io::Stdout),
     File(OutputFile),
@@ -19,7 +19,7 @@ impl Output {
     ///
     /// # Errors
     ///
-    /// As [`OutputFile::create`]; [`Kind::Output`] if `path` is the input.
+    /// Those of [`OutputFile::create`], and [`Kind::Output`] if `path` is the input.
     pub(super) fn create(path: &Path, input: &Path, force: bool) -> Result<Output, Failure> {
         if path == Path::new("-") {
             return Ok(Output::Stdout(io::stdout()));
@@ -42,7 +42,7 @@ impl Output {
     ///
     /// # Errors
     ///
-    /// As [`OutputFile::commit`].
+    /// Those of [`OutputFile::commit`].
     pub(super) fn commit(self) -> Result<(), Failure> {
         match self {
             Output::Stdout(_) => Ok(()),
