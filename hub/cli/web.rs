@@ -1,6 +1,7 @@
 //! `scanhub web` on the command line.
 
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
+use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 
 use clap::Args;
@@ -22,8 +23,8 @@ pub(crate) struct Web {
     /// of this machine see it in the list of processes, unless it comes from the environment or --token-file
     #[arg(long, value_name = "WORD", env = "SCANHUB_WEB_TOKEN", hide_env_values = true, value_parser = word)]
     token: Option<String>,
-    /// File with the word of --token as its only line
-    #[arg(long, value_name = "FILE", conflicts_with = "token")]
+    /// File with the word as its only line, which only this user can read. It goes before --token
+    #[arg(long, value_name = "FILE")]
     token_file: Option<PathBuf>,
     /// Serve everyone who can reach the address, without a token
     #[arg(long, conflicts_with_all = ["token", "token_file"])]
@@ -78,13 +79,19 @@ fn word(text: &str) -> Result<String, String> {
 ///
 /// # Errors
 ///
-/// [`Kind::Input`] if it cannot be read, [`Kind::Configuration`] if it contains no token.
+/// [`Kind::Input`] if it cannot be read, [`Kind::Configuration`] if it contains no token, or if others can use it.
 fn read_token(file: &Path) -> Result<String, Failure> {
     let place = file.display();
-    let text = regular::read_text(file, MAX_TOKEN_FILE).map_err(|error| {
+    let unreadable = |error: std::io::Error| {
         let hint = "it must exist and be readable for this user";
         Failure::new(Kind::Input, format!("cannot read {place}: {error}"), hint)
-    })?;
+    };
+    let text = regular::read_text(file, MAX_TOKEN_FILE).map_err(unreadable)?;
+    let mode = file.metadata().map_err(unreadable)?.mode() & 0o777;
+    if mode & 0o077 != 0 {
+        let message = format!("{place} has mode {mode:04o}, so others can use the token");
+        return Err(Failure::new(Kind::Configuration, message, "`chmod 600` it"));
+    }
     word(text.trim_end()).map_err(|expected| {
         let hint = format!("one line with one word: {expected}");
         Failure::new(Kind::Configuration, format!("{place} contains no token"), hint)

@@ -72,11 +72,12 @@ impl OutputFile {
         let old = target.check(force)?;
         let put = || {
             let permissions = match old {
-                Some(old) => {
-                    // Only root may give a file away. This clears some permissions, so they are set afterwards.
-                    let _ = fchown(file.as_file(), Some(old.st_uid), Some(old.st_gid));
-                    old.st_mode & 0o7777
-                }
+                // Only root may give a file away. This clears some permissions, so they are set afterwards.
+                Some(old) => match fchown(file.as_file(), Some(old.st_uid), Some(old.st_gid)) {
+                    Ok(()) => old.st_mode & 0o777,
+                    // The permissions were meant for another owner or group.
+                    Err(_) => old.st_mode & 0o600,
+                },
                 None => PUBLIC & !umask(),
             };
             file.as_file().set_permissions(Permissions::from_mode(permissions))?;

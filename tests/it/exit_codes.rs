@@ -193,3 +193,20 @@ fn an_existing_output_is_replaced_by_force() {
     assert!(fs::read_to_string(&page).expect("a page").contains("scanhub-run"));
     assert_eq!(fs::read_to_string(&file).expect("a drawing"), drawing);
 }
+
+#[test]
+fn a_token_comes_from_a_file_that_only_this_user_can_read() {
+    let env = TestEnv::new();
+    let file = env.file("token", "carrot\n");
+    let web = |env: &TestEnv| env.command(&["web", "--json", "--listen=127.0.0.1:0", "--token-file", &file]);
+    fs::set_permissions(&file, Permissions::from_mode(0o640)).expect("it is ours");
+    let refused = Program::start(web(&env)).wait();
+    assert_eq!(refused.code, Some(78), "{refused}");
+    assert!(refused.to_string().contains("mode 0640"), "{refused}");
+    fs::set_permissions(&file, Permissions::from_mode(0o600)).expect("it is ours");
+    let mut command = web(&env);
+    command.env("SCANHUB_WEB_TOKEN", "of-the-environment");
+    let mut web = Program::start(command);
+    let ready = web.await_line("ready", |line| line["class"] == "ready");
+    assert!(ready["url"].as_str().is_some_and(|url| url.ends_with("/?token=carrot")), "{ready}");
+}

@@ -72,15 +72,19 @@ fn links_at_the_name_of_an_output_are_refused() {
 fn names_of_temporary_files_cannot_be_guessed() {
     beside_a_stranger("planted_links::names_of_temporary_files_cannot_be_guessed", || {
         prepare();
-        let pid = std::process::id();
-        for name in ["out.mcap", "plan.svg"] {
-            stranger(&format!(
-                "for n in $(seq {pid} {}); do ln -s /mnt/victim /tmp/.{name}.$n; done",
-                pid + 2_000
-            ));
-        }
-        assert_eq!(run(&["convert", "/mnt/walk.log", "/tmp/out.mcap"]).code, Some(0));
-        assert_eq!(run(&["site", "check", "/mnt/site.toml", "--svg", "/tmp/plan.svg"]).code, Some(0));
+        // The shell has the process id that the program gets.
+        let planted = |name: &str, words: &str| {
+            let link = format!("setpriv --reuid=65533 --clear-groups ln -s /mnt/victim /tmp/.{name}.$$");
+            let mut shell = Command::new("sh");
+            shell.args([
+                "-c",
+                &format!("{link} && test -L /tmp/.{name}.$$ && exec /mnt/scanhub {words} /tmp/{name}"),
+            ]);
+            let outcome = Program::start(shell).wait();
+            assert_eq!(outcome.code, Some(0), "{outcome}");
+        };
+        planted("out.mcap", "convert /mnt/walk.log");
+        planted("plan.svg", "site check /mnt/site.toml --svg");
         assert_eq!(fs::read_to_string(VICTIM).expect("it is there"), CONTENT);
         for file in ["/tmp/out.mcap", "/tmp/plan.svg"] {
             let file = fs::symlink_metadata(file).expect("it is there");

@@ -133,13 +133,12 @@ impl<S: TopicStore> Republisher<S> {
         let arrival = Arrival { delivers: false, now_ns: *arrival_ns };
         let candidate = if *is_proven { self.candidates.take(head) } else { None };
         let made = self.make(head, hub, announce, arrival, *is_proven, now);
-        self.publish_kept(head, candidate);
+        self.publish_kept(head, announce.boot, candidate);
         made
     }
 
     /// Publishes `sample`, or counts why not. Makes its sensor as [`announced`](Self::announced) does if its gateway is known
-    /// to deliver since this sample. If there is no room for its sensor, another one may be
-    /// removed for it.
+    /// to deliver with this sample. If there is no room for its sensor, another one may be removed for it.
     ///
     /// # Errors
     ///
@@ -160,7 +159,7 @@ impl<S: TopicStore> Republisher<S> {
             }
             _ => Ok(None),
         };
-        self.publish_kept(head, candidate);
+        self.publish_kept(head, remote.boot, candidate);
         self.publish(sample);
         made
     }
@@ -274,14 +273,17 @@ impl<S: TopicStore> Republisher<S> {
         self.sensors.len() == SENSORS || !self.store.fits(&topics(announce))
     }
 
-    /// Publishes the samples of `candidate`, which sent `head`, if the sensor was made.
-    fn publish_kept(&mut self, head: &Head, candidate: Option<Candidate>) {
+    /// Publishes the samples of `candidate`, which sent `head`, if the sensor was made. Otherwise, it stays a candidate. Samples
+    /// of another run of the hub than `boot` may be of another sensor, so they are dropped.
+    fn publish_kept(&mut self, head: &Head, boot: u64, candidate: Option<Candidate>) {
         let Some(candidate) = candidate else { return };
-        if let Some(sensor) = self.sensors.iter_mut().find(|sensor| sensor.is(head)) {
-            let outcomes = candidate.samples().map(|remote| sensor.publish(&remote));
-            let published = outcomes.filter(|outcome| *outcome == Outcome::Published).count();
-            self.left_out.unproven -= published as u64;
-        }
+        let Some(sensor) = self.sensors.iter_mut().find(|sensor| sensor.is(head)) else {
+            return self.candidates.put_back(candidate);
+        };
+        let samples = candidate.samples().filter(|remote| remote.boot == boot);
+        let outcomes = samples.map(|remote| sensor.publish(&remote));
+        let published = outcomes.filter(|outcome| *outcome == Outcome::Published).count();
+        self.left_out.unproven -= published as u64;
     }
 
     /// Publishes `sample`, if it can be.

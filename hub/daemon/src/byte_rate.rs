@@ -37,8 +37,9 @@ impl ByteRate {
         }
     }
 
-    /// Returns the rate in bytes per second, rounded for a message; `None` if almost nothing arrives, or while the
-    /// rate [settles](Self::is_settling). The session has read `read` bytes at `now`. A rate that varies a little is returned unchanged, because a new message is a new log line.
+    /// Returns the rate in bytes per second, rounded for a message; `None` if almost nothing arrives, or while the rate
+    /// [settles](Self::is_settling). The session has read `read` bytes at `now`. A rate that varies a little is returned
+    /// unchanged, because a new message is a new log line.
     pub(crate) fn shown(&mut self, now: Nanos, read: u64) -> Option<u64> {
         let rate = if self.is_complete { self.last } else { self.of_window(now, read) }?;
         if !(self.shown / 2..=self.shown * 2).contains(&rate) {

@@ -41,14 +41,19 @@ impl Candidates {
         let at = match self.0.iter().position(|candidate| candidate.source == source) {
             Some(at) => at,
             None => {
-                if self.0.len() == CANDIDATES {
-                    self.0.pop_front();
-                }
-                self.0.push_back(Candidate { source, kept: Vec::new() });
+                self.put_back(Candidate { source, kept: Vec::new() });
                 self.0.len() - 1
             }
         };
         &mut self.0[at]
+    }
+
+    /// Adds `candidate`, which was not one. The oldest one has to go if there are too many.
+    pub(super) fn put_back(&mut self, candidate: Candidate) {
+        if self.0.len() == CANDIDATES {
+            self.0.pop_front();
+        }
+        self.0.push_back(candidate);
     }
 
     /// Removes the sensor that sent `head`, and returns it if it was a candidate.
