@@ -190,9 +190,7 @@ fn play(
     let end = loop {
         match received.recv_timeout(next_look.saturating_duration_since(Instant::now()).min(PATIENCE)) {
             Ok(Line::Said { of: TRACKER, text }) => account.take_news(text),
-            Ok(Line::Said { of: SIMULATOR, text }) => {
-                account.take_sent(&serde_json::from_str(&text).unwrap_or_default());
-            }
+            Ok(Line::Said { of: SIMULATOR, text }) => account.take_simulator_line(&text),
             Ok(Line::Said { of, text }) => {
                 let value: Value = serde_json::from_str(&text).unwrap_or_default();
                 if value["class"] == "status" && simulators.is_empty() {
@@ -246,9 +244,7 @@ fn play(
         && let Ok(line) = received.recv_timeout(END_LIMIT)
     {
         match line {
-            Line::Said { of: SIMULATOR, text } => {
-                account.take_sent(&serde_json::from_str(&text).unwrap_or_default());
-            }
+            Line::Said { of: SIMULATOR, text } => account.take_simulator_line(&text),
             Line::Ended { of: SIMULATOR } => open -= 1,
             _ => {}
         }

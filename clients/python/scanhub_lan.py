@@ -108,7 +108,7 @@ class Scan:
     `ranges` are in device units (x `unit_um` = micrometres); those above `valid_to` are codes, which are no ranges:
     `ranges_m()` is what to calculate with. Angles are in radians: 0 is the sensor's own ahead, counter-clockwise positive
     seen from above; `exact` has those of a scanner whose points fall where they like, NaN where nothing was measured.
-    `upper` is the byte beside each range, intensities or field bits. `collapsed` points, with or without a return, were
+    `upper` is the additional byte of each range: an intensity or field bits. `collapsed` points, with or without a return, were
     dropped because another one has the same beam; `incomplete`: packets of the turn are missing. `family` is None if it is not known here.
     """
 

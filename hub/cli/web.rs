@@ -81,11 +81,8 @@ fn word(text: &str) -> Result<String, String> {
 ///
 /// [`Kind::Input`] if it cannot be read, [`Kind::Configuration`] if it contains no token, or if others can use it.
 fn read_token(file: &Path) -> Result<String, Failure> {
-    let place = file.display();
-    let unreadable = |error: std::io::Error| {
-        let hint = "it must exist and be readable for this user";
-        Failure::new(Kind::Input, format!("cannot read {place}: {error}"), hint)
-    };
+    let place = file.display().to_string();
+    let unreadable = |error: std::io::Error| regular::unreadable(&place, &error);
     let text = regular::read_text(file, MAX_TOKEN_FILE).map_err(unreadable)?;
     let mode = file.metadata().map_err(unreadable)?.mode() & 0o777;
     if mode & 0o077 != 0 {

@@ -168,7 +168,8 @@ impl Account {
     }
 
     /// Handles a line of a simulator: a telegram that it sent, or its summary.
-    pub(crate) fn take_sent(&mut self, line: &Value) {
+    pub(crate) fn take_simulator_line(&mut self, text: &str) {
+        let line: Value = serde_json::from_str(text).unwrap_or_default();
         let name = line["port"].as_str().and_then(|port| port.rsplit('/').next());
         let of = self.sensors.iter_mut().find(|sensor| name == Some(sensor.name.as_str()));
         let Some(sensor) = of else { return };
@@ -496,7 +497,7 @@ mod tests {
         account.take(0, &telegram("61"));
         account.cut();
         for line in [sent(b"a", 1), sent(b"b", 2), sent(b"c", u64::MAX)] {
-            account.take_sent(&line);
+            account.take_simulator_line(&line.to_string());
         }
         assert!(!account.is_complete(Duration::MAX) && account.is_complete(Duration::ZERO));
         let silent = "1 telegram was sent and not received: no later telegram of 1 sensor arrived";

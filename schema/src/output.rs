@@ -38,7 +38,7 @@ pub fn write(path: &Path, content: &[u8], force: bool) -> Result<(), Failure> {
 /// Without that, it is removed when it is dropped.
 #[derive(Debug)]
 pub struct OutputFile {
-    // Dropped before the directory, in which it is removed then.
+    // Dropping it removes the file, for which the directory must still be open.
     file: NamedTempFile,
     target: Target,
     force: bool,

@@ -8,6 +8,8 @@ use std::path::Path;
 
 use rustix::fs::OFlags;
 
+use crate::{Failure, Kind};
+
 /// Most bytes of a configuration, a world or a model: many times what people write. Parsed, it is a hundred times as
 /// long.
 pub const LONGEST: u64 = 512 << 10;
@@ -62,6 +64,12 @@ pub fn read_all(input: &mut dyn Read, longest: u64) -> io::Result<Vec<u8>> {
         return Err(io::Error::new(ErrorKind::FileTooLarge, what));
     }
     Ok(content)
+}
+
+/// Returns the failure of a file that a user named as input, which is at `place`.
+pub fn unreadable(place: &str, error: &io::Error) -> Failure {
+    let hint = "it must exist and be readable for this user";
+    Failure::new(Kind::Input, format!("cannot read {place}: {error}"), hint)
 }
 
 #[cfg(test)]

@@ -116,7 +116,7 @@ impl StateDirectory {
 /// The directory of the domain, and the one of all domains above it.
 const OWN: usize = 2;
 
-/// Adds that nothing can be kept to the message.
+/// Puts before the message that nothing can be kept.
 fn unkept(failure: Failure) -> Failure {
     Failure { message: format!("nothing can be kept: {}", failure.message), ..failure }
 }

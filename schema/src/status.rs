@@ -142,12 +142,19 @@ impl Status {
         Some(format!("{percent:.digits$} % {word} on the line"))
     }
 
-    /// Returns whether telegrams have arrived, but most bytes since the hub's start were in none, and the hub looks for the
-    /// scanner again. Only then is the share of these bytes a finding: before, they may be those of another scanner.
-    pub fn is_mostly_discarded(&self) -> bool {
-        let (read, discarded) = (self.counters[Counter::BytesRead], self.counters[Counter::BytesDiscarded]);
+    /// Returns the numbers of discarded and of all bytes since the hub's start, if telegrams have arrived, but most bytes were
+    /// in none, and the hub looks for the scanner again. Only then are they a finding: before, the bytes may be those of
+    /// another scanner.
+    pub fn mostly_discarded(&self) -> Option<(u64, u64)> {
+        let (discarded, read) = (self.counters[Counter::BytesDiscarded], self.counters[Counter::BytesRead]);
         let has_replied = self.counters[Counter::Telegrams] > 0;
-        self.state() == Some(State::Probing) && has_replied && discarded > read / 2
+        let is_finding = self.state() == Some(State::Probing) && has_replied && discarded > read / 2;
+        is_finding.then_some((discarded, read))
+    }
+
+    /// Returns whether `model` is the number of a model that scanhub does not know, such as `0x95`, instead of a name.
+    pub fn is_model_number(model: &str) -> bool {
+        model.starts_with("0x")
     }
 
     /// Returns whether the sensor is a recording, of which nothing can be asked.

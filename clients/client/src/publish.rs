@@ -215,7 +215,7 @@ impl SensorPublisher {
     ///
     /// [`Kind::DomainHeld`](schema::Kind) if this process publishes it already; [`Kind::Configuration`](schema::Kind) if only
     /// sensors have the topic, and the name has no dot; [`Kind::Short`](schema::Kind) if memory or descriptors are short;
-    /// [`Kind::Failed`](schema::Kind) if the topic is there with another layout.
+    /// [`Kind::Failed`](schema::Kind) if the topic exists with another layout.
     pub fn topic<P: Payload + ?Sized>(&self) -> Result<Publication<P>, Failure> {
         self.topic_for(self.limits())
     }

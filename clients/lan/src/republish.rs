@@ -222,7 +222,7 @@ impl<S: TopicStore> Republisher<S> {
         }
         let at = self.sensors.iter().position(|sensor| sensor.name == name);
         if let Some(at) = at {
-            // What it has goes on, even if there is no room for more.
+            // Its topics stay, even if there is no room for more.
             self.sensors[at].announced(head, announce, arrival);
         }
         if self.only_proven && !is_proven {
@@ -274,7 +274,7 @@ impl<S: TopicStore> Republisher<S> {
     }
 
     /// Publishes the samples of `candidate`, which sent `head`, if the sensor was made. Otherwise, it stays a candidate. Samples
-    /// of another run of the hub than `boot` may be of another sensor, so they are dropped.
+    /// from another run of the hub than `boot` may belong to another sensor, so they are dropped.
     fn publish_kept(&mut self, head: &Head, boot: u64, candidate: Option<Candidate>) {
         let Some(candidate) = candidate else { return };
         let Some(sensor) = self.sensors.iter_mut().find(|sensor| sensor.is(head)) else {

@@ -1,7 +1,7 @@
 //! `scanhub background`: shows, resets, freezes, thaws, saves and loads the background model of a sensor. Files are
 //! handled here; the hub gets models only.
 
-use std::io::{self, Read, Write};
+use std::io::{Read, Write};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
 use std::time::{Duration, SystemTime};
@@ -200,10 +200,13 @@ pub fn saved_model(
     input: &mut dyn Read,
 ) -> Result<Box<Background>, Failure> {
     let (text, place) = if file == Path::new(STANDARD) {
-        (regular::read_all(input, LONGEST).map_err(|error| unreadable("stdin", &error))?, "stdin".to_owned())
+        (
+            regular::read_all(input, LONGEST).map_err(|error| regular::unreadable("stdin", &error))?,
+            "stdin".to_owned(),
+        )
     } else {
         let place = file.display().to_string();
-        (regular::read(file, LONGEST).map_err(|error| unreadable(&place, &error))?, place)
+        (regular::read(file, LONGEST).map_err(|error| regular::unreadable(&place, &error))?, place)
     };
     let saved = SavedModel::parse(&text, &place)?;
     if saved.sensor == sensor || any_sensor {
@@ -211,11 +214,6 @@ pub fn saved_model(
     }
     let message = format!("{place} is the background of {}, not of {sensor}", saved.sensor);
     Err(Failure::new(Kind::Configuration, message, "--any-sensor accepts it anyway"))
-}
-
-fn unreadable(place: &str, error: &io::Error) -> Failure {
-    let hint = "it must exist and be readable for this user";
-    Failure::new(Kind::Input, format!("cannot read {place}: {error}"), hint)
 }
 
 /// The file that is stdin or stdout.

@@ -99,7 +99,7 @@ const ASK_AGAIN: Duration = Duration::from_millis(10);
 
 /// Returns the name of `model`. A model that the hub does not know has only a number.
 fn named(model: String) -> String {
-    if model.starts_with("0x") { format!("{model} (unknown)") } else { model }
+    if Status::is_model_number(&model) { format!("{model} (unknown)") } else { model }
 }
 
 fn properties(sensor: &str, status: &Status, now_ns: u64) -> Vec<Vec<String>> {
@@ -145,9 +145,7 @@ fn mode(status: &Status) -> Option<String> {
 
 /// What the line takes away: lately, and since the hub's start.
 fn line(status: &Status) -> String {
-    if status.is_mostly_discarded() {
-        let (read, discarded) =
-            (status.counters[Counter::BytesRead], status.counters[Counter::BytesDiscarded]);
+    if let Some((discarded, read)) = status.mostly_discarded() {
         return format!("{discarded} of {read} bytes were in no intact telegram, and no scans arrive");
     }
     let percent = |share: f64| format!("{:.2} %", 100.0 * share);

@@ -114,8 +114,8 @@ impl<'a> Reception<'a> {
     /// # Errors
     ///
     /// [`Kind::Configuration`](schema::Kind) if a name or hub is not possible, or too little memory is allowed for a sensor;
-    /// [`Kind::DomainHeld`](schema::Kind) if another listener publishes in the domain, [`Kind::Short`](schema::Kind) if memory
-    /// for that is.
+    /// [`Kind::DomainHeld`](schema::Kind) if another listener publishes in the domain, [`Kind::Short`](schema::Kind) if there is
+    /// too little memory.
     pub fn open(
         wanted: Wanted<'_>,
         json: bool,

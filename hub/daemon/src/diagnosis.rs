@@ -26,7 +26,6 @@ pub(crate) struct Diagnosis<'a> {
     device: Option<String>,
     /// Rate of the bytes that arrive while nothing is streaming.
     byte_rate: ByteRate,
-    is_settling: bool,
     /// Family of the scanner. `None` while the session searches for it.
     family: Option<Family>,
     /// Number of telegrams of the session, and the time of the scanner's last one. `None` before the first one.
@@ -87,7 +86,6 @@ impl<'a> Diagnosis<'a> {
             doubt: String::new(),
             device: None,
             byte_rate: ByteRate::default(),
-            is_settling: false,
             family: None,
             telegrams: 0,
             last_telegram: None,
@@ -152,11 +150,10 @@ impl<'a> Diagnosis<'a> {
         }
         if session.state() == line::State::Streaming {
             self.has_streamed = true;
-            (self.byte_rate, self.is_settling) = (ByteRate::default(), false);
+            self.byte_rate = ByteRate::default();
             return None;
         }
         self.byte_rate.note(now, account.read);
-        self.is_settling = self.byte_rate.is_settling(now, account.read);
         let is_shown = self.is_silent_for(SILENCE) || session.missing().is_some();
         if is_shown { self.byte_rate.shown(now, account.read) } else { None }
     }
@@ -330,7 +327,7 @@ impl<'a> Diagnosis<'a> {
             return self.other_bytes(missing, rate);
         }
         // Soon the rate of the bytes gives a better message than "no answer".
-        if self.is_settling && session.missing().is_some() {
+        if session.missing().is_some() && self.byte_rate.is_settling(self.now, account.read) {
             return self.words.clone();
         }
         match session.trouble() {

@@ -20,7 +20,7 @@ use port::{Allowance, LineErrors, Source};
 use scanhub_drivers::line::{Event, Identity, Output, Protocol as _, Session as _, suspect};
 use scanhub_drivers::search::{Memory, Search};
 use scanhub_drivers::{Model, PortSession};
-use schema::{MILLIS, Nanos, State};
+use schema::{MILLIS, Nanos, State, Status};
 
 use crate::backlog::Backlog;
 use crate::control::Flow;
@@ -406,7 +406,7 @@ impl<'a, S: Surroundings> Drive<'a, S> {
 fn name_of(scanner: &KnownScanner) -> String {
     let family = scanner.memory.family.name();
     match &scanner.model {
-        Some(number) if number.starts_with("0x") => format!("{family} model {number} (unknown)"),
+        Some(number) if Status::is_model_number(number) => format!("{family} model {number} (unknown)"),
         Some(model) => model.clone(),
         None => family.to_owned(),
     }

@@ -47,7 +47,7 @@ enum Phase<L> {
 
 impl<'a, S: Surroundings> LiveLink<'a, S> {
     /// Takes the name of `link`, number `number` in the configuration, and creates its topics for the run `boot` of the hub.
-    /// Publishes the first status, and looks for the port. Then [`turn`](Self::turn) is to be called with a timeout.
+    /// Publishes the first status, and looks for the port. The caller then calls [`turn`](Self::turn) with a timeout.
     ///
     /// # Errors
     ///

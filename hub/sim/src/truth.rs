@@ -1,5 +1,5 @@
-//! Record of what the simulator has sent: one line per telegram, and one per port at the end, in a file or on stdout. The hub
-//! never reads it.
+//! Log of the telegrams that the simulator has sent: one line per telegram, and one per port at the end, in a file or on
+//! stdout. The hub never reads it.
 
 use std::fs::File;
 use std::io::{self, Write};

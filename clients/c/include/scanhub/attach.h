@@ -528,7 +528,7 @@ int scanhub_hub_lives(struct scanhub_attachment *handle);
 
 /*
  * Publishes the angles of a mount as the topic tilt of `name` ("mount") in `domain` (NULL: the one that SCANHUB_DOMAIN names),
- * for scanhub tilt and for everybody who follows it: docs/tilt.md. There need not be a hub. The name has no dot: else
+ * for scanhub tilt and all other subscribers: docs/tilt.md. There need not be a hub. A name with a dot is refused with
  * SCANHUB_REFUSED_CONFIGURATION. One process publishes under it: if another one has it, a program or the hub whose sensor it
  * is, SCANHUB_REFUSED_FAILED, and scanhub_error names that process. Returns 0; *publication is NULL after a refusal.
  */

@@ -357,9 +357,7 @@ fn as_the_hub_counts(status: &Status) -> Finding {
 /// Judges the share of its stream that a line of the hub damages or loses.
 fn line_loss(status: &Status) -> Finding {
     const NAME: &str = "line-loss";
-    if status.is_mostly_discarded() {
-        let (read, discarded) =
-            (status.counters[Counter::BytesRead], status.counters[Counter::BytesDiscarded]);
+    if let Some((discarded, read)) = status.mostly_discarded() {
         let text = format!(
             "no scans arrive, and {discarded} of {read} bytes since the hub's start were in no intact telegram"
         );
