@@ -53,6 +53,10 @@ pub(crate) const MOST_SUPPORT: f64 = 20.0;
 /// Longest time between two scans of a sensor of which each counts as one. Those of a slower one count up to twice: else
 /// somebody would not be known for a second at 7.5 Hz.
 const FULL_S: f64 = 0.0625;
+/// Beams on a leg that is certainly not the leg of a chair.
+const CLEAR_BEAMS: usize = 4;
+/// Weight of a leg of fewer beams, compared with a sensor that sees through the place.
+pub(crate) const COARSE: f64 = 0.5;
 /// Nobody is known sooner.
 const SOONEST_NS: u64 = 300_000_000;
 /// Who was seen within this time is not hidden.
@@ -93,11 +97,12 @@ impl Person {
         }
     }
 
-    /// A scan of `sensor`, `since_s` after its last one, showed `legs` of his.
-    pub(crate) fn seen(&mut self, sensor: usize, since_s: f64, legs: usize) {
+    /// A scan of `sensor`, `since_s` after its last one, showed `legs` of the person, one of them with this number of `beams`.
+    pub(crate) fn seen(&mut self, sensor: usize, since_s: f64, legs: usize, beams: usize) {
         self.seen_ns = self.at_ns;
         self.seen_by_ns[sensor] = self.at_ns;
-        self.absent_s = 0.0;
+        // Few beams do not tell a leg of a person from one of a chair, but another sensor may.
+        self.absent_s = if beams < CLEAR_BEAMS { (self.absent_s - COARSE * since_s).max(0.0) } else { 0.0 };
         let both = if legs > 1 { 1.0 } else { 0.0 };
         self.pairs += both;
         self.both += 0.05 * (both - self.both);
@@ -151,14 +156,20 @@ mod tests {
     #[test]
     fn somebody_is_known_after_eight_scans_or_fewer_of_a_slow_sensor() {
         const MS: u64 = 1_000_000;
-        let legs = [-0.1, 0.1].map(|y| Leg { at: [2.0, y], sigma_m: 0.03, is_fresh: true });
+        let legs = [-0.1, 0.1].map(|y| Leg {
+            at: [2.0, y],
+            sigma_m: 0.03,
+            is_fresh: true,
+            is_solid: true,
+            beams: 5,
+        });
         let known_after_ms = |every_ms: u64| {
             let mut person = Person::new(1, MS, &legs);
             let mut after_ms = 0;
             while !person.is_sure() {
                 after_ms += every_ms;
                 person.predict(MS * (1 + after_ms));
-                person.seen(0, every_ms as f64 * 1e-3, 2);
+                person.seen(0, every_ms as f64 * 1e-3, 2, 5);
             }
             after_ms
         };

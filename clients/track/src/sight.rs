@@ -14,6 +14,12 @@ pub const LEGS: usize = 64;
 pub(crate) const LEG_M: f64 = 0.06;
 /// What is wider is two legs beside each other.
 const WIDEST_LEG_M: f64 = 0.26;
+/// Minimum width of a leg with its trousers. The legs of chairs and tables are thinner.
+const THINNEST_LEG_M: f64 = 0.09;
+/// Diameter of the spot of a beam at the scanner, and its growth with the range: an LMS 2xx, the widest of the supported
+/// scanners.
+const SPOT_M: f64 = 0.01;
+const SPOT_RAD: f64 = 0.0045;
 /// What is wider is no person.
 const WIDEST_M: f64 = 1.3;
 /// By so much a beam has to end before the farthest that it ever reached, to have met something that stands there.
@@ -32,6 +38,11 @@ pub(crate) struct Leg {
     pub(crate) sigma_m: f64,
     /// It stands in front of the background, and is no single beam. What the background has learned is not.
     pub(crate) is_fresh: bool,
+    /// Whether it is evidence for a person. A leg of a chair is too thin, and a value between two surfaces is nothing at
+    /// all. Both only support a track that other legs have started.
+    pub(crate) is_solid: bool,
+    /// Number of beams that it reflects.
+    pub(crate) beams: usize,
 }
 
 /// What a scan says of a place where somebody may stand.
@@ -142,23 +153,32 @@ impl Sight {
         let half = ((0.2 / far).min(0.5) / self.step.abs()).ceil();
         let first = (middle - half).max(0.0) as usize;
         let last = ((middle + half) as usize).min(self.ranges.len() - 1);
-        let (mut through, mut here, mut all) = (0, 0, 0);
+        let spacing = far * self.step.abs();
+        let (mut through, mut hidden, mut here_run, mut hidden_run) = (0, 0, 0, 0);
         for (&range, &farthest) in self.ranges[first..=last].iter().zip(&self.farthest[first..=last]) {
             if range.is_nan() {
                 continue;
             }
-            all += 1;
-            if range > far + REACH_M || (range > farthest - BEFORE_M && range > far - 0.05) {
+            let is_here = range > far - REACH_M && range <= far + REACH_M && range < farthest - BEFORE_M;
+            // A person is not as thin as what stands there.
+            let is_through =
+                is_here || range > far + REACH_M || (range > farthest - BEFORE_M && range > far - 0.05);
+            here_run = if is_here { here_run + 1 } else { 0 };
+            if is_here && !is_thin(here_run, spacing) {
+                return Seen::Here;
+            }
+            if is_through {
                 through += 1;
-            } else if range > far - REACH_M && range < farthest - BEFORE_M {
-                here += 1;
+                // Nor is a person hidden by something thin.
+                hidden += if is_thin(hidden_run, spacing) { 0 } else { hidden_run };
+                hidden_run = 0;
+            } else {
+                hidden_run += 1;
             }
         }
-        match () {
-            () if here > 0 => Seen::Here,
-            () if all >= 2 && 5 * through >= 4 * all => Seen::Through,
-            () => Seen::Hidden,
-        }
+        hidden += hidden_run;
+        let all = through + hidden;
+        if all >= 2 && 5 * through >= 4 * all { Seen::Through } else { Seen::Hidden }
     }
 
     /// Elements for which there is memory.
@@ -252,14 +272,23 @@ impl Sight {
         };
         let is_partial = cut_off(first.checked_sub(1)) || cut_off(Some(last + 1));
         let is_short = points.len() == 1 && spacing < LEG_M;
+        // A beam that meets two surfaces may report any value between them.
+        let is_between = is_partial && points.len() as f64 <= 1.0 + (SPOT_M + SPOT_RAD * range) / spacing;
         let sigma_m = if is_partial || is_short { 0.07 } else { 0.03 + 0.3 * spacing };
         let fresh = points.iter().filter(|(beam, _)| self.is_foreground[*beam]).count();
         self.legs.push(Leg {
             at: [mean[0] + deeper * way[0], mean[1] + deeper * way[1]],
             sigma_m,
             is_fresh: 2 * fresh > points.len() && !is_short,
+            beams: points.len(),
+            is_solid: !is_between && !is_short && (is_partial || !is_thin(points.len(), spacing)),
         });
     }
+}
+
+/// Returns whether so many beams, this distance apart, are fewer than a leg reflects.
+fn is_thin(beams: usize, spacing_m: f64) -> bool {
+    (beams + 1) as f64 * spacing_m < THINNEST_LEG_M
 }
 
 /// A beam reaches `range`: single readings that are too far are noise.

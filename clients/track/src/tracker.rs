@@ -8,7 +8,7 @@ use crate::assignment::{Assignment, Edge};
 use crate::filter::Side;
 use crate::geometry::{Point, distance, distance_to_segment, length2, minus};
 use crate::passage::LONGEST_S;
-use crate::person::{Life, Person};
+use crate::person::{COARSE, Life, Person};
 use crate::picture::{Event, Kind, Misplaced, Picture, Track};
 use crate::poses::Poses;
 use crate::sight::{Leg, Seen, Sight};
@@ -194,7 +194,10 @@ impl Tracker {
                 *sum += ahead / 2.0;
                 *weight += speed * speed;
             }
-            person.seen(sensor, since_s, of_one.len());
+            let solid = of_one.iter().map(|&(leg, _)| &legs[leg]).filter(|leg| leg.is_solid);
+            if let Some(beams) = solid.map(|leg| leg.beams).max() {
+                person.seen(sensor, since_s, of_one.len(), beams);
+            }
         }
     }
 
@@ -202,8 +205,8 @@ impl Tracker {
     fn miss(&mut self, sensor: usize, since_s: f64, pairs: &[(usize, usize)]) {
         let sight = &self.sights[sensor];
         for (number, person) in self.persons.iter_mut().enumerate() {
-            if matches!(person.life, Life::Away { .. }) || pairs.iter().any(|&(_, place)| place / 2 == number)
-            {
+            let is_seen = |&(leg, place): &(usize, usize)| place / 2 == number && sight.legs()[leg].is_solid;
+            if matches!(person.life, Life::Away { .. }) || pairs.iter().any(is_seen) {
                 continue;
             }
             let place = person.filter.place();
@@ -214,7 +217,7 @@ impl Tracker {
                     Seen::Here => {
                         // What the background has learned still stands there.
                         if person.is_known() && person.speed() < 0.4 {
-                            person.absent_s = (person.absent_s - since_s).max(0.0);
+                            person.absent_s = (person.absent_s - COARSE * since_s).max(0.0);
                         }
                         0.0
                     }
@@ -246,7 +249,7 @@ impl Tracker {
         let mut free: Vec<usize> = (0..legs.len())
             .filter(|&leg| {
                 let taken = pairs.iter().any(|&(taken, _)| taken == leg);
-                legs[leg].is_fresh && !taken && !near_known(legs[leg].at)
+                legs[leg].is_fresh && legs[leg].is_solid && !taken && !near_known(legs[leg].at)
             })
             .collect();
         while let Some(leg) = free.pop() {

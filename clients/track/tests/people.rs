@@ -1,5 +1,5 @@
-//! The tracker from outside, in the house of the proof: the same tracks however scans come, latecomers and clocks that jump,
-//! identities that are never used again, a sensor that dies and comes back.
+//! The tracker from outside, in the house of the proof: the same tracks in whatever order scans arrive, late scans and clocks that
+//! jump, identities that are never used again, a sensor that dies and comes back, and a person who sits down.
 
 #[allow(dead_code)]
 #[path = "../examples/proof/house.rs"]
@@ -10,11 +10,12 @@ mod walkers;
 
 use std::collections::BTreeSet;
 
-use house::{BEAMS, Eye};
+use house::{BEAMS, Eye, House};
 use preprocess::background::{Model, Settings};
 use preprocess::segments::Segmenter;
 use schema::TrackState;
 use schema::{Foreground, Pose, Scan};
+use track::geometry::distance;
 use track::{People, Picture, Site};
 use walkers::Crowd;
 
@@ -30,27 +31,40 @@ struct Sent {
 }
 
 fn site() -> Site {
-    Site::parse("house.toml", house::SITE).expect("the house is right")
+    Site::parse("house.toml", &IDEAL.site()).expect("the house is right")
 }
 
-/// What the sensors of the house send while `count` people walk there from second 12 on: each 25 scans a second.
+const IDEAL: House = House { is_ideal: true };
+const FURNISHED: House = House { is_ideal: false };
+
+/// Returns the scans of the ideal house while `count` people walk there from second 12 on: 25 per second and sensor.
 fn sent(count: usize, seconds: u64) -> Vec<Sent> {
-    let (site, walls) = (site(), house::walls());
-    let mut random = fastrand::Rng::with_seed(3);
-    let mut crowd = Crowd::new(count, 12.0, 0.25, 3);
-    let mut eyes: Vec<(Eye, Model, Segmenter)> = (0..site.sensors.len())
+    sent_of(IDEAL, (count, 0.0), 3, seconds, |_| {})
+}
+
+/// Returns the scans of a `house`. People spend the share `sits` of their rests on a chair. `each` receives the crowd every 10 ms.
+fn sent_of(
+    house: House,
+    (count, sits): (usize, f64),
+    seed: u64,
+    seconds: u64,
+    mut each: impl FnMut(&Crowd),
+) -> Vec<Sent> {
+    let sensors = Site::parse("house.toml", &house.site()).expect("the house is right").sensors.len();
+    let mut crowd = Crowd::new(house, count, 12.0, (0.25, sits), seed);
+    let mut eyes: Vec<(Eye, Model, Segmenter)> = (0..sensors)
         .map(|sensor| {
             let segmenter = Segmenter::new(Pose::default(), BEAMS);
-            (Eye::new(&site, sensor, &walls), Model::new(Settings::default(), BEAMS), segmenter)
+            (Eye::new(house, sensor, seed), Model::new(Settings::default(), BEAMS), segmenter)
         })
         .collect();
-    let (mut all, mut legs) = (Vec::new(), Vec::new());
+    let mut all = Vec::new();
     for step in 0..100 * seconds {
         crowd.step(step as f64 / 100.0, 0.01);
-        crowd.legs(&mut legs);
+        each(&crowd);
         let sensor = (step % 4) as usize;
         let (eye, model, segmenter) = &mut eyes[sensor];
-        let scan = eye.scan(&legs, &mut random);
+        let scan = eye.scan(&|_| crowd.shapes(), 10 * MS * step);
         let mut foreground = Foreground::of(BEAMS);
         model.update(&scan, &mut foreground);
         segmenter.update(&scan, &mut foreground);
@@ -180,4 +194,33 @@ fn a_sensor_that_comes_back_sees_those_who_are_there_and_nobody_else() {
         picture.expect("a picture").tracks.iter().map(|track| track.covariance[0]).fold(0.0, f64::max)
     };
     assert!(at(29) > 0.05 && at(29) > 4.0 * at(19), "{} and {}", at(19), at(29));
+}
+
+#[test]
+fn no_track_stays_on_the_chair_of_a_person_who_has_left() {
+    let (mut frames, mut wrong, mut sat) = (0, 0, 0);
+    for seed in 801..804 {
+        let mut places = Vec::new();
+        let sent = sent_of(FURNISHED, (1, 1.0), seed, 150, |crowd| {
+            places.push(crowd.walkers.iter().map(|walker| walker.place).collect::<Vec<_>>());
+        });
+        let site = Site::parse("house.toml", &FURNISHED.site()).expect("the house is right");
+        let (pictures, _) = pictures_of(site.clone(), sent.iter());
+        let is_at_chair = |place| house::CHAIRS.iter().any(|(chair, _)| distance(*chair, place) < 0.5);
+        for picture in &pictures {
+            let Some(people) = places.get(((picture.wall_ns - BEGIN_NS) / (10 * MS)) as usize) else {
+                continue;
+            };
+            sat += usize::from(people.iter().any(|&place| is_at_chair(place)));
+            let is_nobody = |track: &&track::Track| {
+                matches!(track.state, TrackState::Confirmed | TrackState::Hidden)
+                    && people.iter().all(|&place| distance(place, track.place) > 0.7)
+                    && track.room.is_some_and(|room| site.watched()[room])
+            };
+            frames += 1;
+            wrong += usize::from(picture.tracks.iter().any(|track| is_nobody(&track)));
+        }
+    }
+    assert!(sat > frames / 4, "somebody sat in {sat} of {frames} pictures");
+    assert!(50 * wrong < frames, "{wrong} of {frames} pictures have a track of nobody");
 }

@@ -39,5 +39,6 @@ pub mod world;
 
 pub use line::Event;
 pub use request_decoder::{Arrival, Dropped};
+pub use shape::{Point, Shape};
 pub use simulate::{Ready, simulate, simulate_with};
 pub use transmission::ChunkSize;

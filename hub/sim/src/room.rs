@@ -9,6 +9,7 @@ use schema::{Nanos, Scan, ScanHead};
 use crate::labeled_scan::{LabeledScan, Mark, Met};
 use crate::layers::{self, BeamRng};
 use crate::series::{Changes, Series};
+use crate::shape::Shape;
 use crate::spot::{Echo, echo};
 use crate::view::{View, WorldView};
 use crate::world::World;
@@ -69,10 +70,7 @@ impl Room {
 
     /// The words of [`Room::scan`] with their truth.
     pub fn labeled_scan(&self, variant: Variant, unit: Unit, mode: Mode, end_ns: Nanos) -> LabeledScan {
-        let step_mdeg = 10 * i32::from(variant.resolution_cdeg);
-        let angles_mdeg =
-            (0..variant.beams() as i32).map(|beam| variant.first_angle_mdeg() + beam * step_mdeg).collect();
-        self.measure(angles_mdeg, variant.turns(), unit, mode, end_ns)
+        self.measure(angles_mdeg(variant), variant.turns(), unit, mode, end_ns, &|_| Vec::new())
     }
 
     /// The value words of the mirror turn that ended at `end_ns`, as a partial scan tells them: 181 beams on whole
@@ -80,7 +78,21 @@ impl Room {
     pub(crate) fn partial(&self, quarter: u8, unit: Unit, mode: Mode, end_ns: Nanos) -> Vec<u16> {
         let beams = if quarter > 0 { 180 } else { 181 };
         let angles_mdeg = (0..beams).map(|beam| 1_000 * beam + 250 * i32::from(quarter) - 90_000).collect();
-        self.measure(angles_mdeg, 1, unit, mode, end_ns).words
+        self.measure(angles_mdeg, 1, unit, mode, end_ns, &|_| Vec::new()).words
+    }
+
+    /// Returns the values of [`Room::scan`] with more shapes in view, such as the legs of people and the doors of a
+    /// simulation of the caller. `shapes` returns them at a time, in the frame of the world. A world that is not a scene, and a
+    /// tilted sensor, do not show them.
+    pub fn scan_with(
+        &self,
+        shapes: &dyn Fn(Nanos) -> Vec<Shape>,
+        variant: Variant,
+        unit: Unit,
+        mode: Mode,
+        end_ns: Nanos,
+    ) -> Vec<u16> {
+        self.measure(angles_mdeg(variant), variant.turns(), unit, mode, end_ns, shapes).words
     }
 
     /// Where the reflectors are that can be seen at `time_ns`: the middle of each, unless something hides it.
@@ -91,7 +103,8 @@ impl Room {
         }
     }
 
-    /// What the beams at `angles_mdeg` tell, every one after the other measured in the next of `turns` mirror turns.
+    /// Returns what the beams at `angles_mdeg` measure, one after the other in the next of `turns` mirror turns, with
+    /// `shapes` in view.
     fn measure(
         &self,
         angles_mdeg: Vec<i32>,
@@ -99,6 +112,7 @@ impl Room {
         unit: Unit,
         mode: Mode,
         end_ns: Nanos,
+        shapes: &dyn Fn(Nanos) -> Vec<Shape>,
     ) -> LabeledScan {
         let mut random = fastrand::Rng::with_seed(self.seed ^ end_ns.wrapping_mul(0x9E37_79B9_7F4A_7C15));
         let beams = angles_mdeg.len();
@@ -107,10 +121,11 @@ impl Room {
             Sight::Value(value) => vec![*value; beams],
             Sight::Random => (0..beams).map(|_| random.u16(..) & !mode.forbidden()).collect(),
             Sight::Scene(stage) => {
-                return measure(stage, &angles_mdeg, turns, unit, mode, end_ns, &mut random);
+                return measure(stage, &angles_mdeg, turns, unit, mode, end_ns, shapes, &mut random);
             }
             Sight::Series(series, changes) => {
-                return series.room(changes, end_ns).measure(angles_mdeg, turns, unit, mode, end_ns);
+                let room = series.room(changes, end_ns);
+                return room.measure(angles_mdeg, turns, unit, mode, end_ns, shapes);
             }
         };
         let truth = words.iter().map(|&word| truth(word, Met::Static { since_ns: 0 }, mode)).collect();
@@ -118,7 +133,15 @@ impl Room {
     }
 }
 
-/// What the beams at `angles_mdeg` tell of `stage`, every one after the other in the next of `turns` mirror turns.
+/// Returns the angles of the beams of `variant`, in thousandths of a degree.
+fn angles_mdeg(variant: Variant) -> Vec<i32> {
+    let step_mdeg = 10 * i32::from(variant.resolution_cdeg);
+    (0..variant.beams() as i32).map(|beam| variant.first_angle_mdeg() + beam * step_mdeg).collect()
+}
+
+/// Returns what the beams at `angles_mdeg` measure of `stage` and `shapes`, one after the other in the next of `turns` mirror
+/// turns.
+#[allow(clippy::too_many_arguments)]
 fn measure(
     stage: &WorldView,
     angles_mdeg: &[i32],
@@ -126,13 +149,14 @@ fn measure(
     unit: Unit,
     mode: Mode,
     end_ns: Nanos,
+    shapes: &dyn Fn(Nanos) -> Vec<Shape>,
     random: &mut fastrand::Rng,
 ) -> LabeledScan {
     if stage.is_tilted() {
         return measure_tilted(stage, angles_mdeg, unit, mode, end_ns, random);
     }
     let times: Vec<Nanos> = (0..turns).map(|turn| stage.layers.turn_ns(turn, turns, end_ns)).collect();
-    let views: Vec<View> = times.iter().map(|&time_ns| stage.view(time_ns)).collect();
+    let views: Vec<View> = times.iter().map(|&time_ns| stage.view_with(time_ns, &shapes(time_ns))).collect();
     let mut look = LabeledScan { words: Vec::new(), truth: Vec::new() };
     for (beam, &angle_mdeg) in angles_mdeg.iter().enumerate() {
         // The beams between whole degrees are measured in the turns after the first.

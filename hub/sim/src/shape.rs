@@ -7,15 +7,25 @@
 use std::f64::consts::TAU;
 
 /// A point or a vector in millimeters.
-pub(crate) type Point = (f64, f64);
+pub type Point = (f64, f64);
 
 /// An obstacle of a ray.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(crate) enum Shape {
+pub enum Shape {
     /// A straight wall between two points.
-    Wall { from: Point, to: Point },
+    Wall {
+        /// One end.
+        from: Point,
+        /// The other end.
+        to: Point,
+    },
     /// A round post.
-    Post { centre: Point, radius: f64 },
+    Post {
+        /// Its center.
+        centre: Point,
+        /// Its radius in millimeters.
+        radius: f64,
+    },
 }
 
 impl Shape {

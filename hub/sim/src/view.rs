@@ -114,6 +114,16 @@ impl WorldView {
         view
     }
 
+    /// Returns the view ahead at `time_ns` with additional `shapes`, in the frame of the world. They count as people.
+    pub(crate) fn view_with(&self, time_ns: Nanos, shapes: &[Shape]) -> View {
+        let mut view = self.view(time_ns);
+        for shape in shapes {
+            let shape = shape.placed(|point| self.eye(point));
+            view.draw(Face { shape, surface: Surface::Plain, kind: Kind::Person });
+        }
+        view
+    }
+
     /// Returns the view of all objects that never change, all around.
     pub(crate) fn still(&self) -> &View {
         &self.still

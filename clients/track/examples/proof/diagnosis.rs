@@ -7,6 +7,7 @@ use schema::TrackState;
 use track::geometry::{Point, distance};
 use track::{Picture, Track};
 
+use crate::house::CHAIRS;
 use crate::walkers::{CORRIDOR, Crossing};
 
 /// Tracks and people match within this distance, as in the score.
@@ -103,7 +104,9 @@ impl Diagnosis {
                 let others = truth.iter().enumerate().filter(|(other, _)| *other != who);
                 let near =
                     others.map(|(_, place)| distance(*place, truth[who])).fold(f64::INFINITY, f64::min);
+                let sits = CHAIRS.iter().any(|(chair, _)| distance(*chair, truth[who]) < 0.5);
                 let class = match (track.sensors.count_ones(), near < 0.9) {
+                    _ if sits => "on a chair",
                     (0 | 1, true) => "one sensor, somebody near",
                     (0 | 1, false) => "one sensor, nobody near",
                     (_, true) => "two sensors, somebody near",
@@ -118,8 +121,23 @@ impl Diagnosis {
             }
         }
         for track in &free {
-            *self.causes.entry("(frames of a track that is nobody)").or_default() +=
-                usize::from(is_scored(track.place));
+            let near = |place: &Point| distance(*place, track.place) < 1.0;
+            let cause = if CHAIRS.iter().any(|(chair, _)| distance(*chair, track.place) < 0.6) {
+                "(frames of a track that is nobody, at a chair)"
+            } else if [0.0, 17.0].iter().any(|x| distance([*x, 2.5], track.place) < 1.0) {
+                "(frames of a track that is nobody, at a door to the street)"
+            } else if truth.iter().any(near) {
+                "(frames of a track that is nobody, near somebody)"
+            } else {
+                "(frames of a track that is nobody, elsewhere)"
+            };
+            *self.causes.entry(cause).or_default() += usize::from(is_scored(track.place));
+            if self.is_told && is_scored(track.place) {
+                println!(
+                    "{now_s:.1}: false {} {:?} at {:.2?} by {:b} {cause}",
+                    track.id, track.state, track.place, track.sensors
+                );
+            }
         }
     }
 

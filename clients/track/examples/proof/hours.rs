@@ -8,10 +8,12 @@ use preprocess::segments::Segmenter;
 use schema::{Foreground, Pose, Scan};
 use track::{People, Picture, Site};
 
-use crate::house::{self, BEAMS, Eye};
+use crate::house::{BEAMS, Eye, House};
 use crate::walkers::Crowd;
 
 const HOUR_S: u64 = 3600;
+/// Shares of changes of the room, and of rests on a chair.
+const PLANS: (f64, f64) = (0.25, 0.25);
 /// Scans a second, one sensor after the other.
 const SCANS_HZ: u64 = 100;
 const DELAY_NS: u64 = 80_000_000;
@@ -23,13 +25,12 @@ const BEGIN_NS: u64 = 1_800_000_000_000_000_000;
 
 /// Follows `people` at a time for so many virtual hours and says each hour what there is.
 pub(crate) fn run(hours: u64, people: usize) {
-    let site = Site::parse("house.toml", house::SITE).expect("the house is right");
-    let walls = house::walls();
-    let mut random = fastrand::Rng::with_seed(hours);
+    let house = House { is_ideal: false };
+    let site = Site::parse("house.toml", &house.site()).expect("the house is right");
     let mut eyes: Vec<(Eye, Model, Segmenter)> = (0..site.sensors.len())
         .map(|sensor| {
             let segmenter = Segmenter::new(Pose::default(), BEAMS);
-            (Eye::new(&site, sensor, &walls), Model::new(Settings::default(), BEAMS), segmenter)
+            (Eye::new(house, sensor, hours), Model::new(Settings::default(), BEAMS), segmenter)
         })
         .collect();
     let sensors = eyes.len() as u64;
@@ -37,17 +38,16 @@ pub(crate) fn run(hours: u64, people: usize) {
     let mut ids = Identities::default();
     let mut held: Option<(usize, u64, Box<Scan>, Box<Foreground>)> = None;
     let (mut sent_late, mut tracker_s) = (0, 0.0);
-    let (mut crowd, mut legs) = (Crowd::new(0, 0.0, 0.25, 0), Vec::new());
+    let mut crowd = Crowd::new(house, 0, 0.0, PLANS, 0);
     for step in 0..hours * HOUR_S * SCANS_HZ {
         if step % (VISIT_S * SCANS_HZ) == 0 {
-            crowd = Crowd::new(people, 12.0, 0.25, step);
+            crowd = Crowd::new(house, people, 12.0, PLANS, step);
         }
         let visit_s = (step % (VISIT_S * SCANS_HZ)) as f64 / SCANS_HZ as f64;
         crowd.step(visit_s, 1.0 / SCANS_HZ as f64);
-        crowd.legs(&mut legs);
         let sensor = (step % sensors) as usize;
         let (eye, model, segmenter) = &mut eyes[sensor];
-        let scan = eye.scan(&legs, &mut random);
+        let scan = eye.scan(&|_| crowd.shapes(), step * 1_000_000_000 / SCANS_HZ);
         let mut foreground = Foreground::of(BEAMS);
         model.update(&scan, &mut foreground);
         segmenter.update(&scan, &mut foreground);

@@ -1,15 +1,18 @@
-//! The house of the proof: two rooms and a corridor between them, a cupboard in each room, a sensor in two corners of each.
-//! What a sensor in it measures, with noise, gaps and flicker.
+//! The house of the proof: two rooms with furniture, a corridor between them that no sensor sees, and a sensor in two corners
+//! of each room. The simulator of the scanners measures it.
 
 use std::f64::consts::PI;
 
-use schema::{Scan, ScanHead};
-use track::Site;
+use scanhub_drivers::lms::variant::{Mode, Unit, Variant};
+use schema::{Nanos, Scan, ScanHead};
+use sim::Shape;
+use sim::layers::Layers;
+use sim::room::Room;
+use sim::world::World;
 use track::geometry::Point;
 
-use crate::walkers::LEG_M;
-
-pub(crate) const SITE: &str = r#"
+/// Sensors, rooms and inner doors.
+const ROOMS: &str = r#"
 [[sensor]]
 name = "hall"
 pose = { x = 0.05, y = 0.05, yaw = 0.7854 }
@@ -46,103 +49,140 @@ between = ["left", "right"]
 seconds = [2, 15]
 "#;
 
-/// Corners of the cupboards: least x and y, greatest x and y.
-pub(crate) const CUPBOARDS: [[f64; 4]; 2] = [[2.6, 3.2, 3.6, 3.6], [13.4, 1.4, 13.8, 2.4]];
-pub(crate) const BEAMS: usize = 361;
-/// Standard deviation of a range.
-const NOISE_M: f64 = 0.01;
-/// Share of beams without a reading, and of those that meet nothing.
-const DROPPED: f64 = 1e-3;
-const FLICKER: f64 = 2e-4;
-const FARTHEST_M: f64 = 8.182;
+/// The doors to the street.
+const OUTER_DOORS: &str = r#"
+[[door]]
+name = "porch"
+from = "hall"
+to = "outside"
+between = [[0, 2], [0, 3]]
+[[door]]
+name = "yard"
+from = "kitchen"
+to = "outside"
+between = [[17, 2], [17, 3]]
+"#;
 
-/// The walls of the house, doors left out, and the sides of the cupboards.
-pub(crate) fn walls() -> Vec<[Point; 2]> {
-    let mut walls = Vec::new();
-    let mut way = |points: &[Point]| walls.extend(points.windows(2).map(|two| [two[0], two[1]]));
-    way(&[[6.0, 2.0], [6.0, 0.0], [0.0, 0.0], [0.0, 5.0], [6.0, 5.0], [6.0, 3.0]]);
-    way(&[[11.0, 2.0], [11.0, 0.0], [17.0, 0.0], [17.0, 5.0], [11.0, 5.0], [11.0, 3.0]]);
-    way(&[[6.0, 2.0], [6.0, 1.5], [11.0, 1.5], [11.0, 2.0]]);
-    way(&[[6.0, 3.0], [6.0, 3.5], [11.0, 3.5], [11.0, 3.0]]);
-    for [a, b, c, d] in CUPBOARDS {
-        way(&[[a, b], [c, b], [c, d], [a, d], [a, b]]);
+/// Corners of the cupboards: minimum x and y, maximum x and y.
+const CUPBOARDS: [[f64; 4]; 2] = [[2.6, 3.2, 3.6, 3.6], [13.4, 1.4, 13.8, 2.4]];
+/// Corners of the tables, in the same order. A table has four legs.
+const TABLES: [[f64; 4]; 2] = [[3.4, 0.5, 4.6, 1.2], [14.9, 3.5, 16.1, 4.2]];
+const TABLE_LEG_M: f64 = 0.03;
+/// Chairs: x, y, and the direction in radians that a sitter faces.
+pub(crate) const CHAIRS: [(Point, f64); 6] = [
+    ([1.2, 4.4], -PI / 2.0),
+    ([4.9, 4.3], -0.75 * PI),
+    ([4.0, 1.6], PI / 2.0),
+    ([12.2, 0.7], PI / 2.0),
+    ([15.6, 0.8], 0.75 * PI),
+    ([15.5, 3.1], -PI / 2.0),
+];
+/// Distance of the legs of a chair from its center along both axes, and their radius.
+const CHAIR_HALF_M: f64 = 0.2;
+const CHAIR_LEG_M: f64 = 0.014;
+/// Standard deviation of a range of the ideal sensor, and its share of beams without a range.
+const IDEAL_SIGMA_MM: f64 = 10.0;
+const IDEAL_ERRORS: f64 = 1e-3;
+
+pub(crate) const BEAMS: usize = 361;
+
+/// The plan of the house, with furniture and doors to the street or without.
+#[derive(Clone, Copy)]
+pub(crate) struct House {
+    /// Whether the sensors are ideal and the house has nothing but cupboards.
+    pub(crate) is_ideal: bool,
+}
+
+impl House {
+    /// Returns the site file.
+    pub(crate) fn site(self) -> String {
+        if self.is_ideal { ROOMS.to_owned() } else { [ROOMS, OUTER_DOORS].concat() }
     }
-    walls
+
+    /// Returns the areas that nobody walks through: minimum x and y, maximum x and y.
+    pub(crate) fn obstacles(self) -> impl Iterator<Item = &'static [f64; 4]> {
+        CUPBOARDS.iter().chain(TABLES.iter().filter(move |_| !self.is_ideal))
+    }
+
+    /// Returns the world of the simulator, without people, chairs and leaves of doors.
+    fn world(self) -> World {
+        let mut text = String::new();
+        let mm = |[x, y]: Point| format!("[{:.0}, {:.0}]", 1000.0 * x, 1000.0 * y);
+        for sensor in track::Site::parse("house.toml", ROOMS).expect("the house is right").sensors {
+            let [x, y] = sensor.place.map(|m| 1000.0 * m);
+            text += &format!("[[sensor]]\npose = [{x:.0}, {y:.0}, {:.3}]\n", sensor.yaw_rad.to_degrees());
+        }
+        let mut line = |points: &[Point]| {
+            let points: Vec<String> = points.iter().map(|&point| mm(point)).collect();
+            text += &format!("[[thing]]\nline = [{}]\n", points.join(", "));
+        };
+        line(&[[6.0, 2.0], [6.0, 0.0], [0.0, 0.0], [0.0, 2.0]]);
+        line(&[[0.0, 3.0], [0.0, 5.0], [6.0, 5.0], [6.0, 3.0]]);
+        line(&[[11.0, 2.0], [11.0, 0.0], [17.0, 0.0], [17.0, 2.0]]);
+        line(&[[17.0, 3.0], [17.0, 5.0], [11.0, 5.0], [11.0, 3.0]]);
+        line(&[[6.0, 2.0], [6.0, 1.5], [11.0, 1.5], [11.0, 2.0]]);
+        line(&[[6.0, 3.0], [6.0, 3.5], [11.0, 3.5], [11.0, 3.0]]);
+        if self.is_ideal {
+            line(&[[0.0, 2.0], [0.0, 3.0]]);
+            line(&[[17.0, 2.0], [17.0, 3.0]]);
+        } else {
+            // A house across the street, and a fence.
+            line(&[[-4.0, -2.0], [-4.0, 8.0]]);
+            line(&[[22.0, -2.0], [22.0, 8.0]]);
+        }
+        for &[a, b, c, d] in &CUPBOARDS {
+            line(&[[a, b], [c, b], [c, d], [a, d], [a, b]]);
+        }
+        for [a, b, c, d] in TABLES.into_iter().filter(|_| !self.is_ideal) {
+            for [x, y] in [[a, b], [a, d], [c, b], [c, d]] {
+                let radius = 1000.0 * TABLE_LEG_M;
+                text += &format!("[[thing]]\nradius_mm = {radius}\npose = {}\n", mm([x, y]));
+            }
+        }
+        let layers = match self.is_ideal {
+            true => Layers { sigma_mm: IDEAL_SIGMA_MM, errors: IDEAL_ERRORS, ..Layers::NONE },
+            false => Layers::default(),
+        };
+        World::of_toml("house.toml", &text).expect("the house is right").with_layers(layers)
+    }
 }
 
 /// A sensor of the house.
-pub(crate) struct Eye {
-    place: Point,
-    directions: Vec<Point>,
-    /// How far each beam goes in the empty house.
-    empty: Vec<f64>,
-}
+pub(crate) struct Eye(Room);
 
 impl Eye {
-    pub(crate) fn new(site: &Site, sensor: usize, walls: &[[Point; 2]]) -> Eye {
-        let sensor = &site.sensors[sensor];
-        let place = sensor.place;
-        let angle = |i: usize| -PI / 2.0 + i as f64 * PI / 360.0;
-        let directions: Vec<Point> = (0..BEAMS).map(|i| sensor.direction(angle(i))).collect();
-        let empty = directions.iter().map(|&direction| {
-            walls.iter().filter_map(|&wall| meets_wall(place, direction, wall)).fold(f64::INFINITY, f64::min)
-        });
-        Eye { place, empty: empty.collect(), directions }
+    pub(crate) fn new(house: House, sensor: usize, seed: u64) -> Eye {
+        Eye(Room::of_port(&house.world(), seed, sensor as u64))
     }
 
-    pub(crate) fn scan(&self, legs: &[Point], random: &mut fastrand::Rng) -> Box<Scan> {
-        let mut ranges: Vec<f64> = self.empty.clone();
-        for leg in legs {
-            let (x, y) = (leg[0] - self.place[0], leg[1] - self.place[1]);
-            let far2 = x * x + y * y;
-            if !(LEG_M * LEG_M..=90.0).contains(&far2) {
-                continue;
-            }
-            for (range, direction) in ranges.iter_mut().zip(&self.directions) {
-                let along = x * direction[0] + y * direction[1];
-                let depth = LEG_M * LEG_M - (far2 - along * along);
-                if along > 0.0 && depth > 0.0 {
-                    *range = range.min(along - depth.sqrt());
-                }
-            }
-        }
-        let words: Vec<u16> = ranges
-            .iter()
-            .map(|&range| {
-                let dice = random.f64();
-                let range =
-                    if dice < FLICKER { range * random.f64() } else { range + NOISE_M * normal(random) };
-                match range {
-                    range if range > FARTHEST_M || dice > 1.0 - DROPPED => 8191,
-                    range => (1000.0 * range).round().max(1.0) as u16,
-                }
-            })
-            .collect();
+    /// Returns the scan that ends at `end_ns`. `shapes` returns everything that moves, at a time.
+    pub(crate) fn scan(&self, shapes: &dyn Fn(Nanos) -> Vec<Shape>, end_ns: Nanos) -> Box<Scan> {
+        let words = self.0.scan_with(shapes, Variant::HALF, Unit::Mm, Mode(0), end_ns);
         Scan::of(head(), &words)
     }
 }
 
-pub(crate) fn head() -> ScanHead {
-    ScanHead {
-        first_angle: -PI / 2.0,
-        step: PI / 360.0,
-        spacing: (PI / 360.0) as f32,
-        beam_time_ns: 37_037,
-        unit_um: 1000,
-        valid_to: 8182,
-        no_return: 8191,
-        beyond: 8191,
-        ..ScanHead::default()
-    }
+/// Returns a post at `center`, both in meters.
+pub(crate) fn post([x, y]: Point, radius_m: f64) -> Shape {
+    Shape::Post { centre: (1000.0 * x, 1000.0 * y), radius: 1000.0 * radius_m }
 }
 
-fn meets_wall(from: Point, direction: Point, [a, b]: [Point; 2]) -> Option<f64> {
-    let along = [b[0] - a[0], b[1] - a[1]];
-    let across = direction[0] * along[1] - direction[1] * along[0];
-    let off = [a[0] - from[0], a[1] - from[1]];
-    let range = (off[0] * along[1] - off[1] * along[0]) / across;
-    let share = (off[0] * direction[1] - off[1] * direction[0]) / across;
-    (range > 1e-6 && (0.0..=1.0).contains(&share)).then_some(range)
+/// Returns a wall between two points in meters.
+pub(crate) fn wall(a: Point, b: Point) -> Shape {
+    let mm = |[x, y]: Point| (1000.0 * x, 1000.0 * y);
+    Shape::Wall { from: mm(a), to: mm(b) }
+}
+
+/// Returns the legs of a chair.
+pub(crate) fn chair_legs([x, y]: Point, turn_rad: f64) -> [Shape; 4] {
+    let (sin, cos) = turn_rad.sin_cos();
+    let half = CHAIR_HALF_M;
+    [[half, half], [half, -half], [-half, half], [-half, -half]]
+        .map(|[u, v]| post([x + u * cos - v * sin, y + u * sin + v * cos], CHAIR_LEG_M))
+}
+
+pub(crate) fn head() -> ScanHead {
+    ScanHead::lms(BEAMS, -90_000, 500, 1, 13)
 }
 
 /// A standard normal number.

@@ -1,23 +1,27 @@
 //! One run of the proof: people in the house, its sensors, backgrounds learned by the hub's own processors, and the tracker.
 
-use std::collections::HashMap;
+use std::collections::{HashMap, VecDeque};
 use std::time::Instant;
 
 use preprocess::background::{Model, Settings};
 use preprocess::segments::Segmenter;
 use schema::TrackState;
-use schema::{Foreground, Pose, Scan};
+use schema::{Foreground, Nanos, Pose, Scan};
+use sim::Shape;
 use track::geometry::{Point, distance, distance_to_border};
 use track::{Kind, People, Picture, Site};
 
 use crate::baseline::Nearest;
 use crate::diagnosis::Diagnosis;
-use crate::house::{self, BEAMS, Eye};
+use crate::house::{BEAMS, Eye, House};
 use crate::walkers::{Crossing, Crowd};
 
 pub(crate) const EMPTY_S: f64 = 12.0;
 const RATE_HZ: f64 = 25.0;
 const NS: f64 = 1e9;
+/// A mirror turn of an LMS 2xx, and steps of the simulation that it takes.
+const TURN_NS: Nanos = 13_320_000;
+const TURN_STEPS: usize = 3;
 /// Begin of time, as a wall clock says it.
 const BEGIN_NS: u64 = 1_800_000_000_000_000_000;
 
@@ -27,6 +31,9 @@ pub(crate) struct Setup {
     pub(crate) seconds: f64,
     pub(crate) seed: u64,
     pub(crate) restless: f64,
+    /// Share of rests on a chair.
+    pub(crate) sits: f64,
+    pub(crate) house: House,
     pub(crate) way: Way,
 }
 
@@ -71,25 +78,25 @@ struct Sent {
 }
 
 pub(crate) fn run(setup: Setup) -> Outcome {
-    let site = Site::parse("house.toml", house::SITE).expect("the house is right");
-    let walls = house::walls();
+    let site = Site::parse("house.toml", &setup.house.site()).expect("the house is right");
     let mut random = fastrand::Rng::with_seed(setup.seed ^ 0x5EED);
     let sensors = site.sensors.len();
-    let eyes: Vec<Eye> = (0..sensors).map(|sensor| Eye::new(&site, sensor, &walls)).collect();
+    let eyes: Vec<Eye> = (0..sensors).map(|sensor| Eye::new(setup.house, sensor, setup.seed)).collect();
     let mut models: Vec<(Model, Segmenter)> = (0..sensors)
         .map(|_| (Model::new(Settings::default(), BEAMS), Segmenter::new(Pose::default(), BEAMS)))
         .collect();
     let offset = 0.05 * (2.0 * random.f64() - 1.0);
     let drift = 50e-6 * (2.0 * random.f64() - 1.0);
     let phases: Vec<f64> = (0..sensors).map(|_| random.f64() / RATE_HZ).collect();
-    let mut crowd = Crowd::new(setup.people, EMPTY_S, setup.restless, setup.seed);
+    let mut crowd = Crowd::new(setup.house, setup.people, EMPTY_S, (setup.restless, setup.sits), setup.seed);
     let mut people = People::new(site.clone(), 80_000_000);
     let mut nearest = Nearest::new(site.clone());
     let mut outcome = Outcome { simulated_s: setup.seconds, ..Outcome::default() };
     let mut truths: Vec<Vec<Point>> = Vec::new();
     let mut pictures: Vec<Picture> = Vec::new();
     let mut sent: Vec<Sent> = Vec::new();
-    let mut legs = Vec::new();
+    // Shapes of the last mirror turns of a scanner.
+    let mut shapes: VecDeque<Vec<Shape>> = VecDeque::new();
     let steps = (setup.seconds * 200.0) as usize;
     for step in 0..steps {
         let now_s = step as f64 / 200.0;
@@ -97,13 +104,21 @@ pub(crate) fn run(setup: Setup) -> Outcome {
         if step % 20 == 0 {
             truths.push(crowd.walkers.iter().map(|walker| walker.place).collect());
         }
-        crowd.legs(&mut legs);
+        shapes.push_back(crowd.shapes());
+        if shapes.len() > TURN_STEPS + 1 {
+            shapes.pop_front();
+        }
         for sensor in 0..sensors {
             let turn = |s: f64| ((s + phases[sensor]) * RATE_HZ).floor();
             if step > 0 && turn(now_s) == turn(now_s - 1.0 / 200.0) {
                 continue;
             }
-            let scan = eyes[sensor].scan(&legs, &mut random);
+            let end_ns = (now_s * NS) as Nanos;
+            let at = |time_ns: Nanos| match time_ns + TURN_NS * 3 / 2 < end_ns {
+                true => shapes.front().cloned().unwrap_or_default(),
+                false => shapes.back().cloned().unwrap_or_default(),
+            };
+            let scan = eyes[sensor].scan(&at, end_ns);
             let (model, segmenter) = &mut models[sensor];
             let mut foreground = Foreground::of(BEAMS);
             model.update(&scan, &mut foreground);
@@ -207,12 +222,12 @@ fn judge(site: &Site, truths: &[Vec<Point>], pictures: &[Picture], crowd: &Crowd
     for event in pictures.iter().flat_map(|picture| &picture.events) {
         if let Kind::Door { door, from, .. } = event.kind {
             let at = (event.wall_ns as i64 - BEGIN_NS as i64) as f64 / NS;
-            told.push((at, door, from != Some(1)));
+            told.push((at, door, from == site.doors[door].from));
         }
     }
     outcome.doors = (crowd.passages.len(), told.len(), 0);
-    for (at, door, goes_in) in &crowd.passages {
-        let fits = |one: &(f64, usize, bool)| (one.1, one.2) == (*door, *goes_in) && (one.0 - at).abs() < 2.0;
+    for (at, door, forth) in &crowd.passages {
+        let fits = |one: &(f64, usize, bool)| (one.1, one.2) == (*door, *forth) && (one.0 - at).abs() < 2.0;
         if let Some(found) = told.iter().position(fits) {
             told.remove(found);
             outcome.doors.2 += 1;
