@@ -71,10 +71,7 @@ impl Man {
 }
 
 fn write_pages(directory: &Path) -> Result<(), Failure> {
-    std::fs::create_dir_all(directory).map_err(|error| {
-        let message = format!("{}: {error}", directory.display());
-        Failure::new(Kind::Output, message, "name a directory that can be written to")
-    })?;
+    output::create_directory(directory)?;
     let mut command = command().disable_help_subcommand(true);
     command.build();
     write_page(command, directory)

@@ -209,6 +209,7 @@ impl Directory {
             return Err(purpose.unusable(&path, Errno::INVAL));
         }
         let owned = components.split_off(components.len() - own);
+        let make = make.then_some(Mode::RWXU);
         let reached = PathWalk::begin(&path, LinkPolicy::Own, user).and_then(|mut walk| {
             if !walk.enter(components, make)? {
                 return Ok(None);

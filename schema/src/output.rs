@@ -34,6 +34,17 @@ pub fn write(path: &Path, content: &[u8], force: bool) -> Result<(), Failure> {
     file.commit()
 }
 
+/// Creates the directory `path` and those above it that do not exist, with the permissions that the umask leaves. An
+/// existing one stays as it is.
+///
+/// # Errors
+///
+/// [`Kind::Output`] if it cannot be created, is not a directory, or is reached by a link that another user has put into a sticky
+/// directory.
+pub fn create_directory(path: &Path) -> Result<(), Failure> {
+    open_directory(path, path, Some(Mode::RWXU | Mode::RWXG | Mode::RWXO)).map(drop)
+}
+
 /// A file that is written at once. It has a random name in the directory of its target, and mode 0600, until [`commit`](Self::commit).
 /// Without that, it is removed when it is dropped.
 #[derive(Debug)]
@@ -126,33 +137,8 @@ impl Target {
             return Err(Failure::new(Kind::Output, message, "name a file in it"));
         };
         let parent = path.parent().unwrap_or(Path::new(""));
-        let reached = PathWalk::begin(path, LinkPolicy::NotPlanted, user()).and_then(|mut walk| {
-            let exists = walk.enter(components_of(parent), false)?;
-            if exists { Ok(walk) } else { Err(WalkError::System(parent.to_owned(), Errno::NOENT)) }
-        });
-        match reached {
-            Ok(walk) => {
-                Ok(Target { directory: walk.into_parts().0, name: name.to_owned(), path: path.to_owned() })
-            }
-            Err(WalkError::System(at, error)) => {
-                let error = io::Error::from(error);
-                // The usual case needs no second path.
-                let error =
-                    if at == parent { error } else { io::Error::other(format!("{}: {error}", at.display())) };
-                Err(unwritable(path, &error))
-            }
-            Err(WalkError::Foreign(at, owner, mode)) => {
-                let mode = mode & 0o7777;
-                let what = format!("{} belongs to user {} with mode {mode:04o}", at.display(), named(owner));
-                Err(unwritable(path, &io::Error::other(what)))
-            }
-            // Only directories of this user's own are checked for that.
-            Err(WalkError::Writable(at, _)) => Err(unwritable(&at, &Errno::PERM.into())),
-            Err(WalkError::Planted(at, what)) => {
-                let message = format!("cannot write {}: {} {what}", path.display(), at.display());
-                Err(Failure::new(Kind::Output, message, "name the file without that link, or another one"))
-            }
-        }
+        let directory = open_directory(path, parent, None)?;
+        Ok(Target { directory, name: name.to_owned(), path: path.to_owned() })
     }
 
     /// Returns the metadata of an existing file that may be replaced, or `None` if there is no file.
@@ -244,6 +230,38 @@ impl Target {
     fn directory_path(&self) -> PathBuf {
         format!("/proc/self/fd/{}", self.directory.as_raw_fd()).into()
     }
+}
+
+/// Opens `directory`, on the way to the output `path`. With `make`, missing directories are created with these permissions.
+fn open_directory(path: &Path, directory: &Path, make: Option<Mode>) -> Result<OwnedFd, Failure> {
+    let reached = PathWalk::begin(path, LinkPolicy::NotPlanted, user()).and_then(|mut walk| {
+        let exists = walk.enter(components_of(directory), make)?;
+        if exists { Ok(walk) } else { Err(WalkError::System(directory.to_owned(), Errno::NOENT)) }
+    });
+    let error = match reached {
+        Ok(walk) => return Ok(walk.into_parts().0),
+        // The usual case needs no second path.
+        Err(WalkError::System(at, error)) if at == directory => error.into(),
+        Err(WalkError::System(at, error)) => {
+            io::Error::other(format!("{}: {}", at.display(), io::Error::from(error)))
+        }
+        Err(WalkError::Foreign(at, owner, mode)) => {
+            let mode = mode & 0o7777;
+            let what = format!("{} belongs to user {} with mode {mode:04o}", at.display(), named(owner));
+            io::Error::other(what)
+        }
+        // Only directories of this user's own are checked for that.
+        Err(WalkError::Writable(at, _)) => return Err(unwritable(&at, &Errno::PERM.into())),
+        Err(WalkError::Planted(at, what)) => {
+            let message = format!("cannot write {}: {} {what}", path.display(), at.display());
+            return Err(Failure::new(Kind::Output, message, "name it without that link, or another one"));
+        }
+    };
+    let failure = unwritable(path, &error);
+    // A missing directory is not the reason.
+    let hint =
+        if make.is_some() { "name a directory that can be written to" } else { &failure.hint }.to_owned();
+    Err(Failure { hint, ..failure })
 }
 
 /// Permissions of a new file, before the umask takes some away.
@@ -366,6 +384,33 @@ mod tests {
         assert!(target.create(true).unwrap_err().to_string().contains("2 names"));
         target.create_new(true, PUBLIC).unwrap().write_all(b"new").unwrap();
         assert_eq!((fs::read(&path).unwrap(), fs::read(&backup).unwrap()), (b"new".into(), b"old".into()));
+    }
+
+    #[test]
+    fn a_directory_is_created_with_those_above_it() {
+        let directory = TempDir::new().unwrap();
+        let at = |name: &str| directory.path().join(name);
+        for _ in 0..2 {
+            create_directory(&at("a/b/../c")).unwrap();
+            assert_eq!(
+                (names(directory.path()), names(&at("a"))),
+                (vec!["a".into()], vec!["b".into(), "c".into()])
+            );
+        }
+        for name in ["a", "a/b", "a/c"] {
+            assert_eq!(fs::metadata(at(name)).unwrap().mode() & 0o777, 0o777 & !umask(), "{name}");
+        }
+        create_directory(Path::new("src")).unwrap();
+        create_directory(Path::new(".")).unwrap();
+        fs::write(at("file"), "").unwrap();
+        symlink("a", at("link")).unwrap();
+        create_directory(&at("link/d")).unwrap();
+        assert_eq!(names(&at("a")), ["b", "c", "d"]);
+        for name in ["file", "file/below"] {
+            let failure = create_directory(&at(name)).unwrap_err();
+            assert!(failure.kind == Kind::Output && failure.message.contains("Not a directory"), "{failure}");
+            assert_eq!(failure.hint, "name a directory that can be written to");
+        }
     }
 
     #[test]

@@ -59,12 +59,16 @@ impl PathWalk {
     }
 
     /// Opens the `components` in this order, and follows links as the policy permits. With `make`, a missing directory is
-    /// created for this user alone. Returns `false` if one is missing.
+    /// created with these permissions, without those that the umask takes away. Returns `false` if one is missing.
     ///
     /// # Errors
     ///
     /// [`WalkError`] if a component cannot be opened or is not to be trusted.
-    pub(crate) fn enter(&mut self, mut components: Vec<OsString>, make: bool) -> Result<bool, WalkError> {
+    pub(crate) fn enter(
+        &mut self,
+        mut components: Vec<OsString>,
+        make: Option<Mode>,
+    ) -> Result<bool, WalkError> {
         components.reverse();
         while let Some(component) = components.pop() {
             match self.step(&component, make, OFlags::PATH)? {
@@ -85,7 +89,7 @@ impl PathWalk {
     pub(crate) fn enter_own(
         &mut self,
         component: &OsStr,
-        make: bool,
+        make: Option<Mode>,
         how: OFlags,
     ) -> Result<bool, WalkError> {
         match self.step(component, make, how)? {
@@ -115,11 +119,11 @@ impl PathWalk {
         (self.at, self.path)
     }
 
-    fn step(&mut self, name: &OsStr, make: bool, how: OFlags) -> Result<Step, WalkError> {
+    fn step(&mut self, name: &OsStr, make: Option<Mode>, how: OFlags) -> Result<Step, WalkError> {
         let open = |at: &OwnedFd| openat(at, name, OPEN_DIRECTORY | how, Mode::empty());
         let mut opened = open(&self.at);
-        if matches!(opened, Err(Errno::NOENT)) && make {
-            match mkdirat(&self.at, name, Mode::RWXU) {
+        if let (Err(Errno::NOENT), Some(mode)) = (&opened, make) {
+            match mkdirat(&self.at, name, mode) {
                 Ok(()) | Err(Errno::EXIST) => opened = open(&self.at),
                 Err(error) => return Err(WalkError::System(self.path.join(name), error)),
             }

@@ -67,6 +67,29 @@ fn links_at_the_name_of_an_output_are_refused() {
     });
 }
 
+#[test]
+fn directories_are_not_created_behind_links_of_others() {
+    beside_a_stranger("planted_links::directories_are_not_created_behind_links_of_others", || {
+        fs::create_dir("/mnt/prey").expect("a directory");
+        stranger("ln -s /mnt/prey /tmp/way && ln -s /mnt/new /tmp/dangling");
+        for directory in ["way", "way/new", "way/new/deep", "dangling", "dangling/deep"] {
+            for (place, path) in [("/", format!("/tmp/{directory}")), ("/tmp", directory.to_owned())] {
+                let mut man = scanhub(0, &["man", &path]);
+                man.current_dir(place);
+                let outcome = Program::start(man).wait();
+                assert_eq!(outcome.code, Some(73), "{path}: {outcome}");
+                assert!(outcome.errors.contains(" is a link of user 65533"), "{path}: {outcome}");
+            }
+        }
+        assert_eq!(fs::read_dir("/mnt/prey").expect("it is ours").count(), 0);
+        assert!(!fs::exists("/mnt/new").unwrap());
+        // Directories below a shared one are created like others.
+        let outcome = run(&["man", "/tmp/pages/deep"]);
+        assert_eq!(outcome.code, Some(0), "{outcome}");
+        assert!(fs::exists("/tmp/pages/deep/scanhub-run.1").unwrap());
+    });
+}
+
 /// A name that contains the process id can be planted before the process starts.
 #[test]
 fn names_of_temporary_files_cannot_be_guessed() {
