@@ -59,6 +59,8 @@ pub struct People {
     next_picture_ns: u64,
     jumps: u32,
     counts: Counts,
+    /// Late scans of each sensor.
+    late: Vec<u64>,
     picture: Picture,
     spare: Vec<Waiting>,
 }
@@ -83,6 +85,7 @@ impl People {
             next_picture_ns: 0,
             jumps: 0,
             counts: Counts::default(),
+            late: vec![0; count],
             picture: Picture::default(),
             spare: Vec::new(),
         }
@@ -96,6 +99,11 @@ impl People {
     /// Returns what was not as it should be.
     pub fn counts(&self) -> Counts {
         self.counts
+    }
+
+    /// Returns the number of late scans of each sensor, in the order of the site. Their sum is [`Counts::late`].
+    pub fn late(&self) -> &[u64] {
+        &self.late
     }
 
     /// Returns how far the clock that stamps `sensor` is ahead of the first sensor's, in seconds, as far as people whom both
@@ -126,6 +134,7 @@ impl People {
         }
         if at_ns <= self.taken_ns {
             self.counts.late += 1;
+            self.late[sensor] += 1;
             return;
         }
         self.jumps = 0;

@@ -1,5 +1,6 @@
 //! `scanhub track`: people across the sensors of a site, as lines and as topics. Refuses to know how they are found.
 
+mod late;
 mod lines;
 mod publish;
 
@@ -8,6 +9,7 @@ use std::sync::atomic::AtomicBool;
 use std::time::{Duration, Instant};
 
 use ::track::{Kind as EventKind, Misplaced, People, Picture, Site};
+use late::LateReports;
 use publish::Samples;
 use scanhub_client::streams::Sample;
 use schema::{Domain, Failure, Foreground, Header, Kind, Scan, Topic};
@@ -77,6 +79,7 @@ pub fn track(
             notes: Output::new(notes),
         },
         missed: 0,
+        late: LateReports::new(options.site.sensors.len()),
         is_there: false,
         flags: 0,
         summaries: names.len(),
@@ -119,6 +122,7 @@ struct Verb<'a> {
     halves: Vec<Half>,
     teller: Teller<'a>,
     missed: u64,
+    late: LateReports,
     /// A topic of a sensor was there.
     is_there: bool,
     /// Flags of the last scan.
@@ -132,8 +136,11 @@ impl Sink for Verb<'_> {
         self.is_there = true;
     }
 
-    /// Publishes from the moment that there is a domain.
-    fn tick(&mut self, _: Instant) -> Result<(), End> {
+    /// Reports late scans, and publishes from the moment that there is a domain.
+    fn tick(&mut self, now: Instant) -> Result<(), End> {
+        for (sensor, count) in self.late.due(now, self.people.late()) {
+            self.teller.report_late(sensor, count)?;
+        }
         let samples = &mut self.teller.samples;
         match &self.options.name {
             Some(name) if self.is_there && !samples.is_published() => {
@@ -199,6 +206,9 @@ impl Sink for Verb<'_> {
             }
         });
         told?;
+        for (sensor, count) in self.late.unreported(self.people.late()) {
+            teller.report_late(sensor, count)?;
+        }
         teller.sum_up(&self.people, self.missed)
     }
 }
@@ -253,6 +263,18 @@ impl Teller<'_> {
             }
         }
         Ok(())
+    }
+
+    /// Reports `count` late scans of `sensor`.
+    fn report_late(&mut self, sensor: usize, count: u64) -> Result<(), End> {
+        let (name, delay) = (&self.options.site.sensors[sensor].name, self.options.delay);
+        match self.options.json {
+            true => {
+                let wall_ns = self.samples.tracks().0.wall_ns;
+                self.out.json(&lines::late(self.name, wall_ns, name, count, delay))
+            }
+            false => self.notes.line(|line| lines::late_text(line, name, count, delay)),
+        }
     }
 
     fn sum_up(&mut self, people: &People, missed: u64) -> Result<(), End> {

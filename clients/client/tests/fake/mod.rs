@@ -121,6 +121,19 @@ impl FakeSensor {
         self.waker.wake(Wake::Telegram).unwrap();
     }
 
+    /// Publishes a scan of these ranges with an empty foreground, and wakes the subscribers. The wall clock of the sample is
+    /// `seq` ns after that of the hub's first one.
+    pub(crate) fn scan_with_foreground(&mut self, seq: u64, ranges: &[u16]) {
+        self.seq = seq;
+        let header = self.header(self.foreground.topic_seq);
+        let mut sample = Foreground::loan(&self.foreground.publisher, Foreground::len(ranges.len())).unwrap();
+        *sample.user_header_mut() = header;
+        Foreground::write(&mut sample).copy_from(Foreground::of(ranges.len()).bytes());
+        sample.send().unwrap();
+        self.foreground.topic_seq += 1;
+        self.scan(ranges);
+    }
+
     /// Publishes zones of `verdict` with something at `nearest_mm`, measured just now, and wakes the consumers.
     pub(crate) fn zones(&mut self, verdict: Verdict, nearest_mm: u32) {
         let now = clock_gettime(ClockId::Monotonic);

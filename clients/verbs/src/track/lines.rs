@@ -1,6 +1,7 @@
 //! The lines that only `track` has: who went through doors, and the end. Refuses to know how that is found.
 
 use std::io::{self, Write};
+use std::time::Duration;
 
 use ::track::Counts;
 use serde::Serialize;
@@ -52,6 +53,35 @@ pub(super) fn misplaced_text(line: &mut Vec<u8>, name: &str, other: &str, off: [
         "{name} sees people ({x:.2}, {y:.2}) m beside where {other} sees them: correct one of their poses "
     )?;
     write!(line, "in the site file; until then {name} is taken to be where {other} says")
+}
+
+/// Class `late`.
+pub(super) fn late<'a>(
+    tracker: &'a str,
+    wall_ns: u64,
+    name: &'a str,
+    late: u64,
+    delay: Duration,
+) -> impl Serialize + 'a {
+    #[derive(Serialize)]
+    struct Line<'a> {
+        class: &'static str,
+        sensor: &'a str,
+        wall_ns: u64,
+        name: &'a str,
+        late: u64,
+        delay_ms: u64,
+    }
+    let delay_ms = u64::try_from(delay.as_millis()).unwrap_or(u64::MAX);
+    Line { class: "late", sensor: tracker, wall_ns, name, late, delay_ms }
+}
+
+pub(super) fn late_text(line: &mut Vec<u8>, name: &str, late: u64, delay: Duration) -> io::Result<()> {
+    match late {
+        1 => write!(line, "{name}: 1 scan was dropped because it arrived late")?,
+        _ => write!(line, "{name}: {late} scans were dropped because they arrived late")?,
+    }
+    write!(line, ": set --delay longer than {delay:?}")
 }
 
 #[derive(Serialize)]

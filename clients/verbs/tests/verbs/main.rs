@@ -10,5 +10,6 @@ mod background;
 mod echo;
 mod latency;
 mod restart;
+mod track;
 mod verbs;
 mod zones;

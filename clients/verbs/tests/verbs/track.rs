@@ -1,0 +1,82 @@
+//! `track` reports late scans while it runs.
+
+use std::time::Duration;
+
+use crate::fake::{FakeHub, Place, Verb, until};
+use ::track::Site;
+use verbs::{Bounds, TrackOptions, track};
+
+const SITE: &str = r#"
+[[sensor]]
+name = "front"
+pose = { x = 0.0, y = 2.0, yaw = 0.0 }
+[[sensor]]
+name = "rear"
+pose = { x = 5.0, y = 2.0, yaw = 3.1416 }
+[[room]]
+name = "hall"
+polygon = [[0, 0], [5, 0], [5, 4], [0, 4]]
+"#;
+const MS: u64 = 1_000_000;
+const RANGES: [u16; 4] = [300; 4];
+
+/// Runs `track`, sends scans of `rear` that are half a second late until a line with `text` reports one, and ends it. Returns
+/// the lines, and the notes.
+fn reported(json: bool, text: &str) -> (String, String) {
+    let place = Place::new();
+    let mut hub = FakeHub::new(&place.domain, &["front", "rear"], 7);
+    let options = TrackOptions {
+        site: Site::parse("site.toml", SITE).unwrap(),
+        name: None,
+        count: Vec::new(),
+        delay: Duration::from_millis(80),
+        json,
+        bounds: Bounds::default(),
+        places: place.places(),
+    };
+    let verb = Verb::start(move |out, notes, stop| track(&options, out, notes, stop));
+    for sensor in &hub.sensors {
+        sensor.scan.await_subscribers(1);
+        sensor.foreground.await_subscribers(1);
+    }
+    for seq in [1_000 * MS, 1_200 * MS, 1_400 * MS] {
+        hub.sensors[0].scan_with_foreground(seq, &RANGES);
+    }
+    // A scan is late only if the tracker has received a later one of `front` before it, so several may be needed.
+    let mut seq = 700 * MS;
+    until("a late scan is reported", || {
+        seq += 1;
+        hub.sensors[1].scan_with_foreground(seq, &RANGES);
+        [&verb.out, &verb.notes].iter().any(|lines| lines.text().contains(text))
+    });
+    verb.stop();
+    let (end, out, notes) = verb.join();
+    assert_eq!(end, Ok(()));
+    (out, notes)
+}
+
+/// The number after `key` in a line.
+fn number(line: &str, key: &str) -> u64 {
+    let (_, rest) = line.split_once(key).expect("the key");
+    rest.chars().take_while(char::is_ascii_digit).collect::<String>().parse().expect("a number")
+}
+
+#[test]
+fn late_scans_are_lines_with_the_sensor_and_their_number() {
+    let (out, notes) = reported(true, r#""class":"late""#);
+    assert_eq!(notes, "");
+    let late: Vec<&str> = out.lines().filter(|line| line.contains(r#""class":"late""#)).collect();
+    let first = r#"{"class":"late","sensor":"people","wall_ns":"#;
+    assert!(late[0].starts_with(first) && late[0].ends_with(r#","name":"rear","late":1,"delay_ms":80}"#));
+    let last = out.lines().last().expect("a summary");
+    let sum: u64 = late.iter().map(|line| number(line, r#""late":"#)).sum();
+    assert_eq!(number(last, r#""late":"#), sum, "{late:?} and {last}");
+}
+
+#[test]
+fn late_scans_are_notes_with_a_remedy() {
+    let (out, notes) = reported(false, "arrived late");
+    let first = "rear: 1 scan was dropped because it arrived late: set --delay longer than 80ms";
+    assert_eq!(notes.lines().find(|line| line.contains("arrived late")), Some(first));
+    assert!(number(&out, "left out: ") > 0, "{out}");
+}
