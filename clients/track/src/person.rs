@@ -97,11 +97,12 @@ impl Person {
         }
     }
 
-    /// A scan of `sensor`, `since_s` after its last one, showed `legs` of the person, one of them with this number of `beams`.
+    /// Handles a scan of `sensor`, `since_s` after its last one, that showed `legs` of the person, one of them with this number of
+    /// `beams`.
     pub(crate) fn seen(&mut self, sensor: usize, since_s: f64, legs: usize, beams: usize) {
         self.seen_ns = self.at_ns;
         self.seen_by_ns[sensor] = self.at_ns;
-        // Few beams do not tell a leg of a person from one of a chair, but another sensor may.
+        // A few beams may also be on the leg of a chair, so another sensor may contradict.
         self.absent_s = if beams < CLEAR_BEAMS { (self.absent_s - COARSE * since_s).max(0.0) } else { 0.0 };
         let both = if legs > 1 { 1.0 } else { 0.0 };
         self.pairs += both;

@@ -286,7 +286,7 @@ impl Sight {
     }
 }
 
-/// Returns whether so many beams, this distance apart, are fewer than a leg reflects.
+/// Returns whether a leg reflects more than this number of beams, which are `spacing_m` apart.
 fn is_thin(beams: usize, spacing_m: f64) -> bool {
     (beams + 1) as f64 * spacing_m < THINNEST_LEG_M
 }

@@ -48,11 +48,11 @@ const OPENS_S: f64 = 0.9;
 const SHINS_M: f64 = 0.36;
 /// Distance by which a sitter moves the chair along each axis, at most, and its turn in radians.
 const CHAIR_MOVES: (f64, f64) = (0.05, 0.15);
-/// Nobody walks nearer to the center of a chair.
+/// Minimum distance of a walker from the center of a chair.
 const CHAIR_M: f64 = 0.3;
 /// Duration of sitting, in seconds.
 const SITS_S: (f64, f64) = (10.0, 40.0);
-/// Where people are who have left.
+/// Position of people who have left.
 const GONE: Point = [-1000.0, -1000.0];
 
 pub(crate) struct Walker {
@@ -95,9 +95,9 @@ pub(crate) struct Crowd {
     house: House,
     /// Center and direction of each chair.
     chairs: Vec<(Point, f64)>,
-    /// How far the doors to the street are open, 0 to 1.
+    /// Opening of the doors to the street, 0 to 1.
     open: [f64; 2],
-    /// Times at which somebody comes in, and by which door.
+    /// Times at which new people enter, and the number of the door.
     arrivals: Vec<(f64, usize)>,
     now_s: f64,
 }
@@ -420,7 +420,7 @@ impl Crowd {
         }
     }
 
-    /// Somebody new comes in from the street.
+    /// Adds the people who enter from the street by now.
     fn let_in(&mut self, now_s: f64) {
         while let Some(due) = self.arrivals.iter().position(|(at_s, _)| *at_s <= now_s) {
             let (_, door) = self.arrivals.swap_remove(due);
