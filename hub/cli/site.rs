@@ -38,6 +38,7 @@ struct Checked {
     unwatched: Vec<String>,
     doors: Vec<String>,
     gaps: usize,
+    ignored: Vec<String>,
 }
 
 impl Site {
@@ -61,6 +62,7 @@ impl Site {
             rooms,
             doors: site.doors.iter().map(|door| door.name.clone()).collect(),
             gaps: site.gaps.len(),
+            ignored: site.ignored.iter().map(|area| area.name.clone()).collect(),
         };
         print(&if json { line(&checked) } else { checked.text() })
     }
@@ -75,6 +77,9 @@ impl Checked {
             if self.doors.is_empty() { "none".to_owned() } else { self.doors.join(", ") },
             self.gaps
         );
+        if !self.ignored.is_empty() {
+            text += &format!("\nignored areas: {}", self.ignored.join(", "));
+        }
         if !self.unwatched.is_empty() {
             text += &format!("\nno sensor is in: {}", self.unwatched.join(", "));
         }

@@ -18,6 +18,8 @@ pub(crate) struct Person {
     pub(crate) life: Life,
     /// When a leg of his was seen last.
     pub(crate) seen_ns: u64,
+    /// Time at which a leg of theirs was last seen outside the ignored areas.
+    pub(crate) free_ns: u64,
     /// When each sensor saw him last; 0 never.
     pub(crate) seen_by_ns: [u64; crate::site::SENSORS],
     /// Scans that spoke for him, at most [`MOST_SUPPORT`]; one of a slow sensor counts up to twice.
@@ -76,6 +78,7 @@ impl Person {
             born_ns: at_ns,
             life: Life::Tentative,
             seen_ns: at_ns,
+            free_ns: at_ns,
             seen_by_ns: [0; crate::site::SENSORS],
             support: 1.0,
             pairs: if legs.len() > 1 { 1.0 } else { 0.0 },
@@ -161,6 +164,7 @@ mod tests {
             at: [2.0, y],
             sigma_m: 0.03,
             is_fresh: true,
+            is_ignored: false,
             is_solid: true,
             beams: 5,
         });

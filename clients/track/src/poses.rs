@@ -109,7 +109,7 @@ mod tests {
     fn told(off: Point) -> Option<Misplaced> {
         let mut random = fastrand::Rng::with_seed(4);
         let mut poses = Poses::new(3);
-        let leg = |at| Leg { at, sigma_m: 0.04, is_fresh: true, is_solid: true, beams: 5 };
+        let leg = |at| Leg { at, sigma_m: 0.04, is_fresh: true, is_ignored: false, is_solid: true, beams: 5 };
         (0..2_000).find_map(|_| {
             let mut place = || [6.0 * random.f64(), 5.0 * random.f64()];
             let places: Vec<Point> = (0..3).map(|_| place()).collect();
@@ -137,7 +137,14 @@ mod tests {
     #[test]
     fn legs_that_are_not_known_well_say_nothing() {
         let mut poses = Poses::new(2);
-        let leg = |x, is_fresh| Leg { at: [x, 0.0], sigma_m: 0.07, is_fresh, is_solid: true, beams: 5 };
+        let leg = |x, is_fresh| Leg {
+            at: [x, 0.0],
+            sigma_m: 0.07,
+            is_fresh,
+            is_ignored: false,
+            is_solid: true,
+            beams: 5,
+        };
         for _ in 0..3_000 {
             assert_eq!(poses.take((0, &[leg(0.0, true)]), (1, &[leg(0.5, true)])), None);
         }

@@ -6,7 +6,7 @@ use std::f64::consts::{FRAC_PI_4, TAU};
 use schema::{Foreground, Scan};
 
 use crate::geometry::{Point, distance, minus};
-use crate::site::Sensor;
+use crate::site::{Sensor, Site};
 
 /// The most legs of a scan.
 pub const LEGS: usize = 64;
@@ -43,6 +43,8 @@ pub(crate) struct Leg {
     pub(crate) is_solid: bool,
     /// Number of beams that it reflects.
     pub(crate) beams: usize,
+    /// Whether it is in an ignored area. Such a leg is not fresh.
+    pub(crate) is_ignored: bool,
 }
 
 /// What a scan says of a place where somebody may stand.
@@ -129,6 +131,13 @@ impl Sight {
     /// All that it sees is off by so much: so is its place.
     pub(crate) fn shift(&mut self, off: Point) {
         self.sensor.place = minus(self.sensor.place, off);
+    }
+
+    /// Marks the legs in the ignored areas of `site`.
+    pub(crate) fn ignore(&mut self, site: &Site) {
+        for leg in self.legs.iter_mut().filter(|leg| site.is_ignored(leg.at)) {
+            (leg.is_fresh, leg.is_ignored) = (false, true);
+        }
     }
 
     pub(crate) fn legs(&self) -> &[Leg] {
@@ -282,6 +291,7 @@ impl Sight {
             is_fresh: 2 * fresh > points.len() && !is_short,
             beams: points.len(),
             is_solid: !is_between && !is_short && (is_partial || !is_thin(points.len(), spacing)),
+            is_ignored: false,
         });
     }
 }

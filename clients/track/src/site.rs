@@ -4,12 +4,14 @@ mod check;
 mod drawing;
 mod file;
 
-use crate::geometry::{Point, contains, distance_to_border};
+use crate::geometry::{Point, contains, distance_to_border, distance_to_segment, middle};
 
 /// The most sensors of a site: as many as a hub has links.
 pub const SENSORS: usize = 32;
 /// The most rooms.
 pub const ROOMS: usize = 64;
+/// Maximum number of ignored areas.
+pub const IGNORED: usize = 64;
 
 /// A plan that was checked.
 #[derive(Clone, Debug, PartialEq)]
@@ -22,6 +24,8 @@ pub struct Site {
     pub doors: Vec<Door>,
     /// Ways between doors that no sensor sees.
     pub gaps: Vec<Gap>,
+    /// Areas in which legs start no track. They may overlap rooms, doors and each other.
+    pub ignored: Vec<Ignored>,
 }
 
 /// A sensor, and where it is in the map.
@@ -68,7 +72,33 @@ pub struct Gap {
     pub seconds: [f64; 2],
 }
 
+/// An area with something that moves and is not a person, such as a fountain, a revolving door or a curtain.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Ignored {
+    /// Name in the drawing.
+    pub name: String,
+    /// Corners in meters, at least three.
+    pub polygon: Vec<Point>,
+}
+
 impl Site {
+    /// Returns whether `point` is in an ignored area.
+    pub fn is_ignored(&self, point: Point) -> bool {
+        self.ignored.iter().any(|area| contains(&area.polygon, point))
+    }
+
+    /// Returns the distance of `point` from a door, in meters. If an ignored area covers the middle of the door, as that of a
+    /// revolving door does, it is the distance from this area.
+    pub(crate) fn distance_to_door(&self, point: Point, door: usize) -> f64 {
+        let between = self.doors[door].between;
+        let area = self.ignored.iter().find(|area| touches(&area.polygon, middle(between), ON_THE_WALL_M));
+        let from_area = area.map_or(f64::INFINITY, |area| match contains(&area.polygon, point) {
+            true => 0.0,
+            false => distance_to_border(&area.polygon, point),
+        });
+        distance_to_segment(point, between).min(from_area)
+    }
+
     /// Returns the room that `point` is in.
     pub fn room_at(&self, point: Point) -> Option<usize> {
         self.rooms.iter().position(|room| contains(&room.polygon, point))

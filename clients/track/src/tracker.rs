@@ -42,6 +42,8 @@ const SLOWEST_S: f64 = 0.2;
 const AT_ONCE_NS: u64 = 45_000_000;
 /// Two who are nearer, and of whom never two pairs of legs are seen, are one.
 const SAME_M: f64 = 0.45;
+/// Time for which legs in an ignored area are taken for those of a known person who went into it.
+const IGNORED_NS: u64 = 5_000_000_000;
 
 /// What follows persons.
 pub(crate) struct Tracker {
@@ -83,12 +85,13 @@ impl Tracker {
     /// Takes the next scan in the order of time.
     pub(crate) fn take(&mut self, sensor: usize, at_ns: u64, scan: &Scan, foreground: &Foreground) {
         self.sights[sensor].take(scan, foreground);
+        self.sights[sensor].ignore(&self.site);
         let since_s = (at_ns.saturating_sub(self.scan_ns[sensor]) as f64 * 1e-9).min(SLOWEST_S);
         self.scan_ns[sensor] = at_ns;
         self.compare_poses(sensor, at_ns);
         self.walk(at_ns);
         let mut pairs = std::mem::take(&mut self.pairs);
-        self.associate(sensor, &mut pairs);
+        self.associate(sensor, at_ns, &mut pairs);
         self.correct(sensor, since_s, &pairs);
         self.miss(sensor, since_s, &pairs);
         self.bear(sensor, at_ns, &pairs);
@@ -131,7 +134,7 @@ impl Tracker {
     }
 
     /// Finds whose legs the sensor sees: pairs of a leg and twice the number of a person plus the side.
-    fn associate(&mut self, sensor: usize, pairs: &mut Vec<(usize, usize)>) {
+    fn associate(&mut self, sensor: usize, at_ns: u64, pairs: &mut Vec<(usize, usize)>) {
         let legs = self.sights[sensor].legs();
         self.edges.clear();
         for (number, person) in self.persons.iter().enumerate() {
@@ -142,10 +145,12 @@ impl Tracker {
             };
             // What the background has learned holds who is known and stands, and makes nobody known.
             let (place, stands) = (person.filter.place(), person.is_known() && person.speed() < 0.5);
+            let passes = person.is_known() && at_ns.saturating_sub(person.free_ns) < IGNORED_NS;
             let reach = FARTHEST_LEG_M + 2.0 * person.filter.variance().sqrt().min(0.5);
             let expected = Side::BOTH.map(|side| person.filter.leg(side));
             for (leg, found) in legs.iter().enumerate() {
-                if length2(minus(found.at, place)) >= reach * reach || !(found.is_fresh || stands) {
+                let may_be_theirs = if found.is_ignored { passes } else { found.is_fresh || stands };
+                if length2(minus(found.at, place)) >= reach * reach || !may_be_theirs {
                     continue;
                 }
                 for (side, (expected, variance)) in expected.into_iter().enumerate() {
@@ -197,6 +202,9 @@ impl Tracker {
             let solid = of_one.iter().map(|&(leg, _)| &legs[leg]).filter(|leg| leg.is_solid);
             if let Some(beams) = solid.map(|leg| leg.beams).max() {
                 person.seen(sensor, since_s, of_one.len(), beams);
+            }
+            if of_one.iter().any(|&(leg, _)| !legs[leg].is_ignored) {
+                person.free_ns = person.at_ns;
             }
         }
     }
@@ -320,7 +328,11 @@ impl Tracker {
             let silent_ns = at_ns.saturating_sub(person.seen_ns);
             let (is_gone, is_told) = match person.life {
                 Life::Tentative => (person.absent_s > GONE_TENTATIVE_S || silent_ns > FORGOTTEN_NS, false),
-                Life::Known => (person.absent_s > GONE_S || silent_ns > HIDDEN_NS, true),
+                Life::Known => {
+                    let is_lost = at_ns.saturating_sub(person.free_ns) > IGNORED_NS
+                        && self.site.is_ignored(person.filter.place());
+                    (person.absent_s > GONE_S || silent_ns > HIDDEN_NS || is_lost, true)
+                }
                 Life::Away { since_ns, .. } => {
                     let away_s = at_ns.saturating_sub(since_ns) as f64 * 1e-9;
                     (person.room.is_none() || away_s > 5.0 * LONGEST_S, true)

@@ -39,6 +39,10 @@ between = [[8, 1.5], [8, 2.5]]
 [[gap]]
 between = ["left", "right"]
 seconds = [2, 15]
+
+[[ignore]]
+name = "fountain"
+polygon = [[2, 1], [3, 1], [3, 2]]
 "#;
 
 #[test]
@@ -49,6 +53,7 @@ fn a_house_is_read() {
     assert_eq!(site.watched(), [true, false, true]);
     assert_eq!((site.room_at([6.0, 2.0]), site.room_at([6.0, 3.5])), (Some(1), None));
     assert_eq!((site.doors[1].from, site.doors[1].to), (Some(1), Some(2)));
+    assert_eq!((site.is_ignored([2.9, 1.5]), site.is_ignored([2.1, 1.5])), (true, false));
 }
 
 #[test]
@@ -86,9 +91,37 @@ fn each_mistake_is_told_with_place_value_and_remedy() {
         ),
         ("seconds = [2, 15]", "seconds = [15, 2]", "seconds 15 to 2", "[2, 15]"),
         ("\"left\", \"right\"", "\"left\", \"rigth\"", "gap: no door \"rigth\"", "did you mean `right`?"),
-        ("[5, 4], [0, 4]", "[0, 4], [5, 4]", "room hall: its walls cross", "in their order"),
+        ("[5, 4], [0, 4]", "[0, 4], [5, 4]", "room hall: its sides cross", "in their order"),
         ("x = 0.0,", "x = 2000.0,", "2000 m is too far", "at most 1000"),
         ("yaw = 0.0", "yaw = 90.0", "yaw 90 of sensor front", "radians"),
+        (
+            "[3, 1], [3, 2]]",
+            "[3, 1]]",
+            "house.toml:40:11: ignored area fountain: 2 corners",
+            "at least three",
+        ),
+        (
+            "[2, 1], [3, 1], [3, 2]",
+            "[2, 1], [3, 2], [3, 1], [2, 2]",
+            "house.toml:40:11: ignored area fountain: its sides cross",
+            "in their order",
+        ),
+        (
+            "[3, 1], [3, 2]]",
+            "[3, 1], [3, 1.01]]",
+            "house.toml:40:11: ignored area fountain: 0.005 m2",
+            "at least 0.02 m2",
+        ),
+        ("[[2, 1], [3, 1], [3, 2]]", "[[2, 7], [3, 7], [3, 8]]", "fountain is in no room", "--svg"),
+        (
+            "[[2, 1], [3, 1], [3, 2]]",
+            "[[-1, -1], [6, -1], [6, 5], [-1, 5]]",
+            "ignored area fountain covers room hall",
+            "smaller",
+        ),
+        ("[2, 1], [3, 1]", "[2000, 1], [3, 1]", "house.toml:40:11: 2000 m is too far", "at most 1000"),
+        ("\"fountain\"", "\"\"", "house.toml:39:8: ignored area name \"\" is not possible", "1 to 24"),
+        ("polygon = [[2,", "corners = [[2,", "unknown key `corners`", "did you mean"),
         (
             "[[gap]]",
             "[[room]]\nname = \"attic\"\npolygon = [[0, 9], [3, 9], [3, 12]]\n[[gap]]",
@@ -113,11 +146,21 @@ fn each_mistake_is_told_with_place_value_and_remedy() {
 #[test]
 fn the_drawing_has_all_that_the_file_names() {
     let svg = Site::parse("house.toml", &HOUSE.replace("kitchen\"", "<&\"")).unwrap().svg();
-    for word in
-        ["front", "kitchen.rear", "hall", "corridor", "no sensor", "left", "right", "2 to 15 s", "&lt;&amp;"]
-    {
+    for word in [
+        "front",
+        "kitchen.rear",
+        "hall",
+        "corridor",
+        "no sensor",
+        "left",
+        "right",
+        "2 to 15 s",
+        "&lt;&amp;",
+        "fountain",
+    ] {
         assert!(svg.contains(word), "{word}");
     }
-    assert_eq!(svg.matches("<polygon").count(), 3);
+    assert_eq!(svg.matches("<polygon").count(), 4);
+    assert_eq!(svg.matches("stroke-dasharray=\"4 4\"").count(), 1, "the ignored area is dashed");
     assert_eq!(svg.matches("<circle").count(), 2);
 }

@@ -6,14 +6,16 @@ use std::ops::Range;
 use schema::{Failure, check_followed};
 use toml::Spanned;
 
-use super::file::{DoorEntry, File, GapEntry, RoomEntry, SensorEntry, Source, nearest};
-use super::{Door, Gap, OUTSIDE, ROOMS, Room, SENSORS, Sensor, Site};
-use crate::geometry::{Point, area, crosses_itself, distance, distance_to_border, middle, overlap};
+use super::file::{DoorEntry, File, GapEntry, IgnoreEntry, RoomEntry, SensorEntry, Source, nearest};
+use super::{Door, Gap, IGNORED, Ignored, OUTSIDE, ROOMS, Room, SENSORS, Sensor, Site};
+use crate::geometry::{Point, area, contains, crosses_itself, distance, distance_to_border, middle, overlap};
 
 /// By so much may rooms overlap, for they are measured by hand.
 const OVERLAP_M: f64 = 0.05;
 /// So far may the middle of a door be from the walls of its rooms: walls are thick.
 const DOOR_OFF_M: f64 = 0.5;
+/// Minimum size of an ignored area, in square meters: a curtain is thin.
+const LEAST_IGNORED_M2: f64 = 0.02;
 /// The greatest coordinate: beyond it, somebody wrote millimetres.
 const FARTHEST_M: f64 = 1_000.0;
 
@@ -28,18 +30,25 @@ pub(super) fn check(source: &Source<'_>, file: &File) -> Result<Site, Failure> {
         let what = format!("{} sensors and {} rooms", file.sensor.len(), file.room.len());
         return Err(source.refuse(None, what, format!("at most {SENSORS} sensors and {ROOMS} rooms")));
     }
+    if let Some(entry) = file.ignore.get(IGNORED) {
+        let what = format!("{} ignored areas", file.ignore.len());
+        return Err(source.refuse(Some(entry.name.span()), what, format!("at most {IGNORED}")));
+    }
     once(source, "sensor", file.sensor.iter().map(|entry| &entry.name))?;
     once(source, "room", file.room.iter().map(|entry| &entry.name))?;
     once(source, "door", file.door.iter().map(|entry| &entry.name))?;
+    once(source, "ignored area", file.ignore.iter().map(|entry| &entry.name))?;
     let mut site = Site {
         sensors: file.sensor.iter().map(|entry| sensor(source, entry)).collect::<Result<_, _>>()?,
         rooms: file.room.iter().map(|entry| room(source, entry)).collect::<Result<_, _>>()?,
         doors: Vec::new(),
         gaps: Vec::new(),
+        ignored: Vec::new(),
     };
     no_overlap(source, file, &site)?;
     site.doors = file.door.iter().map(|entry| door(source, entry, &site)).collect::<Result<_, _>>()?;
     site.gaps = file.gap.iter().map(|entry| gap(source, entry, &site)).collect::<Result<_, _>>()?;
+    site.ignored = file.ignore.iter().map(|entry| ignored(source, entry, &site)).collect::<Result<_, _>>()?;
     all_reachable(source, file, &site)?;
     Ok(site)
 }
@@ -93,22 +102,56 @@ fn sensor(source: &Source<'_>, entry: &SensorEntry) -> Result<Sensor, Failure> {
 
 fn room(source: &Source<'_>, entry: &RoomEntry) -> Result<Room, Failure> {
     let (name, polygon) = (entry.name.as_ref(), entry.polygon.as_ref());
-    let refuse = |what: String, remedy| Err(source.refuse(Some(entry.polygon.span()), what, remedy));
-    finite(source, entry.polygon.span(), polygon)?;
-    if polygon.len() < 3 {
-        return refuse(format!("room {name}: {} corners", polygon.len()), "at least three");
-    }
-    if crosses_itself(polygon) {
-        return refuse(
-            format!("room {name}: its walls cross"),
-            "give the corners in their order around the room",
-        );
-    }
+    corners(source, &format!("room {name}"), &entry.polygon)?;
     let size = area(polygon).abs();
     if size < 0.25 {
-        return refuse(format!("room {name}: {size:.2} m2"), "metres, at least 0.25 m2");
+        let what = format!("room {name}: {size:.2} m2");
+        return Err(source.refuse(Some(entry.polygon.span()), what, "meters, at least 0.25 m2"));
     }
     Ok(Room { name: name.clone(), polygon: polygon.clone() })
+}
+
+/// Checks the polygon of `what`: three corners or more, and sides that do not cross.
+fn corners(source: &Source<'_>, what: &str, polygon: &Spanned<Vec<Point>>) -> Result<(), Failure> {
+    let (span, polygon) = (polygon.span(), polygon.as_ref());
+    finite(source, span.clone(), polygon)?;
+    if polygon.len() < 3 {
+        return Err(source.refuse(
+            Some(span),
+            format!("{what}: {} corners", polygon.len()),
+            "at least three",
+        ));
+    }
+    if crosses_itself(polygon) {
+        let remedy = "give the corners in their order around it";
+        return Err(source.refuse(Some(span), format!("{what}: its sides cross"), remedy));
+    }
+    Ok(())
+}
+
+fn ignored(source: &Source<'_>, entry: &IgnoreEntry, site: &Site) -> Result<Ignored, Failure> {
+    let (name, polygon) = (entry.name.as_ref(), entry.polygon.as_ref());
+    corners(source, &format!("ignored area {name}"), &entry.polygon)?;
+    let size = area(polygon).abs();
+    if size < LEAST_IGNORED_M2 {
+        let what = format!("ignored area {name}: {size:.3} m2");
+        let remedy = format!("meters, at least {LEAST_IGNORED_M2} m2");
+        return Err(source.refuse(Some(entry.polygon.span()), what, remedy));
+    }
+    if !site.rooms.iter().any(|room| overlap(&room.polygon, polygon, 0.0)) {
+        let what = format!("ignored area {name} is in no room");
+        let remedy = "correct its corners; `scanhub site check FILE --svg OUT` draws the rooms";
+        return Err(source.refuse(Some(entry.polygon.span()), what, remedy));
+    }
+    if let Some(room) = site.rooms.iter().find(|room| room.polygon.iter().all(|&at| contains(polygon, at))) {
+        let what = format!("ignored area {name} covers room {}", room.name);
+        return Err(source.refuse(
+            Some(entry.polygon.span()),
+            what,
+            "make it smaller, or leave the room out",
+        ));
+    }
+    Ok(Ignored { name: name.clone(), polygon: polygon.clone() })
 }
 
 fn no_overlap(source: &Source<'_>, file: &File, site: &Site) -> Result<(), Failure> {

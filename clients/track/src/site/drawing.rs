@@ -4,7 +4,7 @@ use std::fmt::Write;
 
 use schema::Printable;
 
-use super::{Room, Site};
+use super::Site;
 use crate::geometry::{Point, middle};
 
 /// Pixels per metre.
@@ -13,10 +13,11 @@ const SCALE: f64 = 60.0;
 const MARGIN_M: f64 = 0.8;
 
 impl Site {
-    /// Returns a drawing: rooms with their names, doors, gaps, and sensors with the way that they look. One metre is 60
-    /// pixels; y is up.
+    /// Returns a drawing: rooms with their names, ignored areas, doors, gaps, and sensors with the way that they look. One
+    /// meter is 60 pixels; y is up.
     pub fn svg(&self) -> String {
         let corners = self.rooms.iter().flat_map(|room| room.polygon.iter().copied());
+        let corners = corners.chain(self.ignored.iter().flat_map(|area| area.polygon.iter().copied()));
         let points: Vec<Point> = corners.chain(self.sensors.iter().map(|sensor| sensor.place)).collect();
         let least = |axis: usize| points.iter().map(|p| p[axis]).fold(f64::INFINITY, f64::min) - MARGIN_M;
         let most = |axis: usize| points.iter().map(|p| p[axis]).fold(f64::NEG_INFINITY, f64::max) + MARGIN_M;
@@ -39,19 +40,25 @@ impl Site {
                 y + down
             );
         };
+        let polygon = |svg: &mut String, corners: &[Point], style: &str| {
+            let corners: Vec<String> =
+                corners.iter().map(|&p| at(p)).map(|(x, y)| format!("{x:.1},{y:.1}")).collect();
+            let _ = writeln!(svg, "<polygon points=\"{}\" {style}/>", corners.join(" "));
+        };
         for (room, watched) in self.rooms.iter().zip(self.watched()) {
             let fill = if watched { "#e6eef7" } else { "#eeeeee" };
-            let corners: Vec<String> =
-                room.polygon.iter().map(|&p| at(p)).map(|(x, y)| format!("{x:.1},{y:.1}")).collect();
-            let _ = writeln!(
-                svg,
-                "<polygon points=\"{}\" fill=\"{fill}\" stroke=\"#333333\" stroke-width=\"3\"/>",
-                corners.join(" ")
-            );
-            text(&mut svg, centre(room), 0.0, "#333333", &room.name);
+            let style = format!("fill=\"{fill}\" stroke=\"#333333\" stroke-width=\"3\"");
+            polygon(&mut svg, &room.polygon, &style);
+            text(&mut svg, center(&room.polygon), 0.0, "#333333", &room.name);
             if !watched {
-                text(&mut svg, centre(room), 16.0, "#777777", "no sensor");
+                text(&mut svg, center(&room.polygon), 16.0, "#777777", "no sensor");
             }
+        }
+        for area in &self.ignored {
+            let style = "fill=\"#777777\" fill-opacity=\"0.2\" stroke=\"#777777\" stroke-width=\"2\" \
+                         stroke-dasharray=\"4 4\"";
+            polygon(&mut svg, &area.polygon, style);
+            text(&mut svg, center(&area.polygon), 4.0, "#777777", &area.name);
         }
         let line = |svg: &mut String, [a, b]: [Point; 2], style: &str| {
             let ((x1, y1), (x2, y2)) = (at(a), at(b));
@@ -82,9 +89,9 @@ impl Site {
     }
 }
 
-/// Mean of the corners.
-fn centre(room: &Room) -> Point {
-    let n = room.polygon.len() as f64;
-    let sum = room.polygon.iter().fold([0.0, 0.0], |sum, p| [sum[0] + p[0], sum[1] + p[1]]);
+/// Returns the mean of the corners.
+fn center(polygon: &[Point]) -> Point {
+    let n = polygon.len() as f64;
+    let sum = polygon.iter().fold([0.0, 0.0], |sum, p| [sum[0] + p[0], sum[1] + p[1]]);
     [sum[0] / n, sum[1] / n]
 }

@@ -27,6 +27,8 @@ pub(super) struct File {
     pub(super) door: Vec<DoorEntry>,
     #[serde(default)]
     pub(super) gap: Vec<GapEntry>,
+    #[serde(default)]
+    pub(super) ignore: Vec<IgnoreEntry>,
 }
 
 #[derive(Deserialize)]
@@ -67,6 +69,13 @@ pub(super) struct DoorEntry {
 pub(super) struct GapEntry {
     pub(super) between: Spanned<[Spanned<String>; 2]>,
     pub(super) seconds: Spanned<[f64; 2]>,
+}
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct IgnoreEntry {
+    pub(super) name: Spanned<String>,
+    pub(super) polygon: Spanned<Vec<Point>>,
 }
 
 impl Site {

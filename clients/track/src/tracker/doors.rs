@@ -155,7 +155,8 @@ impl Tracker {
                     let is_unseen = |room: &Option<usize>| room.is_none_or(|room| !self.watched[room]);
                     ends.contains(&self.persons[number].room) && ends.iter().any(is_unseen)
                 };
-                let door = (0..self.site.doors.len()).filter(leads).find(|&door| off(door) < 0.7);
+                let is_near = |&door: &usize| self.site.distance_to_door(born_at, door) < 0.7;
+                let door = (0..self.site.doors.len()).filter(leads).find(is_near);
                 let (room, is_watched) = {
                     let room = self.persons[number].room;
                     (room, room.is_some_and(|room| self.watched[room]))
