@@ -23,6 +23,11 @@ pub fn middle([a, b]: [Point; 2]) -> Point {
     [(a[0] + b[0]) / 2.0, (a[1] + b[1]) / 2.0]
 }
 
+/// Returns the scalar product.
+pub fn dot(a: Point, b: Point) -> f64 {
+    a[0] * b[0] + a[1] * b[1]
+}
+
 /// Returns the cross product: positive if `b` is counter-clockwise of `a`.
 pub fn cross(a: Point, b: Point) -> f64 {
     a[0] * b[1] - a[1] * b[0]

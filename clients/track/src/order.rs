@@ -101,7 +101,7 @@ impl People {
         self.counts
     }
 
-    /// Returns the number of late scans of each sensor, in the order of the site. Their sum is [`Counts::late`].
+    /// Returns the number of late scans of each sensor, by its index in the site. Their sum is [`Counts::late`].
     pub fn late(&self) -> &[u64] {
         &self.late
     }

@@ -156,6 +156,7 @@ impl Person {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::sight::AtDoor;
 
     #[test]
     fn somebody_is_known_after_eight_scans_or_fewer_of_a_slow_sensor() {
@@ -167,6 +168,8 @@ mod tests {
             is_ignored: false,
             is_solid: true,
             beams: 5,
+            is_free: true,
+            at_door: AtDoor::Clear,
         });
         let known_after_ms = |every_ms: u64| {
             let mut person = Person::new(1, MS, &legs);

@@ -104,12 +104,22 @@ impl Votes {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::sight::AtDoor;
 
     /// What two sensors say of three people who stand anywhere, the second one off by `off`.
     fn told(off: Point) -> Option<Misplaced> {
         let mut random = fastrand::Rng::with_seed(4);
         let mut poses = Poses::new(3);
-        let leg = |at| Leg { at, sigma_m: 0.04, is_fresh: true, is_ignored: false, is_solid: true, beams: 5 };
+        let leg = |at| Leg {
+            at,
+            sigma_m: 0.04,
+            is_fresh: true,
+            is_ignored: false,
+            is_solid: true,
+            beams: 5,
+            is_free: true,
+            at_door: AtDoor::Clear,
+        };
         (0..2_000).find_map(|_| {
             let mut place = || [6.0 * random.f64(), 5.0 * random.f64()];
             let places: Vec<Point> = (0..3).map(|_| place()).collect();
@@ -144,6 +154,8 @@ mod tests {
             is_ignored: false,
             is_solid: true,
             beams: 5,
+            is_free: true,
+            at_door: AtDoor::Clear,
         };
         for _ in 0..3_000 {
             assert_eq!(poses.take((0, &[leg(0.0, true)]), (1, &[leg(0.5, true)])), None);

@@ -20,6 +20,15 @@ const THINNEST_LEG_M: f64 = 0.09;
 /// scanners.
 const SPOT_M: f64 = 0.01;
 const SPOT_RAD: f64 = 0.0045;
+/// Minimum width of a surface, such as a leaf of a door, in meters. A narrower straight piece may be legs.
+const FLAT_M: f64 = 0.4;
+/// Standard deviation of points from the line of a surface: the noise of the ranges.
+const FLATNESS_M: f64 = 0.015;
+/// Minimum distance by which the beams next to a free leg reach behind it, in meters. Points of a surface are closer together.
+const FREE_M: f64 = 0.6;
+/// Points between the jambs at which a door is checked, and the distance from the line that a closed leaf may have.
+const CLOSED_POINTS: usize = 9;
+const CLOSED_M: f64 = 0.25;
 /// What is wider is no person.
 const WIDEST_M: f64 = 1.3;
 /// By so much a beam has to end before the farthest that it ever reached, to have met something that stands there.
@@ -45,6 +54,23 @@ pub(crate) struct Leg {
     pub(crate) beams: usize,
     /// Whether it is in an ignored area. Such a leg is not fresh.
     pub(crate) is_ignored: bool,
+    /// Whether the beams on both sides of it reach far behind it. The points of a leaf of a door are next to each other.
+    pub(crate) is_free: bool,
+    /// Position relative to the leaves of doors.
+    pub(crate) at_door: AtDoor,
+}
+
+/// Whether a leg may be a part of a leaf of a door.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd)]
+pub(crate) enum AtDoor {
+    /// No leaf reaches it.
+    Clear,
+    /// A leaf that swings about a jamb reaches it.
+    Swing,
+    /// Between the jambs of a door, on the line along which a leaf may slide.
+    Line,
+    /// On this line, at a jamb or outside the opening, where an open leaf ends.
+    Jamb,
 }
 
 /// What a scan says of a place where somebody may stand.
@@ -133,11 +159,33 @@ impl Sight {
         self.sensor.place = minus(self.sensor.place, off);
     }
 
-    /// Marks the legs in the ignored areas of `site`.
-    pub(crate) fn ignore(&mut self, site: &Site) {
-        for leg in self.legs.iter_mut().filter(|leg| site.is_ignored(leg.at)) {
-            (leg.is_fresh, leg.is_ignored) = (false, true);
+    /// Marks the legs in the ignored areas of `site`, and those that may be leaves of its doors.
+    pub(crate) fn mark(&mut self, site: &Site, has_leaves: &[bool]) {
+        for leg in &mut self.legs {
+            leg.at_door = site.at_door(leg.at, has_leaves);
+            if site.is_ignored(leg.at) {
+                (leg.is_fresh, leg.is_ignored) = (false, true);
+            }
         }
+    }
+
+    /// Returns whether the opening between two jambs is closed: all beams to it end near the line between them. It is never
+    /// closed if fewer than five beams reach it.
+    pub(crate) fn is_closed(&self, [a, b]: [Point; 2]) -> bool {
+        let ends_there = |i: usize| {
+            let share = (i + 1) as f64 / (CLOSED_POINTS + 1) as f64;
+            let (beam, far) = self.beam([a[0] + share * (b[0] - a[0]), a[1] + share * (b[1] - a[1])])?;
+            let beam = beam.round() as usize;
+            self.ranges.get(beam).is_some_and(|range| (range - far).abs() <= CLOSED_M).then_some(beam)
+        };
+        // An open door fails at its middle, which is the first point.
+        let order = (0..CLOSED_POINTS).map(|i| (i + CLOSED_POINTS / 2) % CLOSED_POINTS);
+        let (mut first, mut last) = (usize::MAX, 0);
+        for i in order {
+            let Some(beam) = ends_there(i) else { return false };
+            (first, last) = (first.min(beam), last.max(beam));
+        }
+        last - first >= 4
     }
 
     pub(crate) fn legs(&self) -> &[Leg] {
@@ -146,18 +194,7 @@ impl Sight {
 
     /// What the last scan says of `place`.
     pub(crate) fn look(&self, place: Point) -> Seen {
-        let way = minus(place, self.sensor.place);
-        let far = (way[0] * way[0] + way[1] * way[1]).sqrt();
-        if self.step == 0.0 || far < 0.2 {
-            return Seen::Hidden;
-        }
-        let bearing = way[1].atan2(way[0]) - self.sensor.yaw_rad;
-        let angle = if self.sensor.is_upside_down { -bearing } else { bearing };
-        let turned = ((angle - self.first_angle) * self.step.signum() + 1e-9).rem_euclid(TAU);
-        let middle = turned / self.step.abs();
-        if middle >= self.ranges.len() as f64 {
-            return Seen::Hidden;
-        }
+        let Some((middle, far)) = self.beam(place) else { return Seen::Hidden };
         // Half the width of a person's legs.
         let half = ((0.2 / far).min(0.5) / self.step.abs()).ceil();
         let first = (middle - half).max(0.0) as usize;
@@ -188,6 +225,20 @@ impl Sight {
         hidden += hidden_run;
         let all = through + hidden;
         if all >= 2 && 5 * through >= 4 * all { Seen::Through } else { Seen::Hidden }
+    }
+
+    /// Returns the beam to `place`, as a fraction of beams, and the distance; `None` if no beam points there.
+    fn beam(&self, place: Point) -> Option<(f64, f64)> {
+        let way = minus(place, self.sensor.place);
+        let far = (way[0] * way[0] + way[1] * way[1]).sqrt();
+        if self.step == 0.0 || far < 0.2 {
+            return None;
+        }
+        let bearing = way[1].atan2(way[0]) - self.sensor.yaw_rad;
+        let angle = if self.sensor.is_upside_down { -bearing } else { bearing };
+        let turned = ((angle - self.first_angle) * self.step.signum() + 1e-9).rem_euclid(TAU);
+        let middle = turned / self.step.abs();
+        (middle < self.ranges.len() as f64).then_some((middle, far))
     }
 
     /// Elements for which there is memory.
@@ -255,6 +306,9 @@ impl Sight {
             return;
         }
         if width > WIDEST_LEG_M && points.len() >= 4 {
+            if width > FLAT_M && is_flat(points) {
+                return;
+            }
             // Between two legs the points lie farther apart than on one.
             let n = points.len();
             let within = n / 4 + 1..=3 * n / 4;
@@ -283,6 +337,9 @@ impl Sight {
         let is_short = points.len() == 1 && spacing < LEG_M;
         // A beam that meets two surfaces may report any value between them.
         let is_between = is_partial && points.len() as f64 <= 1.0 + (SPOT_M + SPOT_RAD * range) / spacing;
+        let is_free = |beam: Option<usize>| {
+            beam.and_then(|beam| self.ranges.get(beam)).is_some_and(|&beside| beside > range + FREE_M)
+        };
         let sigma_m = if is_partial || is_short { 0.07 } else { 0.03 + 0.3 * spacing };
         let fresh = points.iter().filter(|(beam, _)| self.is_foreground[*beam]).count();
         self.legs.push(Leg {
@@ -292,6 +349,8 @@ impl Sight {
             beams: points.len(),
             is_solid: !is_between && !is_short && (is_partial || !is_thin(points.len(), spacing)),
             is_ignored: false,
+            is_free: is_free(first.checked_sub(1)) && is_free(Some(last + 1)),
+            at_door: AtDoor::Clear,
         });
     }
 }
@@ -299,6 +358,20 @@ impl Sight {
 /// Returns whether a leg reflects more than this number of beams, which are `spacing_m` apart.
 fn is_thin(beams: usize, spacing_m: f64) -> bool {
     (beams + 1) as f64 * spacing_m < THINNEST_LEG_M
+}
+
+/// Returns whether the points lie on a line, within the noise of the ranges.
+fn is_flat(points: &[(usize, Point)]) -> bool {
+    let n = points.len() as f64;
+    let mean = points.iter().fold([0.0, 0.0], |sum, (_, p)| [sum[0] + p[0] / n, sum[1] + p[1] / n]);
+    let (mut xx, mut xy, mut yy) = (0.0, 0.0, 0.0);
+    for (_, point) in points {
+        let [x, y] = minus(*point, mean);
+        (xx, xy, yy) = (xx + x * x / n, xy + x * y / n, yy + y * y / n);
+    }
+    // Variance along the minor axis.
+    let across = (xx + yy) / 2.0 - ((xx - yy) * (xx - yy) / 4.0 + xy * xy).sqrt();
+    across < FLATNESS_M * FLATNESS_M
 }
 
 /// A beam reaches `range`: single readings that are too far are noise.

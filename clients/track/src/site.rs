@@ -4,7 +4,10 @@ mod check;
 mod drawing;
 mod file;
 
-use crate::geometry::{Point, contains, distance_to_border, distance_to_segment, middle};
+use crate::geometry::{
+    Point, contains, distance, distance_to_border, distance_to_segment, dot, middle, minus,
+};
+use crate::sight::AtDoor;
 
 /// The most sensors of a site: as many as a hub has links.
 pub const SENSORS: usize = 32;
@@ -99,6 +102,26 @@ impl Site {
         distance_to_segment(point, between).min(from_area)
     }
 
+    /// Returns whether a leaf may reach `point`, for the doors that have leaves.
+    pub(crate) fn at_door(&self, point: Point, has_leaves: &[bool]) -> AtDoor {
+        let mut found = AtDoor::Clear;
+        for (Door { between: [a, b], .. }, _) in self.doors.iter().zip(has_leaves).filter(|(_, has)| **has) {
+            let width = distance(*a, *b);
+            // A wide door has two leaves. One that slides does so along the wall, as far as it is wide.
+            let leaf_m = if width > WIDEST_LEAF_M { width / 2.0 } else { width }.min(WIDEST_LEAF_M);
+            let along = minus(*b, *a).map(|value| value * leaf_m / width);
+            let line = [minus(*a, along), [b[0] + along[0], b[1] + along[1]]];
+            if distance_to_segment(point, line) < LINE_M {
+                let share = dot(minus(point, *a), minus(*b, *a)) / width;
+                return if (JAMB_M..width - JAMB_M).contains(&share) { AtDoor::Line } else { AtDoor::Jamb };
+            }
+            if distance(point, *a).min(distance(point, *b)) < leaf_m + LINE_M {
+                found = AtDoor::Swing;
+            }
+        }
+        found
+    }
+
     /// Returns the room that `point` is in.
     pub fn room_at(&self, point: Point) -> Option<usize> {
         self.rooms.iter().position(|room| contains(&room.polygon, point))
@@ -137,6 +160,12 @@ impl Sensor {
 pub const NAME: usize = 24;
 /// What a door leads to where there is no room.
 pub const OUTSIDE: &str = "outside";
+/// Maximum width of a leaf of a door, in meters.
+const WIDEST_LEAF_M: f64 = 1.3;
+/// Distance from a jamb within which an open leaf may end.
+const JAMB_M: f64 = 0.15;
+/// Maximum distance of a leaf that slides from the line between the jambs.
+const LINE_M: f64 = 0.15;
 /// A sensor so near a wall sits on it.
 const ON_THE_WALL_M: f64 = 0.15;
 

@@ -11,7 +11,7 @@ use crate::passage::LONGEST_S;
 use crate::person::{COARSE, Life, Person};
 use crate::picture::{Event, Kind, Misplaced, Picture, Track};
 use crate::poses::Poses;
-use crate::sight::{Leg, Seen, Sight};
+use crate::sight::{AtDoor, Leg, Seen, Sight};
 use crate::site::Site;
 
 /// The most persons at a time.
@@ -42,8 +42,11 @@ const SLOWEST_S: f64 = 0.2;
 const AT_ONCE_NS: u64 = 45_000_000;
 /// Two who are nearer, and of whom never two pairs of legs are seen, are one.
 const SAME_M: f64 = 0.45;
-/// Time for which legs in an ignored area are taken for those of a known person who went into it.
+/// Time for which a known person who went into an ignored area may be associated with the legs in it.
 const IGNORED_NS: u64 = 5_000_000_000;
+
+/// A known person who was not seen for this time is not found again by a leg that may be a part of a leaf.
+const LEAF_NS: u64 = 300_000_000;
 
 /// What follows persons.
 pub(crate) struct Tracker {
@@ -57,6 +60,10 @@ pub(crate) struct Tracker {
     edges: Vec<Edge>,
     pairs: Vec<(usize, usize)>,
     scan_ns: Vec<u64>,
+    /// Whether each door was seen closed.
+    has_leaves: Vec<bool>,
+    /// Number of scans in a row of each sensor that showed each door closed.
+    closed: Vec<Vec<u32>>,
     poses: Poses,
     misplaced: Vec<Misplaced>,
     /// Legs that were seen where a person walks: how much later than expected, per sensor, summed.
@@ -75,6 +82,8 @@ impl Tracker {
             edges: Vec::new(),
             pairs: Vec::new(),
             scan_ns: vec![0; site.sensors.len()],
+            has_leaves: vec![false; site.doors.len()],
+            closed: vec![vec![0; site.doors.len()]; site.sensors.len()],
             poses: Poses::new(site.sensors.len()),
             misplaced: Vec::new(),
             lateness: vec![(0.0, 0.0); site.sensors.len()],
@@ -85,7 +94,8 @@ impl Tracker {
     /// Takes the next scan in the order of time.
     pub(crate) fn take(&mut self, sensor: usize, at_ns: u64, scan: &Scan, foreground: &Foreground) {
         self.sights[sensor].take(scan, foreground);
-        self.sights[sensor].ignore(&self.site);
+        self.watch_leaves(sensor);
+        self.sights[sensor].mark(&self.site, &self.has_leaves);
         let since_s = (at_ns.saturating_sub(self.scan_ns[sensor]) as f64 * 1e-9).min(SLOWEST_S);
         self.scan_ns[sensor] = at_ns;
         self.compare_poses(sensor, at_ns);
@@ -146,11 +156,13 @@ impl Tracker {
             // What the background has learned holds who is known and stands, and makes nobody known.
             let (place, stands) = (person.filter.place(), person.is_known() && person.speed() < 0.5);
             let passes = person.is_known() && at_ns.saturating_sub(person.free_ns) < IGNORED_NS;
+            let is_lost = person.is_known() && at_ns.saturating_sub(person.seen_ns) > LEAF_NS;
             let reach = FARTHEST_LEG_M + 2.0 * person.filter.variance().sqrt().min(0.5);
             let expected = Side::BOTH.map(|side| person.filter.leg(side));
             for (leg, found) in legs.iter().enumerate() {
                 let may_be_theirs = if found.is_ignored { passes } else { found.is_fresh || stands };
-                if length2(minus(found.at, place)) >= reach * reach || !may_be_theirs {
+                let is_leaf = found.at_door == AtDoor::Jamb || is_lost && may_be_leaf(found);
+                if length2(minus(found.at, place)) >= reach * reach || !may_be_theirs || is_leaf {
                     continue;
                 }
                 for (side, (expected, variance)) in expected.into_iter().enumerate() {
@@ -199,9 +211,13 @@ impl Tracker {
                 *sum += ahead / 2.0;
                 *weight += speed * speed;
             }
-            let solid = of_one.iter().map(|&(leg, _)| &legs[leg]).filter(|leg| leg.is_solid);
-            if let Some(beams) = solid.map(|leg| leg.beams).max() {
-                person.seen(sensor, since_s, of_one.len(), beams);
+            let theirs = of_one.iter().map(|&(leg, _)| &legs[leg]);
+            match theirs.clone().filter(|leg| leg.is_solid).map(|leg| leg.beams).max() {
+                Some(beams) if person.is_known() || shows_person(theirs) => {
+                    person.seen(sensor, since_s, of_one.len(), beams);
+                }
+                Some(_) => person.seen_ns = person.at_ns,
+                None => {}
             }
             if of_one.iter().any(|&(leg, _)| !legs[leg].is_ignored) {
                 person.free_ns = person.at_ns;
@@ -257,7 +273,8 @@ impl Tracker {
         let mut free: Vec<usize> = (0..legs.len())
             .filter(|&leg| {
                 let taken = pairs.iter().any(|&(taken, _)| taken == leg);
-                legs[leg].is_fresh && legs[leg].is_solid && !taken && !near_known(legs[leg].at)
+                let may_start = legs[leg].is_fresh && legs[leg].is_solid && legs[leg].at_door < AtDoor::Line;
+                may_start && !taken && !near_known(legs[leg].at)
             })
             .collect();
         while let Some(leg) = free.pop() {
@@ -390,4 +407,20 @@ impl Tracker {
         picture.misplaced.clear();
         picture.misplaced.append(&mut self.misplaced);
     }
+}
+
+/// Returns whether a leg may be a part of a leaf of a door.
+fn may_be_leaf(leg: &Leg) -> bool {
+    match leg.at_door {
+        AtDoor::Clear => false,
+        AtDoor::Swing => !leg.is_free,
+        AtDoor::Line | AtDoor::Jamb => true,
+    }
+}
+
+/// Returns whether the legs of one scan are evidence for a person: one that no leaf of a door reaches, or two free ones
+/// next to each other.
+fn shows_person<'a>(legs: impl Iterator<Item = &'a Leg> + Clone) -> bool {
+    let is_clear = |leg: &Leg| leg.at_door == AtDoor::Clear;
+    legs.clone().any(is_clear) || legs.filter(|leg| !may_be_leaf(leg)).count() == 2
 }

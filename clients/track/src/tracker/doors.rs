@@ -1,7 +1,7 @@
 //! Who goes through doors, who goes where no sensor looks, and who of them somebody new is. Refuses to know legs.
 
 use super::Tracker;
-use crate::geometry::{Point, distance, distance_to_segment};
+use crate::geometry::{Point, distance, distance_to_segment, dot, length2, middle, minus};
 use crate::passage::{Gone, New};
 use crate::person::{Life, Person};
 use crate::picture::Kind;
@@ -14,12 +14,35 @@ const INSIDE_DOOR_M: f64 = 1.2;
 const BEHIND_DOOR_M: f64 = 0.12;
 /// Who is nearer to somebody known, and never shows two legs, is a part of him.
 const PART_M: f64 = 0.5;
+/// Maximum distance from a door at which a person is first seen who has come through it, in meters.
+const AT_DOOR_M: f64 = 0.7;
+/// This distance for a door with leaves, if the person walks away from it at least at the speed below, in m/s.
+const BEFORE_LEAVES_M: f64 = 1.6;
+const LEAVES_M_S: f64 = 0.2;
+/// A new person who is nearer to a known one may be one of their legs.
+const ALONE_M: f64 = 0.9;
 /// Squared distance over variance within which somebody new is one who was hidden: 98.9 % of the plane's normal distribution.
 const HIDDEN_GATE: f64 = 9.0;
 /// Who is out of sight for so long in an unseen room is away.
 const AWAY_NS: u64 = 250_000_000;
 
+/// A door has leaves if this number of scans of a sensor in a row show it closed.
+const CLOSED_SCANS: u32 = 20;
+
 impl Tracker {
+    /// Finds the doors that have leaves: only these are ever closed.
+    pub(super) fn watch_leaves(&mut self, sensor: usize) {
+        let doors = self.site.doors.iter().zip(&mut self.has_leaves).zip(&mut self.closed[sensor]);
+        for ((door, has_leaves), closed) in doors.filter(|((_, has_leaves), _)| !**has_leaves) {
+            if self.sights[sensor].is_closed(door.between) {
+                *closed += 1;
+                *has_leaves = *closed >= CLOSED_SCANS;
+            } else {
+                *closed = 0;
+            }
+        }
+    }
+
     /// Doors, and those who go where no sensor looks.
     pub(super) fn pass(&mut self, at_ns: u64) {
         let mut number = 0;
@@ -97,6 +120,23 @@ impl Tracker {
         }
     }
 
+    /// Returns whether a new person has come through a door that leads where no sensor looks: they were first seen at the door.
+    /// At a door with leaves, a person is not confirmed, so that they may be first seen at some distance. Then they have
+    /// come through it if they walk away from it, and are not a leg of someone who is known.
+    fn came_through(&self, number: usize, door: usize) -> bool {
+        let person = &self.persons[number];
+        let off_m = self.site.distance_to_door(person.born_at, door);
+        if off_m < AT_DOOR_M || !self.has_leaves[door] {
+            return off_m < AT_DOOR_M;
+        }
+        let (place, away) =
+            (person.filter.place(), minus(person.born_at, middle(self.site.doors[door].between)));
+        let walks_away = dot(away, person.filter.velocity()) > LEAVES_M_S * length2(away).sqrt();
+        let near = |other: &Person| other.is_known() && distance(other.filter.place(), place) < ALONE_M;
+        let is_alone = self.persons.iter().filter(|other| other.id != person.id).all(|other| !near(other));
+        off_m < BEFORE_LEAVES_M && walks_away && is_alone
+    }
+
     /// Somebody new is sure: he may be one who went away.
     fn confirm(&mut self, number: usize, at_ns: u64) {
         let new = &self.persons[number];
@@ -155,8 +195,8 @@ impl Tracker {
                     let is_unseen = |room: &Option<usize>| room.is_none_or(|room| !self.watched[room]);
                     ends.contains(&self.persons[number].room) && ends.iter().any(is_unseen)
                 };
-                let is_near = |&door: &usize| self.site.distance_to_door(born_at, door) < 0.7;
-                let door = (0..self.site.doors.len()).filter(leads).find(is_near);
+                let came_by = |&door: &usize| self.came_through(number, door);
+                let door = (0..self.site.doors.len()).filter(leads).find(came_by);
                 let (room, is_watched) = {
                     let room = self.persons[number].room;
                     (room, room.is_some_and(|room| self.watched[room]))
