@@ -154,7 +154,7 @@ fn a_recording_has_the_family_of_its_scanner() {
     }
     let noise = env.file("noise.bin", [0; 4_096]);
     let refused = env.run(&["run", &format!("--link=front=file:{noise},family=auto")]);
-    assert_eq!(refused.code, Some(78), "{refused}");
+    assert_eq!(refused.code, Some(66), "{refused}");
     assert!(refused.errors.contains("family"), "{refused}");
 }
 

@@ -83,6 +83,18 @@ fn an_input_that_cannot_be_read_is_66() {
             assert_eq!(run(&env, line, file).code, Some(66), "{line} {file}");
         }
     }
+    // `telegram decode` reports bytes without a telegram itself (5).
+    let is_checked = |line: &str| !line.contains("--config") && !line.starts_with("telegram");
+    let mut random = fastrand::Rng::with_seed(43);
+    let junk = env.file("junk", std::iter::repeat_with(|| random.u8(..)).take(50_000).collect::<Vec<u8>>());
+    let zeros = env.file("zeros", vec![0; 50_000]);
+    for (line, _) in INPUTS.into_iter().filter(|(line, is_recording)| *is_recording && is_checked(line)) {
+        for file in [&junk, &zeros] {
+            let outcome = run(&env, line, file);
+            assert_eq!(outcome.code, Some(66), "{line} {file}: {outcome}");
+            assert!(outcome.errors.contains(file), "the message names the file: {line}: {outcome}");
+        }
+    }
     assert!(!env.path("out.csv").exists() && !env.path("out.mcap").exists());
 }
 

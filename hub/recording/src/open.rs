@@ -59,9 +59,8 @@ impl Recording {
     ///
     /// # Errors
     ///
-    /// Returns [`Kind::Input`] if the file is not a recording: neither an MCAP file nor a CARMEN log, and without a telegram.
-    /// Returns [`Kind::Configuration`] if no family takes at least half of the [first bytes](scanhub_drivers::recognize::EXAMINED) of a stream
-    /// file.
+    /// Returns [`Kind::Input`] if the file is neither an MCAP file nor a CARMEN log, and has no telegram. The same holds for a
+    /// stream file if no family takes at least half of the [first bytes](scanhub_drivers::recognize::EXAMINED).
     pub fn open(path: impl Into<PathBuf>) -> Result<Recording, Failure> {
         Recording::open_as(path, None)
     }
@@ -73,11 +72,7 @@ impl Recording {
     /// Returns the errors of [`open`](Self::open).
     pub fn open_as(path: impl Into<PathBuf>, family: Option<Family>) -> Result<Recording, Failure> {
         let path = path.into();
-        let recording = Recording::open_line(&path, family).map_err(|failure| {
-            let is_recording = failure.kind != Kind::Configuration
-                || head(&path).is_ok_and(|head| bytes_by_family(&head)[0].1 > 0);
-            if is_recording { failure } else { without_telegram(&path) }
-        })?;
+        let recording = Recording::open_line(&path, family)?;
         if recording.contents.form == Form::Telegrams && recording.contents.telegrams == 0 {
             return Err(without_telegram(&path));
         }
@@ -366,7 +361,7 @@ impl Recording {
 ///
 /// # Errors
 ///
-/// Returns [`Kind::Input`] if it cannot be read, and [`Kind::Configuration`] if its family is neither named nor recognized.
+/// Returns [`Kind::Input`] if it cannot be read, or if its family is neither named nor recognized.
 fn survey_stream(path: &Path, named: Option<Family>) -> Result<Contents, Failure> {
     let head = head(path).map_err(|error| unreadable(path, &error))?;
     let survey = |family| match family {
@@ -380,6 +375,7 @@ fn survey_stream(path: &Path, named: Option<Family>) -> Result<Contents, Failure
     match (family_of(&head), of_named) {
         (Some(family), _) => survey(family),
         (None, Some(contents)) => Ok(contents),
+        (None, None) if bytes_by_family(&head)[0].1 == 0 => Err(without_telegram(path)),
         (None, None) => Err(unrecognized(path, &head)),
     }
 }
@@ -407,12 +403,16 @@ fn unrecognized(path: &Path, head: &[u8]) -> Failure {
     let hint = format!(
         "name the family of the scanner, one of {names}: family=NAME of a link, or --family NAME of the command"
     );
-    Failure::new(Kind::Configuration, message, hint)
+    Failure::new(Kind::Input, message, hint)
 }
 
 /// Returns the failure of a file that is not a recording.
 fn without_telegram(path: &Path) -> Failure {
-    refused(path, "is neither an MCAP file nor a CARMEN log, and there is no telegram in it")
+    let message = format!(
+        "recording {} is neither an MCAP file nor a CARMEN log, and there is no telegram in it",
+        path.display()
+    );
+    Failure::new(Kind::Input, message, format!("{FORMS}; a link to a file of noise needs family=NAME"))
 }
 
 /// Whether a reader that fails so has no more to give, and the disk is not to blame: a packed file is cut or harmed.

@@ -3,7 +3,7 @@
 
 use scanhub_drivers::line::{Session as _, suspect};
 use scanhub_drivers::{Session, Settings, features};
-use schema::{Failure, Family, Header, MILLIS, Nanos};
+use schema::{Failure, Family, Header, Kind, MILLIS, Nanos};
 
 use crate::{Encoding, Form, Recording, VirtualTime};
 
@@ -11,7 +11,8 @@ use crate::{Encoding, Form, Recording, VirtualTime};
 ///
 /// # Errors
 ///
-/// Returns the errors of [`Recording::telegrams`].
+/// Returns the errors of [`Recording::telegrams`], and [`Kind::Input`] if nothing in the recording defines how its packets must
+/// be read.
 pub(super) fn stream_heads(recording: &Recording) -> Result<Vec<(usize, Vec<u8>)>, Failure> {
     let contents = recording.contents();
     // A stream file has no times, without which the time per point cannot be measured.
@@ -19,15 +20,17 @@ pub(super) fn stream_heads(recording: &Recording) -> Result<Vec<(usize, Vec<u8>)
     let Some(family) = family.filter(|family| !features(*family).has_whole_telegrams) else {
         return Ok(Vec::new());
     };
-    // Packets that may be of two kinds stay so.
-    let Ok(settings) = recording.session_settings() else { return Ok(Vec::new()) };
+    let settings = recording.session_settings().map_err(|_| without_status(recording))?;
     let settings = Settings { beams: None, ..settings };
     let status = contents.sensor_type.as_ref().filter(|(number, _)| *number == family as u8);
     let reported = status.map_or("", |(_, text)| text);
-    let mut heads = Vec::new();
+    let (mut heads, mut is_guess) = (Vec::new(), false);
     let mut close = |stream: Stream| {
-        let head = stream.session.session().stream_head(reported, recording.beams());
+        let session = stream.session.session();
+        let head = session.stream_head(reported, recording.beams());
         if !head.is_empty() {
+            // Without a model, neither a status nor the scanner has confirmed the time per point.
+            is_guess |= status.is_none() && session.model_text().is_none();
             heads.push((stream.at, head));
         }
     };
@@ -42,7 +45,19 @@ pub(super) fn stream_heads(recording: &Recording) -> Result<Vec<(usize, Vec<u8>)
         stream.take(number, &header, &frame.telegram, is_reply);
     }
     open.into_iter().for_each(&mut close);
+    if is_guess {
+        return Err(without_status(recording));
+    }
     Ok(heads)
+}
+
+/// Returns the failure of a recording whose packets can be read in several ways.
+fn without_status(recording: &Recording) -> Failure {
+    let message = format!(
+        "recording {} has neither the topic status nor the scanner's responses, without which its packets cannot be read",
+        recording.path().display()
+    );
+    Failure::new(Kind::Input, message, "record NAME/status too, as `record` does by default")
 }
 
 /// A stream of packets, and the responses before it.

@@ -114,7 +114,7 @@ fn what_is_no_recording_is_refused_with_place_value_and_remedy() {
         let known = line(Some(Family::Lms)).ok();
         assert_eq!(known.map(|line| line.contents().telegrams), is_noise.then_some(0));
         let unknown = line(None).unwrap_err();
-        assert!(!is_noise || unknown.kind.exit_code() == 78 && unknown.hint.contains("family="), "{unknown}");
+        assert!(!is_noise || unknown.kind.exit_code() == 66 && unknown.hint.contains("family="), "{unknown}");
     }
 }
 
@@ -124,7 +124,7 @@ fn stream_of_which_no_family_takes_half_needs_the_family() {
     let noise = vec![0x42; telegrams.len() + 1];
     let few = temporary("few.bin", &[&telegrams[..], &noise].concat());
     let failure = Recording::open(few.path()).unwrap_err();
-    assert_eq!(failure.kind.exit_code(), 78);
+    assert_eq!(failure.kind.exit_code(), 66);
     assert!(failure.message.contains("(lms 49 %, ") && failure.hint.contains("family="), "{failure}");
     let named = Recording::open_as(few.path(), Some(Family::Lms)).unwrap();
     assert_eq!((named.contents().telegrams, named.contents().damage.bytes), (8, noise.len() as u64));

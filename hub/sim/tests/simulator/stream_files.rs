@@ -11,7 +11,7 @@ use scanhub_drivers::line::{Event, Output, Protocol as _, Session as _};
 use scanhub_drivers::{Session, Settings, ld};
 use schema::datagram::Packed;
 use schema::file::Writer;
-use schema::{Family, Foreground, Header, MILLIS, Nanos, Scan, Status, Topic};
+use schema::{Failure, Family, Foreground, Header, MILLIS, Nanos, Scan, Status, Topic};
 use sim::Arrival;
 use sim::device::Device;
 use sim::fault::Faults;
@@ -98,8 +98,8 @@ impl Live {
         live
     }
 
-    /// Writes the default topics of a recorder that is attached at `from`.
-    fn record(&self, folder: &TempDir, from: Nanos) -> PathBuf {
+    /// Writes the default topics of a recorder that is attached at `from`, or only the telegrams and the scans.
+    fn record(&self, folder: &TempDir, from: Nanos, has_status: bool) -> PathBuf {
         let mut writer = Writer::begin(Vec::new(), "", BTreeMap::new()).unwrap();
         let mut room = vec![0; 32_768];
         let first = self.telegrams.iter().position(|(header, _)| header.stamp_first_ns >= from).unwrap();
@@ -107,8 +107,10 @@ impl Live {
         let mut write = |topic, header: &Header, payload: &[u8]| {
             writer.sample("front", topic, header, payload).unwrap();
         };
-        let len = self.status.pack(&mut room).unwrap();
-        write(Topic::Status, &header, &room[..len]);
+        if has_status {
+            let len = self.status.pack(&mut room).unwrap();
+            write(Topic::Status, &header, &room[..len]);
+        }
         for (header, telegram) in &self.telegrams[first..] {
             write(Topic::Telegram, header, telegram);
         }
@@ -122,6 +124,10 @@ impl Live {
 }
 
 fn converted(input: &Path, output: &str) -> (PathBuf, Converted) {
+    try_convert(input, output).unwrap()
+}
+
+fn try_convert(input: &Path, output: &str) -> Result<(PathBuf, Converted), Failure> {
     let output = input.with_file_name(output);
     let options = ConvertOptions {
         input: input.to_owned(),
@@ -129,8 +135,8 @@ fn converted(input: &Path, output: &str) -> (PathBuf, Converted) {
         force: true,
         ..ConvertOptions::default()
     };
-    let converted = convert(&options, &AtomicBool::new(false), |_, _| {}).unwrap();
-    (output, converted)
+    let converted = convert(&options, &AtomicBool::new(false), |_, _| {})?;
+    Ok((output, converted))
 }
 
 /// Reads the scans of a recording, as a replay does.
@@ -164,18 +170,19 @@ fn is_same(a: &Scan, b: &Scan) -> bool {
         && angles(a).iter().zip(&angles(b)).all(is_near)
 }
 
-/// Checks that `path` has the scans of `live` that began after `from`, except the first `learning` ones.
-fn check(name: &str, live: &Live, from: Nanos, path: &Path, learning: usize) {
+/// Checks that `path` has the scans of `live` that began after `from`. Where the recording begins in the middle of the stream, the
+/// first one may be missing.
+fn check(name: &str, live: &Live, from: Nanos, path: &Path) {
     let expected: Vec<_> = live.scans.iter().filter(|(first, _)| *first >= from).collect();
     let read = scans_of(path);
     // A file that has the time per point may have an earlier scan, before which the live session was measuring that time.
-    let earlier = (0..read.len().min(3)).find(|&number| is_same(&expected[0].1, &read[number])).unwrap_or(0);
+    let earlier = (0..read.len().min(2)).find(|&number| is_same(&expected[0].1, &read[number])).unwrap_or(0);
     let read = &read[earlier..];
     let first = read.first().unwrap_or_else(|| panic!("{name}: no scan"));
     let begin = expected.iter().position(|(_, scan)| is_same(scan, first));
     let beams = (first.beams(), expected[0].1.beams());
     let begin = begin.unwrap_or_else(|| panic!("{name}: another scan, {beams:?} beams"));
-    assert!(begin <= learning, "{name}: the first {begin} scans are missing");
+    assert!(begin <= usize::from(from > 0), "{name}: the first {begin} scans are missing");
     for (number, (read, (_, live))) in read.iter().zip(&expected[begin..]).enumerate() {
         assert!(is_same(read, live), "{name}: scan {number} is another one");
     }
@@ -184,11 +191,11 @@ fn check(name: &str, live: &Live, from: Nanos, path: &Path, learning: usize) {
 }
 
 /// Checks that the scans of `live` come back from a stream file, whenever the recording began.
-fn check_stream_files(name: &str, live: &Live, learning: usize) {
+fn check_stream_files(name: &str, live: &Live) {
     let folder = TempDir::new().unwrap();
     for from in [0, JOINED] {
         let name = format!("{name} from {} s", from / SECOND);
-        let recorded = live.record(&folder, from);
+        let recorded = live.record(&folder, from, true);
         let recording = Recording::open(&recorded).unwrap();
         let (stream, account) = converted(&recorded, "a.bin");
         assert_eq!(account.telegrams, recording.contents().telegrams, "{name}");
@@ -208,10 +215,10 @@ fn check_stream_files(name: &str, live: &Live, learning: usize) {
                 .find(|first| *first >= from.max(live.scans[0].0))
                 .unwrap();
         assert!(took.abs_diff(expected) < SECOND, "{name}: {took} {expected}");
-        check(&name, live, from, &stream, learning);
+        check(&name, live, from, &stream);
         // A file of packets and their stamps again, and a stream file of that.
         let (again, _) = converted(&stream, "b.mcap");
-        check(&format!("{name}, in MCAP"), live, from, &again, learning);
+        check(&format!("{name}, in MCAP"), live, from, &again);
         let (twice, _) = converted(&again, "c.bin");
         let [bytes, twice] = [stream, twice].map(|path| std::fs::read(path).unwrap());
         let missing = bytes.len() - twice.len();
@@ -234,7 +241,7 @@ fn every_rplidar_in_every_mode_has_the_same_scans() {
         for (mode, settings) in modes.chain([("the fastest mode", fastest)]) {
             let mut unit = Unit::new(UnitSettings::of(model), room());
             let live = Live::of(&mut unit, Family::Rplidar, &settings);
-            check_stream_files(&format!("{} {mode}", model.name()), &live, 3);
+            check_stream_files(&format!("{} {mode}", model.name()), &live);
         }
     }
 }
@@ -245,8 +252,28 @@ fn every_ldrobot_has_the_same_scans() {
         for settings in [Settings::default(), Settings { model: Some(model.name()), ..Settings::default() }] {
             let mut head = Head::new(HeadSettings::of(model), Packets::Room(Box::new(room())));
             let live = Live::of(&mut head, Family::Ld, &settings);
-            check_stream_files(model.name(), &live, 8);
+            check_stream_files(model.name(), &live);
         }
+    }
+}
+
+/// The packets alone do not define the model, or the time per point. The responses at the beginning of a stream do, and so
+/// does the topic `status`.
+#[test]
+fn recording_without_status_and_responses_becomes_no_stream_file() {
+    for model in Model::ALL {
+        let name = model.name();
+        let fastest = Settings { is_found: true, ..Settings::default() };
+        let live = Live::of(&mut Unit::new(UnitSettings::of(model), room()), Family::Rplidar, &fastest);
+        let folder = TempDir::new().unwrap();
+        let recorded = live.record(&folder, JOINED, false);
+        let failure = try_convert(&recorded, "a.bin").expect_err(name);
+        assert_eq!(failure.kind.exit_code(), 66, "{name}: {failure}");
+        assert!(failure.hint.contains("NAME/status"), "{name}: {failure}");
+        assert!(!folder.path().join("a.bin").exists(), "{name}");
+        let recorded = live.record(&folder, 0, false);
+        let (stream, _) = converted(&recorded, "a.bin");
+        check(name, &live, 0, &stream);
     }
 }
 
