@@ -335,9 +335,7 @@ impl<'a> Diagnosis<'a> {
             Some(Trouble::Search(trouble)) => self.search_trouble(trouble),
             // The search has just begun.
             Some(_) if self.family.is_none() && !self.exchange.is_empty() => self.exchange.clone(),
-            Some(trouble) if session.missing().is_some() => {
-                self.with_remedy(&trouble.to_string(), " Another scanner?")
-            }
+            Some(trouble) if session.missing().is_some() => self.silence(&trouble.to_string()),
             Some(trouble) => trouble.to_string(),
             None => self.mismatch(session).unwrap_or_else(|| match session.notice() {
                 _ if self.unserved_for >= UNSERVED_LIMIT => self.unserved(),
@@ -353,7 +351,7 @@ impl<'a> Diagnosis<'a> {
         let other_rate = if is_server { ", or does the server use another rate" } else { "" };
         let bytes = with_commas(rate);
         let words = format!("{bytes} bytes/s arrive, but no {missing}; is it another scanner{other_rate}?");
-        self.with_remedy(&words, "")
+        self.with_remedy(&words)
     }
 
     /// Returns the message that `rate` bytes per second arrive that are not of the scanner of `session`, which has streamed
@@ -369,26 +367,42 @@ impl<'a> Diagnosis<'a> {
         if self.link.family().is_none() {
             return format!("{words} The search begins after 10 s without it");
         }
-        self.with_remedy(&words, "")
+        self.with_remedy(&words)
     }
 
-    /// Returns `words`, a question and the remedy, if the family is configured and they fit into a status: the scanner may
-    /// belong to another family. `scanhub probe` cannot search the port while the hub has it.
-    fn with_remedy(&self, words: &str, question: &str) -> String {
-        let Link { name, scanner, .. } = self.link;
-        let keys = match &scanner.named_by[..] {
+    /// Returns `words` about a scanner that does not reply, and how to find out whether it belongs to another family, if the
+    /// family is configured and both fit into a status. `scanhub probe` cannot search the port while the hub has it.
+    fn silence(&self, words: &str) -> String {
+        let Some(keys) = self.family_keys() else { return words.to_owned() };
+        let words = format!("{words} Another scanner?");
+        let name = &self.link.name;
+        let both = |port: &str| {
+            format!("{words} Remove {keys} from link {name}, or stop the hub and try: scanhub probe {port}")
+        };
+        let probe = |port: &str| format!("{words} Stop the hub and try: scanhub probe {port}");
+        self.with_port(both).or_else(|| self.with_port(probe)).unwrap_or_else(|| self.with_remedy(&words))
+    }
+
+    /// Returns the keys of the link that name the family, as text. `None` if there are none, or if the link plays a recording.
+    fn family_keys(&self) -> Option<String> {
+        let keys = match &self.link.scanner.named_by[..] {
             [keys @ .., last] if !keys.is_empty() => format!("{} and {last}", keys.join(", ")),
             keys => keys.concat(),
         };
-        if keys.is_empty() || matches!(self.link.port, Source::File { .. }) {
-            return words.to_owned();
-        }
+        (!keys.is_empty() && !matches!(self.link.port, Source::File { .. })).then_some(keys)
+    }
+
+    /// Returns `words` and the remedy, if the family is configured and they fit into a status: the scanner may belong to
+    /// another family.
+    fn with_remedy(&self, words: &str) -> String {
+        let Some(keys) = self.family_keys() else { return words.to_owned() };
+        let name = &self.link.name;
         let remedies = [
             format!("Remove {keys} from link {name} and restart the hub: it finds the scanner"),
             format!("Remove {keys} from link {name}, restart the hub"),
             format!("Remove {keys} from the link"),
         ];
-        let mut messages = remedies.into_iter().map(|remedy| format!("{words}{question} {remedy}"));
+        let mut messages = remedies.into_iter().map(|remedy| format!("{words} {remedy}"));
         let message = messages.find(|message| message.len() <= Status::MAX_ERROR_LEN);
         message.unwrap_or_else(|| words.to_owned())
     }
