@@ -126,12 +126,13 @@ fn a_model_that_is_not_known_is_shown_with_its_number() {
     let _simulator = simulator(&env, "s2", &["--fault=id=0x95"]);
     let probed = env.search(&["probe", &env.word("front"), "--json"]);
     let [found] = &probed.lines()[..] else { panic!("{probed}") };
-    assert_eq!((text(found, "family"), &found["model"]), ("rplidar", &Value::Null), "{found}");
+    assert_eq!((text(found, "family"), &found["model"]), ("rplidar", &"0x95".into()), "{found}");
     assert!(text(found, "identity").starts_with("model 0x95 (unknown), firmware 1.02"), "{found}");
 
     let hub = env.hub(&[env.link("front")]);
     let info = env.await_info("front", |info| info["state"] == "streaming");
     assert_eq!((text(&info, "model"), text(&info, "type")), ("0x95", "0x95 denseboost 1.02"), "{info}");
+    assert_eq!(text(&info, "mode"), "denseboost", "{info}");
     assert_eq!((number(&info, "angle_deg"), text(&info, "last_error")), (360, ""), "{info}");
     let mut scans = env.echo(&["front/scan"]);
     for scan in scans.await_lines(5, "a scan", is_class("scan")) {

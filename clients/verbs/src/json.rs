@@ -186,7 +186,7 @@ pub(crate) fn status<'a>(sensor: &'a str, status: &'a Status) -> impl Serialize 
         family: Option<&'static str>,
         model: Option<String>,
         baud: Option<u32>,
-        mode: Option<u8>,
+        mode: Option<Mode<'a>>,
         #[serde(rename = "type")]
         sensor_type: &'a str,
         unit_mm: Option<u8>,
@@ -203,6 +203,12 @@ pub(crate) fn status<'a>(sensor: &'a str, status: &'a Status) -> impl Serialize 
         damaged: f64,
         lost_on_line: Option<u64>,
     }
+    #[derive(Serialize)]
+    #[serde(untagged)]
+    enum Mode<'a> {
+        Number(u8),
+        Name(&'a str),
+    }
     Line {
         class: "status",
         sensor,
@@ -210,7 +216,7 @@ pub(crate) fn status<'a>(sensor: &'a str, status: &'a Status) -> impl Serialize 
         family: status.family().map(Family::name),
         model: status.model(),
         baud: known(status.baud, 0),
-        mode: known(status.mode, Status::MODE_UNKNOWN),
+        mode: known(status.mode, Status::MODE_UNKNOWN).map(Mode::Number).or(status.way().map(Mode::Name)),
         sensor_type: status.sensor_type(),
         unit_mm: known(status.unit_mm, 0),
         angle_deg: known(status.angle_deg, 0),

@@ -559,7 +559,12 @@ mod tests {
     #[test]
     fn checks_reported_health() {
         let said = |condition| {
-            let said = Introduction { identity: "firmware 1.29".into(), health: "so".into(), condition };
+            let said = Introduction {
+                identity: "firmware 1.29".into(),
+                unknown_model: None,
+                health: "so".into(),
+                condition,
+            };
             let findings = check_rotating(&DetectedScanner { said: Some(said), ..heard() }, None);
             findings.iter().map(|finding| (finding.name, finding.state)).next_back()
         };

@@ -11,7 +11,7 @@ use scanhub_drivers::lms::operating;
 use scanhub_drivers::lms::reply::Reply;
 use scanhub_drivers::lms::variant::Mode;
 use scanhub_drivers::{Model, Report, features, lms};
-use schema::Family;
+use schema::{Family, Status};
 use serde::Serialize;
 
 use crate::driver::DetectedScanner;
@@ -218,7 +218,8 @@ pub struct Turning {
     class: &'static str,
     port: String,
     family: &'static str,
-    model: Option<&'static str>,
+    /// Name of the model, or a number such as `0x95` if scanhub does not know the model.
+    model: Option<String>,
     baud: u32,
     /// Firmware and serial number, as text.
     identity: Option<String>,
@@ -238,11 +239,12 @@ impl Turning {
     pub(crate) fn new(port: String, heard: &DetectedScanner) -> Turning {
         let known = |value: f64| (value > 0.0).then(|| (value * 100.0).round() / 100.0);
         let is_heard = heard.packets > 0 || heard.said.is_none();
+        let unknown = heard.said.as_ref().and_then(|said| said.unknown_model);
         Turning {
             class: "probe",
             port,
             family: heard.family.name(),
-            model: heard.model.map(|model| model.name),
+            model: heard.model.map(|model| model.name.to_owned()).or(unknown.map(|id| format!("0x{id:02x}"))),
             baud: heard.rate,
             identity: heard.said.as_ref().map(|said| said.identity.clone()),
             health: heard.said.as_ref().map(|said| said.health.clone()).filter(|words| !words.is_empty()),
@@ -259,7 +261,7 @@ impl Turning {
     fn alike(&self) -> String {
         let features = Family::parse(self.family).map(features);
         let models = features.map_or(&[][..], |features| features.models);
-        let found = models.iter().find(|model| Some(model.name) == self.model);
+        let found = models.iter().find(|model| Some(model.name) == self.model.as_deref());
         let Some(found) = found.filter(|_| self.identity.is_none()) else { return String::new() };
         let is_alike = |model: &&Model| {
             model.name != found.name && (model.baud, model.beams) == (found.baud, found.beams)
@@ -276,7 +278,7 @@ impl fmt::Display for Turning {
             None => Ok(()),
         };
         row("family", Some(self.family.to_owned()))?;
-        row("model", self.model.map(|model| format!("{model}{}", self.alike())))?;
+        row("model", self.model.as_ref().map(|model| format!("{}{}", named(model), self.alike())))?;
         row("rate", Some(format!("{} Bd", self.baud)))?;
         row("identity", self.identity.clone())?;
         row("health", self.health.clone())?;
@@ -291,6 +293,11 @@ impl fmt::Display for Turning {
         row("turns", self.turns_per_second.map(|turns| format!("{turns:.2} a second")))?;
         row("trouble", self.trouble.clone())
     }
+}
+
+/// Returns the name of `model` for text. A model that scanhub does not know has only a number.
+fn named(model: &str) -> String {
+    if Status::is_model_number(model) { format!("{model} (unknown)") } else { model.to_owned() }
 }
 
 #[cfg(test)]
