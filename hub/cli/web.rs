@@ -108,6 +108,7 @@ impl Web {
                 .token_file
                 .as_deref()
                 .map_or(Ok(self.token.clone()), |file| read_token(file).map(Some))?,
+            token_file: self.token_file.clone(),
             open: self.open,
             origins: self.origins.clone(),
             names: vec![name],

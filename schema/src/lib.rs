@@ -35,6 +35,10 @@ mod lock;
 #[cfg(feature = "output")]
 pub mod output;
 #[cfg(any(feature = "ipc", feature = "output"))]
+#[cfg_attr(
+    not(feature = "ipc"),
+    allow(dead_code, reason = "a domain has stricter rules than an output file")
+)]
 mod path_walk;
 #[cfg(feature = "files")]
 pub mod regular;

@@ -271,7 +271,10 @@ pub const PRIVATE: u32 = 0o600;
 
 /// Returns the failure of a write to the file at `path`.
 pub fn unwritable(path: &Path, error: &io::Error) -> Failure {
-    let hint = "the directory must exist, be writable and have free space";
+    let hint = match error.kind() {
+        ErrorKind::InvalidInput => "name another file",
+        _ => "the directory must exist, be writable and have free space",
+    };
     Failure::new(Kind::Output, format!("cannot write {}: {error}", path.display()), hint)
 }
 

@@ -68,7 +68,11 @@ pub fn read_all(input: &mut dyn Read, longest: u64) -> io::Result<Vec<u8>> {
 
 /// Returns the failure of a file that a user named as input, which is at `place`.
 pub fn unreadable(place: &str, error: &io::Error) -> Failure {
-    let hint = "it must exist and be readable for this user";
+    let hint = match error.kind() {
+        ErrorKind::InvalidInput => "name a regular file",
+        ErrorKind::InvalidData | ErrorKind::FileTooLarge => "name a file of the right kind",
+        _ => "it must exist and be readable for this user",
+    };
     Failure::new(Kind::Input, format!("cannot read {place}: {error}"), hint)
 }
 

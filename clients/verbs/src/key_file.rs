@@ -27,7 +27,9 @@ pub fn new_key(path: &Path, json: bool, out: &mut dyn Write) -> Result<(), Failu
     let text: String = bytes.iter().map(|byte| format!("{byte:02x}")).chain(["\n".into()]).collect();
     let target = Target::open(path)?;
     // No option replaces a key: other machines may have it.
-    target.check(false).map_err(|failure| Failure { hint: KEY_EXISTS.to_owned(), ..failure })?;
+    if target.check(true)?.is_some() {
+        return Err(Failure::new(Kind::Output, format!("{} exists", path.display()), KEY_EXISTS));
+    }
     let mut file = target.create_new(false, PRIVATE)?;
     let written = file.write_all(text.as_bytes()).and_then(|()| file.sync_all());
     written.map_err(|error| unwritable(path, &error))?;

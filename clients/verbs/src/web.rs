@@ -9,6 +9,7 @@ mod told;
 use std::fmt;
 use std::io::Write;
 use std::net::{IpAddr, SocketAddr};
+use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc;
 use std::thread;
@@ -38,6 +39,8 @@ pub struct WebOptions {
     pub origins: Vec<String>,
     /// Names of this machine by which a browser may come, beside its addresses.
     pub names: Vec<String>,
+    /// File that the token was read from, if it was.
+    pub token_file: Option<PathBuf>,
     /// JSON instead of text.
     pub json: bool,
     /// When it ends by itself.
@@ -156,6 +159,7 @@ mod tests {
             open: false,
             origins: Vec::new(),
             names: Vec::new(),
+            token_file: None,
             json: false,
             bounds: Bounds::default(),
             places: Vec::new(),
@@ -193,6 +197,9 @@ mod tests {
         let token = Some("carrot".to_owned());
         let all = text(&WebOptions { token, names: vec!["robot".to_owned()], ..options("0.0.0.0:0") });
         assert!(all.starts_with("ready http://robot:") && !all.contains("anyone"), "{all}");
+        let (token, token_file) = (Some("carrot".to_owned()), Some("/etc/word".into()));
+        let local = text(&WebOptions { token, token_file, ..options("127.0.0.1:0") });
+        assert!(local.ends_with(" --token-file /etc/word\n"), "{local}");
         let open = text(&WebOptions { open: true, ..options("0.0.0.0:0") });
         let warning = "anyone who can reach this address can watch; to restrict that: --token WORD";
         assert_eq!(open.lines().last(), Some(warning), "{open}");

@@ -21,6 +21,7 @@ pub(super) fn failed(path: &Path, is_split: bool, error: &io::Error) -> Failure 
             "--force continues after the last number; -o FILE names others"
         }
         ErrorKind::AlreadyExists => "--force overwrites it; -o FILE names another",
+        ErrorKind::InvalidInput => "name another file: -o FILE",
         ErrorKind::ResourceBusy => "stop it first, or name another file: -o FILE",
         ErrorKind::StorageFull | ErrorKind::QuotaExceeded => {
             "free some space, or name another place: -o FILE"

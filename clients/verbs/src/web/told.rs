@@ -40,8 +40,11 @@ pub(crate) fn ready(output: &mut Output<'_>, urls: &[String], options: &WebOptio
         WEB_PORT => String::new(),
         port => format!(":{port}"),
     };
-    let token = options.token.as_deref().unwrap_or("WORD");
-    output.line(|line| write!(line, "for other machines: --listen 0.0.0.0{port} --token {token}"))
+    let token = match (&options.token_file, &options.token) {
+        (Some(file), _) => format!("--token-file {}", file.display()),
+        (None, token) => format!("--token {}", token.as_deref().unwrap_or("WORD")),
+    };
+    output.line(|line| write!(line, "for other machines: --listen 0.0.0.0{port} {token}"))
 }
 
 /// Prints why there is no hub to serve yet, and the command that reaches another one.
