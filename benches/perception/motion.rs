@@ -12,6 +12,7 @@ use schema::{Lines, Motion, Pose, Scan};
 
 use crate::figures::{self, Cell, Figure, Target};
 use crate::recordings::{self, Drive, normal, scan};
+use crate::worlds;
 
 /// Measures on recorded and simulated drives; `is_quick` takes fewer steps and seeds.
 pub(crate) fn measure(is_quick: bool, is_json: bool) {
@@ -35,13 +36,13 @@ fn run(scans: &[Box<Scan>], settings: Settings) -> (Vec<Motion>, [f64; 2]) {
     let mut estimator = MotionEstimator::new(Pose::default(), settings, beams);
     let mut lines = Lines::default();
     let mut taken_us = [0.0; 2];
-    let motions = scans.iter().map(|scan| {
+    let motions = scans.iter().enumerate().map(|(number, scan)| {
         let begin = Instant::now();
         finder.update(scan, &mut lines);
         taken_us[0] += 1e6 * begin.elapsed().as_secs_f64();
         let begin = Instant::now();
         let mut motion = Motion::default();
-        estimator.update(scan, &lines, &mut motion);
+        estimator.update(scan, worlds::stamp_ns(number), 0, &mut motion);
         taken_us[1] += 1e6 * begin.elapsed().as_secs_f64();
         motion
     });

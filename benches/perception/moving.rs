@@ -9,9 +9,8 @@ use std::ops::Range;
 use std::time::Instant;
 
 use preprocess::background::{Class, Method, Model, Settings};
-use preprocess::lines::{self, LineFinder};
 use preprocess::motion::{self, MotionEstimator};
-use schema::{Foreground, Lines, Motion, Pose, Scan};
+use schema::{Foreground, Motion, Pose, Scan};
 
 use crate::figures::{self, Cell, Figure, Target};
 use crate::recordings;
@@ -28,10 +27,8 @@ pub(crate) fn measure(seeds: Range<u64>, is_json: bool) {
 
 /// The processors that the method needs, in the order in which the hub runs them.
 struct Processors {
-    lines: LineFinder,
     motion: MotionEstimator,
     model: Model,
-    found: Lines,
     out: Box<Foreground>,
 }
 
@@ -39,20 +36,17 @@ impl Processors {
     fn new(method: Method, beams: usize) -> Processors {
         let settings = Settings { method, ..Settings::default() };
         Processors {
-            lines: LineFinder::new(Pose::default(), lines::Settings::default(), beams),
             motion: MotionEstimator::new(Pose::default(), motion::Settings::default(), beams),
             model: Model::new(settings, beams),
-            found: Lines::default(),
             out: Foreground::of(beams),
         }
     }
 
-    fn update(&mut self, scan: &Scan) -> &[Class] {
+    fn update(&mut self, scan: &Scan, stamp_ns: u64) -> &[Class] {
         if self.model.method() == Method::Moving {
             let mut motion = Motion::default();
-            self.lines.update(scan, &mut self.found);
-            self.motion.update(scan, &self.found, &mut motion);
-            self.model.follow(&Pose::default(), &motion);
+            self.motion.update(scan, stamp_ns, 0, &mut motion);
+            self.model.follow(&Pose::default(), &motion, &self.motion.velocity());
         }
         self.model.update(scan, &mut self.out);
         self.model.classes()
@@ -68,7 +62,7 @@ fn run(drive: &Drive, method: Method, from: usize) -> (f64, f64, f64) {
     let (mut due, mut found, mut wrong, mut taken_us) = (0, 0, 0, 0.0);
     for (at, scan) in drive.scans.iter().enumerate() {
         let begin = Instant::now();
-        let classes = processors.update(scan);
+        let classes = processors.update(scan, worlds::stamp_ns(at));
         taken_us += 1e6 * begin.elapsed().as_secs_f64();
         if at >= from {
             for (beam, class) in classes.iter().enumerate() {
@@ -79,13 +73,13 @@ fn run(drive: &Drive, method: Method, from: usize) -> (f64, f64, f64) {
                 if is_edge {
                     continue;
                 }
-                let is_expected = is_person && free.is_free(&drive.places[at], scan, beam);
+                let is_expected = is_person && free.is_free(drive, at, beam);
                 due += usize::from(is_expected);
                 found += usize::from(is_expected && is_reported);
                 wrong += usize::from(!is_person && is_reported);
             }
         }
-        free.look(&drive.places[at], scan);
+        free.look(drive, at);
     }
     let share = |part: usize, of: usize| part as f64 / of.max(1) as f64;
     (share(found, due), share(found, found + wrong), taken_us / drive.scans.len() as f64)
@@ -130,7 +124,7 @@ fn of_recordings(cells: &mut Vec<Cell>) {
         let mut processors = Processors::new(Method::Moving, 360);
         let (mut due, mut found, mut wrong, mut scans) = (0, 0, 0, 0);
         for (at, scan) in drive.scans.iter().enumerate() {
-            let classes = processors.update(scan);
+            let classes = processors.update(scan, worlds::stamp_ns(at));
             let (Some(position), Some(other)) = (drive.positions[at], others[at]) else { continue };
             scans += 1;
             let before = others[at.saturating_sub(1)].unwrap_or(other);

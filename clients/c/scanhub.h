@@ -529,6 +529,7 @@ struct scanhub_motion {
     float covariance[9];         /* of the step, row by row */
     float overlap;               /* share of the readings that lie on the scan before */
     uint8_t method;
+    uint8_t valid;               /* 1: the sum is known, and none of its steps was degenerate */
     uint8_t degenerate;          /* 1: the surroundings leave a direction open */
     uint16_t breaks;             /* steps that were refused since the start */
 };
@@ -551,6 +552,7 @@ static inline enum scanhub_result scanhub_read_motion(const struct scanhub_datag
         out->covariance[i] = scanhub_f32(at + 36 + 4 * (size_t)i);
     out->overlap = scanhub_f32(at + 72);
     out->method = at[76];
+    out->valid = out->method <= SCANHUB_MOTION_BOTH && out->method != SCANHUB_MOTION_REFUSED && !(at[77] & 2);
     out->degenerate = at[77] & 1;
     out->breaks = scanhub_u16(at + 78);
     finite = isfinite(out->x_m) && isfinite(out->y_m) && isfinite(out->yaw_rad) && isfinite(out->dx_m)

@@ -234,7 +234,8 @@ METHODS = ("first", "refused", "beams", "points", "lines", "both")
 @dataclass(frozen=True)
 class Motion:
     """How the robot moved: the sum of all steps, the last step with its covariance (9 numbers, row by row), the share of
-    readings that lie on the scan before, and one of METHODS. `first` and `refused` have no step (0), `refused` no place."""
+    readings that lie on the scan before, and one of METHODS. `first` and `refused` have no step (0), `refused` no place.
+    `valid`: the sum is known, and none of its steps was degenerate."""
 
     x_m: float
     y_m: float
@@ -245,6 +246,7 @@ class Motion:
     covariance: "tuple[float, ...]"
     overlap: float
     method: str
+    valid: bool
     degenerate: bool
     breaks: int
 
@@ -848,7 +850,8 @@ def _motion(payload: bytes) -> Motion:
     *numbers, method, flags, breaks = struct.unpack_from("<3d13fBBH", payload)
     _limit(all(math.isfinite(number) for number in numbers))
     method = METHODS[method] if method < len(METHODS) else "refused"
-    return Motion(*numbers[:6], tuple(numbers[6:15]), numbers[15], method, bool(flags & 1), breaks)
+    valid = method != "refused" and not flags & 2
+    return Motion(*numbers[:6], tuple(numbers[6:15]), numbers[15], method, valid, bool(flags & 1), breaks)
 
 
 def _early(payload: bytes) -> Early:

@@ -32,7 +32,7 @@ pub struct Motion {
     pub overlap: f32,
     /// See [`Motion::how`].
     pub method: u8,
-    /// [`Motion::DEGENERATE`].
+    /// [`Motion::DEGENERATE`], [`Motion::OPEN`].
     pub flags: u8,
     /// Steps that were refused since the start; 65535 is that many and more. The summed pose leaves them out.
     pub breaks: u16,
@@ -96,6 +96,8 @@ impl Motion {
     /// Flag: the surroundings do not say how far the robot moved in some direction, as in a corridor. The covariance is
     /// great there.
     pub const DEGENERATE: u8 = 1;
+    /// Flag: a step since the start was degenerate, so the summed pose may be off by any distance.
+    pub const OPEN: u8 = 2;
 
     /// Returns how the step was found; a number that is not known says nothing.
     pub fn how(&self) -> MotionMethod {
@@ -110,6 +112,11 @@ impl Motion {
     /// Returns whether the summed pose is known: else it is 0.
     pub fn has_pose(&self) -> bool {
         self.how() != MotionMethod::Refused
+    }
+
+    /// Returns whether the summed pose is known, and no step that it contains was degenerate.
+    pub fn has_valid_pose(&self) -> bool {
+        self.has_pose() && self.flags & Motion::OPEN == 0
     }
 
     /// Returns whether the surroundings leave a direction open.

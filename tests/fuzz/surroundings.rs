@@ -31,7 +31,7 @@ pub(super) fn surroundings(data: &[u8]) {
     let mut model = Model::new(MAP, most);
     let mut foreground = Foreground::of(most);
     let mut scan = Scan::zeroed(Scan::len(BEAMS, Contents::ALL));
-    let mut before = Motion::default();
+    let (mut before, mut stamp_ns) = (Motion::default(), 0);
     for _ in 0..SCANS {
         if bytes.is_empty() {
             break;
@@ -57,10 +57,12 @@ pub(super) fn surroundings(data: &[u8]) {
         finder.update(&scan, &mut lines);
         assert_lines(&scan, &lines, &of_lines);
         let mut motion = Motion::default();
-        estimator.update(&scan, &lines, &mut motion);
+        stamp_ns += 1_000_000 * u64::from(bytes.u8());
+        let period_ns = 1_000_000 * u64::from(bytes.u8() % 64);
+        estimator.update(&scan, stamp_ns, period_ns, &mut motion);
         assert_motion(&scan, &before, &motion, &of_motion);
         before = motion;
-        model.follow(&pose, &motion);
+        model.follow(&pose, &motion, &estimator.velocity());
         model.update(&scan, &mut foreground);
         assert!(foreground.readings().all(|(beam, range)| scan.range(beam) == Some(range)));
         if !motion.has_pose() {

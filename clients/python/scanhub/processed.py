@@ -172,6 +172,11 @@ class Motion(Sample):
         return None if self.method == "refused" else Place(f.x_m, f.y_m, f.yaw_rad)
 
     @property
+    def valid(self) -> bool:
+        """Whether `place` is known, and no step that it contains was degenerate."""
+        return self.method != "refused" and not self._fields.flags & 2
+
+    @property
     def degenerate(self) -> bool:
         """The surroundings leave a direction open, as a corridor does."""
         return bool(self._fields.flags & 1)

@@ -45,7 +45,6 @@ struct BackgroundStage {
 
 struct Spare {
     zones: Zones,
-    lines: Box<Lines>,
     motion: Motion,
     foreground: Box<Foreground>,
 }
@@ -91,7 +90,6 @@ impl Pipeline {
             beams,
             spare: Spare {
                 zones: Zones::default(),
-                lines: Box::default(),
                 motion: Motion::default(),
                 foreground: Foreground::of(beams),
             },
@@ -132,8 +130,15 @@ impl Pipeline {
         self.zones.update(scan, out.unwrap_or(&mut self.spare.zones));
     }
 
-    /// Computes all other results of `scan`. Returns a reason if the background does not fit the scan and starts again.
-    pub(crate) fn examine(&mut self, scan: &Scan, out: Outputs<'_>) -> Option<Relearned> {
+    /// Computes all other results of `scan`, which has the stamp `stamp_ns` and comes `period_ns` after the
+    /// scan before. Returns a reason if the background does not fit the scan and starts again.
+    pub(crate) fn examine(
+        &mut self,
+        scan: &Scan,
+        stamp_ns: u64,
+        period_ns: u64,
+        out: Outputs<'_>,
+    ) -> Option<Relearned> {
         if let Some(marks) = out.marks {
             self.marks.update(scan, marks);
         }
@@ -142,19 +147,15 @@ impl Pipeline {
             None if is_moving => Some(&mut self.spare.motion),
             wanted => wanted,
         };
-        match (out.lines, motion) {
-            (None, None) => self.motion.forget(),
-            (Some(lines), None) => {
-                self.lines.update(scan, lines);
-                self.motion.forget();
-            }
-            // Motion is computed from lines.
-            (lines, Some(motion)) => {
-                let lines = lines.unwrap_or(&mut self.spare.lines);
-                self.lines.update(scan, lines);
-                self.motion.update(scan, lines, motion);
+        if let Some(lines) = out.lines {
+            self.lines.update(scan, lines);
+        }
+        match motion {
+            None => self.motion.forget(),
+            Some(motion) => {
+                self.motion.update(scan, stamp_ns, period_ns, motion);
                 if let Some(kept) = &mut self.background {
-                    kept.model.follow(&self.processing.pose, motion);
+                    kept.model.follow(&self.processing.pose, motion, &self.motion.velocity());
                 }
             }
         }
@@ -357,13 +358,13 @@ mod tests {
         let mut pipeline = pipeline(&processing(|_| {}));
         let mut zones = Zones::default();
         for _ in 0..20 {
-            assert_eq!(pipeline.examine(&wall(361, 1, 3000), Outputs::default()), None);
+            assert_eq!(pipeline.examine(&wall(361, 1, 3000), 0, 0, Outputs::default()), None);
         }
         let mut foreground = Foreground::of(361);
         let near = wall(361, 1, 500);
         let out = Outputs { foreground: Some(&mut foreground), ..Outputs::default() };
         pipeline.watch(&near, Some(&mut zones));
-        assert_eq!(pipeline.examine(&near, out), None);
+        assert_eq!(pipeline.examine(&near, 0, 0, out), None);
         assert_eq!((zones.verdict(), foreground.beams), (Verdict::Stop, 361));
         assert_eq!(foreground.segments().len(), 1, "segments are those of this scan");
         let mut stale = Zones::default();
@@ -375,7 +376,7 @@ mod tests {
     fn a_generation_is_new_until_it_is_published() {
         let mut pipeline = pipeline(&processing(|_| {}));
         assert!(!pipeline.is_news(), "nothing was learned yet");
-        pipeline.examine(&wall(361, 1, 3000), Outputs::default());
+        pipeline.examine(&wall(361, 1, 3000), 0, 0, Outputs::default());
         assert!(pipeline.is_news());
         assert_eq!((shown(&mut pipeline).generation, pipeline.is_news()), (0, false));
         for (verb, is_news) in [(Verb::Freeze, false), (Verb::Thaw, false), (Verb::Reset, true)] {
@@ -393,18 +394,18 @@ mod tests {
     #[test]
     fn a_model_that_has_learned_enough_is_published_again() {
         let mut pipeline = pipeline(&processing(|_| {}));
-        pipeline.examine(&wall(361, 1, 3000), Outputs::default());
+        pipeline.examine(&wall(361, 1, 3000), 0, 0, Outputs::default());
         assert_eq!(shown(&mut pipeline).taught, 0);
         for _ in 0..3 {
-            pipeline.examine(&wall(361, 1, 3000), Outputs::default());
+            pipeline.examine(&wall(361, 1, 3000), 0, 0, Outputs::default());
             assert!(!pipeline.is_news());
         }
-        pipeline.examine(&wall(361, 1, 3000), Outputs::default());
+        pipeline.examine(&wall(361, 1, 3000), 0, 0, Outputs::default());
         assert!(pipeline.is_news());
         assert_eq!((shown(&mut pipeline).taught, pipeline.is_news()), (361, false));
         pipeline.handle("a", Verb::Freeze, &Box::<Background>::default()).expect("is kept");
         for _ in 0..9 {
-            pipeline.examine(&wall(361, 1, 3000), Outputs::default());
+            pipeline.examine(&wall(361, 1, 3000), 0, 0, Outputs::default());
         }
         assert!(!pipeline.is_news(), "a frozen model stays as it is");
     }
@@ -417,32 +418,32 @@ mod tests {
         let mut pipeline = pipeline(&processing(|processing| processing.background.model = Some(kept)));
         let (first, is_news) = (shown(&mut pipeline), pipeline.is_news());
         assert_eq!((first.generation, first.taught, first.ranges()[180], is_news), (1, 181, 300, false));
-        let reason = pipeline.examine(&wall(361, 10, 300), Outputs::default());
+        let reason = pipeline.examine(&wall(361, 10, 300), 0, 0, Outputs::default());
         assert_eq!(reason, Some(Relearned::Shape(Mismatch { model: (181, 10_000), sensor: (361, 10_000) })));
         assert!(pipeline.is_news());
         let refusal = pipeline.handle("a", Verb::Load, &model).expect_err("another resolution");
         assert_eq!(refusal.kind, Kind::Configuration);
         let words = "a: the model has 181 beams in units of 10 mm, the sensor's scans have 361 beams in units of 10 mm";
         assert_eq!(refusal.message, words);
-        assert!(pipeline.examine(&wall(361, 1, 3000), Outputs::default()).is_some(), "another unit");
+        assert!(pipeline.examine(&wall(361, 1, 3000), 0, 0, Outputs::default()).is_some(), "another unit");
         let mut turned = wall(361, 1, 3000);
         turned.first_angle = -1.0;
         shown(&mut pipeline);
-        assert_eq!(pipeline.examine(&turned, Outputs::default()), Some(Relearned::Angles));
-        assert_eq!((pipeline.is_news(), pipeline.examine(&turned, Outputs::default())), (true, None));
+        assert_eq!(pipeline.examine(&turned, 0, 0, Outputs::default()), Some(Relearned::Angles));
+        assert_eq!((pipeline.is_news(), pipeline.examine(&turned, 0, 0, Outputs::default())), (true, None));
     }
 
     #[test]
     fn other_settings_keep_the_background() {
         let mut pipeline = pipeline(&processing(|_| {}));
         for _ in 0..20 {
-            pipeline.examine(&wall(361, 1, 3000), Outputs::default());
+            pipeline.examine(&wall(361, 1, 3000), 0, 0, Outputs::default());
         }
         let told = |pipeline: &mut Pipeline, range| {
             let (mut zones, mut foreground) = (Zones::default(), Foreground::of(361));
             let out = Outputs { foreground: Some(&mut foreground), ..Outputs::default() };
             pipeline.watch(&wall(361, 1, range), Some(&mut zones));
-            assert_eq!(pipeline.examine(&wall(361, 1, range), out), None);
+            assert_eq!(pipeline.examine(&wall(361, 1, range), 0, 0, out), None);
             (zones.verdict(), foreground.beams)
         };
         let known = shown(&mut pipeline);
@@ -466,7 +467,7 @@ mod tests {
     #[test]
     fn a_request_without_a_background_names_the_key() {
         let mut pipeline = pipeline(&processing(|processing| processing.background.is_kept = false));
-        pipeline.examine(&wall(361, 1, 3000), Outputs::default());
+        pipeline.examine(&wall(361, 1, 3000), 0, 0, Outputs::default());
         assert!(!pipeline.keeps_background() && !pipeline.is_news() && !pipeline.shows_every_scan());
         let refusal =
             pipeline.handle("side", Verb::Show, &Box::<Background>::default()).expect_err("none is kept");

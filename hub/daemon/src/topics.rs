@@ -184,6 +184,8 @@ impl<'a, S: Surroundings> Topics<'a, S> {
             pipeline.keeps_background().then(|| self.foreground.loan(Foreground::len(raw.beams())));
         let relearned = pipeline.examine(
             &self.decoded,
+            header.stamp_first_ns,
+            raw.period,
             Outputs {
                 marks: Publisher::<Marks, S>::payload_mut(&mut marks),
                 lines: Publisher::<Lines, S>::payload_mut(&mut lines),
@@ -253,7 +255,7 @@ impl<'a, S: Surroundings> Topics<'a, S> {
         let scan = with_room(&mut self.decoded, raw.payload_len());
         raw.write(scan);
         pipeline.watch(scan, None);
-        pipeline.examine(scan, Outputs::default());
+        pipeline.examine(scan, raw.first, raw.period, Outputs::default());
     }
 
     /// Publishes that the zones are unknown as of `now`, because no scans arrive.

@@ -16,6 +16,8 @@ use schema::{
 use fixed::{Multi, Paper};
 use moving::Moving;
 
+use crate::velocity::Velocity;
+
 /// Settings of a background.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Settings {
@@ -231,11 +233,11 @@ impl Model {
         write(scan, self.generation, &self.classes[..count], out);
     }
 
-    /// Sets the robot's position at the next scan, as in `motion`, of a sensor at `pose`, for [`Method::Moving`]. If
-    /// the motion restarts or is refused, the model forgets everything.
-    pub fn follow(&mut self, pose: &Pose, motion: &Motion) {
+    /// Sets the robot's position at the next scan, as in `motion`, and its `velocity` during that scan, for a sensor at `pose` and
+    /// [`Method::Moving`]. If the motion restarts or is refused, the model forgets everything.
+    pub fn follow(&mut self, pose: &Pose, motion: &Motion, velocity: &Velocity) {
         if let Learner::Moving(moving) = &mut self.learner
-            && !moving.follow(pose, motion)
+            && !moving.follow(pose, motion, velocity)
             && !self.fresh
         {
             self.reset();

@@ -1,5 +1,5 @@
 //! Results computed from a scan. Each processor is a small struct that reads a scan and fills a payload, with arrays
-//! of fixed size: no heap, no clock, no telegrams. No processor uses another.
+//! of fixed size: no heap, no clock, no telegrams. The result of a processor does not depend on which others run.
 
 #![forbid(unsafe_code)]
 
@@ -10,4 +10,5 @@ pub mod motion;
 #[cfg(test)]
 mod reading;
 pub mod segments;
+pub mod velocity;
 pub mod zones;

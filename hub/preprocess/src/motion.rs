@@ -10,15 +10,20 @@
 
 mod matching;
 mod rigid;
+mod undistorted;
 mod view;
 
 use std::f64::consts::{FRAC_PI_2, PI};
 
 use schema::{BEAMS, Corner, Line, Lines, Motion, MotionMethod, Pose, Scan};
 
+use crate::lines::{self, LineFinder};
+use crate::velocity::{Velocity, times};
+
 use matching::{Match, Matcher};
 pub use rigid::Rigid;
 use rigid::Square;
+use undistorted::UndistortedScan;
 use view::View;
 
 /// Limits of the steps that are accepted.
@@ -48,6 +53,12 @@ pub struct MotionEstimator {
     matcher: Matcher,
     /// `None` before the first scan.
     track: Option<Track>,
+    /// Stamp of the last scan, in ns.
+    stamp_ns: u64,
+    velocity: Velocity,
+    undistorted: UndistortedScan,
+    finder: LineFinder,
+    lines: Lines,
 }
 
 /// Position of the robot, and its last step.
@@ -59,6 +70,10 @@ struct Track {
     last: Rigid,
     /// Covariance of that position by the last scan's own noise; `None` if that is the kept one.
     unsure: Option<Square>,
+    /// Whether the surroundings left a direction of that position open.
+    is_degenerate: bool,
+    /// Whether the sum of all steps contains a degenerate one.
+    is_open: bool,
     /// The last step.
     step: Rigid,
     breaks: u16,
@@ -75,6 +90,11 @@ impl MotionEstimator {
             now: View::new(beams),
             matcher: Matcher::new(beams),
             track: None,
+            stamp_ns: 0,
+            velocity: Velocity::default(),
+            undistorted: UndistortedScan::new(beams),
+            finder: LineFinder::new(pose, lines::Settings::default(), beams),
+            lines: Lines::default(),
         }
     }
 
@@ -82,6 +102,7 @@ impl MotionEstimator {
     pub fn change(&mut self, pose: Pose, settings: Settings) {
         if self.pose != pose {
             self.forget();
+            self.finder.change(pose, lines::Settings::default());
         }
         (self.pose, self.settings) = (pose, settings);
     }
@@ -91,20 +112,65 @@ impl MotionEstimator {
         self.track = None;
     }
 
-    /// Writes the motion since the last scan into `out`, every byte of it. `lines` are those of `scan`.
-    pub fn update(&mut self, scan: &Scan, lines: &Lines, out: &mut Motion) {
+    /// Returns the velocity during the last scan.
+    pub fn velocity(&self) -> Velocity {
+        self.velocity
+    }
+
+    /// Writes the motion since the last scan into `out`, every byte of it. `stamp_ns` is the stamp of `scan`, and `period_ns` the
+    /// time from one scan to the next, 0 if it is unknown.
+    pub fn update(&mut self, scan: &Scan, stamp_ns: u64, period_ns: u64, out: &mut Motion) {
         *out = Motion::default();
-        self.now.take(&self.pose, scan, lines);
+        let elapsed_ns = stamp_ns.saturating_sub(std::mem::replace(&mut self.stamp_ns, stamp_ns));
+        let seconds = 1e-9 * without_jitter(elapsed_ns, period_ns) as f64;
+        let has_time = self.track.is_some()
+            && (SHORTEST_S..LONGEST_S).contains(&seconds)
+            && times(scan).iter().all(|time| time.abs() < LONGEST_S);
+        if !has_time {
+            self.velocity = Velocity::default();
+        }
+        self.take(scan);
         let Some(track) = self.track else {
             self.matcher.trust_all();
             let (origin, step) = (Rigid::default(), Rigid::default());
-            self.keep(Track { origin, last: origin, unsure: None, step, breaks: 0 });
+            self.keep(Track {
+                origin,
+                last: origin,
+                unsure: None,
+                is_degenerate: false,
+                is_open: false,
+                step,
+                breaks: 0,
+            });
             return;
         };
-        match self.find(&track) {
+        let mut found = self.find(&track, None);
+        // The correction changes the step, which is the velocity of the next correction.
+        let mut offset = [0.0; 3];
+        for round in 0..=CORRECTIONS {
+            let Some((before, step)) = found.filter(|_| has_time) else { break };
+            let measured = Velocity::of_step((step.x, step.y, step.yaw), seconds);
+            let change = self.velocity.difference(&measured);
+            if change.x.hypot(change.y) > MAX_CHANGE_M_S || change.yaw.abs() > MAX_CHANGE_RAD_S {
+                // No robot does that: the step is an error, or the sensor was carried.
+                self.velocity = Velocity::default();
+                break;
+            }
+            if round == CORRECTIONS || !change.distorts(scan, CHANGED_M) {
+                offset = change.offset(scan);
+                self.velocity.approach(&measured);
+                break;
+            }
+            self.velocity = measured;
+            self.take(scan);
+            found = self.find(&track, Some(before.place));
+        }
+        match found {
             Some((found, step)) => {
-                write(&track, &found, &step, out);
-                let next = Track { last: found.place, unsure: Some(found.own), step, ..track };
+                write(&track, &found, &step, &offset, out);
+                let (unsure, is_degenerate) = (Some(found.own), found.is_degenerate);
+                let is_open = track.is_open || is_degenerate;
+                let next = Track { last: found.place, unsure, is_degenerate, is_open, step, ..track };
                 let is_away = found.place.x.hypot(found.place.y) > AWAY_M || found.place.yaw.abs() > AWAY_RAD;
                 if is_away || found.overlap < ENOUGH {
                     self.keep(next);
@@ -113,6 +179,7 @@ impl MotionEstimator {
                 }
             }
             None => {
+                self.velocity = Velocity::default();
                 self.matcher.trust_all();
                 let breaks = track.breaks.saturating_add(1);
                 (out.method, out.breaks) = (MotionMethod::Refused as u8, breaks);
@@ -121,11 +188,21 @@ impl MotionEstimator {
         }
     }
 
-    /// Returns the robot's position and its step, if they are within the limits.
-    fn find(&mut self, track: &Track) -> Option<(Match, Rigid)> {
+    /// Takes the current scan as if it had been measured at one moment.
+    fn take(&mut self, scan: &Scan) {
+        let scan = match self.velocity.distorts(scan, DISTORTED_M) {
+            true => self.undistorted.compute(scan, &self.velocity.of_sensor(&self.pose)),
+            false => scan,
+        };
+        self.finder.update(scan, &mut self.lines);
+        self.now.take(&self.pose, scan, &self.lines);
+    }
+
+    /// Returns the robot's position and its step, if they are within the limits. The search starts at `begin`, if that is known.
+    fn find(&mut self, track: &Track, begin: Option<Rigid>) -> Option<(Match, Rigid)> {
         let Settings { max_step_m, max_turn_deg, min_overlap } = self.settings;
         let limits = Limits { step_m: max_step_m, turn_rad: max_turn_deg.to_radians() };
-        let begin = initial_guess(&self.kept, &self.now, track, &limits);
+        let begin = begin.unwrap_or_else(|| initial_guess(&self.kept, &self.now, track, &limits));
         let found = self.matcher.find(&self.kept, &self.now, begin, max_step_m)?;
         let step = track.last.inverse().then(&found.place);
         let is_near = step.x.hypot(step.y) <= limits.step_m && step.yaw.abs() <= limits.turn_rad;
@@ -137,7 +214,8 @@ impl MotionEstimator {
         self.now.doubt(self.matcher.doubts());
         std::mem::swap(&mut self.kept, &mut self.now);
         let origin = track.origin.then(&track.last);
-        self.track = Some(Track { origin, last: Rigid::default(), unsure: None, ..track });
+        self.track =
+            Some(Track { origin, last: Rigid::default(), unsure: None, is_degenerate: false, ..track });
     }
 }
 
@@ -147,8 +225,14 @@ struct Limits {
     turn_rad: f64,
 }
 
-/// Writes `step`, which leads to `found`.
-fn write(track: &Track, found: &Match, step: &Rigid, out: &mut Motion) {
+/// Returns `elapsed_ns` as a multiple of the period. A stamp has jitter if it is that of a telegram.
+fn without_jitter(elapsed_ns: u64, period_ns: u64) -> u64 {
+    let periods = elapsed_ns.saturating_add(period_ns / 2).checked_div(period_ns);
+    periods.map_or(elapsed_ns, |periods| periods.saturating_mul(period_ns))
+}
+
+/// Writes `step`, which leads to `found`. The beams may be off by `offset` because of a changing velocity.
+fn write(track: &Track, found: &Match, step: &Rigid, offset: &[f64; 3], out: &mut Motion) {
     (out.dx_m, out.dy_m, out.dyaw_rad) = (step.x as f32, step.y as f32, step.yaw as f32);
     // Both scans have their own noise. That of the kept one moves both positions alike.
     let before = track.unsure.unwrap_or(found.of_kept);
@@ -156,11 +240,15 @@ fn write(track: &Track, found: &Match, step: &Rigid, out: &mut Motion) {
     // Readings on no surface contradict this step: according to them, the robot moved as before.
     let other = [step.x - track.step.x, step.y - track.step.y, step.yaw - track.step.yaw];
     rigid::add_outer(&mut covariance, &other, 1.0 - found.overlap);
+    rigid::add_outer(&mut covariance, offset, 1.0);
     for (place, number) in out.covariance.iter_mut().zip(covariance.as_flattened()) {
         *place = *number as f32;
     }
     out.overlap = found.overlap as f32;
-    out.flags = if found.is_degenerate { Motion::DEGENERATE } else { 0 };
+    // The covariance of a step contains that of both positions.
+    let is_degenerate = found.is_degenerate || track.is_degenerate;
+    out.flags = if is_degenerate { Motion::DEGENERATE } else { 0 };
+    out.flags |= if is_degenerate || track.is_open { Motion::OPEN } else { 0 };
     out.method = match (found.has_corners, found.has_lines) {
         (true, true) => MotionMethod::Both,
         (true, false) => MotionMethod::Points,
@@ -172,6 +260,18 @@ fn write(track: &Track, found: &Match, step: &Rigid, out: &mut Motion) {
     out.breaks = track.breaks;
 }
 
+/// Distortion of a scan that is corrected, in meters from its first to its last beam, and change of the distortion after
+/// which the correction is repeated. A repeated correction adds the noise of the last step.
+const DISTORTED_M: f64 = 0.003;
+const CHANGED_M: f64 = 0.01;
+/// Maximum change of velocity from one scan to the next.
+const MAX_CHANGE_M_S: f64 = 2.0;
+const MAX_CHANGE_RAD_S: f64 = 6.0;
+/// Maximum number of corrections after a change of velocity. Each one leaves less than half of the error.
+const CORRECTIONS: u8 = 4;
+/// Time between two scans from which a velocity is computed, in seconds.
+const SHORTEST_S: f64 = 0.005;
+const LONGEST_S: f64 = 1.0;
 /// Distance from the kept scan at which another one is kept. Its surfaces are still seen from about the same side.
 const AWAY_M: f64 = 0.15;
 const AWAY_RAD: f64 = 0.15;

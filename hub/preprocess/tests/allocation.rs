@@ -37,7 +37,7 @@ fn a_scan_takes_nothing_from_the_heap() {
     let mut models =
         [Method::Paper, Method::Multi, Method::Moving].map(|method| Model::new(settings(method), BEAMS));
     let mut estimator = motion::MotionEstimator::new(pose, motion::Settings::default(), BEAMS);
-    let mut found_motion = Motion::default();
+    let (mut found_motion, mut stamp_ns) = (Motion::default(), 0);
     let mut cutter = Segmenter::new(pose, BEAMS);
     let (mut zones, mut marks) = (Zones::default(), Marks::default());
     let mut foreground = Foreground::of(BEAMS);
@@ -54,9 +54,10 @@ fn a_scan_takes_nothing_from_the_heap() {
             finder.update(scan, &mut found_lines);
             lines_found += found_lines.lines().len();
         }
-        estimator.update(scan, &found_lines, &mut found_motion);
+        stamp_ns += 26_640_000;
+        estimator.update(scan, stamp_ns, 0, &mut found_motion);
         for model in &mut models {
-            model.follow(&pose, &found_motion);
+            model.follow(&pose, &found_motion, &estimator.velocity());
             model.update(scan, &mut foreground);
             cutter.update(scan, &mut foreground);
             model.show(&mut background);

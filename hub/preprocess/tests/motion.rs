@@ -7,24 +7,20 @@ use std::f64::consts::PI;
 
 use drives::{Drive, beams_at, normal, scan};
 use fastrand::Rng;
-use preprocess::lines::{self, LineFinder};
 use preprocess::motion::{MotionEstimator, Rigid, Settings};
-use schema::{Contents, Lines, Motion, MotionMethod, Pose, Scan};
+use schema::{Contents, Motion, MotionMethod, Pose, Scan};
 
 /// What is said of each of `scans`; what was in the payload before does not stay.
 fn follow(scans: &[Box<Scan>], pose: Pose, settings: Settings) -> Vec<Motion> {
     let beams = scans.iter().map(|scan| scan.beams()).max().unwrap_or(0);
-    let mut finder = LineFinder::new(pose, lines::Settings::default(), beams);
     let mut estimator = MotionEstimator::new(pose, settings, beams);
-    let mut lines = Lines::default();
-    let say = |scan: &Scan| {
-        finder.update(scan, &mut lines);
+    let say = |(number, scan): (usize, &Scan)| {
         let mut motion: Motion = bytemuck::Zeroable::zeroed();
         bytemuck::bytes_of_mut(&mut motion).fill(0xA5);
-        estimator.update(scan, &lines, &mut motion);
+        estimator.update(scan, drives::stamp_ns(number), 0, &mut motion);
         motion
     };
-    scans.iter().map(|scan| &**scan).map(say).collect()
+    scans.iter().map(|scan| &**scan).enumerate().map(say).collect()
 }
 
 fn step(motion: &Motion) -> Rigid {
@@ -138,6 +134,28 @@ fn steps_add_up_to_the_pose_and_their_errors_are_as_great_as_is_said() {
     }
     let mean = squares / f64::from(steps);
     assert!((0.5..2.0).contains(&mean), "in variances: {mean}");
+}
+
+#[test]
+fn a_turn_during_the_scans_is_measured() {
+    for (seed, deg_per_s) in [(101, 45.0), (102, 90.0), (103, 180.0)] {
+        let count = (270.0 / deg_per_s / drives::PERIOD_S) as usize;
+        let drive = Drive::on_the_spot(seed, count, deg_per_s);
+        let found = follow(&drive.scans, Pose::default(), Settings::default());
+        let (mut sum, mut truth) = (0.0, 0.0);
+        let mut errors = Vec::new();
+        for (at, motion) in found.iter().enumerate().skip(1) {
+            assert!(motion.has_step(), "{deg_per_s} {at}: {motion:?}");
+            let turn = drive.places[at - 1].inverse().then(&drive.places[at]).yaw.to_degrees();
+            let of_scan = f64::from(motion.dyaw_rad).to_degrees();
+            (sum, truth) = (sum + of_scan, truth + turn);
+            errors.push((of_scan - turn).abs());
+        }
+        errors.sort_by(f64::total_cmp);
+        let median = errors[errors.len() / 2];
+        assert!((sum - truth).abs() < 0.6, "{deg_per_s}: {sum} of {truth} degrees");
+        assert!(median < 0.03, "{deg_per_s}: {median} degrees");
+    }
 }
 
 #[test]
@@ -270,6 +288,29 @@ fn what_says_nothing_is_refused_and_never_sure() {
     assert!((42..60).all(|at| found[at].has_step()), "it goes on");
 }
 
+/// Scan 30 sees one wall. The step after it contains the uncertainty of that position, and the sum does from there on.
+#[test]
+fn a_step_from_an_open_position_is_open_too() {
+    let mut open = 0;
+    for seed in 0..6 {
+        let mut drive = Drive::through_a_room(seed, 361, 60, 0.01);
+        let no_return = drive.scans[30].no_return;
+        let ranges = drive.scans[30].arrays().ranges;
+        ranges[..120].fill(no_return);
+        ranges[150..].fill(no_return);
+        let found = follow(&drive.scans, Pose::default(), Settings::default());
+        if !found[30].is_degenerate() || !found[31].has_step() {
+            continue;
+        }
+        open += 1;
+        let is_kept = found[31].covariance[0].max(found[31].covariance[4]) < 1e-3;
+        assert_eq!(found[31].is_degenerate(), !is_kept, "{seed}: {:?}", found[31]);
+        assert!(found[..30].iter().all(|motion| motion.has_valid_pose()), "{seed}");
+        assert!(!found[30..].iter().any(|motion| motion.has_valid_pose()), "{seed}");
+    }
+    assert!(open > 2, "{open}");
+}
+
 #[test]
 fn any_scan_is_answered_with_numbers() {
     let mut random = Rng::with_seed(17);
@@ -302,22 +343,6 @@ fn any_scan_is_answered_with_numbers() {
             assert!(numbers.iter().chain(&motion.covariance).all(|number| number.is_finite()), "{motion:?}");
             assert!((0.0..=1.0).contains(&motion.overlap), "{motion:?}");
         }
-    }
-}
-
-#[test]
-fn lines_without_numbers_harm_nothing() {
-    let drive = Drive::through_a_room(2, 361, 10, 0.01);
-    let mut estimator = MotionEstimator::new(Pose::default(), Settings::default(), 361);
-    for scan in &drive.scans {
-        let mut lines = Lines { count: 64, corners: 64, noise_m: f32::NAN, ..Lines::default() };
-        for (at, line) in lines.line_array.iter_mut().enumerate() {
-            (line.alpha_rad, line.r_m, line.sd_alpha_rad) = (f32::NAN, f32::INFINITY, f32::NAN);
-            (line.first, line.last, line.points) = (360 - 5 * at as u16, 9999, 50);
-        }
-        let mut motion = Motion::default();
-        estimator.update(scan, &lines, &mut motion);
-        assert!(motion.dx_m.is_finite() && motion.x_m.is_finite());
     }
 }
 

@@ -230,8 +230,8 @@ static void motion(const struct scanhub_motion *m)
     for (unsigned i = 0; i < 9; i++)
         number(i ? "," : ",\"covariance\":[", m->covariance[i]);
     number("],\"overlap\":", m->overlap);
-    printf(",\"method\":\"%s\",\"degenerate\":%s,\"breaks\":%u}", methods[m->method < 6 ? m->method : 1],
-           boolean(m->degenerate), m->breaks);
+    printf(",\"method\":\"%s\",\"valid\":%s,\"degenerate\":%s,\"breaks\":%u}", methods[m->method < 6 ? m->method : 1],
+           boolean(m->valid), boolean(m->degenerate), m->breaks);
 }
 
 static void zones(const struct scanhub_zones *z)

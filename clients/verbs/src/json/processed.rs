@@ -76,6 +76,7 @@ pub(crate) fn motion<'a>(sensor: &'a str, header: &Header, motion: &Motion) -> i
         x_m: Option<f64>,
         y_m: Option<f64>,
         yaw_deg: Option<f64>,
+        valid: bool,
         degenerate: bool,
         breaks: u16,
         #[serde(flatten)]
@@ -94,6 +95,7 @@ pub(crate) fn motion<'a>(sensor: &'a str, header: &Header, motion: &Motion) -> i
         x_m: of_pose(motion.x_m),
         y_m: of_pose(motion.y_m),
         yaw_deg: motion.has_pose().then(|| in_degrees(motion.yaw_rad)),
+        valid: motion.has_valid_pose(),
         degenerate: motion.is_degenerate(),
         breaks: motion.breaks,
         flags: Words::of(header),

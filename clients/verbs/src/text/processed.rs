@@ -66,6 +66,9 @@ pub(crate) fn motion(line: &mut Vec<u8>, header: &Header, motion: &Motion) -> io
     if motion.has_pose() {
         let Motion { x_m, y_m, yaw_rad, .. } = motion;
         write!(line, ", at ({x_m:.3}, {y_m:.3}) m {:.2} deg", yaw_rad.to_degrees())?;
+        if !motion.has_valid_pose() {
+            write!(line, " (not valid)")?;
+        }
     }
     if motion.breaks > 0 { write!(line, ", {} steps refused", motion.breaks) } else { Ok(()) }
 }

@@ -2,9 +2,12 @@
 //! space that was seen free is in the foreground; shadows and the edge of what was seen are unknown. Refuses to know how
 //! the robot's place is found: each scan comes with it.
 
+use std::f64::consts::FRAC_PI_2;
+
 use schema::{Background, Motion, Pose, Scan};
 
 use super::{Class, INVALID, Limits, Runs};
+use crate::velocity::Velocity;
 
 /// State of the method that follows the robot.
 #[derive(Clone)]
@@ -29,6 +32,10 @@ struct Cell {
     hits: u16,
     /// Scans that saw through it, less an eighth of those in which a beam ended here.
     free: u16,
+    /// Times that a beam ended here after others had seen through: legs of chairs are thinner than the distance of two beams.
+    returns: u8,
+    /// Scans in a row that saw through it.
+    through: u8,
 }
 
 /// Where the sensor is in the map, and where it looks.
@@ -39,6 +46,8 @@ struct Place {
     cos: f64,
     sin: f64,
     pose: Pose,
+    /// Velocity of the sensor.
+    velocity: Velocity,
     angles: (f64, f64),
     unit_m: f64,
 }
@@ -75,15 +84,16 @@ impl Moving {
         self.runs.forget();
     }
 
-    /// The next scan is from where `motion` says that the robot is, of a sensor at `pose`. Whether the map is still one of
-    /// where the robot is: not after a step that could as well be another one.
-    pub(super) fn follow(&mut self, pose: &Pose, motion: &Motion) -> bool {
+    /// Takes the robot's position at the next scan from `motion`, and its `velocity` during that scan, for a sensor at `pose`.
+    /// Returns whether the map still shows the robot's surroundings: it does not after an uncertain step.
+    pub(super) fn follow(&mut self, pose: &Pose, motion: &Motion, velocity: &Velocity) -> bool {
         let (sin, cos) = motion.yaw_rad.sin_cos();
         let x = motion.x_m + cos * pose.x_m - sin * pose.y_m;
         let y = motion.y_m + sin * pose.x_m + cos * pose.y_m;
         let is_known = motion.has_pose() && x.abs() < FARTHEST_M && y.abs() < FARTHEST_M;
         let (angles, unit_m) = ((0.0, 0.0), 0.0);
-        self.place = is_known.then_some(Place { x, y, cos, sin, pose: *pose, angles, unit_m });
+        let velocity = velocity.of_sensor(pose);
+        self.place = is_known.then_some(Place { x, y, cos, sin, pose: *pose, velocity, angles, unit_m });
         // Along a corridor every place looks alike.
         let variance = f64::from(motion.covariance[0].max(motion.covariance[4]));
         let is_sure = motion.is_degenerate() || variance <= UNSURE_M * UNSURE_M;
@@ -106,6 +116,7 @@ impl Moving {
         (place.angles, place.unit_m) = ((scan.first_angle, scan.step), f64::from(scan.unit_um) * 1e-6);
         let place = *place;
         self.scroll((cell(place.x), cell(place.y)));
+        let (ahead, left) = (place.along(0.0), place.along(FRAC_PI_2));
         let exact = scan.exact_angles();
         for (i, (&reading, class)) in readings.iter().zip(classes.iter_mut()).enumerate() {
             self.ends[i] = (f32::NAN, f32::NAN);
@@ -115,9 +126,14 @@ impl Moving {
             }
             let angle = exact.get(i).filter(|exact| exact.is_finite()).map(|&exact| f64::from(exact));
             let angle = angle.unwrap_or(place.angles.0 + i as f64 * place.angles.1);
-            let along = place.along(angle);
             let range = f64::from(reading) * place.unit_m;
-            let end = (place.x + range * along.0, place.y + range * along.1);
+            // The sensor moves while a scan is measured.
+            let (x, y, yaw) = place.velocity.position(1e-9 * scan.beam_ns(i) as f64);
+            let along = place.along(angle + yaw);
+            let end = (
+                place.x + range * along.0 + x * ahead.0 + y * left.0,
+                place.y + range * along.1 + x * ahead.1 + y * left.1,
+            );
             self.ends[i] = ((end.0 / CELL_M) as f32, (end.1 / CELL_M) as f32);
             *class = self.class(cell(end.0), cell(end.1), limits);
         }
@@ -260,11 +276,15 @@ impl Moving {
 impl Cell {
     /// Something stands here: it was there before the place was seen free, or for as long as it takes.
     fn stands(&self, limits: &Limits) -> bool {
-        self.hits >= STANDS && self.free < FREE || self.hits >= limits.scans.max(STANDS)
+        self.hits >= STANDS && self.free < FREE
+            || self.hits >= limits.scans.max(STANDS)
+            || self.returns >= RETURNS
     }
 
     fn hit(&mut self, most: u16) {
         self.hits = (self.hits + 1).min(most);
+        self.returns = self.returns.saturating_add(u8::from(self.through > 0));
+        self.through = 0;
         if self.hits.is_multiple_of(8) {
             self.free = self.free.saturating_sub(1);
         }
@@ -272,6 +292,10 @@ impl Cell {
 
     fn seen_through(&mut self, most: u16) {
         self.free = (self.free + 1).min(most);
+        self.through = self.through.saturating_add(1);
+        if self.through >= LONG {
+            self.returns = 0;
+        }
         self.hits = self.hits.saturating_sub(1 + self.hits / 16);
     }
 }
@@ -305,6 +329,9 @@ const AROUND: i32 = 2;
 const FREE: u16 = 5;
 /// Beams that end in a cell until something stands there that was never seen free.
 const STANDS: u16 = 3;
+/// Returns from which on something thin stands in a cell, and scans in a row that see through it after which nothing does.
+const RETURNS: u8 = 12;
+const LONG: u8 = 60;
 /// Cells before the end of a beam that it says nothing of.
 const SHORT: f32 = 2.5;
 /// A map does not go on by a step that is less sure than this: walls would stand where there are none.

@@ -130,7 +130,7 @@ impl Matcher {
         let beams = pair.now.points().len();
         let (mut runs, mut off, mut expected) = (0, 0.0, 0.0);
         for i in 0..beams {
-            if i == 0 || !pair.now.is_connected(i) {
+            if i == 0 || !pair.now.is_connected(i) || usize::from(self.runs[runs - 1].all) >= PIECE {
                 self.runs[runs] = Run { first: i as u16, ..Run::default() };
                 runs += 1;
             }
@@ -143,7 +143,7 @@ impl Matcher {
             run.doubt = run.doubt.max(doubt);
             let Some(on) = pair.on(i, place, width) else { continue };
             let square = on.off * on.off;
-            run.off += square / on.variance();
+            run.off += (square / on.variance()).min(CAP);
             run.beams += 1;
             if self.doubts[i] == 0 && on.off.abs() < pair.finest {
                 (off, expected) = (off + square, expected + on.variance());
@@ -381,6 +381,8 @@ const LEAST_BEAMS: usize = 6;
 const SAID_BEAMS: f64 = 1.5;
 /// The same as a share of all beams: in a long corridor, frames of doors are taken for one another.
 const LEAST_PART: f64 = 0.03;
+const PIECE: usize = 24;
+const CAP: f64 = 9.0;
 /// How often what moves is looked for.
 const LOOKS: usize = 2;
 /// What does not move is off by at most so many times what its noise says, in the mean of squares.

@@ -2,7 +2,7 @@
 #![allow(dead_code)] // each test takes what it needs
 
 use std::collections::HashMap;
-use std::f64::consts::{PI, TAU};
+use std::f64::consts::{FRAC_PI_2, PI, TAU};
 
 use fastrand::Rng;
 use preprocess::motion::Rigid;
@@ -18,6 +18,8 @@ pub(crate) struct Drive {
     /// Which beams met a person.
     pub(crate) people: Vec<Vec<bool>>,
     walls: Vec<(Point, Point)>,
+    /// Middles and radii of round legs and pillars.
+    pub(crate) legs: Vec<(Point, f64)>,
     walkers: Vec<Walker>,
     head: ScanHead,
     noise_m: f64,
@@ -32,13 +34,14 @@ pub(crate) struct Seen {
 }
 
 impl Seen {
-    /// Takes what a scan from `place` sees.
-    pub(crate) fn look(&mut self, place: &Rigid, scan: &Scan) {
+    /// Takes what the scan with number `at` sees.
+    pub(crate) fn look(&mut self, drive: &Drive, at: usize) {
         self.scans += 1;
+        let scan = &drive.scans[at];
         for beam in 0..scan.beams() {
             let Some(range) = scan.distance_m(beam) else { continue };
             for step in 1..(range / 0.05) as u32 {
-                let at = self.square(place, scan, beam, 0.05 * f64::from(step));
+                let at = square(drive, at, beam, 0.05 * f64::from(step));
                 let (free, last) = self.squares.entry(at).or_default();
                 if *last != self.scans {
                     (*free, *last) = (*free + 1, self.scans);
@@ -47,17 +50,34 @@ impl Seen {
         }
     }
 
-    /// Whether a beam ends where at least five scans saw through.
-    pub(crate) fn is_free(&self, place: &Rigid, scan: &Scan, beam: usize) -> bool {
-        let end = scan.distance_m(beam).map(|range| self.square(place, scan, beam, range));
+    /// Returns whether a beam of the scan with number `at` ends where at least five scans saw through.
+    pub(crate) fn is_free(&self, drive: &Drive, at: usize, beam: usize) -> bool {
+        let end = drive.scans[at].distance_m(beam).map(|range| square(drive, at, beam, range));
         end.and_then(|at| self.squares.get(&at)).is_some_and(|(free, _)| *free >= 5)
     }
+}
 
-    fn square(&self, place: &Rigid, scan: &Scan, beam: usize, range: f64) -> (i32, i32) {
-        let angle = scan.angle(beam);
-        let (x, y) = place.point((range * angle.cos(), range * angle.sin()));
-        ((10.0 * x).floor() as i32, (10.0 * y).floor() as i32)
-    }
+/// The square in which a beam of the scan with number `at` is at this range.
+fn square(drive: &Drive, at: usize, beam: usize, range: f64) -> (i32, i32) {
+    let (scan, before) = (&drive.scans[at], &drive.places[at.saturating_sub(1)]);
+    let (place, angle) = (place_of(before, &drive.places[at], scan, beam), scan.angle(beam));
+    let (x, y) = place.point((range * angle.cos(), range * angle.sin()));
+    ((10.0 * x).floor() as i32, (10.0 * y).floor() as i32)
+}
+
+/// The robot's place at the time of a beam of `scan`, during which it moves from `before` to `place`.
+fn place_of(before: &Rigid, place: &Rigid, scan: &Scan, beam: usize) -> Rigid {
+    let part = 1.0 + 1e-9 * scan.beam_ns(beam) as f64 / PERIOD_S;
+    let step = before.inverse().then(place);
+    before.then(&Rigid::new(part * step.x, part * step.y, part * step.yaw))
+}
+
+/// Time of a scan of an LMS at half degrees, two revolutions of its mirror, in seconds.
+pub(crate) const PERIOD_S: f64 = 0.026_64;
+
+/// Returns the stamp of the scan with this number, in ns.
+pub(crate) fn stamp_ns(number: usize) -> u64 {
+    1_000_000_000 + (number as f64 * 1e9 * PERIOD_S) as u64
 }
 
 struct Walker {
@@ -151,6 +171,56 @@ impl Drive {
         drive
     }
 
+    /// Returns scans of an LMS at half degrees, on a robot that drives by `speed` meters a scan through a furnished room among
+    /// `people`: tables and chairs with thin legs, cupboards, and pillars. The robot moves while a scan is measured.
+    pub(crate) fn through_furniture(seed: u64, count: usize, people: usize, speed: f64) -> Drive {
+        let mut drive = Drive::begin(seed, 361, 0.01);
+        drive.furnish();
+        for _ in 0..people {
+            drive.add_walker();
+        }
+        drive.on(count, speed);
+        drive
+    }
+
+    /// Returns scans of an LMS at half degrees, on a robot that turns on the spot in a room, by `deg_per_s` from the first scan on. In
+    /// the end it stands for 20 scans.
+    pub(crate) fn on_the_spot(seed: u64, count: usize, deg_per_s: f64) -> Drive {
+        let mut drive = Drive::begin(seed, 361, 0.01);
+        drive.furnish();
+        let mut place = Rigid::new(0.0, 0.0, TAU * drive.random.f64());
+        for number in 0..count + 20 {
+            drive.look(place);
+            let turn = if number < count { (deg_per_s * PERIOD_S).to_radians() } else { 0.0 };
+            place = place.then(&Rigid::new(0.0, 0.0, turn));
+        }
+        drive
+    }
+
+    fn furnish(&mut self) {
+        let Drive { random, walls, legs, .. } = self;
+        let free = |random: &mut Rng| loop {
+            let at = (10.0 * (random.f64() - 0.5), 7.0 * (random.f64() - 0.5));
+            if at.0.hypot(at.1) > 3.0 {
+                return at;
+            }
+        };
+        for _ in 0..5 {
+            let (at, yaw) = (free(random), PI * random.f64());
+            let table = Rigid::new(at.0, at.1, yaw);
+            let corners = |long: f64, wide: f64| [(long, wide), (-long, wide), (-long, -wide), (long, -wide)];
+            legs.extend(corners(0.7, 0.38).map(|corner| (table.point(corner), 0.025)));
+            for side in [-1.0, 1.0] {
+                let chair = table.then(&Rigid::new(0.6 * (random.f64() - 0.5), side * 0.7, random.f64()));
+                legs.extend(corners(0.2, 0.2).map(|corner| (chair.point(corner), 0.012)));
+            }
+        }
+        for _ in 0..3 {
+            legs.push((free(random), 0.08 + 0.2 * random.f64()));
+            walls.extend(boxed(free(random), (0.9, 0.45), FRAC_PI_2 * f64::from(random.u8(..4))));
+        }
+    }
+
     fn add_walker(&mut self) {
         let at = (1.2 + 2.0 * self.random.f64(), TAU * self.random.f64());
         let way = (TAU * self.random.f64()).sin_cos();
@@ -188,6 +258,7 @@ impl Drive {
             places: Vec::new(),
             people: Vec::new(),
             walls,
+            legs: Vec::new(),
             walkers: Vec::new(),
             head: match beams {
                 // As many scans a second as an LMS has.
@@ -208,7 +279,7 @@ impl Drive {
             self.look(place);
             turn = f64::clamp(turn + 0.01 * (self.random.f64() - 0.5), -0.03, 0.03);
             let is_far = place.x.hypot(place.y) > 1.3;
-            let home = ((-place.y).atan2(-place.x) - place.yaw).sin();
+            let home = Rigid::new(0.0, 0.0, (-place.y).atan2(-place.x) - place.yaw).yaw.clamp(-1.0, 1.0);
             place = place.then(&Rigid::new(speed, 0.0, if is_far { 0.04 * home } else { turn }));
         }
     }
@@ -219,9 +290,11 @@ impl Drive {
         (0..count).for_each(|_| self.look(place));
     }
 
-    /// One scan more, from `place`.
+    /// One scan more, which ends at `place`. The robot moves there from its last place while the scan is measured.
     fn look(&mut self, place: Rigid) {
-        let Drive { walls, walkers, head, noise_m, random, .. } = self;
+        let Drive { walls, legs, walkers, head, noise_m, random, places, .. } = self;
+        let before = places.last().copied().unwrap_or(place);
+        let times = Scan::of(*head, &[]);
         for walker in walkers.iter_mut() {
             walker.at = (walker.at.0 + walker.by_scan.0, walker.at.1 + walker.by_scan.1);
             // Nobody walks into the robot, and nobody goes far.
@@ -233,11 +306,15 @@ impl Drive {
             }
         }
         let mut met = Vec::new();
+        let mut beam = 0;
         let scan = scan(*head, |angle| {
+            let place = place_of(&before, &place, &times, beam);
+            beam += 1;
             let (sin, cos) = (place.yaw + angle).sin_cos();
             let (from, along) = ((place.x, place.y), (cos, sin));
-            let wall =
-                walls.iter().filter_map(|wall| to_wall(from, along, wall)).fold(f64::INFINITY, f64::min);
+            let wall = walls.iter().filter_map(|wall| to_wall(from, along, wall));
+            let legs = legs.iter().filter_map(|(at, radius)| to_disc(from, along, *at, *radius));
+            let wall = wall.chain(legs).fold(f64::INFINITY, f64::min);
             let discs = walkers.iter().filter_map(|walker| to_disc(from, along, walker.at, 0.2));
             let disc = discs.fold(f64::INFINITY, f64::min);
             met.push(disc < wall);
