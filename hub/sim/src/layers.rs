@@ -15,8 +15,8 @@ pub struct Layers {
     /// stood still 316 of 348 beams were never off by 30 mm, and 22 more often than in one scan of a hundred: the tail
     /// belongs to a few beams.
     pub tail: f64,
-    /// Whether a beam is as wide as a real one: on two surfaces it reports one, the other or a value between, or too
-    /// weak a signal if they are far apart. Else it is a line without width.
+    /// Whether a beam is as wide as a real one. On two surfaces, it then reports one, the other or a value between. If they
+    /// are far apart, it reports one, the other or too weak a signal. Without the layer, a beam is a line without width.
     pub spot: bool,
     /// Share of the beams that report a code although they could report a range.
     pub errors: f64,
@@ -63,11 +63,11 @@ impl Default for Layers {
 /// they were.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct BeamRng {
-    /// Where in its step the mirror was, standard normal.
+    /// Deviation of the beam's direction, standard normal.
     pub(crate) mirror: f64,
-    /// Which surface a spot on two of them tells, 0 to 1.
+    /// Selects the surface that the scanner reports if a spot is on two of them, 0 to 1.
     pub(crate) surface: f64,
-    /// How far between them, 0 to 1.
+    /// Selects whether the scanner reports a value between them instead, 0 to 1.
     pub(crate) between: f64,
     /// Whether a signal is too weak, 0 to 1.
     pub(crate) weak: f64,

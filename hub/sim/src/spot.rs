@@ -1,5 +1,6 @@
 //! The echo of one beam, computed from the rays that its spot covers. If they hit two surfaces, the scanner reports one of
-//! them, or a value between them.
+//! them, or, if they are not far apart, a value between them. That value follows the share of the light on each surface, so
+//! it hardly changes from scan to scan. `cargo run --release -p scanhub-sim --example edges` measures it.
 
 use crate::labeled_scan::Met;
 use crate::layers::BeamRng;
@@ -79,7 +80,7 @@ pub(crate) fn echo(view: &View, angle_mdeg: i32, wide: bool, dice: &BeamRng) -> 
         bright,
         edge: dull
             && spread.iter().any(|part| (part.hit.range_mm - spread[0].hit.range_mm).abs() > CONTINUOUS_MM),
-        torn: dull && far.is_some_and(|far| far.1 - nearest_mm > TORN_MM),
+        torn: dull && far.is_some_and(|far| far.1 - nearest_mm > MERGED_MM),
         met: met(parts),
     }
 }
@@ -89,7 +90,8 @@ fn heaviest<'a>(parts: impl Iterator<Item = &'a Part<'a>>) -> Option<(Option<&'a
     parts.max_by(|a, b| a.echo().total_cmp(&b.echo())).map(|part| (part.face, part.hit.range_mm))
 }
 
-/// What a spot on a `near` and perhaps a `far` face tells, the nearer one having `share` of its light.
+/// Returns the face and the range that the scanner reports for a spot on a `near` and perhaps a `far` face. The nearer one
+/// has `share` of the light.
 fn told<'a>(
     near: Option<(Option<&'a Face>, f64)>,
     far: Option<(Option<&'a Face>, f64)>,
@@ -100,9 +102,9 @@ fn told<'a>(
     let Some(far) = far else { return near };
     let leans = (share - 0.5) / (1.0 - 2.0 * CLEAR) + 0.5;
     let tells = if dice.surface < leans { near } else { far };
-    let undecided = (0.0..1.0).contains(&leans) && far.1.is_finite();
-    if undecided && dice.between < MIXED {
-        (tells.0, near.1 + (far.1 - near.1) * dice.between / MIXED)
+    let depth_mm = far.1 - near.1;
+    if (0.0..1.0).contains(&leans) && depth_mm <= MERGED_MM && dice.between < MIXED {
+        (tells.0, far.1 - depth_mm * leans)
     } else {
         tells
     }
@@ -182,20 +184,23 @@ fn signal(face: &Face, range_mm: f64, angle_mdeg: i32) -> f64 {
 /// Diameter of the spot at the window, and what it grows with each millimetre of range.
 const SPOT_MM: f64 = 10.0;
 const SPOT_PER_MM: f64 = 0.0045;
-/// How unsteady the mirror is, in rays: 0.02 degrees. So the share of a surface at an edge is another one each turn.
-const MIRROR_STEPS: f64 = 0.32;
+/// Standard deviation of a beam's direction, in rays: 0.01 degrees. In recordings, the value between two surfaces has a
+/// standard deviation of 0.05 of their distance at most edges.
+const MIRROR_STEPS: f64 = 0.16;
 /// Surfaces nearer to each other than this are one to the sensor, such as the two sides of a corner.
 const CONTINUOUS_MM: f64 = 40.0;
-/// Surfaces further apart than this can cost the beam its signal.
-const TORN_MM: f64 = 300.0;
+/// Maximum distance of two surfaces whose echoes the scanner takes for one. It separates the echoes of surfaces that are
+/// farther apart, or loses them. Recordings have hardly any value between for edges deeper than 1.25 m, and hardly any lost
+/// beam for edges below 1 m.
+const MERGED_MM: f64 = 1_000.0;
 /// How much brighter a reflector is than other surfaces: in recordings beams that only touch one tell its range.
 const OUTSHINES: f64 = 100.0;
 /// A surface with less than this share of the light is never told.
 const CLEAR: f64 = 0.17;
 /// Share of the beams on a faint surface that come back.
 const FAINT_RETURNS: f64 = 0.15;
-/// Share of the undecided readings that lie between the surfaces: two pulses that the sensor takes for one.
-const MIXED: f64 = 0.3;
+/// Share of the readings between two surfaces whose echoes the scanner takes for one.
+const MIXED: f64 = 0.9;
 
 #[cfg(test)]
 mod tests {
@@ -225,23 +230,44 @@ mod tests {
         }
     }
 
+    /// A person whose right edge is `edge_x` to the right of the beam at 0 degrees, 3 m ahead, before a wall at `far_y`.
+    fn edge(edge_x: f64, far_y: f64) -> View {
+        view(&[
+            (wall(-2_000.0, edge_x, 3_000.0), Surface::Plain, Kind::Person),
+            (wall(-2_000.0, 2_000.0, far_y), Surface::Plain, Kind::Static),
+        ])
+    }
+
     #[test]
-    fn an_edge_tells_one_the_other_or_between_and_is_grazed_if_somebody_makes_it() {
-        let edge = [
-            (wall(-2_000.0, 1.0, 3_000.0), Surface::Plain, Kind::Person),
-            (wall(-2_000.0, 2_000.0, 4_000.0), Surface::Plain, Kind::Static),
-        ];
-        let view = view(&edge);
-        let told = |surface, between| {
-            let dice = BeamRng { surface, between, ..DICE };
-            let echo = echo(&view, 0, true, &dice);
-            assert!(echo.torn && echo.met == Met::Grazed, "{echo:?}");
+    fn an_edge_reports_one_the_other_or_a_value_between_and_is_grazed_if_a_person_makes_it() {
+        let range = |far_y, surface, between| {
+            let echo = echo(&edge(1.0, far_y), 0, true, &BeamRng { surface, between, ..DICE });
+            assert!(echo.torn == (far_y > 4_000.0) && echo.met == Met::Grazed, "{echo:?}");
             echo.range_mm.round()
         };
-        assert_eq!((told(0.1, 0.9), told(0.9, 0.9), told(0.1, MIXED / 2.0)), (3_000.0, 4_000.0, 3_500.0));
+        assert_eq!((range(3_990.0, 0.1, MIXED), range(3_990.0, 0.9, MIXED)), (3_000.0, 3_990.0));
+        assert!((3_100.0..3_900.0).contains(&range(3_990.0, 0.1, 0.0)));
+        assert_eq!((range(4_010.0, 0.1, 0.0), range(4_010.0, 0.9, 0.0)), (3_000.0, 4_010.0));
+        let view = edge(1.0, 4_000.0);
         assert_eq!(echo(&view, 0, false, &DICE).range_mm.round(), 3_000.0);
         assert_eq!(echo(&view, 2_000, true, &DICE).met, Met::Person);
         assert_eq!(echo(&view, -2_000, true, &DICE).met, Met::Static { since_ns: 0 });
+    }
+
+    #[test]
+    fn the_value_between_follows_the_share_of_the_light_and_stays_in_place() {
+        let range = |edge_x, mirror| {
+            let dice = BeamRng { mirror, between: 0.0, ..DICE };
+            echo(&edge(edge_x, 3_800.0), 0, true, &dice).range_mm
+        };
+        // Rays are 3.3 mm apart there.
+        let ranges = [-9.0, -6.0, -2.0, 1.0, 4.0, 7.0, 10.0].map(|edge_x| range(edge_x, 0.0));
+        assert!(ranges.windows(2).all(|pair| pair[0] >= pair[1]), "{ranges:?}");
+        let is_between = |range: &&f64| (3_040.0..3_760.0).contains(*range);
+        assert!(ranges.iter().filter(is_between).count() >= 2, "{ranges:?}");
+        assert_eq!((ranges[0].round(), ranges[6].round()), (3_800.0, 3_000.0));
+        let spread = (range(1.0, 1.0) - range(1.0, -1.0)).abs() / 2.0 / 800.0;
+        assert!((0.03..0.07).contains(&spread), "{spread}");
     }
 
     #[test]

@@ -1,0 +1,174 @@
+//! Values between two surfaces at edges, in simulated scans. The table of docs/worlds.md has the same figures of recordings:
+//! `cargo run --release -p scanhub-sim --example edges -- WORLD..`
+//! World `board` is a board in front of a wall.
+//!
+//! At an edge, three beams in a row are on one surface and three on another one. Between them are at most [`MOST`] beams, all
+//! of them with values between. Beams without width would have other values there: an oblique surface is no edge.
+
+use std::collections::BTreeMap;
+use std::ops::Range;
+
+use scanhub_drivers::lms::variant::{Mode, Unit, Variant};
+use sim::labeled_scan::Met;
+use sim::layers::Layers;
+use sim::room::Room;
+
+/// An edge in a scan.
+struct Edge {
+    /// Index of the first beam behind the last one of the first surface.
+    beam: usize,
+    /// Index of the last beam on the nearer side of the edge.
+    near: usize,
+    /// For each value between, its share of the way from the nearer surface to the farther one.
+    between: Vec<f64>,
+}
+
+/// Finds the edges in the scan `ranges`, in millimeters. A code is `None`.
+fn edges(ranges: &[Option<f64>]) -> Vec<Edge> {
+    let surface = |beams: Range<usize>| -> Option<()> {
+        let ranges = ranges.get(beams)?.iter().copied().collect::<Option<Vec<f64>>>()?;
+        ranges.windows(2).all(|pair| (pair[0] - pair[1]).abs() < MARGIN_MM).then_some(())
+    };
+    let edge = |beam: usize| -> Option<Edge> {
+        surface(beam.checked_sub(RUN)?..beam)?;
+        let one = ranges[beam - 1]?;
+        (0..=MOST).find_map(|count| {
+            let other = ranges.get(beam + count).copied().flatten()?;
+            let between = ranges[beam..beam + count].iter().copied().collect::<Option<Vec<f64>>>()?;
+            let (near, far) = (one.min(other), one.max(other));
+            let is_between = |range: &f64| near + MARGIN_MM < *range && *range < far - MARGIN_MM;
+            surface(beam + count..beam + count + RUN)?;
+            (DEPTHS_MM.contains(&(far - near)) && between.iter().all(is_between)).then(|| Edge {
+                beam,
+                near: if one < other { beam - 1 } else { beam + count },
+                between: between.iter().map(|range| (range - near) / (far - near)).collect(),
+            })
+        })
+    };
+    (0..ranges.len()).filter_map(edge).collect()
+}
+
+/// Edges, those with a value between, and those with several.
+#[derive(Default)]
+struct Counts {
+    all: u32,
+    one: u32,
+    several: u32,
+}
+
+impl Counts {
+    fn add(&mut self, edge: &Edge) {
+        self.all += 1;
+        self.one += u32::from(!edge.between.is_empty());
+        self.several += u32::from(edge.between.len() > 1);
+    }
+
+    fn row(&self) -> String {
+        let percent = |count| 100.0 * f64::from(count) / f64::from(self.all.max(1));
+        format!("{} | {:.1} % | {:.1} %", self.all, percent(self.one), percent(self.several))
+    }
+}
+
+/// Median of the standard deviations of the values between, of edges that have one at the same beam in a tenth of the scans.
+fn spread(places: &BTreeMap<(u64, usize, usize), Vec<f64>>) -> f64 {
+    let often = places.values().filter(|shares| shares.len() >= SCANS as usize / 10);
+    let mut deviations: Vec<f64> = often
+        .map(|shares| {
+            let mean = shares.iter().sum::<f64>() / shares.len() as f64;
+            (shares.iter().map(|share| (share - mean).powi(2)).sum::<f64>() / shares.len() as f64).sqrt()
+        })
+        .collect();
+    deviations.sort_unstable_by(f64::total_cmp);
+    deviations.get(deviations.len() / 2).copied().unwrap_or(f64::NAN)
+}
+
+/// What the scans of a world have.
+#[derive(Default)]
+struct World {
+    all: Counts,
+    /// Edges whose nearer side is a leg of a person.
+    legs: Counts,
+    /// For each seed, sensor and beam, the values between at an edge that does not move, if there is one each.
+    places: BTreeMap<(u64, usize, usize), Vec<f64>>,
+}
+
+impl World {
+    fn measure(world: &sim::world::World) -> World {
+        let mut found = World::default();
+        let layers = Layers { spot: false, ..world.layers().unwrap_or_default() };
+        let without_width = world.clone().with_layers(layers);
+        for seed in 1..=SEEDS {
+            for sensor in 0..world.sensors() {
+                let [wide, narrow] =
+                    [world, &without_width].map(|world| Room::of_port(world, seed, sensor as u64));
+                for scan in 1..=SCANS {
+                    let end_ns = SPACING * scan * SCAN_NS;
+                    let look = wide.labeled_scan(Variant::HALF, Unit::Mm, Mode(1), end_ns);
+                    let ranges = ranges_mm(&look.words);
+                    let exact = ranges_mm(&narrow.scan(Variant::HALF, Unit::Mm, Mode(1), end_ns));
+                    let is_off = |beam: usize| {
+                        let pair = ranges[beam].zip(exact[beam]);
+                        pair.is_none_or(|(range, exact)| (range - exact).abs() > MARGIN_MM)
+                    };
+                    let is_mixed = |edge: &Edge| (edge.beam..edge.beam + edge.between.len()).all(is_off);
+                    for edge in edges(&ranges).into_iter().filter(is_mixed) {
+                        found.all.add(&edge);
+                        if look.truth[edge.near] == Met::Person {
+                            found.legs.add(&edge);
+                        } else if let [share] = edge.between[..] {
+                            found.places.entry((seed, sensor, edge.beam)).or_default().push(share);
+                        }
+                    }
+                }
+            }
+        }
+        found
+    }
+}
+
+fn main() {
+    let names: Vec<String> = std::env::args().skip(1).collect();
+    let names = if names.is_empty() { USUAL.map(str::to_owned).to_vec() } else { names };
+    println!(
+        "| world | edges | with a value between | with several | of legs | with one | with several | spread |"
+    );
+    println!("|---|---|---|---|---|---|---|---|");
+    for name in names {
+        let world: Result<sim::world::World, _> = match &*name {
+            "board" => sim::world::World::of_toml(&name, BOARD),
+            _ => name.parse(),
+        };
+        let world = world.unwrap_or_else(|failure| panic!("{failure}"));
+        let found = World::measure(&world);
+        let (all, legs, spread) = (found.all.row(), found.legs.row(), spread(&found.places));
+        println!("| {name} | {all} | {legs} | {spread:.3} |");
+    }
+}
+
+/// Ranges in millimeters of the value words of mode 1. A code is `None`.
+fn ranges_mm(words: &[u16]) -> Vec<Option<f64>> {
+    words.iter().map(|word| Some(word & 8191).filter(|range| *range < 8183).map(f64::from)).collect()
+}
+
+const USUAL: [&str; 5] = ["board", "room", "crowd", "house", "demo"];
+/// A board in front of a wall.
+const BOARD: &str = "
+[[thing]]
+line = [[-6000, 3500], [6000, 3500]]
+[[thing]]
+line = [[-300, 0], [300, 0]]
+pose = [0, 2800]
+jitter_mm = 200
+";
+const DEPTHS_MM: std::ops::RangeInclusive<f64> = 300.0..=1_500.0;
+/// Beams in a row that make a surface, and the maximum distance of neighbors. Values between are farther from both surfaces.
+const RUN: usize = 3;
+const MARGIN_MM: f64 = 60.0;
+/// Maximum number of values between.
+const MOST: usize = 3;
+/// Number of seeds, and of scans for each of them and each sensor: 53 s.
+const SEEDS: u64 = 20;
+const SCANS: u64 = 200;
+/// Number of scans from one that is measured to the next one, and the time of one.
+const SPACING: u64 = 10;
+const SCAN_NS: u64 = 26_640_000;
