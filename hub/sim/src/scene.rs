@@ -158,9 +158,19 @@ pub(crate) struct Plan {
 pub(crate) enum Way {
     /// A closed curve within `reach` of `centre` that the seed selects.
     Roam { centre: Point, reach: Point },
-    /// A polyline of corners, with a rest at each, in seconds. After the last corner, the person disappears, or walks
-    /// to the first corner if the path `repeats`.
-    Path { corners: Vec<(Point, f64)>, speed: Speed, repeats: bool },
+    /// A polyline of corners, with a rest at each. After the last corner, the person disappears, or walks to the first
+    /// corner if the path `repeats`.
+    Path { corners: Vec<Corner>, speed: Speed, repeats: bool },
+}
+
+/// A corner of a path.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(crate) struct Corner {
+    pub(crate) point: Point,
+    /// Time that the person spends there, in seconds.
+    pub(crate) rest_s: f64,
+    /// Direction that the person faces if they sit there, in degrees counterclockwise from x.
+    pub(crate) seat_deg: Option<f64>,
 }
 
 /// Speed of a person on a path.
@@ -189,7 +199,22 @@ enum Course {
     Roam { centre: Point, reach: Point, pace: Point, phase: Point },
     /// Time, position and distance walked at each corner, before and after the rest. If the path `repeats`, those of
     /// one lap.
-    Path { knots: Vec<(f64, Point, f64)>, repeats: bool },
+    Path { knots: Vec<(f64, Point, f64)>, seats: Vec<Seat>, repeats: bool },
+}
+
+/// A rest during which a person sits.
+#[derive(Clone, Copy, Debug)]
+struct Seat {
+    from_s: f64,
+    until_s: f64,
+    faces_deg: f64,
+}
+
+impl Seat {
+    /// Returns how far the person sits at `time_s`: 0 if they stand, 1 if they sit.
+    fn share(&self, time_s: f64) -> f64 {
+        ((time_s - self.from_s).min(self.until_s - time_s) / SIT_DOWN_S).clamp(0.0, 1.0)
+    }
 }
 
 /// Pose of a body.
@@ -199,6 +224,8 @@ struct BodyPose {
     ahead: Point,
     /// Number of double steps so far.
     step: f64,
+    /// 0 if the person stands or walks, 1 if they sit, and a value between while they sit down or stand up.
+    seated: f64,
 }
 
 impl Person {
@@ -215,24 +242,25 @@ impl Person {
             }
             Way::Path { ref corners, speed, repeats } => {
                 let mut corners = corners.clone();
-                for (point, _) in &mut corners {
-                    *point = jittered(*point, jitter_mm, random);
+                for corner in &mut corners {
+                    corner.point = jittered(corner.point, jitter_mm, random);
                 }
                 if repeats {
-                    corners.push((corners[0].0, 0.0));
+                    corners.push(Corner { rest_s: 0.0, seat_deg: None, ..corners[0] });
                 }
-                let rest_s: f64 = corners.iter().map(|corner| corner.1).sum();
-                let length: f64 = corners.windows(2).map(|pair| distance(pair[0].0, pair[1].0)).sum();
+                let rest_s: f64 = corners.iter().map(|corner| corner.rest_s).sum();
+                let length = length(&corners);
                 let speed = match speed {
                     Speed::Between(slowest, fastest) => slowest + (fastest - slowest) * random.f64(),
                     Speed::InTime => length / (until_s - from_s - rest_s),
                 };
-                Course::Path { knots: course(&corners, from_s, speed), repeats }
+                let knots = course(&corners, from_s, speed);
+                Course::Path { seats: seats(&corners, &knots), knots, repeats }
             }
         };
         // A person with a speed disappears at the end of the path.
         let until_s = match (&plan.way, &course) {
-            (Way::Path { speed: Speed::Between(..), .. }, Course::Path { knots, repeats: false }) => {
+            (Way::Path { speed: Speed::Between(..), .. }, Course::Path { knots, repeats: false, .. }) => {
                 knots.last().map_or(until_s, |knot| knot.0)
             }
             _ => until_s,
@@ -252,11 +280,13 @@ impl Person {
         let [left, right] = self.legs_of(&stand);
         let part = |shape, from_mm, to_mm| (shape, Heights { from_mm, to_mm });
         let upper = |radius| Shape::Post { centre: stand.place, radius };
+        let [crotch, neck, crown] =
+            [CROTCH_MM, NECK_MM, CROWN_MM].map(|height| height - stand.seated * (CROTCH_MM - SEAT_MM));
         Some([
-            part(left, 0.0, CROTCH_MM),
-            part(right, 0.0, CROTCH_MM),
-            part(upper(TRUNK_MM), CROTCH_MM, NECK_MM),
-            part(upper(HEAD_MM), NECK_MM, CROWN_MM),
+            part(left, 0.0, crotch),
+            part(right, 0.0, crotch),
+            part(upper(TRUNK_MM), crotch, neck),
+            part(upper(HEAD_MM), neck, crown),
         ])
     }
 
@@ -265,14 +295,17 @@ impl Person {
     }
 
     fn legs_of(&self, stand: &BodyPose) -> [Shape; 2] {
-        let BodyPose { place, ahead, step } = *stand;
-        let stride = STRIDE_MM * (TAU * (step + self.phase)).sin();
-        [1.0, -1.0].map(|side| Shape::Post {
-            centre: (
-                place.0 + side * (stride * ahead.0 - HIP_MM * ahead.1),
-                place.1 + side * (stride * ahead.1 + HIP_MM * ahead.0),
-            ),
-            radius: self.leg_mm,
+        let BodyPose { place, ahead, step, seated } = *stand;
+        let stride = (1.0 - seated) * STRIDE_MM * (TAU * (step + self.phase)).sin();
+        [1.0, -1.0].map(|side| {
+            let (along, aside) = (seated * FEET_AHEAD_MM + side * stride, side * HIP_MM);
+            Shape::Post {
+                centre: (
+                    place.0 + along * ahead.0 - aside * ahead.1,
+                    place.1 + along * ahead.1 + aside * ahead.0,
+                ),
+                radius: self.leg_mm,
+            }
         })
     }
 }
@@ -286,9 +319,9 @@ impl Course {
                 let (sin_y, cos_y) = turn(pace.1, phase.1);
                 let heading = (pace.0 * reach.0 * cos_x, pace.1 * reach.1 * cos_y);
                 let place = (centre.0 + reach.0 * sin_x, centre.1 + reach.1 * sin_y);
-                BodyPose { place, ahead: unit(heading), step: STEPS_HZ * time_s }
+                BodyPose { place, ahead: unit(heading), step: STEPS_HZ * time_s, seated: 0.0 }
             }
-            Course::Path { knots, repeats } => {
+            Course::Path { knots, seats, repeats } => {
                 let (first, last) = (knots[0], knots[knots.len() - 1]);
                 let lap_s = last.0 - first.0;
                 let laps = if *repeats { ((time_s - first.0) / lap_s).floor() } else { 0.0 };
@@ -296,15 +329,23 @@ impl Course {
                 let next = knots.partition_point(|knot| knot.0 <= time_s).clamp(1, knots.len() - 1);
                 let ((t0, a, s0), (t1, b, s1)) = (knots[next - 1], knots[next]);
                 let share = if t1 > t0 { ((time_s - t0) / (t1 - t0)).min(1.0) } else { 1.0 };
-                // A person who rests looks along the path, and at its end back to where the path came from.
-                let mut legs = knots[next - 1..].windows(2).chain(knots.windows(2).rev());
-                let ahead = legs.find(|pair| pair[0].1 != pair[1].1);
+                let seat = seats.iter().find(|seat| (seat.from_s..seat.until_s).contains(&time_s));
+                // A person who rests looks along the path, and at its end back to where the path came from. A person
+                // who sits down turns from where they came, and only then to where they go.
+                let came = seat.is_some_and(|seat| time_s < (seat.from_s + seat.until_s) / 2.0);
+                let before = || knots[..next].windows(2).rev();
+                let after = || knots[next - 1..].windows(2);
+                let is_way = |pair: &&[(f64, Point, f64)]| pair[0].1 != pair[1].1;
+                let leg = if came { before().find(is_way) } else { None };
+                let leg = leg.or_else(|| after().chain(knots.windows(2).rev()).find(is_way));
                 let ahead =
-                    ahead.map_or((0.0, 1.0), |pair| (pair[1].1.0 - pair[0].1.0, pair[1].1.1 - pair[0].1.1));
+                    leg.map_or((0.0, 1.0), |pair| (pair[1].1.0 - pair[0].1.0, pair[1].1.1 - pair[0].1.1));
+                let seated = seat.map_or(0.0, |seat| seat.share(time_s));
                 BodyPose {
                     place: (a.0 + (b.0 - a.0) * share, a.1 + (b.1 - a.1) * share),
-                    ahead: unit(ahead),
+                    ahead: seat.map_or(unit(ahead), |seat| turned(ahead, seat.faces_deg, seated)),
                     step: (laps * last.2 + s0 + (s1 - s0) * share) / DOUBLE_STEP_MM,
+                    seated,
                 }
             }
         }
@@ -313,11 +354,11 @@ impl Course {
 
 /// Returns time, position and distance walked at each corner, before and after the rest, for a person who starts at
 /// `from_s`.
-fn course(corners: &[(Point, f64)], from_s: f64, speed: f64) -> Vec<(f64, Point, f64)> {
+fn course(corners: &[Corner], from_s: f64, speed: f64) -> Vec<(f64, Point, f64)> {
     let (mut time_s, mut walked) = (from_s, 0.0);
-    let mut before = corners[0].0;
+    let mut before = corners[0].point;
     let mut knots = Vec::new();
-    for &(point, rest_s) in corners {
+    for &Corner { point, rest_s, .. } in corners {
         let way = distance(before, point);
         walked += way;
         time_s += if way > 0.0 { way / speed } else { 0.0 };
@@ -327,6 +368,32 @@ fn course(corners: &[(Point, f64)], from_s: f64, speed: f64) -> Vec<(f64, Point,
         before = point;
     }
     knots
+}
+
+/// Returns the seats at `corners`, which a person passes at the times of `knots`. A person with one corner always sits.
+fn seats(corners: &[Corner], knots: &[(f64, Point, f64)]) -> Vec<Seat> {
+    let pairs = corners.iter().zip(knots.chunks(2));
+    let seat = |(corner, knots): (&Corner, &[(f64, Point, f64)])| {
+        let (from_s, until_s) = match corners.len() {
+            1 => (f64::NEG_INFINITY, f64::INFINITY),
+            _ => (knots[0].0, knots[1].0),
+        };
+        corner.seat_deg.map(|faces_deg| Seat { from_s, until_s, faces_deg })
+    };
+    pairs.filter_map(seat).collect()
+}
+
+/// Returns the length of the path through `corners`.
+pub(crate) fn length(corners: &[Corner]) -> f64 {
+    corners.windows(2).map(|pair| distance(pair[0].point, pair[1].point)).sum()
+}
+
+/// Returns the direction of `way`, turned by `share` of the angle to `to_deg`, the shorter way round.
+fn turned(way: Point, to_deg: f64, share: f64) -> Point {
+    let from = way.1.atan2(way.0);
+    let angle = (to_deg.to_radians() - from + TAU / 2.0).rem_euclid(TAU) - TAU / 2.0;
+    let (sin, cos) = (from + share * angle).sin_cos();
+    (cos, sin)
 }
 
 /// Returns `point`, moved by up to `max_mm` along both axes.
@@ -352,6 +419,11 @@ const NECK_MM: f64 = 1_480.0;
 const CROWN_MM: f64 = 1_750.0;
 const TRUNK_MM: f64 = 170.0;
 const HEAD_MM: f64 = 95.0;
+/// Distance of the feet of a person who sits ahead of the body, and height of the seat.
+const FEET_AHEAD_MM: f64 = 300.0;
+const SEAT_MM: f64 = 450.0;
+/// Time in which a person sits down, or stands up.
+pub(crate) const SIT_DOWN_S: f64 = 1.2;
 /// Maximum distance of a foot ahead of the body.
 const STRIDE_MM: f64 = 250.0;
 /// Double steps per second of a person who roams.
@@ -403,6 +475,10 @@ mod tests {
         assert_eq!(thing.left(20.0).iter().map(|s| (s.pose, s.since_s)).collect::<Vec<_>>(), [(HERE, 12.0)]);
     }
 
+    fn corner(x: f64, y: f64, rest_s: f64) -> Corner {
+        Corner { point: (x, y), rest_s, seat_deg: None }
+    }
+
     fn person(way: Way, from_s: f64, until_s: f64) -> Person {
         let plan = Plan { way, from_s, until_s, jitter_mm: 0.0, leg_mm: 60.0 };
         Person::new(&plan, &mut fastrand::Rng::with_seed(1))
@@ -439,7 +515,7 @@ mod tests {
 
     #[test]
     fn person_walks_path_with_rests() {
-        let corners = vec![((0.0, 0.0), 0.0), ((0.0, 2000.0), 3.0), ((1000.0, 2000.0), 0.0)];
+        let corners = vec![corner(0.0, 0.0, 0.0), corner(0.0, 2000.0, 3.0), corner(1000.0, 2000.0, 0.0)];
         let walker = person(
             Way::Path { corners, speed: Speed::Between(500.0, 500.0), repeats: false },
             10.0,
@@ -458,7 +534,7 @@ mod tests {
 
     #[test]
     fn person_walks_repeating_path_forever() {
-        let corners = vec![((0.0, 0.0), 1.0), ((0.0, 2000.0), 3.0)];
+        let corners = vec![corner(0.0, 0.0, 1.0), corner(0.0, 2000.0, 3.0)];
         let walker = person(
             Way::Path { corners, speed: Speed::Between(500.0, 500.0), repeats: true },
             10.0,
@@ -479,20 +555,63 @@ mod tests {
     }
 
     #[test]
+    fn person_sits_down_and_stands_up() {
+        // From (0, 0) to a chair 2 m ahead in 4 s, there for 10 s, and on. The sitter faces left.
+        let seat = Corner { seat_deg: Some(180.0), ..corner(0.0, 2000.0, 10.0) };
+        let corners = vec![corner(0.0, 0.0, 0.0), seat, corner(1000.0, 2000.0, 0.0)];
+        let speed = Speed::Between(500.0, 500.0);
+        let sits = person(Way::Path { corners, speed, repeats: false }, 0.0, f64::INFINITY);
+        let feet = |time_s: f64| sits.legs(time_s).expect("is there").map(|leg| leg.front_of_post());
+        for time_s in [4.0 + SIT_DOWN_S, 9.0, 14.0 - SIT_DOWN_S] {
+            let [left, right] = feet(time_s);
+            assert!(distance(left, (-300.0, 1890.0)) < 1e-6, "{time_s} s: {left:?}");
+            assert!(distance(right, (-300.0, 2110.0)) < 1e-6, "{time_s} s: {right:?}");
+        }
+        // Feet do not jump when the person sits down, and hardly when the person, who stands again, turns to walk on.
+        for tenth in 35..139 {
+            let (before, after) = (feet(f64::from(tenth) / 10.0), feet(f64::from(tenth + 1) / 10.0));
+            let jumps = before.iter().zip(after).map(|(a, b)| distance(*a, b)).fold(0.0, f64::max);
+            assert!(jumps < 150.0, "{jumps} mm at {tenth}");
+        }
+        let crown = |time_s| sits.body(time_s).map(|body| body[3].1.to_mm);
+        assert_eq!((crown(3.0), crown(9.0)), (Some(CROWN_MM), Some(CROWN_MM - 370.0)));
+        // A person with one corner sits all the time.
+        let corners = vec![Corner { rest_s: 0.0, ..seat }];
+        let stays = person(Way::Path { corners, speed: Speed::InTime, repeats: false }, 0.0, 20.0);
+        assert_eq!((stays.legs(0.0), stays.legs(19.9)), (sits.legs(9.0), sits.legs(9.0)));
+    }
+
+    #[test]
+    fn person_sits_down_in_each_lap() {
+        let seat = Corner { seat_deg: Some(-90.0), ..corner(0.0, 2000.0, 5.0) };
+        let way = Way::Path {
+            corners: vec![corner(0.0, 0.0, 0.0), seat],
+            speed: Speed::Between(500.0, 500.0),
+            repeats: true,
+        };
+        let walker = person(way, 10.0, f64::INFINITY);
+        // A lap takes 13 s: 4 s each way and the rest.
+        for lap_s in [0.0, 13.0, 13_000.0] {
+            let share = |time_s| walker.stand(lap_s + time_s).map(|stand| stand.seated);
+            assert_eq!((share(12.0), share(16.5), share(20.0)), (Some(0.0), Some(1.0), Some(0.0)));
+        }
+    }
+
+    #[test]
     fn person_stands_or_arrives_in_time() {
         let stands = person(
-            Way::Path { corners: vec![((5.0, 7.0), 0.0)], speed: Speed::InTime, repeats: false },
+            Way::Path { corners: vec![corner(5.0, 7.0, 0.0)], speed: Speed::InTime, repeats: false },
             0.0,
             20.0,
         );
         assert_eq!(stands.legs(0.0), stands.legs(19.9));
         assert!(stands.legs(20.0).is_none());
-        let corners = vec![((0.0, 0.0), 1.0), ((0.0, 2000.0), 0.0)];
+        let corners = vec![corner(0.0, 0.0, 1.0), corner(0.0, 2000.0, 0.0)];
         let walks = person(Way::Path { corners, speed: Speed::InTime, repeats: false }, 2.0, 7.0);
         assert!(distance(body(&walks, 5.0), (0.0, 1000.0)) < 1.0);
         assert!(walks.legs(6.99).is_some() && walks.legs(7.0).is_none());
         // No way at all is in time as well.
-        let corners = vec![((5.0, 7.0), 1.0), ((5.0, 7.0), 0.0)];
+        let corners = vec![corner(5.0, 7.0, 1.0), corner(5.0, 7.0, 0.0)];
         let waits = person(Way::Path { corners, speed: Speed::InTime, repeats: false }, 2.0, 7.0);
         assert_eq!((waits.legs(2.0), waits.legs(7.0)), (waits.legs(6.99), None));
         assert_eq!(body(&waits, 6.99), (5.0, 7.0));

@@ -14,7 +14,7 @@ use toml::Spanned;
 
 use crate::layers::Layers;
 use crate::mount::{Fault, FaultKind, Mount};
-use crate::scene::{Move, Plan, Scene, Sensor, Speed, Sun, Surface, Thing, Way, distance};
+use crate::scene::{Corner, Move, Plan, SIT_DOWN_S, Scene, Sensor, Speed, Sun, Surface, Thing, Way, length};
 use crate::shape::{Heights, Point, Pose, Shape};
 
 /// The surroundings of the simulated scanners.
@@ -377,17 +377,30 @@ impl PersonFile {
                 return Err(origin.refuse(span, "a person with no path, or with two", remedy));
             }
         };
-        let corner = |values: &Vec<Number>| match values[..] {
-            [x, y] => Some(((x.0, y.0), 0.0)),
-            [x, y, rest_s] if rest_s.0 >= 0.0 => Some(((x.0, y.0), rest_s.0)),
-            _ => None,
+        let corner = |values: &Vec<Number>| {
+            let (&[x, y], rest) = values.split_first_chunk()?;
+            let (rest_s, seat_deg) = match rest {
+                [] => (0.0, None),
+                [rest_s] => (rest_s.0, None),
+                [rest_s, seat_deg] => (rest_s.0, Some(seat_deg.0)),
+                _ => return None,
+            };
+            (rest_s >= 0.0).then_some(Corner { point: (x.0, y.0), rest_s, seat_deg })
         };
         let corners = path.get_ref().iter().map(corner).collect::<Option<Vec<_>>>();
         let Some(corners) = corners.filter(|corners| !corners.is_empty()) else {
-            let remedy = "path = [[x, y], [x, y, seconds of rest], ..] in millimetres";
+            let remedy = "path = [[x, y], [x, y, seconds of rest], [x, y, seconds, degrees that a sitter faces], ..] \
+                          in millimetres";
             return Err(origin.refuse(path.span(), "a path without points", remedy));
         };
-        let rest_s: f64 = corners.iter().map(|corner| corner.1).sum();
+        let is_short = |corner: &&Corner| corner.seat_deg.is_some() && corner.rest_s < 2.0 * SIT_DOWN_S;
+        if let Some(corner) = corners.iter().find(is_short).filter(|_| corners.len() > 1) {
+            let what = format!("a person who sits for {} s", corner.rest_s);
+            let least_s = 2.0 * SIT_DOWN_S;
+            let remedy = format!("{least_s} s or more: to sit down and to stand up take {SIT_DOWN_S} s each");
+            return Err(origin.refuse(path.span(), what, remedy));
+        }
+        let rest_s: f64 = corners.iter().map(|corner| corner.rest_s).sum();
         if corners.len() > 1 && rest_s >= until_s - from_s {
             let what = format!("{rest_s} s of rest from {from_s} s until {until_s} s");
             return Err(origin.refuse(path.span(), what, "rests that leave time to walk"));
@@ -413,8 +426,7 @@ impl PersonFile {
             }
         };
         let repeats = self.repeat.as_ref().filter(|repeat| *repeat.get_ref());
-        let length: f64 = corners.windows(2).map(|pair| distance(pair[0].0, pair[1].0)).sum();
-        if let Some(repeat) = repeats.filter(|_| speed == Speed::InTime || length == 0.0) {
+        if let Some(repeat) = repeats.filter(|_| speed == Speed::InTime || length(&corners) == 0.0) {
             let remedy = "repeat = true only beside a path with several corners and speed_mm_s";
             return Err(origin.refuse(repeat.span(), "a path that cannot be walked again and again", remedy));
         }

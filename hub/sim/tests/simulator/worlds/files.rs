@@ -147,6 +147,16 @@ fn what_is_no_world_is_refused_by_name_place_and_remedy() {
             "time to walk",
         ),
         (
+            "[[person]]\npath = [[0, 0, 1, 90, 2]]\nuntil_s = 3",
+            "w.toml:2:8: a path without points",
+            "[x, y, seconds, degrees that a sitter faces]",
+        ),
+        (
+            "[[person]]\npath = [[0, 0], [1, 1, 2.3, 90]]\nspeed_mm_s = 900",
+            "w.toml:2:8: a person who sits for 2.3 s",
+            "2.4 s or more",
+        ),
+        (
             "[[person]]\npath = [[0, 0], [1, 1]]\nspeed_mm_s = [9, 1]",
             "w.toml:3:14: speed",
             "the slower one first",
