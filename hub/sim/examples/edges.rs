@@ -70,7 +70,7 @@ impl Counts {
 }
 
 /// Median of the standard deviations of the values between, of edges that have one at the same beam in a tenth of the scans.
-fn spread(places: &BTreeMap<(u64, usize, usize), Vec<f64>>) -> f64 {
+fn spread(places: &BTreeMap<(u64, usize, usize), Vec<f64>>) -> String {
     let often = places.values().filter(|shares| shares.len() >= SCANS as usize / 10);
     let mut deviations: Vec<f64> = often
         .map(|shares| {
@@ -79,7 +79,7 @@ fn spread(places: &BTreeMap<(u64, usize, usize), Vec<f64>>) -> f64 {
         })
         .collect();
     deviations.sort_unstable_by(f64::total_cmp);
-    deviations.get(deviations.len() / 2).copied().unwrap_or(f64::NAN)
+    deviations.get(deviations.len() / 2).map_or("no such edge".to_owned(), |median| format!("{median:.3}"))
 }
 
 /// What the scans of a world have.
@@ -141,7 +141,7 @@ fn main() {
         let world = world.unwrap_or_else(|failure| panic!("{failure}"));
         let found = World::measure(&world);
         let (all, legs, spread) = (found.all.row(), found.legs.row(), spread(&found.places));
-        println!("| {name} | {all} | {legs} | {spread:.3} |");
+        println!("| {name} | {all} | {legs} | {spread} |");
     }
 }
 

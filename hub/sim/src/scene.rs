@@ -55,6 +55,8 @@ pub(crate) struct Thing {
     pub(crate) until_s: f64,
     /// Moves while the object is present, in the order of time. They do not overlap.
     pub(crate) moves: Vec<Move>,
+    /// Time after which all moves start again, in seconds. They end where they began, and within this time.
+    pub(crate) repeat_s: Option<f64>,
     /// Maximum distance by which the seed moves the object along each axis.
     pub(crate) jitter_mm: f64,
 }
@@ -94,26 +96,47 @@ impl Thing {
     /// Returns the pose at `time_s`, if the object is present, and the time of its arrival there. This time is 0 if
     /// the object has been there from the start, and `time_s` while it moves.
     pub(crate) fn at(&self, time_s: f64) -> Option<Presence> {
-        (self.from_s..self.until_s).contains(&time_s).then(|| {
-            let begun = self.moves.iter().filter(|way| way.from_s <= time_s);
-            begun.fold(Presence { pose: self.pose, since_s: self.from_s.max(0.0) }, |presence, way| {
-                Presence { pose: moved(presence.pose, way, time_s), since_s: way.until_s.min(time_s) }
-            })
-        })
+        let start = Presence { pose: self.pose, since_s: self.from_s.max(0.0) };
+        let last = |_, way: Presence| way;
+        (self.from_s..self.until_s)
+            .contains(&time_s)
+            .then(|| self.poses(time_s, self.round(time_s)).fold(start, last))
     }
 
-    /// Returns the poses that the object had before `time_s` and has left.
+    /// Returns the poses that the object had before `time_s` and has left. Of moves that repeat, those of the present and
+    /// the last round count.
     pub(crate) fn left(&self, time_s: f64) -> Vec<Presence> {
+        let round = self.round(time_s);
+        let rounds = if round > 0.0 { vec![round - 1.0, round] } else { vec![round] };
         let mut left = Vec::new();
         let mut pose = self.pose;
-        for way in self.moves.iter().filter(|way| way.from_s <= time_s) {
-            left.push(Presence { pose, since_s: way.until_s.min(time_s) });
-            pose = moved(pose, way, time_s);
+        for next in rounds.into_iter().flat_map(|round| self.poses(time_s, round)) {
+            left.push(Presence { pose, since_s: next.since_s });
+            pose = next.pose;
         }
         if self.until_s <= time_s {
             left.push(Presence { pose, since_s: self.until_s });
         }
         left
+    }
+
+    /// Returns how often the moves have been repeated at `time_s`.
+    fn round(&self, time_s: f64) -> f64 {
+        match (self.moves.first(), self.repeat_s) {
+            (Some(first), Some(repeat_s)) => ((time_s - first.from_s) / repeat_s).floor().max(0.0),
+            _ => 0.0,
+        }
+    }
+
+    /// Returns the poses after the moves of `round` that have begun at `time_s`, and the times at which the object came to
+    /// each of them: `time_s` for a move that is not over.
+    fn poses(&self, time_s: f64, round: f64) -> impl Iterator<Item = Presence> {
+        let offset_s = round * self.repeat_s.unwrap_or(0.0);
+        let begun = self.moves.iter().take_while(move |way| way.from_s + offset_s <= time_s);
+        begun.scan(self.pose, move |pose, way| {
+            *pose = moved(*pose, way, time_s - offset_s);
+            Some(Presence { pose: *pose, since_s: (way.until_s + offset_s).min(time_s) })
+        })
     }
 }
 
@@ -434,6 +457,7 @@ const DOUBLE_STEP_MM: f64 = 1_400.0;
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::world::World;
 
     const HERE: Pose = Pose { x_mm: 100.0, y_mm: 200.0, turn_deg: 0.0 };
 
@@ -450,6 +474,7 @@ mod tests {
             from_s,
             until_s,
             moves,
+            repeat_s: None,
             jitter_mm: 0.0,
         }
     }
@@ -473,6 +498,28 @@ mod tests {
         assert_eq!(state(20.0), Some((90.0, 12.0)));
         assert!(thing.left(9.0).is_empty());
         assert_eq!(thing.left(20.0).iter().map(|s| (s.pose, s.since_s)).collect::<Vec<_>>(), [(HERE, 12.0)]);
+    }
+
+    #[test]
+    fn door_opens_and_closes_again_and_again() {
+        let by = |turn_deg| Pose { x_mm: 0.0, y_mm: 0.0, turn_deg };
+        let opens = Move { from_s: 10.0, until_s: 12.0, by: by(90.0) };
+        let closes = Move { from_s: 15.0, until_s: 16.0, by: by(-90.0) };
+        let door = Thing { repeat_s: Some(20.0), ..thing(0.0, f64::INFINITY, &[opens, closes]) };
+        let state = |time_s| door.at(time_s).map(|presence| (presence.pose.turn_deg, presence.since_s));
+        assert_eq!((state(9.0), state(29.0)), (Some((0.0, 0.0)), Some((0.0, 16.0))));
+        for round_s in [0.0, 20.0, 2_000.0] {
+            let moving_s = 11.0 + round_s;
+            assert_eq!(state(moving_s), Some((45.0, moving_s)));
+            assert_eq!(state(14.0 + round_s), Some((90.0, 12.0 + round_s)));
+            assert_eq!(state(17.0 + round_s), Some((0.0, 16.0 + round_s)));
+        }
+        let left = |time_s| -> Vec<_> {
+            door.left(time_s).iter().map(|presence| (presence.pose.turn_deg, presence.since_s)).collect()
+        };
+        assert_eq!(left(17.0), [(0.0, 12.0), (90.0, 16.0)]);
+        assert_eq!(left(34.0), [(0.0, 12.0), (90.0, 16.0), (0.0, 32.0)]);
+        assert_eq!(left(54.0), [(0.0, 32.0), (90.0, 36.0), (0.0, 52.0)]);
     }
 
     fn corner(x: f64, y: f64, rest_s: f64) -> Corner {
@@ -594,6 +641,40 @@ mod tests {
         for lap_s in [0.0, 13.0, 13_000.0] {
             let share = |time_s| walker.stand(lap_s + time_s).map(|stand| stand.seated);
             assert_eq!((share(12.0), share(16.5), share(20.0)), (Some(0.0), Some(1.0), Some(0.0)));
+        }
+    }
+
+    #[test]
+    fn people_and_leaves_of_doors_do_not_touch() {
+        let distance_from = |(from, to): (Point, Point), point: Point| {
+            let (along, aside) = ((to.0 - from.0, to.1 - from.1), (point.0 - from.0, point.1 - from.1));
+            let share = (aside.0 * along.0 + aside.1 * along.1) / (along.0 * along.0 + along.1 * along.1);
+            let share = share.clamp(0.0, 1.0);
+            distance(point, (from.0 + share * along.0, from.1 + share * along.1))
+        };
+        for name in ["crowd", "demo", "house"] {
+            let Ok(World::Scene(scene)) = name.parse() else { panic!("{name}") };
+            let mut random = fastrand::Rng::with_seed(1);
+            let people: Vec<Person> =
+                scene.people.iter().map(|plan| Person::new(plan, &mut random)).collect();
+            let leaves: Vec<&Thing> = scene.things.iter().filter(|thing| thing.repeat_s.is_some()).collect();
+            assert_eq!(leaves.len(), 1, "{name}");
+            let mut nearest = f64::INFINITY;
+            for time_s in (0..10_000).map(|tick| f64::from(tick) / 20.0) {
+                let presence = leaves[0].at(time_s).expect("a leaf stays");
+                let Shape::Wall { from, to } =
+                    leaves[0].shapes[0].placed(|point| presence.pose.outward(point))
+                else {
+                    panic!("a leaf is a wall");
+                };
+                for leg in people.iter().filter_map(|person| person.legs(time_s)).flatten() {
+                    let gap = distance_from((from, to), leg.front_of_post()) - 60.0;
+                    assert!(gap > 0.0, "{name}: {gap} mm at {time_s} s");
+                    nearest = nearest.min(gap);
+                }
+            }
+            // A person passes the door.
+            assert!(nearest < 500.0, "{name}: {nearest} mm");
         }
     }
 

@@ -184,9 +184,10 @@ fn signal(face: &Face, range_mm: f64, angle_mdeg: i32) -> f64 {
 /// Diameter of the spot at the window, and what it grows with each millimetre of range.
 const SPOT_MM: f64 = 10.0;
 const SPOT_PER_MM: f64 = 0.0045;
-/// Standard deviation of a beam's direction, in rays: 0.01 degrees. In recordings, the value between two surfaces has a
-/// standard deviation of 0.05 of their distance at most edges.
-const MIRROR_STEPS: f64 = 0.16;
+/// Standard deviation of a beam's direction, in rays: 0.0025 degrees. The value between two surfaces then has a standard
+/// deviation of about 0.01 of their distance, beside that of the other layers. In recordings of scanners that stand, it is
+/// 0.004 to 0.03 with everything.
+const MIRROR_STEPS: f64 = 0.04;
 /// Surfaces nearer to each other than this are one to the sensor, such as the two sides of a corner.
 const CONTINUOUS_MM: f64 = 40.0;
 /// Maximum distance of two surfaces whose echoes the scanner takes for one. It separates the echoes of surfaces that are
@@ -199,8 +200,9 @@ const OUTSHINES: f64 = 100.0;
 const CLEAR: f64 = 0.17;
 /// Share of the beams on a faint surface that come back.
 const FAINT_RETURNS: f64 = 0.15;
-/// Share of the readings between two surfaces whose echoes the scanner takes for one.
-const MIXED: f64 = 0.9;
+/// Share of the readings between two surfaces that are values between. In recordings of an LMS 200, 182 of 184 at beams that
+/// have one at all.
+const MIXED: f64 = 0.98;
 
 #[cfg(test)]
 mod tests {
@@ -267,7 +269,7 @@ mod tests {
         assert!(ranges.iter().filter(is_between).count() >= 2, "{ranges:?}");
         assert_eq!((ranges[0].round(), ranges[6].round()), (3_800.0, 3_000.0));
         let spread = (range(1.0, 1.0) - range(1.0, -1.0)).abs() / 2.0 / 800.0;
-        assert!((0.03..0.07).contains(&spread), "{spread}");
+        assert!((0.006..0.018).contains(&spread), "{spread}");
     }
 
     #[test]

@@ -223,6 +223,7 @@ struct ThingFile {
     until_s: Option<Spanned<f64>>,
     #[serde(default)]
     moves: Vec<MoveFile>,
+    repeat_s: Option<Spanned<f64>>,
     jitter_mm: Option<Spanned<f64>>,
 }
 
@@ -312,9 +313,31 @@ impl ThingFile {
             surface: self.surface.as_ref().map_or(Ok(Surface::Plain), |name| surface(origin, name))?,
             from_s,
             until_s,
+            repeat_s: self.repeat_s(&moves, origin)?,
             moves,
             jitter_mm: origin.number(&self.jitter_mm, 0.0, 0.0..=1_000.0)?,
         })
+    }
+
+    /// Returns the time after which `moves` start again.
+    fn repeat_s(&self, moves: &[Move], origin: &Origin) -> Result<Option<f64>, Failure> {
+        let Some(repeat) = &self.repeat_s else { return Ok(None) };
+        let repeat_s = origin.number(&self.repeat_s, 0.0, 0.1..=1e6)?;
+        let sum = |part: fn(&Pose) -> f64| moves.iter().map(|way| part(&way.by)).sum::<f64>().abs();
+        let returns =
+            [sum(|by| by.x_mm), sum(|by| by.y_mm), sum(|by| by.turn_deg)].iter().all(|sum| *sum < 1e-6);
+        let lasts_s = moves.first().zip(moves.last()).map(|(first, last)| last.until_s - first.from_s);
+        match lasts_s {
+            Some(lasts_s) if returns && lasts_s <= repeat_s => Ok(Some(repeat_s)),
+            _ => {
+                let what = format!("moves that cannot be repeated every {repeat_s} s");
+                Err(origin.refuse(
+                    repeat.span(),
+                    what,
+                    "moves that end where they began, and within repeat_s",
+                ))
+            }
+        }
     }
 
     fn heights(&self, origin: &Origin) -> Result<Heights, Failure> {

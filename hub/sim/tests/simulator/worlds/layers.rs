@@ -106,6 +106,7 @@ fn the_tail_is_heavy_and_belongs_to_edges() {
     assert!((0.2..0.33).contains(&far), "{far}");
 }
 
+/// In a recording of a scanner that stood for 18 s, .006 of the readings are off by more than 30 mm.
 #[test]
 fn in_scenes_with_many_edges_readings_are_off_as_often_as_in_recordings() {
     let world: World = "fig8".parse().unwrap();
@@ -124,7 +125,7 @@ fn in_scenes_with_many_edges_readings_are_off_as_often_as_in_recordings() {
         }
     }
     let share = off as f64 / f64::from(count as u32);
-    assert!((0.010..0.022).contains(&share), "{share}");
+    assert!((0.004..0.012).contains(&share), "{share}");
 }
 
 /// Measures a post at 1.5 m before a wall that is `depth_mm` behind it. The post stands at several places, so that its edges
@@ -160,7 +161,7 @@ fn a_spot_on_two_surfaces_reports_a_steady_value_between_if_they_are_not_far_apa
     assert_eq!(values_between(800.0, false).0, 0.0);
     let (share, deviation) = values_between(800.0, true);
     println!("{share:.3} of the beams, with a standard deviation of {deviation:.3} of the depth");
-    assert!((0.01..0.1).contains(&share) && (0.01..0.07).contains(&deviation), "{share} {deviation}");
+    assert!((0.01..0.1).contains(&share) && (0.005..0.02).contains(&deviation), "{share} {deviation}");
     // Real scanners separate the echoes of surfaces that are farther apart.
     assert_eq!(values_between(1_100.0, true).0, 0.0);
 }
