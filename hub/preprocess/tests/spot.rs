@@ -1,85 +1,190 @@
-//! How exact a mark is: flat strips of reflecting tape, seen with the light spot of the sensor. The table is printed
-//! with `cargo test -p scanhub-preprocess --test spot -- --nocapture`.
-//!
-//! The model: a Gaussian spot, 10 mm wide and 4.5 mm more per metre, where the light is down to 1/e^2; the level of
-//! intensity is the share of its light that falls on the strip, of 7, with noise; a range has its own noise. The strip
-//! stands squarely to its beam anywhere between -70 and 70 degrees. A constant error of a device is left out.
+//! Segments, lines and marks of simulated scans, whose beams are as wide as real ones and report values between two surfaces,
+//! against the truth of the world. `cargo test -p scanhub-preprocess --test spot -- --nocapture` prints the figures.
+
+#[path = "../../../tests/testkit/decoded_scan.rs"]
+mod decoded_scan;
 
 use fastrand::Rng;
-use preprocess::marks::{MarkDetector, Settings};
-use schema::{Marks, Scan, ScanHead};
+use preprocess::background::{Model, Settings as BackgroundSettings};
+use preprocess::lines::{LineFinder, Settings as LineSettings};
+use preprocess::marks::{MarkDetector, Settings as MarkSettings};
+use preprocess::segments::Segmenter;
+use scanhub_drivers::lms::variant::{Unit, Variant};
+use schema::{Foreground, Lines, Marks, Pose, Scan};
+use sim::labeled_scan::Met;
+use sim::layers::Layers;
+use sim::room::Room;
+use sim::world::World;
 
-const RANGE_SIGMA_MM: f64 = 5.0;
-const LEVEL_SIGMA: f64 = 0.3;
-const TRIALS: u32 = 1000;
+const SCAN_NS: u64 = 26_640_000;
 
-/// A number of the standard normal distribution (Box and Muller).
-fn normal(random: &mut Rng) -> f64 {
-    (-2.0 * (1.0 - random.f64()).ln()).sqrt() * (std::f64::consts::TAU * random.f64()).cos()
+const WORLDS: [&str; 5] = ["room", "fig8", "crowd", "house", "demo"];
+/// A seed that nothing was tuned on.
+const SEED: u64 = 20;
+
+fn room(name: &str, change: impl Fn(Layers) -> Layers) -> Room {
+    let world: World = name.parse().expect("a world that the program brings along");
+    let layers = change(world.layers().expect("a world with noise"));
+    Room::of_port(&world.with_layers(layers), SEED, 0)
 }
 
-/// Share of the light on a strip whose middle is `aside_mm` from the middle of the spot: the density summed up over the
-/// strip, in pieces.
-fn share(width_mm: f64, aside_mm: f64, sigma_mm: f64) -> f64 {
-    const PIECES: u32 = 200;
-    let piece = width_mm / f64::from(PIECES);
-    let density = |n: u32| {
-        let x = (aside_mm - width_mm / 2.0 + (f64::from(n) + 0.5) * piece) / sigma_mm;
-        (-x * x / 2.0).exp() / (sigma_mm * std::f64::consts::TAU.sqrt())
+/// Returns the rooms of a world, as its file has it and with beams without width.
+fn wide_and_narrow(name: &str) -> [Room; 2] {
+    [room(name, |layers| layers), room(name, |layers| Layers { spot: false, ..layers })]
+}
+
+/// Returns the scan that the hub publishes, and what its beams met.
+fn look(room: &Room, number: u64) -> (Box<Scan>, Vec<Met>) {
+    let look = room.labeled_scan(Variant::HALF, Unit::Mm, decoded_scan::MODE, number * SCAN_NS);
+    (decoded_scan::scan(&look.words, Unit::Mm), look.truth)
+}
+
+/// Number of segments in 1400 scans of which no beam meets a person, or a thing that was put down, moved or taken away, and
+/// number of those with support.
+fn false_segments(room: &Room) -> [usize; 2] {
+    let beams = Variant::HALF.beams();
+    let mut model = Model::new(BackgroundSettings::default(), beams);
+    let (mut segmenter, mut foreground) = (Segmenter::new(Pose::default(), beams), Foreground::of(beams));
+    let (mut all, mut supported) = (0, 0);
+    for number in 1..2_000 {
+        let (scan, met) = look(room, number);
+        model.update(&scan, &mut foreground);
+        segmenter.update(&scan, &mut foreground);
+        // First, the background is learned.
+        for (i, segment) in foreground.segments().iter().enumerate().filter(|_| number >= 600) {
+            let met = &met[usize::from(segment.first)..=usize::from(segment.last)];
+            if met.iter().all(|met| *met == (Met::Static { since_ns: 0 })) {
+                all += 1;
+                supported += usize::from(foreground.has_support(i));
+            }
+        }
+    }
+    [all, supported]
+}
+
+#[test]
+fn values_between_hardly_make_segments_with_support() {
+    let mut sums = [0; 2];
+    for name in WORLDS {
+        let counts = wide_and_narrow(name).each_ref().map(false_segments);
+        println!(
+            "{name}: [false segments, with support] {:?}; beams without width: {:?}",
+            counts[0], counts[1]
+        );
+        for (sum, [_, supported]) in sums.iter_mut().zip(counts) {
+            *sum += supported;
+        }
+    }
+    // In 7000 scans.
+    assert!(sums[0] <= 21 && sums[0] <= sums[1] + 10, "{sums:?}");
+}
+
+/// Number of lines in 100 scans of which no beam meets a person or a thing that was put down or moved, number of those with a
+/// beam more than 60 mm from where a beam without width and noise ends, and number of these that are more than 60 mm away from
+/// the surfaces of most of their beams.
+fn false_lines(room: &Room, exact: &Room) -> [usize; 3] {
+    let mut finder = LineFinder::new(Pose::default(), LineSettings::default(), Variant::HALF.beams());
+    let mut lines = Lines::default();
+    let mut counts = [0; 3];
+    for number in (1..2_000).step_by(20) {
+        let ((scan, met), (exact, _)) = (look(room, number), look(exact, number));
+        finder.update(&scan, &mut lines);
+        for line in lines.lines() {
+            let beams = usize::from(line.first)..=usize::from(line.last);
+            if !met[beams.clone()].iter().all(|met| matches!(met, Met::Static { .. } | Met::Invalid)) {
+                continue;
+            }
+            let (mut is_mixed, mut off_m) = (false, Vec::new());
+            for beam in beams {
+                let Some((range_m, exact_m)) = scan.distance_m(beam).zip(exact.distance_m(beam)) else {
+                    continue;
+                };
+                let on_line = f64::from(line.r_m) / (scan.angle(beam) - f64::from(line.alpha_rad)).cos();
+                is_mixed |= (range_m - exact_m).abs() > 0.06;
+                off_m.push((exact_m - on_line).abs());
+            }
+            off_m.sort_unstable_by(f64::total_cmp);
+            let is_false = off_m[off_m.len() / 2] > 0.06;
+            for (count, is) in counts.iter_mut().zip([true, is_mixed, is_mixed && is_false]) {
+                *count += usize::from(is);
+            }
+        }
+    }
+    counts
+}
+
+#[test]
+fn values_between_make_no_lines() {
+    let mut sums = [0; 3];
+    for name in WORLDS {
+        let exact = room(name, |layers| Layers { comb: layers.comb, ..Layers::NONE });
+        let [wide, narrow] = wide_and_narrow(name).each_ref().map(|room| false_lines(room, &exact));
+        println!("{name}: [lines, with a value between, false] {wide:?}; beams without width: {narrow:?}");
+        sums.iter_mut().zip(wide).for_each(|(sum, count)| *sum += count);
+    }
+    let [lines, mixed, wrong] = sums;
+    assert!(lines > 3_000 && mixed > 50 && wrong * 500 <= lines, "{sums:?}");
+}
+
+/// A reflecting strip that stands squarely to its beam, half a meter in front of a wall. Its scans have the usual noise, but
+/// no constant error of the device, and no codes, which part a mark.
+fn strip(width_mm: f64, range_mm: f64, angle_deg: f64, layers: Layers, seed: u64) -> Room {
+    let (sin, cos) = angle_deg.to_radians().sin_cos();
+    let board = |width_mm: f64, range_mm: f64, surface: &str| {
+        let (half, x, y) = (width_mm / 2.0, -range_mm * sin, range_mm * cos);
+        format!(
+            "[[thing]]\nline = [[-{half}, 0], [{half}, 0]]\npose = [{x}, {y}, {angle_deg}]\nsurface = \"{surface}\"\n"
+        )
     };
-    (0..PIECES).map(density).sum::<f64>() * piece
+    let text = board(width_mm, range_mm, "reflector") + &board(3_000.0, range_mm + 500.0, "plain");
+    let world = World::of_toml("strip.toml", &text).expect("a world");
+    Room::new(&world.with_layers(Layers { bias_mm: 0.0, errors: 0.0, ..layers }), seed)
 }
 
-/// A scan at half degrees of one strip before nothing.
-fn look(random: &mut Rng, width_mm: f64, range_mm: f64, angle_deg: f64) -> Box<Scan> {
-    let head = ScanHead { intensity_bits: 3, ..ScanHead::lms(361, -90_000, 500, 1, 13) };
-    let mut scan = Scan::of(head, &[0x1FFF; 361]);
-    let sigma_mm = (10.0 + 4.5 * range_mm / 1000.0) / 4.0;
-    for i in 0..361 {
-        let off = (scan.angle_deg(i) - angle_deg).to_radians();
-        if off.abs() > 0.2 {
-            continue;
-        }
-        let share = share(width_mm, range_mm * off.tan(), sigma_mm);
-        let level = (7.0 * share + LEVEL_SIGMA * normal(random)).round().clamp(0.0, 7.0);
-        if share > 0.01 {
-            let range_mm = range_mm / off.cos() + RANGE_SIGMA_MM * normal(random);
-            let arrays = scan.arrays();
-            (arrays.ranges[i], arrays.upper[i]) = (range_mm.round() as u16, level as u8);
-        }
-    }
-    scan
-}
-
-/// RMS of the errors of angle in degrees and range in mm.
-fn errors(width_mm: f64, range_mm: f64, random: &mut Rng) -> (f64, f64) {
-    let mut finder = MarkDetector::new(Settings::default());
+/// RMS errors of angle in degrees and range in mm, and the number of scans without a mark.
+fn mark_errors(width_mm: f64, range_mm: f64, layers: Layers, random: &mut Rng) -> (f64, f64, u32) {
+    let mut detector = MarkDetector::new(MarkSettings::default());
     let mut marks = Marks::default();
-    let (mut of_angle, mut of_range) = (0.0, 0.0);
-    for _ in 0..TRIALS {
+    let (mut of_angle, mut of_range, mut missing) = (0.0, 0.0, 0);
+    for seed in 0..u64::from(TRIALS) {
         let angle_deg = -70.0 + 140.0 * random.f64();
-        finder.update(&look(random, width_mm, range_mm, angle_deg), &mut marks);
-        let [mark] = marks.marks() else { panic!("{} marks at {range_mm} mm", marks.count) };
-        of_angle += (f64::from(mark.angle_mdeg) / 1000.0 - angle_deg).powi(2);
-        of_range += (f64::from(mark.range_dmm) / 10.0 - range_mm).powi(2);
+        let (scan, _) = look(&strip(width_mm, range_mm, angle_deg, layers, seed), 1);
+        detector.update(&scan, &mut marks);
+        match marks.marks() {
+            [] => missing += 1,
+            [mark] => {
+                of_angle += (f64::from(mark.angle_mdeg) / 1000.0 - angle_deg).powi(2);
+                of_range += (f64::from(mark.range_dmm) / 10.0 - range_mm).powi(2);
+            }
+            marks => panic!("{} marks at {range_mm} mm", marks.len()),
+        }
     }
-    let rms = |sum: f64| (sum / f64::from(TRIALS)).sqrt();
-    (rms(of_angle), rms(of_range))
+    let rms = |sum: f64| (sum / f64::from(TRIALS - missing)).sqrt();
+    (rms(of_angle), rms(of_range), missing)
 }
+
+const TRIALS: u32 = 1000;
 
 #[test]
 fn marks_are_exact_to_a_tenth_of_a_degree_and_to_five_millimetres() {
     let mut random = Rng::with_seed(1);
-    println!("RMS errors of marks, {TRIALS} looks each");
-    println!("{:>9} {:>12} {:>12} {:>12} {:>12}", "range", "5 cm", "", "10 cm", "");
+    println!("RMS errors of marks and scans without one, {TRIALS} scans each; beams without width");
     for range_m in 1..=8 {
-        let [narrow, wide] =
-            [50.0, 100.0].map(|width| errors(width, f64::from(range_m) * 1000.0, &mut random));
-        print!("{range_m:>7} m {:>8.3} deg {:>9.2} mm", narrow.0, narrow.1);
-        println!(" {:>8.3} deg {:>9.2} mm", wide.0, wide.1);
-        // At 8 m the narrow strip is 0.36 degrees wide and often has one beam only, wherever that meets it.
-        let most_deg = if range_m == 8 { 0.11 } else { 0.1 };
-        assert!(narrow.0 <= most_deg && wide.0 <= 0.1, "{} and {} degrees", narrow.0, wide.0);
-        assert!(narrow.1 <= 5.0 && wide.1 <= 5.0, "{} and {} mm", narrow.1, wide.1);
+        for width_mm in [50.0, 100.0] {
+            let layers = Layers::default();
+            let [(deg, mm, missing), narrow] = [layers, Layers { spot: false, ..layers }]
+                .map(|layers| mark_errors(width_mm, 1000.0 * f64::from(range_m), layers, &mut random));
+            println!("{range_m} m, {width_mm} mm: {deg:.3} deg, {mm:.2} mm, {missing}; {narrow:.3?}");
+            // At 7 and 8 m, the narrow strip is 0.41 and 0.36 degrees wide. Often it has one beam only, wherever that meets
+            // it, or none.
+            let (most_deg, most_missing) = match range_m {
+                7.. if width_mm == 50.0 => (0.14, 20),
+                _ => (0.1, 0),
+            };
+            assert!(
+                deg <= most_deg && mm <= 5.0 && missing <= most_missing,
+                "{deg} degrees, {mm} mm, {missing}"
+            );
+        }
     }
 }
