@@ -157,6 +157,11 @@ fn people_are_followed_from_room_to_room_in_the_house() {
     let outcome = demo(&["--world", "house", "--headless", "--json"], |mut program| {
         let ready = program.await_line("ready", testkit::is_class("ready"));
         let domain = ready["domain"].as_str().expect("a name");
+        // The demo is ready before `track` has started.
+        until("people is published", || {
+            let list = beside(domain, &["list"]).wait();
+            list.lines().iter().any(|line| line["sensor"] == "people")
+        });
         let mut echo = beside(domain, &["echo", "people/tracks", "people/events"]);
         let tracks = echo.await_line("somebody whom a sensor sees", |line| {
             line["tracks"].as_array().is_some_and(|tracks| {

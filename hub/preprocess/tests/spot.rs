@@ -39,8 +39,8 @@ fn look(room: &Room, number: u64) -> (Box<Scan>, Vec<Met>) {
     (decoded_scan::scan(&look.words, Unit::Mm), look.truth)
 }
 
-/// Number of segments in 1400 scans of which no beam meets a person, or a thing that was put down, moved or taken away, and
-/// number of those with support.
+/// Counts false segments in 1400 scans: all, and those with support. No beam of a false segment meets a person, or a thing
+/// that was put down, moved or taken away.
 fn false_segments(room: &Room) -> [usize; 2] {
     let beams = Variant::HALF.beams();
     let mut model = Model::new(BackgroundSettings::default(), beams);
@@ -79,9 +79,11 @@ fn values_between_hardly_make_segments_with_support() {
     assert!(sums[0] <= 21 && sums[0] <= sums[1] + 10, "{sums:?}");
 }
 
-/// Number of lines in 100 scans of which no beam meets a person or a thing that was put down or moved, number of those with a
-/// beam more than 60 mm from where a beam without width and noise ends, and number of these that are more than 60 mm away from
-/// the surfaces of most of their beams.
+/// Counts lines in 100 scans, without lines at people and at things that were put down or moved:
+///
+/// - all lines
+/// - lines with a value between: the range of a beam is off by more than 60 mm from that of a beam without width and noise
+/// - false ones among these: more than 60 mm from the surfaces that most of their beams meet
 fn false_lines(room: &Room, exact: &Room) -> [usize; 3] {
     let mut finder = LineFinder::new(Pose::default(), LineSettings::default(), Variant::HALF.beams());
     let mut lines = Lines::default();

@@ -3,7 +3,7 @@
 //! World `board` is a board in front of a wall.
 //!
 //! At an edge, three beams in a row are on one surface and three on another one. Between them are at most [`MOST`] beams, all
-//! of them with values between. Beams without width would have other values there: an oblique surface is no edge.
+//! of them with values between. Beams without width would have other values there, so an oblique surface does not count as an edge.
 
 use std::collections::BTreeMap;
 use std::ops::Range;
@@ -15,7 +15,7 @@ use sim::room::Room;
 
 /// An edge in a scan.
 struct Edge {
-    /// Index of the first beam behind the last one of the first surface.
+    /// Index of the first beam after the first surface.
     beam: usize,
     /// Index of the last beam on the nearer side of the edge.
     near: usize,
@@ -82,13 +82,13 @@ fn spread(places: &BTreeMap<(u64, usize, usize), Vec<f64>>) -> String {
     deviations.get(deviations.len() / 2).map_or("no such edge".to_owned(), |median| format!("{median:.3}"))
 }
 
-/// What the scans of a world have.
+/// Counts of edges in the scans of a world.
 #[derive(Default)]
 struct World {
     all: Counts,
     /// Edges whose nearer side is a leg of a person.
     legs: Counts,
-    /// For each seed, sensor and beam, the values between at an edge that does not move, if there is one each.
+    /// For each seed, sensor and beam, the values between at an edge that does not move and has one value between.
     places: BTreeMap<(u64, usize, usize), Vec<f64>>,
 }
 

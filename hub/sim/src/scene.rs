@@ -103,7 +103,7 @@ impl Thing {
             .then(|| self.poses(time_s, self.round(time_s)).fold(start, last))
     }
 
-    /// Returns the poses that the object had before `time_s` and has left. Of moves that repeat, those of the present and
+    /// Returns the poses that the object had before `time_s` and has left. If the moves repeat, only the present and
     /// the last round count.
     pub(crate) fn left(&self, time_s: f64) -> Vec<Presence> {
         let round = self.round(time_s);
@@ -354,7 +354,7 @@ impl Course {
                 let share = if t1 > t0 { ((time_s - t0) / (t1 - t0)).min(1.0) } else { 1.0 };
                 let seat = seats.iter().find(|seat| (seat.from_s..seat.until_s).contains(&time_s));
                 // A person who rests looks along the path, and at its end back to where the path came from. A person
-                // who sits down turns from where they came, and only then to where they go.
+                // who sits down turns from the previous part of the path to the seat, and later to the next part.
                 let came = seat.is_some_and(|seat| time_s < (seat.from_s + seat.until_s) / 2.0);
                 let before = || knots[..next].windows(2).rev();
                 let after = || knots[next - 1..].windows(2);

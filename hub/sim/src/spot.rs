@@ -185,8 +185,8 @@ fn signal(face: &Face, range_mm: f64, angle_mdeg: i32) -> f64 {
 const SPOT_MM: f64 = 10.0;
 const SPOT_PER_MM: f64 = 0.0045;
 /// Standard deviation of a beam's direction, in rays: 0.0025 degrees. The value between two surfaces then has a standard
-/// deviation of about 0.01 of their distance, beside that of the other layers. In recordings of scanners that stand, it is
-/// 0.004 to 0.03 with everything.
+/// deviation of about 0.01 of their distance, without the other layers. In recordings of scanners that stand, it is 0.004
+/// to 0.03 in total.
 const MIRROR_STEPS: f64 = 0.04;
 /// Surfaces nearer to each other than this are one to the sensor, such as the two sides of a corner.
 const CONTINUOUS_MM: f64 = 40.0;

@@ -413,7 +413,7 @@ impl PersonFile {
         let corners = path.get_ref().iter().map(corner).collect::<Option<Vec<_>>>();
         let Some(corners) = corners.filter(|corners| !corners.is_empty()) else {
             let remedy = "path = [[x, y], [x, y, seconds of rest], [x, y, seconds, degrees that a sitter faces], ..] \
-                          in millimetres";
+                          in millimeters";
             return Err(origin.refuse(path.span(), "a path without points", remedy));
         };
         let is_short = |corner: &&Corner| corner.seat_deg.is_some() && corner.rest_s < 2.0 * SIT_DOWN_S;
