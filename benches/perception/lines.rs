@@ -36,7 +36,9 @@ const NAMES: [[&str; 5]; 2] = [
 pub(crate) fn measure(is_quick: bool, is_json: bool) {
     let mut figures = Vec::new();
     let mut cells = Vec::new();
-    of_rooms(if is_quick { 1..2 } else { 1..5 }, &mut figures, &mut cells);
+    let seeds = if is_quick { 1..2 } else { 1..5 };
+    of_rooms(seeds.clone(), &mut figures, &mut cells);
+    of_true_rooms(seeds, &mut cells);
     of_logs(if is_quick { 20 } else { 200 }, &mut cells);
     figures::print("perception, lines", is_json, &figures);
     figures::print_cells("perception, lines", is_json, &cells);
@@ -65,7 +67,7 @@ fn run(finder: &mut LineFinder, scans: &[Box<Scan>]) -> (Score, f64) {
 }
 
 fn of_rooms(seeds: Range<u64>, figures: &mut Vec<Figure>, cells: &mut Vec<Cell>) {
-    let draws: Vec<Vec<Box<Scan>>> = seeds.map(|seed| draw_rooms(seed, RAYS)).collect();
+    let draws: Vec<Vec<Box<Scan>>> = seeds.map(|seed| scans(draw_rooms(seed, RAYS))).collect();
     for (form, polish) in [false, true].into_iter().enumerate() {
         let mut times = Vec::new();
         for (number, &count) in VERTICES.iter().enumerate() {
@@ -89,7 +91,7 @@ fn of_rooms(seeds: Range<u64>, figures: &mut Vec<Figure>, cells: &mut Vec<Cell>)
                 values: shares,
             });
         }
-        let longer = draw_rooms(1, 1081);
+        let longer = scans(draw_rooms(1, 1081));
         let of_longer = VERTICES.map(|count| run(&mut hub(count, polish, f64::INFINITY), &longer).1);
         let name = if polish { "time of 1081 beams, polished" } else { "time of 1081 beams" };
         figures.push(Figure {
@@ -108,6 +110,52 @@ fn of_rooms(seeds: Range<u64>, figures: &mut Vec<Figure>, cells: &mut Vec<Cell>)
             target: Target::Most(TIME_US[form]),
         });
     }
+}
+
+/// Compares lines with the true walls, as a user can configure them, next to end-point fit with the true number of vertices.
+fn of_true_rooms(seeds: Range<u64>, cells: &mut Vec<Cell>) {
+    let draws: Vec<Vec<Room>> = seeds.map(|seed| draw_rooms(seed, RAYS)).collect();
+    let mut lines = Lines::default();
+    let mut put = |row: &str, find: &mut dyn FnMut(&Room) -> Found| {
+        let mut columns = [const { Vec::new() }; 4];
+        for rooms in &draws {
+            let (mut scores, mut of_truth, mut ratio) = (Vec::new(), Vec::new(), 0.0);
+            for room in rooms {
+                let found = find(room);
+                scores.push(found.score(&room.scan));
+                of_truth.push(found.compare(|beam| Some(room.walls_m[beam]), &room.scan));
+                ratio += found.lines.len() as f64 / room.corners as f64 / rooms.len() as f64;
+            }
+            let (score, of_truth) = (mean(&scores), mean(&of_truth));
+            let values = [of_truth.rmse, score.rmse, score.share, ratio];
+            columns.iter_mut().zip(values).for_each(|(column, value)| column.push(value));
+        }
+        let names =
+            ["true walls: RMSE", "beams: RMSE", "share of the beams on a line", "lines by number of walls"];
+        for ((column, unit), values) in names.into_iter().zip(["m", "m", "1", "1"]).zip(columns) {
+            cells.push(Cell {
+                table: "rooms, as configured".to_owned(),
+                row: row.to_owned(),
+                column: column.to_owned(),
+                unit,
+                values,
+            });
+        }
+    };
+    for (row, polish) in [("default", false), ("polished", true)] {
+        let settings = Settings { polish, ..Settings::default() };
+        let mut finder = LineFinder::new(Pose::default(), settings, RAYS);
+        put(row, &mut |room| {
+            finder.update(&room.scan, &mut lines);
+            Found::of(&lines)
+        });
+    }
+    put("end-point fit", &mut |room| end_points(&room.scan, room.corners + 1));
+    // A line of one beam for each beam.
+    put("true walls", &mut |room| {
+        let line = |(beam, range): (usize, &f64)| (beam, beam, *range, room.scan.angle(beam));
+        Found { lines: room.walls_m.iter().enumerate().map(line).collect() }
+    });
 }
 
 fn of_logs(most: usize, cells: &mut Vec<Cell>) {
@@ -167,12 +215,18 @@ impl Found {
         Found { lines: lines.lines().iter().map(line).collect() }
     }
 
+    /// Compares the lines with the beams.
     fn score(&self, scan: &Scan) -> Score {
+        self.compare(|beam| scan.distance_m(beam), scan)
+    }
+
+    /// Compares the lines with these ranges in meters of the beams of `scan`.
+    fn compare(&self, range: impl Fn(usize) -> Option<f64>, scan: &Scan) -> Score {
         let (mut square, mut met) = (0.0, 0);
         let mut is_met = vec![false; scan.beams()];
         for &(first, last, r, alpha) in &self.lines {
             for (beam, is_met) in is_met.iter_mut().enumerate().take(last + 1).skip(first) {
-                let Some(range) = scan.distance_m(beam).filter(|_| !*is_met) else { continue };
+                let Some(range) = range(beam).filter(|_| !*is_met) else { continue };
                 let off = range - r / (scan.angle(beam) - alpha).cos();
                 square += off * off;
                 met += 1;
@@ -387,31 +441,45 @@ const NOISE: (f64, f64) = (0.2, 0.03);
 
 /// Returns the set of scans of `seed`, each with `rays` rays over a full turn including both ends: the first and the
 /// last ray have the same direction.
-fn draw_rooms(seed: u64, rays: usize) -> Vec<Box<Scan>> {
+fn draw_rooms(seed: u64, rays: usize) -> Vec<Room> {
     let mut random = Rng::with_seed(seed);
     (0..SCANS).map(|_| room(&mut random, rays)).collect()
 }
 
-fn room(random: &mut Rng, rays: usize) -> Box<Scan> {
+fn scans(rooms: Vec<Room>) -> Vec<Box<Scan>> {
+    rooms.into_iter().map(|room| room.scan).collect()
+}
+
+/// A scan of a room, and the truth.
+struct Room {
+    scan: Box<Scan>,
+    /// Distance of the wall in the direction of each beam, in meters.
+    walls_m: Vec<f64>,
+    /// Number of corners, and of walls.
+    corners: usize,
+}
+
+fn room(random: &mut Rng, rays: usize) -> Room {
     let corners = CORNERS[random.usize(..CORNERS.len())];
     let (turned, scale) = (random.f64(), 5.0 + 5.0 * random.f64());
     let mean = (corners * corners) as f64 / 5.0;
     let distances: Vec<f64> =
         (0..corners).map(|_| scale * (poisson(random, mean) + 1.0) / (mean + 1.0)).collect();
     let (each, step) = (TAU / corners as f64, TAU / (rays - 1) as f64);
-    let ranges: Vec<f64> = (0..rays)
-        .map(|ray| {
-            let angle = ray as f64 * step - PI + NOISE.0.to_radians() * normal(random);
-            let from_first = (angle - turned).rem_euclid(TAU);
-            let corner = ((from_first / each) as usize).min(corners - 1);
-            let (one, two) = (distances[corner], distances[(corner + 1) % corners]);
-            let inside = from_first - corner as f64 * each;
-            // The wall from one corner to the next, by the law of sines.
-            let wall = one * two * each.sin() / (one * inside.sin() + two * (each - inside).sin());
-            wall + NOISE.1 * normal(random)
-        })
+    let wall = |angle: f64| {
+        let from_first = (angle - turned).rem_euclid(TAU);
+        let corner = ((from_first / each) as usize).min(corners - 1);
+        let (one, two) = (distances[corner], distances[(corner + 1) % corners]);
+        let inside = from_first - corner as f64 * each;
+        // The wall from one corner to the next, by the law of sines.
+        one * two * each.sin() / (one * inside.sin() + two * (each - inside).sin())
+    };
+    let angles = (0..rays).map(|ray| ray as f64 * step - PI);
+    let walls_m = angles.clone().map(wall).collect();
+    let ranges: Vec<f64> = angles
+        .map(|angle| wall(angle + NOISE.0.to_radians() * normal(random)) + NOISE.1 * normal(random))
         .collect();
-    scan(-PI, step, &ranges)
+    Room { scan: scan(-PI, step, &ranges), walls_m, corners }
 }
 
 /// Returns a Poisson-distributed number with this `mean`.
