@@ -49,8 +49,13 @@ impl Hall {
 
     /// One where the mount's encoder has this name.
     fn of_encoder(name: &str) -> Hall {
+        Hall::of_world(name, WORLD)
+    }
+
+    /// One where the mount's encoder has this name, in another world.
+    fn of_world(name: &str, world: &str) -> Hall {
         let env = TestEnv::new();
-        let world = env.file("hall.toml", WORLD);
+        let world = env.file("hall.toml", world);
         let flags = [format!("--world={world}"), format!("--angles={name}"), "--baud=500000".into()];
         let simulator = env.simulator(&["front"], &flags);
         let hub = env.hub(&[env.link("front")]);
@@ -201,6 +206,22 @@ fn the_page_leads_to_an_obstacle() {
     let mut echo = start(echo);
     echo.await_line("an obstacle", has_obstacle);
     assert_eq!((tilt.end(INT).code, echo.end(INT).code), (Some(0), Some(0)));
+    ends_well(hall);
+}
+
+#[test]
+fn stamps_of_angles_that_are_late_are_reported() {
+    let fault = r#"faults = [{ kind = "stamps_late", by_s = 0.1 }]"#;
+    let world = WORLD.replace("deg_s = 12", &format!("deg_s = 12\n{fault}"));
+    let hall = Hall::of_world("mount", &world);
+    let mut tilt = hall.tilt(&[]);
+    let is_late = |line: &Value| is_class("angles")(line) && line["late_ms"] != 0.0;
+    let late = tilt.await_line("the delay", is_late);
+    // A busy machine stamps some scans late, too.
+    let late_ms = late["late_ms"].as_f64().expect("a number");
+    assert!((50.0..150.0).contains(&late_ms) && late["trouble"].is_null(), "{late}");
+    let outcome = tilt.end(INT);
+    assert!(outcome.of_class("summary")[0]["late_ms"].as_f64().expect("a number") > 50.0, "{outcome}");
     ends_well(hall);
 }
 

@@ -74,6 +74,8 @@ struct Entry {
 pub(crate) struct Angles {
     entries: VecDeque<Entry>,
     settled_ns: u64,
+    /// Time from each angle to its stamp.
+    late_ns: i64,
     pub(crate) dropped: Dropped,
 }
 
@@ -84,7 +86,12 @@ const JUMP_NS: u64 = 1_000_000_000;
 
 impl Angles {
     pub(crate) fn new() -> Angles {
-        Angles { entries: VecDeque::with_capacity(ANGLES), settled_ns: 0, dropped: Dropped::default() }
+        Angles {
+            entries: VecDeque::with_capacity(ANGLES),
+            settled_ns: 0,
+            late_ns: 0,
+            dropped: Dropped::default(),
+        }
     }
 
     /// Takes the next angle; the latest scan is of `scan_ns`, if there was one.
@@ -137,7 +144,7 @@ impl Angles {
         is_off.then_some(Withheld::Inconsistent)
     }
 
-    /// The mount has been standing since `since_ns`.
+    /// Marks all angles after the one with the stamp `since_ns`: the mount stands.
     pub(crate) fn stand_since(&mut self, since_ns: u64) {
         let stands = |entry: &&mut Entry| entry.angle.stamp_ns > since_ns && entry.torn.is_none();
         self.entries
@@ -147,9 +154,24 @@ impl Angles {
             .for_each(|entry| entry.torn = Some(Withheld::Standing));
     }
 
-    /// Returns the stamp of the last angle.
+    /// Returns the delay of all stamps.
+    pub(crate) fn late_ns(&self) -> i64 {
+        self.late_ns
+    }
+
+    /// Adds `more_ns` to the delay of all stamps.
+    pub(crate) fn correct(&mut self, more_ns: i64) {
+        self.late_ns += more_ns;
+    }
+
+    /// Returns when the mount was where an angle with the stamp `stamp_ns` says.
+    pub(crate) fn true_ns(&self, stamp_ns: u64) -> u64 {
+        stamp_ns.saturating_add_signed(-self.late_ns)
+    }
+
+    /// Returns when the mount was at the last angle.
     pub(crate) fn last_ns(&self) -> Option<u64> {
-        self.entries.back().map(|entry| entry.angle.stamp_ns)
+        self.entries.back().map(|entry| self.true_ns(entry.angle.stamp_ns))
     }
 
     /// Returns why the way to the last angle is not known.
@@ -159,6 +181,7 @@ impl Angles {
 
     /// Returns the angle at `time_ns`, evenly between those before and after.
     pub(crate) fn at(&self, time_ns: u64) -> At {
+        let time_ns = time_ns.saturating_add_signed(self.late_ns);
         let after = self.entries.partition_point(|entry| entry.angle.stamp_ns < time_ns);
         let Some(Entry { angle, torn }) = self.entries.get(after) else { return At::Open };
         let Some(before) = after.checked_sub(1).map(|i| self.entries[i].angle) else {

@@ -9,6 +9,7 @@
 
 mod angles;
 mod background;
+mod delay;
 mod mount;
 mod obstacles;
 mod scenery;

@@ -71,6 +71,15 @@ impl Scenery {
         self.is_confirmed = false;
     }
 
+    /// Forgets the background, because all angles are corrected from now on. If the last sweep contradicted the background,
+    /// the angles were right when it was learned, and it stays.
+    pub(crate) fn correct(&mut self) {
+        if self.doubted == 0 {
+            self.model.forget();
+            self.forgotten += 1;
+        }
+    }
+
     /// Returns what `rays` show; `sweep` says which sweep that is.
     pub(crate) fn look<'a>(&'a mut self, rays: &[Ray], sweep: Sweep<'a>) -> Sweep<'a> {
         let (known, elsewhere) = self.compare(rays);

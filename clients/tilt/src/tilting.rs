@@ -6,6 +6,7 @@ use std::collections::VecDeque;
 use schema::Scan;
 
 use crate::angles::{Angle, Angles, At, Step, Withheld};
+use crate::delay::Delay;
 use crate::mount::Mount;
 use crate::scenery::{Ray, Scenery};
 use crate::settings::Settings;
@@ -77,6 +78,7 @@ pub struct Tilting {
     rays: Vec<Ray>,
     later: Vec<Ray>,
     scenery: Scenery,
+    delay: Delay,
     /// Beams, first angle and step of the scans.
     shape: (usize, f64, f64),
     from_ns: u64,
@@ -100,6 +102,7 @@ impl Tilting {
             rays: Vec::new(),
             later: Vec::new(),
             scenery: Scenery::new(mount, settings),
+            delay: Delay::default(),
             shape: (0, 0.0, 0.0),
             from_ns: 0,
             is_whole: false,
@@ -119,6 +122,12 @@ impl Tilting {
         }
     }
 
+    /// Returns how much later than its angles the stamps of the mount are, in ns, as up and down sweeps show. All angles are
+    /// corrected by it.
+    pub fn late_ns(&self) -> i64 {
+        self.angles.late_ns()
+    }
+
     /// Returns why beams that are measured now will make no points; nothing if they will.
     pub fn trouble(&self) -> Option<Withheld> {
         let late_ns = self.scan_ns.unwrap_or(0).saturating_sub(self.settings.delay_ns);
@@ -136,13 +145,16 @@ impl Tilting {
                 if self.angles.trouble() == Some(Withheld::Jumped) {
                     self.scenery.distrust();
                 }
-                self.tear(before_ns.unwrap_or(angle.stamp_ns));
+                self.tear(before_ns.unwrap_or(self.angles.true_ns(angle.stamp_ns)));
             }
             Step::On => match self.swing.take(angle.stamp_ns, angle.angle_rad, &self.settings) {
                 Told::Nothing => {}
-                Told::Turned(stamp_ns) => self.ends.push_back(End { stamp_ns, is_turn: true }),
-                Told::Stands(since_ns) => {
-                    self.angles.stand_since(since_ns);
+                Told::Turned(stamp_ns) => {
+                    self.ends.push_back(End { stamp_ns: self.angles.true_ns(stamp_ns), is_turn: true });
+                }
+                Told::Stands(stamp_ns) => {
+                    self.angles.stand_since(stamp_ns);
+                    let since_ns = self.angles.true_ns(stamp_ns);
                     let before = self.rays.len();
                     self.rays.retain(|ray| ray.time_ns <= since_ns);
                     self.counts.withheld[Withheld::Standing as usize] += (before - self.rays.len()) as u64;
@@ -179,6 +191,7 @@ impl Tilting {
         self.rays.clear();
         self.ends.clear();
         self.swing.forget();
+        self.delay.forget();
         (self.taken_ns, self.is_whole) = (0, false);
     }
 
@@ -187,6 +200,7 @@ impl Tilting {
         let shape = (scan.beams(), scan.first_angle, scan.step);
         if shape != self.shape {
             self.scenery.begin(shape.0, self.shape.0 == 0);
+            self.delay.forget();
             self.shape = shape;
         }
     }
@@ -263,6 +277,24 @@ impl Tilting {
         }
     }
 
+    /// Adds `more_ns` to the delay of the angles' stamps, and gives the beams of this sweep their corrected angles.
+    fn correct(&mut self, more_ns: i64) {
+        self.angles.correct(more_ns);
+        let Tilting { angles, rays, later, ends, .. } = self;
+        for rays in [rays, later] {
+            rays.retain_mut(|ray| match angles.at(ray.time_ns) {
+                At::Known(angle_rad) => {
+                    ray.angle_rad = angle_rad;
+                    true
+                }
+                _ => false,
+            });
+        }
+        ends.iter_mut().for_each(|end| end.stamp_ns = end.stamp_ns.saturating_add_signed(-more_ns));
+        self.delay.forget();
+        self.scenery.correct();
+    }
+
     /// Hands out what was measured until `end`.
     fn show(&mut self, end: End, show: &mut impl FnMut(&Sweep<'_>)) {
         let sweep = Sweep {
@@ -272,6 +304,10 @@ impl Tilting {
             is_complete: self.is_whole && end.is_turn,
             ..Sweep::default()
         };
+        let span = (sweep.from_ns, sweep.until_ns);
+        if let Some(late_s) = self.delay.take(&self.rays, self.shape.0, span, sweep.is_complete) {
+            self.correct((late_s * 1e9) as i64);
+        }
         let sweep = self.scenery.look(&self.rays, sweep);
         self.counts.points += sweep.points.len() as u64;
         self.counts.sweeps += 1;

@@ -62,6 +62,7 @@ pub fn tilt(
         options,
         tilting: Tilting::new(options.mount, options.settings),
         trouble: Trouble::default(),
+        late_ns: 0,
         teller: Teller {
             name,
             is_json: options.json,
@@ -86,6 +87,8 @@ struct Verb<'a> {
     options: &'a TiltOptions,
     tilting: Tilting,
     trouble: Trouble,
+    /// The delay of the angles' stamps that was reported.
+    late_ns: i64,
     teller: Teller<'a>,
     /// Of the first scan.
     beams: Option<usize>,
@@ -115,7 +118,11 @@ impl Sink for Verb<'_> {
                 teller.samples.hear(&header);
                 tilting.take_scan(header.stamp_first_ns, scan, |sweep| teller.tell(sweep));
                 if let Some(trouble) = self.trouble.changed(header.stamp_first_ns, tilting.trouble()) {
-                    teller.tell_trouble(trouble)?;
+                    teller.tell_trouble(trouble, tilting.late_ns())?;
+                }
+                if tilting.late_ns() != self.late_ns {
+                    self.late_ns = tilting.late_ns();
+                    teller.tell_late(&self.options.angles, self.trouble.told, self.late_ns)?;
                 }
             }
             Sample::Tilt(said) => {
@@ -144,7 +151,12 @@ impl Sink for Verb<'_> {
             return Ok(());
         }
         let Teller { name, is_json, samples, out, .. } = &mut self.teller;
-        let sum = lines::Sum { counts: self.tilting.counts(), missed: self.missed, failed: samples.failed() };
+        let sum = lines::Sum {
+            counts: self.tilting.counts(),
+            late_ns: self.tilting.late_ns(),
+            missed: self.missed,
+            failed: samples.failed(),
+        };
         match is_json {
             true => out.json(&lines::summary(name, &sum)),
             false => out.line(|line| lines::summary_text(line, &sum)),
@@ -197,10 +209,17 @@ impl Teller<'_> {
         }
     }
 
-    fn tell_trouble(&mut self, trouble: Option<Withheld>) -> Result<(), End> {
+    fn tell_trouble(&mut self, trouble: Option<Withheld>, late_ns: i64) -> Result<(), End> {
         match self.is_json {
-            true => self.out.json(&lines::angles(self.name, trouble)),
+            true => self.out.json(&lines::angles(self.name, trouble, late_ns)),
             false => self.notes.line(|line| lines::angles_text(line, trouble)),
+        }
+    }
+
+    fn tell_late(&mut self, mount: &str, trouble: Option<Withheld>, late_ns: i64) -> Result<(), End> {
+        match self.is_json {
+            true => self.out.json(&lines::angles(self.name, trouble, late_ns)),
+            false => self.notes.line(|line| lines::late_text(line, mount, late_ns)),
         }
     }
 }

@@ -54,6 +54,8 @@ pub enum FaultKind {
     Lies(f64),
     /// What the encoder says comes so many seconds later, with the right time in it.
     Late(f64),
+    /// The stamps are this many seconds later than the angles; earlier if negative.
+    StampsLate(f64),
 }
 
 /// What the encoder says.
@@ -117,7 +119,7 @@ impl Mount {
         let time_s = number as f64 / self.reports_hz;
         let mut at_s = time_s;
         let mut off_deg = 0.0;
-        let mut late_s = 0.0;
+        let (mut late_s, mut stamp_s) = (0.0, time_s);
         for fault in self.faults.iter().filter(|fault| fault.is_on(time_s)) {
             match fault.kind {
                 FaultKind::Halts => {}
@@ -129,14 +131,16 @@ impl Mount {
                     off_deg += by_deg.signum() * (LIE_DEG_S * edge_s).min(by_deg.abs());
                 }
                 FaultKind::Late(by_s) => late_s += by_s,
+                FaultKind::StampsLate(by_s) => stamp_s += by_s,
             }
         }
         let stands = at_s != time_s || self.faults.iter().any(|fault| fault.halts(time_s));
         let rate_deg_s = if stands { 0.0 } else { self.deg_s * self.direction(time_s) };
         let nanos = |time_s: f64| (time_s * 1e9).round() as Nanos;
         Some(Report {
-            stamp_ns: nanos(time_s),
-            arrives_ns: nanos(time_s + late_s),
+            stamp_ns: nanos(stamp_s),
+            // A program that stamps an angle when it arrives stamps it late.
+            arrives_ns: nanos(stamp_s.max(time_s) + late_s),
             angle_rad: (self.angle_deg(at_s) + off_deg).to_radians(),
             rate_rad_s: rate_deg_s / 180.0 * PI,
         })
@@ -245,5 +249,9 @@ mod tests {
         let late = says(FaultKind::Late(0.2), 100).expect("it says so");
         assert_eq!((late.stamp_ns, late.arrives_ns), (1_000_000_000, 1_200_000_000));
         assert!((late.rate_rad_s.to_degrees() - 30.0).abs() < 1e-9);
+        let stamped = [0.03, -0.03].map(|by_s| says(FaultKind::StampsLate(by_s), 100).expect("it says so"));
+        assert_eq!(stamped.map(|report| report.stamp_ns / 1_000_000), [1030, 970]);
+        assert_eq!(stamped.map(|report| report.arrives_ns / 1_000_000), [1030, 1000]);
+        assert_eq!(stamped.map(|report| report.angle_rad.to_degrees().round()), [20.0; 2]);
     }
 }

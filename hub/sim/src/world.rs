@@ -594,8 +594,9 @@ impl FaultFile {
             "jumps" => FaultKind::Jumps(by_deg()?),
             "lies" => FaultKind::Lies(by_deg()?),
             "late" => FaultKind::Late(origin.number(&self.by_s, 0.3, 0.0..=10.0)?),
+            "stamps_late" => FaultKind::StampsLate(origin.number(&self.by_s, 0.03, -1.0..=1.0)?),
             other => {
-                let remedy = "halts, silent, stuck, jumps or lies with by_deg, late with by_s";
+                let remedy = "halts, silent, stuck, jumps or lies with by_deg, late or stamps_late with by_s";
                 return Err(origin.refuse(span, format!("kind = \"{other}\""), remedy));
             }
         };

@@ -2,6 +2,7 @@
 //! what is true of each point. Refuses to judge.
 
 use std::collections::HashMap;
+use std::time::{Duration, Instant};
 
 use scanhub_drivers::lms::variant::{Mode, Unit, Variant};
 use schema::{Scan, ScanHead};
@@ -23,6 +24,8 @@ pub(crate) struct Hall {
     pub(crate) mount: Mount,
     /// What stamped each beam, and what it met.
     truth: HashMap<(u64, u16), Met>,
+    /// The delay of the angles' stamps that the library has found.
+    pub(crate) late_ns: i64,
 }
 
 impl Hall {
@@ -33,7 +36,7 @@ impl Hall {
         let (ahead, up) = (motor.arm_mm.0 / 1000.0, motor.arm_mm.1 / 1000.0);
         let mount =
             Mount { axis_at: [0.0, 0.0, axis_m], sensor_at: [ahead, 0.0, axis_m + up], ..Mount::default() };
-        Hall { room: Room::new(world, seed), motor, mount, truth: HashMap::new() }
+        Hall { room: Room::new(world, seed), motor, mount, truth: HashMap::new(), late_ns: 0 }
     }
 
     /// Plays the hall until `until_s`, and hands out each sweep with the hall.
@@ -57,10 +60,38 @@ impl Hall {
             let scan = self.scan(end_ns);
             tilting.take_scan(end_ns, &scan, |sweep| show(self, sweep));
         }
+        self.late_ns = tilting.late_ns();
         tilting.counts()
     }
 
-    /// What the beam of `point` met.
+    /// Plays the hall until `until_s` again and again. Returns the time of the library for each scan, in the fastest of them.
+    pub(crate) fn cost(&mut self, settings: Settings, until_s: u64) -> Duration {
+        let ends: Vec<u64> = (1..until_s * 1_000_000_000 / SCAN_NS).map(|number| number * SCAN_NS).collect();
+        let scans: Vec<Box<Scan>> = ends.iter().map(|end_ns| self.scan(*end_ns)).collect();
+        let numbers = 0..(until_s as f64 * self.motor.reports_hz) as u64;
+        let reports: Vec<Report> = numbers.filter_map(|number| self.motor.report(number)).collect();
+        let play = |_| {
+            let mut tilting = Tilting::new(self.mount, settings);
+            let mut reports = reports.iter().peekable();
+            let began = Instant::now();
+            for (end_ns, scan) in ends.iter().zip(&scans) {
+                while let Some(report) = reports.next_if(|report| report.arrives_ns < end_ns + LINE_NS) {
+                    let Report { stamp_ns, angle_rad, rate_rad_s, .. } = *report;
+                    tilting.take_angle(Angle { stamp_ns, angle_rad, rate_rad_s }, |_| {});
+                }
+                tilting.take_scan(*end_ns, scan, |_| {});
+            }
+            began.elapsed()
+        };
+        (0..30).map(play).min().unwrap_or_default() / ends.len() as u32
+    }
+
+    /// Returns the time from one reversal of the mount to the next, in ns.
+    pub(crate) fn sweep_ns(&self) -> u64 {
+        ((self.motor.to_deg - self.motor.from_deg) / self.motor.deg_s * 1e9) as u64
+    }
+
+    /// Returns what the beam of `point` met.
     pub(crate) fn met(&self, point: &Point) -> Option<Met> {
         self.truth.get(&(point.stamp_ns, point.beam)).copied()
     }

@@ -50,6 +50,86 @@ impl Score {
     }
 }
 
+/// Objects that are new, and obstacles that were found.
+#[derive(Clone, Copy, Debug, Default)]
+pub(crate) struct Things {
+    /// Clusters of at least [`LEAST`] points on people and new things; of these found.
+    pub(crate) new: (usize, usize),
+    /// Obstacles on something new.
+    pub(crate) right: usize,
+    /// Obstacles where nothing is new.
+    pub(crate) wrong: usize,
+}
+
+/// An object with fewer points need not be found.
+const LEAST: usize = 15;
+/// Greatest distance between neighboring points of an object, in meters.
+const NEAR_M: f32 = 0.2;
+
+impl Things {
+    /// Adds the obstacles of a sweep. [`Score::add`] defines which points are new. It leaves out some
+    /// points; obstacles there do not count either.
+    pub(crate) fn add(&mut self, hall: &Hall, sweep: &Sweep<'_>, settings: &Settings, sweep_ns: u64) {
+        let new_ns = u64::from(settings.sweeps) * sweep_ns;
+        let (mut new, mut open) = (Vec::new(), Vec::new());
+        for point in sweep.points {
+            match hall.met(point) {
+                Some(Met::Person) => new.push(point.at),
+                Some(Met::Box { since_ns }) if point.stamp_ns < since_ns + new_ns => new.push(point.at),
+                Some(Met::Box { since_ns }) if point.stamp_ns < since_ns + new_ns + 3 * sweep_ns => {
+                    open.push(point.at);
+                }
+                _ => {}
+            }
+        }
+        let is_in = |one: &Obstacle, at: &[f32; 3]| {
+            (0..3).all(|i| (one.low[i] - 0.02..=one.high[i] + 0.02).contains(&at[i]))
+        };
+        for one in sweep.obstacles {
+            let on = |points: &[[f32; 3]]| points.iter().filter(|at| is_in(one, at)).count();
+            match (on(&new), on(&open)) {
+                (3.., _) => self.right += 1,
+                (_, 3..) => {}
+                _ => self.wrong += 1,
+            }
+        }
+        for cluster in clusters(&new).into_iter().filter(|cluster| cluster.len() >= LEAST) {
+            let in_some = cluster.iter().filter(|at| sweep.obstacles.iter().any(|one| is_in(one, at)));
+            self.new.0 += 1;
+            self.new.1 += usize::from(2 * in_some.count() >= cluster.len());
+        }
+    }
+
+    /// Returns the share of the new objects that were found.
+    pub(crate) fn recall(&self) -> f64 {
+        share(self.new.1, self.new.0)
+    }
+
+    /// Returns the share of the obstacles that are on something new.
+    pub(crate) fn precision(&self) -> f64 {
+        share(self.right, self.right + self.wrong)
+    }
+}
+
+/// Points that are near each other, directly or over others.
+fn clusters(points: &[[f32; 3]]) -> Vec<Vec<[f32; 3]>> {
+    let mut open = points.to_vec();
+    let mut clusters = Vec::new();
+    while let Some(first) = open.pop() {
+        let mut cluster = vec![first];
+        let mut next = 0;
+        while let Some(at) = cluster.get(next).copied() {
+            next += 1;
+            let is_near = |other: &mut [f32; 3]| {
+                (0..3).map(|i| (at[i] - other[i]).powi(2)).sum::<f32>() < NEAR_M * NEAR_M
+            };
+            cluster.extend(open.extract_if(.., is_near));
+        }
+        clusters.push(cluster);
+    }
+    clusters
+}
+
 /// A share of a count that may be 0.
 pub(crate) fn share(part: usize, all: usize) -> f64 {
     part as f64 / all as f64

@@ -5,10 +5,11 @@
 //! ```
 
 mod hall;
+mod halls;
 mod judge;
 
 use hall::Hall;
-use judge::{Score, Seen, seconds, share};
+use judge::{Score, Seen, Things, seconds, share};
 use sim::mount::{Fault, FaultKind};
 use sim::world::World;
 use tilt::{Settings, Withheld};
@@ -18,13 +19,32 @@ const SEEDS: u64 = 10;
 
 fn main() -> Result<(), schema::Failure> {
     let world: World = "tilt".parse()?;
-    people(&world);
-    println!(
-        "fault from 20 to 24 s: beams withheld (silent, jumped, inconsistent, standing), sweeps doubted of all"
-    );
-    println!("  greatest error of points in other sweeps; obstacles in them where nothing is new");
-    for (name, kind) in FAULTS {
-        fault(&world, name, kind);
+    let part = std::env::args().nth(1);
+    let is_wanted = |name: &str| part.as_deref().is_none_or(|part| part == name);
+    if is_wanted("unchanging") {
+        unchanging();
+    }
+    if is_wanted("changing") {
+        changing();
+    }
+    if is_wanted("stamps") {
+        late_stamps();
+    }
+    if is_wanted("cost") {
+        let cost = |seed| Hall::new(&halls::changing(seed), seed).cost(Settings::default(), 80);
+        println!("time of the library for a scan of 361 beams, in three halls: {:?}", [0, 1, 2].map(cost));
+    }
+    if is_wanted("people") {
+        people(&world);
+    }
+    if is_wanted("faults") {
+        println!(
+            "fault from 20 to 24 s: beams withheld (silent, jumped, inconsistent, standing), sweeps doubted of all"
+        );
+        println!("  greatest error of points in other sweeps; obstacles in them where nothing is new");
+        for (name, kind) in FAULTS {
+            fault(&world, name, kind);
+        }
     }
     Ok(())
 }
@@ -39,6 +59,80 @@ const FAULTS: [(&str, FaultKind); 8] = [
     ("late by 0.2 s", FaultKind::Late(0.2)),
     ("late by 1 s", FaultKind::Late(1.0)),
 ];
+
+/// Halls in which nothing changes, for 200 sweeps: obstacles that are invented once the background is known.
+fn unchanging() {
+    let (mut sweeps, mut with, mut obstacles, mut late) = (0, 0, 0, 0);
+    for seed in 0..4 {
+        let mut hall = Hall::new(&halls::unchanging(seed), seed);
+        let until_s = 200 * hall.sweep_ns() / seconds(1);
+        hall.play(Settings::default(), until_s, |_, sweep| {
+            let is_known = sweep.number > 6;
+            sweeps += u32::from(is_known);
+            with += u32::from(is_known && !sweep.obstacles.is_empty());
+            obstacles += if is_known { sweep.obstacles.len() } else { 0 };
+            late += if sweep.number >= 100 { sweep.obstacles.len() } else { 0 };
+        });
+    }
+    println!("4 halls without changes, 200 sweeps each: {obstacles} obstacles in {with} of {sweeps} sweeps");
+    println!("  {late} of these in the second hundred");
+}
+
+/// Furnished halls with new things and a person: obstacles.
+fn changing() {
+    let settings = Settings::default();
+    let mut all = Things::default();
+    for seed in 0..SEEDS {
+        let mut things = Things::default();
+        let mut hall = Hall::new(&halls::changing(seed), seed);
+        hall.play(settings, 80, |hall, sweep| {
+            if sweep.from_ns > seconds(20) {
+                things.add(hall, sweep, &settings, hall.sweep_ns());
+            }
+        });
+        all.new = (all.new.0 + things.new.0, all.new.1 + things.new.1);
+        (all.right, all.wrong) = (all.right + things.right, all.wrong + things.wrong);
+    }
+    println!(
+        "{SEEDS} furnished halls of 80 s: obstacles recall {:.3} of {}, precision {:.3} of {}",
+        all.recall(),
+        all.new.0,
+        all.precision(),
+        all.right + all.wrong
+    );
+}
+
+/// Stamps of angles that are wrong from the start, in halls in which nothing changes.
+fn late_stamps() {
+    println!(
+        "stamps of angles late by: found; error of points from 20 to 40 s, p50 and p99; obstacles; doubted sweeps"
+    );
+    for by_s in [0.0, 0.005, 0.01, 0.03, 0.1, -0.03] {
+        let (mut errors, mut obstacles, mut doubted, mut sweeps) = (Vec::new(), 0, 0, 0);
+        let mut found = Vec::new();
+        for seed in 0..4 {
+            let fault = Fault { kind: FaultKind::StampsLate(by_s), from_s: 0.0, until_s: f64::INFINITY };
+            let world = halls::unchanging(seed).with_mount_faults(&[fault]);
+            let mut hall = Hall::new(&world, seed);
+            let counts = hall.play(Settings::default(), 40, |hall, sweep| {
+                if sweep.from_ns > seconds(20) {
+                    errors.extend(sweep.points.iter().map(|point| hall.error_m(point)));
+                    obstacles += sweep.obstacles.len();
+                }
+            });
+            found.push(hall.late_ns as f64 / 1e6);
+            (doubted, sweeps) = (doubted + counts.doubted, sweeps + counts.sweeps);
+        }
+        errors.sort_by(f64::total_cmp);
+        let at = |share: f64| 1000.0 * errors[((errors.len() - 1) as f64 * share) as usize];
+        println!(
+            "  {:4.0} ms: {found:.1?} ms; {:.1} mm, {:.1} mm; {obstacles}; {doubted} of {sweeps}",
+            1000.0 * by_s,
+            at(0.5),
+            at(0.99)
+        );
+    }
+}
 
 fn people(world: &World) {
     let settings = Settings::default();

@@ -6,14 +6,31 @@ use ::tilt::{Counts, Withheld};
 use serde::Serialize;
 
 /// Class `angles`.
-pub(super) fn angles(sensor: &str, trouble: Option<Withheld>) -> impl Serialize {
+pub(super) fn angles(sensor: &str, trouble: Option<Withheld>, late_ns: i64) -> impl Serialize {
     #[derive(Serialize)]
     struct Line<'a> {
         class: &'static str,
         sensor: &'a str,
         trouble: Option<&'static str>,
+        late_ms: f64,
     }
-    Line { class: "angles", sensor, trouble: trouble.map(word) }
+    Line { class: "angles", sensor, trouble: trouble.map(word), late_ms: late_ms(late_ns) }
+}
+
+/// Returns milliseconds with one decimal.
+fn late_ms(late_ns: i64) -> f64 {
+    (late_ns as f64 / 1e5).round() / 10.0
+}
+
+/// Writes that the stamps of the angles of `mount` are late.
+pub(super) fn late_text(line: &mut Vec<u8>, mount: &str, late_ns: i64) -> io::Result<()> {
+    let (ms, word) = (late_ms(late_ns), if late_ns < 0 { "early" } else { "late" });
+    write!(
+        line,
+        "the stamps of {mount}/tilt are {:.1} ms {word}, or its gears have play: corrected. Publish each angle with the \
+         time of its measurement",
+        ms.abs()
+    )
 }
 
 pub(super) fn angles_text(line: &mut Vec<u8>, trouble: Option<Withheld>) -> io::Result<()> {
@@ -42,6 +59,8 @@ fn word(why: Withheld) -> &'static str {
 /// What a run came to.
 pub(super) struct Sum {
     pub(super) counts: Counts,
+    /// Delay of the stamps of the angles.
+    pub(super) late_ns: i64,
     pub(super) missed: u64,
     /// Samples that were not published for lack of memory.
     pub(super) failed: u64,
@@ -76,6 +95,7 @@ pub(super) fn summary<'a>(sensor: &'a str, sum: &Sum) -> impl Serialize + 'a {
         angles_unfit: u64,
         missed: u64,
         failed: u64,
+        late_ms: f64,
     }
     let Counts { withheld: [silent, jumped, inconsistent, standing], .. } = sum.counts;
     Line {
@@ -95,6 +115,7 @@ pub(super) fn summary<'a>(sensor: &'a str, sum: &Sum) -> impl Serialize + 'a {
         angles_unfit: sum.counts.angles_unfit,
         missed: sum.missed,
         failed: sum.failed,
+        late_ms: late_ms(sum.late_ns),
     }
 }
 
@@ -112,5 +133,8 @@ pub(super) fn summary_text(line: &mut Vec<u8>, sum: &Sum) -> io::Result<()> {
         "{standing} standing; {angles} angles; left out: {angles_unordered} late, {angles_ahead} ahead, "
     )?;
     write!(line, "{angles_unfit} unfit, {} missed", sum.missed)?;
+    if sum.late_ns != 0 {
+        write!(line, "; stamps of angles {:.1} ms late, corrected", late_ms(sum.late_ns))?;
+    }
     if sum.failed > 0 { write!(line, "; {} not published: no memory", sum.failed) } else { Ok(()) }
 }
