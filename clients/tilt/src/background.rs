@@ -36,7 +36,19 @@ struct Cell {
     candidate: Surface,
     /// Sweeps in a row in which the candidate was met.
     run: u16,
+    /// Surfaces that beams meet now and then, because they are narrower than the distance between two scans.
+    narrow: [Narrow; NARROW],
     /// The sweep in which it was looked at last, and one: once a sweep is enough.
+    seen: u32,
+}
+
+/// A surface that the beams of a cell do not meet in each sweep.
+#[derive(Clone, Copy, Default)]
+struct Narrow {
+    surface: Surface,
+    /// How often a beam met it after beams that met something else; fewer if beams met a third surface. 0: there is none.
+    returns: u16,
+    /// The sweep in which it was met last, and one.
     seen: u32,
 }
 
@@ -58,11 +70,21 @@ impl Model {
     pub(crate) fn class(&self, reading: &Reading, row: usize, threshold_m: f32) -> PointClass {
         let beam = usize::from(reading.beam);
         let own = self.background(row, beam);
-        let beside = (row.saturating_sub(1)..=row + 1)
-            .flat_map(|row| (beam.saturating_sub(1)..=beam + 1).map(move |beam| (row, beam)));
-        let mut all = beside.filter_map(|(row, beam)| self.background(row, beam));
+        let explains = |surface: &Surface| surface.explains(reading, threshold_m);
+        if own.as_ref().is_some_and(explains) {
+            return PointClass::Background;
+        }
         // At edges a beam meets what its neighbours meet.
-        if all.any(|surface| surface.explains(reading, threshold_m)) {
+        let beside = || {
+            let rows = row.saturating_sub(1)..=row + 1;
+            rows.flat_map(|row| (beam.saturating_sub(1)..=beam + 1).map(move |beam| (row, beam)))
+        };
+        let mut all = beside().filter_map(|(row, beam)| self.background(row, beam));
+        let mut narrow =
+            beside().filter_map(|(row, beam)| self.cell(row, beam)).flat_map(|cell| &cell.narrow);
+        if all.any(|surface| explains(&surface))
+            || narrow.any(|narrow| narrow.returns >= RETURNS && explains(&narrow.surface))
+        {
             return PointClass::Background;
         }
         match own {
@@ -107,12 +129,12 @@ impl Model {
             cell.run = 0;
             return;
         }
+        cell.learn_narrow(reading, sweep, threshold_m);
         if cell.run > 0 && cell.candidate.explains(reading, threshold_m) {
             cell.candidate.meet(reading);
             cell.run += 1;
         } else {
-            let &Reading { range_m, rise, .. } = reading;
-            (cell.candidate, cell.run) = (Surface { range_m, rise, off: [0.0; 2] }, 1);
+            (cell.candidate, cell.run) = (Surface::of(reading), 1);
         }
         if cell.run >= settings.sweeps {
             (cell.background, cell.run) = (cell.candidate, 0);
@@ -125,7 +147,31 @@ impl Model {
     }
 
     fn background(&self, row: usize, beam: usize) -> Option<Surface> {
-        self.rows.get(row)?.get(beam).map(|cell| cell.background).filter(Surface::is_known)
+        self.cell(row, beam).map(|cell| cell.background).filter(Surface::is_known)
+    }
+
+    fn cell(&self, row: usize, beam: usize) -> Option<&Cell> {
+        self.rows.get(row)?.get(beam)
+    }
+}
+
+impl Cell {
+    /// Counts how often beams return to a surface that is not the background. What stands still for a while and is gone
+    /// afterwards returns once; people who walk do not return to the same range.
+    fn learn_narrow(&mut self, reading: &Reading, sweep: u32, threshold_m: f32) {
+        let met = |narrow: &&mut Narrow| narrow.returns > 0 && narrow.surface.explains(reading, threshold_m);
+        if let Some(narrow) = self.narrow.iter_mut().find(met) {
+            let is_return = narrow.seen < sweep;
+            narrow.returns = (narrow.returns + u16::from(is_return)).min(2 * RETURNS);
+            narrow.surface.meet(reading);
+            narrow.seen = sweep + 1;
+            return;
+        }
+        let Some(least) = self.narrow.iter_mut().min_by_key(|narrow| narrow.returns) else { return };
+        least.returns = least.returns.saturating_sub(1);
+        if least.returns == 0 {
+            *least = Narrow { surface: Surface::of(reading), returns: 1, seen: sweep + 1 };
+        }
     }
 }
 
@@ -151,6 +197,10 @@ pub(crate) fn placed(
 }
 
 impl Surface {
+    fn of(reading: &Reading) -> Surface {
+        Surface { range_m: reading.range_m, rise: reading.rise, off: [0.0; 2] }
+    }
+
     fn is_known(&self) -> bool {
         self.range_m > 0.0
     }
@@ -196,6 +246,10 @@ impl Surface {
     }
 }
 
+/// A cell stores so many narrow surfaces: of a board, its edge, its top and what is beside it.
+const NARROW: usize = 2;
+/// A narrow surface is background after so many returns.
+const RETURNS: u16 = 3;
 /// Less than a planar scanner measures exactly.
 const LEAST_BIN_RAD: f64 = 0.002;
 /// Share of the last beam in what is known of a surface.
@@ -236,6 +290,43 @@ mod tests {
         assert_eq!([2.0, 4.0].map(|range| class(&model, range)), [Background, Behind], "it stays");
         model.forget();
         assert_eq!(class(&model, 2.0), PointClass::Unknown);
+    }
+
+    #[test]
+    fn a_surface_that_is_met_now_and_then_is_background_after_three_returns() {
+        use PointClass::{Background, Foreground};
+        let mut model = Model::new(11, &settings());
+        let mut classes = Vec::new();
+        for sweep in 0..16 {
+            let range_m = if sweep % 4 == 3 { 2.0 } else { 4.0 };
+            classes.push(model.class(&reading(2.0), 90, 0.06));
+            model.learn(&reading(range_m), 90, sweep, &settings());
+        }
+        assert_eq!(classes[3..], [[Foreground; 9].as_slice(), &[Background; 4]].concat());
+        assert_eq!(model.class(&reading(3.0), 90, 0.06), Foreground, "before both");
+        let beside = Reading { beam: 6, ..reading(4.0) };
+        (16..20).for_each(|sweep| model.learn(&beside, 91, sweep, &settings()));
+        assert_eq!(model.class(&Reading { beam: 6, ..reading(2.0) }, 91, 0.06), Background, "beside it");
+    }
+
+    #[test]
+    fn what_stands_for_a_while_or_walks_does_not_return() {
+        use PointClass::Foreground;
+        let mut model = Model::new(11, &settings());
+        let met = |ranges: &[f32], from: u32, model: &mut Model| {
+            for (range_m, sweep) in ranges.iter().zip(from..) {
+                model.learn(&reading(*range_m), 90, sweep, &settings());
+            }
+        };
+        met(&[4.0; 5], 0, &mut model);
+        // Something stands there for so long that it is background, is gone, and comes back.
+        met(&[2.0, 2.0, 2.0, 2.0, 4.0, 4.0, 4.0, 4.0], 5, &mut model);
+        assert_eq!(model.class(&reading(2.0), 90, 0.06), Foreground);
+        let walks = [1.5, 4.0, 2.5, 3.0, 4.0, 2.0, 1.7, 4.0, 3.3, 2.5, 4.0, 1.5, 2.2, 4.0, 3.6, 2.8, 4.0];
+        met(&walks, 13, &mut model);
+        for range_m in walks.into_iter().filter(|range_m| *range_m < 4.0) {
+            assert_eq!(model.class(&reading(range_m), 90, 0.06), Foreground, "{range_m}");
+        }
     }
 
     #[test]
@@ -296,14 +387,8 @@ mod tests {
             let mut met = Vec::new();
             for sweep in 0..40 {
                 let range = surfaces[random.usize(..4) * random.usize(..2)];
-                let asked = surfaces[random.usize(..4)];
-                let class = match slowly(&met, 3) {
-                    None => PointClass::Unknown,
-                    Some(known) if known == asked || (known - asked).abs() <= 0.06 => PointClass::Background,
-                    Some(known) if asked < known => PointClass::Foreground,
-                    Some(_) => PointClass::Behind,
-                };
-                assert_eq!(model.class(&reading(asked), 90, 0.06), class, "seed {seed}, sweep {sweep}");
+                let known = model.background(90, 5).map(|surface| surface.range_m);
+                assert_eq!(known, slowly(&met, 3), "seed {seed}, sweep {sweep}");
                 model.learn(&reading(range), 90, sweep, &settings());
                 met.push(range);
             }

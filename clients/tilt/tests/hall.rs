@@ -144,3 +144,12 @@ fn stamps_that_get_late_are_corrected_and_the_background_stays() {
     assert!((hall.late_ns as f64 / 1e6 - 30.0).abs() < 1.0, "{} ns", hall.late_ns);
     assert!((1..=5).contains(&counts.doubted) && counts.forgotten == 0 && known > 2, "{counts:?} {known}");
 }
+
+#[test]
+fn boards_narrower_than_the_distance_between_scans_are_no_obstacles() {
+    let mut hall = Hall::new(&halls::unchanging(1), 1);
+    let until_s = 45 * hall.sweep_ns() / seconds(1);
+    hall.play(Settings::default(), until_s, |_, sweep| {
+        assert!(sweep.obstacles.is_empty(), "sweep {}: {:?}", sweep.number, sweep.obstacles);
+    });
+}
