@@ -2,6 +2,7 @@
 //! player.
 
 pub(crate) mod line;
+mod mounts;
 pub(crate) mod page;
 
 use std::io::{IsTerminal, Read, stderr, stdin};
@@ -21,6 +22,7 @@ use serde::Serialize;
 
 use crate::cli::{Everywhere, Replay};
 use line::Line;
+use mounts::Mounts;
 
 /// Runs until the recording has been played or the user ends it. Then prints a summary.
 pub(crate) fn replay(replay: &Replay, everywhere: &Everywhere) -> Result<(), Failure> {
@@ -34,7 +36,12 @@ pub(crate) fn replay(replay: &Replay, everywhere: &Everywhere) -> Result<(), Fai
         holds: replay.hold,
     };
     let mut console = None;
+    let mut mounts = None;
     let played = daemon::replay(&options, &domain, |ready, player| {
+        let started = mounts.insert(Mounts::start(player, &domain));
+        if started.is_err() {
+            return player.end();
+        }
         crate::say_ready(ready, &domain, everywhere.json);
         if !everywhere.json {
             console = Console::open(player);
@@ -42,6 +49,7 @@ pub(crate) fn replay(replay: &Replay, everywhere: &Everywhere) -> Result<(), Fai
     });
     drop(console);
     let played = played?;
+    mounts.transpose()?;
     crate::say(&if everywhere.json { crate::line(&Replayed::of(&played)) } else { line::summary(&played) });
     Ok(())
 }

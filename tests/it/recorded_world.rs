@@ -6,8 +6,9 @@ use std::fs::File;
 
 use scanhub_drivers::lms;
 use scanhub_drivers::lms::variant::{MIRROR_TURN, Mode, Unit, Variant};
+use schema::datagram::Packed;
 use schema::file::Writer;
-use schema::{Header, Topic};
+use schema::{Header, Tilt, Topic};
 use sim::room::Room;
 use sim::world::World;
 
@@ -23,12 +24,16 @@ const WELL: u8 = 0x10;
 
 /// A file with the telegrams of `sensors`, which look at `world` in its order for so many seconds: 361 beams in millimetres, at
 /// 500,000 baud.
+/// The angles of the first sensor's mount, if it has one, are in it as `mount/tilt`.
 pub(crate) fn recorded_world(env: &TestEnv, world: &World, sensors: &[&str], seconds: u64) -> String {
     let file = env.word("world.mcap");
     let rooms: Vec<Room> = (0..sensors.len() as u64).map(|port| Room::of_port(world, 5, port)).collect();
     let mut writer =
         Writer::begin(File::create(&file).expect("a file"), "", BTreeMap::new()).expect("begins");
     let period = Variant::HALF.turns() * MIRROR_TURN;
+    let reports = (0..).map_while(|number| world.mount(0)?.report(number));
+    let mut reports = reports.skip_while(|report| report.stamp_ns < 1_000_000_000).peekable();
+    let mut angles = 0;
     for seq in 0..seconds * 1_000_000_000 / period {
         for (number, room) in rooms.iter().enumerate() {
             let end_ns = 1_000_000_000 + seq * period + number as u64 * APART_NS;
@@ -50,6 +55,25 @@ pub(crate) fn recorded_world(env: &TestEnv, world: &World, sensors: &[&str], sec
             };
             header.set_sent_at(end_ns + 100_000);
             writer.sample(sensors[number], Topic::Telegram, &header, telegram.bytes()).expect("is written");
+        }
+        let now_ns = 1_000_000_000 + seq * period;
+        while let Some(report) = reports.next_if(|report| report.arrives_ns <= now_ns) {
+            // The stamps of the telegrams are this much before the end of their scans.
+            let stamp_ns = report.stamp_ns - TELEGRAM_NS;
+            let header = Header {
+                seq: angles,
+                topic_seq: angles,
+                stamp_first_ns: stamp_ns,
+                stamp_last_ns: stamp_ns,
+                wall_ns: BEGIN_NS + stamp_ns,
+                boot: 8,
+                ..Header::default()
+            };
+            let tilt = Tilt { angle_rad: report.angle_rad, rate_rad_s: report.rate_rad_s };
+            let mut room = [0; 64];
+            let len = tilt.pack(&mut room).expect("there is room");
+            writer.sample("mount", Topic::Tilt, &header, &room[..len]).expect("is written");
+            angles += 1;
         }
         if seq % 40 == 0 {
             writer.close_chunk().expect("is written");

@@ -6,10 +6,13 @@ use std::cell::Cell;
 use scanhub_client::Subscription;
 use schema::Tilt;
 use serde_json::Value;
+use sim::world::World;
 
 use crate::pages::{commands_on, programs_on};
 use crate::publishers::{Mount, languages};
+use crate::recorded_world::{BEGIN_NS, recorded_world};
 use crate::testkit::{INT, Outcome, Program, TestEnv, is_class, number};
+use crate::tilted::Made;
 
 /// A hall with a post ahead of a sensor that swings slowly: how late the hub stamps scans on a busy machine moves
 /// points little.
@@ -207,6 +210,48 @@ fn the_page_leads_to_an_obstacle() {
     echo.await_line("an obstacle", has_obstacle);
     assert_eq!((tilt.end(INT).code, echo.end(INT).code), (Some(0), Some(0)));
     ends_well(hall);
+}
+
+#[test]
+fn a_recording_has_three_dimensions() {
+    let env = TestEnv::new();
+    let file = recorded_world(&env, &World::of_toml("hall", WORLD).expect("a world"), &["front"], 12);
+    let player = env.start(&["replay", &file, "--paused", "--json", "--no-system-config"]).ready();
+    let mut echo = env.echo(&["mount/tilt"]);
+    let words = ["tilt", "front", "--angles=mount", "--axis-at=0,0,0.9", "--sensor-at=0.06,0,0.94", "--json"];
+    let mut tilt = env.start(&[&words[..], &[NEAR]].concat());
+    env.await_info("front", |info| info["state"] == "paused");
+    assert_eq!(env.run(&["control", "front", "resume"]).code, Some(0));
+    let angles = echo.await_lines(100, "angles", is_class("tilt"));
+    for pair in angles.windows(2) {
+        // At rate 1, the times between stamps are those of the recording.
+        assert_eq!(number(&pair[1], "stamp_ns") - number(&pair[0], "stamp_ns"), 10_000_000, "{pair:?}");
+        assert_eq!(number(&pair[1], "wall_ns") - number(&pair[0], "wall_ns"), 10_000_000, "{pair:?}");
+    }
+    assert!((BEGIN_NS..BEGIN_NS + 12_000_000_000).contains(&number(&angles[0], "wall_ns")), "{}", angles[0]);
+    assert!(angles[0]["flags"].to_string().contains("replayed"), "{}", angles[0]);
+    tilt.await_line("the post", has_obstacle);
+    let played = player.wait();
+    assert_eq!(played.code, Some(0), "{played}");
+    let outcome = tilt.end(INT);
+    let sum = &outcome.of_class("summary")[0];
+    // Four whole sweeps are enough to notice stamps that are 8 ms off.
+    assert!(number(sum, "sweeps") >= 4 && sum["late_ms"] == 0.0, "{sum}");
+    assert!(number(sum, "points") > 50_000, "{sum}");
+    let withheld = ["jumped", "inconsistent", "standing"].map(|why| number(&sum["withheld"], why));
+    assert_eq!(withheld, [0; 3], "{sum}");
+}
+
+#[test]
+fn a_recorded_mount_whose_name_another_program_has_is_refused() {
+    let env = TestEnv::new();
+    let file = recorded_world(&env, &World::of_toml("hall", WORLD).expect("a world"), &["front"], 2);
+    let _made = Made::beside(&env);
+    let refused = env.run(&["replay", &file, "--json", "--no-system-config"]);
+    assert!(
+        refused.code == Some(75) && format!("{refused}").contains("the name mount is published by"),
+        "{refused}"
+    );
 }
 
 #[test]

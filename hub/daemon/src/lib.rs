@@ -35,6 +35,7 @@ pub use learned::{Files, Handle, Keeper, KnownRate, KnownScanner, Slots};
 pub use player::{Pace, Play, Player, Progress};
 pub use reconnect::LiveLink;
 pub use reload::{Read, Reload};
+pub use replay::{RecordedAngle, RecordedMount};
 pub use replay_hub::{Replay, replay};
 pub use service::Service;
 pub use supervise::{Ready, run};

@@ -10,6 +10,7 @@ use port::clock;
 use schema::{Failure, Nanos};
 
 use crate::event_fd::EventFd;
+use crate::replay::RecordedMount;
 pub use playback::Play;
 use playback::Playback;
 pub(crate) use playback::{Due, Turn};
@@ -34,6 +35,8 @@ pub struct Player {
     /// Somebody wants it to end now.
     is_ended: AtomicBool,
     length_ns: Option<Nanos>,
+    /// Mounts whose angles are in the recording.
+    mounts: Vec<RecordedMount>,
 }
 
 /// Where a link is.
@@ -123,7 +126,33 @@ impl Player {
             over: EventFd::new()?,
             is_ended: AtomicBool::new(false),
             length_ns,
+            mounts: Vec::new(),
         })
+    }
+
+    /// Returns the player with `mounts`.
+    pub(crate) fn with_mounts(self, mounts: Vec<RecordedMount>) -> Player {
+        Player { mounts, ..self }
+    }
+
+    /// Returns the mounts whose angles are in the recording. The caller publishes their angles.
+    pub fn mounts(&self) -> &[RecordedMount] {
+        &self.mounts
+    }
+
+    /// Returns how the recording is played.
+    pub(crate) fn play(&self) -> Play {
+        *self.lock().play()
+    }
+
+    /// Returns the number of restarts.
+    pub(crate) fn lap(&self) -> u32 {
+        self.lock().lap()
+    }
+
+    /// Returns when something of `media` is due that belongs to no link. No link waits for it.
+    pub(crate) fn due(&self, media: Nanos, now: Nanos) -> Turn {
+        self.lock().due(media, now, self.position())
     }
 
     /// Everything is up: the first telegram may come.

@@ -2,6 +2,7 @@
 //! recorded, or as fast as they can be read. The hub sends no requests, because nothing could answer them.
 
 mod frames;
+mod mounts;
 mod recorded;
 mod stream;
 
@@ -18,6 +19,7 @@ use crate::player::{Due, Pace, Play, Player, PlayerHandle, Turn};
 use crate::surroundings::Woken;
 use crate::system::System;
 
+pub use mounts::{RecordedAngle, RecordedMount};
 pub(crate) use recorded::{Origin, Recorded, tell_of_damage};
 
 /// What a link plays together with others.

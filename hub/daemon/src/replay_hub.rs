@@ -11,7 +11,7 @@ use scanhub_drivers::Model;
 use schema::{Domain, Failure, Family, Kind, Nanos, check_sensor};
 
 use crate::player::{Play, Player, Progress};
-use crate::replay::{Origin, Recorded, tell_of_damage};
+use crate::replay::{Origin, Recorded, RecordedMount, tell_of_damage};
 use crate::supervise::{self, Ready, ReplaySet};
 
 /// What is to be replayed, and how.
@@ -62,8 +62,10 @@ pub fn replay(
         };
         parts.push(Recorded::new(part, link)?);
     }
+    let mut mounts = Vec::new();
     if let Some(origin) = parts.iter().filter_map(Recorded::origin).reduce(Origin::earlier) {
         parts.iter_mut().for_each(|part| part.set_origin(origin));
+        mounts = self::mounts(&recording, origin, &config)?;
     }
     let length = parts.iter().filter_map(Recorded::length).max();
     let start_ns = replay.play.start_ns;
@@ -78,7 +80,7 @@ pub fn replay(
             return Err(behind_the_end(file, start_ns, end));
         }
     }
-    let player = Arc::new(Player::new(replay.play, links, length)?);
+    let player = Arc::new(Player::new(replay.play, links, length)?.with_mounts(mounts));
     let set = ReplaySet { player: &player, parts, holds: replay.holds };
     supervise::serve(&read, config, Some(set), domain, |ready| on_ready(ready, &player))?;
     Ok(player.progress())
@@ -137,6 +139,23 @@ fn sensors(recording: &Recording, wanted: Option<&str>) -> Result<Vec<Sensor>, F
         }
     }
     Ok(sensors)
+}
+
+/// Returns the mounts of `recording`, under names that no link of `config` has.
+fn mounts(recording: &Recording, origin: Origin, config: &Config) -> Result<Vec<RecordedMount>, Failure> {
+    let mut mounts: Vec<RecordedMount> = Vec::new();
+    for recorded in recording.mounts() {
+        let name = link_name(&recorded);
+        check_sensor(&name)?;
+        let is_taken = config.links.iter().any(|link| link.name == name)
+            || mounts.iter().any(|mount| mount.name() == name);
+        if is_taken {
+            tracing::warn!("the angles of mount {recorded} are not played: something else is called {name}");
+            continue;
+        }
+        mounts.push(RecordedMount::new(&recorded, name, recording, origin));
+    }
+    Ok(mounts)
 }
 
 /// What a link can be called: the name of a sensor of another machine has a dot.

@@ -11,7 +11,7 @@ use scanhub_drivers::features;
 use scanhub_drivers::lms::telegram::Telegram;
 use scanhub_drivers::lms::variant::Mode;
 use schema::datagram::Packed;
-use schema::{Family, Foreground, Header, Pace, Scan, Status, Topic};
+use schema::{Family, Foreground, Header, Pace, Scan, Status, Tilt, Topic};
 
 use crate::{Contents, Damage, Form, Frame};
 pub(crate) use catalog::Catalog;
@@ -324,6 +324,32 @@ impl<R: Read> Iterator for Frames<R> {
                     reasons: header.reasons,
                     header: Some(header),
                 });
+            }
+        }
+    }
+}
+
+/// The angles of one mount, in the order of the file.
+pub(crate) struct Angles<R> {
+    reader: Reader<R>,
+    mount: String,
+}
+
+impl<R: Read> Angles<R> {
+    pub(crate) fn new(input: R, survey: &Arc<Survey>, mount: String) -> Self {
+        Angles { reader: survey.reader(input), mount }
+    }
+}
+
+impl<R: Read> Iterator for Angles<R> {
+    type Item = (Header, Tilt);
+
+    fn next(&mut self) -> Option<(Header, Tilt)> {
+        loop {
+            if let Item::Record(record) = self.reader.next().ok()??
+                && let Some(angle) = self.reader.catalog.angle(&record, &self.mount)
+            {
+                return Some(angle);
             }
         }
     }

@@ -9,7 +9,7 @@ use scanhub_drivers::line::Session as _;
 use scanhub_drivers::lms::variant::{Mode, Unit};
 use scanhub_drivers::recognize::{EXAMINED, bytes_by_family, family_of, framing_mode};
 use scanhub_drivers::{Model, Session, Settings, features};
-use schema::{Failure, Family, Kind, regular};
+use schema::{Failure, Family, Header, Kind, Tilt, regular};
 
 use crate::carmen::{self, Log};
 #[cfg(feature = "mcap")]
@@ -324,6 +324,30 @@ impl Recording {
     #[cfg(feature = "mcap")]
     pub(crate) fn reader(&self) -> Result<(Reader<impl Read + use<>>, &Catalog), Failure> {
         Ok((self.survey.reader(reader(&self.path)?), self.survey.catalog()))
+    }
+
+    /// Returns the names of the mounts whose angles are in it.
+    pub fn mounts(&self) -> Vec<String> {
+        #[cfg(feature = "mcap")]
+        return self.survey.catalog().mounts();
+        #[cfg(not(feature = "mcap"))]
+        Vec::new()
+    }
+
+    /// Returns the angles of a mount in the order of the file. If the file becomes unreadable meanwhile, they end there.
+    ///
+    /// # Errors
+    ///
+    /// Returns [`Kind::Input`] if the file cannot be opened.
+    #[cfg(feature = "mcap")]
+    pub fn angles(&self, mount: &str) -> Result<Box<dyn Iterator<Item = (Header, Tilt)> + Send>, Failure> {
+        Ok(Box::new(crate::mcap::Angles::new(reader(&self.path)?, &self.survey, mount.to_owned())))
+    }
+
+    /// Returns no angles: only MCAP contains them.
+    #[cfg(not(feature = "mcap"))]
+    pub fn angles(&self, _: &str) -> Result<Box<dyn Iterator<Item = (Header, Tilt)> + Send>, Failure> {
+        Ok(Box::new(std::iter::empty()))
     }
 
     /// The sensor that was chosen.

@@ -119,11 +119,25 @@ impl Playback {
         if self.skip_silence(now) {
             return self.turn(link, media, now);
         }
-        let due = since.saturating_add_signed(((media as f64 - from as f64) / rate) as i64);
+        let due = due(since, from, media, rate);
         if due > now {
             return Turn::At(due);
         }
         self.play_now(link, Due { at: due, stretch: (1.0 / rate).max(1.0) })
+    }
+
+    /// Returns when something of `media` is due that belongs to no link. `position` is the media time at the fastest pace.
+    pub(super) fn due(&self, media: Nanos, now: Nanos, position: Nanos) -> Turn {
+        let at_once = |is_due| if is_due { Turn::Now(Due::at_once(now)) } else { Turn::Wait };
+        match (self.anchor, self.play.pace) {
+            (None, _) => Turn::Wait,
+            (Some((_, from)), _) if self.play.is_paused => at_once(media < from),
+            (_, Pace::Max) => at_once(media <= position),
+            (Some((since, from)), Pace::Times(rate)) => match due(since, from, media, rate) {
+                at if at > now => Turn::At(at),
+                at => Turn::Now(Due { at, stretch: (1.0 / rate).max(1.0) }),
+            },
+        }
     }
 
     /// `link`, which plays lap number `lap`, has nothing more in it.
@@ -279,6 +293,11 @@ impl Playback {
     }
 }
 
+/// Returns when `media` is due at this rate, where media time was `from` at `since`.
+fn due(since: Nanos, from: Nanos, media: Nanos, rate: f64) -> Nanos {
+    since.saturating_add_signed(((media as f64 - from as f64) / rate) as i64)
+}
+
 /// Media time of what comes next of all.
 fn next_of(links: &[Next]) -> Option<Nanos> {
     let next = |next: &Next| if let Next::At(media) = next { Some(*media) } else { None };
@@ -316,6 +335,23 @@ mod tests {
         assert!(is_now(playback.turn(0, 0, 100 * SECOND), 100 * SECOND));
         assert_eq!(playback.turn(1, 5 * SECOND, 101 * SECOND), Turn::At(105 * SECOND));
         assert!(is_now(playback.turn(1, 5 * SECOND, 106 * SECOND), 105 * SECOND), "it stands for its moment");
+    }
+
+    #[test]
+    fn what_belongs_to_no_link_is_due_with_them() {
+        let mut playback = Playback::new(Play::default(), 1);
+        assert_eq!(playback.due(0, 90 * SECOND, 0), Turn::Wait);
+        playback.begin(100 * SECOND);
+        assert!(is_now(playback.turn(0, 0, 100 * SECOND), 100 * SECOND));
+        assert_eq!(playback.due(3 * SECOND, 101 * SECOND, 0), Turn::At(103 * SECOND));
+        assert!(is_now(playback.due(3 * SECOND, 104 * SECOND, 0), 103 * SECOND), "it stands for its moment");
+        playback.pause(true, 105 * SECOND, 0);
+        assert_eq!(playback.due(6 * SECOND, 120 * SECOND, 0), Turn::Wait);
+        assert!(is_now(playback.due(4 * SECOND, 120 * SECOND, 0), 120 * SECOND));
+        playback.pause(false, 120 * SECOND, 0);
+        playback.set_pace(Pace::Max, 120 * SECOND, 0);
+        assert_eq!(playback.due(6 * SECOND, 121 * SECOND, 5 * SECOND), Turn::Wait);
+        assert!(is_now(playback.due(6 * SECOND, 121 * SECOND, 6 * SECOND), 121 * SECOND));
     }
 
     #[test]

@@ -306,6 +306,17 @@ impl Origin {
         Some(Origin { wall_ns: frame.wall_ns?, life })
     }
 
+    /// Returns the media time of a sample of another program with this `header`; `None` if it is before the first telegram.
+    /// Monotonic stamps count. If they contradict the wall clocks, the machine was restarted in between, and the
+    /// wall clocks count.
+    pub(crate) fn media(&self, header: &Header) -> Option<Nanos> {
+        let by_wall = i128::from(header.wall_ns) - i128::from(self.wall_ns);
+        let by_stamp =
+            self.life.map(|(_, stamp_ns)| i128::from(header.stamp_first_ns) - i128::from(stamp_ns));
+        let is_same_clock = |by_stamp: &i128| (by_stamp - by_wall).abs() < i128::from(CLOCK_SET);
+        Nanos::try_from(by_stamp.filter(is_same_clock).unwrap_or(by_wall)).ok()
+    }
+
     /// The earlier one of both.
     pub(crate) fn earlier(self, other: Origin) -> Origin {
         let is_earlier = match (self.life, other.life) {
@@ -374,6 +385,9 @@ fn tell_of_log(recording: &Recording, name: &str) {
     }
 }
 
+/// A wall clock is set by less than this while a recording is made.
+const CLOCK_SET: Nanos = 1_000 * schema::MILLIS;
+
 /// Whether it is of the first telegram that a hub had: who converts a stream is no hub.
 fn is_first(header: &Header) -> bool {
     header.seq == 0 && header.hub_pid != 0
@@ -423,6 +437,22 @@ mod tests {
             frame(1, header(3, 50)),
         ];
         assert_eq!(medias(&frames), [0, 1, 3, 4, 5, 5, 6, 6]);
+    }
+
+    #[test]
+    fn angles_stand_at_their_stamps_unless_the_clock_is_another_one() {
+        let origin = Origin { wall_ns: 5000 * SECOND, life: Some((1, 100 * SECOND)) };
+        let media = |wall_ns, stamp_first_ns| {
+            let header = Header { boot: 9, wall_ns, stamp_first_ns, ..Header::default() };
+            origin.media(&header)
+        };
+        assert_eq!(
+            media(5003 * SECOND + SECOND / 2, 103 * SECOND),
+            Some(3 * SECOND),
+            "the wall clock was slewed"
+        );
+        assert_eq!(media(5003 * SECOND, 7 * SECOND), Some(3 * SECOND), "another start of the machine");
+        assert_eq!(media(4999 * SECOND, 99 * SECOND), None);
     }
 
     #[test]

@@ -5,8 +5,9 @@ use std::collections::{BTreeMap, HashSet};
 use std::io;
 
 use mcap::records::{Channel, MessageHeader, Record as Parsed, op};
+use schema::datagram::Packed;
 use schema::file::{self, ENCODING, ENCODING_V1, METADATA};
-use schema::{Header, Maker, Topic, check_followed};
+use schema::{Header, Maker, Tilt, Topic, check_followed};
 
 use super::records::Record;
 
@@ -116,11 +117,37 @@ impl Catalog {
         places.map(|place| &place.sensor).filter(|sensor| seen.insert(*sensor)).cloned().collect()
     }
 
+    /// Returns the mounts whose angles have a channel, in the order of the channels' numbers.
+    pub(crate) fn mounts(&self) -> Vec<String> {
+        let mut seen = HashSet::new();
+        let names = self.channels.values().filter_map(|(channel, _)| mount_of(channel));
+        names.filter(|name| seen.insert(*name)).map(str::to_owned).collect()
+    }
+
+    /// Returns the angle that `record` contains, if it is one of `mount`.
+    pub(crate) fn angle(&self, record: &Record, mount: &str) -> Option<(Header, Tilt)> {
+        let (message, data) = record.message()?;
+        let (channel, _) = self.channels.get(&message.channel_id)?;
+        if mount_of(channel)? != mount {
+            return None;
+        }
+        let (header, payload) = sample(&message, data)?;
+        let mut tilt = Tilt::default();
+        tilt.unpack(payload).then_some((header, tilt))
+    }
+
     /// Returns whether a channel has scans of `sensor`.
     pub(crate) fn has_scans(&self, sensor: &str) -> bool {
         let mut places = self.channels.values().filter_map(|(_, place)| place.as_ref());
         places.any(|place| place.sensor == sensor && place.has_scans())
     }
+}
+
+/// Returns the name of the mount whose angles `channel` has.
+fn mount_of(channel: &Channel) -> Option<&str> {
+    let (mount, topic) = channel.topic.rsplit_once('/')?;
+    let is_ours = channel.message_encoding == ENCODING && check_followed(mount).is_ok();
+    (is_ours && Topic::parse(topic) == Some(Topic::Tilt)).then_some(mount)
 }
 
 /// Returns header and payload of a message of the hub; `None` if the header contradicts the message that contains it.
