@@ -44,6 +44,9 @@ pub(crate) struct Tilt {
     /// Sweeps in which a surface must be seen before it is background
     #[arg(long, default_value_t = Settings::default().sweeps, value_name = "N", value_parser = clap::value_parser!(u16).range(1..))]
     sweeps: u16,
+    /// Only check axis, arm and level against a flat floor and a wall ahead, and exit: with 5 if one of them is wrong
+    #[arg(long, conflicts_with_all = ["name", "near"])]
+    check: bool,
     /// Stop after this time, for example 10s, 250ms, 5m
     #[arg(long = "for", value_name = "DURATION", value_parser = duration::parse)]
     run_for: Option<Duration>,
@@ -103,6 +106,7 @@ impl Tilt {
                 is_upside_down: self.upside_down,
             },
             settings: Settings { sweeps: self.sweeps, near: self.near, ..Settings::default() },
+            check: self.check,
             json: everywhere.json,
             bounds: Bounds { count: None, run_for: self.run_for, timeout: self.timeout },
             places: everywhere.places()?,

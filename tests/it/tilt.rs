@@ -243,6 +243,31 @@ fn a_recording_has_three_dimensions() {
 }
 
 #[test]
+fn a_check_reports_a_wrong_level() {
+    let hall = Hall::of_world(
+        "mount",
+        &WORLD.replace("to_deg = 24", "to_deg = 36").replace("deg_s = 12", "deg_s = 36"),
+    );
+    let state = |outcome: &Outcome, name: &str| {
+        let lines = outcome.of_class("tilt_check");
+        let line = lines.into_iter().find(|line| line["name"] == name);
+        line.unwrap_or_else(|| panic!("no {name}: {outcome}"))
+    };
+    let well = hall.tilt(&["--check"]).wait();
+    assert!(well.code == Some(0) && well.of_class("tilt_check").len() == 4, "{well}");
+    assert!(state(&well, "arm")["state"] == "ok" && well.of_class("obstacles").is_empty(), "{well}");
+    let wrong = hall.tilt(&["--check", "--level=0.05"]).wait();
+    let level = state(&wrong, "level");
+    assert!(wrong.code == Some(5) && level["state"] == "failed", "{wrong}");
+    let remedy = level["remedy"].as_str().and_then(|remedy| remedy.strip_prefix("--level "));
+    let right: f64 = remedy.and_then(|number| number.parse().ok()).expect("a number");
+    assert!(right.abs() < 0.01, "{level}");
+    let short = hall.tilt(&["--check", "--for=1s"]).wait();
+    assert!(short.code == Some(3) && format!("{short}").contains("of 6 whole sweeps"), "{short}");
+    ends_well(hall);
+}
+
+#[test]
 fn a_recorded_mount_whose_name_another_program_has_is_refused() {
     let env = TestEnv::new();
     let file = recorded_world(&env, &World::of_toml("hall", WORLD).expect("a world"), &["front"], 2);

@@ -9,6 +9,7 @@
 
 mod angles;
 mod background;
+mod check;
 mod delay;
 mod mount;
 mod obstacles;
@@ -24,6 +25,7 @@ mod tilting;
 struct Page;
 
 pub use angles::{Angle, Withheld};
+pub use check::{Check, Floor, Wall};
 pub use mount::Mount;
 pub use schema::{OBSTACLES, Obstacle, PointClass};
 pub use settings::Settings;

@@ -1,17 +1,18 @@
 //! `scanhub tilt`: three dimensions of a scanner on a mount, as lines and as topics. Refuses to know how points and obstacles
 //! are found.
 
+mod check;
 mod lines;
 mod publish;
 
 use std::io::Write;
-use std::sync::atomic::AtomicBool;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
 
-use ::tilt::{Angle, Mount, Settings, Sweep, Tilting, Withheld};
+use ::tilt::{Angle, Check, Mount, Settings, Sweep, Tilting, Withheld};
 use publish::Samples;
 use scanhub_client::streams::Sample;
-use schema::{Domain, Failure, Topic};
+use schema::{Domain, Failure, Kind, Topic};
 
 use crate::follow::{Bounds, Notice, Sink, follow};
 use crate::names::TopicName;
@@ -32,6 +33,8 @@ pub struct TiltOptions {
     pub mount: Mount,
     /// How sweeps, background and obstacles are found.
     pub settings: Settings,
+    /// Whether it only checks the description of the mount, and ends.
+    pub check: bool,
     /// Lines of JSON.
     pub json: bool,
     /// When it ends by itself.
@@ -48,7 +51,8 @@ pub struct TiltOptions {
 ///
 /// [`Kind::NoTopic`](schema::Kind) with the sensors that there are, [`Kind::NoHub`](schema::Kind) if bounded and there is none
 /// at the start, [`Kind::Timeout`](schema::Kind), [`Kind::Interrupted`](schema::Kind) if bounded and `stop` came first; those of
-/// publishing if it has a name.
+/// publishing if it has a name. [`Kind::Check`](schema::Kind) if a check has failed, and
+/// [`Kind::Interrupted`](schema::Kind) or [`Kind::Timeout`](schema::Kind) if it ended too early.
 pub fn tilt(
     options: &TiltOptions,
     out: &mut dyn Write,
@@ -63,6 +67,7 @@ pub fn tilt(
         tilting: Tilting::new(options.mount, options.settings),
         trouble: Trouble::default(),
         late_ns: 0,
+        check: options.check.then(Check::default),
         teller: Teller {
             name,
             is_json: options.json,
@@ -75,7 +80,15 @@ pub fn tilt(
         missed: 0,
         summaries: names.len(),
     };
-    quiet(follow(&names, &[], &options.places, &options.bounds, stop, &mut verb))
+    let followed = follow(&names, &[], &options.places, &options.bounds, stop, &mut verb);
+    let Verb { check: Some(check), teller, .. } = &mut verb else { return quiet(followed) };
+    if check.sweeps() < check::SWEEPS {
+        quiet(followed)?;
+        let message = format!("the check ended after {} of {} whole sweeps", check.sweeps(), check::SWEEPS);
+        let kind = if stop.load(Ordering::Relaxed) { Kind::Interrupted } else { Kind::Timeout };
+        return Err(Failure::new(kind, message, "let it run until it ends by itself"));
+    }
+    quiet(check::tell(check, &options.mount, name, options.json, &mut teller.out))
 }
 
 /// What lines call one that publishes nothing.
@@ -89,6 +102,7 @@ struct Verb<'a> {
     trouble: Trouble,
     /// The delay of the angles' stamps that was reported.
     late_ns: i64,
+    check: Option<Check>,
     teller: Teller<'a>,
     /// Of the first scan.
     beams: Option<usize>,
@@ -110,18 +124,23 @@ impl Sink for Verb<'_> {
     }
 
     fn sample(&mut self, _: &TopicName, sample: &Sample) -> Result<(), End> {
-        let Verb { tilting, teller, .. } = self;
+        let Verb { tilting, teller, check, .. } = self;
+        let mut take = |sweep: &Sweep<'_>| match check {
+            Some(check) => check.take(sweep),
+            None => teller.tell(sweep),
+        };
         match sample {
             Sample::Scan(scan) => {
                 let header = *scan.header();
                 self.beams.get_or_insert(scan.beams());
+                tilting.take_scan(header.stamp_first_ns, scan, &mut take);
                 teller.samples.hear(&header);
-                tilting.take_scan(header.stamp_first_ns, scan, |sweep| teller.tell(sweep));
                 if let Some(trouble) = self.trouble.changed(header.stamp_first_ns, tilting.trouble()) {
                     teller.tell_trouble(trouble, tilting.late_ns())?;
                 }
                 if tilting.late_ns() != self.late_ns {
                     self.late_ns = tilting.late_ns();
+                    check.iter_mut().for_each(Check::forget);
                     teller.tell_late(&self.options.angles, self.trouble.told, self.late_ns)?;
                 }
             }
@@ -131,9 +150,13 @@ impl Sink for Verb<'_> {
                     angle_rad: said.angle_rad,
                     rate_rad_s: said.rate_rad_s,
                 };
-                tilting.take_angle(angle, |sweep| teller.tell(sweep));
+                tilting.take_angle(angle, &mut take);
             }
             _ => {}
+        }
+        if check.as_ref().is_some_and(|check| check.sweeps() >= check::SWEEPS) {
+            // Ends without a summary.
+            return Err(End::ReaderGone);
         }
         std::mem::replace(&mut teller.told, Ok(()))
     }
@@ -147,7 +170,7 @@ impl Sink for Verb<'_> {
 
     fn summary(&mut self, _: &TopicName, _: &ReceiveStats) -> Result<(), End> {
         self.summaries -= 1;
-        if self.summaries > 0 {
+        if self.summaries > 0 || self.check.is_some() {
             return Ok(());
         }
         let Teller { name, is_json, samples, out, .. } = &mut self.teller;
