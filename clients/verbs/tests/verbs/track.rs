@@ -67,7 +67,13 @@ fn late_scans_are_lines_with_the_sensor_and_their_number() {
     assert_eq!(notes, "");
     let late: Vec<&str> = out.lines().filter(|line| line.contains(r#""class":"late""#)).collect();
     let first = r#"{"class":"late","sensor":"people","wall_ns":"#;
-    assert!(late[0].starts_with(first) && late[0].ends_with(r#","name":"rear","late":1,"delay_ms":80}"#));
+    // On a busy machine, the first line may count several scans.
+    let is_right = |line: &str| {
+        line.starts_with(first)
+            && line.contains(r#","name":"rear","late":"#)
+            && line.ends_with(r#","delay_ms":80}"#)
+    };
+    assert!(is_right(late[0]) && number(late[0], r#""late":"#) > 0, "{late:?}");
     let last = out.lines().last().expect("a summary");
     let sum: u64 = late.iter().map(|line| number(line, r#""late":"#)).sum();
     assert_eq!(number(last, r#""late":"#), sum, "{late:?} and {last}");
@@ -76,7 +82,10 @@ fn late_scans_are_lines_with_the_sensor_and_their_number() {
 #[test]
 fn late_scans_are_notes_with_a_remedy() {
     let (out, notes) = reported(false, "arrived late");
-    let first = "rear: 1 scan was dropped because it arrived late: set --delay longer than 80ms";
-    assert_eq!(notes.lines().find(|line| line.contains("arrived late")), Some(first));
+    let line = notes.lines().find(|line| line.contains("arrived late")).expect("a note");
+    assert!(
+        line.starts_with("rear: ") && line.ends_with("arrived late: set --delay longer than 80ms"),
+        "{line}"
+    );
     assert!(number(&out, "left out: ") > 0, "{out}");
 }

@@ -330,7 +330,7 @@ const FREE: u16 = 5;
 /// Beams that end in a cell until something stands there that was never seen free.
 const STANDS: u16 = 3;
 /// Returns from which on something thin stands in a cell, and scans in a row that see through it after which nothing does.
-const RETURNS: u8 = 12;
+const RETURNS: u8 = 24;
 const LONG: u8 = 60;
 /// Cells before the end of a beam that it says nothing of.
 const SHORT: f32 = 2.5;
