@@ -143,8 +143,12 @@ impl Profile {
         self.columns.iter_mut().for_each(Vec::clear);
         for ray in rays {
             let beam = usize::from(ray.beam);
-            if beam.is_multiple_of(every) && ray.range_m.is_finite() && ray.range_m > 0.0 {
-                self.columns[beam / every].push(Sample {
+            if beam.is_multiple_of(every)
+                && ray.range_m.is_finite()
+                && ray.range_m > 0.0
+                && let Some(column) = self.columns.get_mut(beam / every)
+            {
+                column.push(Sample {
                     time_s: (ray.time_ns as f64 - from_ns as f64) * 1e-9,
                     angle_rad: ray.angle_rad,
                     inverse: 1.0 / f64::from(ray.range_m),

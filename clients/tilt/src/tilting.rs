@@ -19,6 +19,8 @@ const WAITING: usize = 64;
 const RAYS: usize = 262_144;
 /// A scan so far before the last one is of a clock that was set back.
 const JUMP_NS: u64 = 1_000_000_000;
+/// Maximum delay of the angles' stamps that is corrected, in ns.
+const MAX_LATE_NS: u64 = 150_000_000;
 /// What was taken, made and left out, since the start.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Counts {
@@ -201,6 +203,10 @@ impl Tilting {
         if shape != self.shape {
             self.scenery.begin(shape.0, self.shape.0 == 0);
             self.delay.forget();
+            // Beams of the old shape have other directions.
+            self.rays.clear();
+            self.spare.extend(self.waiting.drain(..).map(|one| one.scan));
+            self.is_whole = false;
             self.shape = shape;
         }
     }
@@ -269,19 +275,20 @@ impl Tilting {
             later.clear();
             later.extend(rays.iter().filter(|ray| ray.time_ns > end.stamp_ns));
             rays.retain(|ray| ray.time_ns <= end.stamp_ns);
-            if !self.rays.is_empty() {
-                self.show(end, show);
-            }
+            let is_next_whole = self.rays.is_empty() || self.show(end, show);
             std::mem::swap(&mut self.rays, &mut self.later);
-            (self.from_ns, self.is_whole) = (end.stamp_ns, end.is_turn);
+            (self.from_ns, self.is_whole) = (end.stamp_ns, end.is_turn && is_next_whole);
         }
     }
 
-    /// Adds `more_ns` to the delay of the angles' stamps, and gives the beams of this sweep their corrected angles.
-    fn correct(&mut self, more_ns: i64) {
+    /// Adds `more_ns` to the delay of the angles' stamps, and gives the beams of this sweep and the next one their corrected
+    /// angles. Returns whether each of the two still has all beams: the angles of the first ones may be forgotten, and those of
+    /// the last ones may not have arrived.
+    fn correct(&mut self, more_ns: i64) -> [bool; 2] {
         self.angles.correct(more_ns);
-        let Tilting { angles, rays, later, ends, .. } = self;
-        for rays in [rays, later] {
+        let Tilting { angles, rays, later, ends, counts, .. } = self;
+        let is_whole = [rays, later].map(|rays| {
+            let before = rays.len();
             rays.retain_mut(|ray| match angles.at(ray.time_ns) {
                 At::Known(angle_rad) => {
                     ray.angle_rad = angle_rad;
@@ -289,15 +296,19 @@ impl Tilting {
                 }
                 _ => false,
             });
-        }
+            counts.withheld[Withheld::Silent as usize] += (before - rays.len()) as u64;
+            before == rays.len()
+        });
         ends.iter_mut().for_each(|end| end.stamp_ns = end.stamp_ns.saturating_add_signed(-more_ns));
         self.delay.forget();
         self.scenery.correct();
+        is_whole
     }
 
-    /// Hands out what was measured until `end`.
-    fn show(&mut self, end: End, show: &mut impl FnMut(&Sweep<'_>)) {
-        let sweep = Sweep {
+    /// Hands out what was measured until `end`. Returns whether the next sweep has all beams so far.
+    fn show(&mut self, end: End, show: &mut impl FnMut(&Sweep<'_>)) -> bool {
+        let mut is_next_whole = true;
+        let mut sweep = Sweep {
             number: self.counts.sweeps as u32,
             from_ns: self.from_ns,
             until_ns: end.stamp_ns,
@@ -306,7 +317,11 @@ impl Tilting {
         };
         let span = (sweep.from_ns, sweep.until_ns);
         if let Some(late_s) = self.delay.take(&self.rays, self.shape.0, span, sweep.is_complete) {
-            self.correct((late_s * 1e9) as i64);
+            let more_ns = (late_s * 1e9) as i64;
+            if self.angles.late_ns().saturating_add(more_ns).unsigned_abs() < MAX_LATE_NS {
+                let [is_whole, is_whole_next] = self.correct(more_ns);
+                (sweep.is_complete, is_next_whole) = (sweep.is_complete && is_whole, is_whole_next);
+            }
         }
         let sweep = self.scenery.look(&self.rays, sweep);
         self.counts.points += sweep.points.len() as u64;
@@ -314,5 +329,6 @@ impl Tilting {
         self.counts.incomplete += u64::from(!sweep.is_complete);
         self.counts.doubted += u64::from(sweep.is_doubted);
         show(&sweep);
+        is_next_whole
     }
 }

@@ -56,6 +56,8 @@ pub struct MotionEstimator {
     /// Stamp of the last scan, in ns.
     stamp_ns: u64,
     velocity: Velocity,
+    /// Velocity of the last step, if it was rejected because no robot changes its velocity so fast.
+    rejected: Option<Velocity>,
     undistorted: UndistortedScan,
     finder: LineFinder,
     lines: Lines,
@@ -92,6 +94,7 @@ impl MotionEstimator {
             track: None,
             stamp_ns: 0,
             velocity: Velocity::default(),
+            rejected: None,
             undistorted: UndistortedScan::new(beams),
             finder: LineFinder::new(pose, lines::Settings::default(), beams),
             lines: Lines::default(),
@@ -144,18 +147,23 @@ impl MotionEstimator {
             });
             return;
         };
+        let expected = self.velocity;
         let mut found = self.find(&track, None);
+        let first = found;
         // The correction changes the step, which is the velocity of the next correction.
         let mut offset = [0.0; 3];
         for round in 0..=CORRECTIONS {
             let Some((before, step)) = found.filter(|_| has_time) else { break };
             let measured = Velocity::of_step((step.x, step.y, step.yaw), seconds);
             let change = self.velocity.difference(&measured);
-            if change.x.hypot(change.y) > MAX_CHANGE_M_S || change.yaw.abs() > MAX_CHANGE_RAD_S {
-                // No robot does that: the step is an error, or the sensor was carried.
-                self.velocity = Velocity::default();
+            let is_again = self.rejected.is_some_and(|rejected| rejected.difference(&measured).is_possible());
+            if !change.is_possible() && !is_again {
+                // No robot does that: the step is an error, or the sensor was carried. If the next step agrees, it was right.
+                (self.velocity, self.rejected) = (Velocity::default(), Some(measured));
+                offset = change.offset(scan);
                 break;
             }
+            self.rejected = None;
             if round == CORRECTIONS || !change.distorts(scan, CHANGED_M) {
                 offset = change.offset(scan);
                 self.velocity.approach(&measured);
@@ -164,6 +172,13 @@ impl MotionEstimator {
             self.velocity = measured;
             self.take(scan);
             found = self.find(&track, Some(before.place));
+            if found.is_none() {
+                // The correction was wrong, and the step without it is the best one.
+                (self.velocity, found) = (expected, first);
+                self.take(scan);
+                offset = change.offset(scan);
+                break;
+            }
         }
         match found {
             Some((found, step)) => {
@@ -179,7 +194,11 @@ impl MotionEstimator {
                 }
             }
             None => {
-                self.velocity = Velocity::default();
+                if self.velocity != Velocity::default() {
+                    // The next scan is compared with this one, which no velocity is known for.
+                    self.velocity = Velocity::default();
+                    self.take(scan);
+                }
                 self.matcher.trust_all();
                 let breaks = track.breaks.saturating_add(1);
                 (out.method, out.breaks) = (MotionMethod::Refused as u8, breaks);
@@ -264,9 +283,6 @@ fn write(track: &Track, found: &Match, step: &Rigid, offset: &[f64; 3], out: &mu
 /// which the correction is repeated. A repeated correction adds the noise of the last step.
 const DISTORTED_M: f64 = 0.003;
 const CHANGED_M: f64 = 0.01;
-/// Maximum change of velocity from one scan to the next.
-const MAX_CHANGE_M_S: f64 = 2.0;
-const MAX_CHANGE_RAD_S: f64 = 6.0;
 /// Maximum number of corrections after a change of velocity. Each one leaves less than half of the error.
 const CORRECTIONS: u8 = 4;
 /// Time between two scans from which a velocity is computed, in seconds.

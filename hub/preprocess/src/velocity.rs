@@ -63,6 +63,11 @@ impl Velocity {
         span_s * self.x.hypot(self.y) > limit_m || span_s * self.yaw.abs() > limit_m / FAR_M
     }
 
+    /// Returns whether a robot can change its velocity by this one from one scan to the next.
+    pub(crate) fn is_possible(&self) -> bool {
+        self.x.hypot(self.y) < MAX_CHANGE_M_S && self.yaw.abs() < MAX_CHANGE_RAD_S
+    }
+
     /// Returns how far the beams of `scan` are off on average if they are corrected by a velocity that differs by this one.
     pub(crate) fn offset(&self, scan: &Scan) -> [f64; 3] {
         let [first_s, last_s] = times(scan);
@@ -83,6 +88,9 @@ pub(crate) fn times(scan: &Scan) -> [f64; 2] {
 /// Half the turn of a step below which an arc equals its chord.
 const STRAIGHT_RAD: f64 = 1e-6;
 const GAIN: f64 = 0.3;
+/// Maximum change of velocity from one scan to the next.
+const MAX_CHANGE_M_S: f64 = 2.0;
+const MAX_CHANGE_RAD_S: f64 = 6.0;
 /// Distance of walls that a turn moves as far as the same motion, in meters.
 const FAR_M: f64 = 5.0;
 

@@ -158,6 +158,25 @@ fn a_turn_during_the_scans_is_measured() {
     }
 }
 
+/// The estimator starts while the robot drives at 3 m/s.
+#[test]
+fn a_robot_that_is_already_fast_is_corrected_too() {
+    let mut drive = Drive::through_furniture(7, 0, 0, 0.0);
+    drive.on(40, 0.08);
+    drive.scans.remove(0);
+    drive.places.remove(0);
+    let found = follow(&drive.scans, Pose::default(), Settings::default());
+    let off = |at: usize| {
+        let truth = drive.places[at - 1].inverse().then(&drive.places[at]);
+        let (metres, _) = apart(&truth, &step(&found[at]));
+        metres
+    };
+    let mut errors: Vec<f64> = (4..found.len()).map(off).collect();
+    errors.sort_by(f64::total_cmp);
+    assert!(found[1..].iter().all(Motion::has_step));
+    assert!(errors[errors.len() / 2] < 0.006, "{errors:?}");
+}
+
 #[test]
 fn a_sensor_anywhere_on_the_robot_tells_the_same() {
     let drive = Drive::through_a_room(7, 361, 30, 0.002);
