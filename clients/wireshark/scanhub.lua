@@ -154,6 +154,7 @@ field("motion.dyaw_rad", "float", "Step yaw, rad")
 field("motion.covariance", "float", "Covariance")
 field("motion.overlap", "float", "Overlap")
 field("motion.method", "uint8", "Method")
+field("motion.valid", "uint8", "Sum is valid")
 field("motion.degenerate", "uint8", "Degenerate", base.DEC, nil, 1)
 field("motion.breaks", "uint16", "Steps refused")
 
@@ -724,6 +725,10 @@ unpack_payload[9] = function(payload, tree)
     end
     add_fields(tree, payload, 72, "motion.overlap", 4)
     tree:add(f["motion.method"], payload(76, 1))
+    local method, flags = payload(76, 1):uint(), payload(77, 1):uint()
+    -- There is a sum, and no step in it was degenerate.
+    local is_valid = METHODS[method] and method ~= 1 and flags % 4 < 2
+    tree:add(f["motion.valid"], payload(77, 1), is_valid and 1 or 0)
     tree:add(f["motion.degenerate"], payload(77, 1))
     add_fields(tree, payload, 78, "motion.breaks", 2)
     return METHODS[payload(76, 1):uint()] or "refused"

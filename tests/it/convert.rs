@@ -49,7 +49,7 @@ fn bytes_between_telegrams_are_counted_by_whoever_reads_them() {
     let mcap = stream.replace("a.bin", "a.mcap");
     let outcome = env.run(&["convert", &stream, &mcap]);
     assert!(
-        outcome.code == Some(78) && outcome.errors.contains("lms 15 %"),
+        outcome.code == Some(66) && outcome.errors.contains("lms 15 %"),
         "too few to recognize: {outcome}"
     );
     let outcome = env.run(&["convert", &stream, &mcap, "--family=lms", "--json"]);

@@ -86,7 +86,7 @@ def motion(sample: scanhub.Motion) -> dict:
     def millionths(value: float | None) -> float | None:
         return None if value is None else math.copysign(math.floor(abs(value) * 1e6 + 0.5), value) / 1e6
 
-    said = {name: getattr(sample, name) for name in ("method", "degenerate", "breaks")}
+    said = {name: getattr(sample, name) for name in ("method", "valid", "degenerate", "breaks")}
     step, place = sample.step or (None,) * 3, sample.place or (None,) * 3
     said["dx_m"], said["dy_m"], said["dyaw_deg"] = millionths(step[0]), millionths(step[1]), in_degrees(step[2])
     said["x_m"], said["y_m"], said["yaw_deg"] = millionths(place[0]), millionths(place[1]), in_degrees(place[2])

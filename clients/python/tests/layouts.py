@@ -88,7 +88,7 @@ def payloads_say_what_they_are() -> None:
     assert of.corners[63] == (1, -1, 62, 63)
 
     of = processed.Motion("front", Chunk("motion"))
-    assert (of.method, of.degenerate, of.breaks, of.overlap) == ("both", True, 0x102, 0.75)
+    assert (of.method, of.valid, of.degenerate, of.breaks, of.overlap) == ("both", True, True, 0x102, 0.75)
     assert of.step == (0.25, -0.125, -0.0625) and of.place == (1, -2, 0.5)
     assert of.covariance.tolist() == [[1 / 64, 2 / 64, 3 / 64], [4 / 64, 5 / 64, 6 / 64], [7 / 64, 8 / 64, 9 / 64]]
 
