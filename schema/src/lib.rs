@@ -36,7 +36,7 @@ mod lock;
 pub mod output;
 #[cfg(any(feature = "ipc", feature = "output"))]
 #[cfg_attr(
-    not(feature = "ipc"),
+    not(all(feature = "ipc", feature = "output")),
     allow(dead_code, reason = "a domain has stricter rules than an output file")
 )]
 mod path_walk;

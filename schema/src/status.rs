@@ -157,6 +157,11 @@ impl Status {
         model.starts_with("0x")
     }
 
+    /// Returns `model` for text. A model that scanhub does not know has only a number.
+    pub fn shown_model(model: &str) -> String {
+        if Status::is_model_number(model) { format!("{model} (unknown)") } else { model.to_owned() }
+    }
+
     /// Returns whether the sensor is a recording, of which nothing can be asked.
     pub fn is_replayed(&self) -> bool {
         self.port().starts_with("file:")

@@ -46,7 +46,8 @@ struct Cell {
 #[derive(Clone, Copy, Default)]
 struct Narrow {
     surface: Surface,
-    /// How often a beam met it after beams that met something else; fewer if beams met a third surface. 0: there is none.
+    /// Number of times that a beam met it after beams that met another surface. Beams that meet a third surface decrease it. 0 if
+    /// no surface is stored.
     returns: u16,
     /// The sweep in which it was met last, and one.
     seen: u32,
@@ -156,8 +157,8 @@ impl Model {
 }
 
 impl Cell {
-    /// Counts how often beams return to a surface that is not the background. What stands still for a while and is gone
-    /// afterwards returns once; people who walk do not return to the same range.
+    /// Counts the returns of beams to surfaces that are not the background. An object that stands still for a while and leaves
+    /// returns once. People who walk do not return to the same range.
     fn learn_narrow(&mut self, reading: &Reading, sweep: u32, threshold_m: f32) {
         let met = |narrow: &&mut Narrow| narrow.returns > 0 && narrow.surface.explains(reading, threshold_m);
         if let Some(narrow) = self.narrow.iter_mut().find(met) {
@@ -246,9 +247,9 @@ impl Surface {
     }
 }
 
-/// A cell stores so many narrow surfaces: of a board, its edge, its top and what is beside it.
+/// Number of narrow surfaces that a cell stores, such as the edge and the top of a board.
 const NARROW: usize = 2;
-/// A narrow surface is background after so many returns.
+/// Number of returns after which a narrow surface is background.
 const RETURNS: u16 = 3;
 /// Less than a planar scanner measures exactly.
 const LEAST_BIN_RAD: f64 = 0.002;
@@ -319,7 +320,7 @@ mod tests {
             }
         };
         met(&[4.0; 5], 0, &mut model);
-        // Something stands there for so long that it is background, is gone, and comes back.
+        // An object stands there until it is background, and leaves.
         met(&[2.0, 2.0, 2.0, 2.0, 4.0, 4.0, 4.0, 4.0], 5, &mut model);
         assert_eq!(model.class(&reading(2.0), 90, 0.06), Foreground);
         let walks = [1.5, 4.0, 2.5, 3.0, 4.0, 2.0, 1.7, 4.0, 3.3, 2.5, 4.0, 1.5, 2.2, 4.0, 3.6, 2.8, 4.0];

@@ -9,8 +9,8 @@ const COLUMNS: usize = 24;
 const ENOUGH: usize = 60;
 /// Two sweeps that are farther apart than this show a delay, in radians: 0.1 degrees.
 const LEAST_RAD: f64 = 0.0017;
-/// A greater delay is not corrected, in seconds.
-const MOST_S: f64 = 0.15;
+/// Maximum delay that is corrected, in seconds.
+pub(crate) const MOST_S: f64 = 0.15;
 /// Meters that the end of a beam moves by per radian of the mount's angle. On flatter slopes, noise hides the delay.
 const LEAST_SLOPE_M: f64 = 3.0;
 /// Two neighboring slopes on one surface differ by at most this share.

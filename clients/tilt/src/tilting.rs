@@ -6,7 +6,7 @@ use std::collections::VecDeque;
 use schema::Scan;
 
 use crate::angles::{Angle, Angles, At, Step, Withheld};
-use crate::delay::Delay;
+use crate::delay::{Delay, MOST_S};
 use crate::mount::Mount;
 use crate::scenery::{Ray, Scenery};
 use crate::settings::Settings;
@@ -19,8 +19,6 @@ const WAITING: usize = 64;
 const RAYS: usize = 262_144;
 /// A scan so far before the last one is of a clock that was set back.
 const JUMP_NS: u64 = 1_000_000_000;
-/// Maximum delay of the angles' stamps that is corrected, in ns.
-const MAX_LATE_NS: u64 = 150_000_000;
 /// What was taken, made and left out, since the start.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Counts {
@@ -305,7 +303,7 @@ impl Tilting {
         is_whole
     }
 
-    /// Hands out what was measured until `end`. Returns whether the next sweep has all beams so far.
+    /// Passes the sweep until `end` to `show`. Returns whether the next sweep has all beams so far.
     fn show(&mut self, end: End, show: &mut impl FnMut(&Sweep<'_>)) -> bool {
         let mut is_next_whole = true;
         let mut sweep = Sweep {
@@ -318,7 +316,8 @@ impl Tilting {
         let span = (sweep.from_ns, sweep.until_ns);
         if let Some(late_s) = self.delay.take(&self.rays, self.shape.0, span, sweep.is_complete) {
             let more_ns = (late_s * 1e9) as i64;
-            if self.angles.late_ns().saturating_add(more_ns).unsigned_abs() < MAX_LATE_NS {
+            let all_s = 1e-9 * (self.angles.late_ns() + more_ns) as f64;
+            if all_s.abs() < MOST_S {
                 let [is_whole, is_whole_next] = self.correct(more_ns);
                 (sweep.is_complete, is_next_whole) = (sweep.is_complete && is_whole, is_whole_next);
             }

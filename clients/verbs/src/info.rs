@@ -97,11 +97,6 @@ const PATIENCE: Duration = Duration::from_secs(5);
 /// The history comes without a wake-up.
 const ASK_AGAIN: Duration = Duration::from_millis(10);
 
-/// Returns the name of `model`. A model that the hub does not know has only a number.
-fn named(model: String) -> String {
-    if Status::is_model_number(&model) { format!("{model} (unknown)") } else { model }
-}
-
 fn properties(sensor: &str, status: &Status, now_ns: u64) -> Vec<Vec<String>> {
     let seconds = now_ns.saturating_sub(status.since_ns) as f64 / 1e9;
     let state = status.state().map_or("unknown", |state| state.name());
@@ -111,7 +106,7 @@ fn properties(sensor: &str, status: &Status, now_ns: u64) -> Vec<Vec<String>> {
     let mut rows = vec![
         row(sensor, format!("{state} for {seconds:.1} s")),
         row("  family", status.family().map_or("unknown", |family| family.name()).into()),
-        row("  model", status.model().map_or_else(|| "unknown".into(), named)),
+        row("  model", status.model().map_or_else(|| "unknown".into(), |model| Status::shown_model(&model))),
         row("  type", known(status.sensor_type().into(), !status.sensor_type().is_empty())),
         row("  port", status.port().into()),
         row("  baud rate", known(format!("{} Bd", status.baud), status.baud != 0)),

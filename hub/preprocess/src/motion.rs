@@ -64,7 +64,7 @@ pub struct MotionEstimator {
 }
 
 /// Position of the robot, and its last step.
-#[derive(Clone, Copy)]
+#[derive(Clone, Copy, Default)]
 struct Track {
     /// Position at the kept scan, since the start.
     origin: Rigid,
@@ -126,60 +126,26 @@ impl MotionEstimator {
         *out = Motion::default();
         let elapsed_ns = stamp_ns.saturating_sub(std::mem::replace(&mut self.stamp_ns, stamp_ns));
         let seconds = 1e-9 * without_jitter(elapsed_ns, period_ns) as f64;
-        let has_time = self.track.is_some()
+        let is_timed = self.track.is_some()
             && (SHORTEST_S..LONGEST_S).contains(&seconds)
             && times(scan).iter().all(|time| time.abs() < LONGEST_S);
-        if !has_time {
+        if !is_timed {
             self.velocity = Velocity::default();
         }
         self.take(scan);
         let Some(track) = self.track else {
             self.matcher.trust_all();
-            let (origin, step) = (Rigid::default(), Rigid::default());
-            self.keep(Track {
-                origin,
-                last: origin,
-                unsure: None,
-                is_degenerate: false,
-                is_open: false,
-                step,
-                breaks: 0,
-            });
+            self.keep(Track::default());
             return;
         };
-        let expected = self.velocity;
-        let mut found = self.find(&track, None);
-        let first = found;
-        // The correction changes the step, which is the velocity of the next correction.
-        let mut offset = [0.0; 3];
-        for round in 0..=CORRECTIONS {
-            let Some((before, step)) = found.filter(|_| has_time) else { break };
-            let measured = Velocity::of_step((step.x, step.y, step.yaw), seconds);
-            let change = self.velocity.difference(&measured);
-            let is_again = self.rejected.is_some_and(|rejected| rejected.difference(&measured).is_possible());
-            if !change.is_possible() && !is_again {
-                // No robot does that: the step is an error, or the sensor was carried. If the next step agrees, it was right.
-                (self.velocity, self.rejected) = (Velocity::default(), Some(measured));
-                offset = change.offset(scan);
-                break;
+        let first = self.find(&track, None);
+        let (found, offset) = match first {
+            Some(first) if is_timed => {
+                let (found, offset) = self.correct(scan, &track, first, seconds);
+                (Some(found), offset)
             }
-            self.rejected = None;
-            if round == CORRECTIONS || !change.distorts(scan, CHANGED_M) {
-                offset = change.offset(scan);
-                self.velocity.approach(&measured);
-                break;
-            }
-            self.velocity = measured;
-            self.take(scan);
-            found = self.find(&track, Some(before.place));
-            if found.is_none() {
-                // The correction was wrong, and the step without it is the best one.
-                (self.velocity, found) = (expected, first);
-                self.take(scan);
-                offset = change.offset(scan);
-                break;
-            }
-        }
+            _ => (first, [0.0; 3]),
+        };
         match found {
             Some((found, step)) => {
                 write(&track, &found, &step, &offset, out);
@@ -203,6 +169,48 @@ impl MotionEstimator {
                 let breaks = track.breaks.saturating_add(1);
                 (out.method, out.breaks) = (MotionMethod::Refused as u8, breaks);
                 self.keep(Track { step: Rigid::default(), breaks, ..track });
+            }
+        }
+    }
+
+    /// Corrects the current scan by the velocity of the `first` step, which the robot made in `seconds`, until the velocity is that
+    /// of the step. Returns the position and the step, and by how much the beams may still be off.
+    fn correct(
+        &mut self,
+        scan: &Scan,
+        track: &Track,
+        first: (Match, Rigid),
+        seconds: f64,
+    ) -> ((Match, Rigid), [f64; 3]) {
+        let expected = self.velocity;
+        let (mut found, mut corrections) = (first, 0);
+        loop {
+            let (before, step) = found;
+            let measured = Velocity::of_step((step.x, step.y, step.yaw), seconds);
+            let change = self.velocity.difference(&measured);
+            let offset = change.offset(scan);
+            let is_again = self.rejected.is_some_and(|rejected| rejected.difference(&measured).is_possible());
+            if !change.is_possible() && !is_again {
+                // No robot does that: the step is an error, or the sensor was carried. If the next step agrees, it was right.
+                (self.velocity, self.rejected) = (Velocity::default(), Some(measured));
+                return (found, offset);
+            }
+            self.rejected = None;
+            if corrections == CORRECTIONS || !change.distorts(scan, CHANGED_M) {
+                self.velocity.approach(&measured);
+                return (found, offset);
+            }
+            corrections += 1;
+            self.velocity = measured;
+            self.take(scan);
+            match self.find(track, Some(before.place)) {
+                Some(again) => found = again,
+                None => {
+                    // The correction was wrong, and the step without it is the best one.
+                    self.velocity = expected;
+                    self.take(scan);
+                    return (first, offset);
+                }
             }
         }
     }

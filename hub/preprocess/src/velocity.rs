@@ -87,8 +87,9 @@ pub(crate) fn times(scan: &Scan) -> [f64; 2] {
 
 /// Half the turn of a step below which an arc equals its chord.
 const STRAIGHT_RAD: f64 = 1e-6;
+/// Part of the way to the measured velocity, per scan.
 const GAIN: f64 = 0.3;
-/// Maximum change of velocity from one scan to the next.
+/// Maximum change of velocity from one scan to the next. A robot brakes and turns less hard.
 const MAX_CHANGE_M_S: f64 = 2.0;
 const MAX_CHANGE_RAD_S: f64 = 6.0;
 /// Distance of walls that a turn moves as far as the same motion, in meters.

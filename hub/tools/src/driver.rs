@@ -22,6 +22,8 @@ pub(crate) struct DetectedScanner {
     pub(crate) family: Family,
     /// Model that matches the received packets. Other models may match them, too.
     pub(crate) model: Option<Model>,
+    /// Name of the model, or a number such as `0x95` if scanhub does not know the model.
+    pub(crate) model_text: Option<String>,
     /// Rate of the line, in bits per second.
     pub(crate) rate: u32,
     pub(crate) account: Account,
@@ -149,6 +151,7 @@ pub(crate) fn detect(
         trouble.get_or_insert_with(|| "it answers, but does not begin to measure".to_owned());
     }
     let (account, model) = (session.account(), session.model());
+    let model_text = session.model_text().map(|text| text.to_lowercase());
     // Stops a scanner that measures on request, and its motor, as a hub does when it exits.
     let measures = said.as_ref().is_some_and(|said| !is_error(said));
     let ended = match &driven {
@@ -164,6 +167,7 @@ pub(crate) fn detect(
     Ok(Ok(DetectedScanner {
         family: found.family,
         model,
+        model_text,
         rate: session.rate(),
         account,
         said,

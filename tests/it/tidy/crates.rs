@@ -167,7 +167,7 @@ pub(crate) fn preprocess_only_computes(tree: &Tree) -> Vec<String> {
     breaches
 }
 
-/// What a processor does must not depend on which others run. Motion has a line finder that is only its own.
+/// Checks that the result of a processor does not depend on which others run. Motion has its own line finder.
 pub(crate) fn no_processor_uses_another(tree: &Tree) -> Vec<String> {
     const BELOW: &str = "hub/preprocess/src/";
     const PROCESSORS: [&str; 6] = ["zones", "marks", "lines", "motion", "background", "segments"];

@@ -63,7 +63,7 @@ pub(crate) struct Things {
 
 /// An object with fewer points need not be found.
 const LEAST: usize = 15;
-/// Greatest distance between neighboring points of an object, in meters.
+/// Maximum distance between neighboring points of an object, in meters.
 const NEAR_M: f32 = 0.2;
 
 impl Things {

@@ -24,13 +24,17 @@ fn late_ms(late_ns: i64) -> f64 {
 
 /// Writes that the stamps of the angles of `mount` are late.
 pub(super) fn late_text(line: &mut Vec<u8>, mount: &str, late_ns: i64) -> io::Result<()> {
-    let (ms, word) = (late_ms(late_ns), if late_ns < 0 { "early" } else { "late" });
+    let late = lateness(late_ns);
     write!(
         line,
-        "the stamps of {mount}/tilt are {:.1} ms {word}, or its gears have play: corrected. Publish each angle with the \
-         time of its measurement",
-        ms.abs()
+        "the stamps of {mount}/tilt are {late}, or its gears have play: corrected. Publish each angle with the time of its \
+         measurement"
     )
+}
+
+/// Returns by how much stamps are late, or early, as text.
+fn lateness(late_ns: i64) -> String {
+    format!("{:.1} ms {}", late_ms(late_ns).abs(), if late_ns < 0 { "early" } else { "late" })
 }
 
 pub(super) fn angles_text(line: &mut Vec<u8>, trouble: Option<Withheld>) -> io::Result<()> {
@@ -134,7 +138,7 @@ pub(super) fn summary_text(line: &mut Vec<u8>, sum: &Sum) -> io::Result<()> {
     )?;
     write!(line, "{angles_unfit} unfit, {} missed", sum.missed)?;
     if sum.late_ns != 0 {
-        write!(line, "; stamps of angles {:.1} ms late, corrected", late_ms(sum.late_ns))?;
+        write!(line, "; stamps of angles {}, corrected", lateness(sum.late_ns))?;
     }
     if sum.failed > 0 { write!(line, "; {} not published: no memory", sum.failed) } else { Ok(()) }
 }

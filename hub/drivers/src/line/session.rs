@@ -338,8 +338,6 @@ pub type Identity = [u8; 32];
 pub struct Introduction {
     /// Firmware and numbers.
     pub identity: String,
-    /// Number of the model, if scanhub does not know the model.
-    pub unknown_model: Option<u8>,
     /// Health; empty if it was not reported.
     pub health: String,
     /// The same as a verdict.

@@ -668,13 +668,14 @@ impl line::Session for Session {
         let info = self.info().filter(|_| !is_asked)?;
         let (major, minor) = info.firmware;
         let serial: String = info.serial.iter().map(|byte| format!("{byte:02X}")).collect();
-        let unknown_model = info.model().is_none().then_some(info.id);
-        let model = unknown_model.map_or_else(String::new, |id| format!("model 0x{id:02x} (unknown), "));
+        let model = match info.model() {
+            Some(_) => String::new(),
+            None => format!("model 0x{:02x} (unknown), ", info.id),
+        };
         let hardware = info.hardware;
         let identity = format!("{model}firmware {major}.{minor:02}, hardware {hardware}, number {serial}");
         Some(Introduction {
             identity,
-            unknown_model,
             health: self.health().map_or_else(String::new, |health| health.to_string()),
             condition: match self.health() {
                 None => Condition::Unknown,

@@ -30,7 +30,7 @@ pub(super) struct Matcher {
     runs: Box<[Run]>,
 }
 
-/// Neighbouring readings that may be of one thing.
+/// Neighboring readings, at most [`PIECE`], that may belong to one object.
 #[derive(Clone, Copy, Default)]
 struct Run {
     first: u16,
@@ -381,7 +381,9 @@ const LEAST_BEAMS: usize = 6;
 const SAID_BEAMS: f64 = 1.5;
 /// The same as a share of all beams: in a long corridor, frames of doors are taken for one another.
 const LEAST_PART: f64 = 0.03;
+/// Maximum number of readings that are judged together. A whole wall would count as moving because of one end of it.
 const PIECE: usize = 24;
+/// Maximum square that a reading adds, in variances of its noise. A few readings at an edge do not decide about the others.
 const CAP: f64 = 9.0;
 /// How often what moves is looked for.
 const LOOKS: usize = 2;

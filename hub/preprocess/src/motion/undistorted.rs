@@ -1,9 +1,8 @@
 //! Scans without the distortion by the motion of a sensor, which measures each beam from another position.
 
-use std::f64::consts::TAU;
-
 use schema::{Contents, Scan, ScanHead, ScanWord};
 
+use super::view::is_whole;
 use crate::velocity::{Velocity, times};
 
 /// A scan as if the sensor had measured all beams at the scan's stamp.
@@ -39,7 +38,7 @@ impl UndistortedScan {
             ..**scan
         };
         let (old_m, new_m) = (1e-6 * f64::from(scan.unit_um), 1e-6 * unit_um);
-        let is_whole = count as f64 + 1.5 >= TAU / scan.step.abs();
+        let is_whole = is_whole(count, scan.step);
         let arrays = Scan::of_words_mut(&mut self.words).begin(head);
         arrays.angles.fill(f32::NAN);
         arrays.ranges.fill(NO_RETURN);

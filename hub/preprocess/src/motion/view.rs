@@ -202,9 +202,8 @@ impl View {
         at.is_finite().then_some((x.hypot(y), at))
     }
 
-    /// The last beam is the first one's neighbour.
     fn is_whole(&self) -> bool {
-        self.grid.2 as f64 + 1.5 >= TAU / self.grid.1.abs()
+        is_whole(self.grid.2, self.grid.1)
     }
 
     /// The reading whose point is nearest to `point`, if it is nearer than `most`. Behind a beam that looks past `point` by an
@@ -253,6 +252,11 @@ impl Surface {
     pub(super) fn off(&self, point: (f64, f64)) -> f64 {
         self.normal.0 * point.0 + self.normal.1 * point.1 - self.r
     }
+}
+
+/// Returns whether the last of `beams` beams, `step` radians apart, is a neighbor of the first one.
+pub(super) fn is_whole(beams: usize, step: f64) -> bool {
+    beams as f64 + 1.5 >= TAU / step.abs()
 }
 
 /// Ranges are never surer than this, in metres: what a scanner has beside its noise.

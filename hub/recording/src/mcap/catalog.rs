@@ -124,7 +124,7 @@ impl Catalog {
         names.filter(|name| seen.insert(*name)).map(str::to_owned).collect()
     }
 
-    /// Returns the angle that `record` contains, if it is one of `mount`.
+    /// Returns the angle of `mount` that `record` contains. `None` if it contains anything else.
     pub(crate) fn angle(&self, record: &Record, mount: &str) -> Option<(Header, Tilt)> {
         let (message, data) = record.message()?;
         let (channel, _) = self.channels.get(&message.channel_id)?;

@@ -507,6 +507,7 @@ mod tests {
         DetectedScanner {
             family,
             model: Some(features(family).models[1]),
+            model_text: Some(features(family).models[1].name.to_owned()),
             rate: 230_400,
             account: Account { in_telegrams: 9_400, due: 200, ..Account::default() },
             said: None,
@@ -559,12 +560,7 @@ mod tests {
     #[test]
     fn checks_reported_health() {
         let said = |condition| {
-            let said = Introduction {
-                identity: "firmware 1.29".into(),
-                unknown_model: None,
-                health: "so".into(),
-                condition,
-            };
+            let said = Introduction { identity: "firmware 1.29".into(), health: "so".into(), condition };
             let findings = check_rotating(&DetectedScanner { said: Some(said), ..heard() }, None);
             findings.iter().map(|finding| (finding.name, finding.state)).next_back()
         };

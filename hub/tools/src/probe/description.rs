@@ -239,12 +239,11 @@ impl Turning {
     pub(crate) fn new(port: String, heard: &DetectedScanner) -> Turning {
         let known = |value: f64| (value > 0.0).then(|| (value * 100.0).round() / 100.0);
         let is_heard = heard.packets > 0 || heard.said.is_none();
-        let unknown = heard.said.as_ref().and_then(|said| said.unknown_model);
         Turning {
             class: "probe",
             port,
             family: heard.family.name(),
-            model: heard.model.map(|model| model.name.to_owned()).or(unknown.map(|id| format!("0x{id:02x}"))),
+            model: heard.model_text.clone(),
             baud: heard.rate,
             identity: heard.said.as_ref().map(|said| said.identity.clone()),
             health: heard.said.as_ref().map(|said| said.health.clone()).filter(|words| !words.is_empty()),
@@ -278,7 +277,10 @@ impl fmt::Display for Turning {
             None => Ok(()),
         };
         row("family", Some(self.family.to_owned()))?;
-        row("model", self.model.as_ref().map(|model| format!("{}{}", named(model), self.alike())))?;
+        row(
+            "model",
+            self.model.as_ref().map(|model| format!("{}{}", Status::shown_model(model), self.alike())),
+        )?;
         row("rate", Some(format!("{} Bd", self.baud)))?;
         row("identity", self.identity.clone())?;
         row("health", self.health.clone())?;
@@ -293,11 +295,6 @@ impl fmt::Display for Turning {
         row("turns", self.turns_per_second.map(|turns| format!("{turns:.2} a second")))?;
         row("trouble", self.trouble.clone())
     }
-}
-
-/// Returns the name of `model` for text. A model that scanhub does not know has only a number.
-fn named(model: &str) -> String {
-    if Status::is_model_number(model) { format!("{model} (unknown)") } else { model.to_owned() }
 }
 
 #[cfg(test)]
