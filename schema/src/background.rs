@@ -8,7 +8,9 @@ use bytemuck::{Pod, Zeroable, cast_slice, cast_slice_mut};
 use iceoryx2::prelude::ZeroCopySend;
 
 use crate::datagram::Packed;
+use crate::limits::TopicLimits;
 use crate::sliced::sliced;
+use crate::topic::PayloadLen;
 
 /// Head of a [`Background`], before the ranges. 32 bytes.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Pod, Zeroable)]
@@ -38,6 +40,12 @@ sliced! {
     /// of two bytes for every beam. The hub publishes it when a new generation starts, and with every scan if
     /// configured.
     Background, BackgroundWord, "scanhub.Background.v2", BackgroundHead
+}
+
+impl PayloadLen for Background {
+    fn longest(limits: &TopicLimits) -> usize {
+        Background::len(limits.beams)
+    }
 }
 
 impl Background {
@@ -170,6 +178,12 @@ pub struct ForegroundArrays<'a> {
     /// Ranges of the foreground beams in device units, in the order of the beams. There is room for all beams of the
     /// scan.
     pub ranges: &'a mut [u16],
+}
+
+impl PayloadLen for Foreground {
+    fn longest(limits: &TopicLimits) -> usize {
+        Foreground::len(limits.beams)
+    }
 }
 
 impl Foreground {

@@ -9,7 +9,9 @@ use bytemuck::{Pod, Zeroable, cast_slice, cast_slice_mut};
 #[cfg(feature = "ipc")]
 use iceoryx2::prelude::ZeroCopySend;
 
+use crate::limits::TopicLimits;
 use crate::sliced::sliced;
+use crate::topic::PayloadLen;
 
 pub use family::{Family, PacketFacts};
 
@@ -114,6 +116,12 @@ pub enum Intensities<'a> {
     Narrow(&'a [u8]),
     /// More than 8 bits each.
     Wide(&'a [u16]),
+}
+
+impl PayloadLen for Scan {
+    fn longest(limits: &TopicLimits) -> usize {
+        Scan::len(limits.beams, limits.contents)
+    }
 }
 
 impl Scan {

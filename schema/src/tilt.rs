@@ -8,7 +8,9 @@ use bytemuck::{Pod, Zeroable, cast_slice, cast_slice_mut};
 use iceoryx2::prelude::ZeroCopySend;
 
 use crate::Header;
+use crate::limits::TopicLimits;
 use crate::sliced::sliced;
+use crate::topic::PayloadLen;
 
 /// The payload of topic `tilt`, 16 bytes: the angle of a mount. Both stamps of the sample are the time at which the
 /// mount had this angle, not the time of the report.
@@ -108,6 +110,12 @@ impl CloudPoint {
     /// Returns the class; [`PointClass::Unknown`] if this version does not know its number.
     pub fn class(&self) -> PointClass {
         PointClass::ALL.get(usize::from(self.point_class)).copied().unwrap_or_default()
+    }
+}
+
+impl PayloadLen for Cloud {
+    fn longest(limits: &TopicLimits) -> usize {
+        Cloud::len(limits.beams)
     }
 }
 

@@ -3,56 +3,91 @@
 //! One row of the table has everything that differs between topics. All code for each topic, here and in other crates,
 //! is generated from this table, so a new topic is a new row.
 
+use bytemuck::Pod;
+
 use crate::limits::TopicLimits;
 use crate::{Failure, Kind};
 
-/// Calls the macro `$each` with all rows of the table. A row is `VARIANT PAYLOAD, name, type, group, pace, ring,
-/// waiting, kept: description;`. Its columns are those of [`Row`]. A payload other than `[u8]` is a type of this crate.
+/// The table of topics. Calls the macro `$each` with its rows: with those of all topics, `links`: with those that a hub
+/// publishes for each link, or `makers`: with all rows in groups `MAKER { .. }`, one for each [`Maker`].
+///
+/// A row is `VARIANT PAYLOAD, name, type, group, pace, ring, waiting, kept: description;`. Its columns are those of
+/// [`Row`]. A payload other than `[u8]` is a type of this crate.
 ///
 /// # Examples
 ///
 /// ```
 /// macro_rules! names {
-///     ($($topic:ident $payload:tt, $name:literal, $($column:tt),*: $description:literal;)*) => { [$($name),*] };
+///     ($($topic:ident $payload:tt, $name:ident, $($column:tt),*: $description:literal;)*) => {
+///         [$(stringify!($name)),*]
+///     };
 /// }
 /// let names = schema::for_each_topic!(names);
-/// assert_eq!(names[1], "scan");
+/// assert_eq!((names[1], names[names.len() - 1]), ("scan", "obstacles"));
+/// let names = schema::for_each_topic!(links: names);
+/// assert_eq!((names[1], names[names.len() - 1]), ("scan", "early"));
 /// ```
 #[macro_export]
 macro_rules! for_each_topic {
-    ($each:ident) => {
-        $each! {
-            Telegram [u8], "telegram", "u8[]", 83, Scan, First, 64, 0:
-                "Bytes of telegrams, including replies.";
-            Scan Scan, "scan", "scanhub.Scan.v2", 82, Scan, First, 64, 0:
-                "Decoded measurements.";
-            Marks Marks, "marks", "scanhub.Marks.v2", 81, Scan, Last, 16, 0:
-                "Reflector marks.";
-            Zones Zones, "zones", "scanhub.Zones.v2", 81, Scan, First, 16, 1:
-                "Verdicts about zones around the robot.";
-            Foreground Foreground, "foreground", "scanhub.Foreground.v2", 81, Scan, Last, 16, 0:
-                "Beams in front of the background.";
-            Background Background, "background", "scanhub.Background.v2", 82, Change, Last, 4, 1:
-                "The background model.";
-            Status Status, "status", "scanhub.Status.v2", 80, Second, Last, 4, 1:
-                "State, properties and counters of the link.";
-            Lines Lines, "lines", "scanhub.Lines.v2", 81, Scan, Last, 16, 0:
-                "Straight lines and their corners.";
-            Motion Motion, "motion", "scanhub.Motion.v2", 81, Scan, Last, 16, 0:
-                "Motion of the robot since the previous scan.";
-            Early Early, "early", "scanhub.Early.v2", 81, Change, Early, 16, 0:
-                "Early warnings from partial telegrams.";
-            Tracks Tracks, "tracks", "scanhub.Tracks.v2", 81, Scan, Last, 16, 0:
-                "Positions of people, from a tracker.";
-            Events Event, "events", "scanhub.Event.v2", 81, Change, Last, 64, 0:
-                "Events of people, from a tracker.";
-            Tilt Tilt, "tilt", "scanhub.Tilt.v2", 81, Scan, Last, 64, 0:
-                "The angle of a mount.";
-            Cloud Cloud, "cloud", "scanhub.Cloud.v2", 82, Change, Last, 128, 0:
-                "Points in three dimensions.";
-            Obstacles Obstacles, "obstacles", "scanhub.Obstacles.v2", 81, Change, Last, 16, 0:
-                "Obstacles in three dimensions.";
+    (@rows $($to:tt)*) => {
+        $crate::for_each_topic! { $($to)*
+            Link {
+                Telegram [u8], telegram, "u8[]", 83, Scan, First, 64, 0:
+                    "Bytes of telegrams, including replies.";
+                Scan Scan, scan, "scanhub.Scan.v2", 82, Scan, First, 64, 0:
+                    "Decoded measurements.";
+                Marks Marks, marks, "scanhub.Marks.v2", 81, Scan, Last, 16, 0:
+                    "Reflector marks.";
+                Zones Zones, zones, "scanhub.Zones.v2", 81, Scan, First, 16, 1:
+                    "Verdicts about zones around the robot.";
+                Foreground Foreground, foreground, "scanhub.Foreground.v2", 81, Scan, Last, 16, 0:
+                    "Beams in front of the background.";
+                Background Background, background, "scanhub.Background.v2", 82, Change, Last, 4, 1:
+                    "The background model.";
+                Status Status, status, "scanhub.Status.v2", 80, Second, Last, 4, 1:
+                    "State, properties and counters of the link.";
+                Lines Lines, lines, "scanhub.Lines.v2", 81, Scan, Last, 16, 0:
+                    "Straight lines and their corners.";
+                Motion Motion, motion, "scanhub.Motion.v2", 81, Scan, Last, 16, 0:
+                    "Motion of the robot since the previous scan.";
+                Early Early, early, "scanhub.Early.v2", 81, Change, Early, 16, 0:
+                    "Early warnings from partial telegrams.";
+            }
+            Tracker {
+                Tracks Tracks, tracks, "scanhub.Tracks.v2", 81, Scan, Last, 16, 0:
+                    "Positions of people, from a tracker.";
+                Events Event, events, "scanhub.Event.v2", 81, Change, Last, 64, 0:
+                    "Events of people, from a tracker.";
+            }
+            Mount {
+                Tilt Tilt, tilt, "scanhub.Tilt.v2", 81, Scan, Last, 64, 0:
+                    "The angle of a mount.";
+            }
+            Tilted {
+                Cloud Cloud, cloud, "scanhub.Cloud.v2", 82, Change, Last, 128, 0:
+                    "Points in three dimensions.";
+                Obstacles Obstacles, obstacles, "scanhub.Obstacles.v2", 81, Change, Last, 16, 0:
+                    "Obstacles in three dimensions.";
+            }
         }
+    };
+    (@all $each:ident $($maker:ident { $($rows:tt)* })*) => {
+        $each! { $($($rows)*)* }
+    };
+    (@links $each:ident Link { $($rows:tt)* } $($rest:tt)*) => {
+        $each! { $($rows)* }
+    };
+    (@makers $each:ident $($groups:tt)*) => {
+        $each! { $($groups)* }
+    };
+    ($each:ident) => {
+        $crate::for_each_topic! { @rows @all $each }
+    };
+    (links: $each:ident) => {
+        $crate::for_each_topic! { @rows @links $each }
+    };
+    (makers: $each:ident) => {
+        $crate::for_each_topic! { @rows @makers $each }
     };
 }
 
@@ -125,7 +160,7 @@ impl Ring {
 }
 
 macro_rules! rows {
-    ($($topic:ident $payload:tt, $name:literal, $kind:literal, $group:literal, $pace:ident,
+    ($($topic:ident $payload:tt, $name:ident, $kind:literal, $group:literal, $pace:ident,
         $ring:ident, $waiting:literal, $kept:literal: $about:literal;)*) => {
         /// A topic that a sensor can have.
         #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
@@ -135,61 +170,55 @@ macro_rules! rows {
 
         impl Topic {
             /// All topics, in the order of all output.
-            pub const ALL: [Topic; [$($name),*].len()] = [$(Topic::$topic),*];
+            pub const ALL: [Topic; [$(stringify!($name)),*].len()] = [$(Topic::$topic),*];
         }
 
         /// One row for each of [`Topic::ALL`].
         pub(super) const ROWS: [Row; Topic::ALL.len()] = [$(Row {
-            name: $name,
+            name: stringify!($name),
             payload: $kind,
             group: $group,
             pace: Pace::$pace,
             ring: Ring::$ring,
             waiting: $waiting,
             kept: $kept,
-            longest: longest!($payload),
+            longest: <crate::payload_type!($payload) as PayloadLen>::longest,
         },)*];
-    };
-}
-
-macro_rules! longest {
-    ([u8]) => {
-        |limits| limits.telegram
-    };
-    (Scan) => {
-        |limits| crate::Scan::len(limits.beams, limits.contents)
-    };
-    (Foreground) => {
-        |limits| crate::Foreground::len(limits.beams)
-    };
-    (Background) => {
-        |limits| crate::Background::len(limits.beams)
-    };
-    (Cloud) => {
-        |limits| crate::Cloud::len(limits.beams)
-    };
-    ($payload:tt) => {
-        |_| size_of::<crate::$payload>()
     };
 }
 
 crate::for_each_topic!(rows);
 
-impl Topic {
-    /// Topics that a hub publishes for each link.
-    pub const OF_LINKS: [Topic; 10] = [
-        Topic::Telegram,
-        Topic::Scan,
-        Topic::Marks,
-        Topic::Zones,
-        Topic::Foreground,
-        Topic::Background,
-        Topic::Status,
-        Topic::Lines,
-        Topic::Motion,
-        Topic::Early,
-    ];
+/// Length of the longest payload of a topic.
+pub(crate) trait PayloadLen {
+    /// Returns the length in bytes of the longest payload of a topic that is created with `limits`.
+    fn longest(limits: &TopicLimits) -> usize;
+}
 
+impl PayloadLen for [u8] {
+    fn longest(limits: &TopicLimits) -> usize {
+        limits.telegram
+    }
+}
+
+impl<P: Pod> PayloadLen for P {
+    fn longest(_limits: &TopicLimits) -> usize {
+        size_of::<P>()
+    }
+}
+
+macro_rules! links {
+    ($($topic:ident $payload:tt, $name:ident, $($column:tt),*: $about:literal;)*) => {
+        impl Topic {
+            /// Topics that a hub publishes for each link.
+            pub const OF_LINKS: [Topic; [$(stringify!($name)),*].len()] = [$(Topic::$topic),*];
+        }
+    };
+}
+
+crate::for_each_topic!(links: links);
+
+impl Topic {
     /// Returns the topic's row of the table.
     pub const fn row(self) -> &'static Row {
         &ROWS[self as usize]
@@ -346,19 +375,6 @@ pub enum Maker {
 }
 
 impl Maker {
-    /// All kinds.
-    pub const ALL: [Maker; 4] = [Maker::Link, Maker::Tracker, Maker::Mount, Maker::Tilted];
-
-    /// Returns its topics, in the order of [`Topic::ALL`].
-    pub const fn topics(self) -> &'static [Topic] {
-        match self {
-            Maker::Link => &Topic::OF_LINKS,
-            Maker::Tracker => &[Topic::Tracks, Topic::Events],
-            Maker::Mount => &[Topic::Tilt],
-            Maker::Tilted => &[Topic::Cloud, Topic::Obstacles],
-        }
-    }
-
     /// Returns the description of a name that has these topics.
     pub const fn name(self) -> &'static str {
         match self {
@@ -369,6 +385,24 @@ impl Maker {
         }
     }
 }
+
+macro_rules! makers {
+    ($($maker:ident {
+        $($topic:ident $payload:tt, $name:ident, $($column:tt),*: $about:literal;)*
+    })*) => {
+        impl Maker {
+            /// All kinds.
+            pub const ALL: [Maker; [$(stringify!($maker)),*].len()] = [$(Maker::$maker),*];
+
+            /// Returns its topics, in the order of [`Topic::ALL`].
+            pub const fn topics(self) -> &'static [Topic] {
+                match self { $(Maker::$maker => &[$(Topic::$topic),*],)* }
+            }
+        }
+    };
+}
+
+crate::for_each_topic!(makers: makers);
 
 impl Topic {
     /// Returns the kind of its publisher.
@@ -411,11 +445,11 @@ mod tests {
 
     #[allow(unreachable_pub)]
     mod with_one_more {
-        use super::super::{Pace, Ring, Row};
+        use super::super::{Pace, PayloadLen, Ring, Row};
 
         rows! {
-            Telegram [u8], "telegram", "u8[]", 83, Scan, First, 16, 0: "Bytes.";
-            Beat Marks, "beat", "scanhub.Beat.v1", 82, Change, Last, 2, 1: "A throw-away topic.";
+            Telegram [u8], telegram, "u8[]", 83, Scan, First, 16, 0: "Bytes.";
+            Beat Marks, beat, "scanhub.Beat.v1", 82, Change, Last, 2, 1: "A throw-away topic.";
         }
     }
 

@@ -104,7 +104,7 @@ fn can_be_said_again(datagram: &Datagram<'_>) {
         return assert_eq!(Announce::unpack(&room[..len]), Some(announce));
     };
     macro_rules! by_topic {
-        ($($topic:ident $payload:tt, $name:literal, $($column:tt),*: $about:literal;)*) => {
+        ($($topic:ident $payload:tt, $name:ident, $($column:tt),*: $about:literal;)*) => {
             match topic { $(Topic::$topic => again::<schema::payload_type!($payload)>(payload),)* }
         };
     }

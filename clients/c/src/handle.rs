@@ -46,7 +46,7 @@ macro_rules! sample {
 
 /// Declares what is followed from the table of topics; a robot is all zones in one.
 macro_rules! topics {
-    ($($topic:ident $payload:tt, $name:literal, $($column:tt),*: $about:literal;)*) => {
+    ($($topic:ident $payload:tt, $name:ident, $($column:tt),*: $about:literal;)*) => {
         enum Source { Robot(RobotFollower), $($topic(follower!($topic $payload)),)* }
 
         enum Held { Robot(Told), $($topic(sample!($topic $payload)),)* }

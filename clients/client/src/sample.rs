@@ -34,7 +34,7 @@ macro_rules! source {
 
 /// Declares from the table of topics what a name may stand for: the sample, and the source that it comes from.
 macro_rules! samples {
-    ($($topic:ident $payload:tt, $name:literal, $($column:tt),*: $about:literal;)*) => {
+    ($($topic:ident $payload:tt, $name:ident, $($column:tt),*: $about:literal;)*) => {
         /// A received sample of one of the topics, or of the fold over several.
         pub enum Sample {
             $(#[doc = $about] $topic(sample!($topic $payload)),)*

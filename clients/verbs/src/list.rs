@@ -184,7 +184,7 @@ impl Line {
 }
 
 macro_rules! lines {
-    ($($topic:ident $payload:tt, $name:literal, $($column:tt),*: $about:literal;)*) => {
+    ($($topic:ident $payload:tt, $name:ident, $($column:tt),*: $about:literal;)*) => {
         /// Adds a line for each topic of `sensor`.
         fn of_sensor(node: &Node, sensor: &str, lines: &mut Vec<Line>) -> Result<(), Failure> {
             $(lines.extend(line::<schema::payload_type!($payload)>(node, sensor)?);)*

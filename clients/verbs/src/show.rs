@@ -121,7 +121,7 @@ impl ShowSample for RobotHeard {
 }
 
 macro_rules! samples {
-    ($($topic:ident $payload:tt, $name:literal, $($column:tt),*: $about:literal;)*) => {
+    ($($topic:ident $payload:tt, $name:ident, $($column:tt),*: $about:literal;)*) => {
         /// The line of JSON of a sample of `sensor`.
         pub(crate) fn json(sample: &Sample, sensor: &str, to: impl Keys) -> Result<(), End> {
             match sample {

@@ -65,7 +65,7 @@ impl<'a> Datagram<'a> {
 }
 
 macro_rules! check {
-    ($($topic:ident $payload:tt, $name:literal, $($column:tt),*: $about:literal;)*) => {
+    ($($topic:ident $payload:tt, $name:ident, $($column:tt),*: $about:literal;)*) => {
         /// Returns whether the payload is valid for `topic`.
         fn is_sound(topic: Topic, payload: &[u8]) -> bool {
             match topic { $(Topic::$topic => <crate::payload_type!($payload)>::room(payload).is_some(),)* }

@@ -188,7 +188,7 @@ macro_rules! payload {
 
 /// A payload of variable length is loaned with the longest length.
 macro_rules! payloads {
-    ($($topic:ident $payload:tt, $name:literal, $($column:tt),*: $about:literal;)*) => {
+    ($($topic:ident $payload:tt, $name:ident, $($column:tt),*: $about:literal;)*) => {
         $(payloads!($payload, $topic);)*
     };
     ([u8], $topic:ident) => {

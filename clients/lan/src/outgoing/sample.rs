@@ -16,7 +16,7 @@ pub struct Sample<'a> {
 
 /// Declares from the table of topics what a sample may say.
 macro_rules! payloads {
-    ($($topic:ident $payload:tt, $name:literal, $($column:tt),*: $about:literal;)*) => {
+    ($($topic:ident $payload:tt, $name:ident, $($column:tt),*: $about:literal;)*) => {
         /// The payload of any topic.
         #[derive(Clone, Copy, Debug)]
         pub enum PayloadRef<'a> {

@@ -71,7 +71,7 @@ impl Sensor {
 
 /// Declares from the table of topics where the payload of a sample lies.
 macro_rules! payloads {
-    ($($topic:ident $payload:tt, $name:literal, $($column:tt),*: $about:literal;)*) => {
+    ($($topic:ident $payload:tt, $name:ident, $($column:tt),*: $about:literal;)*) => {
         fn payload(sample: &Sample) -> PayloadRef<'_> {
             match sample {
                 $(Sample::$topic(sample) => PayloadRef::$topic(payloads!($topic sample)),)*

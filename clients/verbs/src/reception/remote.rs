@@ -34,7 +34,7 @@ fn age_ms(remote: &Remote<'_>) -> Option<f64> {
 
 /// Declares how a payload of any topic is had, from the table of topics.
 macro_rules! payloads {
-    ($($topic:ident $payload:tt, $name:literal, $($column:tt),*: $about:literal;)*) => {
+    ($($topic:ident $payload:tt, $name:ident, $($column:tt),*: $about:literal;)*) => {
         /// Has the payload shown by `how`; nothing becomes of one that cannot be had.
         fn show<E>(remote: &Remote<'_>, how: impl Way<E>) -> Result<(), E> {
             match remote.topic {

@@ -8,7 +8,7 @@ use crate::topics::Sample;
 
 /// Declares from the table of topics how the bytes of a sample are read.
 macro_rules! payloads {
-    ($($topic:ident $payload:tt, $name:literal, $($column:tt),*: $about:literal;)*) => {
+    ($($topic:ident $payload:tt, $name:ident, $($column:tt),*: $about:literal;)*) => {
         /// Hands what `sample` says to `to`.
         pub(super) fn lend<R>(sample: &Sample, to: impl FnOnce(PayloadRef<'_>) -> R) -> R {
             match sample.topic {

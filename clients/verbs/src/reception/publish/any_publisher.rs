@@ -23,7 +23,7 @@ impl<P: Payload + Packed + ?Sized> Unpacked for Publication<P> {
 
 /// Declares the publisher of any topic from the table of topics.
 macro_rules! publishers {
-    ($($topic:ident $payload:tt, $name:literal, $($column:tt),*: $about:literal;)*) => {
+    ($($topic:ident $payload:tt, $name:ident, $($column:tt),*: $about:literal;)*) => {
         /// A topic of any kind.
         pub(super) enum AnyPublisher { $($topic(Publication<schema::payload_type!($payload)>),)* }
 
