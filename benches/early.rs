@@ -15,7 +15,7 @@ use std::time::{Duration, Instant};
 
 use scanhub_client::{Early, Header, Zones};
 use schema::Scan;
-use schema::ipc::Payload;
+use shm::Payload;
 use support::figures::{self, Cell, Figure, Target};
 use support::stage::{Child, PATIENCE, PROGRAM, Stage};
 use support::usage::Work;

@@ -16,8 +16,8 @@ use std::time::{Duration, Instant};
 use criterion::{BenchmarkId, Criterion, criterion_group, criterion_main};
 use rustix::time::{ClockId, clock_gettime};
 use schema::datagram::{Datagram, HEAD, Head, MTU_ETHERNET, Packed};
-use schema::ipc::{self, Bell, Node, Payload};
 use schema::{Foreground, Marks, Ring, Scan, Topic, Zones};
+use shm::{Bell, Node, Payload};
 use support::source::{self, SENSOR, Source};
 use support::stage::{PATIENCE, Stage};
 use support::{Outcome, clock};
@@ -40,7 +40,7 @@ fn publish(c: &mut Criterion) {
         for count in CONSUMERS.into_iter().filter(|count| *count > 0 || rest == Rest::Awake) {
             let stage = Stage::new().expect("a domain");
             let mut source = Source::open(&stage.domain).expect("a publisher");
-            let node = ipc::client_node(&stage.domain).expect("a node");
+            let node = shm::client_node(&stage.domain).expect("a node");
             let crowd = Crowd::default();
             thread::scope(|scope| {
                 let _end = End(&crowd);
@@ -103,28 +103,28 @@ fn follow(node: &Node, rest: Rest, crowd: &Crowd) -> Outcome<()> {
     let subscriber = subscriber(node)?;
     let bell = Bell::open(node, SENSOR)?.ok_or("no bell")?;
     let listener = match rest {
-        Rest::Event => Some(ipc::listener(&ipc::open_wake(node, SENSOR)?.ok_or("no event")?)?),
+        Rest::Event => Some(shm::listener(&shm::open_wake(node, SENSOR)?.ok_or("no event")?)?),
         Rest::Awake | Rest::Bell => None,
     };
     crowd.ready.fetch_add(1, Ordering::Release);
     while !crowd.is_over.load(Ordering::Acquire) {
         let rung = bell.rung(Ring::First);
         if let Some(listener) = &listener {
-            ipc::take_wakeups(&[listener])?;
+            shm::take_wakeups(&[listener])?;
         }
         while Scan::receive(&subscriber).map_err(|error| format!("{error:?}"))?.is_some() {
             crowd.received.fetch_add(1, Ordering::Release);
         }
         match &listener {
-            Some(listener) => ipc::sleep(&[listener], LOOK)?,
-            None => ipc::sleep_at_bells(&[(&bell, Ring::First, rung)], clock::now() + LOOK.as_nanos() as u64)
+            Some(listener) => shm::sleep(&[listener], LOOK)?,
+            None => shm::sleep_at_bells(&[(&bell, Ring::First, rung)], clock::now() + LOOK.as_nanos() as u64)
                 .map_err(|_| "no bells on this system")?,
         }
     }
     Ok(())
 }
 
-fn subscriber(node: &Node) -> Outcome<ipc::Subscriber<Scan>> {
+fn subscriber(node: &Node) -> Outcome<shm::Subscriber<Scan>> {
     let service = Scan::open(node, SENSOR)?.ok_or("no topic")?;
     Ok(Scan::subscriber(&service)?)
 }

@@ -14,9 +14,10 @@ use std::sync::mpsc::{self, RecvTimeoutError};
 use std::thread;
 use std::time::{Duration, Instant};
 
-use schema::{Domain, Failure, Kind};
+use schema::{Failure, Kind};
 use serde::Serialize;
 use serde_json::Value;
+use shm::Domain;
 use verbs::{Bounds, WatchOptions};
 
 use crate::cli::watch::{can_show_pictures, colours};

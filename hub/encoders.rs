@@ -5,7 +5,8 @@ use std::thread::{self, JoinHandle};
 
 use scanhub_client::{Publication, PublishSession, SensorPublisher, Wake};
 use schema::limits::TopicLimits;
-use schema::{Domain, Failure, Flags, Header, Kind, Maker, Tilt};
+use schema::{Failure, Flags, Header, Kind, Maker, Tilt};
+use shm::Domain;
 use sim::mount::Report;
 use sim::options::SimulateOptions;
 

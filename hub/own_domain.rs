@@ -2,7 +2,8 @@
 
 use std::ops::Deref;
 
-use schema::{Directory, Domain, Environment, Failure, Kind};
+use schema::{Failure, Kind};
+use shm::{Directory, Domain, Environment};
 use tempfile::TempDir;
 
 /// The domain. Its directory and its shared memory are removed when this is dropped.

@@ -12,8 +12,9 @@ use rustix::net::{
     RecvAncillaryBuffer, RecvAncillaryMessage, RecvFlags, SendAncillaryBuffer, SendAncillaryMessage,
     SendFlags, recvmsg, sendmsg,
 };
-use schema::ipc::{self, Bell, Node, Waker};
-use schema::{Domain, Environment, HubLock, Ring, Wake};
+use schema::{Ring, Wake};
+use shm::{Bell, Node, Waker};
+use shm::{Domain, Environment, HubLock};
 
 use super::message::{Label, PHASES, Way};
 use super::process::{Inlet, Outlet, Task};
@@ -32,7 +33,7 @@ impl Word {
     pub(crate) fn new(task: &Task) -> Outcome<Word> {
         let domain = Domain::of_hub(task.domain, None, &Environment::of_process())?;
         let lock = HubLock::acquire(domain.root())?;
-        let node = ipc::hub_node(&domain)?;
+        let node = shm::hub_node(&domain)?;
         Ok(Word { waker: Waker::new(&node, SENSOR)?, _node: node, _lock: lock })
     }
 }
@@ -63,7 +64,7 @@ pub(crate) struct WordInlet {
 
 impl WordInlet {
     pub(crate) fn new(task: &Task) -> Outcome<WordInlet> {
-        let node = ipc::client_node(&Domain::of_hub(task.domain, None, &Environment::of_process())?)?;
+        let node = shm::client_node(&Domain::of_hub(task.domain, None, &Environment::of_process())?)?;
         let bell = Bell::open(&node, SENSOR)?.ok_or("no bell")?;
         let rung = bell.rung(Ring::First);
         Ok(WordInlet {
@@ -87,7 +88,7 @@ impl Inlet for WordInlet {
                 std::hint::spin_loop();
             } else {
                 let until = clock::now() + LONG_NS;
-                ipc::sleep_at_bells(&[(&self.bell, Ring::First, rung)], until)
+                shm::sleep_at_bells(&[(&self.bell, Ring::First, rung)], until)
                     .map_err(|error| format!("{error:?}"))?;
             }
         }

@@ -10,8 +10,8 @@ use rustix::time::{ClockId, clock_gettime};
 use scanhub_drivers::lms::measured;
 use scanhub_drivers::lms::telegram::STX;
 use scanhub_drivers::lms::variant::{MIRROR_TURN, Mode, Unit, Variant};
-use schema::ipc::{self, Node, Payload, Subscriber};
 use schema::{Background, Failure, Foreground, Kind, Marks, Nanos, Scan, Status, Zones};
+use shm::{Node, Payload, Subscriber};
 use sim::room::Room;
 
 use crate::growth::{Quantity, Sweep};
@@ -238,7 +238,7 @@ pub(crate) fn drive(
     let stage = Stage::new()?;
     let config = config(sensors, variant)?;
     virtual_hub(&config, &stage.domain, |links| {
-        let node = ipc::client_node(&stage.domain)?;
+        let node = shm::client_node(&stage.domain)?;
         let followed = config.links.iter().filter(|_| followed);
         let subscribers: Vec<Subscribers> =
             followed.map(|link| Subscribers::attach(&node, &link.name)).collect::<Result<_, _>>()?;

@@ -9,8 +9,9 @@ use std::thread;
 use std::time::Duration;
 
 use scanhub_client::Subscription;
-use schema::ipc::Payload;
-use schema::{Domain, Environment, Header, Scan, Status, limits};
+use schema::{Header, Scan, Status, limits};
+use shm::Payload;
+use shm::{Domain, Environment};
 
 use super::stage::PATIENCE;
 use super::{Outcome, clock, truth};

@@ -4,7 +4,8 @@ use std::path::{Path, PathBuf};
 
 use clap::{Args, ValueEnum};
 use clap_complete::shells;
-use schema::{Failure, Kind, output};
+use scanhub_files::output;
+use schema::{Failure, Kind};
 
 use super::{command, complete};
 use crate::print_own;

@@ -4,8 +4,9 @@ use std::io::{IsTerminal, stdout};
 use std::path::PathBuf;
 
 use clap::Args;
+use schema::Failure;
 use schema::limits::TopicLimits;
-use schema::{Failure, StateDirectory};
+use shm::StateDirectory;
 use verbs::ListenOptions;
 
 use super::{Everywhere, Limits};

@@ -3,7 +3,8 @@
 use std::path::PathBuf;
 
 use clap::{Args, Subcommand};
-use schema::{Failure, output};
+use scanhub_files::output;
+use schema::Failure;
 use serde::Serialize;
 
 use crate::{line, print};

@@ -5,7 +5,8 @@ use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 
 use clap::Args;
-use schema::{Failure, Kind, regular};
+use scanhub_files::regular;
+use schema::{Failure, Kind};
 use verbs::WebOptions;
 
 use super::{Everywhere, Limits};

@@ -11,8 +11,9 @@ use std::thread;
 use std::time::{Duration, Instant};
 
 use rustix::process::{Pid, Signal, kill_process};
-use schema::{Domain, Failure, Family, Kind};
+use schema::{Failure, Family, Kind};
 use serde_json::Value;
+use shm::Domain;
 use tempfile::TempDir;
 
 use super::cast::{Sensor, World};

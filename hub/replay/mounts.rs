@@ -9,7 +9,8 @@ use std::thread::{self, JoinHandle};
 use daemon::{Player, RecordedAngle, RecordedMount};
 use scanhub_client::{PublishSession, Wake};
 use schema::limits::TopicLimits;
-use schema::{Domain, Failure, Flags, Header, Kind, Maker, Tilt};
+use schema::{Failure, Flags, Header, Kind, Maker, Tilt};
+use shm::Domain;
 
 /// A thread for each mount of a recording. Dropping it ends the threads, and removes the topics.
 pub(crate) struct Mounts {

@@ -1,12 +1,12 @@
-//! The interface between hub and clients: topics with their payloads and names, the format of datagrams and recordings,
-//! and the services in shared memory. Without feature `ipc`, it is plain bytes and names, enough for a receiver on a
-//! network.
+//! The interface between hub and clients: topics with their payloads and names, and the format of datagrams and
+//! recordings. It makes no system calls: the crate `shm` puts payloads into shared memory.
+
+#![forbid(unsafe_code)]
 
 mod background;
 mod control;
 pub mod csv;
 pub mod datagram;
-mod domain;
 mod failure;
 #[cfg(feature = "mcap")]
 pub mod file;
@@ -25,38 +25,15 @@ mod topic;
 mod tracks;
 mod zones;
 
-#[cfg(feature = "ipc")]
-mod directory;
-#[cfg(feature = "ipc")]
-pub mod ipc;
 pub mod limits;
-#[cfg(feature = "ipc")]
-mod lock;
-#[cfg(feature = "output")]
-pub mod output;
-#[cfg(any(feature = "ipc", feature = "output"))]
-#[cfg_attr(
-    not(all(feature = "ipc", feature = "output")),
-    allow(dead_code, reason = "a domain has stricter rules than an output file")
-)]
-mod path_walk;
-#[cfg(feature = "files")]
-pub mod regular;
-#[cfg(feature = "ipc")]
-mod running;
 #[cfg(feature = "json")]
 mod saved;
-#[cfg(feature = "ipc")]
-pub mod shortage;
-#[cfg(feature = "ipc")]
-mod state;
 
 pub use background::{
     Background, BackgroundHead, BackgroundWord, Foreground, ForegroundArrays, ForegroundHead, ForegroundWord,
     SEGMENTS, Segment,
 };
 pub use control::{Request, Response, Shown, Verb};
-pub use domain::{DEFAULT_DOMAIN, Domain, Environment};
 pub use failure::{Failure, Kind};
 pub use header::{Flags, Header, Quality, Reasons};
 pub use landmarks::{Corner, LINES, Line, Lines, MARKS, Mark, Marks};
@@ -80,13 +57,5 @@ pub use topic::{
 pub use tracks::{Event, EventKind, TRACK_SENSORS, TRACKS, Track, TrackSensor, TrackState, Tracks};
 pub use zones::{Early, Verdict, ZONES, Zone, Zones};
 
-#[cfg(feature = "ipc")]
-pub use directory::Directory;
-#[cfg(feature = "ipc")]
-pub use lock::{HubLock, ListenLock, NameLock, holder, is_starting, name_held, publisher, publisher_domain};
-#[cfg(feature = "ipc")]
-pub use running::{RunningHub, shell_word};
 #[cfg(feature = "json")]
 pub use saved::{SavedModel, as_json, unit_in_mm};
-#[cfg(feature = "ipc")]
-pub use state::StateDirectory;

@@ -1,7 +1,7 @@
 //! Points in time, durations, the time that bytes take on a serial line, rates of samples, and ages as text.
 
+use core::time::Duration;
 use std::fmt;
-use std::time::Duration;
 
 /// A point in time or a duration, in nanoseconds of one monotonic clock that the caller chooses.
 pub type Nanos = u64;

@@ -13,7 +13,7 @@ use crate::testkit::{
     write_program,
 };
 use config::Gateway;
-use schema::Domain;
+use shm::Domain;
 use tools::doctor::{Bridge, Subjects, System, examine};
 
 /// `sh` with these words before the program, as `ulimit -f 100; exec`, and its arguments.

@@ -6,9 +6,9 @@ use std::path::Path;
 use config::{Config, Sources};
 use scanhub_drivers::ld;
 use scanhub_drivers::lms::variant::Baud;
-use schema::ipc::{self, Payload};
 use schema::{Family, MILLIS, Nanos, Status};
 use serde_json::Value;
+use shm::Payload;
 use sim::Arrival;
 use sim::device::Device;
 use sim::ld::{Head, HeadSettings, Packets};
@@ -243,7 +243,7 @@ fn exchange(keys: &str, number: usize, end: Nanos) -> (&'static str, Vec<Reporte
     let config = Config::load(&sources).expect("a configuration");
     let domain = env.place();
     let driven = virtual_hub(&config, &domain, |links| {
-        let node = ipc::client_node(&domain).expect("a node");
+        let node = shm::client_node(&domain).expect("a node");
         let topic = Status::open(&node, "a").expect("a topic").expect("is there");
         let statuses = Status::subscriber(&topic).expect("a subscriber");
         let mut reported = Vec::new();

@@ -14,7 +14,6 @@ use crate::testkit::{PATIENCE, TestEnv, in_own_process};
 use config::Sources;
 use daemon::{Play, Player, Replay};
 use recorded_rooms::{LEARNING, Published, SENSORS, Subscribers};
-use schema::ipc;
 use schema::{Flags, Topic};
 
 const SCANS: u64 = 400;
@@ -49,7 +48,7 @@ fn replay(env: &TestEnv, file: &Path, play: Play, set: &[&str]) -> Vec<Vec<Publi
             daemon::replay(&replay, &domain, |_, player| tell.send(player.clone()).expect("waits"))
         });
         let player: Arc<Player> = ready.recv_timeout(PATIENCE).expect("is up");
-        let node = ipc::client_node(&domain).expect("a node");
+        let node = shm::client_node(&domain).expect("a node");
         let followers = SENSORS.map(|(name, _)| Subscribers::attach(&node, name));
         let mut published = vec![Vec::new(), Vec::new()];
         let mut telegrams = 0;

@@ -12,8 +12,8 @@ use crate::testkit::{INT, PATIENCE, Program, TERM, TestEnv, in_own_process, is_c
 use config::Sources;
 use daemon::{Play, Player, Replay};
 use schema::datagram::Packed;
-use schema::ipc::{self, Node, Payload, Subscriber};
 use schema::{Event, EventKind, TrackState, Tracks};
+use shm::{Node, Payload, Subscriber};
 use sim::world::World;
 
 pub(crate) const SITE: &str = r#"
@@ -162,7 +162,7 @@ fn tracked(env: &TestEnv, site: &str, file: &str) -> [Published; 2] {
         let delay = format!("--delay={}ms", DELAY_NS / 1_000_000);
         let track = env.start(&["track", "--site", site, "--as=house", &delay, "--json"]);
         await_follower(env);
-        let node = ipc::client_node(&domain).expect("a node");
+        let node = shm::client_node(&domain).expect("a node");
         let telegrams = ["hall", "kitchen"].map(|sensor| attach::<[u8]>(&node, sensor));
         let (tracks, events) = (attach::<Tracks>(&node, "house"), attach::<Event>(&node, "house"));
         let (mut published, mut played_ns) = ([Published::new(), Published::new()], 0);

@@ -13,8 +13,9 @@ use scanhub_drivers::lms;
 use scanhub_drivers::lms::variant::{MIRROR_TURN, Mode, Unit, Variant};
 use schema::datagram::Packed;
 use schema::file::Writer;
-use schema::ipc::{self, Node, Payload, Subscriber};
-use schema::{Background, Domain, Foreground, Header, Marks, Nanos, Scan, Topic, Zones};
+use schema::{Background, Foreground, Header, Marks, Nanos, Scan, Topic, Zones};
+use shm::Domain;
+use shm::{Node, Payload, Subscriber};
 use sim::room::Room;
 use sim::world::World;
 
@@ -47,7 +48,7 @@ pub(crate) fn record(
     let rooms = SENSORS.map(|(_, name)| Room::new(&name.parse::<World>().expect("a world"), 7));
     let mut writer = Writer::begin(File::create(file).expect("a file"), "", BTreeMap::new()).expect("begins");
     let driven = virtual_hub::virtual_hub(&config, domain, |links| {
-        let node = ipc::client_node(domain).expect("a node");
+        let node = shm::client_node(domain).expect("a node");
         let subscribers = SENSORS.map(|(name, _)| Subscribers::attach(&node, name));
         for scan in 0..=scans {
             for (number, room) in rooms.iter().enumerate() {

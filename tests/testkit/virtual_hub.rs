@@ -12,9 +12,10 @@ use config::Config;
 use daemon::surroundings::{Learned, Line, Surroundings, Wait, Woken};
 use daemon::{LiveLink, Orders};
 use port::{Allowance, Alteration, PortError, Source, clock};
-use schema::ipc::{self, Node, Payload, SharedMemory, Waker};
 use schema::limits::TopicLimits;
-use schema::{Domain, Failure, HubLock, Nanos, Ring, Wake, shortage};
+use schema::{Failure, Nanos, Ring, Wake};
+use shm::{Domain, HubLock, shortage};
+use shm::{Node, Payload, SharedMemory, Waker};
 
 /// A link in virtual time. Its port must be a recording in the configuration: it streams from the start, and its scans
 /// are read in the configured mode.
@@ -36,7 +37,7 @@ pub(crate) fn virtual_hub<T>(
 ) -> Result<T, Failure> {
     shortage::raise_descriptor_limit().expect("a limit can be raised");
     let _lock = HubLock::acquire(domain.root())?;
-    let node = ipc::hub_node(domain)?;
+    let node = shm::hub_node(domain)?;
     let (_orders, queues) = Orders::new(config.links.iter().map(|link| link.name.as_str()))?;
     let around = config.links.iter().map(|link| Around::new(&node, &link.name));
     let around = around.collect::<Result<Vec<_>, _>>()?;

@@ -21,7 +21,8 @@ use std::time::{Duration, Instant};
 
 use lan::outgoing::ANNOUNCE_EVERY;
 use schema::limits::TopicLimits;
-use schema::{Domain, Failure, Kind, Topic};
+use schema::{Failure, Kind, Topic};
+use shm::Domain;
 use verbs::network::{End, LossyWriter, Output, now, quiet};
 
 pub use check::check;

@@ -13,7 +13,8 @@ use clap::Parser;
 use ros::Names;
 use ros::zenoh_wire::Distro;
 use schema::limits::TopicLimits;
-use schema::{DEFAULT_DOMAIN, Domain, Environment, Failure, Kind, Printable, publisher_domain};
+use schema::{Failure, Kind, Printable};
+use shm::{DEFAULT_DOMAIN, Domain, Environment, publisher_domain};
 use verbs::network::received_topics;
 
 /// Carry topics to other machines and back over Zenoh, through a router or as one: other rooms, Wi-Fi, the internet

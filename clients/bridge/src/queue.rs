@@ -10,7 +10,8 @@ use std::time::{Duration, Instant};
 
 use lan::Stamp;
 use lan::outgoing::Sample;
-use schema::{Domain, Failure, Topic};
+use schema::{Failure, Topic};
+use shm::Domain;
 use verbs::network::{Carrier, End, Forwarder, Notice, Selection, now};
 
 use crate::session::{Connection, ZenohSession};

@@ -14,8 +14,9 @@ use lan::Stamp;
 use lan::outgoing::Sample;
 use ros::Names;
 use ros::zenoh_wire::{self, Distro, Node, Qos};
-use schema::{Domain, Failure, Topic};
+use schema::{Failure, Topic};
 use serde::Serialize;
+use shm::Domain;
 use verbs::network::{Carrier, End, Output, Selection, now, tell};
 
 use crate::queue::{self, Follower, Queue, Sender, Shared};

@@ -9,7 +9,8 @@ use std::time::Duration;
 use lan::Stamp;
 use lan::address::{Address, LIVE, PREFIX};
 use lan::outgoing::{Outgoing, Sample, Transmit};
-use schema::{Domain, Failure, Topic};
+use schema::{Failure, Topic};
+use shm::Domain;
 use verbs::network::{Carrier, End, Life, Output, Selection, account, begin_life, now};
 
 use crate::SendOptions;

@@ -5,8 +5,8 @@ use std::os::fd::AsRawFd;
 use std::ptr;
 use std::time::{Duration, Instant};
 
-use scanhub_client::{Heard, Payload, Received, RobotFollower, Subscription, Wait, ZonesFollower};
-use schema::{Domain, Failure, Header, Topic, limits};
+use scanhub_client::{Domain, Heard, Payload, Received, RobotFollower, Subscription, Wait, ZonesFollower};
+use schema::{Failure, Header, Topic, limits};
 
 use crate::boundary::Lent;
 use crate::call_error::CallError;

@@ -4,8 +4,8 @@
 use std::ops::Deref;
 use std::time::{Duration, Instant};
 
-use schema::ipc::{Payload, ReceiveError, Sample, Subscriber};
 use schema::{Failure, Header, Kind, Scan};
+use shm::{Payload, ReceiveError, Sample, Subscriber};
 
 use crate::numbers::{Noted, Numbers};
 use crate::session::Session;

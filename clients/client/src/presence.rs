@@ -4,7 +4,8 @@
 use std::path::Path;
 use std::time::{Duration, Instant};
 
-use schema::{Domain, Environment, Failure, Kind, RunningHub, holder, publisher};
+use schema::{Failure, Kind};
+use shm::{Domain, Environment, RunningHub, holder, publisher};
 
 /// How often the locks are looked at.
 const LOOK_EVERY: Duration = Duration::from_millis(100);

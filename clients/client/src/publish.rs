@@ -8,13 +8,11 @@ use std::cell::{Cell, RefCell};
 use std::hash::{BuildHasher, RandomState};
 use std::rc::{Rc, Weak};
 
-use schema::ipc::{self, DueRings, Node, Payload, TopicPublisher, Waker};
 use schema::limits::TopicLimits;
-use schema::shortage::{allocate, check_descriptors, check_memory, longest_segment, sensor_bytes};
-use schema::{
-    DEFAULT_DOMAIN, Domain, Environment, Failure, Kind, ListenLock, Maker, NameLock, Ring, Topic, Wake,
-    check_followed, check_sensor, holder, is_remote, name_held, publisher_domain,
-};
+use schema::{Failure, Kind, Maker, Ring, Topic, Wake, check_followed, check_sensor, is_remote};
+use shm::shortage::{allocate, check_descriptors, check_memory, longest_segment, sensor_bytes};
+use shm::{DEFAULT_DOMAIN, Domain, Environment, ListenLock, NameLock, holder, name_held, publisher_domain};
+use shm::{DueRings, Node, Payload, TopicPublisher, Waker};
 
 pub use publication::Publication;
 
@@ -107,7 +105,7 @@ impl PublishSession {
         limits.check()?;
         let lock = Place::Others { _lock: ListenLock::acquire(domain.root())? };
         check_topics(topics, &limits)?;
-        Ok(PublishSession::with(domain, limits, ipc::hub_node(domain)?, lock))
+        Ok(PublishSession::with(domain, limits, shm::hub_node(domain)?, lock))
     }
 
     /// Publishes as `name`, beside a hub or a listener if there is one, of which it takes no place: for what is made of the
@@ -131,7 +129,7 @@ impl PublishSession {
         let lock = Place::Own { name: name.to_owned(), _lock: NameLock::acquire(domain.root(), name)? };
         check_topics(topics, &limits)?;
         let of_hub = |(sensor, topic): &(String, Topic)| sensor == name && topic.maker() == Maker::Link;
-        if ipc::published(domain)?.iter().any(of_hub) {
+        if shm::published(domain)?.iter().any(of_hub) {
             // A hub that is starting, or that has waited for this name, takes it now.
             if let Some(pid) = holder(domain.root())? {
                 return Err(name_held(name, pid));
@@ -139,7 +137,7 @@ impl PublishSession {
             let what = format!("{name:?} is no name to publish under: it is a sensor of the hub");
             return Err(Failure::new(Kind::Configuration, what, "any other name, for example house"));
         }
-        PublishSession::with(domain, limits, ipc::hub_node(domain)?, lock).sensor(name)
+        PublishSession::with(domain, limits, shm::hub_node(domain)?, lock).sensor(name)
     }
 
     fn with(domain: &Domain, limits: TopicLimits, node: Node, lock: Place) -> PublishSession {

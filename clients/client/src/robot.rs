@@ -5,7 +5,8 @@ mod source;
 use std::os::fd::BorrowedFd;
 use std::time::Duration;
 
-use schema::{Domain, Failure, Verdict, Zones, check_followed};
+use schema::{Failure, Verdict, Zones, check_followed};
+use shm::Domain;
 
 use crate::session::Session;
 use crate::subscribe::places;

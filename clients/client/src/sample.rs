@@ -4,8 +4,8 @@ use std::time::Duration;
 
 use bytemuck::bytes_of;
 use schema::datagram::Packed;
-use schema::ipc::Payload;
 use schema::{Failure, Header, ROBOT, Topic};
+use shm::Payload;
 
 use crate::follower::{Follower, Received};
 use crate::robot::{RobotHeard, RobotSource};

@@ -4,8 +4,9 @@
 use std::os::fd::{AsFd, BorrowedFd};
 use std::time::{Duration, Instant};
 
-use schema::ipc::{self, Node, Payload, Subscriber};
-use schema::{Domain, Failure, Kind, Topic, holder, is_starting};
+use schema::{Failure, Kind, Topic};
+use shm::{Domain, holder, is_starting};
+use shm::{Node, Payload, Subscriber};
 
 use crate::presence::{Change, Presence, Who};
 use crate::readiness::Readiness;
@@ -80,10 +81,10 @@ impl Session {
             return Ok(change);
         }
         // After all had gone, the next hub's shared memory has other names.
-        let is_member = |joined: &Joined| ipc::is_member(&joined.node, domain.root());
+        let is_member = |joined: &Joined| shm::is_member(&joined.node, domain.root());
         match self.joined.as_ref().filter(|_| is_here).map(is_member).transpose()? {
             Some(true) => {}
-            _ => match ipc::client_node(domain) {
+            _ => match shm::client_node(domain) {
                 Ok(node) => {
                     let (domain, wakeups) = (domain.clone(), Wakeups::by(self.wait));
                     self.joined = Some(Joined { domain, wakeups, node });

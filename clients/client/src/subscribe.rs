@@ -4,8 +4,9 @@
 use std::os::fd::BorrowedFd;
 use std::time::{Duration, Instant};
 
-use schema::ipc::Payload;
-use schema::{DEFAULT_DOMAIN, Domain, Environment, Failure, check_followed};
+use schema::{Failure, check_followed};
+use shm::Payload;
+use shm::{DEFAULT_DOMAIN, Domain, Environment};
 
 use crate::follower::{Follower, Received};
 use crate::session::Session;

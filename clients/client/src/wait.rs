@@ -3,8 +3,8 @@
 use std::os::fd::BorrowedFd;
 use std::time::Duration;
 
-use schema::ipc::{self, Bell, Listener, Node, Unsupported};
 use schema::{Failure, Ring, Topic};
+use shm::{Bell, Listener, Node, Unsupported};
 
 use crate::clock;
 
@@ -99,7 +99,7 @@ impl Wakeups {
                 spin(&bells, until_ns);
                 Ok(())
             }
-            _ => ipc::sleep_at_bells(&bells, until_ns),
+            _ => shm::sleep_at_bells(&bells, until_ns),
         };
         match slept {
             Ok(()) => {
@@ -149,17 +149,17 @@ impl Wakeups {
         }
         let listeners: Vec<&Listener> =
             self.sensors.iter().filter_map(|sensor| sensor.listener.as_ref()).collect();
-        if !self.taken && ipc::take_wakeups(&listeners)? {
+        if !self.taken && shm::take_wakeups(&listeners)? {
             self.taken = true;
             return Ok(());
         }
         self.taken = false;
-        ipc::sleep(&listeners, left)
+        shm::sleep(&listeners, left)
     }
 
     /// What is readable while events are pending, of each sensor that is listened to.
     pub(crate) fn descriptors(&self) -> impl Iterator<Item = BorrowedFd<'_>> {
-        self.sensors.iter().filter_map(|sensor| sensor.listener.as_ref()).map(ipc::descriptor)
+        self.sensors.iter().filter_map(|sensor| sensor.listener.as_ref()).map(shm::descriptor)
     }
 
     /// Takes the events that are pending; whether there were any. What was sent before has to be looked for.
@@ -168,7 +168,7 @@ impl Wakeups {
     pub(crate) fn take(&mut self) -> Result<bool, Failure> {
         let mut any = false;
         for listener in self.sensors.iter().filter_map(|sensor| sensor.listener.as_ref()) {
-            any |= ipc::take_wakeups(&[listener])?;
+            any |= shm::take_wakeups(&[listener])?;
         }
         Ok(any)
     }
@@ -187,8 +187,8 @@ impl Wakeups {
 impl Sensor {
     /// Whether it listens to the event, if possible.
     fn listen(&mut self, node: &Node) -> Result<bool, Failure> {
-        let Some(service) = ipc::open_wake(node, &self.name)? else { return Ok(false) };
-        self.listener = Some(ipc::listener(&service)?);
+        let Some(service) = shm::open_wake(node, &self.name)? else { return Ok(false) };
+        self.listener = Some(shm::listener(&service)?);
         Ok(true)
     }
 

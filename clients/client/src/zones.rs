@@ -7,7 +7,8 @@ mod warned;
 use std::os::fd::BorrowedFd;
 use std::time::Duration;
 
-use schema::{Domain, Early, Failure, Header, Zones, check_followed};
+use schema::{Early, Failure, Header, Zones, check_followed};
+use shm::Domain;
 
 use crate::clock;
 use crate::follower::Follower;

@@ -1,7 +1,7 @@
 """The directory of a domain, opened so that no other user can put another one in its place: step by step from the root of
-the file system, its files relative to it. The same rules as the hub's (schema/src/directory.rs): base and domain belong
-to this user and nobody else can write there; links are followed only above them, where root or this user made them.
-Refuses to know what the files are for.
+the file system, its files relative to it. The same rules as the hub's (schema/shm/src/directory.rs): base and domain
+belong to this user and nobody else can write there; links are followed only above them, where root or this user made
+them. Refuses to know what the files are for.
 """
 
 from __future__ import annotations

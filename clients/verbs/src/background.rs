@@ -7,12 +7,13 @@ use std::sync::atomic::AtomicBool;
 use std::time::{Duration, SystemTime};
 
 use scanhub_client::request;
-use schema::output::{self, Target};
+use scanhub_files::output::{self, Target};
+use scanhub_files::regular;
 use schema::{
-    Age, Background, BackgroundHead, Domain, Failure, Kind, Request, SavedModel, Shown, Verb, as_json,
-    check_sensor, regular,
+    Age, Background, BackgroundHead, Failure, Kind, Request, SavedModel, Shown, Verb, as_json, check_sensor,
 };
 use serde::Serialize;
+use shm::Domain;
 
 use crate::control::done;
 use crate::names::as_word;

@@ -3,7 +3,8 @@
 
 use std::time::{Duration, Instant};
 
-use schema::{Domain, Failure, Maker, Topic, ipc};
+use schema::{Failure, Maker, Topic};
+use shm::Domain;
 
 use crate::background_task::BackgroundTask;
 
@@ -94,7 +95,7 @@ impl Discovery {
         let age = now - *came;
         if age >= due(*calls) {
             let domain = domain.clone();
-            self.call = BackgroundTask::begin(move || ipc::published(&domain)).map(|task| (task, age));
+            self.call = BackgroundTask::begin(move || shm::published(&domain)).map(|task| (task, age));
             *calls += usize::from(self.call.is_some());
         }
         Ok(None)

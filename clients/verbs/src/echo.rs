@@ -5,7 +5,8 @@ use std::sync::atomic::AtomicBool;
 
 use scanhub_client::streams::Sample;
 use schema::csv::ScanColumns;
-use schema::{Domain, Failure, Header, Kind, Scan, Topic};
+use schema::{Failure, Header, Kind, Scan, Topic};
+use shm::Domain;
 
 use crate::follow::{Bounds, Notice, Sink, follow};
 use crate::names::TopicName;

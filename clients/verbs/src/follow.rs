@@ -12,7 +12,8 @@ use std::time::{Duration, Instant};
 
 use scanhub_client::streams::{GRACE, Sample, Session, Who};
 use scanhub_client::{Wait, clock};
-use schema::{Domain, Failure, Kind, Status, Topic, is_remote};
+use schema::{Failure, Kind, Status, Topic, is_remote};
+use shm::Domain;
 
 use crate::discovery::Discovery;
 use crate::names::TopicName;

@@ -14,7 +14,8 @@ use std::time::{Duration, Instant};
 use lan::outgoing::Sample;
 use scanhub_client::clock;
 use scanhub_client::streams::{GRACE, Session};
-use schema::{Domain, Failure, Topic, check_sensor};
+use schema::{Failure, Topic, check_sensor};
+use shm::Domain;
 
 use crate::discovery::Discovery;
 use crate::follow::Notice;

@@ -15,7 +15,8 @@ use std::time::{Duration, Instant};
 
 use lan::Key;
 use lan::outgoing::{ANNOUNCE_EVERY, Form};
-use schema::{Domain, Failure, Kind};
+use schema::{Failure, Kind};
+use shm::Domain;
 
 use crate::forward::{Forwarder, Selection, begin_life};
 use crate::key_file;

@@ -7,8 +7,9 @@ use std::time::{Duration, Instant};
 
 use scanhub_client::clock;
 use scanhub_client::streams::Sample;
-use schema::{Domain, Failure, Status, Topic};
+use schema::{Failure, Status, Topic};
 use serde::Serialize;
+use shm::Domain;
 
 use crate::follow::{Bounds, Notice, Sink, follow};
 use crate::names::TopicName;

@@ -7,8 +7,9 @@ use std::path::Path;
 
 use lan::Key;
 use rustix::rand::{GetRandomFlags, getrandom};
-use schema::output::{PRIVATE, Target, unwritable};
-use schema::{Failure, Kind, regular};
+use scanhub_files::output::{PRIVATE, Target, unwritable};
+use scanhub_files::regular;
+use schema::{Failure, Kind};
 use serde_json::json;
 
 use crate::output::{Output, quiet};

@@ -5,11 +5,10 @@ use std::path::PathBuf;
 use std::sync::atomic::AtomicBool;
 
 use scanhub_client::streams::find;
-use schema::ipc::{self, Node, Payload, PortFactory};
-use schema::{
-    DEFAULT_DOMAIN, Domain, Environment, Failure, Family, Pace, RunningHub, State, Status, Topic, publisher,
-};
+use schema::{Failure, Family, Pace, State, Status, Topic};
 use serde::{Serialize, Serializer};
+use shm::{DEFAULT_DOMAIN, Domain, Environment, RunningHub, publisher};
+use shm::{Node, Payload, PortFactory};
 
 use crate::info::statuses;
 use crate::output::{Output, quiet, table};
@@ -29,13 +28,13 @@ pub struct ListOptions {
 /// [`Kind::NoHub`](schema::Kind) within a second if there is none, [`Kind::Interrupted`](schema::Kind) if `stop` is set.
 pub fn list(options: &ListOptions, out: &mut dyn Write, stop: &AtomicBool) -> Result<(), Failure> {
     let domain = find(&options.places)?;
-    let node = ipc::client_node(&domain)?;
-    let sensors = ipc::sensors(&domain)?;
+    let node = shm::client_node(&domain)?;
+    let sensors = shm::sensors(&domain)?;
     let (mut lines, mut problems) = (Vec::new(), Vec::new());
     for sensor in &sensors {
         of_sensor(&node, sensor, &mut lines)?;
     }
-    for (sensor, status) in statuses(&domain, &ipc::links(&domain)?, stop)? {
+    for (sensor, status) in statuses(&domain, &shm::links(&domain)?, stop)? {
         for line in
             lines.iter_mut().filter(|line| line.sensor == sensor && line.topic.row().pace == Pace::Scan)
         {
@@ -66,7 +65,7 @@ pub fn list(options: &ListOptions, out: &mut dyn Write, stop: &AtomicBool) -> Re
     )
 }
 
-/// Writes every live domain below `bases` (`--root`, or [`Environment::bases`](schema::Environment::bases)) to `out`,
+/// Writes every live domain below `bases` (`--root`, or [`Environment::bases`](shm::Environment::bases)) to `out`,
 /// including those of `hubs` below another directory. Hubs that this user cannot reach follow, with a command that does.
 ///
 /// # Errors
@@ -202,7 +201,7 @@ fn line<P: Payload + ?Sized>(node: &Node, sensor: &str) -> Result<Option<Line>, 
         sensor: sensor.to_owned(),
         topic,
         payload: topic.payload(),
-        revision: ipc::payload_revision(service.attributes()),
+        revision: shm::payload_revision(service.attributes()),
         hz: None,
         subscribers: service.dynamic_config().number_of_subscribers(),
     }))

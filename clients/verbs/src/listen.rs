@@ -13,7 +13,8 @@ use std::time::{Duration, Instant};
 use lan::Stamp;
 use schema::datagram::group;
 use schema::limits::TopicLimits;
-use schema::{Domain, Failure, Kind, StateDirectory, Topic};
+use schema::{Failure, Kind, Topic};
+use shm::{Domain, StateDirectory};
 
 use self::multicast_receiver::{LONGEST, MulticastReceiver};
 use self::wanted::{groups, topics};

@@ -7,8 +7,9 @@ use std::sync::atomic::AtomicBool;
 use std::time::{Duration, Instant};
 
 use scanhub_client::streams::Sample;
-use schema::{Domain, Failure, Kind, Pose, Quality, Topic, check_sensor};
+use schema::{Failure, Kind, Pose, Quality, Topic, check_sensor};
 use serde::Serialize;
+use shm::Domain;
 
 use crate::body::{Body, Mask, SLICES, Sector};
 use crate::follow::{Bounds, Notice, Sink, follow};

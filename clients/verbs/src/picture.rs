@@ -4,7 +4,8 @@
 use scanhub_client::streams::Sample;
 use scanhub_client::{clock, live_topics};
 use scene::Scene;
-use schema::{Domain, Maker, Topic};
+use schema::{Maker, Topic};
+use shm::Domain;
 
 use crate::follow::Notice;
 use crate::names::TopicName;

@@ -18,7 +18,8 @@ use lan::incoming::{Announcement, Arrived, Incoming, RemoteSample};
 use lan::{Key, Stamp};
 use schema::datagram::{DatagramError, Head};
 use schema::limits::TopicLimits;
-use schema::{Domain, Failure, StateDirectory, Topic};
+use schema::{Failure, Topic};
+use shm::{Domain, StateDirectory};
 
 use crate::interface::is_of_this_machine;
 use crate::output::{End, Output};

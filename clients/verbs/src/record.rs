@@ -24,9 +24,10 @@ use std::time::{Duration, Instant};
 
 use scanhub_client::clock;
 use scanhub_client::streams::Sample;
+use scanhub_files::output::Target;
 use schema::file::Compression;
-use schema::output::Target;
-use schema::{Domain, Failure, Header, Kind};
+use schema::{Failure, Header, Kind};
+use shm::Domain;
 
 use crate::follow::{Bounds, Notice, Sink, follow};
 use crate::lossy_writer::LossyWriter;

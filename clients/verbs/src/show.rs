@@ -5,12 +5,12 @@ use std::io;
 
 use scanhub_client::streams::{RobotHeard, Sample};
 use scanhub_client::{Heard, Received};
-use schema::ipc::Payload;
 use schema::{
     Background, Cloud, Early, Event, Foreground, Header, Lines, Marks, Motion, Obstacles, Scan, Status, Tilt,
     Tracks, Zones,
 };
 use serde::Serialize;
+use shm::Payload;
 
 use crate::output::{End, Output};
 use crate::{json, text};

@@ -12,7 +12,8 @@ use std::time::Instant;
 use ::tilt::{Angle, Check, Mount, Settings, Sweep, Tilting, Withheld};
 use publish::Samples;
 use scanhub_client::streams::Sample;
-use schema::{Domain, Failure, Kind, Topic};
+use schema::{Failure, Kind, Topic};
+use shm::Domain;
 
 use crate::follow::{Bounds, Notice, Sink, follow};
 use crate::names::TopicName;

@@ -12,7 +12,8 @@ use ::track::{Kind as EventKind, Misplaced, People, Picture, Site};
 use late::LateReports;
 use publish::Samples;
 use scanhub_client::streams::Sample;
-use schema::{Domain, Failure, Foreground, Header, Kind, Scan, Topic};
+use schema::{Failure, Foreground, Header, Kind, Scan, Topic};
+use shm::Domain;
 
 use crate::follow::{Bounds, Notice, Sink, follow};
 use crate::names::TopicName;

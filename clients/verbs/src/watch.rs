@@ -19,7 +19,8 @@ use std::time::{Duration, Instant};
 
 use scanhub_client::clock;
 use scanhub_client::streams::Sample;
-use schema::{Domain, Failure, Kind, Topic, Verb, check_followed, is_remote};
+use schema::{Failure, Kind, Topic, Verb, check_followed, is_remote};
+use shm::Domain;
 
 use crate::follow::{Bounds, Notice, Sink, follow};
 use crate::names::{TopicName, as_word};

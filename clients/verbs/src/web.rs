@@ -15,7 +15,8 @@ use std::sync::mpsc;
 use std::thread;
 
 use ::web::{Board, Door, Playback, Server};
-use schema::{Domain, Failure, Kind, Maker, check_followed};
+use schema::{Failure, Kind, Maker, check_followed};
+use shm::Domain;
 
 use crate::follow::{Bounds, follow};
 use crate::interface::reachable_addresses;

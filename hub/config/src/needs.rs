@@ -2,7 +2,7 @@
 
 use schema::Topic;
 use schema::limits::TopicLimits;
-use schema::shortage::{self, sensor_bytes};
+use shm::shortage::{self, sensor_bytes};
 
 /// Bytes of shared memory for links with topics made as `limits` say of each, and the first consumers.
 pub fn memory(limits: &[TopicLimits]) -> u64 {

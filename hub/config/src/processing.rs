@@ -10,7 +10,8 @@ use preprocess::background::{Candidate, Method, Settings as Learning, Start};
 use preprocess::zones::{SECTORS, Sector};
 use preprocess::{lines, marks, motion, zones};
 use scanhub_drivers::features;
-use schema::{BEAMS, Failure, Family, Kind, LINES, Pose, SavedModel, ZONES, regular};
+use scanhub_files::regular;
+use schema::{BEAMS, Failure, Family, Kind, LINES, Pose, SavedModel, ZONES};
 use serde::Deserialize;
 use toml::Spanned;
 

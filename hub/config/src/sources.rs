@@ -4,7 +4,8 @@
 use std::ops::Range;
 use std::path::{Path, PathBuf};
 
-use schema::{Failure, Kind, regular};
+use scanhub_files::regular;
+use schema::{Failure, Kind};
 
 use crate::layer::{Layer, link_as_toml, parse, set_as_toml};
 

@@ -8,15 +8,16 @@ use std::sync::{Arc, Mutex, PoisonError};
 use config::Processing;
 use scanhub_drivers::PortSession;
 use scanhub_drivers::line::{Control, Session as _};
-use schema::ipc::{self, Asked, Node};
-use schema::{Background, Failure, Kind, Nanos, Response, Shown, Verb, shortage};
+use schema::{Background, Failure, Kind, Nanos, Response, Shown, Verb};
+use shm::shortage;
+use shm::{Asked, Node};
 
 use crate::event_fd::EventFd;
 use crate::player::Player;
 
 /// The server of control requests. It belongs to the supervising thread.
 pub(crate) struct ControlServer {
-    server: ipc::ControlServer,
+    server: shm::ControlServer,
     pub(crate) orders: Orders,
     /// Requests whose link has not reported an outcome yet, with their numbers.
     open: Vec<(u64, Asked)>,
@@ -139,14 +140,14 @@ impl ControlServer {
         node: &Node,
         sensors: impl Iterator<Item = &'a str>,
     ) -> Result<(ControlServer, Vec<ControlQueue>), Failure> {
-        let server = ipc::ControlServer::create(node)?;
+        let server = shm::ControlServer::create(node)?;
         let (orders, queues) = Orders::new(sensors)?;
         Ok((ControlServer { server, orders, open: Vec::new() }, queues))
     }
 
     /// Descriptors that become readable when [`serve`](Self::serve) has something to do.
     pub(crate) fn descriptors(&self) -> [BorrowedFd<'_>; 2] {
-        [ipc::descriptor(self.server.requests()), self.orders.event.as_fd()]
+        [shm::descriptor(self.server.requests()), self.orders.event.as_fd()]
     }
 
     /// Replies to the requests that links have handled, and queues new ones.
@@ -159,7 +160,7 @@ impl ControlServer {
             }
         }
         self.open.retain(|(_, asked)| asked.is_waited_for());
-        let mut was_signaled = ipc::take_wakeups(&[self.server.requests()]).is_ok_and(|rang| rang);
+        let mut was_signaled = shm::take_wakeups(&[self.server.requests()]).is_ok_and(|rang| rang);
         loop {
             match self.server.receive() {
                 Ok(Some(asked)) => {

@@ -13,7 +13,8 @@ use std::time::Duration;
 
 use config::{Config, Link};
 use port::Source;
-use schema::{Age, Background, Failure, MILLIS, Nanos, Pose, StateDirectory};
+use schema::{Age, Background, Failure, MILLIS, Nanos, Pose};
+use shm::StateDirectory;
 
 use crate::event_fd::EventFd;
 use crate::surroundings::Learned;

@@ -3,7 +3,8 @@
 
 use config::needs;
 use schema::limits::TopicLimits;
-use schema::{Failure, Kind, shortage};
+use schema::{Failure, Kind};
+use shm::shortage;
 
 /// Lets the process have as many descriptors as its hard limit allows.
 pub(crate) fn raise_descriptor_limit() {

@@ -8,7 +8,8 @@ use config::{Config, Sources};
 use port::Source;
 use recording::Recording;
 use scanhub_drivers::Model;
-use schema::{Domain, Failure, Family, Kind, Nanos, check_sensor};
+use schema::{Failure, Family, Kind, Nanos, check_sensor};
+use shm::Domain;
 
 use crate::player::{Play, Player, Progress};
 use crate::replay::{Origin, Recorded, RecordedMount, tell_of_damage};

@@ -9,8 +9,9 @@ use std::thread;
 use config::{Config, Link};
 use port::{Port, Source, clock};
 use rustix::event::{EventfdFlags, PollFd, PollFlags, Timespec, eventfd, poll};
-use schema::ipc::{self, Node};
-use schema::{Domain, Failure, HubLock, Kind, MILLIS, Nanos, StateDirectory, shortage};
+use schema::{Failure, Kind, MILLIS, Nanos};
+use shm::Node;
+use shm::{Domain, HubLock, StateDirectory, shortage};
 
 use crate::control::{ControlQueue, ControlServer};
 use crate::learned::{Keeper, Writer};
@@ -125,7 +126,7 @@ pub(crate) fn serve(
     let (config, keeper) = begin(config, state)?;
     let writer = keeper.map(Writer::start).transpose()?;
     let config = &config;
-    let node = ipc::hub_node(domain)?;
+    let node = shm::hub_node(domain)?;
     node.try_cleanup_dead_nodes();
     let sensors = config.links.iter().map(|link| link.name.clone()).collect();
     let mut ready = Ready { boot: random(), sensors, waiting: Vec::new(), taken: Vec::new() };

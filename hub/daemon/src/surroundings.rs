@@ -6,8 +6,8 @@ use std::io;
 use std::path::Path;
 
 use port::{Allowance, Alteration, PortError, Source};
-use schema::ipc::{Medium, Payload};
 use schema::{Background, Failure, Nanos, Pose, Ring, Wake};
+use shm::{Medium, Payload};
 
 use crate::control::ControlQueue;
 use crate::learned::{KnownRate, KnownScanner};
@@ -64,7 +64,7 @@ pub trait Surroundings {
     ///
     /// # Errors
     ///
-    /// As [`SharedMemory::new`](schema::ipc::SharedMemory::new).
+    /// As [`SharedMemory::new`](shm::SharedMemory::new).
     fn medium<P: Payload + ?Sized>(&self, sensor: &str) -> Result<Self::Medium<P>, Failure>;
 
     /// Wakes the consumers that sleep at the link's bell for topics of `ring`.

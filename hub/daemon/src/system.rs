@@ -11,9 +11,10 @@ use std::time::Duration;
 
 use port::{Allowance, Alteration, Dial, Port, PortError, Source, clock};
 use rustix::event::{PollFd, PollFlags, poll};
-use schema::ipc::{Node, Payload, SharedMemory, Waker};
 use schema::limits::TopicLimits;
-use schema::{Directory, Failure, MILLIS, NameLock, Nanos, Ring, Wake};
+use schema::{Failure, MILLIS, Nanos, Ring, Wake};
+use shm::{Directory, NameLock};
+use shm::{Node, Payload, SharedMemory, Waker};
 
 use crate::control::ControlQueue;
 use crate::learned::Handle;

@@ -2,12 +2,12 @@
 //! waits for memory. A sample without memory is counted and its number is skipped, so that subscribers notice the gap.
 
 use scanhub_drivers::line::{RawScan, Received};
-use schema::ipc::{DueRings, Medium, Payload, TopicPublisher};
 use schema::limits::history;
 use schema::{
     Background, Early, Failure, Family, Flags, Foreground, Header, Lines, MILLIS, Marks, Motion, Nanos,
     Quality, Ring, Scan, Status, Wake, Zones,
 };
+use shm::{DueRings, Medium, Payload, TopicPublisher};
 
 use crate::early::EarlyMessage;
 use crate::pipeline::{Outputs, Pipeline, Relearned};

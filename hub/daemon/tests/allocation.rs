@@ -23,8 +23,9 @@ use scanhub_drivers::lms::command::Request;
 use scanhub_drivers::lms::reply::{self, Health};
 use scanhub_drivers::lms::telegram::{ACK, Encoded, FRAME, MAX_TELEGRAM, STX, Telegram};
 use scanhub_drivers::lms::variant::{Baud, Mode, Unit, Variant};
-use schema::ipc::{self, Payload, Subscriber};
-use schema::{Domain, Foreground, Marks, Scan};
+use schema::{Foreground, Marks, Scan};
+use shm::Domain;
+use shm::{Payload, Subscriber};
 
 /// A scanner at the other end of a pty. Like a real one, it neither sends nor receives anything while the hub's port
 /// has another rate, and it streams until it gets a request to stop.
@@ -226,7 +227,7 @@ fn windows(letter: char, follow_all: bool, set: &[&str]) -> [Window; 4] {
         move || daemon::run(&|| Config::load(&sources), &domain, |_| send.send(()).unwrap_or_default())
     });
     ready.recv_timeout(Duration::from_secs(60)).expect("the hub is up");
-    let node = ipc::client_node(domain).expect("a node");
+    let node = shm::client_node(domain).expect("a node");
     let topic = Scan::open(&node, "heap").expect("a topic").expect("is there");
     let subscriber = Scan::subscriber(&topic).expect("a subscriber");
     let followers = follow_all.then(|| {

@@ -19,7 +19,8 @@ use rustix::net::sockopt::{
     set_socket_keepalive, set_tcp_keepcnt, set_tcp_keepidle, set_tcp_keepintvl, set_tcp_nodelay,
     set_tcp_user_timeout,
 };
-use schema::{MILLIS, Nanos, line_time, shortage};
+use schema::{MILLIS, Nanos, line_time};
+use shm::shortage;
 
 use crate::{Port, PortError, write_all};
 

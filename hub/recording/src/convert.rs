@@ -13,9 +13,9 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use scanhub_drivers::lms::variant::{Baud, Mode, Unit};
+use scanhub_files::output::unwritable;
 use schema::csv::{MarkColumns, ScanColumns};
 use schema::file::{Compression, Writer};
-use schema::output::unwritable;
 use schema::{Failure, Family, Flags, Header, Kind, Topic, check_followed};
 
 use crate::{Damage, Encoding, Form, Frame, Recording, Unread, carmen};

@@ -9,7 +9,8 @@ use scanhub_drivers::line::Session as _;
 use scanhub_drivers::lms::variant::{Mode, Unit};
 use scanhub_drivers::recognize::{EXAMINED, bytes_by_family, family_of, framing_mode};
 use scanhub_drivers::{Model, Session, Settings, features};
-use schema::{Failure, Family, Header, Kind, Tilt, regular};
+use scanhub_files::regular;
+use schema::{Failure, Family, Header, Kind, Tilt};
 
 use crate::carmen::{self, Log};
 #[cfg(feature = "mcap")]

@@ -6,7 +6,7 @@ use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 use std::sync::Mutex;
 
-use schema::output::{self, Target};
+use scanhub_files::output::{self, Target};
 use schema::{Failure, Kind};
 use serde_json::json;
 use sha2::{Digest, Sha256};

@@ -8,7 +8,8 @@ use std::path::Path;
 use std::str::FromStr;
 use std::sync::Arc;
 
-use schema::{Failure, Kind, regular};
+use scanhub_files::regular;
+use schema::{Failure, Kind};
 use serde::Deserialize;
 use toml::Spanned;
 

@@ -16,8 +16,9 @@ use scanhub_drivers::lms::family::Family;
 use scanhub_drivers::lms::operating;
 use scanhub_drivers::lms::parameters::Password;
 use scanhub_drivers::lms::variant::{Mode, Unit};
-use schema::{Domain, Failure, Kind};
+use schema::{Failure, Kind};
 use serde::Serialize;
+use shm::Domain;
 
 use crate::driver::{Procedure, drive};
 use crate::probe::{check_unused, hex, measuring, open, request_report};

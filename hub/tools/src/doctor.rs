@@ -22,8 +22,9 @@ pub(crate) use hub::Hub;
 use machine::Facts;
 use port::{Candidate, PortlessAdapter, Source, candidates};
 use schema::limits::TopicLimits;
-use schema::{Domain, Failure, Kind, Printable, ipc};
+use schema::{Failure, Kind, Printable};
 use serde::Serialize;
+use shm::Domain;
 pub use system::System;
 
 /// The ports, the configuration and the machine to check.
@@ -200,7 +201,7 @@ pub fn examine(
         tell(&finding);
     };
     let there = candidates();
-    let home = subjects.places.iter().find(|place| matches!(schema::holder(place.root()), Ok(Some(_))));
+    let home = subjects.places.iter().find(|place| matches!(shm::holder(place.root()), Ok(Some(_))));
     let domain = home.unwrap_or(&subjects.domain);
     let hub = Hub::find(domain);
     let portless = PortlessAdapter::all(&subjects.system.path("/"));
@@ -226,7 +227,7 @@ pub fn examine(
     tell(machine::memory(&facts, config.and_then(config::Config::memory_remedy)));
     tell(machine::domain(&facts));
     tell(machine::hubs(&facts, |user| system.name_of(user)));
-    tell(shared_memory::strangers(&ipc::strangers(domain.root()), |user| system.name_of(user)));
+    tell(shared_memory::strangers(&shm::strangers(domain.root()), |user| system.name_of(user)));
     tell(shared_memory::leftovers(&facts));
     tell(machine::descriptors(&facts));
     tell(machine::file_size(&facts));

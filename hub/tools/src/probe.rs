@@ -13,8 +13,9 @@ use port::{
 };
 use scanhub_drivers::search::Coverage;
 use scanhub_drivers::{Inquiry, Report, features, inquiry, search};
-use schema::{Domain, Failure, Family, Kind};
+use schema::{Failure, Family, Kind};
 use serde::Serialize;
+use shm::Domain;
 
 use crate::doctor::Hub;
 use crate::driver::{self, DetectedScanner, NotFound, Procedure, detect, drive, not_detected};
@@ -207,7 +208,7 @@ fn nothing_found(source: &Source, is_named: bool, NotFound { bytes, coverage }: 
 
 /// Returns the remedy for a port at which no scanner of the named family replies.
 fn other_scanner(source: &Source) -> String {
-    format!("is it another scanner? Try: scanhub probe {}", schema::shell_word(&source.name()))
+    format!("is it another scanner? Try: scanhub probe {}", shm::shell_word(&source.name()))
 }
 
 /// Lists `rates`, as in "9600, 19200 or 38400".

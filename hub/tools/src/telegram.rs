@@ -8,7 +8,8 @@ use std::io::{self, ErrorKind, Read, Write};
 use std::path::{Path, PathBuf};
 
 use scanhub_drivers::lms::variant::Mode;
-use schema::{Failure, Kind, regular};
+use scanhub_files::regular;
+use schema::{Failure, Kind};
 
 use find::Finder;
 use input::{Input, is_framed, open_recording};

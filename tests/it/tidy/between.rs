@@ -13,6 +13,39 @@ fn schema_knows_nobody() {
 }
 
 #[test]
+fn schema_uses_no_operating_system() {
+    holds(crates::schema_uses_no_operating_system, |tree| {
+        let (manifest, lib) = ("schema/Cargo.toml", "schema/src/lib.rs");
+        let planted = |code: &str| tree.with("schema/src/planted.rs", &format!("//! So.\n{code}\n"));
+        vec![
+            tree.with_line(manifest, "[dependencies]", "rustix.workspace = true"),
+            tree.with(lib, &tree.text(lib).replace("#![forbid(unsafe_code)]", "")),
+            planted("use std::thread;"),
+            planted("use std::{\n    fmt,\n    fs::File,\n};"),
+            planted("let address: std::net::IpAddr;"),
+            planted("let now = std::time::Instant::now();"),
+            planted("let id = std::process::id();"),
+            planted("let page = memmap2::MmapRaw::map_raw(&file);"),
+            planted("use nix::unistd::User;"),
+        ]
+    });
+}
+
+#[test]
+fn shm_and_files_know_only_schema() {
+    holds(crates::shm_and_files_know_only_schema, |tree| {
+        let (files, shm) = ("schema/files/Cargo.toml", "schema/shm/Cargo.toml");
+        vec![
+            tree.with_line(files, "[dependencies]", "scanhub-shm.workspace = true"),
+            tree.with_line(shm, "[dependencies]", "scanhub-drivers.workspace = true"),
+            tree.with_line(shm, "[dev-dependencies]", "scanhub-client.workspace = true"),
+        ]
+    });
+    let crates = crates::built_from("scanhub-files", &["--all-features"]);
+    assert!(!crates.iter().any(|name| name.starts_with("iceoryx2")), "{crates:?}");
+}
+
+#[test]
 fn schema_without_ipc_needs_no_shared_memory() {
     let lan = crates::built_from("scanhub-schema", &["--no-default-features"]);
     assert!(!lan.iter().any(|name| name.starts_with("iceoryx2")), "{lan:?}");
@@ -34,8 +67,6 @@ fn drivers_only_compute() {
             planted("use std::{fmt, net};"),
             planted("let text = std::fs::read_to_string(path);"),
             planted("let now = std::time::Instant::now();"),
-            planted("use schema::ipc::Payload;"),
-            planted("use schema::{Header, ipc};"),
             planted("println!(\"a line\");"),
         ]
     });
@@ -88,7 +119,6 @@ fn preprocess_only_computes() {
             planted("let ranges: Vec<u16> = vec![0; beams];"),
             tree.with("hub/preprocess/src/marks/tests.rs", "//! So.\nlet ranges = Vec::new();\n"),
             planted("let name = format!(\"{i}\");"),
-            planted("use schema::ipc::Payload;"),
         ]
     });
 }
@@ -179,7 +209,6 @@ fn the_ends_of_a_network_only_compute() {
             planted("use std::time::Instant;"),
             planted("use std::net::UdpSocket;"),
             planted("let pid = std::process::id();"),
-            planted("use schema::ipc::Payload;"),
         ]
     });
     let crates = crates::built_from("scanhub-lan", &[]);
@@ -265,7 +294,7 @@ fn the_daemon_is_built_from_few_crates() {
 fn the_client_is_built_from_few_crates() {
     let mut crates = crates::built_from("scanhub-client", &[]);
     // Cargo lists a crate that is not of this workspace only if it has downloaded everything, the bridge's crates included.
-    let shared_memory = crates::built_from("scanhub-schema", &["--no-default-features", "--features", "ipc"]);
+    let shared_memory = crates::built_from("scanhub-shm", &[]);
     crates.retain(|name| !shared_memory.contains(name));
     eprintln!("client: {} crates besides those of shared memory", crates.len());
     assert!(crates.len() <= 3, "{} crates: {crates:#?}", crates.len());

@@ -23,6 +23,43 @@ pub(crate) fn schema_knows_nobody(tree: &Tree) -> Vec<String> {
     ours(&tree.members()["scanhub-schema"], &ALL).into_iter().collect()
 }
 
+/// Finds names of the operating system in `schema`. Payloads and names are the same on every machine.
+pub(crate) fn schema_uses_no_operating_system(tree: &Tree) -> Vec<String> {
+    const OF_STD: [&str; 7] = ["env", "fs", "net", "os", "process", "thread", "time"];
+    const CRATES: [&str; 4] = ["memmap2", "nix", "rustix", "tempfile"];
+    let known = ["bytemuck", "crc", "iceoryx2", "mcap", "serde", "serde_json"];
+    let mut breaches = built_of(tree, "scanhub-schema", &known);
+    breaches.extend(lacks(tree, "schema/src/lib.rs", &["#![forbid(unsafe_code)]"]));
+    for (path, text) in tree.sources().filter(|(path, _)| path.starts_with("schema/src/")) {
+        // One line, because a list of names may have several.
+        let text: String = code(text).map(|(_, line)| format!("{line} ")).collect();
+        breaches.extend(
+            text.split(';')
+                .filter(|statement| {
+                    let of_std = statement.split("std::").skip(1).any(|path| {
+                        let list = path.strip_prefix('{').and_then(|list| list.split('}').next());
+                        let names = list.unwrap_or_else(|| words(path).next().unwrap_or_default());
+                        words(names).any(|name| OF_STD.contains(&name))
+                    });
+                    of_std || words(statement).any(|word| CRATES.contains(&word))
+                })
+                .map(|statement| format!("{path}: {}", statement.trim())),
+        );
+    }
+    breaches
+}
+
+fn words(text: &str) -> impl Iterator<Item = &str> {
+    text.split(|c: char| !c.is_alphanumeric() && c != '_')
+}
+
+/// Shared memory and files of users stand on `schema`, and on nothing of the hub or of clients.
+pub(crate) fn shm_and_files_know_only_schema(tree: &Tree) -> Vec<String> {
+    let known: [(&str, &[&str]); 2] =
+        [("scanhub-files", &["scanhub-schema"]), ("scanhub-shm", &["scanhub-files", "scanhub-schema"])];
+    knows_others(tree, &known)
+}
+
 /// Names of all crates that a manifest names for what is built, tests left out.
 fn built_with(manifest: &toml::Table) -> impl Iterator<Item = &String> {
     let sections = ["dependencies", "build-dependencies"].into_iter();
@@ -84,7 +121,7 @@ pub(crate) fn the_rplidar_simulator_is_independent(tree: &Tree) -> Vec<String> {
 fn outside(tree: &Tree, folder: &str) -> Vec<String> {
     const HARMLESS: [&str; 4] = ["std::f32", "std::f64", "std::fmt", "std::ops"];
     let below = |path: &str| path.starts_with(folder);
-    let mut breaches = find(tree, &["extern crate", "ipc", "println!", "eprint"], below);
+    let mut breaches = find(tree, &["extern crate", "println!", "eprint"], below);
     let mut of_std = find(tree, &["std::"], below);
     of_std.retain(|place| {
         place.matches("std::").count() > HARMLESS.iter().map(|name| place.matches(name).count()).sum()
@@ -158,7 +195,7 @@ pub(crate) fn preprocess_only_computes(tree: &Tree) -> Vec<String> {
         HEAP.iter().map(|word| place.matches(word).count()).sum::<usize>() > for_beams
     });
     breaches.extend(on_heap);
-    breaches.extend(find(tree, &["extern crate", "ipc"], ours));
+    breaches.extend(find(tree, &["extern crate"], ours));
     let mut of_std = find(tree, &["std::"], ours);
     of_std.retain(|place| {
         place.matches("std::").count() > HARMLESS.iter().map(|name| place.matches(name).count()).sum()
@@ -191,13 +228,15 @@ pub(crate) fn no_processor_uses_another(tree: &Tree) -> Vec<String> {
 /// points for the verbs that publish them.
 pub(crate) fn clients_know_only_schema(tree: &Tree) -> Vec<String> {
     let known: [(&str, &[&str]); 2] = [
-        ("scanhub-client", &["scanhub-schema"]),
+        ("scanhub-client", &["scanhub-schema", "scanhub-shm"]),
         (
             "scanhub-verbs",
             &[
                 "scanhub-client",
+                "scanhub-files",
                 "scanhub-lan",
                 "scanhub-schema",
+                "scanhub-shm",
                 "scanhub-ros",
                 "scanhub-scene",
                 "scanhub-tilt",
@@ -206,6 +245,11 @@ pub(crate) fn clients_know_only_schema(tree: &Tree) -> Vec<String> {
             ],
         ),
     ];
+    knows_others(tree, &known)
+}
+
+/// Crates of this project that a crate names besides those that it may know.
+fn knows_others(tree: &Tree, known: &[(&str, &[&str])]) -> Vec<String> {
     let members = tree.members();
     let others = known.iter().flat_map(|(name, known)| {
         let names = ours(&members[*name], &ALL).into_iter().filter(|other| !known.contains(&other.as_str()));
@@ -219,14 +263,13 @@ pub(crate) fn ros_knows_only_schema(tree: &Tree) -> Vec<String> {
     let mut breaches = built_of(tree, "scanhub-ros", &["scanhub-schema", "sha2"]);
     breaches.extend(lacks(tree, "schema/ros/src/lib.rs", &["#![forbid(unsafe_code)]"]));
     let ours = |path: &str| path.starts_with("schema/ros/src/");
-    breaches.extend(find(tree, &["schema::ipc", "std::time", "std::net", "std::fs", "extern crate"], ours));
+    breaches.extend(find(tree, &["std::time", "std::net", "std::fs", "extern crate"], ours));
     breaches
 }
 
 /// From samples to datagrams and back: bytes and time are arguments, so that a simulation runs what sockets run.
 pub(crate) fn the_ends_of_a_network_only_compute(tree: &Tree) -> Vec<String> {
-    const OUTSIDE: [&str; 10] = [
-        "schema::ipc",
+    const OUTSIDE: [&str; 9] = [
         "Instant",
         "SystemTime",
         "std::env",
@@ -245,8 +288,7 @@ pub(crate) fn the_ends_of_a_network_only_compute(tree: &Tree) -> Vec<String> {
 
 /// What a picture shows is told by samples and times, so that a terminal and a browser show the same.
 pub(crate) fn the_scene_only_computes(tree: &Tree) -> Vec<String> {
-    const OUTSIDE: [&str; 7] =
-        ["schema::ipc", "Instant", "SystemTime", "std::env", "std::fs", "std::io", "std::net"];
+    const OUTSIDE: [&str; 6] = ["Instant", "SystemTime", "std::env", "std::fs", "std::io", "std::net"];
     let mut breaches = built_of(tree, "scanhub-scene", &["scanhub-schema"]);
     breaches.extend(lacks(tree, "clients/scene/src/lib.rs", &["#![forbid(unsafe_code)]"]));
     breaches.extend(find(tree, &OUTSIDE, |path| path.starts_with("clients/scene/src/")));
@@ -255,8 +297,7 @@ pub(crate) fn the_scene_only_computes(tree: &Tree) -> Vec<String> {
 
 /// Scans and angles become points by their stamps alone, so that a recording gives what was live.
 pub(crate) fn three_dimensions_only_compute(tree: &Tree) -> Vec<String> {
-    const OUTSIDE: [&str; 7] =
-        ["schema::ipc", "Instant", "SystemTime", "std::env", "std::fs", "std::io", "std::net"];
+    const OUTSIDE: [&str; 6] = ["Instant", "SystemTime", "std::env", "std::fs", "std::io", "std::net"];
     let mut breaches = built_of(tree, "scanhub-tilt", &["scanhub-schema"]);
     breaches.extend(lacks(tree, "clients/tilt/src/lib.rs", &["#![forbid(unsafe_code)]"]));
     breaches.extend(find(tree, &OUTSIDE, |path| path.starts_with("clients/tilt/src/")));
@@ -271,9 +312,8 @@ pub(crate) fn the_server_knows_no_hub(tree: &Tree) -> Vec<String> {
         ours(&members["scanhub-web"], &ALL).into_iter().filter(|name| !known.contains(&name.as_str()));
     let mut breaches: Vec<_> = others.map(|name| format!("scanhub-web knows {name}")).collect();
     breaches.extend(lacks(tree, "clients/web/src/lib.rs", &["#![forbid(unsafe_code)]"]));
-    breaches.extend(find(tree, &["schema::ipc", "std::fs", "process::Command"], |path| {
-        path.starts_with("clients/web/src/")
-    }));
+    breaches
+        .extend(find(tree, &["std::fs", "process::Command"], |path| path.starts_with("clients/web/src/")));
     breaches
 }
 

@@ -14,7 +14,7 @@ pub(crate) fn clocks_are_read_in_few_places(tree: &Tree) -> Vec<String> {
         "hub/port/src/clock.rs",
         "hub/sim/src/pty.rs",
         "hub/demo",
-        "schema/src/ipc/open_failure.rs",
+        "schema/shm/src/open_failure.rs",
     ];
     find(tree, &["Instant::now", "SystemTime::now", "clock_gettime"], |path| {
         !is_test(path) && !ALLOWED.iter().any(|allowed| path.starts_with(allowed))
@@ -24,11 +24,11 @@ pub(crate) fn clocks_are_read_in_few_places(tree: &Tree) -> Vec<String> {
 /// Files that may hold unsafe code, each for something that no safe crate offers.
 const UNSAFE: [&str; 9] = [
     // A page that hub and consumers map.
-    "schema/src/ipc/doorbell.rs",
+    "schema/shm/src/doorbell.rs",
     // The descriptors that wake consumers.
-    "schema/src/ipc/wake.rs",
+    "schema/shm/src/wake.rs",
     // The kernel's word whether nobody has a file.
-    "schema/src/ipc/clean.rs",
+    "schema/shm/src/clean.rs",
     // A handler for SIGBUS.
     "hub/daemon/src/bus_error.rs",
     // What the kernel knows of a UART.
@@ -71,10 +71,10 @@ pub(crate) fn unsafe_code_is_rare_and_explained(tree: &Tree) -> Vec<String> {
     breaches
 }
 
-/// Services are built in one module; the payloads elsewhere in schema derive one trait.
-pub(crate) fn shared_memory_is_built_in_one_module(tree: &Tree) -> Vec<String> {
+/// Services are built in one crate. Payloads in schema derive one trait of the library.
+pub(crate) fn shared_memory_is_built_in_one_crate(tree: &Tree) -> Vec<String> {
     // Messages longer than any payload are compared with sockets by a service that no topic has.
-    let may_build = |path: &str| path.starts_with("schema/src/ipc") || path == "benches/compare/topic.rs";
+    let may_build = |path: &str| path.starts_with("schema/shm/src/") || path == "benches/compare/topic.rs";
     let mut places = find(tree, &["iceoryx2::"], |path| !may_build(path));
     let derives =
         |place: &String| place.starts_with("schema/src/") && place.ends_with("prelude::ZeroCopySend;");

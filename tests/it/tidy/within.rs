@@ -61,8 +61,8 @@ fn tests_start_children_in_one_file() {
 }
 
 #[test]
-fn shared_memory_is_built_in_one_module() {
-    holds(sources::shared_memory_is_built_in_one_module, |tree| {
+fn shared_memory_is_built_in_one_crate() {
+    holds(sources::shared_memory_is_built_in_one_crate, |tree| {
         vec![
             tree.with("clients/verbs/src/planted.rs", "//! A client.\nuse iceoryx2::prelude::*;\n"),
             tree.with("schema/src/scan.rs", "//! A scan.\nuse iceoryx2::node::NodeBuilder;\n"),

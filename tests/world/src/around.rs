@@ -9,8 +9,8 @@ use daemon::Slots;
 use daemon::surroundings::{Learned, Surroundings};
 use port::{PortError, Source};
 use rustix::io::Errno;
-use schema::ipc::Payload;
 use schema::{Failure, Kind, MICROS, Nanos, Ring, Wake};
+use shm::Payload;
 
 use crate::event::Event;
 use crate::line::{Handle, LinkClock, OpenLine};

@@ -3,7 +3,7 @@
 
 use std::path::Path;
 
-use schema::regular;
+use scanhub_files::regular;
 use schema::{Failure, Kind};
 use zenoh::Config;
 use zenoh::config::{EndPoint, WhatAmI};

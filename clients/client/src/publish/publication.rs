@@ -1,9 +1,10 @@
 //! A topic that is being published: its samples get headers and numbers, and wake who follows it. Refuses to know who else
 //! publishes.
 
-use schema::ipc::{Payload, TopicPublisher};
 use schema::limits::TopicLimits;
-use schema::{Domain, Failure, Header, Maker, Topic, Wake};
+use schema::{Failure, Header, Maker, Topic, Wake};
+use shm::Domain;
+use shm::{Payload, TopicPublisher};
 
 use super::{PublishSession, SensorPublisher};
 use crate::clock;

@@ -3,7 +3,7 @@
 
 use std::time::{Duration, Instant};
 
-use schema::{Failure, ipc, is_remote};
+use schema::{Failure, is_remote};
 
 use super::Robot;
 use crate::clock;
@@ -170,7 +170,7 @@ impl RobotSource {
         self.call_at = Some(now + CALL_EVERY);
         let whose = whose.or(session.publishes());
         let is_followed = |sensor: &String| is_remote(sensor) == (whose == Some(Who::Listener));
-        for sensor in ipc::sensors_with_zones(domain)?.into_iter().filter(is_followed) {
+        for sensor in shm::sensors_with_zones(domain)?.into_iter().filter(is_followed) {
             self.whose = Whose::All(whose);
             self.meet(&sensor);
         }

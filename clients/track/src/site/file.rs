@@ -3,7 +3,8 @@
 use std::ops::Range;
 use std::path::Path;
 
-use schema::{Failure, Kind, regular};
+use scanhub_files::regular;
+use schema::{Failure, Kind};
 use serde::Deserialize;
 use toml::Spanned;
 

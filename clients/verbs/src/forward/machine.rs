@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use schema::regular;
+use scanhub_files::regular;
 
 /// A number for this machine: of its own alone, and always the same (machine-id(5), which is not to be handed on as it is).
 /// Nothing where the file at `path` is missing or is no such id.

@@ -6,7 +6,8 @@ use std::collections::HashMap;
 
 use lan::Key;
 use lan::incoming::GATEWAYS;
-use schema::{Failure, StateDirectory};
+use schema::Failure;
+use shm::StateDirectory;
 
 /// The file in which they are kept; nothing where there is no place for one.
 pub(super) struct Epochs {

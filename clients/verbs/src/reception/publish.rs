@@ -8,8 +8,9 @@ use std::rc::Rc;
 use lan::republish::{Republisher, SensorTopics, TopicStore};
 use scanhub_client::{PublishSession, SensorPublisher, clock};
 use schema::limits::TopicLimits;
-use schema::shortage::{check_memory, raise_descriptor_limit, sensor_bytes};
-use schema::{BEAMS, Contents, Domain, Failure, Header, Kind, Telegram, Topic, Wake};
+use schema::{BEAMS, Contents, Failure, Header, Kind, Telegram, Topic, Wake};
+use shm::Domain;
+use shm::shortage::{check_memory, raise_descriptor_limit, sensor_bytes};
 
 use any_publisher::AnyPublisher;
 use budget::{Budget, Share};

@@ -6,10 +6,11 @@ mod classes;
 use std::io::Write;
 
 use lan::incoming::{PeerTable, Remote};
+use schema::Topic;
 use schema::datagram::{Announce, DatagramError, Head, Row, StreamStats};
-use schema::{Domain, Topic};
 use serde::Serialize;
 use serde::ser::{SerializeMap, Serializer};
+use shm::Domain;
 
 use super::names::Names;
 use super::publish::Publication;

@@ -10,8 +10,8 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use rustix::fs::OFlags;
+use scanhub_files::output::Target;
 use schema::file::MAGIC;
-use schema::output::Target;
 
 use super::lock;
 use crate::duration;

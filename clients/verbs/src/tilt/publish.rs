@@ -7,7 +7,8 @@ use ::tilt::{Point, Sweep};
 use scanhub_client::streams::find;
 use scanhub_client::{Publication, PublishSession, SensorPublisher};
 use schema::limits::TopicLimits;
-use schema::{Cloud, CloudHead, CloudPoint, Domain, Failure, Flags, Header, Maker, Obstacles, Wake};
+use schema::{Cloud, CloudHead, CloudPoint, Failure, Flags, Header, Maker, Obstacles, Wake};
+use shm::Domain;
 
 use crate::names::position;
 

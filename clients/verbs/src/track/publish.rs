@@ -7,7 +7,8 @@ use ::track::{PICTURE_NS, Picture, Site};
 use scanhub_client::streams::find;
 use scanhub_client::{Publication, PublishSession, SensorPublisher, clock};
 use schema::limits::TopicLimits;
-use schema::{Domain, Event, Failure, Flags, Header, Maker, Tracks, Wake};
+use schema::{Event, Failure, Flags, Header, Maker, Tracks, Wake};
+use shm::Domain;
 
 use crate::names::position;
 

@@ -6,7 +6,8 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::JoinHandle;
 
 use scanhub_client::request;
-use schema::{Background, Domain, Failure, Request, Verb};
+use schema::{Background, Failure, Request, Verb};
+use shm::Domain;
 
 /// At most one order at a time.
 #[derive(Default)]

@@ -7,7 +7,8 @@ use ::web::{Board, ChannelId, Event, Playback, Progress, messages};
 use scanhub_client::clock;
 use scanhub_client::streams::{Sample, Session, Who};
 use scene::{Circle, People, Scene, Trouble, circles};
-use schema::{Domain, Failure, Kind, Maker, Topic, Verdict};
+use schema::{Failure, Kind, Maker, Topic, Verdict};
+use shm::Domain;
 
 use super::sensor::Channels;
 use super::tilted::Tilted;

@@ -9,8 +9,9 @@ use std::thread::JoinHandle;
 use std::time::Duration;
 
 use crate::fake::Place;
-use schema::ipc::{self, ControlServer};
-use schema::{Background, BackgroundHead, Domain, Failure, HubLock, Kind, Response, Shown, Verb};
+use schema::{Background, BackgroundHead, Failure, Kind, Response, Shown, Verb};
+use shm::ControlServer;
+use shm::{Domain, HubLock};
 use verbs::{BackgroundOptions, ModelOrder, background, saved_model};
 
 /// A hub that answers for the background of `front`.
@@ -26,7 +27,7 @@ impl Keeper {
         let flag = stop.clone();
         let (ready, is_ready) = std::sync::mpsc::channel();
         let thread = std::thread::spawn(move || {
-            let server = ControlServer::create(&ipc::hub_node(&domain).unwrap()).unwrap();
+            let server = ControlServer::create(&shm::hub_node(&domain).unwrap()).unwrap();
             lock.report_ready().unwrap();
             ready.send(()).unwrap();
             while !flag.load(Ordering::Relaxed) {
@@ -42,7 +43,7 @@ impl Keeper {
                     };
                     server.answer(asked, &Response(answer.map(|model| model.map(Shown::from)))).unwrap();
                 }
-                ipc::sleep(&[server.requests()], Duration::from_millis(5)).unwrap();
+                shm::sleep(&[server.requests()], Duration::from_millis(5)).unwrap();
             }
         });
         is_ready.recv().unwrap();

@@ -6,8 +6,9 @@ use std::time::Duration;
 use crate::child::{Child, spawn};
 use crate::fake::{FakeHub, Place, Verb, until};
 use scanhub_client::Subscription;
-use schema::ipc::PortFactory;
-use schema::{Domain, Scan, holder};
+use schema::Scan;
+use shm::PortFactory;
+use shm::{Domain, holder};
 use verbs::{Bounds, EchoOptions, Format, echo};
 
 /// One turn of an LMS's mirror (75 Hz); it measures the half degrees one turn later.
@@ -129,7 +130,7 @@ fn a_client_that_comes_between_two_hubs() {
     let place = Place::new();
     let hub = Hub::start(&place, 1);
     until("a hub", || matches!(holder(place.domain.root()), Ok(Some(1..))));
-    until("its topics", || schema::ipc::sensors(&place.domain).is_ok_and(|sensors| !sensors.is_empty()));
+    until("its topics", || shm::sensors(&place.domain).is_ok_and(|sensors| !sensors.is_empty()));
     hub.kill(&place);
     let timeout = Duration::from_millis(50);
     let mut scans = Subscription::<Scan>::in_domain(place.places(), "front").unwrap().timeout(timeout);

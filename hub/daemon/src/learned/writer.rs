@@ -7,7 +7,8 @@ use std::thread::{self, JoinHandle};
 
 use port::clock;
 use rustix::event::{PollFd, PollFlags, poll};
-use schema::{Failure, StateDirectory};
+use schema::Failure;
+use shm::StateDirectory;
 
 use super::{Keeper, Slots};
 use crate::preflight::no_resource;

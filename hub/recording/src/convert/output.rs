@@ -5,7 +5,7 @@ use std::os::unix::fs::MetadataExt;
 use std::path::Path;
 
 use flate2::write::GzEncoder;
-use schema::output::OutputFile;
+use scanhub_files::output::OutputFile;
 use schema::{Failure, Kind};
 
 /// Output of a conversion.

@@ -9,10 +9,11 @@ use std::path::{Path, PathBuf};
 use config::needs;
 use rustix::fs::{Access, access, statvfs};
 use rustix::process::{Resource, getrlimit, getuid};
-use schema::ipc::Nodes;
+use schema::Failure;
 use schema::limits::TopicLimits;
-use schema::shortage::SHARED_MEMORY;
-use schema::{Domain, Environment, Failure, RunningHub};
+use shm::Nodes;
+use shm::shortage::SHARED_MEMORY;
+use shm::{Domain, Environment, RunningHub};
 
 use super::hub::Hub;
 use super::shared_memory::{self, SharedFile};
@@ -90,14 +91,14 @@ impl Facts {
     ) -> Facts {
         let root = domain.root();
         let elsewhere = || places.iter().filter(|place| place.root() != root);
-        let held = |place: &Domain| schema::holder(place.root()).ok().flatten();
+        let held = |place: &Domain| shm::holder(place.root()).ok().flatten();
         let user = getuid().as_raw();
         let owner =
             |place: &Domain| place.root().ancestors().find_map(|path| Some(path.metadata().ok()?.uid()));
-        let mut nodes = schema::ipc::nodes(domain);
+        let mut nodes = shm::nodes(domain);
         if let Ok(nodes) = &mut nodes {
             let free = elsewhere().filter(|place| held(place).is_none() && owner(place) == Some(user));
-            nodes.dead += free.filter_map(|place| Some(schema::ipc::nodes(place).ok()?.dead)).sum::<usize>();
+            nodes.dead += free.filter_map(|place| Some(shm::nodes(place).ok()?.dead)).sum::<usize>();
         }
         // A process that runs at this location may be opening files, so they do not count as left.
         let is_empty = nodes.as_ref().is_ok_and(|nodes| nodes.alive == 0) && held(domain).is_none();
@@ -110,12 +111,12 @@ impl Facts {
             name: domain.name().to_owned(),
             root: root.to_owned(),
             place: Place::nearest(root),
-            hub: schema::holder(root),
+            hub: shm::holder(root),
             mute: hub.map(Hub::mute).unwrap_or_default(),
             is_stopped: hub.is_some_and(|hub| is_stopped(hub.pid)),
             others: elsewhere().filter_map(|place| Some((place.root().to_owned(), held(place)?))).collect(),
             closed: elsewhere()
-                .filter(|place| schema::holder(place.root()).is_err())
+                .filter(|place| shm::holder(place.root()).is_err())
                 .filter_map(|place| Some((place.root().to_owned(), owner(place)?)))
                 .collect(),
             foreign: RunningHub::all(Path::new("/"))

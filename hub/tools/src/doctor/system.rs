@@ -5,7 +5,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use rustix::process::getuid;
-use schema::regular;
+use scanhub_files::regular;
 
 /// The files of a machine, and the user that reads them.
 #[derive(Clone, Debug)]

@@ -7,7 +7,7 @@ use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 
 use port::Candidate;
-use schema::regular;
+use scanhub_files::regular;
 
 use super::version::{Build, VERSION, compare};
 use super::{Finding, System};

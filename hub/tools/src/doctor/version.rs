@@ -10,7 +10,7 @@ use std::thread;
 use std::time::Duration;
 
 use rustix::process::geteuid;
-use schema::ipc::LIBRARY;
+use shm::LIBRARY;
 
 use super::{Finding, System};
 

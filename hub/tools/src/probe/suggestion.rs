@@ -31,7 +31,7 @@ impl SuggestedLink {
 
     /// Returns the command that runs a hub for this scanner, as a shell takes it.
     pub fn command(&self) -> String {
-        format!("scanhub run --link {}", schema::shell_word(&self.flag()))
+        format!("scanhub run --link {}", shm::shell_word(&self.flag()))
     }
 
     /// Returns the section of a configuration file, without the end of its last line.

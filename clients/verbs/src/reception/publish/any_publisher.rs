@@ -2,9 +2,9 @@
 
 use scanhub_client::{Publication, SensorPublisher};
 use schema::datagram::Packed;
-use schema::ipc::Payload;
 use schema::limits::TopicLimits;
 use schema::{Failure, Header, Topic};
+use shm::Payload;
 
 /// What is published from a payload as it stands in a datagram.
 trait Unpacked {

@@ -4,9 +4,9 @@
 use std::io::{self, Write};
 use std::path::Path;
 
-use schema::Domain;
 use schema::datagram::{GivenUp, Head, PORT};
 use serde::{Serialize, Serializer};
+use shm::Domain;
 
 use super::super::publish::Publication;
 use super::id;

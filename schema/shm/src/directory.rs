@@ -16,8 +16,9 @@ use std::path::{Path, PathBuf};
 use rustix::fs::{AtFlags, Dir, FileType, Mode, OFlags, Stat, fstat, openat, renameat, statat, unlinkat};
 use rustix::io::Errno;
 
-use crate::path_walk::{LinkPolicy, PathWalk, STICKY, WalkError, components_of, named, user};
-use crate::{Failure, Kind, shortage};
+use crate::shortage;
+use scanhub_files::path_walk::{LinkPolicy, PathWalk, STICKY, WalkError, components_of, named, user};
+use schema::{Failure, Kind};
 
 /// An open directory that this user owns and nobody else can write to.
 #[derive(Debug)]

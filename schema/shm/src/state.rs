@@ -8,8 +8,9 @@ use std::io::{self, Read};
 use std::os::unix::fs::MetadataExt;
 use std::path::PathBuf;
 
+use crate::Directory;
 use crate::domain::first_path;
-use crate::{Directory, Failure, Kind};
+use schema::{Failure, Kind};
 
 /// The directory of a domain's files: `$STATE_DIRECTORY/DOMAIN`, else `$XDG_STATE_HOME/scanhub/DOMAIN`, else
 /// `~/.local/state/scanhub/DOMAIN`.

@@ -11,7 +11,7 @@ use iceoryx2::service::port_factory::request_response;
 use super::open_failure::{OpenFailure, create, full, no_port, open};
 use super::{Listener, Node, Notifier, Service, WakeService, listener, name, take_wakeups};
 use crate::shortage::{CONTROL_DESCRIPTORS, check_descriptors};
-use crate::{Failure, Kind, Request, Response, limits, topic};
+use schema::{CONTROL, CONTROL_REQUEST, CONTROL_RESPONSE, Failure, Kind, Request, Response, limits};
 
 /// The hub's end. Its [`requests`](Self::requests) wake when a request was sent.
 pub struct ControlServer {
@@ -46,7 +46,7 @@ impl ControlServer {
     ///
     /// [`Kind::DomainHeld`] if another hub has it, [`Kind::Short`] if there is no memory for it.
     pub fn create(node: &Node) -> Result<ControlServer, Failure> {
-        let service = name(topic::CONTROL)?;
+        let service = name(CONTROL)?;
         let control = create(node, &service, || {
             let builder = node.service_builder(&service).request_response::<[u8], [u8]>();
             builder
@@ -60,7 +60,7 @@ impl ControlServer {
                 .open_or_create()
                 .map_err(OpenFailure::from)
         })?;
-        let (asked, answered) = (bell(node, topic::CONTROL_REQUEST)?, bell(node, topic::CONTROL_RESPONSE)?);
+        let (asked, answered) = (bell(node, CONTROL_REQUEST)?, bell(node, CONTROL_RESPONSE)?);
         let server = control
             .server_builder()
             .initial_max_slice_len(Response::MAX)
@@ -131,11 +131,11 @@ impl ControlClient {
             let service = name(service)?;
             open(node, &service, node.service_builder(&service).event().open())
         };
-        let service = name(topic::CONTROL)?;
+        let service = name(CONTROL)?;
         let builder = node.service_builder(&service).request_response::<[u8], [u8]>();
         let Some(control) = open(node, &service, builder.open())? else { return Ok(None) };
-        let Some(asked) = event(topic::CONTROL_REQUEST)? else { return Ok(None) };
-        let Some(answered) = event(topic::CONTROL_RESPONSE)? else { return Ok(None) };
+        let Some(asked) = event(CONTROL_REQUEST)? else { return Ok(None) };
+        let Some(answered) = event(CONTROL_RESPONSE)? else { return Ok(None) };
         let responses = listener(&answered)?;
         let requests = notifier(&asked)?;
         let builder = control.client_builder().initial_max_slice_len(REQUEST);

@@ -9,7 +9,7 @@ use rustix::fs::{AtFlags, CWD, FileType, Mode, OFlags, fstat, mkdirat, openat, r
 use rustix::io::Errno;
 
 /// A directory that was reached by its path.
-pub(crate) struct PathWalk {
+pub struct PathWalk {
     /// The user who has to own directories and may make links.
     user: u32,
     policy: LinkPolicy,
@@ -23,7 +23,7 @@ pub(crate) struct PathWalk {
 /// Which links on the way are followed. Links of root and of this user always are, in directories that no other user can write
 /// to.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum LinkPolicy {
+pub enum LinkPolicy {
     /// No others.
     Own,
     /// All but those of other users in a sticky directory, such as /tmp.
@@ -32,7 +32,7 @@ pub(crate) enum LinkPolicy {
 
 /// Reason for not opening a directory.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub(crate) enum WalkError {
+pub enum WalkError {
     /// The system refuses it.
     System(PathBuf, Errno),
     /// Another user may have put something at this path. The text continues a sentence that begins with the path.
@@ -50,7 +50,7 @@ impl PathWalk {
     /// # Errors
     ///
     /// [`WalkError::System`] if that cannot be opened.
-    pub(crate) fn begin(path: &Path, policy: LinkPolicy, user: u32) -> Result<PathWalk, WalkError> {
+    pub fn begin(path: &Path, policy: LinkPolicy, user: u32) -> Result<PathWalk, WalkError> {
         let start = Path::new(if path.is_absolute() { "/" } else { "." });
         let at = openat(CWD, start, OPEN_DIRECTORY | OFlags::PATH, Mode::empty());
         let at = at.map_err(|error| WalkError::System(start.to_owned(), error))?;
@@ -64,11 +64,7 @@ impl PathWalk {
     /// # Errors
     ///
     /// [`WalkError`] if a component cannot be opened or is not to be trusted.
-    pub(crate) fn enter(
-        &mut self,
-        mut components: Vec<OsString>,
-        make: Option<Mode>,
-    ) -> Result<bool, WalkError> {
+    pub fn enter(&mut self, mut components: Vec<OsString>, make: Option<Mode>) -> Result<bool, WalkError> {
         components.reverse();
         while let Some(component) = components.pop() {
             match self.step(&component, make, OFlags::PATH)? {
@@ -86,7 +82,7 @@ impl PathWalk {
     /// # Errors
     ///
     /// Those of [`enter`](Self::enter), [`WalkError::Foreign`] and [`WalkError::Writable`].
-    pub(crate) fn enter_own(
+    pub fn enter_own(
         &mut self,
         component: &OsStr,
         make: Option<Mode>,
@@ -115,7 +111,7 @@ impl PathWalk {
     }
 
     /// Returns the directory that was reached, and its path.
-    pub(crate) fn into_parts(self) -> (OwnedFd, PathBuf) {
+    pub fn into_parts(self) -> (OwnedFd, PathBuf) {
         (self.at, self.path)
     }
 
@@ -191,7 +187,7 @@ enum Step {
 }
 
 /// Returns the components of `path` without its root.
-pub(crate) fn components_of(path: &Path) -> Vec<OsString> {
+pub fn components_of(path: &Path) -> Vec<OsString> {
     path.components()
         .filter_map(|component| match component {
             Component::Normal(name) => Some(name.to_owned()),
@@ -202,13 +198,13 @@ pub(crate) fn components_of(path: &Path) -> Vec<OsString> {
 }
 
 /// Returns the number of `user`, and the name if it has one.
-pub(crate) fn named(user: u32) -> String {
+pub fn named(user: u32) -> String {
     let known = nix::unistd::User::from_uid(user.into()).ok().flatten();
     known.map_or_else(|| user.to_string(), |known| format!("{user} ({})", known.name))
 }
 
 /// Returns the user of this process.
-pub(crate) fn user() -> u32 {
+pub fn user() -> u32 {
     rustix::process::geteuid().as_raw()
 }
 
@@ -216,6 +212,6 @@ const OPEN_DIRECTORY: OFlags = OFlags::DIRECTORY.union(OFlags::NOFOLLOW).union(O
 /// Group and others may write.
 const OTHERS_WRITE: u32 = 0o022;
 /// Only owners may rename and remove what is in the directory (inode(7)).
-pub(crate) const STICKY: u32 = 0o1000;
+pub const STICKY: u32 = 0o1000;
 /// As many links as the kernel follows (path_resolution(7)).
 const MAX_LINKS: usize = 40;

@@ -15,9 +15,10 @@ use rustix::io::Errno;
 use rustix::param::page_size;
 use rustix::process::{Resource, getrlimit, setrlimit};
 
-use crate::ipc::isolation::prefix_of;
-use crate::limits::TopicLimits;
-use crate::{Domain, Failure, Header, Kind, Topic, limits};
+use crate::Domain;
+use crate::isolation::prefix_of;
+use schema::limits::TopicLimits;
+use schema::{Failure, Header, Kind, Topic, limits};
 
 /// Directory of POSIX shared memory on Linux.
 pub const SHARED_MEMORY: &str = "/dev/shm";

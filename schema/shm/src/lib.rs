@@ -3,9 +3,15 @@
 
 mod clean;
 mod control;
+mod directory;
+mod domain;
 mod doorbell;
-pub(crate) mod isolation;
+mod isolation;
+mod lock;
 mod open_failure;
+mod running;
+pub mod shortage;
+mod state;
 mod topic_service;
 mod wake;
 
@@ -23,7 +29,7 @@ use iceoryx2::service::Service as _;
 use iceoryx2::service::port_factory::{event, publish_subscribe};
 
 use crate::lock::MakingLock;
-use crate::{Directory, Domain, Failure, Header, Kind, Maker, Topic, of_service};
+use schema::{Failure, Header, Kind, Maker, Topic, of_service};
 
 use self::clean::remove_unfinished_services;
 pub use self::clean::{Cleaned, Nodes, clean, is_unheld, nodes};
@@ -36,11 +42,16 @@ use self::isolation::{
 pub use self::isolation::{Segment, strangers};
 pub use self::topic_service::{Medium, Payload, SharedMemory, TopicPublisher};
 pub use self::wake::{DueRings, Waker, descriptor, listener, open_wake, sleep, take_wakeups};
+pub use directory::Directory;
+pub use domain::{DEFAULT_DOMAIN, Domain, Environment};
 pub use iceoryx2::port::update_connections::UpdateConnections;
 pub use iceoryx2::port::{LoanError, ReceiveError, SendError};
 /// Shared memory between processes; ports of it stay in their thread, nodes and services may move.
 pub use iceoryx2::prelude::ipc::Service;
 pub use iceoryx2::prelude::{PortFactory, ZeroCopySend};
+pub use lock::{HubLock, ListenLock, NameLock, holder, is_starting, name_held, publisher, publisher_domain};
+pub use running::{RunningHub, shell_word};
+pub use state::StateDirectory;
 
 /// The version of the shared-memory library: processes with another version are refused.
 pub const LIBRARY: &str = "iceoryx2 0.10.0";

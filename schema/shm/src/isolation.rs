@@ -20,9 +20,10 @@ use rustix::fs::{CWD, RenameFlags, renameat_with};
 use rustix::io::Errno;
 
 use crate::lock::MakingLock;
-use crate::path_walk::named;
 use crate::shortage::{SHARED_MEMORY, memory};
-use crate::{Directory, Failure, Kind, shortage};
+use crate::{Directory, shortage};
+use scanhub_files::path_walk::named;
+use schema::{Failure, Kind};
 
 /// Returns the reason for a failure in the domain in `root`: another user's directory or file with owner, mode and
 /// remedy, otherwise a shortage if there is one, otherwise `what`.
@@ -262,7 +263,7 @@ mod tests {
     use iceoryx2::config::Config;
     use iceoryx2::prelude::{FileName, NodeBuilder, SemanticString, SignalHandlingMode};
 
-    use crate::ipc::Service;
+    use crate::Service;
 
     use super::*;
 

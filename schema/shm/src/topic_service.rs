@@ -17,9 +17,9 @@ use super::{
     LoanError, Node, PortFactory, Publisher, REVISION, ReceiveError, Sample, SampleMut, SendError,
     Subscriber, TopicService, UpdateConnections, name, places,
 };
-use crate::limits::TopicLimits;
 use crate::shortage::check_client;
-use crate::{Failure, Header, Kind, Topic, limits};
+use schema::limits::TopicLimits;
+use schema::{Failure, Header, Kind, Topic, limits};
 
 /// Payload of a topic: `[u8]` (telegram), or a type of this crate.
 pub trait Payload: Debug + 'static {
@@ -205,18 +205,19 @@ macro_rules! payloads {
     (Cloud, $topic:ident) => { payloads!(Cloud, CloudWord, $topic); };
     ($payload:ident, $word:ident, $topic:ident) => {
         payload!(
-            crate::$payload, Topic::$topic, [crate::$word], len, Box<crate::$payload>, crate::$payload::zeroed(len),
+            schema::$payload, Topic::$topic, [schema::$word], len,
+            Box<schema::$payload>, schema::$payload::zeroed(len),
             |builder, limits| {
                 let longest = Topic::$topic.longest(limits);
-                builder.initial_max_slice_len(crate::$payload::words(longest))
+                builder.initial_max_slice_len(schema::$payload::words(longest))
             },
-            |publisher| publisher.loan_slice(crate::$payload::words(len)),
-            crate::$payload::of_words, crate::$payload::of_words_mut, crate::$payload::bytes
+            |publisher| publisher.loan_slice(schema::$payload::words(len)),
+            schema::$payload::of_words, schema::$payload::of_words_mut, schema::$payload::bytes
         );
     };
     ($payload:tt, $topic:ident) => {
         payload!(
-            crate::$payload, Topic::$topic, crate::$payload, _len, Box<crate::$payload>, Box::default(),
+            schema::$payload, Topic::$topic, schema::$payload, _len, Box<schema::$payload>, Box::default(),
             |builder, _limits| builder,
             |publisher| publisher.loan(),
             std::convert::identity, std::convert::identity, bytemuck::bytes_of
@@ -224,7 +225,7 @@ macro_rules! payloads {
     };
 }
 
-crate::for_each_topic!(payloads);
+schema::for_each_topic!(payloads);
 
 fn revision(topic: Topic) -> Result<AttributeVerifier, Failure> {
     let impossible = |_| Failure::new(Kind::Failed, "the payload's revision is no attribute", "");
@@ -382,7 +383,7 @@ impl<P: Payload + ?Sized, M: Medium<P>> TopicPublisher<P, M> {
     /// # Errors
     ///
     /// Returns the library's error if there is no memory, or if bytes are longer than
-    /// [`Telegram::MAX`](crate::Telegram::MAX).
+    /// [`Telegram::MAX`](schema::Telegram::MAX).
     pub fn loan(&self, len: usize) -> Result<M::Loan, LoanError> {
         self.medium.loan(len)
     }
@@ -444,7 +445,7 @@ impl<M: Medium<[u8]>> TopicPublisher<[u8], M> {
     /// # Errors
     ///
     /// Returns [`Kind::Short`] if there is no memory for it, or if it is longer than
-    /// [`Telegram::MAX`](crate::Telegram::MAX).
+    /// [`Telegram::MAX`](schema::Telegram::MAX).
     pub fn send_bytes(&mut self, header: &Header, bytes: &[u8]) -> Result<usize, Failure> {
         self.send_len(header, bytes.len(), |sample| sample.copy_from_slice(bytes))
     }

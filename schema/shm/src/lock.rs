@@ -13,8 +13,9 @@ use nix::errno::Errno;
 use nix::fcntl::{FcntlArg, fcntl};
 use nix::libc::{self, flock};
 
-use crate::ipc::isolation::{ensure_prefix, read_prefix};
-use crate::{Directory, Domain, Environment, Failure, Kind, ipc, shortage};
+use crate::isolation::{ensure_prefix, read_prefix};
+use crate::{Directory, Domain, Environment, shortage};
+use schema::{Failure, Kind};
 
 /// The lock of a hub on its domain; it ends with the value or with the process, however that ends. Drop it after the
 /// hub's node.
@@ -99,7 +100,7 @@ impl Drop for NameLock {
     /// The last one out takes the names of the shared memory along, as `Publishing` does.
     fn drop(&mut self) {
         if let Ok(None) = publisher(&self.root) {
-            ipc::forget_names(&self.root);
+            crate::forget_names(&self.root);
         }
     }
 }
@@ -128,7 +129,7 @@ impl Drop for Publishing {
         let other = if self.name == HUB { LISTENER } else { HUB };
         // Whoever holds the other lock has the names, or is about to join under them.
         if let Ok(None) = holder_of(&self.root, other) {
-            ipc::forget_names(&self.root);
+            crate::forget_names(&self.root);
         }
     }
 }

@@ -16,9 +16,10 @@ use iceoryx2::service::service_name::ServiceName;
 
 use super::Node;
 use super::isolation::access_failure;
-use crate::limits::TopicLimits;
 use crate::lock::MakingLock;
-use crate::{Failure, Kind, is_remote, of_service, shortage};
+use crate::shortage;
+use schema::limits::TopicLimits;
+use schema::{Failure, Kind, is_remote, of_service};
 
 /// Class of an error.
 pub(super) enum OpenFailure {

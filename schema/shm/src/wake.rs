@@ -17,7 +17,7 @@ use super::doorbell::DoorbellRinger;
 use super::open_failure::{OpenFailure, create, full, no_port, open};
 use super::{Listener, Node, Notifier, PortFactory, WakeService, name};
 use crate::shortage::check_client;
-use crate::{Failure, Kind, Ring, Topic, Wake, limits};
+use schema::{Failure, Kind, Ring, Topic, Wake, limits};
 
 /// The hub's end. It wakes subscribers with [`Wake::HubUp`] when it is created, and with [`Wake::HubDown`] when it is
 /// dropped.

@@ -3,7 +3,7 @@
 
 use std::path::{Path, PathBuf};
 
-use crate::{Failure, Kind};
+use schema::{Failure, Kind};
 
 /// The default domain.
 pub const DEFAULT_DOMAIN: &str = "scanhub";
@@ -12,7 +12,7 @@ pub const DEFAULT_DOMAIN: &str = "scanhub";
 /// (unix(7)), has a number of up to 35 digits and 7 bytes besides.
 const PLACE_LIMIT: usize = 66;
 
-/// Bytes that a domain's directory adds to the prefix (`ipc/isolation.rs`): five random letters, and `_`.
+/// Bytes that a domain's directory adds to the prefix (`isolation.rs`): five random letters, and `_`.
 const RANDOM: usize = 6;
 
 /// What systemd makes for the service; clients outside of the service look there too.
@@ -115,7 +115,6 @@ pub struct Environment {
 
 impl Environment {
     /// Returns the environment of this process.
-    #[cfg(feature = "ipc")]
     pub fn of_process() -> Environment {
         let path = |name| std::env::var_os(name).and_then(first_path);
         Environment {
@@ -165,7 +164,6 @@ pub(crate) fn check_name(name: &str) -> Result<(), Failure> {
 }
 
 /// The first of a colon-separated list (systemd lists several runtime directories so), if it is absolute.
-#[cfg(any(feature = "ipc", test))]
 pub(crate) fn first_path(value: std::ffi::OsString) -> Option<PathBuf> {
     let text = value.into_string().ok()?;
     let first = PathBuf::from(text.split(':').next()?);

@@ -14,7 +14,8 @@ use rustix::fs::{FileType, OFlags};
 
 use super::isolation::access_failure;
 use super::{Node, config, forget, hub_node};
-use crate::{Directory, Domain, Failure, HubLock, ListenLock};
+use crate::{Directory, Domain, HubLock, ListenLock};
+use schema::Failure;
 
 /// Result of a cleanup.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -32,8 +33,8 @@ pub struct Cleaned {
 ///
 /// # Errors
 ///
-/// Returns [`Kind::DomainHeld`](crate::Kind) if a hub or a listener publishes there, because it cleans up by itself.
-/// Returns [`Kind::Failed`](crate::Kind) if the directory belongs to another user.
+/// Returns [`Kind::DomainHeld`](schema::Kind) if a hub or a listener publishes there, because it cleans up by itself.
+/// Returns [`Kind::Failed`](schema::Kind) if the directory belongs to another user.
 pub fn clean(domain: &Domain) -> Result<Cleaned, Failure> {
     let root = domain.root();
     let Some(directory) = Directory::open(root)? else { return Ok(Cleaned::default()) };
@@ -83,7 +84,7 @@ pub struct Nodes {
 ///
 /// # Errors
 ///
-/// Returns [`Kind::Failed`](crate::Kind) with owner, mode and remedy if the directory belongs to another user.
+/// Returns [`Kind::Failed`](schema::Kind) with owner, mode and remedy if the directory belongs to another user.
 pub fn nodes(domain: &Domain) -> Result<Nodes, Failure> {
     nodes_at(domain.root())
 }

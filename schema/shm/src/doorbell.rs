@@ -25,7 +25,7 @@ use rustix::time::{ClockId, Timespec};
 use super::Node;
 use super::isolation::{Segment, in_the_way};
 use crate::shortage::{SHARED_MEMORY, memory};
-use crate::{Failure, Kind, Ring};
+use schema::{Failure, Kind, Ring};
 
 /// The hub's end of a doorbell. Dropping it closes the doorbell and wakes all subscribers once more.
 #[derive(Debug)]
