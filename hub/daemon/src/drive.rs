@@ -1,17 +1,14 @@
-//! Drives a session with a sensor on an open port, until the port is gone. The path of a scan, from the line to the
-//! subscribers, is here:
+//! Runs a session with a scanner on an open port until the port is lost.
 //!
-//! - **read**: [`Drive::turn`] reads into the session's buffer once the port is ready;
-//! - **frame**: [`Drive::drain`] polls the session, which returns a telegram in that buffer, or a revolution;
-//! - **loan**, **decode**, **process**, **send**:
-//!   [`LinkOutput::process_telegram`](crate::process_telegram::LinkOutput::process_telegram) and
-//!   [`process_revolution`](crate::process_telegram::LinkOutput::process_revolution) send the telegram, then take loans
-//!   of shared memory, write the scan and the results of the processors in place, and send them (`topics.rs`,
-//!   `pipeline.rs`);
-//! - **ring**: [`LinkCore::publish`] wakes the subscribers, once per telegram: those of telegram, scan and zones before
-//!   marks and foreground are computed.
+//! The path of a scan, from the line to its subscribers, starts here:
 //!
-//! Nothing on this path allocates, locks or logs.
+//! 1. **Read**: [`Drive::turn`] reads into the session's buffer when the port is ready.
+//! 2. **Frame**: [`Drive::drain`] asks the session for its next action. A telegram stays in that buffer; a revolution is a
+//!    list of points.
+//! 3. **Decode, process, send, ring**: [`LinkOutput`](crate::link_output::LinkOutput) publishes the telegram and the scan,
+//!    wakes the subscribers of both and of the zones, and then publishes the other results.
+//!
+//! Nothing on this path allocates, locks or logs. Opening and reopening the port is up to `reconnect.rs`.
 
 use std::fmt;
 use std::io;
@@ -27,7 +24,7 @@ use crate::control::Flow;
 use crate::identity_cache::IdentityCache;
 use crate::learned::{KnownRate, KnownScanner};
 use crate::link::LinkCore;
-use crate::process_telegram::RecordedContext;
+use crate::link_output::RecordedMetadata;
 use crate::settings_check::SettingsCheck;
 use crate::surroundings::{Learned, Line, On, Surroundings, Woken};
 
@@ -228,7 +225,7 @@ impl<'a, S: Surroundings> Drive<'a, S> {
     fn drain(&mut self, core: &mut LinkCore<'a, S>, open: &mut Open<S::Line>) -> io::Result<()> {
         let Open { line, session, .. } = open;
         let around = core.around;
-        let recorded = RecordedContext::default();
+        let recorded = RecordedMetadata::default();
         let (mut published, mut is_scan) = (false, !core.stats.is_streaming());
         (open.watch, open.until) = loop {
             match session.poll_output() {
@@ -302,7 +299,7 @@ impl<'a, S: Surroundings> Drive<'a, S> {
                 Some(partial) if self.behind_at.is_some_and(|at| partial.first <= at) => {
                     core.output.withdraw(Some(partial.number));
                 }
-                partial => core.output.foresee(partial.as_ref()),
+                partial => core.output.update_early_warning(partial.as_ref()),
             }
         }
         self.identity.keep_first(session);
@@ -315,7 +312,7 @@ impl<'a, S: Surroundings> Drive<'a, S> {
             self.identity.keep(session, around.now());
             self.note_scanner(core, session, now);
             if core.stops_when_idle() {
-                session.set_has_subscribers(around.now(), core.output.topics.is_followed());
+                session.set_has_subscribers(around.now(), core.output.topics.has_data_subscribers());
                 // What follows from it is done at once, after an empty look at the line.
                 open.until = around.now();
             }
@@ -331,7 +328,7 @@ impl<'a, S: Surroundings> Drive<'a, S> {
     /// before it, so detect it by the stamps.
     fn note_silence(&self, core: &mut LinkCore<'a, S>, last: Nanos, is_behind: bool) {
         if !is_behind && last > self.follows_by {
-            core.output.learn_silence();
+            core.output.note_silence();
         }
     }
 

@@ -1,5 +1,5 @@
-//! The parts of a link that do not depend on the source of its bytes: topics, status, diagnosis, requests of users, and the
-//! times at which it publishes without new bytes.
+//! The parts of a link that do not depend on the source of its bytes: topics, status, diagnosis, requests of users, and
+//! deadlines for publishing without new bytes.
 
 use config::{Link, Processing};
 use scanhub_drivers::line::{Control, RawScan, Received, Session as _};
@@ -8,8 +8,8 @@ use schema::{Failure, MILLIS, Nanos, Shown, State, Verb, Wake};
 
 use crate::control::{ControlQueue, Flow};
 use crate::diagnosis::Diagnosis;
+use crate::link_output::{LinkOutput, Published, RecordedMetadata};
 use crate::link_stats::LinkStats;
-use crate::process_telegram::{LinkOutput, Processed, RecordedContext};
 use crate::surroundings::{Learned, Surroundings, Woken};
 use crate::topics::Topics;
 
@@ -21,19 +21,19 @@ pub(crate) struct LinkCore<'a, S: Surroundings> {
     pub(crate) stats: LinkStats,
     pub(crate) diagnosis: Diagnosis<'a>,
     pub(crate) control: ControlQueue,
-    /// When late joiners get what they would else get with the next sample.
-    next_greeting: Nanos,
-    /// When a status goes out without news.
+    /// Time at which new subscribers get the history.
+    next_history: Nanos,
+    /// Time at which the status is published even if it has not changed.
     next_status: Nanos,
 }
 
 impl<'a, S: Surroundings> LinkCore<'a, S> {
-    /// The parts of `link`, number `number` in the configuration, for the hub's life `boot`. Makes its topics; nothing is
-    /// published yet.
+    /// Creates the parts of `link`, which is number `number` in the configuration, and its topics. `boot` identifies the run
+    /// of the hub. Publishes nothing yet.
     ///
     /// # Errors
     ///
-    /// As [`Surroundings::medium`].
+    /// Returns the errors of [`Surroundings::medium`].
     pub(crate) fn new(
         link: &'a Link,
         number: u8,
@@ -51,29 +51,29 @@ impl<'a, S: Surroundings> LinkCore<'a, S> {
             stats: LinkStats::new(link, now),
             diagnosis: Diagnosis::new(link),
             control,
-            next_greeting: now,
+            next_history: now,
             next_status: now,
         })
     }
 
-    /// Publishes how it is before anything can come.
+    /// Publishes the state before the first bytes arrive.
     pub(crate) fn begin(&mut self) {
         self.output.publish_start(self.around.now());
     }
 
-    /// The hub ends: lets be kept what was learned.
+    /// Saves the background at the end of the hub.
     pub(crate) fn end(&mut self) {
-        self.hand_on(true);
+        self.save_background(true);
     }
 
-    /// The `session` on the port is over.
+    /// Handles the end of `session` on the port.
     pub(crate) fn close(&mut self, session: &PortSession) {
         self.diagnosis.end_flood();
-        self.output.foresee(None);
+        self.output.update_early_warning(None);
         self.stats.close(session);
     }
 
-    /// Whether its motor rests while nobody follows.
+    /// Returns whether the scanner's motor stops while the topics have no subscriber.
     pub(crate) fn stops_when_idle(&self) -> bool {
         self.link.scanner.settings.stop_when_idle
     }
@@ -83,23 +83,15 @@ impl<'a, S: Surroundings> LinkCore<'a, S> {
     pub(crate) fn publish(
         &mut self,
         received: &Received<'_>,
-        recorded: &RecordedContext,
-        is_behind: bool,
+        recorded: &RecordedMetadata,
+        is_backlogged: bool,
     ) -> Option<Nanos> {
-        let processed = match &received.whole {
-            Some(whole) => {
-                let processed = self.output.process_telegram(received, whole, recorded, is_behind);
-                self.output.topics.wake(Wake::Telegram);
-                processed
-            }
-            None => {
-                let processed = self.output.process_packets(received, recorded);
-                self.output.topics.wake_for_packets();
-                processed
-            }
+        let published = match &received.whole {
+            Some(whole) => self.output.telegram(received, whole, recorded, is_backlogged),
+            None => self.output.packets(received, recorded),
         };
-        self.stats.note(processed);
-        processed.stands_for
+        self.stats.note(published);
+        published.verdict_lifetime
     }
 
     /// Publishes a scan whose packets were published, and wakes the subscribers. Returns how long the verdict on it
@@ -107,34 +99,34 @@ impl<'a, S: Surroundings> LinkCore<'a, S> {
     pub(crate) fn publish_scan(
         &mut self,
         scan: &RawScan<'_>,
-        recorded: &RecordedContext,
-        is_behind: bool,
+        recorded: &RecordedMetadata,
+        is_backlogged: bool,
     ) -> Nanos {
-        let stands_for = self.output.process_revolution(scan, recorded, is_behind);
-        self.output.topics.wake(Wake::Telegram);
-        self.stats.note(Processed { is_suspect: scan.reasons != 0, stands_for: Some(stands_for) });
-        stands_for
+        let verdict_lifetime = self.output.revolution(scan, recorded, is_backlogged);
+        self.stats
+            .note(Published { is_suspect: scan.reasons != 0, verdict_lifetime: Some(verdict_lifetime) });
+        verdict_lifetime
     }
 
-    /// When a status goes out without news.
+    /// Returns the time at which the status is published even if it has not changed.
     pub(crate) fn next_status(&self) -> Nanos {
         self.next_status
     }
 
-    /// Whether a status or a greeting is due at `now`.
+    /// Returns whether the status or the history for new subscribers is due at `now`.
     pub(crate) fn is_due(&self, now: Nanos) -> bool {
-        now >= self.next_status.min(self.next_greeting)
+        now >= self.next_status.min(self.next_history)
     }
 
-    /// Publishes the status if it has changed or is due, and sends late joiners what they missed. `error` is the
-    /// message of the status. Returns whether a status was published.
+    /// Publishes the status if it has changed or is due, and gives new subscribers the history. `error` is the message of
+    /// the status. Returns whether a status was published.
     pub(crate) fn show(&mut self, session: Option<&PortSession>, state: State, error: &str) -> bool {
         let now = self.around.now();
         let changed = update(&mut self.stats, self.link, state, error, now);
         self.publish_status(session, state, changed, now)
     }
 
-    /// As [`show`](Self::show), of a `session` that was examined: what is wrong is for [`Diagnosis`] to say.
+    /// Does the same as [`show`](Self::show) for a `session` that was examined, with the message of [`Diagnosis`].
     pub(crate) fn show_session(&mut self, session: &PortSession, state: State) -> bool {
         let now = self.around.now();
         let error = self.diagnosis.explanation();
@@ -164,26 +156,26 @@ impl<'a, S: Surroundings> LinkCore<'a, S> {
             if changed || state != State::Streaming {
                 self.output.topics.wake(Wake::Status);
             }
-            self.hand_on(false);
+            self.save_background(false);
             self.diagnosis.watch_line(self.stats.health());
-            self.diagnosis.watch_unserved(self.output.topics.unreached(self.stats.is_streaming()));
+            self.diagnosis.watch_unserved(self.output.topics.starved_subscribers(self.stats.is_streaming()));
             self.diagnosis.tell_mode(self.stats.last());
         }
-        self.greet(now);
+        self.deliver_history(now);
         is_due
     }
 
-    fn greet(&mut self, now: Nanos) {
-        if now >= self.next_greeting {
-            self.next_greeting = now + GREETING_PERIOD;
-            self.output.topics.greet();
+    fn deliver_history(&mut self, now: Nanos) {
+        if now >= self.next_history {
+            self.next_history = now + HISTORY_PERIOD;
+            self.output.topics.deliver_history();
         }
     }
 
-    /// Lets what was learned be kept, if that is news; if this is the `last` time, whatever there is.
-    fn hand_on(&mut self, last: bool) {
+    /// Saves the background if it is worth it. At the end of the hub (`is_last`), one new scan is enough.
+    fn save_background(&mut self, is_last: bool) {
         if let Some(learned) = self.around.learned()
-            && let Some((pose, model)) = self.output.hand_on(last)
+            && let Some((pose, model)) = self.output.take_background_to_save(is_last)
         {
             learned.keep_background(pose, model);
         }
@@ -192,28 +184,28 @@ impl<'a, S: Surroundings> LinkCore<'a, S> {
     /// Publishes what is due, and returns when the wait must end: at `until`, or earlier if the link itself has
     /// something to do. Some drivers report the loss of a port only to a thread that waits for bytes, so a line whose
     /// bytes are `left_alone` is polled every 40 ms.
-    pub(crate) fn bound(&mut self, until: Nanos, left_alone: bool) -> Nanos {
+    pub(crate) fn next_deadline(&mut self, until: Nanos, left_alone: bool) -> Nanos {
         let now = self.around.now();
-        // What was due before comes first: it may be a scan.
-        self.output.expire(now, until);
-        // Whoever attaches to a silent sensor is greeted in time all the same.
-        let greeting = if self.stats.is_streaming() { until } else { self.next_greeting.max(now) };
-        let look = if left_alone { now + LONGEST_REST } else { until };
-        until.min(greeting).min(self.output.stale_at()).min(look)
+        self.output.expire_verdict(now, until);
+        // A new subscriber to a silent sensor also gets the history in time.
+        let history = if self.stats.is_streaming() { until } else { self.next_history.max(now) };
+        let poll = if left_alone { now + POLL_INTERVAL } else { until };
+        until.min(history).min(self.output.stale_at()).min(poll)
     }
 
-    /// Whether a wait `until` is over now that it ended as `woken` says; else only late joiners were due.
+    /// Returns whether a wait `until` ends now, for the reason `woken`. Otherwise only the history was due, which this
+    /// function delivers.
     pub(crate) fn is_over(&mut self, woken: Woken, until: Nanos) -> bool {
         self.stats.wakeups += 1;
         let now = self.around.now();
         let is_over = woken != Woken::Timeout || now >= until;
         if !is_over {
-            self.greet(now);
+            self.deliver_history(now);
         }
         is_over
     }
 
-    /// Does what users asked for, and takes over what was changed for it.
+    /// Handles the requests of users, and applies changed settings.
     pub(crate) fn handle_requests(&mut self, mut flow: Flow<'_>) {
         if let Some(processing) = self.control.changed() {
             self.change(&processing);
@@ -239,7 +231,7 @@ impl<'a, S: Surroundings> LinkCore<'a, S> {
         }
     }
 
-    /// From the next scan on.
+    /// Applies `processing` from the next scan on.
     fn change(&mut self, processing: &Processing) {
         let now = self.around.now();
         self.output.change(processing, now);
@@ -248,14 +240,14 @@ impl<'a, S: Surroundings> LinkCore<'a, S> {
     }
 }
 
-/// Takes over `state` and `error`, and logs them if they are new. Returns whether they are. An error that stays through
+/// Sets `state` and `error`, and logs them if they have changed. Returns whether they have. An error that stays through
 /// several states is logged once.
 fn update(stats: &mut LinkStats, link: &Link, state: State, error: &str, now: Nanos) -> bool {
-    let told = stats.last().last_error_text;
+    let before = stats.last().last_error_text;
     let (changed, name) = (stats.update(state, error, now), &link.name);
     match error {
         _ if !changed => {}
-        _ if stats.last().last_error_text == told => tracing::info!("{name}: {}", state.name()),
+        _ if stats.last().last_error_text == before => tracing::info!("{name}: {}", state.name()),
         "" => tracing::info!("{name}: {}", state.name()),
         error => tracing::warn!("{name}: {}: {error}", state.name()),
     }
@@ -277,9 +269,9 @@ fn update_search(stats: &mut LinkStats, link: &Link, state: State, error: &str, 
 
 /// Minimum time between two log lines about a search.
 const SEARCH_LOG_PERIOD: Nanos = 60_000 * MILLIS;
-/// A port that is left alone is looked at so often whether it is still there; at the highest rate no rest is as long.
-const LONGEST_REST: Nanos = 40 * MILLIS;
-/// A status goes out at least so often.
+/// Interval between checks whether a port that is not read still exists. At the highest rate, no pause is longer.
+const POLL_INTERVAL: Nanos = 40 * MILLIS;
+/// Maximum time between two samples of the status.
 const STATUS_PERIOD: Nanos = 1_000 * MILLIS;
-/// A late joiner gets the last status after so long at the most.
-const GREETING_PERIOD: Nanos = 100 * MILLIS;
+/// Maximum time after which a new subscriber gets the history.
+const HISTORY_PERIOD: Nanos = 100 * MILLIS;

@@ -5,7 +5,7 @@ use scanhub_drivers::PortSession;
 use scanhub_drivers::line::Session as _;
 use schema::{Counter, Counters, Family, MIN_RATE_SPAN, Nanos, State, Status};
 
-use crate::process_telegram::Processed;
+use crate::link_output::Published;
 use crate::recent::{LineHealth, Recent};
 
 /// The link's statistics, across all sessions on its port.
@@ -102,9 +102,9 @@ impl LinkStats {
     }
 
     /// A telegram was published.
-    pub(crate) fn note(&mut self, processed: Processed) {
+    pub(crate) fn note(&mut self, processed: Published) {
         self.suspect += u64::from(processed.is_suspect);
-        self.scans += u64::from(processed.stands_for.is_some());
+        self.scans += u64::from(processed.verdict_lifetime.is_some());
     }
 
     /// Returns the status, so that a telegram of a recording can update it.

@@ -25,7 +25,7 @@ pub(crate) struct Pipeline {
     /// Maximum number of beams of a scan.
     beams: usize,
     /// Buffers for results that have no subscriber or no memory.
-    spare: Spare,
+    scratch: ScratchPayloads,
 }
 
 /// The background model, and which of its states were published and saved.
@@ -38,12 +38,12 @@ struct BackgroundStage {
     /// Scans that the model has learned from since then.
     learned: u32,
     /// Generation that was saved last, and the scans that the model has learned from since then.
-    handed_on: (u32, u32),
+    saved: (u32, u32),
     /// Number of beams and unit in micrometers of the model, if anything was learned or loaded.
     shape: Option<(u16, u32)>,
 }
 
-struct Spare {
+struct ScratchPayloads {
     zones: Zones,
     motion: Motion,
     foreground: Box<Foreground>,
@@ -51,25 +51,25 @@ struct Spare {
 
 /// Reason to learn the background again.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum Relearned {
+pub(crate) enum BackgroundReset {
     /// The model has another number of beams or another unit.
     Shape(Mismatch),
     /// The beams have other angles.
     Angles,
 }
 
-impl fmt::Display for Relearned {
+impl fmt::Display for BackgroundReset {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
-            Relearned::Shape(mismatch) => mismatch.fmt(f),
-            Relearned::Angles => f.write_str("the sensor's beams have other angles than before"),
+            BackgroundReset::Shape(mismatch) => mismatch.fmt(f),
+            BackgroundReset::Angles => f.write_str("the sensor's beams have other angles than before"),
         }
     }
 }
 
 /// Payloads for the results of a scan other than zones. `None`: the topic has no subscriber, or there is no memory.
 #[derive(Default)]
-pub(crate) struct Outputs<'a> {
+pub(crate) struct ResultBuffers<'a> {
     pub(crate) marks: Option<&'a mut Marks>,
     pub(crate) lines: Option<&'a mut Lines>,
     pub(crate) motion: Option<&'a mut Motion>,
@@ -88,7 +88,7 @@ impl Pipeline {
             background: background.is_kept.then(|| BackgroundStage::new(processing, beams)),
             processing: processing.clone(),
             beams,
-            spare: Spare {
+            scratch: ScratchPayloads {
                 zones: Zones::default(),
                 motion: Motion::default(),
                 foreground: Foreground::of(beams),
@@ -126,25 +126,25 @@ impl Pipeline {
 
     /// Computes the zones of `scan`, which subscribers need first. The state of the zones is updated even without
     /// `out`.
-    pub(crate) fn watch(&mut self, scan: &Scan, out: Option<&mut Zones>) {
-        self.zones.update(scan, out.unwrap_or(&mut self.spare.zones));
+    pub(crate) fn check_zones(&mut self, scan: &Scan, out: Option<&mut Zones>) {
+        self.zones.update(scan, out.unwrap_or(&mut self.scratch.zones));
     }
 
     /// Computes all other results of `scan`, which has the stamp `stamp_ns` and comes `period_ns` after the
     /// scan before. Returns a reason if the background does not fit the scan and starts again.
-    pub(crate) fn examine(
+    pub(crate) fn process(
         &mut self,
         scan: &Scan,
         stamp_ns: u64,
         period_ns: u64,
-        out: Outputs<'_>,
-    ) -> Option<Relearned> {
+        out: ResultBuffers<'_>,
+    ) -> Option<BackgroundReset> {
         if let Some(marks) = out.marks {
             self.marks.update(scan, marks);
         }
         let is_moving = self.background.as_ref().is_some_and(BackgroundStage::is_moving);
         let motion = match out.motion {
-            None if is_moving => Some(&mut self.spare.motion),
+            None if is_moving => Some(&mut self.scratch.motion),
             wanted => wanted,
         };
         if let Some(lines) = out.lines {
@@ -159,7 +159,7 @@ impl Pipeline {
                 }
             }
         }
-        self.background.as_mut()?.update(scan, out.foreground, &mut self.spare.foreground)
+        self.background.as_mut()?.update(scan, out.foreground, &mut self.scratch.foreground)
     }
 
     /// Returns the number of reads per telegram while early warnings have a subscriber.
@@ -168,23 +168,23 @@ impl Pipeline {
     }
 
     /// Writes the zones for a time without scans: unknown.
-    pub(crate) fn stale(&mut self, out: &mut Zones) {
+    pub(crate) fn mark_zones_unknown(&mut self, out: &mut Zones) {
         self.zones.stale(out);
     }
 
     /// Returns whether there is a background model.
-    pub(crate) fn keeps_background(&self) -> bool {
+    pub(crate) fn has_background(&self) -> bool {
         self.background.is_some()
     }
 
     /// Returns whether the model is published with every scan.
-    pub(crate) fn shows_every_scan(&self) -> bool {
+    pub(crate) fn publishes_every_scan(&self) -> bool {
         self.background.as_ref().is_some_and(|kept| kept.every_scan)
     }
 
     /// Returns whether the model is worth publishing: its generation was not published yet, or it has learned since
     /// then from as many scans as it needs for a new object.
-    pub(crate) fn is_news(&self) -> bool {
+    pub(crate) fn is_background_due(&self) -> bool {
         let is_new = |kept: &BackgroundStage| kept.published != Some(kept.model.generation());
         let has_learned = |kept: &BackgroundStage| kept.learned >= u32::from(kept.model.scans());
         self.background
@@ -193,12 +193,12 @@ impl Pipeline {
     }
 
     /// Returns the size of the model in bytes, 0 without one.
-    pub(crate) fn model_len(&self) -> usize {
+    pub(crate) fn background_len(&self) -> usize {
         self.background.as_ref().map_or(0, |kept| Background::len(kept.model.beams()))
     }
 
     /// Writes the model into `out`, and counts it as published.
-    pub(crate) fn show(&mut self, out: &mut Background) {
+    pub(crate) fn write_background(&mut self, out: &mut Background) {
         if let Some(kept) = &mut self.background {
             kept.model.show(out);
             kept.published = Some(out.generation);
@@ -207,17 +207,17 @@ impl Pipeline {
     }
 
     /// Returns the model and the sensor's pose for the next hub if they are worth saving. They are if the generation
-    /// was not saved yet, or if the model has learned from as many scans as it needs. At the end of the hub (`last`),
+    /// was not saved yet, or if the model has learned from as many scans as it needs. At the end of the hub (`is_last`),
     /// one scan is enough.
-    pub(crate) fn hand_on(&mut self, last: bool) -> Option<(Pose, Box<Background>)> {
+    pub(crate) fn take_background_to_save(&mut self, is_last: bool) -> Option<(Pose, Box<Background>)> {
         let Processing { pose, background, .. } = &self.processing;
         let kept = self.background.as_mut().filter(|kept| background.is_handed_on && !kept.is_moving())?;
-        let (generation, learned) = kept.handed_on;
-        let enough = if last { 1 } else { u32::from(kept.model.scans()) };
+        let (generation, learned) = kept.saved;
+        let enough = if is_last { 1 } else { u32::from(kept.model.scans()) };
         if learned < enough && generation == kept.model.generation() {
             return None;
         }
-        kept.handed_on = (kept.model.generation(), 0);
+        kept.saved = (kept.model.generation(), 0);
         Some((*pose, kept.shown()))
     }
 
@@ -269,13 +269,13 @@ impl BackgroundStage {
             every_scan: background.every_scan,
             published: None,
             learned: 0,
-            handed_on: (0, 0),
+            saved: (0, 0),
             shape: None,
         };
         if let Some(model) = background.model.as_ref().filter(|_| !kept.is_moving()) {
             // Before the first scan, every model fits.
             let _ = kept.load(model);
-            kept.handed_on.0 = kept.model.generation();
+            kept.saved.0 = kept.model.generation();
         }
         kept
     }
@@ -303,7 +303,7 @@ impl BackgroundStage {
         scan: &Scan,
         out: Option<&mut Foreground>,
         spare: &mut Foreground,
-    ) -> Option<Relearned> {
+    ) -> Option<BackgroundReset> {
         let before = self.model.generation();
         match out {
             Some(out) => {
@@ -318,10 +318,11 @@ impl BackgroundStage {
         }
         let scans = u32::from(!self.model.is_frozen());
         self.learned = self.learned.saturating_add(scans);
-        self.handed_on.1 = self.handed_on.1.saturating_add(scans);
+        self.saved.1 = self.saved.1.saturating_add(scans);
         let sensor = (scan.beams() as u16, scan.unit_um);
         let model = self.shape.replace(sensor).filter(|shape| *shape != sensor);
-        let reason = model.map_or(Relearned::Angles, |model| Relearned::Shape(Mismatch { model, sensor }));
+        let reason =
+            model.map_or(BackgroundReset::Angles, |model| BackgroundReset::Shape(Mismatch { model, sensor }));
         (self.model.generation() != before).then_some(reason)
     }
 }
@@ -349,7 +350,7 @@ mod tests {
 
     fn shown(pipeline: &mut Pipeline) -> Box<Background> {
         let mut model = Background::zeroed(Background::len(401));
-        pipeline.show(&mut model);
+        pipeline.write_background(&mut model);
         model
     }
 
@@ -358,30 +359,30 @@ mod tests {
         let mut pipeline = pipeline(&processing(|_| {}));
         let mut zones = Zones::default();
         for _ in 0..20 {
-            assert_eq!(pipeline.examine(&wall(361, 1, 3000), 0, 0, Outputs::default()), None);
+            assert_eq!(pipeline.process(&wall(361, 1, 3000), 0, 0, ResultBuffers::default()), None);
         }
         let mut foreground = Foreground::of(361);
         let near = wall(361, 1, 500);
-        let out = Outputs { foreground: Some(&mut foreground), ..Outputs::default() };
-        pipeline.watch(&near, Some(&mut zones));
-        assert_eq!(pipeline.examine(&near, 0, 0, out), None);
+        let out = ResultBuffers { foreground: Some(&mut foreground), ..ResultBuffers::default() };
+        pipeline.check_zones(&near, Some(&mut zones));
+        assert_eq!(pipeline.process(&near, 0, 0, out), None);
         assert_eq!((zones.verdict(), foreground.beams), (Verdict::Stop, 361));
         assert_eq!(foreground.segments().len(), 1, "segments are those of this scan");
         let mut stale = Zones::default();
-        pipeline.stale(&mut stale);
+        pipeline.mark_zones_unknown(&mut stale);
         assert_eq!((stale.verdict(), stale.count), (Verdict::Unknown, 2));
     }
 
     #[test]
     fn a_generation_is_new_until_it_is_published() {
         let mut pipeline = pipeline(&processing(|_| {}));
-        assert!(!pipeline.is_news(), "nothing was learned yet");
-        pipeline.examine(&wall(361, 1, 3000), 0, 0, Outputs::default());
-        assert!(pipeline.is_news());
-        assert_eq!((shown(&mut pipeline).generation, pipeline.is_news()), (0, false));
+        assert!(!pipeline.is_background_due(), "nothing was learned yet");
+        pipeline.process(&wall(361, 1, 3000), 0, 0, ResultBuffers::default());
+        assert!(pipeline.is_background_due());
+        assert_eq!((shown(&mut pipeline).generation, pipeline.is_background_due()), (0, false));
         for (verb, is_news) in [(Verb::Freeze, false), (Verb::Thaw, false), (Verb::Reset, true)] {
             assert_eq!(pipeline.handle("a", verb, &Box::<Background>::default()), Ok(None));
-            assert_eq!(pipeline.is_news(), is_news, "{verb:?}");
+            assert_eq!(pipeline.is_background_due(), is_news, "{verb:?}");
         }
         assert_eq!(shown(&mut pipeline).generation, 1);
         let asked = pipeline
@@ -394,20 +395,20 @@ mod tests {
     #[test]
     fn a_model_that_has_learned_enough_is_published_again() {
         let mut pipeline = pipeline(&processing(|_| {}));
-        pipeline.examine(&wall(361, 1, 3000), 0, 0, Outputs::default());
+        pipeline.process(&wall(361, 1, 3000), 0, 0, ResultBuffers::default());
         assert_eq!(shown(&mut pipeline).taught, 0);
         for _ in 0..3 {
-            pipeline.examine(&wall(361, 1, 3000), 0, 0, Outputs::default());
-            assert!(!pipeline.is_news());
+            pipeline.process(&wall(361, 1, 3000), 0, 0, ResultBuffers::default());
+            assert!(!pipeline.is_background_due());
         }
-        pipeline.examine(&wall(361, 1, 3000), 0, 0, Outputs::default());
-        assert!(pipeline.is_news());
-        assert_eq!((shown(&mut pipeline).taught, pipeline.is_news()), (361, false));
+        pipeline.process(&wall(361, 1, 3000), 0, 0, ResultBuffers::default());
+        assert!(pipeline.is_background_due());
+        assert_eq!((shown(&mut pipeline).taught, pipeline.is_background_due()), (361, false));
         pipeline.handle("a", Verb::Freeze, &Box::<Background>::default()).expect("is kept");
         for _ in 0..9 {
-            pipeline.examine(&wall(361, 1, 3000), 0, 0, Outputs::default());
+            pipeline.process(&wall(361, 1, 3000), 0, 0, ResultBuffers::default());
         }
-        assert!(!pipeline.is_news(), "a frozen model stays as it is");
+        assert!(!pipeline.is_background_due(), "a frozen model stays as it is");
     }
 
     #[test]
@@ -416,40 +417,49 @@ mod tests {
         let model = Background::of(head, &[300; 181]);
         let kept = model.clone();
         let mut pipeline = pipeline(&processing(|processing| processing.background.model = Some(kept)));
-        let (first, is_news) = (shown(&mut pipeline), pipeline.is_news());
+        let (first, is_news) = (shown(&mut pipeline), pipeline.is_background_due());
         assert_eq!((first.generation, first.taught, first.ranges()[180], is_news), (1, 181, 300, false));
-        let reason = pipeline.examine(&wall(361, 10, 300), 0, 0, Outputs::default());
-        assert_eq!(reason, Some(Relearned::Shape(Mismatch { model: (181, 10_000), sensor: (361, 10_000) })));
-        assert!(pipeline.is_news());
+        let reason = pipeline.process(&wall(361, 10, 300), 0, 0, ResultBuffers::default());
+        assert_eq!(
+            reason,
+            Some(BackgroundReset::Shape(Mismatch { model: (181, 10_000), sensor: (361, 10_000) }))
+        );
+        assert!(pipeline.is_background_due());
         let refusal = pipeline.handle("a", Verb::Load, &model).expect_err("another resolution");
         assert_eq!(refusal.kind, Kind::Configuration);
         let words = "a: the model has 181 beams in units of 10 mm, the sensor's scans have 361 beams in units of 10 mm";
         assert_eq!(refusal.message, words);
-        assert!(pipeline.examine(&wall(361, 1, 3000), 0, 0, Outputs::default()).is_some(), "another unit");
+        assert!(
+            pipeline.process(&wall(361, 1, 3000), 0, 0, ResultBuffers::default()).is_some(),
+            "another unit"
+        );
         let mut turned = wall(361, 1, 3000);
         turned.first_angle = -1.0;
         shown(&mut pipeline);
-        assert_eq!(pipeline.examine(&turned, 0, 0, Outputs::default()), Some(Relearned::Angles));
-        assert_eq!((pipeline.is_news(), pipeline.examine(&turned, 0, 0, Outputs::default())), (true, None));
+        assert_eq!(pipeline.process(&turned, 0, 0, ResultBuffers::default()), Some(BackgroundReset::Angles));
+        assert_eq!(
+            (pipeline.is_background_due(), pipeline.process(&turned, 0, 0, ResultBuffers::default())),
+            (true, None)
+        );
     }
 
     #[test]
     fn other_settings_keep_the_background() {
         let mut pipeline = pipeline(&processing(|_| {}));
         for _ in 0..20 {
-            pipeline.examine(&wall(361, 1, 3000), 0, 0, Outputs::default());
+            pipeline.process(&wall(361, 1, 3000), 0, 0, ResultBuffers::default());
         }
         let told = |pipeline: &mut Pipeline, range| {
             let (mut zones, mut foreground) = (Zones::default(), Foreground::of(361));
-            let out = Outputs { foreground: Some(&mut foreground), ..Outputs::default() };
-            pipeline.watch(&wall(361, 1, range), Some(&mut zones));
-            assert_eq!(pipeline.examine(&wall(361, 1, range), 0, 0, out), None);
+            let out = ResultBuffers { foreground: Some(&mut foreground), ..ResultBuffers::default() };
+            pipeline.check_zones(&wall(361, 1, range), Some(&mut zones));
+            assert_eq!(pipeline.process(&wall(361, 1, range), 0, 0, out), None);
             (zones.verdict(), foreground.beams)
         };
         let known = shown(&mut pipeline);
         assert_eq!((told(&mut pipeline, 2000), known.taught), ((Verdict::Clear, 361), 361));
         pipeline.change(&processing(|processing| processing.zones.radii_mm = vec![2500]));
-        assert!(!pipeline.is_news(), "the background is not concerned");
+        assert!(!pipeline.is_background_due(), "the background is not concerned");
         assert_eq!(told(&mut pipeline, 2000), (Verdict::Stop, 361));
         pipeline.change(&processing(|processing| {
             processing.background.learning.method = preprocess::background::Method::Paper;
@@ -459,16 +469,18 @@ mod tests {
         assert_eq!((changed.generation, changed.ranges()), (known.generation + 1, known.ranges()));
         assert_eq!(told(&mut pipeline, 2000), (Verdict::Clear, 0), "the threshold is another one");
         pipeline.change(&processing(|processing| processing.background.is_kept = false));
-        assert!(!pipeline.keeps_background());
+        assert!(!pipeline.has_background());
         pipeline.change(&processing(|_| {}));
-        assert_eq!((pipeline.keeps_background(), shown(&mut pipeline).taught), (true, 0));
+        assert_eq!((pipeline.has_background(), shown(&mut pipeline).taught), (true, 0));
     }
 
     #[test]
     fn a_request_without_a_background_names_the_key() {
         let mut pipeline = pipeline(&processing(|processing| processing.background.is_kept = false));
-        pipeline.examine(&wall(361, 1, 3000), 0, 0, Outputs::default());
-        assert!(!pipeline.keeps_background() && !pipeline.is_news() && !pipeline.shows_every_scan());
+        pipeline.process(&wall(361, 1, 3000), 0, 0, ResultBuffers::default());
+        assert!(
+            !pipeline.has_background() && !pipeline.is_background_due() && !pipeline.publishes_every_scan()
+        );
         let refusal =
             pipeline.handle("side", Verb::Show, &Box::<Background>::default()).expect_err("none is kept");
         assert!(refusal.hint.contains("link.side.background.method=multi"), "{refusal}");

@@ -149,7 +149,7 @@ impl<'a, S: Surroundings> LiveLink<'a, S> {
             }
         }
         let (on, until) = self.phase.wait();
-        let bound = self.core.bound(until, matches!(on, On::Loss(_)));
+        let bound = self.core.next_deadline(until, matches!(on, On::Loss(_)));
         Wait { requests: &self.core.control, on, until: bound }
     }
 

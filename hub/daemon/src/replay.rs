@@ -109,7 +109,7 @@ impl<'a, 'p> ReplayLink<'a, 'p> {
     fn play(&mut self, mut recorded: Recorded) {
         let mut lap = 0;
         if let Some(wall_ns) = recorded.begin_ns() {
-            self.link.output.topics.recall(wall_ns, Flags::REPLAYED);
+            self.link.output.topics.set_recorded_time(wall_ns, Flags::REPLAYED);
         }
         loop {
             self.look_at = 0;
@@ -118,7 +118,7 @@ impl<'a, 'p> ReplayLink<'a, 'p> {
                 Recorded::Frames(frames) => frames::play(self, frames),
             };
             let Some(limit) = ended else { return };
-            self.link.output.stand_until(limit.map_or(Nanos::MAX, |limit| clock::now() + limit));
+            self.link.output.extend_verdict(limit.map_or(Nanos::MAX, |limit| clock::now() + limit));
             loop {
                 if let Turn::Restart(next) = self.handle.end(lap, clock::now()) {
                     lap = next;

@@ -161,7 +161,7 @@ impl<'a> LinkCore<'a, System<'a>> {
     /// Waits until `news` is readable, a request, `until`, or the hub's end; meanwhile what is due goes out.
     pub(crate) fn wait(&mut self, news: BorrowedFd<'_>, until: Nanos) -> Woken {
         loop {
-            let bound = self.bound(until, false);
+            let bound = self.next_deadline(until, false);
             let woken = self.around.wait(&self.control, Some((news, PollFlags::IN)), bound);
             if self.is_over(woken, until) {
                 return woken;

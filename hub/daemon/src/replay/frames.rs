@@ -12,8 +12,8 @@ use schema::{Flags, Header, MILLIS, Nanos, State};
 
 use super::recorded::Frames;
 use super::{LONGEST_GAP, ReplayLink, STANDS};
+use crate::link_output::{RecordedMetadata, micros, verdict_lifetime};
 use crate::player::Due;
-use crate::process_telegram::{RecordedContext, limit, micros};
 
 /// Plays `frames` into the topics of `replay`. Returns how long the last verdict stays valid at the end; `None` if the
 /// hub must end.
@@ -127,7 +127,7 @@ impl Lap<'_> {
             return Some(());
         };
         if when.is_skipped {
-            replay.link.output.learn_silence();
+            replay.link.output.note_silence();
             return Some(());
         }
         let at = silence.until.clamp(self.start_ns, when.media);
@@ -146,7 +146,7 @@ impl Lap<'_> {
         if !self.has_begun || self.run != run {
             if std::mem::replace(&mut self.has_begun, true) {
                 self.verdict = None;
-                if when.is_skipped { replay.link.output.forget() } else { replay.restart() }
+                if when.is_skipped { replay.link.output.reset() } else { replay.restart() }
             }
             if let Some(session) = self.shown_session() {
                 replay.link.stats.close(session);
@@ -209,14 +209,14 @@ impl Lap<'_> {
                 };
                 replay.link.stats.note_recorded(received.bytes.len());
                 let gap = next.and_then(|next| gap(frame, next));
-                let recorded = RecordedContext {
+                let recorded = RecordedMetadata {
                     period_us: header.map(|header| header.period_us),
                     gap_us: gap.map_or(0, |gap| (gap / 1000) as u32),
                     stretch: due.stretch,
                     ..recorded(frame)
                 };
                 self.limit = replay.link.publish(&received, &recorded, false).or(self.limit);
-                replay.link.output.stand_until(STANDS);
+                replay.link.output.extend_verdict(STANDS);
                 replay.handle.played(when.begin);
                 self.state = State::Streaming;
                 replay.link.show(None, self.state, &replay.trouble);
@@ -232,7 +232,7 @@ impl Lap<'_> {
     /// Plays packets of a rotating scanner, and the revolutions that end with them. Returns `None` if the hub must end.
     fn play_packets(&mut self, replay: &mut ReplayLink<'_, '_>, frame: &Frame, when: When) -> Option<()> {
         let at = self.wait(replay, when)?.map(|due| {
-            let recorded = RecordedContext { stretch: due.stretch, ..recorded(frame) };
+            let recorded = RecordedMetadata { stretch: due.stretch, ..recorded(frame) };
             (self.last_stamp, recorded)
         });
         if let Some((at, recorded)) = &at {
@@ -260,10 +260,10 @@ impl Lap<'_> {
             let here = |stamp: Nanos| at.saturating_sub(when.last.saturating_sub(stamp));
             let wall_ns = recorded.wall_ns.map(|ns| ns.saturating_add(scan.first).saturating_sub(when.first));
             let (first, last) = (here(scan.first), here(scan.last));
-            let recorded = RecordedContext { wall_ns, ..recorded };
+            let recorded = RecordedMetadata { wall_ns, ..recorded };
             *last_limit = Some(replay.link.publish_scan(&RawScan { first, last, ..scan }, &recorded, false));
-            replay.link.output.stand_until(STANDS);
-            let valid = limit(micros(scan.period));
+            replay.link.output.extend_verdict(STANDS);
+            let valid = verdict_lifetime(micros(scan.period));
             let (until_ns, until) = (when.last.saturating_add(valid), when.media.saturating_add(valid));
             *verdict = Some(Verdict { of: when.media, until_ns, until });
             *state = State::Streaming;
@@ -279,7 +279,7 @@ impl Verdict {
     /// Returns how long the verdict on the scan with `header`, at `media`, was valid in the hub that recorded it.
     fn of(header: &Header, media: Nanos) -> Verdict {
         let published = header.stamp_last_ns.saturating_add(header.hub_time_ns().unwrap_or(0));
-        let until_ns = published.saturating_add(limit(header.period_us));
+        let until_ns = published.saturating_add(verdict_lifetime(header.period_us));
         let after = until_ns.saturating_sub(header.stamp_first_ns);
         Verdict { of: media, until_ns, until: media.saturating_add(after) }
     }
@@ -299,11 +299,11 @@ impl When {
     }
 }
 
-fn recorded(frame: &Frame) -> RecordedContext {
-    RecordedContext {
+fn recorded(frame: &Frame) -> RecordedMetadata {
+    RecordedMetadata {
         wall_ns: frame.wall_ns,
         flags: frame.header.map_or(0, |header| header.flags & Flags::SIMULATED),
-        ..RecordedContext::default()
+        ..RecordedMetadata::default()
     }
 }
 

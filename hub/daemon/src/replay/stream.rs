@@ -8,7 +8,7 @@ use schema::{MILLIS, Nanos, State};
 
 use super::recorded::{Stream, read};
 use super::{ReplayLink, STANDS};
-use crate::process_telegram::RecordedContext;
+use crate::link_output::RecordedMetadata;
 
 /// Plays `stream` into the topics of `replay`. At the end, for how long the last verdict stands; nothing if the hub
 /// shall end.
@@ -24,7 +24,7 @@ pub(super) fn play(replay: &mut ReplayLink<'_, '_>, stream: &Stream) -> Option<O
     let link = replay.link.link;
     let settings = Settings { mode_number: stream.mode, ..link.settings() };
     let mut session = PortSession::begin(Some(stream.family), &settings, None, clock::now());
-    let mut recorded = RecordedContext::default();
+    let mut recorded = RecordedMetadata::default();
     let (mut media, mut limit) = (0, None);
     let state = if stream.has_telegrams() { State::Streaming } else { State::Probing };
     loop {
@@ -51,7 +51,7 @@ pub(super) fn play(replay: &mut ReplayLink<'_, '_>, stream: &Stream) -> Option<O
         while let Output::Event(Event::Telegram(received)) = session.poll_output() {
             if !is_skipped {
                 limit = replay.link.publish(&received, &recorded, false).or(limit);
-                replay.link.output.stand_until(STANDS);
+                replay.link.output.extend_verdict(STANDS);
                 replay.handle.played(media);
             } else if let Some(scan) = received.whole.and_then(|whole| whole.scan) {
                 replay.link.output.learn(&scan);

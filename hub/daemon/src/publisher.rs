@@ -1,0 +1,139 @@
+//! Publisher of one topic of a link. It takes the loan for a sample before the sample arrives, so that a telegram does
+//! not have to wait for memory.
+
+use schema::limits::history;
+use schema::{Failure, Header};
+use shm::{DueRings, Medium, Payload, TopicPublisher};
+
+use crate::surroundings::Surroundings;
+
+/// Publisher of one topic, which takes a loan before the sample arrives.
+///
+/// A topic without a history is not sent while it has no subscriber, and its number is skipped. Sending visits the
+/// slots of all possible subscribers, and after a pause none of them is in the processor's cache.
+pub(crate) struct PreparedPublisher<P: Payload + ?Sized, M: Medium<P>> {
+    topic: TopicPublisher<P, M>,
+    /// Subscribers that got the last sample.
+    reached: usize,
+    /// Loan for the next sample, with the length of the last one.
+    prepared: Option<M::Loan>,
+    last_len: usize,
+}
+
+/// Loan of a sample.
+pub(crate) enum Loan<P: Payload + ?Sized, M: Medium<P>> {
+    /// Memory that the sample is written into.
+    Taken(M::Loan),
+    /// There is no memory for the sample.
+    Lacking,
+    /// The topic has no subscriber.
+    Unwanted,
+}
+
+impl<P: Payload + ?Sized, M: Medium<P>> PreparedPublisher<P, M> {
+    /// Opens the topic of `sensor`.
+    ///
+    /// # Errors
+    ///
+    /// Returns [`Kind::Short`](schema::Kind::Short) if no memory or descriptors are left.
+    pub(crate) fn new(around: &impl Surroundings<Medium<P> = M>, sensor: &str) -> Result<Self, Failure> {
+        let topic = TopicPublisher::over(around.medium::<P>(sensor)?);
+        Ok(PreparedPublisher { topic, reached: 0, prepared: None, last_len: 0 })
+    }
+
+    /// Takes a loan for the sample that is about to arrive, as long as the last one, and connects new subscribers.
+    pub(crate) fn prepare(&mut self) {
+        if self.prepared.is_none() && self.is_wanted() {
+            self.prepared = self.topic.loan(self.last_len).ok();
+        }
+        // Connects now instead of while the telegram waits. It also brings the slots into the cache.
+        self.connect();
+    }
+
+    /// Takes a loan for the next sample. `len` is its size in bytes if the payload has no fixed size.
+    pub(crate) fn loan(&mut self, len: usize) -> Loan<P, M> {
+        if !self.is_wanted() {
+            return Loan::Unwanted;
+        }
+        if self.last_len != len {
+            self.last_len = len;
+            self.prepared = None;
+        }
+        self.prepared.take().or_else(|| self.topic.loan(len).ok()).map_or(Loan::Lacking, Loan::Taken)
+    }
+
+    /// Sends a sample from [`loan`](Self::loan), and notes in `due` which doorbell has to ring.
+    pub(crate) fn send(&mut self, loan: Loan<P, M>, header: &Header, due: &mut DueRings) {
+        match loan {
+            Loan::Taken(loan) => {
+                // The topic counts a failure.
+                if let Ok(reached) = self.topic.send_loan(loan, header) {
+                    self.reached = reached;
+                    due.note(P::TOPIC, reached);
+                }
+            }
+            Loan::Lacking => self.topic.fail(),
+            Loan::Unwanted => self.skip(),
+        }
+    }
+
+    /// Skips the number of a sample that is not sent, because the topic has no subscriber.
+    pub(crate) fn skip(&mut self) {
+        self.topic.skip(1);
+        self.reached = 0;
+    }
+
+    /// Returns the number of samples that were dropped because there was no memory.
+    pub(crate) fn failed(&self) -> u64 {
+        self.topic.failed()
+    }
+
+    /// Returns whether the topic has a subscriber.
+    pub(crate) fn has_subscribers(&self) -> bool {
+        self.topic.subscribers() > 0
+    }
+
+    /// Returns whether a subscriber got the last sample.
+    pub(crate) fn has_reached(&self) -> bool {
+        self.reached > 0
+    }
+
+    /// Returns the number of attached subscribers that did not get the last sample.
+    pub(crate) fn undelivered(&self) -> usize {
+        let has_begun = self.topic.next_number() > 0;
+        if has_begun { self.topic.subscribers().saturating_sub(self.reached) } else { 0 }
+    }
+
+    /// Connects new subscribers, and gives them the history of the topic.
+    pub(crate) fn connect(&self) {
+        if let Err(error) = self.topic.connect() {
+            tracing::debug!(?error, "a subscriber could not be connected");
+        }
+    }
+
+    /// Returns whether samples are sent: the topic has a subscriber, or a history for later ones.
+    fn is_wanted(&self) -> bool {
+        history(P::TOPIC) > 0 || self.has_subscribers()
+    }
+}
+
+impl<M: Medium<[u8]>> PreparedPublisher<[u8], M> {
+    /// Publishes `bytes` if the topic has a subscriber.
+    pub(crate) fn send_bytes(&mut self, bytes: &[u8], header: &Header, due: &mut DueRings) {
+        let mut loan = self.loan(bytes.len());
+        if let Some(payload) = loan.payload_mut() {
+            payload.copy_from_slice(bytes);
+        }
+        self.send(loan, header, due);
+    }
+}
+
+impl<P: Payload + ?Sized, M: Medium<P>> Loan<P, M> {
+    /// Returns the payload, if there is memory for it.
+    pub(crate) fn payload_mut(&mut self) -> Option<&mut P> {
+        match self {
+            Loan::Taken(loan) => Some(M::payload_mut(loan)),
+            Loan::Lacking | Loan::Unwanted => None,
+        }
+    }
+}
