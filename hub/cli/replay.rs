@@ -32,7 +32,7 @@ pub(crate) struct Replay {
     /// Stay at the end, without publishing, until Ctrl-C
     #[arg(long)]
     pub(crate) hold: bool,
-    /// Play only this sensor; for a stream or a log, the name that it gets [default: front]
+    /// Play only this sensor, and no mounts; for a stream or a log, the name that it gets [default: front]
     #[arg(long, value_name = "NAME")]
     pub(crate) sensor: Option<String>,
     /// Family of a telegram stream: lms, ld or rplidar [default: recognized by its bytes]

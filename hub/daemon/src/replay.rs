@@ -149,7 +149,7 @@ impl<'a, 'p> ReplayLink<'a, 'p> {
                 Turn::Now(due) if now < self.look_at => return Some(due),
                 Turn::Now(_) => 0,
                 Turn::At(at) => at.min(now + IDLE),
-                Turn::Wait | Turn::Restart(_) | Turn::Over => now + IDLE,
+                Turn::Wait | Turn::Restart(_) | Turn::Skipped | Turn::Over => now + IDLE,
             };
             if self.rest(until) == Woken::Stop {
                 return None;

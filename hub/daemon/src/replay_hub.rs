@@ -20,7 +20,7 @@ use crate::supervise::{self, Ready, ReplaySet};
 pub struct Replay<'a> {
     /// The recording.
     pub file: &'a Path,
-    /// Of one with several sensors the only one to play; of one that names none the name that it gets.
+    /// Only sensor to play, without mounts. For a recording that has no sensor names, the name that its sensor gets.
     pub sensor: Option<&'a str>,
     /// Family of a stream file; `None` if it is recognized by the bytes.
     pub family: Option<Family>,
@@ -66,7 +66,7 @@ pub fn replay(
     let mut mounts = Vec::new();
     if let Some(origin) = parts.iter().filter_map(Recorded::origin).reduce(Origin::earlier) {
         parts.iter_mut().for_each(|part| part.set_origin(origin));
-        mounts = self::mounts(&recording, origin, &config)?;
+        mounts = self::mounts(&recording, replay.sensor, origin, &config)?;
     }
     let length = parts.iter().filter_map(Recorded::length).max();
     let start_ns = replay.play.start_ns;
@@ -142,10 +142,21 @@ fn sensors(recording: &Recording, wanted: Option<&str>) -> Result<Vec<Sensor>, F
     Ok(sensors)
 }
 
-/// Returns the mounts of `recording`, under names that no link of `config` has.
-fn mounts(recording: &Recording, origin: Origin, config: &Config) -> Result<Vec<RecordedMount>, Failure> {
+/// Returns the mounts of `recording`, under names that no link of `config` has. If the user chose a sensor, no mount is played.
+fn mounts(
+    recording: &Recording,
+    chosen: Option<&str>,
+    origin: Origin,
+    config: &Config,
+) -> Result<Vec<RecordedMount>, Failure> {
     let mut mounts: Vec<RecordedMount> = Vec::new();
     for recorded in recording.mounts() {
+        if chosen.is_some() {
+            tracing::info!(
+                "{recorded}: not played, because --sensor plays only one sensor; replay without --sensor plays it"
+            );
+            continue;
+        }
         let name = link_name(&recorded);
         check_sensor(&name)?;
         let is_taken = config.links.iter().any(|link| link.name == name)

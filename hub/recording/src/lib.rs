@@ -43,6 +43,15 @@ pub struct Frame {
     pub header: Option<schema::Header>,
 }
 
+/// Record of a file that matters for the angles of a mount.
+#[derive(Clone, Copy, Debug)]
+pub enum MountRecord {
+    /// Angle of the mount.
+    Angle(schema::Header, schema::Tilt),
+    /// Header of a telegram from a sensor of the mount's machine. Its stamps are from the same clock as the mount's.
+    Telegram(schema::Header),
+}
+
 impl Frame {
     /// Whether it is a telegram of measured values (B0h), which is what an LMS streams.
     pub fn is_scan(&self) -> bool {

@@ -13,7 +13,7 @@ use scanhub_drivers::lms::variant::Mode;
 use schema::datagram::Packed;
 use schema::{Family, Foreground, Header, Pace, Scan, Status, Tilt, Topic};
 
-use crate::{Contents, Damage, Form, Frame};
+use crate::{Contents, Damage, Form, Frame, MountRecord};
 pub(crate) use catalog::Catalog;
 use catalog::Place;
 use records::Records;
@@ -329,30 +329,46 @@ impl<R: Read> Iterator for Frames<R> {
     }
 }
 
-/// The angles of one mount, in the order of the file.
+/// The angles of one mount and the telegrams of its machine, in the order of the file.
 pub(crate) struct Angles<R> {
     reader: Reader<R>,
     mount: String,
+    /// Whether the recording has no sensor of the mount's machine. Then the telegrams of all machines count.
+    is_alone: bool,
 }
 
 impl<R: Read> Angles<R> {
     pub(crate) fn new(input: R, survey: &Arc<Survey>, mount: String) -> Self {
-        Angles { reader: survey.reader(input), mount }
+        let is_near = |sensor: &String| machine(sensor) == machine(&mount);
+        let is_alone = !survey.catalog().sensors().iter().any(is_near);
+        Angles { reader: survey.reader(input), mount, is_alone }
     }
 }
 
 impl<R: Read> Iterator for Angles<R> {
-    type Item = (Header, Tilt);
+    type Item = MountRecord;
 
-    fn next(&mut self) -> Option<(Header, Tilt)> {
+    fn next(&mut self) -> Option<MountRecord> {
         loop {
-            if let Item::Record(record) = self.reader.next().ok()??
-                && let Some(angle) = self.reader.catalog.angle(&record, &self.mount)
-            {
-                return Some(angle);
+            match self.reader.next().ok()?? {
+                Item::Record(record) => {
+                    if let Some((header, tilt)) = self.reader.catalog.angle(&record, &self.mount) {
+                        return Some(MountRecord::Angle(header, tilt));
+                    }
+                }
+                Item::Telegram(Sample { sensor, header, .. }) => {
+                    if self.is_alone || machine(&sensor) == machine(&self.mount) {
+                        return Some(MountRecord::Telegram(header));
+                    }
+                }
             }
         }
     }
+}
+
+/// Returns the machine in the name of a remote sensor; `None` for a sensor of this machine.
+fn machine(sensor: &str) -> Option<&str> {
+    sensor.split_once('.').map(|(machine, _)| machine)
 }
 
 /// Maximum number of runs of a hub that are remembered: one per minute for a month.

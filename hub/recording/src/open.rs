@@ -10,14 +10,14 @@ use scanhub_drivers::lms::variant::{Mode, Unit};
 use scanhub_drivers::recognize::{EXAMINED, bytes_by_family, family_of, framing_mode};
 use scanhub_drivers::{Model, Session, Settings, features};
 use scanhub_files::regular;
-use schema::{Failure, Family, Header, Kind, Tilt};
+use schema::{Failure, Family, Kind};
 
 use crate::carmen::{self, Log};
 #[cfg(feature = "mcap")]
 use crate::mcap::{Catalog, Reader};
 use crate::packed::Packed;
 use crate::stream::{Packets, Telegrams, survey_packets, survey_telegrams};
-use crate::{Contents, Form, Frame, VirtualTime};
+use crate::{Contents, Form, Frame, MountRecord, VirtualTime};
 
 /// How a log's metres become value words; a telegram stream is what it is.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -335,19 +335,20 @@ impl Recording {
         Vec::new()
     }
 
-    /// Returns the angles of a mount in the order of the file. If the file becomes unreadable meanwhile, they end there.
+    /// Returns the angles of a mount and the telegrams of its machine in the order of the file. If the file becomes
+    /// unreadable meanwhile, they end there.
     ///
     /// # Errors
     ///
     /// Returns [`Kind::Input`] if the file cannot be opened.
     #[cfg(feature = "mcap")]
-    pub fn angles(&self, mount: &str) -> Result<Box<dyn Iterator<Item = (Header, Tilt)> + Send>, Failure> {
+    pub fn angles(&self, mount: &str) -> Result<Box<dyn Iterator<Item = MountRecord> + Send>, Failure> {
         Ok(Box::new(crate::mcap::Angles::new(reader(&self.path)?, &self.survey, mount.to_owned())))
     }
 
     /// Returns no angles: only MCAP contains them.
     #[cfg(not(feature = "mcap"))]
-    pub fn angles(&self, _: &str) -> Result<Box<dyn Iterator<Item = (Header, Tilt)> + Send>, Failure> {
+    pub fn angles(&self, _: &str) -> Result<Box<dyn Iterator<Item = MountRecord> + Send>, Failure> {
         Ok(Box::new(std::iter::empty()))
     }
 

@@ -46,6 +46,8 @@ pub(super) struct Playback {
     owes_step: bool,
     /// Whether links that wait have to ask again.
     is_news: bool,
+    /// End of the last silence that was skipped in this lap, as media time; 0 if there was none. Angles before it are not played.
+    skipped_until: Nanos,
 }
 
 /// What a link has next.
@@ -67,6 +69,8 @@ pub(crate) enum Turn {
     At(Nanos),
     /// It is to ask again when something has changed.
     Wait,
+    /// Its time was skipped with a silence. Only samples that belong to no link are skipped.
+    Skipped,
     /// It starts again, with this lap.
     Restart(u32),
     /// Nothing comes any more, for nobody.
@@ -97,6 +101,7 @@ impl Playback {
             paused: 0,
             owes_step: false,
             is_news: false,
+            skipped_until: 0,
         }
     }
 
@@ -128,6 +133,9 @@ impl Playback {
 
     /// Returns when something of `media` is due that belongs to no link. `position` is the media time at the fastest pace.
     pub(super) fn due(&self, media: Nanos, now: Nanos, position: Nanos) -> Turn {
+        if media < self.skipped_until {
+            return Turn::Skipped;
+        }
         let at_once = |is_due| if is_due { Turn::Now(Due::at_once(now)) } else { Turn::Wait };
         match (self.anchor, self.play.pace) {
             (None, _) => Turn::Wait,
@@ -162,7 +170,7 @@ impl Playback {
         }
         self.lap += 1;
         self.links.fill(Next::Unknown);
-        (self.anchor, self.has_played) = (None, false);
+        (self.anchor, self.has_played, self.skipped_until) = (None, false, 0);
         Turn::Restart(self.lap)
     }
 
@@ -253,8 +261,12 @@ impl Playback {
             && !self.links.contains(&Next::Unknown)
             && let Some(((_, media), next)) = self.anchor.as_mut().zip(next_of(&self.links))
         {
-            *media = (*media).max(next.saturating_add(1));
+            let before = *media;
+            *media = before.max(next.saturating_add(1));
             (self.owes_step, self.is_news) = (false, true);
+            if next > before.saturating_add(LONGEST_SILENCE) {
+                self.skipped_until = next - LONGEST_SILENCE;
+            }
         }
     }
 
@@ -286,6 +298,7 @@ impl Playback {
             Some(next) if next > media.saturating_add(LONGEST_SILENCE) => {
                 self.anchor = Some((now, next - LONGEST_SILENCE));
                 self.is_news = true;
+                self.skipped_until = next - LONGEST_SILENCE;
                 true
             }
             _ => false,
@@ -457,6 +470,28 @@ mod tests {
         let mut empty = begun(1, Play { is_looped: true, ..Play::default() });
         assert_eq!(empty.end(0, 0, 100 * SECOND), Turn::Over);
         assert!(empty.is_over());
+    }
+
+    #[test]
+    fn angles_of_a_skipped_silence_are_not_played() {
+        let mut playback = begun(1, Play::default());
+        assert!(is_now(playback.turn(0, 0, 100 * SECOND), 100 * SECOND));
+        assert!(is_now(playback.turn(0, 3 * SECOND, 103 * SECOND), 103 * SECOND));
+        assert_eq!(playback.due(5 * SECOND, 104 * SECOND, 0), Turn::At(105 * SECOND));
+        assert_eq!(playback.turn(0, 3600 * SECOND, 104 * SECOND), Turn::At(114 * SECOND));
+        let at = |playback: &Playback, media| playback.due(media, 104 * SECOND, 0);
+        assert_eq!([4 * SECOND - 1, 5 * SECOND].map(|media| at(&playback, media)), [Turn::Skipped; 2]);
+        assert_eq!(at(&playback, 3589 * SECOND), Turn::Skipped);
+        assert_eq!(at(&playback, 3591 * SECOND), Turn::At(105 * SECOND));
+        // A step over a silence skips it, too, but not the time just before the next telegram.
+        let mut playback = begun(1, Play { is_paused: true, ..Play::default() });
+        assert_eq!(playback.turn(0, 0, 100 * SECOND), Turn::Wait);
+        playback.step(101 * SECOND, 0);
+        assert!(is_now(playback.turn(0, 0, 101 * SECOND), 101 * SECOND));
+        assert_eq!(playback.turn(0, 3600 * SECOND, 102 * SECOND), Turn::Wait);
+        playback.step(103 * SECOND, 0);
+        assert_eq!(playback.due(2000 * SECOND, 103 * SECOND, 0), Turn::Skipped);
+        assert!(is_now(playback.due(3599 * SECOND, 103 * SECOND, 0), 103 * SECOND));
     }
 
     #[test]

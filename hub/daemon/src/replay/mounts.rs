@@ -6,10 +6,10 @@ use std::thread;
 use std::time::Duration;
 
 use port::clock;
-use recording::Recording;
+use recording::{Frame, MountRecord, Recording};
 use schema::{Header, Nanos, Tilt};
 
-use super::recorded::Origin;
+use super::recorded::{Origin, Timeline};
 use crate::player::{Player, Turn};
 
 /// A mount whose angles are in a recording.
@@ -51,19 +51,31 @@ impl RecordedMount {
         while !stop.load(Ordering::Relaxed) {
             let lap = player.lap();
             let is_current = || player.lap() == lap && !stop.load(Ordering::Relaxed);
-            let angles = match self.recording.angles(&self.recorded) {
-                Ok(angles) => angles,
+            let records = match self.recording.angles(&self.recorded) {
+                Ok(records) => records,
                 Err(failure) => return tracing::warn!("{}: {}", self.name, failure.message),
             };
-            for (header, tilt) in angles {
-                let Some(media) = self.origin.media(&header).filter(|media| *media >= play.start_ns) else {
-                    continue;
+            let mut timeline = Timeline::new(Some(self.origin));
+            for record in records {
+                let (header, tilt) = match record {
+                    MountRecord::Angle(header, tilt) => (header, tilt),
+                    MountRecord::Telegram(header) => {
+                        let frame =
+                            Frame { header: Some(header), wall_ns: Some(header.wall_ns), ..Frame::default() };
+                        timeline.media(&frame);
+                        continue;
+                    }
                 };
+                let media = timeline.media_beside(&header);
+                let Some(media) = media.filter(|media| *media >= play.start_ns) else { continue };
                 if play.end_ns.is_some_and(|end_ns| media >= end_ns) {
                     break;
                 }
-                let Some(stamp_ns) = wait(player, media, &is_current) else { break };
-                publish(RecordedAngle { stamp_ns, header, tilt });
+                match wait(player, media, &is_current) {
+                    Turn::Now(due) => publish(RecordedAngle { stamp_ns: due.at, header, tilt }),
+                    Turn::Skipped => {}
+                    _ => break,
+                }
             }
             while is_current() {
                 thread::sleep(POLL);
@@ -72,17 +84,17 @@ impl RecordedMount {
     }
 }
 
-/// Waits until something of `media` is due. Returns its time, or `None` if the lap ends before.
-fn wait(player: &Player, media: Nanos, is_current: &impl Fn() -> bool) -> Option<Nanos> {
+/// Waits until something of `media` is due or skipped, or until the lap ends: [`Turn::Over`].
+fn wait(player: &Player, media: Nanos, is_current: &impl Fn() -> bool) -> Turn {
     while is_current() {
         let now = clock::now();
         match player.due(media, now) {
-            Turn::Now(due) => return Some(due.at),
+            turn @ (Turn::Now(_) | Turn::Skipped) => return turn,
             Turn::At(at) => thread::sleep(Duration::from_nanos(at.saturating_sub(now)).min(POLL)),
             _ => thread::sleep(POLL),
         }
     }
-    None
+    Turn::Over
 }
 
 /// Interval of the checks whether the player was paused, or has ended.

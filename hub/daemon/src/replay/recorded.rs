@@ -235,12 +235,7 @@ impl Frames {
 
     /// Media time, from the beginning.
     pub(super) fn timeline(&self) -> Timeline {
-        let life = self.origin.and_then(|origin| origin.life);
-        Timeline {
-            wall_zero_ns: i128::from(self.origin.map_or(0, |origin| origin.wall_ns)),
-            life: life.map(|(boot, stamp_ns)| (boot, i128::from(stamp_ns))),
-            last: 0,
-        }
+        Timeline::new(self.origin)
     }
 
     /// Returns the time from a scan of `beams` to the next one, where there are no stamps.
@@ -265,6 +260,26 @@ pub(super) struct Timeline {
 }
 
 impl Timeline {
+    /// Creates one for a recording whose media time begins at `origin`.
+    pub(super) fn new(origin: Option<Origin>) -> Timeline {
+        let life = origin.and_then(|origin| origin.life);
+        Timeline {
+            wall_zero_ns: i128::from(origin.map_or(0, |origin| origin.wall_ns)),
+            life: life.map(|(boot, stamp_ns)| (boot, i128::from(stamp_ns))),
+            last: 0,
+        }
+    }
+
+    /// Returns the media time of a sample of another program with this `header`. Its stamp and those of the telegrams before it
+    /// in the recording are from the same clock. Returns `None` if it is before the first telegram, or if the machine was
+    /// restarted after the last one: scans follow only when the hub of the new start has sent a telegram.
+    pub(super) fn media_beside(&self, header: &Header) -> Option<Nanos> {
+        let by_wall = i128::from(header.wall_ns) - self.wall_zero_ns;
+        let by_stamp = self.life.map(|(_, zero_ns)| i128::from(header.stamp_first_ns) - zero_ns);
+        let media = Nanos::try_from(by_stamp.unwrap_or(by_wall)).ok()?;
+        (media.saturating_add(LONGEST_GAP) >= self.last).then_some(media)
+    }
+
     /// The media time of `frame`, which comes next.
     pub(super) fn media(&mut self, frame: &Frame) -> Nanos {
         if let Some(scanner_ns) = frame.scanner_ns {
@@ -304,17 +319,6 @@ impl Origin {
     fn of(frame: &Frame) -> Option<Origin> {
         let life = frame.header.map(|header| (header.boot, header.stamp_first_ns));
         Some(Origin { wall_ns: frame.wall_ns?, life })
-    }
-
-    /// Returns the media time of a sample of another program with this `header`; `None` if it is before the first telegram.
-    /// Monotonic stamps count. If they contradict the wall clocks, the machine was restarted in between, and the
-    /// wall clocks count.
-    pub(crate) fn media(&self, header: &Header) -> Option<Nanos> {
-        let by_wall = i128::from(header.wall_ns) - i128::from(self.wall_ns);
-        let by_stamp =
-            self.life.map(|(_, stamp_ns)| i128::from(header.stamp_first_ns) - i128::from(stamp_ns));
-        let is_same_clock = |by_stamp: &i128| (by_stamp - by_wall).abs() < i128::from(CLOCK_SET);
-        Nanos::try_from(by_stamp.filter(is_same_clock).unwrap_or(by_wall)).ok()
     }
 
     /// The earlier one of both.
@@ -385,9 +389,6 @@ fn tell_of_log(recording: &Recording, name: &str) {
     }
 }
 
-/// A wall clock is set by less than this while a recording is made.
-const CLOCK_SET: Nanos = 1_000 * schema::MILLIS;
-
 /// Whether it is of the first telegram that a hub had: who converts a stream is no hub.
 fn is_first(header: &Header) -> bool {
     header.seq == 0 && header.hub_pid != 0
@@ -413,9 +414,7 @@ mod tests {
 
     /// Media times, in seconds.
     fn medias(frames: &[Frame]) -> Vec<u64> {
-        let origin = Origin::of(&frames[0]).expect("it has stamps");
-        let life = origin.life.map(|(boot, stamp_ns)| (boot, i128::from(stamp_ns)));
-        let mut timeline = Timeline { wall_zero_ns: i128::from(origin.wall_ns), life, last: 0 };
+        let mut timeline = Timeline::new(Origin::of(&frames[0]));
         frames.iter().map(|frame| timeline.media(frame) / SECOND).collect()
     }
 
@@ -440,19 +439,32 @@ mod tests {
     }
 
     #[test]
-    fn angles_stand_at_their_stamps_unless_the_clock_is_another_one() {
-        let origin = Origin { wall_ns: 5000 * SECOND, life: Some((1, 100 * SECOND)) };
-        let media = |wall_ns, stamp_first_ns| {
-            let header = Header { boot: 9, wall_ns, stamp_first_ns, ..Header::default() };
-            origin.media(&header)
+    fn angles_follow_the_stamps_of_the_telegrams_before_them() {
+        let header = |boot, wall_s: u64, stamp_s: u64| Header {
+            boot,
+            wall_ns: wall_s * SECOND,
+            stamp_first_ns: stamp_s * SECOND,
+            ..Header::default()
         };
+        let telegram = |boot, wall_s, stamp_s| frame(wall_s, Some(header(boot, wall_s, stamp_s)));
+        let first = telegram(1, 5000, 100);
+        let mut timeline = Timeline::new(Origin::of(&first));
+        let angle = |timeline: &Timeline, wall_s, stamp_s| {
+            timeline.media_beside(&header(9, wall_s, stamp_s)).map(|media| media / SECOND)
+        };
+        assert_eq!(angle(&timeline, 4999, 99), None, "before the first telegram");
+        timeline.media(&first);
+        assert_eq!(angle(&timeline, 5003, 103), Some(3));
+        assert_eq!(angle(&timeline, 9003, 103), Some(3), "the wall clock was set");
+        timeline.media(&telegram(1, 9020, 120));
+        assert_eq!(angle(&timeline, 9021, 121), Some(21));
         assert_eq!(
-            media(5003 * SECOND + SECOND / 2, 103 * SECOND),
-            Some(3 * SECOND),
-            "the wall clock was slewed"
+            angle(&timeline, 9060, 7),
+            None,
+            "the machine was restarted, and its hub has no scans yet"
         );
-        assert_eq!(media(5003 * SECOND, 7 * SECOND), Some(3 * SECOND), "another start of the machine");
-        assert_eq!(media(4999 * SECOND, 99 * SECOND), None);
+        timeline.media(&telegram(2, 9061, 8));
+        assert_eq!(angle(&timeline, 9062, 9), Some(4062), "by the wall clock of the next hub");
     }
 
     #[test]
