@@ -16,14 +16,16 @@ const BIN_M: f64 = 0.1;
 const ENOUGH: usize = 300;
 /// A wall is at least this high, in meters.
 const WALL_HIGH_M: f64 = 0.4;
-/// At most this many points are kept.
-const POINTS: usize = 200_000;
+/// Maximum number of points that are stored of a sweep. Each sweep has the same share, because up and down sweeps can differ.
+const POINTS: usize = 40_000;
 
 /// Points of sweeps, until they are enough.
 #[derive(Debug, Default)]
 pub struct Check {
     points: Vec<[f64; 3]>,
     sweeps: u32,
+    /// Delay by which the angles of these sweeps are corrected, in ns.
+    late_ns: i64,
 }
 
 /// A flat floor as the points show it.
@@ -55,24 +57,25 @@ pub struct Wall {
 }
 
 impl Check {
-    /// Takes the points of a complete sweep.
+    /// Takes the points of a complete sweep. If another delay corrects its angles than those of the sweeps before, the check
+    /// starts again with this sweep.
     pub fn take(&mut self, sweep: &Sweep<'_>) {
-        if sweep.is_complete {
-            self.sweeps += 1;
-            let room = POINTS.saturating_sub(self.points.len());
-            let points = sweep.points.iter().map(|point| point.at.map(f64::from));
-            self.points.extend(points.filter(|at| at[0].hypot(at[1]) < FAR_M).take(room));
+        if !sweep.is_complete {
+            return;
         }
+        if sweep.late_ns != self.late_ns {
+            *self = Check { late_ns: sweep.late_ns, ..Check::default() };
+        }
+        self.sweeps += 1;
+        let points = sweep.points.iter().map(|point| point.at.map(f64::from));
+        let near = points.filter(|at| at[0].hypot(at[1]) < FAR_M);
+        let every = near.clone().count().div_ceil(POINTS).max(1);
+        self.points.extend(near.step_by(every));
     }
 
     /// Returns how many sweeps were taken.
     pub fn sweeps(&self) -> u32 {
         self.sweeps
-    }
-
-    /// Forgets all points, because the angles are corrected from now on.
-    pub fn forget(&mut self) {
-        *self = Check::default();
     }
 
     /// Returns the floor, if there are enough points on one plane.
@@ -110,7 +113,10 @@ impl Check {
             let mut counts = [0_usize; (FAR_M / BIN_M) as usize + 2];
             for at in &high {
                 let distance = at[0] * way.cos() + at[1] * way.sin();
-                if let Some(count) = counts.get_mut((distance / BIN_M).max(0.0) as usize) {
+                // Points of a side wall can be behind the origin.
+                if distance >= 0.0
+                    && let Some(count) = counts.get_mut((distance / BIN_M) as usize)
+                {
                     *count += 1;
                 }
             }
@@ -134,8 +140,15 @@ impl Check {
             return None;
         }
         let plane = Plane::of(on)?;
-        let [distance_m, _, lean] = plane.terms;
-        Some(Wall { distance_m, lean_rad: lean.atan(), deviation_m: plane.deviation, points: plane.points })
+        // The wall is not exactly across the direction in which it was found.
+        let [distance, slope, lean] = plane.terms;
+        let across = slope.hypot(1.0);
+        Some(Wall {
+            distance_m: distance / across,
+            lean_rad: (lean / across).atan(),
+            deviation_m: plane.deviation / across,
+            points: plane.points,
+        })
     }
 }
 
@@ -228,6 +241,48 @@ mod tests {
         check.take(&Sweep { points: &points, is_complete: true, ..Sweep::default() });
         assert_eq!(check.sweeps(), 1);
         (check.floor(told).expect("a floor"), check.wall().expect("a wall"))
+    }
+
+    #[test]
+    fn a_side_wall_behind_the_origin_is_not_a_wall_ahead() {
+        let grid =
+            |points: usize| (0..points).map(|i| (0.005 * (i % 100) as f32, 0.1 * (i / 100 % 10) as f32));
+        let ahead = grid(2000).map(|(y, z)| [3.0, 4.0 * y - 1.0, 0.4 + z]);
+        // In a direction to the left, all of it is behind the origin.
+        let right = grid(4000).map(|(x, z)| [0.35 + 4.0 * x, -3.0 - 4.0 * x, 0.4 + z]);
+        let points: Vec<Point> = ahead.chain(right).map(|at| Point { at, ..Point::default() }).collect();
+        let mut check = Check::default();
+        check.take(&Sweep { points: &points, is_complete: true, ..Sweep::default() });
+        let wall = check.wall().expect("a wall");
+        assert!((wall.distance_m - 3.0).abs() < 0.01, "{wall:?}");
+    }
+
+    #[test]
+    fn each_sweep_counts_whole_and_as_much_as_the_others() {
+        let points: Vec<Point> = (0..100_000_u32)
+            .map(|i| Point { at: [if i < 50_000 { 1.0 } else { 2.0 }, 0.0, 0.0], ..Point::default() })
+            .collect();
+        let mut check = Check::default();
+        for _ in 0..6 {
+            check.take(&Sweep { points: &points, is_complete: true, ..Sweep::default() });
+        }
+        let near = check.points.iter().filter(|at| at[0] < 1.5).count();
+        assert!(
+            near > 90_000 && near.abs_diff(check.points.len() - near) < 12,
+            "{near} of {}",
+            check.points.len()
+        );
+    }
+
+    #[test]
+    fn a_correction_starts_the_check_again_with_the_first_corrected_sweep() {
+        let points = vec![Point { at: [1.0, 0.0, 0.0], ..Point::default() }; 10];
+        let mut check = Check::default();
+        let sweeps = [0, 0, 0, 30_000_000, 30_000_000].map(|late_ns| {
+            check.take(&Sweep { points: &points, is_complete: true, late_ns, ..Sweep::default() });
+            check.sweeps()
+        });
+        assert_eq!((sweeps, check.points.len()), ([1, 2, 3, 1, 2], 20));
     }
 
     fn mount() -> Mount {

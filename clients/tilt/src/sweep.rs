@@ -31,6 +31,8 @@ pub struct Sweep<'a> {
     pub is_doubted: bool,
     /// Number of the background that the points were compared with: one more each time that it was forgotten.
     pub generation: u32,
+    /// Delay of the angles' stamps by which its angles are corrected, in ns.
+    pub late_ns: i64,
     /// In the order of their scans.
     pub points: &'a [Point],
     /// What stands there, the nearest first.

@@ -322,6 +322,7 @@ impl Tilting {
                 (sweep.is_complete, is_next_whole) = (sweep.is_complete && is_whole, is_whole_next);
             }
         }
+        sweep.late_ns = self.angles.late_ns();
         let sweep = self.scenery.look(&self.rays, sweep);
         self.counts.points += sweep.points.len() as u64;
         self.counts.sweeps += 1;

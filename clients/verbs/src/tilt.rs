@@ -139,11 +139,6 @@ impl Sink for Verb<'_> {
                 if let Some(trouble) = self.trouble.changed(header.stamp_first_ns, tilting.trouble()) {
                     teller.tell_trouble(trouble, tilting.late_ns())?;
                 }
-                if tilting.late_ns() != self.late_ns {
-                    self.late_ns = tilting.late_ns();
-                    check.iter_mut().for_each(Check::forget);
-                    teller.tell_late(&self.options.angles, self.trouble.told, self.late_ns)?;
-                }
             }
             Sample::Tilt(said) => {
                 let angle = Angle {
@@ -154,6 +149,10 @@ impl Sink for Verb<'_> {
                 tilting.take_angle(angle, &mut take);
             }
             _ => {}
+        }
+        if tilting.late_ns() != self.late_ns {
+            self.late_ns = tilting.late_ns();
+            teller.tell_late(&self.options.angles, self.trouble.told, self.late_ns)?;
         }
         if check.as_ref().is_some_and(|check| check.sweeps() >= check::SWEEPS) {
             // Ends without a summary.
