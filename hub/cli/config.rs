@@ -43,8 +43,9 @@ impl Config {
                 if let Some(file) = file {
                     sources.files = vec![file.clone()];
                 }
+                let sources = sources.read();
                 Gateway::check(&sources, everywhere)?;
-                let links = config::Config::load(&sources)?.links;
+                let links = config::Config::of(&sources)?.links;
                 if everywhere.json { checked_line(&links) } else { checked(&links) }
             }
             Order::Show { run } => {

@@ -35,11 +35,12 @@ impl Doctor {
     pub(crate) fn run(&self, everywhere: &Everywhere, stop: &AtomicBool) -> Result<(), Failure> {
         let sources = self.run.sources();
         let is_said = !(sources.files.is_empty() && sources.links.is_empty() && sources.set.is_empty());
-        let gateway = Gateway::load(&sources);
+        let read = sources.read();
+        let gateway = Gateway::of(&read);
         let subjects = Subjects {
             ports: self.ports.iter().map(|port| source(port)).collect::<Result<_, _>>()?,
             config: is_said
-                .then(|| Config::load(&sources).and_then(|config| gateway.clone().map(|_| config))),
+                .then(|| Config::of(&read).and_then(|config| gateway.clone().map(|_| config))),
             gateway: gateway.clone().unwrap_or_default(),
             domain: everywhere.hub_domain()?,
             places: everywhere.places()?,

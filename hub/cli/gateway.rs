@@ -6,7 +6,7 @@ use std::path::PathBuf;
 use std::time::Duration;
 
 use clap::Args;
-use config::Sources;
+use config::SourceMap;
 use schema::datagram::{Announce, GROUPS, PORT, group};
 use schema::{Failure, Kind, Topic};
 use verbs::{GatewayLook, GatewayOptions, duration};
@@ -60,8 +60,8 @@ impl Gateway {
     }
 
     /// Checks that a gateway accepts the section in `sources`.
-    pub(super) fn check(sources: &Sources, everywhere: &Everywhere) -> Result<(), Failure> {
-        let checked = Gateway::default().over(config::Gateway::load(sources)?, everywhere)?.check();
+    pub(super) fn check(sources: &SourceMap, everywhere: &Everywhere) -> Result<(), Failure> {
+        let checked = Gateway::default().over(config::Gateway::of(sources)?, everywhere)?.check();
         checked.map_err(of_section)
     }
 

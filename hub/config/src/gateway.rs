@@ -1,14 +1,50 @@
-//! Section `gateway`: its values in effect, and its keys in one source. Topics, addresses and durations are text here;
-//! the gateway parses them.
+//! Sections that belong to no link. Section `limits` is for the topics of all links. Section `gateway` is for
+//! `scanhub gateway`, which can use the hub's configuration; its topics, addresses and durations are text here, and the
+//! gateway parses them.
 
 use std::path::PathBuf;
 
-use schema::Failure;
 use schema::datagram::{MTU_ETHERNET, MTU_LEAST, MTU_SAFE};
-use serde::Deserialize;
-use toml::Spanned;
+use schema::limits::TopicLimits;
+use serde_json::{Value as Json, json};
 
-use crate::sources::Origin;
+use crate::section::{Section, optional, section, whole_or};
+
+section! {
+    /// Keys of section `limits`.
+    pub(crate) struct LimitsKeys: "keys of limits, as { consumers = 32 }" {
+        /// subscribers of each topic, 1 to 250
+        consumers: i64 = TopicLimits::default().consumers as i64, check whole_or(
+            *TopicLimits::CONSUMERS.start() as i64..=*TopicLimits::CONSUMERS.end() as i64,
+            format!("{} to {}", TopicLimits::CONSUMERS.start(), TopicLimits::CONSUMERS.end()),
+        );
+    }
+}
+
+section! {
+    /// Keys of section `gateway`.
+    pub(crate) struct GatewayKeys: "keys of gateway, as { interface = \"eth0\" }" {
+        /// for the multicast groups; no default
+        interface: Option<String> = None, example "\"eth0\"";
+        /// default: all but telegram, lines, motion, early and cloud
+        topics: Option<Vec<String>> = None, example "[\"*/zones\", \"*/scan:every=4\"]";
+        /// receivers of copies; default: none
+        to: Option<Vec<String>> = None, example "[\"10.0.0.7:22200\"]";
+        /// whether to send only telegrams, without a header
+        bare: Option<bool> = None;
+        /// authenticates datagrams; no default
+        key_file: Option<PathBuf> = None, example "\"/etc/scanhub/lan.key\"";
+        /// networks that a datagram to a group may cross
+        ttl: Option<i64> = None, check optional(whole_or(0..=255, "0 to 255".into()));
+        /// interval at which a background is sent again; default: only new ones are sent
+        background_every: Option<String> = None, example "\"10s\"";
+        /// longest datagram in bytes, 576 to 1472
+        mtu: Option<i64> = None, check optional(whole_or(
+            MTU_LEAST as i64..=MTU_ETHERNET as i64,
+            format!("{MTU_LEAST} to {MTU_ETHERNET} bytes, which an Ethernet carries"),
+        ));
+    }
+}
 
 /// Settings of the gateway; `None` for those that are not set.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
@@ -38,46 +74,34 @@ impl Gateway {
     pub const MTU: usize = MTU_SAFE;
 }
 
-/// Keys of section `gateway`.
-#[derive(Deserialize)]
-#[serde(deny_unknown_fields)]
-pub(crate) struct GatewayLayer {
-    interface: Option<String>,
-    topics: Option<Vec<String>>,
-    to: Option<Vec<String>>,
-    bare: Option<bool>,
-    key_file: Option<PathBuf>,
-    ttl: Option<Spanned<i64>>,
-    background_every: Option<Spanned<String>>,
-    mtu: Option<Spanned<i64>>,
-}
+impl GatewayKeys {
+    /// Returns the settings of the gateway. `every_place` is where `background_every` is set.
+    pub(crate) fn settings(self, every_place: Option<String>) -> Gateway {
+        let GatewayKeys { interface, topics, to, bare, key_file, ttl, background_every, mtu } = self;
+        Gateway {
+            interface,
+            topics,
+            to,
+            bare,
+            key_file,
+            ttl: ttl.map(|ttl| ttl as u8),
+            background_every: background_every.zip(every_place),
+            mtu: mtu.map(|mtu| mtu as usize),
+        }
+    }
 
-impl GatewayLayer {
-    /// Applies the keys that are set to `gateway`.
-    pub(crate) fn apply(self, origin: &Origin, gateway: &mut Gateway) -> Result<(), Failure> {
-        let GatewayLayer { interface, topics, to, bare, key_file, ttl, background_every, mtu } = self;
-        gateway.interface = interface.or(gateway.interface.take());
-        gateway.topics = topics.or(gateway.topics.take());
-        gateway.to = to.or(gateway.to.take());
-        gateway.bare = bare.or(gateway.bare);
-        gateway.key_file = key_file.or(gateway.key_file.take());
-        if let Some(ttl) = ttl {
-            let value = u8::try_from(*ttl.get_ref());
-            let refuse = |_| origin.refuse(Some(ttl.span()), format!("ttl = {}", ttl.get_ref()), "0 to 255");
-            gateway.ttl = Some(value.map_err(refuse)?);
+    /// Returns keys and values in effect.
+    pub(crate) fn shown(&self) -> Vec<(&'static str, Json)> {
+        let mut values = self.values();
+        for (key, value) in values.iter_mut().filter(|(_, value)| value.is_null()) {
+            *value = match *key {
+                "to" => json!([]),
+                "bare" => json!(false),
+                "ttl" => json!(Gateway::TTL),
+                "mtu" => json!(Gateway::MTU),
+                _ => Json::Null,
+            };
         }
-        if let Some(every) = background_every {
-            let place = origin.place(Some(every.span()));
-            gateway.background_every = Some((every.into_inner(), place));
-        }
-        if let Some(mtu) = mtu {
-            let value = usize::try_from(*mtu.get_ref()).ok();
-            let value = value.filter(|value| (MTU_LEAST..=MTU_ETHERNET).contains(value));
-            gateway.mtu = Some(value.ok_or_else(|| {
-                let remedy = format!("{MTU_LEAST} to {MTU_ETHERNET} bytes, which an Ethernet carries");
-                origin.refuse(Some(mtu.span()), format!("mtu = {}", mtu.get_ref()), remedy)
-            })?);
-        }
-        Ok(())
+        values
     }
 }

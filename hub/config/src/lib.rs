@@ -3,21 +3,21 @@
 
 mod effective;
 mod gateway;
-mod layer;
 mod link;
 mod load;
 pub mod needs;
 mod processing;
 mod scanner;
+mod section;
 mod sources;
-mod zone_coverage;
 
-pub use effective::{Value, values};
+pub use effective::{Value, keys, values};
 pub use gateway::Gateway;
 pub use link::{Config, Link};
 pub use processing::{Background, Processing, Zones};
 pub use scanner::Scanner;
-pub use sources::Sources;
+pub use section::Key;
+pub use sources::{SourceMap, Sources};
 
 /// Configuration file to start from, with the default values.
 pub const DEFAULT: &str = include_str!("default.toml");

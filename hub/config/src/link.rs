@@ -1,12 +1,15 @@
-//! The links of a hub, each with its port and the settings of its sensor: values in effect.
+//! The links of a hub, each with its port and the settings of its sensor: keys of the sources and values in effect.
 
 use port::Source;
 use scanhub_drivers::{Features, Settings, scan_heads};
 use schema::limits::TopicLimits;
-use schema::{Background, Failure, Family, ScanHead};
+use schema::{Background, Failure, Family, ScanHead, check_sensor};
 
-use crate::processing::Processing;
+use crate::processing::{
+    BackgroundKeys, EarlyKeys, LinesKeys, MarksKeys, MotionKeys, PoseKeys, Processing, ZonesKeys,
+};
 use crate::scanner::Scanner;
+use crate::section::{Checked, Section, optional, refused, section};
 
 /// The effective configuration.
 #[derive(Clone, Debug, PartialEq)]
@@ -79,6 +82,12 @@ impl Link {
         self.scanner.family
     }
 
+    /// Returns the keys, apart from its processing, that differ in `other`.
+    pub fn differences(&self, other: &Link) -> Vec<&'static str> {
+        let port = (self.port != other.port).then_some("port");
+        port.into_iter().chain(self.scanner.differences(&other.scanner)).collect()
+    }
+
     /// Returns the possible heads of its scans, as far as they are known; those with the most beams first.
     pub fn scan_heads(&self) -> Vec<ScanHead> {
         let families = self.family().map_or(Family::ALL.to_vec(), |family| vec![family]);
@@ -115,5 +124,77 @@ impl Link {
     }
 }
 
-/// Links of one hub.
+section! {
+    /// Keys of a link. A scanner key is in [`scanhub_drivers::Key`], too; its family checks the value.
+    pub(crate) struct LinkKeys: "keys of a link, as { name = \"front\", port = \"/dev/ttyUSB0\" }" {
+        /// first part of topic names: a-z, 0-9, _ and -
+        ///
+        /// The sensor's name in topics, at most 24 of a-z, 0-9, _ and -; not `robot`.
+        name: String = String::new(), check name;
+        /// better a permanent name: `scanhub probe` lists them; or tcp:HOST:PORT, or file:PATH
+        ///
+        /// A tty, `tcp:HOST:PORT`, or `file:PATH[?rate=max]`.
+        port: Option<String> = None, check optional(port), example "\"/dev/ttyUSB0\"";
+        /// lms200, lms211, lms221 or lms291: other settings are refused
+        expected_type ("type"): Option<String> = None, example "\"lms291\"";
+        /// auto: the hub finds the scanner; or lms, ld or rplidar
+        family: Option<String> = None, example "\"auto\"";
+        /// auto, or the name of a model
+        model: Option<String> = None, example "\"auto\"";
+        /// of a scan, 2 to 8192; default: as many points as the model measures per revolution
+        beams: Option<i64> = None, example "450";
+        /// degrees, 100 or 180
+        angle: Option<f64> = None, example "180";
+        /// degrees, 0.25, 0.5 or 1
+        resolution: Option<f64> = None, example "0.5";
+        /// mm or cm, compared with the sensor's, never written
+        unit: Option<String> = None, example "\"mm\"";
+        /// measuring mode, for a recording that does not contain it
+        mode: Option<toml::Value> = None, example "0x01";
+        /// run, or stop: the motor stops while no program subscribes
+        idle: Option<String> = None, example "\"run\"";
+        /// the rate to stream at: 500000, 38400, 19200 or 9600
+        baud: Option<i64> = None, example "500000";
+        /// in the robot's frame: meters, radians
+        pose: PoseKeys = PoseKeys::default();
+        /// see `[zones]`
+        zones: ZonesKeys = ZonesKeys::default();
+        /// see `[marks]`
+        marks: MarksKeys = MarksKeys::default();
+        /// see `[lines]`
+        lines: LinesKeys = LinesKeys::default();
+        /// see `[motion]`
+        motion: MotionKeys = MotionKeys::default();
+        /// see `[background]`
+        background: BackgroundKeys = BackgroundKeys::default();
+        /// see `[early]`
+        early: EarlyKeys = EarlyKeys::default();
+    }
+}
+
+impl LinkKeys {
+    /// Returns its sections, each with its name.
+    pub(crate) fn sections(&self) -> [(&'static str, &dyn Section); 7] {
+        [
+            ("pose", &self.pose),
+            ("zones", &self.zones),
+            ("marks", &self.marks),
+            ("lines", &self.lines),
+            ("motion", &self.motion),
+            ("early", &self.early),
+            ("background", &self.background),
+        ]
+    }
+}
+
+fn name(_: &str, name: &str) -> Checked {
+    check_sensor(name).map_err(|failure| refused(failure.message, failure.hint))
+}
+
+fn port(_: &str, port: &str) -> Checked {
+    let remedy = "name a tty, tcp:HOST:PORT, or file:PATH, which may end with ?rate=max";
+    Source::parse(port).map(drop).map_err(|what| refused(what, remedy))
+}
+
+/// Maximum number of links of one hub.
 pub(crate) const MAX_LINKS: usize = 256;

@@ -1,14 +1,278 @@
-//! Reads all sources of a configuration into the values in effect; the last one wins.
+//! Merges all sources of a configuration into the values in effect; the last one wins. Each source must be valid by itself,
+//! so that an error names its place.
 
+use std::ops::Range;
 use std::path::Path;
 
 use port::{Source, is_same_line};
+use schema::limits::TopicLimits;
 use schema::{Failure, Kind};
+use serde::Deserialize;
+use serde::de::DeserializeOwned;
+use toml::Spanned;
+use toml::de::{DeTable, DeValue};
 
-use crate::gateway::Gateway;
-use crate::layer::Drafts;
-use crate::link::{Config, Link};
-use crate::sources::Sources;
+use crate::gateway::{Gateway, GatewayKeys, LimitsKeys};
+use crate::link::{Config, Link, LinkKeys, MAX_LINKS};
+use crate::processing::{
+    BackgroundKeys, EarlyKeys, LinesKeys, MarksKeys, MotionKeys, Processing, ZonesKeys, check_coverage,
+    check_family,
+};
+use crate::scanner::ScannerRequest;
+use crate::section::{Section, find};
+use crate::sources::{SourceKind, SourceMap, Sources};
+
+/// Keys of a source. Sections are for all links.
+#[derive(Default, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub(crate) struct Document {
+    link: Vec<LinkKeys>,
+    zones: ZonesKeys,
+    marks: MarksKeys,
+    lines: LinesKeys,
+    motion: MotionKeys,
+    background: BackgroundKeys,
+    early: EarlyKeys,
+    pub(crate) limits: LimitsKeys,
+    pub(crate) gateway: GatewayKeys,
+}
+
+impl Document {
+    /// Checks its values, which were read from `table`, but for those of the gateway.
+    fn check(&self, table: &DeTable<'_>, sources: &SourceMap) -> Result<(), Failure> {
+        let Document { link: _, zones, marks, lines, motion, background, early, limits, gateway: _ } = self;
+        let sections: [(_, &dyn Section); _] = [
+            ("zones", zones),
+            ("marks", marks),
+            ("lines", lines),
+            ("motion", motion),
+            ("background", background),
+            ("early", early),
+            ("limits", limits),
+        ];
+        sections.into_iter().try_for_each(|(name, section)| check_section(name, section, table, sources))
+    }
+}
+
+fn check_section(
+    name: &str,
+    section: &dyn Section,
+    table: &DeTable<'_>,
+    sources: &SourceMap,
+) -> Result<(), Failure> {
+    let Some(value) = find(table, name) else { return Ok(()) };
+    match value.get_ref() {
+        DeValue::Table(table) => section.check(table, sources),
+        // serde would assign the elements to the keys in their order.
+        _ => Err(sources.refuse(value.span(), format!("{name} is a list"), format!("write it as [{name}]"))),
+    }
+}
+
+/// All sources, merged.
+pub(crate) struct Merged<'a> {
+    sources: &'a SourceMap,
+    /// Values for all links, of limits and of the gateway.
+    pub(crate) general: DeTable<'a>,
+    /// Links in the order in which they were added.
+    pub(crate) links: Vec<MergedLink<'a>>,
+    /// Failure of the first source with an invalid value for the gateway, which the hub ignores.
+    gateway: Result<(), Failure>,
+}
+
+/// One link of all sources.
+pub(crate) struct MergedLink<'a> {
+    /// Place where the link starts.
+    place: String,
+    /// Values for this link only.
+    own: DeTable<'a>,
+    /// Values for this link and for all links. Those for this link take precedence, whichever source they are from.
+    pub(crate) table: DeTable<'a>,
+    /// Keys of `table`.
+    pub(crate) keys: LinkKeys,
+}
+
+impl<'a> Merged<'a> {
+    /// Parses and merges `sources`.
+    pub(crate) fn of(sources: &'a SourceMap) -> Result<Merged<'a>, Failure> {
+        let mut merged = Merged { sources, general: DeTable::new(), links: Vec::new(), gateway: Ok(()) };
+        let (settings, others): (Vec<_>, Vec<_>) =
+            sources.layers()?.into_iter().partition(|(kind, ..)| *kind == SourceKind::Setting);
+        let mut flags = Vec::new();
+        for (kind, table, document) in others {
+            merged.add(kind, table, document, &mut flags)?;
+        }
+        if merged.links.is_empty() {
+            let remedy =
+                "--link NAME=PORT, or a section [[link]] in a file: scanhub config default prints one";
+            return Err(Failure::new(Kind::Configuration, "no link is configured", remedy));
+        }
+        for (kind, table, document) in settings {
+            merged.add(kind, table, document, &mut flags)?;
+        }
+        for link in &mut merged.links {
+            link.table = merged.general.clone();
+            for section in ["limits", "gateway"] {
+                link.table.remove(section);
+            }
+            overlay(&mut link.table, link.own.clone());
+            link.keys = sources.deserialize(link.table.clone())?;
+        }
+        Ok(merged)
+    }
+
+    /// Adds one source, whose values take precedence. `flags` are the names of links of `--link` so far.
+    fn add(
+        &mut self,
+        kind: SourceKind,
+        mut table: DeTable<'a>,
+        document: Document,
+        flags: &mut Vec<String>,
+    ) -> Result<(), Failure> {
+        document.check(&table, self.sources)?;
+        let gateway = check_section("gateway", &document.gateway, &table, self.sources);
+        self.gateway = std::mem::replace(&mut self.gateway, Ok(())).and(gateway);
+        let links = table.remove("link").map(Spanned::into_inner);
+        let Some(DeValue::Array(links)) = links else {
+            overlay(&mut self.general, table);
+            return Ok(());
+        };
+        overlay(&mut self.general, table);
+        let mut seen = Vec::new();
+        for (keys, link) in document.link.into_iter().zip(links) {
+            let span = link.span();
+            let DeValue::Table(link) = link.into_inner() else {
+                return Err(self.sources.refuse(span, "a link is a list", "write it as [[link]]"));
+            };
+            self.add_link(kind, keys, link, span, if kind == SourceKind::Link { flags } else { &mut seen })?;
+        }
+        Ok(())
+    }
+
+    fn add_link(
+        &mut self,
+        kind: SourceKind,
+        keys: LinkKeys,
+        table: DeTable<'a>,
+        span: Range<usize>,
+        seen: &mut Vec<String>,
+    ) -> Result<(), Failure> {
+        let sources = self.sources;
+        let Some(span) = table.get("name").map(Spanned::span) else {
+            return Err(sources.refuse(span, "missing field `name`", "see docs/configuration.md"));
+        };
+        keys.check(&table, sources)?;
+        for (name, section) in keys.sections() {
+            check_section(name, section, &table, sources)?;
+        }
+        ScannerRequest::of(&keys, &table, sources)?;
+        let name = keys.name;
+        if seen.contains(&name) {
+            let remedy = match kind {
+                SourceKind::Link => "give each link its own name",
+                _ => "give each link its own name, or put its keys into the section of the first one",
+            };
+            return Err(sources.refuse(span, format!("a second link {name}"), remedy));
+        }
+        seen.push(name.clone());
+        if let Some(link) = self.links.iter_mut().find(|link| link.keys.name == name) {
+            overlay(&mut link.own, table);
+            return Ok(());
+        }
+        if kind == SourceKind::Setting {
+            let names: Vec<_> = self.links.iter().map(|link| link.keys.name.as_str()).collect();
+            let remedy = format!("there are: {}", names.join(", "));
+            return Err(sources.refuse(span, format!("no link {name}"), remedy));
+        }
+        if self.links.len() >= MAX_LINKS {
+            let what =
+                format!("more than {MAX_LINKS} links: a sample stores its sensor's number in one byte");
+            return Err(sources.refuse(span, what, format!("{MAX_LINKS} links for one hub")));
+        }
+        let keys = LinkKeys { name, ..LinkKeys::default() };
+        let place = sources.place(span);
+        self.links.push(MergedLink { place, own: table, table: DeTable::new(), keys });
+        Ok(())
+    }
+
+    /// Returns the configuration in effect.
+    pub(crate) fn config(&self) -> Result<Config, Failure> {
+        let links = self.links.iter().map(|link| link.finish(self.sources)).collect::<Result<Vec<_>, _>>()?;
+        check_ports(&links)?;
+        let limits: LimitsKeys = self.section("limits")?;
+        let limits = TopicLimits { consumers: limits.consumers as usize, ..TopicLimits::default() };
+        Ok(Config { links, limits })
+    }
+
+    /// Returns the section of the gateway.
+    pub(crate) fn gateway(&self) -> Result<GatewayKeys, Failure> {
+        self.gateway.clone()?;
+        self.section("gateway")
+    }
+
+    /// Returns the section `name` that belongs to no link.
+    pub(crate) fn section<T: DeserializeOwned + Default>(&self, name: &str) -> Result<T, Failure> {
+        let table = find(&self.general, name).and_then(|section| section.get_ref().as_table());
+        table.map_or(Ok(T::default()), |table| self.sources.deserialize(table.clone()))
+    }
+
+    /// Returns the place where `key` is set that belongs to no link.
+    pub(crate) fn place(&self, key: &str) -> Option<String> {
+        find(&self.general, key).map(|value| self.sources.place(value.span()))
+    }
+
+    /// Returns the place where `key` of `link` is set.
+    pub(crate) fn place_of(&self, link: &MergedLink<'_>, key: &str) -> Option<String> {
+        find(&link.table, key).map(|value| self.sources.place(value.span()))
+    }
+}
+
+impl MergedLink<'_> {
+    /// Returns the link.
+    fn finish(&self, sources: &SourceMap) -> Result<Link, Failure> {
+        let MergedLink { place, own, table, keys } = self;
+        let name = keys.name.clone();
+        let refuse = |place: Option<String>, what: String, remedy: &str| {
+            let place = place.as_ref().unwrap_or(&self.place);
+            Failure::new(Kind::Configuration, format!("{place}: link {name}: {what}"), remedy)
+        };
+        let no_port = || refuse(None, "no port".into(), "add port = \"/dev/ttyUSB0\"");
+        let port = keys.port.as_deref().and_then(|port| Source::parse(port).ok()).ok_or_else(no_port)?;
+        let request = ScannerRequest::of(keys, table, sources)?;
+        let scanner = request.finish(refuse)?;
+        let is_live = !matches!(port, Source::File { .. });
+        if let Some(place) = request.mode_number_place().filter(|_| is_live) {
+            let what = format!("the mode of {} is read from the sensor", port.name());
+            let remedy = "mode is only for recordings, port = \"file:PATH\"; leave it out";
+            return Err(refuse(Some(place), what, remedy));
+        }
+        let mut link = Link { name: name.clone(), port, scanner, processing: Processing::of(keys) };
+        check_coverage(&link, table, place, sources)?;
+        if let Some(family) = link.family() {
+            check_family(own, sources, family)?;
+        }
+        let mut background = link.processing.background.clone();
+        background.read(&link).map_err(|failure| {
+            let start = find(table, "background.start");
+            let place = start.map(|start| sources.place(start.span())).unwrap_or_default();
+            Failure::new(failure.kind, format!("{place}: {}", failure.message), failure.hint)
+        })?;
+        link.processing.background = background;
+        Ok(link)
+    }
+}
+
+/// Puts the values of `over` into `under`, in place of values of the same keys.
+fn overlay<'a>(under: &mut DeTable<'a>, over: DeTable<'a>) {
+    for (key, value) in over {
+        let span = value.span();
+        match (under.get_mut(&**key.get_ref()).map(Spanned::get_mut), value.into_inner()) {
+            (Some(DeValue::Table(under)), DeValue::Table(over)) => overlay(under, over),
+            (_, value) => {
+                under.insert(key, Spanned::new(span, value));
+            }
+        }
+    }
+}
 
 impl Config {
     /// Reads all sources.
@@ -18,29 +282,41 @@ impl Config {
     /// Returns [`schema::Kind::Configuration`] with place, value and remedy if a value is not valid, or if there is no
     /// link.
     pub fn load(sources: &Sources) -> Result<Config, Failure> {
-        let mut drafts = Drafts::default();
-        for layer in sources.files() {
-            let (origin, layer) = layer?;
-            drafts.merge(layer, origin, true)?;
+        Config::of(&sources.read())
+    }
+
+    /// Merges sources that were read.
+    ///
+    /// # Errors
+    ///
+    /// As those of [`load`](Self::load).
+    pub fn of(sources: &SourceMap) -> Result<Config, Failure> {
+        Merged::of(sources)?.config()
+    }
+}
+
+impl Gateway {
+    /// Reads the section in all sources; the last one wins. Links are not required.
+    ///
+    /// # Errors
+    ///
+    /// Returns [`schema::Kind::Configuration`] with place, value and remedy if a value is not valid.
+    pub fn load(sources: &Sources) -> Result<Gateway, Failure> {
+        Gateway::of(&sources.read())
+    }
+
+    /// Merges sources that were read.
+    ///
+    /// # Errors
+    ///
+    /// As those of [`load`](Self::load).
+    pub fn of(sources: &SourceMap) -> Result<Gateway, Failure> {
+        let mut merged = Merged { sources, general: DeTable::new(), links: Vec::new(), gateway: Ok(()) };
+        for (_, table, document) in sources.layers::<Document>()? {
+            check_section("gateway", &document.gateway, &table, sources)?;
+            overlay(&mut merged.general, table);
         }
-        let mut names = Vec::new();
-        for layer in sources.links() {
-            let (origin, layer) = layer?;
-            layer.check_names(&origin, &mut names)?;
-            drafts.merge(layer, origin, true)?;
-        }
-        let settings = sources.settings().collect::<Result<Vec<_>, _>>()?;
-        if drafts.len() == 0 {
-            let remedy =
-                "--link NAME=PORT, or a section [[link]] in a file: scanhub config default prints one";
-            return Err(Failure::new(Kind::Configuration, "no link is configured", remedy));
-        }
-        for (origin, layer) in settings {
-            drafts.merge(layer, origin, false)?;
-        }
-        let (links, limits) = drafts.finish()?;
-        check_ports(&links)?;
-        Ok(Config { links, limits })
+        Ok(merged.section::<GatewayKeys>("gateway")?.settings(merged.place("gateway.background_every")))
     }
 }
 
@@ -75,22 +351,6 @@ fn check_ports(links: &[Link]) -> Result<(), Failure> {
 /// Returns whether udev has made the name of an adapter's serial number.
 fn is_by_serial_number(path: &Path) -> bool {
     path.parent().is_some_and(|parent| parent.ends_with("serial/by-id"))
-}
-
-impl Gateway {
-    /// Reads the section in all sources; the last one wins. Links are not required.
-    ///
-    /// [`schema::Kind::Configuration`] with place, value and remedy.
-    pub fn load(sources: &Sources) -> Result<Gateway, Failure> {
-        let mut gateway = Gateway::default();
-        for layer in sources.files().chain(sources.settings()) {
-            let (origin, layer) = layer?;
-            if let Some(section) = layer.gateway {
-                section.apply(&origin, &mut gateway)?;
-            }
-        }
-        Ok(gateway)
-    }
 }
 
 #[cfg(test)]

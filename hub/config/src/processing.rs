@@ -1,25 +1,24 @@
-//! Processing of a link's scans: sections pose, zones, marks, lines, motion, background and early, as values in effect
-//! and as keys of the sources.
-//!
-//! Each value is checked in its own source. Meters, radians and degrees become the units of the processors.
+//! Processing of a link's scans: sections pose, zones, marks, lines, motion, background and early, as keys of the
+//! sources and as values in effect. Meters, radians and degrees of the keys become the units of the processors.
 
-use std::ops::{Range, RangeInclusive};
 use std::path::PathBuf;
 
 use preprocess::background::{Candidate, Method, Settings as Learning, Start};
-use preprocess::zones::{SECTORS, Sector};
+use preprocess::zones::{Check, SECTORS, Sector};
 use preprocess::{lines, marks, motion, zones};
 use scanhub_drivers::features;
 use scanhub_files::regular;
-use schema::{BEAMS, Failure, Family, Kind, LINES, Pose, SavedModel, ZONES};
-use serde::Deserialize;
+use schema::{BEAMS, Failure, Family, Kind, LINES, Pose, SavedModel, Scan, ScanHead, ZONES};
+use serde::{Deserialize, Serialize};
 use toml::Spanned;
+use toml::de::DeTable;
 
-use crate::link::Link;
-use crate::sources::Origin;
+use crate::link::{Link, LinkKeys};
+use crate::section::{Checked, each, find, meters, optional, refused, section, whole, within};
+use crate::sources::SourceMap;
 
 /// Settings for processing the scans of one link.
-#[derive(Clone, Debug, Default, PartialEq)]
+#[derive(Clone, Debug, PartialEq)]
 pub struct Processing {
     /// Pose of the sensor.
     pub pose: Pose,
@@ -42,12 +41,6 @@ pub struct Processing {
 pub struct Early {
     /// Number of reads per LMS telegram while the topic has a subscriber, 2 to 8.
     pub pieces: u8,
-}
-
-impl Default for Early {
-    fn default() -> Self {
-        Early { pieces: 2 }
-    }
 }
 
 /// Values of section `[zones]`.
@@ -84,23 +77,6 @@ impl Zones {
             exact: self.exact,
             no_return_is_far: self.no_return_is_far,
         }
-    }
-}
-
-impl Default for Zones {
-    fn default() -> Self {
-        let zones::Settings {
-            radii_mm,
-            self_min,
-            margin_mm,
-            min_beams,
-            min_scans,
-            max_invalid,
-            exact,
-            no_return_is_far,
-        } = zones::Settings::default();
-        let (radii_mm, self_min) = (radii_mm.to_vec(), self_min.to_vec());
-        Zones { radii_mm, self_min, margin_mm, min_beams, min_scans, max_invalid, exact, no_return_is_far }
     }
 }
 
@@ -161,390 +137,414 @@ impl Background {
     }
 }
 
-impl Default for Background {
-    fn default() -> Self {
-        Background {
-            is_kept: true,
-            learning: Learning::default(),
-            file: None,
-            start_is_said: false,
-            is_handed_on: true,
-            model: None,
-            every_scan: false,
-        }
-    }
-}
-
 /// Values of `start`.
 pub(crate) const START: &str =
     "\"empty\", \"first-scan\", or a file that `scanhub background SENSOR save` has written";
 
-/// Keys of section `pose` of a link.
-#[derive(Clone, Deserialize)]
-#[serde(deny_unknown_fields, expecting = "where the sensor sits, as { x = 0.3, y = 0.0, yaw = 1.5708 }")]
-pub(crate) struct PoseLayer {
-    x: Option<Spanned<f64>>,
-    y: Option<Spanned<f64>>,
-    yaw: Option<Spanned<f64>>,
-    upside_down: Option<bool>,
+section! {
+    /// Keys of section `pose` of a link.
+    pub(crate) struct PoseKeys: "where the sensor sits, as { x = 0.3, y = 0.0, yaw = 1.5708 }" {
+        /// meters ahead of the robot's center, at most 100
+        x: f64 = 0.0, check within(-100.0..=100.0, OFFSET);
+        /// meters to the left of the robot's center, at most 100
+        y: f64 = 0.0, check within(-100.0..=100.0, OFFSET);
+        /// radians, counterclockwise from ahead
+        ///
+        /// The direction in which the sensor looks, at most one turn.
+        yaw: f64 = 0.0, check within(-FULL_CIRCLE..=FULL_CIRCLE, "radians, counter-clockwise: 90 degrees are 1.5708");
+        /// whether the sensor hangs upside down
+        ///
+        /// The first beam is then the leftmost.
+        upside_down: bool = false;
+    }
 }
 
-/// Keys of section `zones`.
-#[derive(Clone, Deserialize)]
-#[serde(deny_unknown_fields, expecting = "keys of zones, as { radii = [1.0, 0.6] }")]
-pub(crate) struct ZonesLayer {
-    radii: Option<Spanned<Vec<f64>>>,
-    self_min: Option<Spanned<Vec<Spanned<SectorLayer>>>>,
-    margin: Option<Spanned<f64>>,
-    min_beams: Option<Spanned<i64>>,
-    min_scans: Option<Spanned<i64>>,
-    max_invalid: Option<Spanned<f64>>,
-    exact: Option<bool>,
-    no_return_is_far: Option<bool>,
+section! {
+    /// Keys of section `zones`.
+    pub(crate) struct ZonesKeys: "keys of zones, as { radii = [1.0, 0.6] }" {
+        /// meters around the robot's center: slow first, stop last
+        ///
+        /// 1 to 8 circles around the robot's center, the largest first, up to 65 m. A point inside the smallest circle
+        /// means stop; inside another circle, slow.
+        radii: Vec<f64> = vec![1.0, 0.6], check radii;
+        /// the robot's own body, such as { from_deg = -77.5, to_deg = -60.0, range = 0.42 }
+        ///
+        /// The robot's own body in the sensor's view, at most 64 sectors: between the sensor angles `from_deg` and
+        /// `to_deg` (degrees within -180 to 180: 0 ahead, 90 left, -90 right; `from_deg` is the smaller one), readings
+        /// nearer than `range` meters are ignored. `from` and `to`, which counted from the right, are refused, and the
+        /// message has the sector in the new keys. `scanhub zones SENSOR mask` learns these sectors.
+        self_min: Vec<SectorKeys> = Vec::new(), check sectors;
+        /// meters added to each radius
+        ///
+        /// Meters added to every circle, up to 10.
+        margin: f64 = 0.0, check meters(0.0..=10.0);
+        /// beams inside a circle that violate it
+        ///
+        /// Minimum number of beams of a violation.
+        min_beams: i64 = 1, check whole(1..=BEAMS as i64);
+        /// consecutive scans in which they do
+        ///
+        /// Minimum number of consecutive scans of a violation, at most 1000. The verdict is unknown until this number of
+        /// scans has followed a start, a silence or a scan with too many invalid beams.
+        min_scans: i64 = 1, check whole(1..=1000);
+        /// the verdict is unknown if a larger share of the beams has no reading
+        ///
+        /// The verdict is unknown if a larger share of the beams that see into the largest circle has no reading.
+        max_invalid: f64 = 0.1, check within(0.0..=1.0, "a share from 0 to 1");
+        /// ignore what stands between the sensor and the near side of a circle
+        ///
+        /// Whether a sensor outside a circle ignores points in front of the circle's near side.
+        exact: bool = true;
+        /// whether no echo means that nothing is near
+        ///
+        /// If true, no echo means that nothing is near; if false, it counts as no reading.
+        no_return_is_far: bool = true;
+    }
 }
 
-#[derive(Clone, Deserialize)]
+/// A sector of the robot's own body.
+#[derive(Clone, Debug, PartialEq, Deserialize, Serialize)]
 #[serde(deny_unknown_fields, expecting = "a sector, as { from_deg = -77.5, to_deg = -60.0, range = 0.42 }")]
-struct SectorLayer {
+pub(crate) struct SectorKeys {
     from_deg: Option<f64>,
     to_deg: Option<f64>,
     range: f64,
     /// The former keys, whose 0 was to the right. Many of their values are possible in both frames, so none is
     /// accepted.
+    #[serde(skip_serializing)]
     from: Option<f64>,
+    #[serde(skip_serializing)]
     to: Option<f64>,
 }
 
-/// Keys of section `marks`.
-#[derive(Clone, Deserialize)]
-#[serde(deny_unknown_fields, expecting = "keys of marks, as { i_min = 1 } or { level = 240 }")]
-pub(crate) struct MarksLayer {
-    i_min: Option<Spanned<i64>>,
-    level: Option<Spanned<i64>>,
-    max_range_step: Option<Spanned<f64>>,
-    max_gap: Option<Spanned<i64>>,
+section! {
+    /// Keys of section `marks`.
+    pub(crate) struct MarksKeys: "keys of marks, as { i_min = 1 } or { level = 240 }" {
+        /// reflectors of an LMS: lowest level, 1 to 7
+        i_min: i64 = 1, check whole(1..=7);
+        /// reflectors of all other scanners: lowest intensity, 1 to 65535; no default
+        level: Option<i64> = None, check optional(whole(1..=i64::from(u16::MAX))), example "240";
+        /// meters between neighboring beams of a mark
+        ///
+        /// Maximum difference in meters between the ranges of neighboring beams of a mark, up to 10.
+        max_range_step: f64 = 0.1, check meters(0.001..=10.0);
+        /// beams that may be missing in a mark
+        ///
+        /// Maximum number of beams that may be missing between two beams of a mark.
+        max_gap: i64 = 0, check whole(0..=BEAMS as i64);
+    }
 }
 
-/// Keys of section `lines`.
-#[derive(Clone, Deserialize)]
-#[serde(deny_unknown_fields, expecting = "keys of lines, as { max = 20, polish = true }")]
-pub(crate) struct LinesLayer {
-    max: Option<Spanned<i64>>,
-    min_points: Option<Spanned<i64>>,
-    polish: Option<bool>,
+section! {
+    /// Keys of section `lines`.
+    pub(crate) struct LinesKeys: "keys of lines, as { max = 20, polish = true }" {
+        /// lines of a scan, 1 to 64
+        ///
+        /// Maximum number of lines of a scan, 1 to 64. If there are more, those that differ least are joined, and beams
+        /// that fit no line well are left out.
+        max: i64 = 64, check whole(1..=LINES as i64);
+        /// beams of a line, at least 3
+        ///
+        /// Minimum number of beams of a line, 3 to 8192.
+        min_points: i64 = 5, check whole(3..=BEAMS as i64);
+        /// the slower, better fit
+        ///
+        /// Whether cuts between lines are moved to wherever they help most, and beams that fit worst at the ends of lines
+        /// are left out, at most one in twenty. This is slower.
+        polish: bool = false;
+    }
 }
 
-/// Keys of section `background`.
-#[derive(Clone, Deserialize)]
-#[serde(deny_unknown_fields, expecting = "keys of background, as { method = \"multi\" }")]
-pub(crate) struct BackgroundLayer {
-    method: Option<MethodLayer>,
-    threshold_mm: Option<Spanned<i64>>,
-    candidate_mm: Option<Spanned<i64>>,
-    scans: Option<Spanned<i64>>,
-    candidate: Option<CandidateLayer>,
-    start: Option<Spanned<String>>,
-    keep: Option<bool>,
-    no_return_is_far: Option<bool>,
-    publish: Option<PublishLayer>,
+section! {
+    /// Keys of section `motion`.
+    pub(crate) struct MotionKeys: "keys of motion, as { max_step = 0.5, max_turn = 30.0 }" {
+        /// meters from one scan to the next
+        ///
+        /// Maximum distance in meters from one scan to the next: 0.01 to 10. A longer step is refused.
+        max_step: f64 = 0.5, check within(0.01..=10.0, "metres from scan to scan, from 0.01 to 10");
+        /// degrees from one scan to the next
+        ///
+        /// Maximum turn in degrees from one scan to the next: 1 to 85.
+        max_turn: f64 = 30.0, check within(1.0..=85.0, "degrees from scan to scan, from 1 to 85");
+        /// share of readings on surfaces of the scan before
+        ///
+        /// Minimum share of a scan's readings that lie on surfaces of the scan before, 0.1 to 1. With less, the step is
+        /// refused.
+        min_overlap: f64 = 0.4, check within(0.1..=1.0, "a share from 0.1 to 1");
+    }
 }
 
-#[derive(Clone, Deserialize)]
+section! {
+    /// Keys of section `background`.
+    pub(crate) struct BackgroundKeys: "keys of background, as { method = \"multi\" }" {
+        /// multi, paper, moving (for a robot that drives) or off
+        ///
+        /// `multi`; `paper`, a simpler published method; `moving`, for a robot that drives, see below; `off`: the hub
+        /// publishes neither foreground nor background, and refuses requests.
+        method: MethodKey = MethodKey::Multi;
+        /// distance from the background that still belongs to it; default: 30, 60 or 100, by the unit
+        ///
+        /// Distance in mm from the background at which a reading still belongs to it, up to 10,000; at least one unit of
+        /// the sensor. Default: 30, 60 for units of cm, 100 for dm.
+        threshold_mm: Option<i64> = None, check optional(whole(1..=10_000)), example "30";
+        /// of paper: the same distance from a candidate, with the same default
+        ///
+        /// `paper`: the same distance from a candidate that may become background.
+        candidate_mm: Option<i64> = None, check optional(whole(1..=10_000)), example "30";
+        /// scans until a surface is background; default: those of 10 s
+        ///
+        /// Number of scans in which a surface must be seen before it is background, at most 8191; for `paper` they must be
+        /// consecutive. Default: the number of scans in 10 s at the full rate. `multi` knows a surface after 5/8 of this
+        /// number, even when you set it.
+        scans: Option<i64> = None, check optional(whole(1..=8_191)), example "375";
+        /// of paper: first or latest
+        ///
+        /// `paper`: a candidate is compared with the `first` reading of its run, or with the `latest`.
+        candidate: CandidateKey = CandidateKey::First;
+        /// empty, first-scan or a saved file; default: the saved background if it fits, or empty
+        ///
+        /// The model to start with: `empty`; `first-scan`; or a file that `scanhub background SENSOR save` wrote for this
+        /// sensor. A relative path starts in the directory in which the hub was started. Default: the model that an
+        /// earlier hub kept, if it fits, otherwise `empty`.
+        start: Option<String> = None, check optional(start), example "\"empty\"";
+        /// the next hub starts with this background; false: it starts empty
+        ///
+        /// Whether the learned model survives the hub: the next hub starts with it. See below.
+        keep: bool = true;
+        /// whether no echo is a background far away; default: true, of paper false
+        ///
+        /// If true, no echo counts as a background far away; if false, as no reading. Default: true for `multi`, false
+        /// for `paper`.
+        no_return_is_far: Option<bool> = None, example "true";
+        /// on-demand or every-scan
+        ///
+        /// `on-demand`: the model is published when a new generation begins, and after every `scans` scans that it learned
+        /// from; `every-scan`.
+        publish: PublishKey = PublishKey::OnDemand;
+    }
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Deserialize, Serialize)]
 #[serde(rename_all = "kebab-case")]
-enum MethodLayer {
+pub(crate) enum MethodKey {
     Multi,
     Paper,
     Moving,
     Off,
 }
 
-#[derive(Clone, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Deserialize, Serialize)]
 #[serde(rename_all = "kebab-case")]
-enum CandidateLayer {
+pub(crate) enum CandidateKey {
     First,
     Latest,
 }
 
-#[derive(Clone, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Deserialize, Serialize)]
 #[serde(rename_all = "kebab-case")]
-enum PublishLayer {
+pub(crate) enum PublishKey {
     OnDemand,
     EveryScan,
 }
 
-/// Sections of one source, for all links or for one.
-#[derive(Clone)]
-pub(crate) struct Sections {
-    pub(crate) pose: Option<PoseLayer>,
-    pub(crate) zones: Option<ZonesLayer>,
-    pub(crate) marks: Option<MarksLayer>,
-    pub(crate) lines: Option<LinesLayer>,
-    pub(crate) motion: Option<MotionLayer>,
-    pub(crate) background: Option<BackgroundLayer>,
-    pub(crate) early: Option<EarlyLayer>,
+section! {
+    /// Keys of section `early`.
+    pub(crate) struct EarlyKeys: "keys of early, as { pieces = 2 }" {
+        /// reads per telegram of an LMS while `early` has a subscriber, 2 to 8
+        ///
+        /// Number of reads per telegram of an LMS while the topic `early` has a subscriber, 2 to 8.
+        pieces: i64 = 2, check whole(2..=8);
+    }
 }
 
-impl Sections {
-    /// Applies the sections of `origin` to `processing`.
-    pub(crate) fn apply(self, origin: &Origin, processing: &mut Processing) -> Result<(), Failure> {
-        let Sections { pose, zones, marks, lines, motion, background, early } = self;
-        if let Some(layer) = pose {
-            let pose = &mut processing.pose;
-            put(&mut pose.x_m, layer.x, |value| place(origin, "x", value))?;
-            put(&mut pose.y_m, layer.y, |value| place(origin, "y", value))?;
-            put(&mut pose.yaw_rad, layer.yaw, |value| {
-                within(
-                    origin,
-                    "yaw",
-                    value,
-                    -FULL_CIRCLE..=FULL_CIRCLE,
-                    "radians, counter-clockwise: 90 degrees are 1.5708",
-                )
-            })?;
-            pose.upside_down = layer.upside_down.map_or(pose.upside_down, u8::from);
+impl Processing {
+    /// Returns the values in effect of the sections of a link.
+    pub(crate) fn of(keys: &LinkKeys) -> Processing {
+        let LinkKeys { pose, zones, marks, lines, motion, background, early, .. } = keys;
+        Processing {
+            pose: Pose {
+                x_m: pose.x,
+                y_m: pose.y,
+                yaw_rad: pose.yaw,
+                upside_down: pose.upside_down.into(),
+                ..Pose::default()
+            },
+            zones: Zones {
+                radii_mm: zones.radii.iter().copied().map(in_mm).collect(),
+                self_min: zones.self_min.iter().filter_map(SectorKeys::sector).collect(),
+                margin_mm: in_mm(zones.margin),
+                min_beams: zones.min_beams as u16,
+                min_scans: zones.min_scans as u16,
+                max_invalid: zones.max_invalid,
+                exact: zones.exact,
+                no_return_is_far: zones.no_return_is_far,
+            },
+            marks: marks::Settings {
+                i_min: marks.i_min as u8,
+                level: marks.level.map(|level| level as u16),
+                max_range_step_mm: in_mm(marks.max_range_step),
+                max_gap: marks.max_gap as u16,
+            },
+            lines: lines::Settings {
+                max: lines.max as u8,
+                min_points: lines.min_points as u16,
+                polish: lines.polish,
+                ..lines::Settings::default()
+            },
+            motion: motion::Settings {
+                max_step_m: motion.max_step,
+                max_turn_deg: motion.max_turn,
+                min_overlap: motion.min_overlap,
+            },
+            background: background.values(),
+            early: Early { pieces: early.pieces as u8 },
         }
-        if let Some(layer) = zones {
-            layer.apply(origin, &mut processing.zones)?;
-        }
-        if let Some(layer) = marks {
-            let marks = &mut processing.marks;
-            put(&mut marks.i_min, layer.i_min, |value| whole(origin, "i_min", value, 1..=7))?;
-            put(&mut marks.level, layer.level, |value| {
-                whole(origin, "level", value, 1..=i64::from(u16::MAX)).map(Some)
-            })?;
-            put(&mut marks.max_range_step_mm, layer.max_range_step, |value| {
-                millimeters(origin, "max_range_step", value, 0.001..=10.0)
-            })?;
-            put(&mut marks.max_gap, layer.max_gap, |value| {
-                whole(origin, "max_gap", value, 0..=BEAMS as i64)
-            })?;
-        }
-        if let Some(layer) = lines {
-            let lines = &mut processing.lines;
-            put(&mut lines.max, layer.max, |value| whole(origin, "max", value, 1..=LINES as i64))?;
-            put(&mut lines.min_points, layer.min_points, |value| {
-                whole(origin, "min_points", value, 3..=BEAMS as i64)
-            })?;
-            lines.polish = layer.polish.unwrap_or(lines.polish);
-        }
-        motion.map_or(Ok(()), |layer| layer.apply(origin, &mut processing.motion))?;
-        if let Some(layer) = background {
-            layer.apply(origin, &mut processing.background)?;
-        }
-        if let Some(layer) = early {
-            layer.apply(origin, &mut processing.early)?;
-        }
-        Ok(())
     }
 
-    /// Returns [`Kind::Configuration`] if these sections, which belong to one link, set a
-    /// key that a scanner of `family` does not have. A key for all links applies to the families that have it.
-    pub(crate) fn check_family(&self, origin: &Origin, family: Family) -> Result<(), Failure> {
-        if let Some(early) = &self.early {
-            early.check_family(origin, family)?;
-        }
-        let Some(MarksLayer { i_min, level, .. }) = &self.marks else { return Ok(()) };
-        let name = family.name();
-        let (foreign, what, remedy) = if family.has_reflector_levels() {
-            let what = format!("level, and the intensities of an {name} are levels of reflectors, 0 to 7");
-            (level, what, "i_min is the least of them")
-        } else {
-            let what = format!("i_min, and the intensities of an {name} are counts of any surface");
-            (i_min, what, "level is the least of a reflector, as intensities of scans show it")
+    /// Returns the names of the sections that differ in `other`.
+    pub fn differences(&self, other: &Processing) -> Vec<&'static str> {
+        let differences = [
+            ("pose", self.pose != other.pose),
+            ("zones", self.zones != other.zones),
+            ("marks", self.marks != other.marks),
+            ("lines", self.lines != other.lines),
+            ("motion", self.motion != other.motion),
+            ("background", self.background != other.background),
+            ("early", self.early != other.early),
+        ];
+        differences.into_iter().filter(|(_, differs)| *differs).map(|(section, _)| section).collect()
+    }
+}
+
+impl Default for Processing {
+    fn default() -> Self {
+        Processing::of(&LinkKeys::default())
+    }
+}
+
+impl BackgroundKeys {
+    fn values(&self) -> Background {
+        let (start, file) = match self.start.as_deref() {
+            None | Some("empty") => (Start::Empty, None),
+            Some("first-scan") => (Start::FirstScan, None),
+            Some(file) => (Start::Empty, Some(file.into())),
         };
-        foreign.as_ref().map_or(Ok(()), |value| Err(origin.refuse(Some(value.span()), what, remedy)))
-    }
-
-    /// Returns the position of the sensor's pose, if it is set.
-    pub(crate) fn pose(&self) -> Option<Range<usize>> {
-        let PoseLayer { x, y, yaw, .. } = self.pose.as_ref()?;
-        [x, y, yaw].into_iter().flatten().map(Spanned::span).next()
-    }
-
-    /// Returns the position of the initial background, if it is set.
-    pub(crate) fn start(&self) -> Option<Range<usize>> {
-        self.background.as_ref()?.start.as_ref().map(Spanned::span)
-    }
-
-    /// Returns the position of the robot's own body, if it is set.
-    pub(crate) fn self_min(&self) -> Option<Range<usize>> {
-        self.zones.as_ref()?.self_min.as_ref().map(Spanned::span)
-    }
-
-    /// Returns the position of the minimum number of beams, if it is set.
-    pub(crate) fn min_beams(&self) -> Option<Range<usize>> {
-        self.zones.as_ref()?.min_beams.as_ref().map(Spanned::span)
+        Background {
+            is_kept: self.method != MethodKey::Off,
+            learning: Learning {
+                method: match self.method {
+                    MethodKey::Multi | MethodKey::Off => Method::Multi,
+                    MethodKey::Paper => Method::Paper,
+                    MethodKey::Moving => Method::Moving,
+                },
+                threshold_mm: self.threshold_mm.map(|mm| mm as u16),
+                candidate_mm: self.candidate_mm.map(|mm| mm as u16),
+                scans: self.scans.map(|scans| scans as u32),
+                candidate: match self.candidate {
+                    CandidateKey::First => Candidate::First,
+                    CandidateKey::Latest => Candidate::Latest,
+                },
+                start,
+                no_return_is_far: self.no_return_is_far,
+            },
+            file,
+            start_is_said: self.start.is_some(),
+            is_handed_on: self.keep,
+            model: None,
+            every_scan: self.publish == PublishKey::EveryScan,
+        }
     }
 }
 
-impl ZonesLayer {
-    fn apply(self, origin: &Origin, zones: &mut Zones) -> Result<(), Failure> {
-        put(&mut zones.radii_mm, self.radii, |value| radii(origin, value))?;
-        put(&mut zones.self_min, self.self_min, |value| sectors(origin, value))?;
-        put(&mut zones.margin_mm, self.margin, |value| millimeters(origin, "margin", value, 0.0..=10.0))?;
-        put(&mut zones.min_beams, self.min_beams, |value| {
-            whole(origin, "min_beams", value, 1..=BEAMS as i64)
-        })?;
-        put(&mut zones.min_scans, self.min_scans, |value| whole(origin, "min_scans", value, 1..=1000))?;
-        put(&mut zones.max_invalid, self.max_invalid, |value| {
-            within(origin, "max_invalid", value, 0.0..=1.0, "a share from 0 to 1")
-        })?;
-        zones.exact = self.exact.unwrap_or(zones.exact);
-        zones.no_return_is_far = self.no_return_is_far.unwrap_or(zones.no_return_is_far);
-        Ok(())
-    }
-}
-
-impl BackgroundLayer {
-    fn apply(self, origin: &Origin, background: &mut Background) -> Result<(), Failure> {
-        let learning = &mut background.learning;
-        if let Some(method) = self.method {
-            background.is_kept = !matches!(method, MethodLayer::Off);
-            learning.method = match method {
-                MethodLayer::Multi => Method::Multi,
-                MethodLayer::Paper => Method::Paper,
-                MethodLayer::Moving => Method::Moving,
-                MethodLayer::Off => learning.method,
-            };
-        }
-        put(&mut learning.threshold_mm, self.threshold_mm, |value| {
-            whole(origin, "threshold_mm", value, 1..=10_000).map(Some)
-        })?;
-        put(&mut learning.candidate_mm, self.candidate_mm, |value| {
-            whole(origin, "candidate_mm", value, 1..=10_000).map(Some)
-        })?;
-        put(&mut learning.scans, self.scans, |value| whole(origin, "scans", value, 1..=8_191).map(Some))?;
-        if let Some(candidate) = self.candidate {
-            learning.candidate = match candidate {
-                CandidateLayer::First => Candidate::First,
-                CandidateLayer::Latest => Candidate::Latest,
-            };
-        }
-        background.is_handed_on = self.keep.unwrap_or(background.is_handed_on);
-        if let Some(start) = self.start {
-            background.start_is_said = true;
-            (learning.start, background.file) = match start.get_ref().as_str() {
-                "empty" => (Start::Empty, None),
-                "first-scan" => (Start::FirstScan, None),
-                "" => return Err(origin.refuse(Some(start.span()), "start = \"\"", START)),
-                file => (Start::Empty, Some(file.into())),
-            };
-        }
-        learning.no_return_is_far = self.no_return_is_far.or(learning.no_return_is_far);
-        if let Some(publish) = self.publish {
-            background.every_scan = matches!(publish, PublishLayer::EveryScan);
-        }
-        Ok(())
-    }
-}
-
-/// Sets `field` to the result of `check`, if there is a value.
-pub(crate) fn put<T, V>(
-    field: &mut T,
-    value: Option<Spanned<V>>,
-    check: impl FnOnce(Spanned<V>) -> Result<T, Failure>,
-) -> Result<(), Failure> {
-    if let Some(value) = value {
-        *field = check(value)?;
+/// Checks a link's `own` values, which are not those for all links.
+///
+/// Returns [`Kind::Configuration`] if it sets a key that a scanner of `family` does not have. A key for all links applies to
+/// the families that have it.
+pub(crate) fn check_family(own: &DeTable<'_>, sources: &SourceMap, family: Family) -> Result<(), Failure> {
+    let name = family.name();
+    for key in FAMILY_KEYS.into_iter().filter(|key| !has_key(Some(family), key)) {
+        let Some(value) = find(own, key) else { continue };
+        let (what, remedy) = match key {
+            "marks.level" => (
+                format!("level, and the intensities of an {name} are levels of reflectors, 0 to 7"),
+                "i_min is the least of them",
+            ),
+            "marks.i_min" => (
+                format!("i_min, and the intensities of an {name} are counts of any surface"),
+                "level is the least of a reflector, as intensities of scans show it",
+            ),
+            _ => (
+                format!("pieces, and an {name} sends packets, which are short"),
+                "it warns by each packet anyway",
+            ),
+        };
+        return Err(sources.refuse(value.span(), what, remedy));
     }
     Ok(())
 }
 
-pub(crate) fn within(
-    origin: &Origin,
-    key: &str,
-    value: Spanned<f64>,
-    allowed: RangeInclusive<f64>,
-    remedy: &str,
-) -> Result<f64, Failure> {
-    // NaN is not within any range.
-    if allowed.contains(value.get_ref()) {
-        return Ok(*value.get_ref());
-    }
-    Err(origin.refuse(Some(value.span()), format!("{key} = {}", value.get_ref()), remedy))
-}
-
-pub(crate) fn whole<T: TryFrom<i64>>(
-    origin: &Origin,
-    key: &str,
-    value: Spanned<i64>,
-    allowed: RangeInclusive<i64>,
-) -> Result<T, Failure> {
-    let number = Some(*value.get_ref()).filter(|number| allowed.contains(number));
-    number.and_then(|number| T::try_from(number).ok()).ok_or_else(|| {
-        let remedy = format!("a whole number from {} to {}", allowed.start(), allowed.end());
-        origin.refuse(Some(value.span()), format!("{key} = {}", value.get_ref()), remedy)
+/// Returns whether a scanner of `family` has the key of a section. If the scanner is searched for, it may have all.
+pub(crate) fn has_key(family: Option<Family>, key: &str) -> bool {
+    family.is_none_or(|family| match key {
+        "marks.i_min" => family.has_reflector_levels(),
+        "marks.level" => !family.has_reflector_levels(),
+        "early.pieces" => features(family).has_whole_telegrams,
+        _ => true,
     })
 }
 
-fn place(origin: &Origin, key: &str, value: Spanned<f64>) -> Result<f64, Failure> {
-    within(origin, key, value, -MAX_OFFSET_M..=MAX_OFFSET_M, "metres from the robot's centre, at most 100")
-}
-
-fn millimeters(
-    origin: &Origin,
-    key: &str,
-    value: Spanned<f64>,
-    allowed_m: RangeInclusive<f64>,
-) -> Result<u16, Failure> {
-    let remedy = format!("metres, from {} to {}", allowed_m.start(), allowed_m.end());
-    within(origin, key, value, allowed_m, &remedy).map(in_mm)
-}
+/// Keys that only some families have.
+const FAMILY_KEYS: [&str; 3] = ["early.pieces", "marks.level", "marks.i_min"];
 
 /// Returns the nearest whole number of millimeters, saturated to a u16.
-fn in_mm(metres: f64) -> u16 {
-    (metres * 1000.0).round() as u16
+fn in_mm(meters: f64) -> u16 {
+    (meters * 1000.0).round() as u16
 }
 
-fn radii(origin: &Origin, value: Spanned<Vec<f64>>) -> Result<Vec<u16>, Failure> {
-    let radii = value.get_ref();
-    let refuse = |remedy: &str| Err(origin.refuse(Some(value.span()), format!("radii = {radii:?}"), remedy));
+fn radii(key: &str, radii: &[f64]) -> Checked {
+    let refuse = |remedy: &str| Err(refused(format!("{key} = {radii:?}"), remedy));
     if !(1..=ZONES).contains(&radii.len()) {
         return refuse("1 to 8 radii, the largest first, for example [1.0, 0.6]");
     }
     if !radii.iter().all(|radius| (0.001..=MAX_RADIUS_M).contains(radius)) {
         return refuse("metres around the robot's centre, more than 0 and at most 65");
     }
-    let radii: Vec<u16> = radii.iter().copied().map(in_mm).collect();
-    if radii.is_sorted_by(|one, next| one > next) {
-        Ok(radii)
-    } else {
-        refuse("the largest first, each once")
+    match radii.iter().copied().map(in_mm).is_sorted_by(|one, next| one > next) {
+        true => Ok(()),
+        false => refuse("the largest first, each once"),
     }
 }
 
-fn sectors(origin: &Origin, value: Spanned<Vec<Spanned<SectorLayer>>>) -> Result<Vec<Sector>, Failure> {
-    if value.get_ref().len() > SECTORS {
-        let what = format!("self_min has {} sectors", value.get_ref().len());
-        return Err(origin.refuse(Some(value.span()), what, format!("at most {SECTORS}: merge neighbours")));
+fn sectors(key: &str, sectors: &[SectorKeys]) -> Checked {
+    if sectors.len() > SECTORS {
+        let what = format!("{key} has {} sectors", sectors.len());
+        return Err(refused(what, format!("at most {SECTORS}: merge neighbours")));
     }
-    value.into_inner().into_iter().map(|sector| in_sector(origin, sector)).collect()
+    each(sector)(key, sectors)
 }
 
-fn in_sector(origin: &Origin, sector: Spanned<SectorLayer>) -> Result<Sector, Failure> {
-    let span = Some(sector.span());
-    let (from, to, range) = match sector.into_inner() {
-        SectorLayer { from_deg: Some(from), to_deg: Some(to), range, from: None, to: None } => {
+fn sector(key: &str, sector: &SectorKeys) -> Checked {
+    let (from, to, range) = match *sector {
+        SectorKeys { from_deg: Some(from), to_deg: Some(to), range, from: None, to: None } => {
             (from, to, range)
         }
-        SectorLayer { from_deg: None, to_deg: None, range, from: Some(from), to: Some(to) } => {
+        SectorKeys { from_deg: None, to_deg: None, range, from: Some(from), to: Some(to) } => {
             let [now_from, now_to] = [from, to].map(|deg| (deg * 1000.0 - 90_000.0).round() / 1000.0);
             let what = format!(
-                "self_min = {{ from = {from}, to = {to}, range = {range} }} counts angles from the right"
+                "{key} = {{ from = {from}, to = {to}, range = {range} }} counts angles from the right"
             );
             let remedy = format!(
                 "angles are counted from ahead now: {{ from_deg = {now_from:?}, to_deg = {now_to:?}, range = {range:?} }}"
             );
-            return Err(origin.refuse(span, what, remedy));
+            return Err(refused(what, remedy));
         }
         _ => {
             let remedy = "give it both angles, as { from_deg = -77.5, to_deg = -60.0, range = 0.42 }";
-            return Err(origin.refuse(span, "self_min has a sector without its two angles", remedy));
+            return Err(refused(format!("{key} has a sector without its two angles"), remedy));
         }
     };
     let refuse = |remedy: &str| {
-        let what = format!("self_min = {{ from_deg = {from}, to_deg = {to}, range = {range} }}");
-        Err(origin.refuse(span.clone(), what, remedy))
+        Err(refused(format!("{key} = {{ from_deg = {from}, to_deg = {to}, range = {range} }}"), remedy))
     };
     if !(-180.0..=180.0).contains(&from) || !(from..=180.0).contains(&to) {
         return refuse(
@@ -554,62 +554,85 @@ fn in_sector(origin: &Origin, sector: Spanned<SectorLayer>) -> Result<Sector, Fa
     if !(0.001..=MAX_RADIUS_M).contains(&range) {
         return refuse("range in metres: readings that are nearer are the robot's own body");
     }
-    let mdeg = |deg: f64| (deg * 1000.0).round() as i32;
-    Ok(Sector { from_mdeg: mdeg(from), to_mdeg: mdeg(to), range_mm: in_mm(range) })
+    Ok(())
 }
 
-/// No robot is larger. A greater value is in millimeters, or a mistake.
-const MAX_OFFSET_M: f64 = 100.0;
+impl SectorKeys {
+    fn sector(&self) -> Option<Sector> {
+        let mdeg = |deg: f64| (deg * 1000.0).round() as i32;
+        let (from_mdeg, to_mdeg) = (mdeg(self.from_deg?), mdeg(self.to_deg?));
+        Some(Sector { from_mdeg, to_mdeg, range_mm: in_mm(self.range) })
+    }
+}
+
+fn start(key: &str, start: &str) -> Checked {
+    if start.is_empty() { Err(refused(format!("{key} = \"\""), START)) } else { Ok(()) }
+}
+
+const OFFSET: &str = "metres from the robot's centre, at most 100";
 /// A radius in mm must fit into 16 bits.
 const MAX_RADIUS_M: f64 = 65.0;
 /// A larger yaw, in either direction, was written in degrees by mistake.
 const FULL_CIRCLE: f64 = 2.0 * std::f64::consts::PI;
 
-/// Keys of section `motion`.
-#[derive(Clone, Deserialize)]
-#[serde(deny_unknown_fields, expecting = "keys of motion, as { max_step = 0.5, max_turn = 30.0 }")]
-pub(crate) struct MotionLayer {
-    max_step: Option<Spanned<f64>>,
-    max_turn: Option<Spanned<f64>>,
-    min_overlap: Option<Spanned<f64>>,
-}
-
-impl MotionLayer {
-    pub(crate) fn apply(
-        self,
-        origin: &Origin,
-        motion: &mut preprocess::motion::Settings,
-    ) -> Result<(), Failure> {
-        put(&mut motion.max_step_m, self.max_step, |value| {
-            within(origin, "max_step", value, 0.01..=10.0, "metres from scan to scan, from 0.01 to 10")
-        })?;
-        put(&mut motion.max_turn_deg, self.max_turn, |value| {
-            within(origin, "max_turn", value, 1.0..=85.0, "degrees from scan to scan, from 1 to 85")
-        })?;
-        put(&mut motion.min_overlap, self.min_overlap, |value| {
-            within(origin, "min_overlap", value, 0.1..=1.0, "a share from 0.1 to 1")
-        })
+/// Checks that a sensor's beams cover enough of its largest zone to ever detect a violation. A zone that cannot be violated
+/// is an error of the configuration. The real sensor is unknown here, so the hub checks again with its scans.
+///
+/// Returns [`Kind::Configuration`] with the place of the cause in `table`, the values of the link, or else with `place`,
+/// where the link starts.
+pub(crate) fn check_coverage(
+    link: &Link,
+    table: &DeTable<'_>,
+    place: &str,
+    sources: &SourceMap,
+) -> Result<(), Failure> {
+    let processing = &link.processing;
+    let settings = processing.zones.settings();
+    let (beams, min_beams) = (link.scan_heads()[0].count.into(), settings.min_beams);
+    let refuse = |keys: &[&str], what: String, remedy: &str| {
+        let spans = keys.iter().filter_map(|key| find(table, key).map(Spanned::span));
+        // The first key of the last source.
+        let last = spans.rev().max_by_key(|span| sources.index(span));
+        let place = last.map_or(place.to_owned(), |span| sources.place(span));
+        let message = format!("{place}: link {}: {what}", link.name);
+        Err(Failure::new(Kind::Configuration, message, remedy.replace("NAME", &link.name)))
+    };
+    if usize::from(min_beams) > beams {
+        let what = format!("min_beams = {min_beams}, and a scan has {beams} beams");
+        return refuse(&["zones.min_beams"], what, "the default is one beam");
     }
-}
-
-/// Keys of section `early`.
-#[derive(Clone, Deserialize)]
-#[serde(deny_unknown_fields, expecting = "keys of early, as { pieces = 2 }")]
-pub(crate) struct EarlyLayer {
-    pieces: Option<Spanned<i64>>,
-}
-
-impl EarlyLayer {
-    pub(crate) fn apply(self, origin: &Origin, early: &mut Early) -> Result<(), Failure> {
-        put(&mut early.pieces, self.pieces, |value| whole(origin, "pieces", value, 2..=8))
+    // The maximum number of beams that can detect something in the largest zone.
+    let detecting = |settings: &zones::Settings<'_>| {
+        let of_head = |head: &ScanHead| {
+            let beams = usize::from(head.count);
+            let mut check = Check::new(processing.pose, settings, beams);
+            check.update(&Scan::of(*head, &vec![0; beams]), &mut schema::Zones::unknown());
+            check.telling()
+        };
+        link.scan_heads().iter().map(of_head).max().unwrap_or_default()
+    };
+    let seeing = detecting(&settings);
+    if seeing >= min_beams {
+        return Ok(());
     }
-
-    /// Returns [`Kind::Configuration`] if it is set for a `family` that sends packets, which are short already.
-    pub(crate) fn check_family(&self, origin: &Origin, family: Family) -> Result<(), Failure> {
-        let foreign = self.pieces.as_ref().filter(|_| !features(family).has_whole_telegrams);
-        foreign.map_or(Ok(()), |pieces| {
-            let what = format!("pieces, and an {} sends packets, which are short", family.name());
-            Err(origin.refuse(Some(pieces.span()), what, "it warns by each packet anyway"))
-        })
+    let circle_m = f64::from(settings.radii_mm.first().copied().unwrap_or_default()) / 1000.0;
+    if detecting(&zones::Settings { self_min: &[], ..settings }) == 0 {
+        return refuse(
+            &["pose.x", "pose.y", "pose.yaw"],
+            format!("no beam sees into the circle of {circle_m} m"),
+            "correct the sensor's pose, or set a circle that it sees: link.NAME.zones.radii",
+        );
     }
+    if seeing == 0 {
+        return refuse(
+            &["zones.self_min"],
+            format!("self_min covers every beam up to the circle of {circle_m} m"),
+            "shorten self_min: it is only for the robot's own body",
+        );
+    }
+    refuse(
+        &["zones.min_beams"],
+        format!("min_beams = {min_beams}, and {seeing} can see the circle of {circle_m} m"),
+        "set fewer beams, a larger circle, or another pose or self_min",
+    )
 }

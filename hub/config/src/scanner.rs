@@ -1,17 +1,18 @@
 //! The scanner of a link: its family and settings, as values in effect and as keys of the sources. The family checks the
 //! settings; this module knows where each one is set.
 
-use std::collections::BTreeMap;
-use std::ops::Range;
-
 use port::Source;
 use scanhub_drivers::{
     ANY, AUTO, Features, Key, Model, Refusal, Settings, SettingsRequest, Value, auto_or, family_of, features,
 };
 use schema::{Failure, Family};
+use serde_json::Value as Json;
 use toml::Spanned;
+use toml::de::DeTable;
 
-use crate::sources::Origin;
+use crate::link::LinkKeys;
+use crate::section::{Section, find};
+use crate::sources::SourceMap;
 
 /// Family of a scanner, with its settings.
 #[derive(Clone, Debug)]
@@ -90,117 +91,127 @@ impl Scanner {
         let is_found = self.family.is_none() || self.settings.is_found;
         Settings { max_beams: Some(self.max_beams()), fixed_rate, listen_only, is_found, ..self.settings }
     }
-}
 
-/// Keys of a scanner in one source.
-pub(crate) struct ScannerLayer {
-    pub(crate) family: Option<Spanned<String>>,
-    pub(crate) expected_type: Option<Spanned<String>>,
-    pub(crate) model: Option<Spanned<String>>,
-    pub(crate) beams: Option<Spanned<i64>>,
-    pub(crate) angle: Option<Spanned<f64>>,
-    pub(crate) resolution: Option<Spanned<f64>>,
-    pub(crate) unit: Option<Spanned<String>>,
-    /// A number or a name.
-    pub(crate) mode: Option<Spanned<toml::Value>>,
-    pub(crate) idle: Option<Spanned<String>>,
-    pub(crate) baud: Option<Spanned<u32>>,
-}
-
-/// Values of all sources with their places.
-#[derive(Default)]
-pub(crate) struct ScannerDraft {
-    /// The family, or that it is searched for.
-    family: Option<(Option<Family>, String)>,
-    request: SettingsRequest,
-    places: BTreeMap<Key, String>,
-}
-
-impl ScannerDraft {
-    /// Applies the keys that are set in `layer`.
-    pub(crate) fn apply(&mut self, layer: ScannerLayer, origin: &Origin) -> Result<(), Failure> {
-        let ScannerLayer { family, expected_type, model, beams, angle, resolution, unit, mode, idle, baud } =
-            layer;
-        if let Some(family) = family {
-            let known = Family::parse(family.get_ref());
-            if known.is_none() && !family.get_ref().eq_ignore_ascii_case(AUTO) {
-                let what = format!("family = \"{}\"", family.get_ref());
-                let names = auto_or(Family::ALL.into_iter().map(Family::name));
-                return Err(origin.refuse(Some(family.span()), what, names));
-            }
-            self.family = Some((known, origin.place(Some(family.span()))));
-        }
-        for (key, text) in
-            [(Key::Model, model), (Key::Idle, idle), (Key::Type, expected_type), (Key::Unit, unit)]
-        {
-            self.set(key, text.as_ref().map(|text| (Value::Text(text.get_ref()), text.span())), origin)?;
-        }
-        for (key, whole) in [(Key::Beams, beams), (Key::Baud, baud.map(widened))] {
-            self.set(key, whole.map(|whole| (Value::Whole(*whole.get_ref()), whole.span())), origin)?;
-        }
-        for (key, number) in [(Key::Angle, angle), (Key::Resolution, resolution)] {
-            self.set(key, number.map(|number| (Value::Number(*number.get_ref()), number.span())), origin)?;
-        }
-        let Some(mode) = mode else { return Ok(()) };
-        let other = mode.get_ref().to_string();
-        let (key, value) = match mode.get_ref() {
-            toml::Value::String(name) => (Key::ModeName, Value::Text(name)),
-            toml::Value::Integer(number) => (Key::ModeNumber, Value::Whole(*number)),
-            _ => (Key::ModeNumber, Value::Other(&other)),
-        };
-        self.set(key, Some((value, mode.span())), origin)
+    /// Returns the keys that the scanner can have, with their values.
+    pub(crate) fn values(&self) -> impl Iterator<Item = (&'static str, Json)> {
+        let has_models = !self.features().models.is_empty();
+        let own = self.family.map_or(&[][..], |_| self.features().keys);
+        let keys = Key::ALL.into_iter().filter(move |key| match key {
+            Key::Beams => self.family.is_none() || has_models,
+            Key::Model => self.family.is_some() && has_models,
+            key => own.contains(key),
+        });
+        keys.map(|key| (key.name(), self.settings.value(key).map_or(Json::Null, json)))
     }
 
-    /// Sets `key`, if there is a value for it.
-    fn set(
-        &mut self,
-        key: Key,
-        value: Option<(Value<'_>, Range<usize>)>,
-        origin: &Origin,
-    ) -> Result<(), Failure> {
-        let Some((value, span)) = value else { return Ok(()) };
-        self.places.insert(key, origin.place(Some(span.clone())));
-        self.request
-            .set(key, value)
-            .map_err(|Refusal { what, remedy, .. }| origin.refuse(Some(span), what, remedy))
+    /// Returns the keys whose values differ in `other`.
+    pub(crate) fn differences(&self, other: &Scanner) -> Vec<&'static str> {
+        let is_other_family = self.family != other.family;
+        let differs = |key: &Key| {
+            // Another family has another default.
+            let follows = is_other_family && matches!(key, Key::Angle | Key::Resolution);
+            !follows && self.settings.value(*key) != other.settings.value(*key)
+        };
+        let family = is_other_family.then_some("family");
+        let mut keys: Vec<_> =
+            family.into_iter().chain(Key::ALL.into_iter().filter(differs).map(Key::name)).collect();
+        keys.dedup();
+        keys
+    }
+}
+
+fn json(value: Value<'_>) -> Json {
+    match value {
+        Value::Text(text) | Value::Other(text) => text.into(),
+        Value::Whole(number) => number.into(),
+        Value::Number(number) => number.into(),
+    }
+}
+
+/// The scanner that the keys of a link request, with their places.
+pub(crate) struct ScannerRequest<'a> {
+    /// Family, if it is set. `None` in it: it is searched for.
+    family: Option<Option<Family>>,
+    request: SettingsRequest,
+    table: &'a DeTable<'a>,
+    sources: &'a SourceMap,
+}
+
+impl<'a> ScannerRequest<'a> {
+    /// Returns the request of `keys`, which were read from `table`.
+    ///
+    /// Returns [`schema::Kind::Configuration`] with place, value and remedy if no scanner can have a value.
+    pub(crate) fn of(
+        keys: &LinkKeys,
+        table: &'a DeTable<'a>,
+        sources: &'a SourceMap,
+    ) -> Result<ScannerRequest<'a>, Failure> {
+        let span = |key: &str| find(table, key).map(Spanned::span).unwrap_or_default();
+        let family = keys.family.as_ref().map(|name| match Family::parse(name) {
+            None if !name.eq_ignore_ascii_case(AUTO) => {
+                let names = auto_or(Family::ALL.into_iter().map(Family::name));
+                Err(sources.refuse(span("family"), format!("family = \"{name}\""), names))
+            }
+            known => Ok(known),
+        });
+        let mut request = SettingsRequest::default();
+        let values = keys.json();
+        let mode = keys.mode.as_ref().map(ToString::to_string).unwrap_or_default();
+        for key in Key::ALL {
+            let value = match &values[key.name()] {
+                Json::Null => continue,
+                Json::String(text) => Value::Text(text),
+                Json::Number(number) => match (number.as_i64(), number.as_f64()) {
+                    (Some(number), _) => Value::Whole(number),
+                    (_, Some(number)) if key.name() != "mode" => Value::Number(number),
+                    _ => Value::Other(&mode),
+                },
+                _ => Value::Other(&mode),
+            };
+            // A mode has a name or a number.
+            if (key == Key::ModeName) != matches!(value, Value::Text(_)) && key.name() == "mode" {
+                continue;
+            }
+            request
+                .set(key, value)
+                .map_err(|Refusal { what, remedy, .. }| sources.refuse(span(key.name()), what, remedy))?;
+        }
+        Ok(ScannerRequest { family: family.transpose()?, request, table, sources })
     }
 
     /// Returns the place of the number of a measuring mode, if one is set.
-    pub(crate) fn mode_number_place(&self) -> Option<&str> {
+    pub(crate) fn mode_number_place(&self) -> Option<String> {
         self.request.mode_number?;
-        self.places.get(&Key::ModeNumber).map(String::as_str)
+        self.place("mode")
     }
 
     /// Returns the scanner. `refuse` creates the failure for a place, a problem and a remedy. Without a place, it is that
     /// of the link.
     pub(crate) fn finish(
         &self,
-        refuse: impl Fn(Option<&str>, String, &str) -> Failure,
+        refuse: impl Fn(Option<String>, String, &str) -> Failure,
     ) -> Result<Scanner, Failure> {
         let refused = |Refusal { keys, what, remedy }: Refusal| {
-            refuse(keys.iter().find_map(|key| self.place(*key)), what, &remedy)
+            refuse(keys.iter().find_map(|key| self.place(key.name())), what, &remedy)
         };
-        let named = match &self.family {
-            Some((Some(_), _)) => None,
-            _ => self.named_family(&refuse)?,
-        };
+        let set = self.family.flatten();
+        let named = if set.is_some() { None } else { self.named_family(&refuse)? };
         let model = self.request.model.as_deref();
-        let set = self.family.as_ref().and_then(|(family, place)| Some(((*family)?, place)));
         match (model, set) {
-            (Some(model), Some((family, family_place))) => {
+            (Some(model), Some(family)) => {
                 if let Some(implied) = family_of(model).filter(|implied| *implied != family) {
                     let [implied, family] = [implied.name(), family.name()];
-                    let what = format!(
-                        "model = \"{model}\" is of family {implied}, but {family_place} says {family}"
-                    );
+                    let place = self.place("family").unwrap_or_default();
+                    let what =
+                        format!("model = \"{model}\" is of family {implied}, but {place} says {family}");
                     let remedy = format!("leave `family` out, or set family = \"{implied}\"");
-                    return Err(refuse(self.place(Key::Model), what, &remedy));
+                    return Err(refuse(self.place(Key::Model.name()), what, &remedy));
                 }
             }
             (_, None) => self.request.check_model().map_err(refused)?,
             (None, Some(_)) => {}
         }
-        let family = set.map(|(family, _)| family).or(named);
+        let family = set.or(named);
         let settings = match family {
             Some(family) => self.request.check(family).map_err(refused)?,
             None => Settings { beams: self.request.beams, ..Settings::default() },
@@ -214,7 +225,7 @@ impl ScannerDraft {
     /// Returns the family that the keys name which only one family has. `None` if there are none.
     fn named_family(
         &self,
-        refuse: impl Fn(Option<&str>, String, &str) -> Failure,
+        refuse: impl Fn(Option<String>, String, &str) -> Failure,
     ) -> Result<Option<Family>, Failure> {
         let mut all = self.request.naming();
         let Some((first_key, first, first_what)) = all.next() else { return Ok(None) };
@@ -222,19 +233,20 @@ impl ScannerDraft {
             let what = format!(
                 "{what} is of family {}, but {first_what} at {} is of family {}",
                 other.name(),
-                self.place(first_key).unwrap_or_default(),
+                self.place(first_key.name()).unwrap_or_default(),
                 first.name()
             );
-            return Err(refuse(self.place(key), what, "set only keys of the family that the scanner has"));
+            return Err(refuse(
+                self.place(key.name()),
+                what,
+                "set only keys of the family that the scanner has",
+            ));
         }
         Ok(Some(first))
     }
 
-    fn place(&self, key: Key) -> Option<&str> {
-        self.places.get(&key).map(String::as_str)
+    /// Returns the place where `key` is set.
+    fn place(&self, key: &str) -> Option<String> {
+        find(self.table, key).map(|value| self.sources.place(value.span()))
     }
-}
-
-fn widened(value: Spanned<u32>) -> Spanned<i64> {
-    Spanned::new(value.span(), i64::from(*value.get_ref()))
 }

@@ -1,16 +1,14 @@
-//! The sources of a configuration: files and flags, one layer each, and the place of each value in them, so that an
-//! error can name file, line and column, or the flag. `load.rs` combines the layers.
+//! The sources of a configuration: files and flags, and the place of each value in them, so that an error can name file,
+//! line and column, or the flag. `load.rs` merges them.
 
 use std::ops::Range;
 use std::path::{Path, PathBuf};
 
 use scanhub_files::regular;
 use schema::{Failure, Kind};
-
-use crate::layer::{Layer, link_as_toml, parse, set_as_toml};
-
-/// A layer and its origin.
-type SourceLayer = Result<(Origin, Layer), Failure>;
+use serde::de::DeserializeOwned;
+use toml::Spanned;
+use toml::de::{DeArray, DeTable, DeValue, ValueDeserializer};
 
 /// Sources of values, in addition to the defaults.
 #[derive(Clone, Debug, Default)]
@@ -38,105 +36,136 @@ impl Sources {
         files
     }
 
-    /// Reads the files one by one.
-    pub(crate) fn files(&self) -> impl Iterator<Item = SourceLayer> {
-        self.files.iter().map(|path| {
-            let origin = Origin::read(path)?;
-            let layer = parse(&origin)?;
-            Ok((origin, layer))
-        })
+    /// Reads each source once, up to the first one that cannot be read.
+    pub fn read(&self) -> SourceMap {
+        let mut map = SourceMap { text: String::new(), lines: vec![0], sources: Vec::new(), failure: None };
+        map.failure = self.read_into(&mut map).err();
+        map
     }
 
-    /// Parses the links of the command line.
-    pub(crate) fn links(&self) -> impl Iterator<Item = SourceLayer> {
-        self.links.iter().map(|flag| {
+    fn read_into(&self, map: &mut SourceMap) -> Result<(), Failure> {
+        for path in &self.files {
+            let text = regular::read_text(path, regular::LONGEST).map_err(|error| {
+                let message = format!("{}: {error}", path.display());
+                Failure::new(Kind::Input, message, "name a readable TOML file")
+            })?;
+            map.push(SourceKind::File, path.display().to_string(), &text);
+        }
+        for (kind, flag, toml, what, remedy) in self.flags() {
+            let refuse = || Failure::new(Kind::Configuration, format!("{flag}: {what}"), remedy);
+            let text = toml.ok_or_else(refuse)?;
+            map.push(kind, flag, &text);
+        }
+        Ok(())
+    }
+
+    /// Returns the flags, each with its TOML and with the error and the remedy for a flag without.
+    fn flags(&self) -> impl Iterator<Item = (SourceKind, String, Option<String>, &str, &str)> {
+        let links = self.links.iter().map(|flag| {
             let remedy = "write --link NAME=PORT, for example front=/dev/ttyUSB0";
-            of_flag(format!("--link {flag}"), link_as_toml(flag), "no = in it", remedy)
-        })
-    }
-
-    /// Parses the single values of the command line.
-    pub(crate) fn settings(&self) -> impl Iterator<Item = SourceLayer> {
-        self.set.iter().map(|flag| {
+            (SourceKind::Link, format!("--link {flag}"), link_as_toml(flag), "no = in it", remedy)
+        });
+        links.chain(self.set.iter().map(|flag| {
             let remedy = "write --set link.NAME.KEY=VALUE, as link.front.angle=100, or for all links --set \
                           'zones.radii=[1.2,0.7]'";
-            of_flag(format!("--set {flag}"), set_as_toml(flag), "not a setting", remedy)
-        })
-    }
-
-    /// Returns all layers. A later one takes precedence.
-    pub(crate) fn all(&self) -> impl Iterator<Item = SourceLayer> {
-        self.files().chain(self.links()).chain(self.settings())
+            (SourceKind::Setting, format!("--set {flag}"), set_as_toml(flag), "not a setting", remedy)
+        }))
     }
 }
 
-/// Parses `text`, the TOML of a flag. Refuses the flag if there is none.
-fn of_flag(flag: String, text: Option<String>, what: &str, remedy: &str) -> SourceLayer {
-    let is_none = text.is_none();
-    let origin = Origin::Flag { flag, text: text.unwrap_or_default() };
-    if is_none {
-        return Err(origin.refuse(None, what, remedy));
+/// Type of a source.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum SourceKind {
+    File,
+    /// `--link`.
+    Link,
+    /// `--set`.
+    Setting,
+}
+
+/// The texts of all sources, one after the other. A position in them names a source, and a line and column in it.
+pub struct SourceMap {
+    text: String,
+    /// Positions at which lines start.
+    lines: Vec<usize>,
+    sources: Vec<Source>,
+    /// Failure of the first source that could not be read.
+    failure: Option<Failure>,
+}
+
+struct Source {
+    kind: SourceKind,
+    /// Path of the file, or the flag as given.
+    name: String,
+    /// Part of the text that is from this source.
+    span: Range<usize>,
+}
+
+impl SourceMap {
+    fn push(&mut self, kind: SourceKind, name: String, text: &str) {
+        let begin = self.text.len();
+        self.text.push_str(text);
+        self.sources.push(Source { kind, name, span: begin..self.text.len() });
+        self.text.push('\n');
+        self.lines.extend(self.text[begin..].match_indices('\n').map(|(end, _)| begin + end + 1));
     }
-    let layer = parse(&origin)?;
-    Ok((origin, layer))
-}
 
-/// One source of values with its text.
-#[derive(Clone, Debug)]
-pub(crate) enum Origin {
-    /// A TOML file, and the offsets of its lines.
-    File { path: PathBuf, text: String, lines: Vec<usize> },
-    /// A flag of the command line, as given and as TOML.
-    Flag { flag: String, text: String },
-}
-
-impl Origin {
-    /// Reads a file.
+    /// Parses the sources into tables, whose spans are positions in this text, and into values of type `T`.
     ///
-    /// Returns [`Kind::Input`] if it cannot be read.
-    pub(crate) fn read(path: &Path) -> Result<Origin, Failure> {
-        let text = regular::read_text(path, regular::LONGEST).map_err(|error| {
-            let message = format!("{}: {error}", path.display());
-            Failure::new(Kind::Input, message, "name a readable TOML file")
-        })?;
-        let lines = std::iter::once(0).chain(text.match_indices('\n').map(|(end, _)| end + 1)).collect();
-        Ok(Origin::File { path: path.to_owned(), text, lines })
+    /// Returns [`Kind::Configuration`] with place and remedy if a source is not valid TOML, has an unknown key or a value of
+    /// the wrong type, and [`Kind::Input`] if it cannot be read.
+    pub(crate) fn layers<T: DeserializeOwned>(&self) -> Result<Vec<(SourceKind, DeTable<'_>, T)>, Failure> {
+        let mut layers = Vec::new();
+        for Source { kind, span: Range { start: begin, end }, .. } in &self.sources {
+            let table = DeTable::parse(&self.text[*begin..*end]);
+            let table = table.map_err(|error| self.explain(&error, *begin))?.into_inner();
+            let table = moved_table(table, *begin);
+            layers.push((*kind, table.clone(), self.deserialize(table)?));
+        }
+        self.failure.clone().map_or(Ok(layers), Err)
     }
 
-    /// Returns its text, as TOML.
-    pub(crate) fn text(&self) -> &str {
-        match self {
-            Origin::File { text, .. } | Origin::Flag { text, .. } => text,
-        }
+    /// Returns the value that `table` contains.
+    ///
+    /// Returns [`Kind::Configuration`] with place and remedy if there is an unknown key, or a value of the wrong type.
+    pub(crate) fn deserialize<T: DeserializeOwned>(&self, table: DeTable<'_>) -> Result<T, Failure> {
+        let begin = table.keys().map(|key| key.span().start).min().unwrap_or_default();
+        let table = Spanned::new(begin..begin, DeValue::Table(table));
+        T::deserialize(ValueDeserializer::from(table)).map_err(|error| self.explain(&error, 0))
     }
 
-    /// Returns the place of `span` in this source: `FILE:LINE:COLUMN`, or the flag.
-    pub(crate) fn place(&self, span: Option<Range<usize>>) -> String {
-        match (self, span) {
-            (Origin::File { path, text, lines }, Some(span)) => {
-                let at = span.start.min(text.len());
-                let line = lines.partition_point(|&begin| begin <= at);
-                let column = text[lines[line - 1]..at].chars().count() + 1;
-                format!("{}:{line}:{column}", path.display())
-            }
-            (Origin::File { path, .. }, None) => path.display().to_string(),
-            (Origin::Flag { flag, .. }, _) => flag.clone(),
+    /// Returns the index of the source of `span`.
+    pub(crate) fn index(&self, span: &Range<usize>) -> usize {
+        self.sources.partition_point(|source| source.span.start <= span.start).saturating_sub(1)
+    }
+
+    /// Returns the place of `span`: `FILE:LINE:COLUMN`, or the flag.
+    pub(crate) fn place(&self, span: Range<usize>) -> String {
+        let Source { kind, name, span: own } = &self.sources[self.index(&span)];
+        if *kind != SourceKind::File {
+            return name.clone();
         }
+        let line = |at: usize| self.lines.partition_point(|&begin| begin <= at);
+        let at = span.start.min(own.end);
+        let column = self.text[self.lines[line(at) - 1]..at].chars().count() + 1;
+        format!("{name}:{}:{column}", line(at) - line(own.start) + 1)
     }
 
     /// Returns the failure for an invalid value at `span`. `what` states the problem, `remedy` the valid values.
     pub(crate) fn refuse(
         &self,
-        span: Option<Range<usize>>,
+        span: Range<usize>,
         what: impl std::fmt::Display,
         remedy: impl Into<String>,
     ) -> Failure {
         Failure::new(Kind::Configuration, format!("{}: {what}", self.place(span)), remedy)
     }
 
-    /// Returns the failure for an error of the TOML parser. For an unknown key or word, it suggests the nearest known
-    /// one.
-    pub(crate) fn explain(&self, error: &toml::de::Error) -> Failure {
+    /// Returns the failure for an error of the TOML parser in a text that starts at `begin`. For an unknown key or word, it
+    /// suggests the nearest known one.
+    fn explain(&self, error: &toml::de::Error, begin: usize) -> Failure {
+        let span = error.span().unwrap_or_default();
+        let span = span.start + begin..span.end + begin;
         let message = error.message();
         let names: Vec<&str> = message.split('`').skip(1).step_by(2).collect();
         let unknown =
@@ -149,19 +178,17 @@ impl Origin {
             let remedy = nearest.map_or(String::new(), |nearest| {
                 format!("did you mean `{nearest}`? {those} here: {}", known.join(", "))
             });
-            return self.refuse(error.span(), format!("{what} `{unknown}`"), remedy);
+            return self.refuse(span, format!("{what} `{unknown}`"), remedy);
         }
-        if let Some(failure) = self.mistyped(message, error.span()) {
-            return failure;
-        }
-        self.refuse(error.span(), message, "see docs/configuration.md")
+        self.mistyped(message, span.clone())
+            .unwrap_or_else(|| self.refuse(span, message, "see docs/configuration.md"))
     }
 
     /// Returns the failure for a value of the wrong type, in terms of TOML instead of the program's own types.
-    fn mistyped(&self, message: &str, span: Option<Range<usize>>) -> Option<Failure> {
+    fn mistyped(&self, message: &str, span: Range<usize>) -> Option<Failure> {
         let (_, expected) = message.strip_prefix("invalid type: ")?.rsplit_once(", expected ")?;
-        let value = self.text().get(span.clone()?)?;
-        let key = self.text()[..span.as_ref()?.start].rsplit(['\n', '{', ',']).next()?.trim();
+        let value = self.text.get(span.clone())?;
+        let key = self.text[..span.start].rsplit(['\n', '{', ',']).next()?.trim();
         let key = key.strip_suffix('=').map_or("", str::trim_end);
         let bare = value.trim_matches(['"', '\'']);
         if expected == "a sequence" && value.starts_with("[link") {
@@ -172,7 +199,7 @@ impl Origin {
             "a string" => ("text", format!("{key} = \"{bare}\", with quotes")),
             "a boolean" if ["true", "false"].contains(&bare) => ("a switch", without_quotes(key, bare)),
             "a boolean" => ("a switch", format!("{key} = true, or {key} = false")),
-            "u8" | "u32" | "i64" | "usize" | "f64" => {
+            "i64" | "f64" => {
                 let wanted = if expected == "f64" { "a number" } else { "a whole number" };
                 match bare.parse::<f64>() {
                     Ok(_) if bare != value => (wanted, without_quotes(key, bare)),
@@ -184,6 +211,86 @@ impl Origin {
         };
         (!key.is_empty()).then(|| self.refuse(span, format!("{key} = {value} is not {wanted}"), remedy))
     }
+}
+
+/// Returns `table` with spans that are moved by `begin`.
+fn moved_table(table: DeTable<'_>, begin: usize) -> DeTable<'_> {
+    table.into_iter().map(|(key, value)| (moved(key, begin), moved_value(value, begin))).collect()
+}
+
+fn moved_value(value: Spanned<DeValue<'_>>, begin: usize) -> Spanned<DeValue<'_>> {
+    let span = value.span();
+    let value = match value.into_inner() {
+        DeValue::Table(table) => DeValue::Table(moved_table(table, begin)),
+        DeValue::Array(values) => {
+            let mut array = DeArray::new();
+            values.into_iter().for_each(|value| array.push(moved_value(value, begin)));
+            DeValue::Array(array)
+        }
+        plain => plain,
+    };
+    moved(Spanned::new(span, value), begin)
+}
+
+fn moved<T>(value: Spanned<T>, begin: usize) -> Spanned<T> {
+    let span = value.span();
+    Spanned::new(span.start + begin..span.end + begin, value.into_inner())
+}
+
+/// Returns `link.NAME.KEY=VALUE`, or a key of all links such as `zones.margin=0.05`, as TOML. A value that is not valid
+/// TOML becomes text.
+fn set_as_toml(flag: &str) -> Option<String> {
+    let (path, value) = flag.split_once('=')?;
+    let (table, key) = path.split_once('.')?;
+    let (head, key) = match (table, key.split_once('.')) {
+        ("link", Some((name, key))) => (format!("[[link]]\nname = {}\n", quoted(name)), key),
+        ("link", None) => return None,
+        _ => (String::new(), path),
+    };
+    let is_key = |c: char| c.is_ascii_alphanumeric() || c == '_' || c == '-';
+    if key == "name" || key.split('.').any(|word| word.is_empty() || !word.chars().all(is_key)) {
+        return None;
+    }
+    Some(format!("{head}{key} = {}", to_toml(value)))
+}
+
+/// Returns `NAME=PORT`, followed by any number of `,KEY=VALUE`, as TOML.
+fn link_as_toml(flag: &str) -> Option<String> {
+    let (name, rest) = flag.split_once('=')?;
+    let is_set = |part: &&str| {
+        part.split_once('=')
+            .is_some_and(|(key, _)| key.chars().all(|c| c.is_ascii_lowercase() || c == '_' || c == '.'))
+    };
+    // The name of a port may contain a comma.
+    let parts: Vec<&str> = rest.split(',').collect();
+    let set = parts.iter().rev().take_while(|part| is_set(part)).count().min(parts.len() - 1);
+    let (port, set) = parts.split_at(parts.len() - set);
+    let mut text = format!("[[link]]\nname = {}\nport = {}", quoted(name), quoted(&port.join(",")));
+    for (key, value) in set.iter().filter_map(|part| part.split_once('=')) {
+        text = format!("{text}\n{key} = {}", to_toml(value));
+    }
+    Some(text)
+}
+
+/// Returns `value` as TOML. It becomes text unless it is valid TOML.
+fn to_toml(value: &str) -> String {
+    match toml::from_str::<toml::Table>(&format!("v = {value}")) {
+        Ok(table) if table.len() == 1 => value.to_owned(),
+        _ => quoted(value),
+    }
+}
+
+/// Returns `text` as a TOML string.
+fn quoted(text: &str) -> String {
+    let escaped: String = text
+        .chars()
+        .map(|c| match c {
+            '"' | '\\' => format!("\\{c}"),
+            c if c.is_control() => format!("\\u{:04X}", c as u32),
+            c => c.to_string(),
+        })
+        .collect();
+    format!("\"{escaped}\"")
 }
 
 fn without_quotes(key: &str, bare: &str) -> String {

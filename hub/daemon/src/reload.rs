@@ -106,38 +106,16 @@ impl Differences {
 
     fn of_link(&mut self, old: &Link, new: &Link) {
         let taken = taken(&old.processing, &new.processing);
-        let (before, after) = (&old.processing, &taken);
-        let sections = of_others([
-            ("pose", before.pose != after.pose),
-            ("zones", before.zones != after.zones),
-            ("marks", before.marks != after.marks),
-            ("lines", before.lines != after.lines),
-            ("motion", before.motion != after.motion),
-            ("background", before.background != after.background),
-            ("early", before.early != after.early),
-        ]);
+        let sections = old.processing.differences(&taken);
         let begin = |link: &Link| {
             let background = &link.processing.background;
             (background.learning.start, background.file.clone())
         };
-        let (was, will) = (old.scanner.settings, new.scanner.settings);
-        // Another family has another default.
-        let views = was.view.zip(will.view);
-        let is_begun = before.background.is_kept && new.processing.background.is_kept;
-        let waiting = of_others([
-            ("port", old.port != new.port),
-            ("family", old.family() != new.family()),
-            ("model", was.model != will.model),
-            ("beams", was.beams != will.beams),
-            ("type", was.expected_type != will.expected_type),
-            ("angle", views.is_some_and(|((was, _), (will, _))| was != will)),
-            ("resolution", views.is_some_and(|((_, was), (_, will))| was != will)),
-            ("unit", was.unit_mm != will.unit_mm),
-            ("mode", was.mode_number != will.mode_number || was.mode != will.mode),
-            ("idle", was.stop_when_idle != will.stop_when_idle),
-            ("baud", was.baud != will.baud),
-            ("background.start", is_begun && begin(old) != begin(new)),
-        ]);
+        let is_begun = old.processing.background.is_kept && new.processing.background.is_kept;
+        let mut waiting = old.differences(new);
+        if is_begun && begin(old) != begin(new) {
+            waiting.push("background.start");
+        }
         if !sections.is_empty() {
             self.now.push((old.name.clone(), taken, sections));
         }
@@ -157,11 +135,6 @@ fn taken(old: &Processing, new: &Processing) -> Processing {
         (taken.background.file, taken.background.model) = (file.clone(), model.clone());
     }
     taken
-}
-
-/// The names of what is another one.
-fn of_others<const N: usize>(compared: [(&'static str, bool); N]) -> Vec<&'static str> {
-    compared.into_iter().filter(|(_, is_other)| *is_other).map(|(name, _)| name).collect()
 }
 
 #[cfg(test)]

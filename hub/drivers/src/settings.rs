@@ -104,6 +104,28 @@ impl SettingsRequest {
     }
 }
 
+impl Settings {
+    /// Returns the value of `key` in a configuration. `None` if it is not set and has no default.
+    pub fn value(&self, key: Key) -> Option<Value<'static>> {
+        let whole = |number: u32| Value::Whole(number.into());
+        match key {
+            Key::Type => self.expected_type.map(Value::Text),
+            Key::Angle => self.view.map(|(angle_deg, _)| whole(angle_deg.into())),
+            Key::Resolution => self.view.map(|(_, cdeg)| Value::Number(f64::from(cdeg) / 100.0)),
+            Key::Unit => self.unit_mm.map(|mm| Value::Text(if mm == 1 { "mm" } else { "cm" })),
+            Key::ModeNumber => self.mode_number.map(|number| whole(number.into())),
+            Key::Baud => self.baud.map(whole),
+            Key::Model => Some(Value::Text(self.model.unwrap_or(AUTO))),
+            Key::Beams => self.beams.map(|beams| whole(beams as u32)),
+            Key::ModeName => Some(Value::Text(self.mode.unwrap_or(AUTO))),
+            Key::Idle => IDLE
+                .iter()
+                .find(|(_, stops)| *stops == self.stop_when_idle)
+                .map(|(word, _)| Value::Text(word)),
+        }
+    }
+}
+
 /// Returns the family that alone has `key`.
 fn owner(key: Key) -> Option<Family> {
     Family::ALL.into_iter().find(|&family| features(family).keys.contains(&key))

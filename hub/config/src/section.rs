@@ -1,0 +1,175 @@
+//! Sections of the configuration. Each is one struct of the macro [`section!`]: a field is a key, with its description, its
+//! default and its check.
+
+use std::borrow::Borrow;
+use std::ops::RangeInclusive;
+
+use schema::Failure;
+use serde_json::Value as Json;
+use toml::Spanned;
+use toml::de::{DeTable, DeValue};
+
+use crate::sources::SourceMap;
+
+/// Declares a section: a struct that serde reads and writes.
+///
+/// The first paragraph of a key's description is its comment in the default configuration, the others are for
+/// `docs/configuration.md`. A key without a default has an `example`.
+macro_rules! section {
+    (
+        $(#[doc = $about:literal])+
+        $vis:vis struct $section:ident: $expecting:literal {
+            $(
+                $(#[doc = $doc:literal])+
+                $field:ident $(($name:literal))?: $type:ty = $default:expr
+                    $(, check $check:expr)? $(, example $example:literal)?;
+            )+
+        }
+    ) => {
+        $(#[doc = $about])+
+        #[derive(Clone, Debug, PartialEq, serde::Deserialize, serde::Serialize)]
+        #[serde(default, deny_unknown_fields, expecting = $expecting)]
+        $vis struct $section {
+            $($(#[doc = $doc])+ $(#[serde(rename = $name)])? pub(crate) $field: $type,)+
+        }
+
+        impl Default for $section {
+            fn default() -> Self {
+                $section { $($field: $default),+ }
+            }
+        }
+
+        impl $crate::section::Section for $section {
+            fn keys(&self) -> &'static [$crate::section::Key] {
+                &[$($crate::section::Key {
+                    name: [$($name,)? stringify!($field)][0],
+                    text: concat!($($doc, "\n"),+),
+                    example: [$($example,)? ""][0],
+                }),+]
+            }
+
+            fn json(&self) -> serde_json::Value {
+                serde_json::to_value(self).unwrap_or_default()
+            }
+
+            fn refused(&self) -> Option<(&'static str, $crate::section::Refused)> {
+                $($(
+                    let name = stringify!($field);
+                    if let Err(refused) = ($check)(name, &self.$field) {
+                        return Some((name, refused));
+                    }
+                )?)+
+                None
+            }
+        }
+    };
+}
+pub(crate) use section;
+
+/// A key of a section.
+#[derive(Clone, Copy, Debug)]
+pub struct Key {
+    /// Name.
+    pub name: &'static str,
+    /// Description: lines of a doc comment. Its first paragraph is short.
+    pub text: &'static str,
+    /// Example of a key without a default, as TOML.
+    pub example: &'static str,
+}
+
+/// A value that is not valid.
+#[derive(Debug)]
+pub(crate) struct Refused {
+    what: String,
+    remedy: String,
+    /// Index of the invalid element of a list.
+    at: Option<usize>,
+}
+
+/// Result of a check of one value.
+pub(crate) type Checked = Result<(), Refused>;
+
+pub(crate) trait Section {
+    /// Returns its keys in their order.
+    fn keys(&self) -> &'static [Key];
+
+    /// Returns all values as one object.
+    fn json(&self) -> Json;
+
+    /// Returns the first key whose value is not valid, and why.
+    fn refused(&self) -> Option<(&'static str, Refused)>;
+
+    /// Returns keys and values in their order.
+    fn values(&self) -> Vec<(&'static str, Json)> {
+        let json = self.json();
+        self.keys().iter().map(|key| (key.name, json[key.name].clone())).collect()
+    }
+
+    /// Checks the values, which were read from `table`.
+    ///
+    /// Returns [`schema::Kind::Configuration`] with place, value and remedy if one is not valid.
+    fn check(&self, table: &DeTable<'_>, sources: &SourceMap) -> Result<(), Failure> {
+        let Some((key, Refused { what, remedy, at })) = self.refused() else { return Ok(()) };
+        let list = find(table, key);
+        let element = || list?.get_ref().as_array()?.get(at?);
+        let span = element().or(list).map(Spanned::span).unwrap_or_default();
+        Err(sources.refuse(span, what, remedy))
+    }
+}
+
+/// Returns the value at `path` in `table`, such as `zones.margin`.
+pub(crate) fn find<'t, 'i>(table: &'t DeTable<'i>, path: &str) -> Option<&'t Spanned<DeValue<'i>>> {
+    match path.split_once('.') {
+        None => table.get(path),
+        Some((section, rest)) => find(table.get(section)?.get_ref().as_table()?, rest),
+    }
+}
+
+/// Returns the refusal of `value`. `remedy` states the valid values.
+pub(crate) fn refused(what: impl Into<String>, remedy: impl Into<String>) -> Refused {
+    Refused { what: what.into(), remedy: remedy.into(), at: None }
+}
+
+/// Returns the check of a number in `allowed`; `remedy` states the range.
+pub(crate) fn within(allowed: RangeInclusive<f64>, remedy: &str) -> impl Fn(&str, &f64) -> Checked {
+    // NaN is not within any range.
+    move |key, value| match allowed.contains(value) {
+        true => Ok(()),
+        false => Err(refused(format!("{key} = {value}"), remedy)),
+    }
+}
+
+/// Returns the check of a length in meters.
+pub(crate) fn meters(allowed: RangeInclusive<f64>) -> impl Fn(&str, &f64) -> Checked {
+    let remedy = format!("metres, from {} to {}", allowed.start(), allowed.end());
+    move |key, value| within(allowed.clone(), &remedy)(key, value)
+}
+
+/// Returns the check of a whole number.
+pub(crate) fn whole(allowed: RangeInclusive<i64>) -> impl Fn(&str, &i64) -> Checked {
+    let remedy = format!("a whole number from {} to {}", allowed.start(), allowed.end());
+    whole_or(allowed, remedy)
+}
+
+/// Returns the check of a whole number with its own `remedy`.
+pub(crate) fn whole_or(allowed: RangeInclusive<i64>, remedy: String) -> impl Fn(&str, &i64) -> Checked {
+    move |key, value| match allowed.contains(value) {
+        true => Ok(()),
+        false => Err(refused(format!("{key} = {value}"), &remedy)),
+    }
+}
+
+/// Returns the check of a value that may be missing.
+pub(crate) fn optional<T: Borrow<U>, U: ?Sized>(
+    check: impl Fn(&str, &U) -> Checked,
+) -> impl Fn(&str, &Option<T>) -> Checked {
+    move |key, value| value.as_ref().map_or(Ok(()), |value| check(key, value.borrow()))
+}
+
+/// Returns the check of each element of a list.
+pub(crate) fn each<T>(check: impl Fn(&str, &T) -> Checked) -> impl Fn(&str, &[T]) -> Checked {
+    move |key, values| {
+        let checked = |(at, value)| check(key, value).map_err(|refused| Refused { at: Some(at), ..refused });
+        values.iter().enumerate().try_for_each(checked)
+    }
+}
