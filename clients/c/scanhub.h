@@ -526,12 +526,13 @@ enum scanhub_method {
 struct scanhub_motion {
     double x_m, y_m, yaw_rad;    /* the sum of all steps: it drifts */
     float dx_m, dy_m, dyaw_rad;  /* the step */
-    float covariance[9];         /* of the step, row by row */
+    float covariance[9];         /* of the step, row by row, in the order x, y, yaw: m2, m rad and rad2 */
     float overlap;               /* share of the readings that lie on the scan before */
     uint8_t method;
     uint8_t valid;               /* 1: the sum is known, and none of its steps was degenerate */
     uint8_t degenerate;          /* 1: the surroundings leave a direction open */
     uint16_t breaks;             /* steps that were refused since the start */
+    float pose_covariance[9];    /* of the sum, as `covariance`; 0 if it is not valid or the sender is older */
 };
 static inline enum scanhub_result scanhub_read_motion(const struct scanhub_datagram *datagram,
                                                       struct scanhub_motion *out)
@@ -557,8 +558,11 @@ static inline enum scanhub_result scanhub_read_motion(const struct scanhub_datag
     out->breaks = scanhub_u16(at + 78);
     finite = isfinite(out->x_m) && isfinite(out->y_m) && isfinite(out->yaw_rad) && isfinite(out->dx_m)
              && isfinite(out->dy_m) && isfinite(out->dyaw_rad) && isfinite(out->overlap);
-    for (i = 0; i < 9; i++)
-        finite = finite && isfinite(out->covariance[i]);
+    for (i = 0; i < 9; i++) {
+        /* Revision 1 has 80 bytes. */
+        out->pose_covariance[i] = datagram->payload_len < 120 ? 0.0f : scanhub_f32(at + 80 + 4 * (size_t)i);
+        finite = finite && isfinite(out->covariance[i]) && isfinite(out->pose_covariance[i]);
+    }
     return finite ? SCANHUB_OK : SCANHUB_BAD_PAYLOAD;
 }
 

@@ -235,7 +235,8 @@ METHODS = ("first", "refused", "beams", "points", "lines", "both")
 class Motion:
     """How the robot moved: the sum of all steps, the last step with its covariance (9 numbers, row by row), the share of
     readings that lie on the scan before, and one of METHODS. `first` and `refused` have no step (0), `refused` no place.
-    `valid`: the sum is known, and none of its steps was degenerate."""
+    `valid`: the sum is known, and none of its steps was degenerate. `pose_covariance`: of the sum, in the same form; 0 if the
+    sum is not valid or the sender is older."""
 
     x_m: float
     y_m: float
@@ -249,6 +250,7 @@ class Motion:
     valid: bool
     degenerate: bool
     breaks: int
+    pose_covariance: "tuple[float, ...]"
 
 
 @dataclass(frozen=True)
@@ -848,10 +850,12 @@ def _lines(payload: bytes) -> Lines:
 
 def _motion(payload: bytes) -> Motion:
     *numbers, method, flags, breaks = struct.unpack_from("<3d13fBBH", payload)
-    _limit(all(math.isfinite(number) for number in numbers))
+    # Revision 1 ends here.
+    of_pose = struct.unpack_from("<9f", payload, 80) if len(payload) >= 120 else (0.0,) * 9
+    _limit(all(math.isfinite(number) for number in (*numbers, *of_pose)))
     method = METHODS[method] if method < len(METHODS) else "refused"
     valid = method != "refused" and not flags & 2
-    return Motion(*numbers[:6], tuple(numbers[6:15]), numbers[15], method, valid, bool(flags & 1), breaks)
+    return Motion(*numbers[:6], tuple(numbers[6:15]), numbers[15], method, valid, bool(flags & 1), breaks, of_pose)
 
 
 def _early(payload: bytes) -> Early:

@@ -157,6 +157,7 @@ field("motion.method", "uint8", "Method")
 field("motion.valid", "uint8", "Sum is valid")
 field("motion.degenerate", "uint8", "Degenerate", base.DEC, nil, 1)
 field("motion.breaks", "uint16", "Steps refused")
+field("motion.pose_covariance", "float", "Covariance of the sum")
 
 field("early.verdict", "uint8", "Verdict", base.DEC, VERDICTS)
 field("early.withdrawn", "uint8", "Withdrawn", base.DEC, nil, 1)
@@ -718,6 +719,11 @@ unpack_payload[9] = function(payload, tree)
     for at = 24, 72, 4 do
         if not is_finite(payload(at, 4):le_float()) then return nil end
     end
+    -- Revision 1 ends before the covariance of the sum.
+    local has_pose_covariance = payload:len() >= 120
+    for at = 80, has_pose_covariance and 112 or 0, 4 do
+        if not is_finite(payload(at, 4):le_float()) then return nil end
+    end
     add_fields(tree, payload, 0, "motion.x_m", 8, "motion.y_m", 8, "motion.yaw_rad", 8, "motion.dx_m", 4,
         "motion.dy_m", 4, "motion.dyaw_rad", 4)
     for at = 36, 68, 4 do
@@ -731,6 +737,9 @@ unpack_payload[9] = function(payload, tree)
     tree:add(f["motion.valid"], payload(77, 1), is_valid and 1 or 0)
     tree:add(f["motion.degenerate"], payload(77, 1))
     add_fields(tree, payload, 78, "motion.breaks", 2)
+    for at = 80, has_pose_covariance and 112 or 0, 4 do
+        tree:add_le(f["motion.pose_covariance"], payload(at, 4))
+    end
     return METHODS[payload(76, 1):uint()] or "refused"
 end
 

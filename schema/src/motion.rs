@@ -6,7 +6,7 @@ use bytemuck::{Pod, Zeroable};
 #[cfg(feature = "ipc")]
 use iceoryx2::prelude::ZeroCopySend;
 
-/// The payload of topic `motion`, 80 bytes: one sample per scan, in the robot's frame.
+/// The payload of topic `motion`, 120 bytes: one sample per scan, in the robot's frame.
 ///
 /// The step is the pose of the robot at this scan in the frame that it had at the scan before. The pose is the sum of all
 /// steps since the start: it drifts.
@@ -36,6 +36,12 @@ pub struct Motion {
     pub flags: u8,
     /// Steps that were refused since the start; 65535 is that many and more. The summed pose leaves them out.
     pub breaks: u16,
+    /// Covariance of the summed pose in the frame of the start, in the layout of [`Motion::covariance`]. Refused steps add
+    /// nothing to it. It is 0 for the first scan, if the pose is not valid, and if the sender's payload has revision 1. See
+    /// [`Motion::sum_covariance`].
+    pub pose_covariance: [f32; 9],
+    /// Always 0.
+    pub reserved: u32,
 }
 
 /// How a step was found.
@@ -117,6 +123,13 @@ impl Motion {
     /// Returns whether the summed pose is known, and no step that it contains was degenerate.
     pub fn has_valid_pose(&self) -> bool {
         self.has_pose() && self.flags & Motion::OPEN == 0
+    }
+
+    /// Returns the covariance of the summed pose; `None` if the pose is not valid, or if the sender's payload has none.
+    pub fn sum_covariance(&self) -> Option<&[f32; 9]> {
+        let is_first = self.how() == MotionMethod::First;
+        let is_given = is_first || self.pose_covariance != [0.0; 9];
+        (self.has_valid_pose() && is_given).then_some(&self.pose_covariance)
     }
 
     /// Returns whether the surroundings leave a direction open.

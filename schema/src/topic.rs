@@ -265,7 +265,10 @@ impl Topic {
 
     /// Returns the revision of the payload. A higher revision only appends fields.
     pub fn revision(self) -> u32 {
-        1
+        match self {
+            Topic::Motion => 2,
+            _ => 1,
+        }
     }
 
     /// Returns the name of the topic's service for `sensor`.

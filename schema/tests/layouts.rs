@@ -47,7 +47,8 @@ fn the_text_says_what_the_structs_are() {
     layout!(text, Line: x1_m y1_m x2_m y2_m r_m alpha_rad sd_r_m sd_alpha_rad first last points reserved);
     layout!(text, Corner: x_m y_m first_line second_line);
     layout!(text, Lines: count corners flags reserved readings on_lines noise_m line_array corner_array);
-    layout!(text, Motion: x_m y_m yaw_rad dx_m dy_m dyaw_rad covariance overlap method flags breaks);
+    layout!(text, Motion: x_m y_m yaw_rad dx_m dy_m dyaw_rad covariance overlap method flags breaks
+        pose_covariance reserved);
     layout!(text, Early: verdict flags beam distance_mm bytes_seen beams_seen);
     layout!(text, Track: id x_m y_m vx_m_s vy_m_s covariance score age_ms sensors room_text state reserved);
     layout!(text, TrackSensor: x_m y_m yaw_rad upside_down reserved name_text);

@@ -91,7 +91,10 @@ fn assert_motion(scan: &Scan, before: &Motion, motion: &Motion, settings: &motio
     let place = [motion.x_m, motion.y_m, motion.yaw_rad];
     let step = [motion.dx_m, motion.dy_m, motion.dyaw_rad];
     assert!(place.iter().all(|number| number.is_finite()), "{motion:?}");
-    assert!(step.iter().chain(&motion.covariance).all(|number| number.is_finite()), "{motion:?}");
+    let numbers = step.iter().chain(&motion.covariance).chain(&motion.pose_covariance);
+    assert!({ numbers }.all(|number| number.is_finite()), "{motion:?}");
+    assert!([0, 4, 8].iter().all(|at| motion.pose_covariance[*at] >= 0.0), "{motion:?}");
+    assert!(motion.has_valid_pose() || motion.pose_covariance == [0.0; 9], "{motion:?}");
     match motion.how() {
         MotionMethod::First => assert_eq!(*motion, Motion::default()),
         MotionMethod::Refused => {

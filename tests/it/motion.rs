@@ -25,7 +25,9 @@ fn a_robot_that_stands_is_said_to_stand_and_a_map_is_kept_if_wanted() {
     for line in &found[1..] {
         let [dx, dy, x] = ["dx_m", "dy_m", "x_m"].map(|key| line[key].as_f64().unwrap_or(1.0));
         assert!(dx.hypot(dy) < 0.02 && x.abs() < 0.05, "{line}");
-        assert!(line["covariance"].as_array().is_some_and(|numbers| numbers.len() == 9), "{line}");
+        for key in ["covariance", "pose_covariance"] {
+            assert!(line[key].as_array().is_some_and(|numbers| numbers.len() == 9), "{line}");
+        }
         assert!(["beams", "points", "lines", "both"].contains(&line["method"].as_str().unwrap()), "{line}");
     }
     rear.await_lines(20, "a foreground", is_class("foreground"));

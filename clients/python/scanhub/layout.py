@@ -132,6 +132,8 @@ class Motion(_Struct):
         ("method", c_uint8),
         ("flags", c_uint8),
         ("breaks", c_uint16),
+        ("pose_covariance", c_float * 9),
+        ("reserved", c_uint32),
     ]
 
 

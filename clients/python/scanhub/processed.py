@@ -172,6 +172,12 @@ class Motion(Sample):
         return None if self.method == "refused" else Place(f.x_m, f.y_m, f.yaw_rad)
 
     @property
+    def pose_covariance(self) -> NDArray[np.float32] | None:
+        """Covariance of `place`, 3 x 3: copied; None if `place` is not valid, or if the sender is older and has none."""
+        covariance = np.array(self._fields.pose_covariance, dtype=np.float32).reshape(3, 3)
+        return covariance if self.valid and (self.method == "first" or covariance.any()) else None
+
+    @property
     def valid(self) -> bool:
         """Whether `place` is known, and no step that it contains was degenerate."""
         return self.method != "refused" and not self._fields.flags & 2

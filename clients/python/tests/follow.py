@@ -91,9 +91,10 @@ def motion(sample: scanhub.Motion) -> dict:
     said["dx_m"], said["dy_m"], said["dyaw_deg"] = millionths(step[0]), millionths(step[1]), in_degrees(step[2])
     said["x_m"], said["y_m"], said["yaw_deg"] = millionths(place[0]), millionths(place[1]), in_degrees(place[2])
     said["overlap"] = millionths(sample.overlap)
-    covariance = sample.covariance
-    # The shortest number that is this one of 32 bits.
-    said["covariance"] = None if covariance is None else [float(str(value)) for value in covariance.flat]
+    for name in ("covariance", "pose_covariance"):
+        covariance = getattr(sample, name)
+        # The shortest number that is this one of 32 bits.
+        said[name] = None if covariance is None else [float(str(value)) for value in covariance.flat]
     return said
 
 

@@ -92,6 +92,8 @@ def payloads_say_what_they_are() -> None:
     assert of.step == (0.25, -0.125, -0.0625) and of.place == (1, -2, 0.5)
     assert of.covariance.tolist() == [[1 / 64, 2 / 64, 3 / 64], [4 / 64, 5 / 64, 6 / 64], [7 / 64, 8 / 64, 9 / 64]]
 
+    assert of.pose_covariance.tolist() == [[-n / 32 for n in row] for row in ((1, 2, 3), (4, 5, 6), (7, 8, 9))]
+
     of = processed.Early("front", Chunk("early"))
     assert (of.verdict, of.withdrawn, of.beam, of.distance_mm) == ("stop", True, 0x102, 0x3040506)
     assert (of.bytes_seen, of.beams_seen) == (0x708, 0x90A)

@@ -66,12 +66,15 @@ pub struct MotionEstimator {
 /// Position of the robot, and its last step.
 #[derive(Clone, Copy, Default)]
 struct Track {
-    /// Position at the kept scan, since the start.
+    /// Position at the kept scan, since the start, and its covariance.
     origin: Rigid,
+    of_origin: Square,
     /// Position at the last scan, in the frame of the kept one.
     last: Rigid,
     /// Covariance of that position by the last scan's own noise; `None` if that is the kept one.
     unsure: Option<Square>,
+    /// Covariance of that position by all causes.
+    of_last: Square,
     /// Whether the surroundings left a direction of that position open.
     is_degenerate: bool,
     /// Whether the sum of all steps contains a degenerate one.
@@ -148,10 +151,17 @@ impl MotionEstimator {
         };
         match found {
             Some((found, step)) => {
-                write(&track, &found, &step, &offset, out);
-                let (unsure, is_degenerate) = (Some(found.own), found.is_degenerate);
-                let is_open = track.is_open || is_degenerate;
-                let next = Track { last: found.place, unsure, is_degenerate, is_open, step, ..track };
+                let of_place = covariance_in_kept(&track, &found, &step, &offset);
+                write(&track, &found, &step, &offset, &of_place, out);
+                let next = Track {
+                    last: found.place,
+                    unsure: Some(found.own),
+                    of_last: of_place,
+                    is_degenerate: found.is_degenerate,
+                    is_open: track.is_open || found.is_degenerate,
+                    step,
+                    ..track
+                };
                 let is_away = found.place.x.hypot(found.place.y) > AWAY_M || found.place.yaw.abs() > AWAY_RAD;
                 if is_away || found.overlap < ENOUGH {
                     self.keep(next);
@@ -240,9 +250,16 @@ impl MotionEstimator {
     fn keep(&mut self, track: Track) {
         self.now.doubt(self.matcher.doubts());
         std::mem::swap(&mut self.kept, &mut self.now);
-        let origin = track.origin.then(&track.last);
-        self.track =
-            Some(Track { origin, last: Rigid::default(), unsure: None, is_degenerate: false, ..track });
+        let Track { origin, of_origin, last, of_last, .. } = track;
+        self.track = Some(Track {
+            origin: origin.then(&last),
+            of_origin: rigid::of_both(&of_origin, &of_last, &origin, &last),
+            last: Rigid::default(),
+            unsure: None,
+            of_last: Square::default(),
+            is_degenerate: false,
+            ..track
+        });
     }
 }
 
@@ -259,18 +276,13 @@ fn without_jitter(elapsed_ns: u64, period_ns: u64) -> u64 {
 }
 
 /// Writes `step`, which leads to `found`. The beams may be off by `offset` because of a changing velocity.
-fn write(track: &Track, found: &Match, step: &Rigid, offset: &[f64; 3], out: &mut Motion) {
+fn write(track: &Track, found: &Match, step: &Rigid, offset: &[f64; 3], of_place: &Square, out: &mut Motion) {
     (out.dx_m, out.dy_m, out.dyaw_rad) = (step.x as f32, step.y as f32, step.yaw as f32);
     // Both scans have their own noise. That of the kept one moves both positions alike.
     let before = track.unsure.unwrap_or(found.of_kept);
     let mut covariance = rigid::of_step(&found.own, &before, &track.last, step);
-    // Readings on no surface contradict this step: according to them, the robot moved as before.
-    let other = [step.x - track.step.x, step.y - track.step.y, step.yaw - track.step.yaw];
-    rigid::add_outer(&mut covariance, &other, 1.0 - found.overlap);
-    rigid::add_outer(&mut covariance, offset, 1.0);
-    for (place, number) in out.covariance.iter_mut().zip(covariance.as_flattened()) {
-        *place = *number as f32;
-    }
+    add_doubts(&mut covariance, track, found, step, offset);
+    out.covariance = rigid::rows(&covariance);
     out.overlap = found.overlap as f32;
     // The covariance of a step contains that of both positions.
     let is_degenerate = found.is_degenerate || track.is_degenerate;
@@ -285,6 +297,28 @@ fn write(track: &Track, found: &Match, step: &Rigid, offset: &[f64; 3], out: &mu
     let place = track.origin.then(&found.place);
     (out.x_m, out.y_m, out.yaw_rad) = (place.x, place.y, place.yaw);
     out.breaks = track.breaks;
+    if out.has_valid_pose() {
+        let covariance = rigid::of_both(&track.of_origin, of_place, &track.origin, &found.place);
+        out.pose_covariance = rigid::rows(&covariance);
+    }
+}
+
+/// Returns the covariance of the position that `step` leads to, in the frame of the kept scan. All positions in that frame are
+/// found independently of each other, so the covariances of the steps between them are not summed.
+fn covariance_in_kept(track: &Track, found: &Match, step: &Rigid, offset: &[f64; 3]) -> Square {
+    let mut of_step = Square::default();
+    add_doubts(&mut of_step, track, found, step, offset);
+    let of_step = rigid::turned(&of_step, &track.last);
+    let sum = |i: usize, j: usize| found.own[i][j] + found.of_kept[i][j] + of_step[i][j];
+    std::array::from_fn(|i| std::array::from_fn(|j| sum(i, j)))
+}
+
+/// Adds the causes other than noise to the `covariance` of `step`.
+fn add_doubts(covariance: &mut Square, track: &Track, found: &Match, step: &Rigid, offset: &[f64; 3]) {
+    // Readings on no surface contradict this step: according to them, the robot moved as before.
+    let other = [step.x - track.step.x, step.y - track.step.y, step.yaw - track.step.yaw];
+    rigid::add_outer(covariance, &other, 1.0 - found.overlap);
+    rigid::add_outer(covariance, offset, 1.0);
 }
 
 /// Distortion of a scan that is corrected, in meters from its first to its last beam, and change of the distortion after

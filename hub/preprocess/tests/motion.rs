@@ -136,6 +136,71 @@ fn steps_add_up_to_the_pose_and_their_errors_are_as_great_as_is_said() {
     assert!((0.5..2.0).contains(&mean), "in variances: {mean}");
 }
 
+/// Returns the square of `off` in standard deviations of `covariance`. Its mean is 3 if the covariance is right. It is NaN if the
+/// covariance is not positive definite.
+fn normalized(off: [f64; 3], covariance: &[f32; 9]) -> f64 {
+    let (mut lower, mut whitened) = ([[0.0; 3]; 3], [0.0; 3]);
+    for i in 0..3 {
+        for j in 0..=i {
+            let sum: f64 = (0..j).map(|k| lower[i][k] * lower[j][k]).sum();
+            let rest = f64::from(covariance[3 * i + j]) - sum;
+            lower[i][j] = if i == j { rest.sqrt() } else { rest / lower[j][j] };
+        }
+        let sum: f64 = (0..i).map(|k| lower[i][k] * whitened[k]).sum();
+        whitened[i] = (off[i] - sum) / lower[i][i];
+    }
+    whitened.iter().map(|value| value * value).sum()
+}
+
+/// Returns the mean square of the errors of the sums at the end of `drives`, in variances, and the share of the errors within two
+/// standard deviations.
+fn errors_of_sums(drives: impl Iterator<Item = Drive>) -> (f64, f64) {
+    let (mut squares, mut within, mut count) = (0.0, 0.0, 0.0);
+    for drive in drives {
+        let found = follow(&drive.scans, Pose::default(), Settings::default());
+        let last = found.last().unwrap();
+        let covariance = last.sum_covariance().expect("a valid sum");
+        let truth = drive.places[0].inverse().then(&drive.places[drive.places.len() - 1]);
+        let yaw = Rigid::new(0.0, 0.0, last.yaw_rad - truth.yaw).yaw;
+        let off = [last.x_m - truth.x, last.y_m - truth.y, yaw];
+        squares += normalized(off, covariance) / 3.0;
+        let is_within =
+            |(k, off): (usize, &f64)| off.abs() < 2.0 * f64::from(covariance[4 * k]).max(0.0).sqrt();
+        within += off.iter().enumerate().filter(|axis| is_within(*axis)).count() as f64 / 3.0;
+        count += 1.0;
+    }
+    (squares / count, within / count)
+}
+
+/// All positions of a robot that stands are found on the same scan, so the covariance does not grow with the number of steps.
+#[test]
+fn covariance_of_the_sum_is_right_for_a_robot_that_stands() {
+    let standing = (1000..1100).map(|seed| {
+        let mut drive = Drive::through_a_room(seed, 361, 1, 0.01);
+        drive.stand(30);
+        drive
+    });
+    let (square, within) = errors_of_sums(standing);
+    println!("stands: {square:.3} variances, {within:.3} within 2 deviations");
+    assert!(
+        (0.5..1.3).contains(&square) && within > 0.93,
+        "{square} variances, {within} within 2 deviations"
+    );
+}
+
+#[test]
+fn covariance_of_the_sum_is_not_too_small_for_a_robot_that_drives() {
+    for (name, drive) in [
+        ("room", (|seed| Drive::through_a_room(seed, 361, 50, 0.01)) as fn(u64) -> Drive),
+        ("furniture", |seed| Drive::through_furniture(seed, 50, 3, 0.02)),
+        ("turn", |seed| Drive::on_the_spot(seed, 30, 45.0)),
+    ] {
+        let (square, within) = errors_of_sums((1000..1100).map(drive));
+        println!("{name}: {square:.3} variances, {within:.3} within 2 deviations");
+        assert!(square < 1.0 && within > 0.95, "{name}: {square} variances, {within} within 2 deviations");
+    }
+}
+
 #[test]
 fn a_turn_during_the_scans_is_measured() {
     for (seed, deg_per_s) in [(101, 45.0), (102, 90.0), (103, 180.0)] {
@@ -326,6 +391,8 @@ fn a_step_from_an_open_position_is_open_too() {
         assert_eq!(found[31].is_degenerate(), !is_kept, "{seed}: {:?}", found[31]);
         assert!(found[..30].iter().all(|motion| motion.has_valid_pose()), "{seed}");
         assert!(!found[30..].iter().any(|motion| motion.has_valid_pose()), "{seed}");
+        assert!(found[1..30].iter().all(|motion| motion.sum_covariance().is_some()), "{seed}");
+        assert!(found[30..].iter().all(|motion| motion.pose_covariance == [0.0; 9]), "{seed}");
     }
     assert!(open > 2, "{open}");
 }
@@ -359,7 +426,8 @@ fn any_scan_is_answered_with_numbers() {
             let numbers = [motion.x_m, motion.y_m, motion.yaw_rad];
             assert!(numbers.iter().all(|number| number.is_finite()), "{motion:?}");
             let numbers = [motion.dx_m, motion.dy_m, motion.dyaw_rad, motion.overlap];
-            assert!(numbers.iter().chain(&motion.covariance).all(|number| number.is_finite()), "{motion:?}");
+            let mut numbers = numbers.iter().chain(&motion.covariance).chain(&motion.pose_covariance);
+            assert!(numbers.all(|number| number.is_finite()), "{motion:?}");
             assert!((0.0..=1.0).contains(&motion.overlap), "{motion:?}");
         }
     }

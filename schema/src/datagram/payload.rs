@@ -402,19 +402,18 @@ impl Packed for Motion {
     }
 
     fn room(payload: &[u8]) -> Option<usize> {
-        let motion: Motion = pod_read_unaligned(payload.get(..size_of::<Motion>())?);
+        let motion = read_motion(payload)?;
         let pose = [motion.x_m, motion.y_m, motion.yaw_rad];
         let step = [motion.dx_m, motion.dy_m, motion.dyaw_rad, motion.overlap];
-        let numbers = step.iter().chain(&motion.covariance);
+        let numbers = step.iter().chain(&motion.covariance).chain(&motion.pose_covariance);
         let is_finite =
             pose.iter().all(|number| number.is_finite()) && { numbers }.all(|number| number.is_finite());
         is_finite.then_some(size_of::<Motion>())
     }
 
     fn unpack(&mut self, payload: &[u8]) -> bool {
-        let Some(len) = Motion::room(payload) else { return false };
-        *self = Motion::zeroed();
-        bytes_of_mut(self).copy_from_slice(&payload[..len]);
+        let Some(motion) = Motion::room(payload).and_then(|_| read_motion(payload)) else { return false };
+        *self = motion;
         true
     }
 
@@ -422,6 +421,17 @@ impl Packed for Motion {
         place.unpack(payload)
     }
 }
+
+/// Returns the motion in `payload`; `None` if it is too short. Revision 1 ends before the covariance of the pose.
+fn read_motion(payload: &[u8]) -> Option<Motion> {
+    let mut motion = Motion::zeroed();
+    let len = if payload.len() < size_of::<Motion>() { MOTION_1 } else { size_of::<Motion>() };
+    bytes_of_mut(&mut motion)[..len].copy_from_slice(payload.get(..len)?);
+    Some(motion)
+}
+
+/// Length of a motion of revision 1.
+const MOTION_1: usize = std::mem::offset_of!(Motion, pose_covariance);
 
 impl Packed for Tilt {
     fn pack(&self, room: &mut [u8]) -> Option<usize> {
@@ -702,14 +712,26 @@ mod tests {
 
     #[test]
     fn a_motion_goes_there_and_back() {
-        let motion = Motion { x_m: -1.5, dyaw_rad: 0.25, method: 5, breaks: 3, ..Motion::default() };
-        there_and_back(&motion, &mut Motion::default(), 80);
+        let mut motion = Motion { x_m: -1.5, dyaw_rad: 0.25, method: 5, breaks: 3, ..Motion::default() };
+        motion.pose_covariance[8] = 0.5;
+        let (mut room, mut back) = ([0xAA; 127], Motion::default());
+        assert_eq!((motion.pack(&mut room[..119]), motion.pack(&mut room)), (None, Some(120)));
+        assert!(back.unpack(&room) && back == motion, "bytes after it belong to a later revision");
+        assert_eq!(back.sum_covariance(), Some(&motion.pose_covariance));
+        // Revision 1 has no covariance of the pose.
+        for short in 80..120 {
+            assert!(back.unpack(&room[..short]));
+            assert_eq!(back, Motion { pose_covariance: [0.0; 9], ..motion }, "{short}");
+            assert_eq!((back.has_valid_pose(), back.sum_covariance()), (true, None));
+        }
+        assert!((0..80).all(|short| !back.unpack(&room[..short])));
         for (at, bytes) in [
             (16, &f64::NAN.to_le_bytes()[..]),
             (24, &f32::NAN.to_le_bytes()),
             (72, &f32::INFINITY.to_le_bytes()),
+            (112, &f32::NAN.to_le_bytes()),
         ] {
-            let mut bad = [0; 80];
+            let mut bad = [0; 120];
             bad[at..at + bytes.len()].copy_from_slice(bytes);
             assert!(!Motion::default().unpack(&bad), "{bytes:?} at {at}");
         }

@@ -112,6 +112,7 @@ fn motion(motion: &Motion) -> Value {
         "x_m": motion.x_m, "y_m": motion.y_m, "yaw_rad": motion.yaw_rad, "dx_m": motion.dx_m, "dy_m": motion.dy_m,
         "dyaw_rad": motion.dyaw_rad, "covariance": motion.covariance, "overlap": motion.overlap,
         "method": motion.how().name(), "valid": motion.has_valid_pose(), "degenerate": motion.is_degenerate(), "breaks": motion.breaks,
+        "pose_covariance": motion.pose_covariance,
     })
 }
 

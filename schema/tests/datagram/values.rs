@@ -45,7 +45,7 @@ pub(crate) const ALL: [Golden; 22] = [
         |room| status().pack(room),
     ),
     ("lines", head(Some(Topic::Lines)), |room| lines().pack(room)),
-    ("motion", head(Some(Topic::Motion)), |room| motion().pack(room)),
+    ("motion", Head { revision: 2, ..head(Some(Topic::Motion)) }, |room| motion().pack(room)),
     ("early", head(Some(Topic::Early)), |room| EARLY.pack(room)),
     ("early_withdrawn", head(Some(Topic::Early)), |room| {
         Early { flags: Early::WITHDRAWN, ..EARLY }.pack(room)
@@ -239,6 +239,8 @@ fn motion() -> Motion {
         method: MotionMethod::Lines as u8,
         flags: Motion::DEGENERATE,
         breaks: 2,
+        pose_covariance: [0.5, 0.125, 0.0, 0.125, 0.25, 0.0, 0.0, 0.0, 0.015625],
+        reserved: 0,
     }
 }
 

@@ -230,8 +230,11 @@ static void motion(const struct scanhub_motion *m)
     for (unsigned i = 0; i < 9; i++)
         number(i ? "," : ",\"covariance\":[", m->covariance[i]);
     number("],\"overlap\":", m->overlap);
-    printf(",\"method\":\"%s\",\"valid\":%s,\"degenerate\":%s,\"breaks\":%u}", methods[m->method < 6 ? m->method : 1],
+    printf(",\"method\":\"%s\",\"valid\":%s,\"degenerate\":%s,\"breaks\":%u", methods[m->method < 6 ? m->method : 1],
            boolean(m->valid), boolean(m->degenerate), m->breaks);
+    for (unsigned i = 0; i < 9; i++)
+        number(i ? "," : ",\"pose_covariance\":[", m->pose_covariance[i]);
+    printf("]}");
 }
 
 static void zones(const struct scanhub_zones *z)

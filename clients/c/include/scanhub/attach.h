@@ -192,8 +192,10 @@ struct scanhub_motion_v2 {
     float covariance[9]; /* of the step, row by row */
     float overlap;       /* share of the readings that lie on the scan before */
     uint8_t method;
-    uint8_t flags;   /* 1 the surroundings leave a direction open */
+    uint8_t flags;   /* 1 the surroundings leave a direction open; 2 the sum contains a step with an open direction */
     uint16_t breaks; /* steps that were refused since the start */
+    float pose_covariance[9]; /* of the sum, as `covariance`; 0 if it is not valid or the sender is older */
+    uint32_t reserved;
 };
 
 struct scanhub_zone_v2 {
@@ -774,9 +776,10 @@ SCANHUB_SIZE(scanhub_corner_v2, 12);
 SCANHUB_SIZE(scanhub_lines_v2, 3340);
 SCANHUB_AT(scanhub_lines_v2, line_array, 12);
 SCANHUB_AT(scanhub_lines_v2, corner_array, 2572);
-SCANHUB_SIZE(scanhub_motion_v2, 80);
+SCANHUB_SIZE(scanhub_motion_v2, 120);
 SCANHUB_AT(scanhub_motion_v2, covariance, 36);
 SCANHUB_AT(scanhub_motion_v2, method, 76);
+SCANHUB_AT(scanhub_motion_v2, pose_covariance, 80);
 SCANHUB_SIZE(scanhub_zone_v2, 8);
 SCANHUB_SIZE(scanhub_zones_v2, 76);
 SCANHUB_AT(scanhub_zones_v2, zone_array, 12);

@@ -79,6 +79,7 @@ pub(crate) fn motion<'a>(sensor: &'a str, header: &Header, motion: &Motion) -> i
         valid: bool,
         degenerate: bool,
         breaks: u16,
+        pose_covariance: Option<[f32; 9]>,
         #[serde(flatten)]
         flags: Words,
     }
@@ -98,6 +99,7 @@ pub(crate) fn motion<'a>(sensor: &'a str, header: &Header, motion: &Motion) -> i
         valid: motion.has_valid_pose(),
         degenerate: motion.is_degenerate(),
         breaks: motion.breaks,
+        pose_covariance: motion.sum_covariance().copied(),
         flags: Words::of(header),
     }
 }

@@ -68,6 +68,9 @@ pub(crate) fn motion(line: &mut Vec<u8>, header: &Header, motion: &Motion) -> io
         write!(line, ", at ({x_m:.3}, {y_m:.3}) m {:.2} deg", yaw_rad.to_degrees())?;
         if !motion.has_valid_pose() {
             write!(line, " (not valid)")?;
+        } else if let Some(covariance) = motion.sum_covariance() {
+            let [sd_x, sd_y, sd_yaw] = [0, 4, 8].map(|at| covariance[at].max(0.0).sqrt());
+            write!(line, " +- ({sd_x:.3}, {sd_y:.3}) m {:.2} deg", sd_yaw.to_degrees())?;
         }
     }
     if motion.breaks > 0 { write!(line, ", {} steps refused", motion.breaks) } else { Ok(()) }

@@ -119,6 +119,26 @@ pub(super) fn of_step(own: &Square, of_before: &Square, before: &Rigid, step: &R
     std::array::from_fn(|i| std::array::from_fn(|j| own[i][j] + other[i][j]))
 }
 
+/// Returns the covariance of `first` followed by `next`, whose covariances are `of_first` and `of_next`, as in Smith, Self and
+/// Cheeseman: "Estimating uncertain spatial relationships in robotics" (1990). The two errors must be independent.
+pub(super) fn of_both(of_first: &Square, of_next: &Square, first: &Rigid, next: &Rigid) -> Square {
+    let (x, y) = first.turned((next.x, next.y));
+    let by_first = [[1.0, 0.0, -y], [0.0, 1.0, x], [0.0, 0.0, 1.0]];
+    let (one, other) = (around(&by_first, of_first), turned(of_next, first));
+    std::array::from_fn(|i| std::array::from_fn(|j| one[i][j] + other[i][j]))
+}
+
+/// Returns the covariance `m` of a position in the frame of `place`, in the frame that contains `place`.
+pub(super) fn turned(m: &Square, place: &Rigid) -> Square {
+    let (x, y) = (place.turned((1.0, 0.0)), place.turned((0.0, 1.0)));
+    around(&[[x.0, y.0, 0.0], [x.1, y.1, 0.0], [0.0, 0.0, 1.0]], m)
+}
+
+/// Returns the numbers of `m`, row by row.
+pub(super) fn rows(m: &Square) -> [f32; 9] {
+    std::array::from_fn(|i| m[i / 3][i % 3] as f32)
+}
+
 /// Enough for all digits of three numbers.
 const SWEEPS: usize = 6;
 
