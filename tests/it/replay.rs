@@ -74,6 +74,55 @@ fn from_here_to_there_faster() {
     assert_eq!(number(&replayed(&player.wait()), "telegrams"), 20);
 }
 
+/// Log of an LMS at half degrees whose robot turns in a room, faster and faster.
+fn turning_log(env: &TestEnv, scans: u64) -> String {
+    const PERIOD_S: f64 = 0.026_64;
+    let range = |angle: f64| {
+        let walls = [(3.0, 0.0), (2.0, 90.0), (4.0, 180.0), (2.5, 270.0_f64)];
+        let to = |(distance, normal): (f64, f64)| (distance, (angle - normal).to_radians().cos());
+        let ahead = walls.into_iter().map(to).filter(|(_, cos)| *cos > 1e-3);
+        ahead.map(|(distance, cos)| distance / cos).fold(f64::INFINITY, f64::min)
+    };
+    let line = |scan: u64| {
+        let yaw = 0.02 * (scan * scan) as f64;
+        let ranges: Vec<_> =
+            (0..361).map(|i| format!("{:.3}", range(yaw - 90.0 + 0.5 * f64::from(i)))).collect();
+        let at = 1000.0 + scan as f64 * PERIOD_S;
+        format!("FLASER 361 {} 0 0 0 0 0 0 {at:.5} host {at:.5}\n", ranges.join(" "))
+    };
+    env.file("turning", (0..scans).map(line).collect::<String>())
+}
+
+#[test]
+fn motion_is_the_same_at_all_rates() {
+    const SCANS: u64 = 60;
+    let env = TestEnv::new();
+    let log = turning_log(&env, SCANS);
+    let motion = |rate: &str| {
+        let player = start(&env, &[&log, "--paused", "--set=link.front.background.method=moving", rate]);
+        let mut consumer = env.echo(&["front/motion", "front/status"]);
+        resume(&env);
+        consumer.await_line("the end", |line| line["state"] == "silent");
+        let outcome = consumer.end(INT);
+        assert_eq!(number(&replayed(&player.wait()), "telegrams"), SCANS);
+        let keys =
+            ["method", "dx_m", "dy_m", "dyaw_deg", "covariance", "x_m", "y_m", "yaw_deg", "pose_covariance"];
+        let values = |line: &Value| (number(line, "seq"), keys.map(|key| line[key].clone()));
+        outcome.of_class("motion").iter().map(values).collect::<BTreeMap<_, _>>()
+    };
+    let recorded = motion("--rate=1");
+    assert_eq!(recorded.len() as u64, SCANS);
+    assert!(recorded.values().skip(1).all(|values| values[0] != "first" && values[0] != "refused"));
+    for rate in ["--rate=0.5", "--rate=4", "--rate=max"] {
+        let found = motion(rate);
+        // With `max`, a subscriber may miss samples.
+        assert!(found.len() as u64 > SCANS / 2, "{rate}: {}", found.len());
+        for (seq, values) in found {
+            assert_eq!(Some(&values), recorded.get(&seq), "{rate}, scan {seq}");
+        }
+    }
+}
+
 #[test]
 fn a_lap_follows_another_until_somebody_ends_it() {
     let env = TestEnv::new();

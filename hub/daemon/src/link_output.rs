@@ -27,6 +27,8 @@ pub(crate) struct RecordedMetadata {
     pub(crate) gap_us: u32,
     /// Factor by which the replay is slower than the recording; 0 or less than 1 if it is not.
     pub(crate) stretch: f64,
+    /// Stamp of the scan in the time of the recording, which does not depend on the rate of the replay.
+    pub(crate) measured_ns: Option<Nanos>,
     /// [`Flags`] that the recording has for the line, such as that of a simulated scanner.
     pub(crate) flags: u8,
 }
@@ -101,8 +103,9 @@ impl<'a, S: Surroundings> LinkOutput<'a, S> {
         // A withdrawal has the sequence number that this telegram gets.
         self.withdraw(Some(whole.number));
         self.topics.telegram(received, period_us);
-        let verdict_lifetime =
-            whole.scan.as_ref().map(|scan| self.publish_scan(scan, period_us, is_backlogged));
+        let measured_ns = recorded.measured_ns;
+        let publish = |scan| self.publish_scan(scan, measured_ns, period_us, is_backlogged);
+        let verdict_lifetime = whole.scan.as_ref().map(publish);
         self.topics.wake(Wake::Telegram);
         Published { is_suspect: received.reasons != 0, verdict_lifetime }
     }
@@ -130,15 +133,22 @@ impl<'a, S: Surroundings> LinkOutput<'a, S> {
             self.update_early_warning(Some(scan));
         }
         self.topics.begin_revolution(scan.first, scan.last, scan.reasons, period_us);
-        let verdict_lifetime = self.publish_scan(scan, period_us, is_backlogged);
+        let verdict_lifetime = self.publish_scan(scan, recorded.measured_ns, period_us, is_backlogged);
         self.topics.wake(Wake::Telegram);
         verdict_lifetime
     }
 
     /// Publishes a scan and the results that are computed from it. Subscribers to scan and zones are woken before the
     /// other results are computed; the caller wakes the rest. A result without a subscriber is computed only if the
-    /// state of a processor depends on it. Returns how long the verdict is valid.
-    fn publish_scan(&mut self, raw: &RawScan<'_>, period_us: u32, is_backlogged: bool) -> Nanos {
+    /// state of a processor depends on it. The processors use `measured_ns` in place of the scan's stamp, if it is given.
+    /// Returns how long the verdict is valid.
+    fn publish_scan(
+        &mut self,
+        raw: &RawScan<'_>,
+        measured_ns: Option<Nanos>,
+        period_us: u32,
+        is_backlogged: bool,
+    ) -> Nanos {
         let LinkOutput { topics, pipeline, scan, .. } = self;
 
         // Decode. The sample is a copy, because the processors read the scan after the sample was sent.
@@ -172,7 +182,8 @@ impl<'a, S: Surroundings> LinkOutput<'a, S> {
             motion: motion.payload_mut(),
             foreground: foreground.payload_mut(),
         };
-        let reset = pipeline.process(scan, header.stamp_first_ns, raw.period, results);
+        let measured_ns = measured_ns.unwrap_or(header.stamp_first_ns);
+        let reset = pipeline.process(scan, measured_ns, raw.period, results);
 
         // Send.
         topics.publishers.marks.send(marks, &header, &mut topics.due);
@@ -205,11 +216,11 @@ impl<'a, S: Surroundings> LinkOutput<'a, S> {
         lifetime
     }
 
-    /// Updates the processors from a scan that is not published.
-    pub(crate) fn learn(&mut self, raw: &RawScan<'_>) {
+    /// Updates the processors from a scan that is not published. `measured_ns` is its stamp in the time of the recording.
+    pub(crate) fn learn(&mut self, raw: &RawScan<'_>, measured_ns: Nanos) {
         decode(raw, &mut self.scan);
         self.pipeline.check_zones(&self.scan, None);
-        self.pipeline.process(&self.scan, raw.first, raw.period, ResultBuffers::default());
+        self.pipeline.process(&self.scan, measured_ns, raw.period, ResultBuffers::default());
     }
 
     /// Resets what the processors know of consecutive scans, after a silence that was not published.

@@ -130,8 +130,9 @@ impl Pipeline {
         self.zones.update(scan, out.unwrap_or(&mut self.scratch.zones));
     }
 
-    /// Computes all other results of `scan`, which has the stamp `stamp_ns` and comes `period_ns` after the
-    /// scan before. Returns a reason if the background does not fit the scan and starts again.
+    /// Computes all other results of `scan`, which was measured at `stamp_ns`, `period_ns` after the scan before. Only
+    /// differences of stamps count, so a replay passes the times of the recording. Returns a reason if the background does
+    /// not fit the scan and starts again.
     pub(crate) fn process(
         &mut self,
         scan: &Scan,

@@ -197,7 +197,7 @@ impl Lap<'_> {
         };
         let whole = received.whole?;
         match due {
-            None => whole.scan.iter().for_each(|scan| replay.link.output.learn(scan)),
+            None => whole.scan.iter().for_each(|scan| replay.link.output.learn(scan, when.first)),
             Some(due) => {
                 let at = self.last_stamp;
                 let received = Received {
@@ -213,6 +213,7 @@ impl Lap<'_> {
                     period_us: header.map(|header| header.period_us),
                     gap_us: gap.map_or(0, |gap| (gap / 1000) as u32),
                     stretch: due.stretch,
+                    measured_ns: Some(when.first),
                     ..recorded(frame)
                 };
                 self.limit = replay.link.publish(&received, &recorded, false).or(self.limit);
@@ -256,11 +257,11 @@ impl Lap<'_> {
         session.session_mut().mark_suspect(frame.reasons & !suspect::LINE_ERROR);
         session.take(when.last, &frame.telegram, |event| {
             let Event::Scan(scan) = event else { return };
-            let Some((at, recorded)) = at else { return replay.link.output.learn(&scan) };
+            let Some((at, recorded)) = at else { return replay.link.output.learn(&scan, scan.first) };
             let here = |stamp: Nanos| at.saturating_sub(when.last.saturating_sub(stamp));
             let wall_ns = recorded.wall_ns.map(|ns| ns.saturating_add(scan.first).saturating_sub(when.first));
             let (first, last) = (here(scan.first), here(scan.last));
-            let recorded = RecordedMetadata { wall_ns, ..recorded };
+            let recorded = RecordedMetadata { wall_ns, measured_ns: Some(scan.first), ..recorded };
             *last_limit = Some(replay.link.publish_scan(&RawScan { first, last, ..scan }, &recorded, false));
             replay.link.output.extend_verdict(STANDS);
             let valid = verdict_lifetime(micros(scan.period));

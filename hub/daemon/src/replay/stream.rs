@@ -50,11 +50,12 @@ pub(super) fn play(replay: &mut ReplayLink<'_, '_>, stream: &Stream) -> Option<O
         }
         while let Output::Event(Event::Telegram(received)) = session.poll_output() {
             if !is_skipped {
+                recorded.measured_ns = Some(media);
                 limit = replay.link.publish(&received, &recorded, false).or(limit);
                 replay.link.output.extend_verdict(STANDS);
                 replay.handle.played(media);
             } else if let Some(scan) = received.whole.and_then(|whole| whole.scan) {
-                replay.link.output.learn(&scan);
+                replay.link.output.learn(&scan, media);
             }
             if !received.is_reply {
                 media += stream.period(received.whole.map_or(0, |whole| whole.beams));
