@@ -3,6 +3,42 @@
 
 use schema::{OBSTACLES, Obstacle};
 
+/// A point that can belong to an obstacle.
+#[derive(Clone, Copy, Debug, Default)]
+pub(crate) struct Candidate {
+    pub(crate) at: [f32; 3],
+    /// Flags of an obstacle with this point.
+    pub(crate) flags: u8,
+    /// Angle of the mount.
+    pub(crate) angle_rad: f32,
+    /// Height that the beam gains with each meter, -1 to 1.
+    pub(crate) rise: f32,
+}
+
+/// Obstacle with the beams that met it.
+struct Grown {
+    obstacle: Obstacle,
+    /// Lowest and highest angle of the mount.
+    angles_rad: [f32; 2],
+    /// Maximum absolute rise of the beams.
+    rise: f32,
+}
+
+impl Grown {
+    /// Returns whether a level surface, which stands always, can be all of it. Nearly level beams graze a top in few sweeps,
+    /// each time at another range, and in a span of the mount's angle that is smaller than the distance between two scans. An
+    /// object that is put down is higher.
+    fn is_grazed(&self) -> bool {
+        let [low, high] = self.angles_rad;
+        self.obstacle.flags & Obstacle::NEAR == 0 && high - low < GRAZED_RAD && self.rise < GRAZING_RISE
+    }
+}
+
+/// Span of the mount's angle in which beams graze a top: 0.4 degrees.
+const GRAZED_RAD: f32 = 0.007;
+/// Beams that rise or fall more meet a top in more than one scan.
+const GRAZING_RISE: f32 = 0.1;
+
 /// Finds obstacles; keeps its memory.
 #[derive(Default)]
 pub(crate) struct Clusters {
@@ -18,15 +54,10 @@ pub(crate) struct Clusters {
 impl Clusters {
     /// Returns what the points make, the nearest first, of at least `least` points each, and how many did not fit. A point has
     /// the flags of what it is.
-    pub(crate) fn find(
-        &mut self,
-        points: &[([f32; 3], u8)],
-        cube_m: f32,
-        least: usize,
-    ) -> (&[Obstacle], u32) {
+    pub(crate) fn find(&mut self, points: &[Candidate], cube_m: f32, least: usize) -> (&[Obstacle], u32) {
         let cube = |at: [f32; 3]| at.map(|value| (value / cube_m).floor() as i16);
         self.cubes.clear();
-        self.cubes.extend(points.iter().zip(0..).map(|(&(at, _), number)| (cube(at), number)));
+        self.cubes.extend(points.iter().zip(0..).map(|(point, number)| (cube(point.at), number)));
         self.cubes.sort_unstable();
         self.open.clear();
         self.open.resize(self.cubes.len(), true);
@@ -35,9 +66,9 @@ impl Clusters {
             if !self.open[first] || first > 0 && self.cubes[first].0 == self.cubes[first - 1].0 {
                 continue;
             }
-            let obstacle = self.grown_from(first, points);
-            if obstacle.points as usize >= least {
-                self.found.push(obstacle);
+            let grown = self.grown_from(first, points);
+            if grown.obstacle.points as usize >= least && !grown.is_grazed() {
+                self.found.push(grown.obstacle);
             }
         }
         self.found.sort_by(|a, b| a.distance_m.total_cmp(&b.distance_m));
@@ -46,15 +77,18 @@ impl Clusters {
         (&self.found, left_out)
     }
 
-    fn grown_from(&mut self, first: usize, points: &[([f32; 3], u8)]) -> Obstacle {
+    fn grown_from(&mut self, first: usize, points: &[Candidate]) -> Grown {
         let (inf, mut sum) = (f32::INFINITY, [0.0_f64; 3]);
         let mut grown = Obstacle { low: [inf; 3], high: [-inf; 3], distance_m: inf, ..Obstacle::default() };
+        let (mut angles_rad, mut most_rise) = ([inf, -inf], 0.0_f32);
         self.open[first] = false;
         self.front.push(first);
         while let Some(first) = self.front.pop() {
             let cube = self.cubes[first].0;
             for (_, number) in self.cubes[first..].iter().take_while(|(other, _)| *other == cube) {
-                let (at, flags) = points[*number as usize];
+                let Candidate { at, flags, angle_rad, rise } = points[*number as usize];
+                angles_rad = [angles_rad[0].min(angle_rad), angles_rad[1].max(angle_rad)];
+                most_rise = most_rise.max(rise.abs());
                 for i in 0..3 {
                     sum[i] += f64::from(at[i]);
                     grown.low[i] = grown.low[i].min(at[i]);
@@ -74,7 +108,7 @@ impl Clusters {
             }
         }
         grown.middle = sum.map(|value| (value / f64::from(grown.points)) as f32);
-        grown
+        Grown { obstacle: grown, angles_rad, rise: most_rise }
     }
 }
 
@@ -91,13 +125,33 @@ fn around(cube: [i16; 3]) -> impl Iterator<Item = [i16; 3]> {
 mod tests {
     use super::*;
 
+    fn candidate((at, flags): ([f32; 3], u8)) -> Candidate {
+        Candidate { at, flags, angle_rad: 0.2, rise: -0.3 }
+    }
+
+    #[test]
+    fn a_line_that_level_beams_of_one_scan_graze_is_no_obstacle() {
+        let line = |flags, angle_rad: f32, rise| {
+            let point = move |i| ([4.0, 0.05 * i as f32, 0.7 + angle_rad], flags);
+            (0..12).map(move |i| Candidate { angle_rad, rise, ..candidate(point(i)) })
+        };
+        let mut clusters = Clusters::default();
+        let mut count = |points: Vec<Candidate>| clusters.find(&points, 0.15, 8).0.len();
+        assert_eq!(count(line(Obstacle::FOREGROUND, 0.0, -0.02).collect()), 0);
+        assert_eq!(count(line(Obstacle::FOREGROUND, 0.0, -0.2).collect()), 1, "steep beams");
+        assert_eq!(count(line(Obstacle::NEAR, 0.0, -0.02).collect()), 1, "in the box near");
+        let two = line(Obstacle::FOREGROUND, 0.0, -0.02).chain(line(Obstacle::FOREGROUND, 0.01, -0.01));
+        assert_eq!(count(two.collect()), 1, "two scans");
+    }
+
     #[test]
     fn near_points_are_one_obstacle_and_few_are_none() {
         let pole = (0..20).map(|i| ([2.0, 0.0, 0.05 * i as f32], Obstacle::FOREGROUND));
         let crate_ = (0..9).map(|i| ([1.0 + 0.1 * i as f32, -1.0, 0.3], Obstacle::NEAR));
         let speck = (0..3).map(|i| ([5.0, 5.0, 0.1 * i as f32], Obstacle::FOREGROUND));
         let mut clusters = Clusters::default();
-        let (found, left_out) = clusters.find(&pole.chain(crate_).chain(speck).collect::<Vec<_>>(), 0.15, 5);
+        let (found, left_out) =
+            clusters.find(&pole.chain(crate_).chain(speck).map(candidate).collect::<Vec<_>>(), 0.15, 5);
         assert_eq!((found.len(), left_out), (2, 0));
         assert_eq!((found[0].points, found[0].flags), (9, Obstacle::NEAR), "the nearest first");
         assert!((found[0].distance_m - 2.0_f32.sqrt()).abs() < 1e-6);
@@ -137,7 +191,7 @@ mod tests {
             let count = random.usize(0..90);
             let points: Vec<[f32; 3]> =
                 (0..count).map(|_| std::array::from_fn(|_| 1.6 * random.f32() - 0.8)).collect();
-            let flagged: Vec<_> = points.iter().map(|at| (*at, 1)).collect();
+            let flagged: Vec<_> = points.iter().map(|at| candidate((*at, 1))).collect();
             let (found, left_out) = clusters.find(&flagged, 0.15, 2);
             let mut sizes: Vec<usize> = found.iter().map(|obstacle| obstacle.points as usize).collect();
             sizes.sort_unstable();

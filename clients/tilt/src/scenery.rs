@@ -5,7 +5,7 @@ use schema::{Obstacle, PointClass};
 
 use crate::background::{Model, Reading, placed};
 use crate::mount::Mount;
-use crate::obstacles::Clusters;
+use crate::obstacles::{Candidate, Clusters};
 use crate::settings::Settings;
 use crate::sweep::{Point, Sweep};
 
@@ -33,10 +33,14 @@ pub(crate) struct Scenery {
     /// How often the model was forgotten.
     pub(crate) forgotten: u64,
     points: Vec<Point>,
+    /// Row of the model and reading of each beam.
+    readings: Vec<(usize, Reading)>,
     /// What each beam on a level surface tells of the angles.
     off: Vec<f32>,
     /// Points of which obstacles may be.
-    standing: Vec<([f32; 3], u8)>,
+    standing: Vec<Candidate>,
+    /// Mount's angle and rise of the beam of each point.
+    beams: Vec<(f32, f32)>,
     clusters: Clusters,
     /// The floor was where the angles say, or they have never jumped.
     is_confirmed: bool,
@@ -52,8 +56,10 @@ impl Scenery {
             model: Model::new(0, &settings),
             forgotten: 0,
             points: Vec::new(),
+            readings: Vec::new(),
             off: Vec::new(),
             standing: Vec::new(),
+            beams: Vec::new(),
             clusters: Clusters::default(),
             is_confirmed: true,
             doubted: 0,
@@ -93,7 +99,7 @@ impl Scenery {
             self.points.iter_mut().for_each(|point| point.class = PointClass::Unknown);
             self.doubted += 1;
         } else {
-            self.learn(rays, sweep.number);
+            self.learn(sweep.number);
             self.pick();
             self.doubted = 0;
         }
@@ -110,11 +116,14 @@ impl Scenery {
     /// Makes points of the rays; returns how many have a cell whose background is known, and how many of these are elsewhere.
     fn compare(&mut self, rays: &[Ray]) -> (usize, usize) {
         self.points.clear();
+        self.readings.clear();
+        self.beams.clear();
         self.off.clear();
         let threshold_m = self.settings.threshold_m as f32;
         let (mut known, mut elsewhere) = (0, 0);
         for ray in rays {
             let (row, reading) = ray.reading(&self.mount, &self.settings);
+            self.readings.push((row, reading));
             let class = self.model.class(&reading, row, threshold_m);
             self.off.extend(self.model.angle_off(&reading, row, threshold_m));
             if self.model.knows(&reading, row) {
@@ -124,6 +133,7 @@ impl Scenery {
             if ray.range_m.is_finite() {
                 let at = self.mount.point(ray.angle_rad, ray.beam_rad, ray.range_m.into());
                 let at = at.map(|value| value as f32);
+                self.beams.push((ray.angle_rad as f32, reading.rise));
                 self.points.push(Point { at, stamp_ns: ray.time_ns, beam: ray.beam, class });
             }
         }
@@ -142,17 +152,16 @@ impl Scenery {
         self.off.chunks_exact_mut(part).any(is_off)
     }
 
-    fn learn(&mut self, rays: &[Ray], number: u32) {
-        for ray in rays {
-            let (row, reading) = ray.reading(&self.mount, &self.settings);
-            self.model.learn(&reading, row, number, &self.settings);
+    fn learn(&mut self, number: u32) {
+        for (row, reading) in &self.readings {
+            self.model.learn(reading, *row, number, &self.settings);
         }
     }
 
     /// Picks the points of which obstacles may be.
     fn pick(&mut self) {
         let near = self.settings.near;
-        for point in &self.points {
+        for (point, &(angle_rad, rise)) in self.points.iter().zip(&self.beams) {
             let within = |near: &[[f64; 2]; 3]| {
                 near.iter().zip(point.at).all(|(span, value)| (span[0]..=span[1]).contains(&f64::from(value)))
             };
@@ -160,7 +169,7 @@ impl Scenery {
             let flags = if is_foreground { Obstacle::FOREGROUND } else { 0 }
                 | if near.as_ref().is_some_and(within) { Obstacle::NEAR } else { 0 };
             if flags != 0 {
-                self.standing.push((point.at, flags));
+                self.standing.push(Candidate { at: point.at, flags, angle_rad, rise });
             }
         }
     }

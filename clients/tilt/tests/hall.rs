@@ -153,3 +153,12 @@ fn boards_narrower_than_the_distance_between_scans_are_no_obstacles() {
         assert!(sweep.obstacles.is_empty(), "sweep {}: {:?}", sweep.number, sweep.obstacles);
     });
 }
+
+#[test]
+fn a_top_that_level_beams_graze_is_no_obstacle() {
+    let mut hall = Hall::new(&halls::unchanging(41), 41);
+    let until_s = 33 * hall.sweep_ns() / seconds(1);
+    hall.play(Settings::default(), until_s, |_, sweep| {
+        assert!(sweep.obstacles.is_empty(), "sweep {}: {:?}", sweep.number, sweep.obstacles);
+    });
+}
