@@ -46,16 +46,19 @@ struct Cell {
 #[derive(Clone, Copy, Default)]
 struct Narrow {
     surface: Surface,
-    /// Number of times that a beam met it after beams that met another surface. Beams that meet a third surface decrease it. 0 if
-    /// no surface is stored.
-    returns: u16,
-    /// The sweep in which it was met last, and one.
-    seen: u32,
+    /// Number of sweeps that met it. Beams that meet a third surface decrease it. 0 if no surface is stored.
+    met: u16,
+    /// Number of times that a sweep met it and the sweep before did not.
+    visits: u16,
+    /// Number of sweeps since the last one that met it. Sweeps that did not measure the cell do not count.
+    missed: u16,
 }
 
 /// What stands always.
 pub(crate) struct Model {
     beams: usize,
+    /// Number of sweeps in which a surface must be met until it is background.
+    sweeps: u16,
     /// By angle; those that the mount never came to have no memory.
     rows: Box<[Box<[Cell]>]>,
 }
@@ -64,7 +67,7 @@ impl Model {
     /// A model that knows nothing, of a mount that turns by a quarter to each side of level at most.
     pub(crate) fn new(beams: usize, settings: &Settings) -> Model {
         let rows = (std::f64::consts::PI / width_rad(settings)).ceil() as usize + 1;
-        Model { beams, rows: (0..rows).map(|_| Box::default()).collect() }
+        Model { beams, sweeps: settings.sweeps, rows: (0..rows).map(|_| Box::default()).collect() }
     }
 
     /// Compares with the model as it is.
@@ -84,7 +87,7 @@ impl Model {
         let mut narrow =
             beside().filter_map(|(row, beam)| self.cell(row, beam)).flat_map(|cell| &cell.narrow);
         if all.any(|surface| explains(&surface))
-            || narrow.any(|narrow| narrow.returns >= RETURNS && explains(&narrow.surface))
+            || narrow.any(|narrow| narrow.is_background(self.sweeps) && explains(&narrow.surface))
         {
             return PointClass::Background;
         }
@@ -120,17 +123,23 @@ impl Model {
             *cells = vec![Cell::default(); beams].into();
         }
         let Some(cell) = cells.get_mut(usize::from(reading.beam)) else { return };
-        if cell.seen == sweep + 1 {
-            return;
+        let is_first = cell.seen != sweep + 1;
+        if is_first {
+            cell.seen = sweep + 1;
+            cell.narrow.iter_mut().for_each(|narrow| narrow.begin_sweep(settings.sweeps));
         }
-        cell.seen = sweep + 1;
         let threshold_m = settings.threshold_m as f32;
         if cell.background.is_known() && cell.background.explains(reading, threshold_m) {
-            cell.background.meet(reading);
-            cell.run = 0;
+            if is_first {
+                cell.background.meet(reading);
+                cell.run = 0;
+            }
             return;
         }
-        cell.learn_narrow(reading, sweep, threshold_m);
+        cell.learn_narrow(reading, settings.sweeps, threshold_m);
+        if !is_first {
+            return;
+        }
         if cell.run > 0 && cell.candidate.explains(reading, threshold_m) {
             cell.candidate.meet(reading);
             cell.run += 1;
@@ -157,22 +166,43 @@ impl Model {
 }
 
 impl Cell {
-    /// Counts the returns of beams to surfaces that are not the background. An object that stands still for a while and leaves
-    /// returns once. People who walk do not return to the same range.
-    fn learn_narrow(&mut self, reading: &Reading, sweep: u32, threshold_m: f32) {
-        let met = |narrow: &&mut Narrow| narrow.returns > 0 && narrow.surface.explains(reading, threshold_m);
+    /// Counts the sweeps that meet surfaces other than the background.
+    fn learn_narrow(&mut self, reading: &Reading, sweeps: u16, threshold_m: f32) {
+        let met = |narrow: &&mut Narrow| narrow.met > 0 && narrow.surface.explains(reading, threshold_m);
         if let Some(narrow) = self.narrow.iter_mut().find(met) {
-            let is_return = narrow.seen < sweep;
-            narrow.returns = (narrow.returns + u16::from(is_return)).min(2 * RETURNS);
-            narrow.surface.meet(reading);
-            narrow.seen = sweep + 1;
+            narrow.meet(reading, sweeps);
             return;
         }
-        let Some(least) = self.narrow.iter_mut().min_by_key(|narrow| narrow.returns) else { return };
-        least.returns = least.returns.saturating_sub(1);
-        if least.returns == 0 {
-            *least = Narrow { surface: Surface::of(reading), returns: 1, seen: sweep + 1 };
+        let Some(least) = self.narrow.iter_mut().min_by_key(|narrow| narrow.met) else { return };
+        least.met = least.met.saturating_sub(1);
+        if least.met == 0 {
+            *least = Narrow { surface: Surface::of(reading), met: 1, visits: 1, missed: 0 };
         }
+    }
+}
+
+impl Narrow {
+    /// Returns whether it is background. An object that stands still for a while and leaves visits the cell once. People who
+    /// walk do not return to the same range.
+    fn is_background(&self, sweeps: u16) -> bool {
+        self.met >= sweeps && self.visits >= VISITS.min(sweeps)
+    }
+
+    /// A sweep measures its cell. Forgets the surface if too many sweeps have met something else.
+    fn begin_sweep(&mut self, sweeps: u16) {
+        self.missed = self.missed.saturating_add(1);
+        if self.missed > sweeps.saturating_mul(MEMORY) {
+            *self = Narrow::default();
+        }
+    }
+
+    fn meet(&mut self, reading: &Reading, sweeps: u16) {
+        if self.missed > 0 {
+            self.met = (self.met + 1).min(sweeps.saturating_mul(2).max(1));
+            self.visits = self.visits.saturating_add(u16::from(self.missed > 1));
+        }
+        self.missed = 0;
+        self.surface.meet(reading);
     }
 }
 
@@ -249,8 +279,10 @@ impl Surface {
 
 /// Number of narrow surfaces that a cell stores, such as the edge and the top of a board.
 const NARROW: usize = 2;
-/// Number of returns after which a narrow surface is background.
-const RETURNS: u16 = 3;
+/// Minimum number of visits of a narrow surface that is background. Objects that are put down and people can visit twice.
+const VISITS: u16 = 3;
+/// A narrow surface is forgotten when this many times the sweeps of the setting have not met it in a row.
+const MEMORY: u16 = 8;
 /// Less than a planar scanner measures exactly.
 const LEAST_BIN_RAD: f64 = 0.002;
 /// Share of the last beam in what is known of a surface.
@@ -294,7 +326,7 @@ mod tests {
     }
 
     #[test]
-    fn a_surface_that_is_met_now_and_then_is_background_after_three_returns() {
+    fn a_surface_that_is_met_now_and_then_is_background_after_three_visits() {
         use PointClass::{Background, Foreground};
         let mut model = Model::new(11, &settings());
         let mut classes = Vec::new();
@@ -308,6 +340,45 @@ mod tests {
         let beside = Reading { beam: 6, ..reading(4.0) };
         (16..20).for_each(|sweep| model.learn(&beside, 91, sweep, &settings()));
         assert_eq!(model.class(&Reading { beam: 6, ..reading(2.0) }, 91, 0.06), Background, "beside it");
+    }
+
+    /// Returns whether the reading at 2 m is background after `sweeps`, of which each has a range or did not measure the cell.
+    fn is_narrow_background(settings: &Settings, sweeps: impl IntoIterator<Item = Option<f32>>) -> bool {
+        let mut model = Model::new(11, settings);
+        for (sweep, range_m) in sweeps.into_iter().enumerate() {
+            if let Some(range_m) = range_m {
+                model.learn(&reading(range_m), 90, sweep as u32, settings);
+            }
+        }
+        model.class(&reading(2.0), 90, 0.06) == PointClass::Background
+    }
+
+    #[test]
+    fn a_narrow_surface_is_background_after_the_sweeps_of_the_settings() {
+        let visits = |count| [Some(4.0); 20].into_iter().chain([Some(4.0), Some(2.0)].repeat(count));
+        for (sweeps, wanted) in [(1, 1), (3, 3), (5, 5), (12, 12)] {
+            let settings = Settings { sweeps, ..Settings::default() };
+            let learned = (1..20).find(|count| is_narrow_background(&settings, visits(*count)));
+            assert_eq!(learned, Some(wanted), "{sweeps} sweeps");
+        }
+    }
+
+    #[test]
+    fn a_sweep_that_did_not_measure_the_place_is_no_visit() {
+        let settings = Settings::default();
+        let sweeps = [Some(4.0); 6].into_iter().chain([None, Some(2.0)].repeat(4)).chain([Some(4.0)]);
+        assert!(!is_narrow_background(&settings, sweeps));
+    }
+
+    #[test]
+    fn a_narrow_surface_that_is_seen_through_is_forgotten() {
+        let visits = [Some(4.0); 3].into_iter().chain([Some(4.0), Some(2.0)].repeat(3));
+        for (after, is_background) in [(24, true), (25, false)] {
+            let sweeps = visits.clone().chain(vec![Some(4.0); after]);
+            assert_eq!(is_narrow_background(&settings(), sweeps), is_background, "after {after} sweeps");
+            let sweeps = visits.clone().chain([Some(4.0), None].repeat(24)).chain(vec![None; 90]);
+            assert!(is_narrow_background(&settings(), sweeps), "only sweeps that measured the place count");
+        }
     }
 
     #[test]
