@@ -47,7 +47,7 @@ pub(crate) fn virtual_hub<T>(
         let Wait { until, .. } = link.turn(Woken::Timeout);
         links.push(VirtualLink { around, link, until });
     }
-    shortage::allocate(domain)?;
+    shm::allocate(domain)?;
     Ok(drive(&mut links))
 }
 

@@ -10,7 +10,7 @@ use std::rc::{Rc, Weak};
 
 use schema::limits::TopicLimits;
 use schema::{Failure, Kind, Maker, Ring, Topic, Wake, check_followed, check_sensor, is_remote};
-use shm::shortage::{allocate, check_descriptors, check_memory, longest_segment, sensor_bytes};
+use shm::shortage::{check_descriptors, check_memory, longest_segment, sensor_bytes};
 use shm::{DEFAULT_DOMAIN, Domain, Environment, ListenLock, NameLock, holder, name_held, publisher_domain};
 use shm::{DueRings, Node, Payload, TopicPublisher, Waker};
 
@@ -238,7 +238,7 @@ impl SensorPublisher {
         check_descriptors(SERVICE_DESCRIPTORS)?;
         let topic = TopicPublisher::new(node, &self.0.name, limits)?;
         // To write into what has no memory behind it would end the process.
-        allocate(domain)?;
+        shm::allocate(domain)?;
         Ok(Publication::new(topic, SensorPublisher(self.0.clone())))
     }
 

@@ -1,5 +1,5 @@
 """The one segment that the shared-memory library would open to all users: its counter of nodes. Made or checked here
-before the library looks for it, as the hub does (schema/shm/src/isolation.rs)."""
+before the library looks for it, as the hub does (schema/shm/src/segments.rs)."""
 
 from __future__ import annotations
 

@@ -11,7 +11,7 @@ use port::{Port, Source, clock};
 use rustix::event::{EventfdFlags, PollFd, PollFlags, Timespec, eventfd, poll};
 use schema::{Failure, Kind, MILLIS, Nanos};
 use shm::Node;
-use shm::{Domain, HubLock, StateDirectory, shortage};
+use shm::{Domain, HubLock, StateDirectory};
 
 use crate::control::{ControlQueue, ControlServer};
 use crate::learned::{Keeper, Writer};
@@ -196,7 +196,7 @@ pub(crate) fn serve(
             names.sort_by_key(|name| ready.sensors.iter().position(|sensor| sensor == name));
         }
         if outcome.is_ok() {
-            outcome = shortage::allocate(domain);
+            outcome = shm::allocate(domain);
         }
         if outcome.is_ok() {
             outcome = lock.report_ready();

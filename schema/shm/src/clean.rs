@@ -1,5 +1,5 @@
-//! Processes of a domain, and the removal of files that dead ones left. Files in shared memory that did not belong to a
-//! known dead process are not touched.
+//! Removal of files that dead processes of a domain left. Files in shared memory that did not belong to a known dead process
+//! are not touched.
 
 use std::fs::OpenOptions;
 use std::os::fd::AsRawFd;
@@ -7,15 +7,15 @@ use std::os::unix::fs::OpenOptionsExt;
 use std::path::Path;
 use std::time::Duration;
 
-use iceoryx2::node::NodeState;
-use iceoryx2::prelude::CallbackProgression;
 use nix::libc::{self, c_int};
 use rustix::fs::{FileType, OFlags};
-
-use super::isolation::access_failure;
-use super::{Node, config, forget, hub_node};
-use crate::{Directory, Domain, HubLock, ListenLock};
 use schema::Failure;
+
+use crate::directory::Directory;
+use crate::domain::Domain;
+use crate::lock::{HubLock, ListenLock};
+use crate::node::{hub_node, nodes};
+use crate::segments::forget;
 
 /// Result of a cleanup.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -70,62 +70,6 @@ fn remove_domain(directory: &Directory, root: &Path) -> bool {
 
 /// Maximum wait for another process that is cleaning up after the same dead process.
 const CLEANUP_TIMEOUT: Duration = Duration::from_secs(1);
-
-/// Processes that have joined a domain.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub struct Nodes {
-    /// Running processes.
-    pub alive: usize,
-    /// Processes that ended without cleaning up. Their files still exist.
-    pub dead: usize,
-}
-
-/// Returns the number of processes in `domain`; 0 if the domain does not exist.
-///
-/// # Errors
-///
-/// Returns [`Kind::Failed`](schema::Kind) with owner, mode and remedy if the directory belongs to another user.
-pub fn nodes(domain: &Domain) -> Result<Nodes, Failure> {
-    nodes_at(domain.root())
-}
-
-/// Returns the number of processes in the domain in `root`.
-pub(super) fn nodes_at(root: &Path) -> Result<Nodes, Failure> {
-    let mut nodes = Nodes::default();
-    let Some(config) = config(root)? else { return Ok(nodes) };
-    let listed = Node::list(&config, |state| {
-        match state {
-            NodeState::Alive(_) => nodes.alive += 1,
-            NodeState::Dead(_) => nodes.dead += 1,
-            NodeState::Inaccessible(_) | NodeState::Undefined(_) => {}
-        }
-        CallbackProgression::Continue
-    });
-    listed.map_err(|error| access_failure(root, format!("cannot list processes: {error:?}")))?;
-    Ok(nodes)
-}
-
-/// Removes unfinished service descriptions of the domain in `root`, which a hub leaves if it is killed while it creates
-/// a service. The library waits for them forever and cleans up only finished ones, so no later hub could create that
-/// service again.
-///
-/// The caller must hold the [`MakingLock`](crate::lock::MakingLock). Then no process creates services, and no process
-/// has opened an unfinished one. Finished descriptions are read-only.
-pub(super) fn remove_unfinished_services(root: &Path) {
-    let Ok(Some(directory)) = Directory::open(root) else { return };
-    let Some(services) = directory.below(SERVICES) else { return };
-    for (name, stat) in services.entries() {
-        let finished = stat.st_mode & 0o200 == 0;
-        if !finished && name.to_string_lossy().ends_with(SUFFIX) {
-            services.remove(&name);
-        }
-    }
-}
-
-/// The library's directory of service descriptions, below the root.
-const SERVICES: &str = "services";
-
-const SUFFIX: &str = ".service";
 
 /// Returns whether no process has the file at `path` open or mapped. Only then does the kernel grant a lease for
 /// writing (fcntl(2)). Only the kernel knows this: processes that this one cannot see, or in a container that shares

@@ -4,14 +4,17 @@
 use iceoryx2::active_request::ActiveRequest;
 use iceoryx2::pending_response::PendingResponse;
 use iceoryx2::port::{client, server};
+use iceoryx2::prelude::ipc::Service;
 use iceoryx2::prelude::{AllocationStrategy, EventId, PortFactory as _};
 use iceoryx2::service::port_factory::client::ClientCreateError;
 use iceoryx2::service::port_factory::request_response;
 
-use super::open_failure::{OpenFailure, create, full, no_port, open};
-use super::{Listener, Node, Notifier, Service, WakeService, listener, name, take_wakeups};
-use crate::shortage::{CONTROL_DESCRIPTORS, check_descriptors};
 use schema::{CONTROL, CONTROL_REQUEST, CONTROL_RESPONSE, Failure, Kind, Request, Response, limits};
+
+use crate::node::Node;
+use crate::service::{OpenFailure, create, full, name, no_port, open};
+use crate::shortage::{CONTROL_DESCRIPTORS, check_descriptors};
+use crate::wake::{Listener, Notifier, WakeService, listener, take_wakeups};
 
 /// The hub's end. Its [`requests`](Self::requests) wake when a request was sent.
 pub struct ControlServer {

@@ -16,9 +16,10 @@ use std::path::{Path, PathBuf};
 use rustix::fs::{AtFlags, Dir, FileType, Mode, OFlags, Stat, fstat, openat, renameat, statat, unlinkat};
 use rustix::io::Errno;
 
-use crate::shortage;
 use scanhub_files::path_walk::{LinkPolicy, PathWalk, STICKY, WalkError, components_of, named, user};
 use schema::{Failure, Kind};
+
+use crate::shortage;
 
 /// An open directory that this user owns and nobody else can write to.
 #[derive(Debug)]

@@ -12,7 +12,7 @@ pub const DEFAULT_DOMAIN: &str = "scanhub";
 /// (unix(7)), has a number of up to 35 digits and 7 bytes besides.
 const PLACE_LIMIT: usize = 66;
 
-/// Bytes that a domain's directory adds to the prefix (`isolation.rs`): five random letters, and `_`.
+/// Bytes that a domain's directory adds to the prefix (`prefix.rs`): five random letters, and `_`.
 const RANDOM: usize = 6;
 
 /// What systemd makes for the service; clients outside of the service look there too.

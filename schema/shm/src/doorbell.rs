@@ -22,14 +22,15 @@ use rustix::io::Errno;
 use rustix::thread::futex::{self, WaitFlags, WaitPtr, WaitvFlags};
 use rustix::time::{ClockId, Timespec};
 
-use super::Node;
-use super::isolation::{Segment, in_the_way};
-use crate::shortage::{SHARED_MEMORY, memory};
 use schema::{Failure, Kind, Ring};
+
+use crate::node::Node;
+use crate::segments::{Segment, in_the_way};
+use crate::shortage::{SHARED_MEMORY, memory};
 
 /// The hub's end of a doorbell. Dropping it closes the doorbell and wakes all subscribers once more.
 #[derive(Debug)]
-pub(super) struct DoorbellRinger {
+pub(crate) struct DoorbellRinger {
     page: Page,
     path: PathBuf,
 }
@@ -39,7 +40,7 @@ impl DoorbellRinger {
     /// one.
     ///
     /// Returns [`Kind::Short`] if there is no memory for it, and [`Kind::Failed`] if another user's file has its name.
-    pub(super) fn hang(node: &Node, sensor: &str) -> Result<DoorbellRinger, Failure> {
+    pub(crate) fn hang(node: &Node, sensor: &str) -> Result<DoorbellRinger, Failure> {
         let path = path(node, sensor);
         match DoorbellRinger::open(&path) {
             Ok(page) => Ok(DoorbellRinger { page, path }),
@@ -55,7 +56,7 @@ impl DoorbellRinger {
     }
 
     /// Wakes all subscribers that sleep at `word`.
-    pub(super) fn ring(&self, word: Ring) {
+    pub(crate) fn ring(&self, word: Ring) {
         ring(self.page.words().of(word));
     }
 

@@ -1,29 +1,27 @@
-//! Keeps a domain's shared memory apart from other users, who can all create files in /dev/shm:
+//! Files in shared memory under a domain's prefix, which all users of the machine could create:
 //!
-//! - The names of a domain start with a prefix that contains a random word. Without it, another user could occupy the
-//!   names before the hub starts. The prefix, `sh_DOMAIN_WORD_`, is stored in the file `prefix` of the domain's
-//!   directory, which only this user can read. It stays as long as any process uses it.
-//! - The node counter is the one segment that the shared-memory library opens to all users of the machine. Anyone who
-//!   can write to it can keep every later process out. It is therefore created here, for this user only, before the
-//!   library looks for it. The library uses the file that it finds.
-//! - Segments of other users under the domain's names are found by name, owner and mode, without opening them. The
-//!   owner is reported, because the library only reports "internal error".
+//! - Segments of other users are found by name, owner and mode, without opening them. The owner is reported, because the
+//!   library only reports "internal error".
+//! - The node counter is the one segment that the shared-memory library opens to all users. Anyone who can write to it can
+//!   keep every later process out. It is therefore created here, for this user only, before the library looks for it. The
+//!   library uses the file that it finds.
+//! - A publisher's segments are allocated, because the first access to a full /dev/shm would end the process.
 
-use std::fs::{File, Metadata, OpenOptions};
-use std::hash::{BuildHasher, RandomState};
-use std::io::{Read, Write};
+use std::fs::{self, File, Metadata, OpenOptions};
+use std::io::Write;
 use std::os::unix::fs::{MetadataExt, OpenOptionsExt};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicU32, Ordering};
 
-use rustix::fs::{CWD, RenameFlags, renameat_with};
+use rustix::fs::{CWD, FallocateFlags, OFlags, RenameFlags, fallocate, renameat_with};
 use rustix::io::Errno;
-
-use crate::lock::MakingLock;
-use crate::shortage::{SHARED_MEMORY, memory};
-use crate::{Directory, shortage};
 use scanhub_files::path_walk::named;
 use schema::{Failure, Kind};
+
+use crate::directory::Directory;
+use crate::domain::Domain;
+use crate::prefix::{PREFIX_FILE, prefix_of, read_prefix};
+use crate::shortage::{self, SHARED_MEMORY, memory};
 
 /// Returns the reason for a failure in the domain in `root`: another user's directory or file with owner, mode and
 /// remedy, otherwise a shortage if there is one, otherwise `what`.
@@ -61,11 +59,11 @@ impl Segment {
         Segment { path: path.into(), owner, mode, bytes, is_file: true }
     }
 
-    pub(super) fn at(path: &Path) -> Option<Segment> {
+    pub(crate) fn at(path: &Path) -> Option<Segment> {
         Some(Segment::of(path, &path.symlink_metadata().ok()?))
     }
 
-    pub(super) fn of(path: &Path, metadata: &Metadata) -> Segment {
+    pub(crate) fn of(path: &Path, metadata: &Metadata) -> Segment {
         Segment {
             path: path.to_owned(),
             owner: metadata.uid(),
@@ -76,12 +74,12 @@ impl Segment {
     }
 
     /// Returns whether it is a regular file of this user.
-    pub(super) fn is_own(&self) -> bool {
+    pub(crate) fn is_own(&self) -> bool {
         self.owner == rustix::process::geteuid().as_raw() && self.is_file
     }
 
     /// Returns whether it is not a regular file of this user, or other users can write to it.
-    pub(super) fn is_foreign(&self) -> bool {
+    pub(crate) fn is_foreign(&self) -> bool {
         !self.is_own() || self.mode & 0o022 != 0
     }
 }
@@ -90,7 +88,7 @@ impl Segment {
 /// Empty if the domain has no names.
 pub fn strangers(root: &Path) -> Vec<Segment> {
     let Ok(Some(prefix)) = prefix_of(root) else { return Vec::new() };
-    let entries = std::fs::read_dir(SHARED_MEMORY).into_iter().flatten().flatten();
+    let entries = fs::read_dir(SHARED_MEMORY).into_iter().flatten().flatten();
     let named = entries.filter(|entry| entry.file_name().to_string_lossy().starts_with(&prefix));
     let mut found: Vec<_> =
         named.filter_map(|entry| Segment::at(&entry.path())).filter(Segment::is_foreign).collect();
@@ -113,83 +111,36 @@ pub(crate) fn in_the_way(segment: &Segment) -> Failure {
     )
 }
 
-/// Returns the prefix of the domain in `root`. `None` if no process has published there, or all have ended.
+/// Allocates the memory of all segments that `domain` has reserved so far.
 ///
 /// # Errors
 ///
-/// Returns the errors of [`Directory::open`] and [`Directory::file`].
-pub(crate) fn prefix_of(root: &Path) -> Result<Option<String>, Failure> {
-    match Directory::open(root)? {
-        Some(directory) => read_prefix(&directory, root),
-        None => Ok(None),
+/// Returns [`Kind::Short`] if there is not enough memory.
+pub fn allocate(domain: &Domain) -> Result<(), Failure> {
+    let Some(prefix) = prefix_of(domain.root())? else { return Ok(()) };
+    let user = rustix::process::geteuid().as_raw();
+    let entries = fs::read_dir(SHARED_MEMORY).into_iter().flatten().flatten();
+    for entry in entries.filter(|entry| entry.file_name().to_string_lossy().starts_with(&prefix)) {
+        // Skip segments of other users, and those that have been removed in between.
+        if !entry.metadata().is_ok_and(|metadata| metadata.is_file() && metadata.uid() == user) {
+            continue;
+        }
+        let flags = (OFlags::NOFOLLOW | OFlags::NONBLOCK).bits() as i32;
+        let Ok(segment) = OpenOptions::new().write(true).custom_flags(flags).open(entry.path()) else {
+            continue;
+        };
+        let Ok(metadata) = segment.metadata() else { continue };
+        if metadata.len() == 0 {
+            continue;
+        }
+        // After any other error, the allocation may succeed later.
+        if fallocate(&segment, FallocateFlags::empty(), 0, metadata.len()) == Err(Errno::NOSPC) {
+            let name = entry.file_name().to_string_lossy().into_owned();
+            return Err(memory(&format!("no room for {name}: {} kB", metadata.len() / 1024)));
+        }
     }
+    Ok(())
 }
-
-/// Returns the prefix of the domain in `root`, and chooses one if the domain has none.
-///
-/// # Errors
-///
-/// Returns the errors of [`prefix_of`], and an error if the file cannot be written.
-pub(crate) fn ensure_prefix(root: &Path, _making: &MakingLock) -> Result<String, Failure> {
-    let directory = Directory::make(root)?;
-    if let Some(prefix) = read_prefix(&directory, root)? {
-        return Ok(prefix);
-    }
-    // The hash is keyed with random numbers of the system. Another user cannot create files with all names, but
-    // possibly with some.
-    let mut words = (0..).map(|number: u32| random_word(RandomState::new().hash_one(number)));
-    let prefixes = words.by_ref().map(|word| format!("{}{word}_", prefix_start(root)));
-    let prefix = prefixes.take(MAX_ATTEMPTS).find(|prefix| is_free(prefix)).ok_or_else(|| {
-        let what = format!("{SHARED_MEMORY} is full of files that start with {}", prefix_start(root));
-        Failure::new(Kind::Failed, what, "have them removed, or choose another --domain")
-    })?;
-    directory.replace(PREFIX_FILE, format!("{prefix}\n").as_bytes())?;
-    Ok(prefix)
-}
-
-fn random_word(mut random: u64) -> String {
-    let letters = std::iter::repeat_with(|| {
-        let letter = LETTERS[(random % LETTERS.len() as u64) as usize];
-        random /= LETTERS.len() as u64;
-        letter as char
-    });
-    letters.take(RANDOM_LETTERS).collect()
-}
-
-fn is_free(prefix: &str) -> bool {
-    let mut entries = std::fs::read_dir(SHARED_MEMORY).into_iter().flatten().flatten();
-    !entries.any(|entry| entry.file_name().to_string_lossy().starts_with(prefix))
-}
-
-/// Returns the prefix in the open `directory` of `root`. A prefix of another form was not written here, and counts as
-/// none.
-///
-/// # Errors
-///
-/// Returns the errors of [`Directory::file`].
-pub(crate) fn read_prefix(directory: &Directory, root: &Path) -> Result<Option<String>, Failure> {
-    let Some(file) = directory.file(PREFIX_FILE)? else { return Ok(None) };
-    let mut text = String::new();
-    let read = file.take(MAX_PREFIX_FILE_BYTES).read_to_string(&mut text);
-    let is_one = |prefix: &str| {
-        let random = prefix.strip_prefix(&prefix_start(root)).and_then(|rest| rest.strip_suffix('_'));
-        random.is_some_and(|it| it.len() == RANDOM_LETTERS && it.bytes().all(|byte| LETTERS.contains(&byte)))
-    };
-    Ok(read.ok().and_then(|_| text.strip_suffix('\n')).filter(|prefix| is_one(prefix)).map(str::to_owned))
-}
-
-fn prefix_start(root: &Path) -> String {
-    format!("sh_{}_", root.file_name().unwrap_or_default().to_string_lossy())
-}
-
-/// Name of the file in the domain's directory.
-pub(crate) const PREFIX_FILE: &str = "prefix";
-/// Length of the random word: 60 million words.
-const RANDOM_LETTERS: usize = 5;
-const LETTERS: &[u8] = b"0123456789abcdefghijklmnopqrstuvwxyz";
-const MAX_PREFIX_FILE_BYTES: u64 = 64;
-/// Number of words to try. They are not all taken by chance.
-const MAX_ATTEMPTS: usize = 16;
 
 /// Creates the node counter under `prefix`, unless it exists and belongs to this user alone.
 ///
@@ -197,7 +148,7 @@ const MAX_ATTEMPTS: usize = 16;
 ///
 /// Returns [`Kind::Failed`] with file, owner and remedy if another user's file has its name or another user could write
 /// to it. Returns [`Kind::Short`] if there is no memory for it.
-pub(super) fn ensure_node_counter(prefix: &str) -> Result<(), Failure> {
+pub(crate) fn ensure_node_counter(prefix: &str) -> Result<(), Failure> {
     let path = node_counter_path(prefix);
     loop {
         match Segment::at(&path) {
@@ -213,8 +164,16 @@ pub(super) fn ensure_node_counter(prefix: &str) -> Result<(), Failure> {
 }
 
 /// Removes the node counter under `prefix`, which no process needs any more.
-pub(super) fn remove_node_counter(prefix: &str) {
-    let _ = std::fs::remove_file(node_counter_path(prefix));
+fn remove_node_counter(prefix: &str) {
+    let _ = fs::remove_file(node_counter_path(prefix));
+}
+
+/// Removes what only a running process needs of the names: the node counter, and the prefix in `directory`.
+pub(crate) fn forget(directory: &Directory, root: &Path) {
+    if let Ok(Some(prefix)) = read_prefix(directory, root) {
+        remove_node_counter(&prefix);
+    }
+    directory.remove(PREFIX_FILE.as_ref());
 }
 
 /// Creates the file with its content in one step, unless another process is faster.
@@ -230,7 +189,7 @@ fn create_node_counter(path: &Path) -> Result<(), Failure> {
             Err(Errno::EXIST) => Ok(()),
             placed => Ok(placed?),
         });
-    let _ = std::fs::remove_file(&beside);
+    let _ = fs::remove_file(&beside);
     placed.map_err(|error| match Errno::from_io_error(&error) {
         Some(Errno::NOSPC) => memory(&format!("no room for {}: 16 bytes", path.display())),
         _ => Failure::new(Kind::Failed, format!("{}: {error}", path.display()), "scanhub doctor --clean"),
@@ -258,30 +217,10 @@ const NODE_COUNTER_CONTENT: [u8; 16] = {
 
 #[cfg(test)]
 mod tests {
-    use std::fs;
-
     use iceoryx2::config::Config;
-    use iceoryx2::prelude::{FileName, NodeBuilder, SemanticString, SignalHandlingMode};
-
-    use crate::Service;
+    use iceoryx2::prelude::{FileName, NodeBuilder, SemanticString, SignalHandlingMode, ipc};
 
     use super::*;
-
-    #[test]
-    fn a_word_is_kept_and_never_the_same_twice() {
-        let base = tempfile::tempdir().unwrap();
-        let root = base.path().join("a-1");
-        assert_eq!(prefix_of(&root), Ok(None), "there is no such directory");
-        let ensure_prefix = |root: &Path| ensure_prefix(root, &MakingLock::wait(root).unwrap());
-        let first = ensure_prefix(&root).unwrap();
-        assert!(first.starts_with("sh_a-1_") && first.len() == 13, "{first}");
-        assert_eq!((ensure_prefix(&root), prefix_of(&root)), (Ok(first.clone()), Ok(Some(first.clone()))));
-        for written in ["", "sh_a-1_four_\n", "sh_b_12345_\n", "sh_a-1_12/45_\n"] {
-            fs::write(root.join(PREFIX_FILE), written).unwrap();
-            assert_eq!(prefix_of(&root), Ok(None), "{written:?}");
-        }
-        assert_ne!(ensure_prefix(&root).unwrap(), first);
-    }
 
     #[test]
     fn it_is_the_one_that_the_library_would_make() {
@@ -294,7 +233,7 @@ mod tests {
                 &iceoryx2::prelude::Path::new(base.path().as_os_str().as_encoded_bytes()).unwrap(),
             );
             let builder = NodeBuilder::new().signal_handling_mode(SignalHandlingMode::Disabled);
-            builder.config(&config).create::<Service>().unwrap()
+            builder.config(&config).create::<ipc::Service>().unwrap()
         };
         let files = || {
             let entries = fs::read_dir(SHARED_MEMORY).unwrap().flatten();

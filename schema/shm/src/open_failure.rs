@@ -1,4 +1,4 @@
-//! Failures to create or open a service, classified by the remedy: wait, retry later, or report it to the user.
+//! Creates and opens services. Failures are classified by the remedy: wait, retry later, or report it to the user.
 
 use std::fmt::Debug;
 use std::path::Path;
@@ -14,15 +14,16 @@ use iceoryx2::service::builder::request_response::RequestResponseOpenOrCreateErr
 use iceoryx2::service::builder::{ServiceCreateError, ServiceOpenError};
 use iceoryx2::service::service_name::ServiceName;
 
-use super::Node;
-use super::isolation::access_failure;
-use crate::lock::MakingLock;
-use crate::shortage;
 use schema::limits::TopicLimits;
 use schema::{Failure, Kind, is_remote, of_service};
 
+use crate::file_lock::MakingLock;
+use crate::node::Node;
+use crate::segments::access_failure;
+use crate::shortage;
+
 /// Class of an error.
-pub(super) enum OpenFailure {
+pub(crate) enum OpenFailure {
     /// The service does not exist, or is being created or removed right now.
     Absent,
     /// There is no place for another process.
@@ -99,9 +100,16 @@ impl From<ControlError> for OpenFailure {
     }
 }
 
+/// Returns the name of a service as the library takes it.
+pub(crate) fn name(service: &str) -> Result<ServiceName, Failure> {
+    ServiceName::new(service).map_err(|error| {
+        Failure::new(Kind::Configuration, format!("{service:?} is no service: {error:?}"), "")
+    })
+}
+
 /// Calls `make` until the service exists, for at most two seconds. A service that its last user is leaving can be
 /// created again soon.
-pub(super) fn create<T>(
+pub(crate) fn create<T>(
     node: &Node,
     service: &ServiceName,
     make: impl Fn() -> Result<T, OpenFailure>,
@@ -121,7 +129,7 @@ pub(super) fn create<T>(
 }
 
 /// Returns `None` if the service does not exist, and a failure for any other error.
-pub(super) fn open<T, E>(
+pub(crate) fn open<T, E>(
     node: &Node,
     service: &ServiceName,
     opened: Result<T, E>,
@@ -137,7 +145,7 @@ where
 }
 
 /// Returns the failure for a publisher that cannot be created.
-pub(super) fn no_publisher(service: &ServiceName, error: PublisherCreateError) -> Failure {
+pub(crate) fn no_publisher(service: &ServiceName, error: PublisherCreateError) -> Failure {
     match error {
         PublisherCreateError::ExceedsMaxSupportedPublishers => Failure::new(
             Kind::DomainHeld,
@@ -154,7 +162,7 @@ pub(super) fn no_publisher(service: &ServiceName, error: PublisherCreateError) -
 }
 
 /// Returns the failure if all `limit` places for subscribers of the topic `service` are taken.
-pub(super) fn no_place(service: &ServiceName, limit: usize) -> Failure {
+pub(crate) fn no_place(service: &ServiceName, limit: usize) -> Failure {
     let (start, key) = match of_service(service.as_str()) {
         Some((sensor, _)) if is_remote(sensor) => ("start what publishes it", "--consumers"),
         _ => ("configure the hub", "limits.consumers"),
@@ -168,7 +176,7 @@ pub(super) fn no_place(service: &ServiceName, limit: usize) -> Failure {
 }
 
 /// Returns the failure if all `limit` places for subscribers or clients of `service` are taken.
-pub(super) fn full(service: &ServiceName, limit: usize) -> Failure {
+pub(crate) fn full(service: &ServiceName, limit: usize) -> Failure {
     Failure::new(
         Kind::Short,
         format!("{service} has {limit} consumers, the most that are possible"),
@@ -177,7 +185,7 @@ pub(super) fn full(service: &ServiceName, limit: usize) -> Failure {
 }
 
 /// Returns the failure for any other port that cannot be created. As a rule, descriptors or places are short.
-pub(super) fn no_port(service: &ServiceName, error: &dyn Debug) -> Failure {
+pub(crate) fn no_port(service: &ServiceName, error: &dyn Debug) -> Failure {
     shortage::found(Path::new(shortage::SHARED_MEMORY)).unwrap_or_else(|| {
         let hint = "too many consumers, or `ulimit -n` is too small: about 4 descriptors for each";
         Failure::new(Kind::Short, format!("no port at {service}: {error:?}"), hint)

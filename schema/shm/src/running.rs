@@ -6,7 +6,7 @@ use std::fs;
 use std::os::unix::ffi::OsStrExt;
 use std::path::{Path, PathBuf};
 
-use crate::{DEFAULT_DOMAIN, Environment};
+use crate::domain::{DEFAULT_DOMAIN, Environment, check_name, first_path};
 
 /// A process that runs a hub: `scanhub run` or `scanhub replay`.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -60,7 +60,7 @@ impl RunningHub {
             let value = all.find_map(|entry| entry.strip_prefix(name.as_bytes())?.strip_prefix(b"="))?;
             (!value.is_empty()).then(|| OsStr::from_bytes(value).to_owned())
         };
-        let directory = |name: &str| crate::domain::first_path(variable(name)?);
+        let directory = |name: &str| first_path(variable(name)?);
         let base = match command.root {
             // A relative one counts from the process's working directory, which other users cannot read.
             Some(root) => Some(fs::read_link(path.join("cwd")).map_or(root.clone(), |cwd| cwd.join(root))),
@@ -78,7 +78,7 @@ impl RunningHub {
         let domain = domain.or_else(|| environment.is_some().then(|| DEFAULT_DOMAIN.to_owned()));
         // Any user can start a process with any command line, and the name becomes part of a suggested command.
         if let Some(domain) = &domain {
-            crate::domain::check_name(domain).ok()?;
+            check_name(domain).ok()?;
         }
         // A relative path counts from the process's working directory.
         let program = if command.program.contains('/') && !command.program.starts_with('/') {

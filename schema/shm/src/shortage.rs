@@ -2,21 +2,16 @@
 //! domain.
 //!
 //! The shared-memory library reserves segments without allocating them. With a full /dev/shm, the first access would
-//! end the process with SIGBUS, so a publisher allocates its segments here. For any other shortage, the library only
-//! reports "internal error".
+//! end the process with SIGBUS, so a publisher calls [`allocate`](crate::allocate). For any other shortage, the library
+//! only reports "internal error".
 
-use std::fs::{self, OpenOptions};
 use std::io;
-use std::os::unix::fs::{MetadataExt, OpenOptionsExt};
 use std::path::Path;
 
-use rustix::fs::{FallocateFlags, OFlags, StatVfs, fallocate, statvfs};
+use rustix::fs::{StatVfs, statvfs};
 use rustix::io::Errno;
 use rustix::param::page_size;
 use rustix::process::{Resource, getrlimit, setrlimit};
-
-use crate::Domain;
-use crate::isolation::prefix_of;
 use schema::limits::TopicLimits;
 use schema::{Failure, Header, Kind, Topic, limits};
 
@@ -179,37 +174,6 @@ const PAGE_COUNTS: &str = "/proc/self/statm";
 
 /// Directory of this process's open descriptors.
 const OPEN_DESCRIPTORS: &str = "/proc/self/fd";
-
-/// Allocates the memory of all segments that `domain` has reserved so far.
-///
-/// # Errors
-///
-/// Returns [`Kind::Short`] if there is not enough memory.
-pub fn allocate(domain: &Domain) -> Result<(), Failure> {
-    let Some(prefix) = prefix_of(domain.root())? else { return Ok(()) };
-    let user = rustix::process::geteuid().as_raw();
-    let entries = fs::read_dir(SHARED_MEMORY).into_iter().flatten().flatten();
-    for entry in entries.filter(|entry| entry.file_name().to_string_lossy().starts_with(&prefix)) {
-        // Skip segments of other users, and those that have been removed in between.
-        if !entry.metadata().is_ok_and(|metadata| metadata.is_file() && metadata.uid() == user) {
-            continue;
-        }
-        let flags = (OFlags::NOFOLLOW | OFlags::NONBLOCK).bits() as i32;
-        let Ok(segment) = OpenOptions::new().write(true).custom_flags(flags).open(entry.path()) else {
-            continue;
-        };
-        let Ok(metadata) = segment.metadata() else { continue };
-        if metadata.len() == 0 {
-            continue;
-        }
-        // After any other error, the allocation may succeed later.
-        if fallocate(&segment, FallocateFlags::empty(), 0, metadata.len()) == Err(Errno::NOSPC) {
-            let name = entry.file_name().to_string_lossy().into_owned();
-            return Err(memory(&format!("no room for {name}: {} kB", metadata.len() / 1024)));
-        }
-    }
-    Ok(())
-}
 
 /// Returns the bytes of all segments of one sensor's `topics` if they are created with `limits`: payloads with their
 /// headers, and the lists of each service.

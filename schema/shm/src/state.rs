@@ -8,9 +8,10 @@ use std::io::{self, Read};
 use std::os::unix::fs::MetadataExt;
 use std::path::PathBuf;
 
-use crate::Directory;
-use crate::domain::first_path;
 use schema::{Failure, Kind};
+
+use crate::directory::Directory;
+use crate::domain::first_path;
 
 /// The directory of a domain's files: `$STATE_DIRECTORY/DOMAIN`, else `$XDG_STATE_HOME/scanhub/DOMAIN`, else
 /// `~/.local/state/scanhub/DOMAIN`.

@@ -7,19 +7,32 @@ use std::fmt::Debug;
 use std::marker::PhantomData;
 
 use iceoryx2::port::subscriber::SubscriberCreateError;
-use iceoryx2::prelude::{AttributeVerifier, IceoryxSend};
+use iceoryx2::port::update_connections::UpdateConnections;
+use iceoryx2::port::{self, LoanError, ReceiveError, SendError};
+use iceoryx2::prelude::ipc::Service;
+use iceoryx2::prelude::{AttributeSet, AttributeVerifier, IceoryxSend, PortFactory, SemanticString};
 use iceoryx2::service::builder::publish_subscribe::{
     PublishSubscribeOpenError, PublishSubscribeOpenOrCreateError,
 };
+use iceoryx2::service::port_factory::publish_subscribe;
 
-use super::open_failure::{OpenFailure, create, no_place, no_port, no_publisher, open};
-use super::{
-    LoanError, Node, PortFactory, Publisher, REVISION, ReceiveError, Sample, SampleMut, SendError,
-    Subscriber, TopicService, UpdateConnections, name, places,
-};
-use crate::shortage::check_client;
 use schema::limits::TopicLimits;
 use schema::{Failure, Header, Kind, Topic, limits};
+
+use crate::node::Node;
+use crate::service::{OpenFailure, create, name, no_place, no_port, no_publisher, open};
+use crate::shortage::check_client;
+
+/// A topic of one sensor.
+pub type TopicService<P> = publish_subscribe::PortFactory<Service, <P as Payload>::Memory, Header>;
+/// Sends the samples of a topic.
+pub type Publisher<P> = port::publisher::Publisher<Service, <P as Payload>::Memory, Header>;
+/// Receives the samples of a topic.
+pub type Subscriber<P> = port::subscriber::Subscriber<Service, <P as Payload>::Memory, Header>;
+/// A received sample: the payload by `*`, read-only, in shared memory; the header by `user_header()`.
+pub type Sample<P> = iceoryx2::sample::Sample<Service, <P as Payload>::Memory, Header>;
+/// A loaned sample that is not sent yet.
+pub type SampleMut<P> = iceoryx2::sample_mut::SampleMut<Service, <P as Payload>::Memory, Header>;
 
 /// Payload of a topic: `[u8]` (telegram), or a type of this crate.
 pub trait Payload: Debug + 'static {
@@ -227,6 +240,19 @@ macro_rules! payloads {
 
 schema::for_each_topic!(payloads);
 
+/// Returns the number of places for subscribers that `topic` was created with.
+pub fn places<P: Payload + ?Sized>(topic: &TopicService<P>) -> usize {
+    topic.static_config().max_subscribers()
+}
+
+/// Returns the payload's revision that the publisher wrote into the `attributes` of a service; 0 if there is none.
+pub fn payload_revision(attributes: &AttributeSet) -> u32 {
+    let revision = attributes.iter().find(|attribute| attribute.key().as_bytes() == REVISION.as_bytes());
+    revision.and_then(|attribute| attribute.value().to_string().parse().ok()).unwrap_or_default()
+}
+
+const REVISION: &str = "revision";
+
 fn revision(topic: Topic) -> Result<AttributeVerifier, Failure> {
     let impossible = |_| Failure::new(Kind::Failed, "the payload's revision is no attribute", "");
     let value = topic.revision().to_string();
@@ -277,7 +303,7 @@ pub struct SharedMemory<P: Payload + ?Sized> {
 
 impl<P: Payload + ?Sized> SharedMemory<P> {
     /// Creates the topic of `sensor` with payload `P` and `limits`, or takes over the topic of a dead process. The
-    /// [`Waker`](super::Waker) of the sensor must exist before.
+    /// [`Waker`](crate::Waker) of the sensor must exist before.
     ///
     /// # Errors
     ///

@@ -8,16 +8,27 @@
 use std::os::fd::BorrowedFd;
 use std::time::Duration;
 
+use iceoryx2::port;
 use iceoryx2::port::listener::{ListenerCreateError, ListenerWaitError};
-use iceoryx2::prelude::{EventId, FileDescriptorBased};
+use iceoryx2::prelude::ipc::Service;
+use iceoryx2::prelude::{EventId, FileDescriptorBased, PortFactory};
+use iceoryx2::service::port_factory::event;
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::io::Errno;
 
-use super::doorbell::DoorbellRinger;
-use super::open_failure::{OpenFailure, create, full, no_port, open};
-use super::{Listener, Node, Notifier, PortFactory, WakeService, name};
-use crate::shortage::check_client;
 use schema::{Failure, Kind, Ring, Topic, Wake, limits};
+
+use crate::doorbell::DoorbellRinger;
+use crate::node::Node;
+use crate::service::{OpenFailure, create, full, name, no_port, open};
+use crate::shortage::check_client;
+
+/// Event service that wakes the subscribers of one sensor.
+pub type WakeService = event::PortFactory<Service>;
+/// Wakes subscribers.
+pub type Notifier = port::notifier::Notifier<Service>;
+/// Sleeps until it is woken.
+pub type Listener = port::listener::Listener<Service>;
 
 /// The hub's end. It wakes subscribers with [`Wake::HubUp`] when it is created, and with [`Wake::HubDown`] when it is
 /// dropped.

@@ -46,6 +46,23 @@ fn shm_and_files_know_only_schema() {
 }
 
 #[test]
+fn modules_of_shm_form_layers() {
+    holds(crates::modules_of_shm_form_layers, |tree| {
+        let planted = |module: &str, code: &str| {
+            tree.with(&format!("schema/shm/src/{module}.rs"), &format!("//! So.\n{code}\n"))
+        };
+        vec![
+            planted("file_lock", "use crate::prefix::prefix_of;"),
+            planted("node", "crate::lock::holder(root)?;"),
+            planted("shortage", "use crate::Domain;"),
+            planted("shortage", "use crate::{domain::Domain, prefix};"),
+            planted("segments", "use super::node::Node;"),
+            planted("planted", "use crate::domain::Domain;"),
+        ]
+    });
+}
+
+#[test]
 fn schema_without_ipc_needs_no_shared_memory() {
     let lan = crates::built_from("scanhub-schema", &["--no-default-features"]);
     assert!(!lan.iter().any(|name| name.starts_with("iceoryx2")), "{lan:?}");

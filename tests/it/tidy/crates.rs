@@ -248,6 +248,33 @@ pub(crate) fn clients_know_only_schema(tree: &Tree) -> Vec<String> {
     knows_others(tree, &known)
 }
 
+/// Finds modules of `shm` that use one that is not before them in the list at the start of the crate.
+pub(crate) fn modules_of_shm_form_layers(tree: &Tree) -> Vec<String> {
+    const FOLDER: &str = "schema/shm/src/";
+    let lib = tree.text("schema/shm/src/lib.rs");
+    let list = lib.lines().filter_map(|line| line.strip_prefix("//! - "));
+    let layers: Vec<&str> = list.flat_map(|line| line.split('`').skip(1).step_by(2)).collect();
+    let mut breaches = Vec::new();
+    for (path, text) in tree.sources() {
+        let Some(file) = path.strip_prefix(FOLDER).filter(|file| *file != "lib.rs") else { continue };
+        let module = words(file).next().unwrap_or_default();
+        let Some(layer) = layers.iter().position(|layer| *layer == module) else {
+            breaches.push(format!("{path} is not in the list of layers"));
+            continue;
+        };
+        for (number, line) in code(text) {
+            let mut used = line.split("crate::").skip(1).filter_map(|rest| words(rest).next());
+            // A name at the top of the crate may come from any module.
+            let is_below = |name: &str| name == module || layers[..layer].contains(&name);
+            let is_above = !file.contains('/') && line.contains("super::");
+            if is_above || used.any(|name| !is_below(name)) {
+                breaches.push(format!("{path}:{number}: {}", line.trim()));
+            }
+        }
+    }
+    breaches
+}
+
 /// Crates of this project that a crate names besides those that it may know.
 fn knows_others(tree: &Tree, known: &[(&str, &[&str])]) -> Vec<String> {
     let members = tree.members();
