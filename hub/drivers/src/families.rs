@@ -2,13 +2,13 @@
 
 use std::fmt;
 
-use crate::line::family::{Features, Model, Settings};
+use crate::line::family::{Features, Model};
 use crate::line::probe::Probe;
-use crate::line::settings::{Refusal, SettingsRequest};
 use crate::line::{
     self, Account, Control, Identity, Introduction, KnownRate, Notice, Output, RawScan, Received, State,
 };
 use crate::lms::Inquiry;
+use crate::settings::{Refusal, Settings, SettingsRequest};
 use crate::{ld, lms, rplidar, search};
 use schema::{Counters, Family, Nanos, ScanHead, Status};
 

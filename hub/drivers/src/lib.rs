@@ -15,8 +15,7 @@ pub mod search;
 mod settings;
 
 pub use families::{ANY, Session, Trouble, features, inquiry, scan_heads};
-pub use line::family::{Features, Model, Settings};
-pub use line::settings::{AUTO, Key, Refusal, SettingsRequest, Value, auto_or};
+pub use line::family::{Features, Model};
 pub use lms::inquiry::{Inquiry, Report};
 pub use port_session::PortSession;
-pub use settings::family_of;
+pub use settings::{AUTO, Key, Refusal, Settings, SettingsRequest, Value, auto_or, family_of};

@@ -11,7 +11,6 @@ mod reads;
 mod scan;
 mod sensor_clock;
 mod session;
-pub(crate) mod settings;
 mod stream;
 mod turns;
 

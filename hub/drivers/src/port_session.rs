@@ -8,12 +8,13 @@ use core::fmt;
 use schema::{Counter, Counters, Family, MILLIS, Nanos, Status};
 
 use crate::families::{Session, Trouble, features};
-use crate::line::family::{Features, Model, Settings};
+use crate::line::family::{Features, Model};
 use crate::line::{
     self, Account, Control, Identity, Introduction, KnownRate, Notice, Output, Protocol as _, RawScan,
     Received, Session as _, State,
 };
 use crate::search::{Found, Memory, PortKind, Search};
+use crate::settings::Settings;
 
 /// A session on an open port.
 #[derive(Debug)]

@@ -1,13 +1,151 @@
-//! Settings that a user requests: which family they name, and whether a family has them. The family checks their values, and
-//! makes [`Settings`] of them. A configuration adds the place of each key.
+//! Settings of a scanner: the keys of a configuration, and the settings of a session. A family says which keys only it has,
+//! and checks their values. A configuration adds the place of each key.
+
+use std::fmt;
 
 use schema::Family;
 
 use crate::families::{check, features};
-use crate::line::family::{Features, Settings};
+use crate::line::family::Features;
 use crate::line::grid;
-use crate::line::settings::{AUTO, Key, Refusal, SettingsRequest, Value, auto_or, refused};
 use crate::lms;
+
+/// Declares the keys, each with its name in a configuration, and the field that a request has for its value.
+macro_rules! keys {
+    ($($(#[doc = $doc:literal])+ $key:ident $name:literal $field:ident: $type:ty,)+) => {
+        /// Key of a setting.
+        #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+        pub enum Key {
+            $($(#[doc = $doc])+ $key,)+
+        }
+
+        impl Key {
+            /// All keys.
+            pub const ALL: [Key; [$(Key::$key),+].len()] = [$(Key::$key),+];
+
+            /// Returns its name in a configuration.
+            pub fn name(self) -> &'static str {
+                match self { $(Key::$key => $name,)+ }
+            }
+        }
+
+        /// Settings that a user requests, before the family has checked them. Each value alone is valid.
+        #[derive(Clone, Debug, Default, PartialEq)]
+        pub struct SettingsRequest {
+            $($(#[doc = $doc])+ pub $field: Option<$type>,)+
+        }
+
+        impl SettingsRequest {
+            /// Returns whether `key` is set.
+            fn has(&self, key: Key) -> bool {
+                match key { $(Key::$key => self.$field.is_some(),)+ }
+            }
+        }
+    };
+}
+
+keys! {
+    /// Name of the type that the scanner is expected to report.
+    Type "type" expected_type: &'static str,
+    /// Angle of view in degrees.
+    Angle "angle" angle_deg: u16,
+    /// Angle between two beams in hundredths of a degree.
+    Resolution "resolution" resolution_cdeg: u16,
+    /// Unit of ranges in mm.
+    Unit "unit" unit_mm: u8,
+    /// Number of the measuring mode.
+    ModeNumber "mode" mode_number: u8,
+    /// Rate in bits per second.
+    Baud "baud" baud: u32,
+    /// Name of the model; `None` for [`AUTO`].
+    Model "model" model: String,
+    /// Number of beams.
+    Beams "beams" beams: usize,
+    /// Name of the scan mode; `None` for [`AUTO`].
+    ModeName "mode" mode: String,
+    /// Whether the motor stops while there are no subscribers.
+    Idle "idle" stop_when_idle: bool,
+}
+
+impl Key {
+    /// Returns whether every family accepts it with its default, [`AUTO`] or `run`.
+    fn has_default(self) -> bool {
+        matches!(self, Key::Model | Key::Beams | Key::ModeName | Key::Idle)
+    }
+}
+
+/// Value of a setting, as given.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Value<'a> {
+    /// Text.
+    Text(&'a str),
+    /// A whole number.
+    Whole(i64),
+    /// Another number.
+    Number(f64),
+    /// Anything else, as it is written.
+    Other(&'a str),
+}
+
+impl fmt::Display for Value<'_> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Value::Text(text) => write!(f, "\"{text}\""),
+            Value::Whole(number) => number.fmt(f),
+            Value::Number(number) => number.fmt(f),
+            Value::Other(text) => f.write_str(text),
+        }
+    }
+}
+
+/// A setting that is not valid, as text for a user.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Refusal {
+    /// Keys whose values cause the problem, the main one first. The others stand for it if it is not set.
+    pub keys: Vec<Key>,
+    /// The problem, with the value.
+    pub what: String,
+    /// The remedy.
+    pub remedy: String,
+}
+
+impl Refusal {
+    pub(crate) fn new(keys: &[Key], what: String, remedy: impl Into<String>) -> Refusal {
+        Refusal { keys: keys.to_vec(), what, remedy: remedy.into() }
+    }
+}
+
+/// Settings of a session, with names and numbers in place of a family's types. A family ignores what it does not have.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Settings {
+    /// Name of one of the [`Features::models`]. `None`: the session finds it out.
+    pub model: Option<&'static str>,
+    /// Name of one of the [`Features::modes`]. `None`: the best one.
+    pub mode: Option<&'static str>,
+    /// Number of beams of the grid. `None`: the model's number, at most [`max_beams`](Self::max_beams).
+    pub beams: Option<usize>,
+    /// Maximum number of beams. `None`: the maximum of a grid.
+    pub max_beams: Option<usize>,
+    /// Angle of view in degrees and angle between two beams in hundredths of a degree. `None`: the family's usual ones.
+    pub view: Option<(u16, u16)>,
+    /// Rate to stream at, in bits per second. `None`: that of the model or family.
+    pub baud: Option<u32>,
+    /// Name of the expected type. It is compared, never written.
+    pub expected_type: Option<&'static str>,
+    /// Expected unit of ranges in mm. It is compared, never written.
+    pub unit_mm: Option<u8>,
+    /// Number of the mode that defines the meaning of values, for a recording that does not contain it.
+    pub mode_number: Option<u8>,
+    /// Whether the port has one fixed rate and bytes do not arrive at the pace of a line, as with a serial server on
+    /// the network or a recording.
+    pub fixed_rate: bool,
+    /// Whether nothing can be sent, because the bytes are from a recording.
+    pub listen_only: bool,
+    /// Whether the motor stops while there are no subscribers, if it [can](Features::can_rest).
+    pub stop_when_idle: bool,
+    /// Whether a search has found the scanner. Its number of beams then follows what it reports.
+    pub is_found: bool,
+}
 
 impl SettingsRequest {
     /// Sets `key` to `value`. A name of a mode replaces a number, and a number a name.
@@ -33,7 +171,7 @@ impl SettingsRequest {
                 let remedy = || format!("one of: {}", IDLE.map(|(word, _)| word).join(", "));
                 self.stop_when_idle = Some(known.ok_or_else(|| refused(Key::Idle, value, remedy()))?.1);
             }
-            _ => lms::settings::set(self, key, value)?,
+            _ => lms::set(self, key, value)?,
         }
         Ok(())
     }
@@ -102,6 +240,45 @@ impl SettingsRequest {
         };
         Err(Refusal::new(&[key], what, remedy))
     }
+
+    /// Returns the settings of a scanner of `family`, which has `features` with models.
+    pub(crate) fn check_models(&self, family: Family, features: &Features) -> Result<Settings, Refusal> {
+        let mut settings = self.checked();
+        if let Some(model) = &self.model {
+            let known = features.models.iter().find(|known| known.name.eq_ignore_ascii_case(model));
+            settings.model = Some(known.map(|known| known.name).ok_or_else(|| {
+                let names = features.models.iter().map(|model| model.name);
+                Refusal::new(&[Key::Model], format!("model = \"{model}\""), auto_or(names))
+            })?);
+        }
+        if let Some(mode) = &self.mode {
+            let known = features.modes.iter().find(|known| known.eq_ignore_ascii_case(mode));
+            settings.mode = Some(*known.ok_or_else(|| {
+                let what = format!("mode = \"{mode}\"");
+                match features.modes {
+                    [] => {
+                        let what = format!("{what}, and an {} measures in one way only", family.name());
+                        Refusal::new(&[Key::ModeName], what, "leave it out")
+                    }
+                    modes => Refusal::new(&[Key::ModeName], what, auto_or(modes.iter().copied())),
+                }
+            })?);
+        }
+        Ok(settings)
+    }
+
+    /// Returns the settings that need no further check.
+    pub(crate) fn checked(&self) -> Settings {
+        Settings {
+            beams: self.beams,
+            expected_type: self.expected_type,
+            baud: self.baud,
+            unit_mm: self.unit_mm,
+            mode_number: self.mode_number,
+            stop_when_idle: self.stop_when_idle.unwrap_or_default(),
+            ..Settings::default()
+        }
+    }
 }
 
 impl Settings {
@@ -140,3 +317,16 @@ pub fn family_of(model: &str) -> Option<Family> {
 
 /// Values of `idle`, and whether the motor then stops while there are no subscribers.
 const IDLE: [(&str, bool); 2] = [("run", false), ("stop", true)];
+
+/// Returns the refusal of a value that no scanner can have.
+pub(crate) fn refused(key: Key, value: Value<'_>, remedy: impl Into<String>) -> Refusal {
+    Refusal::new(&[key], format!("{} = {value}", key.name()), remedy)
+}
+
+/// Returns the remedy that lists `names`.
+pub fn auto_or(names: impl Iterator<Item = &'static str>) -> String {
+    format!("{AUTO}, or one of: {}", names.collect::<Vec<_>>().join(", "))
+}
+
+/// The hub or the session detects or chooses the value.
+pub const AUTO: &str = "auto";

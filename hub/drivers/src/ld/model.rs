@@ -1,6 +1,6 @@
 //! The models of the family, as far as they differ. Where the figures come from: the makers' data sheets.
 
-use crate::line::family::Settings;
+use crate::settings::Settings;
 
 /// A scanner of the family.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

@@ -12,12 +12,12 @@ use crate::ld::packet::{LEN, POINTS, Packet};
 use crate::ld::point_count::{Counted, PointCount};
 use crate::ld::restarts::Restarts;
 use crate::ld::sequence::{Place, Sequence};
-use crate::line::family::{self, Features, Settings, table};
-use crate::line::settings::{Refusal, SettingsRequest};
+use crate::line::family::{self, Features, table};
 use crate::line::{
     self, Account, Closed, Control, Event, Flow, Output, Pace, RawScan, Reads, Received, SensorClock, State,
     StreamCounters, Tally, TurnCounts, Turns, Watchdog,
 };
+use crate::settings::{Refusal, Settings, SettingsRequest};
 
 /// The session with one scanner.
 #[derive(Clone, Debug)]

@@ -1,6 +1,6 @@
 //! What a configuration can name: the models and settings of a family.
 
-use crate::line::settings::Key;
+use crate::settings::Key;
 
 /// Models and settings of a family.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -37,38 +37,6 @@ pub struct Model {
     pub baud: u32,
     /// Default number of beams of a scan.
     pub beams: usize,
-}
-
-/// Settings of a session, with names and numbers in place of a family's types. A family ignores what it does not have.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub struct Settings {
-    /// Name of one of the [`Features::models`]. `None`: the session finds it out.
-    pub model: Option<&'static str>,
-    /// Name of one of the [`Features::modes`]. `None`: the best one.
-    pub mode: Option<&'static str>,
-    /// Number of beams of the grid. `None`: the model's number, at most [`max_beams`](Self::max_beams).
-    pub beams: Option<usize>,
-    /// Maximum number of beams. `None`: the maximum of a grid.
-    pub max_beams: Option<usize>,
-    /// Angle of view in degrees and angle between two beams in hundredths of a degree. `None`: the family's usual ones.
-    pub view: Option<(u16, u16)>,
-    /// Rate to stream at, in bits per second. `None`: that of the model or family.
-    pub baud: Option<u32>,
-    /// Name of the expected type. It is compared, never written.
-    pub expected_type: Option<&'static str>,
-    /// Expected unit of ranges in mm. It is compared, never written.
-    pub unit_mm: Option<u8>,
-    /// Number of the mode that defines the meaning of values, for a recording that does not contain it.
-    pub mode_number: Option<u8>,
-    /// Whether the port has one fixed rate and bytes do not arrive at the pace of a line, as with a serial server on
-    /// the network or a recording.
-    pub fixed_rate: bool,
-    /// Whether nothing can be sent, because the bytes are from a recording.
-    pub listen_only: bool,
-    /// Whether the motor stops while there are no subscribers, if it [can](Features::can_rest).
-    pub stop_when_idle: bool,
-    /// Whether a search has found the scanner. Its number of beams then follows what it reports.
-    pub is_found: bool,
 }
 
 /// Maps a constant array with a constant function.

@@ -1,11 +1,11 @@
 //! The handshake with a scanner: the queries in their order, what the scanner has reported, and the scan mode that
 //! follows from it. [`Handshake`] decides which step comes next; the session carries it out, and waits for responses.
 
-use crate::line::family::Settings;
 use crate::rplidar::device_info::{Health, Info};
 use crate::rplidar::model::{Mode, Model, Motor};
 use crate::rplidar::packet::Kind;
 use crate::rplidar::request::{Answer, Request, key};
+use crate::settings::Settings;
 
 /// A request whose response the session waits for, in the order of the handshake. Those about a mode contain its place
 /// in the list of modes.

@@ -1,7 +1,7 @@
 //! The models of the family and their modes, as far as they differ. Where the figures come from: the maker's data sheets; of
 //! an A1, measurements of a real one.
 
-use crate::line::family::Settings;
+use crate::settings::Settings;
 
 /// A scanner of the family.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

@@ -5,9 +5,9 @@
 
 use schema::{MILLIS, Nanos};
 
-use crate::line::family::Settings;
 use crate::rplidar::model::Model;
 use crate::rplidar::session::{DRAIN, FEATURES, Trouble};
+use crate::settings::Settings;
 
 /// The rate of the line, and the state of the search for it.
 #[derive(Clone, Copy, Debug)]

@@ -8,8 +8,7 @@ use core::fmt;
 
 use schema::{Contents, Family, MILLIS, Nanos, ScanHead, line_time};
 
-use crate::line::family::{self, Features, Settings, table};
-use crate::line::settings::{Key, Refusal, SettingsRequest};
+use crate::line::family::{self, Features, table};
 use crate::line::{
     self, Account, Closed, Condition, Control, Event, Introduction, Output, RawScan, Reads, Received, State,
     StreamCounters, Tally, TurnCounts, Watchdog,
@@ -23,6 +22,7 @@ use crate::rplidar::rate_search::RateSearch;
 use crate::rplidar::request::{Answer, Head, Request, RequestQueue};
 use crate::rplidar::stream::{Line, MAX_SAMPLE_LEN, Stream};
 use crate::rplidar::stream_head::StreamHead;
+use crate::settings::{Key, Refusal, Settings, SettingsRequest};
 
 /// The session with one scanner.
 #[derive(Clone, Debug)]

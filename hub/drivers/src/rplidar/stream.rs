@@ -1,8 +1,8 @@
 //! Packets of a stream: gives them stamps, and assembles their points into revolutions. The points of a packet with
 //! several points are known once the next packet has arrived, and only if nothing is missing between the two.
 
-use crate::line::family::Settings;
 use crate::line::{self, Arrivals, Closed, Flow, Pace, RawScan, Reads, SensorClock, TurnCounts, Turns};
+use crate::settings::Settings;
 use schema::{Family, MILLIS, Nanos, line_time};
 
 use crate::rplidar::framer::{Framer, Span};
