@@ -25,18 +25,28 @@ section! {
     /// Keys of section `gateway`.
     pub(crate) struct GatewayKeys: "keys of gateway, as { interface = \"eth0\" }" {
         /// for the multicast groups; no default
+        ///
+        /// Network interface on which the multicast groups are sent.
         interface: Option<String> = None, example "\"eth0\"";
         /// default: all but telegram, lines, motion, early and cloud
+        ///
+        /// Topics to send: `SENSOR/TOPIC`, `SENSOR/*` or `*/TOPIC`, possibly with `:every=N`, see below.
         topics: Option<Vec<String>> = None, example "[\"*/zones\", \"*/scan:every=4\"]";
         /// receivers of copies; default: none
+        ///
+        /// Hosts that receive copies: `HOST:PORT`, `[IPV6]:PORT` or `[fe80::7%eth0]:PORT`.
         to: Option<Vec<String>> = None, example "[\"10.0.0.7:22200\"]";
         /// whether to send only telegrams, without a header
         bare: Option<bool> = None;
         /// authenticates datagrams; no default
+        ///
+        /// File with the key that authenticates datagrams.
         key_file: Option<PathBuf> = None, example "\"/etc/scanhub/lan.key\"";
         /// networks that a datagram to a group may cross
         ttl: Option<i64> = None, check optional(whole_or(0..=255, "0 to 255".into()));
         /// interval at which a background is sent again; default: only new ones are sent
+        ///
+        /// Interval at which a background is sent again, such as `10s`. Default: only new ones are sent.
         background_every: Option<String> = None, example "\"10s\"";
         /// longest datagram in bytes, 576 to 1472
         mtu: Option<i64> = None, check optional(whole_or(

@@ -136,24 +136,46 @@ section! {
         /// A tty, `tcp:HOST:PORT`, or `file:PATH[?rate=max]`.
         port: Option<String> = None, check optional(port), example "\"/dev/ttyUSB0\"";
         /// lms200, lms211, lms221 or lms291: other settings are refused
-        expected_type ("type"): Option<String> = None, example "\"lms291\"";
-        /// auto: the hub finds the scanner; or lms, ld or rplidar
+        ///
+        /// Expected type of an LMS: `lms200`, `lms211`, `lms221` or `lms291`. Settings that it does not support are refused.
+        expected_type ("type"): Option<String> = None;
+        /// auto: the hub finds the scanner
+        ///
+        /// The name of a family, see below, or `auto`, the default: the hub finds the scanner.
         family: Option<String> = None, example "\"auto\"";
         /// auto, or the name of a model
+        ///
+        /// The name of a model, see below, or `auto`, the default.
         model: Option<String> = None, example "\"auto\"";
         /// of a scan, 2 to 8192; default: as many points as the model measures per revolution
+        ///
+        /// Number of beams of a scan of a rotating scanner, 2 to 8192. Default: as many points as the model measures per
+        /// revolution.
         beams: Option<i64> = None, example "450";
         /// degrees, 100 or 180
+        ///
+        /// Angle of view of an LMS in degrees: 100 or 180.
         angle: Option<f64> = None, example "180";
         /// degrees, 0.25, 0.5 or 1
+        ///
+        /// Angle between two beams of an LMS in degrees: 0.25, 0.5 or 1.
         resolution: Option<f64> = None, example "0.5";
         /// mm or cm, compared with the sensor's, never written
+        ///
+        /// Expected unit of an LMS: `mm` or `cm`. It is compared, never written.
         unit: Option<String> = None, example "\"mm\"";
         /// measuring mode, for a recording that does not contain it
+        ///
+        /// Scan mode of an RPLIDAR, or measuring mode of a recording of an LMS, see below.
         mode: Option<toml::Value> = None, example "0x01";
         /// run, or stop: the motor stops while no program subscribes
+        ///
+        /// `run`; or `stop`: the motor of an RPLIDAR stops while no program subscribes.
         idle: Option<String> = None, example "\"run\"";
         /// the rate to stream at: 500000, 38400, 19200 or 9600
+        ///
+        /// Rate at which an LMS streams: 500000, 38400, 19200 or 9600. Default: 500000, or 38400 on RS-232
+        /// ([scanners.md](scanners.md)).
         baud: Option<i64> = None, example "500000";
         /// in the robot's frame: meters, radians
         pose: PoseKeys = PoseKeys::default();

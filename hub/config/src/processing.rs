@@ -150,11 +150,11 @@ section! {
         y: f64 = 0.0, check within(-100.0..=100.0, OFFSET);
         /// radians, counterclockwise from ahead
         ///
-        /// The direction in which the sensor looks, at most one turn.
+        /// Direction in which the sensor looks, in radians counterclockwise from ahead, at most one turn.
         yaw: f64 = 0.0, check within(-FULL_CIRCLE..=FULL_CIRCLE, "radians, counter-clockwise: 90 degrees are 1.5708");
         /// whether the sensor hangs upside down
         ///
-        /// The first beam is then the leftmost.
+        /// Whether the sensor hangs upside down, so that its first beam is the leftmost.
         upside_down: bool = false;
     }
 }
@@ -180,11 +180,11 @@ section! {
         margin: f64 = 0.0, check meters(0.0..=10.0);
         /// beams inside a circle that violate it
         ///
-        /// Minimum number of beams of a violation.
+        /// A circle is violated if at least this number of beams is inside.
         min_beams: i64 = 1, check whole(1..=BEAMS as i64);
         /// consecutive scans in which they do
         ///
-        /// Minimum number of consecutive scans of a violation, at most 1000. The verdict is unknown until this number of
+        /// Number of consecutive scans in which a circle must be violated, at most 1000. The verdict is unknown until this number of
         /// scans has followed a start, a silence or a scan with too many invalid beams.
         min_scans: i64 = 1, check whole(1..=1000);
         /// the verdict is unknown if a larger share of the beams has no reading
@@ -221,8 +221,12 @@ section! {
     /// Keys of section `marks`.
     pub(crate) struct MarksKeys: "keys of marks, as { i_min = 1 } or { level = 240 }" {
         /// reflectors of an LMS: lowest level, 1 to 7
+        ///
+        /// For an LMS: lowest level of a beam of a mark, 1 to 7.
         i_min: i64 = 1, check whole(1..=7);
         /// reflectors of all other scanners: lowest intensity, 1 to 65535; no default
+        ///
+        /// For all other scanners: lowest intensity of a beam of a mark, 1 to 65535.
         level: Option<i64> = None, check optional(whole(1..=i64::from(u16::MAX))), example "240";
         /// meters between neighboring beams of a mark
         ///
