@@ -39,8 +39,7 @@ impl Doctor {
         let gateway = Gateway::of(&read);
         let subjects = Subjects {
             ports: self.ports.iter().map(|port| source(port)).collect::<Result<_, _>>()?,
-            config: is_said
-                .then(|| Config::of(&read).and_then(|config| gateway.clone().map(|_| config))),
+            config: is_said.then(|| Config::of(&read).and_then(|config| gateway.clone().map(|_| config))),
             gateway: gateway.clone().unwrap_or_default(),
             domain: everywhere.hub_domain()?,
             places: everywhere.places()?,

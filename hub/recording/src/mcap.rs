@@ -11,7 +11,7 @@ use scanhub_drivers::features;
 use scanhub_drivers::lms::telegram::Telegram;
 use scanhub_drivers::lms::variant::Mode;
 use schema::datagram::Packed;
-use schema::{Family, Foreground, Header, Pace, Scan, Status, Tilt, Topic};
+use schema::{Family, Foreground, Header, Pace, Scan, Status, Topic};
 
 use crate::{Contents, Damage, Form, Frame, MountRecord};
 pub(crate) use catalog::Catalog;

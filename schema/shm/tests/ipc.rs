@@ -286,7 +286,7 @@ fn clients_that_went_while_they_asked_are_no_obstacle() {
 
 #[test]
 fn the_librarys_version_is_the_one_that_is_built_with() {
-    let manifest = include_str!("../../Cargo.toml");
+    let manifest = include_str!("../../../Cargo.toml");
     let pinned = manifest.lines().find_map(|line| line.strip_prefix("iceoryx2 = { version = \"="));
     let version = pinned.and_then(|rest| rest.split('"').next()).expect("it is pinned");
     assert_eq!(shm::LIBRARY, format!("iceoryx2 {version}"));
