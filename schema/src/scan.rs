@@ -14,6 +14,7 @@ use crate::sliced::sliced;
 use crate::topic::PayloadLen;
 
 pub use family::{Family, PacketFacts};
+pub(crate) use family::{REFLECTOR_MODE, has_reflector_bits};
 
 /// Maximum number of beams of a scan, in any family.
 pub const BEAMS: usize = 8192;

@@ -7,6 +7,7 @@ use bytemuck::{Pod, Zeroable};
 #[cfg(feature = "ipc")]
 use iceoryx2::prelude::ZeroCopySend;
 
+use crate::scan::{REFLECTOR_MODE, has_reflector_bits};
 use crate::{Family, Pose, text};
 
 /// Room for counters in a [`Status`]; new ones append.
@@ -63,17 +64,17 @@ impl Status {
         State::ALL.get(usize::from(self.state)).copied()
     }
 
-    /// Returns whether the measuring mode has reflector bits, without which there are no marks (Telegram listing, 77h
-    /// block D); nothing as long as the mode is not known.
+    /// Returns whether the measuring mode has reflector bits, without which topic `marks` is unavailable. `None` while the
+    /// mode is unknown.
     pub fn has_reflector_bits(&self) -> Option<bool> {
-        (self.mode != Status::MODE_UNKNOWN).then_some(matches!(self.mode, 0x01 | 0x03 | 0x05))
+        (self.mode != Status::MODE_UNKNOWN).then(|| has_reflector_bits(self.mode))
     }
 
-    /// Returns the command that gives the sensor reflector bits, if it has none and is no recording: they live in its
-    /// EEPROM, which only a person changes.
-    pub fn reflector_remedy(&self) -> Option<String> {
-        let is_wanted = self.has_reflector_bits() == Some(false) && !self.is_replayed();
-        is_wanted.then(|| format!("scanhub configure {} mode=0x01", self.port()))
+    /// Returns the measuring mode that would give the scanner reflector bits. `None` if it has them, if its mode is unknown,
+    /// or if it is a recording. The mode is in the scanner's EEPROM, which only a person changes.
+    pub fn missing_reflector_mode(&self) -> Option<u8> {
+        let is_missing = self.has_reflector_bits() == Some(false) && !self.is_replayed();
+        is_missing.then_some(REFLECTOR_MODE)
     }
 
     /// Returns whether a threshold for reflectors (`marks.level`) is configured. Only scanners without
@@ -95,17 +96,6 @@ impl Status {
             self.has_reflector_bits()
         } else {
             Some(self.has_mark_level())
-        }
-    }
-
-    /// Returns the command, or the setting of link `sensor`, that makes topic `marks` available. `None` if it is available,
-    /// or if that is unknown or impossible.
-    pub fn marks_remedy(&self, sensor: &str) -> Option<String> {
-        // The name on the machine of the sensor.
-        let name = sensor.rsplit('.').next().unwrap_or(sensor);
-        match self.family()?.has_reflector_levels() {
-            true => self.reflector_remedy(),
-            false => (!self.has_mark_level()).then(|| format!("set link.{name}.marks.level")),
         }
     }
 
@@ -376,45 +366,37 @@ mod tests {
     fn a_mode_without_reflector_bits_has_a_remedy() {
         let mut status = Status { mode: 0, ..Status::default() };
         status.set_port("/dev/ttyUSB0");
-        let remedy = "scanhub configure /dev/ttyUSB0 mode=0x01";
-        assert_eq!(
-            (status.has_reflector_bits(), status.reflector_remedy()),
-            (Some(false), Some(remedy.into()))
-        );
-        status.mode = 1;
-        assert_eq!((status.has_reflector_bits(), status.reflector_remedy()), (Some(true), None));
+        let facts = |status: &Status| (status.has_reflector_bits(), status.missing_reflector_mode());
+        assert_eq!(facts(&status), (Some(false), Some(REFLECTOR_MODE)));
+        status.mode = REFLECTOR_MODE;
+        assert_eq!(facts(&status), (Some(true), None));
         status.set_port("file:/tmp/walk.log");
         status.mode = 0;
-        assert_eq!((status.has_reflector_bits(), status.reflector_remedy()), (Some(false), None));
-        assert_eq!(Status::default().has_reflector_bits(), None);
+        assert_eq!(facts(&status), (Some(false), None));
+        assert_eq!(facts(&Status::default()), (None, None));
     }
 
     #[test]
     fn marks_need_reflector_bits_or_a_threshold() {
         let of = |family: u8, mode, has_mark_level| {
             let mut status = Status { family, mode, ..Status::default() };
-            status.set_port("/dev/ttyUSB0");
             status.set_processing(Pose { x_m: 1.0, ..Pose::default() }, has_mark_level);
             assert_eq!(status.pose.x_m, 1.0);
-            (status.has_marks(), status.marks_remedy("robot1.front"))
+            status.has_marks()
         };
-        let configure = Some("scanhub configure /dev/ttyUSB0 mode=0x01".to_owned());
         for (number, family) in Family::ALL.into_iter().enumerate() {
             let number = number as u8;
             let [without, with] = [false, true].map(|has_level| of(number, Status::MODE_UNKNOWN, has_level));
             match family {
                 Family::Lms => {
-                    assert_eq!((&without, &with), (&(None, None), &(None, None)));
-                    assert_eq!(of(number, 0, true), (Some(false), configure.clone()));
-                    assert_eq!(of(number, 1, false), (Some(true), None));
+                    assert_eq!((without, with), (None, None));
+                    assert_eq!(of(number, 0, true), Some(false));
+                    assert_eq!(of(number, REFLECTOR_MODE, false), Some(true));
                 }
-                _ => {
-                    assert_eq!(without, (Some(false), Some("set link.front.marks.level".to_owned())));
-                    assert_eq!(with, (Some(true), None));
-                }
+                _ => assert_eq!((without, with), (Some(false), Some(true))),
             }
         }
-        assert_eq!(of(Family::UNKNOWN, Status::MODE_UNKNOWN, true), (None, None), "while the hub searches");
+        assert_eq!(of(Family::UNKNOWN, Status::MODE_UNKNOWN, true), None, "while the hub searches");
     }
 
     #[test]

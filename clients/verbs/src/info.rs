@@ -163,7 +163,7 @@ fn pose(pose: &Pose) -> String {
 
 fn marks(sensor: &str, status: &Status) -> String {
     let is_lms = status.family() == Some(Family::Lms);
-    match (status.has_marks(), status.marks_remedy(sensor)) {
+    match (status.has_marks(), json::marks_remedy(sensor, status)) {
         (None, _) if is_lms && status.is_replayed() => {
             format!("unavailable: the recording does not contain its measuring mode; set link.{sensor}.mode")
         }

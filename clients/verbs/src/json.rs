@@ -232,9 +232,22 @@ pub(crate) fn status<'a>(sensor: &'a str, status: &'a Status) -> impl Serialize 
             yaw_rad: status.pose.yaw_rad,
             upside_down: status.pose.upside_down != 0,
         },
-        marks: MarksOffer { available: status.has_marks(), remedy: status.marks_remedy(sensor) },
+        marks: MarksOffer { available: status.has_marks(), remedy: marks_remedy(sensor, status) },
         damaged: status.damaged(),
         lost_on_line: status.lost_on_line(),
+    }
+}
+
+/// Returns the command, or the setting of link `sensor`, that makes topic `marks` available. `None` if it is available, or if
+/// that is unknown or impossible.
+pub(crate) fn marks_remedy(sensor: &str, status: &Status) -> Option<String> {
+    // The name on the machine of the sensor.
+    let name = sensor.rsplit('.').next().unwrap_or(sensor);
+    if status.family()?.has_reflector_levels() {
+        let mode = status.missing_reflector_mode()?;
+        Some(format!("scanhub configure {} mode={mode:#04x}", status.port()))
+    } else {
+        (!status.has_mark_level()).then(|| format!("set link.{name}.marks.level"))
     }
 }
 

@@ -265,12 +265,13 @@ impl<'a> Diagnosis<'a> {
         }
     }
 
-    /// Says once that the measuring mode of `status` has no marks, which is no error, and what changes it.
+    /// Logs once that the measuring mode of `status` has no marks, and the command that changes it. This is not an error.
     pub(crate) fn tell_mode(&mut self, status: &Status) {
         if std::mem::replace(&mut self.told_mode, status.mode) != status.mode
-            && let Some(remedy) = status.reflector_remedy()
+            && let Some(mode) = status.missing_reflector_mode()
         {
-            let name = &self.link.name;
+            let (name, port) = (&self.link.name, status.port());
+            let remedy = format!("scanhub configure {port} mode={mode:#04x}");
             tracing::info!("{name}: marks are unavailable; stop the hub and run `{remedy}`");
         }
     }

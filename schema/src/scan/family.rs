@@ -189,6 +189,14 @@ pub(super) fn lms_code(head: &ScanHead, value: u16) -> Code {
     }
 }
 
+/// Returns whether an LMS in measuring mode `mode` sends reflector bits (Telegram listing, 77h block D).
+pub(crate) fn has_reflector_bits(mode: u8) -> bool {
+    matches!(mode, REFLECTOR_MODE | 0x03 | 0x05)
+}
+
+/// Measuring mode of an LMS with all three reflector bits.
+pub(crate) const REFLECTOR_MODE: u8 = 0x01;
+
 /// Time of one revolution of the mirror (75 Hz).
 const TURN_NS: u32 = 13_320_000;
 

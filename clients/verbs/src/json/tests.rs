@@ -1,7 +1,7 @@
-//! Lines of class `scan` to the letter: of a sensor whose beams are where it says, and of one whose points have angles of
-//! their own.
+//! Exact lines of class `scan`, for a scanner with beams at fixed angles and for one whose points have their own angles. And
+//! the remedy of missing marks in class `status`.
 
-use schema::{Code, Contents, Family, Flags, Header, Reasons, Scan, ScanHead};
+use schema::{Code, Contents, Family, Flags, Header, Pose, Reasons, Scan, ScanHead, Status};
 
 fn header() -> Header {
     Header {
@@ -63,4 +63,26 @@ fn of_points_with_angles_of_their_own() {
     (scan.collapsed, scan.flags) = (0, 0);
     let end = r#""collapsed":0,"flags":["simulated"]}"#;
     assert_eq!(line(&header, &scan), [BEGIN, head, measured, end].concat());
+}
+
+#[test]
+fn marks_need_reflector_bits_or_a_threshold() {
+    let remedy = |family: u8, mode, has_mark_level| {
+        let mut status = Status { family, mode, ..Status::default() };
+        status.set_port("/dev/ttyUSB0");
+        status.set_processing(Pose::default(), has_mark_level);
+        super::marks_remedy("robot1.front", &status)
+    };
+    let configure = Some("scanhub configure /dev/ttyUSB0 mode=0x01".to_owned());
+    for family in Family::ALL {
+        let number = family as u8;
+        let [without, with] = [false, true].map(|has_level| remedy(number, Status::MODE_UNKNOWN, has_level));
+        if family.has_reflector_levels() {
+            assert_eq!((without, with), (None, None));
+            assert_eq!((remedy(number, 0, true), remedy(number, 1, false)), (configure.clone(), None));
+        } else {
+            assert_eq!((without, with), (Some("set link.front.marks.level".to_owned()), None));
+        }
+    }
+    assert_eq!(remedy(Family::UNKNOWN, Status::MODE_UNKNOWN, true), None, "while the hub searches");
 }

@@ -40,7 +40,7 @@ pub(crate) fn of_hub(hub: &Hub, (name, status): (&str, &Status), holders: &[Hold
 /// scanner without these bits needs no remedy, like one of another family without a configured threshold.
 fn marks(status: &Status, when: &str) -> Option<Finding> {
     const NAME: &str = "marks";
-    let Some(remedy) = status.reflector_remedy() else {
+    let Some(mode) = status.missing_reflector_mode() else {
         let is_lms = status.family() == Some(schema::Family::Lms);
         let why = if is_lms { "the measuring mode has reflector bits" } else { "marks.level is set" };
         return status.has_marks()?.then(|| Finding::ok(NAME, why));
@@ -49,7 +49,8 @@ fn marks(status: &Status, when: &str) -> Option<Finding> {
         "the measuring mode, {:02x}h, has no reflector bits: topic marks is unavailable",
         status.mode
     );
-    Some(Finding::warning(NAME, what, format!("{when}{remedy}")))
+    let remedy = format!("{when}scanhub configure {} mode={mode:#04x}", status.port());
+    Some(Finding::warning(NAME, what, remedy))
 }
 
 fn link_of_the_hub(name: &str, status: &Status, remedy: String) -> Finding {
