@@ -50,7 +50,7 @@ fn main() -> ExitCode {
         Verb::Record(record) => record.is_to_stdout(),
         _ => false,
     };
-    daemon::bus_error::explain(cli.everywhere.json, quiet);
+    daemon::explain_bus_error(cli.everywhere.json, quiet);
     match dispatch(&cli) {
         Ok(()) => ExitCode::SUCCESS,
         Err(failure) => {

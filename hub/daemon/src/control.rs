@@ -12,8 +12,8 @@ use schema::{Background, Failure, Kind, Nanos, Response, Shown, Verb};
 use shm::shortage;
 use shm::{Asked, Node};
 
-use crate::event_fd::EventFd;
 use crate::player::Player;
+use crate::process::EventFd;
 
 /// The server of control requests. It belongs to the supervising thread.
 pub(crate) struct ControlServer {

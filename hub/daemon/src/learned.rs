@@ -16,7 +16,7 @@ use port::Source;
 use schema::{Age, Background, Failure, MILLIS, Nanos, Pose};
 use shm::StateDirectory;
 
-use crate::event_fd::EventFd;
+use crate::process::EventFd;
 use crate::surroundings::Learned;
 use file::KeptBackground;
 pub use scanhub_drivers::line::KnownRate;

@@ -2,13 +2,11 @@
 //! memory; who listens is not its business.
 
 mod backlog;
-pub mod bus_error;
 mod byte_rate;
 mod control;
 mod diagnosis;
 mod drive;
 mod early;
-mod event_fd;
 mod identity_cache;
 mod learned;
 mod link;
@@ -16,7 +14,7 @@ mod link_output;
 mod link_stats;
 mod pipeline;
 mod player;
-mod preflight;
+mod process;
 mod publisher;
 mod recent;
 mod reconnect;
@@ -25,7 +23,6 @@ mod replay;
 mod replay_hub;
 mod service;
 mod settings_check;
-mod signals;
 mod supervise;
 pub mod surroundings;
 mod system;
@@ -34,6 +31,7 @@ mod topics;
 pub use control::{ControlQueue, Orders, Outcome};
 pub use learned::{Files, Handle, Keeper, KnownRate, KnownScanner, Slots};
 pub use player::{Pace, Play, Player, Progress};
+pub use process::explain_bus_error;
 pub use reconnect::LiveLink;
 pub use reload::{Read, Reload};
 pub use replay::{RecordedAngle, RecordedMount};

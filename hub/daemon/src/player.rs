@@ -9,7 +9,7 @@ use std::sync::{Mutex, MutexGuard, PoisonError};
 use port::clock;
 use schema::{Failure, Nanos};
 
-use crate::event_fd::EventFd;
+use crate::process::EventFd;
 use crate::replay::RecordedMount;
 pub use playback::Play;
 use playback::Playback;

@@ -17,15 +17,16 @@ use crate::control::{ControlQueue, ControlServer};
 use crate::learned::{Keeper, Writer};
 use crate::link::LinkCore;
 use crate::player::{Player, PlayerHandle};
-use crate::preflight::no_resource;
+use crate::process::{
+    SignalAction, Signals, check_descriptors, check_memory, no_resource, raise_descriptor_limit,
+};
 use crate::reconnect::LiveLink;
 use crate::reload::{Read, Reload};
+use crate::replay;
 use crate::replay::{Recorded, ReplayPart};
 use crate::service::{Service, Watchdog};
-use crate::signals::{Signals, Wanted};
 use crate::surroundings::Surroundings as _;
 use crate::system::{Hub, System};
-use crate::{preflight, replay};
 
 /// What is up.
 #[derive(Clone, Debug)]
@@ -109,8 +110,8 @@ pub(crate) fn serve(
     on_ready: impl FnOnce(&Ready),
 ) -> Result<(), Failure> {
     let service = Service::of_process();
-    preflight::raise_descriptor_limit();
-    let signals = Signals::of_process()?;
+    raise_descriptor_limit();
+    let signals = Signals::register()?;
     let lock = HubLock::acquire(domain.root())?;
     // A replay does not use the saved state of sensors.
     let state = StateDirectory::of_domain(domain.name()).filter(|_| set.is_none()).filter(|state| {
@@ -120,8 +121,8 @@ pub(crate) fn serve(
         }
         checked.is_ok()
     });
-    preflight::check_descriptors(config.links.len())?;
-    preflight::check_memory(&config.topic_limits()).map_err(|failure| config.with_remedy(failure))?;
+    check_descriptors(config.links.len())?;
+    check_memory(&config.topic_limits()).map_err(|failure| config.with_remedy(failure))?;
     // Ends after the links: it writes what they had learned last.
     let (config, keeper) = begin(config, state)?;
     let writer = keeper.map(Writer::start).transpose()?;
@@ -291,8 +292,8 @@ fn keep_up(
         // A signal ends the wait, and is there to be taken.
         let _ = poll(&mut fds, Some(&look));
         match signals.take() {
-            Some(Wanted::End) => return Ok(()),
-            Some(Wanted::Reload) => reload.reload(&control.orders, clock::now()),
+            Some(SignalAction::End) => return Ok(()),
+            Some(SignalAction::Reload) => reload.reload(&control.orders, clock::now()),
             None => {}
         }
         // Without a wake-up too: what is behind a request that could not be received has been announced already.

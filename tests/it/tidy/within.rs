@@ -33,7 +33,7 @@ fn tests_do_not_depend_on_time() {
 #[test]
 fn unsafe_code_is_rare_and_explained() {
     holds(sources::unsafe_code_is_rare_and_explained, |tree| {
-        let listed = "hub/daemon/src/bus_error.rs";
+        let listed = "hub/daemon/src/process.rs";
         let explained = "// SAFETY: so it is.\nunsafe { call() };\n";
         vec![
             tree.with(listed, "//! A handler.\nunsafe { call() };\n"),

@@ -11,7 +11,7 @@ use schema::Failure;
 use shm::StateDirectory;
 
 use super::{Keeper, Slots};
-use crate::preflight::no_resource;
+use crate::process::no_resource;
 
 /// The thread; ends when this is dropped, after what was handed on until then.
 pub(crate) struct Writer {
