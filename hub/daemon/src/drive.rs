@@ -22,9 +22,9 @@ use schema::{MILLIS, Nanos, State, Status};
 use crate::backlog::Backlog;
 use crate::control::Flow;
 use crate::identity_cache::IdentityCache;
-use crate::learned::{KnownRate, KnownScanner};
 use crate::link::LinkCore;
 use crate::link_output::RecordedMetadata;
+use crate::saved_state::{KnownRate, KnownScanner};
 use crate::settings_check::SettingsCheck;
 use crate::surroundings::{Learned, Line, On, Surroundings, Woken};
 

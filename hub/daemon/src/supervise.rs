@@ -14,7 +14,6 @@ use shm::Node;
 use shm::{Domain, HubLock, StateDirectory};
 
 use crate::control::{ControlQueue, ControlServer};
-use crate::learned::{Keeper, Writer};
 use crate::link::LinkCore;
 use crate::player::{Player, PlayerHandle};
 use crate::process::{
@@ -24,6 +23,7 @@ use crate::reconnect::LiveLink;
 use crate::reload::{Read, Reload};
 use crate::replay;
 use crate::replay::{Recorded, ReplayPart};
+use crate::saved_state::{StateSaver, StateWriter};
 use crate::service::{Service, Watchdog};
 use crate::surroundings::Surroundings as _;
 use crate::system::{Hub, System};
@@ -124,8 +124,8 @@ pub(crate) fn serve(
     check_descriptors(config.links.len())?;
     check_memory(&config.topic_limits()).map_err(|failure| config.with_remedy(failure))?;
     // Ends after the links: it writes what they had learned last.
-    let (config, keeper) = begin(config, state)?;
-    let writer = keeper.map(Writer::start).transpose()?;
+    let (config, saver) = begin(config, state)?;
+    let writer = saver.map(StateWriter::start).transpose()?;
     let config = &config;
     let node = shm::hub_node(domain)?;
     node.try_cleanup_dead_nodes();
@@ -158,7 +158,7 @@ pub(crate) fn serve(
                 root: domain.root(),
             };
             let (report, worked) = (report.clone(), &worked[number]);
-            let learned = writer.as_ref().and_then(|writer| writer.slots().of(&link.name));
+            let learned = writer.as_ref().and_then(|writer| writer.queue().slot(&link.name));
             let part = player
                 .zip(parts.next())
                 .map(|(player, recorded)| ReplayPart { recorded, handle: PlayerHandle { player, number } });
@@ -224,9 +224,9 @@ pub(crate) fn serve(
 fn begin(
     config: Config,
     state: Option<StateDirectory>,
-) -> Result<(Config, Option<Keeper<StateDirectory>>), Failure> {
+) -> Result<(Config, Option<StateSaver<StateDirectory>>), Failure> {
     match state {
-        Some(state) => Keeper::begin(config, state, clock::wall_ns()),
+        Some(state) => StateSaver::load(config, state, clock::wall_ns()),
         None => Ok((config, None)),
     }
 }

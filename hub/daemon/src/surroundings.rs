@@ -10,7 +10,7 @@ use schema::{Background, Failure, Nanos, Pose, Ring, Wake};
 use shm::{Medium, Payload};
 
 use crate::control::ControlQueue;
-use crate::learned::{KnownRate, KnownScanner};
+use crate::saved_state::{KnownRate, KnownScanner};
 
 /// What one link has around it.
 pub trait Surroundings {

@@ -17,9 +17,9 @@ use shm::{Directory, NameLock};
 use shm::{Node, Payload, SharedMemory, Waker};
 
 use crate::control::ControlQueue;
-use crate::learned::Handle;
 use crate::link::LinkCore;
 use crate::reconnect::LiveLink;
+use crate::saved_state::SaveSlot;
 use crate::service::Service;
 use crate::surroundings::{Learned, Line, On, Surroundings, Wait, Woken};
 
@@ -31,7 +31,7 @@ pub(crate) struct System<'a> {
     name: OnceCell<HeldName>,
     /// Set whenever the link finished something.
     worked: &'a AtomicBool,
-    learned: Option<Handle<'a>>,
+    learned: Option<SaveSlot<'a>>,
     /// The connection that is being made.
     dial: RefCell<Option<Dial>>,
     /// When requests, the hub's end and the line were looked at last.
@@ -68,7 +68,7 @@ impl<'a> System<'a> {
         hub: Hub<'a>,
         sensor: &'a str,
         worked: &'a AtomicBool,
-        learned: Option<Handle<'a>>,
+        learned: Option<SaveSlot<'a>>,
     ) -> System<'a> {
         let (dial, looked_at, record) = (RefCell::default(), Cell::default(), OnceCell::new());
         System { hub, sensor, name: OnceCell::new(), worked, learned, dial, looked_at, record }

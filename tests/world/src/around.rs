@@ -5,7 +5,7 @@ use std::cell::Cell;
 use std::rc::Rc;
 use std::sync::Arc;
 
-use daemon::Slots;
+use daemon::SaveQueue;
 use daemon::surroundings::{Learned, Surroundings};
 use port::{PortError, Source};
 use rustix::io::Errno;
@@ -23,7 +23,7 @@ pub(crate) struct Around<'a> {
     pub(crate) shared: Rc<Shared>,
     pub(crate) number: usize,
     pub(crate) clock: Rc<LinkClock>,
-    pub(crate) learned: Option<daemon::Handle<'a>>,
+    pub(crate) learned: Option<daemon::SaveSlot<'a>>,
     /// A planted defect owes the first ring.
     is_owed: Cell<bool>,
 }
@@ -34,11 +34,11 @@ impl<'a> Around<'a> {
         shared: &Rc<Shared>,
         number: usize,
         sensor: &str,
-        slots: Option<&'a Arc<Slots>>,
+        queue: Option<&'a Arc<SaveQueue>>,
     ) -> Self {
         let clock = Rc::new(LinkClock::default());
         clock.pass(shared.clock.get());
-        let learned = slots.and_then(|slots| slots.of(sensor));
+        let learned = queue.and_then(|queue| queue.slot(sensor));
         Around { shared: shared.clone(), number, clock, learned, is_owed: Cell::default() }
     }
 

@@ -4,7 +4,7 @@
 use std::rc::Rc;
 
 use daemon::surroundings::{On, Wait, Woken};
-use daemon::{Files, Keeper, LiveLink, Orders, Reload, Service};
+use daemon::{LiveLink, Orders, Reload, Service, StateSaver, StateStore};
 use schema::{Background, Failure, Kind, MICROS, MILLIS, Nanos};
 
 use crate::around::Around;
@@ -40,14 +40,14 @@ fn begin(world: &mut World, shared: &Rc<Shared>, boot: u64) -> Result<Ending, Fa
     let read = || setup.config(edition.get());
     let config = read().or_else(|_| setup.config(0))?;
     let wall_ns = |now: Nanos| now + shared.wall_ahead.get();
-    let (config, mut keeper) = Keeper::begin(config, Disk(shared.clone()), wall_ns(world.now()))?;
-    let slots = keeper.as_ref().map(Keeper::slots);
+    let (config, mut saver) = StateSaver::load(config, Disk(shared.clone()), wall_ns(world.now()))?;
+    let queue = saver.as_ref().map(StateSaver::queue);
     let names = || (0..setup.sensors.len()).map(Setup::name).collect::<Vec<_>>();
     let (orders, queues) = Orders::new(names().iter().map(String::as_str))?;
     world.orders = Some(orders);
     let (service, names) = (Service::default(), names());
     let mut reload = Reload::new(&config, &read, &service);
-    let around = |(number, name): (usize, &String)| Around::new(shared, number, name, slots.as_ref());
+    let around = |(number, name): (usize, &String)| Around::new(shared, number, name, queue.as_ref());
     let arounds: Vec<Around<'_>> = names.iter().enumerate().map(around).collect();
     let mut links = Vec::new();
     for ((number, link), (around, queue)) in config.links.iter().enumerate().zip(arounds.iter().zip(queues)) {
@@ -93,7 +93,7 @@ fn begin(world: &mut World, shared: &Rc<Shared>, boot: u64) -> Result<Ending, Fa
         }
         while world.orders.as_ref().and_then(Orders::outcome).is_some() {}
         if now >= writes_at {
-            let due = keeper.as_mut().map(|keeper| keeper.turn(now, wall_ns(now), false));
+            let due = saver.as_mut().map(|saver| saver.flush_due(now, wall_ns(now), false));
             writes_at = due.unwrap_or(Nanos::MAX).clamp(now + WRITES, now + 10 * WRITES);
         }
     };
@@ -105,8 +105,8 @@ fn begin(world: &mut World, shared: &Rc<Shared>, boot: u64) -> Result<Ending, Fa
         }
         // What they say last wakes whoever sleeps.
         world.ring();
-        if let Some(keeper) = &mut keeper {
-            keeper.turn(world.now(), wall_ns(world.now()), true);
+        if let Some(saver) = &mut saver {
+            saver.flush_due(world.now(), wall_ns(world.now()), true);
         }
     }
     Ok(ending)
@@ -184,7 +184,7 @@ impl<'a> Running<'a> {
 /// The files of the domain's state.
 struct Disk(Rc<Shared>);
 
-impl Files for Disk {
+impl StateStore for Disk {
     fn read(&self, name: &str, _: u64) -> Result<Option<String>, Failure> {
         Ok(self.0.files.borrow().get(name).cloned())
     }
@@ -202,7 +202,7 @@ impl Files for Disk {
         Ok(())
     }
 
-    fn place(&self, name: &str) -> String {
+    fn location(&self, name: &str) -> String {
         name.to_owned()
     }
 }
