@@ -1,6 +1,9 @@
 //! Finds the problem of a link that its status reports: the session's problem, a unit other than the configured one, more
 //! bytes than the line can carry, a line that damages most bytes, bytes of another scanner, settings that another process
 //! changed, a scanner that restarts, and subscribers that receive nothing.
+//!
+//! Every change of the message is a log line. Numbers in a message are therefore rounded, and stay while they vary a
+//! little.
 
 use std::path::Path;
 
@@ -10,18 +13,17 @@ use scanhub_drivers::line::{Notice, Session as _};
 use scanhub_drivers::{PortSession, Trouble, line, search};
 use schema::{Family, MILLIS, Nanos, State, Status};
 
-use crate::byte_rate::{ByteRate, with_commas};
-use crate::recent::LineHealth;
+use crate::link_stats::LineHealth;
 
-/// What is known to be wrong with one link.
+/// Problems of one link.
 pub(crate) struct Diagnosis<'a> {
     link: &'a Link,
-    /// What the words were made from; nothing if they have to be made.
+    /// Findings that the message was made from; `None` if it must be made again.
     facts: Option<Facts>,
-    /// What is wrong, in words; empty if nothing is.
-    words: String,
-    /// Why the port went away the last time, if it did so without a byte.
-    doubt: String,
+    /// Message about the problem; empty if there is none.
+    message: String,
+    /// Message that the last connection closed without delivering a byte; otherwise empty.
+    empty_connection: String,
     /// Device of the open port, for a message that has no room for the configured name.
     device: Option<String>,
     /// Rate of the bytes that arrive while nothing is streaming.
@@ -37,35 +39,35 @@ pub(crate) struct Diagnosis<'a> {
     exchange: String,
     /// Time of the last update.
     now: Nanos,
-    /// Settings that another process changed.
+    /// Settings of the port that another process changed.
     altered: Option<Altered>,
-    /// The port brings more than its line can.
+    /// Whether the port delivers more than its line can carry.
     is_flooded: bool,
     /// Share of the bytes that the line damages, in percent, while it damages most of them.
     damaged_percent: Option<u32>,
-    /// The most restarts of the scanner in 10 s since the last 10 s without one.
+    /// Maximum number of restarts of the scanner in 10 s, since the last 10 s without one.
     restarts: u64,
-    /// Consumers that got nothing, as of the last status.
-    unserved: usize,
-    /// Statuses in a row that said that there are some.
-    unserved_for: u32,
-    /// The measuring mode of which was said whether it has marks.
-    told_mode: u8,
+    /// Attached subscribers that receive nothing, as of the last status.
+    starved: usize,
+    /// Consecutive statuses with such subscribers.
+    starved_statuses: u32,
+    /// Measuring mode of which the log says whether it has marks.
+    logged_mode: u8,
 }
 
 /// A change of the port's settings by another process, and the message about it.
 struct Altered {
     alteration: Alteration,
-    words: String,
+    message: String,
     /// Time until which the message is shown.
     until: Nanos,
 }
 
-/// What the words are made from.
+/// Findings that a message is made from.
 #[derive(Clone, Copy, PartialEq)]
 struct Facts {
     state: State,
-    trouble: Option<Trouble>,
+    problem: Option<Trouble>,
     /// Rate of the bytes that arrive while the session is [missing](line::Session::missing) something, or was
     /// interrupted.
     bytes_per_second: Option<u64>,
@@ -77,13 +79,13 @@ struct Facts {
 }
 
 impl<'a> Diagnosis<'a> {
-    /// Nothing is wrong with `link` yet.
+    /// Creates the diagnosis of `link`, without a problem.
     pub(crate) fn new(link: &'a Link) -> Self {
         Diagnosis {
             link,
             facts: None,
-            words: String::new(),
-            doubt: String::new(),
+            message: String::new(),
+            empty_connection: String::new(),
             device: None,
             byte_rate: ByteRate::default(),
             family: None,
@@ -96,23 +98,23 @@ impl<'a> Diagnosis<'a> {
             is_flooded: false,
             damaged_percent: None,
             restarts: 0,
-            unserved: 0,
-            unserved_for: 0,
-            told_mode: Status::MODE_UNKNOWN,
+            starved: 0,
+            starved_statuses: 0,
+            logged_mode: Status::MODE_UNKNOWN,
         }
     }
 
-    /// Looks at `session`, at `now`. The state of the link, and whether anything is new since the last look.
-    pub(crate) fn examine(&mut self, session: &PortSession, now: Nanos) -> (State, bool) {
+    /// Updates the diagnosis from `session` at `now`. Returns the state of the link, and whether anything has changed.
+    pub(crate) fn update(&mut self, session: &PortSession, now: Nanos) -> (State, bool) {
         if self.altered.take_if(|altered| now >= altered.until).is_some() {
             self.facts = None;
         }
         self.now = now;
         let bytes_per_second = self.measure(session, now);
-        let state = if self.is_doubtful(session) { State::Absent } else { state_of(session) };
+        let state = if self.may_disconnect(session) { State::Absent } else { state_of(session) };
         let facts = Facts {
             state,
-            trouble: session.trouble(),
+            problem: session.trouble(),
             bytes_per_second,
             is_exchanged: self.is_exchanged(session, bytes_per_second),
             other_model: session.other_model().map(|model| model.name),
@@ -121,14 +123,14 @@ impl<'a> Diagnosis<'a> {
         };
         let is_new = self.facts != Some(facts);
         if is_new {
-            // What is good to know is no error.
+            // A notice that is not a fault only goes to the log.
             if let Some(notice) = facts.notice.filter(|notice| !notice.is_fault)
                 && self.facts.is_none_or(|before| before.notice != Some(notice))
             {
                 tracing::info!("{}: {}", self.link.name, notice.text);
             }
             self.facts = Some(facts);
-            self.words = self.trouble(session);
+            self.message = self.problem(session);
             if let Some(rate) = facts.bytes_per_second.filter(|_| facts.is_exchanged) {
                 self.exchange = self.bytes_of_another_kind(session, rate);
             } else if self.family.is_some() {
@@ -184,56 +186,56 @@ impl<'a> Diagnosis<'a> {
     }
 
     /// Notes the `alteration` that the hub has undone at `now`. `program` searches for the program that made it. A message that
-    /// already names the alteration stays: a program that keeps changing the port is not worth a search each time.
+    /// already names the alteration stays: a program that keeps changing the port does not cause a search each time.
     pub(crate) fn note_altered(
         &mut self,
         alteration: Alteration,
         program: impl FnOnce() -> Option<String>,
         now: Nanos,
     ) {
-        let words = match self.altered.take() {
-            Some(altered) if altered.alteration == alteration => altered.words,
+        let message = match self.altered.take() {
+            Some(altered) if altered.alteration == alteration => altered.message,
             _ => {
                 self.facts = None;
                 program().map_or_else(|| alteration.to_string(), |program| format!("{alteration}; {program}"))
             }
         };
-        self.altered = Some(Altered { alteration, words, until: now + ALTERED_SHOWN });
+        self.altered = Some(Altered { alteration, message, until: now + ALTERED_SHOWN });
     }
 
-    /// What is wrong, in words; empty if nothing is.
-    pub(crate) fn explanation(&self) -> &str {
-        &self.words
+    /// Returns the message about the problem; an empty string if there is none.
+    pub(crate) fn message(&self) -> &str {
+        &self.message
     }
 
-    /// The session is over: what is wrong is not what was.
-    pub(crate) fn forget(&mut self) {
+    /// Handles the end of the session. The next one has its own problems.
+    pub(crate) fn end_session(&mut self) {
         self.facts = None;
     }
 
-    /// Why the port went away, if it did so without a byte; else empty. While it may do so again, it is not said to be
-    /// there.
-    pub(crate) fn doubt(&mut self, why: String) {
-        self.doubt = why;
+    /// Notes `message` if the last connection closed without delivering a byte; otherwise it is empty. While the next
+    /// one may do so too, the port counts as absent.
+    pub(crate) fn note_empty_connection(&mut self, message: String) {
+        self.empty_connection = message;
     }
 
-    /// Notes whether the port brings more than its line can.
-    pub(crate) fn watch_flood(&mut self, is_flooded: bool) {
+    /// Notes whether the port delivers more than its line can carry.
+    pub(crate) fn note_flood(&mut self, is_flooded: bool) {
         if std::mem::replace(&mut self.is_flooded, is_flooded) != is_flooded {
             self.facts = None;
         }
     }
 
-    /// The port is closed: what it brought is no flood any more.
+    /// Handles the end of the port, and of its flood.
     pub(crate) fn end_flood(&mut self) {
         self.is_flooded = false;
     }
 
-    /// Notes the state of the line in the last ten seconds, once a status.
-    pub(crate) fn watch_line(&mut self, line: LineHealth) {
+    /// Notes the state of the line in the last ten seconds. Called once per status.
+    pub(crate) fn note_line(&mut self, line: LineHealth) {
         // Where scans do not arrive, bytes of a scanner that was received count too, unless nothing is wrong.
-        let is_troubled = self.facts.is_some_and(|facts| facts.trouble.is_some());
-        let is_received = is_troubled && line.telegrams >= FEW_TELEGRAMS;
+        let has_problem = self.facts.is_some_and(|facts| facts.problem.is_some());
+        let is_received = has_problem && line.telegrams >= FEW_TELEGRAMS;
         let share = if is_received { line.damaged.max(line.discarded) } else { line.damaged };
         let percent = (100.0 * share).round() as u32;
         let damaged_percent = match self.damaged_percent {
@@ -251,23 +253,23 @@ impl<'a> Diagnosis<'a> {
         }
     }
 
-    /// Notes how many consumers are attached and get nothing, once a status.
-    pub(crate) fn watch_unserved(&mut self, consumers: usize) {
-        let before = self.unserved_for;
-        self.unserved = consumers;
-        self.unserved_for = if consumers > 0 { before.saturating_add(1) } else { 0 };
-        if self.unserved_for == UNSERVED_LIMIT || before >= UNSERVED_LIMIT && self.unserved_for == 0 {
-            // Whoever is served shall read it in the status.
+    /// Notes how many subscribers are attached but receive nothing. Called once per status.
+    pub(crate) fn note_starved_subscribers(&mut self, starved: usize) {
+        let before = self.starved_statuses;
+        self.starved = starved;
+        self.starved_statuses = if starved > 0 { before.saturating_add(1) } else { 0 };
+        if self.starved_statuses == STARVED_LIMIT || before >= STARVED_LIMIT && self.starved_statuses == 0 {
+            // The subscribers that do receive something read it in the status.
             self.facts = None;
         }
-        if self.unserved_for == UNSERVED_LIMIT {
-            tracing::warn!("{}: {}", self.link.name, self.unserved());
+        if self.starved_statuses == STARVED_LIMIT {
+            tracing::warn!("{}: {}", self.link.name, self.starved_message());
         }
     }
 
     /// Logs once that the measuring mode of `status` has no marks, and the command that changes it. This is not an error.
-    pub(crate) fn tell_mode(&mut self, status: &Status) {
-        if std::mem::replace(&mut self.told_mode, status.mode) != status.mode
+    pub(crate) fn log_missing_marks(&mut self, status: &Status) {
+        if std::mem::replace(&mut self.logged_mode, status.mode) != status.mode
             && let Some(mode) = status.missing_reflector_mode()
         {
             let (name, port) = (&self.link.name, status.port());
@@ -276,16 +278,17 @@ impl<'a> Diagnosis<'a> {
         }
     }
 
-    /// Whether the port may go away again before it brings anything, as it did the last time: a serial server that
-    /// serves somebody else takes each connection and closes it.
-    fn is_doubtful(&self, session: &PortSession) -> bool {
+    /// Returns whether the port may close again before it delivers anything, as it did the last time. A serial server
+    /// that serves another client accepts each connection and closes it.
+    fn may_disconnect(&self, session: &PortSession) -> bool {
         let is_silent = session.account().read == 0 && session.trouble().is_none();
-        !self.doubt.is_empty() && is_silent && session.state() == line::State::Probing
+        !self.empty_connection.is_empty() && is_silent && session.state() == line::State::Probing
     }
 
-    fn trouble(&self, session: &PortSession) -> String {
-        if self.is_doubtful(session) {
-            return self.doubt.clone();
+    /// Returns the message about the problem of `session`; an empty string if there is none.
+    fn problem(&self, session: &PortSession) -> String {
+        if self.may_disconnect(session) {
+            return self.empty_connection.clone();
         }
         if self.is_flooded {
             return format!(
@@ -295,7 +298,7 @@ impl<'a> Diagnosis<'a> {
             );
         }
         if let Some(altered) = &self.altered {
-            return altered.words.clone();
+            return altered.message.clone();
         }
         // Damage and restarts explain most other findings, so they come first.
         if let Some(percent) = self.damaged_percent {
@@ -329,17 +332,17 @@ impl<'a> Diagnosis<'a> {
         }
         // Soon the rate of the bytes gives a better message than "no answer".
         if session.missing().is_some() && self.byte_rate.is_settling(self.now, account.read) {
-            return self.words.clone();
+            return self.message.clone();
         }
         match session.trouble() {
             // Another family's scanner may be connected, or one at a rate that this family does not have.
-            Some(Trouble::Search(trouble)) => self.search_trouble(trouble),
+            Some(Trouble::Search(problem)) => self.search_problem(problem),
             // The search has just begun.
             Some(_) if self.family.is_none() && !self.exchange.is_empty() => self.exchange.clone(),
-            Some(trouble) if session.missing().is_some() => self.silence(&trouble.to_string()),
-            Some(trouble) => trouble.to_string(),
+            Some(problem) if session.missing().is_some() => self.silence(&problem.to_string()),
+            Some(problem) => problem.to_string(),
             None => self.mismatch(session).unwrap_or_else(|| match session.notice() {
-                _ if self.unserved_for >= UNSERVED_LIMIT => self.unserved(),
+                _ if self.starved_statuses >= STARVED_LIMIT => self.starved_message(),
                 Some(notice) if notice.is_fault => notice.text.to_owned(),
                 _ => String::new(),
             }),
@@ -409,8 +412,8 @@ impl<'a> Diagnosis<'a> {
     }
 
     /// Returns why the search finds no scanner, with the port if the message then fits into a status.
-    fn search_trouble(&self, trouble: search::Trouble) -> String {
-        self.with_port(|port| trouble.message(port)).unwrap_or_else(|| trouble.to_string())
+    fn search_problem(&self, problem: search::Trouble) -> String {
+        self.with_port(|port| problem.message(port)).unwrap_or_else(|| problem.to_string())
     }
 
     /// Returns the message for the name of the port, or else for its device. `None` if the port cannot be probed, or no message
@@ -452,21 +455,81 @@ impl<'a> Diagnosis<'a> {
         })
     }
 
-    fn unserved(&self) -> String {
-        let count = self.unserved;
+    fn starved_message(&self) -> String {
+        let count = self.starved;
         format!(
             "{count} consumers are attached but get nothing: raise the limit of open descriptors (ulimit -n)"
         )
     }
 }
 
-/// Returns the name of the scanner of `session`: its model's, or else its family's.
+/// Rate of the bytes that a session has read, over windows of some seconds.
+#[derive(Clone, Copy, Debug, Default)]
+struct ByteRate {
+    /// Start of the window, and the number of bytes read by then.
+    window: Option<(Nanos, u64)>,
+    /// Result of the last complete window, in bytes per second; `None` before there is one, or if almost nothing arrived.
+    last: Option<u64>,
+    is_complete: bool,
+    /// Consecutive windows in which almost nothing arrived.
+    quiet: u32,
+    /// Rate in the last message, in bytes per second.
+    shown: u64,
+}
+
+impl ByteRate {
+    /// Notes that the session had read `read` bytes at `now`.
+    fn note(&mut self, now: Nanos, read: u64) {
+        let (since, before) = *self.window.get_or_insert((now, read));
+        if !self.is_complete && read == before {
+            // The first window begins with the first byte.
+            self.window = Some((now, read));
+            return;
+        }
+        if now >= since + RATE_WINDOW {
+            let rate = self.of_window(now, read);
+            self.quiet = if rate.is_some() { 0 } else { self.quiet + 1 };
+            // Noise near the limit must not change the message with every window: each change is a log line.
+            if rate.is_some() || self.quiet >= QUIET_WINDOWS {
+                self.last = rate;
+            }
+            self.is_complete = true;
+            self.window = Some((now, read));
+        }
+    }
+
+    /// Returns the rate in bytes per second, rounded for a message; `None` if almost nothing arrives, or while the rate
+    /// [settles](Self::is_settling). The session has read `read` bytes at `now`. A rate that varies a little is returned
+    /// unchanged, because a new message is a new log line.
+    fn shown(&mut self, now: Nanos, read: u64) -> Option<u64> {
+        let rate = if self.is_complete { self.last } else { self.of_window(now, read) }?;
+        if !(self.shown / 2..=self.shown * 2).contains(&rate) {
+            self.shown = rounded(rate);
+        }
+        Some(self.shown)
+    }
+
+    /// Returns whether bytes have begun to arrive, but not long enough for a rate.
+    fn is_settling(&self, now: Nanos, read: u64) -> bool {
+        let is_begun = |(since, before)| read > before + NOISE_BYTES && now < since + FIRST_RATE_AFTER;
+        !self.is_complete && self.window.is_some_and(is_begun)
+    }
+
+    fn of_window(&self, now: Nanos, read: u64) -> Option<u64> {
+        let (since, before) = self.window?;
+        let bytes = read.saturating_sub(before);
+        (bytes > NOISE_BYTES && now >= since + FIRST_RATE_AFTER)
+            .then(|| (bytes * 1_000 * MILLIS).div_ceil(now - since))
+    }
+}
+
+/// Returns the name of the scanner of `session`: that of its model, or of its family if the model is unknown.
 fn scanner_of(session: &PortSession) -> String {
     let family = session.family().map_or("", |family| family.name());
     session.model().map_or_else(|| format!("{family} scanner"), |model| model.name.to_owned())
 }
 
-/// The word for how far `session` is.
+/// Returns the state of `session` as that of its link.
 fn state_of(session: &PortSession) -> State {
     match session.state() {
         line::State::Probing => State::Probing,
@@ -478,7 +541,26 @@ fn state_of(session: &PortSession) -> State {
     }
 }
 
-/// Share of damaged bytes from which on nothing is concluded from the others, in percent.
+/// Rounds to three digits.
+fn rounded(rate: u64) -> u64 {
+    let unit = 10_u64.pow(rate.checked_ilog10().unwrap_or(0).saturating_sub(2));
+    (rate + unit / 2) / unit * unit
+}
+
+/// Writes `number` with a comma after every three digits.
+fn with_commas(number: u64) -> String {
+    let digits = number.to_string();
+    let mut text = String::new();
+    for (at, digit) in digits.chars().enumerate() {
+        if at > 0 && (digits.len() - at).is_multiple_of(3) {
+            text.push(',');
+        }
+        text.push(digit);
+    }
+    text
+}
+
+/// Minimum share of damaged bytes, in percent, at which the others prove nothing.
 const MOST_DAMAGED: u32 = 50;
 /// Steps in which that share is reported.
 const COARSE: u32 = 10;
@@ -492,5 +574,70 @@ const STREAM_BYTES: u64 = 500;
 const FEW_TELEGRAMS: u64 = 3;
 /// Time for which a status reports that another process changed the port's settings.
 const ALTERED_SHOWN: Nanos = 10_000 * MILLIS;
-/// Statuses after which consumers without samples are more than ones that are just attaching.
-const UNSERVED_LIMIT: u32 = 3;
+/// Number of statuses after which subscribers without samples do not count as just attaching any more.
+const STARVED_LIMIT: u32 = 3;
+/// Longer than a search at all rates, so that the rate of the host's port does not change the result.
+const RATE_WINDOW: Nanos = 5_000 * MILLIS;
+/// Time before the first rate. A scanner that returns is found within this time, and the rate of a shorter time changes
+/// quickly: each change is a log line.
+const FIRST_RATE_AFTER: Nanos = 2_000 * MILLIS;
+/// Windows without bytes after which there is no rate any more.
+const QUIET_WINDOWS: u32 = 3;
+/// Number of bytes that an adapter may deliver when a cable is plugged in.
+const NOISE_BYTES: u64 = 64;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Returns the rates that are shown for a line with `rate` bytes per second, sampled ten times a second for `seconds`.
+    fn shown(
+        bytes: &mut ByteRate,
+        (from, seconds): (u64, u64),
+        rate: impl Fn(u64) -> u64,
+    ) -> Vec<Option<u64>> {
+        let mut read = 0;
+        let rates = (from * 10..(from + seconds) * 10).map(|tenth| {
+            let now = tenth * 100 * MILLIS;
+            read += rate(tenth) / 10;
+            bytes.note(now, read);
+            bytes.shown(now, read)
+        });
+        let mut all: Vec<_> = rates.collect();
+        all.dedup();
+        all
+    }
+
+    #[test]
+    fn rate_is_known_before_the_first_window_ends_and_stays() {
+        let mut bytes = ByteRate::default();
+        let steady = shown(&mut bytes, (0, 60), |tenth| if tenth % 2 == 0 { 12_000 } else { 12_840 });
+        assert_eq!(steady.first(), Some(&None), "nothing was measured yet");
+        assert_eq!(steady.len(), 2, "{steady:?}");
+        assert!(steady[1].is_some_and(|rate| (12_000..=12_900).contains(&rate)), "{steady:?}");
+    }
+
+    #[test]
+    fn bytes_that_begin_or_end_are_noticed_within_a_few_windows() {
+        let mut bytes = ByteRate::default();
+        assert_eq!(shown(&mut bytes, (0, 3_600), |_| 0), [None]);
+        assert_eq!(shown(&mut bytes, (3_600, 10), |_| 17_625).last(), Some(&Some(17_600)));
+        assert_eq!(shown(&mut bytes, (3_610, 20), |_| 0).last(), Some(&None));
+        assert_eq!(shown(&mut bytes, (3_630, 10), |_| 10).last(), Some(&None), "noise of a cable");
+    }
+
+    #[test]
+    fn noise_near_the_limit_does_not_change_the_message() {
+        let mut bytes = ByteRate::default();
+        let noise = |tenth| if tenth / 50 % 2 == 0 { 20 } else { 10 };
+        let texts = shown(&mut bytes, (0, 600), noise);
+        assert!(texts.len() <= 3, "{texts:?}");
+    }
+
+    #[test]
+    fn rates_are_written_with_commas() {
+        let numbers = [0, 999, 1_000, 12_400, 1_234_567].map(with_commas);
+        assert_eq!(numbers, ["0", "999", "1,000", "12,400", "1,234,567"]);
+        assert_eq!([7, 960, 1_234, 17_625].map(rounded), [7, 960, 1_230, 17_600]);
+    }
+}

@@ -213,7 +213,7 @@ impl<'a, S: Surroundings> Drive<'a, S> {
         if let Some(allowance) = allowance {
             allowance.take(len, room, now);
             self.behind_at = allowance.is_behind(now).then_some(now);
-            core.diagnosis.watch_flood(allowance.is_flooded(now));
+            core.diagnosis.note_flood(allowance.is_flooded(now));
         }
         if len == 0 && now >= *until {
             session.handle_timeout(now);
@@ -303,7 +303,7 @@ impl<'a, S: Surroundings> Drive<'a, S> {
             }
         }
         self.identity.keep_first(session);
-        let (state, is_new) = core.diagnosis.examine(session, now);
+        let (state, is_new) = core.diagnosis.update(session, now);
         if is_new && let Some(found) = session.known_rate() {
             self.found = Some(found);
             rates(core).iter().for_each(|rates| rates.keep_rate(&core.link.port.name(), found));

@@ -2,7 +2,6 @@
 //! memory; who listens is not its business.
 
 mod backlog;
-mod byte_rate;
 mod control;
 mod diagnosis;
 mod drive;
@@ -15,7 +14,6 @@ mod pipeline;
 mod player;
 mod process;
 mod publisher;
-mod recent;
 mod reconnect;
 mod reload;
 mod replay;

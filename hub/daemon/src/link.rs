@@ -129,7 +129,7 @@ impl<'a, S: Surroundings> LinkCore<'a, S> {
     /// Does the same as [`show`](Self::show) for a `session` that was examined, with the message of [`Diagnosis`].
     pub(crate) fn show_session(&mut self, session: &PortSession, state: State) -> bool {
         let now = self.around.now();
-        let error = self.diagnosis.explanation();
+        let error = self.diagnosis.message();
         if session.family().is_some() {
             self.stats.next_search_log = 0;
         }
@@ -157,9 +157,10 @@ impl<'a, S: Surroundings> LinkCore<'a, S> {
                 self.output.topics.wake(Wake::Status);
             }
             self.save_background(false);
-            self.diagnosis.watch_line(self.stats.health());
-            self.diagnosis.watch_unserved(self.output.topics.starved_subscribers(self.stats.is_streaming()));
-            self.diagnosis.tell_mode(self.stats.last());
+            self.diagnosis.note_line(self.stats.health());
+            self.diagnosis
+                .note_starved_subscribers(self.output.topics.starved_subscribers(self.stats.is_streaming()));
+            self.diagnosis.log_missing_marks(self.stats.last());
         }
         self.deliver_history(now);
         is_due

@@ -1,40 +1,54 @@
-//! What a link reports of itself: the state of a session and the hub's own counts as the payload of topic `status`.
+//! Statistics of a link: the state of its session and the counters of the hub, as the payload of topic `status`.
+
+use std::collections::VecDeque;
 
 use config::{Link, Processing};
 use scanhub_drivers::PortSession;
 use scanhub_drivers::line::Session as _;
-use schema::{Counter, Counters, Family, MIN_RATE_SPAN, Nanos, State, Status};
+use schema::{Counter, Counters, Family, MILLIS, MIN_RATE_SPAN, Nanos, State, Status};
 
 use crate::link_output::Published;
-use crate::recent::{LineHealth, Recent};
 
-/// The link's statistics, across all sessions on its port.
+/// Statistics of a link, across all sessions on its port.
 pub(crate) struct LinkStats {
     status: Status,
     /// Configured measuring mode, which is reported while no reply has reported it.
     mode: Option<u8>,
-    /// Counters of the sessions that ended.
+    /// Counters of the sessions that have ended.
     past: Counters,
-    /// What the line took away lately.
-    recent: Recent,
-    /// As of the last status.
+    window: LossWindow,
+    /// State of the line as of the last status.
     health: LineHealth,
-    /// Counters as they were when the rate was last computed.
+    /// Time and number of scans at the start of the measurement of the scan rate.
     measured_at: Option<(Nanos, u64)>,
-    /// Scans published.
+    /// Number of published scans.
     scans: u64,
-    /// Times that the thread woke up.
+    /// Number of times that the thread woke up.
     pub(crate) wakeups: u64,
-    /// Telegrams that were suspect.
+    /// Number of suspect telegrams.
     suspect: u64,
     pub(crate) reconnects: u64,
-    /// Errors that the line's driver counted.
+    /// Errors that the driver of the line has counted.
     pub(crate) line_errors: u64,
     /// Earliest time of the next log line about a search.
     pub(crate) next_search_log: Nanos,
 }
 
+/// State of a line and its scanner in the last ten seconds.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub(crate) struct LineHealth {
+    /// Share of the bytes that were damaged while scans arrived, 0 to 1.
+    pub(crate) damaged: f64,
+    /// Share of the bytes that were in nothing, 0 to 1.
+    pub(crate) discarded: f64,
+    /// Telegrams that arrived.
+    pub(crate) telegrams: u64,
+    /// Restarts of the scanner.
+    pub(crate) restarts: u64,
+}
+
 impl LinkStats {
+    /// Creates the statistics of `link`, which exists since `now`.
     pub(crate) fn new(link: &Link, now: Nanos) -> Self {
         let mut status = Status { since_ns: now, ..Status::default() };
         status.family = number_of(link.family());
@@ -43,7 +57,7 @@ impl LinkStats {
             status,
             mode: link.scanner.settings.mode_number,
             past: Counters::default(),
-            recent: Recent::new(),
+            window: LossWindow::new(),
             health: LineHealth::default(),
             measured_at: None,
             scans: 0,
@@ -57,7 +71,7 @@ impl LinkStats {
         stats
     }
 
-    /// Takes over the state and the trouble of the moment; returns whether either is new.
+    /// Sets the state and the error. Returns whether either has changed.
     pub(crate) fn update(&mut self, state: State, error: &str, now: Nanos) -> bool {
         let before = (self.status.state, self.status.last_error_text);
         if self.status.state != state as u8 {
@@ -70,7 +84,7 @@ impl LinkStats {
         before != (self.status.state, self.status.last_error_text)
     }
 
-    /// The status with everything that `session`, if there is one, knows.
+    /// Returns the status as of `now`, with the values of `session`.
     pub(crate) fn status(&mut self, session: Option<&PortSession>, loan_failed: u64, now: Nanos) -> &Status {
         let mut counters = self.past;
         let was_searched = self.status.family == Family::UNKNOWN;
@@ -87,9 +101,9 @@ impl LinkStats {
         counters[Counter::LoanFailed] = loan_failed;
         counters[Counter::LineErrors] = self.line_errors;
         if was_searched && self.status.family != Family::UNKNOWN {
-            self.recent.restart(now, &counters);
+            self.window.restart(now, &counters);
         }
-        self.health = self.recent.gauge(now, &mut counters);
+        self.health = self.window.update(now, &mut counters);
         self.status.counters = counters;
         let (since, scans) = *self.measured_at.get_or_insert((now, self.scans));
         if u128::from(now.saturating_sub(since)) >= MIN_RATE_SPAN.as_nanos() {
@@ -101,10 +115,10 @@ impl LinkStats {
         &self.status
     }
 
-    /// A telegram was published.
-    pub(crate) fn note(&mut self, processed: Published) {
-        self.suspect += u64::from(processed.is_suspect);
-        self.scans += u64::from(processed.verdict_lifetime.is_some());
+    /// Counts what was published.
+    pub(crate) fn note(&mut self, published: Published) {
+        self.suspect += u64::from(published.is_suspect);
+        self.scans += u64::from(published.verdict_lifetime.is_some());
     }
 
     /// Returns the status, so that a telegram of a recording can update it.
@@ -124,12 +138,12 @@ impl LinkStats {
         self.status.family = family as u8;
     }
 
-    /// Takes over the configured pose, and whether a threshold for reflectors is configured.
+    /// Sets the configured pose, and whether a threshold for reflectors is configured.
     pub(crate) fn set_processing(&mut self, processing: &Processing) {
         self.status.set_processing(processing.pose, processing.marks.level.is_some());
     }
 
-    /// The status as it was last.
+    /// Returns the last status.
     pub(crate) fn last(&self) -> &Status {
         &self.status
     }
@@ -139,12 +153,12 @@ impl LinkStats {
         self.health
     }
 
-    /// Whether telegrams come.
+    /// Returns whether the link streams.
     pub(crate) fn is_streaming(&self) -> bool {
         self.status.state == State::Streaming as u8
     }
 
-    /// The session is over: its counters stay.
+    /// Handles the end of `session`, whose counters are kept.
     pub(crate) fn close(&mut self, session: &PortSession) {
         self.describe(session);
         session.add_counters(&mut self.past);
@@ -163,10 +177,103 @@ impl LinkStats {
     }
 }
 
+/// Sliding window of the counters in the last ten seconds.
+struct LossWindow {
+    /// Counters with the time of each, a second apart, the newest last.
+    samples: VecDeque<(Nanos, Counters)>,
+}
+
+impl LossWindow {
+    fn new() -> LossWindow {
+        LossWindow { samples: VecDeque::with_capacity(MAX_SAMPLES) }
+    }
+
+    /// Restarts at `now`, with the `counters` of that time. Earlier bytes do not belong to the scanner.
+    fn restart(&mut self, now: Nanos, counters: &Counters) {
+        self.samples.clear();
+        self.samples.push_back((now, *counters));
+    }
+
+    /// Sets the gauges of `counters`, which are those of `now`, and returns the state of the line.
+    fn update(&mut self, now: Nanos, counters: &mut Counters) -> LineHealth {
+        while self.samples.get(1).is_some_and(|(at, _)| now.saturating_sub(*at) >= WINDOW) {
+            self.samples.pop_front();
+        }
+        let zero = Counters::default();
+        let since = self.samples.front().map_or(&zero, |(_, counters)| counters);
+        let grown = |counter| counters[counter].saturating_sub(since[counter]);
+        let ppm = |part: Counter, whole: Counter| {
+            (1_000_000 * grown(part)).checked_div(grown(whole)).unwrap_or(0).min(1_000_000)
+        };
+        let damaged = ppm(Counter::BytesDamaged, Counter::BytesRead);
+        let lost = ppm(Counter::LostOnLine, Counter::DueOnLine);
+        let health = LineHealth {
+            damaged: damaged as f64 / 1e6,
+            discarded: ppm(Counter::BytesDiscarded, Counter::BytesRead) as f64 / 1e6,
+            telegrams: grown(Counter::Telegrams),
+            restarts: grown(Counter::ScannerRestarts),
+        };
+        (counters[Counter::DamagedPpm], counters[Counter::LostPpm]) = (damaged, lost);
+        if self.samples.back().is_none_or(|(at, _)| now.saturating_sub(*at) >= SAMPLE_INTERVAL) {
+            self.samples.push_back((now, *counters));
+        }
+        health
+    }
+}
+
 /// Returns the number of `family` in a status.
 fn number_of(family: Option<Family>) -> u8 {
     family.map_or(Family::UNKNOWN, |family| family as u8)
 }
 
-/// The rate is that of the last seconds.
+/// Time after which the measurement of the scan rate starts again.
 const RATE_WINDOW: Nanos = 5_000_000_000;
+/// Length of the window.
+const WINDOW: Nanos = 10_000 * MILLIS;
+const SAMPLE_INTERVAL: Nanos = 1_000 * MILLIS;
+/// The samples of the window, one before it, and one at its end.
+const MAX_SAMPLES: usize = (WINDOW / SAMPLE_INTERVAL) as usize + 2;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn bytes_of_a_search_do_not_count_for_the_scanner() {
+        let mut window = LossWindow::new();
+        let mut counters = Counters::default();
+        (counters[Counter::BytesRead], counters[Counter::BytesDiscarded]) = (90_000, 90_000);
+        assert_eq!(window.update(0, &mut counters).discarded, 1.0);
+        window.restart(MILLIS, &counters);
+        assert_eq!(window.update(MILLIS, &mut counters), LineHealth::default());
+        counters[Counter::BytesRead] += 1_000;
+        counters[Counter::BytesDiscarded] += 100;
+        assert_eq!(window.update(2 * MILLIS, &mut counters).discarded, 0.1);
+    }
+
+    #[test]
+    fn shares_cover_the_last_ten_seconds() {
+        let mut window = LossWindow::new();
+        let mut counters = Counters::default();
+        for second in 0..40 {
+            counters[Counter::BytesRead] += 1000;
+            counters[Counter::DueOnLine] += 40;
+            if (10..20).contains(&second) {
+                counters[Counter::BytesDamaged] += 500;
+                counters[Counter::LostOnLine] += 10;
+            }
+            counters[Counter::ScannerRestarts] += u64::from(second == 12 || second == 17);
+            let health = window.update(second * 1_000 * MILLIS, &mut counters);
+            let restarts = [12..22, 17..27].iter().filter(|range| range.contains(&second)).count();
+            assert_eq!(health.restarts, restarts as u64, "{second}");
+            let ppm = (counters[Counter::DamagedPpm], counters[Counter::LostPpm]);
+            match second {
+                0..10 | 29.. => assert_eq!(ppm, (0, 0), "{second}"),
+                19 => assert_eq!(ppm, (500_000, 250_000)),
+                14 => assert_eq!(ppm, (250_000, 125_000)),
+                _ => assert!(ppm.0 > 0 && ppm.0 < 500_000, "{second}: {ppm:?}"),
+            }
+        }
+        assert_eq!(window.samples.len(), 11);
+    }
+}

@@ -279,13 +279,13 @@ impl<'a, S: Surroundings> LiveLink<'a, S> {
         self.core.stats.reconnects += 1;
         self.futile = if heard { 0 } else { self.futile + 1 };
         let words = format!("{} went away: {error}", source.name());
-        self.core.diagnosis.doubt(if heard { String::new() } else { words.clone() });
+        self.core.diagnosis.note_empty_connection(if heard { String::new() } else { words.clone() });
         self.leave(Away { refused: self.futile, ..Away::for_lack_of_a_port(words) });
     }
 
     /// The port is away: says so, and looks for it later.
     fn leave(&mut self, away: Away) {
-        self.core.diagnosis.forget();
+        self.core.diagnosis.end_session();
         self.core.show(None, State::Absent, &away.words);
         let look_at = self.core.around.now() + away.pause();
         let until = look_at.min(self.core.next_status());
