@@ -1,21 +1,20 @@
-//! MCAP files that the hub recorded: each sensor's telegrams, and what the file says about the sensors.
+//! MCAP files that the hub recorded. [`Reader`] yields each sensor's telegrams and all other records, [`Catalog`] has the
+//! channels, and [`Survey`] has the contents of the whole file, which is read once before anything uses it.
 
-mod catalog;
 mod records;
 
 use std::collections::{BTreeMap, HashSet};
 use std::io::{self, Read};
-use std::sync::Arc;
 
+use mcap::records::{Channel, MessageHeader, Record as Parsed, op};
 use scanhub_drivers::features;
 use scanhub_drivers::lms::telegram::Telegram;
 use scanhub_drivers::lms::variant::Mode;
 use schema::datagram::Packed;
-use schema::{Family, Foreground, Header, Pace, Scan, Status, Topic};
+use schema::file::{self, ENCODING, ENCODING_V1, METADATA};
+use schema::{Family, Foreground, Header, Maker, Pace, Scan, Status, Tilt, Topic, check_followed};
 
 use crate::{Contents, Damage, Form, Frame, MountRecord};
-pub(crate) use catalog::Catalog;
-use catalog::Place;
 use records::Records;
 pub(crate) use records::{Record, has_border};
 
@@ -79,7 +78,7 @@ impl<R: Read> Reader<R> {
         }
         record.message().is_some_and(|(message, data)| {
             let is_ours = matches!(self.catalog.place(message.channel_id), Some(Some(_)));
-            is_ours && catalog::sample(&message, data).is_none()
+            is_ours && split_sample(&message, data).is_none()
         })
     }
 
@@ -88,12 +87,12 @@ impl<R: Read> Reader<R> {
         let (sensor, (header, telegram)) = match self.catalog.place(message.channel_id) {
             Some(place) => {
                 let place = place.filter(|place| place.topic == Topic::Telegram)?;
-                (place.sensor.clone(), catalog::sample(&message, data)?)
+                (place.sensor.clone(), split_sample(&message, data)?)
             }
             // The channel's record is lost. A telegram of an LMS shows by itself that it is one.
             None => {
                 self.has_unknown = true;
-                let sample = catalog::sample(&message, data)?;
+                let sample = split_sample(&message, data)?;
                 Telegram::check(sample.1)?;
                 (format!("sensor{}", sample.0.sensor), sample)
             }
@@ -184,6 +183,56 @@ impl Survey {
         Reader::new(input, self.catalog.clone())
     }
 
+    /// Reads the file again, and returns the telegrams of `sensor` in the order of the file. They end at an error.
+    pub(crate) fn frames<R: Read>(&self, input: R, sensor: String) -> impl Iterator<Item = Frame> + use<R> {
+        let mut reader = self.reader(input);
+        std::iter::from_fn(move || {
+            loop {
+                if let Item::Telegram(sample) = reader.next().ok()??
+                    && sample.sensor == sensor
+                {
+                    let Sample { header, telegram, .. } = sample;
+                    return Some(Frame {
+                        telegram,
+                        family: header.family,
+                        wall_ns: Some(header.wall_ns),
+                        scanner_ns: None,
+                        reasons: header.reasons,
+                        header: Some(header),
+                    });
+                }
+            }
+        })
+    }
+
+    /// Reads the file again, and returns the angles of `mount` and the telegrams of its machine, in the order of the file.
+    /// They end at an error. If the file has no sensor of that machine, it returns the telegrams of all machines.
+    pub(crate) fn angles<R: Read>(
+        &self,
+        input: R,
+        mount: String,
+    ) -> impl Iterator<Item = MountRecord> + use<R> {
+        let is_near = |sensor: &String| machine(sensor) == machine(&mount);
+        let is_alone = !self.catalog.sensors().iter().any(is_near);
+        let mut reader = self.reader(input);
+        std::iter::from_fn(move || {
+            loop {
+                match reader.next().ok()?? {
+                    Item::Record(record) => {
+                        if let Some((header, tilt)) = reader.catalog.angle(&record, &mount) {
+                            return Some(MountRecord::Angle(header, tilt));
+                        }
+                    }
+                    Item::Telegram(Sample { sensor, header, .. }) => {
+                        if is_alone || machine(&sensor) == machine(&mount) {
+                            return Some(MountRecord::Telegram(header));
+                        }
+                    }
+                }
+            }
+        })
+    }
+
     /// Returns the channels of the file.
     pub(crate) fn catalog(&self) -> &Catalog {
         &self.catalog
@@ -230,7 +279,7 @@ impl Survey {
             };
             match runs.get_mut(&header.boot) {
                 Some(first) => *first = header.seq.min(*first),
-                None if self.runs < MOST_RUNS => {
+                None if self.runs < MAX_RUNS => {
                     runs.insert(header.boot, header.seq);
                     self.runs += 1;
                 }
@@ -265,7 +314,7 @@ impl Survey {
 }
 
 /// Returns the number of beams of the scan that `payload` is, or that it was computed from. `None` for another topic.
-fn beams_of(place: &Place, payload: &[u8]) -> Option<u16> {
+fn beams_of(place: &ChannelTopic, payload: &[u8]) -> Option<u16> {
     match place.topic {
         _ if place.is_old => None,
         Topic::Scan => {
@@ -296,80 +345,163 @@ fn of_sensor<'a>(sensors: &'a mut BTreeMap<String, Contents>, sensor: &str) -> &
     sensors.entry(sensor.to_owned()).or_insert(Contents::new(Form::Mcap))
 }
 
-/// The telegrams of one sensor, in the order of the file.
-pub(crate) struct Frames<R> {
-    reader: Reader<R>,
-    sensor: String,
-}
-
-impl<R: Read> Frames<R> {
-    pub(crate) fn new(input: R, survey: &Arc<Survey>, sensor: String) -> Self {
-        Frames { reader: survey.reader(input), sensor }
-    }
-}
-
-impl<R: Read> Iterator for Frames<R> {
-    type Item = Frame;
-
-    fn next(&mut self) -> Option<Frame> {
-        loop {
-            if let Item::Telegram(Sample { sensor, header, telegram }) = self.reader.next().ok()??
-                && sensor == self.sensor
-            {
-                return Some(Frame {
-                    telegram,
-                    family: header.family,
-                    wall_ns: Some(header.wall_ns),
-                    scanner_ns: None,
-                    reasons: header.reasons,
-                    header: Some(header),
-                });
-            }
-        }
-    }
-}
-
-/// The angles of one mount and the telegrams of its machine, in the order of the file.
-pub(crate) struct Angles<R> {
-    reader: Reader<R>,
-    mount: String,
-    /// Whether the recording has no sensor of the mount's machine. Then the telegrams of all machines count.
-    is_alone: bool,
-}
-
-impl<R: Read> Angles<R> {
-    pub(crate) fn new(input: R, survey: &Arc<Survey>, mount: String) -> Self {
-        let is_near = |sensor: &String| machine(sensor) == machine(&mount);
-        let is_alone = !survey.catalog().sensors().iter().any(is_near);
-        Angles { reader: survey.reader(input), mount, is_alone }
-    }
-}
-
-impl<R: Read> Iterator for Angles<R> {
-    type Item = MountRecord;
-
-    fn next(&mut self) -> Option<MountRecord> {
-        loop {
-            match self.reader.next().ok()?? {
-                Item::Record(record) => {
-                    if let Some((header, tilt)) = self.reader.catalog.angle(&record, &self.mount) {
-                        return Some(MountRecord::Angle(header, tilt));
-                    }
-                }
-                Item::Telegram(Sample { sensor, header, .. }) => {
-                    if self.is_alone || machine(&sensor) == machine(&self.mount) {
-                        return Some(MountRecord::Telegram(header));
-                    }
-                }
-            }
-        }
-    }
-}
-
 /// Returns the machine in the name of a remote sensor; `None` for a sensor of this machine.
 fn machine(sensor: &str) -> Option<&str> {
     sensor.split_once('.').map(|(machine, _)| machine)
 }
 
 /// Maximum number of runs of a hub that are remembered: one per minute for a month.
-const MOST_RUNS: usize = 50_000;
+const MAX_RUNS: usize = 50_000;
+
+/// Topic of a sensor that a channel has.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(crate) struct ChannelTopic {
+    pub(crate) sensor: String,
+    pub(crate) topic: Topic,
+    /// Whether its messages have the format of version 1.
+    is_old: bool,
+}
+
+impl ChannelTopic {
+    /// Returns the topic of `channel`; `None` if another program made the channel, or if it names no valid sensor.
+    fn of(channel: &Channel) -> Option<ChannelTopic> {
+        let (sensor, topic) = channel.topic.rsplit_once('/')?;
+        let is_old = channel.message_encoding == ENCODING_V1;
+        let is_ours = (is_old || channel.message_encoding == ENCODING) && check_followed(sensor).is_ok();
+        let topic = Topic::parse(topic).filter(|topic| is_ours && topic.maker() == Maker::Link)?;
+        Some(ChannelTopic { sensor: sensor.to_owned(), topic, is_old })
+    }
+
+    /// Returns whether its messages are scans in today's format.
+    pub(crate) fn has_scans(&self) -> bool {
+        self.topic == Topic::Scan && !self.is_old
+    }
+}
+
+/// Name, language and text of a type.
+type Schema = (String, String, Vec<u8>);
+
+/// Schemas and channels of a file. Its index repeats them, so they are known even if the chunk that had them first is lost.
+#[derive(Clone, Debug, Default)]
+pub(crate) struct Catalog {
+    /// Profile of the file, such as `ros2`.
+    pub(crate) profile: String,
+    /// Description of the recording: domain, host, version ([`METADATA`]).
+    pub(crate) facts: BTreeMap<String, String>,
+    schemas: BTreeMap<u16, Schema>,
+    channels: BTreeMap<u16, (Channel, Option<ChannelTopic>)>,
+    sensors: HashSet<String>,
+    /// Approximate memory of schemas and channels.
+    bytes: usize,
+}
+
+impl Catalog {
+    /// Takes over what `record` says. The first schema or channel with a number counts.
+    ///
+    /// # Errors
+    ///
+    /// Returns [`io::ErrorKind::FileTooLarge`] if the file has more channels, schemas or sensors than are kept in memory.
+    pub(crate) fn note(&mut self, record: &Record) -> io::Result<()> {
+        if !matches!(record.opcode, op::HEADER | op::METADATA | op::SCHEMA | op::CHANNEL) {
+            return Ok(());
+        }
+        match record.parse() {
+            Some(Parsed::Header(header)) => self.profile = header.profile,
+            Some(Parsed::Metadata(metadata)) if metadata.name == METADATA && self.facts.is_empty() => {
+                self.facts = metadata.metadata;
+            }
+            Some(Parsed::Schema { header, data }) if !self.schemas.contains_key(&header.id) => {
+                self.bytes += record.body.len() + OVERHEAD;
+                self.schemas.insert(header.id, (header.name, header.encoding, data.into_owned()));
+            }
+            Some(Parsed::Channel(channel)) if !self.channels.contains_key(&channel.id) => {
+                self.bytes += record.body.len() + OVERHEAD * (1 + channel.metadata.len());
+                let place = ChannelTopic::of(&channel);
+                self.sensors.extend(place.iter().map(|place| place.sensor.clone()));
+                self.channels.insert(channel.id, (channel, place));
+            }
+            _ => {}
+        }
+        let what = if self.sensors.len() > MAX_SENSORS {
+            format!("it names more than {MAX_SENSORS} sensors")
+        } else if self.bytes > MAX_BYTES {
+            format!("its channels and schemas take more than {} MB", MAX_BYTES >> 20)
+        } else {
+            return Ok(());
+        };
+        Err(io::Error::new(io::ErrorKind::FileTooLarge, what))
+    }
+
+    /// Returns the channel with this number, and its schema.
+    pub(crate) fn channel(&self, id: u16) -> Option<(&Channel, Option<&Schema>)> {
+        let (channel, _) = self.channels.get(&id)?;
+        Some((channel, self.schemas.get(&channel.schema_id)))
+    }
+
+    /// Returns the topic of the channel with this number: `Some(None)` if another program made it, `None` if the channel is
+    /// unknown.
+    pub(crate) fn place(&self, id: u16) -> Option<Option<&ChannelTopic>> {
+        self.channels.get(&id).map(|(_, place)| place.as_ref())
+    }
+
+    /// Returns the topic of a message of the hub, its header and its payload; `None` for any other record.
+    pub(crate) fn message<'a>(&self, record: &'a Record) -> Option<(&ChannelTopic, Header, &'a [u8])> {
+        let (message, data) = record.message()?;
+        let place = self.place(message.channel_id)??;
+        let (header, payload) = split_sample(&message, data)?;
+        Some((place, header, payload))
+    }
+
+    /// Returns the sensors that channels name, in the order of the channels' numbers.
+    pub(crate) fn sensors(&self) -> Vec<String> {
+        let mut seen = HashSet::new();
+        let places = self.channels.values().filter_map(|(_, place)| place.as_ref());
+        places.map(|place| &place.sensor).filter(|sensor| seen.insert(*sensor)).cloned().collect()
+    }
+
+    /// Returns the mounts whose angles have a channel, in the order of the channels' numbers.
+    pub(crate) fn mounts(&self) -> Vec<String> {
+        let mut seen = HashSet::new();
+        let names = self.channels.values().filter_map(|(channel, _)| mount_of(channel));
+        names.filter(|name| seen.insert(*name)).map(str::to_owned).collect()
+    }
+
+    /// Returns the angle of `mount` that `record` contains. `None` if it contains anything else.
+    pub(crate) fn angle(&self, record: &Record, mount: &str) -> Option<(Header, Tilt)> {
+        let (message, data) = record.message()?;
+        let (channel, _) = self.channels.get(&message.channel_id)?;
+        if mount_of(channel)? != mount {
+            return None;
+        }
+        let (header, payload) = split_sample(&message, data)?;
+        let mut tilt = Tilt::default();
+        tilt.unpack(payload).then_some((header, tilt))
+    }
+
+    /// Returns whether a channel has scans of `sensor`.
+    pub(crate) fn has_scans(&self, sensor: &str) -> bool {
+        let mut places = self.channels.values().filter_map(|(_, place)| place.as_ref());
+        places.any(|place| place.sensor == sensor && place.has_scans())
+    }
+}
+
+/// Returns the name of the mount whose angles `channel` has.
+fn mount_of(channel: &Channel) -> Option<&str> {
+    let (mount, topic) = channel.topic.rsplit_once('/')?;
+    let is_ours = channel.message_encoding == ENCODING && check_followed(mount).is_ok();
+    (is_ours && Topic::parse(topic) == Some(Topic::Tilt)).then_some(mount)
+}
+
+/// Returns header and payload of a message of the hub; `None` if the header contradicts the message that contains it.
+pub(crate) fn split_sample<'a>(message: &MessageHeader, data: &'a [u8]) -> Option<(Header, &'a [u8])> {
+    let (header, payload) = file::parts(data)?;
+    let is_same = (header.topic_seq as u32, header.wall_ns) == (message.sequence, message.log_time);
+    is_same.then_some((header, payload))
+}
+
+/// Maximum number of sensors: those of sixteen hubs, each with as many as one can have.
+const MAX_SENSORS: usize = 4096;
+/// Maximum memory of channels and schemas. Files of many sensors have some hundred channels, and a megabyte of schemas.
+const MAX_BYTES: usize = 20 << 20;
+/// Memory that a record takes in addition to its text.
+const OVERHEAD: usize = 128;

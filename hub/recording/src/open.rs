@@ -309,7 +309,7 @@ impl Recording {
                 return Err(Failure::new(Kind::Usage, message, self.choice()));
             }
         };
-        Ok(Box::new(crate::mcap::Frames::new(reader, &self.survey, sensor)))
+        Ok(Box::new(self.survey.frames(reader, sensor)))
     }
 
     #[cfg(not(feature = "mcap"))]
@@ -343,7 +343,7 @@ impl Recording {
     /// Returns [`Kind::Input`] if the file cannot be opened.
     #[cfg(feature = "mcap")]
     pub fn angles(&self, mount: &str) -> Result<Box<dyn Iterator<Item = MountRecord> + Send>, Failure> {
-        Ok(Box::new(crate::mcap::Angles::new(reader(&self.path)?, &self.survey, mount.to_owned())))
+        Ok(Box::new(self.survey.angles(reader(&self.path)?, mount.to_owned())))
     }
 
     /// Returns no angles: only MCAP contains them.

@@ -22,7 +22,7 @@ use mcap::records::{MessageHeader, Record as Parsed, op};
 use mcap::sans_io::{LinearReadEvent, LinearReader, LinearReaderOptions};
 use mcap::{MAGIC, McapError, parse_record};
 
-use super::catalog;
+use super::split_sample;
 use crate::Damage;
 use crate::open::is_end;
 
@@ -62,7 +62,7 @@ pub(crate) struct Records<R> {
     input: R,
     /// The open chunk, whose records are returned next.
     chunk: Chunk,
-    /// Hashes of the first [`MOST_CHUNKS`] chunks with messages.
+    /// Hashes of the first [`MAX_CHUNKS`] chunks with messages.
     chunks: HashSet<u64>,
     /// Bytes to read again before those of `input`.
     unread: Cursor<Vec<u8>>,
@@ -105,7 +105,7 @@ impl<R: Read> Records<R> {
     ///
     /// # Errors
     ///
-    /// Returns the error of the input. Returns `FileTooLarge` at an intact chunk that is longer than [`LONGEST`], compressed
+    /// Returns the error of the input. Returns `FileTooLarge` at an intact chunk that is longer than [`MAX_LEN`], compressed
     /// or not, and `Unsupported` at a chunk whose compression this build lacks.
     pub(crate) fn next(&mut self) -> io::Result<Option<Record>> {
         loop {
@@ -139,13 +139,13 @@ impl<R: Read> Records<R> {
             self.end_in_record(head.len() as u64);
             return Ok(None);
         };
-        if opcode == 0 || length > longest_possible(opcode) {
+        if opcode == 0 || length > max_possible_len(opcode) {
             return self.resynchronize(head);
         }
         if opcode == op::CHUNK {
             return self.read_chunk(head, length);
         }
-        if length > LONGEST {
+        if length > MAX_LEN {
             return self.skip_long(&head, length).map(|()| None);
         }
         let body = self.read(length as usize)?;
@@ -178,7 +178,7 @@ impl<R: Read> Records<R> {
                 self.section.update(&body);
             }
         }
-        if length > longest(opcode) {
+        if length > max_len(opcode) {
             self.damage.bytes += len;
             return Ok(None);
         }
@@ -202,7 +202,7 @@ impl<R: Read> Records<R> {
                 self.resynchronize([head, body].concat())
             };
         }
-        if length > LONGEST {
+        if length > MAX_LEN {
             return Err(too_long(length));
         }
         body.append(&mut self.read(length as usize - body.len())?);
@@ -238,7 +238,7 @@ impl<R: Read> Records<R> {
     /// Returns whether no chunk with this hash was read before. Two chunks of a recorder are never equal, because the times and
     /// numbers of their messages differ.
     fn is_new(&mut self, hash: u64) -> bool {
-        if self.chunks.len() < MOST_CHUNKS { self.chunks.insert(hash) } else { !self.chunks.contains(&hash) }
+        if self.chunks.len() < MAX_CHUNKS { self.chunks.insert(hash) } else { !self.chunks.contains(&hash) }
     }
 
     /// Counts `record`, which was read outside chunks, as damaged.
@@ -269,7 +269,7 @@ impl<R: Read> Records<R> {
     fn resynchronize(&mut self, mut window: Vec<u8>) -> io::Result<Option<Record>> {
         self.resyncs += 1;
         let mut from = 1;
-        while self.resyncs <= MOST_RESYNCS {
+        while self.resyncs <= MAX_RESYNCS {
             let missing = (from + PIECE as usize).saturating_sub(window.len());
             let is_end = missing > 0 && {
                 let more = self.read(missing)?;
@@ -392,12 +392,12 @@ impl Chunk {
     /// # Errors
     ///
     /// Returns an error if the checksum is wrong, if its records do not fill it, or if it cannot be unpacked. Returns
-    /// [`McapError::ChunkTooLarge`] if it is intact, but unpacks to more than [`LONGEST`].
+    /// [`McapError::ChunkTooLarge`] if it is intact, but unpacks to more than [`MAX_LEN`].
     fn open(body: Vec<u8>) -> Result<Chunk, McapError> {
         let Parsed::Chunk { header, data } = parse_record(op::CHUNK, &body)? else {
             return Err(McapError::UnexpectedEoc);
         };
-        if header.uncompressed_size > LONGEST {
+        if header.uncompressed_size > MAX_LEN {
             // Its length may be damaged. Only an intact chunk shows that the file has longer chunks than can be read.
             return Err(match unpacked_length(&body, header.uncompressed_size) {
                 Ok(len) if len == header.uncompressed_size => McapError::ChunkTooLarge(len),
@@ -459,7 +459,7 @@ fn unpack(body: &[u8]) -> Result<Vec<u8>, McapError> {
 /// Returns the length of the records of a compressed chunk that may be too long to be held in memory. Stops when it is
 /// longer than `most`, or than any chunk that a recorder writes.
 fn unpacked_length(body: &[u8], most: u64) -> Result<u64, McapError> {
-    let (mut len, most) = (0, most.min(LONGEST_WRITTEN));
+    let (mut len, most) = (0, most.min(MAX_WRITTEN_CHUNK));
     for_each_record(body, LinearReaderOptions::default().with_validate_chunk_crcs(true), |_, data| {
         len += (HEAD + data.len()) as u64;
         len <= most
@@ -476,7 +476,7 @@ fn for_each_record(
     let options = options
         .with_skip_start_magic(true)
         .with_skip_end_magic(true)
-        .with_record_length_limit(LONGEST as usize);
+        .with_record_length_limit(MAX_LEN as usize);
     let mut reader = LinearReader::new_with_options(options);
     let chunk = [&[op::CHUNK][..], &(body.len() as u64).to_le_bytes(), body].concat();
     let mut input = &chunk[..];
@@ -500,7 +500,7 @@ fn for_each_record(
 
 /// Returns the error of a chunk of `len` bytes, which is too long.
 fn too_long(len: u64) -> io::Error {
-    let (megabytes, most) = (len >> 20, LONGEST >> 20);
+    let (megabytes, most) = (len >> 20, MAX_LEN >> 20);
     let what = format!("it has a chunk of {megabytes} MB; at most {most} MB are read at a time");
     io::Error::new(io::ErrorKind::FileTooLarge, what)
 }
@@ -510,7 +510,7 @@ fn too_long(len: u64) -> io::Error {
 fn is_border(bytes: &[u8], messages: bool) -> bool {
     let Some((opcode, length)) = split_head(bytes) else { return false };
     match opcode {
-        _ if length > LONGEST => false,
+        _ if length > MAX_LEN => false,
         op::CHUNK => is_chunk(&bytes[HEAD..], length),
         op::MESSAGE => messages && is_message_of_hub(bytes),
         _ => false,
@@ -533,7 +533,7 @@ fn is_message_of_hub(bytes: &[u8]) -> bool {
     let end = bytes.len().min(HEAD.saturating_add(length as usize)).min(HEAD + HEAD_OF_MESSAGE);
     match parse_record(op::MESSAGE, &bytes[HEAD..end]) {
         Ok(Parsed::Message { header, data }) => {
-            header.log_time != 0 && catalog::sample(&header, &data).is_some()
+            header.log_time != 0 && split_sample(&header, &data).is_some()
         }
         _ => false,
     }
@@ -550,7 +550,7 @@ fn is_chunk(body: &[u8], length: u64) -> bool {
 }
 
 /// Returns the maximum length that a record with this opcode can have. A greater length is damaged.
-fn longest_possible(opcode: u8) -> u64 {
+fn max_possible_len(opcode: u8) -> u64 {
     match opcode {
         op::HEADER
         | op::FOOTER
@@ -560,8 +560,8 @@ fn longest_possible(opcode: u8) -> u64 {
         | op::STATISTICS
         | op::METADATA_INDEX
         | op::SUMMARY_OFFSET
-        | op::DATA_END => LONGEST,
-        _ => LONGEST_FILE,
+        | op::DATA_END => MAX_LEN,
+        _ => MAX_FILE_LEN,
     }
 }
 
@@ -574,7 +574,7 @@ fn split_head(bytes: &[u8]) -> Option<(u8, u64)> {
 /// Splits `bytes` after their first record, which includes its opcode and length.
 fn split_record(bytes: &[u8]) -> Option<(&[u8], &[u8])> {
     let (opcode, length) = split_head(bytes)?;
-    bytes.split_at_checked(HEAD + usize::try_from(length).ok().filter(|_| length <= longest(opcode))?)
+    bytes.split_at_checked(HEAD + usize::try_from(length).ok().filter(|_| length <= max_len(opcode))?)
 }
 
 /// Returns the length that a chunk must have according to the fields at the beginning of its `body`.
@@ -607,10 +607,10 @@ fn is_interpreted(opcode: u8) -> bool {
 }
 
 /// Maximum length of a record that is held in memory. Records of texts take many times their length when they are parsed.
-fn longest(opcode: u8) -> u64 {
+fn max_len(opcode: u8) -> u64 {
     match opcode {
         op::HEADER | op::CHANNEL | op::METADATA => 1 << 20,
-        _ => LONGEST,
+        _ => MAX_LEN,
     }
 }
 
@@ -632,14 +632,14 @@ const FOOTER_LEN: u64 = FOOTER_CRC as u64 + 4;
 /// Opcodes that no version of the format uses yet. Those from 80h are free for any program.
 const RESERVED: RangeInclusive<u8> = 0x10..=0x7F;
 /// Maximum length of all other records. A few times this is held in memory; recorders write chunks of less than half of it.
-const LONGEST: u64 = 8 << 20;
+const MAX_LEN: u64 = 8 << 20;
 /// No file is longer.
-const LONGEST_FILE: u64 = 1 << 40;
+const MAX_FILE_LEN: u64 = 1 << 40;
 /// Longest chunk that is unpacked to find out whether it is intact.
-const LONGEST_WRITTEN: u64 = 1 << 30;
+const MAX_WRITTEN_CHUNK: u64 = 1 << 30;
 /// Maximum number of chunks that are compared with later ones: 14 hours of a recording of the hub.
-const MOST_CHUNKS: usize = 1 << 19;
+const MAX_CHUNKS: usize = 1 << 19;
 /// Maximum number of places at which the structure of a file is found again. Each one may read the longest record twice.
-const MOST_RESYNCS: u32 = 256;
+const MAX_RESYNCS: u32 = 256;
 /// Bytes that are read at a time.
 const PIECE: u64 = 64 * 1024;
