@@ -321,7 +321,7 @@ fn told(line: &str) -> Option<Encoding> {
 ///
 /// Returns [`Kind::Input`] if it cannot be read, or if none of its lines is a valid scan.
 pub(crate) fn survey(path: &Path, reader: impl BufRead) -> Result<Contents, Failure> {
-    let mut contents = Contents::new(Form::Carmen);
+    let mut contents = Contents { form: Form::Carmen, ..Contents::default() };
     let (mut log, mut census, mut refusal) = (Log::new(reader), Census::default(), None);
     loop {
         match log.next() {

@@ -1,45 +1,45 @@
 //! Reads recordings: MCAP files of the hub (feature `mcap`), streams of telegrams as they arrived on a line, and CARMEN
 //! logs, each plain or gzipped.
 //!
-//! All of them yield whole telegrams, so that the simulator can send them and a hub can read them. [`Contents`] says which
-//! sensor it was and what its values mean, as far as the file contains that; nothing here reads a clock or opens a port.
+//! All of them yield whole telegrams as [`Frame`]s, so that the simulator can send them and a hub can read them. [`Contents`]
+//! describes the sensors and the meaning of the values, as far as the file contains that. Nothing here reads a clock or opens a
+//! port.
 
 mod carmen;
-mod contents;
 #[cfg(feature = "mcap")]
 pub mod convert;
 #[cfg(feature = "mcap")]
 mod mcap;
 mod open;
-mod packed;
 mod stream;
-mod virtual_time;
 
-pub use carmen::{BEYOND, Unfit, Unread};
-pub use contents::{Contents, Damage, Form};
-pub use open::{Encoding, Recording};
-pub use virtual_time::VirtualTime;
+use std::fmt;
 
-use scanhub_drivers::lms::measured::MEASURED;
+use scanhub_drivers::lms::measured::{MEASURED, Measured, nominal_period};
 use scanhub_drivers::lms::reply::Reply;
 use scanhub_drivers::lms::telegram::Telegram;
-use schema::Family;
+use scanhub_drivers::lms::variant::{Baud, Mode, Unit, Variant};
+use schema::{Family, Nanos};
 
-/// One telegram of a recording, or the packets that arrived together.
+pub use carmen::{BEYOND, Unfit, Unread};
+pub use open::Recording;
+pub use stream::VirtualTime;
+
+/// A telegram of a recording, or the packets that arrived together.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Frame {
-    /// The whole telegram, STX to checksum; of other families than LMS whole packets. Of a stream bit for bit as it was
-    /// received.
+    /// The whole telegram, STX to checksum; for other families than LMS whole packets. Those of a stream file have every bit as
+    /// it was received.
     pub telegram: Vec<u8>,
-    /// Of which family it is, a number of [`Family`].
+    /// Number of its [`Family`].
     pub family: u8,
-    /// When it was measured, in nanoseconds since 1970, if the recording contains that.
+    /// Time of the measurement, in nanoseconds since 1970, if the recording contains it.
     pub wall_ns: Option<u64>,
-    /// When it was measured by the scanner's own clock, in nanoseconds from the first one on, where that is all there is.
+    /// Time of the measurement by the scanner's clock, in nanoseconds since the first frame, if the recording has no other time.
     pub scanner_ns: Option<u64>,
-    /// Why it is suspect, bits of [`scanhub_drivers::line::suspect`].
+    /// Reasons why it is suspect, bits of [`scanhub_drivers::line::suspect`].
     pub reasons: u8,
-    /// What the hub knew of it when it was recorded: numbers, stamps, quality. Streams and logs have none.
+    /// Header that the hub published. Streams and logs have none.
     pub header: Option<schema::Header>,
 }
 
@@ -53,7 +53,7 @@ pub enum MountRecord {
 }
 
 impl Frame {
-    /// Whether it is a telegram of measured values (B0h), which is what an LMS streams.
+    /// Returns whether it is a telegram of measured values (B0h), which an LMS streams.
     pub fn is_scan(&self) -> bool {
         is_scan(self.family, &self.telegram)
     }
@@ -67,4 +67,220 @@ impl Frame {
 
 pub(crate) fn is_scan(family: u8, telegram: &[u8]) -> bool {
     family == Family::Lms as u8 && telegram.get(4) == Some(&MEASURED)
+}
+
+/// Encoding of ranges as value words. The ranges of a log are in meters, so they have none of their own.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Encoding {
+    /// Unit of the ranges.
+    pub unit: Unit,
+    /// Meaning of the 16 bits of a value.
+    pub mode: Mode,
+}
+
+impl Default for Encoding {
+    /// Returns millimeters in 13 bits.
+    fn default() -> Encoding {
+        Encoding { unit: Unit::Mm, mode: Mode(0) }
+    }
+}
+
+impl fmt::Display for Encoding {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "values of {} mm in {} bits", self.unit.mm(), self.mode.range_bits())
+    }
+}
+
+/// Format of a recording.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Form {
+    /// Bytes as they arrived on a line.
+    Telegrams,
+    /// A CARMEN log.
+    Carmen,
+    /// An MCAP file of `scanhub record`.
+    #[default]
+    Mcap,
+}
+
+/// Contents of a recording, including its description of the sensor.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct Contents {
+    /// Format of the file.
+    pub form: Form,
+    /// Number of the first sensor's [`Family`]; that of an LMS for a log.
+    pub family: u8,
+    /// Number of another family that telegrams belong to. `None` if all have the same.
+    pub other_family: Option<u8>,
+    /// Names of the sensors, in order of appearance; a stream and a log name none.
+    pub sensors: Vec<String>,
+    /// Number of whole telegrams; for a log, of scans.
+    pub telegrams: u64,
+    /// Number of telegrams with measured values (B0h).
+    pub scans: u64,
+    /// Times of the first and the last telegram, in ns since 1970, if there are stamps.
+    pub span: Option<(u64, u64)>,
+    /// Duration by the scanner's clock, in ns, if there is no other time.
+    pub scanner_ns: Option<u64>,
+    /// Number of beams in the recorded scans of a rotating scanner.
+    pub beams: Option<u16>,
+    /// Name of the model of a rotating scanner, if a status reports it.
+    pub model: Option<&'static str>,
+    /// Name of the scan mode of a rotating scanner, if a status reports it.
+    pub way: Option<&'static str>,
+    /// Number of the sensor's family, and its type, as in the first status that has a type.
+    pub sensor_type: Option<(u8, String)>,
+    /// Angle between two beams of a rotating scanner, in 1/100 degree, if a status reports it.
+    pub step_cdeg: Option<u16>,
+    /// Variant of the first scan.
+    pub variant: Option<Variant>,
+    /// Unit of the first scan; for a log the unit in which its ranges are whole values.
+    pub unit: Option<Unit>,
+    /// Measuring mode, if a configuration reply (F4h) or a status contains it; for a log, a mode whose values reach as far as
+    /// its ranges.
+    pub mode: Option<Mode>,
+    /// Bits that are set in any value of the scans; none for a log.
+    pub bits: u16,
+    /// Ranges of a log that its unit and mode cannot encode.
+    pub unfit: Unfit,
+    /// Data of a log that its scans do not contain.
+    pub unread: Unread,
+    /// Data that could not be read. [`telegrams`](Recording::telegrams) returns the rest.
+    pub damage: Damage,
+}
+
+impl Contents {
+    /// Returns the measuring mode for reading the values: the one in the recording, or else the mode of 13 bits if no value has a
+    /// higher bit, because then the modes agree. Returns `None` if the values could be split in several ways.
+    pub fn readable(&self) -> Option<Mode> {
+        let plain = Mode(0x00);
+        self.mode.or((self.bits <= plain.max_value()).then_some(plain))
+    }
+
+    /// Returns the number of the measuring mode for reading the values: the one in the recording, or else `configured`, or else
+    /// the [readable](Self::readable) one.
+    pub fn mode_or(&self, configured: Option<u8>) -> Option<u8> {
+        self.mode.map(|mode| mode.0).or(configured).or(self.readable().map(|mode| mode.0))
+    }
+
+    /// Returns the encoding of values in the measuring mode with the number `mode`.
+    pub fn encoding(&self, mode: Option<u8>) -> Encoding {
+        let default = Encoding::default();
+        Encoding { unit: self.unit.unwrap_or(default.unit), mode: mode.map_or(default.mode, Mode) }
+    }
+
+    /// Returns the time from a scan of `beams` to the next one, for a recording without stamps. Another number of beams than those of
+    /// the listing has the period of the other scans.
+    pub fn period(&self, beams: usize) -> Nanos {
+        let variant = Variant::of_beams(beams).or(self.variant).unwrap_or(Variant::HALF);
+        nominal_period(variant.beams(), Baud::B500000.rate())
+    }
+
+    /// Returns whether the first sensor is an LMS.
+    pub fn is_lms(&self) -> bool {
+        self.family == Family::Lms as u8
+    }
+
+    /// Counts a telegram of a sensor of `family`, and stores its description of the sensor.
+    pub(crate) fn note(&mut self, family: u8, telegram: &[u8], wall_ns: Option<u64>) {
+        if self.telegrams == 0 {
+            self.family = family;
+        } else if family != self.family {
+            self.other_family.get_or_insert(family);
+        }
+        self.telegrams += 1;
+        self.note_time(wall_ns);
+        if family != Family::Lms as u8 {
+            return;
+        }
+        let Some(telegram) = Telegram::check(telegram) else { return };
+        if let Some(Reply::Configuration(configuration)) = Reply::decode(telegram) {
+            self.mode = self.mode.or(Some(configuration.mode()));
+        }
+        if let Some(measured) = Measured::decode(telegram) {
+            self.scans += 1;
+            self.variant = self.variant.or(Variant::of_beams(measured.count()));
+            self.unit = self.unit.or(Some(measured.unit()));
+            self.bits = measured.words().fold(self.bits, |bits, word| bits | word);
+        }
+    }
+
+    /// Counts a scan of a log.
+    pub(crate) fn note_scan(&mut self, variant: Option<Variant>, wall_ns: Option<u64>) {
+        self.telegrams += 1;
+        self.scans += 1;
+        self.note_time(wall_ns);
+        self.variant = self.variant.or(variant);
+    }
+
+    fn note_time(&mut self, wall_ns: Option<u64>) {
+        if let Some(wall_ns) = wall_ns {
+            let (first_ns, last_ns) = self.span.unwrap_or((wall_ns, wall_ns));
+            self.span = Some((first_ns, last_ns.max(wall_ns)));
+        }
+    }
+}
+
+/// Parts of a recording that could not be read; all zero if the file is intact.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Damage {
+    /// Telegrams whose numbers are missing between others. Either the file or the recorder lost them.
+    pub telegrams: u64,
+    /// Bytes that were not read: those of damaged chunks and records, those after a place where the structure of the file is
+    /// lost, and those outside the telegrams of a stream.
+    pub bytes: u64,
+    /// Chunks that were skipped because they are damaged.
+    pub chunks: u64,
+    /// Chunks that were skipped because the file contains them twice.
+    pub repeats: u64,
+    /// Whether the file ends without its index, as after a kill.
+    pub is_cut: bool,
+    /// Whether the file was changed after it was written: a checksum or a length is wrong.
+    pub is_harmed: bool,
+}
+
+impl Damage {
+    /// Returns whether nothing is missing.
+    pub fn is_none(&self) -> bool {
+        *self == Damage::default()
+    }
+}
+
+impl fmt::Display for Damage {
+    /// Writes one line, `nothing` if nothing is missing.
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let counted = |count: u64, one: &str, more: &str| match count {
+            0 => None,
+            1 => Some(format!("1 {one}")),
+            count => Some(format!("{count} {more}")),
+        };
+        let parts = [
+            counted(self.telegrams, "telegram", "telegrams"),
+            counted(self.chunks, "chunk", "chunks"),
+            counted(self.repeats, "chunk that the file has twice", "chunks that the file has twice"),
+            counted(self.bytes, "byte that could not be used", "bytes that could not be used"),
+            self.is_cut.then(|| "the end of the file, with its index".to_owned()),
+        ];
+        let parts: Vec<_> = parts.into_iter().flatten().collect();
+        match (&parts[..], self.is_harmed) {
+            ([], true) => f.write_str("no telegram, but a checksum is wrong"),
+            ([], false) => f.write_str("nothing"),
+            _ => f.write_str(&parts.join(", ")),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn lists_what_is_missing() {
+        assert_eq!(Damage::default().to_string(), "nothing");
+        let damage = Damage { telegrams: 2, chunks: 1, is_cut: true, ..Damage::default() };
+        let words = "2 telegrams, 1 chunk, the end of the file, with its index";
+        assert_eq!(damage.to_string(), words);
+        let damage = Damage { is_harmed: true, ..Damage::default() };
+        assert_eq!(damage.to_string(), "no telegram, but a checksum is wrong");
+    }
 }

@@ -14,7 +14,7 @@ use schema::datagram::Packed;
 use schema::file::{self, ENCODING, ENCODING_V1, METADATA};
 use schema::{Family, Foreground, Header, Maker, Pace, Scan, Status, Tilt, Topic, check_followed};
 
-use crate::{Contents, Damage, Form, Frame, MountRecord};
+use crate::{Contents, Damage, Frame, MountRecord};
 use records::Records;
 pub(crate) use records::{Record, has_border};
 
@@ -102,7 +102,7 @@ impl<R: Read> Reader<R> {
 }
 
 /// Contents of a file that was read to its end.
-#[derive(Debug)]
+#[derive(Debug, Default)]
 pub(crate) struct Survey {
     whole: Contents,
     sensors: BTreeMap<String, Contents>,
@@ -113,19 +113,6 @@ pub(crate) struct Survey {
     understood: BTreeMap<String, BTreeMap<u64, u64>>,
     /// Number of pairs of sensor and run in it.
     runs: usize,
-}
-
-impl Default for Survey {
-    fn default() -> Self {
-        Survey {
-            whole: Contents::new(Form::Mcap),
-            sensors: BTreeMap::new(),
-            catalog: Catalog::default(),
-            last: BTreeMap::new(),
-            understood: BTreeMap::new(),
-            runs: 0,
-        }
-    }
 }
 
 impl Survey {
@@ -174,7 +161,7 @@ impl Survey {
 
     /// Returns the contents that belong to `sensor`.
     pub(crate) fn contents_of(&self, sensor: &str) -> Contents {
-        let contents = self.sensors.get(sensor).cloned().unwrap_or(Contents::new(Form::Mcap));
+        let contents = self.sensors.get(sensor).cloned().unwrap_or_default();
         Contents { sensors: vec![sensor.to_owned()], ..contents }
     }
 
@@ -342,7 +329,7 @@ fn rotating(status: &Status) -> Option<(Option<&'static str>, Option<&'static st
 }
 
 fn of_sensor<'a>(sensors: &'a mut BTreeMap<String, Contents>, sensor: &str) -> &'a mut Contents {
-    sensors.entry(sensor.to_owned()).or_insert(Contents::new(Form::Mcap))
+    sensors.entry(sensor.to_owned()).or_default()
 }
 
 /// Returns the machine in the name of a remote sensor; `None` for a sensor of this machine.

@@ -1,13 +1,12 @@
-//! Opens a recording by its content, not by its name, and reads all of it once: its content is known, and what is wrong
-//! with it is reported, before anything is sent from it. Nothing is kept in memory.
+//! Opens a recording, whose form is detected by its content and not by its name. The file is read to its end once, so that its
+//! contents and its damage are known before anything uses it. No telegram is kept in memory.
 
-use std::fmt;
-use std::io::{self, BufRead, BufReader, Read, Seek, SeekFrom};
+use std::io::{self, BufRead, BufReader, ErrorKind, Read, Seek, SeekFrom};
 use std::path::{Path, PathBuf};
 
+use flate2::bufread::MultiGzDecoder;
 use scanhub_drivers::line::Session as _;
-use scanhub_drivers::lms::variant::{Mode, Unit};
-use scanhub_drivers::recognize::{EXAMINED, bytes_by_family, family_of, framing_mode};
+use scanhub_drivers::recognize::{EXAMINED, bytes_by_family, family_of};
 use scanhub_drivers::{Model, Session, Settings, features};
 use scanhub_files::regular;
 use schema::{Failure, Family, Kind};
@@ -15,42 +14,18 @@ use schema::{Failure, Family, Kind};
 use crate::carmen::{self, Log};
 #[cfg(feature = "mcap")]
 use crate::mcap::{Catalog, Reader};
-use crate::packed::Packed;
-use crate::stream::{Packets, Telegrams, survey_packets, survey_telegrams};
-use crate::{Contents, Form, Frame, MountRecord, VirtualTime};
-
-/// How a log's metres become value words; a telegram stream is what it is.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Encoding {
-    /// Unit of the ranges.
-    pub unit: Unit,
-    /// How the 16 bits of a value are split.
-    pub mode: Mode,
-}
-
-/// Ranges in mm, in as many bits as a value has for them.
-impl Default for Encoding {
-    fn default() -> Encoding {
-        Encoding { unit: Unit::Mm, mode: Mode(0) }
-    }
-}
-
-/// In words.
-impl fmt::Display for Encoding {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "values of {} mm in {} bits", self.unit.mm(), self.mode.range_bits())
-    }
-}
+use crate::stream::{self, StreamReader};
+use crate::{Contents, Encoding, Form, Frame, MountRecord, VirtualTime};
 
 /// A recording that could be read to its end.
 #[derive(Clone, Debug)]
 pub struct Recording {
     path: PathBuf,
     contents: Contents,
-    /// Of an MCAP file.
+    /// Contents of an MCAP file by sensor.
     #[cfg(feature = "mcap")]
     survey: std::sync::Arc<crate::mcap::Survey>,
-    /// The sensor that was chosen.
+    /// The sensor that [`of`](Self::of) selected.
     sensor: Option<String>,
 }
 
@@ -135,14 +110,17 @@ impl Recording {
         Err(Failure::new(Kind::Input, message, "build it with feature mcap of scanhub-recording"))
     }
 
-    /// Whether a file that starts with `head` is a container, MCAP or gzip, with telegrams inside.
+    /// Returns whether a file that starts with `head` is a container with telegrams inside: MCAP or gzip.
     pub fn is_framed(head: &[u8]) -> bool {
         head.starts_with(MCAP) || head.starts_with(GZIP)
     }
 
-    /// The part of it that belongs to `sensor`.
+    /// Returns the part of the recording that belongs to `sensor`.
     ///
-    /// [`Kind::NoTopic`] with the existing ones if it has no such sensor. [`Kind::Usage`] if it names none.
+    /// # Errors
+    ///
+    /// Returns [`Kind::NoTopic`] with the existing sensors if there is no such sensor, and [`Kind::Usage`] if the recording names no
+    /// sensor.
     pub fn of(&self, sensor: &str) -> Result<Recording, Failure> {
         let place = self.path.display();
         if self.contents.sensors.is_empty() {
@@ -162,69 +140,70 @@ impl Recording {
         Ok(chosen)
     }
 
-    /// Number of the first telegram of its only sensor that the hub with this `boot` processed: from there on, the hub knew
-    /// the meaning of the values. Nothing if the recording does not contain it.
-    #[cfg(feature = "mcap")]
+    /// Returns the number of the first telegram of the only sensor that the hub with this `boot` processed further. From there on,
+    /// the hub knew the meaning of the values. Returns `None` if the recording does not contain it; only MCAP does.
     pub fn understood(&self, boot: u64) -> Option<u64> {
-        self.survey.understood(self.contents.sensors.first()?, boot)
+        #[cfg(feature = "mcap")]
+        return self.survey.understood(self.contents.sensors.first()?, boot);
+        #[cfg(not(feature = "mcap"))]
+        {
+            let _ = boot;
+            None
+        }
     }
 
-    /// Nothing: only MCAP contains it.
-    #[cfg(not(feature = "mcap"))]
-    pub fn understood(&self, _: u64) -> Option<u64> {
-        None
-    }
-
-    /// Returns the family of its first sensor; nothing if this version does not know it.
+    /// Returns the family of the first sensor; `None` if this version does not support it.
     pub fn family(&self) -> Option<Family> {
         Family::of_number(self.contents.family)
     }
 
-    /// Returns what its scanner is, if that is one whose head turns, as far as a status or its first packets tell.
+    /// Returns the model of a rotating scanner, as a status or the first packets report it.
     ///
     /// # Errors
     ///
-    /// As [`telegrams`](Self::telegrams); [`Kind::Input`] if nothing in it tells how its packets are to be read.
+    /// Returns the errors of [`telegrams`](Self::telegrams), and [`Kind::Input`] if nothing in the recording defines how its
+    /// packets must be read.
     pub fn model(&self) -> Result<Option<Model>, Failure> {
         let Some(family) = self.family().filter(|family| !features(*family).models.is_empty()) else {
             return Ok(None);
         };
         let mut models = features(family).models.iter();
-        if let Some(told) = models.find(|it| Some(it.name) == self.contents.model) {
-            return Ok(Some(*told));
+        if let Some(reported) = models.find(|it| Some(it.name) == self.contents.model) {
+            return Ok(Some(*reported));
         }
         let settings = Settings { fixed_rate: true, listen_only: true, ..Settings::default() };
         let mut session = VirtualTime::new(Session::begin(family, &settings, 0), 0);
-        // Nothing of it is encoded here.
         let mut frames = self.telegrams(Encoding::default())?;
-        let mut told = None;
-        for frame in frames.by_ref().take(TELLING) {
+        let mut model = None;
+        for frame in frames.by_ref().take(MODEL_FRAMES) {
             session.take(0, &frame.telegram, |_| {});
-            told = session.session().model();
-            if told.is_some() {
+            model = session.session().model();
+            if model.is_some() {
                 break;
             }
         }
         let missing = session.session().missing_setting();
-        if let Some(missing) = missing.filter(|_| told.is_none() && self.contents.way.is_none()) {
+        if let Some(missing) = missing.filter(|_| model.is_none() && self.contents.way.is_none()) {
             return Err(Failure::new(
                 Kind::Input,
                 format!("recording {} does not tell of which kind its packets are", self.path.display()),
                 format!("`scanhub replay` plays it where link.NAME.{missing} is set"),
             ));
         }
-        Ok(told)
+        Ok(model)
     }
 
-    /// Returns how many beams the scans of its scanner had, if that is one whose head turns, as far as they or a status
-    /// tell.
+    /// Returns the number of beams in the scans of a rotating scanner, as the scans or a status report it.
     pub fn beams(&self) -> Option<usize> {
         let scans = self.contents.beams.map(usize::from);
         scans.or_else(|| {
             let (step, features) = (self.contents.step_cdeg?, features(self.family()?));
             let model = features.models.iter().find(|model| Some(model.name) == self.contents.model);
-            let is_told = |beams: &usize| (36_000.0 / *beams as f64).round() == f64::from(step);
-            [model.map(|model| model.beams), Some(features.auto.beams)].into_iter().flatten().find(is_told)
+            let is_reported = |beams: &usize| (36_000.0 / *beams as f64).round() == f64::from(step);
+            [model.map(|model| model.beams), Some(features.auto.beams)]
+                .into_iter()
+                .flatten()
+                .find(is_reported)
         })
     }
 
@@ -239,30 +218,38 @@ impl Recording {
         Ok(Settings { model, mode, beams, fixed_rate: true, listen_only: true, ..Settings::default() })
     }
 
-    /// Where it is.
+    /// Returns the path of the file.
     pub fn path(&self) -> &Path {
         &self.path
     }
 
-    /// What is in it; after [`of`](Self::of), of that sensor.
+    /// Returns the contents: after [`of`](Self::of), those of that sensor.
     pub fn contents(&self) -> &Contents {
         &self.contents
     }
 
-    /// The file's bytes, unpacked, from the start; for a telegram stream, what a hub would have read from the line.
+    /// Returns the unpacked bytes of the file. Those of a stream file are what a hub would have read from the line.
+    ///
+    /// # Errors
+    ///
+    /// Returns [`Kind::Input`] if the file cannot be opened.
     pub fn bytes(&self) -> Result<Box<dyn Read + Send>, Failure> {
         Ok(reader(&self.path)?)
     }
 
-    /// How the values are encoded, if the recording contains that; for a log, the encoding in which its ranges are whole values.
+    /// Returns the encoding of the values, if the recording contains it. For a log, it is the encoding in which the ranges are
+    /// whole values.
     pub fn encoding(&self) -> Option<Encoding> {
         Some(Encoding { unit: self.contents.unit?, mode: self.contents.mode? })
     }
 
-    /// Its telegrams in order, replies too; a log's scans encoded as `encoding`: without loss if that is its own. If the
-    /// file becomes unreadable meanwhile, they end there.
+    /// Returns the telegrams in order, including replies. The scans of a log are encoded as `encoding`, which loses nothing if it is
+    /// the log's own. If the file becomes unreadable in the meantime, the telegrams end there.
     ///
-    /// [`Kind::Usage`] if it has several sensors and none was chosen by [`of`](Self::of).
+    /// # Errors
+    ///
+    /// Returns [`Kind::Usage`] if there are several sensors and [`of`](Self::of) selected none, and [`Kind::Input`] if the file
+    /// cannot be opened.
     pub fn telegrams(&self, encoding: Encoding) -> Result<Box<dyn Iterator<Item = Frame> + Send>, Failure> {
         let reader = reader(&self.path)?;
         Ok(match self.contents.form {
@@ -270,29 +257,12 @@ impl Recording {
                 let (mut log, own) = (Log::new(reader), self.encoding().unwrap_or(encoding));
                 Box::new(std::iter::from_fn(move || Some(log.following()?.frame(own, encoding))))
             }
-            Form::Telegrams => self.telegrams_of_stream(reader)?,
-            Form::Mcap => self.telegrams_of_sensor(reader)?,
-        })
-    }
-
-    fn telegrams_of_stream(
-        &self,
-        reader: Box<dyn BufRead + Send>,
-    ) -> Result<Box<dyn Iterator<Item = Frame> + Send>, Failure> {
-        let family = self.family().unwrap_or(Family::Lms);
-        let mode = if family == Family::Lms {
-            None
-        } else {
-            framing_mode(family, &head(&self.path).map_err(|error| unreadable(&self.path, &error))?)
-        };
-        Ok(match Packets::of(family, mode, reader) {
-            Some(mut packets) => Box::new(std::iter::from_fn(move || packets.next().ok()?)),
-            None => {
-                let mut telegrams = Telegrams::new(self::reader(&self.path)?);
-                Box::new(std::iter::from_fn(move || {
-                    Some(Frame { telegram: telegrams.next().ok()??, ..Frame::default() })
-                }))
+            Form::Telegrams => {
+                let head = head(&self.path).map_err(|error| unreadable(&self.path, &error))?;
+                let mut stream = StreamReader::new(self.family().unwrap_or(Family::Lms), &head, reader);
+                Box::new(std::iter::from_fn(move || stream.next().ok()?))
             }
+            Form::Mcap => self.telegrams_of_sensor(reader)?,
         })
     }
 
@@ -317,7 +287,7 @@ impl Recording {
         &self,
         _: Box<dyn BufRead + Send>,
     ) -> Result<Box<dyn Iterator<Item = Frame> + Send>, Failure> {
-        // None could be opened.
+        // A build without the feature opens no MCAP file.
         Ok(Box::new(std::iter::empty()))
     }
 
@@ -336,7 +306,7 @@ impl Recording {
     }
 
     /// Returns the angles of a mount and the telegrams of its machine in the order of the file. If the file becomes
-    /// unreadable meanwhile, they end there.
+    /// unreadable in the meantime, they end there.
     ///
     /// # Errors
     ///
@@ -352,13 +322,13 @@ impl Recording {
         Ok(Box::new(std::iter::empty()))
     }
 
-    /// The sensor that was chosen.
+    /// Returns the sensor that [`of`](Self::of) selected.
     #[cfg(feature = "mcap")]
     pub(crate) fn chosen(&self) -> Option<&String> {
         self.sensor.as_ref()
     }
 
-    /// When the file was last written, ns since 1970; 0 if not known.
+    /// Returns the time at which the file was last written, in ns since 1970, or 0 if it is unknown.
     #[cfg(feature = "mcap")]
     pub(crate) fn written_ns(&self) -> u64 {
         let written = std::fs::metadata(&self.path).and_then(|metadata| metadata.modified()).ok();
@@ -366,7 +336,7 @@ impl Recording {
         since.map_or(0, |since| since.as_nanos() as u64)
     }
 
-    /// It could be read before, and cannot any more.
+    /// Returns the failure of a file that has become unreadable.
     #[cfg(feature = "mcap")]
     pub(crate) fn broken(&self, error: &io::Error) -> Failure {
         unreadable(&self.path, error)
@@ -374,11 +344,11 @@ impl Recording {
 
     fn choice(&self) -> String {
         let sensors = &self.contents.sensors;
-        let more = match sensors.len().saturating_sub(TOLD) {
+        let more = match sensors.len().saturating_sub(MAX_NAMES) {
             0 => String::new(),
             more => format!(" and {more} more"),
         };
-        format!("choose one: {}{more}", sensors[..sensors.len().min(TOLD)].join(", "))
+        format!("choose one: {}{more}", sensors[..sensors.len().min(MAX_NAMES)].join(", "))
     }
 }
 
@@ -390,10 +360,7 @@ impl Recording {
 /// Returns [`Kind::Input`] if it cannot be read, or if its family is neither named nor recognized.
 fn survey_stream(path: &Path, named: Option<Family>) -> Result<Contents, Failure> {
     let head = head(path).map_err(|error| unreadable(path, &error))?;
-    let survey = |family| match family {
-        Family::Lms => survey_telegrams(path),
-        _ => survey_packets(path, family, framing_mode(family, &head)),
-    };
+    let survey = |family| stream::survey(path, family, &head);
     let of_named = named.map(survey).transpose()?;
     if let Some(contents) = of_named.as_ref().filter(|contents| contents.telegrams > 0) {
         return Ok(contents.clone());
@@ -441,7 +408,7 @@ fn without_telegram(path: &Path) -> Failure {
     Failure::new(Kind::Input, message, format!("{FORMS}; a link to a file of noise needs family=NAME"))
 }
 
-/// Whether a reader that fails so has no more to give, and the disk is not to blame: a packed file is cut or harmed.
+/// Returns whether `error` means that a packed file ends early or is damaged, and not that the disk failed.
 pub(crate) fn is_end(error: &io::Error) -> bool {
     use io::ErrorKind::{InvalidData, InvalidInput, UnexpectedEof};
     matches!(error.kind(), InvalidData | InvalidInput | UnexpectedEof)
@@ -454,7 +421,7 @@ pub(crate) fn reader(path: &Path) -> Result<Box<dyn BufRead + Send>, Failure> {
 fn open(path: &Path) -> io::Result<Box<dyn BufRead + Send>> {
     let mut file = BufReader::with_capacity(BUFFER, regular::open(path)?);
     if file.fill_buf()?.starts_with(GZIP) {
-        return Ok(Box::new(BufReader::with_capacity(BUFFER, Packed::new(file))));
+        return Ok(Box::new(BufReader::with_capacity(BUFFER, GzipReader::new(file))));
     }
     Ok(Box::new(file))
 }
@@ -502,8 +469,8 @@ fn refused(path: &Path, what: &str) -> Failure {
     Failure::new(Kind::Input, format!("recording {} {what}", path.display()), FORMS)
 }
 
-/// Sensors that a failure names.
-const TOLD: usize = 32;
+/// Maximum number of sensors that a failure names.
+const MAX_NAMES: usize = 32;
 const FORMS: &str = "a recording is an MCAP file, a stream of telegrams or a CARMEN log, plain or gzipped";
 /// First bytes of a gzip file.
 const GZIP: &[u8] = &[0x1F, 0x8B];
@@ -512,7 +479,108 @@ const MCAP: &[u8] = b"\x89MCAP0\r\n";
 /// Bytes at the beginning of a file in which records of MCAP are searched for: several samples of any topic.
 #[cfg(feature = "mcap")]
 const SEARCHED: u64 = 256 * 1024;
-/// Enough for the head of a log to show a line that tells it.
+/// Size of a read buffer in bytes. A CARMEN log is detected by the lines in the first one.
 const BUFFER: usize = 64 * 1024;
-/// Frames within which a model is known.
-const TELLING: usize = 500;
+/// Number of frames after which the packets of every model have shown it.
+const MODEL_FRAMES: usize = 500;
+
+/// Reader of a gzip file, with a limit. A kilobyte can unpack to a megabyte of the same byte, so a file that cannot be a recording
+/// is rejected early.
+struct GzipReader<R> {
+    decoder: MultiGzDecoder<Counted<R>>,
+    /// Number of unpacked bytes.
+    unpacked: u64,
+}
+
+/// Reader that counts the bytes that are read.
+struct Counted<R> {
+    input: R,
+    read: u64,
+}
+
+impl<R: BufRead> GzipReader<R> {
+    fn new(input: R) -> Self {
+        GzipReader { decoder: MultiGzDecoder::new(Counted { input, read: 0 }), unpacked: 0 }
+    }
+}
+
+impl<R: BufRead> Read for GzipReader<R> {
+    /// Returns [`ErrorKind::FileTooLarge`] if the file unpacks to more than [`MAX_RATIO`] times its length.
+    fn read(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
+        let len = self.decoder.read(buffer)?;
+        self.unpacked += len as u64;
+        let max = self.decoder.get_ref().read.saturating_mul(MAX_RATIO).max(UNLIMITED);
+        if self.unpacked > max {
+            let what =
+                format!("it unpacks to more than {MAX_RATIO} times its length, which no recording does");
+            return Err(io::Error::new(ErrorKind::FileTooLarge, what));
+        }
+        Ok(len)
+    }
+}
+
+impl<R: BufRead> Read for Counted<R> {
+    fn read(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
+        let len = self.input.read(buffer)?;
+        self.read += len as u64;
+        Ok(len)
+    }
+}
+
+impl<R: BufRead> BufRead for Counted<R> {
+    fn fill_buf(&mut self) -> io::Result<&[u8]> {
+        self.input.fill_buf()
+    }
+
+    fn consume(&mut self, len: usize) {
+        self.read += len as u64;
+        self.input.consume(len);
+    }
+}
+
+/// Maximum ratio of unpacked to packed bytes. A stream of equal telegrams has 100; the format allows 1,000.
+const MAX_RATIO: u64 = 400;
+/// Number of unpacked bytes up to which there is no limit.
+const UNLIMITED: u64 = 32 << 20;
+
+#[cfg(test)]
+mod tests {
+    use std::io::Write;
+
+    use flate2::Compression;
+    use flate2::write::GzEncoder;
+
+    use super::*;
+
+    fn packed(byte: impl Fn(usize) -> u8, len: usize) -> Vec<u8> {
+        let mut encoder = GzEncoder::new(Vec::new(), Compression::best());
+        for begin in (0..len).step_by(1 << 16) {
+            let piece: Vec<u8> = (begin..len.min(begin + (1 << 16))).map(&byte).collect();
+            encoder.write_all(&piece).unwrap();
+        }
+        encoder.finish().unwrap()
+    }
+
+    /// Returns the number of unpacked bytes, and the error that ended them.
+    fn unpacked(packed: &[u8]) -> (usize, Result<(), ErrorKind>) {
+        let (mut input, mut buffer, mut len) = (GzipReader::new(packed), vec![0; 1 << 16], 0);
+        loop {
+            match input.read(&mut buffer) {
+                Ok(0) => return (len, Ok(())),
+                Ok(read) => len += read,
+                Err(error) => return (len, Err(error.kind())),
+            }
+        }
+    }
+
+    #[test]
+    fn rejects_gzip_bomb_early() {
+        let max = UNLIMITED as usize;
+        assert_eq!(unpacked(&packed(|_| 0, max)), (max, Ok(())), "short enough for any ratio");
+        let (len, end) = unpacked(&packed(|_| 0, 3 * max));
+        assert!(len <= max && end == Err(ErrorKind::FileTooLarge), "{len} {end:?}");
+        // Equal telegrams, as from an empty room.
+        let telegram = |at: usize| (at % 732) as u8 ^ ((at % 732) >> 8) as u8;
+        assert_eq!(unpacked(&packed(telegram, 2 * max)), (2 * max, Ok(())));
+    }
+}

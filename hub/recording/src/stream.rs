@@ -1,114 +1,115 @@
-//! Streams of bytes as they arrived on a line. They contain the telegrams of an LMS or the packets of a rotating scanner, and
-//! other bytes, which are skipped and counted. A stream has no stamps. If the scanner has a clock, packets have times of that
-//! clock.
+//! Sessions and framers that read recorded bytes. [`StreamReader`] reads a stream file: bytes as they arrived on a line, without
+//! stamps. [`VirtualTime`] reads telegrams at the times at which the hub received them.
 
 use std::io::{self, Read};
 use std::path::Path;
 
-use scanhub_drivers::line::{Event, Output, Protocol as _, Session as _};
+use scanhub_drivers::line::{Event, Output, Protocol, Session as _};
 use scanhub_drivers::lms::framer::{Found, Framer, VETO_HOLD};
+use scanhub_drivers::recognize::framing_mode;
 use scanhub_drivers::{Session, Settings, features};
 use schema::{Failure, Family, MILLIS, Nanos, line_time};
 
 use crate::open::{is_end, reader, unreadable};
 use crate::{Contents, Form, Frame};
 
-/// Reads telegrams of an LMS; ends with the stream.
-pub(crate) struct Telegrams<R> {
+/// Reads the telegrams of an LMS or the packets of a rotating scanner from a stream, and counts the bytes outside them.
+pub(crate) struct StreamReader<R> {
     reader: R,
-    framer: Framer,
+    framing: Framing,
     /// Whether the reader is at its end.
-    ended: bool,
+    is_ended: bool,
 }
 
-impl<R: Read> Telegrams<R> {
-    pub(crate) fn new(reader: R) -> Self {
-        Telegrams { reader, framer: Framer::default(), ended: false }
-    }
-
-    /// Returns the number of bytes so far outside telegrams. It is complete at the end.
-    pub(crate) fn discarded(&self) -> u64 {
-        let open = if self.ended { self.framer.buffered() as u64 } else { 0 };
-        self.framer.tally().discarded + open
-    }
-
-    /// Returns the next whole telegram; `None` at the end.
-    pub(crate) fn next(&mut self) -> io::Result<Option<Vec<u8>>> {
-        loop {
-            while let Some(found) = self.framer.poll() {
-                if let Found::Telegram(framed) = found {
-                    return Ok(Some(framed.telegram.bytes().to_vec()));
-                }
-            }
-            if self.ended {
-                return Ok(None);
-            }
-            match self.reader.read(self.framer.spare()) {
-                Ok(0) => {
-                    self.ended = true;
-                    self.framer.release(VETO_HOLD);
-                }
-                Ok(len) => self.framer.commit(len),
-                Err(error) if error.kind() == io::ErrorKind::Interrupted => {}
-                Err(error) => return Err(error),
-            }
-        }
-    }
+enum Framing {
+    Telegrams(Box<Framer>),
+    Packets(Box<Packets>),
 }
 
-/// Reads packets of a rotating scanner; ends with the stream.
-pub(crate) struct Packets<R> {
-    reader: R,
+struct Packets {
     session: Session,
     family: Family,
     /// The scanner's clock at the last packets.
     last: Option<Nanos>,
     /// Time since the first packets.
     passed: Nanos,
-    ended: bool,
 }
 
-impl<R: Read> Packets<R> {
-    /// Reads packets of `family`, which are split as those of `mode`, if that is given. `None` if the family sends no packets.
-    pub(crate) fn of(family: Family, mode: Option<&'static str>, reader: R) -> Option<Packets<R>> {
-        if features(family).has_whole_telegrams {
-            return None;
-        }
-        let settings = Settings { mode, fixed_rate: true, listen_only: true, ..Settings::default() };
-        let session = Session::begin(family, &settings, 0);
-        Some(Packets { reader, session, family, last: None, passed: 0, ended: false })
+impl<R: Read> StreamReader<R> {
+    /// Creates a reader of a stream of `family`. The first bytes of the stream, `head`, show in which mode its packets are framed.
+    pub(crate) fn new(family: Family, head: &[u8], reader: R) -> StreamReader<R> {
+        let framing = if features(family).has_whole_telegrams {
+            Framing::Telegrams(Box::default())
+        } else {
+            let mode = framing_mode(family, head);
+            let settings = Settings { mode, fixed_rate: true, listen_only: true, ..Settings::default() };
+            let session = Session::begin(family, &settings, 0);
+            Framing::Packets(Box::new(Packets { session, family, last: None, passed: 0 }))
+        };
+        StreamReader { reader, framing, is_ended: false }
     }
 
-    /// Returns the number of bytes so far outside packets. It is complete at the end.
-    pub(crate) fn discarded(&self) -> u64 {
-        let account = self.session.account();
-        account.discarded + if self.ended { account.buffered } else { 0 }
+    /// Returns the number of bytes so far outside telegrams and packets. It is complete at the end.
+    fn discarded(&self) -> u64 {
+        let (discarded, buffered) = match &self.framing {
+            Framing::Telegrams(framer) => (framer.tally().discarded, framer.buffered() as u64),
+            Framing::Packets(packets) => {
+                let account = packets.session.account();
+                (account.discarded, account.buffered)
+            }
+        };
+        discarded + if self.is_ended { buffered } else { 0 }
     }
 
-    /// Returns the next packets; `None` at the end.
+    /// Returns the next telegram or packets; `None` at the end.
+    ///
+    /// # Errors
+    ///
+    /// Returns the error of the reader.
     pub(crate) fn next(&mut self) -> io::Result<Option<Frame>> {
         loop {
-            if let Some(frame) = self.heard() {
-                return Ok(Some(frame));
+            let frame = match &mut self.framing {
+                Framing::Telegrams(framer) => next_telegram(framer),
+                Framing::Packets(packets) => packets.next(),
+            };
+            if frame.is_some() || self.is_ended {
+                return Ok(frame);
             }
-            if self.ended {
-                return Ok(None);
-            }
-            match self.reader.read(self.session.spare()) {
-                Ok(0) => {
-                    self.ended = true;
-                    self.session.commit(0, 0);
-                    // No more bytes can refute packets that are held back.
-                    self.session.handle_timeout(IDLE);
-                }
-                Ok(len) => self.session.commit(0, len),
-                Err(error) if error.kind() == io::ErrorKind::Interrupted => {}
+            let spare = match &mut self.framing {
+                Framing::Telegrams(framer) => framer.spare(),
+                Framing::Packets(packets) => packets.session.spare(),
+            };
+            let len = match self.reader.read(spare) {
+                Ok(len) => len,
+                Err(error) if error.kind() == io::ErrorKind::Interrupted => continue,
                 Err(error) => return Err(error),
+            };
+            self.is_ended = len == 0;
+            match &mut self.framing {
+                Framing::Telegrams(framer) if self.is_ended => framer.release(VETO_HOLD),
+                Framing::Telegrams(framer) => framer.commit(len),
+                Framing::Packets(packets) => {
+                    packets.session.commit(0, len);
+                    if self.is_ended {
+                        // No more bytes can refute packets that are held back.
+                        packets.session.handle_timeout(IDLE);
+                    }
+                }
             }
         }
     }
+}
 
-    fn heard(&mut self) -> Option<Frame> {
+fn next_telegram(framer: &mut Framer) -> Option<Frame> {
+    loop {
+        if let Found::Telegram(framed) = framer.poll()? {
+            return Some(Frame { telegram: framed.telegram.bytes().to_vec(), ..Frame::default() });
+        }
+    }
+}
+
+impl Packets {
+    fn next(&mut self) -> Option<Frame> {
         let (telegram, reasons) = loop {
             match self.session.poll_output() {
                 Output::Event(Event::Telegram(received)) => {
@@ -140,59 +141,98 @@ impl<R: Read> Packets<R> {
     }
 }
 
-/// Reads the stream at `path` for telegrams of an LMS.
+/// Reads the stream at `path` as one of `family`. Its first bytes are `head`.
 ///
 /// # Errors
 ///
 /// Returns [`Kind::Input`](schema::Kind::Input) if it cannot be read.
-pub(crate) fn survey_telegrams(path: &Path) -> Result<Contents, Failure> {
-    let mut telegrams = Telegrams::new(reader(path)?);
-    let mut contents = survey(path, Family::Lms, || {
-        Ok(telegrams.next()?.map(|telegram| Frame { telegram, ..Frame::default() }))
-    })?;
-    contents.damage.bytes = telegrams.discarded();
-    Ok(contents)
-}
-
-/// Reads the stream at `path` for packets of `family`, which is not that of an LMS. They are split as those of `mode`, if that is
-/// given.
-///
-/// # Errors
-///
-/// Returns [`Kind::Input`](schema::Kind::Input) if it cannot be read.
-pub(crate) fn survey_packets(
-    path: &Path,
-    family: Family,
-    mode: Option<&'static str>,
-) -> Result<Contents, Failure> {
-    let Some(mut packets) = Packets::of(family, mode, reader(path)?) else {
-        return Ok(Contents::new(Form::Telegrams));
-    };
-    let mut contents = survey(path, family, || packets.next())?;
-    contents.damage.bytes = packets.discarded();
-    Ok(contents)
-}
-
-/// Returns the contents of the telegrams or packets that `next` reads from the stream at `path`.
-fn survey(
-    path: &Path,
-    family: Family,
-    mut next: impl FnMut() -> io::Result<Option<Frame>>,
-) -> Result<Contents, Failure> {
-    let mut contents = Contents { family: family as u8, ..Contents::new(Form::Telegrams) };
+pub(crate) fn survey(path: &Path, family: Family, head: &[u8]) -> Result<Contents, Failure> {
+    let mut stream = StreamReader::new(family, head, reader(path)?);
+    let mut contents = Contents { form: Form::Telegrams, family: family as u8, ..Contents::default() };
     loop {
-        match next() {
+        match stream.next() {
             Ok(Some(frame)) => {
                 contents.note(frame.family, &frame.telegram, None);
                 contents.scanner_ns = frame.scanner_ns;
             }
-            Ok(None) => return Ok(contents),
+            Ok(None) => break,
             Err(error) if is_end(&error) && contents.telegrams > 0 => {
                 contents.damage.is_cut = true;
-                return Ok(contents);
+                break;
             }
             Err(error) => return Err(unreadable(path, &error)),
         }
+    }
+    contents.damage.bytes = stream.discarded();
+    Ok(contents)
+}
+
+/// A session in the time of a recording. It receives each packet at the time at which the hub that recorded it received it, and
+/// its timers expire in between. It therefore produces from the packets what they produced then.
+pub struct VirtualTime<S> {
+    session: S,
+    now: Nanos,
+    /// Time of the session's next timeout.
+    until: Nanos,
+}
+
+impl<S: Protocol> VirtualTime<S> {
+    /// Creates the time of `session`, which began at `now`.
+    pub fn new(session: S, now: Nanos) -> VirtualTime<S> {
+        VirtualTime { session, now, until: now }
+    }
+
+    /// Returns the session.
+    pub fn session(&self) -> &S {
+        &self.session
+    }
+
+    /// Returns the session, to change it.
+    pub fn session_mut(&mut self) -> &mut S {
+        &mut self.session
+    }
+
+    /// Advances the time to `now`, and then passes `bytes` to the session. `handle` receives the events. Time never goes
+    /// back: an earlier `now` counts as the last one.
+    pub fn take(&mut self, now: Nanos, bytes: &[u8], mut handle: impl FnMut(Event<'_>)) {
+        let now = now.max(self.now);
+        while self.until < now {
+            self.now = self.until.max(self.now);
+            self.session.spare();
+            self.session.commit(self.now, 0);
+            self.session.handle_timeout(self.now);
+            self.drain(&mut handle);
+            // The next timeout is later, or time would stand still.
+            self.until = self.until.max(self.now + 1);
+        }
+        self.now = now;
+        let mut bytes = bytes;
+        while !bytes.is_empty() {
+            let room = self.session.spare();
+            let (taken, rest) = bytes.split_at(bytes.len().min(room.len()));
+            room[..taken.len()].copy_from_slice(taken);
+            self.session.commit(now, taken.len());
+            self.drain(&mut handle);
+            bytes = rest;
+        }
+    }
+
+    fn drain(&mut self, handle: &mut impl FnMut(Event<'_>)) {
+        self.until = loop {
+            let is_sent = match self.session.poll_output() {
+                Output::Transmit { .. } => true,
+                Output::Event(event) => {
+                    handle(event);
+                    false
+                }
+                Output::SetRate(_) | Output::SetDtr(_) => false,
+                Output::Rest(until) | Output::Wait { until, .. } => break until,
+            };
+            // A recording does not reply.
+            if is_sent {
+                self.session.transmitted(self.now);
+            }
+        };
     }
 }
 
