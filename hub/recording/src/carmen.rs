@@ -1,8 +1,8 @@
 //! CARMEN logs: text files in which lines that start with `FLASER n r1 .. rn ..`, `ROBOTLASER1` and `RAWLASER1` are scans in
 //! meters.
 //!
-//! [`Log`] reads the scans, [`Census`] chooses the unit and the bits in which their ranges are whole values, and
-//! [`Sweep::frame`] turns a scan into the telegram that an LMS 2xx would have sent. In the other direction, [`scan_line`] writes a
+//! [`Log`] reads the scans, [`RangeStats`] chooses the unit and the bits in which their ranges are whole values, and
+//! [`LogScan::frame`] turns a scan into the telegram that an LMS 2xx would have sent. In the other direction, [`scan_line`] writes a
 //! telegram as a line. Poses and all other lines are not read, but counted ([`Unread`]).
 
 use std::fmt;
@@ -25,7 +25,7 @@ use crate::{Contents, Encoding, Form, Frame};
 
 /// A scan of a log.
 #[derive(Clone, Debug, PartialEq)]
-pub(crate) struct Sweep {
+pub(crate) struct LogScan {
     pub(crate) form: LineForm,
     /// Ranges in meters, from right to left.
     pub(crate) ranges_m: Vec<f64>,
@@ -90,13 +90,13 @@ impl LineForm {
     }
 }
 
-impl Sweep {
+impl LogScan {
     /// Parses `line`; `Ok(None)` if it is another kind of line.
     ///
     /// # Errors
     ///
     /// Returns a description of the mistake in the line.
-    pub(crate) fn parse(line: &str) -> Result<Option<Sweep>, String> {
+    pub(crate) fn parse(line: &str) -> Result<Option<LogScan>, String> {
         let mut fields = line.split_ascii_whitespace();
         let Some(form) = fields.next().and_then(LineForm::of) else { return Ok(None) };
         // Type, start angle, field of view in radians, resolution, maximum range, accuracy, remission mode.
@@ -127,14 +127,14 @@ impl Sweep {
             LineForm::RobotLaser => (remissions(fields.next()), 11),
             LineForm::RawLaser => (remissions(fields.next()), 0),
         };
-        let mut sweep =
-            Sweep { form, ranges_m, time_ns: None, has_pose: false, has_remissions: remissions > Some(0) };
-        let Some(remissions) = remissions else { return Ok(Some(sweep)) };
+        let mut log_scan =
+            LogScan { form, ranges_m, time_ns: None, has_pose: false, has_remissions: remissions > Some(0) };
+        let Some(remissions) = remissions else { return Ok(Some(log_scan)) };
         let mut rest = fields.skip(remissions);
         let poses: Vec<&str> = rest.by_ref().take(numbers).take(POSES).collect();
-        sweep.has_pose = poses.iter().any(|field| field.parse().is_ok_and(|number: f64| number != 0.0));
-        sweep.time_ns = rest.nth(numbers.saturating_sub(POSES)).and_then(nanoseconds);
-        Ok(Some(sweep))
+        log_scan.has_pose = poses.iter().any(|field| field.parse().is_ok_and(|number: f64| number != 0.0));
+        log_scan.time_ns = rest.nth(numbers.saturating_sub(POSES)).and_then(nanoseconds);
+        Ok(Some(log_scan))
     }
 
     /// Returns the variant with this number of beams.
@@ -243,7 +243,7 @@ pub(crate) struct Log<R> {
 
 /// Reason why no scan can be returned.
 #[derive(Debug)]
-pub(crate) enum Wrong {
+pub(crate) enum LogError {
     /// The line is wrong, as described.
     Line(String),
     /// The file cannot be read.
@@ -256,46 +256,53 @@ impl<R: BufRead> Log<R> {
     }
 
     /// Returns the next scan. A last line without its end that is not a scan is where the recording broke off, not a mistake.
-    pub(crate) fn next(&mut self) -> Result<Option<Sweep>, Wrong> {
+    pub(crate) fn next(&mut self) -> Result<Option<LogScan>, LogError> {
         let mut bytes = Vec::new();
         loop {
             bytes.clear();
-            if self.reader.by_ref().take(LONGEST).read_until(b'\n', &mut bytes).map_err(Wrong::File)? == 0 {
+            if self
+                .reader
+                .by_ref()
+                .take(MAX_LINE_LEN)
+                .read_until(b'\n', &mut bytes)
+                .map_err(LogError::File)?
+                == 0
+            {
                 return Ok(None);
             }
             self.line += 1;
-            let is_last = bytes.last() != Some(&b'\n') && bytes.len() < LONGEST as usize;
+            let is_last = bytes.last() != Some(&b'\n') && bytes.len() < MAX_LINE_LEN as usize;
             let line = String::from_utf8_lossy(&bytes);
             if let Some(encoding) = told(&line) {
                 self.told = self.told.or(Some(encoding));
             }
-            match Sweep::parse(&line) {
+            match LogScan::parse(&line) {
                 Ok(None) => match line.split_ascii_whitespace().next() {
                     Some("ODOM") => self.unread.odometry += 1,
                     Some(word) if !word.starts_with('#') => self.unread.lines += 1,
                     _ => {}
                 },
-                Ok(Some(sweep)) if *self.form.get_or_insert(sweep.form) != sweep.form => {
+                Ok(Some(log_scan)) if *self.form.get_or_insert(log_scan.form) != log_scan.form => {
                     self.unread.lines += 1;
                 }
-                Ok(Some(sweep)) => {
-                    self.unread.poses += u64::from(sweep.has_pose);
-                    self.unread.remissions += u64::from(sweep.has_remissions);
-                    return Ok(Some(sweep));
+                Ok(Some(log_scan)) => {
+                    self.unread.poses += u64::from(log_scan.has_pose);
+                    self.unread.remissions += u64::from(log_scan.has_remissions);
+                    return Ok(Some(log_scan));
                 }
                 Err(_) if is_last => return Ok(None),
-                Err(wrong) => return Err(Wrong::Line(wrong)),
+                Err(wrong) => return Err(LogError::Line(wrong)),
             }
         }
     }
 
     /// Returns the next scan of a log that was read before: wrong lines are skipped, and it ends where the file cannot be read.
-    pub(crate) fn following(&mut self) -> Option<Sweep> {
+    pub(crate) fn following(&mut self) -> Option<LogScan> {
         loop {
             match self.next() {
-                Ok(sweep) => return sweep,
-                Err(Wrong::Line(_)) => {}
-                Err(Wrong::File(_)) => return None,
+                Ok(log_scan) => return log_scan,
+                Err(LogError::Line(_)) => {}
+                Err(LogError::File(_)) => return None,
             }
         }
     }
@@ -322,20 +329,20 @@ fn told(line: &str) -> Option<Encoding> {
 /// Returns [`Kind::Input`] if it cannot be read, or if none of its lines is a valid scan.
 pub(crate) fn survey(path: &Path, reader: impl BufRead) -> Result<Contents, Failure> {
     let mut contents = Contents { form: Form::Carmen, ..Contents::default() };
-    let (mut log, mut census, mut refusal) = (Log::new(reader), Census::default(), None);
+    let (mut log, mut stats, mut refusal) = (Log::new(reader), RangeStats::default(), None);
     loop {
         match log.next() {
-            Ok(Some(sweep)) => {
-                contents.note_scan(sweep.variant(), sweep.time_ns);
-                census.note(&sweep.ranges_m);
+            Ok(Some(log_scan)) => {
+                contents.note_scan(log_scan.variant(), log_scan.time_ns);
+                stats.note(&log_scan.ranges_m);
             }
             Ok(None) => break,
-            Err(Wrong::File(error)) if is_end(&error) && contents.scans > 0 => {
+            Err(LogError::File(error)) if is_end(&error) && contents.scans > 0 => {
                 contents.damage.is_cut = true;
                 break;
             }
-            Err(Wrong::File(error)) => return Err(unreadable(path, &error)),
-            Err(Wrong::Line(wrong)) => {
+            Err(LogError::File(error)) => return Err(unreadable(path, &error)),
+            Err(LogError::Line(wrong)) => {
                 let message = format!("{}:{}: {wrong}", path.display(), log.line);
                 let hint = "a scan is: FLASER 361 RANGE... in meters";
                 refusal.get_or_insert(Failure::new(Kind::Input, message, hint));
@@ -345,7 +352,7 @@ pub(crate) fn survey(path: &Path, reader: impl BufRead) -> Result<Contents, Fail
         }
     }
     contents.unread = log.unread;
-    let (encoding, unfit) = census.encoding(log.told);
+    let (encoding, unfit) = stats.encoding(log.told);
     (contents.unit, contents.mode, contents.unfit) = (Some(encoding.unit), Some(encoding.mode), unfit);
     // If no line is right, the format is wrong, not the file.
     match refusal.filter(|_| contents.scans == 0) {
@@ -362,7 +369,7 @@ pub(crate) fn is_log(head: &[u8]) -> bool {
 /// Statistics of the ranges of a log, from which their encoding is chosen. In a log, a code of the scanner is one of the
 /// largest ranges that the encoding can hold.
 #[derive(Clone, Copy, Debug, Default)]
-pub(crate) struct Census {
+pub(crate) struct RangeStats {
     /// Number of ranges that are not whole centimeters, and that are not whole millimeters.
     finer: [u64; 2],
     /// Longest range that a value can hold.
@@ -380,7 +387,7 @@ pub struct Unfit {
     pub beyond: u64,
 }
 
-impl Census {
+impl RangeStats {
     /// Counts a scan.
     pub(crate) fn note(&mut self, ranges_m: &[f64]) {
         for &range_m in ranges_m.iter().filter(|range_m| range_m.is_finite() && **range_m >= 0.0) {
@@ -482,7 +489,7 @@ const FIRST_WORDS: [&[u8]; 6] =
 /// Beginning of the line that names the encoding of the ranges.
 const TOLD: &str = "# LMS 2xx values:";
 /// Maximum length of a line in bytes.
-const LONGEST: u64 = 1 << 20;
+const MAX_LINE_LEN: u64 = 1 << 20;
 /// Measuring modes without reflector levels, by the bits of a range: 13, 14, 15.
 const MODES: [Mode; 3] = [Mode(0x00), Mode(0x04), Mode(0x06)];
 /// Encoding with the longest maximum range.
@@ -518,10 +525,10 @@ mod tests {
 
     #[test]
     fn a_scan_becomes_the_telegram_of_a_sensor() {
-        let sweep = Sweep::parse(&line(180, "2.5")).unwrap().unwrap();
-        assert_eq!((sweep.time_ns, sweep.has_pose), (Some(1_071_078_720_500_000_000), true));
+        let log_scan = LogScan::parse(&line(180, "2.5")).unwrap().unwrap();
+        assert_eq!((log_scan.time_ns, log_scan.has_pose), (Some(1_071_078_720_500_000_000), true));
         let mm = encoding(Unit::Mm, 1);
-        let frame = sweep.frame(mm, mm);
+        let frame = log_scan.frame(mm, mm);
         assert_eq!(frame.wall_ns, Some(1_071_078_720_500_000_000));
         let measured = Measured::decode(Telegram::check(&frame.telegram).unwrap()).unwrap();
         let words: Vec<u16> = measured.words().collect();
@@ -532,8 +539,8 @@ mod tests {
     fn ranges_are_rounded_and_what_is_too_far_has_its_code() {
         // Of a log that can say all of them.
         let word = |range: &str, unit, mode| {
-            let sweep = Sweep::parse(&line(361, range)).unwrap().unwrap();
-            sweep.words(encoding(Unit::Cm, 6), encoding(unit, mode))[0]
+            let log_scan = LogScan::parse(&line(361, range)).unwrap().unwrap();
+            log_scan.words(encoding(Unit::Cm, 6), encoding(unit, mode))[0]
         };
         assert_eq!(word("8.1824", Unit::Mm, 1), 8182);
         assert_eq!(word("8.1830", Unit::Mm, 1), 8183);
@@ -547,8 +554,9 @@ mod tests {
 
     #[test]
     fn a_code_stays_that_code_in_every_encoding() {
-        let word =
-            |range: &str, own, other| Sweep::parse(&line(181, range)).unwrap().unwrap().words(own, other)[7];
+        let word = |range: &str, own, other| {
+            LogScan::parse(&line(181, range)).unwrap().unwrap().words(own, other)[7]
+        };
         let (cm, mm14, mm15) = (encoding(Unit::Cm, 0), encoding(Unit::Mm, 4), encoding(Unit::Mm, 6));
         for (range, code) in [("81.91", 0), ("81.90", 1), ("81.87", 4), ("81.83", 8)] {
             assert_eq!((word(range, cm, cm), word(range, cm, mm14)), (8191 - code, 16383 - code), "{range}");
@@ -566,28 +574,28 @@ mod tests {
             format!("ROBOTLASER1 {sensor} 361 {ranges} 2 7 8 1 2 3 1 2 3 0 0 0.1 0.2 0.3 12.25 host 1\n"),
             format!("RAWLASER1 {sensor} 361 {ranges} 0 12.25 host 1\n"),
         ] {
-            let sweep = Sweep::parse(&line).unwrap().unwrap();
+            let log_scan = LogScan::parse(&line).unwrap().unwrap();
             assert_eq!(
-                (sweep.ranges_m.len(), sweep.ranges_m[360], sweep.time_ns),
+                (log_scan.ranges_m.len(), log_scan.ranges_m[360], log_scan.time_ns),
                 (361, 2.5, Some(12_250_000_000)),
                 "{line}"
             );
         }
         let wide = format!("RAWLASER1 {} 361 {ranges} 0 1 host 1", sensor.replace("3.141593", "4.18"));
-        assert!(Sweep::parse(&wide).unwrap_err().contains("361 beams over 239.5 degrees"));
-        assert!(Sweep::parse("ROBOTLASER1 0 1").unwrap_err().contains("no field of view"));
-        assert_eq!(Sweep::parse("ROBOTLASER2 0 1"), Ok(None));
+        assert!(LogScan::parse(&wide).unwrap_err().contains("361 beams over 239.5 degrees"));
+        assert!(LogScan::parse("ROBOTLASER1 0 1").unwrap_err().contains("no field of view"));
+        assert_eq!(LogScan::parse("ROBOTLASER2 0 1"), Ok(None));
     }
 
     #[test]
     fn a_wrong_line_says_what_is_wrong() {
-        assert_eq!(Sweep::parse("ODOM 1 2 3"), Ok(None));
-        assert!(Sweep::parse("FLASER x").unwrap_err().contains("not a number of beams"));
-        assert!(Sweep::parse("FLASER 17 1").unwrap_err().contains("17 beams"));
-        assert!(Sweep::parse("FLASER 181 1 2").unwrap_err().contains("2 ranges"));
-        assert!(Sweep::parse(&line(101, "2,5")).unwrap_err().contains("2,5"));
+        assert_eq!(LogScan::parse("ODOM 1 2 3"), Ok(None));
+        assert!(LogScan::parse("FLASER x").unwrap_err().contains("not a number of beams"));
+        assert!(LogScan::parse("FLASER 17 1").unwrap_err().contains("17 beams"));
+        assert!(LogScan::parse("FLASER 181 1 2").unwrap_err().contains("2 ranges"));
+        assert!(LogScan::parse(&line(101, "2,5")).unwrap_err().contains("2,5"));
         assert_eq!(
-            Sweep::parse(&line(101, "1").replace("1071078720.5", "x")).unwrap().unwrap().time_ns,
+            LogScan::parse(&line(101, "1").replace("1071078720.5", "x")).unwrap().unwrap().time_ns,
             None
         );
     }
@@ -614,8 +622,8 @@ mod tests {
     #[test]
     fn a_scan_says_whether_it_has_a_pose_and_remissions() {
         let has = |line: &str| {
-            let sweep = Sweep::parse(line).unwrap().unwrap();
-            (sweep.has_pose, sweep.has_remissions)
+            let log_scan = LogScan::parse(line).unwrap().unwrap();
+            (log_scan.has_pose, log_scan.has_remissions)
         };
         let ranges = vec!["2.5"; 181].join(" ");
         assert_eq!(has(&format!("FLASER 181 {ranges} 0 0.0 0 0 0 0 12.25 host 1")), (false, false));
@@ -630,9 +638,9 @@ mod tests {
     }
 
     fn chosen(ranges_m: &[f64], told: Option<Encoding>) -> (u8, u8, Unfit) {
-        let mut census = Census::default();
-        census.note(ranges_m);
-        let (encoding, unfit) = census.encoding(told);
+        let mut stats = RangeStats::default();
+        stats.note(ranges_m);
+        let (encoding, unfit) = stats.encoding(told);
         (encoding.unit.mm(), encoding.mode.range_bits(), unfit)
     }
 
@@ -686,10 +694,10 @@ mod tests {
         let first = 1_071_078_720_000_000_000 + 100_000_400;
         let again = scan_line(telegram.bytes(), Mode(1), 1_071_078_720_123_456_500, first).unwrap();
         assert!(again.ends_with(" scanhub 0.023457\n"), "{again}");
-        let sweep = Sweep::parse(&line).unwrap().unwrap();
-        assert_eq!(sweep.ranges_m[..4], [5.0, 81.91, 81.83, 12.34]);
+        let log_scan = LogScan::parse(&line).unwrap().unwrap();
+        assert_eq!(log_scan.ranges_m[..4], [5.0, 81.91, 81.83, 12.34]);
         let cm = Encoding { unit: Unit::Cm, mode: Mode(0) };
-        assert_eq!(sweep.words(cm, cm)[..4], [500, 8191, 8183, 1234]);
+        assert_eq!(log_scan.words(cm, cm)[..4], [500, 8191, 8183, 1234]);
         words[180] = 8191 - LEFT_OUT;
         let line = scan_line(measured::encode(0, Unit::Cm, &words, 0x10).bytes(), Mode(1), 1, 1).unwrap();
         assert!(line.starts_with("FLASER 180 5.00 81.91 81.83 12.34"), "{line}");

@@ -1,84 +1,80 @@
 //! Writes a recording in the same format or another. A damaged file becomes an intact one with everything that can be read
 //! from it.
 
-mod copy;
-mod output;
 mod scans;
-mod stream_head;
-mod views;
+mod writers;
 
 use std::cell::Cell;
 use std::io::{self, BufWriter, Write};
+use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
 
-use scanhub_drivers::lms::variant::{Baud, Mode, Unit};
-use scanhub_files::output::unwritable;
+use flate2::write::GzEncoder;
+use scanhub_drivers::lms::variant::{Mode, Unit};
+use scanhub_files::output::{OutputFile, unwritable};
 use schema::csv::{MarkColumns, ScanColumns};
-use schema::file::{Compression, Writer};
-use schema::{Failure, Family, Flags, Header, Kind, Topic, check_followed};
+use schema::file::Compression;
+use schema::{Failure, Family, Kind, Topic, check_followed};
 
-use crate::{Damage, Encoding, Form, Frame, Recording, Unread, carmen};
-use output::{Output, Packing};
-use scans::{Sight, Times};
-use stream_head::stream_heads;
-use views::{Csv, Ros2, View, write_marks};
+use crate::{Damage, Encoding, Form, Frame, Recording, Unread};
+use writers::{Csv, Ros2};
 
-/// What to convert.
+/// Options of a conversion.
 #[derive(Clone, Debug, Default)]
 pub struct ConvertOptions {
     /// The recording, of any form.
     pub input: PathBuf,
     /// Family of a stream file; `None` if it is recognized by the bytes.
     pub family: Option<Family>,
-    /// What it becomes: the form is that of the ending; `-` is a telegram stream on stdout.
+    /// Path of the output, whose ending selects the format; `-` is a telegram stream on stdout.
     pub output: PathBuf,
-    /// Which sensor of the recording; of a stream or a log the name that it gets in an MCAP file.
+    /// Sensor of the recording; for a stream or a log its name in an MCAP file.
     pub sensor: Option<String>,
-    /// Overwrite an existing file.
+    /// Whether to overwrite an existing file.
     pub force: bool,
-    /// An MCAP file with only messages of ROS 2.
+    /// Whether to write an MCAP file with only messages of ROS 2.
     pub ros2: bool,
-    /// For ROS 2: each scan also as a PointCloud2.
+    /// Whether ROS 2 output has each scan also as a PointCloud2.
     pub points: bool,
     /// For scans: the measuring mode of a recording that does not contain it.
     pub mode: Option<Mode>,
     /// For CSV: `SENSOR/scan` or `SENSOR/marks`.
     pub topic: Option<String>,
-    /// For CSV: ranges in meters.
+    /// Whether CSV output has ranges in meters.
     pub meters: bool,
-    /// For CSV: columns for intensities.
+    /// Whether CSV output has columns for intensities.
     pub intensities: bool,
-    /// How an MCAP file is packed, if not as usual.
+    /// Compression of an MCAP file; `None` is the default.
     pub compression: Option<Compression>,
 }
 
-/// What was converted.
+/// Result of a conversion.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Converted {
     /// Formats of the input and of the output.
     pub forms: (Form, Target),
     /// How the ranges of a log are encoded as values; `None` for other formats.
     pub encoding: Option<Encoding>,
-    /// Its sensors; of one that names none the name that it gets in an MCAP file.
+    /// Sensors of the recording; if it names none, the name in an MCAP file.
     pub sensors: Vec<String>,
     /// Telegrams that were written.
     pub telegrams: u64,
-    /// Scans that were written; of marks, scans whose marks were written.
+    /// Scans that were written; for marks, scans whose marks were written.
     pub scans: u64,
-    /// Marks that were written; `None` if these were not asked for.
+    /// Marks that were written; `None` if they were not requested.
     pub marks: Option<u64>,
-    /// Telegrams that the form cannot hold: in a CARMEN log all but whole scans, for ROS 2 and in columns all but scans. The
-    /// reply that stands for the encoding of a log does not count.
+    /// Telegrams that the format cannot hold: in a CARMEN log all but whole scans, for ROS 2 and CSV all but scans. The reply that
+    /// contains the encoding of a log does not count.
     pub left_out: u64,
     /// Data of a log that no telegram holds.
     pub unread: Unread,
-    /// From the first telegram to the last one, in ns, as stamps say: the recording's, or those that were made for it.
-    /// Nothing if there are neither.
+    /// Time from the first telegram to the last one in ns, by the stamps of the recording or by generated ones; `None` if there
+    /// are neither.
     pub took_ns: Option<u64>,
-    /// What was missing of the recording.
+    /// Data that could not be read.
     pub damage: Damage,
-    /// The reader of stdout closed it before the end.
+    /// Whether the reader of stdout closed it before the end.
     pub is_closed: bool,
 }
 
@@ -107,11 +103,15 @@ impl Target {
 }
 
 /// Converts according to `options` until `stop` is set; calls `progress` with the telegrams written and their total. A
-/// closed stdout is not an error.
+/// closed stdout is not an error. After an error, no output remains.
 ///
-/// [`Kind::Input`] if the recording cannot be read, or not be converted without loss, [`Kind::NoTopic`] if it has no such
-/// sensor, [`Kind::Usage`] if the output format is not known or options contradict each other, [`Kind::Output`] if the
-/// output exists or cannot be written, [`Kind::Interrupted`] if it was stopped. No output is left then.
+/// # Errors
+///
+/// - [`Kind::Input`] if the recording cannot be read, or not be converted without loss.
+/// - [`Kind::NoTopic`] if it has no such sensor.
+/// - [`Kind::Usage`] if the output format is unknown, or options contradict each other.
+/// - [`Kind::Output`] if the output exists or cannot be written.
+/// - [`Kind::Interrupted`] if the conversion was stopped.
 pub fn convert(
     options: &ConvertOptions,
     stop: &AtomicBool,
@@ -129,19 +129,6 @@ pub fn convert(
         None => whole,
     };
     let contents = recording.contents();
-    let mut converted = Converted {
-        forms: (contents.form, target),
-        encoding: recording.encoding().filter(|_| contents.form == Form::Carmen),
-        sensors: contents.sensors.clone(),
-        telegrams: 0,
-        scans: 0,
-        marks: None,
-        left_out: 0,
-        unread: contents.unread,
-        took_ns: None,
-        damage: contents.damage,
-        is_closed: false,
-    };
     // Marks are copied, whatever the encoding of the scans.
     let encoding = match target {
         Target::MarksCsv => Encoding { unit: Unit::Cm, mode: Mode(0) },
@@ -152,76 +139,119 @@ pub fn convert(
         // Fails before anything is written if the file has several sensors and none was chosen.
         drop(recording.telegrams(encoding)?);
     }
-    let mut file = BufWriter::with_capacity(BUFFER, output);
-    let is_closed = Cell::new(false);
-    let failed = |error: io::Error| {
-        is_closed.set(Output::is_closed(&options.output, &error));
-        unwritable(&options.output, &error)
+    let mut conversion = Conversion {
+        recording: &recording,
+        options,
+        sensor: chosen.unwrap_or(SENSOR),
+        encoding,
+        stop,
+        progress: &mut progress,
+        done: 0,
+        first_ns: None,
+        converted: Converted {
+            forms: (contents.form, target),
+            encoding: recording.encoding().filter(|_| contents.form == Form::Carmen),
+            sensors: contents.sensors.clone(),
+            telegrams: 0,
+            scans: 0,
+            marks: None,
+            left_out: 0,
+            unread: contents.unread,
+            took_ns: None,
+            damage: contents.damage,
+            is_closed: false,
+        },
+        is_closed: Cell::new(false),
     };
-    let mut first_ns = None;
-    let mut done = 0_u64;
-    let mut count = |written: Written, at_ns: Option<u64>| {
+    let mut file = BufWriter::with_capacity(BUFFER, output);
+    let written = conversion.write(target, &mut file);
+    let failed = |error| conversion.failed(error);
+    let flushed = written.and_then(|()| file.flush().map_err(failed));
+    match flushed.and_then(|()| file.into_inner().map_err(|error| failed(error.into_error()))) {
+        Err(_) if conversion.is_closed.get() => Ok(Converted { is_closed: true, ..conversion.converted }),
+        Err(failure) => Err(failure),
+        Ok(output) => output.commit().map(|()| conversion.converted),
+    }
+}
+
+/// A conversion that runs: its input, its progress and its result so far.
+struct Conversion<'a> {
+    recording: &'a Recording,
+    options: &'a ConvertOptions,
+    /// Sensor of a recording that names none.
+    sensor: &'a str,
+    encoding: Encoding,
+    stop: &'a AtomicBool,
+    progress: &'a mut dyn FnMut(u64, u64),
+    /// Telegrams so far, written or not.
+    done: u64,
+    /// Time of the first telegram.
+    first_ns: Option<u64>,
+    converted: Converted,
+    /// Whether an error means that the reader of stdout closed it.
+    is_closed: Cell<bool>,
+}
+
+impl Conversion<'_> {
+    /// Writes the recording into `file` in the format `target`.
+    fn write(&mut self, target: Target, file: &mut impl Write) -> Result<(), Failure> {
+        let options = self.options;
+        let &ConvertOptions { meters, intensities, .. } = options;
+        match target {
+            Target::Recording(Form::Mcap) if self.recording.contents().form == Form::Mcap => {
+                writers::copy(self, file)
+            }
+            Target::Recording(Form::Mcap) => writers::write_mcap(self, file),
+            Target::Ros2 => {
+                let sink = Ros2::begin(self, file).map_err(|error| self.failed(error))?;
+                writers::write_scans(self, sink)
+            }
+            Target::Csv => {
+                let columns = ScanColumns { meters, intensities };
+                writers::write_scans(self, Csv::begin(Packing::of(&options.output, file), columns))
+            }
+            Target::MarksCsv => {
+                writers::write_marks(self, MarkColumns { meters }, Packing::of(&options.output, file))
+            }
+            Target::Recording(Form::Carmen) => writers::write_log(self, Packing::of(&options.output, file)),
+            Target::Recording(Form::Telegrams) => {
+                writers::write_stream(self, Packing::of(&options.output, file))
+            }
+        }
+    }
+
+    /// Counts a telegram that was measured at `at_ns`.
+    ///
+    /// # Errors
+    ///
+    /// Returns [`Kind::Interrupted`] if the conversion was stopped.
+    fn count(&mut self, written: Written, at_ns: Option<u64>) -> Result<(), Failure> {
+        let converted = &mut self.converted;
         if let Some(at_ns) = at_ns.filter(|_| !matches!(written, Written::Added | Written::LeftOut)) {
-            let since_ns = at_ns.saturating_sub(*first_ns.get_or_insert(at_ns));
+            let since_ns = at_ns.saturating_sub(*self.first_ns.get_or_insert(at_ns));
             converted.took_ns = converted.took_ns.max(Some(since_ns));
         }
         converted.telegrams += u64::from(matches!(written, Written::Scan | Written::Other));
         converted.scans += u64::from(matches!(written, Written::Scan | Written::Marks));
         converted.left_out += u64::from(written == Written::LeftOut);
-        done += 1;
-        if done.is_multiple_of(STEP) {
-            progress(done, contents.telegrams);
+        self.done += 1;
+        if self.done.is_multiple_of(PROGRESS_INTERVAL) {
+            (self.progress)(self.done, self.recording.contents().telegrams);
         }
-        if stop.load(Ordering::Relaxed) {
+        if self.stop.load(Ordering::Relaxed) {
             return Err(Failure::new(Kind::Interrupted, "interrupted before the end", ""));
         }
         Ok(())
-    };
-    let sensor = chosen.unwrap_or(SENSOR);
-    let compression = options.compression.unwrap_or_default();
-    let written = match target {
-        Target::Recording(Form::Mcap) if contents.form == Form::Mcap => {
-            copy::copy(&recording, compression, &mut file, &mut count, &failed)
-        }
-        Target::Recording(Form::Mcap) => {
-            let file = (&mut file, compression);
-            converted.sensors = vec![sensor.to_owned()];
-            write_mcap(&recording, sensor, encoding, file, &mut count, &failed)
-        }
-        Target::Ros2 => {
-            let view = Ros2::begin(&mut file, compression, form_name(contents.form), options.points);
-            view.map_err(&failed).and_then(|view| {
-                write_view(&recording, sensor, encoding, options.mode, view, &mut count, &failed)
-            })
-        }
-        Target::Csv => {
-            let columns = ScanColumns { meters: options.meters, intensities: options.intensities };
-            let view = Csv::begin(Packing::of(&options.output, &mut file), columns);
-            write_view(&recording, sensor, encoding, options.mode, view, &mut count, &failed)
-        }
-        Target::MarksCsv => {
-            let out = Packing::of(&options.output, &mut file);
-            let columns = MarkColumns { meters: options.meters };
-            let written = write_marks(&recording, columns, out, &mut count, &failed);
-            written.map(|written| converted.marks = Some(written))
-        }
-        Target::Recording(form) => {
-            let out = Packing::of(&options.output, &mut file);
-            write_bytes(&recording, form, encoding, out, &mut count, &failed)
-        }
-    };
-    let flushed = written.and_then(|()| file.flush().map_err(&failed));
-    match flushed.and_then(|()| file.into_inner().map_err(|error| failed(error.into_error()))) {
-        Err(_) if is_closed.get() => Ok(Converted { is_closed: true, ..converted }),
-        Err(failure) => Err(failure),
-        Ok(output) => output.commit().map(|()| converted),
+    }
+
+    /// Returns the failure of the output after `error`.
+    fn failed(&self, error: io::Error) -> Failure {
+        self.is_closed.set(Output::is_closed(&self.options.output, &error));
+        unwritable(&self.options.output, &error)
     }
 }
 
-/// Size of the buffer before the output, in bytes.
-const BUFFER: usize = 1 << 20;
-
-/// What became of a telegram.
+/// Form in which a telegram was written.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Written {
     Scan,
@@ -238,113 +268,10 @@ impl Written {
         if is_scan { Written::Scan } else { Written::Other }
     }
 
-    /// Returns what was written with `frame`, number `number` of those that [`frames`] returns for a recording of `form`.
+    /// Returns how `frame` was written, number `number` of those that [`writers::frames`] returns for a recording of `form`.
     fn of_frame(form: Form, number: usize, frame: &Frame) -> Written {
         if form == Form::Carmen && number == 0 { Written::Added } else { Written::of(frame.is_scan()) }
     }
-}
-
-/// Writes a stream of telegrams, or a log.
-fn write_bytes(
-    recording: &Recording,
-    form: Form,
-    encoding: Encoding,
-    mut out: Packing<impl Write>,
-    count: &mut impl FnMut(Written, Option<u64>) -> Result<(), Failure>,
-    failed: &impl Fn(io::Error) -> Failure,
-) -> Result<(), Failure> {
-    let mut times = Times::of(recording);
-    if form == Form::Telegrams {
-        let mut heads = stream_heads(recording)?.into_iter().peekable();
-        for (number, frame) in frames(recording, encoding)?.enumerate() {
-            if let Some((_, head)) = heads.next_if(|(before, _)| *before == number) {
-                out.write_all(&head).map_err(failed)?;
-            }
-            out.write_all(&frame.telegram).map_err(failed)?;
-            count(Written::of_frame(recording.contents().form, number, &frame), frame.wall_ns)?;
-        }
-        return out.finish().map_err(failed);
-    }
-    let mode = encoding.mode;
-    let told = carmen::encoding_line(encoding);
-    out.write_all(told.as_bytes()).map_err(failed)?;
-    let mut first_ns = None;
-    for (number, frame) in recording.telegrams(encoding)?.enumerate() {
-        let at_ns = times.wall_ns(&frame);
-        // The line above says the same.
-        if number == 0 && is_made_up(&frame.telegram, frame.header.as_ref()) {
-            continue;
-        }
-        let line = carmen::scan_line(&frame.telegram, mode, at_ns, *first_ns.get_or_insert(at_ns));
-        out.write_all(line.as_deref().unwrap_or_default().as_bytes()).map_err(failed)?;
-        count(if line.is_some() { Written::Scan } else { Written::LeftOut }, Some(at_ns))?;
-    }
-    out.finish().map_err(failed)
-}
-
-/// Writes telegrams that have no header into an MCAP file.
-fn write_mcap(
-    recording: &Recording,
-    sensor: &str,
-    encoding: Encoding,
-    (file, compression): (&mut impl Write, Compression),
-    count: &mut impl FnMut(Written, Option<u64>) -> Result<(), Failure>,
-    failed: &impl Fn(io::Error) -> Failure,
-) -> Result<(), Failure> {
-    let facts = [("converted from".to_owned(), form_name(recording.contents().form).to_owned())];
-    let mut writer = Writer::packed(file, "", compression, facts.into()).map_err(failed)?;
-    let mut times = Times::of(recording);
-    let mut bytes = 0;
-    let mut frames = frames(recording, encoding)?.enumerate().peekable();
-    while let Some((number, frame)) = frames.next() {
-        let next_ns = frames.peek().and_then(|(_, next)| next.wall_ns);
-        let header = times.header(&frame, number as u64, next_ns);
-        writer.sample(sensor, Topic::Telegram, &header, &frame.telegram).map_err(failed)?;
-        bytes += frame.telegram.len();
-        if bytes >= CHUNK {
-            writer.close_chunk().map_err(failed)?;
-            bytes = 0;
-        }
-        count(Written::of_frame(recording.contents().form, number, &frame), Some(header.wall_ns))?;
-    }
-    writer.finish().map_err(failed).map(drop)
-}
-
-/// Writes the scans in the format of `view`.
-fn write_view(
-    recording: &Recording,
-    sensor: &str,
-    encoding: Encoding,
-    mode: Option<Mode>,
-    mut view: impl View,
-    count: &mut impl FnMut(Written, Option<u64>) -> Result<(), Failure>,
-    failed: &impl Fn(io::Error) -> Failure,
-) -> Result<(), Failure> {
-    let mut is_empty = true;
-    scans::each(recording, sensor, encoding, mode, &mut |sight| {
-        let Some(written) = view.see(&sight).map_err(failed)? else { return Ok(()) };
-        let Sight::Scan(_, header, _) = sight else { return count(written, None) };
-        is_empty = false;
-        count(written, Some(header.wall_ns))
-    })?;
-    if is_empty {
-        let message = format!("there is no scan in {}", recording.path().display());
-        let hint = "scans are decoded from topic telegram, or taken from topic scan";
-        return Err(Failure::new(Kind::Input, message, hint));
-    }
-    if view.lacks_intensities() {
-        let message = format!("no scan in {} has intensities", recording.path().display());
-        let hint = "leave --intensities out; an LMS sends reflector levels only in some measuring modes, such as 0x01";
-        return Err(Failure::new(Kind::Input, message, hint));
-    }
-    view.finish().map_err(failed)
-}
-
-/// Returns whether `telegram`, the first one of a sensor, is the reply that [`frames`] adds to a log. No scanner sent it, so
-/// nothing is lost without it.
-fn is_made_up(telegram: &[u8], header: Option<&Header>) -> bool {
-    let is_estimated = header.is_none_or(|header| header.flags & Flags::STAMP_ESTIMATED != 0);
-    is_estimated && carmen::is_made_up(telegram)
 }
 
 /// Returns the encoding of the values, if `target` needs it.
@@ -397,18 +324,6 @@ fn encoding(recording: &Recording, target: Target) -> Result<Encoding, Failure> 
         return Err(Failure::new(Kind::Input, message, hint));
     }
     Ok(Encoding { unit: contents.unit.unwrap_or(Unit::Cm), mode: mode.unwrap_or(Mode(0)) })
-}
-
-/// Returns the telegrams of `recording`. Those of a log begin with the reply that contains the encoding of the values.
-fn frames(recording: &Recording, encoding: Encoding) -> Result<impl Iterator<Item = Frame> + use<>, Failure> {
-    let contents = recording.contents();
-    let told = (contents.form == Form::Carmen).then(|| {
-        let telegram = carmen::configuration(encoding);
-        let took_ns = schema::line_time(telegram.len(), Baud::B500000.rate());
-        let wall_ns = contents.span.map(|(first_ns, _)| first_ns.saturating_sub(took_ns));
-        Frame { telegram, wall_ns, ..Frame::default() }
-    });
-    Ok(told.into_iter().chain(recording.telegrams(encoding)?))
 }
 
 /// Returns the output format, and the sensor that the options choose.
@@ -518,9 +433,99 @@ pub fn form_name(form: Form) -> &'static str {
     }
 }
 
-/// Name of the sensor of a stream or a log that has none.
+/// Output of a conversion.
+enum Output {
+    Stdout(io::Stdout),
+    File(OutputFile),
+}
+
+impl Output {
+    /// Creates the output at `path`, which may replace another file than `input` if `force` is set. `-` is stdout.
+    ///
+    /// # Errors
+    ///
+    /// Returns the errors of [`OutputFile::create`], and [`Kind::Output`] if `path` is the input.
+    fn create(path: &Path, input: &Path, force: bool) -> Result<Output, Failure> {
+        if path == Path::new("-") {
+            return Ok(Output::Stdout(io::stdout()));
+        }
+        let id = |path: &Path| path.metadata().map(|metadata| (metadata.dev(), metadata.ino())).ok();
+        if id(path).is_some_and(|output| id(input) == Some(output)) {
+            let hint = "write into another file, look at it, and then replace the first one";
+            let message = format!("{} is both read and written", path.display());
+            return Err(Failure::new(Kind::Output, message, hint));
+        }
+        OutputFile::create(path, force).map(Output::File)
+    }
+
+    /// Returns whether `error` means that the reader of stdout closed it.
+    fn is_closed(path: &Path, error: &io::Error) -> bool {
+        path == Path::new("-") && error.kind() == io::ErrorKind::BrokenPipe
+    }
+
+    /// Completes the output.
+    ///
+    /// # Errors
+    ///
+    /// Returns the errors of [`OutputFile::commit`].
+    fn commit(self) -> Result<(), Failure> {
+        match self {
+            Output::Stdout(_) => Ok(()),
+            Output::File(file) => file.commit(),
+        }
+    }
+}
+
+impl Write for Output {
+    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        match self {
+            Output::Stdout(stdout) => stdout.write(bytes),
+            Output::File(file) => file.write(bytes),
+        }
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        match self {
+            Output::Stdout(stdout) => stdout.flush(),
+            Output::File(file) => file.flush(),
+        }
+    }
+}
+
+/// Output that is compressed by gzip if the name of the file ends with `.gz`.
+enum Packing<W: Write> {
+    Plain(W),
+    Gzip(GzEncoder<W>),
+}
+
+impl<W: Write> Packing<W> {
+    fn of(path: &Path, file: W) -> Self {
+        match path.extension() {
+            Some(ending) if ending.eq_ignore_ascii_case("gz") => {
+                Packing::Gzip(GzEncoder::new(file, flate2::Compression::default()))
+            }
+            _ => Packing::Plain(file),
+        }
+    }
+
+    fn write_all(&mut self, bytes: &[u8]) -> io::Result<()> {
+        match self {
+            Packing::Plain(file) => file.write_all(bytes),
+            Packing::Gzip(encoder) => encoder.write_all(bytes),
+        }
+    }
+
+    fn finish(self) -> io::Result<()> {
+        match self {
+            Packing::Plain(_) => Ok(()),
+            Packing::Gzip(encoder) => encoder.finish().map(drop),
+        }
+    }
+}
+
+/// Sensor of a stream or a log, unless an option names it.
 const SENSOR: &str = "front";
-/// Bytes of telegrams in a chunk.
-const CHUNK: usize = 256 * 1024;
-/// Telegrams between two reports of progress.
-const STEP: u64 = 512;
+/// Size of the buffer before the output, in bytes.
+const BUFFER: usize = 1 << 20;
+/// Number of telegrams between two reports of progress.
+const PROGRESS_INTERVAL: u64 = 512;

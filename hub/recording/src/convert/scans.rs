@@ -3,6 +3,9 @@
 //! The scans of an LMS are decoded from its telegrams, as in the hub. If its telegrams were not recorded, its published scans are
 //! used. For a rotating scanner, published scans are preferred, and otherwise its packets are turned into scans by the session
 //! that the hub uses.
+//!
+//! A recording may begin after a rotating scanner has sent the responses that define how to read its packets.
+//! [`stream_heads`] finds the places at which a stream file needs them.
 
 use std::collections::BTreeMap;
 
@@ -13,14 +16,14 @@ use scanhub_drivers::lms::telegram::Telegram;
 use scanhub_drivers::lms::variant::{Baud, Mode, Variant};
 use scanhub_drivers::{Session, Settings, features};
 use schema::datagram::Packed;
-use schema::{Failure, Family, Flags, Header, Kind, Nanos, Pose, Quality, Scan, Status, Topic};
+use schema::{Failure, Family, Flags, Header, Kind, MILLIS, Nanos, Pose, Quality, Scan, Status, Topic};
 
-use super::is_made_up;
+use crate::convert::writers::is_made_up;
 use crate::mcap::Item;
 use crate::{Encoding, Form, Frame, Recording, VirtualTime};
 
-/// A part of a recording.
-pub(super) enum Sight<'a> {
+/// An item of a recording.
+pub(super) enum DecodedItem<'a> {
     /// A scan of a sensor.
     Scan(&'a str, Header, &'a Scan),
     /// Pose of a sensor from this time on, in ns since 1970.
@@ -34,50 +37,51 @@ struct Sensor {
     mode: Option<Mode>,
     /// Whether its scans are decoded from telegrams.
     is_decoded: bool,
-    /// For a rotating scanner: its revolutions.
-    turns: Option<Turns>,
+    /// Revolutions the packets of a rotating scanner into scans.
+    revolutions: Option<Revolutions>,
     /// Whether none of its telegrams has been read.
     is_first: bool,
 }
 
-/// Calls `tell` for each part of `recording`, in its order. A recording that does not name its sensor belongs to `name`; `mode`
+/// Calls `take_item` for each item of `recording`, in its order. A recording that does not name its sensor belongs to `name`; `mode`
 /// is used if the recording does not contain the measuring mode.
 ///
 /// # Errors
 ///
 /// Returns [`Kind::Configuration`] if the measuring mode is unknown, without which values are not ranges. Otherwise returns the
-/// error of `tell`.
+/// error of `take_item`.
 pub(super) fn each(
     recording: &Recording,
     name: &str,
     encoding: Encoding,
     mode: Option<Mode>,
-    tell: &mut impl FnMut(Sight<'_>) -> Result<(), Failure>,
+    take_item: &mut impl FnMut(DecodedItem<'_>) -> Result<(), Failure>,
 ) -> Result<(), Failure> {
     match recording.contents().form {
-        Form::Mcap => each_of_mcap(recording, mode, tell),
+        Form::Mcap => each_of_mcap(recording, mode, take_item),
         form => {
-            let told = (form == Form::Carmen).then_some(encoding.mode);
+            let of_log = (form == Form::Carmen).then_some(encoding.mode);
             let contents = recording.contents();
-            let mode = contents.mode.or(told).or(mode).or(contents.readable());
-            let mut sensor = Sensor { mode, is_decoded: true, turns: Turns::of(recording)?, is_first: true };
+            let mode = contents.mode.or(of_log).or(mode).or(contents.readable());
+            let mut sensor =
+                Sensor { mode, is_decoded: true, revolutions: Revolutions::of(recording)?, is_first: true };
             sensor.check(recording, name)?;
-            let mut times = Times::of(recording);
+            let mut clock = SyntheticClock::of(recording);
             let mut scan = Box::<Scan>::default();
             let mut frames = recording.telegrams(encoding)?.enumerate().peekable();
             while let Some((number, frame)) = frames.next() {
                 let next_ns = frames.peek().and_then(|(_, next)| next.wall_ns);
-                let header = times.header(&frame, number as u64, next_ns);
-                if let Some(turns) = &mut sensor.turns {
-                    turns.each(&header, &frame.telegram, |header, scan| {
-                        tell(Sight::Scan(name, header, scan))
+                let header = clock.header(&frame, number as u64, next_ns);
+                if let Some(revolutions) = &mut sensor.revolutions {
+                    revolutions.each(&header, &frame.telegram, |header, scan| {
+                        take_item(DecodedItem::Scan(name, header, scan))
                     })?;
                     continue;
                 }
                 match sensor.decode(&frame.telegram, &mut scan) {
-                    true => tell(Sight::Scan(name, header, &scan))?,
+                    true => take_item(DecodedItem::Scan(name, header, &scan))?,
                     false if number == 0 && is_made_up(&frame.telegram, None) => {}
-                    false => tell(Sight::Other)?,
+                    false => take_item(DecodedItem::Other)?,
                 }
             }
             Ok(())
@@ -88,7 +92,7 @@ pub(super) fn each(
 fn each_of_mcap(
     recording: &Recording,
     mode: Option<Mode>,
-    tell: &mut impl FnMut(Sight<'_>) -> Result<(), Failure>,
+    take_item: &mut impl FnMut(DecodedItem<'_>) -> Result<(), Failure>,
 ) -> Result<(), Failure> {
     let (mut reader, catalog) = recording.reader()?;
     let mut sensors = BTreeMap::new();
@@ -96,9 +100,9 @@ fn each_of_mcap(
         let contents = recording.of(name)?.contents().clone();
         let mode = contents.mode.or(mode).or(contents.readable());
         let has_scans = catalog.has_scans(name);
-        let turns = if has_scans { None } else { Turns::of(&recording.of(name)?)? };
+        let revolutions = if has_scans { None } else { Revolutions::of(&recording.of(name)?)? };
         let is_decoded = contents.scans > 0 && (mode.is_some() || !has_scans);
-        let sensor = Sensor { mode, is_decoded, turns, is_first: true };
+        let sensor = Sensor { mode, is_decoded, revolutions, is_first: true };
         sensor.check(recording, name)?;
         sensors.insert(name.clone(), sensor);
     }
@@ -108,31 +112,31 @@ fn each_of_mcap(
             Item::Telegram(sample) => {
                 let Some(sensor) = sensors.get_mut(&sample.sensor) else { continue };
                 if sample.header.family != Family::Lms as u8 {
-                    let Some(turns) = &mut sensor.turns else { continue };
+                    let Some(revolutions) = &mut sensor.revolutions else { continue };
                     let name = &sample.sensor;
-                    turns.each(&sample.header, &sample.telegram, |header, scan| {
-                        tell(Sight::Scan(name, header, scan))
+                    revolutions.each(&sample.header, &sample.telegram, |header, scan| {
+                        take_item(DecodedItem::Scan(name, header, scan))
                     })?;
                     continue;
                 }
                 let is_first = std::mem::replace(&mut sensor.is_first, false);
                 match sensor.decode(&sample.telegram, &mut scan) && sensor.is_decoded {
-                    true => tell(Sight::Scan(&sample.sensor, sample.header, &scan))?,
+                    true => take_item(DecodedItem::Scan(&sample.sensor, sample.header, &scan))?,
                     false if is_first && is_made_up(&sample.telegram, Some(&sample.header)) => {}
-                    false => tell(Sight::Other)?,
+                    false => take_item(DecodedItem::Other)?,
                 }
             }
             Item::Record(record) => {
-                let Some((place, header, payload)) = catalog.message(&record) else { continue };
-                let Some(sensor) = sensors.get_mut(&place.sensor) else { continue };
-                if place.has_scans() && !sensor.is_decoded && Scan::unpack_into(&mut scan, payload) {
-                    tell(Sight::Scan(&place.sensor, header, &scan))?;
+                let Some((channel, header, payload)) = catalog.message(&record) else { continue };
+                let Some(sensor) = sensors.get_mut(&channel.sensor) else { continue };
+                if channel.has_scans() && !sensor.is_decoded && Scan::unpack_into(&mut scan, payload) {
+                    take_item(DecodedItem::Scan(&channel.sensor, header, &scan))?;
                 }
                 let mut status = Status::default();
-                if place.topic == Topic::Status && status.unpack(payload) {
-                    let told = Some(Mode(status.mode)).filter(|mode| mode.0 != Status::MODE_UNKNOWN);
-                    sensor.mode = told.or(sensor.mode);
-                    tell(Sight::Pose(&place.sensor, header.wall_ns, status.pose))?;
+                if channel.topic == Topic::Status && status.unpack(payload) {
+                    let reported = Some(Mode(status.mode)).filter(|mode| mode.0 != Status::MODE_UNKNOWN);
+                    sensor.mode = reported.or(sensor.mode);
+                    take_item(DecodedItem::Pose(&channel.sensor, header.wall_ns, status.pose))?;
                 }
             }
         }
@@ -169,8 +173,8 @@ impl Sensor {
     }
 }
 
-/// Turns the packets of a rotating scanner into scans, as the hub does.
-pub(super) struct Turns {
+/// Revolutions the packets of a rotating scanner into scans, as the hub does.
+pub(super) struct Revolutions {
     family: Family,
     settings: Settings,
     /// The session, and the run of the hub that it belongs to.
@@ -178,24 +182,24 @@ pub(super) struct Turns {
     scan: Box<Scan>,
 }
 
-impl Turns {
+impl Revolutions {
     /// Starts with the only sensor of `recording`; `None` if it is not a rotating scanner.
-    pub(super) fn of(recording: &Recording) -> Result<Option<Turns>, Failure> {
+    pub(super) fn of(recording: &Recording) -> Result<Option<Revolutions>, Failure> {
         let Some(family) = recording.family().filter(|family| !features(*family).has_whole_telegrams) else {
             return Ok(None);
         };
         let settings = recording.session_settings()?;
-        Ok(Some(Turns { family, settings, session: None, scan: Box::default() }))
+        Ok(Some(Revolutions { family, settings, session: None, scan: Box::default() }))
     }
 
-    /// Takes the packets of a sample with this `header`, and calls `tell` for each scan that they complete, with its header.
+    /// Takes the packets of a sample with this `header`, and calls `take_item` for each scan that they complete, with its header.
     pub(super) fn each(
         &mut self,
         header: &Header,
         packets: &[u8],
-        mut tell: impl FnMut(Header, &Scan) -> Result<(), Failure>,
+        mut take_item: impl FnMut(Header, &Scan) -> Result<(), Failure>,
     ) -> Result<(), Failure> {
-        let Turns { family, settings, session, scan } = self;
+        let Revolutions { family, settings, session, scan } = self;
         // Another run of the hub has another clock.
         if session.as_ref().is_none_or(|(boot, _)| *boot != header.boot) {
             let begun = Session::begin(*family, settings, header.stamp_first_ns);
@@ -203,7 +207,7 @@ impl Turns {
         }
         let Some((_, session)) = session else { return Ok(()) };
         session.session_mut().mark_suspect(header.reasons & !suspect::LINE_ERROR);
-        let mut told = Ok(());
+        let mut result = Ok(());
         session.take(header.stamp_last_ns, packets, |event| {
             let Event::Scan(raw) = event else { return };
             Scan::grow(scan, raw.payload_len());
@@ -221,25 +225,26 @@ impl Turns {
                 hub_time: [0; 3],
                 ..*header
             };
-            if told.is_ok() {
-                told = tell(header, scan);
+            if result.is_ok() {
+                result = take_item(header, scan);
             }
         });
-        told
+        result
     }
 }
 
-/// Times for telegrams that have none: they are one scan period apart, and the last one ends when the file was last written.
-pub(super) struct Times {
+/// Generates stamps for telegrams that have none. They are one scan period apart, and the last telegram ends at the time at which
+/// the file was last written.
+pub(super) struct SyntheticClock {
     wall_ns: u64,
     begin_ns: u64,
     boot: u64,
     variant: Variant,
 }
 
-impl Times {
+impl SyntheticClock {
     /// Starts at the beginning of `recording`.
-    pub(super) fn of(recording: &Recording) -> Times {
+    pub(super) fn of(recording: &Recording) -> SyntheticClock {
         let contents = recording.contents();
         let variant = contents.variant.unwrap_or(Variant::HALF);
         let took_ns = contents.scanner_ns.unwrap_or(contents.scans * scan_ns(variant));
@@ -249,7 +254,7 @@ impl Times {
         };
         // Any number that differs between recordings.
         let boot = begin_ns.wrapping_mul(0x9E37_79B9_7F4A_7C15) | 1;
-        Times { wall_ns: begin_ns, begin_ns, boot, variant }
+        SyntheticClock { wall_ns: begin_ns, begin_ns, boot, variant }
     }
 
     /// Returns the time at which `frame`, the next one, was measured.
@@ -267,7 +272,7 @@ impl Times {
         let wall_ns = self.wall_ns(frame);
         let first_ns = wall_ns.saturating_add(UPTIME_NS).saturating_sub(self.begin_ns);
         let gap_ns = next_ns.map_or(0, |next_ns| next_ns.saturating_sub(wall_ns));
-        let period_ns = scan_ns(self.variant).max(gap_ns).min(LONGEST_PERIOD_NS);
+        let period_ns = scan_ns(self.variant).max(gap_ns).min(MAX_PERIOD_NS);
         Header {
             seq: number,
             topic_seq: number,
@@ -296,6 +301,112 @@ fn line_ns(frame: &Frame) -> u64 {
 }
 
 /// Maximum period, which fits into a header.
-const LONGEST_PERIOD_NS: u64 = 3_600_000_000_000;
+const MAX_PERIOD_NS: u64 = 3_600_000_000_000;
 /// Monotonic clock at the first telegram, as on a machine that has just started.
 const UPTIME_NS: u64 = 10_000_000_000;
+
+/// Returns the missing responses, each with the number of the frame before which they belong.
+///
+/// # Errors
+///
+/// Returns the errors of [`Recording::telegrams`], and [`Kind::Input`] if nothing in the recording defines how its packets must
+/// be read.
+pub(super) fn stream_heads(recording: &Recording) -> Result<Vec<(usize, Vec<u8>)>, Failure> {
+    let contents = recording.contents();
+    // A stream file has no times, without which the time per point cannot be measured.
+    let family = recording.family().filter(|_| contents.form == Form::Mcap);
+    let Some(family) = family.filter(|family| !features(*family).has_whole_telegrams) else {
+        return Ok(Vec::new());
+    };
+    let settings = recording.session_settings().map_err(|_| without_status(recording))?;
+    let settings = Settings { beams: None, ..settings };
+    let status = contents.sensor_type.as_ref().filter(|(number, _)| *number == family as u8);
+    let reported = status.map_or("", |(_, text)| text);
+    let (mut heads, mut is_guess) = (Vec::new(), false);
+    let mut close = |stream: Stream| {
+        let session = stream.session.session();
+        let head = session.stream_head(reported, recording.beams());
+        if !head.is_empty() {
+            // Without a model, neither a status nor the scanner has confirmed the time per point.
+            is_guess |= status.is_none() && session.model_text().is_none();
+            heads.push((stream.at, head));
+        }
+    };
+    let mut open: Option<Stream> = None;
+    for (number, frame) in recording.telegrams(Encoding::default())?.enumerate() {
+        let Some(header) = frame.header.filter(|header| header.family == family as u8) else { continue };
+        let is_reply = family.packets(&frame.telegram).is_some_and(|facts| facts.kind == REPLY);
+        if let Some(ended) = open.take_if(|stream| !stream.continues_with(&header, is_reply)) {
+            close(ended);
+        }
+        let stream = open.get_or_insert_with(|| Stream::begin(family, settings, number, &header, is_reply));
+        stream.take(number, &header, &frame.telegram, is_reply);
+    }
+    open.into_iter().for_each(&mut close);
+    if is_guess {
+        return Err(without_status(recording));
+    }
+    Ok(heads)
+}
+
+/// Returns the failure of a recording whose packets can be read in several ways.
+fn without_status(recording: &Recording) -> Failure {
+    let message = format!(
+        "recording {} has neither the topic status nor the scanner's responses, without which its packets cannot be read",
+        recording.path().display()
+    );
+    Failure::new(Kind::Input, message, "record NAME/status too, as `record` does by default")
+}
+
+/// A stream of packets, and the responses before it.
+struct Stream {
+    /// Run of the hub.
+    boot: u64,
+    /// Number of the frame before which missing responses belong: the last response before the packets, or the first frame if
+    /// there is none.
+    at: usize,
+    /// Stamp of its first packets. `None` before they have arrived.
+    packets_since: Option<Nanos>,
+    session: VirtualTime<Session>,
+}
+
+impl Stream {
+    /// Creates the stream that begins with the frame `number`, which has this `header`. The mode in `settings` is that of the
+    /// recording's first status. It is not used for a scanner that reports its modes.
+    fn begin(family: Family, settings: Settings, number: usize, header: &Header, is_reply: bool) -> Stream {
+        let (begun, mode) = (header.stamp_first_ns, settings.mode.filter(|_| !is_reply));
+        let session = Session::begin(family, &Settings { mode, ..settings }, begun);
+        Stream {
+            boot: header.boot,
+            at: number,
+            packets_since: None,
+            session: VirtualTime::new(session, begun),
+        }
+    }
+
+    /// Returns whether the frame with this `header` belongs to it. A frame of another run of the hub does not, and neither does a
+    /// response after packets.
+    fn continues_with(&self, header: &Header, is_reply: bool) -> bool {
+        header.boot == self.boot && !(is_reply && self.packets_since.is_some())
+    }
+
+    /// Handles the telegram of the frame `number`.
+    fn take(&mut self, number: usize, header: &Header, telegram: &[u8], is_reply: bool) {
+        if is_reply {
+            self.at = number;
+        } else {
+            let since = *self.packets_since.get_or_insert(header.stamp_first_ns);
+            if header.stamp_first_ns >= since.saturating_add(MEASURED_TIME) {
+                return;
+            }
+        }
+        // As on a line, an error of the line concerns the packets alone.
+        self.session.session_mut().mark_suspect(header.reasons & !suspect::LINE_ERROR);
+        self.session.take(header.stamp_last_ns, telegram, |_| {});
+    }
+}
+
+/// Kind of a telegram that is a response.
+const REPLY: &str = "reply";
+/// Time for which the packets of a stream are measured.
+const MEASURED_TIME: Nanos = 4_000 * MILLIS;

@@ -1,0 +1,374 @@
+//! Writers of the formats that a recording is converted to: a stream of telegrams, a CARMEN log, MCAP, messages of ROS 2, and CSV
+//! of scans or marks.
+
+use std::collections::BTreeMap;
+use std::io::{self, Write};
+
+use mcap::records::{Record as Parsed, op};
+use ros::bag::{self, Bag};
+use scanhub_drivers::lms::variant::Baud;
+use schema::csv::{MarkColumns, ScanColumns};
+use schema::datagram::Packed;
+use schema::file::{METADATA, Writer};
+use schema::{Failure, Flags, Header, Kind, Marks, Topic};
+
+use super::scans::{self, DecodedItem, SyntheticClock, stream_heads};
+use super::{Conversion, Packing, Written, form_name};
+use crate::mcap::{Catalog, Item, Record, Sample};
+use crate::{Encoding, Form, Frame, Recording, carmen};
+
+/// Writes a stream of telegrams.
+pub(super) fn write_stream(conversion: &mut Conversion, mut out: Packing<impl Write>) -> Result<(), Failure> {
+    let recording = conversion.recording;
+    let mut heads = stream_heads(recording)?.into_iter().peekable();
+    for (number, frame) in frames(recording, conversion.encoding)?.enumerate() {
+        let head = heads.next_if(|(before, _)| *before == number).map(|(_, head)| head).unwrap_or_default();
+        let written = out.write_all(&head).and_then(|()| out.write_all(&frame.telegram));
+        written.map_err(|error| conversion.failed(error))?;
+        let form = recording.contents().form;
+        conversion.count(Written::of_frame(form, number, &frame), frame.wall_ns)?;
+    }
+    out.finish().map_err(|error| conversion.failed(error))
+}
+
+/// Writes a CARMEN log.
+pub(super) fn write_log(conversion: &mut Conversion, mut out: Packing<impl Write>) -> Result<(), Failure> {
+    let (recording, encoding) = (conversion.recording, conversion.encoding);
+    let mut clock = SyntheticClock::of(recording);
+    let first_line = carmen::encoding_line(encoding);
+    out.write_all(first_line.as_bytes()).map_err(|error| conversion.failed(error))?;
+    let mut first_ns = None;
+    for (number, frame) in recording.telegrams(encoding)?.enumerate() {
+        let at_ns = clock.wall_ns(&frame);
+        // The first line has the encoding.
+        if number == 0 && is_made_up(&frame.telegram, frame.header.as_ref()) {
+            continue;
+        }
+        let line = carmen::scan_line(&frame.telegram, encoding.mode, at_ns, *first_ns.get_or_insert(at_ns));
+        let written = out.write_all(line.as_deref().unwrap_or_default().as_bytes());
+        written.map_err(|error| conversion.failed(error))?;
+        conversion.count(if line.is_some() { Written::Scan } else { Written::LeftOut }, Some(at_ns))?;
+    }
+    out.finish().map_err(|error| conversion.failed(error))
+}
+
+/// Writes telegrams that have no header into an MCAP file.
+pub(super) fn write_mcap(conversion: &mut Conversion, file: &mut impl Write) -> Result<(), Failure> {
+    let (recording, sensor) = (conversion.recording, conversion.sensor);
+    conversion.converted.sensors = vec![sensor.to_owned()];
+    let form = recording.contents().form;
+    let facts = [("converted from".to_owned(), form_name(form).to_owned())];
+    let writer = Writer::packed(file, "", conversion.options.compression.unwrap_or_default(), facts.into());
+    let mut writer = writer.map_err(|error| conversion.failed(error))?;
+    let mut clock = SyntheticClock::of(recording);
+    let mut bytes = 0;
+    let mut frames = frames(recording, conversion.encoding)?.enumerate().peekable();
+    while let Some((number, frame)) = frames.next() {
+        let next_ns = frames.peek().and_then(|(_, next)| next.wall_ns);
+        let header = clock.header(&frame, number as u64, next_ns);
+        let written = writer.sample(sensor, Topic::Telegram, &header, &frame.telegram);
+        let written = written.and_then(|()| close_chunk(&mut writer, &mut bytes, frame.telegram.len()));
+        written.map_err(|error| conversion.failed(error))?;
+        conversion.count(Written::of_frame(form, number, &frame), Some(header.wall_ns))?;
+    }
+    writer.finish().map(drop).map_err(|error| conversion.failed(error))
+}
+
+/// Adds `len` to the `bytes` in the open chunk of `writer`, and ends the chunk if it is large enough.
+fn close_chunk<W: Write>(writer: &mut Writer<W>, bytes: &mut usize, len: usize) -> io::Result<()> {
+    *bytes += len;
+    if *bytes >= CHUNK {
+        *bytes = 0;
+        writer.close_chunk()?;
+    }
+    Ok(())
+}
+
+/// Returns the telegrams of `recording`. Those of a log begin with the reply that contains the encoding of the values.
+fn frames(recording: &Recording, encoding: Encoding) -> Result<impl Iterator<Item = Frame> + use<>, Failure> {
+    let contents = recording.contents();
+    let first = (contents.form == Form::Carmen).then(|| {
+        let telegram = carmen::configuration(encoding);
+        let took_ns = schema::line_time(telegram.len(), Baud::B500000.rate());
+        let wall_ns = contents.span.map(|(first_ns, _)| first_ns.saturating_sub(took_ns));
+        Frame { telegram, wall_ns, ..Frame::default() }
+    });
+    Ok(first.into_iter().chain(recording.telegrams(encoding)?))
+}
+
+/// Returns whether `telegram`, the first one of a sensor, is the reply that [`frames`] adds to a log. No scanner sent it, so
+/// nothing is lost without it.
+pub(super) fn is_made_up(telegram: &[u8], header: Option<&Header>) -> bool {
+    let is_estimated = header.is_none_or(|header| header.flags & Flags::STAMP_ESTIMATED != 0);
+    is_estimated && carmen::is_made_up(telegram)
+}
+
+/// Copies an MCAP file: every message that can be read, of all channels including those of other programs, and a new index.
+pub(super) fn copy(conversion: &mut Conversion, file: &mut impl Write) -> Result<(), Failure> {
+    let recording = conversion.recording;
+    let (mut reader, catalog) = recording.reader()?;
+    let sensor = recording.chosen();
+    let compression = conversion.options.compression.unwrap_or_default();
+    let writer = Writer::packed(file, &catalog.profile, compression, catalog.facts.clone());
+    let writer = writer.map_err(|error| conversion.failed(error))?;
+    let mut copy = Copy { writer, catalog, channels: BTreeMap::new(), has_facts: false, bytes: 0 };
+    while let Some(item) = reader.next().map_err(|error| recording.broken(&error))? {
+        match item {
+            Item::Telegram(sample) if sensor.is_none_or(|sensor| *sensor == sample.sensor) => {
+                let Sample { sensor, header, telegram } = &sample;
+                let written = copy.writer.sample(sensor, Topic::Telegram, header, telegram);
+                let written =
+                    written.and_then(|()| close_chunk(&mut copy.writer, &mut copy.bytes, telegram.len()));
+                written.map_err(|error| conversion.failed(error))?;
+                let is_scan = crate::is_scan(header.family, telegram);
+                conversion.count(Written::of(is_scan), Some(header.wall_ns))?;
+            }
+            Item::Telegram(_) => {}
+            Item::Record(record) => {
+                let channel =
+                    record.message().and_then(|(message, _)| catalog.place(message.channel_id).flatten());
+                let is_chosen =
+                    sensor.is_none_or(|sensor| channel.is_some_and(|channel| channel.sensor == *sensor));
+                if is_chosen || record.opcode != op::MESSAGE {
+                    copy.record(&record).map_err(|error| conversion.failed(error))?;
+                }
+            }
+        }
+    }
+    copy.writer.finish().map(drop).map_err(|error| conversion.failed(error))
+}
+
+struct Copy<'a, W: Write> {
+    writer: Writer<W>,
+    catalog: &'a Catalog,
+    /// Channel numbers in the new file, by those in the old file.
+    channels: BTreeMap<u16, u16>,
+    /// Whether the facts of the old file were read. The new file begins with them.
+    has_facts: bool,
+    /// Bytes in the open chunk.
+    bytes: usize,
+}
+
+impl<W: Write> Copy<'_, W> {
+    fn record(&mut self, record: &Record) -> io::Result<()> {
+        match record.opcode {
+            op::MESSAGE => self.message(record),
+            op::METADATA | op::ATTACHMENT => match record.parse() {
+                Some(Parsed::Metadata(metadata)) if metadata.name == METADATA && !self.has_facts => {
+                    self.has_facts = true;
+                    Ok(())
+                }
+                Some(Parsed::Metadata(metadata)) => self.writer.note(&metadata.name, metadata.metadata),
+                Some(Parsed::Attachment { header, data, .. }) => {
+                    self.writer.copied_attachment(&mcap::Attachment {
+                        log_time: header.log_time,
+                        create_time: header.create_time,
+                        name: header.name,
+                        media_type: header.media_type,
+                        data,
+                    })
+                }
+                _ => Ok(()),
+            },
+            _ => Ok(()),
+        }
+    }
+
+    /// Copies a message, unless its channel is unknown.
+    fn message(&mut self, record: &Record) -> io::Result<()> {
+        let Some((mut head, data)) = record.message() else { return Ok(()) };
+        head.channel_id = match self.channels.get(&head.channel_id) {
+            Some(&id) => id,
+            None => {
+                let Some((channel, schema)) = self.catalog.channel(head.channel_id) else { return Ok(()) };
+                let schema = schema.map(|(name, language, text)| (&name[..], &language[..], &text[..]));
+                let id = self.writer.copied_channel(channel, schema)?;
+                self.channels.insert(head.channel_id, id);
+                id
+            }
+        };
+        self.writer.copied_message(&head, data)?;
+        close_chunk(&mut self.writer, &mut self.bytes, data.len())
+    }
+}
+
+/// A writer of a format that holds decoded scans.
+pub(super) trait ScanSink {
+    /// Writes `item`, and returns how. Returns `None` if it was not a telegram.
+    fn write(&mut self, item: &DecodedItem<'_>) -> io::Result<Option<Written>>;
+
+    /// Returns whether intensities were requested, and no scan had any.
+    fn lacks_intensities(&self) -> bool {
+        false
+    }
+
+    /// Writes the end.
+    fn finish(self) -> io::Result<()>;
+}
+
+/// Writes the scans into `sink`.
+pub(super) fn write_scans(conversion: &mut Conversion, mut sink: impl ScanSink) -> Result<(), Failure> {
+    let recording = conversion.recording;
+    let (sensor, encoding, mode) = (conversion.sensor, conversion.encoding, conversion.options.mode);
+    let mut is_empty = true;
+    scans::each(recording, sensor, encoding, mode, &mut |item| {
+        let written = sink.write(&item).map_err(|error| conversion.failed(error))?;
+        let Some(written) = written else { return Ok(()) };
+        let DecodedItem::Scan(_, header, _) = item else { return conversion.count(written, None) };
+        is_empty = false;
+        conversion.count(written, Some(header.wall_ns))
+    })?;
+    if is_empty {
+        let message = format!("there is no scan in {}", recording.path().display());
+        let hint = "scans are decoded from topic telegram, or taken from topic scan";
+        return Err(Failure::new(Kind::Input, message, hint));
+    }
+    if sink.lacks_intensities() {
+        let message = format!("no scan in {} has intensities", recording.path().display());
+        let hint = "leave --intensities out; an LMS sends reflector levels only in some measuring modes, such as 0x01";
+        return Err(Failure::new(Kind::Input, message, hint));
+    }
+    sink.finish().map_err(|error| conversion.failed(error))
+}
+
+/// An MCAP file with only messages of ROS 2.
+pub(super) struct Ros2<W: Write> {
+    writer: Writer<W>,
+    bag: Bag,
+    /// Whether each scan is also written as points.
+    has_points: bool,
+    /// Bytes of scans in the open chunk, approximately.
+    chunk_len: usize,
+}
+
+impl<W: Write> Ros2<W> {
+    pub(super) fn begin(conversion: &Conversion, file: W) -> io::Result<Self> {
+        let from = form_name(conversion.recording.contents().form);
+        let facts = [("converted from".to_owned(), from.to_owned())];
+        let compression = conversion.options.compression.unwrap_or_default();
+        Ok(Ros2 {
+            writer: Writer::packed(file, bag::PROFILE, compression, facts.into())?,
+            bag: Bag::default(),
+            has_points: conversion.options.points,
+            chunk_len: 0,
+        })
+    }
+}
+
+impl<W: Write> ScanSink for Ros2<W> {
+    fn write(&mut self, item: &DecodedItem<'_>) -> io::Result<Option<Written>> {
+        match item {
+            DecodedItem::Scan(sensor, header, scan) => {
+                self.bag.scan(&mut self.writer, sensor, header, scan)?;
+                let mut len = scan.beams() * size_of::<f32>();
+                if self.has_points {
+                    self.bag.points(&mut self.writer, sensor, header, scan)?;
+                    len += scan.beams() * size_of::<[f32; 4]>();
+                }
+                close_chunk(&mut self.writer, &mut self.chunk_len, len)?;
+                Ok(Some(Written::Scan))
+            }
+            DecodedItem::Pose(sensor, wall_ns, pose) => {
+                self.bag.pose(&mut self.writer, sensor, *wall_ns, pose)?;
+                Ok(None)
+            }
+            DecodedItem::Other => Ok(Some(Written::LeftOut)),
+        }
+    }
+
+    fn finish(self) -> io::Result<()> {
+        self.writer.finish().map(drop)
+    }
+}
+
+/// A row for each scan, after the names of the columns. The names are repeated if the number of beams changes.
+pub(super) struct Csv<W: Write> {
+    out: Packing<W>,
+    columns: ScanColumns,
+    /// Number of beams in the last line of column names.
+    beams: Option<usize>,
+    has_intensities: bool,
+    line: Vec<u8>,
+}
+
+impl<W: Write> Csv<W> {
+    pub(super) fn begin(out: Packing<W>, columns: ScanColumns) -> Self {
+        Csv { out, columns, beams: None, has_intensities: false, line: Vec::new() }
+    }
+}
+
+impl<W: Write> ScanSink for Csv<W> {
+    fn write(&mut self, item: &DecodedItem<'_>) -> io::Result<Option<Written>> {
+        let DecodedItem::Scan(_, header, scan) = item else {
+            return Ok(matches!(item, DecodedItem::Other).then_some(Written::LeftOut));
+        };
+        self.line.clear();
+        if self.beams != Some(scan.beams()) {
+            self.beams = Some(scan.beams());
+            self.columns.names(&mut self.line, scan.beams())?;
+            self.line.push(b'\n');
+        }
+        self.has_intensities |= !scan.intensities().is_empty();
+        self.columns.row(&mut self.line, header, scan)?;
+        self.line.push(b'\n');
+        self.out.write_all(&self.line)?;
+        Ok(Some(Written::Scan))
+    }
+
+    fn lacks_intensities(&self) -> bool {
+        self.columns.intensities && !self.has_intensities
+    }
+
+    fn finish(self) -> io::Result<()> {
+        self.out.finish()
+    }
+}
+
+/// Writes the marks of the chosen sensor.
+///
+/// # Errors
+///
+/// Returns [`Kind::NoTopic`] if none were recorded.
+pub(super) fn write_marks(
+    conversion: &mut Conversion,
+    columns: MarkColumns,
+    mut out: Packing<impl Write>,
+) -> Result<(), Failure> {
+    let recording = conversion.recording;
+    let mut lines = Vec::new();
+    columns.names(&mut lines).map_err(|error| conversion.failed(error))?;
+    let (mut samples, mut written) = (0, 0);
+    if recording.contents().form == Form::Mcap {
+        let (mut reader, catalog) = recording.reader()?;
+        while let Some(item) = reader.next().map_err(|error| recording.broken(&error))? {
+            let Item::Record(record) = item else { continue };
+            let Some((channel, header, payload)) = catalog.message(&record) else { continue };
+            let mut marks = Marks::default();
+            if channel.topic != Topic::Marks
+                || recording.chosen() != Some(&channel.sensor)
+                || !marks.unpack(payload)
+            {
+                continue;
+            }
+            let rows = columns.rows(&mut lines, &header, &marks).and_then(|()| out.write_all(&lines));
+            rows.map_err(|error| conversion.failed(error))?;
+            lines.clear();
+            samples += 1;
+            written += marks.marks().len() as u64;
+            conversion.count(Written::Marks, Some(header.wall_ns))?;
+        }
+    }
+    if samples == 0 {
+        let path = recording.path().display();
+        let message = format!("there are no recorded marks in {path}");
+        let hint = format!(
+            "`scanhub replay {path}` finds marks in the scans, and meanwhile `scanhub record SENSOR/marks` records them"
+        );
+        return Err(Failure::new(Kind::NoTopic, message, hint));
+    }
+    conversion.converted.marks = Some(written);
+    out.finish().map_err(|error| conversion.failed(error))
+}
+
+/// Bytes of telegrams after which a chunk ends.
+const CHUNK: usize = 256 * 1024;
