@@ -1,22 +1,23 @@
 //! Injected faults. A user writes them as `loss=0.00135,burst=1.89`, and one table has the keys with their meaning and
 //! range for the parser, the printer and the help.
 //!
-//! A seed causes the same damage in every run, for any size of chunks. [`crate::wire`] applies the faults between the
-//! scanner and the port, except the scanner's own deviations from the protocol.
-
-mod damage;
-mod schedule;
+//! [`crate::wire`] applies the faults between the scanner and the port, except the scanner's own deviations from the
+//! protocol:
+//!
+//! - Damage to bytes. A byte is lost, flipped or doubled, or has random bytes before it. The random numbers of each byte
+//!   are drawn in any case, so that the same seed damages the same bytes in every run, for any size of chunks.
+//! - Damage to telegrams. A telegram is truncated, broken off or sent twice, or has another length field. Its random
+//!   numbers are drawn at its start.
+//! - Faults at a time, in time of the scanner: [`Schedule`] has points in time, [`Window`] spans of time, [`Extra`]
+//!   garbage between or inside telegrams, and [`Delay`] the delays of chunks.
 
 use std::fmt;
 use std::str::FromStr;
 
-use schema::{Failure, Kind, Nanos};
+use scanhub_drivers::lms;
+use schema::{Failure, Kind, MILLIS, Nanos};
 
 use crate::machine::Habits;
-
-pub use damage::Loss;
-pub(crate) use damage::{Fate, Noise, TelegramFaults};
-pub(crate) use schedule::{Extra, Lateness, Schedule, Window};
 
 /// First cause for which a telegram did not reach the host intact, as recorded in the truth. A telegram is intact if
 /// all its bytes arrive as sent and next to each other.
@@ -81,15 +82,15 @@ impl Fault {
 struct Key {
     name: &'static str,
     meaning: &'static str,
-    least: f64,
-    most: f64,
+    min: f64,
+    max: f64,
     default: f64,
     field: fn(&mut Faults) -> &mut f64,
 }
 
 /// Creates a field and a key from each row.
 macro_rules! faults {
-    ($($name:ident, $least:literal to $most:literal, $default:literal, $meaning:literal;)*) => {
+    ($($name:ident, $min:literal to $max:literal, $default:literal, $meaning:literal;)*) => {
         /// Kinds and amounts of faults.
         #[derive(Clone, Copy, Debug, PartialEq)]
         pub struct Faults {
@@ -106,8 +107,8 @@ macro_rules! faults {
         const TABLE: &[Key] = &[$(Key {
             name: stringify!($name),
             meaning: $meaning,
-            least: $least,
-            most: $most,
+            min: $min,
+            max: $max,
             default: $default,
             field: |faults| &mut faults.$name,
         },)*];
@@ -170,8 +171,8 @@ impl Faults {
     /// Returns each key, and its meaning, range and default as text.
     pub fn keys() -> impl Iterator<Item = (&'static str, String)> {
         TABLE.iter().map(|key| {
-            let Key { name, meaning, least, most, default, .. } = key;
-            (*name, format!("{meaning}, {least} to {most} [{default}]"))
+            let Key { name, meaning, min, max, default, .. } = key;
+            (*name, format!("{meaning}, {min} to {max} [{default}]"))
         })
     }
 
@@ -203,14 +204,14 @@ impl FromStr for Faults {
             let (name, value) =
                 part.split_once('=').ok_or_else(|| wrong(part, "is not KEY=VALUE", names()))?;
             let key = TABLE.iter().find(|key| key.name == name);
-            let Key { least, most, field, .. } = key.ok_or_else(|| wrong(part, "names no fault", names()))?;
+            let Key { min, max, field, .. } = key.ok_or_else(|| wrong(part, "names no fault", names()))?;
             let number = match value.strip_prefix("0x") {
                 Some(digits) => u8::from_str_radix(digits, 16).ok().map(f64::from),
                 None => value.parse().ok(),
             };
             *field(&mut faults) =
-                number.filter(|number| (*least..=*most).contains(number)).ok_or_else(|| {
-                    wrong(part, "is out of range", format!("{name} is a number from {least} to {most}"))
+                number.filter(|number| (*min..=*max).contains(number)).ok_or_else(|| {
+                    wrong(part, "is out of range", format!("{name} is a number from {min} to {max}"))
                 })?;
         }
         Ok(faults)
@@ -243,12 +244,449 @@ fn random(seed: u64, kind: u64) -> fastrand::Rng {
     fastrand::Rng::with_seed(seed ^ kind.wrapping_mul(0x9E37_79B9_7F4A_7C15))
 }
 
+/// Loses bytes in bursts, the same ones in every run with the same seed.
+#[derive(Clone, Debug)]
+pub struct Loss {
+    /// Probability that a burst begins after a byte that arrived.
+    begin: f64,
+    /// Probability that a burst continues.
+    continues: f64,
+    inside: bool,
+    random: fastrand::Rng,
+}
+
+impl Loss {
+    /// Creates the losses of `faults` with `seed`.
+    pub fn new(faults: Faults, seed: u64) -> Self {
+        Loss {
+            // Bursts of mean b and, between them, runs of mean 1/begin: their share is b / (b + 1/begin).
+            begin: faults.loss / (faults.burst * (1.0 - faults.loss)),
+            continues: 1.0 - 1.0 / faults.burst,
+            inside: false,
+            random: fastrand::Rng::with_seed(seed),
+        }
+    }
+
+    /// Removes the lost bytes from `bytes`. Returns whether any byte was lost.
+    pub fn apply(&mut self, bytes: &mut Vec<u8>) -> bool {
+        let before = bytes.len();
+        bytes.retain(|_| !self.next());
+        bytes.len() < before
+    }
+
+    /// Returns whether the next byte is lost.
+    fn next(&mut self) -> bool {
+        if self.begin == 0.0 {
+            return false;
+        }
+        let chance = if self.inside { self.continues } else { self.begin };
+        self.inside = self.random.f64() < chance;
+        self.inside
+    }
+}
+
+/// Damage to one byte.
+#[derive(Debug, Default, PartialEq, Eq)]
+pub(crate) struct ByteOutcome {
+    /// Inserted bytes before this one.
+    pub(crate) before: Vec<u8>,
+    pub(crate) lost: bool,
+    /// Mask of the flipped bits.
+    pub(crate) flipped: u8,
+    pub(crate) doubled: bool,
+}
+
+/// The faults of single bytes.
+#[derive(Clone, Debug)]
+pub(crate) struct Noise {
+    loss: Loss,
+    flip: f64,
+    flip_bits: f64,
+    /// Bits of a run that reach into the next byte.
+    bits_left: u32,
+    flips: fastrand::Rng,
+    insert: f64,
+    insert_burst: f64,
+    inserts: fastrand::Rng,
+    double: f64,
+    doubles: fastrand::Rng,
+}
+
+impl Noise {
+    pub(crate) fn new(faults: &Faults, seed: u64) -> Noise {
+        Noise {
+            loss: Loss::new(*faults, seed),
+            flip: faults.flip,
+            flip_bits: faults.flip_bits,
+            bits_left: 0,
+            flips: random(seed, 1),
+            insert: faults.insert,
+            insert_burst: faults.insert_burst,
+            inserts: random(seed, 2),
+            double: faults.double,
+            doubles: random(seed, 3),
+        }
+    }
+
+    /// Returns the damage to the next byte.
+    pub(crate) fn next(&mut self) -> ByteOutcome {
+        ByteOutcome {
+            before: self.inserted(),
+            lost: self.loss.next(),
+            flipped: self.flipped(),
+            doubled: happens(&mut self.doubles, self.double),
+        }
+    }
+
+    /// Returns the mask of flipped bits. The lowest bit is sent first, so a run continues in the low bits of the next
+    /// byte.
+    fn flipped(&mut self) -> u8 {
+        let mut first = 0;
+        if self.bits_left == 0 {
+            if !happens(&mut self.flips, self.flip) {
+                return 0;
+            }
+            first = self.flips.u32(..8);
+            self.bits_left = geometric(&mut self.flips, self.flip_bits);
+        }
+        let here = self.bits_left.min(8 - first);
+        self.bits_left -= here;
+        (((1u16 << here) - 1) << first) as u8
+    }
+
+    fn inserted(&mut self) -> Vec<u8> {
+        if !happens(&mut self.inserts, self.insert) {
+            return Vec::new();
+        }
+        let count = geometric(&mut self.inserts, self.insert_burst);
+        (0..count).map(|_| self.inserts.u8(..)).collect()
+    }
+}
+
+/// Returns whether an event with the probability `share` happens. Draws no number if `share` is 0.
+pub(super) fn happens(random: &mut fastrand::Rng, share: f64) -> bool {
+    share > 0.0 && random.f64() < share
+}
+
+/// Returns a number from a geometric distribution: 1 or more, `mean` on average.
+fn geometric(random: &mut fastrand::Rng, mean: f64) -> u32 {
+    let mut count = 1;
+    while happens(random, 1.0 - 1.0 / mean) {
+        count += 1;
+    }
+    count
+}
+
+/// The faults of the telegram on the line.
+#[derive(Clone, Debug)]
+pub(crate) struct TelegramFaults {
+    truncate: f64,
+    length: f64,
+    repeat: f64,
+    abort: f64,
+    random: fastrand::Rng,
+    /// Share of the bytes that arrive, if the telegram is truncated.
+    arrives: Option<f64>,
+    /// Mask of the flipped bits of the length field; 0 if there are none.
+    mask: u16,
+    repeats: bool,
+    /// Share of the bytes after which the scanner breaks off the telegram.
+    breaks: Option<f64>,
+    /// Length of the telegram, as far as its bytes have announced it.
+    len: usize,
+    announces: bool,
+}
+
+impl TelegramFaults {
+    pub(crate) fn new(faults: &Faults, seed: u64) -> TelegramFaults {
+        TelegramFaults {
+            truncate: faults.truncate,
+            length: faults.length,
+            repeat: faults.repeat,
+            abort: faults.abort,
+            random: random(seed, 4),
+            arrives: None,
+            mask: 0,
+            repeats: false,
+            breaks: None,
+            len: 0,
+            announces: true,
+        }
+    }
+
+    /// Starts a telegram. It has `len` bytes, or announces its length.
+    pub(crate) fn begin(&mut self, len: Option<usize>) {
+        let shares = [self.random.f64(), self.random.f64()];
+        // Half of the changed lengths are valid.
+        let masks = [self.random.u16(1..0x0400), self.random.u16(1..)];
+        let mask = masks[usize::from(self.random.bool())];
+        self.arrives = happens(&mut self.random, self.truncate).then_some(shares[0]);
+        self.mask = if happens(&mut self.random, self.length) { mask } else { 0 };
+        self.repeats = happens(&mut self.random, self.repeat);
+        self.breaks = happens(&mut self.random, self.abort).then_some(shares[1]);
+        self.len = len.unwrap_or(lms::telegram::FRAME);
+        self.announces = len.is_none();
+    }
+
+    /// Returns the byte that arrives for `byte` at `position`, or `None` if it is lost, and the fault.
+    pub(crate) fn apply(&mut self, position: usize, byte: u8) -> (Option<u8>, Option<Fault>) {
+        let [low, high] = self.mask.to_le_bytes();
+        // Telegrams of a fixed length have it in the byte after the first one.
+        let flipped = match (self.announces, position) {
+            (true, 2) | (false, 1) => low,
+            (true, 3) => high,
+            _ => 0,
+        };
+        match position {
+            2 if self.announces => self.len += usize::from(byte),
+            3 if self.announces => self.len += usize::from(byte) << 8,
+            _ => {}
+        }
+        if position > 3 && self.arrives.is_some_and(|share| position >= self.place(share)) {
+            return (None, Some(Fault::Truncated));
+        }
+        (Some(byte ^ flipped), (flipped != 0).then_some(Fault::Length))
+    }
+
+    /// Returns whether the scanner breaks off the telegram after `position` bytes.
+    pub(crate) fn breaks_at(&self, position: usize) -> bool {
+        position > 4 && self.breaks.is_some_and(|share| position >= self.place(share))
+    }
+
+    /// Returns whether the telegram is sent twice.
+    pub(crate) fn repeats(&self) -> bool {
+        self.repeats
+    }
+
+    /// Returns the position at `share` of the length, after the first byte and within the telegram.
+    fn place(&self, share: f64) -> usize {
+        1 + (share * (self.len - 1) as f64) as usize
+    }
+}
+
+/// Points in time at which a fault happens.
+#[derive(Clone, Debug)]
+pub(crate) struct Schedule {
+    every_s: f64,
+    next_ns: Nanos,
+    random: fastrand::Rng,
+}
+
+impl Schedule {
+    /// Creates a schedule. The first time is `at_s`, and each next time is `every_s` later on average, in seconds. If
+    /// `every_s` is 0, there is only the first time. If `at_s` is 0, the first time is drawn like the others, or is
+    /// [`ONCE_S`] if there are no others.
+    pub(crate) fn new(at_s: f64, every_s: f64, random: fastrand::Rng) -> Schedule {
+        let mut schedule = Schedule { every_s, next_ns: 0, random };
+        schedule.next_ns = match (at_s > 0.0, every_s > 0.0) {
+            (true, _) => nanos(at_s),
+            (false, true) => schedule.interval_ns(),
+            (false, false) => nanos(ONCE_S),
+        };
+        schedule
+    }
+
+    /// Returns the times of the scanner's power cycles.
+    pub(crate) fn power_cycles(faults: &Faults, seed: u64) -> Schedule {
+        Schedule::if_configured(faults.power_at, faults.power_every, random(seed, 7))
+    }
+
+    /// Returns the times at which the scanner's voltage dips.
+    pub(crate) fn brownouts(faults: &Faults, seed: u64) -> Schedule {
+        Schedule::if_configured(faults.brownout_at, faults.brownout_every, random(seed, 12))
+    }
+
+    /// Creates a schedule as [`Schedule::new`] does, or an empty one if both times are 0.
+    fn if_configured(at_s: f64, every_s: f64, random: fastrand::Rng) -> Schedule {
+        if at_s + every_s > 0.0 { Schedule::new(at_s, every_s, random) } else { Schedule::never() }
+    }
+
+    /// Returns an empty schedule.
+    pub(crate) fn never() -> Schedule {
+        Schedule { every_s: 0.0, next_ns: Nanos::MAX, random: fastrand::Rng::with_seed(0) }
+    }
+
+    pub(crate) fn next_ns(&self) -> Nanos {
+        self.next_ns
+    }
+
+    /// Removes and returns the next time, unless it is after `now`.
+    pub(crate) fn take(&mut self, now: Nanos) -> Option<Nanos> {
+        let at_ns = Some(self.next_ns).filter(|&at| at <= now)?;
+        let interval_ns = if self.every_s > 0.0 { self.interval_ns() } else { Nanos::MAX };
+        self.next_ns = at_ns.saturating_add(interval_ns);
+        Some(at_ns)
+    }
+
+    fn interval_ns(&mut self) -> Nanos {
+        nanos(self.every_s * (0.5 + self.random.f64())).max(MILLIS)
+    }
+}
+
+/// Spans of time in which a fault is present.
+#[derive(Clone, Debug)]
+pub(crate) struct Window {
+    begins: Schedule,
+    span_ns: Nanos,
+    /// End of the span that has begun last.
+    until_ns: Nanos,
+}
+
+impl Window {
+    /// Creates spans of `span_s` seconds that begin at the times of [`Schedule::new`]. There are none if `span_s` is 0.
+    pub(crate) fn new(span_s: f64, at_s: f64, every_s: f64, random: fastrand::Rng) -> Window {
+        let begins = if span_s > 0.0 { Schedule::new(at_s, every_s, random) } else { Schedule::never() };
+        Window { begins, span_ns: nanos(span_s), until_ns: 0 }
+    }
+
+    /// Creates a single span, which begins at `begin_ns`.
+    pub(crate) fn once(begin_ns: Nanos, span_ns: Nanos) -> Window {
+        let begins = Schedule { next_ns: begin_ns, ..Schedule::never() };
+        Window { begins, span_ns, until_ns: 0 }
+    }
+
+    /// Returns the times at which no byte arrives.
+    pub(crate) fn silences(faults: &Faults, seed: u64) -> Window {
+        Window::new(faults.silence, faults.silence_at, faults.silence_every, random(seed, 8))
+    }
+
+    /// Returns the times at which the port is unplugged.
+    pub(crate) fn unplugs(faults: &Faults, seed: u64) -> Window {
+        Window::new(faults.unplug, faults.unplug_at, faults.unplug_every, random(seed, 9))
+    }
+
+    /// Returns the times at which something holds the head of the scanner.
+    pub(crate) fn held(faults: &Faults, seed: u64) -> Window {
+        Window::new(faults.hold, faults.hold_at, faults.hold_every, random(seed, 13))
+    }
+
+    /// Returns whether the fault is present at `now`. Time must not go backwards.
+    pub(crate) fn holds(&mut self, now: Nanos) -> bool {
+        while let Some(begin_ns) = self.begins.take(now) {
+            self.until_ns = begin_ns + self.span_ns;
+        }
+        now < self.until_ns
+    }
+
+    /// Returns the end of the span at `now`, or `now` if there is none.
+    pub(crate) fn end_ns(&mut self, now: Nanos) -> Nanos {
+        if self.holds(now) { self.until_ns } else { now }
+    }
+
+    /// Returns the time of the next change after `now`.
+    pub(crate) fn next_ns(&self, now: Nanos) -> Nanos {
+        if now < self.until_ns { self.until_ns.min(self.begins.next_ns()) } else { self.begins.next_ns() }
+    }
+}
+
+/// Garbage that arrives now and then, between telegrams or inside one.
+#[derive(Clone, Debug)]
+pub(crate) struct Extra {
+    pub(crate) fault: Fault,
+    schedule: Schedule,
+    len: usize,
+    inside: f64,
+    random: fastrand::Rng,
+    /// Whether the next garbage arrives inside a telegram.
+    wants_inside: bool,
+    /// Number of bytes of the telegram before the garbage.
+    passes: usize,
+}
+
+impl Extra {
+    /// Creates floods of random bytes.
+    pub(crate) fn floods(faults: &Faults, seed: u64) -> Extra {
+        Extra::new(Fault::Flood, faults.flood, faults.flood_every, faults.inside, random(seed, 5))
+    }
+
+    /// Creates walls of start bytes.
+    pub(crate) fn walls(faults: &Faults, seed: u64) -> Extra {
+        Extra::new(Fault::Wall, faults.wall, faults.wall_every, faults.inside, random(seed, 6))
+    }
+
+    fn new(fault: Fault, len: f64, every_s: f64, inside: f64, mut random: fastrand::Rng) -> Extra {
+        let happens = len >= 1.0;
+        let schedule = if happens { Schedule::new(0.0, every_s, random.fork()) } else { Schedule::never() };
+        let wants_inside = random.f64() < inside;
+        Extra { fault, schedule, len: len as usize, inside, random, wants_inside, passes: 0 }
+    }
+
+    /// Returns the time of the next garbage, for a line between two telegrams, or inside one if `inside` is set.
+    pub(crate) fn due_ns(&self, inside: bool) -> Nanos {
+        if inside == self.wants_inside { self.schedule.next_ns() } else { Nanos::MAX }
+    }
+
+    /// Returns the garbage, if it is due before the byte that ends at `now`. `header` has the first bytes of the
+    /// stream's telegrams.
+    pub(crate) fn take(&mut self, now: Nanos, inside: bool, header: &[u8]) -> Option<Vec<u8>> {
+        if self.due_ns(inside) > now {
+            return None;
+        }
+        if inside && self.passes > 0 {
+            self.passes -= 1;
+            return None;
+        }
+        self.schedule.take(now)?;
+        self.wants_inside = self.random.f64() < self.inside;
+        self.passes = self.random.usize(..64);
+        if self.fault == Fault::Flood {
+            return Some((0..self.len).map(|_| self.random.u8(..)).collect());
+        }
+        // Before the start of the stream, use the first bytes of an LMS telegram.
+        let header = if header.len() < 2 { &[0x02, 0x80] } else { header };
+        let bricks: [&[u8]; 3] = [&header[..1], &header[..2], header];
+        let brick = bricks[self.random.usize(..3)];
+        Some(brick.iter().copied().cycle().take(self.len).collect())
+    }
+}
+
+fn nanos(seconds: f64) -> Nanos {
+    (seconds * 1e9) as Nanos
+}
+
+/// Time of a single fault without a configured time, in seconds. A session streams by then.
+const ONCE_S: f64 = 5.0;
+
+/// Delays of chunks: a line that is stuck for a while, and random delays. The order of the chunks never changes.
+#[derive(Clone, Debug)]
+pub(crate) struct Delay {
+    stall: Window,
+    /// Maximum random delay.
+    delay_ns: Nanos,
+    random: fastrand::Rng,
+    /// Arrival of the last chunk.
+    last_ns: Nanos,
+}
+
+impl Delay {
+    pub(crate) fn new(faults: &Faults, seed: u64) -> Delay {
+        Delay {
+            stall: Window::new(faults.stall, faults.stall_at, faults.stall_every, random(seed, 10)),
+            delay_ns: (faults.delay * 1e9) as Nanos,
+            random: random(seed, 11),
+            last_ns: 0,
+        }
+    }
+
+    /// Returns these delays, with every chunk after those that `other` delays.
+    pub(crate) fn after(self, other: &Delay) -> Delay {
+        Delay { last_ns: other.last_ns, ..self }
+    }
+
+    /// Returns the arrival of a chunk whose transmission ends at `now`.
+    pub(crate) fn release_ns(&mut self, now: Nanos) -> Nanos {
+        let delay_ns = if self.delay_ns > 0 { self.random.u64(..=self.delay_ns) } else { 0 };
+        self.last_ns = self.last_ns.max(self.stall.end_ns(now) + delay_ns);
+        self.last_ns
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
 
     #[test]
-    fn written_faults() {
+    fn parses_and_prints_faults() {
         let faults: Faults = "loss=0.00135,burst=1.89".parse().unwrap();
         assert_eq!(faults, Faults { loss: 0.00135, burst: 1.89, ..Faults::default() });
         assert_eq!(faults.to_string(), "loss=0.00135,burst=1.89");
@@ -270,13 +708,13 @@ mod tests {
     }
 
     #[test]
-    fn every_key_is_written_and_read_and_is_off_unless_asked_for() {
+    fn every_key_is_printed_and_parsed_and_is_off_by_default() {
         for key in TABLE {
             let mut faults = Faults::default();
             assert_eq!(*(key.field)(&mut faults), key.default);
-            *(key.field)(&mut faults) = key.most;
+            *(key.field)(&mut faults) = key.max;
             let text = faults.to_string();
-            assert_eq!((text.parse(), text), (Ok(faults), format!("{}={}", key.name, key.most)));
+            assert_eq!((text.parse(), text), (Ok(faults), format!("{}={}", key.name, key.max)));
         }
         let habits = "overlook=0.5,late=1.5,refuse=0x3B,mute=1".parse::<Faults>().unwrap().habits();
         assert_eq!((habits.overlooks, habits.late_reply_ns), (0.5, 1_500_000_000));
@@ -286,5 +724,106 @@ mod tests {
         let habits = "late_mode=2.5,late_write=6".parse::<Faults>().unwrap().habits();
         assert_eq!((habits.late_mode_ns, habits.late_write_ns), (2_500_000_000, 6_000_000_000));
         assert_eq!(Faults::default().habits(), Habits::default());
+    }
+
+    #[test]
+    fn damages_share_of_telegrams_as_measured() {
+        // 0.135 % of the bytes in bursts of 1.89 damage 40.8 % of 732-byte telegrams.
+        let mut loss = Loss::new(Faults { loss: 0.00135, burst: 1.89, ..Faults::default() }, 1);
+        let (telegrams, mut damaged, mut lost) = (20_000, 0, 0);
+        for _ in 0..telegrams {
+            let mut bytes = vec![0; 732];
+            damaged += u32::from(loss.apply(&mut bytes));
+            lost += 732 - bytes.len();
+        }
+        let share = lost as f64 / (732.0 * f64::from(telegrams));
+        assert!((share - 0.00135).abs() < 0.00005, "{share}");
+        let damaged = f64::from(damaged) / f64::from(telegrams);
+        assert!((damaged - 0.408).abs() < 0.01, "{damaged}");
+    }
+
+    #[test]
+    fn loses_same_bytes_for_any_chunk_size() {
+        let faults = Faults { loss: 0.05, burst: 3.0, ..Faults::default() };
+        let bytes: Vec<u8> = (0..5000).map(|i| i as u8).collect();
+        let mut whole = bytes.clone();
+        assert!(Loss::new(faults, 9).apply(&mut whole));
+        let mut loss = Loss::new(faults, 9);
+        let mut cut = Vec::new();
+        for chunk in bytes.chunks(62) {
+            let mut chunk = chunk.to_vec();
+            loss.apply(&mut chunk);
+            cut.append(&mut chunk);
+        }
+        assert_eq!(cut, whole);
+        assert!(!Loss::new(Faults::default(), 9).apply(&mut whole));
+    }
+
+    #[test]
+    fn faults_have_configured_shares_and_are_independent() {
+        let faults =
+            Faults { flip: 0.01, flip_bits: 3.0, insert: 0.02, insert_burst: 4.0, ..Faults::default() };
+        let faults = Faults { double: 0.03, ..faults };
+        let mut noise = Noise::new(&faults, 1);
+        let outcomes: Vec<ByteOutcome> = (0..100_000).map(|_| noise.next()).collect();
+        let bits: u32 = outcomes.iter().map(|outcome| outcome.flipped.count_ones()).sum();
+        let inserted: usize = outcomes.iter().map(|outcome| outcome.before.len()).sum();
+        let doubled = outcomes.iter().filter(|outcome| outcome.doubled).count();
+        assert!((2_700..3_300).contains(&bits), "{bits}");
+        assert!((7_300..8_700).contains(&inserted), "{inserted}");
+        assert!((2_800..3_200).contains(&doubled), "{doubled}");
+        let mut alone = Noise::new(&Faults { double: 0.03, ..Faults::default() }, 1);
+        assert!(outcomes.iter().all(|outcome| alone.next().doubled == outcome.doubled));
+        let mut nothing = Noise::new(&Faults::default(), 1);
+        assert_eq!(nothing.next(), ByteOutcome::default());
+    }
+
+    #[test]
+    fn truncates_telegrams_and_changes_lengths() {
+        let telegram = lms::reply::mode(0, true, 0x10).bytes().to_vec();
+        let mut cuts = std::collections::HashSet::new();
+        let mut telegram_faults = TelegramFaults::new(&Faults { truncate: 1.0, ..Faults::default() }, 3);
+        for _ in 0..200 {
+            telegram_faults.begin(None);
+            let arrived: Vec<u8> = telegram
+                .iter()
+                .enumerate()
+                .filter_map(|(at, &byte)| telegram_faults.apply(at, byte).0)
+                .collect();
+            assert!(arrived.len() < telegram.len() && telegram.starts_with(&arrived));
+            cuts.insert(arrived.len());
+        }
+        assert_eq!(cuts.len(), 5, "{cuts:?}");
+        let mut telegram_faults = TelegramFaults::new(&Faults { length: 1.0, ..Faults::default() }, 3);
+        for _ in 0..200 {
+            telegram_faults.begin(None);
+            let arrived: Vec<u8> = telegram
+                .iter()
+                .enumerate()
+                .filter_map(|(at, &byte)| telegram_faults.apply(at, byte).0)
+                .collect();
+            assert!(arrived[2..4] != telegram[2..4] && arrived[4..] == telegram[4..]);
+        }
+    }
+
+    const S: Nanos = 1_000_000_000;
+
+    #[test]
+    fn spans_begin_and_end_at_their_times() {
+        let mut window = Window::new(1.5, 3.0, 0.0, random(1, 1));
+        assert_eq!((window.next_ns(0), window.holds(3 * S - 1)), (3 * S, false));
+        assert!(window.holds(3 * S) && window.holds(4 * S));
+        assert_eq!(window.next_ns(4 * S), 4 * S + S / 2);
+        assert!(!window.holds(4 * S + S / 2) && !window.holds(100 * S));
+        assert_eq!(window.next_ns(100 * S), Nanos::MAX);
+        assert!(!Window::new(0.0, 3.0, 1.0, random(1, 1)).holds(50 * S));
+        assert!(Window::new(1.0, 0.0, 0.0, random(1, 1)).holds(5 * S));
+    }
+
+    #[test]
+    fn repeats_at_mean_interval() {
+        let mut schedule = Schedule::new(0.0, 2.0, random(1, 1));
+        let times = (0..200 * 100).filter(|i| schedule.take(i * S / 100).is_some()).count();
+        assert!((85..115).contains(&times), "{times}");
     }
 }

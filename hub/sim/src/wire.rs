@@ -9,7 +9,7 @@ use std::collections::VecDeque;
 use schema::Nanos;
 
 use crate::device::{Chunk, Device, Part, Sent};
-use crate::fault::{Extra, Fate, Fault, Faults, Lateness, Noise, Schedule, TelegramFaults, Window};
+use crate::fault::{ByteOutcome, Delay, Extra, Fault, Faults, Noise, Schedule, TelegramFaults, Window};
 use crate::request_decoder::Arrival;
 
 /// What arrives at once.
@@ -34,7 +34,7 @@ pub struct Wire {
     telegram_faults: TelegramFaults,
     extras: [Extra; 2],
     silence: Window,
-    lateness: Lateness,
+    delay: Delay,
     unplug: Window,
     power: Schedule,
     brownouts: Schedule,
@@ -64,7 +64,7 @@ impl Wire {
             telegram_faults: TelegramFaults::new(faults, seed),
             extras: [Extra::floods(faults, seed), Extra::walls(faults, seed)],
             silence: Window::silences(faults, seed),
-            lateness: Lateness::new(faults, seed),
+            delay: Delay::new(faults, seed),
             unplug: Window::unplugs(faults, seed),
             power: Schedule::power_cycles(faults, seed),
             brownouts: Schedule::brownouts(faults, seed),
@@ -83,10 +83,10 @@ impl Wire {
     /// Uses other faults from now on, with new random numbers; what is on its way does not change.
     pub fn set_faults(&mut self, faults: &Faults, seed: u64) {
         let fresh = Wire::new(faults, seed);
-        let lateness = fresh.lateness.behind(&self.lateness);
+        let delay = fresh.delay.after(&self.delay);
         let (queue, header) = (std::mem::take(&mut self.queue), std::mem::take(&mut self.header));
         let Wire { position, last, fault, power_broke, .. } = *self;
-        *self = Wire { lateness, position, last, fault, power_broke, queue, header, ..fresh };
+        *self = Wire { delay, position, last, fault, power_broke, queue, header, ..fresh };
     }
 
     /// The host's adapter is out of its socket from `now` on for `span`, whatever the faults say of it.
@@ -194,7 +194,7 @@ impl Wire {
     fn carry_acknowledge(&mut self, bytes: &[u8]) -> Vec<u8> {
         let mut arrived = Vec::new();
         for &byte in bytes {
-            let Fate { before, lost, flipped, doubled } = self.noise.next();
+            let ByteOutcome { before, lost, flipped, doubled } = self.noise.next();
             arrived.extend(before);
             let copies = if lost { 0 } else { 1 + usize::from(doubled) };
             arrived.extend(std::iter::repeat_n(byte ^ flipped, copies));
@@ -226,7 +226,7 @@ impl Wire {
                 arrived.extend(foreign(garbage, between));
                 fault = fault.or(between.map(|_| cause));
             }
-            let Fate { before, lost, flipped, doubled } = self.noise.next();
+            let ByteOutcome { before, lost, flipped, doubled } = self.noise.next();
             let (blemished, blemish) = self.telegram_faults.apply(position, byte);
             fault = fault.or((position > 0 && !before.is_empty()).then_some(Fault::Insert));
             arrived.extend(foreign(before, between));
@@ -262,7 +262,7 @@ impl Wire {
     }
 
     fn push(&mut self, now: Nanos, carried: Carried) {
-        self.queue.push_back((self.lateness.release_ns(now), carried));
+        self.queue.push_back((self.delay.release_ns(now), carried));
     }
 }
 
