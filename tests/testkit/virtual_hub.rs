@@ -44,7 +44,7 @@ pub(crate) fn virtual_hub<T>(
     let mut links = Vec::with_capacity(config.links.len());
     for (((number, link), around), queue) in config.links.iter().enumerate().zip(&around).zip(queues) {
         let mut link = LiveLink::new(link, number as u8, 0, around, queue)?;
-        let Wait { until, .. } = link.turn(Woken::Timeout);
+        let Wait { until, .. } = link.on_wakeup(Woken::Timeout);
         links.push(VirtualLink { around, link, until });
     }
     shm::allocate(domain)?;
@@ -81,7 +81,7 @@ impl VirtualLink<'_> {
     }
 
     fn turn(&mut self, woken: Woken) {
-        let Wait { until, .. } = self.link.turn(woken);
+        let Wait { until, .. } = self.link.on_wakeup(woken);
         self.until = until;
     }
 }

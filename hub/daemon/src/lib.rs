@@ -1,12 +1,9 @@
 //! The hub: all the I/O there is. It owns the serial links, one thread each, and publishes what they say into shared
 //! memory; who listens is not its business.
 
-mod backlog;
 mod control;
 mod diagnosis;
-mod drive;
 mod early;
-mod identity_cache;
 mod link;
 mod link_output;
 mod link_stats;
@@ -20,7 +17,7 @@ mod replay;
 mod replay_hub;
 mod saved_state;
 mod service;
-mod settings_check;
+mod session_driver;
 mod supervise;
 pub mod surroundings;
 mod system;

@@ -10,44 +10,52 @@ use scanhub_drivers::line::{Control, Identity, Protocol as _, Session as _};
 use schema::{Failure, Flags, Kind, MILLIS, Nanos, State};
 
 use crate::control::{ControlQueue, Flow};
-use crate::drive::{Drive, Open};
 use crate::link::LinkCore;
+use crate::session_driver::{OpenLine, SessionDriver};
 use crate::surroundings::{Line, On, Surroundings, Wait, Woken};
 
-/// A link whose other end is a port that comes and goes: told why a wait is over, it says for what to wait next.
+/// A link to a port that may disappear and come back. It is a state machine: [`on_wakeup`](Self::on_wakeup) takes the
+/// reason why a wait ended and returns what to wait for next.
 pub struct LiveLink<'a, S: Surroundings> {
     core: LinkCore<'a, S>,
-    drive: Drive<'a, S>,
+    driver: SessionDriver<'a, S>,
     phase: Phase<S::Line>,
-    /// Times in a row that the port was there and went without a byte.
-    futile: u32,
+    /// Consecutive connections that closed without delivering a byte.
+    empty_connections: u32,
     has_begun: bool,
     /// Whether another process has had the sensor's name since the link exists.
     lacks_name: bool,
 }
 
-/// A line that was just opened.
-struct OpenLine<L> {
+/// A port that was just opened.
+struct OpenedPort<L> {
     line: L,
-    /// Whether it has the rate that the session wants first.
+    /// Whether it has the rate with which the session starts.
     has_rate: bool,
     /// Whether a service manager kept the line of a killed hub open, with the bytes that it has received.
     is_kept: bool,
 }
 
-/// Where the port is.
+/// State of the port.
 enum Phase<L> {
-    /// There.
-    Open(Box<Open<L>>),
-    /// Away until it is looked for again, and what to wait for until then.
-    Away { away: Away, look_at: Nanos, until: Nanos },
-    /// Being opened.
-    Opening { away: Away, until: Nanos },
+    Open(Box<OpenLine<L>>),
+    /// Unavailable. The link tries to open it at `retry_at`, and the next wait ends at `until`.
+    Unavailable {
+        reason: Unavailable,
+        retry_at: Nanos,
+        until: Nanos,
+    },
+    /// Being opened. The next wait ends at `until`.
+    Opening {
+        reason: Unavailable,
+        until: Nanos,
+    },
 }
 
 impl<'a, S: Surroundings> LiveLink<'a, S> {
     /// Takes the name of `link`, number `number` in the configuration, and creates its topics for the run `boot` of the hub.
-    /// Publishes the first status, and looks for the port. The caller then calls [`turn`](Self::turn) with a timeout.
+    /// Publishes the first status, and tries to open the port. The caller then calls [`on_wakeup`](Self::on_wakeup) with a
+    /// timeout.
     ///
     /// # Errors
     ///
@@ -70,28 +78,28 @@ impl<'a, S: Surroundings> LiveLink<'a, S> {
         };
         let mut core = LinkCore::new(link, number, boot, around, control)?;
         core.begin();
-        let drive = Drive::new(&core);
-        let known = drive.recall(around.now());
-        let phase = Phase::away(Away::default(), 0);
+        let driver = SessionDriver::new(&core);
+        let saved_identity = driver.saved_identity(around.now());
+        let phase = Phase::unavailable(Unavailable::default(), 0);
         let lacks_name = taken.is_some();
-        let mut live = LiveLink { core, drive, phase, futile: 0, has_begun: false, lacks_name };
+        let mut live = LiveLink { core, driver, phase, empty_connections: 0, has_begun: false, lacks_name };
         if let Some(failure) = taken {
-            live.leave(Away::for_lack_of_the_name(failure));
+            live.schedule_retry(Unavailable::without_name(failure));
             return Ok(live);
         }
-        match live.first_line() {
-            Ok(Some(line)) => {
-                // On a line that was closed meanwhile it may be another sensor, or the same in another mode.
-                let known = known.filter(|_| line.is_kept);
-                live.open(line, known);
+        match live.open_first() {
+            Ok(Some(port)) => {
+                // If the line was closed in between, another scanner may be connected, or the same one in another mode.
+                let identity = saved_identity.filter(|_| port.is_kept);
+                live.start_session(port, identity);
                 Ok(live)
             }
             Ok(None) => {
-                let words = format!("{}: not connected yet", link.port.name());
-                live.leave(Away { words, ..Away::default() });
+                let message = format!("{}: not connected yet", link.port.name());
+                live.schedule_retry(Unavailable { message, ..Unavailable::default() });
                 Ok(live)
             }
-            // Only a hub plays recordings.
+            // Only the hub plays recordings, so the hint of the port does not name them.
             Err(error @ PortError::NotTty) => {
                 let failure = around.explain(&error, &link.port);
                 let hint = format!("{}, or file:PATH for a recording", failure.hint);
@@ -99,9 +107,9 @@ impl<'a, S: Surroundings> LiveLink<'a, S> {
             }
             Err(error @ PortError::Short(_)) => Err(around.explain(&error, &link.port)),
             Err(error) => {
-                let mut away = Away::default();
-                away.learn(&error, around.now(), |error| said(around.explain(error, &link.port)));
-                live.leave(away);
+                let mut reason = Unavailable::default();
+                reason.update(&error, around.now(), |error| one_line(around.explain(error, &link.port)));
+                live.schedule_retry(reason);
                 Ok(live)
             }
         }
@@ -121,128 +129,135 @@ impl<'a, S: Surroundings> LiveLink<'a, S> {
     pub fn has_tried(&self) -> bool {
         match &self.phase {
             Phase::Open(_) => true,
-            Phase::Away { away, .. } | Phase::Opening { away, .. } => self.lacks_name || away.error.is_some(),
+            Phase::Unavailable { reason, .. } | Phase::Opening { reason, .. } => {
+                self.lacks_name || reason.error.is_some()
+            }
         }
     }
 
-    /// Does what there is to do after a wait that ended as `woken` says, and returns what to wait for next.
-    pub fn turn(&mut self, woken: Woken) -> Wait<'_, S::Line> {
+    /// Handles the end of a wait, for the reason `woken`. Returns what to wait for next.
+    pub fn on_wakeup(&mut self, woken: Woken) -> Wait<'_, S::Line> {
         let (_, until) = self.phase.wait();
         if !std::mem::replace(&mut self.has_begun, true) {
             self.begin();
         } else if self.core.is_over(woken, until) {
             match &mut self.phase {
                 Phase::Open(open) => {
-                    if let Err(error) = self.drive.turn(&mut self.core, open, woken) {
-                        self.lose(&error);
+                    if let Err(error) = self.driver.on_wakeup(&mut self.core, open, woken) {
+                        self.on_line_lost(&error);
                     }
                 }
-                Phase::Away { look_at, .. } => {
-                    let look_at = *look_at;
-                    self.pass(woken);
-                    if self.core.around.now() >= look_at {
-                        self.reach();
+                Phase::Unavailable { retry_at, .. } => {
+                    let retry_at = *retry_at;
+                    self.keep_waiting(woken);
+                    if self.core.around.now() >= retry_at {
+                        self.try_open();
                     }
                 }
-                Phase::Opening { .. } if woken == Woken::Ready => self.reach(),
-                Phase::Opening { .. } => self.pass(woken),
+                Phase::Opening { .. } if woken == Woken::Ready => self.try_open(),
+                Phase::Opening { .. } => self.keep_waiting(woken),
             }
         }
         let (on, until) = self.phase.wait();
-        let bound = self.core.next_deadline(until, matches!(on, On::Loss(_)));
-        Wait { requests: &self.core.control, on, until: bound }
+        let until = self.core.next_deadline(until, matches!(on, On::Loss(_)));
+        Wait { requests: &self.core.control, on, until }
     }
 
-    /// The hub ends: hands on what was learned.
+    /// Ends the session and saves the state of the link, because the hub ends.
     pub fn end(mut self) {
         if let Phase::Open(open) = &mut self.phase {
-            // If the line goes just now, there is nobody to be told.
-            let _ = self.drive.end(&self.core, open);
+            // A line that is lost at this moment needs no last requests.
+            let _ = self.driver.end(&self.core, open);
             self.core.close(&open.session);
         }
         self.core.end();
     }
 
-    /// Returns the line at the start of the hub. `None` if a connection has to be made.
-    fn first_line(&mut self) -> Result<Option<OpenLine<S::Line>>, PortError> {
-        let (source, baud) = (&self.core.link.port, self.drive.opening_rate(&self.core));
+    /// Opens the port at the start of the hub. Returns `None` if that needs a connection.
+    fn open_first(&mut self) -> Result<Option<OpenedPort<S::Line>>, PortError> {
+        let (source, baud) = (&self.core.link.port, self.driver.opening_rate(&self.core));
         if let Source::Tcp { .. } = source {
             return Ok(None);
         }
-        match self.kept_line(baud) {
-            Some(line) => Ok(Some(line)),
-            None => self.open_line(baud).transpose(),
+        match self.take_kept(baud) {
+            Some(port) => Ok(Some(port)),
+            None => self.open(baud).transpose(),
         }
     }
 
-    /// Returns the line that the service manager kept open while the previous hub was killed.
-    fn kept_line(&self, baud: u32) -> Option<OpenLine<S::Line>> {
+    /// Returns the port that the service manager kept open while the previous hub was killed.
+    fn take_kept(&self, baud: u32) -> Option<OpenedPort<S::Line>> {
         let LinkCore { link, around, .. } = self.core;
         let (name, source) = (&link.name, &link.port);
         let line = around.take_kept(name, source, baud)?;
         tracing::info!("{name}: continues with {}, which the service manager kept open", source.name());
-        Some(OpenLine { line, has_rate: true, is_kept: true })
+        Some(OpenedPort { line, has_rate: true, is_kept: true })
     }
 
-    /// Opens the port at `baud`. A search leaves out a rate that the port cannot have, so it then gets a port at
-    /// another rate.
-    fn open_line(&mut self, baud: u32) -> Option<Result<OpenLine<S::Line>, PortError>> {
+    /// Opens the port at `baud`. A search skips a rate that the port rejects, so the port is then opened at another rate.
+    /// Returns `None` while a connection is being made.
+    fn open(&mut self, baud: u32) -> Option<Result<OpenedPort<S::Line>, PortError>> {
         let LinkCore { link, around, .. } = self.core;
         let (opened, has_rate) = match around.open(&link.port, baud) {
             Some(Err(error @ PortError::Rate { .. })) if link.family().is_none() => {
-                self.drive.refuse(&self.core, baud, &error);
-                (around.open(&link.port, SLOWEST), false)
+                self.driver.log_rejected_rate(&self.core, baud, &error);
+                (around.open(&link.port, SUPPORTED_RATE), false)
             }
             opened => (opened, true),
         };
-        opened.map(|opened| opened.map(|line| OpenLine { line, has_rate, is_kept: false }))
+        opened.map(|opened| opened.map(|line| OpenedPort { line, has_rate, is_kept: false }))
     }
 
-    /// Tries to open the port; what becomes of it is known at once, or when the wait for it is over.
-    fn reach(&mut self) {
+    /// Tries to take the name and to open the port. The result is known at once, or when the connection is made.
+    fn try_open(&mut self) {
         let (link, around) = (self.core.link, self.core.around);
-        let mut away = self.phase.take_away();
+        let mut reason = self.phase.take_reason();
         if self.lacks_name
             && let Err(failure) = around.take_name()
         {
-            return self.leave(Away::for_lack_of_the_name(failure));
+            return self.schedule_retry(Unavailable::without_name(failure));
         }
-        let baud = self.drive.opening_rate(&self.core);
+        let baud = self.driver.opening_rate(&self.core);
         // While the link had no name, it has not taken the line that was kept for it.
-        let kept = if std::mem::take(&mut self.lacks_name) { self.kept_line(baud) } else { None };
-        match kept.map(Ok).or_else(|| self.open_line(baud)) {
-            Some(Ok(line)) => {
-                self.open(line, None);
+        let kept = if std::mem::take(&mut self.lacks_name) { self.take_kept(baud) } else { None };
+        match kept.map(Ok).or_else(|| self.open(baud)) {
+            Some(Ok(port)) => {
+                self.start_session(port, None);
                 self.begin();
             }
             Some(Err(error)) => {
-                away.learn(&error, around.now(), |error| said(around.explain(error, &link.port)));
-                self.leave(away);
+                reason.update(&error, around.now(), |error| one_line(around.explain(error, &link.port)));
+                self.schedule_retry(reason);
             }
-            None => self.phase = Phase::Opening { away, until: around.now() + STILL_AWAY },
+            None => self.phase = Phase::Opening { reason, until: around.now() + OPENING_STATUS_PERIOD },
         }
     }
 
-    /// Starts a session on an open line. It may continue with the stream of a scanner whose identity is `known`.
-    fn open(&mut self, OpenLine { line, has_rate, .. }: OpenLine<S::Line>, known: Option<Identity>) {
+    /// Creates a session on a port that was just opened. With the `identity` of the scanner, it continues with a stream
+    /// at once.
+    fn start_session(
+        &mut self,
+        OpenedPort { line, has_rate, .. }: OpenedPort<S::Line>,
+        identity: Option<Identity>,
+    ) {
         let core = &mut self.core;
         let now = core.around.now();
         core.around.keep(&core.link.name, &line);
         core.diagnosis.open(line.device());
         core.output.topics.set_flags(if line.is_simulated() { Flags::SIMULATED } else { 0 });
-        let (family, memory) = (core.link.family(), self.drive.memory(core));
+        let (family, memory) = (core.link.family(), self.driver.memory(core));
         let mut session = PortSession::begin(family, &core.link.settings(), memory, now);
         core.output.topics.set_family(family);
         if !has_rate {
             session.reject_rate(now);
         }
-        if let Some(known) = known {
-            session.restore_identity(known);
+        if let Some(identity) = identity {
+            session.restore_identity(identity);
         }
-        if let Some((model, beams)) = self.drive.take_beams() {
+        if let Some((model, beams)) = self.driver.take_saved_beams() {
             session.restore_beams(model, beams);
         }
-        if let Some(rate) = self.drive.last_rate(core) {
+        if let Some(rate) = self.driver.known_rate(core) {
             tracing::debug!(
                 "{}: the search begins at {} baud, where the scanner was found",
                 core.link.name,
@@ -253,165 +268,169 @@ impl<'a, S: Surroundings> LiveLink<'a, S> {
         if core.control.is_paused() {
             session.control(Control::Pause, now);
         }
-        self.phase = Phase::Open(Box::new(Open::new(line, session, core.link.max_rate(), now)));
+        self.phase = Phase::Open(Box::new(OpenLine::new(line, session, core.link.max_rate(), now)));
     }
 
-    /// A session begins, if there is a line.
+    /// Starts the session, if the port is open.
     fn begin(&mut self) {
         if let Phase::Open(open) = &mut self.phase
-            && let Err(error) = self.drive.begin(&mut self.core, open)
+            && let Err(error) = self.driver.begin(&mut self.core, open)
         {
-            self.lose(&error);
+            self.on_line_lost(&error);
         }
     }
 
-    /// The line is gone, as `error` says.
-    fn lose(&mut self, error: &io::Error) {
+    /// Handles the loss of the line because of `error`.
+    fn on_line_lost(&mut self, error: &io::Error) {
         let source = &self.core.link.port;
-        let Phase::Open(open) = std::mem::replace(&mut self.phase, Phase::away(Away::default(), 0)) else {
+        let Phase::Open(open) =
+            std::mem::replace(&mut self.phase, Phase::unavailable(Unavailable::default(), 0))
+        else {
             return;
         };
         self.core.close(&open.session);
-        let heard = open.session.account().read > 0;
-        // Before the port is looked for: it could not be opened while this holds it.
+        let has_received = open.session.account().read > 0;
+        // Close the port now, because it cannot be opened again while it is open.
         drop(open);
         self.core.around.release(&self.core.link.name);
         self.core.stats.reconnects += 1;
-        self.futile = if heard { 0 } else { self.futile + 1 };
-        let words = format!("{} went away: {error}", source.name());
-        self.core.diagnosis.note_empty_connection(if heard { String::new() } else { words.clone() });
-        self.leave(Away { refused: self.futile, ..Away::for_lack_of_a_port(words) });
+        self.empty_connections = if has_received { 0 } else { self.empty_connections + 1 };
+        let message = format!("{} went away: {error}", source.name());
+        self.core.diagnosis.note_empty_connection(if has_received { String::new() } else { message.clone() });
+        let failures = self.empty_connections;
+        self.schedule_retry(Unavailable { failures, ..Unavailable::missing(message) });
     }
 
-    /// The port is away: says so, and looks for it later.
-    fn leave(&mut self, away: Away) {
+    /// Publishes that the port is unavailable, and schedules the next attempt to open it.
+    fn schedule_retry(&mut self, reason: Unavailable) {
         self.core.diagnosis.end_session();
-        self.core.show(None, State::Absent, &away.words);
-        let look_at = self.core.around.now() + away.pause();
-        let until = look_at.min(self.core.next_status());
-        self.phase = Phase::Away { away, look_at, until };
+        self.core.show(None, State::Absent, &reason.message);
+        let retry_at = self.core.around.now() + reason.retry_interval();
+        let until = retry_at.min(self.core.next_status());
+        self.phase = Phase::Unavailable { reason, retry_at, until };
     }
 
-    /// A wait without a port is over.
-    fn pass(&mut self, woken: Woken) {
+    /// Handles the end of a wait without a port, and sets the next deadline.
+    fn keep_waiting(&mut self, woken: Woken) {
         let core = &mut self.core;
-        let (Phase::Away { away, .. } | Phase::Opening { away, .. }) = &self.phase else { return };
+        let (Phase::Unavailable { reason, .. } | Phase::Opening { reason, .. }) = &self.phase else { return };
         if woken == Woken::Request {
             core.handle_requests(Flow::Away);
         } else {
-            core.show(None, State::Absent, &away.words);
+            core.show(None, State::Absent, &reason.message);
         }
         match &mut self.phase {
             Phase::Open(_) => {}
-            Phase::Away { look_at, until, .. } => *until = (*look_at).min(core.next_status()),
-            Phase::Opening { until, .. } => *until = core.around.now() + STILL_AWAY,
+            Phase::Unavailable { retry_at, until, .. } => *until = (*retry_at).min(core.next_status()),
+            Phase::Opening { until, .. } => *until = core.around.now() + OPENING_STATUS_PERIOD,
         }
     }
 }
 
 impl<L: Line> Phase<L> {
-    fn away(away: Away, at: Nanos) -> Phase<L> {
-        Phase::Away { away, look_at: at, until: at }
+    fn unavailable(reason: Unavailable, retry_at: Nanos) -> Phase<L> {
+        Phase::Unavailable { reason, retry_at, until: retry_at }
     }
 
-    /// What to wait for, and until when.
+    /// Returns what to wait for, and until when.
     fn wait(&self) -> (On<'_, L>, Nanos) {
         match self {
             Phase::Open(open) => open.wait(),
-            Phase::Away { until, .. } => (On::Nothing, *until),
+            Phase::Unavailable { until, .. } => (On::Nothing, *until),
             Phase::Opening { until, .. } => (On::Opening, *until),
         }
     }
 
-    /// Why the port was away until now.
-    fn take_away(&mut self) -> Away {
+    /// Takes the reason why the port was unavailable until now.
+    fn take_reason(&mut self) -> Unavailable {
         match self {
-            Phase::Open(_) => Away::default(),
-            Phase::Away { away, .. } | Phase::Opening { away, .. } => std::mem::take(away),
+            Phase::Open(_) => Unavailable::default(),
+            Phase::Unavailable { reason, .. } | Phase::Opening { reason, .. } => std::mem::take(reason),
         }
     }
 }
 
-/// Why a port is away, for how many looks, and in which words.
+/// Reason why a port is unavailable.
 #[derive(Default)]
-struct Away {
+struct Unavailable {
     error: Option<PortError>,
-    words: String,
-    /// When the words were found.
+    message: String,
+    /// Time at which the message was made.
     since: Nanos,
-    /// Looks in a row that found something that cannot be opened, or went again without a byte.
-    refused: u32,
+    /// Consecutive attempts that found a port that cannot be opened, or one that closed without delivering a byte.
+    failures: u32,
 }
 
-impl Away {
-    /// There is no port, which `words` say: that the next look finds none is no news.
-    fn for_lack_of_a_port(words: String) -> Away {
-        Away { error: Some(PortError::Missing), words, ..Away::default() }
+impl Unavailable {
+    /// Creates the reason that the port is missing. The `message` stays while it is.
+    fn missing(message: String) -> Unavailable {
+        Unavailable { error: Some(PortError::Missing), message, ..Unavailable::default() }
     }
 
-    /// The link must not open its port, because another process has its name, as `failure` says.
-    fn for_lack_of_the_name(failure: Failure) -> Away {
-        Away { words: said(failure), ..Away::default() }
+    /// Creates the reason that the link must not open its port, because another process has its name.
+    fn without_name(failure: Failure) -> Unavailable {
+        Unavailable { message: one_line(failure), ..Unavailable::default() }
     }
 
-    /// The port cannot be opened because of `error`, which `explain` says in words.
-    fn learn(&mut self, error: &PortError, now: Nanos, explain: impl FnOnce(&PortError) -> String) {
+    /// Notes that the port cannot be opened because of `error`. `explain` makes the message.
+    fn update(&mut self, error: &PortError, now: Nanos, explain: impl FnOnce(&PortError) -> String) {
         let is_missing = *error == PortError::Missing;
-        self.refused = if is_missing { 0 } else { self.refused + 1 };
-        let is_news = self.error.as_ref() != Some(error);
-        // Another process may hold it now than the one that was named.
-        if is_news || (!is_missing && now >= self.since + STALE) {
-            self.words = explain(error);
+        self.failures = if is_missing { 0 } else { self.failures + 1 };
+        let has_changed = self.error.as_ref() != Some(error);
+        // By now, another process than the one in the message may hold the port.
+        if has_changed || (!is_missing && now >= self.since + STALE_AFTER) {
+            self.message = explain(error);
             self.since = now;
         }
         self.error = Some(error.clone());
     }
 
-    /// How long to wait before the next look: what is not there is looked for by name only, what is there and cannot be
-    /// opened is left alone for longer each time. The first looks come soon, for udev gives a new device its group.
-    fn pause(&self) -> Nanos {
-        LOOK << self.refused.saturating_sub(1).min(LONGEST_PAUSE)
+    /// Returns the time until the next attempt. A missing port is only searched for by name. The interval grows for a
+    /// port that exists but cannot be opened. The first attempts follow quickly, because udev sets the group of a new
+    /// device a moment after it appears.
+    fn retry_interval(&self) -> Nanos {
+        POLL_INTERVAL << self.failures.saturating_sub(1).min(MAX_DOUBLINGS)
     }
 }
 
-/// A failure as a line of a status and of a log.
-fn said(failure: Failure) -> String {
+/// Returns `failure` as one line, for a status and a log.
+fn one_line(failure: Failure) -> String {
     format!("{}; {}", failure.message, failure.hint)
 }
 
-/// Every port can have this rate, in bits per second.
-const SLOWEST: u32 = 9_600;
-/// Between two looks for a port that is away.
-const LOOK: Nanos = 100 * MILLIS;
-/// Times that the pause between two looks doubles.
-const LONGEST_PAUSE: u32 = 4;
-/// A status is due so often while a connection is being made.
-const STILL_AWAY: Nanos = 1_000 * MILLIS;
-/// After so long the circumstances of a refusal are looked for again.
-const STALE: Nanos = 10_000 * MILLIS;
+/// Rate that every port supports, in bits per second.
+const SUPPORTED_RATE: u32 = 9_600;
+/// Interval between attempts to open an unavailable port.
+const POLL_INTERVAL: Nanos = 100 * MILLIS;
+/// Maximum number of times that this interval doubles.
+const MAX_DOUBLINGS: u32 = 4;
+/// Interval of the statuses while a connection is being made.
+const OPENING_STATUS_PERIOD: Nanos = 1_000 * MILLIS;
+/// Age after which a message about a port that cannot be opened is made again.
+const STALE_AFTER: Nanos = 10_000 * MILLIS;
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
     #[test]
-    fn why_it_is_away_is_looked_for_once_per_change() {
+    fn message_is_made_once_per_change_of_the_error() {
         let source = Source::Tty("/dev/no-such-port".into());
-        let explain = |error: &PortError| said(error.explain(&source));
-        let mut away = Away::for_lack_of_a_port("it went".to_owned());
-        away.learn(&PortError::Missing, 1, explain);
-        assert_eq!((away.words.as_str(), away.pause()), ("it went", LOOK));
-        away.learn(&PortError::Busy, 2, explain);
-        assert!(away.words.contains("in use by another process; stop it first"), "{}", away.words);
-        assert_eq!((away.since, away.pause()), (2, LOOK));
-        for look in 3..20 {
-            away.learn(&PortError::Busy, look, explain);
+        let explain = |error: &PortError| one_line(error.explain(&source));
+        let mut reason = Unavailable::missing("it went".to_owned());
+        reason.update(&PortError::Missing, 1, explain);
+        assert_eq!((reason.message.as_str(), reason.retry_interval()), ("it went", POLL_INTERVAL));
+        reason.update(&PortError::Busy, 2, explain);
+        assert!(reason.message.contains("in use by another process; stop it first"), "{}", reason.message);
+        assert_eq!((reason.since, reason.retry_interval()), (2, POLL_INTERVAL));
+        for attempt in 3..20 {
+            reason.update(&PortError::Busy, attempt, explain);
         }
-        assert_eq!((away.since, away.pause()), (2, 16 * LOOK));
-        away.learn(&PortError::Busy, 2 + STALE, explain);
-        assert_eq!(away.since, 2 + STALE);
-        away.learn(&PortError::Missing, 3 + STALE, explain);
-        assert!(away.words.contains("no such port"), "{}", away.words);
-        assert_eq!(away.pause(), LOOK);
+        assert_eq!((reason.since, reason.retry_interval()), (2, 16 * POLL_INTERVAL));
+        reason.update(&PortError::Busy, 2 + STALE_AFTER, explain);
+        assert_eq!(reason.since, 2 + STALE_AFTER);
+        reason.update(&PortError::Missing, 3 + STALE_AFTER, explain);
+        assert!(reason.message.contains("no such port"), "{}", reason.message);
+        assert_eq!(reason.retry_interval(), POLL_INTERVAL);
     }
 }

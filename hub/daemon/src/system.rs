@@ -83,7 +83,7 @@ impl<'a> System<'a> {
             if let Some(on_start) = on_start.take_if(|_| link.has_tried() || clock::now() >= start_by) {
                 on_start(&link);
             }
-            let Wait { requests, on, until } = link.turn(woken);
+            let Wait { requests, on, until } = link.on_wakeup(woken);
             let until = if on_start.is_some() { until.min(start_by) } else { until };
             let dial = self.dial.borrow();
             let port = match on {

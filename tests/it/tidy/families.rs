@@ -98,8 +98,11 @@ fn named<'a>(tree: &'a Tree, name: &str, words: &[&str]) -> Vec<&'a str> {
 fn the_hub_names_no_lms() {
     holds(hub_names_no_lms, |tree| {
         vec![
-            tree.with("hub/daemon/src/drive.rs", "//! Drives.\nif matches!(session, Session::Lms(_)) {\n"),
-            tree.with("hub/daemon/src/drive.rs", "//! Drives.\nif family == Family::Lms {\n"),
+            tree.with(
+                "hub/daemon/src/session_driver.rs",
+                "//! Drives.\nif matches!(session, Session::Lms(_)) {\n",
+            ),
+            tree.with("hub/daemon/src/session_driver.rs", "//! Drives.\nif family == Family::Lms {\n"),
             tree.with("hub/tools/src/driver.rs", "//! Drives.\nuse scanhub_drivers::lms::variant::Baud;\n"),
             tree.with("hub/tools/src/probe.rs", "//! Probes.\nif kind == \"LMS291\" {\n"),
             tree.with("hub/config/src/planted.rs", "//! Settings.\nif family != Family::Lms {\n"),
@@ -117,8 +120,14 @@ fn the_hub_names_no_lms() {
 fn a_family_is_a_line_in_few_files() {
     holds(few_files_name_a_family, |tree| {
         vec![
-            tree.with("hub/daemon/src/drive.rs", "//! Drives.\nlet trouble = ld::Trouble::Silence;\n"),
-            tree.with("hub/daemon/src/drive.rs", "//! Drives.\nlet trouble = rplidar::Trouble::Silence;\n"),
+            tree.with(
+                "hub/daemon/src/session_driver.rs",
+                "//! Drives.\nlet trouble = ld::Trouble::Silence;\n",
+            ),
+            tree.with(
+                "hub/daemon/src/session_driver.rs",
+                "//! Drives.\nlet trouble = rplidar::Trouble::Silence;\n",
+            ),
             tree.with("hub/config/src/planted.rs", "//! Settings.\nuse scanhub_drivers::ld::Model;\n"),
             tree.with("hub/tools/src/probe.rs", "//! Probes.\nif model == \"LD19\" {\n"),
             tree.with("clients/c/planted.h", "#define FAMILY_LD 1\n"),

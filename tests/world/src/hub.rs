@@ -171,7 +171,7 @@ impl<'a> Running<'a> {
         };
         self.ready_at = None;
         self.around.clock.pass(now);
-        let Wait { on, until, .. } = self.link.turn(woken);
+        let Wait { on, until, .. } = self.link.on_wakeup(woken);
         self.watched = match on {
             On::Nothing | On::Opening => None,
             On::Bytes(line) => Some((line.handle.device, true)),
