@@ -54,12 +54,14 @@ impl Slow {
     fn update(&mut self, place: &Rigid, velocity: &Velocity, scan: &Scan) -> Vec<Class> {
         let around =
             |reach: i32| (-reach..=reach).flat_map(move |dx| (-reach..=reach).map(move |dy| (dx, dy)));
+        let place_of = |beam: usize| {
+            let (x, y, yaw) = velocity.position(1e-9 * scan.beam_ns(beam) as f64);
+            place.then(&Rigid::new(x, y, yaw))
+        };
         let ends: Vec<Option<(f64, f64)>> = (0..scan.beams())
             .map(|i| {
                 let (range, angle) = (scan.distance_m(i)?, scan.angle(i));
-                let (x, y, yaw) = velocity.position(1e-9 * scan.beam_ns(i) as f64);
-                let place = place.then(&Rigid::new(x, y, yaw));
-                Some(place.point((range * angle.cos(), range * angle.sin())))
+                Some(place_of(i).point((range * angle.cos(), range * angle.sin())))
             })
             .collect();
         let class = |end: &Option<(f64, f64)>| {
@@ -82,7 +84,8 @@ impl Slow {
             *free -= i32::from(*hits % 8 == 0 && *free > 0);
         }
         let mut through = HashSet::new();
-        for (x, y) in ends.iter().flatten() {
+        for (beam, end) in ends.iter().enumerate() {
+            let (Some((x, y)), place) = (end, place_of(beam)) else { continue };
             let (dx, dy) = (x - place.x, y - place.y);
             let length = dx.hypot(dy);
             for step in 1..=((length / 0.05 - 2.5).max(0.0) as u32) {
@@ -101,8 +104,8 @@ impl Slow {
 
 #[test]
 fn classes_are_those_of_a_slow_version() {
-    for seed in 0..3 {
-        let drive = Drive::with_walkers(seed, 361, 160, 3, 0.02);
+    for (seed, speed) in [(0, 0.02), (1, 0.02), (2, 0.02), (3, 0.2), (4, 0.2)] {
+        let drive = Drive::with_walkers(seed, 361, 160, 3, speed);
         let (mut model, mut slow) = (Model::new(SETTINGS, 361), Slow::default());
         let mut out = Foreground::of(361);
         let (mut same, mut all, mut foreground) = (0, 0, 0);
@@ -120,7 +123,7 @@ fn classes_are_those_of_a_slow_version() {
             }
         }
         // The borders of squares are rounded in other ways.
-        assert!(same as f64 > 0.985 * all as f64, "{seed}: {same} of {all}");
+        assert!(same as f64 > 0.9998 * all as f64, "{seed}: {same} of {all}");
         assert!(foreground > 100, "{seed}: {foreground}");
     }
 }

@@ -20,6 +20,8 @@ pub(super) struct Moving {
     middle: (i32, i32),
     place: Option<Place>,
     scan: u8,
+    /// Positions of the sensor at the times of the beams, in cells, while a scan is processed.
+    starts: Box<[(f32, f32)]>,
     /// Where the beams end, in cells, while a scan is looked at.
     ends: Box<[(f32, f32)]>,
     runs: Runs,
@@ -73,6 +75,7 @@ impl Moving {
             middle: (0, 0),
             place: None,
             scan: 0,
+            starts: vec![(0.0, 0.0); beams].into(),
             ends: vec![(0.0, 0.0); beams].into(),
             runs: Runs::new(beams),
         }
@@ -130,16 +133,15 @@ impl Moving {
             // The sensor moves while a scan is measured.
             let (x, y, yaw) = place.velocity.position(1e-9 * scan.beam_ns(i) as f64);
             let along = place.along(angle + yaw);
-            let end = (
-                place.x + range * along.0 + x * ahead.0 + y * left.0,
-                place.y + range * along.1 + x * ahead.1 + y * left.1,
-            );
-            self.ends[i] = ((end.0 / CELL_M) as f32, (end.1 / CELL_M) as f32);
+            let start = (place.x + x * ahead.0 + y * left.0, place.y + x * ahead.1 + y * left.1);
+            let end = (start.0 + range * along.0, start.1 + range * along.1);
+            self.starts[i] = in_cells(start);
+            self.ends[i] = in_cells(end);
             *class = self.class(cell(end.0), cell(end.1), limits);
         }
         self.runs.keep(readings, limits, classes);
         if learn {
-            self.lay(&place, readings.len(), limits);
+            self.lay(readings.len(), limits);
         }
     }
 
@@ -190,7 +192,7 @@ impl Moving {
     }
 
     /// Lays the scan into the map: each cell counts once, and where a beam ended no other sees through.
-    fn lay(&mut self, place: &Place, beams: usize, limits: &Limits) {
+    fn lay(&mut self, beams: usize, limits: &Limits) {
         self.scan = if self.scan >= Mark::SCANS { 1 } else { self.scan + 1 };
         if self.scan == 1 {
             self.marks.fill(0);
@@ -219,10 +221,10 @@ impl Moving {
         }
         // Counted from the first cell that is kept, no place is below 0.
         let first = ((self.middle.0 - WIDTH / 2) as f32, (self.middle.1 - WIDTH / 2) as f32);
-        let from = ((place.x / CELL_M) as f32 - first.0, (place.y / CELL_M) as f32 - first.1);
         for i in 0..beams {
-            let end = self.ends[i];
+            let (start, end) = (self.starts[i], self.ends[i]);
             if !end.0.is_nan() {
+                let from = (start.0 - first.0, start.1 - first.1);
                 self.see_through(from, (end.0 - first.0, end.1 - first.1), most);
             }
         }
@@ -306,6 +308,11 @@ impl Place {
         let (x, y) = self.pose.direction(angle);
         (self.cos * x - self.sin * y, self.sin * x + self.cos * y)
     }
+}
+
+/// Converts a position from meters to cells.
+fn in_cells((x, y): (f64, f64)) -> (f32, f32) {
+    ((x / CELL_M) as f32, (y / CELL_M) as f32)
 }
 
 /// The cell of a coordinate in metres.
