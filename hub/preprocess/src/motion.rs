@@ -202,8 +202,8 @@ impl MotionEstimator {
             let is_again = self.rejected.is_some_and(|rejected| rejected.difference(&measured).is_possible());
             if !change.is_possible() && !is_again {
                 // No robot does that: the step is an error, or the sensor was carried. If the next step agrees, it was right.
-                (self.velocity, self.rejected) = (Velocity::default(), Some(measured));
-                return (found, offset);
+                self.rejected = Some(measured);
+                return (self.stop_or_continue(scan, track, found), offset);
             }
             self.rejected = None;
             if corrections == CORRECTIONS || !change.distorts(scan, CHANGED_M) {
@@ -223,6 +223,24 @@ impl MotionEstimator {
                 }
             }
         }
+    }
+
+    /// Decides after a rejected velocity whether the robot stands, because the sensor was carried, or continues as before, because
+    /// the `found` step is an error. The scan fits better with the right velocity. Returns the position and the step.
+    fn stop_or_continue(&mut self, scan: &Scan, track: &Track, found: (Match, Rigid)) -> (Match, Rigid) {
+        let moving = std::mem::take(&mut self.velocity);
+        if !moving.distorts(scan, DISTORTED_M) {
+            return found;
+        }
+        self.take(scan);
+        let begin = Some(found.0.place);
+        if let Some(standing) = self.find(track, begin).filter(|standing| standing.0.weight > found.0.weight)
+        {
+            return standing;
+        }
+        self.velocity = moving;
+        self.take(scan);
+        self.find(track, begin).unwrap_or(found)
     }
 
     /// Takes the current scan as if it had been measured at one moment.

@@ -242,6 +242,29 @@ fn a_robot_that_is_already_fast_is_corrected_too() {
     assert!(errors[errors.len() / 2] < 0.006, "{errors:?}");
 }
 
+/// A robot turns at 120 degrees/s, and moves by 0.2 m between two scans. Either a person has carried it and it stands now, or it
+/// was pushed and still turns. Both scans must be corrected by the right velocity, because the later steps use them.
+#[test]
+fn a_robot_that_was_carried_or_pushed_is_corrected_by_the_right_velocity() {
+    for deg_per_s in [0.0, 120.0] {
+        for seed in 0..20 {
+            let mut drive = Drive::turning(seed, 30, 120.0);
+            drive.carry(Rigid::new(0.14, 0.14, 0.0), deg_per_s);
+            drive.turn(10, deg_per_s);
+            let found = follow(&drive.scans, Pose::default(), Settings::default());
+            for (at, motion) in found.iter().enumerate().skip(30) {
+                let truth = drive.places[at - 1].inverse().then(&drive.places[at]);
+                let (meters, radians) = apart(&truth, &step(motion));
+                let degrees = radians.to_degrees();
+                assert!(
+                    motion.has_step() && meters < 0.02 && degrees < 0.3,
+                    "{deg_per_s} degrees/s, seed {seed}, scan {at}: {meters} m, {degrees} degrees"
+                );
+            }
+        }
+    }
+}
+
 #[test]
 fn a_sensor_anywhere_on_the_robot_tells_the_same() {
     let drive = Drive::through_a_room(7, 361, 30, 0.002);

@@ -15,6 +15,8 @@ pub(super) struct Match {
     pub(super) of_kept: Square,
     /// Share of the readings that lie on surfaces.
     pub(super) overlap: f64,
+    /// Sum of the weights of the readings. A reading near a surface has more weight, so a match with a greater sum fits better.
+    pub(super) weight: f64,
     /// Some direction is not known.
     pub(super) is_degenerate: bool,
     /// Corners of both are the same.
@@ -105,6 +107,7 @@ impl Matcher {
             own,
             of_kept,
             overlap: pair.overlap(&place),
+            weight: sums.weights,
             is_degenerate: !known.is_known.iter().all(|is_known| *is_known),
             has_corners: same_corners(kept, now, &place),
             has_lines: same_lines(kept, now, &place),

@@ -186,14 +186,18 @@ impl Drive {
     /// Returns scans of an LMS at half degrees, on a robot that turns on the spot in a room, by `deg_per_s` from the first scan on. In
     /// the end it stands for 20 scans.
     pub(crate) fn on_the_spot(seed: u64, count: usize, deg_per_s: f64) -> Drive {
+        let mut drive = Drive::turning(seed, count + 1, deg_per_s);
+        drive.stand(19);
+        drive
+    }
+
+    /// Returns `count` scans of an LMS at half degrees, on a robot that turns on the spot in a furnished room by `deg_per_s`.
+    pub(crate) fn turning(seed: u64, count: usize, deg_per_s: f64) -> Drive {
         let mut drive = Drive::begin(seed, 361, 0.01);
         drive.furnish();
-        let mut place = Rigid::new(0.0, 0.0, TAU * drive.random.f64());
-        for number in 0..count + 20 {
-            drive.look(place);
-            let turn = if number < count { (deg_per_s * PERIOD_S).to_radians() } else { 0.0 };
-            place = place.then(&Rigid::new(0.0, 0.0, turn));
-        }
+        let place = Rigid::new(0.0, 0.0, TAU * drive.random.f64());
+        drive.look(place);
+        drive.turn(count - 1, deg_per_s);
         drive
     }
 
@@ -284,6 +288,21 @@ impl Drive {
         }
     }
 
+    /// Adds `count` scans, while the robot turns on the spot by `deg_per_s`.
+    pub(crate) fn turn(&mut self, count: usize, deg_per_s: f64) {
+        let step = Rigid::new(0.0, 0.0, (deg_per_s * PERIOD_S).to_radians());
+        for _ in 0..count {
+            let place = self.places.last().copied().unwrap_or_default();
+            self.look(place.then(&step));
+        }
+    }
+
+    /// Adds a scan. The robot has moved by `by` since the scan before, and turns by `deg_per_s` during this one.
+    pub(crate) fn carry(&mut self, by: Rigid, deg_per_s: f64) {
+        let before = self.places.last().copied().unwrap_or_default().then(&by);
+        self.look_from(before, before.then(&Rigid::new(0.0, 0.0, (deg_per_s * PERIOD_S).to_radians())));
+    }
+
     /// So many scans more from where the robot is.
     pub(crate) fn stand(&mut self, count: usize) {
         let place = self.places.last().copied().unwrap_or_default();
@@ -292,8 +311,12 @@ impl Drive {
 
     /// One scan more, which ends at `place`. The robot moves there from its last place while the scan is measured.
     fn look(&mut self, place: Rigid) {
-        let Drive { walls, legs, walkers, head, noise_m, random, places, .. } = self;
-        let before = places.last().copied().unwrap_or(place);
+        self.look_from(self.places.last().copied().unwrap_or(place), place);
+    }
+
+    /// One scan more, during which the robot moves from `before` to `place`.
+    fn look_from(&mut self, before: Rigid, place: Rigid) {
+        let Drive { walls, legs, walkers, head, noise_m, random, .. } = self;
         let times = Scan::of(*head, &[]);
         for walker in walkers.iter_mut() {
             walker.at = (walker.at.0 + walker.by_scan.0, walker.at.1 + walker.by_scan.1);
