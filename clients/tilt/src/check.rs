@@ -16,6 +16,8 @@ const BIN_M: f64 = 0.1;
 const ENOUGH: usize = 300;
 /// A wall is at least this high, in meters.
 const WALL_HIGH_M: f64 = 0.4;
+/// Points with a larger standard deviation are not a wall, in meters.
+const ROUGH_M: f64 = 0.07;
 /// Maximum number of points that are stored of a sweep. Each sweep has the same share, because up and down sweeps can differ.
 const POINTS: usize = 40_000;
 
@@ -103,24 +105,25 @@ impl Check {
         })
     }
 
-    /// Returns the wall ahead, within 45 degrees, that has the most points.
+    /// Returns the wall ahead, within 45 degrees, with the largest area.
     pub fn wall(&self) -> Option<Wall> {
         let high: Vec<[f64; 3]> =
             self.points.iter().filter(|at| at[2] > WALL_FROM_M && at[0] > 0.3).copied().collect();
-        let mut best = (0, 0.0, 0.0);
+        let mut best = (0.0, 0.0, 0.0);
         for degrees in -45..=45 {
             let way = f64::from(degrees).to_radians();
-            let mut counts = [0_usize; (FAR_M / BIN_M) as usize + 2];
+            let mut areas = [0.0; (FAR_M / BIN_M) as usize + 2];
             for at in &high {
                 let distance = at[0] * way.cos() + at[1] * way.sin();
                 // Points of a side wall can be behind the origin.
                 if distance >= 0.0
-                    && let Some(count) = counts.get_mut((distance / BIN_M) as usize)
+                    && let Some(area) = areas.get_mut((distance / BIN_M) as usize)
                 {
-                    *count += 1;
+                    // The beams diverge. Without this weight, a slice of near side walls has more points than a wall ahead.
+                    *area += at[0].powi(2) + at[1].powi(2);
                 }
             }
-            for (bin, pair) in counts.windows(2).enumerate() {
+            for (bin, pair) in areas.windows(2).enumerate() {
                 if pair[0] + pair[1] > best.0 {
                     best = (pair[0] + pair[1], way, (bin + 1) as f64 * BIN_M);
                 }
@@ -139,7 +142,7 @@ impl Check {
         if top - low < WALL_HIGH_M {
             return None;
         }
-        let plane = Plane::of(on)?;
+        let plane = Plane::of(on).filter(|plane| plane.deviation < ROUGH_M)?;
         // The wall is not exactly across the direction in which it was found.
         let [distance, slope, lean] = plane.terms;
         let across = slope.hypot(1.0);
@@ -249,7 +252,7 @@ mod tests {
             |points: usize| (0..points).map(|i| (0.005 * (i % 100) as f32, 0.1 * (i / 100 % 10) as f32));
         let ahead = grid(2000).map(|(y, z)| [3.0, 4.0 * y - 1.0, 0.4 + z]);
         // In a direction to the left, all of it is behind the origin.
-        let right = grid(4000).map(|(x, z)| [0.35 + 4.0 * x, -3.0 - 4.0 * x, 0.4 + z]);
+        let right = grid(2500).map(|(x, z)| [0.35 + 4.0 * x, -3.0 - 4.0 * x, 0.4 + z]);
         let points: Vec<Point> = ahead.chain(right).map(|at| Point { at, ..Point::default() }).collect();
         let mut check = Check::default();
         check.take(&Sweep { points: &points, is_complete: true, ..Sweep::default() });

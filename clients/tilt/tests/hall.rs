@@ -162,3 +162,13 @@ fn a_top_that_level_beams_graze_is_no_obstacle() {
         assert!(sweep.obstacles.is_empty(), "sweep {}: {:?}", sweep.number, sweep.obstacles);
     });
 }
+
+#[test]
+fn a_check_finds_the_wall_ahead_between_side_walls() {
+    let mut check = tilt::Check::default();
+    let mut hall = Hall::new(&"tilt".parse().expect("built in"), 1);
+    hall.play(Settings::default(), 14, |_, sweep| check.take(sweep));
+    let (floor, wall) = (check.floor(&hall.mount).expect("a floor"), check.wall().expect("a wall"));
+    assert!(floor.height_m.abs() < 0.01 && floor.level_rad.abs() < 0.002, "{floor:?}");
+    assert!(wall.distance_m > 2.0 && wall.lean_rad.abs() < 0.004 && wall.points > 2000, "{wall:?}");
+}
