@@ -282,7 +282,7 @@ const NARROW: usize = 2;
 /// Minimum number of visits of a narrow surface that is background. Objects that are put down and people can visit twice.
 const VISITS: u16 = 3;
 /// A narrow surface is forgotten when this many times the sweeps of the setting have not met it in a row.
-const MEMORY: u16 = 8;
+const MEMORY: u16 = 20;
 /// Less than a planar scanner measures exactly.
 const LEAST_BIN_RAD: f64 = 0.002;
 /// Share of the last beam in what is known of a surface.
@@ -373,10 +373,10 @@ mod tests {
     #[test]
     fn a_narrow_surface_that_is_seen_through_is_forgotten() {
         let visits = [Some(4.0); 3].into_iter().chain([Some(4.0), Some(2.0)].repeat(3));
-        for (after, is_background) in [(24, true), (25, false)] {
+        for (after, is_background) in [(60, true), (61, false)] {
             let sweeps = visits.clone().chain(vec![Some(4.0); after]);
             assert_eq!(is_narrow_background(&settings(), sweeps), is_background, "after {after} sweeps");
-            let sweeps = visits.clone().chain([Some(4.0), None].repeat(24)).chain(vec![None; 90]);
+            let sweeps = visits.clone().chain([Some(4.0), None].repeat(60)).chain(vec![None; 90]);
             assert!(is_narrow_background(&settings(), sweeps), "only sweeps that measured the place count");
         }
     }
