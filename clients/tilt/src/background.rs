@@ -342,7 +342,7 @@ mod tests {
         assert_eq!(model.class(&Reading { beam: 6, ..reading(2.0) }, 91, 0.06), Background, "beside it");
     }
 
-    /// Returns whether the reading at 2 m is background after `sweeps`, of which each has a range or did not measure the cell.
+    /// Returns whether the reading at 2 m is background after `sweeps`. Each has a range, or `None` if it did not measure the cell.
     fn is_narrow_background(settings: &Settings, sweeps: impl IntoIterator<Item = Option<f32>>) -> bool {
         let mut model = Model::new(11, settings);
         for (sweep, range_m) in sweeps.into_iter().enumerate() {

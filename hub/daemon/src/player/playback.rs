@@ -69,7 +69,7 @@ pub(crate) enum Turn {
     At(Nanos),
     /// It is to ask again when something has changed.
     Wait,
-    /// Its time was skipped with a silence. Only samples that belong to no link are skipped.
+    /// The silence that contains its time was skipped. Only samples that belong to no link are skipped.
     Skipped,
     /// It starts again, with this lap.
     Restart(u32),
