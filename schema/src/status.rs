@@ -64,14 +64,14 @@ impl Status {
         State::ALL.get(usize::from(self.state)).copied()
     }
 
-    /// Returns whether the measuring mode has reflector bits, without which topic `marks` is unavailable. `None` while the
-    /// mode is unknown.
+    /// Returns whether the measuring mode has reflector bits, without which topic `marks` is unavailable. `None` while
+    /// the mode is unknown.
     pub fn has_reflector_bits(&self) -> Option<bool> {
         (self.mode != Status::MODE_UNKNOWN).then(|| has_reflector_bits(self.mode))
     }
 
-    /// Returns the measuring mode that would give the scanner reflector bits. `None` if it has them, if its mode is unknown,
-    /// or if it is a recording. The mode is in the scanner's EEPROM, which only a person changes.
+    /// Returns the measuring mode that would give the scanner reflector bits. `None` if it has them, if its mode is
+    /// unknown, or if it is a recording. The mode is in the scanner's EEPROM, which only a person changes.
     pub fn missing_reflector_mode(&self) -> Option<u8> {
         let is_missing = self.has_reflector_bits() == Some(false) && !self.is_replayed();
         is_missing.then_some(REFLECTOR_MODE)

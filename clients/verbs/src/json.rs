@@ -238,8 +238,8 @@ pub(crate) fn status<'a>(sensor: &'a str, status: &'a Status) -> impl Serialize 
     }
 }
 
-/// Returns the command, or the setting of link `sensor`, that makes topic `marks` available. `None` if it is available, or if
-/// that is unknown or impossible.
+/// Returns the command, or the setting of link `sensor`, that makes topic `marks` available. `None` if it is
+/// available, or if that is unknown or impossible.
 pub(crate) fn marks_remedy(sensor: &str, status: &Status) -> Option<String> {
     // The name on the machine of the sensor.
     let name = sensor.rsplit('.').next().unwrap_or(sensor);

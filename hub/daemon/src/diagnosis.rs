@@ -267,7 +267,8 @@ impl<'a> Diagnosis<'a> {
         }
     }
 
-    /// Logs once that the measuring mode of `status` has no marks, and the command that changes it. This is not an error.
+    /// Logs once that the measuring mode of `status` has no marks, and the command that changes it. This is not an
+    /// error.
     pub(crate) fn log_missing_marks(&mut self, status: &Status) {
         if std::mem::replace(&mut self.logged_mode, status.mode) != status.mode
             && let Some(mode) = status.missing_reflector_mode()

@@ -64,7 +64,7 @@ pub trait Surroundings {
     ///
     /// # Errors
     ///
-    /// As [`SharedMemory::new`](shm::SharedMemory::new).
+    /// Returns the errors of [`SharedMemory::new`](shm::SharedMemory::new).
     fn medium<P: Payload + ?Sized>(&self, sensor: &str) -> Result<Self::Medium<P>, Failure>;
 
     /// Wakes the consumers that sleep at the link's bell for topics of `ring`.

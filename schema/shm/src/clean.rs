@@ -1,5 +1,5 @@
-//! Removal of files that dead processes of a domain left. Files in shared memory that did not belong to a known dead process
-//! are not touched.
+//! Removal of files that dead processes of a domain left. Files in shared memory that did not belong to a known dead
+//! process are not touched.
 
 use std::fs::OpenOptions;
 use std::os::fd::AsRawFd;

@@ -1,5 +1,5 @@
-//! Locks on files of a domain's directory. A lock ends with its process. The file has the ID of the process, because the
-//! kernel does not report it.
+//! Locks on files of a domain's directory. A lock ends with its process. The file has the ID of the process, because
+//! the kernel does not report it.
 
 use std::fs::File;
 use std::io;
@@ -22,12 +22,13 @@ pub(crate) struct FileLock {
 }
 
 impl FileLock {
-    /// Takes the lock on the file `name` in `root`, and clears the file. Creates directory and file if they do not exist.
+    /// Takes the lock on the file `name` in `root`, and clears the file. Creates directory and file if they do not
+    /// exist.
     ///
     /// # Errors
     ///
-    /// Returns the failure `held` if another process has the lock. Its argument is the ID of that process, or 0 if the process
-    /// has not written it yet. Returns [`Kind::Failed`] if the file cannot be locked.
+    /// Returns the failure `held` if another process has the lock. Its argument is the ID of that process, or 0 if the
+    /// process has not written it yet. Returns [`Kind::Failed`] if the file cannot be locked.
     pub(crate) fn acquire(
         root: &Path,
         name: &str,

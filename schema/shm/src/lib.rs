@@ -1,5 +1,5 @@
-//! The shared memory of a domain: where it is, who publishes in it, and the services of its topics. Only this crate names the
-//! builders of iceoryx2; all other code uses its ports.
+//! The shared memory of a domain: where it is, who publishes in it, and the services of its topics. Only this crate
+//! names the builders of iceoryx2; all other code uses its ports.
 //!
 //! The modules form layers. Each one uses only modules that are before it in this list:
 //!

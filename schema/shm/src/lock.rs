@@ -25,8 +25,8 @@ impl HubLock {
     ///
     /// # Errors
     ///
-    /// Returns [`Kind::DomainHeld`] if another hub has the lock; the message names its process. Returns [`Kind::Failed`] if
-    /// the directory belongs to another user or cannot be created.
+    /// Returns [`Kind::DomainHeld`] if another hub has the lock; the message names its process. Returns
+    /// [`Kind::Failed`] if the directory belongs to another user or cannot be created.
     pub fn acquire(root: &Path) -> Result<HubLock, Failure> {
         Ok(HubLock { publishing: Publishing::acquire(root, HUB, "hub")? })
     }
@@ -59,8 +59,8 @@ impl ListenLock {
     }
 }
 
-/// Lock of the process that publishes under a name: a program with a tracker or a mount, or the hub with a link. Doorbell
-/// and services of the name belong to this process alone. A hub is not necessary.
+/// Lock of the process that publishes under a name: a program with a tracker or a mount, or the hub with a link.
+/// Doorbell and services of the name belong to this process alone. A hub is not necessary.
 #[derive(Debug)]
 pub struct NameLock {
     root: PathBuf,
@@ -72,8 +72,8 @@ impl NameLock {
     ///
     /// # Errors
     ///
-    /// Returns [`Kind::NameHeld`] if another process publishes under `name`; the message names it. Otherwise the errors of
-    /// [`HubLock::acquire`].
+    /// Returns [`Kind::NameHeld`] if another process publishes under `name`; the message names it. Otherwise the
+    /// errors of [`HubLock::acquire`].
     pub fn acquire(root: &Path, name: &str) -> Result<NameLock, Failure> {
         let lock = acquire(root, &format!("name.{name}.lock"), |pid| name_held(name, pid));
         Ok(NameLock { _lock: lock?, root: root.to_owned() })
@@ -136,8 +136,8 @@ fn acquire(root: &Path, name: &str, held: impl Fn(u32) -> Failure) -> Result<Fil
     Ok(lock)
 }
 
-/// Returns the process of the hub in the domain in `root`; 0 if the hub has not written its ID yet. `None` if no hub runs
-/// there.
+/// Returns the process of the hub in the domain in `root`; 0 if the hub has not written its ID yet. `None` if no hub
+/// runs there.
 ///
 /// # Errors
 ///
@@ -168,9 +168,9 @@ pub fn publisher(root: &Path) -> Result<Option<u32>, Failure> {
     }
 }
 
-/// Returns the domain in which a program publishes: at the first place, in the order in which clients search, where a hub
-/// or a listener is running. If none is, at the place that a hub in this `environment` would take, so that the hub that
-/// starts next is in the same domain. Only below `base` if it is given.
+/// Returns the domain in which a program publishes: at the first place, in the order in which clients search, where a
+/// hub or a listener is running. If none is, at the place that a hub in this `environment` would take, so that the hub
+/// that starts next is in the same domain. Only below `base` if it is given.
 ///
 /// # Errors
 ///

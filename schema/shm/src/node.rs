@@ -25,8 +25,9 @@ pub const LIBRARY: &str = "iceoryx2 0.10.0";
 /// Membership of a process in a domain.
 pub type Node = iceoryx2::node::Node<Service>;
 
-/// Returns the node of a publisher in `domain`, which holds its [`HubLock`](crate::HubLock), [`ListenLock`](crate::ListenLock)
-/// or a [`NameLock`](crate::NameLock). Removes the files that dead publishers and subscribers left.
+/// Returns the node of a publisher in `domain`, which holds its [`HubLock`](crate::HubLock),
+/// [`ListenLock`](crate::ListenLock) or a [`NameLock`](crate::NameLock). Removes the files that dead publishers and
+/// subscribers left.
 ///
 /// # Errors
 ///
@@ -78,7 +79,8 @@ fn node(domain: &Domain, cleanup: bool) -> Result<Node, Failure> {
         .map_err(|error| access_failure(root, format!("cannot join {}: {error:?}", domain.name())))
 }
 
-/// Returns whether `node` uses the current prefix of the domain in `root`. The prefix changes after all processes have left.
+/// Returns whether `node` uses the current prefix of the domain in `root`. The prefix changes after all processes have
+/// left.
 ///
 /// # Errors
 ///
@@ -122,8 +124,8 @@ fn nodes_at(root: &Path) -> Result<Nodes, Failure> {
     Ok(nodes)
 }
 
-/// Removes the names of the domain in `root` if no process is left. The next hub chooses names that no other user can have
-/// seen.
+/// Removes the names of the domain in `root` if no process is left. The next hub chooses names that no other user can
+/// have seen.
 pub(crate) fn forget_names(root: &Path) {
     let Ok(Some(directory)) = Directory::open(root) else { return };
     // Not while another process joins to publish.
@@ -133,8 +135,8 @@ pub(crate) fn forget_names(root: &Path) {
     }
 }
 
-/// Returns the configuration of the shared-memory library; `None` for a domain without a prefix. It never comes from a file,
-/// which the library would search in the working directory.
+/// Returns the configuration of the shared-memory library; `None` for a domain without a prefix. It never comes from a
+/// file, which the library would search in the working directory.
 pub(crate) fn config(root: &Path) -> Result<Option<Config>, Failure> {
     let Some(prefix) = prefix_of(root)? else { return Ok(None) };
     let unusable = || Failure::new(Kind::Configuration, format!("{} cannot be a root", root.display()), "");
@@ -149,8 +151,8 @@ pub(crate) fn config(root: &Path) -> Result<Option<Config>, Failure> {
 /// a service. The library waits for them forever and cleans up only finished ones, so no later hub could create that
 /// service again.
 ///
-/// The caller must hold the [`MakingLock`]. Then no process creates services, and no process has opened an unfinished one.
-/// Finished descriptions are read-only.
+/// The caller must hold the [`MakingLock`]. Then no process creates services, and no process has opened an unfinished
+/// one. Finished descriptions are read-only.
 fn remove_unfinished_services(root: &Path) {
     let Ok(Some(directory)) = Directory::open(root) else { return };
     let Some(services) = directory.below(SERVICES) else { return };

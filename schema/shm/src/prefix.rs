@@ -1,8 +1,8 @@
-//! Prefix of the names of a domain's shared memory. All users can create files in /dev/shm, so the prefix contains a random
-//! word. Without it, another user could occupy the names before the hub starts.
+//! Prefix of the names of a domain's shared memory. All users can create files in /dev/shm, so the prefix contains a
+//! random word. Without it, another user could occupy the names before the hub starts.
 //!
-//! The prefix, `sh_DOMAIN_WORD_`, is stored in the file `prefix` of the domain's directory, which only this user can read.
-//! It stays as long as any process uses it.
+//! The prefix, `sh_DOMAIN_WORD_`, is stored in the file `prefix` of the domain's directory, which only this user can
+//! read. It stays as long as any process uses it.
 
 use std::hash::{BuildHasher, RandomState};
 use std::io::Read;

@@ -9,7 +9,8 @@ use crate::domain::Domain;
 use crate::node::config;
 use crate::segments::access_failure;
 
-/// Returns the sensors that have topics in `domain`, sorted. Those of a dead hub stay as long as a subscriber keeps them.
+/// Returns the sensors that have topics in `domain`, sorted. Those of a dead hub stay as long as a subscriber keeps
+/// them.
 ///
 /// # Errors
 ///

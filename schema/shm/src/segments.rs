@@ -1,10 +1,10 @@
 //! Files in shared memory under a domain's prefix, which all users of the machine could create:
 //!
-//! - Segments of other users are found by name, owner and mode, without opening them. The owner is reported, because the
-//!   library only reports "internal error".
-//! - The node counter is the one segment that the shared-memory library opens to all users. Anyone who can write to it can
-//!   keep every later process out. It is therefore created here, for this user only, before the library looks for it. The
-//!   library uses the file that it finds.
+//! - Segments of other users are found by name, owner and mode, without opening them. The owner is reported, because
+//!   the library only reports "internal error".
+//! - The node counter is the one segment that the shared-memory library opens to all users. Anyone who can write to it
+//!   can keep every later process out. It is therefore created here, for this user only, before the library looks for
+//!   it. The library uses the file that it finds.
 //! - A publisher's segments are allocated, because the first access to a full /dev/shm would end the process.
 
 use std::fs::{self, File, Metadata, OpenOptions};

@@ -53,7 +53,7 @@ fn words(text: &str) -> impl Iterator<Item = &str> {
     text.split(|c: char| !c.is_alphanumeric() && c != '_')
 }
 
-/// Shared memory and files of users stand on `schema`, and on nothing of the hub or of clients.
+/// Finds what `shm` and `files` use of this project besides `schema`.
 pub(crate) fn shm_and_files_know_only_schema(tree: &Tree) -> Vec<String> {
     let known: [(&str, &[&str]); 2] =
         [("scanhub-files", &["scanhub-schema"]), ("scanhub-shm", &["scanhub-files", "scanhub-schema"])];
