@@ -5,6 +5,7 @@ mod between;
 mod crates;
 mod eeprom;
 mod families;
+mod keys;
 mod sources;
 mod tree;
 mod within;

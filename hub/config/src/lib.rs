@@ -5,7 +5,6 @@ mod effective;
 mod gateway;
 mod link;
 mod load;
-pub mod needs;
 mod processing;
 mod scanner;
 mod section;
@@ -13,7 +12,7 @@ mod sources;
 
 pub use effective::{Value, keys, values};
 pub use gateway::Gateway;
-pub use link::{Config, Link};
+pub use link::{Config, Link, needs};
 pub use processing::{Background, Processing, Zones};
 pub use scanner::Scanner;
 pub use section::Key;

@@ -220,3 +220,38 @@ fn port(_: &str, port: &str) -> Checked {
 
 /// Maximum number of links of one hub.
 pub(crate) const MAX_LINKS: usize = 256;
+
+/// Shared memory and descriptors that links need.
+pub mod needs {
+    use schema::Topic;
+    use schema::limits::TopicLimits;
+    use shm::shortage::{self, sensor_bytes};
+
+    /// Returns the number of bytes of shared memory for links with topics for `limits`, and their first subscribers.
+    pub fn memory(limits: &[TopicLimits]) -> u64 {
+        limits.iter().map(|limits| sensor_bytes(&Topic::OF_LINKS, limits)).sum::<u64>() + REST
+    }
+
+    /// Returns the number of bytes of their longest shared-memory segment.
+    pub fn longest_segment(limits: &[TopicLimits]) -> u64 {
+        limits
+            .iter()
+            .map(|limits| shortage::longest_segment(&Topic::OF_LINKS, limits))
+            .max()
+            .unwrap_or_default()
+    }
+
+    /// Returns the number of descriptors for `links` links and a first subscriber of each, in addition to those that are
+    /// open from the start.
+    pub fn descriptors(links: usize) -> u64 {
+        BASE_DESCRIPTORS + links as u64 * LINK_DESCRIPTORS
+    }
+
+    /// Descriptors that belong to no link: 16 stay open, and more are open while they are created.
+    const BASE_DESCRIPTORS: u64 = 24;
+    /// Descriptors of a link: four for each of its services, which are the topics and the event. The others are for its
+    /// port, the lock of its name, and a first subscriber.
+    const LINK_DESCRIPTORS: u64 = 4 * (Topic::OF_LINKS.len() as u64 + 1) + 7;
+    /// Bytes of the control service, of everything else that belongs to no link, and of the first subscribers.
+    const REST: u64 = 512 * 1024;
+}
