@@ -11,7 +11,7 @@ use scanhub_drivers::line::{Event, RawScan, Received, Session as _, suspect};
 use schema::{Flags, Header, MILLIS, Nanos, State};
 
 use super::recorded::Frames;
-use super::{LONGEST_GAP, ReplayLink, STANDS};
+use super::{MAX_GAP, ReplayLink, VALID_UNTIL_NEXT};
 use crate::link_output::{RecordedMetadata, micros, verdict_lifetime};
 use crate::player::Due;
 
@@ -217,10 +217,10 @@ impl Lap<'_> {
                     ..recorded(frame)
                 };
                 self.limit = replay.link.publish(&received, &recorded, false).or(self.limit);
-                replay.link.output.extend_verdict(STANDS);
+                replay.link.output.extend_verdict(VALID_UNTIL_NEXT);
                 replay.handle.played(when.begin);
                 self.state = State::Streaming;
-                replay.link.show(None, self.state, &replay.trouble);
+                replay.link.show(None, self.state, &replay.problem);
             }
         }
         // A scan whose values could not be read had no verdict.
@@ -263,14 +263,14 @@ impl Lap<'_> {
             let (first, last) = (here(scan.first), here(scan.last));
             let recorded = RecordedMetadata { wall_ns, measured_ns: Some(scan.first), ..recorded };
             *last_limit = Some(replay.link.publish_scan(&RawScan { first, last, ..scan }, &recorded, false));
-            replay.link.output.extend_verdict(STANDS);
+            replay.link.output.extend_verdict(VALID_UNTIL_NEXT);
             let valid = verdict_lifetime(micros(scan.period));
             let (until_ns, until) = (when.last.saturating_add(valid), when.media.saturating_add(valid));
             *verdict = Some(Verdict { of: when.media, until_ns, until });
             *state = State::Streaming;
         });
         if !when.is_skipped {
-            replay.link.show(Some(session.session()), *state, &replay.trouble);
+            replay.link.show(Some(session.session()), *state, &replay.problem);
         }
         Some(())
     }
@@ -295,7 +295,7 @@ impl When {
             frame.header.map_or((begun, begun), |header| (header.stamp_first_ns, header.stamp_last_ns));
         let took = last.saturating_sub(first);
         // A hub has a frame with its last byte.
-        let media = begin.saturating_add(took.min(LONGEST_GAP));
+        let media = begin.saturating_add(took.min(MAX_GAP));
         When { first, last: last.max(first), begin, media, is_skipped }
     }
 }
@@ -314,7 +314,7 @@ fn gap(frame: &Frame, next: &Frame) -> Option<Nanos> {
         return None;
     }
     let (from, to) = frame.wall_ns.zip(next.wall_ns)?;
-    Some(to.saturating_sub(from).min(LONGEST_GAP))
+    Some(to.saturating_sub(from).min(MAX_GAP))
 }
 
 /// A scanner is silent after this time without a scan.

@@ -9,7 +9,7 @@ use recording::{Encoding, Form, Frame, Recording};
 use scanhub_drivers::{Settings, features};
 use schema::{Failure, Family, Header, Kind, Nanos};
 
-use super::LONGEST_GAP;
+use super::MAX_GAP;
 
 /// A recording of one sensor.
 pub(crate) enum Recorded {
@@ -141,8 +141,8 @@ impl Recorded {
         self.origin().map(|origin| origin.wall_ns)
     }
 
-    /// Why no scan can be read, in words; empty if they can.
-    pub(super) fn trouble(&self, name: &str) -> String {
+    /// Returns the message why no scan can be read; an empty string if they can.
+    pub(super) fn problem(&self, name: &str) -> String {
         let (Recorded::Stream(Stream { mode, recording, .. })
         | Recorded::Frames(Frames { mode, recording, .. })) = self;
         if recording.contents().telegrams == 0 {
@@ -277,7 +277,7 @@ impl Timeline {
         let by_wall = i128::from(header.wall_ns) - self.wall_zero_ns;
         let by_stamp = self.life.map(|(_, zero_ns)| i128::from(header.stamp_first_ns) - zero_ns);
         let media = Nanos::try_from(by_stamp.unwrap_or(by_wall)).ok()?;
-        (media.saturating_add(LONGEST_GAP) >= self.last).then_some(media)
+        (media.saturating_add(MAX_GAP) >= self.last).then_some(media)
     }
 
     /// The media time of `frame`, which comes next.
@@ -308,7 +308,7 @@ impl Timeline {
     fn by_wall_clock(&mut self, frame: &Frame) -> i128 {
         let last = i128::from(self.last);
         let Some(wall_ns) = frame.wall_ns.map(i128::from) else { return last };
-        if wall_ns - self.wall_zero_ns + i128::from(LONGEST_GAP) < last {
+        if wall_ns - self.wall_zero_ns + i128::from(MAX_GAP) < last {
             self.wall_zero_ns = wall_ns - last;
         }
         last.max(wall_ns - self.wall_zero_ns)
