@@ -4,7 +4,7 @@ use std::path::PathBuf;
 use std::time::Duration;
 
 use clap::Args;
-use daemon::{Pace, Play};
+use daemon::{PlaybackOptions, PlaybackRate};
 use schema::{Failure, Family, Kind};
 use verbs::duration;
 
@@ -16,7 +16,7 @@ pub(crate) struct Replay {
     pub(crate) file: PathBuf,
     /// Speed relative to the recording, 0.015625 to 64, or max: as fast as it can be read
     #[arg(long, default_value = "1", value_name = "FACTOR|max", value_parser = pace)]
-    rate: Pace,
+    rate: PlaybackRate,
     /// Start again at the end, until Ctrl-C; each lap forgets what was learned
     #[arg(long = "loop", conflicts_with = "hold")]
     is_looped: bool,
@@ -46,13 +46,13 @@ impl Replay {
     /// The options of the player.
     ///
     /// [`Kind::Usage`] if it ends before it starts.
-    pub(crate) fn play(&self) -> Result<Play, Failure> {
+    pub(crate) fn play(&self) -> Result<PlaybackOptions, Failure> {
         let start = self.start.unwrap_or_default();
         if let Some(end) = self.end.filter(|end| *end <= start) {
             let message = format!("--end {end:?} is not after --start {start:?}");
             return Err(Failure::new(Kind::Usage, message, "both count from the first telegram"));
         }
-        Ok(Play {
+        Ok(PlaybackOptions {
             pace: self.rate,
             start_ns: nanos(start),
             end_ns: self.end.map(nanos),
@@ -66,13 +66,15 @@ fn nanos(duration: Duration) -> u64 {
     u64::try_from(duration.as_nanos()).unwrap_or(u64::MAX)
 }
 
-fn pace(text: &str) -> Result<Pace, String> {
+fn pace(text: &str) -> Result<PlaybackRate, String> {
     if text == "max" {
-        return Ok(Pace::Max);
+        return Ok(PlaybackRate::Max);
     }
-    let rate = text.parse().ok().filter(|rate| (Pace::SLOWEST..=Pace::FASTEST).contains(rate));
-    rate.map(Pace::Times)
-        .ok_or_else(|| format!("a number from {} to {}, or max", Pace::SLOWEST, Pace::FASTEST))
+    let rate =
+        text.parse().ok().filter(|rate| (PlaybackRate::SLOWEST..=PlaybackRate::FASTEST).contains(rate));
+    rate.map(PlaybackRate::Times).ok_or_else(|| {
+        format!("a number from {} to {}, or max", PlaybackRate::SLOWEST, PlaybackRate::FASTEST)
+    })
 }
 
 /// The keys, for the end of the help.
@@ -89,7 +91,7 @@ mod tests {
 
     #[test]
     fn rates() {
-        assert_eq!((pace("max"), pace("0.5")), (Ok(Pace::Max), Ok(Pace::Times(0.5))));
+        assert_eq!((pace("max"), pace("0.5")), (Ok(PlaybackRate::Max), Ok(PlaybackRate::Times(0.5))));
         for wrong in ["0", "-1", "65", "nan", "inf", "fast", ""] {
             assert!(pace(wrong).is_err_and(|error| error.contains("0.015625 to 64, or max")), "{wrong}");
         }

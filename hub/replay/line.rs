@@ -3,7 +3,7 @@
 use std::io::{self, Write, stderr};
 use std::sync::atomic::{AtomicBool, Ordering};
 
-use daemon::{Pace, Progress};
+use daemon::{PlaybackRate, Progress};
 use rustix::termios::tcgetwinsize;
 
 /// The line at the bottom of stderr, until it is dropped.
@@ -65,7 +65,7 @@ pub(super) fn summary(played: &Progress) -> String {
     if paused_ns > 0 {
         words += &format!(" and {} of pauses", span(paused_ns));
     }
-    if pace == Pace::Max && lap == 0 && took_ns > 0 {
+    if pace == PlaybackRate::Max && lap == 0 && took_ns > 0 {
         words += &format!(", {:.0} times as fast as it was recorded", position_ns as f64 / took_ns as f64);
     }
     words
@@ -91,8 +91,8 @@ fn text_of(progress: &Progress, brevity: u32) -> String {
     }
     if brevity < 7 {
         text += &match pace {
-            Pace::Times(rate) => format!("  x{rate}"),
-            Pace::Max => "  x max".to_owned(),
+            PlaybackRate::Times(rate) => format!("  x{rate}"),
+            PlaybackRate::Max => "  x max".to_owned(),
         };
     }
     if brevity < 2 {
@@ -143,7 +143,7 @@ mod tests {
         let progress = Progress {
             position_ns: 65_250_000_000,
             length_ns: Some(130_500_000_000),
-            pace: Pace::Times(0.5),
+            pace: PlaybackRate::Times(0.5),
             is_paused: false,
             is_over: false,
             lap: 0,
@@ -154,7 +154,7 @@ mod tests {
         };
         let begin = "1:05.2 [##########..........] 2:10.5  x0.5  7 telegrams  ";
         assert_eq!(text(&progress, usize::MAX), format!("{begin}space pauses, + - rate, q quits"));
-        let open = Progress { length_ns: None, pace: Pace::Max, lap: 1, is_paused: true, ..progress };
+        let open = Progress { length_ns: None, pace: PlaybackRate::Max, lap: 1, is_paused: true, ..progress };
         assert_eq!(
             text(&open, 200),
             "1:05.2  x max  7 telegrams  lap 2  paused; space continues, . steps, q quits"
@@ -181,7 +181,7 @@ mod tests {
         let played = Progress {
             position_ns: 60_000_000_000,
             length_ns: None,
-            pace: Pace::Max,
+            pace: PlaybackRate::Max,
             is_paused: false,
             is_over: true,
             lap: 0,
@@ -192,7 +192,7 @@ mod tests {
         };
         let words = "replayed 7 telegrams up to 1:00.0, in 30 ms, 2000 times as fast as it was recorded";
         assert_eq!(summary(&played), words);
-        let slow = Progress { pace: Pace::Times(1.0), took_ns: 61_000_000_000, ..played };
+        let slow = Progress { pace: PlaybackRate::Times(1.0), took_ns: 61_000_000_000, ..played };
         assert_eq!(summary(&slow), "replayed 7 telegrams up to 1:00.0, in 61.0 s");
         let paused = Progress { paused_ns: 12_340_000_000, ..played };
         let words = "replayed 7 telegrams up to 1:00.0, in 30 ms and 12.3 s of pauses, 2000 times as fast as it was recorded";

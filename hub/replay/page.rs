@@ -8,7 +8,7 @@ use std::sync::{Arc, mpsc};
 use std::thread;
 
 use config::Sources;
-use daemon::{Pace, Play, Player};
+use daemon::{PlaybackOptions, PlaybackRate, Player};
 use schema::{Failure, Kind};
 use verbs::WebOptions;
 use web::{Order, Playback, Progress};
@@ -32,7 +32,7 @@ pub(crate) fn show(
         sensor: None,
         family: None,
         sources: &sources,
-        play: Play { is_looped: web.is_looped, ..Play::default() },
+        play: PlaybackOptions { is_looped: web.is_looped, ..PlaybackOptions::default() },
         // What was seen last stands until whoever looks has seen enough.
         holds: true,
     };
@@ -80,8 +80,8 @@ impl Playback for Keys {
             position_s: seconds(progress.position_ns),
             length_s: progress.length_ns.map(seconds),
             rate: match progress.pace {
-                Pace::Times(rate) => Some(rate),
-                Pace::Max => None,
+                PlaybackRate::Times(rate) => Some(rate),
+                PlaybackRate::Max => None,
             },
             paused: progress.is_paused,
             over: progress.is_over,

@@ -12,7 +12,7 @@ use std::time::{Duration, Instant};
 
 use crate::testkit::{PATIENCE, TestEnv, in_own_process};
 use config::Sources;
-use daemon::{Play, Player, Replay};
+use daemon::{PlaybackOptions, Player, Replay};
 use recorded_rooms::{LEARNING, Published, SENSORS, Subscribers};
 use schema::{Flags, Topic};
 
@@ -30,7 +30,7 @@ fn record(env: &TestEnv) -> (PathBuf, Vec<Vec<Published>>) {
 }
 
 /// Replays `file` step by step; what was published of each sensor.
-fn replay(env: &TestEnv, file: &Path, play: Play, set: &[&str]) -> Vec<Vec<Published>> {
+fn replay(env: &TestEnv, file: &Path, play: PlaybackOptions, set: &[&str]) -> Vec<Vec<Published>> {
     let set = set.iter().map(|word| (*word).to_owned()).collect();
     let sources = Sources { set, ..Sources::default() };
     let replay = Replay {
@@ -38,7 +38,7 @@ fn replay(env: &TestEnv, file: &Path, play: Play, set: &[&str]) -> Vec<Vec<Publi
         sensor: None,
         family: None,
         sources: &sources,
-        play: Play { is_paused: true, ..play },
+        play: PlaybackOptions { is_paused: true, ..play },
         holds: false,
     };
     let domain = env.place();
@@ -102,7 +102,7 @@ fn the_same_parameters_give_the_same_bytes_and_others_give_others() {
     in_own_process("replayed::the_same_parameters_give_the_same_bytes_and_others_give_others", || {
         let env = TestEnv::new();
         let (file, recorded) = record(&env);
-        let replayed = replay(&env, &file, Play::default(), &[LEARNING]);
+        let replayed = replay(&env, &file, PlaybackOptions::default(), &[LEARNING]);
         for ((recorded, replayed), (name, _)) in recorded.iter().zip(&replayed).zip(SENSORS) {
             let count = |topic| [replayed, recorded].map(|published| payloads(published, topic).len());
             for topic in [Topic::Telegram, Topic::Scan, Topic::Marks, Topic::Foreground, Topic::Background] {
@@ -123,7 +123,7 @@ fn the_same_parameters_give_the_same_bytes_and_others_give_others() {
             };
             assert_eq!(walls(recorded), walls(replayed), "{name}");
         }
-        let others = replay(&env, &file, Play::default(), &[LEARNING, "zones.radii=[2.5,1.5]"]);
+        let others = replay(&env, &file, PlaybackOptions::default(), &[LEARNING, "zones.radii=[2.5,1.5]"]);
         assert!(payloads(&others[0], Topic::Zones) != payloads(&recorded[0], Topic::Zones));
         assert!(payloads(&others[0], Topic::Foreground) == payloads(&recorded[0], Topic::Foreground));
     });
@@ -134,7 +134,7 @@ fn what_is_skipped_is_learned_from() {
     in_own_process("replayed::what_is_skipped_is_learned_from", || {
         let env = TestEnv::new();
         let (file, recorded) = record(&env);
-        let play = Play { start_ns: 5_000_000_000, ..Play::default() };
+        let play = PlaybackOptions { start_ns: 5_000_000_000, ..PlaybackOptions::default() };
         let replayed = replay(&env, &file, play, &[LEARNING]);
         for (recorded, replayed) in recorded.iter().zip(&replayed) {
             for topic in [Topic::Scan, Topic::Marks, Topic::Zones, Topic::Foreground] {

@@ -10,7 +10,7 @@ use crate::pages::programs_on;
 use crate::recorded_world::{BEGIN_NS, recorded_world};
 use crate::testkit::{INT, PATIENCE, Program, TERM, TestEnv, in_own_process, is_class, number, until};
 use config::Sources;
-use daemon::{Play, Player, Replay};
+use daemon::{PlaybackOptions, Player, Replay};
 use schema::datagram::Packed;
 use schema::{Event, EventKind, TrackState, Tracks};
 use shm::{Node, Payload, Subscriber};
@@ -149,7 +149,7 @@ type Published = Vec<(u64, Vec<u8>)>;
 /// misses nothing. Returns the tracks and events that it published of the first twenty seconds of the world.
 fn tracked(env: &TestEnv, site: &str, file: &str) -> [Published; 2] {
     let sources = Sources { set: vec!["background.scans=100".to_owned()], ..Sources::default() };
-    let play = Play { is_paused: true, ..Play::default() };
+    let play = PlaybackOptions { is_paused: true, ..PlaybackOptions::default() };
     let replay =
         Replay { file: Path::new(file), sensor: None, family: None, sources: &sources, play, holds: true };
     let domain = env.place();

@@ -24,7 +24,7 @@ mod system;
 mod topics;
 
 pub use control::{ControlQueue, Orders, Outcome};
-pub use player::{Pace, Play, Player, Progress};
+pub use player::{PlaybackOptions, PlaybackRate, Player, Progress};
 pub use process::explain_bus_error;
 pub use reconnect::LiveLink;
 pub use reload::{Read, Reload};

@@ -1,5 +1,10 @@
-//! A player as its users and its links see it: the links' threads ask whose turn it is, keys and requests change how it
-//! goes on. Where nothing is waited for, nobody asks and nothing is locked. Refuses to know what is played.
+//! The player of a recording. The threads of its links ask when their next telegram is due, and keys and requests of
+//! users pause, step and speed it up. At maximum rate no link asks, and nothing is locked.
+//!
+//! [`Playback`] is the clock of the player. It keeps the times between telegrams of all links while the recording is paused,
+//! stepped, played faster or slower, and repeated. The current time is an argument.
+//!
+//! Media time is the time since the first telegram of the recording, in nanoseconds.
 
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Mutex, MutexGuard, PoisonError};
@@ -10,129 +15,141 @@ use schema::{Failure, Nanos};
 use crate::process::EventFd;
 use crate::replay::RecordedMount;
 
-/// How fast a recording is played.
+/// Speed of playback.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub enum Pace {
-    /// So many times as fast as it was recorded.
+pub enum PlaybackRate {
+    /// Multiple of the recorded speed.
     Times(f64),
     /// As fast as it can be read.
     Max,
 }
 
-/// What a user wants of a player.
+/// Options of a user for playing a recording.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct Play {
-    /// How fast.
-    pub pace: Pace,
+pub struct PlaybackOptions {
+    /// Speed of playback.
+    pub pace: PlaybackRate,
     /// Media time, in ns, before which nothing is published.
     pub start_ns: Nanos,
-    /// Media time, in ns, from which on nothing is published.
+    /// Media time, in ns, at which playback ends.
     pub end_ns: Option<Nanos>,
-    /// Whether it starts again at its end.
+    /// Whether it restarts at its end.
     pub is_looped: bool,
-    /// Whether it waits to be resumed before the first telegram.
+    /// Whether it pauses before the first telegram.
     pub is_paused: bool,
 }
 
-/// The player of a recording, for all links that are in it.
+/// Player of a recording for all of its links.
 pub struct Player {
     playback: Mutex<Playback>,
-    /// Whether it is everybody's turn.
-    flows: AtomicBool,
-    links: Vec<LinkPlace>,
-    /// Rings at the end.
+    /// Whether every telegram is due at once.
+    is_unthrottled: AtomicBool,
+    links: Vec<LinkProgress>,
+    /// Readable at the end.
     over: EventFd,
-    /// Somebody wants it to end now.
+    /// Whether a user has ended it.
     is_ended: AtomicBool,
     length_ns: Option<Nanos>,
     /// Mounts whose angles are in the recording.
     mounts: Vec<RecordedMount>,
 }
 
-/// Where a link is.
-struct LinkPlace {
+/// Progress of one link.
+struct LinkProgress {
+    /// Readable when the link must ask again.
     event: EventFd,
+    /// Media time of the last telegram.
     media: AtomicU64,
     has_ended: AtomicBool,
+    /// Number of published telegrams.
     telegrams: AtomicU64,
-    /// Those of them that were published when a lap ended last.
-    of_laps: AtomicU64,
+    /// Value of `telegrams` at the end of the last lap.
+    telegrams_of_laps: AtomicU64,
 }
 
-/// A link's place at a player.
+/// Access of link number `number` to its player.
 #[derive(Clone, Copy)]
 pub(crate) struct PlayerHandle<'a> {
     pub(crate) player: &'a Player,
     pub(crate) number: usize,
 }
 
-/// How far a player is.
+/// Progress of a player.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Progress {
-    /// Media time, in ns, from the first telegram of the recording.
+    /// Media time, in ns.
     pub position_ns: u64,
-    /// Media time of the end, where it is known.
+    /// Media time of the end, in ns, if it is known.
     pub length_ns: Option<u64>,
-    /// How fast.
-    pub pace: Pace,
-    /// Whether it waits.
+    /// Speed of playback.
+    pub pace: PlaybackRate,
+    /// Whether it is paused.
     pub is_paused: bool,
     /// Whether everything was played.
     pub is_over: bool,
-    /// Times that it started again.
+    /// Number of restarts.
     pub lap: u32,
-    /// Telegrams published, of all links and laps.
+    /// Number of published telegrams of all links and laps.
     pub telegrams: u64,
     /// Time that it has played, in ns, without pauses.
     pub took_ns: u64,
     /// Time that it has been paused since everything was ready to play, in ns.
     pub paused_ns: u64,
-    /// CLOCK_MONOTONIC of this answer, in ns.
+    /// Time of this report, CLOCK_MONOTONIC in ns.
     pub now_ns: u64,
 }
 
-impl Default for Pace {
-    fn default() -> Pace {
-        Pace::Times(1.0)
+impl Default for PlaybackRate {
+    fn default() -> PlaybackRate {
+        PlaybackRate::Times(1.0)
     }
 }
 
-impl Pace {
-    /// Twice as fast; more than [`Pace::FASTEST`] is [`Pace::Max`].
-    fn doubled(self) -> Pace {
+impl PlaybackRate {
+    /// Returns twice this rate. More than [`FASTEST`](Self::FASTEST) is [`Max`](Self::Max).
+    fn doubled(self) -> PlaybackRate {
         match self {
-            Pace::Times(rate) if rate < Pace::FASTEST => Pace::Times((2.0 * rate).min(Pace::FASTEST)),
-            _ => Pace::Max,
+            PlaybackRate::Times(rate) if rate < PlaybackRate::FASTEST => {
+                PlaybackRate::Times((2.0 * rate).min(PlaybackRate::FASTEST))
+            }
+            _ => PlaybackRate::Max,
         }
     }
 
-    fn halved(self) -> Pace {
+    /// Returns half this rate.
+    fn halved(self) -> PlaybackRate {
         match self {
-            Pace::Times(rate) => Pace::Times((rate / 2.0).max(Pace::SLOWEST)),
-            Pace::Max => Pace::Times(Pace::FASTEST),
+            PlaybackRate::Times(rate) => PlaybackRate::Times((rate / 2.0).max(PlaybackRate::SLOWEST)),
+            PlaybackRate::Max => PlaybackRate::Times(PlaybackRate::FASTEST),
         }
     }
 
-    /// The slowest that can be asked for.
+    /// Minimum rate.
     pub const SLOWEST: f64 = 1.0 / 64.0;
-    /// The fastest that is waited for.
+    /// Maximum rate at which playback waits at all.
     pub const FASTEST: f64 = 64.0;
 }
 
 impl Player {
-    /// A player of `links` links that together last `length_ns`, if that is known.
+    /// Creates a player of `links` links, with a total length of `length_ns` if that is known.
     ///
-    /// [`Kind::Short`](schema::Kind) if descriptors are.
-    pub(crate) fn new(play: Play, links: usize, length_ns: Option<Nanos>) -> Result<Player, Failure> {
-        let place = |_| -> Result<LinkPlace, Failure> {
-            let (media, telegrams, of_laps) = Default::default();
+    /// # Errors
+    ///
+    /// Returns [`Kind::Short`](schema::Kind) if no descriptors are left.
+    pub(crate) fn new(
+        play: PlaybackOptions,
+        links: usize,
+        length_ns: Option<Nanos>,
+    ) -> Result<Player, Failure> {
+        let progress = |_| -> Result<LinkProgress, Failure> {
+            let (media, telegrams, telegrams_of_laps) = Default::default();
             let (event, has_ended) = (EventFd::new()?, AtomicBool::new(false));
-            Ok(LinkPlace { event, media, has_ended, telegrams, of_laps })
+            Ok(LinkProgress { event, media, has_ended, telegrams, telegrams_of_laps })
         };
         Ok(Player {
             playback: Mutex::new(Playback::new(play, links)),
-            flows: AtomicBool::new(false),
-            links: (0..links).map(place).collect::<Result<_, _>>()?,
+            is_unthrottled: AtomicBool::new(false),
+            links: (0..links).map(progress).collect::<Result<_, _>>()?,
             over: EventFd::new()?,
             is_ended: AtomicBool::new(false),
             length_ns,
@@ -151,7 +168,7 @@ impl Player {
     }
 
     /// Returns how the recording is played.
-    pub(crate) fn play(&self) -> Play {
+    pub(crate) fn play(&self) -> PlaybackOptions {
         *self.lock().play()
     }
 
@@ -160,27 +177,27 @@ impl Player {
         self.lock().lap()
     }
 
-    /// Returns when something of `media` is due that belongs to no link. No link waits for it.
-    pub(crate) fn due(&self, media: Nanos, now: Nanos) -> Turn {
+    /// Returns when a sample of time `media` is due that belongs to no link. No link waits for it.
+    pub(crate) fn due(&self, media: Nanos, now: Nanos) -> PlaybackAction {
         self.lock().due(media, now, self.position())
     }
 
-    /// Everything is up: the first telegram may come.
+    /// Starts playback, because all topics exist.
     pub(crate) fn begin(&self) {
         self.change(|playback, now, _| playback.begin(now));
     }
 
-    /// Waits after the telegram that is played, until it is resumed.
+    /// Pauses after the current telegram.
     pub fn pause(&self) {
         self.change(|playback, now, position| playback.pause(true, now, position));
     }
 
-    /// Goes on.
+    /// Resumes playback.
     pub fn resume(&self) {
         self.change(|playback, now, position| playback.pause(false, now, position));
     }
 
-    /// Pauses, or goes on.
+    /// Pauses or resumes playback.
     pub fn toggle(&self) {
         self.change(|playback, now, position| {
             let is_paused = playback.play().is_paused;
@@ -193,34 +210,34 @@ impl Player {
         self.change(Playback::step);
     }
 
-    /// Goes on twice as fast.
+    /// Doubles the rate.
     pub fn speed_up(&self) {
         self.change(|playback, now, position| {
-            playback.set_pace(playback.play().pace.doubled(), now, position);
+            playback.set_rate(playback.play().pace.doubled(), now, position);
         });
     }
 
-    /// Goes on half as fast.
+    /// Halves the rate.
     pub fn slow_down(&self) {
         self.change(|playback, now, position| {
-            playback.set_pace(playback.play().pace.halved(), now, position);
+            playback.set_rate(playback.play().pace.halved(), now, position);
         });
     }
 
-    /// Ends, wherever it is.
+    /// Ends playback now.
     pub fn end(&self) {
         self.is_ended.store(true, Ordering::Relaxed);
         self.over.signal();
     }
 
-    /// How far it is.
+    /// Returns the progress.
     pub fn progress(&self) -> Progress {
         let playback = self.lock();
         let length_ns = playback.play().end_ns.into_iter().chain(self.length_ns).min();
         let now = clock::now();
         let is_over = playback.is_over();
         let position = self.position();
-        // What follows the end is no place in it.
+        // Media time continues after the end, but the position stays there.
         let media = playback.media(now, position).min(length_ns.unwrap_or(Nanos::MAX)).max(position);
         Progress {
             position_ns: if is_over { position } else { media },
@@ -236,33 +253,34 @@ impl Player {
         }
     }
 
-    /// What becomes readable when it [`is_over`](Self::is_over) or shall end.
+    /// Returns the event that is readable when it [`is_over`](Self::is_over), or a user has ended it.
     pub(crate) fn over(&self) -> &EventFd {
         &self.over
     }
 
-    /// Whether a user wants it to end now.
+    /// Returns whether a user has ended it.
     pub(crate) fn is_ended(&self) -> bool {
         self.is_ended.load(Ordering::Relaxed)
     }
 
-    /// Whether everything was played.
+    /// Returns whether everything was played.
     pub(crate) fn is_over(&self) -> bool {
         self.lock().is_over()
     }
 
+    /// Changes the playback by `how`, and notifies the links.
     fn change(&self, how: impl FnOnce(&mut Playback, Nanos, Nanos)) {
         let mut playback = self.lock();
         how(&mut playback, clock::now(), self.position());
-        self.tell(playback);
+        self.notify(playback);
     }
 
-    /// Lets go of `playback`, and everybody know what is new of it.
-    fn tell(&self, mut playback: MutexGuard<'_, Playback>) {
-        self.flows.store(playback.flows(), Ordering::Relaxed);
-        let (is_news, is_over) = (playback.take_news(), playback.is_over());
+    /// Unlocks `playback`, and wakes the links that must ask again, and the supervisor at the end.
+    fn notify(&self, mut playback: MutexGuard<'_, Playback>) {
+        self.is_unthrottled.store(playback.is_unthrottled(), Ordering::Relaxed);
+        let (has_changed, is_over) = (playback.take_change(), playback.is_over());
         drop(playback);
-        if is_news {
+        if has_changed {
             self.links.iter().for_each(|link| link.event.signal());
         }
         if is_over {
@@ -270,11 +288,11 @@ impl Player {
         }
     }
 
-    /// The media time of the link that has come the least far of those that go on.
+    /// Returns the minimum media time of the links that still play; if none does, the maximum of all links.
     fn position(&self) -> Nanos {
-        let media = |link: &LinkPlace| link.media.load(Ordering::Relaxed);
-        let going = self.links.iter().filter(|link| !link.has_ended.load(Ordering::Relaxed));
-        going.map(media).min().or_else(|| self.links.iter().map(media).max()).unwrap_or(0)
+        let media = |link: &LinkProgress| link.media.load(Ordering::Relaxed);
+        let playing = self.links.iter().filter(|link| !link.has_ended.load(Ordering::Relaxed));
+        playing.map(media).min().or_else(|| self.links.iter().map(media).max()).unwrap_or(0)
     }
 
     fn lock(&self) -> MutexGuard<'_, Playback> {
@@ -283,140 +301,140 @@ impl Player {
 }
 
 impl PlayerHandle<'_> {
-    /// Whether it is the link's turn without asking.
-    pub(crate) fn flows(self) -> bool {
-        self.player.flows.load(Ordering::Relaxed)
+    /// Returns whether the link may play everything without asking.
+    pub(crate) fn is_unthrottled(self) -> bool {
+        self.player.is_unthrottled.load(Ordering::Relaxed)
     }
 
-    /// Whether it is the link's turn, which has something of `media` next.
-    pub(crate) fn turn(self, media: Nanos, now: Nanos) -> Turn {
-        self.ask(|playback| playback.turn(self.number, media, now))
+    /// Returns what the link does, whose next telegram has time `media`.
+    pub(crate) fn next_action(self, media: Nanos, now: Nanos) -> PlaybackAction {
+        self.ask(|playback| playback.next_action(self.number, media, now))
     }
 
-    /// The link is at the end of lap number `lap`.
-    pub(crate) fn end(self, lap: u32, now: Nanos) -> Turn {
-        let place = self.place();
-        place.has_ended.store(true, Ordering::Relaxed);
-        let telegrams = place.telegrams.load(Ordering::Relaxed);
-        let has_played = place.of_laps.swap(telegrams, Ordering::Relaxed) < telegrams;
-        let turn = self.ask(|playback| {
+    /// Handles that the link is at the end of lap number `lap`. Returns what the link does next.
+    pub(crate) fn end(self, lap: u32, now: Nanos) -> PlaybackAction {
+        let progress = self.progress();
+        progress.has_ended.store(true, Ordering::Relaxed);
+        let telegrams = progress.telegrams.load(Ordering::Relaxed);
+        let has_played = progress.telegrams_of_laps.swap(telegrams, Ordering::Relaxed) < telegrams;
+        let action = self.ask(|playback| {
             playback.has_played |= has_played;
             playback.end(self.number, lap, now)
         });
-        if let Turn::Restart(_) = turn {
-            self.place().media.store(0, Ordering::Relaxed);
-            self.place().has_ended.store(false, Ordering::Relaxed);
+        if let PlaybackAction::Restart(_) = action {
+            progress.media.store(0, Ordering::Relaxed);
+            progress.has_ended.store(false, Ordering::Relaxed);
         }
-        turn
+        action
     }
 
-    /// The link has published something of `media`.
+    /// Notes that the link has published a telegram of time `media`.
     pub(crate) fn played(self, media: Nanos) {
-        let place = self.place();
-        place.media.store(media, Ordering::Relaxed);
-        place.has_ended.store(false, Ordering::Relaxed);
-        place.telegrams.fetch_add(1, Ordering::Relaxed);
+        let progress = self.progress();
+        progress.media.store(media, Ordering::Relaxed);
+        progress.has_ended.store(false, Ordering::Relaxed);
+        progress.telegrams.fetch_add(1, Ordering::Relaxed);
     }
 
-    /// What was asked for.
-    pub(crate) fn play(self) -> Play {
+    /// Returns how the recording is played.
+    pub(crate) fn play(self) -> PlaybackOptions {
         *self.player.lock().play()
     }
 
-    /// Whether the player waits.
+    /// Returns whether the player is paused.
     pub(crate) fn is_paused(self) -> bool {
         self.player.lock().play().is_paused
     }
 
-    /// What becomes readable when it is worth asking again.
-    pub(crate) fn news(&self) -> &EventFd {
-        &self.place().event
+    /// Returns the event that is readable when the link must ask again.
+    pub(crate) fn event(&self) -> &EventFd {
+        &self.progress().event
     }
 
-    fn ask(self, question: impl FnOnce(&mut Playback) -> Turn) -> Turn {
+    fn ask(self, question: impl FnOnce(&mut Playback) -> PlaybackAction) -> PlaybackAction {
         let mut playback = self.player.lock();
-        let turn = question(&mut playback);
-        self.player.tell(playback);
-        turn
+        let action = question(&mut playback);
+        self.player.notify(playback);
+        action
     }
 
-    fn place(&self) -> &LinkPlace {
+    fn progress(&self) -> &LinkProgress {
         &self.player.links[self.number]
     }
 }
 
-/// What a link is to do.
+/// What a link does next.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(crate) enum Turn {
-    /// It is its turn.
+pub(crate) enum PlaybackAction {
+    /// Plays its next telegram now.
     Now(Due),
-    /// It will be its turn then.
+    /// Waits until this time.
     At(Nanos),
-    /// It is to ask again when something has changed.
+    /// Waits until the player changes.
     Wait,
-    /// The silence that contains its time was skipped. Only samples that belong to no link are skipped.
+    /// Skips an angle: the silence that contains its time was skipped. A link never gets this action.
     Skipped,
-    /// It starts again, with this lap.
+    /// Restarts with this lap.
     Restart(u32),
-    /// Nothing comes any more, for nobody.
+    /// Ends, because everything was played.
     Over,
 }
 
-/// When something plays.
+/// Time at which a telegram is played.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Due {
-    /// The moment for which it stands.
+    /// Time at which it was due, CLOCK_MONOTONIC in ns.
     pub(crate) at: Nanos,
-    /// How many times longer than in the recording it takes until the next.
+    /// Factor by which the time to the next telegram is longer than in the recording.
     pub(crate) stretch: f64,
 }
 
 impl Due {
-    /// What nobody waits for.
+    /// Creates the time of a telegram that does not wait.
     pub(crate) fn at_once(now: Nanos) -> Due {
         Due { at: now, stretch: 1.0 }
     }
 }
 
-/// Where all links of a recording are.
+/// Clock of a recording, for all of its links.
 #[derive(Clone, Debug)]
 struct Playback {
-    play: Play,
-    /// Whether everything is up that shall be there at the first telegram.
+    play: PlaybackOptions,
+    /// Whether playback has been started.
     is_begun: bool,
-    /// When, and what media time it was then; nothing until every link has said what it has first.
+    /// A time and its media time; `None` until every link has reported its first telegram.
     anchor: Option<(Nanos, Nanos)>,
     links: Vec<Next>,
-    /// Times that it started again.
+    /// Number of restarts.
     lap: u32,
-    /// Whether this lap had a telegram, also of a link that did not ask whose turn it was.
+    /// Whether this lap had a telegram, including those of links that did not ask.
     has_played: bool,
-    /// When the first lap began, and when nothing came any more.
+    /// Start of the first lap, and the end of the last one.
     began_at: Option<Nanos>,
     over_at: Option<Nanos>,
     /// Start of the current pause, and total duration of the earlier ones, both within the time since `began_at`.
     paused_at: Option<Nanos>,
     paused: Nanos,
-    /// Whether what comes next is to be played, as soon as all have said what they have.
-    owes_step: bool,
-    /// Whether links that wait have to ask again.
-    is_news: bool,
+    /// Whether the next telegram must be played, once all links have reported theirs.
+    is_step_pending: bool,
+    /// Whether waiting links must ask again.
+    has_changed: bool,
     /// End of the last silence that was skipped in this lap, as media time; 0 if there was none. Angles before it are not played.
     skipped_until: Nanos,
 }
 
-/// What a link has next.
+/// Next telegram of a link.
 #[derive(Clone, Copy, Debug, PartialEq)]
 enum Next {
-    /// It looks for it.
+    /// The link has not reported it yet.
     Unknown,
-    /// Something of this media time.
+    /// A telegram with this media time.
     At(Nanos),
     Ended,
 }
 
 impl Playback {
-    fn new(play: Play, links: usize) -> Playback {
+    fn new(play: PlaybackOptions, links: usize) -> Playback {
         Playback {
             play,
             is_begun: false,
@@ -428,103 +446,104 @@ impl Playback {
             over_at: None,
             paused_at: None,
             paused: 0,
-            owes_step: false,
-            is_news: false,
+            is_step_pending: false,
+            has_changed: false,
             skipped_until: 0,
         }
     }
 
-    /// Everything is up.
+    /// Starts playback.
     fn begin(&mut self, now: Nanos) {
         self.is_begun = true;
         self.start(now);
     }
 
-    /// Whose turn it is, if `link` has something of `media` next.
-    fn turn(&mut self, link: usize, media: Nanos, now: Nanos) -> Turn {
+    /// Returns what `link` does, whose next telegram has time `media`.
+    fn next_action(&mut self, link: usize, media: Nanos, now: Nanos) -> PlaybackAction {
         self.links[link] = Next::At(media);
         self.start(now);
-        self.pay_step();
-        let Some((since, from)) = self.anchor else { return Turn::Wait };
+        self.apply_step();
+        let Some((since, from)) = self.anchor else { return PlaybackAction::Wait };
         if self.play.is_paused {
-            return if media < from { self.play_now(link, Due::at_once(now)) } else { Turn::Wait };
+            return if media < from { self.play_now(link, Due::at_once(now)) } else { PlaybackAction::Wait };
         }
-        let Pace::Times(rate) = self.play.pace else { return self.play_now(link, Due::at_once(now)) };
+        let PlaybackRate::Times(rate) = self.play.pace else { return self.play_now(link, Due::at_once(now)) };
         if self.skip_silence(now) {
-            return self.turn(link, media, now);
+            return self.next_action(link, media, now);
         }
         let due = due(since, from, media, rate);
         if due > now {
-            return Turn::At(due);
+            return PlaybackAction::At(due);
         }
         self.play_now(link, Due { at: due, stretch: (1.0 / rate).max(1.0) })
     }
 
-    /// Returns when something of `media` is due that belongs to no link. `position` is the media time at the fastest pace.
-    fn due(&self, media: Nanos, now: Nanos, position: Nanos) -> Turn {
+    /// Returns when a sample of time `media` is due that belongs to no link. `position` is the media time at maximum rate.
+    fn due(&self, media: Nanos, now: Nanos, position: Nanos) -> PlaybackAction {
         if media < self.skipped_until {
-            return Turn::Skipped;
+            return PlaybackAction::Skipped;
         }
-        let at_once = |is_due| if is_due { Turn::Now(Due::at_once(now)) } else { Turn::Wait };
+        let at_once =
+            |is_due| if is_due { PlaybackAction::Now(Due::at_once(now)) } else { PlaybackAction::Wait };
         match (self.anchor, self.play.pace) {
-            (None, _) => Turn::Wait,
+            (None, _) => PlaybackAction::Wait,
             (Some((_, from)), _) if self.play.is_paused => at_once(media < from),
-            (_, Pace::Max) => at_once(media <= position),
-            (Some((since, from)), Pace::Times(rate)) => match due(since, from, media, rate) {
-                at if at > now => Turn::At(at),
-                at => Turn::Now(Due { at, stretch: (1.0 / rate).max(1.0) }),
+            (_, PlaybackRate::Max) => at_once(media <= position),
+            (Some((since, from)), PlaybackRate::Times(rate)) => match due(since, from, media, rate) {
+                at if at > now => PlaybackAction::At(at),
+                at => PlaybackAction::Now(Due { at, stretch: (1.0 / rate).max(1.0) }),
             },
         }
     }
 
-    /// `link`, which plays lap number `lap`, has nothing more in it.
-    fn end(&mut self, link: usize, lap: u32, now: Nanos) -> Turn {
+    /// Handles the end of lap number `lap` for `link`. Returns what the link does next.
+    fn end(&mut self, link: usize, lap: u32, now: Nanos) -> PlaybackAction {
         if self.lap != lap {
-            return Turn::Restart(self.lap);
+            return PlaybackAction::Restart(self.lap);
         }
         if self.is_over() {
-            return Turn::Over;
+            return PlaybackAction::Over;
         }
         self.links[link] = Next::Ended;
         self.start(now);
         if !self.is_over() {
-            self.pay_step();
-            return Turn::Wait;
+            self.apply_step();
+            return PlaybackAction::Wait;
         }
-        self.is_news = true;
-        // What has nothing in it would start again for ever.
+        self.has_changed = true;
+        // An empty recording would restart forever.
         if !(self.play.is_looped && self.has_played) {
             self.over_at = Some(now);
-            return Turn::Over;
+            return PlaybackAction::Over;
         }
         self.lap += 1;
         self.links.fill(Next::Unknown);
         (self.anchor, self.has_played, self.skipped_until) = (None, false, 0);
-        Turn::Restart(self.lap)
+        PlaybackAction::Restart(self.lap)
     }
 
-    /// Plays, or waits; `position` is the media time where nothing is waited for.
+    /// Pauses or resumes. `position` is the media time at maximum rate.
     fn pause(&mut self, is_paused: bool, now: Nanos, position: Nanos) {
-        self.hold(now, position);
+        self.set_anchor(now, position);
         self.set_paused(is_paused, now);
-        self.owes_step = false;
+        self.is_step_pending = false;
     }
 
-    /// Pauses after what comes next.
+    /// Pauses after the next telegram.
     fn step(&mut self, now: Nanos, position: Nanos) {
-        self.hold(now, position);
+        self.set_anchor(now, position);
         self.set_paused(true, now);
-        self.owes_step = true;
-        self.pay_step();
+        self.is_step_pending = true;
+        self.apply_step();
     }
 
-    /// Goes on so fast.
-    fn set_pace(&mut self, pace: Pace, now: Nanos, position: Nanos) {
-        self.hold(now, position);
+    /// Continues at another rate.
+    fn set_rate(&mut self, pace: PlaybackRate, now: Nanos, position: Nanos) {
+        self.set_anchor(now, position);
         self.play.pace = pace;
     }
 
-    fn play(&self) -> &Play {
+    fn play(&self) -> &PlaybackOptions {
         &self.play
     }
 
@@ -532,12 +551,12 @@ impl Playback {
         self.lap
     }
 
-    /// Whether it is everybody's turn until something changes.
-    fn flows(&self) -> bool {
-        self.anchor.is_some() && !self.play.is_paused && self.play.pace == Pace::Max
+    /// Returns whether every telegram is due at once until something changes.
+    fn is_unthrottled(&self) -> bool {
+        self.anchor.is_some() && !self.play.is_paused && self.play.pace == PlaybackRate::Max
     }
 
-    /// Whether nothing comes any more.
+    /// Returns whether everything was played.
     fn is_over(&self) -> bool {
         self.links.iter().all(|next| *next == Next::Ended)
     }
@@ -562,44 +581,46 @@ impl Playback {
         self.paused_at = self.began_at.filter(|_| is_paused).map(|_| now);
     }
 
-    /// Whether links that wait have to ask again since the last call.
-    fn take_news(&mut self) -> bool {
-        std::mem::take(&mut self.is_news)
+    /// Returns whether waiting links must ask again since the last call.
+    fn take_change(&mut self) -> bool {
+        std::mem::take(&mut self.has_changed)
     }
 
-    /// The media time at `now`; `position` where nothing is waited for.
+    /// Returns the media time at `now`: `position` at maximum rate.
     fn media(&self, now: Nanos, position: Nanos) -> Nanos {
         let Some((since, from)) = self.anchor else { return self.play.start_ns };
         match self.play.pace {
             _ if self.play.is_paused => from,
-            Pace::Max => position.max(from),
-            Pace::Times(rate) => from.saturating_add((now.saturating_sub(since) as f64 * rate) as Nanos),
+            PlaybackRate::Max => position.max(from),
+            PlaybackRate::Times(rate) => {
+                from.saturating_add((now.saturating_sub(since) as f64 * rate) as Nanos)
+            }
         }
     }
 
-    /// It is the turn of `link`, which then looks for what it has next.
-    fn play_now(&mut self, link: usize, due: Due) -> Turn {
+    /// Lets `link` play. Its next telegram is unknown until it asks again.
+    fn play_now(&mut self, link: usize, due: Due) -> PlaybackAction {
         self.has_played = true;
         self.links[link] = Next::Unknown;
-        Turn::Now(due)
+        PlaybackAction::Now(due)
     }
 
-    /// Lets what comes next play in a pause, if that was asked for and all have said what they have.
-    fn pay_step(&mut self) {
-        if self.owes_step
+    /// Lets the next telegram play in a pause, if a step is pending and all links have reported theirs.
+    fn apply_step(&mut self) {
+        if self.is_step_pending
             && !self.links.contains(&Next::Unknown)
             && let Some(((_, media), next)) = self.anchor.as_mut().zip(next_of(&self.links))
         {
             let before = *media;
             *media = before.max(next.saturating_add(1));
-            (self.owes_step, self.is_news) = (false, true);
-            if next > before.saturating_add(LONGEST_SILENCE) {
-                self.skipped_until = next - LONGEST_SILENCE;
+            (self.is_step_pending, self.has_changed) = (false, true);
+            if next > before.saturating_add(MAX_SILENCE) {
+                self.skipped_until = next - MAX_SILENCE;
             }
         }
     }
 
-    /// Lets the time run as soon as all are there.
+    /// Starts the clock once all links have reported their first telegram.
     fn start(&mut self, now: Nanos) {
         if self.is_begun && self.anchor.is_none() && !self.links.contains(&Next::Unknown) {
             self.anchor = Some((now, self.play.start_ns));
@@ -607,27 +628,27 @@ impl Playback {
                 self.began_at = Some(now);
                 self.set_paused(self.play.is_paused, now);
             }
-            self.is_news = true;
+            self.has_changed = true;
         }
     }
 
-    /// From now on the time runs another way.
-    fn hold(&mut self, now: Nanos, position: Nanos) {
+    /// Anchors the clock at `now`, before its rate changes.
+    fn set_anchor(&mut self, now: Nanos, position: Nanos) {
         let media = self.media(now, position);
         if let Some(anchor) = &mut self.anchor {
             *anchor = (now, media);
         }
-        self.is_news = true;
+        self.has_changed = true;
     }
 
-    /// Where all were silent for long, for the recording was interrupted, listeners wait less.
+    /// Shortens a silence of all links, in which the recording was interrupted. Returns whether it has.
     fn skip_silence(&mut self, now: Nanos) -> bool {
         let media = self.media(now, 0);
         match next_of(&self.links).filter(|_| !self.links.contains(&Next::Unknown)) {
-            Some(next) if next > media.saturating_add(LONGEST_SILENCE) => {
-                self.anchor = Some((now, next - LONGEST_SILENCE));
-                self.is_news = true;
-                self.skipped_until = next - LONGEST_SILENCE;
+            Some(next) if next > media.saturating_add(MAX_SILENCE) => {
+                self.anchor = Some((now, next - MAX_SILENCE));
+                self.has_changed = true;
+                self.skipped_until = next - MAX_SILENCE;
                 true
             }
             _ => false,
@@ -635,19 +656,19 @@ impl Playback {
     }
 }
 
-/// Returns when `media` is due at this rate, where media time was `from` at `since`.
+/// Returns when `media` is due at this rate, if the media time was `from` at `since`.
 fn due(since: Nanos, from: Nanos, media: Nanos, rate: f64) -> Nanos {
     since.saturating_add_signed(((media as f64 - from as f64) / rate) as i64)
 }
 
-/// Media time of what comes next of all.
+/// Returns the media time of the next telegram of all links.
 fn next_of(links: &[Next]) -> Option<Nanos> {
     let next = |next: &Next| if let Next::At(media) = next { Some(*media) } else { None };
     links.iter().filter_map(next).min()
 }
 
-/// A recording that was interrupted does not keep its listeners waiting for longer, at its own pace.
-const LONGEST_SILENCE: Nanos = 10_000 * schema::MILLIS;
+/// Maximum media time that passes while all links are silent.
+const MAX_SILENCE: Nanos = 10_000 * schema::MILLIS;
 
 #[cfg(test)]
 mod tests {
@@ -655,87 +676,103 @@ mod tests {
 
     const SECOND: Nanos = 1_000 * schema::MILLIS;
 
-    /// One of `links` that is up, from `start` seconds on.
-    fn begun(links: usize, play: Play) -> Playback {
+    /// Creates a playback of `links` links that was started at 100 s.
+    fn begun(links: usize, play: PlaybackOptions) -> Playback {
         let mut playback = Playback::new(play, links);
         playback.begin(100 * SECOND);
         playback
     }
 
-    fn is_now(turn: Turn, at: Nanos) -> bool {
-        matches!(turn, Turn::Now(due) if due.at == at)
+    fn is_now(action: PlaybackAction, at: Nanos) -> bool {
+        matches!(action, PlaybackAction::Now(due) if due.at == at)
     }
 
     #[test]
-    fn nobody_begins_before_all_are_there() {
-        let mut playback = Playback::new(Play::default(), 2);
-        assert_eq!(playback.turn(0, 0, 90 * SECOND), Turn::Wait);
-        assert_eq!(playback.turn(1, 5 * SECOND, 95 * SECOND), Turn::Wait);
-        assert!(!playback.take_news());
+    fn starts_when_all_links_have_reported() {
+        let mut playback = Playback::new(PlaybackOptions::default(), 2);
+        assert_eq!(playback.next_action(0, 0, 90 * SECOND), PlaybackAction::Wait);
+        assert_eq!(playback.next_action(1, 5 * SECOND, 95 * SECOND), PlaybackAction::Wait);
+        assert!(!playback.take_change());
         playback.begin(100 * SECOND);
-        assert!(playback.take_news());
-        assert!(is_now(playback.turn(0, 0, 100 * SECOND), 100 * SECOND));
-        assert_eq!(playback.turn(1, 5 * SECOND, 101 * SECOND), Turn::At(105 * SECOND));
-        assert!(is_now(playback.turn(1, 5 * SECOND, 106 * SECOND), 105 * SECOND), "it stands for its moment");
+        assert!(playback.take_change());
+        assert!(is_now(playback.next_action(0, 0, 100 * SECOND), 100 * SECOND));
+        assert_eq!(playback.next_action(1, 5 * SECOND, 101 * SECOND), PlaybackAction::At(105 * SECOND));
+        assert!(
+            is_now(playback.next_action(1, 5 * SECOND, 106 * SECOND), 105 * SECOND),
+            "the time at which it was due"
+        );
     }
 
     #[test]
-    fn what_belongs_to_no_link_is_due_with_them() {
-        let mut playback = Playback::new(Play::default(), 1);
-        assert_eq!(playback.due(0, 90 * SECOND, 0), Turn::Wait);
+    fn samples_without_a_link_are_due_with_the_links() {
+        let mut playback = Playback::new(PlaybackOptions::default(), 1);
+        assert_eq!(playback.due(0, 90 * SECOND, 0), PlaybackAction::Wait);
         playback.begin(100 * SECOND);
-        assert!(is_now(playback.turn(0, 0, 100 * SECOND), 100 * SECOND));
-        assert_eq!(playback.due(3 * SECOND, 101 * SECOND, 0), Turn::At(103 * SECOND));
-        assert!(is_now(playback.due(3 * SECOND, 104 * SECOND, 0), 103 * SECOND), "it stands for its moment");
+        assert!(is_now(playback.next_action(0, 0, 100 * SECOND), 100 * SECOND));
+        assert_eq!(playback.due(3 * SECOND, 101 * SECOND, 0), PlaybackAction::At(103 * SECOND));
+        assert!(
+            is_now(playback.due(3 * SECOND, 104 * SECOND, 0), 103 * SECOND),
+            "the time at which it was due"
+        );
         playback.pause(true, 105 * SECOND, 0);
-        assert_eq!(playback.due(6 * SECOND, 120 * SECOND, 0), Turn::Wait);
+        assert_eq!(playback.due(6 * SECOND, 120 * SECOND, 0), PlaybackAction::Wait);
         assert!(is_now(playback.due(4 * SECOND, 120 * SECOND, 0), 120 * SECOND));
         playback.pause(false, 120 * SECOND, 0);
-        playback.set_pace(Pace::Max, 120 * SECOND, 0);
-        assert_eq!(playback.due(6 * SECOND, 121 * SECOND, 5 * SECOND), Turn::Wait);
+        playback.set_rate(PlaybackRate::Max, 120 * SECOND, 0);
+        assert_eq!(playback.due(6 * SECOND, 121 * SECOND, 5 * SECOND), PlaybackAction::Wait);
         assert!(is_now(playback.due(6 * SECOND, 121 * SECOND, 6 * SECOND), 121 * SECOND));
     }
 
     #[test]
-    fn a_pace_changes_from_where_it_is() {
-        let mut playback = begun(1, Play { pace: Pace::Times(2.0), ..Play::default() });
-        assert!(is_now(playback.turn(0, 0, 100 * SECOND), 100 * SECOND));
-        assert_eq!(playback.turn(0, 8 * SECOND, 101 * SECOND), Turn::At(104 * SECOND));
-        playback.set_pace(Pace::Times(0.5), 102 * SECOND, 0);
-        assert!(playback.take_news());
+    fn rate_changes_at_the_current_media_time() {
+        let mut playback =
+            begun(1, PlaybackOptions { pace: PlaybackRate::Times(2.0), ..PlaybackOptions::default() });
+        assert!(is_now(playback.next_action(0, 0, 100 * SECOND), 100 * SECOND));
+        assert_eq!(playback.next_action(0, 8 * SECOND, 101 * SECOND), PlaybackAction::At(104 * SECOND));
+        playback.set_rate(PlaybackRate::Times(0.5), 102 * SECOND, 0);
+        assert!(playback.take_change());
         assert_eq!(playback.media(102 * SECOND, 0), 4 * SECOND);
-        assert_eq!(playback.turn(0, 8 * SECOND, 103 * SECOND), Turn::At(110 * SECOND));
-        let Turn::Now(due) = playback.turn(0, 8 * SECOND, 111 * SECOND) else { panic!("not due") };
+        assert_eq!(playback.next_action(0, 8 * SECOND, 103 * SECOND), PlaybackAction::At(110 * SECOND));
+        let PlaybackAction::Now(due) = playback.next_action(0, 8 * SECOND, 111 * SECOND) else {
+            panic!("not due")
+        };
         assert_eq!(due, Due { at: 110 * SECOND, stretch: 2.0 });
-        playback.set_pace(Pace::Max, 112 * SECOND, 0);
-        assert!(playback.flows());
-        assert!(is_now(playback.turn(0, 9999 * SECOND, 112 * SECOND), 112 * SECOND));
-        playback.set_pace(Pace::Times(1.0), 113 * SECOND, 9999 * SECOND);
-        assert_eq!(playback.turn(0, 10_000 * SECOND, 113 * SECOND), Turn::At(114 * SECOND));
+        playback.set_rate(PlaybackRate::Max, 112 * SECOND, 0);
+        assert!(playback.is_unthrottled());
+        assert!(is_now(playback.next_action(0, 9999 * SECOND, 112 * SECOND), 112 * SECOND));
+        playback.set_rate(PlaybackRate::Times(1.0), 113 * SECOND, 9999 * SECOND);
+        assert_eq!(playback.next_action(0, 10_000 * SECOND, 113 * SECOND), PlaybackAction::At(114 * SECOND));
     }
 
     #[test]
-    fn a_pause_takes_no_media_time_and_a_step_is_one_of_all() {
-        let mut playback = begun(2, Play { is_paused: true, ..Play::default() });
-        assert_eq!(playback.turn(0, 0, 101 * SECOND), Turn::Wait);
-        assert_eq!(playback.turn(1, SECOND, 101 * SECOND), Turn::Wait, "the first one waits too");
+    fn pause_takes_no_media_time_and_step_plays_one_telegram_of_all_links() {
+        let mut playback = begun(2, PlaybackOptions { is_paused: true, ..PlaybackOptions::default() });
+        assert_eq!(playback.next_action(0, 0, 101 * SECOND), PlaybackAction::Wait);
+        assert_eq!(
+            playback.next_action(1, SECOND, 101 * SECOND),
+            PlaybackAction::Wait,
+            "the first one waits too"
+        );
         playback.step(110 * SECOND, 0);
-        assert_eq!(playback.turn(1, SECOND, 110 * SECOND), Turn::Wait);
-        assert!(is_now(playback.turn(0, 0, 111 * SECOND), 111 * SECOND));
-        assert_eq!(playback.turn(0, 2 * SECOND, 111 * SECOND), Turn::Wait);
+        assert_eq!(playback.next_action(1, SECOND, 110 * SECOND), PlaybackAction::Wait);
+        assert!(is_now(playback.next_action(0, 0, 111 * SECOND), 111 * SECOND));
+        assert_eq!(playback.next_action(0, 2 * SECOND, 111 * SECOND), PlaybackAction::Wait);
         playback.step(112 * SECOND, 0);
-        assert!(is_now(playback.turn(1, SECOND, 112 * SECOND), 112 * SECOND));
-        assert_eq!(playback.turn(1, 3 * SECOND, 112 * SECOND), Turn::Wait);
+        assert!(is_now(playback.next_action(1, SECOND, 112 * SECOND), 112 * SECOND));
+        assert_eq!(playback.next_action(1, 3 * SECOND, 112 * SECOND), PlaybackAction::Wait);
         playback.pause(false, 200 * SECOND, 0);
-        assert_eq!(playback.turn(0, 2 * SECOND, 200 * SECOND), Turn::At(201 * SECOND - 1));
+        assert_eq!(playback.next_action(0, 2 * SECOND, 200 * SECOND), PlaybackAction::At(201 * SECOND - 1));
         playback.pause(true, 200 * SECOND + 5, 0);
-        assert_eq!(playback.turn(0, 2 * SECOND, 300 * SECOND), Turn::Wait);
+        assert_eq!(playback.next_action(0, 2 * SECOND, 300 * SECOND), PlaybackAction::Wait);
     }
 
     #[test]
     fn pauses_are_not_playing_time() {
-        let mut playback = Playback::new(Play { pace: Pace::Max, is_paused: true, ..Play::default() }, 1);
-        assert_eq!(playback.turn(0, 0, 90 * SECOND), Turn::Wait);
+        let mut playback = Playback::new(
+            PlaybackOptions { pace: PlaybackRate::Max, is_paused: true, ..PlaybackOptions::default() },
+            1,
+        );
+        assert_eq!(playback.next_action(0, 0, 90 * SECOND), PlaybackAction::Wait);
         // Time before the start does not count at all.
         playback.pause(true, 95 * SECOND, 0);
         playback.begin(100 * SECOND);
@@ -746,97 +783,101 @@ mod tests {
         assert_eq!(times(&playback, 162), (2 * SECOND, 60 * SECOND));
         playback.pause(true, 163 * SECOND, 0);
         playback.step(164 * SECOND, 0);
-        assert!(is_now(playback.turn(0, 0, 165 * SECOND), 165 * SECOND));
+        assert!(is_now(playback.next_action(0, 0, 165 * SECOND), 165 * SECOND));
         playback.pause(false, 170 * SECOND, 0);
         assert_eq!(times(&playback, 170), (3 * SECOND, 67 * SECOND));
-        assert_eq!(playback.end(0, 0, 171 * SECOND), Turn::Over);
+        assert_eq!(playback.end(0, 0, 171 * SECOND), PlaybackAction::Over);
         playback.pause(true, 172 * SECOND, 0);
         assert_eq!(times(&playback, 180), (4 * SECOND, 67 * SECOND), "it is over");
     }
 
     #[test]
-    fn a_step_waits_for_all_to_say_what_they_have() {
-        let mut playback = begun(2, Play { is_paused: true, ..Play::default() });
-        assert_eq!(playback.turn(0, 0, 100 * SECOND), Turn::Wait);
-        assert_eq!(playback.turn(1, 3 * SECOND, 100 * SECOND), Turn::Wait);
+    fn step_waits_until_all_links_have_reported() {
+        let mut playback = begun(2, PlaybackOptions { is_paused: true, ..PlaybackOptions::default() });
+        assert_eq!(playback.next_action(0, 0, 100 * SECOND), PlaybackAction::Wait);
+        assert_eq!(playback.next_action(1, 3 * SECOND, 100 * SECOND), PlaybackAction::Wait);
         playback.step(101 * SECOND, 0);
-        assert!(is_now(playback.turn(0, 0, 101 * SECOND), 101 * SECOND));
-        // Pressed again before it has read on.
+        assert!(is_now(playback.next_action(0, 0, 101 * SECOND), 101 * SECOND));
+        // The user steps again before the link has read on.
         playback.step(101 * SECOND, 0);
-        assert_eq!(playback.turn(1, 3 * SECOND, 101 * SECOND), Turn::Wait);
-        assert!(is_now(playback.turn(0, 2 * SECOND, 102 * SECOND), 102 * SECOND));
-        // As fast as it goes nobody asks.
-        playback.set_pace(Pace::Max, 103 * SECOND, 0);
+        assert_eq!(playback.next_action(1, 3 * SECOND, 101 * SECOND), PlaybackAction::Wait);
+        assert!(is_now(playback.next_action(0, 2 * SECOND, 102 * SECOND), 102 * SECOND));
+        // At maximum rate no link asks.
+        playback.set_rate(PlaybackRate::Max, 103 * SECOND, 0);
         playback.pause(false, 103 * SECOND, 0);
-        assert!(is_now(playback.turn(0, 4 * SECOND, 103 * SECOND), 103 * SECOND));
-        assert!(is_now(playback.turn(1, 3 * SECOND, 103 * SECOND), 103 * SECOND));
+        assert!(is_now(playback.next_action(0, 4 * SECOND, 103 * SECOND), 103 * SECOND));
+        assert!(is_now(playback.next_action(1, 3 * SECOND, 103 * SECOND), 103 * SECOND));
         playback.step(104 * SECOND, 700 * SECOND);
-        assert_eq!(playback.turn(0, 800 * SECOND, 104 * SECOND), Turn::Wait);
-        assert!(is_now(playback.turn(1, 701 * SECOND, 104 * SECOND), 104 * SECOND));
+        assert_eq!(playback.next_action(0, 800 * SECOND, 104 * SECOND), PlaybackAction::Wait);
+        assert!(is_now(playback.next_action(1, 701 * SECOND, 104 * SECOND), 104 * SECOND));
     }
 
     #[test]
-    fn after_years_of_uptime_distances_are_those_of_the_recording() {
-        let (mut playback, up) = (Playback::new(Play::default(), 1), 100_000_000 * SECOND + 1);
+    fn times_between_telegrams_are_exact_after_years_of_uptime() {
+        let (mut playback, up) = (Playback::new(PlaybackOptions::default(), 1), 100_000_000 * SECOND + 1);
         playback.begin(up);
         for media in (0..100).map(|scan| scan * 26_640_001) {
-            assert!(is_now(playback.turn(0, media, up + media), up + media), "{media}");
+            assert!(is_now(playback.next_action(0, media, up + media), up + media), "{media}");
         }
     }
 
     #[test]
-    fn a_lap_begins_when_all_are_at_the_end_and_something_was_played() {
-        let mut playback = begun(2, Play { is_looped: true, start_ns: SECOND, ..Play::default() });
-        assert_eq!(playback.turn(0, SECOND, 100 * SECOND), Turn::Wait);
-        assert_eq!(playback.end(1, 0, 100 * SECOND), Turn::Wait, "it has nothing");
-        assert!(is_now(playback.turn(0, SECOND, 100 * SECOND), 100 * SECOND));
-        assert_eq!(playback.end(0, 0, 101 * SECOND), Turn::Restart(1));
-        assert!(playback.take_news());
-        assert_eq!(playback.turn(0, SECOND, 102 * SECOND), Turn::Wait);
-        assert_eq!(playback.end(1, 0, 102 * SECOND), Turn::Restart(1));
-        assert_eq!(playback.end(1, 1, 103 * SECOND), Turn::Wait);
-        assert!(is_now(playback.turn(0, SECOND, 104 * SECOND), 103 * SECOND));
-        let mut empty = begun(1, Play { is_looped: true, ..Play::default() });
-        assert_eq!(empty.end(0, 0, 100 * SECOND), Turn::Over);
+    fn restarts_when_all_links_are_at_the_end_and_a_telegram_was_played() {
+        let mut playback =
+            begun(2, PlaybackOptions { is_looped: true, start_ns: SECOND, ..PlaybackOptions::default() });
+        assert_eq!(playback.next_action(0, SECOND, 100 * SECOND), PlaybackAction::Wait);
+        assert_eq!(playback.end(1, 0, 100 * SECOND), PlaybackAction::Wait, "it has nothing");
+        assert!(is_now(playback.next_action(0, SECOND, 100 * SECOND), 100 * SECOND));
+        assert_eq!(playback.end(0, 0, 101 * SECOND), PlaybackAction::Restart(1));
+        assert!(playback.take_change());
+        assert_eq!(playback.next_action(0, SECOND, 102 * SECOND), PlaybackAction::Wait);
+        assert_eq!(playback.end(1, 0, 102 * SECOND), PlaybackAction::Restart(1));
+        assert_eq!(playback.end(1, 1, 103 * SECOND), PlaybackAction::Wait);
+        assert!(is_now(playback.next_action(0, SECOND, 104 * SECOND), 103 * SECOND));
+        let mut empty = begun(1, PlaybackOptions { is_looped: true, ..PlaybackOptions::default() });
+        assert_eq!(empty.end(0, 0, 100 * SECOND), PlaybackAction::Over);
         assert!(empty.is_over());
     }
 
     #[test]
     fn angles_of_a_skipped_silence_are_not_played() {
-        let mut playback = begun(1, Play::default());
-        assert!(is_now(playback.turn(0, 0, 100 * SECOND), 100 * SECOND));
-        assert!(is_now(playback.turn(0, 3 * SECOND, 103 * SECOND), 103 * SECOND));
-        assert_eq!(playback.due(5 * SECOND, 104 * SECOND, 0), Turn::At(105 * SECOND));
-        assert_eq!(playback.turn(0, 3600 * SECOND, 104 * SECOND), Turn::At(114 * SECOND));
+        let mut playback = begun(1, PlaybackOptions::default());
+        assert!(is_now(playback.next_action(0, 0, 100 * SECOND), 100 * SECOND));
+        assert!(is_now(playback.next_action(0, 3 * SECOND, 103 * SECOND), 103 * SECOND));
+        assert_eq!(playback.due(5 * SECOND, 104 * SECOND, 0), PlaybackAction::At(105 * SECOND));
+        assert_eq!(playback.next_action(0, 3600 * SECOND, 104 * SECOND), PlaybackAction::At(114 * SECOND));
         let at = |playback: &Playback, media| playback.due(media, 104 * SECOND, 0);
-        assert_eq!([4 * SECOND - 1, 5 * SECOND].map(|media| at(&playback, media)), [Turn::Skipped; 2]);
-        assert_eq!(at(&playback, 3589 * SECOND), Turn::Skipped);
-        assert_eq!(at(&playback, 3591 * SECOND), Turn::At(105 * SECOND));
+        assert_eq!(
+            [4 * SECOND - 1, 5 * SECOND].map(|media| at(&playback, media)),
+            [PlaybackAction::Skipped; 2]
+        );
+        assert_eq!(at(&playback, 3589 * SECOND), PlaybackAction::Skipped);
+        assert_eq!(at(&playback, 3591 * SECOND), PlaybackAction::At(105 * SECOND));
         // A step over a silence skips it, too, but not the time just before the next telegram.
-        let mut playback = begun(1, Play { is_paused: true, ..Play::default() });
-        assert_eq!(playback.turn(0, 0, 100 * SECOND), Turn::Wait);
+        let mut playback = begun(1, PlaybackOptions { is_paused: true, ..PlaybackOptions::default() });
+        assert_eq!(playback.next_action(0, 0, 100 * SECOND), PlaybackAction::Wait);
         playback.step(101 * SECOND, 0);
-        assert!(is_now(playback.turn(0, 0, 101 * SECOND), 101 * SECOND));
-        assert_eq!(playback.turn(0, 3600 * SECOND, 102 * SECOND), Turn::Wait);
+        assert!(is_now(playback.next_action(0, 0, 101 * SECOND), 101 * SECOND));
+        assert_eq!(playback.next_action(0, 3600 * SECOND, 102 * SECOND), PlaybackAction::Wait);
         playback.step(103 * SECOND, 0);
-        assert_eq!(playback.due(2000 * SECOND, 103 * SECOND, 0), Turn::Skipped);
+        assert_eq!(playback.due(2000 * SECOND, 103 * SECOND, 0), PlaybackAction::Skipped);
         assert!(is_now(playback.due(3599 * SECOND, 103 * SECOND, 0), 103 * SECOND));
     }
 
     #[test]
-    fn what_was_interrupted_is_not_waited_for() {
-        let mut playback = begun(2, Play::default());
-        playback.turn(1, 3 * SECOND, 100 * SECOND);
-        assert!(is_now(playback.turn(0, 0, 100 * SECOND), 100 * SECOND));
+    fn interruption_of_the_recording_is_shortened() {
+        let mut playback = begun(2, PlaybackOptions::default());
+        playback.next_action(1, 3 * SECOND, 100 * SECOND);
+        assert!(is_now(playback.next_action(0, 0, 100 * SECOND), 100 * SECOND));
         assert_eq!(
-            playback.turn(0, 3600 * SECOND, 101 * SECOND),
-            Turn::At(3700 * SECOND),
+            playback.next_action(0, 3600 * SECOND, 101 * SECOND),
+            PlaybackAction::At(3700 * SECOND),
             "another one plays"
         );
-        assert!(is_now(playback.turn(1, 3 * SECOND, 103 * SECOND), 103 * SECOND));
-        playback.take_news();
-        assert_eq!(playback.turn(1, 3601 * SECOND, 103 * SECOND), Turn::At(114 * SECOND));
-        assert!(playback.take_news());
-        assert_eq!(playback.turn(0, 3600 * SECOND, 103 * SECOND), Turn::At(113 * SECOND));
+        assert!(is_now(playback.next_action(1, 3 * SECOND, 103 * SECOND), 103 * SECOND));
+        playback.take_change();
+        assert_eq!(playback.next_action(1, 3601 * SECOND, 103 * SECOND), PlaybackAction::At(114 * SECOND));
+        assert!(playback.take_change());
+        assert_eq!(playback.next_action(0, 3600 * SECOND, 103 * SECOND), PlaybackAction::At(113 * SECOND));
     }
 }

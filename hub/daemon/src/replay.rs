@@ -25,7 +25,7 @@ use schema::{Failure, Flags, Header, MILLIS, Nanos, State, Tilt};
 use crate::control::Flow;
 use crate::link::LinkCore;
 use crate::link_output::RecordedMetadata;
-use crate::player::{Due, Pace, Play, Player, PlayerHandle, Turn};
+use crate::player::{Due, PlaybackAction, PlaybackOptions, PlaybackRate, Player, PlayerHandle};
 use crate::surroundings::Woken;
 use crate::system::System;
 
@@ -55,10 +55,11 @@ pub(crate) fn run<'a>(
         replay.play(recorded);
         return replay.link.end();
     }
-    let pace = if paced { Pace::default() } else { Pace::Max };
+    let pace = if paced { PlaybackRate::default() } else { PlaybackRate::Max };
     let alone = || {
         let recorded = Recorded::open(path, link.link)?;
-        let player = Player::new(Play { pace, ..Play::default() }, 1, recorded.length())?;
+        let player =
+            Player::new(PlaybackOptions { pace, ..PlaybackOptions::default() }, 1, recorded.length())?;
         Ok((recorded, player))
     };
     match alone() {
@@ -131,7 +132,7 @@ impl<'a, 'p> ReplayLink<'a, 'p> {
             let Some(lifetime) = ended else { return };
             self.link.output.extend_verdict(lifetime.map_or(Nanos::MAX, |lifetime| clock::now() + lifetime));
             loop {
-                if let Turn::Restart(next) = self.handle.end(lap, clock::now()) {
+                if let PlaybackAction::Restart(next) = self.handle.end(lap, clock::now()) {
                     lap = next;
                     self.restart();
                     break;
@@ -216,14 +217,17 @@ impl<'a, 'p> ReplayLink<'a, 'p> {
     fn wait_turn(&mut self, session: Option<&PortSession>, media: Nanos, state: State) -> Option<Due> {
         loop {
             let now = clock::now();
-            if self.handle.flows() && now < self.check_at {
+            if self.handle.is_unthrottled() && now < self.check_at {
                 return Some(Due::at_once(now));
             }
-            let until = match self.handle.turn(media, now) {
-                Turn::Now(due) if now < self.check_at => return Some(due),
-                Turn::Now(_) => 0,
-                Turn::At(at) => at.min(now + IDLE_INTERVAL),
-                Turn::Wait | Turn::Restart(_) | Turn::Skipped | Turn::Over => now + IDLE_INTERVAL,
+            let until = match self.handle.next_action(media, now) {
+                PlaybackAction::Now(due) if now < self.check_at => return Some(due),
+                PlaybackAction::Now(_) => 0,
+                PlaybackAction::At(at) => at.min(now + IDLE_INTERVAL),
+                PlaybackAction::Wait
+                | PlaybackAction::Restart(_)
+                | PlaybackAction::Skipped
+                | PlaybackAction::Over => now + IDLE_INTERVAL,
             };
             if self.rest(until) == Woken::Stop {
                 return None;
@@ -247,10 +251,10 @@ impl<'a, 'p> ReplayLink<'a, 'p> {
 
     /// Waits until `until`, the end of the hub, or a change of the player.
     fn rest(&mut self, until: Nanos) -> Woken {
-        let news = self.handle.news();
-        match self.link.wait(news.as_fd(), until) {
+        let event = self.handle.event();
+        match self.link.wait(event.as_fd(), until) {
             Woken::Request => self.link.handle_requests(Flow::Recording(self.handle.player)),
-            Woken::Ready => news.clear(),
+            Woken::Ready => event.clear(),
             Woken::Stop => return Woken::Stop,
             Woken::Timeout => {}
         }
@@ -318,8 +322,8 @@ impl RecordedMount {
                     break;
                 }
                 match wait(player, media, &is_current) {
-                    Turn::Now(due) => publish(RecordedAngle { stamp_ns: due.at, header, tilt }),
-                    Turn::Skipped => {}
+                    PlaybackAction::Now(due) => publish(RecordedAngle { stamp_ns: due.at, header, tilt }),
+                    PlaybackAction::Skipped => {}
                     _ => break,
                 }
             }
@@ -330,19 +334,19 @@ impl RecordedMount {
     }
 }
 
-/// Waits until something of `media` is due or skipped, or until the lap ends: [`Turn::Over`].
-fn wait(player: &Player, media: Nanos, is_current: &impl Fn() -> bool) -> Turn {
+/// Waits until something of `media` is due or skipped, or until the lap ends: [`PlaybackAction::Over`].
+fn wait(player: &Player, media: Nanos, is_current: &impl Fn() -> bool) -> PlaybackAction {
     while is_current() {
         let now = clock::now();
         match player.due(media, now) {
-            turn @ (Turn::Now(_) | Turn::Skipped) => return turn,
-            Turn::At(at) => {
+            turn @ (PlaybackAction::Now(_) | PlaybackAction::Skipped) => return turn,
+            PlaybackAction::At(at) => {
                 thread::sleep(Duration::from_nanos(at.saturating_sub(now)).min(ANGLE_POLL_INTERVAL))
             }
             _ => thread::sleep(ANGLE_POLL_INTERVAL),
         }
     }
-    Turn::Over
+    PlaybackAction::Over
 }
 
 /// Validity of a verdict while a recording plays: until the next verdict, even while the player waits.

@@ -11,7 +11,7 @@ use scanhub_drivers::Model;
 use schema::{Failure, Family, Kind, Nanos, check_sensor};
 use shm::Domain;
 
-use crate::player::{Play, Player, Progress};
+use crate::player::{PlaybackOptions, Player, Progress};
 use crate::replay::{Origin, Recorded, RecordedMount, tell_of_damage};
 use crate::supervise::{self, Ready, ReplaySet};
 
@@ -27,7 +27,7 @@ pub struct Replay<'a> {
     /// Where its sensors are configured.
     pub sources: &'a Sources,
     /// What is asked of the player.
-    pub play: Play,
+    pub play: PlaybackOptions,
     /// Whether the hub stays when everything was played.
     pub holds: bool,
 }
