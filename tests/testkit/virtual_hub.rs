@@ -9,7 +9,7 @@ use std::path::Path;
 use std::rc::Rc;
 
 use config::Config;
-use daemon::surroundings::{Learned, Line, Surroundings, Wait, Woken};
+use daemon::platform::{Line, Platform, SavedState, Wait, WakeReason};
 use daemon::{LiveLink, Orders};
 use port::{Allowance, Alteration, PortError, Source, clock};
 use schema::limits::TopicLimits;
@@ -20,8 +20,8 @@ use shm::{Node, Payload, SharedMemory, Waker};
 /// A link in virtual time. Its port must be a recording in the configuration: it streams from the start, and its scans
 /// are read in the configured mode.
 pub(crate) struct VirtualLink<'a> {
-    around: &'a Around<'a>,
-    link: LiveLink<'a, Around<'a>>,
+    platform: &'a VirtualPlatform<'a>,
+    link: LiveLink<'a, VirtualPlatform<'a>>,
     until: Nanos,
 }
 
@@ -39,13 +39,13 @@ pub(crate) fn virtual_hub<T>(
     let _lock = HubLock::acquire(domain.root())?;
     let node = shm::hub_node(domain)?;
     let (_orders, queues) = Orders::new(config.links.iter().map(|link| link.name.as_str()))?;
-    let around = config.links.iter().map(|link| Around::new(&node, &link.name));
-    let around = around.collect::<Result<Vec<_>, _>>()?;
+    let platform = config.links.iter().map(|link| VirtualPlatform::new(&node, &link.name));
+    let platform = platform.collect::<Result<Vec<_>, _>>()?;
     let mut links = Vec::with_capacity(config.links.len());
-    for (((number, link), around), queue) in config.links.iter().enumerate().zip(&around).zip(queues) {
-        let mut link = LiveLink::new(link, number as u8, 0, around, queue)?;
-        let Wait { until, .. } = link.on_wakeup(Woken::Timeout);
-        links.push(VirtualLink { around, link, until });
+    for (((number, link), platform), queue) in config.links.iter().enumerate().zip(&platform).zip(queues) {
+        let mut link = LiveLink::new(link, number as u8, 0, platform, queue)?;
+        let Wait { until, .. } = link.on_wakeup(WakeReason::Timeout);
+        links.push(VirtualLink { platform, link, until });
     }
     shm::allocate(domain)?;
     Ok(drive(&mut links))
@@ -55,39 +55,39 @@ impl VirtualLink<'_> {
     /// Passes `bytes` that arrived in one read at `now`: publishes what became due before, and what is complete with
     /// them. Returns the number of telegrams.
     pub(crate) fn read(&mut self, now: Nanos, bytes: &[u8]) -> usize {
-        self.around.telegrams.set(0);
+        self.platform.telegrams.set(0);
         while self.until < now {
-            self.around.now.set(self.until);
-            self.turn(Woken::Timeout);
+            self.platform.now.set(self.until);
+            self.turn(WakeReason::Timeout);
         }
-        self.around.now.set(now);
-        self.around.line.0.borrow_mut().extend(bytes);
-        while !self.around.line.0.borrow().is_empty() {
-            self.turn(Woken::Ready);
+        self.platform.now.set(now);
+        self.platform.line.0.borrow_mut().extend(bytes);
+        while !self.platform.line.0.borrow().is_empty() {
+            self.turn(WakeReason::Ready);
         }
-        self.around.telegrams.get()
+        self.platform.telegrams.get()
     }
 
     /// Makes the port reject these `rates`.
     #[allow(dead_code, reason = "not every program that includes this module has such a port")]
     pub(crate) fn reject(&mut self, rates: &[u32]) {
-        *self.around.line.1.borrow_mut() = rates.to_vec();
+        *self.platform.line.1.borrow_mut() = rates.to_vec();
     }
 
     /// Returns the bytes that the session has sent since the last call.
     #[allow(dead_code, reason = "not every program that includes this module has a sensor that receives")]
     pub(crate) fn take_written(&mut self) -> Vec<u8> {
-        std::mem::take(&mut self.around.line.2.borrow_mut())
+        std::mem::take(&mut self.platform.line.2.borrow_mut())
     }
 
-    fn turn(&mut self, woken: Woken) {
+    fn turn(&mut self, woken: WakeReason) {
         let Wait { until, .. } = self.link.on_wakeup(woken);
         self.until = until;
     }
 }
 
 /// The platform of a link: a clock that stands still, bytes, and the shared memory of a domain.
-struct Around<'a> {
+struct VirtualPlatform<'a> {
     node: &'a Node,
     waker: Waker,
     now: Cell<Nanos>,
@@ -102,10 +102,10 @@ struct Around<'a> {
 #[derive(Clone, Default)]
 struct Bytes(Rc<RefCell<VecDeque<u8>>>, Rc<RefCell<Vec<u32>>>, Rc<RefCell<Vec<u8>>>);
 
-impl<'a> Around<'a> {
+impl<'a> VirtualPlatform<'a> {
     fn new(node: &'a Node, sensor: &str) -> Result<Self, Failure> {
         let wall_ahead_ns = clock::wall_ns() - clock::now();
-        Ok(Around {
+        Ok(VirtualPlatform {
             node,
             waker: Waker::new(node, sensor)?,
             now: Cell::new(0),
@@ -116,7 +116,7 @@ impl<'a> Around<'a> {
     }
 }
 
-impl Surroundings for Around<'_> {
+impl Platform for VirtualPlatform<'_> {
     type Line = Bytes;
     type Medium<P: Payload + ?Sized> = SharedMemory<P>;
 
@@ -162,20 +162,20 @@ impl Surroundings for Around<'_> {
         self.waker.ring(ring);
     }
 
-    fn tell(&self, why: Wake) {
+    fn notify_event(&self, why: Wake) {
         if why == Wake::Telegram {
             self.telegrams.set(self.telegrams.get() + 1);
         }
         self.waker.tell(why).expect("subscribers can be woken");
     }
 
-    fn recall(&self, _: &str, _: &mut [u8]) -> Option<usize> {
+    fn load_record(&self, _: &str, _: &mut [u8]) -> Option<usize> {
         None
     }
 
-    fn remember(&self, _: &str, _: &[u8]) {}
+    fn store_record(&self, _: &str, _: &[u8]) {}
 
-    fn learned(&self) -> Option<&dyn Learned> {
+    fn saved_state(&self) -> Option<&dyn SavedState> {
         None
     }
 }

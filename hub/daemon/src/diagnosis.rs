@@ -1,6 +1,6 @@
-//! Finds the problem of a link that its status reports: the session's problem, a unit other than the configured one, more
-//! bytes than the line can carry, a line that damages most bytes, bytes of another scanner, settings that another process
-//! changed, a scanner that restarts, and subscribers that receive nothing.
+//! Finds the problem of a link that its status reports: the session's problem, a unit other than the configured one,
+//! more bytes than the line can carry, a line that damages most bytes, bytes of another scanner, settings that
+//! another process changed, a scanner that restarts, and subscribers that receive nothing.
 //!
 //! Every change of the message is a log line. Numbers in a message are therefore rounded, and stay while they vary a
 //! little.
@@ -165,8 +165,8 @@ impl<'a> Diagnosis<'a> {
         self.last_telegram.is_some_and(|at| self.now >= at + span)
     }
 
-    /// Returns whether another scanner must have been connected: a stream of bytes arrives, but no telegram of the scanner that
-    /// has streamed. If the line has damaged most bytes before, it may damage all of them now.
+    /// Returns whether another scanner must have been connected: a stream of bytes arrives, but no telegram of the
+    /// scanner that has streamed. If the line has damaged most bytes before, it may damage all of them now.
     fn is_exchanged(&self, session: &PortSession, bytes_per_second: Option<u64>) -> bool {
         session.state() != line::State::Paused
             && self.has_streamed
@@ -185,8 +185,9 @@ impl<'a> Diagnosis<'a> {
         self.damaged_percent = None;
     }
 
-    /// Notes the `alteration` that the hub has undone at `now`. `program` searches for the program that made it. A message that
-    /// already names the alteration stays: a program that keeps changing the port does not cause a search each time.
+    /// Notes the `alteration` that the hub has undone at `now`. `program` searches for the program that made it. A
+    /// message that already names the alteration stays: a program that keeps changing the port does not cause a
+    /// search each time.
     pub(crate) fn note_altered(
         &mut self,
         alteration: Alteration,
@@ -359,8 +360,8 @@ impl<'a> Diagnosis<'a> {
         self.with_remedy(&words)
     }
 
-    /// Returns the message that `rate` bytes per second arrive that are not of the scanner of `session`, which has streamed
-    /// before.
+    /// Returns the message that `rate` bytes per second arrive that are not of the scanner of `session`, which has
+    /// streamed before.
     fn bytes_of_another_kind(&self, session: &PortSession, rate: u64) -> String {
         let name = scanner_of(session);
         let is_server = matches!(self.link.port, Source::Tcp { .. });
@@ -375,8 +376,9 @@ impl<'a> Diagnosis<'a> {
         self.with_remedy(&words)
     }
 
-    /// Returns `words` about a scanner that does not reply, and how to find out whether it belongs to another family, if the
-    /// family is configured and both fit into a status. `scanhub probe` cannot search the port while the hub has it.
+    /// Returns `words` about a scanner that does not reply, and how to find out whether it belongs to another family,
+    /// if the family is configured and both fit into a status. `scanhub probe` cannot search the port while the hub
+    /// has it.
     fn silence(&self, words: &str) -> String {
         let Some(keys) = self.family_keys() else { return words.to_owned() };
         let words = format!("{words} Another scanner?");
@@ -388,7 +390,8 @@ impl<'a> Diagnosis<'a> {
         self.with_port(both).or_else(|| self.with_port(probe)).unwrap_or_else(|| self.with_remedy(&words))
     }
 
-    /// Returns the keys of the link that name the family, as text. `None` if there are none, or if the link plays a recording.
+    /// Returns the keys of the link that name the family, as text. `None` if there are none, or if the link plays a
+    /// recording.
     fn family_keys(&self) -> Option<String> {
         let keys = match &self.link.scanner.named_by[..] {
             [keys @ .., last] if !keys.is_empty() => format!("{} and {last}", keys.join(", ")),
@@ -397,8 +400,8 @@ impl<'a> Diagnosis<'a> {
         (!keys.is_empty() && !matches!(self.link.port, Source::File { .. })).then_some(keys)
     }
 
-    /// Returns `words` and the remedy, if the family is configured and they fit into a status: the scanner may belong to
-    /// another family.
+    /// Returns `words` and the remedy, if the family is configured and they fit into a status: the scanner may belong
+    /// to another family.
     fn with_remedy(&self, words: &str) -> String {
         let Some(keys) = self.family_keys() else { return words.to_owned() };
         let name = &self.link.name;
@@ -417,8 +420,8 @@ impl<'a> Diagnosis<'a> {
         self.with_port(|port| problem.message(port)).unwrap_or_else(|| problem.to_string())
     }
 
-    /// Returns the message for the name of the port, or else for its device. `None` if the port cannot be probed, or no message
-    /// fits into a status.
+    /// Returns the message for the name of the port, or else for its device. `None` if the port cannot be probed, or
+    /// no message fits into a status.
     fn with_port(&self, message: impl Fn(&str) -> String) -> Option<String> {
         let ports = match self.link.port {
             Source::Tty(_) | Source::Tcp { .. } => vec![Some(self.link.port.name()), self.device.clone()],
@@ -469,7 +472,8 @@ impl<'a> Diagnosis<'a> {
 struct ByteRate {
     /// Start of the window, and the number of bytes read by then.
     window: Option<(Nanos, u64)>,
-    /// Result of the last complete window, in bytes per second; `None` before there is one, or if almost nothing arrived.
+    /// Result of the last complete window, in bytes per second; `None` before there is one, or if almost nothing
+    /// arrived.
     last: Option<u64>,
     is_complete: bool,
     /// Consecutive windows in which almost nothing arrived.
@@ -500,8 +504,8 @@ impl ByteRate {
     }
 
     /// Returns the rate in bytes per second, rounded for a message; `None` if almost nothing arrives, or while the rate
-    /// [settles](Self::is_settling). The session has read `read` bytes at `now`. A rate that varies a little is returned
-    /// unchanged, because a new message is a new log line.
+    /// [settles](Self::is_settling). The session has read `read` bytes at `now`. A rate that varies a little is
+    /// returned unchanged, because a new message is a new log line.
     fn shown(&mut self, now: Nanos, read: u64) -> Option<u64> {
         let rate = if self.is_complete { self.last } else { self.of_window(now, read) }?;
         if !(self.shown / 2..=self.shown * 2).contains(&rate) {
@@ -591,7 +595,8 @@ const NOISE_BYTES: u64 = 64;
 mod tests {
     use super::*;
 
-    /// Returns the rates that are shown for a line with `rate` bytes per second, sampled ten times a second for `seconds`.
+    /// Returns the rates that are shown for a line with `rate` bytes per second, sampled ten times a second for
+    /// `seconds`.
     fn shown(
         bytes: &mut ByteRate,
         (from, seconds): (u64, u64),

@@ -8,6 +8,7 @@ mod link;
 mod link_output;
 mod link_stats;
 mod pipeline;
+pub mod platform;
 mod player;
 mod process;
 mod publisher;
@@ -19,7 +20,6 @@ mod saved_state;
 mod service;
 mod session_driver;
 mod supervise;
-pub mod surroundings;
 mod system;
 mod topics;
 

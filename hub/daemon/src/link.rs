@@ -10,13 +10,13 @@ use crate::control::{ControlQueue, Flow};
 use crate::diagnosis::Diagnosis;
 use crate::link_output::{LinkOutput, Published, RecordedMetadata};
 use crate::link_stats::LinkStats;
-use crate::surroundings::{Learned, Surroundings, Woken};
+use crate::platform::{Platform, SavedState, WakeReason};
 use crate::topics::Topics;
 
 /// The parts of a link.
-pub(crate) struct LinkCore<'a, S: Surroundings> {
+pub(crate) struct LinkCore<'a, S: Platform> {
     pub(crate) link: &'a Link,
-    pub(crate) around: &'a S,
+    pub(crate) platform: &'a S,
     pub(crate) output: LinkOutput<'a, S>,
     pub(crate) stats: LinkStats,
     pub(crate) diagnosis: Diagnosis<'a>,
@@ -27,27 +27,27 @@ pub(crate) struct LinkCore<'a, S: Surroundings> {
     next_status: Nanos,
 }
 
-impl<'a, S: Surroundings> LinkCore<'a, S> {
+impl<'a, S: Platform> LinkCore<'a, S> {
     /// Creates the parts of `link`, which is number `number` in the configuration, and its topics. `boot` identifies the run
     /// of the hub. Publishes nothing yet.
     ///
     /// # Errors
     ///
-    /// Returns the errors of [`Surroundings::medium`].
+    /// Returns the errors of [`Platform::medium`].
     pub(crate) fn new(
         link: &'a Link,
         number: u8,
         boot: u64,
-        around: &'a S,
+        platform: &'a S,
         control: ControlQueue,
     ) -> Result<Self, Failure> {
-        let now = around.now();
-        let mut topics = Topics::new(around, &link.name, number, boot)?;
+        let now = platform.now();
+        let mut topics = Topics::new(platform, &link.name, number, boot)?;
         topics.set_family(link.family());
         Ok(LinkCore {
             link,
-            around,
-            output: LinkOutput::new(link, around, topics),
+            platform,
+            output: LinkOutput::new(link, platform, topics),
             stats: LinkStats::new(link, now),
             diagnosis: Diagnosis::new(link),
             control,
@@ -58,7 +58,7 @@ impl<'a, S: Surroundings> LinkCore<'a, S> {
 
     /// Publishes the state before the first bytes arrive.
     pub(crate) fn begin(&mut self) {
-        self.output.publish_start(self.around.now());
+        self.output.publish_start(self.platform.now());
     }
 
     /// Saves the background at the end of the hub.
@@ -121,14 +121,14 @@ impl<'a, S: Surroundings> LinkCore<'a, S> {
     /// Publishes the status if it has changed or is due, and gives new subscribers the history. `error` is the message of
     /// the status. Returns whether a status was published.
     pub(crate) fn show(&mut self, session: Option<&PortSession>, state: State, error: &str) -> bool {
-        let now = self.around.now();
+        let now = self.platform.now();
         let changed = update(&mut self.stats, self.link, state, error, now);
         self.publish_status(session, state, changed, now)
     }
 
     /// Does the same as [`show`](Self::show) for a `session` that was examined, with the message of [`Diagnosis`].
     pub(crate) fn show_session(&mut self, session: &PortSession, state: State) -> bool {
-        let now = self.around.now();
+        let now = self.platform.now();
         let error = self.diagnosis.message();
         if session.family().is_some() {
             self.stats.next_search_log = 0;
@@ -175,10 +175,10 @@ impl<'a, S: Surroundings> LinkCore<'a, S> {
 
     /// Saves the background if it is worth it. At the end of the hub (`is_last`), one new scan is enough.
     fn save_background(&mut self, is_last: bool) {
-        if let Some(learned) = self.around.learned()
+        if let Some(saved_state) = self.platform.saved_state()
             && let Some((pose, model)) = self.output.take_background_to_save(is_last)
         {
-            learned.keep_background(pose, model);
+            saved_state.keep_background(pose, model);
         }
     }
 
@@ -186,7 +186,7 @@ impl<'a, S: Surroundings> LinkCore<'a, S> {
     /// something to do. Some drivers report the loss of a port only to a thread that waits for bytes, so a line whose
     /// bytes are `left_alone` is polled every 40 ms.
     pub(crate) fn next_deadline(&mut self, until: Nanos, left_alone: bool) -> Nanos {
-        let now = self.around.now();
+        let now = self.platform.now();
         self.output.expire_verdict(now, until);
         // A new subscriber to a silent sensor also gets the history in time.
         let history = if self.stats.is_streaming() { until } else { self.next_history.max(now) };
@@ -196,10 +196,10 @@ impl<'a, S: Surroundings> LinkCore<'a, S> {
 
     /// Returns whether a wait `until` ends now, for the reason `woken`. Otherwise only the history was due, which this
     /// function delivers.
-    pub(crate) fn is_over(&mut self, woken: Woken, until: Nanos) -> bool {
+    pub(crate) fn is_over(&mut self, woken: WakeReason, until: Nanos) -> bool {
         self.stats.wakeups += 1;
-        let now = self.around.now();
-        let is_over = woken != Woken::Timeout || now >= until;
+        let now = self.platform.now();
+        let is_over = woken != WakeReason::Timeout || now >= until;
         if !is_over {
             self.deliver_history(now);
         }
@@ -212,7 +212,7 @@ impl<'a, S: Surroundings> LinkCore<'a, S> {
             self.change(&processing);
         }
         while let Some(request) = self.control.take() {
-            let now = self.around.now();
+            let now = self.platform.now();
             let control = match request.verb {
                 Verb::Pause => Some(Control::Pause),
                 Verb::Resume => Some(Control::Resume),
@@ -223,7 +223,7 @@ impl<'a, S: Surroundings> LinkCore<'a, S> {
                 Some(control) => self.control.control(control, &mut flow, now).map(|()| None),
                 None => {
                     let shown = self.output.handle(request.verb, &request.model);
-                    let kept_wall_ns = self.around.learned().and_then(Learned::kept_wall_ns);
+                    let kept_wall_ns = self.platform.saved_state().and_then(SavedState::kept_wall_ns);
                     shown.map(|model| model.map(|model| Box::new(Shown { model, kept_wall_ns })))
                 }
             };
@@ -234,7 +234,7 @@ impl<'a, S: Surroundings> LinkCore<'a, S> {
 
     /// Applies `processing` from the next scan on.
     fn change(&mut self, processing: &Processing) {
-        let now = self.around.now();
+        let now = self.platform.now();
         self.output.change(processing, now);
         self.stats.set_processing(processing);
         self.next_status = now;

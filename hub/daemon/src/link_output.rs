@@ -13,7 +13,7 @@ use schema::{
 
 use crate::early::{EarlyMessage, EarlyWarner};
 use crate::pipeline::{Pipeline, ResultBuffers};
-use crate::surroundings::Surroundings;
+use crate::platform::Platform;
 use crate::topics::Topics;
 
 /// Time, period and flags that a recording has for a telegram, in place of those of the session. The default has none.
@@ -50,9 +50,9 @@ pub(crate) struct Published {
 }
 
 /// Output of one link: its topics, the processors that compute the results in them, and the validity of the last verdict.
-pub(crate) struct LinkOutput<'a, S: Surroundings> {
+pub(crate) struct LinkOutput<'a, S: Platform> {
     link: &'a Link,
-    around: &'a S,
+    platform: &'a S,
     pub(crate) topics: Topics<'a, S>,
     /// The last scan, in memory of this process. The processors read it after its sample was sent.
     scan: Box<Scan>,
@@ -64,13 +64,13 @@ pub(crate) struct LinkOutput<'a, S: Surroundings> {
     is_blind: bool,
 }
 
-impl<'a, S: Surroundings> LinkOutput<'a, S> {
+impl<'a, S: Platform> LinkOutput<'a, S> {
     /// Creates the output of `link`, and publishes nothing yet.
-    pub(crate) fn new(link: &'a Link, around: &'a S, topics: Topics<'a, S>) -> Self {
+    pub(crate) fn new(link: &'a Link, platform: &'a S, topics: Topics<'a, S>) -> Self {
         let beams = link.max_beams();
         LinkOutput {
             link,
-            around,
+            platform,
             topics,
             scan: Scan::zeroed(Scan::len(beams, Contents::TURNING)),
             pipeline: Pipeline::new(&link.processing, beams),
@@ -211,7 +211,7 @@ impl<'a, S: Surroundings> LinkOutput<'a, S> {
         self.is_blind = is_blind;
         // The verdict is valid from now on: telegrams that had to wait for the hub are late, but scans do arrive.
         let lifetime = verdict_lifetime(period_us);
-        self.stale_at = self.around.now().saturating_add(lifetime);
+        self.stale_at = self.platform.now().saturating_add(lifetime);
         self.early.confirm(raw.number);
         lifetime
     }
@@ -260,7 +260,7 @@ impl<'a, S: Surroundings> LinkOutput<'a, S> {
 
     fn publish_withdrawal(&mut self, withdrawn: Option<EarlyMessage>) {
         if let Some(message) = withdrawn {
-            let now = self.around.now();
+            let now = self.platform.now();
             self.topics.early(&message, now, now, 0, 0);
         }
     }

@@ -1,8 +1,8 @@
 //! The player of a recording. The threads of its links ask when their next telegram is due, and keys and requests of
 //! users pause, step and speed it up. At maximum rate no link asks, and nothing is locked.
 //!
-//! [`Playback`] is the clock of the player. It keeps the times between telegrams of all links while the recording is paused,
-//! stepped, played faster or slower, and repeated. The current time is an argument.
+//! [`Playback`] is the clock of the player. It keeps the times between telegrams of all links while the recording is
+//! paused, stepped, played faster or slower, and repeated. The current time is an argument.
 //!
 //! Media time is the time since the first telegram of the recording, in nanoseconds.
 
@@ -478,7 +478,8 @@ impl Playback {
         self.play_now(link, Due { at: due, stretch: (1.0 / rate).max(1.0) })
     }
 
-    /// Returns when a sample of time `media` is due that belongs to no link. `position` is the media time at maximum rate.
+    /// Returns when a sample of time `media` is due that belongs to no link. `position` is the media time at maximum
+    /// rate.
     fn due(&self, media: Nanos, now: Nanos, position: Nanos) -> PlaybackAction {
         if media < self.skipped_until {
             return PlaybackAction::Skipped;

@@ -108,8 +108,8 @@ impl AsFd for EventFd {
     }
 }
 
-/// Makes SIGBUS end the process with the exit code of [`Kind::Short`], after one message: text to stderr, or with `json`
-/// an object of class `error` to stdout. If stdout `is_taken`, the object goes to stderr.
+/// Makes SIGBUS end the process with the exit code of [`Kind::Short`], after one message: text to stderr, or with
+/// `json` an object of class `error` to stdout. If stdout `is_taken`, the object goes to stderr.
 #[allow(unsafe_code)]
 pub fn explain_bus_error(json: bool, is_taken: bool) {
     let (message, output): (&[u8], fn() -> BorrowedFd<'static>) = match (json, is_taken) {

@@ -5,7 +5,7 @@ use schema::limits::history;
 use schema::{Failure, Header};
 use shm::{DueRings, Medium, Payload, TopicPublisher};
 
-use crate::surroundings::Surroundings;
+use crate::platform::Platform;
 
 /// Publisher of one topic, which takes a loan before the sample arrives.
 ///
@@ -36,8 +36,8 @@ impl<P: Payload + ?Sized, M: Medium<P>> PreparedPublisher<P, M> {
     /// # Errors
     ///
     /// Returns [`Kind::Short`](schema::Kind::Short) if no memory or descriptors are left.
-    pub(crate) fn new(around: &impl Surroundings<Medium<P> = M>, sensor: &str) -> Result<Self, Failure> {
-        let topic = TopicPublisher::over(around.medium::<P>(sensor)?);
+    pub(crate) fn new(platform: &impl Platform<Medium<P> = M>, sensor: &str) -> Result<Self, Failure> {
+        let topic = TopicPublisher::over(platform.medium::<P>(sensor)?);
         Ok(PreparedPublisher { topic, reached: 0, prepared: None, last_len: 0 })
     }
 

@@ -11,12 +11,12 @@ use schema::{Failure, Flags, Kind, MILLIS, Nanos, State};
 
 use crate::control::{ControlQueue, Flow};
 use crate::link::LinkCore;
+use crate::platform::{Line, Platform, Wait, WaitSource, WakeReason};
 use crate::session_driver::{OpenLine, SessionDriver};
-use crate::surroundings::{Line, On, Surroundings, Wait, Woken};
 
 /// A link to a port that may disappear and come back. It is a state machine: [`on_wakeup`](Self::on_wakeup) takes the
 /// reason why a wait ended and returns what to wait for next.
-pub struct LiveLink<'a, S: Surroundings> {
+pub struct LiveLink<'a, S: Platform> {
     core: LinkCore<'a, S>,
     driver: SessionDriver<'a, S>,
     phase: Phase<S::Line>,
@@ -52,34 +52,34 @@ enum Phase<L> {
     },
 }
 
-impl<'a, S: Surroundings> LiveLink<'a, S> {
-    /// Takes the name of `link`, number `number` in the configuration, and creates its topics for the run `boot` of the hub.
-    /// Publishes the first status, and tries to open the port. The caller then calls [`on_wakeup`](Self::on_wakeup) with a
-    /// timeout.
+impl<'a, S: Platform> LiveLink<'a, S> {
+    /// Takes the name of `link`, number `number` in the configuration, and creates its topics for the run `boot` of
+    /// the hub. Publishes the first status, and tries to open the port. The caller then calls
+    /// [`on_wakeup`](Self::on_wakeup) with a timeout.
     ///
     /// # Errors
     ///
-    /// Returns an error of kind [`PortNotTty`](schema::Kind::PortNotTty) if the port is not a serial line at all, an error
-    /// of kind [`Short`](schema::Kind::Short) if descriptors or memory run out, and those of [`Surroundings::medium`]. The
-    /// link waits for a port that is missing, in use or forbidden, or that cannot have the rate, and for a name that
-    /// another process has.
+    /// Returns an error of kind [`PortNotTty`](schema::Kind::PortNotTty) if the port is not a serial line at all, an
+    /// error of kind [`Short`](schema::Kind::Short) if descriptors or memory run out, and those of
+    /// [`Platform::medium`]. The link waits for a port that is missing, in use or forbidden, or that cannot have the
+    /// rate, and for a name that another process has.
     pub fn new(
         link: &'a config::Link,
         number: u8,
         boot: u64,
-        around: &'a S,
+        platform: &'a S,
         control: ControlQueue,
     ) -> Result<Self, Failure> {
         // Before the topics: a subscriber that finds a topic sleeps at the doorbell.
-        let taken = match around.take_name() {
+        let taken = match platform.take_name() {
             Ok(()) => None,
             Err(failure) if failure.kind == Kind::NameHeld => Some(failure),
             Err(failure) => return Err(failure),
         };
-        let mut core = LinkCore::new(link, number, boot, around, control)?;
+        let mut core = LinkCore::new(link, number, boot, platform, control)?;
         core.begin();
         let driver = SessionDriver::new(&core);
-        let saved_identity = driver.saved_identity(around.now());
+        let saved_identity = driver.saved_identity(platform.now());
         let phase = Phase::unavailable(Unavailable::default(), 0);
         let lacks_name = taken.is_some();
         let mut live = LiveLink { core, driver, phase, empty_connections: 0, has_begun: false, lacks_name };
@@ -101,14 +101,14 @@ impl<'a, S: Surroundings> LiveLink<'a, S> {
             }
             // Only the hub plays recordings, so the hint of the port does not name them.
             Err(error @ PortError::NotTty) => {
-                let failure = around.explain(&error, &link.port);
+                let failure = platform.explain(&error, &link.port);
                 let hint = format!("{}, or file:PATH for a recording", failure.hint);
                 Err(Failure { hint, ..failure })
             }
-            Err(error @ PortError::Short(_)) => Err(around.explain(&error, &link.port)),
+            Err(error @ PortError::Short(_)) => Err(platform.explain(&error, &link.port)),
             Err(error) => {
                 let mut reason = Unavailable::default();
-                reason.update(&error, around.now(), |error| one_line(around.explain(error, &link.port)));
+                reason.update(&error, platform.now(), |error| one_line(platform.explain(error, &link.port)));
                 live.schedule_retry(reason);
                 Ok(live)
             }
@@ -136,7 +136,7 @@ impl<'a, S: Surroundings> LiveLink<'a, S> {
     }
 
     /// Handles the end of a wait, for the reason `woken`. Returns what to wait for next.
-    pub fn on_wakeup(&mut self, woken: Woken) -> Wait<'_, S::Line> {
+    pub fn on_wakeup(&mut self, woken: WakeReason) -> Wait<'_, S::Line> {
         let (_, until) = self.phase.wait();
         if !std::mem::replace(&mut self.has_begun, true) {
             self.begin();
@@ -150,16 +150,16 @@ impl<'a, S: Surroundings> LiveLink<'a, S> {
                 Phase::Unavailable { retry_at, .. } => {
                     let retry_at = *retry_at;
                     self.keep_waiting(woken);
-                    if self.core.around.now() >= retry_at {
+                    if self.core.platform.now() >= retry_at {
                         self.try_open();
                     }
                 }
-                Phase::Opening { .. } if woken == Woken::Ready => self.try_open(),
+                Phase::Opening { .. } if woken == WakeReason::Ready => self.try_open(),
                 Phase::Opening { .. } => self.keep_waiting(woken),
             }
         }
         let (on, until) = self.phase.wait();
-        let until = self.core.next_deadline(until, matches!(on, On::Loss(_)));
+        let until = self.core.next_deadline(until, matches!(on, WaitSource::Loss(_)));
         Wait { requests: &self.core.control, on, until }
     }
 
@@ -187,21 +187,21 @@ impl<'a, S: Surroundings> LiveLink<'a, S> {
 
     /// Returns the port that the service manager kept open while the previous hub was killed.
     fn take_kept(&self, baud: u32) -> Option<OpenedPort<S::Line>> {
-        let LinkCore { link, around, .. } = self.core;
+        let LinkCore { link, platform, .. } = self.core;
         let (name, source) = (&link.name, &link.port);
-        let line = around.take_kept(name, source, baud)?;
+        let line = platform.take_kept(name, source, baud)?;
         tracing::info!("{name}: continues with {}, which the service manager kept open", source.name());
         Some(OpenedPort { line, has_rate: true, is_kept: true })
     }
 
-    /// Opens the port at `baud`. A search skips a rate that the port rejects, so the port is then opened at another rate.
-    /// Returns `None` while a connection is being made.
+    /// Opens the port at `baud`. A search skips a rate that the port rejects, so the port is then opened at another
+    /// rate. Returns `None` while a connection is being made.
     fn open(&mut self, baud: u32) -> Option<Result<OpenedPort<S::Line>, PortError>> {
-        let LinkCore { link, around, .. } = self.core;
-        let (opened, has_rate) = match around.open(&link.port, baud) {
+        let LinkCore { link, platform, .. } = self.core;
+        let (opened, has_rate) = match platform.open(&link.port, baud) {
             Some(Err(error @ PortError::Rate { .. })) if link.family().is_none() => {
                 self.driver.log_rejected_rate(&self.core, baud, &error);
-                (around.open(&link.port, SUPPORTED_RATE), false)
+                (platform.open(&link.port, SUPPORTED_RATE), false)
             }
             opened => (opened, true),
         };
@@ -210,10 +210,10 @@ impl<'a, S: Surroundings> LiveLink<'a, S> {
 
     /// Tries to take the name and to open the port. The result is known at once, or when the connection is made.
     fn try_open(&mut self) {
-        let (link, around) = (self.core.link, self.core.around);
+        let (link, platform) = (self.core.link, self.core.platform);
         let mut reason = self.phase.take_reason();
         if self.lacks_name
-            && let Err(failure) = around.take_name()
+            && let Err(failure) = platform.take_name()
         {
             return self.schedule_retry(Unavailable::without_name(failure));
         }
@@ -226,10 +226,10 @@ impl<'a, S: Surroundings> LiveLink<'a, S> {
                 self.begin();
             }
             Some(Err(error)) => {
-                reason.update(&error, around.now(), |error| one_line(around.explain(error, &link.port)));
+                reason.update(&error, platform.now(), |error| one_line(platform.explain(error, &link.port)));
                 self.schedule_retry(reason);
             }
-            None => self.phase = Phase::Opening { reason, until: around.now() + OPENING_STATUS_PERIOD },
+            None => self.phase = Phase::Opening { reason, until: platform.now() + OPENING_STATUS_PERIOD },
         }
     }
 
@@ -241,8 +241,8 @@ impl<'a, S: Surroundings> LiveLink<'a, S> {
         identity: Option<Identity>,
     ) {
         let core = &mut self.core;
-        let now = core.around.now();
-        core.around.keep(&core.link.name, &line);
+        let now = core.platform.now();
+        core.platform.keep(&core.link.name, &line);
         core.diagnosis.open(line.device());
         core.output.topics.set_flags(if line.is_simulated() { Flags::SIMULATED } else { 0 });
         let (family, memory) = (core.link.family(), self.driver.memory(core));
@@ -292,7 +292,7 @@ impl<'a, S: Surroundings> LiveLink<'a, S> {
         let has_received = open.session.account().read > 0;
         // Close the port now, because it cannot be opened again while it is open.
         drop(open);
-        self.core.around.release(&self.core.link.name);
+        self.core.platform.release(&self.core.link.name);
         self.core.stats.reconnects += 1;
         self.empty_connections = if has_received { 0 } else { self.empty_connections + 1 };
         let message = format!("{} went away: {error}", source.name());
@@ -305,16 +305,16 @@ impl<'a, S: Surroundings> LiveLink<'a, S> {
     fn schedule_retry(&mut self, reason: Unavailable) {
         self.core.diagnosis.end_session();
         self.core.show(None, State::Absent, &reason.message);
-        let retry_at = self.core.around.now() + reason.retry_interval();
+        let retry_at = self.core.platform.now() + reason.retry_interval();
         let until = retry_at.min(self.core.next_status());
         self.phase = Phase::Unavailable { reason, retry_at, until };
     }
 
     /// Handles the end of a wait without a port, and sets the next deadline.
-    fn keep_waiting(&mut self, woken: Woken) {
+    fn keep_waiting(&mut self, woken: WakeReason) {
         let core = &mut self.core;
         let (Phase::Unavailable { reason, .. } | Phase::Opening { reason, .. }) = &self.phase else { return };
-        if woken == Woken::Request {
+        if woken == WakeReason::Request {
             core.handle_requests(Flow::Away);
         } else {
             core.show(None, State::Absent, &reason.message);
@@ -322,7 +322,7 @@ impl<'a, S: Surroundings> LiveLink<'a, S> {
         match &mut self.phase {
             Phase::Open(_) => {}
             Phase::Unavailable { retry_at, until, .. } => *until = (*retry_at).min(core.next_status()),
-            Phase::Opening { until, .. } => *until = core.around.now() + OPENING_STATUS_PERIOD,
+            Phase::Opening { until, .. } => *until = core.platform.now() + OPENING_STATUS_PERIOD,
         }
     }
 }
@@ -333,11 +333,11 @@ impl<L: Line> Phase<L> {
     }
 
     /// Returns what to wait for, and until when.
-    fn wait(&self) -> (On<'_, L>, Nanos) {
+    fn wait(&self) -> (WaitSource<'_, L>, Nanos) {
         match self {
             Phase::Open(open) => open.wait(),
-            Phase::Unavailable { until, .. } => (On::Nothing, *until),
-            Phase::Opening { until, .. } => (On::Opening, *until),
+            Phase::Unavailable { until, .. } => (WaitSource::Nothing, *until),
+            Phase::Opening { until, .. } => (WaitSource::Opening, *until),
         }
     }
 

@@ -1,9 +1,9 @@
-//! A link that plays a recording. Telegrams are played in order, with the recorded times between them or as fast as they can
-//! be read. The hub sends no requests, because nothing could reply to them.
+//! A link that plays a recording. Telegrams are played in order, with the recorded times between them or as fast as
+//! they can be read. The hub sends no requests, because nothing could reply to them.
 //!
 //! `recorded.rs` opens recordings and computes the media time of their telegrams. Recordings with stamps are played by
-//! `frames.rs`. A stream of bytes is played here: it passes through a session like the bytes of a line. The session also
-//! finds out what is damaged in it.
+//! `frames.rs`. A stream of bytes is played here: it passes through a session like the bytes of a line. The session
+//! also finds out what is damaged in it.
 //!
 //! [`RecordedMount`] plays the angles of a mount. Another program publishes them, because a hub has no topic for them.
 
@@ -25,8 +25,8 @@ use schema::{Failure, Flags, Header, MILLIS, Nanos, State, Tilt};
 use crate::control::Flow;
 use crate::link::LinkCore;
 use crate::link_output::RecordedMetadata;
+use crate::platform::WakeReason;
 use crate::player::{Due, PlaybackAction, PlaybackOptions, PlaybackRate, Player, PlayerHandle};
-use crate::surroundings::Woken;
 use crate::system::System;
 
 pub(crate) use recorded::{Origin, Recorded, tell_of_damage};
@@ -66,7 +66,7 @@ pub(crate) fn run<'a>(
         Ok((recorded, player)) => {
             report(Ok(()));
             let mut replay = ReplayLink::new(link, &recorded, PlayerHandle { player: &player, number: 0 });
-            if replay.await_subscriber() != Woken::Stop {
+            if replay.await_subscriber() != WakeReason::Stop {
                 player.begin();
                 replay.play(recorded);
             }
@@ -100,7 +100,7 @@ impl<'a, 'p> ReplayLink<'a, 'p> {
 
     /// Waits for a short time until a subscriber is attached: a user who starts a hub and a subscriber together wants
     /// the recording from its beginning.
-    fn await_subscriber(&mut self) -> Woken {
+    fn await_subscriber(&mut self) -> WakeReason {
         let (mut until, mut has_subscribers) = (clock::now() + FIRST_SUBSCRIBER_TIMEOUT, false);
         while clock::now() < until {
             if !has_subscribers && self.link.output.topics.has_subscribers() {
@@ -110,11 +110,11 @@ impl<'a, 'p> ReplayLink<'a, 'p> {
             }
             self.link.show(None, State::Starting, "");
             let next = (clock::now() + POLL_INTERVAL).min(until);
-            if self.rest(next) == Woken::Stop {
-                return Woken::Stop;
+            if self.rest(next) == WakeReason::Stop {
+                return WakeReason::Stop;
             }
         }
-        Woken::Timeout
+        WakeReason::Timeout
     }
 
     /// Plays `recorded`, lap by lap, until the hub ends.
@@ -137,7 +137,7 @@ impl<'a, 'p> ReplayLink<'a, 'p> {
                     self.restart();
                     break;
                 }
-                if self.rest(clock::now() + IDLE_INTERVAL) == Woken::Stop {
+                if self.rest(clock::now() + IDLE_INTERVAL) == WakeReason::Stop {
                     return;
                 }
                 self.link.show(None, State::Silent, "the recording is at its end");
@@ -145,8 +145,8 @@ impl<'a, 'p> ReplayLink<'a, 'p> {
         }
     }
 
-    /// Plays the bytes of `stream` at the pace of its scans. Returns how long the last verdict stays valid at the end; `None` if
-    /// the hub must end.
+    /// Plays the bytes of `stream` at the pace of its scans. Returns how long the last verdict stays valid at the
+    /// end; `None` if the hub must end.
     fn play_stream(&mut self, stream: &Stream) -> Option<Option<Nanos>> {
         let play = self.handle.play();
         let mut bytes = match stream.bytes() {
@@ -212,8 +212,8 @@ impl<'a, 'p> ReplayLink<'a, 'p> {
         self.link.output.restart(clock::now(), VALID_UNTIL_NEXT);
     }
 
-    /// Waits until a telegram of time `media` is due. Meanwhile, the link publishes `state`. Returns `None` if the hub must
-    /// end.
+    /// Waits until a telegram of time `media` is due. Meanwhile, the link publishes `state`. Returns `None` if the
+    /// hub must end.
     fn wait_turn(&mut self, session: Option<&PortSession>, media: Nanos, state: State) -> Option<Due> {
         loop {
             let now = clock::now();
@@ -229,7 +229,7 @@ impl<'a, 'p> ReplayLink<'a, 'p> {
                 | PlaybackAction::Skipped
                 | PlaybackAction::Over => now + IDLE_INTERVAL,
             };
-            if self.rest(until) == Woken::Stop {
+            if self.rest(until) == WakeReason::Stop {
                 return None;
             }
             self.check_at = clock::now() + POLL_INTERVAL;
@@ -246,19 +246,19 @@ impl<'a, 'p> ReplayLink<'a, 'p> {
         }
         self.check_at = now + POLL_INTERVAL;
         self.link.show(None, State::Starting, &self.problem);
-        self.rest(0) != Woken::Stop
+        self.rest(0) != WakeReason::Stop
     }
 
     /// Waits until `until`, the end of the hub, or a change of the player.
-    fn rest(&mut self, until: Nanos) -> Woken {
+    fn rest(&mut self, until: Nanos) -> WakeReason {
         let event = self.handle.event();
         match self.link.wait(event.as_fd(), until) {
-            Woken::Request => self.link.handle_requests(Flow::Recording(self.handle.player)),
-            Woken::Ready => event.clear(),
-            Woken::Stop => return Woken::Stop,
-            Woken::Timeout => {}
+            WakeReason::Request => self.link.handle_requests(Flow::Recording(self.handle.player)),
+            WakeReason::Ready => event.clear(),
+            WakeReason::Stop => return WakeReason::Stop,
+            WakeReason::Timeout => {}
         }
-        Woken::Timeout
+        WakeReason::Timeout
     }
 }
 

@@ -1,11 +1,11 @@
-//! State of the links that outlives the hub: the background of each sensor, the rate at which its scanner was found, and
-//! the scanner that a search found. Without a background, whoever stands in front of a sensor while the hub starts
-//! becomes part of the background, and foreground is unknown for seconds.
+//! State of the links that outlives the hub: the background of each sensor, the rate at which its scanner was found,
+//! and the scanner that a search found. Without a background, whoever stands in front of a sensor while the hub
+//! starts becomes part of the background, and foreground is unknown for seconds.
 //!
-//! A link hands state over between two scans, by a [`SaveSlot`], and never waits for a disk. [`StateSaver`] decides when
-//! to write it to a [`StateStore`], and a [`StateWriter`] is the thread that runs it. Each record is a text of its own
-//! for each sensor. A record is used only for the same sensor at the same port, or at the same pose. A wrong one costs
-//! only time.
+//! A link hands state over between two scans, by a [`SaveSlot`], and never waits for a disk. [`StateSaver`] decides
+//! when to write it to a [`StateStore`], and a [`StateWriter`] is the thread that runs it. Each record is a text of
+//! its own for each sensor. A record is used only for the same sensor at the same port, or at the same pose. A wrong
+//! one costs only time.
 
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -23,8 +23,8 @@ use schema::{Age, Background, Failure, Family, Kind, MILLIS, Nanos, Pose, SavedM
 use serde::{Deserialize, Serialize};
 use shm::StateDirectory;
 
+use crate::platform::SavedState;
 use crate::process::{EventFd, no_resource};
-use crate::surroundings::Learned;
 
 /// Storage for named texts that outlives the hub.
 pub trait StateStore {
@@ -187,7 +187,7 @@ impl SaveQueue {
     }
 }
 
-impl Learned for SaveSlot<'_> {
+impl SavedState for SaveSlot<'_> {
     fn keep_background(&self, pose: Pose, model: Box<Background>) {
         *lock(&self.slot.background) = Some((pose, model));
         self.queue.event.signal();
@@ -311,7 +311,8 @@ impl KnownScanner {
     }
 }
 
-/// Record about the scanner at a port. Its text is a line of words without spaces, which ends with the name of the port.
+/// Record about the scanner at a port. Its text is a line of words without spaces, which ends with the name of the
+/// port.
 ///
 /// After power-on, a scanner has the same rate each time, so a search that starts there saves the timeouts of the other
 /// rates.
@@ -406,7 +407,8 @@ impl<K: PortRecord> SavedRecord<K> {
         is_new
     }
 
-    /// Writes the record of `sensor` if it is new. The lock is released first, so that a link need not wait for the disk.
+    /// Writes the record of `sensor` if it is new. The lock is released first, so that a link need not wait for the
+    /// disk.
     fn write(&self, sensor: &str, store: &impl StateStore) {
         let text = {
             let mut state = lock(&self.0);

@@ -5,7 +5,8 @@
 //! 1. **Read**: [`SessionDriver::on_wakeup`] reads into the session's buffer when the port is ready.
 //! 2. **Frame**: [`SessionDriver::drain`] asks the session for its next action. A telegram stays in that buffer; a
 //!    revolution is a list of points.
-//! 3. **Decode, process, send, ring**: [`LinkOutput`](crate::link_output::LinkOutput) publishes the telegram and the scan,
+//! 3. **Decode, process, send, ring**: [`LinkOutput`](crate::link_output::LinkOutput) publishes the telegram and the
+//! scan,
 //!    wakes the subscribers of both and of the zones, and then publishes the other results.
 //!
 //! Nothing on this path allocates, locks or logs. Opening and reopening the port is up to `reconnect.rs`.
@@ -22,11 +23,11 @@ use schema::{MILLIS, Nanos, State, Status, line_time};
 use crate::control::Flow;
 use crate::link::LinkCore;
 use crate::link_output::RecordedMetadata;
+use crate::platform::{Line, Platform, SavedState, WaitSource, WakeReason};
 use crate::saved_state::{KnownRate, KnownScanner};
-use crate::surroundings::{Learned, Line, On, Surroundings, Woken};
 
 /// State that outlives a session and is used by the next one on the same port.
-pub(crate) struct SessionDriver<'a, S: Surroundings> {
+pub(crate) struct SessionDriver<'a, S: Platform> {
     /// Identity of the scanner, saved for the next hub.
     identity: IdentityCache<'a, S>,
     /// Baud rates that the port has rejected. Each one is logged once.
@@ -82,19 +83,20 @@ impl<L: Line> OpenLine<L> {
     }
 
     /// Returns what to wait for, and until when. The loss of the port ends the wait even while bytes are left unread.
-    pub(crate) fn wait(&self) -> (On<'_, L>, Nanos) {
+    pub(crate) fn wait(&self) -> (WaitSource<'_, L>, Nanos) {
         let for_bytes = self.waits_for_bytes && self.throttled_until.is_none();
-        let on = if for_bytes { On::Bytes(&self.line) } else { On::Loss(&self.line) };
+        let on = if for_bytes { WaitSource::Bytes(&self.line) } else { WaitSource::Loss(&self.line) };
         (on, self.throttled_until.unwrap_or(self.deadline))
     }
 }
 
-impl<'a, S: Surroundings> SessionDriver<'a, S> {
+impl<'a, S: Platform> SessionDriver<'a, S> {
     /// Creates the state for the port of `core`.
     pub(crate) fn new(core: &LinkCore<'a, S>) -> SessionDriver<'a, S> {
-        let scanner = core.around.learned().and_then(|learned| learned.scanner(&core.link.port.name()));
+        let scanner =
+            core.platform.saved_state().and_then(|saved_state| saved_state.scanner(&core.link.port.name()));
         SessionDriver {
-            identity: IdentityCache::new(core.around, &core.link.name, core.link.port.name()),
+            identity: IdentityCache::new(core.platform, &core.link.name, core.link.port.name()),
             rejected_rates: Vec::new(),
             line_errors: LineErrors::default(),
             backlog_read_at: None,
@@ -161,9 +163,9 @@ impl<'a, S: Surroundings> SessionDriver<'a, S> {
         &mut self,
         core: &mut LinkCore<'a, S>,
         open: &mut OpenLine<S::Line>,
-        woken: Woken,
+        woken: WakeReason,
     ) -> io::Result<()> {
-        if woken == Woken::Request {
+        if woken == WakeReason::Request {
             core.handle_requests(Flow::Session(&mut open.session));
         } else {
             self.read(core, open)?;
@@ -178,16 +180,16 @@ impl<'a, S: Surroundings> SessionDriver<'a, S> {
     /// Returns an error if the line is lost.
     pub(crate) fn end(&self, core: &LinkCore<'a, S>, open: &mut OpenLine<S::Line>) -> io::Result<()> {
         let OpenLine { line, session, .. } = open;
-        if !session.end(core.around.now()) {
+        if !session.end(core.platform.now()) {
             return Ok(());
         }
         loop {
             match session.poll_output() {
                 Output::SetDtr(on) => line.set_dtr(on)?,
                 Output::Transmit { bytes, not_before } => {
-                    core.around.pause(not_before);
+                    core.platform.pause(not_before);
                     line.write(bytes)?;
-                    session.transmitted(core.around.now());
+                    session.transmitted(core.platform.now());
                 }
                 // The hub is shutting down, so nothing is published any more.
                 Output::SetRate(_) | Output::Event(_) => {}
@@ -199,7 +201,7 @@ impl<'a, S: Surroundings> SessionDriver<'a, S> {
     fn read(&mut self, core: &mut LinkCore<'a, S>, open: &mut OpenLine<S::Line>) -> io::Result<()> {
         let OpenLine { line, session, allowance, backlog, settings_check, waits_for_bytes, deadline, .. } =
             open;
-        let around = core.around;
+        let platform = core.platform;
         if !*waits_for_bytes && session.features().is_some_and(|features| features.has_whole_telegrams) {
             // The telegram ends soon. Prepare now what its publication needs, so that less work is left at its end.
             // Packets end too often for this.
@@ -208,18 +210,18 @@ impl<'a, S: Surroundings> SessionDriver<'a, S> {
         if *waits_for_bytes
             && session.can_defer_read()
             && let Some(waiting) = line.waiting()
-            && session.defer_read(around.now(), waiting)
+            && session.defer_read(platform.now(), waiting)
         {
             return Ok(());
         }
         let mut buffer = session.spare();
         if let Some(allowance) = &allowance {
-            let max_len = buffer.len().min(allowance.bytes(around.now()).max(1));
+            let max_len = buffer.len().min(allowance.bytes(platform.now()).max(1));
             buffer = &mut buffer[..max_len];
         }
         let room = buffer.len();
         let len = line.read(buffer)?;
-        let now = around.now();
+        let now = platform.now();
         session.commit(now, len);
         if len > 0 {
             settings_check.note_bytes(now);
@@ -245,7 +247,7 @@ impl<'a, S: Surroundings> SessionDriver<'a, S> {
     /// Carries out the session's actions until it asks to wait.
     fn drain(&mut self, core: &mut LinkCore<'a, S>, open: &mut OpenLine<S::Line>) -> io::Result<()> {
         let OpenLine { line, session, .. } = open;
-        let around = core.around;
+        let platform = core.platform;
         let recorded = RecordedMetadata::default();
         let (mut published, mut is_scan) = (false, !core.stats.is_streaming());
         (open.waits_for_bytes, open.deadline) = loop {
@@ -254,7 +256,7 @@ impl<'a, S: Surroundings> SessionDriver<'a, S> {
                     // Setting the rate hides what another process has changed.
                     restore(core, line, baud)?;
                     if !self.set_baud(core, line, baud)? {
-                        session.reject_rate(around.now());
+                        session.reject_rate(platform.now());
                     }
                     // Changing the rate discards buffered input.
                     open.backlog = None;
@@ -262,9 +264,9 @@ impl<'a, S: Surroundings> SessionDriver<'a, S> {
                 }
                 Output::SetDtr(on) => line.set_dtr(on)?,
                 Output::Transmit { bytes, not_before } => {
-                    around.pause(not_before);
+                    platform.pause(not_before);
                     line.write(bytes)?;
-                    session.transmitted(around.now());
+                    session.transmitted(platform.now());
                 }
                 Output::Event(Event::Telegram(mut received)) => {
                     let new_errors = line.line_errors();
@@ -307,7 +309,7 @@ impl<'a, S: Surroundings> SessionDriver<'a, S> {
             self.line_errors.wait();
             open.settings_check.pass();
         }
-        let now = around.now();
+        let now = platform.now();
         if open.settings_check.is_due(session.state(), now) && restore(core, line, session.rate())? {
             open.backlog = None;
         }
@@ -332,19 +334,19 @@ impl<'a, S: Surroundings> SessionDriver<'a, S> {
             saved_rates(core).iter().for_each(|rates| rates.keep_rate(&core.link.port.name(), rate));
         }
         if (has_changed || core.is_due(now)) && core.show_session(session, state) {
-            self.identity.save(session, around.now());
+            self.identity.save(session, platform.now());
             self.note_scanner(core, session, now);
             if core.stops_when_idle() {
-                session.set_has_subscribers(around.now(), core.output.topics.has_data_subscribers());
+                session.set_has_subscribers(platform.now(), core.output.topics.has_data_subscribers());
                 // Poll again at once, so that the session can stop or start the motor.
-                open.deadline = around.now();
+                open.deadline = platform.now();
             }
         }
         // While telegrams arrive, each one checks whether a status is due, so no extra wake-up is needed.
         let status_due = if state == State::Streaming { Nanos::MAX } else { core.next_status() };
         open.deadline = open.deadline.min(status_due);
         open.throttled_until =
-            open.allowance.as_mut().and_then(|allowance| allowance.rest(around.now(), open.deadline));
+            open.allowance.as_mut().and_then(|allowance| allowance.rest(platform.now(), open.deadline));
         Ok(())
     }
 
@@ -420,8 +422,8 @@ impl<'a, S: Surroundings> SessionDriver<'a, S> {
             return;
         }
         if self.scanner.as_ref() != Some(&scanner) {
-            if let Some(learned) = core.around.learned() {
-                learned.keep_scanner(&link.port.name(), scanner.clone());
+            if let Some(saved_state) = core.platform.saved_state() {
+                saved_state.keep_scanner(&link.port.name(), scanner.clone());
             }
             self.scanner = Some(scanner);
         }
@@ -440,21 +442,21 @@ fn name_of(scanner: &KnownScanner) -> String {
 }
 
 /// Restores the hub's settings of `line`, at `baud`, if another process has changed them. Returns whether it has.
-fn restore<S: Surroundings>(core: &mut LinkCore<'_, S>, line: &S::Line, baud: u32) -> io::Result<bool> {
+fn restore<S: Platform>(core: &mut LinkCore<'_, S>, line: &S::Line, baud: u32) -> io::Result<bool> {
     let Some(alteration) = line.altered()? else { return Ok(false) };
     line.restore(baud)?;
-    let program = || core.around.altering_program(&core.link.port);
-    core.diagnosis.note_altered(alteration, program, core.around.now());
+    let program = || core.platform.altering_program(&core.link.port);
+    core.diagnosis.note_altered(alteration, program, core.platform.now());
     Ok(true)
 }
 
 /// Returns the store of baud rates, if the link has one.
-fn saved_rates<'a, S: Surroundings>(core: &LinkCore<'a, S>) -> Option<&'a dyn Learned> {
-    core.around.learned().filter(|_| is_tty(core))
+fn saved_rates<'a, S: Platform>(core: &LinkCore<'a, S>) -> Option<&'a dyn SavedState> {
+    core.platform.saved_state().filter(|_| is_tty(core))
 }
 
 /// Returns whether the port is a tty, whose rate can be changed.
-fn is_tty<S: Surroundings>(core: &LinkCore<'_, S>) -> bool {
+fn is_tty<S: Platform>(core: &LinkCore<'_, S>) -> bool {
     matches!(core.link.port, Source::Tty(_))
 }
 
@@ -527,12 +529,12 @@ impl SettingsCheck {
     }
 }
 
-/// Saves the identity of a link's scanner, so that the next hub can publish scans at once if this hub is killed. Without
-/// it, the next hub first has to send the scanner two requests, and each reply costs a scan.
+/// Saves the identity of a link's scanner, so that the next hub can publish scans at once if this hub is killed.
+/// Without it, the next hub first has to send the scanner two requests, and each reply costs a scan.
 ///
 /// The record is written as soon as the identity is known, and then once a second while the scanner streams.
 struct IdentityCache<'a, S> {
-    around: &'a S,
+    platform: &'a S,
     link: &'a str,
     /// Port that the identity belongs to.
     port: String,
@@ -542,17 +544,17 @@ struct IdentityCache<'a, S> {
     identity: Option<Identity>,
 }
 
-impl<'a, S: Surroundings> IdentityCache<'a, S> {
+impl<'a, S: Platform> IdentityCache<'a, S> {
     /// Creates an empty cache for `link` at `port`.
-    fn new(around: &'a S, link: &'a str, port: String) -> Self {
-        IdentityCache { around, link, port, record: Vec::new(), identity: None }
+    fn new(platform: &'a S, link: &'a str, port: String) -> Self {
+        IdentityCache { platform, link, port, record: Vec::new(), identity: None }
     }
 
     /// Returns the identity that the previous hub saved, if it is recent and belongs to this port.
     fn load(&self, now: Nanos) -> Option<Identity> {
         // One more byte than expected, because a longer record belongs to another port.
         let mut record = vec![0; STAMP_LEN + size_of::<Identity>() + self.port.len() + 1];
-        let len = self.around.recall(self.link, &mut record)?;
+        let len = self.platform.load_record(self.link, &mut record)?;
         read_identity(record.get(..len)?, &self.port, now)
     }
 
@@ -564,13 +566,13 @@ impl<'a, S: Surroundings> IdentityCache<'a, S> {
             self.record = identity_record(identity, &self.port);
         }
         self.record[..STAMP_LEN].copy_from_slice(&now.to_le_bytes());
-        self.around.remember(self.link, &self.record);
+        self.platform.store_record(self.link, &self.record);
     }
 
     /// Saves the identity as soon as it is known. [`save`](Self::save) then keeps the record recent.
     fn save_once_known(&mut self, session: &PortSession) {
         if self.identity.is_none() {
-            self.save(session, self.around.now());
+            self.save(session, self.platform.now());
         }
     }
 }

@@ -15,6 +15,7 @@ use shm::{Domain, HubLock, StateDirectory};
 
 use crate::control::{ControlQueue, ControlServer};
 use crate::link::LinkCore;
+use crate::platform::Platform as _;
 use crate::player::{Player, PlayerHandle};
 use crate::process::{
     SignalAction, Signals, check_descriptors, check_memory, no_resource, raise_descriptor_limit,
@@ -25,7 +26,6 @@ use crate::replay;
 use crate::replay::{Recorded, ReplayPart};
 use crate::saved_state::{StateSaver, StateWriter};
 use crate::service::{Service, Watchdog};
-use crate::surroundings::Surroundings as _;
 use crate::system::{Hub, System};
 
 /// What is up.
@@ -158,13 +158,13 @@ pub(crate) fn serve(
                 root: domain.root(),
             };
             let (report, worked) = (report.clone(), &worked[number]);
-            let learned = writer.as_ref().and_then(|writer| writer.queue().slot(&link.name));
+            let save_slot = writer.as_ref().and_then(|writer| writer.queue().slot(&link.name));
             let part = player
                 .zip(parts.next())
                 .map(|(player, recorded)| ReplayPart { recorded, handle: PlayerHandle { player, number } });
             let body = move || {
                 let report = |outcome| drop(report.send((number, outcome)));
-                let system = System::new(hub, &link.name, worked, learned);
+                let system = System::new(hub, &link.name, worked, save_slot);
                 run_link(link, number as u8, boot, &system, queue, part, report);
             };
             let thread = thread::Builder::new().name(link.name.clone()).spawn_scoped(scope, body);

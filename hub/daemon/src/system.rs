@@ -1,4 +1,5 @@
-//! This machine as the surroundings of a link: its clocks, ports, shared memory, files, and service manager. Decides nothing.
+//! This machine as the surroundings of a link: its clocks, ports, shared memory, files, and service manager. Decides
+//! nothing.
 
 use std::cell::{Cell, OnceCell, RefCell};
 use std::fs::File;
@@ -18,10 +19,10 @@ use shm::{Node, Payload, SharedMemory, Waker};
 
 use crate::control::ControlQueue;
 use crate::link::LinkCore;
+use crate::platform::{Line, Platform, SavedState, Wait, WaitSource, WakeReason};
 use crate::reconnect::LiveLink;
 use crate::saved_state::SaveSlot;
 use crate::service::Service;
-use crate::surroundings::{Learned, Line, On, Surroundings, Wait, Woken};
 
 /// What the machine has for one link; stays in the link's thread.
 pub(crate) struct System<'a> {
@@ -31,7 +32,7 @@ pub(crate) struct System<'a> {
     name: OnceCell<HeldName>,
     /// Set whenever the link finished something.
     worked: &'a AtomicBool,
-    learned: Option<SaveSlot<'a>>,
+    save_slot: Option<SaveSlot<'a>>,
     /// The connection that is being made.
     dial: RefCell<Option<Dial>>,
     /// When requests, the hub's end and the line were looked at last.
@@ -62,24 +63,24 @@ pub(crate) struct Hub<'a> {
 }
 
 impl<'a> System<'a> {
-    /// What `hub` has for the link of `sensor`, which sets `worked` whenever it finished something; `learned` is where it hands
-    /// on what it learned.
+    /// Creates the platform of the link of `sensor` from the resources of `hub`. The link sets `worked` whenever it
+    /// has finished something, and hands state over to `save_slot`.
     pub(crate) fn new(
         hub: Hub<'a>,
         sensor: &'a str,
         worked: &'a AtomicBool,
-        learned: Option<SaveSlot<'a>>,
+        save_slot: Option<SaveSlot<'a>>,
     ) -> System<'a> {
         let (dial, looked_at, record) = (RefCell::default(), Cell::default(), OnceCell::new());
-        System { hub, sensor, name: OnceCell::new(), worked, learned, dial, looked_at, record }
+        System { hub, sensor, name: OnceCell::new(), worked, save_slot, dial, looked_at, record }
     }
 
     /// Drives `link` until the hub ends. Calls `on_start` once with the link: as soon as it has tried to open its port,
     /// but not later than [`START`].
     pub(crate) fn drive(&self, mut link: LiveLink<'_, Self>, on_start: impl FnOnce(&LiveLink<'_, Self>)) {
-        let mut woken = Woken::Timeout;
+        let mut woken = WakeReason::Timeout;
         let (mut on_start, start_by) = (Some(on_start), clock::now() + START);
-        while woken != Woken::Stop {
+        while woken != WakeReason::Stop {
             if let Some(on_start) = on_start.take_if(|_| link.has_tried() || clock::now() >= start_by) {
                 on_start(&link);
             }
@@ -87,22 +88,22 @@ impl<'a> System<'a> {
             let until = if on_start.is_some() { until.min(start_by) } else { until };
             let dial = self.dial.borrow();
             let port = match on {
-                On::Nothing => None,
-                On::Opening => dial.as_ref().map(|dial| (dial.as_fd(), PollFlags::IN)),
-                On::Bytes(line) => Some((line.as_fd(), PollFlags::IN)),
-                On::Loss(_) if self.sleeps(until) => {
-                    woken = Woken::Timeout;
+                WaitSource::Nothing => None,
+                WaitSource::Opening => dial.as_ref().map(|dial| (dial.as_fd(), PollFlags::IN)),
+                WaitSource::Bytes(line) => Some((line.as_fd(), PollFlags::IN)),
+                WaitSource::Loss(_) if self.sleeps(until) => {
+                    woken = WakeReason::Timeout;
                     continue;
                 }
-                On::Loss(line) => Some((line.as_fd(), PollFlags::empty())),
+                WaitSource::Loss(line) => Some((line.as_fd(), PollFlags::empty())),
             };
             woken = self.wait(requests, port, until);
         }
         link.end();
     }
 
-    /// Sleeps until `until`, if that is soon and everything else was looked at a moment ago: a look at descriptors, one of
-    /// them a tty's, costs more than the sleep.
+    /// Sleeps until `until`, if that is soon and everything else was looked at a moment ago: a look at descriptors,
+    /// one of them a tty's, costs more than the sleep.
     fn sleeps(&self, until: Nanos) -> bool {
         let now = clock::now();
         let is_soon = until <= now + SHORT && now < self.looked_at.get() + UNSEEN;
@@ -119,7 +120,7 @@ impl<'a> System<'a> {
         requests: &ControlQueue,
         port: Option<(BorrowedFd<'_>, PollFlags)>,
         until: Nanos,
-    ) -> Woken {
+    ) -> WakeReason {
         let now = clock::now();
         self.looked_at.set(now);
         let span = clock::span(now, until);
@@ -137,10 +138,10 @@ impl<'a> System<'a> {
         };
         self.worked.store(true, Ordering::Relaxed);
         match woken {
-            Ok([true, ..]) => Woken::Stop,
-            Ok([_, true, _]) => Woken::Request,
-            Ok([.., true]) => Woken::Ready,
-            _ => Woken::Timeout,
+            Ok([true, ..]) => WakeReason::Stop,
+            Ok([_, true, _]) => WakeReason::Request,
+            Ok([.., true]) => WakeReason::Ready,
+            _ => WakeReason::Timeout,
         }
     }
 
@@ -159,10 +160,10 @@ impl<'a> System<'a> {
 
 impl<'a> LinkCore<'a, System<'a>> {
     /// Waits until `news` is readable, a request, `until`, or the hub's end; meanwhile what is due goes out.
-    pub(crate) fn wait(&mut self, news: BorrowedFd<'_>, until: Nanos) -> Woken {
+    pub(crate) fn wait(&mut self, news: BorrowedFd<'_>, until: Nanos) -> WakeReason {
         loop {
             let bound = self.next_deadline(until, false);
-            let woken = self.around.wait(&self.control, Some((news, PollFlags::IN)), bound);
+            let woken = self.platform.wait(&self.control, Some((news, PollFlags::IN)), bound);
             if self.is_over(woken, until) {
                 return woken;
             }
@@ -170,7 +171,7 @@ impl<'a> LinkCore<'a, System<'a>> {
     }
 }
 
-impl Surroundings for System<'_> {
+impl Platform for System<'_> {
     type Line = Port;
     type Medium<P: Payload + ?Sized> = SharedMemory<P>;
 
@@ -264,24 +265,24 @@ impl Surroundings for System<'_> {
         }
     }
 
-    fn tell(&self, why: Wake) {
+    fn notify_event(&self, why: Wake) {
         if let Some(Err(failure)) = self.name.get().map(|name| name.waker.tell(why)) {
             tracing::debug!(%failure, "some consumers were not woken");
         }
     }
 
-    fn recall(&self, name: &str, record: &mut [u8]) -> Option<usize> {
+    fn load_record(&self, name: &str, record: &mut [u8]) -> Option<usize> {
         self.record(name)?.read_at(record, 0).ok()
     }
 
-    fn remember(&self, name: &str, record: &[u8]) {
+    fn store_record(&self, name: &str, record: &[u8]) {
         let Some(file) = self.record(name) else { return };
         // One that cannot be written is too old soon; behind a shorter one nothing of a longer one stays.
         let _ = file.write_all_at(record, 0).and_then(|()| file.set_len(record.len() as u64));
     }
 
-    fn learned(&self) -> Option<&dyn Learned> {
-        self.learned.as_ref().map(|learned| learned as &dyn Learned)
+    fn saved_state(&self) -> Option<&dyn SavedState> {
+        self.save_slot.as_ref().map(|slot| slot as &dyn SavedState)
     }
 }
 
@@ -335,7 +336,8 @@ fn is_ready(fd: &PollFd<'_>) -> bool {
     !fd.revents().is_empty()
 }
 
-/// A rest that is not longer is slept through, if requests, the hub's end and the loss of a line do not wait for longer than that.
+/// A rest that is not longer is slept through, if requests, the hub's end and the loss of a line do not wait for
+/// longer than that.
 const SHORT: Nanos = 20 * MILLIS;
 const UNSEEN: Nanos = 50 * MILLIS;
 /// Time that the start of the hub waits for the connection to a serial server.

@@ -13,22 +13,22 @@ use schema::{
 use shm::DueRings;
 
 use crate::early::EarlyMessage;
+use crate::platform::Platform;
 use crate::publisher::PreparedPublisher;
-use crate::surroundings::Surroundings;
 
 macro_rules! publishers {
     ($($topic:ident $payload:tt, $name:ident, $($column:tt),*: $about:literal;)*) => {
         /// Publishers of all topics of a link.
-        pub(crate) struct Publishers<S: Surroundings> {
+        pub(crate) struct Publishers<S: Platform> {
             $(
                 #[doc = $about]
                 pub(crate) $name: Publisher<schema::payload_type!($payload), S>,
             )*
         }
 
-        impl<S: Surroundings> Publishers<S> {
-            fn new(around: &S, sensor: &str) -> Result<Self, Failure> {
-                Ok(Publishers { $($name: PreparedPublisher::new(around, sensor)?,)* })
+        impl<S: Platform> Publishers<S> {
+            fn new(platform: &S, sensor: &str) -> Result<Self, Failure> {
+                Ok(Publishers { $($name: PreparedPublisher::new(platform, sensor)?,)* })
             }
 
             /// Prepares the topics that are published with every scan.
@@ -67,11 +67,11 @@ macro_rules! publishers {
 schema::for_each_topic!(links: publishers);
 
 /// Publisher of one topic.
-type Publisher<P, S> = PreparedPublisher<P, <S as Surroundings>::Medium<P>>;
+type Publisher<P, S> = PreparedPublisher<P, <S as Platform>::Medium<P>>;
 
 /// The topics of one sensor. They belong to the thread of its link.
-pub(crate) struct Topics<'a, S: Surroundings> {
-    around: &'a S,
+pub(crate) struct Topics<'a, S: Platform> {
+    platform: &'a S,
     pub(crate) publishers: Publishers<S>,
     /// Doorbells that have to ring for samples that were sent.
     pub(crate) due: DueRings,
@@ -87,17 +87,17 @@ pub(crate) struct Topics<'a, S: Surroundings> {
     checked_at: Nanos,
 }
 
-impl<'a, S: Surroundings> Topics<'a, S> {
+impl<'a, S: Platform> Topics<'a, S> {
     /// Creates the topics of `sensor`, which is number `number` in the configuration. `boot` identifies the run of the hub.
     ///
     /// # Errors
     ///
     /// Returns [`Kind::Short`](schema::Kind::Short) if no memory or descriptors are left.
-    pub(crate) fn new(around: &'a S, sensor: &str, number: u8, boot: u64) -> Result<Self, Failure> {
+    pub(crate) fn new(platform: &'a S, sensor: &str, number: u8, boot: u64) -> Result<Self, Failure> {
         let header = Header { sensor: number, boot, hub_pid: std::process::id(), ..Header::default() };
         Ok(Topics {
-            around,
-            publishers: Publishers::new(around, sensor)?,
+            platform,
+            publishers: Publishers::new(platform, sensor)?,
             due: DueRings::default(),
             header,
             is_recorded: false,
@@ -170,10 +170,10 @@ impl<'a, S: Surroundings> Topics<'a, S> {
     }
 
     fn begin(&mut self, first: Nanos, last: Nanos, reasons: u8, period_us: u32) {
-        let now = self.around.now();
+        let now = self.platform.now();
         (self.header.stamp_first_ns, self.header.stamp_last_ns) = (first, last);
         if !self.is_recorded {
-            self.header.wall_ns = wall_clock(self.around, first, now);
+            self.header.wall_ns = wall_clock(self.platform, first, now);
         }
         self.header.set_sent_at(now);
         self.header.period_us = period_us;
@@ -185,7 +185,7 @@ impl<'a, S: Surroundings> Topics<'a, S> {
 
     /// Returns the header for the samples of the last telegram or revolution, which are sent now.
     pub(crate) fn header(&mut self) -> Header {
-        self.header.set_sent_at(self.around.now());
+        self.header.set_sent_at(self.platform.now());
         self.header
     }
 
@@ -204,13 +204,13 @@ impl<'a, S: Surroundings> Topics<'a, S> {
         reasons: u8,
         period_us: u32,
     ) {
-        let now = self.around.now();
+        let now = self.platform.now();
         let quality = if reasons == 0 { Quality::Clean } else { Quality::Suspect };
         let mut header = Header {
             seq: message.seq,
             stamp_first_ns: first,
             stamp_last_ns: last,
-            wall_ns: wall_clock(self.around, first, now),
+            wall_ns: wall_clock(self.platform, first, now),
             quality: quality as u8,
             reasons,
             period_us,
@@ -224,8 +224,8 @@ impl<'a, S: Surroundings> Topics<'a, S> {
         }
         self.publishers.early.send(early, &header, &mut self.due);
         if self.due.take(Ring::Early) {
-            self.around.ring(Ring::Early);
-            self.around.tell(Wake::Early);
+            self.platform.ring(Ring::Early);
+            self.platform.notify_event(Wake::Early);
         }
     }
 
@@ -266,7 +266,7 @@ impl<'a, S: Surroundings> Topics<'a, S> {
     /// last sample.
     pub(crate) fn wake(&mut self, why: Wake) {
         Ring::ALL.into_iter().for_each(|ring| self.ring(ring));
-        self.around.tell(why);
+        self.platform.notify_event(why);
     }
 
     /// Wakes the subscribers of the packets that were just published. Subscribers of scans alone are not woken.
@@ -279,7 +279,7 @@ impl<'a, S: Surroundings> Topics<'a, S> {
     /// Rings the doorbell `ring` if samples were sent since the last time, to save the system call otherwise.
     pub(crate) fn ring(&mut self, ring: Ring) {
         if self.due.take(ring) {
-            self.around.ring(ring);
+            self.platform.ring(ring);
         }
     }
 
@@ -324,7 +324,7 @@ impl<'a, S: Surroundings> Topics<'a, S> {
         let wall_ns = if self.is_recorded {
             self.header.wall_ns
         } else {
-            wall_clock(self.around, now, self.around.now())
+            wall_clock(self.platform, now, self.platform.now())
         };
         header_without_telegram(&self.header, now, wall_ns)
     }
@@ -368,9 +368,9 @@ fn later(stamp: u64, last: u64) -> u64 {
 /// Largest time by which a stamp may be earlier than the last one and still count as its successor.
 const MAX_REVERSAL: Nanos = 100 * MILLIS;
 
-/// Converts `stamp` to nanoseconds since 1970. `now` is the current time of the clock of `around`.
-fn wall_clock(around: &impl Surroundings, stamp: Nanos, now: Nanos) -> u64 {
-    around.wall_ns().saturating_sub(now.saturating_sub(stamp))
+/// Converts `stamp` to nanoseconds since 1970. `now` is the current time of the clock of `platform`.
+fn wall_clock(platform: &impl Platform, stamp: Nanos, now: Nanos) -> u64 {
+    platform.wall_ns().saturating_sub(now.saturating_sub(stamp))
 }
 
 /// Returns the header of a sample that is published at `now` without a telegram. It has the number of the last

@@ -3,14 +3,14 @@
 
 use std::rc::Rc;
 
-use daemon::surroundings::{On, Wait, Woken};
+use daemon::platform::{Wait, WaitSource, WakeReason};
 use daemon::{LiveLink, Orders, Reload, Service, StateSaver, StateStore};
 use schema::{Background, Failure, Kind, MICROS, MILLIS, Nanos};
 
-use crate::around::Around;
 use crate::event::Event;
 use crate::setup::Setup;
 use crate::shared::Shared;
+use crate::sim_platform::SimPlatform;
 use crate::world::{Ending, World};
 
 /// A hub begins, lives and ends; `world` knows then when the next one begins.
@@ -47,12 +47,14 @@ fn begin(world: &mut World, shared: &Rc<Shared>, boot: u64) -> Result<Ending, Fa
     world.orders = Some(orders);
     let (service, names) = (Service::default(), names());
     let mut reload = Reload::new(&config, &read, &service);
-    let around = |(number, name): (usize, &String)| Around::new(shared, number, name, queue.as_ref());
-    let arounds: Vec<Around<'_>> = names.iter().enumerate().map(around).collect();
+    let platform = |(number, name): (usize, &String)| SimPlatform::new(shared, number, name, queue.as_ref());
+    let platforms: Vec<SimPlatform<'_>> = names.iter().enumerate().map(platform).collect();
     let mut links = Vec::new();
-    for ((number, link), (around, queue)) in config.links.iter().enumerate().zip(arounds.iter().zip(queues)) {
-        let live = LiveLink::new(link, number as u8, boot, around, queue)?;
-        links.push(Running::new(live, around));
+    for ((number, link), (platform, queue)) in
+        config.links.iter().enumerate().zip(platforms.iter().zip(queues))
+    {
+        let live = LiveLink::new(link, number as u8, boot, platform, queue)?;
+        links.push(Running::new(live, platform));
     }
     let mut writes_at = world.now();
     world.greet();
@@ -99,8 +101,8 @@ fn begin(world: &mut World, shared: &Rc<Shared>, boot: u64) -> Result<Ending, Fa
     };
     if !ending.is_killed {
         let now = world.now();
-        for Running { link, around, .. } in links {
-            around.clock.pass(now);
+        for Running { link, platform, .. } in links {
+            platform.clock.pass(now);
             link.end();
         }
         // What they say last wakes whoever sleeps.
@@ -114,8 +116,8 @@ fn begin(world: &mut World, shared: &Rc<Shared>, boot: u64) -> Result<Ending, Fa
 
 /// A link and what its thread would wait for.
 struct Running<'a> {
-    link: LiveLink<'a, Around<'a>>,
-    around: &'a Around<'a>,
+    link: LiveLink<'a, SimPlatform<'a>>,
+    platform: &'a SimPlatform<'a>,
     /// The device that it watches, and whether for bytes or only for its loss.
     watched: Option<(u64, bool)>,
     until: Nanos,
@@ -126,13 +128,13 @@ struct Running<'a> {
 }
 
 impl<'a> Running<'a> {
-    fn new(link: LiveLink<'a, Around<'a>>, around: &'a Around<'a>) -> Running<'a> {
-        Running { link, around, watched: None, until: 0, ready_at: None, is_wanted: false }
+    fn new(link: LiveLink<'a, SimPlatform<'a>>, platform: &'a SimPlatform<'a>) -> Running<'a> {
+        Running { link, platform, watched: None, until: 0, ready_at: None, is_wanted: false }
     }
 
     /// When it has something to do, or when its sensor has something that it may have to.
     fn next_ns(&self) -> Nanos {
-        let Around { shared, number, clock, .. } = self.around;
+        let SimPlatform { shared, number, clock, .. } = self.platform;
         let due = match (self.is_wanted, self.ready_at, self.watched) {
             (true, ..) => 0,
             (_, Some(ready_at), _) => ready_at,
@@ -148,7 +150,7 @@ impl<'a> Running<'a> {
     /// Looks whether what it watches is ready.
     fn look(&mut self, now: Nanos) {
         let Some((device, wants_bytes)) = self.watched.filter(|_| self.ready_at.is_none()) else { return };
-        let Around { shared, number, .. } = self.around;
+        let SimPlatform { shared, number, .. } = self.platform;
         let mut tty = shared.ports[*number].borrow_mut();
         if wants_bytes {
             tty.advance(now, &shared.log);
@@ -161,21 +163,21 @@ impl<'a> Running<'a> {
     /// Its thread runs at `now`, if there is a reason.
     fn run(&mut self, now: Nanos) {
         let woken = if std::mem::take(&mut self.is_wanted) {
-            Woken::Request
+            WakeReason::Request
         } else if self.ready_at.is_some() {
-            Woken::Ready
+            WakeReason::Ready
         } else if now >= self.until {
-            Woken::Timeout
+            WakeReason::Timeout
         } else {
             return;
         };
         self.ready_at = None;
-        self.around.clock.pass(now);
+        self.platform.clock.pass(now);
         let Wait { on, until, .. } = self.link.on_wakeup(woken);
         self.watched = match on {
-            On::Nothing | On::Opening => None,
-            On::Bytes(line) => Some((line.handle.device, true)),
-            On::Loss(line) => Some((line.handle.device, false)),
+            WaitSource::Nothing | WaitSource::Opening => None,
+            WaitSource::Bytes(line) => Some((line.handle.device, true)),
+            WaitSource::Loss(line) => Some((line.handle.device, false)),
         };
         self.until = until;
     }

@@ -5,7 +5,6 @@
 //! [`Plan`] is what shall happen, as data; [`run`] lets it happen; [`Outcome`] is what the judges say.
 
 mod actions;
-mod around;
 mod consumer;
 pub mod corpus;
 mod event;
@@ -23,6 +22,7 @@ mod sensor;
 mod setup;
 mod shared;
 pub mod shrink;
+mod sim_platform;
 mod topics;
 mod tty;
 mod world;

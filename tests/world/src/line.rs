@@ -1,11 +1,11 @@
-//! A hub's end of a port: what [`daemon::surroundings::Line`] asks, of a tty that is simulated. Decides nothing.
+//! A hub's end of a port: it implements [`daemon::platform::Line`] with a simulated tty.
 
 use std::cell::Cell;
 use std::io;
 use std::path::Path;
 use std::rc::Rc;
 
-use daemon::surroundings::Line;
+use daemon::platform::Line;
 use port::{Allowance, Alteration};
 use schema::Nanos;
 

@@ -1,12 +1,12 @@
-//! The surroundings of one link in a world: what [`daemon::surroundings::Surroundings`] asks, of simulated ports, topics and
-//! files. Decides nothing.
+//! The platform of one link in a world: it implements [`daemon::platform::Platform`] with simulated ports, topics and
+//! files.
 
 use std::cell::Cell;
 use std::rc::Rc;
 use std::sync::Arc;
 
 use daemon::SaveQueue;
-use daemon::surroundings::{Learned, Surroundings};
+use daemon::platform::{Platform, SavedState};
 use port::{PortError, Source};
 use rustix::io::Errno;
 use schema::{Failure, Kind, MICROS, Nanos, Ring, Wake};
@@ -18,17 +18,17 @@ use crate::planted::Defect;
 use crate::shared::Shared;
 use crate::topics::Carrier;
 
-/// What link number `number` has around it; its sensor is the one of this number, too.
-pub(crate) struct Around<'a> {
+/// Platform of link number `number`, whose sensor has the same number.
+pub(crate) struct SimPlatform<'a> {
     pub(crate) shared: Rc<Shared>,
     pub(crate) number: usize,
     pub(crate) clock: Rc<LinkClock>,
-    pub(crate) learned: Option<daemon::SaveSlot<'a>>,
+    pub(crate) save_slot: Option<daemon::SaveSlot<'a>>,
     /// A planted defect owes the first ring.
     is_owed: Cell<bool>,
 }
 
-impl<'a> Around<'a> {
+impl<'a> SimPlatform<'a> {
     /// Of a hub that began at the world's present time.
     pub(crate) fn new(
         shared: &Rc<Shared>,
@@ -38,8 +38,8 @@ impl<'a> Around<'a> {
     ) -> Self {
         let clock = Rc::new(LinkClock::default());
         clock.pass(shared.clock.get());
-        let learned = queue.and_then(|queue| queue.slot(sensor));
-        Around { shared: shared.clone(), number, clock, learned, is_owed: Cell::default() }
+        let save_slot = queue.and_then(|queue| queue.slot(sensor));
+        SimPlatform { shared: shared.clone(), number, clock, save_slot, is_owed: Cell::default() }
     }
 
     /// Whoever sleeps for topics of `ring` will hear it.
@@ -58,7 +58,7 @@ impl<'a> Around<'a> {
     }
 }
 
-impl Surroundings for Around<'_> {
+impl Platform for SimPlatform<'_> {
     type Line = OpenLine;
     type Medium<P: Payload + ?Sized> = Carrier<P>;
 
@@ -145,14 +145,14 @@ impl Surroundings for Around<'_> {
         }
     }
 
-    fn tell(&self, _: Wake) {
+    fn notify_event(&self, _: Wake) {
         // Nobody here listens to the event.
         if self.is_owed.take() {
             self.rouse(Ring::First);
         }
     }
 
-    fn recall(&self, name: &str, record: &mut [u8]) -> Option<usize> {
+    fn load_record(&self, name: &str, record: &mut [u8]) -> Option<usize> {
         let records = self.shared.records.borrow();
         let known = records.get(name)?;
         let len = known.len().min(record.len());
@@ -160,14 +160,14 @@ impl Surroundings for Around<'_> {
         Some(len)
     }
 
-    fn remember(&self, name: &str, record: &[u8]) {
+    fn store_record(&self, name: &str, record: &[u8]) {
         let mut records = self.shared.records.borrow_mut();
         let kept = records.entry(name.to_owned()).or_default();
         kept.clear();
         kept.extend_from_slice(record);
     }
 
-    fn learned(&self) -> Option<&dyn Learned> {
-        self.learned.as_ref().map(|learned| learned as &dyn Learned)
+    fn saved_state(&self) -> Option<&dyn SavedState> {
+        self.save_slot.as_ref().map(|slot| slot as &dyn SavedState)
     }
 }
