@@ -11,11 +11,11 @@ use serde_json::Value;
 use shm::Payload;
 use sim::Arrival;
 use sim::device::Device;
-use sim::ld::{Head, HeadSettings, Packets};
-use sim::machine::{self, Machine, Start};
+use sim::ld::{LdSettings, LdSimulator, Packets};
+use sim::machine::{self, LmsSimulator, Start};
 use sim::operating::Operating;
 use sim::room::Room;
-use sim::rplidar::{Model, Unit, UnitSettings, UnitStart};
+use sim::rplidar::{Model, RplidarSettings, RplidarSimulator, RplidarStart};
 
 use crate::replayed::recorded_rooms::virtual_hub::{VirtualLink, virtual_hub};
 use crate::testkit::{INT, TERM, TestEnv};
@@ -189,18 +189,18 @@ fn a_port_of_the_hub_is_refused_with_what_the_hub_reports_and_the_next_command()
 /// Scanners that stream, with the name that the message has for each.
 fn scanners() -> [(&'static str, Box<dyn Device>); 3] {
     let room = || Room::new(&"room".parse().expect("a world"), 7);
-    let head = HeadSettings { seed: 7, ..HeadSettings::of(ld::Model::Ld19) };
+    let head = LdSettings { seed: 7, ..LdSettings::of(ld::Model::Ld19) };
     let machine = machine::Settings {
         baud: Baud::B500000,
         start: Start::In(Operating::All),
         seed: 7,
         ..machine::Settings::default()
     };
-    let unit = UnitSettings { start: UnitStart::Streaming, seed: 7, ..UnitSettings::of(Model::A1) };
+    let unit = RplidarSettings { start: RplidarStart::Streaming, seed: 7, ..RplidarSettings::of(Model::A1) };
     [
-        ("ld19", Box::new(Head::new(head, Packets::Room(Box::new(room()))))),
-        ("lms scanner", Box::new(Machine::new(machine, sim::source::Source::Room(room())))),
-        ("a1", Box::new(Unit::new(unit, room()))),
+        ("ld19", Box::new(LdSimulator::new(head, Packets::Room(Box::new(room()))))),
+        ("lms scanner", Box::new(LmsSimulator::new(machine, sim::operating::Source::Room(room())))),
+        ("a1", Box::new(RplidarSimulator::new(unit, room()))),
     ]
 }
 

@@ -12,7 +12,7 @@ use schema::Failure;
 use serde_json::Value;
 use sim::fault::Faults;
 use sim::options::SimulateOptions;
-use sim::truth::Summary;
+use sim::simulate::Summary;
 use sim::{Event, simulate_with};
 
 use crate::testkit::{PATIENCE, TERM, TestEnv, is_class};

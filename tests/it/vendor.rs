@@ -11,9 +11,9 @@ use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use serde_json::Value;
 use sim::Arrival;
 use sim::device::Device;
-use sim::pty::Pty;
+use sim::port::Pty;
 use sim::room::Room;
-use sim::rplidar::{Model, Unit, UnitSettings};
+use sim::rplidar::{Model, RplidarSettings, RplidarSimulator};
 use sim::world::World;
 
 use crate::testkit::{Program, python_for};
@@ -50,7 +50,7 @@ fn off(x: f64, y: f64) -> f64 {
 }
 
 /// Serves `unit` at the other end of `pty` until `driver` is over.
-fn serve(unit: &mut Unit, pty: &Pty, driver: &Program) {
+fn serve(unit: &mut RplidarSimulator, pty: &Pty, driver: &Program) {
     let mut now = 0;
     let mut unread = Vec::new();
     while !driver.is_over() {
@@ -94,8 +94,8 @@ fn the_vendors_driver_sees_the_simulated_room_in_every_form_of_packet() {
     ] {
         let Some(mut command) = python_for("rplidar-driver", "pyrplidarsdk") else { return };
         let typical = model.modes().iter().position(|known| known.name == mode).expect("a mode");
-        let settings = UnitSettings { typical, ..UnitSettings::of(model) };
-        let mut unit = Unit::new(settings, Room::new(&world, 0));
+        let settings = RplidarSettings { typical, ..RplidarSettings::of(model) };
+        let mut unit = RplidarSimulator::new(settings, Room::new(&world, 0));
         let pty = Pty::open().expect("a pty");
         command.arg(script).arg(pty.name()).args([&model.baud().to_string(), "12"]);
         let driver = Program::start(command);

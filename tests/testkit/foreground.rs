@@ -10,7 +10,7 @@ use preprocess::background::{Class, Model, Settings};
 use scanhub_drivers::lms;
 use scanhub_drivers::lms::variant::{Unit, Variant};
 use schema::{Foreground, Scan};
-use sim::labeled_scan::Met;
+use sim::room::BeamTarget;
 use sim::room::Room;
 use sim::world::World;
 
@@ -51,15 +51,15 @@ const OLD_S: f64 = 20.0;
 pub(crate) struct LabeledScan {
     pub(crate) scan: Box<Scan>,
     pub(crate) expected: Vec<Expected>,
-    pub(crate) met: Vec<Met>,
+    pub(crate) met: Vec<BeamTarget>,
 }
 
 /// Returns the scans of `scene` with random numbers from `seed`.
 pub(crate) fn play(scene: &Scene, seed: u64) -> Vec<LabeledScan> {
     let world: World = scene.world.parse().expect("a world that the program brings along");
-    let mut layers = world.layers().expect("a world with noise");
+    let mut layers = world.noise().expect("a world with noise");
     layers.spot &= scene.mixed;
-    let room = Room::new(&world.with_layers(layers), seed);
+    let room = Room::new(&world.with_noise(layers), seed);
     (1..=SCANS).map(|number| frame(&room, scene.unit, number)).collect()
 }
 
@@ -71,13 +71,15 @@ fn frame(room: &Room, unit: Unit, number: u64) -> LabeledScan {
     LabeledScan { scan, expected, met: look.truth }
 }
 
-fn expected_of(scan: &Scan, i: usize, met: Met, end_ns: u64) -> Expected {
+fn expected_of(scan: &Scan, i: usize, met: BeamTarget, end_ns: u64) -> Expected {
     match met {
         _ if scan.range(i).is_none() => Expected::Neither,
-        Met::Person => Expected::Foreground,
-        Met::Box { since_ns } if end_ns.saturating_sub(since_ns) as f64 <= OLD_S * 1e9 => Expected::New,
-        Met::Static { .. } | Met::Box { .. } => Expected::Other,
-        Met::Grazed | Met::Invalid => Expected::Neither,
+        BeamTarget::Person => Expected::Foreground,
+        BeamTarget::Box { since_ns } if end_ns.saturating_sub(since_ns) as f64 <= OLD_S * 1e9 => {
+            Expected::New
+        }
+        BeamTarget::Static { .. } | BeamTarget::Box { .. } => Expected::Other,
+        BeamTarget::Grazed | BeamTarget::Invalid => Expected::Neither,
     }
 }
 
@@ -197,7 +199,7 @@ impl Share {
 impl Boxes {
     /// Adds a run of `frames`. `make` creates the method with an empty background.
     pub(crate) fn add(&mut self, make: impl Fn() -> Box<dyn Detector>, frames: &[LabeledScan]) {
-        let first = |is: fn(&Met) -> bool| {
+        let first = |is: fn(&BeamTarget) -> bool| {
             frames.iter().position(|frame| frame.met.iter().any(is)).expect("boxes come and go in this room")
         };
         let at = first(is_new) + N;
@@ -229,17 +231,17 @@ impl Boxes {
     }
 }
 
-fn is_new(met: &Met) -> bool {
-    matches!(met, Met::Box { .. })
+fn is_new(met: &BeamTarget) -> bool {
+    matches!(met, BeamTarget::Box { .. })
 }
 
 /// Whether the beam meets the place from which an object was taken away.
-fn is_bare(met: &Met) -> bool {
-    matches!(met, Met::Static { since_ns: 1.. })
+fn is_bare(met: &BeamTarget) -> bool {
+    matches!(met, BeamTarget::Static { since_ns: 1.. })
 }
 
-fn is_still(met: &Met) -> bool {
-    matches!(met, Met::Static { since_ns: 0 })
+fn is_still(met: &BeamTarget) -> bool {
+    matches!(met, BeamTarget::Static { since_ns: 0 })
 }
 
 /// Returns the answers of `method` for `scan` after it has seen `before`.

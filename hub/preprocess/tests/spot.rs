@@ -11,8 +11,8 @@ use preprocess::marks::{MarkDetector, Settings as MarkSettings};
 use preprocess::segments::Segmenter;
 use scanhub_drivers::lms::variant::{Unit, Variant};
 use schema::{Foreground, Lines, Marks, Pose, Scan};
-use sim::labeled_scan::Met;
-use sim::layers::Layers;
+use sim::beam::NoiseModel;
+use sim::room::BeamTarget;
 use sim::room::Room;
 use sim::world::World;
 
@@ -22,19 +22,19 @@ const WORLDS: [&str; 5] = ["room", "fig8", "crowd", "house", "demo"];
 /// A seed that nothing was tuned on.
 const SEED: u64 = 20;
 
-fn room(name: &str, change: impl Fn(Layers) -> Layers) -> Room {
+fn room(name: &str, change: impl Fn(NoiseModel) -> NoiseModel) -> Room {
     let world: World = name.parse().expect("a world that the program brings along");
-    let layers = change(world.layers().expect("a world with noise"));
-    Room::of_port(&world.with_layers(layers), SEED, 0)
+    let layers = change(world.noise().expect("a world with noise"));
+    Room::of_port(&world.with_noise(layers), SEED, 0)
 }
 
 /// Returns the rooms of a world, as its file has it and with beams without width.
 fn wide_and_narrow(name: &str) -> [Room; 2] {
-    [room(name, |layers| layers), room(name, |layers| Layers { spot: false, ..layers })]
+    [room(name, |layers| layers), room(name, |layers| NoiseModel { spot: false, ..layers })]
 }
 
 /// Returns the scan that the hub publishes, and what its beams met.
-fn look(room: &Room, number: u64) -> (Box<Scan>, Vec<Met>) {
+fn look(room: &Room, number: u64) -> (Box<Scan>, Vec<BeamTarget>) {
     let look = room.labeled_scan(Variant::HALF, Unit::Mm, decoded_scan::MODE, number * SCAN_NS);
     (decoded_scan::scan(&look.words, Unit::Mm), look.truth)
 }
@@ -53,7 +53,7 @@ fn false_segments(room: &Room) -> [usize; 2] {
         // First, the background is learned.
         for (i, segment) in foreground.segments().iter().enumerate().filter(|_| number >= 600) {
             let met = &met[usize::from(segment.first)..=usize::from(segment.last)];
-            if met.iter().all(|met| *met == (Met::Static { since_ns: 0 })) {
+            if met.iter().all(|met| *met == (BeamTarget::Static { since_ns: 0 })) {
                 all += 1;
                 supported += usize::from(foreground.has_support(i));
             }
@@ -93,7 +93,10 @@ fn false_lines(room: &Room, exact: &Room) -> [usize; 3] {
         finder.update(&scan, &mut lines);
         for line in lines.lines() {
             let beams = usize::from(line.first)..=usize::from(line.last);
-            if !met[beams.clone()].iter().all(|met| matches!(met, Met::Static { .. } | Met::Invalid)) {
+            if !met[beams.clone()]
+                .iter()
+                .all(|met| matches!(met, BeamTarget::Static { .. } | BeamTarget::Invalid))
+            {
                 continue;
             }
             let (mut is_mixed, mut off_m) = (false, Vec::new());
@@ -119,7 +122,7 @@ fn false_lines(room: &Room, exact: &Room) -> [usize; 3] {
 fn values_between_make_no_lines() {
     let mut sums = [0; 3];
     for name in WORLDS {
-        let exact = room(name, |layers| Layers { comb: layers.comb, ..Layers::NONE });
+        let exact = room(name, |layers| NoiseModel { comb: layers.comb, ..NoiseModel::NONE });
         let [wide, narrow] = wide_and_narrow(name).each_ref().map(|room| false_lines(room, &exact));
         println!("{name}: [lines, with a value between, false] {wide:?}; beams without width: {narrow:?}");
         sums.iter_mut().zip(wide).for_each(|(sum, count)| *sum += count);
@@ -130,7 +133,7 @@ fn values_between_make_no_lines() {
 
 /// A reflecting strip that stands squarely to its beam, half a meter in front of a wall. Its scans have the usual noise, but
 /// no constant error of the device, and no codes, which part a mark.
-fn strip(width_mm: f64, range_mm: f64, angle_deg: f64, layers: Layers, seed: u64) -> Room {
+fn strip(width_mm: f64, range_mm: f64, angle_deg: f64, layers: NoiseModel, seed: u64) -> Room {
     let (sin, cos) = angle_deg.to_radians().sin_cos();
     let board = |width_mm: f64, range_mm: f64, surface: &str| {
         let (half, x, y) = (width_mm / 2.0, -range_mm * sin, range_mm * cos);
@@ -140,11 +143,11 @@ fn strip(width_mm: f64, range_mm: f64, angle_deg: f64, layers: Layers, seed: u64
     };
     let text = board(width_mm, range_mm, "reflector") + &board(3_000.0, range_mm + 500.0, "plain");
     let world = World::of_toml("strip.toml", &text).expect("a world");
-    Room::new(&world.with_layers(Layers { bias_mm: 0.0, errors: 0.0, ..layers }), seed)
+    Room::new(&world.with_noise(NoiseModel { bias_mm: 0.0, errors: 0.0, ..layers }), seed)
 }
 
 /// RMS errors of angle in degrees and range in mm, and the number of scans without a mark.
-fn mark_errors(width_mm: f64, range_mm: f64, layers: Layers, random: &mut Rng) -> (f64, f64, u32) {
+fn mark_errors(width_mm: f64, range_mm: f64, layers: NoiseModel, random: &mut Rng) -> (f64, f64, u32) {
     let mut detector = MarkDetector::new(MarkSettings::default());
     let mut marks = Marks::default();
     let (mut of_angle, mut of_range, mut missing) = (0.0, 0.0, 0);
@@ -173,8 +176,8 @@ fn marks_are_exact_to_a_tenth_of_a_degree_and_to_five_millimetres() {
     println!("RMS errors of marks and scans without one, {TRIALS} scans each; beams without width");
     for range_m in 1..=8 {
         for width_mm in [50.0, 100.0] {
-            let layers = Layers::default();
-            let [(deg, mm, missing), narrow] = [layers, Layers { spot: false, ..layers }]
+            let layers = NoiseModel::default();
+            let [(deg, mm, missing), narrow] = [layers, NoiseModel { spot: false, ..layers }]
                 .map(|layers| mark_errors(width_mm, 1000.0 * f64::from(range_m), layers, &mut random));
             println!("{range_m} m, {width_mm} mm: {deg:.3} deg, {mm:.2} mm, {missing}; {narrow:.3?}");
             // At 7 and 8 m, the narrow strip is 0.41 and 0.36 degrees wide. Often it has one beam only, wherever that meets

@@ -8,11 +8,11 @@ use scanhub_drivers::{Settings, ld, rplidar};
 use schema::{MILLIS, Nanos, line_time};
 use sim::Arrival;
 use sim::device::Device;
-use sim::ld::{Head, HeadSettings, Packets};
-use sim::pty::now_ns;
+use sim::ld::{LdSettings, LdSimulator, Packets};
+use sim::port::now_ns;
 
 use sim::room::Room;
-use sim::rplidar::{Unit, UnitSettings};
+use sim::rplidar::{RplidarSettings, RplidarSimulator};
 use sim::world::World;
 
 fn room() -> Room {
@@ -105,7 +105,7 @@ fn main() {
     println!("| model | beams | of points collapsed | of beams not measured |\n|---|---|---|---|");
     for model in [ld::Model::Ld19, ld::Model::Stl27l, ld::Model::Ld14p] {
         let session = ld::Session::new(Settings { model: Some(model.name()), ..Settings::default() }, 0);
-        let head = Head::new(HeadSettings::of(model), Packets::Room(Box::new(room())));
+        let head = LdSimulator::new(LdSettings::of(model), Packets::Room(Box::new(room())));
         let a_turn = model.points_per_second() / model.turns_per_second();
         let percents = [67, 80, 90, 95, 99, 100, 101, 105, 110, 120, 133];
         rows(model.name(), a_turn as usize, &turns(session, head, 30).0, &percents);
@@ -117,7 +117,7 @@ fn main() {
                 mode: rplidar::Mode::named(mode.name).map(rplidar::Mode::name),
                 ..Settings::default()
             };
-            let unit = Unit::new(UnitSettings::of(simulated), room());
+            let unit = RplidarSimulator::new(RplidarSettings::of(simulated), room());
             let (turns, beams) = turns(rplidar::Session::new(settings, 0), unit, 30);
             rows(&format!("{} {}", simulated.name(), mode.name), beams, &turns, &[80, 90, 100, 110, 120]);
         }

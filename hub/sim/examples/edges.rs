@@ -9,8 +9,8 @@ use std::collections::BTreeMap;
 use std::ops::Range;
 
 use scanhub_drivers::lms::variant::{Mode, Unit, Variant};
-use sim::labeled_scan::Met;
-use sim::layers::Layers;
+use sim::beam::NoiseModel;
+use sim::room::BeamTarget;
 use sim::room::Room;
 
 /// An edge in a scan.
@@ -95,8 +95,8 @@ struct World {
 impl World {
     fn measure(world: &sim::world::World) -> World {
         let mut found = World::default();
-        let layers = Layers { spot: false, ..world.layers().unwrap_or_default() };
-        let without_width = world.clone().with_layers(layers);
+        let layers = NoiseModel { spot: false, ..world.noise().unwrap_or_default() };
+        let without_width = world.clone().with_noise(layers);
         for seed in 1..=SEEDS {
             for sensor in 0..world.sensors() {
                 let [wide, narrow] =
@@ -113,7 +113,7 @@ impl World {
                     let is_mixed = |edge: &Edge| (edge.beam..edge.beam + edge.between.len()).all(is_off);
                     for edge in edges(&ranges).into_iter().filter(is_mixed) {
                         found.all.add(&edge);
-                        if look.truth[edge.near] == Met::Person {
+                        if look.truth[edge.near] == BeamTarget::Person {
                             found.legs.add(&edge);
                         } else if let [share] = edge.between[..] {
                             found.places.entry((seed, sensor, edge.beam)).or_default().push(share);

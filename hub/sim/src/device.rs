@@ -1,61 +1,64 @@
-//! What is at the sensor's end of a line, as the line sees it: chunks of bytes with the time at which they are through go
-//! out, the host's bytes come in. Knows no family.
+//! The scanner's end of a line: the trait of every simulated scanner, and its transmitter.
 //!
-//! To drive one, call [`Device::poll_transmit`] until it returns `None`, pass the host's bytes, and call again at
-//! [`Device::poll_timeout`].
+//! To drive a scanner, call [`Device::poll_transmit`] until it returns `None`, pass the host's bytes, and call again at
+//! [`Device::poll_timeout`]. [`Transmission`] sends one telegram or single byte at the rate of the line, in the chunks
+//! that the receiver's hardware delivers, and [`TxQueue`] everything that a rotating scanner sends.
 
-use schema::Nanos;
+use std::collections::VecDeque;
+
+use scanhub_drivers::lms::variant::{BYTES_PER_TURN, MIRROR_TURN};
+use schema::{Nanos, line_time};
 
 use crate::request_decoder::{Arrival, Dropped};
 
-/// A simulated sensor.
+/// A simulated scanner.
 pub trait Device {
-    /// The next bytes that are through at `now`.
+    /// Returns the next chunk whose transmission is complete at `now`.
     fn poll_transmit(&mut self, now: Nanos) -> Option<Chunk>;
 
-    /// When there will be something to transmit.
+    /// Returns the time at which the next chunk is complete.
     fn poll_timeout(&self) -> Option<Nanos>;
 
-    /// Hears a byte of the host. Call it after [`Device::poll_transmit`] answered `None` for `arrival.not_after`.
+    /// Receives a byte of the host. Call it after [`Device::poll_transmit`] returned `None` for `arrival.not_after`.
     fn receive(&mut self, byte: u8, arrival: Arrival);
 
-    /// The power goes off and on. Returns whether a telegram was broken off.
+    /// Switches the power off and on. Returns whether a telegram was broken off.
     fn power_cycle(&mut self, now: Nanos) -> bool;
 
-    /// The voltage dips at `now`, and the sensor restarts by itself. Returns whether a telegram was broken off.
+    /// Lets the voltage dip at `now`, so that the scanner restarts. Returns whether a telegram was broken off.
     fn brown_out(&mut self, now: Nanos) -> bool {
         self.power_cycle(now)
     }
 
-    /// Breaks off what it is sending; a stream continues with a whole telegram.
+    /// Breaks off the current telegram. A stream continues with a whole telegram.
     fn break_off(&mut self, now: Nanos);
 
-    /// The rate at which it speaks and hears now, in bits per second.
+    /// Returns the rate of the line in bits per second.
     fn rate(&self) -> u32;
 
-    /// Whether it sends unasked now.
+    /// Returns whether the scanner streams.
     fn streams(&self) -> bool;
 
-    /// Bytes of each of its telegrams, if they all have as many; else they say it themselves.
+    /// Returns the length of a telegram, if all have the same. Otherwise each telegram contains its length.
     fn telegram_len(&self) -> Option<usize>;
 
-    /// The last request that it dropped because of its gaps; returned once.
+    /// Returns the last request that the scanner dropped because of its gaps. Returns it once.
     fn take_dropped(&mut self) -> Option<Dropped>;
 
-    /// Requests heard that would change what it keeps without power, done or refused.
+    /// Returns the number of requests that would change the permanent settings, carried out or refused.
     fn eeprom_writes(&self) -> u64;
 }
 
-/// Bytes that the host's hardware hands over at once.
+/// Bytes that the host's hardware delivers at once.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Chunk {
-    /// Up to 62 bytes; none at the end of a telegram that was broken off between two bursts.
+    /// Up to 62 bytes; empty at the end of a telegram that was broken off between two bursts.
     pub bytes: Vec<u8>,
-    /// The rate they were sent at, in bits per second.
+    /// Rate of the line in bits per second.
     pub rate: u32,
     /// Whether the line is idle after them.
     pub idle_after: bool,
-    /// What they are part of.
+    /// Position in the telegram.
     pub part: Part,
 }
 
@@ -64,19 +67,255 @@ pub struct Chunk {
 pub enum Part {
     /// A single ACK or NAK.
     Acknowledge,
-    /// Bytes of a telegram, not its last ones.
+    /// Bytes of a telegram, without its last byte.
     Telegram,
-    /// The last bytes of a telegram that leave.
+    /// The last bytes of a telegram.
     End(Sent),
 }
 
-/// A telegram that has left.
+/// A telegram that was sent.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Sent {
-    /// Measured values of the stream, or a reply.
+    /// Whether it is a reply, and not data of the stream.
     pub is_reply: bool,
-    /// The telegram as it should have been.
+    /// The intact telegram.
     pub telegram: Vec<u8>,
-    /// Whether it was broken off, by a request or by the power.
+    /// Whether it was broken off by a request or a power cycle.
     pub aborted: bool,
+}
+
+/// Number of bytes that the receiving hardware collects before its driver receives them.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum ChunkSize {
+    /// A 16550's FIFO: 16 bytes.
+    Uart,
+    /// A full-speed USB packet of a common adapter, without its two status bytes: 62 bytes.
+    Usb,
+}
+
+impl ChunkSize {
+    /// Returns the number of bytes: 16 or 62.
+    pub fn bytes(self) -> usize {
+        match self {
+            ChunkSize::Uart => 16,
+            ChunkSize::Usb => 62,
+        }
+    }
+}
+
+/// Transmission of bytes, one after the other from a start time on.
+#[derive(Debug)]
+pub(crate) struct Transmission<T> {
+    bytes: Vec<u8>,
+    /// Number of bytes to send: all, or fewer if the transmission was broken off.
+    leaving: usize,
+    handed: usize,
+    start_ns: Nanos,
+    rate: u32,
+    chunk: usize,
+    /// Value of the sender, for use at the end of the transmission.
+    pub(crate) tag: T,
+}
+
+impl<T> Transmission<T> {
+    /// Creates a transmission of `bytes` (at least one) from `start_ns` on.
+    pub(crate) fn new(bytes: Vec<u8>, start_ns: Nanos, rate: u32, chunk: ChunkSize, tag: T) -> Self {
+        let leaving = bytes.len();
+        Transmission { bytes, leaving, handed: 0, start_ns, rate, chunk: chunk.bytes(), tag }
+    }
+
+    /// Returns the time at which the next chunk is complete.
+    pub(crate) fn next_chunk_ns(&self) -> Nanos {
+        self.through_ns(self.chunk_end())
+    }
+
+    /// Returns the end of the last byte.
+    pub(crate) fn end_ns(&self) -> Nanos {
+        self.through_ns(self.leaving)
+    }
+
+    /// Returns the start of the first byte.
+    pub(crate) fn start_ns(&self) -> Nanos {
+        self.start_ns
+    }
+
+    /// Delays the start to `at_ns`, unless it is later already. Call it before the first byte was taken.
+    pub(crate) fn start_no_earlier(&mut self, at_ns: Nanos) {
+        self.start_ns = self.start_ns.max(at_ns);
+    }
+
+    /// Returns the rate of the line in bits per second.
+    pub(crate) fn rate(&self) -> u32 {
+        self.rate
+    }
+
+    /// Returns the next chunk, if it is complete at `now`, and whether the line is idle after it. The chunk is empty if
+    /// the transmission was broken off between two bursts.
+    pub(crate) fn take_chunk(&mut self, now: Nanos) -> Option<(&[u8], bool)> {
+        if self.next_chunk_ns() > now {
+            return None;
+        }
+        let (from, to) = (self.handed, self.chunk_end());
+        self.handed = to;
+        Some((&self.bytes[from..to], to == self.leaving || to % BYTES_PER_TURN == 0))
+    }
+
+    /// Returns whether every byte to send was taken.
+    pub(crate) fn is_done(&self) -> bool {
+        self.handed == self.leaving
+    }
+
+    /// Returns whether the transmission was broken off before its last byte.
+    pub(crate) fn is_broken(&self) -> bool {
+        self.leaving < self.bytes.len()
+    }
+
+    /// Ends the transmission with the byte that is in the transmitter at `now`.
+    pub(crate) fn break_off(&mut self, now: Nanos) {
+        let byte_ns = line_time(1, self.rate);
+        let begun = (0..self.leaving).take_while(|&i| self.through_ns(i + 1) - byte_ns <= now).count();
+        self.leaving = begun.max(self.handed).max(1);
+    }
+
+    /// Returns all bytes, including those that were not sent, and the tag.
+    pub(crate) fn into_parts(self) -> (Vec<u8>, T) {
+        (self.bytes, self.tag)
+    }
+
+    /// Returns the end of the first `count` (at least 1) bytes. If 508 bytes need less time than a turn of the mirror,
+    /// the rest waits for the next turn.
+    fn through_ns(&self, count: usize) -> Nanos {
+        let rate = self.rate;
+        let turns = (count - 1) / BYTES_PER_TURN;
+        let turn_ns = MIRROR_TURN.max(line_time(BYTES_PER_TURN, rate));
+        self.start_ns + turns as Nanos * turn_ns + line_time(count - turns * BYTES_PER_TURN, rate)
+    }
+
+    fn chunk_end(&self) -> usize {
+        let turn_end = (self.handed / BYTES_PER_TURN + 1) * BYTES_PER_TURN;
+        (self.handed + self.chunk).min(turn_end).min(self.leaving)
+    }
+}
+
+/// Transmit queue of a rotating scanner. It sends one telegram after the other.
+#[derive(Debug)]
+pub(crate) struct TxQueue {
+    /// The transmissions. The tag is whether the telegram is a reply.
+    queue: VecDeque<Transmission<bool>>,
+    chunk: ChunkSize,
+    rate: u32,
+    free_ns: Nanos,
+}
+
+impl TxQueue {
+    /// Creates a queue that sends at `rate` bits per second, in chunks of the size `chunk`.
+    pub(crate) fn new(rate: u32, chunk: ChunkSize) -> TxQueue {
+        TxQueue { queue: VecDeque::new(), chunk, rate, free_ns: 0 }
+    }
+
+    /// Sends `telegram` after everything before it, at `at_ns` at the earliest.
+    pub(crate) fn send(&mut self, telegram: Vec<u8>, at_ns: Nanos, is_reply: bool) {
+        let start_ns = at_ns.max(self.free_ns);
+        let transmission = Transmission::new(telegram, start_ns, self.rate, self.chunk, is_reply);
+        self.free_ns = transmission.end_ns();
+        self.queue.push_back(transmission);
+    }
+
+    /// Returns the next chunk, if it is complete at `now`.
+    pub(crate) fn take(&mut self, now: Nanos) -> Option<Chunk> {
+        let rate = self.rate;
+        let front = self.queue.front_mut()?;
+        let (bytes, idle_after) = front.take_chunk(now)?;
+        let bytes = bytes.to_vec();
+        if !front.is_done() {
+            return Some(Chunk { bytes, rate, idle_after, part: Part::Telegram });
+        }
+        let front = self.queue.pop_front()?;
+        let aborted = front.is_broken();
+        let (telegram, is_reply) = front.into_parts();
+        Some(Chunk { bytes, rate, idle_after, part: Part::End(Sent { is_reply, telegram, aborted }) })
+    }
+
+    /// Returns the time at which the next chunk is complete, or `None` if the queue is empty.
+    pub(crate) fn next_ns(&self) -> Option<Nanos> {
+        self.queue.front().map(Transmission::next_chunk_ns)
+    }
+
+    /// Returns the end of the last telegram.
+    pub(crate) fn free_ns(&self) -> Nanos {
+        self.free_ns
+    }
+
+    /// Breaks off the current telegram and drops the rest. Returns whether a telegram was broken off.
+    pub(crate) fn break_off(&mut self, now: Nanos) -> bool {
+        self.queue.retain(|transmission| transmission.start_ns() <= now);
+        let mut broken = false;
+        self.free_ns = now;
+        for transmission in &mut self.queue {
+            transmission.break_off(now);
+            broken |= transmission.is_broken();
+            self.free_ns = transmission.end_ns().max(now);
+        }
+        broken
+    }
+
+    /// Drops the data whose transmission has not started.
+    pub(crate) fn forget_data(&mut self, now: Nanos) {
+        self.queue.retain(|transmission| transmission.tag || transmission.start_ns() <= now);
+        self.free_ns = self.queue.back().map_or(now, Transmission::end_ns);
+    }
+
+    /// Returns the rate of the line in bits per second.
+    pub(crate) fn rate(&self) -> u32 {
+        self.rate
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use schema::MICROS;
+
+    use super::*;
+
+    fn times(mut transmission: Transmission<()>) -> Vec<(usize, Nanos, bool)> {
+        let mut all = Vec::new();
+        while !transmission.is_done() {
+            let at = transmission.next_chunk_ns();
+            assert_eq!(transmission.take_chunk(at - 1), None);
+            let (bytes, idle) = transmission.take_chunk(at).unwrap();
+            all.push((bytes.len(), at, idle));
+        }
+        all
+    }
+
+    #[test]
+    fn sends_half_degree_scan_at_500k_in_two_bursts() {
+        let chunks = times(Transmission::new(vec![7; 732], 0, 500_000, ChunkSize::Uart, ()));
+        assert_eq!(chunks.iter().map(|c| c.0).sum::<usize>(), 732);
+        assert_eq!(chunks[0], (16, 320 * MICROS, false));
+        assert_eq!(chunks[31], (12, 10_160 * MICROS, true));
+        assert_eq!(chunks[32], (16, 13_640 * MICROS, false));
+        assert_eq!(*chunks.last().unwrap(), (16, 17_800 * MICROS, true));
+        let usb = times(Transmission::new(vec![7; 732], 0, 500_000, ChunkSize::Usb, ()));
+        assert_eq!(usb.len(), 13);
+    }
+
+    #[test]
+    fn a_slow_line_does_not_pause() {
+        let chunks = times(Transmission::new(vec![7; 732], 5, 38_400, ChunkSize::Uart, ()));
+        let longest = chunks.windows(2).map(|w| w[1].1 - w[0].1).max().unwrap();
+        assert!(longest <= line_time(16, 38_400) + 1);
+        assert_eq!(chunks.last().unwrap().1, 5 + line_time(508, 38_400) + line_time(224, 38_400));
+    }
+
+    #[test]
+    fn breaks_off_after_byte_in_transmitter() {
+        let mut transmission = Transmission::new(vec![7; 732], 0, 500_000, ChunkSize::Uart, ());
+        assert!(transmission.take_chunk(320 * MICROS).is_some());
+        transmission.break_off(405 * MICROS);
+        // Byte 20 began at 400 us.
+        assert_eq!(transmission.end_ns(), 420 * MICROS);
+        assert_eq!(transmission.take_chunk(420 * MICROS), Some((&[7; 5][..], true)));
+        assert!(transmission.is_done() && transmission.is_broken());
+    }
 }

@@ -17,7 +17,7 @@ use std::str::FromStr;
 use scanhub_drivers::lms;
 use schema::{Failure, Kind, MILLIS, Nanos};
 
-use crate::machine::Habits;
+use crate::machine::ProtocolQuirks;
 
 /// First cause for which a telegram did not reach the host intact, as recorded in the truth. A telegram is intact if
 /// all its bytes arrive as sent and next to each other.
@@ -177,8 +177,8 @@ impl Faults {
     }
 
     /// Returns the faults that are deviations of the scanner from the protocol.
-    pub fn habits(&self) -> Habits {
-        Habits {
+    pub fn quirks(&self) -> ProtocolQuirks {
+        ProtocolQuirks {
             overlooks: self.overlook,
             naks: self.nak,
             doubles: self.twice,
@@ -716,14 +716,14 @@ mod tests {
             let text = faults.to_string();
             assert_eq!((text.parse(), text), (Ok(faults), format!("{}={}", key.name, key.max)));
         }
-        let habits = "overlook=0.5,late=1.5,refuse=0x3B,mute=1".parse::<Faults>().unwrap().habits();
-        assert_eq!((habits.overlooks, habits.late_reply_ns), (0.5, 1_500_000_000));
-        assert_eq!((habits.refuses, habits.mute), (vec![0x3B], true));
-        let habits = "strict_gap=1,answer=0.06".parse::<Faults>().unwrap().habits();
-        assert_eq!((habits.strict_gap, habits.answer_ns), (true, 60_000_000));
-        let habits = "late_mode=2.5,late_write=6".parse::<Faults>().unwrap().habits();
-        assert_eq!((habits.late_mode_ns, habits.late_write_ns), (2_500_000_000, 6_000_000_000));
-        assert_eq!(Faults::default().habits(), Habits::default());
+        let quirks = "overlook=0.5,late=1.5,refuse=0x3B,mute=1".parse::<Faults>().unwrap().quirks();
+        assert_eq!((quirks.overlooks, quirks.late_reply_ns), (0.5, 1_500_000_000));
+        assert_eq!((quirks.refuses, quirks.mute), (vec![0x3B], true));
+        let quirks = "strict_gap=1,answer=0.06".parse::<Faults>().unwrap().quirks();
+        assert_eq!((quirks.strict_gap, quirks.answer_ns), (true, 60_000_000));
+        let quirks = "late_mode=2.5,late_write=6".parse::<Faults>().unwrap().quirks();
+        assert_eq!((quirks.late_mode_ns, quirks.late_write_ns), (2_500_000_000, 6_000_000_000));
+        assert_eq!(Faults::default().quirks(), ProtocolQuirks::default());
     }
 
     #[test]

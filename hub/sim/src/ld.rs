@@ -1,5 +1,5 @@
-//! A scanner of LDROBOT, without a line and without a clock: its head turns and measures point by point, each at its
-//! own time, and each twelve of them leave as a packet. It never listens. Or it sends packets that were recorded.
+//! A simulated scanner of LDROBOT, without I/O. Its head rotates and measures point by point, each at its own time, and a
+//! packet has twelve points. It receives nothing. Instead of measuring, it can send recorded packets.
 
 use std::path::Path;
 
@@ -9,40 +9,40 @@ use scanhub_drivers::ld::packet::{CLOCK_TURN, Contents, LEN, POINTS, Packet, TUR
 use scanhub_drivers::lms::variant::{Mode, Unit};
 use schema::{Failure, Family, Kind, MILLIS, Nanos};
 
+use crate::device::ChunkSize;
+use crate::device::TxQueue;
 use crate::device::{Chunk, Device};
 use crate::request_decoder::{Arrival, Dropped};
 use crate::room::Room;
 use crate::rotating::{Beams, Rotation, ahead_deg};
-use crate::transmission::ChunkSize;
-use crate::transmission::TxQueue;
 
 pub use crate::rotating::TruePoint;
 
-/// How a scanner is.
+/// Settings of a scanner.
 #[derive(Clone, Copy, Debug)]
-pub struct HeadSettings {
-    /// Which one.
+pub struct LdSettings {
+    /// The model.
     pub model: Model,
-    /// Turns in a second, on the mean; by default the model's.
+    /// Mean revolutions per second; by default those of the model.
     pub turns_per_second: f64,
     /// Points per second; by default those of the model.
     pub points_per_second: f64,
-    /// By which share of that the speed goes up and down; real ones hold it within 1 %.
+    /// Share by which the speed varies. Real scanners stay within 1 %.
     pub wander: f64,
     /// Time constant of the spin-up after power-on, in seconds; 0 means full speed at once.
     pub spin_up_s: f64,
-    /// From power-on to the first packet.
+    /// Time from power-on to the first packet.
     pub boot_ns: Nanos,
-    /// How many bytes the host's hardware hands over at once.
+    /// Number of bytes that the host's hardware delivers at once.
     pub chunk: ChunkSize,
-    /// Of its speed.
+    /// Seed of the speed.
     pub seed: u64,
 }
 
-impl HeadSettings {
-    /// A `model` as it comes out of its box, switched on two seconds ago.
-    pub fn of(model: Model) -> HeadSettings {
-        HeadSettings {
+impl LdSettings {
+    /// Returns a `model` with factory settings that was switched on two seconds ago.
+    pub fn of(model: Model) -> LdSettings {
+        LdSettings {
             model,
             turns_per_second: f64::from(model.turns_per_second()),
             points_per_second: f64::from(model.points_per_second()),
@@ -55,27 +55,28 @@ impl HeadSettings {
     }
 }
 
-/// What a scanner sends.
+/// Source of the packets that a scanner sends.
 pub enum Packets {
-    /// What it sees of a room.
+    /// The scanner measures a room.
     Room(Box<Room>),
-    /// What another one sent: once, or again and again.
+    /// The scanner repeats recorded packets, once or in a loop.
     Recorded {
         /// The packets.
         packets: Vec<[u8; LEN]>,
-        /// Whether they begin again at their end.
+        /// Whether they restart at their end.
         looped: bool,
     },
 }
 
-/// The scanner.
-pub struct Head {
-    settings: HeadSettings,
+/// A simulated scanner of LDROBOT.
+pub struct LdSimulator {
+    settings: LdSettings,
     source: Source,
-    /// When its power came on, and when its head turns.
+    /// Time of power-on.
     power_ns: Nanos,
+    /// Time from which on the head rotates.
     turns_ns: Nanos,
-    /// Packets sent since it turns.
+    /// Number of packets since then.
     sent: u64,
     rotation: Rotation,
     tx_queue: TxQueue,
@@ -86,37 +87,37 @@ enum Source {
     Recorded {
         packets: Vec<[u8; LEN]>,
         looped: bool,
-        /// Milliseconds of the clock of the one that sent them, since the first one.
+        /// Time since the first packet by the clock of the recorded scanner, in milliseconds.
         passed_ms: u64,
     },
 }
 
-impl Head {
-    /// The scanner that `settings` describe, at time 0, when it turns already.
-    pub fn new(settings: HeadSettings, packets: Packets) -> Head {
+impl LdSimulator {
+    /// Creates the scanner that `settings` describe, at time 0. Its head rotates already.
+    pub fn new(settings: LdSettings, packets: Packets) -> LdSimulator {
         let source = match packets {
             Packets::Room(room) => Source::Room(Beams::new(*room)),
             Packets::Recorded { packets, looped } => Source::Recorded { packets, looped, passed_ms: 0 },
         };
-        let HeadSettings { turns_per_second, wander, seed, .. } = settings;
+        let LdSettings { turns_per_second, wander, seed, .. } = settings;
         let rotation = Rotation::new(turns_per_second, wander, 0.0, seed);
         let tx_queue = TxQueue::new(settings.model.baud(), settings.chunk);
-        Head { settings, source, power_ns: 0, turns_ns: 0, sent: 0, rotation, tx_queue }
+        LdSimulator { settings, source, power_ns: 0, turns_ns: 0, sent: 0, rotation, tx_queue }
     }
 
-    /// Makes it turn so many times in a second from its next packet on. The inertia of a real head is the caller's: of
-    /// two packets in a row the second is 5 % faster or slower at the most.
+    /// Changes the speed from the next packet on. The caller has to simulate the inertia of a real head, whose speed differs
+    /// by at most 5 % between two consecutive packets.
     pub fn set_speed(&mut self, turns_per_second: f64) {
         self.rotation.set_speed(self.seconds(self.sent * POINTS as u64), turns_per_second);
     }
 
-    /// Packets of a room that were begun since the head turns; each has the next twelve points.
+    /// Returns the number of packets of a room since the head rotates, including the current one. Each has twelve points.
     pub fn sent(&self) -> u64 {
         self.sent
     }
 
-    /// Point number `point` since the head turns, as it is, if it is not of the time before the last
-    /// [`set_speed`](Self::set_speed); a recording does not tell.
+    /// Returns point number `point` since the head rotates, without noise. It must not be before the last
+    /// [`set_speed`](Self::set_speed). A recording has no true points.
     pub fn truth(&mut self, point: u64) -> TruePoint {
         let (at_ns, clockwise_deg) = self.place(point);
         let range_mm = match &mut self.source {
@@ -126,18 +127,18 @@ impl Head {
         TruePoint { at_ns, clockwise_deg, range_mm }
     }
 
-    /// Where point number `point` is: degrees clockwise from the head's zero, 0 to 360.
+    /// Returns the clockwise angle of point number `point` from the head's zero, 0 to 360 degrees.
     pub fn clockwise_deg(&self, point: u64) -> f64 {
         self.place(point).1
     }
 
-    /// When point number `point` is measured, and where.
+    /// Returns time and clockwise angle of point number `point`.
     fn place(&self, point: u64) -> (Nanos, f64) {
         let seconds = self.seconds(point);
         (self.turns_ns + (seconds * 1e9) as Nanos, self.rotation.turns(seconds).fract() * 360.0)
     }
 
-    /// When point number `point` is measured, in seconds since the head turns.
+    /// Returns the time of point number `point`, in seconds since the head rotates.
     fn seconds(&self, point: u64) -> f64 {
         point as f64 / self.settings.points_per_second
     }
@@ -147,7 +148,7 @@ impl Head {
         let broken = self.tx_queue.break_off(now);
         self.power_ns = now;
         self.turns_ns = now + boot_ns;
-        let HeadSettings { turns_per_second, wander, seed, .. } = self.settings;
+        let LdSettings { turns_per_second, wander, seed, .. } = self.settings;
         (self.rotation, self.sent) = (Rotation::new(turns_per_second, wander, spin_up_s, seed), 0);
         if let Source::Recorded { passed_ms, .. } = &mut self.source {
             *passed_ms = 0;
@@ -155,16 +156,16 @@ impl Head {
         broken
     }
 
-    /// Packet number `number` of a room.
+    /// Returns packet number `number` of a room.
     fn measure(&mut self, number: u64) -> [u8; LEN] {
         let first = number * POINTS as u64;
         let places: [(Nanos, f64); POINTS] = std::array::from_fn(|i| self.place(first + i as u64));
         let model = self.settings.model;
         let Source::Room(beams) = &mut self.source else { return [0; LEN] };
         let points = places.map(|(at_ns, clockwise_deg)| {
-            let look = beams.measure(at_ns, ahead_deg(clockwise_deg));
-            match look.range_mm.filter(|range_mm| reach_mm(model).contains(range_mm)) {
-                Some(range_mm) => (range_mm.round() as u16, look.intensity),
+            let beam = beams.measure(at_ns, ahead_deg(clockwise_deg));
+            match beam.range_mm.filter(|range_mm| reach_mm(model).contains(range_mm)) {
+                Some(range_mm) => (range_mm.round() as u16, beam.intensity),
                 None => (0, 0),
             }
         });
@@ -176,18 +177,18 @@ impl Head {
         Contents { speed, start, points, end, millis: millis as u16 }.encode()
     }
 
-    /// When packet number `number` is complete; nothing if there is none.
+    /// Returns the time at which packet number `number` is complete; `None` at the end of a recording.
     fn due_ns(&self, number: u64) -> Option<Nanos> {
         match &self.source {
             Source::Room(_) => Some(self.place((number + 1) * POINTS as u64).0),
             Source::Recorded { packets, looped, passed_ms } => {
-                let is_there = (number as usize) < packets.len() || *looped && !packets.is_empty();
-                is_there.then(|| (self.turns_ns + passed_ms * MILLIS).max(self.tx_queue.free_ns()))
+                let exists = (number as usize) < packets.len() || *looped && !packets.is_empty();
+                exists.then(|| (self.turns_ns + passed_ms * MILLIS).max(self.tx_queue.free_ns()))
             }
         }
     }
 
-    /// Packet number `number`, which leaves now.
+    /// Returns packet number `number`, which is sent now.
     fn take(&mut self, number: u64) -> [u8; LEN] {
         let Source::Recorded { packets, passed_ms, .. } = &mut self.source else {
             return self.measure(number);
@@ -196,13 +197,13 @@ impl Head {
         let millis = |at: usize| Packet::check(&packets[at]).map_or(0, |packet| packet.millis());
         let next = (at + 1) % packets.len();
         let passed = (millis(next) + CLOCK_TURN - millis(at)) % CLOCK_TURN;
-        // From the end to the beginning the clock says nothing.
+        // The clock does not define the time from the last packet to the first.
         *passed_ms += if next == 0 { 1 } else { u64::from(passed.min(1_000)) };
         packets[at]
     }
 }
 
-impl Device for Head {
+impl Device for LdSimulator {
     fn poll_transmit(&mut self, now: Nanos) -> Option<Chunk> {
         if self.tx_queue.next_ns().is_none() {
             let start_ns = self.due_ns(self.sent).filter(|&at| at <= now)?;
@@ -253,16 +254,15 @@ impl Device for Head {
     }
 }
 
-/// The packets in the recording at `path`, of its sensor `sensor` if it has several; damaged ones left out.
+/// Returns the packets in the recording at `path`, without damaged ones. If it has several sensors, `sensor` selects one.
 ///
 /// # Errors
 ///
-/// [`Kind::Input`] if it cannot be read, or there are none; [`Kind::NoTopic`] and [`Kind::Usage`] as of
-/// [`Recording::of`].
+/// Returns [`Kind::Input`] if it cannot be read or has no packet, and the errors of [`Recording::of`].
 pub fn recorded(path: &Path, sensor: Option<&str>) -> Result<Vec<[u8; LEN]>, Failure> {
     let whole = Recording::open_line(path, Some(Family::Ld))?;
     let recording = sensor.map_or(Ok(whole.clone()), |sensor| whole.of(sensor))?;
-    // Packets are sent as they were: nothing of them is encoded.
+    // Packets are sent unchanged, so the encoding is not used.
     let frames = recording.telegrams(Encoding { unit: Unit::Mm, mode: Mode(1) })?;
     let of_family = frames.filter(|frame| frame.family == Family::Ld as u8);
     let packets: Vec<_> = of_family
@@ -277,10 +277,10 @@ pub fn recorded(path: &Path, sensor: Option<&str>) -> Result<Vec<[u8; LEN]>, Fai
     Ok(packets)
 }
 
-/// Time from a dip of the voltage to the first packet. Invented: it is not published.
+/// Time from a dip of the voltage to the first packet. It is invented, because the real one is not published.
 const RESTART_NS: Nanos = 300 * MILLIS;
 
-/// Between which ranges a model measures, by its data sheet.
+/// Returns the minimum and maximum range of `model` by its data sheet, in millimeters.
 fn reach_mm(model: Model) -> std::ops::RangeInclusive<f64> {
     match model {
         Model::Ld06 | Model::Ld19 | Model::Stl19p => 20.0..=12_000.0,

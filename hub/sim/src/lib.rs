@@ -2,43 +2,33 @@
 //!
 //! - [`machine`] is a SICK LMS 2xx, [`ld`] a scanner of LDROBOT, and [`rplidar`] one of Slamtec. They do no I/O, and
 //!   time is an argument.
-//! - [`world`] describes their surroundings, [`room`] measures them, [`mount`] tilts a scanner, and [`labeled_scan`]
-//!   has the true values.
-//! - [`wire`], [`fault`] and [`noise`] simulate the line.
-//! - [`pty`] is the only file that reads a clock.
+//! - [`world`] describes their surroundings, [`room`] measures them and has the true values, and [`mount`] tilts a
+//!   scanner.
+//! - [`wire`] and [`fault`] simulate the line.
+//! - [`port`] is the only file that reads a clock.
 //! - [`simulate()`] is the command.
 
+pub mod beam;
 pub mod device;
 pub mod fault;
-pub mod labeled_scan;
-pub mod layers;
 pub mod ld;
-mod line;
 pub mod machine;
 pub mod mount;
-pub mod noise;
 pub mod operating;
 pub mod options;
-pub mod pty;
+pub mod port;
 mod request_decoder;
 pub mod room;
 mod rotating;
 pub mod rplidar;
 mod scene;
-pub mod series;
 mod shape;
-mod simulate;
-mod socket;
-pub mod source;
-mod spot;
-mod transmission;
-pub mod truth;
+pub mod simulate;
 mod view;
 pub mod wire;
 pub mod world;
 
-pub use line::Event;
+pub use device::ChunkSize;
 pub use request_decoder::{Arrival, Dropped};
 pub use shape::{Point, Shape};
-pub use simulate::{Ready, simulate, simulate_with};
-pub use transmission::ChunkSize;
+pub use simulate::{Event, Ready, simulate, simulate_with};

@@ -22,10 +22,10 @@ use scanhub_drivers::lms::variant::{Baud, MIRROR_TURN, Mode, Unit, Variant};
 use schema::{MILLIS, Nanos};
 
 use crate::device::{Chunk, Device, Part, Sent};
-use crate::operating::{Operating, Shot};
-use crate::request_decoder::{Arrival, Dropped, Heard, RequestDecoder};
-use crate::source::Source;
-use crate::transmission::{ChunkSize, Transmission};
+use crate::device::{ChunkSize, Transmission};
+use crate::operating::Source;
+use crate::operating::{MeasuredValues, Operating};
+use crate::request_decoder::{Arrival, DecodedRequest, Dropped, RequestDecoder};
 
 /// A scanner at time 0: its type, its EEPROM, the state in which an earlier host left it, and the hardware at the
 /// host's end of its line.
@@ -60,7 +60,7 @@ pub struct Settings {
     /// Transparency of the front window, in percent of a clean one. Below 75 it is a warning, and below 30 an error.
     pub pollution_percent: u16,
     /// Deviations from the listing.
-    pub habits: Habits,
+    pub quirks: ProtocolQuirks,
     /// Number of bytes that arrive at once.
     pub chunk: ChunkSize,
     /// Speed of the simulation's time, relative to that of the host. The host measures the gaps of its requests by its
@@ -88,7 +88,7 @@ impl Default for Settings {
             status: 0x10,
             errors: Vec::new(),
             pollution_percent: 100,
-            habits: Habits::default(),
+            quirks: ProtocolQuirks::default(),
             chunk: ChunkSize::Uart,
             speed: 1.0,
             seed: 0,
@@ -107,7 +107,7 @@ pub enum Start {
 
 /// Deviations of a scanner from the listing. Real ones deviate occasionally.
 #[derive(Clone, Debug, Default, PartialEq)]
-pub struct Habits {
+pub struct ProtocolQuirks {
     /// Share of the requests that the scanner overlooks while its mirror rotates.
     pub overlooks: f64,
     /// Share of the intact requests that the scanner answers with NAK.
@@ -138,7 +138,7 @@ pub struct Habits {
 }
 
 /// A simulated LMS.
-pub struct Machine {
+pub struct LmsSimulator {
     pub(crate) settings: Settings,
     pub(crate) source: Source,
     eeprom: Eeprom,
@@ -147,7 +147,7 @@ pub struct Machine {
     baud: Baud,
     decoder: RequestDecoder,
     pub(crate) random: fastrand::Rng,
-    habits: fastrand::Rng,
+    quirks: fastrand::Rng,
     queue: VecDeque<Transmission<Tag>>,
     /// Start of the transmission of the next scan; `None` while there is no stream.
     next_scan_ns: Option<Nanos>,
@@ -189,17 +189,17 @@ enum After {
     Reset,
 }
 
-impl Machine {
+impl LmsSimulator {
     /// Creates the scanner that `settings` describe, at time 0.
     pub fn new(settings: Settings, source: Source) -> Self {
-        let mut machine = Machine {
+        let mut machine = LmsSimulator {
             eeprom: Eeprom::new(&settings),
             operating: Operating::OnRequest,
             variant: settings.variant,
             baud: settings.baud,
-            decoder: RequestDecoder::new(settings.speed, settings.habits.strict_gap),
+            decoder: RequestDecoder::new(settings.speed, settings.quirks.strict_gap),
             random: fastrand::Rng::with_seed(settings.seed),
-            habits: fastrand::Rng::with_seed(!settings.seed),
+            quirks: fastrand::Rng::with_seed(!settings.seed),
             settings,
             source,
             queue: VecDeque::new(),
@@ -229,9 +229,9 @@ impl Machine {
     }
 
     /// Changes the deviations from now on.
-    pub fn set_habits(&mut self, habits: Habits) {
-        self.decoder.is_strict = habits.strict_gap;
-        self.settings.habits = habits;
+    pub fn set_quirks(&mut self, quirks: ProtocolQuirks) {
+        self.decoder.is_strict = quirks.strict_gap;
+        self.settings.quirks = quirks;
     }
 
     /// Returns a telegram of measured values for a scanner in `operating`, with a scan that ended at `at_ns`.
@@ -242,7 +242,7 @@ impl Machine {
         let turn = self.partials;
         self.scans += 1;
         self.partials += u64::from(*operating == Operating::Partial);
-        let shot = |room| Shot { room, variant, unit, mode, at_ns, address, status, index, turn };
+        let shot = |room| MeasuredValues { room, variant, unit, mode, at_ns, address, status, index, turn };
         self.source.telegram(operating, shot)
     }
 
@@ -306,7 +306,7 @@ impl Machine {
         self.scans = 0;
         self.partials = 0;
         self.started_ns = now + self.settings.boot_ns;
-        self.decoder = RequestDecoder::new(self.settings.speed, self.settings.habits.strict_gap);
+        self.decoder = RequestDecoder::new(self.settings.speed, self.settings.quirks.strict_gap);
         self.send(self.boot_message(), self.started_ns, Tag::Reply { late: false, after: After::Nothing });
     }
 
@@ -320,7 +320,7 @@ impl Machine {
     }
 
     fn chance(&mut self, share: f64) -> bool {
-        share > 0.0 && self.habits.f64() < share
+        share > 0.0 && self.quirks.f64() < share
     }
 
     /// Returns the address byte of replies.
@@ -334,7 +334,7 @@ impl Machine {
             self.eeprom.writes += 1;
         }
         let command = request.command();
-        let is_refused = self.settings.habits.refuses.contains(&command);
+        let is_refused = self.settings.quirks.refuses.contains(&command);
         if is_refused || self.family().and_then(|family| family.refuses_command(command)).is_some() {
             return self.refusal();
         }
@@ -482,12 +482,12 @@ impl Machine {
 
     /// Returns the time from ACK to A0h or BBh.
     fn mode_ns(&mut self) -> Nanos {
-        self.delay_ns(MODE_NS) + self.settings.habits.late_mode_ns
+        self.delay_ns(MODE_NS) + self.settings.quirks.late_mode_ns
     }
 
     fn delay_ns(&mut self, usual: Range<Nanos>) -> Nanos {
         let random_ns = self.random.u64(usual);
-        match self.settings.habits.answer_ns {
+        match self.settings.quirks.answer_ns {
             0 => random_ns,
             answer_ns => answer_ns,
         }
@@ -496,12 +496,12 @@ impl Machine {
     /// Returns the time from ACK to F7h or E6h.
     fn write_ns(&self, is_other_unit: bool) -> Nanos {
         let usual_ns = if is_other_unit { UNIT_NS } else { SAME_NS };
-        usual_ns + self.settings.habits.late_write_ns
+        usual_ns + self.settings.quirks.late_write_ns
     }
 
     fn may(&self, operating: &Operating) -> bool {
         let is_measuring = operating.streams();
-        !(self.settings.habits.strict && is_measuring) || self.operating != Operating::Installation
+        !(self.settings.quirks.strict && is_measuring) || self.operating != Operating::Installation
     }
 
     fn family(&self) -> Option<Family> {
@@ -521,7 +521,7 @@ impl Machine {
     }
 }
 
-impl Device for Machine {
+impl Device for LmsSimulator {
     fn poll_transmit(&mut self, now: Nanos) -> Option<Chunk> {
         if self.queue.is_empty() {
             self.start_scan(now);
@@ -546,27 +546,29 @@ impl Device for Machine {
         if arrival.not_after < self.started_ns {
             return;
         }
-        let Some(Heard { bytes, at }) = self.decoder.hear(byte, arrival, self.baud.rate()) else { return };
+        let Some(DecodedRequest { bytes, at }) = self.decoder.receive(byte, arrival, self.baud.rate()) else {
+            return;
+        };
         let is_mine = bytes[1] == 0 || bytes[1] == self.settings.address;
-        if !is_mine || self.settings.habits.mute || self.chance(self.settings.habits.overlooks) {
+        if !is_mine || self.settings.quirks.mute || self.chance(self.settings.quirks.overlooks) {
             return;
         }
         let free_ns = self.interrupt(at);
-        let late_ns = self.settings.habits.late_acknowledge_ns;
+        let late_ns = self.settings.quirks.late_acknowledge_ns;
         let first_ns = free_ns + late_ns + self.random.u64(2 * MILLIS..8 * MILLIS);
-        let request = Telegram::check(&bytes).filter(|_| !self.chance(self.settings.habits.naks));
+        let request = Telegram::check(&bytes).filter(|_| !self.chance(self.settings.quirks.naks));
         let Some(request) = request else {
             self.send(vec![NAK], first_ns, Tag::Acknowledge);
             return;
         };
         let Answer { reply, delay_ns, after } = self.answer(request, first_ns);
         let acknowledged_ns = self.send(vec![ACK], first_ns, Tag::Acknowledge);
-        let late_ns = self.settings.habits.late_reply_ns;
+        let late_ns = self.settings.quirks.late_reply_ns;
         let reply_ns = acknowledged_ns + delay_ns + late_ns;
         let late = late_ns > 0;
         let end_ns = self.send(reply.clone(), reply_ns, Tag::Reply { late, after });
-        if self.chance(self.settings.habits.doubles) {
-            let again_ns = end_ns + self.habits.u64(..20 * MILLIS);
+        if self.chance(self.settings.quirks.doubles) {
+            let again_ns = end_ns + self.quirks.u64(..20 * MILLIS);
             self.send(reply, again_ns, Tag::Reply { late, after: After::Nothing });
         }
     }

@@ -1,5 +1,6 @@
-//! The operating modes: what a sensor sends continuously after a request 20h, or once after the request for one value, and
-//! the layout of such a telegram (Telegram listing, 20h, 30h to 3Fh and 75h). Knows nothing about the line.
+//! Operating modes of an LMS: the telegrams that a scanner sends continuously after a request 20h, or once after the
+//! request for one value (Telegram listing, 20h, 30h to 3Fh and 75h). [`Source`] provides the measured values: a room, or
+//! a recording.
 
 use scanhub_drivers::lms::command::Request;
 use scanhub_drivers::lms::measured::{Frame, encode_with};
@@ -10,31 +11,31 @@ use schema::{Nanos, line_time};
 
 use crate::room::Room;
 
-/// What the sensor does.
+/// Operating mode of a scanner.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Operating {
-    /// 00h: installation; the only one in which the EEPROM can be written.
+    /// 00h: installation, the only mode in which the EEPROM can be written.
     Installation,
     /// 24h: all values of every scan, B0h.
     All,
     /// 25h: values on request only.
     OnRequest,
-    /// 26h: means of so many scans, B6h.
+    /// 26h: means of this number of scans, B6h.
     Means(u8),
     /// 27h: the values from one beam to another, counted from 1, B7h.
     Range(u16, u16),
-    /// 28h: means of so many scans, from one beam to another, BFh.
+    /// 28h: means of this number of scans, from one beam to another, BFh.
     MeanRange(u8, u16, u16),
-    /// 29h: the values from one beam to another with what they say of the fields, BEh.
+    /// 29h: the values from one beam to another, with the states of the fields, BEh.
     Fields(u16, u16),
-    /// 2Ah: every mirror turn as a scan of its own, B0h with the partial bit.
+    /// 2Ah: every mirror turn as a separate scan, B0h with the partial bit.
     Partial,
     /// 2Bh: range and reflectivity of up to five ranges of beams, F5h.
     Reflectivity(Vec<(u16, u16)>),
 }
 
-/// What a telegram of measured values is made of.
-pub(crate) struct Shot<'a> {
+/// Contents of a telegram of measured values.
+pub(crate) struct MeasuredValues<'a> {
     pub(crate) room: &'a Room,
     pub(crate) variant: Variant,
     pub(crate) unit: Unit,
@@ -42,14 +43,14 @@ pub(crate) struct Shot<'a> {
     pub(crate) at_ns: Nanos,
     pub(crate) address: u8,
     pub(crate) status: u8,
-    /// Where real-time indices are wanted: number of the telegram.
+    /// Number of the telegram; `None` if real-time indices are off.
     pub(crate) index: Option<u8>,
     /// Number of the partial scan.
     pub(crate) turn: u64,
 }
 
 impl Operating {
-    /// The byte after 20h.
+    /// Returns the byte after 20h.
     pub fn code(&self) -> u8 {
         match self {
             Operating::Installation => mode::INSTALLATION,
@@ -64,13 +65,13 @@ impl Operating {
         }
     }
 
-    /// Whether telegrams are sent continuously.
+    /// Returns whether telegrams are sent continuously.
     pub fn streams(&self) -> bool {
         !matches!(self, Operating::Installation | Operating::OnRequest)
     }
 
-    /// What `request` asks for, once or from now on, if a sensor set to `variant` can do it; not the installation,
-    /// which takes a password.
+    /// Returns the mode that `request` selects, once or from now on, if a scanner in `variant` supports it. It is never the
+    /// installation mode, which needs a password.
     pub(crate) fn of_request(request: Request, variant: Variant) -> Option<Operating> {
         let operating = match request {
             Request::Stream | Request::Values(1) => Operating::All,
@@ -106,7 +107,7 @@ impl Operating {
             Operating::Reflectivity(ranges) => {
                 let pairs: usize =
                     ranges.iter().map(|(first, last)| usize::from(last.abs_diff(*first)) + 1).sum();
-                // As many as LENGTH has room for (808 less command, number of ranges, their heads and status).
+                // The maximum of LENGTH: 808 less command, number of ranges, their heads, and status.
                 let room = 6 * ranges.len() + 4 * pairs <= 804;
                 room && ranges.iter().all(|&(first, last)| within(first, last))
             }
@@ -114,7 +115,7 @@ impl Operating {
         }
     }
 
-    /// Mirror turns from one telegram's first beam to the next one's at least.
+    /// Returns the minimum number of mirror turns from one telegram to the next.
     pub(crate) fn turns(&self, variant: Variant) -> u64 {
         match self {
             Operating::Partial => 1,
@@ -123,71 +124,71 @@ impl Operating {
         }
     }
 
-    /// Time between two telegrams of `len` bytes at `rate`: whole scans, as many as the line needs (Telegram listing
-    /// table 10-17).
+    /// Returns the time from one telegram of `len` bytes to the next at `rate`: the number of whole scans that the line
+    /// needs (Telegram listing, table 10-17).
     pub(crate) fn period(&self, variant: Variant, len: usize, rate: u32) -> Nanos {
         let scan = self.turns(variant) * MIRROR_TURN;
         scan * line_time(len, rate).div_ceil(scan).max(1)
     }
 
-    /// The telegram of what is seen; `None` for a mode in which nothing is sent.
-    pub(crate) fn telegram(&self, shot: &Shot<'_>) -> Option<Vec<u8>> {
-        let whole = |words: &[u16]| words.len() as u16 | u16::from(shot.unit.code()) << 14;
-        let begin = |command| Writer::new(shot.address | REPLY, command);
+    /// Returns the telegram with `values`; `None` in a mode that sends none.
+    pub(crate) fn telegram(&self, values: &MeasuredValues<'_>) -> Option<Vec<u8>> {
+        let whole = |words: &[u16]| words.len() as u16 | u16::from(values.unit.code()) << 14;
+        let begin = |command| Writer::new(values.address | REPLY, command);
         let writer = match self {
             Operating::Installation | Operating::OnRequest => return None,
-            Operating::All => return Some(shot.scan(None, &shot.words())),
+            Operating::All => return Some(values.scan(None, &values.words())),
             Operating::Partial => {
-                let step = 4 / shot.variant.turns();
-                let quarter = (shot.turn % shot.variant.turns() * step) as u8;
-                let words = shot.room.partial(quarter, shot.unit, shot.mode, shot.at_ns);
-                return Some(shot.scan(Some(quarter), &words));
+                let step = 4 / values.variant.turns();
+                let quarter = (values.turn % values.variant.turns() * step) as u8;
+                let words = values.room.partial(quarter, values.unit, values.mode, values.at_ns);
+                return Some(values.scan(Some(quarter), &words));
             }
             Operating::Means(shots) => {
-                let words = shot.means(*shots);
+                let words = values.means(*shots);
                 append(begin(0xB6).byte(*shots).word(whole(&words)), &words)
             }
             Operating::Range(first, last) => {
-                let words = beams(&shot.words(), *first, *last);
+                let words = beams(&values.words(), *first, *last);
                 append(begin(0xB7).word(*first).word(*last).word(whole(&words)), &words)
             }
             Operating::MeanRange(shots, first, last) => {
-                let words = beams(&shot.means(*shots), *first, *last);
+                let words = beams(&values.means(*shots), *first, *last);
                 let writer = begin(0xBF).byte(*shots).word(*first).word(*last).word(whole(&words));
-                return Some(append(writer, &words).byte(shot.status).finish().bytes().to_vec());
+                return Some(append(writer, &words).byte(values.status).finish().bytes().to_vec());
             }
             Operating::Fields(first, last) => {
-                let words = beams(&shot.words(), *first, *last);
+                let words = beams(&values.words(), *first, *last);
                 let head = begin(0xBE).word(*first).word(*last).word(whole(&words));
                 let writer = words.iter().fold(head, |writer, &word| append(writer, &[word, 0, 0, 0]));
-                return Some(writer.byte(shot.status).finish().bytes().to_vec());
+                return Some(writer.byte(values.status).finish().bytes().to_vec());
             }
             Operating::Reflectivity(ranges) => {
-                let pairs = shot.pairs();
+                let pairs = values.pairs();
                 ranges.iter().fold(begin(0xF5).word(ranges.len() as u16), |writer, &(first, last)| {
                     let pairs = &pairs[usize::from(first) - 1..usize::from(last)];
-                    let count = pairs.len() as u16 | u16::from(shot.unit.code()) << 14;
+                    let count = pairs.len() as u16 | u16::from(values.unit.code()) << 14;
                     let writer = writer.word(first).word(last).word(count);
                     pairs.iter().fold(writer, |writer, pair| append(writer, pair))
                 })
             }
         };
-        let writer = match shot.indices() {
+        let writer = match values.indices() {
             Some((scan, telegram)) => writer.byte(scan).byte(telegram),
             None => writer,
         };
-        Some(writer.byte(shot.status).finish().bytes().to_vec())
+        Some(writer.byte(values.status).finish().bytes().to_vec())
     }
 }
 
-impl Shot<'_> {
-    /// B0h of `words`, which are a whole scan or the one that begins at a quarter of a degree.
+impl MeasuredValues<'_> {
+    /// Returns the telegram B0h of `words`: a whole scan, or a partial one with this offset in quarters of a degree.
     fn scan(&self, partial: Option<u8>, words: &[u16]) -> Vec<u8> {
         let frame = Frame { unit: self.unit, partial, indices: self.indices() };
         encode_with(self.address, frame, words, self.status).bytes().to_vec()
     }
 
-    /// Numbers of the mirror turn and of the telegram, where they are wanted.
+    /// Returns the numbers of the mirror turn and of the telegram, if real-time indices are on.
     fn indices(&self) -> Option<(u8, u8)> {
         self.index.map(|index| ((self.at_ns / MIRROR_TURN) as u8, index))
     }
@@ -196,12 +197,13 @@ impl Shot<'_> {
         self.room.scan(self.variant, self.unit, self.mode, self.at_ns)
     }
 
-    /// Ranges only, each the mean of `shots` scans; where a fifth of them have none it is the code for overflow.
+    /// Returns ranges without levels, each the mean of `shots` scans. A beam without a range in a fifth of them has the code
+    /// for overflow.
     fn means(&self, shots: u8) -> Vec<u16> {
         let (greatest, scan) = (self.mode.max_value(), self.variant.turns() * MIRROR_TURN);
         let mut sums = vec![(0u32, 0u32); self.variant.beams()];
-        for shot in 0..u64::from(shots) {
-            let at_ns = self.at_ns + shot * scan;
+        for scan_number in 0..u64::from(shots) {
+            let at_ns = self.at_ns + scan_number * scan;
             let words = self.room.scan(self.variant, self.unit, self.mode, at_ns);
             for (sum, range) in sums.iter_mut().zip(words.iter().map(|word| word & greatest)) {
                 if range < greatest - recording::BEYOND {
@@ -216,7 +218,7 @@ impl Shot<'_> {
         sums.into_iter().map(mean).collect()
     }
 
-    /// Range and reflectivity of each beam: a plain surface sends back some, a reflector up to about 13000.
+    /// Returns range and reflectivity of each beam: 400 for a plain surface, up to about 13,000 for a reflector.
     fn pairs(&self) -> Vec<[u16; 2]> {
         let levels = Mode(1);
         let words = self.room.scan(self.variant, self.unit, levels, self.at_ns);
@@ -236,5 +238,46 @@ fn append(writer: Writer, words: &[u16]) -> Writer {
     words.iter().fold(writer, |writer, &word| writer.word(word))
 }
 
-/// Code of a value that could not be calculated: maximum - 2 (Telegram listing 10.8).
+/// Code of a value that could not be calculated, counted down from the maximum (Telegram listing 10.8).
 const OVERFLOW: u16 = 2;
+
+/// A source of measured-value telegrams.
+pub enum Source {
+    /// A simulated room.
+    Room(Room),
+    /// Whole telegrams, sent as they are.
+    Recorded {
+        /// Variant of the recording. The scanner supports no other variant.
+        variant: Variant,
+        /// The telegrams, in the order in which they are sent. The stream ends with them.
+        telegrams: Box<dyn Iterator<Item = Vec<u8>> + Send>,
+    },
+}
+
+impl Source {
+    /// Returns the next telegram of a scanner in `operating`, with the values that `measure` takes from the room. Returns
+    /// `None` at the end of a recording, and in a mode that sends nothing.
+    pub(crate) fn telegram<'a>(
+        &'a mut self,
+        operating: &Operating,
+        measure: impl FnOnce(&'a Room) -> MeasuredValues<'a>,
+    ) -> Option<Vec<u8>> {
+        match self {
+            Source::Room(room) => operating.telegram(&measure(room)),
+            Source::Recorded { telegrams, .. } => telegrams.next(),
+        }
+    }
+
+    /// Returns the only supported variant, or `None` if all are supported.
+    pub(crate) fn variant(&self) -> Option<Variant> {
+        match self {
+            Source::Room(_) => None,
+            Source::Recorded { variant, .. } => Some(*variant),
+        }
+    }
+
+    /// Returns whether `operating` is supported: a recording streams whole scans, each of them once.
+    pub(crate) fn can(&self, operating: &Operating) -> bool {
+        matches!(self, Source::Room(_)) || *operating == Operating::All || !operating.streams()
+    }
+}

@@ -1,4 +1,4 @@
-//! The options of `simulate`, and how they are written. [`crate::simulate`] checks that the values fit together.
+//! The options of `simulate`: their values, the parsers of their texts, and the check that they fit together.
 
 use std::path::PathBuf;
 use std::str::FromStr;
@@ -9,36 +9,37 @@ use scanhub_drivers::lms::family::Family;
 use scanhub_drivers::lms::variant::{Baud, Mode, Unit, Variant};
 use schema::{Failure, Kind};
 
+use crate::device::ChunkSize;
 use crate::fault::Faults;
 use crate::machine::Start;
 use crate::operating::Operating;
+use crate::port;
 use crate::rplidar;
-use crate::transmission::ChunkSize;
 use crate::world::World;
 
-/// Family of the sensors, unless an option names another one.
+/// Family of the scanners, unless an option names another one.
 pub const DEFAULT_FAMILY: &str = "lms";
-/// Type of the sensors of this family, unless an option names another one.
+/// Type of the scanners of this family, unless an option names another one.
 pub const DEFAULT_TYPE: &str = "lms200";
 
-/// The options of the verb.
+/// Options of the verb `simulate`.
 #[derive(Clone, Debug)]
 pub struct SimulateOptions {
-    /// One sensor each: where the symlink to its pty is to be, or `tcp:HOST:PORT` for a TCP server there.
+    /// Ports of the scanners: the path of the symlink to a pty, or `tcp:HOST:PORT` for a TCP server.
     pub ports: Vec<PathBuf>,
-    /// Rate of the line; `None`: the permanent rate, else 9600.
+    /// Rate of the line; `None` selects the permanent rate, or else 9600.
     pub baud: Option<Baud>,
-    /// Rate at power-on that a former owner has written into the sensor.
+    /// Rate at power-on that a former owner has written into the scanner.
     pub permanent_baud: Option<Baud>,
-    /// The sensors' own address, 0 to 127.
+    /// Address of the scanners, 0 to 127.
     pub address: u8,
-    /// What a host that is gone left them doing.
+    /// State in which an earlier host left the scanners.
     pub state: Start,
-    /// From power-on to the banner.
+    /// Time from power-on to the boot message.
     pub boot: Duration,
     /// The byte that ends each reply.
     pub status: u8,
-    /// What 32h is answered with.
+    /// Errors in the reply to 32h: type and number.
     pub errors: Vec<(u8, u8)>,
     /// Transparency of the front window in percent.
     pub pollution: u16,
@@ -46,58 +47,57 @@ pub struct SimulateOptions {
     pub indices: bool,
     /// Whether the configuration has 32 bytes, as with older firmware.
     pub short_configuration: bool,
-    /// What the sensors see, unless they replay.
+    /// Surroundings of the scanners, unless they replay.
     pub world: World,
-    /// A recording to send instead.
+    /// Recording to send instead.
     pub replay: Option<PathBuf>,
-    /// Which of the recording's sensors each port is; one for all, none if the recording has but one.
+    /// Sensor of the recording that each port plays: one for all ports, or none if the recording has only one.
     pub sensors: Vec<String>,
     /// Whether the recording starts again at its end.
     pub looped: bool,
-    /// How many times faster than the clock the sensor's time runs, the bit time too; 0.01 to 100.
+    /// Speed of the scanner's time relative to the clock, including the bit time: 0.01 to 100.
     pub speed: f64,
-    /// Seed of worlds, delays and faults. For its delays and faults each port adds its number, for worlds see
+    /// Seed of worlds, delays and faults. For delays and faults, each port adds its number. For worlds, see
     /// [`Room::of_port`](crate::room::Room::of_port).
     pub seed: u64,
-    /// What goes wrong on the line.
+    /// Faults of the line.
     pub faults: Faults,
-    /// File for the truth.
+    /// Path of the truth file.
     pub truth: Option<PathBuf>,
-    /// Whether an existing file for the truth is replaced.
+    /// Whether to replace an existing truth file.
     pub force: bool,
-    /// What the sensor calls itself, which decides what it cannot do.
+    /// Type that the scanners report, which limits what they support.
     pub family: Family,
-    /// Angle and resolution; `None`: those of the recording, else the type's.
+    /// Angle and resolution; `None` selects those of the recording, or else of the type.
     pub variant: Option<Variant>,
-    /// Unit; `None`: that of the recording, else the type's.
+    /// Unit; `None` selects that of the recording, or else of the type.
     pub unit: Option<Unit>,
-    /// Measuring mode; `None`: that of the recording, else 0x01.
+    /// Measuring mode; `None` selects that of the recording, or else 0x01.
     pub mode: Option<Mode>,
-    /// How many bytes the host's hardware hands over at once.
+    /// Number of bytes that the host's hardware delivers at once.
     pub chunk: ChunkSize,
-    /// Whether the sensors wait while the host's buffer is full, instead of losing bytes as on a real line.
+    /// Whether the scanners wait while the host's buffer is full. Otherwise bytes are lost, as on a real line.
     pub lossless: bool,
-    /// Which scanner of another family the ports are in place of an LMS; then what only an LMS has must be left as it
-    /// is.
+    /// Scanner of another family; `None` is an LMS. Options that only an LMS has must keep their defaults then.
     pub scanner: Option<Scanner>,
 }
 
-/// A scanner that is no LMS.
+/// A scanner of another family than LMS.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Scanner {
     /// One of LDROBOT.
     Ld(ld::Model),
     /// One of Slamtec.
     Rplidar {
-        /// Which one.
+        /// The model.
         model: rplidar::Model,
-        /// Number of the mode that it recommends, and in which it streams if an earlier host left it so.
+        /// Number of the mode that the scanner recommends. If an earlier host left a stream on, it has this mode.
         mode: usize,
     },
 }
 
 impl Scanner {
-    /// Its model as options call it.
+    /// Returns the name of the model in options.
     pub fn name(self) -> &'static str {
         match self {
             Scanner::Ld(model) => model.name(),
@@ -107,7 +107,7 @@ impl Scanner {
 }
 
 impl Default for SimulateOptions {
-    /// No port; everything else as the verb has it.
+    /// Returns the defaults of the verb, without a port.
     fn default() -> Self {
         SimulateOptions {
             ports: Vec::new(),
@@ -141,13 +141,104 @@ impl Default for SimulateOptions {
     }
 }
 
-/// Type, number and firmware as a sensor of `family` reports them: 21 characters (Telegram listing, BAh).
+impl SimulateOptions {
+    /// Checks that the values fit together.
+    ///
+    /// # Errors
+    ///
+    /// Returns [`Kind::Configuration`] if they do not.
+    pub(crate) fn check(&self) -> Result<(), Failure> {
+        let wrong = |message: String, hint: &str| Err(Failure::new(Kind::Configuration, message, hint));
+        if self.ports.is_empty() {
+            return wrong("no port to simulate".into(), "name one with --port PATH or --tcp HOST:PORT");
+        }
+        for (number, port) in self.ports.iter().enumerate() {
+            let is_any = port::server(port).is_some_and(|address| address.ends_with(":0"));
+            if self.ports[..number].contains(port) && !is_any {
+                return wrong(
+                    format!("port {} is named twice", port.display()),
+                    "each sensor needs its own path",
+                );
+            }
+        }
+        if !(0.01..=100.0).contains(&self.speed) {
+            return wrong(format!("speed {} is out of range", self.speed), "a number from 0.01 to 100");
+        }
+        if self.address > 127 {
+            return wrong(format!("address {} is out of range", self.address), "a number from 0 to 127");
+        }
+        if self.pollution > 100 {
+            return wrong(format!("pollution {} is out of range", self.pollution), "percent, 0 to 100");
+        }
+        if let Some(scanner) = self.scanner {
+            let talks = matches!(scanner, Scanner::Rplidar { .. });
+            let states = [Start::In(Operating::OnRequest), Start::In(Operating::All), Start::PowerOn];
+            let lms = [
+                ("baud", self.baud.is_some() || self.permanent_baud.is_some()),
+                ("variant", self.variant.is_some()),
+                ("unit", self.unit.is_some()),
+                ("mode by number", self.mode.is_some()),
+                ("state", self.state != states[0] && !(talks && states.contains(&self.state))),
+                ("sensor", !self.sensors.is_empty() && talks),
+                ("type", self.family != SimulateOptions::default().family),
+                ("address", self.address != 0),
+                ("pollution", self.pollution != 100),
+                ("status byte", self.status != SimulateOptions::default().status),
+                ("error", !self.errors.is_empty()),
+                ("indices", self.indices || self.short_configuration),
+                ("recording", self.replay.is_some() && talks),
+            ];
+            if let Some((name, _)) = lms.into_iter().find(|(_, is_said)| *is_said) {
+                let message = format!("a scanner {} has no {name} to choose", scanner.name());
+                let hint = match name {
+                    "state" if talks => "use idle, streaming or starting, or --family lms",
+                    _ => "leave it out, or use --family lms",
+                };
+                return wrong(message, hint);
+            }
+        }
+        if let (Some(variant), family) = (self.variant, self.family)
+            && let Some(reason) = family.refuses_variant(variant)
+        {
+            let Variant { angle_deg, resolution_cdeg } = variant;
+            let message = format!(
+                "an {} cannot scan {angle_deg}/{}",
+                family.name(),
+                f64::from(resolution_cdeg) / 100.0
+            );
+            return wrong(message, reason);
+        }
+        let tells_all = |start: &Start| match start {
+            Start::In(operating) => *operating == Operating::All || !operating.streams(),
+            Start::PowerOn => true,
+        };
+        if self.replay.is_some() && !tells_all(&self.state) {
+            return wrong(
+                "a recording is sent in whole scans only".into(),
+                "leave --state out, or use idle, streaming, installation or starting",
+            );
+        }
+        if !self.sensors.is_empty() && self.replay.is_none() {
+            return wrong("--sensor without a recording".into(), "name one with --replay FILE");
+        }
+        if self.sensors.len() > 1 && self.sensors.len() != self.ports.len() {
+            let message = format!("{} sensors for {} ports", self.sensors.len(), self.ports.len());
+            return wrong(message, "name one --sensor for all ports, or one for each");
+        }
+        if self.looped && self.replay.is_none() {
+            return wrong("--loop without a recording".into(), "name one with --replay FILE");
+        }
+        Ok(())
+    }
+}
+
+/// Returns type, number and firmware as a scanner of `family` reports them: 21 characters (Telegram listing, BAh).
 pub fn type_name(family: Family) -> String {
     format!("{};301063;V02.30 ", family.name().to_uppercase())
 }
 
-/// Which scanner `family`, `model` and the name of a `mode` say, `None` for an LMS: its models are types, and its modes
-/// numbers.
+/// Returns the scanner that `family`, `model` and the name of a `mode` select. Returns `None` for an LMS, whose models are
+/// types and whose modes are numbers.
 pub fn parse_family(
     family: &str,
     model: Option<&str>,
@@ -191,14 +282,14 @@ pub fn parse_family(
     }
 }
 
-/// `lms200` and the other types that support the values of [`Variant`].
+/// Parses `lms200` and the other types that support the values of [`Variant`].
 pub fn parse_type(text: &str) -> Result<Family, Failure> {
     let families = Family::ALL.into_iter().filter(|family| family.factory_variant().is_some());
     one_of("type", text, &families.map(|family| (family.name(), family)).collect::<Vec<_>>())
 }
 
-/// What a host that is gone left the sensor doing: `idle`, `streaming`, another mode that streams, `installation`, or
-/// `starting` for a sensor that gets its power now.
+/// Parses the state in which an earlier host left the scanner: `idle`, `streaming`, another mode that streams,
+/// `installation`, or `starting` for a scanner that is switched on now.
 pub fn parse_state(text: &str) -> Result<Start, Failure> {
     let known = [
         ("idle", Start::In(Operating::OnRequest)),
@@ -215,7 +306,7 @@ pub fn parse_state(text: &str) -> Result<Start, Failure> {
     one_of("state", text, &known)
 }
 
-/// An error as in a reply to 32h: type and number, `0x84:22`.
+/// Parses an error as in a reply to 32h: type and number, such as `0x84:22`.
 pub fn parse_error(text: &str) -> Result<(u8, u8), Failure> {
     let pair = text.split_once(':').and_then(|(kind, number)| Some((byte(kind)?, byte(number)?)));
     pair.ok_or_else(|| {
@@ -224,7 +315,7 @@ pub fn parse_error(text: &str) -> Result<(u8, u8), Failure> {
     })
 }
 
-/// A byte, `0x10` or `16`; `what` it is for.
+/// Parses a byte, such as `0x10` or `16`. `what` names the option in the error.
 pub fn parse_byte(what: &str, text: &str) -> Result<u8, Failure> {
     byte(text).ok_or_else(|| {
         Failure::new(Kind::Configuration, format!("{what} {text:?} is no byte"), "0 to 255, or 0x00 to 0xFF")
@@ -246,26 +337,26 @@ impl FromStr for ChunkSize {
     }
 }
 
-/// `180/0.5` and its kind: degrees, and degrees between beams.
+/// Parses a variant: degrees, and degrees between beams, such as `180/0.5`.
 pub fn parse_variant(text: &str) -> Result<Variant, Failure> {
     let names = ["180/1", "180/0.5", "100/1", "100/0.5", "100/0.25"];
     let named: Vec<(&str, Variant)> = names.into_iter().zip(Variant::ALL).collect();
     one_of("variant", text, &named)
 }
 
-/// `mm`, `cm` or `dm`.
+/// Parses `mm`, `cm` or `dm`.
 pub fn parse_unit(text: &str) -> Result<Unit, Failure> {
     one_of("unit", text, &[("mm", Unit::Mm), ("cm", Unit::Cm), ("dm", Unit::Dm)])
 }
 
-/// `9600` and the other rates of the sensor.
+/// Parses `9600` or another rate of an LMS.
 pub fn parse_baud(text: &str) -> Result<Baud, Failure> {
     let named =
         [("9600", Baud::B9600), ("19200", Baud::B19200), ("38400", Baud::B38400), ("500000", Baud::B500000)];
     one_of("baud", text, &named)
 }
 
-/// The measuring mode, `0x01` or `1`.
+/// Parses a measuring mode, such as `0x01` or `1`.
 pub fn parse_mode(text: &str) -> Result<Mode, Failure> {
     byte(text).filter(|mode| MODES.contains(mode)).map(Mode).ok_or_else(|| {
         let hint = format!("one of: {}", MODES.map(|mode| format!("{mode:#04x}")).join(", "));
@@ -284,7 +375,7 @@ fn one_of<T: Clone>(what: &str, text: &str, known: &[(&str, T)]) -> Result<T, Fa
     })
 }
 
-/// Measuring modes whose values hold a range (Telegram listing, 77h block D).
+/// Measuring modes whose values contain a range (Telegram listing, 77h block D).
 const MODES: [u8; 8] = [0x00, 0x01, 0x02, 0x03, 0x04, 0x05, 0x06, 0x0F];
 
 #[cfg(test)]
@@ -292,7 +383,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn written_values_and_what_is_said_to_others() {
+    fn parses_values_and_rejects_others() {
         assert_eq!(parse_variant("180/0.5").unwrap(), Variant::HALF);
         assert_eq!(parse_variant("100/0.25").unwrap().beams(), 401);
         assert_eq!((parse_mode("0x0F").unwrap(), parse_mode("1").unwrap()), (Mode(15), Mode(1)));

@@ -1,37 +1,37 @@
-//! Host bytes to requests, as the sensor receives them. What a host writes at once leaves its UART byte by byte, which a
-//! pty does not imitate: so each byte is received when the line would have carried it. A request with too long a gap is
-//! dropped; a strict sensor also drops one with too short gaps. [`crate::machine`] knows what a request means.
+//! Decodes the bytes of a host into requests of an LMS. Bytes that a host writes at once leave its UART one after the
+//! other, which a pty does not imitate. Each byte is therefore received at the time at which the line would have carried it.
+//! A request with too long a gap is dropped. A strict scanner also drops a request with too short gaps.
 
 use std::fmt;
 
 use scanhub_drivers::lms::telegram::{FRAME, MAX_LENGTH, STX};
 use schema::{MICROS, MILLIS, Nanos, line_time};
 
-/// When a byte was written by the host, as far as that is known.
+/// Time at which the host wrote a byte, as far as it is known.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Arrival {
-    /// It cannot have been earlier.
+    /// Earliest possible time.
     pub not_before: Nanos,
-    /// It cannot have been later.
+    /// Latest possible time.
     pub not_after: Nanos,
 }
 
 impl Arrival {
-    /// A byte of which the time is known exactly.
+    /// Returns an exact time.
     pub fn at(time: Nanos) -> Self {
         Arrival { not_before: time, not_after: time }
     }
 }
 
-/// A request that was not heard, and why.
+/// Reason for which a request was dropped.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Dropped {
-    /// More than 6 ms passed behind the first so many of its bytes.
+    /// A gap of more than 6 ms inside the request.
     LongGap {
-        /// How many.
+        /// Number of bytes before the gap.
         after: usize,
     },
-    /// Its bytes came less than 55 us apart, to a sensor that is strict.
+    /// A gap of less than 55 us, which a strict scanner does not accept.
     ShortGap,
 }
 
@@ -48,25 +48,26 @@ impl fmt::Display for Dropped {
     }
 }
 
-/// A request that was heard.
+/// A request that was received.
 #[derive(Debug, PartialEq, Eq)]
-pub(crate) struct Heard {
-    /// All of it; its checksum was not looked at.
+pub(crate) struct DecodedRequest {
+    /// The whole request. Its checksum was not checked.
     pub(crate) bytes: Vec<u8>,
-    /// When the line had carried its last byte.
+    /// Time at which the line had carried its last byte.
     pub(crate) at: Nanos,
 }
 
-/// Collects one request.
+/// Decoder of requests. It collects the bytes of one request.
 #[derive(Debug)]
 pub(crate) struct RequestDecoder {
     bytes: Vec<u8>,
-    /// When the last byte can have come if every gap before it was right; `None` before the first.
+    /// Time at which the line carried the last byte, if every gap before it was valid; `None` before the first byte.
     last: Option<Arrival>,
+    /// Whether a gap of the request was too short.
     broken: bool,
-    /// Whether the host itself has to leave the least gap.
+    /// Whether the host itself must leave the minimum gap.
     pub(crate) is_strict: bool,
-    /// Machine time per host time: the host keeps its gaps by its own clock, however fast the sensor runs.
+    /// Speed of the simulation's time relative to that of the host, which measures the gaps by its own clock.
     speed: f64,
     dropped: Option<Dropped>,
 }
@@ -76,14 +77,14 @@ impl RequestDecoder {
         RequestDecoder { bytes: Vec::new(), last: None, broken: false, is_strict, speed, dropped: None }
     }
 
-    /// The last request that was dropped, told once.
+    /// Returns the last request that was dropped. Returns it once.
     pub(crate) fn take_dropped(&mut self) -> Option<Dropped> {
         self.dropped.take()
     }
 
-    /// Takes a byte on a line of `baud` bits per second; returns a request that is whole and whose gaps were not
-    /// provably wrong.
-    pub(crate) fn hear(&mut self, byte: u8, arrival: Arrival, baud: u32) -> Option<Heard> {
+    /// Adds a byte on a line at `baud` bits per second. Returns the request that it completes, unless its gaps were certainly
+    /// wrong.
+    pub(crate) fn receive(&mut self, byte: u8, arrival: Arrival, baud: u32) -> Option<DecodedRequest> {
         let possible = self.place(arrival, baud);
         self.last = Some(possible);
         if self.bytes.is_empty() && byte != STX {
@@ -105,17 +106,18 @@ impl RequestDecoder {
             self.dropped = Some(Dropped::ShortGap);
             return None;
         }
-        Some(Heard { bytes, at: possible.not_before.max(arrival.not_after) })
+        Some(DecodedRequest { bytes, at: possible.not_before.max(arrival.not_after) })
     }
 
-    /// When the line can have carried a byte that came at `arrival`; drops the request that it comes too late for.
+    /// Returns the time at which the line can have carried a byte that the host wrote at `arrival`. Drops the present request
+    /// if the byte is too late for it.
     fn place(&mut self, arrival: Arrival, baud: u32) -> Arrival {
         let Some(last) = self.last else { return arrival };
         let scaled = |span: Nanos| (span as f64 * self.speed) as Nanos;
         let byte_ns = scaled(line_time(1, baud));
-        // Several bytes seen at once came one after the other: each leaves less for the next.
-        let least = if self.is_strict { scaled(MIN_GAP) } else { 0 };
-        let soonest = last.not_before + byte_ns + least;
+        // Bytes that were read at once arrived one after the other, so each one leaves less time for the next.
+        let min_gap = if self.is_strict { scaled(MIN_GAP) } else { 0 };
+        let earliest = last.not_before + byte_ns + min_gap;
         let latest = last.not_after + byte_ns + scaled(MAX_GAP);
         if arrival.not_before > latest {
             if !self.bytes.is_empty() {
@@ -125,14 +127,14 @@ impl RequestDecoder {
             return arrival;
         }
         let is_host_s = self.is_strict && !self.bytes.is_empty();
-        if is_host_s && soonest > arrival.not_after {
+        if is_host_s && earliest > arrival.not_after {
             self.broken = true;
             return arrival;
         }
-        // Else a UART keeps it until it is through with the one before.
+        // Otherwise the UART sends it after the byte before it.
         let carried = if is_host_s { 0 } else { last.not_after + byte_ns };
         Arrival {
-            not_before: arrival.not_before.max(soonest),
+            not_before: arrival.not_before.max(earliest),
             not_after: arrival.not_after.max(carried).min(latest),
         }
     }
@@ -143,9 +145,9 @@ impl RequestDecoder {
     }
 }
 
-/// Least idle time between two bytes to the sensor (Telegram listing 4.3).
+/// Minimum idle time between two bytes to the scanner (Telegram listing 4.3).
 const MIN_GAP: Nanos = 55 * MICROS;
-/// Most idle time between two bytes to the sensor (Telegram listing 4.3).
+/// Maximum idle time between two bytes to the scanner (Telegram listing 4.3).
 const MAX_GAP: Nanos = 6 * MILLIS;
 
 #[cfg(test)]
@@ -153,7 +155,7 @@ mod tests {
     use super::*;
     use scanhub_drivers::lms::command::Request;
 
-    /// When a status request is heard whose bytes are known to come with `gap` of idle time between them.
+    /// Returns the time at which a status request is received whose bytes have `gap` of idle time between them.
     fn heard_at(decoder: &mut RequestDecoder, start: Nanos, gap: Nanos, width: Nanos) -> Option<Nanos> {
         let request = Request::Status.encode(0);
         let step = line_time(1, 9_600) + gap;
@@ -161,7 +163,7 @@ mod tests {
         for (i, &byte) in request.bytes().iter().enumerate() {
             let at = start + i as Nanos * step;
             let arrival = Arrival { not_before: at.saturating_sub(width), not_after: at + width };
-            heard = heard.or(decoder.hear(byte, arrival, 9_600));
+            heard = heard.or(decoder.receive(byte, arrival, 9_600));
         }
         heard.filter(|heard| heard.bytes == request.bytes()).map(|heard| heard.at)
     }
@@ -170,48 +172,48 @@ mod tests {
         heard_at(decoder, start, gap, width).is_some()
     }
 
-    /// When a status request is heard that is written at once at `start`.
+    /// Returns the time at which a status request is received that is written at once at `start`.
     fn written_at_once(decoder: &mut RequestDecoder, start: Nanos, baud: u32) -> Option<Nanos> {
         let request = Request::Status.encode(0);
         let heard =
-            request.bytes().iter().filter_map(|&byte| decoder.hear(byte, Arrival::at(start), baud)).last();
+            request.bytes().iter().filter_map(|&byte| decoder.receive(byte, Arrival::at(start), baud)).last();
         heard.filter(|heard| heard.bytes == request.bytes()).map(|heard| heard.at)
     }
 
     #[test]
-    fn what_is_written_at_once_is_heard_when_the_line_has_carried_it() {
+    fn receives_request_when_line_has_carried_it() {
         let mut decoder = RequestDecoder::new(1.0, false);
         for (round, baud) in [9_600, 19_200, 38_400, 500_000].repeat(25).into_iter().enumerate() {
             let start = (round as Nanos + 1) * 1_000 * MILLIS;
             assert_eq!(written_at_once(&mut decoder, start, baud), Some(start + 6 * line_time(1, baud)));
-            // As some drivers do: 55 us from one byte to the next, whatever the rate.
+            // Some drivers leave 55 us from one byte to the next at any rate.
             let request = Request::Stop.encode(0);
             let bytes = request.bytes().iter().enumerate();
             let at = |i: usize| Arrival::at(start + 500 * MILLIS + i as Nanos * 55 * MICROS);
-            assert!(bytes.filter_map(|(i, &byte)| decoder.hear(byte, at(i), baud)).count() == 1);
+            assert!(bytes.filter_map(|(i, &byte)| decoder.receive(byte, at(i), baud)).count() == 1);
         }
         assert_eq!(decoder.take_dropped(), None);
     }
 
     #[test]
-    fn a_second_request_waits_for_the_first_one_to_leave() {
+    fn second_request_waits_for_first() {
         let mut decoder = RequestDecoder::new(1.0, false);
         let byte_ns = line_time(1, 9_600);
         assert_eq!(written_at_once(&mut decoder, 0, 9_600), Some(6 * byte_ns));
         assert_eq!(written_at_once(&mut decoder, 0, 9_600), Some(13 * byte_ns));
-        // Noise takes its time too.
-        decoder.hear(0xFF, Arrival::at(0), 9_600);
+        // Noise needs time on the line, too.
+        decoder.receive(0xFF, Arrival::at(0), 9_600);
         assert_eq!(written_at_once(&mut decoder, 0, 9_600), Some(21 * byte_ns));
     }
 
     #[test]
-    fn a_long_gap_drops_a_request() {
+    fn drops_request_with_long_gap() {
         for (gap, width, expected) in [
             (0, 0, true),
             (54 * MICROS, 0, true),
             (6 * MILLIS, 0, true),
             (6 * MILLIS + MICROS, 0, false),
-            // Nothing is proved by bytes that may have come long before they were seen.
+            // Bytes that may have arrived long before they were read prove nothing.
             (6_100 * MICROS, MILLIS, true),
         ] {
             let mut decoder = RequestDecoder::new(1.0, false);
@@ -220,29 +222,30 @@ mod tests {
             assert!(heard(&mut decoder, 2_000 * MILLIS, 100 * MICROS, 0), "not heard again after {gap}");
             assert_eq!(decoder.take_dropped(), None);
         }
-        // What was written at once is on the line for as long as that takes, and the gap begins behind it.
+        // Bytes that were written at once need their time on the line, and the gap begins after it.
         let request = Request::Status.encode(0);
         let (head, tail) = request.bytes().split_at(4);
         let byte_ns = line_time(1, 9_600);
         for (pause, expected) in [(4 * byte_ns + 6 * MILLIS, true), (4 * byte_ns + 6 * MILLIS + 1, false)] {
             let mut decoder = RequestDecoder::new(1.0, false);
-            assert!(head.iter().all(|&byte| decoder.hear(byte, Arrival::at(0), 9_600).is_none()));
-            let heard = tail.iter().filter_map(|&byte| decoder.hear(byte, Arrival::at(pause), 9_600)).count();
+            assert!(head.iter().all(|&byte| decoder.receive(byte, Arrival::at(0), 9_600).is_none()));
+            let heard =
+                tail.iter().filter_map(|&byte| decoder.receive(byte, Arrival::at(pause), 9_600)).count();
             assert_eq!(heard == 1, expected, "{pause}");
             assert_eq!(decoder.take_dropped(), (!expected).then_some(Dropped::LongGap { after: 4 }));
         }
     }
 
     #[test]
-    fn short_gaps_decide_for_a_strict_sensor() {
+    fn strict_scanner_drops_request_with_short_gaps() {
         for (gap, width, expected) in [
             (55 * MICROS, 0, true),
             (54 * MICROS, 0, false),
             (0, 0, false),
             (6 * MILLIS, 0, true),
             (6 * MILLIS + MICROS, 0, false),
-            // Nothing is proved by bytes that may have come long before they were seen; but seven bytes within 2 ms,
-            // however they came, were too fast for 9600.
+            // Bytes that may have arrived long before they were read prove nothing. But seven bytes within 2 ms were too
+            // fast for 9600 in any case.
             (40 * MICROS, 50 * MICROS, true),
             (0, 100 * MICROS, false),
             (6_100 * MICROS, MILLIS, true),
@@ -256,51 +259,52 @@ mod tests {
     }
 
     #[test]
-    fn a_request_that_came_all_at_once_needs_time_to_have_come_rightly() {
+    fn request_read_at_once_needs_enough_time() {
         let request = Request::Status.encode(0);
         let least = 6 * (line_time(1, 9_600) + MIN_GAP);
         for (window, expected) in [(least, true), (least - 1, false)] {
             let mut decoder = RequestDecoder::new(1.0, true);
             let arrival = Arrival { not_before: 5 * MILLIS, not_after: 5 * MILLIS + window };
-            let heard = request.bytes().iter().filter_map(|&byte| decoder.hear(byte, arrival, 9_600)).count();
+            let heard =
+                request.bytes().iter().filter_map(|&byte| decoder.receive(byte, arrival, 9_600)).count();
             assert_eq!(heard == 1, expected, "{window}");
         }
     }
 
     #[test]
-    fn what_was_spaced_and_is_read_late_is_not_spaced_again() {
+    fn does_not_space_late_bytes_again() {
         let mut decoder = RequestDecoder::new(1.0, false);
         let arrival = Arrival { not_before: 5 * MILLIS, not_after: 25 * MILLIS };
         let request = Request::Status.encode(0);
-        let heard = request.bytes().iter().filter_map(|&byte| decoder.hear(byte, arrival, 9_600)).last();
+        let heard = request.bytes().iter().filter_map(|&byte| decoder.receive(byte, arrival, 9_600)).last();
         assert_eq!(heard.map(|heard| heard.at), Some(25 * MILLIS));
     }
 
     #[test]
-    fn the_host_keeps_its_own_time() {
-        // Four times as fast: 240 us of machine time are 60 us of the host's.
+    fn host_measures_gaps_by_its_own_clock() {
+        // At four times the speed, 240 us of the scanner are 60 us of the host.
         let mut decoder = RequestDecoder::new(4.0, true);
         let request = Request::Stop.encode(0);
         let mut heard = None;
         for (i, &byte) in request.bytes().iter().enumerate() {
             let at = 4 * i as Nanos * (line_time(1, 500_000) + 60 * MICROS);
-            heard = heard.or(decoder.hear(byte, Arrival::at(at), 500_000));
+            heard = heard.or(decoder.receive(byte, Arrival::at(at), 500_000));
         }
         assert!(heard.is_some());
     }
 
     #[test]
-    fn noise_before_a_request_is_passed_over() {
+    fn skips_noise_before_request() {
         for is_strict in [false, true] {
             let mut decoder = RequestDecoder::new(1.0, is_strict);
             for byte in [0x00, 0xFF, 0x06] {
-                assert_eq!(decoder.hear(byte, Arrival::at(0), 9_600), None);
+                assert_eq!(decoder.receive(byte, Arrival::at(0), 9_600), None);
             }
             assert!(heard(&mut decoder, 100 * MILLIS, 100 * MICROS, 0));
-            // A length that cannot be is given up at once.
+            // An impossible length is dropped at once.
             for (i, byte) in [STX, 0, 0xFF, 0xFF].into_iter().enumerate() {
                 assert_eq!(
-                    decoder.hear(byte, Arrival::at(200 * MILLIS + i as Nanos * 2 * MILLIS), 9_600),
+                    decoder.receive(byte, Arrival::at(200 * MILLIS + i as Nanos * 2 * MILLIS), 9_600),
                     None
                 );
             }

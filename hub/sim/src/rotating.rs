@@ -5,9 +5,9 @@ use std::f64::consts::TAU;
 
 use schema::Nanos;
 
-use crate::layers::{BeamRng, Layers};
-use crate::room::{Room, Sight, reported_range};
-use crate::spot::echo;
+use crate::beam::echo;
+use crate::beam::{BeamRng, NoiseModel};
+use crate::room::{Room, RoomView, reported_range};
 use crate::view::View;
 
 /// Rotation of a head since the start of its motor.
@@ -111,8 +111,10 @@ pub(crate) struct BeamReading {
 
 impl Beams {
     pub(crate) fn new(room: Room) -> Beams {
-        let rooms = match &room.sight {
-            Sight::Series(series, _) => series.rooms().map(|room| Beams::new(room.clone())).collect(),
+        let rooms = match &room.view {
+            RoomView::PrecomputedScans(series, _) => {
+                series.rooms().map(|room| Beams::new(room.clone())).collect()
+            }
             _ => Vec::new(),
         };
         Beams { room, view: None, rooms }
@@ -120,37 +122,39 @@ impl Beams {
 
     /// Measures the beam at `angle_deg` (0 ahead, counterclockwise, -180 to 180) at `at_ns`.
     pub(crate) fn measure(&mut self, at_ns: Nanos, angle_deg: f64) -> BeamReading {
-        if let Sight::Series(series, changes) = &self.room.sight {
+        if let RoomView::PrecomputedScans(series, changes) = &self.room.view {
             return self.rooms[series.number(changes, at_ns)].measure(at_ns, angle_deg);
         }
         let mut random = fastrand::Rng::with_seed(self.room.seed ^ at_ns.wrapping_mul(0x9E37_79B9_7F4A_7C15));
-        let dice = BeamRng::throw(&mut random);
+        let rng = BeamRng::draw(&mut random);
         let all = |range_mm: Option<f64>| BeamReading {
             range_mm,
             exact_mm: range_mm,
             intensity: PLAIN as u8,
             signal: f64::INFINITY,
         };
-        let stage = match &self.room.sight {
-            Sight::Scene(stage) => stage,
-            Sight::Empty | Sight::Series(..) => return BeamReading { intensity: 0, ..all(None) },
-            Sight::Value(value) => return all(Some(f64::from(*value))),
-            Sight::Random => return all(Some(f64::from(random.u16(..12_000)))),
+        let world = match &self.room.view {
+            RoomView::Scene(world) => world,
+            RoomView::Empty | RoomView::PrecomputedScans(..) => {
+                return BeamReading { intensity: 0, ..all(None) };
+            }
+            RoomView::Value(value) => return all(Some(f64::from(*value))),
+            RoomView::Random => return all(Some(f64::from(random.u16(..12_000)))),
         };
-        let view = self.view.get_or_insert_with(|| stage.still().clone());
-        stage.look_along(view, angle_deg, at_ns);
+        let view = self.view.get_or_insert_with(|| world.still().clone());
+        world.look_along(view, angle_deg, at_ns);
         let angle_mdeg = (angle_deg * 1e3) as i32;
-        let echo = echo(view, angle_mdeg, stage.layers.spot, &dice);
+        let echo = echo(view, angle_mdeg, world.noise.spot, &rng);
         let (ray_mm, exact_mm) = view.exact(angle_deg);
         // Beams lie between the rays. The range to a single surface is corrected to the point where the beam meets it.
         let is_one = echo.range_mm == ray_mm;
         let off_mm = exact_mm.filter(|_| is_one).map_or(0.0, |exact_mm| exact_mm - ray_mm);
         let time_s = at_ns as f64 / 1e9;
-        let sun = stage.suns.iter().map(|sun| sun.share(angle_mdeg, time_s)).fold(0.0, f64::max);
-        let range_mm = reported_range(stage, &echo, sun, &dice).ok().map(|range_mm| range_mm + off_mm);
+        let sun = world.suns.iter().map(|sun| sun.share(angle_mdeg, time_s)).fold(0.0, f64::max);
+        let range_mm = reported_range(world, &echo, sun, &rng).ok().map(|range_mm| range_mm + off_mm);
         let plain = PLAIN * echo.signal.min(1.0).powf(0.25);
         let intensity = if echo.bright > 0.0 { plain.max(REFLECTOR * echo.bright) } else { plain };
-        let signal = if stage.layers != Layers::NONE { echo.signal } else { f64::INFINITY };
+        let signal = if world.noise != NoiseModel::NONE { echo.signal } else { f64::INFINITY };
         BeamReading { range_mm, exact_mm, intensity: range_mm.map_or(0, |_| intensity as u8), signal }
     }
 }

@@ -1,32 +1,31 @@
 //! A simulated RPLIDAR of Slamtec, without I/O. It replies to requests of a host, its motor spins up, and its head
 //! measures point by point, each at its own time. The points leave in packets of the requested mode.
 //!
+//! The laser of a scanner that triangulates is beside its lens. The angle of a point therefore lags behind that of the
+//! head by a shift that depends on the range, and points at the edge of a near object are out of angular order. The
+//! vendor's decoder of type 0x84 has a formula for the shift, which is used here for all modes of such a scanner. At an
+//! edge where the formula has no solution, there is no return.
+//!
 //! The sources of this behavior are the vendor's protocol manual and driver, and published measurements of a real A1M8.
 //! The simulator does not reply to requests that they do not describe.
 
-mod models;
-mod optics;
 mod protocol;
 
 use schema::{MILLIS, Nanos};
 
 use crate::device::{Chunk, Device};
+use crate::device::{ChunkSize, TxQueue};
 use crate::fault::{Faults, Window};
-use crate::machine::Habits;
+use crate::machine::ProtocolQuirks;
 use crate::request_decoder::{Arrival, Dropped};
 use crate::room::Room;
-use crate::rotating::{Rotation, TruePoint};
-use crate::transmission::{ChunkSize, TxQueue};
-
-use models::Motor;
-use optics::Optics;
-use protocol::{Decoder, Reading, Request};
-
-pub use models::{Form, Mode, Model};
+use crate::rotating::{BeamReading, Beams, Rotation, TruePoint, ahead_deg};
+use protocol::{Decoder, Motor, Reading, Request};
+pub use protocol::{Form, Mode, Model};
 
 /// Settings of a scanner at the start of a simulation.
 #[derive(Clone, Debug)]
-pub struct UnitSettings {
+pub struct RplidarSettings {
     /// The model.
     pub model: Model,
     /// Number that the scanner reports as its model; by default that of the model.
@@ -38,7 +37,7 @@ pub struct UnitSettings {
     /// Share by which the speed varies.
     pub wander: f64,
     /// State at time 0.
-    pub start: UnitStart,
+    pub start: RplidarStart,
     /// Time from power-on to the boot message.
     pub boot_ns: Nanos,
     /// Status and code that the scanner reports. A status of 2 is an error, in which it does not measure.
@@ -46,7 +45,7 @@ pub struct UnitSettings {
     /// Whether the status remains after a RESET.
     pub stubborn: bool,
     /// Deviations from the manual. Those that only an LMS has are ignored.
-    pub habits: Habits,
+    pub quirks: ProtocolQuirks,
     /// Faults of the scanner: times at which something holds its head.
     pub faults: Faults,
     /// Number of bytes that the host's hardware delivers at once.
@@ -57,7 +56,7 @@ pub struct UnitSettings {
 
 /// State of a scanner at time 0.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum UnitStart {
+pub enum RplidarStart {
     /// The scanner waits for requests. Its motor is on or off as after power-on, and at full speed if it is on.
     Idle,
     /// The scanner streams in its typical mode, because an earlier host left the stream on.
@@ -66,20 +65,20 @@ pub enum UnitStart {
     PowerOn,
 }
 
-impl UnitSettings {
+impl RplidarSettings {
     /// Returns a `model` with factory settings that was switched on long ago.
-    pub fn of(model: Model) -> UnitSettings {
-        UnitSettings {
+    pub fn of(model: Model) -> RplidarSettings {
+        RplidarSettings {
             model,
             id: model.id(),
             typical: model.typical(),
             turns_per_second: model.turns_per_second(),
             wander: 0.005,
-            start: UnitStart::Idle,
+            start: RplidarStart::Idle,
             boot_ns: 2_000 * MILLIS,
             health: (0, 0),
             stubborn: false,
-            habits: Habits::default(),
+            quirks: ProtocolQuirks::default(),
             faults: Faults::default(),
             chunk: ChunkSize::Uart,
             seed: 0,
@@ -88,8 +87,8 @@ impl UnitSettings {
 }
 
 /// A simulated RPLIDAR.
-pub struct Unit {
-    settings: UnitSettings,
+pub struct RplidarSimulator {
+    settings: RplidarSettings,
     optics: Optics,
     decoder: Decoder,
     tx_queue: TxQueue,
@@ -101,18 +100,18 @@ pub struct Unit {
     /// Time of the boot message; `None` after the start-up.
     boots_ns: Option<Nanos>,
     /// Time from which on the scanner receives requests.
-    hears_ns: Nanos,
+    receives_from_ns: Nanos,
     stalls: Window,
     /// Motion of the motor to resume, while something holds the head.
     held: Option<Option<Motion>>,
     writes: u64,
 }
 
-impl Unit {
+impl RplidarSimulator {
     /// Creates the scanner that `settings` describe, at time 0, in `room`.
-    pub fn new(settings: UnitSettings, room: Room) -> Unit {
-        let UnitSettings { model, seed, health, .. } = settings;
-        let mut unit = Unit {
+    pub fn new(settings: RplidarSettings, room: Room) -> RplidarSimulator {
+        let RplidarSettings { model, seed, health, .. } = settings;
+        let mut simulator = RplidarSimulator {
             optics: Optics::new(model, room, seed),
             decoder: Decoder::default(),
             tx_queue: TxQueue::new(model.baud(), settings.chunk),
@@ -121,26 +120,26 @@ impl Unit {
             stream: None,
             health,
             boots_ns: None,
-            hears_ns: 0,
+            receives_from_ns: 0,
             stalls: Window::held(&settings.faults, seed),
             held: None,
             writes: 0,
             settings,
         };
-        match unit.settings.start {
-            UnitStart::PowerOn => {
-                unit.power_cycle(0);
+        match simulator.settings.start {
+            RplidarStart::PowerOn => {
+                simulator.power_cycle(0);
             }
             start => {
-                let turns = start == UnitStart::Streaming || model.motor() != Motor::Pwm;
-                unit.motor = turns.then(|| Motion { steady_ns: 0, ..unit.motion(0, 1.0) });
-                unit.motor.iter_mut().for_each(|motion| motion.rotation.spin_up_s = 0.0);
-                if start == UnitStart::Streaming {
-                    unit.measure(model.modes()[unit.settings.typical], false, 0);
+                let turns = start == RplidarStart::Streaming || model.motor() != Motor::Pwm;
+                simulator.motor = turns.then(|| Motion { steady_ns: 0, ..simulator.motion(0, 1.0) });
+                simulator.motor.iter_mut().for_each(|motion| motion.rotation.spin_up_s = 0.0);
+                if start == RplidarStart::Streaming {
+                    simulator.measure(model.modes()[simulator.settings.typical], false, 0);
                 }
             }
         }
-        unit
+        simulator
     }
 
     /// Returns point number `point` of the present stream, without noise. Returns `None` before the first point.
@@ -182,8 +181,8 @@ impl Unit {
     }
 
     /// Changes the deviations from the manual from now on.
-    pub fn set_habits(&mut self, habits: Habits) {
-        self.settings.habits = habits;
+    pub fn set_quirks(&mut self, quirks: ProtocolQuirks) {
+        self.settings.quirks = quirks;
     }
 
     /// Holds the head from `now` on for `span`.
@@ -202,7 +201,7 @@ impl Unit {
 
     /// Returns the motion of a motor that starts at `now`, with this share of its usual speed.
     fn motion(&self, now: Nanos, share: f64) -> Motion {
-        let UnitSettings { turns_per_second, wander, seed, .. } = self.settings;
+        let RplidarSettings { turns_per_second, wander, seed, .. } = self.settings;
         let turns_per_second = turns_per_second * share;
         let rotation = Rotation::new(turns_per_second, wander, SPIN_UP_S, seed);
         Motion { since_ns: now, steady_ns: now + STEADY_NS, rotation }
@@ -233,7 +232,7 @@ impl Unit {
         self.stream = None;
         self.decoder.forget();
         self.boots_ns = Some(now + span);
-        self.hears_ns = Nanos::MAX;
+        self.receives_from_ns = Nanos::MAX;
         if !self.settings.stubborn {
             self.health = (0, 0);
         }
@@ -245,7 +244,7 @@ impl Unit {
         if self.boots_ns.is_some_and(|at| at <= now) {
             let at_ns = self.boots_ns.take().unwrap_or(now);
             self.tx_queue.send(protocol::boot_message(self.settings.model, self.settings.id), at_ns, true);
-            self.hears_ns = self.tx_queue.free_ns() + HEARS_NS;
+            self.receives_from_ns = self.tx_queue.free_ns() + BOOT_TO_REQUEST_NS;
         }
         match (self.stalls.holds(now), self.held) {
             (true, None) => {
@@ -270,10 +269,10 @@ impl Unit {
     }
 
     fn reply(&mut self, telegram: Vec<u8>, now: Nanos) {
-        let Habits { late_reply_ns, doubles, .. } = self.settings.habits;
+        let ProtocolQuirks { late_reply_ns, doubles, .. } = self.settings.quirks;
         let copies = if self.random.f64() < doubles { 2 } else { 1 };
         for _ in 0..copies {
-            self.tx_queue.send(telegram.clone(), now + ANSWER_NS + late_reply_ns, true);
+            self.tx_queue.send(telegram.clone(), now + RESPONSE_DELAY_NS + late_reply_ns, true);
         }
     }
 
@@ -353,7 +352,7 @@ impl Unit {
     }
 }
 
-impl Device for Unit {
+impl Device for RplidarSimulator {
     fn poll_transmit(&mut self, now: Nanos) -> Option<Chunk> {
         self.advance(now);
         self.tx_queue.take(now)
@@ -369,11 +368,11 @@ impl Device for Unit {
 
     fn receive(&mut self, byte: u8, arrival: Arrival) {
         let now = arrival.not_after;
-        if now < self.hears_ns {
+        if now < self.receives_from_ns {
             return;
         }
-        let Some(request) = self.decoder.hear(byte) else { return };
-        let Habits { mute, overlooks, .. } = self.settings.habits;
+        let Some(request) = self.decoder.receive(byte) else { return };
+        let ProtocolQuirks { mute, overlooks, .. } = self.settings.quirks;
         let is_overlooked = self.random.f64() < overlooks;
         if !mute && !is_overlooked {
             self.handle_request(request, now);
@@ -512,6 +511,97 @@ impl Stream {
     }
 }
 
+/// Optics of a head in a room. For each point, it determines the position that the laser hits, and whether and how
+/// strongly that reflects.
+struct Optics {
+    model: Model,
+    beams: Beams,
+    seed: u64,
+}
+
+impl Optics {
+    pub(crate) fn new(model: Model, room: Room, seed: u64) -> Optics {
+        Optics { model, beams: Beams::new(room), seed }
+    }
+
+    /// Returns the point at `at_ns` with the head at `head_deg`, without noise.
+    pub(crate) fn truth(&mut self, at_ns: Nanos, head_deg: f64) -> TruePoint {
+        let (clockwise_deg, beam) = self.meet(at_ns, head_deg);
+        TruePoint { at_ns, clockwise_deg, range_mm: beam.and_then(|beam| beam.exact_mm) }
+    }
+
+    /// Returns the reading at `at_ns` with the head at `head_deg`, in a mode with a maximum range of `reach_m` meters.
+    pub(crate) fn measure(&mut self, at_ns: Nanos, head_deg: f64, reach_m: f64) -> Reading {
+        let (clockwise_deg, beam) = self.meet(at_ns, head_deg);
+        let shift_deg = self.shift_without_return_deg(at_ns);
+        let no_return =
+            Reading { head_deg, clockwise_deg: (head_deg - shift_deg + 360.0) % 360.0, ..Reading::default() };
+        let Some(beam) = beam.filter(|beam| self.returns(at_ns, clockwise_deg, beam)) else {
+            return no_return;
+        };
+        let is_in_reach = |mm: &f64| self.model.reach_mm().contains(mm) && *mm <= 1e3 * reach_m;
+        let Some(range_mm) = beam.range_mm.filter(is_in_reach) else { return no_return };
+        // The minimum quality that the six bits of type 0x81 can hold.
+        let quality = beam.intensity.max(4);
+        Reading { clockwise_deg, range_mm: range_mm.round() as u16, quality, ..no_return }
+    }
+
+    /// Returns the clockwise angle of the point that the laser hits, in degrees from the head's zero, and its reading.
+    /// There is no reading if the formula has no solution.
+    fn meet(&mut self, at_ns: Nanos, head_deg: f64) -> (f64, Option<BeamReading>) {
+        let mut measure = |clockwise_deg: f64| self.beams.measure(at_ns, ahead_deg(clockwise_deg));
+        if !self.model.triangulates() {
+            return (head_deg, Some(measure(head_deg)));
+        }
+        let behind = |range_mm: Option<f64>| (head_deg - shift_deg(range_mm) + 360.0) % 360.0;
+        let mut clockwise_deg = behind(Some(FAR_MM));
+        for _ in 0..MAX_ITERATIONS {
+            let beam = measure(clockwise_deg);
+            let met_deg = behind(beam.exact_mm);
+            if met_deg == clockwise_deg {
+                return (clockwise_deg, Some(beam));
+            }
+            clockwise_deg = met_deg;
+        }
+        (behind(None), None)
+    }
+
+    /// Returns the reported shift of a point without a return, in degrees. A real A1 reports 12 % of its points out of
+    /// angular order, and the first point of a revolution anywhere from 351 to 359.5 degrees. Its rule is unknown.
+    fn shift_without_return_deg(&self, at_ns: Nanos) -> f64 {
+        if !self.model.triangulates() {
+            return 0.0;
+        }
+        let mut random = fastrand::Rng::with_seed(!self.seed ^ at_ns);
+        if random.f64() < ASTRAY { 2.0 + 7.0 * random.f64() } else { shift_deg(None) }
+    }
+
+    /// Returns whether the echo is strong enough. Indoors, scanners that triangulate lose most points: those of dark, far
+    /// or oblique surfaces. The direction of a patch of surface determines how dark it is.
+    fn returns(&self, at_ns: Nanos, clockwise_deg: f64, beam: &BeamReading) -> bool {
+        if !self.model.triangulates() {
+            return true;
+        }
+        let patch = (clockwise_deg / PATCH_DEG) as u64;
+        let dark = fastrand::Rng::with_seed(self.seed ^ patch.wrapping_mul(0x9E37_79B9_7F4A_7C15)).f64();
+        let dice = fastrand::Rng::with_seed(self.seed ^ at_ns).f64();
+        beam.signal * (0.75 + 0.5 * dice) > MIN_SIGNAL * DARKEST.powf(dark)
+    }
+}
+
+/// Returns the shift of a point at `range_mm` behind the head, in degrees, with the steps of the vendor's decoder: 8
+/// degrees less k / 1024 less k^3 / 6442450944 radians, where k is the integer part of 98361 / (4 range). It is 7.5
+/// degrees below 50 mm and for no return.
+fn shift_deg(range_mm: Option<f64>) -> f64 {
+    match range_mm {
+        Some(range_mm) if range_mm >= 50.0 => {
+            let k = (98_361.0 / (4.0 * range_mm.round())).floor();
+            8.0 - (k / 1_024.0 + k.powi(3) / 6_442_450_944.0).to_degrees()
+        }
+        _ => 7.5,
+    }
+}
+
 /// Health status of a scanner that does not measure.
 const ERROR: u8 = 2;
 /// Health code while something holds the head. It is invented, because the real ones are not published.
@@ -519,10 +609,22 @@ const HELD: u16 = 0x0001;
 /// Time from RESET to the boot message, as measured on a real A1.
 const RESTART_NS: Nanos = 671 * MILLIS;
 /// Time from the boot message to the first request that the scanner receives, as measured on a real A1.
-const HEARS_NS: Nanos = 4 * MILLIS;
+const BOOT_TO_REQUEST_NS: Nanos = 4 * MILLIS;
 /// Time from a request to its response.
-const ANSWER_NS: Nanos = MILLIS;
+const RESPONSE_DELAY_NS: Nanos = MILLIS;
 /// Time constant of the motor's spin-up, in seconds.
 const SPIN_UP_S: f64 = 0.4;
 /// Time after which the speed of the motor is steady enough to measure.
 const STEADY_NS: Nanos = 1_600 * MILLIS;
+/// Share of the points without a return that are reported anywhere from 2 to 9 degrees behind the head.
+const ASTRAY: f64 = 0.27;
+/// Range at which the search for a point begins, in millimeters.
+const FAR_MM: f64 = 3_000.0;
+/// Maximum number of steps of this search.
+const MAX_ITERATIONS: usize = 6;
+/// Width of a patch of surface that is equally dark, in degrees.
+const PATCH_DEG: f64 = 2.0;
+/// Minimum signal for a return from the brightest surfaces, relative to a white surface at 1 m. The darkest surfaces
+/// need [`DARKEST`] times as much. With these values, 61 to 84 % of the points indoors are invalid, as on a real A1.
+const MIN_SIGNAL: f64 = 0.003;
+const DARKEST: f64 = 20_000.0;

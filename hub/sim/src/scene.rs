@@ -4,7 +4,7 @@
 
 use std::f64::consts::TAU;
 
-use crate::layers::Layers;
+use crate::beam::NoiseModel;
 use crate::mount::Mount;
 use crate::shape::{Heights, Point, Pose, Shape};
 
@@ -13,7 +13,7 @@ use crate::shape::{Heights, Point, Pose, Shape};
 pub struct Scene {
     /// The sensors in the scene.
     pub(crate) sensors: Vec<Sensor>,
-    pub(crate) layers: Layers,
+    pub(crate) noise: NoiseModel,
     pub(crate) things: Vec<Thing>,
     pub(crate) people: Vec<Plan>,
     pub(crate) suns: Vec<Sun>,

@@ -1,41 +1,50 @@
-//! The verb `simulate`: sensors on ptys or TCP servers until it is stopped. Builds them from the options, gives each a thread, and writes
-//! the truth. Refuses to print and to handle signals: the program does.
+//! The verb `simulate`: simulates scanners on ptys or TCP servers until it is stopped.
+//!
+//! Each port has a thread, [`PortThread`], which paces scanner and line by their deadlines and adds what happens at the
+//! host's port: another rate, no host, a host that does not read, an unplugged adapter. [`Truth`] is the log of the
+//! telegrams: one line per telegram, and one per port at the end, in a file or on stdout. The hub never reads it.
 
+use std::fs::File;
+use std::io::{self, Write};
 use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
 use std::path::{Path, PathBuf};
+use std::sync::Mutex;
 
 use recording::{Encoding, Frame, Recording};
 use rustix::event::{EventfdFlags, eventfd};
 use scanhub_drivers::lms::variant::{Baud, Mode, Variant};
-use schema::{Failure, Family, Kind, Nanos};
+use scanhub_files::output::{self, Target};
+use schema::{Failure, Family, Kind, MILLIS, Nanos};
+use serde_json::json;
+use sha2::{Digest, Sha256};
 
-use crate::device::Device;
-use crate::ld::{Head, HeadSettings, Packets, recorded};
-use crate::line::{Event, Line, Time};
-use crate::machine::{Machine, Settings, Start};
+use crate::device::{Device, Part};
+use crate::fault::{Fault, Faults};
+use crate::ld::{LdSettings, LdSimulator, Packets, recorded};
+use crate::machine::{LmsSimulator, Settings, Start};
 use crate::mount::{Encoder, Report};
-use crate::operating::Operating;
+use crate::operating::Source;
 use crate::options::{Scanner, SimulateOptions, type_name};
-use crate::pty::now_ns;
+use crate::port::SimPort;
+use crate::port::{Wake, now_ns, wait};
+use crate::request_decoder::Arrival;
 use crate::room::Room;
-use crate::rplidar::{Unit, UnitSettings, UnitStart};
-use crate::socket::{self, Socket};
-use crate::source::Source;
-use crate::truth::{Record, Summary, Truth};
-use crate::wire::Wire;
+use crate::rplidar::{RplidarSettings, RplidarSimulator, RplidarStart};
+use crate::wire::BaudMismatch;
+use crate::wire::{Delivery, LineModel};
 
 /// A port that is ready to be opened.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Ready {
-    /// The symlink as the user named it; of a TCP server `tcp:HOST:PORT`, which a hub opens.
+    /// The symlink as the user named it; for a TCP server `tcp:HOST:PORT`, which a hub opens.
     pub port: PathBuf,
-    /// The pty behind it, if it is one.
+    /// The pty; `None` for a TCP server.
     pub pty: Option<PathBuf>,
 }
 
-/// Simulates the sensors of `options` until `stop` is readable, and returns what each port sent. `on_ready` is called once
-/// all ports exist, `tell` with each telegram sent, from the port's thread and at its pace. The symlinks are removed when
-/// this returns.
+/// Simulates the scanners of `options` until `stop` is readable, and returns the summary of each port. `on_ready` is called
+/// once all ports exist, and `tell` with each telegram from the thread of the port. The symlinks are removed when this
+/// function returns.
 pub fn simulate(
     options: &SimulateOptions,
     stop: impl AsFd,
@@ -45,8 +54,8 @@ pub fn simulate(
     simulate_with(options, stop, on_ready, tell, |_| None, |_, _| {})
 }
 
-/// As [`simulate()`]; `event` is asked again and again, from the thread of each port, what is done to that sensor now, and
-/// `say` is called with the number of a port and what the encoder of its mount says, in times of the clock.
+/// Simulates like [`simulate()`]. The thread of each port repeatedly calls `event`, which returns an event for this port.
+/// `say` receives the number of a port and the reports of the encoder of its mount, in time of the clock.
 pub fn simulate_with(
     options: &SimulateOptions,
     stop: impl AsFd,
@@ -55,9 +64,9 @@ pub fn simulate_with(
     event: impl Fn(&Path) -> Option<Event> + Sync,
     say: impl Fn(usize, Report) + Sync,
 ) -> Result<Vec<Summary>, Failure> {
-    check(options)?;
+    options.check()?;
     let recording = options.replay.as_ref().filter(|_| options.scanner.is_none());
-    // The ports are LMS, so the bytes of a stream file are theirs.
+    // The ports are LMS, so the bytes of a stream file belong to an LMS.
     let recording = recording.map(|path| Recording::open_as(path, Some(Family::Lms))).transpose()?;
     let truth = options.truth.as_deref().map(|path| Truth::create(path, options.force)).transpose()?;
     let tell = |record: &Record| {
@@ -65,21 +74,21 @@ pub fn simulate_with(
         truth.as_ref().map_or(Ok(()), |truth| truth.write(&record.line()))
     };
     let mut ready = Vec::new();
-    let mut lines = Vec::new();
+    let mut threads = Vec::new();
     let time = Time { zero_ns: now_ns(), speed: options.speed };
     for (number, port) in options.ports.iter().enumerate() {
         let seed = options.seed.wrapping_add(number as u64);
         let machine = device(options, recording.as_ref(), number)?;
-        let socket = Socket::new(port)?;
-        let port = socket.found(port);
-        ready.push(Ready { port: port.clone(), pty: socket.pty().map(Path::to_owned) });
-        let wire = Wire::new(&options.faults, seed);
-        let socket = Some(socket);
+        let sim_port = SimPort::new(port)?;
+        let port = sim_port.found(port);
+        ready.push(Ready { port: port.clone(), pty: sim_port.pty().map(Path::to_owned) });
+        let wire = LineModel::new(&options.faults, seed);
+        let sim_port = Some(sim_port);
         let encoder = options.world.mount(number % options.world.sensors()).cloned().map(Encoder::new);
-        lines.push(Line {
+        threads.push(PortThread {
             number,
             port,
-            socket,
+            sim_port,
             machine,
             wire,
             time,
@@ -88,10 +97,15 @@ pub fn simulate_with(
             encoder,
             say: &say,
             lossless: options.lossless,
+            is_open: false,
+            fault: None,
+            mismatch: BaudMismatch::default(),
+            sent: 0,
+            held: Vec::new(),
         });
     }
     on_ready(&ready);
-    let summaries = run(lines, stop.as_fd())?;
+    let summaries = run(threads, stop.as_fd())?;
     if let Some(truth) = &truth {
         for summary in &summaries {
             truth.write(&summary.line())?;
@@ -100,17 +114,17 @@ pub fn simulate_with(
     Ok(summaries)
 }
 
-/// Runs each line in a thread of its own; if one fails, the others end too.
-fn run(lines: Vec<Line<'_>>, stop: BorrowedFd<'_>) -> Result<Vec<Summary>, Failure> {
+/// Runs each port in a separate thread. If one fails, the others end too.
+fn run(threads: Vec<PortThread<'_>>, stop: BorrowedFd<'_>) -> Result<Vec<Summary>, Failure> {
     let failed: OwnedFd = eventfd(0, EventfdFlags::CLOEXEC)
         .map_err(|errno| Failure::new(Kind::Short, format!("cannot make an eventfd: {errno}"), ""))?;
     std::thread::scope(|scope| {
-        let threads: Vec<_> = lines
+        let threads: Vec<_> = threads
             .into_iter()
-            .map(|line| {
+            .map(|thread| {
                 let failed = &failed;
                 scope.spawn(move || {
-                    let outcome = line.run([stop, failed.as_fd()]);
+                    let outcome = thread.run([stop, failed.as_fd()]);
                     if outcome.is_err() {
                         let _ = rustix::io::write(failed, &1u64.to_ne_bytes());
                     }
@@ -126,7 +140,7 @@ fn run(lines: Vec<Line<'_>>, stop: BorrowedFd<'_>) -> Result<Vec<Summary>, Failu
     })
 }
 
-/// The sensor of the port with this number.
+/// Creates the scanner of the port with this number.
 fn device(
     options: &SimulateOptions,
     recording: Option<&Recording>,
@@ -144,7 +158,7 @@ fn device(
                 return Err(Failure::new(Kind::Input, message, hint));
             }
             let (settings, source) = sensor(options, chosen.as_ref(), number)?;
-            Box::new(Machine::new(settings, source))
+            Box::new(LmsSimulator::new(settings, source))
         }
         Some(Scanner::Ld(model)) => {
             let sensor = options.sensors.get(number).or(options.sensors.last()).map(String::as_str);
@@ -152,33 +166,33 @@ fn device(
                 Some(path) => Packets::Recorded { packets: recorded(path, sensor)?, looped: options.looped },
                 None => Packets::Room(Box::new(room())),
             };
-            Box::new(Head::new(HeadSettings { chunk, boot_ns, seed, ..HeadSettings::of(model) }, packets))
+            Box::new(LdSimulator::new(LdSettings { chunk, boot_ns, seed, ..LdSettings::of(model) }, packets))
         }
         Some(Scanner::Rplidar { model, mode }) => {
             let faults = options.faults;
-            let settings = UnitSettings {
+            let settings = RplidarSettings {
                 id: if faults.id > 0.0 { faults.id as u8 } else { model.id() },
                 typical: mode,
                 start: match &options.state {
-                    Start::PowerOn => UnitStart::PowerOn,
-                    Start::In(operating) if operating.streams() => UnitStart::Streaming,
-                    Start::In(_) => UnitStart::Idle,
+                    Start::PowerOn => RplidarStart::PowerOn,
+                    Start::In(operating) if operating.streams() => RplidarStart::Streaming,
+                    Start::In(_) => RplidarStart::Idle,
                 },
                 health: (faults.health as u8, u16::from(faults.health > 0.0)),
                 stubborn: faults.stubborn > 0.0,
-                habits: faults.habits(),
+                quirks: faults.quirks(),
                 faults,
                 chunk,
                 boot_ns,
                 seed,
-                ..UnitSettings::of(model)
+                ..RplidarSettings::of(model)
             };
-            Box::new(Unit::new(settings, room()))
+            Box::new(RplidarSimulator::new(settings, room()))
         }
     })
 }
 
-/// The recording that the port with this number plays: of several sensors the one that was named for it.
+/// Returns the recording that the port with this number plays: the part of the sensor that was named for it.
 fn chosen(
     options: &SimulateOptions,
     recording: Option<&Recording>,
@@ -190,7 +204,8 @@ fn chosen(
     chosen.transpose()
 }
 
-/// A sensor as the flags, else the recording, else the factory have it, and what it sends.
+/// Returns the settings of an LMS from the flags, or else from the recording, or else of the factory, and its measured
+/// values.
 fn sensor(
     options: &SimulateOptions,
     recording: Option<&Recording>,
@@ -217,7 +232,7 @@ fn sensor(
         status: options.status,
         errors: options.errors.clone(),
         pollution_percent: options.pollution,
-        habits: options.faults.habits(),
+        quirks: options.faults.quirks(),
         chunk: options.chunk,
         speed: options.speed,
         seed,
@@ -232,7 +247,7 @@ fn sensor(
     Ok((settings, source))
 }
 
-/// The scans of `recording`, once or again and again.
+/// Returns the scans of `recording`, once or in a loop.
 fn scans(
     recording: &Recording,
     encoding: Encoding,
@@ -259,83 +274,378 @@ fn scans(
     })))
 }
 
-fn check(options: &SimulateOptions) -> Result<(), Failure> {
-    let wrong = |message: String, hint: &str| Err(Failure::new(Kind::Configuration, message, hint));
-    if options.ports.is_empty() {
-        return wrong("no port to simulate".into(), "name one with --port PATH or --tcp HOST:PORT");
+/// A scanner on its line, and the thread that runs them.
+struct PortThread<'a> {
+    /// Number of the port, from 0.
+    pub(crate) number: usize,
+    /// Name of the port: as the user gave it, or the address of a server.
+    pub(crate) port: PathBuf,
+    /// The port that a host opens; `None` while the adapter is unplugged.
+    sim_port: Option<SimPort>,
+    pub(crate) machine: Box<dyn Device + Send>,
+    pub(crate) wire: LineModel,
+    pub(crate) time: Time,
+    /// Receives each telegram that was sent.
+    pub(crate) tell: &'a (dyn Fn(&Record) -> Result<(), Failure> + Sync),
+    /// Returns the next event for this port.
+    pub(crate) event: &'a (dyn Fn(&Path) -> Option<Event> + Sync),
+    /// Encoder of its mount, if it has one.
+    pub(crate) encoder: Option<Encoder>,
+    /// Receives the reports of the encoder, in time of the clock.
+    say: &'a (dyn Fn(usize, Report) + Sync),
+    /// Whether bytes wait while the host's buffer is full. Otherwise they are lost, as in a UART that no program reads.
+    pub(crate) lossless: bool,
+    /// Whether a host has the port open.
+    is_open: bool,
+    /// First fault of the current telegram.
+    fault: Option<Fault>,
+    /// The port of a host at another rate.
+    mismatch: BaudMismatch,
+    /// Number of telegrams that were sent.
+    sent: u64,
+    /// Bytes that wait for room in the host's buffer; only on a lossless line.
+    held: Vec<u8>,
+}
+
+/// An event that a test causes while a scanner runs.
+#[derive(Clone, Debug)]
+pub enum Event {
+    /// The power goes off and on.
+    PowerCycle,
+    /// The host's adapter is unplugged for this time in nanoseconds. Then it is another terminal with the same name.
+    Unplug(Nanos),
+    /// The line has these faults from now on, with random numbers of this seed. Times count from now.
+    Faults(Box<Faults>, u64),
+}
+
+/// Time of the scanner: it starts at 0, and is `speed` times as fast as the clock.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Time {
+    zero_ns: Nanos,
+    pub(crate) speed: f64,
+}
+
+impl Time {
+    fn of_machine(self, clock_ns: Nanos) -> Nanos {
+        (clock_ns.saturating_sub(self.zero_ns) as f64 * self.speed) as Nanos
     }
-    for (number, port) in options.ports.iter().enumerate() {
-        let is_any = socket::server(port).is_some_and(|address| address.ends_with(":0"));
-        if options.ports[..number].contains(port) && !is_any {
-            return wrong(
-                format!("port {} is named twice", port.display()),
-                "each sensor needs its own path",
-            );
+
+    fn of_clock(self, machine_ns: Nanos) -> Nanos {
+        // One more nanosecond, because a deadline must not be before the time that it represents.
+        self.zero_ns + (machine_ns as f64 / self.speed) as Nanos + 1
+    }
+}
+
+impl PortThread<'_> {
+    /// Runs until one of `stops` is readable.
+    pub(crate) fn run(mut self, stops: [BorrowedFd<'_>; 2]) -> Result<Summary, Failure> {
+        let mut buffer = [0; 64];
+        // Time of the clock until which there was nothing to read.
+        let mut quiet_ns = now_ns();
+        loop {
+            let read_ns = now_ns();
+            let count = self.read_host(&mut buffer)?;
+            let now_ns = now_ns();
+            self.limit_lag(now_ns);
+            let machine_ns = self.time.of_machine(now_ns);
+            while let Some(event) = (self.event)(&self.port) {
+                self.handle_event(event, machine_ns);
+            }
+            while let Some(report) = self.encoder.as_mut().and_then(|encoder| encoder.poll(machine_ns)) {
+                let [stamp_ns, arrives_ns] =
+                    [report.stamp_ns, report.arrives_ns].map(|at| self.time.of_clock(at));
+                let rate_rad_s = report.rate_rad_s * self.time.speed;
+                (self.say)(self.number, Report { stamp_ns, arrives_ns, rate_rad_s, ..report });
+            }
+            while let Some(delivery) = self.wire.poll_transmit(&mut *self.machine, machine_ns) {
+                self.hand_over(delivery)?;
+            }
+            if self.wait_for_room(stops)? == Wake::Stop {
+                return Ok(self.summary());
+            }
+            if count > 0 && self.is_tuned() {
+                let arrival = Arrival {
+                    not_before: self.time.of_machine(quiet_ns.saturating_sub(PTY_DELAY_NS)),
+                    not_after: self.time.of_machine(now_ns),
+                };
+                for &byte in &buffer[..count] {
+                    self.wire.receive(&mut *self.machine, byte, arrival);
+                    if let Some(dropped) = self.machine.take_dropped() {
+                        tracing::warn!("{}: {dropped}", self.port.display());
+                    }
+                }
+            }
+            if count == 0 {
+                quiet_ns = read_ns;
+            }
+            if self.wire.is_plugged() != self.sim_port.is_some() {
+                self.sim_port = None;
+                self.is_open = false;
+                self.sim_port = self.wire.is_plugged().then(|| SimPort::new(&self.port)).transpose()?;
+            }
+            let due = self.wire.poll_timeout(&*self.machine, machine_ns);
+            let due = due.into_iter().chain(self.encoder.as_ref().map(Encoder::poll_timeout)).min();
+            let due_ns = due.map_or(Nanos::MAX, |at| self.time.of_clock(at));
+            let poll_ns = if self.sim_port.is_some() { now_ns + POLL_INTERVAL_NS } else { Nanos::MAX };
+            let watched = self.sim_port.as_ref().and_then(|sim_port| sim_port.waits_for(self.is_open));
+            if wait(stops, watched, due_ns.min(poll_ns)) == Wake::Stop {
+                return Ok(self.summary());
+            }
         }
     }
-    if !(0.01..=100.0).contains(&options.speed) {
-        return wrong(format!("speed {} is out of range", options.speed), "a number from 0.01 to 100");
+
+    fn summary(self) -> Summary {
+        Summary { eeprom_writes: self.machine.eeprom_writes(), port: self.port, sent: self.sent }
     }
-    if options.address > 127 {
-        return wrong(format!("address {} is out of range", options.address), "a number from 0 to 127");
+
+    /// Waits until the host has read all held bytes or has closed its side. The time of the scanner stands still.
+    fn wait_for_room(&mut self, stops: [BorrowedFd<'_>; 2]) -> Result<Wake, Failure> {
+        let begun_ns = now_ns();
+        while !self.held.is_empty() {
+            let Some(sim_port) = self.sim_port.as_mut().filter(|_| self.is_open) else { break };
+            let taken = sim_port.write(&self.held)?;
+            self.held.drain(..taken);
+            if self.held.is_empty() {
+                break;
+            }
+            if wait(stops, None, now_ns() + ROOM_CHECK_INTERVAL_NS) == Wake::Stop {
+                return Ok(Wake::Stop);
+            }
+            self.is_open = sim_port.is_open(true);
+        }
+        self.held.clear();
+        self.time.zero_ns += now_ns() - begun_ns;
+        Ok(Wake::Line)
     }
-    if options.pollution > 100 {
-        return wrong(format!("pollution {} is out of range", options.pollution), "percent, 0 to 100");
-    }
-    if let Some(scanner) = options.scanner {
-        let talks = matches!(scanner, Scanner::Rplidar { .. });
-        let states = [Start::In(Operating::OnRequest), Start::In(Operating::All), Start::PowerOn];
-        let lms = [
-            ("baud", options.baud.is_some() || options.permanent_baud.is_some()),
-            ("variant", options.variant.is_some()),
-            ("unit", options.unit.is_some()),
-            ("mode by number", options.mode.is_some()),
-            ("state", options.state != states[0] && !(talks && states.contains(&options.state))),
-            ("sensor", !options.sensors.is_empty() && talks),
-            ("type", options.family != SimulateOptions::default().family),
-            ("address", options.address != 0),
-            ("pollution", options.pollution != 100),
-            ("status byte", options.status != SimulateOptions::default().status),
-            ("error", !options.errors.is_empty()),
-            ("indices", options.indices || options.short_configuration),
-            ("recording", options.replay.is_some() && talks),
-        ];
-        if let Some((name, _)) = lms.into_iter().find(|(_, is_said)| *is_said) {
-            let message = format!("a scanner {} has no {name} to choose", scanner.name());
-            let hint = match name {
-                "state" if talks => "use idle, streaming or starting, or --family lms",
-                _ => "leave it out, or use --family lms",
-            };
-            return wrong(message, hint);
+
+    /// Carries out an event.
+    fn handle_event(&mut self, event: Event, machine_ns: Nanos) {
+        match event {
+            Event::PowerCycle => self.wire.cycle_power(&mut *self.machine, machine_ns),
+            Event::Unplug(span_ns) => self.wire.unplug(machine_ns, span_ns),
+            Event::Faults(mut faults, seed) => {
+                let now_s = machine_ns as f64 / 1e9;
+                let times = [&mut faults.silence_at, &mut faults.stall_at, &mut faults.power_at];
+                times.into_iter().filter(|at| **at > 0.0).for_each(|at| *at += now_s);
+                self.wire.set_faults(&faults, seed);
+            }
         }
     }
-    if let (Some(variant), family) = (options.variant, options.family)
-        && let Some(reason) = family.refuses_variant(variant)
-    {
-        let Variant { angle_deg, resolution_cdeg } = variant;
-        let message =
-            format!("an {} cannot scan {angle_deg}/{}", family.name(), f64::from(resolution_cdeg) / 100.0);
-        return wrong(message, reason);
+
+    /// Checks whether a host has the port open, and reads the bytes that it has written.
+    fn read_host(&mut self, buffer: &mut [u8]) -> Result<usize, Failure> {
+        let Some(sim_port) = &mut self.sim_port else { return Ok(0) };
+        self.is_open = sim_port.is_open(self.is_open);
+        sim_port.read(buffer)
     }
-    let tells_all = |start: &Start| match start {
-        Start::In(operating) => *operating == Operating::All || !operating.streams(),
-        Start::PowerOn => true,
-    };
-    if options.replay.is_some() && !tells_all(&options.state) {
-        return wrong(
-            "a recording is sent in whole scans only".into(),
-            "leave --state out, or use idle, streaming, installation or starting",
+
+    /// Returns whether the host's port has the rate of the scanner.
+    fn is_tuned(&self) -> bool {
+        let rate = self.sim_port.as_ref().and_then(SimPort::rate);
+        rate.is_none_or(|rate| same_rate(rate, self.machine.rate()))
+    }
+
+    /// Stops the time of the scanner while this thread could not run for long. Otherwise the line would deliver more bytes at
+    /// once than it can carry.
+    fn limit_lag(&mut self, now_ns: Nanos) {
+        let machine_ns = self.time.of_machine(now_ns);
+        let Some(due_ns) = self.wire.poll_timeout(&*self.machine, machine_ns) else { return };
+        let latest_ns = self.time.of_clock(due_ns + MAX_LAG_NS);
+        self.time.zero_ns += now_ns.saturating_sub(latest_ns);
+    }
+
+    /// Writes bytes that arrive at the host, and reports a telegram that ends with them.
+    fn hand_over(&mut self, delivery: Delivery) -> Result<(), Failure> {
+        let is_telegram = delivery.is_telegram();
+        let Delivery { mut bytes, rate, idle_after, part, mut fault } = delivery;
+        match self.sim_port.as_mut().filter(|_| self.is_open) {
+            Some(sim_port) => {
+                let rates = (rate, sim_port.rate().unwrap_or(rate));
+                if same_rate(rates.1, rates.0) {
+                    self.mismatch.reset();
+                } else {
+                    fault = fault.or(Some(Fault::Baud));
+                    bytes = self.mismatch.receive(rates, &bytes, idle_after);
+                }
+                if self.lossless {
+                    self.held.append(&mut bytes);
+                    let taken = sim_port.write(&self.held)?;
+                    self.held.drain(..taken);
+                } else if sim_port.write(&bytes)? < bytes.len() {
+                    fault = fault.or(Some(Fault::Overrun));
+                }
+            }
+            None => fault = fault.or(Some(Fault::Unread)),
+        }
+        // Read the clock before the hash, which takes longer than a host that waits for this byte.
+        let sent_ns = now_ns();
+        if is_telegram {
+            self.fault = self.fault.or(fault);
+        }
+        if let Some(Part::End(sent)) = part {
+            (self.tell)(&Record {
+                port: self.port.clone(),
+                index: self.sent,
+                is_reply: sent.is_reply,
+                length: sent.telegram.len(),
+                sha256: Record::hash(&sent.telegram),
+                sent_ns,
+                fault: self.fault.take(),
+            })?;
+            self.sent += 1;
+        }
+        Ok(())
+    }
+}
+
+/// Returns whether a UART at `a` bits per second can read bytes at `b` bits per second: within 3 %.
+fn same_rate(a: u32, b: u32) -> bool {
+    u64::from(a.abs_diff(b)) * 100 <= 3 * u64::from(b)
+}
+
+/// Maximum lag of the scanner, in its own time: 5 kB at its highest rate, a quarter of the buffer of a pty.
+const MAX_LAG_NS: Nanos = 100 * MILLIS;
+/// Maximum time from a write to a pty until the byte can be read. A worker thread of the kernel moves it.
+const PTY_DELAY_NS: Nanos = 2 * MILLIS;
+/// Interval at which a lossless line checks for room in the host's buffer.
+const ROOM_CHECK_INTERVAL_NS: Nanos = MILLIS;
+/// Interval between polls of the port, because no event reports that a host opened it. It also limits the uncertainty of
+/// the time at which a byte arrived. At 9600, where every host begins, it is short enough to prove to a strict scanner
+/// that a request was written without gaps.
+const POLL_INTERVAL_NS: Nanos = 4 * MILLIS;
+
+/// A telegram that a scanner sent.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Record {
+    /// Name of the port.
+    pub port: PathBuf,
+    /// Number of the telegram on this port, from 0. Data and replies are counted together.
+    pub index: u64,
+    /// Whether it is a reply, and not data of the stream.
+    pub is_reply: bool,
+    /// Length of the intact telegram in bytes.
+    pub length: usize,
+    /// SHA-256 of the intact telegram.
+    pub sha256: [u8; 32],
+    /// CLOCK_MONOTONIC after its last byte was written, in nanoseconds.
+    pub sent_ns: u64,
+    /// Fault because of which it did not arrive intact.
+    pub fault: Option<Fault>,
+}
+
+impl Record {
+    /// Returns the SHA-256 of `telegram`.
+    pub fn hash(telegram: &[u8]) -> [u8; 32] {
+        Sha256::digest(telegram).into()
+    }
+
+    /// Returns its line without the line end. The keys have the order of the contract.
+    pub fn line(&self) -> String {
+        let port = json!(self.port.to_string_lossy());
+        let kind = if self.is_reply { "reply" } else { "data" };
+        let sha256 = self.sha256.map(|byte| format!("{byte:02x}")).concat();
+        let fault = json!(self.fault.map(Fault::name));
+        let Record { index, length, sent_ns, .. } = self;
+        format!(
+            r#"{{"class":"truth","port":{port},"index":{index},"kind":"{kind}","length":{length},"sha256":"{sha256}","sent_ns":{sent_ns},"fault":{fault}}}"#
+        )
+    }
+}
+
+/// Totals of a port.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Summary {
+    /// Name of the port.
+    pub port: PathBuf,
+    /// Number of telegrams that were sent, including those with a fault.
+    pub sent: u64,
+    /// Number of requests that would have written the EEPROM of the scanner.
+    pub eeprom_writes: u64,
+}
+
+impl Summary {
+    /// Returns its line without the line end.
+    pub fn line(&self) -> String {
+        let port = json!(self.port.to_string_lossy());
+        let Summary { sent, eeprom_writes, .. } = self;
+        format!(r#"{{"class":"simulated","port":{port},"sent":{sent},"eeprom_writes":{eeprom_writes}}}"#)
+    }
+}
+
+/// Log that several ports write. Each line is one write.
+#[derive(Debug)]
+pub struct Truth {
+    path: PathBuf,
+    /// `None` for stdout.
+    file: Option<Mutex<File>>,
+}
+
+impl Truth {
+    /// Creates the file at `path`, which replaces an existing one if `force`. `-` is stdout.
+    ///
+    /// # Errors
+    ///
+    /// Returns the errors of [`Target::create_new`].
+    pub fn create(path: &Path, force: bool) -> Result<Self, Failure> {
+        let is_stdout = path == Path::new("-");
+        let file =
+            if is_stdout { None } else { Some(Target::open(path)?.create_new(force, output::PUBLIC)?) };
+        Ok(Truth { path: path.to_owned(), file: file.map(Mutex::new) })
+    }
+
+    /// Appends `line`.
+    ///
+    /// # Errors
+    ///
+    /// Returns [`Kind::Failed`] if it cannot be written.
+    pub fn write(&self, line: &str) -> Result<(), Failure> {
+        let line = format!("{line}\n");
+        let written = match &self.file {
+            // A thread that panicked with the lock has written its line or not. In both cases, the next line is intact.
+            Some(file) => {
+                file.lock().unwrap_or_else(std::sync::PoisonError::into_inner).write_all(line.as_bytes())
+            }
+            None => {
+                let mut stdout = io::stdout().lock();
+                stdout.write_all(line.as_bytes()).and_then(|()| stdout.flush())
+            }
+        };
+        written.map_err(|error| failure(&self.path, &error))
+    }
+}
+
+fn failure(path: &Path, error: &io::Error) -> Failure {
+    let what = format!("cannot write the truth to {}: {error}", path.display());
+    Failure::new(Kind::Failed, what, "the disk must have space, and the reader of stdout must stay")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn lines_follow_contract() {
+        let record = Record {
+            port: "/tmp/a".into(),
+            index: 3,
+            is_reply: false,
+            length: 3,
+            sha256: Record::hash(b"abc"),
+            sent_ns: 12_345_678_901_234,
+            fault: None,
+        };
+        let value: serde_json::Value = serde_json::from_str(&record.line()).unwrap();
+        assert_eq!(
+            value,
+            json!({
+                "class": "truth", "port": "/tmp/a", "index": 3, "kind": "data", "length": 3,
+                "sha256": "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad",
+                "sent_ns": 12_345_678_901_234u64, "fault": null,
+            })
         );
+        let reply = Record { is_reply: true, fault: Some(Fault::Unread), ..record }.line();
+        assert!(reply.contains(r#""kind":"reply""#) && reply.contains(r#""fault":"unread""#));
+        let summary = Summary { port: "/tmp/a".into(), sent: 7, eeprom_writes: 0 }.line();
+        assert!(summary.contains(r#""class":"simulated""#) && summary.contains(r#""sent":7"#));
     }
-    if !options.sensors.is_empty() && options.replay.is_none() {
-        return wrong("--sensor without a recording".into(), "name one with --replay FILE");
-    }
-    if options.sensors.len() > 1 && options.sensors.len() != options.ports.len() {
-        let message = format!("{} sensors for {} ports", options.sensors.len(), options.ports.len());
-        return wrong(message, "name one --sensor for all ports, or one for each");
-    }
-    if options.looped && options.replay.is_none() {
-        return wrong("--loop without a recording".into(), "name one with --replay FILE");
-    }
-    Ok(())
 }

@@ -6,16 +6,16 @@ use std::sync::LazyLock;
 
 use schema::Nanos;
 
-use crate::labeled_scan::Mark;
-use crate::layers::Layers;
+use crate::beam::NoiseModel;
 use crate::mount::Mount;
+use crate::room::Mark;
 use crate::scene::{Person, Scene, Sun, Surface, Thing, jittered};
 use crate::shape::{Plane, Point, Pose, Shape};
 
 /// A scene with its random parts, seen by one scanner.
 #[derive(Clone, Debug)]
 pub(crate) struct WorldView {
-    pub(crate) layers: Layers,
+    pub(crate) noise: NoiseModel,
     sensor: Pose,
     mount: Option<Mount>,
     /// Constant error of all ranges of this scanner.
@@ -42,11 +42,11 @@ impl WorldView {
         }
         let (still_things, changing): (Vec<_>, Vec<_>) = things.into_iter().partition(Thing::is_still);
         let bias = fastrand::Rng::with_seed(!seed ^ sensor << 32).f64();
-        let mut stage = WorldView {
-            layers: scene.layers,
+        let mut world = WorldView {
+            noise: scene.noise,
             sensor: scene.sensors[sensor as usize].pose,
             mount: scene.sensors[sensor as usize].mount.clone(),
-            bias_mm: scene.layers.bias_mm * (2.0 * bias - 1.0),
+            bias_mm: scene.noise.bias_mm * (2.0 * bias - 1.0),
             still: View::empty(),
             still_things: Vec::new(),
             still_reflectors: Vec::new(),
@@ -54,19 +54,19 @@ impl WorldView {
             people,
             suns: scene.suns.clone(),
         };
-        if stage.mount.is_some() {
-            stage.still_things = still_things;
-            return stage;
+        if world.mount.is_some() {
+            world.still_things = still_things;
+            return world;
         }
         for thing in still_things {
-            for shape in stage.seen(&thing, thing.pose) {
+            for shape in world.seen(&thing, thing.pose) {
                 if thing.surface == Surface::Reflector {
-                    stage.still_reflectors.push(shape);
+                    world.still_reflectors.push(shape);
                 }
-                stage.still.draw(Face { shape, surface: thing.surface, kind: Kind::Static });
+                world.still.draw(Face { shape, surface: thing.surface, kind: Kind::Static });
             }
         }
-        stage
+        world
     }
 
     /// Returns the shapes of `thing` at `pose`, in the frame of the scanner.

@@ -1,8 +1,11 @@
-//! The line between sensor and port with all its faults; time is an argument: the sensor's chunks go in, what arrives
-//! and why it differs comes out. One implementation for ptys and for tests in virtual time.
+//! The line between scanner and port with all its faults. Time is an argument, so that ptys and tests in virtual time
+//! share this model.
 //!
-//! Drive it like a [`Device`]: call [`Wire::poll_transmit`] until it returns `None`, pass the host's bytes, call again
-//! at [`Wire::poll_timeout`]. What the host's port does (another rate, no reader) comes after it.
+//! A [`LineModel`] is driven like a [`Device`]: call [`LineModel::poll_transmit`] until it returns `None`, pass the host's
+//! bytes, and call again at [`LineModel::poll_timeout`]. The properties of the host's port, such as another rate, apply
+//! after the line. A [`Receiver`] at the wrong rate converts bytes to bits at the rate of the sender, and samples them at
+//! its own. An ideal UART that samples a little early agrees with recordings of real ones. Bytes with a wrong stop bit are
+//! delivered, as Linux does.
 
 use std::collections::VecDeque;
 
@@ -12,24 +15,24 @@ use crate::device::{Chunk, Device, Part, Sent};
 use crate::fault::{ByteOutcome, Delay, Extra, Fault, Faults, Noise, Schedule, TelegramFaults, Window};
 use crate::request_decoder::Arrival;
 
-/// What arrives at once.
+/// Bytes that arrive at once.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Carried {
-    /// The bytes, with what arrived between them; none if all of them were lost.
+pub struct Delivery {
+    /// The bytes, including foreign ones between them; empty if all of them were lost.
     pub bytes: Vec<u8>,
-    /// The rate they were sent at, in bits per second.
+    /// Rate at which they were sent, in bits per second.
     pub rate: u32,
     /// Whether the line is idle after them.
     pub idle_after: bool,
-    /// What was sent; `None` where nothing was.
+    /// The part of a telegram that was sent; `None` for bytes that the scanner did not send.
     pub part: Option<Part>,
-    /// The first cause why the telegram's bytes among them did not arrive as sent.
+    /// First cause for which bytes of the telegram did not arrive as sent.
     pub fault: Option<Fault>,
 }
 
-/// The line.
+/// The line between a scanner and the port of a host.
 #[derive(Clone, Debug)]
-pub struct Wire {
+pub struct LineModel {
     noise: Noise,
     telegram_faults: TelegramFaults,
     extras: [Extra; 2],
@@ -38,28 +41,30 @@ pub struct Wire {
     unplug: Window,
     power: Schedule,
     brownouts: Schedule,
-    /// Whether nothing gets through at [`RS422_RATE`] or more.
+    /// Whether the line carries nothing at [`RS422_RATE`] or more.
     is_rs232: bool,
-    /// Whether the adapter is in its socket.
+    /// Whether the adapter is plugged in.
     plugged: bool,
-    /// Bytes of the telegram on the line that were sent, the last of them, and why they did not arrive as they were.
+    /// Number of bytes of the current telegram that were sent.
     position: usize,
+    /// The last one of these bytes.
     last: u8,
+    /// First cause for which one of them did not arrive as sent.
     fault: Option<Fault>,
-    /// Whether the power broke it off.
+    /// Whether a power cycle broke off the current telegram.
     power_broke: bool,
-    /// Bytes of each telegram, if they all have as many.
+    /// Length of a telegram, if all have the same.
     telegram_len: Option<usize>,
-    /// How the last telegram of measured values began.
+    /// First bytes of the last telegram of measured values.
     header: Vec<u8>,
-    /// What has not arrived yet, with the time at which it does.
-    queue: VecDeque<(Nanos, Carried)>,
+    /// Bytes that have not arrived yet, with the times of their arrival.
+    queue: VecDeque<(Nanos, Delivery)>,
 }
 
-impl Wire {
-    /// A line with `faults`, drawn with `seed`.
-    pub fn new(faults: &Faults, seed: u64) -> Wire {
-        Wire {
+impl LineModel {
+    /// Creates a line with `faults`, drawn with `seed`.
+    pub fn new(faults: &Faults, seed: u64) -> LineModel {
+        LineModel {
             noise: Noise::new(faults, seed),
             telegram_faults: TelegramFaults::new(faults, seed),
             extras: [Extra::floods(faults, seed), Extra::walls(faults, seed)],
@@ -80,39 +85,40 @@ impl Wire {
         }
     }
 
-    /// Uses other faults from now on, with new random numbers; what is on its way does not change.
+    /// Changes the faults from now on, with new random numbers. Bytes that were sent before do not change.
     pub fn set_faults(&mut self, faults: &Faults, seed: u64) {
-        let fresh = Wire::new(faults, seed);
+        let fresh = LineModel::new(faults, seed);
         let delay = fresh.delay.after(&self.delay);
         let (queue, header) = (std::mem::take(&mut self.queue), std::mem::take(&mut self.header));
-        let Wire { position, last, fault, power_broke, .. } = *self;
-        *self = Wire { delay, position, last, fault, power_broke, queue, header, ..fresh };
+        let LineModel { position, last, fault, power_broke, .. } = *self;
+        *self = LineModel { delay, position, last, fault, power_broke, queue, header, ..fresh };
     }
 
-    /// The host's adapter is out of its socket from `now` on for `span`, whatever the faults say of it.
+    /// Unplugs the host's adapter from `now` on for `span`, in addition to the faults.
     pub fn unplug(&mut self, now: Nanos, span: Nanos) {
         self.unplug = Window::once(now, span);
     }
 
-    /// The power of `machine` goes off and on at `now`.
+    /// Switches the power of `machine` off and on at `now`.
     pub fn cycle_power(&mut self, machine: &mut dyn Device, now: Nanos) {
         self.power_broke |= machine.power_cycle(now);
     }
 
-    /// Whether the host's adapter is in its socket, as of the last poll.
+    /// Returns whether the host's adapter was plugged in at the last poll.
     pub fn is_plugged(&self) -> bool {
         self.plugged
     }
 
-    /// A byte of the host, if it gets through. Call it after [`Wire::poll_transmit`] answered `None`.
+    /// Passes a byte of the host to `machine`, if the line carries it. Call it after [`LineModel::poll_transmit`] returned
+    /// `None`.
     pub fn receive(&mut self, machine: &mut dyn Device, byte: u8, arrival: Arrival) {
         if self.plugged && self.carries(machine.rate()) {
             machine.receive(byte, arrival);
         }
     }
 
-    /// The next bytes that arrive at `now`.
-    pub fn poll_transmit(&mut self, machine: &mut dyn Device, now: Nanos) -> Option<Carried> {
+    /// Returns the next bytes that arrive at `now`.
+    pub fn poll_transmit(&mut self, machine: &mut dyn Device, now: Nanos) -> Option<Delivery> {
         self.plugged = !self.unplug.holds(now);
         if self.power.take(now).is_some() {
             self.cycle_power(machine, now);
@@ -122,12 +128,12 @@ impl Wire {
         }
         loop {
             if self.queue.front().is_some_and(|(at, _)| *at <= now)
-                && let Some((_, mut carried)) = self.queue.pop_front()
+                && let Some((_, mut delivery)) = self.queue.pop_front()
             {
-                if !self.plugged && !std::mem::take(&mut carried.bytes).is_empty() {
-                    carried.fault = carried.fault.or(carried.is_telegram().then_some(Fault::Unplug));
+                if !self.plugged && !std::mem::take(&mut delivery.bytes).is_empty() {
+                    delivery.fault = delivery.fault.or(delivery.is_telegram().then_some(Fault::Unplug));
                 }
-                return Some(carried);
+                return Some(delivery);
             }
             match machine.poll_transmit(now) {
                 Some(chunk) => self.carry(machine, chunk, now),
@@ -138,13 +144,13 @@ impl Wire {
                     let bytes = Some(self.garbage(now, false)?.0);
                     let bytes = bytes.filter(|_| !self.is_silent(machine.rate(), now)).unwrap_or_default();
                     let rate = machine.rate();
-                    self.push(now, Carried { bytes, rate, idle_after: true, part: None, fault: None });
+                    self.push(now, Delivery { bytes, rate, idle_after: true, part: None, fault: None });
                 }
             }
         }
     }
 
-    /// When there will be something to poll, seen from `now`.
+    /// Returns the time after `now` at which the next bytes can arrive.
     pub fn poll_timeout(&self, machine: &dyn Device, now: Nanos) -> Option<Nanos> {
         let extras = self.extras.iter().filter(|_| self.position == 0).map(|extra| extra.due_ns(false));
         extras
@@ -155,7 +161,7 @@ impl Wire {
             .min()
     }
 
-    /// Puts what becomes of a chunk that is through on its way to the host.
+    /// Damages a chunk whose transmission is complete, and queues it for the host.
     fn carry(&mut self, machine: &mut dyn Device, chunk: Chunk, now: Nanos) {
         let Chunk { bytes, rate, idle_after, part } = chunk;
         let is_silent = self.is_silent(rate, now);
@@ -174,10 +180,10 @@ impl Wire {
         } else if machine.streams() && self.telegram_faults.breaks_at(self.position) {
             machine.break_off(now);
         }
-        self.push(now, Carried { bytes: arrived, rate, idle_after, part: Some(part), fault });
+        self.push(now, Delivery { bytes: arrived, rate, idle_after, part: Some(part), fault });
         if let Some(sent) = copy {
             let bytes = sent.telegram.clone();
-            self.push(now, Carried { bytes, rate, idle_after, part: Some(Part::End(sent)), fault: None });
+            self.push(now, Delivery { bytes, rate, idle_after, part: Some(Part::End(sent)), fault: None });
         }
     }
 
@@ -202,7 +208,8 @@ impl Wire {
         arrived
     }
 
-    /// What becomes of bytes of a telegram that has `len` (if that is known yet), and the first cause.
+    /// Returns the bytes that arrive for `bytes` of a telegram, and the first fault. The telegram has `len` bytes, if that is
+    /// known.
     fn carry_telegram(
         &mut self,
         bytes: &[u8],
@@ -227,13 +234,13 @@ impl Wire {
                 fault = fault.or(between.map(|_| cause));
             }
             let ByteOutcome { before, lost, flipped, doubled } = self.noise.next();
-            let (blemished, blemish) = self.telegram_faults.apply(position, byte);
+            let (changed, telegram_fault) = self.telegram_faults.apply(position, byte);
             fault = fault.or((position > 0 && !before.is_empty()).then_some(Fault::Insert));
             arrived.extend(foreign(before, between));
-            fault = fault.or(blemish).or(lost.then_some(Fault::Loss));
-            let Some(byte) = blemished.filter(|_| !lost) else { continue };
+            fault = fault.or(telegram_fault).or(lost.then_some(Fault::Loss));
+            let Some(byte) = changed.filter(|_| !lost) else { continue };
             fault = fault.or((flipped != 0).then_some(Fault::Flip));
-            // A copy of the first byte comes before a whole telegram, one of the last behind it.
+            // A copy of the first byte is before the intact telegram, and a copy of the last byte is after it.
             let splits = doubled && position > 0 && position + 1 < len;
             fault = fault.or(splits.then_some(Fault::Double));
             arrived.extend(std::iter::repeat_n(byte ^ flipped, 1 + usize::from(doubled)));
@@ -242,7 +249,7 @@ impl Wire {
         (arrived, fault)
     }
 
-    /// A telegram has left; returns its copy, if it comes twice.
+    /// Ends the current telegram. Returns a copy if it is sent twice.
     fn end(&mut self, sent: &Sent, fault: Option<Fault>) -> Option<Sent> {
         self.position = 0;
         if !sent.is_reply {
@@ -252,7 +259,7 @@ impl Wire {
         (is_whole && self.telegram_faults.repeats()).then(|| sent.clone())
     }
 
-    /// Garbage that is due, inside a telegram or between two, and its name.
+    /// Returns the garbage that is due, and its fault.
     fn garbage(&mut self, now: Nanos, inside: bool) -> Option<(Vec<u8>, Fault)> {
         if self.extras.iter().all(|extra| extra.due_ns(inside) > now) {
             return None;
@@ -261,20 +268,20 @@ impl Wire {
         self.extras.iter_mut().find_map(|extra| Some((extra.take(now, inside, header)?, extra.fault)))
     }
 
-    fn push(&mut self, now: Nanos, carried: Carried) {
-        self.queue.push_back((self.delay.release_ns(now), carried));
+    fn push(&mut self, now: Nanos, delivery: Delivery) {
+        self.queue.push_back((self.delay.release_ns(now), delivery));
     }
 }
 
-impl Carried {
-    /// Whether bytes of a telegram are among those that were sent.
+impl Delivery {
+    /// Returns whether the bytes belong to a telegram.
     pub fn is_telegram(&self) -> bool {
         matches!(self.part, Some(Part::Telegram | Part::End(_)))
     }
 }
 
-/// Foreign bytes that came `between` two of a telegram, none of which can stand for one of them: else the telegram
-/// would be whole, shifted by as many.
+/// Changes foreign bytes `between` two bytes of a telegram, so that they differ from their neighbors. Otherwise the
+/// telegram would be intact, with a shift.
 fn foreign(mut bytes: Vec<u8>, between: Option<(u8, u8)>) -> Vec<u8> {
     if let (Some((before, after)), [first, rest @ ..]) = (between, &mut bytes[..]) {
         let last = rest.last_mut();
@@ -291,5 +298,184 @@ fn foreign(mut bytes: Vec<u8>, between: Option<(u8, u8)>) -> Vec<u8> {
 
 /// Lowest rate that RS-232 does not carry, in bits per second.
 const RS422_RATE: u32 = 500_000;
-/// Bytes of a stream's header: STX to count word.
+/// Length of a stream's header in bytes: STX to count word.
 const HEADER: usize = 7;
+
+/// A receiver at the wrong rate.
+#[derive(Clone, Debug)]
+pub struct Receiver {
+    /// Number of the sender's bits in one bit of the receiver.
+    ratio: f64,
+    /// Levels of the line that were not sampled yet. The first one is bit number `first`.
+    line: VecDeque<bool>,
+    first: u64,
+    state: State,
+}
+
+/// A port that may have another rate than the line. Both rates can change; the receiver restarts then.
+#[derive(Clone, Debug, Default)]
+pub struct BaudMismatch(Option<((u32, u32), Receiver)>);
+
+impl BaudMismatch {
+    /// Receives bytes like [`Receiver::receive`]. The line has the first of the `rates`, and the port the second, in bits per
+    /// second.
+    pub fn receive(&mut self, rates: (u32, u32), bytes: &[u8], idle_after: bool) -> Vec<u8> {
+        let known = self.0.take().filter(|(known, _)| *known == rates);
+        let (_, receiver) = self.0.insert(known.unwrap_or_else(|| (rates, Receiver::new(rates.0, rates.1))));
+        receiver.receive(bytes, idle_after)
+    }
+
+    /// Drops a byte that was partly received, because both ends have the same rate now.
+    pub fn reset(&mut self) {
+        self.0 = None;
+    }
+}
+
+#[derive(Clone, Copy, Debug)]
+enum State {
+    /// Waits for a falling edge after bit number `after`, whose level was `level`.
+    Hunting { after: u64, level: bool },
+    /// A start bit fell at the beginning of bit number `start`; `bits` data bits were sampled.
+    Sampling { start: u64, bits: u32, byte: u8 },
+}
+
+impl Receiver {
+    /// Creates a receiver at `receiver_rate` bits per second on a line at `sender_rate`.
+    pub fn new(sender_rate: u32, receiver_rate: u32) -> Self {
+        Receiver {
+            ratio: f64::from(sender_rate) / f64::from(receiver_rate.max(1)),
+            line: VecDeque::new(),
+            first: 0,
+            state: State::Hunting { after: 0, level: true },
+        }
+    }
+
+    /// Returns the bytes that the receiver reads from `bytes` without a pause. If `idle_after` is set, the line is idle
+    /// afterwards.
+    pub fn receive(&mut self, bytes: &[u8], idle_after: bool) -> Vec<u8> {
+        for &byte in bytes {
+            self.line.push_back(false);
+            self.line.extend((0..8).map(|bit| byte >> bit & 1 == 1));
+            self.line.push_back(true);
+        }
+        if idle_after {
+            // The time of a byte of the receiver, so that it completes the last byte.
+            let bits = (11.0 * self.ratio).ceil() as usize + 1;
+            self.line.extend(std::iter::repeat_n(true, bits));
+        }
+        let mut read = Vec::new();
+        while let Some(byte) = self.next() {
+            read.extend(byte);
+        }
+        read
+    }
+
+    /// Makes one step. Returns `None` if more bits are needed, and `Some(None)` if the step completed no byte.
+    fn next(&mut self) -> Option<Option<u8>> {
+        match self.state {
+            State::Hunting { after, level } => {
+                let now = self.level(after)?;
+                self.state = if level && !now {
+                    State::Sampling { start: after, bits: 0, byte: 0 }
+                } else {
+                    State::Hunting { after: after + 1, level: now }
+                };
+                Some(None)
+            }
+            State::Sampling { start, bits, byte } => {
+                let at = start + ((1.0 + f64::from(bits) + SAMPLE_POSITION) * self.ratio) as u64;
+                let level = self.level(at)?;
+                if bits == 8 {
+                    self.state = State::Hunting { after: at + 1, level };
+                    return Some(Some(byte));
+                }
+                self.state = State::Sampling { start, bits: bits + 1, byte: byte | u8::from(level) << bits };
+                Some(None)
+            }
+        }
+    }
+
+    /// Returns the level of bit number `at`, and drops earlier bits.
+    fn level(&mut self, at: u64) -> Option<bool> {
+        let skip = (at - self.first).min(self.line.len() as u64);
+        self.line.drain(..skip as usize);
+        self.first += skip;
+        if self.first == at { self.line.front().copied() } else { None }
+    }
+}
+
+/// Position in a bit at which the receiver samples. 0.40 to 0.48 agree with a recording of a real port at 19200 on a line
+/// at 38400; 0.5 and more do not (reference, section 2).
+const SAMPLE_POSITION: f64 = 0.45;
+
+#[cfg(test)]
+#[path = "../../../tests/testkit/skip.rs"]
+mod skip;
+
+#[cfg(test)]
+mod tests {
+    use std::collections::HashSet;
+    use std::path::PathBuf;
+
+    use super::*;
+
+    #[test]
+    fn right_rate_changes_nothing() {
+        let bytes: Vec<u8> = (0..=255).collect();
+        for rate in [9_600, 9_500, 9_700] {
+            assert_eq!(Receiver::new(9_600, rate).receive(&bytes, true), bytes, "{rate}");
+        }
+        let mut receiver = Receiver::new(500_000, 500_000);
+        let mut read = Vec::new();
+        for chunk in bytes.chunks(16) {
+            read.extend(receiver.receive(chunk, false));
+        }
+        read.extend(receiver.receive(&[], true));
+        assert_eq!(read, bytes);
+    }
+
+    #[test]
+    fn a_faster_host_reads_zeros() {
+        let read = Receiver::new(38_400, 500_000).receive(&[0x02, 0x80, 0xD6, 0x02, 0xB0, 0x69, 0x41], true);
+        assert!(read.len() > 7 && read.iter().all(|&byte| byte == 0), "{read:02X?}");
+    }
+
+    #[test]
+    fn a_slower_host_reads_less() {
+        let bytes: Vec<u8> = (0..20_000u32).map(|i| ((i * i) >> 3) as u8).collect();
+        for (rate, share) in [(19_200, 0.5), (9_600, 0.25)] {
+            let read = Receiver::new(38_400, rate).receive(&bytes, true).len() as f64 / bytes.len() as f64;
+            assert!((read - share).abs() < 0.08 * share, "{rate}: {read}");
+        }
+    }
+
+    /// Compares the recording of a host at 19200 on a line at 38400 with the model, which receives what that scanner sent.
+    #[test]
+    fn agrees_with_a_recording() {
+        let data = std::env::var_os("SCANHUB_DATA").map_or_else(
+            || PathBuf::from(concat!(env!("CARGO_MANIFEST_DIR"), "/../../../shared/data")),
+            PathBuf::from,
+        );
+        let read = |name: &str| std::fs::read(data.join("captures").join(name));
+        let (Ok(real), Ok(sent)) = (read("host19200_while_sensor_38400.bin"), read("lms200_38400.bin"))
+        else {
+            super::skip::skip("recordings", format!("none at {}", data.display()));
+            return;
+        };
+        let model = Receiver::new(38_400, 19_200).receive(&sent, true);
+        let grams: HashSet<&[u8]> = model.windows(4).collect();
+        let found = real.windows(4).filter(|gram| grams.contains(gram)).count();
+        // The recordings show different scenes; with a sample position of 0.5 none at all is found.
+        println!("{found} of {} runs of 4 bytes are in the model's output", real.len() - 3);
+        assert!(found > 3_000, "{found}");
+        let histogram = |bytes: &[u8]| {
+            let mut counts = [0.0f64; 256];
+            bytes.iter().for_each(|&byte| counts[usize::from(byte)] += 1.0 / bytes.len() as f64);
+            counts
+        };
+        let (a, b) = (histogram(&real), histogram(&model));
+        let distance = a.iter().zip(&b).map(|(a, b)| (a - b).abs()).sum::<f64>() / 2.0;
+        println!("histogram distance {distance:.3}");
+        assert!(distance < 0.55, "{distance}");
+    }
+}

@@ -13,7 +13,7 @@ use schema::{Failure, Kind};
 use serde::Deserialize;
 use toml::Spanned;
 
-use crate::layers::Layers;
+use crate::beam::NoiseModel;
 use crate::mount::{Fault, FaultKind, Mount};
 use crate::scene::{Corner, Move, Plan, SIT_DOWN_S, Scene, Sensor, Speed, Sun, Surface, Thing, Way, length};
 use crate::shape::{Heights, Point, Pose, Shape};
@@ -92,18 +92,18 @@ impl World {
         World::Scene(Arc::new(scene))
     }
 
-    /// Returns the layers of noise, or `None` if the world has none.
-    pub fn layers(&self) -> Option<Layers> {
+    /// Returns the noise, or `None` if the world has none.
+    pub fn noise(&self) -> Option<NoiseModel> {
         match self {
-            World::Scene(scene) => Some(scene.layers),
+            World::Scene(scene) => Some(scene.noise),
             _ => None,
         }
     }
 
-    /// Returns the world with other layers of noise. A world without layers stays as it is.
-    pub fn with_layers(self, layers: Layers) -> World {
+    /// Returns the world with other noise. A world without noise stays as it is.
+    pub fn with_noise(self, noise: NoiseModel) -> World {
         match self {
-            World::Scene(scene) => World::Scene(Arc::new(Scene { layers, ..Arc::unwrap_or_clone(scene) })),
+            World::Scene(scene) => World::Scene(Arc::new(Scene { noise, ..Arc::unwrap_or_clone(scene) })),
             other => other,
         }
     }
@@ -155,7 +155,7 @@ fn parse_scene(name: &str, text: &str) -> Result<Scene, Failure> {
     let sensors = file.sensor.iter().map(sensor).collect::<Result<Vec<_>, _>>()?;
     Ok(Scene {
         sensors: if sensors.is_empty() { vec![Sensor { pose: MIDDLE, mount: None }] } else { sensors },
-        layers: file.noise.layers(&origin)?,
+        noise: file.noise.model(&origin)?,
         things: file
             .thing
             .iter()
@@ -271,11 +271,11 @@ struct SunFile {
 }
 
 impl NoiseFile {
-    fn layers(&self, origin: &Origin) -> Result<Layers, Failure> {
-        let all = Layers::default();
+    fn model(&self, origin: &Origin) -> Result<NoiseModel, Failure> {
+        let all = NoiseModel::default();
         let length = |value: &Option<Spanned<f64>>, usual| origin.number(value, usual, 0.0..=1_000.0);
         let share = |value: &Option<Spanned<f64>>, usual| origin.number(value, usual, 0.0..=1.0);
-        Ok(Layers {
+        Ok(NoiseModel {
             bias_mm: length(&self.bias_mm, all.bias_mm)?,
             sigma_mm: length(&self.sigma_mm, all.sigma_mm)?,
             tail: share(&self.tail, all.tail)?,

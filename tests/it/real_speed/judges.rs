@@ -3,7 +3,7 @@
 use std::collections::HashSet;
 
 use serde_json::Value;
-use sim::truth::Record;
+use sim::simulate::Record;
 
 use crate::testkit::{Outcome, bytes_of, number};
 

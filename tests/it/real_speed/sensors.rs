@@ -9,7 +9,7 @@ use std::thread::{self, JoinHandle};
 
 use schema::Failure;
 use sim::options::SimulateOptions;
-use sim::truth::{Record, Summary};
+use sim::simulate::{Record, Summary};
 use sim::{Event, simulate_with};
 
 use crate::testkit::{PATIENCE, TestEnv};

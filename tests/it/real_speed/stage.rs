@@ -82,7 +82,7 @@ impl Stage {
     }
 
     /// Does `action`, if it can be done to a real program: the machine's clock, disk, memory and rights are left alone, and a
-    /// sensor's view and habits are those that it began with.
+    /// sensor's view and quirks are those that it began with.
     pub(super) fn act(&mut self, action: &Action) {
         let sensor = action.value("sensor") as usize % SENSORS.len();
         let span = action.value("span_ms") * MILLIS;

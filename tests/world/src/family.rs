@@ -11,12 +11,12 @@ use std::sync::{Arc, LazyLock};
 
 use scanhub_drivers::lms::variant::{Mode, Unit, Variant};
 use schema::{MILLIS, Nanos, Scan};
+use sim::beam::NoiseModel;
 use sim::device::Device;
-use sim::layers::Layers;
 use sim::ld::TruePoint;
-use sim::machine::Habits;
+use sim::machine::ProtocolQuirks;
 use sim::room::Room;
-use sim::series::{Changes, Series};
+use sim::room::{Changes, PrecomputedScans};
 use sim::world::World as Scene;
 
 use crate::plan::Action;
@@ -202,23 +202,23 @@ pub(crate) fn named(text: &str, random: &mut fastrand::Rng) -> Option<Rc<dyn Fam
 }
 
 /// How a scanner behaves to which `action` happens: shares are in percent.
-fn habits(action: &Action) -> Habits {
+fn quirks(action: &Action) -> ProtocolQuirks {
     let share = |name| action.value(name) as f64 / 1e2;
-    Habits {
+    ProtocolQuirks {
         overlooks: share("overlooks"),
         naks: share("naks"),
         doubles: share("doubles"),
         late_reply_ns: action.value("late_ms") * MILLIS,
         mute: action.value("mute") > 0,
-        ..Habits::default()
+        ..ProtocolQuirks::default()
     }
 }
 
 /// The rooms without any noise, for all worlds. No LMS tells its scans of them.
-fn still_rooms() -> Arc<Series> {
-    static SERIES: LazyLock<Arc<Series>> = LazyLock::new(|| {
-        let rooms = rooms(|scene| scene.with_layers(Layers::NONE));
-        Arc::new(Series::new(rooms, 1, Variant::HALF, Unit::Mm, Mode(1)))
+fn still_rooms() -> Arc<PrecomputedScans> {
+    static SERIES: LazyLock<Arc<PrecomputedScans>> = LazyLock::new(|| {
+        let rooms = rooms(|scene| scene.with_noise(NoiseModel::NONE));
+        Arc::new(PrecomputedScans::new(rooms, 1, Variant::HALF, Unit::Mm, Mode(1)))
     });
     SERIES.clone()
 }

@@ -7,7 +7,7 @@ use schema::{MICROS, Nanos, line_time};
 use sim::Arrival;
 use sim::fault::Faults;
 use sim::ld::TruePoint;
-use sim::wire::{Carried, Wire};
+use sim::wire::{Delivery, LineModel};
 
 use crate::family::{Ailment, Scanner};
 use crate::plan::Action;
@@ -15,7 +15,7 @@ use crate::plan::Action;
 /// A sensor at the end of its line.
 pub(crate) struct Sensor {
     scanner: Box<dyn Scanner>,
-    wire: Wire,
+    wire: LineModel,
     /// Bytes of the host on their way: when they are through, and their rate.
     outgoing: VecDeque<(Nanos, u8, u32)>,
     now: Nanos,
@@ -26,7 +26,7 @@ pub(crate) struct Sensor {
 /// What happens at a sensor and its line.
 pub(crate) enum Happening {
     /// Bytes come out of the line.
-    Arrived(Carried),
+    Arrived(Delivery),
     /// The scanner measured these points.
     Measured(Vec<TruePoint>),
 }
@@ -36,7 +36,7 @@ impl Sensor {
     pub(crate) fn new(scanner: Box<dyn Scanner>) -> Sensor {
         Sensor {
             scanner,
-            wire: Wire::new(&Faults::default(), 0),
+            wire: LineModel::new(&Faults::default(), 0),
             outgoing: VecDeque::new(),
             now: 0,
             eeprom_writes: 0,

@@ -5,7 +5,7 @@ use std::rc::Rc;
 
 use config::{Config, Sources};
 use schema::{Failure, Topic};
-use sim::series::Changes;
+use sim::room::Changes;
 
 use crate::consumer::Habit;
 use crate::family::{self, Family};

@@ -6,8 +6,8 @@ use std::collections::VecDeque;
 use port::PortError;
 use schema::Nanos;
 use sim::device::{Part, Sent};
-use sim::noise::Mistuned;
-use sim::wire::Carried;
+use sim::wire::BaudMismatch;
+use sim::wire::Delivery;
 
 use crate::event::{Event, Telegram};
 use crate::sensor::{Happening, Sensor};
@@ -31,7 +31,7 @@ pub(crate) struct Tty {
     rate: u32,
     /// Rate that the hub has set; another process may have set another one.
     own_rate: u32,
-    mistuned: Mistuned,
+    mistuned: BaudMismatch,
     buffer: VecDeque<u8>,
     /// Bytes that went into the buffer, ever.
     put: u64,
@@ -67,7 +67,7 @@ impl Tty {
             is_open: false,
             rate: 9_600,
             own_rate: 9_600,
-            mistuned: Mistuned::default(),
+            mistuned: BaudMismatch::default(),
             buffer: VecDeque::with_capacity(ROOM),
             put: 0,
             begun: None,
@@ -85,7 +85,7 @@ impl Tty {
                     return log.tell(at, &Event::Measured { sensor: *number, points: &points });
                 }
             };
-            let Carried { bytes, rate: sent_at, idle_after, part, fault } = carried;
+            let Delivery { bytes, rate: sent_at, idle_after, part, fault } = carried;
             let mut damage = fault.map(|fault| fault.name());
             let mut bytes = bytes;
             if device.is_none() || !*is_open {
@@ -95,7 +95,7 @@ impl Tty {
                 damage = damage.or(Some("baud"));
                 bytes = mistuned.receive((sent_at, *rate), &bytes, idle_after);
             } else {
-                mistuned.tune();
+                mistuned.reset();
             }
             if bytes.len() > ROOM - buffer.len() {
                 damage = damage.or(Some("overrun"));

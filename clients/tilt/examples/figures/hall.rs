@@ -6,8 +6,8 @@ use std::time::{Duration, Instant};
 
 use scanhub_drivers::lms::variant::{Mode, Unit, Variant};
 use schema::{Scan, ScanHead};
-use sim::labeled_scan::Met;
 use sim::mount::{Mount as Motor, Report};
+use sim::room::BeamTarget;
 use sim::room::Room;
 use sim::world::World;
 use tilt::{Angle, Counts, Mount, Point, Settings, Sweep, Tilting};
@@ -23,7 +23,7 @@ pub(crate) struct Hall {
     /// The mount as it is known.
     pub(crate) mount: Mount,
     /// What stamped each beam, and what it met.
-    truth: HashMap<(u64, u16), Met>,
+    truth: HashMap<(u64, u16), BeamTarget>,
     /// The delay of the angles' stamps that the library has found.
     pub(crate) late_ns: i64,
 }
@@ -92,7 +92,7 @@ impl Hall {
     }
 
     /// Returns what the beam of `point` met.
-    pub(crate) fn met(&self, point: &Point) -> Option<Met> {
+    pub(crate) fn met(&self, point: &Point) -> Option<BeamTarget> {
         self.truth.get(&(point.stamp_ns, point.beam)).copied()
     }
 

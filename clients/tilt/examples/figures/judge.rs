@@ -1,6 +1,6 @@
 //! How right the classes of points are, and where obstacles are found. Refuses to know how a hall is played.
 
-use sim::labeled_scan::Met;
+use sim::room::BeamTarget;
 use tilt::{Obstacle, PointClass, Settings, Sweep};
 
 use super::hall::Hall;
@@ -29,10 +29,12 @@ impl Score {
                 (*all, *found) = (*all + 1, *found + usize::from(is_found))
             };
             match hall.met(point) {
-                Some(Met::Person) => count(&mut self.persons),
-                Some(Met::Box { since_ns }) if point.stamp_ns < since_ns + new_ns => count(&mut self.things),
-                Some(Met::Box { since_ns }) if point.stamp_ns < since_ns + new_ns + 2 * sweep_ns => {}
-                Some(Met::Grazed | Met::Invalid) | None => {}
+                Some(BeamTarget::Person) => count(&mut self.persons),
+                Some(BeamTarget::Box { since_ns }) if point.stamp_ns < since_ns + new_ns => {
+                    count(&mut self.things)
+                }
+                Some(BeamTarget::Box { since_ns }) if point.stamp_ns < since_ns + new_ns + 2 * sweep_ns => {}
+                Some(BeamTarget::Grazed | BeamTarget::Invalid) | None => {}
                 Some(_) => self.wrong += usize::from(is_found),
             }
         }
@@ -74,9 +76,11 @@ impl Things {
         let (mut new, mut open) = (Vec::new(), Vec::new());
         for point in sweep.points {
             match hall.met(point) {
-                Some(Met::Person) => new.push(point.at),
-                Some(Met::Box { since_ns }) if point.stamp_ns < since_ns + new_ns => new.push(point.at),
-                Some(Met::Box { since_ns }) if point.stamp_ns < since_ns + new_ns + 3 * sweep_ns => {
+                Some(BeamTarget::Person) => new.push(point.at),
+                Some(BeamTarget::Box { since_ns }) if point.stamp_ns < since_ns + new_ns => {
+                    new.push(point.at)
+                }
+                Some(BeamTarget::Box { since_ns }) if point.stamp_ns < since_ns + new_ns + 3 * sweep_ns => {
                     open.push(point.at);
                 }
                 _ => {}

@@ -6,7 +6,7 @@ use std::f64::consts::PI;
 use scanhub_drivers::lms::variant::{Mode, Unit, Variant};
 use schema::{Nanos, Scan, ScanHead};
 use sim::Shape;
-use sim::layers::Layers;
+use sim::beam::NoiseModel;
 use sim::room::Room;
 use sim::world::World;
 use track::geometry::Point;
@@ -140,10 +140,10 @@ impl House {
             }
         }
         let layers = match self.is_ideal {
-            true => Layers { sigma_mm: IDEAL_SIGMA_MM, errors: IDEAL_ERRORS, ..Layers::NONE },
-            false => Layers::default(),
+            true => NoiseModel { sigma_mm: IDEAL_SIGMA_MM, errors: IDEAL_ERRORS, ..NoiseModel::NONE },
+            false => NoiseModel::default(),
         };
-        World::of_toml("house.toml", &text).expect("the house is right").with_layers(layers)
+        World::of_toml("house.toml", &text).expect("the house is right").with_noise(layers)
     }
 }
 

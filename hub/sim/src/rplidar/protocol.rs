@@ -1,10 +1,256 @@
-//! The wire format of an RPLIDAR: decodes requests, and encodes responses and packets of points.
+//! The models of RPLIDARs and their wire format: decodes requests, and encodes responses and packets of points.
 //!
 //! A request is `A5 command`. If the top bit of the command is set, a length, a payload of this length and the XOR of
 //! all bytes follow. A response is a descriptor and its data. Angles and ranges are rounded here to the resolution of
 //! the format. The driver has its own description of the protocol, so that an error in one of them is noticed.
+//!
+//! Whole microseconds, names and response types of the A1 are those of a real A1M8 with firmware 1.29. Those of the other
+//! models come from their data sheets and the logs of the vendor's driver, and were not measured.
 
-use super::models::{Mode, Model};
+/// Model of an RPLIDAR.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Model {
+    /// RPLIDAR A1M8.
+    A1,
+    /// RPLIDAR A2M8.
+    A2m8,
+    /// RPLIDAR A2M12.
+    A2m12,
+    /// RPLIDAR A3M1.
+    A3,
+    /// RPLIDAR S1.
+    S1,
+    /// RPLIDAR S2.
+    S2,
+    /// RPLIDAR S3.
+    S3,
+    /// RPLIDAR C1.
+    C1,
+}
+
+/// Format of a mode's points: the type in its descriptor.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Form {
+    /// 0x81: one point in 5 bytes.
+    Standard,
+    /// 0x82: 32 points in 84 bytes, with a correction of each angle.
+    Express,
+    /// 0x84: 96 points in 132 bytes, two of three ranges predicted.
+    Ultra,
+    /// 0x85: 40 points in 84 bytes.
+    Dense,
+    /// 0x86: 64 points in 170 bytes.
+    UltraDense,
+}
+
+/// A scan mode, which a host requests by its number.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Mode {
+    /// Name that the scanner reports.
+    pub name: &'static str,
+    /// Time from one point to the next in microseconds, as the scanner reports it. A real A1 takes 0.7 % longer.
+    pub sample_us: f64,
+    /// Format of its points.
+    pub form: Form,
+    /// Maximum range that the scanner reports, in meters.
+    pub reach_m: f64,
+}
+
+/// Control of the motor.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Motor {
+    /// The line DTR. A pty does not have it, so the motor turns while there is power.
+    Dtr,
+    /// An accessory board that receives a duty cycle.
+    Pwm,
+    /// The scanner itself, which receives revolutions per minute.
+    Rpm,
+}
+
+impl Form {
+    /// Returns the type in the descriptor.
+    pub fn answer(self) -> u8 {
+        match self {
+            Form::Standard => 0x81,
+            Form::Express => 0x82,
+            Form::Ultra => 0x84,
+            Form::Dense => 0x85,
+            Form::UltraDense => 0x86,
+        }
+    }
+
+    /// Returns the number of bytes in a packet.
+    pub fn packet_len(self) -> usize {
+        match self {
+            Form::Standard => 5,
+            Form::Express | Form::Dense => 84,
+            Form::Ultra => 132,
+            Form::UltraDense => 170,
+        }
+    }
+
+    /// Returns the number of points in a packet.
+    pub fn points(self) -> usize {
+        match self {
+            Form::Standard => 1,
+            Form::Express => 32,
+            Form::Ultra => 96,
+            Form::Dense => 40,
+            Form::UltraDense => 64,
+        }
+    }
+}
+
+impl Model {
+    /// All models.
+    pub const ALL: [Model; 8] =
+        [Model::A1, Model::A2m8, Model::A2m12, Model::A3, Model::S1, Model::S2, Model::S3, Model::C1];
+
+    /// Returns the name in options.
+    pub fn name(self) -> &'static str {
+        match self {
+            Model::A1 => "a1",
+            Model::A2m8 => "a2m8",
+            Model::A2m12 => "a2m12",
+            Model::A3 => "a3",
+            Model::S1 => "s1",
+            Model::S2 => "s2",
+            Model::S3 => "s3",
+            Model::C1 => "c1",
+        }
+    }
+
+    /// Returns the byte that the scanner reports as its model.
+    pub fn id(self) -> u8 {
+        match self {
+            Model::A1 => 0x18,
+            Model::A2m8 => 0x28,
+            Model::A2m12 => 0x2C,
+            Model::A3 => 0x31,
+            Model::S1 => 0x61,
+            Model::S2 => 0x71,
+            Model::S3 => 0x81,
+            Model::C1 => 0x41,
+        }
+    }
+
+    /// Returns the rate of the line in bits per second.
+    pub fn baud(self) -> u32 {
+        match self {
+            Model::A1 | Model::A2m8 => 115_200,
+            Model::A2m12 | Model::A3 | Model::S1 => 256_000,
+            Model::S2 | Model::S3 => 1_000_000,
+            Model::C1 => 460_800,
+        }
+    }
+
+    /// Returns the modes, each at the index that is its number.
+    pub fn modes(self) -> &'static [Mode] {
+        match self {
+            Model::A1 | Model::A2m8 => &MODES_8K,
+            Model::A2m12 => &MODES_A2M12,
+            Model::A3 => &MODES_A3,
+            Model::S1 => &MODES_S1,
+            Model::S2 => &MODES_S3[..2],
+            Model::S3 => &MODES_S3,
+            Model::C1 => &MODES_C1,
+        }
+    }
+
+    /// Returns the number of the mode that the scanner recommends.
+    pub fn typical(self) -> usize {
+        match self {
+            Model::A1 | Model::A2m8 | Model::A2m12 | Model::A3 => 3,
+            Model::S1 => 2,
+            Model::S2 | Model::S3 => 1,
+            Model::C1 => 0,
+        }
+    }
+
+    /// Returns the revolutions per second with factory settings. A real A1 sent 1,954 points per second, and 264 to 267 of them per
+    /// revolution.
+    pub fn turns_per_second(self) -> f64 {
+        if self == Model::A1 { 7.36 } else { 10.0 }
+    }
+
+    /// Returns the minimum and maximum range of the data sheet in millimeters.
+    pub(crate) fn reach_mm(self) -> std::ops::RangeInclusive<f64> {
+        match self {
+            Model::A1 => 150.0..=12_000.0,
+            Model::A2m8 | Model::A2m12 => 200.0..=12_000.0,
+            Model::A3 => 200.0..=25_000.0,
+            Model::S1 => 100.0..=40_000.0,
+            Model::S2 => 50.0..=30_000.0,
+            Model::S3 => 50.0..=40_000.0,
+            Model::C1 => 50.0..=12_000.0,
+        }
+    }
+
+    /// Returns whether the scanner triangulates, with a laser beside its lens: then the angle of a point depends on its range, and
+    /// weak surfaces have no return. The others measure the time of flight of the light.
+    pub(crate) fn triangulates(self) -> bool {
+        matches!(self, Model::A1 | Model::A2m8 | Model::A2m12 | Model::A3)
+    }
+
+    pub(crate) fn motor(self) -> Motor {
+        match self {
+            Model::A1 | Model::C1 => Motor::Dtr,
+            Model::A2m8 | Model::A2m12 | Model::A3 => Motor::Pwm,
+            Model::S1 | Model::S2 | Model::S3 => Motor::Rpm,
+        }
+    }
+
+    /// Returns the firmware as (major, minor), and the number of the hardware. The vendor's driver expects 256,000 baud from an A2 or
+    /// A3 with hardware 6.
+    fn versions(self) -> ([u8; 2], u8) {
+        match self {
+            Model::A1 => ([1, 29], 5),
+            Model::A2m8 => ([1, 29], 5),
+            Model::A2m12 | Model::A3 => ([1, 29], 6),
+            Model::S1 | Model::S2 | Model::S3 => ([1, 2], 18),
+            Model::C1 => ([1, 1], 18),
+        }
+    }
+
+    /// Returns the length of the scanner's microsecond in microseconds of the host: a real A1 reported 508 us per point, and sent
+    /// 1,954 points per second.
+    pub(crate) fn slowness(self) -> f64 {
+        if self == Model::A1 { 1.0 / (508e-6 * 1_954.0) } else { 1.0 }
+    }
+}
+
+const fn mode(name: &'static str, sample_us: f64, form: Form, reach_m: f64) -> Mode {
+    Mode { name, sample_us, form, reach_m }
+}
+
+/// Returns the modes of a scanner that triangulates. A point takes `us` microseconds in the fastest modes, and `stable_us` in mode
+/// Stability.
+const fn modes(us: f64, stable_us: f64, reach_m: f64, fast_reach_m: f64) -> [Mode; 5] {
+    [
+        mode("Standard", 4.0 * us, Form::Standard, reach_m),
+        mode("Express", 2.0 * us, Form::Express, reach_m),
+        mode("Boost", us, Form::Ultra, fast_reach_m),
+        mode("Sensitivity", us, Form::Ultra, fast_reach_m),
+        mode("Stability", stable_us, Form::Ultra, fast_reach_m),
+    ]
+}
+
+const MODES_8K: [Mode; 5] = modes(127.0, 201.0, 12.0, 12.0);
+const MODES_A2M12: [Mode; 5] = modes(63.0, 100.0, 12.0, 12.0);
+const MODES_A3: [Mode; 5] = modes(63.0, 100.0, 16.0, 25.0);
+/// The rate of the line limits the standard mode.
+const MODES_S1: [Mode; 3] = [
+    mode("Standard", 217.0, Form::Standard, 16.0),
+    mode("Express", 108.5, Form::Express, 16.0),
+    mode("DenseBoost", 108.5, Form::Dense, 40.0),
+];
+const MODES_S3: [Mode; 3] = [
+    mode("Standard", 62.5, Form::Standard, 16.0),
+    mode("DenseBoost", 31.25, Form::Dense, 40.0),
+    mode("UltraDense", 31.25, Form::UltraDense, 40.0),
+];
+const MODES_C1: [Mode; 2] =
+    [mode("Standard", 200.0, Form::Standard, 16.0), mode("DenseBoost", 200.0, Form::Dense, 16.0)];
 
 /// A request of a host.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -43,7 +289,7 @@ pub(crate) struct Decoder {
 impl Decoder {
     /// Adds a byte, and returns the request that it completes. Requests with a wrong checksum, a wrong length or an
     /// unknown command are dropped.
-    pub(crate) fn hear(&mut self, byte: u8) -> Option<Request> {
+    pub(crate) fn receive(&mut self, byte: u8) -> Option<Request> {
         if self.bytes.is_empty() && byte != START {
             return None;
         }
@@ -332,24 +578,36 @@ fn twenty_bits(reading: &Reading) -> u32 {
 mod tests {
     use super::*;
 
-    fn heard(bytes: &[u8]) -> Vec<Request> {
+    #[test]
+    fn every_mode_leaves_5_percent_of_line_free() {
+        for model in Model::ALL {
+            assert!(model.typical() < model.modes().len());
+            for mode in model.modes() {
+                let packets = 1e6 / (mode.sample_us * model.slowness() * mode.form.points() as f64);
+                let load = packets * mode.form.packet_len() as f64 * 10.0 / f64::from(model.baud());
+                assert!(load < 0.95, "{model:?} {}: {load}", mode.name);
+            }
+        }
+    }
+
+    fn received(bytes: &[u8]) -> Vec<Request> {
         let mut decoder = Decoder::default();
-        bytes.iter().filter_map(|&byte| decoder.hear(byte)).collect()
+        bytes.iter().filter_map(|&byte| decoder.receive(byte)).collect()
     }
 
     #[test]
     fn decodes_valid_requests_among_other_bytes() {
-        assert_eq!(heard(&[0x00, 0x25, 0xA5, 0x25, 0xA5, 0x50, 0x52]), [Request::Stop, Request::Info]);
+        assert_eq!(received(&[0x00, 0x25, 0xA5, 0x25, 0xA5, 0x50, 0x52]), [Request::Stop, Request::Info]);
         let express = [0xA5, 0x82, 0x05, 3, 0, 0, 0, 0, 0xA5 ^ 0x82 ^ 0x05 ^ 3];
-        assert_eq!(heard(&express), [Request::Express(3)]);
+        assert_eq!(received(&express), [Request::Express(3)]);
         for at in 2..express.len() {
             let mut wrong = express;
             wrong[at] ^= 4;
-            assert_eq!(heard(&wrong), [], "{at}");
+            assert_eq!(received(&wrong), [], "{at}");
         }
         let name = [0xA5, 0x84, 0x06, 0x7F, 0, 0, 0, 2, 0, 0xA5 ^ 0x84 ^ 0x06 ^ 0x7F ^ 2];
-        assert_eq!(heard(&name), [Request::Configuration { key: 0x7F, mode: 2 }]);
+        assert_eq!(received(&name), [Request::Configuration { key: 0x7F, mode: 2 }]);
         let pwm = [0xA5, 0xF0, 0x02, 0x94, 0x02, 0xC1];
-        assert_eq!(heard(&[&pwm[..], &[0xA5, 0x40]].concat()), [Request::Pwm(660), Request::Reset]);
+        assert_eq!(received(&[&pwm[..], &[0xA5, 0x40]].concat()), [Request::Pwm(660), Request::Reset]);
     }
 }

@@ -11,9 +11,9 @@ use scanhub_drivers::{Settings, features};
 use schema::{Failure, Family, Nanos};
 use sim::fault::Faults;
 use sim::options::{Scanner, SimulateOptions};
-use sim::pty::now_ns;
+use sim::port::now_ns;
 use sim::simulate;
-use sim::truth::Record;
+use sim::simulate::Record;
 
 use crate::PATIENCE;
 use crate::host::Host;

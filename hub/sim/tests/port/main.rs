@@ -24,7 +24,7 @@ use sim::machine::Start;
 use sim::operating::Operating;
 use sim::options::SimulateOptions;
 use sim::simulate;
-use sim::truth::Record;
+use sim::simulate::Record;
 
 use host::Host;
 use simulator::{Folder, Simulator};

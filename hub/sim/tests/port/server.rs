@@ -13,7 +13,7 @@ use sim::fault::Faults;
 use sim::options::{Scanner, SimulateOptions};
 use sim::rplidar::Model;
 use sim::simulate;
-use sim::truth::Record;
+use sim::simulate::Record;
 
 use crate::PATIENCE;
 use crate::simulator::Simulator;

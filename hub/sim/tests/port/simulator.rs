@@ -11,7 +11,7 @@ use std::time::Instant;
 use schema::Failure;
 use sim::fault::Fault;
 use sim::options::SimulateOptions;
-use sim::truth::{Record, Summary};
+use sim::simulate::{Record, Summary};
 use sim::{Ready, simulate};
 use tempfile::TempDir;
 

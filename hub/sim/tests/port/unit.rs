@@ -8,7 +8,7 @@ use sim::fault::Fault;
 use sim::options::{Scanner, SimulateOptions};
 use sim::rplidar::Model;
 use sim::simulate;
-use sim::truth::Record;
+use sim::simulate::Record;
 
 use crate::PATIENCE;
 use crate::host::Host;

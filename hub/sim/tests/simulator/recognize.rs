@@ -6,17 +6,17 @@ use scanhub_drivers::recognize::{EXAMINED, family_of};
 use schema::{Family, MILLIS, Nanos};
 use sim::device::Device;
 use sim::fault::Faults;
-use sim::ld::{Head, HeadSettings, Packets};
-use sim::machine::{Machine, Settings, Start};
+use sim::ld::{LdSettings, LdSimulator, Packets};
+use sim::machine::{LmsSimulator, Settings, Start};
 use sim::operating::Operating;
+use sim::operating::Source;
 use sim::room::Room;
-use sim::rplidar::{self, Unit, UnitSettings, UnitStart};
-use sim::source::Source;
-use sim::wire::Wire;
+use sim::rplidar::{self, RplidarSettings, RplidarSimulator, RplidarStart};
+use sim::wire::LineModel;
 
 /// Returns at most the first `len` bytes that arrive from `device` within 30 s.
 fn bytes_of(device: &mut dyn Device, faults: &str, len: usize) -> Vec<u8> {
-    let mut wire = Wire::new(&faults.parse::<Faults>().expect("faults"), 3);
+    let mut wire = LineModel::new(&faults.parse::<Faults>().expect("faults"), 3);
     let (mut now, mut bytes): (Nanos, _) = (0, Vec::new());
     while now < 30_000 * MILLIS && bytes.len() < len {
         while let Some(carried) = wire.poll_transmit(device, now) {
@@ -42,18 +42,19 @@ fn scanners() -> Vec<(Family, String, Box<dyn Device>)> {
             let start = Start::In(operating.clone());
             let settings = Settings { baud: Baud::B500000, variant, start, ..Settings::default() };
             let name = format!("lms, mode {number}, {variant:?}");
-            scanners.push((Family::Lms, name, Box::new(Machine::new(settings, Source::Room(room())))));
+            scanners.push((Family::Lms, name, Box::new(LmsSimulator::new(settings, Source::Room(room())))));
         }
     }
     for model in scanhub_drivers::ld::Model::ALL {
-        let head = Head::new(HeadSettings::of(model), Packets::Room(Box::new(room())));
+        let head = LdSimulator::new(LdSettings::of(model), Packets::Room(Box::new(room())));
         scanners.push((Family::Ld, model.name().to_owned(), Box::new(head)));
     }
     for model in rplidar::Model::ALL {
         for typical in 0..model.modes().len() {
-            let settings = UnitSettings { start: UnitStart::Streaming, typical, ..UnitSettings::of(model) };
+            let settings =
+                RplidarSettings { start: RplidarStart::Streaming, typical, ..RplidarSettings::of(model) };
             let name = format!("{}, mode {typical}", model.name());
-            scanners.push((Family::Rplidar, name, Box::new(Unit::new(settings, room()))));
+            scanners.push((Family::Rplidar, name, Box::new(RplidarSimulator::new(settings, room()))));
         }
     }
     scanners

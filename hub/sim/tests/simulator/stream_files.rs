@@ -15,10 +15,10 @@ use schema::{Failure, Family, Foreground, Header, MILLIS, Nanos, Scan, Status, T
 use sim::Arrival;
 use sim::device::Device;
 use sim::fault::Faults;
-use sim::ld::{Head, HeadSettings, Packets};
+use sim::ld::{LdSettings, LdSimulator, Packets};
 use sim::room::Room;
-use sim::rplidar::{Model, Unit, UnitSettings};
-use sim::wire::Wire;
+use sim::rplidar::{Model, RplidarSettings, RplidarSimulator};
+use sim::wire::LineModel;
 use tempfile::TempDir;
 
 const SECOND: Nanos = 1_000 * MILLIS;
@@ -43,7 +43,7 @@ struct Live {
 impl Live {
     /// Runs a session with `settings` on `device` for [`LENGTH`].
     fn of(device: &mut dyn Device, family: Family, settings: &Settings) -> Live {
-        let mut wire = Wire::new(&Faults::default(), 3);
+        let mut wire = LineModel::new(&Faults::default(), 3);
         let mut session = Session::begin(family, settings, 0);
         let mut live = Live { family, telegrams: Vec::new(), scans: Vec::new(), status: Status::default() };
         for now in (0..LENGTH).step_by(MILLIS as usize) {
@@ -239,7 +239,7 @@ fn every_rplidar_in_every_mode_has_the_same_scans() {
             (mode, Settings { model: Some(model.name()), mode: Some(mode), ..Settings::default() })
         });
         for (mode, settings) in modes.chain([("the fastest mode", fastest)]) {
-            let mut unit = Unit::new(UnitSettings::of(model), room());
+            let mut unit = RplidarSimulator::new(RplidarSettings::of(model), room());
             let live = Live::of(&mut unit, Family::Rplidar, &settings);
             check_stream_files(&format!("{} {mode}", model.name()), &live);
         }
@@ -250,7 +250,7 @@ fn every_rplidar_in_every_mode_has_the_same_scans() {
 fn every_ldrobot_has_the_same_scans() {
     for model in ld::Model::ALL {
         for settings in [Settings::default(), Settings { model: Some(model.name()), ..Settings::default() }] {
-            let mut head = Head::new(HeadSettings::of(model), Packets::Room(Box::new(room())));
+            let mut head = LdSimulator::new(LdSettings::of(model), Packets::Room(Box::new(room())));
             let live = Live::of(&mut head, Family::Ld, &settings);
             check_stream_files(model.name(), &live);
         }
@@ -264,7 +264,11 @@ fn recording_without_status_and_responses_becomes_no_stream_file() {
     for model in Model::ALL {
         let name = model.name();
         let fastest = Settings { is_found: true, ..Settings::default() };
-        let live = Live::of(&mut Unit::new(UnitSettings::of(model), room()), Family::Rplidar, &fastest);
+        let live = Live::of(
+            &mut RplidarSimulator::new(RplidarSettings::of(model), room()),
+            Family::Rplidar,
+            &fastest,
+        );
         let folder = TempDir::new().unwrap();
         let recorded = live.record(&folder, JOINED, false);
         let failure = try_convert(&recorded, "a.bin").expect_err(name);
@@ -283,7 +287,11 @@ fn recording_without_status_and_responses_becomes_no_stream_file() {
 fn stream_without_responses_needs_model_or_mode_if_its_packets_look_alike() {
     let folder = TempDir::new().unwrap();
     let settings = Settings { model: Some("s1"), ..Settings::default() };
-    let live = Live::of(&mut Unit::new(UnitSettings::of(Model::S1), room()), Family::Rplidar, &settings);
+    let live = Live::of(
+        &mut RplidarSimulator::new(RplidarSettings::of(Model::S1), room()),
+        Family::Rplidar,
+        &settings,
+    );
     let packets = live.telegrams.iter().filter(|(header, _)| header.stamp_first_ns >= JOINED);
     let bytes: Vec<u8> = packets.flat_map(|(_, bytes)| bytes.clone()).collect();
     let path = folder.path().join("old.bin");

@@ -11,7 +11,6 @@ mod end_hub;
 mod exchange;
 mod garbage;
 mod gateway_killed;
-mod habits;
 mod hold;
 mod key_errors;
 mod kill_hub;
@@ -26,6 +25,7 @@ mod pace;
 mod partition;
 mod pause;
 mod power_cycle;
+mod quirks;
 mod reload;
 mod replug_elsewhere;
 mod resync;
@@ -81,7 +81,7 @@ pub(crate) const KINDS: &[Kind] = &[
     garbage::KIND,
     telegrams::KIND,
     silence::KIND,
-    habits::KIND,
+    quirks::KIND,
     stall::KIND,
     kill_hub::KIND,
     end_hub::KIND,

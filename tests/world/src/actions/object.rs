@@ -2,7 +2,7 @@
 //! happens only this is known from the start, for the scans are measured before.
 
 use schema::{MILLIS, Nanos};
-use sim::series::Changes;
+use sim::room::Changes;
 
 use super::{Key, Kind, SENSOR};
 use crate::plan::{Action, Plan};

@@ -6,7 +6,7 @@ use std::rc::Rc;
 use schema::{Family as Name, Nanos, Scan};
 use sim::device::Device;
 use sim::ld::TruePoint;
-use sim::series::Changes;
+use sim::room::Changes;
 
 use super::{Ailment, Begin, Exactness, Family, Scanner, is_ld_packet};
 use crate::plan::Action;

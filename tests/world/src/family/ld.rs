@@ -8,9 +8,9 @@ use scanhub_drivers::ld::packet::{LEN, POINTS, Packet};
 use schema::{MILLIS, Nanos, Scan};
 use sim::ChunkSize;
 use sim::device::Device;
-use sim::ld::{Head, HeadSettings, Packets, TruePoint};
+use sim::ld::{LdSettings, LdSimulator, Packets, TruePoint};
+use sim::room::Changes;
 use sim::room::Room;
-use sim::series::Changes;
 
 use super::{Begin, Family, INERTIA, SLOWEST, Scanner, still_rooms};
 use crate::plan::Action;
@@ -18,7 +18,7 @@ use crate::plan::Action;
 /// One of them, and what its link asks for.
 #[derive(Clone)]
 pub(super) struct Ld {
-    settings: HeadSettings,
+    settings: LdSettings,
     /// Name of the family in the link.
     family: &'static str,
     /// The link says which model it is.
@@ -35,12 +35,12 @@ impl Ld {
 
     /// One of this model, on its own beams.
     pub(super) fn of(model: Model, random: &mut fastrand::Rng) -> Ld {
-        let settings = HeadSettings {
+        let settings = LdSettings {
             wander: random.f64() * 0.01,
             boot_ns: random.u64(100..2_500) * MILLIS,
             chunk: if random.bool() { ChunkSize::Uart } else { ChunkSize::Usb },
             seed: random.u64(..),
-            ..HeadSettings::of(model)
+            ..LdSettings::of(model)
         };
         Ld { settings, family: "ld", is_said: random.bool(), beams: None }
     }
@@ -67,7 +67,7 @@ impl Family for Ld {
 
     /// What appears where the head has just been is measured a turn later, and told when that turn is over.
     fn times(&self) -> (Nanos, Nanos) {
-        let HeadSettings { turns_per_second, wander, .. } = self.settings;
+        let LdSettings { turns_per_second, wander, .. } = self.settings;
         let slowest = turns_per_second * SLOWEST * (1.0 - wander);
         let turn = (1e9 / slowest) as Nanos;
         (turn, 2 * turn + LAST_PACKET)
@@ -112,8 +112,8 @@ impl Family for Ld {
 
 /// A scanner at a line.
 struct AtLine {
-    head: Head,
-    settings: HeadSettings,
+    head: LdSimulator,
+    settings: LdSettings,
     changes: Changes,
     /// Packets whose points were told as true.
     told: u64,
@@ -123,9 +123,9 @@ struct AtLine {
 }
 
 impl AtLine {
-    fn new(settings: HeadSettings, changes: Changes) -> AtLine {
+    fn new(settings: LdSettings, changes: Changes) -> AtLine {
         let room = Room::of_series(still_rooms(), changes.clone());
-        let head = Head::new(settings, Packets::Room(Box::new(room)));
+        let head = LdSimulator::new(settings, Packets::Room(Box::new(room)));
         AtLine { head, settings, changes, told: 0, pace: 1.0, wanted: 1.0 }
     }
 }
@@ -147,7 +147,7 @@ impl Scanner for AtLine {
     /// It gets its power then.
     fn exchange(&mut self, _: &Action, now: Nanos) -> Vec<u8> {
         let seed = self.settings.seed.wrapping_add(1);
-        *self = AtLine::new(HeadSettings { seed, ..self.settings }, self.changes.clone());
+        *self = AtLine::new(LdSettings { seed, ..self.settings }, self.changes.clone());
         self.head.power_cycle(now);
         Vec::new()
     }

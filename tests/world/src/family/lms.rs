@@ -11,13 +11,13 @@ use scanhub_drivers::lms::variant::{Baud, Mode, Unit, Variant};
 use schema::{MILLIS, Nanos, Scan};
 use sim::ChunkSize;
 use sim::device::Device;
-use sim::machine::{Habits, Machine, Settings, Start};
+use sim::machine::{LmsSimulator, ProtocolQuirks, Settings, Start};
 use sim::operating::Operating;
+use sim::operating::Source;
 use sim::room::Room;
-use sim::series::{Changes, Series};
-use sim::source::Source;
+use sim::room::{Changes, PrecomputedScans};
 
-use super::{Family, Scanner, habits, rooms};
+use super::{Family, Scanner, quirks, rooms};
 use crate::plan::Action;
 
 /// One of them, and what its link asks for.
@@ -137,9 +137,9 @@ impl Family for Lms {
 
 /// A sensor at a line.
 struct AtLine {
-    machine: Machine,
+    machine: LmsSimulator,
     settings: Settings,
-    series: Arc<Series>,
+    series: Arc<PrecomputedScans>,
     changes: Changes,
 }
 
@@ -164,24 +164,25 @@ impl Scanner for AtLine {
     }
 
     fn misbehave(&mut self, action: Option<&Action>) {
-        self.machine.set_habits(action.map_or_else(Habits::default, habits));
+        self.machine.set_quirks(action.map_or_else(ProtocolQuirks::default, quirks));
     }
 }
 
-fn machine(settings: &Settings, series: &Arc<Series>, changes: &Changes) -> Machine {
+fn machine(settings: &Settings, series: &Arc<PrecomputedScans>, changes: &Changes) -> LmsSimulator {
     let room = Room::of_series(series.clone(), changes.clone());
-    Machine::new(settings.clone(), Source::Room(room))
+    LmsSimulator::new(settings.clone(), Source::Room(room))
 }
 
 /// The scans that sensors of `variant` tell, measured once.
-fn measured(variant: Variant) -> Arc<Series> {
-    type Known = Mutex<Vec<(Variant, Arc<Series>)>>;
+fn measured(variant: Variant) -> Arc<PrecomputedScans> {
+    type Known = Mutex<Vec<(Variant, Arc<PrecomputedScans>)>>;
     static KNOWN: LazyLock<Known> = LazyLock::new(Known::default);
     let mut known = KNOWN.lock().unwrap_or_else(PoisonError::into_inner);
     match known.iter().find(|(of, _)| *of == variant) {
         Some((_, series)) => series.clone(),
         None => {
-            let made = Arc::new(Series::new(rooms(|scene| scene), SCANS, variant, Unit::Mm, Mode(1)));
+            let made =
+                Arc::new(PrecomputedScans::new(rooms(|scene| scene), SCANS, variant, Unit::Mm, Mode(1)));
             known.push((variant, made.clone()));
             made
         }

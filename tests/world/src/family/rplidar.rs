@@ -8,19 +8,19 @@ use scanhub_drivers::rplidar::packet::Kind;
 use schema::{MILLIS, Nanos, Scan};
 use sim::device::Device;
 use sim::ld::TruePoint;
-use sim::machine::Habits;
+use sim::machine::ProtocolQuirks;
+use sim::room::Changes;
 use sim::room::Room;
-use sim::rplidar::{Form, Model, Unit, UnitSettings, UnitStart};
-use sim::series::Changes;
+use sim::rplidar::{Form, Model, RplidarSettings, RplidarSimulator, RplidarStart};
 use sim::{Arrival, ChunkSize};
 
-use super::{Ailment, Begin, Exactness, Family, Scanner, habits, still_rooms};
+use super::{Ailment, Begin, Exactness, Family, Scanner, quirks, still_rooms};
 use crate::plan::Action;
 
 /// One of them, and what its link asks for.
 #[derive(Clone)]
 pub(super) struct Rplidar {
-    settings: UnitSettings,
+    settings: RplidarSettings,
     /// Name of the family in the link.
     family: &'static str,
     /// Nobody told its motor to turn.
@@ -36,23 +36,23 @@ impl Rplidar {
         let model = DRAWN[random.usize(..DRAWN.len())];
         let mode = random.usize(..2 * model.modes().len());
         let mode = Some(mode).filter(|&mode| model.modes().get(mode).is_some_and(is_moderate));
-        let start = [UnitStart::Idle, UnitStart::Streaming, UnitStart::PowerOn][random.usize(..3)];
+        let start = [RplidarStart::Idle, RplidarStart::Streaming, RplidarStart::PowerOn][random.usize(..3)];
         let beams = (random.u8(..4) == 0).then(|| random.usize(200..2_000));
         let status = [0, 0, 0, 1, 2][random.usize(..5)];
         let mut drawn = Rplidar { mode, beams, ..Rplidar::of(model, random) };
         drawn.settings.start = start;
-        drawn.settings.health = (if start == UnitStart::Idle { status } else { status % 2 }, 0x8001);
+        drawn.settings.health = (if start == RplidarStart::Idle { status } else { status % 2 }, 0x8001);
         drawn
     }
 
     /// One of this model, idle, on its own beams and in its fastest mode.
     fn of(model: Model, random: &mut fastrand::Rng) -> Rplidar {
-        let settings = UnitSettings {
+        let settings = RplidarSettings {
             wander: random.f64() * 0.01,
             boot_ns: random.u64(100..2_500) * MILLIS,
             chunk: if random.bool() { ChunkSize::Uart } else { ChunkSize::Usb },
             seed: random.u64(..),
-            ..UnitSettings::of(model)
+            ..RplidarSettings::of(model)
         };
         let is_said = random.bool();
         Rplidar { settings, family: "rplidar", is_off: false, is_said, mode: None, beams: None }
@@ -70,7 +70,7 @@ impl Rplidar {
         }
         match state {
             None | Some("idle") => {}
-            Some("streaming") => named.settings.start = UnitStart::Streaming,
+            Some("streaming") => named.settings.start = RplidarStart::Streaming,
             Some("off") => named.is_off = true,
             Some("error") => named.settings.health = (2, 0x8001),
             Some(_) => return None,
@@ -92,7 +92,7 @@ impl Rplidar {
 
 impl Family for Rplidar {
     fn keys(&self) -> Vec<String> {
-        let UnitSettings { model, .. } = self.settings;
+        let RplidarSettings { model, .. } = self.settings;
         let said = self.is_said.then(|| format!("model={}", model.name()));
         let mode = self.mode.map(|mode| format!("mode={}", key(model.modes()[mode].name)));
         let beams = self.beams.map(|beams| format!("beams={beams}"));
@@ -187,24 +187,24 @@ impl Family for Rplidar {
 
 /// A scanner at a line.
 struct AtLine {
-    unit: Unit,
-    settings: UnitSettings,
+    unit: RplidarSimulator,
+    settings: RplidarSettings,
     changes: Changes,
     /// The stream of which so many packets' points were told as true: when it began.
     stream: Option<Nanos>,
     told: u64,
     /// The share of its usual speed at which its head shall turn.
     wanted: f64,
-    habits: Habits,
+    quirks: ProtocolQuirks,
     /// While it measures it hears nothing, not even that it shall stop.
     is_deaf: bool,
 }
 
 impl AtLine {
-    fn new(settings: UnitSettings, changes: Changes) -> AtLine {
-        let unit = Unit::new(settings.clone(), Room::of_series(still_rooms(), changes.clone()));
-        let habits = Habits::default();
-        AtLine { unit, settings, changes, stream: None, told: 0, wanted: 1.0, habits, is_deaf: false }
+    fn new(settings: RplidarSettings, changes: Changes) -> AtLine {
+        let unit = RplidarSimulator::new(settings.clone(), Room::of_series(still_rooms(), changes.clone()));
+        let quirks = ProtocolQuirks::default();
+        AtLine { unit, settings, changes, stream: None, told: 0, wanted: 1.0, quirks, is_deaf: false }
     }
 
     /// Brings its head nearer to the speed that it shall have.
@@ -226,8 +226,8 @@ impl Scanner for AtLine {
 
     fn device_mut(&mut self) -> &mut dyn Device {
         if self.is_deaf {
-            let mute = self.habits.mute || self.unit.streams();
-            self.unit.set_habits(Habits { mute, ..self.habits.clone() });
+            let mute = self.quirks.mute || self.unit.streams();
+            self.unit.set_quirks(ProtocolQuirks { mute, ..self.quirks.clone() });
         }
         &mut self.unit
     }
@@ -237,9 +237,9 @@ impl Scanner for AtLine {
         let models = alike(self.settings.model);
         let at = models.iter().position(|model| *model == self.settings.model).unwrap_or(0);
         let model = models[(at + action.value("rate") as usize) % models.len()];
-        let UnitSettings { wander, boot_ns, chunk, seed, .. } = self.settings;
+        let RplidarSettings { wander, boot_ns, chunk, seed, .. } = self.settings;
         let seed = seed.wrapping_add(1);
-        let settings = UnitSettings { wander, boot_ns, chunk, seed, ..UnitSettings::of(model) };
+        let settings = RplidarSettings { wander, boot_ns, chunk, seed, ..RplidarSettings::of(model) };
         *self = AtLine { wanted: self.wanted, ..AtLine::new(settings, self.changes.clone()) };
         if action.value("streams") == 0 {
             self.unit.power_cycle(now);
@@ -250,8 +250,8 @@ impl Scanner for AtLine {
     }
 
     fn misbehave(&mut self, action: Option<&Action>) {
-        self.habits = action.map_or_else(Habits::default, habits);
-        self.unit.set_habits(self.habits.clone());
+        self.quirks = action.map_or_else(ProtocolQuirks::default, quirks);
+        self.unit.set_quirks(self.quirks.clone());
     }
 
     fn suffer(&mut self, ailment: Ailment, now: Nanos) {
@@ -262,7 +262,7 @@ impl Scanner for AtLine {
             }
             Ailment::Deaf(is_deaf) => {
                 self.is_deaf = is_deaf;
-                self.unit.set_habits(self.habits.clone());
+                self.unit.set_quirks(self.quirks.clone());
             }
         }
     }

@@ -4,11 +4,11 @@ use scanhub_drivers::line::Session as _;
 use scanhub_drivers::lms::variant::Baud;
 use schema::{MILLIS, Nanos};
 use sim::fault::Faults;
-use sim::machine::{Habits, Machine, Settings, Start};
+use sim::machine::{LmsSimulator, ProtocolQuirks, Settings, Start};
 use sim::operating::Operating;
+use sim::operating::Source;
 use sim::room::Room;
-use sim::source::Source;
-use sim::wire::Wire;
+use sim::wire::LineModel;
 
 use super::alignment::align;
 use super::effect::Effects;
@@ -51,23 +51,23 @@ impl Verdict {
 }
 
 impl Scene {
-    /// Bad habits show while the sensor is asked: it is idle then.
+    /// Bad quirks show while the sensor is asked: it is idle then.
     pub(crate) fn new(faults: Faults, span_ms: u64) -> Scene {
-        Scene { faults, span_ms, is_idle: faults.habits() != Habits::default() }
+        Scene { faults, span_ms, is_idle: faults.quirks() != ProtocolQuirks::default() }
     }
 
     pub(crate) fn run(&self, seed: u64) -> Verdict {
-        let habits = self.faults.habits();
+        let quirks = self.faults.quirks();
         let start = Start::In(if self.is_idle { Operating::OnRequest } else { Operating::All });
         let baud = Baud::B500000;
         let boot_ns = 200 * MILLIS;
-        let settings = Settings { baud, start, boot_ns, habits, seed, ..Settings::default() };
+        let settings = Settings { baud, start, boot_ns, quirks, seed, ..Settings::default() };
         let world = world(seed).parse().expect("a world with this name");
-        let mut bench = Bench::new(Machine::new(settings, Source::Room(Room::new(&world, seed))), 0);
-        bench.wire = Wire::new(&self.faults, seed);
+        let mut bench = Bench::new(LmsSimulator::new(settings, Source::Room(Room::new(&world, seed))), 0);
+        bench.wire = LineModel::new(&self.faults, seed);
         bench.run(self.span_ms * MILLIS);
         bench.wire.set_faults(&Faults::default(), 0);
-        bench.machine.set_habits(Habits::default());
+        bench.machine.set_quirks(ProtocolQuirks::default());
         let healed = bench.now;
         let streams = |bench: &Bench| bench.is_streaming() && !bench.received_scans(healed).is_empty();
         let back = bench.until(&self.name(seed), LONGEST, streams);

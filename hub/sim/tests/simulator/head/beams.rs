@@ -5,7 +5,7 @@ use scanhub_drivers::Settings;
 use scanhub_drivers::ld::{Model, Session, Trouble};
 use scanhub_drivers::line::Session as _;
 use schema::{MILLIS, Nanos};
-use sim::ld::HeadSettings;
+use sim::ld::LdSettings;
 
 use super::bench::{Bench, still};
 
@@ -13,8 +13,8 @@ const SECOND: Nanos = 1_000 * MILLIS;
 const SPIN_UPS: [f64; 4] = [0.0, 0.5, 1.5, 3.0];
 
 /// A scanner and a session that does not know its model.
-fn bench(settings: HeadSettings, seed: u64) -> Bench {
-    let mut bench = Bench::new(HeadSettings { seed, ..settings }, &still("wall640"), "", seed);
+fn bench(settings: LdSettings, seed: u64) -> Bench {
+    let mut bench = Bench::new(LdSettings { seed, ..settings }, &still("wall640"), "", seed);
     bench.session = Session::new(Settings::default(), 0);
     bench
 }
@@ -31,7 +31,7 @@ fn a_power_cycle_does_not_change_the_number_of_beams() {
     for model in Model::ALL {
         for spin_up_s in SPIN_UPS {
             for seed in 0..2 {
-                let mut bench = bench(HeadSettings { spin_up_s, ..HeadSettings::of(model) }, seed);
+                let mut bench = bench(LdSettings { spin_up_s, ..LdSettings::of(model) }, seed);
                 bench.run(3 * SECOND);
                 for cycle in 1..=2 {
                     let before = bench.turns.len();
@@ -54,7 +54,7 @@ fn a_scanner_that_gets_power_later_has_its_beams_from_the_first_scan_on() {
     for model in Model::ALL {
         for spin_up_s in SPIN_UPS {
             for seed in 0..2 {
-                let mut bench = bench(HeadSettings { spin_up_s, ..HeadSettings::of(model) }, seed);
+                let mut bench = bench(LdSettings { spin_up_s, ..LdSettings::of(model) }, seed);
                 bench.cycle_power();
                 bench.run(20 * SECOND);
                 assert_eq!(numbers_of_beams(&bench), [model.beams()], "{model:?} {spin_up_s}, seed {seed}");
@@ -65,8 +65,8 @@ fn a_scanner_that_gets_power_later_has_its_beams_from_the_first_scan_on() {
 
 #[test]
 fn beams_are_the_points_that_a_revolution_has() {
-    let sold = HeadSettings { points_per_second: 5_000.0, ..HeadSettings::of(Model::Stl19p) };
-    let slow = HeadSettings { turns_per_second: 4.0, ..HeadSettings::of(Model::Ld14p) };
+    let sold = LdSettings { points_per_second: 5_000.0, ..LdSettings::of(Model::Stl19p) };
+    let slow = LdSettings { turns_per_second: 4.0, ..LdSettings::of(Model::Ld14p) };
     for (settings, beams) in [(sold, 500), (slow, 1_000)] {
         for seed in 0..2 {
             let mut bench = bench(settings, seed);
@@ -85,7 +85,7 @@ fn beams_are_the_points_that_a_revolution_has() {
 
 #[test]
 fn another_speed_changes_the_beams_after_ten_seconds_and_says_so() {
-    let mut bench = bench(HeadSettings::of(Model::Ld19), 1);
+    let mut bench = bench(LdSettings::of(Model::Ld19), 1);
     bench.run(3 * SECOND);
     for (speed, span) in [(8.0, 5), (10.0, 5), (8.0, 25)] {
         bench.head.set_speed(speed);
@@ -102,7 +102,7 @@ fn another_speed_changes_the_beams_after_ten_seconds_and_says_so() {
 #[test]
 fn a_typical_scanner_has_its_beams_within_a_revolution() {
     for model in Model::ALL.into_iter().filter(|model| model.baud() == 230_400) {
-        let mut bench = bench(HeadSettings::of(model), 1);
+        let mut bench = bench(LdSettings::of(model), 1);
         bench.run(SECOND);
         assert_eq!(numbers_of_beams(&bench), [model.beams()]);
         let revolution = SECOND / Nanos::from(model.turns_per_second());

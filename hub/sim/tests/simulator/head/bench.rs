@@ -8,12 +8,12 @@ use scanhub_drivers::line;
 use scanhub_drivers::line::grid::Point;
 use scanhub_drivers::line::{Event, Output, Protocol as _, Session as _};
 use schema::{MILLIS, Nanos};
+use sim::beam::NoiseModel;
 use sim::device::{Device as _, Part};
 use sim::fault::Faults;
-use sim::layers::Layers;
-use sim::ld::{Head, HeadSettings, Packets};
+use sim::ld::{LdSettings, LdSimulator, Packets};
 use sim::room::Room;
-use sim::wire::Wire;
+use sim::wire::LineModel;
 use sim::world::World;
 
 /// A packet that left, and whether nothing happened to it on its way.
@@ -32,9 +32,9 @@ pub(crate) struct Turn {
 
 pub(crate) struct Bench {
     pub(crate) session: Session,
-    pub(crate) head: Head,
-    settings: HeadSettings,
-    wire: Wire,
+    pub(crate) head: LdSimulator,
+    settings: LdSettings,
+    wire: LineModel,
     pub(crate) now: Nanos,
     inbox: Vec<u8>,
     intact: bool,
@@ -47,24 +47,24 @@ pub(crate) struct Bench {
 
 /// A room without noise.
 pub(crate) fn still(world: &str) -> World {
-    world.parse::<World>().expect("a world").with_layers(Layers::NONE)
+    world.parse::<World>().expect("a world").with_noise(NoiseModel::NONE)
 }
 
 impl Bench {
-    pub(crate) fn new(settings: HeadSettings, world: &World, faults: &str, seed: u64) -> Bench {
+    pub(crate) fn new(settings: LdSettings, world: &World, faults: &str, seed: u64) -> Bench {
         let room = Room::new(world, seed);
         let packets = Packets::Room(Box::new(room));
         Bench::of(settings, packets, faults, seed)
     }
 
-    pub(crate) fn of(settings: HeadSettings, packets: Packets, faults: &str, seed: u64) -> Bench {
+    pub(crate) fn of(settings: LdSettings, packets: Packets, faults: &str, seed: u64) -> Bench {
         let faults: Faults = faults.parse().expect("faults");
         let session = Session::new(Settings { model: Some(settings.model.name()), ..Settings::default() }, 0);
         Bench {
             session,
-            head: Head::new(settings, packets),
+            head: LdSimulator::new(settings, packets),
             settings,
-            wire: Wire::new(&faults, seed),
+            wire: LineModel::new(&faults, seed),
             now: 0,
             inbox: Vec::new(),
             intact: true,

@@ -8,7 +8,7 @@ use scanhub_drivers::ld::Model;
 use scanhub_drivers::line::{Session as _, State};
 use scanhub_drivers::{ld, line};
 use schema::{MILLIS, Nanos};
-use sim::ld::{HeadSettings, Packets, recorded};
+use sim::ld::{LdSettings, Packets, recorded};
 use sim::world::World;
 
 const SECOND: Nanos = 1_000 * MILLIS;
@@ -16,7 +16,7 @@ const SECOND: Nanos = 1_000 * MILLIS;
 #[test]
 fn every_point_of_every_turn_is_where_the_head_measured_it() {
     for model in Model::ALL {
-        let mut bench = Bench::new(HeadSettings::of(model), &still("room"), "", 7);
+        let mut bench = Bench::new(LdSettings::of(model), &still("room"), "", 7);
         bench.run(10 * SECOND);
         let due = 9 * model.turns_per_second() as usize;
         assert!(bench.turns.len() >= due, "{model:?}: {} turns", bench.turns.len());
@@ -41,7 +41,7 @@ fn a_line_that_loses_bytes_costs_no_intact_packet_and_no_truth() {
     for seed in 0..100 {
         let model = Model::ALL[seed as usize % Model::ALL.len()];
         let world = still("wall640");
-        let mut bench = Bench::new(HeadSettings { seed, ..HeadSettings::of(model) }, &world, LOSS, seed);
+        let mut bench = Bench::new(LdSettings { seed, ..LdSettings::of(model) }, &world, LOSS, seed);
         bench.run(6 * SECOND);
         bench.judge_packets();
         let worst = bench.judge_turns(0, 0.05, 2.0);
@@ -70,7 +70,7 @@ fn whatever_else_happens_on_the_line_costs_no_intact_packet_and_no_truth() {
     .into_iter()
     .flat_map(|faults| (0..5).map(move |seed| (faults, seed)))
     {
-        let mut bench = Bench::new(HeadSettings::of(Model::Ld19), &still("bare"), faults, seed);
+        let mut bench = Bench::new(LdSettings::of(Model::Ld19), &still("bare"), faults, seed);
         bench.run(8 * SECOND);
         bench.judge_packets();
         let worst = bench.judge_turns(0, 0.05, 2.0);
@@ -87,7 +87,7 @@ fn whatever_else_happens_on_the_line_costs_no_intact_packet_and_no_truth() {
 fn what_a_line_held_back_is_dated_as_it_was_measured() {
     for model in [Model::Ld19, Model::Stl27l] {
         let faults = "stall=0.5,stall_at=2,stall_every=2,delay=0.003";
-        let mut bench = Bench::new(HeadSettings::of(model), &still("wall640"), faults, 3);
+        let mut bench = Bench::new(LdSettings::of(model), &still("wall640"), faults, 3);
         bench.run(20 * SECOND);
         let worst = bench.judge_turns(0, 0.05, 2.0);
         assert!(worst < 5 * MILLIS, "{model:?}: {worst}");
@@ -98,7 +98,7 @@ fn what_a_line_held_back_is_dated_as_it_was_measured() {
 
 #[test]
 fn a_power_cycle_is_a_silence_and_a_new_beginning() {
-    let mut bench = Bench::new(HeadSettings::of(Model::Ld19), &still("wall640"), "", 3);
+    let mut bench = Bench::new(LdSettings::of(Model::Ld19), &still("wall640"), "", 3);
     bench.run(3 * SECOND);
     let turns = bench.turns.len();
     bench.cycle_power();
@@ -117,7 +117,7 @@ fn a_power_cycle_is_a_silence_and_a_new_beginning() {
 #[test]
 fn every_brown_out_is_a_restart() {
     for model in Model::ALL {
-        let mut bench = Bench::new(HeadSettings::of(model), &still("wall640"), "", 3);
+        let mut bench = Bench::new(LdSettings::of(model), &still("wall640"), "", 3);
         bench.run(4 * SECOND);
         for restarts in 1..=12 {
             // A voltage that falls makes the head slower first.
@@ -157,7 +157,7 @@ fn what_only_looks_like_a_restart_is_none() {
         "abort=0.1,repeat=0.1",
     ] {
         // The clock wraps three times.
-        let mut bench = Bench::new(HeadSettings::of(Model::Ld19), &still("bare"), faults, 11);
+        let mut bench = Bench::new(LdSettings::of(Model::Ld19), &still("bare"), faults, 11);
         bench.run(100 * SECOND);
         assert_eq!(bench.session.account().restarts, 0, "{faults}");
     }
@@ -165,7 +165,7 @@ fn what_only_looks_like_a_restart_is_none() {
 
 #[test]
 fn a_line_that_damages_most_bytes_does_not_accuse_the_head() {
-    let mut bench = Bench::new(HeadSettings::of(Model::Ld19), &still("room"), "loss=0.08", 5);
+    let mut bench = Bench::new(LdSettings::of(Model::Ld19), &still("room"), "loss=0.08", 5);
     bench.run(4 * SECOND);
     for _ in 0..100 {
         bench.run(bench.now + 100 * MILLIS);
@@ -177,7 +177,7 @@ fn a_line_that_damages_most_bytes_does_not_accuse_the_head() {
 
 #[test]
 fn a_head_that_changes_its_speed_still_tells_the_truth() {
-    let mut bench = Bench::new(HeadSettings::of(Model::Ld19), &still("room"), "", 7);
+    let mut bench = Bench::new(LdSettings::of(Model::Ld19), &still("room"), "", 7);
     for step in 0..60 {
         bench.run(2 * SECOND + step * 100 * MILLIS);
         // From 10 turns in a second to 6 and back to 12.
@@ -202,7 +202,7 @@ fn a_head_that_changes_its_speed_still_tells_the_truth() {
 fn the_same_seed_says_the_same_and_what_was_recorded_is_said_again() {
     let world: World = "demo".parse().expect("a world");
     let said = |seed| {
-        let mut bench = Bench::new(HeadSettings { seed, ..HeadSettings::of(Model::Ld06) }, &world, "", seed);
+        let mut bench = Bench::new(LdSettings { seed, ..LdSettings::of(Model::Ld06) }, &world, "", seed);
         bench.run(3 * SECOND);
         bench.packets
     };
@@ -219,7 +219,7 @@ fn the_same_seed_says_the_same_and_what_was_recorded_is_said_again() {
     assert_eq!(found, packets);
     for looped in [false, true] {
         let source = Packets::Recorded { packets: found.clone(), looped };
-        let mut bench = Bench::of(HeadSettings::of(Model::Ld06), source, "", 1);
+        let mut bench = Bench::of(LdSettings::of(Model::Ld06), source, "", 1);
         bench.run(7 * SECOND);
         assert_eq!(bench.packets[..packets.len()], packets);
         assert_eq!(bench.packets.len() > packets.len(), looped);

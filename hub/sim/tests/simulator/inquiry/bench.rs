@@ -11,11 +11,11 @@ use schema::{MICROS, MILLIS, Nanos, line_time};
 use sim::Arrival;
 use sim::device::{Device as _, Part};
 use sim::fault::Faults;
-use sim::machine::{Machine, Settings};
-use sim::noise::Mistuned;
+use sim::machine::{LmsSimulator, Settings};
+use sim::operating::Source;
 use sim::room::Room;
-use sim::source::Source;
-use sim::wire::{Carried, Wire};
+use sim::wire::BaudMismatch;
+use sim::wire::{Delivery, LineModel};
 
 /// What becomes of bytes on their way.
 pub(crate) type Way = Box<dyn FnMut(Vec<u8>) -> Vec<u8>>;
@@ -23,33 +23,33 @@ pub(crate) type Way = Box<dyn FnMut(Vec<u8>) -> Vec<u8>>;
 /// Both ends and the line.
 pub(crate) struct Bench<C> {
     pub(crate) talk: C,
-    pub(crate) machine: Machine,
+    pub(crate) machine: LmsSimulator,
     pub(crate) now: Nanos,
     /// What goes wrong on the line by itself.
-    pub(crate) wire: Wire,
+    pub(crate) wire: LineModel,
     pub(crate) to_host: Way,
     pub(crate) to_sensor: Way,
     /// Telegrams that were said.
     pub(crate) said: Vec<Vec<u8>>,
     port: Baud,
     inbox: VecDeque<u8>,
-    mistuned: Mistuned,
+    mistuned: BaudMismatch,
     request: Vec<u8>,
     last: Nanos,
 }
 
 /// A sensor in a room, at this rate.
-pub(crate) fn sensor(baud: Baud) -> Machine {
+pub(crate) fn sensor(baud: Baud) -> LmsSimulator {
     machine(Settings { baud, seed: 1, ..Settings::default() })
 }
 
 /// A sensor in a room.
-pub(crate) fn machine(settings: Settings) -> Machine {
-    Machine::new(settings, Source::Room(Room::new(&"room".parse().unwrap(), 1)))
+pub(crate) fn machine(settings: Settings) -> LmsSimulator {
+    LmsSimulator::new(settings, Source::Room(Room::new(&"room".parse().unwrap(), 1)))
 }
 
 /// Says `request` to `machine` as a host does that is gone; returns the time.
-pub(crate) fn say(machine: &mut Machine, request: &Encoded) -> Nanos {
+pub(crate) fn say(machine: &mut LmsSimulator, request: &Encoded) -> Nanos {
     let mut now = 10 * MILLIS;
     for &byte in request.bytes() {
         now += line_time(1, machine.baud().rate()) + 60 * MICROS;
@@ -61,24 +61,24 @@ pub(crate) fn say(machine: &mut Machine, request: &Encoded) -> Nanos {
 }
 
 /// Makes `machine` stream.
-pub(crate) fn make_stream(machine: &mut Machine) -> Nanos {
+pub(crate) fn make_stream(machine: &mut LmsSimulator) -> Nanos {
     say(machine, &Request::Stream.encode(0))
 }
 
 impl<C: Protocol> Bench<C> {
     /// The conversation begins at `now` of the machine's time, at a port with the rate `port`.
-    pub(crate) fn new(talk: C, port: Baud, machine: Machine, now: Nanos) -> Self {
+    pub(crate) fn new(talk: C, port: Baud, machine: LmsSimulator, now: Nanos) -> Self {
         Bench {
             talk,
             machine,
             now,
-            wire: Wire::new(&Faults::default(), 0),
+            wire: LineModel::new(&Faults::default(), 0),
             to_host: Box::new(|bytes| bytes),
             to_sensor: Box::new(|bytes| bytes),
             said: Vec::new(),
             port,
             inbox: VecDeque::new(),
-            mistuned: Mistuned::default(),
+            mistuned: BaudMismatch::default(),
             request: Vec::new(),
             last: now,
         }
@@ -179,8 +179,8 @@ impl<C: Protocol> Bench<C> {
         self.now = self.now.max(to);
     }
 
-    fn carry(&mut self, carried: Carried) {
-        let Carried { bytes, rate, idle_after, .. } = carried;
+    fn carry(&mut self, carried: Delivery) {
+        let Delivery { bytes, rate, idle_after, .. } = carried;
         let mut bytes = (self.to_host)(bytes);
         if rate != self.port.rate() {
             bytes = self.mistuned.receive((rate, self.port.rate()), &bytes, idle_after);

@@ -9,13 +9,13 @@ use scanhub_drivers::lms::telegram::{NAK, Writer};
 use scanhub_drivers::lms::variant::{Baud, Mode, Unit};
 use schema::{MILLIS, Nanos};
 use sim::device::Device as _;
-use sim::machine::{Habits, Machine, Settings};
+use sim::machine::{LmsSimulator, ProtocolQuirks, Settings};
 use sim::operating::Operating;
 
 use super::bench::{Bench, machine, make_stream, sensor};
 
 /// Asks the sensor what it is; returns the plan to change nothing, and when that was known.
-pub(crate) fn plan(machine: Machine, now: Nanos) -> (Plan, Machine, Nanos) {
+pub(crate) fn plan(machine: LmsSimulator, now: Nanos) -> (Plan, LmsSimulator, Nanos) {
     let mut bench = Bench::new(Inquiry::new(Baud::B500000, now), Baud::B500000, machine, now);
     bench.finish(20_000 * MILLIS);
     let plan = Plan::of(bench.talk.report()).expect("it told all of it");
@@ -28,12 +28,12 @@ pub(crate) fn other_values(plan: &mut Plan) {
     plan.new.set(6, Unit::Cm.code());
 }
 
-pub(crate) fn change(plan: Plan, machine: Machine, now: Nanos) -> Bench<Change> {
+pub(crate) fn change(plan: Plan, machine: LmsSimulator, now: Nanos) -> Bench<Change> {
     Bench::new(Change::new(Consent::of_a_person(plan), now), plan.baud, machine, now)
 }
 
 /// What the sensor says of itself now.
-pub(crate) fn again(bench: Bench<Change>) -> (Plan, Machine, Nanos) {
+pub(crate) fn again(bench: Bench<Change>) -> (Plan, LmsSimulator, Nanos) {
     plan(bench.machine, bench.now)
 }
 
@@ -119,7 +119,7 @@ fn a_wrong_password_writes_nothing_and_leaves_the_stream() {
 fn a_refused_write_leaves_what_was() {
     let (mut plan, mut machine, now) = plan(sensor(Baud::B19200), 0);
     other_values(&mut plan);
-    machine.set_habits(Habits { refuses: vec![0x77], ..Habits::default() });
+    machine.set_quirks(ProtocolQuirks { refuses: vec![0x77], ..ProtocolQuirks::default() });
     let mut bench = change(plan, machine, now);
     bench.finish(60_000 * MILLIS);
     let outcome = bench.talk.outcome();
@@ -131,7 +131,7 @@ fn a_refused_write_leaves_what_was() {
 fn another_unit_may_take_seven_seconds() {
     let (mut plan, mut machine, now) = plan(sensor(Baud::B38400), 0);
     other_values(&mut plan);
-    machine.set_habits(Habits { late_write_ns: 6_000 * MILLIS, ..Habits::default() });
+    machine.set_quirks(ProtocolQuirks { late_write_ns: 6_000 * MILLIS, ..ProtocolQuirks::default() });
     let mut bench = change(plan, machine, now);
     let took = bench.finish(60_000 * MILLIS);
     assert!(took > 7_000 * MILLIS, "{took}");
@@ -182,8 +182,8 @@ fn bad_habits_and_lossy_lines_never_lie() {
         let now = if seed % 3 == 0 { make_stream(&mut machine) } else { 0 };
         let (mut plan, mut machine, now) = plan(machine, now);
         other_values(&mut plan);
-        let habits = Habits { overlooks: 0.2, naks: 0.1, doubles: 0.2, ..Habits::default() };
-        machine.set_habits(habits);
+        let quirks = ProtocolQuirks { overlooks: 0.2, naks: 0.1, doubles: 0.2, ..ProtocolQuirks::default() };
+        machine.set_quirks(quirks);
         let mut bench = change(plan, machine, now);
         let mut random = fastrand::Rng::with_seed(seed);
         bench.to_host = Box::new(move |bytes| bytes.into_iter().filter(|_| random.f64() > 0.001).collect());
@@ -192,7 +192,7 @@ fn bad_habits_and_lossy_lines_never_lie() {
         let writes = bench.machine.eeprom_writes();
         assert!(writes <= 3, "{writes} writes, seed {seed}");
         assert!(outcome.written || writes == 0, "seed {seed}");
-        bench.machine.set_habits(Habits::default());
+        bench.machine.set_quirks(ProtocolQuirks::default());
         let (found, _, _) = again(bench);
         if outcome.failed.is_none() {
             done += 1;
@@ -249,7 +249,7 @@ fn a_stray_nak_is_not_believed_where_it_does_harm() {
     for after in [0, 53] {
         let (mut plan, mut machine, now) = plan(sensor(Baud::B38400), 0);
         other_values(&mut plan);
-        machine.set_habits(Habits { late_write_ns: 5_000 * MILLIS, ..Habits::default() });
+        machine.set_quirks(ProtocolQuirks { late_write_ns: 5_000 * MILLIS, ..ProtocolQuirks::default() });
         let mut bench = change(plan, machine, now);
         let mut heard = 0;
         bench.to_host = Box::new(move |mut bytes| {

@@ -7,8 +7,8 @@ use scanhub_drivers::lms::variant::Baud;
 use schema::MILLIS;
 use sim::device::Device as _;
 use sim::fault::Faults;
-use sim::machine::{Habits, Machine};
-use sim::wire::Wire;
+use sim::machine::{LmsSimulator, ProtocolQuirks};
+use sim::wire::LineModel;
 
 use super::bench::{Bench, make_stream, sensor};
 use super::change::{again, change, other_values, plan};
@@ -37,7 +37,7 @@ const SCENES: &[(&str, [usize; 2])] = &[
 ];
 
 /// The sensor of `seed`, idle or streaming, and when it is.
-fn any_sensor(seed: u64) -> (Baud, Machine, u64, bool) {
+fn any_sensor(seed: u64) -> (Baud, LmsSimulator, u64, bool) {
     let baud = Baud::ALL[seed as usize % 4];
     let mut machine = sensor(baud);
     let is_streaming = seed % 8 >= 4;
@@ -47,8 +47,8 @@ fn any_sensor(seed: u64) -> (Baud, Machine, u64, bool) {
 
 /// `bench` with `faults`, the sensor's own and the line's.
 fn troubled<C>(mut bench: Bench<C>, faults: &Faults, seed: u64) -> Bench<C> {
-    bench.machine.set_habits(faults.habits());
-    let fresh = Wire::new(faults, seed);
+    bench.machine.set_quirks(faults.quirks());
+    let fresh = LineModel::new(faults, seed);
     bench.wire = fresh;
     bench
 }
@@ -99,7 +99,7 @@ fn a_change_knows_what_it_did() {
             let writes = bench.machine.eeprom_writes();
             assert!(writes <= 3 && (outcome.written || writes == 0), "{text}, {seed}: {writes} writes");
             bench.wire.set_faults(&Faults::default(), 0);
-            bench.machine.set_habits(Habits::default());
+            bench.machine.set_quirks(ProtocolQuirks::default());
             bench.overhear(10_000 * MILLIS);
             let (found, _, _) = again(bench);
             if let Some(kept) = outcome.configuration {

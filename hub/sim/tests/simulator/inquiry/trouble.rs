@@ -3,7 +3,7 @@
 use scanhub_drivers::lms::Inquiry;
 use scanhub_drivers::lms::variant::Baud;
 use schema::MILLIS;
-use sim::machine::Habits;
+use sim::machine::ProtocolQuirks;
 
 use super::bench::{Bench, make_stream, sensor};
 
@@ -55,16 +55,16 @@ fn a_request_that_is_overlooked_is_said_again() {
 
 #[test]
 fn late_doubled_and_refused_replies() {
-    for (word, habits) in [
-        ("late", Habits { late_reply_ns: 250 * MILLIS, ..Habits::default() }),
-        ("late ACK", Habits { late_acknowledge_ns: 120 * MILLIS, ..Habits::default() }),
-        ("doubled", Habits { doubles: 1.0, ..Habits::default() }),
-        ("NAK", Habits { naks: 0.3, ..Habits::default() }),
-        ("refused", Habits { refuses: vec![0x3A, 0x32], ..Habits::default() }),
+    for (word, quirks) in [
+        ("late", ProtocolQuirks { late_reply_ns: 250 * MILLIS, ..ProtocolQuirks::default() }),
+        ("late ACK", ProtocolQuirks { late_acknowledge_ns: 120 * MILLIS, ..ProtocolQuirks::default() }),
+        ("doubled", ProtocolQuirks { doubles: 1.0, ..ProtocolQuirks::default() }),
+        ("NAK", ProtocolQuirks { naks: 0.3, ..ProtocolQuirks::default() }),
+        ("refused", ProtocolQuirks { refuses: vec![0x3A, 0x32], ..ProtocolQuirks::default() }),
     ] {
         for baud in Baud::ALL {
             let mut machine = sensor(baud);
-            machine.set_habits(habits.clone());
+            machine.set_quirks(quirks.clone());
             let mut bench = Bench::new(Inquiry::new(Baud::B500000, 0), Baud::B500000, machine, 0);
             bench.finish(20_000 * MILLIS);
             let report = bench.talk.report();

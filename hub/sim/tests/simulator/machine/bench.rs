@@ -3,13 +3,13 @@
 use schema::{MICROS, MILLIS, Nanos, line_time};
 use sim::Arrival;
 use sim::device::{Chunk, Device as _, Part, Sent};
-use sim::machine::{Machine, Settings};
+use sim::machine::{LmsSimulator, Settings};
+use sim::operating::Source;
 use sim::room::Room;
-use sim::source::Source;
 
 /// A machine with a clock of its own and everything that it has sent.
 pub(crate) struct Bench {
-    pub(crate) machine: Machine,
+    pub(crate) machine: LmsSimulator,
     pub(crate) now: Nanos,
     pub(crate) chunks: Vec<(Nanos, Chunk)>,
 }
@@ -20,7 +20,7 @@ impl Bench {
     }
 
     pub(crate) fn with(settings: Settings, source: Source) -> Bench {
-        Bench { machine: Machine::new(settings, source), now: 0, chunks: Vec::new() }
+        Bench { machine: LmsSimulator::new(settings, source), now: 0, chunks: Vec::new() }
     }
 
     pub(crate) fn run_until(&mut self, end: Nanos) {

@@ -1,9 +1,9 @@
 //! The sensor in virtual time: what it answers, when its bytes are through, and what a request does to its stream.
 
 mod bench;
-mod habits;
 mod modes;
 mod power;
+mod quirks;
 mod wire;
 
 use proptest::prelude::*;
@@ -15,9 +15,9 @@ use scanhub_drivers::lms::telegram::{ACK, NAK, Telegram, Writer};
 use scanhub_drivers::lms::variant::{Baud, MIRROR_TURN, Mode, Unit, Variant};
 use schema::{MICROS, MILLIS, Nanos, line_time};
 use sim::device::{Device as _, Part};
-use sim::machine::{Machine, Settings};
+use sim::machine::{LmsSimulator, Settings};
+use sim::operating::Source;
 use sim::room::Room;
-use sim::source::Source;
 use sim::world::World;
 use sim::{Arrival, ChunkSize, Dropped};
 
@@ -270,7 +270,7 @@ proptest! {
             ..Settings::default()
         };
         let world: World = World::names().nth(world).unwrap().parse().unwrap();
-        let mut machine = Machine::new(settings, Source::Room(Room::new(&world, seed)));
+        let mut machine = LmsSimulator::new(settings, Source::Room(Room::new(&world, seed)));
         let mut now = 0;
         for &byte in Request::Stream.encode(0).bytes() {
             now += line_time(1, machine.baud().rate()) + 60 * MICROS;

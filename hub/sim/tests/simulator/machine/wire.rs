@@ -5,11 +5,11 @@ use schema::{MILLIS, Nanos};
 use sim::ChunkSize;
 use sim::device::Part;
 use sim::fault::{Fault, Faults};
-use sim::machine::{Machine, Settings, Start};
+use sim::machine::{LmsSimulator, Settings, Start};
 use sim::operating::Operating;
+use sim::operating::Source;
 use sim::room::Room;
-use sim::source::Source;
-use sim::wire::Wire;
+use sim::wire::LineModel;
 use sim::world::World;
 
 /// A telegram with the bytes that arrived in its time, and the verdict.
@@ -23,8 +23,8 @@ struct Told {
 fn carried(faults: &str, seed: u64, chunk: ChunkSize, span: Nanos) -> Vec<Told> {
     let settings =
         Settings { baud: Baud::B500000, start: Start::In(Operating::All), chunk, ..Settings::default() };
-    let mut machine = Machine::new(settings, Source::Room(Room::new(&World::Random, 1)));
-    let mut wire = Wire::new(&faults.parse::<Faults>().unwrap(), seed);
+    let mut machine = LmsSimulator::new(settings, Source::Room(Room::new(&World::Random, 1)));
+    let mut wire = LineModel::new(&faults.parse::<Faults>().unwrap(), seed);
     let (mut now, mut arrived, mut fault, mut told) = (0, Vec::new(), None, Vec::new());
     while let Some(at) = wire.poll_timeout(&machine, now).filter(|&at| at <= span) {
         assert!(at > now || now == 0, "no progress at {at}");

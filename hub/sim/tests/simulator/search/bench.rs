@@ -11,13 +11,13 @@ use schema::{MICROS, MILLIS, Nanos, line_time};
 use sim::Arrival;
 use sim::device::Device;
 use sim::fault::Faults;
-use sim::ld::{Head, HeadSettings, Packets};
-use sim::machine::{self, Machine, Start};
-use sim::noise::Mistuned;
+use sim::ld::{LdSettings, LdSimulator, Packets};
+use sim::machine::{self, LmsSimulator, Start};
 use sim::operating::Operating;
 use sim::room::Room;
-use sim::rplidar::{Model, Unit, UnitSettings, UnitStart};
-use sim::wire::Wire;
+use sim::rplidar::{Model, RplidarSettings, RplidarSimulator, RplidarStart};
+use sim::wire::BaudMismatch;
+use sim::wire::LineModel;
 
 /// Host's end of the line: a search, or a session to compare it with.
 pub(crate) trait Host {
@@ -96,7 +96,7 @@ pub(crate) struct Bench<H = Search> {
     pub(crate) host: H,
     /// `None` if no scanner is connected.
     pub(crate) device: Option<Box<dyn Device>>,
-    wire: Wire,
+    wire: LineModel,
     /// Time at which the scanner gets power.
     power_at: Nanos,
     is_powered: bool,
@@ -106,8 +106,8 @@ pub(crate) struct Bench<H = Search> {
     rate: u32,
     /// Rates that the port cannot have.
     pub(crate) impossible: Vec<u32>,
-    to_host: Mistuned,
-    to_device: Mistuned,
+    to_host: BaudMismatch,
+    to_device: BaudMismatch,
     /// Time at which the last byte of the host has left, and whether the line was idle since then.
     left_at: Nanos,
     is_flushed: bool,
@@ -132,19 +132,19 @@ pub(crate) fn lms(baud: Baud, streams: bool, seed: u64) -> Box<dyn Device> {
     let operating = if streams { Operating::All } else { Operating::OnRequest };
     let settings =
         machine::Settings { baud, start: Start::In(operating), seed, ..machine::Settings::default() };
-    Box::new(Machine::new(settings, sim::source::Source::Room(room(seed))))
+    Box::new(LmsSimulator::new(settings, sim::operating::Source::Room(room(seed))))
 }
 
 pub(crate) fn ld(model: ld::Model, seed: u64) -> Box<dyn Device> {
-    let settings = HeadSettings { seed, ..HeadSettings::of(model) };
-    Box::new(Head::new(settings, Packets::Room(Box::new(room(seed)))))
+    let settings = LdSettings { seed, ..LdSettings::of(model) };
+    Box::new(LdSimulator::new(settings, Packets::Room(Box::new(room(seed)))))
 }
 
 /// Creates an RPLIDAR that streams or not, and reports this health.
 pub(crate) fn rplidar(model: Model, streams: bool, health: u8, seed: u64) -> Box<dyn Device> {
-    let start = if streams { UnitStart::Streaming } else { UnitStart::Idle };
-    let settings = UnitSettings { start, health: (health, 1), seed, ..UnitSettings::of(model) };
-    Box::new(Unit::new(settings, room(seed)))
+    let start = if streams { RplidarStart::Streaming } else { RplidarStart::Idle };
+    let settings = RplidarSettings { start, health: (health, 1), seed, ..RplidarSettings::of(model) };
+    Box::new(RplidarSimulator::new(settings, room(seed)))
 }
 
 impl Bench {
@@ -217,7 +217,7 @@ impl<H: Host> Bench<H> {
         Bench {
             host: begin(now),
             device,
-            wire: Wire::new(faults, seed),
+            wire: LineModel::new(faults, seed),
             power_at: 0,
             is_powered: true,
             opened_at: now,
@@ -225,8 +225,8 @@ impl<H: Host> Bench<H> {
             port,
             rate,
             impossible: Vec::new(),
-            to_host: Mistuned::default(),
-            to_device: Mistuned::default(),
+            to_host: BaudMismatch::default(),
+            to_device: BaudMismatch::default(),
             left_at: 0,
             is_flushed: true,
             inbox: VecDeque::new(),

@@ -5,10 +5,10 @@ use scanhub_drivers::lms::variant::Baud;
 use scanhub_drivers::search::PortKind;
 use schema::{MILLIS, Nanos};
 use sim::device::Device;
-use sim::ld::{Head, HeadSettings, Packets};
-use sim::machine::{self, Machine};
-use sim::rplidar::{Model, Unit, UnitSettings};
-use sim::source::Source;
+use sim::ld::{LdSettings, LdSimulator, Packets};
+use sim::machine::{self, LmsSimulator};
+use sim::operating::Source;
+use sim::rplidar::{Model, RplidarSettings, RplidarSimulator};
 
 use super::bench::{self, Bench};
 
@@ -36,7 +36,7 @@ fn finds_an_lms_that_starts_slowly() {
         let worst = worst(&format!("lms {}", boot / SECOND), 100 * MILLIS, boot, |seed| {
             let settings =
                 machine::Settings { boot_ns: boot, permanent_baud, seed, ..machine::Settings::default() };
-            Box::new(Machine::new(settings, Source::Room(bench::room(seed))))
+            Box::new(LmsSimulator::new(settings, Source::Room(bench::room(seed))))
         });
         assert!(worst <= 6 * SECOND);
     }
@@ -47,15 +47,15 @@ fn finds_rotating_scanners_that_get_power_later() {
     let boot = 2 * SECOND;
     for model in ld::Model::ALL {
         let worst = worst(model.name(), 30 * SECOND, boot, |seed| {
-            let settings = HeadSettings { boot_ns: boot, seed, ..HeadSettings::of(model) };
-            Box::new(Head::new(settings, Packets::Room(Box::new(bench::room(seed)))))
+            let settings = LdSettings { boot_ns: boot, seed, ..LdSettings::of(model) };
+            Box::new(LdSimulator::new(settings, Packets::Room(Box::new(bench::room(seed)))))
         });
         assert!(worst <= 6 * SECOND);
     }
     for model in Model::ALL {
         let worst = worst(model.name(), 30 * SECOND, boot, |seed| {
-            let settings = UnitSettings { boot_ns: boot, seed, ..UnitSettings::of(model) };
-            Box::new(Unit::new(settings, bench::room(seed)))
+            let settings = RplidarSettings { boot_ns: boot, seed, ..RplidarSettings::of(model) };
+            Box::new(RplidarSimulator::new(settings, bench::room(seed)))
         });
         assert!(worst <= 6 * SECOND);
     }

@@ -5,8 +5,8 @@ use scanhub_drivers::lms::variant::Baud;
 use schema::{MILLIS, Nanos, line_time};
 use sim::Arrival;
 use sim::device::Device;
-use sim::noise::Receiver;
 use sim::rplidar::Model;
+use sim::wire::Receiver;
 
 use super::bench;
 

@@ -14,11 +14,11 @@ use schema::{MICROS, MILLIS, Nanos, line_time};
 use sim::Arrival;
 use sim::device::{Device as _, Part};
 use sim::fault::{Fault, Faults};
-use sim::machine::{self, Machine};
-use sim::noise::Mistuned;
+use sim::machine::{self, LmsSimulator};
+use sim::operating::Source;
 use sim::room::Room;
-use sim::source::Source;
-use sim::wire::{Carried, Wire};
+use sim::wire::BaudMismatch;
+use sim::wire::{Delivery, LineModel};
 
 /// From sensor to host: what becomes of a chunk that is through at this time.
 pub(crate) type ToHost = Box<dyn FnMut(Nanos, Vec<u8>) -> Vec<u8>>;
@@ -28,9 +28,9 @@ pub(crate) type ToSensor = Box<dyn FnMut(usize, u8) -> Option<u8>>;
 /// Both ends, the line, and everything that went over it.
 pub(crate) struct Bench {
     pub(crate) session: Session,
-    pub(crate) machine: Machine,
+    pub(crate) machine: LmsSimulator,
     /// What goes wrong on the line by itself.
-    pub(crate) wire: Wire,
+    pub(crate) wire: LineModel,
     pub(crate) now: Nanos,
     pub(crate) to_host: ToHost,
     pub(crate) to_sensor: ToSensor,
@@ -51,7 +51,7 @@ pub(crate) struct Bench {
     pub(crate) room: usize,
     /// Bytes that came and were not read.
     inbox: VecDeque<u8>,
-    mistuned: Mistuned,
+    mistuned: BaudMismatch,
     damaged: bool,
     fault: Option<Fault>,
     /// Whether the session streamed since the telegram on the line began.
@@ -110,18 +110,18 @@ pub(crate) const WANTED: Settings = Settings {
 };
 
 /// A sensor in a room, at this rate.
-pub(crate) fn sensor(baud: Baud) -> Machine {
+pub(crate) fn sensor(baud: Baud) -> LmsSimulator {
     let settings = machine::Settings { baud, seed: 1, ..machine::Settings::default() };
-    Machine::new(settings, Source::Room(Room::new(&"room".parse().unwrap(), 1)))
+    LmsSimulator::new(settings, Source::Room(Room::new(&"room".parse().unwrap(), 1)))
 }
 
 /// The sensor of `settings` in a room.
-pub(crate) fn sensor_with(settings: machine::Settings) -> Machine {
-    Machine::new(settings, Source::Room(Room::new(&"room".parse().unwrap(), 1)))
+pub(crate) fn sensor_with(settings: machine::Settings) -> LmsSimulator {
+    LmsSimulator::new(settings, Source::Room(Room::new(&"room".parse().unwrap(), 1)))
 }
 
 /// Makes `machine` stream, as a host did that is gone; returns the time.
-pub(crate) fn make_stream(machine: &mut Machine) -> Nanos {
+pub(crate) fn make_stream(machine: &mut LmsSimulator) -> Nanos {
     let mut now = 10 * MILLIS;
     for &byte in Request::Stream.encode(0).bytes() {
         now += line_time(1, machine.baud().rate()) + 60 * MICROS;
@@ -135,17 +135,17 @@ pub(crate) fn make_stream(machine: &mut Machine) -> Nanos {
 
 impl Bench {
     /// The session begins at `now` of the machine's time, on a line that does no harm.
-    pub(crate) fn new(machine: Machine, now: Nanos) -> Bench {
+    pub(crate) fn new(machine: LmsSimulator, now: Nanos) -> Bench {
         Bench::wanting(WANTED, machine, now)
     }
 
     /// As [`Bench::new`], with a session that wants something else.
-    pub(crate) fn wanting(wanted: Settings, mut machine: Machine, now: Nanos) -> Bench {
+    pub(crate) fn wanting(wanted: Settings, mut machine: LmsSimulator, now: Nanos) -> Bench {
         while machine.poll_transmit(now).is_some() {}
         Bench {
             session: Session::new(wanted, now),
             machine,
-            wire: Wire::new(&Faults::default(), 0),
+            wire: LineModel::new(&Faults::default(), 0),
             now,
             to_host: Box::new(|_, bytes| bytes),
             to_sensor: Box::new(|_, byte| Some(byte)),
@@ -159,7 +159,7 @@ impl Bench {
             port: wanted.baud,
             room: usize::MAX,
             inbox: VecDeque::new(),
-            mistuned: Mistuned::default(),
+            mistuned: BaudMismatch::default(),
             damaged: false,
             fault: None,
             streamed: true,
@@ -181,7 +181,7 @@ impl Bench {
     }
 
     /// A session with a past, none of whose requests is half said, gets this machine.
-    pub(crate) fn adopting(session: Session, machine: Machine, now: Nanos) -> Bench {
+    pub(crate) fn adopting(session: Session, machine: LmsSimulator, now: Nanos) -> Bench {
         let (port, read) = (session.baud(), session.tally().read);
         Bench { port, read, session, ..Bench::new(machine, now) }
     }
@@ -356,11 +356,11 @@ impl Bench {
     }
 
     /// What the wire brings is there.
-    fn carry(&mut self, carried: Carried) {
+    fn carry(&mut self, carried: Delivery) {
         if carried.is_telegram() {
             self.fault = self.fault.or(carried.fault);
         }
-        let Carried { bytes: brought, rate, idle_after, part, .. } = carried;
+        let Delivery { bytes: brought, rate, idle_after, part, .. } = carried;
         let mut bytes = (self.to_host)(self.now, brought.clone());
         if rate != self.port.rate() {
             bytes = self.mistuned.receive((rate, self.port.rate()), &bytes, idle_after);

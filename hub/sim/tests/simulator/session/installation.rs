@@ -5,7 +5,7 @@ use scanhub_drivers::lms::Notice;
 use scanhub_drivers::lms::variant::Baud;
 use schema::MILLIS;
 use sim::device::Device as _;
-use sim::machine::{Habits, Settings, Start};
+use sim::machine::{ProtocolQuirks, Settings, Start};
 use sim::operating::Operating;
 
 use super::bench::{Bench, sensor_with};
@@ -14,9 +14,9 @@ use super::bench::{Bench, sensor_with};
 fn the_installation_mode_is_left() {
     for baud in Baud::ALL {
         for strict in [false, true] {
-            let habits = Habits { strict, ..Habits::default() };
+            let quirks = ProtocolQuirks { strict, ..ProtocolQuirks::default() };
             let start = Start::In(Operating::Installation);
-            let settings = Settings { baud, start, habits, ..Settings::default() };
+            let settings = Settings { baud, start, quirks, ..Settings::default() };
             let mut bench = Bench::new(sensor_with(settings), 0);
             bench.until("streaming", 3_000 * MILLIS, Bench::is_streaming);
             bench.run(1_000 * MILLIS);
@@ -29,9 +29,9 @@ fn the_installation_mode_is_left() {
 #[test]
 fn it_is_left_too_by_a_sensor_that_does_not_tell_it() {
     for baud in Baud::ALL {
-        let habits = Habits { refuses: vec![0x31], ..Habits::default() };
+        let quirks = ProtocolQuirks { refuses: vec![0x31], ..ProtocolQuirks::default() };
         let start = Start::In(Operating::Installation);
-        let mut bench = Bench::new(sensor_with(Settings { baud, start, habits, ..Settings::default() }), 0);
+        let mut bench = Bench::new(sensor_with(Settings { baud, start, quirks, ..Settings::default() }), 0);
         bench.until("stopped", 3_000 * MILLIS, |bench| bench.machine.operating() == &Operating::OnRequest);
         bench.until("streaming", 3_000 * MILLIS, Bench::is_streaming);
         bench.run(1_000 * MILLIS);

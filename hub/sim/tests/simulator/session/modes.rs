@@ -6,7 +6,7 @@ use scanhub_drivers::lms;
 use scanhub_drivers::lms::variant::{Baud, Variant};
 use schema::{MILLIS, Nanos};
 use sim::device::Device as _;
-use sim::machine::{Machine, Settings, Start};
+use sim::machine::{LmsSimulator, Settings, Start};
 use sim::operating::Operating;
 
 use super::bench::{Bench, WANTED, sensor_with};
@@ -26,7 +26,7 @@ fn modes() -> [Operating; 9] {
 }
 
 /// A sensor that does this since `age`.
-fn streaming(settings: Settings, operating: &Operating, age: Nanos) -> (Machine, Nanos) {
+fn streaming(settings: Settings, operating: &Operating, age: Nanos) -> (LmsSimulator, Nanos) {
     let mut machine = sensor_with(Settings { start: Start::In(operating.clone()), seed: age, ..settings });
     while let Some(at) = machine.poll_timeout().filter(|&at| at < age) {
         while machine.poll_transmit(at).is_some() {}

@@ -9,8 +9,8 @@ use scanhub_drivers::lms::variant::Baud;
 use schema::{MILLIS, Nanos};
 use sim::device::Device as _;
 use sim::fault::Faults;
-use sim::machine::{Habits, Settings, Start};
-use sim::wire::Wire;
+use sim::machine::{ProtocolQuirks, Settings, Start};
+use sim::wire::LineModel;
 
 use super::bench::{Bench, sensor_with};
 
@@ -104,7 +104,10 @@ fn a_banner_that_is_heard_is_answered_at_once() {
 
 #[test]
 fn a_mute_line_is_asked_rarely_and_for_ever() {
-    let settings = Settings { habits: Habits { mute: true, ..Habits::default() }, ..Settings::default() };
+    let settings = Settings {
+        quirks: ProtocolQuirks { mute: true, ..ProtocolQuirks::default() },
+        ..Settings::default()
+    };
     let mut bench = Bench::new(sensor_with(settings), 0);
     let mut told = Vec::new();
     for _ in 0..7_300 {
@@ -123,7 +126,7 @@ fn a_mute_line_is_asked_rarely_and_for_ever() {
     assert_eq!(seconds, [1, 3, 10, 30, 60, 300, 600, 1_800, 3_600, 7_200]);
     let requests = bench.said.len() as u64 / 7;
     assert!((7_300..4 * 7_300).contains(&requests), "{requests} requests in 7300 s");
-    bench.machine.set_habits(Habits::default());
+    bench.machine.set_quirks(ProtocolQuirks::default());
     bench.until("streaming", LIMIT, Bench::is_streaming);
 }
 
@@ -166,9 +169,9 @@ fn a_restart_is_counted_once_at_every_rate_and_however_long_it_takes() {
 fn a_cable_and_a_user_do_not_restart_a_sensor() {
     let mut bench = Bench::new(sensor_with(Settings::default()), 0);
     bench.until("streaming", 3_000 * MILLIS, Bench::is_streaming);
-    bench.wire = Wire::new(&"silence=3,silence_every=6".parse().expect("faults"), 1);
+    bench.wire = LineModel::new(&"silence=3,silence_every=6".parse().expect("faults"), 1);
     bench.run(40_000 * MILLIS);
-    bench.wire = Wire::new(&Faults::default(), 1);
+    bench.wire = LineModel::new(&Faults::default(), 1);
     bench.until("streaming", SEARCHING, Bench::is_streaming);
     assert!(bench.session.account().resyncs > 3);
     for control in [Control::Resync, Control::Pause, Control::Resume] {

@@ -5,9 +5,9 @@ use scanhub_drivers::line::Session as _;
 use scanhub_drivers::lms::variant::{Baud, Variant};
 use schema::{MICROS, MILLIS};
 use sim::ChunkSize;
-use sim::machine::{Machine, Settings};
+use sim::machine::{LmsSimulator, Settings};
+use sim::operating::Source;
 use sim::room::Room;
-use sim::source::Source;
 
 use super::bench::{Bench, Received, Sent, make_stream, sensor};
 
@@ -22,7 +22,7 @@ fn a_telegram_is_there_soon_after_its_last_byte() {
     for chunk in [ChunkSize::Uart, ChunkSize::Usb] {
         for variant in [Variant::HALF, Variant::ALL[0]] {
             let settings = Settings { baud: Baud::B500000, variant, chunk, ..Settings::default() };
-            let machine = Machine::new(settings, Source::Room(Room::new(&"room".parse().unwrap(), 5)));
+            let machine = LmsSimulator::new(settings, Source::Room(Room::new(&"room".parse().unwrap(), 5)));
             let mut bench = Bench::new(machine, 0);
             bench.until("streaming", 3_000 * MILLIS, Bench::is_streaming);
             bench.run(20_000 * MILLIS);
@@ -49,7 +49,7 @@ const LESSONS: usize = 6;
 #[test]
 fn what_a_killed_host_would_lose_is_not_read_before_it_is_nearly_complete() {
     let settings = Settings { baud: Baud::B500000, ..Settings::default() };
-    let machine = Machine::new(settings, Source::Room(Room::new(&"room".parse().unwrap(), 5)));
+    let machine = LmsSimulator::new(settings, Source::Room(Room::new(&"room".parse().unwrap(), 5)));
     let mut bench = Bench::new(machine, 0);
     bench.until("streaming", 3_000 * MILLIS, Bench::is_streaming);
     bench.run(500 * MILLIS);

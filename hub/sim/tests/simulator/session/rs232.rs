@@ -11,7 +11,7 @@ use sim::device::Device as _;
 use sim::fault::Faults;
 use sim::machine::{Settings, Start};
 use sim::operating::Operating;
-use sim::wire::Wire;
+use sim::wire::LineModel;
 
 use super::bench::{Bench, WANTED, make_stream, sensor, sensor_with};
 
@@ -22,7 +22,7 @@ const KEEPS: Option<Trouble> = Some(Trouble::NeedsRs422 { instead: None });
 
 fn on_rs232(wanted: lms::Settings, settings: Settings) -> Bench {
     let mut bench = Bench::wanting(wanted, sensor_with(settings), 0);
-    bench.wire = Wire::new(&Faults { rs232: 1.0, ..Faults::default() }, 0);
+    bench.wire = LineModel::new(&Faults { rs232: 1.0, ..Faults::default() }, 0);
     bench
 }
 
@@ -102,7 +102,7 @@ fn count_outlives_session_and_next_session_uses_38400_first() {
         [(streaming(), 500), ((sensor(Baud::B38400), 0), 1_500), ((sensor(Baud::B9600), 0), 2_500)]
     {
         let mut bench = Bench::new(machine, now);
-        bench.wire = Wire::new(&Faults { rs232: 1.0, ..Faults::default() }, 0);
+        bench.wire = LineModel::new(&Faults { rs232: 1.0, ..Faults::default() }, 0);
         bench.seek_first(Baud::B38400);
         bench.session.recall_silent_switches(counted);
         bench.until("streaming", within * MILLIS, Bench::is_streaming);
@@ -123,7 +123,7 @@ fn configured_rate_is_kept_and_message_names_rs422() {
         assert_eq!((bench.session.trouble(), bench.found_at()), (KEEPS, Some(Baud::B9600)));
     }
     // The line was rewired.
-    bench.wire = Wire::new(&Faults::default(), 0);
+    bench.wire = LineModel::new(&Faults::default(), 0);
     bench.until("streaming", LIMIT, Bench::is_streaming);
     assert_eq!((bench.session.trouble(), bench.session.silent_switches()), (None, 0));
     assert_eq!(bench.session.baud(), Baud::B500000);
@@ -173,7 +173,7 @@ fn other_rates_and_servers_are_not_limited() {
 #[test]
 fn pause_and_silence_keep_the_limit() {
     let mut bench = Bench::new(sensor(Baud::B9600), 0);
-    bench.wire = Wire::new(&Faults { rs232: 1.0, ..Faults::default() }, 0);
+    bench.wire = LineModel::new(&Faults { rs232: 1.0, ..Faults::default() }, 0);
     bench.session.recall_silent_switches(2);
     bench.until("streaming", LIMIT, Bench::is_streaming);
     bench.session.control(Control::Pause, bench.now);

@@ -5,7 +5,7 @@ use scanhub_drivers::lms;
 use scanhub_drivers::lms::variant::{Baud, Mode, Unit, Variant};
 use schema::MILLIS;
 
-use sim::machine::{Habits, Settings, Start};
+use sim::machine::{ProtocolQuirks, Settings, Start};
 use sim::operating::Operating;
 
 use super::bench::{Bench, make_stream, sensor, sensor_with};
@@ -39,7 +39,7 @@ fn from_each_rate_to_a_stream_within_three_seconds() {
 fn a_sensor_with_another_variant_is_set_to_the_wanted_one() {
     let settings = Settings { variant: Variant::ALL[4], baud: Baud::B38400, ..Settings::default() };
     let room = sim::room::Room::new(&sim::world::World::Random, 3);
-    let machine = sim::machine::Machine::new(settings, sim::source::Source::Room(room));
+    let machine = sim::machine::LmsSimulator::new(settings, sim::operating::Source::Room(room));
     let mut bench = Bench::new(machine, 0);
     bench.until("streaming", 3_000 * MILLIS, Bench::is_streaming);
     bench.run(500 * MILLIS);
@@ -66,8 +66,8 @@ fn nobody_there_is_said_and_the_search_goes_on() {
 
 /// A sensor that answers 60 ms after its ACK, as the faster half of those captured.
 fn prompt(baud: Baud, start: Start) -> Settings {
-    let habits = Habits { answer_ns: 60 * MILLIS, ..Habits::default() };
-    Settings { baud, start, habits, ..Settings::default() }
+    let quirks = ProtocolQuirks { answer_ns: 60 * MILLIS, ..ProtocolQuirks::default() };
+    Settings { baud, start, quirks, ..Settings::default() }
 }
 
 #[test]
@@ -96,8 +96,8 @@ fn what_does_not_tell_its_type_or_its_status_is_started_all_the_same() {
         for start in [Operating::OnRequest, Operating::All, Operating::Installation] {
             for refused in [0x3A, 0x31, 0x74] {
                 let settings = prompt(baud, Start::In(start.clone()));
-                let habits = Habits { refuses: vec![refused], ..settings.habits.clone() };
-                let mut bench = Bench::new(sensor_with(Settings { habits, ..settings }), 0);
+                let quirks = ProtocolQuirks { refuses: vec![refused], ..settings.quirks.clone() };
+                let mut bench = Bench::new(sensor_with(Settings { quirks, ..settings }), 0);
                 bench.until("streaming", 4_000 * MILLIS, Bench::is_streaming);
                 bench.run(1_500 * MILLIS);
                 assert!(bench.is_streaming() && bench.session.trouble().is_none(), "{refused:02x}: {bench}");
@@ -150,25 +150,25 @@ fn what_has_no_answer_for_its_type_is_found_by_its_status() {
 fn what_refuses_another_rate_is_stopped_first() {
     for baud in [Baud::B9600, Baud::B19200, Baud::B38400] {
         let settings = prompt(baud, Start::In(Operating::Installation));
-        let willing = settings.habits.clone();
-        let habits = Habits { refuses: vec![0x20], ..willing.clone() };
-        let mut bench = Bench::new(sensor_with(Settings { habits, ..settings }), 0);
+        let willing = settings.quirks.clone();
+        let quirks = ProtocolQuirks { refuses: vec![0x20], ..willing.clone() };
+        let mut bench = Bench::new(sensor_with(Settings { quirks, ..settings }), 0);
         bench.until("refused", 2_000 * MILLIS, |bench| {
             bench.received.iter().any(|got| got.telegram[4] == lms::reply::REFUSED)
         });
-        bench.machine.set_habits(willing);
+        bench.machine.set_quirks(willing);
         bench.until("streaming", 2_000 * MILLIS, Bench::is_streaming);
         bench.run(500 * MILLIS);
         assert!(bench.is_streaming() && bench.session.trouble().is_none(), "{bench}");
         // Whoever refuses it always is told of, and asked again.
-        let habits = Habits { refuses: vec![0x20], ..Habits::default() };
+        let quirks = ProtocolQuirks { refuses: vec![0x20], ..ProtocolQuirks::default() };
         let settings = prompt(baud, Start::In(Operating::OnRequest));
-        let mut bench = Bench::new(sensor_with(Settings { habits, ..settings }), 0);
+        let mut bench = Bench::new(sensor_with(Settings { quirks, ..settings }), 0);
         bench.until("said", 4_000 * MILLIS, |bench| {
             matches!(bench.session.trouble(), Some(lms::Trouble::Refused(_)))
         });
         bench.run(5_000 * MILLIS);
-        bench.machine.set_habits(Habits::default());
+        bench.machine.set_quirks(ProtocolQuirks::default());
         bench.until("streaming", 4_000 * MILLIS, Bench::is_streaming);
         assert_eq!(bench.session.trouble(), None);
     }

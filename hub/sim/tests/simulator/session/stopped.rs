@@ -4,16 +4,16 @@ use scanhub_drivers::line::Session as _;
 use scanhub_drivers::lms;
 use scanhub_drivers::lms::variant::{Baud, Variant};
 use schema::{MICROS, MILLIS, Nanos};
-use sim::machine::{Machine, Settings};
+use sim::machine::{LmsSimulator, Settings};
+use sim::operating::Source;
 use sim::room::Room;
-use sim::source::Source;
 
 use super::bench::{Bench, WANTED};
 
 /// A stream that has gone on for some seconds, and how long its scans take from the first byte to the last.
 fn streaming(baud: Baud, variant: Variant) -> (Bench, Nanos) {
     let settings = Settings { baud, variant, ..Settings::default() };
-    let machine = Machine::new(settings, Source::Room(Room::new(&"room".parse().unwrap(), 5)));
+    let machine = LmsSimulator::new(settings, Source::Room(Room::new(&"room".parse().unwrap(), 5)));
     let mut bench = Bench::wanting(lms::Settings { baud, variant, ..WANTED }, machine, 0);
     bench.until("streaming", 5_000 * MILLIS, Bench::is_streaming);
     bench.run(10_000 * MILLIS);

@@ -5,9 +5,9 @@ use scanhub_drivers::lms;
 use scanhub_drivers::lms::Trouble;
 use scanhub_drivers::lms::variant::{Baud, Unit, Variant};
 use schema::MILLIS;
-use sim::machine::{Habits, Machine, Settings};
+use sim::machine::{LmsSimulator, ProtocolQuirks, Settings};
+use sim::operating::Source;
 use sim::room::Room;
-use sim::source::Source;
 
 use super::bench::{Bench, make_stream, sensor};
 
@@ -17,7 +17,7 @@ fn a_refused_variant_streams_as_it_is() {
     let scan = |i: u16| lms::measured::encode(0, Unit::Cm, &[700 + i % 50; 181], 0x10).bytes().to_vec();
     let telegrams = Box::new((0..).map(scan));
     let settings = Settings { variant, baud: Baud::B9600, ..Settings::default() };
-    let mut bench = Bench::new(Machine::new(settings, Source::Recorded { variant, telegrams }), 0);
+    let mut bench = Bench::new(LmsSimulator::new(settings, Source::Recorded { variant, telegrams }), 0);
     bench.until("streaming", 3_000 * MILLIS, Bench::is_streaming);
     bench.run(1_000 * MILLIS);
     assert!(bench.is_streaming() && bench.received_scans(0).len() > 60, "{bench}");
@@ -28,10 +28,10 @@ fn a_refused_variant_streams_as_it_is() {
 #[test]
 fn what_was_refused_is_not_forgotten_in_a_silence() {
     let variant = Variant::ALL[0];
-    let habits = Habits { refuses: vec![0x3B], ..Habits::default() };
-    let settings = Settings { variant, habits, ..Settings::default() };
+    let quirks = ProtocolQuirks { refuses: vec![0x3B], ..ProtocolQuirks::default() };
+    let settings = Settings { variant, quirks, ..Settings::default() };
     let mut bench =
-        Bench::new(Machine::new(settings, Source::Room(Room::new(&"room".parse().unwrap(), 1))), 0);
+        Bench::new(LmsSimulator::new(settings, Source::Room(Room::new(&"room".parse().unwrap(), 1))), 0);
     bench.until("streaming", 3_000 * MILLIS, Bench::is_streaming);
     bench.run(500 * MILLIS);
     let cut = bench.now;
@@ -40,11 +40,11 @@ fn what_was_refused_is_not_forgotten_in_a_silence() {
     assert_eq!(bench.session.trouble(), Some(Trouble::Silence));
     bench.states.clear();
     // Nobody tells the mode for some time.
-    let mute = Habits { mute: true, ..Habits::default() };
-    bench.machine.set_habits(mute);
+    let mute = ProtocolQuirks { mute: true, ..ProtocolQuirks::default() };
+    bench.machine.set_quirks(mute);
     bench.until("streaming", 200 * MILLIS, Bench::is_streaming);
     bench.until("told", 10_000 * MILLIS, |bench| bench.session.trouble() == Some(Trouble::ModeUnknown));
-    bench.machine.set_habits(Habits::default());
+    bench.machine.set_quirks(ProtocolQuirks::default());
     bench.until("mode known", 11_000 * MILLIS, |bench| bench.session.sensor().mode.is_some());
     bench.run(500 * MILLIS);
     assert_eq!(bench.session.trouble(), Some(Trouble::VariantRefused), "{bench}");
@@ -154,7 +154,7 @@ fn a_variant_that_gets_no_answer_is_done_without() {
     let settings =
         Settings { variant: Variant { angle_deg: 180, resolution_cdeg: 100 }, ..Settings::default() };
     let mut bench =
-        Bench::new(Machine::new(settings, Source::Room(Room::new(&"room".parse().unwrap(), 1))), 0);
+        Bench::new(LmsSimulator::new(settings, Source::Room(Room::new(&"room".parse().unwrap(), 1))), 0);
     // Every request to switch arrives damaged, and is answered with NAK.
     let mut heard = Vec::new();
     bench.to_sensor = Box::new(move |_, byte| {
@@ -172,7 +172,7 @@ fn a_variant_that_gets_no_answer_is_done_without() {
 fn a_sensor_that_was_swapped_may_have_another_address() {
     let at = |address| {
         let settings = Settings { address, ..Settings::default() };
-        Machine::new(settings, Source::Room(Room::new(&"room".parse().unwrap(), 1)))
+        LmsSimulator::new(settings, Source::Room(Room::new(&"room".parse().unwrap(), 1)))
     };
     let mut bench = Bench::new(at(1), 0);
     bench.until("streaming", 3_000 * MILLIS, Bench::is_streaming);

@@ -2,13 +2,13 @@
 
 use schema::MILLIS;
 use sim::device::Device as _;
-use sim::rplidar::{Form, Model, UnitSettings, UnitStart};
+use sim::rplidar::{Form, Model, RplidarSettings, RplidarStart};
 use sim::world::World;
 
 use super::bench::{Bench, SECOND, start, with_payload};
 
 fn bench(model: Model) -> Bench {
-    Bench::new(UnitSettings::of(model), &World::Empty, "")
+    Bench::new(RplidarSettings::of(model), &World::Empty, "")
 }
 
 /// What a request of one answer is answered with.
@@ -151,7 +151,7 @@ fn after_a_reset_comes_the_banner_and_then_it_hears() {
     assert!((671 * MILLIS..680 * MILLIS).contains(&took), "{took}");
     assert!(!bench.unit.streams());
     assert_eq!(one(bench.ask(&[0xA5, 0x50])).len(), 27);
-    let settings = UnitSettings { start: UnitStart::PowerOn, ..UnitSettings::of(Model::A1) };
+    let settings = RplidarSettings { start: RplidarStart::PowerOn, ..RplidarSettings::of(Model::A1) };
     let mut bench = Bench::new(settings, &World::Empty, "");
     assert!(bench.ask(&[0xA5, 0x50]).is_empty());
     bench.run(3 * SECOND);

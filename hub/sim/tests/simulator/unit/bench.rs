@@ -5,8 +5,8 @@ use sim::Arrival;
 use sim::device::{Device as _, Part};
 use sim::fault::Faults;
 use sim::room::Room;
-use sim::rplidar::{Unit, UnitSettings};
-use sim::wire::Wire;
+use sim::rplidar::{RplidarSettings, RplidarSimulator};
+use sim::wire::LineModel;
 use sim::world::World;
 
 pub(crate) const SECOND: Nanos = 1_000 * MILLIS;
@@ -22,8 +22,8 @@ pub(crate) struct Sent {
 }
 
 pub(crate) struct Bench {
-    pub(crate) unit: Unit,
-    wire: Wire,
+    pub(crate) unit: RplidarSimulator,
+    wire: LineModel,
     pub(crate) now: Nanos,
     /// What arrived, byte for byte.
     pub(crate) line: Vec<u8>,
@@ -32,13 +32,13 @@ pub(crate) struct Bench {
 }
 
 impl Bench {
-    pub(crate) fn new(settings: UnitSettings, world: &World, faults: &str) -> Bench {
+    pub(crate) fn new(settings: RplidarSettings, world: &World, faults: &str) -> Bench {
         let faults: Faults = faults.parse().expect("faults");
         let seed = settings.seed;
-        let settings = UnitSettings { faults, habits: faults.habits(), ..settings };
+        let settings = RplidarSettings { faults, quirks: faults.quirks(), ..settings };
         Bench {
-            unit: Unit::new(settings, Room::new(world, seed)),
-            wire: Wire::new(&faults, seed),
+            unit: RplidarSimulator::new(settings, Room::new(world, seed)),
+            wire: LineModel::new(&faults, seed),
             now: 0,
             line: Vec::new(),
             sent: Vec::new(),

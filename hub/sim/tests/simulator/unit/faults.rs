@@ -1,14 +1,15 @@
 //! How a scanner fails, and what the line does to its packets: each fault, with what the truth says of it.
 
 use sim::device::Device as _;
-use sim::rplidar::{Model, UnitSettings, UnitStart};
+use sim::rplidar::{Model, RplidarSettings, RplidarStart};
 use sim::world::World;
 
 use super::bench::{Bench, SECOND, start};
 
 /// A scanner that streams in its mode number `typical` from the start.
 fn streaming(model: Model, typical: usize, faults: &str) -> Bench {
-    let settings = UnitSettings { typical, start: UnitStart::Streaming, seed: 3, ..UnitSettings::of(model) };
+    let settings =
+        RplidarSettings { typical, start: RplidarStart::Streaming, seed: 3, ..RplidarSettings::of(model) };
     Bench::new(settings, &World::Wall640, faults)
 }
 
@@ -108,7 +109,7 @@ fn an_error_ends_the_stream_and_only_some_go_away_with_a_reset() {
         assert_eq!(health(&mut bench)[0], status);
         assert_eq!(bench.ask(&start(2)).len(), answers);
     }
-    let mut warned = UnitSettings::of(Model::A1);
+    let mut warned = RplidarSettings::of(Model::A1);
     warned.health = (1, 7);
     let mut bench = Bench::new(warned, &World::Empty, "");
     assert_eq!(bench.ask(&[0xA5, 0x52])[0][7..], [1, 7, 0]);
@@ -133,7 +134,7 @@ fn a_head_that_is_held_measures_nothing_and_gets_up_to_speed_again() {
 #[test]
 fn bad_habits_of_answering() {
     let asked = |faults: &str| {
-        let mut bench = Bench::new(UnitSettings::of(Model::A1), &World::Empty, faults);
+        let mut bench = Bench::new(RplidarSettings::of(Model::A1), &World::Empty, faults);
         (0..100).map(|_| bench.ask(&[0xA5, 0x52]).len()).sum::<usize>()
     };
     assert_eq!((asked(""), asked("mute=1"), asked("twice=1"), asked("late=0.1")), (100, 0, 200, 95));

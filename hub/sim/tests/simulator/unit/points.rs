@@ -1,8 +1,8 @@
 //! Points beside what was measured: each form of packet of each model, and what is odd about an A1.
 
 use schema::Nanos;
-use sim::layers::Layers;
-use sim::rplidar::{Form, Model, UnitSettings};
+use sim::beam::NoiseModel;
+use sim::rplidar::{Form, Model, RplidarSettings};
 use sim::world::World;
 
 use super::bench::{Bench, SECOND, start};
@@ -10,11 +10,11 @@ use super::decode::{Point, capsules, standard};
 
 /// A room, without noise.
 fn still(world: &str) -> World {
-    world.parse::<World>().expect("a world").with_layers(Layers::NONE)
+    world.parse::<World>().expect("a world").with_noise(NoiseModel::NONE)
 }
 
 /// Streams in mode `mode` for `span` in `world`; the points that were sent.
-fn streamed(settings: UnitSettings, mode: usize, world: &World, span: Nanos) -> (Bench, Vec<Point>) {
+fn streamed(settings: RplidarSettings, mode: usize, world: &World, span: Nanos) -> (Bench, Vec<Point>) {
     let model = settings.model;
     let mut bench = Bench::new(settings, world, "");
     // Those whose motor rests until it is told.
@@ -39,7 +39,8 @@ fn off(a: f64, b: f64) -> f64 {
 fn every_point_of_every_mode_of_every_model_is_where_it_was_measured() {
     for model in Model::ALL {
         for (number, mode) in model.modes().iter().enumerate() {
-            let (mut bench, points) = streamed(UnitSettings::of(model), number, &still("corridor"), SECOND);
+            let (mut bench, points) =
+                streamed(RplidarSettings::of(model), number, &still("corridor"), SECOND);
             let begin = bench.unit.begin_ns().expect("it streams");
             let seconds = (bench.now - begin) as f64 / 1e9;
             let due = seconds * 1e6 / mode.sample_us;
@@ -78,7 +79,7 @@ fn every_point_of_every_mode_of_every_model_is_where_it_was_measured() {
 fn an_a1_indoors_is_as_odd_as_a_real_one() {
     let (mut in_all, mut invalid, mut backward, mut counts, mut flags) = (0, 0, 0, Vec::new(), Vec::new());
     for seed in 0..4 {
-        let settings = UnitSettings { seed, ..UnitSettings::of(Model::A1) };
+        let settings = RplidarSettings { seed, ..RplidarSettings::of(Model::A1) };
         let (_, points) = streamed(settings, 0, &"demo".parse().expect("a world"), 10 * SECOND);
         in_all += points.len();
         invalid += points.iter().filter(|point| point.quality == Some(0)).count();
@@ -119,7 +120,7 @@ fn share(part: usize, of: usize) -> f64 {
 fn the_same_seed_says_the_same_and_another_another() {
     let world: World = "demo".parse().expect("a world");
     let said = |seed| {
-        let settings = UnitSettings { seed, ..UnitSettings::of(Model::A1) };
+        let settings = RplidarSettings { seed, ..RplidarSettings::of(Model::A1) };
         streamed(settings, 1, &world, SECOND).1
     };
     let points = said(5);

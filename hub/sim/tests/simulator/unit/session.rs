@@ -5,9 +5,9 @@ use scanhub_drivers::line::grid::NO_RETURN;
 use scanhub_drivers::line::{Event, Output, Protocol as _, Session as _, State};
 use scanhub_drivers::rplidar::{Mode, Model as Known, Session, Trouble};
 use schema::{MILLIS, Nanos, line_time};
+use sim::beam::NoiseModel;
 use sim::device::Device as _;
-use sim::layers::Layers;
-use sim::rplidar::{Model, UnitSettings, UnitStart};
+use sim::rplidar::{Model, RplidarSettings, RplidarStart};
 use sim::world::World;
 
 use super::bench::{Bench, SECOND};
@@ -31,8 +31,8 @@ struct Talk {
 }
 
 impl Talk {
-    fn new(settings: Settings, unit: UnitSettings, faults: &str) -> Talk {
-        let world = "corridor".parse::<World>().expect("a world").with_layers(Layers::NONE);
+    fn new(settings: Settings, unit: RplidarSettings, faults: &str) -> Talk {
+        let world = "corridor".parse::<World>().expect("a world").with_noise(NoiseModel::NONE);
         let bench = Bench::new(unit, &world, faults);
         Talk { session: Session::new(settings, 0), bench, read: 0, turns: Vec::new() }
     }
@@ -140,7 +140,7 @@ fn every_mode_of_every_model_is_understood() {
             let known = Known::named(model.name()).expect("known");
             let settings =
                 Settings { model: Some(known.name()), mode: mode.map(Mode::name), ..Settings::default() };
-            let mut talk = Talk::new(settings, UnitSettings::of(model), "");
+            let mut talk = Talk::new(settings, RplidarSettings::of(model), "");
             talk.run(8 * SECOND);
             assert_eq!((talk.session.state(), talk.session.trouble()), (State::Streaming, None));
             assert_eq!(talk.session.model(), Some(known));
@@ -160,8 +160,10 @@ fn every_mode_of_every_model_is_understood() {
 #[test]
 fn one_that_somebody_left_streaming_or_unwell_streams_in_three_seconds() {
     for model in Model::ALL {
-        for (start, health) in [(UnitStart::Streaming, 0), (UnitStart::Idle, 0), (UnitStart::Idle, 2)] {
-            let unit = UnitSettings { start, health: (health, 0x8001), ..UnitSettings::of(model) };
+        for (start, health) in
+            [(RplidarStart::Streaming, 0), (RplidarStart::Idle, 0), (RplidarStart::Idle, 2)]
+        {
+            let unit = RplidarSettings { start, health: (health, 0x8001), ..RplidarSettings::of(model) };
             let mut talk = Talk::new(Settings::default(), unit, "");
             let begun = |talk: &Talk| !talk.turns.is_empty();
             while !begun(&talk) && talk.bench.now < 3 * SECOND {
@@ -176,7 +178,7 @@ fn one_that_somebody_left_streaming_or_unwell_streams_in_three_seconds() {
 fn every_brown_out_is_a_restart_and_so_is_a_power_cycle() {
     for model in Model::ALL {
         let settings = Settings { model: Some(model.name()), ..Settings::default() };
-        let mut talk = Talk::new(settings, UnitSettings::of(model), "brownout_at=4,brownout_every=5");
+        let mut talk = Talk::new(settings, RplidarSettings::of(model), "brownout_at=4,brownout_every=5");
         talk.run(30 * SECOND);
         let banners = talk.bench.sent.iter().filter(|sent| sent.bytes.starts_with(b"RP LIDAR"));
         // A banner that completes the bytes of a packet is recognized once the stream is silent for a second.
@@ -188,7 +190,7 @@ fn every_brown_out_is_a_restart_and_so_is_a_power_cycle() {
         assert!((recognized - 1..=banners.count() as u64).contains(&restarts), "{model:?}: {restarts}");
 
         // A power cycle takes longer than the silence after which the session searches.
-        let mut talk = Talk::new(settings, UnitSettings::of(model), "");
+        let mut talk = Talk::new(settings, RplidarSettings::of(model), "");
         for restarts in 1..=4 {
             talk.run(talk.bench.now + 7 * SECOND + restarts * 130 * MILLIS);
             assert_eq!(talk.session.state(), State::Streaming, "{model:?}");
@@ -209,7 +211,7 @@ fn what_only_looks_like_a_restart_is_none() {
             "loss=0.002",
         ] {
             let settings = Settings { model: Some(model.name()), ..Settings::default() };
-            let mut talk = Talk::new(settings, UnitSettings::of(model), faults);
+            let mut talk = Talk::new(settings, RplidarSettings::of(model), faults);
             talk.run(30 * SECOND);
             assert_eq!(talk.session.account().restarts, 0, "{model:?} {faults}");
         }
@@ -218,7 +220,7 @@ fn what_only_looks_like_a_restart_is_none() {
 
 #[test]
 fn a_line_that_damages_most_bytes_does_not_accuse_the_head() {
-    let mut talk = Talk::new(Settings::default(), UnitSettings::of(Model::S2), "loss=0.02");
+    let mut talk = Talk::new(Settings::default(), RplidarSettings::of(Model::S2), "loss=0.02");
     talk.run(6 * SECOND);
     for _ in 0..100 {
         talk.run(talk.bench.now + 100 * MILLIS);
@@ -235,7 +237,7 @@ fn no_point_of_an_unmarked_turn_is_wrong_on_a_line_that_loses_bytes() {
         for seed in 0..3 {
             let settings =
                 Settings { model: Some(model.name()), mode: Some(mode.name()), ..Settings::default() };
-            let unit = UnitSettings { seed, ..UnitSettings::of(model) };
+            let unit = RplidarSettings { seed, ..RplidarSettings::of(model) };
             let mut talk = Talk::new(settings, unit, "loss=0.0002,burst=4");
             talk.run(12 * SECOND);
             assert_eq!(talk.session.state(), State::Streaming, "{model:?}: {:?}", talk.session.trouble());

@@ -5,7 +5,7 @@ use std::collections::BTreeSet;
 use proptest::prelude::*;
 use scanhub_drivers::lms::variant::{Mode, Unit, Variant};
 use schema::Failure;
-use sim::labeled_scan::Met;
+use sim::room::BeamTarget;
 use sim::room::Room;
 use sim::world::World;
 
@@ -40,12 +40,12 @@ fn every_world_runs_for_a_minute_as_its_name_says() {
                 let first = look(&room, end_ns);
                 assert_eq!(first, look(&room, end_ns), "{name} at {end_ns}");
                 kinds.extend(first.truth.iter().map(|met| match met {
-                    Met::Static { since_ns: 0 } => "static",
-                    Met::Static { .. } => "uncovered",
-                    Met::Person => "person",
-                    Met::Box { .. } => "box",
-                    Met::Grazed => "grazed",
-                    Met::Invalid => "invalid",
+                    BeamTarget::Static { since_ns: 0 } => "static",
+                    BeamTarget::Static { .. } => "uncovered",
+                    BeamTarget::Person => "person",
+                    BeamTarget::Box { .. } => "box",
+                    BeamTarget::Grazed => "grazed",
+                    BeamTarget::Invalid => "invalid",
                 }));
             }
         }
@@ -66,7 +66,7 @@ fn ten_seeds_are_ten_runs() {
         ["fig8", "standing", "approach", "door", "corridor", "glass", "faint", "sun", "chair", "crowd"]
     {
         let world: World = name.parse().unwrap();
-        let world = world.with_layers(sim::layers::Layers::NONE);
+        let world = world.with_noise(sim::beam::NoiseModel::NONE);
         let scan = |seed| Room::new(&world, seed).scan(Variant::HALF, Unit::Mm, Mode(1), 17_000_000_000);
         let runs: BTreeSet<Vec<u16>> = (0..10).map(scan).collect();
         assert_eq!(runs.len(), 10, "{name}");
@@ -77,7 +77,7 @@ fn ten_seeds_are_ten_runs() {
 #[test]
 fn ports_share_a_world_until_its_sensors_are_taken() {
     let text = format!("{}[[sensor]]\npose = [0, 100, 90]\n", text("fig8"));
-    let quiet = world(&text).with_layers(sim::layers::Layers::NONE);
+    let quiet = world(&text).with_noise(sim::beam::NoiseModel::NONE);
     let noisy = world(&text);
     let scan = |world, port| look(&Room::of_port(world, 5, port), 20_000_000_000).words;
     assert_eq!(quiet.sensors(), 2);
@@ -90,7 +90,10 @@ fn ports_share_a_world_until_its_sensors_are_taken() {
 #[test]
 fn a_world_without_anything_is_one() {
     let look = look(&room("", 1), SCAN_NS);
-    assert!(look.words.iter().all(|&word| word == 8191) && look.truth.iter().all(|&met| met == Met::Invalid));
+    assert!(
+        look.words.iter().all(|&word| word == 8191)
+            && look.truth.iter().all(|&met| met == BeamTarget::Invalid)
+    );
 }
 
 #[test]

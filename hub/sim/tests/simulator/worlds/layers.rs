@@ -1,8 +1,8 @@
 //! Each layer of noise is seen to act, and to be off when it is switched off.
 
 use scanhub_drivers::lms::variant::{Mode, Unit, Variant};
-use sim::labeled_scan::Met;
-use sim::layers::Layers;
+use sim::beam::NoiseModel;
+use sim::room::BeamTarget;
 use sim::room::Room;
 use sim::world::World;
 
@@ -22,11 +22,11 @@ surface = \"dark\"
 line = [[6000, 9000], [9000, 2000]]
 ";
 
-const NONE: Layers = Layers::NONE;
+const NONE: NoiseModel = NoiseModel::NONE;
 
 /// The words of `count` scans with these layers.
-fn words(layers: Layers, seed: u64, count: u64) -> Vec<Vec<u16>> {
-    let room = Room::new(&world(WORLD).with_layers(layers), seed);
+fn words(layers: NoiseModel, seed: u64, count: u64) -> Vec<Vec<u16>> {
+    let room = Room::new(&world(WORLD).with_noise(layers), seed);
     (1..=count).map(|scan| look(&room, scan * SCAN_NS).words).collect()
 }
 
@@ -46,7 +46,7 @@ fn share(values: &[f64], is: impl Fn(f64) -> bool) -> f64 {
 
 #[test]
 fn without_layers_a_word_is_the_true_range_in_its_unit() {
-    let room = Room::new(&world(WORLD).with_layers(NONE), 9);
+    let room = Room::new(&world(WORLD).with_noise(NONE), 9);
     for (unit, mm) in [(Unit::Mm, 1.0), (Unit::Cm, 10.0), (Unit::Dm, 100.0)] {
         let words = room.scan(Variant::HALF, unit, Mode(1), SCAN_NS);
         for beam in 180..200 {
@@ -59,7 +59,7 @@ fn without_layers_a_word_is_the_true_range_in_its_unit() {
 
 #[test]
 fn sigma_spreads_ranges() {
-    let deviations = deviations_mm(&words(Layers { sigma_mm: 5.0, ..NONE }, 1, 100));
+    let deviations = deviations_mm(&words(NoiseModel { sigma_mm: 5.0, ..NONE }, 1, 100));
     let mean = deviations.iter().sum::<f64>() / deviations.len() as f64;
     let variance = deviations.iter().map(|d| (d - mean).powi(2)).sum::<f64>() / deviations.len() as f64;
     assert!(mean.abs() < 0.2 && (4.8..5.2).contains(&variance.sqrt()), "{mean} {variance}");
@@ -70,7 +70,7 @@ fn sigma_spreads_ranges() {
 fn bias_is_one_for_a_device_and_another_for_the_next() {
     let mut met: Vec<i32> = Vec::new();
     for seed in 0..20 {
-        let deviations = deviations_mm(&words(Layers { bias_mm: 15.0, ..NONE }, seed, 2));
+        let deviations = deviations_mm(&words(NoiseModel { bias_mm: 15.0, ..NONE }, seed, 2));
         let bias = deviations[0].round();
         assert!(bias.abs() <= 15.0 && deviations.iter().all(|d| (d - bias).abs() <= 1.0), "seed {seed}");
         met.push(bias as i32);
@@ -83,7 +83,7 @@ fn bias_is_one_for_a_device_and_another_for_the_next() {
 #[test]
 fn the_tail_is_heavy_and_belongs_to_edges() {
     let exact = &words(NONE, 1, 1)[0];
-    let scans = words(Layers { tail: 0.5, ..NONE }, 1, 400);
+    let scans = words(NoiseModel { tail: 0.5, ..NONE }, 1, 400);
     let ranges = (0..361).filter(|&beam| exact[beam] < 8183);
     let (mut at_edges, mut readings) = (0, Vec::new());
     for beam in ranges {
@@ -116,7 +116,7 @@ fn in_scenes_with_many_edges_readings_are_off_as_often_as_in_recordings() {
         // Before anybody or anything moves.
         let looks: Vec<_> = (1..300).map(|scan| look(&room, scan * SCAN_NS)).collect();
         for beam in 0..361 {
-            let told = looks.iter().filter(|look| look.truth[beam] != Met::Invalid);
+            let told = looks.iter().filter(|look| look.truth[beam] != BeamTarget::Invalid);
             let mut ranges: Vec<i32> = told.map(|look| i32::from(look.words[beam] & 8191)).collect();
             ranges.sort_unstable();
             let Some(&middle) = ranges.get(ranges.len() / 2) else { continue };
@@ -138,7 +138,7 @@ fn values_between(depth_mm: f64, spot: bool) -> (f64, f64) {
             "[[thing]]\nline = [[-3000, {0}], [3000, {0}]]\n[[thing]]\nradius_mm = 60\npose = [{x_mm}, 1560]",
             1_500.0 + depth_mm
         );
-        let room = Room::new(&world(&text).with_layers(Layers { spot, ..NONE }), 1);
+        let room = Room::new(&world(&text).with_noise(NoiseModel { spot, ..NONE }), 1);
         let scans: Vec<Vec<u16>> = (1..=50).map(|scan| look(&room, scan * SCAN_NS).words).collect();
         for beam in 170..191 {
             let ranges = scans.iter().map(|words| f64::from(words[beam]));
@@ -168,7 +168,7 @@ fn a_spot_on_two_surfaces_reports_a_steady_value_between_if_they_are_not_far_apa
 
 #[test]
 fn errors_are_codes_in_place_of_ranges_and_change_nothing_else() {
-    let (with, without) = (words(Layers { errors: 0.005, ..NONE }, 1, 200), words(NONE, 1, 200));
+    let (with, without) = (words(NoiseModel { errors: 0.005, ..NONE }, 1, 200), words(NONE, 1, 200));
     let (mut codes, mut ranges) = (0, 0);
     for (with, without) in with.iter().flatten().zip(without.iter().flatten()) {
         if *without < 8183 {
@@ -183,7 +183,7 @@ fn errors_are_codes_in_place_of_ranges_and_change_nothing_else() {
 
 #[test]
 fn what_is_beyond_the_greatest_value_says_so() {
-    let room = Room::new(&world(WORLD).with_layers(NONE), 1);
+    let room = Room::new(&world(WORLD).with_noise(NONE), 1);
     // The far wall: 8.5 m at 40 degrees.
     assert_eq!(look(&room, SCAN_NS).words[80], 8191 - 8);
     let cm = room.scan(Variant::HALF, Unit::Cm, Mode(1), SCAN_NS);
@@ -195,19 +195,19 @@ fn dark_and_oblique_surfaces_far_away_are_too_weak() {
     let board = (0..361).filter(|beam| (250..265).contains(beam));
     let far = "[[thing]]\nline = [[-20000, 900], [20000, 900]]";
     let told = |weak: bool, beam: usize| {
-        let world = world(&format!("{WORLD}{far}")).with_layers(Layers { weak, ..NONE });
+        let world = world(&format!("{WORLD}{far}")).with_noise(NoiseModel { weak, ..NONE });
         Room::new(&world, 1).scan(Variant::HALF, Unit::Cm, Mode(1), SCAN_NS)[beam]
     };
     // The wall at 0.9 m, seen from 4 degrees: 12.9 m away.
     assert_eq!((told(true, 8), told(false, 8)), (8187, 1290));
     let dark = "[[thing]]\nline = [[-3000, 7900], [3000, 7900]]\nsurface = \"dark\"";
     let told = |weak: bool| {
-        let world = world(dark).with_layers(Layers { weak, ..NONE });
+        let world = world(dark).with_noise(NoiseModel { weak, ..NONE });
         look(&Room::new(&world, 1), SCAN_NS).words[180]
     };
     assert_eq!((told(true), told(false)), (7900 + 287, 7900));
     // Three metres away the dark board is seen.
-    let near = words(Layers { weak: true, ..NONE }, 1, 1);
+    let near = words(NoiseModel { weak: true, ..NONE }, 1, 1);
     assert!(board.into_iter().all(|beam| near[0][beam] < 8183));
 }
 
@@ -215,7 +215,7 @@ fn dark_and_oblique_surfaces_far_away_are_too_weak() {
 fn the_sun_dazzles_a_sector_for_a_time() {
     let text = format!("{WORLD}[[sun]]\nfrom_deg = 0\nto_deg = 5\nfrom_s = 2\nuntil_s = 4\nshare = 0.5\n");
     let dazzled = |dazzle, end_s: u64, beams: std::ops::RangeInclusive<usize>| {
-        let room = Room::new(&world(&text).with_layers(Layers { dazzle, ..NONE }), 1);
+        let room = Room::new(&world(&text).with_noise(NoiseModel { dazzle, ..NONE }), 1);
         let codes = (0..40).flat_map(|scan| {
             look(&room, end_s * 1_000_000_000 + scan * SCAN_NS).words[beams.clone()].to_vec()
         });
@@ -233,7 +233,9 @@ fn the_sun_dazzles_a_sector_for_a_time() {
 #[test]
 fn half_degrees_are_measured_one_mirror_turn_later() {
     let (comb, straight) = [true, false]
-        .map(|comb| Room::new(&"approach".parse::<World>().unwrap().with_layers(Layers { comb, ..NONE }), 1))
+        .map(|comb| {
+            Room::new(&"approach".parse::<World>().unwrap().with_noise(NoiseModel { comb, ..NONE }), 1)
+        })
         .into();
     let half_scan_ns = SCAN_NS / 2;
     let mut moved = 0;

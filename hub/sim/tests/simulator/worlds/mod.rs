@@ -8,7 +8,7 @@ mod truth;
 
 use scanhub_drivers::lms::variant::{Mode, Unit, Variant};
 use schema::Nanos;
-use sim::labeled_scan::LabeledScan;
+use sim::room::LabeledScan;
 use sim::room::Room;
 use sim::world::World;
 

@@ -1,9 +1,9 @@
 //! What a tilted sensor measures, against the geometry of what stands there.
 
 use schema::{Nanos, Scan, ScanHead};
-use sim::labeled_scan::Met;
-use sim::layers::Layers;
+use sim::beam::NoiseModel;
 use sim::mount::Mount;
+use sim::room::BeamTarget;
 use sim::room::Room;
 use sim::world::World;
 
@@ -11,12 +11,12 @@ use super::{look, text, world};
 
 const SECOND: Nanos = 1_000_000_000;
 /// Beams as thin as lines, each at its own time.
-const THIN: Layers = Layers { comb: true, ..Layers::NONE };
+const THIN: NoiseModel = NoiseModel { comb: true, ..NoiseModel::NONE };
 
 /// The world with one sensor 1 m high that swings from 0 to 40 degrees, and `things`.
 fn tilted(things: &str) -> World {
     let mount = "[sensor.mount]\nheight_mm = 1000\nfrom_deg = 0\nto_deg = 40\ndeg_s = 20\n";
-    world(&format!("[[sensor]]\npose = [0, 0, 90]\n{mount}\n{things}")).with_layers(THIN)
+    world(&format!("[[sensor]]\npose = [0, 0, 90]\n{mount}\n{things}")).with_noise(THIN)
 }
 
 fn mount(world: &World) -> &Mount {
@@ -25,7 +25,7 @@ fn mount(world: &World) -> &Mount {
 
 /// Where each beam with a range ends that ended at `end_ns`, in the frame of the mount's axis on the floor: to the right,
 /// ahead, up. By the angle at the beam's own time.
-fn points(world: &World, end_ns: Nanos) -> Vec<(usize, [f64; 3], Met)> {
+fn points(world: &World, end_ns: Nanos) -> Vec<(usize, [f64; 3], BeamTarget)> {
     let scan = look(&Room::new(world, 1), end_ns);
     let head = ScanHead::lms(361, -90_000, 500, 1, 13);
     let times = Scan::of(head, &[0; 361]);
@@ -35,7 +35,7 @@ fn points(world: &World, end_ns: Nanos) -> Vec<(usize, [f64; 3], Met)> {
         let (left, ahead) = times.angle(beam).sin_cos();
         [-left * range, ahead * range * down.cos(), 1000.0 - ahead * range * down.sin()]
     };
-    let valid = (0..361).filter(|&beam| scan.truth[beam] != Met::Invalid);
+    let valid = (0..361).filter(|&beam| scan.truth[beam] != BeamTarget::Invalid);
     valid.map(|beam| (beam, point(beam), scan.truth[beam])).collect()
 }
 
@@ -58,7 +58,7 @@ fn things_end_at_their_height_and_a_board_has_room_below() {
         let world = tilted(things);
         (0..160).flat_map(|tenth| points(&world, 3 * SECOND + tenth * SECOND / 40)).collect::<Vec<_>>()
     };
-    let on_it = |points: &[(usize, [f64; 3], Met)], from: f64, until: f64| {
+    let on_it = |points: &[(usize, [f64; 3], BeamTarget)], from: f64, until: f64| {
         let within = |p: &[f64; 3]| p[0].abs() < 290.0 && (1400.0..2000.0).contains(&p[1]);
         points.iter().filter(|(_, p, _)| within(p) && (from..until).contains(&p[2])).count()
     };
@@ -74,14 +74,14 @@ fn things_end_at_their_height_and_a_board_has_room_below() {
 #[test]
 fn what_is_put_down_and_who_walks_is_known() {
     let world: World = "tilt".parse().expect("built in");
-    let world = world.with_layers(THIN);
-    let count = |second: Nanos, is: &dyn Fn(&Met) -> bool| {
+    let world = world.with_noise(THIN);
+    let count = |second: Nanos, is: &dyn Fn(&BeamTarget) -> bool| {
         let room = Room::new(&world, 1);
         let scans = (0..80).map(|i| look(&room, second * SECOND + i * 26_640_000));
         scans.flat_map(|scan| scan.truth).filter(|met| is(met)).count()
     };
-    let is_person = |met: &Met| *met == Met::Person;
-    let is_box = |met: &Met| matches!(met, Met::Box { .. });
+    let is_person = |met: &BeamTarget| *met == BeamTarget::Person;
+    let is_box = |met: &BeamTarget| matches!(met, BeamTarget::Box { .. });
     assert_eq!((count(10, &is_person), count(10, &is_box)), (0, 0));
     assert!(count(40, &is_person) > 100);
     assert!(count(40, &is_box) > 300);

@@ -1,4 +1,4 @@
-//! Bad habits of a sensor, each alone.
+//! Bad quirks of a sensor, each alone.
 
 use lms_configure::eeprom::{PowerOn, Write};
 use scanhub_drivers::lms::command::Request;
@@ -9,44 +9,44 @@ use scanhub_drivers::lms::telegram::{ACK, NAK};
 use scanhub_drivers::lms::variant::{Baud, Variant};
 use schema::{MICROS, MILLIS, line_time};
 use sim::device::Device as _;
-use sim::machine::{Habits, Settings};
+use sim::machine::{ProtocolQuirks, Settings};
 use sim::{Arrival, Dropped};
 
 use super::bench::Bench;
 use super::{fast, reply};
 
-fn with(habits: Habits) -> Bench {
-    Bench::new(Settings { habits, ..fast() })
+fn with(quirks: ProtocolQuirks) -> Bench {
+    Bench::new(Settings { quirks, ..fast() })
 }
 
 /// How many of 200 requests for the type get this as the first byte of the answer.
-fn answered(habits: Habits, first: Option<u8>) -> usize {
-    let mut bench = with(habits);
+fn answered(quirks: ProtocolQuirks, first: Option<u8>) -> usize {
+    let mut bench = with(quirks);
     let request = Request::Type.encode(0);
     (0..200).filter(|_| bench.ask(request.bytes()).first().copied() == first).count()
 }
 
 #[test]
 fn a_share_of_the_requests_is_overlooked_or_refused_by_nak() {
-    let overlooked = answered(Habits { overlooks: 0.3, ..Habits::default() }, None);
+    let overlooked = answered(ProtocolQuirks { overlooks: 0.3, ..ProtocolQuirks::default() }, None);
     assert!((40..80).contains(&overlooked), "{overlooked}");
-    let refused = answered(Habits { naks: 0.3, ..Habits::default() }, Some(NAK));
+    let refused = answered(ProtocolQuirks { naks: 0.3, ..ProtocolQuirks::default() }, Some(NAK));
     assert!((40..80).contains(&refused), "{refused}");
-    assert_eq!(answered(Habits { mute: true, ..Habits::default() }, None), 200);
+    assert_eq!(answered(ProtocolQuirks { mute: true, ..ProtocolQuirks::default() }, None), 200);
 }
 
 #[test]
 fn a_command_may_be_refused() {
-    let mut bench = with(Habits { refuses: vec![0x3A], ..Habits::default() });
+    let mut bench = with(ProtocolQuirks { refuses: vec![0x3A], ..ProtocolQuirks::default() });
     assert_eq!(reply(&bench.ask(Request::Type.encode(0).bytes())), Reply::Refused);
     assert!(matches!(reply(&bench.ask(Request::Status.encode(0).bytes())), Reply::Status(_)));
-    bench.machine.set_habits(Habits::default());
+    bench.machine.set_quirks(ProtocolQuirks::default());
     assert!(matches!(reply(&bench.ask(Request::Type.encode(0).bytes())), Reply::Type(_)));
 }
 
 #[test]
 fn replies_come_twice() {
-    let mut bench = with(Habits { doubles: 1.0, ..Habits::default() });
+    let mut bench = with(ProtocolQuirks { doubles: 1.0, ..ProtocolQuirks::default() });
     bench.ask(Request::Type.encode(0).bytes());
     let sent = bench.sent();
     assert_eq!((sent.len(), &sent[0].1.telegram), (2, &sent[1].1.telegram));
@@ -54,13 +54,13 @@ fn replies_come_twice() {
 
 #[test]
 fn a_late_reply_comes_though_the_next_request_was_there_before_it() {
-    let mut bench = with(Habits { late_reply_ns: 800 * MILLIS, ..Habits::default() });
+    let mut bench = with(ProtocolQuirks { late_reply_ns: 800 * MILLIS, ..ProtocolQuirks::default() });
     assert_eq!(bench.ask(Request::Type.encode(0).bytes()), [ACK]);
     assert_eq!(bench.ask(Request::Stop.encode(0).bytes())[0], ACK);
     bench.run_until(bench.now + 2_000 * MILLIS);
     let commands: Vec<u8> = bench.sent().iter().map(|(_, sent)| sent.telegram[4]).collect();
     assert_eq!(commands, [0xBA, 0xA0]);
-    let mut bench = with(Habits { late_acknowledge_ns: 300 * MILLIS, ..Habits::default() });
+    let mut bench = with(ProtocolQuirks { late_acknowledge_ns: 300 * MILLIS, ..ProtocolQuirks::default() });
     bench.say(Request::Type.encode(0).bytes(), 60_000);
     let asked = bench.now;
     bench.run_until(asked + 1_000 * MILLIS);
@@ -69,7 +69,7 @@ fn a_late_reply_comes_though_the_next_request_was_there_before_it() {
 
 #[test]
 fn a_mode_is_changed_slowly_and_a_status_told_at_once() {
-    let mut bench = with(Habits { late_mode_ns: 2_000 * MILLIS, ..Habits::default() });
+    let mut bench = with(ProtocolQuirks { late_mode_ns: 2_000 * MILLIS, ..ProtocolQuirks::default() });
     for request in [Request::Stop, Request::Variant(Variant::ALL[0]), Request::Baud(Baud::B500000)] {
         assert_eq!(bench.ask(request.encode(0).bytes()), [ACK]);
         let before = bench.sent().len();
@@ -86,7 +86,7 @@ fn a_mode_is_changed_slowly_and_a_status_told_at_once() {
 
 #[test]
 fn writing_the_eeprom_takes_its_time() {
-    let mut bench = with(Habits { late_write_ns: 6_000 * MILLIS, ..Habits::default() });
+    let mut bench = with(ProtocolQuirks { late_write_ns: 6_000 * MILLIS, ..ProtocolQuirks::default() });
     assert_eq!(
         reply(&bench.ask(Request::install(Password::FACTORY).encode(0).bytes())),
         Reply::Mode { done: true }
@@ -104,7 +104,7 @@ fn writing_the_eeprom_takes_its_time() {
 #[test]
 fn a_strict_sensor_does_not_measure_in_installation_mode() {
     for strict in [false, true] {
-        let mut bench = with(Habits { strict, ..Habits::default() });
+        let mut bench = with(ProtocolQuirks { strict, ..ProtocolQuirks::default() });
         bench.ask(Request::install(Password::FACTORY).encode(0).bytes());
         let measuring = [
             Request::Operate(Operating::Means(2)),
@@ -156,10 +156,11 @@ fn what_a_host_leaves_to_its_uart_is_heard_unless_the_sensor_is_strict() {
         assert_eq!(answered_unspaced(&mut bench), 100);
         assert_eq!(bench.machine.take_dropped(), None);
         assert!(bench.chunks[0].0 >= line_ns + 2 * MILLIS, "the line carries it first");
-        bench.machine.set_habits(Habits { strict_gap: true, ..Habits::default() });
+        bench.machine.set_quirks(ProtocolQuirks { strict_gap: true, ..ProtocolQuirks::default() });
         assert_eq!(answered_unspaced(&mut bench), 0);
         assert_eq!(bench.machine.take_dropped(), Some(Dropped::ShortGap));
-        let strict = Settings { habits: Habits { strict_gap: true, ..Habits::default() }, ..slow };
+        let strict =
+            Settings { quirks: ProtocolQuirks { strict_gap: true, ..ProtocolQuirks::default() }, ..slow };
         assert_eq!(answered_unspaced(&mut Bench::new(strict.clone())), 0);
         assert!(matches!(
             reply(&Bench::new(strict).ask(Request::Status.encode(0).bytes())),
@@ -170,7 +171,7 @@ fn what_a_host_leaves_to_its_uart_is_heard_unless_the_sensor_is_strict() {
 
 #[test]
 fn a_sensor_may_think_as_long_each_time() {
-    let mut bench = with(Habits { answer_ns: 60 * MILLIS, ..Habits::default() });
+    let mut bench = with(ProtocolQuirks { answer_ns: 60 * MILLIS, ..ProtocolQuirks::default() });
     for request in [Request::Type, Request::Stop, Request::Variant(Variant::HALF)] {
         let before = bench.chunks.len();
         bench.ask(request.encode(0).bytes());
